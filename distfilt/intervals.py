@@ -1,0 +1,178 @@
+"""Intervals around a mean, a median or a share, each with its confidence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .checks import Array, array, count, number
+
+__all__ = ["Interval", "mean_interval", "median_interval", "proportion_interval"]
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate with a confidence interval around it.
+
+    Parameters
+    ----------
+    estimate : float
+        The estimate, inside the interval.
+    low, high : float
+        The interval's ends, both included: ``0.3 in interval`` asks whether it covers 0.3.
+    error : float
+        The estimate's standard error, at least 0.
+
+    Raises
+    ------
+    ValueError
+        If a value is not finite, the error is negative or low <= estimate <= high fails.
+
+    Examples
+    --------
+    >>> share = Interval(0.25, 0.15, 0.375, 0.06)
+    >>> print(share, 0.1 in share)
+    0.25 [0.15, 0.375] False
+    """
+
+    estimate: float
+    low: float
+    high: float
+    error: float
+
+    def __post_init__(self) -> None:
+        middle = number(self.estimate, "estimate")
+        number(self.low, "low", at_most=middle)
+        number(self.high, "high", at_least=middle)
+        number(self.error, "error", at_least=0)
+
+    def __contains__(self, value: object) -> bool:
+        return bool(self.low <= number(value, "value") <= self.high)
+
+    def __str__(self) -> str:
+        return f"{self.estimate:.3g} [{self.low:.3g}, {self.high:.3g}]"
+
+
+def _level(value: Any) -> float:
+    return number(value, "level", above=0, below=1)
+
+
+def _values(values: ArrayLike, least: int) -> Array:
+    out = array(values, "values", ("n",))
+    if out.size < least:
+        raise ValueError(f"values: needs at least {least} values, got {out.size}")
+    return out
+
+
+def mean_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
+    """Student's t interval for the mean of independent values.
+
+    Parameters
+    ----------
+    values : array_like, (n,)
+        One number a run, at least two.
+    level : float
+        Confidence, in (0, 1).
+
+    Returns
+    -------
+    Interval
+        The mean, the interval, and the standard error s/√n.
+
+    Examples
+    --------
+    >>> print(mean_interval([1.0, 2.0, 3.0, 4.0]))
+    2.5 [0.446, 4.55]
+    """
+    from scipy.stats import t
+
+    v = _values(values, 2)
+    confidence = _level(level)
+    middle, error = float(v.mean()), float(v.std(ddof=1)) / float(np.sqrt(v.size))
+    half = float(t.ppf(0.5 + confidence / 2, v.size - 1)) * error
+    return Interval(middle, middle - half, middle + half, error)
+
+
+def median_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
+    """Interval for the median that assumes nothing about the distribution.
+
+    The k-th smallest and the k-th largest value miss the median with probability
+    2 P(B < k), B binomial (n, 1/2); k is the largest with which they miss it seldom enough.
+
+    Parameters
+    ----------
+    values : array_like, (n,)
+        Independent values; enough of them for `level`: 6 for 95%.
+    level : float
+        Confidence that the interval has at least, in (0, 1).
+
+    Returns
+    -------
+    Interval
+        The sample median, the order statistics, and as error the half width divided by the normal
+        quantile of `level`, which tends to the standard error for large n.
+
+    Examples
+    --------
+    >>> print(median_interval([5.0, 1.0, 4.0, 2.0, 9.0, 3.0, 8.0]))
+    4 [1, 9]
+    """
+    from scipy.special import ndtri
+    from scipy.stats import binom
+
+    confidence = _level(level)
+    v = np.sort(_values(values, 1))
+    n = v.size
+    # P(B <= k - 1) for k = 1, 2, ...: the chance that the k-th smallest lies above the median.
+    missed = 2 * binom.cdf(np.arange((n + 1) // 2), n, 0.5)
+    k = int((missed <= 1 - confidence).sum())
+    if k == 0:
+        raise ValueError(f"values: needs more values for level {confidence:g}, got {n}")
+    low, high = float(v[k - 1]), float(v[n - k])
+    error = (high - low) / (2 * float(ndtri(0.5 + confidence / 2)))
+    return Interval(float(np.median(v)), low, high, error)
+
+
+def proportion_interval(successes: int, trials: int, *, level: float = 0.95) -> Interval:
+    """Clopper-Pearson interval for a probability: it covers with at least `level`, for every n.
+
+    Parameters
+    ----------
+    successes : int
+        How often it happened, 0 to `trials`.
+    trials : int
+        Independent trials, at least one.
+    level : float
+        Confidence that the interval has at least, in (0, 1).
+
+    Returns
+    -------
+    Interval
+        The share, the interval, and the plug-in standard error √(p(1-p)/n), 0 at p = 0 and 1.
+
+    Notes
+    -----
+    C. J. Clopper and E. S. Pearson, Biometrika 26 (1934) 404-413.
+
+    Examples
+    --------
+    >>> print(proportion_interval(0, 100))
+    0 [0, 0.0362]
+    """
+    from scipy.stats import beta
+
+    n = count(trials, "trials")
+    k = count(successes, "successes", at_least=0)
+    if k > n:
+        raise ValueError(f"successes: needs at most as many as trials ({n}), got {k}")
+    tail = (1 - _level(level)) / 2
+    low = 0.0 if k == 0 else float(beta.ppf(tail, k, n - k + 1))
+    high = 1.0 if k == n else float(beta.ppf(1 - tail, k + 1, n - k))
+    share = k / n
+    # A level near 0 gives ends that pass each other around the share.
+    return Interval(
+        share, min(low, share), max(high, share), float(np.sqrt(share * (1 - share) / n))
+    )
