@@ -1,0 +1,171 @@
+"""The book's build: Sphinx on the repository, with stored outputs and nothing from the network.
+
+A figure of a chapter needs a text for readers who do not see it. It stands in the header of the cell:
+
+    ```{code-cell} ipython3
+    ---
+    mystnb:
+      image:
+        alt: Two curves; the error of A falls to 0.2 m, that of B stays at 3 m.
+      figure:
+        caption: Error of agents A and B.
+        name: fig-errors
+    ---
+    fig, ax = plt.subplots()
+    ```
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from sphinx.application import Sphinx
+from sphinx.environment.collectors.toctree import TocTreeCollector
+from sphinx.errors import ExtensionError
+
+sys.path.insert(0, str(Path(__file__).parent / "tools"))
+
+from common import BOOK, ROOT, missing_pages
+from pages import chapter_number, escape_stars, number_chapters, write_generated
+
+project = "Distributed Nonlinear Filtering"
+author = "The distfilt authors"
+copyright = "2026, The distfilt authors"  # noqa: A001 (Sphinx's name)
+language = "en"
+
+extensions = [
+    "myst_nb",
+    "sphinx_external_toc",
+    "sphinx_design",
+    "sphinx_copybutton",
+    "sphinx_togglebutton",
+    "sphinx_proof",
+    "sphinx_exercise",
+    "sphinxcontrib.bibtex",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "numpydoc",
+]
+
+# Pages: book/ only; a chapter is read from its notebook, never from both files of the pair.
+external_toc_path = "_toc.yml"
+external_toc_exclude_missing = False
+include_patterns = ["book/**"]
+exclude_patterns = [
+    "book/_generated/**",
+    "book/examples/**",
+    "book/tools/**",
+    "**/.ipynb_checkpoints",
+    *(p.with_suffix(".md").relative_to(ROOT).as_posix() for p in BOOK.glob("*.ipynb")),
+]
+
+# Notebooks: the stored outputs are what a reader sees; make outputs executes them.
+nb_execution_mode = "off"
+nb_merge_streams = True
+nb_number_source_lines = False
+nb_ipywidgets_js: dict[str, Any] = {}
+nb_mime_priority_overrides = [("html", "application/vnd.jupyter.widget-view+json", None)]
+myst_enable_extensions = [
+    "amsmath",
+    "attrs_block",
+    "attrs_inline",
+    "colon_fence",
+    "deflist",
+    "dollarmath",
+    "fieldlist",
+]
+myst_heading_anchors = 3
+myst_dmath_double_inline = True
+
+# Numbers: (4.1) and Fig. 4.1 start with the chapter's number, which its file name gives.
+numfig = True
+numfig_secnum_depth = 1
+numfig_format = {"figure": "Fig. %s", "table": "Table %s", "code-block": "Listing %s"}
+math_eqref_format = "({number})"
+math_numfig = True
+
+bibtex_bibfiles = ["refs.bib"]
+bibtex_reference_style = "author_year"
+bibtex_default_style = "plain"
+
+autodoc_typehints = "signature"
+autodoc_member_order = "bysource"
+autodoc_type_aliases = {"Array": "Array", "ArrayLike": "ArrayLike"}
+autodoc_preserve_defaults = True
+python_maximum_signature_line_length = 72
+numpydoc_show_class_members = False
+numpydoc_class_members_toctree = False
+
+# Mathematics without a network: MathJax 3 is copied from a Python package at the end of a build.
+mathjax_path = "mathjax/tex-mml-chtml.js"
+mathjax3_config = {
+    "tex": {"tags": "none"},
+    "chtml": {"mtextInheritFont": True},
+    "options": {"enableMenu": False},
+}
+
+html_theme = "sphinx_book_theme"
+html_title = project
+html_static_path = ["_static"]
+html_css_files = ["book.css"]
+html_favicon = "_static/mark.svg"
+html_logo = "_static/mark.svg"
+html_copy_source = False
+html_show_sourcelink = False
+html_show_sphinx = False
+html_theme_options = {
+    "logo": {"text": project, "alt_text": "Distributed Nonlinear Filtering, first page"},
+    "home_page_in_toc": False,
+    "show_navbar_depth": 1,
+    "show_toc_level": 2,
+    "use_download_button": False,
+    "use_fullscreen_button": False,
+    "use_issues_button": False,
+    "use_repository_button": False,
+    "use_source_button": False,
+}
+pygments_style = "tango"
+copybutton_exclude = ".linenos, .gp, .go"
+togglebutton_hint = "Show"
+togglebutton_hint_hide = "Hide"
+
+
+def check_toc(app: Sphinx) -> None:
+    """Stop the build when a page of the table of contents has no file."""
+    if missing := missing_pages():
+        raise ExtensionError(f"_toc.yml names pages that do not exist: {', '.join(missing)}")
+
+
+def copy_mathjax(app: Sphinx, error: Exception | None) -> None:
+    """Copy MathJax, its fonts and its TeX extensions into the built book."""
+    if error is not None:
+        return
+    spec = find_spec("sphinx-mathjax-offline")
+    if spec is None or spec.origin is None:
+        raise ExtensionError("sphinx-mathjax-offline is not installed: no mathematics")
+    source = Path(spec.origin).parent / "static" / "mathjax"
+    target = Path(app.outdir) / "_static" / "mathjax"
+    for part in ("tex-mml-chtml.js", "output/chtml/fonts", "input/tex/extensions", "a11y", "sre"):
+        if (source / part).is_dir():
+            shutil.copytree(source / part, target / part, dirs_exist_ok=True)
+        else:
+            (target / part).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(source / part, target / part)
+
+
+def setup(app: Sphinx) -> None:
+    number_figures = TocTreeCollector.assign_figure_numbers
+
+    def with_chapter_numbers(self: Any, env: Any) -> list[str]:
+        number_chapters(env, chapter_number)
+        return number_figures(self, env)
+
+    TocTreeCollector.assign_figure_numbers = with_chapter_numbers  # type: ignore[method-assign]
+    app.connect("builder-inited", check_toc)
+    app.connect("builder-inited", lambda app: write_generated(BOOK / "_generated"))
+    app.connect("autodoc-process-docstring", lambda *event: escape_stars(event[-1]))
+    app.connect("build-finished", copy_mathjax)

@@ -1,0 +1,115 @@
+"""What the book's tools share: where things are, and the environment that a chapter runs in."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+ROOT = Path(__file__).resolve().parents[2]
+BOOK = ROOT / "book"
+VERDICT = "application/vnd.distfilt.verdict+json"
+
+# Addresses in memory, kernel files and home folders differ on the next machine.
+_FOREIGN = re.compile(r"(/home/|/root/|/Users/|/tmp/|site-packages/|ipykernel_\d|\b0x[0-9a-f]{8,})")
+
+
+def pinned_environment() -> dict[str, str]:
+    """Return the environment in which every chapter runs, wherever it is run.
+
+    One thread in each BLAS and a fixed hash seed keep the digits; the reader's own IPython profile
+    and kernels are not looked at; progress bars, whose text holds times, are off.
+    """
+    home = ROOT / "_build" / "jupyter"
+    return {
+        **os.environ,
+        "OPENBLAS_NUM_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+        "MKL_NUM_THREADS": "1",
+        "PYTHONHASHSEED": "0",
+        "TQDM_DISABLE": "1",
+        "IPYTHONDIR": str(home / "ipython"),
+        "JUPYTER_CONFIG_DIR": str(home / "config"),
+        "JUPYTER_PREFER_ENV_PATH": "1",
+        "JUPYTER_PLATFORM_DIRS": "1",
+        "MPLCONFIGDIR": os.environ.get("MPLCONFIGDIR", str(home / "matplotlib")),
+        "PYDEVD_DISABLE_FILE_VALIDATION": "1",
+    }
+
+
+def toc_pages(toc: Path = ROOT / "_toc.yml") -> list[str]:
+    """Return every page of the table of contents, without a suffix, in reading order."""
+
+    def walk(node: Any) -> Iterator[str]:
+        if isinstance(node, dict):
+            for key, value in node.items():
+                if key in ("root", "file"):
+                    yield str(value).removesuffix(".md").removesuffix(".ipynb")
+                else:
+                    yield from walk(value)
+        elif isinstance(node, list):
+            for item in node:
+                yield from walk(item)
+
+    return list(walk(yaml.safe_load(toc.read_text(encoding="utf-8"))))
+
+
+def missing_pages() -> list[str]:
+    """Return the pages of the table of contents that have no file."""
+    return [page for page in toc_pages() if not (ROOT / f"{page}.md").is_file()]
+
+
+def is_chapter(source: Path) -> bool:
+    """Say whether a Markdown page is a notebook: its header names a kernel."""
+    text = source.read_text(encoding="utf-8")
+    header = text.split("\n---", 1)[0] if text.startswith("---") else ""
+    return "kernelspec:" in header
+
+
+def chapters() -> list[Path]:
+    """Return the Markdown sources of the book's notebooks, in reading order."""
+    sources = [ROOT / f"{page}.md" for page in toc_pages()]
+    return [source for source in sources if source.is_file() and is_chapter(source)]
+
+
+def chosen(names: list[str]) -> list[Path]:
+    """Return the sources that the command line names (all chapters without a name)."""
+    if not names:
+        return chapters()
+    out = []
+    for name in names:
+        known = [c for c in chapters() if c.stem == name or c.stem.startswith(f"{name}-")]
+        path = known[0] if known else Path(name).with_suffix(".md").resolve()
+        if not path.is_file():
+            sys.exit(f"{name}: no such chapter; _toc.yml has {[c.stem for c in chapters()]}")
+        out.append(path)
+    return out
+
+
+def output_texts(output: Any) -> Iterator[str]:
+    """Yield every piece of text that an output stores, pictures left out."""
+    yield output.get("text", "")
+    yield output.get("evalue", "")
+    yield from output.get("traceback", [])
+    for mime, value in output.get("data", {}).items():
+        if not mime.startswith("image/") or mime.endswith("svg+xml"):
+            yield value if isinstance(value, str) else repr(value)
+
+
+def foreign_text(output: Any) -> str:
+    """Return a piece of the output that belongs to one machine or one run, or ''."""
+    here = [str(ROOT), str(Path.home()), tempfile.gettempdir(), sys.prefix]
+    for text in output_texts(output):
+        found = _FOREIGN.search(text)
+        if found:
+            return found.group()
+        for path in here:
+            if len(path) > 1 and path in text:
+                return path
+    return ""

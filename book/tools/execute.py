@@ -1,0 +1,137 @@
+"""Execute chapters and store their outputs beside them, the same bytes every time.
+
+    python book/tools/execute.py [CHAPTER ...] [--check] [--jobs N]
+
+The Markdown is the source; the notebook is written from it. A chapter that raises, warns, writes to
+stderr or stores a path of this machine is refused, and its stored notebook stays as it was. With
+``--check`` nothing is written: the chapters run again and their bytes are compared.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import jupytext
+import nbformat
+from common import ROOT, chosen, foreign_text, pinned_environment
+from nbclient import NotebookClient
+from nbclient.exceptions import CellExecutionError
+
+KERNELSPEC = {"display_name": "Python 3", "language": "python", "name": "python3"}
+LANGUAGE = {
+    "codemirror_mode": {"name": "ipython", "version": 3},
+    "file_extension": ".py",
+    "mimetype": "text/x-python",
+    "name": "python",
+    "nbconvert_exporter": "python",
+    "pygments_lexer": "ipython3",
+}
+WIDGET_STATE = "application/vnd.jupyter.widget-state+json"
+
+
+def read(source: Path) -> Any:
+    """Return the Markdown source as a notebook with numbered cells and no version in its header."""
+    notebook = jupytext.read(source)
+    header = notebook.metadata.get("jupytext", {})
+    wanted = {k: v for k, v in header.items() if k in ("formats", "notebook_metadata_filter")}
+    layout = header.get("text_representation", {})
+    wanted["text_representation"] = {
+        k: v for k, v in layout.items() if k in ("extension", "format_name")
+    }
+    notebook.metadata = nbformat.from_dict(
+        {"jupytext": wanted, "kernelspec": KERNELSPEC, "language_info": LANGUAGE}
+    )
+    for k, cell in enumerate(notebook.cells):
+        cell["id"] = f"{source.stem}-{k:03d}"
+    notebook.nbformat, notebook.nbformat_minor = 4, 5
+    return notebook
+
+
+def run(notebook: Any, folder: Path) -> None:
+    """Execute the notebook in place, in its own folder and the pinned environment."""
+    client = NotebookClient(
+        notebook,
+        timeout=900,
+        kernel_name="python3",
+        record_timing=False,
+        coalesce_streams=True,
+        resources={"metadata": {"path": str(folder)}},
+    )
+    client.execute(env=pinned_environment())
+    notebook.metadata["language_info"] = nbformat.from_dict(LANGUAGE)
+
+
+def complaints(notebook: Any) -> list[str]:
+    """Return what a stored notebook must not hold: stderr, and what belongs to one machine."""
+    out = []
+    for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            where = f"cell {cell['id']}:\n{cell.source}\n"
+            if output.get("name") == "stderr":
+                out.append(f"{where}wrote to stderr (fix the cause):\n{output['text']}")
+            elif foreign := foreign_text(output):
+                out.append(f"{where}its output holds {foreign!r}, which another run would not")
+    return out
+
+
+def dump(notebook: Any) -> str:
+    """Return the notebook as text: sorted keys, and widget models numbered in order of creation."""
+    text: str = nbformat.writes(notebook, sort_keys=True, indent=1, ensure_ascii=False) + "\n"
+    state = notebook.metadata.get("widgets", {}).get(WIDGET_STATE, {}).get("state", {})
+    for k, model in enumerate(state):
+        text = text.replace(model, f"{k:032d}")
+    # The keys were sorted by their random names: sort again by the new ones.
+    return text if not state else _sorted(text)
+
+
+def _sorted(text: str) -> str:
+    notebook = nbformat.reads(text, as_version=4)
+    return str(nbformat.writes(notebook, sort_keys=True, indent=1, ensure_ascii=False)) + "\n"
+
+
+def execute(source: Path, check: bool = False) -> str:
+    """Execute one chapter; return what is wrong with it, or ''."""
+    os.environ.update(pinned_environment())
+    started = time.perf_counter()
+    notebook = read(source)
+    try:
+        run(notebook, source.parent)
+    except CellExecutionError as error:
+        return f"{source.stem}: a cell failed\n{error}"
+    problems = complaints(notebook)
+    if problems:
+        return "\n".join([f"{source.stem}: outputs that cannot be stored", *problems])
+    text, target = dump(notebook), source.with_suffix(".ipynb")
+    if check:
+        if not target.is_file() or target.read_text(encoding="utf-8") != text:
+            return f"{target.name}: another execution does not give the stored bytes"
+    else:
+        target.write_text(text, encoding="utf-8")
+    print(f"{source.stem}: {time.perf_counter() - started:.1f} s", flush=True)
+    return ""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Execute chapters and store their outputs.")
+    parser.add_argument("chapters", nargs="*", help="names or numbers; all without one")
+    parser.add_argument("--check", action="store_true", help="compare bytes, write nothing")
+    parser.add_argument("--jobs", type=int, default=2, help="chapters at a time")
+    options = parser.parse_args()
+    sources = chosen(options.chapters)
+    with ProcessPoolExecutor(max_workers=options.jobs) as pool:
+        found = list(pool.map(execute, sources, [options.check] * len(sources)))
+    for problem in filter(None, found):
+        print(problem, file=sys.stderr)
+    if not sources:
+        print(f"{ROOT.name}: the table of contents has no chapter", file=sys.stderr)
+    return int(any(found) or not sources)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,150 @@
+"""What the build computes: chapter numbers, the API page's list, the page of reproductions."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+import types
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from common import BOOK, ROOT, toc_pages
+from docutils import nodes
+from ledger import ITEMS, LEDGER, VERDICTS, rows_of
+from sphinx.pycode import ModuleAnalyzer
+
+PAPERS = {
+    "grange": "Triangular transport maps",
+    "das": "Constrained optimal transport",
+    "semeraro": "Partial-state fusion",
+    "zheng": "Distributed density filter",
+}
+
+
+def chapter_number(page: str) -> int | None:
+    """Return the number that a chapter's file name starts with."""
+    found = re.match(r"book/(\d+)-", page)
+    return int(found.group(1)) if found else None
+
+
+def number_chapters(env: Any, number_of: Any) -> None:
+    """Give each chapter the number of its file name, whichever chapters exist.
+
+    Sphinx counts the chapters that it finds; then equation (4.1) would be renumbered when
+    chapters 2 and 3 appear.
+    """
+    for page, sections in env.toc_secnumbers.items():
+        number = number_of(page)
+        if number is None:
+            continue
+        for anchor, old in sections.items():
+            sections[anchor] = (number, *old[1:]) if old else old
+        marked = [env.titles[page], *env.tocs[page].findall(nodes.reference)]
+        for node in marked:
+            if old := node.get("secnumber"):
+                node["secnumber"] = [number, *old[1:]]
+
+
+def modules() -> list[str]:
+    """Return every module of the library, the package first."""
+    root = ROOT / "distfilt"
+    paths = sorted(p for p in root.rglob("*.py") if not p.stem.startswith("_") or p.stem == "__init__")
+    names = [p.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".") for p in paths]
+    return sorted(name.removesuffix(".__init__") for name in names)
+
+
+def directive(module: Any, name: str) -> list[str]:
+    """Return the lines that document one public name."""
+    value = getattr(module, name)
+    home = getattr(value, "__module__", module.__name__)
+    if callable(value) and home != module.__name__ and home.startswith("distfilt"):
+        role = "class" if inspect.isclass(value) else "func"
+        return [f"``{name}`` is :py:{role}:`{home}.{name}`.", ""]
+    if isinstance(value, types.GenericAlias):
+        meaning = ModuleAnalyzer.for_module(module.__name__).find_attr_docs().get(("", name), [])
+        shown = str(value).replace("typing.", "").replace("numpy.", "np.")
+        text = [f"   {line}" for line in [*meaning, "", f"The type ``{shown}``."]]
+        return [f".. py:data:: {module.__name__}.{name}", "", *text, ""]
+    if inspect.isclass(value):
+        return [f".. autoclass:: {module.__name__}.{name}", "   :members:", ""]
+    if inspect.isfunction(value):
+        return [f".. autofunction:: {module.__name__}.{name}", ""]
+    return [f".. autodata:: {module.__name__}.{name}", "   :no-value:", ""]
+
+
+def escape_stars(lines: list[str]) -> None:
+    """Escape the star of a shape such as ``(*runs, N, d)``, which is no emphasis."""
+    for k, line in enumerate(lines):
+        if not line.lstrip().startswith((">>>", "...")):
+            parts = line.split("``")
+            parts[::2] = [re.sub(r"(?<=[(\s])\*(?=\w+[,)])", r"\\*", part) for part in parts[::2]]
+            lines[k] = "``".join(parts)
+
+
+def api_text() -> str:
+    """Return the API reference: each module's text, then every name of its ``__all__``."""
+    lines = []
+    for name in modules():
+        module = importlib.import_module(name)
+        body = [f".. automodule:: {name}", "   :no-members:", ""]
+        for public in getattr(module, "__all__", ()):
+            body += directive(module, public)
+        if name == "distfilt":
+            continue
+        lines += [f"## `{name}`", "", "```{eval-rst}", *body, "```", ""]
+    return "\n".join(lines)
+
+
+def cell(text: str) -> str:
+    """Return a text that fits a cell of a Markdown table."""
+    return text.replace("|", r"\|").replace("\n", " ") or "–"
+
+
+def chapter_link(chapter: str) -> str:
+    """Return a link to a chapter that exists, or its number."""
+    page = f"book/{chapter}"
+    number = chapter_number(page)
+    label = chapter if number is None else str(number)
+    return f"[{label}](/{page})" if page in toc_pages() else label
+
+
+def reproductions_text() -> str:
+    """Return the count of verdicts and one table for each paper."""
+    titles = {(item["paper"], item["item"]): item["title"] for item in rows_of(ITEMS)}
+    rows = rows_of(LEDGER)
+    counts = Counter(row["verdict"] for row in rows)
+    summary = ", ".join(f"{counts[verdict]} *{verdict}*" for verdict in VERDICTS)
+    lines = [f"Of {len(rows)} items: {summary}.", ""]
+    for paper in dict.fromkeys(row["paper"] for row in rows):
+        lines += [f"## {PAPERS.get(paper, paper)} (`{paper}`)", ""]
+        lines += ["| Item | Shows | Chapter | Verdict | Ours | Published | Why |"]
+        lines += ["|---|---|---|---|---|---|---|"]
+        for row in (r for r in rows if r["paper"] == paper):
+            shown = [row["item"], titles[paper, row["item"]], "", *(row[k] for k in (
+                "verdict", "ours", "published", "why"))]
+            cells = [cell(text) for text in shown]
+            cells[2] = chapter_link(row["chapter"])
+            lines += ["| " + " | ".join(cells) + " |"]
+        lines += [""]
+    return "\n".join(lines)
+
+
+def own_filter_text() -> str:
+    """Return the listing of the reader's own filter, when the example exists."""
+    if not (BOOK / "examples" / "own_filter.py").is_file():
+        return ""
+    return "```{literalinclude} /book/examples/own_filter.py\n:language: python\n```\n"
+
+
+def write_generated(folder: Path) -> None:
+    """Write the included parts of pages; an unchanged part keeps its date."""
+    folder.mkdir(exist_ok=True)
+    parts = {"api.md": api_text(), "own_filter.md": own_filter_text()}
+    if ITEMS.is_file() and LEDGER.is_file():
+        parts["reproductions.md"] = reproductions_text()
+    for name, text in parts.items():
+        target = folder / name
+        if not target.is_file() or target.read_text(encoding="utf-8") != text:
+            target.write_text(text, encoding="utf-8")

@@ -1,0 +1,120 @@
+"""Compare each chapter's Markdown with its stored notebook, and refuse what must not be stored.
+
+    python book/tools/pairs.py [CHAPTER ...]
+
+No tool of the toolchain does this: jupytext does not compare the two files, and nbval passes a
+notebook whose outputs and execution counts were both cleared.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import nbformat
+from common import BOOK, ROOT, chosen, foreign_text, is_chapter, missing_pages, toc_pages
+from execute import read
+
+WIDTH = 79
+"""Longest line of code: it fits a phone held sideways and a printed page."""
+
+
+def differences(source: Path, stored: Any) -> list[str]:
+    """Return where the stored notebook's cells are not the Markdown's."""
+    fresh = read(source)
+    out = []
+    if len(fresh.cells) != len(stored.cells):
+        out.append(f"{len(fresh.cells)} cells in the Markdown, {len(stored.cells)} stored")
+    for ours, theirs in zip(fresh.cells, stored.cells, strict=False):
+        for key in ("id", "cell_type", "source", "metadata"):
+            if ours.get(key) != theirs.get(key):
+                out.append(f"{ours['id']}: {key} differs between the Markdown and the notebook")
+    if fresh.metadata != {k: v for k, v in stored.metadata.items() if k != "widgets"}:
+        out.append("the headers of the Markdown and of the notebook differ")
+    return out
+
+
+def code_faults(cell: Any, count: int) -> list[str]:
+    """Return what is wrong with one stored code cell, the `count`-th of its chapter."""
+    out = []
+    if not cell.source.strip():
+        return ["an empty code cell"]
+    if cell.execution_count != count:
+        out.append(f"execution count {cell.execution_count}, needs {count}: make outputs")
+    for line in cell.source.splitlines():
+        if len(line) > WIDTH:
+            out.append(f"a line of {len(line)} characters, at most {WIDTH}: {line.strip()[:40]}…")
+    for output in cell.outputs:
+        if output.output_type == "error":
+            out.append(f"a stored error: {output.ename}")
+        if output.get("name") == "stderr":
+            out.append("stored stderr")
+        if foreign := foreign_text(output):
+            out.append(f"an output holds {foreign!r}, which belongs to one machine")
+    return out + figure_faults(cell)
+
+
+def figure_faults(cell: Any) -> list[str]:
+    """Return what a cell with a picture lacks: its alternative text, its caption."""
+    pictures = [
+        mime
+        for output in cell.outputs
+        for mime in output.get("data", {})
+        if mime.startswith("image/")
+    ]
+    given = cell.metadata.get("mystnb", {})
+    out = []
+    if len(pictures) > 1:
+        out.append(f"{len(pictures)} pictures in one cell would share one alternative text")
+    if pictures and not str(given.get("image", {}).get("alt", "")).strip():
+        out.append("a figure without mystnb.image.alt in its header")
+    if pictures and not str(given.get("figure", {}).get("caption", "")).strip():
+        out.append("a figure without mystnb.figure.caption in its header")
+    return out
+
+
+def check(source: Path) -> list[str]:
+    """Return everything that is wrong with one pair."""
+    target = source.with_suffix(".ipynb")
+    if not target.is_file():
+        return [f"{source.stem}: no stored notebook: make outputs"]
+    stored = nbformat.read(target, as_version=4)
+    out = differences(source, stored)
+    code = [cell for cell in stored.cells if cell.cell_type == "code"]
+    for count, cell in enumerate(code, start=1):
+        out += [f"{cell.get('id')}: {fault}" for fault in code_faults(cell, count)]
+    return [f"{source.stem}: {problem}" for problem in out]
+
+
+def strays() -> list[str]:
+    """Return pages without a file, files without a page, and code outside notebooks."""
+    out = [f"_toc.yml names {page}, which has no file" for page in missing_pages()]
+    pages = set(toc_pages())
+    for path in sorted([*BOOK.glob("*.md"), *BOOK.glob("*.ipynb")]):
+        page = path.relative_to(ROOT).with_suffix("").as_posix()
+        if page not in pages:
+            out.append(f"{path.name} is not in _toc.yml")
+        if path.suffix == ".ipynb" and not path.with_suffix(".md").is_file():
+            out.append(f"{path.name} has no Markdown source")
+        if path.suffix == ".md" and not is_chapter(path):
+            text = path.read_text(encoding="utf-8")
+            if re.search(r"^(`{3,}|:{3,})\{code-cell\}", text, flags=re.MULTILINE):
+                out.append(f"{path.name} has a code cell but no notebook header")
+    return out
+
+
+def main() -> int:
+    names = sys.argv[1:]
+    sources = chosen(names)
+    problems = [problem for source in sources for problem in check(source)]
+    problems += [] if names else strays()
+    for problem in problems:
+        print(problem, file=sys.stderr)
+    print(f"{len(sources)} pairs of Markdown and notebook, {len(problems)} problems")
+    return int(bool(problems))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

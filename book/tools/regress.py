@@ -1,0 +1,85 @@
+"""Run chapters again and compare every stored output with nbval, strictly.
+
+    python book/tools/regress.py [CHAPTER ...] [--portable] [--jobs N]
+
+``--portable`` runs them under another BLAS kernel and with numpy's newer SIMD code off. A probe
+notebook goes through the very same command first and fails if the setting did not take hold.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import nbformat
+from common import ROOT, chosen, pinned_environment
+
+PROBE_BLAS = """\
+import numpy, scipy.linalg, threadpoolctl
+found = [b for b in threadpoolctl.threadpool_info() if b["user_api"] == "blas"]
+assert found, "no BLAS was found"
+for blas in found:
+    assert blas["internal_api"] == "openblas", blas
+    assert blas["architecture"] == "Nehalem", blas
+    assert blas["num_threads"] == 1, blas
+"""
+PROBE_SIMD = """\
+from numpy._core._multiarray_umath import __cpu_features__ as features
+assert features["X86_V3"] is False, "X86_V3 is still on"
+"""
+SETTINGS = {
+    "blas": ({"OPENBLAS_CORETYPE": "Nehalem"}, PROBE_BLAS),
+    "simd": ({"NPY_DISABLE_CPU_FEATURES": "X86_V4 X86_V3 AVX512_ICL AVX512_SPR"}, PROBE_SIMD),
+}
+
+
+def compare(notebook: Path, extra: dict[str, str]) -> int:
+    """Run one notebook against its stored outputs; return pytest's exit code."""
+    started = time.perf_counter()
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", ""]
+    command += ["--nbval", "--nbval-current-env", "--nbval-cell-timeout=900", str(notebook)]
+    done = subprocess.run(
+        command, cwd=ROOT, env=pinned_environment() | extra, capture_output=True, text=True
+    )
+    if done.returncode:
+        print(done.stdout, done.stderr, sep="\n", file=sys.stderr)
+    state = "differs" if done.returncode else "as stored"
+    print(f"{notebook.stem}: {state}, {time.perf_counter() - started:.1f} s", flush=True)
+    return done.returncode
+
+
+def probe(name: str, code: str) -> Path:
+    """Write a notebook of one cell that fails unless the setting took hold."""
+    target = ROOT / "_build" / "portable" / f"probe-{name}.ipynb"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    cell = nbformat.v4.new_code_cell(code, execution_count=1, id="probe-000")
+    nbformat.write(nbformat.v4.new_notebook(cells=[cell]), target)
+    return target
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Compare chapters with their stored outputs.")
+    parser.add_argument("chapters", nargs="*", help="names or numbers; all without one")
+    parser.add_argument("--portable", action="store_true", help="other BLAS kernel, less SIMD")
+    parser.add_argument("--jobs", type=int, default=2, help="chapters at a time")
+    options = parser.parse_args()
+    notebooks = [source.with_suffix(".ipynb") for source in chosen(options.chapters)]
+    if not notebooks:
+        print("the table of contents has no chapter", file=sys.stderr)
+        return 1
+    codes = []
+    for name, (extra, code) in SETTINGS.items() if options.portable else [("", ({}, ""))]:
+        if name:
+            print(f"under {extra}", flush=True)
+            codes.append(compare(probe(name, code), extra))
+        with ThreadPoolExecutor(max_workers=options.jobs) as pool:
+            codes += pool.map(compare, notebooks, [extra] * len(notebooks))
+    return int(any(codes))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
