@@ -1,0 +1,302 @@
+"""The Kalman, extended and unscented filters of filterpy 2.0 behind the library's shapes.
+
+They are slow (one run and one step at a time) and independently written: the reference that the
+batched filters are compared with. Nothing else in the library imports filterpy.
+
+Three habits of filterpy are guarded against here: states are vectors (d,), since a column state and
+a flat observation silently give a matrix; missing components are taken out before filterpy sees
+them, since NaN passes through without an error; and every update follows a forecast, since a second
+update on the same sigma points can give a negative variance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..checks import Array, array, number
+from ..models import Model
+from ..sensors import Sensor
+from .linear import GaussianRun, _broadcast, _fill_axes, _noise_per_step, _per_step, _prior
+from .stacking import _instantaneous, _series
+
+_Mask = NDArray[np.bool_]
+
+__all__ = ["filterpy_ekf", "filterpy_kf", "filterpy_ukf"]
+
+_DIFFERENCE_STEP = 6e-6
+"""Step of a central difference, about the cube root of the rounding unit."""
+
+
+def filterpy_kf(
+    mean: ArrayLike,
+    cov: ArrayLike,
+    observations: ArrayLike,
+    *,
+    F: ArrayLike,
+    H: ArrayLike,
+    Q: ArrayLike,
+    R: ArrayLike,
+    likelihood: bool = True,
+) -> GaussianRun:
+    """Filterpy's Kalman filter over a series: arguments and result of :func:`kalman_filter`.
+
+    Parameters
+    ----------
+    mean, cov, observations, F, H, Q, R : array_like
+        As for :func:`distfilt.kalman.kalman_filter`.
+    likelihood : bool
+        Whether to ask filterpy for the log density of each observation, which takes longer than
+        the filter. Without it `log_likelihood` is zero.
+
+    Returns
+    -------
+    GaussianRun
+        Covariances have all run axes.
+
+    Raises
+    ------
+    ValueError
+        As :func:`distfilt.kalman.kalman_filter`.
+
+    Examples
+    --------
+    >>> run = filterpy_kf([0.0], [[1.0]], [[2.0]], F=[[1.0]], H=[[1.0]], Q=[[0.0]], R=[[1.0]])
+    >>> run.means, run.covariances
+    (array([[1.]]), array([[[0.5]]]))
+    """
+    from filterpy.kalman import KalmanFilter
+
+    y = array(observations, "observations", None, finite=False)
+    if y.ndim < 2 or np.isinf(y).any():
+        raise ValueError(f"observations: needs (T, ..., m), finite or NaN, got shape {y.shape}")
+    steps, m = y.shape[0], y.shape[-1]
+    d = _prior(mean, cov)[0].shape[-1]
+    f, q = _per_step(F, "F", steps, (d, d)), _noise_per_step(Q, "Q", steps, d, semidefinite=True)
+    h, r = _per_step(H, "H", steps, (m, d)), _noise_per_step(R, "R", steps, m)
+
+    def start(x: Array, p: Array) -> Any:
+        kf = KalmanFilter(dim_x=d, dim_z=m)
+        kf.x, kf.P = x.copy(), p.copy()
+        return kf
+
+    def step(kf: Any, k: int, z: Array, seen: _Mask) -> None:
+        kf.predict(F=f[k], Q=q[k])
+        if seen.any():
+            kf.update(z[seen], H=h[k][seen], R=r[k][np.ix_(seen, seen)])
+
+    return _over_runs(mean, cov, y, start, step, likelihood)
+
+
+def filterpy_ekf(
+    mean: ArrayLike,
+    cov: ArrayLike,
+    observations: ArrayLike,
+    *,
+    model: Model,
+    sensors: Sequence[Sensor],
+    times: ArrayLike,
+    t0: float = 0.0,
+    likelihood: bool = False,
+) -> GaussianRun:
+    r"""Filterpy's extended Kalman filter over a series: linearise the model and the sensors.
+
+    Parameters
+    ----------
+    mean : array_like, (d,) or (..., d)
+        Prior mean at `t0`.
+    cov : array_like, (d, d) or (..., d, d)
+        Prior covariance.
+    observations : array_like, (T, ..., m)
+        The observations of all sensors, one after the other; NaN marks a missing component.
+    model : Model
+        Linearised about each analysis mean; a model with `transition` is not differenced.
+    sensors : sequence of Sensor
+        Linearised about each forecast mean; residuals wrap where the sensor wraps.
+    times : array_like, (T,)
+        Observation times, in s.
+    t0 : float
+        The time of the prior, in s.
+    likelihood : bool
+        Whether to ask filterpy for the log density of each innovation.
+
+    Returns
+    -------
+    GaussianRun
+
+    Raises
+    ------
+    ValueError
+        If a shape, a covariance or a time is wrong, or a sensor needs the previous state.
+
+    Examples
+    --------
+    >>> from distfilt.sensors import direct
+    >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
+    >>> run = filterpy_ekf([0.0], [[1.0]], [[3.0]], model=walk,
+    ...                    sensors=[direct([0], noise=1.0)], times=[1.0])
+    >>> run.means.round(6)
+    array([[2.]])
+    """
+    from filterpy.kalman import ExtendedKalmanFilter
+
+    sensor = _instantaneous(sensors)
+    y, grid = _series(observations, times, t0, sensor.dim)
+
+    def start(x: Array, p: Array) -> Any:
+        kf = ExtendedKalmanFilter(dim_x=model.dim, dim_z=sensor.dim)
+        kf.x, kf.P = x.copy(), p.copy()
+        return kf
+
+    def step(kf: Any, k: int, z: Array, seen: _Mask) -> None:
+        t, dt = float(grid[k]), float(grid[k + 1] - grid[k])
+        kf.F, kf.Q = _model_jacobian(model, kf.x, t, dt), model.noise(t, dt)
+        moved = model.step(kf.x, t, dt)
+        kf.predict()
+        kf.x = moved  # filterpy moves the mean with F; the model itself is the better step
+        if seen.any():
+            kf.update(
+                z[seen],
+                HJacobian=lambda x: np.concatenate([s.jacobian(x) for s in sensors])[seen],
+                Hx=lambda x: sensor.predict(x)[seen],
+                R=sensor.noise[np.ix_(seen, seen)],
+                residual=_residual_of(sensor, seen),
+            )
+
+    return _over_runs(mean, cov, y, start, step, likelihood, model.dim)
+
+
+def filterpy_ukf(
+    mean: ArrayLike,
+    cov: ArrayLike,
+    observations: ArrayLike,
+    *,
+    model: Model,
+    sensors: Sequence[Sensor],
+    times: ArrayLike,
+    t0: float = 0.0,
+    alpha: float = 1.0,
+    beta: float = 0.0,
+    kappa: float = 1.0,
+    likelihood: bool = False,
+) -> GaussianRun:
+    r"""Filterpy's unscented Kalman filter over a series: 2d + 1 points instead of derivatives.
+
+    Parameters
+    ----------
+    mean, cov, observations, model, sensors, times, t0, likelihood
+        As for :func:`filterpy_ekf`.
+    alpha, beta, kappa : float
+        Of the scaled sigma points: the points lie :math:`\alpha\sqrt{d+\kappa}` standard
+        deviations from the mean. The defaults keep every weight positive, and with it the
+        covariance.
+
+    Returns
+    -------
+    GaussianRun
+
+    Raises
+    ------
+    ValueError
+        As :func:`filterpy_ekf`, or if `alpha` or d + `kappa` is not positive.
+
+    Examples
+    --------
+    >>> from distfilt.sensors import direct
+    >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
+    >>> run = filterpy_ukf([0.0], [[1.0]], [[3.0]], model=walk,
+    ...                    sensors=[direct([0], noise=1.0)], times=[1.0])
+    >>> run.means.round(6)
+    array([[2.]])
+    """
+    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+
+    sensor = _instantaneous(sensors)
+    y, grid = _series(observations, times, t0, sensor.dim)
+    number(alpha, "alpha", above=0)
+    number(beta, "beta", at_least=0)
+    number(kappa, "kappa", above=-model.dim)
+
+    class Batched(UnscentedKalmanFilter):  # type: ignore[misc]
+        """Moves all sigma points in one call of the model."""
+
+        def compute_process_sigmas(self, dt: float, fx: Any = None, **fx_args: Any) -> None:
+            points = self.points_fn.sigma_points(self.x, self.P)
+            self.sigmas_f = model.step(points, fx_args["t"], dt)
+
+    def start(x: Array, p: Array) -> Any:
+        points = MerweScaledSigmaPoints(model.dim, alpha, beta, kappa)
+        kf = Batched(model.dim, sensor.dim, 0.0, None, None, points)
+        kf.x, kf.P = x.copy(), p.copy()
+        return kf
+
+    def step(kf: Any, k: int, z: Array, seen: _Mask) -> None:
+        t, dt = float(grid[k]), float(grid[k + 1] - grid[k])
+        kf.Q = model.noise(t, dt)
+        kf.predict(dt=dt, t=t)
+        if seen.any():
+            residual = kf.residual_z = _residual_of(sensor, seen)
+            # An angle's mean is taken about the central point's angle, so that it may wrap.
+            kf.z_mean = lambda s, w: s[0] + w @ np.array([residual(row, s[0]) for row in s])
+            rows: Iterator[Array] = iter(sensor.predict(kf.sigmas_f)[:, seen])
+            # filterpy calls hx once for each sigma point, in their order.
+            kf.update(z[seen], R=sensor.noise[np.ix_(seen, seen)], hx=lambda s: next(rows))
+
+    return _over_runs(mean, cov, y, start, step, likelihood, model.dim)
+
+
+def _over_runs(
+    mean: ArrayLike,
+    cov: ArrayLike,
+    y: Array,
+    start: Callable[[Array, Array], Any],
+    step: Callable[[Any, int, Array, _Mask], None],
+    likelihood: bool,
+    dim: int | None = None,
+) -> GaussianRun:
+    """Run one of filterpy's objects over every run and every step."""
+    x0, p0 = _prior(mean, cov)
+    d = x0.shape[-1]
+    if dim is not None and d != dim:
+        raise ValueError(f"mean: needs {dim} components like the model, got {d}")
+    runs = _broadcast(y.shape[1:-1], x0, p0)
+    y = np.broadcast_to(_fill_axes(y, len(runs)), (len(y), *runs, y.shape[-1]))
+    x0, p0 = np.broadcast_to(x0, (*runs, d)), np.broadcast_to(p0, (*runs, d, d))
+    means, covs = np.empty((len(y), *runs, d)), np.empty((len(y), *runs, d, d))
+    density = np.zeros((len(y), *runs))
+    for run in np.ndindex(runs):
+        kf = start(x0[run], p0[run])
+        for k in range(len(y)):
+            z = y[(k, *run)]
+            seen = ~np.isnan(z)
+            step(kf, k, z, seen)
+            means[(k, *run)], covs[(k, *run)] = kf.x, kf.P
+            if likelihood and seen.any():
+                density[(k, *run)] = kf.log_likelihood
+    if not np.isfinite(means).all():
+        raise np.linalg.LinAlgError("filterpy's filter ended in NaN")
+    return GaussianRun(means, covs, density)
+
+
+def _residual_of(sensor: Sensor, seen: _Mask) -> Callable[[Array, Array], Array]:
+    """The sensor's residual on the observed components only."""
+
+    def residual(a: Array, b: Array) -> Array:
+        whole_a, whole_b = np.zeros(sensor.dim), np.zeros(sensor.dim)
+        whole_a[seen], whole_b[seen] = a, b
+        return np.asarray(sensor.residual(whole_a, whole_b)[seen])
+
+    return residual
+
+
+def _model_jacobian(model: Model, x: Array, t: float, dt: float) -> Array:
+    """Derivative of the model's step, (d, d)."""
+    if hasattr(model, "transition"):
+        return array(model.transition(dt), "transition", (model.dim, model.dim))
+    h = _DIFFERENCE_STEP * np.maximum(1.0, np.abs(x))
+    moves = np.diag(h)
+    change = model.step(x + moves, t, dt) - model.step(x - moves, t, dt)
+    return np.asarray((change / (2 * h[:, None])).T)
