@@ -1,7 +1,7 @@
-"""Distributed nonlinear filtering: transport maps, mixtures, densities and the networks they run on.
+"""Distributed nonlinear filtering: transport maps, mixtures, densities and their networks.
 
-The modules are imported one by one, ``from distfilt.filters.ensemble import EnsembleFilter``, so that
-``import distfilt`` costs no more than numpy.
+The modules are imported one by one, ``from distfilt.filters.ensemble import EnsembleFilter``, so
+that ``import distfilt`` costs no more than numpy.
 """
 
 __all__ = ["__version__"]

@@ -1,7 +1,7 @@
 """Checks of what callers pass in: each error names the argument, what came and what is needed.
 
 Every function returns its input as a plain float64 array (or the plain Python value) and never
-changes it. Nothing is repaired here: a covariance that is not symmetric is refused, not symmetrised.
+changes it. Nothing is repaired: a covariance that is not symmetric is refused, not symmetrised.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 __all__ = [
     "Array",
+    "SolverError",
     "array",
     "callable_",
     "choice",
@@ -27,6 +28,11 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+
+
+class SolverError(RuntimeError):
+    """A solver stopped without a solution; the message names it, its status and the problem."""
+
 
 _SYMMETRY = 1e-9
 """Largest asymmetry, relative to the largest entry, that counts as rounding."""
@@ -85,7 +91,8 @@ def _fits(got: tuple[int, ...], needed: tuple[Any, ...]) -> bool:
 
 
 def _shape_text(shape: tuple[Any, ...]) -> str:
-    return "(" + ", ".join("..." if n is ... else str(n) for n in shape) + ("," * (len(shape) == 1)) + ")"
+    sizes = ", ".join("..." if n is ... else str(n) for n in shape)
+    return f"({sizes},)" if len(shape) == 1 else f"({sizes})"
 
 
 def covariance(

@@ -77,7 +77,7 @@ def anomalies(ensemble: ArrayLike) -> Array:
            [ 1.]])
     """
     e = _ensemble(ensemble, "ensemble")
-    return e - e.mean(axis=-2, keepdims=True)
+    return np.asarray(e - e.mean(axis=-2, keepdims=True))
 
 
 def sample_covariance(ensemble: ArrayLike) -> Array:

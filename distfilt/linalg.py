@@ -1,4 +1,4 @@
-"""Batched linear algebra on covariances: Cholesky factors and triangular solves, never an inverse."""
+"""Batched linear algebra on covariances: Cholesky factors and solves, never an inverse."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def symmetrise(matrix: ArrayLike) -> Array:
 
 
 def factor(cov: ArrayLike, *, name: str = "cov") -> Array:
-    r"""A matrix :math:`\mathbf L` with :math:`\mathbf L\mathbf L^\top` = `cov`, also when `cov` is singular.
+    r"""A matrix :math:`\mathbf L` with :math:`\mathbf L\mathbf L^\top` = `cov`, singular or not.
 
     Parameters
     ----------

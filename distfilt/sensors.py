@@ -251,8 +251,8 @@ def angle(indices: Sequence[int], *, noise: float, full: bool = False) -> Sensor
 
     Notes
     -----
-    At a = b = 0 the angle does not exist; the prediction is then NaN and the caller's check
-    refuses it.
+    At a = b = 0 the angle does not exist: the prediction is NaN, which a filter reads as a missing
+    observation.
 
     Examples
     --------
@@ -265,19 +265,18 @@ def angle(indices: Sequence[int], *, noise: float, full: bool = False) -> Sensor
     picked = _indices(indices, 2)
     period = 2 * np.pi if full else np.pi
 
+    def centred(value: Array) -> Array:
+        return (value + period / 2) % period - period / 2
+
     def function(x: Array) -> Array:
         a, b = np.moveaxis(_pick(x, picked), -1, 0)
-        direction = np.arctan2(b, a)
-        direction = np.where((a == 0) & (b == 0), np.nan, direction)
-        return direction[..., None] if full else wrap_finite(direction)[..., None]
-
-    def wrap_finite(direction: Array) -> Array:
-        return (direction + np.pi / 2) % np.pi - np.pi / 2
+        direction = np.where((a == 0) & (b == 0), np.nan, np.arctan2(b, a))
+        return np.asarray(centred(direction))[..., None]
 
     return Sensor(
         1,
         function,
         _variance(noise, 1),
-        difference=lambda y, p: (y - p + period / 2) % period - period / 2,
+        difference=lambda y, p: centred(y - p),
         kind="angle",
     )

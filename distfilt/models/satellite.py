@@ -1,7 +1,7 @@
 r"""Relative motion of a satellite in the Hill frame of a chief on a circular orbit.
 
-The axes are radial (away from the Earth), along the track, and along the orbit's normal. The state is
-:math:`\mathbf x = (x, y, z, \dot x, \dot y, \dot z)` in m and m/s.
+The axes are radial (away from the Earth), along the track, and along the orbit's normal. The state
+is :math:`\mathbf x = (x, y, z, \dot x, \dot y, \dot z)` in m and m/s.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def clohessy_wiltshire_transition(rate: float, dt: float) -> Array:
 
 
 def clohessy_wiltshire(*, rate: float, sigma: float) -> LinearModel:
-    r"""The Clohessy-Wiltshire model with white noise on all six rows, equation (18) of Grange et al.
+    r"""The Clohessy-Wiltshire model, equation (18) of Grange et al., with noise on all six rows.
 
     Parameters
     ----------

@@ -1,0 +1,84 @@
+"""What a run leaves behind: estimates, spreads, scores and the ledger, with named axes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..checks import Array
+from ..metrics import crps, ensemble_nees, squared_error
+from ..models import Model
+from .state import EnsembleState
+
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["as_dataset"]
+
+_SENT = ("messages", "scalars", "bytes")
+
+
+def _recorded(state: EnsembleState, truth: Array | None) -> dict[str, Array]:
+    e = state.ensembles
+    mean = e.mean(axis=-2)
+    out = {"mean": mean, "variance": e.var(axis=-2, ddof=1)}
+    out["spread"] = np.sqrt(out["variance"].sum(axis=-1))
+    for name in _SENT:
+        out[name] = getattr(state.ledger, name)
+    if truth is not None:
+        known = np.broadcast_to(truth[..., None, :], mean.shape)
+        out["squared_error"] = squared_error(mean, known)
+        out["crps"] = crps(e, known)
+        if state.members > state.dim:
+            out["nees"] = ensemble_nees(e, known)
+    return out
+
+
+def as_dataset(
+    states: Iterable[EnsembleState],
+    times: ArrayLike,
+    model: Model,
+    start: EnsembleState,
+    truth: Array | None = None,
+) -> xarray.Dataset:
+    """Collect the states of a run in an xarray.Dataset.
+
+    Parameters
+    ----------
+    states : iterable of EnsembleState
+        One per time.
+    times : array_like, (T,)
+        The times, in s.
+    model : Model
+        For the components' names.
+    start : EnsembleState
+        The state before the first step, for the run axes.
+    truth : ndarray, (T, *runs, d), optional
+        For errors, NEES and CRPS.
+
+    Returns
+    -------
+    xarray.Dataset
+        Axes ``time``, ``run`` (``run0``, ``run1`` … where there are several), ``agent``,
+        ``component``. NEES needs more members than components and is left out otherwise.
+    """
+    import xarray
+
+    columns: dict[str, list[Array]] = {}
+    for k, state in enumerate(states):
+        for name, value in _recorded(state, None if truth is None else truth[k]).items():
+            columns.setdefault(name, []).append(value)
+    n = len(start.runs)
+    runs = ("run",) if n == 1 else tuple(f"run{i}" for i in range(n))
+    per_agent = ("time", *runs, "agent")
+    axes = {name: per_agent for name in ("spread", "squared_error", "nees")}
+    axes |= {name: (*per_agent, "component") for name in ("mean", "variance", "crps")}
+    axes |= {name: ("time", "agent") for name in _SENT}
+    names = model.names or tuple(str(i) for i in range(model.dim))
+    return xarray.Dataset(
+        {name: (axes[name], np.array(values)) for name, values in columns.items()},
+        coords={"time": np.asarray(times, dtype=np.float64), "component": list(names)},
+    )

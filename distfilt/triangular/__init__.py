@@ -1,0 +1,5 @@
+"""Triangular transport maps: fit one to samples of (y, x), then condition on an observation."""
+
+from .affine import AffineMap
+
+__all__ = ["AffineMap"]

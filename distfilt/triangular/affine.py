@@ -1,0 +1,276 @@
+r"""Affine triangular maps, equations (12)-(14) of Grange et al.
+
+The x-block of the Knothe-Rosenblatt map of a Gaussian is affine,
+
+.. math:: \mathbf S(\mathbf y, \mathbf x) = \mathbf L^{-1}\bigl(\mathbf x - \bar{\mathbf x}
+    - \mathbf K(\mathbf y - \bar{\mathbf y})\bigr),
+
+with the regression matrix K of x on y and the Cholesky factor L of what the regression leaves. The
+minimiser of (12) over affine maps has this form with sample moments, so no solver is needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..checks import Array, SolverError, array, choice
+from ..linalg import symmetrise
+
+__all__ = ["AffineMap", "fit", "fit_convex", "gradient", "objective"]
+
+
+@dataclass(frozen=True, eq=False)
+class AffineMap:
+    """The affine map S(y, x) that takes x given y to the standard normal.
+
+    Parameters
+    ----------
+    observed_mean : ndarray, (..., m)
+        Mean of y.
+    mean : ndarray, (..., d)
+        Mean of x.
+    gain : ndarray, (..., d, m)
+        Regression of x on y.
+    scale : ndarray, (..., d, d)
+        Lower triangular with a positive diagonal.
+
+    Examples
+    --------
+    >>> s = AffineMap(np.zeros(1), np.zeros(1), np.array([[0.5]]), np.array([[2.0]]))
+    >>> s([[2.0]], [[3.0]])
+    array([[1.]])
+    >>> s.inverse([0.0], [[1.0]])
+    array([[2.]])
+    """
+
+    observed_mean: Array
+    mean: Array
+    gain: Array
+    scale: Array
+
+    def __post_init__(self) -> None:
+        m, d = self.observed_mean.shape[-1], self.mean.shape[-1]
+        array(self.gain, "gain", (..., d, m))
+        scale = array(self.scale, "scale", (..., d, d))
+        diagonal = np.diagonal(scale, axis1=-2, axis2=-1)
+        if np.triu(scale, 1).any() or not (diagonal > 0).all():
+            raise ValueError("scale: needs lower triangular matrices with a positive diagonal")
+
+    def _predicted(self, y: ArrayLike) -> Array:
+        """The regression of x on y, (..., N, d)."""
+        seen = array(y, "y", (..., self.observed_mean.shape[-1]))
+        if seen.ndim == self.observed_mean.ndim:
+            seen = seen[..., None, :]
+        centred = seen - self.observed_mean[..., None, :]
+        return self.mean[..., None, :] + centred @ np.swapaxes(self.gain, -1, -2)
+
+    def __call__(self, y: ArrayLike, x: ArrayLike) -> Array:
+        """Reference samples S(y, x), (..., N, d), of members y (..., N, m) and x (..., N, d)."""
+        members = array(x, "x", (..., "N", self.mean.shape[-1]))
+        left = np.swapaxes(members - self._predicted(y), -1, -2)
+        return np.swapaxes(np.linalg.solve(self.scale, left), -1, -2)
+
+    def inverse(self, y: ArrayLike, z: ArrayLike) -> Array:
+        """Members x with S(y, x) = z, (..., N, d); `y` is (..., N, m), or (..., m) for all."""
+        reference = array(z, "z", (..., "N", self.mean.shape[-1]))
+        return self._predicted(y) + reference @ np.swapaxes(self.scale, -1, -2)
+
+    def log_det(self, y: ArrayLike, x: ArrayLike) -> Array:
+        """Logarithm of the determinant of the map's derivative in x at each member, (..., N)."""
+        members = array(x, "x", (..., "N", self.mean.shape[-1]))
+        array(y, "y", (..., self.observed_mean.shape[-1]))
+        diagonal = np.diagonal(self.scale, axis1=-2, axis2=-1)
+        total = -np.log(diagonal).sum(axis=-1)
+        return np.asarray(np.broadcast_to(total[..., None], members.shape[:-1])).copy()
+
+
+def _samples(y: ArrayLike, x: ArrayLike) -> tuple[Array, Array]:
+    members = array(x, "x", (..., "N", "d"))
+    seen = array(y, "y", (*members.shape[:-1], "m"))
+    needed = seen.shape[-1] + members.shape[-1]
+    if members.shape[-2] <= needed:
+        raise ValueError(
+            f"x: needs more than {needed} members for {needed} variables, got {members.shape[-2]}"
+        )
+    return seen, members
+
+
+def fit(y: ArrayLike, x: ArrayLike) -> AffineMap:
+    """Fit the affine map to samples in closed form: the minimiser of (12).
+
+    Parameters
+    ----------
+    y : array_like, (..., N, m)
+        Predicted observations, with noise; m may be 0 for a map of x alone.
+    x : array_like, (..., N, d)
+        Members.
+
+    Returns
+    -------
+    AffineMap
+
+    Raises
+    ------
+    ValueError
+        With too few members (N ≤ m + d), or where a variable is constant or repeats others.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> x = rng.standard_normal((500, 2))
+    >>> s = fit(x[:, :1] + 0.1 * rng.standard_normal((500, 1)), x)
+    >>> s.gain.round(1).ravel() + 0.0
+    array([1., 0.])
+    """
+    seen, members = _samples(y, x)
+    n = members.shape[-2]
+    ybar, xbar = seen.mean(axis=-2), members.mean(axis=-2)
+    dy, dx = seen - ybar[..., None, :], members - xbar[..., None, :]
+    yt, xt = np.swapaxes(dy, -1, -2), np.swapaxes(dx, -1, -2)
+    lower = _cholesky(yt @ dy / n, "y")
+    # Whitened observations: their regression coefficients need no further solve.
+    half = np.linalg.solve(lower, yt @ dx / n)
+    gain = np.swapaxes(np.linalg.solve(np.swapaxes(lower, -1, -2), half), -1, -2)
+    rest = xt @ dx / n - np.swapaxes(half, -1, -2) @ half
+    return AffineMap(ybar, xbar, gain, _cholesky(symmetrise(rest), "x"))
+
+
+def _cholesky(cov: Array, name: str) -> Array:
+    try:
+        return np.asarray(np.linalg.cholesky(cov), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        raise ValueError(
+            f"{name}: needs variables that are not constant and not combinations of others, "
+            f"got a sample covariance that is not positive definite"
+        ) from None
+
+
+def objective(map_: AffineMap, y: ArrayLike, x: ArrayLike) -> Array:
+    """The objective (12) of the x-block, summed over its components, (...).
+
+    Up to a constant it is the negative mean log-likelihood of x given y under the map.
+
+    Parameters
+    ----------
+    map_ : AffineMap
+        The map S.
+    y, x : array_like, (..., N, m) and (..., N, d)
+        Samples.
+
+    Examples
+    --------
+    >>> x = np.array([[-1.0], [1.0], [-1.0], [1.0]])
+    >>> float(objective(fit(np.empty((4, 0)), x), np.empty((4, 0)), x))
+    0.5
+    """
+    seen, members = _samples(y, x)
+    squares = 0.5 * (map_(seen, members) ** 2).sum(axis=-1)
+    return np.asarray((squares - map_.log_det(seen, members)).mean(axis=-1))
+
+
+def gradient(coefficients: ArrayLike, samples: ArrayLike) -> Array:
+    r"""Gradient of (12) for one affine component, the corrected equation (14).
+
+    .. math:: \frac{\partial\mathcal L^k}{\partial u_l}
+        = \frac1N\sum_i U^k(\mathbf z_i)\, z_{i,l} - \frac{\delta_{lk}}{u_k}
+
+    The paper prints :math:`u_l` where :math:`z_{i,l}` belongs.
+
+    Parameters
+    ----------
+    coefficients : array_like, (k + 1,)
+        :math:`u_0` and :math:`u_1,\dots,u_k`, with :math:`u_k > 0`.
+    samples : array_like, (N, k)
+        The first k variables.
+
+    Returns
+    -------
+    ndarray, (k + 1,)
+
+    Examples
+    --------
+    >>> gradient([0.0, 1.0], [[-1.0], [1.0]])
+    array([0., 0.])
+    """
+    z = array(samples, "samples", ("N", "k"))
+    u = array(coefficients, "coefficients", (z.shape[1] + 1,))
+    if u[-1] <= 0:
+        raise ValueError(f"coefficients: needs a positive last entry, got {u[-1]:g}")
+    ones = np.column_stack([np.ones(len(z)), z])
+    out = np.asarray(ones.T @ (ones @ u) / len(z))
+    out[-1] -= 1 / u[-1]
+    return out
+
+
+def fit_convex(
+    y: ArrayLike, x: ArrayLike, *, solver: str = "ECOS", max_iters: int | None = None
+) -> AffineMap:
+    """Fit the affine map by the convex program (12), component by component, in cvxpy.
+
+    The paper's way. :func:`fit` gives the same composed map in closed form, hundreds to thousands
+    of times faster.
+
+    Parameters
+    ----------
+    y : array_like, (N, m)
+        Predicted observations, with noise.
+    x : array_like, (N, d)
+        Members.
+    solver : {"ECOS", "CLARABEL"}
+        A conic solver, at its default tolerances.
+    max_iters : int, optional
+        Stop the solver early, which raises.
+
+    Returns
+    -------
+    AffineMap
+
+    Raises
+    ------
+    SolverError
+        If the solver does not report an optimum; the message has its status and the component.
+
+    Examples
+    --------
+    >>> x = np.random.default_rng(0).standard_normal((50, 1))
+    >>> exact, solved = fit(x[:, :0], x), fit_convex(x[:, :0], x)
+    >>> bool(abs(exact.scale - solved.scale).max() < 1e-4)
+    True
+    """
+    seen, members = _samples(y, x)
+    array(members, "x", ("N", "d"))
+    choice(solver, "solver", ("ECOS", "CLARABEL"))
+    m, d = seen.shape[-1], members.shape[-1]
+    joint = np.concatenate([seen, members], axis=-1)
+    rows = np.zeros((d, 1 + m + d))
+    for k in range(d):
+        rows[k, : m + k + 2] = _solve_component(joint[:, : m + k + 1], solver, max_iters)
+    upper = rows[:, 1 + m :]
+    scale = np.linalg.solve(upper, np.eye(d))
+    gain = -np.linalg.solve(upper, rows[:, 1 : 1 + m])
+    offset = -np.linalg.solve(upper, rows[:, 0])
+    ybar = seen.mean(axis=0)
+    return AffineMap(ybar, offset + gain @ ybar, gain, np.tril(scale))
+
+
+def _solve_component(z: Array, solver: str, max_iters: int | None) -> Array:
+    """Coefficients (u_0, u_1 … u_k) that minimise (12) for the last column of `z`."""
+    import cvxpy as cp
+
+    n, k = z.shape
+    u0, u = cp.Variable(), cp.Variable(k)
+    loss = cp.sum_squares(u0 + z @ u) / (2 * n) - cp.log(u[k - 1])
+    problem = cp.Problem(cp.Minimize(loss))
+    limit = {} if max_iters is None else {
+        {"ECOS": "max_iters", "CLARABEL": "max_iter"}[solver]: max_iters
+    }
+    try:
+        problem.solve(solver=solver, **limit)
+    except cp.error.SolverError as error:
+        raise SolverError(f"{solver}: component {k} of the map has no solution: {error}") from None
+    if problem.status != cp.OPTIMAL:
+        raise SolverError(f"{solver}: component {k} of the map stopped with {problem.status!r}")
+    return np.concatenate([[u0.value], u.value])
