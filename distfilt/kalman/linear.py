@@ -122,8 +122,8 @@ def kalman_filter(
     out = _recursion(x, p, group, y, f, h, q, r)
     shared = p.shape[-1] == 1
     means = np.moveaxis(out.means, 1, -1).reshape(steps, *runs, d)
-    covs = np.moveaxis(out.covariances, -1, 1)
-    covs = covs.reshape((steps,) + ((1,) * len(runs) if shared else runs) + (d, d))
+    covs = np.moveaxis(out.covariances if shared else out.covariances[..., group], -1, 1)
+    covs = covs.reshape(steps, *((1,) * len(runs) if shared else runs), d, d)
     return GaussianRun(means, covs, out.log_likelihood.reshape(steps, *runs))
 
 
@@ -191,18 +191,25 @@ def _recursion(
     x: Array, p: Array, group: _Indices, y: Array, f: Array, h: Array, q: Array, r: Array
 ) -> GaussianRun:
     """Forecast and analysis over all steps, runs last: x (d, R), p (d, d, G), y (T, m, R)."""
-    steps = y.shape[0]
+    steps, g = y.shape[0], p.shape[-1]
     means, covs = np.empty((steps, *x.shape)), np.empty((steps, *p.shape))
-    likelihood = np.empty((steps, x.shape[-1]))
+    squares, log_det = np.empty((steps, x.shape[-1])), np.empty((steps, g))
+    missing = np.isnan(y)
+    gaps = np.asarray(missing.any(axis=(1, 2)))
     # One representative run shows the pattern of its whole group.
-    _, first = np.unique(group, return_index=True)
+    here = ~missing[:, :, np.unique(group, return_index=True)[1]]
     for k in range(steps):
         p = _forecast_cov(p, f[k], q[k])
-        seen = ~np.isnan(y[k])
-        lower, half, p = _analysis_cov(p, h[k], r[k], seen[:, first])
+        lower, half, p = _analysis_cov(p, h[k], r[k], here[k] if gaps[k] else None)
         x = f[k] @ x
-        x, likelihood[k] = _analysis_mean(x, y[k], seen, h[k], lower, half, group)
+        innovation = y[k] - h[k] @ x
+        if gaps[k]:
+            innovation[missing[k]] = 0.0
+        x, squares[k] = _analysis_mean(x, innovation, lower, half, group)
+        log_det[k] = 2.0 * np.log(lower.diagonal()).sum(axis=-1)
         means[k], covs[k] = x, p
+    size = y.shape[1] - np.count_nonzero(missing, axis=1)
+    likelihood = -0.5 * (size * np.log(2.0 * np.pi) + log_det[:, group] + squares)
     return GaussianRun(means, covs, likelihood)
 
 
@@ -214,45 +221,45 @@ def _forecast_cov(p: Array, f: Array, q: Array) -> Array:
     return np.asarray(0.5 * (out + out.swapaxes(0, 1)) + q[..., None])
 
 
-def _analysis_cov(p: Array, h: Array, r: Array, seen: _Mask) -> tuple[Array, Array, Array]:
+def _analysis_cov(
+    p: Array, h: Array, r: Array, here: _Mask | None
+) -> tuple[Array, Array, Array]:
     """Factor of the innovation covariance, its solve with H P, and the analysis covariance.
 
-    A missing component keeps its place with a zero row in H and a one on the diagonal of R, which
-    takes it out of every sum exactly.
+    `here` (m, G) marks the components that are not missing; None if none is. A missing component
+    keeps its place with a zero row in H and a one on the diagonal of R, which takes it out of
+    every sum exactly.
     """
     d, _, g = p.shape
     m = h.shape[0]
-    here = seen.astype(np.float64)[:, None]
-    cross = np.matmul(h, p).swapaxes(0, 1) * here  # H P, (m, d, G)
-    inner = (np.matmul(h, cross) + r[..., None]) * (here * here.swapaxes(0, 1))
-    inner[range(m), range(m)] += 1.0 - here[:, 0]
+    mask = np.ones((m, 1, 1)) if here is None else here[:, None].astype(np.float64)
+    cross = np.matmul(h, p).swapaxes(0, 1) * mask  # H P, (m, d, G)
+    inner = np.matmul(h, cross) + r[..., None]
+    if here is not None:
+        inner *= mask * mask.swapaxes(0, 1)
+        inner[range(m), range(m)] += 1.0 - mask[:, 0]
     lower = _cholesky(inner)
     half = _forward(lower, cross)  # L^-1 H P: the gain K is half' L^-1
     gain = _backward(lower, half)  # K'
     # Joseph's form, (I - KH) P (I - KH)' + K R K', with A = (I - KH) P and its small factor
     # K R - A H' taken together: it cancels the rounding errors of A along the observed directions.
     kept = p - _sum_of_outer(gain, cross)
-    noise = (r @ gain.reshape(m, d * g)).reshape(m, d, g) * here
-    rest = noise - np.matmul(h, kept).swapaxes(0, 1) * here
+    noise = (r @ gain.reshape(m, d * g)).reshape(m, d, g)
+    rest = (noise - np.matmul(h, kept).swapaxes(0, 1)) * mask
     out = kept + _sum_of_outer(rest, gain)
     return lower, half, 0.5 * (out + out.swapaxes(0, 1))
 
 
 def _analysis_mean(
-    x: Array, y: Array, seen: _Mask, h: Array, lower: Array, half: Array, group: _Indices
+    x: Array, innovation: Array, lower: Array, half: Array, group: _Indices
 ) -> tuple[Array, Array]:
-    """Analysis means (d, R) and log densities of the innovations (R,)."""
+    """Analysis means (d, R) and squared Mahalanobis lengths of the innovations (R,)."""
     if lower.shape[-1] not in (1, x.shape[-1]):
         lower, half = lower[..., group], half[..., group]
-    innovation = np.where(seen, y - h @ x, 0.0)
     white = _forward(lower, innovation)
-    if half.shape[-1] == 1:
-        x = x + half[..., 0].T @ white
-    else:
-        x = x + (half * white[:, None]).sum(axis=0)
-    log_det = 2.0 * np.log(lower.diagonal()).sum(axis=-1)
-    size = np.count_nonzero(seen, axis=0)
-    return x, -0.5 * (size * np.log(2.0 * np.pi) + log_det + (white**2).sum(axis=0))
+    shared = half.shape[-1] == 1
+    moved = half[..., 0].T @ white if shared else (half * white[:, None]).sum(axis=0)
+    return x + moved, (white**2).sum(axis=0)
 
 
 def _sum_of_outer(a: Array, b: Array) -> Array:
@@ -383,6 +390,8 @@ def update(
     x, p = _prior(mean, cov)
     h = array(H, "H", ("m", x.shape[-1]))
     y = array(observed, "observed", (..., h.shape[0]), finite=False)
+    if np.isinf(y).any():
+        raise ValueError("observed: needs finite numbers or NaN (missing), got infinity")
     # The filter's one step without a forecast: identity dynamics and no process noise.
     d = x.shape[-1]
     run = kalman_filter(x, p, y[None], F=np.eye(d), H=h, Q=np.zeros((d, d)), R=R)

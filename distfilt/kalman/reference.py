@@ -85,7 +85,9 @@ def filterpy_kf(
 
     def step(kf: Any, k: int, z: Array, seen: _Mask) -> None:
         kf.predict(F=f[k], Q=q[k])
-        if seen.any():
+        if seen.all():
+            kf.update(z, H=h[k], R=r[k])
+        elif seen.any():
             kf.update(z[seen], H=h[k][seen], R=r[k][np.ix_(seen, seen)])
 
     return _over_runs(mean, cov, y, start, step, likelihood)

@@ -1,0 +1,92 @@
+"""What every benchmark shares: repeated timing, and tables that say where they were measured."""
+
+from __future__ import annotations
+
+import csv
+import os
+import platform
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Timing", "machine", "timed", "versions", "write"]
+
+FOLDER = Path(__file__).resolve().parents[2] / "data" / "bench"
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Medians over the repeats, in s, the peak memory of the process so far, in MB, the result."""
+
+    cpu: float
+    wall: float
+    repeats: int
+    peak_mb: float
+    result: Any
+
+
+def timed(function: Callable[[], Any], repeats: int = 3) -> Timing:
+    """Call `function` `repeats` times and take the median of processor and of wall time.
+
+    Ratios are taken from the processor time, which another program on the machine disturbs least.
+    """
+    cpu, wall, result = [], [], None
+    for _ in range(repeats):
+        start_cpu, start = time.process_time(), time.perf_counter()
+        result = function()
+        wall.append(time.perf_counter() - start)
+        cpu.append(time.process_time() - start_cpu)
+    return Timing(statistics.median(cpu), statistics.median(wall), repeats, peak_mb(), result)
+
+
+def peak_mb() -> float:
+    """Largest resident memory of this process so far, in MB."""
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+
+
+def machine() -> str:
+    """Processor, core count and threads of the linear algebra, in one line."""
+    name = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        name = next(line.split(":", 1)[1].strip() for line in lines if "model name" in line)
+    except (OSError, StopIteration):
+        pass
+    threads = os.environ.get("OPENBLAS_NUM_THREADS", "default")
+    return f"{name}; {os.cpu_count()} cores; BLAS threads {threads}"
+
+
+def versions(packages: Sequence[str]) -> str:
+    """Python and the named packages with their versions, in one line."""
+    found = [f"python {platform.python_version()}"]
+    for name in packages:
+        try:
+            found.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            found.append(f"{name} missing")
+    return "; ".join(found)
+
+
+def write(
+    name: str, rows: Sequence[Mapping[str, Any]], packages: Sequence[str] = ("numpy", "scipy")
+) -> Path:
+    """Write rows to data/bench/`name`.csv with versions and machine, and print them."""
+    columns = list(rows[0])
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    path = FOLDER / f"{name}.csv"
+    where = {"versions": versions(packages), "machine": machine()}
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, [*columns, *where], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({**row, **where} for row in rows)
+    widths = [max(len(c), *(len(str(row[c])) for row in rows)) for c in columns]
+    for cells in (columns, *([row[c] for c in columns] for row in rows)):
+        print("  ".join(str(v).ljust(w) for v, w in zip(cells, widths, strict=True)).rstrip())
+    return path
