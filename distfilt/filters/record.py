@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array
+from ..checks import Array, array, increasing
 from ..metrics import crps, ensemble_nees, squared_error
 from ..models import Model
 from .state import EnsembleState
@@ -67,10 +67,19 @@ def as_dataset(
     """
     import xarray
 
+    grid = increasing(times, "times")
+    if truth is not None:
+        array(truth, "truth", (grid.size, *start.runs, model.dim))
     columns: dict[str, list[Array]] = {}
-    for k, state in enumerate(states):
-        for name, value in _recorded(state, None if truth is None else truth[k]).items():
-            columns.setdefault(name, []).append(value)
+    taken = 0
+    for state in states:
+        if taken < grid.size:
+            known = None if truth is None else truth[taken]
+            for name, value in _recorded(state, known).items():
+                columns.setdefault(name, []).append(value)
+        taken += 1
+    if taken != grid.size:
+        raise ValueError(f"states: needs one per time ({grid.size}), got {taken}")
     n = len(start.runs)
     runs = ("run",) if n == 1 else tuple(f"run{i}" for i in range(n))
     per_agent = ("time", *runs, "agent")
@@ -80,5 +89,5 @@ def as_dataset(
     names = model.names or tuple(str(i) for i in range(model.dim))
     return xarray.Dataset(
         {name: (axes[name], np.array(values)) for name, values in columns.items()},
-        coords={"time": np.asarray(times, dtype=np.float64), "component": list(names)},
+        coords={"time": grid, "component": list(names)},
     )

@@ -11,15 +11,19 @@ minimiser of (12) over affine maps has this form with sample moments, so no solv
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, SolverError, array, choice
+from ..checks import Array, SolverError, array, choice, count
 from ..linalg import symmetrise
 
 __all__ = ["AffineMap", "fit", "fit_convex", "gradient", "objective"]
+
+_LIMIT = {"ECOS": "max_iters", "CLARABEL": "max_iter"}
+"""The solvers, and what each calls its limit of iterations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,7 +246,7 @@ def fit_convex(
     """
     seen, members = _samples(y, x)
     array(members, "x", ("N", "d"))
-    choice(solver, "solver", ("ECOS", "CLARABEL"))
+    choice(solver, "solver", tuple(_LIMIT))
     m, d = seen.shape[-1], members.shape[-1]
     joint = np.concatenate([seen, members], axis=-1)
     rows = np.zeros((d, 1 + m + d))
@@ -264,11 +268,12 @@ def _solve_component(z: Array, solver: str, max_iters: int | None) -> Array:
     u0, u = cp.Variable(), cp.Variable(k)
     loss = cp.sum_squares(u0 + z @ u) / (2 * n) - cp.log(u[k - 1])
     problem = cp.Problem(cp.Minimize(loss))
-    limit = {} if max_iters is None else {
-        {"ECOS": "max_iters", "CLARABEL": "max_iter"}[solver]: max_iters
-    }
+    limit = {} if max_iters is None else {_LIMIT[solver]: count(max_iters, "max_iters")}
     try:
-        problem.solve(solver=solver, **limit)
+        # What cvxpy would warn of, the status below tells, and it becomes an error.
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            problem.solve(solver=solver, **limit)
     except cp.error.SolverError as error:
         raise SolverError(f"{solver}: component {k} of the map has no solution: {error}") from None
     if problem.status != cp.OPTIMAL:

@@ -1,0 +1,94 @@
+"""Every public name meets bad input: a name without a case, or a case that passes, fails here.
+
+The cases live beside the other tests of their module, in ``BAD_INPUT`` (qualified name to pairs of
+the argument's name and a call that has to raise) and ``EXEMPT`` (qualified name to the reason).
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import distfilt
+
+Case = tuple[str, Callable[[], object]]
+
+
+def _modules() -> Iterator[ModuleType]:
+    yield distfilt
+    for info in pkgutil.walk_packages(distfilt.__path__, "distfilt."):
+        yield importlib.import_module(info.name)
+
+
+def _home(module: ModuleType, name: str) -> str:
+    """Where a name is defined; packages hand names on."""
+    thing = getattr(module, name)
+    home = getattr(thing, "__module__", None)
+    own = isinstance(home, str) and home.startswith("distfilt") and hasattr(thing, "__qualname__")
+    return f"{home}.{name}" if own else f"{module.__name__}.{name}"
+
+
+def _qualified(key: str) -> str:
+    """A case's key with the name's home, for a name that its module hands on; methods stay."""
+    module, _, name = key.rpartition(".")
+    try:
+        found = importlib.import_module(module)
+    except ModuleNotFoundError:
+        return key
+    return _home(found, name) if name in found.__all__ else key
+
+
+def _tables() -> tuple[dict[str, list[Case]], dict[str, str]]:
+    cases: dict[str, list[Case]] = {}
+    exempt: dict[str, str] = {}
+    for path in sorted(Path(__file__).parent.glob("test_*.py")):
+        if path.name == Path(__file__).name:
+            continue
+        module = importlib.import_module(path.stem)
+        cases.update({_qualified(k): v for k, v in getattr(module, "BAD_INPUT", {}).items()})
+        exempt.update({_qualified(k): v for k, v in getattr(module, "EXEMPT", {}).items()})
+    return cases, exempt
+
+
+CASES, EXEMPT = _tables()
+PUBLIC = sorted({_home(m, name) for m in _modules() for name in m.__all__})
+CALLS = [
+    pytest.param(name, argument, call, id=f"{name}-{argument}-{k}")
+    for name, cases in sorted(CASES.items())
+    for k, (argument, call) in enumerate(cases)
+]
+
+
+@pytest.fixture(autouse=True)
+def _no_figures_left() -> Iterator[None]:
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_every_public_name_has_a_case(name: str) -> None:
+    covered = bool(CASES.get(name)) or bool(EXEMPT.get(name))
+    assert covered, f"{name}: no bad-input case and no reason to be exempt"
+
+
+@pytest.mark.parametrize("name", sorted({*CASES, *EXEMPT}))
+def test_every_case_is_of_a_public_name(name: str) -> None:
+    # A case of a method belongs to its public class.
+    assert name in PUBLIC or name.rpartition(".")[0] in PUBLIC
+
+
+@pytest.mark.parametrize(("name", "argument", "call"), CALLS)
+def test_bad_input_names_its_argument(
+    name: str, argument: str, call: Callable[[], object]
+) -> None:
+    with pytest.raises((ValueError, RuntimeError, LookupError)) as caught:
+        call()
+    message = str(caught.value)
+    assert argument in message, f"{name}: {message!r} does not name {argument!r}"
