@@ -93,6 +93,7 @@ bibtex_reference_style = "author_year"
 bibtex_default_style = "plain"
 
 autodoc_typehints = "signature"
+toc_object_entries = False
 autodoc_member_order = "bysource"
 autodoc_type_aliases = {"Array": "Array", "ArrayLike": "ArrayLike"}
 autodoc_preserve_defaults = True
@@ -117,6 +118,7 @@ html_logo = "_static/mark.svg"
 html_copy_source = False
 html_show_sourcelink = False
 html_show_sphinx = False
+html_context = {"default_mode": "light"}
 html_theme_options = {
     "logo": {"text": project, "alt_text": "Distributed Nonlinear Filtering, first page"},
     "home_page_in_toc": False,

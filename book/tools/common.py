@@ -16,8 +16,10 @@ ROOT = Path(__file__).resolve().parents[2]
 BOOK = ROOT / "book"
 VERDICT = "application/vnd.distfilt.verdict+json"
 
-# Addresses in memory, kernel files and home folders differ on the next machine.
-_FOREIGN = re.compile(r"(/home/|/root/|/Users/|/tmp/|site-packages/|ipykernel_\d|\b0x[0-9a-f]{8,})")
+# Home folders, kernel files, addresses in memory and progress bars differ on the next machine.
+_FOREIGN = re.compile(
+    r"/home/|/root/|/Users/|/tmp/|site-packages/|ipykernel_\d|\b0x[0-9a-f]{8,}|\[\d\d:\d\d<"
+)
 
 
 def pinned_environment() -> dict[str, str]:
@@ -27,6 +29,7 @@ def pinned_environment() -> dict[str, str]:
     and kernels are not looked at; progress bars, whose text holds times, are off.
     """
     home = ROOT / "_build" / "jupyter"
+    (home / "ipython").mkdir(parents=True, exist_ok=True)
     return {
         **os.environ,
         "OPENBLAS_NUM_THREADS": "1",

@@ -53,14 +53,30 @@ def read(source: Path) -> Any:
     return notebook
 
 
+class Client(NotebookClient):
+    """A client that stores what an interactive cell shows first in the cell, beside its widget.
+
+    The HTML then has a picture where it has no widget, and nbval, which knows no widgets, finds
+    the outputs that it receives.
+    """
+
+    def __init__(self, notebook: Any, **options: Any) -> None:
+        super().__init__(notebook, **options)
+        self.widget_registry: dict[str, Any] = {}
+
+    def clear_output(self, outs: Any, msg: Any, cell_index: int) -> None:
+        """Keep the outputs: an interactive cell clears its widget's, not the cell's."""
+
+
 def run(notebook: Any, folder: Path) -> None:
     """Execute the notebook in place, in its own folder and the pinned environment."""
-    client = NotebookClient(
+    client = Client(
         notebook,
         timeout=900,
         kernel_name="python3",
         record_timing=False,
         coalesce_streams=True,
+        extra_arguments=["--log-level=40"],
         resources={"metadata": {"path": str(folder)}},
     )
     client.execute(env=pinned_environment())

@@ -66,7 +66,7 @@ def directive(module: Any, name: str) -> list[str]:
         meaning = ModuleAnalyzer.for_module(module.__name__).find_attr_docs().get(("", name), [])
         shown = str(value).replace("typing.", "").replace("numpy.", "np.")
         text = [f"   {line}" for line in [*meaning, "", f"The type ``{shown}``."]]
-        return [f".. py:data:: {module.__name__}.{name}", "", *text, ""]
+        return [f".. py:data:: {name}", "", *text, ""]
     if inspect.isclass(value):
         return [f".. autoclass:: {module.__name__}.{name}", "   :members:", ""]
     if inspect.isfunction(value):
@@ -83,18 +83,26 @@ def escape_stars(lines: list[str]) -> None:
             lines[k] = "``".join(parts)
 
 
+def summary(module: Any) -> str:
+    """Return the first sentence of a module's text."""
+    first = (inspect.getdoc(module) or "").split("\n\n")[0].replace("\n", " ")
+    return cell(first)
+
+
 def api_text() -> str:
-    """Return the API reference: each module's text, then every name of its ``__all__``."""
-    lines = []
+    """Return the API reference: a list of modules, then every name of each ``__all__``."""
+    index, lines = ["| Module | What it is for |", "|---|---|"], []
     for name in modules():
+        if name == "distfilt":
+            continue
         module = importlib.import_module(name)
+        anchor = "api-" + name.replace(".", "-").replace("_", "-")
+        index += [f"| [`{name}`](#{anchor}) | {summary(module)} |"]
         body = [f".. automodule:: {name}", "   :no-members:", ""]
         for public in getattr(module, "__all__", ()):
             body += directive(module, public)
-        if name == "distfilt":
-            continue
-        lines += [f"## `{name}`", "", "```{eval-rst}", *body, "```", ""]
-    return "\n".join(lines)
+        lines += [f"({anchor})=", f"## `{name}`", "", "```{eval-rst}", *body, "```", ""]
+    return "\n".join([*index, "", *lines])
 
 
 def cell(text: str) -> str:

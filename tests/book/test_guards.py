@@ -1,0 +1,208 @@
+"""What guards the book must itself be able to fail: a small chapter is broken in every way.
+
+Each test runs the commands of ``make test`` on a copy of the chapter in ``fixtures``: the comparison of
+the pair, and nbval over the stored outputs.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jupytext
+import nbformat
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+TOOLS = ROOT / "book" / "tools"
+FIXTURES = Path(__file__).parent / "fixtures"
+
+
+def tool(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run one of the book's tools as the Makefile does."""
+    command = [sys.executable, str(TOOLS / name), *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+
+
+def passes(source: Path) -> bool:
+    """Say whether `make test` would accept the chapter; the pair first, as it is cheaper."""
+    return not any(tool(name, str(source)).returncode for name in ("pairs.py", "regress.py"))
+
+
+@pytest.fixture
+def folder() -> Iterator[Path]:
+    """Yield a scratch folder inside the repository, where its conftest.py is found."""
+    (ROOT / "_build").mkdir(exist_ok=True)
+    path = Path(tempfile.mkdtemp(prefix="guard-", dir=ROOT / "_build"))
+    yield path
+    shutil.rmtree(path)
+
+
+@pytest.fixture(scope="module")
+def executed() -> Iterator[Path]:
+    """Yield a folder with the small chapter, executed once."""
+    (ROOT / "_build").mkdir(exist_ok=True)
+    path = Path(tempfile.mkdtemp(prefix="guard-", dir=ROOT / "_build"))
+    shutil.copy(FIXTURES / "small.md", path)
+    done = tool("execute.py", str(path / "small.md"))
+    assert done.returncode == 0, done.stderr
+    yield path
+    shutil.rmtree(path)
+
+
+@pytest.fixture
+def chapter(executed: Path, folder: Path) -> Path:
+    """Return a fresh copy of the executed small chapter."""
+    for name in ("small.md", "small.ipynb"):
+        shutil.copy(executed / name, folder)
+    return folder / "small.md"
+
+
+def stored(source: Path) -> Any:
+    return nbformat.read(source.with_suffix(".ipynb"), as_version=4)
+
+
+def store(source: Path, notebook: Any) -> None:
+    nbformat.write(notebook, source.with_suffix(".ipynb"))
+
+
+def code_cells(notebook: Any) -> list[Any]:
+    return [cell for cell in notebook.cells if cell.cell_type == "code"]
+
+
+def change_source(source: Path, old: str, new: str) -> None:
+    """Replace text in both files of the pair, so that only the outputs disagree."""
+    text = source.read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    source.write_text(text.replace(old, new), encoding="utf-8")
+    notebook = stored(source)
+    for cell in notebook.cells:
+        cell.source = cell.source.replace(old, new)
+    store(source, notebook)
+
+
+def test_untouched_chapter_passes(chapter: Path) -> None:
+    assert passes(chapter)
+
+
+def test_changed_digit_fails(chapter: Path) -> None:
+    notebook = stored(chapter)
+    output = code_cells(notebook)[0].outputs[0]
+    assert "2.0000" in output.text
+    output.text = output.text.replace("2.0000", "2.0001")
+    store(chapter, notebook)
+    assert tool("pairs.py", str(chapter)).returncode == 0
+    assert tool("regress.py", str(chapter)).returncode == 1
+
+
+def test_changed_verdict_fails(chapter: Path) -> None:
+    path = chapter.with_suffix(".ipynb")
+    text = path.read_text(encoding="utf-8")
+    assert text.count('"ours": "0.1353"') == 1
+    path.write_text(text.replace('"ours": "0.1353"', '"ours": "0.1354"'), encoding="utf-8")
+    assert tool("regress.py", str(chapter)).returncode == 1
+
+
+def test_broken_cell_fails(chapter: Path) -> None:
+    change_source(chapter, 'print(f"rate {rate:.4f}")', 'print(f"rate {rote:.4f}")')
+    assert tool("pairs.py", str(chapter)).returncode == 0
+    assert tool("regress.py", str(chapter)).returncode == 1
+
+
+@pytest.mark.parametrize("counts", [True, False], ids=["counts kept", "counts cleared"])
+def test_cleared_outputs_fail(chapter: Path, counts: bool) -> None:
+    notebook = stored(chapter)
+    for cell in code_cells(notebook):
+        cell.outputs = []
+        if not counts:
+            cell.execution_count = None
+    store(chapter, notebook)
+    assert not passes(chapter)
+
+
+def test_changed_curve_fails_through_its_digest(chapter: Path) -> None:
+    change_source(chapter, "ax.plot(t, curve)", "ax.plot(t, curve ** 1.01)")
+    assert tool("pairs.py", str(chapter)).returncode == 0
+    done = tool("regress.py", str(chapter))
+    assert done.returncode == 1 and "mean" in done.stderr
+
+
+def test_changed_prose_fails(chapter: Path) -> None:
+    text = chapter.read_text(encoding="utf-8")
+    chapter.write_text(text.replace("The curve is", "The line is"), encoding="utf-8")
+    done = tool("pairs.py", str(chapter))
+    assert done.returncode == 1 and "source differs" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("    alt: One curve that falls from 1 at time 0 to 0.14 at time 1.", "    width: 80%", "alt"),
+        ("    caption: The curve {eq}`eq-small`.\n", "", "caption"),
+        ("rate = 2.0", "rate = 2.0  # " + "x" * 70, "at most 79"),
+    ],
+    ids=["no alternative text", "no caption", "long line"],
+)
+def test_pair_check_refuses(chapter: Path, old: str, new: str, complaint: str) -> None:
+    text = chapter.read_text(encoding="utf-8")
+    assert text.count(old) == 1
+    chapter.write_text(text.replace(old, new), encoding="utf-8")
+    assert tool("execute.py", str(chapter)).returncode == 0
+    done = tool("pairs.py", str(chapter))
+    assert done.returncode == 1 and complaint in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        ("import warnings; warnings.warn('careful')", "stderr"),
+        ("raise ValueError('no')", "a cell failed"),
+        ("import sys; print(sys.prefix)", "its output holds"),
+        ("object()", "its output holds"),
+    ],
+    ids=["warning", "error", "path", "address"],
+)
+def test_execution_refuses(chapter: Path, line: str, complaint: str) -> None:
+    before = chapter.with_suffix(".ipynb").read_bytes()
+    text = chapter.read_text(encoding="utf-8")
+    chapter.write_text(text + f"\n```{{code-cell}} ipython3\n{line}\n```\n", encoding="utf-8")
+    done = tool("execute.py", str(chapter))
+    assert done.returncode == 1 and complaint in done.stderr
+    assert chapter.with_suffix(".ipynb").read_bytes() == before
+
+
+def test_executing_again_gives_the_same_bytes(executed: Path, folder: Path) -> None:
+    for name in ("small.md", "widget.md"):
+        shutil.copy(FIXTURES / name, folder)
+    sources = [str(folder / "small.md"), str(folder / "widget.md")]
+    assert tool("execute.py", *sources).returncode == 0
+    first = (folder / "small.ipynb").read_bytes()
+    assert first == (executed / "small.ipynb").read_bytes()
+    assert b'"image/png"' in first
+    assert b"widget-state+json" in (folder / "widget.ipynb").read_bytes()
+    assert tool("execute.py", "--check", *sources).returncode == 0
+    (folder / "small.ipynb").write_bytes(first.replace(b"rate 2.0000", b"rate 2.0001"))
+    assert tool("execute.py", "--check", *sources).returncode == 1
+    assert tool("regress.py", str(folder / "widget.md")).returncode == 0
+
+
+def test_header_of_a_figure_survives_the_round_trip(executed: Path) -> None:
+    notebook = jupytext.read(executed / "small.ipynb")
+    (figure,) = [cell for cell in notebook.cells if "mystnb" in cell.metadata]
+    again = jupytext.reads(jupytext.writes(notebook, "md:myst"), "md:myst")
+    (kept,) = [cell for cell in again.cells if "mystnb" in cell.metadata]
+    assert kept.metadata == figure.metadata
+    assert kept.metadata["mystnb"]["image"]["alt"].startswith("One curve")
+
+
+def test_stored_notebook_names_no_version_and_no_path(executed: Path) -> None:
+    text = (executed / "small.ipynb").read_text(encoding="utf-8")
+    notebook = json.loads(text)
+    assert "version" not in notebook["metadata"]["language_info"]
+    assert "jupytext_version" not in text and str(ROOT) not in text

@@ -1,0 +1,69 @@
+"""The ledger of reproductions is complete, comes from the stored verdicts, and is on its page."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from ledger import COLUMNS, ITEMS, LEDGER, VERDICTS, current, ledger, rows_of, text_of
+
+ITEM = {"paper": "grange", "item": "Fig. 1", "title": "Error", "chapter": "04-satellite-network"}
+VERDICT = {
+    "paper": "grange",
+    "item": "Fig. 1",
+    "chapter": "04-satellite-network",
+    "verdict": "differs",
+    "ours": "0.08",
+    "published": "unstable",
+    "why": "a, b",
+}
+
+
+def test_ledger_is_what_the_chapters_give() -> None:
+    assert LEDGER.read_text(encoding="utf-8") == current()
+
+
+def test_ledger_has_every_item_once() -> None:
+    papers = Counter(row["paper"] for row in rows_of(ITEMS))
+    assert papers == {"grange": 5, "das": 5, "semeraro": 9, "zheng": 2}
+    items = [(row["paper"], row["item"]) for row in rows_of(ITEMS)]
+    rows = rows_of(LEDGER)
+    assert [(row["paper"], row["item"]) for row in rows] == items
+    assert len(set(items)) == 21
+    assert {row["verdict"] for row in rows} <= set(VERDICTS)
+    for row in rows:
+        given = [row[name] for name in ("ours", "published", "why")]
+        assert row["verdict"] != "not yet" or not any(given)
+
+
+def test_an_item_without_a_verdict_is_not_yet() -> None:
+    (row,) = ledger([ITEM], [])
+    assert row["verdict"] == "not yet" and row["chapter"] == ITEM["chapter"]
+
+
+def test_a_verdict_fills_its_row() -> None:
+    (row,) = ledger([ITEM], [VERDICT])
+    assert row == VERDICT and tuple(row) == COLUMNS
+    assert text_of([row]).splitlines()[1].endswith('"a, b"')
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "message"),
+    [
+        ([VERDICT, VERDICT], "has a verdict already"),
+        ([{**VERDICT, "item": "Fig. 9"}], "not an item"),
+        ([{**VERDICT, "verdict": "close"}], "needs one of"),
+    ],
+    ids=["twice", "unknown item", "unknown verdict"],
+)
+def test_ledger_refuses(verdicts: list[dict[str, str]], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ledger([ITEM], verdicts)
+
+
+def test_malformed_items_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "items.csv"
+    path.write_text("paper,item\ngrange\n", encoding="utf-8")
+    with pytest.raises(SystemExit, match="row 2"):
+        rows_of(path)

@@ -1,0 +1,86 @@
+"""The built book: every page is there, every public name is documented, every chapter is a pair."""
+
+from __future__ import annotations
+
+import html
+import importlib
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from common import missing_pages, toc_pages
+from ledger import LEDGER, VERDICTS, rows_of
+from pages import modules
+
+ROOT = Path(__file__).resolve().parents[2]
+BUILT = ROOT / "_build" / "html"
+
+
+def page(name: str) -> str:
+    path = BUILT / f"{name}.html"
+    assert path.is_file(), f"{name} is not built: make book"
+    return path.read_text(encoding="utf-8")
+
+
+def plain(text: str) -> str:
+    """Return the text of a page without its tags."""
+    return html.unescape(re.sub(r"<[^>]+>", "", text))
+
+
+@pytest.mark.parametrize("name", toc_pages())
+def test_page_of_the_contents_is_built(name: str) -> None:
+    assert not missing_pages()
+    assert "<h1>" in page(name)
+
+
+def test_every_pair_is_in_step() -> None:
+    command = [sys.executable, str(ROOT / "book" / "tools" / "pairs.py")]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_api_page_documents_every_public_name() -> None:
+    text = page("book/api")
+    anchors = set(re.findall(r'id="(distfilt[^"]*)"', text))
+    wanted, missing = 0, []
+    for name in modules():
+        if name == "distfilt":
+            continue
+        module = importlib.import_module(name)
+        for public in module.__all__:
+            value = getattr(module, public)
+            home = getattr(value, "__module__", name)
+            known = {f"{name}.{public}", f"{home}.{public}"}
+            wanted += 1
+            missing += [] if anchors & known else [f"{name}.{public}"]
+    assert wanted > 50 and not missing
+
+
+@pytest.mark.skipif(not (ROOT / "book/reproductions.md").is_file(), reason="no such page")
+def test_page_of_reproductions_shows_the_ledger() -> None:
+    text = page("book/reproductions")
+    rows = rows_of(LEDGER)
+    tables = re.findall(r"<tbody>(.*?)</tbody>", text, flags=re.DOTALL)
+    shown = [row for table in tables for row in re.findall(r"<tr.*?</tr>", table, flags=re.DOTALL)]
+    assert len(shown) == len(rows) == 21
+    for row, line in zip(rows, shown, strict=True):
+        assert row["item"] in plain(line) and row["verdict"] in plain(line)
+    for verdict in VERDICTS:
+        count = sum(row["verdict"] == verdict for row in rows)
+        assert f"{count} {verdict}" in plain(text)
+
+
+def test_build_stops_at_a_missing_page(tmp_path: Path) -> None:
+    book = tmp_path / "book"
+    shutil.copytree(ROOT / "book", book, ignore=shutil.ignore_patterns("*.ipynb", "_generated"))
+    shutil.copytree(ROOT / "data", tmp_path / "data")
+    toc = "format: jb-book\nroot: book/index\nchapters:\n  - file: book/nowhere\n"
+    (tmp_path / "_toc.yml").write_text(toc, encoding="utf-8")
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "-b", "html", "-c", str(book)]
+    done = subprocess.run(
+        [*command, str(tmp_path), str(tmp_path / "out")], capture_output=True, text=True
+    )
+    assert done.returncode != 0 and "book/nowhere" in done.stderr

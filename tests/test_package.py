@@ -1,0 +1,226 @@
+"""The package as a whole: its floors, its size, its public names, and the wheel that it makes."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import os
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "distfilt"
+PATHS = sorted(PACKAGE.rglob("*.py"))
+
+# Who may import whom: a module imports from floors below its own, or within its own folder.
+FLOORS = {
+    "checks": 0,
+    "linalg": 1,
+    "digests": 1,
+    "intervals": 1,
+    "models": 2,
+    "network": 2,
+    "sensors": 2,
+    "ensembles": 2,
+    "metrics": 2,
+    "mixtures": 3,
+    "density": 3,
+    "kalman": 3,
+    "triangular": 4,
+    "coupling": 4,
+    "plotting": 4,
+    "filters": 5,
+}
+# Apart from the floors: they build on checks and linalg, and no floor imports them.
+APART = {"studies", "published"}
+# A heavy package has a home; the second set is imported inside functions only, by everybody.
+HOMES = {
+    "cvxpy": {"triangular", "coupling"},
+    "ot": {"coupling"},
+    "filterpy": {"kalman"},
+    "networkx": {"network"},
+    "matplotlib": {"plotting"},
+    "xarray": {"filters", "studies"},
+}
+LATE = {*HOMES, "pandas", "scipy.stats", "tqdm"}
+
+
+def dotted(path: Path) -> str:
+    """Return a module's name below the package: ``network.channel``, '' for the package itself."""
+    name = path.relative_to(PACKAGE).with_suffix("").as_posix().replace("/", ".")
+    return name.removesuffix("__init__").rstrip(".")
+
+
+def part(name: str) -> str:
+    """Return the folder or the single module that a dotted name belongs to."""
+    return name.split(".")[0]
+
+
+def imports(path: Path, tree: ast.AST) -> set[str]:
+    """Return the full names of what is imported below a node."""
+    out = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            out |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                here = path.relative_to(ROOT).with_suffix("").parts[: -node.level]
+                base = ".".join([*here, *filter(None, [node.module])])
+            out |= {f"{base}.{alias.name}" for alias in node.names}
+    return out
+
+
+def is_for_types(node: ast.stmt) -> bool:
+    """Say whether a statement is ``if TYPE_CHECKING:``, which runs for no user."""
+    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+
+
+def top_imports(path: Path) -> set[str]:
+    """Return what a module imports when it is itself imported."""
+    out: set[str] = set()
+    for node in ast.parse(path.read_text(encoding="utf-8")).body:
+        if not isinstance(node, ast.FunctionDef | ast.ClassDef) and not is_for_types(node):
+            out |= imports(path, node)
+    return out
+
+
+def inner(names: set[str]) -> set[str]:
+    """Return the parts of this package among imported names."""
+    return {part(n.removeprefix("distfilt.")) for n in names if n.startswith("distfilt.")}
+
+
+@pytest.mark.parametrize("path", PATHS, ids=dotted)
+def test_module_imports_only_from_floors_below(path: Path) -> None:
+    here = part(dotted(path))
+    if not here:
+        return
+    wanted = inner(imports(path, ast.parse(path.read_text(encoding="utf-8")))) - {"__version__"}
+    assert here in FLOORS or here in APART, f"{here} has no floor: add it to FLOORS"
+    for other in wanted - {here}:
+        assert other != "plotting", "nobody imports plotting"
+        assert other not in APART, f"{here} imports {other}, which stands apart"
+        limit = 2 if here in APART else FLOORS[here]
+        assert FLOORS[other] < limit, f"{here} imports {other}, which is not below it"
+
+
+@pytest.mark.parametrize("path", PATHS, ids=dotted)
+def test_heavy_packages_stay_at_home_and_load_late(path: Path) -> None:
+    here = part(dotted(path))
+    used = imports(path, ast.parse(path.read_text(encoding="utf-8")))
+    for package, homes in HOMES.items():
+        if any(n == package or n.startswith(f"{package}.") for n in used):
+            assert here in homes, f"{here} imports {package}, whose home is {sorted(homes)}"
+    for name in top_imports(path):
+        for package in LATE:
+            late = name == package or name.startswith(f"{package}.")
+            assert not late, f"{package} has to be imported inside the function that uses it"
+
+
+@pytest.mark.parametrize("path", PATHS, ids=dotted)
+def test_module_is_short_and_says_what_is_public(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 400
+    name = f"distfilt.{dotted(path)}".rstrip(".")
+    module = importlib.import_module(name)
+    assert module.__doc__, "a module starts with what it is for"
+    assert isinstance(module.__all__, list | tuple)
+    for public in module.__all__:
+        value = getattr(module, public)
+        if callable(value) and getattr(value, "__module__", "").startswith("distfilt"):
+            assert value.__doc__, f"{public} has no docstring"
+
+
+def length(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Return the lines of a function, its docstring left out."""
+    first = min([node.lineno, *(d.lineno for d in node.decorator_list)])
+    lines = (node.end_lineno or first) - first + 1
+    if ast.get_docstring(node) is not None:
+        text = node.body[0]
+        lines -= (text.end_lineno or text.lineno) - text.lineno + 1
+    return lines
+
+
+@pytest.mark.parametrize("path", PATHS, ids=dotted)
+def test_functions_fit_a_screen(path: Path) -> None:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            assert length(node) <= 40, f"{node.name} has {length(node)} lines, at most 40"
+
+
+def test_every_folder_is_a_package() -> None:
+    for folder in {path.parent for path in PATHS}:
+        assert (folder / "__init__.py").is_file(), f"{folder.name} has no __init__.py"
+
+
+def run(code: str, path: Path | None = None) -> str:
+    """Run code in a fresh interpreter, away from the repository; return what it prints."""
+    env = {**os.environ, "PYTHONPATH": "" if path is None else str(path)}
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        cwd=ROOT.parent if path is None else path,
+        env=env,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_import_loads_no_heavy_package() -> None:
+    heavy = ["cvxpy", "ecos", "ot", "filterpy", "networkx", "xarray", "matplotlib", "pandas"]
+    heavy += ["scipy.stats", "tqdm"]
+    modules = [f"distfilt.{dotted(path)}".rstrip(".") for path in PATHS]
+    for names in (["distfilt"], modules):
+        code = f"import sys, {', '.join(names)}; print([h for h in {heavy} if h in sys.modules])"
+        assert run(code).strip() == "[]"
+
+
+def test_extras() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert {"book", "test", "peers", "dask", "mpi"} <= set(project["optional-dependencies"])
+
+
+def test_lock_names_no_registry() -> None:
+    text = (ROOT / "requirements.txt").read_text(encoding="utf-8")
+    assert "//" not in text and "--index" not in text
+    pins = [line for line in text.splitlines() if line and not line.startswith("#")]
+    assert pins and all("==" in pin for pin in pins)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the wheel without a network and unpack it; return the folder."""
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-index", "--no-deps"]
+    command += ["--no-build-isolation", "--wheel-dir", str(folder), str(ROOT)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    (built,) = folder.glob("distfilt-*.whl")
+    target = folder / "installed"
+    with zipfile.ZipFile(built) as archive:
+        archive.extractall(target)
+    return target
+
+
+def test_wheel_carries_the_data(wheel: Path) -> None:
+    carried = wheel / "distfilt" / "_data"
+    for name in ("published", "scenarios"):
+        source = ROOT / "data" / name
+        files = sorted(p.relative_to(source) for p in source.rglob("*") if p.is_file())
+        found = [p.relative_to(carried / name) for p in (carried / name).rglob("*") if p.is_file()]
+        assert files and files == sorted(found)
+        for file in files:
+            assert (source / file).read_bytes() == (carried / name / file).read_bytes()
+
+
+def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
+    tops = {p.name for p in wheel.iterdir()}
+    assert tops == {"distfilt", next(t for t in tops if t.endswith(".dist-info"))}
+    found = sorted(p.relative_to(wheel / "distfilt") for p in (wheel / "distfilt").rglob("*.py"))
+    assert found == [p.relative_to(PACKAGE) for p in PATHS]
