@@ -240,12 +240,15 @@ def filterpy_ukf(
         kf.Q = model.noise(t, dt)
         kf.predict(dt=dt, t=t)
         if seen.any():
-            residual = kf.residual_z = _residual_of(sensor, seen)
-            # An angle's mean is taken about the central point's angle, so that it may wrap.
-            kf.z_mean = lambda s, w: s[0] + w @ np.array([residual(row, s[0]) for row in s])
-            rows: Iterator[Array] = iter(sensor.predict(kf.sigmas_f)[:, seen])
+            h = sensor.predict(kf.sigmas_f)
+            # Readings that wrap are unwrapped: the points around the central one, the observation
+            # around the points' mean. Plain differences are then right.
+            h = h[0] + sensor.residual(h, np.broadcast_to(h[0], h.shape))
+            middle = kf.Wm @ h
+            near = middle + sensor.residual(z, middle)
+            rows: Iterator[Array] = iter(h[:, seen])
             # filterpy calls hx once for each sigma point, in their order.
-            kf.update(z[seen], R=sensor.noise[np.ix_(seen, seen)], hx=lambda s: next(rows))
+            kf.update(near[seen], R=sensor.noise[np.ix_(seen, seen)], hx=lambda s: next(rows))
 
     return _over_runs(mean, cov, y, start, step, likelihood, model.dim)
 
