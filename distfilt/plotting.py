@@ -86,7 +86,11 @@ def use_style() -> None:
 
     Examples
     --------
-    >>> use_style()
+    >>> from matplotlib import rc_context, rcParams
+    >>> with rc_context():  # so that this example leaves no trace
+    ...     use_style()
+    ...     rcParams["figure.dpi"]
+    110.0
     """
     from cycler import cycler
     from matplotlib import rcParams

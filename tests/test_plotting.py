@@ -167,7 +167,7 @@ def test_palette_stays_distinct(vision):
 
 
 def test_the_default_colours_would_not_stay_distinct():
-    assert _closest_pair([f"C{k}" for k in range(8)], "protan") < 10
+    assert _closest_pair(matplotlib.colormaps["tab10"].colors[:8], "protan") < 10
 
 
 def test_colour_and_style_pairs_repeat_late():
