@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .checks import Array, array, callable_, count, covariance, generator, number
+from .checks import Array, array, callable_, choice, count, covariance, generator, number
 from .linalg import factor
 
-__all__ = ["Sensor", "angle", "differential", "direct", "range_", "wrap"]
+__all__ = ["Sensor", "angle", "differential", "direct", "of_kind", "range_", "stack", "wrap"]
 
 _DIFFERENCE_STEP = 6e-6
 """Step of a central difference, about the cube root of the rounding unit."""
@@ -279,4 +279,90 @@ def angle(indices: Sequence[int], *, noise: float, full: bool = False) -> Sensor
         _variance(noise, 1),
         difference=lambda y, p: centred(y - p),
         kind="angle",
+    )
+
+
+def of_kind(kind: str, indices: Sequence[int], *, noise: float) -> Sensor:
+    """The sensor that a table names.
+
+    Parameters
+    ----------
+    kind : {"direct", "differential", "range", "angle"}
+        The types of Grange et al., Table I; ``"angle"`` is ``arctan(b/a)``.
+    indices : sequence of int
+        The components, counted from 0.
+    noise : float
+        Standard deviation of each reading, positive.
+
+    Examples
+    --------
+    >>> of_kind("range", [0, 1], noise=0.1).kind
+    'range'
+    """
+    makers: dict[str, Callable[..., Sensor]] = {
+        "direct": direct,
+        "differential": differential,
+        "range": range_,
+        "angle": angle,
+    }
+    return makers[choice(kind, "kind", makers)](indices, noise=noise)
+
+
+def stack(sensors: Sequence[Sensor]) -> Sensor:
+    """One sensor whose observation is the observations of `sensors`, one after the other.
+
+    Parameters
+    ----------
+    sensors : sequence of Sensor
+        At least one. The noise of different sensors is independent.
+
+    Returns
+    -------
+    Sensor
+        It wraps the components that the given sensors wrap, it is linear if all of them are, and
+        it needs the previous state if one of them does.
+
+    Raises
+    ------
+    ValueError
+        If there is no sensor or an entry is none.
+
+    Examples
+    --------
+    >>> both = stack([direct([0], noise=0.1), angle([0, 1], noise=0.2)])
+    >>> both.predict([1.0, 1.0]).round(4), both.noise.diagonal().round(4)
+    (array([1.    , 0.7854]), array([0.01, 0.04]))
+    """
+    parts = tuple(sensors) if isinstance(sensors, Sequence) else ()
+    if not parts or not all(isinstance(s, Sensor) for s in parts):
+        raise ValueError(f"sensors: needs a sequence of at least one Sensor, got {sensors!r}")
+    ends = np.cumsum([s.dim for s in parts])
+    noise = np.zeros((ends[-1], ends[-1]))
+    for s, end in zip(parts, ends, strict=True):
+        noise[end - s.dim : end, end - s.dim : end] = s.noise
+
+    def function(x: Array, previous: Array | None = None) -> Array:
+        return np.concatenate([s.predict(x, previous) for s in parts], axis=-1)
+
+    def difference(observed: Array, predicted: Array) -> Array:
+        pairs = zip(
+            parts,
+            np.split(observed, ends[:-1], axis=-1),
+            np.split(predicted, ends[:-1], axis=-1),
+            strict=True,
+        )
+        return np.concatenate([s.residual(y, p) for s, y, p in pairs], axis=-1)
+
+    return Sensor(
+        int(ends[-1]),
+        function,
+        noise,
+        difference=difference,
+        uses_previous=any(s.uses_previous for s in parts),
+        kind="stacked",
+        linear=(
+            None
+            if any(s.linear is None for s in parts)
+            else lambda d: np.concatenate([s.matrix(d) for s in parts])
+        ),
     )

@@ -134,7 +134,7 @@ def test_a_run_is_its_steps() -> None:
     truth, obs = _data()
     run = F.run(S, TIMES, obs, truth=truth)
     states = list(F.steps(S, TIMES, obs))
-    assert (run["mean"].values[-1] == states[-1].ensembles.mean(axis=-2)).all()
+    assert (run["mean"].values[-1] == ensembles.mean(states[-1].ensembles)).all()
     assert run["mean"].dims == ("time", "run", "agent", "component")
     error = ((states[3].ensembles.mean(axis=-2) - truth[3][:, None, :]) ** 2).sum(axis=-1)
     assert np.allclose(run["squared_error"].values[3], error)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from distfilt import checks, linalg
+from distfilt.progress import track
 
 NAN = float("nan")
 INDEFINITE = [[1.0, 2.0], [2.0, 1.0]]
@@ -62,6 +63,7 @@ BAD_INPUT = {
         ("w", lambda: checks.weights([1.5, -0.5], "w")),
         ("w", lambda: checks.weights([1.0], "w", 2)),
     ],
+    "distfilt.progress.track": [("items", lambda: track(3, show=True))],
     _L + "cholesky_solve": [
         ("cov", lambda: linalg.cholesky_solve(INDEFINITE, np.eye(2))),
         ("right", lambda: linalg.cholesky_solve(np.eye(2), np.eye(3))),
@@ -151,3 +153,8 @@ def test_van_loan_without_time() -> None:
 def test_solver_error_is_a_runtime_error() -> None:
     with pytest.raises(RuntimeError, match="stopped"):
         raise checks.SolverError("stopped")
+
+
+def test_progress_is_silent_under_a_test(capsys: pytest.CaptureFixture[str]) -> None:
+    assert list(track(range(3), show=True)) == [0, 1, 2]
+    assert capsys.readouterr() == ("", "")

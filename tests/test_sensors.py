@@ -46,6 +46,10 @@ BAD_INPUT = {
         ("indices", lambda: direct([-1], noise=0.1)),
         ("noise", lambda: direct([0], noise=-1.0)),
     ],
+    _S + "of_kind": [
+        ("kind", lambda: sensors.of_kind("radar", [0], noise=0.1)),
+        ("noise", lambda: sensors.of_kind("angle", [0, 1], noise=-0.1)),
+    ],
     _S + "range_": [("noise", lambda: range_([0], noise=NAN))],
     _S + "wrap": [
         ("angles", lambda: wrap([NAN])),

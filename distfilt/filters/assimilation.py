@@ -9,7 +9,7 @@ import numpy as np
 
 from ..checks import Array
 from ..network import Channel
-from ..sensors import Sensor
+from ..sensors import Sensor, stack
 
 __all__ = ["Update", "assimilate"]
 
@@ -73,23 +73,17 @@ def _joint(
     before: Array | None,
 ) -> tuple[Array, Array, Array]:
     """Predictions (*runs, N, M), observations (*runs, M) and noise (M, M) of all that was heard."""
-    predicted, target, blocks = [], [], []
-    for agent in sorted(heard):
-        sensor = sensors[agent]
-        if sensor is None:
-            raise ValueError(f"sensors: needs a sensor for agent {agent}, which observed")
-        y = heard[agent][..., None, :]
-        p = sensor.predict(members, before if sensor.uses_previous else None)
-        # Readings that wrap are predicted on the branch of the observation: y* - wrap(y* - p).
-        predicted.append(np.where(np.isnan(y), p, y - sensor.residual(y, p)))
-        target.append(heard[agent])
-        blocks.append(sensor.noise)
-    noise = np.zeros((sum(map(len, blocks)),) * 2)
-    at = 0
-    for block in blocks:
-        noise[at : at + len(block), at : at + len(block)] = block
-        at += len(block)
-    return np.concatenate(predicted, axis=-1), np.concatenate(target, axis=-1), noise
+    blind = [agent for agent in heard if sensors[agent] is None]
+    if blind:
+        raise ValueError(f"sensors: needs a sensor for agent {blind[0]}, which observed")
+    senders = sorted(heard)
+    both = stack([s for a in senders if (s := sensors[a]) is not None])
+    target = np.concatenate([heard[agent] for agent in senders], axis=-1)
+    predicted = both.predict(members, before)
+    # Readings that wrap are predicted on the branch of the observation: y* - wrap(y* - p).
+    gap = both.residual(target[..., None, :], predicted)
+    unwrapped = np.where(np.isnan(gap), predicted, target[..., None, :] - gap)
+    return unwrapped, target, both.noise
 
 
 def _by_pattern(

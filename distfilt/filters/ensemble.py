@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from ..checks import Array, array, callable_, count, generator, increasing, number, same_length
 from ..models import Model
 from ..network import Channel, Graph, Ledger
+from ..progress import track
 from ..sensors import Sensor
 from .assimilation import Update, assimilate
 from .record import as_dataset
@@ -251,7 +252,7 @@ class EnsembleFilter:
             raise ValueError(
                 f"late: needs arrivals up to {grid[-1]:g}, got one at {waiting[-1].arrived:g}"
             )
-        for k, t in enumerate(_shown(grid, progress)):
+        for k, t in enumerate(track(grid, show=progress)):
             due = [item for item in waiting if item.arrived <= t]
             waiting = waiting[len(due) :]
             now = [None if o is None else o[k] for o in series]
@@ -344,12 +345,3 @@ class EnsembleFilter:
         observations: list[ArrayLike | None] = [None] * len(self.sensors)
         observations[item.agent] = item.value
         return match[0], self._checked(observations, state.runs)
-
-
-def _shown(grid: Array, progress: bool) -> Any:
-    """The times, behind a progress bar when asked for; tqdm itself stays silent in a pipe."""
-    if not progress:
-        return grid
-    from tqdm.auto import tqdm
-
-    return tqdm(grid, leave=False, disable=None)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .. import ensembles
 from ..checks import Array, array, increasing
 from ..metrics import crps, ensemble_nees, squared_error
 from ..models import Model
@@ -23,8 +24,9 @@ _SENT = ("messages", "scalars", "bytes")
 
 def _recorded(state: EnsembleState, truth: Array | None) -> dict[str, Array]:
     e = state.ensembles
-    mean = e.mean(axis=-2)
-    out = {"mean": mean, "variance": e.var(axis=-2, ddof=1)}
+    mean = ensembles.mean(e)
+    squares = ensembles.mean(ensembles.anomalies(e) ** 2)
+    out = {"mean": mean, "variance": squares * state.members / (state.members - 1)}
     out["spread"] = np.sqrt(out["variance"].sum(axis=-1))
     for name in _SENT:
         out[name] = getattr(state.ledger, name)

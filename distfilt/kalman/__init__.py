@@ -1,5 +1,6 @@
 """Kalman filters: exact and batched, filterpy's as a reference, ensemble and particle filters."""
 
+from ..sensors import stack
 from .ensemble import EnsembleRun, enkf, enkf_filter
 from .linear import GaussianRun, kalman_filter, predict, update
 from .particle import (
@@ -11,7 +12,6 @@ from .particle import (
     systematic,
 )
 from .reference import filterpy_ekf, filterpy_kf, filterpy_ukf
-from .stacking import stack
 
 __all__ = [
     "EnsembleRun",

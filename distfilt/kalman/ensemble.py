@@ -13,7 +13,7 @@ from ..ensembles import cross_covariance, mean, sample_covariance
 from ..linalg import cholesky_solve, factor
 from ..models import Model
 from ..sensors import Sensor
-from .stacking import _instantaneous, _series
+from ._inputs import instantaneous, series
 
 __all__ = ["EnsembleRun", "enkf", "enkf_filter"]
 
@@ -169,9 +169,9 @@ def enkf_filter(
     >>> run.means.shape, run.covariances.shape
     ((2, 4, 1), (2, 4, 1, 1))
     """
-    sensor = _instantaneous(sensors)
+    sensor = instantaneous(sensors)
     x = array(ensemble, "ensemble", (..., "N", model.dim))
-    y, grid = _series(observations, times, t0, sensor.dim)
+    y, grid = series(observations, times, t0, sensor.dim)
     stride = len(y) + 1 if every is None else count(every, "every")
     generator(rng)
     means, covs, kept = [], [], []

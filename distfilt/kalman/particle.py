@@ -12,7 +12,7 @@ from ..checks import Array, array, choice, count, generator, number, weights
 from ..linalg import cholesky_solve
 from ..models import Model
 from ..sensors import Sensor
-from .stacking import _instantaneous, _series
+from ._inputs import instantaneous, series
 
 __all__ = [
     "ParticleRun",
@@ -285,9 +285,9 @@ def particle_filter(
     >>> run.means.round(1)
     array([[2.]])
     """
-    sensor = _instantaneous(sensors)
+    sensor = instantaneous(sensors)
     start = array(points, "points", (..., "N", model.dim))
-    y, grid = _series(observations, times, t0, sensor.dim)
+    y, grid = series(observations, times, t0, sensor.dim)
     runs = np.broadcast_shapes(start.shape[:-2], y.shape[1:-1])
     limit = number(threshold, "threshold", at_least=0, at_most=1) * count(
         start.shape[-2], "points"

@@ -21,7 +21,7 @@ from ..checks import Array, array, number
 from ..models import Model
 from ..sensors import Sensor
 from .linear import GaussianRun, _broadcast, _fill_axes, _noise_per_step, _per_step, _prior
-from .stacking import _instantaneous, _series
+from ._inputs import instantaneous, series
 
 _Mask = NDArray[np.bool_]
 
@@ -145,8 +145,8 @@ def filterpy_ekf(
     """
     from filterpy.kalman import ExtendedKalmanFilter
 
-    sensor = _instantaneous(sensors)
-    y, grid = _series(observations, times, t0, sensor.dim)
+    sensor = instantaneous(sensors)
+    y, grid = series(observations, times, t0, sensor.dim)
 
     def start(x: Array, p: Array) -> Any:
         kf = ExtendedKalmanFilter(dim_x=model.dim, dim_z=sensor.dim)
@@ -216,8 +216,8 @@ def filterpy_ukf(
     """
     from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-    sensor = _instantaneous(sensors)
-    y, grid = _series(observations, times, t0, sensor.dim)
+    sensor = instantaneous(sensors)
+    y, grid = series(observations, times, t0, sensor.dim)
     number(alpha, "alpha", above=0)
     number(beta, "beta", at_least=0)
     number(kappa, "kappa", above=-model.dim)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, array, count, number
+from ..ensembles import mean
 from .channel import Channel
 
 __all__ = ["average", "mean_pull"]
@@ -105,6 +106,6 @@ def mean_pull(
     heard = channel.graph.links + np.eye(size) * include_self
     weight = channel.graph.degrees + include_self
     for _ in range(count(rounds, "rounds")):
-        pull = channel.combine(out.mean(axis=-2), heard)
+        pull = channel.combine(mean(out), heard)
         out = out + g * (pull[..., None, :] - weight[:, None, None] * out)
     return out

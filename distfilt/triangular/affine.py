@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .. import ensembles
 from ..checks import Array, SolverError, array, choice, count
-from ..linalg import symmetrise
 
 __all__ = ["AffineMap", "fit", "fit_convex", "gradient", "objective"]
 
@@ -130,22 +130,28 @@ def fit(y: ArrayLike, x: ArrayLike) -> AffineMap:
     array([1., 0.])
     """
     seen, members = _samples(y, x)
-    n = members.shape[-2]
-    ybar, xbar = seen.mean(axis=-2), members.mean(axis=-2)
-    dy, dx = seen - ybar[..., None, :], members - xbar[..., None, :]
-    yt, xt = np.swapaxes(dy, -1, -2), np.swapaxes(dx, -1, -2)
-    lower = _cholesky(yt @ dy / n, "y")
-    # Whitened observations: their regression coefficients need no further solve.
-    half = np.linalg.solve(lower, yt @ dx / n)
-    gain = np.swapaxes(np.linalg.solve(np.swapaxes(lower, -1, -2), half), -1, -2)
-    rest = xt @ dx / n - np.swapaxes(half, -1, -2) @ half
-    return AffineMap(ybar, xbar, gain, _cholesky(symmetrise(rest), "x"))
+    m = seen.shape[-1]
+    joint = np.concatenate([seen, members], axis=-1)
+    mean = ensembles.mean(joint)
+    joint -= mean[..., None, :]
+    cov = np.swapaxes(joint, -1, -2) @ joint / joint.shape[-2]
+    lower = _cholesky(cov, m)
+    # The factor of the joint covariance holds the map: its lower blocks are K L_yy and L.
+    across = np.swapaxes(lower[..., m:, :m], -1, -2)
+    gain = np.linalg.solve(np.swapaxes(lower[..., :m, :m], -1, -2), across)
+    return AffineMap(mean[..., :m], mean[..., m:], np.swapaxes(gain, -1, -2), lower[..., m:, m:])
 
 
-def _cholesky(cov: Array, name: str) -> Array:
+def _cholesky(cov: Array, m: int) -> Array:
+    """Factor of the joint covariance of (y, x); an error says which of them is to blame."""
     try:
         return np.asarray(np.linalg.cholesky(cov), dtype=np.float64)
     except np.linalg.LinAlgError:
+        try:
+            np.linalg.cholesky(cov[..., :m, :m])
+            name = "x"
+        except np.linalg.LinAlgError:
+            name = "y"
         raise ValueError(
             f"{name}: needs variables that are not constant and not combinations of others, "
             f"got a sample covariance that is not positive definite"
@@ -256,7 +262,7 @@ def fit_convex(
     scale = np.linalg.solve(upper, np.eye(d))
     gain = -np.linalg.solve(upper, rows[:, 1 : 1 + m])
     offset = -np.linalg.solve(upper, rows[:, 0])
-    ybar = seen.mean(axis=0)
+    ybar = ensembles.mean(seen)
     return AffineMap(ybar, offset + gain @ ybar, gain, np.tril(scale))
 
 
