@@ -6,6 +6,7 @@ changes it. Nothing is repaired: a covariance that is not symmetric is refused, 
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Collection
 from typing import Any
 
@@ -195,13 +196,14 @@ def number(
         good = bool(np.isfinite(out)) and np.ndim(value) == 0
     except (TypeError, ValueError):
         raise ValueError(f"{name}: needs {needs}, got {value!r}") from None
-    for bound, word, holds in (
-        (above, "above", lambda b: out > b),
-        (at_least, "at least", lambda b: out >= b),
-        (below, "below", lambda b: out < b),
-        (at_most, "at most", lambda b: out <= b),
-    ):
-        if bound is not None and not holds(bound):
+    bounds: tuple[tuple[float | None, str, Callable[[float, float], bool]], ...] = (
+        (above, "above", operator.gt),
+        (at_least, "at least", operator.ge),
+        (below, "below", operator.lt),
+        (at_most, "at most", operator.le),
+    )
+    for bound, word, holds in bounds:
+        if bound is not None and not holds(out, bound):
             needs, good = f"a number {word} {bound:g}", False
     if not good:
         raise ValueError(f"{name}: needs {needs}, got {value!r}")

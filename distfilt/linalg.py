@@ -57,12 +57,11 @@ def factor(cov: ArrayLike, *, name: str = "cov") -> Array:
     """
     c = array(cov, name, (..., "d", "d"))
     try:
-        lower = np.linalg.cholesky(covariance(c, name))
+        return np.asarray(np.linalg.cholesky(covariance(c, name)), dtype=np.float64)
     except ValueError:
         covariance(c, name, semidefinite=True)
         values, vectors = np.linalg.eigh(c)
-        lower = vectors * np.sqrt(np.clip(values, 0.0, None))[..., None, :]
-    return lower
+        return np.asarray(vectors * np.sqrt(np.clip(values, 0.0, None))[..., None, :])
 
 
 def cholesky_solve(cov: ArrayLike, right: ArrayLike) -> Array:

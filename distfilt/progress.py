@@ -35,4 +35,5 @@ def track(items: Iterable[Any], *, show: bool, total: int | None = None) -> Iter
         return items
     from tqdm.auto import tqdm
 
-    return tqdm(items, total=total, leave=False, disable=None)
+    shown: Iterable[Any] = tqdm(items, total=total, leave=False, disable=None)
+    return shown
