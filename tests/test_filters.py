@@ -14,7 +14,7 @@ from distfilt.filters.assimilation import assimilate
 from distfilt.filters.record import as_dataset
 from distfilt.models import Model, simulate
 from distfilt.models.satellite import clohessy_wiltshire
-from distfilt.network import Channel, Graph, Ledger
+from distfilt.network import Channel, Faults, Graph, Ledger
 from distfilt.network.consensus import mean_pull
 from distfilt.sensors import angle, differential, direct
 from distfilt.triangular.conditioning import affine_update, pca_update
@@ -74,6 +74,8 @@ BAD_INPUT = {
         ("update", lambda: _satellites(update=None)),
         ("consensus", lambda: _satellites(consensus=0.05)),
         ("members", lambda: _satellites(members=1)),
+        ("faults", lambda: _satellites(faults=0.1)),
+        ("faults", lambda: _satellites(faults=Faults(delay=1))),
         ("lag", lambda: _satellites(lag=-1)),
         ("prior", lambda: F.start(np.zeros((3, 6)), rng=_rng())),
         ("prior", lambda: F.start(np.full((40, 6), NAN), rng=_rng())),
@@ -297,6 +299,25 @@ def test_a_time_varying_graph() -> None:
     run = f.run(_begin(f), TIMES, _data()[1])
     sent = run["messages"].values.sum(axis=1)
     assert (sent[:4] == 0).all() and (np.diff(sent[3:]) > 0).all()
+
+
+def test_losing_everything_is_being_alone() -> None:
+    """With certain loss each agent does what it would do on a graph without links."""
+    alone = Graph.from_adjacency(np.zeros((3, 3)))
+    truth, obs = _data()
+    lossy = _satellites(faults=Faults(loss=1.0), consensus=partial(mean_pull, gain=0.05,
+                                                                   include_self=False))
+    single = _satellites(graph=alone, consensus=None)
+    a, b = (f.run(_begin(f), TIMES, obs)["mean"].values for f in (lossy, single))
+    assert np.allclose(a, b, rtol=1e-12, atol=1e-12)
+
+
+def test_losses_differ_between_runs_and_are_counted() -> None:
+    f = _satellites(faults=Faults(loss=0.5, seed=3))
+    run = f.run(_begin(f), TIMES, _data()[1])
+    sent, lost = run["messages"].values[-1].sum(), run["lost"].values[-1].sum()
+    assert 0.25 < lost / sent < 0.75
+    assert np.isfinite(run["mean"].values).all()
 
 
 def test_pca_and_no_consensus_run_and_dimensions_without_runs() -> None:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import Array, array, callable_, count, generator, increasing, number, same_length
 from ..models import Model
-from ..network import Channel, Graph, Ledger
+from ..network import Channel, Faults, Graph, Ledger
 from ..progress import track
 from ..sensors import Sensor
 from .assimilation import Update, assimilate
@@ -88,6 +88,9 @@ class EnsembleFilter:
         ``partial(mean_pull, gain=0.05)``; none by default.
     members : int
         Number N of members of each agent.
+    faults : Faults, optional
+        Messages lost and agents silenced; a lost observation is a missing one. A delay is not
+        accepted: an observation that comes late has its own time, pass it as :class:`Late`.
     lag : int
         How many earlier times are kept for late observations. Each of them is conditioned on
         every observation too, so a step costs 1 + `lag` updates.
@@ -112,6 +115,7 @@ class EnsembleFilter:
     update: Update
     consensus: Consensus | None = None
     members: int = 100
+    faults: Faults | None = None
     lag: int = 0
 
     def __post_init__(self) -> None:
@@ -127,6 +131,8 @@ class EnsembleFilter:
         callable_(self.update, "update")
         if self.consensus is not None:
             callable_(self.consensus, "consensus")
+        if self.faults is not None and (not isinstance(self.faults, Faults) or self.faults.delay):
+            raise ValueError(f"faults: needs Faults without a delay, got {self.faults!r}")
         count(self.members, "members", at_least=2)
         count(self.lag, "lag", at_least=0)
 
@@ -208,7 +214,9 @@ class EnsembleFilter:
         seen = self._checked(observations, state.runs)
         earlier = [self._checked_late(item, state) for item in late]
         rng = copy.deepcopy(state.rng)
-        channel = Channel(self._graph_at(t), ledger=state.ledger, runs=state.runs)
+        channel = Channel(
+            self._graph_at(t), ledger=state.ledger, runs=state.runs, faults=self.faults
+        )
         ensembles = self.model.sample_step(state.ensembles, state.t, dt, rng=rng)
         kept = (*state.history, (state.t, state.ensembles)) if self.lag else ()
         stack = [*(e.copy() for _, e in kept), ensembles]

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["as_dataset"]
 
-_SENT = ("messages", "scalars", "bytes")
+_SENT = ("messages", "scalars", "bytes", "lost")
 
 
 def _recorded(state: EnsembleState, truth: Array | None) -> dict[str, Array]:

@@ -95,6 +95,7 @@ class EnsembleState:
                 messages=self.ledger.messages,
                 scalars=self.ledger.scalars,
                 bytes=self.ledger.bytes,
+                lost=self.ledger.lost,
             )
 
     @classmethod
@@ -114,9 +115,8 @@ class EnsembleState:
             header = json.loads(str(parts["header"]))
             if header["format"] != _FORMAT:
                 raise ValueError(f"format {header['format']}")
-            ledger = Ledger(
-                int(header["rounds"]), parts["messages"], parts["scalars"], parts["bytes"]
-            )
+            counts = (parts[name] for name in ("messages", "scalars", "bytes", "lost"))
+            ledger = Ledger(int(header["rounds"]), *counts)
             history = tuple(zip(header["history"], parts["history"], strict=True))
             rng = _restored(header["rng"])
             return cls(float(header["t"]), parts["ensembles"], rng, ledger, history)

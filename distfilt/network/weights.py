@@ -1,0 +1,207 @@
+"""Weights for combining values along the links: what an agent makes of its own and of each heard."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import sparse
+
+from ..checks import Array, array, number
+from .graphs import Graph
+
+__all__ = ["Weights", "balanced", "laplacian", "maximum_degree", "metropolis", "push"]
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """One weight for each agent's own value, and one for each link.
+
+    Parameters
+    ----------
+    graph : Graph
+        The links.
+    own : ndarray, (A,)
+        Weight of an agent's own value.
+    links : ndarray, (E,)
+        Weight of each link, in the order of ``graph.receivers`` and ``graph.senders``.
+
+    Examples
+    --------
+    >>> from distfilt.network import graphs
+    >>> metropolis(graphs.path(3)).matrix.toarray().round(3)
+    array([[0.667, 0.333, 0.   ],
+           [0.333, 0.333, 0.333],
+           [0.   , 0.333, 0.667]])
+    """
+
+    graph: Graph
+    own: Array
+    links: Array
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.graph, Graph):
+            raise ValueError(f"graph: needs a Graph, got {type(self.graph).__name__}")
+        array(self.own, "own", (self.graph.size,))
+        array(self.links, "links", (self.graph.senders.size,))
+
+    @classmethod
+    def from_matrix(cls, graph: Graph, matrix: ArrayLike | sparse.sparray) -> Weights:
+        """Read the weights from a matrix (A, A); off its diagonal only links may be weighted."""
+        w = sparse.csr_array(matrix)
+        if w.shape != graph.links.shape:
+            raise ValueError(f"weights: needs shape {graph.links.shape}, got {w.shape}")
+        if not np.isfinite(w.data).all():
+            raise ValueError("weights: needs finite numbers, got NaN or infinite entries")
+        own = w.diagonal()
+        entries = w.tocoo()
+        row, column = (np.asarray(c, dtype=np.int64) for c in entries.coords)
+        used = (entries.data != 0) & (row != column)
+        key = graph.receivers * graph.size + graph.senders
+        wanted = (row * graph.size + column)[used]
+        if not np.isin(wanted, key).all():
+            raise ValueError("weights: needs zeros where an agent does not hear another")
+        links = np.zeros(key.size)
+        links[np.searchsorted(key, wanted)] = entries.data[used]
+        return cls(graph, np.asarray(own, dtype=np.float64), links)
+
+    @cached_property
+    def matrix(self) -> sparse.csr_array:
+        """The matrix W of x <- W x, (A, A), each row's own entry stored first."""
+        return stacked(self.graph, self.own[None], self.links[None], heard_at=0)
+
+
+def stacked(graph: Graph, own: Array, links: Array, *, heard_at: int) -> sparse.csr_array:
+    """Matrices of R runs as one block-diagonal matrix, each row's own entry first.
+
+    `own` is (R, A) and `links` (R, E). With `heard_at` = 0 both multiply the same stacked values;
+    otherwise what is heard stands `heard_at` rows further on.
+    """
+    runs, size, edges = own.shape[0], graph.size, graph.senders.size
+    starts = graph.links.indptr + np.arange(size + 1)
+    data = np.empty((runs, size + edges))
+    indices = np.empty((runs, size + edges), dtype=np.int64)
+    at_own = starts[:-1]
+    at_link = np.arange(edges) + graph.receivers + 1
+    offset = size * np.arange(runs)[:, None]
+    data[:, at_own], data[:, at_link] = own, links
+    indices[:, at_own] = np.arange(size) + offset
+    indices[:, at_link] = graph.senders + offset + heard_at
+    pointers = np.concatenate(
+        [(starts[:-1] + (size + edges) * np.arange(runs)[:, None]).ravel(), [data.size]]
+    )
+    shape = (runs * size, runs * size + heard_at)
+    return sparse.csr_array((data.ravel(), indices.ravel(), pointers), shape)
+
+
+def _both_ways(graph: Graph) -> None:
+    if graph.directed:
+        raise ValueError("graph: needs links both ways for these weights, got one-way links")
+
+
+def metropolis(graph: Graph) -> Weights:
+    r"""Metropolis weights :math:`w_{ij}=1/(1+\max(d_i,d_j))`: symmetric, rows sum to one.
+
+    Each agent needs only its neighbours' degrees. An agent without neighbours keeps its value.
+
+    Notes
+    -----
+    L. Xiao, S. Boyd and S. Lall, Information Processing in Sensor Networks (2005) 63-70.
+
+    Examples
+    --------
+    >>> from distfilt.network import graphs
+    >>> metropolis(graphs.star(3)).own.round(3)
+    array([0.333, 0.667, 0.667])
+    """
+    _both_ways(graph)
+    d = graph.degrees
+    links = 1 / (1 + np.maximum(d[graph.receivers], d[graph.senders]))
+    return Weights(graph, 1 - _row_sums(graph, links), links)
+
+
+def maximum_degree(graph: Graph) -> Weights:
+    """Equal weights 1 / (1 + the largest degree) on every link; needs that one global number.
+
+    Examples
+    --------
+    >>> from distfilt.network import graphs
+    >>> maximum_degree(graphs.star(3)).own.round(3)
+    array([0.333, 0.667, 0.667])
+    """
+    _both_ways(graph)
+    links = np.full(graph.senders.size, 1 / (1 + graph.degrees.max()))
+    return Weights(graph, 1 - _row_sums(graph, links), links)
+
+
+def laplacian(graph: Graph, gain: float) -> Weights:
+    r"""The weights of one averaging step, :math:`\mathbf I-\gamma\mathbf L`.
+
+    Parameters
+    ----------
+    graph : Graph
+        The links, one way or both.
+    gain : float
+        The gain γ, at least 0.
+
+    Examples
+    --------
+    >>> from distfilt.network import graphs
+    >>> laplacian(graphs.star(3), 0.5).own
+    array([0. , 0.5, 0.5])
+    """
+    g = number(gain, "gain", at_least=0)
+    return Weights(graph, 1 - g * graph.degrees, np.full(graph.senders.size, g))
+
+
+def push(graph: Graph) -> Weights:
+    """Each agent splits its value evenly between itself and its listeners: columns sum to one.
+
+    An agent needs to know only how many hear it.
+
+    Examples
+    --------
+    >>> from distfilt.network import Graph
+    >>> circle = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1)], directed=True)
+    >>> push(circle).own
+    array([0.5, 0.5, 0.5])
+    """
+    share = 1 / (1 + graph.listeners)
+    return Weights(graph, share, share[graph.senders])
+
+
+def balanced(graph: Graph) -> Weights:
+    r"""Weights of a strongly connected digraph whose rows and columns sum to one.
+
+    Scaling agent i's links by the left null vector p of the Laplacian makes what it hears as heavy
+    as what others make of it, :math:`\mathbf 1^\top\operatorname{diag}(\mathbf p)\mathbf L
+    =\mathbf p^\top\mathbf L=\mathbf 0`. Averaging then keeps the average on a digraph too. The
+    vector is global knowledge: agents compute it together once, or are told.
+
+    Raises
+    ------
+    ValueError
+        If the graph is not strongly connected.
+
+    Examples
+    --------
+    >>> from distfilt.network import Graph
+    >>> circle = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1)], directed=True)
+    >>> balanced(circle).matrix.toarray().sum(axis=0)
+    array([1., 1., 1.])
+    """
+    if not graph.connected:
+        raise ValueError(
+            f"graph: needs a strongly connected graph, got {graph.components.max() + 1} components"
+        )
+    _, _, right = np.linalg.svd(graph.laplacian.T.toarray())
+    p = np.abs(right[-1])
+    scale = 1 / (2 * max((p * graph.degrees).max(), 1e-300)) if graph.size > 1 else 0.0
+    links = scale * p[graph.receivers]
+    return Weights(graph, 1 - _row_sums(graph, links), links)
+
+
+def _row_sums(graph: Graph, links: Array) -> Array:
+    return np.asarray(graph.incidence @ links)
