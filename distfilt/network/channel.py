@@ -216,7 +216,7 @@ class Channel:
         k, size = v.shape[-1], self.graph.size
         both = lost in ("mutual", "metropolis")
         if both and self.graph.directed:
-            raise ValueError(f"lost: {lost!r} needs links both ways, got a graph with one-way links")
+            raise ValueError(f"lost: {lost!r} needs links both ways, got one-way links")
         # Metropolis weights need the degree of what is left, one number more.
         sizes = np.full(size, k + (lost == "metropolis"))
         arrived = self._transmit(self._links, sizes, 8 * sizes, acknowledged=both)

@@ -1,4 +1,4 @@
-"""What goes wrong on the way: messages lost or late, agents silent; the same for everyone who asks."""
+"""What goes wrong on the way: messages lost or late, agents silent."""
 
 from __future__ import annotations
 

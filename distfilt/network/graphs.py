@@ -93,7 +93,8 @@ class Graph:
         pairs = array(edges, name)
         pairs = pairs.reshape(-1, 2) if pairs.size == 0 else array(pairs, name, ("E", 2))
         listed = pairs.astype(np.int64)
-        if (listed != pairs).any() or (listed.size and not 0 <= listed.min() <= listed.max() < size):
+        inside = not listed.size or 0 <= listed.min() <= listed.max() < size
+        if (listed != pairs).any() or not inside:
             raise ValueError(f"{name}: needs agents from 0 to {size - 1}, got {pairs.tolist()[:3]}")
         loops = listed[listed[:, 0] == listed[:, 1], 0]
         if loops.size:
@@ -124,7 +125,7 @@ class Graph:
 
     @cached_property
     def reverse(self) -> Indices:
-        """For each link the number of the link that goes the other way, (E,); -1 where none does."""
+        """For each link the number of the one that goes the other way, (E,); -1 for none."""
         key = self.receivers * self.size + self.senders
         other = self.senders * self.size + self.receivers
         found = np.searchsorted(key, other).clip(max=max(key.size - 1, 0))
@@ -210,7 +211,8 @@ class Graph:
     def diameter(self) -> int:
         """The largest number of hops between two agents of a connected graph."""
         if not self.connected:
-            raise ValueError(f"graph: needs a connected graph, got {self.components.max() + 1} parts")
+            parts = self.components.max() + 1
+            raise ValueError(f"graph: needs a connected graph, got {parts} parts")
         hops = sparse.csgraph.shortest_path(self.links, unweighted=True)
         return int(hops.max())
 

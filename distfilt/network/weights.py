@@ -1,4 +1,4 @@
-"""Weights for combining values along the links: what an agent makes of its own and of each heard."""
+"""Weights for combining values: what an agent makes of its own and of each that it hears."""
 
 from __future__ import annotations
 
