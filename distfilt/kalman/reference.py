@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..checks import Array, array, number
 from ..models import Model
 from ..sensors import Sensor
-from .linear import GaussianRun, _broadcast, _fill_axes, _noise_per_step, _per_step, _prior
 from ._inputs import instantaneous, series
+from .linear import GaussianRun, _broadcast, _fill_axes, _noise_per_step, _per_step, _prior
 
 _Mask = NDArray[np.bool_]
 
