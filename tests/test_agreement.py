@@ -103,7 +103,7 @@ BAD_INPUT = {
         ("agree", lambda: admm(_quadratic, np.zeros((3, 1)), _star(), agree=None)),
     ],
 }
-EXEMPT = {_A + "AdmmRun": "a record that admm fills", _F + "Fuse": "a type"}
+EXEMPT = {_A + "AdmmRun": "a record that admm fills"}
 
 
 def _follow_ramp(graph: Graph, *, with_rate: bool, faults: Faults | None = None) -> np.ndarray:

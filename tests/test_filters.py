@@ -11,11 +11,14 @@ import pytest
 from distfilt import ensembles
 from distfilt.filters import EnsembleFilter, EnsembleState, Late
 from distfilt.filters.assimilation import assimilate
+from distfilt.filters.gaussian import GaussianFilter, GaussianState
+from distfilt.filters.observations import at_one_time, over_times
 from distfilt.filters.record import as_dataset
 from distfilt.models import Model, simulate
 from distfilt.models.satellite import clohessy_wiltshire
 from distfilt.network import Channel, Faults, Graph, Ledger
 from distfilt.network.consensus import mean_pull
+from distfilt.network.fusion import covariance_intersection
 from distfilt.sensors import angle, differential, direct
 from distfilt.triangular.conditioning import affine_update, pca_update
 
@@ -59,10 +62,23 @@ def _data(runs: int = 3, times: np.ndarray = TIMES) -> tuple[np.ndarray, list[np
     return truth, [s.observe(truth, rng=rng) for s in SENSORS]
 
 
+LINEAR = (SENSORS[0], direct([1, 2], noise=0.2), SENSORS[2])
+
+
+def _kalmans(**change: object) -> GaussianFilter:
+    options: dict[str, object] = {
+        "model": clohessy_wiltshire(rate=0.1, sigma=0.2), "sensors": LINEAR, "graph": STAR,
+    }
+    options.update(change)
+    return GaussianFilter(**options)
+
+
 F = _satellites()
 S = _begin(F)
 OBS = [o[0] for o in _data()[1]]
 _E = "distfilt.filters.ensemble."
+_G = "distfilt.filters.gaussian."
+_O = "distfilt.filters.observations."
 BAD_INPUT = {
     _E + "EnsembleFilter": [
         ("model", lambda: _satellites(model=3)),
@@ -117,6 +133,38 @@ BAD_INPUT = {
         ("sensors", lambda: assimilate(
             [np.zeros((3, 4, 6))], 0, [np.zeros(2), None, None], [None] * 3, affine_update,
             Channel(STAR), _rng())),
+    ],
+    _O + "at_one_time": [
+        ("observations", lambda: at_one_time([None], SENSORS, ())),
+        ("observations[1]", lambda: at_one_time([None, [1.0, 2.0], None], SENSORS, ())),
+        ("observations[0]", lambda: at_one_time([[1.0, np.inf], None, None], SENSORS, ())),
+        ("observations", lambda: at_one_time([[1.0]], [None], ())),
+    ],
+    _O + "over_times": [
+        ("times", lambda: over_times([None] * 3, SENSORS, [1.0, 1.0])),
+        ("observations", lambda: over_times([None], SENSORS, [1.0])),
+        ("observations", lambda: over_times([[1.0], None, None], SENSORS, [1.0])),
+    ],
+    _G + "GaussianFilter": [
+        ("model", lambda: _kalmans(model=_walk())),
+        ("sensors", lambda: _kalmans(sensors=SENSORS)),
+        ("graph", lambda: _kalmans(graph=Graph.from_adjacency([[0]]))),
+        ("fuse", lambda: _kalmans(fuse=3)),
+        ("faults", lambda: _kalmans(faults=Faults(delay=1))),
+        ("mean", lambda: _kalmans().start([1.0], np.eye(6))),
+        ("cov", lambda: _kalmans().start(X0, -np.eye(6))),
+        ("runs", lambda: _kalmans().start(X0, np.eye(6), runs=(0,))),
+        ("state", lambda: _kalmans().step(S, 0.1, [None] * 3)),
+        ("t", lambda: _kalmans().step(_kalmans().start(X0, np.eye(6)), 0.0, [None] * 3)),
+        ("truth", lambda: _kalmans().run(
+            _kalmans().start(X0, np.eye(6)), [0.1], [None] * 3, truth=np.zeros((2, 6)))),
+    ],
+    _G + "GaussianState": [
+        ("means", lambda: GaussianState(0.0, np.zeros(3), np.eye(3), Ledger.empty(1))),
+        ("covariances", lambda: GaussianState(
+            0.0, np.zeros((1, 2)), -np.eye(2)[None], Ledger.empty(1))),
+        ("ledger", lambda: GaussianState(
+            0.0, np.zeros((1, 2)), np.eye(2)[None], Ledger.empty(2))),
     ],
     "distfilt.filters.record.as_dataset": [
         ("states", lambda: as_dataset([S], TIMES, F.model, S)),
@@ -325,6 +373,43 @@ def test_pca_and_no_consensus_run_and_dimensions_without_runs() -> None:
     run = f.run(_begin(f, runs=()), TIMES, [o[:, 0] for o in _data()[1]])
     assert run["mean"].dims == ("time", "agent", "component")
     assert np.isfinite(run["mean"].values).all()
+
+
+def _linear_data(runs: int, steps: int) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    rng, times = _rng(8), np.round(0.1 * np.arange(1, steps + 1), 10)
+    truth = simulate(F.model, np.broadcast_to(X0, (runs, 6)), times, rng=rng)
+    return times, truth, [s.observe(truth, rng=rng) for s in LINEAR]
+
+
+def test_the_centre_of_a_network_of_kalman_filters_is_the_kalman_filter() -> None:
+    """Agent A hears both others: sharing observations makes it the central filter."""
+    from distfilt.kalman.linear import kalman_filter
+
+    times, truth, obs = _linear_data(4, 12)
+    obs[1][3, 1] = NAN
+    obs[2][5, 0, 1] = NAN
+    f = _kalmans(share=True)
+    run = f.run(f.start(X0 + 3, 25 * np.eye(6), runs=(4,)), times, obs, truth=truth)
+    best = kalman_filter(
+        X0 + 3, 25 * np.eye(6), np.concatenate(obs, axis=-1),
+        F=F.model.transition(0.1), Q=F.model.noise(0, 0.1),
+        H=np.vstack([s.matrix(6) for s in LINEAR]), R=np.diag([0.04] * 4 + [0.01] * 3),
+    )
+    # Times are differences of rounded numbers, so transitions agree to 1e-14, not to the bit.
+    assert np.allclose(run["mean"].values[:, :, 0], best.means, atol=1e-9)
+    assert np.allclose(run["covariance"].values[:, :, 0], best.covariances, atol=1e-9)
+    assert {"nees", "squared_error", "scalars"} <= set(run.data_vars)
+
+
+def test_fused_kalman_filters_learn_from_each_other() -> None:
+    times, truth, obs = _linear_data(4, 60)
+    alone, fused = (
+        f.run(f.start(X0 + 3, 25 * np.eye(6), runs=(4,)), times, obs, truth=truth)
+        for f in (_kalmans(), _kalmans(fuse=covariance_intersection))
+    )
+    last = [r["squared_error"].values[-1].mean(axis=0) for r in (alone, fused)]
+    assert (last[1] < last[0]).all()
+    assert fused["scalars"].values[-1].tolist() == [60 * 27 * n for n in (2, 1, 1)]
 
 
 @pytest.mark.slow

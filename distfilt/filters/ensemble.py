@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, callable_, count, generator, increasing, number, same_length
+from ..checks import Array, array, callable_, count, generator, number
 from ..models import Model
 from ..network import Channel, Faults, Graph, Ledger
 from ..progress import track
 from ..sensors import Sensor
 from .assimilation import Update, assimilate
+from .observations import at_one_time, over_times
 from .record import as_dataset
 from .state import EnsembleState
 
@@ -211,7 +212,7 @@ class EnsembleFilter:
         """
         self._check_state(state)
         dt = number(t, "t", above=state.t) - state.t
-        seen = self._checked(observations, state.runs)
+        seen = at_one_time(observations, self.sensors, state.runs)
         earlier = [self._checked_late(item, state) for item in late]
         rng = copy.deepcopy(state.rng)
         channel = Channel(
@@ -244,17 +245,7 @@ class EnsembleFilter:
     ) -> Iterator[EnsembleState]:
         """The states at `times`, one after the other; arguments as in :meth:`run`."""
         self._check_state(state)
-        grid = increasing(times, "times")
-        same_length(observations, self.sensors, "observations", "sensors")
-        series = [
-            None if o is None else array(o, "observations", None, finite=False)
-            for o in observations
-        ]
-        for agent, o in enumerate(series):
-            if o is not None and (o.ndim < 2 or o.shape[0] != grid.size):
-                raise ValueError(
-                    f"observations: needs ({grid.size}, ..., m) for agent {agent}, got {o.shape}"
-                )
+        grid, series = over_times(observations, self.sensors, times)
         waiting = sorted(late, key=lambda item: item.arrived)
         if waiting and grid.size and waiting[-1].arrived > grid[-1]:
             raise ValueError(
@@ -314,29 +305,6 @@ class EnsembleFilter:
         if state.ensembles.shape[-3:] != needed:
             raise ValueError(f"state: needs ensembles (..., {needed}), got {state.ensembles.shape}")
 
-    def _checked(
-        self, observations: Sequence[ArrayLike | None], runs: tuple[int, ...]
-    ) -> list[Array | None]:
-        """Per agent (*runs, m) with NaN where missing, or None where nothing was seen at all."""
-        same_length(observations, self.sensors, "observations", "sensors")
-        out: list[Array | None] = []
-        for agent, (value, sensor) in enumerate(zip(observations, self.sensors, strict=True)):
-            if value is None:
-                out.append(None)
-                continue
-            if sensor is None:
-                raise ValueError(f"observations: needs None for agent {agent}, which has no sensor")
-            seen = array(value, f"observations[{agent}]", (..., sensor.dim), finite=False)
-            if np.isinf(seen).any():
-                raise ValueError(f"observations[{agent}]: needs numbers or NaN, got infinity")
-            if seen.shape[:-1] not in ((), runs):
-                raise ValueError(
-                    f"observations[{agent}]: needs shape {(*runs, sensor.dim)}, got {seen.shape}"
-                )
-            full = np.broadcast_to(seen, (*runs, sensor.dim))
-            out.append(None if np.isnan(full).all() else full)
-        return out
-
     def _checked_late(self, item: Late, state: EnsembleState) -> tuple[int, list[Array | None]]:
         """Where in the history a late observation belongs, and the observations of that time."""
         times = [t for t, _ in state.history] + ([state.t] if self.lag else [])
@@ -352,4 +320,4 @@ class EnsembleFilter:
             raise ValueError(f"late: a {sensor.kind} sensor cannot be late, it compares two times")
         observations: list[ArrayLike | None] = [None] * len(self.sensors)
         observations[item.agent] = item.value
-        return match[0], self._checked(observations, state.runs)
+        return match[0], at_one_time(observations, self.sensors, state.runs)
