@@ -69,6 +69,8 @@ nb_merge_streams = True
 nb_number_source_lines = False
 nb_ipywidgets_js: dict[str, Any] = {}
 nb_mime_priority_overrides = [("html", "application/vnd.jupyter.widget-view+json", None)]
+# A verdict is shown as text or HTML; its third form is for the ledger.
+suppress_warnings = ["mystnb.unknown_mime_type"]
 myst_enable_extensions = [
     "amsmath",
     "attrs_block",

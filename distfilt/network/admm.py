@@ -30,7 +30,7 @@ class AdmmRun:
     iterations : int
         How many.
     primal, dual : float
-        The residuals at the end: largest |local - common|, and ρ times the largest change of the
+        The residuals at the end: largest distance of local from common, and ρ times the largest change of the
         common variable.
 
     Examples

@@ -58,7 +58,8 @@ def stable_substeps(channel: Channel, dt: float, *, alpha: float, a: float, b: f
 
     An eigenvalue λ of the Laplacian contributes the matrix
     :math:`\begin{pmatrix}-\alpha-a\lambda & b\lambda\\ -b\lambda & 0\end{pmatrix}`. Its eigenvalues
-    μ have a negative real part, and a step h is stable when |1 + hμ| < 1 for all of them. The
+    μ have a negative real part, and a step h is stable when
+    :math:`|1+h\mu|<1` for all of them. The
     largest λ is bounded by twice the largest degree (Gershgorin), which agents can agree on.
 
     Parameters
