@@ -20,7 +20,7 @@ export PYTHONHASHSEED := 0
 export MPLCONFIGDIR := $(CURDIR)/$(VENV)/matplotlib
 
 .DEFAULT_GOAL := help
-.PHONY: help environment book test unit types style pairs regress slow outputs identical bench portable lab lock clean
+.PHONY: help environment book test unit types style pairs regress slow outputs identical studies bench portable lab lock clean
 
 help:
 	@echo "make book       environment, library and HTML (warnings are errors); prints the page's path"
@@ -28,6 +28,7 @@ help:
 	@echo "make slow       the tests that take minutes"
 	@echo "make outputs    execute every chapter, store its outputs, write the ledger of reproductions"
 	@echo "make identical  execute every chapter again and compare byte for byte with what is stored"
+	@echo "make studies    run the studies that take too long for a chapter, store them in data/studies"
 	@echo "make portable   stored outputs on another BLAS kernel and without numpy's newer SIMD"
 	@echo "make bench      side-by-side measurements, written to data/bench"
 	@echo "make lab        JupyterLab on the chapters"
@@ -80,6 +81,9 @@ identical: $(STAMP)
 
 portable: $(STAMP)
 	$(PY) book/tools/regress.py --portable
+
+studies: $(STAMP)
+	$(PY) book/tools/studies.py
 
 bench: $(STAMP)
 	mkdir -p data/bench

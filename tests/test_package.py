@@ -23,6 +23,7 @@ FLOORS = {
     "linalg": 1,
     "digests": 1,
     "intervals": 1,
+    "progress": 1,
     "models": 2,
     "network": 2,
     "sensors": 2,
@@ -46,8 +47,10 @@ HOMES = {
     "networkx": {"network"},
     "matplotlib": {"plotting"},
     "xarray": {"filters", "studies"},
+    "loky": {"studies"},
+    "cloudpickle": {"studies"},
 }
-LATE = {*HOMES, "pandas", "scipy.stats", "tqdm"}
+LATE = {*HOMES, "pandas", "scipy.stats", "threadpoolctl", "tqdm"}
 
 
 def dotted(path: Path) -> str:
@@ -174,7 +177,7 @@ def run(code: str, path: Path | None = None) -> str:
 
 def test_import_loads_no_heavy_package() -> None:
     heavy = ["cvxpy", "ecos", "ot", "filterpy", "networkx", "xarray", "matplotlib", "pandas"]
-    heavy += ["scipy.stats", "tqdm"]
+    heavy += ["scipy.stats", "tqdm", "loky", "cloudpickle", "threadpoolctl"]
     modules = [f"distfilt.{dotted(path)}".rstrip(".") for path in PATHS]
     for names in (["distfilt"], modules):
         code = f"import sys, {', '.join(names)}; print([h for h in {heavy} if h in sys.modules])"

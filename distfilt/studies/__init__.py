@@ -1,0 +1,28 @@
+"""Monte Carlo studies: the same trial for many seeds, on any executor, with the same bits.
+
+A trial is a function of one seed. `run` calls it for every seed, on this machine's cores or on any
+``concurrent.futures.Executor``, and keeps what was done when a trial raises, a worker dies or the
+user presses Ctrl-C. `store`, `load` and `check` keep a long study's metrics in a CSV file that a
+later run can be compared with.
+"""
+
+from .checking import check
+from .running import run
+from .seeds import spawn
+from .sources import fingerprint
+from .stored import Stored, load, store
+from .study import Failure, Study, StudyError, StudyInterrupted
+
+__all__ = [
+    "Failure",
+    "Stored",
+    "Study",
+    "StudyError",
+    "StudyInterrupted",
+    "check",
+    "fingerprint",
+    "load",
+    "run",
+    "spawn",
+    "store",
+]
