@@ -1,6 +1,6 @@
 """The book's build: Sphinx on the repository, with stored outputs and nothing from the network.
 
-A figure of a chapter needs a text for readers who do not see it. It stands in the header of the cell:
+A figure of a chapter needs a text for readers who do not see it, in the header of the cell:
 
     ```{code-cell} ipython3
     ---
@@ -30,11 +30,11 @@ from sphinx.errors import ExtensionError
 sys.path.insert(0, str(Path(__file__).parent / "tools"))
 
 from common import BOOK, ROOT, missing_pages
-from pages import chapter_number, escape_stars, number_chapters, write_generated
+from pages import chapter_number, drop_widgets, escape_stars, number_chapters, write_generated
 
 project = "Distributed Nonlinear Filtering"
 author = "The distfilt authors"
-copyright = "2026, The distfilt authors"  # noqa: A001 (Sphinx's name)
+copyright = "2026, The distfilt authors"
 language = "en"
 
 extensions = [
@@ -171,5 +171,6 @@ def setup(app: Sphinx) -> None:
     TocTreeCollector.assign_figure_numbers = with_chapter_numbers  # type: ignore[method-assign]
     app.connect("builder-inited", check_toc)
     app.connect("builder-inited", lambda app: write_generated(BOOK / "_generated"))
+    app.connect("doctree-read", lambda app, tree: drop_widgets(tree))
     app.connect("autodoc-process-docstring", lambda *event: escape_stars(event[-1]))
     app.connect("build-finished", copy_mathjax)

@@ -19,9 +19,10 @@ from typing import Any
 
 import jupytext
 import nbformat
-from common import ROOT, chosen, foreign_text, pinned_environment
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
+
+from common import ROOT, chosen, foreign_text, pinned_environment
 
 KERNELSPEC = {"display_name": "Python 3", "language": "python", "name": "python3"}
 LANGUAGE = {

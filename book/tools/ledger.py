@@ -2,9 +2,10 @@
 
     python book/tools/ledger.py [--check]
 
-``data/published/items.csv`` lists what the papers print; a chapter displays a verdict for an item it
-has reproduced. An item without a verdict is "not yet"; two verdicts for one item are an error. With
-``--check`` nothing is written and ``data/published/ledger.csv`` is compared byte for byte.
+``data/published/items.csv`` lists what the papers print; a chapter displays a verdict for an item
+that it has reproduced. An item without a verdict is "not yet"; two verdicts for one item are an
+error. With ``--check`` nothing is written and ``data/published/ledger.csv`` is compared byte for
+byte.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import nbformat
+
 from common import ROOT, VERDICT, chapters
 
 ITEMS = ROOT / "data" / "published" / "items.csv"

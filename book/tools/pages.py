@@ -10,10 +10,11 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from common import BOOK, ROOT, toc_pages
 from docutils import nodes
-from ledger import ITEMS, LEDGER, VERDICTS, rows_of
 from sphinx.pycode import ModuleAnalyzer
+
+from common import BOOK, ROOT, toc_pages
+from ledger import ITEMS, LEDGER, VERDICTS, rows_of
 
 PAPERS = {
     "grange": "Triangular transport maps",
@@ -27,6 +28,13 @@ def chapter_number(page: str) -> int | None:
     """Return the number that a chapter's file name starts with."""
     found = re.match(r"book/(\d+)-", page)
     return int(found.group(1)) if found else None
+
+
+def drop_widgets(tree: nodes.document) -> None:
+    """Remove what is left of a widget without its script: a line that names its parts."""
+    for node in list(tree.findall(nodes.literal_block)):
+        if node.astext().startswith("interactive(children="):
+            node.parent.remove(node)
 
 
 def number_chapters(env: Any, number_of: Any) -> None:
@@ -50,7 +58,8 @@ def number_chapters(env: Any, number_of: Any) -> None:
 def modules() -> list[str]:
     """Return every module of the library, the package first."""
     root = ROOT / "distfilt"
-    paths = sorted(p for p in root.rglob("*.py") if not p.stem.startswith("_") or p.stem == "__init__")
+    shown = (p for p in root.rglob("*.py") if p.stem == "__init__" or p.stem[0] != "_")
+    paths = sorted(shown)
     names = [p.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".") for p in paths]
     return sorted(name.removesuffix(".__init__") for name in names)
 
@@ -130,7 +139,7 @@ def reproductions_text() -> str:
         lines += ["| Item | Shows | Chapter | Verdict | Ours | Published | Why |"]
         lines += ["|---|---|---|---|---|---|---|"]
         for row in (r for r in rows if r["paper"] == paper):
-            shown = [row["item"], titles[paper, row["item"]], "", *(row[k] for k in (
+            shown = [row["item"].replace(" ", "\u00a0"), titles[paper, row["item"]], "", *(row[k] for k in (
                 "verdict", "ours", "published", "why"))]
             cells = [cell(text) for text in shown]
             cells[2] = chapter_link(row["chapter"])
@@ -139,17 +148,10 @@ def reproductions_text() -> str:
     return "\n".join(lines)
 
 
-def own_filter_text() -> str:
-    """Return the listing of the reader's own filter, when the example exists."""
-    if not (BOOK / "examples" / "own_filter.py").is_file():
-        return ""
-    return "```{literalinclude} /book/examples/own_filter.py\n:language: python\n```\n"
-
-
 def write_generated(folder: Path) -> None:
     """Write the included parts of pages; an unchanged part keeps its date."""
     folder.mkdir(exist_ok=True)
-    parts = {"api.md": api_text(), "own_filter.md": own_filter_text()}
+    parts = {"api.md": api_text()}
     if ITEMS.is_file() and LEDGER.is_file():
         parts["reproductions.md"] = reproductions_text()
     for name, text in parts.items():

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import nbformat
+
 from common import BOOK, ROOT, chosen, foreign_text, is_chapter, missing_pages, toc_pages
 from execute import read
 

@@ -16,6 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import nbformat
+
 from common import ROOT, chosen, pinned_environment
 
 PROBE_BLAS = """\

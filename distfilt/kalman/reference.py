@@ -214,26 +214,12 @@ def filterpy_ukf(
     >>> run.means.round(6)
     array([[2.]])
     """
-    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
-
     sensor = instantaneous(sensors)
     y, grid = series(observations, times, t0, sensor.dim)
     number(alpha, "alpha", above=0)
     number(beta, "beta", at_least=0)
     number(kappa, "kappa", above=-model.dim)
-
-    class Batched(UnscentedKalmanFilter):  # type: ignore[misc]
-        """Moves all sigma points in one call of the model."""
-
-        def compute_process_sigmas(self, dt: float, fx: Any = None, **fx_args: Any) -> None:
-            points = self.points_fn.sigma_points(self.x, self.P)
-            self.sigmas_f = model.step(points, fx_args["t"], dt)
-
-    def start(x: Array, p: Array) -> Any:
-        points = MerweScaledSigmaPoints(model.dim, alpha, beta, kappa)
-        kf = Batched(model.dim, sensor.dim, 0.0, None, None, points)
-        kf.x, kf.P = x.copy(), p.copy()
-        return kf
+    start = _unscented(model, sensor.dim, alpha, beta, kappa)
 
     def step(kf: Any, k: int, z: Array, seen: _Mask) -> None:
         t, dt = float(grid[k]), float(grid[k + 1] - grid[k])
@@ -251,6 +237,28 @@ def filterpy_ukf(
             kf.update(near[seen], R=sensor.noise[np.ix_(seen, seen)], hx=lambda s: next(rows))
 
     return _over_runs(mean, cov, y, start, step, likelihood, model.dim)
+
+
+def _unscented(
+    model: Model, observed: int, alpha: float, beta: float, kappa: float
+) -> Callable[[Array, Array], Any]:
+    """What starts filterpy's filter at a mean and a covariance."""
+    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+
+    class Batched(UnscentedKalmanFilter):  # type: ignore[misc]
+        """Moves all sigma points in one call of the model."""
+
+        def compute_process_sigmas(self, dt: float, fx: Any = None, **fx_args: Any) -> None:
+            points = self.points_fn.sigma_points(self.x, self.P)
+            self.sigmas_f = model.step(points, fx_args["t"], dt)
+
+    def start(x: Array, p: Array) -> Any:
+        points = MerweScaledSigmaPoints(model.dim, alpha, beta, kappa)
+        kf = Batched(model.dim, observed, 0.0, None, None, points)
+        kf.x, kf.P = x.copy(), p.copy()
+        return kf
+
+    return start
 
 
 def _over_runs(

@@ -30,8 +30,8 @@ class AdmmRun:
     iterations : int
         How many.
     primal, dual : float
-        The residuals at the end: largest distance of local from common, and ρ times the largest change of the
-        common variable.
+        The residuals at the end: the largest distance of local from common, and ρ times the
+        largest change of the common variable.
 
     Examples
     --------

@@ -18,6 +18,7 @@ SIZES = ((1, 6, 300), (3, 13, 800), (10, 40, 2000))
 """Observations m, state d, and the ratio that ECOS has to lose by."""
 
 MEMBERS = 200
+CALLS = 200
 
 
 def samples(m: int, d: int) -> tuple[np.ndarray, np.ndarray]:
@@ -33,19 +34,18 @@ def main() -> int:
     rows, missed = [], 0
     for m, d, needed in SIZES:
         y, x = samples(m, d)
-        calls = 200
-        closed = timed(lambda y=y, x=x: [fit(y, x) for _ in range(calls)][0], 5)
+        closed = timed(lambda y=y, x=x: [fit(y, x) for _ in range(CALLS)][0], 5)
         exact = compose(closed.result, y, x, y[0])
         for solver in ("ECOS", "CLARABEL"):
             solved = timed(lambda y=y, x=x, s=solver: fit_convex(y, x, solver=s), 3)
-            ratio = solved.cpu / (closed.cpu / calls)
+            ratio = solved.cpu / (closed.cpu / CALLS)
             gap = np.abs(compose(solved.result, y, x, y[0]) - exact).max()
             wanted = needed if solver == "ECOS" else None
             missed += gap >= 1e-8 or (wanted is not None and ratio < wanted)
             rows.append({
                 "variables": m + d,
                 "solver": solver,
-                "closed_form_us": f"{closed.cpu / calls * 1e6:.1f}",
+                "closed_form_us": f"{closed.cpu / CALLS * 1e6:.1f}",
                 "solver_ms": f"{solved.cpu * 1e3:.1f}",
                 "ratio": f"{ratio:.0f}",
                 "needed": wanted or "",

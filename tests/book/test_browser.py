@@ -12,6 +12,7 @@ from typing import Any
 from urllib.parse import unquote, urldefrag, urlparse
 
 import pytest
+
 from common import toc_pages
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -148,7 +149,8 @@ def broken_links(visits: dict[Path, Visit]) -> list[str]:
             url, anchor = urldefrag(link)
             target = Path(unquote(urlparse(url).path))
             known = visits[target].report["ids"] if target in visits else None
-            if not target.is_file() or (anchor and known is not None and unquote(anchor) not in known):
+            lost = anchor and known is not None and unquote(anchor) not in known
+            if not target.is_file() or lost:
                 out.append(f"{page.name} -> {link}")
     return out
 
@@ -197,7 +199,8 @@ def test_nothing_scrolls_sideways(visits: dict[Path, Visit]) -> None:
 
 
 BAD = r"""<!doctype html><title>bad</title><body>
-<p>\(x\)</p><p class="math">x</p><img src="nowhere.png"><a href="nowhere.html">a</a><a href="#no">b</a>
+<p>\(x\)</p><p class="math">x</p><img src="nowhere.png">
+<a href="nowhere.html">a</a><a href="#no">b</a>
 <img src="http://example.invalid/a.png" alt="far"><div style="width: 2000px">wide</div>
 <script>throw new Error("broken")</script></body>"""
 

@@ -1,7 +1,7 @@
 """What guards the book must itself be able to fail: a small chapter is broken in every way.
 
-Each test runs the commands of ``make test`` on a copy of the chapter in ``fixtures``: the comparison of
-the pair, and nbval over the stored outputs.
+Each test runs the commands of ``make test`` on a copy of the chapter in ``fixtures``: the
+comparison of the pair, and nbval over the stored outputs.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def test_changed_prose_fails(chapter: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [
-        ("    alt: One curve that falls from 1 at time 0 to 0.14 at time 1.", "    width: 80%", "alt"),
+        ("alt: One curve that falls from 1 at time 0 to 0.14 at time 1.", "width: 80%", "alt"),
         ("    caption: The curve {eq}`eq-small`.\n", "", "caption"),
         ("rate = 2.0", "rate = 2.0  # " + "x" * 70, "at most 79"),
     ],

@@ -6,6 +6,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
+
 from ledger import COLUMNS, ITEMS, LEDGER, VERDICTS, current, ledger, rows_of, text_of
 
 ITEM = {"paper": "grange", "item": "Fig. 1", "title": "Error", "chapter": "04-satellite-network"}

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from common import missing_pages, toc_pages
 from ledger import LEDGER, VERDICTS, rows_of
 from pages import modules
@@ -26,8 +27,8 @@ def page(name: str) -> str:
 
 
 def plain(text: str) -> str:
-    """Return the text of a page without its tags."""
-    return html.unescape(re.sub(r"<[^>]+>", "", text))
+    """Return the text of a page without its tags and with plain spaces."""
+    return html.unescape(re.sub(r"<[^>]+>", "", text)).replace("\u00a0", " ")
 
 
 @pytest.mark.parametrize("name", toc_pages())
