@@ -307,7 +307,8 @@ def test_raise_stops_at_the_first_failure_and_keeps_what_was_done(workers: int) 
         studies.run(trial, studies.spawn(9, 2000), workers=workers, chunk=1)
     study = caught.value.study
     assert [f.index for f in study.failures] == [10]
-    assert study.done[:8].all() and 0 < len(study.missing) < 1992
+    # At most four chunks a worker are ahead of the oldest that is not back.
+    assert study.done.sum() >= 3 and len(study.missing) > 1900
     assert len(study.missing) + study.done.sum() + 1 == 2000
     # What is missing completes the study.
     rest = studies.run(number, [study.seed(i) for i in study.missing], workers=1)
@@ -357,7 +358,7 @@ def test_a_foreign_pool_that_breaks_gives_the_partial_study(spawned_pool: Execut
             errors="collect",
         )
     study = caught.value.study
-    assert study.done[:40].all() and not study.done[60] and 60 in study.missing
+    assert study.done.sum() >= 40 and not study.done[60] and 60 in study.missing
     assert all(study.values[i] == i for i in np.flatnonzero(study.done))
 
 
