@@ -227,3 +227,33 @@ def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
     assert tops == {"distfilt", next(t for t in tops if t.endswith(".dist-info"))}
     found = sorted(p.relative_to(wheel / "distfilt") for p in (wheel / "distfilt").rglob("*.py"))
     assert found == [p.relative_to(PACKAGE) for p in PATHS]
+
+
+READ_FROM_WHEEL = """
+from pathlib import Path
+import distfilt
+from distfilt import published
+here = Path.cwd()
+assert Path(distfilt.__file__).is_relative_to(here), distfilt.__file__
+assert published.root().is_relative_to(here), published.root()
+print(len(published.items()), len(published.table("grange", "table-2").rows))
+print(published.scenario("grange", "table-2").name)
+"""
+
+
+def test_installed_library_reads_the_data_it_carries(wheel: Path) -> None:
+    items, rows, _ = run(READ_FROM_WHEEL, wheel).split(maxsplit=2)
+    assert int(items) == 21 and int(rows) > 0
+
+
+TIMED = """
+import time, numpy, scipy.linalg
+start = time.perf_counter()
+import distfilt
+print(time.perf_counter() - start)
+"""
+
+
+def test_import_is_quick() -> None:
+    # The least of three: the first may read from a cold disk.
+    assert min(float(run(TIMED)) for _ in range(3)) < 0.4

@@ -13,7 +13,7 @@ from typing import Any
 from docutils import nodes
 from sphinx.pycode import ModuleAnalyzer
 
-from common import BOOK, ROOT, toc_pages
+from common import ROOT, toc_pages
 from ledger import ITEMS, LEDGER, VERDICTS, rows_of
 
 PAPERS = {
@@ -139,10 +139,9 @@ def reproductions_text() -> str:
         lines += ["| Item | Shows | Chapter | Verdict | Ours | Published | Why |"]
         lines += ["|---|---|---|---|---|---|---|"]
         for row in (r for r in rows if r["paper"] == paper):
-            shown = [row["item"].replace(" ", "\u00a0"), titles[paper, row["item"]], "", *(row[k] for k in (
-                "verdict", "ours", "published", "why"))]
-            cells = [cell(text) for text in shown]
-            cells[2] = chapter_link(row["chapter"])
+            cells = [row["item"].replace(" ", "\u00a0"), cell(titles[paper, row["item"]])]
+            cells += [chapter_link(row["chapter"])]
+            cells += [cell(row[name]) for name in ("verdict", "ours", "published", "why")]
             lines += ["| " + " | ".join(cells) + " |"]
         lines += [""]
     return "\n".join(lines)
