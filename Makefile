@@ -20,6 +20,7 @@ export PYTHONHASHSEED := 0
 export MPLCONFIGDIR := $(CURDIR)/$(VENV)/matplotlib
 
 .DEFAULT_GOAL := help
+.NOTPARALLEL:
 .PHONY: help environment book test unit types style pairs regress slow outputs identical studies bench portable lab lock clean
 
 help:
@@ -87,7 +88,7 @@ studies: $(STAMP)
 
 bench: $(STAMP)
 	mkdir -p data/bench
-	set -e; for script in tests/bench/*.py; do echo "$$script"; $(PY) "$$script"; done
+	set -e; for script in tests/bench/bench_*.py; do echo "$$script"; $(PY) "$$script"; done
 
 lab: $(STAMP)
 	$(PY) -m jupyterlab --notebook-dir=book
