@@ -169,9 +169,13 @@ BAD_INPUT = {
     "distfilt.filters.record.as_dataset": [
         ("states", lambda: as_dataset([S], TIMES, F.model, S)),
         ("truth", lambda: as_dataset([S], [0.1], F.model, S, np.zeros((2, 6)))),
+        ("scores", lambda: as_dataset([S], [0.1], F.model, S, scores=["rmse"])),
     ],
 }
-EXEMPT = {"distfilt.filters.assimilation.Update": "a type"}
+EXEMPT = {
+    "distfilt.filters.assimilation.Update": "a type",
+    "distfilt.filters.record.SCORES": "a constant",
+}
 
 
 def test_stepping_a_state_twice_gives_the_same_bits() -> None:
@@ -399,6 +403,12 @@ def test_the_centre_of_a_network_of_kalman_filters_is_the_kalman_filter() -> Non
     assert np.allclose(run["mean"].values[:, :, 0], best.means, atol=1e-9)
     assert np.allclose(run["covariance"].values[:, :, 0], best.covariances, atol=1e-9)
     assert {"nees", "squared_error", "scalars"} <= set(run.data_vars)
+
+
+def test_only_the_wanted_scores_are_recorded() -> None:
+    truth, obs = _data()
+    run = F.run(S, TIMES, obs, truth=truth, scores=["nees"])
+    assert "nees" in run and "crps" not in run and "squared_error" not in run
 
 
 def test_fused_kalman_filters_learn_from_each_other() -> None:

@@ -6,7 +6,7 @@ Algorithm 1 of Grange et al., for any model, sensors, graph, update and consensu
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ from ..progress import track
 from ..sensors import Sensor
 from .assimilation import Update, assimilate
 from .observations import at_one_time, over_times
-from .record import as_dataset
+from .record import SCORES, as_dataset
 from .state import EnsembleState
 
 if TYPE_CHECKING:
@@ -265,6 +265,7 @@ class EnsembleFilter:
         observations: Sequence[ArrayLike | None],
         *,
         truth: ArrayLike | None = None,
+        scores: Collection[str] = SCORES,
         late: Sequence[Late] = (),
         progress: bool = False,
     ) -> xarray.Dataset:
@@ -279,7 +280,9 @@ class EnsembleFilter:
         observations : sequence of length A
             Per agent (T, *runs, m) or (T, m), or None. NaN marks what is missing.
         truth : array_like, (T, *runs, d), optional
-            If given, errors, NEES and CRPS are recorded too.
+            If given, the scores are recorded too.
+        scores : collection of {"squared_error", "nees", "crps"}
+            Which of them; CRPS costs about as much as the filter.
         late : sequence of Late
             Each is taken in at the first of `times` that is not before its arrival.
         progress : bool
@@ -296,7 +299,7 @@ class EnsembleFilter:
         if truth is not None:
             known = array(truth, "truth", (np.size(times), *state.runs, self.model.dim))
         states = self.steps(state, times, observations, late=late, progress=progress)
-        return as_dataset(states, times, self.model, state, known)
+        return as_dataset(states, times, self.model, state, known, scores=scores)
 
     def _check_state(self, state: Any) -> None:
         if not isinstance(state, EnsembleState):

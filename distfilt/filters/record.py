@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import ensembles
-from ..checks import Array, array, increasing
+from ..checks import Array, array, choice, increasing
 from ..metrics import crps, ensemble_nees, squared_error
 from ..models import Model
 from .state import EnsembleState
@@ -17,12 +17,18 @@ from .state import EnsembleState
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["as_dataset"]
+__all__ = ["SCORES", "as_dataset"]
 
 _SENT = ("messages", "scalars", "bytes", "lost")
 
 
-def _recorded(state: EnsembleState, truth: Array | None) -> dict[str, Array]:
+SCORES = ("squared_error", "nees", "crps")
+"""What can be recorded beside a known truth."""
+
+
+def _recorded(
+    state: EnsembleState, truth: Array | None, scores: Collection[str]
+) -> dict[str, Array]:
     e = state.ensembles
     mean = ensembles.mean(e)
     squares = ensembles.mean(ensembles.anomalies(e) ** 2)
@@ -32,9 +38,11 @@ def _recorded(state: EnsembleState, truth: Array | None) -> dict[str, Array]:
         out[name] = getattr(state.ledger, name)
     if truth is not None:
         known = np.broadcast_to(truth[..., None, :], mean.shape)
-        out["squared_error"] = squared_error(mean, known)
-        out["crps"] = crps(e, known)
-        if state.members > state.dim:
+        if "squared_error" in scores:
+            out["squared_error"] = squared_error(mean, known)
+        if "crps" in scores:
+            out["crps"] = crps(e, known)
+        if "nees" in scores and state.members > state.dim:
             out["nees"] = ensemble_nees(e, known)
     return out
 
@@ -45,6 +53,8 @@ def as_dataset(
     model: Model,
     start: EnsembleState,
     truth: Array | None = None,
+    *,
+    scores: Collection[str] = SCORES,
 ) -> xarray.Dataset:
     """Collect the states of a run in an xarray.Dataset.
 
@@ -59,7 +69,9 @@ def as_dataset(
     start : EnsembleState
         The state before the first step, for the run axes.
     truth : ndarray, (T, *runs, d), optional
-        For errors, NEES and CRPS.
+        For the scores.
+    scores : collection of {"squared_error", "nees", "crps"}
+        Which of them to record.
 
     Returns
     -------
@@ -70,6 +82,8 @@ def as_dataset(
     import xarray
 
     grid = increasing(times, "times")
+    for score in scores:
+        choice(score, "scores", SCORES)
     if truth is not None:
         array(truth, "truth", (grid.size, *start.runs, model.dim))
     columns: dict[str, list[Array]] = {}
@@ -77,7 +91,7 @@ def as_dataset(
     for state in states:
         if taken < grid.size:
             known = None if truth is None else truth[taken]
-            for name, value in _recorded(state, known).items():
+            for name, value in _recorded(state, known, scores).items():
                 columns.setdefault(name, []).append(value)
         taken += 1
     if taken != grid.size:
