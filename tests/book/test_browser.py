@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -126,12 +127,19 @@ def driver(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     chromium.quit()
 
 
+def redirect(page: Path) -> Path | None:
+    """Return the page that another one only sends its reader on to."""
+    text = page.read_text(encoding="utf-8")
+    sent = re.search(r'http-equiv="refresh" content="0; *url=([^"]+)"', text, flags=re.IGNORECASE)
+    return (page.parent / sent.group(1)).resolve() if sent else None
+
+
 @pytest.fixture(scope="module")
 def visits(driver: Any) -> dict[Path, Visit]:
     """Return what the browser met on each built page."""
     pages = sorted(p for p in BUILT.rglob("*.html") if "_static" not in p.parts)
     assert pages, "the book is not built: make book"
-    return {page: visit(driver, page) for page in pages}
+    return {page: visit(driver, page) for page in pages if redirect(page) is None}
 
 
 def found(visits: dict[Path, Visit], key: str) -> dict[str, Any]:
@@ -163,6 +171,7 @@ def outside(seen: Visit) -> list[str]:
 def test_every_page_of_the_contents_is_there(visits: dict[Path, Visit]) -> None:
     names = {page.relative_to(BUILT).with_suffix("").as_posix() for page in visits}
     assert set(toc_pages()) <= names
+    assert redirect(BUILT / "index.html") == BUILT / "book" / "index.html"
 
 
 def test_no_request_leaves_the_machine(visits: dict[Path, Visit]) -> None:
