@@ -134,6 +134,7 @@ class Channel:
         weights: Weights | ArrayLike | sparse.sparray,
         *,
         lost: str = "mutual",
+        rounds: int = 1,
     ) -> Array:
         """Let every agent replace its value by a weighted sum of its own and what it hears.
 
@@ -153,6 +154,8 @@ class Channel:
               that are left; the given ones are not used.
             - ``"keep"``: the receiver gives the weight to its own value, ``"renormalise"``: to all
               that it has, ``"zero"``: to nothing. These move the average.
+        rounds : int
+            How many times; the values are checked once.
 
         Returns
         -------
@@ -164,7 +167,11 @@ class Channel:
             If the shapes do not fit, an agent weights one that it does not hear, or the rule needs
             links both ways and some go one way.
         """
-        return self.combine_with_own(values, weights, lost=lost)[0]
+        v, w = self._checked(values, weights)
+        choice(lost, "lost", LOST)
+        for _ in range(count(rounds, "rounds")):
+            v = self._mixed(v, w, lost)[0]
+        return v
 
     def combine_with_own(
         self,
@@ -174,20 +181,29 @@ class Channel:
         lost: str = "mutual",
     ) -> tuple[Array, Array]:
         """As :meth:`combine`, with the weight that each agent's own value got, (*runs, A)."""
+        v, w = self._checked(values, weights)
+        return self._mixed(v, w, choice(lost, "lost", LOST))
+
+    def _checked(
+        self, values: ArrayLike, weights: Weights | ArrayLike | sparse.sparray
+    ) -> tuple[Array, Weights]:
         v = array(values, "values", (*self.runs, self.graph.size, "k"))
-        known = isinstance(weights, Weights) and weights.graph is self.graph
-        w = weights if known else Weights.from_matrix(
-            self.graph, weights.matrix if isinstance(weights, Weights) else weights
-        )
-        assert isinstance(w, Weights)
-        if self._perfect:
-            self._owed[v.shape[-1]] = self._owed.get(v.shape[-1], 0) + 1
-            if not self.runs:
-                return w.matrix @ v, w.own
-            front = np.moveaxis(v, -2, 0)
-            out = (w.matrix @ front.reshape(self.graph.size, -1)).reshape(front.shape)
-            return np.ascontiguousarray(np.moveaxis(out, 0, -2)), w.own
-        return self._combine_what_arrives(v, w, choice(lost, "lost", LOST))
+        if isinstance(weights, Weights):
+            if weights.graph is self.graph:
+                return v, weights
+            weights = weights.matrix
+        return v, Weights.from_matrix(self.graph, weights)
+
+    def _mixed(self, v: Array, w: Weights, lost: str) -> tuple[Array, Array]:
+        """One round: the combined values, and the weight that each agent's own value got."""
+        if not self._perfect:
+            return self._combine_what_arrives(v, w, lost)
+        self._owed[v.shape[-1]] = self._owed.get(v.shape[-1], 0) + 1
+        if not self.runs:
+            return w.matrix @ v, w.own
+        front = np.moveaxis(v, -2, 0)
+        out = (w.matrix @ front.reshape(self.graph.size, -1)).reshape(front.shape)
+        return np.ascontiguousarray(np.moveaxis(out, 0, -2)), w.own
 
     def carry(self, values: ArrayLike, *, acknowledged: bool = False) -> Array:
         """Send a payload of its own along each link.

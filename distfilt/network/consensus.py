@@ -87,9 +87,7 @@ def average(
         raise ValueError(
             f"weights: needs columns that sum to 1 to keep the average, got {columns.round(6)}"
         )
-    for _ in range(count(rounds, "rounds")):
-        out = channel.combine(out, weights, lost=lost)
-    return out
+    return channel.combine(out, weights, lost=lost, rounds=rounds)
 
 
 def finite_time(values: ArrayLike, channel: Channel) -> Array:
