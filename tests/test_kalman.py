@@ -25,13 +25,12 @@ from distfilt.kalman import (
     particle_filter,
     predict,
     resample,
-    stack,
     systematic,
     update,
 )
 from distfilt.models import LinearModel, Model, simulate
 from distfilt.models.satellite import clohessy_wiltshire
-from distfilt.sensors import angle, differential, direct, range_
+from distfilt.sensors import angle, differential, direct, range_, stack
 
 STEPS, RUNS, D, M = 7, 4, 3, 2
 
@@ -558,7 +557,7 @@ BAD_INPUT: dict[str, list[tuple[str, Callable[[], Any]]]] = {
         ("method", lambda: resample(Particles(_X, np.zeros(9)), rng=_RNG, method="best")),
         ("rng", lambda: resample(Particles(_X, np.zeros(9)), rng=0)),  # type: ignore[arg-type]
     ],
-    "distfilt.kalman.stack": [
+    "distfilt.sensors.stack": [
         ("sensors", lambda: stack([])),
         ("sensors", lambda: stack([direct([0], noise=1.0), 3])),  # type: ignore[list-item]
         ("sensors", lambda: stack(direct([0], noise=1.0))),  # type: ignore[arg-type]

@@ -1,6 +1,5 @@
 """Kalman filters: exact and batched, filterpy's as a reference, ensemble and particle filters."""
 
-from ..sensors import stack
 from .ensemble import EnsembleRun, enkf, enkf_filter
 from .linear import GaussianRun, kalman_filter, predict, update
 from .particle import (
@@ -28,7 +27,6 @@ __all__ = [
     "particle_filter",
     "predict",
     "resample",
-    "stack",
     "systematic",
     "update",
 ]

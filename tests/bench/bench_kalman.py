@@ -17,10 +17,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 import numpy as np
 from _bench import timed, write
 
-from distfilt.kalman import filterpy_kf, kalman_filter, stack
+from distfilt.kalman import filterpy_kf, kalman_filter
 from distfilt.models import simulate
 from distfilt.models.satellite import clohessy_wiltshire
-from distfilt.sensors import direct
+from distfilt.sensors import direct, stack
 
 RUNS, STEPS, DT = 500, 200, 0.1
 REQUIRED = {"common pattern": 50.0, "gaps that differ by run": 8.0}
