@@ -275,7 +275,9 @@ def test_threads_of_every_blas_are_held_and_given_back(spawned_pool: Executor) -
                 study = studies.run(
                     _blas_threads, studies.spawn(0, 8), blas_threads=wanted, **options
                 )
-                assert all(set(found) == {wanted} for found in study.values)
+                # A library that was built for one thread stays at one.
+                assert all(set(found) <= {1, wanted} for found in study.values)
+                assert all(wanted in found for found in study.values)
     assert _blas_threads(SeedSequence(0)) == before
 
 
