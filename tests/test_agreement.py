@@ -45,6 +45,8 @@ def _quadratic(v: np.ndarray, rho: float) -> np.ndarray:
 
 
 _ZEROS, _EYES = np.zeros((3, 2)), np.tile(np.eye(2), (3, 1, 1))
+_ONE_WAY = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1)], directed=True)
+_UNBALANCED = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1), (0, 1)], directed=True)
 _T = "distfilt.network.tracking."
 _F = "distfilt.network.fusion."
 _A = "distfilt.network.admm."
@@ -73,6 +75,7 @@ BAD_INPUT = {
         ("dt", lambda: _pi(dt=0.0)),
         ("alpha", lambda: _pi(alpha=-0.1)),
         ("substeps", lambda: _pi(substeps=0)),
+        ("channel", lambda: _pi(channel=Channel(_ONE_WAY))),
     ],
     _T + "stable_substeps": [
         ("dt", lambda: stable_substeps(_star(), 0.0, **GAINS)),
@@ -84,6 +87,8 @@ BAD_INPUT = {
         ("inputs", lambda: first_order(_ZEROS, _ZEROS[:2], _ZEROS, _star())),
         ("previous", lambda: first_order(_ZEROS, _ZEROS, NAN * _ZEROS, _star())),
         ("channel", lambda: first_order(_ZEROS, _ZEROS, _ZEROS, None)),
+        ("weights", lambda: first_order(_ZEROS, _ZEROS, _ZEROS, Channel(_UNBALANCED),
+                                        weights=weights.laplacian(_UNBALANCED, 0.3))),
     ],
     _F + "covariance_intersection": [
         *_fusion_cases(covariance_intersection),
@@ -161,6 +166,15 @@ def test_explicit_steps_blow_up_where_the_substeps_do_not() -> None:
             state = pi_step(state, u, Channel(graph), dt=0.1, substeps=substeps, **GAINS)
         ends.append(np.abs(state.estimate - u.mean()).max())
     assert ends[0] > 1e6 and ends[1] < 0.1
+
+
+def test_first_order_tracking_on_a_digraph_with_balanced_weights() -> None:
+    u = x = _rng(3).standard_normal((3, 2))
+    channel = Channel(_UNBALANCED)
+    for _ in range(200):
+        new = u + 0.1 * np.array([1.0, -2.0])
+        x, u = first_order(x, new, u, channel, weights=weights.balanced(_UNBALANCED)), new
+    assert np.abs(x - u.mean(axis=0)).max() < 1e-10
 
 
 @given(st.integers(0, 500), st.floats(0.01, 2), st.floats(0, 2), st.floats(0, 2))

@@ -109,6 +109,10 @@ BAD_INPUT = {
         ("links", lambda: weights.Weights(_STAR, np.ones(3), np.ones(3))),
     ],
     _W + "balanced": [("graph", lambda: weights.balanced(_APART))],
+    _W + "keeping": [
+        ("weights", lambda: weights.keeping(np.eye(3))),
+        ("weights", lambda: weights.keeping(weights.Weights(_STAR, np.ones(3), np.ones(4)))),
+    ],
     _W + "laplacian": [("gain", lambda: weights.laplacian(_STAR, -0.1))],
     _W + "maximum_degree": [("graph", lambda: weights.maximum_degree(_ONE_WAY))],
     _W + "metropolis": [("graph", lambda: weights.metropolis(_ONE_WAY))],

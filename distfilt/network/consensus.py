@@ -82,11 +82,7 @@ def average(
         weights = weighting.laplacian(channel.graph, number(gain, "gain", above=0))
     elif weights is None:
         weights = weighting.metropolis(channel.graph)
-    columns = weights.matrix.sum(axis=0)
-    if np.abs(columns - 1).max() > 1e-9:
-        raise ValueError(
-            f"weights: needs columns that sum to 1 to keep the average, got {columns.round(6)}"
-        )
+    weighting.keeping(weights)
     return channel.combine(out, weights, lost=lost, rounds=rounds)
 
 

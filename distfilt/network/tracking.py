@@ -152,6 +152,8 @@ def pi_step(
     """
     if not isinstance(state, PIState):
         raise ValueError(f"state: needs a PIState, got {type(state).__name__}")
+    if channel.graph.directed:
+        raise ValueError("channel: needs links both ways to keep the sum, got one-way links")
     shape = (*channel.runs, channel.graph.size, state.estimate.shape[-1])
     nu = array(state.estimate, "state", shape)
     eta = state.integral
@@ -197,7 +199,7 @@ def first_order(
     channel : Channel
         The door between agents.
     weights : Weights, optional
-        Metropolis by default.
+        Metropolis by default. Columns have to sum to one.
     lost : str
         See :meth:`Channel.combine`.
 
@@ -220,5 +222,5 @@ def first_order(
         raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
     x = array(estimates, "estimates", (*channel.runs, channel.graph.size, "k"))
     change = array(inputs, "inputs", x.shape) - array(previous, "previous", x.shape)
-    w = weighting.metropolis(channel.graph) if weights is None else weights
+    w = weighting.metropolis(channel.graph) if weights is None else weighting.keeping(weights)
     return channel.combine(x, w, lost=lost) + change

@@ -12,7 +12,7 @@ from scipy import sparse
 from ..checks import Array, array, number
 from .graphs import Graph
 
-__all__ = ["Weights", "balanced", "laplacian", "maximum_degree", "metropolis", "push"]
+__all__ = ["Weights", "balanced", "keeping", "laplacian", "maximum_degree", "metropolis", "push"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,6 +201,25 @@ def balanced(graph: Graph) -> Weights:
     scale = 1 / (2 * max((p * graph.degrees).max(), 1e-300)) if graph.size > 1 else 0.0
     links = scale * p[graph.receivers]
     return Weights(graph, 1 - _row_sums(graph, links), links)
+
+
+def keeping(weights: Weights) -> Weights:
+    """The weights themselves, or a ValueError if their columns do not sum to one.
+
+    Examples
+    --------
+    >>> from distfilt.network import graphs
+    >>> keeping(metropolis(graphs.path(3))).own.round(3)
+    array([0.667, 0.333, 0.667])
+    """
+    if not isinstance(weights, Weights):
+        raise ValueError(f"weights: needs Weights, got {type(weights).__name__}")
+    columns = weights.matrix.sum(axis=0)
+    if np.abs(columns - 1).max() > 1e-9:
+        raise ValueError(
+            f"weights: needs columns that sum to 1 to keep the average, got {columns.round(6)}"
+        )
+    return weights
 
 
 def _row_sums(graph: Graph, links: Array) -> Array:
