@@ -8,6 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from distfilt.checks import SolverError
+from distfilt.ensembles import sample_covariance
+from distfilt.kalman.ensemble import enkf
 from distfilt.triangular import AffineMap, affine, conditioning
 from distfilt.triangular.affine import fit, fit_convex, gradient, objective
 from distfilt.triangular.conditioning import (
@@ -15,7 +17,9 @@ from distfilt.triangular.conditioning import (
     compose,
     pca_update,
     principal_directions,
+    sample_update,
 )
+from distfilt.triangular.regularised import informed_update, known_noise_update
 
 NAN = float("nan")
 
@@ -48,6 +52,7 @@ _MAP = fit(_Y, _X)
 _ONE = [[0.04]]
 _A = "distfilt.triangular.affine."
 _T = "distfilt.triangular.conditioning."
+_R = "distfilt.triangular.regularised."
 
 
 def _update(update: object = affine_update, **change: object) -> object:
@@ -61,6 +66,19 @@ def _pca(**change: object) -> object:
     options = {"n_state": 1, "n_observed": 1}
     options.update(change)
     return _update(pca_update, **options)
+
+
+def _update_cases(update: object) -> list[tuple[str, object]]:
+    return [
+        ("ensemble", lambda: _update(update, ensemble=[1.0])),
+        ("predicted", lambda: _update(update, predicted=_Y[:4])),
+        ("predicted", lambda: _update(update, predicted=NAN * _Y)),
+        ("observed", lambda: _update(update, observed=[NAN])),
+        ("observed", lambda: _update(update, observed=[0.1, 0.2])),
+        ("noise", lambda: _update(update, noise=[[-1.0]])),
+        ("noise", lambda: _update(update, noise=np.eye(2))),
+        ("rng", lambda: _update(update, rng=1)),
+    ]
 
 
 BAD_INPUT = {
@@ -79,6 +97,9 @@ BAD_INPUT = {
         ("x", lambda: fit(_Y, np.ones((20, 2)))),
         ("x", lambda: fit(_Y, _X[:, [0, 0]])),
         ("x", lambda: fit(_X[:, :1], _X)),
+        ("x", lambda: fit(_Y, _X @ [[1.0, 1.0, 0.3], [0.0, 1.0, 0.7]])),
+        ("x", lambda: fit(_Y, np.column_stack([_X, np.full(20, 0.1)]))),
+        ("y", lambda: fit(_Y @ [[1.0, 0.3]], _X)),
         ("y", lambda: fit(np.zeros((20, 1)), _X)),
         ("y", lambda: fit(_Y[:10], _X)),
         ("x", lambda: fit(_Y, NAN * _X)),
@@ -97,14 +118,23 @@ BAD_INPUT = {
         ("coefficients", lambda: gradient([0.0, 0.0], [[1.0]])),
     ],
     _A + "objective": [("x", lambda: objective(_MAP, _Y, _X[:, :1]))],
-    _T + "affine_update": [
-        ("ensemble", lambda: _update(ensemble=[1.0])),
-        ("predicted", lambda: _update(predicted=_Y[:4])),
-        ("observed", lambda: _update(observed=[NAN])),
-        ("observed", lambda: _update(observed=[0.1, 0.2])),
-        ("noise", lambda: _update(noise=[[-1.0]])),
-        ("noise", lambda: _update(noise=np.eye(2))),
-        ("rng", lambda: _update(rng=1)),
+    _T + "affine_update": _update_cases(affine_update),
+    _T + "sample_update": [
+        *_update_cases(sample_update),
+        ("x", lambda: _update(sample_update, ensemble=_X[:3], predicted=_Y[:3])),
+        ("x", lambda: _update(sample_update, ensemble=_X[:, [0, 0]])),
+    ],
+    _R + "known_noise_update": [
+        *_update_cases(known_noise_update),
+        ("ensemble", lambda: _update(known_noise_update, ensemble=_X[:1], predicted=_Y[:1])),
+        ("noise", lambda: _update(known_noise_update, noise=np.eye(1)[None])),
+        ("shrinkage", lambda: _update(known_noise_update, shrinkage=1.1)),
+        ("ridge", lambda: _update(known_noise_update, ridge=-0.1)),
+    ],
+    _R + "informed_update": [
+        *_update_cases(informed_update),
+        ("ensemble", lambda: _update(informed_update, ensemble=_X[:1], predicted=_Y[:1])),
+        ("threshold", lambda: _update(informed_update, threshold=NAN)),
     ],
     _T + "compose": [
         ("x", lambda: compose(_MAP, _Y, [1.0], [0.1])),
@@ -307,3 +337,89 @@ def test_another_fit_can_be_handed_in() -> None:
     solved = affine_update(*inputs, rng=_rng(3), fit=affine.fit_convex)
     assert np.abs(closed - solved).max() < 1e-6
     assert conditioning.affine_update is affine_update
+
+
+def test_known_noise_is_the_filter_of_chapter_1() -> None:
+    y, x = _samples(10, leading=(3,))
+    inputs = (x, y, np.zeros((3, 2)), np.diag([0.3, 0.2]))
+    ours = known_noise_update(*inputs, rng=_rng(3))
+    theirs = enkf(*inputs, rng=_rng(3), known_noise=True)
+    assert np.abs(ours - theirs).max() < 1e-10
+
+
+def test_known_noise_has_the_smaller_error_in_small_ensembles() -> None:
+    """Posterior means of 4000 ensembles of 8 members, four components, all observed."""
+    rng = _rng(5)
+    x = rng.standard_normal((4000, 10, 4))
+    inputs = (x, x, np.ones((4000, 4)), np.eye(4))
+    error = {
+        name: ((update(*inputs, rng=_rng(6)).mean(axis=1) - 0.5) ** 2).mean()
+        for name, update in (("sampled", affine_update), ("known", known_noise_update))
+    }
+    assert error["known"] < 0.8 * error["sampled"]
+
+
+def test_shrinkage_and_ridge_have_their_limits() -> None:
+    y, x = _samples(11)
+    inputs = (x, y, np.zeros(2), np.diag([0.3, 0.2]))
+    plain = known_noise_update(*inputs, rng=_rng(3))
+    none = known_noise_update(*inputs, rng=_rng(3), shrinkage=1.0)
+    assert np.array_equal(none, x)
+    assert np.abs(known_noise_update(*inputs, rng=_rng(3), ridge=1e12) - x).max() < 1e-6
+    little = known_noise_update(*inputs, rng=_rng(3), shrinkage=1e-9, ridge=1e-9)
+    assert np.abs(little - plain).max() < 1e-5
+
+
+def test_shrinkage_takes_the_correlations_it_says() -> None:
+    """The gain with the joint correlation matrix shrunk by hand."""
+    y, x = _samples(12)
+    noise, target, s = np.diag([0.3, 0.2]), np.array([1.0, -2.0]), 0.3
+    joint = np.cov(np.hstack([x, y]), rowvar=False)
+    joint = (1 - s) * joint + s * np.diag(np.diag(joint))
+    gain = joint[:3, 3:] @ np.linalg.inv(joint[3:, 3:] + noise)
+    drawn = y + _rng(3).standard_normal(y.shape) @ np.sqrt(noise)
+    ours = known_noise_update(x, y, target, noise, rng=_rng(3), shrinkage=s)
+    assert np.allclose(ours, x + (target - drawn) @ gain.T, atol=1e-9)
+
+
+def test_informed_update_without_a_threshold_leaves_nothing_out() -> None:
+    y, x = _samples(13, leading=(4,))
+    inputs = (x, y, np.zeros((4, 2)), np.array([[0.3, 0.1], [0.1, 0.2]]))
+    whole = known_noise_update(*inputs, rng=_rng(3))
+    assert np.abs(informed_update(*inputs, rng=_rng(3), threshold=0.0) - whole).max() < 1e-8
+    assert np.array_equal(informed_update(*inputs, rng=_rng(3), threshold=1e12), x)
+
+
+def test_informed_directions_do_not_depend_on_units() -> None:
+    y, x = _samples(14)
+    units, noise, target = np.diag([1e3, 1e-2]), np.diag([0.3, 0.2]), np.zeros(2)
+    level = np.linalg.eigvalsh(sample_covariance(y) / np.sqrt(np.outer([0.3, 0.2], [0.3, 0.2])))
+    for threshold in (0.0, level.mean()):
+        plain = informed_update(x, y, target, noise, rng=_rng(3), threshold=threshold)
+        other = informed_update(
+            x, y @ units, target, units @ noise @ units, rng=_rng(3), threshold=threshold
+        )
+        assert np.allclose(plain, other, atol=1e-8)
+
+
+def test_direct_sampling_and_the_composed_map_agree_where_the_map_fits() -> None:
+    rng = _rng(15)
+    x = rng.standard_normal((60, 2000, 2)) @ np.array([[1.0, 0.5], [0.0, 1.0]])
+    inputs = (x, x[..., :1], np.full((60, 1), 1.5), [[0.5]])
+    direct, composed = sample_update(*inputs, rng=_rng(1)), affine_update(*inputs, rng=_rng(1))
+    assert np.abs(direct.mean(axis=(0, 1)) - composed.mean(axis=(0, 1))).max() < 0.01
+    gap = sample_covariance(direct).mean(axis=0) - sample_covariance(composed).mean(axis=0)
+    assert np.abs(gap).max() < 0.01
+
+
+def test_composed_map_keeps_what_a_misfitted_map_forgets() -> None:
+    """Of a skewed prior and an observation that says nothing, (10) keeps the skewness."""
+    x = _rng(16).exponential(size=(20, 2000, 1))
+    inputs = (x, _rng(17).standard_normal(x.shape), np.zeros((20, 1)), [[1.0]])
+
+    def skewness(e: np.ndarray) -> float:
+        gap = e - e.mean(axis=1, keepdims=True)
+        return float(((gap**3).mean(axis=1) / (gap**2).mean(axis=1) ** 1.5).mean())
+
+    assert skewness(affine_update(*inputs, rng=_rng(1))) > 1.8
+    assert abs(skewness(sample_update(*inputs, rng=_rng(1)))) < 0.1

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,10 +21,16 @@ from numpy.typing import ArrayLike
 from .. import ensembles
 from ..checks import Array, SolverError, array, choice, count
 
+if TYPE_CHECKING:
+    from .conditioning import ConditionalMap
+
 __all__ = ["AffineMap", "fit", "fit_convex", "gradient", "objective"]
 
 _LIMIT = {"ECOS": "max_iters", "CLARABEL": "max_iter"}
 """The solvers, and what each calls its limit of iterations."""
+
+_ROUNDING = 1e-13
+"""Share of a variable's variance, or of its mean, that counts as rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,37 +142,44 @@ def fit(y: ArrayLike, x: ArrayLike) -> AffineMap:
     mean = ensembles.mean(joint)
     joint -= mean[..., None, :]
     cov = np.swapaxes(joint, -1, -2) @ joint / joint.shape[-2]
-    lower = _cholesky(cov, m)
+    lower = _cholesky(cov, mean, m)
     # The factor of the joint covariance holds the map: its lower blocks are K L_yy and L.
     across = np.swapaxes(lower[..., m:, :m], -1, -2)
     gain = np.linalg.solve(np.swapaxes(lower[..., :m, :m], -1, -2), across)
     return AffineMap(mean[..., :m], mean[..., m:], np.swapaxes(gain, -1, -2), lower[..., m:, m:])
 
 
-def _cholesky(cov: Array, m: int) -> Array:
+def _cholesky(cov: Array, mean: Array, m: int) -> Array:
     """Factor of the joint covariance of (y, x); an error says which of them is to blame."""
+    variance = np.diagonal(cov, axis1=-2, axis2=-1)
     try:
-        return np.asarray(np.linalg.cholesky(cov), dtype=np.float64)
+        lower = np.asarray(np.linalg.cholesky(cov), dtype=np.float64)
+        # Rounding may leave a repeated variable a tiny variance of its own.
+        left = np.diagonal(lower, axis1=-2, axis2=-1) ** 2
+        repeated = (left <= _ROUNDING * variance) | (variance <= (_ROUNDING * mean) ** 2)
+        if not repeated.any():
+            return lower
+        name = "y" if repeated[..., :m].any() else "x"
     except np.linalg.LinAlgError:
         try:
             np.linalg.cholesky(cov[..., :m, :m])
             name = "x"
         except np.linalg.LinAlgError:
             name = "y"
-        raise ValueError(
-            f"{name}: needs variables that are not constant and not combinations of others, "
-            f"got a sample covariance that is not positive definite"
-        ) from None
+    raise ValueError(
+        f"{name}: needs variables that are not constant and not combinations of others, "
+        f"got a sample covariance that is not positive definite"
+    )
 
 
-def objective(map_: AffineMap, y: ArrayLike, x: ArrayLike) -> Array:
+def objective(map_: ConditionalMap, y: ArrayLike, x: ArrayLike) -> Array:
     """The objective (12) of the x-block, summed over its components, (...).
 
     Up to a constant it is the negative mean log-likelihood of x given y under the map.
 
     Parameters
     ----------
-    map_ : AffineMap
+    map_ : AffineMap or SeparableMap
         The map S.
     y, x : array_like, (..., N, m) and (..., N, d)
         Samples.

@@ -16,7 +16,14 @@ from ..ensembles import anomalies, sample_covariance
 from ..linalg import factor
 from . import affine
 
-__all__ = ["ConditionalMap", "affine_update", "compose", "pca_update", "principal_directions"]
+__all__ = [
+    "ConditionalMap",
+    "affine_update",
+    "compose",
+    "pca_update",
+    "principal_directions",
+    "sample_update",
+]
 
 
 class ConditionalMap(Protocol):
@@ -132,6 +139,50 @@ def affine_update(
     if perturb:
         seen = seen + generator(rng).standard_normal(seen.shape) @ factor(cov).T
     return compose(fit(seen, members), seen, members, target)
+
+
+def sample_update(
+    ensemble: ArrayLike,
+    predicted: ArrayLike,
+    observed: ArrayLike,
+    noise: ArrayLike,
+    *,
+    rng: np.random.Generator,
+    fit: Callable[[Array, Array], ConditionalMap] = affine.fit,
+) -> Array:
+    r"""Draw a new ensemble from the conditional by the inverse map alone, equation (9).
+
+    .. math:: \mathbf x_i' = \mathbf S(\mathbf y^*,\cdot)^{-1}(\mathbf z_i),\qquad
+        \mathbf z_i\sim N(\mathbf 0,\mathbf I)
+
+    The new members forget the old ones. Where the map fits badly, so do they: the composed map
+    (10) of :func:`affine_update` makes most of the map's error undo itself.
+
+    Parameters
+    ----------
+    ensemble, predicted, observed, noise
+        As in :func:`affine_update`.
+    rng : numpy.random.Generator
+        Source of the noise in the predictions and of the reference samples.
+    fit : callable
+        ``fit(y, x) -> map``.
+
+    Returns
+    -------
+    ndarray, (..., N, d)
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(3)
+    >>> prior = rng.standard_normal((4000, 1))
+    >>> posterior = sample_update(prior, prior, [1.0], [[1.0]], rng=rng)
+    >>> posterior.mean().round(1), posterior.var().round(1)
+    (np.float64(0.5), np.float64(0.5))
+    """
+    members, seen, target, cov = _inputs(ensemble, predicted, observed, noise)
+    seen = seen + generator(rng).standard_normal(seen.shape) @ factor(cov).T
+    reference = rng.standard_normal(members.shape)
+    return fit(seen, members).inverse(target, reference)
 
 
 def principal_directions(ensemble: ArrayLike, n: int) -> Array:

@@ -1,0 +1,123 @@
+"""Inversion of increasing functions of one variable, many at once, without a step out of bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..checks import Array, SolverError, array, callable_, number
+
+__all__ = ["invert"]
+
+_DOUBLINGS = 60
+"""Brackets grow to 2^60 initial widths before a target counts as out of range."""
+
+_ITERATIONS = 200
+
+Function = Callable[[Array], tuple[Array, Array]]
+"""``function(v) -> (value, slope)``, element by element."""
+
+
+def invert(
+    function: Function,
+    target: ArrayLike,
+    *,
+    start: float = 0.0,
+    width: float = 1.0,
+    tolerance: float = 1e-13,
+    name: str = "target",
+) -> Array:
+    """Solve ``function(v) = target`` by Newton's method inside a shrinking bracket.
+
+    A Newton step that would leave the bracket is replaced by a bisection, so the iteration
+    converges wherever the function increases.
+
+    Parameters
+    ----------
+    function : callable
+        ``function(v) -> (value, slope)`` on arrays of the shape of `target`, element by element;
+        every element may be a function of its own.
+    target : array_like
+        The values to reach.
+    start : float
+        Where the search for a bracket begins.
+    width : float
+        Half the width of the first bracket, positive.
+    tolerance : float
+        Stop when every step is below `tolerance` times 1 + |v|.
+    name : str
+        What an error calls the targets.
+
+    Returns
+    -------
+    ndarray
+        Of the shape of `target`.
+
+    Raises
+    ------
+    ValueError
+        If a target is outside the function's range, or the function decreases somewhere on the
+        way.
+    SolverError
+        If the iteration does not settle, as for a function with jumps.
+
+    Examples
+    --------
+    >>> invert(lambda v: (np.sinh(v), np.cosh(v)), np.sinh([-2.0, 0.5])).round(9)
+    array([-2. ,  0.5])
+    """
+    f = callable_(function, "function")
+    aim = array(target, name, (...,))
+    centre, half = number(start, "start"), number(width, "width", above=0)
+    small = number(tolerance, "tolerance", above=0)
+    if not aim.size:
+        return aim.copy()
+    low, high = _bracket(f, aim, centre, half, name)
+    v = 0.5 * (low + high)
+    for _ in range(_ITERATIONS):
+        value, slope = _evaluated(f, v)
+        gap = value - aim
+        low, high = np.where(gap <= 0, v, low), np.where(gap >= 0, v, high)
+        steep = slope > 0
+        newton = v - gap / np.where(steep, slope, 1.0)
+        inside = steep & (newton > low) & (newton < high)
+        new = np.where(gap == 0, v, np.where(inside, newton, 0.5 * (low + high)))
+        done = np.abs(new - v) <= small * (1 + np.abs(v))
+        v = new
+        if done.all():
+            return np.asarray(v)
+    raise SolverError(f"invert: {int((~done).sum())} of {done.size} targets did not settle")
+
+
+def _evaluated(f: Function, v: Array) -> tuple[Array, Array]:
+    value, slope = (np.asarray(part) for part in f(v))
+    if value.shape != v.shape or slope.shape != v.shape:
+        raise ValueError(f"function: needs to return a value and a slope of shape {v.shape}")
+    if not (slope >= 0).all():
+        raise ValueError(
+            f"function: needs an increasing function to invert, got slope {slope.min():.6g}"
+        )
+    return value, slope
+
+
+def _bracket(f: Function, aim: Array, centre: float, half: float, name: str) -> tuple[Array, Array]:
+    """Ends between which each target is reached."""
+    ends = []
+    for sign in (-1.0, 1.0):
+        end = np.full(aim.shape, centre + sign * half)
+        size = half
+        for _ in range(_DOUBLINGS):
+            short = sign * (_evaluated(f, end)[0] - aim) < 0
+            if not short.any():
+                break
+            size *= 2
+            end = np.where(short, centre + sign * size, end)
+        else:
+            raise ValueError(
+                f"{name}: needs targets inside the range of the map, got {int(short.sum())} of "
+                f"{short.size} outside, such as {aim[short][0]:.6g}"
+            )
+        ends.append(end)
+    return ends[0], ends[1]
