@@ -104,6 +104,19 @@ BAD_INPUT = {
         ("y", lambda: fit(_Y[:10], _X)),
         ("x", lambda: fit(_Y, NAN * _X)),
     ],
+    _A + "from_moments": [
+        ("mean", lambda: affine.from_moments(0.0, np.eye(2), 1)),
+        ("cov", lambda: affine.from_moments([0.0, 1.0], np.eye(3), 1)),
+        ("m", lambda: affine.from_moments([0.0, 1.0], np.eye(2), 3)),
+        ("y", lambda: affine.from_moments([0.0, 1.0], np.diag([0.0, 1.0]), 1)),
+        ("x", lambda: affine.from_moments([0.0, 1.0], np.ones((2, 2)), 1)),
+    ],
+    _A + "from_rows": [
+        ("rows", lambda: affine.from_rows([[0.0, 1.0]], [0.0])),
+        ("rows", lambda: affine.from_rows([[0.0, 1.0, 0.0]], [0.0])),
+        ("rows", lambda: affine.from_rows([[0, 1, 1], [0, 0, 1]], [])),
+        ("observed_mean", lambda: affine.from_rows([[0.0, 1.0, 1.0]], [NAN])),
+    ],
     _A + "fit_convex": [
         ("solver", lambda: fit_convex(_Y, _X, solver="SIMPLEX")),
         ("ECOS", lambda: fit_convex(_Y, _X, max_iters=1)),

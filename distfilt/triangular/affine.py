@@ -24,7 +24,15 @@ from ..checks import Array, SolverError, array, choice, count
 if TYPE_CHECKING:
     from .conditioning import ConditionalMap
 
-__all__ = ["AffineMap", "fit", "fit_convex", "gradient", "objective"]
+__all__ = [
+    "AffineMap",
+    "fit",
+    "fit_convex",
+    "from_moments",
+    "from_rows",
+    "gradient",
+    "objective",
+]
 
 _LIMIT = {"ECOS": "max_iters", "CLARABEL": "max_iter"}
 """The solvers, and what each calls its limit of iterations."""
@@ -142,11 +150,84 @@ def fit(y: ArrayLike, x: ArrayLike) -> AffineMap:
     mean = ensembles.mean(joint)
     joint -= mean[..., None, :]
     cov = np.swapaxes(joint, -1, -2) @ joint / joint.shape[-2]
-    lower = _cholesky(cov, mean, m)
+    return from_moments(mean, cov, m)
+
+
+def from_moments(mean: ArrayLike, cov: ArrayLike, m: int) -> AffineMap:
+    """The affine map of a Gaussian (y, x), or of samples with these moments (divided by N).
+
+    Parameters
+    ----------
+    mean : array_like, (..., m + d)
+        Mean of (y, x).
+    cov : array_like, (..., m + d, m + d)
+        Their covariance, positive definite.
+    m : int
+        Number of observations, at least 0.
+
+    Returns
+    -------
+    AffineMap
+
+    Raises
+    ------
+    ValueError
+        If a variable is constant or a combination of others.
+
+    Examples
+    --------
+    >>> from_moments([0.0, 1.0], [[2.0, 1.0], [1.0, 1.0]], 1).gain
+    array([[0.5]])
+    """
+    centre = array(mean, "mean", (..., "D"))
+    joint = array(cov, "cov", (*centre.shape, centre.shape[-1]))
+    if count(m, "m", at_least=0) > centre.shape[-1]:
+        raise ValueError(f"m: needs at most {centre.shape[-1]} observations, got {m}")
+    lower = _cholesky(joint, centre, m)
     # The factor of the joint covariance holds the map: its lower blocks are K L_yy and L.
     across = np.swapaxes(lower[..., m:, :m], -1, -2)
     gain = np.linalg.solve(np.swapaxes(lower[..., :m, :m], -1, -2), across)
-    return AffineMap(mean[..., :m], mean[..., m:], np.swapaxes(gain, -1, -2), lower[..., m:, m:])
+    return AffineMap(
+        centre[..., :m], centre[..., m:], np.swapaxes(gain, -1, -2), lower[..., m:, m:]
+    )
+
+
+def from_rows(rows: ArrayLike, observed_mean: ArrayLike) -> AffineMap:
+    """The affine map of the coefficients of (13), component by component.
+
+    Parameters
+    ----------
+    rows : array_like, (..., d, 1 + m + d)
+        Per component of the x-block: the constant, the coefficients of y and those of x, zero to
+        the right of the diagonal and positive on it.
+    observed_mean : array_like, (..., m)
+        The y about which the map is written; any will do.
+
+    Returns
+    -------
+    AffineMap
+
+    Examples
+    --------
+    >>> from_rows([[-1.0, 0.0, 2.0]], [0.0]).inverse([5.0], [[1.0]])
+    array([[1.]])
+    """
+    ybar = array(observed_mean, "observed_mean", (..., "m"))
+    m = ybar.shape[-1]
+    u = array(rows, "rows", (*ybar.shape[:-1], "d", "D"))
+    d = u.shape[-2]
+    if u.shape[-1] != 1 + m + d:
+        raise ValueError(f"rows: needs {1 + m + d} columns for m = {m}, d = {d}, got {u.shape}")
+    upper = u[..., 1 + m :]
+    if not (np.diagonal(upper, axis1=-2, axis2=-1) > 0).all():
+        raise ValueError("rows: needs positive coefficients of each component's own variable")
+    scale = np.linalg.solve(upper, np.broadcast_to(np.eye(d), upper.shape))
+    gain = np.asarray(-np.linalg.solve(upper, u[..., 1 : 1 + m]), dtype=np.float64)
+    offset = -np.linalg.solve(upper, u[..., :1])[..., 0]
+    mean = offset + (gain @ ybar[..., None])[..., 0]
+    if np.triu(upper, 1).any():
+        raise ValueError("rows: needs zeros to the right of the diagonal")
+    return AffineMap(ybar, mean, gain, np.tril(scale))
 
 
 def _cholesky(cov: Array, mean: Array, m: int) -> Array:
@@ -272,12 +353,7 @@ def fit_convex(
     rows = np.zeros((d, 1 + m + d))
     for k in range(d):
         rows[k, : m + k + 2] = _solve_component(joint[:, : m + k + 1], solver, max_iters)
-    upper = rows[:, 1 + m :]
-    scale = np.linalg.solve(upper, np.eye(d))
-    gain = -np.linalg.solve(upper, rows[:, 1 : 1 + m])
-    offset = -np.linalg.solve(upper, rows[:, 0])
-    ybar = ensembles.mean(seen)
-    return AffineMap(ybar, offset + gain @ ybar, gain, np.tril(scale))
+    return from_rows(rows, ensembles.mean(seen))
 
 
 def _solve_component(z: Array, solver: str, max_iters: int | None) -> Array:
