@@ -62,13 +62,15 @@ def network(update: Callable[..., Any], consensus: Callable[..., Any]) -> Ensemb
     return EnsembleFilter(model, sensors, graph, update, consensus, members=SETTING["members"])
 
 
-def data(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Times, the truth at them, and each agent's observations."""
+def data(
+    rng: np.random.Generator, runs: tuple[int, ...] = ()
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Times, the truth (T, *runs, 13) at them, and each agent's observations."""
     dt, x0 = SETTING["dt_observe"], np.array(SETTING["initial_state"])
     times = np.round(np.arange(1, round(SETTING["end_time"] / dt) + 1) * dt, 10)
     f = network(affine_update, PULL)
-    truth = simulate(f.model, x0, times, rng=rng)
-    before = np.vstack([x0, truth[:-1]])
+    truth = simulate(f.model, np.broadcast_to(x0, (*runs, x0.size)), times, rng=rng)
+    before = np.concatenate([np.broadcast_to(x0, truth[:1].shape), truth[:-1]])
     seen = [
         s.observe(truth, rng=rng, previous=before if s.uses_previous else None)
         for s in f.sensors
