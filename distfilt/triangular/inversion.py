@@ -46,7 +46,7 @@ def invert(
     width : float
         Half the width of the first bracket, positive.
     tolerance : float
-        Stop when every step is below `tolerance` times 1 + |v|.
+        Stop when every step is below `tolerance` times one plus the size of the value.
     name : str
         What an error calls the targets.
 
