@@ -27,6 +27,7 @@ from distfilt import studies
 from distfilt.published import PAPERS
 from distfilt.studies.seeds import recipes
 from distfilt.studies.stored import jsons
+from distfilt.studies.study import column_names
 
 NEEDED = ("NAME", "PAPER", "trial", "parameters", "columns", "seeds")
 
@@ -51,6 +52,8 @@ def load_script(path: Path) -> ModuleType:
     lacking = [name for name in NEEDED if not hasattr(script, name)]
     if lacking:
         raise ValueError(f"{path.name}: has to define {', '.join(lacking)}")
+    # A name that cannot be stored is found out now, not after the last trial.
+    column_names(script.columns)
     if script.PAPER not in PAPERS:
         raise ValueError(f"{path.name}: PAPER needs one of {PAPERS}, got {script.PAPER!r}")
     if not isinstance(script.NAME, str) or not re.fullmatch(r"[a-z0-9][a-z0-9-]*", script.NAME):
