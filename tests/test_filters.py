@@ -444,3 +444,33 @@ def test_linear_check_case_against_the_kalman_filter() -> None:
     )
     optimum = ((best.means[100:] - truth[100:]) ** 2).sum(axis=-1).mean()
     assert optimum <= ours <= 1.12 * optimum
+
+
+@pytest.mark.slow
+def test_linear_check_case_with_known_noise_and_intersection() -> None:
+    """Every agent within 10% of the Kalman filter with all sensors, and honest about it."""
+    from distfilt.filters.agreement import intersection_agreement
+    from distfilt.kalman.linear import kalman_filter
+    from distfilt.triangular.regularised import known_noise_update
+
+    runs = 48
+    times, truth, obs = _linear_data(runs, 200)
+    best = kalman_filter(
+        X0 + 3, 25 * np.eye(6), np.concatenate(obs, axis=-1),
+        F=F.model.transition(0.1), Q=F.model.noise(0, 0.1),
+        H=np.vstack([s.matrix(6) for s in LINEAR]), R=np.diag([0.04] * 4 + [0.01] * 3),
+    )
+    optimum = ((best.means[100:] - truth[100:]) ** 2).sum(axis=-1).mean()
+    fuse = partial(intersection_agreement, weights="trace")
+    for consensus, limit in ((fuse, 1.10), (None, 1.05)):
+        f = _satellites(
+            sensors=LINEAR, update=known_noise_update, consensus=consensus, members=200
+        )
+        run = f.run(_begin(f, runs=(runs,)), times, obs, truth=truth)
+        late = run.sel(time=slice(10.05, None))
+        error = late["squared_error"].mean(("time", "run")).values
+        nees = late["nees"].mean(("time", "run")).values / 6
+        # Without agreement only agent A, who hears both others, has all the data.
+        checked = slice(None) if consensus is not None else slice(0, 1)
+        assert (error[checked] < limit * optimum).all()
+        assert ((nees[checked] > 0.85) & (nees[checked] < 1.15)).all()
