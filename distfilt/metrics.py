@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .checks import Array, array, count, covariance, number
+from .ensembles import mean, sample_covariance
 from .intervals import Interval, mean_interval, median_interval, proportion_interval
 
 __all__ = [
@@ -206,16 +207,15 @@ def ensemble_nees(ensemble: ArrayLike, truth: ArrayLike) -> Array:
     n, d = x.shape[-2:]
     if n <= d:
         raise ValueError(f"ensemble: needs more members than components ({d}), got {n}")
-    middle = x.mean(axis=-2)
+    middle = mean(x)
     t = _truth(truth, middle.shape, "ensemble")
-    a = x - middle[..., None, :]
+    cov = sample_covariance(x)
     # NEES does not depend on units: scaled to unit variances, rounding does not either, and the
     # test for a subspace compares pure numbers.
-    scale = np.sqrt((a**2).sum(axis=-2) / (n - 1))
-    if (scale <= n * np.finfo(float).eps * np.abs(x).max(axis=-2)).any():
+    scale = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    if (scale <= n * np.finfo(float).eps * np.abs(middle)).any():
         raise ValueError("ensemble: needs members that differ in every component")
-    a = a / scale[..., None, :]
-    correlation = np.swapaxes(a, -1, -2) @ a / (n - 1)
+    correlation = cov / (scale[..., :, None] * scale[..., None, :])
     if np.linalg.eigvalsh(correlation).min(initial=1.0) <= 10 * n * np.finfo(float).eps:
         raise ValueError("ensemble: needs members that span all components, got a subspace")
     return _mahalanobis(np.linalg.cholesky(correlation), (middle - t) / scale)

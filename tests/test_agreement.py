@@ -11,7 +11,12 @@ from distfilt.checks import SolverError
 from distfilt.network import Channel, Faults, Graph, graphs, weights
 from distfilt.network.admm import AdmmRun, admm
 from distfilt.network.consensus import average
-from distfilt.network.fusion import arithmetic_average, covariance_intersection, naive_fusion
+from distfilt.network.fusion import (
+    arithmetic_average,
+    covariance_intersection,
+    exchanged,
+    naive_fusion,
+)
 from distfilt.network.tracking import (
     PIState,
     first_order,
@@ -96,6 +101,10 @@ BAD_INPUT = {
     ],
     _F + "naive_fusion": _fusion_cases(naive_fusion),
     _F + "arithmetic_average": _fusion_cases(arithmetic_average),
+    _F + "exchanged": [
+        ("channel", lambda: exchanged(_ZEROS, _EYES, None, 1, lambda m, p, here: (m[0], p[0]))),
+        ("rounds", lambda: exchanged(_ZEROS, _EYES, _star(), 0, lambda m, p, here: (m[0], p[0]))),
+    ],
     _A + "admm": [
         ("local_solve", lambda: admm(3, np.zeros((3, 1)), _star())),
         ("local_solve", lambda: admm(lambda v, rho: v[:2], np.zeros((3, 1)), _star())),

@@ -16,8 +16,7 @@ from ..checks import weights as unit_weights
 from ..ensembles import anomalies, mean, sample_covariance
 from ..linalg import symmetrise
 from ..network import Channel
-from ..network.fusion import _exchanged as exchanged
-from ..network.fusion import covariance_intersection
+from ..network.fusion import covariance_intersection, exchanged
 
 __all__ = [
     "barycentre_agreement",

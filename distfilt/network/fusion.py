@@ -11,7 +11,7 @@ from ..checks import Array, array, choice, count, covariance
 from ..linalg import symmetrise
 from .channel import Channel
 
-__all__ = ["arithmetic_average", "covariance_intersection", "naive_fusion"]
+__all__ = ["arithmetic_average", "covariance_intersection", "exchanged", "naive_fusion"]
 
 _WEIGHTS = ("fixed", "trace", "determinant")
 
@@ -76,7 +76,7 @@ def covariance_intersection(
         omega = _omegas(p, here, weights)
         return _information_sum(m, p, omega)
 
-    return _exchanged(means, covs, channel, rounds, fuse)
+    return exchanged(means, covs, channel, rounds, fuse)
 
 
 def naive_fusion(
@@ -99,7 +99,7 @@ def naive_fusion(
     def fuse(m: Array, p: Array, here: Array) -> tuple[Array, Array]:
         return _information_sum(m, p, here.astype(np.float64))
 
-    return _exchanged(means, covs, channel, rounds, fuse)
+    return exchanged(means, covs, channel, rounds, fuse)
 
 
 def arithmetic_average(
@@ -129,13 +129,37 @@ def arithmetic_average(
         spread = p + gap[..., :, None] * gap[..., None, :]
         return centre, symmetrise((omega[..., None, None] * spread).sum(axis=0))
 
-    return _exchanged(means, covs, channel, rounds, fuse)
+    return exchanged(means, covs, channel, rounds, fuse)
 
 
-def _exchanged(
+def exchanged(
     means: ArrayLike, covs: ArrayLike, channel: Channel, rounds: int, fuse: Fuse
 ) -> tuple[Array, Array]:
-    """Rounds of exchange, each followed by `fuse` of all that an agent has."""
+    """Let agents exchange means and covariances, and fuse all that each has, for some rounds.
+
+    Parameters
+    ----------
+    means, covs, channel, rounds
+        As for :func:`covariance_intersection`.
+    fuse : callable
+        ``fuse(means, covs, here) -> mean, cov`` of S sources: (S, *runs, d), (S, *runs, d, d), and
+        (S, *runs) telling which of them arrived; the agent's own comes first.
+
+    Returns
+    -------
+    means : ndarray, (*runs, A, d)
+    covs : ndarray, (*runs, A, d, d)
+
+    Examples
+    --------
+    The own estimate, whatever the neighbours say:
+
+    >>> from distfilt.network import Channel, graphs
+    >>> own = exchanged([[0.0], [3.0]], [[[1.0]], [[2.0]]], Channel(graphs.path(2)), 1,
+    ...                 lambda means, covs, here: (means[0], covs[0]))
+    >>> own[0].ravel()
+    array([0., 3.])
+    """
     if not isinstance(channel, Channel):
         raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
     m = array(means, "means", (*channel.runs, channel.graph.size, "d"))

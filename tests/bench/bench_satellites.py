@@ -40,13 +40,13 @@ def fig_1(mode: str) -> None:
 def fig_2(half: str) -> None:
     """Fifty of the 100 runs with principal components, as one batch."""
     sys.path.insert(0, str(BOOK / "studies"))
-    import table_3
+    import satellites
 
     rng = np.random.default_rng(int(half))
-    runs = table_3.SETTING["runs"] // 2
-    network = table_3.network(*table_3.FILTERS["pca"])
-    times, truth, seen = table_3.data(rng, runs=(runs,))
-    start = network.start(table_3.prior(), rng=rng, runs=(runs,))
+    runs = (satellites.parameters["runs"] // 2,)
+    network = satellites.network("III", "pca")
+    times, truth, seen = satellites.data("III", rng, runs)
+    start = network.start(satellites.prior("III"), rng=rng, runs=runs)
     network.run(start, times, seen, truth=truth)
 
 
