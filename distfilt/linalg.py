@@ -40,8 +40,7 @@ def factor(cov: ArrayLike, *, name: str = "cov") -> Array:
     Returns
     -------
     ndarray, (..., d, d)
-        The lower Cholesky factor if every matrix is positive definite, else the factor from the
-        eigenvectors, which exists for singular matrices too.
+        Lower triangular: the Cholesky factor, with zero columns where a matrix is singular.
 
     Raises
     ------
@@ -59,9 +58,24 @@ def factor(cov: ArrayLike, *, name: str = "cov") -> Array:
     try:
         return np.asarray(np.linalg.cholesky(covariance(c, name)), dtype=np.float64)
     except ValueError:
-        covariance(c, name, semidefinite=True)
-        values, vectors = np.linalg.eigh(c)
-        return np.asarray(vectors * np.sqrt(np.clip(values, 0.0, None))[..., None, :])
+        return _semidefinite_cholesky(covariance(c, name, semidefinite=True))
+
+
+def _semidefinite_cholesky(cov: Array) -> Array:
+    """The lower triangular factor with a zero column where a pivot vanishes.
+
+    Unlike a factor from eigenvectors it is unique, so that draws do not depend on the machine.
+    """
+    d = cov.shape[-1]
+    lower = np.zeros_like(cov)
+    smallest = d * np.finfo(float).eps * np.diagonal(cov, axis1=-2, axis2=-1).max(axis=-1)
+    for j in range(d):
+        done = lower[..., j:, :j] @ lower[..., j, :j, None]
+        column = cov[..., j:, j] - done[..., 0]
+        pivot = column[..., 0]
+        root = np.sqrt(np.where(pivot > smallest, pivot, np.inf))
+        lower[..., j:, j] = column / root[..., None]
+    return lower
 
 
 def cholesky_solve(cov: ArrayLike, right: ArrayLike) -> Array:

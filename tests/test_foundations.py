@@ -158,3 +158,15 @@ def test_solver_error_is_a_runtime_error() -> None:
 def test_progress_is_silent_under_a_test(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(track(range(3), show=True)) == [0, 1, 2]
     assert capsys.readouterr() == ("", "")
+
+
+@given(st.integers(0, 10_000), st.integers(2, 6))
+def test_factor_is_lower_triangular_also_where_a_component_is_still(seed: int, d: int) -> None:
+    """Unique, so a draw with it does not depend on the machine: no free signs or rotations."""
+    cov = _covariance(seed, d)
+    cov[-1] = cov[:, -1] = 0.0
+    lower = linalg.factor(cov)
+    assert (np.triu(lower, 1) == 0).all() and (np.diagonal(lower) >= 0).all()
+    plain = np.linalg.cholesky(cov[:-1, :-1])
+    assert np.allclose(lower[:-1, :-1], plain, rtol=1e-9, atol=1e-12)
+    assert (lower[-1] == 0).all()

@@ -48,7 +48,7 @@ columns = [
 ]
 parameters = {"runs": 100, "seed": 2024, "integration_step": 0.1}
 seeds = spawn(parameters["seed"], parameters["runs"])
-rtol = 1e-6
+rtol = 1e-4
 
 
 def model(table: str) -> Model:
