@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 
 from ..checks import Array, array, number
+from ._spectral import left_null_vector
 from .graphs import Graph
 
 __all__ = ["Weights", "balanced", "keeping", "laplacian", "maximum_degree", "metropolis", "push"]
@@ -196,10 +197,10 @@ def balanced(graph: Graph) -> Weights:
         raise ValueError(
             f"graph: needs a strongly connected graph, got {graph.components.max() + 1} components"
         )
-    _, _, right = np.linalg.svd(graph.laplacian.T.toarray())
-    p = np.abs(right[-1])
-    scale = 1 / (2 * max((p * graph.degrees).max(), 1e-300)) if graph.size > 1 else 0.0
-    links = scale * p[graph.receivers]
+    if graph.size == 1:
+        return Weights(graph, np.ones(1), np.zeros(0))
+    p = left_null_vector(graph.laplacian) if graph.directed else np.ones(graph.size)
+    links = p[graph.receivers] / (2 * (p * graph.degrees).max())
     return Weights(graph, 1 - _row_sums(graph, links), links)
 
 
