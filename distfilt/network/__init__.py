@@ -3,6 +3,7 @@
 from . import graphs, weights
 from .admm import AdmmRun, admm
 from .agreement import barycentre, intersection, pull
+from .asynchronous import event_triggered, flood, gossip
 from .channel import Channel
 from .consensus import UnstableGain, average, finite_time, maximum, push_sum
 from .faults import Faults
@@ -13,8 +14,8 @@ from .fusion import (
     exchanged,
     naive_fusion,
 )
-from .graphs import Graph
 from .ledger import Ledger
+from .links import Graph
 from .tracking import PIState, first_order, pi_start, pi_step, stable_substeps
 from .weights import Weights
 
@@ -33,9 +34,12 @@ __all__ = [
     "barycentre",
     "consensus_pull",
     "covariance_intersection",
+    "event_triggered",
     "exchanged",
     "finite_time",
     "first_order",
+    "flood",
+    "gossip",
     "graphs",
     "intersection",
     "maximum",

@@ -12,9 +12,10 @@ from ..checks import Array, array, count, number
 from ..ensembles import mean, sample_covariance
 from ..gaussians import bures_barycentre, recolour
 from . import weights as weighting
+from ._neighbourhood import fused_by
 from .channel import Channel
 from .consensus import warn_if_unstable
-from .fusion import _fused, _intersected
+from .fusion import _intersected
 from .weights import Weights
 
 __all__ = ["barycentre", "intersection", "pull"]
@@ -182,7 +183,7 @@ def barycentre(
         centre = (omega[..., None] * means).sum(axis=-2)
         return centre, bures_barycentre(covs, omega, tolerance=small)
 
-    return recolour(x, *_fused(mean(x), _sampled(x), channel, fuse, rounds)) * size
+    return recolour(x, *fused_by(mean(x), _sampled(x), channel, fuse, rounds)) * size
 
 
 def _ensembles(ensembles: ArrayLike, channel: Channel) -> Array:

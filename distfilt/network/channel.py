@@ -13,8 +13,8 @@ from scipy import sparse
 from ..checks import Array, array, choice, count, number
 from . import _payloads
 from .faults import Faults
-from .graphs import Graph
 from .ledger import Ledger
+from .links import Graph
 from .weights import Weights, stacked
 
 __all__ = ["Channel", "LOST"]

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from ..checks import Array, array, count, number
 from . import weights as weighting
 from .channel import Channel
-from .graphs import Graph
+from .links import Graph
 from .weights import Weights
 
 __all__ = ["UnstableGain", "average", "finite_time", "maximum", "push_sum"]

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..checks import Array, array, choice, count, number
-from .graphs import Graph
+from .links import Graph
 
 __all__ = ["Faults"]
 

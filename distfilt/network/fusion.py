@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
+from numpy.typing import ArrayLike
 
 from ..checks import Array, array, callable_, choice, count, covariance, number
 from ..gaussians import intersection_weights
 from ..linalg import symmetrise
 from . import weights as weighting
+from ._neighbourhood import Fuse, Heard, fused_by, in_rounds
 from .channel import Channel
 from .consensus import warn_if_unstable
-from .graphs import Graph
-from .weights import Weights, stacked
+from .links import Graph
+from .weights import Weights
 
 __all__ = [
     "arithmetic_average",
@@ -27,78 +24,6 @@ __all__ = [
 ]
 
 RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
-
-Fuse = Callable[[Array, Array, NDArray[np.bool_]], tuple[Array, Array]]
-"""Means (..., S, d), covariances and who is there (..., S), of S sources, to one Gaussian."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Heard:
-    """One round's Gaussians, runs in one axis: own ones, those by sender, and which arrived."""
-
-    graph: Graph
-    means: Array
-    covs: Array
-    sent_means: Array
-    sent_covs: Array
-    arrived: NDArray[np.bool_]
-    late: bool
-
-    @property
-    def sources(self) -> tuple[Array, Array]:
-        """All that weights multiply: the own Gaussians, and behind them what comes late."""
-        if not self.late:
-            return self.means, self.covs
-        return (np.concatenate([self.means, self.sent_means], axis=1),
-                np.concatenate([self.covs, self.sent_covs], axis=1))
-
-    def matrix(self, own: Array, links: Array) -> sparse.csr_array:
-        """The weights of :attr:`sources`, run by run on the diagonal."""
-        runs, size = own.shape
-        if not self.late:
-            return stacked(self.graph, own, links, heard_at=0)
-        # Each run's late Gaussians stand behind its own ones.
-        blocks = [sparse.hstack([sparse.diags_array(o), self._of_links(w)])
-                  for o, w in zip(own, links, strict=True)]
-        return sparse.csr_array(sparse.block_diag(blocks, format="csr"))
-
-    def _of_links(self, links: Array) -> sparse.csr_array:
-        graph = self.graph
-        return sparse.csr_array((links, graph.senders, graph.links.indptr), graph.links.shape)
-
-    def sums(self, per_link: Array) -> Array:
-        """What each agent's links carry, added: (R, E, k) to (R, A, k)."""
-        runs, edges, k = per_link.shape
-        flat = np.moveaxis(per_link, 1, 0).reshape(edges, runs * k)
-        out = (self.graph.incidence @ flat).reshape(self.graph.size, runs, k)
-        return np.moveaxis(out, 0, 1)
-
-    def gaps(self) -> Array:
-        """The heard mean less the own one, on each link, (R, E, d)."""
-        graph = self.graph
-        return np.asarray(self.sent_means[:, graph.senders] - self.means[:, graph.receivers])
-
-    def groups(self) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
-        """Agents that hear equally many, (n,), and their links, (n, S - 1)."""
-        starts, degrees = self.graph.links.indptr, np.diff(self.graph.links.indptr)
-        for degree in np.unique(degrees):
-            agents = np.flatnonzero(degrees == degree)
-            yield agents, starts[agents, None] + np.arange(degree)
-
-    def collected(
-        self, agents: NDArray[np.int64], links: NDArray[np.int64]
-    ) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Means (R, n, S, d), covariances and who is there, (R, n, S), the own first."""
-        here = self.arrived[:, links]
-        who = self.graph.senders[links]
-        means = np.where(here[..., None], self.sent_means[:, who], 0.0)
-        covs = np.where(here[..., None, None], self.sent_covs[:, who], np.eye(means.shape[-1]))
-        return (np.concatenate([self.means[:, agents, None], means], axis=2),
-                np.concatenate([self.covs[:, agents, None], covs], axis=2),
-                np.concatenate([np.ones((*here.shape[:2], 1), dtype=bool), here], axis=2))
-
-
-Step = Callable[[_Heard], tuple[Array, Array]]
 
 
 def covariance_intersection(
@@ -175,7 +100,7 @@ def _intersected(
     choice(rule, "rule", RULES)
     given = None if weights is None else _given(channel.graph, weights)
 
-    def step(heard: _Heard) -> tuple[Array, Array]:
+    def step(heard: Heard) -> tuple[Array, Array]:
         if given is None:
             own, links = _by_rule(heard, rule)
         else:
@@ -183,7 +108,7 @@ def _intersected(
                                  given.links * heard.arrived, heard)
         return _information_sum(heard, own, links)
 
-    return _in_rounds(means, covs, channel, rounds, step)
+    return in_rounds(means, covs, channel, rounds, step)
 
 
 def _given(graph: Graph, weights: Weights | ArrayLike) -> Weights:
@@ -204,7 +129,7 @@ def _given(graph: Graph, weights: Weights | ArrayLike) -> Weights:
     return w
 
 
-def _by_rule(heard: _Heard, rule: str) -> tuple[Array, Array]:
+def _by_rule(heard: Heard, rule: str) -> tuple[Array, Array]:
     """Own weights (R, A) and those of links (R, E); each agent's sum to one."""
     graph, size = heard.graph, heard.graph.size
     if rule == "equal":
@@ -222,7 +147,7 @@ def _by_rule(heard: _Heard, rule: str) -> tuple[Array, Array]:
     return own, links
 
 
-def _shared(own: Array, links: Array, heard: _Heard) -> tuple[Array, Array]:
+def _shared(own: Array, links: Array, heard: Heard) -> tuple[Array, Array]:
     total = own + heard.sums(links[..., None])[..., 0]
     return own / total, links / total[:, heard.graph.receivers]
 
@@ -244,11 +169,11 @@ def naive_fusion(
     array([0.666667, 0.666667])
     """
 
-    def step(heard: _Heard) -> tuple[Array, Array]:
+    def step(heard: Heard) -> tuple[Array, Array]:
         ones = np.ones(heard.means.shape[:2])
         return _information_sum(heard, ones, heard.arrived.astype(np.float64))
 
-    return _in_rounds(*_checked(means, covs, channel), channel, rounds, step)
+    return in_rounds(*_checked(means, covs, channel), channel, rounds, step)
 
 
 def arithmetic_average(
@@ -271,7 +196,7 @@ def arithmetic_average(
     (array([1.5, 1.5]), array([3.75, 3.75]))
     """
 
-    def step(heard: _Heard) -> tuple[Array, Array]:
+    def step(heard: Heard) -> tuple[Array, Array]:
         own, links = _by_rule(heard, "equal")
         gap = heard.gaps()
         moved = heard.sums(links[..., None] * gap)
@@ -283,7 +208,7 @@ def arithmetic_average(
         covs = _weighted(heard, own, links, heard.sources[1])
         return heard.means + moved, symmetrise(covs + spread)
 
-    return _in_rounds(*_checked(means, covs, channel), channel, rounds, step)
+    return in_rounds(*_checked(means, covs, channel), channel, rounds, step)
 
 
 def consensus_pull(
@@ -393,21 +318,7 @@ def exchanged(
     array([0., 3.])
     """
     callable_(fuse, "fuse")
-    return _fused(*_checked(means, covs, channel), channel, fuse, rounds)
-
-
-def _fused(
-    means: Array, covs: Array, channel: Channel, fuse: Fuse, rounds: int
-) -> tuple[Array, Array]:
-    def step(heard: _Heard) -> tuple[Array, Array]:
-        m, p = np.empty_like(heard.means), np.empty_like(heard.covs)
-        for agents, links in heard.groups():
-            mean, cov = fuse(*heard.collected(agents, links))
-            m[:, agents] = array(mean, "fuse", m[:, agents].shape)
-            p[:, agents] = array(cov, "fuse", p[:, agents].shape)
-        return m, p
-
-    return _in_rounds(means, covs, channel, rounds, step)
+    return fused_by(*_checked(means, covs, channel), channel, fuse, rounds)
 
 
 def _checked(means: ArrayLike, covs: ArrayLike, channel: Channel) -> tuple[Array, Array]:
@@ -417,41 +328,13 @@ def _checked(means: ArrayLike, covs: ArrayLike, channel: Channel) -> tuple[Array
     return m, covariance(array(covs, "covs", (*m.shape, m.shape[-1])), "covs")
 
 
-def _in_rounds(
-    means: Array, covs: Array, channel: Channel, rounds: int, step: Step
-) -> tuple[Array, Array]:
-    """Exchange means and upper triangles and take a step, some times."""
-    graph, d = channel.graph, means.shape[-1]
-    row, column = np.triu_indices(d)
-    m, p = means.reshape(-1, graph.size, d), covs.reshape(-1, graph.size, d, d)
-    late = channel.faults.late > 0
-    for _ in range(count(rounds, "rounds")):
-        packed = np.concatenate([m, p[..., row, column]], axis=-1)
-        heard, arrived = channel.broadcast(packed.reshape(*channel.runs, graph.size, -1))
-        sent_m, sent_p = m, p
-        if late:
-            # Before the first message is there, zeros stand in its place: no covariances.
-            got = heard.reshape(packed.shape) if heard.any() else packed
-            sent_m, sent_p = _unpacked(got, d)
-        m, p = step(_Heard(graph, m, p, sent_m, sent_p, arrived.reshape(len(m), -1), late))
-    return m.reshape(means.shape), p.reshape(covs.shape)
-
-
-def _unpacked(packed: Array, d: int) -> tuple[Array, Array]:
-    row, column = np.triu_indices(d)
-    covs = np.empty((*packed.shape[:-1], d, d))
-    covs[..., row, column] = packed[..., d:]
-    covs[..., column, row] = packed[..., d:]
-    return packed[..., :d], covs
-
-
-def _weighted(heard: _Heard, own: Array, links: Array, values: Array) -> Array:
+def _weighted(heard: Heard, own: Array, links: Array, values: Array) -> Array:
     """Sums of the sources' values (R, S, d, d) by weights, (R, A, d, d)."""
     flat = values.reshape(-1, values.shape[-1] ** 2)
     return np.asarray((heard.matrix(own, links) @ flat).reshape(heard.covs.shape))
 
 
-def _information_sum(heard: _Heard, own: Array, links: Array) -> tuple[Array, Array]:
+def _information_sum(heard: Heard, own: Array, links: Array) -> tuple[Array, Array]:
     """Weighted sum of information matrices and vectors, turned back into mean and covariance."""
     # A sender's information is the same for all that hear it, and is computed once.
     information = _inverse(heard.sources[1])
