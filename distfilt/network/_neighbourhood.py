@@ -7,12 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from ..checks import Array, array, count
 from .channel import Channel
 from .links import Graph
-from .weights import stacked
 
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.int64]
@@ -23,7 +21,11 @@ Fuse = Callable[[Array, Array, Mask], tuple[Array, Array]]
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """One round's Gaussians, runs in one axis: own ones, those by sender, and which arrived."""
+    """One round's Gaussians, runs in one axis: own ones, those by sender, and which arrived.
+
+    What a sender sent is kept once, not for each of its links; :attr:`arrived` (R, E) tells who may
+    use it.
+    """
 
     graph: Graph
     means: Array
@@ -31,36 +33,22 @@ class Heard:
     sent_means: Array
     sent_covs: Array
     arrived: Mask
-    late: bool
-
-    @property
-    def sources(self) -> tuple[Array, Array]:
-        """All that weights multiply: the own Gaussians, and behind them what comes late."""
-        if not self.late:
-            return self.means, self.covs
-        return (np.concatenate([self.means, self.sent_means], axis=1),
-                np.concatenate([self.covs, self.sent_covs], axis=1))
-
-    def matrix(self, own: Array, links: Array) -> sparse.csr_array:
-        """The weights of :attr:`sources`, run by run on the diagonal."""
-        runs, size = own.shape
-        if not self.late:
-            return stacked(self.graph, own, links, heard_at=0)
-        # Each run's late Gaussians stand behind its own ones.
-        blocks = [sparse.hstack([sparse.diags_array(o), self._of_links(w)])
-                  for o, w in zip(own, links, strict=True)]
-        return sparse.csr_array(sparse.block_diag(blocks, format="csr"))
-
-    def _of_links(self, links: Array) -> sparse.csr_array:
-        graph = self.graph
-        return sparse.csr_array((links, graph.senders, graph.links.indptr), graph.links.shape)
 
     def sums(self, per_link: Array) -> Array:
-        """What each agent's links carry, added: (R, E, k) to (R, A, k)."""
-        runs, edges, k = per_link.shape
-        flat = np.moveaxis(per_link, 1, 0).reshape(edges, runs * k)
-        out = (self.graph.incidence @ flat).reshape(self.graph.size, runs, k)
-        return np.moveaxis(out, 0, 1)
+        """What each agent's links carry, added: (R, E, ...) to (R, A, ...)."""
+        runs, edges, *rest = per_link.shape
+        size = self.graph.size
+        if runs == 1:
+            return np.asarray(
+                (self.graph.incidence @ per_link.reshape(edges, -1)).reshape(1, size, *rest)
+            )
+        flat = per_link.swapaxes(0, 1).reshape(edges, -1)
+        return np.asarray((self.graph.incidence @ flat).reshape(size, runs, *rest).swapaxes(0, 1))
+
+    def mixed(self, own: Array, links: Array, mine: Array, sent: Array) -> Array:
+        """Weighted sums of matrices (R, A, d, d), the own one and what each sender sent."""
+        heard = links[..., None, None] * sent[:, self.graph.senders]
+        return own[..., None, None] * mine + self.sums(heard)
 
     def gaps(self) -> Array:
         """The heard mean less the own one, on each link, (R, E, d)."""
@@ -97,16 +85,14 @@ def in_rounds(
     graph, d = channel.graph, means.shape[-1]
     row, column = np.triu_indices(d)
     m, p = means.reshape(-1, graph.size, d), covs.reshape(-1, graph.size, d, d)
-    late = channel.faults.late > 0
     for _ in range(count(rounds, "rounds")):
         packed = np.concatenate([m, p[..., row, column]], axis=-1)
         heard, arrived = channel.broadcast(packed.reshape(*channel.runs, graph.size, -1))
         sent_m, sent_p = m, p
-        if late:
-            # Before the first message is there, zeros stand in its place: no covariances.
-            got = heard.reshape(packed.shape) if heard.any() else packed
-            sent_m, sent_p = _unpacked(got, d)
-        m, p = step(Heard(graph, m, p, sent_m, sent_p, arrived.reshape(len(m), -1), late))
+        # Before the first late message is there, zeros stand in its place: no covariances.
+        if channel.faults.late and heard.any():
+            sent_m, sent_p = _unpacked(heard.reshape(packed.shape), d)
+        m, p = step(Heard(graph, m, p, sent_m, sent_p, arrived.reshape(len(m), -1)))
     return m.reshape(means.shape), p.reshape(covs.shape)
 
 

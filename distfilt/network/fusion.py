@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import Array, array, callable_, choice, count, covariance, number
 from ..gaussians import intersection_weights
-from ..linalg import symmetrise
+from ..linalg import _solve_lower, _symmetrise
 from . import weights as weighting
 from ._neighbourhood import Fuse, Heard, fused_by, in_rounds
 from .channel import Channel
@@ -137,8 +137,10 @@ def _by_rule(heard: Heard, rule: str) -> tuple[Array, Array]:
         return _shared(ones, heard.arrived.astype(np.float64), heard)
     if rule in ("trace", "determinant"):
         # Such a weight is a number of the source alone, up to the sum of what an agent has.
-        sizes = intersection_weights(heard.sources[1], rule=rule)
-        return _shared(sizes[:, :size], sizes[:, -size:][:, graph.senders] * heard.arrived, heard)
+        both = np.concatenate([heard.covs, heard.sent_covs], axis=1)
+        shares = intersection_weights(both, rule=rule)
+        sent = shares[:, size:][:, graph.senders]
+        return _shared(shares[:, :size], sent * heard.arrived, heard)
     own, links = np.empty(heard.means.shape[:2]), np.zeros(heard.arrived.shape)
     for agents, at in heard.groups():
         _, covs, here = heard.collected(agents, at)
@@ -148,7 +150,7 @@ def _by_rule(heard: Heard, rule: str) -> tuple[Array, Array]:
 
 
 def _shared(own: Array, links: Array, heard: Heard) -> tuple[Array, Array]:
-    total = own + heard.sums(links[..., None])[..., 0]
+    total = own + heard.sums(links)
     return own / total, links / total[:, heard.graph.receivers]
 
 
@@ -202,11 +204,10 @@ def arithmetic_average(
         moved = heard.sums(links[..., None] * gap)
         # From the new mean: the own one lies -moved away, a heard one gap - moved.
         left = gap - moved[:, heard.graph.receivers]
-        outer = (links[..., None, None] * left[..., :, None] * left[..., None, :])
-        spread = heard.sums(outer.reshape(*outer.shape[:2], -1)).reshape(heard.covs.shape)
+        spread = heard.sums(links[..., None, None] * left[..., :, None] * left[..., None, :])
         spread += own[..., None, None] * moved[..., :, None] * moved[..., None, :]
-        covs = _weighted(heard, own, links, heard.sources[1])
-        return heard.means + moved, symmetrise(covs + spread)
+        covs = heard.mixed(own, links, heard.covs, heard.sent_covs)
+        return heard.means + moved, _symmetrise(covs + spread)
 
     return in_rounds(*_checked(means, covs, channel), channel, rounds, step)
 
@@ -328,26 +329,19 @@ def _checked(means: ArrayLike, covs: ArrayLike, channel: Channel) -> tuple[Array
     return m, covariance(array(covs, "covs", (*m.shape, m.shape[-1])), "covs")
 
 
-def _weighted(heard: Heard, own: Array, links: Array, values: Array) -> Array:
-    """Sums of the sources' values (R, S, d, d) by weights, (R, A, d, d)."""
-    flat = values.reshape(-1, values.shape[-1] ** 2)
-    return np.asarray((heard.matrix(own, links) @ flat).reshape(heard.covs.shape))
-
-
 def _information_sum(heard: Heard, own: Array, links: Array) -> tuple[Array, Array]:
     """Weighted sum of information matrices and vectors, turned back into mean and covariance."""
-    # A sender's information is the same for all that hear it, and is computed once.
-    information = _inverse(heard.sources[1])
-    total = _inverse(_weighted(heard, own, links, information))
-    at = heard.graph.senders - heard.graph.size  # from the end: own or, behind them, late ones
+    mine = _inverse(heard.covs)
+    sent = mine if heard.sent_covs is heard.covs else _inverse(heard.sent_covs)
+    total = _inverse(heard.mixed(own, links, mine, sent))
     # About the own mean, so that equal means stay and large ones lose no digits.
-    turned = (information[:, at] @ heard.gaps()[..., None])[..., 0]
+    turned = (sent[:, heard.graph.senders] @ heard.gaps()[..., None])[..., 0]
     moved = (total @ heard.sums(links[..., None] * turned)[..., None])[..., 0]
-    return heard.means + moved, symmetrise(total)
+    return heard.means + moved, _symmetrise(total)
 
 
 def _inverse(spd: Array) -> Array:
     """Inverse of positive definite matrices by the inverse of their Cholesky factors."""
     lower = np.linalg.cholesky(spd)
-    half = np.linalg.solve(lower, np.broadcast_to(np.eye(spd.shape[-1]), spd.shape))
-    return np.asarray(np.swapaxes(half, -1, -2) @ half)
+    half = _solve_lower(lower, np.broadcast_to(np.eye(spd.shape[-1]), spd.shape))
+    return np.asarray(half.swapaxes(-1, -2) @ half)
