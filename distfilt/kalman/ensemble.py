@@ -165,7 +165,7 @@ def enkf_filter(
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
     >>> rng = np.random.default_rng(1)
     >>> run = enkf_filter(rng.standard_normal((4, 9, 1)), np.ones((2, 4, 1)), model=walk,
-    ...                   sensors=[direct([0], noise=1.0)], times=[1.0, 2.0], rng=rng)
+    ...                   sensors=[direct([0], std=1.0)], times=[1.0, 2.0], rng=rng)
     >>> run.means.shape, run.covariances.shape
     ((2, 4, 1), (2, 4, 1, 1))
     """
@@ -183,7 +183,7 @@ def enkf_filter(
             near = y[k][..., None, :] - sensor.residual(
                 np.broadcast_to(y[k][..., None, :], h.shape), h
             )
-            noise = sensor.noise[np.ix_(seen, seen)]
+            noise = sensor.cov[np.ix_(seen, seen)]
             x = enkf(
                 x, near[..., seen], y[k][..., seen], noise, rng=rng, known_noise=known_noise
             )

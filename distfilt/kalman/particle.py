@@ -281,7 +281,7 @@ def particle_filter(
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
     >>> rng = np.random.default_rng(1)
     >>> run = particle_filter(rng.standard_normal((500, 1)), [[3.0]], model=walk,
-    ...                       sensors=[direct([0], noise=1.0)], times=[1.0], rng=rng)
+    ...                       sensors=[direct([0], std=1.0)], times=[1.0], rng=rng)
     >>> run.means.round(1)
     array([[2.]])
     """
@@ -329,7 +329,7 @@ def _log_likelihood(sensor: Sensor, y: Array, x: Array) -> Array:
     seen = ~np.isnan(y)
     # A missing component gets a zero residual and a unit of its own in R: it adds a factor one.
     here = seen[..., :, None] & seen[..., None, :]
-    noise = np.where(here, sensor.noise, np.eye(sensor.dim))
+    noise = np.where(here, sensor.cov, np.eye(sensor.dim))
     gap = np.where(seen[..., None, :], gap, 0.0)
     solved = np.swapaxes(cholesky_solve(noise, np.swapaxes(gap, -1, -2)), -1, -2)
     log_det = np.linalg.slogdet(noise)[1]
