@@ -13,11 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, callable_, count
+from ..checks import Array, array, callable_, count, instance
 from ..models import Model
 from ..models.rotations import left_directions, turn_between, turned
 from ..sensors import Sensor
-from ._inputs import an_instance, instantaneous, series
+from ._inputs import instantaneous, series
 from ._steps import analysed, linearised, moved_cov, over_time
 from .linear import GaussianRun
 
@@ -183,8 +183,8 @@ def multiplicative_filter(
     (1.0, (1, 12, 12))
     """
     sensor = instantaneous(sensors)
-    an_instance(model, "model", Model)
-    an_instance(chart, "chart", Chart)
+    instance(model, "model", Model)
+    instance(chart, "chart", Chart)
     if chart.dim != model.dim:
         raise ValueError(f"chart: needs {model.dim} components like the model, got {chart.dim}")
 
