@@ -117,12 +117,15 @@ def _print_digests() -> None:
     if "IPython" not in sys.modules:
         return
     from IPython import get_ipython
+    from matplotlib import get_backend, pyplot
     from matplotlib.figure import Figure
 
     from ..digests import of_axes
 
     shell = get_ipython()
     if shell is not None:
+        # The notebook's backend forgets printers when it starts, with the first figure: start it.
+        pyplot.switch_backend(get_backend())
         text = shell.display_formatter.formatters["text/plain"]
         text.for_type(Figure, lambda figure, printer, cycle: printer.text(of_axes(figure)))
 
