@@ -232,24 +232,24 @@ class EnsembleFilter(SensorFilter):
             If a run fails; see `failures`.
         """
         self._check_state(state)
-        dt = self._elapsed(state, t)
-        seen = self._observed(state, observations)
+        dt = self.elapsed(state, t)
+        seen = self.observed(state, observations)
         kept = (*state.history, (state.t, state.ensembles)) if self.lag else ()
         times = [time for time, _ in kept]
-        earlier = [self._slot(item, times, state) for item in late]
+        earlier = [self.slot(item, times, state) for item in late]
         rng = copy.deepcopy(state.rng)
-        channel = self._channel(state, t)
+        channel = self.channel(state, t)
         moved = self.forecast(state.ensembles, self.model, state.t, dt, rng=rng)
         moved = array(moved, "forecast", state.ensembles.shape, finite=False)
-        failed = self._settle(not_finite(moved, 2), range(state.agents), t, state.failed)
+        failed = self.settle(not_finite(moved, 2), range(state.agents), t, state.failed)
         moved = np.where(failed[..., None, None, None], state.ensembles, moved)
         stack = [*(e.copy() for _, e in kept), moved]
         readings = [*earlier, (len(times), seen)]
         for slot, observed in readings:
             before = state.ensembles if slot == len(times) else None
-            for group in self._gather(observed, channel):
+            for group in self.gather(observed, channel):
                 errors = self._condition(stack, slot, group, failed, rng, before)
-                failed = self._settle(errors, group.agents, t, failed)
+                failed = self.settle(errors, group.agents, t, failed)
         now = stack[-1]
         if self.agreement is not None and channel is not None:
             now = array(self.agreement(now, channel), "agreement", now.shape)

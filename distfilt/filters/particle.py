@@ -158,24 +158,24 @@ class ParticleFilter(SensorFilter):
         """
         if not isinstance(state, ParticleState):
             raise ValueError(f"state: needs a ParticleState, got {type(state).__name__}")
-        dt = self._elapsed(state, t)
-        seen = self._observed(state, observations)
+        dt = self.elapsed(state, t)
+        seen = self.observed(state, observations)
         rng = copy.deepcopy(state.rng)
-        channel = self._channel(state, t)
+        channel = self.channel(state, t)
         kept = (*state.history, (state.t, state.points))[-self.lag :] if self.lag else ()
         times = [time for time, _ in kept]
-        earlier = [self._slot(item, times, state) for item in late]
+        earlier = [self.slot(item, times, state) for item in late]
         poor = effective_size(state.log_weights) < self.threshold * self.members
         stack, weights = self._resampled([e for _, e in kept], state, poor, rng)
         moved = self.model.sample_step(stack[-1], state.t, dt, rng=rng)
         agents = range(len(self.sensors))
-        failed = self._settle(not_finite(moved, 2), agents, t, state.failed)
+        failed = self.settle(not_finite(moved, 2), agents, t, state.failed)
         stack[-1] = np.where(failed[..., None, None, None], stack[-1], moved)
         for slot, observed in [*earlier, (len(times), seen)]:
             before = state.points if slot == len(times) else None
-            for group in self._gather(observed, channel):
+            for group in self.gather(observed, channel):
                 errors = self._weigh(weights, stack[slot], group, failed, before)
-                failed = self._settle(errors, group.agents, t, failed)
+                failed = self.settle(errors, group.agents, t, failed)
         if self.agreement is not None and channel is not None:
             stack, weights = self._agreed(stack, weights, channel, rng)
         ledger = state.ledger if channel is None else channel.ledger
