@@ -7,7 +7,7 @@ from distfilt.models import constant_velocity, simulate
 from distfilt.network import graphs
 from distfilt.sensors import distance
 
-model = constant_velocity(2, sigma=0.1)
+model = constant_velocity(sigma=0.1)
 beacons = [[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]]
 sensors = [distance([0, 1], std=0.3, origin=place) for place in beacons]
 net = graphs.path(3)

@@ -9,7 +9,8 @@ from distfilt.sensors import direct
 
 def cautious(ensemble, predicted, observed, noise, *, rng):
     """The ensemble Kalman filter's update with innovations cut at three standard deviations."""
-    x, h = ensemble - ensemble.mean(-2, keepdims=True), predicted - predicted.mean(-2, keepdims=True)
+    x = ensemble - ensemble.mean(axis=-2, keepdims=True)
+    h = predicted - predicted.mean(axis=-2, keepdims=True)
     n = ensemble.shape[-2] - 1
     inner = np.swapaxes(h, -1, -2) @ h / n + noise
     width = 3 * np.sqrt(np.diagonal(inner, axis1=-2, axis2=-1))[..., None, :]

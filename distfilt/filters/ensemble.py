@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from .. import ensembles as moments
 from ..checks import Array, array, callable_, count, covariance, generator, number
@@ -28,6 +28,8 @@ from .saving import State
 from .wiring import SensorFilter
 
 __all__ = ["EnsembleFilter", "EnsembleState"]
+
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +56,7 @@ class EnsembleState(State):
 
     ensembles: Array
     history: tuple[tuple[float, Array], ...] = ()
-    failed: Array = field(default_factory=lambda: np.zeros((), dtype=bool))
+    failed: Mask = field(default_factory=lambda: np.zeros((), dtype=bool))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -237,7 +239,7 @@ class EnsembleFilter(SensorFilter):
         kept = (*state.history, (state.t, state.ensembles)) if self.lag else ()
         times = [time for time, _ in kept]
         earlier = [self.slot(item, times, state) for item in late]
-        rng = copy.deepcopy(state.rng)
+        rng = copy.deepcopy(generator(state.rng))
         channel = self.channel(state, t)
         moved = self.forecast(state.ensembles, self.model, state.t, dt, rng=rng)
         moved = array(moved, "forecast", state.ensembles.shape, finite=False)
@@ -270,7 +272,7 @@ class EnsembleFilter(SensorFilter):
         stack: list[Array],
         slot: int,
         group: Heard,
-        failed: Array,
+        failed: Mask,
         rng: np.random.Generator,
         previous: Array | None,
     ) -> dict[tuple[int, ...], str]:
@@ -329,7 +331,7 @@ class EnsembleFilter(SensorFilter):
             raise ValueError(f"state: needs ensembles (..., {needed}), got {state.ensembles.shape}")
 
 
-def _summary(e: Array, failed: Array) -> Summary:
+def _summary(e: Array, failed: Mask) -> Summary:
     mean = moments.mean(e)
     squares = moments.mean(moments.anomalies(e) ** 2)
     variance = squares * e.shape[-2] / (e.shape[-2] - 1)

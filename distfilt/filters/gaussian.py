@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..checks import Array, array, choice, count, covariance, number
 from ..network import Ledger
@@ -18,6 +18,8 @@ from .saving import State
 from .wiring import SensorFilter
 
 __all__ = ["GaussianFilter", "GaussianState"]
+
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,7 @@ class GaussianState(State):
     joint_covariances: Array
     dim: int
     history: tuple[float, ...] = ()
-    failed: Array = field(default_factory=lambda: np.zeros((), dtype=bool))
+    failed: Mask = field(default_factory=lambda: np.zeros((), dtype=bool))
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
 from ..checks import Array, array, choice, count, generator, number
@@ -24,6 +24,8 @@ from .saving import State
 from .wiring import SensorFilter
 
 __all__ = ["ParticleCollapse", "ParticleFilter", "ParticleState"]
+
+Mask = NDArray[np.bool_]
 
 
 class ParticleCollapse(RuntimeWarning):
@@ -57,7 +59,7 @@ class ParticleState(State):
     points: Array
     log_weights: Array
     history: tuple[tuple[float, Array], ...] = ()
-    failed: Array = field(default_factory=lambda: np.zeros((), dtype=bool))
+    failed: Mask = field(default_factory=lambda: np.zeros((), dtype=bool))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -160,7 +162,7 @@ class ParticleFilter(SensorFilter):
             raise ValueError(f"state: needs a ParticleState, got {type(state).__name__}")
         dt = self.elapsed(state, t)
         seen = self.observed(state, observations)
-        rng = copy.deepcopy(state.rng)
+        rng = copy.deepcopy(generator(state.rng))
         channel = self.channel(state, t)
         kept = (*state.history, (state.t, state.points))[-self.lag :] if self.lag else ()
         times = [time for time, _ in kept]
@@ -192,7 +194,7 @@ class ParticleFilter(SensorFilter):
         return tuple((t, _summary(state, points)) for t, points in state.history)
 
     def _resampled(
-        self, earlier: list[Array], state: ParticleState, poor: Array, rng: np.random.Generator
+        self, earlier: list[Array], state: ParticleState, poor: Mask, rng: np.random.Generator
     ) -> tuple[list[Array], Array]:
         """Paths, and log-weights, after agents with a poor effective size have resampled."""
         paths = [*earlier, state.points]
@@ -215,7 +217,7 @@ class ParticleFilter(SensorFilter):
         return out, weights
 
     def _weigh(
-        self, weights: Array, points: Array, group: Heard, failed: Array, previous: Array | None
+        self, weights: Array, points: Array, group: Heard, failed: Mask, previous: Array | None
     ) -> dict[tuple[int, ...], str]:
         """Multiply a group's weights by the likelihood, in place; the rows that failed."""
         rows = group.agents

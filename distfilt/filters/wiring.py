@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, callable_, choice, count, number
+from ..checks import Array, callable_, choice, count, number
 from ..models import Model
 from ..network import Channel, Faults, Graph
 from ..sensors import Sensor
@@ -19,6 +20,8 @@ from .observations import at_one_time, over_times
 from .saving import State
 
 __all__ = ["SensorFilter"]
+
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,10 +162,10 @@ class SensorFilter(Filter):
     def settle(
         self,
         errors: dict[tuple[int, ...], str],
-        agents: Sequence[int],
+        agents: Sequence[int] | NDArray[np.intp],
         t: float,
-        failed: Array,
-    ) -> Array:
+        failed: Mask,
+    ) -> Mask:
         """The runs that have failed by now, or the error that names the first of them."""
         if not errors:
             return failed
