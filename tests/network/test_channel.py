@@ -432,7 +432,8 @@ def test_combine_with_own_tells_the_own_weight() -> None:
 
 def test_windows_in_time_follow_the_channel_s_time() -> None:
     faults = Faults(silent=[0], during=[(10.0, 20.0)], clock="time")
-    heard = [len(star(faults=faults, t=t).exchange([np.zeros(1)] * 3)[0]) for t in (9.9, 10, 19, 20)]
+    sent = [np.zeros(1)] * 3
+    heard = [len(star(faults=faults, t=t).exchange(sent)[0]) for t in (9.9, 10.0, 19.0, 20.0)]
     assert heard == [2, 0, 0, 2]
 
 

@@ -165,7 +165,8 @@ def test_a_gain_from_degrees_is_safe(seed: int, agents: int, directed: bool) -> 
     values = np.linalg.eigvals(graph.laplacian.toarray())
     moving = values[np.abs(values) > 1e-8]
     if moving.size:
-        assert np.abs(1 - 0.999 * limit * moving).max() < 1 < np.abs(1 - 1.001 * limit * moving).max()
+        below, above = (np.abs(1 - f * limit * moving).max() for f in (0.999, 1.001))
+        assert below < 1 < above
 
 
 def test_the_degree_bound_is_exact_for_stars_and_even_rings() -> None:
