@@ -1,4 +1,4 @@
-"""Property tests: the same examples in every run, or new ones for ``HYPOTHESIS_PROFILE=explore``."""
+"""Property tests take the same examples each time; ``HYPOTHESIS_PROFILE=explore`` new ones."""
 
 from __future__ import annotations
 
