@@ -1,6 +1,26 @@
-"""Filters: a model, sensors, an update and a network, put together."""
+"""Filters: a model, sensors, an update and a network, put together on one contract."""
 
-from .ensemble import EnsembleFilter, EnsembleState, Late
+from .driver import Filter, Late, Summary, final_state
+from .ensemble import EnsembleFilter, EnsembleState
+from .failures import FilterError
 from .gaussian import GaussianFilter, GaussianState
+from .particle import ParticleCollapse, ParticleFilter, ParticleState
+from .saving import State
+from .wiring import SensorFilter
 
-__all__ = ["EnsembleFilter", "EnsembleState", "GaussianFilter", "GaussianState", "Late"]
+__all__ = [
+    "EnsembleFilter",
+    "EnsembleState",
+    "Filter",
+    "FilterError",
+    "GaussianFilter",
+    "GaussianState",
+    "Late",
+    "ParticleCollapse",
+    "ParticleFilter",
+    "ParticleState",
+    "SensorFilter",
+    "State",
+    "Summary",
+    "final_state",
+]

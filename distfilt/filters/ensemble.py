@@ -1,157 +1,182 @@
 """A network of ensemble filters: forecast, assimilate what was heard, agree with the neighbours.
 
-Algorithm 1 of Grange et al., for any model, sensors, graph, update and consensus rule.
+Algorithm 1 of Grange et al., for any model, sensors, graph, update and rule of agreement.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, callable_, count, generator, number
+from .. import ensembles as moments
+from ..checks import Array, array, callable_, count, covariance, generator, number
 from ..models import Model
-from ..network import Channel, Faults, Graph, Ledger
-from ..progress import track
+from ..network import Graph, Ledger, intersection
 from ..sensors import Sensor
-from .assimilation import Update, assimilate
-from .observations import at_one_time, over_times
-from .record import SCORES, as_dataset
-from .state import EnsembleState
+from ..updates import exact_draws, exact_forecast, known_noise, sampled_forecast, with_missing
+from ..updates.door import Update, stackable, unchecked
+from .driver import Late, Summary
+from .failures import guarded, not_finite
+from .heard import Heard
+from .saving import State
+from .wiring import SensorFilter
 
-if TYPE_CHECKING:
-    import xarray
+__all__ = ["EnsembleFilter", "EnsembleState"]
 
-__all__ = ["EnsembleFilter", "EnsembleState", "Late"]
-
-Consensus = Callable[[Array, Channel], Array]
+Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class Late:
-    """An observation that arrives after the time at which it was made.
+@dataclass(frozen=True, eq=False)
+class EnsembleState(State):
+    """What the agents' ensembles are between two steps.
 
     Parameters
     ----------
-    agent : int
-        Who observed.
-    measured : float
-        When, in s: a time at which the filter was stepped before.
-    value : array_like, (*runs, m) or (m,)
-        What was observed; NaN marks a missing component.
-    arrived : float
-        When it became known, in s; used by :meth:`EnsembleFilter.run`.
+    t, ledger, rng
+        As for :class:`~distfilt.filters.State`.
+    ensembles : ndarray, (*runs, A, N, d)
+        Every agent's members.
+    history : tuple of (float, ndarray)
+        Earlier times and their ensembles, oldest first, conditioned on all that came since.
+    failed : ndarray of bool, (*runs)
+        Runs that failed and are no longer updated.
 
     Examples
     --------
-    >>> Late(0, 1.0, [2.0], arrived=3.0).measured
-    1.0
+    >>> state = EnsembleState(0.0, Ledger.empty(2), np.random.default_rng(0), np.zeros((2, 5, 3)))
+    >>> state.agents, state.members, state.dim
+    (2, 5, 3)
     """
 
-    agent: int
-    measured: float
-    value: ArrayLike
-    arrived: float
+    ensembles: Array
+    history: tuple[tuple[float, Array], ...] = ()
+    failed: Mask = field(default_factory=lambda: np.zeros((), dtype=bool))
 
     def __post_init__(self) -> None:
-        count(self.agent, "agent", at_least=0)
-        number(self.measured, "measured")
-        number(self.arrived, "arrived", above=self.measured)
-        array(self.value, "value", (..., "m"), finite=False)
+        super().__post_init__()
+        ensembles = array(self.ensembles, "ensembles", (..., "A", "N", "d"))
+        generator(self.rng)
+        if self.ledger.messages.size != ensembles.shape[-3]:
+            raise ValueError(
+                f"ledger: needs {ensembles.shape[-3]} agents, got {self.ledger.messages.size}"
+            )
+        for _, earlier in self.history:
+            array(earlier, "history", ensembles.shape)
+        object.__setattr__(self, "failed", np.broadcast_to(self.failed, self.runs))
+
+    @property
+    def runs(self) -> tuple[int, ...]:
+        """Leading axes: independent runs of the network."""
+        return tuple(self.ensembles.shape[:-3])
+
+    @property
+    def agents(self) -> int:
+        """Number A of agents."""
+        return int(self.ensembles.shape[-3])
+
+    @property
+    def members(self) -> int:
+        """Number N of members of each agent."""
+        return int(self.ensembles.shape[-2])
+
+    @property
+    def dim(self) -> int:
+        """Size d of the state vector."""
+        return int(self.ensembles.shape[-1])
 
 
-@dataclass(frozen=True)
-class EnsembleFilter:
-    """One ensemble per agent; agents share observations and pull each other towards agreement.
+@dataclass(frozen=True, eq=False)
+class EnsembleFilter(SensorFilter):
+    """One ensemble per agent; agents share observations and agree with each other.
 
     In every step each agent moves its members with the model, sends its observation to those that
-    hear it, updates its members with what it knows, and applies the consensus rule. All that
+    hear it, updates its members with what it knows, and applies the rule of agreement. All that
     passes between agents passes through one :class:`~distfilt.network.Channel`.
 
     Parameters
     ----------
-    model : Model
-        How the state moves; known to all agents.
-    sensors : sequence of Sensor or None, length A
-        What each agent sees; None for an agent without a sensor. Neighbours know each other's
-        sensors.
-    graph : Graph, or callable t -> Graph
-        Who hears whom.
+    model, sensors, graph, agreement, share, faults, lag, names, failures
+        As for :class:`~distfilt.filters.SensorFilter`. The agreement is a function
+        ``agreement(ensembles, channel) -> ensembles``, such as ``partial(pull, gain=0.05)``.
     update : callable
-        ``update(ensemble, predicted, observed, noise, *, rng) -> ensemble``, such as
-        :func:`distfilt.triangular.conditioning.affine_update`.
-    consensus : callable, optional
-        ``consensus(ensembles, channel) -> ensembles``, such as
-        ``partial(mean_pull, gain=0.05)``; none by default.
+        ``update(ensemble, predicted, observed, noise, *, rng) -> ensemble``; one of
+        :mod:`distfilt.updates`, or a function of one's own for a single agent's ensembles.
+    forecast : callable
+        ``forecast(ensemble, model, t, dt, *, rng) -> ensemble``.
     members : int
         Number N of members of each agent.
-    faults : Faults, optional
-        Messages lost and agents silenced; a lost observation is a missing one. A delay is not
-        accepted: an observation that comes late has its own time, pass it as :class:`Late`.
-    lag : int
-        How many earlier times are kept for late observations. Each of them is conditioned on
-        every observation too, so a step costs 1 + `lag` updates.
+
+    See Also
+    --------
+    EnsembleFilter.exact : exact draws and covariance intersection, in one line.
 
     Examples
     --------
+    >>> from distfilt.network import graphs
     >>> from distfilt.sensors import direct
-    >>> from distfilt.triangular.conditioning import affine_update
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
-    >>> pair = Graph.from_adjacency([[0, 1], [1, 0]])
-    >>> f = EnsembleFilter(walk, [direct([0], noise=0.5), None], pair, affine_update, members=50)
-    >>> state = f.start(np.zeros((50, 1)) + np.linspace(-2, 2, 50)[:, None],
-    ...                 rng=np.random.default_rng(0))
+    >>> f = EnsembleFilter(walk, [direct([0], std=0.5), None], graphs.path(2), members=500)
+    >>> state = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0))
     >>> state = f.step(state, 1.0, [[0.8], None])
     >>> state.ensembles.mean(axis=1).round(1).ravel()
-    array([0.8, 0.6])
+    array([0.7, 0.7])
     """
 
-    model: Model
-    sensors: Sequence[Sensor | None]
-    graph: Graph | Callable[[float], Graph]
-    update: Update
-    consensus: Consensus | None = None
-    members: int = 100
-    faults: Faults | None = None
-    lag: int = 0
+    update: Update = field(default=known_noise, kw_only=True)
+    forecast: Callable[..., Array] = field(default=sampled_forecast, kw_only=True)
+    members: int = field(default=100, kw_only=True)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.model, Model):
-            raise ValueError(f"model: needs a Model, got {type(self.model).__name__}")
-        for sensor in self.sensors:
-            if sensor is not None and not isinstance(sensor, Sensor):
-                raise ValueError(f"sensors: needs Sensor or None, got {type(sensor).__name__}")
-        if isinstance(self.graph, Graph):
-            self._check_graph(self.graph)
-        else:
-            callable_(self.graph, "graph")
+        super().__post_init__()
         callable_(self.update, "update")
-        if self.consensus is not None:
-            callable_(self.consensus, "consensus")
-        if self.faults is not None and (not isinstance(self.faults, Faults) or self.faults.delay):
-            raise ValueError(f"faults: needs Faults without a delay, got {self.faults!r}")
+        callable_(self.forecast, "forecast")
         count(self.members, "members", at_least=2)
-        count(self.lag, "lag", at_least=0)
 
-    def _check_graph(self, graph: Graph) -> Graph:
-        if not isinstance(graph, Graph):
-            raise ValueError(f"graph: needs a Graph, got {type(graph).__name__}")
-        if graph.size != len(self.sensors):
-            raise ValueError(
-                f"graph: needs {len(self.sensors)} agents like sensors, got {graph.size}"
-            )
-        return graph
+    @classmethod
+    def exact(
+        cls,
+        model: Model,
+        sensors: Sequence[Sensor | None],
+        graph: Graph | Callable[[float], Graph] | None = None,
+        **options: Any,
+    ) -> EnsembleFilter:
+        """Second-order exact draws and covariance intersection of least determinant.
 
-    def _graph_at(self, t: float) -> Graph:
-        return self.graph if isinstance(self.graph, Graph) else self._check_graph(self.graph(t))
+        For a linear model and linear sensors every agent's sample moments are those of the Kalman
+        filters that fuse by the same rule; the book's chapter 4 measures it on others.
+
+        Parameters
+        ----------
+        model, sensors, graph
+            As for the class.
+        **options
+            Any other option of the class; needs more `members` than d + twice the readings heard.
+
+        Examples
+        --------
+        >>> from distfilt.sensors import direct
+        >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
+        >>> f = EnsembleFilter.exact(walk, [direct([0], std=1.0)], members=10)
+        >>> prior = np.linspace(-1, 1, 10)[:, None]
+        >>> state = f.step(f.start(prior, rng=np.random.default_rng(0)), 1.0, [[0.8]])
+        >>> p = prior.var(ddof=1) + 1.0
+        >>> bool(abs(state.ensembles.var(ddof=1) - p / (p + 1.0)) < 1e-12)
+        True
+        """
+        own: dict[str, Any] = {"update": exact_draws, "forecast": exact_forecast}
+        if graph is not None:
+            own["agreement"] = partial(intersection, rule="min_determinant")
+        return cls(model, sensors, graph, **(own | options))
 
     def start(
         self,
-        prior: ArrayLike | Callable[..., Array],
+        prior: ArrayLike | Callable[..., Array] | tuple[ArrayLike, ArrayLike],
         *,
         rng: np.random.Generator,
         runs: tuple[int, ...] = (),
@@ -161,10 +186,10 @@ class EnsembleFilter:
 
         Parameters
         ----------
-        prior : array_like or callable
-            Members (N, d) for every agent and run, or (*runs, A, N, d); or a function
-            ``prior(members, rng=rng, leading=leading)`` that draws (*leading, N, d), such as
-            ``partial(ensembles.draw, mean, cov)``.
+        prior : tuple, array_like or callable
+            A Gaussian's ``(mean, cov)``, (d,) and (d, d); members (N, d) for every agent and run,
+            or (*runs, A, N, d); or a function ``prior(members, rng=rng, leading=leading)`` that
+            draws (*leading, N, d).
         rng : numpy.random.Generator
             Draws the prior; a child stream of it, independent of whatever else is drawn from it,
             serves all later steps.
@@ -173,15 +198,11 @@ class EnsembleFilter:
         t : float
             The time of the prior, in s.
         """
-        shape = (*(count(n, "runs") for n in runs), len(self.sensors), self.members, self.model.dim)
         generator(rng)
-        drawn = prior(self.members, rng=rng, leading=shape[:-2]) if callable(prior) else prior
-        members = array(np.asarray(drawn), "prior", (..., self.members, self.model.dim))
-        if members.shape != shape and members.shape != shape[-2:]:
-            raise ValueError(f"prior: needs shape {shape} or {shape[-2:]}, got {members.shape}")
-        ensembles = np.broadcast_to(members, shape).copy()
+        lead = (*(count(n, "runs") for n in runs), len(self.sensors))
+        drawn = drawn_prior(prior, self.members, self.model.dim, lead, rng)
         ledger = Ledger.empty(len(self.sensors))
-        return EnsembleState(number(t, "t"), ensembles, rng.spawn(1)[0], ledger)
+        return EnsembleState(number(t, "t"), ledger, rng.spawn(1)[0], drawn)
 
     def step(
         self,
@@ -209,97 +230,98 @@ class EnsembleFilter:
         ValueError
             If `t` is not later, or an observation does not fit its sensor or no earlier state is
             kept for a late one.
+        FilterError
+            If a run fails; see `failures`.
         """
         self._check_state(state)
-        dt = number(t, "t", above=state.t) - state.t
-        seen = at_one_time(observations, self.sensors, state.runs)
-        earlier = [self._checked_late(item, state) for item in late]
-        rng = copy.deepcopy(state.rng)
-        channel = Channel(
-            self._graph_at(t), ledger=state.ledger, runs=state.runs, faults=self.faults
-        )
-        ensembles = self.model.sample_step(state.ensembles, state.t, dt, rng=rng)
+        dt = self.elapsed(state, t)
+        seen = self.observed(state, observations)
         kept = (*state.history, (state.t, state.ensembles)) if self.lag else ()
-        stack = [*(e.copy() for _, e in kept), ensembles]
-        for slot, observed in earlier:
-            assimilate(stack, slot, observed, self.sensors, self.update, channel, rng)
-        here = len(stack) - 1
-        assimilate(
-            stack, here, seen, self.sensors, self.update, channel, rng, previous=state.ensembles
-        )
-        moved = stack[-1]
-        if self.consensus is not None:
-            moved = array(self.consensus(moved, channel), "consensus", ensembles.shape)
         times = [time for time, _ in kept]
+        earlier = [self.slot(item, times, state) for item in late]
+        rng = copy.deepcopy(generator(state.rng))
+        channel = self.channel(state, t)
+        moved = self.forecast(state.ensembles, self.model, state.t, dt, rng=rng)
+        moved = array(moved, "forecast", state.ensembles.shape, finite=False)
+        failed = self.settle(not_finite(moved, 2), range(state.agents), t, state.failed)
+        moved = np.where(failed[..., None, None, None], state.ensembles, moved)
+        stack = [*(e.copy() for _, e in kept), moved]
+        readings = [*earlier, (len(times), seen)]
+        for slot, observed in readings:
+            before = state.ensembles if slot == len(times) else None
+            for group in self.gather(observed, channel):
+                errors = self._condition(stack, slot, group, failed, rng, before)
+                failed = self.settle(errors, group.agents, t, failed)
+        now = stack[-1]
+        if self.agreement is not None and channel is not None:
+            now = array(self.agreement(now, channel), "agreement", now.shape)
         history = tuple(zip(times, stack[:-1], strict=True))[-self.lag :] if self.lag else ()
-        return EnsembleState(float(t), moved, rng, channel.ledger, history)
+        ledger = state.ledger if channel is None else channel.ledger
+        return EnsembleState(float(t), ledger, rng, now, history, failed)
 
-    def steps(
+    def summary(self, state: EnsembleState) -> Summary:
+        """Ensemble means and variances; the members for the scores."""
+        return _summary(state.ensembles, state.failed)
+
+    def past(self, state: EnsembleState) -> tuple[tuple[float, Summary], ...]:
+        """Earlier times, oldest first, and what is believed of them by now."""
+        return tuple((t, _summary(e, state.failed)) for t, e in state.history)
+
+    def _condition(
         self,
-        state: EnsembleState,
-        times: ArrayLike,
-        observations: Sequence[ArrayLike | None],
-        *,
-        late: Sequence[Late] = (),
-        progress: bool = False,
-    ) -> Iterator[EnsembleState]:
-        """The states at `times`, one after the other; arguments as in :meth:`run`."""
-        self._check_state(state)
-        grid, series = over_times(observations, self.sensors, times)
-        waiting = sorted(late, key=lambda item: item.arrived)
-        if waiting and grid.size and waiting[-1].arrived > grid[-1]:
-            raise ValueError(
-                f"late: needs arrivals up to {grid[-1]:g}, got one at {waiting[-1].arrived:g}"
+        stack: list[Array],
+        slot: int,
+        group: Heard,
+        failed: Mask,
+        rng: np.random.Generator,
+        previous: Array | None,
+    ) -> dict[tuple[int, ...], str]:
+        """Condition every time's ensembles of a group's agents, in place; the rows that failed."""
+        rows = group.agents
+        members = tuple(e[..., rows, :, :] for e in stack)
+        before = None if previous is None else previous[..., rows, :, :]
+        predicted = group.predict(members[slot], before)
+        target = np.where(failed[..., None, None], np.nan, group.target)
+        repredicts = bool(getattr(self.update, "repredicts", False)) and len(stack) == 1
+
+        def compute(h: Array, y: Array, *rest: Any) -> tuple[Array, ...]:
+            *ensembles, noise, source = rest
+            whole = h.shape == predicted.shape
+            options: dict[str, Any] = {}
+            if repredicts and whole:
+                options["predict"] = lambda x: group.predict(x, before)
+            out = []
+            for k, x in enumerate(ensembles):
+                # Every time's members meet the same draw of the noise, so that all the separate
+                # updates are one joint update; the last one advances the generator.
+                own = source if k == len(ensembles) - 1 else copy.deepcopy(source)
+                out.append(self._updated(x, h, y, noise, own, options))
+            return tuple(out)
+
+        arrays = (predicted, target, *members)
+        result, errors = guarded(
+            compute, arrays, members, target.ndim - 1, shared=group.noise, rng=rng
+        )
+        for e, new in zip(stack, result, strict=True):
+            e[..., rows, :, :] = new
+        return errors
+
+    def _updated(
+        self, x: Array, h: Array, y: Array, noise: Array, rng: Any, options: dict[str, Any]
+    ) -> Array:
+        """One time's ensembles after the update; a plain function gets one agent's at a time."""
+        if options or getattr(self.update, "repredicts", False):
+            return unchecked(self.update)(x, h, y, noise, rng=rng, **options)
+        if stackable(self.update) or x.ndim == 2:
+            return with_missing(self.update, x, h, y, noise, rng=rng)
+        out = np.empty_like(x)
+        for g in range(x.shape[-3]):
+            r = noise[g] if noise.ndim > 2 else noise
+            new = with_missing(
+                self.update, x[..., g, :, :], h[..., g, :, :], y[..., g, :], r, rng=rng
             )
-        for k, t in enumerate(track(grid, show=progress)):
-            due = [item for item in waiting if item.arrived <= t]
-            waiting = waiting[len(due) :]
-            now = [None if o is None else o[k] for o in series]
-            state = self.step(state, float(t), now, late=due)
-            yield state
-
-    def run(
-        self,
-        state: EnsembleState,
-        times: ArrayLike,
-        observations: Sequence[ArrayLike | None],
-        *,
-        truth: ArrayLike | None = None,
-        scores: Collection[str] = SCORES,
-        late: Sequence[Late] = (),
-        progress: bool = False,
-    ) -> xarray.Dataset:
-        """Step through a series and record it.
-
-        Parameters
-        ----------
-        state : EnsembleState
-            Where to begin.
-        times : array_like, (T,)
-            Strictly increasing; steps may differ in length.
-        observations : sequence of length A
-            Per agent (T, *runs, m) or (T, m), or None. NaN marks what is missing.
-        truth : array_like, (T, *runs, d), optional
-            If given, the scores are recorded too.
-        scores : collection of {"squared_error", "nees", "crps"}
-            Which of them; CRPS costs about as much as the filter.
-        late : sequence of Late
-            Each is taken in at the first of `times` that is not before its arrival.
-        progress : bool
-            Show a progress bar when a person watches.
-
-        Returns
-        -------
-        xarray.Dataset
-            ``mean``, ``variance``, ``spread`` and the ledger's ``messages``, ``scalars``,
-            ``bytes`` over time, run, agent and component; with `truth` also ``squared_error``,
-            ``nees`` and ``crps``.
-        """
-        known = None
-        if truth is not None:
-            known = array(truth, "truth", (np.size(times), *state.runs, self.model.dim))
-        states = self.steps(state, times, observations, late=late, progress=progress)
-        return as_dataset(states, times, self.model, state, known, scores=scores)
+            out[..., g, :, :] = array(new, "update", x[..., g, :, :].shape, finite=False)
+        return out
 
     def _check_state(self, state: Any) -> None:
         if not isinstance(state, EnsembleState):
@@ -308,19 +330,28 @@ class EnsembleFilter:
         if state.ensembles.shape[-3:] != needed:
             raise ValueError(f"state: needs ensembles (..., {needed}), got {state.ensembles.shape}")
 
-    def _checked_late(self, item: Late, state: EnsembleState) -> tuple[int, list[Array | None]]:
-        """Where in the history a late observation belongs, and the observations of that time."""
-        times = [t for t, _ in state.history] + ([state.t] if self.lag else [])
-        match = [k for k, t in enumerate(times) if abs(t - item.measured) <= 1e-9 * max(1, abs(t))]
-        if not match:
-            kept = ", ".join(f"{t:g}" for t in times) or "none (lag = 0)"
-            raise ValueError(f"late: needs an earlier time that is kept ({kept}), "
-                             f"got {item.measured:g}")
-        if item.agent >= len(self.sensors):
-            raise ValueError(f"late: needs an agent below {len(self.sensors)}, got {item.agent}")
-        sensor = self.sensors[item.agent]
-        if sensor is not None and sensor.uses_previous:
-            raise ValueError(f"late: a {sensor.kind} sensor cannot be late, it compares two times")
-        observations: list[ArrayLike | None] = [None] * len(self.sensors)
-        observations[item.agent] = item.value
-        return match[0], at_one_time(observations, self.sensors, state.runs)
+
+def _summary(e: Array, failed: Mask) -> Summary:
+    mean = moments.mean(e)
+    squares = moments.mean(moments.anomalies(e) ** 2)
+    variance = squares * e.shape[-2] / (e.shape[-2] - 1)
+    if failed.any():
+        mean, variance = mean.copy(), variance.copy()
+        mean[failed], variance[failed] = np.nan, np.nan
+    return Summary(mean, variance, members=e)
+
+
+def drawn_prior(
+    prior: Any, members: int, dim: int, lead: tuple[int, ...], rng: np.random.Generator
+) -> Array:
+    """Members (*lead, N, d) of a prior in any of the forms that a filter's start accepts."""
+    if isinstance(prior, tuple) and len(prior) == 2:
+        centre = array(prior[0], "prior", (dim,))
+        cov = covariance(prior[1], "prior", dim, semidefinite=True)
+        return moments.draw(centre, cov, members, rng=rng, leading=lead)
+    drawn = prior(members, rng=rng, leading=lead) if callable(prior) else prior
+    shape = (*lead, members, dim)
+    out = array(np.asarray(drawn), "prior", (..., members, dim))
+    if out.shape != shape and out.shape != shape[-2:]:
+        raise ValueError(f"prior: needs shape {shape} or {shape[-2:]}, got {out.shape}")
+    return np.broadcast_to(out, shape).copy()

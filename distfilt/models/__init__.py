@@ -1,5 +1,44 @@
 """Models of motion: how a state moves from one time to the next, and how uncertain that is."""
 
+from .attitude import angular_acceleration, attitude, satellite_pose
 from .base import LinearModel, Model, simulate
+from .integrators import rk4, rk4_jacobian
+from .lorenz import lorenz63, lorenz63_rate
+from .motion import constant_velocity, coordinated_turn
+from .rotations import (
+    cross_matrix,
+    left_directions,
+    quaternion_rate,
+    rotation_matrix,
+    turn_between,
+    turned,
+)
+from .satellite import (
+    clohessy_wiltshire,
+    clohessy_wiltshire_drift,
+    clohessy_wiltshire_transition,
+)
 
-__all__ = ["LinearModel", "Model", "simulate"]
+__all__ = [
+    "LinearModel",
+    "Model",
+    "angular_acceleration",
+    "attitude",
+    "clohessy_wiltshire",
+    "clohessy_wiltshire_drift",
+    "clohessy_wiltshire_transition",
+    "constant_velocity",
+    "coordinated_turn",
+    "cross_matrix",
+    "left_directions",
+    "lorenz63",
+    "lorenz63_rate",
+    "quaternion_rate",
+    "rk4",
+    "rk4_jacobian",
+    "rotation_matrix",
+    "satellite_pose",
+    "simulate",
+    "turn_between",
+    "turned",
+]

@@ -8,7 +8,6 @@ not for its transpose, :math:`\dot{\mathbf R} = -[\boldsymbol\omega]_\times\math
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
 
 import numpy as np
@@ -16,115 +15,17 @@ from numpy.typing import ArrayLike
 
 from ..checks import Array, array, number
 from .base import Model
-from .integrators import rk4
+from .integrators import rk4, rk4_jacobian
+from .rotations import (
+    _quaternion,
+    _quaternion_rate,
+    cross_matrix,
+    left_directions,
+    rotation_matrix,
+)
 from .satellite import clohessy_wiltshire
 
-__all__ = [
-    "angular_acceleration",
-    "attitude",
-    "cross_matrix",
-    "quaternion_rate",
-    "rotation_matrix",
-    "satellite_pose",
-]
-
-
-def cross_matrix(vector: ArrayLike) -> Array:
-    r"""The matrix :math:`[\boldsymbol\omega]_\times` of the cross product, equation (19).
-
-    Parameters
-    ----------
-    vector : array_like, (..., 3)
-
-    Returns
-    -------
-    ndarray, (..., 3, 3)
-
-    Examples
-    --------
-    >>> cross_matrix([0.0, 0.0, 1.0]) @ [1.0, 0.0, 0.0]
-    array([0., 1., 0.])
-    """
-    w = array(vector, "vector", (..., 3))
-    out = np.zeros((*w.shape, 3))
-    out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
-    out[..., 1, 2], out[..., 2, 0], out[..., 0, 1] = -w[..., 0], -w[..., 1], -w[..., 2]
-    return out
-
-
-def _quaternion(value: ArrayLike) -> Array:
-    q = array(value, "quaternion", (..., 4))
-    if not (q != 0).any(axis=-1).all():
-        raise ValueError("quaternion: needs quaternions that are not zero, got a zero one")
-    return q
-
-
-def rotation_matrix(quaternion: ArrayLike) -> Array:
-    r"""The active rotation matrix R(q) of a quaternion with its scalar part first.
-
-    Members of an ensemble need not have unit length, so the length is divided out.
-
-    Parameters
-    ----------
-    quaternion : array_like, (..., 4)
-        Not zero.
-
-    Returns
-    -------
-    ndarray, (..., 3, 3)
-
-    Examples
-    --------
-    A quarter turn about the third axis takes the first axis to the second:
-
-    >>> (rotation_matrix([1.0, 0.0, 0.0, 1.0]) @ [1.0, 0.0, 0.0]).round(12)
-    array([0., 1., 0.])
-    """
-    q = _quaternion(quaternion)
-    a, b, c, d = (q[..., k] for k in range(4))
-    rows = [
-        [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
-        [2 * (b * c + a * d), a * a - b * b + c * c - d * d, 2 * (c * d - a * b)],
-        [2 * (b * d - a * c), 2 * (c * d + a * b), a * a - b * b - c * c + d * d],
-    ]
-    stacked = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-    return np.asarray(stacked / (q**2).sum(axis=-1)[..., None, None])
-
-
-def quaternion_rate(quaternion: ArrayLike, angular_velocity: ArrayLike) -> Array:
-    """The quaternion's derivative, equation (21); it keeps the length.
-
-    Parameters
-    ----------
-    quaternion : array_like, (..., 4)
-    angular_velocity : array_like, (..., 3)
-        Of the body relative to the Hill frame, in rad/s.
-
-    Returns
-    -------
-    ndarray, (..., 4)
-        In 1/s.
-
-    Examples
-    --------
-    >>> quaternion_rate([1.0, 0.0, 0.0, 0.0], [0.2, 0.0, 0.0]) + 0.0
-    array([ 0. , -0.1,  0. ,  0. ])
-    """
-    q = _quaternion(quaternion)
-    w = array(angular_velocity, "angular_velocity", (*q.shape[:-1], 3))
-    return np.stack(_quaternion_rate(np.moveaxis(q, -1, 0), np.moveaxis(w, -1, 0)), axis=-1)
-
-
-def _quaternion_rate(q: Array, w: Array) -> list[Array]:
-    """Equation (21), components first."""
-    a, b, c, d = q
-    w1, w2, w3 = w
-    return [
-        0.5 * (b * w1 + c * w2 + d * w3),
-        -0.5 * (a * w1 + d * w2 - c * w3),
-        -0.5 * (a * w2 + b * w3 - d * w1),
-        -0.5 * (c * w1 - b * w2 + a * w3),
-    ]
+__all__ = ["angular_acceleration", "attitude", "satellite_pose"]
 
 
 def angular_acceleration(
@@ -184,9 +85,43 @@ def _flow(x: Array, t: float, dt: float, alpha: float, step: float) -> Array:
 
     # Components first: each operation then runs over contiguous memory.
     rows = np.ascontiguousarray(np.moveaxis(x, -1, 0))
-    # A step that divides dt up to rounding is not cut once more.
-    moved = rk4(rates, rows, t, dt, substeps=max(1, math.ceil(dt / step - 1e-9)))
+    moved = rk4(rates, rows, t, dt, longest=step)
     return np.ascontiguousarray(np.moveaxis(moved, 0, -1))
+
+
+def _rates(x: Array, alpha: float) -> Array:
+    """Right-hand sides of (20) and (21) together, (..., 7)."""
+    rows = np.moveaxis(x, -1, 0)
+    w, q = rows[:3], rows[3:]
+    return np.stack([*_angular_acceleration(q, w, alpha), *_quaternion_rate(q, w)], axis=-1)
+
+
+def _slopes(x: Array, alpha: float) -> Array:
+    r"""Derivative of (20) and (21), (..., 7, 7).
+
+    With v = R(q) (0, 0, α), the rate [ω]v has the slopes -[v] in ω and [ω] dv/dq in q.
+    """
+    w, q = x[..., :3], x[..., 3:]
+    a, b, c, d = (q[..., k] for k in range(4))
+    squared = (q**2).sum(axis=-1)[..., None, None]
+    third = rotation_matrix(q)[..., 2]
+    rows = [[c, d, a, b], [-b, -a, d, c], [a, -b, -c, d]]
+    bent = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    turn = 2 * alpha * (bent - third[..., None] * q[..., None, :]) / squared
+    out = np.zeros((*x.shape, 7))
+    out[..., :3, :3] = -cross_matrix(alpha * third)
+    out[..., :3, 3:] = cross_matrix(w) @ turn
+    out[..., 3:, :3] = -left_directions(q)
+    out[..., 3, 4:], out[..., 4:, 3] = 0.5 * w, -0.5 * w
+    out[..., 4:, 4:] = -0.5 * cross_matrix(w)
+    return out
+
+
+def _slope_of_flow(x: Array, t: float, dt: float, alpha: float, step: float) -> Array:
+    """Derivative of `_flow`, (..., 7, 7)."""
+    return rk4_jacobian(
+        lambda v, _: _rates(v, alpha), lambda v, _: _slopes(v, alpha), x, t, dt, longest=step
+    )
 
 
 def attitude(*, rate: float, sigma: float, step: float = 0.01) -> Model:
@@ -221,6 +156,7 @@ def attitude(*, rate: float, sigma: float, step: float = 0.01) -> Model:
         7,
         lambda x, t, dt: _flow(x, t, dt, alpha, longest),
         lambda t, dt: density * dt,
+        derivative=lambda x, t, dt: _slope_of_flow(x, t, dt, alpha, longest),
         names=("w1", "w2", "w3", "q1", "q2", "q3", "q4"),
         units=("rad/s",) * 3 + ("1",) * 4,
     )
@@ -255,14 +191,25 @@ def satellite_pose(*, rate: float, sigma: float, step: float = 0.01) -> Model:
         moved = orbit.flow(x[..., :6], t, dt)
         return np.concatenate([moved, body.flow(x[..., 6:], t, dt)], axis=-1)
 
+    def derivative(x: Array, t: float, dt: float) -> Array:
+        out = np.zeros((*x.shape, 13))
+        out[..., :6, :6] = orbit.transition_matrix(dt)
+        out[..., 6:, 6:] = body._jacobian(x[..., 6:], t, dt)
+        return out
+
     @lru_cache(maxsize=64)
     def noise(dt: float) -> Array:
         cov = np.zeros((13, 13))
-        cov[:6, :6] = orbit.noise_covariance(0.0, dt)
-        cov[6:, 6:] = body.noise_covariance(0.0, dt)
+        cov[:6, :6] = orbit.noise_cov(0.0, dt)
+        cov[6:, 6:] = body.noise_cov(0.0, dt)
         cov.setflags(write=False)
         return cov
 
     return Model(
-        13, flow, lambda t, dt: noise(dt), orbit.names + body.names, orbit.units + body.units
+        13,
+        flow,
+        lambda t, dt: noise(dt),
+        derivative=derivative,
+        names=orbit.names + body.names,
+        units=orbit.units + body.units,
     )

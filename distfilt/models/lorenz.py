@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, array, number
 from .base import Model
-from .integrators import rk4
+from .integrators import rk4, rk4_jacobian
 
 __all__ = ["lorenz63", "lorenz63_rate"]
 
 
 def lorenz63_rate(
-    x: ArrayLike, *, sigma: float = 10.0, rho: float = 28.0, beta: float = 8 / 3
+    x: ArrayLike, *, prandtl: float = 10.0, rho: float = 28.0, beta: float = 8 / 3
 ) -> Array:
     r"""Right-hand side of Lorenz's equations.
 
-    .. math:: \dot x = \sigma(y-x),\quad \dot y = x(\rho-z)-y,\quad \dot z = xy-\beta z
+    .. math:: \dot x = p(y-x),\quad \dot y = x(\rho-z)-y,\quad \dot z = xy-\beta z
 
     Parameters
     ----------
     x : array_like, (..., 3)
         States.
-    sigma, rho, beta : float
+    prandtl, rho, beta : float
         Prandtl number, scaled Rayleigh number and geometry.
 
     Returns
@@ -42,52 +40,73 @@ def lorenz63_rate(
     array([10., 23., -6.])
     """
     state = array(x, "x", (..., 3))
-    s, r, b = number(sigma, "sigma"), number(rho, "rho"), number(beta, "beta")
+    s, r, b = number(prandtl, "prandtl"), number(rho, "rho"), number(beta, "beta")
     return _rate(state, s, r, b)
 
 
-def _rate(state: Array, sigma: float, rho: float, beta: float) -> Array:
+def _rate(state: Array, prandtl: float, rho: float, beta: float) -> Array:
     x, y, z = state[..., 0], state[..., 1], state[..., 2]
-    return np.stack([sigma * (y - x), x * (rho - z) - y, x * y - beta * z], axis=-1)
+    return np.stack([prandtl * (y - x), x * (rho - z) - y, x * y - beta * z], axis=-1)
+
+
+def _slope(state: Array, prandtl: float, rho: float, beta: float) -> Array:
+    """Derivative of the right-hand side, (..., 3, 3)."""
+    x, y, z = state[..., 0], state[..., 1], state[..., 2]
+    out = np.zeros((*state.shape, 3))
+    out[..., 0, 0], out[..., 0, 1] = -prandtl, prandtl
+    out[..., 1, 0], out[..., 1, 1], out[..., 1, 2] = rho - z, -1.0, -x
+    out[..., 2, 0], out[..., 2, 1], out[..., 2, 2] = y, x, -beta
+    return out
 
 
 def lorenz63(
     *,
-    sigma: float = 10.0,
+    prandtl: float = 10.0,
     rho: float = 28.0,
     beta: float = 8 / 3,
-    noise: float = 0.0,
+    sigma: float = 0.0,
     step: float = 0.01,
 ) -> Model:
     """Lorenz's model of 1963, integrated by Runge-Kutta of order 4 with a fixed step.
 
     Parameters
     ----------
-    sigma, rho, beta : float
+    prandtl, rho, beta : float
         As for :func:`lorenz63_rate`.
-    noise : float
+    sigma : float
         Strength of independent white noise on each component: it gathers a standard deviation of
-        ``noise * sqrt(dt)`` in a step; none by default.
+        ``sigma * sqrt(dt)`` in a step; none by default.
     step : float
         Longest integration step, positive, in units of time.
 
     Returns
     -------
     Model
-        With three components.
+        With three components and its Jacobian, which is that of the integration to rounding.
 
     Examples
     --------
     >>> lorenz63().step([1.0, 1.0, 20.0], 0.0, 0.1).shape
     (3,)
     """
-    s, r, b = number(sigma, "sigma"), number(rho, "rho"), number(beta, "beta")
-    density = number(noise, "noise", at_least=0) ** 2 * np.eye(3)
+    s, r, b = number(prandtl, "prandtl"), number(rho, "rho"), number(beta, "beta")
+    density = number(sigma, "sigma", at_least=0) ** 2 * np.eye(3)
     longest = number(step, "step", above=0)
 
-    def flow(x: Array, t: float, dt: float) -> Array:
-        # A step that divides dt up to rounding is not cut once more.
-        n = max(1, math.ceil(dt / longest - 1e-9))
-        return rk4(lambda state, _: _rate(state, s, r, b), x, t, dt, substeps=n)
+    def rate(x: Array, _: float) -> Array:
+        return _rate(x, s, r, b)
 
-    return Model(3, flow, lambda t, dt: density * dt, names=("x", "y", "z"), units=("1",) * 3)
+    def flow(x: Array, t: float, dt: float) -> Array:
+        return rk4(rate, x, t, dt, longest=longest)
+
+    def derivative(x: Array, t: float, dt: float) -> Array:
+        return rk4_jacobian(rate, lambda v, _: _slope(v, s, r, b), x, t, dt, longest=longest)
+
+    return Model(
+        3,
+        flow,
+        lambda t, dt: density * dt,
+        derivative=derivative,
+        names=("x", "y", "z"),
+        units=("1",) * 3,
+    )

@@ -32,7 +32,7 @@ def clohessy_wiltshire_drift(rate: float) -> Array:
 
     Examples
     --------
-    >>> clohessy_wiltshire_drift(0.1)[3:]
+    >>> clohessy_wiltshire_drift(0.1)[3:].round(15)
     array([[ 0.03,  0.  ,  0.  ,  0.  ,  0.2 ,  0.  ],
            [ 0.  ,  0.  ,  0.  , -0.2 ,  0.  ,  0.  ],
            [ 0.  ,  0.  , -0.01,  0.  ,  0.  ,  0.  ]])
@@ -43,7 +43,7 @@ def clohessy_wiltshire_drift(rate: float) -> Array:
     a[3, 0], a[3, 4] = 3 * n * n, 2 * n
     a[4, 3] = -2 * n
     a[5, 2] = -n * n
-    return a.round(15)
+    return a
 
 
 def clohessy_wiltshire_transition(rate: float, dt: float) -> Array:
@@ -111,15 +111,16 @@ def clohessy_wiltshire(*, rate: float, sigma: float) -> LinearModel:
     density = number(sigma, "sigma", at_least=0) ** 2 * np.eye(6)
 
     @lru_cache(maxsize=64)
-    def discretised(dt: float) -> Array:
-        noise = van_loan(drift, density, dt)[1]
+    def discretised(dt: float) -> tuple[Array, Array]:
+        phi, noise = clohessy_wiltshire_transition(rate, dt), van_loan(drift, density, dt)[1]
+        phi.setflags(write=False)
         noise.setflags(write=False)
-        return noise
+        return phi, noise
 
     return LinearModel.from_transition(
         6,
-        lambda dt: clohessy_wiltshire_transition(rate, dt),
-        lambda t, dt: discretised(dt),
+        lambda dt: discretised(dt)[0],
+        lambda t, dt: discretised(dt)[1],
         names=("x", "y", "z", "vx", "vy", "vz"),
         units=("m", "m", "m", "m/s", "m/s", "m/s"),
     )

@@ -1,0 +1,202 @@
+"""The state of a filter between two steps, and how it is kept on disk."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import zipfile
+from dataclasses import dataclass, fields, is_dataclass
+from importlib import import_module
+from os import PathLike
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from ..checks import generator, number
+from ..network import Ledger
+
+__all__ = ["State"]
+
+_FORMAT = 2
+_BITS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """All that a filter needs to go on: nothing is hidden elsewhere.
+
+    A family of filters adds its own fields. They may be arrays, numbers, texts, None, tuples of
+    these, random generators, and frozen dataclasses of this package; all of them are saved.
+
+    Parameters
+    ----------
+    t : float
+        The time, in s.
+    ledger : Ledger
+        What has been sent so far.
+    rng : numpy.random.Generator or None
+        Where the next draw comes from; none for a filter that draws nothing. A step copies it, so
+        a state can be stepped twice.
+
+    Examples
+    --------
+    >>> State(0.0, Ledger.empty(2), None).runs
+    ()
+    """
+
+    t: float
+    ledger: Ledger
+    rng: np.random.Generator | None
+
+    def __post_init__(self) -> None:
+        number(self.t, "t")
+        if not isinstance(self.ledger, Ledger):
+            raise ValueError(f"ledger: needs a Ledger, got {type(self.ledger).__name__}")
+        if self.rng is not None:
+            generator(self.rng)
+
+    @property
+    def runs(self) -> tuple[int, ...]:
+        """Leading axes: independent runs of the network."""
+        return ()
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the state to one .npz file; :meth:`load` gives back the same bits.
+
+        The file appears whole or not at all: a full disk leaves an earlier one as it was.
+        """
+        target = Path(path)
+        arrays: list[Any] = []
+        header = {"format": _FORMAT, "kind": _name(type(self)), "state": _encoded(self, arrays)}
+        parts = {f"a{k}": a for k, a in enumerate(arrays)}
+        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                np.savez(file, header=np.array(json.dumps(header)), **parts)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, target)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> Self:
+        """Read a state that :meth:`save` wrote.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is no such file.
+        ValueError
+            If the file is no saved state of this kind, or is damaged.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                parts = {name: file[name] for name in file.files}
+            header = json.loads(str(parts["header"]))
+            if header["format"] != _FORMAT or header["kind"] != _name(cls):
+                raise ValueError(f"format {header['format']}, a {header['kind']}")
+            return cls(**_fields(header["state"], parts))
+        except FileNotFoundError:
+            raise
+        except (
+            OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, ImportError,
+            IndexError, zipfile.BadZipFile,
+        ) as error:
+            raise ValueError(
+                f"path: needs a saved {cls.__name__}, got {path}: {error}"
+            ) from None
+
+
+def _name(kind: type) -> str:
+    return f"{kind.__module__}:{kind.__qualname__}"
+
+
+def _encoded(value: Any, arrays: list[Any]) -> Any:
+    """`value` as JSON, with arrays put aside."""
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, np.ndarray | np.generic):
+        if np.asarray(value).dtype.hasobject:
+            raise ValueError("state: needs numeric arrays to be saved, got objects")
+        arrays.append(np.asarray(value))
+        return {"array": len(arrays) - 1}
+    if isinstance(value, tuple):
+        return {"tuple": [_encoded(v, arrays) for v in value]}
+    if isinstance(value, np.random.Generator):
+        return {"rng": _listed(value.bit_generator.state), "seed": _seed(value)}
+    if is_dataclass(value) and not isinstance(value, type):
+        parts = {f.name: _encoded(getattr(value, f.name), arrays) for f in fields(value)}
+        return {"fields": parts, "of": _name(type(value))}
+    raise ValueError(f"state: needs fields that can be saved, got {type(value).__name__}")
+
+
+def _fields(coded: dict[str, Any], parts: dict[str, Any]) -> dict[str, Any]:
+    return {name: _decoded(v, parts) for name, v in coded["fields"].items()}
+
+
+def _decoded(coded: Any, parts: dict[str, Any]) -> Any:
+    if not isinstance(coded, dict):
+        return coded
+    if "array" in coded:
+        return parts[f"a{coded['array']}"]
+    if "tuple" in coded:
+        return tuple(_decoded(v, parts) for v in coded["tuple"])
+    if "rng" in coded:
+        return _restored(coded["rng"], coded["seed"])
+    module, _, name = coded["of"].partition(":")
+    # Nothing is imported that a file names, unless it is one of this package's own structures.
+    if not module.startswith("distfilt."):
+        raise ValueError(f"structure {coded['of']!r}")
+    kind = getattr(import_module(module), name)
+    if not (isinstance(kind, type) and is_dataclass(kind)):
+        raise ValueError(f"structure {coded['of']!r}")
+    return kind(**_fields(coded, parts))
+
+
+def _seed(rng: np.random.Generator) -> dict[str, Any] | None:
+    """What :meth:`numpy.random.Generator.spawn` needs, so that children are the same too."""
+    sequence = rng.bit_generator.seed_seq
+    if not isinstance(sequence, np.random.SeedSequence):
+        return None
+    entropy: Any = sequence.entropy
+    return {
+        "entropy": np.asarray(entropy).tolist() if np.ndim(entropy) else entropy,
+        "spawn_key": [int(k) for k in sequence.spawn_key],
+        "pool_size": int(sequence.pool_size),
+        "n_children_spawned": int(sequence.n_children_spawned),
+    }
+
+
+def _listed(value: Any) -> Any:
+    """The generator's state with arrays as lists, for JSON."""
+    if isinstance(value, dict):
+        return {key: _listed(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return {"dtype": str(value.dtype), "values": value.tolist()}
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _arrays(value: Any) -> Any:
+    if isinstance(value, dict):
+        if set(value) == {"dtype", "values"}:
+            return np.array(value["values"], dtype=value["dtype"])
+        return {key: _arrays(item) for key, item in value.items()}
+    return value
+
+
+def _restored(listed: dict[str, Any], seed: dict[str, Any] | None) -> np.random.Generator:
+    kind = listed["bit_generator"]
+    if kind not in _BITS:
+        raise ValueError(f"bit generator {kind!r}")
+    if seed is None:
+        bits = getattr(np.random, kind)()
+    else:
+        bits = getattr(np.random, kind)(np.random.SeedSequence(**seed))
+    bits.state = _arrays(listed)
+    return np.random.Generator(bits)
+
+

@@ -1,0 +1,178 @@
+"""What filters that read sensors have in common: a model, agents with sensors, and a network."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..checks import Array, callable_, choice, count, number
+from ..models import Model
+from ..network import Channel, Faults, Graph
+from ..sensors import Sensor
+from .driver import Filter, Late
+from .failures import FilterError
+from .heard import Heard, gather
+from .observations import at_one_time, over_times
+from .saving import State
+
+__all__ = ["SensorFilter"]
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFilter(Filter):
+    """The part of a filter that knows the agents, and what every family asks of it.
+
+    Parameters
+    ----------
+    model : Model
+        How the state moves; known to all agents.
+    sensors : sequence of Sensor or None, length A
+        What each agent sees; None for an agent without a sensor. Neighbours know each other's.
+    graph : Graph, or callable t -> Graph, optional
+        Who hears whom; a single agent needs none.
+    agreement : callable, optional
+        What agents do after the update to agree; none by default.
+    share : bool
+        Whether agents send their observations to those that hear them, who use them too.
+    faults : Faults, optional
+        Messages lost and agents silenced; a lost observation is a missing one. A delay is not
+        accepted: an observation that comes late has its own time, pass it as :class:`Late`.
+    lag : int
+        How many earlier times are kept, for late observations and for smoothing.
+    names : sequence of str
+        Names of the agents; their numbers by default.
+    failures : {"raise", "keep"}
+        What happens when one run of a batch fails: a :class:`FilterError` that names it, or the
+        other runs go on and the failed one is recorded as NaN.
+    """
+
+    model: Model
+    sensors: Sequence[Sensor | None]
+    graph: Graph | Callable[[float], Graph] | None = None
+    _: KW_ONLY
+    agreement: Callable[..., Any] | None = None
+    share: bool = True
+    faults: Faults | None = None
+    lag: int = 0
+    names: Sequence[str] = ()
+    failures: str = "raise"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.model, Model):
+            raise ValueError(f"model: needs a Model, got {type(self.model).__name__}")
+        if isinstance(self.sensors, Sensor) or not isinstance(self.sensors, Sequence):
+            raise ValueError(
+                f"sensors: needs one Sensor or None for each agent, in a list, "
+                f"got {type(self.sensors).__name__}"
+            )
+        object.__setattr__(self, "sensors", tuple(self.sensors))
+        for sensor in self.sensors:
+            if sensor is not None and not isinstance(sensor, Sensor):
+                raise ValueError(f"sensors: needs Sensor or None, got {type(sensor).__name__}")
+        count(len(self.sensors), "sensors")
+        if self.graph is None:
+            if len(self.sensors) > 1:
+                raise ValueError(f"graph: needs a Graph of {len(self.sensors)} agents, got None")
+        elif isinstance(self.graph, Graph):
+            self._check_graph(self.graph)
+        else:
+            callable_(self.graph, "graph")
+        if self.agreement is not None:
+            callable_(self.agreement, "agreement")
+        if not isinstance(self.share, bool):
+            raise ValueError(f"share: needs True or False, got {self.share!r}")
+        if self.faults is not None and (not isinstance(self.faults, Faults) or self.faults.delay):
+            raise ValueError(f"faults: needs Faults without a delay, got {self.faults!r}")
+        count(self.lag, "lag", at_least=0)
+        choice(self.failures, "failures", ("raise", "keep"))
+        if self.names and len(self.names) != len(self.sensors):
+            raise ValueError(f"names: needs {len(self.sensors)} names, got {len(self.names)}")
+
+    def _check_graph(self, graph: Any) -> Graph:
+        if not isinstance(graph, Graph):
+            raise ValueError(f"graph: needs a Graph, got {type(graph).__name__}")
+        if graph.size != len(self.sensors):
+            raise ValueError(
+                f"graph: needs {len(self.sensors)} agents like sensors, got {graph.size}"
+            )
+        return graph
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """Names of the agents."""
+        return tuple(self.names) or tuple(str(i) for i in range(len(self.sensors)))
+
+    @property
+    def components(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Names and units of the state's components."""
+        names = self.model.names or tuple(str(i) for i in range(self.model.dim))
+        return tuple(names), tuple(self.model.units or ("",) * self.model.dim)
+
+    def series(self, observations: Any, times: Array) -> Sequence[Any]:
+        """Per time the agents' observations, from per agent their series (T, *runs, m)."""
+        _, series = over_times(observations, self.sensors, times)
+        return [[None if o is None else o[k] for o in series] for k in range(times.size)]
+
+    def elapsed(self, state: State, t: float) -> float:
+        """Seconds from the state's time to `t`, which has to be later."""
+        return number(t, "t", above=state.t) - state.t
+
+    def observed(
+        self, state: State, observations: Sequence[ArrayLike | None]
+    ) -> list[Array | None]:
+        """Observations of one time, checked, per agent (*runs, m) or None."""
+        return at_one_time(observations, self.sensors, state.runs)
+
+    def channel(self, state: State, t: float) -> Channel | None:
+        """The door of this step; a single agent without a graph has none."""
+        if self.graph is None:
+            return None
+        graph = self.graph if isinstance(self.graph, Graph) else self._check_graph(self.graph(t))
+        return Channel(graph, ledger=state.ledger, runs=state.runs, faults=self.faults)
+
+    def gather(self, observed: Sequence[Array | None], channel: Channel | None) -> list[Heard]:
+        """What every agent knows of the observations once they are shared."""
+        return gather(observed, self.sensors, channel if self.share else None)
+
+    def slot(
+        self, item: Late, kept: Sequence[float], state: State
+    ) -> tuple[int, list[Array | None]]:
+        """Where among the kept times a late observation belongs, and the observations of then."""
+        match = [k for k, t in enumerate(kept) if abs(t - item.measured) <= 1e-9 * max(1, abs(t))]
+        if not match:
+            known = ", ".join(f"{t:g}" for t in kept) or "none (lag = 0)"
+            raise ValueError(
+                f"late: needs an earlier time that is kept ({known}), got {item.measured:g}"
+            )
+        if item.agent >= len(self.sensors):
+            raise ValueError(f"late: needs an agent below {len(self.sensors)}, got {item.agent}")
+        sensor = self.sensors[item.agent]
+        if sensor is not None and sensor.uses_previous:
+            raise ValueError(f"late: a {sensor.kind} sensor cannot be late, it compares two times")
+        observations: list[ArrayLike | None] = [None] * len(self.sensors)
+        observations[item.agent] = item.value
+        return match[0], self.observed(state, observations)
+
+    def settle(
+        self,
+        errors: dict[tuple[int, ...], str],
+        agents: Sequence[int] | NDArray[np.intp],
+        t: float,
+        failed: Mask,
+    ) -> Mask:
+        """The runs that have failed by now, or the error that names the first of them."""
+        if not errors:
+            return failed
+        row, why = next(iter(errors.items()))
+        if self.failures == "raise" or not failed.shape:
+            raise FilterError(row[:-1], int(agents[row[-1]]), t, why)
+        out = failed.copy()
+        for row in errors:
+            out[row[:-1]] = True
+        return out

@@ -1,0 +1,83 @@
+"""Forecasts: how the members of an ensemble meet the model's noise."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..checks import Array, array, generator
+from ..ensembles import anomalies, exact_noise
+from ..models import Model
+
+__all__ = ["exact_forecast", "sampled_forecast"]
+
+
+def sampled_forecast(
+    ensemble: ArrayLike, model: Model, t: float, dt: float, *, rng: np.random.Generator
+) -> Array:
+    """Move every member with the model and add an independent draw of the noise.
+
+    Parameters
+    ----------
+    ensemble : array_like, (..., N, d)
+        Members at time `t`.
+    model : Model
+    t, dt : float
+        From when, and how far, in s.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    ndarray, (..., N, d)
+        Members at time `t` + `dt`.
+
+    Examples
+    --------
+    >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    >>> sampled_forecast([[1.0], [2.0]], still, 0.0, 0.1, rng=np.random.default_rng(0)).ravel()
+    array([1., 2.])
+    """
+    return model.sample_step(ensemble, t, dt, rng=rng)
+
+
+def exact_forecast(
+    ensemble: ArrayLike, model: Model, t: float, dt: float, *, rng: np.random.Generator
+) -> Array:
+    r"""Move the members and add noise that is exact to second order.
+
+    The draws are centred, orthogonal to the moved members' anomalies, and have the sample
+    covariance Q: for a linear model the sample covariance becomes
+    :math:`\boldsymbol\Phi\mathbf P\boldsymbol\Phi^\top+\mathbf Q` to rounding.
+
+    Parameters
+    ----------
+    ensemble, model, t, dt, rng
+        As for :func:`sampled_forecast`; more members than d + the rank of Q.
+
+    Returns
+    -------
+    ndarray, (..., N, d)
+
+    Raises
+    ------
+    ValueError
+        If there are too few members for such draws.
+
+    Examples
+    --------
+    >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
+    >>> x = np.array([[-1.0], [0.0], [0.5], [0.5]])
+    >>> moved = exact_forecast(x, walk, 0.0, 0.5, rng=np.random.default_rng(0))
+    >>> float(moved.mean().round(12)), float(moved.var(ddof=1).round(12))
+    (0.0, 1.0)
+    """
+    x = array(ensemble, "ensemble", (..., "N", model.dim))
+    moved = model.step(x, t, dt)
+    q = model.noise(t, dt)
+    if not q.any():
+        return moved
+    bad = ~np.isfinite(moved).all(axis=(-2, -1), keepdims=True)
+    clean = np.where(bad, x, moved)
+    noisy = clean + exact_noise(anomalies(clean), q, rng=generator(rng))
+    # Members that the model lost stay lost, and do not take the others' noise with them.
+    return np.where(bad, np.nan, noisy)

@@ -1,0 +1,282 @@
+r"""Updates by the Kalman gain: four ways to treat the noise of the observation.
+
+With the sample covariances :math:`\hat{\mathbf C}` of members and predictions, and one draw
+:math:`\zeta_i` of the noise for each member,
+
+.. math:: \mathbf x_i' = \mathbf x_i + \mathbf K(\mathbf y^* - \mathbf h(\mathbf x_i) - \zeta_i),
+    \qquad \mathbf K = \hat{\mathbf C}_{xh}(\hat{\mathbf C}_{hh} + \mathbf R)^{-1}.
+
+What differs is what stands for R in the gain, and how the draws are made.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.fft import dct
+
+from ..checks import Array, choice, number
+from ..ensembles import exact_noise
+from .door import perturbed, update
+
+__all__ = ["exact_draws", "known_noise", "sampled_noise", "square_root"]
+
+
+def _centred(members: Array) -> tuple[Array, Array]:
+    """Mean (..., 1, d) and anomalies of members (..., N, d)."""
+    n = members.shape[-2]
+    centre = (np.full(n, 1 / n) @ members)[..., None, :]
+    return centre, members - centre
+
+
+def _gain(inner: Array, a: Array, b: Array) -> Array:
+    """The gain transposed, (..., m, d): one solve for all members."""
+    cross = np.swapaxes(b, -1, -2) @ a / (a.shape[-2] - 1)
+    return np.asarray(np.linalg.solve(inner, cross))
+
+
+def _inner(b: Array) -> Array:
+    return np.asarray(np.swapaxes(b, -1, -2) @ b / (b.shape[-2] - 1))
+
+
+@update
+def sampled_noise(
+    ensemble: Array,
+    predicted: Array,
+    observed: Array,
+    noise: Array,
+    *,
+    rng: np.random.Generator,
+) -> Array:
+    r"""The ensemble Kalman filter's update with both covariances sampled, perturbations included.
+
+    The gain is :math:`\hat{\mathbf\Sigma}_{xy}\hat{\mathbf\Sigma}_{yy}^{-1}` of the perturbed
+    predictions :math:`\mathbf y_i = \mathbf h(\mathbf x_i)+\zeta_i`: the composed affine map of
+    Grange et al. computes the same. Chance correlations of members and draws enter the gain, so a
+    small ensemble loses its spread; :func:`known_noise` does not.
+
+    Parameters
+    ----------
+    ensemble : array_like, (..., N, d)
+        Forecast members, more than m.
+    predicted : array_like, (..., N, m)
+        What each member would observe, without noise. For a reading that wraps, on the branch of
+        the observation: ``observed - sensor.residual(observed, h(x_i))``.
+    observed : array_like, (..., m)
+        The observation y*.
+    noise : array_like, (m, m) or (..., m, m)
+        Covariance R of the observation's noise, positive definite.
+    rng : numpy.random.Generator
+        Source of the perturbations :math:`\zeta_i\sim N(0, \mathbf R)`.
+
+    Returns
+    -------
+    ndarray, (..., N, d)
+        Analysis members.
+
+    Raises
+    ------
+    ValueError
+        If a shape or the covariance is wrong, a number is not finite, or N ≤ m.
+
+    Notes
+    -----
+    G. Burgers, P. J. van Leeuwen, G. Evensen, Monthly Weather Review 126 (1998) 1719-1724.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(1)
+    >>> prior = rng.standard_normal((2000, 1))
+    >>> after = sampled_noise(prior, prior, [2.0], [[1.0]], rng=rng)
+    >>> after.mean().round(1), after.var().round(1)
+    (np.float64(1.0), np.float64(0.5))
+    """
+    members, m = predicted.shape[-2:]
+    if members <= m:
+        raise ValueError(f"ensemble: needs at least {m + 1} members for {m} readings, "
+                         f"got {members}")
+    drawn = perturbed(predicted, noise, rng)
+    b = _centred(drawn)[1]
+    gain = _gain(_inner(b), _centred(ensemble)[1], b)
+    return np.asarray(ensemble + (observed[..., None, :] - drawn) @ gain)
+
+
+@update
+def known_noise(
+    ensemble: Array,
+    predicted: Array,
+    observed: Array,
+    noise: Array,
+    *,
+    rng: np.random.Generator,
+    shrinkage: float = 0.0,
+    ridge: float = 0.0,
+) -> Array:
+    r"""Update with R itself in the gain, where :func:`sampled_noise` has a sample covariance.
+
+    The chance correlations of the members with the drawn noise stay out of the gain, and
+    :math:`\hat{\mathbf C}_{hh}+\mathbf R` can be inverted for any number of members.
+
+    Parameters
+    ----------
+    ensemble, predicted, observed, noise, rng
+        As in :func:`sampled_noise`; two members are enough.
+    shrinkage : float
+        Between 0 and 1: every sample correlation of two different variables is multiplied by one
+        minus it, which takes from the chance correlations of small ensembles.
+    ridge : float
+        At least 0: the diagonal of :math:`\hat{\mathbf C}_{hh}+\mathbf R` is multiplied by one plus
+        it.
+
+    Returns
+    -------
+    ndarray, (..., N, d)
+
+    Raises
+    ------
+    ValueError
+        As in :func:`sampled_noise`, or if an option is out of its bounds.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(3)
+    >>> prior = rng.standard_normal((1000, 1))
+    >>> posterior = known_noise(prior, prior, [1.0], [[1.0]], rng=rng)
+    >>> posterior.mean().round(1), posterior.var().round(1)
+    (np.float64(0.5), np.float64(0.5))
+    """
+    drawn = perturbed(predicted, noise, rng)
+    b = _centred(predicted)[1]
+    inner, factor = _inner(b), 1.0
+    if shrinkage:
+        # A component that is observed directly is correlated with its prediction by more than
+        # chance, and shrinks all the same: the update does not know which is which.
+        factor = 1 - number(shrinkage, "shrinkage", at_least=0, at_most=1)
+        inner = factor * inner + (1 - factor) * inner * np.eye(inner.shape[-1])
+    inner = inner + noise
+    if ridge:
+        inner = inner * (1 + number(ridge, "ridge", at_least=0) * np.eye(inner.shape[-1]))
+    gain = factor * _gain(inner, _centred(ensemble)[1], b)
+    return np.asarray(ensemble + (observed[..., None, :] - drawn) @ gain)
+
+
+@update
+def exact_draws(
+    ensemble: Array,
+    predicted: Array,
+    observed: Array,
+    noise: Array,
+    *,
+    rng: np.random.Generator,
+) -> Array:
+    r"""Update with perturbations that are exact to second order.
+
+    The draws are centred over the members, orthogonal to the members' and the predictions'
+    anomalies, and have the sample covariance R. The sampled gain then *is* the gain of
+    :func:`known_noise`, and :math:`\mathbf P^+=(\mathbf I-\mathbf K\mathbf H)\mathbf P` holds for
+    the sample covariances themselves: what is known is not sampled.
+
+    Parameters
+    ----------
+    ensemble, predicted, observed, noise, rng
+        As in :func:`sampled_noise`; more than d + 2m members (d + m where the predictions are
+        linear in the members).
+
+    Returns
+    -------
+    ndarray, (..., N, d)
+
+    Raises
+    ------
+    ValueError
+        As in :func:`sampled_noise`, or if there are too few members for such draws.
+
+    Examples
+    --------
+    Halfway between prior and observation, with half the variance, whatever was drawn:
+
+    >>> prior = np.array([[-1.0], [0.0], [0.5], [0.5]])
+    >>> after = exact_draws(prior, prior, [1.0], [[0.5]], rng=np.random.default_rng(0))
+    >>> float(after.mean().round(12)), float(after.var(ddof=1).round(12))
+    (0.5, 0.25)
+    """
+    a, b = _centred(ensemble)[1], _centred(predicted)[1]
+    draws = exact_noise(np.concatenate([a, b], axis=-1), noise, rng=rng)
+    gain = _gain(_inner(b) + noise, a, b)
+    return np.asarray(ensemble + (observed[..., None, :] - predicted - draws) @ gain)
+
+
+@update
+def square_root(
+    ensemble: Array,
+    predicted: Array,
+    observed: Array,
+    noise: Array,
+    *,
+    rng: np.random.Generator,
+    rotation: str = "random",
+) -> Array:
+    r"""Update mean and anomalies without perturbations, then turn the anomalies at random.
+
+    With the whitened predictions :math:`\mathbf s_i=\mathbf R^{-1/2}(\mathbf h(\mathbf x_i)
+    -\bar{\mathbf h})/\sqrt{N-1}` as the rows of S, the mean moves by the Kalman gain and the
+    anomalies are multiplied by :math:`(\mathbf I+\mathbf S\mathbf S^\top)^{-1/2}`, the symmetric
+    root, which leaves their mean at zero. A random rotation of the members that keeps the vector
+    of ones changes neither mean nor covariance, and mixes away the outliers that repeated
+    deterministic updates of a nonlinear model breed.
+
+    Parameters
+    ----------
+    ensemble, predicted, observed, noise, rng
+        As in :func:`sampled_noise`; two members are enough.
+    rotation : {"random", "none"}
+        Whether the anomalies are turned.
+
+    Returns
+    -------
+    ndarray, (..., N, d)
+
+    Notes
+    -----
+    C. H. Bishop, B. J. Etherton, S. J. Majumdar, Monthly Weather Review 129 (2001) 420-436;
+    P. Sakov, P. R. Oke, Monthly Weather Review 136 (2008) 1042-1053, for the rotation.
+
+    Examples
+    --------
+    >>> prior = np.array([[-1.0], [1.0]])
+    >>> after = square_root(prior, prior, [2.0], [[2.0]], rng=np.random.default_rng(0))
+    >>> float(after.mean().round(12)), float(after.var(ddof=1).round(12))
+    (1.0, 1.0)
+    """
+    choice(rotation, "rotation", ("random", "none"))
+    n = ensemble.shape[-2]
+    (centre, a), (seen, b) = _centred(ensemble), _centred(predicted)
+    gain = _gain(_inner(b) + noise, a, b)
+    root = np.linalg.cholesky(noise)
+    white = np.swapaxes(np.linalg.solve(root, np.swapaxes(b, -1, -2)), -1, -2) / np.sqrt(n - 1)
+    left, sizes, _ = np.linalg.svd(white, full_matrices=False)
+    shrink = 1 / np.sqrt(1 + sizes**2) - 1
+    spread = a + (left * shrink[..., None, :]) @ (np.swapaxes(left, -1, -2) @ a)
+    if rotation == "random" and n > 2:
+        spread = _turned(spread, rng)
+    return np.asarray(centre + (observed[..., None, :] - seen) @ gain + spread)
+
+
+def _turned(spread: Array, rng: np.random.Generator) -> Array:
+    """Anomalies (..., N, d) after a random rotation of the members that keeps the vector of ones.
+
+    Random signs and cosine transforms in turn, in the space of centred members: orthogonal to
+    rounding, in N log N steps where a random matrix takes N cubed.
+    """
+    n = spread.shape[-2]
+    # A reflection takes the direction of ones to the first unit vector, and is its own inverse.
+    v = np.full(n, -1 / np.sqrt(n))
+    v[0] += 1
+    v /= np.linalg.norm(v)
+    out = spread - 2 * v[:, None] * (v @ spread)[..., None, :]
+    rest = out[..., 1:, :]
+    for _ in range(3):
+        signs = np.copysign(1.0, rng.standard_normal((*rest.shape[:-1], 1)))
+        rest = dct(signs * rest, norm="ortho", axis=-2)
+    signs = np.copysign(1.0, rng.standard_normal((*rest.shape[:-1], 1)))
+    out = np.concatenate([out[..., :1, :], signs * rest], axis=-2)
+    return np.asarray(out - 2 * v[:, None] * (v @ out)[..., None, :])

@@ -1,0 +1,100 @@
+"""Readings that are missing: the same update with their rows left out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..checks import Array
+from .door import Update, unchecked
+
+__all__ = ["with_missing"]
+
+
+def with_missing(
+    update: Update,
+    ensemble: Array,
+    predicted: Array,
+    observed: Array,
+    noise: Array,
+    *,
+    rng: np.random.Generator,
+) -> Array:
+    """Apply an update where NaN marks a missing component of the observation.
+
+    Ensembles that miss the same components are updated together, so a batch costs one call for
+    each pattern.
+
+    Parameters
+    ----------
+    update : callable
+        ``update(ensemble, predicted, observed, noise, *, rng)``; its checks are left out.
+    ensemble : ndarray, (..., N, d)
+    predicted : ndarray, (..., N, m)
+        NaN for every member where a prediction does not exist; it is a missing reading too.
+    observed : ndarray, (..., m)
+        NaN where a component is missing.
+    noise : ndarray, (m, m) or (..., m, m)
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    ndarray, (..., N, d)
+        Ensembles without any reading are returned as they came.
+
+    Examples
+    --------
+    >>> from distfilt.updates import exact_draws
+    >>> x = np.array([[-1.0], [0.0], [0.5], [0.5]])
+    >>> seen = np.concatenate([x, x], axis=1)
+    >>> after = with_missing(exact_draws, x, seen, np.array([1.0, np.nan]), 0.5 * np.eye(2),
+    ...                      rng=np.random.default_rng(0))
+    >>> float(after.mean().round(12))
+    0.5
+    """
+    inner = unchecked(update)
+    m = observed.shape[-1]
+    lead = observed.shape[:-1]
+    # What is drawn for an ensemble depends on its place and on how many readings it has, not on
+    # what others miss: each number of readings has a stream, which is drawn from for all places.
+    base = rng.integers(2**63, size=2)
+    present = ~(np.isnan(observed) | np.isnan(predicted).any(axis=-2))
+    if present.all():
+        stream = _Rows([*base, m], lead, None)
+        return inner(ensemble, predicted, observed, noise, rng=stream)
+    flat = present.reshape(-1, m)
+    rows = ensemble.reshape(-1, *ensemble.shape[-2:])
+    seen = predicted.reshape(-1, *predicted.shape[-2:])
+    aim = observed.reshape(-1, m)
+    cov = noise
+    if noise.ndim > 2:
+        cov = np.broadcast_to(noise, (*lead, m, m)).reshape(-1, m, m)
+    out = rows.copy()
+    for pattern in np.unique(flat, axis=0):
+        keep = np.flatnonzero(pattern)
+        if not keep.size:
+            continue
+        where = np.flatnonzero((flat == pattern).all(axis=1))
+        part = cov[np.ix_(where, keep, keep)] if cov.ndim > 2 else cov[np.ix_(keep, keep)]
+        stream = _Rows([*base, keep.size], lead, where)
+        out[where] = inner(
+            rows[where], seen[where][..., keep], aim[where][:, keep], part, rng=stream
+        )
+    return np.asarray(out.reshape(ensemble.shape))
+
+
+class _Rows(np.random.Generator):
+    """Normal draws for all ensembles of a batch, of which some are asked for."""
+
+    def __init__(self, seed: Any, lead: tuple[int, ...], where: Any) -> None:
+        super().__init__(np.random.PCG64(np.random.SeedSequence([int(s) for s in seed])))
+        self.lead, self.where = lead, where
+
+    def standard_normal(self, size: Any = None, *args: Any, **options: Any) -> Any:
+        """As numpy's, but of a batch's rows those that belong to the pattern."""
+        if self.where is None or not np.iterable(size) or tuple(size)[:1] != self.where.shape:
+            return super().standard_normal(size, *args, **options)
+        rest = tuple(size)[1:]
+        drawn = super().standard_normal((*self.lead, *rest), *args, **options)
+        return drawn.reshape(-1, *rest)[self.where]
