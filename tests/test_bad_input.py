@@ -65,7 +65,14 @@ def _tables() -> tuple[dict[str, list[Case]], dict[str, str]]:
 
 
 CASES, EXEMPT = _tables()
-PUBLIC = sorted({_home(m, name) for m in _modules() for name in m.__all__})
+PUBLIC = sorted(
+    {
+        _home(m, name)
+        for m in _modules()
+        for name in m.__all__
+        if not isinstance(getattr(m, name), ModuleType)
+    }
+)
 CALLS = [
     pytest.param(name, argument, call, id=f"{name}-{argument}-{k}")
     for name, cases in sorted(CASES.items())

@@ -10,6 +10,8 @@ from scipy import sparse
 
 from ..checks import Array
 
+__all__: list[str] = []
+
 Indices = NDArray[np.int64]
 
 DENSE = 200
