@@ -191,12 +191,26 @@ def exact_noise(
 def _exact_noise(avoid: Array, root: Array, rng: np.random.Generator) -> Array:
     """As the public one, with a lower factor of the covariance; it too needs enough members."""
     n = avoid.shape[-2]
-    # Columns that are zero in all factors need no draw: a singular covariance asks for less room.
-    root = root[..., (root != 0).any(axis=tuple(range(root.ndim - 1)))]
+    if n <= avoid.shape[-1] + root.shape[-1]:
+        root = _narrow(root)
     rank = root.shape[-1]
     leading = np.broadcast_shapes(avoid.shape[:-2], root.shape[:-2])
     drawn = _projected(rng.standard_normal((*leading, n, rank)), avoid)
     return _coloured(drawn, root)
+
+
+def _narrow(root: Array) -> Array:
+    """A factor with as many columns as the rank, up to rounding: it asks for fewer members."""
+    std = np.sqrt((root**2).sum(axis=-1))
+    unit = np.where(std > 0, std, 1.0)[..., None]
+    u, s, _ = np.linalg.svd(root / unit)
+    kept = s**2 > 64 * s.shape[-1] * _EPS * s.max(axis=-1, initial=0.0, keepdims=True) ** 2
+    width = int(kept.sum(axis=-1).max(initial=0))
+    narrow = (u * (s * kept)[..., None, :])[..., :width]
+    # Triangular again, which leaves no signs or rotations to the machine.
+    upper: Array = np.asarray(np.linalg.qr(narrow.swapaxes(-1, -2), mode="r"))
+    sign = np.where(np.diagonal(upper, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
+    return (upper * sign[..., None]).swapaxes(-1, -2) * unit
 
 
 def _projected(drawn: Array, avoid: Array) -> Array:
