@@ -9,12 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .checks import Array, array, count, generator
-from .linalg import _cholesky, _leading, _solve_upper, _symmetrise, factor
+from .linalg import _EPS, _cholesky, _leading, _solve_upper, _symmetrise, factor
 
 __all__ = ["anomalies", "cross_covariance", "draw", "exact_noise", "mean", "sample_covariance"]
-
-_REPEATED = 1e-12
-"""Smallest variance of an anomaly that is not a repetition of others, over the largest."""
 
 
 def _ensemble(value: ArrayLike, name: str, members: int = 1) -> Array:
@@ -219,19 +216,20 @@ def _projected(drawn: Array, avoid: Array) -> Array:
     centred = _anomalies(avoid)
     size = np.sqrt((centred**2).sum(axis=-2, keepdims=True))
     unit = centred / np.where(size > 0, size, 1.0)
-    values, vectors = np.linalg.eigh(np.ascontiguousarray(unit.swapaxes(-1, -2)) @ unit)
-    # Anomalies that repeat others, as linear predictions do, leave a zero among the eigenvalues.
-    good = values > _REPEATED * values.max(axis=-1, initial=0.0, keepdims=True)
-    independent, rank = int(good.sum(axis=-1).max(initial=0)), drawn.shape[-1]
+    # A frame by two orthogonal factors, the second one small; anomalies that repeat others, as
+    # linear predictions do, leave a zero among the singular values.
+    constant = np.full((*unit.shape[:-1], 1), n**-0.5)
+    q, r = np.linalg.qr(np.concatenate([constant, unit], axis=-1))
+    u, values, _ = np.linalg.svd(r, full_matrices=False)
+    good = values > n * _EPS * values.max(axis=-1, initial=0.0, keepdims=True)
+    independent, rank = int(good.sum(axis=-1).max(initial=1)) - 1, drawn.shape[-1]
     if n <= independent + rank:
         raise ValueError(
             f"anomalies_to_avoid: needs more than {independent} + {rank} members, for "
             f"{independent} independent anomalies and noise of rank {rank}, got {n}"
         )
-    frame = unit @ (vectors * (good / np.sqrt(np.where(good, values, 1.0)))[..., None, :])
-    # Each pass leaves the square of what rounding in the frame lost.
-    for _ in range(3):
-        drawn = _anomalies(drawn)
+    frame = q @ (u * good[..., None, :])
+    for _ in range(2):
         drawn = drawn - frame @ (frame.swapaxes(-1, -2) @ drawn)
     return drawn
 
