@@ -325,7 +325,7 @@ def test_what_chromium_asks_for_itself_is_not_the_book_s() -> None:
     page, far = "file:///book/index.html", "http://example.invalid/a.js"
     untrusted = "chrome-untrusted://new-tab-page/one-google-bar"
     entries = [
-        sent(page, page), sent(untrusted, untrusted), sent("chrome://theme/a.css", "chrome://newtab"),
+        sent(page, page), sent(untrusted, untrusted), sent("chrome://theme/a.css", "chrome://new"),
         sent("https://www.gstatic.com/a.js", "chrome-untrusted://new-tab-page/", "another"),
         sent(far, page), sent("data:image/png;base64,xx", page),
     ]  # fmt: skip
@@ -338,9 +338,11 @@ BAD = r"""<!doctype html><title>bad</title><body>
 <p>\(x\)</p><p class="math">x</p><img src="nowhere.png">
 <a href="nowhere.html">a</a><a href="#no">b</a>
 <img src="http://example.invalid/a.png" alt="far"><div style="width: 2000px">wide</div>
-<article><div style="width: 300px; overflow: hidden"><pre>x<span style="padding: 400px">x</span></pre>
-</div><pre style="overflow-x: auto; width: 300px">x<span style="padding: 400px">x</span></pre></article>
-<div data-frames="a"><img alt="a"><button></button><input type="range" max="3"><output>a</output></div>
+<article><div style="width: 300px; overflow: hidden">
+<pre>x<span style="padding: 400px">x</span></pre></div>
+<pre style="overflow-x: auto; width: 300px">x<span style="padding: 400px">x</span></pre></article>
+<div data-frames="a"><img alt="a"><button></button><input type="range" max="3">
+<output>a</output></div>
 <script>throw new Error("broken")</script></body>"""
 
 
