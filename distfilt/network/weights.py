@@ -349,10 +349,17 @@ def keeping(weights: Weights) -> Weights:
     """
     if not isinstance(weights, Weights):
         raise ValueError(f"weights: needs Weights, got {type(weights).__name__}")
-    w = weights.matrix
-    columns = np.asarray(w.sum(axis=0))
+    # Not by the matrix: scipy's sums sort its entries in place, which changes how sums round.
+    graph = weights.graph
+    columns, sizes = (
+        own + np.bincount(graph.senders, weights=links, minlength=graph.size)
+        for own, links in (
+            (weights.own, weights.links),
+            (np.abs(weights.own), np.abs(weights.links)),
+        )
+    )
     # Rounding grows with the weights that cancel in a sum.
-    off = np.abs(columns - 1) / np.maximum(1.0, np.asarray(abs(w).sum(axis=0)))
+    off = np.abs(columns - 1) / np.maximum(1.0, sizes)
     worst = int(off.argmax())
     if off[worst] > 1e-9:
         raise ValueError(

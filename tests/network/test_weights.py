@@ -164,3 +164,10 @@ def test_weights_go_through_a_matrix_and_back() -> None:
     w = Weights(graph, rng(1).standard_normal(7), rng(2).standard_normal(graph.senders.size))
     back = Weights.from_matrix(graph, w.matrix.toarray())
     assert (back.own == w.own).all() and (back.links == w.links).all()
+
+
+def test_asking_whether_weights_keep_the_average_leaves_their_order_alone() -> None:
+    w = weights.metropolis(graphs.ring(6))
+    before = w.matrix.indices.copy()
+    weights.keeping(w)
+    assert (w.matrix.indices == before).all()
