@@ -100,8 +100,15 @@ def _reduce(w: Any, m: Any, p: Any, alive: Any, size: int) -> None:
                 best[i], nearest[i] = table[i, j], j
     left = n
     while left > size:
-        i = int(np.argmin(best))
-        j = nearest[i]
+        # The first of the pairs that cost the same, so that rounding does not choose.
+        lowest = best.min()
+        lowest += 1e-12 + 1e-9 * abs(lowest)
+        i = 0
+        while best[i] > lowest:
+            i += 1
+        j = i + 1
+        while not alive[j] or table[i, j] > lowest:
+            j += 1
         merge(w, m, p, i, j)
         work[:] = p[i]
         dets[i] = log_det(work, d)

@@ -302,7 +302,9 @@ def _reduce_by_rows(w: Array, m: Array, p: Array, alive: NDArray[np.bool_], size
     for i in range(n - 1):
         table[i, i + 1 :] = _costs(w, m, p, dets, i, np.arange(i + 1, n))
     for _ in range(n - size):
-        i, j = (int(k) for k in np.unravel_index(np.argmin(table), table.shape))
+        lowest = table.min()
+        first = np.argmax(table <= lowest + 1e-12 + 1e-9 * abs(lowest))
+        i, j = (int(k) for k in np.unravel_index(first, table.shape))
         total = w[i] + w[j]
         a = w[i] / total if total > 0 else 0.5
         gap = m[i] - m[j]
