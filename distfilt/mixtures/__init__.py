@@ -2,7 +2,12 @@
 
 from .arcs import arc
 from .collocation import nonnegative_least_squares, tikhonov
-from .divergence import Divergence, jeffreys_by_quadrature, jeffreys_by_sampling
+from .divergence import (
+    Divergence,
+    jeffreys_by_quadrature,
+    jeffreys_by_sampling,
+    jeffreys_of_many,
+)
 from .fusion import PartialFusion, average, fuse, fuse_moments
 from .gaussian import GaussianMixture
 from .quadratics import ExponentialQuadratics
@@ -30,6 +35,7 @@ __all__ = [
     "fuse_moments",
     "jeffreys_by_quadrature",
     "jeffreys_by_sampling",
+    "jeffreys_of_many",
     "kept_by_relevance",
     "merge_costs",
     "nonnegative_least_squares",

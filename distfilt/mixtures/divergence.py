@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ from .gaussian import GaussianMixture
 
 __all__ = [
     "Divergence", "gaussian_divergences", "jeffreys_by_quadrature", "jeffreys_by_sampling",
-    "tensor_grid",
+    "jeffreys_of_many", "tensor_grid",
 ]
 
 LogDensity = Callable[[Array], Array]
@@ -136,8 +136,37 @@ def jeffreys_by_quadrature(
     >>> round(jeffreys_by_quadrature(one.log_density, two.log_density, [-8], [9]).value, 9)
     0.5
     """
-    callable_(log_p, "log_p")
     callable_(log_q, "log_q")
+    return jeffreys_of_many(log_p, [log_q], lower, upper, nodes=nodes)[0]
+
+
+def jeffreys_of_many(
+    log_p: LogDensity,
+    log_qs: Sequence[LogDensity],
+    lower: ArrayLike,
+    upper: ArrayLike,
+    *,
+    nodes: int = 50,
+) -> list[Divergence]:
+    """Jeffreys' divergences of one density from several, on the same nodes.
+
+    Parameters
+    ----------
+    log_p : callable
+        As of :func:`jeffreys_by_quadrature`; it is evaluated once.
+    log_qs : sequence of callable
+        The others.
+    lower, upper, nodes
+        As of :func:`jeffreys_by_quadrature`.
+
+    Examples
+    --------
+    >>> one, two = (GaussianMixture.gaussian([m], [[1.0]]) for m in (0.0, 1.0))
+    >>> found = jeffreys_of_many(one.log_density, [one.log_density, two.log_density], [-8], [9])
+    >>> [round(d.value, 6) for d in found]
+    [0.0, 0.5]
+    """
+    functions = [callable_(log_p, "log_p"), *(callable_(f, "log_qs") for f in log_qs)]
     low = array(lower, "lower", ("d",))
     high = array(upper, "upper", low.shape)
     n = count(nodes, "nodes", at_least=2)
@@ -145,21 +174,24 @@ def jeffreys_by_quadrature(
     points, parts = (
         tensor_grid(low[1:], high[1:], n) if low.size > 1 else (np.empty((1, 0)), np.ones(1))
     )
-    tops = (-np.inf, -np.inf)
-    sums = np.zeros((2, 2))
+    tops = np.full(len(functions), -np.inf)
+    sums = np.zeros((len(functions), 1 + len(functions)))
+    # One slice of the first axis at a time; each density is rescaled when a larger value comes.
     for x, part in zip(front[:, 0], front_parts, strict=True):
         at = np.concatenate([np.full((points.shape[0], 1), x), points], axis=1)
-        logs = [array(f(at), name, (at.shape[0],)) for f, name in
-                ((log_p, "log_p"), (log_q, "log_q"))]
-        ratio = logs[0] - logs[1]
-        new = (max(tops[0], logs[0].max()), max(tops[1], logs[1].max()))
-        for k in range(2):
-            mass = part * parts * np.exp(logs[k] - new[k])
-            sums[k] *= np.exp(tops[k] - new[k])
-            sums[k] += mass.sum(), mass @ ratio
+        names = ["log_p"] + ["log_q"] * len(log_qs)
+        logs = np.stack(
+            [array(f(at), name, (at.shape[0],)) for f, name in zip(functions, names, strict=True)]
+        )
+        new = np.maximum(tops, logs.max(axis=1))
+        mass = part * parts * np.exp(logs - new[:, None])
+        sums *= np.exp(tops - new)[:, None]
+        sums[:, 0] += mass.sum(axis=1)
+        sums[:, 1:] += mass @ (logs[0] - logs).T
         tops = new
-    means = sums[:, 1] / sums[:, 0]
-    return Divergence(float(0.5 * (means[0] - means[1])), 0.0, 1.0)
+    ratios = sums[:, 1:] / sums[:, :1]
+    gaps = 0.5 * (ratios[0, 1:] - np.diagonal(ratios)[1:])
+    return [Divergence(float(gap), 0.0, 1.0) for gap in gaps]
 
 
 def jeffreys_by_sampling(

@@ -11,6 +11,7 @@ from distfilt.mixtures import (
     arc,
     jeffreys_by_quadrature,
     jeffreys_by_sampling,
+    jeffreys_of_many,
 )
 from distfilt.mixtures.divergence import gaussian_divergences, tensor_grid
 
@@ -38,6 +39,10 @@ BAD_INPUT = {
         ("lower", lambda: jeffreys_by_quadrature(F, F, [[0.0]], [1.0])),
         ("upper", lambda: jeffreys_by_quadrature(F, F, [0.0, 0.0], [1.0])),
         ("nodes", lambda: jeffreys_by_quadrature(F, F, [0.0, 0], [1.0, 1], nodes=1)),
+    ],
+    "distfilt.mixtures.divergence.jeffreys_of_many": [
+        ("log_p", lambda: jeffreys_of_many(3, [F], [0, 0], [1, 1])),  # type: ignore[arg-type]
+        ("log_qs", lambda: jeffreys_of_many(F, [3], [0, 0], [1, 1])),  # type: ignore[list-item]
     ],
     "distfilt.mixtures.divergence.jeffreys_by_sampling": [
         ("log_p", lambda: jeffreys_by_sampling(
