@@ -15,8 +15,8 @@ from distfilt.mixtures import (
     average,
     fuse,
     fuse_moments,
-    jeffreys_by_quadrature,
     jeffreys_by_sampling,
+    jeffreys_of_many,
     kept_by_relevance,
     nonnegative_least_squares,
     pivoted_qr,
@@ -387,24 +387,26 @@ def test_sigma_points_beat_c3_on_pair_a() -> None:
 
 @pytest.mark.slow
 def test_pair_a_by_quadrature() -> None:
-    for (terms, rule), wanted in TABLE_1.items():
-        exact, fused = both("A", terms, rule)
-        got = {}
-        for n in (30, 50):
-            got[n] = [
-                jeffreys_by_quadrature(m.log_density, f.log_value, *BOX[k], nodes=n).value
-                for k, (f, m) in enumerate(zip(exact, fused, strict=True))
-            ]
-            a, b = (m.marginal(TARGET) for m in fused)
-            got[n].append(
-                jeffreys_by_quadrature(
-                    a.log_density, b.log_density, [-4, -4], [5, 4], nodes=4 * n
-                ).value
+    exact, _ = both("A", "matched", "C2")
+    fused = {key: both("A", *key)[1] for key in TABLE_1}
+    got = {}
+    for n in (30, 50):
+        found = [
+            jeffreys_of_many(
+                exact[k].log_value, [m[k].log_density for m in fused.values()], *BOX[k], nodes=n
             )
-        assert np.allclose(got[50], wanted, rtol=0.03)
-        assert np.allclose(got[30], got[50], rtol=2e-3)
-        sampled, _ = divergences(exact, fused, 100_000)
-        assert np.allclose(sampled, got[50], rtol=0.05)
+            for k in (0, 1)
+        ]
+        targets = [[m.marginal(TARGET).log_density for m in pair] for pair in fused.values()]
+        found.append([
+            jeffreys_of_many(a, [b], [-4, -4], [5, 4], nodes=4 * n)[0] for a, b in targets
+        ])
+        got[n] = np.array([[d.value for d in column] for column in found]).T
+    wanted = np.array(list(TABLE_1.values()))
+    assert np.allclose(got[50], wanted, rtol=0.03)
+    assert np.allclose(got[30], got[50], rtol=2e-3)
+    sampled = [divergences(exact, pair, 100_000)[0] for pair in fused.values()]
+    assert np.allclose(sampled, got[50], rtol=0.05)
 
 
 def test_pair_b_orders_the_reductions() -> None:
