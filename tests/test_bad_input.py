@@ -44,14 +44,22 @@ def _qualified(key: str) -> str:
     return _home(found, name) if name in found.__all__ else key
 
 
+def _test_modules() -> Iterator[ModuleType]:
+    """The other test modules, by their names as packages: ``tests.network.test_channel``."""
+    here = Path(__file__)
+    for path in sorted(here.parent.rglob("test_*.py")):
+        parts = path.relative_to(here.parents[1]).with_suffix("").parts
+        folders = [here.parents[1].joinpath(*parts[:k]) for k in range(1, len(parts))]
+        if path != here and all((folder / "__init__.py").is_file() for folder in folders):
+            yield importlib.import_module(".".join(parts))
+
+
 def _tables() -> tuple[dict[str, list[Case]], dict[str, str]]:
     cases: dict[str, list[Case]] = {}
     exempt: dict[str, str] = {}
-    for path in sorted(Path(__file__).parent.glob("test_*.py")):
-        if path.name == Path(__file__).name:
-            continue
-        module = importlib.import_module(path.stem)
-        cases.update({_qualified(k): v for k, v in getattr(module, "BAD_INPUT", {}).items()})
+    for module in _test_modules():
+        for key, calls in getattr(module, "BAD_INPUT", {}).items():
+            cases.setdefault(_qualified(key), []).extend(calls)
         exempt.update({_qualified(k): v for k, v in getattr(module, "EXEMPT", {}).items()})
     return cases, exempt
 
@@ -88,7 +96,7 @@ def test_every_case_is_of_a_public_name(name: str) -> None:
 def test_bad_input_names_its_argument(
     name: str, argument: str, call: Callable[[], object]
 ) -> None:
-    with pytest.raises((ValueError, RuntimeError, LookupError)) as caught:
+    with pytest.raises((ValueError, RuntimeError, LookupError, ImportError)) as caught:
         call()
     message = str(caught.value)
     assert argument in message, f"{name}: {message!r} does not name {argument!r}"

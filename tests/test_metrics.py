@@ -46,10 +46,10 @@ _CASES = {
     ],
     "nees": [
         ("estimate", lambda: nees([np.inf], [[1.0]], [0.0])),
-        ("covariance", lambda: nees([1.0, 2.0], np.eye(3), [0.0, 0.0])),
-        ("covariance", lambda: nees([1.0, 2.0], [[1.0, 2.0], [2.0, 1.0]], [0.0, 0.0])),
-        ("covariance", lambda: nees([1.0, 2.0], [[1.0, 0.5], [0.2, 1.0]], [0.0, 0.0])),
-        ("covariance", lambda: nees(np.zeros((3, 1)), np.ones((2, 1, 1)), [0.0])),
+        ("cov", lambda: nees([1.0, 2.0], np.eye(3), [0.0, 0.0])),
+        ("cov", lambda: nees([1.0, 2.0], [[1.0, 2.0], [2.0, 1.0]], [0.0, 0.0])),
+        ("cov", lambda: nees([1.0, 2.0], [[1.0, 0.5], [0.2, 1.0]], [0.0, 0.0])),
+        ("cov", lambda: nees(np.zeros((3, 1)), np.ones((2, 1, 1)), [0.0])),
         ("truth", lambda: nees([1.0, 2.0], np.eye(2), [0.0])),
     ],
     "ensemble_nees": [

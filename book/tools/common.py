@@ -12,6 +12,8 @@ from typing import Any
 
 import yaml
 
+from pictures import taken_out
+
 ROOT = Path(__file__).resolve().parents[2]
 BOOK = ROOT / "book"
 VERDICT = "application/vnd.distfilt.verdict+json"
@@ -102,7 +104,7 @@ def output_texts(output: Any) -> Iterator[str]:
     yield from output.get("traceback", [])
     for mime, value in output.get("data", {}).items():
         if not mime.startswith("image/") or mime.endswith("svg+xml"):
-            yield value if isinstance(value, str) else repr(value)
+            yield taken_out(value)[0] if isinstance(value, str) else repr(value)
 
 
 def foreign_text(output: Any) -> str:

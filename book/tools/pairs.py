@@ -18,6 +18,9 @@ import nbformat
 from common import BOOK, ROOT, chosen, foreign_text, is_chapter, missing_pages, toc_pages
 from execute import read
 
+SLIDER = 'class="frames"'
+"""In the HTML of a picture that moves, which brings its own alternative text."""
+
 WIDTH = 79
 """Longest line of code: it fits a phone held sideways and a printed page."""
 
@@ -58,20 +61,25 @@ def code_faults(cell: Any, count: int) -> list[str]:
 
 
 def figure_faults(cell: Any) -> list[str]:
-    """Return what a cell with a picture lacks: its alternative text, its caption."""
+    """Return what a figure's cell lacks: its one picture, alternative text, caption, digest."""
     pictures = [
-        mime
+        output["data"]
         for output in cell.outputs
-        for mime in output.get("data", {})
-        if mime.startswith("image/")
+        if any(mime.startswith("image/") for mime in output.get("data", {}))
     ]
     given = cell.metadata.get("mystnb", {})
+    if not pictures and not given.get("figure"):
+        return []
     out = []
-    if len(pictures) > 1:
-        out.append(f"{len(pictures)} pictures in one cell would share one alternative text")
-    if pictures and not str(given.get("image", {}).get("alt", "")).strip():
+    if len(pictures) != 1:
+        out.append(f"a figure's cell with {len(pictures)} pictures, needs one")
+    for data in pictures:
+        if data.get("text/plain", "<").startswith("<"):
+            out.append("a picture without the digest of its axes: plotting.use_style()")
+    moving = [data for data in pictures if SLIDER in data.get("text/html", "")]
+    if not moving and not str(given.get("image", {}).get("alt", "")).strip():
         out.append("a figure without mystnb.image.alt in its header")
-    if pictures and not str(given.get("figure", {}).get("caption", "")).strip():
+    if not str(given.get("figure", {}).get("caption", "")).strip():
         out.append("a figure without mystnb.figure.caption in its header")
     return out
 

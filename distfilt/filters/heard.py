@@ -95,7 +95,7 @@ class Heard:
     def _spread(self) -> list[tuple[_Part, list[tuple[int, slice]]]]:
         """Each part, and the cells (agent of the group, columns) that it fills."""
         return [
-            (p, [(int(g), slice(s, s + p.sensor.dim)) for g, s in zip(p.rows, p.starts)])
+            (p, [(int(g), slice(s, s + p.sensor.dim)) for g, s in zip(p.rows, p.starts, strict=True)])
             for p in self.parts
         ]
 

@@ -35,7 +35,8 @@ def _least(covs: Array, here: NDArray[np.bool_], determinant: bool) -> Array:
         slope, curvature = problem.derivatives(point)
         mean = (point * slope).sum(axis=-1, keepdims=True)
         gap = slope.max(axis=-1) / mean[:, 0] - 1
-        lower_gap = gap < lowest
+        # What is settled stays: the others' need for more steps must not move it.
+        lower_gap = (gap < lowest) & (lowest > _GAP)
         best[left[lower_gap]] = point[lower_gap]
         # A Newton step has to halve the gap; where it does not, its start's sure step counts.
         taken = certain | (gap < 0.5 * lowest)

@@ -226,7 +226,7 @@ def fastest(graph: Graph, *, iterations: int = 200) -> Weights:
     >>> edges = [(0, 1), (0, 2), (1, 2), (2, 3), (3, 4), (3, 5), (4, 5)]
     >>> pair = Graph.from_edges(6, [e for i, j in edges for e in ((i, j), (j, i))])
     >>> w = fastest(pair).matrix.toarray()
-    >>> bool(w[2, 3] > 1.5 * w[0, 2])
+    >>> bool(w[2, 3] > 1.4 * w[0, 2])
     True
     """
     from scipy.optimize import minimize

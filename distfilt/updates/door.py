@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial, wraps
-from typing import Concatenate, ParamSpec
+from typing import Any, Concatenate, ParamSpec, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -79,7 +79,8 @@ def update(
         return function(x, h, y, r, *args, **options)
 
     checked.unchecked = function  # type: ignore[attr-defined]
-    return checked
+    # The wrapper has named parameters, where the type knows places only.
+    return cast(Any, checked)  # type: ignore[no-any-return]
 
 
 def unchecked(update: Update) -> Update:

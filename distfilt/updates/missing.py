@@ -56,12 +56,12 @@ def with_missing(
     inner = unchecked(update)
     m = observed.shape[-1]
     lead = observed.shape[:-1]
-    # What is drawn for an ensemble depends on its own missing readings and its place, not on what
-    # others miss: each pattern has a stream of its own, drawn from for all places.
+    # What is drawn for an ensemble depends on its place and on how many readings it has, not on
+    # what others miss: each number of readings has a stream, which is drawn from for all places.
     base = rng.integers(2**63, size=2)
     present = ~(np.isnan(observed) | np.isnan(predicted).any(axis=-2))
     if present.all():
-        stream = _Rows([*base, *np.ones(m, dtype=np.int64)], lead, None)
+        stream = _Rows([*base, m], lead, None)
         return inner(ensemble, predicted, observed, noise, rng=stream)
     flat = present.reshape(-1, m)
     rows = ensemble.reshape(-1, *ensemble.shape[-2:])
@@ -77,7 +77,7 @@ def with_missing(
             continue
         where = np.flatnonzero((flat == pattern).all(axis=1))
         part = cov[np.ix_(where, keep, keep)] if cov.ndim > 2 else cov[np.ix_(keep, keep)]
-        stream = _Rows([*base, *pattern.astype(np.int64)], lead, where)
+        stream = _Rows([*base, keep.size], lead, where)
         out[where] = inner(
             rows[where], seen[where][..., keep], aim[where][:, keep], part, rng=stream
         )

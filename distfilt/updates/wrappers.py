@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.special import ndtri
@@ -19,6 +19,8 @@ from .door import Update, joined, unchecked
 from .missing import with_missing
 
 __all__ = ["centred", "gated", "inflated", "serial"]
+
+Indices = NDArray[np.intp]
 
 
 def inflated(update: Update, *, factor: float) -> Update:
@@ -203,12 +205,12 @@ def serial(update: Update) -> Update:
     return out
 
 
-def _groups(noise: ArrayLike) -> list[Array]:
+def _groups(noise: ArrayLike) -> list[Indices]:
     """Indices of readings that are correlated with each other, in the order of their first."""
     linked = (np.asarray(noise) != 0).reshape(-1, *np.shape(noise)[-2:]).any(axis=0)
     labels = csgraph.connected_components(sparse.csr_array(linked), directed=False)[1]
     return [np.flatnonzero(labels == k) for k in dict.fromkeys(labels.tolist())]
 
 
-def _block(noise: Array, rows: Array) -> Array:
+def _block(noise: Array, rows: Indices) -> Array:
     return np.asarray(noise[..., rows[:, None], rows])
