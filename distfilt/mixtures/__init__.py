@@ -21,6 +21,7 @@ from .reduction import (
     two_stage,
 )
 from .shapes import Shapes
+from .splitting import split, split_library, stretching
 
 __all__ = [
     "Divergence",
@@ -42,6 +43,9 @@ __all__ = [
     "pivoted_qr",
     "prune",
     "runnalls",
+    "split",
+    "split_library",
+    "stretching",
     "tikhonov",
     "two_stage",
 ]
