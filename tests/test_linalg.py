@@ -189,6 +189,16 @@ def test_whitening_broadcasts_in_every_way(leading: tuple[int, ...]) -> None:
     assert np.allclose((lower[(0,) * len(leading)] @ out[..., None])[..., 0], many)
 
 
+@pytest.mark.parametrize("leading", [(), (0,), (3,), (0, 2)])
+@pytest.mark.parametrize(("d", "k"), [(0, 0), (0, 2), (2, 0), (2, 1)])
+def test_empty_systems(leading: tuple[int, ...], d: int, k: int) -> None:
+    cov, right = np.broadcast_to(np.eye(d), (*leading, d, d)), np.ones((*leading, d, k))
+    assert linalg.cholesky_solve(cov, right).shape == right.shape
+    assert linalg.quadratic_form(cov, np.ones((*leading, d))).shape == leading
+    assert linalg.quadratic_form(np.eye(d), np.ones((*leading, d))).shape == leading
+    assert linalg.factor(cov).shape == cov.shape and linalg.log_det(cov).shape == leading
+
+
 @given(SEEDS, SIZES, st.sampled_from(LEADING))
 def test_public_solves_agree_with_numpy(seed: int, d: int, leading: tuple[int, ...]) -> None:
     rng = generator(seed)

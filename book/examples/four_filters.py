@@ -10,7 +10,7 @@ from distfilt.sensors import distance
 model = constant_velocity(sigma=0.1)
 beacons = [[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]]
 sensors = [distance([0, 1], std=0.3, origin=place) for place in beacons]
-net = graphs.path(3)
+net = graphs.ring(3)
 prior = ([4.0, 4.0, 0.0, 0.0], np.diag([4.0, 4.0, 0.25, 0.25]))
 times = np.arange(1, 41) * 0.5
 rng = np.random.default_rng(0)
@@ -20,7 +20,7 @@ seen = [sensor.observe(truth, rng=rng) for sensor in sensors]
 filters = {
     "extended": GaussianFilter(model, sensors, net, rule="extended"),
     "unscented": GaussianFilter(model, sensors, net, rule="unscented"),
-    "ensemble": EnsembleFilter.exact(model, sensors, net, members=60),
+    "ensemble": EnsembleFilter(model, sensors, net, members=60),
     "particles": ParticleFilter(model, sensors, net, members=2000),
 }
 for name, f in filters.items():

@@ -313,7 +313,8 @@ class EnsembleFilter(SensorFilter):
         if options or getattr(self.update, "repredicts", False):
             return unchecked(self.update)(x, h, y, noise, rng=rng, **options)
         if stackable(self.update) or x.ndim == 2:
-            return with_missing(self.update, x, h, y, noise, rng=rng)
+            new = with_missing(self.update, x, h, y, noise, rng=rng)
+            return array(new, "update", x.shape, finite=False)
         out = np.empty_like(x)
         for g in range(x.shape[-3]):
             r = noise[g] if noise.ndim > 2 else noise

@@ -248,7 +248,7 @@ class GaussianFilter(SensorFilter):
         return at, slope, weighed @ gap - slope @ cov @ np.swapaxes(slope, -1, -2)
 
     def _condition(
-        self, means: Array, covs: Array, slot: int, group: Heard, failed: Array
+        self, means: Array, covs: Array, slot: int, group: Heard, failed: Mask
     ) -> dict[tuple[int, ...], str]:
         """Condition a group's joint Gaussians in place; the rows that failed."""
         d, rows = self.model.dim, group.agents

@@ -107,7 +107,7 @@ class ParticleFilter(SensorFilter):
     >>> f = ParticleFilter(walk, [direct([0], std=1.0)], members=500)
     >>> state = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(1))
     >>> f.summary(f.step(state, 1.0, [[3.0]])).mean.round(1)
-    array([[2.]])
+    array([[1.9]])
     """
 
     members: int = field(default=1000, kw_only=True)
@@ -243,7 +243,7 @@ class ParticleFilter(SensorFilter):
     def _agreed(
         self, stack: list[Array], weights: Array, channel: Any, rng: np.random.Generator
     ) -> tuple[list[Array], Array]:
-        """Everybody resamples, so that the particles are an ensemble, and the agreement moves it."""
+        """Everybody resamples, so that the particles are an ensemble that the agreement moves."""
         picked = _resampled(np.exp(weights), rng, self.rule)
         out = [np.take_along_axis(p, picked[..., None], axis=-2) for p in stack]
         assert self.agreement is not None

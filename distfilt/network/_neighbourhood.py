@@ -12,6 +12,8 @@ from ..checks import Array, array, count
 from .channel import Channel
 from .links import Graph
 
+__all__: list[str] = []
+
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 

@@ -96,3 +96,10 @@ def test_targets_of_their_own_functions() -> None:
     v = invert(lambda v: (np.sinh(scale * v), scale * np.cosh(scale * v)),
                np.broadcast_to(target, (3, 3)))
     assert np.allclose(v, np.arcsinh(target) / scale, rtol=1e-12, atol=1e-13)
+
+
+def test_the_tolerance_is_relative_to_the_value() -> None:
+    """At 1e8 two neighbouring numbers are 1.5e-8 apart: no step is ever below 1e-13."""
+    target = np.array([1e24 + 1e8, -1e24 - 1e8])
+    v = invert(lambda v: (v**3 + v, 3 * v**2 + 1), target)
+    assert np.allclose(v, [1e8, -1e8], rtol=1e-13)
