@@ -225,8 +225,10 @@ class MixtureFilter(Filter):
             channel = Channel(graph, ledger=ledger, faults=self.faults)
             beliefs = self._agreed(beliefs, channel)
             ledger = channel.ledger
-        kept = tuple(runnalls(belief, self.size) for belief in beliefs)
-        return MixtureState(now, ledger, None, kept)
+        kept = [runnalls(belief, self.size) for belief in beliefs]
+        # Without the square roots that they came with: a loaded state has to go on alike.
+        plain = tuple(trusted(m.weights, m.means, m.covs) for m in kept)
+        return MixtureState(now, ledger, None, plain)
 
     def summary(self, state: MixtureState) -> Summary:
         """Means, variances and covariances of the whole mixtures, and their sizes.
