@@ -124,7 +124,7 @@ def propagate(
     Raises
     ------
     ValueError
-        If an orbit starts, or ends, below the surface.
+        If an orbit comes below the surface.
 
     Examples
     --------
@@ -139,9 +139,7 @@ def propagate(
     step = number(longest, "longest", above=0)
     _above(states)
     with np.errstate(all="ignore"):
-        moved = _moved(states, length, rule, step)
-    _above(moved)
-    return moved
+        return _moved(states, length, rule, step)
 
 
 def _above(x: Array) -> None:
@@ -155,25 +153,28 @@ def _moved(x: Array, dt: float, rule: str, longest: float) -> Array:
     steps = max(1, int(np.ceil(abs(dt) / longest - 1e-9)))
     if dt == 0:
         return x
-    if rule == "rk4":
-        turned: Callable[[Array, float], Array] = _rate if dt > 0 else lambda x, t: -_rate(x)
-        return rk4(turned, x, 0.0, abs(dt), longest=longest)
-    return _dop853(x, dt / steps, steps)
+    turned: Callable[[Array, float], Array] = _rate if dt > 0 else lambda x, t: -_rate(x)
+    for _ in range(steps):
+        # A body that dives through the Earth and comes out again is found on its way.
+        if rule == "rk4":
+            x = rk4(turned, x, 0.0, abs(dt) / steps)
+        else:
+            x = _dop853(x, dt / steps)
+        _above(x)
+    return x
 
 
-def _dop853(x: Array, h: float, steps: int) -> Array:
+def _dop853(x: Array, h: float) -> Array:
     """E. Hairer, S. Norsett and G. Wanner, Solving Ordinary Differential Equations I (1993)."""
     from scipy.integrate import DOP853
 
     a, b = h * DOP853.A[:12, :12], h * DOP853.B
     stages = np.empty((12, *x.shape))
     flat = stages.reshape(12, -1)
-    for _ in range(steps):
-        stages[0] = _rate(x)
-        for k in range(1, 12):
-            stages[k] = _rate(x + (a[k, :k] @ flat[:k]).reshape(x.shape))
-        x = x + (b @ flat).reshape(x.shape)
-    return x
+    stages[0] = _rate(x)
+    for k in range(1, 12):
+        stages[k] = _rate(x + (a[k, :k] @ flat[:k]).reshape(x.shape))
+    return x + np.asarray(b @ flat).reshape(x.shape)
 
 
 def orbits(
