@@ -174,7 +174,7 @@ def _dop853(x: Array, h: float) -> Array:
     stages[0] = _rate(x)
     for k in range(1, 12):
         stages[k] = _rate(x + (a[k, :k] @ flat[:k]).reshape(x.shape))
-    return x + np.asarray(b @ flat).reshape(x.shape)
+    return np.asarray(x + (b @ flat).reshape(x.shape))
 
 
 def orbits(
