@@ -30,7 +30,15 @@ from sphinx.errors import ExtensionError
 sys.path.insert(0, str(Path(__file__).parent / "tools"))
 
 from common import BOOK, ROOT, missing_pages
-from pages import chapter_number, drop_widgets, escape_stars, number_chapters, write_generated
+from pages import (
+    chapter_number,
+    drop_widgets,
+    escape_stars,
+    keep_sliders,
+    number_chapters,
+    plain_types,
+    write_generated,
+)
 
 project = "Distributed Nonlinear Filtering"
 author = "The distfilt authors"
@@ -96,6 +104,7 @@ bibtex_default_style = "plain"
 
 autodoc_typehints = "signature"
 toc_object_entries = False
+add_module_names = False
 autodoc_member_order = "bysource"
 autodoc_type_aliases = {"Array": "Array", "ArrayLike": "ArrayLike"}
 autodoc_preserve_defaults = True
@@ -172,5 +181,7 @@ def setup(app: Sphinx) -> None:
     app.connect("builder-inited", check_toc)
     app.connect("builder-inited", lambda app: write_generated(BOOK / "_generated"))
     app.connect("doctree-read", lambda app, tree: drop_widgets(tree))
+    app.connect("doctree-read", lambda app, tree: keep_sliders(tree))
     app.connect("autodoc-process-docstring", lambda *event: escape_stars(event[-1]))
+    app.connect("autodoc-process-signature", lambda *event: tuple(map(plain_types, event[-2:])))
     app.connect("build-finished", copy_mathjax)

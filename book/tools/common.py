@@ -16,6 +16,8 @@ from pictures import taken_out
 
 ROOT = Path(__file__).resolve().parents[2]
 BOOK = ROOT / "book"
+SLIDER = 'class="frames"'
+"""In the HTML of a picture that moves, which brings its own alternative text."""
 VERDICT = "application/vnd.distfilt.verdict+json"
 
 # Home folders, kernel files, addresses in memory and progress bars differ on the next machine.

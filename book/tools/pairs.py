@@ -15,14 +15,11 @@ from typing import Any
 
 import nbformat
 
-from common import BOOK, ROOT, chosen, foreign_text, is_chapter, missing_pages, toc_pages
+from common import BOOK, ROOT, SLIDER, chosen, foreign_text, is_chapter, missing_pages, toc_pages
 from execute import read
 
-SLIDER = 'class="frames"'
-"""In the HTML of a picture that moves, which brings its own alternative text."""
-
 WIDTH = 79
-"""Longest line of code: it fits a phone held sideways and a printed page."""
+"""Longest line of code and of printed text: it fits the page at 1200 pixels, and paper."""
 
 
 def differences(source: Path, stored: Any) -> list[str]:
@@ -55,9 +52,18 @@ def code_faults(cell: Any, count: int) -> list[str]:
             out.append(f"a stored error: {output.ename}")
         if output.get("name") == "stderr":
             out.append("stored stderr")
+        for line in shown(output).splitlines():
+            if len(line) > WIDTH:
+                out.append(f"a line of {len(line)} characters printed, at most {WIDTH}: {line}")
         if foreign := foreign_text(output):
             out.append(f"an output holds {foreign!r}, which belongs to one machine")
     return out + figure_faults(cell)
+
+
+def shown(output: Any) -> str:
+    """Return the text that a page shows of an output; '' where it shows a picture or a table."""
+    data = output.get("data", {})
+    return str(output.get("text", data.get("text/plain", ""))) if len(data) < 2 else ""
 
 
 def figure_faults(cell: Any) -> list[str]:

@@ -62,6 +62,8 @@ class Weights:
     @classmethod
     def from_matrix(cls, graph: Graph, matrix: ArrayLike | sparse.sparray) -> Weights:
         """Read the weights from a matrix (A, A); off its diagonal only links may be weighted."""
+        if not sparse.issparse(matrix):
+            matrix = array(matrix, "weights", graph.links.shape, finite=False)
         w = sparse.csr_array(matrix)
         if w.shape != graph.links.shape:
             raise ValueError(f"weights: needs shape {graph.links.shape}, got {w.shape}")

@@ -71,7 +71,10 @@ def update(
             raise ValueError(f"ensemble: needs at least 2 members, got {x.shape[-2]}")
         h = array(predicted, "predicted", (*x.shape[:-1], "m"))
         m = h.shape[-1]
-        y = array(observed, "observed", (*x.shape[:-2], m))
+        y = array(observed, "observed", (..., m))
+        if y.shape not in ((m,), (*x.shape[:-2], m)):
+            raise ValueError(f"observed: needs shape {(*x.shape[:-2], m)}, got {y.shape}")
+        y = np.broadcast_to(y, (*x.shape[:-2], m))
         r = covariance(noise, "noise", m)
         if r.shape[:-2] and np.broadcast_shapes(r.shape[:-2], x.shape[:-2]) != x.shape[:-2]:
             raise ValueError(f"noise: needs leading axes {x.shape[:-2]}, got {r.shape[:-2]}")

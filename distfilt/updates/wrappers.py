@@ -16,7 +16,7 @@ from scipy.special import ndtri
 
 from ..checks import Array, callable_, number
 from .door import Update, joined, unchecked
-from .missing import with_missing
+from .missing import Rows, with_missing
 
 __all__ = ["centred", "gated", "inflated", "serial"]
 
@@ -105,6 +105,11 @@ class _Centred(np.random.Generator):
     def __init__(self, source: np.random.Generator) -> None:
         super().__init__(source.bit_generator)
         self.source = source
+
+    def stream(self, seed: list[int], where: Any) -> _Centred:
+        """What the wrapped update's own wrappers draw from, centred too."""
+        maker = getattr(self.source, "stream", None)
+        return _Centred(Rows(seed, (), None) if maker is None else maker(seed, where))
 
     def standard_normal(self, size: Any = None, *args: Any, **options: Any) -> Any:
         """As the source's, centred along the last axis but one."""

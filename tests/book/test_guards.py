@@ -247,8 +247,9 @@ def test_changed_prose_fails(chapter: Path) -> None:
         ("alt: One curve that falls from 1 at time 0 to 0.14 at time 1.", "width: 80%", "alt"),
         ("    caption: The curve {eq}`eq-small`.\n", "", "caption"),
         ("rate = 2.0", "rate = 2.0  # " + "x" * 70, "at most 79"),
+        ('print(f"rate {rate:.4f}")', 'print("x" * 80)', "80 characters printed, at most 79"),
     ],
-    ids=["no alternative text", "no caption", "long line"],
+    ids=["no alternative text", "no caption", "long line", "long output"],
 )
 def test_pair_check_refuses(chapter: Path, old: str, new: str, complaint: str) -> None:
     text = chapter.read_text(encoding="utf-8")

@@ -39,7 +39,8 @@ def test_everything_comes_back(tmp_path: Path, kind: str) -> None:
     before = kept(rng)
     before.save(tmp_path / "a.npz")
     after = Kept.load(tmp_path / "a.npz")
-    assert (after.t, after.size, after.word, after.nothing, after.yes) == (1.5, 7, "a b", None, True)
+    got = (after.t, after.size, after.word, after.nothing, after.yes)
+    assert got == (1.5, 7, "a b", None, True)
     assert after.counts.dtype == np.int32 and after.counts.tolist() == [1, 2]
     assert [t for t, _ in after.nested] == [0.1, 0.2]
     for (_, a), (_, b) in zip(before.nested, after.nested, strict=True):
