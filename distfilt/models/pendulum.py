@@ -271,7 +271,7 @@ def pendulum_energy(states: ArrayLike, *, gravity: float = 9.8) -> Array:
 
     Examples
     --------
-    >>> float(pendulum_energy([0.0, 1.0, 2.0, 0.0]))
+    >>> float(pendulum_energy([0.0, 1.0, 2.0, 0.0]).round(12))
     -7.8
     """
     s = array(states, "states", (..., 4))
