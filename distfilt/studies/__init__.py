@@ -10,7 +10,7 @@ from .checking import check
 from .running import run
 from .seeds import spawn
 from .sources import fingerprint
-from .stored import Stored, load, store
+from .files import Stored, load, store, stored
 from .study import Failure, Study, StudyError, StudyInterrupted
 
 __all__ = [
@@ -25,4 +25,5 @@ __all__ = [
     "run",
     "spawn",
     "store",
+    "stored",
 ]

@@ -13,16 +13,18 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import lru_cache
+from threading import Lock
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import ensembles
-from ..checks import Array, SolverError, array, choice, count
+from ..checks import Array, SolverError, array, choice, count, covariance
 
 if TYPE_CHECKING:
-    from .conditioning import ConditionalMap
+    from .composition import ConditionalMap
 
 __all__ = [
     "AffineMap",
@@ -150,7 +152,7 @@ def fit(y: ArrayLike, x: ArrayLike) -> AffineMap:
     mean = ensembles.mean(joint)
     joint -= mean[..., None, :]
     cov = np.swapaxes(joint, -1, -2) @ joint / joint.shape[-2]
-    return from_moments(mean, cov, m)
+    return _from_moments(mean, cov, m)
 
 
 def from_moments(mean: ArrayLike, cov: ArrayLike, m: int) -> AffineMap:
@@ -161,7 +163,7 @@ def from_moments(mean: ArrayLike, cov: ArrayLike, m: int) -> AffineMap:
     mean : array_like, (..., m + d)
         Mean of (y, x).
     cov : array_like, (..., m + d, m + d)
-        Their covariance, positive definite.
+        Their covariance, symmetric and positive definite.
     m : int
         Number of observations, at least 0.
 
@@ -172,7 +174,7 @@ def from_moments(mean: ArrayLike, cov: ArrayLike, m: int) -> AffineMap:
     Raises
     ------
     ValueError
-        If a variable is constant or a combination of others.
+        If `cov` is no covariance, or a variable is constant or a combination of others.
 
     Examples
     --------
@@ -180,9 +182,15 @@ def from_moments(mean: ArrayLike, cov: ArrayLike, m: int) -> AffineMap:
     array([[0.5]])
     """
     centre = array(mean, "mean", (..., "D"))
-    joint = array(cov, "cov", (*centre.shape, centre.shape[-1]))
+    joint = covariance(cov, "cov", centre.shape[-1], semidefinite=True)
+    joint = array(joint, "cov", (*centre.shape, centre.shape[-1]))
     if count(m, "m", at_least=0) > centre.shape[-1]:
         raise ValueError(f"m: needs at most {centre.shape[-1]} observations, got {m}")
+    return _from_moments(centre, joint, m)
+
+
+def _from_moments(centre: Array, joint: Array, m: int) -> AffineMap:
+    """`from_moments` of checked arguments."""
     lower = _cholesky(joint, centre, m)
     # The factor of the joint covariance holds the map: its lower blocks are K L_yy and L.
     across = np.swapaxes(lower[..., m:, :m], -1, -2)
@@ -361,17 +369,35 @@ def _solve_component(z: Array, solver: str, max_iters: int | None) -> Array:
     import cvxpy as cp
 
     n, k = z.shape
-    u0, u = cp.Variable(), cp.Variable(k)
-    loss = cp.sum_squares(u0 + z @ u) / (2 * n) - cp.log(u[k - 1])
-    problem = cp.Problem(cp.Minimize(loss))
+    problem, root, u = _program(k)
     limit = {} if max_iters is None else {_LIMIT[solver]: count(max_iters, "max_iters")}
-    try:
-        # What cvxpy would warn of, the status below tells, and it becomes an error.
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            problem.solve(solver=solver, **limit)
-    except cp.error.SolverError as error:
-        raise SolverError(f"{solver}: component {k} of the map has no solution: {error}") from None
-    if problem.status != cp.OPTIMAL:
-        raise SolverError(f"{solver}: component {k} of the map stopped with {problem.status!r}")
-    return np.concatenate([[u0.value], u.value])
+    # What cvxpy would warn of, the status below tells, and it becomes an error.
+    with _SOLVING, warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        root.value = np.linalg.qr(np.column_stack([np.ones(n), z]) / np.sqrt(n), mode="r")
+        try:
+            problem.solve(solver=solver, warm_start=False, **limit)
+        except cp.error.SolverError as error:
+            raise SolverError(
+                f"{solver}: component {k} of the map has no solution: {error}"
+            ) from None
+        if problem.status != cp.OPTIMAL:
+            raise SolverError(f"{solver}: component {k} of the map stopped with {problem.status!r}")
+        return np.asarray(u.value, dtype=np.float64).copy()
+
+
+_SOLVING = Lock()
+"""A compiled program holds its last data: one thread at a time."""
+
+
+@lru_cache(maxsize=32)
+def _program(k: int) -> tuple[Any, Any, Any]:
+    """The program (12) of component k, compiled once, with the samples' triangular factor open.
+
+    The samples enter by |u_0 + Z u|² only, which their QR factor keeps.
+    """
+    import cvxpy as cp
+
+    root, u = cp.Parameter((k + 1, k + 1)), cp.Variable(k + 1)
+    loss = cp.sum_squares(root @ u) / 2 - cp.log(u[k])
+    return cp.Problem(cp.Minimize(loss)), root, u

@@ -28,7 +28,7 @@ from numpy.random import SeedSequence
 from distfilt import studies
 from distfilt.studies import Failure, Stored, Study, StudyError, StudyInterrupted
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 class Scores(NamedTuple):
