@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from distfilt.checks import SolverError
-from distfilt.coupling import SOLVERS, Plan, distances, plan, sorted_plan, solvers
+from distfilt.coupling import SOLVERS, Plan, distances, plan, solvers, sorted_plan
 
 NAN = float("nan")
 EXACT = ("network", "highs", "clarabel", "linprog")
