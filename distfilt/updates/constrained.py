@@ -36,9 +36,9 @@ def augmented(update: Update, constraint: Constraint, *, std: float) -> Update:
     Examples
     --------
     >>> from distfilt.coupling import norm
-    >>> from distfilt.updates import exact_draws
+    >>> from distfilt.updates import square_root
     >>> x = np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
-    >>> knows = augmented(exact_draws, norm([0, 1]), std=0.01)
+    >>> knows = augmented(square_root, norm([0, 1]), std=0.01)
     >>> after = knows(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
     >>> bool(abs((after**2).sum(axis=1) - 1).mean() < abs((x**2).sum(axis=1) - 1).mean() / 5)
     True
@@ -79,9 +79,9 @@ def projected(
     Examples
     --------
     >>> from distfilt.coupling import norm
-    >>> from distfilt.updates import exact_draws
+    >>> from distfilt.updates import square_root
     >>> x = np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
-    >>> on = projected(exact_draws, norm([0, 1]))
+    >>> on = projected(square_root, norm([0, 1]))
     >>> after = on(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
     >>> bool(abs((after**2).sum(axis=1).mean() - 1) < 0.01)
     True
@@ -124,9 +124,9 @@ def retracted(
     Examples
     --------
     >>> from distfilt.coupling import norm
-    >>> from distfilt.updates import exact_draws
+    >>> from distfilt.updates import square_root
     >>> x = np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
-    >>> on = retracted(exact_draws, norm([0, 1]))
+    >>> on = retracted(square_root, norm([0, 1]))
     >>> after = on(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
     >>> bool(abs((after**2).sum(axis=1) - 1).max() < 1e-14)
     True
@@ -160,9 +160,9 @@ def clipped(update: Update, constraint: Constraint) -> Update:
     Examples
     --------
     >>> from distfilt.coupling import norm
-    >>> from distfilt.updates import exact_draws
+    >>> from distfilt.updates import square_root
     >>> x = np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
-    >>> within = clipped(exact_draws, norm([0, 1]))
+    >>> within = clipped(square_root, norm([0, 1]))
     >>> after = within(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
     >>> bool((after**2).sum(axis=1).max() <= 1 + 1e-14)
     True
