@@ -43,6 +43,17 @@ class Outcome(NamedTuple):
     seconds: float
 
 
+class _Kept(NamedTuple):
+    """A plain value that is not pickled yet."""
+
+    which: int
+    value: Any
+    seconds: float
+
+    def outcome(self) -> Outcome:
+        return Outcome(self.which, _dumps(self.value), "", "", self.seconds)
+
+
 class Job(NamedTuple):
     """What every chunk of a study shares."""
 
@@ -164,7 +175,7 @@ def chunk(job: Job, items: Sequence[Item]) -> list[Outcome]:
             _outcome(trial, item, seed, job.timeout)
             for item, seed in zip(items, seeds, strict=True)
         ]
-    return [d if isinstance(d, Outcome) else Outcome(*d[:1], _dumps(d[1]), *d[2:]) for d in done]
+    return [d if isinstance(d, Outcome) else d.outcome() for d in done]
 
 
 class _TooLateError(BaseException):
@@ -196,8 +207,8 @@ def _alarm(seconds: float | None) -> Iterator[None]:
 
 def _outcome(
     trial: Callable[[Any], Any], item: Item, seed: Any, timeout: float | None
-) -> Outcome | tuple[int, Any, str, str, float]:
-    """One trial's outcome; a plain value is copied here and pickled later, with `_dumps`."""
+) -> Outcome | _Kept:
+    """One trial's outcome; a plain value is only copied here, to be pickled later."""
     began = time.perf_counter()
     try:
         if timeout is None:
@@ -222,7 +233,7 @@ def _outcome(
     if timeout is not None and seconds > timeout:  # in a thread, which no signal can stop
         return late(item, timeout, seconds)
     if plain:
-        return item.which, kept, "", "", seconds
+        return _Kept(item.which, kept, seconds)
     return Outcome(item.which, kept, "", "", seconds)
 
 

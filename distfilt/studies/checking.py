@@ -12,9 +12,9 @@ from numpy.random import SeedSequence
 
 from ..checks import callable_, count, number
 from ._worker import versions
+from .files import Stored, load
 from .running import run
 from .sources import fingerprints, name_of
-from .files import Stored, load
 from .study import Study, row
 
 __all__ = ["check"]
