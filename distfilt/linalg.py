@@ -185,9 +185,12 @@ def _triangular(lower: Array, right: Array, transposed: int) -> Array:
     if lower.ndim == 2:
         return _one_triangular(lower, right, transposed)
     d, k = right.shape[-2:]
-    leading = np.broadcast_shapes(lower.shape[:-2], right.shape[:-2])
-    factors = np.broadcast_to(lower, (*leading, d, d)).reshape(-1, d, d)
-    columns = np.broadcast_to(right, (*leading, d, k)).reshape(-1, d, k)
+    leading = lower.shape[:-2]
+    if leading != right.shape[:-2]:
+        leading = np.broadcast_shapes(leading, right.shape[:-2])
+        lower = np.broadcast_to(lower, (*leading, d, d))
+        right = np.broadcast_to(right, (*leading, d, k))
+    factors, columns = lower.reshape(-1, d, d), right.reshape(-1, d, k)
     if len(factors) > 2 * d:
         # Many small systems: row after row of all of them at once beats a call for each.
         out = _substitute(factors, columns, transposed)

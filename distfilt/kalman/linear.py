@@ -5,6 +5,7 @@ The functions that a caller sees keep runs in front; inside, the run axis stands
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -117,8 +118,9 @@ def kalman_filter(
     f, q = _per_step(F, "F", steps, (d, d)), _noise_per_step(Q, "Q", steps, d, semidefinite=True)
     h, r = _per_step(H, "H", steps, (m, d)), _noise_per_step(R, "R", steps, m)
     runs = common_runs(runs, x0, p0)
-    y = np.broadcast_to(fill_axes(y, len(runs)), (steps, *runs, m)).reshape(steps, -1, m)
-    x = np.broadcast_to(x0, (*runs, d)).reshape(-1, d)
+    size = math.prod(runs)
+    y = np.broadcast_to(fill_axes(y, len(runs)), (steps, *runs, m)).reshape(steps, size, m)
+    x = np.broadcast_to(x0, (*runs, d)).reshape(size, d)
     p, group = _groups(y, p0, runs)
     own = p.shape[-1] > 1
     model = (f, h, q, r)

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..checks import Array, array, count, number
 from ..ensembles import mean, sample_covariance
-from ..gaussians import bures_barycentre, recolour
+from ..gaussians import _bures_barycentre, _recolour
 from . import weights as weighting
 from ._neighbourhood import fused_by
 from .channel import Channel
@@ -20,8 +20,11 @@ from .weights import Weights
 
 __all__ = ["barycentre", "intersection", "pull"]
 
+_SWEEPS = 500
+"""Iterations after which a barycentre that does not settle is an error."""
+
 _SINGULAR = 1e-13
-"""Smallest eigenvalue of a sample correlation, over the largest, that is not rounding."""
+"""Least share of a component's variance that the components before it do not explain."""
 
 
 def pull(
@@ -137,7 +140,7 @@ def intersection(
     """
     x, size = _scaled(ensembles, channel, scale)
     fused = _intersected(mean(x), _sampled(x), channel, rule, weights, rounds)
-    return recolour(x, *fused) * size
+    return _recolour(x, *fused) * size
 
 
 def barycentre(
@@ -181,9 +184,9 @@ def barycentre(
     def fuse(means: Array, covs: Array, here: NDArray[np.bool_]) -> tuple[Array, Array]:
         omega = here / here.sum(axis=-1, keepdims=True)
         centre = (omega[..., None] * means).sum(axis=-2)
-        return centre, bures_barycentre(covs, omega, tolerance=small)
+        return centre, _bures_barycentre(covs, omega, small, _SWEEPS)
 
-    return recolour(x, *fused_by(mean(x), _sampled(x), channel, fuse, rounds)) * size
+    return _recolour(x, *fused_by(mean(x), _sampled(x), channel, fuse, rounds)) * size
 
 
 def _ensembles(ensembles: ArrayLike, channel: Channel) -> Array:
@@ -211,11 +214,14 @@ def _sampled(x: Array) -> Array:
             f"ensembles: needs more than {d} members for {d} components, got {members}"
         )
     cov = sample_covariance(x)
-    scale = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
-    singular = (scale == 0).any()
-    if not singular:
-        ends = np.linalg.eigvalsh(cov / (scale[..., :, None] * scale[..., None, :]))
-        singular = bool((ends[..., 0] < _SINGULAR * ends[..., -1]).any())
+    spread = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    size = np.where(spread > 0, spread, 1.0)
+    try:
+        # Squared pivots of the correlations: what each component has that those before have not.
+        lower = np.linalg.cholesky(cov / (size[..., :, None] * size[..., None, :]))
+        singular = bool((np.diagonal(lower, axis1=-2, axis2=-1) ** 2 < _SINGULAR).any())
+    except np.linalg.LinAlgError:
+        singular = True
     if singular:
         raise ValueError(
             "ensembles: needs components that are not constant and not combinations of others, "

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, array, callable_, choice, count, covariance, number
-from ..gaussians import intersection_weights
+from ..gaussians import _intersection_weights
 from ..linalg import _solve_lower, _symmetrise
 from . import weights as weighting
 from ._neighbourhood import Fuse, Heard, fused_by, in_rounds
@@ -138,13 +138,13 @@ def _by_rule(heard: Heard, rule: str) -> tuple[Array, Array]:
     if rule in ("trace", "determinant"):
         # Such a weight is a number of the source alone, up to the sum of what an agent has.
         both = np.concatenate([heard.covs, heard.sent_covs], axis=1)
-        shares = intersection_weights(both, rule=rule)
+        shares = _intersection_weights(both, rule, np.ones(both.shape[:2], dtype=bool))
         sent = shares[:, size:][:, graph.senders]
         return _shared(shares[:, :size], sent * heard.arrived, heard)
     own, links = np.empty(heard.means.shape[:2]), np.zeros(heard.arrived.shape)
     for agents, at in heard.groups():
         _, covs, here = heard.collected(agents, at)
-        omega = intersection_weights(covs, rule=rule, here=here)
+        omega = _intersection_weights(covs, rule, here)
         own[:, agents], links[:, at] = omega[..., 0], omega[..., 1:]
     return own, links
 
@@ -330,7 +330,10 @@ def _checked(means: ArrayLike, covs: ArrayLike, channel: Channel) -> tuple[Array
 
 
 def _information_sum(heard: Heard, own: Array, links: Array) -> tuple[Array, Array]:
-    """Weighted sum of information matrices and vectors, turned back into mean and covariance."""
+    """Weighted sum of information matrices and vectors, turned back into mean and covariance.
+
+    The same as :func:`distfilt.gaussians.intersection`, for all neighbourhoods at once.
+    """
     mine = _inverse(heard.covs)
     sent = mine if heard.sent_covs is heard.covs else _inverse(heard.sent_covs)
     total = _inverse(heard.mixed(own, links, mine, sent))
@@ -342,6 +345,6 @@ def _information_sum(heard: Heard, own: Array, links: Array) -> tuple[Array, Arr
 
 def _inverse(spd: Array) -> Array:
     """Inverse of positive definite matrices by the inverse of their Cholesky factors."""
-    lower = np.linalg.cholesky(spd)
+    lower: Array = np.asarray(np.linalg.cholesky(spd), dtype=np.float64)
     half = _solve_lower(lower, np.broadcast_to(np.eye(spd.shape[-1]), spd.shape))
     return np.asarray(half.swapaxes(-1, -2) @ half)

@@ -11,17 +11,15 @@ minimiser of (12) over affine maps has this form with sample moments, so no solv
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
-from functools import lru_cache
-from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import ensembles
-from ..checks import Array, SolverError, array, choice, count, covariance
+from ..checks import Array, array, choice, count, covariance
+from ._conic import LIMIT, solve_component
 
 if TYPE_CHECKING:
     from .composition import ConditionalMap
@@ -35,9 +33,6 @@ __all__ = [
     "gradient",
     "objective",
 ]
-
-_LIMIT = {"ECOS": "max_iters", "CLARABEL": "max_iter"}
-"""The solvers, and what each calls its limit of iterations."""
 
 _ROUNDING = 1e-13
 """Share of a variable's variance, or of its mean, that counts as rounding."""
@@ -355,49 +350,10 @@ def fit_convex(
     """
     seen, members = _samples(y, x)
     array(members, "x", ("N", "d"))
-    choice(solver, "solver", tuple(_LIMIT))
+    choice(solver, "solver", tuple(LIMIT))
     m, d = seen.shape[-1], members.shape[-1]
     joint = np.concatenate([seen, members], axis=-1)
     rows = np.zeros((d, 1 + m + d))
     for k in range(d):
-        rows[k, : m + k + 2] = _solve_component(joint[:, : m + k + 1], solver, max_iters)
+        rows[k, : m + k + 2] = solve_component(joint[:, : m + k + 1], solver, max_iters)
     return from_rows(rows, ensembles.mean(seen))
-
-
-def _solve_component(z: Array, solver: str, max_iters: int | None) -> Array:
-    """Coefficients (u_0, u_1 … u_k) that minimise (12) for the last column of `z`."""
-    import cvxpy as cp
-
-    n, k = z.shape
-    problem, root, u = _program(k)
-    limit = {} if max_iters is None else {_LIMIT[solver]: count(max_iters, "max_iters")}
-    # What cvxpy would warn of, the status below tells, and it becomes an error.
-    with _SOLVING, warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")
-        root.value = np.linalg.qr(np.column_stack([np.ones(n), z]) / np.sqrt(n), mode="r")
-        try:
-            problem.solve(solver=solver, warm_start=False, **limit)
-        except cp.error.SolverError as error:
-            raise SolverError(
-                f"{solver}: component {k} of the map has no solution: {error}"
-            ) from None
-        if problem.status != cp.OPTIMAL:
-            raise SolverError(f"{solver}: component {k} of the map stopped with {problem.status!r}")
-        return np.asarray(u.value, dtype=np.float64).copy()
-
-
-_SOLVING = Lock()
-"""A compiled program holds its last data: one thread at a time."""
-
-
-@lru_cache(maxsize=32)
-def _program(k: int) -> tuple[Any, Any, Any]:
-    """The program (12) of component k, compiled once, with the samples' triangular factor open.
-
-    The samples enter by |u_0 + Z u|² only, which their QR factor keeps.
-    """
-    import cvxpy as cp
-
-    root, u = cp.Parameter((k + 1, k + 1)), cp.Variable(k + 1)
-    loss = cp.sum_squares(root @ u) / 2 - cp.log(u[k])
-    return cp.Problem(cp.Minimize(loss)), root, u

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from distfilt.updates import exact_draws, known_noise, sampled_noise, square_root, transport
-from distfilt.updates.gaussian import _rotation
+from distfilt.updates.gaussian import _turned
 
 from .cases import H, R, Y, members
 
@@ -85,19 +85,20 @@ def test_square_root_without_rotation_is_symmetric() -> None:
 
 
 def test_rotation_keeps_ones_and_lengths_and_differs() -> None:
-    turn = _rotation(7, (2,), np.random.default_rng(0))
+    eye = np.broadcast_to(np.eye(7), (2, 7, 7))
+    turn = _turned(eye, np.random.default_rng(0))
     assert np.allclose(turn @ np.ones(7), 1, atol=1e-13)
+    assert np.allclose(np.ones(7) @ turn, 1, atol=1e-13)
     assert np.allclose(turn @ np.swapaxes(turn, -1, -2), np.eye(7), atol=1e-13)
     assert np.abs(turn[0] - turn[1]).max() > 0.1
 
 
-def test_rotation_is_uniform() -> None:
-    """An entry of a uniform rotation of the centred space has mean 1/n and variance (n-2)/n(n-1)…"""
-    n, draws = 4, 20_000
-    turn = _rotation(n, (draws,), np.random.default_rng(1))
+def test_rotation_prefers_no_direction() -> None:
+    """On average nothing is left of the anomalies, and every entry is equally large."""
+    n, draws = 5, 20_000
+    turn = _turned(np.broadcast_to(np.eye(n), (draws, n, n)), np.random.default_rng(1))
     assert np.allclose(turn.mean(axis=0), 1 / n, atol=5 * 0.5 / np.sqrt(draws))
-    # Each centred unit direction goes to every centred direction equally: trace has variance 1.
-    assert abs(np.trace(turn, axis1=-2, axis2=-1).var() - 1.0) < 0.1
+    assert np.allclose((turn - 1 / n).var(axis=0), (n - 1) / n**2, atol=0.03)
 
 
 def test_noisy_observations_leave_the_forecast() -> None:
