@@ -37,7 +37,7 @@ def augmented(update: Update, constraint: Constraint, *, std: float) -> Update:
     --------
     >>> from distfilt.coupling import norm
     >>> from distfilt.updates import square_root
-    >>> x = np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
+    >>> x = 1.3 * np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
     >>> knows = augmented(square_root, norm([0, 1]), std=0.01)
     >>> after = knows(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
     >>> bool(abs((after**2).sum(axis=1) - 1).mean() < abs((x**2).sum(axis=1) - 1).mean() / 5)
@@ -80,7 +80,7 @@ def projected(
     --------
     >>> from distfilt.coupling import norm
     >>> from distfilt.updates import square_root
-    >>> x = np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
+    >>> x = 1.3 * np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
     >>> on = projected(square_root, norm([0, 1]))
     >>> after = on(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
     >>> bool(abs((after**2).sum(axis=1).mean() - 1) < 0.01)
@@ -125,7 +125,7 @@ def retracted(
     --------
     >>> from distfilt.coupling import norm
     >>> from distfilt.updates import square_root
-    >>> x = np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
+    >>> x = 1.3 * np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
     >>> on = retracted(square_root, norm([0, 1]))
     >>> after = on(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
     >>> bool(abs((after**2).sum(axis=1) - 1).max() < 1e-14)
@@ -161,7 +161,7 @@ def clipped(update: Update, constraint: Constraint) -> Update:
     --------
     >>> from distfilt.coupling import norm
     >>> from distfilt.updates import square_root
-    >>> x = np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
+    >>> x = 1.3 * np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
     >>> within = clipped(square_root, norm([0, 1]))
     >>> after = within(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
     >>> bool((after**2).sum(axis=1).max() <= 1 + 1e-14)
