@@ -12,10 +12,10 @@ A2013-A2024. The mean of the new members is the weighted mean, exactly.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import logsumexp
 
 from ..checks import Array, array, callable_, choice, generator, number
 from .solvers import SOLVERS, Solve, _scaled, _solver, _squares
@@ -30,6 +30,10 @@ __all__ = [
 ]
 
 
+_TIE = 1e-7
+"""In units of the largest cost. The weighted mean stays exact, the plan costs at most this more."""
+
+
 def _weights(log_weights: ArrayLike, shape: tuple[int, ...]) -> Array:
     """Weights (..., N) that sum to one, from logarithms of any size; -inf is a weight of zero."""
     w = array(log_weights, "log_weights", shape, finite=False)
@@ -41,7 +45,7 @@ def _weights(log_weights: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 
 def _normalised(log_weights: Array) -> Array:
-    w = np.exp(log_weights - logsumexp(log_weights, axis=-1, keepdims=True))
+    w = np.exp(log_weights - log_weights.max(axis=-1, keepdims=True))
     return np.asarray(w / w.sum(axis=-1, keepdims=True))
 
 
@@ -58,10 +62,24 @@ def _plans(x: Array, w: Array, solve: Solve) -> Array:
     equal = np.full(n, 1 / n)
     out = np.empty((*x.shape[:-1], n))
     rows = zip(x.reshape(-1, n, d), w.reshape(-1, n), out.reshape(-1, n, n), strict=True)
+    ties = _ties(n)
     for points, masses, target in rows:
         cost, _, _ = _scaled(_squares(points, points))
-        target[...], _ = solve(cost, masses, equal)
+        target[...], _ = solve(cost + ties, masses, equal)
     return out
+
+
+@lru_cache(maxsize=8)
+def _ties(n: int) -> Array:
+    """A fixed matrix between 0 and 1e-7, added to costs of range one.
+
+    Where members coincide, as copies do after one weight has dominated, the cheapest coupling is
+    not unique and the last bit of a cost decides between quite different ensembles. This decides
+    instead, on every machine alike.
+    """
+    fixed = _TIE * np.random.default_rng(0).random((n, n))
+    fixed.setflags(write=False)
+    return fixed
 
 
 def plans(
@@ -85,7 +103,9 @@ def plans(
     Returns
     -------
     ndarray, (..., N, N)
-        Row i is where the mass of member i goes; the cost is the squared distance.
+        Row i is where the mass of member i goes; the cost is the squared distance. Where it leaves
+        a choice, as between copies of a member, a fixed addition of at most 1e-7 of the largest
+        cost decides.
 
     Examples
     --------
@@ -412,6 +432,6 @@ def transform_along(
     costs = (v * v).sum(axis=-1)
     steps = np.empty((*x.shape[:-1], v.shape[-1]))
     for row in np.ndindex(x.shape[:-2]):
-        matrix, _ = solve(_scaled(costs[row])[0], w[row], equal)
+        matrix, _ = solve(_scaled(costs[row])[0] + _ties(n), w[row], equal)
         steps[row] = n * np.einsum("ij,ijk->jk", matrix, v[row])
     return array(retract(x.copy(), steps), "retract", x.shape)

@@ -154,6 +154,17 @@ def test_the_result_scales_with_the_members(scale: float) -> None:
     assert np.abs(shifted - reference).max() < 1e-12
 
 
+def test_copies_do_not_leave_the_choice_to_rounding() -> None:
+    """Ten copies of one member, then a move by rounding: without a rule for ties all differs."""
+    x, logs, _ = _case(21)
+    x[:10] = x[0]
+    x[20:25] = x[20]
+    reference = ensemble_transform(x, logs)
+    for seed in range(10):
+        nudged = x * (1 + 1e-15 * _rng(seed).standard_normal(x.shape))
+        assert np.abs(ensemble_transform(nudged, logs) - reference).max() < 1e-9
+
+
 def test_equal_weights_move_nobody() -> None:
     x, _, _ = _case(4)
     assert np.abs(ensemble_transform(x, np.zeros(40)) - x).max() < 1e-13
