@@ -157,6 +157,12 @@ def particle_bound(readings, members, see, noise, rng):
     return np.array(out)
 
 
+def score(members: np.ndarray, truth: np.ndarray) -> float:
+    """CRPS of one component, mean over time; of at most 200 members or a few more."""
+    some = members[:, :: max(1, members.shape[1] // 200)]
+    return float(np.mean([crps(m, t) for m, t in zip(some, truth, strict=True)]))
+
+
 def scores(name, members, truth) -> dict[str, float]:
     """Of one filter's members, in the chart (T, N, 2) or Cartesian (T, N, 4)."""
     aim = place(truth)[LATE]
@@ -180,7 +186,7 @@ def scores(name, members, truth) -> dict[str, float]:
         "velocity": np.sqrt((gap[:, 2:] ** 2).sum(axis=1).mean()),
         "honest": np.sqrt((spread[:, 0] ** 2).mean()) / angle,
         "nees": float(np.mean((off[:, 0] / np.maximum(spread[:, 0], 1e-12)) ** 2)),
-        "crps": float(np.mean([crps(m[:: max(1, len(m) // 200), :1], t[:1]) for m, t in zip(q, truth[LATE])])),
+        "crps": score(q[..., :1], truth[LATE, :1]),
     }
     return {f"{name}_{key}": float(value) for key, value in found.items()}
 
@@ -214,10 +220,7 @@ def mirror(rng: np.random.Generator) -> dict[str, float]:
     found["bound"] = particle_bound(readings, first, see, noise, rng)
     x = place(truth)[LATE, :1]
     return {
-        f"{name}_crps": float(
-            np.mean([crps(m[:: max(1, len(m) // 200)], t) for m, t in zip(place(q[LATE])[..., :1], x)])
-        )
-        for name, q in found.items()
+        f"{name}_crps": score(place(q[LATE])[..., :1], x) for name, q in found.items()
     }
 
 
@@ -241,6 +244,6 @@ columns = (
     *(f"{c}_{f}_{s}" for c in ("still", "noisy") for f in FILTERS for s in SCORES),
     *(f"mirror_{f}_crps" for f in (*MIRRORED, "bound")),
 )
-code = (data, ensembles, extended, paths, grid_bound, particle_bound, scores, case, mirror)
+code = (data, ensembles, extended, paths, grid_bound, particle_bound, score, scores, case, mirror)
 seeds = np.random.SeedSequence(4096).spawn(RUNS)
 rtol = 1e-3
