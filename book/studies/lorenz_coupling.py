@@ -13,8 +13,14 @@ import numpy as np
 
 from distfilt.metrics import crps
 from distfilt.models import lorenz63, simulate
-from distfilt.updates import ensemble_transform, inflated, jitter, known_noise, resampled
-from distfilt.updates import square_root
+from distfilt.updates import (
+    ensemble_transform,
+    inflated,
+    jitter,
+    known_noise,
+    resampled,
+    square_root,
+)
 from distfilt.updates.door import unchecked
 
 NAME = "lorenz-coupling"

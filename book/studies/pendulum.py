@@ -4,6 +4,7 @@ A trial is one run: a true swing, its readings and one first ensemble for all al
 reports a projection of OTF's members and goes on without it, so it needs no run of its own.
 """
 
+# ruff: noqa: SIM300
 from __future__ import annotations
 
 import numpy as np

@@ -1,4 +1,4 @@
-"""How well can the pendulum be known? Filters in Cartesian coordinates and in the chart, and a bound.
+"""How well can the pendulum be known? Cartesian filters, filters in the chart, and a bound.
 
 Three cases. ``still`` has no process noise, as in the paper; ``noisy`` has some; in ``mirror`` the
 sensor sees only \\|x\\|, so that the posterior has two modes for ever. All ensembles start on the
@@ -6,6 +6,7 @@ manifold. The bound of ``still`` is a grid of initial conditions, that of the ot
 the chart.
 """
 
+# ruff: noqa: SIM300
 from __future__ import annotations
 
 from functools import cache, partial
@@ -16,8 +17,15 @@ from distfilt.coupling import norm, retract
 from distfilt.metrics import crps
 from distfilt.models import pendulum, pendulum_angle, pendulum_chart, pendulum_states
 from distfilt.published import scenario
-from distfilt.updates import augmented, ensemble_transform, projected, resampled, retracted
-from distfilt.updates import known_noise, square_root
+from distfilt.updates import (
+    augmented,
+    ensemble_transform,
+    known_noise,
+    projected,
+    resampled,
+    retracted,
+    square_root,
+)
 from distfilt.updates.door import unchecked
 
 NAME = "pendulum-bound"

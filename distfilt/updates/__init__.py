@@ -1,7 +1,7 @@
 """Updates: what an ensemble makes of an observation, ``(ensemble, predicted, observed, noise)``."""
 
 from .constrained import augmented, clipped, projected, retracted
-from .coupling import ensemble_transform
+from .coupling import ensemble_transform, transform_by_agreement
 from .door import update
 from .forecasts import exact_forecast, sampled_forecast
 from .gaussian import exact_draws, known_noise, sampled_noise, square_root
@@ -40,6 +40,7 @@ __all__ = [
     "sampled_noise",
     "serial",
     "square_root",
+    "transform_by_agreement",
     "transport",
     "transport_sample",
     "update",

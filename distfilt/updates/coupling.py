@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ..checks import Array, callable_, choice, flags, number
+from ..checks import Array, array, callable_, choice, count, flags, instance, number
 from ..coupling import SOLVERS
 from ..coupling.solvers import _solver
 from ..coupling.transform import _normalised, _rejuvenated, _transform
+from ..network import Channel
+from ..network.consensus import average, finite_time
 from .door import update
 
-__all__ = ["ensemble_transform"]
+__all__ = ["ensemble_transform", "transform_by_agreement"]
 
 
 @update
@@ -92,3 +95,64 @@ def log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
     gap = np.swapaxes(observed[..., None, :] - predicted, -1, -2)
     white = np.linalg.solve(np.linalg.cholesky(noise), gap)
     return np.asarray(-0.5 * (white * white).sum(axis=-2))
+
+
+def transform_by_agreement(
+    ensembles: ArrayLike,
+    log_likelihoods: ArrayLike,
+    channel: Channel,
+    *,
+    rounds: int | None = None,
+    solver: str = "network",
+    correct: bool = False,
+) -> Array:
+    r"""Agents with one particle set in common agree on its weights, then each transports alone.
+
+    The likelihood of independent readings is a product, so the log-likelihood of all is A times
+    the average of the agents' own, and averaging is what a network can do. Agents whose sums agree
+    to the last digits compute the same transform and keep the particle set in common.
+
+    Parameters
+    ----------
+    ensembles : array_like, (*runs, A, N, d)
+        Every agent's copy of the set. Without process noise, or with noise drawn from a seed that
+        all know, the copies stay equal.
+    log_likelihoods : array_like, (*runs, A, N)
+        What each agent's own reading says of each member; zeros for an agent that saw nothing.
+    channel : Channel
+        The door between agents: N scalars a link and round.
+    rounds : int, optional
+        Rounds of Metropolis averaging; exact finite-time averaging by default, which needs a
+        connected graph, links both ways and no faults.
+    solver, correct
+        As for :func:`ensemble_transform`.
+
+    Returns
+    -------
+    ndarray, (*runs, A, N, d)
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit the channel, or it does not allow the agreement.
+
+    Examples
+    --------
+    >>> from distfilt.network import graphs
+    >>> x = np.broadcast_to([[0.0], [1.0], [2.0]], (2, 3, 1))
+    >>> seen = np.array([[0.0, -1.0, -4.0], [0.0, -0.5, -1.0]])
+    >>> channel = Channel(graphs.path(2))
+    >>> after = transform_by_agreement(x, seen, channel)
+    >>> bool((after[0] == after[1]).all()), channel.ledger.rounds
+    (True, 1)
+    """
+    door = instance(channel, "channel", Channel)
+    agents = door.graph.size
+    x = array(ensembles, "ensembles", (*door.runs, agents, "N", "d"))
+    logs = array(log_likelihoods, "log_likelihoods", x.shape[:-1])
+    solve = _solver(choice(solver, "solver", SOLVERS), 0.01)
+    if rounds is None:
+        shared = finite_time(logs, door)
+    else:
+        shared = average(logs, door, rounds=count(rounds, "rounds"))
+    return _transform(x, _normalised(agents * shared), solve, correct=bool(correct))
