@@ -73,8 +73,8 @@ def run(readings: np.ndarray, members: np.ndarray, names=tuple(UPDATES), updates
                 except (ValueError, RuntimeError, ArithmeticError):
                     alive[f] = False
                 if not alive[f]:
-                    x[f] = np.nan
-            out[k] = x
+                    x[f] = members  # something finite for the model; not recorded
+            out[k] = np.where(alive[:, None, None], x, np.nan)
     return out
 
 
@@ -124,7 +124,9 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     truth, readings, members = data(np.random.default_rng(seed))
     found = dict(zip(UPDATES, np.moveaxis(run(readings, members), 1, 0), strict=True))
     with np.errstate(all="ignore"):
-        found["OTProj"] = project(found["OTF"], rod, **how)
+        whole = np.isfinite(found["OTF"]).all(axis=(1, 2))
+        found["OTProj"] = found["OTF"].copy()
+        found["OTProj"][whole] = project(found["OTF"][whole], rod, **how)
         return {k: v for name in ALGORITHMS for k, v in scores(name, found[name], truth).items()}
 
 
