@@ -90,6 +90,7 @@ def scores(name: str, members: np.ndarray, truth: np.ndarray) -> dict[str, float
     """Of one filter's members (T, N, 4): errors, spreads, divergence, and the traced error."""
     mean = estimates(members, name)
     missed = np.abs(np.hypot(mean[:, 0], mean[:, 1]) - setting["length"])
+    missed = np.where(missed < 1e-14, 0.0, missed)  # rounding is no number to store
     gap = mean - truth
     late = TIMES > setting["score_from"] + 1e-9
     spread = np.sqrt(members[late].var(axis=1, ddof=1).mean(axis=0))
