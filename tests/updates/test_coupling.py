@@ -148,7 +148,7 @@ def _run(rounds: int | None, steps: int = 100, agents: int = 4) -> tuple[np.ndar
     return np.array(worst), channel
 
 
-@pytest.mark.parametrize(("rounds", "bound"), [(20, 1e-6), (30, 1e-10), (None, 1e-11)])
+@pytest.mark.parametrize(("rounds", "bound"), [(20, 1e-7), (30, 1e-11), (None, 1e-12)])
 def test_agents_stay_with_the_centralised_filter(rounds: int | None, bound: float) -> None:
     worst, _ = _run(rounds)
     assert worst < bound
