@@ -216,7 +216,7 @@ def _probabilities(loss: float | ArrayLike) -> float | Array:
 def _check_burst(burst: float, loss: Array) -> None:
     rates = loss[(loss > 0) & (loss < 1)]
     shortest = 1 / (1 - rates.max(initial=0.0))
-    if burst < shortest * (1 - 1e-12):
+    if burst < shortest * (1 - 1e-9):
         raise ValueError(
             f"burst: needs at least 1 / (1 - loss) = {shortest:g} rounds, which independent losses "
             f"last, got {burst:g}"

@@ -13,30 +13,27 @@ from typing import Any
 import numpy as np
 from _bench import timed, write
 
-from distfilt import ensembles
 from distfilt.filters import EnsembleFilter
-from distfilt.filters.agreement import intersection_agreement
-from distfilt.models.satellite import clohessy_wiltshire
-from distfilt.network import graphs
-from distfilt.network.consensus import mean_pull
+from distfilt.models import clohessy_wiltshire
+from distfilt.network import graphs, intersection, pull
 from distfilt.sensors import direct
-from distfilt.triangular.conditioning import affine_update
-from distfilt.triangular.regularised import known_noise_update
+from distfilt.updates import known_noise, transport
 
 AGENTS, RUNS, MEMBERS, LIMIT = (4, 8, 16, 32, 64), 10, 200, 1.3
 FILTERS: dict[str, tuple[Any, Any]] = {
-    "affine map, mean pull": (affine_update, partial(mean_pull, gain=0.05)),
-    "known noise, intersection": (known_noise_update, intersection_agreement),
+    "affine map, pull": (transport, partial(pull, gain=0.05)),
+    "known noise, intersection": (known_noise, partial(intersection, rule="equal")),
 }
 
 
-def step_ms(agents: int, update: Any, consensus: Any) -> float:
+def step_ms(agents: int, update: Any, agreement: Any) -> float:
     """Milliseconds of one step of a batch of runs."""
-    sensors = [direct([k % 6], noise=0.2) for k in range(agents)]
+    sensors = [direct([k % 6], std=0.2) for k in range(agents)]
     model = clohessy_wiltshire(rate=0.1, sigma=0.2)
-    f = EnsembleFilter(model, sensors, graphs.path(agents), update, consensus, members=MEMBERS)
-    prior = partial(ensembles.draw, np.zeros(6), 25 * np.eye(6))
-    state = f.start(prior, rng=np.random.default_rng(1), runs=(RUNS,))
+    f = EnsembleFilter(
+        model, sensors, graphs.path(agents), update=update, agreement=agreement, members=MEMBERS
+    )
+    state = f.start((np.zeros(6), 25 * np.eye(6)), rng=np.random.default_rng(1), runs=(RUNS,))
     seen = [np.zeros(1)] * agents
     return 1e3 * timed(lambda: f.step(state, 0.1, seen), 5).cpu
 
@@ -44,8 +41,8 @@ def step_ms(agents: int, update: Any, consensus: Any) -> float:
 def main() -> int:
     """Measure, write the table, and count slopes above the limit."""
     rows, missed = [], 0
-    for name, (update, consensus) in FILTERS.items():
-        spent = [step_ms(a, update, consensus) for a in AGENTS]
+    for name, (update, agreement) in FILTERS.items():
+        spent = [step_ms(a, update, agreement) for a in AGENTS]
         slope = np.polyfit(np.log(AGENTS), np.log(spent), 1)[0]
         missed += slope > LIMIT
         rows += [

@@ -18,8 +18,7 @@ import numpy as np
 from _bench import timed, write
 
 from distfilt.kalman import filterpy_kf, kalman_filter
-from distfilt.models import simulate
-from distfilt.models.satellite import clohessy_wiltshire
+from distfilt.models import clohessy_wiltshire, simulate
 from distfilt.sensors import direct, stack
 
 RUNS, STEPS, DT = 500, 200, 0.1
@@ -31,14 +30,14 @@ def case(rng: np.random.Generator) -> tuple[tuple[np.ndarray, ...], dict[str, np
     model = clohessy_wiltshire(rate=0.1, sigma=0.2)
     x0 = np.array([100.0, 0.0, 0.0, 10.0, 0.1, 0.0])
     sensor = stack(
-        [direct([0, 1], noise=0.2), direct([1, 2], noise=0.2), direct([3, 4, 5], noise=0.1)]
+        [direct([0, 1], std=0.2), direct([1, 2], std=0.2), direct([3, 4, 5], std=0.1)]
     )
     truth = simulate(model, np.tile(x0, (RUNS, 1)), DT * np.arange(1, STEPS + 1), rng=rng)
     matrices = {
         "F": model.transition(DT),
         "H": sensor.matrix(6),
         "Q": model.noise(0.0, DT),
-        "R": sensor.noise,
+        "R": sensor.cov,
     }
     return (x0 + 3.0, 25.0 * np.eye(6), sensor.observe(truth, rng=rng)), matrices
 

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from _bench import timed, write
 
-from distfilt.triangular import affine, separable
-from distfilt.triangular.conditioning import compose
+from distfilt.triangular import affine, compose, separable
 
 BASE_MEMBERS, BASE_DIM = 400, 6
 MEMBERS, DIMS = (400, 800, 1600, 3200), (4, 8, 16, 32)

@@ -11,8 +11,8 @@ import sys
 import numpy as np
 from _bench import timed, write
 
+from distfilt.triangular import compose
 from distfilt.triangular.affine import fit, fit_convex
-from distfilt.triangular.conditioning import compose
 
 SIZES = ((1, 6, 300), (3, 13, 800), (10, 40, 2000))
 """Observations m, state d, and the ratio that ECOS has to lose by."""

@@ -128,6 +128,18 @@ def test_bursts_have_their_rate_and_their_length(loss: float, burst: float) -> N
     assert _within((~third & second & first).sum(), int((second & first).sum()), 1 / burst)
 
 
+def test_each_round_of_a_burst_follows_from_the_one_before() -> None:
+    """The numbers drawn are those of independent losses: below p lost, below p + q as before."""
+    loss, burst = 0.2, 8.0
+    stay = 1 - 1 / (burst * (1 - loss))
+    enter = loss * (1 - stay)
+    lost = _series(Faults(loss=loss, burst=burst, seed=6), DISK, 12, 5)
+    surely = _series(Faults(loss=enter, seed=6), DISK, 12, 5)
+    maybe = _series(Faults(loss=enter + stay, seed=6), DISK, 12, 5)
+    assert (lost[1:] == (surely[1:] | (maybe[1:] & lost[:-1]))).all()
+    assert (lost[0] >= surely[0]).all() and (lost[0] <= maybe[0]).all() and lost[0].any()
+
+
 def test_a_burst_of_the_shortest_length_is_independence() -> None:
     plain, shortest = Faults(loss=0.3, seed=4), Faults(loss=0.3, seed=4, burst=1 / 0.7)
     for k in range(5):
@@ -144,7 +156,10 @@ def test_bursts_do_not_depend_on_what_was_computed_before() -> None:
 
 @given(st.integers(0, 1000), st.floats(0, 1), st.floats(1, 50))
 def test_bursts_of_any_rate_end(seed: int, loss: float, burst: float) -> None:
-    if loss < 1 and burst < (1 - 1e-9) / (1 - loss):
+    shortest = 1 / (1 - loss) if 0 < loss < 1 else 1.0
+    if shortest * (1 - 1e-8) < burst < shortest:
+        burst = shortest
+    if burst < shortest:
         with pytest.raises(ValueError, match="burst"):
             Faults(loss=loss, burst=burst)
         return

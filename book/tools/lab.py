@@ -1,0 +1,263 @@
+"""Open JupyterLab on a working copy of the book; what is saved there is not the repository's.
+
+    python book/tools/lab.py FOLDER [--no-open]
+
+The copy has the chapters as notebooks only, so that each is one name, with their stored outputs
+trusted; the pages around them; the scripts; and the data, which the chapters read and a reader may
+edit. Citations, numbers of equations and figures, and references to other chapters are written out,
+since JupyterLab knows only one page at a time. A copy that is there already is opened as it is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import nbformat
+from nbformat.sign import NotebookNotary
+from pybtex.database import BibliographyData, parse_file
+from pybtex.plugin import find_plugin
+
+from common import BOOK, ROOT, is_chapter, toc_pages
+from pages import chapter_number, reproductions_text
+
+ROLE = re.compile(r"\{(cite:p|cite:t|cite|eq|numref|ref|doc|prf:ref)\}`([^`]+)`")
+MATH = re.compile(r"^(?P<fence>`{3,})\{math\}\n(?P<body>.*?)^(?P=fence)$", re.M | re.S)
+DOLLARS = re.compile(r"\$\$(?P<body>[^$]+?)\$\$ *\((?P<label>[\w-]+)\)", re.S)
+OPTION = re.compile(r"^:(\w+): *(.*)\n", re.M)
+TITLE = re.compile(r"^# +(.+)$", re.M)
+ANCHOR = re.compile(r"^\(([\w-]+)\)=\s*\n+#+ +(.+)$", re.M)
+SOLUTION = re.compile(r"^(`{3,}|:{3,})\{solution-(start|end)\}[^\n]*\n.*?^\1$\n?", re.M | re.S)
+INCLUDE = re.compile(r"^```\{include\} _generated/reproductions\.md\n```$", re.M)
+HELP = """# API reference
+
+The reference is a page of the built book (`make book`). In a notebook `help(name)` or `name?` shows
+the same text: what a function takes, in which shapes and units, what it raises, and an example.
+`book/examples` has a filter of your own in thirty lines.
+"""
+HIDDEN = {"hide-input", "remove-input", "remove-cell", "hide-cell"}
+
+
+@dataclass
+class Names:
+    """What every page's labels are called in words: ``(4.2)``, ``Fig. 4.1``, a section's title."""
+
+    words: dict[str, str] = field(default_factory=dict)
+    homes: dict[str, str] = field(default_factory=dict)
+    equations: dict[str, str] = field(default_factory=dict)
+    figures: dict[str, str] = field(default_factory=dict)
+
+    def add(self, label: str, words: str, home: str) -> None:
+        self.words[label], self.homes[label] = words, home
+
+
+def labels_of(text: str) -> Iterator[str]:
+    """Yield the labels of a text's equations, in order."""
+    found = [(m.start(), dict(OPTION.findall(m["body"])).get("label")) for m in MATH.finditer(text)]
+    found += [(m.start(), m["label"]) for m in DOLLARS.finditer(text)]
+    return (label for _, label in sorted(found) if label)
+
+
+def texts_of(source: Path) -> list[tuple[str, Any]]:
+    """Return a page's texts in order, each with the header of the cell that draws a figure."""
+    if not is_chapter(source):
+        return [(source.read_text(encoding="utf-8"), None)]
+    cells = nbformat.read(source.with_suffix(".ipynb"), as_version=4).cells
+    return [
+        (cell.source if cell.cell_type == "markdown" else "",
+         cell.metadata.get("mystnb", {}).get("figure"))
+        for cell in cells
+    ]  # fmt: skip
+
+
+def names(sources: list[Path]) -> Names:
+    """Return what all labels of the book are called."""
+    out = Names()
+    for source in sources:
+        number = chapter_number(f"book/{source.stem}")
+        head = "" if number is None else f"{number}."
+        equations = figures = 0
+        for text, figure in texts_of(source):
+            if title := TITLE.search(text):
+                chapter = title[1] if number is None else f"Chapter {number}, {title[1]}"
+                out.add(source.stem, chapter, source.stem)
+            for label in labels_of(text):
+                equations += 1
+                out.equations[label] = f"{head}{equations}"
+                out.add(label, f"({head}{equations})", source.stem)
+            for label, section in ANCHOR.findall(text):
+                out.add(label, section, source.stem)
+            if figure:
+                figures += 1
+                name = str(figure.get("name", f"{source.stem}-{figures}"))
+                out.figures[name] = f"Fig. {head}{figures}"
+                out.add(name, f"Fig. {head}{figures}", source.stem)
+    return out
+
+
+def cited(key: str, references: BibliographyData) -> tuple[str, str]:
+    """Return an entry's authors, as a text names them, and its year."""
+    entry = references.entries[key]
+    people = entry.persons.get("author") or entry.persons.get("editor") or []
+    last = [" ".join([*p.prelast_names, *p.last_names]).strip("{}") for p in people]
+    shown = f"{last[0]} et al." if len(last) > 2 else " and ".join(last) or key
+    return shown, str(entry.fields.get("year", "n.d."))
+
+
+def written_out(role: str, target: str, page: str, known: Names, refs: BibliographyData) -> str:
+    """Return the words that a role stands for."""
+    if role.startswith("cite"):
+        entries = [cited(key.strip(), refs) for key in target.split(",")]
+        if role == "cite:t":
+            return "; ".join(f"[{who} ({year})](bibliography.md)" for who, year in entries)
+        return "([" + "; ".join(f"{who}, {year}" for who, year in entries) + "](bibliography.md))"
+    shown, _, inner = target.rpartition("<")
+    label = inner.rstrip(">").strip() if shown else target
+    label = label.removeprefix("/").removeprefix("book/").removesuffix(".md")
+    words = shown.strip() or known.words.get(label, label)
+    home = known.homes.get(label, page)
+    return words if home == page else f"[{words}]({file_of(home)})"
+
+
+def file_of(stem: str) -> str:
+    """Return the name of a page's file in the copy."""
+    return f"{stem}.ipynb" if is_chapter(BOOK / f"{stem}.md") else f"{stem}.md"
+
+
+def plain(text: str, page: str, known: Names, references: BibliographyData) -> str:
+    """Return a page's text as JupyterLab reads it: numbers, names and authors written out."""
+
+    def equation(found: re.Match[str]) -> str:
+        options = dict(OPTION.findall(found["body"]))
+        number = known.equations.get(options.get("label", ""))
+        body = OPTION.sub("", found["body"]).strip()
+        return f"$$\n{body}\n" + (f"\\tag{{{number}}}\n$$" if number else "$$")
+
+    def dollars(found: re.Match[str]) -> str:
+        return f"$${found['body']}\\tag{{{known.equations[found['label']]}}}$$"
+
+    text = MATH.sub(equation, DOLLARS.sub(dollars, text))
+    text = SOLUTION.sub(lambda m: "**Solution**\n" if m[2] == "start" else "", text)
+    text = INCLUDE.sub(lambda m: reproductions_text(), text)
+    text = re.sub(r"\]\((?:/book/)?(\d\d-[\w-]+)\.md", r"](\1.ipynb", text)
+    return ROLE.sub(lambda m: written_out(m[1], m[2], page, known, references), text)
+
+
+def notebook(source: Path, known: Names, references: BibliographyData) -> Any:
+    """Return a chapter as a notebook of its own, which no save writes to a second file."""
+    stored = nbformat.read(source.with_suffix(".ipynb"), as_version=4)
+    stored.metadata.pop("jupytext", None)
+    cells, figures = [], 0
+    for cell in stored.cells:
+        cells.append(cell)
+        if cell.cell_type == "markdown":
+            cell.source = plain(cell.source, source.stem, known, references)
+            continue
+        if HIDDEN & set(cell.metadata.get("tags", [])):
+            cell.metadata["jupyter"] = {"source_hidden": True}
+        figure = cell.metadata.get("mystnb", {}).get("figure")
+        if figure:
+            figures += 1
+            name = known.figures[str(figure.get("name", f"{source.stem}-{figures}"))]
+            caption = plain(str(figure.get("caption", "")), source.stem, known, references)
+            below = nbformat.v4.new_markdown_cell(f"**{name}** {caption}", id=f"{cell.id}-caption")
+            cells.append(below)
+    stored.cells = cells
+    return stored
+
+
+def bibliography(references: BibliographyData) -> str:
+    """Return the list of references as Markdown."""
+    style = find_plugin("pybtex.style.formatting", "plain")()
+    backend = find_plugin("pybtex.backends", "markdown")()
+    entries = sorted(references.entries.values(), key=lambda e: cited(e.key, references))
+    lines = [entry.text.render(backend) for entry in style.format_entries(entries)]
+    return "# Bibliography\n\n" + "\n".join(f"- {line}" for line in lines) + "\n"
+
+
+def copy(folder: Path) -> list[Path]:
+    """Write the working copy; return its notebooks."""
+    pages = [ROOT / f"{page}.md" for page in toc_pages() if (ROOT / f"{page}.md").is_file()]
+    references = parse_file(str(BOOK / "refs.bib"), bib_format="bibtex")
+    known, book, out = names(pages), folder / "book", []
+    book.mkdir(parents=True)
+    for source in pages:
+        if is_chapter(source):
+            target = book / f"{source.stem}.ipynb"
+            nbformat.write(notebook(source, known, references), target)
+            out.append(target)
+        elif source.stem == "bibliography":
+            (book / source.name).write_text(bibliography(references), encoding="utf-8")
+        elif source.stem == "api":
+            (book / source.name).write_text(HELP, encoding="utf-8")
+        else:
+            text = plain(source.read_text(encoding="utf-8"), source.stem, known, references)
+            (book / source.name).write_text(text, encoding="utf-8")
+    left_out = shutil.ignore_patterns("__pycache__", ".*")
+    for name in ("examples", "studies"):
+        shutil.copytree(BOOK / name, book / name, ignore=left_out)
+    shutil.copytree(ROOT / "data", folder / "data", ignore=left_out)
+    return out
+
+
+def settings(folder: Path) -> dict[str, str]:
+    """Return the environment in which JupyterLab keeps everything of its own in the copy."""
+    home = folder / ".jupyter"
+    viewers = home / "lab" / "user-settings" / "@jupyterlab" / "docmanager-extension"
+    viewers.mkdir(parents=True, exist_ok=True)
+    chosen = {"defaultViewers": {"markdown": "Markdown Preview"}}
+    (viewers / "plugin.jupyterlab-settings").write_text(json.dumps(chosen), encoding="utf-8")
+    return {
+        **os.environ,
+        "JUPYTER_CONFIG_DIR": str(home / "config"),
+        "JUPYTER_DATA_DIR": str(home / "data"),
+        "JUPYTERLAB_SETTINGS_DIR": str(home / "lab" / "user-settings"),
+        "JUPYTERLAB_WORKSPACES_DIR": str(home / "lab" / "workspaces"),
+        "JUPYTER_PREFER_ENV_PATH": "1",
+    }
+
+
+def trust(notebooks: list[Path], environment: dict[str, str]) -> None:
+    """Sign the notebooks, so that their pictures move before a cell is run."""
+    data = Path(environment["JUPYTER_DATA_DIR"])
+    data.mkdir(parents=True, exist_ok=True)
+    notary = NotebookNotary(data_dir=str(data))
+    for path in notebooks:
+        notary.sign(nbformat.read(path, as_version=4))
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description="JupyterLab on a working copy of the book.")
+    parser.add_argument("folder", type=Path, help="where the copy is, or is made")
+    parser.add_argument("--no-open", action="store_true", help="make the copy only")
+    options = parser.parse_args(arguments)
+    folder = options.folder.resolve()
+    if folder in (ROOT, *ROOT.parents) or folder.is_relative_to(BOOK):
+        parser.error(f"{options.folder}: would be written over the repository")
+    environment = settings(folder) if (folder / "book").is_dir() else {}
+    if environment:
+        print(f"The working copy of before: {folder}\nFor a fresh one: make lab LAB=another/folder")
+    elif folder.is_dir() and any(folder.iterdir()):
+        parser.error(f"{options.folder}: is not empty and holds no working copy")
+    else:
+        notebooks = copy(folder)
+        environment = settings(folder)
+        trust(notebooks, environment)
+        print(f"A working copy: {folder}")
+    if options.no_open:
+        return 0
+    command = [sys.executable, "-m", "jupyterlab", f"--notebook-dir={folder / 'book'}"]
+    return subprocess.call(command, env=environment)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,197 @@
+"""The working copy of `make lab`: readable in JupyterLab, and apart from the repository."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import nbformat
+import pytest
+from nbformat.sign import NotebookNotary
+
+import lab
+from common import BOOK, ROOT, chapters, toc_pages
+
+BUILT = ROOT / "_build" / "html" / "book"
+
+
+@pytest.fixture(scope="module")
+def copied(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("lab") / "copy"
+    assert lab.main([str(folder), "--no-open"]) == 0
+    return folder
+
+
+def prose(path: Path) -> str:
+    cells = nbformat.read(path, as_version=4).cells
+    return "\n\n".join(cell.source for cell in cells if cell.cell_type == "markdown")
+
+
+def test_every_chapter_is_one_notebook_and_every_page_is_there(copied: Path) -> None:
+    files = {p.name for p in (copied / "book").iterdir() if p.is_file()}
+    assert files == {lab.file_of(Path(page).name) for page in toc_pages()}
+    stems = [name.rpartition(".")[0] for name in files]
+    assert len(stems) == len(set(stems))
+    assert (copied / "data" / "scenarios" / "accepted.csv").is_file()
+    assert (copied / "book" / "examples" / "own_filter.py").is_file()
+
+
+def test_no_role_is_left_and_no_label_is_lost(copied: Path) -> None:
+    for source in chapters():
+        text = prose(copied / "book" / f"{source.stem}.ipynb")
+        assert not lab.ROLE.search(text) and "{math}" not in text
+        assert "solution-" not in text
+        stored = nbformat.read(source.with_suffix(".ipynb"), as_version=4)
+        labels = [x for c in stored.cells if c.cell_type == "markdown" for x in
+                  lab.labels_of(c.source)]  # fmt: skip
+        assert text.count("\\tag{") == len(labels) > 0
+        figures = [c for c in stored.cells if c.metadata.get("mystnb", {}).get("figure")]
+        assert len(re.findall(r"^\*\*Fig\. [\d.]+\*\* ", text, re.M)) == len(figures)
+
+
+def test_numbers_are_those_of_the_built_book() -> None:
+    pages = [ROOT / f"{page}.md" for page in toc_pages()]
+    known, seen = lab.names(pages), 0
+    for source in chapters():
+        html = (BUILT / f"{source.stem}.html").read_text(encoding="utf-8")
+        numbers = dict(
+            re.findall(r'id="equation-([\w-]+)">\s*<span class="eqno">(\([\d.]+\))', html)
+        )
+        for label, number in numbers.items():
+            assert known.words[label] == number
+        seen += len(numbers)
+    assert seen >= len(known.equations) > 20
+
+
+def test_words_for_citations_and_places() -> None:
+    refs = lab.parse_file(str(BOOK / "refs.bib"), bib_format="bibtex")
+    known = lab.Names()
+    known.add("04-satellite-network", "Chapter 4, Satellites", "04-satellite-network")
+    known.add("eq-sat-step", "(4.1)", "04-satellite-network")
+    known.equations["eq-sat-step"] = "4.1"
+    text = (
+        "{cite:t}`clohessy1960terminal` and {cite:p}`evensen2003ensemble,vanloan1978computing`, "
+        "{eq}`eq-sat-step`, {ref}`the step <eq-sat-step>`, {doc}`04-satellite-network`.\n\n"
+        "```{math}\n:label: eq-sat-step\nx = 1\n```\n\n```{math}\ny = 2\n```\n"
+        "[one](01-bayes-and-kalman.md)"
+    )
+    assert lab.plain(text, "04-satellite-network", known, refs) == (
+        "[Clohessy and Wiltshire (1960)](bibliography.md) and "
+        "([Evensen, 2003; Van Loan, 1978](bibliography.md)), "
+        "(4.1), the step, Chapter 4, Satellites.\n\n"
+        "$$\nx = 1\n\\tag{4.1}\n$$\n\n$$\ny = 2\n$$\n"
+        "[one](01-bayes-and-kalman.ipynb)"
+    )
+    other = lab.plain("{eq}`eq-sat-step`", "notation", known, refs)
+    assert other == "[(4.1)](04-satellite-network.ipynb)"
+
+
+def test_no_save_writes_a_second_file(copied: Path) -> None:
+    for path in (copied / "book").glob("*.ipynb"):
+        notebook = nbformat.read(path, as_version=4)
+        nbformat.validate(notebook)
+        assert "jupytext" not in notebook.metadata
+
+
+def test_stored_outputs_are_trusted_and_code_that_a_page_hides_is_folded(copied: Path) -> None:
+    notary = NotebookNotary(data_dir=str(copied / ".jupyter" / "data"))
+    for path in (copied / "book").glob("*.ipynb"):
+        notebook = nbformat.read(path, as_version=4)
+        assert notary.check_signature(notebook)
+        for cell in notebook.cells:
+            if lab.HIDDEN & set(cell.metadata.get("tags", [])):
+                assert cell.metadata["jupyter"]["source_hidden"]
+
+
+def test_a_copy_is_kept_and_the_repository_is_not_written_to(
+    copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    note = copied / "book" / "mine.txt"
+    note.write_text("mine")
+    assert lab.main([str(copied), "--no-open"]) == 0
+    assert note.read_text() == "mine" and "make lab LAB=" in capsys.readouterr().out
+    note.unlink()
+    full = tmp_path / "full"
+    full.mkdir()
+    (full / "thing").touch()
+    for folder in (ROOT, ROOT.parent, BOOK, BOOK / "new", full):
+        with pytest.raises(SystemExit):
+            lab.main([str(folder), "--no-open"])
+
+
+def wait(what: Any, seconds: int = 240) -> Any:
+    """What is asked for, as soon as it is there."""
+    for _ in range(seconds):
+        try:
+            if found := what():
+                return found
+        except OSError:
+            pass
+        time.sleep(1)
+    raise AssertionError("nothing came")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium and chromedriver")
+def test_in_jupyterlab_a_chapter_runs_and_is_saved_apart(tmp_path: Path) -> None:
+    from .test_browser import FLAGS
+
+    folder = tmp_path / "copy"
+    lab.main([str(folder), "--no-open"])
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"http://127.0.0.1:{free.getsockname()[1]}"
+    command = [sys.executable, "-m", "jupyterlab", f"--notebook-dir={folder / 'book'}"]
+    command += ["--no-browser", "--allow-root", f"--port={address.rsplit(':')[-1]}"]
+    command += ["--IdentityProvider.token=", "--expose-app-in-browser"]
+    before = subprocess.run(["git", "status", "--short"], cwd=ROOT, capture_output=True).stdout
+    server = subprocess.Popen(command, env=lab.settings(folder), stderr=subprocess.DEVNULL)
+    try:
+        wait(lambda: urllib.request.urlopen(f"{address}/api"))
+        _run_all(address, chapters()[0].stem, tmp_path, FLAGS)
+    finally:
+        server.terminate()
+        server.wait()
+    after = subprocess.run(["git", "status", "--short"], cwd=ROOT, capture_output=True).stdout
+    assert before == after
+    assert not (folder / "book" / f"{chapters()[0].stem}.md").exists()
+
+
+def _run_all(address: str, stem: str, scratch: Path, flags: tuple[str, ...]) -> None:
+    """Open a chapter, run all its cells, move its sliders, save it."""
+    from selenium import webdriver
+    from selenium.webdriver.chrome.options import Options
+    from selenium.webdriver.chrome.service import Service
+
+    options = Options()
+    options.binary_location = str(shutil.which("chromium"))
+    for flag in (*flags, f"--user-data-dir={scratch / 'profile'}", "--window-size=1400,1000"):
+        options.add_argument(flag)
+    driver = webdriver.Chrome(options=options, service=Service(shutil.which("chromedriver")))
+    driver.set_script_timeout(600)
+    command = ("const done = arguments[1]; jupyterapp.commands.execute(arguments[0])"
+               ".then(() => done('done'), e => done(String(e)));")  # fmt: skip
+    try:
+        driver.get(f"{address}/lab/tree/{stem}.ipynb")
+        ready = "return !!window.jupyterapp && !!document.querySelector('.jp-Notebook')"
+        wait(lambda: driver.execute_script(ready))
+        assert driver.execute_async_script(command, "notebook:run-all-cells") == "done"
+        errors = "return document.querySelectorAll('[data-mime-type*=error]').length"
+        assert driver.execute_script(errors) == 0
+        moved = driver.execute_script(
+            "return [...document.querySelectorAll('[data-frames]')].map(r => {"
+            "const [i, m] = [r.querySelector('input'), r.querySelector('img')]; const was = m.src;"
+            "i.value = Number(i.value) ? 0 : 1; i.dispatchEvent(new Event('input'));"
+            "return m.src !== was; })"
+        )
+        assert all(moved)
+        assert driver.execute_async_script(command, "docmanager:save") == "done"
+    finally:
+        driver.quit()
