@@ -5,6 +5,14 @@ from .base import LinearModel, Model, simulate
 from .integrators import rk4, rk4_jacobian
 from .lorenz import lorenz63, lorenz63_rate
 from .motion import constant_velocity, coordinated_turn
+from .pendulum import (
+    pendulum,
+    pendulum_angle,
+    pendulum_chart,
+    pendulum_energy,
+    pendulum_rate,
+    pendulum_states,
+)
 from .rotations import (
     cross_matrix,
     left_directions,
@@ -33,6 +41,12 @@ __all__ = [
     "left_directions",
     "lorenz63",
     "lorenz63_rate",
+    "pendulum",
+    "pendulum_angle",
+    "pendulum_chart",
+    "pendulum_energy",
+    "pendulum_rate",
+    "pendulum_states",
     "quaternion_rate",
     "rk4",
     "rk4_jacobian",
