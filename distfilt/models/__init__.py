@@ -18,10 +18,14 @@ from .satellite import (
     clohessy_wiltshire_drift,
     clohessy_wiltshire_transition,
 )
+from .swarm import READINGS, RotatingMixture, Swarm, reflected, rotating_swarm
 
 __all__ = [
+    "READINGS",
     "LinearModel",
     "Model",
+    "RotatingMixture",
+    "Swarm",
     "angular_acceleration",
     "attitude",
     "clohessy_wiltshire",
@@ -34,8 +38,10 @@ __all__ = [
     "lorenz63",
     "lorenz63_rate",
     "quaternion_rate",
+    "reflected",
     "rk4",
     "rk4_jacobian",
+    "rotating_swarm",
     "rotation_matrix",
     "satellite_pose",
     "simulate",

@@ -1,0 +1,46 @@
+"""Densities on grids: kernel estimates, the Fokker-Planck equation, and the filter of both."""
+
+from .fokker_planck import FokkerPlanck, bernoulli
+from .gain import (
+    Dense,
+    LowRank,
+    Shared,
+    dense_step,
+    low_rank_start,
+    low_rank_step,
+    shared_moved,
+    shared_start,
+    shared_step,
+    zero_mean_prior,
+)
+from .grid import Grid
+from .kernel import (
+    adaptive_bandwidths,
+    bandwidth,
+    kernel_covariance,
+    kernel_density,
+    kernel_information,
+    kernels,
+)
+
+__all__ = [
+    "Dense",
+    "FokkerPlanck",
+    "Grid",
+    "LowRank",
+    "Shared",
+    "adaptive_bandwidths",
+    "bandwidth",
+    "bernoulli",
+    "dense_step",
+    "kernel_covariance",
+    "kernel_density",
+    "kernel_information",
+    "kernels",
+    "low_rank_start",
+    "low_rank_step",
+    "shared_moved",
+    "shared_start",
+    "shared_step",
+    "zero_mean_prior",
+]
