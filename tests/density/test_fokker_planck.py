@@ -156,6 +156,7 @@ def test_time_enters_the_drift() -> None:
     assert flow.grid.norm(p - f) / flow.grid.norm(f) < 0.12
 
 
+@pytest.mark.slow
 def test_agents_and_density_agree_in_the_literal_case() -> None:
     """Criterion 4: the histogram of agents against the equation on 120², in cells of 30²."""
     swarm, f, rng = rotating_swarm("literal"), RotatingMixture(), np.random.default_rng(3)
@@ -164,8 +165,8 @@ def test_agents_and_density_agree_in_the_literal_case() -> None:
     x = x[((x > 0) & (x < 1)).all(axis=-1)]
     p = fine.normalised(sum(
         np.exp(-0.5 * ((fine.centres - m) ** 2).sum(axis=-1) / 0.01) for m in f.means(0.0)))
-    times = np.arange(1, 21) * 0.1
-    p = FokkerPlanck(swarm, fine).evolve(p, times, substeps=2)[-1]
+    times = np.arange(1, 41) * 0.1
+    p = FokkerPlanck(swarm, fine).evolve(p, times)[-1]
     h = coarse.histogram(swarm.simulate(x, times, rng=rng)[-1])
     p = fine.aggregated(p, coarse)
     assert coarse.norm(h - p) / coarse.norm(p) < 0.02
