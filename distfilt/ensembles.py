@@ -1,4 +1,7 @@
-"""Ensembles: arrays (..., N, d) whose rows are members, their moments and how to change them."""
+"""Ensembles: arrays (..., N, d) whose rows are members, their moments and how to draw them.
+
+Names with an underscore are the same without checks, for loops of this package.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .checks import Array, array, count, generator
-from .linalg import factor, symmetrise
+from .linalg import _EPS, _cholesky, _cholesky_solve, _leading, _solve_upper, _symmetrise, factor
 
-__all__ = ["anomalies", "cross_covariance", "draw", "mean", "sample_covariance"]
+__all__ = ["anomalies", "cross_covariance", "draw", "exact_noise", "mean", "sample_covariance"]
 
 
 def _ensemble(value: ArrayLike, name: str, members: int = 1) -> Array:
@@ -64,7 +67,10 @@ def mean(ensemble: ArrayLike) -> Array:
     >>> mean([[1.0, 2.0], [3.0, 4.0]])
     array([2., 3.])
     """
-    e = _ensemble(ensemble, "ensemble")
+    return _mean(_ensemble(ensemble, "ensemble"))
+
+
+def _mean(e: Array) -> Array:
     # A product with equal weights: ten times faster than a reduction over a short inner axis.
     return np.asarray(np.full(e.shape[-2], 1 / e.shape[-2]) @ e)
 
@@ -78,8 +84,11 @@ def anomalies(ensemble: ArrayLike) -> Array:
     array([[-1.],
            [ 1.]])
     """
-    e = _ensemble(ensemble, "ensemble")
-    return np.asarray(e - mean(e)[..., None, :])
+    return _anomalies(_ensemble(ensemble, "ensemble"))
+
+
+def _anomalies(e: Array) -> Array:
+    return np.asarray(e - _mean(e)[..., None, :])
 
 
 def sample_covariance(ensemble: ArrayLike) -> Array:
@@ -96,8 +105,12 @@ def sample_covariance(ensemble: ArrayLike) -> Array:
     array([[2., 4.],
            [4., 8.]])
     """
-    a = anomalies(_ensemble(ensemble, "ensemble", 2))
-    return symmetrise(np.swapaxes(a, -1, -2) @ a / (a.shape[-2] - 1))
+    return _sample_covariance(_ensemble(ensemble, "ensemble", 2))
+
+
+def _sample_covariance(e: Array) -> Array:
+    a = _anomalies(e)
+    return _symmetrise(a.swapaxes(-1, -2) @ a / (a.shape[-2] - 1))
 
 
 def cross_covariance(ensemble: ArrayLike, other: ArrayLike) -> Array:
@@ -108,10 +121,137 @@ def cross_covariance(ensemble: ArrayLike, other: ArrayLike) -> Array:
     >>> cross_covariance([[0.0], [2.0]], [[1.0], [5.0]])
     array([[4.]])
     """
-    a = anomalies(_ensemble(ensemble, "ensemble", 2))
-    b = anomalies(_ensemble(other, "other", 2))
+    a, b = _ensemble(ensemble, "ensemble", 2), _ensemble(other, "other", 2)
     if a.shape[-2] != b.shape[-2]:
         raise ValueError(f"other: needs {a.shape[-2]} members like ensemble, got {b.shape[-2]}")
-    return np.asarray(np.swapaxes(a, -1, -2) @ b / (a.shape[-2] - 1))
+    _leading(a.shape[:-2], b.shape[:-2], "other")
+    return _cross_covariance(a, b)
 
 
+def _cross_covariance(a: Array, b: Array) -> Array:
+    return np.asarray(_anomalies(a).swapaxes(-1, -2) @ _anomalies(b) / (a.shape[-2] - 1))
+
+
+def exact_noise(
+    anomalies_to_avoid: ArrayLike, cov: ArrayLike, *, rng: np.random.Generator
+) -> Array:
+    r"""Draw noise whose sample moments are exact: second-order exact draws.
+
+    Over the members the draws average to zero, are uncorrelated with the given anomalies, and have
+    exactly the sample covariance `cov`. An ensemble with such noise added has the sum of both
+    covariances, without the sampling error of a plain draw; otherwise they are as random as can be.
+
+    Parameters
+    ----------
+    anomalies_to_avoid : array_like, (..., N, p)
+        What the noise has to be uncorrelated with, by member: the ensemble, its predictions, other
+        noise. Only differences from their mean matter, so ensembles serve as well. p may be 0.
+    cov : array_like, (..., k, k)
+        Covariance of the noise, positive semidefinite. Leading axes broadcast.
+    rng : numpy.random.Generator
+        Source of the draw.
+
+    Returns
+    -------
+    ndarray, (..., N, k)
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, `cov` is not a covariance, or there are too few members: N has to
+        exceed the number of independent anomalies plus the rank of `cov`.
+
+    Notes
+    -----
+    A plain draw is projected onto what is orthogonal over the members to the constant and to the
+    anomalies, orthonormalised, which is whitening by the Cholesky factor of its own covariance, and
+    coloured: :math:`\sqrt{N-1}\,\mathbf Q\mathbf L^\top` with :math:`\mathbf P=\mathbf L
+    \mathbf L^\top`. :math:`\mathbf Q` is distributed uniformly over the orthonormal frames there.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> x = rng.standard_normal((20, 3))
+    >>> noise = exact_noise(x, [[2.0, 1.0], [1.0, 3.0]], rng=rng)
+    >>> sample_covariance(noise).round(12)
+    array([[2., 1.],
+           [1., 3.]])
+    >>> bool((abs(cross_covariance(x, noise)) < 1e-12).all())
+    True
+    """
+    a = array(anomalies_to_avoid, "anomalies_to_avoid", (..., "N", "p"))
+    root = factor(cov)
+    _leading(a.shape[:-2], root.shape[:-2], "cov")
+    return _exact_noise(a, root, generator(rng))
+
+
+def _exact_noise(avoid: Array, root: Array, rng: np.random.Generator) -> Array:
+    """As the public one, with a lower factor of the covariance; it too needs enough members."""
+    n = avoid.shape[-2]
+    # Columns that are zero in all factors need no draw: a singular covariance asks for less room.
+    root = root[..., (root != 0).any(axis=tuple(range(root.ndim - 1)))]
+    rank = root.shape[-1]
+    leading = np.broadcast_shapes(avoid.shape[:-2], root.shape[:-2])
+    drawn = _projected(rng.standard_normal((*leading, n, rank)), avoid)
+    return _coloured(drawn, root)
+
+
+def _projected(drawn: Array, avoid: Array) -> Array:
+    """What is left of a draw without the constant and the anomalies."""
+    n, p = avoid.shape[-2:]
+    centred = _anomalies(avoid)
+    turned = np.ascontiguousarray(centred.swapaxes(-1, -2))
+    gram = turned @ centred
+    size = np.sqrt(np.diagonal(gram, axis1=-2, axis2=-1))
+    size = np.where(size > 0, size, 1.0)[..., None]
+    # Two passes leave the square of what the normal equations lose, if no pivot is below 1e-8.
+    lower = _steady(gram / (size * size.swapaxes(-1, -2)), 1e-8)
+    if lower is None or n <= p + drawn.shape[-1]:
+        basis = _span(centred / size.swapaxes(-1, -2), drawn.shape[-1])
+        for _ in range(2):
+            drawn = drawn - basis @ (basis.swapaxes(-1, -2) @ drawn)
+        return drawn
+    for _ in range(2):
+        drawn = _anomalies(drawn)
+        drawn -= centred @ (_cholesky_solve(lower, turned @ drawn / size) / size)
+    return drawn
+
+
+def _coloured(drawn: Array, root: Array) -> Array:
+    """The draw (..., N, r) turned linearly so that its sample covariance is root root'."""
+    n = drawn.shape[-2]
+    lower = _steady(np.ascontiguousarray(drawn.swapaxes(-1, -2)) @ drawn / (n - 1), 0.1)
+    if lower is not None:
+        return np.asarray(drawn @ _solve_upper(lower, root.swapaxes(-1, -2)))
+    q, r = np.linalg.qr(drawn)
+    # A positive diagonal makes the frame that of whitening, whatever signs LAPACK prefers.
+    sign = np.where(np.diagonal(r, axis1=-2, axis2=-1) < 0, -1.0, 1.0)[..., None, :]
+    return np.asarray(np.sqrt(n - 1) * ((q * sign) @ root.swapaxes(-1, -2)))
+
+
+def _steady(gram: Array, least: float) -> Array | None:
+    """The Cholesky factor, unless a pivot is so small that solving with it would lose digits."""
+    try:
+        lower = _cholesky(gram)
+    except np.linalg.LinAlgError:
+        return None
+    small = np.diagonal(lower, axis1=-2, axis2=-1).min(initial=1.0) < np.sqrt(least)
+    return None if small else lower
+
+
+def _span(unit: Array, rank: int) -> Array:
+    """Orthonormal basis over the members (..., N, 1 + p) of the constant and centred columns."""
+    n, p = unit.shape[-2:]
+    constant = np.full((*unit.shape[:-1], 1), n**-0.5)
+    if n > p + rank:
+        # If they depend on each other, the basis has directions to spare, which do no harm.
+        return np.asarray(np.linalg.qr(np.concatenate([constant, unit], axis=-1))[0])
+    u, s, _ = np.linalg.svd(unit, full_matrices=False)
+    kept = s > n * _EPS * s.max(axis=-1, initial=0.0, keepdims=True)
+    independent = int(kept.sum(axis=-1).max(initial=0))
+    if n <= independent + rank:
+        raise ValueError(
+            f"anomalies_to_avoid: needs more than {independent} + {rank} members, for "
+            f"{independent} independent anomalies and noise of rank {rank}, got {n}"
+        )
+    return np.concatenate([constant, u * kept[..., None, :]], axis=-1)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .checks import Array, array, count, covariance, number
+from .checks import weights as unit_weights
 from .ensembles import mean, sample_covariance
 from .intervals import Interval, mean_interval, median_interval, proportion_interval
 
@@ -267,7 +268,13 @@ def _count(value: Any, name: str) -> int:
     return count(value, name)
 
 
-def crps(ensemble: ArrayLike, truth: ArrayLike, *, fair: bool = False) -> Array:
+def crps(
+    ensemble: ArrayLike,
+    truth: ArrayLike,
+    *,
+    fair: bool = False,
+    weights: ArrayLike | None = None,
+) -> Array:
     r"""Continuous ranked probability score of each component of an ensemble; smaller is better.
 
     :math:`\operatorname{mean}_i|x_i-y|-\tfrac12\operatorname{mean}_{i,j}|x_i-x_j|`, the integral of
@@ -282,6 +289,8 @@ def crps(ensemble: ArrayLike, truth: ArrayLike, *, fair: bool = False) -> Array:
     fair : bool
         Average the pairs over i ≠ j, N (N - 1) of them: unbiased for the score of the distribution
         that the members are drawn from. Needs N >= 2.
+    weights : array_like, (..., N), optional
+        Of the members, with sum one; equal by default. Not together with `fair`.
 
     Returns
     -------
@@ -303,11 +312,24 @@ def crps(ensemble: ArrayLike, truth: ArrayLike, *, fair: bool = False) -> Array:
     x = _ensemble(ensemble, 2 if fair else 1)
     n = x.shape[-2]
     t = _truth(truth, (*x.shape[:-2], x.shape[-1]), "ensemble")
+    if weights is not None:
+        return _weighted_crps(x - t[..., None, :], weights, fair)
     # Distances from the truth are as good as the members, and lose fewer digits far from zero.
     gap = np.sort(x - t[..., None, :], axis=-2)
     rank = 2.0 * np.arange(1, n + 1) - n - 1
     pairs = (rank[:, None] * gap).sum(axis=-2) / (n * (n - 1 if fair else n))
     return np.asarray(np.abs(gap).mean(axis=-2) - pairs)
+
+
+def _weighted_crps(gap: Array, weights: ArrayLike, fair: bool) -> Array:
+    if fair:
+        raise ValueError("fair: needs members of equal weight, got weights")
+    w = unit_weights(array(weights, "weights", gap.shape[:-1]), "weights")
+    order = np.argsort(gap, axis=-2)
+    gap = np.take_along_axis(gap, order, axis=-2)
+    share = np.take_along_axis(np.broadcast_to(w[..., None], gap.shape), order, axis=-2)
+    above = 2 * np.cumsum(share, axis=-2) - share - 1
+    return np.asarray((share * (np.abs(gap) - above * gap)).sum(axis=-2))
 
 
 def gaussian_crps(mean: ArrayLike, std: ArrayLike, truth: ArrayLike) -> Array:

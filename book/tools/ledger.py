@@ -23,8 +23,14 @@ from common import ROOT, VERDICT, chapters
 
 ITEMS = ROOT / "data" / "published" / "items.csv"
 LEDGER = ROOT / "data" / "published" / "ledger.csv"
-COLUMNS = ("paper", "item", "chapter", "verdict", "ours", "published", "why")
-VERDICTS = ("match", "differs", "not comparable", "not yet")
+COLUMNS = ("paper", "item", "kind", "chapter", "verdict", "ours", "published", "why")
+OPEN = "not yet"
+VERDICTS = {
+    "parameters": ("read", "differs", "not comparable", OPEN),
+    "results": ("match", "differs", "not comparable", OPEN),
+}
+"""What can be found of each kind of item: a study reads parameters and reproduces results."""
+WORDS = {"parameters": "tables of parameters", "results": "tables and figures of results"}
 
 
 def rows_of(path: Path) -> list[dict[str, str]]:
@@ -56,9 +62,10 @@ def ledger(items: list[dict[str, str]], verdicts: list[dict[str, str]]) -> list[
     Raises
     ------
     ValueError
-        If a verdict names no item, an item has two, or a verdict is not one of the four.
+        If a verdict names no item, an item has two, or a verdict is not one of its kind's.
     """
     keys = [(item["paper"], item["item"]) for item in items]
+    kinds = dict(zip(keys, (item["kind"] for item in items), strict=True))
     given: dict[tuple[str, str], dict[str, str]] = {}
     for verdict in verdicts:
         key = (verdict["paper"], verdict["item"])
@@ -67,10 +74,11 @@ def ledger(items: list[dict[str, str]], verdicts: list[dict[str, str]]) -> list[
             raise ValueError(f"{where}: not an item of {ITEMS.name}")
         if key in given:
             raise ValueError(f"{where}: has a verdict already, in {given[key]['chapter']}")
-        if verdict["verdict"] not in VERDICTS:
-            raise ValueError(f"{where}: verdict {verdict['verdict']!r}, needs one of {VERDICTS}")
+        known = VERDICTS[kinds[key]]
+        if verdict["verdict"] not in known:
+            raise ValueError(f"{where}: verdict {verdict['verdict']!r}, needs one of {known}")
         given[key] = verdict
-    blank = {"verdict": "not yet", "ours": "", "published": "", "why": ""}
+    blank = {"verdict": OPEN, "ours": "", "published": "", "why": ""}
     return [
         {name: ({**item, **blank, **given.get(key, {})})[name] for name in COLUMNS}
         for key, item in zip(keys, items, strict=True)
@@ -84,6 +92,15 @@ def text_of(rows: list[dict[str, str]]) -> str:
     writer.writeheader()
     writer.writerows(rows)
     return out.getvalue()
+
+
+def summaries(rows: list[dict[str, str]]) -> dict[str, tuple[int, dict[str, int]]]:
+    """Return, for each kind of item, how many there are and how many have each verdict."""
+    out = {}
+    for kind, known in VERDICTS.items():
+        found = Counter(row["verdict"] for row in rows if row["kind"] == kind)
+        out[kind] = found.total(), {verdict: found[verdict] for verdict in known}
+    return out
 
 
 def current() -> str:
@@ -102,8 +119,8 @@ def main() -> int:
         LEDGER.write_text(text, encoding="utf-8")
     elif not LEDGER.is_file() or LEDGER.read_text(encoding="utf-8") != text:
         sys.exit(f"{LEDGER.name} is not what the stored chapters give: make outputs")
-    counts = Counter(row["verdict"] for row in rows_of(LEDGER))
-    print(f"{counts.total()} items: " + ", ".join(f"{counts[v]} {v}" for v in VERDICTS))
+    for kind, (total, counts) in summaries(rows_of(LEDGER)).items():
+        print(f"{total} {WORDS[kind]}: " + ", ".join(f"{n} {v}" for v, n in counts.items()))
     return 0
 
 

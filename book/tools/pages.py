@@ -6,7 +6,6 @@ import importlib
 import inspect
 import re
 import types
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from docutils import nodes
 from sphinx.pycode import ModuleAnalyzer
 
 from common import ROOT, toc_pages
-from ledger import ITEMS, LEDGER, VERDICTS, rows_of
+from ledger import ITEMS, LEDGER, WORDS, rows_of, summaries
 
 PAPERS = {
     "grange": "Triangular transport maps",
@@ -131,9 +130,10 @@ def reproductions_text() -> str:
     """Return the count of verdicts and one table for each paper."""
     titles = {(item["paper"], item["item"]): item["title"] for item in rows_of(ITEMS)}
     rows = rows_of(LEDGER)
-    counts = Counter(row["verdict"] for row in rows)
-    summary = ", ".join(f"{counts[verdict]} *{verdict}*" for verdict in VERDICTS)
-    lines = [f"Of {len(rows)} items: {summary}.", ""]
+    lines = []
+    for kind, (total, counts) in summaries(rows).items():
+        shown = ", ".join(f"{n} *{verdict}*" for verdict, n in counts.items())
+        lines += [f"Of {total} {WORDS[kind]}: {shown}.", ""]
     for paper in dict.fromkeys(row["paper"] for row in rows):
         lines += [f"## {PAPERS.get(paper, paper)} (`{paper}`)", ""]
         lines += ["| Item | Shows | Chapter | Verdict | Ours | Published | Why |"]

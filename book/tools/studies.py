@@ -26,7 +26,7 @@ from common import ROOT
 from distfilt import studies
 from distfilt.published import PAPERS
 from distfilt.studies.seeds import recipes
-from distfilt.studies.stored import jsons
+from distfilt.studies.files import jsons
 from distfilt.studies.study import column_names
 
 NEEDED = ("NAME", "PAPER", "trial", "parameters", "columns", "seeds")

@@ -13,10 +13,9 @@ from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
 from ..checks import Array, array, choice, count, generator, number
-from ..gaussians import log_density
 from ..network import Ledger
-from ..updates import effective_size, jitter
-from ..updates.particles import RESAMPLING, _resampled
+from ..updates import effective_size
+from ..updates.particles import RESAMPLING, _jittered, _levels, _picked, _resampled
 from .driver import Late, Summary
 from .ensemble import drawn_prior
 from .failures import guarded, not_finite
@@ -197,19 +196,23 @@ class ParticleFilter(SensorFilter):
     ) -> tuple[list[Array], Array]:
         """Paths, and log-weights, after agents with a poor effective size have resampled."""
         paths = [*earlier, state.points]
+        # Everybody draws, needed or not: an agent's luck must not depend on another's weights.
+        drawn = _levels(state.log_weights.shape, rng, self.rule)
+        noise = rng.standard_normal(state.points.shape) if self.jitter else None
+        weights = state.log_weights.copy()
+        out = [p.copy() for p in paths]
         if not poor.any():
-            return [p.copy() for p in paths], state.log_weights.copy()
-        w = np.exp(state.log_weights)
-        picked = np.where(poor[..., None], _resampled(w, rng, self.rule), np.arange(self.members))
-        out = [np.take_along_axis(p, picked[..., None], axis=-2) for p in paths]
-        if self.jitter:
-            around = np.swapaxes(state.points - state.points.mean(axis=-2, keepdims=True), -1, -2)
+            return out, weights
+        picked = _picked(np.exp(weights[poor]), drawn[poor], self.rule)[..., None]
+        for target, path in zip(out, paths, strict=True):
+            target[poor] = np.take_along_axis(path[poor], picked, axis=-2)
+        if noise is not None:
+            around = paths[-1][poor] - paths[-1][poor].mean(axis=-2, keepdims=True)
             # Of all particles, weighted or not: after one weight dominated its copies have none.
-            cov = around @ np.swapaxes(around, -1, -2) / self.members
-            apart = jitter(out[-1], rng=rng, bandwidth=self.jitter, cov=cov)
-            out[-1] = np.where(poor[..., None, None], apart, out[-1])
-        equal = -np.log(self.members)
-        return out, np.where(poor[..., None], equal, state.log_weights)
+            cov = np.swapaxes(around, -1, -2) @ around / self.members
+            out[-1][poor] = _jittered(out[-1][poor], cov, self.jitter, noise[poor])
+        weights[poor] = -np.log(self.members)
+        return out, weights
 
     def _weigh(
         self, weights: Array, points: Array, group: Heard, failed: Array, previous: Array | None
@@ -274,14 +277,15 @@ def _distinct(points: Array) -> Array:
 
 
 def _log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
-    """Log density of observations (..., m) for each prediction (..., N, m), as (..., N)."""
+    """Log-likelihood of each particle's prediction (..., N, m) but for a constant, (..., N)."""
     missing = np.isnan(observed) | np.isnan(predicted).any(axis=-2)
     gap = observed[..., None, :] - predicted
     cov = noise
     if missing.any():
-        # A missing component gets a zero residual and a unit of its own in R: it adds a constant.
+        # A missing component gets a zero residual and a unit of its own in R.
         here = ~missing[..., :, None] & ~missing[..., None, :]
         cov = np.where(here, noise, np.eye(noise.shape[-1]))
         gap = np.where(missing[..., None, :], 0.0, gap)
-    cov = np.broadcast_to(cov, (*gap.shape[:-2], *cov.shape[-2:]))
-    return log_density(gap, np.zeros(gap.shape[-1]), cov[..., None, :, :])
+    # One solve with all particles as right-hand sides: the factor is the same for them.
+    half = np.linalg.solve(np.linalg.cholesky(cov), np.swapaxes(gap, -1, -2))
+    return np.asarray(-0.5 * (half**2).sum(axis=-2))

@@ -1,32 +1,37 @@
-"""Kalman filters: exact and batched, filterpy's as a reference, ensemble and particle filters."""
+"""Kalman filters for many runs at once: linear, extended, unscented, with a smoother.
 
-from .ensemble import EnsembleRun, enkf, enkf_filter
+Filterpy's stand beside them as the reference.
+"""
+
 from .linear import GaussianRun, kalman_filter, predict, update
-from .particle import (
-    ParticleRun,
-    Particles,
-    effective_size,
-    particle_filter,
-    resample,
-    systematic,
+from .multiplicative import Chart, multiplicative_filter, quaternion_chart
+from .nonlinear import (
+    extended_filter,
+    extended_predict,
+    extended_update,
+    unscented_filter,
+    unscented_predict,
+    unscented_update,
 )
 from .reference import filterpy_ekf, filterpy_kf, filterpy_ukf
+from .smoothing import rts_smoother
 
 __all__ = [
-    "EnsembleRun",
+    "Chart",
     "GaussianRun",
-    "ParticleRun",
-    "Particles",
-    "effective_size",
-    "enkf",
-    "enkf_filter",
+    "extended_filter",
+    "extended_predict",
+    "extended_update",
     "filterpy_ekf",
     "filterpy_kf",
     "filterpy_ukf",
     "kalman_filter",
-    "particle_filter",
+    "multiplicative_filter",
     "predict",
-    "resample",
-    "systematic",
+    "quaternion_chart",
+    "rts_smoother",
+    "unscented_filter",
+    "unscented_predict",
+    "unscented_update",
     "update",
 ]

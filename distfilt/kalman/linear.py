@@ -1,25 +1,28 @@
 """The Kalman filter for many runs at once: exact, with single components of observations missing.
 
-Inside this module the run axis stands last, ``(d, d, G)``: every product with the matrices of the
-model is then one large matrix product, and every operation on the small matrices of the filter is
-vectorised over the runs. The functions that a caller sees keep runs in front.
+The functions that a caller sees keep runs in front; inside, the run axis stands last.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.linalg.lapack import dtrtrs
+from numpy.typing import ArrayLike
 
 from ..checks import Array, array, covariance
+from ._algebra import (
+    Indices,
+    analysis,
+    forecast_cov,
+    log_density,
+    shared_gains,
+    whitened,
+)
+from ._inputs import common_runs, fill_axes, prior
 
 __all__ = ["GaussianRun", "kalman_filter", "predict", "update"]
-
-
-_Indices = NDArray[np.intp]
-_Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -110,26 +113,21 @@ def kalman_filter(
     if np.isinf(y).any():
         raise ValueError("observations: needs finite numbers or NaN (missing), got infinity")
     steps, runs, m = y.shape[0], y.shape[1:-1], y.shape[-1]
-    x0, p0 = _prior(mean, cov)
+    x0, p0 = prior(mean, cov)
     d = x0.shape[-1]
     f, q = _per_step(F, "F", steps, (d, d)), _noise_per_step(Q, "Q", steps, d, semidefinite=True)
     h, r = _per_step(H, "H", steps, (m, d)), _noise_per_step(R, "R", steps, m)
-    runs = _broadcast(runs, x0, p0)
-    y = np.moveaxis(np.broadcast_to(_fill_axes(y, len(runs)), (steps, *runs, m)), -1, 1)
-    y = y.reshape(steps, m, -1)
-    x = np.ascontiguousarray(np.broadcast_to(x0, (*runs, d)).reshape(-1, d).T)
+    runs = common_runs(runs, x0, p0)
+    size = math.prod(runs)
+    y = np.broadcast_to(fill_axes(y, len(runs)), (steps, *runs, m)).reshape(steps, size, m)
+    x = np.broadcast_to(x0, (*runs, d)).reshape(size, d)
     p, group = _groups(y, p0, runs)
-    out = _recursion(x, p, group, y, f, h, q, r)
-    shared = p.shape[-1] == 1
-    means = np.moveaxis(out.means, 1, -1).reshape(steps, *runs, d)
-    covs = np.moveaxis(out.covariances if shared else out.covariances[..., group], -1, 1)
-    covs = covs.reshape(steps, *((1,) * len(runs) if shared else runs), d, d)
-    return GaussianRun(means, covs, out.log_likelihood.reshape(steps, *runs))
-
-
-def _prior(mean: ArrayLike, cov: ArrayLike) -> tuple[Array, Array]:
-    x = array(mean, "mean", (..., "d"))
-    return x, covariance(cov, "cov", x.shape[-1])
+    own = p.shape[-1] > 1
+    model = (f, h, q, r)
+    out = _recursion(x, p, group, y, *model) if own else _shared(x, p[..., 0], y, *model)
+    covs = out.covariances.reshape(steps, *(runs if own else (1,) * len(runs)), d, d)
+    density = out.log_likelihood.reshape(steps, *runs)
+    return GaussianRun(out.means.reshape(steps, *runs, d), covs, density)
 
 
 def _per_step(value: ArrayLike, name: str, steps: int, shape: tuple[int, int]) -> Array:
@@ -148,38 +146,21 @@ def _noise_per_step(
     )
 
 
-def _broadcast(runs: tuple[int, ...], mean: Array, cov: Array) -> tuple[int, ...]:
-    """The run axes that observations, prior means and prior covariances have in common."""
-    for name, axes in (("mean", mean.shape[:-1]), ("cov", cov.shape[:-2])):
-        try:
-            runs = np.broadcast_shapes(runs, axes)
-        except ValueError:
-            raise ValueError(
-                f"{name}: needs run axes that broadcast with {runs}, got {axes}"
-            ) from None
-    return runs
-
-
-def _fill_axes(y: Array, count: int) -> Array:
-    """Insert run axes of length one after time, as broadcasting would in front."""
-    missing = count - (y.ndim - 2)
-    return y.reshape(y.shape[:1] + (1,) * missing + y.shape[1:])
-
-
-def _groups(y: Array, cov: Array, runs: tuple[int, ...]) -> tuple[Array, _Indices]:
+def _groups(y: Array, cov: Array, runs: tuple[int, ...]) -> tuple[Array, Indices]:
     """Prior covariances (d, d, G), and for each run the index of the covariance it uses.
 
-    Two runs with the same missing components at all times have the same covariances.
+    Two runs of y (T, R, m) with the same missing components at all times have the same covariances.
     """
-    d, size = cov.shape[-1], y.shape[-1]
+    d, size = cov.shape[-1], y.shape[1]
     if cov.ndim > 2:
         full = np.broadcast_to(cov, (*runs, d, d)).reshape(-1, d, d)
         return np.moveaxis(full, 0, -1).copy(), np.arange(size)
-    missing = np.isnan(y).reshape(-1, size)
+    missing = np.isnan(y)
     if (missing == missing[:, :1]).all():
-        group: _Indices = np.zeros(size, dtype=np.intp)
+        group: Indices = np.zeros(size, dtype=np.intp)
     else:
-        _, group = np.unique(np.packbits(missing, axis=0), axis=1, return_inverse=True)
+        bits = np.packbits(np.moveaxis(missing, 1, -1).reshape(-1, size), axis=0)
+        _, group = np.unique(bits, axis=1, return_inverse=True)
         group = np.asarray(group, dtype=np.intp).reshape(-1)
     count = int(group.max(initial=0)) + 1
     if count == size:
@@ -187,131 +168,40 @@ def _groups(y: Array, cov: Array, runs: tuple[int, ...]) -> tuple[Array, _Indice
     return np.repeat(cov[..., None], count, axis=-1), group
 
 
-def _recursion(
-    x: Array, p: Array, group: _Indices, y: Array, f: Array, h: Array, q: Array, r: Array
+def _shared(
+    x: Array, p: Array, y: Array, f: Array, h: Array, q: Array, r: Array
 ) -> GaussianRun:
-    """Forecast and analysis over all steps, runs last: x (d, R), p (d, d, G), y (T, m, R)."""
-    steps, g = y.shape[0], p.shape[-1]
-    means, covs = np.empty((steps, *x.shape)), np.empty((steps, *p.shape))
-    squares, log_det = np.empty((steps, x.shape[-1])), np.empty((steps, g))
-    missing = np.isnan(y)
-    gaps = np.asarray(missing.any(axis=(1, 2)))
-    # One representative run shows the pattern of its whole group.
-    here = ~missing[:, :, np.unique(group, return_index=True)[1]]
+    """All steps of runs x (R, d), y (T, R, m) that share their covariance p (d, d)."""
+    steps = len(y)
+    here = np.asarray(~np.isnan(y).any(axis=1))
+    gains, lowers, covs = shared_gains(p, f, h, q, r, here)
+    means, squares = np.empty((steps, *x.shape)), np.empty((steps, len(x)))
     for k in range(steps):
-        p = _forecast_cov(p, f[k], q[k])
-        lower, half, p = _analysis_cov(p, h[k], r[k], here[k] if gaps[k] else None)
-        x = f[k] @ x
-        innovation = y[k] - h[k] @ x
-        if gaps[k]:
-            innovation[missing[k]] = 0.0
-        x, squares[k] = _analysis_mean(x, innovation, lower, half, group)
-        log_det[k] = 2.0 * np.log(lower.diagonal()).sum(axis=-1)
+        x = x @ f[k].T
+        innovation = y[k] - x @ h[k].T
+        if not here[k].all():
+            innovation[:, ~here[k]] = 0.0
+        means[k] = x = x + innovation @ gains[k].T
+        white = whitened(lowers[k], innovation)
+        squares[k] = np.einsum("rm,rm->r", white, white)
+    log_det = 2.0 * np.log(np.diagonal(lowers, axis1=1, axis2=2)).sum(axis=-1)
+    size = np.count_nonzero(here, axis=1)
+    return GaussianRun(means, covs, log_density(size[:, None], log_det[:, None], squares))
+
+
+def _recursion(
+    x: Array, p: Array, group: Indices, y: Array, f: Array, h: Array, q: Array, r: Array
+) -> GaussianRun:
+    """All steps of runs x (R, d), y (T, R, m) with covariances p (d, d, G)."""
+    steps, x = len(y), np.ascontiguousarray(x.T)
+    means, covs = np.empty((steps, *x.shape)), np.empty((steps, *p.shape))
+    density = np.empty((steps, x.shape[-1]))
+    for k in range(steps):
+        x, p = f[k] @ x, forecast_cov(p, f[k], q[k])
+        x, p, density[k] = analysis(x, p, y[k].T - h[k] @ x, h[k], r[k], group)
         means[k], covs[k] = x, p
-    size = y.shape[1] - np.count_nonzero(missing, axis=1)
-    likelihood = -0.5 * (size * np.log(2.0 * np.pi) + log_det[:, group] + squares)
-    return GaussianRun(means, covs, likelihood)
-
-
-def _forecast_cov(p: Array, f: Array, q: Array) -> Array:
-    """F P F' + Q on (d, d, G), made symmetric here, where rounding breaks it."""
-    d, _, g = p.shape
-    left = (f @ p.reshape(d, d * g)).reshape(d, d, g)
-    out = np.matmul(f, left)
-    return np.asarray(0.5 * (out + out.swapaxes(0, 1)) + q[..., None])
-
-
-def _analysis_cov(
-    p: Array, h: Array, r: Array, here: _Mask | None
-) -> tuple[Array, Array, Array]:
-    """Factor of the innovation covariance, its solve with H P, and the analysis covariance.
-
-    `here` (m, G) marks the components that are not missing; None if none is. A missing component
-    keeps its place with a zero row in H and a one on the diagonal of R, which takes it out of
-    every sum exactly.
-    """
-    d, _, g = p.shape
-    m = h.shape[0]
-    mask = np.ones((m, 1, 1)) if here is None else here[:, None].astype(np.float64)
-    cross = np.matmul(h, p).swapaxes(0, 1) * mask  # H P, (m, d, G)
-    inner = np.matmul(h, cross) + r[..., None]
-    if here is not None:
-        inner *= mask * mask.swapaxes(0, 1)
-        inner[range(m), range(m)] += 1.0 - mask[:, 0]
-    lower = _cholesky(inner)
-    half = _forward(lower, cross)  # L^-1 H P: the gain K is half' L^-1
-    gain = _backward(lower, half)  # K'
-    # Joseph's form, (I - KH) P (I - KH)' + K R K', with A = (I - KH) P and its small factor
-    # K R - A H' taken together: it cancels the rounding errors of A along the observed directions.
-    kept = p - _sum_of_outer(gain, cross)
-    noise = (r @ gain.reshape(m, d * g)).reshape(m, d, g)
-    rest = (noise - np.matmul(h, kept).swapaxes(0, 1)) * mask
-    out = kept + _sum_of_outer(rest, gain)
-    return lower, half, 0.5 * (out + out.swapaxes(0, 1))
-
-
-def _analysis_mean(
-    x: Array, innovation: Array, lower: Array, half: Array, group: _Indices
-) -> tuple[Array, Array]:
-    """Analysis means (d, R) and squared Mahalanobis lengths of the innovations (R,)."""
-    if lower.shape[-1] not in (1, x.shape[-1]):
-        lower, half = lower[..., group], half[..., group]
-    white = _forward(lower, innovation)
-    shared = half.shape[-1] == 1
-    moved = half[..., 0].T @ white if shared else (half * white[:, None]).sum(axis=0)
-    return x + moved, (white**2).sum(axis=0)
-
-
-def _sum_of_outer(a: Array, b: Array) -> Array:
-    """A' B for stacks (m, d, G) and (m, d, G), (d, d, G)."""
-    if a.shape[-1] == 1:
-        return np.asarray((a[..., 0].T @ b[..., 0])[..., None])
-    out: Array = a[0][:, None] * b[0][None]
-    for j in range(1, a.shape[0]):
-        out += a[j][:, None] * b[j][None]
-    return out
-
-
-def _cholesky(a: Array) -> Array:
-    """Lower Cholesky factors of (m, m, G), column by column over all G at once."""
-    if a.shape[-1] == 1:
-        return np.asarray(np.linalg.cholesky(a[..., 0])[..., None], dtype=np.float64)
-    lower = np.zeros_like(a)
-    for j in range(a.shape[0]):
-        column = a[j:, j] - (lower[j:, :j] * lower[j, :j]).sum(axis=1)
-        if not (column[0] > 0).all():
-            raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
-        lower[j:, j] = column / np.sqrt(column[0])
-    return lower
-
-
-def _forward(lower: Array, right: Array) -> Array:
-    """Solve L z = right for (m, m, G) and (m, ..., G), or for (m, m, 1) and any last axis."""
-    if lower.shape[-1] == 1:
-        return _triangular_solve(lower[..., 0], right)
-    out = np.empty_like(right)
-    factors = lower[:, :, None] if right.ndim == 3 else lower
-    for j in range(lower.shape[0]):
-        done = (factors[j, :j] * out[:j]).sum(axis=0)
-        out[j] = (right[j] - done) / lower[j, j]
-    return out
-
-
-def _triangular_solve(lower: Array, right: Array, *, transposed: bool = False) -> Array:
-    """One triangular system with all its right-hand sides, by LAPACK."""
-    out, _ = dtrtrs(lower, right.reshape(len(right), -1), lower=1, trans=int(transposed))
-    return np.asarray(out).reshape(right.shape)
-
-
-def _backward(lower: Array, right: Array) -> Array:
-    """Solve L' z = right for (m, m, G) and (m, d, G)."""
-    if lower.shape[-1] == 1:
-        return _triangular_solve(lower[..., 0], right, transposed=True)
-    out = np.empty_like(right)
-    for j in reversed(range(lower.shape[0])):
-        done = (lower[j + 1 :, j, None] * out[j + 1 :]).sum(axis=0)
-        out[j] = (right[j] - done) / lower[j, j]
-    return out
+    covs = np.moveaxis(covs[..., group], -1, 1)
+    return GaussianRun(np.moveaxis(means, -1, 1), covs, density)
 
 
 def predict(mean: ArrayLike, cov: ArrayLike, *, F: ArrayLike, Q: ArrayLike) -> tuple[Array, Array]:
@@ -343,13 +233,18 @@ def predict(mean: ArrayLike, cov: ArrayLike, *, F: ArrayLike, Q: ArrayLike) -> t
     >>> predict([1.0], [[2.0]], F=[[3.0]], Q=[[0.5]])
     (array([3.]), array([[18.5]]))
     """
-    x, p = _prior(mean, cov)
+    x, p = prior(mean, cov)
     d = x.shape[-1]
     f = array(F, "F", (d, d))
     q = array(covariance(Q, "Q", d, semidefinite=True), "Q", (d, d))
+    return _predict(x, p, f, q)
+
+
+def _predict(x: Array, p: Array, f: Array, q: Array) -> tuple[Array, Array]:
+    """`predict` of checked arguments."""
+    d = x.shape[-1]
     stack = np.ascontiguousarray(np.moveaxis(p.reshape(-1, d, d), 0, -1))
-    out = np.moveaxis(_forecast_cov(stack, f, q), -1, 0)
-    return x @ f.T, out.reshape(p.shape)
+    return x @ f.T, np.moveaxis(forecast_cov(stack, f, q), -1, 0).reshape(p.shape)
 
 
 def update(
@@ -387,12 +282,26 @@ def update(
     >>> x, p
     (array([1.]), array([[0.5]]))
     """
-    x, p = _prior(mean, cov)
+    x, p = prior(mean, cov)
     h = array(H, "H", ("m", x.shape[-1]))
-    y = array(observed, "observed", (..., h.shape[0]), finite=False)
+    m = h.shape[0]
+    y = array(observed, "observed", (..., m), finite=False)
     if np.isinf(y).any():
         raise ValueError("observed: needs finite numbers or NaN (missing), got infinity")
-    # The filter's one step without a forecast: identity dynamics and no process noise.
-    d = x.shape[-1]
-    run = kalman_filter(x, p, y[None], F=np.eye(d), H=h, Q=np.zeros((d, d)), R=R)
-    return run.means[0], run.covariances[0], run.log_likelihood[0]
+    r = array(covariance(R, "R", m), "R", (m, m))
+    common_runs(y.shape[:-1], x, p)
+    return _update(x, p, y, h, r)
+
+
+def _update(x: Array, p: Array, y: Array, h: Array, r: Array) -> tuple[Array, Array, Array]:
+    """`update` of checked arguments."""
+    d, m = x.shape[-1], y.shape[-1]
+    runs = np.broadcast_shapes(y.shape[:-1], x.shape[:-1], p.shape[:-2])
+    seen = np.broadcast_to(y, (*runs, m)).reshape(-1, m).T
+    mean = np.ascontiguousarray(np.broadcast_to(x, (*runs, d)).reshape(-1, d).T)
+    stack, group = _groups(seen.T[None], p, runs)
+    shared = stack.shape[-1] == 1
+    mean, stack, density = analysis(mean, stack, seen - h @ mean, h, r, group)
+    covs = np.moveaxis(stack if shared else stack[..., group], -1, 0)
+    covs = covs.reshape(*((1,) * len(runs) if shared else runs), d, d)
+    return np.ascontiguousarray(mean.T).reshape(*runs, d), covs, density.reshape(runs)

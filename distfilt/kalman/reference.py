@@ -20,15 +20,12 @@ from numpy.typing import ArrayLike, NDArray
 from ..checks import Array, array, number
 from ..models import Model
 from ..sensors import Sensor
-from ._inputs import instantaneous, series
-from .linear import GaussianRun, _broadcast, _fill_axes, _noise_per_step, _per_step, _prior
+from ._inputs import common_runs, fill_axes, instantaneous, prior, series
+from .linear import GaussianRun, _noise_per_step, _per_step
 
 _Mask = NDArray[np.bool_]
 
 __all__ = ["filterpy_ekf", "filterpy_kf", "filterpy_ukf"]
-
-_DIFFERENCE_STEP = 6e-6
-"""Step of a central difference, about the cube root of the rounding unit."""
 
 
 def filterpy_kf(
@@ -74,7 +71,7 @@ def filterpy_kf(
     if y.ndim < 2 or np.isinf(y).any():
         raise ValueError(f"observations: needs (T, ..., m), finite or NaN, got shape {y.shape}")
     steps, m = y.shape[0], y.shape[-1]
-    d = _prior(mean, cov)[0].shape[-1]
+    d = prior(mean, cov)[0].shape[-1]
     f, q = _per_step(F, "F", steps, (d, d)), _noise_per_step(Q, "Q", steps, d, semidefinite=True)
     h, r = _per_step(H, "H", steps, (m, d)), _noise_per_step(R, "R", steps, m)
 
@@ -115,7 +112,7 @@ def filterpy_ekf(
     observations : array_like, (T, ..., m)
         The observations of all sensors, one after the other; NaN marks a missing component.
     model : Model
-        Linearised about each analysis mean; a model with `transition` is not differenced.
+        Linearised about each analysis mean, by its Jacobian.
     sensors : sequence of Sensor
         Linearised about each forecast mean; residuals wrap where the sensor wraps.
     times : array_like, (T,)
@@ -139,7 +136,7 @@ def filterpy_ekf(
     >>> from distfilt.sensors import direct
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
     >>> run = filterpy_ekf([0.0], [[1.0]], [[3.0]], model=walk,
-    ...                    sensors=[direct([0], noise=1.0)], times=[1.0])
+    ...                    sensors=[direct([0], std=1.0)], times=[1.0])
     >>> run.means.round(6)
     array([[2.]])
     """
@@ -155,16 +152,16 @@ def filterpy_ekf(
 
     def step(kf: Any, k: int, z: Array, seen: _Mask) -> None:
         t, dt = float(grid[k]), float(grid[k + 1] - grid[k])
-        kf.F, kf.Q = _model_jacobian(model, kf.x, t, dt), model.noise(t, dt)
+        kf.F, kf.Q = model.jacobian(kf.x, t, dt), model.noise(t, dt)
         moved = model.step(kf.x, t, dt)
         kf.predict()
         kf.x = moved  # filterpy moves the mean with F; the model itself is the better step
         if seen.any():
             kf.update(
                 z[seen],
-                HJacobian=lambda x: np.concatenate([s.jacobian(x) for s in sensors])[seen],
+                HJacobian=lambda x: sensor.jacobian(x)[seen],
                 Hx=lambda x: sensor.predict(x)[seen],
-                R=sensor.noise[np.ix_(seen, seen)],
+                R=sensor.cov[np.ix_(seen, seen)],
                 residual=_residual_of(sensor, seen),
             )
 
@@ -210,7 +207,7 @@ def filterpy_ukf(
     >>> from distfilt.sensors import direct
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
     >>> run = filterpy_ukf([0.0], [[1.0]], [[3.0]], model=walk,
-    ...                    sensors=[direct([0], noise=1.0)], times=[1.0])
+    ...                    sensors=[direct([0], std=1.0)], times=[1.0])
     >>> run.means.round(6)
     array([[2.]])
     """
@@ -234,7 +231,7 @@ def filterpy_ukf(
             near = middle + sensor.residual(z, middle)
             rows: Iterator[Array] = iter(h[:, seen])
             # filterpy calls hx once for each sigma point, in their order.
-            kf.update(near[seen], R=sensor.noise[np.ix_(seen, seen)], hx=lambda s: next(rows))
+            kf.update(near[seen], R=sensor.cov[np.ix_(seen, seen)], hx=lambda s: next(rows))
 
     return _over_runs(mean, cov, y, start, step, likelihood, model.dim)
 
@@ -271,12 +268,12 @@ def _over_runs(
     dim: int | None = None,
 ) -> GaussianRun:
     """Run one of filterpy's objects over every run and every step."""
-    x0, p0 = _prior(mean, cov)
+    x0, p0 = prior(mean, cov)
     d = x0.shape[-1]
     if dim is not None and d != dim:
         raise ValueError(f"mean: needs {dim} components like the model, got {d}")
-    runs = _broadcast(y.shape[1:-1], x0, p0)
-    y = np.broadcast_to(_fill_axes(y, len(runs)), (len(y), *runs, y.shape[-1]))
+    runs = common_runs(y.shape[1:-1], x0, p0)
+    y = np.broadcast_to(fill_axes(y, len(runs)), (len(y), *runs, y.shape[-1]))
     x0, p0 = np.broadcast_to(x0, (*runs, d)), np.broadcast_to(p0, (*runs, d, d))
     means, covs = np.empty((len(y), *runs, d)), np.empty((len(y), *runs, d, d))
     density = np.zeros((len(y), *runs))
@@ -303,13 +300,3 @@ def _residual_of(sensor: Sensor, seen: _Mask) -> Callable[[Array, Array], Array]
         return np.asarray(sensor.residual(whole_a, whole_b)[seen])
 
     return residual
-
-
-def _model_jacobian(model: Model, x: Array, t: float, dt: float) -> Array:
-    """Derivative of the model's step, (d, d)."""
-    if hasattr(model, "transition"):
-        return array(model.transition(dt), "transition", (model.dim, model.dim))
-    h = _DIFFERENCE_STEP * np.maximum(1.0, np.abs(x))
-    moves = np.diag(h)
-    change = model.step(x + moves, t, dt) - model.step(x - moves, t, dt)
-    return np.asarray((change / (2 * h[:, None])).T)

@@ -199,13 +199,18 @@ def _turn_slope(omega: Array, dt: float) -> Array:
     """Derivative of the transition's velocity columns in the turn rate, (..., 4, 2)."""
     tau = omega * dt
     half = 0.5 * tau
-    # The spherical Bessel functions j0 = sin(x)/x and -j1, its derivative, are exact near zero.
-    j0, j1 = (spherical_jn(n, np.abs(half)) for n in (0, 1))
-    along = -np.sign(tau) * spherical_jn(1, np.abs(tau))
-    aside = 0.5 * j0**2 - np.abs(half) * j0 * j1
+    j0 = np.sinc(half / np.pi)
+    along, aside = -_bessel(tau), 0.5 * j0**2 - half * j0 * _bessel(half)
     moved = dt**2 * _spiral(along, aside)
     turned = dt * _spiral(-np.sin(tau), np.cos(tau))
     return np.concatenate([moved, turned], axis=-2)
+
+
+def _bessel(x: Array) -> Array:
+    """The spherical Bessel function j1, minus the derivative of sin(x)/x, without cancellation."""
+    small = np.abs(x) < 1e-3
+    series = x / 3 * (1 - x**2 / 10)
+    return np.where(small, series, np.sign(x) * spherical_jn(1, np.abs(np.where(small, 1.0, x))))
 
 
 def _spiral(along: Array, aside: Array) -> Array:

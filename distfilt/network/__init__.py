@@ -1,9 +1,53 @@
 """Who hears whom, what a message costs, and how neighbours agree."""
 
+from . import graphs, weights
+from .admm import AdmmRun, admm
+from .agreement import barycentre, intersection, pull
+from .asynchronous import event_triggered, flood, gossip
 from .channel import Channel
+from .consensus import UnstableGain, average, finite_time, maximum, push_sum
 from .faults import Faults
-from .graphs import Graph
+from .fusion import (
+    arithmetic_average,
+    consensus_pull,
+    covariance_intersection,
+    exchanged,
+    naive_fusion,
+)
 from .ledger import Ledger
+from .links import Graph
+from .tracking import PIState, first_order, pi_start, pi_step, stable_substeps
 from .weights import Weights
 
-__all__ = ["Channel", "Faults", "Graph", "Ledger", "Weights"]
+__all__ = [
+    "AdmmRun",
+    "Channel",
+    "Faults",
+    "Graph",
+    "Ledger",
+    "PIState",
+    "UnstableGain",
+    "Weights",
+    "admm",
+    "arithmetic_average",
+    "average",
+    "barycentre",
+    "consensus_pull",
+    "covariance_intersection",
+    "event_triggered",
+    "exchanged",
+    "finite_time",
+    "first_order",
+    "flood",
+    "gossip",
+    "graphs",
+    "intersection",
+    "maximum",
+    "naive_fusion",
+    "pi_start",
+    "pi_step",
+    "pull",
+    "push_sum",
+    "stable_substeps",
+    "weights",
+]

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from ..checks import Array, array, choice, count
+from ..checks import Array, array, choice, count, number
+from . import _payloads
 from .faults import Faults
-from .graphs import Graph
 from .ledger import Ledger
+from .links import Graph
 from .weights import Weights, stacked
 
 __all__ = ["Channel", "LOST"]
@@ -28,8 +29,8 @@ class Channel:
     """Deliver payloads along a graph's links, lose or delay some, and charge for all of them.
 
     Everything that an agent learns from another passes through :meth:`exchange` (any payload),
-    :meth:`combine` (weighted sums of stacked vectors, one sparse product) or :meth:`carry` (a
-    payload of its own on each link).
+    :meth:`combine` (weighted sums of stacked vectors, one sparse product), :meth:`broadcast` (one
+    vector of each agent) or :meth:`carry` (a vector of its own on each link).
 
     Parameters
     ----------
@@ -42,6 +43,8 @@ class Channel:
         charged once, and lose different messages.
     faults : Faults, optional
         How the channel fails; not at all by default.
+    t : float, optional
+        The time, in s; needed for faults whose windows are in seconds.
 
     Examples
     --------
@@ -61,9 +64,12 @@ class Channel:
         ledger: Ledger | None = None,
         runs: tuple[int, ...] = (),
         faults: Faults | None = None,
+        t: float | None = None,
     ) -> None:
         if not isinstance(graph, Graph):
             raise ValueError(f"graph: needs a Graph, got {type(graph).__name__}")
+        if ledger is not None and not isinstance(ledger, Ledger):
+            raise ValueError(f"ledger: needs a Ledger, got {type(ledger).__name__}")
         if ledger is not None and ledger.messages.size != graph.size:
             raise ValueError(
                 f"ledger: needs {graph.size} agents like the graph, got {ledger.messages.size}"
@@ -71,15 +77,19 @@ class Channel:
         if faults is not None and not isinstance(faults, Faults):
             raise ValueError(f"faults: needs Faults, got {type(faults).__name__}")
         self.graph = graph
+        if not isinstance(runs, tuple | list):
+            raise ValueError(f"runs: needs a tuple of sizes such as (20,), got {runs!r}")
         self.runs = tuple(count(n, "runs") for n in runs)
         self.faults = Faults() if faults is None else faults
         self.faults.check(graph)
+        self.t = None if t is None else number(t, "t")
+        if self.faults.needs_time and t is None:
+            raise ValueError("t: needs the time for faults with windows in seconds, got None")
         self._ledger = Ledger.empty(graph.size) if ledger is None else ledger
         self._owed: dict[int, int] = {}
         self._late: dict[Any, deque[Any]] = {}
         self._perfect = self.faults.none
         self._listeners = graph.listeners.astype(np.int64)
-        self._links = self.faults.speaking(graph)
 
     @property
     def ledger(self) -> Ledger:
@@ -97,35 +107,39 @@ class Channel:
         Parameters
         ----------
         payloads : sequence of length A
-            Per agent an array (*runs, ...), a tuple of arrays, or None to stay silent.
+            Per agent a numeric array (*runs, ...), a flat tuple of them, or None to stay silent.
+            Nothing but NaN is silence too. Each entry counts as one scalar, of its own item size.
 
         Returns
         -------
         list of dict
             For each agent what arrived, by sender, in ascending order; the arrays are read-only.
-            In a batch, the runs that lost a message find NaN in its place.
+            In a batch, the runs that lost a message find NaN in its place, and integers become
+            floats there.
 
         Raises
         ------
         ValueError
-            If there is not one payload per agent, or a payload lacks the leading run axes.
+            If there is not one payload per agent, or a payload is an object, a dict, a nested
+            tuple, text or anything else whose numbers cannot be counted, or lacks the leading run
+            axes.
         """
-        if len(payloads) != self.graph.size:
-            raise ValueError(
-                f"payloads: needs one per agent ({self.graph.size}), got {len(payloads)}"
-            )
-        parts = [None if p is None else _parts(p, self.runs) for p in payloads]
-        runs = int(np.prod(self.runs, dtype=np.int64))
-        sizes = np.array([sum(a.size for a in p) // runs if p else 0 for p in parts])
-        bytes_ = np.array([sum(a.nbytes for a in p) // runs if p else 0 for p in parts])
-        speaks = np.array([p is not None for p in parts])[self.graph.senders] & self._links
-        arrived = self._transmit(speaks, sizes, bytes_)
-        sent = self._delayed("exchange", list(payloads), [None] * self.graph.size)
+        sent = _payloads.checked(payloads, self.graph.size, self.runs, copy=self.faults.late > 0)
+        speaks = np.array([p is not None for p in sent])[self.graph.senders]
+        arrived = self._transmit(speaks, *_payloads.sizes(sent, self.runs))
+        late = self._delayed("exchange", (sent, arrived))
         inbox: list[dict[int, Any]] = [{} for _ in range(self.graph.size)]
-        for link in np.flatnonzero(arrived.any(axis=0)):
-            i, j = int(self.graph.receivers[link]), int(self.graph.senders[link])
-            if sent[j] is not None:
-                inbox[i][j] = _delivered(sent[j], arrived[:, link].reshape(self.runs))
+        if late is None:
+            return inbox
+        sent, arrived = late
+        some = np.flatnonzero(arrived.any(axis=0))
+        ends = self.graph.receivers[some].tolist(), self.graph.senders[some].tolist()
+        whole = arrived.all(axis=0)[some].tolist()
+        for link, i, j, all_runs in zip(some.tolist(), *ends, whole, strict=True):
+            payload = sent[j]
+            if payload is not None and not all_runs:
+                payload = _payloads.thinned(payload, arrived[:, link].reshape(self.runs))
+            inbox[i][j] = payload
         return inbox
 
     def combine(
@@ -169,8 +183,11 @@ class Channel:
         """
         v, w = self._checked(values, weights)
         choice(lost, "lost", LOST)
-        for _ in range(count(rounds, "rounds")):
-            v = self._mixed(v, w, lost)[0]
+        times = count(rounds, "rounds")
+        if self._perfect:
+            return self._combine_all(v, w, times)
+        for _ in range(times):
+            v = self._combine_what_arrives(v, w, lost)[0]
         return v
 
     def combine_with_own(
@@ -182,7 +199,10 @@ class Channel:
     ) -> tuple[Array, Array]:
         """As :meth:`combine`, with the weight that each agent's own value got, (*runs, A)."""
         v, w = self._checked(values, weights)
-        return self._mixed(v, w, choice(lost, "lost", LOST))
+        choice(lost, "lost", LOST)
+        if self._perfect:
+            return self._combine_all(v, w, 1), w.own
+        return self._combine_what_arrives(v, w, lost)
 
     def _checked(
         self, values: ArrayLike, weights: Weights | ArrayLike | sparse.sparray
@@ -194,24 +214,57 @@ class Channel:
             weights = weights.matrix
         return v, Weights.from_matrix(self.graph, weights)
 
-    def _mixed(self, v: Array, w: Weights, lost: str) -> tuple[Array, Array]:
-        """One round: the combined values, and the weight that each agent's own value got."""
-        if not self._perfect:
-            return self._combine_what_arrives(v, w, lost)
-        self._owed[v.shape[-1]] = self._owed.get(v.shape[-1], 0) + 1
-        if not self.runs:
-            return w.matrix @ v, w.own
+    def _combine_all(self, v: Array, w: Weights, rounds: int) -> Array:
+        """Rounds without faults, agents in front throughout."""
+        self._owed[v.shape[-1]] = self._owed.get(v.shape[-1], 0) + rounds
         front = np.moveaxis(v, -2, 0)
-        out = (w.matrix @ front.reshape(self.graph.size, -1)).reshape(front.shape)
-        return np.ascontiguousarray(np.moveaxis(out, 0, -2)), w.own
+        flat = front.reshape(self.graph.size, -1)
+        for _ in range(rounds):
+            flat = w.matrix @ flat
+        return np.ascontiguousarray(np.moveaxis(flat.reshape(front.shape), 0, -2))
 
-    def carry(self, values: ArrayLike, *, acknowledged: bool = False) -> Array:
+    def broadcast(self, values: ArrayLike) -> tuple[Array, Mask]:
+        """Let every agent send one vector to all that hear it.
+
+        Parameters
+        ----------
+        values : array_like, (*runs, A, k)
+            One vector per agent.
+
+        Returns
+        -------
+        values : ndarray, (*runs, A, k)
+            By sender, what arrives in this round; read-only. Another array than what was sent only
+            where messages are late.
+        arrived : ndarray of bool, (*runs, E)
+            On which links it does, in the order of ``graph.receivers`` and ``graph.senders``. What
+            did not arrive at an agent it must not use.
+
+        Examples
+        --------
+        >>> from distfilt.network import graphs
+        >>> heard, arrived = Channel(graphs.path(2)).broadcast([[1.0], [3.0]])
+        >>> heard.ravel(), arrived
+        (array([1., 3.]), array([ True,  True]))
+        """
+        v = array(values, "values", (*self.runs, self.graph.size, "k"))
+        sizes = np.full(self.graph.size, v.shape[-1])
+        heard, arrived = self._sent("broadcast", v, sizes)
+        heard = heard.view()
+        heard.flags.writeable = False
+        return heard, arrived.reshape(*self.runs, self.graph.senders.size)
+
+    def carry(
+        self, values: ArrayLike, *, links: ArrayLike | None = None, acknowledged: bool = False
+    ) -> Array:
         """Send a payload of its own along each link.
 
         Parameters
         ----------
         values : array_like, (*runs, E, k)
             One vector per link, in the order of ``graph.receivers`` and ``graph.senders``.
+        links : array_like of bool, (E,), optional
+            The links that are used in this round; all by default. The others are not charged.
         acknowledged : bool
             Charge an acknowledgement for each message.
 
@@ -222,10 +275,14 @@ class Channel:
         """
         edges = self.graph.senders.size
         v = array(values, "values", (*self.runs, edges, "k"))
+        speaks = np.ones(edges, dtype=bool) if links is None else np.asarray(links)
+        if speaks.dtype != bool or speaks.shape != (edges,):
+            raise ValueError(
+                f"links: needs booleans for each of {edges} links, got {speaks.dtype} of shape "
+                f"{speaks.shape}"
+            )
         sizes = np.full(self.graph.size, v.shape[-1])
-        arrived = self._transmit(self._links, sizes, 8 * sizes, acknowledged=acknowledged)
-        nothing = np.full_like(v, np.nan)
-        sent = self._delayed(("carry", v.shape), v, nothing)
+        sent, arrived = self._sent("carry", v, sizes, speaks=speaks, acknowledged=acknowledged)
         return np.where(arrived.reshape(*self.runs, edges)[..., None], sent, np.nan)
 
     def _combine_what_arrives(self, v: Array, w: Weights, lost: str) -> tuple[Array, Array]:
@@ -235,30 +292,46 @@ class Channel:
             raise ValueError(f"lost: {lost!r} needs links both ways, got one-way links")
         # Metropolis weights need the degree of what is left, one number more.
         sizes = np.full(size, k + (lost == "metropolis"))
-        arrived = self._transmit(self._links, sizes, 8 * sizes, acknowledged=both)
-        heard = self._delayed(("combine", v.shape), v, None)
-        if heard is None:
-            arrived = np.zeros_like(arrived)
-            heard = np.zeros_like(v)
+        heard, arrived = self._sent("combine", v, sizes, acknowledged=both)
         own, links = _after_loss(self.graph, w, arrived, lost)
         runs = own.shape[0]
-        delayed = self.faults.delay > 0
+        delayed = self.faults.late > 0
         matrix = stacked(self.graph, own, links, heard_at=runs * size if delayed else 0)
         flat = v.reshape(-1, k)
         out = matrix @ (np.concatenate([flat, heard.reshape(-1, k)]) if delayed else flat)
         return out.reshape(v.shape), own.reshape(*self.runs, size)
+
+    def _sent(
+        self,
+        kind: str,
+        v: Array,
+        sizes: Any,
+        *,
+        speaks: Mask | None = None,
+        acknowledged: bool = False,
+    ) -> tuple[Array, Mask]:
+        """Send vectors: those that arrive in this round, and on which links, (R, E)."""
+        used = np.ones(self.graph.senders.size, dtype=bool) if speaks is None else speaks
+        arrived = self._transmit(used, sizes, 8 * sizes, acknowledged=acknowledged)
+        if not self.faults.late:
+            return v, arrived
+        late = self._delayed((kind, v.shape), (v.copy(), arrived))
+        return (np.zeros_like(v), np.zeros_like(arrived)) if late is None else late
 
     def _transmit(
         self, speaks: Mask, sizes: Any, bytes_: Any, *, acknowledged: bool = False
     ) -> Mask:
         """Charge one round in which the links in `speaks` are used; which messages arrive."""
         now = self.ledger
-        runs = int(np.prod(self.runs, dtype=np.int64))
-        arrived = speaks & ~self.faults.lost(self.graph, now.rounds, runs)
-        size = self.graph.size
+        size, runs = self.graph.size, int(np.prod(self.runs, dtype=np.int64))
+        if self._perfect:
+            arrived, lost = np.broadcast_to(speaks, (runs, speaks.size)), np.zeros(size)
+        else:
+            speaks = speaks & self.faults.speaking(self.graph, now.rounds, self.t)
+            arrived = speaks & ~self.faults.lost(self.graph, now.rounds, runs, self.t)
+            missing = (speaks & ~arrived).sum(axis=0) / runs
+            lost = np.bincount(self.graph.senders, weights=missing, minlength=size).astype(float)
         messages = np.bincount(self.graph.senders[speaks], minlength=size)
-        missing = (speaks & ~arrived).sum(axis=0) / runs
-        lost = np.bincount(self.graph.senders, weights=missing, minlength=size).astype(np.float64)
         after = now.charge(messages, sizes, bytes_, lost=lost)
         if acknowledged:
             back = np.bincount(self.graph.receivers[speaks], minlength=size)
@@ -266,13 +339,13 @@ class Channel:
         self._ledger = after
         return np.asarray(arrived)
 
-    def _delayed(self, key: Any, now: Any, nothing: Any) -> Any:
-        """What arrives in this round of what was sent `delay` rounds ago under the same key."""
-        if not self.faults.delay:
+    def _delayed(self, key: Any, now: Any) -> Any:
+        """What arrives in this round of what was sent before under the same key; None at first."""
+        if not self.faults.late:
             return now
         queue = self._late.setdefault(key, deque())
         queue.append(now)
-        return queue.popleft() if len(queue) > self.faults.delay else nothing
+        return queue.popleft() if len(queue) > self.faults.late else None
 
 
 def _after_loss(graph: Graph, w: Weights, arrived: Mask, lost: str) -> tuple[Array, Array]:
@@ -299,23 +372,3 @@ def _after_loss(graph: Graph, w: Weights, arrived: Mask, lost: str) -> tuple[Arr
             raise ValueError("lost: 'renormalise' needs weights left, got a row that sums to 0")
         own, links = own / total, links / total[:, ends]
     return np.asarray(own), links
-
-
-def _parts(payload: Any, runs: tuple[int, ...]) -> list[Array]:
-    parts = [np.asarray(p) for p in (payload if isinstance(payload, tuple) else (payload,))]
-    for part in parts:
-        if part.shape[: len(runs)] != runs:
-            raise ValueError(f"payloads: needs leading axes {runs}, got shape {part.shape}")
-    return parts
-
-
-def _delivered(payload: Any, arrived: Mask) -> Any:
-    """A read-only view, or a copy with NaN in the runs that lost it."""
-    if isinstance(payload, tuple):
-        return tuple(_delivered(part, arrived) for part in payload)
-    view = np.asarray(payload).view()
-    if not arrived.all():
-        gone = ~arrived.reshape(arrived.shape + (1,) * (view.ndim - arrived.ndim))
-        view = np.where(gone, np.nan, view)
-    view.flags.writeable = False
-    return view

@@ -2,16 +2,52 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, array, count, number
-from ..ensembles import mean
 from . import weights as weighting
 from .channel import Channel
+from .links import Graph
 from .weights import Weights
 
-__all__ = ["average", "finite_time", "maximum", "mean_pull", "push_sum"]
+__all__ = ["UnstableGain", "average", "finite_time", "maximum", "push_sum"]
+
+
+_SMALL = 1000
+"""Up to this many agents :func:`maximum` looks for the diameter itself."""
+
+
+class UnstableGain(RuntimeWarning):
+    """A gain above 2/λ_max: what the agents exchange drives them apart instead of together.
+
+    Turn it into an error, or off, by ``warnings.filterwarnings("error", category=UnstableGain)``.
+
+    Examples
+    --------
+    >>> issubclass(UnstableGain, RuntimeWarning)
+    True
+    """
+
+
+def warn_if_unstable(graph: Graph, gain: float) -> None:
+    """Warn the caller's caller of a gain at which averaging on the graph diverges.
+
+    A bound from the degrees clears most gains; eigenvalues are computed, once for a graph, only
+    beyond it.
+    """
+    if gain <= graph.safe_gain:
+        return
+    limit = graph.largest_gain
+    if gain > limit * (1 + 1e-9):
+        warnings.warn(
+            f"gain: {gain:.6g} is above 2/λ_max = {limit:.6g} of this graph, so the agents drift "
+            f"apart",
+            UnstableGain,
+            stacklevel=3,
+        )
 
 
 def _values(values: ArrayLike, channel: Channel) -> Array:
@@ -50,7 +86,7 @@ def average(
         How many times.
     gain : float, optional
         The gain γ, positive. The values agree if and only if the graph is connected and
-        γ < 2/λ_max of its Laplacian.
+        γ < 2/λ_max of its Laplacian; above it an :class:`UnstableGain` warns.
     weights : Weights, optional
         Other weights instead; Metropolis by default. They have to keep the average on their own
         account: symmetric, or :func:`distfilt.network.weights.balanced` on a digraph.
@@ -80,6 +116,7 @@ def average(
         raise ValueError("gain: needs to stand alone, got weights too")
     if gain is not None:
         weights = weighting.laplacian(channel.graph, number(gain, "gain", above=0))
+        warn_if_unstable(channel.graph, gain)
     elif weights is None:
         weights = weighting.metropolis(channel.graph)
     weighting.keeping(weights)
@@ -134,15 +171,19 @@ def _distinct(values: Array) -> Array:
 
 
 def _leja(points: Array) -> list[float]:
-    """The points in an order in which every partial product stays small."""
-    left: list[float] = points.tolist()
-    chosen: list[float] = []
-    while left:
-        scores = [
-            sum(np.log(abs(p - c)) for c in chosen) if chosen else abs(p) for p in left
-        ]
-        chosen.append(left.pop(int(np.argmax(scores))))
-    return chosen
+    """The points in an order in which partial products of their factors stay small.
+
+    Each next one is farthest, in the geometric mean, from all before it.
+    """
+    score, order = np.abs(points), []
+    for k in range(points.size):
+        at = int(score.argmax())
+        order.append(at)
+        with np.errstate(divide="ignore"):
+            away = np.log(np.abs(points - points[at]))
+        score = away if k == 0 else score + away
+        score[order] = -np.inf
+    return [float(p) for p in points[order]]
 
 
 def push_sum(values: ArrayLike, channel: Channel, *, rounds: int) -> Array:
@@ -211,7 +252,8 @@ def maximum(values: ArrayLike, channel: Channel, *, rounds: int | None = None) -
     channel : Channel
         Connected. A lost message only costs time.
     rounds : int, optional
-        The graph's diameter by default.
+        By default the graph's diameter; with more than 1 000 agents ``graph.diameter_bound``, which
+        is enough, and at most twice as much, where the diameter itself would take long to find.
 
     Returns
     -------
@@ -226,7 +268,9 @@ def maximum(values: ArrayLike, channel: Channel, *, rounds: int | None = None) -
     out = _values(values, channel)
     _connected(channel)
     graph = channel.graph
-    needed = graph.diameter if rounds is None else count(rounds, "rounds")
+    small = graph.size <= _SMALL
+    enough = graph.diameter if small else graph.diameter_bound
+    needed = enough if rounds is None else count(rounds, "rounds")
     for _ in range(needed):
         arrived = channel.carry(out[..., graph.senders, :])
         if graph.senders.size:
@@ -235,61 +279,3 @@ def maximum(values: ArrayLike, channel: Channel, *, rounds: int | None = None) -
             out = out.copy()
             out[..., hears, :] = np.fmax(out[..., hears, :], best)
     return out.copy()
-
-
-def mean_pull(
-    ensembles: ArrayLike,
-    channel: Channel,
-    *,
-    gain: float,
-    rounds: int = 1,
-    include_self: bool = True,
-) -> Array:
-    r"""Pull every member towards the neighbours' ensemble means, equation (16) of Grange et al.
-
-    .. math:: \mathbf x_i^l \leftarrow \mathbf x_i^l
-        + \gamma\sum_{l'\in\mathrm{Nbs}(l)}(\hat{\mathbf x}^{l'}-\mathbf x_i^l)
-
-    Parameters
-    ----------
-    ensembles : array_like, (*runs, A, N, d)
-        One ensemble per agent.
-    channel : Channel
-        The door between agents; only means pass through it, d scalars a link and round. A mean
-        that is lost does not pull.
-    gain : float
-        The gain γ, at least 0; 0 sends nothing and changes nothing.
-    rounds : int
-        How many times.
-    include_self : bool
-        Whether Nbs(l) holds l itself, as the paper's tables print. The means do not notice, but
-        the spread shrinks by 1 - γ|Nbs(l)| either way, one neighbour more with it.
-
-    Returns
-    -------
-    ndarray, (*runs, A, N, d)
-
-    Raises
-    ------
-    ValueError
-        If the ensembles do not fit the channel, or `gain` is negative.
-
-    Examples
-    --------
-    >>> from distfilt.network import Channel, graphs
-    >>> two = [[[0.0], [2.0]], [[4.0], [6.0]]]
-    >>> mean_pull(two, Channel(graphs.path(2)), gain=0.25, include_self=False)[0].ravel()
-    array([1.25, 2.75])
-    """
-    g = number(gain, "gain", at_least=0)
-    out = array(ensembles, "ensembles", (*channel.runs, channel.graph.size, "N", "d"))
-    needed = count(rounds, "rounds")
-    if g == 0:
-        return out.copy()
-    weights = weighting.laplacian(channel.graph, g)
-    for _ in range(needed):
-        centre = mean(out)
-        moved, own = channel.combine_with_own(centre, weights, lost="keep")
-        kept = (own - g * include_self)[..., None, None]
-        out = moved[..., None, :] + kept * (out - centre[..., None, :])
-    return out

@@ -1,97 +1,248 @@
-"""What goes wrong on the way: messages lost or late, agents silent."""
+"""What goes wrong on the way: messages lost, alone or in bursts, late, and agents silent."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, count, number
-from .graphs import Graph
+from ..checks import Array, array, choice, count, number
+from .links import Graph
 
 __all__ = ["Faults"]
 
 _GOLDEN = 0x9E3779B97F4A7C15
 
+Mask = NDArray[np.bool_]
+Hashes = NDArray[np.uint64]
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Faults:
-    """How a channel fails.
+    r"""How a channel fails. ``faults | other`` fails in both ways.
 
     Parameters
     ----------
-    loss : float or array_like, (A,)
-        Probability that a message is lost, in [0, 1]; an array gives one for each receiver.
+    loss : float or array_like, (A,) or (A, A)
+        Probability that a message is lost, in [0, 1]; one for each receiver, or ``loss[i, j]`` for
+        what agent i hears of agent j.
     seed : int
         Of the losses. Whether a message is lost is a function of seed, run, round and link alone,
         so that every agent, or every process of a real network, can compute it, and no draw
         depends on what was drawn before.
     symmetric : bool
-        A link fails both ways at once.
+        A link fails both ways at once, with the larger of its two probabilities.
+    burst : float, optional
+        Mean number of rounds for which a link that fails keeps failing. Losses are independent by
+        default, which is the shortest burst there is, 1 / (1 - loss) rounds.
     delay : int
-        Rounds that a message takes on top of its own.
+        Rounds that a message takes on top of its own, in a channel that lives as long.
     silent : collection of int
         Agents whose radio is off: they neither send nor hear.
+    during : sequence of (start, stop), optional
+        When losses happen and agents are silent: from `start` to before `stop`. Always by default;
+        `stop` may be infinite.
+    clock : {"rounds", "time"}
+        What `during` counts: the rounds of the channel's ledger, or the time `t` of the channel, in
+        s.
+    also : tuple of Faults
+        What fails besides; ``|`` fills it.
+
+    Notes
+    -----
+    Bursts are a two-state Markov chain on each link (E. N. Gilbert, Bell System Technical Journal
+    39 (1960) 1253-1265, with nothing lost in one state and everything in the other). Its state in a
+    round is that of the last round, looking back, in which the number drawn leads to the same
+    state from both: exact from the first round on, and again independent of what was computed
+    before.
 
     Examples
     --------
     >>> Faults(loss=0.2, seed=7).lost(Graph.from_adjacency([[0, 1], [1, 0]]), 0, 5).shape
     (5, 2)
+
+    Agent 3 is off from 10 s to 20 s, and all links fail for 8 rounds at a time:
+
+    >>> faults = Faults(loss=0.1, burst=8.0) | Faults(silent=[3], during=[(10, 20)], clock="time")
+    >>> faults.none
+    False
     """
 
-    loss: float | Array = 0.0
+    loss: float | ArrayLike = 0.0
     seed: int = 0
     symmetric: bool = False
+    burst: float | None = None
     delay: int = 0
     silent: Collection[int] = ()
+    during: Sequence[tuple[float, float]] | None = None
+    clock: str = "rounds"
+    also: tuple[Faults, ...] = ()
 
     def __post_init__(self) -> None:
-        if np.ndim(self.loss) == 0:
-            number(self.loss, "loss", at_least=0, at_most=1)
-        else:
-            rates = array(self.loss, "loss", ("A",))
-            if rates.min(initial=0) < 0 or rates.max(initial=0) > 1:
-                raise ValueError(f"loss: needs probabilities in [0, 1], got {rates.tolist()}")
+        object.__setattr__(self, "loss", _probabilities(self.loss))
         count(self.seed, "seed", at_least=0)
         count(self.delay, "delay", at_least=0)
-        object.__setattr__(self, "silent", tuple(count(a, "silent", at_least=0)
-                                                 for a in self.silent))
+        choice(self.clock, "clock", ("rounds", "time"))
+        if isinstance(self.silent, str) or not isinstance(self.silent, Collection):
+            raise ValueError(
+                f"silent: needs a collection of agents such as [3], got {self.silent!r}"
+            )
+        off = tuple(count(a, "silent", at_least=0) for a in self.silent)
+        object.__setattr__(self, "silent", off)
+        if self.burst is not None:
+            _check_burst(number(self.burst, "burst", at_least=1), np.asarray(self.loss))
+        if self.during is not None:
+            object.__setattr__(self, "during", _windows(self.during))
+        if not all(isinstance(other, Faults) for other in self.also):
+            raise ValueError(f"also: needs a tuple of Faults, got {self.also!r}")
+
+    def __or__(self, other: Faults) -> Faults:
+        if not isinstance(other, Faults):
+            raise ValueError(f"faults: needs Faults on both sides of |, got {other!r}")
+        mine, theirs = ({f.seed for f in x._all() if np.any(f.loss)} for x in (self, other))
+        if mine & theirs:
+            raise ValueError(
+                f"seed: needs other seeds to lose other messages, got {min(mine & theirs)} twice"
+            )
+        return replace(self, also=(*self.also, *other._all()))
+
+    def _all(self) -> tuple[Faults, ...]:
+        return (replace(self, also=()), *self.also) if self.also else (self,)
 
     def check(self, graph: Graph) -> None:
         """Refuse a graph whose agents do not fit."""
-        if np.ndim(self.loss) == 1 and np.size(self.loss) != graph.size:
-            raise ValueError(f"loss: needs one per agent ({graph.size}), got {np.size(self.loss)}")
-        if self.silent and max(self.silent) >= graph.size:
-            raise ValueError(f"silent: needs agents below {graph.size}, got {max(self.silent)}")
+        for faults in self._all():
+            needed = (graph.size,) * np.ndim(faults.loss)
+            if np.shape(faults.loss) != needed:
+                raise ValueError(
+                    f"loss: needs a number for each of {graph.size} agents, shape {needed}, "
+                    f"got {np.shape(faults.loss)}"
+                )
+            if faults.silent and max(faults.silent) >= graph.size:
+                raise ValueError(
+                    f"silent: needs agents below {graph.size}, got {max(faults.silent)}"
+                )
 
     @property
     def none(self) -> bool:
-        """Whether nothing fails."""
-        return not np.any(self.loss) and not self.delay and not self.silent
+        """Whether nothing ever fails."""
+        return not any(np.any(f.loss) or f.delay or f.silent for f in self._all())
 
-    def speaking(self, graph: Graph) -> NDArray[np.bool_]:
-        """Links whose both ends have their radio on, (E,)."""
+    @property
+    def lossless(self) -> bool:
+        """Whether every message arrives at last: no losses, and nobody silent."""
+        return not any(np.any(f.loss) or f.silent for f in self._all())
+
+    @property
+    def late(self) -> int:
+        """Rounds that a message takes on top of its own, all delays together."""
+        return sum(f.delay for f in self._all())
+
+    @property
+    def needs_time(self) -> bool:
+        """Whether some windows are in seconds, so that a channel needs to know the time."""
+        return any(f.during is not None and f.clock == "time" for f in self._all())
+
+    def speaking(self, graph: Graph, round_: int = 0, t: float | None = None) -> Mask:
+        """Links whose both ends have their radio on in a round, (E,)."""
         off = np.zeros(graph.size, dtype=bool)
-        off[list(self.silent)] = True
+        for faults in self._all():
+            if faults.silent and faults._active(round_, t):
+                off[list(faults.silent)] = True
         return ~(off[graph.receivers] | off[graph.senders])
 
-    def lost(self, graph: Graph, round_: int, runs: int) -> NDArray[np.bool_]:
+    def lost(self, graph: Graph, round_: int, runs: int, t: float | None = None) -> Mask:
         """Which links lose the message of round `round_` in each of `runs` runs, (runs, E)."""
-        if not np.any(self.loss):
-            return np.zeros((runs, graph.senders.size), dtype=bool)
+        out = np.zeros((runs, graph.senders.size), dtype=bool)
+        for faults in self._all():
+            if np.any(faults.loss) and faults._active(round_, t):
+                out |= faults._losses(graph, round_, runs)
+        return out
+
+    def _active(self, round_: int, t: float | None) -> bool:
+        if self.during is None:
+            return True
+        if self.clock == "time" and t is None:
+            raise ValueError("t: needs the channel's time for windows in seconds, got None")
+        now = round_ if self.clock == "rounds" else t
+        return any(start <= now < stop for start, stop in self.during)  # type: ignore[operator]
+
+    def _losses(self, graph: Graph, round_: int, runs: int) -> Mask:
         i, j = graph.receivers, graph.senders
         ends = (np.minimum(i, j), np.maximum(i, j)) if self.symmetric else (i, j)
-        link = (ends[0] * graph.size + ends[1]).astype(np.uint64)
-        key = (self.seed + _GOLDEN * (round_ + 1)) % 2**64
-        run = _mixed(_mixed(key) ^ (np.arange(runs, dtype=np.uint64) * np.uint64(_GOLDEN)))
-        bits = _mixed(run[:, None] ^ _mixed(link + np.uint64(_GOLDEN)))
-        rate = self.loss if np.ndim(self.loss) == 0 else np.asarray(self.loss)[i]
-        return np.asarray((bits >> np.uint64(11)).astype(np.float64) * 2.0**-53 < rate)
+        link = _mixed((ends[0] * graph.size + ends[1]).astype(np.uint64) + np.uint64(_GOLDEN))
+        rate = _rates(np.asarray(self.loss), i, j)
+        if self.symmetric and rate.ndim:
+            rate = np.maximum(rate, _rates(np.asarray(self.loss), j, i))
+        drawn = _uniform(self._runs(round_, runs)[:, None] ^ link)
+        if self.burst is None:
+            return np.asarray(drawn < rate)
+        rate = np.broadcast_to(rate, link.shape)
+        inner = (rate > 0) & (rate < 1)
+        stay = np.where(inner, 1 - 1 / (self.burst * np.where(inner, 1 - rate, 1.0)), 0.0).clip(0)
+        enter = rate * (1 - stay)
+        out = drawn < enter
+        run, at = np.nonzero(~out & (drawn < enter + stay))
+        while run.size:
+            round_ -= 1
+            drawn = _uniform(self._runs(round_, runs)[run] ^ link[at])
+            hit = drawn < enter[at]
+            out[run[hit], at[hit]] = True
+            open_ = ~hit & (drawn < (enter + stay)[at])
+            run, at = run[open_], at[open_]
+        return np.asarray(out)
+
+    def _runs(self, round_: int, runs: int) -> Hashes:
+        key = _mixed((self.seed + _GOLDEN * (round_ + 1)) % 2**64)
+        return _mixed(key ^ (np.arange(runs, dtype=np.uint64) * np.uint64(_GOLDEN)))
 
 
-def _mixed(bits: NDArray[np.uint64] | int) -> NDArray[np.uint64]:
+def _probabilities(loss: float | ArrayLike) -> float | Array:
+    if np.ndim(loss) == 0:
+        return number(loss, "loss", at_least=0, at_most=1)
+    rates = array(loss, "loss").copy()
+    if rates.ndim > 2 or rates.shape[0] != rates.shape[-1]:
+        raise ValueError(f"loss: needs a number, shape (A,) or (A, A), got {rates.shape}")
+    if rates.min(initial=0) < 0 or rates.max(initial=0) > 1:
+        raise ValueError(
+            f"loss: needs probabilities in [0, 1], got {rates.min():g} to {rates.max():g}"
+        )
+    rates.flags.writeable = False
+    return rates
+
+
+def _check_burst(burst: float, loss: Array) -> None:
+    rates = loss[(loss > 0) & (loss < 1)]
+    shortest = 1 / (1 - rates.max(initial=0.0))
+    if burst < shortest * (1 - 1e-12):
+        raise ValueError(
+            f"burst: needs at least 1 / (1 - loss) = {shortest:g} rounds, which independent losses "
+            f"last, got {burst:g}"
+        )
+
+
+def _windows(during: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
+    ends = array(during, "during", finite=False)
+    if ends.ndim != 2 or ends.shape[1] != 2 or not (ends[:, 0] < ends[:, 1]).all():
+        raise ValueError(
+            f"during: needs windows (start, stop) with start before stop, got {during!r}"
+        )
+    return tuple((float(start), float(stop)) for start, stop in ends)
+
+
+def _rates(loss: Array, receivers: NDArray[np.int64], senders: NDArray[np.int64]) -> Array:
+    if loss.ndim < 2:
+        return loss if loss.ndim == 0 else loss[receivers]
+    return np.asarray(loss[receivers, senders])
+
+
+def _uniform(bits: Hashes) -> Array:
+    return (_mixed(bits) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+
+
+def _mixed(bits: Hashes | int) -> Hashes:
     """The finaliser of splitmix64: every output bit depends on every input bit."""
     # Arrays, not scalars: their products wrap around silently, as they should here.
     z = np.atleast_1d(np.asarray(bits, dtype=np.uint64))

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..checks import Array, array, choice, count, covariance
-from ..linalg import symmetrise
+from ..checks import Array, array, callable_, choice, count, covariance, number
+from ..gaussians import _intersection_weights
+from ..linalg import _solve_lower, _symmetrise
+from . import weights as weighting
+from ._neighbourhood import Fuse, Heard, fused_by, in_rounds
 from .channel import Channel
+from .consensus import warn_if_unstable
+from .links import Graph
+from .weights import Weights
 
-__all__ = ["arithmetic_average", "covariance_intersection", "exchanged", "naive_fusion"]
+__all__ = [
+    "arithmetic_average",
+    "consensus_pull",
+    "covariance_intersection",
+    "exchanged",
+    "naive_fusion",
+]
 
-_WEIGHTS = ("fixed", "trace", "determinant")
-
-Fuse = Callable[[Array, Array, Array], tuple[Array, Array]]
-"""Means (S, *runs, d), covariances and who is there (S, *runs), of S sources, to one Gaussian."""
-
-_Upper = tuple[NDArray[np.intp], NDArray[np.intp]]
+RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
 
 
 def covariance_intersection(
@@ -26,7 +31,8 @@ def covariance_intersection(
     covs: ArrayLike,
     channel: Channel,
     *,
-    weights: str = "fixed",
+    rule: str = "equal",
+    weights: Weights | ArrayLike | None = None,
     rounds: int = 1,
 ) -> tuple[Array, Array]:
     r"""Each agent fuses its Gaussian with its neighbours', safely whatever they share.
@@ -46,9 +52,12 @@ def covariance_intersection(
         Each agent's covariance, positive definite.
     channel : Channel
         Mean and covariance go over each link, d + d(d+1)/2 scalars. What is lost is left out.
-    weights : {"fixed", "trace", "determinant"}
-        Equal for all that an agent has; inversely proportional to the covariance's trace; or to
-        the d-th root of its determinant, which does not depend on units.
+    rule : {"equal", "trace", "determinant", "min_trace", "min_determinant"}
+        How an agent weights what it has: see
+        :func:`distfilt.gaussians.intersection_weights`.
+    weights : Weights or array_like, (A, A), optional
+        Given weights instead of a rule, nonnegative, each row's sum one. Where messages are lost,
+        those of what arrived are scaled up to one again.
     rounds : int
         How many times.
 
@@ -56,6 +65,12 @@ def covariance_intersection(
     -------
     means : ndarray, (*runs, A, d)
     covs : ndarray, (*runs, A, d, d)
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit, a covariance is not positive definite, the rule is unknown, or
+        given weights are negative, do not sum to one or weight an agent that is not heard.
 
     Notes
     -----
@@ -66,17 +81,77 @@ def covariance_intersection(
     --------
     >>> from distfilt.network import Channel, graphs
     >>> two = covariance_intersection(
-    ...     [[0.0], [3.0]], [[[1.0]], [[2.0]]], Channel(graphs.path(2)), weights="trace")
+    ...     [[0.0], [3.0]], [[[1.0]], [[2.0]]], Channel(graphs.path(2)), rule="trace")
     >>> two[0].ravel().round(6), two[1].ravel().round(6)
     (array([0.6, 0.6]), array([1.2, 1.2]))
     """
-    choice(weights, "weights", _WEIGHTS)
+    return _intersected(*_checked(means, covs, channel), channel, rule, weights, rounds)
 
-    def fuse(m: Array, p: Array, here: Array) -> tuple[Array, Array]:
-        omega = _omegas(p, here, weights)
-        return _information_sum(m, p, omega)
 
-    return exchanged(means, covs, channel, rounds, fuse)
+def _intersected(
+    means: Array,
+    covs: Array,
+    channel: Channel,
+    rule: str,
+    weights: Weights | ArrayLike | None,
+    rounds: int,
+) -> tuple[Array, Array]:
+    """The same of arrays that were checked."""
+    choice(rule, "rule", RULES)
+    given = None if weights is None else _given(channel.graph, weights)
+
+    def step(heard: Heard) -> tuple[Array, Array]:
+        if given is None:
+            own, links = _by_rule(heard, rule)
+        else:
+            own, links = _shared(np.broadcast_to(given.own, heard.means.shape[:2]),
+                                 given.links * heard.arrived, heard)
+        return _information_sum(heard, own, links)
+
+    return in_rounds(means, covs, channel, rounds, step)
+
+
+def _given(graph: Graph, weights: Weights | ArrayLike) -> Weights:
+    w = weights if isinstance(weights, Weights) else Weights.from_matrix(graph, weights)
+    if w.graph is not graph:
+        w = Weights.from_matrix(graph, w.matrix)
+    least = min(w.own.min(), w.links.min(initial=0.0))
+    if least < 0 or w.own.min() <= 0:
+        raise ValueError(
+            f"weights: needs positive own weights and no negative ones, got {least:g}"
+        )
+    rows = w.own + graph.incidence @ w.links
+    worst = int(np.abs(rows - 1).argmax())
+    if abs(rows[worst] - 1) > 1e-8:
+        raise ValueError(
+            f"weights: needs rows that sum to 1, got {rows[worst]:.6g} for agent {worst}"
+        )
+    return w
+
+
+def _by_rule(heard: Heard, rule: str) -> tuple[Array, Array]:
+    """Own weights (R, A) and those of links (R, E); each agent's sum to one."""
+    graph, size = heard.graph, heard.graph.size
+    if rule == "equal":
+        ones = np.ones(heard.means.shape[:2])
+        return _shared(ones, heard.arrived.astype(np.float64), heard)
+    if rule in ("trace", "determinant"):
+        # Such a weight is a number of the source alone, up to the sum of what an agent has.
+        both = np.concatenate([heard.covs, heard.sent_covs], axis=1)
+        shares = _intersection_weights(both, rule, np.ones(both.shape[:2], dtype=bool))
+        sent = shares[:, size:][:, graph.senders]
+        return _shared(shares[:, :size], sent * heard.arrived, heard)
+    own, links = np.empty(heard.means.shape[:2]), np.zeros(heard.arrived.shape)
+    for agents, at in heard.groups():
+        _, covs, here = heard.collected(agents, at)
+        omega = _intersection_weights(covs, rule, here)
+        own[:, agents], links[:, at] = omega[..., 0], omega[..., 1:]
+    return own, links
+
+
+def _shared(own: Array, links: Array, heard: Heard) -> tuple[Array, Array]:
+    total = own + heard.sums(links)
+    return own / total, links / total[:, heard.graph.receivers]
 
 
 def naive_fusion(
@@ -96,10 +171,11 @@ def naive_fusion(
     array([0.666667, 0.666667])
     """
 
-    def fuse(m: Array, p: Array, here: Array) -> tuple[Array, Array]:
-        return _information_sum(m, p, here.astype(np.float64))
+    def step(heard: Heard) -> tuple[Array, Array]:
+        ones = np.ones(heard.means.shape[:2])
+        return _information_sum(heard, ones, heard.arrived.astype(np.float64))
 
-    return exchanged(means, covs, channel, rounds, fuse)
+    return in_rounds(*_checked(means, covs, channel), channel, rounds, step)
 
 
 def arithmetic_average(
@@ -122,28 +198,110 @@ def arithmetic_average(
     (array([1.5, 1.5]), array([3.75, 3.75]))
     """
 
-    def fuse(m: Array, p: Array, here: Array) -> tuple[Array, Array]:
-        omega = here / here.sum(axis=0)
-        centre = (omega[..., None] * m).sum(axis=0)
-        gap = m - centre
-        spread = p + gap[..., :, None] * gap[..., None, :]
-        return centre, symmetrise((omega[..., None, None] * spread).sum(axis=0))
+    def step(heard: Heard) -> tuple[Array, Array]:
+        own, links = _by_rule(heard, "equal")
+        gap = heard.gaps()
+        moved = heard.sums(links[..., None] * gap)
+        # From the new mean: the own one lies -moved away, a heard one gap - moved.
+        left = gap - moved[:, heard.graph.receivers]
+        spread = heard.sums(links[..., None, None] * left[..., :, None] * left[..., None, :])
+        spread += own[..., None, None] * moved[..., :, None] * moved[..., None, :]
+        covs = heard.mixed(own, links, heard.covs, heard.sent_covs)
+        return heard.means + moved, _symmetrise(covs + spread)
 
-    return exchanged(means, covs, channel, rounds, fuse)
+    return in_rounds(*_checked(means, covs, channel), channel, rounds, step)
 
 
-def exchanged(
-    means: ArrayLike, covs: ArrayLike, channel: Channel, rounds: int, fuse: Fuse
+def consensus_pull(
+    means: ArrayLike,
+    covs: ArrayLike,
+    channel: Channel,
+    *,
+    gain: float,
+    rule: str = "scalar",
+    rounds: int = 1,
 ) -> tuple[Array, Array]:
-    """Let agents exchange means and covariances, and fuse all that each has, for some rounds.
+    r"""Pull each mean towards the neighbours': the consensus Kalman filter's step.
+
+    .. math:: \mathbf m_i\leftarrow\mathbf m_i
+        +\boldsymbol\Gamma_i\sum_j(\mathbf m_j-\mathbf m_i),\qquad
+        \boldsymbol\Gamma_i=\gamma\mathbf I\ \text{ or }\
+        \gamma\frac{\mathbf P_i}{1+\|\mathbf P_i\|_F}
+
+    The covariances stay as they are: the pull is not in them, which is cheap, and wrong as soon as
+    neighbours' errors are correlated.
 
     Parameters
     ----------
-    means, covs, channel, rounds
+    means : array_like, (*runs, A, d)
+        Each agent's mean.
+    covs : array_like, (*runs, A, d, d)
+        Each agent's covariance, positive definite.
+    channel : Channel
+        Only means go over each link, d scalars. A mean that is lost does not pull.
+    gain : float
+        The gain γ, at least 0; 0 sends nothing and changes nothing.
+    rule : {"scalar", "covariance"}
+        The same gain for all components, or more where an agent is less sure.
+    rounds : int
+        How many times.
+
+    Returns
+    -------
+    means : ndarray, (*runs, A, d)
+    covs : ndarray, (*runs, A, d, d)
+
+    Warns
+    -----
+    UnstableGain
+        If the gain is above 2/λ_max, so that the means drift apart.
+
+    Notes
+    -----
+    R. Olfati-Saber, IEEE Conference on Decision and Control (2007) 5492-5498, algorithm 3.
+
+    Examples
+    --------
+    >>> from distfilt.network import Channel, graphs
+    >>> consensus_pull([[0.0], [4.0]], [[[1.0]], [[2.0]]], Channel(graphs.path(2)), gain=0.25)[0]
+    array([[1.],
+           [3.]])
+    """
+    m, p = _checked(means, covs, channel)
+    g = number(gain, "gain", at_least=0)
+    choice(rule, "rule", ("scalar", "covariance"))
+    needed = count(rounds, "rounds")
+    if g == 0:
+        return m.copy(), p.copy()
+    trust = np.broadcast_to(np.eye(m.shape[-1]), p.shape)
+    largest = 1.0
+    if rule == "covariance":
+        norm = np.sqrt((p**2).sum(axis=(-2, -1), keepdims=True))
+        trust = p / (1 + norm)
+        largest = float((norm / (1 + norm)).max())
+    warn_if_unstable(channel.graph, g * largest)
+    weights = weighting.laplacian(channel.graph, g)
+    for _ in range(needed):
+        change = channel.combine(m, weights, lost="keep") - m
+        m = m + (trust @ change[..., None])[..., 0]
+    return m, p.copy()
+
+
+def exchanged(
+    means: ArrayLike, covs: ArrayLike, channel: Channel, fuse: Fuse, *, rounds: int = 1
+) -> tuple[Array, Array]:
+    """Let agents exchange means and covariances, and fuse all that each has by a rule of yours.
+
+    Parameters
+    ----------
+    means, covs, channel
         As for :func:`covariance_intersection`.
     fuse : callable
-        ``fuse(means, covs, here) -> mean, cov`` of S sources: (S, *runs, d), (S, *runs, d, d), and
-        (S, *runs) telling which of them arrived; the agent's own comes first.
+        ``fuse(means, covs, here) -> mean, cov`` of S sources: (..., S, d), (..., S, d, d), and
+        (..., S) telling which of them arrived, to (..., d) and (..., d, d). The agent's own comes
+        first. It is called once for all agents that hear equally many.
+    rounds : int
+        How many times.
 
     Returns
     -------
@@ -155,64 +313,38 @@ def exchanged(
     The own estimate, whatever the neighbours say:
 
     >>> from distfilt.network import Channel, graphs
-    >>> own = exchanged([[0.0], [3.0]], [[[1.0]], [[2.0]]], Channel(graphs.path(2)), 1,
-    ...                 lambda means, covs, here: (means[0], covs[0]))
+    >>> own = exchanged([[0.0], [3.0]], [[[1.0]], [[2.0]]], Channel(graphs.path(2)),
+    ...                 lambda means, covs, here: (means[..., 0, :], covs[..., 0, :, :]))
     >>> own[0].ravel()
     array([0., 3.])
     """
+    callable_(fuse, "fuse")
+    return fused_by(*_checked(means, covs, channel), channel, fuse, rounds)
+
+
+def _checked(means: ArrayLike, covs: ArrayLike, channel: Channel) -> tuple[Array, Array]:
     if not isinstance(channel, Channel):
         raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
     m = array(means, "means", (*channel.runs, channel.graph.size, "d"))
-    p = covariance(array(covs, "covs", (*m.shape, m.shape[-1])), "covs")
-    upper = np.triu_indices(m.shape[-1])
-    for _ in range(count(rounds, "rounds")):
-        packed = np.concatenate([m, p[..., upper[0], upper[1]]], axis=-1)
-        inbox = channel.exchange([packed[..., a, :] for a in range(channel.graph.size)])
-        fused = [
-            _with_own(m[..., a, :], p[..., a, :, :], inbox[a], upper, fuse)
-            for a in range(channel.graph.size)
-        ]
-        m = np.stack([f[0] for f in fused], axis=-2)
-        p = np.stack([f[1] for f in fused], axis=-3)
-    return m, p
+    return m, covariance(array(covs, "covs", (*m.shape, m.shape[-1])), "covs")
 
 
-def _with_own(
-    mean: Array, cov: Array, heard: dict[int, Array], upper: _Upper, fuse: Fuse
-) -> tuple[Array, Array]:
-    """Unpack what one agent heard, put it behind its own, and fuse; lost runs weigh nothing."""
-    d = mean.shape[-1]
-    means, covs, here = [mean], [cov], [np.ones(mean.shape[:-1], dtype=bool)]
-    for packed in heard.values():
-        arrived = ~np.isnan(packed[..., 0])
-        full = np.zeros((*packed.shape[:-1], d, d))
-        full[..., upper[0], upper[1]] = packed[..., d:]
-        full[..., upper[1], upper[0]] = packed[..., d:]
-        keep = arrived[..., None]
-        means.append(np.where(keep, packed[..., :d], 0.0))
-        covs.append(np.where(keep[..., None], full, np.eye(d)))
-        here.append(arrived)
-    return fuse(np.stack(means), np.stack(covs), np.stack(here))
+def _information_sum(heard: Heard, own: Array, links: Array) -> tuple[Array, Array]:
+    """Weighted sum of information matrices and vectors, turned back into mean and covariance.
+
+    The same as :func:`distfilt.gaussians.intersection`, for all neighbourhoods at once.
+    """
+    mine = _inverse(heard.covs)
+    sent = mine if heard.sent_covs is heard.covs else _inverse(heard.sent_covs)
+    total = _inverse(heard.mixed(own, links, mine, sent))
+    # About the own mean, so that equal means stay and large ones lose no digits.
+    turned = (sent[:, heard.graph.senders] @ heard.gaps()[..., None])[..., 0]
+    moved = (total @ heard.sums(links[..., None] * turned)[..., None])[..., 0]
+    return heard.means + moved, _symmetrise(total)
 
 
-def _omegas(covs: Array, here: Array, rule: str) -> Array:
-    if rule == "fixed":
-        sizes = np.ones(here.shape)
-    elif rule == "trace":
-        sizes = np.trace(covs, axis1=-2, axis2=-1)
-    else:
-        sizes = np.exp(np.linalg.slogdet(covs)[1] / covs.shape[-1])
-    weight = here / sizes
-    return np.asarray(weight / weight.sum(axis=0))
-
-
-def _information_sum(means: Array, covs: Array, omega: Array) -> tuple[Array, Array]:
-    """Weighted sum of information matrices and vectors, turned back into mean and covariance."""
-    d = means.shape[-1]
-    eye = np.broadcast_to(np.eye(d), covs.shape)
-    information = np.linalg.solve(covs, eye)
-    total = symmetrise((omega[..., None, None] * information).sum(axis=0))
-    vector = (omega[..., None] * (information @ means[..., None])[..., 0]).sum(axis=0)
-    both = np.concatenate([vector[..., None], np.broadcast_to(np.eye(d), total.shape)], axis=-1)
-    solved = np.linalg.solve(total, both)
-    return np.asarray(solved[..., 0]), symmetrise(solved[..., 1:])
+def _inverse(spd: Array) -> Array:
+    """Inverse of positive definite matrices by the inverse of their Cholesky factors."""
+    lower: Array = np.asarray(np.linalg.cholesky(spd), dtype=np.float64)
+    half = _solve_lower(lower, np.broadcast_to(np.eye(spd.shape[-1]), spd.shape))
+    return np.asarray(half.swapaxes(-1, -2) @ half)

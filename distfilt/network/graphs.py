@@ -1,247 +1,22 @@
-"""Graphs of agents: who hears whom, static or moving, and what follows from the links alone."""
+"""Graphs of agents in common shapes, at random, and by the range of radios."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
+from numpy.typing import ArrayLike
 
-from ..checks import Array, array, count, generator, number
+from ..checks import array, count, generator, number
+from .links import Graph, Indices, linked
 
 __all__ = ["Graph", "complete", "disk", "grid", "path", "random", "ring", "star"]
 
-Indices = NDArray[np.int64]
-
-_DENSE = 200
-"""Up to this many agents a dense eigenvalue solver is the faster one."""
+_BLOCK = 4_000_000
+"""Numbers that :func:`random` draws at a time."""
 
 
-@dataclass(frozen=True, eq=False)
-class Graph:
-    """Links between agents, without self-loops: an agent always knows what it knows itself.
-
-    Build it with :meth:`from_adjacency`, :meth:`from_edges` or one of this module's functions. A
-    graph that changes in time is a function ``t -> Graph``.
-
-    Parameters
-    ----------
-    links : scipy.sparse.csr_array, (A, A)
-        ``links[i, j] = 1`` when agent i hears agent j; indices ascending in each row.
-
-    Examples
-    --------
-    >>> graph = Graph.from_adjacency([[0, 1, 1], [1, 0, 0], [1, 0, 0]])
-    >>> graph.neighbours(0)
-    (1, 2)
-    >>> graph.spectrum.round(6) + 0.0
-    array([0., 1., 3.])
-    """
-
-    links: sparse.csr_array
-
-    @classmethod
-    def from_adjacency(cls, adjacency: ArrayLike, *, directed: bool = False) -> Graph:
-        """Build a graph from a matrix of zeros and ones.
-
-        Parameters
-        ----------
-        adjacency : array_like, (A, A)
-            Row i marks the agents that agent i hears.
-        directed : bool
-            Accept links that go one way only.
-
-        Raises
-        ------
-        ValueError
-            If the matrix is not square, has entries other than 0 and 1 or a self-loop, or is not
-            symmetric although the graph is undirected.
-        """
-        a = array(adjacency, "adjacency", ("A", "A"))
-        if a.shape[0] != a.shape[1] or a.shape[0] == 0:
-            raise ValueError(f"adjacency: needs a square matrix, got shape {a.shape}")
-        if not np.isin(a, (0, 1)).all():
-            raise ValueError(f"adjacency: needs zeros and ones, got {a[~np.isin(a, (0, 1))][0]:g}")
-        return cls.from_edges(a.shape[0], np.argwhere(a), directed=directed, name="adjacency")
-
-    @classmethod
-    def from_edges(
-        cls,
-        agents: int,
-        edges: ArrayLike,
-        *,
-        directed: bool = False,
-        name: str = "edges",
-    ) -> Graph:
-        """Build a graph from its links, listed as pairs (listener, speaker).
-
-        Parameters
-        ----------
-        agents : int
-            Number A of agents.
-        edges : array_like of int, (E, 2)
-            The links; of an undirected graph each has to be listed both ways.
-        directed : bool
-            Accept links that go one way only.
-        name : str
-            What an error calls the links.
-        """
-        size = count(agents, "agents")
-        pairs = array(edges, name)
-        pairs = pairs.reshape(-1, 2) if pairs.size == 0 else array(pairs, name, ("E", 2))
-        listed = pairs.astype(np.int64)
-        inside = not listed.size or 0 <= listed.min() <= listed.max() < size
-        if (listed != pairs).any() or not inside:
-            raise ValueError(f"{name}: needs agents from 0 to {size - 1}, got {pairs.tolist()[:3]}")
-        loops = listed[listed[:, 0] == listed[:, 1], 0]
-        if loops.size:
-            raise ValueError(f"{name}: needs no self-loops, got one at agent {loops[0]}")
-        graph = cls(_csr(size, listed))
-        if not directed and graph.directed:
-            i, j = np.argwhere((graph.links != graph.links.T).toarray())[0]
-            raise ValueError(
-                f"{name}: needs every link both ways in an undirected graph, got one way only "
-                f"between agents {i} and {j}"
-            )
-        return graph
-
-    @property
-    def size(self) -> int:
-        """Number A of agents."""
-        return int(self.links.shape[0])
-
-    @cached_property
-    def receivers(self) -> Indices:
-        """The listener of each link, (E,), ascending."""
-        return np.repeat(np.arange(self.size), np.diff(self.links.indptr))
-
-    @cached_property
-    def senders(self) -> Indices:
-        """The speaker of each link, (E,), ascending for each listener."""
-        return np.asarray(self.links.indices, dtype=np.int64)
-
-    @cached_property
-    def reverse(self) -> Indices:
-        """For each link the number of the one that goes the other way, (E,); -1 for none."""
-        key = self.receivers * self.size + self.senders
-        other = self.senders * self.size + self.receivers
-        found = np.searchsorted(key, other).clip(max=max(key.size - 1, 0))
-        return np.where(key[found] == other, found, -1) if key.size else found
-
-    @cached_property
-    def incidence(self) -> sparse.csr_array:
-        """Sums what arrives over an agent's links: ``incidence[i, e] = 1`` if link e ends at i."""
-        edges = self.senders.size
-        return sparse.csr_array(
-            (np.ones(edges), np.arange(edges), self.links.indptr), (self.size, edges)
-        )
-
-    def neighbours(self, agent: int) -> tuple[int, ...]:
-        """The agents that `agent` hears, ascending, without itself."""
-        i = count(agent, "agent", at_least=0)
-        if i >= self.size:
-            raise ValueError(f"agent: needs an agent below {self.size}, got {i}")
-        row = self.links.indices[self.links.indptr[i] : self.links.indptr[i + 1]]
-        return tuple(row.tolist())
-
-    @cached_property
-    def degrees(self) -> Array:
-        """How many agents each agent hears, (A,)."""
-        return np.asarray(np.diff(self.links.indptr), dtype=np.float64)
-
-    @cached_property
-    def listeners(self) -> Array:
-        """How many agents hear each agent, (A,)."""
-        return np.bincount(self.senders, minlength=self.size).astype(np.float64)
-
-    @cached_property
-    def directed(self) -> bool:
-        """Whether some link goes one way only."""
-        return bool((self.reverse < 0).any())
-
-    @cached_property
-    def laplacian(self) -> sparse.csr_array:
-        """The Laplacian, sparse: degrees on the diagonal, -1 where an agent hears another."""
-        return (sparse.diags_array(self.degrees) - self.links).tocsr()
-
-    @cached_property
-    def spectrum(self) -> Array:
-        """Eigenvalues of the Laplacian of an undirected graph, ascending, (A,)."""
-        self._undirected()
-        return np.asarray(np.linalg.eigvalsh(self.laplacian.toarray()), dtype=np.float64)
-
-    @cached_property
-    def fiedler_value(self) -> float:
-        """The second smallest eigenvalue of the Laplacian; 0 where the graph is not connected."""
-        self._undirected()
-        if self.size == 1 or not self.connected:
-            return 0.0
-        if self.size <= _DENSE:
-            return float(self.spectrum[1])
-        from scipy.sparse.linalg import eigsh
-
-        # Shifted below zero the matrix is definite; a fixed start makes the result repeatable.
-        shift, start = -1e-3 * float(self.degrees.mean()), np.cos(np.arange(self.size))
-        values = eigsh(
-            self.laplacian.tocsc(), k=2, sigma=shift, v0=start, return_eigenvectors=False
-        )
-        return float(np.sort(values)[1])
-
-    @property
-    def largest_gain(self) -> float:
-        r"""The bound :math:`2/\lambda_{\max}` below which averaging agrees."""
-        largest = self.spectrum[-1]
-        return float(2 / largest) if largest > 0 else float("inf")
-
-    @cached_property
-    def components(self) -> Indices:
-        """For each agent the number of its (strongly) connected component, (A,)."""
-        _, labels = sparse.csgraph.connected_components(self.links, connection="strong")
-        return np.asarray(labels, dtype=np.int64)
-
-    @property
-    def connected(self) -> bool:
-        """Whether every agent can reach every other along the links."""
-        return int(self.components.max()) == 0
-
-    @cached_property
-    def diameter(self) -> int:
-        """The largest number of hops between two agents of a connected graph."""
-        if not self.connected:
-            parts = self.components.max() + 1
-            raise ValueError(f"graph: needs a connected graph, got {parts} parts")
-        hops = sparse.csgraph.shortest_path(self.links, unweighted=True)
-        return int(hops.max())
-
-    def _undirected(self) -> None:
-        if self.directed:
-            raise ValueError("graph: needs links both ways for a real spectrum, got one-way links")
-
-    def to_networkx(self) -> Any:
-        """The same graph as a networkx DiGraph whose edges run from speaker to listener."""
-        import networkx as nx
-
-        return nx.from_scipy_sparse_array(self.links.T, create_using=nx.DiGraph)
-
-
-def _csr(size: int, pairs: Indices) -> sparse.csr_array:
-    links = sparse.csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (size, size))
-    links.sum_duplicates()
-    links.data[:] = 1.0
-    links.sort_indices()
-    return links
-
-
-def _from_networkx(graph: Any) -> Graph:
-    """An undirected networkx graph, its nodes in networkx's order."""
-    import networkx as nx
-
-    numbered = nx.convert_node_labels_to_integers(graph)
-    pairs = np.array(numbered.edges, dtype=np.int64).reshape(-1, 2)
-    return Graph(_csr(len(numbered), np.concatenate([pairs, pairs[:, ::-1]])))
+def _both_ways(size: int, first: Indices, second: Indices) -> Graph:
+    one_way = np.stack([first.ravel(), second.ravel()], axis=1)
+    return Graph(linked(size, np.concatenate([one_way, one_way[:, ::-1]])))
 
 
 def path(agents: int) -> Graph:
@@ -252,9 +27,8 @@ def path(agents: int) -> Graph:
     >>> path(3).neighbours(1)
     (0, 2)
     """
-    import networkx as nx
-
-    return _from_networkx(nx.path_graph(count(agents, "agents")))
+    number_of = np.arange(count(agents, "agents"))
+    return _both_ways(number_of.size, number_of[:-1], number_of[1:])
 
 
 def ring(agents: int) -> Graph:
@@ -265,9 +39,8 @@ def ring(agents: int) -> Graph:
     >>> ring(4).neighbours(0)
     (1, 3)
     """
-    import networkx as nx
-
-    return _from_networkx(nx.cycle_graph(count(agents, "agents", at_least=3)))
+    number_of = np.arange(count(agents, "agents", at_least=3))
+    return _both_ways(number_of.size, number_of, np.roll(number_of, -1))
 
 
 def star(agents: int) -> Graph:
@@ -278,9 +51,8 @@ def star(agents: int) -> Graph:
     >>> star(5).spectrum.round(6) + 0.0
     array([0., 1., 1., 1., 5.])
     """
-    import networkx as nx
-
-    return _from_networkx(nx.star_graph(count(agents, "agents") - 1))
+    others = np.arange(1, count(agents, "agents"))
+    return _both_ways(others.size + 1, np.zeros_like(others), others)
 
 
 def grid(rows: int, columns: int) -> Graph:
@@ -291,9 +63,11 @@ def grid(rows: int, columns: int) -> Graph:
     >>> grid(2, 3).neighbours(4)
     (1, 3, 5)
     """
-    import networkx as nx
-
-    return _from_networkx(nx.grid_2d_graph(count(rows, "rows"), count(columns, "columns")))
+    shape = count(rows, "rows"), count(columns, "columns")
+    number_of = np.arange(shape[0] * shape[1]).reshape(shape)
+    first = np.concatenate([number_of[:, :-1].ravel(), number_of[:-1].ravel()])
+    second = np.concatenate([number_of[:, 1:].ravel(), number_of[1:].ravel()])
+    return _both_ways(number_of.size, first, second)
 
 
 def complete(agents: int) -> Graph:
@@ -304,9 +78,8 @@ def complete(agents: int) -> Graph:
     >>> complete(4).degrees
     array([3., 3., 3., 3.])
     """
-    import networkx as nx
-
-    return _from_networkx(nx.complete_graph(count(agents, "agents")))
+    size = count(agents, "agents")
+    return _both_ways(size, *np.triu_indices(size, 1))
 
 
 def random(
@@ -332,11 +105,15 @@ def random(
     """
     size = count(agents, "agents")
     p = number(probability, "probability", at_least=0, at_most=1)
-    drawn = generator(rng).random((size, size)) < p
-    np.fill_diagonal(drawn, False)
+    source, rows = generator(rng), max(1, _BLOCK // size)
+    found = []
+    for start in range(0, size, rows):
+        block = np.argwhere(source.random((min(rows, size - start), size)) < p)
+        found.append(block + [start, 0])
+    i, j = np.concatenate(found).T
     if not directed:
-        drawn = np.triu(drawn) | np.triu(drawn).T
-    return Graph(_csr(size, np.argwhere(drawn)))
+        return _both_ways(size, i[i < j], j[i < j])
+    return Graph(linked(size, np.stack([i[i != j], j[i != j]], axis=1)))
 
 
 def disk(positions: ArrayLike, radius: float) -> Graph:
@@ -365,4 +142,4 @@ def disk(positions: ArrayLike, radius: float) -> Graph:
         raise ValueError(f"positions: needs at least one agent, got shape {places.shape}")
     reach = number(radius, "radius", above=0)
     pairs = cKDTree(places).query_pairs(reach, output_type="ndarray").astype(np.int64)
-    return Graph(_csr(len(places), np.concatenate([pairs, pairs[:, ::-1]])))
+    return _both_ways(len(places), pairs[:, 0], pairs[:, 1])

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, number
+from ..checks import Array, array, count, number
 from . import weights as weighting
 from .channel import Channel
 from .weights import Weights
@@ -53,7 +53,9 @@ def pi_start(estimate: ArrayLike) -> PIState:
     return PIState(first.copy(), np.zeros_like(first))
 
 
-def stable_substeps(channel: Channel, dt: float, *, alpha: float, a: float, b: float) -> int:
+def stable_substeps(
+    channel: Channel, dt: float, *, alpha: float, a: float, b: float, safety: float = 2.0
+) -> int:
     r"""How many explicit steps make up `dt` so that the estimator is stable.
 
     An eigenvalue λ of the Laplacian contributes the matrix
@@ -70,12 +72,14 @@ def stable_substeps(channel: Channel, dt: float, *, alpha: float, a: float, b: f
         The step that is wanted, in s, positive.
     alpha, a, b : float
         The gains of :func:`pi_step`.
+    safety : float
+        Factor, at least 1, by which the steps are shorter than the bound of stability, at which a
+        mode would swing for ever. With 2 the fastest mode does not swing at all.
 
     Returns
     -------
     int
-        At least 1; the smallest number for which h = `dt` / number is half the stability limit or
-        less.
+        At least 1; the smallest number for which h = `dt` / number is the bound / `safety` or less.
 
     Examples
     --------
@@ -83,7 +87,9 @@ def stable_substeps(channel: Channel, dt: float, *, alpha: float, a: float, b: f
     >>> stable_substeps(Channel(graphs.complete(100)), 0.1, alpha=0.2, a=0.4, b=0.04)
     8
     """
-    step = number(dt, "dt", above=0)
+    if not isinstance(channel, Channel):
+        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
+    step, factor = number(dt, "dt", above=0), number(safety, "safety", at_least=1)
     gains = [number(g, n, at_least=0) for g, n in ((alpha, "alpha"), (a, "a"), (b, "b"))]
     bound = 2 * float(channel.graph.degrees.max())
     rate = gains[0] + gains[1] * bound
@@ -93,7 +99,7 @@ def stable_substeps(channel: Channel, dt: float, *, alpha: float, a: float, b: f
     # modulus b λ and the real part -(α + a λ)/2, and the largest λ is the worst.
     spring = gains[2] * bound
     limit = 2 / rate if 2 * spring <= rate else min(2 / rate, rate / spring**2)
-    return max(1, int(np.ceil(2 * step / limit)))
+    return max(1, int(np.ceil(factor * step / limit)))
 
 
 def pi_step(
@@ -124,7 +130,8 @@ def pi_step(
     state : PIState
         Not changed.
     inputs : array_like, (*runs, A, k)
-        What the agents measure at the beginning of the step, u.
+        What the agents measure at the beginning of the step, u. Within the step it moves on by
+        `rate`, or stays.
     channel : Channel
         Links both ways. Each substep is a round of 2k scalars a link. A link of which a message is
         lost rests for that round.
@@ -152,6 +159,8 @@ def pi_step(
     """
     if not isinstance(state, PIState):
         raise ValueError(f"state: needs a PIState, got {type(state).__name__}")
+    if not isinstance(channel, Channel):
+        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
     if channel.graph.directed:
         raise ValueError("channel: needs links both ways to keep the sum, got one-way links")
     shape = (*channel.runs, channel.graph.size, state.estimate.shape[-1])
@@ -160,7 +169,7 @@ def pi_step(
     u = array(inputs, "inputs", shape)
     slope = 0.0 if rate is None else array(rate, "rate", shape)
     least = stable_substeps(channel, dt, alpha=alpha, a=a, b=b)
-    n = least if substeps is None else int(number(substeps, "substeps", at_least=1))
+    n = least if substeps is None else count(substeps, "substeps")
     h, k = dt / n, u.shape[-1]
     # One combination gives -h L of both: the weights I - h L less the values themselves.
     weights = weighting.laplacian(channel.graph, h)

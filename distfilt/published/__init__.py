@@ -1,31 +1,35 @@
 """What the papers print, the scenarios of their studies, and verdicts on our reproductions."""
 
+from .parameters import judge_parameters
+from .parts import Parameter, Row, UnknownKey
 from .scenarios import read_scenario, scenario
-from .specs import AgentSpec, Parameter, Scenario, UnknownKey
-from .tables import PAPERS, Item, Table, items, read_table, root, table
+from .specs import Reading, Scenario
+from .tables import KINDS, PAPERS, Item, Table, accepted, items, read_table, root, table
 from .verdicts import (
     VERDICTS,
     Claim,
     Value,
     Verdict,
     judge_claims,
-    judge_parameters,
     judge_table,
     judge_value,
 )
 
 __all__ = [
+    "KINDS",
     "PAPERS",
     "VERDICTS",
-    "AgentSpec",
     "Claim",
     "Item",
     "Parameter",
+    "Reading",
+    "Row",
     "Scenario",
     "Table",
     "UnknownKey",
     "Value",
     "Verdict",
+    "accepted",
     "items",
     "judge_claims",
     "judge_parameters",

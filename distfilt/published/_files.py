@@ -8,17 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ..folders import data_root
+
 __all__: list[str] = []  # used inside this folder only
-
-_PACKAGE = Path(__file__).resolve().parents[1]
-
-
-def data_root() -> Path:
-    """The folder that holds `published` and `scenarios`: the wheel's, else the repository's."""
-    for folder in (_PACKAGE / "_data", _PACKAGE.parent / "data"):
-        if (folder / "published").is_dir() and (folder / "scenarios").is_dir():
-            return folder
-    raise FileNotFoundError("distfilt is installed without its folders published and scenarios")
 
 
 def shown(path: Path) -> str:

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable
 from dataclasses import MISSING, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from ..checks import choice
-from ._files import data_root, fault, named_file, read_text
-from .specs import AgentSpec, Parameter, Scenario, link_fault
+from ..folders import data_root
+from ._files import fault, named_file, read_text
+from .parts import Parameter, Row, link_fault
+from .specs import Scenario
 from .tables import PAPERS
 
 __all__ = ["read_scenario", "scenario"]
+
+_GROUPS = ("parameters", "notes")
+_T = TypeVar("_T")
 
 
 def _line(text: str, header: str, nth: int, key: str) -> int:
@@ -33,21 +38,22 @@ def _line(text: str, header: str, nth: int, key: str) -> int:
     return heads[nth] + 1
 
 
-def _build(
-    path: Path, text: str, header: str, nth: int, kind: type[Any], given: Mapping[str, Any]
-) -> Any:
-    """A `Parameter` or `AgentSpec` from its table in the file; faults name file and line."""
-    known = {field.name: field.default is MISSING for field in fields(kind)}
+def _parameter(path: Path, text: str, header: str, name: str, given: Any) -> Parameter:
+    """A `Parameter` from its table in the file; faults name file and line."""
+    known = {f.name: f.default is MISSING for f in fields(Parameter)}
     for key in given:
         if key not in known:
-            line = _line(text, header, nth, key)
+            line = _line(text, header, 0, key)
             raise fault(path, line, f"{header} has an unknown key {key!r}")
-    missing = [key for key, needed in known.items() if needed and key not in given]
+    missing = [k for k, needed in known.items() if needed and k not in given and k != "name"]
     if missing:
-        line = _line(text, header, nth, missing[0])
-        raise fault(path, line, f"{header} needs {', '.join(missing)}")
+        raise fault(path, _line(text, header, 0, ""), f"{header} needs {', '.join(missing)}")
+    return _made(path, text, header, 0, lambda: Parameter(name, **given))
+
+
+def _made(path: Path, text: str, header: str, nth: int, make: Callable[[], _T]) -> _T:
     try:
-        return kind(**given)
+        return make()
     except ValueError as error:
         line = _line(text, header, nth, str(error).split(":")[0])
         raise fault(path, line, f"{header} {error}") from None
@@ -56,9 +62,11 @@ def _build(
 def read_scenario(path: str | Path) -> Scenario:
     """Read a scenario from a TOML file.
 
-    The file has a ``title``, one table ``[parameters.NAME]`` for each parameter with ``value``,
-    ``unit``, ``source`` and ``where`` (if given) or ``reason``, and one ``[[agents]]`` for each
-    agent. The folder's name becomes the paper, the file's the name.
+    The file has a ``title``, one table ``[parameters.NAME]`` for each parameter that the study
+    reads with ``value``, ``unit``, ``source`` and ``where`` (if given) or ``reason``, one table
+    ``[notes.NAME]`` of the same form for what no study can read, and any arrays of tables, such as
+    one ``[[agents]]`` for each agent (see `Row`). The folder's name becomes the paper, the file's
+    the name.
 
     Parameters
     ----------
@@ -72,8 +80,8 @@ def read_scenario(path: str | Path) -> Scenario:
     Raises
     ------
     ValueError
-        With file and line, if the TOML is malformed, a key is missing, unknown or wrong, or an
-        agent's neighbours are unknown or not mutual.
+        With file and line, if the TOML is malformed, a key is missing, unknown or wrong, a unit
+        does not fit its kind, or an agent's neighbours are unknown or not mutual.
 
     Examples
     --------
@@ -83,18 +91,37 @@ def read_scenario(path: str | Path) -> Scenario:
     """
     source, text = read_text(path)
     data = _load(source, text)
-    parameters = tuple(
-        _build(source, text, f"[parameters.{name}]", 0, Parameter, {"name": name, **entries})
-        for name, entries in data["parameters"].items()
+    groups = {
+        group: tuple(
+            _parameter(source, text, f"[{group}.{name}]", name, entries)
+            for name, entries in data.get(group, {}).items()
+        )
+        for group in _GROUPS
+    }
+    twice = {p.name for p in groups["parameters"]} & {p.name for p in groups["notes"]}
+    for name in sorted(twice):
+        header = f"[notes.{name}]"
+        raise fault(source, _line(text, header, 0, ""), f"{header} is a parameter already")
+    tables = {
+        name: _rows(source, text, name, data[name])
+        for name in data
+        if name not in ("title", *_GROUPS)
+    }
+    title, named = data["title"], (source.parent.name, source.stem)
+    return Scenario(*named, title, groups["parameters"], notes=groups["notes"], tables=tables)
+
+
+def _rows(path: Path, text: str, name: str, blocks: list[Any]) -> tuple[Row, ...]:
+    """One table's rows, which name each other rightly."""
+    header = f"[[{name}]]"
+    rows = tuple(
+        _made(path, text, header, k, lambda block=block: Row(block))  # type: ignore[misc]
+        for k, block in enumerate(blocks)
     )
-    agents = tuple(
-        _build(source, text, "[[agents]]", k, AgentSpec, entries)
-        for k, entries in enumerate(data.get("agents", []))
-    )
-    found = link_fault(agents)
+    found = link_fault(rows)
     if found is not None:
-        raise fault(source, _line(text, "[[agents]]", found[0], found[1]), found[2])
-    return Scenario(source.parent.name, source.stem, data["title"], parameters, agents)
+        raise fault(path, _line(text, header, found[0], found[1]), found[2])
+    return rows
 
 
 def _load(source: Path, text: str) -> dict[str, Any]:
@@ -105,22 +132,30 @@ def _load(source: Path, text: str) -> dict[str, Any]:
         at = re.search(r"at line (\d+)", str(error))
         line = int(at[1]) if at else text.rstrip().count("\n") + 1
         raise fault(source, line, f"needs well-formed TOML: {error}") from None
-    for key in sorted(data.keys() - {"title", "parameters", "agents"}):
-        start = re.compile(rf"\s*\[*\s*{re.escape(key)}\b")
-        near = next((k for k, t in enumerate(text.splitlines(), 1) if start.match(t)), 1)
-        raise fault(source, near, f"has an unknown entry {key!r}")
     if not isinstance(data.get("title"), str) or not data["title"].strip():
         raise fault(source, 1, "needs a title")
-    tables, blocks = data.get("parameters"), data.get("agents", [])
-    if not isinstance(tables, dict) or not all(isinstance(t, dict) for t in tables.values()):
+    if "parameters" not in data:
         raise fault(source, 1, "needs parameters, each as [parameters.NAME]")
-    for name, entries in tables.items():
-        if "name" in entries:
-            line = _line(text, f"[parameters.{name}]", 0, "name")
-            raise fault(source, line, f"[parameters.{name}] has a name already in its header")
-    if not isinstance(blocks, list) or not all(isinstance(b, dict) for b in blocks):
-        raise fault(source, 1, "needs agents, each as [[agents]]")
+    for key in (key for key in data if key != "title"):
+        start = re.compile(rf"\s*\[*\s*{re.escape(key)}\b")
+        near = next((k for k, t in enumerate(text.splitlines(), 1) if start.match(t)), 1)
+        if key in _GROUPS:
+            tables = data[key]
+            if not isinstance(tables, dict) or not all(map(_is_table, tables.values())):
+                raise fault(source, near, f"needs {key}, each as [{key}.NAME]")
+            for name, entries in tables.items():
+                header = f"[{key}.{name}]"
+                if "name" in entries:
+                    line = _line(text, header, 0, "name")
+                    raise fault(source, line, f"{header} has a name already in its header")
+        elif not isinstance(data[key], list) or not all(map(_is_table, data[key])):
+            raise fault(source, near, f"has {key!r}, needs title, [parameters.NAME], "
+                        f"[notes.NAME] or rows, each as [[{key}]]")  # fmt: skip
     return data
+
+
+def _is_table(value: Any) -> bool:
+    return isinstance(value, dict)
 
 
 def scenario(paper: str, name: str) -> Scenario:

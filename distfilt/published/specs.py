@@ -1,199 +1,24 @@
-"""What a scenario holds: parameters with unit and source, agents, and the table it prints as."""
+"""A scenario: every parameter of a study, what was changed in it, and what a study read of it."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from difflib import get_close_matches
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ..checks import Array, choice, count, number
+from ..checks import Array, array
 from ._files import html_table, markdown_table, text_table
+from .parts import ORIGIN, Parameter, Row, UnknownKey, link_fault, nearest, plain, text
+from .tables import accepted
 
-__all__ = ["AgentSpec", "Parameter", "Scenario", "UnknownKey"]
+__all__ = ["Reading", "Scenario"]
 
-_SOURCES = ("given", "inferred", "assumed")
-_KINDS = ("direct", "angle", "range", "differential")
-_NAME = re.compile(r"[a-z][a-z0-9_]*")
-
-
-class UnknownKey(KeyError, ValueError):
-    """A scenario has no parameter of that name; the message lists the nearest names.
-
-    Examples
-    --------
-    >>> from distfilt.published import scenario
-    >>> try:
-    ...     scenario("grange", "table-2")["gian"]
-    ... except UnknownKey as error:
-    ...     print(error)
-    key: scenario grange/table-2 has no parameter 'gian'; nearest: gain, angle
-    """
-
-    def __str__(self) -> str:  # KeyError would print the message in quotes
-        return str(self.args[0])
-
-
-def _text(value: Any, name: str) -> str:
-    if not isinstance(value, str) or not value.strip():
-        raise ValueError(f"{name}: needs a text, got {value!r}")
-    return value
-
-
-def _check_origin(unit: Any, source: Any, where: Any, reason: Any) -> None:
-    """What is given says where, and what is not says why."""
-    _text(unit, "unit")
-    choice(source, "source", _SOURCES)
-    needed, text = ("where", where) if source == "given" else ("reason", reason)
-    _text(text, needed)
-    for name, value in (("where", where), ("reason", reason)):
-        if not isinstance(value, str):
-            raise ValueError(f"{name}: needs a text, got {value!r}")
-
-
-def _plain(value: Any) -> Any:
-    """A TOML value as a scalar or as (nested) tuples, checked."""
-    if isinstance(value, bool):
-        return value
-    if isinstance(value, str):
-        return _text(value, "value")
-    if isinstance(value, int | float):
-        number(value, "value")
-        return value
-    if not isinstance(value, list | tuple) or not value:
-        raise ValueError(f"value: needs a number, a text or a list of them, got {value!r}")
-    inner = tuple(_plain(v) for v in value)
-    if all(isinstance(v, str) for v in inner):
-        return inner
-    if any(isinstance(v, bool | str) for v in inner):
-        raise ValueError(f"value: needs a list of numbers or of texts, got {value!r}")
-    try:
-        np.array(inner, dtype=float)
-    except ValueError:
-        raise ValueError(f"value: needs numbers in rows of one length, got {value!r}") from None
-    return inner
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """One parameter of a study.
-
-    Parameters
-    ----------
-    name : str
-        In lower case with underscores.
-    value : bool, int, float, str or (nested) sequence
-        Its value; sequences are kept as tuples.
-    unit : str
-        ``1`` for a pure number, ``-`` where a unit has no meaning.
-    source : {"given", "inferred", "assumed"}
-        Whether the paper gives it, it follows from what the paper gives, or we chose it.
-    where : str
-        The place in the paper; needed if given.
-    reason : str
-        Why this value; needed if inferred or assumed.
-    note : str
-        A remark.
-
-    Examples
-    --------
-    >>> Parameter("gain", 0.05, "1", "assumed", reason="a sweep goes with it").why
-    'a sweep goes with it'
-    """
-
-    name: str
-    value: Any
-    unit: str
-    source: str
-    where: str = ""
-    reason: str = ""
-    note: str = ""
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not _NAME.fullmatch(self.name):
-            raise ValueError(f"name: needs a lower-case name, got {self.name!r}")
-        object.__setattr__(self, "value", _plain(self.value))
-        _check_origin(self.unit, self.source, self.where, self.reason)
-        if not isinstance(self.note, str):
-            raise ValueError(f"note: needs a text, got {self.note!r}")
-
-    @property
-    def why(self) -> str:
-        """Where it is given, or the reason for it; with the note."""
-        return " ".join(t for t in (self.reason or f"{self.where}.", self.note) if t)
-
-
-@dataclass(frozen=True)
-class AgentSpec:
-    """One agent of a study, as a row of the paper's table.
-
-    Parameters
-    ----------
-    name : str
-        Its name.
-    dims : tuple of int
-        The state's components that it sees, counted from 0.
-    kind : {"direct", "angle", "range", "differential"}
-        What it sees of them.
-    noise : float
-        Standard deviation of a reading, in `unit`, positive.
-    neighbours : tuple of str
-        Whom it hears, as printed: usually itself too.
-    unit, source, where, reason : str
-        As of a `Parameter`.
-
-    Examples
-    --------
-    >>> AgentSpec("B", (1, 2), "angle", 0.2, ("A", "B"), "rad", "given", "Table II").kind
-    'angle'
-    """
-
-    name: str
-    dims: tuple[int, ...]
-    kind: str
-    noise: float
-    neighbours: tuple[str, ...]
-    unit: str
-    source: str
-    where: str = ""
-    reason: str = ""
-
-    def __post_init__(self) -> None:
-        _text(self.name, "name")
-        for name in ("dims", "neighbours"):
-            value = getattr(self, name)
-            if not isinstance(value, list | tuple) or len(set(map(str, value))) != len(value):
-                raise ValueError(f"{name}: needs a list without repeats, got {value!r}")
-            object.__setattr__(self, name, tuple(value))
-        for k in self.dims:
-            count(k, "dims", at_least=0)
-        if not self.dims:
-            raise ValueError("dims: needs at least one component, got none")
-        for other in self.neighbours:
-            _text(other, "neighbours")
-        choice(self.kind, "kind", _KINDS)
-        number(self.noise, "noise", above=0)
-        _check_origin(self.unit, self.source, self.where, self.reason)
-
-
-def link_fault(agents: tuple[AgentSpec, ...]) -> tuple[int, str, str] | None:
-    """Position, key and message of the first fault in names and neighbours, or None."""
-    by_name: dict[str, AgentSpec] = {}
-    for k, agent in enumerate(agents):
-        if agent.name in by_name:
-            return k, "name", f"needs distinct agents, got {agent.name!r} again"
-        by_name[agent.name] = agent
-    for k, agent in enumerate(agents):
-        for other in agent.neighbours:
-            if other not in by_name:
-                return k, "neighbours", f"needs known agents, got {other!r} beside {agent.name!r}"
-            if agent.name not in by_name[other].neighbours and other != agent.name:
-                text = f"{agent.name!r} names {other!r}, which does not name it"
-                return k, "neighbours", f"needs mutual neighbours; {text}"
-    return None
+_AGENTS = "agents"
 
 
 @dataclass(frozen=True, repr=False)
@@ -207,9 +32,12 @@ class Scenario:
     title : str
         What is studied.
     parameters : tuple of Parameter
-        In the file's order.
-    agents : tuple of AgentSpec
-        In the file's order; may be empty.
+        What the study reads, in the file's order.
+    notes : tuple of Parameter
+        What describes the study but is read by nothing: choices that are built into a method, and
+        values of the paper that ours does not need. They print, but ``s["name"]`` refuses them.
+    tables : mapping from str to tuple of Row
+        The file's arrays of tables, such as ``agents``.
 
     Examples
     --------
@@ -223,33 +51,38 @@ class Scenario:
     array([[0., 1., 1.],
            [1., 0., 0.],
            [1., 0., 0.]])
+    >>> s.replace(gain=0.1).changes
+    ('gain: 0.1, not 0.05',)
     """
 
     paper: str
     name: str
     title: str
     parameters: tuple[Parameter, ...]
-    agents: tuple[AgentSpec, ...] = ()
+    notes: tuple[Parameter, ...] = field(default=(), kw_only=True)
+    tables: Mapping[str, tuple[Row, ...]] = field(default_factory=dict, kw_only=True)
 
     def __post_init__(self) -> None:
-        for field in ("paper", "name", "title"):
-            _text(getattr(self, field), field)
-        names = [p.name for p in self.parameters]
+        for name in ("paper", "name", "title"):
+            text(getattr(self, name), name)
+        names = [p.name for p in (*self.parameters, *self.notes)]
         if len(set(names)) != len(names):
-            raise ValueError("parameters: needs distinct names")
-        found = link_fault(self.agents)
-        if found is not None:
-            raise ValueError(f"agents: {found[2]}")
+            raise ValueError("parameters: needs distinct names, those of the notes included")
+        for name, rows in self.tables.items():
+            found = link_fault(tuple(rows))
+            if found is not None:
+                raise ValueError(f"{name}: {found[2]}")
 
     def parameter(self, key: str) -> Parameter:
         """The parameter of that name."""
-        names = [p.name for p in self.parameters]
-        if key in names:
-            return self.parameters[names.index(key)]
-        near = get_close_matches(str(key), names, n=3, cutoff=0.4) or names[:3]
+        named = {p.name: p for p in self.parameters}
+        if key in named:
+            return named[key]
+        here = f"scenario {self.paper}/{self.name}"
+        if any(p.name == key for p in self.notes):
+            raise UnknownKey(f"key: {here} has {key!r} among its notes, which no study reads")
         raise UnknownKey(
-            f"key: scenario {self.paper}/{self.name} has no parameter {key!r}; "
-            f"nearest: {', '.join(near) or 'none'}"
+            f"key: {here} has no parameter {key!r}; nearest: {nearest(key, list(named))}"
         )
 
     def __getitem__(self, key: str) -> Any:
@@ -278,45 +111,263 @@ class Scenario:
         """Why a parameter has its value, or where the paper gives it."""
         return self.parameter(key).why
 
+    def rows(self, table: str = _AGENTS) -> tuple[Row, ...]:
+        """The rows of one of its tables, in the file's order."""
+        if table not in self.tables:
+            raise UnknownKey(
+                f"table: scenario {self.paper}/{self.name} has no table {table!r}; nearest: "
+                f"{nearest(table, list(self.tables))}"
+            )
+        return tuple(self.tables[table])
+
+    @property
+    def agents(self) -> tuple[Row, ...]:
+        """The rows of the table ``agents``; none if it has no such table."""
+        return self.rows() if _AGENTS in self.tables else ()
+
     @property
     def adjacency(self) -> Array:
-        """Who talks to whom, (A, A): 1 or 0, without links to oneself."""
-        names = [a.name for a in self.agents]
+        """Who talks to whom, (A, A): 1 or 0, without links to oneself; from ``neighbours``."""
+        names = [row["name"] for row in self.agents]
         out = np.zeros((len(names), len(names)))
         for i, agent in enumerate(self.agents):
-            for other in agent.neighbours:
-                out[i, names.index(other)] = other != agent.name
+            for other in agent["neighbours"]:
+                out[i, names.index(other)] = other != agent["name"]
         return out
 
-    def _tables(self) -> list[tuple[Sequence[str], list[Sequence[str]]]]:
-        why = "where or why"
-        heads = ("agent", "sees", "components", "noise", "unit", "hears", "source", why)
-        rows: list[Sequence[str]] = [
-            (p.name, _shown(p.value), p.unit, p.source, p.why) for p in self.parameters
-        ]
-        agents: list[Sequence[str]] = [
-            (a.name, a.kind, _shown(a.dims), _shown(a.noise), a.unit, " ".join(a.neighbours))
-            + (a.source, a.reason or a.where)
-            for a in self.agents
-        ]
-        first: tuple[Sequence[str], list[Sequence[str]]]
-        first = ("parameter", "value", "unit", "source", why), rows
-        return [first, (heads, agents)] if agents else [first]
+    def replace(self, **values: Any) -> Scenario:
+        """The scenario with other values of some parameters; units and places stay.
+
+        Examples
+        --------
+        >>> from distfilt.published import scenario
+        >>> scenario("grange", "table-2").replace(members=50)["members"]
+        50
+        """
+        made = {key: replace(self.parameter(key), value=value) for key, value in values.items()}
+        kept = tuple(made.get(p.name, p) for p in self.parameters)
+        return replace(self, parameters=kept)
+
+    def replace_row(self, name: str, *, table: str = _AGENTS, **cells: Any) -> Scenario:
+        """The scenario with other cells in one row.
+
+        Examples
+        --------
+        >>> from distfilt.published import scenario
+        >>> s = scenario("grange", "table-2").replace_row("B", kind="range", unit="m")
+        >>> s.changes
+        ('agents.B.kind: range, not angle', 'agents.B.unit: m, not rad')
+        """
+        rows = {row["name"]: row for row in self.rows(table)}
+        if name not in rows:
+            raise UnknownKey(f"name: table {table} has no row {name!r}; nearest: "
+                             f"{nearest(name, list(rows))}")  # fmt: skip
+        rows[name] = Row({**rows[name], **cells})
+        return replace(self, tables={**self.tables, table: tuple(rows.values())})
+
+    def replace_adjacency(self, adjacency: ArrayLike) -> Scenario:
+        """The scenario with other links between its agents.
+
+        Parameters
+        ----------
+        adjacency : array_like, (A, A)
+            Nonzero where two agents talk, symmetric; every agent stays among its own neighbours.
+
+        Examples
+        --------
+        >>> from distfilt.published import scenario
+        >>> s = scenario("grange", "table-2").replace_adjacency([[0, 1, 1], [1, 0, 1], [1, 1, 0]])
+        >>> s.changes[0]
+        'agents.B.neighbours: [A, B, C], not [A, B]'
+        """
+        names = [row["name"] for row in self.agents]
+        links = array(adjacency, "adjacency", (len(names), len(names)))
+        if (links != links.T).any():
+            raise ValueError("adjacency: needs a symmetric matrix, got links that go one way")
+        heard = links.astype(bool) | np.eye(len(names), dtype=bool)
+        rows = tuple(
+            Row({**row, "neighbours": [n for n, yes in zip(names, line, strict=True) if yes]})
+            for row, line in zip(self.tables[_AGENTS], heard, strict=True)
+        )
+        return replace(self, tables={**self.tables, _AGENTS: rows})
+
+    def entries(self) -> dict[str, str]:
+        """Everything that a study can read, each as JSON: the values, not where they come from."""
+        out = {p.name: f"{_json(p.value)} {p.unit}" for p in self.parameters}
+        for table, rows in self.tables.items():
+            out[table] = _json([row["name"] for row in rows])
+            for row in rows:
+                cells = {c: row[c] for c in row.value_columns if c != "name"}
+                out |= {f"{table}.{row['name']}.{c}": _json(v) for c, v in cells.items()}
+        return out
+
+    @property
+    def digest(self) -> str:
+        """16 digits that change with every value that a study can read, and with no text."""
+        return hashlib.sha256(_json(self.entries()).encode()).hexdigest()[:16]
+
+    @property
+    def changes(self) -> tuple[str, ...]:
+        """What differs from the paper's study as the book accepts it; empty for that study itself.
+
+        A scenario of a reader's own, which the book does not know, is one change.
+        """
+        known, found = accepted(self.paper, self.name), self.entries()
+        if not known:
+            return (f"{self.paper}/{self.name} is no scenario of the book",)
+        names = [*found, *(name for name in known if name not in found)]
+        return tuple(
+            f"{name}: {_said(found, name)}, not {_said(known, name)}"
+            for name in names
+            if found.get(name) != known.get(name)
+        )
+
+    @property
+    def changed(self) -> bool:
+        """Whether it differs from the paper's study as the book accepts it."""
+        return bool(self.changes)
+
+    def reading(self) -> Reading:
+        """The same scenario, which remembers what was read of it."""
+        return Reading(
+            self.paper,
+            self.name,
+            self.title,
+            self.parameters,
+            notes=self.notes,
+            tables=self.tables,
+        )
+
+    def _shown(self) -> list[tuple[Sequence[str], list[Sequence[str]]]]:
+        heads = ("unit", "source", "where or why")
+        out: list[tuple[Sequence[str], list[Sequence[str]]]] = []
+        for head, entries in (("parameter", self.parameters), ("note", self.notes)):
+            lines = [(p.name, _plain_text(p.value), p.unit, p.source, p.why) for p in entries]
+            if lines:
+                out.append(((head, "value", *heads), list(lines)))
+        for name, rows in self.tables.items():
+            columns = list(dict.fromkeys(c for row in rows for c in row.value_columns))
+            columns = [c for c in columns if c not in ("name", "unit")]
+            cells = [
+                (row["name"], *(_plain_text(row.get(c, "")) for c in columns))
+                + (row["unit"], row["source"], row.why)
+                for row in map(_still, rows)
+            ]
+            out.append(((name, *columns, *heads), list(cells)))
+        return out
 
     def __repr__(self) -> str:
         head = f"{self.paper}/{self.name}: {self.title}"
-        return "\n".join([head, *(text_table(*t) for t in self._tables())])
+        return "\n".join([head, *(text_table(*t) for t in self._shown())])
 
     def _repr_html_(self) -> str:
-        return "\n".join(html_table(*t) for t in self._tables())
+        return "\n".join(html_table(*t) for t in self._shown())
 
     def _repr_markdown_(self) -> str:
-        return "\n\n".join(markdown_table(*t) for t in self._tables())
+        return "\n\n".join(markdown_table(*t) for t in self._shown())
 
 
-def _shown(value: Any) -> str:
+class _ReadRow(Row):
+    """A row that notes which of its columns are read."""
+
+    __slots__ = ("_seen",)
+
+    def __init__(self, cells: Mapping[str, Any], seen: set[str] | None = None) -> None:
+        super().__init__(cells)
+        object.__setattr__(self, "_seen", set() if seen is None else seen)
+
+    def __getitem__(self, key: str) -> Any:
+        value = super().__getitem__(key)
+        if key not in ORIGIN:
+            self._seen.add(key)
+        return value
+
+
+@dataclass(frozen=True, repr=False)
+class Reading(Scenario):
+    """A scenario that remembers what was read of it; `Scenario.reading` makes one.
+
+    It is read as a `Scenario` is. `used` and `unread` say which values were taken; printing takes
+    none. A copy that travels to a worker process remembers there, not here: take what a trial
+    needs before the study starts.
+
+    Examples
+    --------
+    >>> from distfilt.published import scenario
+    >>> s = scenario("grange", "table-2").reading()
+    >>> gain, noise = s["gain"], s.agents[1].noise
+    >>> s.used
+    ('gain', 'agents.B.noise')
+    >>> "members" in s.unread
+    True
+    """
+
+    _seen: dict[str, set[str]] = field(default_factory=dict, kw_only=True, compare=False)
+
+    def __getitem__(self, key: str) -> Any:
+        value = super().__getitem__(key)
+        self._seen.setdefault("", set()).add(key)
+        return value
+
+    def rows(self, table: str = _AGENTS) -> tuple[Row, ...]:
+        """The rows of one of its tables; each notes what is read of it."""
+        plain_rows = super().rows(table)
+        return tuple(
+            _ReadRow(row, self._seen.setdefault(f"{table}.{row['name']}", set()))
+            for row in map(_still, plain_rows)
+        )
+
+    @property
+    def used(self) -> tuple[str, ...]:
+        """The entries that were read: parameters, then ``table.row.column``."""
+        return tuple(name for name in self._names() if self._was_read(name))
+
+    @property
+    def unread(self) -> tuple[str, ...]:
+        """The entries that were not read."""
+        return tuple(name for name in self._names() if not self._was_read(name))
+
+    def cells(self, table: str = _AGENTS) -> tuple[dict[str, Any], ...]:
+        """What was read of each row, with its name; reading it here does not count."""
+        return tuple(
+            {"name": row["name"]}
+            | {c: row[c] for c in row.value_columns if self._was_read(f"{table}.{row['name']}.{c}")}
+            for row in map(_still, super().rows(table))
+        )
+
+    def _names(self) -> list[str]:
+        out = [p.name for p in self.parameters]
+        for table, rows in self.tables.items():
+            for row in map(_still, rows):
+                columns = [c for c in row.value_columns if c not in ("name", "unit")]
+                out += [f"{table}.{row['name']}.{c}" for c in columns]
+        return out
+
+    def _was_read(self, name: str) -> bool:
+        place, _, column = name.rpartition(".")
+        return column in self._seen.get(place, set())
+
+
+def _still(row: Row) -> Row:
+    """The row without a memory."""
+    return Row(row._cells) if isinstance(row, _ReadRow) else row
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, sort_keys=isinstance(value, dict))
+
+
+def _said(entries: Mapping[str, str], name: str) -> str:
+    """An entry as a change prints it: without quotes and without the unit 1."""
+    value = entries.get(name, "absent")
+    return value.removesuffix(" 1").removesuffix(" -").replace('"', "")
+
+
+def _plain_text(value: Any) -> str:
+    value = plain(value) if value != "" else ""
     if isinstance(value, tuple):
-        return ", ".join(f"({_shown(v)})" if isinstance(v, tuple) else _shown(v) for v in value)
+        inner = (f"({_plain_text(v)})" if isinstance(v, tuple) else _plain_text(v) for v in value)
+        return ", ".join(inner)
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:g}" if isinstance(value, float) else str(value)

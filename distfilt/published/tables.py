@@ -12,20 +12,28 @@ from pathlib import Path
 import numpy as np
 
 from ..checks import Array, array, choice, count
-from ._files import data_root, fault, named_file, read_text, shown
+from ..folders import data_root
+from ._files import fault, named_file, read_text, shown
 
-__all__ = ["PAPERS", "Item", "Table", "items", "read_table", "root", "table"]
+__all__ = ["KINDS", "PAPERS", "Item", "Table", "accepted", "items", "read_table", "root", "table"]
 
 PAPERS = ("grange", "das", "semeraro", "zheng")
 """Keys of the papers: triangular maps, constrained transport, mixture fusion, density."""
 
+KINDS = ("parameters", "results")
+"""What an item is: a table of parameters, which a study reads, or results, which it reproduces."""
+
 _COLUMN = re.compile(r"[a-z][a-z0-9_]*")
 _ITEM = re.compile(r"(Table|Fig\.) (\d+|I{1,3})")
-_ITEM_COLUMNS = ("paper", "item", "title", "chapter")
+_ITEM_COLUMNS = ("paper", "item", "kind", "title", "chapter")
+_ACCEPTED = ("paper", "scenario", "entry", "value")
 
 
 def root() -> Path:
     """The folder that holds the data: ``published/KEY`` and ``scenarios/KEY`` for each paper.
+
+    It is the working copy's that the process runs in, or the one that the library carries;
+    :func:`distfilt.folders.data_root` has the rule.
 
     Raises
     ------
@@ -58,7 +66,7 @@ class Table:
     Examples
     --------
     >>> printed = table("grange", "table-2")
-    >>> printed.text("type")
+    >>> printed.text("kind")
     ('direct', 'angle', 'direct')
     >>> printed.numbers("noise")
     array([0.2, 0.2, 0.1])
@@ -136,7 +144,7 @@ def read_table(
     Examples
     --------
     >>> read_table(root() / "published" / "items.csv", key=2).columns
-    ('paper', 'item', 'title', 'chapter')
+    ('paper', 'item', 'kind', 'title', 'chapter')
     """
     source, text = read_text(path)
     leading = count(key, "key")
@@ -200,7 +208,7 @@ def table(paper: str, name: str, *, numbers: Sequence[str] = ()) -> Table:
 
     Examples
     --------
-    >>> table("grange", "table-3").text("agent")
+    >>> table("grange", "table-3").text("name")
     ('A', 'B', 'C', 'D', 'E')
     """
     folder = data_root() / "published" / choice(paper, "paper", PAPERS)
@@ -217,6 +225,8 @@ class Item:
         The paper's key.
     item : str
         Its name as printed: ``Table II``, ``Fig. 1``.
+    kind : {"parameters", "results"}
+        Whether a study reads it or reproduces it.
     title : str
         What it shows, in our words.
     chapter : str
@@ -224,12 +234,13 @@ class Item:
 
     Examples
     --------
-    >>> Item("grange", "Table II", "Three agents", "04-satellite-network").file
+    >>> Item("grange", "Table II", "parameters", "Three agents", "04-satellite-network").file
     'table-2'
     """
 
     paper: str
     item: str
+    kind: str
     title: str
     chapter: str
 
@@ -237,6 +248,7 @@ class Item:
         choice(self.paper, "paper", PAPERS)
         if not isinstance(self.item, str) or not _ITEM.fullmatch(self.item):
             raise ValueError(f"item: needs a name like 'Table II' or 'Fig. 1', got {self.item!r}")
+        choice(self.kind, "kind", KINDS)
         for name in ("title", "chapter"):
             if not str(getattr(self, name)).strip():
                 raise ValueError(f"{name}: needs a text, got {getattr(self, name)!r}")
@@ -268,3 +280,24 @@ def items() -> tuple[Item, ...]:
         except ValueError as error:
             raise ValueError(f"{shown(path)}, line {line}: {error}") from None
     return tuple(out)
+
+
+def accepted(paper: str, name: str) -> dict[str, str]:
+    """The entries of a scenario that the book stands for; empty if it has no such scenario.
+
+    ``scenarios/accepted.csv`` has a line for every entry of every scenario, by which a change of
+    the TOML file is noticed; who changes the book's own study accepts it with
+    ``make accept``.
+
+    Parameters
+    ----------
+    paper, name : str
+        The paper's key and the scenario's name.
+
+    Examples
+    --------
+    >>> accepted("grange", "table-2")["gain"]
+    '0.05 1'
+    """
+    found = read_table(data_root() / "scenarios" / "accepted.csv", columns=_ACCEPTED, key=3)
+    return {entry: value for p, n, entry, value in found.rows if (p, n) == (paper, name)}

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +10,8 @@ import numpy as np
 
 from ..checks import choice, number
 from ._files import html_table
-from .specs import AgentSpec
+from .parts import text
+from .specs import Scenario
 from .tables import PAPERS, Item, Table, items, table
 
 __all__ = [
@@ -20,26 +20,23 @@ __all__ = [
     "Value",
     "Verdict",
     "judge_claims",
-    "judge_parameters",
     "judge_table",
     "judge_value",
 ]
 
-VERDICTS = ("match", "differs", "not comparable")
-"""What a chapter can find; an item without a verdict is "not yet" in the ledger."""
+VERDICTS = ("read", "match", "differs", "not comparable")
+"""What a chapter can find; an item without a verdict is "not yet" in the ledger.
+
+``"read"`` is for a table of parameters, ``"match"`` for results: a study that read its parameters
+has reproduced nothing yet.
+"""
 
 _MIME = "application/vnd.distfilt.verdict+json"
 
 
-def _item(paper: Any, item: Any) -> Item:
+def known_item(paper: Any, item: Any) -> Item:
     found = {i.item: i for i in items() if i.paper == choice(paper, "paper", PAPERS)}
     return found[choice(item, "item", found)]
-
-
-def _text(value: Any, name: str) -> str:
-    if not isinstance(value, str) or not value.strip():
-        raise ValueError(f"{name}: needs a text, got {value!r}")
-    return value
 
 
 @dataclass(frozen=True)
@@ -50,18 +47,18 @@ class Verdict:
     ----------
     paper, item : str
         One of `items`.
-    verdict : {"match", "differs", "not comparable"}
-        The finding.
+    verdict : {"read", "match", "differs", "not comparable"}
+        The finding: "read" only for an item of kind "parameters", "match" only for results.
     ours, published : str
         What we find and what the paper prints.
     why : str
-        Needed unless it is a match: the reason why it differs, or the input that the paper does
+        Needed if it differs or is not comparable: the reason, or the input that the paper does
         not give.
 
     Examples
     --------
-    >>> print(Verdict("grange", "Table I", "match", "4 rows read", "4 rows"))
-    grange Table I: match
+    >>> print(Verdict("grange", "Table I", "read", "4 rows read", "4 rows"))
+    grange Table I: read
       ours       4 rows read
       published  4 rows
     """
@@ -74,12 +71,13 @@ class Verdict:
     why: str = ""
 
     def __post_init__(self) -> None:
-        _item(self.paper, self.item)
-        choice(self.verdict, "verdict", VERDICTS)
-        _text(self.ours, "ours")
-        _text(self.published, "published")
-        if self.verdict != "match" or self.why != "":
-            _text(self.why, "why")
+        kind = known_item(self.paper, self.item).kind
+        other = "match" if kind == "parameters" else "read"
+        choice(self.verdict, "verdict", [v for v in VERDICTS if v != other])
+        text(self.ours, "ours")
+        text(self.published, "published")
+        if self.verdict in ("differs", "not comparable") or self.why != "":
+            text(self.why, "why")
 
     def _fields(self) -> list[tuple[str, str]]:
         pairs = [("ours", self.ours), ("published", self.published), ("why", self.why)]
@@ -99,11 +97,18 @@ class Verdict:
         }
 
 
-def _judged(item: Item, matches: bool, ours: str, published: str, why: str) -> Verdict:
-    """A match or a difference; the reason is only used, and only needed, for a difference."""
-    if matches:
-        return Verdict(item.paper, item.item, "match", ours, published)
-    return Verdict(item.paper, item.item, "differs", ours, published, why)
+def judged(item: Item, good: bool, ours: str, published: str, why: str, study: Any) -> Verdict:
+    """What was found, unless the study was another one; the reason is needed for a difference."""
+    named = (item.paper, item.item)
+    if study is not None and not isinstance(study, Scenario):
+        raise ValueError(f"scenario: needs a Scenario, got {type(study).__name__}")
+    if study is not None and study.changed:
+        reason = "changed scenario: " + "; ".join(study.changes)
+        return Verdict(*named, "not comparable", ours, published, reason)
+    if good:
+        word = "read" if item.kind == "parameters" else "match"
+        return Verdict(*named, word, ours, published)
+    return Verdict(*named, "differs", ours, published, why)
 
 
 def judge_value(ours: float, error: float, published: float, *, tolerance: float = 0.0) -> bool:
@@ -160,7 +165,7 @@ class Value:
     tolerance: float = 0.0
 
     def __post_init__(self) -> None:
-        _text(self.id, "id")
+        text(self.id, "id")
         judge_value(self.ours, self.error, self.published, tolerance=self.tolerance)
 
     @property
@@ -172,7 +177,7 @@ class Value:
         return f"{self.id}: {self.ours:.4g} ± {self.error:.1g} (published {self.published:.4g})"
 
 
-def _distinct(ids: Sequence[str], name: str) -> None:
+def distinct(ids: Sequence[str], name: str) -> None:
     if not ids:
         raise ValueError(f"{name}: needs at least one entry, got none")
     if len(set(ids)) != len(ids):
@@ -180,7 +185,14 @@ def _distinct(ids: Sequence[str], name: str) -> None:
         raise ValueError(f"{name}: needs distinct entries, got {', '.join(twice)} more than once")
 
 
-def judge_table(paper: str, item: str, values: Sequence[Value], *, why: str = "") -> Verdict:
+def judge_table(
+    paper: str,
+    item: str,
+    values: Sequence[Value],
+    *,
+    why: str = "",
+    scenario: Scenario | None = None,
+) -> Verdict:
     """The verdict on a table of numbers: a match if every value matches.
 
     Parameters
@@ -191,6 +203,9 @@ def judge_table(paper: str, item: str, values: Sequence[Value], *, why: str = ""
         Every number of the table.
     why : str
         Why it differs; needed and used only if it does.
+    scenario : Scenario, optional
+        What the study ran; if it is not the paper's, the verdict is "not comparable" and names
+        what was changed.
 
     Returns
     -------
@@ -203,13 +218,14 @@ def judge_table(paper: str, item: str, values: Sequence[Value], *, why: str = ""
     >>> judge_table("semeraro", "Table 1", [one]).verdict
     'match'
     """
-    known = _item(paper, item)
+    known = known_item(paper, item)
     if not all(isinstance(v, Value) for v in values):
         raise ValueError("values: needs a sequence of Value")
-    _distinct([v.id for v in values], "values")
+    distinct([v.id for v in values], "values")
     missed = [str(v) for v in values if not v.matches]
     ours = f"{len(values) - len(missed)} of {len(values)} values match"
-    return _judged(known, not missed, "; ".join([ours, *missed]), f"{len(values)} values", why)
+    shown, said = "; ".join([ours, *missed]), f"{len(values)} values"
+    return judged(known, not missed, shown, said, why, scenario)
 
 
 @dataclass(frozen=True)
@@ -240,7 +256,7 @@ class Claim:
 
     def __post_init__(self) -> None:
         for name in ("id", "text", "evidence"):
-            _text(getattr(self, name), name)
+            text(getattr(self, name), name)
         if not isinstance(self.holds, bool | np.bool_):
             raise ValueError(f"holds: needs True or False, got {self.holds!r}")
 
@@ -249,7 +265,14 @@ class Claim:
         return f"{self.id} {word}: {self.text} {self.evidence}"
 
 
-def judge_claims(paper: str, item: str, claims: Sequence[Claim], *, why: str = "") -> Verdict:
+def judge_claims(
+    paper: str,
+    item: str,
+    claims: Sequence[Claim],
+    *,
+    why: str = "",
+    scenario: Scenario | None = None,
+) -> Verdict:
     """The verdict on a figure: a match if every claim listed for it is judged and holds.
 
     Parameters
@@ -260,6 +283,8 @@ def judge_claims(paper: str, item: str, claims: Sequence[Claim], *, why: str = "
         Every listed claim, once.
     why : str
         Why it differs; needed and used only if a claim fails.
+    scenario : Scenario, optional
+        What the study ran, as of `judge_table`.
 
     Returns
     -------
@@ -275,14 +300,15 @@ def judge_claims(paper: str, item: str, claims: Sequence[Claim], *, why: str = "
     >>> judged = [
     ...     Claim("without-pca-unstable", "share of unstable runs", False, "0 [0, 0.0362]"),
     ...     Claim("pca-stable", "share of unstable runs", True, "0.02 [0.00243, 0.0704]"),
+    ...     Claim("small-samples", "difference of shares", False, "0.05 [-0.03, 0.13]"),
     ... ]
     >>> judge_claims("grange", "Fig. 1", judged, why="a run must exceed the prior").verdict
     'differs'
     """
-    known = _item(paper, item)
+    known = known_item(paper, item)
     if not all(isinstance(c, Claim) for c in claims):
         raise ValueError("claims: needs a sequence of Claim")
-    _distinct([c.id for c in claims], "claims")
+    distinct([c.id for c in claims], "claims")
     listed = {r["id"]: r for r in _claims_of(known).records()}
     unknown = [c.id for c in claims if c.id not in listed]
     missing = sorted(listed.keys() - {c.id for c in claims})
@@ -296,7 +322,7 @@ def judge_claims(paper: str, item: str, claims: Sequence[Claim], *, why: str = "
         raise ValueError(f"claims: needs a fixed criterion, open for {', '.join(undecided)}")
     ours = "; ".join(str(c) for c in claims)
     said = "; ".join(row["claim"] for row in listed.values())
-    return _judged(known, all(c.holds for c in claims), ours, said, why)
+    return judged(known, all(c.holds for c in claims), ours, said, why, scenario)
 
 
 def _claims_of(item: Item) -> Table:
@@ -304,81 +330,3 @@ def _claims_of(item: Item) -> Table:
     if found.columns != ("id", "claim", "criterion"):
         raise ValueError(f"item: needs one with claims, got {item.paper} {item.item}")
     return found
-
-
-def judge_parameters(
-    paper: str, item: str, read: Sequence[AgentSpec] | Sequence[Mapping[str, str]]
-) -> Verdict:
-    """The verdict on a table of parameters: a match if the study read the rows as printed.
-
-    Rows are paired by the first column, and cells compared as numbers where both are numbers, else
-    as text without spaces.
-
-    Parameters
-    ----------
-    paper, item : str
-        One of `items`.
-    read : sequence of AgentSpec or of mappings
-        What the study read: a scenario's agents, or rows from column to cell.
-
-    Returns
-    -------
-    Verdict
-        If it differs, the first difference is the reason.
-
-    Examples
-    --------
-    >>> from distfilt.published import scenario
-    >>> judge_parameters("grange", "Table II", scenario("grange", "table-2").agents).verdict
-    'match'
-    """
-    known = _item(paper, item)
-    printed = table(paper, known.file)
-    rows = [_row(entry) for entry in read]
-    for row in rows:
-        if row.keys() != set(printed.columns):
-            raise ValueError(
-                f"read: needs the columns {', '.join(printed.columns)}, got {', '.join(row)}"
-            )
-    first = printed.columns[0]
-    _distinct([row[first] for row in rows], "read")
-    why = _first_difference(rows, printed)
-    ours, published = f"{len(rows)} rows read", f"{len(printed)} rows printed"
-    return _judged(known, not why, ours, published, why)
-
-
-def _row(entry: Any) -> dict[str, str]:
-    if isinstance(entry, Mapping):
-        return {str(k): str(v) for k, v in entry.items()}
-    if not isinstance(entry, AgentSpec):
-        raise ValueError(f"read: needs agents or rows, got {type(entry).__name__}")
-    return {
-        "agent": entry.name,
-        "dimensions": str(list(entry.dims)),
-        "type": entry.kind,
-        "noise": str(entry.noise),
-        "neighbours": f"[{','.join(entry.neighbours)}]",
-    }
-
-
-def _same(a: str, b: str) -> bool:
-    try:
-        return float(a) == float(b)
-    except ValueError:
-        return re.sub(r"\s+", "", a) == re.sub(r"\s+", "", b)
-
-
-def _first_difference(rows: list[dict[str, str]], printed: Table) -> str:
-    """The first cell that was read otherwise than printed, or nothing."""
-    first = printed.columns[0]
-    by_key = {row[first]: row for row in rows}
-    for wanted in printed.records():
-        key = wanted[first]
-        if key not in by_key:
-            return f"row {key} is printed but was not read"
-        for column in printed.columns:
-            got = by_key[key][column]
-            if not _same(got, wanted[column]):
-                return f"row {key}, {column}: read {got}, printed {wanted[column]}"
-    extra = [key for key in by_key if key not in printed.text(first)]
-    return f"row {extra[0]} was read but is not printed" if extra else ""

@@ -7,10 +7,10 @@ later run can be compared with.
 """
 
 from .checking import check
+from .files import Stored, load, store, stored
 from .running import run
 from .seeds import spawn
 from .sources import fingerprint
-from .stored import Stored, load, store
 from .study import Failure, Study, StudyError, StudyInterrupted
 
 __all__ = [
@@ -25,4 +25,5 @@ __all__ = [
     "run",
     "spawn",
     "store",
+    "stored",
 ]

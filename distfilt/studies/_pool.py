@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 import warnings
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -13,18 +14,21 @@ from math import ceil
 from typing import Any
 
 from . import _worker
-from ._worker import Item, Job, Outcome
+from ._worker import Item, Job, Outcome, late
 from .study import DIED
 
 __all__: list[str] = []  # used inside this folder only
 
-CHUNK_SECONDS = 0.2
+CHUNK_SECONDS = 0.4
 """What a chunk should take: long against its transport, short against a wait for Ctrl-C."""
 
 CHUNKS_AHEAD = 4
 """Chunks per worker that are submitted but not back; memory does not grow with the study."""
 
 _LOOK_SECONDS = 1.0
+_GRACE_SECONDS = 2.0
+"""What a trial may take beyond its time before its process is ended."""
+
 _IDLE_SECONDS = 10
 """After this time without work the workers of our own pool end."""
 
@@ -49,7 +53,7 @@ class Pool:
     """An executor, how many workers it has, and whether it is ours to rebuild."""
 
     def __init__(self, executor: Executor | None, workers: int | None) -> None:
-        self.own = False
+        self.own = self.killed = False
         if executor is not None:
             known = getattr(executor, "_max_workers", None)
             self.workers = workers or (known if isinstance(known, int) else os.cpu_count()) or 1
@@ -80,6 +84,7 @@ class Pool:
 
     def restart(self) -> None:
         """Replace a broken pool of our own by one that is seen to work."""
+        self.killed = False
         try:
             self.executor = self._rebuilt()
             self.executor.submit(_worker.hello).result()
@@ -89,6 +94,7 @@ class Pool:
     def kill(self) -> None:
         """End our own workers at once; a caller's pool is left to the caller."""
         if self.own:
+            self.killed = True
             stop: Any = self.executor.shutdown
             stop(wait=True, kill_workers=True)
 
@@ -130,6 +136,7 @@ class Flight:
         self.waiting = deque(items)
         self.flying: dict[Future[list[Outcome]], list[Item]] = {}
         self.sizes = _Sizes(chunk, pool.workers)
+        self.heard = time.monotonic()
 
     def outcomes(self) -> Iterator[Outcome]:
         """Every trial's outcome, as it comes.
@@ -141,13 +148,29 @@ class Flight:
             self._fill()
             # Executors do not tell those who wait of a chunk that was cancelled: look again.
             wait(self.flying, timeout=_LOOK_SECONDS, return_when=FIRST_COMPLETED)
-            for future in [f for f in self.flying if f.done()]:
+            ready = [f for f in self.flying if f.done()]
+            if ready:
+                self.heard = time.monotonic()
+            elif self._stuck():
+                self.pool.kill()
+            for future in ready:
                 if self._broke(future):
                     yield from self._one_by_one()
                     break
                 self.sizes.learn(future.result())
                 yield from future.result()
                 del self.flying[future]
+
+    def _stuck(self) -> bool:
+        """Whether some worker must be busy with a trial that no signal ends: nothing came back.
+
+        Every worker has a chunk in hand, and of the longest one every trial may take its time.
+        """
+        if self.job.timeout is None or not self.pool.own or not self.flying:
+            return False
+        longest = max(map(len, self.flying.values()))
+        allowed = longest * self.job.timeout + _GRACE_SECONDS
+        return time.monotonic() - self.heard > allowed
 
     def _fill(self) -> None:
         while self.waiting and len(self.flying) < self.pool.window:
@@ -173,7 +196,8 @@ class Flight:
         error = future.exception()
         if isinstance(error, KeyboardInterrupt):
             raise error
-        if error is None or (self.pool.own and isinstance(error, BrokenExecutor)):
+        lost = self.pool.killed or isinstance(error, BrokenExecutor)
+        if error is None or (self.pool.own and lost):
             return error is not None
         raise PoolError(_named(error)) from error
 
@@ -194,8 +218,13 @@ class Flight:
         for item in suspects:
             future = self.pool.submit(self.job, [item])
             self.flying[future] = [item]
-            wait(self.flying)
-            if self._broke(future):
+            limit = self.job.timeout
+            if not wait(self.flying, None if limit is None else limit + _GRACE_SECONDS).done:
+                yield late(item, limit, 0.0)
+                self.flying.clear()
+                self.pool.kill()
+                self.pool.restart()
+            elif self._broke(future):
                 yield Outcome(item.which, None, DIED, str(future.exception()), 0.0)
                 self.flying.clear()
                 self.pool.restart()

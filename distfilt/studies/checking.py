@@ -12,16 +12,16 @@ from numpy.random import SeedSequence
 
 from ..checks import callable_, count, number
 from ._worker import versions
+from .files import Stored, load
 from .running import run
 from .sources import fingerprints, name_of
-from .stored import Stored, load
 from .study import Study, row
 
 __all__ = ["check"]
 
 
 def check(
-    path: str | Path,
+    path: str | Path | Stored,
     trial: Callable[[SeedSequence], Any],
     *,
     indices: Iterable[int] | None = None,
@@ -33,8 +33,8 @@ def check(
 
     Parameters
     ----------
-    path : path
-        The stored study.
+    path : path or Stored
+        The stored study, or its file.
     trial : callable
         The trial that made it.
     indices : iterable of int, optional
@@ -58,7 +58,7 @@ def check(
     ValueError
         If the file is malformed, or an index is not in it.
     """
-    stored = load(path)
+    stored = path if isinstance(path, Stored) else load(path)
     limit = number(rtol, "rtol", at_least=0)
     chosen = _indices(range(len(stored)) if indices is None else indices, len(stored))
     study = run(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.random import SeedSequence
 
-from ..checks import callable_, choice, count
+from ..checks import callable_, choice, count, number
 from ..progress import track
 from . import _worker
 from ._pool import Flight, Pool, PoolError, quiet
@@ -32,6 +32,7 @@ def run(
     workers: int | None = None,
     chunk: int | None = None,
     errors: str = "raise",
+    timeout: float | None = None,
     progress: bool = True,
     blas_threads: int | None = 1,
 ) -> Study:
@@ -58,10 +59,16 @@ def run(
         how many it has, for the number of chunks kept ready. 1 runs in this process, which is
         easy to debug but is not protected from a trial that ends its process.
     chunk : int, optional
-        Trials that travel together; by default as many as take about 0.2 s.
+        Trials that travel together; by default as many as take about 0.4 s.
     errors : {"raise", "collect"}
         ``"raise"`` stops at the first failure that comes back. ``"collect"`` runs all trials and
         leaves failures to the caller.
+    timeout : float, optional
+        Seconds for one trial, without a limit by default. A trial that takes longer is a failure
+        of kind ``"timeout"``, with its seed like any other. It is interrupted where its process
+        runs it in the main thread, as the default pool, ``workers=1`` and pools of processes do;
+        one of the default pool that hangs in compiled code loses its process some two seconds
+        later. In a pool of threads it ends by itself before it is counted.
     progress : bool
         Show a progress bar, where a person may be watching (`distfilt.progress.track`).
     blas_threads : int or None
@@ -106,11 +113,11 @@ def run(
     size = None if chunk is None else count(chunk, "chunk")
     stops = choice(errors, "errors", ("raise", "collect")) == "raise"
     threads = None if blas_threads is None else count(blas_threads, "blas_threads")
-    job = Job(_pickled(call), threads, _worker.home(), _worker.versions())
+    limit = None if timeout is None else number(timeout, "timeout", above=0)
+    pool = Pool(executor, n_workers)
+    job = Job(_pickled(call), limit, threads, _worker.home(), pool.own, _worker.versions())
     record = _Record(call, made)
-    flight = Flight(
-        Pool(executor, n_workers), job, [Item(i, r) for i, r in enumerate(made)], size
-    )
+    flight = Flight(pool, job, [Item(i, r) for i, r in enumerate(made)], size)
     with _worker.limited(threads), quiet() if flight.pool.own else nullcontext():
         _fly(flight, record, stops, progress)
     return record.study()

@@ -60,6 +60,8 @@ def _is_count(value: Any) -> bool:
 
 def recipe(seed: Any, name: str = "seeds") -> Recipe:
     """What makes a seed, which is a SeedSequence or a nonnegative integer."""
+    if type(seed) is SeedSequence and type(seed.entropy) is int and seed.entropy >= 0:
+        return Recipe(seed.entropy, tuple(map(int, seed.spawn_key)), seed.pool_size)
     if _is_count(seed):
         return Recipe(int(seed), (), POOL_SIZE)
     if not isinstance(seed, SeedSequence):

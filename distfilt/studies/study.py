@@ -16,6 +16,9 @@ from .seeds import Recipe
 
 __all__ = ["Failure", "Study", "StudyError", "StudyInterrupted"]
 
+LATE = "timeout"
+"""The kind of failure of a trial that took longer than it was given."""
+
 DIED = "died"
 """The kind of failure of a trial whose worker process ended before the trial did."""
 
@@ -31,7 +34,8 @@ class Failure:
     recipe : Recipe
         What makes its seed.
     kind : str
-        The class of what it raised, or ``"died"`` if it took its worker process down.
+        The class of what it raised, ``"died"`` if it took its worker process down, or
+        ``"timeout"`` if it took longer than it was given.
     traceback : str
         The worker's traceback; for a worker that died, what the pool knows of its end.
     """

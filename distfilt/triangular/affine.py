@@ -11,7 +11,6 @@ minimiser of (12) over affine maps has this form with sample moments, so no solv
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -19,10 +18,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import ensembles
-from ..checks import Array, SolverError, array, choice, count
+from ..checks import Array, array, choice, count, covariance
+from ._conic import LIMIT, solve_component
 
 if TYPE_CHECKING:
-    from .conditioning import ConditionalMap
+    from .composition import ConditionalMap
 
 __all__ = [
     "AffineMap",
@@ -33,9 +33,6 @@ __all__ = [
     "gradient",
     "objective",
 ]
-
-_LIMIT = {"ECOS": "max_iters", "CLARABEL": "max_iter"}
-"""The solvers, and what each calls its limit of iterations."""
 
 _ROUNDING = 1e-13
 """Share of a variable's variance, or of its mean, that counts as rounding."""
@@ -150,7 +147,7 @@ def fit(y: ArrayLike, x: ArrayLike) -> AffineMap:
     mean = ensembles.mean(joint)
     joint -= mean[..., None, :]
     cov = np.swapaxes(joint, -1, -2) @ joint / joint.shape[-2]
-    return from_moments(mean, cov, m)
+    return _from_moments(mean, cov, m)
 
 
 def from_moments(mean: ArrayLike, cov: ArrayLike, m: int) -> AffineMap:
@@ -161,7 +158,7 @@ def from_moments(mean: ArrayLike, cov: ArrayLike, m: int) -> AffineMap:
     mean : array_like, (..., m + d)
         Mean of (y, x).
     cov : array_like, (..., m + d, m + d)
-        Their covariance, positive definite.
+        Their covariance, symmetric and positive definite.
     m : int
         Number of observations, at least 0.
 
@@ -172,7 +169,7 @@ def from_moments(mean: ArrayLike, cov: ArrayLike, m: int) -> AffineMap:
     Raises
     ------
     ValueError
-        If a variable is constant or a combination of others.
+        If `cov` is no covariance, or a variable is constant or a combination of others.
 
     Examples
     --------
@@ -180,9 +177,15 @@ def from_moments(mean: ArrayLike, cov: ArrayLike, m: int) -> AffineMap:
     array([[0.5]])
     """
     centre = array(mean, "mean", (..., "D"))
-    joint = array(cov, "cov", (*centre.shape, centre.shape[-1]))
+    joint = covariance(cov, "cov", centre.shape[-1], semidefinite=True)
+    joint = array(joint, "cov", (*centre.shape, centre.shape[-1]))
     if count(m, "m", at_least=0) > centre.shape[-1]:
         raise ValueError(f"m: needs at most {centre.shape[-1]} observations, got {m}")
+    return _from_moments(centre, joint, m)
+
+
+def _from_moments(centre: Array, joint: Array, m: int) -> AffineMap:
+    """`from_moments` of checked arguments."""
     lower = _cholesky(joint, centre, m)
     # The factor of the joint covariance holds the map: its lower blocks are K L_yy and L.
     across = np.swapaxes(lower[..., m:, :m], -1, -2)
@@ -347,31 +350,10 @@ def fit_convex(
     """
     seen, members = _samples(y, x)
     array(members, "x", ("N", "d"))
-    choice(solver, "solver", tuple(_LIMIT))
+    choice(solver, "solver", tuple(LIMIT))
     m, d = seen.shape[-1], members.shape[-1]
     joint = np.concatenate([seen, members], axis=-1)
     rows = np.zeros((d, 1 + m + d))
     for k in range(d):
-        rows[k, : m + k + 2] = _solve_component(joint[:, : m + k + 1], solver, max_iters)
+        rows[k, : m + k + 2] = solve_component(joint[:, : m + k + 1], solver, max_iters)
     return from_rows(rows, ensembles.mean(seen))
-
-
-def _solve_component(z: Array, solver: str, max_iters: int | None) -> Array:
-    """Coefficients (u_0, u_1 … u_k) that minimise (12) for the last column of `z`."""
-    import cvxpy as cp
-
-    n, k = z.shape
-    u0, u = cp.Variable(), cp.Variable(k)
-    loss = cp.sum_squares(u0 + z @ u) / (2 * n) - cp.log(u[k - 1])
-    problem = cp.Problem(cp.Minimize(loss))
-    limit = {} if max_iters is None else {_LIMIT[solver]: count(max_iters, "max_iters")}
-    try:
-        # What cvxpy would warn of, the status below tells, and it becomes an error.
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            problem.solve(solver=solver, **limit)
-    except cp.error.SolverError as error:
-        raise SolverError(f"{solver}: component {k} of the map has no solution: {error}") from None
-    if problem.status != cp.OPTIMAL:
-        raise SolverError(f"{solver}: component {k} of the map stopped with {problem.status!r}")
-    return np.concatenate([[u0.value], u.value])

@@ -75,19 +75,33 @@ def invert(
     if not aim.size:
         return aim.copy()
     low, high = _bracket(f, aim, centre, half, name)
-    v = 0.5 * (low + high)
+    return _newton(f, aim, low, high, 0.5 * (low + high), small)
+
+
+def _newton(f: Function, aim: Array, low: Array, high: Array, v: Array, small: float) -> Array:
+    """Newton's method from `v` between ends where the targets are reached."""
+    moved = high - low
     for _ in range(_ITERATIONS):
         value, slope = _evaluated(f, v)
         gap = value - aim
         low, high = np.where(gap <= 0, v, low), np.where(gap >= 0, v, high)
         steep = slope > 0
         newton = v - gap / np.where(steep, slope, 1.0)
-        inside = steep & (newton > low) & (newton < high)
-        new = np.where(gap == 0, v, np.where(inside, newton, 0.5 * (low + high)))
-        done = np.abs(new - v) <= small * (1 + np.abs(v))
+        step = np.abs(newton - v)
+        enough = small * (1 + np.abs(v))
+        # A step that has settled may stand on an end of its bracket; any other has to be inside
+        # and half as long as the last, or Newton's method could go to and fro for ever.
+        good = (newton > low) & (newton < high) & (step <= 0.5 * moved)
+        new = np.where(steep & (good | (step <= enough)), newton, 0.5 * (low + high))
+        moved = np.abs(new - v)
         v = new
+        done = moved <= enough
         if done.all():
-            return np.asarray(v)
+            # Halving settles at a jump as well, where the value is not reached.
+            done = (step <= enough) | (np.abs(gap) <= 1e-9 * (1 + np.abs(aim)))
+            if done.all():
+                return np.asarray(v)
+            break
     raise SolverError(f"invert: {int((~done).sum())} of {done.size} targets did not settle")
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array
+from ..checks import Array, array, callable_
 from ..ensembles import mean
 from ..network import Channel
 from ..network.admm import AdmmRun, admm
@@ -67,8 +67,9 @@ def pool_by_moments(
     True
     """
     joint, m = _joint(y, x, channel)
+    callable_(agree, "agree")
     centre, cov = _agreed_moments(joint, channel, agree)
-    return affine.from_moments(centre, cov, m)
+    return affine._from_moments(centre, cov, m)
 
 
 def pool_by_admm(
@@ -127,15 +128,15 @@ def pool_by_admm(
     (True, True)
     """
     joint, m = _joint(y, x, channel)
+    callable_(agree, "agree")
     size = joint.shape[-1]
     if channel.runs:
         raise ValueError(f"channel: needs a single run for ADMM, got runs {channel.runs}")
     centre, spread = np.zeros(joint.shape[:-2] + (size,)), np.ones(joint.shape[:-2] + (size,))
     if standardise:
-        centre = np.asarray(agree(mean(joint), channel))
+        centre = _average(mean(joint), channel, agree)
         squares = ((joint - centre[..., None, :]) ** 2).mean(axis=-2)
-        spread = np.sqrt(np.asarray(agree(squares, channel)))
-        _varies(centre, spread, m)
+        spread = np.sqrt(_average(squares, channel, agree))
     joint = (joint - centre[..., None, :]) / spread[..., None, :]
     ones = np.concatenate([np.ones((*joint.shape[:-1], 1)), joint], axis=-1)
     moments = np.swapaxes(ones, -1, -2) @ ones / joint.shape[-2]
@@ -155,22 +156,42 @@ def _joint(y: ArrayLike, x: ArrayLike, channel: Channel) -> tuple[Array, int]:
     if samples <= size:
         raise ValueError(f"x: needs more than {size} members of all agents together for {size} "
                          f"variables, got {samples}")
-    return np.concatenate([seen, members], axis=-1), seen.shape[-1]
+    joint = np.concatenate([seen, members], axis=-1)
+    _varies(joint, seen.shape[-1])
+    return joint, seen.shape[-1]
 
 
-def _varies(centre: Array, spread: Array, m: int) -> None:
-    constant = np.atleast_2d(spread <= 1e-13 * np.abs(centre))
+def _varies(joint: Array, m: int) -> None:
+    """Refuse variables that are the same for all members of all agents."""
+    largest = np.abs(joint).max(axis=(-3, -2))
+    constant = np.ptp(joint, axis=(-3, -2)) <= 1e-13 * largest
     if constant.any():
-        name = "y" if constant[:, :m].any() else "x"
+        name = "y" if constant[..., :m].any() else "x"
         raise ValueError(f"{name}: needs variables that are not constant, got one")
 
 
+def _average(values: Array, channel: Channel, agree: Agree) -> Array:
+    """What the agents agree on, refused where it cannot be an average of the values."""
+    out = array(agree(values, channel), "agree", values.shape, finite=False)
+    low, high = values.min(axis=-2, keepdims=True), values.max(axis=-2, keepdims=True)
+    # A rule that is only approximate may miss by as much as the values differ.
+    slack = (high - low) + 1e-9 * np.maximum(np.abs(low), np.abs(high))
+    good = (out >= low - slack) & (out <= high + slack)
+    if not good.all():
+        at = tuple(np.argwhere(~good)[0])
+        raise ValueError(
+            f"agree: needs a rule that returns averages of the agents' values, got {out[at]:.6g} "
+            f"of values up to {values.max(axis=-2)[(*at[:-2], at[-1])]:.6g}"
+        )
+    return out
+
+
 def _agreed_moments(joint: Array, channel: Channel, agree: Agree) -> tuple[Array, Array]:
-    centre = np.asarray(agree(mean(joint), channel))
+    centre = _average(mean(joint), channel, agree)
     about = joint - centre[..., None, :]
     second = np.swapaxes(about, -1, -2) @ about / joint.shape[-2]
     rows, columns = np.triu_indices(joint.shape[-1])
-    packed = np.asarray(agree(np.ascontiguousarray(second[..., rows, columns]), channel))
+    packed = _average(np.ascontiguousarray(second[..., rows, columns]), channel, agree)
     cov = np.empty_like(second)
     cov[..., rows, columns] = cov[..., columns, rows] = packed
     return centre, cov

@@ -23,9 +23,11 @@ from scipy.special import ndtr
 from .. import ensembles
 from ..checks import Array, array, count, number
 from ._convex import SINGULAR, best_coefficients
-from .inversion import invert
+from .inversion import _newton, invert
 
 __all__ = ["SeparableMap", "fit"]
+
+_ROOT = np.sqrt(2 * np.pi)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,9 +119,26 @@ class SeparableMap:
 
     def _own(self, v: Array, k: int) -> tuple[Array, Array]:
         """The increasing part of component k and its slope, (..., N)."""
-        values, slopes = _own_features(v, self.steps[..., k, :])
-        a = self.slopes[k][..., None]
-        return np.asarray((values @ a)[..., 0]), np.asarray((slopes @ a)[..., 0])
+        centres, widths = self.steps[..., k, None, :]
+        first, rest = self.slopes[k][..., :1], self.slopes[k][..., 1:, None]
+        u = (v[..., None] - centres) / widths
+        value = first * v + ((_ROOT * widths * ndtr(u)) @ rest)[..., 0]
+        return np.asarray(value), np.asarray(first + (np.exp(-0.5 * u**2) @ rest)[..., 0])
+
+    def _inverted(self, aim: Array, k: int) -> Array:
+        """Where the increasing part of component k has the values `aim`, (..., N)."""
+
+        def own(v: Array) -> tuple[Array, Array]:
+            return self._own(v, k)
+
+        first, rest = self.slopes[k][..., :1], self.slopes[k][..., 1:]
+        if not (first > 1e-6).all():
+            return invert(own, aim, name="z")
+        # A line plus steps of known heights: its ends need no search.
+        heights = _ROOT * self.steps[1][..., k, :] * rest
+        low = (aim - heights.sum(axis=-1, keepdims=True)) / first
+        high = aim / first
+        return _newton(own, aim, low, high, 0.5 * (low + high), 1e-13)
 
     def __call__(self, y: ArrayLike, x: ArrayLike) -> Array:
         """Reference samples S(y, x), (..., N, d), of members y (..., N, m) and x (..., N, d)."""
@@ -140,8 +159,7 @@ class SeparableMap:
         joint = self._standard(y, reference, "z")
         m = self.observed
         for k in range(self.dim):
-            aim = reference[..., k] - self._earlier(joint, k)
-            joint[..., m + k] = invert(lambda v, k=k: self._own(v, k), aim, name="z")  # type: ignore[misc]
+            joint[..., m + k] = self._inverted(reference[..., k] - self._earlier(joint, k), k)
         return joint[..., m:] * self.spread[..., None, m:] + self.centre[..., None, m:]
 
     def log_det(self, y: ArrayLike, x: ArrayLike) -> Array:
@@ -166,7 +184,7 @@ def _own_features(v: Array, steps: Array) -> tuple[Array, Array]:
     """The variable and its integrated bumps, and their slopes, (..., N, 1 + q), of (..., N)."""
     centres, widths = steps[..., None, :]
     u = (v[..., None] - centres) / widths
-    values = np.sqrt(2 * np.pi) * widths * ndtr(u)
+    values = _ROOT * widths * ndtr(u)
     ones = np.ones((*v.shape, 1))
     return (
         np.concatenate([v[..., None], values], axis=-1),

@@ -76,4 +76,8 @@ def exact_forecast(
     q = model.noise(t, dt)
     if not q.any():
         return moved
-    return moved + exact_noise(anomalies(moved), q, rng=generator(rng))
+    bad = ~np.isfinite(moved).all(axis=(-2, -1))[..., None, None]
+    clean = np.where(bad, x, moved)
+    noisy = clean + exact_noise(anomalies(clean), q, rng=generator(rng))
+    # Members that the model lost stay lost, and do not take the others' noise with them.
+    return np.where(bad, np.nan, noisy)

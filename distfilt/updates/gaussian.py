@@ -12,6 +12,7 @@ What differs is what stands for R in the gain, and how the draws are made.
 from __future__ import annotations
 
 import numpy as np
+from scipy.fft import dct
 
 from ..checks import Array, choice, number
 from ..ensembles import exact_noise
@@ -256,19 +257,26 @@ def square_root(
     shrink = 1 / np.sqrt(1 + sizes**2) - 1
     spread = a + (left * shrink[..., None, :]) @ (np.swapaxes(left, -1, -2) @ a)
     if rotation == "random" and n > 2:
-        spread = _rotation(n, spread.shape[:-2], rng) @ spread
+        spread = _turned(spread, rng)
     return np.asarray(centre + (observed[..., None, :] - seen) @ gain + spread)
 
 
-def _rotation(n: int, leading: tuple[int, ...], rng: np.random.Generator) -> Array:
-    """Random orthogonal matrices (*leading, n, n) that keep the vector of ones."""
-    drawn = rng.standard_normal((*leading, n - 1, n - 1))
-    q, r = np.linalg.qr(drawn)
-    # The signs make the distribution uniform over all rotations and reflections.
-    q = q * np.sign(np.diagonal(r, axis1=-2, axis2=-1))[..., None, :]
-    # A Householder reflection takes the first unit vector to the direction of ones.
+def _turned(spread: Array, rng: np.random.Generator) -> Array:
+    """Anomalies (..., N, d) after a random rotation of the members that keeps the vector of ones.
+
+    Random signs and cosine transforms in turn, in the space of centred members: orthogonal to
+    rounding, in N log N steps where a random matrix takes N cubed.
+    """
+    n = spread.shape[-2]
+    # A reflection takes the direction of ones to the first unit vector, and is its own inverse.
     v = np.full(n, -1 / np.sqrt(n))
     v[0] += 1
     v /= np.linalg.norm(v)
-    basis = (np.eye(n) - 2 * np.outer(v, v))[:, 1:]
-    return np.asarray(1 / n + basis @ q @ basis.T)
+    out = spread - 2 * v[:, None] * (v @ spread)[..., None, :]
+    rest = out[..., 1:, :]
+    for _ in range(3):
+        signs = np.copysign(1.0, rng.standard_normal((*rest.shape[:-1], 1)))
+        rest = dct(signs * rest, norm="ortho", axis=-2)
+    signs = np.copysign(1.0, rng.standard_normal((*rest.shape[:-1], 1)))
+    out = np.concatenate([out[..., :1, :], signs * rest], axis=-2)
+    return np.asarray(out - 2 * v[:, None] * (v @ out)[..., None, :])

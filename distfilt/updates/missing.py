@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ..checks import Array
@@ -52,26 +54,47 @@ def with_missing(
     0.5
     """
     inner = unchecked(update)
+    m = observed.shape[-1]
+    lead = observed.shape[:-1]
+    # What is drawn for an ensemble depends on its own missing readings and its place, not on what
+    # others miss: each pattern has a stream of its own, drawn from for all places.
+    base = rng.integers(2**63, size=2)
     present = ~(np.isnan(observed) | np.isnan(predicted).any(axis=-2))
     if present.all():
-        return inner(ensemble, predicted, observed, noise, rng=rng)
-    m = present.shape[-1]
+        stream = _Rows([*base, *np.ones(m, dtype=np.int64)], lead, None)
+        return inner(ensemble, predicted, observed, noise, rng=stream)
     flat = present.reshape(-1, m)
     rows = ensemble.reshape(-1, *ensemble.shape[-2:])
     seen = predicted.reshape(-1, *predicted.shape[-2:])
     aim = observed.reshape(-1, m)
     cov = noise
     if noise.ndim > 2:
-        cov = np.broadcast_to(noise, (*observed.shape, m)).reshape(-1, m, m)
+        cov = np.broadcast_to(noise, (*lead, m, m)).reshape(-1, m, m)
     out = rows.copy()
     for pattern in np.unique(flat, axis=0):
         keep = np.flatnonzero(pattern)
         if not keep.size:
             continue
         where = np.flatnonzero((flat == pattern).all(axis=1))
-        if cov.ndim > 2:
-            part = cov[np.ix_(where, keep, keep)]
-        else:
-            part = cov[np.ix_(keep, keep)]
-        out[where] = inner(rows[where], seen[where][..., keep], aim[where][:, keep], part, rng=rng)
+        part = cov[np.ix_(where, keep, keep)] if cov.ndim > 2 else cov[np.ix_(keep, keep)]
+        stream = _Rows([*base, *pattern.astype(np.int64)], lead, where)
+        out[where] = inner(
+            rows[where], seen[where][..., keep], aim[where][:, keep], part, rng=stream
+        )
     return np.asarray(out.reshape(ensemble.shape))
+
+
+class _Rows(np.random.Generator):
+    """Normal draws for all ensembles of a batch, of which some are asked for."""
+
+    def __init__(self, seed: Any, lead: tuple[int, ...], where: Any) -> None:
+        super().__init__(np.random.PCG64(np.random.SeedSequence([int(s) for s in seed])))
+        self.lead, self.where = lead, where
+
+    def standard_normal(self, size: Any = None, *args: Any, **options: Any) -> Any:
+        """As numpy's, but of a batch's rows those that belong to the pattern."""
+        if self.where is None or not np.iterable(size) or tuple(size)[:1] != self.where.shape:
+            return super().standard_normal(size, *args, **options)
+        rest = tuple(size)[1:]
+        drawn = super().standard_normal((*self.lead, *rest), *args, **options)
+        return drawn.reshape(-1, *rest)[self.where]

@@ -139,15 +139,23 @@ def resampled(
 
 
 def _resampled(w: Array, rng: np.random.Generator, rule: str) -> Indices:
+    return _picked(w, _levels(w.shape, rng, rule), rule)
+
+
+def _levels(shape: tuple[int, ...], rng: np.random.Generator, rule: str) -> Array:
+    """The random numbers that a rule needs; as many whatever the weights are."""
+    one = rule in ("systematic", "residual")
+    return rng.random((*shape[:-1], 1 if one else shape[-1]))
+
+
+def _picked(w: Array, drawn: Array, rule: str) -> Indices:
+    """The indices of weights (..., N) that the random numbers of :func:`_levels` pick."""
     n = w.shape[-1]
     if rule == "residual":
-        return _residual(w, rng)
+        return _residual(w, drawn)
     if rule == "systematic":
-        return _systematic(w, rng.random((*w.shape[:-1], 1)))
-    if rule == "stratified":
-        levels = (np.arange(n) + rng.random(w.shape)) / n
-    else:
-        levels = np.sort(rng.random(w.shape), axis=-1)
+        return _systematic(w, drawn)
+    levels = (np.arange(n) + drawn) / n if rule == "stratified" else np.sort(drawn, axis=-1)
     edges = _edges(w).reshape(-1, n)
     # Rounding must not leave a level at the last edge: it would pick an index beyond the weights.
     inside = np.minimum(levels, np.nextafter(1.0, 0.0)).reshape(-1, n)
@@ -171,13 +179,12 @@ def _systematic(w: Array, offset: Array) -> Indices:
     return np.asarray(flat.reshape(w.shape), dtype=np.intp)
 
 
-def _residual(w: Array, rng: np.random.Generator) -> Indices:
+def _residual(w: Array, offset: Array) -> Indices:
     n = w.shape[-1]
     scaled = n * w
     sure = np.floor(scaled + 1e-12 * n).astype(np.intp)
     rest = np.clip(scaled - sure, 0.0, None)
     left = n - sure.sum(axis=-1)
-    offset = rng.random((*w.shape[:-1], 1))
     total = rest.sum(axis=-1, keepdims=True)
     edges = np.cumsum(rest, axis=-1) / np.where(total > 0, total, 1.0)
     below = np.clip(np.ceil(left[..., None] * edges - offset), 0, left[..., None]).astype(np.intp)
@@ -264,12 +271,15 @@ def jitter(
     h = min(1.0, (4 / (n * (d + 2))) ** (1 / (d + 4)))
     if bandwidth is not None:
         h = number(bandwidth, "bandwidth", above=0, at_most=1)
-    centre = x.mean(axis=-2, keepdims=True)
     if cov is None:
-        around = x - centre
+        around = x - x.mean(axis=-2, keepdims=True)
         c = np.swapaxes(around, -1, -2) @ around / n
     else:
         c = covariance(cov, "cov", d, semidefinite=True)
-    root = np.swapaxes(factor(c), -1, -2)
-    drawn = generator(rng).standard_normal(x.shape) @ root
-    return np.asarray(centre + np.sqrt(1 - h * h) * (x - centre) + h * drawn)
+    return _jittered(x, c, h, generator(rng).standard_normal(x.shape))
+
+
+def _jittered(x: Array, cov: Array, h: float, drawn: Array) -> Array:
+    centre = x.mean(axis=-2, keepdims=True)
+    moved = drawn @ np.swapaxes(factor(cov), -1, -2)
+    return np.asarray(centre + np.sqrt(1 - h * h) * (x - centre) + h * moved)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -99,8 +100,13 @@ def gated(update: Update, *, probability: float = 0.999) -> Update:
 class _Centred(np.random.Generator):
     """A generator whose normal draws have mean zero over the members and keep their variance."""
 
-    def standard_normal(self, size=None, *args, **options):  # type: ignore[no-untyped-def]
-        drawn = super().standard_normal(size, *args, **options)
+    def __init__(self, source: np.random.Generator) -> None:
+        super().__init__(source.bit_generator)
+        self.source = source
+
+    def standard_normal(self, size: Any = None, *args: Any, **options: Any) -> Any:
+        """As the source's, centred along the last axis but one."""
+        drawn = self.source.standard_normal(size, *args, **options)
         if np.ndim(drawn) < 2 or drawn.shape[-2] < 2:
             return drawn
         n = drawn.shape[-2]
@@ -134,7 +140,7 @@ def centred(update: Update) -> Update:
     inner = unchecked(callable_(update, "update"))
 
     def centre(x: Array, h: Array, y: Array, r: Array, *, rng: np.random.Generator) -> Array:
-        return inner(x, h, y, r, rng=_Centred(rng.bit_generator))
+        return inner(x, h, y, r, rng=_Centred(rng))
 
     return joined(centre, update)
 

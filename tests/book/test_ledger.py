@@ -7,9 +7,16 @@ from pathlib import Path
 
 import pytest
 
-from ledger import COLUMNS, ITEMS, LEDGER, VERDICTS, current, ledger, rows_of, text_of
+from ledger import COLUMNS, ITEMS, LEDGER, VERDICTS, current, ledger, rows_of, summaries, text_of
 
-ITEM = {"paper": "grange", "item": "Fig. 1", "title": "Error", "chapter": "04-satellite-network"}
+ITEM = {
+    "paper": "grange",
+    "item": "Fig. 1",
+    "kind": "results",
+    "title": "Error",
+    "chapter": "04-satellite-network",
+}
+TABLE = {**ITEM, "item": "Table I", "kind": "parameters"}
 VERDICT = {
     "paper": "grange",
     "item": "Fig. 1",
@@ -32,8 +39,8 @@ def test_ledger_has_every_item_once() -> None:
     rows = rows_of(LEDGER)
     assert [(row["paper"], row["item"]) for row in rows] == items
     assert len(set(items)) == 21
-    assert {row["verdict"] for row in rows} <= set(VERDICTS)
     for row in rows:
+        assert row["verdict"] in VERDICTS[row["kind"]]
         given = [row[name] for name in ("ours", "published", "why")]
         assert row["verdict"] != "not yet" or not any(given)
 
@@ -45,7 +52,7 @@ def test_an_item_without_a_verdict_is_not_yet() -> None:
 
 def test_a_verdict_fills_its_row() -> None:
     (row,) = ledger([ITEM], [VERDICT])
-    assert row == VERDICT and tuple(row) == COLUMNS
+    assert row == {**VERDICT, "kind": "results"} and tuple(row) == COLUMNS
     assert text_of([row]).splitlines()[1].endswith('"a, b"')
 
 
@@ -55,12 +62,21 @@ def test_a_verdict_fills_its_row() -> None:
         ([VERDICT, VERDICT], "has a verdict already"),
         ([{**VERDICT, "item": "Fig. 9"}], "not an item"),
         ([{**VERDICT, "verdict": "close"}], "needs one of"),
+        ([{**VERDICT, "verdict": "read"}], "needs one of"),
+        ([{**VERDICT, "item": "Table I", "verdict": "match"}], "needs one of"),
     ],
-    ids=["twice", "unknown item", "unknown verdict"],
+    ids=["twice", "unknown item", "unknown verdict", "results read", "parameters matched"],
 )
 def test_ledger_refuses(verdicts: list[dict[str, str]], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        ledger([ITEM], verdicts)
+        ledger([ITEM, TABLE], verdicts)
+
+
+def test_what_was_read_is_counted_apart_from_what_matches() -> None:
+    read = {**VERDICT, "item": "Table I", "verdict": "read"}
+    found = summaries(ledger([ITEM, TABLE], [VERDICT, read]))
+    assert found["parameters"] == (1, {"read": 1, "differs": 0, "not comparable": 0, "not yet": 0})
+    assert found["results"] == (1, {"match": 0, "differs": 1, "not comparable": 0, "not yet": 0})
 
 
 def test_malformed_items_are_refused(tmp_path: Path) -> None:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+
+from distfilt import studies
 
 ROOT = Path(__file__).resolve().parents[2]
 GOOD = """
@@ -17,18 +22,20 @@ def trial(seed):
 """
 
 
-@pytest.fixture()
-def tool(monkeypatch: pytest.MonkeyPatch) -> object:
-    import importlib.util
-
-    monkeypatch.syspath_prepend(str(ROOT / "book" / "tools"))
+def load() -> ModuleType:
+    """The tool as a module of its own."""
     path = ROOT / "book" / "tools" / "studies.py"
     spec = importlib.util.spec_from_file_location("study_tool", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    monkeypatch.setitem(sys.modules, "study_tool", module)
+    sys.modules["study_tool"] = module
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(name="tool")
+def _tool() -> ModuleType:
+    return load()
 
 
 def _script(tmp_path: Path, text: str) -> Path:
@@ -37,7 +44,7 @@ def _script(tmp_path: Path, text: str) -> Path:
     return path
 
 
-def test_a_good_script_is_taken(tool: object, tmp_path: Path) -> None:
+def test_a_good_script_is_taken(tool: ModuleType, tmp_path: Path) -> None:
     assert tool.load_script(_script(tmp_path, GOOD)).NAME == "small"
 
 
@@ -52,7 +59,78 @@ def test_a_good_script_is_taken(tool: object, tmp_path: Path) -> None:
     ],
 )
 def test_a_bad_script_is_refused_before_it_runs(
-    tool: object, tmp_path: Path, old: str, new: str, complaint: str
+    tool: ModuleType, tmp_path: Path, old: str, new: str, complaint: str
 ) -> None:
     with pytest.raises(ValueError, match=complaint):
         tool.load_script(_script(tmp_path, GOOD.replace(old, new)))
+
+
+# `make studies`.
+
+SCRIPT = """
+import numpy as np
+from distfilt import studies
+
+NAME, PAPER = "spread", "zheng"
+parameters = {"members": 20}
+columns = ["mean", "spread"]
+seeds = studies.spawn(2023, 12)
+
+def trial(seed):
+    x = np.random.default_rng(seed).normal(size=parameters["members"])
+    return x.mean(), x.std()
+"""
+
+
+def test_make_studies_without_a_script(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert load().main([], tmp_path) == 0
+    assert "no script" in capsys.readouterr().out
+
+
+def test_make_studies_stores_and_checks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tool, folder = load(), tmp_path / "book" / "studies"
+    folder.mkdir(parents=True)
+    script = folder / "spread.py"
+    script.write_text(SCRIPT, encoding="utf-8")
+    assert tool.main(["--check"], tmp_path) == 1
+    assert "not stored yet" in capsys.readouterr().err
+    assert tool.main(["--workers", "2"], tmp_path) == 0
+    path = tmp_path / "data" / "studies" / "zheng" / "spread.csv"
+    stored = studies.load(path)
+    assert len(stored) == 12 and stored.parameters == {"members": 20} and "trial" in stored.code
+    assert tool.main(["spread", "--check", "--workers", "1"], tmp_path) == 0
+    assert tool.main(["sprawl"], tmp_path) == 1
+    capsys.readouterr()
+    for old, new, word in [
+        ("size=para", "loc=1e-12, size=para", "another run"),
+        ("2023, 12", "2023, 11", "other seeds"),
+        ('"members": 20', '"rule": "mean", "members": 20', "other parameters"),
+        ('"spread", "z', '"spreads", "z', "no script in book/studies makes it"),
+    ]:
+        script.write_text(SCRIPT.replace(old, new), encoding="utf-8")
+        os.utime(script, (0, hash(word) % 2**30))  # a new time: python caches by it
+        assert tool.main(["--check", "--workers", "1"], tmp_path) == 1
+        assert word in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "word"),
+    [
+        ("columns =", "names =", "columns"),
+        ('"zheng"', '"chang"', "PAPER"),
+        ('"spread", "zheng"', '"a/b", "zheng"', "NAME"),
+    ],
+)
+def test_make_studies_refuses_a_script(old: str, new: str, word: str, tmp_path: Path) -> None:
+    folder = tmp_path / "book" / "studies"
+    folder.mkdir(parents=True)
+    (folder / "a.py").write_text(SCRIPT.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(ValueError, match=word):
+        load().main([], tmp_path)
+
+
+@pytest.mark.slow
+def test_every_stored_study_runs_again() -> None:
+    assert load().main(["--check"]) == 0

@@ -1,4 +1,4 @@
-"""Attitude, pose and Lorenz's model: what is conserved, what rotates what, and the order of rk4."""
+"""Attitude and pose: what is conserved, what rotates what, and the derivatives."""
 
 from __future__ import annotations
 
@@ -9,33 +9,28 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from distfilt.models import attitude as att
-from distfilt.models.integrators import rk4
-from distfilt.models.lorenz import lorenz63, lorenz63_rate
-from distfilt.models.satellite import clohessy_wiltshire
+import distfilt.models as att
+from distfilt.differences import central
+from distfilt.models import clohessy_wiltshire
 
 NAN = float("nan")
 START = np.array([0.3, 0.2, 0.1, 1.0, 0.0, 0.0, 0.0])
 _Q = [1.0, 0.0, 0.0, 0.0]
 _W = [0.3, 0.2, 0.1]
 _A = "distfilt.models.attitude."
-_L = "distfilt.models.lorenz."
-
-
-def _decay(x: np.ndarray, t: float) -> np.ndarray:
-    return -x
+_R = "distfilt.models.rotations."
 
 
 BAD_INPUT = {
-    _A + "cross_matrix": [
+    _R + "cross_matrix": [
         ("vector", lambda: att.cross_matrix([1.0, 2.0])),
         ("vector", lambda: att.cross_matrix([1.0, 2.0, NAN])),
     ],
-    _A + "rotation_matrix": [
+    _R + "rotation_matrix": [
         ("quaternion", lambda: att.rotation_matrix([1.0, 0.0, 0.0])),
         ("quaternion", lambda: att.rotation_matrix(np.zeros(4))),
     ],
-    _A + "quaternion_rate": [
+    _R + "quaternion_rate": [
         ("quaternion", lambda: att.quaternion_rate(np.zeros(4), _W)),
         ("angular_velocity", lambda: att.quaternion_rate(_Q, [1.0])),
         ("angular_velocity", lambda: att.quaternion_rate(np.ones((2, 4)), _W)),
@@ -57,23 +52,14 @@ BAD_INPUT = {
         ("step", lambda: att.satellite_pose(rate=0.1, sigma=0.2, step=-0.1)),
         ("x", lambda: att.satellite_pose(rate=0.1, sigma=0.2).step(START, 0.0, 0.1)),
     ],
-    _L + "lorenz63": [
-        ("sigma", lambda: lorenz63(sigma=NAN)),
-        ("noise", lambda: lorenz63(noise=-1.0)),
-        ("step", lambda: lorenz63(step=0.0)),
-        ("x", lambda: lorenz63().step([1.0, 2.0], 0.0, 0.1)),
+    _R + "left_directions": [("quaternion", lambda: att.left_directions(np.zeros(4)))],
+    _R + "turned": [
+        ("quaternion", lambda: att.turned(np.zeros(4), _W)),
+        ("angle", lambda: att.turned(_Q, [1.0])),
     ],
-    _L + "lorenz63_rate": [
-        ("x", lambda: lorenz63_rate([1.0, 2.0])),
-        ("rho", lambda: lorenz63_rate([1.0, 2.0, 3.0], rho=NAN)),
-    ],
-    "distfilt.models.integrators.rk4": [
-        ("rate", lambda: rk4(3, [1.0], 0.0, 0.1)),
-        ("rate", lambda: rk4(lambda x, t: x[:1], [1.0, 2.0], 0.0, 0.1)),
-        ("x", lambda: rk4(_decay, [NAN], 0.0, 0.1)),
-        ("t", lambda: rk4(_decay, [1.0], NAN, 0.1)),
-        ("dt", lambda: rk4(_decay, [1.0], 0.0, -0.1)),
-        ("substeps", lambda: rk4(_decay, [1.0], 0.0, 0.1, substeps=0)),
+    _R + "turn_between": [
+        ("quaternion", lambda: att.turn_between([1.0], _Q)),
+        ("quaternion", lambda: att.turn_between(_Q, np.zeros(4))),
     ],
 }
 
@@ -165,29 +151,42 @@ def test_pose_is_translation_and_attitude() -> None:
     assert np.allclose(q[6:, 6:], body.noise(0.0, 0.1))
 
 
-@pytest.mark.parametrize("substeps", [2, 3])
-def test_rk4_is_batched_and_exact_for_cubics(substeps: int) -> None:
-    x = np.zeros((3, 2))
-    out = rk4(lambda x, t: np.full_like(x, 4 * t**3), x, 1.0, 1.0, substeps=substeps)
-    assert np.allclose(out, 15.0, atol=1e-12) and not x.any()
+@given(st.integers(0, 10_000))
+def test_turned_rotates_the_active_matrix_from_the_left(seed: int) -> None:
+    q, angle = _random(seed)
+    rotated = Rotation.from_rotvec(angle).as_matrix() @ att.rotation_matrix(q)
+    assert np.abs(att.rotation_matrix(att.turned(3 * q, angle)) - rotated).max() < 1e-13
+    lengths = np.linalg.norm(att.turned(3 * q, angle), axis=1)
+    assert np.abs(lengths - 3).max() < 1e-13
 
 
-def test_lorenz_agrees_with_an_adaptive_rule() -> None:
-    """From twenty states near the attractor: close, and closer with the step's fourth power."""
-    starts = np.array([1.5, -1.5, 25.5]) + np.random.default_rng(0).standard_normal((20, 3))
-
-    def rate(t: float, x: np.ndarray) -> np.ndarray:
-        return lorenz63_rate(x.reshape(20, 3)).ravel()
-
-    run = solve_ivp(rate, (0, 1), starts.ravel(), method="DOP853", rtol=1e-13, atol=1e-13)
-    exact = run.y[:, -1].reshape(20, 3)
-    steps = np.array([0.01, 0.005, 0.0025, 0.00125])
-    gaps = [lorenz63(step=h).step(starts, 0.0, 1.0) - exact for h in steps]
-    error = [np.sqrt((gap**2).mean()) for gap in gaps]
-    assert error[-1] < 1e-7
-    assert abs(np.polyfit(np.log(steps), np.log(error), 1)[0] - 4) < 0.3
+@given(st.integers(0, 10_000))
+def test_turn_between_undoes_turned(seed: int) -> None:
+    q, angle = _random(seed)
+    angle *= np.minimum(1, 3 / np.linalg.norm(angle, axis=1, keepdims=True))
+    there = att.turned(q, angle)
+    assert np.abs(att.turn_between(2 * q, there) - angle).max() < 1e-12
+    assert np.abs(att.turn_between(q, -there) - angle).max() < 1e-12
+    assert np.abs(att.turn_between(q, q)).max() < 1e-15
 
 
-def test_lorenz_noise() -> None:
-    assert np.allclose(lorenz63(noise=0.5).noise(0.0, 0.1), 0.025 * np.eye(3))
-    assert not lorenz63().noise(0.0, 0.1).any()
+def test_left_directions_are_the_derivative_of_turned_and_of_equation_21() -> None:
+    q, w = _random(3, 5)
+    for one in q:
+        numeric = central(lambda e, one=one: att.turned(one, e), np.zeros(3))
+        assert np.abs(att.left_directions(one) - numeric).max() < 1e-9
+    rate = -(att.left_directions(q) @ w[..., None])[..., 0]
+    assert np.abs(att.quaternion_rate(q, w) - rate).max() < 1e-15
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_pose_s_jacobian_is_that_of_its_step(seed: int) -> None:
+    """Off the unit sphere and with large rates too, through several substeps."""
+    x = np.random.default_rng(seed).standard_normal((3, 13))
+    model = att.satellite_pose(rate=0.1, sigma=0.2, step=0.04)
+    slope = model.jacobian(x, 0.0, 0.1)
+    numeric = central(lambda v: model.step(v, 0.0, 0.1), x)
+    assert np.abs(slope - numeric).max() < 1e-8 * max(1.0, np.abs(slope).max())
+    body = att.attitude(rate=0.1, sigma=0.2, step=0.04)
+    assert np.array_equal(body.jacobian(x[:, 6:], 0.0, 0.1), slope[:, 6:, 6:])
+    assert not slope[:, :6, 6:].any() and not slope[:, 6:, :6].any()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import uuid
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,14 +16,16 @@ from numpy.random import SeedSequence
 from numpy.typing import NDArray
 
 from ..checks import Array, callable_, choice, count
+from ..folders import data_root
 from ._worker import versions
 from .seeds import POOL_SIZE, Recipe
 from .sources import fingerprints
-from .study import DIED, Study, column_names, row
+from .study import DIED, LATE, Study, column_names, row
 
-__all__ = ["Stored", "load", "store"]
+__all__ = ["Stored", "load", "store", "stored"]
 
-_FORMAT = "# distfilt study, format 1"
+_FORMAT = "# distfilt study, format 2"
+_TRIALS = re.compile(r"# trials ([1-9][0-9]*)")
 _FIRST = ("index", "entropy", "spawn_key", "failure")
 _HEADER = re.compile(r"# (version|code|parameter) ([^\s:]+): (.+)")
 
@@ -88,8 +91,9 @@ def store(
 ) -> Path:
     """Write a study's metrics to a CSV file: the same study gives the same bytes.
 
-    Lines that begin with ``#`` say with which versions it was made, the `fingerprint` of the trial
-    and of the functions in `code`, and the parameters as JSON. Then one row a trial: its index,
+    Lines that begin with ``#`` say how many trials follow, with which versions it was made, the
+    `fingerprint` of the trial and of the functions in `code`, and the parameters as JSON. Then one
+    row a trial: its index,
     the entropy and the spawn key of its seed, the class of what it raised or nothing, and the
     metrics with as many digits as give the same float back.
 
@@ -109,8 +113,8 @@ def store(
     Raises
     ------
     ValueError
-        If trials are missing, a worker died (which may say nothing of the trial), a metric is not
-        a real number, or a parameter is not JSON.
+        If trials are missing, a worker died or a trial took too long (which may say nothing of
+        the trial), a metric is not a real number, or a parameter is not JSON.
     """
     if not isinstance(study, Study):
         raise ValueError(f"study: needs a Study, got {type(study).__name__}")
@@ -120,11 +124,13 @@ def store(
     if study.missing:
         raise ValueError(f"study: needs every trial run, got {len(study.missing)} not run")
     kinds = {failure.index: failure.kind for failure in study.failures}
-    if DIED in kinds.values():
-        raise ValueError("study: needs trials that raise or return, got one whose worker died")
+    for kind, what in ((DIED, "whose worker died"), (LATE, "that took too long")):
+        if kind in kinds.values():
+            raise ValueError(f"study: needs trials that raise or return, got one {what}")
     made_by = {**study.code, **fingerprints(_functions(code), strict=True)}
     lines = [
         _FORMAT,
+        f"# trials {len(study)}",
         *(f"# version {k}: {json.dumps(v)}" for k, v in versions()),
         *(f"# code {k}: {json.dumps(v)}" for k, v in sorted(made_by.items())),
         *(f"# parameter {k}: {v}" for k, v in jsons(parameters).items()),
@@ -176,12 +182,48 @@ def _seed_cells(recipe: Recipe) -> tuple[str, str]:
 
 
 def _write(path: Path, text: str) -> Path:
+    """Write a file whole or not at all: a study that took an hour is not lost to an interrupt.
+
+    The name on the way is this writer's own, so that two writers leave one of two whole files.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    # A study that took an hour is not lost to an interrupt while it is written.
-    new = path.with_name(path.name + ".new")
-    new.write_text(text, encoding="utf-8", newline="\n")
-    os.replace(new, path)
+    new = path.with_name(f".{path.name}-{uuid.uuid4().hex}.new")
+    try:
+        with new.open("x", encoding="utf-8", newline="\n") as out:
+            out.write(text)
+            out.flush()
+            os.fsync(out.fileno())
+        os.replace(new, path)
+    except BaseException:
+        new.unlink(missing_ok=True)
+        raise
     return path
+
+
+def stored(paper: str, name: str) -> Stored:
+    """The stored study of one item of a paper, from ``data/studies/PAPER/NAME.csv``.
+
+    It is found from any folder, in the working copy or beside the library
+    (:func:`distfilt.folders.data_root`).
+
+    Parameters
+    ----------
+    paper : str
+        The paper's key.
+    name : str
+        Such as ``figure-2``.
+
+    Raises
+    ------
+    ValueError
+        If there is none of that name, or as of `load`.
+    """
+    root = data_root() / "studies"
+    there = sorted(p.relative_to(root).with_suffix("").as_posix() for p in root.glob("*/*.csv"))
+    if f"{paper}/{name}" not in there:
+        known = ", ".join(there) or "none yet"
+        raise ValueError(f"name: needs one of {known}, got {paper}/{name}: make studies")
+    return load(root / str(paper) / f"{name}.csv")
 
 
 def load(path: str | Path) -> Stored:
@@ -209,7 +251,7 @@ class _Reader:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.lines = 0
+        self.lines = self.trials = 0
         self.heads: dict[str, dict[str, Any]] = {"version": {}, "code": {}, "parameter": {}}
         self.names: tuple[str, ...] = ()
         self.recipes: list[Recipe] = []
@@ -225,6 +267,11 @@ class _Reader:
         if self.lines == 1:
             if line != _FORMAT:
                 raise ValueError(f"needs {_FORMAT!r}, got {line[:60]!r}")
+        elif self.lines == 2:
+            found = _TRIALS.fullmatch(line)
+            if found is None:
+                raise ValueError(f"needs '# trials NUMBER', got {line[:60]!r}")
+            self.trials = int(found[1])
         elif not line:
             self.ended = True
         elif line.startswith("#") and not self.names:
@@ -282,6 +329,9 @@ class _Reader:
         if not self.ended or not self.rows:
             what = "an end of line after the last row" if self.rows else "at least one trial"
             raise ValueError(f"path: {self.path}, line {self.lines}: needs {what}")
+        if len(self.rows) != self.trials:
+            got = f"needs {self.trials} trials, as its second line says, got {len(self.rows)}"
+            raise ValueError(f"path: {self.path}, line {self.lines}: {got}")
         table = np.array(self.rows)
         return Stored(
             self.path,

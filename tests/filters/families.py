@@ -1,0 +1,125 @@
+"""Every family of filters and every rule of agreement, for the tests that all of them have to pass.
+
+A new family adds a line to FAMILIES and gets the contract's tests for nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from distfilt.filters import EnsembleFilter, GaussianFilter, ParticleFilter
+from distfilt.models import LinearModel, simulate
+from distfilt.network import (
+    arithmetic_average,
+    barycentre,
+    consensus_pull,
+    covariance_intersection,
+    graphs,
+    intersection,
+    naive_fusion,
+    pull,
+)
+from distfilt.sensors import Sensor, angle, direct
+from distfilt.updates import exact_draws, gated, inflated, serial, square_root, transport
+
+FAMILIES: dict[str, Callable[..., Any]] = {
+    "ensemble": partial(EnsembleFilter, members=40),
+    "ensemble, exact": partial(EnsembleFilter.exact, members=40),
+    "ensemble, exact draws": partial(EnsembleFilter, update=exact_draws, members=40),
+    "ensemble, transport": partial(EnsembleFilter, update=transport, members=60),
+    "ensemble, square root": partial(
+        EnsembleFilter, update=inflated(gated(square_root), factor=1.01), members=40
+    ),
+    "ensemble, serial": partial(EnsembleFilter, update=serial(exact_draws), members=40),
+    "gaussian": GaussianFilter,
+    "gaussian, unscented": partial(GaussianFilter, rule="unscented"),
+    "particle": partial(ParticleFilter, members=500),
+    "particle, residual": partial(ParticleFilter, members=500, rule="residual", jitter=0.2),
+}
+
+ENSEMBLE_RULES = {
+    "pull": partial(pull, gain=0.1),
+    "intersection": intersection,
+    "intersection, equal": partial(intersection, rule="equal"),
+    "intersection, trace": partial(intersection, rule="trace"),
+    "intersection, least trace": partial(intersection, rule="min_trace"),
+    "barycentre": barycentre,
+}
+GAUSSIAN_RULES = {
+    "intersection": covariance_intersection,
+    "intersection, least determinant": partial(covariance_intersection, rule="min_determinant"),
+    "naive": naive_fusion,
+    "arithmetic": arithmetic_average,
+    "pull": partial(consensus_pull, gain=0.1),
+}
+RULED = [
+    (family, rule)
+    for family in FAMILIES
+    for rule in (GAUSSIAN_RULES if family.startswith("gaussian") else ENSEMBLE_RULES)
+]
+
+
+def rule_of(family: str, name: str) -> Any:
+    """An agreement that fits the family."""
+    return (GAUSSIAN_RULES if family.startswith("gaussian") else ENSEMBLE_RULES)[name]
+
+
+Q = np.array([[0.3, 0.1], [0.1, 0.2]])
+PRIOR = (np.array([1.0, -0.5]), np.array([[1.0, 0.3], [0.3, 0.8]]))
+NOISE = np.array([[0.5, 0.2], [0.2, 0.4]])
+
+
+def model() -> LinearModel:
+    """A damped oscillator with a full process noise."""
+
+    def transition(dt: float) -> np.ndarray:
+        return np.exp(-0.1 * dt) * np.array(
+            [[np.cos(dt), np.sin(dt)], [-np.sin(dt), np.cos(dt)]]
+        )
+
+    return LinearModel.from_transition(
+        2, transition, lambda t, dt: dt * Q, names=("x", "v"), units=("m", "m/s")
+    )
+
+
+def team(agents: int = 5) -> list[Sensor | None]:
+    """Sensors of one, two (correlated) and no readings in turn."""
+    both = Sensor(2, lambda x: x, NOISE, linear=lambda d: np.eye(d))
+    return [[direct([0], std=0.6), both, None][k % 3] for k in range(agents)]
+
+
+TIMES = np.cumsum([0.1, 0.3, 0.2, 0.4, 0.1, 0.2, 0.3, 0.2])
+
+
+def data(
+    sensors: list[Sensor | None], runs: tuple[int, ...] = (), seed: int = 0
+) -> tuple[np.ndarray, list[np.ndarray | None]]:
+    """A truth (T, *runs, 2) and the sensors' readings."""
+    rng = np.random.default_rng(seed)
+    start = PRIOR[0] + rng.standard_normal((*runs, 2)) @ np.linalg.cholesky(PRIOR[1]).T
+    truth = simulate(model(), start, TIMES, rng=rng)
+    return truth, [None if s is None else s.observe(truth, rng=rng) for s in sensors]
+
+
+def made(family: str, agents: int = 5, **options: Any) -> tuple[Any, Any]:
+    """A filter of a family on a path of agents, and its state at the start."""
+    sensors = options.pop("sensors", team(agents))
+    graph = options.pop("graph", graphs.path(len(sensors)))
+    runs = options.pop("runs", ())
+    f = FAMILIES[family](options.pop("model", model()), sensors, graph, **options)
+    return f, f.start(PRIOR, rng=np.random.default_rng(3), runs=runs)
+
+
+def values(state: Any) -> dict[str, np.ndarray]:
+    """Every array that a state holds, by name."""
+    names = ("ensembles", "points", "log_weights", "joint_means", "joint_covariances")
+    return {n: getattr(state, n) for n in names if hasattr(state, n)}
+
+
+def sight() -> Sensor:
+    """A direction, which wraps at π."""
+    return angle([0, 1], std=0.05, full=True)

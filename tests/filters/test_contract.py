@@ -1,0 +1,372 @@
+"""What every family keeps to, whatever the update and the agreement: one test for all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from distfilt.filters import FilterError, Late, final_state
+from distfilt.models import Model
+from distfilt.network import Faults, graphs
+from distfilt.sensors import Sensor, direct
+
+from .families import (
+    FAMILIES,
+    PRIOR,
+    RULED,
+    TIMES,
+    data,
+    made,
+    model,
+    rule_of,
+    sight,
+    team,
+    values,
+)
+
+EACH = pytest.mark.parametrize("family", FAMILIES)
+LEDGER = ("rounds", "messages", "scalars", "bytes", "lost")
+
+
+def same(a: Any, b: Any) -> bool:
+    """Whether two states hold the same bits, ledger included."""
+    first, second = values(a), values(b)
+    return all((first[n] == second[n]).all() for n in first) and all(
+        np.array_equal(getattr(a.ledger, n), getattr(b.ledger, n)) for n in LEDGER
+    )
+
+
+def at(observations: list[Any], k: int) -> list[Any]:
+    return [None if o is None else o[k] for o in observations]
+
+
+@EACH
+def test_step_leaves_its_state_alone_and_repeats(family: str) -> None:
+    f, start = made(family, runs=(2,))
+    _, seen = data(f.sensors, (2,))
+    before = {n: v.copy() for n, v in values(start).items()}
+    once, twice = (f.step(start, TIMES[0], at(seen, 0)) for _ in range(2))
+    assert same(once, twice) and once.t == TIMES[0]
+    assert all((values(start)[n] == before[n]).all() for n in before)
+    assert any((values(once)[n] != before[n]).any() for n in before)
+
+
+@EACH
+def test_resumed_lossy_run_is_the_whole_run(family: str, tmp_path: Path) -> None:
+    f, start = made(family, runs=(2,), faults=Faults(loss=0.4, seed=5), lag=1)
+    _, seen = data(f.sensors, (2,))
+    whole = list(f.steps(start, TIMES, seen))[-1]
+    first = list(f.steps(start, TIMES[:4], [None if o is None else o[:4] for o in seen]))[-1]
+    first.save(tmp_path / "state.npz")
+    again = type(first).load(tmp_path / "state.npz")
+    assert same(first, again)
+    rest = [None if o is None else o[4:] for o in seen]
+    assert same(whole, list(f.steps(again, TIMES[4:], rest))[-1])
+    assert whole.ledger.lost.sum() > 0
+    if first.rng is not None:
+        child, other = first.rng.spawn(1)[0], again.rng.spawn(1)[0]
+        assert child.random() == other.random()
+
+
+@pytest.mark.parametrize(("family", "rule"), RULED)
+def test_nobody_notices_beyond_the_neighbours(family: str, rule: str) -> None:
+    """On a path 0-1-2-3-4 a step reaches one link: agents 0, 1, 2 know nothing of agent 4."""
+    f, start = made(family, agreement=rule_of(family, rule))
+    _, seen = data(f.sensors)
+    start = f.step(start, TIMES[0], at(seen, 0))
+    changed = {n: v.copy() for n, v in values(start).items()}
+    for name, v in changed.items():
+        if name == "joint_covariances":
+            v[4] *= 3.0
+        elif name == "log_weights":
+            v[4] = np.roll(v[4], 1)
+        else:
+            v[4] = 7.0 + 2.5 * v[4]
+    fields = {k: getattr(start, k) for k in start.__dataclass_fields__} | changed
+    other = f.step(type(start)(**fields), TIMES[1], at(seen, 1))
+    plain = f.step(start, TIMES[1], at(seen, 1))
+    for name, v in values(plain).items():
+        assert (v[:3] == values(other)[name][:3]).all(), f"{name} of an agent out of reach moved"
+        assert (v[4] != values(other)[name][4]).any()
+
+
+@EACH
+def test_observations_reach_one_link(family: str) -> None:
+    sensors = [direct([0], std=0.5) for _ in range(5)]
+    f, start = made(family, sensors=sensors, agreement=None)
+    near = f.step(start, 0.5, [[0.3]] * 5)
+    far = f.step(start, 0.5, [[0.3]] * 4 + [[2.0]])
+    both = [(v, values(far)[name]) for name, v in values(near).items()]
+    assert all((v[:3] == w[:3]).all() for v, w in both)
+    assert all(any((v[k] != w[k]).any() for v, w in both) for k in (3, 4))
+
+
+@EACH
+def test_share_false_sends_nothing(family: str) -> None:
+    f, start = made(family, share=False, sensors=[direct([0], std=0.5), None], agreement=None)
+    out = f.step(start, 0.5, [[0.3], None])
+    assert out.ledger.rounds == 0 and not out.ledger.messages.any()
+    summary = f.summary(out)
+    assert summary.variance[0, 0] < summary.variance[1, 0]
+
+
+@EACH
+def test_recorded_scores_by_their_definitions(family: str) -> None:
+    f, start = made(family, runs=(3,), agents=3, names=("A", "B", "C"))
+    truth, seen = data(f.sensors, (3,))
+    run = f.run(start, TIMES, seen, truth=truth)
+    states = list(f.steps(start, TIMES, seen))
+    assert list(run["agent"].values) == ["A", "B", "C"]
+    assert list(run["component"].values) == ["x", "v"]
+    assert list(run["unit"].values) == ["m", "m/s"]
+    k, r, a = 5, 1, 2
+    mean = run["mean"].values[k, r, a]
+    assert np.allclose(
+        run["squared_error"].values[k, r, a], (mean - truth[k, r]) ** 2, atol=1e-14
+    )
+    total = run["total_squared_error"].values[k, r, a]
+    assert abs(total - ((mean - truth[k, r]) ** 2).sum()) < 1e-13
+    members, w = _members(states[k], r, a)
+    if members is None:
+        cov = states[k].covariances[r, a]
+        assert np.allclose(mean, states[k].means[r, a])
+    else:
+        assert np.allclose(mean, w @ members, atol=1e-12)
+        gap = members - w @ members
+        correction = len(w) / (len(w) - 1) if family.startswith("ensemble") else 1.0
+        cov = correction * gap.T @ (w[:, None] * gap)
+        pairs = np.abs(members[:, None] - members[None])
+        crps = w @ np.abs(members - truth[k, r]) - 0.5 * np.einsum("i,j,ijc", w, w, pairs)
+        assert np.allclose(run["crps"].values[k, r, a], crps, atol=1e-12)
+    assert np.allclose(run["variance"].values[k, r, a], np.diag(cov), atol=1e-12)
+    assert abs(run["spread"].values[k, r, a] - np.sqrt(np.trace(cov))) < 1e-12
+    gap = mean - truth[k, r]
+    assert abs(run["nees"].values[k, r, a] / (gap @ np.linalg.solve(cov, gap)) - 1) < 1e-9
+
+
+def _members(state: Any, r: int, a: int) -> tuple[Any, Any]:
+    if hasattr(state, "ensembles"):
+        x = state.ensembles[r, a]
+        return x, np.full(len(x), 1 / len(x))
+    if hasattr(state, "points"):
+        return state.points[r, a], np.exp(state.log_weights[r, a])
+    return None, None
+
+
+@EACH
+def test_ledger_per_step_and_in_sum(family: str) -> None:
+    f, start = made(family, agents=3)
+    _, seen = data(f.sensors)
+    run = f.run(start, TIMES, seen)
+    last = list(f.steps(start, TIMES, seen))[-1].ledger
+    for name in LEDGER:
+        total = run[f"{name}_total"].values
+        assert np.array_equal(total, np.cumsum(run[name].values, axis=0))
+        assert np.array_equal(total[-1], getattr(last, name))
+        assert run[name].attrs["units"] and "this step" in run[name].attrs["long_name"]
+    # Agents 0 (one reading) and 1 (two) send to one and two neighbours in every step.
+    assert (run["scalars"].values >= [1, 4, 0]).all()
+    assert same(final_state(run), list(f.steps(start, TIMES, seen))[-1])
+
+
+@EACH
+def test_missing_component_is_a_sensor_without_it(family: str) -> None:
+    sensors = [team(2)[1]]
+    f, start = made(family, sensors=sensors, graph=None)
+    y = np.array([0.4, np.nan])
+    less = made(family, sensors=[direct([0], std=np.sqrt(0.5))], graph=None)[0]
+    a, b = f.step(start, 0.5, [y]), less.step(start, 0.5, [[0.4]])
+    assert np.allclose(f.summary(a).mean, less.summary(b).mean, atol=1e-12)
+    assert np.allclose(f.summary(a).variance, less.summary(b).variance, atol=1e-12)
+
+
+@EACH
+def test_components_missing_in_some_runs_only(family: str) -> None:
+    sensors = [team(2)[1]]
+    f, start = made(family, sensors=sensors, graph=None, runs=(3,))
+    y = np.array([[0.4, 0.1], [np.nan, 0.1], [np.nan, np.nan]])
+    out = f.summary(f.step(start, 0.5, [y]))
+    blind = f.summary(f.step(start, 0.5, [None]))
+    assert np.allclose(out.mean[2], blind.mean[2], atol=1e-12)
+    assert (np.abs(out.mean[:2] - blind.mean[:2]).max(axis=(1, 2)) > 1e-3).all()
+
+
+@EACH
+def test_direction_across_pi(family: str) -> None:
+    """A truth near the negative x-axis, whose direction jumps between π and −π."""
+    still = Model(2, lambda x, t, dt: x, lambda t, dt: 1e-4 * dt * np.eye(2))
+    sensors: list[Sensor | None] = [sight(), direct([0], std=0.1)]
+    f = made(family, sensors=sensors, model=still)[0]
+    prior = (np.array([-2.0, 0.0]), 0.04 * np.eye(2))
+    start = f.start(prior, rng=np.random.default_rng(0), runs=(20,))
+    rng = np.random.default_rng(1)
+    truth = np.array([-2.0, 0.0]) + 0.02 * rng.standard_normal((20, 2))
+    for k in range(10):
+        seen = [s.observe(truth, rng=rng) for s in sensors if s is not None]
+        start = f.step(start, k + 1.0, seen)
+    summary = f.summary(start)
+    error = summary.mean - truth[:, None]
+    assert np.sqrt((error**2).mean(axis=(0, 1))).max() < 0.09
+    assert np.sqrt(summary.variance).max() < 0.12
+
+
+@EACH
+def test_time_passes_to_model_and_noise(family: str) -> None:
+    calls: list[tuple[str, float, float]] = []
+
+    def flow(x: np.ndarray, t: float, dt: float) -> np.ndarray:
+        calls.append(("flow", t, dt))
+        return x + t * dt
+
+    def noise(t: float, dt: float) -> np.ndarray:
+        calls.append(("noise", t, dt))
+        return (0.1 + t) * dt * np.eye(2)
+
+    f = made(family, sensors=[None], graph=None, model=Model(2, flow, noise))[0]
+    state = f.start(PRIOR, rng=np.random.default_rng(0), t=2.0)
+    state = f.step(state, 2.5, [None])
+    state = f.step(state, 3.5, [None])
+    assert {c[1:] for c in calls} == {(2.0, 0.5), (2.5, 1.0)}
+    assert {c[0] for c in calls} == {"flow", "noise"}
+    # 1 + 2 · .5 + 2.5 · 1 in each component; the noise's variances add to those of the prior.
+    shift = f.summary(state).mean[0] - PRIOR[0]
+    assert np.allclose(shift, 3.5, atol=1.5)
+
+
+@EACH
+def test_moving_graph(family: str) -> None:
+    pair, apart = graphs.path(2), graphs.Graph.from_edges(2, np.empty((0, 2)))
+    f, start = made(
+        family, sensors=[direct([0], std=0.3), None], graph=lambda t: pair if t > 1 else apart
+    )
+    first = f.step(start, 1.0, [[0.5], None])
+    assert not first.ledger.messages.any()
+    second = f.step(first, 2.0, [[0.5], None])
+    assert second.ledger.messages.tolist() == [1, 0]
+    assert f.summary(second).variance[1, 0] < f.summary(first).variance[1, 0] + 0.3
+
+
+@EACH
+def test_late_reading_is_in_time_after_all(family: str) -> None:
+    """Exact for Gaussians; ensembles and particles come as near as their size allows."""
+    f, start = made(family, sensors=[direct([0], std=0.4)], graph=None, lag=2, runs=(40,))
+    for t in (0.5, 1.0):
+        start = f.step(start, t, [None])
+    late = f.step(start, 1.5, [[0.1]], late=[Late(0, 0.5, [1.9], arrived=1.5)])
+    g, begin = made(family, sensors=[direct([0], std=0.4)], graph=None, runs=(40,))
+    begin = g.step(begin, 0.5, [[1.9]])
+    begin = g.step(g.step(begin, 1.0, [None]), 1.5, [[0.1]])
+    a, b = f.summary(late), g.summary(begin)
+    if family.startswith("gaussian"):
+        assert np.allclose(a.mean, b.mean, atol=1e-12)
+        assert np.allclose(a.covariance, b.covariance, atol=1e-12)
+    blind = g.step(g.step(g.start(PRIOR, rng=np.random.default_rng(3), runs=(40,)), 1.0, [None]),
+                   1.5, [[0.1]])
+    gap = np.abs(a.mean.mean(axis=0) - b.mean.mean(axis=0)).max()
+    assert gap < 0.12 < np.abs(g.summary(blind).mean.mean(axis=0) - b.mean.mean(axis=0)).max()
+
+
+@EACH
+def test_smoothing_knows_more(family: str) -> None:
+    f, start = made(family, agents=2, lag=4, runs=(60,))
+    truth, seen = data(f.sensors, (60,), seed=4)
+    run = f.run(start, TIMES, seen, truth=truth)
+    smooth = f.smooth(start, TIMES, seen, truth=truth)
+    early = slice(0, 4)
+    error = [r["total_squared_error"].values[early].mean() for r in (run, smooth)]
+    assert error[1] < 0.9 * error[0]
+    assert np.array_equal(smooth["mean"].values[-1], run["mean"].values[-1])
+    assert np.array_equal(smooth["scalars"].values, run["scalars"].values)
+
+
+@EACH
+def test_bad_run_is_named_and_others_go_on(family: str) -> None:
+    """A model that leaves the numbers in one run of three at the second step."""
+
+    def flow(x: np.ndarray, t: float, dt: float) -> np.ndarray:
+        out = x.copy()
+        if t > 0.4 and x.ndim > 2 and x.shape[0] == 3:
+            out[1, 0] = np.nan
+        return out
+
+    broken = Model(
+        2, flow, lambda t, dt: dt * np.eye(2), derivative=lambda x, t, dt: np.eye(2)
+    )
+    sensors = [direct([0], std=0.5), direct([1], std=0.5)]
+    f, start = made(family, sensors=sensors, model=broken, runs=(3,))
+    start = f.step(start, 0.5, [[0.1], [0.2]])
+    with pytest.raises(FilterError, match=r"run 1, agent 0, t = 1 s: the forecast is not finite"):
+        f.step(start, 1.0, [[0.1], [0.2]])
+    g, state = made(family, sensors=sensors, model=broken, runs=(3,), failures="keep")
+    run = g.run(state, [0.5, 1.0, 1.5], [np.full((3, 1), 0.1), np.full((3, 1), 0.2)],
+                truth=np.zeros((3, 3, 2)))
+    assert np.isfinite(run["mean"].values[:, [0, 2]]).all()
+    assert np.isfinite(run["mean"].values[0]).all()
+    assert np.isnan(run["mean"].values[1:, 1]).all() and np.isnan(run["nees"].values[1:, 1]).all()
+
+
+@EACH
+@pytest.mark.parametrize(
+    ("argument", "options"),
+    [
+        ("model", {"model": 3}),
+        ("sensors", {"sensors": [3]}),
+        ("sensors", {"sensors": direct([0], std=1.0)}),
+        ("sensors", {"sensors": []}),
+        ("graph", {"graph": None}),
+        ("graph", {"graph": 3}),
+        ("graph", {"graph": graphs.path(3)}),
+        ("agreement", {"agreement": 3}),
+        ("share", {"share": 1}),
+        ("faults", {"faults": 0.2}),
+        ("faults", {"faults": Faults(delay=1)}),
+        ("lag", {"lag": -1}),
+        ("names", {"names": ("A",)}),
+        ("failures", {"failures": "hide"}),
+    ],
+)
+def test_bad_wiring(family: str, argument: str, options: dict[str, Any]) -> None:
+    given = {"model": model(), "sensors": team(2), "graph": graphs.path(2)} | options
+    with pytest.raises(ValueError, match=argument):
+        FAMILIES[family](given.pop("model"), given.pop("sensors"), given.pop("graph"), **given)
+
+
+@EACH
+@pytest.mark.parametrize(
+    ("argument", "change"),
+    [
+        ("t", {"t": 0.0}),
+        ("t", {"t": np.nan}),
+        ("observations", {"observations": [None]}),
+        ("observations", {"observations": [[1.0, 2.0], None]}),
+        ("observations", {"observations": [[np.inf], None]}),
+        ("observations", {"observations": [[1.0], [1.0]]}),
+        ("state", {"state": 3}),
+        ("late", {"late": [Late(0, -9.0, [1.0], arrived=0.5)]}),
+    ],
+)
+def test_bad_step(family: str, argument: str, change: dict[str, Any]) -> None:
+    f, start = made(family, sensors=[direct([0], std=1.0), None])
+    given = {"state": start, "t": 0.5, "observations": [[1.0], None]} | change
+    with pytest.raises(ValueError, match=argument):
+        f.step(given.pop("state"), given.pop("t"), given.pop("observations"), **given)
+
+
+@EACH
+def test_bad_start_and_bad_agreement(family: str) -> None:
+    f, _ = made(family, agents=2)
+    for prior in ((np.zeros(3), np.eye(3)), (np.zeros(2), -np.eye(2))):
+        with pytest.raises(ValueError, match="prior"):
+            f.start(prior, rng=np.random.default_rng(0))
+    with pytest.raises(ValueError, match="runs"):
+        f.start(PRIOR, rng=np.random.default_rng(0), runs=(0,))
+    if family.startswith("gaussian"):
+        wrong = lambda means, covs, channel: (means[:1], covs)  # noqa: E731
+    else:
+        wrong = lambda ensembles, channel: ensembles[:1]  # noqa: E731
+    g, start = made(family, agents=2, agreement=wrong)
+    with pytest.raises(ValueError, match="agreement"):
+        g.step(start, 0.5, [[0.1], None])

@@ -1,0 +1,76 @@
+"""The smoother against the joint Gaussian of all states and observations."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from distfilt.kalman import GaussianRun, kalman_filter, rts_smoother
+from tests.kalman.problems import RUNS, STEPS, D, M, posterior, problem, spd
+
+_RUN = kalman_filter([0.0], [[1.0]], np.zeros((2, 1)), F=[[1.0]], H=[[1.0]], Q=[[1.0]], R=[[1.0]])
+_LOST = GaussianRun(np.zeros((2, 1)), np.zeros((2, 1, 1)), np.zeros(2))
+BAD_INPUT: dict[str, Any] = {
+    "distfilt.kalman.rts_smoother": [
+        ("run", lambda: rts_smoother(3, F=[[1.0]], Q=[[1.0]])),
+        ("F", lambda: rts_smoother(_RUN, F=np.eye(2), Q=[[1.0]])),
+        ("F", lambda: rts_smoother(_RUN, F=np.ones((3, 1, 1)), Q=[[1.0]])),
+        ("Q", lambda: rts_smoother(_RUN, F=[[1.0]], Q=[[-1.0]])),
+    ]
+}
+
+
+@given(seed=st.integers(0, 10**6), share=st.sampled_from([0.0, 0.3, 1.0]))
+def test_smoothing_is_conditioning_of_the_joint_gaussian(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    p, mean, cov = problem(rng), rng.standard_normal(D), spd(rng, D)
+    y = rng.standard_normal((STEPS, M))
+    y[rng.random(y.shape) < share] = np.nan
+    run = rts_smoother(kalman_filter(mean, cov, y, **p), F=p["F"], Q=p["Q"])
+    means, covs, *_ = posterior(mean, cov, y, p)
+    np.testing.assert_allclose(run.means, means, rtol=0, atol=1e-9)
+    for k in range(STEPS):
+        block = covs[k * D : (k + 1) * D, k * D : (k + 1) * D]
+        np.testing.assert_allclose(run.covariances[k], block, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+def test_runs_are_smoothed_as_if_alone(gaps: bool) -> None:
+    rng = np.random.default_rng(3)
+    p, y = problem(rng, varying=False), rng.standard_normal((STEPS, RUNS, M))
+    if gaps:
+        y[rng.random(y.shape) < 0.3] = np.nan
+    run = kalman_filter(np.zeros(D), np.eye(D), y, **p)
+    kept = run.means.copy(), run.covariances.copy()
+    smooth = rts_smoother(run, F=p["F"], Q=p["Q"])
+    assert smooth.covariances.shape == run.covariances.shape
+    assert (smooth.means[-1] == run.means[-1]).all()
+    assert np.array_equal(smooth.log_likelihood, run.log_likelihood)
+    for k in range(RUNS):
+        alone = kalman_filter(np.zeros(D), np.eye(D), y[:, k], **p)
+        alone = rts_smoother(alone, F=p["F"], Q=p["Q"])
+        np.testing.assert_allclose(smooth.means[:, k], alone.means, rtol=0, atol=1e-12)
+    assert (run.means == kept[0]).all() and (run.covariances == kept[1]).all()
+    assert (smooth.covariances == np.swapaxes(smooth.covariances, -1, -2)).all()
+
+
+def test_later_observations_only_help() -> None:
+    rng = np.random.default_rng(4)
+    p = problem(rng)
+    run = kalman_filter(np.zeros(D), np.eye(D), rng.standard_normal((STEPS, M)), **p)
+    gain = run.covariances - rts_smoother(run, F=p["F"], Q=p["Q"]).covariances
+    assert np.linalg.eigvalsh(gain).min() > -1e-12
+
+
+def test_a_state_that_cannot_be_forecast_raises() -> None:
+    with pytest.raises(np.linalg.LinAlgError, match="forecast"):
+        rts_smoother(_LOST, F=[[1.0]], Q=[[0.0]])
+
+
+def test_one_step_and_none() -> None:
+    one = kalman_filter([0.0], [[1.0]], [[1.0]], F=[[1.0]], H=[[1.0]], Q=[[1.0]], R=[[1.0]])
+    assert rts_smoother(one, F=[[1.0]], Q=[[1.0]]).means == one.means
