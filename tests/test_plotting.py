@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import base64
+import html.parser
+import json
+import re
 import subprocess
 import sys
 
@@ -20,6 +24,7 @@ from distfilt.plotting import (
     LINE_STYLES,
     PALETTE,
     SIZE,
+    Slider,
     axes,
     band,
     colour,
@@ -28,6 +33,7 @@ from distfilt.plotting import (
     graph,
     line_style,
     save,
+    slider,
     use_style,
 )
 
@@ -41,6 +47,20 @@ def _fresh_style():
 
 def blank():
     return axes(xlabel="x", ylabel="y")
+
+
+def curve(rate):
+    ax = axes(xlabel="time", ylabel="x", size=(3, 2))
+    t = np.linspace(0, 1, 50)
+    ax.plot(t, np.exp(-rate * t))
+    ax.set_ylim(0, 1.1)
+    return ax
+
+
+def noise(seed):
+    ax = axes(xlabel="x", ylabel="y")
+    ax.imshow(np.random.default_rng(seed).random((400, 600)), aspect="auto")
+    return ax.figure
 
 
 EYE = np.eye(2)
@@ -90,6 +110,11 @@ _CASES = {
         ("labels", lambda: graph(blank(), PAIR, labels=["A"])),
         ("labels", lambda: graph(blank(), PAIR, labels=["A", 2])),
         ("positions", lambda: graph(blank(), PAIR, positions=[[0, 1]])),
+        ("known", lambda: graph(blank(), PAIR, known=[0.0, 1.5])),
+        ("known", lambda: graph(blank(), PAIR, known=[-0.1, 1.0])),
+        ("known", lambda: graph(blank(), PAIR, known=[1.0])),
+        ("notes", lambda: graph(blank(), PAIR, notes=["one"])),
+        ("notes", lambda: graph(blank(), PAIR, notes=["one", 2])),
     ],
     "save": [
         ("figure", lambda: save(blank(), "a.png")),
@@ -102,6 +127,29 @@ _CASES = {
         ("curve", lambda: digest(curve=[[1, 2], [3]])),
     ],
 }
+_CASES |= {
+    "slider": [
+        ("draw", lambda: slider(3, [1.0], label="x", alt="y")),
+        ("draw", lambda: slider(lambda v: 3, [1.0], label="x", alt="y")),
+        ("draw", lambda: slider(lambda v: axes(xlabel="x", ylabel="y", size=(2 + v, 2)),
+                                [1.0, 2.0], label="x", alt="y")),
+        ("values", lambda: slider(curve, [], label="x", alt="y")),
+        ("values", lambda: slider(curve, "abc", label="x", alt="y")),
+        ("label", lambda: slider(curve, [1.0], label=" ", alt="y")),
+        ("alt", lambda: slider(curve, [1.0], label="x", alt="")),
+        ("unit", lambda: slider(curve, [1.0], label="x", alt="y", unit="")),
+        ("form", lambda: slider(curve, [1.0], label="x", alt="y", form="d")),
+        ("start", lambda: slider(curve, [1.0], label="x", alt="y", start=1)),
+        ("seconds", lambda: slider(curve, [1.0], label="x", alt="y", seconds=0)),
+        ("colours", lambda: slider(curve, [1.0], label="x", alt="y", colours=1)),
+        ("colours", lambda: slider(curve, [1.0], label="x", alt="y", colours=300)),
+        ("frames", lambda: slider(noise, range(4), label="x", alt="y", form="d", colours=256)),
+    ],
+    "Slider": [
+        ("frames", lambda: Slider((), (), (), label="x", alt="y")),
+        ("frames", lambda: Slider((b"",), (), ("",), label="x", alt="y")),
+    ],
+}  # fmt: skip
 BAD_INPUT = {f"distfilt.plotting.{name}": cases for name, cases in _CASES.items()} | {
     "distfilt.digests.digest": _CASES["digest"]
 }
@@ -238,6 +286,88 @@ def test_style_fixes_size_and_resolution():
     assert tuple(matplotlib.rcParams["figure.figsize"]) == SIZE
     assert matplotlib.rcParams["figure.dpi"] == matplotlib.rcParams["savefig.dpi"] == 110
     assert matplotlib.rcParams["axes.prop_cycle"].by_key()["color"] == list(PALETTE)
+
+
+def test_graph_shows_who_knows_what():
+    ax = graph(blank(), PAIR, labels=["A", "B"], known=[0.0, 1.0], notes=["angle", ""])
+    empty, full = ax.collections[0].get_facecolors()
+    assert empty.tolist() == [1, 1, 1, 1] and np.allclose(full[:3], to_rgb(colour(5)))
+    half = graph(blank(), PAIR, known=[0.5, 0.5]).collections[0].get_facecolors()[0]
+    assert np.allclose(half[:3], 0.5 + 0.5 * np.array(to_rgb(colour(5))))
+    assert [t.get_text() for t in ax.texts] == ["A", "angle", "B"]
+
+
+# --- pictures that move -----------------------------------------------------------------------
+
+
+class _Page(html.parser.HTMLParser):
+    """Tags with their attributes, and the text of the scripts."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.scripts, self.open = [], [], False
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        self.open = tag == "script"
+
+    def handle_endtag(self, tag):
+        self.open = self.open and tag != "script"
+
+    def handle_data(self, data):
+        if self.open:
+            self.scripts.append(data)
+
+    def find(self, tag):
+        return [attrs for name, attrs in self.tags if name == tag]
+
+
+def test_a_slider_holds_its_frames_and_nothing_else():
+    use_style()
+    rates = [0.0, 0.5, 1.0, 2.0]
+    found = slider(curve, rates, label="rate", unit="1/s", alt="A curve <falls>.", start=2)
+    assert found.said == ("rate 0 1/s", "rate 0.5 1/s", "rate 1 1/s", "rate 2 1/s")
+    assert len(set(found.frames)) == 4 and not pyplot.get_fignums()
+    page = _Page(found.html)
+    (image,), (knob,) = page.find("img"), page.find("input")
+    assert image["alt"] == "A curve <falls>. rate 1 1/s."
+    first = base64.b64decode(image["src"].removeprefix("data:image/png;base64,"))
+    assert first == found.frames[2] and first[:4] == b"\x89PNG"
+    assert (knob["type"], knob["min"], knob["max"], knob["value"]) == ("range", "0", "3", "2")
+    assert knob["aria-label"] == "rate" and len(page.find("button")) == 1
+    data = json.loads(page.scripts[0])
+    assert [base64.b64decode(f) for f in data["frames"]] == list(found.frames)
+    assert data["said"] == list(found.said) and data["milliseconds"] == 500
+    assert "http" not in found.html and not any("src" in s for s in page.find("script"))
+    assert len(found.html) < 100_000
+    bundle = found._repr_mimebundle_()
+    assert set(bundle) == {"text/plain", "text/html", "image/png"}
+    assert base64.b64decode(bundle["image/png"]) == found.frames[2]
+
+
+def test_a_slider_drawn_twice_is_the_same_page():
+    use_style()
+    one, two = (slider(curve, [0.0, 1.0], label="rate", alt="A curve.") for _ in range(2))
+    assert one.html == two.html and repr(one) == repr(two)
+
+
+def test_a_slider_notices_a_changed_frame():
+    use_style()
+    texts = {
+        repr(slider(lambda v, k=k: curve(v * k), [0.5, 1.0], label="rate", alt="A curve."))
+        for k in (1.0, 1.01, 0.99)
+    }
+    assert len(texts) == 3
+    keys = {re.search('data-frames="([0-9a-f]{16})"', slider(
+        curve, [0.5, last], label="rate", alt="A curve.").html)[1] for last in (1.0, 1.01)}
+    assert len(keys) == 2
+
+
+def test_texts_of_a_slider_cannot_end_its_script():
+    found = slider(curve, [1.0], label="rate", alt="</script><b>x</b>")
+    page = _Page(found.html)
+    assert json.loads(page.scripts[0])["alt"] == "</script><b>x</b>" and not page.find("b")
 
 
 # --- the digest -------------------------------------------------------------------------------
