@@ -18,7 +18,14 @@ from .satellite import (
     clohessy_wiltshire_drift,
     clohessy_wiltshire_transition,
 )
-from .swarm import READINGS, RotatingMixture, Swarm, reflected, rotating_swarm
+from .swarm import (
+    READINGS,
+    RotatingMixture,
+    Swarm,
+    mobility_and_diffusion,
+    reflected,
+    rotating_swarm,
+)
 
 __all__ = [
     "READINGS",
@@ -37,6 +44,7 @@ __all__ = [
     "left_directions",
     "lorenz63",
     "lorenz63_rate",
+    "mobility_and_diffusion",
     "quaternion_rate",
     "reflected",
     "rk4",

@@ -11,18 +11,45 @@ from numpy.typing import ArrayLike
 
 from ..checks import Array, array, callable_, choice, count, generator, increasing, number
 
-__all__ = ["READINGS", "RotatingMixture", "Swarm", "reflected", "rotating_swarm"]
+__all__ = [
+    "READINGS",
+    "RotatingMixture",
+    "Swarm",
+    "mobility_and_diffusion",
+    "reflected",
+    "rotating_swarm",
+]
 
-READINGS = {
-    "literal": (0.03, 0.00045),
-    "gibbs": (0.03, 0.03),
-    "slowgibbs": (0.00045, 0.00045),
-}
-"""Readings of equation (23) of Zheng and Lin: mobility c and diffusion D, both in 1/s.
+READINGS = ("literal", "gibbs", "slowgibbs")
+"""Readings of equation (23) of Zheng and Lin, see :func:`mobility_and_diffusion`."""
 
-The drift is c ∇f/f. Printed are c = 0.03 and D = 0.03²/2; the density then follows a power of f.
-With c = D it follows f itself, fast with the one number and slowly with the other.
-"""
+
+def mobility_and_diffusion(reading: str, strength: float = 0.03) -> tuple[float, float]:
+    """Mobility c and diffusion D of a drift c ∇f/f, in one of the `READINGS` of equation (23).
+
+    Parameters
+    ----------
+    reading : {"literal", "gibbs", "slowgibbs"}
+        As printed, the one number s is the mobility and the noise's strength, so that D = s²/2; the
+        density then follows the power 2/s of f. With both s ("gibbs"), or both s²/2 ("slowgibbs"),
+        it follows f itself, fast or slowly.
+    strength : float
+        The number s, positive.
+
+    Returns
+    -------
+    mobility, diffusion : float
+        Both in 1/s for a box of width 1.
+
+    Examples
+    --------
+    >>> mobility_and_diffusion("literal")
+    (0.03, 0.00045)
+    """
+    s = number(strength, "strength", above=0)
+    small = s**2 / 2
+    choice(reading, "reading", READINGS)
+    return (small if reading == "slowgibbs" else s), (s if reading == "gibbs" else small)
 
 
 def reflected(positions: ArrayLike, low: ArrayLike, high: ArrayLike) -> Array:
@@ -233,14 +260,16 @@ class Swarm:
         return path
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class RotatingMixture:
     """Gaussians of equal weight and variance that go round a circle: f(x, t) of Zheng and Lin.
 
     Parameters
     ----------
+    centre : array_like, (2,)
+        Of the circle.
     radius, rate : float
-        Of the circle about (0.5, 0.5), and in rad/s.
+        Of the circle, and in rad/s.
     variance : float
         Of each component along each axis, positive.
     components : int
@@ -255,6 +284,7 @@ class RotatingMixture:
            [0.2, 0.5]])
     """
 
+    centre: ArrayLike = field(default=(0.5, 0.5), kw_only=True)
     radius: float = field(default=0.3, kw_only=True)
     rate: float = field(default=0.04, kw_only=True)
     variance: float = field(default=0.02, kw_only=True)
@@ -262,6 +292,7 @@ class RotatingMixture:
     phase: float = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
+        array(self.centre, "centre", (2,))
         number(self.radius, "radius", at_least=0)
         number(self.rate, "rate")
         number(self.variance, "variance", above=0)
@@ -272,7 +303,8 @@ class RotatingMixture:
         """Where the components are at time `t`, (K, 2)."""
         k = np.arange(self.components)
         angle = self.rate * t + self.phase + 2 * np.pi * k / self.components
-        return 0.5 + self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        return np.asarray(np.asarray(self.centre) + self.radius * circle)
 
     def _logs(self, x: Array, t: float) -> tuple[Array, Array]:
         means = self.means(t)
@@ -297,14 +329,17 @@ class RotatingMixture:
 
 
 def rotating_swarm(
-    reading: str = "slowgibbs", *, mixture: RotatingMixture | None = None
+    reading: str = "slowgibbs",
+    *,
+    strength: float = 0.03,
+    mixture: RotatingMixture | None = None,
 ) -> Swarm:
     """The swarm of Zheng and Lin's study, equation (23), in one of its `READINGS`.
 
     Parameters
     ----------
-    reading : {"literal", "gibbs", "slowgibbs"}
-        As printed, or with mobility and diffusion that agree, fast or slow.
+    reading, strength
+        As for :func:`mobility_and_diffusion`.
     mixture : RotatingMixture, optional
         What the agents are drawn to.
 
@@ -318,7 +353,7 @@ def rotating_swarm(
     >>> swarm.drift_at(np.array([[0.8, 0.6]]), 0.0).round(3)
     array([[-0.  , -0.15]])
     """
-    mobility, diffusion = READINGS[choice(reading, "reading", READINGS)]
+    mobility, diffusion = mobility_and_diffusion(reading, strength)
     f = RotatingMixture() if mixture is None else mixture
     if not isinstance(f, RotatingMixture):
         raise ValueError(f"mixture: needs a RotatingMixture, got {type(f).__name__}")

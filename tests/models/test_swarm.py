@@ -7,7 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distfilt.models import READINGS, RotatingMixture, Swarm, reflected, rotating_swarm
+from distfilt.models import (
+    READINGS,
+    RotatingMixture,
+    Swarm,
+    mobility_and_diffusion,
+    reflected,
+    rotating_swarm,
+)
 
 CORNERS = [-1.0, 0.5], [1.0, 2.0]
 
@@ -124,11 +131,12 @@ def test_literal_reading_follows_a_power_of_f_with_a_lag() -> None:
 
 @pytest.mark.parametrize("reading", READINGS)
 def test_readings_are_the_published_numbers(reading: str) -> None:
-    mobility, diffusion = READINGS[reading]
+    mobility, diffusion = mobility_and_diffusion(reading)
     swarm, x = rotating_swarm(reading), np.array([[0.3, 0.9]])
     assert np.allclose(swarm.drift_at(x, 1.0), mobility * RotatingMixture().score(x, 1.0))
     assert np.allclose(swarm.diffusion_at(x, 1.0), diffusion)
-    assert READINGS["literal"][1] == pytest.approx(0.03**2 / 2)
+    wanted = {"literal": (0.2, 0.02), "gibbs": (0.2, 0.2), "slowgibbs": (0.02, 0.02)}
+    assert mobility_and_diffusion(reading, 0.2) == pytest.approx(wanted[reading])
 
 
 _RNG = np.random.default_rng(0)
@@ -167,6 +175,10 @@ BAD_INPUT = {
         ("variance", lambda: RotatingMixture(variance=0.0)),
         ("components", lambda: RotatingMixture(components=0)),
         ("radius", lambda: RotatingMixture(radius=-1.0)),
+    ],
+    "distfilt.models.swarm.mobility_and_diffusion": [
+        ("reading", lambda: mobility_and_diffusion("quick")),
+        ("strength", lambda: mobility_and_diffusion("gibbs", 0.0)),
     ],
     "distfilt.models.swarm.rotating_swarm": [
         ("reading", lambda: rotating_swarm("quick")),
