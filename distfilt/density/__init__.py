@@ -22,13 +22,20 @@ from .kernel import (
     kernel_information,
     kernels,
 )
+from .sharing import Centralised, DynamicAverage, Flooding, Neighbours, PIConsensus, Sharing
 
 __all__ = [
+    "Centralised",
     "Dense",
+    "DynamicAverage",
+    "Flooding",
     "FokkerPlanck",
     "Grid",
     "LowRank",
+    "Neighbours",
+    "PIConsensus",
     "Shared",
+    "Sharing",
     "adaptive_bandwidths",
     "bandwidth",
     "bernoulli",

@@ -85,8 +85,8 @@ def zero_mean_prior(
 
 
 def _variance(noise: ArrayLike, shape: tuple[int, ...]) -> Array:
-    r = array(noise, "noise", shape)
-    if r.size and r.min() <= 0:
+    r = array(noise, "noise", shape, finite=False)
+    if r.size and not r.min() > 0:
         raise ValueError(f"noise: needs variances above 0, got {r.min():g}")
     return r
 
@@ -272,7 +272,7 @@ def shared_step(
         As :func:`shared_moved` left it.
     observed : array_like, (F, n) or (n,)
     noise : array_like, (F, n) or (n,)
-        Strength R of the noise, positive.
+        Strength R of the noise, positive; infinite where a filter measures nothing.
     dt : float
         In s.
 
@@ -285,14 +285,16 @@ def shared_step(
     if not isinstance(state, Shared):
         raise ValueError(f"state: needs a Shared state, got {type(state).__name__}")
     shape, length = state.base.shape, number(dt, "dt", above=0)
-    y, r = array(observed, "observed"), array(noise, "noise")
+    y, r = array(observed, "observed"), array(noise, "noise", finite=False)
     for name, value in (("observed", y), ("noise", r)):
         if value.shape not in (shape, shape[1:]):
             raise ValueError(f"{name}: needs shape {shape} or {shape[1:]}, got {value.shape}")
     precision = length / _variance(np.broadcast_to(r, shape), shape)
     s = state.basis
     vector = state.vector + (precision * (y - state.base)) @ s
-    information = state.information + _weighted_products(s, precision)
+    informed = precision.any(axis=-1)
+    information = state.information.copy()
+    information[informed] += _weighted_products(s, precision[informed])
     return Shared(s, state.base, information, vector)
 
 

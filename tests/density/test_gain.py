@@ -124,6 +124,16 @@ def test_filters_do_not_see_each_other() -> None:
     assert np.abs(everyone.information[0] - many.information[0]).max() < 1e-12
 
 
+def test_an_infinite_noise_measures_nothing() -> None:
+    grid = Grid((10, 10))
+    state = shared_start(zero_mean_prior(grid, rank=40), RNG.random((3, 100)))
+    r = np.ones((3, 100))
+    r[1], r[2, 50:] = np.inf, np.inf
+    after, huge = (shared_step(state, np.ones(100), np.minimum(r, m), 0.1) for m in (np.inf, 1e15))
+    assert np.array_equal(after.estimates[1], state.estimates[1])
+    assert np.abs(after.estimates - huge.estimates).max() < 1e-12
+
+
 def test_prior_has_the_variance_and_the_mass_that_it_says() -> None:
     grid = Grid((20, 20), high=[2.0, 1.0])
     s = zero_mean_prior(grid, rank=399, length=0.2, std=0.7)
@@ -183,6 +193,7 @@ BAD_INPUT = {
         ("state", lambda: shared_step(_DENSE, _Y, _R, 0.1)),
         ("observed", lambda: shared_step(_SHARED, np.ones((3, 16)), _R, 0.1)),
         ("noise", lambda: shared_step(_SHARED, _Y, -_R, 0.1)),
+        ("noise", lambda: shared_step(_SHARED, _Y, np.nan * _R, 0.1)),
         ("dt", lambda: shared_step(_SHARED, _Y, _R, -0.1)),
     ],
     "distfilt.density.gain.LowRank": [("factor", lambda: LowRank(np.ones(3), np.eye(2)))],
