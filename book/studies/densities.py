@@ -163,6 +163,7 @@ def trial(seed: np.random.SeedSequence) -> list[float]:
         result = case(
             reading, "peaked" if wrong else start, np.random.default_rng(part),
             phase=CHOICES["wrong_phase"] if wrong else 0.0,
+            end=CHOICES["wrong_end"] if wrong else None,
         )
         found |= {f"{reading}_{start}_{name}": late(v) for name, v in result.items()}
     return [found[c] for c in columns]

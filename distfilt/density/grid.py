@@ -211,7 +211,8 @@ class Grid:
         r"""The `rank` lowest cosine modes at the centres, (n, rank), orthonormal over the box.
 
         :math:`c_k(x)\propto\prod_j\cos(\pi k_j (x_j-\text{low}_j)/w_j)`: the modes of reflecting
-        walls. Their sums over cells are orthonormal exactly, not only in the limit.
+        walls. Their sums over cells are orthonormal exactly, not only in the limit. The array is
+        kept, and read-only.
 
         Examples
         --------
@@ -219,8 +220,17 @@ class Grid:
         >>> bool(np.abs(basis.T @ basis / 64 - np.eye(10)).max() < 1e-12)
         True
         """
+        if rank in self._kept:
+            return self._kept[rank]
         k = self.wavenumbers(rank)
         x = (self.centres - self.corner) / self.width
         waves = np.cos(np.pi * x[:, None, :] * k).prod(axis=-1)
-        size = np.sqrt((waves**2).sum(axis=0) * self.volume)
-        return np.asarray(waves / size)
+        out = np.asarray(waves / np.sqrt((waves**2).sum(axis=0) * self.volume))
+        out.setflags(write=False)
+        self._kept[rank] = out
+        return out
+
+    @cached_property
+    def _kept(self) -> dict[int, Array]:
+        """Bases that were asked for before; consensus asks in every step."""
+        return {}
