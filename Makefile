@@ -9,9 +9,10 @@ PYTHON := $(shell for p in python3.11 python3 python; do \
 endif
 VENV := .venv
 PY := $(VENV)/bin/python
-PIP := $(PY) -m pip install --quiet --disable-pip-version-check
 STAMP := $(VENV)/stamp
 HTML := _build/html
+LAB := _build/lab
+SAMPLE := 300
 
 # One thread in each BLAS, so that two runs give the same digits; book/tools pins the same for kernels.
 export OPENBLAS_NUM_THREADS := 1
@@ -21,30 +22,37 @@ export MPLCONFIGDIR := $(CURDIR)/$(VENV)/matplotlib
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help environment book test unit types style pairs regress slow outputs identical studies bench portable lab lock clean
+.PHONY: help environment remake book test unit types style pairs regress slow outputs identical \
+	accept studies check-studies bench mutants portable lab lock clean
 
 help:
 	@echo "make book       environment, library and HTML (warnings are errors); prints the page's path"
 	@echo "make test       the book, then unit, property and doc tests, types, style, pairs, stored outputs, browser"
-	@echo "make slow       the tests that take minutes"
+	@echo "make slow       the tests that take minutes, and new examples for the property tests"
 	@echo "make outputs    execute every chapter, store its outputs, write the ledger of reproductions"
-	@echo "make identical  execute every chapter again and compare byte for byte with what is stored"
+	@echo "make identical  execute every chapter again and compare texts byte for byte, pictures as seen"
+	@echo "make accept     take the scenarios as they are for the book's own"
 	@echo "make studies    run the studies that take too long for a chapter, store them in data/studies"
+	@echo "make check-studies  run every stored study again and compare"
 	@echo "make portable   stored outputs on another BLAS kernel and without numpy's newer SIMD"
 	@echo "make bench      side-by-side measurements, written to data/bench"
-	@echo "make lab        JupyterLab on the chapters"
+	@echo "make mutants    how many of SAMPLE=300 random faults the tests find, written to data/bench"
+	@echo "make lab        JupyterLab on a working copy of the chapters (LAB=folder for another one)"
 	@echo "make lock       resolve requirements.txt again"
-	@echo "make clean      remove what was built (the environment stays)"
+	@echo "make clean      remove what was built (the environment and the working copy stay)"
 
 environment: $(STAMP)
 
+# The stamp is written last and names this folder: without it, or with another one's, the
+# environment is made again.
+ifneq ($(shell $(PY) -c "" 2>/dev/null && cat $(STAMP) 2>/dev/null),$(CURDIR))
+$(STAMP): remake
+endif
 $(STAMP): requirements.txt pyproject.toml
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer was not found: make PYTHON=/path/to/python"; exit 1; }
-	test -x $(PY) || "$(PYTHON)" -m venv $(VENV)
-	$(PIP) -r requirements.txt
-	$(PIP) --no-deps --no-build-isolation --editable .
-	@$(PY) -W ignore -c "import matplotlib.font_manager"
-	@touch $@
+	@"$(PYTHON)" -B book/tools/environment.py $(VENV)
+
+remake:
 
 # Built afresh each time: a page that is not read again would not repeat its warnings.
 book: $(STAMP)
@@ -55,7 +63,7 @@ book: $(STAMP)
 test: book unit types style pairs regress
 
 unit: $(STAMP)
-	$(PY) -m pytest -q
+	HYPOTHESIS_PROFILE=gate $(PY) -m pytest -q
 
 types: $(STAMP)
 	$(PY) -m mypy
@@ -65,13 +73,14 @@ style: $(STAMP)
 
 pairs: $(STAMP)
 	$(PY) book/tools/pairs.py
+	$(PY) book/tools/scenarios.py
 	$(PY) book/tools/ledger.py --check
 
 regress: $(STAMP)
 	$(PY) book/tools/regress.py
 
 slow: $(STAMP)
-	$(PY) -m pytest -q -m slow
+	HYPOTHESIS_PROFILE=explore $(PY) -m pytest -q -m slow
 
 outputs: $(STAMP)
 	$(PY) book/tools/execute.py
@@ -80,24 +89,34 @@ outputs: $(STAMP)
 identical: $(STAMP)
 	$(PY) book/tools/execute.py --check
 
+accept: $(STAMP)
+	$(PY) book/tools/scenarios.py --accept
+
 portable: $(STAMP)
 	$(PY) book/tools/regress.py --portable
 
 studies: $(STAMP)
 	$(PY) book/tools/studies.py
 
+check-studies: $(STAMP)
+	$(PY) book/tools/studies.py --check
+
 bench: $(STAMP)
 	mkdir -p data/bench
 	set -e; for script in tests/bench/bench_*.py; do echo "$$script"; $(PY) "$$script"; done
 
+mutants: $(STAMP)
+	$(PY) tests/tools/mutants.py --sample $(SAMPLE)
+
 lab: $(STAMP)
-	$(PY) -m jupyterlab --notebook-dir=book
+	$(PY) book/tools/lab.py "$(LAB)"
 
 lock: $(STAMP)
 	$(PY) -m uv pip compile --quiet --universal --python-version 3.11 --no-emit-index-url \
-		--no-emit-find-links --no-header --no-annotate --extra book --extra test \
+		--no-emit-find-links --no-header --no-annotate --extra book --extra test --extra mutants \
 		pyproject.toml requirements.in --output-file requirements.txt
 
 clean:
-	rm -rf _build dist book/_generated .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find _build -mindepth 1 -maxdepth 1 -not -name lab -exec rm -rf {} + 2>/dev/null || true
+	rm -rf dist book/_generated .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -not -path "./$(VENV)/*" -prune -exec rm -rf {} +

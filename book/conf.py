@@ -30,7 +30,14 @@ from sphinx.errors import ExtensionError
 sys.path.insert(0, str(Path(__file__).parent / "tools"))
 
 from common import BOOK, ROOT, missing_pages
-from pages import chapter_number, drop_widgets, escape_stars, number_chapters, write_generated
+from pages import (
+    chapter_number,
+    drop_widgets,
+    escape_stars,
+    keep_sliders,
+    number_chapters,
+    write_generated,
+)
 
 project = "Distributed Nonlinear Filtering"
 author = "The distfilt authors"
@@ -172,5 +179,6 @@ def setup(app: Sphinx) -> None:
     app.connect("builder-inited", check_toc)
     app.connect("builder-inited", lambda app: write_generated(BOOK / "_generated"))
     app.connect("doctree-read", lambda app, tree: drop_widgets(tree))
+    app.connect("doctree-read", lambda app, tree: keep_sliders(tree))
     app.connect("autodoc-process-docstring", lambda *event: escape_stars(event[-1]))
     app.connect("build-finished", copy_mathjax)

@@ -1,9 +1,44 @@
 """Distributed nonlinear filtering: transport maps, mixtures, densities and their networks.
 
-The modules are imported one by one, ``from distfilt.filters.ensemble import EnsembleFilter``, so
-that ``import distfilt`` costs no more than numpy.
+The rooms are packages with a face each, ``from distfilt.filters import EnsembleFilter``. All of
+them are attributes here too, imported when they are first asked for, so that ``import distfilt``
+itself costs next to nothing.
 """
 
-__all__ = ["__version__"]
+from __future__ import annotations
 
-__version__ = "0.1.0"
+import importlib
+from types import ModuleType
+
+__version__ = "0.2.0"
+
+_ROOMS = (
+    "digests",
+    "ensembles",
+    "filters",
+    "gaussians",
+    "intervals",
+    "kalman",
+    "linalg",
+    "metrics",
+    "models",
+    "network",
+    "plotting",
+    "published",
+    "sensors",
+    "studies",
+    "triangular",
+    "updates",
+)
+
+__all__ = ["__version__", *_ROOMS]
+
+
+def __getattr__(name: str) -> ModuleType:
+    if name not in _ROOMS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return importlib.import_module(f".{name}", __name__)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .checks import Array, array, count, generator
-from .linalg import _EPS, _cholesky, _cholesky_solve, _leading, _solve_upper, _symmetrise, factor
+from .linalg import _EPS, _cholesky, _leading, _solve_upper, _symmetrise, factor
 
 __all__ = ["anomalies", "cross_covariance", "draw", "exact_noise", "mean", "sample_covariance"]
 
@@ -188,32 +188,49 @@ def exact_noise(
 def _exact_noise(avoid: Array, root: Array, rng: np.random.Generator) -> Array:
     """As the public one, with a lower factor of the covariance; it too needs enough members."""
     n = avoid.shape[-2]
-    # Columns that are zero in all factors need no draw: a singular covariance asks for less room.
-    root = root[..., (root != 0).any(axis=tuple(range(root.ndim - 1)))]
+    if n <= avoid.shape[-1] + root.shape[-1]:
+        root = _narrow(root)
     rank = root.shape[-1]
     leading = np.broadcast_shapes(avoid.shape[:-2], root.shape[:-2])
     drawn = _projected(rng.standard_normal((*leading, n, rank)), avoid)
     return _coloured(drawn, root)
 
 
+def _narrow(root: Array) -> Array:
+    """A factor with as many columns as the rank, up to rounding: it asks for fewer members."""
+    std = np.sqrt((root**2).sum(axis=-1))
+    unit = np.where(std > 0, std, 1.0)[..., None]
+    u, s, _ = np.linalg.svd(root / unit)
+    kept = s**2 > 64 * s.shape[-1] * _EPS * s.max(axis=-1, initial=0.0, keepdims=True) ** 2
+    width = int(kept.sum(axis=-1).max(initial=0))
+    narrow = (u * (s * kept)[..., None, :])[..., :width]
+    # Triangular again, which leaves no signs or rotations to the machine.
+    upper: Array = np.asarray(np.linalg.qr(narrow.swapaxes(-1, -2), mode="r"))
+    sign = np.where(np.diagonal(upper, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
+    return (upper * sign[..., None]).swapaxes(-1, -2) * unit
+
+
 def _projected(drawn: Array, avoid: Array) -> Array:
     """What is left of a draw without the constant and the anomalies."""
-    n, p = avoid.shape[-2:]
+    n = avoid.shape[-2]
     centred = _anomalies(avoid)
-    turned = np.ascontiguousarray(centred.swapaxes(-1, -2))
-    gram = turned @ centred
-    size = np.sqrt(np.diagonal(gram, axis1=-2, axis2=-1))
-    size = np.where(size > 0, size, 1.0)[..., None]
-    # Two passes leave the square of what the normal equations lose, if no pivot is below 1e-8.
-    lower = _steady(gram / (size * size.swapaxes(-1, -2)), 1e-8)
-    if lower is None or n <= p + drawn.shape[-1]:
-        basis = _span(centred / size.swapaxes(-1, -2), drawn.shape[-1])
-        for _ in range(2):
-            drawn = drawn - basis @ (basis.swapaxes(-1, -2) @ drawn)
-        return drawn
+    size = np.sqrt((centred**2).sum(axis=-2, keepdims=True))
+    unit = centred / np.where(size > 0, size, 1.0)
+    # A frame by two orthogonal factors, the second one small; anomalies that repeat others, as
+    # linear predictions do, leave a zero among the singular values.
+    constant = np.full((*unit.shape[:-1], 1), n**-0.5)
+    q, r = np.linalg.qr(np.concatenate([constant, unit], axis=-1))
+    u, values, _ = np.linalg.svd(r, full_matrices=False)
+    good = values > n * _EPS * values.max(axis=-1, initial=0.0, keepdims=True)
+    independent, rank = int(good.sum(axis=-1).max(initial=1)) - 1, drawn.shape[-1]
+    if n <= independent + rank:
+        raise ValueError(
+            f"anomalies_to_avoid: needs more than {independent} + {rank} members, for "
+            f"{independent} independent anomalies and noise of rank {rank}, got {n}"
+        )
+    frame = q @ (u * good[..., None, :])
     for _ in range(2):
-        drawn = _anomalies(drawn)
-        drawn -= centred @ (_cholesky_solve(lower, turned @ drawn / size) / size)
+        drawn = drawn - frame @ (frame.swapaxes(-1, -2) @ drawn)
     return drawn
 
 
@@ -237,21 +254,3 @@ def _steady(gram: Array, least: float) -> Array | None:
         return None
     small = np.diagonal(lower, axis1=-2, axis2=-1).min(initial=1.0) < np.sqrt(least)
     return None if small else lower
-
-
-def _span(unit: Array, rank: int) -> Array:
-    """Orthonormal basis over the members (..., N, 1 + p) of the constant and centred columns."""
-    n, p = unit.shape[-2:]
-    constant = np.full((*unit.shape[:-1], 1), n**-0.5)
-    if n > p + rank:
-        # If they depend on each other, the basis has directions to spare, which do no harm.
-        return np.asarray(np.linalg.qr(np.concatenate([constant, unit], axis=-1))[0])
-    u, s, _ = np.linalg.svd(unit, full_matrices=False)
-    kept = s > n * _EPS * s.max(axis=-1, initial=0.0, keepdims=True)
-    independent = int(kept.sum(axis=-1).max(initial=0))
-    if n <= independent + rank:
-        raise ValueError(
-            f"anomalies_to_avoid: needs more than {independent} + {rank} members, for "
-            f"{independent} independent anomalies and noise of rank {rank}, got {n}"
-        )
-    return np.concatenate([constant, u * kept[..., None, :]], axis=-1)

@@ -92,8 +92,10 @@ def mean_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
     v = _values(values, 2)
     confidence = _level(level)
     middle, error = float(v.mean()), float(v.std(ddof=1)) / float(np.sqrt(v.size))
-    half = float(t.ppf(0.5 + confidence / 2, v.size - 1)) * error
-    return Interval(middle, middle - half, middle + half, error)
+    if error == 0:  # all alike, which a distribution of scale 0 is not made for
+        return Interval(middle, middle, middle, 0.0)
+    low, high = t.interval(confidence, v.size - 1, loc=middle, scale=error)
+    return Interval(middle, float(low), float(high), error)
 
 
 def median_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:

@@ -6,6 +6,8 @@ takes float64 arrays that fit, and factors where its public twin takes covarianc
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf, dtrtrs
@@ -190,7 +192,8 @@ def _triangular(lower: Array, right: Array, transposed: int) -> Array:
         leading = np.broadcast_shapes(leading, right.shape[:-2])
         lower = np.broadcast_to(lower, (*leading, d, d))
         right = np.broadcast_to(right, (*leading, d, k))
-    factors, columns = lower.reshape(-1, d, d), right.reshape(-1, d, k)
+    n = math.prod(leading)
+    factors, columns = lower.reshape(n, d, d), right.reshape(n, d, k)
     if len(factors) > 2 * d:
         # Many small systems: row after row of all of them at once beats a call for each.
         out = _substitute(factors, columns, transposed)
@@ -230,7 +233,7 @@ def _substitute(lower: Array, right: Array, transposed: int) -> Array:
 def _whiten(lower: Array, vectors: Array) -> Array:
     """Solve L out = v for vectors (..., d); leading axes broadcast."""
     if lower.ndim == 2:
-        flat = vectors.reshape(-1, vectors.shape[-1])
+        flat = vectors.reshape(math.prod(vectors.shape[:-1]), -1 if vectors.size else len(lower))
         return _one_triangular(lower, flat.T, 0).T.reshape(vectors.shape)
     if lower.shape[-3] == 1 and vectors.ndim > 1:
         # One factor for all vectors along the last leading axis: they are its columns.

@@ -49,8 +49,8 @@ def blank():
     return axes(xlabel="x", ylabel="y")
 
 
-def curve(rate):
-    ax = axes(xlabel="time", ylabel="x", size=(3, 2))
+def curve(rate, width=3.0):
+    ax = axes(xlabel="time", ylabel="x", size=(width, 2))
     t = np.linspace(0, 1, 50)
     ax.plot(t, np.exp(-rate * t))
     ax.set_ylim(0, 1.1)
@@ -131,8 +131,8 @@ _CASES |= {
     "slider": [
         ("draw", lambda: slider(3, [1.0], label="x", alt="y")),
         ("draw", lambda: slider(lambda v: 3, [1.0], label="x", alt="y")),
-        ("draw", lambda: slider(lambda v: axes(xlabel="x", ylabel="y", size=(2 + v, 2)),
-                                [1.0, 2.0], label="x", alt="y")),
+        ("draw", lambda: slider(lambda v: blank(), [1.0], label="x", alt="y")),
+        ("draw", lambda: slider(lambda v: curve(v, width=v), [3.0, 4.0], label="x", alt="y")),
         ("values", lambda: slider(curve, [], label="x", alt="y")),
         ("values", lambda: slider(curve, "abc", label="x", alt="y")),
         ("label", lambda: slider(curve, [1.0], label=" ", alt="y")),

@@ -1,30 +1,36 @@
-"""Four buoys on a ring follow a drifting spill: a model, a sensor and a graph of one's own."""
+"""A filter family of one's own: the belief on a grid of places, for walkers on a line."""
 
-from functools import partial
+from dataclasses import dataclass
 
 import numpy as np
 
-from distfilt import ensembles
-from distfilt.filters import EnsembleFilter
-from distfilt.models import Model, simulate
-from distfilt.network import Graph
-from distfilt.network.consensus import mean_pull
-from distfilt.sensors import Sensor
-from distfilt.triangular.conditioning import affine_update
+from distfilt.filters import SensorFilter, State, Summary
+from distfilt.network import Ledger
 
-rng = np.random.default_rng(0)
-turn = lambda x, t, dt: x + dt * np.stack([-x[..., 1], x[..., 0]], axis=-1)  # noqa: E731
-model = Model(2, turn, lambda t, dt: 0.01 * dt * np.eye(2), ("x", "y"), ("km", "km"))
-buoys = np.array([[2.0, 0.0], [0.0, 2.0], [-2.0, 0.0], [0.0, -2.0]])
-reach = lambda place, x: np.exp(-((x - place) ** 2).sum(-1, keepdims=True) / 8)  # noqa: E731
-sensors = [Sensor(1, partial(reach, place), [[0.02**2]]) for place in buoys]
-ring = Graph.from_adjacency([[0, 1, 0, 1], [1, 0, 1, 0], [0, 1, 0, 1], [1, 0, 1, 0]])
+X = np.linspace(-6, 6, 241)[:, None]  # places, in m
 
-times = np.arange(1, 61) * 0.05
-truth = simulate(model, [1.0, 0.0], times, rng=rng)
-seen = [sensor.observe(truth, rng=rng) for sensor in sensors]
-agree = partial(mean_pull, gain=0.02)
-spill = EnsembleFilter(model, sensors, ring, affine_update, agree, members=300)
-state = spill.start(partial(ensembles.draw, [0.5, 0.5], np.eye(2)), rng=rng)
-run = spill.run(state, times, seen, truth=truth)
-print(run["squared_error"].sel(time=slice(2, 3)).mean("time").values.round(3), "km²")
+
+@dataclass(frozen=True, eq=False)
+class GridState(State):
+    belief: np.ndarray  # (A, places)
+
+
+class GridFilter(SensorFilter):
+    def start(self, prior, *, rng=None, runs=(), t=0.0):
+        belief = np.exp(-((X.T - prior[0]) ** 2) / (2 * np.asarray(prior[1])))
+        belief = np.repeat(belief / belief.sum(), len(self.sensors), axis=0)
+        return GridState(t, Ledger.empty(len(belief)), None, belief)
+
+    def step(self, state, t, observations):
+        dt, channel = self.elapsed(state, t), self.channel(state, t)
+        gap = X.T - self.model.step(X, state.t, dt)
+        kernel = np.exp(-(gap**2) / (2 * self.model.noise(state.t, dt)))
+        belief = state.belief @ (kernel / kernel.sum(axis=1, keepdims=True))
+        for heard in self.gather(self.observed(state, observations), channel):
+            gap = heard.target[:, None] - heard.predict(np.repeat(X[None], len(heard.agents), 0))
+            belief[heard.agents] *= np.exp(-(gap**2 / np.diag(heard.covariance(0))).sum(-1) / 2)
+        return GridState(t, channel.ledger, None, belief / belief.sum(axis=1, keepdims=True))
+
+    def summary(self, state):
+        mean = state.belief @ X
+        return Summary(mean, state.belief @ X**2 - mean**2)

@@ -12,8 +12,12 @@ from typing import Any
 
 import yaml
 
+from pictures import taken_out
+
 ROOT = Path(__file__).resolve().parents[2]
 BOOK = ROOT / "book"
+SLIDER = 'class="frames"'
+"""In the HTML of a picture that moves, which brings its own alternative text."""
 VERDICT = "application/vnd.distfilt.verdict+json"
 
 # Home folders, kernel files, addresses in memory and progress bars differ on the next machine.
@@ -102,7 +106,7 @@ def output_texts(output: Any) -> Iterator[str]:
     yield from output.get("traceback", [])
     for mime, value in output.get("data", {}).items():
         if not mime.startswith("image/") or mime.endswith("svg+xml"):
-            yield value if isinstance(value, str) else repr(value)
+            yield taken_out(value)[0] if isinstance(value, str) else repr(value)
 
 
 def foreign_text(output: Any) -> str:

@@ -1,10 +1,12 @@
 """Execute chapters and store their outputs beside them, the same bytes every time.
 
-    python book/tools/execute.py [CHAPTER ...] [--check] [--jobs N]
+    python book/tools/execute.py [CHAPTER ...] [--check] [--bytes] [--jobs N]
 
 The Markdown is the source; the notebook is written from it. A chapter that raises, warns, writes to
 stderr or stores a path of this machine is refused, and its stored notebook stays as it was. With
-``--check`` nothing is written: the chapters run again and their bytes are compared.
+``--check`` nothing is written: the chapters run again and are compared with what is stored, every
+byte of text, and pictures as a reader sees them. ``--bytes`` compares the pictures' bytes too: they
+are the same on the machine that stored them, while another processor may shade a pixel otherwise.
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 
 from common import ROOT, chosen, foreign_text, pinned_environment
+from pictures import differences, taken_out
 
 KERNELSPEC = {"display_name": "Python 3", "language": "python", "name": "python3"}
 LANGUAGE = {
@@ -112,7 +115,26 @@ def _sorted(text: str) -> str:
     return str(nbformat.writes(notebook, sort_keys=True, indent=1, ensure_ascii=False)) + "\n"
 
 
-def execute(source: Path, check: bool = False) -> str:
+def unlike(stored: str, fresh: str, whole: bool) -> str:
+    """Return how another execution differs from the stored text of a notebook, or ''."""
+    if stored == fresh:
+        return ""
+    if whole or taken_out(stored)[0] != taken_out(fresh)[0]:
+        return "another execution does not give the stored bytes"
+    pairs = zip(cells_of(stored), cells_of(fresh), strict=True)
+    found = [
+        f"{a['id']}: {text}" for a, b in pairs for text in differences(a["outputs"], b["outputs"])
+    ]
+    return "\n".join(found)
+
+
+def cells_of(text: str) -> list[Any]:
+    """Return the code cells of a notebook's text."""
+    cells = nbformat.reads(text, as_version=4).cells
+    return [cell for cell in cells if cell.cell_type == "code"]
+
+
+def execute(source: Path, check: bool = False, whole: bool = False) -> str:
     """Execute one chapter; return what is wrong with it, or ''."""
     os.environ.update(pinned_environment())
     started = time.perf_counter()
@@ -126,10 +148,12 @@ def execute(source: Path, check: bool = False) -> str:
         return "\n".join([f"{source.stem}: outputs that cannot be stored", *problems])
     text, target = dump(notebook), source.with_suffix(".ipynb")
     if check:
-        if not target.is_file() or target.read_text(encoding="utf-8") != text:
-            return f"{target.name}: another execution does not give the stored bytes"
+        if not target.is_file():
+            return f"{target.name}: not stored yet: make outputs"
+        if found := unlike(target.read_text(encoding="utf-8"), text, whole):
+            return f"{target.name}: {found}"
     else:
-        target.write_text(text, encoding="utf-8")
+        target.write_text(text, encoding="utf-8", newline="\n")
     print(f"{source.stem}: {time.perf_counter() - started:.1f} s", flush=True)
     return ""
 
@@ -137,12 +161,15 @@ def execute(source: Path, check: bool = False) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description="Execute chapters and store their outputs.")
     parser.add_argument("chapters", nargs="*", help="names or numbers; all without one")
-    parser.add_argument("--check", action="store_true", help="compare bytes, write nothing")
+    parser.add_argument("--check", action="store_true", help="compare, write nothing")
+    parser.add_argument("--bytes", action="store_true", help="compare the bytes of pictures too")
     parser.add_argument("--jobs", type=int, default=2, help="chapters at a time")
     options = parser.parse_args()
     sources = chosen(options.chapters)
     with ProcessPoolExecutor(max_workers=options.jobs) as pool:
-        found = list(pool.map(execute, sources, [options.check] * len(sources)))
+        many = len(sources)
+        whole = [options.bytes] * many
+        found = list(pool.map(execute, sources, [options.check or options.bytes] * many, whole))
     for problem in filter(None, found):
         print(problem, file=sys.stderr)
     if not sources:

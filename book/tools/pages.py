@@ -12,7 +12,7 @@ from typing import Any
 from docutils import nodes
 from sphinx.pycode import ModuleAnalyzer
 
-from common import ROOT, toc_pages
+from common import ROOT, SLIDER, toc_pages
 from ledger import ITEMS, LEDGER, WORDS, rows_of, summaries
 
 PAPERS = {
@@ -34,6 +34,29 @@ def drop_widgets(tree: nodes.document) -> None:
     for node in list(tree.findall(nodes.literal_block)):
         if node.astext().startswith("interactive(children="):
             node.parent.remove(node)
+
+
+def keep_sliders(tree: nodes.document) -> None:
+    """Show a picture that moves in the place of its first frame, under the figure's caption.
+
+    An output with a slider also holds that frame as a PNG, which the notebook's figure options
+    (caption, name, number) are put around. The slider's HTML takes the PNG's place there.
+    """
+    bundles = [
+        node
+        for node in tree.findall(nodes.container)
+        if node.get("nb_element") == "mime_bundle"
+    ]
+    for bundle in bundles:
+        parts = {part.get("mime_type"): part for part in bundle.children}
+        page, picture = parts.get("text/html"), parts.get("image/png")
+        if page is None or picture is None:
+            continue
+        raw = next((n for n in page.findall(nodes.raw) if SLIDER in n.astext()), None)
+        image = next(iter(picture.findall(nodes.image)), None)
+        if raw is not None and image is not None:
+            image.parent.replace(image, raw.deepcopy())
+            bundle.remove(page)
 
 
 def number_chapters(env: Any, number_of: Any) -> None:

@@ -15,11 +15,11 @@ from typing import Any
 
 import nbformat
 
-from common import BOOK, ROOT, chosen, foreign_text, is_chapter, missing_pages, toc_pages
+from common import BOOK, ROOT, SLIDER, chosen, foreign_text, is_chapter, missing_pages, toc_pages
 from execute import read
 
 WIDTH = 79
-"""Longest line of code: it fits a phone held sideways and a printed page."""
+"""Longest line of code and of printed text: it fits the page at 1200 pixels, and paper."""
 
 
 def differences(source: Path, stored: Any) -> list[str]:
@@ -52,26 +52,40 @@ def code_faults(cell: Any, count: int) -> list[str]:
             out.append(f"a stored error: {output.ename}")
         if output.get("name") == "stderr":
             out.append("stored stderr")
+        for line in shown(output).splitlines():
+            if len(line) > WIDTH:
+                out.append(f"a line of {len(line)} characters printed, at most {WIDTH}: {line}")
         if foreign := foreign_text(output):
             out.append(f"an output holds {foreign!r}, which belongs to one machine")
     return out + figure_faults(cell)
 
 
+def shown(output: Any) -> str:
+    """Return the text that a page shows of an output; '' where it shows a picture or a table."""
+    data = output.get("data", {})
+    return str(output.get("text", data.get("text/plain", ""))) if len(data) < 2 else ""
+
+
 def figure_faults(cell: Any) -> list[str]:
-    """Return what a cell with a picture lacks: its alternative text, its caption."""
+    """Return what a figure's cell lacks: its one picture, alternative text, caption, digest."""
     pictures = [
-        mime
+        output["data"]
         for output in cell.outputs
-        for mime in output.get("data", {})
-        if mime.startswith("image/")
+        if any(mime.startswith("image/") for mime in output.get("data", {}))
     ]
     given = cell.metadata.get("mystnb", {})
+    if not pictures and not given.get("figure"):
+        return []
     out = []
-    if len(pictures) > 1:
-        out.append(f"{len(pictures)} pictures in one cell would share one alternative text")
-    if pictures and not str(given.get("image", {}).get("alt", "")).strip():
+    if len(pictures) != 1:
+        out.append(f"a figure's cell with {len(pictures)} pictures, needs one")
+    for data in pictures:
+        if data.get("text/plain", "<").startswith("<"):
+            out.append("a picture without the digest of its axes: plotting.use_style()")
+    moving = [data for data in pictures if SLIDER in data.get("text/html", "")]
+    if not moving and not str(given.get("image", {}).get("alt", "")).strip():
         out.append("a figure without mystnb.image.alt in its header")
-    if pictures and not str(given.get("figure", {}).get("caption", "")).strip():
+    if not str(given.get("figure", {}).get("caption", "")).strip():
         out.append("a figure without mystnb.figure.caption in its header")
     return out
 

@@ -2,11 +2,16 @@
 
     python book/tools/studies.py [NAME ...] [--check] [--workers N]
 
-Each ``book/studies/*.py`` defines one study: ``NAME``, ``PAPER`` (a key of the papers), ``trial``,
-``parameters``, ``columns`` and ``seeds``, and if it wants ``code`` (other functions whose source is
-recorded) and ``rtol`` (largest relative difference of a later run; 0, the same bits, without it).
-Its metrics go to ``data/studies/PAPER/NAME.csv``. With ``--check`` nothing is written: every stored
-trial runs again and is compared.
+Each ``book/studies/*.py`` defines one study, which serves one item: ``NAME`` (the item's, such as
+``figure-2``), ``PAPER`` (a key of the papers), ``trial``, ``parameters``, ``columns`` and
+``seeds``; and if it wants ``code`` (other functions whose source is recorded), ``rtol`` (largest
+relative difference of a later run; 0, the same bits, without it), ``timeout`` (seconds for one
+trial) and ``scenarios`` (those that it reads). A scenario's digest is stored among the parameters, and one
+that is not as accepted is refused: what is stored is the book's own study. What several scripts
+share stands in ``book/studies/_NAME.py``, which they import by that name.
+
+Metrics go to ``data/studies/PAPER/NAME.csv``; ``studies.stored(PAPER, NAME)`` finds them. With
+``--check`` nothing is written: every stored trial runs again and is compared.
 """
 
 from __future__ import annotations
@@ -19,14 +24,15 @@ import sys
 import time
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import cloudpickle
 
 from common import ROOT
 from distfilt import studies
-from distfilt.published import PAPERS
-from distfilt.studies.seeds import recipes
+from distfilt.published import PAPERS, Scenario
 from distfilt.studies.files import jsons
+from distfilt.studies.seeds import recipes
 from distfilt.studies.study import column_names
 
 NEEDED = ("NAME", "PAPER", "trial", "parameters", "columns", "seeds")
@@ -46,9 +52,14 @@ def load_script(path: Path) -> ModuleType:
     script = importlib.util.module_from_spec(spec)
     # inspect finds a class's source through sys.modules.
     sys.modules[spec.name] = script
+    folder = str(path.parent.resolve())
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
     spec.loader.exec_module(script)
-    # A worker cannot import it by its name: send its functions themselves.
-    cloudpickle.register_pickle_by_value(script)
+    # A worker cannot import these by their names: send their functions themselves.
+    for module in list(sys.modules.values()):
+        if str(getattr(module, "__file__", None) or "").startswith(f"{folder}/"):
+            cloudpickle.register_pickle_by_value(module)
     lacking = [name for name in NEEDED if not hasattr(script, name)]
     if lacking:
         raise ValueError(f"{path.name}: has to define {', '.join(lacking)}")
@@ -58,7 +69,24 @@ def load_script(path: Path) -> ModuleType:
         raise ValueError(f"{path.name}: PAPER needs one of {PAPERS}, got {script.PAPER!r}")
     if not isinstance(script.NAME, str) or not re.fullmatch(r"[a-z0-9][a-z0-9-]*", script.NAME):
         raise ValueError(f"{path.name}: NAME needs small letters, digits, -, got {script.NAME!r}")
+    if not all(isinstance(s, Scenario) for s in getattr(script, "scenarios", ())):
+        raise ValueError(f"{path.name}: scenarios needs what distfilt.published.scenario returns")
     return script
+
+
+def parameters_of(script: ModuleType) -> dict[str, Any]:
+    """Return a study's parameters with the digests of the scenarios that it reads."""
+    read = getattr(script, "scenarios", ())
+    return {
+        **script.parameters,
+        **{f"scenario_{s.name.replace('-', '_')}": s.digest for s in read},
+    }
+
+
+def changed(script: ModuleType) -> str:
+    """Return what differs in a study's scenarios from the book's own, or ''."""
+    found = [c for s in getattr(script, "scenarios", ()) for c in s.changes]
+    return f"{script.NAME}: changed scenario: {'; '.join(found)}: make accept" if found else ""
 
 
 def target(script: ModuleType, root: Path) -> Path:
@@ -68,7 +96,8 @@ def target(script: ModuleType, root: Path) -> Path:
 
 def scripts(root: Path) -> list[ModuleType]:
     """Return the scripts of a repository, in order; two for one file are an error."""
-    out = [load_script(path) for path in sorted((root / "book" / "studies").glob("*.py"))]
+    paths = sorted((root / "book" / "studies").glob("*.py"))
+    out = [load_script(path) for path in paths if not path.name.startswith("_")]
     targets = [target(script, root) for script in out]
     twice = sorted({t.name for t in targets if targets.count(t) > 1})
     if twice:
@@ -85,13 +114,19 @@ def orphans(root: Path, known: list[ModuleType]) -> list[str]:
 
 def run(script: ModuleType, root: Path, workers: int | None) -> None:
     """Run one study at full size and store it."""
-    study = studies.run(script.trial, script.seeds, errors="collect", workers=workers)
+    study = studies.run(
+        script.trial,
+        script.seeds,
+        errors="collect",
+        workers=workers,
+        timeout=getattr(script, "timeout", None),
+    )
     for failure in study.failures:
         print(f"  {failure}", file=sys.stderr)
     path = studies.store(
         study,
         target(script, root),
-        parameters=script.parameters,
+        parameters=parameters_of(script),
         columns=script.columns,
         code=getattr(script, "code", ()),
     )
@@ -110,7 +145,7 @@ def check(script: ModuleType, root: Path, workers: int | None) -> str:
         return str(error)
     if recipes(script.seeds) != stored.recipes:
         return f"{path.relative_to(root)}: the script has other seeds: make studies"
-    written = {name: json.loads(text) for name, text in jsons(script.parameters).items()}
+    written = {name: json.loads(text) for name, text in jsons(parameters_of(script)).items()}
     if written != stored.parameters or tuple(script.columns) != tuple(stored.columns):
         return f"{path.relative_to(root)}: the script has other parameters: make studies"
     print(f"{path.relative_to(root)}: {len(stored)} trials agree, "
@@ -135,7 +170,9 @@ def main(arguments: list[str] | None = None, root: Path = ROOT) -> int:
     if not known:
         print("book/studies holds no script: there is no long study to run")
     for script in chosen:
-        if options.check:
+        if found := changed(script):
+            problems.append(found)
+        elif options.check:
             problems.append(check(script, root, options.workers))
         else:
             run(script, root, options.workers)

@@ -1,4 +1,4 @@
-"""What all filters share. A filter supplies `start`, `step` and `summary`; this runs and records it.
+"""What all filters share: a filter supplies `start`, `step`, `summary`; this runs and records it.
 
 Nothing here assumes one array for all agents, equal states, or readings of sensors.
 """

@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from .. import ensembles as moments
 from ..checks import Array, array, callable_, count, covariance, generator, number
@@ -28,6 +28,8 @@ from .saving import State
 from .wiring import SensorFilter
 
 __all__ = ["EnsembleFilter", "EnsembleState"]
+
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +56,7 @@ class EnsembleState(State):
 
     ensembles: Array
     history: tuple[tuple[float, Array], ...] = ()
-    failed: Array = field(default_factory=lambda: np.zeros((), dtype=bool))
+    failed: Mask = field(default_factory=lambda: np.zeros((), dtype=bool))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -232,24 +234,24 @@ class EnsembleFilter(SensorFilter):
             If a run fails; see `failures`.
         """
         self._check_state(state)
-        dt = self._elapsed(state, t)
-        seen = self._observed(state, observations)
+        dt = self.elapsed(state, t)
+        seen = self.observed(state, observations)
         kept = (*state.history, (state.t, state.ensembles)) if self.lag else ()
         times = [time for time, _ in kept]
-        earlier = [self._slot(item, times, state) for item in late]
-        rng = copy.deepcopy(state.rng)
-        channel = self._channel(state, t)
+        earlier = [self.slot(item, times, state) for item in late]
+        rng = copy.deepcopy(generator(state.rng))
+        channel = self.channel(state, t)
         moved = self.forecast(state.ensembles, self.model, state.t, dt, rng=rng)
         moved = array(moved, "forecast", state.ensembles.shape, finite=False)
-        failed = self._settle(not_finite(moved, 2), range(state.agents), t, state.failed)
+        failed = self.settle(not_finite(moved, 2), range(state.agents), t, state.failed)
         moved = np.where(failed[..., None, None, None], state.ensembles, moved)
         stack = [*(e.copy() for _, e in kept), moved]
         readings = [*earlier, (len(times), seen)]
         for slot, observed in readings:
             before = state.ensembles if slot == len(times) else None
-            for group in self._gather(observed, channel):
+            for group in self.gather(observed, channel):
                 errors = self._condition(stack, slot, group, failed, rng, before)
-                failed = self._settle(errors, group.agents, t, failed)
+                failed = self.settle(errors, group.agents, t, failed)
         now = stack[-1]
         if self.agreement is not None and channel is not None:
             now = array(self.agreement(now, channel), "agreement", now.shape)
@@ -270,7 +272,7 @@ class EnsembleFilter(SensorFilter):
         stack: list[Array],
         slot: int,
         group: Heard,
-        failed: Array,
+        failed: Mask,
         rng: np.random.Generator,
         previous: Array | None,
     ) -> dict[tuple[int, ...], str]:
@@ -311,7 +313,8 @@ class EnsembleFilter(SensorFilter):
         if options or getattr(self.update, "repredicts", False):
             return unchecked(self.update)(x, h, y, noise, rng=rng, **options)
         if stackable(self.update) or x.ndim == 2:
-            return with_missing(self.update, x, h, y, noise, rng=rng)
+            new = with_missing(self.update, x, h, y, noise, rng=rng)
+            return array(new, "update", x.shape, finite=False)
         out = np.empty_like(x)
         for g in range(x.shape[-3]):
             r = noise[g] if noise.ndim > 2 else noise
@@ -329,7 +332,7 @@ class EnsembleFilter(SensorFilter):
             raise ValueError(f"state: needs ensembles (..., {needed}), got {state.ensembles.shape}")
 
 
-def _summary(e: Array, failed: Array) -> Summary:
+def _summary(e: Array, failed: Mask) -> Summary:
     mean = moments.mean(e)
     squares = moments.mean(moments.anomalies(e) ** 2)
     variance = squares * e.shape[-2] / (e.shape[-2] - 1)

@@ -147,10 +147,10 @@ def _row_by_row(
             continue
         for target, result in zip(out, results, strict=True):
             target[row] = result
+    # numpy's LinAlgError is a ValueError too, and says nothing of the arguments.
+    own = own and not isinstance(first, np.linalg.LinAlgError)
     if own and len(errors) == int(np.prod(arrays[0].shape[:lead])):
-        # np.linalg.LinAlgError is a ValueError too, and says nothing of the arguments.
-        if not isinstance(first, np.linalg.LinAlgError):
-            raise first
+        raise first
     return out, errors
 
 

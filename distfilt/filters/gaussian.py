@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..checks import Array, array, choice, count, covariance, number
 from ..network import Ledger
@@ -18,6 +18,8 @@ from .saving import State
 from .wiring import SensorFilter
 
 __all__ = ["GaussianFilter", "GaussianState"]
+
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,7 @@ class GaussianState(State):
     joint_covariances: Array
     dim: int
     history: tuple[float, ...] = ()
-    failed: Array = field(default_factory=lambda: np.zeros((), dtype=bool))
+    failed: Mask = field(default_factory=lambda: np.zeros((), dtype=bool))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -168,21 +170,21 @@ class GaussianFilter(SensorFilter):
         """
         if not isinstance(state, GaussianState):
             raise ValueError(f"state: needs a GaussianState, got {type(state).__name__}")
-        dt = self._elapsed(state, t)
-        seen = self._observed(state, observations)
-        channel = self._channel(state, t)
+        dt = self.elapsed(state, t)
+        seen = self.observed(state, observations)
+        channel = self.channel(state, t)
         times = (state.t, *state.history)[: self.lag]
-        earlier = [self._slot(item, times, state) for item in late]
+        earlier = [self.slot(item, times, state) for item in late]
         means, covs = self._forecast(state, dt, len(times))
         agents = range(len(self.sensors))
-        failed = self._settle(not_finite(means, 1), agents, t, state.failed)
+        failed = self.settle(not_finite(means, 1), agents, t, state.failed)
         if failed.any():
             means = np.where(failed[..., None, None], 0.0, means)
             covs = np.where(failed[..., None, None, None], np.eye(means.shape[-1]), covs)
         for slot, observed in [*((k + 1, o) for k, o in earlier), (0, seen)]:
-            for group in self._gather(observed, channel):
+            for group in self.gather(observed, channel):
                 errors = self._condition(means, covs, slot, group, failed)
-                failed = self._settle(errors, group.agents, t, failed)
+                failed = self.settle(errors, group.agents, t, failed)
         if self.agreement is not None and channel is not None:
             means, covs = self._agreed(means, covs, channel)
         ledger = state.ledger if channel is None else channel.ledger
@@ -246,7 +248,7 @@ class GaussianFilter(SensorFilter):
         return at, slope, weighed @ gap - slope @ cov @ np.swapaxes(slope, -1, -2)
 
     def _condition(
-        self, means: Array, covs: Array, slot: int, group: Heard, failed: Array
+        self, means: Array, covs: Array, slot: int, group: Heard, failed: Mask
     ) -> dict[tuple[int, ...], str]:
         """Condition a group's joint Gaussians in place; the rows that failed."""
         d, rows = self.model.dim, group.agents

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +24,11 @@ class _Part:
     sensor: Sensor
     rows: Indices
     starts: Indices
+
+    @property
+    def places(self) -> Iterator[tuple[int, int]]:
+        """Agent of the group and first column, one after the other."""
+        return zip(self.rows, self.starts, strict=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +100,7 @@ class Heard:
     def _spread(self) -> list[tuple[_Part, list[tuple[int, slice]]]]:
         """Each part, and the cells (agent of the group, columns) that it fills."""
         return [
-            (p, [(int(g), slice(s, s + p.sensor.dim)) for g, s in zip(p.rows, p.starts)])
+            (p, [(int(g), slice(int(s), int(s) + p.sensor.dim)) for g, s in p.places])
             for p in self.parts
         ]
 

@@ -42,7 +42,7 @@ def at_one_time(
     Examples
     --------
     >>> from distfilt.sensors import direct
-    >>> at_one_time([[1.0], None], [direct([0], noise=1.0), None], (2,))
+    >>> at_one_time([[1.0], None], [direct([0], std=1.0), None], (2,))
     [array([[1.],
            [1.]]), None]
     """

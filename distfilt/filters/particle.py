@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
 from ..checks import Array, array, choice, count, generator, number
@@ -24,6 +24,8 @@ from .saving import State
 from .wiring import SensorFilter
 
 __all__ = ["ParticleCollapse", "ParticleFilter", "ParticleState"]
+
+Mask = NDArray[np.bool_]
 
 
 class ParticleCollapse(RuntimeWarning):
@@ -57,7 +59,7 @@ class ParticleState(State):
     points: Array
     log_weights: Array
     history: tuple[tuple[float, Array], ...] = ()
-    failed: Array = field(default_factory=lambda: np.zeros((), dtype=bool))
+    failed: Mask = field(default_factory=lambda: np.zeros((), dtype=bool))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -105,7 +107,7 @@ class ParticleFilter(SensorFilter):
     >>> f = ParticleFilter(walk, [direct([0], std=1.0)], members=500)
     >>> state = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(1))
     >>> f.summary(f.step(state, 1.0, [[3.0]])).mean.round(1)
-    array([[2.]])
+    array([[1.9]])
     """
 
     members: int = field(default=1000, kw_only=True)
@@ -158,24 +160,24 @@ class ParticleFilter(SensorFilter):
         """
         if not isinstance(state, ParticleState):
             raise ValueError(f"state: needs a ParticleState, got {type(state).__name__}")
-        dt = self._elapsed(state, t)
-        seen = self._observed(state, observations)
-        rng = copy.deepcopy(state.rng)
-        channel = self._channel(state, t)
+        dt = self.elapsed(state, t)
+        seen = self.observed(state, observations)
+        rng = copy.deepcopy(generator(state.rng))
+        channel = self.channel(state, t)
         kept = (*state.history, (state.t, state.points))[-self.lag :] if self.lag else ()
         times = [time for time, _ in kept]
-        earlier = [self._slot(item, times, state) for item in late]
+        earlier = [self.slot(item, times, state) for item in late]
         poor = effective_size(state.log_weights) < self.threshold * self.members
         stack, weights = self._resampled([e for _, e in kept], state, poor, rng)
         moved = self.model.sample_step(stack[-1], state.t, dt, rng=rng)
         agents = range(len(self.sensors))
-        failed = self._settle(not_finite(moved, 2), agents, t, state.failed)
+        failed = self.settle(not_finite(moved, 2), agents, t, state.failed)
         stack[-1] = np.where(failed[..., None, None, None], stack[-1], moved)
         for slot, observed in [*earlier, (len(times), seen)]:
             before = state.points if slot == len(times) else None
-            for group in self._gather(observed, channel):
+            for group in self.gather(observed, channel):
                 errors = self._weigh(weights, stack[slot], group, failed, before)
-                failed = self._settle(errors, group.agents, t, failed)
+                failed = self.settle(errors, group.agents, t, failed)
         if self.agreement is not None and channel is not None:
             stack, weights = self._agreed(stack, weights, channel, rng)
         ledger = state.ledger if channel is None else channel.ledger
@@ -192,7 +194,7 @@ class ParticleFilter(SensorFilter):
         return tuple((t, _summary(state, points)) for t, points in state.history)
 
     def _resampled(
-        self, earlier: list[Array], state: ParticleState, poor: Array, rng: np.random.Generator
+        self, earlier: list[Array], state: ParticleState, poor: Mask, rng: np.random.Generator
     ) -> tuple[list[Array], Array]:
         """Paths, and log-weights, after agents with a poor effective size have resampled."""
         paths = [*earlier, state.points]
@@ -215,7 +217,7 @@ class ParticleFilter(SensorFilter):
         return out, weights
 
     def _weigh(
-        self, weights: Array, points: Array, group: Heard, failed: Array, previous: Array | None
+        self, weights: Array, points: Array, group: Heard, failed: Mask, previous: Array | None
     ) -> dict[tuple[int, ...], str]:
         """Multiply a group's weights by the likelihood, in place; the rows that failed."""
         rows = group.agents
@@ -241,7 +243,7 @@ class ParticleFilter(SensorFilter):
     def _agreed(
         self, stack: list[Array], weights: Array, channel: Any, rng: np.random.Generator
     ) -> tuple[list[Array], Array]:
-        """Everybody resamples, so that the particles are an ensemble, and the agreement moves it."""
+        """Everybody resamples, so that the particles are an ensemble that the agreement moves."""
         picked = _resampled(np.exp(weights), rng, self.rule)
         out = [np.take_along_axis(p, picked[..., None], axis=-2) for p in stack]
         assert self.agreement is not None

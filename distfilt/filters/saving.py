@@ -162,7 +162,7 @@ def _seed(rng: np.random.Generator) -> dict[str, Any] | None:
     sequence = rng.bit_generator.seed_seq
     if not isinstance(sequence, np.random.SeedSequence):
         return None
-    entropy = sequence.entropy
+    entropy: Any = sequence.entropy
     return {
         "entropy": np.asarray(entropy).tolist() if np.ndim(entropy) else entropy,
         "spawn_key": [int(k) for k in sequence.spawn_key],

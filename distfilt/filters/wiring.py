@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, callable_, choice, count, number
+from ..checks import Array, callable_, choice, count, number
 from ..models import Model
 from ..network import Channel, Faults, Graph
 from ..sensors import Sensor
@@ -19,6 +20,8 @@ from .observations import at_one_time, over_times
 from .saving import State
 
 __all__ = ["SensorFilter"]
+
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,25 +119,28 @@ class SensorFilter(Filter):
         _, series = over_times(observations, self.sensors, times)
         return [[None if o is None else o[k] for o in series] for k in range(times.size)]
 
-    def _elapsed(self, state: State, t: float) -> float:
+    def elapsed(self, state: State, t: float) -> float:
+        """Seconds from the state's time to `t`, which has to be later."""
         return number(t, "t", above=state.t) - state.t
 
-    def _observed(
+    def observed(
         self, state: State, observations: Sequence[ArrayLike | None]
     ) -> list[Array | None]:
+        """Observations of one time, checked, per agent (*runs, m) or None."""
         return at_one_time(observations, self.sensors, state.runs)
 
-    def _channel(self, state: State, t: float) -> Channel | None:
+    def channel(self, state: State, t: float) -> Channel | None:
         """The door of this step; a single agent without a graph has none."""
         if self.graph is None:
             return None
         graph = self.graph if isinstance(self.graph, Graph) else self._check_graph(self.graph(t))
         return Channel(graph, ledger=state.ledger, runs=state.runs, faults=self.faults)
 
-    def _gather(self, observed: Sequence[Array | None], channel: Channel | None) -> list[Heard]:
+    def gather(self, observed: Sequence[Array | None], channel: Channel | None) -> list[Heard]:
+        """What every agent knows of the observations once they are shared."""
         return gather(observed, self.sensors, channel if self.share else None)
 
-    def _slot(
+    def slot(
         self, item: Late, kept: Sequence[float], state: State
     ) -> tuple[int, list[Array | None]]:
         """Where among the kept times a late observation belongs, and the observations of then."""
@@ -151,15 +157,15 @@ class SensorFilter(Filter):
             raise ValueError(f"late: a {sensor.kind} sensor cannot be late, it compares two times")
         observations: list[ArrayLike | None] = [None] * len(self.sensors)
         observations[item.agent] = item.value
-        return match[0], self._observed(state, observations)
+        return match[0], self.observed(state, observations)
 
-    def _settle(
+    def settle(
         self,
         errors: dict[tuple[int, ...], str],
-        agents: Sequence[int],
+        agents: Sequence[int] | NDArray[np.intp],
         t: float,
-        failed: Array,
-    ) -> Array:
+        failed: Mask,
+    ) -> Mask:
         """The runs that have failed by now, or the error that names the first of them."""
         if not errors:
             return failed

@@ -190,11 +190,11 @@ def intersection_weights(
 def _intersection_weights(covs: Array, rule: str, here: NDArray[np.bool_]) -> Array:
     if rule in ("min_trace", "min_determinant") and here.shape[-1] > 1:
         return _least(covs, here, rule == "min_determinant")
-    sizes = np.ones(here.shape)
+    logs = np.zeros(here.shape)
     if rule == "trace":
-        sizes = np.trace(covs, axis1=-2, axis2=-1)
+        logs = np.log(np.where(here, np.trace(covs, axis1=-2, axis2=-1), 1.0))
     elif rule == "determinant":
-        logs = np.where(here, _log_det(_factors(covs, here)) / covs.shape[-1], np.inf)
-        sizes = np.exp(logs - logs.min(axis=-1, keepdims=True))
-    weights = here / np.where(here, sizes, 1.0)
+        logs = _log_det(_factors(covs, here)) / covs.shape[-1]
+    logs = np.where(here, logs, np.inf)
+    weights = np.exp(logs.min(axis=-1, keepdims=True) - logs)
     return np.asarray(weights / weights.sum(axis=-1, keepdims=True))

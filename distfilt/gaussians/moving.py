@@ -144,15 +144,18 @@ def _bures_barycentre(covs: Array, weights: Array, tolerance: float, iterations:
     share = weights[..., None, None]
     p = covs if (weights > 0).all() else np.where(share > 0, covs, np.eye(covs.shape[-1]))
     s = _symmetrise((share * p).sum(axis=-3))
-    change = np.zeros(())
+    change = np.full(s.shape[:-2], np.inf)
     for _ in range(iterations):
+        open_ = change >= tolerance
         root, inverse = _roots(s)
         wide = root[..., None, :, :]
         inner = (share * _roots(_symmetrise(wide @ p @ wide))[0]).sum(axis=-3)
         half = inverse @ inner
         new = _symmetrise(half @ half.swapaxes(-1, -2))
-        change = np.abs(new - s).max(axis=(-2, -1)) / np.abs(s).max(axis=(-2, -1))
-        s = new
+        moved = np.abs(new - s).max(axis=(-2, -1)) / np.abs(s).max(axis=(-2, -1))
+        # What is settled stays: the others' need for more steps must not move it.
+        s = np.where(open_[..., None, None], new, s)
+        change = np.where(open_, moved, change)
         if (change < tolerance).all():
             return s
     raise SolverError(

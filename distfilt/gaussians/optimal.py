@@ -21,6 +21,12 @@ _LEAST = 1e-30
 
 def _least(covs: Array, here: NDArray[np.bool_], determinant: bool) -> Array:
     """Weights of least determinant or trace; :func:`.intersection_weights` says how and why."""
+    # Where ratios of covariances leave the range of numbers, no gap is found, and none is taken.
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        return _iterated(covs, here, determinant)
+
+
+def _iterated(covs: Array, here: NDArray[np.bool_], determinant: bool) -> Array:
     leading, (s, d) = here.shape[:-1], covs.shape[-3:-1]
     there = here.reshape(-1, s).astype(np.float64)
     lower = _factors(covs, here).reshape(-1, s, d, d)
@@ -35,7 +41,8 @@ def _least(covs: Array, here: NDArray[np.bool_], determinant: bool) -> Array:
         slope, curvature = problem.derivatives(point)
         mean = (point * slope).sum(axis=-1, keepdims=True)
         gap = slope.max(axis=-1) / mean[:, 0] - 1
-        lower_gap = gap < lowest
+        # What is settled stays: the others' need for more steps must not move it.
+        lower_gap = (gap < lowest) & (lowest > _GAP)
         best[left[lower_gap]] = point[lower_gap]
         # A Newton step has to halve the gap; where it does not, its start's sure step counts.
         taken = certain | (gap < 0.5 * lowest)
@@ -97,7 +104,12 @@ def _newton(weights: Array, slope: Array, mean: Array, curvature: Array, there: 
     held = np.maximum(mean - slope, 0.0) / np.maximum(weights, _LEAST)
     ridge = there * (held + 1e-12 * size) + (1 - there) * size
     matrix = curvature + ridge[..., None] * np.eye(weights.shape[-1])
-    solved = np.linalg.solve(matrix, np.stack([slope, there], axis=-1))
+    scale = np.sqrt(np.diagonal(matrix, axis1=-2, axis2=-1))[..., None]
+    matrix /= scale * scale.swapaxes(-1, -2)
+    try:
+        solved = np.linalg.solve(matrix, np.stack([slope, there], axis=-1) / scale) / scale
+    except np.linalg.LinAlgError:
+        return weights  # which is not better: the sure step follows
     pull, ones = solved.sum(axis=1).T[..., None]
     out = weights + solved[..., 0] - pull / ones * solved[..., 1]
     out = np.maximum(out, np.maximum(1e-3 * weights, _LEAST * there))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, covariance, increasing, number
+from ..checks import Array, array, covariance, increasing, instance, number
 from ..sensors import Sensor, stack
 
 __all__: list[str] = []
@@ -81,15 +81,9 @@ def in_front(runs: tuple[int, ...], x: Array, p: Array) -> tuple[Array, Array]:
 
 def reading(observed: ArrayLike, sensor: Sensor) -> Array:
     """An observation (..., m) of a sensor of the present state."""
-    an_instance(sensor, "sensor", Sensor)
+    instance(sensor, "sensor", Sensor)
     instantaneous([sensor])
     y = array(observed, "observed", (..., sensor.dim), finite=False)
     if np.isinf(y).any():
         raise ValueError("observed: needs finite numbers or NaN (missing), got infinity")
     return y
-
-
-def an_instance(value: object, name: str, kind: type) -> None:
-    """Refuse a value of another type."""
-    if not isinstance(value, kind):
-        raise ValueError(f"{name}: needs a {kind.__name__}, got {type(value).__name__}")

@@ -52,10 +52,12 @@ def extended_analysis(
     return x + moved, p, density
 
 
-def linearised(x: Array, y: Array, sensor: Sensor) -> tuple[Array, Array]:
+def linearised(
+    x: Array, y: Array, sensor: Sensor, previous: Array | None = None
+) -> tuple[Array, Array]:
     """Innovations (R, m), NaN where missing, and the sensor's Jacobian, (R, m, d) or (m, d)."""
-    innovation = sensor._residual(y, sensor._predict(x))
-    slope = sensor._jacobian(x)
+    innovation = sensor._residual(y, sensor._predict(x, previous))
+    slope = sensor._jacobian(x, previous)
     if slope.ndim == 3:
         # Where there is no prediction there is no derivative either; the row is not used.
         slope = np.where(np.isnan(innovation)[..., None], 0.0, slope)

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, callable_, count
+from ..checks import Array, array, callable_, count, instance
+from ..differences import _central
 from ..models import Model
 from ..models.rotations import left_directions, turn_between, turned
-from ..sensors import Sensor
-from ._inputs import an_instance, instantaneous, series
+from ..sensors import Sensor, stack
+from ._inputs import series
 from ._steps import analysed, linearised, moved_cov, over_time
 from .linear import GaussianRun
 
@@ -150,7 +151,8 @@ def multiplicative_filter(
     chart : Chart
         Such as :func:`quaternion_chart`.
     model, sensors, times, t0
-        As for :func:`extended_filter`.
+        As for :func:`extended_filter`; sensors of changes are welcome too: the errors of the
+        previous state are kept beside those of the present one until the reading is used.
 
     Returns
     -------
@@ -182,9 +184,9 @@ def multiplicative_filter(
     >>> float((run.means[0, 9:] ** 2).sum().round(9)), run.covariances.shape
     (1.0, (1, 12, 12))
     """
-    sensor = instantaneous(sensors)
-    an_instance(model, "model", Model)
-    an_instance(chart, "chart", Chart)
+    sensor = stack(sensors)
+    instance(model, "model", Model)
+    instance(chart, "chart", Chart)
     if chart.dim != model.dim:
         raise ValueError(f"chart: needs {model.dim} components like the model, got {chart.dim}")
 
@@ -192,13 +194,35 @@ def multiplicative_filter(
         moved = model._step(x, t, dt)
         inwards = chart._inwards(moved)
         slope = inwards @ model._jacobian(x, t, dt) @ chart.directions(x)
-        return moved, moved_cov(p, slope, inwards @ model.noise(t, dt) @ inwards.swapaxes(-1, -2))
+        after = moved_cov(p, slope, inwards @ model.noise(t, dt) @ inwards.swapaxes(-1, -2))
+        if not sensor.uses_previous:
+            return moved, after
+        across = slope @ p
+        joint = np.block([[after, across], [across.swapaxes(-1, -2), p]])
+        return np.concatenate([moved, x], axis=-1), joint
 
     def analyse(x: Array, p: Array, y: Array) -> tuple[Array, Array, Array]:
-        innovation, slope = linearised(x, y, sensor)
-        none = np.zeros((len(x), chart.error_dim))
-        error, p, density = analysed(none, p, innovation, slope @ chart.directions(x), sensor.cov)
-        return chart.retract(x, error), p, density
+        innovation, slope = _errors_seen(x, y, sensor, chart)
+        error, p, density = analysed(np.zeros(p.shape[:-1]), p, innovation, slope, sensor.cov)
+        k = chart.error_dim
+        return chart.retract(x[:, : chart.dim], error[:, :k]), p[:, :k, :k], density
 
     checked = series(observations, times, t0, sensor.dim)
     return over_time(*checked, mean, cov, model.dim, forecast, analyse, chart.error_dim)
+
+
+def _errors_seen(x: Array, y: Array, sensor: Sensor, chart: Chart) -> tuple[Array, Array]:
+    """Innovations, and how a sensor sees the errors, of the previous state too if it uses it."""
+    if not sensor.uses_previous:
+        innovation, slope = linearised(x, y, sensor)
+        return innovation, np.asarray(slope @ chart.directions(x))
+    now, before = x[:, : chart.dim], x[:, chart.dim :]
+    innovation, slope = linearised(now, y, sensor, before)
+
+    def of_before(v: Array) -> Array:
+        return sensor._predict(np.broadcast_to(now[:, None], v.shape), v)
+
+    back = _central(of_before, before, sensor._residual)
+    back = np.where(np.isnan(innovation)[..., None], 0.0, back)
+    both = [slope @ chart.directions(now), back @ chart.directions(before)]
+    return innovation, np.concatenate(both, axis=-1)

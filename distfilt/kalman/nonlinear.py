@@ -12,10 +12,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, number
+from ..checks import Array, instance, number
 from ..models import Model
 from ..sensors import Sensor
-from ._inputs import an_instance, flat, in_front, instantaneous, reading, series
+from ._inputs import flat, in_front, instantaneous, reading, series
 from ._steps import (
     Points,
     extended_analysis,
@@ -70,7 +70,7 @@ def extended_predict(
     >>> x, p.round(6)
     (array([9.]), array([[4.1]]))
     """
-    an_instance(model, "model", Model)
+    instance(model, "model", Model)
     x, p, runs = flat(mean, cov, (), model.dim)
     now, length = number(t, "t"), number(dt, "dt", at_least=0)
     return in_front(runs, *extended_forecast(x, p, model, now, length))
@@ -172,7 +172,7 @@ def extended_filter(
     array([[2.]])
     """
     sensor = instantaneous(sensors)
-    an_instance(model, "model", Model)
+    instance(model, "model", Model)
     return over_time(
         *series(observations, times, t0, sensor.dim),
         mean,
@@ -227,7 +227,7 @@ def unscented_predict(
     >>> unscented_predict([3.0], [[0.1]], bent, 0.0, 1.0)[0].round(6)
     array([9.1])
     """
-    an_instance(model, "model", Model)
+    instance(model, "model", Model)
     x, p, runs = flat(mean, cov, (), model.dim)
     now, length = number(t, "t"), number(dt, "dt", at_least=0)
     points = Points.of(model.dim, alpha, beta, kappa)
@@ -327,7 +327,7 @@ def unscented_filter(
     array([[2.]])
     """
     sensor = instantaneous(sensors)
-    an_instance(model, "model", Model)
+    instance(model, "model", Model)
     points = Points.of(model.dim, alpha, beta, kappa)
     return over_time(
         *series(observations, times, t0, sensor.dim),

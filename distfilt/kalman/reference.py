@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, number
+from ..checks import Array, array, instance, needed, number
 from ..models import Model
 from ..sensors import Sensor
 from ._inputs import common_runs, fill_axes, instantaneous, prior, series
@@ -65,7 +65,7 @@ def filterpy_kf(
     >>> run.means, run.covariances
     (array([[1.]]), array([[[0.5]]]))
     """
-    from filterpy.kalman import KalmanFilter
+    filterpy = needed("filterpy.kalman", "reference")
 
     y = array(observations, "observations", None, finite=False)
     if y.ndim < 2 or np.isinf(y).any():
@@ -76,7 +76,7 @@ def filterpy_kf(
     h, r = _per_step(H, "H", steps, (m, d)), _noise_per_step(R, "R", steps, m)
 
     def start(x: Array, p: Array) -> Any:
-        kf = KalmanFilter(dim_x=d, dim_z=m)
+        kf = filterpy.KalmanFilter(dim_x=d, dim_z=m)
         kf.x, kf.P = x.copy(), p.copy()
         return kf
 
@@ -140,13 +140,14 @@ def filterpy_ekf(
     >>> run.means.round(6)
     array([[2.]])
     """
-    from filterpy.kalman import ExtendedKalmanFilter
+    filterpy = needed("filterpy.kalman", "reference")
 
+    instance(model, "model", Model)
     sensor = instantaneous(sensors)
     y, grid = series(observations, times, t0, sensor.dim)
 
     def start(x: Array, p: Array) -> Any:
-        kf = ExtendedKalmanFilter(dim_x=model.dim, dim_z=sensor.dim)
+        kf = filterpy.ExtendedKalmanFilter(dim_x=model.dim, dim_z=sensor.dim)
         kf.x, kf.P = x.copy(), p.copy()
         return kf
 
@@ -211,6 +212,7 @@ def filterpy_ukf(
     >>> run.means.round(6)
     array([[2.]])
     """
+    instance(model, "model", Model)
     sensor = instantaneous(sensors)
     y, grid = series(observations, times, t0, sensor.dim)
     number(alpha, "alpha", above=0)
@@ -240,9 +242,9 @@ def _unscented(
     model: Model, observed: int, alpha: float, beta: float, kappa: float
 ) -> Callable[[Array, Array], Any]:
     """What starts filterpy's filter at a mean and a covariance."""
-    from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
+    filterpy = needed("filterpy.kalman", "reference")
 
-    class Batched(UnscentedKalmanFilter):  # type: ignore[misc]
+    class Batched(filterpy.UnscentedKalmanFilter):  # type: ignore[misc, name-defined]
         """Moves all sigma points in one call of the model."""
 
         def compute_process_sigmas(self, dt: float, fx: Any = None, **fx_args: Any) -> None:
@@ -250,7 +252,7 @@ def _unscented(
             self.sigmas_f = model.step(points, fx_args["t"], dt)
 
     def start(x: Array, p: Array) -> Any:
-        points = MerweScaledSigmaPoints(model.dim, alpha, beta, kappa)
+        points = filterpy.MerweScaledSigmaPoints(model.dim, alpha, beta, kappa)
         kf = Batched(model.dim, observed, 0.0, None, None, points)
         kf.x, kf.P = x.copy(), p.copy()
         return kf

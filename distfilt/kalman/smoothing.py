@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array
-from ._inputs import an_instance
+from ..checks import Array, instance
 from .linear import GaussianRun, _noise_per_step, _per_step
 
 __all__ = ["rts_smoother"]
@@ -57,7 +56,7 @@ def rts_smoother(run: GaussianRun, *, F: ArrayLike, Q: ArrayLike) -> GaussianRun
     >>> rts_smoother(run, **model).means.ravel()
     array([1. , 1.5])
     """
-    an_instance(run, "run", GaussianRun)
+    instance(run, "run", GaussianRun)
     steps, d = len(run.means), run.means.shape[-1]
     f = _per_step(F, "F", steps, (d, d))
     q = _noise_per_step(Q, "Q", steps, d, semidefinite=True)

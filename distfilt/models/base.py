@@ -9,7 +9,17 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, callable_, count, covariance, generator, increasing, number
+from ..checks import (
+    Array,
+    array,
+    callable_,
+    count,
+    covariance,
+    generator,
+    increasing,
+    instance,
+    number,
+)
 from ..differences import _central
 from ..linalg import factor
 
@@ -231,8 +241,7 @@ def simulate(
     >>> simulate(walk, [0.0], [1.0, 2.0], rng=np.random.default_rng(1)).shape
     (2, 1)
     """
-    if not isinstance(model, Model):
-        raise ValueError(f"model: needs a Model, got {type(model).__name__}")
+    instance(model, "model", Model)
     state = array(x0, "x0", (..., model.dim))
     grid = increasing(times, "times")
     now = number(t0, "t0")

@@ -12,6 +12,8 @@ from ..checks import Array, array, count
 from .channel import Channel
 from .links import Graph
 
+__all__: list[str] = []
+
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.int64]
 
@@ -38,6 +40,8 @@ class Heard:
         """What each agent's links carry, added: (R, E, ...) to (R, A, ...)."""
         runs, edges, *rest = per_link.shape
         size = self.graph.size
+        if not edges:
+            return np.zeros((runs, size, *rest))
         if runs == 1:
             return np.asarray(
                 (self.graph.incidence @ per_link.reshape(edges, -1)).reshape(1, size, *rest)

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+__all__: list[str] = []
+
 Part = NDArray[Any]
 Payload = Part | tuple[Part, ...]
 Mask = NDArray[np.bool_]

@@ -10,13 +10,15 @@ from scipy import sparse
 
 from ..checks import Array
 
+__all__: list[str] = []
+
 Indices = NDArray[np.int64]
 
 DENSE = 200
 """Up to this many agents a dense eigenvalue solver is the faster one."""
 
-_RESTARTS = 4
-_SWEEPS = 64
+_FEW_LINKS = 6
+"""Up to this mean degree a sparse factor is cheaper than many of Lanczos's iterations."""
 
 
 def degree_bound(links: sparse.csr_array, degrees: Array) -> float:
@@ -34,10 +36,11 @@ def largest_eigenvalue(laplacian: sparse.csr_array, bound: float) -> float:
     from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
     size = laplacian.shape[0]
-    options: dict[str, Any] = {"k": 1, "which": "LA", "v0": _start(size), "tol": 1e-10,
+    options: dict[str, Any] = {"k": 1, "which": "LA", "v0": _start(size), "tol": 1e-8,
                                "return_eigenvectors": False}
+    few = laplacian.nnz <= (_FEW_LINKS + 1) * size
     try:
-        return float(eigsh(laplacian, maxiter=_RESTARTS, **options)[0])
+        return float(eigsh(laplacian, maxiter=4 if few else 60, **options)[0])
     except ArpackNoConvergence:
         # Eigenvalues crowd below the bound, as on rings and grids: inverted there, they spread.
         shift = bound * (1 + 1e-6)

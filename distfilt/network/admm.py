@@ -123,13 +123,7 @@ def admm(
     z = array(start, "start", (channel.graph.size, "k"))
     penalty, small = number(rho, "rho", above=0), number(tolerance, "tolerance", above=0)
     most = count(iterations, "iterations")
-    if check is not None:
-        count(check, "check")
-        if not channel.faults.none:
-            raise ValueError(
-                "check: needs a channel without faults, or agents would stop apart, got one with "
-                "faults; None makes all iterations"
-            )
+    _refuse_faults(check, channel)
     w = np.zeros_like(z)
     for n in range(1, most + 1):
         u = array(local_solve(z - w, penalty), "local_solve", z.shape)
@@ -148,3 +142,12 @@ def admm(
         f"admm: residuals {primal:.3g} and {dual:.3g} after {most} iterations, "
         f"needs both below {small:g}"
     )
+
+
+def _refuse_faults(check: int | None, channel: Channel) -> None:
+    """Agents that miss a message would stop apart."""
+    if check is not None and count(check, "check") and not channel.faults.none:
+        raise ValueError(
+            "check: needs a channel without faults, or agents would stop apart, got one with "
+            "faults; None makes all iterations"
+        )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -128,19 +129,19 @@ class Channel:
         speaks = np.array([p is not None for p in sent])[self.graph.senders]
         arrived = self._transmit(speaks, *_payloads.sizes(sent, self.runs))
         late = self._delayed("exchange", (sent, arrived))
-        inbox: list[dict[int, Any]] = [{} for _ in range(self.graph.size)]
         if late is None:
-            return inbox
+            return [{} for _ in range(self.graph.size)]
         sent, arrived = late
         some = np.flatnonzero(arrived.any(axis=0))
-        ends = self.graph.receivers[some].tolist(), self.graph.senders[some].tolist()
-        whole = arrived.all(axis=0)[some].tolist()
-        for link, i, j, all_runs in zip(some.tolist(), *ends, whole, strict=True):
-            payload = sent[j]
-            if payload is not None and not all_runs:
-                payload = _payloads.thinned(payload, arrived[:, link].reshape(self.runs))
-            inbox[i][j] = payload
-        return inbox
+        senders = self.graph.senders[some].tolist()
+        messages: list[Any] = [sent[j] for j in senders]
+        for k in np.flatnonzero(~arrived[:, some].all(axis=0)).tolist():
+            here = arrived[:, some[k]].reshape(self.runs)
+            messages[k] = _payloads.thinned(messages[k], here)
+        ends = np.searchsorted(self.graph.receivers[some], np.arange(self.graph.size + 1))
+        return [
+            dict(zip(senders[i:j], messages[i:j], strict=True)) for i, j in pairwise(ends.tolist())
+        ]
 
     def combine(
         self,

@@ -131,22 +131,32 @@ def _given(graph: Graph, weights: Weights | ArrayLike) -> Weights:
 
 def _by_rule(heard: Heard, rule: str) -> tuple[Array, Array]:
     """Own weights (R, A) and those of links (R, E); each agent's sum to one."""
-    graph, size = heard.graph, heard.graph.size
+    graph = heard.graph
     if rule == "equal":
         ones = np.ones(heard.means.shape[:2])
         return _shared(ones, heard.arrived.astype(np.float64), heard)
     if rule in ("trace", "determinant"):
-        # Such a weight is a number of the source alone, up to the sum of what an agent has.
-        both = np.concatenate([heard.covs, heard.sent_covs], axis=1)
-        shares = _intersection_weights(both, rule, np.ones(both.shape[:2], dtype=bool))
-        sent = shares[:, size:][:, graph.senders]
-        return _shared(shares[:, :size], sent * heard.arrived, heard)
+        mine = _size_weights(heard.covs, rule)
+        sent = mine if heard.sent_covs is heard.covs else _size_weights(heard.sent_covs, rule)
+        return _shared(mine, sent[:, graph.senders] * heard.arrived, heard)
     own, links = np.empty(heard.means.shape[:2]), np.zeros(heard.arrived.shape)
     for agents, at in heard.groups():
         _, covs, here = heard.collected(agents, at)
         omega = _intersection_weights(covs, rule, here)
         own[:, agents], links[:, at] = omega[..., 0], omega[..., 1:]
     return own, links
+
+
+def _size_weights(covs: Array, rule: str) -> Array:
+    """Weights in closed form up to a factor: a number of each source alone, (R, A).
+
+    The odds against a unit covariance: no agent's number depends on another's, not even in its
+    last digit.
+    """
+    unit = np.broadcast_to(np.eye(covs.shape[-1]), covs.shape)
+    both = np.stack([covs, unit], axis=-3)
+    share = _intersection_weights(both, rule, np.ones(both.shape[:-2], dtype=bool))
+    return np.asarray(share[..., 0] / share[..., 1])
 
 
 def _shared(own: Array, links: Array, heard: Heard) -> tuple[Array, Array]:

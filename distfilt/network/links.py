@@ -160,10 +160,17 @@ class Graph:
     @cached_property
     def reverse(self) -> Indices:
         """For each link the number of the one that goes the other way, (E,); -1 for none."""
+        edges = self.senders.size
+        numbered = sparse.csr_array(
+            (np.arange(edges), self.links.indices, self.links.indptr), self.links.shape
+        )
+        turned = numbered.T.tocsr()
+        if (turned.indptr == self.links.indptr).all() and (turned.indices == self.senders).all():
+            return np.asarray(turned.data, dtype=np.int64)
         key = self.receivers * self.size + self.senders
         other = self.senders * self.size + self.receivers
-        found = np.searchsorted(key, other).clip(max=max(key.size - 1, 0))
-        return np.where(key[found] == other, found, -1) if key.size else found
+        found = np.searchsorted(key, other).clip(max=edges - 1)
+        return np.where(key[found] == other, found, -1)
 
     @cached_property
     def incidence(self) -> sparse.csr_array:

@@ -117,14 +117,23 @@ def _print_digests() -> None:
     if "IPython" not in sys.modules:
         return
     from IPython import get_ipython
+    from matplotlib import get_backend, pyplot
     from matplotlib.figure import Figure
 
     from ..digests import of_axes
 
+    def said(figure: Figure) -> str:
+        try:
+            return of_axes(figure)
+        except ValueError:  # nothing is drawn in it
+            return "an empty figure"
+
     shell = get_ipython()
     if shell is not None:
+        # The notebook's backend forgets printers when it starts, with the first figure: start it.
+        pyplot.switch_backend(get_backend())
         text = shell.display_formatter.formatters["text/plain"]
-        text.for_type(Figure, lambda figure, printer, cycle: printer.text(of_axes(figure)))
+        text.for_type(Figure, lambda figure, printer, cycle: printer.text(said(figure)))
 
 
 def nonblank(value: Any, name: str) -> str:

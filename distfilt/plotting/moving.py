@@ -261,8 +261,11 @@ def _frame(drawn: Any, colours: int) -> tuple[bytes, str]:
 
     figure: Figure = drawn if isinstance(drawn, Figure) else _figure_of(drawn)
     whole, small = io.BytesIO(), io.BytesIO()
+    try:
+        text = of_axes(figure)
+    except ValueError:
+        raise ValueError("draw: needs to draw something, got an empty figure") from None
     figure.savefig(whole, format="png", metadata={"Software": None}, bbox_inches=None)
-    text = of_axes(figure)
     pyplot.close(figure)
     picture = Image.open(whole).convert("RGB")
     picture.quantize(colours, dither=Image.Dither.NONE).save(small, format="png", optimize=True)

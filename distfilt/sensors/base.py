@@ -140,19 +140,29 @@ class Sensor:
             return (state,)
         if previous is None:
             raise ValueError(f"previous: a {self.kind} sensor needs the previous states, got None")
-        return state, array(previous, "previous", (..., state.shape[-1]))
+        before = array(previous, "previous", (..., state.shape[-1]))
+        try:
+            return tuple(np.broadcast_arrays(state, before))
+        except ValueError:
+            raise ValueError(
+                f"previous: needs states that go with {state.shape}, got {before.shape}"
+            ) from None
 
     def _predict(self, state: Array, previous: Array | None = None) -> Array:
         """`predict` of checked arguments. The copies are for functions that work in place."""
-        both = (state.copy(),) if previous is None else (state.copy(), previous.copy())
-        seen = np.asarray(self.function(*both[: 1 + self.uses_previous]), dtype=np.float64)
-        lead = np.broadcast_shapes(*(v.shape[:-1] for v in both))
-        if seen.shape != (*lead, self.dim):
+        seen = np.asarray(self.function(*self._copies(state, previous)), dtype=np.float64)
+        wanted = (*state.shape[:-1], self.dim)
+        if seen.shape != wanted:
             raise ValueError(
-                f"function: needs to return shape {(*lead, self.dim)} for states {state.shape}, "
+                f"function: needs to return shape {wanted} for states {state.shape}, "
                 f"got {seen.shape}"
             )
         return seen
+
+    def _copies(self, state: Array, previous: Array | None) -> tuple[Array, ...]:
+        if previous is None or not self.uses_previous:
+            return (state.copy(),)
+        return state.copy(), previous.copy()
 
     def observe(
         self, x: ArrayLike, *, rng: np.random.Generator, previous: ArrayLike | None = None
@@ -203,8 +213,7 @@ class Sensor:
             return self.matrix(state.shape[-1])
         if self.derivative is None:
             return self._differences(state, previous)
-        both = (state.copy(),) if previous is None else (state.copy(), previous.copy())
-        slope = np.asarray(self.derivative(*both[: 1 + self.uses_previous]))
+        slope = np.asarray(self.derivative(*self._copies(state, previous)))
         each = (self.dim, state.shape[-1])
         if slope.shape not in ((*state.shape[:-1], *each), each):
             wanted = (*state.shape[:-1], *each)
@@ -213,7 +222,9 @@ class Sensor:
 
     def _differences(self, state: Array, previous: Array | None) -> Array:
         def function(x: Array) -> Array:
-            return self._predict(x, None if previous is None else previous[..., None, :])
+            if previous is None:
+                return self._predict(x)
+            return self._predict(x, np.broadcast_to(previous[..., None, :], x.shape))
 
         return _central(function, state, self._residual)
 

@@ -315,10 +315,8 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
 
     def derivative(x: Array, previous: Array | None = None) -> Array:
         slopes = [s._jacobian(x, previous) for s in parts]
-        lead = x.shape[:-1]
-        return np.concatenate(
-            [np.broadcast_to(h, (*lead, *h.shape[-2:])) for h in slopes], axis=-2
-        )
+        full = [np.broadcast_to(h, (*x.shape[:-1], *h.shape[-2:])) for h in slopes]
+        return np.concatenate(full, axis=-2)
 
     known = any(s.units for s in parts)
     linear = all(s.linear is not None for s in parts)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import Array, SolverError, count
+from ..checks import Array, SolverError, count, needed
 
 __all__: list[str] = []
 
@@ -19,7 +19,7 @@ LIMIT = {"ECOS": "max_iters", "CLARABEL": "max_iter"}
 
 def solve_component(z: Array, solver: str, max_iters: int | None) -> Array:
     """Coefficients (u_0, u_1 … u_k) that minimise (12) for the last column of `z`."""
-    import cvxpy as cp
+    cp = needed("cvxpy", "maps")
 
     n, k = z.shape
     problem, root, u = _program(k)
@@ -49,7 +49,7 @@ def _program(k: int) -> tuple[Any, Any, Any]:
 
     The samples enter by |u_0 + Z u|² only, which their QR factor keeps.
     """
-    import cvxpy as cp
+    cp = needed("cvxpy", "maps")
 
     root, u = cp.Parameter((k + 1, k + 1)), cp.Variable(k + 1)
     loss = cp.sum_squares(root @ u) / 2 - cp.log(u[k])

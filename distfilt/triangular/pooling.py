@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, callable_
+from ..checks import Array, array, callable_, instance
 from ..ensembles import mean
 from ..network import Channel
 from ..network.admm import AdmmRun, admm
@@ -80,6 +80,7 @@ def pool_by_admm(
     rho: float = 1.0,
     tolerance: float = 1e-6,
     iterations: int = 1000,
+    check: int | None = 1,
     standardise: bool = True,
     agree: Agree = finite_time,
 ) -> tuple[AffineMap, AdmmRun]:
@@ -97,7 +98,7 @@ def pool_by_admm(
     ----------
     y, x, channel
         As in :func:`pool_by_moments`; a channel of a single run.
-    rho, tolerance, iterations, agree
+    rho, tolerance, iterations, check, agree
         As in :func:`distfilt.network.admm.admm`.
     standardise : bool
         Agree on each variable's mean and variance first, 2 D scalars more, and work on standardised
@@ -142,14 +143,14 @@ def pool_by_admm(
     moments = np.swapaxes(ones, -1, -2) @ ones / joint.shape[-2]
     solve, start = _proximal(moments, m)
     run = admm(
-        solve, start, channel, rho=rho, tolerance=tolerance, iterations=iterations, agree=agree
+        solve, start, channel, rho=rho, tolerance=tolerance, iterations=iterations, check=check,
+        agree=agree,
     )
     return _in_units(_as_map(run.common, m, size - m), centre, spread), run
 
 
 def _joint(y: ArrayLike, x: ArrayLike, channel: Channel) -> tuple[Array, int]:
-    if not isinstance(channel, Channel):
-        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
+    instance(channel, "channel", Channel)
     members = array(x, "x", (*channel.runs, channel.graph.size, "N", "d"))
     seen = array(y, "y", (*members.shape[:-1], "m"))
     samples, size = channel.graph.size * members.shape[-2], seen.shape[-1] + members.shape[-1]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial, wraps
-from typing import Concatenate, ParamSpec
+from typing import Any, Concatenate, ParamSpec, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -71,7 +71,10 @@ def update(
             raise ValueError(f"ensemble: needs at least 2 members, got {x.shape[-2]}")
         h = array(predicted, "predicted", (*x.shape[:-1], "m"))
         m = h.shape[-1]
-        y = array(observed, "observed", (*x.shape[:-2], m))
+        y = array(observed, "observed", (..., m))
+        if y.shape not in ((m,), (*x.shape[:-2], m)):
+            raise ValueError(f"observed: needs shape {(*x.shape[:-2], m)}, got {y.shape}")
+        y = np.broadcast_to(y, (*x.shape[:-2], m))
         r = covariance(noise, "noise", m)
         if r.shape[:-2] and np.broadcast_shapes(r.shape[:-2], x.shape[:-2]) != x.shape[:-2]:
             raise ValueError(f"noise: needs leading axes {x.shape[:-2]}, got {r.shape[:-2]}")
@@ -79,7 +82,8 @@ def update(
         return function(x, h, y, r, *args, **options)
 
     checked.unchecked = function  # type: ignore[attr-defined]
-    return checked
+    # The wrapper has named parameters, where the type knows places only.
+    return cast(Any, checked)  # type: ignore[no-any-return]
 
 
 def unchecked(update: Update) -> Update:

@@ -76,7 +76,7 @@ def exact_forecast(
     q = model.noise(t, dt)
     if not q.any():
         return moved
-    bad = ~np.isfinite(moved).all(axis=(-2, -1))[..., None, None]
+    bad = ~np.isfinite(moved).all(axis=(-2, -1), keepdims=True)
     clean = np.where(bad, x, moved)
     noisy = clean + exact_noise(anomalies(clean), q, rng=generator(rng))
     # Members that the model lost stay lost, and do not take the others' noise with them.

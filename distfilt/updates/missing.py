@@ -9,7 +9,7 @@ import numpy as np
 from ..checks import Array
 from .door import Update, unchecked
 
-__all__ = ["with_missing"]
+__all__ = ["Rows", "with_missing"]
 
 
 def with_missing(
@@ -56,12 +56,12 @@ def with_missing(
     inner = unchecked(update)
     m = observed.shape[-1]
     lead = observed.shape[:-1]
-    # What is drawn for an ensemble depends on its own missing readings and its place, not on what
-    # others miss: each pattern has a stream of its own, drawn from for all places.
-    base = rng.integers(2**63, size=2)
+    # What is drawn for an ensemble depends on its place and on how many readings it has, not on
+    # what others miss: each number of readings has a stream, which is drawn from for all places.
+    base = [int(b) for b in rng.integers(2**63, size=2)]
     present = ~(np.isnan(observed) | np.isnan(predicted).any(axis=-2))
     if present.all():
-        stream = _Rows([*base, *np.ones(m, dtype=np.int64)], lead, None)
+        stream = _stream(rng, [*base, m], lead, None)
         return inner(ensemble, predicted, observed, noise, rng=stream)
     flat = present.reshape(-1, m)
     rows = ensemble.reshape(-1, *ensemble.shape[-2:])
@@ -77,22 +77,47 @@ def with_missing(
             continue
         where = np.flatnonzero((flat == pattern).all(axis=1))
         part = cov[np.ix_(where, keep, keep)] if cov.ndim > 2 else cov[np.ix_(keep, keep)]
-        stream = _Rows([*base, *pattern.astype(np.int64)], lead, where)
+        stream = _stream(rng, [*base, keep.size], lead, where)
         out[where] = inner(
             rows[where], seen[where][..., keep], aim[where][:, keep], part, rng=stream
         )
     return np.asarray(out.reshape(ensemble.shape))
 
 
-class _Rows(np.random.Generator):
-    """Normal draws for all ensembles of a batch, of which some are asked for."""
+def _stream(
+    rng: np.random.Generator, seed: list[int], lead: tuple[int, ...], where: Any
+) -> np.random.Generator:
+    """A stream of draws for the rows `where` (all if None) of a batch."""
+    maker = getattr(rng, "stream", None)
+    if maker is not None:
+        return maker(seed, where)  # type: ignore[no-any-return]
+    return Rows(seed, lead, where)
 
-    def __init__(self, seed: Any, lead: tuple[int, ...], where: Any) -> None:
-        super().__init__(np.random.PCG64(np.random.SeedSequence([int(s) for s in seed])))
+
+class Rows(np.random.Generator):
+    """Normal draws for all ensembles of a batch, of which some are asked for.
+
+    Parameters
+    ----------
+    seed : list of int
+    lead : tuple of int
+        Leading axes of the batch.
+    where : ndarray of int or None
+        Which of its ensembles, counted flat; all of them if None.
+    """
+
+    def __init__(self, seed: list[int], lead: tuple[int, ...], where: Any) -> None:
+        super().__init__(np.random.PCG64(np.random.SeedSequence(seed)))
         self.lead, self.where = lead, where
 
+    def stream(self, seed: list[int], where: Any) -> Rows:
+        """Another stream for these ensembles, or for some of them: their places stay."""
+        if where is None:
+            return Rows(seed, self.lead, self.where)
+        return Rows(seed, self.lead, where if self.where is None else self.where[where])
+
     def standard_normal(self, size: Any = None, *args: Any, **options: Any) -> Any:
-        """As numpy's, but of a batch's rows those that belong to the pattern."""
+        """As numpy's, but of a batch's rows those that are asked for."""
         if self.where is None or not np.iterable(size) or tuple(size)[:1] != self.where.shape:
             return super().standard_normal(size, *args, **options)
         rest = tuple(size)[1:]

@@ -9,16 +9,18 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.special import ndtri
 
 from ..checks import Array, callable_, number
 from .door import Update, joined, unchecked
-from .missing import with_missing
+from .missing import Rows, with_missing
 
 __all__ = ["centred", "gated", "inflated", "serial"]
+
+Indices = NDArray[np.intp]
 
 
 def inflated(update: Update, *, factor: float) -> Update:
@@ -103,6 +105,11 @@ class _Centred(np.random.Generator):
     def __init__(self, source: np.random.Generator) -> None:
         super().__init__(source.bit_generator)
         self.source = source
+
+    def stream(self, seed: list[int], where: Any) -> _Centred:
+        """What the wrapped update's own wrappers draw from, centred too."""
+        maker = getattr(self.source, "stream", None)
+        return _Centred(Rows(seed, (), None) if maker is None else maker(seed, where))
 
     def standard_normal(self, size: Any = None, *args: Any, **options: Any) -> Any:
         """As the source's, centred along the last axis but one."""
@@ -203,12 +210,12 @@ def serial(update: Update) -> Update:
     return out
 
 
-def _groups(noise: ArrayLike) -> list[Array]:
+def _groups(noise: ArrayLike) -> list[Indices]:
     """Indices of readings that are correlated with each other, in the order of their first."""
     linked = (np.asarray(noise) != 0).reshape(-1, *np.shape(noise)[-2:]).any(axis=0)
     labels = csgraph.connected_components(sparse.csr_array(linked), directed=False)[1]
     return [np.flatnonzero(labels == k) for k in dict.fromkeys(labels.tolist())]
 
 
-def _block(noise: Array, rows: Array) -> Array:
+def _block(noise: Array, rows: Indices) -> Array:
     return np.asarray(noise[..., rows[:, None], rows])

@@ -1,4 +1,4 @@
-"""The built book in a browser: headless Chromium opens every page, wide and 400 px narrow."""
+"""The built book in a browser: headless Chromium opens every page, at three widths."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ from common import toc_pages
 
 ROOT = Path(__file__).resolve().parents[2]
 BUILT = ROOT / "_build" / "html"
-# The last is the start page, which Chromium carries in itself.
-LOCAL = ("file://", "data:", "blob:", "about:", "chrome://")
+LOCAL = ("file://", "data:", "blob:", "about:")
+# Pages that a Chromium opens for itself, whatever its version: what they ask for is not the book's.
+OWN = ("chrome://", "chrome-untrusted://", "chrome-extension://", "devtools://", "about:")
+WIDTHS = (1440, 1200, 400)
 FLAGS = (
     "--headless=new",
     "--no-sandbox",
@@ -66,7 +68,61 @@ return {
   formulas: document.querySelectorAll(".math").length,
 };
 """
-WIDTHS = "return [document.documentElement.scrollWidth, document.documentElement.clientWidth];"
+PAGE = "return [document.documentElement.scrollWidth, document.documentElement.clientWidth];"
+# What does not fit: it scrolls in a box of its own, or it is cut.
+FIT = r"""
+const out = {cut: [], scrolls: []};
+const parts = ".math mjx-math, pre, table, img, svg, .frames, .output";
+for (const part of document.querySelectorAll("article :is(" + parts + ")")) {
+  const box = part.getBoundingClientRect();
+  if (box.width === 0) continue;
+  const style = getComputedStyle(part).overflowX, formula = part.tagName === "MJX-MATH";
+  const own = !formula && part.clientWidth > 0 && part.scrollWidth > part.clientWidth + 1;
+  const words = (part.closest(".math") || part).textContent.trim().slice(0, 60);
+  const name = part.tagName.toLowerCase() + ": " + words;
+  if (own && (style === "auto" || style === "scroll")) { out.scrolls.push(name); continue; }
+  if (own && (style === "hidden" || style === "clip")) { out.cut.push(name); continue; }
+  const right = own ? box.left + part.scrollWidth : box.right;
+  let where = right > window.innerWidth + 1 ? "cut" : "";
+  for (let a = part.parentElement; a && a.tagName !== "BODY"; a = a.parentElement) {
+    const held = getComputedStyle(a).overflowX, edge = a.getBoundingClientRect().right;
+    if (held === "visible" || right <= edge + 1) continue;
+    where = held === "auto" || held === "scroll" ? "scrolls" : "cut";
+    break;
+  }
+  if (where) out[where].push(name);
+}
+return out;
+"""
+# Moves every slider by one step, then plays it: the picture, its text and what is said change.
+MOVE = r"""
+const done = arguments[arguments.length - 1], found = [];
+const roots = [...document.querySelectorAll("[data-frames]")];
+const wait = (ms) => new Promise(r => setTimeout(r, ms));
+(async () => {
+  for (const root of roots) {
+    const [image, input] = [root.querySelector("img"), root.querySelector("input")];
+    const [button, output] = [root.querySelector("button"), root.querySelector("output")];
+    const now = () => [image.src, image.alt, output.textContent];
+    const before = now(), last = Number(input.max);
+    input.value = Number(input.value) === last ? 0 : Number(input.value) + 1;
+    input.dispatchEvent(new Event("input"));
+    const moved = now();
+    button.click();
+    for (let k = 0; k < 80 && now()[2] === moved[2]; k++) await wait(50);
+    const played = now();
+    button.click();
+    await image.decode().catch(() => null);
+    found.push({
+      ready: root.hasAttribute("data-ready") && input.offsetWidth > 0,
+      moved: moved.every((v, k) => v !== before[k]),
+      played: played.every((v, k) => v !== moved[k]),
+      drawn: image.naturalWidth > 0,
+    });
+  }
+  done(found);
+})();
+"""
 
 
 @dataclass
@@ -77,36 +133,59 @@ class Visit:
     requests: list[str]
     console: list[str]
     widths: dict[int, tuple[int, int]] = field(default_factory=dict)
+    fit: dict[int, dict[str, list[str]]] = field(default_factory=dict)
+    sliders: list[dict[str, bool]] = field(default_factory=list)
 
 
 def visit(driver: Any, page: Path) -> Visit:
     """Open a page, wide and narrow, and collect what happened."""
     for kind in ("performance", "browser"):
         driver.get_log(kind)
-    widths = {}
-    for width in (1280, 400):
+    widths, fit = {}, {}
+    tab = driver.current_window_handle
+    for width in WIDTHS:
         size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
         driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
         driver.get(page.as_uri())
         driver.execute_async_script(READY)
         report = driver.execute_script(REPORT)
-        scroll, client = driver.execute_script(WIDTHS)
+        scroll, client = driver.execute_script(PAGE)
         widths[width] = (scroll, client)
-    requests = []
-    for entry in driver.get_log("performance"):
-        message = json.loads(entry["message"])["message"]
-        if message["method"] == "Network.requestWillBeSent":
-            requests.append(message["params"]["request"]["url"])
-        elif message["method"] == "Network.webSocketCreated":
-            requests.append(message["params"]["url"])
+        fit[width] = driver.execute_script(FIT)
+    sliders = driver.execute_async_script(MOVE)
+    entries = [json.loads(entry["message"]) for entry in driver.get_log("performance")]
+    requests = asked(entries, tab)
     console = [e["message"] for e in driver.get_log("browser") if e["level"] == "SEVERE"]
-    return Visit(report, requests, console, widths)
+    return Visit(report, requests, console, widths, fit, sliders)
+
+
+def asked(entries: list[dict[str, Any]], tab: str) -> list[str]:
+    """Return what the pages of one tab asked for, from the browser's log.
+
+    The log has every tab's events, and Chromium opens tabs of its own; and a new tab shows a page
+    of Chromium's own before it shows ours.
+    """
+    out = []
+    for entry in entries:
+        message = entry["message"]
+        params = message.get("params", {})
+        if entry.get("webview", tab) != tab:
+            continue
+        if message["method"] == "Network.requestWillBeSent":
+            url = params["request"]["url"]
+            if not str(params.get("documentURL", "")).startswith(OWN) or not url.startswith(OWN):
+                out.append(url)
+        elif message["method"] == "Network.webSocketCreated":
+            out.append(params["url"])
+    return [url for url in out if not url.startswith(OWN)]
 
 
 @pytest.fixture(scope="module")
 def driver(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     """Yield a headless Chromium with a fresh profile."""
-    browser, helper = shutil.which("chromium"), shutil.which("chromedriver")
+    names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+    browser = next(filter(None, map(shutil.which, names)), None)
+    helper = shutil.which("chromedriver")
     if not browser or not helper:
         message = "chromium or chromedriver is not installed: no page was opened in a browser"
         if os.environ.get("CI") == "true":
@@ -207,10 +286,63 @@ def test_nothing_scrolls_sideways(visits: dict[Path, Visit]) -> None:
     assert wide == {}
 
 
+def test_nothing_is_cut(visits: dict[Path, Visit]) -> None:
+    cut = {
+        (page.name, width): found["cut"]
+        for page, seen in visits.items()
+        for width, found in seen.fit.items()
+        if found["cut"]
+    }
+    assert cut == {}
+
+
+def test_on_a_desk_nothing_scrolls_in_its_box(visits: dict[Path, Visit]) -> None:
+    scrolls = {
+        (page.name, width): found["scrolls"]
+        for page, seen in visits.items()
+        for width, found in seen.fit.items()
+        if width >= 1200 and found["scrolls"]
+    }
+    assert scrolls == {}
+
+
+def test_every_slider_moves_and_plays(visits: dict[Path, Visit]) -> None:
+    still = {
+        page.name: slider
+        for page, seen in visits.items()
+        for slider in seen.sliders
+        if not all(slider.values())
+    }
+    assert still == {}
+
+
+def test_what_chromium_asks_for_itself_is_not_the_book_s() -> None:
+    def sent(url: str, document: str, tab: str = "ours") -> dict[str, Any]:
+        params = {"request": {"url": url}, "documentURL": document}
+        return {"message": {"method": "Network.requestWillBeSent", "params": params},
+                "webview": tab}  # fmt: skip
+
+    page, far = "file:///book/index.html", "http://example.invalid/a.js"
+    untrusted = "chrome-untrusted://new-tab-page/one-google-bar"
+    entries = [
+        sent(page, page), sent(untrusted, untrusted), sent("chrome://theme/a.css", "chrome://new"),
+        sent("https://www.gstatic.com/a.js", "chrome-untrusted://new-tab-page/", "another"),
+        sent(far, page), sent("data:image/png;base64,xx", page),
+    ]  # fmt: skip
+    assert asked(entries, "ours") == [page, far, "data:image/png;base64,xx"]
+    socket = {"method": "Network.webSocketCreated", "params": {"url": "wss://example.invalid"}}
+    assert asked([{"message": socket, "webview": "ours"}], "ours") == ["wss://example.invalid"]
+
+
 BAD = r"""<!doctype html><title>bad</title><body>
 <p>\(x\)</p><p class="math">x</p><img src="nowhere.png">
 <a href="nowhere.html">a</a><a href="#no">b</a>
 <img src="http://example.invalid/a.png" alt="far"><div style="width: 2000px">wide</div>
+<article><div style="width: 300px; overflow: hidden">
+<pre>x<span style="padding: 400px">x</span></pre></div>
+<pre style="overflow-x: auto; width: 300px">x<span style="padding: 400px">x</span></pre></article>
+<div data-frames="a"><img alt="a"><button></button><input type="range" max="3">
+<output>a</output></div>
 <script>throw new Error("broken")</script></body>"""
 
 
@@ -219,7 +351,9 @@ def test_a_bad_page_is_found_out(driver: Any, tmp_path: Path) -> None:
     page.write_text(BAD, encoding="utf-8")
     seen = visit(driver, page)
     assert seen.report["raw"] and seen.report["unset"] and seen.report["mute"]
-    assert len(seen.report["broken"]) == 2
+    assert len(seen.report["broken"]) == 3
     assert len(broken_links({page: seen})) == 2
     assert outside(seen) and seen.console
+    assert len(seen.fit[1200]["cut"]) == 1 and len(seen.fit[1200]["scrolls"]) == 1
+    assert seen.sliders and not any(seen.sliders[0].values())
     assert seen.widths[400][0] > seen.widths[400][1]

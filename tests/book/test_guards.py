@@ -6,6 +6,8 @@ comparison of the pair, and nbval over the stored outputs.
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import shutil
 import subprocess
@@ -17,7 +19,11 @@ from typing import Any
 
 import jupytext
 import nbformat
+import numpy as np
 import pytest
+from PIL import Image
+
+from pictures import difference, taken_out
 
 ROOT = Path(__file__).resolve().parents[2]
 TOOLS = ROOT / "book" / "tools"
@@ -126,11 +132,106 @@ def test_cleared_outputs_fail(chapter: Path, counts: bool) -> None:
     assert not passes(chapter)
 
 
-def test_changed_curve_fails_through_its_digest(chapter: Path) -> None:
-    change_source(chapter, "ax.plot(t, curve)", "ax.plot(t, curve ** 1.01)")
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("ax.plot(t, curve)", "ax.plot(t, 1.01 * curve)"),
+        ("ax.plot(t, np.exp(-rate * t))", "ax.plot(t, 1.01 * np.exp(-rate * t))"),
+    ],
+    ids=["figure", "moving frames"],
+)
+def test_changed_curve_fails_through_its_digest(chapter: Path, old: str, new: str) -> None:
+    change_source(chapter, old, new)
     assert tool("pairs.py", str(chapter)).returncode == 0
     done = tool("regress.py", str(chapter))
     assert done.returncode == 1 and "mean" in done.stderr
+
+
+def pictures(notebook: Any) -> list[Any]:
+    """The bundles of the chapter's figure and of its slider."""
+    outputs = [output for cell in code_cells(notebook) for output in cell.outputs]
+    found = [output.data for output in outputs if "image/png" in output.get("data", {})]
+    assert len(found) == 2 and "text/html" in found[1]
+    return found
+
+
+@pytest.mark.parametrize("which", [0, 1], ids=["figure", "slider"])
+def test_removed_picture_fails(chapter: Path, which: int) -> None:
+    notebook = stored(chapter)
+    del pictures(notebook)[which]["image/png"]
+    store(chapter, notebook)
+    assert tool("pairs.py", str(chapter)).returncode == 1
+    assert tool("regress.py", str(chapter)).returncode == 1
+
+
+def test_exchanged_picture_fails(chapter: Path) -> None:
+    notebook = stored(chapter)
+    figure, moving = pictures(notebook)
+    figure["image/png"] = moving["image/png"]
+    store(chapter, notebook)
+    assert tool("pairs.py", str(chapter)).returncode == 0
+    done = tool("regress.py", str(chapter))
+    assert done.returncode == 1 and "pixels" in done.stderr
+    assert tool("execute.py", "--check", str(chapter)).returncode == 1
+
+
+def test_exchanged_frames_fail(chapter: Path) -> None:
+    notebook = stored(chapter)
+    moving = pictures(notebook)[1]
+    html, frames = taken_out(moving["text/html"])
+    assert len(frames) == 4 and frames[0] == frames[2]  # the first one shown, then all three
+    assert len(set(frames)) == 3
+    swapped = moving["text/html"].replace(frames[1], "first").replace(frames[3], frames[1])
+    moving["text/html"] = swapped.replace("first", frames[3])
+    store(chapter, notebook)
+    assert taken_out(moving["text/html"])[0] == html
+    done = tool("regress.py", str(chapter))
+    assert done.returncode == 1 and "pixels" in done.stderr
+
+
+def shaded(png: str, share: float, by: int) -> str:
+    """The picture with some of its pixels shaded otherwise."""
+    image = Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB")
+    pixels = np.asarray(image).astype(int)
+    chosen = np.random.default_rng(1).random(pixels.shape[:2]) < share
+    pixels[chosen] += np.where(pixels[chosen] > 127, -by, by)
+    out = io.BytesIO()
+    Image.fromarray(pixels.astype(np.uint8)).save(out, format="png")
+    return base64.b64encode(out.getvalue()).decode()
+
+
+def test_another_machine_s_shades_pass(chapter: Path) -> None:
+    notebook = stored(chapter)
+    for bundle in pictures(notebook):
+        bundle["image/png"] = shaded(bundle["image/png"], 0.5, 20)
+    store(chapter, notebook)
+    assert passes(chapter)
+    png = pictures(stored(chapter))[0]["image/png"]
+    assert difference(shaded(png, 0.002, 120), png).startswith("differs in 0.2")
+    assert difference(shaded(png, 0.0001, 120), png) == ""
+    assert difference(png, "a") == "is no picture"
+
+
+def test_a_picture_without_its_digest_is_refused(chapter: Path) -> None:
+    notebook = stored(chapter)
+    assert not pictures(notebook)[0]["text/plain"].startswith("<")
+    pictures(notebook)[0]["text/plain"] = "<Figure size 440x275 with 1 Axes>"
+    store(chapter, notebook)
+    done = tool("pairs.py", str(chapter))
+    assert done.returncode == 1 and "without the digest of its axes" in done.stderr
+
+
+def test_two_pictures_or_none_in_a_figure_s_cell_are_refused(chapter: Path) -> None:
+    for copies in (0, 2):
+        notebook = stored(chapter)
+        (cell,) = [c for c in code_cells(notebook) if "fig-small" in str(c.metadata)]
+        picture = [o for o in cell.outputs if "image/png" in o.get("data", {})]
+        cell.outputs = [o for o in cell.outputs if o not in picture] + picture * copies
+        path = chapter.with_name(f"copies{copies}.md")
+        path.write_bytes(chapter.read_bytes())
+        store(path, notebook)
+        done = tool("pairs.py", str(path))
+        assert done.returncode == 1 and f"with {copies} pictures, needs one" in done.stderr
 
 
 def test_changed_prose_fails(chapter: Path) -> None:
@@ -146,8 +247,9 @@ def test_changed_prose_fails(chapter: Path) -> None:
         ("alt: One curve that falls from 1 at time 0 to 0.14 at time 1.", "width: 80%", "alt"),
         ("    caption: The curve {eq}`eq-small`.\n", "", "caption"),
         ("rate = 2.0", "rate = 2.0  # " + "x" * 70, "at most 79"),
+        ('print(f"rate {rate:.4f}")', 'print("x" * 80)', "80 characters printed, at most 79"),
     ],
-    ids=["no alternative text", "no caption", "long line"],
+    ids=["no alternative text", "no caption", "long line", "long output"],
 )
 def test_pair_check_refuses(chapter: Path, old: str, new: str, complaint: str) -> None:
     text = chapter.read_text(encoding="utf-8")

@@ -131,6 +131,47 @@ def test_make_studies_refuses_a_script(old: str, new: str, word: str, tmp_path: 
         load().main([], tmp_path)
 
 
+SHARED = """
+def shared(seed):
+    return [float(seed.spawn_key[0]), 1.0]
+"""
+USES = """
+import _common
+from distfilt.published import scenario
+from distfilt.studies import spawn
+NAME, PAPER, columns, parameters = "table-2", "grange", ["a", "b"], {"gain": 1}
+seeds, scenarios, timeout = spawn(1, 4), [scenario("grange", "table-2")], 30.0
+def trial(seed):
+    return _common.shared(seed)
+"""
+
+
+def test_scripts_share_a_module_and_store_what_their_scenario_was(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tool, folder = load(), tmp_path / "book" / "studies"
+    folder.mkdir(parents=True)
+    (folder / "_common.py").write_text(SHARED, encoding="utf-8")
+    (folder / "two.py").write_text(USES, encoding="utf-8")
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    assert tool.main(["--workers", "2"], tmp_path) == 0
+    stored = studies.load(tmp_path / "data" / "studies" / "grange" / "table-2.csv")
+    assert stored.metric("a").tolist() == [0.0, 1.0, 2.0, 3.0]
+    from distfilt.published import scenario
+
+    digest = scenario("grange", "table-2").digest
+    assert stored.parameters == {"gain": 1, "scenario_table_2": digest}
+    assert tool.main(["--check", "--workers", "1"], tmp_path) == 0
+    text = USES.replace('"table-2")]', '"table-2").replace(gain=0.2)]')
+    (folder / "two.py").write_text(text, encoding="utf-8")
+    os.utime(folder / "two.py", (5, 5))
+    capsys.readouterr()
+    for arguments in ([], ["--check"]):
+        assert tool.main(arguments, tmp_path) == 1
+        assert "changed scenario: gain: 0.2, not 0.05" in capsys.readouterr().err
+    sys.modules.pop("_common", None)
+
+
 @pytest.mark.slow
 def test_every_stored_study_runs_again() -> None:
     assert load().main(["--check"]) == 0

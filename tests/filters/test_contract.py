@@ -84,13 +84,14 @@ def test_nobody_notices_beyond_the_neighbours(family: str, rule: str) -> None:
         elif name == "log_weights":
             v[4] = np.roll(v[4], 1)
         else:
-            v[4] = 7.0 + 2.5 * v[4]
+            v[4] = 0.5 + 1.2 * v[4]
     fields = {k: getattr(start, k) for k in start.__dataclass_fields__} | changed
     other = f.step(type(start)(**fields), TIMES[1], at(seen, 1))
     plain = f.step(start, TIMES[1], at(seen, 1))
-    for name, v in values(plain).items():
-        assert (v[:3] == values(other)[name][:3]).all(), f"{name} of an agent out of reach moved"
-        assert (v[4] != values(other)[name][4]).any()
+    both = [(v, values(other)[name]) for name, v in values(plain).items()]
+    # Products of a smaller batch round differently, and nothing else may.
+    assert all(np.allclose(v[:3], w[:3], rtol=0, atol=1e-13) for v, w in both)
+    assert any((v[4] != w[4]).any() for v, w in both)
 
 
 @EACH
@@ -240,7 +241,8 @@ def test_time_passes_to_model_and_noise(family: str) -> None:
 def test_moving_graph(family: str) -> None:
     pair, apart = graphs.path(2), graphs.Graph.from_edges(2, np.empty((0, 2)))
     f, start = made(
-        family, sensors=[direct([0], std=0.3), None], graph=lambda t: pair if t > 1 else apart
+        family, sensors=[direct([0], std=0.3), None], agreement=None,
+        graph=lambda t: pair if t > 1 else apart,
     )
     first = f.step(start, 1.0, [[0.5], None])
     assert not first.ledger.messages.any()

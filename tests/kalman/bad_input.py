@@ -65,12 +65,16 @@ def series_cases(f: Callable[..., Any]) -> list[tuple[str, Callable[[], Any]]]:
         ("observations", lambda: _series(f, y=np.full((3, 5, 1), np.inf))),
         ("observations", lambda: _series(f, y=np.zeros(3))),
         ("sensors", lambda: _series(f, sensors=[])),
-        ("sensors", lambda: _series(f, sensors=[differential([0], std=1.0)])),
         ("times", lambda: _series(f, times=[1.0, 1.0, 2.0])),
         ("times", lambda: _series(f, times=[0.0, 1.0, 2.0])),
         ("times", lambda: _series(f, times=[], y=np.zeros((0, 5, 1)))),
         ("t0", lambda: _series(f, t0=np.nan)),
     ]
+
+
+def of_changes(f: Callable[..., Any]) -> tuple[str, Callable[[], Any]]:
+    """The case of a sensor that needs the previous state."""
+    return "sensors", lambda: _series(f, sensors=[differential([0], std=1.0)])
 
 
 def with_option(f: Callable[..., Any], **option: Any) -> tuple[str, Callable[[], Any]]:

@@ -8,9 +8,21 @@ import numpy as np
 import pytest
 
 from distfilt.differences import central
-from distfilt.kalman import Chart, extended_filter, multiplicative_filter, quaternion_chart
-from distfilt.models import coordinated_turn, satellite_pose, simulate, turned
-from distfilt.sensors import direct, distance_and_angle, stack
+from distfilt.kalman import (
+    Chart,
+    extended_filter,
+    kalman_filter,
+    multiplicative_filter,
+    quaternion_chart,
+)
+from distfilt.models import (
+    constant_velocity,
+    coordinated_turn,
+    satellite_pose,
+    simulate,
+    turned,
+)
+from distfilt.sensors import differential, direct, distance_and_angle, stack
 from tests.kalman.bad_input import series_cases
 from tests.kalman.problems import spd, walk
 
@@ -92,6 +104,31 @@ def test_a_flat_chart_is_the_extended_filter() -> None:
     plain = extended_filter(start, cov, y, **options)
     for name in ("means", "covariances", "log_likelihood"):
         np.testing.assert_allclose(getattr(ours, name), getattr(plain, name), rtol=0, atol=1e-13)
+
+
+def test_changes_are_readings_of_two_states() -> None:
+    """A differential sensor: equal to the Kalman filter of the doubled state (x, x before)."""
+    rng = np.random.default_rng(5)
+    model, d = constant_velocity(sigma=0.3), 4
+    sensors = [differential([0, 3], std=0.2), direct([1], std=0.3)]
+    mean, cov, y = rng.standard_normal(d), spd(rng, d), rng.standard_normal((4, 3, 3))
+    y[1, 0, 0] = y[2, 1] = np.nan
+    run = multiplicative_filter(mean, cov, y, chart=_flat(d), model=model, sensors=sensors,
+                                times=[0.5, 1.0, 1.5, 2.0])
+    phi, q = model.transition(0.5), model.noise(0.0, 0.5)
+    double, noise = np.zeros((2 * d, 2 * d)), np.zeros((2 * d, 2 * d))
+    double[:d, :d], double[d:, :d], noise[:d, :d] = phi, np.eye(d), q
+    h = np.zeros((3, 2 * d))
+    h[0, 0] = h[1, 3] = h[2, 1] = 1.0
+    h[0, d] = h[1, d + 3] = -1.0
+    wide = np.kron(np.eye(2), cov)  # what was before the prior is never seen
+    exact = kalman_filter(np.r_[mean, mean], wide, y, F=double, Q=noise, H=h,
+                          R=np.diag([0.04, 0.04, 0.09]))
+    np.testing.assert_allclose(run.means, exact.means[..., :d], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        run.covariances, np.broadcast_to(exact.covariances[..., :d, :d], run.covariances.shape),
+        rtol=0, atol=1e-8)
+    np.testing.assert_allclose(run.log_likelihood, exact.log_likelihood, rtol=0, atol=1e-7)
 
 
 def test_an_attitude_s_uncertainty_is_honest_and_its_length_kept() -> None:

@@ -23,7 +23,7 @@ from distfilt.kalman import (
 )
 from distfilt.models import LinearModel, Model, clohessy_wiltshire
 from distfilt.sensors import Sensor, angle, differential, direct, distance_and_angle, stack
-from tests.kalman.bad_input import INDEFINITE, LOPSIDED, series_cases, with_option
+from tests.kalman.bad_input import INDEFINITE, LOPSIDED, of_changes, series_cases, with_option
 from tests.kalman.problems import D, M, problem, spd, walk
 
 PREDICTS, UPDATES = (extended_predict, unscented_predict), (extended_update, unscented_update)
@@ -93,9 +93,11 @@ BAD_INPUT: dict[str, Any] = {
     ],
     "distfilt.kalman.unscented_update": [
         *_update_cases(unscented_update), *_weights(_analysis, unscented_update)],
-    "distfilt.kalman.extended_filter": series_cases(extended_filter),
+    "distfilt.kalman.extended_filter": [
+        *series_cases(extended_filter), of_changes(extended_filter)],
     "distfilt.kalman.unscented_filter": [
         *series_cases(unscented_filter),
+        of_changes(unscented_filter),
         with_option(unscented_filter, alpha=0.0),
         with_option(unscented_filter, beta=-1.0),
         with_option(unscented_filter, kappa=-2.0),

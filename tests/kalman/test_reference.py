@@ -18,14 +18,15 @@ from distfilt.kalman import (
 )
 from distfilt.models import Model, clohessy_wiltshire, coordinated_turn, satellite_pose
 from distfilt.sensors import angle, direct, distance, distance_and_angle, stack
-from tests.kalman.bad_input import linear_cases, series_cases, with_option
+from tests.kalman.bad_input import linear_cases, of_changes, series_cases, with_option
 from tests.kalman.problems import D, M, problem, spd, walk
 
 BAD_INPUT: dict[str, Any] = {
     "distfilt.kalman.filterpy_kf": linear_cases(filterpy_kf),
-    "distfilt.kalman.filterpy_ekf": series_cases(filterpy_ekf),
+    "distfilt.kalman.filterpy_ekf": [*series_cases(filterpy_ekf), of_changes(filterpy_ekf)],
     "distfilt.kalman.filterpy_ukf": [
         *series_cases(filterpy_ukf),
+        of_changes(filterpy_ukf),
         with_option(filterpy_ukf, alpha=0.0),
         with_option(filterpy_ukf, beta=-1.0),
         with_option(filterpy_ukf, kappa=-2.0),

@@ -44,6 +44,7 @@ BAD_INPUT = {
         ("previous", lambda: differential([0], std=1.0).predict([1.0])),
         ("previous", lambda: differential([0], std=1.0).jacobian([1.0])),
         ("previous", lambda: differential([0], std=1.0).predict([1.0], [1.0, 2.0])),
+        ("previous", lambda: differential([0], std=1.0).predict(np.ones((2, 1)), np.ones((3, 1)))),
         ("x", lambda: direct([3], std=1.0).predict([1.0])),
         ("x", lambda: direct([0], std=1.0).predict([NAN])),
         ("x", lambda: distance([0, 1], std=1.0).jacobian([NAN, 1.0])),

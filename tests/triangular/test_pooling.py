@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from distfilt.checks import SolverError
 from distfilt.network import Channel, graphs
 from distfilt.network.consensus import average
-from distfilt.triangular import AffineMap, affine
-from distfilt.triangular.conditioning import compose
+from distfilt.triangular import AffineMap, affine, compose
 from distfilt.triangular.pooling import _proximal, pool_by_admm, pool_by_moments
 
 NAN = float("nan")
@@ -46,6 +45,10 @@ def _cases(pool: object) -> list[tuple[str, object]]:
 
     return [
         ("channel", lambda: pool(_Y, _X, graphs.path(3))),
+        ("agree", lambda: pool(_Y, _X, Channel(graphs.path(3)), agree=3)),
+        ("agree", lambda: pool(_Y, _X, Channel(graphs.path(3)), agree=lambda v, c: 1000 * v)),
+        ("agree", lambda: pool(_Y, _X, Channel(graphs.path(3)), agree=lambda v, c: NAN * v)),
+        ("agree", lambda: pool(_Y, _X, Channel(graphs.path(3)), agree=lambda v, c: v[:1])),
         ("x", lambda: pool(_Y, _X[:2], Channel(graphs.path(3)))),
         ("x", lambda: pool(_Y[:, :1], _X[:, :1], Channel(graphs.path(3)))),
         ("x", lambda: pool(_Y, NAN * _X, Channel(graphs.path(3)))),
@@ -71,7 +74,6 @@ BAD_INPUT = {
 
 
 @given(st.integers(0, 10_000), st.sampled_from([graphs.path(3), graphs.star(5), graphs.ring(4)]))
-@settings(max_examples=25)
 def test_averaged_moments_give_the_map_of_all_samples(seed: int, graph: graphs.Graph) -> None:
     y, x = _samples(seed, graph.size)
     pooled, central = pool_by_moments(y, x, Channel(graph)), _centralised(y, x)
@@ -138,3 +140,30 @@ def test_admm_needs_standardised_data() -> None:
     y, x = _samples(5, 3, raw=True)
     with pytest.raises(SolverError):
         pool_by_admm(y, x, Channel(graphs.path(3)), standardise=False, iterations=3000)
+
+
+def test_a_rule_that_diverges_is_blamed_itself() -> None:
+    """Gains far too large: not the samples are at fault, as they vary."""
+    for gain in (2.0, 1000.0):
+
+        def rule(values: np.ndarray, channel: Channel, gain: float = gain) -> np.ndarray:
+            return values + gain * (values - values.mean(axis=0)) * 10
+
+        for pool in (pool_by_moments, pool_by_admm):
+            with pytest.raises(ValueError, match="agree: needs a rule that returns averages"):
+                pool(_Y, _X, Channel(graphs.path(3)), agree=rule)
+
+
+def test_a_variable_that_only_differs_between_agents_is_not_constant() -> None:
+    y, x = _samples(6)
+    x[..., 0] = np.arange(3.0)[:, None]
+    pooled = pool_by_moments(y, x, Channel(graphs.path(3)))
+    assert np.abs(pooled.scale[0] - _centralised(y, x).scale).max() < 1e-12
+
+
+def test_rho_changes_the_way_and_not_the_end() -> None:
+    y, x = _samples(7)
+    few = [pool_by_admm(y, x, Channel(graphs.path(3)), rho=rho, tolerance=1e-9)
+           for rho in (0.5, 2.0)]
+    assert few[0][1].iterations != few[1][1].iterations
+    assert np.abs(few[0][0].gain - few[1][0].gain).max() < 1e-6

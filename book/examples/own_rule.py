@@ -1,0 +1,30 @@
+"""A rule of agreement of one's own: each agent moves to the median of the means it knows."""
+
+import numpy as np
+
+from distfilt.filters import EnsembleFilter
+from distfilt.models import Model
+from distfilt.network import graphs
+from distfilt.sensors import direct
+
+
+def median_of_means(ensembles, channel):
+    """Move every ensemble (A, N, d) to the median of its own mean and its neighbours'."""
+    means = list(ensembles.mean(axis=-2))
+    inbox = channel.exchange(means)
+    out = ensembles.copy()
+    for agent, heard in enumerate(inbox):
+        middle = np.median([means[agent], *heard.values()], axis=0)
+        out[agent] += middle - means[agent]
+    return out
+
+
+walk = Model(1, lambda x, t, dt: x, lambda t, dt: 0.1 * dt * np.eye(1), units=("m",))
+sensors = [direct([0], std=0.5) for _ in range(5)]
+f = EnsembleFilter(
+    walk, sensors, graphs.complete(5), agreement=median_of_means, share=False, members=100
+)
+state = f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0))
+readings = [np.full((20, 1), 1.0)] * 4 + [np.full((20, 1), 30.0)]  # the last sensor is broken
+run = f.run(state, np.arange(1.0, 21.0), readings)
+print(run["mean"].values[-1, :, 0].round(1), "m;", run["scalars"].values[-1].sum(), "numbers")

@@ -1,0 +1,85 @@
+"""Pictures in stored outputs: found, taken out of texts, and compared.
+
+A figure's curves are compared by the digest of its axes, to four digits. What is left for the
+picture itself is that it shows the same: another machine may round a pixel's shade otherwise, so
+few pixels may differ, and none by much more than a line's edge.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import io
+import re
+from typing import Any
+
+import nbformat
+import numpy as np
+from PIL import Image
+
+# With a slider the PNG's own first bytes tell it from other text; a notebook escapes quotes.
+_EMBEDDED = re.compile(
+    r'(?<=data:image/png;base64,)[A-Za-z0-9+/=\n]+|(?<=")iVBORw0KGgo[A-Za-z0-9+/=]+'
+)
+SHADE = 0.25
+"""A pixel differs if its shade does by more than this share of black to white."""
+SHARE = 5e-4
+"""How many of a picture's pixels may differ."""
+
+
+def taken_out(text: str) -> tuple[str, list[str]]:
+    """Return a text without the PNGs that are written in it, and these."""
+    return _EMBEDDED.sub("…", text), _EMBEDDED.findall(text)
+
+
+def stored_pictures(output: Any) -> list[str]:
+    """Return the PNGs of an output, those that its HTML embeds included, as base64."""
+    data = output.get("data", {})
+    out = [data["image/png"]] if "image/png" in data else []
+    return out + taken_out(_joined(data.get("text/html", "")))[1]
+
+
+def _joined(text: Any) -> str:
+    return text if isinstance(text, str) else "".join(text)
+
+
+def without_pictures(outputs: list[Any]) -> list[Any]:
+    """Return outputs with every PNG replaced by its place."""
+    out = []
+    for output in outputs:
+        data = dict(output.get("data", {}))
+        if "image/png" in data:
+            data["image/png"] = "…"
+        if "text/html" in data:
+            data["text/html"] = taken_out(_joined(data["text/html"]))[0]
+        out.append(nbformat.from_dict({**output, "data": data}) if data else output)
+    return out
+
+
+def _shades(picture: str) -> np.ndarray:
+    raw = base64.b64decode(picture)
+    return np.asarray(Image.open(io.BytesIO(raw)).convert("RGB"), dtype=float) / 255
+
+
+def difference(one: str, other: str) -> str:
+    """Return in words how two pictures, as base64, differ; '' if a reader sees the same."""
+    if one.strip() == other.strip():
+        return ""
+    try:
+        a, b = _shades(one), _shades(other)
+    except (OSError, ValueError, binascii.Error):
+        return "is no picture"
+    if a.shape != b.shape:
+        return f"has {a.shape[1]} x {a.shape[0]} pixels, not {b.shape[1]} x {b.shape[0]}"
+    share = float((np.abs(a - b).max(axis=-1) > SHADE).mean())
+    return f"differs in {share:.2%} of its pixels" if share > SHARE else ""
+
+
+def differences(stored: list[Any], fresh: list[Any]) -> list[str]:
+    """Return how the pictures of two lists of outputs differ."""
+    one = [p for output in stored for p in stored_pictures(output)]
+    two = [p for output in fresh for p in stored_pictures(output)]
+    if len(one) != len(two):
+        return [f"{len(one)} pictures stored, {len(two)} drawn"]
+    found = (difference(a, b) for a, b in zip(one, two, strict=True))
+    return [f"picture {k} {text}" for k, text in enumerate(found, start=1) if text]

@@ -1,0 +1,155 @@
+"""The environment is whole or made again: interrupted, moved, copied, an old Python."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import environment
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def clone(tmp_path: Path) -> Path:
+    """A folder with what make looks at, under a name with a space in it."""
+    folder = tmp_path / "a clone"
+    (folder / "book" / "tools").mkdir(parents=True)
+    for name in ("Makefile", "requirements.txt", "pyproject.toml", "book/tools/environment.py"):
+        shutil.copy(ROOT / name, folder / name)
+    return folder
+
+
+def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["make", *arguments], cwd=folder, capture_output=True, text=True,
+        env={k: v for k, v in os.environ.items() if not k.startswith("MAKE")},
+    )  # fmt: skip
+
+
+def pretend(folder: Path, stamp: str | None) -> None:
+    """An environment whose Python works, with that stamp."""
+    (folder / ".venv" / "bin").mkdir(parents=True)
+    (folder / ".venv" / "bin" / "python").symlink_to(sys.executable)
+    if stamp is not None:
+        (folder / ".venv" / "stamp").write_text(stamp + "\n")
+
+
+def makes_it(folder: Path) -> bool:
+    done = make(folder, "-n", "environment")
+    assert done.returncode == 0, done.stderr
+    return "environment.py" in done.stdout
+
+
+def test_a_whole_environment_is_kept(clone: Path) -> None:
+    pretend(clone, str(clone))
+    assert not makes_it(clone)
+
+
+def test_a_changed_lock_updates_it(clone: Path) -> None:
+    pretend(clone, str(clone))
+    os.utime(clone / ".venv" / "stamp", (1, 1))
+    assert makes_it(clone)
+
+
+def test_no_environment_or_half_of_one_is_made_again(clone: Path) -> None:
+    assert makes_it(clone)
+    pretend(clone, None)
+    assert makes_it(clone)
+
+
+def test_a_moved_or_copied_folder_makes_its_own(clone: Path, tmp_path: Path) -> None:
+    pretend(clone, str(clone))
+    copied = tmp_path / "copied"
+    shutil.copytree(clone, copied, symlinks=True)
+    assert makes_it(copied) and not makes_it(clone)
+    assert makes_it(clone.rename(tmp_path / "moved"))
+
+
+def test_an_environment_whose_python_is_gone_is_made_again(clone: Path) -> None:
+    pretend(clone, str(clone))
+    (clone / ".venv" / "bin" / "python").unlink()
+    (clone / ".venv" / "bin" / "python").symlink_to("/nowhere/python")
+    assert makes_it(clone)
+
+
+def test_an_old_python_is_named_and_leaves_nothing(clone: Path) -> None:
+    before = sorted(clone.rglob("*"))
+    old = clone / "old python"
+    old.write_text(
+        f'#!{sys.executable}\nimport runpy, sys\nsys.version_info = (3, 10, 4)\n'
+        'sys.argv = sys.argv[2:]\nrunpy.run_path(sys.argv[0], run_name="__main__")\n'
+    )
+    old.chmod(0o755)
+    done = make(clone, "environment", f"PYTHON={old}")
+    assert done.returncode != 0
+    assert "Python 3.11 or newer is needed, got 3.10.4" in done.stderr
+    old.unlink()
+    assert sorted(clone.rglob("*")) == before
+
+
+def test_without_a_python_make_says_so(clone: Path) -> None:
+    before = sorted(clone.rglob("*"))
+    done = make(clone, "environment", "PYTHON=")
+    assert done.returncode != 0 and "Python 3.11 or newer was not found" in done.stdout
+    assert sorted(clone.rglob("*")) == before
+
+
+@pytest.fixture
+def steps(clone: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What the tool would run, in order; `fail` in it stops there."""
+    done: list[str] = []
+
+    def run(python: str, *arguments: str) -> None:
+        if arguments[1] == "venv":
+            pretend(clone, None)
+        done.append(arguments[1])
+        if len(done) > 1 and done[0] == "fail":
+            sys.exit(1)
+
+    monkeypatch.chdir(clone)
+    monkeypatch.setattr(environment, "run", run)
+    monkeypatch.setattr(sys, "argv", ["environment.py", ".venv"])
+    return done
+
+
+def test_the_stamp_comes_last_and_names_the_folder(clone: Path, steps: list[str]) -> None:
+    environment.main()
+    assert steps[0] == "venv" and steps.count("pip") == 2
+    assert (clone / ".venv" / "stamp").read_text() == f"{clone}\n" and not makes_it(clone)
+    steps.clear()
+    (clone / ".venv" / "kept").touch()
+    environment.main()
+    assert "venv" not in steps and (clone / ".venv" / "kept").exists()
+
+
+def test_an_interrupted_update_leaves_no_stamp(clone: Path, steps: list[str]) -> None:
+    environment.main()
+    steps[:] = ["fail"]
+    with pytest.raises(SystemExit):
+        environment.main()
+    assert not (clone / ".venv" / "stamp").exists() and makes_it(clone)
+    steps.clear()
+    (clone / ".venv" / "half").touch()
+    environment.main()
+    assert steps[0] == "venv" and not (clone / ".venv" / "half").exists()
+
+
+def test_line_ends_are_fixed_whatever_a_clone_s_settings_are(tmp_path: Path) -> None:
+    source, clone = tmp_path / "source", tmp_path / "clone"
+    source.mkdir()
+    names = ("a.csv", "a.ipynb", "a.md", "a.py")
+    for name in names:
+        (source / name).write_bytes(b"one\ntwo\n")
+    shutil.copy(ROOT / ".gitattributes", source)
+    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b", "-c", "core.autocrlf=true"]
+    for arguments in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "a"]):
+        subprocess.run([*git, *arguments], cwd=source, check=True, capture_output=True)
+    subprocess.run([*git, "clone", "-q", source, clone], check=True, capture_output=True)
+    for name in names:
+        assert (clone / name).read_bytes() == b"one\ntwo\n"

@@ -1,0 +1,342 @@
+"""What each family promises of its own: exactness, collapse, linearisation, failures of updates."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+import xarray
+
+from distfilt.filters import (
+    EnsembleFilter,
+    EnsembleState,
+    Filter,
+    FilterError,
+    GaussianFilter,
+    GaussianState,
+    Late,
+    ParticleCollapse,
+    ParticleFilter,
+    ParticleState,
+    SensorFilter,
+    final_state,
+)
+from distfilt.filters.failures import guarded, not_finite
+from distfilt.filters.heard import gather
+from distfilt.filters.observations import at_one_time, over_times
+from distfilt.kalman import kalman_filter, rts_smoother
+from distfilt.models import LinearModel, Model, lorenz63, simulate
+from distfilt.network import Channel, Ledger, covariance_intersection, graphs, intersection
+from distfilt.sensors import Sensor, direct, distance
+from distfilt.updates import exact_draws, exact_forecast, known_noise, sampled_noise
+
+from .families import NOISE, PRIOR, TIMES, Q, data, made, model, team
+
+BOTH = Sensor(2, lambda x: x, NOISE, linear=lambda d: np.eye(d))
+
+
+def exact_kalman(seen: np.ndarray) -> object:
+    """The Kalman filter with the matrices written out, for readings (T, ..., 2)."""
+    steps = np.diff(TIMES, prepend=0.0)
+    f = np.array([model().transition(dt) for dt in steps])
+    q = np.array([dt * Q for dt in steps])
+    return kalman_filter(*PRIOR, seen, F=f, Q=q, H=np.eye(2), R=NOISE)
+
+
+def test_gaussian_filter_is_the_kalman_filter_with_full_noise_and_gaps() -> None:
+    _, (seen,) = data([BOTH], (5,))
+    seen[2, 1, 0] = np.nan
+    seen[4] = np.nan
+    run = made("gaussian", sensors=[BOTH], graph=None, runs=(5,))
+    out = run[0].run(run[1], TIMES, [seen])
+    exact = exact_kalman(seen)
+    assert np.allclose(out["mean"].values[..., 0, :], exact.means, atol=1e-12)
+    assert np.allclose(
+        out["covariance"].values[..., 0, :, :],
+        np.broadcast_to(exact.covariances, (8, 5, 2, 2)), atol=1e-12,
+    )
+
+
+def test_exact_draws_are_the_kalman_filter_for_a_linear_model() -> None:
+    _, (seen,) = data([BOTH], (5,))
+    f = EnsembleFilter.exact(model(), [BOTH], members=9)
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((5, 1, 9, 2))
+    x -= x.mean(axis=-2, keepdims=True)
+    lower = np.linalg.cholesky(np.swapaxes(x, -1, -2) @ x / 8)
+    x = np.swapaxes(np.linalg.solve(lower, np.swapaxes(x, -1, -2)), -1, -2)
+    prior = PRIOR[0] + x @ np.linalg.cholesky(PRIOR[1]).T
+    states = list(f.steps(f.start(prior, rng=rng, runs=(5,)), TIMES, [seen]))
+    exact = exact_kalman(seen)
+    for k, state in enumerate(states):
+        e = state.ensembles[:, 0]
+        cov = np.array([np.cov(m.T) for m in e])
+        assert np.allclose(e.mean(axis=1), exact.means[k], atol=1e-11)
+        assert np.allclose(cov, exact.covariances[k], atol=1e-11)
+
+
+def test_network_of_exact_ensembles_is_the_network_of_kalman_filters() -> None:
+    """With the same rule of intersection, agent by agent, with loss and a full noise matrix."""
+    from distfilt.network import Faults
+
+    sensors = team(4)
+    _, seen = data(sensors, (3,))
+    options = {"graph": graphs.ring(4), "runs": (3,), "sensors": sensors}
+    faults = Faults(loss=0.3, seed=1)
+    f, start = made("ensemble, exact", faults=faults, **options)
+    rule = partial(covariance_intersection, rule="min_determinant")
+    g, begin = made("gaussian", agreement=rule, faults=faults, **options)
+    e = start.ensembles
+    state = GaussianState(
+        0.0, begin.ledger, None, e.mean(axis=-2),
+        np.array([[np.cov(m.T) for m in agents] for agents in e]), 2,
+    )
+    a, b = f.run(start, TIMES, seen), g.run(state, TIMES, seen)
+    assert np.allclose(a["mean"], b["mean"], atol=1e-8)
+    assert np.allclose(a["variance"], b["variance"], atol=1e-8)
+    for name in ("messages", "scalars", "lost", "rounds"):
+        assert np.array_equal(a[name], b[name])
+
+
+@pytest.mark.parametrize("rule", ["extended", "unscented"])
+def test_gaussian_smoothing_is_the_smoother(rule: str) -> None:
+    _, (seen,) = data([BOTH], (4,))
+    f = GaussianFilter(model(), [BOTH], rule=rule, lag=len(TIMES))
+    out = f.smooth(f.start(PRIOR, runs=(4,)), TIMES, [seen])
+    steps = np.diff(TIMES, prepend=0.0)
+    phi = np.array([model().transition(dt) for dt in steps])
+    q = np.array([dt * Q for dt in steps])
+    exact = rts_smoother(exact_kalman(seen), F=phi, Q=q)
+    assert np.allclose(out["mean"].values[..., 0, :], exact.means, atol=1e-11)
+    assert np.allclose(out["covariance"].values[..., 0, :, :], exact.covariances, atol=1e-11)
+
+
+@pytest.mark.parametrize("rule", ["extended", "unscented"])
+def test_agreement_moves_the_past_along(rule: str) -> None:
+    """After fusion with an agent who knows the present exactly, the past is known better too."""
+    sensors = [direct([0, 1], std=1e-4), None]
+    f = GaussianFilter(model(), sensors, graphs.path(2), share=False, lag=1, rule=rule,
+                       agreement=partial(covariance_intersection, rule="min_determinant"))
+    state = f.step(f.start(PRIOR), 0.1, [[0.3, 0.2], None])
+    ((_, past),) = f.past(state)
+    assert past.variance[1].max() < 0.5 * PRIOR[1].diagonal().min()
+
+
+def test_unscented_points_see_a_curve() -> None:
+    """E[x²] of N(m, P) is m² + P: exact with points, not with the derivative at the mean."""
+    square = Model(1, lambda x, t, dt: x**2, lambda t, dt: np.zeros((1, 1)) + 1e-9)
+    for rule, wanted in (("unscented", 1.25), ("extended", 1.0)):
+        f = GaussianFilter(square, [None], rule=rule)
+        state = f.step(f.start(([1.0], [[0.25]])), 1.0, [None])
+        assert abs(state.means[0, 0] - wanted) < 1e-9
+
+
+def test_default_filter_is_safe_at_ten_members() -> None:
+    """Chaotic model, ten members: sampling the noise's covariance loses the truth more often."""
+    chaos = lorenz63(sigma=0.3)
+    sensors = [direct([0, 1, 2], std=1.0)]
+    times = np.arange(1, 201) * 0.05
+    rng = np.random.default_rng(0)
+    begin = np.array([1.5, -1.5, 25.0])
+    truth = simulate(chaos, begin + rng.standard_normal((30, 3)), times, rng=rng)
+    seen = [sensors[0].observe(truth, rng=rng)]
+    worst = {}
+    for name, update in (("default", known_noise), ("sampled", sampled_noise)):
+        f = EnsembleFilter(chaos, sensors, members=10, update=update)
+        assert name != "default" or EnsembleFilter(chaos, sensors, members=10).update is update
+        run = f.run(f.start((begin, np.eye(3)), rng=np.random.default_rng(1), runs=(30,)),
+                    times, seen, truth=truth, scores=["squared_error"])
+        worst[name] = run["total_squared_error"].values[100:].mean()
+    assert worst["default"] < 0.7 * worst["sampled"] and worst["default"] < 3.0
+
+
+def test_particles_tend_to_the_kalman_filter_with_a_full_noise() -> None:
+    _, (seen,) = data([BOTH])
+    seen[3, 0] = np.nan
+    f = ParticleFilter(model(), [BOTH], members=40_000)
+    run = f.run(f.start(PRIOR, rng=np.random.default_rng(0)), TIMES, [seen])
+    exact = exact_kalman(seen)
+    assert np.allclose(run["mean"].values[:, 0], exact.means, atol=0.03)
+    assert np.allclose(run["covariance"].values[:, 0], exact.covariances, atol=0.03)
+    assert (run["effective_size"].values > 1000).all() and (run["distinct"].values > 0.03).all()
+
+
+def test_collapse_warns_with_step_and_share_and_jitter_helps() -> None:
+    """A model without noise: copies never part, although their weights look perfect."""
+    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    sensors, readings = [direct([0], std=0.01)], [np.zeros((6, 1))]
+    f = ParticleFilter(still, sensors, members=800)
+    start = f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0))
+    with pytest.warns(ParticleCollapse, match=r"t = \d s: 0\.\d+% of an agent's particles"):
+        run = f.run(start, np.arange(1.0, 7.0), readings)
+    assert run["distinct"].values[-1] < 0.01
+    g = ParticleFilter(still, sensors, members=800, jitter=0.3)
+    run = g.run(g.start(([0.0], [[4.0]]), rng=np.random.default_rng(0)), np.arange(1.0, 7.0),
+                readings)
+    assert run["distinct"].values[-1] > 0.5 and run["variance"].values[-1] > 1e-7
+
+
+def test_update_that_fails_in_one_run_is_named() -> None:
+    def fragile(x: np.ndarray, h: np.ndarray, y: np.ndarray, r: np.ndarray, *, rng: object):
+        if (y > 5).any():
+            raise np.linalg.LinAlgError("singular")
+        return x + 0.1 * (y[..., None, :] - h)
+
+    f = EnsembleFilter(model(), [direct([0], std=1.0)] * 2, graphs.path(2), update=fragile,
+                       share=False, members=5)
+    start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(3,))
+    seen = [np.zeros((3, 1)), np.array([[0.0], [9.0], [0.0]])]
+    with pytest.raises(FilterError, match="run 1, agent 1, t = 0.5 s: singular") as caught:
+        f.step(start, 0.5, seen)
+    assert (caught.value.run, caught.value.agent, caught.value.t) == ((1,), 1, 0.5)
+    g = EnsembleFilter(model(), [direct([0], std=1.0)] * 2, graphs.path(2), update=fragile,
+                       share=False, members=5, failures="keep")
+    summary = g.summary(g.step(start, 0.5, seen))
+    assert np.isnan(summary.mean[1]).all() and np.isfinite(summary.mean[[0, 2]]).all()
+
+
+def test_wrong_call_of_every_run_is_no_failure_of_one() -> None:
+    f = EnsembleFilter(model(), [BOTH], update=exact_draws, members=3)
+    start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(3,))
+    with pytest.raises(ValueError, match="members"):
+        f.step(start, 0.5, [np.zeros(2)])
+    g = EnsembleFilter(model(), [BOTH], update=lambda x, h, y, r, *, rng: x[..., :1], members=9)
+    with pytest.raises(ValueError, match="update"):
+        g.step(g.start(PRIOR, rng=np.random.default_rng(0)), 0.5, [np.zeros(2)])
+
+
+def test_unbatched_sensor_is_told() -> None:
+    flat = Sensor(1, lambda x: np.array([x[0] ** 2]), [[1.0]])
+    f = EnsembleFilter(model(), [flat], members=9)
+    with pytest.raises(ValueError, match=r"function.*many at once|function"):
+        f.step(f.start(PRIOR, rng=np.random.default_rng(0)), 0.5, [np.zeros(1)])
+
+
+def test_groups_of_readings_give_each_agent_its_own_noise() -> None:
+    """Agents with one reading each but different noise: the quieter one is the surer."""
+    sensors = [direct([0], std=0.1), direct([0], std=2.0)]
+    f = EnsembleFilter(model(), sensors, graphs.path(2), share=False, members=4000)
+    state = f.step(f.start(PRIOR, rng=np.random.default_rng(0)), 1e-6, [[1.0], [1.0]])
+    variance = f.summary(state).variance[:, 0]
+    p = PRIOR[1][0, 0]
+    assert np.allclose(variance, [p * 0.01 / (p + 0.01), p * 4 / (p + 4)], rtol=0.1)
+
+
+def test_graph_many_agents() -> None:
+    """Two hundred agents with sensors of three kinds and a hub: one step, groups by readings."""
+    places = np.random.default_rng(0).uniform(size=(200, 2))
+    sensors = [[direct([0], std=0.3), direct([0, 1], std=0.5), None][k % 3] for k in range(200)]
+    f = EnsembleFilter(model(), sensors, graphs.disk(places, 0.15), members=40,
+                       agreement=partial(intersection, rule="equal"))
+    seen = [None if s is None else np.zeros(s.dim) for s in sensors]
+    state = f.step(f.start(PRIOR, rng=np.random.default_rng(0)), 0.1, seen)
+    assert np.isfinite(state.ensembles).all() and state.ledger.rounds == 2
+
+
+def test_late_readings_of_a_distance_in_a_network() -> None:
+    """A curved sensor, late by two steps, helps its agent and who hears it, and is charged."""
+    far = distance([0, 1], std=0.05, origin=[3.0, 0.0])
+    for family in ("ensemble", "gaussian", "particle"):
+        f, start = made(family, sensors=[far, None], lag=2, runs=(30,))
+        for t in (0.1, 0.2):
+            start = f.step(start, t, [None, None])
+        before = f.step(start, 0.3, [None, None])
+        after = f.step(start, 0.3, [None, None], late=[Late(0, 0.1, [2.0], arrived=0.3)])
+        spread = [f.summary(s).variance.sum(axis=-1).mean(axis=0) for s in (before, after)]
+        assert (spread[1] < 0.8 * spread[0]).all()
+        assert after.ledger.messages.tolist() == [1, 0]
+
+
+START = {"rng": np.random.default_rng(0)}
+LINE: LinearModel = model()
+BAD_INPUT = {
+    "distfilt.filters.ensemble.EnsembleFilter": [
+        ("update", lambda: EnsembleFilter(LINE, [None], update=3)),
+        ("forecast", lambda: EnsembleFilter(LINE, [None], forecast=3)),
+        ("members", lambda: EnsembleFilter(LINE, [None], members=1)),
+        ("prior", lambda: EnsembleFilter(LINE, [None]).start(np.zeros((3, 2)), **START)),
+        ("rng", lambda: EnsembleFilter(LINE, [None]).start(PRIOR, rng=3)),
+    ],
+    "distfilt.filters.ensemble.EnsembleState": [
+        ("ensembles", lambda: EnsembleState(0.0, Ledger.empty(1), START["rng"], np.zeros(3))),
+        ("ledger", lambda: EnsembleState(0.0, Ledger.empty(2), START["rng"], np.zeros((1, 2, 1)))),
+        ("rng", lambda: EnsembleState(0.0, Ledger.empty(1), None, np.zeros((1, 2, 1)))),
+        ("history", lambda: EnsembleState(0.0, Ledger.empty(1), START["rng"], np.zeros((1, 2, 1)),
+                                          ((0.0, np.zeros(2)),))),
+    ],
+    "distfilt.filters.gaussian.GaussianFilter": [
+        ("rule", lambda: GaussianFilter(LINE, [None], rule="cubature")),
+        ("kappa", lambda: GaussianFilter(LINE, [None], kappa=-1)),
+        ("prior", lambda: GaussianFilter(LINE, [None]).start(np.zeros(2))),
+    ],
+    "distfilt.filters.gaussian.GaussianState": [
+        ("joint_means", lambda: GaussianState(0.0, Ledger.empty(1), None, np.zeros(2),
+                                              np.eye(2), 2)),
+        ("joint_covariances", lambda: GaussianState(0.0, Ledger.empty(1), None, np.zeros((1, 2)),
+                                                    -np.eye(2)[None], 2)),
+        ("ledger", lambda: GaussianState(0.0, Ledger.empty(2), None, np.zeros((1, 2)),
+                                         np.eye(2)[None], 2)),
+    ],
+    "distfilt.filters.particle.ParticleFilter": [
+        ("members", lambda: ParticleFilter(LINE, [None], members=1)),
+        ("threshold", lambda: ParticleFilter(LINE, [None], threshold=2)),
+        ("rule", lambda: ParticleFilter(LINE, [None], rule="best")),
+        ("jitter", lambda: ParticleFilter(LINE, [None], jitter=-1)),
+    ],
+    "distfilt.filters.particle.ParticleState": [
+        ("points", lambda: ParticleState(0.0, Ledger.empty(1), START["rng"], np.zeros(2),
+                                         np.zeros(2))),
+        ("log_weights", lambda: ParticleState(0.0, Ledger.empty(1), START["rng"],
+                                              np.zeros((1, 2, 1)), np.zeros(2))),
+    ],
+    "distfilt.filters.driver.Late": [
+        ("agent", lambda: Late(-1, 0.0, [1.0], arrived=1.0)),
+        ("measured", lambda: Late(0, np.nan, [1.0], arrived=1.0)),
+        ("value", lambda: Late(0, 0.0, 1.0, arrived=1.0)),
+        ("arrived", lambda: Late(0, 1.0, [1.0], arrived=0.5)),
+    ],
+    "distfilt.filters.driver.final_state": [("run", lambda: final_state(xarray.Dataset()))],
+    "distfilt.filters.wiring.SensorFilter": [
+        ("late", lambda: list(made("ensemble", agents=2, lag=1)[0].steps(
+            made("ensemble", agents=2, lag=1)[1], [1.0], [None, None],
+            late=[Late(0, 0.5, [1.0], arrived=2.0)]))),
+        ("truth", lambda: made("gaussian", agents=2)[0].run(
+            made("gaussian", agents=2)[1], [1.0], [None, None], truth=np.zeros(2))),
+        ("scores", lambda: made("gaussian", agents=2)[0].run(
+            made("gaussian", agents=2)[1], [1.0], [None, None], scores=["rmse"])),
+        ("lag", lambda: made("gaussian", agents=2)[0].smooth(
+            made("gaussian", agents=2)[1], [1.0], [None, None])),
+    ],
+    "distfilt.filters.observations.at_one_time": [
+        ("observations", lambda: at_one_time([[1.0]], [None], ())),
+    ],
+    "distfilt.filters.observations.over_times": [
+        ("observations", lambda: over_times([[1.0]], [None], [1.0])),
+        ("times", lambda: over_times([None], [None], [1.0, 1.0])),
+    ],
+    "distfilt.filters.heard.gather": [
+        ("sensors", lambda: gather([np.zeros(1), None], [None, None], Channel(graphs.path(2)))),
+    ],
+    "distfilt.filters.failures.guarded": [
+        ("fallback", lambda: guarded(lambda x, s, r: (x[:, :1],), (np.zeros((2, 2)),),
+                                     (np.zeros((2, 2)),), 1, shared=np.eye(1), rng=None)),
+    ],
+    "distfilt.updates.forecasts.exact_forecast": [
+        ("rng", lambda: exact_forecast(np.zeros((9, 2)), LINE, 0.0, 0.1, rng=3)),
+    ],
+}
+EXEMPT = {
+    "distfilt.filters.driver.Filter": "abstract: what it refuses is tested through its families",
+    "distfilt.filters.driver.Summary": "a record of what a filter computed, nothing is passed in",
+    "distfilt.filters.failures.FilterError": "an error",
+    "distfilt.filters.failures.not_finite": "says which rows are bad, whatever they hold",
+    "distfilt.filters.heard.Heard": "made by gather, which refuses what does not fit",
+    "distfilt.filters.particle.ParticleCollapse": "a warning",
+    "distfilt.filters.record.Recorder": "made by a filter's run: truth and scores, above",
+    "distfilt.filters.record.SCORES": "names",
+}
+
+
+def test_exempt_names_are_what_they_say() -> None:
+    assert issubclass(SensorFilter, Filter) and not_finite(np.ones((2, 1)), 1) == {}

@@ -1,0 +1,123 @@
+"""States on disk: the same bits back, whole files or none, damage found."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from distfilt.filters import EnsembleState, ParticleState, State
+from distfilt.network import Ledger
+
+
+@dataclass(frozen=True, eq=False)
+class Kept(State):
+    """A family of one's own with every kind of field."""
+
+    size: int
+    word: str
+    nested: tuple[tuple[float, np.ndarray], ...]
+    nothing: None
+    yes: bool
+    counts: np.ndarray
+
+
+def kept(rng: np.random.Generator | None) -> Kept:
+    ledger = Ledger.empty(2).charge(np.array([3, 4]), 5, 40, lost=np.array([0.5, 0.0]))
+    nested = ((0.1, np.arange(3.0)), (0.2, np.array([np.nan, np.inf, -0.0])))
+    return Kept(1.5, ledger, rng, 7, "a b", nested, None, True, np.array([1, 2], dtype=np.int32))
+
+
+@pytest.mark.parametrize("kind", ["PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64"])
+def test_everything_comes_back(tmp_path: Path, kind: str) -> None:
+    rng = np.random.Generator(getattr(np.random, kind)([1, 2**40]))
+    rng.spawn(2)
+    rng.random(5)
+    before = kept(rng)
+    before.save(tmp_path / "a.npz")
+    after = Kept.load(tmp_path / "a.npz")
+    got = (after.t, after.size, after.word, after.nothing, after.yes)
+    assert got == (1.5, 7, "a b", None, True)
+    assert after.counts.dtype == np.int32 and after.counts.tolist() == [1, 2]
+    assert [t for t, _ in after.nested] == [0.1, 0.2]
+    for (_, a), (_, b) in zip(before.nested, after.nested, strict=True):
+        assert a.tobytes() == b.tobytes()
+    for name in ("rounds", "messages", "scalars", "bytes", "lost"):
+        assert np.array_equal(getattr(before.ledger, name), getattr(after.ledger, name))
+    assert rng.random() == after.rng.random()
+    assert rng.spawn(1)[0].random() == after.rng.spawn(1)[0].random()
+
+
+def test_a_filter_without_draws_has_no_generator(tmp_path: Path) -> None:
+    kept(None).save(tmp_path / "a.npz")
+    assert Kept.load(tmp_path / "a.npz").rng is None
+
+
+def test_a_failed_save_leaves_the_earlier_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.npz"
+    kept(None).save(path)
+    before = path.read_bytes()
+
+    def full(*args: object, **options: object) -> None:
+        raise OSError("no space left")
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(OSError, match="no space"):
+        kept(np.random.default_rng(0)).save(path)
+    assert path.read_bytes() == before and os.listdir(tmp_path) == ["a.npz"]
+
+
+def test_another_kind_of_state_is_refused(tmp_path: Path) -> None:
+    state = EnsembleState(0.0, Ledger.empty(1), np.random.default_rng(0), np.zeros((1, 2, 1)))
+    state.save(tmp_path / "a.npz")
+    with pytest.raises(ValueError, match="needs a saved ParticleState"):
+        ParticleState.load(tmp_path / "a.npz")
+
+
+def test_damage_is_found_at_every_byte(tmp_path: Path) -> None:
+    """No flipped bit gives another state in silence: it is refused, or changes nothing."""
+    path = tmp_path / "a.npz"
+    kept(np.random.default_rng(3)).save(path)
+    whole, right = path.read_bytes(), Kept.load(path)
+    rng = np.random.default_rng(0)
+    for place in rng.choice(len(whole), 400, replace=False):
+        bad = bytearray(whole)
+        bad[place] ^= 1 << int(rng.integers(8))
+        path.write_bytes(bytes(bad))
+        try:
+            state = Kept.load(path)
+        except ValueError:
+            continue
+        assert state.word == right.word and state.t == right.t
+        assert state.counts.tolist() == right.counts.tolist()
+    for size in (0, 10, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:size])
+        with pytest.raises(ValueError, match="path"):
+            Kept.load(path)
+    with pytest.raises(FileNotFoundError):
+        Kept.load(tmp_path / "none.npz")
+
+
+def test_what_cannot_be_saved_says_so(tmp_path: Path) -> None:
+    state = kept(None)
+    object.__setattr__(state, "word", {1: 2})
+    with pytest.raises(ValueError, match="state: needs fields that can be saved, got dict"):
+        state.save(tmp_path / "a.npz")
+    object.__setattr__(state, "word", np.array([None]))
+    with pytest.raises(ValueError, match="objects"):
+        state.save(tmp_path / "a.npz")
+    assert not list(tmp_path.iterdir())
+
+
+BAD_INPUT = {
+    "distfilt.filters.saving.State": [
+        ("t", lambda: State(np.nan, Ledger.empty(1), None)),
+        ("ledger", lambda: State(0.0, 3, None)),
+        ("rng", lambda: State(0.0, Ledger.empty(1), 3)),
+    ],
+}

@@ -1,0 +1,52 @@
+"""Networks, channels and Gaussians that the tests of this folder share."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from distfilt.network import Channel, Faults, Graph, graphs
+
+NAN = float("nan")
+STAR = graphs.star(3)
+ONE_WAY = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1)], directed=True)
+UNBALANCED = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1), (0, 1)], directed=True)
+APART = Graph.from_adjacency(np.zeros((3, 3)))
+
+
+def rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def star(**options: object) -> Channel:
+    """A channel on a star of three."""
+    return Channel(STAR, **options)
+
+
+def lossy(loss: float = 0.3, graph: Graph | None = None, **options: object) -> Channel:
+    return Channel(graph or STAR, faults=Faults(loss=loss, seed=5), **options)
+
+
+def random_graph(seed: int, agents: int, *, directed: bool = False) -> Graph:
+    """Each link with probability one half."""
+    a = rng(seed).random((agents, agents)) < 0.5
+    a = np.triu(a, 1) | (np.tril(a, -1) if directed else np.triu(a, 1).T)
+    return Graph.from_adjacency(a.astype(float), directed=directed)
+
+
+def gaussians(seed: int, *leading: int, d: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """Means and full covariances, components of different size."""
+    draw = rng(seed)
+    a = draw.standard_normal((*leading, d, d))
+    size = np.logspace(-1, 1, d)
+    covs = (a @ np.swapaxes(a, -1, -2) + 0.2 * np.eye(d)) * np.outer(size, size)
+    return draw.standard_normal((*leading, d)) * size, 0.5 * (covs + np.swapaxes(covs, -1, -2))
+
+
+REFERENCE = {
+    "path": graphs.path(6),
+    "ring": graphs.ring(7),
+    "star": graphs.star(5),
+    "grid": graphs.grid(3, 4),
+    "complete": graphs.complete(5),
+    "disk": graphs.disk(rng(3).random((30, 2)), 0.4),
+}

@@ -1,0 +1,198 @@
+"""Losses alone and in bursts, by seed, run, round and link; silence; windows; combinations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import binom
+
+from distfilt.network import Channel, Faults, Graph, graphs
+from tests.network.helpers import NAN, REFERENCE, STAR
+
+DISK = REFERENCE["disk"]
+BAD_INPUT = {
+    "distfilt.network.faults.Faults": [
+        ("loss", lambda: Faults(loss=1.1)),
+        ("loss", lambda: Faults(loss=-0.1)),
+        ("loss", lambda: Faults(loss=NAN)),
+        ("loss", lambda: Faults(loss=[0.1, 1.2])),
+        ("loss", lambda: Faults(loss=np.zeros((2, 3)))),
+        ("loss", lambda: Faults(loss=np.zeros((2, 2, 2)))),
+        ("loss", lambda: Channel(STAR, faults=Faults(loss=[0.1, 0.2]))),
+        ("loss", lambda: Channel(STAR, faults=Faults(loss=np.zeros((2, 2))))),
+        ("loss", lambda: Channel(STAR, faults=Faults(seed=1) | Faults(loss=[0.1]))),
+        ("seed", lambda: Faults(seed=-1)),
+        ("seed", lambda: Faults(loss=0.1, seed=3) | Faults(loss=0.2, seed=3)),
+        ("burst", lambda: Faults(loss=0.5, burst=1.9)),
+        ("burst", lambda: Faults(loss=[0.1, 0.8], burst=4.0)),
+        ("burst", lambda: Faults(burst=0.5)),
+        ("delay", lambda: Faults(delay=-1)),
+        ("silent", lambda: Faults(silent=3)),
+        ("silent", lambda: Faults(silent="3")),
+        ("silent", lambda: Faults(silent=[-1])),
+        ("silent", lambda: Faults(silent=[0.5])),
+        ("silent", lambda: Channel(STAR, faults=Faults(silent=[3]))),
+        ("silent", lambda: Channel(STAR, faults=Faults() | Faults(silent=[3]))),
+        ("during", lambda: Faults(loss=0.1, during=(1, 2))),
+        ("during", lambda: Faults(loss=0.1, during=[(2, 2)])),
+        ("during", lambda: Faults(loss=0.1, during=[(NAN, 2)])),
+        ("during", lambda: Faults(loss=0.1, during=[])),
+        ("clock", lambda: Faults(clock="seconds")),
+        ("t", lambda: Faults(loss=0.1, during=[(0, 1)], clock="time").lost(STAR, 0, 1)),
+        ("also", lambda: Faults(also=(3,))),
+        ("faults", lambda: Faults() | 3),
+    ],
+}
+
+
+def _series(faults: Faults, graph: Graph, rounds: int, runs: int) -> np.ndarray:
+    """Losses, (rounds, runs, E)."""
+    return np.stack([faults.lost(graph, k, runs) for k in range(rounds)])
+
+
+def _within(hits: int, trials: int, share: float) -> bool:
+    """Inside the 99.9% band of a binomial."""
+    low, high = binom.ppf([5e-4, 1 - 5e-4], trials, share)
+    return bool(low <= hits <= high)
+
+
+def test_a_lone_agent_as_silent_says_what_to_write() -> None:
+    with pytest.raises(ValueError, match=r"silent: needs a collection of agents such as \[3\]"):
+        Faults(silent=3)
+
+
+@pytest.mark.parametrize("burst", [None, 6.0])
+def test_losses_depend_on_seed_run_round_and_link_alone(burst: float | None) -> None:
+    faults = Faults(loss=0.5, seed=11, burst=burst)
+    whole = faults.lost(DISK, 7, 10)
+    assert (whole[:4] == faults.lost(DISK, 7, 4)).all()
+    assert (whole != faults.lost(DISK, 8, 10)).any()
+    assert (whole[0] != whole[1]).any()
+    assert (whole != Faults(loss=0.5, seed=12, burst=burst).lost(DISK, 7, 10)).any()
+
+
+@pytest.mark.parametrize("burst", [None, 6.0])
+def test_symmetric_losses_hit_both_ways(burst: float | None) -> None:
+    both = Faults(loss=0.5, seed=11, symmetric=True, burst=burst).lost(DISK, 7, 10)
+    assert (both == both[:, DISK.reverse]).all() and 0.3 < both.mean() < 0.7
+    rates = np.linspace(0.1, 0.6, DISK.size)
+    uneven = Faults(loss=rates, seed=11, symmetric=True, burst=burst).lost(DISK, 7, 4000)
+    assert (uneven == uneven[:, DISK.reverse]).all()
+    larger = np.maximum(rates[DISK.receivers], rates[DISK.senders])
+    assert np.abs(uneven.mean(axis=0) - larger).max() < 0.04
+
+
+def test_stored_losses_stay() -> None:
+    """The first losses of a seed, by the formula written out with plain integers."""
+    golden, mask = 0x9E3779B97F4A7C15, 2**64 - 1
+
+    def mixed(z: int) -> int:
+        z = ((z ^ (z >> 30)) * 0xBF58476D1CE4E5B9) & mask
+        z = ((z ^ (z >> 27)) * 0x94D049BB133111EB) & mask
+        return z ^ (z >> 31)
+
+    for run in range(3):
+        for link, (i, j) in enumerate(zip(STAR.receivers, STAR.senders, strict=True)):
+            key = mixed((5 + golden * 3) & mask)
+            bits = mixed(mixed(key ^ (run * golden & mask)) ^ mixed(int(i) * 3 + int(j) + golden))
+            lost = (bits >> 11) * 2.0**-53 < 0.4
+            assert Faults(loss=0.4, seed=5).lost(STAR, 2, 3)[run, link] == lost
+
+
+def test_the_share_of_losses_is_the_probability() -> None:
+    """Counts, and those of neighbouring pairs of runs, links and rounds."""
+    lost = _series(Faults(loss=0.3, seed=1), DISK, 4, 150)
+    assert _within(lost.sum(), lost.size, 0.3)
+    pairs = [(lost[:, :-1:2], lost[:, 1::2]), (lost[..., :-1:2], lost[..., 1::2]),
+             (lost[::2], lost[1::2])]
+    for a, b in pairs:
+        b = b[: a.shape[0], : a.shape[1], : a.shape[2]]
+        a = a[: b.shape[0], : b.shape[1], : b.shape[2]]
+        assert _within((a & b).sum(), a.size, 0.09)
+
+
+@pytest.mark.parametrize(("loss", "burst"), [(0.2, 5.0), (0.5, 3.0), (0.05, 20.0)])
+def test_bursts_have_their_rate_and_their_length(loss: float, burst: float) -> None:
+    """Transitions of the chain, over independent links and runs and from the first round on."""
+    graph, faults = graphs.ring(40), Faults(loss=loss, burst=burst, seed=3)
+    lost = _series(faults, graph, 2, 500)
+    first, second = lost
+    assert _within(first.sum(), first.size, loss)
+    assert _within((~second & first).sum(), int(first.sum()), 1 / burst)
+    enter = loss / (1 - loss) / burst
+    assert _within((second & ~first).sum(), int((~first).sum()), enter)
+    # Markov: given the second round, the first tells nothing of the third.
+    third = faults.lost(graph, 2, 500)
+    assert _within((~third & second & first).sum(), int((second & first).sum()), 1 / burst)
+
+
+def test_a_burst_of_the_shortest_length_is_independence() -> None:
+    plain, shortest = Faults(loss=0.3, seed=4), Faults(loss=0.3, seed=4, burst=1 / 0.7)
+    for k in range(5):
+        a, b = plain.lost(DISK, k, 20), shortest.lost(DISK, k, 20)
+        assert (a != b).mean() < 1e-3
+
+
+def test_bursts_do_not_depend_on_what_was_computed_before() -> None:
+    faults = Faults(loss=0.2, burst=30.0, seed=3)
+    alone = faults.lost(DISK, 50, 4)
+    assert (_series(faults, DISK, 51, 4)[-1] == alone).all()
+    assert (faults.lost(DISK, 50, 2) == alone[:2]).all()
+
+
+@given(st.integers(0, 1000), st.floats(0, 1), st.floats(1, 50))
+def test_bursts_of_any_rate_end(seed: int, loss: float, burst: float) -> None:
+    if loss < 1 and burst < (1 - 1e-9) / (1 - loss):
+        with pytest.raises(ValueError, match="burst"):
+            Faults(loss=loss, burst=burst)
+        return
+    lost = Faults(loss=loss, burst=burst, seed=seed).lost(STAR, 0, 5)
+    assert lost.shape == (5, 4)
+    assert loss not in (0.0, 1.0) or (lost == bool(loss)).all()
+
+
+def test_loss_by_receiver_and_by_link() -> None:
+    faults = Faults(loss=[1.0, 0.0, 0.0], seed=1)
+    inbox = Channel(STAR, faults=faults).exchange([np.zeros(1)] * 3)
+    assert not inbox[0] and set(inbox[1]) == set(inbox[2]) == {0}
+    by_link = np.zeros((3, 3))
+    by_link[0, 2] = by_link[1, 0] = 1.0
+    inbox = Channel(STAR, faults=Faults(loss=by_link)).exchange([np.zeros(1)] * 3)
+    assert [sorted(box) for box in inbox] == [[1], [], [0]]
+
+
+def test_arrays_of_losses_are_the_faults_own() -> None:
+    rates = np.zeros(3)
+    faults = Faults(loss=rates)
+    rates[:] = 1.0
+    assert not np.any(faults.loss)
+    with pytest.raises(ValueError, match="read-only"):
+        faults.loss[0] = 1.0
+
+
+def test_windows_hold_losses_and_silence() -> None:
+    faults = Faults(loss=1.0, silent=[1], during=[(2, 4), (6, np.inf)])
+    lost = [bool(faults.lost(STAR, k, 1).all()) for k in range(8)]
+    assert lost == [False, False, True, True, False, False, True, True]
+    off = [int((~faults.speaking(STAR, k)).sum()) for k in range(8)]
+    assert off == [0, 0, 2, 2, 0, 0, 2, 2]
+    timed = Faults(loss=1.0, during=[(0.5, 1.0)], clock="time")
+    assert [bool(timed.lost(STAR, 9, 1, t).all()) for t in (0.4, 0.5, 1.0)] == [False, True, False]
+    assert timed.needs_time and not faults.needs_time
+
+
+def test_faults_together_fail_in_every_way() -> None:
+    a, b = Faults(loss=0.3, seed=1), Faults(loss=0.4, seed=2, during=[(0, 5)])
+    c = Faults(silent=[2], delay=2)
+    whole = a | b | c
+    assert (whole.lost(STAR, 3, 9) == (a.lost(STAR, 3, 9) | b.lost(STAR, 3, 9))).all()
+    assert (whole.lost(STAR, 6, 9) == a.lost(STAR, 6, 9)).all()
+    assert (whole.speaking(STAR) == c.speaking(STAR)).all() and whole.late == 2
+    other = a | (b | c)
+    assert (other.lost(STAR, 3, 9) == whole.lost(STAR, 3, 9)).all() and other.late == 2
+    assert not whole.none and not whole.lossless and (Faults() | Faults()).none
+    assert Faults(delay=1).lossless and not Faults(delay=1).none
+    assert not (Faults() | Faults(silent=[0])).lossless
+    assert (a | Faults(loss=0.1, seed=3, during=[(0, 1)], clock="time")).needs_time

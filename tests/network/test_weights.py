@@ -1,0 +1,166 @@
+"""Weights: sums, symmetry, optimality, and what keeps the average."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from distfilt.network import Graph, Weights, graphs, weights
+from tests.network.helpers import APART, ONE_WAY, REFERENCE, STAR, random_graph, rng
+
+named = pytest.mark.parametrize("graph", REFERENCE.values(), ids=REFERENCE.keys())
+_W = "distfilt.network.weights."
+BAD_INPUT = {
+    _W + "Weights": [
+        ("graph", lambda: Weights([[0, 1], [1, 0]], np.ones(3), np.ones(4))),
+        ("own", lambda: Weights(STAR, np.ones(2), np.ones(4))),
+        ("links", lambda: Weights(STAR, np.ones(3), np.ones(3))),
+        ("weights", lambda: Weights.from_matrix(STAR, np.ones((3, 3)))),
+        ("weights", lambda: Weights.from_matrix(STAR, np.eye(2))),
+    ],
+    _W + "balanced": [("graph", lambda: weights.balanced(APART))],
+    _W + "best_constant": [
+        ("graph", lambda: weights.best_constant(APART)),
+        ("graph", lambda: weights.best_constant(ONE_WAY)),
+    ],
+    _W + "fastest": [
+        ("graph", lambda: weights.fastest(APART)),
+        ("graph", lambda: weights.fastest(ONE_WAY)),
+        ("iterations", lambda: weights.fastest(STAR, iterations=0)),
+    ],
+    _W + "gossip": [("graph", lambda: weights.gossip(ONE_WAY))],
+    _W + "keeping": [
+        ("weights", lambda: weights.keeping(np.eye(3))),
+        ("agent 0", lambda: weights.keeping(Weights(STAR, np.ones(3), np.ones(4)))),
+    ],
+    _W + "laplacian": [("gain", lambda: weights.laplacian(STAR, -0.1))],
+    _W + "maximum_degree": [("graph", lambda: weights.maximum_degree(ONE_WAY))],
+    _W + "metropolis": [("graph", lambda: weights.metropolis(ONE_WAY))],
+}
+EXEMPT = {_W + "push": "takes any graph, and a graph checks itself"}
+
+
+def _slowest(w: Weights) -> float:
+    """The second largest modulus of the eigenvalues of symmetric weights."""
+    return float(np.sort(np.abs(np.linalg.eigvalsh(w.matrix.toarray())))[-2])
+
+
+@named
+def test_metropolis_and_maximum_degree_are_doubly_stochastic(graph: Graph) -> None:
+    d = graph.degrees
+    pair = np.maximum(d[graph.receivers], d[graph.senders])
+    assert (weights.metropolis(graph).links == 1 / (1 + pair)).all()
+    assert (weights.maximum_degree(graph).links == 1 / (1 + d.max())).all()
+    for w in (weights.metropolis(graph), weights.maximum_degree(graph), weights.gossip(graph)):
+        dense = w.matrix.toarray()
+        assert (dense >= 0).all() and (dense == dense.T).all()
+        assert np.abs(dense.sum(axis=1) - 1).max() < 1e-12
+
+
+@given(st.integers(0, 1000), st.integers(2, 8))
+def test_balanced_weights_of_a_digraph(seed: int, agents: int) -> None:
+    graph = random_graph(seed, agents, directed=True)
+    if not graph.connected:
+        with pytest.raises(ValueError, match="strongly connected"):
+            weights.balanced(graph)
+        return
+    dense = weights.balanced(graph).matrix.toarray()
+    for axis in (0, 1):
+        assert np.abs(dense.sum(axis=axis) - 1).max() < 1e-12
+    assert (dense >= -1e-12).all() and (dense[graph.receivers, graph.senders] > 0).all()
+    assert np.isclose(dense.diagonal().min(), 0.5)
+    # Proportional to the left null vector, from a dense decomposition.
+    p = np.abs(np.linalg.svd(graph.laplacian.T.toarray())[2][-1])
+    ratio = dense[graph.receivers, graph.senders] / p[graph.receivers]
+    assert np.ptp(ratio) < 1e-9 * ratio.max()
+    assert np.abs(weights.push(graph).matrix.toarray().sum(axis=0) - 1).max() < 1e-12
+
+
+def test_balanced_weights_of_many_agents() -> None:
+    """Sparse throughout: five thousand agents on a digraph cost no dense matrix."""
+    disk = graphs.disk(rng(1).random((5000, 2)), 0.05)
+    keep = rng(2).random(disk.senders.size) < 0.9
+    edges = np.stack([disk.receivers, disk.senders], axis=1)[keep]
+    graph = Graph.from_edges(5000, edges, directed=True)
+    assert graph.connected
+    w = weights.balanced(graph).matrix
+    for axis in (0, 1):
+        assert np.abs(np.asarray(w.sum(axis=axis)) - 1).max() < 1e-12
+    assert (weights.balanced(graphs.path(1)).matrix.toarray() == 1).all()
+
+
+def test_balanced_weights_of_an_undirected_graph_are_the_laplacian_s() -> None:
+    graph = REFERENCE["disk"]
+    expected = weights.laplacian(graph, 0.5 / graph.degrees.max())
+    assert np.allclose(weights.balanced(graph).links, expected.links, rtol=1e-14)
+
+
+@named
+def test_the_best_constant_is_no_worse_than_any(graph: Graph) -> None:
+    best = weights.best_constant(graph)
+    low, high = graph.spectrum[1], graph.spectrum[-1]
+    assert np.isclose(_slowest(best), (high - low) / (high + low), atol=1e-9)
+    for factor in (0.97, 1.03):
+        other = weights.laplacian(graph, factor * best.links[0])
+        assert _slowest(other) > _slowest(best) or low == high
+    assert (weights.best_constant(graphs.path(1)).matrix.toarray() == 1).all()
+
+
+@pytest.mark.parametrize("name", ["path", "star", "grid", "disk", "ring"])
+def test_the_fastest_weights_reach_the_convex_optimum(name: str) -> None:
+    """Against the semidefinite program, solved by cvxpy."""
+    cp = pytest.importorskip("cvxpy")
+    graph = REFERENCE[name]
+    w = weights.fastest(graph)
+    dense = w.matrix.toarray()
+    assert np.abs(dense - dense.T).max() == 0 and np.abs(dense.sum(axis=0) - 1).max() < 1e-12
+    at = np.flatnonzero(graph.receivers < graph.senders)
+    ends = np.zeros((graph.size, at.size))
+    ends[graph.receivers[at], range(at.size)] = 1
+    ends[graph.senders[at], range(at.size)] = -1
+    x = cp.Variable(at.size)
+    matrix = np.eye(graph.size) - ends @ cp.diag(x) @ ends.T - 1 / graph.size
+    optimum = cp.Problem(cp.Minimize(cp.norm(matrix, 2))).solve()
+    assert optimum - 1e-5 < _slowest(w) < optimum + 1e-3
+    assert _slowest(w) <= _slowest(weights.best_constant(graph)) + 1e-12
+
+
+def test_the_fastest_weights_gain_where_links_differ() -> None:
+    graph = REFERENCE["disk"]
+    assert _slowest(weights.fastest(graph)) < 0.85 * _slowest(weights.best_constant(graph))
+
+
+@named
+def test_gossip_weights_are_the_mean_of_all_meetings(graph: Graph) -> None:
+    total = np.zeros((graph.size, graph.size))
+    for i in range(graph.size):
+        near = graph.neighbours(i)
+        for j in near:
+            meeting = np.eye(graph.size)
+            meeting[np.ix_([i, j], [i, j])] = 0.5
+            total += meeting / (graph.size * len(near))
+    assert np.abs(weights.gossip(graph).matrix.toarray() - total).max() < 1e-14
+
+
+def test_keeping_looks_at_columns_relative_to_what_cancels_in_them() -> None:
+    """Rows that sum to one are not enough; a steep gain's rounding is no fault."""
+    uneven = Weights(STAR, np.zeros(3), np.array([0.5, 0.5, 1.0, 1.0]))
+    with pytest.raises(ValueError, match=r"columns that sum to 1.* got 2 for agent 0"):
+        weights.keeping(uneven)
+    slightly = Weights(STAR, np.full(3, 1 / 3), np.array([1, 1, 1, 1]) / 3)
+    with pytest.raises(ValueError, match="columns"):
+        weights.keeping(slightly)
+    steep = weights.laplacian(REFERENCE["disk"], 1e7 / 3)
+    assert weights.keeping(steep) is steep
+    off = weights.metropolis(STAR)
+    with pytest.raises(ValueError, match="columns"):
+        weights.keeping(Weights(STAR, off.own + [0, 1e-8, 0], off.links))
+
+
+def test_weights_go_through_a_matrix_and_back() -> None:
+    graph = random_graph(3, 7, directed=True)
+    w = Weights(graph, rng(1).standard_normal(7), rng(2).standard_normal(graph.senders.size))
+    back = Weights.from_matrix(graph, w.matrix.toarray())
+    assert (back.own == w.own).all() and (back.links == w.links).all()

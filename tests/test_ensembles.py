@@ -1,0 +1,221 @@
+"""Moments against their definitions, draws against statistics, exact noise against identities."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import chi2, kstest
+
+from distfilt import ensembles
+from distfilt.ensembles import (
+    anomalies,
+    cross_covariance,
+    draw,
+    exact_noise,
+    mean,
+    sample_covariance,
+)
+from distfilt.linalg import factor
+from tests.support import INDEFINITE, NAN, assert_unchanged, generator, singular, spd, unit_gap
+
+SEEDS = st.integers(0, 10_000)
+E = np.arange(12.0).reshape(4, 3) ** 2
+FULL = np.array([[4.0, 1.8, -0.6], [1.8, 1.5, 0.1], [-0.6, 0.1, 0.5]])
+"""Its Cholesky factor and the factor's transpose give different covariances."""
+
+_E = "distfilt.ensembles."
+BAD_INPUT = {
+    _E + "draw": [
+        ("mean", lambda: draw([[0.0]], np.eye(1), 3, rng=generator())),
+        ("cov", lambda: draw([0.0, 0.0], np.eye(3), 3, rng=generator())),
+        ("cov", lambda: draw([0.0, 0.0], INDEFINITE, 3, rng=generator())),
+        ("members", lambda: draw([0.0], np.eye(1), 0, rng=generator())),
+        ("rng", lambda: draw([0.0], np.eye(1), 3, rng=None)),
+        ("leading", lambda: draw([0.0], np.eye(1), 3, rng=generator(), leading=(2.5,))),
+    ],
+    _E + "mean": [("ensemble", lambda: mean([1.0])), ("ensemble", lambda: mean(np.zeros((0, 2))))],
+    _E + "anomalies": [
+        ("ensemble", lambda: anomalies(NAN * E)),
+        ("ensemble", lambda: anomalies(np.zeros((0, 2)))),
+    ],
+    _E + "sample_covariance": [
+        ("ensemble", lambda: sample_covariance(E[:1])),
+        ("ensemble", lambda: sample_covariance([1.0, 2.0])),
+    ],
+    _E + "cross_covariance": [
+        ("ensemble", lambda: cross_covariance(E[:1], E[:1])),
+        ("other", lambda: cross_covariance(E, E[:3])),
+        ("other", lambda: cross_covariance(E, [1.0])),
+        ("other", lambda: cross_covariance(np.zeros((2, 4, 1)), np.zeros((3, 4, 1)))),
+    ],
+    _E + "exact_noise": [
+        ("anomalies_to_avoid", lambda: exact_noise([1.0, 2.0], np.eye(1), rng=generator())),
+        ("anomalies_to_avoid", lambda: exact_noise(NAN * E, np.eye(1), rng=generator())),
+        ("anomalies_to_avoid", lambda: exact_noise(E, np.eye(2), rng=generator())),
+        ("anomalies_to_avoid", lambda: exact_noise(np.zeros((3, 0)), FULL, rng=generator())),
+        ("cov", lambda: exact_noise(np.zeros((9, 1)), INDEFINITE, rng=generator())),
+        ("cov", lambda: exact_noise(np.zeros((2, 9, 1)), [FULL] * 3, rng=generator())),
+        ("rng", lambda: exact_noise(np.zeros((9, 1)), FULL, rng=3)),
+    ],
+}
+
+
+def test_moments_are_their_definitions() -> None:
+    x = generator(1).standard_normal((2, 7, 3)) @ FULL + 5.0
+    y = generator(2).standard_normal((2, 7, 2)) + x[..., :2]
+    for k in range(2):
+        assert np.allclose(mean(x)[k], x[k].mean(axis=0), rtol=1e-14)
+        assert np.allclose(anomalies(x)[k], x[k] - x[k].mean(axis=0), atol=1e-14)
+        both = np.cov(x[k], y[k], rowvar=False)
+        assert np.allclose(sample_covariance(x)[k], both[:3, :3], rtol=1e-12, atol=1e-13)
+        assert np.allclose(cross_covariance(x, y)[k], both[:3, 3:], rtol=1e-12, atol=1e-13)
+    assert (sample_covariance(x) == sample_covariance(x).swapaxes(-1, -2)).all()
+    assert mean(x[:, :1]).shape == (2, 3) and (anomalies(x[:, :1]) == 0).all()
+
+
+# --- draws ------------------------------------------------------------------------------------
+
+
+def test_draws_have_the_mean_and_the_full_covariance() -> None:
+    """Each entry of the sample moments within 5 standard errors; a transposed factor is 50 off."""
+    n = 20_000
+    x = draw([1.0, -2.0, 3.0], FULL, n, rng=generator(3))
+    error = np.sqrt((FULL**2 + np.outer(FULL.diagonal(), FULL.diagonal())) / n)
+    assert (np.abs(sample_covariance(x) - FULL) < 5 * error).all()
+    assert (np.abs(mean(x) - [1.0, -2.0, 3.0]) < 5 * np.sqrt(FULL.diagonal() / n)).all()
+    lower = factor(FULL)
+    assert (np.abs(lower.T @ lower - FULL) > 50 * error).any()
+    # The squared length is chi-square: the shape is Gaussian too.
+    length = ((x - [1.0, -2.0, 3.0]) * np.linalg.solve(FULL, (x - [1.0, -2.0, 3.0]).T).T).sum(-1)
+    assert kstest(length, chi2(3).cdf).pvalue > 1e-4
+
+
+def test_draws_are_independent_between_leading_axes_and_members() -> None:
+    x = draw(np.zeros(2), np.eye(2), 3, rng=generator(4), leading=(4000, 2))
+    assert x.shape == (4000, 2, 3, 2)
+    flat = x.reshape(4000, -1)
+    off = np.corrcoef(flat, rowvar=False) - np.eye(12)
+    assert np.abs(off).max() < 5 / np.sqrt(4000)
+
+
+def test_draws_of_a_singular_covariance_stay_in_its_range() -> None:
+    x = draw([0.0, 5.0, 0.0], np.outer([1.0, 0.0, 2.0], [1.0, 0.0, 2.0]), 50, rng=generator(5))
+    assert (x[:, 1] == 5.0).all() and np.allclose(x[:, 2], 2 * x[:, 0], rtol=1e-12)
+    assert (draw([1.0], [[0.0]], 3, rng=generator()) == 1.0).all()
+
+
+# --- noise with exact second moments ----------------------------------------------------------
+
+
+def _exact(avoid: np.ndarray, cov: np.ndarray, noise: np.ndarray) -> None:
+    """Centred, without correlation to what is avoided, with covariance `cov`: all to 1e-12."""
+    std = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    std = np.where(std > 0, std, 1.0)
+    assert np.abs(mean(noise) / std).max(initial=0) < 1e-12
+    found = sample_covariance(noise)
+    assert unit_gap(found, np.broadcast_to(cov, found.shape)) < 1e-12
+    if avoid.shape[-1]:
+        length = avoid.std(axis=-2, ddof=1)
+        length = np.where(length > 0, length, 1.0)
+        gap = cross_covariance(avoid, noise) / (length[..., :, None] * std[..., None, :])
+        assert np.abs(gap).max() < 1e-12
+
+
+@given(SEEDS, st.integers(0, 5), st.integers(1, 4), st.integers(1, 40), st.data())
+def test_exact_noise_is_exact_down_to_the_last_member(
+    seed: int, p: int, k: int, more: int, data: st.DataObject
+) -> None:
+    """Any number of members above p + rank, full and singular covariances, steep anomalies."""
+    rng = generator(seed)
+    rank = data.draw(st.integers(0, k))
+    cov = spd(rng, k, (2,)) if rank == k else singular(rng, k, rank, (2,))
+    n = max(2, p + rank + more)
+    avoid = rng.standard_normal((2, n, p)) @ np.diag(10.0 ** rng.uniform(-6, 6, p)) + 1.0
+    noise = exact_noise(avoid, cov, rng=rng)
+    assert noise.shape == (2, n, k)
+    _exact(avoid, cov, noise)
+
+
+@pytest.mark.parametrize("n", [12, 40])
+def test_exact_noise_beside_anomalies_that_depend_on_each_other(n: int) -> None:
+    """As predictions do on the state: the independent ones count, nearly dependent ones too."""
+    rng = generator(6)
+    x = rng.standard_normal((3, n, 4))
+    for slight in (0.0, 1e-12, 1e-9, 1e-6, 1e-3):
+        h = x @ rng.standard_normal((4, 8)) + slight * rng.standard_normal((3, n, 8))
+        both = np.concatenate([x, h], axis=-1)
+        if n == 12 and slight:
+            with pytest.raises(ValueError, match=r"needs more than 1[12] \+ 3 members.* got 12$"):
+                exact_noise(both, FULL, rng=rng)
+        else:
+            _exact(both, FULL, exact_noise(both, FULL, rng=rng))
+    flat = np.concatenate([x, np.zeros((3, n, 2)), 1e6 + x[..., :1]], axis=-1)
+    _exact(flat[..., :6], FULL, exact_noise(flat, FULL, rng=rng))
+
+
+def test_exact_noise_says_how_many_members_it_needs() -> None:
+    x = generator(7).standard_normal((9, 4))
+    assert exact_noise(x[:8], FULL, rng=generator()).shape == (8, 3)
+    with pytest.raises(ValueError, match=r"^anomalies_to_avoid: needs more than 4 \+ 3 members"):
+        exact_noise(x[:7], FULL, rng=generator())
+    rank_one = np.ones((3, 3))
+    assert exact_noise(x[:6], rank_one, rng=generator()).shape == (6, 3)
+    assert (exact_noise(x[:5], np.zeros((3, 3)), rng=generator()) == 0).all()
+
+
+def test_both_ways_give_the_same_draw(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Normal equations where they are safe, orthogonal bases where not: one projection."""
+    x = generator(8).standard_normal((5, 30, 4)) @ np.diag([1.0, 1e3, 1e-3, 1.0])
+    fast = exact_noise(x, FULL, rng=generator(9))
+    monkeypatch.setattr(ensembles, "_steady", lambda gram, least: None)
+    slow = exact_noise(x, FULL, rng=generator(9))
+    assert np.allclose(fast, slow, rtol=0, atol=1e-12)
+    assert not np.allclose(fast, exact_noise(x, FULL, rng=generator(10)))
+
+
+def test_exact_noise_adds_covariances() -> None:
+    """What it is for: x + w has exactly the sum, a plain draw does not."""
+    rng = generator(11)
+    x = rng.standard_normal((40, 3)) @ FULL
+    w = exact_noise(x, FULL, rng=rng)
+    assert unit_gap(sample_covariance(x + w), sample_covariance(x) + FULL) < 1e-13
+    v = exact_noise(np.concatenate([x, w], axis=-1), 2 * FULL, rng=rng)
+    assert unit_gap(sample_covariance(x + w + v), sample_covariance(x) + 3 * FULL) < 1e-13
+    plain = draw(np.zeros(3), FULL, 40, rng=rng)
+    assert unit_gap(sample_covariance(x + plain), sample_covariance(x) + FULL) > 1e-3
+
+
+def test_exact_noise_is_as_random_as_can_be() -> None:
+    """Uniform over the directions left: each member's mean 0, variance that of the projection."""
+    rng = generator(12)
+    x = rng.standard_normal((8, 2))
+    noise = exact_noise(np.broadcast_to(x, (20_000, 8, 2)), [[4.0]], rng=rng)[..., 0]
+    basis = np.linalg.qr(np.column_stack([np.ones(8), x]))[0]
+    left = np.eye(8) - basis @ basis.T
+    found = noise.T @ noise / 20_000
+    # 7 · 4 is the squared length, spread evenly over 8 - 1 - 2 directions.
+    exact = 4.0 * 7 / 5 * left
+    assert np.abs(found - exact).max() < 6 * 4.0 * 7 / 5 / np.sqrt(20_000)
+    assert np.abs(noise.mean(axis=0)).max() < 6 * np.sqrt(4.0 * 7 / 5 / 20_000)
+    skewed = (noise**3).mean(axis=0)
+    assert np.abs(skewed).max() < 6 * np.sqrt(15 * (4.0 * 7 / 5) ** 3 / 20_000)
+
+
+def test_leading_axes_broadcast() -> None:
+    rng = generator(13)
+    avoid, cov = rng.standard_normal((7, 1, 20, 2)), spd(rng, 2, (3,))
+    noise = exact_noise(avoid, cov, rng=rng)
+    assert noise.shape == (7, 3, 20, 2)
+    _exact(np.broadcast_to(avoid, (7, 3, 20, 2)), cov, noise)
+    assert np.abs(noise[0] - noise[1]).max() > 0.1
+    assert np.abs(noise[:, 0] - noise[:, 1]).max() > 0.1
+
+
+def test_inputs_are_left_alone() -> None:
+    x = generator(14).standard_normal((12, 3))
+    for call in (mean, anomalies, sample_covariance, lambda e: cross_covariance(e, e)):
+        assert_unchanged(call, x.copy())
+    assert_unchanged(lambda e, c: exact_noise(e, c, rng=generator()), x.copy(), FULL.copy())
+    assert_unchanged(lambda m, c: draw(m, c, 5, rng=generator()), np.zeros(3), FULL.copy())

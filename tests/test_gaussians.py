@@ -1,0 +1,462 @@
+"""Density, intersection and its weights, recolouring, barycentre: exact identities."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import sqrtm
+from scipy.optimize import minimize
+from scipy.stats import multivariate_normal
+
+from distfilt.checks import SolverError
+from distfilt.ensembles import mean, sample_covariance
+from distfilt.gaussians import (
+    bures_barycentre,
+    intersection,
+    intersection_weights,
+    log_density,
+    optimal,
+    recolour,
+)
+from tests.support import ASYMMETRIC, INDEFINITE, NAN, assert_unchanged, generator, spd, unit_gap
+
+SEEDS = st.integers(0, 10_000)
+RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
+THREE = np.stack([np.eye(2), 2 * np.eye(2), [[2.0, 1.0], [1.0, 3.0]]])
+THIRDS = np.full(3, 1 / 3)
+BROKEN = np.stack([np.eye(2), np.eye(2), INDEFINITE])
+
+_G = "distfilt.gaussians."
+BAD_INPUT = {
+    _G + "log_density": [
+        ("x", lambda: log_density(1.0, [1.0], [[1.0]])),
+        ("x", lambda: log_density([NAN], [1.0], [[1.0]])),
+        ("mean", lambda: log_density([1.0], [1.0, 2.0], [[1.0]])),
+        ("mean", lambda: log_density(np.ones((2, 1)), np.ones((3, 1)), [[1.0]])),
+        ("cov", lambda: log_density([1.0], [1.0], [[-1.0]])),
+        ("cov", lambda: log_density([1.0], [1.0], np.eye(2))),
+        ("cov", lambda: log_density([1.0, 2.0], [1.0, 2.0], ASYMMETRIC)),
+        ("cov", lambda: log_density(np.ones((2, 1)), [1.0], np.ones((3, 1, 1)))),
+    ],
+    _G + "intersection": [
+        ("means", lambda: intersection(np.zeros(2), THREE, THIRDS)),
+        ("means", lambda: intersection(np.full((3, 2), NAN), THREE, THIRDS)),
+        ("means", lambda: intersection(np.zeros((2, 3, 2)), THREE, np.tile(THIRDS, (4, 1)))),
+        ("covs", lambda: intersection(np.zeros((3, 2)), THREE[:2], THIRDS)),
+        ("covs", lambda: intersection(np.zeros((3, 2)), BROKEN, THIRDS)),
+        ("covs", lambda: intersection(np.zeros((2, 3, 2)), np.stack([THREE] * 3), THIRDS)),
+        ("weights", lambda: intersection(np.zeros((3, 2)), THREE, [0.5, 0.5, 0.5])),
+        ("weights", lambda: intersection(np.zeros((3, 2)), THREE, [0.5, 0.7, -0.2])),
+        ("weights", lambda: intersection(np.zeros((3, 2)), THREE, 1.0)),
+    ],
+    _G + "intersection_weights": [
+        ("covs", lambda: intersection_weights(np.eye(2))),
+        ("covs", lambda: intersection_weights(np.ones((3, 2, 1)))),
+        ("covs", lambda: intersection_weights(BROKEN)),
+        ("covs", lambda: intersection_weights(np.full((2, 2, 2), NAN))),
+        ("covs", lambda: intersection_weights(np.stack([THREE] * 2), here=[[True] * 3] * 3)),
+        ("rule", lambda: intersection_weights(THREE, rule="best")),
+        ("here", lambda: intersection_weights(THREE, here=[True, True])),
+        ("here", lambda: intersection_weights(THREE, here=[1, 1, 1])),
+        ("here", lambda: intersection_weights(THREE, here=[False, False, False])),
+    ],
+    _G + "recolour": [
+        ("ensemble", lambda: recolour([1.0], [1.0], [[1.0]])),
+        ("ensemble", lambda: recolour([[1.0], [1.0]], [1.0], [[1.0]])),
+        ("ensemble", lambda: recolour([[1.0]], [1.0], [[1.0]])),
+        ("ensemble", lambda: recolour(np.eye(2), [1.0, 1.0], np.eye(2))),
+        ("ensemble", lambda: recolour(np.arange(9.0)[:, None] * [1, 2], [1, 1], np.eye(2))),
+        ("mean", lambda: recolour([[0.0], [1.0]], [1.0, 2.0], [[1.0]])),
+        ("cov", lambda: recolour([[0.0], [1.0]], [1.0], [[-1.0]])),
+        ("cov", lambda: recolour([[0.0], [1.0]], [1.0], np.eye(2))),
+    ],
+    _G + "bures_barycentre": [
+        ("covs", lambda: bures_barycentre(np.eye(2), [1.0])),
+        ("covs", lambda: bures_barycentre(-THREE, THIRDS)),
+        ("covs", lambda: bures_barycentre(np.ones((3, 2, 1)), THIRDS)),
+        ("weights", lambda: bures_barycentre(THREE, [0.5, 0.5])),
+        ("weights", lambda: bures_barycentre(THREE, [0.5, 0.7, -0.2])),
+        ("tolerance", lambda: bures_barycentre(THREE, THIRDS, tolerance=-1.0)),
+        ("iterations", lambda: bures_barycentre(THREE, THIRDS, iterations=0)),
+        ("iterations", lambda: bures_barycentre(THREE, THIRDS, iterations=1, tolerance=1e-15)),
+    ],
+}
+
+
+# --- density ----------------------------------------------------------------------------------
+
+
+@given(SEEDS, st.integers(1, 6))
+def test_log_density_is_the_definition(seed: int, d: int) -> None:
+    rng = generator(seed)
+    x, centre, cov = rng.standard_normal((4, 3, d)), rng.standard_normal((3, d)), spd(rng, d, (3,))
+    found = log_density(x, centre, cov)
+    assert found.shape == (4, 3)
+    for i in range(3):
+        exact = multivariate_normal(centre[i], cov[i]).logpdf(x[:, i])
+        assert np.allclose(found[:, i], exact, rtol=1e-9, atol=1e-9)
+    assert np.allclose(log_density(x, centre, cov[0])[..., 0], found[:, 0])
+
+
+def test_log_density_broadcasts_and_integrates_to_one() -> None:
+    grid = np.stack(np.meshgrid(*[np.linspace(-9, 9, 181)] * 2, indexing="ij"), axis=-1)
+    cov = np.array([[[1.0, 0.6], [0.6, 1.5]], [[2.0, -1.0], [-1.0, 0.8]]])[:, None, None]
+    density = np.exp(log_density(grid, [0.3, -0.2], cov))
+    assert density.shape == (2, 181, 181)
+    assert np.allclose(density.sum((1, 2)) * 0.01, 1.0, atol=1e-8)
+
+
+# --- intersection -----------------------------------------------------------------------------
+
+
+def _by_inverses(m: np.ndarray, p: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    information = np.linalg.inv(p)
+    cov = np.linalg.inv((w[..., None, None] * information).sum(axis=-3))
+    vector = (w[..., None] * (information @ m[..., None])[..., 0]).sum(axis=-2)
+    return (cov @ vector[..., None])[..., 0], cov
+
+
+@given(SEEDS, st.integers(1, 5), st.integers(1, 5))
+def test_intersection_is_the_weighted_sum_of_information(seed: int, s: int, d: int) -> None:
+    rng = generator(seed)
+    m, p = rng.standard_normal((6, s, d)), spd(rng, d, (6, s))
+    w = rng.dirichlet(np.ones(s), 6)
+    found, exact = intersection(m, p, w), _by_inverses(m, p, w)
+    worst = 1e-13 * np.linalg.cond(p).max()
+    assert np.abs(found[0] - exact[0]).max() < 10 * worst
+    assert unit_gap(found[1], exact[1]) < worst
+    assert (found[1] == found[1].swapaxes(-1, -2)).all()
+    one = intersection(m[2], p[2], w[2])
+    assert np.allclose(one[0], found[0][2], atol=worst) and np.allclose(one[1], found[1][2])
+
+
+def test_intersection_of_the_same_or_one_source_changes_nothing() -> None:
+    rng = generator(1)
+    m, p = 1e6 + rng.standard_normal(3), spd(rng, 3)
+    mean_, cov = intersection([m] * 4, [p] * 4, [0.1, 0.2, 0.3, 0.4])
+    assert np.allclose(mean_, m, rtol=1e-15, atol=0) and unit_gap(cov, p) < 1e-14
+    mean_, cov = intersection([m, 0 * m], [p, np.eye(3)], [1.0, 0.0])
+    assert (mean_ == m).all() and unit_gap(cov, p) < 1e-14
+    mean_, cov = intersection([0 * m, m], [np.eye(3), p], [0.0, 1.0])
+    assert np.allclose(mean_, m, rtol=1e-14) and unit_gap(cov, p) < 1e-13
+
+
+def test_intersection_does_not_depend_on_units_or_order() -> None:
+    rng = generator(2)
+    m, p, w = rng.standard_normal((3, 4)), spd(rng, 4, (3,)), np.array([0.2, 0.5, 0.3])
+    size = np.array([1e-9, 1.0, 1e9, 1e3])
+    plain, scaled = intersection(m, p, w), intersection(m * size, p * np.outer(size, size), w)
+    assert np.allclose(scaled[0], plain[0] * size, rtol=1e-11)
+    assert unit_gap(scaled[1], plain[1] * np.outer(size, size)) < 1e-12
+    turned = intersection(m[::-1], p[::-1], w[::-1])
+    assert np.allclose(turned[0], plain[0]) and unit_gap(turned[1], plain[1]) < 1e-12
+
+
+def test_intersection_bounds_the_error_for_any_correlation() -> None:
+    """The claim P minus the error's covariance of the fused mean is positive semidefinite."""
+    rng = generator(3)
+    for _ in range(50):
+        joint = spd(rng, 6, least=1e-3)  # of both errors together, blocks of 3
+        p = np.stack([joint[:3, :3], joint[3:, 3:]])
+        w = rng.dirichlet([1, 1])
+        cov = intersection(np.zeros((2, 3)), p, w)[1]
+        gains = np.hstack([w[b] * cov @ np.linalg.inv(p[b]) for b in range(2)])
+        slack = cov - gains @ joint @ gains.T
+        assert np.linalg.eigvalsh(0.5 * (slack + slack.T))[0] > -1e-12 * np.abs(cov).max()
+
+
+def test_extreme_precision_does_not_spoil_the_rest() -> None:
+    rng = generator(4)
+    sharp, wide = 1e-20 * spd(rng, 3), spd(rng, 3)
+    for order in (slice(None), slice(None, None, -1)):
+        m = np.stack([np.ones(3), np.zeros(3)])[order]
+        mean_, cov = intersection(m, np.stack([sharp, wide])[order], [0.5, 0.5])
+        assert np.allclose(mean_, 1.0) and unit_gap(cov, 2 * sharp) < 1e-9
+
+
+# --- weights ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_what_did_not_arrive_weighs_nothing_whatever_it_holds(rule: str) -> None:
+    rng = generator(5)
+    p, m = spd(rng, 3, (4, 5)), rng.standard_normal((4, 5, 3))
+    here = rng.random((4, 5)) < 0.6
+    here[:, 2] = True
+    here[0] = [False, False, True, False, False]
+    here[1, 0], here[2, 0] = False, True
+    for junk in (NAN, 0.0, -3.0):
+        covs, means = np.where(here[..., None, None], p, junk), np.where(here[..., None], m, junk)
+        w = intersection_weights(covs, rule=rule, here=here)
+        assert (w[~here] == 0).all() and np.allclose(w.sum(-1), 1.0, rtol=1e-14)
+        assert w[0, 2] == 1.0 and (w >= 0).all()
+        fused = intersection(means, covs, w)
+        for i in range(4):
+            alone = intersection_weights(p[i][here[i]], rule=rule)
+            assert np.allclose(w[i][here[i]], alone, atol=1e-6)
+            one = intersection(m[i][here[i]], p[i][here[i]], w[i][here[i]])
+            assert np.allclose(fused[0][i], one[0], atol=1e-11)
+            assert unit_gap(fused[1][i], one[1]) < 1e-11
+
+
+def test_closed_forms() -> None:
+    p = np.stack([np.diag([1.0, 4.0]), np.diag([9.0, 1.0]), [[2.0, 1.0], [1.0, 2.0]]])
+    assert np.allclose(intersection_weights(p), THIRDS, rtol=1e-15)
+    traces = np.array([1 / 5, 1 / 10, 1 / 4])
+    assert np.allclose(intersection_weights(p, rule="trace"), traces / traces.sum(), rtol=1e-14)
+    roots = np.array([1 / 2, 1 / 3, 1 / np.sqrt(3)])
+    assert np.allclose(intersection_weights(p, rule="determinant"), roots / roots.sum(), rtol=1e-14)
+    for rule in RULES:
+        assert intersection_weights(p[:1], rule=rule).tolist() == [1.0]
+    huge = np.stack([1e-200 * np.eye(4), 1e200 * np.eye(4)])
+    assert np.allclose(intersection_weights(huge, rule="determinant"), [1.0, 0.0])
+
+
+def _value(w: np.ndarray, p: np.ndarray, rule: str) -> float:
+    cov = np.linalg.inv((w[:, None, None] * np.linalg.inv(p)).sum(axis=0))
+    return float(np.log(np.trace(cov)) if rule == "min_trace" else np.linalg.slogdet(cov)[1])
+
+
+def _slopes(w: np.ndarray, p: np.ndarray, rule: str) -> np.ndarray:
+    """The derivatives of the documentation, by inverses."""
+    information = np.linalg.inv(p)
+    cov = np.linalg.inv((w[:, None, None] * information).sum(axis=0))
+    right = cov @ information @ cov if rule == "min_trace" else cov @ information
+    return np.trace(right, axis1=-2, axis2=-1)
+
+
+@pytest.mark.parametrize("rule", ["min_trace", "min_determinant"])
+@given(seed=SEEDS, s=st.integers(2, 5), d=st.integers(1, 5), spread=st.sampled_from([0.1, 1, 3]))
+def test_optimal_weights_meet_the_conditions_of_the_optimum(
+    rule: str, seed: int, s: int, d: int, spread: float
+) -> None:
+    rng = generator(seed)
+    p = spd(rng, d, (s,)) * np.exp(spread * rng.standard_normal((s, 1, 1)))
+    w = intersection_weights(p, rule=rule)
+    slopes = _slopes(w, p, rule)
+    average = float(w @ slopes)
+    assert slopes.max() <= (1 + 2e-7) * average
+    assert (w * (average - slopes) <= 2e-7 * average).all()
+    if rule == "min_determinant":
+        assert average == pytest.approx(d, rel=1e-9)
+    for other in (*np.eye(s), rng.dirichlet(np.ones(s)), np.full(s, 1 / s)):
+        blend = 0.999 * w + 0.001 * other
+        assert _value(w, p, rule) <= _value(blend, p, rule) + d * 2e-7
+
+
+@pytest.mark.parametrize("rule", ["min_trace", "min_determinant"])
+def test_optimal_weights_against_a_general_optimiser(rule: str) -> None:
+    rng = generator(6)
+    for _ in range(40):
+        s, d = int(rng.integers(2, 6)), int(rng.integers(1, 6))
+        p = spd(rng, d, (s,)) * np.exp(rng.standard_normal((s, 1, 1)))
+        found = minimize(
+            _value, np.full(s, 1 / s), (p, rule), method="SLSQP", bounds=[(0, 1)] * s,
+            constraints={"type": "eq", "fun": lambda w: w.sum() - 1}, options={"ftol": 1e-14},
+        )  # fmt: skip
+        ours = intersection_weights(p, rule=rule)
+        assert _value(ours, p, rule) <= found.fun + 1e-6
+        sharp = np.abs(ours - found.x).max() > 1e-3
+        assert not sharp or abs(_value(ours, p, rule) - found.fun) < 1e-6
+
+
+def test_optimal_weights_are_where_the_slow_iteration_goes() -> None:
+    p = spd(generator(7), 4, (3,))
+    w = np.full(3, 1 / 3)
+    values = [_value(w, p, "min_determinant")]
+    for _ in range(3000):
+        w = w * _slopes(w, p, "min_determinant") / 4
+        values.append(_value(w, p, "min_determinant"))
+    assert (np.diff(values) < 1e-13).all()  # never worse
+    assert np.allclose(intersection_weights(p, rule="min_determinant"), w, atol=1e-5)
+    w, values = np.full(3, 1 / 3), []
+    for _ in range(3000):
+        values.append(_value(w, p, "min_trace"))
+        w = w * np.sqrt(_slopes(w, p, "min_trace"))
+        w /= w.sum()
+    assert (np.diff(values) < 1e-13).all()
+    assert np.allclose(intersection_weights(p, rule="min_trace"), w, atol=1e-5)
+
+
+def test_sure_steps_alone_reach_the_optimum(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A Newton step that leads astray is not taken."""
+    p = spd(generator(8), 3, (20, 3))
+    exact = intersection_weights(p, rule="min_determinant")
+
+    def astray(weights: np.ndarray, *rest: object) -> np.ndarray:
+        return np.roll(weights, 1, axis=-1) ** 2 / (weights**2).sum(-1, keepdims=True)
+
+    monkeypatch.setattr(optimal, "_newton", astray)
+    monkeypatch.setattr(optimal, "_STEPS", 4000)
+    for rule in ("min_determinant", "min_trace"):
+        w = intersection_weights(p, rule=rule)
+        assert np.allclose(w.sum(-1), 1.0) and (w >= 0).all()
+        for i in range(20):
+            best = _slopes(w[i], p[i], rule)
+            assert best.max() <= 1.001 * float(w[i] @ best)
+    assert np.allclose(intersection_weights(p, rule="min_determinant"), exact, atol=0.02)
+
+
+def test_optimal_weights_of_equal_crossed_and_dominated_sources() -> None:
+    crossed = [np.diag([1.0, 4.0]), np.diag([4.0, 1.0])]
+    for rule in ("min_trace", "min_determinant"):
+        assert np.allclose(intersection_weights(crossed, rule=rule), 0.5, atol=1e-7)
+        assert np.allclose(intersection_weights([np.eye(3)] * 4, rule=rule), 0.25)
+        better = intersection_weights([np.eye(2), 1.01 * np.eye(2), 9 * np.eye(2)], rule=rule)
+        assert better[0] > 1 - 1e-4
+        twice = intersection_weights([crossed[0], crossed[0], crossed[1]], rule=rule)
+        assert np.allclose([twice[:2].sum(), twice[2]], 0.5, atol=1e-6)
+
+
+@given(SEEDS, st.floats(-300, 290))
+def test_optimal_weights_are_numbers_for_any_sizes(seed: int, power: float) -> None:
+    rng = generator(seed)
+    size = 10.0 ** rng.uniform(-8, 8, (4, 3, 4))
+    p = spd(rng, 4, (4, 3)) * size[..., :, None] * size[..., None, :]
+    p[:, 0] *= 10.0**power
+    p = 0.5 * (p + p.swapaxes(-1, -2))
+    for rule in RULES:
+        w = intersection_weights(p, rule=rule)
+        assert (w >= 0).all() and np.allclose(w.sum(-1), 1.0, rtol=1e-12)
+
+
+def test_determinants_do_not_depend_on_units_traces_do() -> None:
+    p, size = spd(generator(9), 4, (6, 3)), np.logspace(-2, 3, 4)
+    for rule in RULES:
+        same = np.allclose(
+            intersection_weights(p, rule=rule),
+            intersection_weights(p * np.outer(size, size), rule=rule),
+            atol=1e-5,
+        )
+        assert same == ("trace" not in rule)
+
+
+def test_batches_equal_one_by_one() -> None:
+    p = spd(generator(10), 3, (4, 7, 3))
+    for rule in RULES:
+        whole = intersection_weights(p, rule=rule)
+        assert whole.shape == (4, 7, 3)
+        for i, j in ((0, 0), (3, 6), (2, 1)):
+            assert np.allclose(whole[i, j], intersection_weights(p[i, j], rule=rule), atol=1e-9)
+    here = np.array([True, False, True])
+    assert intersection_weights(p[0, 0], here=[here, ~here]).tolist() == [[0.5, 0, 0.5], [0, 1, 0]]
+
+
+# --- recolouring ------------------------------------------------------------------------------
+
+
+def _ensembles(seed: int, n: int, d: int, leading: tuple[int, ...] = ()) -> np.ndarray:
+    rng = generator(seed)
+    mixing = rng.standard_normal((*leading, d, d))
+    shift = 10 * rng.standard_normal((*leading, 1, d))
+    return (rng.standard_normal((*leading, n, d)) @ mixing + shift) * np.logspace(-3, 3, d)
+
+
+@given(SEEDS, st.integers(1, 13), st.integers(1, 30))
+def test_recoloured_moments_are_exact(seed: int, d: int, more: int) -> None:
+    """Whatever the condition of the old and the new covariance, down to d + 1 members."""
+    e, other = _ensembles(seed, d + more, d, (2,)), _ensembles(seed + 1, d + 5, d, (2,))
+    centre, cov = mean(other), sample_covariance(other)
+    try:
+        out = recolour(e, centre, cov)
+    except ValueError as error:  # members or target flat to rounding
+        assert "singular" in str(error) or "definite" in str(error)
+        return
+    std = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    rounding = 1e-15 * (np.abs(centre) / std).max()
+    assert np.abs((mean(out) - centre) / std).max() < 1e-13 + 10 * rounding
+    assert unit_gap(sample_covariance(out), cov) < 1e-13 + 100 * rounding
+
+
+def test_the_draw_that_lost_nine_digits() -> None:
+    """Ill-conditioned old and new covariances at once."""
+    rng = generator(31)
+    for d in (3, 12):
+        flat = np.diag(np.logspace(0, -7, d)) @ np.linalg.qr(rng.standard_normal((d, d)))[0]
+        e = rng.standard_normal((60, d)) @ flat
+        target = spd(rng, d, least=1e-10)
+        out = recolour(e, np.zeros(d), target)
+        assert unit_gap(sample_covariance(out), target) < 1e-13
+
+
+def test_recolouring_is_symmetric_and_moves_the_members_least() -> None:
+    e, other = _ensembles(1, 40, 4), _ensembles(2, 40, 4)
+    cov = sample_covariance(other)
+    unit = np.sqrt(cov.diagonal())
+    e, cov = e / unit, cov / np.outer(unit, unit)
+    out = recolour(e, mean(e), cov)
+    a = np.linalg.lstsq(e - mean(e), out - mean(e), rcond=None)[0].T
+    assert np.abs(a - a.T).max() < 1e-9 * np.abs(a).max()
+    assert (np.linalg.eigvalsh(0.5 * (a + a.T)) > 0).all()
+    # A C A = P has one symmetric positive solution; Cholesky factors give P by a longer way.
+    now = sample_covariance(e)
+    exact = np.real(np.linalg.inv(sqrtm(now)) @ sqrtm(sqrtm(now) @ cov @ sqrtm(now)))
+    exact = exact @ np.real(np.linalg.inv(sqrtm(now)))
+    assert np.allclose(a, exact, rtol=1e-6, atol=1e-8 * np.abs(a).max())
+    step = np.linalg.solve(np.linalg.cholesky(now), (e - mean(e)).T)
+    longer = mean(e) + (np.linalg.cholesky(cov) @ step).T
+    assert unit_gap(sample_covariance(longer), cov) < 1e-9
+    assert ((out - e) ** 2).sum() < ((longer - e) ** 2).sum()
+
+
+def test_recolouring_to_what_is_there_keeps_each_member() -> None:
+    e = _ensembles(3, 9, 8, (3,))  # N = d + 1
+    out = recolour(e, mean(e), sample_covariance(e))
+    assert np.abs((out - e) / e.std(axis=-2, keepdims=True)).max() < 1e-6
+    shifted = recolour(e, mean(e) + 2.0, sample_covariance(e))
+    assert np.allclose(shifted, out + 2.0, rtol=1e-9, atol=1e-9)
+    for k in range(3):
+        one = recolour(e[k], mean(e[k]), 4 * sample_covariance(e[k]))
+        assert np.allclose(one - mean(one), 2 * (e[k] - mean(e[k])), atol=1e-5 * e[k].std(axis=0))
+
+
+def test_flat_ensembles_are_refused_wherever_they_lie() -> None:
+    rng = generator(12)
+    x = rng.standard_normal((20, 3))
+    for flat in (x @ [[1, 0, 1], [0, 1, 1], [0, 0, 0]], x * [1, 0, 1], 1e9 + x * [1, 1e-9, 1]):
+        for shift in (0.0, 1e6):
+            with pytest.raises(ValueError, match="^ensemble: .* singular"):
+                recolour(np.stack([x, flat + shift]), np.zeros((2, 3)), np.stack([np.eye(3)] * 2))
+
+
+# --- barycentre -------------------------------------------------------------------------------
+
+
+@given(SEEDS, st.integers(1, 6))
+def test_barycentre_solves_its_equation(seed: int, d: int) -> None:
+    """S = sum of w (S^1/2 P S^1/2)^1/2, by matrix square roots from scipy."""
+    rng = generator(seed)
+    covs, weights = spd(rng, d, (3,)), rng.dirichlet(np.ones(3))
+    s = bures_barycentre(covs, weights, tolerance=1e-12)
+    half = np.real(sqrtm(s))
+    right = sum(w * np.real(sqrtm(half @ p @ half)) for w, p in zip(weights, covs, strict=True))
+    assert np.abs(s - right).max() < 1e-8 * np.abs(s).max()
+    assert (s == s.T).all()
+
+
+def test_barycentre_of_commuting_covariances_averages_standard_deviations() -> None:
+    covs = np.stack([np.diag([1.0, 4.0]), np.diag([9.0, 16.0])])
+    s = bures_barycentre(np.stack([covs, covs]), [[0.5, 0.5], [0.25, 0.75]])
+    assert np.allclose(s[0], np.diag([4.0, 9.0])) and np.allclose(s[1], np.diag([6.25, 12.25]))
+    with pytest.raises(SolverError, match="iterations"):
+        bures_barycentre([np.diag([1.0, 4.0]), [[2.0, 1.0], [1.0, 3.0]]], [0.5, 0.5], iterations=1)
+
+
+def test_barycentre_leaves_out_what_has_no_weight() -> None:
+    covs = spd(generator(13), 3, (2, 4))
+    alone = bures_barycentre(covs[:, :2], [[0.3, 0.7]] * 2)
+    covs[:, 2:] = NAN
+    assert np.allclose(bures_barycentre(covs, [[0.3, 0.7, 0.0, 0.0]] * 2), alone, rtol=1e-12)
+
+
+def test_inputs_are_left_alone() -> None:
+    rng = generator(14)
+    p, m, w = spd(rng, 3, (5, 3)), rng.standard_normal((5, 3, 3)), np.tile(THIRDS, (5, 1))
+    assert_unchanged(intersection, m.copy(), p.copy(), w.copy())
+    for rule in RULES:
+        assert_unchanged(lambda c, rule=rule: intersection_weights(c, rule=rule), p.copy())
+    assert_unchanged(bures_barycentre, p.copy(), w.copy())
+    assert_unchanged(recolour, rng.standard_normal((5, 8, 3)), m[:, 0].copy(), p[:, 0].copy())
+    assert_unchanged(log_density, m.copy(), m[:, :1].copy(), p.copy())

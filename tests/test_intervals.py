@@ -1,0 +1,136 @@
+"""Intervals: exact coverage, the library functions of scipy, and what they refuse."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from distfilt.intervals import Interval, mean_interval, median_interval, proportion_interval
+
+_I = "distfilt.intervals."
+BAD_INPUT = {
+    _I + "mean_interval": [
+        ("values", lambda: mean_interval([1.0])),
+        ("values", lambda: mean_interval([1.0, np.nan])),
+        ("values", lambda: mean_interval([[1.0, 2.0]])),
+        ("level", lambda: mean_interval([1.0, 2.0], level=0.0)),
+        ("level", lambda: mean_interval([1.0, 2.0], level="0.95")),
+    ],
+    _I + "median_interval": [
+        ("values", lambda: median_interval([])),
+        ("values", lambda: median_interval([1.0, 2.0, 3.0, 4.0, 5.0])),
+        ("level", lambda: median_interval(np.arange(9.0), level=95)),
+    ],
+    _I + "proportion_interval": [
+        ("successes", lambda: proportion_interval(5, 4)),
+        ("successes", lambda: proportion_interval(-1, 4)),
+        ("successes", lambda: proportion_interval(True, 4)),
+        ("trials", lambda: proportion_interval(0, 0)),
+        ("level", lambda: proportion_interval(1, 4, level=-0.5)),
+    ],
+    _I + "Interval": [
+        ("estimate", lambda: Interval(np.nan, 0.0, 1.0, 0.1)),
+        ("low", lambda: Interval(0.5, 0.6, 1.0, 0.1)),
+        ("high", lambda: Interval(0.5, 0.0, 0.4, 0.1)),
+        ("error", lambda: Interval(0.5, 0.0, 1.0, -0.1)),
+        ("value", lambda: "much" in Interval(0.5, 0.0, 1.0, 0.1)),
+    ],
+}
+RNG = np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("level", [0.5, 0.9, 0.95, 0.99])
+@pytest.mark.parametrize("n", [2, 3, 8, 50, 301])
+def test_intervals_are_those_of_scipy(n, level):
+    values = np.random.default_rng(n).standard_normal(n) ** 3
+    found = mean_interval(values, level=level)
+    exact = stats.t.interval(level, n - 1, values.mean(), stats.sem(values))
+    assert (found.low, found.high) == pytest.approx(exact, rel=1e-12)
+    for k in sorted({0, 1, n // 3, n - 1, n}):
+        ours = proportion_interval(k, n, level=level)
+        theirs = stats.binomtest(k, n).proportion_ci(level, method="exact")
+        # scipy searches these roots; the quantiles of the beta distribution are the roots.
+        assert (ours.low, ours.high) == pytest.approx(tuple(theirs), abs=1e-11)
+        assert ours.error == pytest.approx(np.sqrt(k / n * (1 - k / n) / n), rel=1e-12)
+    if n >= 8 and (n > 8 or level < 0.99):
+        ours = median_interval(values, level=level)
+        theirs = stats.quantile_test(values).confidence_interval(level)
+        assert (ours.low, ours.high) == tuple(theirs)
+
+
+def test_values_that_are_all_alike():
+    found = mean_interval([2.0, 2.0, 2.0])
+    assert (found.estimate, found.low, found.high, found.error) == (2.0, 2.0, 2.0, 0.0)
+
+
+def test_tiny_levels_keep_the_estimate_inside():
+    for k in range(5):
+        found = proportion_interval(k, 4, level=1e-6)
+        assert found.low <= k / 4 <= found.high
+
+
+@pytest.mark.parametrize("level", [0.9, 0.95])
+@pytest.mark.parametrize("n", [1, 2, 7, 30])
+def test_clopper_pearson_covers_exactly(n, level):
+    found = [proportion_interval(k, n, level=level) for k in range(n + 1)]
+    for p in np.linspace(0, 1, 301):
+        law = stats.binom.pmf(np.arange(n + 1), n, p)
+        coverage = sum(w for w, interval in zip(law, found, strict=True) if p in interval)
+        assert coverage >= level - 1e-12
+    for k, interval in enumerate(found):
+        # Each tail at an end is exactly (1 - level)/2: no shorter interval of this kind covers.
+        if k > 0:
+            assert stats.binom.sf(k - 1, n, interval.low) == pytest.approx((1 - level) / 2)
+        if k < n:
+            assert stats.binom.cdf(k, n, interval.high) == pytest.approx((1 - level) / 2)
+
+
+@pytest.mark.parametrize("n", [6, 7, 20, 101])
+def test_median_interval_covers_and_no_shorter_one_does(n):
+    values = np.random.default_rng(n).permutation(n) + 1.0
+    found = median_interval(values)
+    k = int(found.low)
+    assert found.high == n + 1 - k
+    assert 1 - 2 * stats.binom.cdf(k - 1, n, 0.5) >= 0.95
+    assert 1 - 2 * stats.binom.cdf(k, n, 0.5) < 0.95
+    assert found.estimate == np.median(values)
+
+
+def test_median_interval_error_tends_to_the_standard_error():
+    values = stats.norm.ppf((np.arange(100000) + 0.5) / 100000)
+    exact = np.sqrt(np.pi / 2 / 100000)  # asymptotic, Gaussian
+    assert median_interval(values).error == pytest.approx(exact, rel=0.01)
+
+
+def test_mean_interval_is_students():
+    values = RNG.standard_normal(12)
+    found = mean_interval(values, level=0.9)
+    expected = stats.ttest_1samp(values, 0.0).confidence_interval(0.9)
+    assert (found.low, found.high) == pytest.approx(tuple(expected), rel=1e-12)
+    assert found.error == pytest.approx(stats.sem(values), rel=1e-12)
+    for end in (found.low, found.high):
+        assert stats.ttest_1samp(values, end).pvalue == pytest.approx(0.1, rel=1e-9)
+
+
+def test_mean_interval_covers():
+    trials = 4000
+    samples = np.random.default_rng(7).standard_normal((trials, 5))
+    inside = sum(0.0 in mean_interval(v) for v in samples)
+    assert 0.95 in proportion_interval(inside, trials, level=0.999)
+
+
+def test_interval_is_frozen_and_compact():
+    interval = Interval(1.23456, 1.1, 1.4, 0.05)
+    assert str(interval) == "1.23 [1.1, 1.4]"
+    assert 1.1 in interval and 1.4 in interval and 1.41 not in interval
+    with pytest.raises(AttributeError):
+        interval.low = 0.0
+
+
+def test_inputs_are_left_alone():
+    values = np.array([3.0, 1.0, 2.0, 5.0, 4.0, 0.0])
+    values.flags.writeable = False
+    median_interval(values)
+    mean_interval(values)
+    assert values.tolist() == [3.0, 1.0, 2.0, 5.0, 4.0, 0.0]

@@ -1,0 +1,310 @@
+"""Factors, solves and exact discretisation against definitions, full matrices, stiff drifts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import expm, solve_continuous_lyapunov
+
+from distfilt import linalg
+from tests.support import (
+    ASYMMETRIC,
+    INDEFINITE,
+    NAN,
+    assert_unchanged,
+    generator,
+    singular,
+    spd,
+    unit_gap,
+)
+
+SEEDS, SIZES = st.integers(0, 10_000), st.integers(1, 7)
+EPS = np.finfo(float).eps
+
+_L = "distfilt.linalg."
+BAD_INPUT = {
+    _L + "cholesky_solve": [
+        ("cov", lambda: linalg.cholesky_solve(INDEFINITE, np.eye(2))),
+        ("cov", lambda: linalg.cholesky_solve(np.zeros((2, 2)), np.eye(2))),
+        ("right", lambda: linalg.cholesky_solve(np.eye(2), np.eye(3))),
+        ("right", lambda: linalg.cholesky_solve(np.eye(2), [1.0, 2.0])),
+        ("right", lambda: linalg.cholesky_solve(np.ones((2, 1, 1)), np.ones((3, 1, 1)))),
+    ],
+    _L + "factor": [
+        ("cov", lambda: linalg.factor(-np.eye(2))),
+        ("cov", lambda: linalg.factor(INDEFINITE)),
+        ("cov", lambda: linalg.factor([[1.0, 2.0]])),
+        ("noise", lambda: linalg.factor(ASYMMETRIC, name="noise")),
+    ],
+    _L + "log_det": [
+        ("cov", lambda: linalg.log_det(INDEFINITE)),
+        ("cov", lambda: linalg.log_det(np.zeros((2, 2)))),
+    ],
+    _L + "quadratic_form": [
+        ("cov", lambda: linalg.quadratic_form(INDEFINITE, [1.0, 2.0])),
+        ("vector", lambda: linalg.quadratic_form(np.eye(2), [1.0])),
+        ("vector", lambda: linalg.quadratic_form(np.ones((2, 1, 1)), np.ones((3, 1)))),
+    ],
+    _L + "symmetrise": [
+        ("matrix", lambda: linalg.symmetrise([[1.0, 2.0]])),
+        ("matrix", lambda: linalg.symmetrise([[NAN]])),
+    ],
+    _L + "van_loan": [
+        ("drift", lambda: linalg.van_loan([[0.0, 1.0]], np.eye(2), 0.1)),
+        ("diffusion", lambda: linalg.van_loan(np.eye(2), -np.eye(2), 0.1)),
+        ("diffusion", lambda: linalg.van_loan(np.eye(2), np.eye(3), 0.1)),
+        ("dt", lambda: linalg.van_loan(np.eye(2), np.eye(2), -0.1)),
+        ("dt", lambda: linalg.van_loan(np.eye(2), np.eye(2), 1e3)),
+        ("dt", lambda: linalg.van_loan(np.eye(2), np.eye(2), 1e308)),
+        ("dt", lambda: linalg.van_loan([[0, 1], [0, 0]], np.diag([0.0, 1.0]), 1e-200)),
+    ],
+}
+
+
+def _turned(a: np.ndarray) -> np.ndarray:
+    return np.swapaxes(a, -1, -2)
+
+
+def test_inputs_are_not_changed() -> None:
+    cov = spd(generator(), 3)
+    assert_unchanged(linalg.factor, cov.copy())
+    assert_unchanged(linalg.cholesky_solve, cov.copy(), np.eye(3))
+    assert_unchanged(linalg.quadratic_form, np.stack([cov] * 9), np.ones((9, 3)))
+    assert_unchanged(lambda a, q: linalg.van_loan(a, q, 2.0), np.ones((3, 3)), cov.copy())
+
+
+# --- factors ----------------------------------------------------------------------------------
+
+
+@given(SEEDS, SIZES)
+def test_factor_reproduces_its_matrix(seed: int, d: int) -> None:
+    cov = spd(generator(seed), d, (2, 3))
+    lower = linalg.factor(cov)
+    assert unit_gap(lower @ _turned(lower), cov) < 10 * d * EPS
+    assert (np.triu(lower, 1) == 0).all() and (np.diagonal(lower, axis1=-2, axis2=-1) > 0).all()
+    assert np.allclose(linalg.factor(cov[1, 2]), lower[1, 2], rtol=1e-10, atol=1e-12)
+
+
+@given(SEEDS, st.integers(2, 7), st.data())
+def test_factor_of_a_singular_matrix_keeps_every_digit(
+    seed: int, d: int, data: st.DataObject
+) -> None:
+    """Also where elimination meets a pivot of rounding, in any units; zero columns are kept."""
+    rank = data.draw(st.integers(1, d - 1))
+    rng = generator(seed)
+    size = 10.0 ** rng.uniform(-8, 8, d)
+    cov = singular(rng, d, rank) * size[:, None] * size
+    cov = 0.5 * (cov + cov.T)
+    lower = linalg.factor(cov)
+    assert unit_gap(lower @ lower.T, cov) < 50 * d * EPS
+    assert (np.triu(lower, 1) == 0).all() and (np.diagonal(lower) >= 0).all()
+
+
+@pytest.mark.parametrize("nearly", [1e-7, 3e-8, 1e-8, 1e-9])
+def test_factor_where_a_tiny_pivot_decides(nearly: float) -> None:
+    """The second component is the first but for `nearly` times what the third consists of.
+
+    Elimination divides a column by the root of a pivot that rounding has spoilt: a third pivot of
+    0.1 below zero would be dropped, and with it a tenth of a variance.
+    """
+    third = np.array([0.0, nearly, 1.0])
+    for k in range(20):
+        first = generator(k).uniform(0.5, 2.0) * np.array([1.0, generator(k).uniform(0.5, 2), 0.3])
+        cov = np.outer(first, first) + np.outer(third, third)
+        lower = linalg.factor(cov)
+        assert unit_gap(lower @ lower.T, cov) < 150 * EPS
+        assert (np.triu(lower, 1) == 0).all()
+
+
+def test_factor_of_the_matrix_that_lost_four_digits() -> None:
+    a = np.random.default_rng(9320).standard_normal((6, 5))
+    cov = linalg.symmetrise(a @ a.T)
+    lower = linalg.factor(cov)
+    assert unit_gap(lower @ lower.T, cov) < 300 * EPS
+
+
+@given(SEEDS, st.integers(2, 6), st.data())
+def test_factor_is_unique_where_a_component_is_still(
+    seed: int, d: int, data: st.DataObject
+) -> None:
+    """No free signs or rotations: a draw with it does not depend on the machine."""
+    k = data.draw(st.integers(0, d - 1))
+    cov = spd(generator(seed), d)
+    cov[k] = cov[:, k] = 0.0
+    lower = linalg.factor(cov)
+    others = np.arange(d) != k
+    plain = np.linalg.cholesky(cov[np.ix_(others, others)])
+    assert np.allclose(lower[np.ix_(others, others)], plain, rtol=1e-9, atol=1e-12)
+    assert (lower[k] == 0).all() and (lower[:, k] == 0).all()
+
+
+def test_factor_of_nothing_and_of_a_mixed_stack() -> None:
+    assert (linalg.factor(np.zeros((2, 3, 3))) == 0).all()
+    mixed = np.stack([spd(generator(), 3), np.ones((3, 3)), np.diag([0.0, 4.0, 0.0])])
+    lower = linalg.factor(mixed)
+    assert unit_gap(lower @ _turned(lower), mixed) < 100 * EPS
+    assert np.allclose(lower[1], [[1, 0, 0], [1, 0, 0], [1, 0, 0]])
+    assert lower[2, 1, 1] == 2 and np.count_nonzero(lower[2]) == 1
+
+
+# --- solves -----------------------------------------------------------------------------------
+
+LEADING = [(), (1,), (3,), (40,), (2, 3), (5, 8)]
+"""One system, a call for each, and substitution in all of them at once."""
+
+
+@pytest.mark.parametrize("leading", LEADING)
+@pytest.mark.parametrize("d", [1, 2, 5])
+def test_triangular_solves_of_every_number_of_systems(leading: tuple[int, ...], d: int) -> None:
+    rng = generator(d)
+    lower = np.linalg.cholesky(spd(rng, d, leading))
+    right = rng.standard_normal((*leading, d, 3))
+    for solve, matrix in ((linalg._solve_lower, lower), (linalg._solve_upper, _turned(lower))):
+        assert_unchanged(solve, lower.copy(), right.copy())
+        out = solve(lower, right)
+        assert out.shape == right.shape
+        assert np.allclose(matrix @ out, right, rtol=1e-11, atol=1e-11)
+        shared = solve(lower, right[(0,) * len(leading)])
+        assert np.allclose(matrix @ shared, right[(0,) * len(leading)], rtol=1e-11, atol=1e-11)
+    one = lower[(0,) * len(leading)]
+    assert np.allclose(one @ linalg._solve_lower(one, right), right, rtol=1e-11, atol=1e-11)
+    assert np.allclose(one.T @ linalg._solve_upper(one, right), right, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("leading", LEADING)
+def test_whitening_broadcasts_in_every_way(leading: tuple[int, ...]) -> None:
+    rng = generator(2)
+    lower = np.linalg.cholesky(spd(rng, 4, leading))
+    for shape in ((*leading, 4), (4,)):
+        v = rng.standard_normal(shape)
+        out = linalg._whiten(lower, v)
+        assert np.allclose((lower @ out[..., None])[..., 0], np.broadcast_to(v, out.shape))
+    many = rng.standard_normal((*leading, 7, 4))
+    out = linalg._whiten(lower[..., None, :, :], many)
+    assert out.shape == many.shape
+    assert np.allclose((lower[..., None, :, :] @ out[..., None])[..., 0], many)
+    out = linalg._whiten(lower[(0,) * len(leading)], many)
+    assert np.allclose((lower[(0,) * len(leading)] @ out[..., None])[..., 0], many)
+
+
+@pytest.mark.parametrize("leading", [(), (0,), (3,), (0, 2)])
+@pytest.mark.parametrize(("d", "k"), [(0, 0), (0, 2), (2, 0), (2, 1)])
+def test_empty_systems(leading: tuple[int, ...], d: int, k: int) -> None:
+    cov, right = np.broadcast_to(np.eye(d), (*leading, d, d)), np.ones((*leading, d, k))
+    assert linalg.cholesky_solve(cov, right).shape == right.shape
+    assert linalg.quadratic_form(cov, np.ones((*leading, d))).shape == leading
+    assert linalg.quadratic_form(np.eye(d), np.ones((*leading, d))).shape == leading
+    assert linalg.factor(cov).shape == cov.shape and linalg.log_det(cov).shape == leading
+
+
+@given(SEEDS, SIZES, st.sampled_from(LEADING))
+def test_public_solves_agree_with_numpy(seed: int, d: int, leading: tuple[int, ...]) -> None:
+    rng = generator(seed)
+    cov = spd(rng, d, leading)
+    v, b = rng.standard_normal((*leading, d)), rng.standard_normal((*leading, d, 2))
+    worst = 1e-13 * np.linalg.cond(cov).max()
+    assert np.allclose(cov @ linalg.cholesky_solve(cov, b), b, rtol=worst, atol=worst)
+    plain = np.linalg.solve(cov, v[..., None])[..., 0]
+    assert np.allclose(linalg.quadratic_form(cov, v), (v * plain).sum(-1), rtol=worst)
+    logs = np.linalg.slogdet(cov)[1]
+    assert np.allclose(linalg.log_det(cov), logs, rtol=1e-11, atol=1e-11)
+    assert linalg.log_det(cov).shape == leading
+
+
+def test_leading_axes_broadcast() -> None:
+    rng = generator(4)
+    cov, v = spd(rng, 3, (2, 1)), rng.standard_normal((5, 3))
+    whole = linalg.quadratic_form(cov, v)
+    assert whole.shape == (2, 5)
+    assert np.isclose(whole[1, 4], v[4] @ np.linalg.solve(cov[1, 0], v[4]), rtol=1e-12)
+
+
+# --- exact discretisation ---------------------------------------------------------------------
+
+STIFF = np.array([[-1.0, 1.0], [0.0, -50.0]])
+SLOW_AND_FAST = np.array([[-0.01, 2.0, 0.3], [-1.0, -0.02, 0.1], [0.0, 0.4, -500.0]])
+
+
+@pytest.mark.parametrize("dt", [1e-3, 0.1, 1.0, 2.0, 30.0])
+@pytest.mark.parametrize("drift", [STIFF, SLOW_AND_FAST], ids=["two", "three"])
+def test_van_loan_of_a_stiff_drift(drift: np.ndarray, dt: float) -> None:
+    """Against the stationary covariance X: Q = X − Φ X Φ', exact for stable drifts."""
+    density = np.array([[1.0, 0.3, 0.1], [0.3, 2.0, -0.4], [0.1, -0.4, 0.5]])
+    density = density[: len(drift), : len(drift)]
+    phi, q = linalg.van_loan(drift, density, dt)
+    whole = solve_continuous_lyapunov(drift, -density)
+    exact = expm(drift * dt)
+    assert np.allclose(phi, exact, rtol=1e-9, atol=1e-13)
+    lost = 1e-13 * np.abs(whole).max() / np.abs(q).max()  # digits lost in the reference
+    assert unit_gap(q, whole - exact @ whole @ exact.T) < 1e-12 + 10 * lost
+    assert (q == q.T).all() and np.linalg.eigvalsh(q)[0] > 0
+
+
+@given(SEEDS, SIZES, st.floats(1e-3, 30.0))
+def test_van_loan_meets_its_differential_equation(seed: int, d: int, dt: float) -> None:
+    """Halves compose to the whole, and a short step is the integrand: both together fix Q."""
+    rng = generator(seed)
+    drift = rng.standard_normal((d, d))
+    drift -= (1.5 * np.sqrt(d)) * np.eye(d)  # decays
+    density = singular(rng, d, max(1, d - 1))
+    phi, q = linalg.van_loan(drift, density, dt)
+    half, noise = linalg.van_loan(drift, density, dt / 2)
+    assert np.allclose(half @ half, phi, rtol=1e-9, atol=1e-12)
+    assert unit_gap(half @ noise @ half.T + noise, q) < 1e-10
+    tiny = 1e-6
+    short = linalg.van_loan(drift, density, tiny)[1]
+    first = density + tiny / 2 * (drift @ density + density @ drift.T)
+    assert np.allclose(short / tiny, first, rtol=0, atol=1e-10 * (1 + np.abs(density).max()) * d**2)
+    scaled = q / np.sqrt(np.outer(np.diag(q), np.diag(q)))
+    assert np.linalg.eigvalsh(scaled)[0] > -1e-13
+
+
+def test_van_loan_of_a_chain_keeps_the_digits_of_short_steps() -> None:
+    chain = np.diag([1.0, 1.0], 1)
+    for h in (1e-9, 1e-3, 1.0, 1e4):
+        phi, q = linalg.van_loan(chain, np.diag([0.0, 0.0, 3.0]), h)
+        exact = 3 * np.array([[h**5 / 20, h**4 / 8, h**3 / 6], [h**4 / 8, h**3 / 3, h**2 / 2],
+                              [h**3 / 6, h**2 / 2, h]])  # fmt: skip
+        assert np.allclose(q, exact, rtol=1e-14, atol=0)
+        assert np.allclose(phi, [[1, h, h * h / 2], [0, 1, h], [0, 0, 1]], rtol=1e-14, atol=0)
+
+
+def test_van_loan_of_a_rotation_and_of_growth() -> None:
+    phi, q = linalg.van_loan([[0.0, 7.0], [-7.0, 0.0]], 2 * np.eye(2), 3.0)
+    c, s = np.cos(21.0), np.sin(21.0)
+    assert np.allclose(phi, [[c, s], [-s, c]], atol=1e-13)
+    assert np.allclose(q, 6 * np.eye(2), atol=1e-12)
+    phi, q = linalg.van_loan([[2.0]], [[3.0]], 5.0)
+    assert np.allclose([phi, q], [[[np.exp(10)]], [[0.75 * (np.exp(20) - 1)]]], rtol=1e-13)
+
+
+def test_van_loan_without_time_noise_or_motion() -> None:
+    phi, q = linalg.van_loan(np.ones((3, 3)), np.eye(3), 0.0)
+    assert (phi == np.eye(3)).all() and (q == 0).all()
+    phi, q = linalg.van_loan(STIFF, np.zeros((2, 2)), 1.0)
+    assert (q == 0).all() and np.allclose(phi, expm(STIFF))
+    phi, q = linalg.van_loan(np.zeros((2, 2)), np.eye(2), 1e-300)
+    assert (phi == np.eye(2)).all() and np.allclose(q, 1e-300 * np.eye(2), rtol=1e-12, atol=0)
+
+
+def test_van_loan_forgets_completely_but_does_not_overflow() -> None:
+    phi, q = linalg.van_loan([[-1.0]], [[3.0]], 1e300)
+    assert phi == 0 and np.allclose(q, 1.5, rtol=1e-12)
+    with pytest.raises(ValueError, match="transition is finite, got 1000"):
+        linalg.van_loan(STIFF + 60 * np.eye(2), np.eye(2), 1000.0)
+
+
+def test_van_loan_keeps_noise_that_cancels_exactly() -> None:
+    """Two equal noises whose difference drives the first component: no underflow, plain zero."""
+    both = np.zeros((3, 3))
+    both[1:, 1:] = 1.0
+    q = linalg.van_loan([[0.0, 1.0, -1.0], [0, 0, 0], [0, 0, 0]], both, 1e-3)[1]
+    assert np.allclose(q, 1e-3 * both, atol=1e-30)
+
+
+def test_symmetrise_averages() -> None:
+    m = generator(1).standard_normal((2, 3, 3))
+    out = linalg.symmetrise(m)
+    assert (out == _turned(out)).all() and np.allclose(out, (m + _turned(m)) / 2)

@@ -1,0 +1,191 @@
+"""Affine triangular maps: the exact minimiser, the program as printed, and what they refuse."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from distfilt.checks import SolverError
+from distfilt.triangular import AffineMap, affine, compose
+from distfilt.triangular._conic import _program
+from distfilt.triangular.affine import fit, fit_convex, gradient, objective
+from tests.triangular.samples import rng_of, samples
+
+NAN = float("nan")
+_X = np.random.default_rng(9).standard_normal((20, 2))
+_Y = np.random.default_rng(8).standard_normal((20, 1))
+_MAP = fit(_Y, _X)
+_A = "distfilt.triangular.affine."
+BAD_INPUT = {
+    _A + "AffineMap": [
+        ("gain", lambda: AffineMap(np.zeros(1), np.zeros(2), np.zeros((1, 2)), np.eye(2))),
+        ("scale", lambda: AffineMap(np.zeros(1), np.zeros(1), np.zeros((1, 1)), -np.eye(1))),
+        ("scale", lambda: AffineMap(
+            np.zeros(1), np.zeros(2), np.zeros((2, 1)), np.ones((2, 2)))),
+        ("x", lambda: _MAP(_Y, _X[:, :1])),
+        ("y", lambda: _MAP(_X, _X)),
+        ("z", lambda: _MAP.inverse([0.1], [[NAN, 0.0]])),
+        ("y", lambda: _MAP.log_det(_X, _X)),
+    ],
+    _A + "fit": [
+        ("x", lambda: fit(_Y[:3], _X[:3])),
+        ("x", lambda: fit(_Y, np.ones((20, 2)))),
+        ("x", lambda: fit(_Y, _X[:, [0, 0]])),
+        ("x", lambda: fit(_X[:, :1], _X)),
+        ("x", lambda: fit(_Y, _X @ [[1.0, 1.0, 0.3], [0.0, 1.0, 0.7]])),
+        ("x", lambda: fit(_Y, np.column_stack([_X, np.full(20, 0.1)]))),
+        ("y", lambda: fit(_Y @ [[1.0, 0.3]], _X)),
+        ("y", lambda: fit(np.zeros((20, 1)), _X)),
+        ("y", lambda: fit(_Y[:10], _X)),
+        ("x", lambda: fit(_Y, NAN * _X)),
+    ],
+    _A + "from_moments": [
+        ("mean", lambda: affine.from_moments(0.0, np.eye(2), 1)),
+        ("cov", lambda: affine.from_moments([0.0, 1.0], np.eye(3), 1)),
+        ("m", lambda: affine.from_moments([0.0, 1.0], np.eye(2), 3)),
+        ("cov", lambda: affine.from_moments([0.0, 1.0], [[1.0, 0.5], [0.0, 1.0]], 1)),
+        ("cov", lambda: affine.from_moments([0.0, 1.0], [[1.0, 2.0], [2.0, 1.0]], 1)),
+        ("cov", lambda: affine.from_moments([0.0, 1.0], np.diag([1e12, -100.0]), 1)),
+        ("m", lambda: affine.from_moments([0.0, 1.0], np.eye(2), -1)),
+        ("y", lambda: affine.from_moments([0.0, 1.0], np.diag([0.0, 1.0]), 1)),
+        ("x", lambda: affine.from_moments([0.0, 1.0], np.ones((2, 2)), 1)),
+    ],
+    _A + "from_rows": [
+        ("rows", lambda: affine.from_rows([[0.0, 1.0]], [0.0])),
+        ("rows", lambda: affine.from_rows([[0.0, 1.0, 0.0]], [0.0])),
+        ("rows", lambda: affine.from_rows([[0, 1, 1], [0, 0, 1]], [])),
+        ("observed_mean", lambda: affine.from_rows([[0.0, 1.0, 1.0]], [NAN])),
+    ],
+    _A + "fit_convex": [
+        ("solver", lambda: fit_convex(_Y, _X, solver="SIMPLEX")),
+        ("ECOS", lambda: fit_convex(_Y, _X, max_iters=1)),
+        ("CLARABEL", lambda: fit_convex(_Y, _X, solver="CLARABEL", max_iters=1)),
+        ("max_iters", lambda: fit_convex(_Y, _X, max_iters=0)),
+        ("x", lambda: fit_convex(_Y[None], _X[None])),
+        ("x", lambda: fit_convex(_Y[:3], _X[:3])),
+    ],
+    _A + "gradient": [
+        ("samples", lambda: gradient([0.0, 1.0], [1.0])),
+        ("coefficients", lambda: gradient([1.0], [[1.0]])),
+        ("coefficients", lambda: gradient([0.0, 0.0], [[1.0]])),
+    ],
+    _A + "objective": [("x", lambda: objective(_MAP, _Y, _X[:, :1]))],
+}
+EXEMPT = {"distfilt.triangular.affine": "a module"}
+
+
+@given(st.integers(0, 10_000), st.integers(0, 4), st.integers(1, 5))
+def test_map_whitens_and_inverts(seed: int, m: int, d: int) -> None:
+    y, x = samples(seed, 60, m, d)
+    s = fit(y, x)
+    z = s(y, x)
+    assert np.allclose(z.mean(axis=0), 0, atol=1e-7)
+    assert np.allclose(z.T @ z / len(z), np.eye(d), atol=1e-6)
+    assert np.allclose(s.inverse(y, z), x, rtol=1e-9, atol=1e-9)
+
+
+def test_map_is_batched() -> None:
+    y, x = samples(3, leading=(2, 4))
+    whole, one = fit(y, x), fit(y[1, 2], x[1, 2])
+    assert np.allclose(whole(y, x)[1, 2], one(y[1, 2], x[1, 2]), atol=1e-12)
+    assert np.allclose(whole.log_det(y, x)[1, 2], one.log_det(y[1, 2], x[1, 2]))
+
+
+@given(st.integers(0, 10_000))
+def test_log_det_is_the_derivative_s(seed: int) -> None:
+    """Finite differences of the map: it is affine, so they are exact up to rounding."""
+    y, x = samples(seed)
+    s = fit(y, x)
+    moved = x[0] + np.eye(3)
+    base = s(y[:1], x[:1])
+    columns = s(np.repeat(y[:1], 3, axis=0), moved) - base
+    assert np.isclose(np.linalg.slogdet(columns)[1], s.log_det(y, x)[0], rtol=1e-9, atol=1e-9)
+    assert np.allclose(np.tril(columns.T), columns.T, atol=1e-9)
+
+
+@given(st.integers(0, 10_000))
+def test_closed_form_is_the_minimiser(seed: int) -> None:
+    """The gradient of (12) vanishes at the fit, component by component."""
+    y, x = samples(seed, m=1, d=2)
+    z = (lambda v: (v - v.mean(axis=0)) / v.std(axis=0))(np.hstack([y, x]))
+    s = fit(z[:, :1], z[:, 1:])
+    rows = np.linalg.solve(s.scale, np.hstack([-s.gain, np.eye(2)]))
+    offsets = np.linalg.solve(s.scale, s.gain @ s.observed_mean - s.mean)
+    for k in range(2):
+        u = np.concatenate([[offsets[k]], rows[k, : k + 2]])
+        assert np.abs(gradient(u, z[:, : k + 2])).max() < 1e-8
+
+
+def test_gradient_agrees_with_finite_differences() -> None:
+    z = samples(4)[1]
+    u = np.array([0.3, -0.2, 0.5, 0.8])
+
+    def loss(c: np.ndarray) -> float:
+        values = c[0] + z @ c[1:]
+        return float((0.5 * values**2).mean() - np.log(c[-1]))
+
+    steps = 1e-6 * np.eye(4)
+    numeric = [(loss(u + h) - loss(u - h)) / 2e-6 for h in steps]
+    assert np.abs(numeric - gradient(u, z)).max() < 1e-6 * np.abs(numeric).max()
+
+
+@pytest.mark.parametrize("solver", ["ECOS", "CLARABEL"])
+def test_the_printed_program_has_the_same_composed_map(solver: str) -> None:
+    """(12) per component at the solver's default tolerances: 1e-8; its coefficients only 1e-4."""
+    rng = rng_of(6)
+    x = rng.standard_normal((200, 6)) @ np.diag([1, 2, 1, 0.5, 1, 1.5])
+    y = x[:, :4] + 0.5 * rng.standard_normal((200, 4))
+    observed = x[0, :4]
+    exact, solved = fit(y, x), fit_convex(y, x, solver=solver)
+    gap = compose(exact, y, x, observed) - compose(solved, y, x, observed)
+    assert np.abs(gap).max() < 1e-8
+    assert np.abs(exact.scale - solved.scale).max() < 1e-4
+    assert objective(exact, y, x) <= objective(solved, y, x) + 1e-12
+
+
+def test_a_solver_that_stops_short_raises_its_status() -> None:
+    with pytest.raises(SolverError, match="component 2"):
+        fit_convex(_Y, _X, max_iters=1)
+
+
+def test_moments_are_looked_at() -> None:
+    """Moments by hand: the map of a Gaussian (y, x1, x2) with a full covariance."""
+    mean, cov = np.array([1.0, -2.0, 3.0]), np.array(
+        [[2.0, 0.8, -0.4], [0.8, 1.0, 0.3], [-0.4, 0.3, 1.5]])
+    s = affine.from_moments(mean, cov, 1)
+    gain = cov[1:, :1] / 2.0
+    left = cov[1:, 1:] - gain @ cov[:1, 1:]
+    assert np.allclose(s.gain, gain) and np.allclose(s.scale @ s.scale.T, left)
+    assert np.allclose(s.mean, mean[1:]) and np.allclose(s.observed_mean, mean[:1])
+
+
+def test_rows_and_moments_are_one_map() -> None:
+    y, x = samples(21, m=2, d=3)
+    s = fit(y, x)
+    rows = np.linalg.solve(s.scale, np.hstack([-s.gain, np.eye(3)]))
+    rows[:, 2:] = np.tril(rows[:, 2:])
+    offset = np.linalg.solve(s.scale, s.gain @ s.observed_mean - s.mean)
+    again = affine.from_rows(np.hstack([offset[:, None], rows]), [5.0, -3.0])
+    assert np.allclose(again(y, x), s(y, x), atol=1e-7)
+
+
+def test_the_program_is_compiled_once_for_each_size() -> None:
+    _program.cache_clear()
+    for seed in (1, 2):
+        y, x = samples(seed, m=1, d=2)
+        y, x = (y - y.mean(0)) / y.std(0), (x - x.mean(0)) / x.std(0)
+        gap = compose(fit(y, x), y, x, y[0]) - compose(fit_convex(y, x), y, x, y[0])
+        assert np.abs(gap).max() < 1e-6
+    info = _program.cache_info()
+    assert (info.misses, info.hits) == (2, 2) and info.maxsize is not None
+
+
+def test_the_program_forgets_the_samples_before() -> None:
+    """The same samples, after others and under another solver: the same bits."""
+    y, x = samples(3, m=1, d=2)
+    first = fit_convex(y, x)
+    fit_convex(*samples(4, m=1, d=2))
+    fit_convex(y, x, solver="CLARABEL")
+    assert np.array_equal(fit_convex(y, x).scale, first.scale)
