@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -32,6 +33,7 @@ __all__ = [
 ]
 
 Move = Callable[[Array], Array]
+Indices = NDArray[np.int64]
 
 
 def zero_mean_prior(
@@ -293,8 +295,11 @@ def shared_step(
     s = state.basis
     vector = state.vector + (precision * (y - state.base)) @ s
     informed = precision.any(axis=-1)
-    information = state.information.copy()
-    information[informed] += _weighted_products(s, precision[informed])
+    if informed.all():
+        information = state.information + _weighted_products(s, precision)
+    else:
+        information = state.information.copy()
+        information[informed] += _weighted_products(s, precision[informed])
     return Shared(s, state.base, information, vector)
 
 
@@ -303,12 +308,19 @@ def _weighted_products(s: Array, weights: Array) -> Array:
     r = s.shape[1]
     if len(weights) < r // 16:
         return np.stack([(s.T * w) @ s for w in weights])
+    rows, columns, place = _pairs(r)
+    turned = np.ascontiguousarray(s.T)
+    half = weights @ (turned[rows] * turned[columns]).T
+    return np.asarray(np.take(half, place, axis=1).reshape(len(weights), r, r))
+
+
+@lru_cache(maxsize=8)
+def _pairs(r: int) -> tuple[Indices, Indices, Indices]:
+    """Rows and columns of an upper triangle, and where each entry of the whole matrix is in it."""
     rows, columns = np.triu_indices(r)
-    half = weights @ (s[:, rows] * s[:, columns])
-    out = np.empty((len(weights), r, r))
-    out[:, rows, columns] = half
-    out[:, columns, rows] = half
-    return out
+    place = np.empty((r, r), dtype=np.int64)
+    place[rows, columns] = place[columns, rows] = np.arange(rows.size)
+    return rows, columns, place.ravel()
 
 
 @dataclass(frozen=True, eq=False)
