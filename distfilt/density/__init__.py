@@ -11,7 +11,6 @@ from .gain import (
     shared_moved,
     shared_start,
     shared_step,
-    zero_mean_prior,
 )
 from .grid import Grid
 from .kernel import (
@@ -22,6 +21,7 @@ from .kernel import (
     kernel_information,
     kernels,
 )
+from .prior import zero_mean_prior
 from .sharing import Centralised, DynamicAverage, Flooding, Neighbours, PIConsensus, Sharing
 
 __all__ = [

@@ -171,7 +171,7 @@ _DENSE = Dense(np.ones(16), np.eye(16))
 _LOW = LowRank(np.ones(16), _S)
 _Y, _R = np.ones(16), np.ones(16)
 BAD_INPUT = {
-    "distfilt.density.gain.zero_mean_prior": [
+    "distfilt.density.prior.zero_mean_prior": [
         ("grid", lambda: zero_mean_prior(3, rank=3)),
         ("rank", lambda: zero_mean_prior(Grid((4, 4)), rank=16)),
         ("length", lambda: zero_mean_prior(Grid((4, 4)), rank=3, length=0.0)),
