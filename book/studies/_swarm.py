@@ -1,33 +1,25 @@
 """A swarm's local density filters: the paper's, its variants, and flooding, on the same agents.
 
-One trial draws agents from a uniform and from a peaked density, moves them by one reading of (23),
-and runs every scheme on the same positions with eight local filters. It stores errors averaged
-over the last part of the run, and the numbers sent.
+Chapter 10 runs it live: every scheme sees the same positions, with eight local filters.
 """
 
 from __future__ import annotations
 
 import sys
-from itertools import product
 from pathlib import Path
 from typing import Any
 
-import cloudpickle
 import numpy as np
 
 from distfilt import density
 from distfilt.filters import DensityFilter
 from distfilt.network import Faults
-from distfilt.studies import spawn
 
 sys.path.insert(0, str(Path(__file__).parent))
 import densities
 
-cloudpickle.register_pickle_by_value(densities)
-
-NAME, PAPER = "swarm", "zheng"
 SWARM, CHOICES = densities.SWARM, densities.CHOICES
-LOCAL, END, FROM = 8, 40.0, 20.0
+LOCAL, END = 8, 20.0
 GAINS = {"alpha": SWARM["pi_alpha"], "a": SWARM["pi_proportional"]}
 PAPERS = {**GAINS, "b": SWARM["pi_integral"]}
 FAST = {**GAINS, "b": 10 * SWARM["pi_integral"]}
@@ -41,19 +33,6 @@ SCHEMES: dict[str, tuple[Any, dict[str, Any]]] = {
     "paper_half": (density.PIConsensus(modes=64, **PAPERS), {"faults": Faults(loss=0.5, seed=3)}),
     "neighbours": (density.Neighbours(), {}),
 }
-READING = "slowgibbs"
-CASES = {"uniform": tuple(SCHEMES), "peaked": ("central", "paper", "flooding")}
-parameters = {
-    **densities.parameters, "local": LOCAL, "end": END, "from": FROM,
-}
-seeds = spawn(CHOICES["seed"] + 1, 4)
-rtol = 1e-4
-columns = [
-    *(f"{start}_{scheme}_{what}" for start, schemes in CASES.items()
-      for scheme, what in product(schemes, ("error", "consensus"))),
-    *(f"{start}_{name}" for start, name in product(CASES, ("kde", "open", "open_flat"))),
-    *(f"scalars_{scheme}" for scheme in SCHEMES),
-]
 
 
 def network(scheme: str, reading: str, agents: int, local: int = LOCAL) -> DensityFilter:
@@ -100,21 +79,3 @@ def compared(
         note("open", cells.norm(opened[0] - p))
         note("open_flat", cells.norm(opened[1] - p))
     return {name: np.array(values) for name, values in out.items()}, states
-
-
-def trial(seed: np.random.SeedSequence) -> list[float]:
-    """One run of all cases, in the order of `columns`."""
-    found: dict[str, float] = {}
-    skip = round(FROM / SWARM["dt"])
-    for (start, schemes), part in zip(CASES.items(), seed.spawn(len(CASES)), strict=True):
-        errors, states = compared(READING, start, np.random.default_rng(part), schemes)
-        found |= {f"{start}_{k}": float(v[skip:].mean()) for k, v in errors.items()}
-        steps = round(END / SWARM["dt"])
-        for s, state in states.items():
-            links = max(float(state.ledger.messages.sum()), 1.0)
-            sent = float(state.ledger.scalars.sum()) / links * state.ledger.rounds / steps
-            found[f"scalars_{s}"] = sent
-    return [found[c] for c in columns]
-
-
-code: tuple[Any, ...] = (network, compared, densities.first_agents, densities.first_density)
