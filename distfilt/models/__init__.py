@@ -26,10 +26,21 @@ from .satellite import (
     clohessy_wiltshire_drift,
     clohessy_wiltshire_transition,
 )
+from .swarm import (
+    READINGS,
+    RotatingMixture,
+    Swarm,
+    mobility_and_diffusion,
+    reflected,
+    rotating_swarm,
+)
 
 __all__ = [
+    "READINGS",
     "LinearModel",
     "Model",
+    "RotatingMixture",
+    "Swarm",
     "angular_acceleration",
     "attitude",
     "clohessy_wiltshire",
@@ -47,9 +58,12 @@ __all__ = [
     "pendulum_energy",
     "pendulum_rate",
     "pendulum_states",
+    "mobility_and_diffusion",
     "quaternion_rate",
+    "reflected",
     "rk4",
     "rk4_jacobian",
+    "rotating_swarm",
     "rotation_matrix",
     "satellite_pose",
     "simulate",
