@@ -71,14 +71,14 @@ def setup(name: str, **changes: Any) -> Setup:
     if name == "table-2":
         make = partial(clohessy_wiltshire, rate=s["orbital_rate"])
         offset, variance = s["prior_offset"] * np.ones(6), s["prior_variance"] * np.ones(6)
-    else:
+    elif name == "table-3":
         make = partial(satellite_pose, rate=s["orbital_rate"], step=s["integration_step"])
         if make(sigma=0.0).names != tuple(s["state_order"]):
             raise ValueError(f"state_order: needs that of satellite_pose, got {s['state_order']}")
-        offset, variance = (
-            np.repeat([s[f"prior_{what}_{part}"] for part in ("translation", "attitude")], [6, 7])
-            for what in ("offset", "variance")
-        )
+        moved, wide = s["prior_offset_translation"], s["prior_variance_translation"]
+        turned, loose = s["prior_offset_attitude"], s["prior_variance_attitude"]
+        offset = np.repeat([moved, turned], [6, 7])
+        variance = np.repeat([wide, loose], [6, 7])
     n = round((s["end_time"] - s["first_observation"]) / dt) + 1
     times = np.round(s["first_observation"] + dt * np.arange(n), 10)
     return Setup(
