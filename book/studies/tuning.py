@@ -11,15 +11,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import cloudpickle
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-import satellites
+import _satellites as satellites
 
 from distfilt.network import pull
-
-cloudpickle.register_pickle_by_value(satellites)
 
 NAME, PAPER, BATCH = "tuning", "grange", 1
 GAINS = (0.0, 0.02, 0.05, 0.1, 0.15)
@@ -37,11 +34,9 @@ columns = [
     for k in range(len(GAINS))
     for what in ("mse", "nees")
 ]
-parameters = {
-    "gains": list(GAINS), "seed": 7, "runs": 8,
-    "scenarios": [s.scenario.digest for s in SETUPS.values()],
-}  # fmt: skip
+parameters = {"gains": list(GAINS), "seed": 7, "runs": 8}
 seeds = np.random.SeedSequence(7).spawn(8)
+scenarios = tuple(s.scenario for s in SETUPS.values())
 rtol = 1e-4
 
 
