@@ -10,13 +10,10 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-import cloudpickle
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-import satellites
-
-cloudpickle.register_pickle_by_value(satellites)
+import _satellites as satellites
 
 NAME, PAPER, BATCH = "readings", "grange", 5
 ORBIT = float(np.sqrt(3.986004418e14 / 8.413e6**3))
@@ -26,11 +23,9 @@ FACTORS = {"none": 0.0, "hundredth": 0.01}
 VERSIONS = {"bare": False, "pca": True}
 NAMES = [f"{rate}_{noise}_{v}" for rate in SETUPS for noise in FACTORS for v in VERSIONS]
 columns = [f"{name}_mse_{r}" for name in NAMES for r in range(BATCH)]
-parameters = {
-    "batch": BATCH, "seed": 2024, "orbit": ORBIT, "factors": FACTORS,
-    "scenario": SETUP.scenario.digest,
-}  # fmt: skip
+parameters = {"batch": BATCH, "seed": 2024, "orbit": ORBIT, "factors": FACTORS}
 seeds = np.random.SeedSequence(satellites.SEED).spawn(SETUP.runs // BATCH)
+scenarios = (SETUP.scenario,)
 rtol = 1e-3
 
 
