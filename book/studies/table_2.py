@@ -20,7 +20,7 @@ from distfilt.sensors import stack
 
 NAME, PAPER, BATCH = "table-2", "grange", 5
 SETUP = satellites.setup("table-2")
-TUNED = {"pca": False, "include_self": False, "gain": 0.05}
+TUNED = {"pca": False, "include_self": False, "gain": 0.1}
 REPAIRED = ("sampled_fused", "known_pulled", "known_fused")
 EXACT = ("exact", "exact_again", "exact_once_more")
 CENTRAL = ("extended", "iterated")
