@@ -36,6 +36,7 @@ from pages import (
     escape_stars,
     keep_sliders,
     number_chapters,
+    plain_types,
     write_generated,
 )
 
@@ -103,6 +104,7 @@ bibtex_default_style = "plain"
 
 autodoc_typehints = "signature"
 toc_object_entries = False
+add_module_names = False
 autodoc_member_order = "bysource"
 autodoc_type_aliases = {"Array": "Array", "ArrayLike": "ArrayLike"}
 autodoc_preserve_defaults = True
@@ -181,4 +183,5 @@ def setup(app: Sphinx) -> None:
     app.connect("doctree-read", lambda app, tree: drop_widgets(tree))
     app.connect("doctree-read", lambda app, tree: keep_sliders(tree))
     app.connect("autodoc-process-docstring", lambda *event: escape_stars(event[-1]))
+    app.connect("autodoc-process-signature", lambda *event: tuple(map(plain_types, event[-2:])))
     app.connect("build-finished", copy_mathjax)

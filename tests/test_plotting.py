@@ -180,6 +180,24 @@ def test_importing_plotting_does_not_load_matplotlib():
     assert out.stdout.strip() == "False"
 
 
+def test_without_matplotlib_the_error_names_the_extra():
+    code = """
+import sys
+sys.modules["matplotlib"] = None
+from distfilt import plotting as p
+calls = [p.use_style, lambda: p.axes(xlabel="x", ylabel="y"), lambda: p.save(None, "a.png"),
+         lambda: p.band(None, [0, 1], [[0, 1]]), lambda: p.slider(print, [1], label="x", alt="y")]
+for call in calls:
+    try:
+        call()
+    except ModuleNotFoundError as error:
+        print(error)
+"""
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    wanted = "matplotlib: needs the extra plots: pip install 'distfilt[plots]'"
+    assert out.stdout.splitlines() == [wanted] * 5
+
+
 # --- figures ----------------------------------------------------------------------------------
 
 # Machado, Oliveira and Fernandes (2009), severity 1, for linear RGB: how each reader sees a colour.

@@ -4,7 +4,7 @@ The Clohessy-Wiltshire equations do not couple the motion along the orbit's norm
 Kalman filter holds the plane (x, y, vx, vy), which the positions and velocities determine;
 particles hold (z, vz), and the angle weighs them with y integrated out over the plane's Gaussian.
 What the angle tells about y is left out; beyond the first second that is next to nothing. The data
-are those of the study in `satellites.py`, trial by trial.
+are those of Fig. 1, batch by batch.
 """
 
 from __future__ import annotations
@@ -13,94 +13,104 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import cloudpickle
 import numpy as np
 
-from distfilt.ensembles import draw
-from distfilt.kalman import predict, systematic, update
-from distfilt.linalg import factor
-
 sys.path.insert(0, str(Path(__file__).parent))
-import satellites
+import _satellites as satellites
 
-cloudpickle.register_pickle_by_value(satellites)
+from distfilt.ensembles import draw
+from distfilt.kalman import kalman_filter
+from distfilt.linalg import factor
+from distfilt.updates import resampled
 
-NAME, PAPER = "bound", "grange"
+NAME, PAPER, BATCH = "bound", "grange", 5
+SETUP = satellites.setup("table-2")
 PLANE, NORMAL = [0, 1, 3, 4], [2, 5]
-columns = ["mse", "nees", "crps_z", "least_share"]
-parameters = {**satellites.parameters, "particles": 20_000, "nodes": 7}
-seeds = satellites.seeds
+APPLIES = [(a.kind, list(a.dims)) for a in SETUP.scenario.agents] == [
+    ("direct", [0, 1]), ("angle", [1, 2]), ("direct", [3, 4, 5])
+]  # fmt: skip
+columns = [
+    *(f"bound_{what}_{r}" for what in ("mse", "nees", "share") for r in range(BATCH)),
+    *satellites.time_columns("bound"),
+]
+parameters = {
+    "batch": BATCH, "seed": 2024, "particles": 10_000, "nodes": 7}  # fmt: skip
+seeds = np.random.SeedSequence(satellites.SEED).spawn(SETUP.runs // BATCH)
+scenarios = (SETUP.scenario,)
 rtol = 1e-4
 
 
 def weighed(
-    angle: float, z: np.ndarray, y: float, variance: float, noise: float
+    angle: np.ndarray, z: np.ndarray, y: np.ndarray, variance: float, noise: float
 ) -> np.ndarray:
-    """Log likelihood of an angle for each z, with y ~ N(y, variance) integrated out."""
+    """Log likelihood (R, n) of an angle for each z, with y ~ N(y, variance) integrated out."""
     nodes, shares = np.polynomial.hermite_e.hermegauss(parameters["nodes"])
-    places = y + np.sqrt(variance) * nodes
-    gap = angle - np.arctan2(z[:, None], places)
+    places = y[:, None, None] + np.sqrt(variance) * nodes
+    gap = angle[:, None, None] - np.arctan2(z[..., None], places)
     gap = (gap + np.pi / 2) % np.pi - np.pi / 2
     likelihood = np.exp(-0.5 * gap**2 / noise) @ (shares / shares.sum())
     return np.asarray(np.log(np.maximum(likelihood, 1e-300)))
 
 
-def resampled(
-    points: np.ndarray, log_weights: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-    """Moments before, and equally weighted points after resampling; the effective share."""
-    w = np.exp(log_weights - log_weights.max())
-    w /= w.sum()
-    mean = w @ points
-    spread = (points - mean).T @ ((points - mean) * w[:, None])
-    share = 1 / (w**2).sum() / w.size
-    return mean, spread, share, points[systematic(w, rng=rng)]
+def plane(seen: list[np.ndarray], phi: np.ndarray, q: np.ndarray) -> Any:
+    """The Kalman filter of what the positions and two velocities say of the plane."""
+    block = np.ix_(PLANE, PLANE)
+    stds = [s.cov[0, 0] for s in SETUP.sensors]
+    return kalman_filter(
+        SETUP.prior[0][PLANE], SETUP.prior[1][block],
+        np.concatenate([seen[0], seen[2][..., :2]], axis=-1),
+        F=phi[block], Q=q[block], H=np.eye(4), R=np.diag([stds[0]] * 2 + [stds[2]] * 2),
+    )  # fmt: skip
 
 
-def score_z(points: np.ndarray, truth: float) -> float:
-    """CRPS of the particles' z."""
-    from distfilt.metrics import crps
-
-    return float(crps(points[:, :1], np.array([truth]))[0])
-
-
-def trial(seed: np.random.SeedSequence) -> list[float]:
-    """One run: settled squared error, NEES, CRPS of z, and the least effective share."""
-    part = seed.spawn(2)[0]
-    for_data, _ = part.spawn(2)
-    times, truth, (position, angle, velocity) = satellites.data(
-        "II", np.random.default_rng(for_data)
-    )
-    setting, model = satellites.TABLES["II"], satellites.model("II")
-    rng = np.random.default_rng(part.spawn(1)[0])
-    x0 = np.array(setting["initial_state"]) + setting["prior_offset"]
-    eye = setting["prior_variance"] * np.eye(6)
-    mean, cov = x0[PLANE], eye[:4, :4]
-    points = draw(x0[NORMAL], eye[:2, :2], parameters["particles"], rng=rng)
-    dt = float(times[0])
-    phi, q = model.transition(dt), model.noise(0.0, dt)
-    root = factor(q[np.ix_(NORMAL, NORMAL)])
-    plane = np.vstack([position.T, velocity[:, :2].T]).T
-    in_metres, in_rad, in_metres_a_second = (a.noise for a in setting.agents)
-    noise = np.diag([in_metres] * 2 + [in_metres_a_second] * 2) ** 2
-    rows: list[list[float]] = []
-    for k, t in enumerate(times):
-        mean, cov = predict(
-            mean, cov, F=phi[np.ix_(PLANE, PLANE)], Q=q[np.ix_(PLANE, PLANE)]
+def trial(seed: np.random.SeedSequence) -> dict[str, float]:
+    """A batch of runs: settled error, NEES/d and least effective share; error and NEES in time."""
+    if not APPLIES:  # a reader's sensors: there is no such split of the state
+        return dict.fromkeys(columns, float("nan"))
+    for_data, _ = seed.spawn(2)
+    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    rng, n = np.random.default_rng(seed.spawn(1)[0]), parameters["particles"]
+    dt = float(SETUP.times[0])
+    phi, q = SETUP.model.transition(dt), SETUP.model.noise(0.0, dt)
+    flat = plane(seen, phi, q)
+    block = np.ix_(NORMAL, NORMAL)
+    root, noise = factor(q[block]), [s.cov[0, 0] for s in SETUP.sensors]
+    points = draw(SETUP.prior[0][NORMAL], SETUP.prior[1][block], n, rng=rng, leading=(BATCH,))
+    errors, scores, shares = [], [], []
+    for k in range(SETUP.times.size):
+        points = points @ phi[block].T + rng.standard_normal(points.shape) @ root.T
+        log = -0.5 * (seen[2][k, :, 2, None] - points[..., 1]) ** 2 / noise[2]
+        cov = np.broadcast_to(flat.covariances[k], (BATCH, 4, 4))
+        log += weighed(
+            seen[1][k, :, 0], points[..., 0], flat.means[k, :, 1], cov[0, 1, 1], noise[1]
         )
-        mean, cov, _ = update(mean, cov, plane[k], H=np.eye(4), R=noise)
-        points = points @ phi[np.ix_(NORMAL, NORMAL)].T
-        points = points + rng.standard_normal(points.shape) @ root.T
-        log_weights = -0.5 * ((velocity[k, 2] - points[:, 1]) / in_metres_a_second) ** 2
-        log_weights += weighed(angle[k, 0], points[:, 0], mean[1], cov[1, 1], in_rad**2)
-        normal, spread, share, points = resampled(points, log_weights, rng)
-        gap = truth[k] - np.array([*mean[:2], normal[0], *mean[2:], normal[1]])
-        nees = gap[PLANE] @ np.linalg.solve(cov, gap[PLANE])
-        nees += gap[NORMAL] @ np.linalg.solve(spread, gap[NORMAL])
-        if t > setting["average_from"]:
-            rows.append([gap @ gap, nees, score_z(points, truth[k, 2]), share])
-    settled = np.array(rows)
-    return [*settled[:, :3].mean(axis=0), float(settled[:, 3].min())]
+        w = np.exp(log - log.max(axis=1, keepdims=True))
+        w /= w.sum(axis=1, keepdims=True)
+        mean = np.einsum("rn,rnj->rj", w, points)
+        off = points - mean[:, None]
+        spread = np.einsum("rn,rni,rnj->rij", w, off, off)
+        in_plane, along = truth[k][:, PLANE] - flat.means[k], truth[k][:, NORMAL] - mean
+        errors.append((in_plane**2).sum(axis=1) + (along**2).sum(axis=1))
+        scores.append(squared(in_plane, cov) + squared(along, spread))
+        shares.append(1 / (w**2).sum(axis=1) / n)
+        points = np.take_along_axis(points, resampled(w, rng=rng)[..., None], axis=1)
+    return stored(np.array(errors), np.array(scores) / 6, np.array(shares))
 
 
-code: tuple[Any, ...] = (weighed, resampled, score_z)
+def squared(gap: np.ndarray, cov: np.ndarray) -> np.ndarray:
+    """Normalised squared errors (R,)."""
+    return np.einsum("ri,ri->r", gap, np.linalg.solve(cov, gap[..., None])[..., 0])
+
+
+def stored(errors: np.ndarray, scores: np.ndarray, shares: np.ndarray) -> dict[str, float]:
+    """What is stored of the series (T, R)."""
+    late = SETUP.settled
+    out = satellites.over_time("bound", errors, scores)
+    for r in range(BATCH):
+        out[f"bound_mse_{r}"] = float(errors[late, r].mean())
+        out[f"bound_nees_{r}"] = float(scores[late, r].mean())
+        out[f"bound_share_{r}"] = float(shares[late, r].min())
+    return out
+
+
+code = (weighed, plane, squared, stored, satellites.data)

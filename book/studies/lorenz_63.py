@@ -10,10 +10,9 @@ from functools import partial
 
 import numpy as np
 
-from distfilt.models import simulate
-from distfilt.models.lorenz import lorenz63
+from distfilt.models import lorenz63, simulate
 from distfilt.triangular import affine, separable
-from distfilt.triangular.conditioning import affine_update
+from distfilt.updates import transport
 
 NAME = "lorenz-63"
 PAPER = "grange"
@@ -54,7 +53,7 @@ def scores(name, fit, members, truth, seen, rng):
     noise = VARIANCE * np.eye(3)
     for k, y in enumerate(seen):
         members = model.step(members, 0.0, DT)
-        members = affine_update(members, members, y, noise, rng=rng, fit=fit)
+        members = transport(members, members, y, noise, rng=rng, fit=fit)
         if k >= BURN:
             gap = members.mean(axis=0) - truth[k]
             errors.append(np.sqrt((gap**2).mean()))

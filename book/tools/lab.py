@@ -1,4 +1,4 @@
-"""Open JupyterLab on a working copy of the book: nothing read or saved there changes the repository.
+"""Open JupyterLab on a working copy of the book; what is saved there is not the repository's.
 
     python book/tools/lab.py FOLDER [--no-open]
 

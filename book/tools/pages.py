@@ -87,12 +87,8 @@ def modules() -> list[str]:
 
 
 def directive(module: Any, name: str) -> list[str]:
-    """Return the lines that document one public name."""
+    """Return the lines that document one public name of the module that defines it."""
     value = getattr(module, name)
-    home = getattr(value, "__module__", module.__name__)
-    if callable(value) and home != module.__name__ and home.startswith("distfilt"):
-        role = "class" if inspect.isclass(value) else "func"
-        return [f"``{name}`` is :py:{role}:`{home}.{name}`.", ""]
     if isinstance(value, types.GenericAlias):
         meaning = ModuleAnalyzer.for_module(module.__name__).find_attr_docs().get(("", name), [])
         shown = str(value).replace("typing.", "").replace("numpy.", "np.")
@@ -103,6 +99,21 @@ def directive(module: Any, name: str) -> list[str]:
     if inspect.isfunction(value):
         return [f".. autofunction:: {module.__name__}.{name}", ""]
     return [f".. autodata:: {module.__name__}.{name}", "   :no-value:", ""]
+
+
+def home_of(module: Any, name: str) -> str:
+    """Return the module that defines a public name, which packages hand on."""
+    value = getattr(module, name)
+    if isinstance(value, types.ModuleType):
+        return value.__name__
+    home = str(getattr(value, "__module__", "") or "")
+    own = home.startswith("distfilt") and hasattr(value, "__qualname__")
+    return home if own else module.__name__
+
+
+def plain_types(signature: str | None) -> str | None:
+    """Return a signature without the builder's own word around the names of our types."""
+    return signature and re.sub(r"TypeAliasForwardRef\('([\w.]+)'\)", r"\1", signature)
 
 
 def escape_stars(lines: list[str]) -> None:
@@ -120,19 +131,54 @@ def summary(module: Any) -> str:
     return cell(first)
 
 
-def api_text() -> str:
-    """Return the API reference: a list of modules, then every name of each ``__all__``."""
-    index, lines = ["| Module | What it is for |", "|---|---|"], []
+FIRST = ("filters", "updates", "network", "sensors", "models", "metrics", "kalman", "triangular")
+"""What a reader looks for first; the other parts follow in alphabetical order."""
+
+
+def parts() -> dict[str, list[str]]:
+    """Return the library's parts in the order of the page, each with its modules."""
+    found: dict[str, list[str]] = {}
     for name in modules():
-        if name == "distfilt":
-            continue
-        module = importlib.import_module(name)
-        anchor = "api-" + name.replace(".", "-").replace("_", "-")
-        index += [f"| [`{name}`](#{anchor}) | {summary(module)} |"]
-        body = [f".. automodule:: {name}", "   :no-members:", ""]
-        for public in getattr(module, "__all__", ()):
-            body += directive(module, public)
-        lines += [f"({anchor})=", f"## `{name}`", "", "```{eval-rst}", *body, "```", ""]
+        if name != "distfilt":
+            found.setdefault(name.split(".")[1], []).append(name)
+    order = [*(p for p in FIRST if p in found), *sorted(p for p in found if p not in FIRST)]
+    return {part: found[part] for part in order}
+
+
+def anchor(name: str) -> str:
+    """Return the label of a module's section."""
+    return "api-" + name.replace(".", "-").replace("_", "-")
+
+
+def links(module: Any) -> str:
+    """Return links to what a part's face offers, in the order of its names."""
+    out = []
+    for name in module.__all__:
+        home, value = home_of(module, name), getattr(module, name)
+        if isinstance(value, types.ModuleType):
+            out.append(f"[`{name}`](#{anchor(home)})")
+        else:
+            out.append("{py:obj}`" + f"{name} <{home}.{name}>`")
+    return ", ".join(out)
+
+
+def api_text() -> str:
+    """Return the API reference: an index of one screen, then part by part what each module has."""
+    index, lines = ["| Part | What it is for | Names |", "|---|---|---|"], []
+    for part, names in parts().items():
+        face = importlib.import_module(f"distfilt.{part}")
+        head = f"distfilt.{part}"
+        index += [f"| [`{part}`](#{anchor(head)}) | {summary(face)} | {links(face)} |"]
+        lines += [f"({anchor(head)})=", f"## `{head}`", ""]
+        for name in names:
+            module = importlib.import_module(name)
+            own = [n for n in module.__all__ if home_of(module, n) == name]
+            if name != head:
+                lines += [f"({anchor(name)})=", f"### `{name}`", ""]
+            body = [f".. automodule:: {name}", "   :no-members:", ""]
+            for public in own:
+                body += directive(module, public)
+            lines += ["```{eval-rst}", *body, "```", ""]
     return "\n".join([*index, "", *lines])
 
 

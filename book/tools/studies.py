@@ -17,7 +17,6 @@ Metrics go to ``data/studies/PAPER/NAME.csv``; ``studies.stored(PAPER, NAME)`` f
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
 import re
 import sys
@@ -46,16 +45,8 @@ def load_script(path: Path) -> ModuleType:
     ValueError
         If it lacks one of the names, or NAME or PAPER is not one.
     """
-    spec = importlib.util.spec_from_file_location(f"stored_study_{path.stem}", path)
-    if spec is None or spec.loader is None:
-        raise ValueError(f"{path.name}: cannot be imported")
-    script = importlib.util.module_from_spec(spec)
-    # inspect finds a class's source through sys.modules.
-    sys.modules[spec.name] = script
+    script = studies.script(path)
     folder = str(path.parent.resolve())
-    if folder not in sys.path:
-        sys.path.insert(0, folder)
-    spec.loader.exec_module(script)
     # A worker cannot import these by their names: send their functions themselves.
     for module in list(sys.modules.values()):
         if str(getattr(module, "__file__", None) or "").startswith(f"{folder}/"):

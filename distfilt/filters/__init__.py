@@ -1,5 +1,6 @@
 """Filters: a model, sensors, an update and a network, put together on one contract."""
 
+from .density import DensityFilter, DensityState
 from .driver import Filter, Late, Summary, final_state
 from .ensemble import EnsembleFilter, EnsembleState
 from .failures import FilterError
@@ -9,6 +10,8 @@ from .saving import State
 from .wiring import SensorFilter
 
 __all__ = [
+    "DensityFilter",
+    "DensityState",
     "EnsembleFilter",
     "EnsembleState",
     "Filter",

@@ -166,8 +166,21 @@ def _has_nees(summary: Any) -> bool:
 
 def _nees(summary: Any, known: Array, keep: Any) -> Array:
     if summary.covariance is not None:
-        return nees(summary.mean[keep], summary.covariance[keep], known[keep])
+        return _nees_or_infinite(summary.mean[keep], summary.covariance[keep], known[keep])
     return ensemble_nees(summary.members[keep], known[keep])
+
+
+def _nees_or_infinite(mean: Array, cov: Array, known: Array) -> Array:
+    """NEES; infinite where a cloud has collapsed, so that its covariance claims certainty."""
+    try:
+        return nees(mean, cov, known)
+    except ValueError:
+        values = np.linalg.eigvalsh(cov)
+        sure = values[..., 0] <= 1e-12 * np.abs(values[..., -1])
+        if not sure.any():
+            raise
+        some = np.where(sure[..., None, None], np.eye(cov.shape[-1]), cov)
+        return np.where(sure, np.inf, nees(mean, some, known))
 
 
 def _crps(summary: Any, known: Array, keep: Any) -> Array:

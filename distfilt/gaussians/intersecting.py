@@ -159,10 +159,11 @@ def intersection_weights(
     in the limit would have made them grow. So a limit meets the conditions.
 
     These steps are sure and slow. So each is preceded by a Newton step on the simplex, which stays
-    positive, and which counts where it halves :math:`\max_bg_b/\bar g-1`; else the sure step does.
-    The end is where that gap is below :math:`10^{-7}`: by convexity the log-determinant is then
-    within :math:`10^{-7}d` of the least, the trace within a share of :math:`10^{-7}`. After 60
-    steps, where rounding hides the gap, the weights with the least gap are returned.
+    positive, and which counts where it gains a share of what its slope promised; else the sure step
+    does. The end is where :math:`\max_bg_b/\bar g-1` is below :math:`10^{-7}`: by convexity the
+    log-determinant is then within :math:`10^{-7}d` of the least, the trace within a share of
+    :math:`10^{-7}`. After 60 steps, where rounding hides the gap, the weights with the least gap
+    are returned.
 
     Examples
     --------

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..checks import Array
-from ..linalg import _cholesky, _solve_lower
+from ..linalg import _cholesky, _log_det, _solve_lower
 
 __all__: list[str] = []
 
@@ -36,16 +36,14 @@ def _iterated(covs: Array, here: NDArray[np.bool_], determinant: bool) -> Array:
     problem = _Problem(roots, _square(roots.swapaxes(-1, -2)), lower[:, 0], there, determinant)
     point = there / there.sum(axis=-1, keepdims=True)
     best, sure = point.copy(), point
-    left, lowest, certain = np.arange(len(point)), np.full(len(point), np.inf), np.array(True)
+    left, lowest = np.arange(len(point)), np.full(len(point), np.inf)
+    bound = lowest
     for _ in range(_STEPS):
-        slope, curvature = problem.derivatives(point)
+        value, slope, curvature = problem.derivatives(point)
         mean = (point * slope).sum(axis=-1, keepdims=True)
         gap = slope.max(axis=-1) / mean[:, 0] - 1
-        # What is settled stays: the others' need for more steps must not move it.
-        lower_gap = (gap < lowest) & (lowest > _GAP)
+        lower_gap = gap < lowest
         best[left[lower_gap]] = point[lower_gap]
-        # A Newton step has to halve the gap; where it does not, its start's sure step counts.
-        taken = certain | (gap < 0.5 * lowest)
         lowest = np.where(lower_gap, gap, lowest)
         open_ = lowest > _GAP
         if not open_.any():
@@ -54,11 +52,17 @@ def _iterated(covs: Array, here: NDArray[np.bool_], determinant: bool) -> Array:
         ratio = slope / mean
         scaled = point * (ratio if determinant else np.sqrt(ratio))
         scaled /= scaled.sum(axis=-1, keepdims=True)
+        # A Newton step counts if it gains a share of what its slope promised; else its start's
+        # sure step does, whatever the value there.
+        taken = value <= bound
+        gain = (slope * (newton - point)).sum(axis=-1)
+        aim = np.where(gain > 0, value - 1e-3 * gain + 1e-13 * (1 + np.abs(value)), -np.inf)
+        bound = np.where(taken, aim, np.inf)
         at = taken[:, None]
-        point, sure, certain = np.where(at, newton, sure), np.where(at, scaled, sure), ~taken
+        point, sure = np.where(at, newton, sure), np.where(at, scaled, sure)
         if 2 * np.count_nonzero(open_) <= len(open_):
             problem = problem.part(open_)
-            left, lowest, certain = left[open_], lowest[open_], certain[open_]
+            left, lowest, bound = left[open_], lowest[open_], bound[open_]
             point, sure = point[open_], sure[open_]
     return np.asarray(best.reshape(*leading, s))
 
@@ -77,8 +81,8 @@ class _Problem:
         parts = (self.roots[keep], self.information[keep], self.first[keep], self.there[keep])
         return _Problem(*parts, self.determinant)
 
-    def derivatives(self, weights: Array) -> tuple[Array, Array]:
-        """Minus the gradient (n, S), and the matrix of second derivatives (n, S, S)."""
+    def derivatives(self, weights: Array) -> tuple[Array, Array, Array]:
+        """What is made least (n,), minus its gradient (n, S), its second derivatives (n, S, S)."""
         n, s, d, _ = self.roots.shape
         total = weights[:, None, :] @ self.information.reshape(n, s, d * d)
         lower = _cholesky_or_qr(total.reshape(n, d, d), np.zeros((1, 1)), weights, self.roots)
@@ -87,10 +91,11 @@ class _Problem:
         shares = _square(half.reshape(n, d, s, d).swapaxes(1, 2))
         if self.determinant:
             flat = shares.reshape(n, s, d * d)
-            return np.einsum("nsii->ns", shares), flat @ flat.swapaxes(-1, -2)
+            return -_log_det(lower), np.einsum("nsii->ns", shares), flat @ flat.swapaxes(-1, -2)
         spread = _solve_lower(lower, self.first.swapaxes(-1, -2))
         flat = (shares @ spread[:, None]).reshape(n, s, d * d)
-        return (flat @ spread.reshape(n, d * d, 1))[..., 0], 2 * flat @ flat.swapaxes(-1, -2)
+        slope = (flat @ spread.reshape(n, d * d, 1))[..., 0]
+        return (spread**2).sum(axis=(-2, -1)), slope, 2 * flat @ flat.swapaxes(-1, -2)
 
 
 def _square(root: Array) -> Array:

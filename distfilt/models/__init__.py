@@ -5,6 +5,14 @@ from .base import LinearModel, Model, simulate
 from .integrators import rk4, rk4_jacobian
 from .lorenz import lorenz63, lorenz63_rate
 from .motion import constant_velocity, coordinated_turn
+from .pendulum import (
+    pendulum,
+    pendulum_angle,
+    pendulum_chart,
+    pendulum_energy,
+    pendulum_rate,
+    pendulum_states,
+)
 from .rotations import (
     cross_matrix,
     left_directions,
@@ -18,10 +26,21 @@ from .satellite import (
     clohessy_wiltshire_drift,
     clohessy_wiltshire_transition,
 )
+from .swarm import (
+    READINGS,
+    RotatingMixture,
+    Swarm,
+    mobility_and_diffusion,
+    reflected,
+    rotating_swarm,
+)
 
 __all__ = [
+    "READINGS",
     "LinearModel",
     "Model",
+    "RotatingMixture",
+    "Swarm",
     "angular_acceleration",
     "attitude",
     "clohessy_wiltshire",
@@ -33,9 +52,18 @@ __all__ = [
     "left_directions",
     "lorenz63",
     "lorenz63_rate",
+    "pendulum",
+    "pendulum_angle",
+    "pendulum_chart",
+    "pendulum_energy",
+    "pendulum_rate",
+    "pendulum_states",
+    "mobility_and_diffusion",
     "quaternion_rate",
+    "reflected",
     "rk4",
     "rk4_jacobian",
+    "rotating_swarm",
     "rotation_matrix",
     "satellite_pose",
     "simulate",

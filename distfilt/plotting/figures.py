@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..checks import array, choice, count, number
+from ..checks import array, choice, count, needed, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -85,6 +85,7 @@ def use_style() -> None:
     ...     rcParams["figure.dpi"]
     110.0
     """
+    needed("matplotlib", "plots")
     from cycler import cycler
     from matplotlib import rcParams
 
@@ -148,6 +149,7 @@ def _labelled(label: Any, unit: Any, axis: str) -> str:
 
 
 def check_axes(ax: Any) -> Axes:
+    needed("matplotlib", "plots")
     from matplotlib.axes import Axes
 
     if not isinstance(ax, Axes):
@@ -201,6 +203,7 @@ def axes(
     width, height = array(size, "size", (2,)).tolist()
     number(min(width, height), "size", above=0)
     if ax is None:
+        needed("matplotlib", "plots")
         from matplotlib import pyplot
 
         _, ax = pyplot.subplots(figsize=(width, height))
@@ -232,6 +235,7 @@ def save(figure: Figure, path: str | Path) -> Path:
     >>> save(figure, Path(tempfile.mkdtemp()) / "empty.png").suffix
     '.png'
     """
+    needed("matplotlib", "plots")
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 

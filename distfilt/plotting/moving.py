@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from ..checks import callable_, count, number
+from ..checks import callable_, count, needed, number
 from .figures import check_axes, nonblank
 
 if TYPE_CHECKING:
@@ -225,6 +225,7 @@ def slider(
     >>> len(found.frames), found.said
     (3, ('rate 0', 'rate 0.5', 'rate 1'))
     """
+    needed("matplotlib", "plots")
     make = callable_(draw, "draw")
     if isinstance(values, str) or not len(values):
         raise ValueError(f"values: needs at least one value, got {values!r}")

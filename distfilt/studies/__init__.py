@@ -9,6 +9,7 @@ later run can be compared with.
 from .checking import check
 from .files import Stored, load, store, stored
 from .running import run
+from .scripts import script
 from .seeds import spawn
 from .sources import fingerprint
 from .study import Failure, Study, StudyError, StudyInterrupted
@@ -23,6 +24,7 @@ __all__ = [
     "fingerprint",
     "load",
     "run",
+    "script",
     "spawn",
     "store",
     "stored",

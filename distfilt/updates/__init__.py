@@ -1,5 +1,7 @@
 """Updates: what an ensemble makes of an observation, ``(ensemble, predicted, observed, noise)``."""
 
+from .constrained import augmented, clipped, projected, retracted
+from .coupling import ensemble_transform, transform_by_agreement
 from .door import update
 from .forecasts import exact_forecast, sampled_forecast
 from .gaussian import exact_draws, known_noise, sampled_noise, square_root
@@ -16,8 +18,11 @@ from .wrappers import centred, gated, inflated, serial
 
 __all__ = [
     "Particles",
+    "augmented",
     "centred",
+    "clipped",
     "effective_size",
+    "ensemble_transform",
     "exact_draws",
     "exact_forecast",
     "gated",
@@ -27,12 +32,15 @@ __all__ = [
     "known_noise",
     "principal_components",
     "principal_directions",
+    "projected",
     "resample",
     "resampled",
+    "retracted",
     "sampled_forecast",
     "sampled_noise",
     "serial",
     "square_root",
+    "transform_by_agreement",
     "transport",
     "transport_sample",
     "update",

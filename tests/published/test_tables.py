@@ -149,7 +149,7 @@ def test_items_are_complete():
         "grange": {"04-satellite-network"},
         "das": {"06-constrained-pendulum"},
         "semeraro": {"07-partial-state-fusion", "08-tracking-in-orbit"},
-        "zheng": {"10-swarm"},
+        "zheng": {"10-swarm-that-knows"},
     }
 
 

@@ -1,0 +1,302 @@
+"""The set-ups of Tables II and III of Grange et al., for the stored studies and for chapter 4.
+
+A trial of these studies is a batch of a few runs, because a filter steps through five runs in
+hardly more time than through one. What is stored of a run ends in its number within the batch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from distfilt import studies
+from distfilt.filters import EnsembleFilter
+from distfilt.models import Model, clohessy_wiltshire, satellite_pose, simulate
+from distfilt.network import Graph, intersection, pull
+from distfilt.published import Reading, scenario
+from distfilt.sensors import Sensor, of_kind
+from distfilt.updates import (
+    known_noise,
+    principal_components,
+    principal_directions,
+    sampled_noise,
+    transport,
+    update,
+)
+
+PAPER = "grange"
+SEED = 2024
+HALF_SECONDS = range(4, 200, 5)
+"""Steps at 0.5 s, 1 s, ...: the instants at which a comparison over time is stored."""
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """Everything that a study of one table reads of its scenario, read when it is made."""
+
+    scenario: Reading
+    model: Model
+    still: Model
+    sensors: tuple[Sensor, ...]
+    graph: Graph
+    names: tuple[str, ...]
+    start: np.ndarray
+    prior: tuple[np.ndarray, np.ndarray]
+    times: np.ndarray
+    settled: np.ndarray
+    members: int
+    runs: int
+    pca: dict[str, int]
+    pull: dict[str, Any]
+    made: tuple[str, dict[str, Any]]
+
+    def __reduce__(self) -> Any:
+        """How it reaches a worker: made again there, since a model's functions cannot travel."""
+        return partial(setup, self.made[0], **self.made[1]), ()
+
+    @property
+    def changed(self) -> bool:
+        """Whether it is another study than the paper's, as the book reads it."""
+        return self.scenario.changed
+
+
+def setup(name: str, **changes: Any) -> Setup:
+    """The set-up of ``table-2`` or ``table-3``, with other values of some parameters."""
+    s = scenario(PAPER, name).replace(**changes).reading()
+    start, dt = np.array(s["initial_state"]), s["dt_observe"]
+    if name == "table-2":
+        make = partial(clohessy_wiltshire, rate=s["orbital_rate"])
+        offset, variance = s["prior_offset"] * np.ones(6), s["prior_variance"] * np.ones(6)
+    elif name == "table-3":
+        make = partial(satellite_pose, rate=s["orbital_rate"], step=s["integration_step"])
+        if make(sigma=0.0).names != tuple(s["state_order"]):
+            raise ValueError(f"state_order: needs that of satellite_pose, got {s['state_order']}")
+        moved, wide = s["prior_offset_translation"], s["prior_variance_translation"]
+        turned, loose = s["prior_offset_attitude"], s["prior_variance_attitude"]
+        offset = np.repeat([moved, turned], [6, 7])
+        variance = np.repeat([wide, loose], [6, 7])
+    n = round((s["end_time"] - s["first_observation"]) / dt) + 1
+    times = np.round(s["first_observation"] + dt * np.arange(n), 10)
+    return Setup(
+        s,
+        make(sigma=s["process_noise"]),
+        make(sigma=0.0),
+        tuple(of_kind(a.kind, a.dims, std=a.noise) for a in s.agents),
+        Graph.from_adjacency(s.adjacency),
+        tuple(a.name for a in s.agents),
+        start,
+        (start + offset, np.diag(variance)),
+        times,
+        times > s["average_from"] + dt / 2,
+        s["members"],
+        s["runs"],
+        {"n_state": s["pca_state"], "n_observed": s["pca_observation"]},
+        {
+            "gain": s["gain"],
+            "rounds": s["consensus_rounds"],
+            "include_self": s["consensus_includes_self"],
+        },
+        (name, changes),
+    )
+
+
+def data(
+    s: Setup, rng: np.random.Generator, runs: tuple[int, ...], *, noisy: bool = True
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The truth (T, *runs, d), with process noise or without, and each agent's observations."""
+    start = np.broadcast_to(s.start, (*runs, s.start.size))
+    truth = simulate(s.model if noisy else s.still, start, s.times, rng=rng)
+    before = np.concatenate([start[None], truth[:-1]])
+    seen = [
+        q.observe(truth, rng=rng, previous=before if q.uses_previous else None) for q in s.sensors
+    ]
+    return truth, seen
+
+
+def published(s: Setup, *, pca: bool, noise_factor: float = 1.0, **changes: Any) -> EnsembleFilter:
+    """Algorithm 1 of the paper, in principal components (Algorithm 2) or without.
+
+    Without them the update is `sampled_noise`, which is the affine map in closed form.
+    """
+    options = s.pca if pca else {}
+    if noise_factor == 0:
+        rule: Any = partial(noise_free, **options)
+    elif pca:
+        rule = partial(principal_components, noise_factor=noise_factor, **options)
+    else:
+        full = noise_factor == 1
+        rule = sampled_noise if full else partial(transport, noise_factor=noise_factor)
+    return _filter(s, rule, partial(pull, **(s.pull | changes)))
+
+
+@update
+def noise_free(
+    ensemble: np.ndarray,
+    predicted: np.ndarray,
+    observed: np.ndarray,
+    noise: np.ndarray,
+    *,
+    rng: np.random.Generator,
+    n_state: int | None = None,
+    n_observed: int | None = None,
+) -> np.ndarray:
+    """The update of Algorithm 2 with predictions that carry no noise: a mistake, to be shown.
+
+    The members then determine the predictions, and where these are singular a map does not exist;
+    a pseudo-inverse gives the gain that is nearest to it.
+    """
+    d, m = ensemble.shape[-1], predicted.shape[-1]
+    w = principal_directions(ensemble, n_state or d)
+    v = principal_directions(predicted, min(n_observed or m, m))
+    x, h = ensemble @ w, predicted @ v
+    dx, dh = x - x.mean(axis=-2, keepdims=True), h - h.mean(axis=-2, keepdims=True)
+    across = np.swapaxes(dh, -1, -2)
+    gain = np.linalg.pinv(across @ dh, hermitian=True, rtol=1e-12) @ (across @ dx)
+    step = (observed[..., None, :] @ v - h) @ gain
+    return np.asarray(ensemble + step @ np.swapaxes(w, -1, -2))
+
+
+def repaired(s: Setup, kind: str) -> EnsembleFilter:
+    """One of the filters of the section "Better": what the update knows, how agents agree."""
+    fuse = partial(intersection, rule="trace", scale=np.sqrt(np.diag(s.prior[1])))
+    if kind == "exact":
+        return EnsembleFilter.exact(
+            s.model, s.sensors, s.graph, members=s.members, names=s.names, failures="keep"
+        )
+    rule, agreement = {
+        "sampled_fused": (sampled_noise, fuse),
+        "known_pulled": (known_noise, partial(pull, **s.pull)),
+        "known_fused": (known_noise, fuse),
+        "known_best": (known_noise, partial(intersection, rule="min_determinant")),
+    }[kind]
+    return _filter(s, rule, agreement)
+
+
+def _filter(s: Setup, rule: Any, agreement: Any) -> EnsembleFilter:
+    return EnsembleFilter(
+        s.model, s.sensors, s.graph, update=rule, agreement=agreement, members=s.members,
+        names=s.names, failures="keep",
+    )  # fmt: skip
+
+
+def run(
+    s: Setup,
+    f: EnsembleFilter,
+    seed: np.random.SeedSequence,
+    truth: np.ndarray,
+    seen: list[np.ndarray],
+    scores: tuple[str, ...] = ("squared_error", "nees"),
+) -> Any:
+    """The filter on a batch of runs, as an xarray.Dataset."""
+    begin = f.start(s.prior, rng=np.random.default_rng(seed), runs=truth.shape[1:-1])
+    return f.run(begin, s.times, seen, truth=truth, scores=scores)
+
+
+def short(value: Any) -> float:
+    """Six digits: what is stored of a mean over runs, so that files stay small."""
+    return float(f"{float(value):.6g}")
+
+
+def scored(s: Setup, name: str, result: Any, *, each_agent: bool = True) -> dict[str, float]:
+    """What is stored of each run: settled error (of each agent), NEES/d, distance of the means."""
+    late = result.isel(time=s.settled)
+    error = late["total_squared_error"].mean("time").values
+    gap = late["mean"] - late["mean"].mean("agent")
+    apart = (gap**2).sum("component").mean(("time", "agent")).values
+    nees = late["nees"].mean(("time", "agent")).values / s.model.dim if "nees" in late else None
+    out: dict[str, float] = {}
+    for r in range(error.shape[0]):
+        if each_agent:
+            out |= {f"{name}_mse_{a}_{r}": float(error[r, k]) for k, a in enumerate(s.names)}
+            out[f"{name}_apart_{r}"] = float(apart[r])
+        else:
+            out[f"{name}_mse_{r}"] = float(error[r].mean())
+        if nees is not None:
+            out[f"{name}_nees_{r}"] = float(nees[r])
+    return out
+
+
+def score_columns(s: Setup, name: str, batch: int, *, each_agent: bool = True) -> list[str]:
+    """The names of what `scored` gives with NEES."""
+    out = []
+    for r in range(batch):
+        if each_agent:
+            out += [f"{name}_mse_{a}_{r}" for a in s.names] + [f"{name}_apart_{r}"]
+        else:
+            out += [f"{name}_mse_{r}"]
+        out += [f"{name}_nees_{r}"]
+    return out
+
+
+def over_time(name: str, error: np.ndarray, nees: np.ndarray) -> dict[str, float]:
+    """Means over the runs (T, R, ...) of a batch, of error and NEES/d, at every half second."""
+    out = {}
+    for k in HALF_SECONDS:
+        out[f"{name}_e{k:03d}"] = short(error[k].mean())
+        out[f"{name}_n{k:03d}"] = short(nees[k].mean())
+    return out
+
+
+def time_columns(name: str) -> list[str]:
+    """The names of what `over_time` gives."""
+    return [f"{name}_{what}{k:03d}" for k in HALF_SECONDS for what in "en"]
+
+
+def of_every_step(s: Setup, name: str, result: Any) -> dict[str, float]:
+    """Mean over a batch's runs of every agent's squared error, at all steps."""
+    error = result["total_squared_error"].mean("run").values
+    return {
+        f"{name}_{a}_t{k:03d}": short(error[k, i])
+        for k in range(error.shape[0])
+        for i, a in enumerate(s.names)
+    }
+
+
+def step_columns(s: Setup, name: str) -> list[str]:
+    """The names of what `of_every_step` gives."""
+    return [f"{name}_{a}_t{k:03d}" for k in range(s.times.size) for a in s.names]
+
+
+class Kept:
+    """What a study stored, or what a changed scenario gives now, run by run and over time."""
+
+    def __init__(self, columns: Any, batch: int) -> None:
+        self.columns, self.batch = columns, batch
+
+    @property
+    def runs(self) -> int:
+        """How many runs there are."""
+        return self.batch * next(iter(self.columns.values())).size
+
+    def each(self, name: str) -> np.ndarray:
+        """One number a run, in the order of the runs, (runs,)."""
+        found = [self.columns[f"{name}_{r}"] for r in range(self.batch)]
+        return np.stack(found, axis=1).ravel()
+
+    def agents(self, name: str, agents: Any) -> np.ndarray:
+        """One number an agent and run, (agents, runs)."""
+        return np.array([self.each(f"{name}_{a}") for a in agents])
+
+    def series(self, name: str, steps: Any) -> np.ndarray:
+        """Means over the runs of each batch, (batches, steps)."""
+        return np.stack([self.columns[f"{name}{k:03d}"] for k in steps], axis=1)
+
+
+def kept(script: ModuleType, *, repeat: int = 2) -> Kept:
+    """A study's stored numbers, with a few of its trials run again and found equal.
+
+    Of a scenario that a reader has changed nothing is stored: two trials of it run now.
+    """
+    if not script.SETUP.changed:
+        found = studies.stored(script.PAPER, script.NAME)
+        if repeat:
+            studies.check(
+                found, script.trial, indices=range(repeat), rtol=script.rtol, workers=2
+            )
+        return Kept({c: found.metric(c) for c in script.columns}, script.BATCH)
+    few = studies.run(script.trial, script.seeds[:2], workers=2)
+    return Kept(few.metrics(script.columns), script.BATCH)

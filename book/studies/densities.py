@@ -1,0 +1,172 @@
+"""Centralised density filters of Zheng and Lin beside a kernel estimate, open loops and a bound.
+
+One trial runs both readings of (23), from a uniform and from a peaked density, with the exact model
+and with one whose f is out of phase, and averages L2 errors from 20 s on. All filters of a case see
+the same agents.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from distfilt import density
+from distfilt.models import RotatingMixture, rotating_swarm
+from distfilt.published import scenario
+from distfilt.studies import spawn
+
+NAME, PAPER = "densities", "zheng"
+SWARM, CHOICES = scenario("zheng", "swarm"), scenario("zheng", "figure-1")
+parameters = {k: s.parameter(k).value for s in (SWARM, CHOICES) for k in s}
+seeds = spawn(CHOICES["seed"], CHOICES["runs"])
+rtol = 1e-4
+READINGS = tuple(CHOICES["readings"])
+STARTS = ("uniform", "peaked")
+EXACT = ("kde", "filter", "observed_r", "open", "open_flat", "bound")
+WRONG = ("kde", "filter", "process", "open")
+columns = [
+    *(f"{r}_{s}_{e}" for r, s, e in product(READINGS, STARTS, EXACT)),
+    *(f"{r}_{s}_{e}" for r, s, e in product(
+        READINGS, STARTS, ("filter_nees", "bound_nees", "filter_crps", "bound_crps"))),
+    *(f"{r}_wrong_{e}" for r, e in product(READINGS, WRONG)),
+]
+
+
+def grid() -> density.Grid:
+    """The paper's grid."""
+    return density.Grid(tuple(int(n) for n in SWARM["cells"]))
+
+
+def swarm(reading: str, phase: float = 0.0) -> Any:
+    """The swarm of (23) in one reading, its f turned by `phase`."""
+    phases = SWARM["target_phases"]
+    mixture = RotatingMixture(
+        centre=SWARM["target_centre"], radius=SWARM["target_radius"],
+        rate=SWARM["target_rate"], variance=SWARM["target_variance"],
+        components=len(phases), phase=phases[0] + phase,
+    )
+    return rotating_swarm(reading, strength=SWARM["diffusion"], mixture=mixture)
+
+
+def first_density(start: str) -> np.ndarray:
+    """The density from which agents are drawn: uniform or peaked, (n,)."""
+    cells = grid()
+    if start == "uniform":
+        return np.ones(cells.size)
+    gap = ((cells.centres - CHOICES["peak_centre"]) ** 2).sum(axis=-1)
+    peak = np.exp(-0.5 * gap / CHOICES["peak_variance"])
+    return cells.normalised(peak + CHOICES["peak_floor"])
+
+
+def first_agents(start: str, agents: int, rng: np.random.Generator) -> np.ndarray:
+    """Agents drawn from it, (N, 2)."""
+    cells = grid()
+    share = first_density(start) * cells.volume
+    chosen = cells.centres[rng.choice(cells.size, size=agents, p=share)]
+    return chosen + (rng.random((agents, 2)) - 0.5) * cells.spacing
+
+
+def informed(basis: np.ndarray, positions: np.ndarray) -> Any:
+    """The linear Bayes estimate of a density from agents alone: a filter of one row.
+
+    A histogram of N independent agents has the variance p / (N cell). Once with p = 1, then with
+    what that gave.
+    """
+    cells, level = grid(), np.ones(grid().size)
+    for _ in range(2):
+        state = density.shared_start(basis, np.ones((1, cells.size)))
+        noise = np.maximum(level, CHOICES["floor"]) / (len(positions) * cells.volume)
+        state = density.shared_step(state, cells.histogram(positions), noise, 1.0)
+        level = state.estimates[0]
+    return state
+
+
+def case(
+    reading: str, start: str, rng: np.random.Generator, *, phase: float = 0.0,
+    agents: int | None = None, end: float | None = None,
+) -> dict[str, np.ndarray]:
+    """L2 errors over time by method, (T,), and NEES and CRPS per cell of two of them."""
+    cells, dt = grid(), SWARM["dt"]
+    n = int(SWARM["agents"]) if agents is None else agents
+    h = CHOICES["bandwidth"]
+    end = dict(zip(READINGS, CHOICES["end_times"], strict=True))[reading] if end is None else end
+    true, believed = swarm(reading), swarm(reading, phase)
+    truth, model = (density.FokkerPlanck(s, cells) for s in (true, believed))
+    k = density.kernel_information(cells, bandwidth=h, agents=n)
+    basis = density.zero_mean_prior(
+        cells, rank=CHOICES["rank"], length=CHOICES["prior_length"], std=CHOICES["prior_std"])
+    x, p = first_agents(start, n, rng), first_density(start)
+    y = density.kernel_density(x, cells, bandwidth=h)
+    flat = np.exp(-0.5 * ((cells.centres - x[0]) ** 2).sum(axis=-1)
+                  / CHOICES["local_prior_std"] ** 2)
+    filters = beginning(basis, np.stack([y, y, y, cells.normalised(flat)]), x)
+    low = density.low_rank_start(y, basis[:, : CHOICES["low_rank"]])
+    scale = dict(zip(READINGS, CHOICES["process_scale"], strict=True))[reading]
+    floor, rows = CHOICES["floor"], []
+    noise = np.full(filters.base.shape, np.inf)
+    for j in range(round(end / dt)):
+        t = j * dt
+        move = model.solver(t, dt)
+        x = true.step(x, t, dt, rng=rng, substeps=CHOICES["substeps"])
+        p = truth.step(p, t, dt)
+        y = density.kernel_density(x, cells, bandwidth=h)
+        filters = density.shared_moved(filters, move)
+        noise[0] = k * np.maximum(filters.estimates[0], floor)
+        noise[1] = k * np.maximum(y, floor)
+        filters = density.shared_step(filters, y, noise, dt)
+        if phase:
+            low = density.low_rank_step(
+                low, move, y, k * np.maximum(move(low.mean), floor), dt,
+                process=scale * basis[:, : CHOICES["low_rank"]])
+        found = np.stack([y, *filters.estimates, low.mean])
+        rows.append(np.concatenate([cells.norm(found - p), scored(filters, p, j)]))
+    names = (*EXACT, "process", "filter_nees", "bound_nees", "filter_crps", "bound_crps")
+    return dict(zip(names, np.array(rows).T, strict=True))
+
+
+def beginning(basis: np.ndarray, base: np.ndarray, positions: np.ndarray) -> Any:
+    """Filters that start from the rows of `base`, and the bound's, informed once, as the last."""
+    known, state = informed(basis, positions), density.shared_start(basis, base)
+    return density.Shared(
+        basis, np.concatenate([base, known.base]),
+        np.concatenate([state.information, known.information]),
+        np.concatenate([state.vector, known.vector]),
+    )
+
+
+def scored(filters: Any, p: np.ndarray, step: int) -> np.ndarray:
+    """NEES and CRPS per cell of the filter and of the bound, every two seconds; else NaN."""
+    if step % 20 != 19:
+        return np.full(4, np.nan)
+    from distfilt.metrics import gaussian_crps
+
+    gap = (filters.estimates - p)[[0, -1]]
+    variance = np.maximum(filters.variances[[0, -1]], 1e-12)
+    nees = (gap**2 / variance).mean(axis=-1)
+    crps = gaussian_crps(0 * gap, np.sqrt(variance), gap).mean(axis=-1)
+    return np.concatenate([nees, crps])
+
+
+def late(values: np.ndarray) -> float:
+    """Mean from the scenario's time on."""
+    return float(np.nanmean(values[round(CHOICES["average_from"] / SWARM["dt"]):]))
+
+
+def trial(seed: np.random.SeedSequence) -> list[float]:
+    """One run of all cases: time-averaged errors in the order of `columns`."""
+    found: dict[str, float] = {}
+    cases = [(r, s) for r in READINGS for s in (*STARTS, "wrong")]
+    for (reading, start), part in zip(cases, seed.spawn(len(cases)), strict=True):
+        wrong = start == "wrong"
+        result = case(
+            reading, "peaked" if wrong else start, np.random.default_rng(part),
+            phase=CHOICES["wrong_phase"] if wrong else 0.0,
+            end=CHOICES["wrong_end"] if wrong else None,
+        )
+        found |= {f"{reading}_{start}_{name}": late(v) for name, v in result.items()}
+    return [found[c] for c in columns]
+
+
+code: tuple[Any, ...] = (case, beginning, informed, scored, first_agents, first_density, late)

@@ -1,0 +1,56 @@
+"""Fig. 1 of Grange et al.: the paper's filter with and without principal components, 100 runs.
+
+With the 200 members of the figure, all agents at all steps; and with 13, for the claim about small
+samples in Section V.B.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+import _satellites as satellites
+
+NAME, PAPER, BATCH, FEW = "figure-1", "grange", 5, 13
+SETUP = satellites.setup("table-2")
+NAMES = {"bare": False, "pca": True}
+columns = [
+    c
+    for name in NAMES
+    for c in (
+        *satellites.score_columns(SETUP, name, BATCH),
+        *(f"{name}_few_mse_{r}" for r in range(BATCH)),
+        *satellites.step_columns(SETUP, name),
+        *satellites.time_columns(name),
+    )
+]
+parameters = {"batch": BATCH, "few": FEW, "seed": 2024}
+seeds = np.random.SeedSequence(satellites.SEED).spawn(SETUP.runs // BATCH)
+scenarios = (SETUP.scenario,)
+rtol = 1e-4
+
+
+def trial(seed: np.random.SeedSequence) -> dict[str, float]:
+    """A batch of runs of both versions, on the same data."""
+    for_data, for_filters = seed.spawn(2)
+    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    out: dict[str, float] = {}
+    for name, pca in NAMES.items():
+        f = satellites.published(SETUP, pca=pca)
+        result = satellites.run(SETUP, f, for_filters, truth, seen)
+        out |= satellites.scored(SETUP, name, result)
+        out |= satellites.of_every_step(SETUP, name, result)
+        error = result["total_squared_error"].mean("agent").values
+        nees = result["nees"].mean("agent").values / SETUP.model.dim
+        out |= satellites.over_time(name, error, nees)
+        small = satellites.published(replace(SETUP, members=FEW), pca=pca)
+        result = satellites.run(SETUP, small, for_filters, truth, seen, ("squared_error",))
+        out |= satellites.scored(SETUP, f"{name}_few", result, each_agent=False)
+    return out
+
+
+code = (satellites.data, satellites.published, satellites.scored)

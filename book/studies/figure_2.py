@@ -1,0 +1,46 @@
+"""Fig. 2 of Grange et al.: five agents with principal components, 100 runs, at every step.
+
+With the gain of the scenario, and without any pull: what consensus does is the difference.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+import _satellites as satellites
+
+NAME, PAPER, BATCH = "figure-2", "grange", 4
+SETUP = satellites.setup("table-3")
+GAINS = {"pca": SETUP.pull["gain"], "alone": 0.0}
+columns = [
+    c
+    for name in GAINS
+    for c in (
+        *satellites.score_columns(SETUP, name, BATCH),
+        *satellites.step_columns(SETUP, name),
+    )
+]
+parameters = {"batch": BATCH, "seed": 2025, "gains": GAINS}
+seeds = np.random.SeedSequence(satellites.SEED + 1).spawn(SETUP.runs // BATCH)
+scenarios = (SETUP.scenario,)
+rtol = 1e-4
+
+
+def trial(seed: np.random.SeedSequence) -> dict[str, float]:
+    """A batch of runs with both gains, on the same data."""
+    for_data, for_filters = seed.spawn(2)
+    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    out: dict[str, float] = {}
+    for name, gain in GAINS.items():
+        f = satellites.published(SETUP, pca=True, gain=gain)
+        result = satellites.run(SETUP, f, for_filters, truth, seen)
+        out |= satellites.scored(SETUP, name, result)
+        out |= satellites.of_every_step(SETUP, name, result)
+    return out
+
+
+code = (satellites.data, satellites.published, satellites.scored)

@@ -1,0 +1,109 @@
+"""Lorenz-63 with one component seen: transport beside Kalman and particle filters, and a bound.
+
+Every family runs with three strengths of its own remedy for a spread that is too small. The first
+`TUNING` trials choose the strength, the others are reported. The bound is a particle filter with
+`PARTICLES` members on the same data.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from distfilt.metrics import crps
+from distfilt.models import lorenz63, simulate
+from distfilt.updates import (
+    ensemble_transform,
+    inflated,
+    jitter,
+    known_noise,
+    resampled,
+    square_root,
+)
+from distfilt.updates.door import unchecked
+
+NAME = "lorenz-coupling"
+PAPER = "das"
+
+MEMBERS = (20, 100)
+DT, STEPS, BURN, VARIANCE = 0.12, 120, 30, 8.0
+PARTICLES, TUNING, TRIALS = 2000, 5, 20
+
+
+def particles(x, h, y, r, *, rng, bandwidth):
+    """Weigh, resample, jitter: a particle filter as an update of members."""
+    logs = -0.5 * ((y - h) ** 2).sum(axis=-1) / r[0, 0]
+    w = np.exp(logs - logs.max())
+    picked = x[resampled(w / w.sum(), rng=rng)]
+    return jitter(picked, rng=rng, bandwidth=bandwidth, cov=np.cov(x.T, bias=True))
+
+
+FAMILIES = {
+    "enkf": [inflated(known_noise, factor=f) for f in (1.02, 1.05, 1.1)],
+    "root": [inflated(square_root, factor=f) for f in (1.02, 1.05, 1.1)],
+    "transport": [partial(ensemble_transform, rejuvenation=h) for h in (0.1, 0.2, 0.3)],
+    "second": [
+        partial(ensemble_transform, rejuvenation=h, correct=True) for h in (0.1, 0.2, 0.3)
+    ],
+    "particles": [partial(particles, bandwidth=h) for h in (0.2, 0.3, 0.4)],
+}
+bound = partial(particles, bandwidth=0.1)
+model = lorenz63(step=0.03)
+
+
+def data(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A truth (T, 3), its readings (T, 1), and members of the prior (PARTICLES, 3)."""
+    start = rng.standard_normal(3) + [1.5, -1.5, 25.5]
+    path = simulate(model, start, DT * np.arange(1, STEPS + 101), rng=rng)
+    truth = path[100:]
+    seen = truth[:, :1] + np.sqrt(VARIANCE) * rng.standard_normal((STEPS, 1))
+    return truth, seen, path[99] + 2 * rng.standard_normal((PARTICLES, 3))
+
+
+def scores(update, members, truth, seen, rng):
+    """Error, spread and CRPS of one filter: means over time after the burn-in."""
+    inner, rows = unchecked(update), []
+    noise = VARIANCE * np.eye(1)
+    for k, y in enumerate(seen):
+        members = model.flow(members, 0.0, DT)
+        members = inner(members, members[:, :1], y, noise, rng=rng)
+        if k >= BURN:
+            gap = members.mean(axis=0) - truth[k]
+            own = members.var(axis=0, ddof=1).mean()
+            rows.append([(gap**2).mean(), own, crps(members[:100], truth[k]).mean()])
+    square, own, score = np.mean(rows, axis=0)
+    return [np.sqrt(square), np.sqrt(own), score]
+
+
+def trial(seed: np.random.SeedSequence) -> dict[str, float]:
+    """Every family, size and strength on one truth."""
+    rng, source = (np.random.default_rng(s) for s in seed.spawn(2))
+    truth, seen, cloud = data(rng)
+    cases = {
+        f"{name}_{n}_{k}": (update, n)
+        for n in MEMBERS
+        for name, updates in FAMILIES.items()
+        for k, update in enumerate(updates)
+    }
+    cases["bound"] = (bound, PARTICLES)
+    out = {}
+    for (case, (update, n)), stream in zip(cases.items(), source.spawn(len(cases)), strict=True):
+        found = scores(update, cloud[:n], truth, seen, stream)
+        out |= {f"{case}_{what}": float(v) for what, v in zip(SCORES, found, strict=True)}
+    return out
+
+
+SCORES = ("rmse", "spread", "crps")
+parameters = {
+    "members": list(MEMBERS), "dt": DT, "steps": STEPS, "burn": BURN, "variance": VARIANCE,
+    "particles": PARTICLES, "tuning": TUNING, "families": list(FAMILIES),
+}  # fmt: skip
+columns = (
+    *(f"{name}_{n}_{k}_{what}" for n in MEMBERS for name in FAMILIES for k in range(3)
+      for what in SCORES),
+    *(f"bound_{what}" for what in SCORES),
+)  # fmt: skip
+code = (particles, data, scores)
+seeds = np.random.SeedSequence(512).spawn(TRIALS)
+rtol = 1e-3

@@ -1,0 +1,146 @@
+"""The five algorithms of Das and Bhattacharya on their pendulum, and retraction: Figs. 3 to 5.
+
+A trial is one run: a true swing, its readings and one first ensemble for all algorithms. OTProj
+reports a projection of OTF's members and goes on without it, so it needs no run of its own.
+"""
+
+# ruff: noqa: SIM300
+from __future__ import annotations
+
+import numpy as np
+
+from distfilt.coupling import norm, project, retract
+from distfilt.models import pendulum, pendulum_states
+from distfilt.published import scenario
+from distfilt.updates import augmented, ensemble_transform, projected, retracted
+from distfilt.updates.door import unchecked
+
+NAME = "pendulum"
+PAPER = "das"
+
+setting = scenario("das", "pendulum")
+DT = setting["dt_observe"]
+STEPS = round(setting["end_time"] / DT)
+TIMES = DT * np.arange(1, STEPS + 1)
+NOISE = setting["noise_variance"] * np.eye(2)
+MOTION = ([0, 1], [2, 3])
+TRACED = tuple(range(STEPS // 20))
+"""Half seconds over which the constraint error is averaged for the figure."""
+
+rod = norm([0, 1], length=setting["length"])
+swing = pendulum(
+    length=setting["length"], gravity=setting["gravity"], step=setting["integration_step"]
+)
+seen_too = augmented(ensemble_transform, rod, std=setting["constraint_std"])
+how = {"reading": setting["reading"], "regularisation": setting["regularisation"]}
+UPDATES = {
+    "OTF": ensemble_transform,
+    "OTMA": seen_too,
+    "OTNLeq": projected(ensemble_transform, rod, **how),
+    "OTNLeqMA": projected(seen_too, rod, **how),
+    "retraction": retracted(ensemble_transform, rod, motion=MOTION),
+}
+ALGORITHMS = ("OTF", "OTProj", "OTMA", "OTNLeq", "OTNLeqMA", "retraction")
+
+
+def data(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """True states (T, 4), readings (T, 2), and first members (N, 4)."""
+    angle = np.deg2rad(setting["start_angle"])
+    state = pendulum_states([angle, setting["start_rate"]], length=setting["length"])
+    size = setting["prior_std"]
+    centre = state + size * rng.standard_normal(4)
+    members = centre + size * rng.standard_normal((setting["members"], 4))
+    truth = np.empty((STEPS, 4))
+    for k in range(STEPS):
+        state = truth[k] = swing.step(state, 0.0, DT)
+    return truth, truth[:, :2] + np.sqrt(NOISE[0, 0]) * rng.standard_normal((STEPS, 2)), members
+
+
+def run(readings: np.ndarray, members: np.ndarray, names=tuple(UPDATES), updates=UPDATES):
+    """Analysis members of several filters side by side, (T, F, N, 4); NaN after a failure."""
+    rng = np.random.default_rng(0)  # no update here draws
+    inner = [unchecked(updates[name]) for name in names]
+    x = np.stack([members] * len(inner))
+    out = np.full((len(readings), *x.shape), np.nan)
+    alive = np.ones(len(inner), dtype=bool)
+    with np.errstate(all="ignore"):
+        for k, y in enumerate(readings):
+            x = swing.flow(x, 0.0, DT)
+            for f in np.flatnonzero(alive):
+                try:
+                    x[f] = inner[f](x[f], x[f, :, :2], y, NOISE, rng=rng)
+                    alive[f] = np.isfinite(x[f]).all()
+                except (ValueError, RuntimeError, ArithmeticError):
+                    alive[f] = False
+                if not alive[f]:
+                    x[f] = members  # something finite for the model; not recorded
+            out[k] = np.where(alive[:, None, None], x, np.nan)
+    return out
+
+
+def estimates(members: np.ndarray, name: str) -> np.ndarray:
+    """What is reported: the mean; on the manifold the retracted mean."""
+    mean = members.mean(axis=-2)
+    if name == "retraction" and np.isfinite(mean).all():
+        return retract(mean, rod, motion=MOTION)
+    return mean
+
+
+def scores(name: str, members: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    """Of one filter's members (T, N, 4): errors, spreads, divergence, and the traced error."""
+    mean = estimates(members, name)
+    missed = np.abs(np.hypot(mean[:, 0], mean[:, 1]) - setting["length"])
+    missed = np.where(missed < 1e-14, 0.0, missed)  # rounding is no number to store
+    gap = mean - truth
+    late = TIMES > setting["score_from"] + 1e-9
+    spread = np.sqrt(members[late].var(axis=1, ddof=1).mean(axis=0))
+    away = (np.hypot(gap[:, 0], gap[:, 1]) > 0.3) & (TIMES > 1 + 1e-9)
+    around = members[late][:, :, :2] - members[late][:, :, :2].mean(axis=1, keepdims=True)
+    cov = np.swapaxes(around, 1, 2) @ around / (members.shape[1] - 1)
+    nees = np.nan
+    if np.isfinite(cov).all() and np.linalg.det(cov).min() > 1e-30:
+        solved = np.linalg.solve(cov, gap[late, :2, None])[..., 0]
+        nees = float((gap[late, :2] * solved).sum(axis=1).mean() / 2)
+    found = {
+        "constraint": np.sqrt((missed**2).mean()),
+        "growth": missed[TIMES > 9 + 1e-9].mean()
+        / missed[(TIMES > 1 + 1e-9) & (TIMES < 2 + 1e-9)].mean(),
+        "position": np.sqrt((gap[late, :2] ** 2).sum(axis=1).mean()),
+        "velocity": np.sqrt((gap[late, 2:] ** 2).sum(axis=1).mean()),
+        "spread": np.hypot(*spread[:2]),
+        "spread_velocity": np.hypot(*spread[2:]),
+        "nees": nees,
+        "ratio_yx": np.sqrt((gap[60:, 1] ** 2).mean() / (gap[60:, 0] ** 2).mean()),
+        "diverged": float(away.any() or not np.isfinite(gap).all()),
+        "onset": TIMES[away.argmax()] if away.any() else np.nan,
+        "finite": float(np.isfinite(gap).all()),
+    }
+    traced = np.sqrt((missed.reshape(-1, 10) ** 2).mean(axis=1))
+    found |= {f"trace{h:02d}": traced[h] for h in TRACED}
+    return {f"{name}_{key}": float(value) for key, value in found.items()}
+
+
+def trial(seed: np.random.SeedSequence) -> dict[str, float]:
+    """All algorithms on one run."""
+    truth, readings, members = data(np.random.default_rng(seed))
+    found = dict(zip(UPDATES, np.moveaxis(run(readings, members), 1, 0), strict=True))
+    with np.errstate(all="ignore"):
+        whole = np.isfinite(found["OTF"]).all(axis=(1, 2))
+        found["OTProj"] = found["OTF"].copy()
+        found["OTProj"][whole] = project(found["OTF"][whole], rod, **how)
+        return {k: v for name in ALGORITHMS for k, v in scores(name, found[name], truth).items()}
+
+
+parameters = {name: np.asarray(setting[name]).tolist() for name in setting}
+SCORES = (
+    "constraint", "growth", "position", "velocity", "spread", "spread_velocity", "nees", "ratio_yx",
+    "diverged", "onset", "finite",
+)
+columns = tuple(
+    f"{name}_{key}"
+    for name in ALGORITHMS
+    for key in (*SCORES, *(f"trace{h:02d}" for h in TRACED))
+)
+code = (data, run, estimates, scores)
+seeds = np.random.SeedSequence(2024).spawn(setting["runs"])
+rtol = 1e-4

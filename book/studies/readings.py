@@ -1,0 +1,47 @@
+"""Other readings of what stands behind Fig. 1 of Grange et al.
+
+The truth moves without process noise, as Section V.B can be read; the predicted observations carry
+no noise or a hundredth of the stated; the orbital rate is the printed one or that of the printed
+orbit.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+import _satellites as satellites
+
+NAME, PAPER, BATCH = "readings", "grange", 5
+ORBIT = float(np.sqrt(3.986004418e14 / 8.413e6**3))
+SETUP = satellites.setup("table-2")
+SETUPS = {"printed": SETUP, "orbit": satellites.setup("table-2", orbital_rate=ORBIT)}
+FACTORS = {"none": 0.0, "hundredth": 0.01}
+VERSIONS = {"bare": False, "pca": True}
+NAMES = [f"{rate}_{noise}_{v}" for rate in SETUPS for noise in FACTORS for v in VERSIONS]
+columns = [f"{name}_mse_{r}" for name in NAMES for r in range(BATCH)]
+parameters = {"batch": BATCH, "seed": 2024, "orbit": ORBIT, "factors": FACTORS}
+seeds = np.random.SeedSequence(satellites.SEED).spawn(SETUP.runs // BATCH)
+scenarios = (SETUP.scenario,)
+rtol = 1e-3
+
+
+def trial(seed: np.random.SeedSequence) -> dict[str, float]:
+    """A batch of runs of every reading, on the same data at each rate."""
+    for_data, for_filters = seed.spawn(2)
+    out: dict[str, float] = {}
+    for rate, s in SETUPS.items():
+        truth, seen = satellites.data(s, np.random.default_rng(for_data), (BATCH,), noisy=False)
+        for noise, factor in FACTORS.items():
+            for v, pca in VERSIONS.items():
+                f = satellites.published(s, pca=pca, noise_factor=factor)
+                result = satellites.run(s, f, for_filters, truth, seen, ("squared_error",))
+                name = f"{rate}_{noise}_{v}"
+                out |= satellites.scored(s, name, result, each_agent=False)
+    return out
+
+
+code = (satellites.data, satellites.published, satellites.noise_free, satellites.scored)

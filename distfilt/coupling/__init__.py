@@ -1,0 +1,43 @@
+"""Couplings: plans that turn weights into equally weighted members, and members that obey rules."""
+
+from .constraints import (
+    READINGS,
+    Constraint,
+    accepted,
+    augmented_readings,
+    clip,
+    norm,
+    project,
+    retract,
+)
+from .solvers import SOLVERS, Plan, distances, plan, sorted_plan
+from .transform import (
+    ensemble_transform,
+    plans,
+    rejuvenated,
+    second_order,
+    transform_along,
+    transform_within,
+)
+
+__all__ = [
+    "READINGS",
+    "SOLVERS",
+    "Constraint",
+    "Plan",
+    "accepted",
+    "augmented_readings",
+    "clip",
+    "distances",
+    "ensemble_transform",
+    "norm",
+    "plan",
+    "plans",
+    "project",
+    "rejuvenated",
+    "retract",
+    "second_order",
+    "sorted_plan",
+    "transform_along",
+    "transform_within",
+]

@@ -1,0 +1,437 @@
+r"""The ensemble transform: a coupling that turns weighted members into equally weighted ones.
+
+With the optimal coupling :math:`\mathbf T` of the weights to equal masses, each new member is an
+average of old ones,
+
+.. math:: \mathbf x_j^+ = N\sum_i t_{ij}\,\mathbf x_i,
+
+equation (3) of Das and Bhattacharya after S. Reich, SIAM Journal on Scientific Computing 35 (2013)
+A2013-A2024. The mean of the new members is the weighted mean, exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..checks import Array, array, callable_, choice, generator, number
+from .solvers import SOLVERS, Solve, _scaled, _solver, _squares
+
+__all__ = [
+    "ensemble_transform",
+    "plans",
+    "rejuvenated",
+    "second_order",
+    "transform_along",
+    "transform_within",
+]
+
+
+_TIE = 1e-7
+"""In units of the largest cost. The weighted mean stays exact, the plan costs at most this more."""
+
+
+def _weights(log_weights: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Weights (..., N) that sum to one, from logarithms of any size; -inf is a weight of zero."""
+    w = array(log_weights, "log_weights", shape, finite=False)
+    if np.isnan(w).any() or np.isposinf(w).any():
+        raise ValueError("log_weights: needs numbers below infinity, got NaN or infinity")
+    if np.isneginf(w.max(axis=-1)).any():
+        raise ValueError("log_weights: needs a positive weight in every ensemble, got only zeros")
+    return _normalised(w)
+
+
+def _normalised(log_weights: Array) -> Array:
+    w = np.exp(log_weights - log_weights.max(axis=-1, keepdims=True))
+    return np.asarray(w / w.sum(axis=-1, keepdims=True))
+
+
+def _members(value: ArrayLike, name: str = "ensemble") -> Array:
+    x = array(value, name, (..., "N", "d"))
+    if 0 in x.shape:
+        raise ValueError(f"{name}: needs at least one member and one component, got {x.shape}")
+    return x
+
+
+def _plans(x: Array, w: Array, solve: Solve) -> Array:
+    """Couplings (..., N, N) of the weights to equal masses, for the squared distance."""
+    n, d = x.shape[-2:]
+    equal = np.full(n, 1 / n)
+    out = np.empty((*x.shape[:-1], n))
+    rows = zip(x.reshape(-1, n, d), w.reshape(-1, n), out.reshape(-1, n, n), strict=True)
+    ties = _ties(n)
+    for points, masses, target in rows:
+        cost, _, _ = _scaled(_squares(points, points))
+        target[...], _ = solve(cost + ties, masses, equal)
+    return out
+
+
+@lru_cache(maxsize=8)
+def _ties(n: int) -> Array:
+    """A fixed matrix between 0 and 1e-7, added to costs of range one.
+
+    Where members coincide, as copies do after one weight has dominated, the cheapest coupling is
+    not unique and the last bit of a cost decides between quite different ensembles. This decides
+    instead, on every machine alike.
+    """
+    fixed = _TIE * np.random.default_rng(0).random((n, n))
+    fixed.setflags(write=False)
+    return fixed
+
+
+def plans(
+    ensemble: ArrayLike,
+    log_weights: ArrayLike,
+    *,
+    solver: str = "network",
+    regularisation: float = 0.01,
+) -> Array:
+    """Optimal couplings of weighted members to the same members with equal weights.
+
+    Parameters
+    ----------
+    ensemble : array_like, (..., N, d)
+        Members.
+    log_weights : array_like, (..., N)
+        Logarithms of their weights, in any normalisation.
+    solver, regularisation
+        As for :func:`~distfilt.coupling.plan`.
+
+    Returns
+    -------
+    ndarray, (..., N, N)
+        Row i is where the mass of member i goes; the cost is the squared distance. Where it leaves
+        a choice, as between copies of a member, a fixed addition of at most 1e-7 of the largest
+        cost decides.
+
+    Examples
+    --------
+    >>> plans([[0.0], [1.0]], np.log([0.75, 0.25]))
+    array([[0.5 , 0.25],
+           [0.  , 0.25]])
+    """
+    x = _members(ensemble)
+    w = _weights(log_weights, x.shape[:-1])
+    return _plans(x, w, _solver(choice(solver, "solver", SOLVERS), regularisation))
+
+
+def ensemble_transform(
+    ensemble: ArrayLike,
+    log_weights: ArrayLike,
+    *,
+    solver: str = "network",
+    regularisation: float = 0.01,
+    debias: bool = False,
+    correct: bool = False,
+) -> Array:
+    r"""Replace weighted members by as many with equal weights.
+
+    .. math:: \mathbf X^+ = \mathbf X\,N\,\mathbf T
+
+    Parameters
+    ----------
+    ensemble : array_like, (..., N, d)
+        Members.
+    log_weights : array_like, (..., N)
+        Logarithms of their weights, in any normalisation; -inf is a weight of zero.
+    solver, regularisation
+        As for :func:`~distfilt.coupling.plan`.
+    debias : bool
+        Take off the displacement that the solver's plan gives members whose weights are equal
+        already. An entropic plan shrinks the ensemble; this undoes most of it, and does nothing to
+        an optimal plan.
+    correct : bool
+        Give the new members the weighted covariance too, by :func:`second_order`.
+
+    Returns
+    -------
+    ndarray, (..., N, d)
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, a number is not finite or all weights of an ensemble are zero.
+    SolverError
+        If a linear programme is not solved.
+
+    Examples
+    --------
+    >>> ensemble_transform([[0.0], [1.0]], np.log([0.75, 0.25]))
+    array([[0. ],
+           [0.5]])
+    >>> bool(ensemble_transform([[0.0], [1.0]], [-1e4, -2e4])[1, 0] == 0.0)
+    True
+    """
+    x = _members(ensemble)
+    w = _weights(log_weights, x.shape[:-1])
+    solve = _solver(choice(solver, "solver", SOLVERS), regularisation)
+    for name, value in (("debias", debias), ("correct", correct)):
+        if not isinstance(value, bool):
+            raise ValueError(f"{name}: needs True or False, got {value!r}")
+    return _transform(x, w, solve, debias=debias, correct=correct)
+
+
+def _transform(
+    x: Array, w: Array, solve: Solve, *, debias: bool = False, correct: bool = False
+) -> Array:
+    """`ensemble_transform` of checked arguments."""
+    n = x.shape[-2]
+    centre = (w[..., None, :] @ x)
+    around = x - centre
+    moved = n * (np.swapaxes(_plans(x, w, solve), -1, -2) @ around)
+    if debias:
+        equal = np.full(w.shape, 1 / n)
+        moved += around - n * (np.swapaxes(_plans(x, equal, solve), -1, -2) @ around)
+        moved -= moved.mean(axis=-2, keepdims=True)
+    out = np.asarray(centre + moved)
+    return _second_order(out, x, w) if correct else out
+
+
+def second_order(moved: ArrayLike, ensemble: ArrayLike, log_weights: ArrayLike) -> Array:
+    r"""Give transformed members the mean and covariance of the weighted ones, exactly.
+
+    Averages vary less than what they average, so :math:`\mathbf X^+` has too small a covariance.
+    The symmetric matrix
+
+    .. math:: \mathbf B = \mathbf P^{1/2}
+        (\mathbf P^{1/2}\mathbf C\mathbf P^{1/2})^{-1/2}\mathbf P^{1/2}
+
+    takes its covariance :math:`\mathbf C` to the weighted covariance :math:`\mathbf P` and is the
+    map that moves a Gaussian least.
+
+    Parameters
+    ----------
+    moved : array_like, (..., N, d)
+        What :func:`ensemble_transform` returned.
+    ensemble, log_weights
+        What it was given.
+
+    Returns
+    -------
+    ndarray, (..., N, d)
+        Where `moved` has no spread in a direction in which the weighted members have one, nothing
+        can be stretched, and the covariance falls short there. Covariances are about the mean with
+        N, not N - 1, in the denominator.
+
+    Notes
+    -----
+    W. Acevedo, J. de Wiljes, S. Reich, SIAM Journal on Scientific Computing 39 (2017) A1834-A1850
+    correct the N x N transform instead; this corrects d x d and keeps the same moments.
+
+    Examples
+    --------
+    >>> x, logs = [[0.0], [1.0]], np.log([0.75, 0.25])
+    >>> float(second_order(ensemble_transform(x, logs), x, logs).var().round(12))
+    0.1875
+    """
+    x = _members(ensemble)
+    y = array(moved, "moved", x.shape)
+    return _second_order(y, x, _weights(log_weights, x.shape[:-1]))
+
+
+def _second_order(y: Array, x: Array, w: Array) -> Array:
+    n = x.shape[-2]
+    centre = w[..., None, :] @ x
+    around, spread = x - centre, y - y.mean(axis=-2, keepdims=True)
+    target = np.swapaxes(around, -1, -2) @ (w[..., None] * around)
+    now = np.swapaxes(spread, -1, -2) @ spread / n
+    root = _power(target, 0.5)
+    inner = _power(root @ now @ root, -0.5)
+    return np.asarray(centre + spread @ (root @ inner @ root))
+
+
+def _power(matrix: Array, power: float) -> Array:
+    """A power of symmetric matrices; null directions stay null."""
+    values, vectors = np.linalg.eigh(0.5 * (matrix + np.swapaxes(matrix, -1, -2)))
+    least = 1e-13 * np.maximum(values[..., -1:], 0.0)
+    kept = values > least
+    raised = np.where(kept, np.where(kept, values, 1.0) ** power, 0.0)
+    return np.asarray((vectors * raised[..., None, :]) @ np.swapaxes(vectors, -1, -2))
+
+
+def rejuvenated(
+    moved: ArrayLike, ensemble: ArrayLike, *, bandwidth: float, rng: np.random.Generator
+) -> Array:
+    r"""Add combinations of the forecast's anomalies: new places, and the same mean.
+
+    .. math:: \mathbf x_j' = \mathbf x_j^+ + \frac{h}{\sqrt{N-1}}\sum_i(\mathbf x_i-\bar{\mathbf x})
+        \,\xi_{ij},\qquad \sum_j\xi_{ij}=0
+
+    Parameters
+    ----------
+    moved : array_like, (..., N, d)
+        What :func:`ensemble_transform` returned; N is at least two.
+    ensemble : array_like, (..., N, d)
+        The forecast.
+    bandwidth : float
+        h, at least 0: the covariance grows by about h² times the forecast's.
+    rng : numpy.random.Generator
+
+    Returns
+    -------
+    ndarray, (..., N, d)
+        The added members lie in the forecast's span, and their mean is zero.
+
+    Examples
+    --------
+    >>> x = np.array([[0.0], [1.0], [4.0]])
+    >>> after = rejuvenated(np.zeros((3, 1)), x, bandwidth=0.1, rng=np.random.default_rng(0))
+    >>> bool(abs(after.mean()) < 1e-15), len(set(after.ravel()))
+    (True, 3)
+    """
+    x = _members(ensemble)
+    y = array(moved, "moved", x.shape)
+    if x.shape[-2] < 2:
+        raise ValueError(f"ensemble: needs at least 2 members, got {x.shape[-2]}")
+    h = number(bandwidth, "bandwidth", at_least=0)
+    return _rejuvenated(y, x, h, generator(rng))
+
+
+def _rejuvenated(y: Array, x: Array, h: float, rng: np.random.Generator) -> Array:
+    n = x.shape[-2]
+    drawn = rng.standard_normal((*x.shape[:-1], n))
+    # Centring costs one part in N of the variance.
+    drawn = (drawn - drawn.mean(axis=-2, keepdims=True)) * np.sqrt(n / (n - 1))
+    around = x - x.mean(axis=-2, keepdims=True)
+    return np.asarray(y + h / np.sqrt(n - 1) * (drawn @ around))
+
+
+def transform_within(
+    ensemble: ArrayLike,
+    log_weights: ArrayLike,
+    pieces: ArrayLike,
+    *,
+    rng: np.random.Generator,
+    solver: str = "network",
+) -> Array:
+    r"""The transform on a set cut into pieces: no average crosses from one piece to another.
+
+    Each new member chooses a piece p with probability :math:`N\sum_{i\in p}t_{ij}` and is the
+    average within it. Convex pieces hold their averages, so no member leaves the set. One piece is
+    :func:`ensemble_transform`; a piece for every member is random resampling by the plan.
+
+    Parameters
+    ----------
+    ensemble : array_like, (N, d)
+        Members.
+    log_weights : array_like, (N,)
+        Logarithms of their weights.
+    pieces : array_like of int, (N,)
+        The number of each member's piece.
+    rng : numpy.random.Generator
+        Chooses the pieces, systematically: each gets its share of the members to within one or
+        two.
+    solver : str
+        As for :func:`~distfilt.coupling.plan`.
+
+    Returns
+    -------
+    ndarray, (N, d)
+        The mean is the weighted mean on average over the choice.
+
+    Examples
+    --------
+    >>> x = [[-1.0], [-0.9], [0.9], [1.0]]
+    >>> y = transform_within(x, np.log([0.4, 0.1, 0.1, 0.4]), [0, 0, 1, 1],
+    ...                      rng=np.random.default_rng(0))
+    >>> bool((np.abs(y) >= 0.9).all())
+    True
+    """
+    x = array(ensemble, "ensemble", ("N", "d"))
+    w = _weights(log_weights, x.shape[:-1])
+    labels = np.asarray(pieces)
+    if labels.shape != w.shape or labels.dtype.kind not in "iu":
+        raise ValueError(f"pieces: needs {w.size} integers, got shape {labels.shape}")
+    generator(rng)
+    solve = _solver(choice(solver, "solver", SOLVERS), 0.01)
+    matrix = x.shape[0] * _plans(x, w, solve)
+    names, index = np.unique(labels, return_inverse=True)
+    belongs = (index == np.arange(names.size)[:, None]).astype(np.float64)
+    share = belongs @ matrix
+    chosen = _chosen(share, rng)
+    kept = matrix * belongs[chosen].T
+    return np.asarray(kept.T @ x / kept.sum(axis=0)[:, None])
+
+
+def _chosen(share: Array, rng: np.random.Generator) -> Array:
+    """For each column one row, as probable as its share; each row's total hardly varies.
+
+    Row by row, the columns that are still free are laid end to end, each as long as its chance,
+    and those that hold a level k + u are taken.
+    """
+    left, order = np.arange(share.shape[1]), np.full(share.shape[1], share.shape[0] - 1)
+    rest = np.cumsum(share[::-1], axis=0)[::-1]
+    for row in range(share.shape[0] - 1):
+        chance = share[row, left] / np.where(rest[row, left] > 0, rest[row, left], 1.0)
+        levels = np.floor(np.cumsum(chance) + rng.random())
+        taken = np.diff(levels, prepend=0.0) > 0
+        order[left[taken]] = row
+        left = left[~taken]
+    # By rounding a column could be left with a row of zero share.
+    bare = share[order, np.arange(order.size)] <= 0
+    return np.asarray(np.where(bare, share.argmax(axis=0), order))
+
+
+def transform_along(
+    ensemble: ArrayLike,
+    log_weights: ArrayLike,
+    *,
+    difference: Callable[[Array, Array], Array],
+    retract: Callable[[Array, Array], Array],
+    solver: str = "network",
+) -> Array:
+    r"""The transform on a curved set: averages of tangent vectors, moved back onto the set.
+
+    .. math:: \mathbf x_j^+ = \operatorname{retract}\Bigl(\mathbf x_j,\;
+        N\sum_it_{ij}\operatorname{difference}(\mathbf x_i,\mathbf x_j)\Bigr)
+
+    with the cost :math:`|\operatorname{difference}(\mathbf x_i,\mathbf x_j)|^2`.
+
+    Parameters
+    ----------
+    ensemble : array_like, (..., N, d)
+        Members on the set.
+    log_weights : array_like, (..., N)
+        Logarithms of their weights.
+    difference : callable
+        ``difference(to, here) -> v``, (..., k): the tangent vector at `here` that points to `to`,
+        both (..., d). On a circle the angle between them, wrapped.
+    retract : callable
+        ``retract(here, v) -> x``, (..., d): where it leads.
+    solver : str
+        As for :func:`~distfilt.coupling.plan`.
+
+    Returns
+    -------
+    ndarray, (..., N, d)
+        On the set as nearly as `retract` leads there.
+
+    Examples
+    --------
+    Angles on both sides of ±π; the plain average of the second pair would be near zero.
+
+    >>> def wrapped(a, b):
+    ...     return (a - b + np.pi) % (2 * np.pi) - np.pi
+    >>> transform_along([[3.0], [-3.0]], np.log([0.75, 0.25]), difference=wrapped,
+    ...                 retract=lambda x, v: wrapped(x + v, 0.0)).round(3)
+    array([[ 3.   ],
+           [-3.142]])
+    """
+    x = _members(ensemble)
+    w = _weights(log_weights, x.shape[:-1])
+    callable_(difference, "difference")
+    callable_(retract, "retract")
+    solve = _solver(choice(solver, "solver", SOLVERS), 0.01)
+    n = x.shape[-2]
+    equal = np.full(n, 1 / n)
+    there, here = np.broadcast_arrays(x[..., :, None, :], x[..., None, :, :])
+    v = array(difference(there.copy(), here.copy()), "difference", (*x.shape[:-1], n, "k"))
+    costs = (v * v).sum(axis=-1)
+    steps = np.empty((*x.shape[:-1], v.shape[-1]))
+    for row in np.ndindex(x.shape[:-2]):
+        matrix, _ = solve(_scaled(costs[row])[0] + _ties(n), w[row], equal)
+        steps[row] = n * np.einsum("ij,ijk->jk", matrix, v[row])
+    return array(retract(x.copy(), steps), "retract", x.shape)

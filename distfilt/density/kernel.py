@@ -1,0 +1,305 @@
+"""Kernel estimates of a density on a grid: Gaussian kernels between reflecting walls."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import erf
+
+from ..checks import Array, array, choice, count, number
+from .grid import Grid
+
+__all__ = [
+    "adaptive_bandwidths",
+    "bandwidth",
+    "kernel_covariance",
+    "kernel_density",
+    "kernel_information",
+    "kernels",
+]
+
+
+def _along(x: Array, grid: Grid, k: int, width: Array, reflect: bool) -> Array:
+    """Means of one-dimensional kernels at x (...) over the cells of axis k, (..., n_k)."""
+    edges = grid.edges(k)
+    scale = np.sqrt(2.0) * width[..., None]
+    span = edges[-1] - edges[0]
+    total = _steps(x, edges, scale)
+    if reflect:
+        images = int(np.ceil(float(np.max(width, initial=0.0)) * 9 / span / 2))
+        # Images in both walls, and images of images where kernels are as wide as the box.
+        for m in range(-images, images + 1):
+            if m:
+                total = total + _steps(x + 2 * m * span, edges, scale)
+            total = total + _steps(2 * edges[0] - x + 2 * m * span, edges, scale)
+    return np.asarray(total / grid.spacing[k])
+
+
+def _steps(x: Array, edges: Array, scale: Array) -> Array:
+    return np.asarray(0.5 * np.diff(erf((edges - x[..., None]) / scale), axis=-1))
+
+
+def _width(value: ArrayLike, grid: Grid, agents: int, name: str = "bandwidth") -> Array:
+    """Bandwidths of all agents, (N,), positive and not below half a cell."""
+    h = array(value, name)
+    if h.shape not in ((), (agents,)):
+        raise ValueError(f"{name}: needs a number or one for each of {agents} agents, "
+                         f"got shape {h.shape}")
+    least = float(h.min(initial=np.inf))
+    if not least > 0:
+        raise ValueError(f"{name}: needs a number above 0, got {least:g}")
+    widest = float(grid.spacing.max())
+    if widest > 2 * least * (1 + 1e-12):
+        raise ValueError(
+            f"grid: needs cells no wider than two bandwidths ({2 * least:g}), got {widest:g}: "
+            f"too coarse for the kernel"
+        )
+    return np.broadcast_to(h, (agents,))
+
+
+def _agents(positions: ArrayLike, grid: Grid) -> Array:
+    if not isinstance(grid, Grid):
+        raise ValueError(f"grid: needs a Grid, got {type(grid).__name__}")
+    x = grid.inside(array(positions, "positions", (..., "N", grid.dim)))
+    if x.shape[-2] == 0:
+        raise ValueError("positions: needs at least one agent, got none")
+    return x
+
+
+def _factors(x: Array, grid: Grid, h: Array, reflect: bool) -> list[Array]:
+    wide = np.broadcast_to(h, x.shape[:-1])
+    return [_along(x[..., k], grid, k, wide, reflect) for k in range(grid.dim)]
+
+
+def kernels(
+    positions: ArrayLike, grid: Grid, *, bandwidth: ArrayLike, reflect: bool = True
+) -> Array:
+    """Each agent's own kernel, the z_i of equation (13) of Zheng and Lin.
+
+    Parameters
+    ----------
+    positions : array_like, (..., N, d)
+        Agents inside the box.
+    grid : Grid
+        Where the kernels are wanted, as means over cells.
+    bandwidth : float or array_like, (N,)
+        Standard deviation of the Gaussian, in the positions' unit, at least half a cell.
+    reflect : bool
+        Fold back at the walls what lies outside, so that each kernel has mass 1 to rounding.
+
+    Returns
+    -------
+    ndarray, (..., N, n)
+
+    Raises
+    ------
+    ValueError
+        If an agent is outside or NaN, the bandwidth is not positive, or the cells are wider than
+        two bandwidths.
+
+    Examples
+    --------
+    >>> grid = Grid((20, 20))
+    >>> z = kernels([[0.02, 0.5], [0.5, 0.5]], grid, bandwidth=0.08)
+    >>> z.shape, bool(abs(grid.integral(z) - 1).max() < 1e-12)
+    ((2, 400), True)
+    """
+    x = _agents(positions, grid)
+    return _kernels(x, grid, _width(bandwidth, grid, x.shape[-2]), reflect)
+
+
+def _kernels(x: Array, grid: Grid, h: Array, reflect: bool = True) -> Array:
+    out, *rest = _factors(x, grid, h, reflect)
+    for factor in rest:
+        out = (out[..., :, None] * factor[..., None, :]).reshape(*out.shape[:-1], -1)
+    return out
+
+
+def kernel_density(
+    positions: ArrayLike, grid: Grid, *, bandwidth: ArrayLike, reflect: bool = True
+) -> Array:
+    """The kernel estimate of agents' density, equation (4) of Zheng and Lin.
+
+    It is the mean of :func:`kernels` over the agents, whose parameters these are, without the
+    N kernels in memory.
+
+    Returns
+    -------
+    ndarray, (..., n)
+
+    Examples
+    --------
+    >>> grid = Grid((20, 20))
+    >>> p = kernel_density(np.full((1, 2), 0.5), grid, bandwidth=0.1)
+    >>> round(float(p.max() * 2 * np.pi * 0.1**2), 2)
+    0.92
+    """
+    x = _agents(positions, grid)
+    return _kernel_density(x, grid, _width(bandwidth, grid, x.shape[-2]), reflect)
+
+
+def _kernel_density(x: Array, grid: Grid, h: Array, reflect: bool = True) -> Array:
+    factors = _factors(x, grid, h, reflect)
+    if grid.dim == 2:
+        out = np.swapaxes(factors[0], -1, -2) @ factors[1]
+    elif grid.dim == 1:
+        out = factors[0].sum(axis=-2)
+    else:
+        out = np.einsum("...ni,...nj,...nk->...ijk", *factors, optimize=True)
+    return np.asarray(out.reshape(*x.shape[:-2], grid.size) / x.shape[-2])
+
+
+def kernel_information(grid: Grid, *, bandwidth: float, agents: int) -> float:
+    r"""The constant k̄ of Zheng and Lin: ∫K²/(N hᵈ), for which Var p_KDE ≈ k̄ p.
+
+    For a Gaussian, :math:`\bar k = 1/\bigl(N(2\sqrt\pi h)^d\bigr)`. It is the variance of one cell.
+    Neighbouring cells see the same agents, so it is no white noise: see :func:`kernel_covariance`.
+
+    Examples
+    --------
+    >>> round(kernel_information(Grid((30, 30)), bandwidth=0.08, agents=100), 4)
+    0.1243
+    """
+    n = count(agents, "agents")
+    if not isinstance(grid, Grid):
+        raise ValueError(f"grid: needs a Grid, got {type(grid).__name__}")
+    h = number(bandwidth, "bandwidth", above=0)
+    return float(1 / (n * (2 * np.sqrt(np.pi) * h) ** grid.dim))
+
+
+def kernel_covariance(
+    density: ArrayLike, grid: Grid, *, bandwidth: float, agents: int
+) -> tuple[Array, Array]:
+    r"""Mean and covariance of the kernel estimate of N independent agents, without approximation.
+
+    .. math::
+        \mathrm E\,\hat p = \mathbf G\mathbf p,\qquad
+        \mathrm{Cov}\,\hat p=\tfrac1N\bigl(\mathbf G\,\mathrm{diag}(\mathbf p)\mathbf G^\top\Delta
+        -\mathbf G\mathbf p(\mathbf G\mathbf p)^\top\bigr)
+
+    with the kernel from each cell to each other, :math:`\mathbf G/\Delta`, and cells of volume Δ.
+
+    Parameters
+    ----------
+    density : array_like, (n,)
+        The agents' true density, of integral 1; agents sit at the centres of cells.
+    grid : Grid
+    bandwidth : float
+    agents : int
+        Their number N.
+
+    Returns
+    -------
+    mean : ndarray, (n,)
+    covariance : ndarray, (n, n)
+
+    Examples
+    --------
+    >>> grid = Grid((20, 20))
+    >>> mean, cov = kernel_covariance(np.ones(400), grid, bandwidth=0.08, agents=100)
+    >>> middle = 10 * 20 + 10
+    >>> print(round(cov[middle, middle] / (1 / (400 * np.pi * 0.08**2)), 2))
+    0.89
+    """
+    p = array(density, "density", (grid.size,))
+    total = float(grid.integral(p))
+    if p.min() < 0 or abs(total - 1) > 1e-8:
+        raise ValueError(f"density: needs values of at least 0 and integral 1, got a least value "
+                         f"{p.min():g} and integral {total:g}")
+    n = count(agents, "agents")
+    h = number(bandwidth, "bandwidth", above=0)
+    g = kernels(grid.centres, grid, bandwidth=h).T * grid.volume
+    mean = g @ p
+    return mean, ((g * p) @ g.T / grid.volume - np.outer(mean, mean)) / n
+
+
+def bandwidth(
+    positions: ArrayLike, grid: Grid, *, rule: str = "silverman"
+) -> float:
+    r"""A bandwidth from the agents themselves.
+
+    Parameters
+    ----------
+    positions : array_like, (N, d)
+        At least two agents that are not all in one place.
+    grid : Grid
+    rule : {"silverman", "least_squares"}
+        Silverman's, :math:`\sigma\,(4/((d+2)N))^{1/(d+4)}` with the mean variance over axes, best
+        for one Gaussian; or the minimum of the unbiased estimate of the integrated squared error,
+        :math:`\int\hat p^2-\tfrac2N\sum_i\hat p_{-i}(\mathbf X_i)`, over twenty candidates.
+
+    Returns
+    -------
+    float
+        At least half a cell.
+
+    Examples
+    --------
+    >>> x = np.random.default_rng(1).random((100, 2))
+    >>> round(bandwidth(x, Grid((30, 30))), 3)
+    0.129
+    """
+    x = _agents(array(positions, "positions", ("N", grid.dim)), grid)
+    choice(rule, "rule", ("silverman", "least_squares"))
+    n, d = x.shape
+    spread = float(np.sqrt(x.var(axis=0).mean()))
+    if n < 2 or spread == 0:
+        raise ValueError(f"positions: needs two agents or more in different places, got {n} "
+                         f"with a spread of {spread:g}")
+    least = 0.5 * float(grid.spacing.max())
+    normal = spread * (4 / ((d + 2) * n)) ** (1 / (d + 4))
+    if rule == "silverman":
+        return float(max(normal, least))
+    candidates = np.maximum(normal * np.geomspace(0.15, 1.5, 20), least)
+    scores = [_least_squares(x, grid, h) for h in candidates]
+    return float(candidates[int(np.argmin(scores))])
+
+
+def _least_squares(x: Array, grid: Grid, h: float) -> float:
+    n = len(x)
+    z = _kernels(x, grid, np.full(n, h))
+    mean = z.mean(axis=0)
+    at = z[:, grid.cells(x)]  # kernel of agent i in the cell of agent j
+    others = (at.sum() - np.trace(at)) / (n * (n - 1))
+    return float((mean**2).sum() * grid.volume - 2 * others)
+
+
+def adaptive_bandwidths(
+    positions: ArrayLike, grid: Grid, *, bandwidth: float, sensitivity: float = 0.5
+) -> Array:
+    r"""Abramson's bandwidths: narrow where agents are many, wide where they are few.
+
+    .. math:: h_i = h\,\bigl(\hat p(\mathbf X_i)/g\bigr)^{-s},\qquad
+              \log g=\tfrac1N\textstyle\sum_i\log\hat p(\mathbf X_i)
+
+    Parameters
+    ----------
+    positions : array_like, (N, d)
+    grid : Grid
+    bandwidth : float
+        h, of the pilot estimate and in the mean.
+    sensitivity : float
+        s in [0, 1]; 1/2 removes the leading bias.
+
+    Returns
+    -------
+    ndarray, (N,)
+        At least half a cell.
+
+    Notes
+    -----
+    I. S. Abramson, Annals of Statistics 10 (1982) 1217-1223.
+
+    Examples
+    --------
+    >>> x = [[0.5, 0.5], [0.5, 0.52], [0.1, 0.9]]
+    >>> h = adaptive_bandwidths(x, Grid((30, 30)), bandwidth=0.1)
+    >>> bool(h[2] > 0.1 > h[0])
+    True
+    """
+    x = _agents(array(positions, "positions", ("N", grid.dim)), grid)
+    s = number(sensitivity, "sensitivity", at_least=0, at_most=1)
+    h = number(bandwidth, "bandwidth", above=0)
+    pilot = kernel_density(x, grid, bandwidth=h)[grid.cells(x)]
+    local = h * (pilot / np.exp(np.log(pilot).mean())) ** -s
+    return np.asarray(np.maximum(local, 0.5 * float(grid.spacing.max())))

@@ -1,0 +1,427 @@
+r"""Fusing beliefs about a shared part of agents' states: only beliefs about the target travel.
+
+An agent's state is x = [t; e]: the target t, which all agents estimate, comes first; what is its
+own, e, comes last and differs from agent to agent. The fused density is
+
+.. math:: p_f(\mathbf x)\propto p(\mathbf x)\,p(\mathbf t)^{\omega-1}
+    \prod_b p_b(\mathbf t)^{\omega_b},\qquad \omega+\sum_b\omega_b=1,
+
+equations (14)-(15) of Semeraro, LeGrand and Kulik for one other agent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import logsumexp
+
+from ..checks import Array, array, choice, instance, number, weights
+from .collocation import collocation_weights
+from .gaussian import GaussianMixture, symmetric, trusted
+from .quadratics import ExponentialQuadratics, inverse
+from .reduction import runnalls
+from .shapes import Shapes
+
+__all__ = ["PartialFusion", "average", "fuse", "fuse_moments"]
+
+TERMS = ("matched", "all")
+FORMS = ("conditional", "literal")
+
+
+@dataclass(frozen=True, eq=False)
+class PartialFusion:
+    r"""The exact fused density, which can be evaluated but is no mixture, and its approximations.
+
+    Parameters
+    ----------
+    own : GaussianMixture
+        The agent's belief about [t; e].
+    heard : GaussianMixture or sequence of them
+        Others' beliefs about t; all of one dimension, at most that of `own`.
+    omega : float or array_like
+        Exponent of the own target marginal, in [0, 1]; the others share the rest equally. Or one
+        exponent each, own first, nonnegative with sum 1.
+
+    Examples
+    --------
+    >>> own = GaussianMixture.gaussian([0.0, 0.0], [[2.0, 1.0], [1.0, 1.0]])
+    >>> other = GaussianMixture.gaussian([3.0], [[1.0]])
+    >>> fused = PartialFusion(own, other, omega=0.5).approximation()
+    >>> fused.means.round(4), fused.covs[0, 0, 0].round(4)
+    (array([[2., 1.]]), np.float64(1.3333))
+    """
+
+    own: GaussianMixture
+    heard: tuple[GaussianMixture, ...]
+    omega: float | ArrayLike = 0.5
+
+    def __init__(
+        self,
+        own: GaussianMixture,
+        heard: GaussianMixture | Sequence[GaussianMixture],
+        *,
+        omega: float | ArrayLike = 0.5,
+    ) -> None:
+        instance(own, "own", GaussianMixture)
+        others = (heard,) if isinstance(heard, GaussianMixture) else tuple(heard)
+        if not others:
+            raise ValueError("heard: needs at least one belief, got none")
+        for other in others:
+            instance(other, "heard", GaussianMixture)
+        sizes = {other.dim for other in others}
+        if len(sizes) > 1 or max(sizes) > own.dim:
+            raise ValueError(
+                f"heard: needs target beliefs of one size, at most own's {own.dim}, "
+                f"got {sorted(sizes)}"
+            )
+        for name, value in (
+            ("own", own), ("heard", others), ("omega", _exponents(omega, len(others))),
+        ):
+            object.__setattr__(self, name, value)
+
+    @property
+    def exponents(self) -> Array:
+        """Exponents of the own and of the others' target marginals; their sum is 1."""
+        return np.asarray(self.omega)
+
+    @property
+    def target_dim(self) -> int:
+        """Number of components of the target."""
+        return self.heard[0].dim
+
+    @cached_property
+    def target(self) -> GaussianMixture:
+        """The own belief about the target."""
+        return self.own.marginal(range(self.target_dim))
+
+    def log_update(self, t: ArrayLike) -> Array:
+        """Logarithm of the update factor g(t) of (15), not normalised, (...).
+
+        Parameters
+        ----------
+        t : array_like, (..., n_t)
+        """
+        return self._log_update(array(t, "t", (..., self.target_dim)))
+
+    def log_value(self, x: ArrayLike) -> Array:
+        """Logarithm of the fused density (14), not normalised, (...).
+
+        Parameters
+        ----------
+        x : array_like, (..., d)
+        """
+        at = array(x, "x", (..., self.own.dim))
+        return self.own.log_density(at) + self._log_update(at[..., : self.target_dim])
+
+    def log_target(self, t: ArrayLike) -> Array:
+        """Logarithm of the fused target marginal, not normalised; it needs no ego state."""
+        at = array(t, "t", (..., self.target_dim))
+        return self.target.log_density(at) + self._log_update(at)
+
+    def _log_update(self, t: Array) -> Array:
+        w = self.exponents
+        out = (w[0] - 1) * self.target.log_density(t) if w[0] != 1 else np.zeros(t.shape[:-1])
+        for weight, other in zip(w[1:], self.heard, strict=True):
+            out = out + (weight * other.log_density(t) if weight else 0.0)
+        return np.asarray(out)
+
+    def shapes(
+        self,
+        *,
+        terms: str = "matched",
+        form: str = "conditional",
+        marginal: GaussianMixture | None = None,
+        received: Sequence[GaussianMixture] | None = None,
+    ) -> Shapes:
+        """Means and covariances of the fused mixands, (22)-(28), without weights.
+
+        Parameters
+        ----------
+        terms : {"matched", "all"}
+            Terms in which own mixand and divided mixand are the same, L L' of them, all positive
+            definite; or all L² L', of which some are not and are left out.
+        form : {"conditional", "literal"}
+            By conditioning, which inverts nothing indefinite; or (22)-(27) as printed.
+        marginal : GaussianMixture, optional
+            What to divide by in place of the own target marginal (a reduced one); with
+            ``terms="all"``.
+        received : sequence of GaussianMixture, optional
+            What to multiply by in place of `heard` (reduced ones).
+        """
+        choice(terms, "terms", TERMS)
+        choice(form, "form", FORMS)
+        if marginal is not None and terms == "matched":
+            raise ValueError("marginal: needs terms='all', since matched terms use the own mixands")
+        divided = self._target_like(marginal, "marginal", self.target)
+        others = self.heard if received is None else tuple(received)
+        if len(others) != len(self.heard):
+            raise ValueError(f"received: needs {len(self.heard)} mixtures, got {len(others)}")
+        sent = [self._target_like(m, "received", m) for m in others]
+        pairs = np.indices((self.own.size, divided.size)).reshape(2, -1)
+        if terms == "matched":
+            pairs = np.repeat(np.arange(self.own.size)[None], 2, axis=0)
+        make = _conditional_shapes if form == "conditional" else _literal_shapes
+        return make(self.own, divided, sent, self.exponents, pairs)
+
+    def _target_like(
+        self, mixture: GaussianMixture | None, name: str, default: GaussianMixture
+    ) -> GaussianMixture:
+        if mixture is None:
+            return default
+        instance(mixture, name, GaussianMixture)
+        if mixture.dim != self.target_dim:
+            raise ValueError(f"{name}: needs dimension {self.target_dim}, got {mixture.dim}")
+        return mixture
+
+    def weigh(self, shapes: Shapes, *, rule: str = "C3", at_most: int = 500) -> GaussianMixture:
+        """The mixture of these shapes, with weights from the exact density at collocation points.
+
+        Parameters
+        ----------
+        shapes : Shapes
+        rule : {"C1", "C2", "C3", "points"}
+            (30), (31), (32)-(34), or C3 with the mixands' sigma points as further points.
+        at_most : int
+            For "C3" and "points": how many mixands may take part, the largest by C2.
+        """
+        instance(shapes, "shapes", Shapes)
+        return collocation_weights(
+            shapes, self.own, self.log_value, self.log_update, self.target_dim,
+            rule=rule, at_most=at_most,
+        )
+
+    def approximation(
+        self, *, terms: str = "matched", rule: str = "C3", size: int | None = None
+    ) -> GaussianMixture:
+        """The fused mixture: shapes, weights, and Runnalls' reduction to `size` mixands."""
+        if self.exponents[0] == 1:
+            return self.own
+        fused = self.weigh(self.shapes(terms=terms), rule=rule)
+        return fused if size is None or fused.size <= size else runnalls(fused, size)
+
+
+def fuse(
+    own: GaussianMixture,
+    heard: GaussianMixture | Sequence[GaussianMixture],
+    *,
+    omega: float | ArrayLike = 0.5,
+    terms: str = "matched",
+    rule: str = "C3",
+    size: int | None = None,
+) -> GaussianMixture:
+    """Fuse a belief about [target; ego] with others' beliefs about the target.
+
+    Parameters
+    ----------
+    own, heard, omega
+        As of :class:`PartialFusion`.
+    terms : {"matched", "all"}
+        As of :meth:`PartialFusion.shapes`.
+    rule : {"C1", "C2", "C3", "points"}
+        As of :meth:`PartialFusion.weigh`.
+    size : int, optional
+        Reduce the result to so many mixands by Runnalls' algorithm.
+
+    Examples
+    --------
+    >>> own = GaussianMixture.gaussian([0.0, 0.0], [[2.0, 1.0], [1.0, 1.0]])
+    >>> fuse(own, own.marginal([0])).covs.round(6).tolist()
+    [[[2.0, 1.0], [1.0, 1.0]]]
+    """
+    return PartialFusion(own, heard, omega=omega).approximation(terms=terms, rule=rule, size=size)
+
+
+def fuse_moments(
+    own: GaussianMixture,
+    heard: GaussianMixture | Sequence[GaussianMixture],
+    *,
+    omega: float | ArrayLike = 0.5,
+) -> GaussianMixture:
+    """Factorised covariance intersection: fuse the Gaussians that have the mixtures' moments.
+
+    Parameters
+    ----------
+    own, heard, omega
+        As of :class:`PartialFusion`.
+
+    Returns
+    -------
+    GaussianMixture
+        Of one mixand.
+
+    Examples
+    --------
+    >>> own = GaussianMixture.gaussian([0.0], [[2.0]])
+    >>> fuse_moments(own, GaussianMixture.gaussian([3.0], [[1.0]])).means.round(6)
+    array([[2.]])
+    """
+    exact = PartialFusion(own, heard, omega=omega)
+    alone = PartialFusion(
+        own.collapsed(), [m.collapsed() for m in exact.heard], omega=exact.exponents
+    )
+    shapes = alone.shapes()
+    return trusted(np.ones(1), shapes.means, shapes.covs)
+
+
+def average(
+    own: GaussianMixture, heard: GaussianMixture, *, omega: float = 0.5
+) -> GaussianMixture:
+    r"""Arithmetic average of the target beliefs, with the own conditional belief about the rest.
+
+    :math:`p(\mathbf e|\mathbf t)\,[\omega\,p(\mathbf t)+(1-\omega)\,p_b(\mathbf t)]`. The weights
+    of the own mixands given t are taken at the means of the heard mixands; with one own mixand the
+    result is exact.
+
+    Parameters
+    ----------
+    own, heard : GaussianMixture
+        As of :class:`PartialFusion`.
+    omega : float
+        The own share, in [0, 1].
+
+    Examples
+    --------
+    >>> own = GaussianMixture.gaussian([0.0, 0.0], [[1.0, 0.5], [0.5, 1.0]])
+    >>> average(own, GaussianMixture.gaussian([2.0], [[1.0]])).moments()[0]
+    array([1. , 0.5])
+    """
+    w = number(omega, "omega", at_least=0, at_most=1)
+    exact = PartialFusion(own, heard, omega=w)
+    target, n = exact.target, exact.target_dim
+    logs = target.log_weights + target.component_log_densities(heard.means)
+    share = np.exp(logs - logsumexp(logs, axis=1, keepdims=True))
+    means = np.empty((heard.size, own.size, own.dim))
+    covs = np.empty((heard.size, own.size, own.dim, own.dim))
+    gain, rest = _regression(own, n)
+    means[..., :n] = heard.means[:, None]
+    gap = heard.means[:, None] - own.means[:, :n]
+    means[..., n:] = own.means[:, n:] + (gain @ gap[..., None])[..., 0]
+    covs[:] = _joined(np.broadcast_to(heard.covs[:, None], (*means.shape[:2], n, n)), gain, rest)
+    new = (heard.weights[:, None] * share).ravel() * (1 - w)
+    d = own.dim
+    keep = new > 0
+    return trusted(
+        np.concatenate([w * own.weights, new[keep]]),
+        np.concatenate([own.means, means.reshape(-1, d)[keep]]),
+        np.concatenate([own.covs, covs.reshape(-1, d, d)[keep]]),
+    )
+
+
+def _exponents(omega: float | ArrayLike, others: int) -> Array:
+    if np.ndim(omega) == 0:
+        w = number(omega, "omega", at_least=0, at_most=1)
+        return np.concatenate([[w], np.full(others, (1 - w) / others)])
+    return weights(omega, "omega", others + 1)
+
+
+def _regression(own: GaussianMixture, n: int) -> tuple[Array, Array]:
+    """Gain of e on t and covariance of e given t, of each mixand."""
+    cross = own.covs[:, :n, n:]
+    gain = np.swapaxes(np.linalg.solve(own.covs[:, :n, :n], cross), -1, -2)
+    return gain, symmetric(own.covs[:, n:, n:] - gain @ cross)
+
+
+def _joined(target: Array, gain: Array, rest: Array) -> Array:
+    """Covariances of [t; e] from that of t, the gain of e on t, and the covariance of e given t."""
+    cross = target @ np.swapaxes(gain, -1, -2)
+    below = rest + gain @ cross
+    top = np.concatenate([target, cross], axis=-1)
+    low = np.concatenate([np.swapaxes(cross, -1, -2), symmetric(below)], axis=-1)
+    return np.concatenate([top, low], axis=-2)
+
+
+def _combined(sent: Sequence[GaussianMixture], w: Array) -> ExponentialQuadratics:
+    """The product of the others' powers, one term for each choice of a mixand from each."""
+    total: ExponentialQuadratics | None = None
+    for weight, other in zip(w, sent, strict=True):
+        part = other.quadratics()
+        part = ExponentialQuadratics(
+            weight * part.precisions, weight * part.vectors, 0 * part.vectors[:, 0]
+        )
+        total = part if total is None else total.times(part)
+    assert total is not None
+    return total
+
+
+def _conditional_shapes(
+    own: GaussianMixture, divided: GaussianMixture, sent: Sequence[GaussianMixture], w: Array,
+    pairs: NDArray[np.intp],
+) -> Shapes:
+    """Update the target part by Λ and η in the own mixand's whitened frame; e follows."""
+    n = divided.dim
+    q, p = pairs
+    precisions = inverse(divided.factors)
+    # Everything about the own mixand's mean: far from the origin products would cancel.
+    spread = np.zeros((q.size, 1, n, n))
+    pull = np.zeros((q.size, 1, n))
+    for weight, other in zip(w[1:], sent, strict=True):
+        j = weight * inverse(other.factors)
+        gap = other.means - own.means[q, None, :n]
+        eta = np.einsum("rij,srj->sri", j, gap)
+        size = (q.size, -1)
+        spread = (spread[:, :, None] + j).reshape(*size, n, n)
+        pull = (pull[:, :, None] + eta[:, None]).reshape(*size, n)
+    if w[0] != 1:
+        j = (w[0] - 1) * precisions[p]
+        gap = divided.means[p] - own.means[q, :n]
+        spread = spread + j[:, None]
+        pull = pull + (j @ gap[..., None])[:, None, :, 0]
+    root = np.linalg.cholesky(own.covs[q, :n, :n])[:, None]
+    middle = np.eye(n) + np.swapaxes(root, -1, -2) @ symmetric(spread) @ root
+    lower, good = _factored(middle)
+    half = np.linalg.solve(lower, np.broadcast_to(np.swapaxes(root, -1, -2), lower.shape))
+    target = np.swapaxes(half, -1, -2) @ half
+    move = (target @ pull[..., None])[..., 0]
+    gain, rest = _regression(own, n)
+    shift = np.concatenate([move, (gain[q, None] @ move[..., None])[..., 0]], axis=-1)
+    means = own.means[q, None] + shift
+    covs = _joined(target, np.broadcast_to(gain[q, None], (*good.shape, *gain.shape[1:])),
+                   np.broadcast_to(rest[q, None], (*good.shape, *rest.shape[1:])))
+    source = np.broadcast_to(q[:, None], good.shape)
+    return Shapes(means[good], covs[good], source[good], int((~good).sum()))
+
+
+def _literal_shapes(
+    own: GaussianMixture, divided: GaussianMixture, sent: Sequence[GaussianMixture], w: Array,
+    pairs: NDArray[np.intp],
+) -> Shapes:
+    """(22)-(27) as printed, with each inverse; for comparison."""
+    n, d = divided.dim, own.dim
+    q, p = pairs
+    inv = np.linalg.inv
+    terms = _combined(sent, w[1:])
+    j = (w[0] - 1) * inv(divided.covs)
+    information = (j[p, None] + terms.precisions).reshape(-1, n, n)
+    vector = ((j @ divided.means[..., None])[p, None, :, 0] + terms.vectors).reshape(-1, n)
+    factor_cov = inv(information)
+    factor_mean = (factor_cov @ vector[..., None])[..., 0]
+    source = np.repeat(q, terms.size)
+    full = np.zeros((source.size, d, d))
+    full[:, :n, :n] = inv(factor_cov)
+    lift = np.zeros((source.size, d))
+    lift[:, :n] = (inv(factor_cov) @ factor_mean[..., None])[..., 0]
+    prior = inv(own.covs)[source]
+    covs = inv(prior + full)
+    means = (covs @ ((prior @ own.means[source][..., None])[..., 0] + lift)[..., None])[..., 0]
+    covs = symmetric(covs)
+    _, good = _factored(covs)
+    return Shapes(means[good], covs[good], source[good], int((~good).sum()))
+
+
+def _factored(matrices: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Cholesky factors of a stack, and which of them exist; the identity where none does."""
+    d = matrices.shape[-1]
+    lower = np.zeros_like(matrices)
+    good = np.ones(matrices.shape[:-2], dtype=bool)
+    for k in range(d):
+        column = matrices[..., k:, k] - (lower[..., k:, :k] @ lower[..., k, :k, None])[..., 0]
+        # A pivot that has lost ten digits to cancellation is rounding.
+        good &= column[..., 0] > 1e-10 * np.abs(matrices[..., k, k])
+        pivot = np.where(good, column[..., 0], 1.0)
+        lower[..., k:, k] = np.where(good[..., None], column, 0.0) / np.sqrt(pivot)[..., None]
+    lower[~good] = np.eye(d)
+    return lower, good

@@ -1,0 +1,279 @@
+r"""A pendulum in Cartesian coordinates, with a length that its equations of motion have to keep.
+
+The state is :math:`(x, y, \dot x, \dot y)` with x to the right and y **downwards**, so that the
+pendulum hangs at :math:`(0, L)`; or, in the chart, the angle from there and its rate.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..checks import Array, array, choice, number
+from .base import Model
+from .integrators import rk4, rk4_jacobian
+
+__all__ = [
+    "FORMS",
+    "pendulum",
+    "pendulum_angle",
+    "pendulum_chart",
+    "pendulum_energy",
+    "pendulum_rate",
+    "pendulum_states",
+]
+
+FORMS = ("printed", "multiplier")
+"""Equations (14)-(15) as the paper prints them, and with the multiplier written out."""
+
+
+def pendulum_rate(
+    states: ArrayLike, *, length: float = 1.0, gravity: float = 9.8, form: str = "printed"
+) -> Array:
+    r"""Right-hand side of the pendulum's equations, (14)-(15) of Das and Bhattacharya.
+
+    .. math:: \ddot x=\frac{-gxy-x|\mathbf v|^2}{L^2},\qquad
+        \ddot y=\frac{gx^2-y|\mathbf v|^2}{L^2}
+
+    On the circle :math:`x^2+y^2=L^2` these are
+    :math:`\ddot{\mathbf q}=\mathbf g+\lambda\mathbf q` with the multiplier
+    :math:`\lambda=-(|\mathbf v|^2+gy)/L^2`. Off the circle the two differ: the printed form lets an
+    error of the length grow, the form with the multiplier does not.
+
+    Parameters
+    ----------
+    states : array_like, (..., 4)
+        Positions in m and velocities in m/s.
+    length : float
+        L, in m, positive.
+    gravity : float
+        g, in m/s², at least 0.
+    form : {"printed", "multiplier"}
+        `FORMS`.
+
+    Returns
+    -------
+    ndarray, (..., 4)
+
+    Examples
+    --------
+    >>> pendulum_rate([1.0, 0.0, 0.0, 0.0])
+    array([ 0. ,  0. , -0. ,  9.8])
+    """
+    x = array(states, "states", (..., 4))
+    size, g = number(length, "length", above=0), number(gravity, "gravity", at_least=0)
+    return _rate(x, size, g, choice(form, "form", FORMS) == "printed")
+
+
+def _rate(s: Array, size: float, g: float, printed: bool) -> Array:
+    x, y, u, v = s[..., 0], s[..., 1], s[..., 2], s[..., 3]
+    pull = (u * u + v * v + g * y) / -(size * size)
+    out = np.empty_like(s)
+    out[..., 0], out[..., 1] = u, v
+    np.multiply(pull, x, out=out[..., 2])
+    if printed:
+        # g x² / L² = g - g y² / L² + g (x² + y² - L²) / L²: off the circle another force.
+        out[..., 3] = pull * y + g * (x * x + y * y) / (size * size)
+    else:
+        out[..., 3] = pull * y + g
+    return out
+
+
+def _slope(s: Array, size: float, g: float, printed: bool) -> Array:
+    """Derivative of the right-hand side, (..., 4, 4)."""
+    x, y, u, v = s[..., 0], s[..., 1], s[..., 2], s[..., 3]
+    k = -1.0 / (size * size)
+    pull = (u * u + v * v + g * y) * k
+    out = np.zeros((*s.shape, 4))
+    out[..., 0, 2] = out[..., 1, 3] = 1.0
+    out[..., 2, 0], out[..., 2, 1] = pull, k * g * x
+    out[..., 2, 2], out[..., 2, 3] = 2 * k * u * x, 2 * k * v * x
+    out[..., 3, 1] = pull + k * g * y
+    out[..., 3, 2], out[..., 3, 3] = 2 * k * u * y, 2 * k * v * y
+    if printed:
+        out[..., 3, 0] -= 2 * k * g * x
+        out[..., 3, 1] -= 2 * k * g * y
+    return out
+
+
+def pendulum(
+    *,
+    length: float = 1.0,
+    gravity: float = 9.8,
+    form: str = "printed",
+    sigma: tuple[float, float] = (0.0, 0.0),
+    step: float = 0.01,
+) -> Model:
+    """The pendulum in Cartesian coordinates, integrated by Runge-Kutta of order 4.
+
+    Parameters
+    ----------
+    length, gravity, form
+        As for :func:`pendulum_rate`.
+    sigma : (float, float)
+        Strength of independent white noise on the positions, in m/√s, and on the velocities, in
+        m/s/√s; none by default. It does not know of the constraint.
+    step : float
+        Longest integration step, in s, positive.
+
+    Returns
+    -------
+    Model
+        Components x, y, vx, vy, with the Jacobian of the integration.
+
+    Examples
+    --------
+    >>> swing = pendulum().step([np.sin(1.0), np.cos(1.0), 0.0, 0.0], 0.0, 1.0)
+    >>> float(np.hypot(*swing[:2]).round(6))
+    1.0
+    """
+    size, g = number(length, "length", above=0), number(gravity, "gravity", at_least=0)
+    printed = choice(form, "form", FORMS) == "printed"
+    longest = number(step, "step", above=0)
+    density = _density(sigma, 2)
+
+    def rate(x: Array, _: float) -> Array:
+        return _rate(x, size, g, printed)
+
+    def slope(x: Array, _: float) -> Array:
+        return _slope(x, size, g, printed)
+
+    return Model(
+        4,
+        lambda x, t, dt: rk4(rate, x, t, dt, longest=longest),
+        lambda t, dt: density * dt,
+        derivative=lambda x, t, dt: rk4_jacobian(rate, slope, x, t, dt, longest=longest),
+        names=("x", "y", "vx", "vy"),
+        units=("m", "m", "m/s", "m/s"),
+    )
+
+
+def _density(sigma: tuple[float, float], each: int) -> Array:
+    pair = array(sigma, "sigma", (2,))
+    for value in pair:
+        number(value, "sigma", at_least=0)
+    return np.diag(np.repeat(pair, each) ** 2)
+
+
+def pendulum_angle(
+    *,
+    length: float = 1.0,
+    gravity: float = 9.8,
+    sigma: tuple[float, float] = (0.0, 0.0),
+    step: float = 0.01,
+) -> Model:
+    r"""The pendulum in its chart: the angle θ from the vertical and its rate.
+
+    .. math:: \ddot\theta = -\frac gL\sin\theta
+
+    Parameters
+    ----------
+    length, gravity, step
+        As for :func:`pendulum`.
+    sigma : (float, float)
+        Strength of white noise on the angle, in rad/√s, and on the rate, in rad/s/√s.
+
+    Returns
+    -------
+    Model
+        Components theta and omega; the angle is not wrapped.
+
+    Examples
+    --------
+    >>> pendulum_angle().step([0.0, 1.0], 0.0, 0.01).round(4)
+    array([0.01  , 0.9995])
+    """
+    size, g = number(length, "length", above=0), number(gravity, "gravity", at_least=0)
+    longest = number(step, "step", above=0)
+    density = _density(sigma, 1)
+
+    def rate(x: Array, _: float) -> Array:
+        out = np.empty_like(x)
+        out[..., 0] = x[..., 1]
+        out[..., 1] = -(g / size) * np.sin(x[..., 0])
+        return out
+
+    def slope(x: Array, _: float) -> Array:
+        out = np.zeros((*x.shape, 2))
+        out[..., 0, 1] = 1.0
+        out[..., 1, 0] = -(g / size) * np.cos(x[..., 0])
+        return out
+
+    return Model(
+        2,
+        lambda x, t, dt: rk4(rate, x, t, dt, longest=longest),
+        lambda t, dt: density * dt,
+        derivative=lambda x, t, dt: rk4_jacobian(rate, slope, x, t, dt, longest=longest),
+        names=("theta", "omega"),
+        units=("rad", "rad/s"),
+    )
+
+
+def pendulum_states(chart: ArrayLike, *, length: float = 1.0) -> Array:
+    r"""Cartesian states of chart coordinates, :math:`L(\sin\theta,\cos\theta)` and its velocity.
+
+    Parameters
+    ----------
+    chart : array_like, (..., 2)
+        Angles in rad and rates in rad/s.
+    length : float
+        L, in m, positive.
+
+    Returns
+    -------
+    ndarray, (..., 4)
+
+    Examples
+    --------
+    >>> pendulum_states([np.pi / 2, 2.0]).round(12) + 0.0
+    array([ 1.,  0.,  0., -2.])
+    """
+    q = array(chart, "chart", (..., 2))
+    size = number(length, "length", above=0)
+    sine, cosine, rate = np.sin(q[..., 0]), np.cos(q[..., 0]), q[..., 1]
+    return size * np.stack([sine, cosine, rate * cosine, -rate * sine], axis=-1)
+
+
+def pendulum_chart(states: ArrayLike) -> Array:
+    r"""Angle and rate of Cartesian states; the distance from the pivot and its rate are dropped.
+
+    Parameters
+    ----------
+    states : array_like, (..., 4)
+        Not at the pivot.
+
+    Returns
+    -------
+    ndarray, (..., 2)
+        The angle in (-π, π] and :math:`(\dot xy-x\dot y)/r^2`.
+
+    Examples
+    --------
+    >>> pendulum_chart(pendulum_states([2.0, -1.5])).round(12)
+    array([ 2. , -1.5])
+    """
+    s = array(states, "states", (..., 4))
+    x, y, u, v = s[..., 0], s[..., 1], s[..., 2], s[..., 3]
+    square = x * x + y * y
+    if (square == 0).any():
+        raise ValueError("states: needs positions away from the pivot, got one at it")
+    return np.stack([np.arctan2(x, y), (u * y - x * v) / square], axis=-1)
+
+
+def pendulum_energy(states: ArrayLike, *, gravity: float = 9.8) -> Array:
+    r"""Energy per mass, :math:`\frac12|\mathbf v|^2-gy`, in m²/s², (...).
+
+    Parameters
+    ----------
+    states : array_like, (..., 4)
+    gravity : float
+        g, in m/s², at least 0.
+
+    Examples
+    --------
+    >>> float(pendulum_energy([0.0, 1.0, 2.0, 0.0]).round(12))
+    -7.8
+    """
+    s = array(states, "states", (..., 4))
+    g = number(gravity, "gravity", at_least=0)
+    return np.asarray(0.5 * (s[..., 2] ** 2 + s[..., 3] ** 2) - g * s[..., 1])

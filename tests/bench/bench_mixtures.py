@@ -1,0 +1,195 @@
+"""Runnalls' reduction beside pyest and Stone Soup, its growth, and the cost of one fusion.
+
+Every library gets the same mixtures in one run. Stone Soup's reducer merges within a gate, which
+is another algorithm: its time is told, its result not compared. Writes data/bench/mixtures.csv;
+fails where a ratio, an agreement or the memory is missed.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from _bench import peak_mb, timed, write
+
+from distfilt.mixtures import (
+    GaussianMixture,
+    PartialFusion,
+    kept_by_relevance,
+    runnalls,
+    two_stage,
+)
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "book" / "studies"))
+
+Row = dict[str, Any]
+LEFT = 36
+PEERS = ((4, 500, 15), (12, 500, 6))
+"""Components, mixands, and the ratio that pyest has to lose by."""
+GROWTH = ((4, (500, 1000, 2000, 5000)), (12, (500, 1000, 2000)))
+FUSED = (5, 10, 20, 40)
+LIMIT_MB = 2000
+
+
+def mixture(size: int, dim: int, seed: int = 0) -> GaussianMixture:
+    """Uneven weights, means in a cloud, full covariances."""
+    rng = np.random.default_rng(seed + 1000 * dim + size)
+    roots = 0.4 * rng.standard_normal((size, dim, dim)) + 0.6 * np.eye(dim)
+    covs = roots @ np.swapaxes(roots, -1, -2) + 0.1 * np.eye(dim)
+    w = rng.dirichlet(np.ones(size))
+    return GaussianMixture(w, 3 * rng.standard_normal((size, dim)), covs)
+
+
+def row(task: str, dim: int, size: int, seconds: float, **more: Any) -> Row:
+    """One line of the table."""
+    empty = {"ratio": "", "needed": "", "gap": "", "slope": ""}
+    return {
+        "task": task, "components": dim, "mixands": size, "ms": f"{1e3 * seconds:.1f}",
+        **{**empty, **more}, "peak_mb": f"{peak_mb():.0f}",
+    }
+
+
+def gap(ours: GaussianMixture, weights: Any, means: Any, covs: Any) -> float:
+    """Largest relative difference of two mixtures whose mixands stand in another order."""
+    mine, theirs = np.argsort(ours.weights), np.argsort(weights)
+    pairs = ((ours.weights, weights), (ours.means, means), (ours.covs, covs))
+    return max(
+        float(np.abs(a[mine] - np.asarray(b)[theirs]).max() / np.abs(a).max()) for a, b in pairs
+    )
+
+
+def stone_soup(p: GaussianMixture) -> Callable[[], Any]:
+    """Its reducer on the same mixture."""
+    from stonesoup.mixturereducer.gaussianmixture import GaussianMixtureReducer
+    from stonesoup.types.numeric import Probability
+    from stonesoup.types.state import WeightedGaussianState
+
+    states = [
+        WeightedGaussianState(m[:, None], c, weight=Probability(w))
+        for w, m, c in zip(p.weights, p.means, p.covs, strict=True)
+    ]
+    reducer = GaussianMixtureReducer(
+        prune_threshold=1e-12, merge_threshold=4 * p.dim, max_number_components=LEFT
+    )
+    return lambda: reducer.reduce(list(states))
+
+
+def beside_peers() -> tuple[list[Row], int]:
+    """Our reduction, plain numpy's, pyest's and Stone Soup's."""
+    from pyest.gm import GaussianMixture as TheirMixture
+    from pyest.gm import merge_runnalls
+
+    rows, missed = [], 0
+    for dim, size, needed in PEERS:
+        p = mixture(size, dim)
+        theirs = TheirMixture(p.weights.copy(), p.means.copy(), p.covs.copy())
+        for warm in (mixture(40, dim), p):
+            runnalls(warm, 30)
+        small = mixture(40, dim)
+        merge_runnalls(TheirMixture(small.weights, small.means, small.covs), 30)
+        ours = timed(lambda p=p: runnalls(p, LEFT, engine="numba"), 5)
+        plain = timed(lambda p=p: runnalls(p, LEFT, engine="numpy"), 1)
+        peer = timed(lambda t=theirs: merge_runnalls(t, LEFT), 1)
+        soup = timed(stone_soup(p), 1)
+        apart = gap(ours.result, peer.result.w, peer.result.m, peer.result.P)
+        ratio = peer.cpu / ours.cpu
+        missed += int(ratio < needed or apart > 1e-12)
+        rows.append(row("reduce", dim, size, ours.cpu))
+        rows.append(row("reduce, numpy", dim, size, plain.cpu, ratio=f"{plain.cpu / ours.cpu:.1f}",
+                        gap=f"{gap(ours.result, *parts(plain.result)):.0e}"))
+        rows.append(row("reduce, pyest", dim, size, peer.cpu, ratio=f"{ratio:.1f}",
+                        needed=needed, gap=f"{apart:.0e}"))
+        rows.append(row("merge in a gate, Stone Soup", dim, size, soup.cpu,
+                        ratio=f"{soup.cpu / ours.cpu:.1f}"))
+    return rows, missed
+
+
+def parts(p: GaussianMixture) -> tuple[Any, Any, Any]:
+    """Weights, means, covariances."""
+    return p.weights, p.means, p.covs
+
+
+def growth() -> list[Row]:
+    """Time against the number of mixands, with the slope between neighbours."""
+    rows = []
+    for reduce, name in ((runnalls, "reduce"), (two_stage, "reduce in two stages")):
+        for dim, sizes in GROWTH:
+            before: tuple[int, float] | None = None
+            for size in sizes:
+                p = mixture(size, dim)
+                took = timed(lambda p=p, f=reduce: f(p, LEFT), 1 if size > 1000 else 3).cpu
+                slope = "" if before is None else (
+                    f"{np.log(took / before[1]) / np.log(size / before[0]):.2f}"
+                )
+                rows.append(row(name, dim, size, took, slope=slope))
+                before = size, took
+    return rows
+
+
+def fusion() -> list[Row]:
+    """Shapes and C2 weights of a 12-component fusion, and C3 weights where they are few."""
+    rows = []
+    for size in FUSED:
+        f = PartialFusion(mixture(size, 12, 1), mixture(size, 12, 2).marginal(range(6)))
+        for name, options in (
+            ("all terms", {"terms": "all"}),
+            ("all terms, literal", {"terms": "all", "form": "literal"}),
+            ("matched terms", {"terms": "matched"}),
+        ):
+            took = timed(lambda f=f, o=options: f.weigh(f.shapes(**o), rule="C2"), 1)
+            rows.append(row(f"fuse, {name}", 12, size, took.cpu))
+        least = [runnalls(m, min(6, size)) for m in (f.target, f.heard[0])]
+        took = timed(lambda f=f, r=least: f.weigh(
+            f.shapes(terms="all", marginal=r[0], received=[r[1]]), rule="C2"), 3)
+        rows.append(row("fuse, marginals reduced to 6", 12, size, took.cpu))
+        took = timed(lambda f=f, r=least: f.weigh(f.shapes(received=[r[1]]), rule="C3"), 3)
+        rows.append(row("fuse, matched, heard reduced to 6, C3", 12, size, took.cpu))
+        took = timed(lambda f=f: kept_by_relevance(f.target, f.heard[0], threshold=40.0), 3)
+        rows.append(row("relevance", 6, size, took.cpu))
+    return rows
+
+
+def in_orbit() -> tuple[list[Row], int]:
+    """One seed of chapter 8's rows, a day of 10 000 states, and a split beside pyest's."""
+    import orbit as study
+    from pyest.gm import GaussSplitOptions, split_gaussian
+
+    from distfilt.mixtures import split
+    from distfilt.models.orbit import propagate
+
+    rows, missed = [], 0
+    truth = study.data(study.SETTING, np.random.default_rng(7))[1:]
+    for name in ("none", "matched", "one_ci"):
+        took = timed(lambda n=name: study.run(study.SETTING, study.ROWS[n], *truth), 3)
+        missed += int(took.cpu > 2)
+        size = took.result[-1].mixtures[0].size
+        rows.append(row(f"track, {name}", 12, size, took.cpu, needed=2000))
+    many = np.tile(study.SETTING["target"], (10_000, 1))
+    rows.append(row("propagate 24 h", 6, 10_000, timed(lambda: propagate(many, 86400.0), 1).cpu))
+    p = mixture(1, 12)
+    u = p.factors[:, :, 0]
+    options = GaussSplitOptions(L=3, lam=1e-3)
+    ours = timed(lambda: [split(p, [0], u) for _ in range(200)], 3).cpu / 200
+    theirs = timed(lambda: [
+        split_gaussian(1.0, p.means[0], p.covs[0], options, direction=u[0]) for _ in range(200)
+    ], 3).cpu / 200
+    rows.append(row("split", 12, 1, ours))
+    rows.append(row("split, pyest", 12, 1, theirs, ratio=f"{theirs / ours:.1f}"))
+    return rows, missed
+
+
+def main() -> int:
+    """Measure, write the table, and count what is missed."""
+    rows, missed = beside_peers()
+    rows += growth() + fusion()
+    more, late = in_orbit()
+    rows, missed = rows + more, missed + late
+    write("mixtures", rows, ("numpy", "numba", "pyest", "stonesoup"))
+    return missed + int(peak_mb() > LIMIT_MB)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,307 @@
+"""Constraints: the four readings of (12), retraction, clipping, acceptance, augmentation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from distfilt.checks import SolverError
+from distfilt.coupling import (
+    READINGS,
+    Constraint,
+    accepted,
+    augmented_readings,
+    clip,
+    norm,
+    project,
+    retract,
+)
+
+NAN = float("nan")
+_C = "distfilt.coupling.constraints."
+_X = np.array([[0.5, 1.0], [2.0, -1.0], [0.5, 0.5]])
+_LINE = Constraint(lambda x: x @ np.array([[1.0], [2.0]]), [1.0])
+_WRONG = Constraint(lambda x: x[0], [1.0])
+
+
+def _either(call: Callable[..., object]) -> list[tuple[str, Callable[[], object]]]:
+    return [
+        ("constraint", lambda: call(_X, norm)),
+        ("function", lambda: call(_X, _WRONG)),
+    ]
+
+
+BAD_INPUT: dict[str, list[tuple[str, Callable[[], object]]]] = {
+    _C + "Constraint": [
+        ("function", lambda: Constraint(3, [1.0])),
+        ("value", lambda: Constraint(lambda x: x, 1.0)),
+        ("value", lambda: Constraint(lambda x: x, [])),
+        ("value", lambda: Constraint(lambda x: x, [NAN])),
+        ("derivative", lambda: Constraint(lambda x: x, [1.0], derivative=2)),
+        ("function", lambda: _WRONG.residual(_X)),
+        ("x", lambda: _LINE.residual(3.0)),
+        ("derivative", lambda: Constraint(
+            lambda x: x[..., :1], [1.0], derivative=lambda x: x).jacobian(_X)),
+    ],
+    _C + "norm": [
+        ("indices", lambda: norm([])),
+        ("indices", lambda: norm([0, 0])),
+        ("indices", lambda: norm([-1])),
+        ("indices", lambda: norm([0.5])),
+        ("length", lambda: norm([0], length=0.0)),
+    ],
+    _C + "project": [
+        *_either(project),
+        ("ensemble", lambda: project(_X[:1], _LINE)),
+        ("ensemble", lambda: project(NAN * _X, _LINE)),
+        ("reading", lambda: project(_X, _LINE, reading="as meant")),
+        ("regularisation", lambda: project(_X, _LINE, regularisation=-1.0)),
+    ],
+    _C + "retract": [
+        *_either(retract),
+        ("states", lambda: retract(NAN * _X, _LINE)),
+        ("tolerance", lambda: retract(_X, _LINE, tolerance=0.0)),
+        ("iterations", lambda: retract(_X, _LINE, iterations=0)),
+        ("motion", lambda: retract(_X, norm([0]), motion=([0], [2]))),
+        ("motion", lambda: retract(_X, norm([0]), motion=([0], [0]))),
+        ("motion", lambda: retract(_X, norm([0]), motion=([0], []))),
+        ("motion", lambda: retract(_X, norm([0]), motion=[0, 1])),
+        ("rank", lambda: retract([[0.0, 0.0]], norm([0, 1]))),
+    ],
+    _C + "clip": [
+        *_either(clip),
+        ("states", lambda: clip(NAN * _X, _LINE)),
+        ("constraint", lambda: clip(_X, Constraint(lambda x: x, [0.0, 0.0]))),
+    ],
+    _C + "accepted": [
+        *_either(lambda x, g: accepted(np.zeros(3), x, g)),
+        ("log_weights", lambda: accepted(np.zeros(2), _X, _LINE)),
+        ("ensemble", lambda: accepted(np.zeros(3), _X + 100, _LINE)),
+        ("tolerance", lambda: accepted(np.zeros(3), _X, _LINE, tolerance=-1.0)),
+    ],
+    _C + "augmented_readings": [
+        *_either(lambda x, g: augmented_readings(x, x, x[0], np.eye(2), g, std=1.0)),
+        ("std", lambda: augmented_readings(_X, _X, _X[0], np.eye(2), _LINE, std=0.0)),
+        ("predicted", lambda: augmented_readings(_X, _X[:2], _X[0], np.eye(2), _LINE, std=1.0)),
+        ("observed", lambda: augmented_readings(_X, _X, _X, np.eye(2), _LINE, std=1.0)),
+        ("noise", lambda: augmented_readings(_X, _X, _X[0], np.eye(3), _LINE, std=1.0)),
+    ],
+}
+EXEMPT = {_C + "READINGS": "a tuple of names"}
+
+
+def _members(seed: int, n: int = 30, d: int = 4) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return rng.standard_normal(d) + rng.standard_normal((n, d)) @ rng.standard_normal((d, d))
+
+
+def _linear(seed: int, s: int = 2, d: int = 4) -> Constraint:
+    rng = np.random.default_rng(seed + 1000)
+    matrix = rng.standard_normal((s, d))
+    return Constraint(lambda x: x @ matrix.T, rng.standard_normal(s))
+
+
+def _std(g: Constraint, x: np.ndarray) -> np.ndarray:
+    return g.residual(x).std(axis=0)
+
+
+# ------------------------------------------------------------------------------ readings of (12)
+
+
+@given(st.integers(0, 10_000))
+def test_linear_constraints_tell_the_readings_apart(seed: int) -> None:
+    """Printed: same mean, twice the spread. Reversed: mean D. Particle: exact. Shift: mean d."""
+    x, g = _members(seed), _linear(seed)
+    out = {r: project(x, g, reading=r, regularisation=0.0, guarded=False) for r in READINGS}
+    scale = 1 + np.abs(x).max()
+    size = 1e-9 * scale * max(1.0, 1 / _std(g, x).min())
+    assert np.abs(out["printed"].mean(axis=0) - x.mean(axis=0)).max() < size
+    assert np.abs(_std(g, out["printed"]) / _std(g, x) - 2).max() < 1e-8
+    assert np.abs(g.residual(out["reversed"]) - g.residual(x).mean(axis=0)).max() < size
+    assert np.abs(g.residual(out["particle"])).max() < size
+    assert np.abs(g.residual(out["shift"]).mean(axis=0)).max() < size
+    assert np.abs(_std(g, out["shift"]) - _std(g, x)).max() < size
+
+
+def test_the_printed_spread_doubles_exactly_and_covariance_gains_three() -> None:
+    x, g = _members(1, d=3), _linear(1, s=1, d=3)
+    out = project(x, g, reading="printed", regularisation=0.0, guarded=False)
+    assert abs(_std(g, out)[0] / _std(g, x)[0] - 2) < 1e-10
+    assert _std(g, project(x, g, reading="particle", regularisation=0.0))[0] < 1e-10
+    around = x - x.mean(axis=0)
+    seen = g.residual(x) - g.residual(x).mean(axis=0)
+    spread = seen.T @ seen / 30
+    gain = np.linalg.solve(spread, seen.T @ around / 30)
+    now = out - out.mean(axis=0)
+    expected = around.T @ around / 30 + 3 * gain.T @ spread @ gain
+    assert np.abs(now.T @ now / 30 - expected).max() < 1e-12 * np.abs(expected).max()
+
+
+def test_the_mean_of_the_printed_projection_never_moves() -> None:
+    """So that reporting it, OTProj, is the filter without a constraint."""
+    x = np.array([0.5, 0.9]) + 0.1 * np.random.default_rng(2).standard_normal((3, 50, 2))
+    out = project(x, norm([0, 1]), reading="printed", guarded=False)
+    assert np.abs(out.mean(axis=1) - x.mean(axis=1)).max() < 1e-12
+    assert np.abs(out - x).max() > 0.01
+
+
+def test_the_projection_by_its_formula_in_a_batch() -> None:
+    x, g = _members(3, 25, 3), norm([0, 2], length=1.3)
+    eps = 0.3
+    d = (x[:, [0, 2]] ** 2).sum(axis=1)
+    gain = np.cov(x.T, d, bias=True)[:3, 3] / (d.var() + eps)
+    shift = x + np.outer(1.69 - np.full(25, d.mean()), gain)
+    particle = x + np.outer(1.69 - d, gain)
+    options = {"regularisation": eps, "guarded": False}
+    stack = np.stack([x, 0.5 * x])
+    assert np.allclose(project(stack, g, **options)[0], shift, atol=1e-12)
+    assert np.allclose(project(x, g, reading="particle", **options), particle, atol=1e-12)
+    assert np.allclose(project(stack, g, **options)[1], project(0.5 * x, g, **options))
+
+
+def test_a_projection_that_makes_it_worse_is_refused() -> None:
+    """On the manifold the covariance of g is rounding, and the gain a million million."""
+    angle = np.linspace(0, 1, 40)
+    x = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    g = norm([0, 1])
+    wild = project(x, g, reading="particle", regularisation=1e-40, guarded=False)
+    calm = project(x, g, reading="particle", regularisation=1e-40)
+    assert np.abs(g.residual(calm)).mean() <= np.abs(g.residual(x)).mean()
+    assert np.abs(calm - x).max() < 1e-9 or np.abs(wild - x).max() < 1e-9
+    far = np.random.default_rng(4).standard_normal((40, 2)) * [3.0, 0.01]
+    both = project(np.stack([far, x + 0.1]), g, reading="printed")
+    assert (both[0] == far).all()
+
+
+def test_a_singular_covariance_without_regularisation_raises() -> None:
+    x = np.array([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]])
+    with pytest.raises(np.linalg.LinAlgError):
+        project(x, Constraint(lambda v: v[..., :1], [1.0]), regularisation=0.0)
+
+
+# ------------------------------------------------------------------------------ retraction
+
+
+@given(st.integers(0, 10_000), st.floats(0.2, 5.0))
+def test_a_length_is_retracted_to_the_closest_point(seed: int, length: float) -> None:
+    x = 0.3 + np.random.default_rng(seed).uniform(0, 3, (2, 20, 3))
+    out = retract(x, norm([0, 1, 2], length=length))
+    r = np.linalg.norm(x, axis=-1, keepdims=True)
+    assert np.abs(out - length * x / r).max() < 1e-12 * length
+    assert np.abs(np.linalg.norm(out, axis=-1) - length).max() <= 1e-14 * max(1.0, length)
+
+
+def test_two_constraints_and_numerical_derivatives() -> None:
+    """A circle in a tilted plane, without a Jacobian."""
+    g = Constraint(
+        lambda x: np.stack([(x**2).sum(axis=-1), x[..., 0] + x[..., 2]], axis=-1), [4.0, 0.5]
+    )
+    x = np.random.default_rng(5).standard_normal((50, 3)) + [1.0, 1.0, 0.0]
+    out = retract(x, g)
+    assert np.abs(g.residual(out)).max() < 1e-13
+    again = retract(out, g)
+    assert np.abs(again - out).max() < 1e-13
+
+
+def test_velocities_become_tangent_and_keep_their_tangent_part() -> None:
+    rng = np.random.default_rng(6)
+    x = rng.standard_normal((40, 6))
+    out = retract(x, norm([3, 0]), motion=([0, 3], [1, 5]))
+    radial = out[:, 0] * out[:, 1] + out[:, 3] * out[:, 5]
+    assert np.abs(radial).max() < 1e-14
+    before = x[:, 0] * x[:, 5] - x[:, 3] * x[:, 1]
+    after = out[:, 0] * out[:, 5] - out[:, 3] * out[:, 1]
+    assert np.allclose(after, before / np.hypot(x[:, 0], x[:, 3]), atol=1e-12)
+    assert (out[:, [2, 4]] == x[:, [2, 4]]).all()
+
+
+def test_a_quaternion_of_a_pose() -> None:
+    x = np.random.default_rng(7).standard_normal((4, 25, 13))
+    out = retract(x, norm(range(9, 13)))
+    assert np.abs(np.linalg.norm(out[..., 9:], axis=-1) - 1).max() <= 1e-14
+    assert (out[..., :9] == x[..., :9]).all()
+
+
+def test_a_rank_that_is_lost_at_one_state_is_named() -> None:
+    x = np.ones((5, 2))
+    x[3] = 0.0
+    with pytest.raises(ValueError, match=r"rank at state 3 \(1 of 5\)"):
+        retract(x, norm([0, 1]))
+
+
+def test_a_constraint_without_a_solution_does_not_converge() -> None:
+    impossible = Constraint(lambda x: (x**2).sum(axis=-1, keepdims=True) + 1, [0.5])
+    with pytest.raises((SolverError, ValueError), match=r"did not reach|loses rank"):
+        retract([[0.7, 0.4]], impossible)
+    with pytest.raises(SolverError, match="1 of 2 states"):
+        retract([[100.0, 3.0], [0.6, 0.8]], norm([0, 1]), iterations=2)
+
+
+def test_steps_are_shortened_where_newton_overshoots() -> None:
+    """g = arctan: from 3 a full Newton step goes to -9.5, and the next one far away."""
+    g = Constraint(np.arctan, [0.0], derivative=lambda x: 1 / (1 + x[..., None] ** 2))
+    assert np.abs(retract([[3.0], [-20.0]], g)).max() < 1e-14
+
+
+def test_states_on_the_constraint_stay() -> None:
+    x = np.array([[0.6, 0.8], [1.0, 0.0]])
+    assert (retract(x, norm([0, 1])) == x).all()
+
+
+# ------------------------------------------------------------------------------ inequalities
+
+
+def test_clipping_moves_only_what_is_outside() -> None:
+    x = np.random.default_rng(8).standard_normal((3, 200, 2))
+    out, r = clip(x, norm([0, 1])), np.hypot(x[..., 0], x[..., 1])
+    assert (out[r <= 1] == x[r <= 1]).all()
+    assert np.abs(np.hypot(*out[r > 1].T) - 1).max() < 1e-14
+
+
+def test_accepting_takes_weights_away_outside() -> None:
+    x = np.random.default_rng(9).standard_normal((4, 50, 2))
+    logs = np.random.default_rng(10).standard_normal((4, 50))
+    out, r = accepted(logs, x, norm([0, 1])), np.hypot(x[..., 0], x[..., 1])
+    assert np.isneginf(out[r > 1]).all() and (out[r <= 1] == logs[r <= 1]).all()
+    wide = accepted(logs, x, norm([0, 1]), tolerance=3.0)
+    assert np.isneginf(wide).sum() < np.isneginf(out).sum()
+
+
+def test_augmented_readings_by_hand() -> None:
+    x = _members(11, 10, 3)
+    r = np.array([[0.5, 0.2], [0.2, 0.3]])
+    h, y, noise = augmented_readings(x, x[:, :2], [1.0, 2.0], r, norm([0, 2], length=2.0), std=0.1)
+    assert np.allclose(h, np.column_stack([x[:, :2], x[:, 0] ** 2 + x[:, 2] ** 2]))
+    assert np.allclose(y, [1.0, 2.0, 4.0])
+    assert np.allclose(noise, [[0.5, 0.2, 0], [0.2, 0.3, 0], [0, 0, 0.01]])
+
+
+def test_jacobians_by_formula_and_by_differences() -> None:
+    x = _members(12, 7, 4)
+    g = norm([1, 3])
+    numeric = Constraint(g.function, g.value)
+    assert np.abs(g.jacobian(x) - numeric.jacobian(x)).max() < 1e-8
+    assert g.jacobian(x).shape == (7, 1, 4)
+
+
+def test_inputs_stay_as_they_were() -> None:
+    x = _members(13, 10, 4)
+    kept = x.copy()
+
+    def spoils(v: np.ndarray) -> np.ndarray:
+        v *= v
+        return v.sum(axis=-1, keepdims=True)
+
+    g = Constraint(spoils, [1.0])
+    project(x, g)
+    retract(x, g)
+    clip(x, g)
+    assert (x == kept).all()
+    value = np.array([1.0])
+    held = Constraint(spoils, value)
+    value[0] = 5.0
+    assert held.value[0] == 1.0

@@ -1,0 +1,359 @@
+"""The ensemble transform: exact moments and identities, corrections, pieces and curved sets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import ot.lp.emd_wrap  # noqa: F401  (its import takes seconds, an example should not)
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from distfilt.coupling import (
+    distances,
+    ensemble_transform,
+    plan,
+    plans,
+    rejuvenated,
+    second_order,
+    transform_along,
+    transform_within,
+)
+from distfilt.coupling.transform import _chosen
+
+NAN = float("nan")
+_T = "distfilt.coupling.transform."
+_X = np.array([[0.0, 1.0], [2.0, -1.0], [0.5, 0.5]])
+_W = np.log([0.5, 0.3, 0.2])
+
+
+def _rng(seed: int = 0) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
+def _wrapped(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return (a - b + np.pi) % (2 * np.pi) - np.pi
+
+
+def _common(call: Callable[..., object]) -> list[tuple[str, Callable[[], object]]]:
+    return [
+        ("ensemble", lambda: call(_X[0], _W)),
+        ("ensemble", lambda: call(NAN * _X, _W)),
+        ("ensemble", lambda: call(np.zeros((0, 2)), [])),
+        ("log_weights", lambda: call(_X, _W[:2])),
+        ("log_weights", lambda: call(_X, [0.0, NAN, 0.0])),
+        ("log_weights", lambda: call(_X, [0.0, np.inf, 0.0])),
+        ("log_weights", lambda: call(_X, np.full(3, -np.inf))),
+    ]
+
+
+BAD_INPUT: dict[str, list[tuple[str, Callable[[], object]]]] = {
+    _T + "plans": [
+        *_common(plans),
+        ("solver", lambda: plans(_X, _W, solver="best")),
+    ],
+    _T + "ensemble_transform": [
+        *_common(ensemble_transform),
+        ("solver", lambda: ensemble_transform(_X, _W, solver="best")),
+        ("debias", lambda: ensemble_transform(_X, _W, debias=1)),
+        ("correct", lambda: ensemble_transform(_X, _W, correct="yes")),
+        ("regularisation", lambda: ensemble_transform(
+            _X, _W, solver="entropic", regularisation=-1.0)),
+    ],
+    _T + "second_order": [
+        *_common(lambda x, w: second_order(x, x, w)),
+        ("moved", lambda: second_order(_X[:2], _X, _W)),
+    ],
+    _T + "rejuvenated": [
+        ("ensemble", lambda: rejuvenated(_X[:1], _X[:1], bandwidth=0.1, rng=_rng())),
+        ("moved", lambda: rejuvenated(_X[:2], _X, bandwidth=0.1, rng=_rng())),
+        ("bandwidth", lambda: rejuvenated(_X, _X, bandwidth=-0.1, rng=_rng())),
+        ("rng", lambda: rejuvenated(_X, _X, bandwidth=0.1, rng=3)),
+    ],
+    _T + "transform_within": [
+        ("ensemble", lambda: transform_within(_X[None], _W, [0, 0, 0], rng=_rng())),
+        ("log_weights", lambda: transform_within(_X, NAN * _W, [0, 0, 0], rng=_rng())),
+        ("pieces", lambda: transform_within(_X, _W, [0, 0], rng=_rng())),
+        ("pieces", lambda: transform_within(_X, _W, [0.0, 0.5, 1.0], rng=_rng())),
+        ("rng", lambda: transform_within(_X, _W, [0, 0, 0], rng=None)),
+        ("solver", lambda: transform_within(_X, _W, [0, 0, 0], rng=_rng(), solver="best")),
+    ],
+    _T + "transform_along": [
+        *_common(lambda x, w: transform_along(
+            x, w, difference=np.subtract, retract=np.add)),
+        ("difference", lambda: transform_along(_X, _W, difference=1, retract=np.add)),
+        ("difference", lambda: transform_along(
+            _X, _W, difference=lambda a, b: a[0], retract=np.add)),
+        ("retract", lambda: transform_along(_X, _W, difference=np.subtract, retract=2)),
+        ("retract", lambda: transform_along(
+            _X, _W, difference=np.subtract, retract=lambda x, v: x[:1])),
+        ("solver", lambda: transform_along(
+            _X, _W, difference=np.subtract, retract=np.add, solver="best")),
+    ],
+}
+
+
+def _case(seed: int, n: int = 40, d: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Correlated members far from the origin, log-weights, and the weights."""
+    rng = _rng(seed)
+    x = 5.0 + rng.standard_normal((n, d)) @ rng.standard_normal((d, d))
+    logs = -0.5 * ((x[:, 0] - 5.5) / 0.5) ** 2
+    w = np.exp(logs - logs.max())
+    return x, logs, w / w.sum()
+
+
+def _covariance(x: np.ndarray, w: np.ndarray | None = None) -> np.ndarray:
+    w = np.full(len(x), 1 / len(x)) if w is None else w
+    around = x - w @ x
+    return around.T @ (w[:, None] * around)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 30), st.integers(1, 4))
+def test_the_mean_is_the_weighted_mean(seed: int, n: int, d: int) -> None:
+    x, logs, w = _case(seed, n, d)
+    scale = np.abs(x).max()
+    moved = ensemble_transform(x, logs)
+    assert np.abs(moved.mean(axis=0) - w @ x).max() <= 1e-14 * scale
+    t = plans(x, logs)
+    assert np.abs(t.sum(axis=1) - w).max() <= 1e-14
+    assert np.abs(t.sum(axis=0) - 1 / n).max() <= 1e-14
+    assert np.abs(moved - n * t.T @ x).max() <= 1e-13 * scale
+
+
+def test_against_the_plan_of_the_solvers() -> None:
+    x, logs, w = _case(1)
+    expected = 40 * plan(distances(x), w).matrix.T @ x
+    assert np.allclose(ensemble_transform(x, logs), expected, atol=1e-13)
+    for solver in ("highs", "linprog"):
+        assert np.allclose(ensemble_transform(x, logs, solver=solver), expected, atol=1e-9)
+
+
+def test_averaging_identities() -> None:
+    """|x_j+|² = L² - sum phi |x_i - x_j+|² on a circle, |mean|² = mean |x|² - tr Cov."""
+    rng = _rng(2)
+    angle = rng.uniform(-1.0, 2.5, 50)
+    x = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    logs = -8 * (x[:, 0] - 0.3) ** 2
+    phi = 50 * plans(x, logs)
+    moved = ensemble_transform(x, logs)
+    gap = (phi * distances(x, moved)).sum(axis=0)
+    assert np.abs((moved**2).sum(axis=1) - (1 - gap)).max() < 1e-13
+    mean = moved.mean(axis=0)
+    assert abs(mean @ mean - ((moved**2).sum(axis=1).mean() - np.trace(_covariance(moved)))) < 1e-13
+    assert (np.hypot(*moved.T) <= 1 + 1e-12).all() and np.hypot(*mean) < 1
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-9, 1e5])
+def test_the_result_scales_with_the_members(scale: float) -> None:
+    x, logs, _ = _case(3)
+    reference = ensemble_transform(x, logs)
+    moved = ensemble_transform(scale * x, logs) / scale
+    assert np.abs(moved - reference).max() < 1e-9 * np.abs(reference).max()
+    shifted = ensemble_transform(x - x.mean(axis=0), logs) + x.mean(axis=0)
+    assert np.abs(shifted - reference).max() < 1e-12
+
+
+def test_copies_do_not_leave_the_choice_to_rounding() -> None:
+    """Ten copies of one member, then a move by rounding: without a rule for ties all differs."""
+    x, logs, _ = _case(21)
+    x[:10] = x[0]
+    x[20:25] = x[20]
+    reference = ensemble_transform(x, logs)
+    for seed in range(10):
+        nudged = x * (1 + 1e-15 * _rng(seed).standard_normal(x.shape))
+        assert np.abs(ensemble_transform(nudged, logs) - reference).max() < 1e-9
+
+
+def test_equal_weights_move_nobody() -> None:
+    x, _, _ = _case(4)
+    assert np.abs(ensemble_transform(x, np.zeros(40)) - x).max() < 1e-13
+
+
+def test_weights_that_underflow_and_weights_of_zero() -> None:
+    x, logs, _ = _case(5)
+    assert np.allclose(ensemble_transform(x, logs - 1e4), ensemble_transform(x, logs), atol=1e-9)
+    one = np.full(40, -np.inf)
+    one[7] = -1e4
+    assert np.abs(ensemble_transform(x, one) - x[7]).max() < 1e-13
+    some = np.where(np.arange(40) < 3, logs, -np.inf)
+    assert np.isfinite(ensemble_transform(x, some)).all()
+
+
+def test_one_member_and_a_collapsed_ensemble() -> None:
+    assert (ensemble_transform([[3.0, 4.0]], [-5.0]) == [[3.0, 4.0]]).all()
+    same = np.ones((6, 2))
+    assert (ensemble_transform(same, np.arange(6.0)) == 1).all()
+
+
+def test_leading_axes_are_ensembles_of_their_own() -> None:
+    x = np.stack([[_case(s)[0] for s in (1, 2)], [_case(s)[0] for s in (3, 4)]])
+    logs = np.stack([[_case(s)[1] for s in (1, 2)], [_case(s)[1] for s in (3, 4)]])
+    for options in ({}, {"correct": True}):
+        moved = ensemble_transform(x, logs, **options)
+        alone = ensemble_transform(x[1, 0], logs[1, 0], **options)
+        assert np.allclose(moved[1, 0], alone, atol=1e-12)
+
+
+def test_in_one_dimension_the_order_stays() -> None:
+    x, logs, _ = _case(6, 30, 1)
+    order = np.argsort(x[:, 0])
+    moved = ensemble_transform(x, logs)[order, 0]
+    assert (np.diff(moved) > -1e-12).all()
+
+
+@given(st.integers(0, 10_000), st.integers(20, 40), st.integers(1, 4))
+def test_the_correction_gives_both_moments(seed: int, n: int, d: int) -> None:
+    x, logs, w = _case(seed, n, d)
+    w = (w + 0.05) / (w + 0.05).sum()  # many members count, so that no direction is lost
+    moved = ensemble_transform(x, np.log(w), correct=True)
+    assert np.abs(moved.mean(axis=0) - w @ x).max() < 1e-12 * np.abs(x).max()
+    p = _covariance(x, w)
+    assert np.abs(_covariance(moved) - p).max() < 1e-8 * np.abs(p).max()
+    plain = ensemble_transform(x, np.log(w))
+    assert np.trace(_covariance(plain)) <= np.trace(p) + 1e-9 * np.trace(p)
+
+
+def test_the_correction_is_the_symmetric_map() -> None:
+    x, logs, w = _case(7)
+    plain = ensemble_transform(x, logs)
+    moved = second_order(plain, x, logs)
+    a, b = plain - plain.mean(axis=0), moved - moved.mean(axis=0)
+    matrix = np.linalg.lstsq(a, b, rcond=None)[0]
+    assert np.abs(a @ matrix - b).max() < 1e-10
+    assert np.abs(matrix - matrix.T).max() < 1e-9 and np.linalg.eigvalsh(matrix).min() > 0
+
+
+def test_the_correction_with_fewer_members_than_components() -> None:
+    x, logs, w = _case(8, 4, 6)
+    moved = ensemble_transform(x, np.log((w + 0.1) / 1.4), correct=True)
+    p = _covariance(x, (w + 0.1) / 1.4)
+    assert np.abs(_covariance(moved) - p).max() < 1e-8 * np.abs(p).max()
+
+
+def test_entropy_shrinks_debiasing_and_correction_restore() -> None:
+    x, logs, w = _case(9, 60, 2)
+    p = np.trace(_covariance(x, w))
+
+    def share(**options: object) -> float:
+        return float(np.trace(_covariance(ensemble_transform(x, logs, **options))) / p)
+
+    entropic = {"solver": "entropic", "regularisation": 0.05}
+    biased, plain = share(**entropic), share()
+    assert biased < 0.7 * plain
+    assert abs(share(**entropic, debias=True) - plain) < 0.5 * abs(biased - plain)
+    assert abs(share(**entropic, correct=True) - 1) < 1e-9
+    assert np.allclose(ensemble_transform(x, logs, debias=True), ensemble_transform(x, logs))
+    debiased = ensemble_transform(x, logs, debias=True, **entropic)
+    assert np.abs(debiased.mean(axis=0) - w @ x).max() < 1e-13
+    assert np.allclose(ensemble_transform(x, np.zeros(60), debias=True, **entropic), x)
+
+
+def test_rejuvenation_keeps_the_mean_and_adds_its_share() -> None:
+    x, logs, _ = _case(10, 60, 3)
+    copies = np.tile(x.mean(axis=0), (4000, 60, 1))
+    added = rejuvenated(copies, np.tile(x, (4000, 1, 1)), bandwidth=0.2, rng=_rng(11))
+    assert np.abs(added.mean(axis=1) - x.mean(axis=0)).max() < 1e-12
+    spread = added - copies
+    cov = np.einsum("rni,rnj->ij", spread, spread) / (4000 * 60)
+    expected = 0.04 * np.cov(x.T)
+    assert np.abs(cov - expected).max() < 0.01 * np.abs(expected).max()
+    assert (rejuvenated(x, x, bandwidth=0.0, rng=_rng()) == x).all()
+
+
+# ------------------------------------------------------------------------------ pieces
+
+
+def test_one_piece_is_the_transform_and_many_are_a_resampling() -> None:
+    x, logs, _ = _case(12)
+    whole = transform_within(x, logs, np.zeros(40, dtype=int), rng=_rng())
+    assert np.allclose(whole, ensemble_transform(x, logs), atol=1e-13)
+    drawn = transform_within(x, logs, np.arange(40), rng=_rng())
+    assert np.abs(drawn[:, None] - x).sum(axis=-1).min(axis=1).max() < 1e-12
+
+
+def test_pieces_choose_as_often_as_the_plan_says() -> None:
+    """Over 4000 draws each column's frequencies lie within five standard errors of its shares."""
+    share = np.array([[0.2, 0.5, 1.0, 0.1], [0.3, 0.5, 0.0, 0.2], [0.5, 0.0, 0.0, 0.7]])
+    rng = _rng(13)
+    draws = np.array([_chosen(share, rng) for _ in range(4000)])
+    for row in range(3):
+        gap = (draws == row).mean(axis=0) - share[row]
+        bound = 5 * np.sqrt(share[row] * (1 - share[row]) / 4000)
+        assert (np.abs(gap) <= bound + 1e-12).all()
+    totals = (draws == 0).sum(axis=1)
+    assert set(totals) <= {1, 2}  # 1.8 on average
+
+
+def test_pieces_keep_members_apart_and_the_mean_on_average() -> None:
+    rng = _rng(14)
+    x = np.concatenate([rng.uniform(-2, -1, 25), rng.uniform(1, 2, 25)])[:, None]
+    logs = np.where(x[:, 0] > 0, 0.7, 0.0) + 0.3 * x[:, 0]
+    w = np.exp(logs)
+    pieces = (x[:, 0] > 0).astype(int)
+    means = []
+    for _ in range(400):
+        y = transform_within(x, logs, pieces, rng=rng)
+        assert (np.abs(y) >= 1).all()
+        means.append(y.mean())
+    target = (w / w.sum()) @ x[:, 0]
+    assert abs(np.mean(means) - target) < 4 * np.std(means) / 20
+    assert (np.abs(ensemble_transform(x, logs)) < 1).any()  # what the pieces prevent
+
+
+# ------------------------------------------------------------------------------ curved sets
+
+
+def test_along_a_flat_set_is_the_transform() -> None:
+    x, logs, _ = _case(15)
+    flat = transform_along(x, logs, difference=np.subtract, retract=np.add)
+    assert np.allclose(flat, ensemble_transform(x, logs), atol=1e-12)
+    stack = transform_along(np.stack([x, 2 * x]), np.stack([logs, logs]),
+                            difference=np.subtract, retract=np.add)
+    assert np.allclose(stack, [flat, 2 * flat], atol=1e-12)
+
+
+def test_angles_across_the_cut() -> None:
+    """Turning all angles turns the result, also where that puts the cut among them."""
+    rng = _rng(16)
+    angle = rng.normal(0.0, 0.5, (30, 1))
+    logs = -4 * (angle[:, 0] - 0.3) ** 2
+    options = {"difference": _wrapped, "retract": lambda x, v: _wrapped(x + v, np.zeros(1))}
+    reference = transform_along(angle, logs, **options)
+    turned = transform_along(_wrapped(angle + 3.0, np.zeros(1)), logs, **options)
+    assert np.abs(_wrapped(turned - 3.0, reference)).max() < 1e-12
+    assert np.abs(turned).max() > 3.0
+
+
+def test_unit_quaternions_stay_unit() -> None:
+    rng = _rng(17)
+    q = np.array([1.0, 0, 0, 0]) + 0.15 * rng.standard_normal((40, 4))
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    logs = -20 * (q[:, 1] - 0.2) ** 2
+
+    def tangent(to: np.ndarray, here: np.ndarray) -> np.ndarray:
+        return to - (to * here).sum(axis=-1, keepdims=True) * here
+
+    def retract(here: np.ndarray, v: np.ndarray) -> np.ndarray:
+        return (here + v) / np.linalg.norm(here + v, axis=-1, keepdims=True)
+
+    moved = transform_along(q, logs, difference=tangent, retract=retract)
+    assert np.abs(np.linalg.norm(moved, axis=1) - 1).max() < 1e-15
+    plain = ensemble_transform(q, logs)
+    assert np.linalg.norm(plain, axis=1).max() < 1 + 1e-12
+    assert np.abs(moved - plain).max() < 0.1
+
+
+def test_inputs_stay_as_they_were() -> None:
+    x, logs, _ = _case(18)
+    kept = x.copy(), logs.copy()
+
+    def spoils(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        a -= b
+        return a
+
+    ensemble_transform(x, logs, correct=True, debias=True)
+    transform_along(x, logs, difference=spoils, retract=lambda a, v: a.__iadd__(v))
+    transform_within(x, logs, np.arange(40) % 2, rng=_rng())
+    rejuvenated(x, x, bandwidth=0.1, rng=_rng())
+    assert (x == kept[0]).all() and (logs == kept[1]).all()

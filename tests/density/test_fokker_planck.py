@@ -1,0 +1,197 @@
+"""Finite volumes: mass, sign, order, equilibria, and agents beside their density."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.integrate import quad
+from scipy.linalg import expm
+
+from distfilt.density import FokkerPlanck, Grid, bernoulli
+from distfilt.models import READINGS, RotatingMixture, Swarm, rotating_swarm
+
+SCHEMES = ("split", "backward_euler", "crank_nicolson")
+
+
+def _still(x: np.ndarray, t: float) -> np.ndarray:
+    return 0 * x
+
+
+@given(st.floats(-500, 500))
+def test_bernoulli_identity(z: float) -> None:
+    assert bernoulli(-z) - bernoulli(z) == pytest.approx(z, abs=1e-11)
+    assert bernoulli(z) >= 0
+
+
+def test_bernoulli_near_zero_joins_smoothly() -> None:
+    z = np.array([9.99e-5, 1.01e-4])
+    assert np.allclose(bernoulli(z), 1 - z / 2 + z**2 / 12, rtol=1e-12)
+
+
+@pytest.mark.parametrize("reading", READINGS)
+@pytest.mark.parametrize("shape", [(30, 30), (12, 17)])
+def test_generator_is_one_of_a_markov_chain(reading: str, shape: tuple[int, int]) -> None:
+    a = FokkerPlanck(rotating_swarm(reading), Grid(shape)).generator(3.0)
+    dense = a.toarray()
+    off = dense - np.diag(np.diag(dense))
+    assert off.min() >= 0
+    assert np.abs(dense.sum(axis=0)).max() < 1e-13 * np.abs(dense).max()
+
+
+def test_generator_in_three_dimensions_and_by_hand_in_one() -> None:
+    cube = FokkerPlanck(
+        Swarm(lambda x, t: np.sin(5 * x[..., ::-1]), [0.1, 0.2, 0.3], low=np.zeros(3),
+              high=np.ones(3)), Grid((3, 4, 5)))
+    dense = cube.generator(0.0).toarray()
+    assert np.abs(dense.sum(axis=0)).max() < 1e-12
+    v, d, h = 0.7, 0.2, 0.25
+    line = FokkerPlanck(Swarm(lambda x, t: v + 0 * x, d, low=[0.0], high=[1.0]), Grid((4,)))
+    up, down = (float(bernoulli(s * v * h / d)) * d / h**2 for s in (-1, 1))
+    wanted = np.diag([-up, -up - down, -up - down, -down]) + np.diag([up] * 3, -1) + np.diag(
+        [down] * 3, 1)
+    assert np.allclose(line.generator(0.0).toarray(), wanted, atol=1e-13)
+
+
+@pytest.mark.parametrize("reading", READINGS)
+def test_mass_and_sign_over_600_steps(reading: str) -> None:
+    flow = FokkerPlanck(rotating_swarm(reading), Grid((30, 30)))
+    p = np.ones(900)
+    for k in range(600):
+        p = flow.step(p, 0.1 * k, 0.1)
+        assert p.min() >= 0
+    assert abs(flow.grid.integral(p) - 1) < 1e-12
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_schemes_are_their_definitions(scheme: str) -> None:
+    swarm = Swarm(lambda x, t: np.stack([np.sin(t + x[..., 1]), x[..., 0]], axis=-1), [0.1, 0.3])
+    grid = Grid((4, 5))
+    flow = FokkerPlanck(swarm, grid, scheme=scheme)
+    p, dt, t = np.random.default_rng(1).random((3, 20)), 0.2, 0.4
+    now, then, eye = flow.generator(t).toarray(), flow.generator(t + dt).toarray(), np.eye(20)
+    if scheme == "backward_euler":
+        wanted = np.linalg.solve(eye - dt * then, p.T).T
+    elif scheme == "crank_nicolson":
+        wanted = np.linalg.solve(eye - dt / 2 * then, (eye + dt / 2 * now) @ p.T).T
+    else:
+        # The axes' own generators: links within a column of cells, and within a row.
+        rows = np.equal.outer(np.arange(20) % 5, np.arange(20) % 5)
+        first, second = np.where(rows, then, 0.0), np.where(rows, 0.0, then)
+        for part in (first, second):
+            np.fill_diagonal(part, 0.0)
+            np.fill_diagonal(part, -part.sum(axis=0))
+        assert np.allclose(first + second, then)
+        wanted = np.linalg.solve(eye - dt * first, p.T)
+        wanted = np.linalg.solve(eye - dt * second, wanted).T
+    assert np.abs(flow.step(p, t, dt) - wanted).max() < 1e-12
+
+
+@pytest.mark.parametrize(("scheme", "order"), [
+    ("split", 1.0), ("backward_euler", 1.0), ("crank_nicolson", 2.0),
+])
+def test_order_on_a_heat_mode(scheme: str, order: float) -> None:
+    """cos πx cos 2πy decays as exp(-5π²Dt): errors under joint refinement."""
+    d, end, errors = 0.05, 1.0, []
+    for n in (16, 32, 64):
+        grid = Grid((n, n))
+        flow = FokkerPlanck(Swarm(_still, d), grid, scheme=scheme)
+        x, y = np.pi * grid.centres.T
+        size = np.sinc(0.5 / n) * np.sinc(1.0 / n)  # means over cells of the mode
+        mode = np.cos(x) * np.cos(2 * y) * size
+        times = np.arange(1, n + 1) * end / n
+        p = flow.evolve(mode, times)[-1]
+        errors.append(float(grid.norm(p - mode * np.exp(-5 * np.pi**2 * d * end))))
+    rates = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert abs(rates[-1] - order) < 0.1
+
+
+@pytest.mark.parametrize(("n", "bound"), [(30, 0.06), (60, 0.018), (120, 0.005)])
+def test_ornstein_and_uhlenbeck(n: int, bound: float) -> None:
+    """The stationary density of v = -(x - 1/2)/2 with D = 0.003 is a Gaussian between walls."""
+    d, k = 0.003, 0.5
+    grid = Grid((n, n))
+    flow = FokkerPlanck(Swarm(lambda x, t: k * (0.5 - x), d), grid, scheme="backward_euler")
+    line = [quad(lambda s: np.exp(-k * (s - 0.5) ** 2 / (2 * d)), a, b)[0] / (b - a)
+            for a, b in zip(grid.edges(0)[:-1], grid.edges(0)[1:], strict=True)]
+    exact = grid.normalised(np.outer(line, line).ravel())
+    p = flow.evolve(np.ones(grid.size), [50.0, 200.0, 1e4])[-1]
+    assert grid.norm(p - exact) / grid.norm(exact) < bound
+
+
+def test_gibbs_density_is_kept_where_the_drift_is_a_difference() -> None:
+    # With a constant drift the flux is exact: p ~ exp(v x / D) at any Péclet number.
+    for v in (0.1, 3.0, -40.0):
+        grid = Grid((12,))
+        flow = FokkerPlanck(Swarm(lambda x, t, v=v: v + 0 * x, 0.05, low=[0.0], high=[1.0]), grid)
+        wanted = np.exp(v * (grid.centres[:, 0] - (v > 0)) / 0.05)
+        assert np.abs(flow.generator(0.0) @ grid.normalised(wanted)).max() < 1e-9 * abs(v) / 0.05
+
+
+def test_diffusion_that_varies_is_meant_in_the_sense_of_ito() -> None:
+    grid = Grid((200,))
+    swarm = Swarm(_still, lambda x, t: 0.1 * (1 + x[..., 0]), low=[0.0], high=[1.0])
+    p = FokkerPlanck(swarm, grid).evolve(np.ones(200), [50.0, 1000.0])[-1]
+    assert np.abs(p * (1 + grid.centres[:, 0]) * np.log(2) - 1).max() < 1e-5
+
+
+def test_small_steps_approach_the_exponential() -> None:
+    flow = FokkerPlanck(rotating_swarm("gibbs", mixture=RotatingMixture(rate=0.0)), Grid((6, 6)))
+    p = np.random.default_rng(2).random(36)
+    exact = expm(0.5 * flow.generator(0.0).toarray()) @ p
+    for scheme in SCHEMES:
+        near = FokkerPlanck(flow.swarm, flow.grid, scheme=scheme)
+        got = near.evolve(p, [0.5], substeps=500)[-1]
+        assert np.abs(got - exact).max() < (1e-6 if scheme == "crank_nicolson" else 2e-3)
+
+
+def test_time_enters_the_drift() -> None:
+    flow = FokkerPlanck(rotating_swarm("gibbs"), Grid((20, 20)))
+    early, late = flow.generator(0.0), flow.generator(20.0)
+    assert np.abs((early - late).toarray()).max() > 0.1
+    p = flow.evolve(np.ones(400), np.arange(1, 400) * 0.5)[-1]
+    f = flow.grid.normalised(RotatingMixture().density(flow.grid.centres, 199.5))
+    # p follows f with a lag of one relaxation time, 1.5 s.
+    assert flow.grid.norm(p - f) / flow.grid.norm(f) < 0.12
+
+
+@pytest.mark.slow
+def test_agents_and_density_agree_in_the_literal_case() -> None:
+    """Criterion 4: the histogram of agents against the equation on 120², in cells of 30²."""
+    swarm, f, rng = rotating_swarm("literal"), RotatingMixture(), np.random.default_rng(3)
+    fine, coarse = Grid((120, 120)), Grid((30, 30))
+    x = f.means(0.0)[rng.integers(2, size=100_000)] + 0.1 * rng.standard_normal((100_000, 2))
+    x = x[((x > 0) & (x < 1)).all(axis=-1)]
+    p = fine.normalised(sum(
+        np.exp(-0.5 * ((fine.centres - m) ** 2).sum(axis=-1) / 0.01) for m in f.means(0.0)))
+    times = np.arange(1, 41) * 0.1
+    p = FokkerPlanck(swarm, fine).evolve(p, times)[-1]
+    h = coarse.histogram(swarm.simulate(x, times, rng=rng)[-1])
+    p = fine.aggregated(p, coarse)
+    assert coarse.norm(h - p) / coarse.norm(p) < 0.02
+
+
+_FLOW = FokkerPlanck(rotating_swarm(), Grid((5, 5)))
+BAD_INPUT = {
+    "distfilt.density.fokker_planck.bernoulli": [("z", lambda: bernoulli([np.nan]))],
+    "distfilt.density.fokker_planck.FokkerPlanck": [
+        ("swarm", lambda: FokkerPlanck(3, Grid((5, 5)))),
+        ("grid", lambda: FokkerPlanck(rotating_swarm(), Grid((5,)))),
+        ("grid", lambda: FokkerPlanck(rotating_swarm(), Grid((5, 5), high=[1.0, 2.0]))),
+        ("scheme", lambda: FokkerPlanck(rotating_swarm(), Grid((5, 5)), scheme="explicit")),
+        ("values", lambda: _FLOW.step(np.ones(24), 0.0, 0.1)),
+        ("dt", lambda: _FLOW.step(np.ones(25), 0.0, 0.0)),
+        ("times", lambda: _FLOW.evolve(np.ones(25), [0.0])),
+        ("diffusion", lambda: FokkerPlanck(
+            Swarm(_still, lambda x, t: x[..., 0] - 0.5), Grid((5, 5))).generator(0.0)),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("word", "call"), [case for cases in BAD_INPUT.values() for case in cases]
+)
+def test_bad_input(word: str, call: object) -> None:
+    with pytest.raises(ValueError, match=word):
+        call()  # type: ignore[operator]

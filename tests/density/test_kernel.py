@@ -1,0 +1,188 @@
+"""Kernel estimates: mass, reflection, their exact noise, and bandwidths."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from distfilt.density import (
+    Grid,
+    adaptive_bandwidths,
+    bandwidth,
+    kernel_covariance,
+    kernel_density,
+    kernel_information,
+    kernels,
+)
+
+GRID = Grid((20, 30))
+SOME = np.random.default_rng(1).random((40, 2))
+
+
+@pytest.mark.parametrize("shape", [(25,), (20, 30), (8, 9, 10)])
+@pytest.mark.parametrize("h", [0.08, 0.9])
+def test_reflection_keeps_the_mass_and_plain_kernels_lose_it(
+    shape: tuple[int, ...], h: float
+) -> None:
+    grid = Grid(shape)
+    x = np.random.default_rng(2).random((30, grid.dim))
+    z = kernels(x, grid, bandwidth=h)
+    assert np.abs(grid.integral(z) - 1).max() < 1e-12 and z.min() >= 0
+    assert grid.integral(kernel_density(x, grid, bandwidth=h, reflect=False)) < 0.99
+    mean = kernel_density(x, grid, bandwidth=h)
+    assert np.abs(mean - z.mean(axis=0)).max() < 1e-13
+
+
+def test_plain_kernels_are_differences_of_the_normal_distribution() -> None:
+    grid = Grid((10,), low=[-1.0], high=[3.0])
+    got = kernels([[0.7]], grid, bandwidth=0.5, reflect=False)[0]
+    assert np.allclose(got, np.diff(norm.cdf(grid.edges(0), 0.7, 0.5)) / 0.4, atol=1e-14)
+
+
+def test_reflection_solves_the_heat_equation() -> None:
+    # A kernel between reflecting walls is the cosine series of the heat kernel.
+    grid, x, h = Grid((40,)), 0.13, 0.2
+    k = np.arange(1, 60)
+    edges = grid.edges(0)
+    modes = np.diff(np.sin(np.pi * k[:, None] * edges), axis=1) / (np.pi * k[:, None])
+    decay = np.exp(-0.5 * (np.pi * k * h) ** 2) * np.cos(np.pi * k * x)
+    series = 1 + 2 * (decay[:, None] * modes).sum(axis=0) / grid.volume
+    assert np.abs(kernels([[x]], grid, bandwidth=h)[0] - series).max() < 1e-12
+
+
+def test_axes_are_not_exchanged_and_batches_broadcast() -> None:
+    z = kernels([[0.2, 0.8]], GRID, bandwidth=0.06)[0]
+    assert np.allclose(GRID.mean(z), [0.2, 0.8], atol=1e-3)
+    many = kernel_density(np.stack([SOME, SOME[::-1] * 0.5]), GRID, bandwidth=0.1)
+    assert np.allclose(many[1], kernel_density(SOME * 0.5, GRID, bandwidth=0.1))
+
+
+def test_one_bandwidth_for_each_agent() -> None:
+    h = np.linspace(0.05, 0.2, 40)
+    z = kernels(SOME, GRID, bandwidth=h)
+    for i in (0, 39):
+        assert np.allclose(z[i], kernels(SOME[i : i + 1], GRID, bandwidth=h[i])[0])
+
+
+def test_the_constant_is_the_integral_of_the_kernel_squared() -> None:
+    for grid in (Grid((400,)), Grid((150, 150))):
+        middle = np.full((1, grid.dim), 0.5)
+        z = kernels(middle, grid, bandwidth=0.05)[0]
+        wanted = float((z**2).sum() * grid.volume) / 100
+        got = kernel_information(grid, bandwidth=0.05, agents=100)
+        assert got == pytest.approx(wanted, rel=5e-3)
+
+
+def test_covariance_is_that_of_many_swarms() -> None:
+    grid = Grid((10, 10))
+    p = grid.normalised(1 + grid.centres[:, 0] + 2 * grid.centres[:, 1] ** 2)
+    mean, cov = kernel_covariance(p, grid, bandwidth=0.12, agents=20)
+    rng = np.random.default_rng(3)
+    cells = rng.choice(100, size=(8000, 20), p=p * grid.volume)
+    seen = kernel_density(grid.centres[cells], grid, bandwidth=0.12)
+    # Largest of 100 and 5050 standardised errors: bounds at a confidence above 99.9 %.
+    se = np.sqrt(np.diag(cov) / 8000)
+    assert np.abs((seen.mean(axis=0) - mean) / se).max() < 5
+    s = np.cov(seen, rowvar=False)
+    se = np.sqrt((np.outer(np.diag(cov), np.diag(cov)) + cov**2) / 8000)
+    assert np.abs((s - cov) / se).max() < 6
+    assert np.abs(cov.sum(axis=0)).max() < 1e-10  # the mass of an estimate is certain
+
+
+def test_information_is_overstated_by_the_cells_of_a_kernel() -> None:
+    """E9: k̄ diag(p) taken as white claims 4πh²n² times the information that there is."""
+    for h, printed in ((0.05, 26), (0.08, 68), (0.12, 149)):
+        ratio = 4 * np.pi * h**2 * 900
+        white = 1 / (100 / 900)  # variance of a histogram's cell, p = 1
+        grid = Grid((30, 30))
+        assert white / kernel_information(grid, bandwidth=h, agents=100) == pytest.approx(ratio)
+        assert abs(ratio / printed - 1) < 0.12
+
+
+def test_silverman_by_its_formula() -> None:
+    x = np.random.default_rng(4).random((100, 2))
+    wanted = np.sqrt(x.var(axis=0).mean()) * 100 ** (-1 / 6)
+    assert bandwidth(x, GRID) == pytest.approx(wanted)
+    one = np.random.default_rng(4).random((50, 1))
+    wanted = one.std() * (4 / 150) ** 0.2
+    assert bandwidth(one, Grid((40,))) == pytest.approx(wanted)
+
+
+def test_cross_validation_beats_silverman_on_two_clusters() -> None:
+    rng = np.random.default_rng(5)
+    grid, gain = Grid((40, 40)), []
+    truth = 0.5 * kernels([[0.2, 0.5], [0.8, 0.5]], grid, bandwidth=0.06).sum(axis=0)
+    for _ in range(10):
+        side = rng.integers(2, size=100)
+        x = np.array([[0.2, 0.5], [0.8, 0.5]])[side] + 0.06 * rng.standard_normal((100, 2))
+        x = np.clip(x, 0, 1)
+        gain.append([
+            float(grid.norm(kernel_density(x, grid, bandwidth=bandwidth(x, grid, rule=r)) - truth))
+            for r in ("silverman", "least_squares")
+        ])
+    a, b = np.array(gain).T
+    assert (b < a).all()
+
+
+def test_leave_one_out_counts_each_pair_twice() -> None:
+    # Two agents far apart see nothing of each other: the score is the estimate's own square.
+    from distfilt.density.kernel import _least_squares
+
+    grid = Grid((40, 40))
+    x = np.array([[0.2, 0.2], [0.8, 0.8]])
+    p = kernel_density(x, grid, bandwidth=0.04)
+    assert _least_squares(x, grid, 0.04) == pytest.approx((p**2).sum() * grid.volume)
+
+
+def test_adaptive_bandwidths_by_the_formula() -> None:
+    rng = np.random.default_rng(6)
+    x = np.concatenate([0.3 + 0.03 * rng.standard_normal((80, 2)), rng.random((20, 2))])
+    x = np.clip(x, 0, 1)
+    pilot = kernel_density(x, GRID, bandwidth=0.1)[GRID.cells(x)]
+    wanted = 0.1 * np.sqrt(np.exp(np.log(pilot).mean()) / pilot)
+    got = adaptive_bandwidths(x, GRID, bandwidth=0.1)
+    assert np.allclose(got, np.maximum(wanted, 0.025))
+    assert np.allclose(adaptive_bandwidths(x, GRID, bandwidth=0.1, sensitivity=0.0), 0.1)
+
+
+_ONE = [[0.5, 0.5]]
+BAD_INPUT = {
+    "distfilt.density.kernel.kernels": [
+        ("positions", lambda: kernels([[0.5, 1.2]], GRID, bandwidth=0.1)),
+        ("positions", lambda: kernels([[0.5, np.nan]], GRID, bandwidth=0.1)),
+        ("bandwidth", lambda: kernels(_ONE, GRID, bandwidth=0.0)),
+        ("bandwidth", lambda: kernels(_ONE, GRID, bandwidth=[0.1, 0.1])),
+        ("too coarse", lambda: kernels(_ONE, GRID, bandwidth=0.02)),
+        ("grid", lambda: kernels(_ONE, 30, bandwidth=0.02)),
+    ],
+    "distfilt.density.kernel.kernel_density": [
+        ("positions", lambda: kernel_density(np.zeros((0, 2)), GRID, bandwidth=0.1)),
+        ("bandwidth", lambda: kernel_density(_ONE, GRID, bandwidth=-0.1)),
+    ],
+    "distfilt.density.kernel.kernel_information": [
+        ("agents", lambda: kernel_information(GRID, bandwidth=0.1, agents=0)),
+        ("bandwidth", lambda: kernel_information(GRID, bandwidth=0.0, agents=5)),
+        ("grid", lambda: kernel_information(3, bandwidth=0.1, agents=5)),
+    ],
+    "distfilt.density.kernel.kernel_covariance": [
+        ("density", lambda: kernel_covariance(np.zeros(600), GRID, bandwidth=0.1, agents=5)),
+        ("agents", lambda: kernel_covariance(np.ones(600), GRID, bandwidth=0.1, agents=0)),
+    ],
+    "distfilt.density.kernel.bandwidth": [
+        ("positions", lambda: bandwidth(_ONE, GRID)),
+        ("rule", lambda: bandwidth(SOME, GRID, rule="thumb")),
+    ],
+    "distfilt.density.kernel.adaptive_bandwidths": [
+        ("sensitivity", lambda: adaptive_bandwidths(SOME, GRID, bandwidth=0.1, sensitivity=2)),
+        ("bandwidth", lambda: adaptive_bandwidths(SOME, GRID, bandwidth=0.0)),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("word", "call"), [case for cases in BAD_INPUT.values() for case in cases]
+)
+def test_bad_input(word: str, call: object) -> None:
+    with pytest.raises(ValueError, match=word):
+        call()  # type: ignore[operator]

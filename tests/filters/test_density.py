@@ -1,0 +1,288 @@
+"""Density filters: sharing rules, local filters against the centralised one, faults, states."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from distfilt.density import (
+    Centralised,
+    DynamicAverage,
+    Flooding,
+    FokkerPlanck,
+    Grid,
+    Neighbours,
+    PIConsensus,
+    kernel_density,
+    kernels,
+)
+from distfilt.density.sharing import Seen, present_graph
+from distfilt.filters import DensityFilter, DensityState, final_state
+from distfilt.models import rotating_swarm
+from distfilt.network import Faults, Graph, graphs
+
+SIZE, H = 12, 0.12
+GRID = Grid((10, 10))
+SWARM = rotating_swarm("gibbs")
+MODEL = FokkerPlanck(SWARM, GRID)
+START = np.random.default_rng(1).random((SIZE, 2))
+PATH = SWARM.simulate(START, np.arange(1, 9) * 0.1, rng=np.random.default_rng(2), substeps=2)
+make = partial(DensityFilter, MODEL, SIZE, bandwidth=H, rank=20)
+RULES = {
+    "pi": PIConsensus(),
+    "pi, coefficients": PIConsensus(modes=30),
+    "pi, rate": PIConsensus(rate=True),
+    "average": DynamicAverage(modes=30),
+    "flooding": Flooding(),
+    "neighbours": Neighbours(),
+}
+
+
+def last(f: DensityFilter, path: np.ndarray = PATH, start: np.ndarray = START) -> DensityState:
+    state = f.start(start)
+    for k, x in enumerate(path):
+        state = f.step(state, 0.1 * (k + 1), x)
+    return state
+
+
+@pytest.mark.parametrize("rule", [Flooding(), Neighbours()])
+def test_complete_graph_and_equal_starts_give_the_centralised_filter(rule: object) -> None:
+    """Criterion 7."""
+    everyone = last(make(graphs.complete(SIZE), rule, first=np.ones(100)))
+    central = last(make(graphs.complete(SIZE), Centralised(), first=np.ones(100)))
+    assert np.abs(everyone.estimates - central.estimates).max() < 1e-12
+    assert (everyone.counted == SIZE).all()
+
+
+def test_consensus_on_a_complete_graph_lags() -> None:
+    """E4: (16) is not the centralised filter even there."""
+    apart = last(make(graphs.complete(SIZE), PIConsensus(), first=np.ones(100)))
+    central = last(make(graphs.complete(SIZE), Centralised(), first=np.ones(100)))
+    assert np.abs(apart.estimates - central.estimates).max() > 1e-3
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_mass_stays_one(name: str) -> None:
+    state = last(make(0.5, RULES[name]))
+    assert np.abs(GRID.integral(state.estimates) - 1).max() < 1e-12
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_nobody_reads_beyond_its_links(name: str) -> None:
+    # On a path, moving agent 11 cannot change what agents 0 to 9 believe after one step.
+    f = make(graphs.path(SIZE), RULES[name])
+    moved = PATH[0].copy()
+    moved[11] = 1 - moved[11]
+    substeps = 1 if not name.startswith("pi") else 2
+    a, b = (f.step(f.start(START), 0.1, x) for x in (PATH[0], moved))
+    assert np.array_equal(a.estimates[: SIZE - 1 - substeps], b.estimates[: SIZE - 1 - substeps])
+
+
+def test_coefficients_are_the_whole_density_to_truncation() -> None:
+    whole = last(make(0.5, PIConsensus()))
+    cut = last(make(0.5, PIConsensus(modes=100)))
+    assert np.abs(whole.observed - cut.observed).max() < 1e-10
+    assert cut.ledger.scalars.sum() == whole.ledger.scalars.sum()
+    fewer = last(make(0.5, PIConsensus(modes=30)))
+    assert fewer.ledger.scalars.sum() * 101 == whole.ledger.scalars.sum() * 31
+
+
+def test_first_order_rule_keeps_the_average() -> None:
+    state = last(make(0.6, DynamicAverage(modes=None)))
+    y = kernel_density(PATH[-1], GRID, bandwidth=H)
+    assert np.abs(state.observed.mean(axis=0) - y).max() < 1e-12
+
+
+def test_flooding_knows_where_agents_were_as_many_steps_ago_as_hops() -> None:
+    state = last(make(graphs.path(SIZE), Flooding(), local=(0,)))
+    table = state.carried[0][0]
+    # Agent 8 is eight hops from agent 0; eight steps were taken, the first with positions of then.
+    for j in range(8):
+        assert table[j, 2] == pytest.approx(0.8 - 0.1 * max(j - 1, 0))
+        assert np.array_equal(table[j, :2], PATH[7 - max(j - 1, 0)][j])
+    assert (table[9:, 2] < 0).all() and state.counted[0] == 9
+    x = np.stack([PATH[7 - max(j - 1, 0)][j] for j in range(9)])
+    assert np.abs(state.observed[0] - kernel_density(x, GRID, bandwidth=H)).max() < 1e-12
+
+
+def test_flooding_forgets() -> None:
+    path = PATH.copy()
+    path[2:, 3] = np.nan
+    kept = last(make(graphs.complete(SIZE), Flooding(), local=(0,)), path)
+    gone = last(make(graphs.complete(SIZE), Flooding(forget=0.35), local=(0,)), path)
+    assert kept.counted[0] == SIZE and gone.counted[0] == SIZE - 1
+
+
+def test_ledger_charges_what_each_rule_sends() -> None:
+    graph = graphs.ring(SIZE)
+    wanted = {"flooding": 3 * SIZE, "neighbours": 2, "average": 31}
+    for name, numbers in wanted.items():
+        ledger = last(make(graph, RULES[name])).ledger
+        assert (ledger.scalars == 8 * 2 * numbers).all(), name
+    assert last(make(graph, Centralised())).ledger.scalars.sum() == 0
+
+
+def test_agents_that_go_are_left_out_and_their_filters_go_on() -> None:
+    path = PATH.copy()
+    path[4:, 5] = np.nan
+    state = last(make(graphs.complete(SIZE), Centralised(), first=np.ones(100)), path)
+    here = [i for i in range(SIZE) if i != 5]
+    assert np.abs(state.observed[0] - kernel_density(path[-1][here], GRID, bandwidth=H)).max(
+        ) < 1e-13
+    assert np.isnan(state.positions[5]).all() and np.isfinite(state.estimates).all()
+    assert np.trace(state.filters.information[5]) < np.trace(state.filters.information[4])
+
+
+def test_a_network_that_falls_apart_is_told() -> None:
+    def graph(t: float, x: np.ndarray) -> Graph:
+        if t < 0.45:
+            return graphs.ring(SIZE)
+        half = SIZE // 2
+        block = np.ones((half, half)) - np.eye(half)
+        return Graph.from_adjacency(np.kron(np.eye(2), block))
+
+    f = make(graph, PIConsensus())
+    run = f.run(f.start(START), np.arange(1, 9) * 0.1, PATH)
+    assert run["parts"].isel(agent=0).values.tolist() == [1] * 4 + [2] * 4
+    assert np.isfinite(run["mean"].values).all()
+    assert np.allclose(run["mass"].values, 1)
+
+
+def test_directed_graphs_flood_and_average() -> None:
+    one_way = Graph.from_edges(
+        SIZE, [[i, (i - 1) % SIZE] for i in range(SIZE)], directed=True)
+    state = last(make(one_way, Flooding(), local=(3,)))
+    assert (state.carried[0][3][:, 2] > 0).sum() == 9
+    averaged = last(make(one_way, DynamicAverage(modes=None)))
+    y = kernel_density(PATH[-1], GRID, bandwidth=H)
+    assert np.abs(averaged.observed.mean(axis=0) - y).max() < 1e-12
+    with pytest.raises(ValueError, match="both ways"):
+        last(make(one_way, PIConsensus()))
+
+
+def test_losses_change_what_is_known_and_are_counted() -> None:
+    f = make(graphs.ring(SIZE), Flooding(), faults=Faults(loss=0.4, seed=1))
+    state = last(f)
+    assert state.ledger.lost.sum() > 0
+    assert not np.array_equal(state.observed, last(make(graphs.ring(SIZE), Flooding())).observed)
+
+
+def test_unknown_number_is_learnt() -> None:
+    known = last(make(graphs.complete(SIZE), Flooding()))
+    learnt = last(make(graphs.complete(SIZE), Flooding(), number_known=False))
+    assert np.abs(known.estimates - learnt.estimates).max() < 1e-13
+    f = make(graphs.complete(SIZE), PIConsensus(b=0.4, a=1.0), number_known=False)
+    path = np.repeat(PATH[-1:], 200, axis=0)
+    assert np.allclose(last(f, path).counted, SIZE, rtol=0.05)
+
+
+def test_process_noise_keeps_the_filter_open() -> None:
+    closed = last(make(graphs.complete(SIZE), Centralised(), local=(0,)))
+    tiny = last(make(graphs.complete(SIZE), Centralised(), local=(0,), process=1e-9))
+    opened = last(make(graphs.complete(SIZE), Centralised(), local=(0,), process=1.0))
+    assert np.abs(closed.estimates - tiny.estimates).max() < 1e-9
+    assert opened.variances.mean() > 2 * closed.variances.mean()
+
+
+def test_saving_and_going_on_gives_the_same_bits(tmp_path: object) -> None:
+    for rule in RULES.values():
+        f = make(0.5, rule)
+        half = last(f, PATH[:4])
+        half.save(f"{tmp_path}/state.npz")
+        again = DensityState.load(f"{tmp_path}/state.npz")
+        for k in range(4, 8):
+            half, again = (f.step(s, 0.1 * (k + 1), PATH[k]) for s in (half, again))
+        assert np.array_equal(half.estimates, again.estimates)
+        assert np.array_equal(half.ledger.scalars, again.ledger.scalars)
+
+
+def test_run_records_and_leaves_inputs_alone() -> None:
+    f = make(0.6, Flooding(), local=(2, 7))
+    path = PATH.copy()
+    truth = MODEL.evolve(np.ones(100), np.arange(1, 9) * 0.1)
+    run = f.run(f.start(START), np.arange(1, 9) * 0.1, path, truth=truth,
+                scores=["squared_error"])
+    assert np.array_equal(path, PATH)
+    state = final_state(run)
+    assert np.allclose(run["mean"].values[-1, [2, 7]], state.estimates)
+    assert np.isnan(run["mean"].values[:, 0]).all()
+    wanted = ((state.estimates - truth[-1]) ** 2).sum(axis=-1)
+    assert np.allclose(run["total_squared_error"].values[-1, [2, 7]], wanted)
+    assert np.allclose(state.variances[0], np.diag(state.filters.covariance(0)))
+
+
+def test_first_estimates() -> None:
+    flat = make(0.5, Flooding(), first_std=0.3).start(START)
+    gap = ((GRID.centres - START[4]) ** 2).sum(axis=-1)
+    assert np.allclose(flat.estimates[4], GRID.normalised(np.exp(-0.5 * gap / 0.09)))
+    own = make(0.5, Flooding(), first="observed").start(START)
+    assert np.allclose(own.estimates, kernels(START, GRID, bandwidth=H))
+    central = make(0.5, Centralised(), first="observed").start(START)
+    assert np.allclose(central.estimates[3], kernel_density(START, GRID, bandwidth=H))
+
+
+_STATE = make(0.5, Flooding()).start(START)
+BAD_INPUT = {
+    "distfilt.filters.density.DensityFilter": [
+        ("model", lambda: DensityFilter(3, SIZE, 0.5, Flooding(), bandwidth=H)),
+        ("size", lambda: DensityFilter(MODEL, 0, 0.5, Flooding(), bandwidth=H)),
+        ("graph", lambda: make(-0.5, Flooding())),
+        ("sharing", lambda: make(0.5, 3)),
+        ("bandwidth", lambda: make(0.5, Flooding(), bandwidth=0.0)),
+        ("too coarse", lambda: make(0.5, Flooding(), bandwidth=0.01)),
+        ("local", lambda: make(0.5, Flooding(), local=(SIZE,))),
+        ("local", lambda: make(0.5, Flooding(), local=())),
+        ("first", lambda: make(0.5, Flooding(), first="guess")),
+        ("noise", lambda: make(0.5, Flooding(), noise="white")),
+        ("floor", lambda: make(0.5, Flooding(), floor=0.0)),
+        ("process", lambda: make(0.5, Flooding(), process=0.0)),
+        ("faults", lambda: make(0.5, Flooding(), faults=0.1)),
+        ("names", lambda: make(0.5, Flooding(), names=("a",))),
+        ("runs", lambda: make(0.5, Flooding()).start(START, runs=(2,))),
+        ("prior", lambda: make(0.5, Flooding()).start(START + 1)),
+        ("prior", lambda: make(0.5, Flooding()).start(np.full((SIZE, 2), np.nan))),
+        ("state", lambda: make(0.5, Flooding()).step(3, 0.1, START)),
+        ("t", lambda: make(0.5, Flooding()).step(_STATE, 0.0, START)),
+        ("observations", lambda: make(0.5, Flooding()).step(_STATE, 0.1, START[:3])),
+        ("observations", lambda: make(0.5, Flooding()).step(
+            _STATE, 0.1, np.where(np.arange(24).reshape(12, 2) == 4, np.nan, START))),
+        ("graph", lambda: make(lambda t, x: 3, Flooding()).step(_STATE, 0.1, START)),
+        ("late", lambda: make(0.5, Flooding()).step(_STATE, 0.1, START, late=[1])),
+        ("observations", lambda: make(0.5, Flooding()).run(_STATE, [0.1], PATH)),
+    ],
+    "distfilt.density.sharing.PIConsensus": [
+        ("alpha", lambda: PIConsensus(alpha=-1.0)),
+        ("modes", lambda: PIConsensus(modes=0)),
+    ],
+    "distfilt.density.sharing.DynamicAverage": [
+        ("modes", lambda: DynamicAverage(modes=0)),
+        ("rounds", lambda: DynamicAverage(rounds=0)),
+    ],
+    "distfilt.density.sharing.Flooding": [("forget", lambda: Flooding(forget=0.0))],
+    "distfilt.density.sharing.present_graph": [
+        ("graph", lambda: present_graph(3, np.ones(2, bool)))
+    ],
+}
+EXEMPT = {
+    "distfilt.filters.density.DensityState": "made by the filter; its fields are checked there",
+    "distfilt.density.sharing.Seen": "made by the filter from checked positions",
+    "distfilt.density.sharing.Sharing": "a protocol",
+    "distfilt.density.sharing.Centralised": "takes no input",
+    "distfilt.density.sharing.Neighbours": "takes no input",
+}
+
+
+@pytest.mark.parametrize(
+    ("word", "call"), [case for cases in BAD_INPUT.values() for case in cases]
+)
+def test_bad_input(word: str, call: object) -> None:
+    with pytest.raises(ValueError, match=word):
+        call()  # type: ignore[operator]
+
+
+def test_seen_kernels_of_the_gone_are_zero() -> None:
+    present = np.array([True, False])
+    seen = Seen(np.array([[0.5, 0.5], [0.0, 0.0]]), present, GRID, H, 0.0)
+    assert seen.kernels[1].max() == 0 and GRID.integral(seen.kernels[0]) == pytest.approx(1)

@@ -1,0 +1,187 @@
+"""The mixture filter on the contract: against Kalman, through the channel only, at its edges."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from distfilt.filters.mixture import MixtureFilter, MixtureState
+from distfilt.mixtures import GaussianMixture, fuse, fuse_moments
+from distfilt.models import Model
+from distfilt.network import Faults, Ledger, graphs
+from distfilt.sensors import direct, stack
+
+PUSH = np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 0.9]])
+Q = np.array([[0.2, 0.05, 0.0], [0.05, 0.1, 0.0], [0.0, 0.0, 0.3]])
+LINEAR = Model(3, lambda x, t, dt: x @ PUSH.T, lambda t, dt: Q)
+SMALL = Model(2, lambda x, t, dt: x, lambda t, dt: 0.1 * np.eye(2))
+BENT = Model(2, lambda x, t, dt: x + 0.3 * x**2, lambda t, dt: 0.01 * np.eye(2))
+PRIOR = GaussianMixture.gaussian([1.0, -1.0, 0.5], [[2, 0.5, 0.3], [0.5, 1, 0.2], [0.3, 0.2, 1]])
+OTHER = GaussianMixture.gaussian([1.2, 0.4], [[1.0, 0.4], [0.4, 1.0]])
+SEE = direct([0, 2], std=0.5)
+ONE = MixtureFilter([LINEAR], [SEE], target_dim=1)
+TWO = MixtureFilter([LINEAR, SMALL], [SEE, None], graphs.path(2), target_dim=1, agreement=fuse)
+
+BAD_INPUT = {
+    "distfilt.filters.mixture.MixtureState": [
+        ("mixtures", lambda: MixtureState(0.0, Ledger.empty(1), None, (3,))),
+        ("mixtures", lambda: MixtureState(0.0, Ledger.empty(2), None, (PRIOR,))),
+    ],
+    "distfilt.filters.mixture.MixtureFilter": [
+        ("models", lambda: MixtureFilter([], [], target_dim=1)),
+        ("models", lambda: MixtureFilter([SMALL], [None], target_dim=3)),
+        ("sensors", lambda: MixtureFilter([SMALL], [], target_dim=1)),
+        ("sensors", lambda: MixtureFilter([SMALL], [3], target_dim=1)),
+        ("graph", lambda: MixtureFilter([SMALL], [None], target_dim=1, agreement=fuse)),
+        ("graph", lambda: MixtureFilter([SMALL], [None], 3, target_dim=1)),
+        ("agreement", lambda: MixtureFilter([SMALL], [None], target_dim=1, agreement=3)),
+        ("target_dim", lambda: MixtureFilter([SMALL], [None], target_dim=0)),
+        ("most", lambda: MixtureFilter([SMALL], [None], target_dim=1, size=5, most=3)),
+        ("stretch", lambda: MixtureFilter([SMALL], [None], target_dim=1, stretch=-1.0)),
+        ("gate", lambda: MixtureFilter([SMALL], [None], target_dim=1, gate=0.0)),
+        ("rule", lambda: MixtureFilter([SMALL], [None], target_dim=1, rule="x")),
+        ("names", lambda: MixtureFilter([SMALL], [None], target_dim=1, names=("a", "b"))),
+    ],
+    "distfilt.filters.mixture.MixtureFilter.start": [
+        ("prior", lambda: ONE.start([PRIOR, PRIOR])),
+        ("prior", lambda: ONE.start([OTHER])),
+        ("runs", lambda: ONE.start([PRIOR], runs=(2,))),
+    ],
+    "distfilt.filters.mixture.MixtureFilter.step": [
+        ("t", lambda: ONE.step(ONE.start([PRIOR], t=1.0), 0.5, [None])),
+        ("observations", lambda: ONE.step(ONE.start([PRIOR]), 1.0, [[1.0]])),
+    ],
+}
+
+
+def kalman(m: np.ndarray, p: np.ndarray, y: np.ndarray, rows: list[int]) -> tuple:
+    m, p = PUSH @ m, PUSH @ p @ PUSH.T + Q
+    h = np.eye(3)[[(0, 2)[r] for r in rows]]
+    gain = p @ h.T @ np.linalg.inv(h @ p @ h.T + 0.25 * np.eye(len(rows)))
+    return m + gain @ (y[rows] - h @ m), p - gain @ h @ p
+
+
+@pytest.mark.parametrize("rule", ["dd2", "unscented"])
+def test_one_agent_is_a_kalman_filter_with_gaps(rule: str) -> None:
+    f = MixtureFilter([LINEAR], [SEE], target_dim=1, rule=rule)
+    state = f.start([PRIOR])
+    m, p = PRIOR.means[0], PRIOR.covs[0]
+    rng = np.random.default_rng(0)
+    for k, rows in enumerate(([0, 1], [1], [0, 1], [0])):
+        y = rng.standard_normal(2)
+        state = f.step(state, k + 1.0, [np.where(np.isin([0, 1], rows), y, np.nan)])
+        m, p = kalman(m, p, y, rows)
+    mean, cov = state.mixtures[0].moments()
+    assert np.allclose(mean, m, atol=1e-6) and np.allclose(cov, p, atol=1e-6)
+
+
+def test_mixands_are_weighed_by_what_they_predicted() -> None:
+    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    f = MixtureFilter([still], [direct([0], std=1.0)], target_dim=1)
+    prior = GaussianMixture([0.3, 0.7], [[-2.0], [1.0]], [[[1.0]], [[2.0]]])
+    after = f.step(f.start([prior]), 1.0, [[0.5]]).mixtures[0]
+    exact, _ = prior.product(GaussianMixture.gaussian([0.5], [[1.0]]))
+    assert np.allclose(after.weights, exact.weights)
+    assert np.allclose(after.means, exact.means) and np.allclose(after.covs, exact.covs)
+
+
+def test_splitting_improves_a_bent_forecast() -> None:
+    prior = GaussianMixture.gaussian([0.5, 0.2], [[0.8, 0.1], [0.1, 0.3]])
+    x = prior.sample(4000, rng=np.random.default_rng(1))
+    moved = BENT.sample_step(x, 0.0, 1.0, rng=np.random.default_rng(2))
+    scores = []
+    for stretch in (None, 0.05):
+        f = MixtureFilter([BENT], [None], target_dim=1, stretch=stretch, size=15, most=15)
+        belief = f.step(f.start([prior]), 1.0, [None]).mixtures[0]
+        scores.append(belief.log_density(moved).mean())
+    assert scores[1] > scores[0] + 0.05
+
+
+def test_states_of_different_size_and_the_ledger() -> None:
+    state = TWO.start([PRIOR, OTHER])
+    after = TWO.step(state, 1.0, [[1.0, 0.2], None])
+    assert [m.dim for m in after.mixtures] == [3, 2]
+    assert after.ledger.scalars.tolist() == [3, 3]
+    summary = TWO.summary(after)
+    assert summary.mean.shape == (2, 3) and np.isnan(summary.mean[1, 2])
+    assert np.isfinite(summary.mean[0]).all()
+    run = TWO.run(state, [1.0, 2.0], [[[1.0, 0.2], None], [None, None]])
+    assert run["mean"].shape == (2, 2, 3) and run["mixands"].values.max() <= 12
+
+
+def test_only_the_target_marginal_is_heard() -> None:
+    # What agent 2 believes of itself, and how that goes with the target, changes nothing for 1.
+    odd = GaussianMixture.gaussian([1.2, 77.0], [[1.0, -0.9], [-0.9, 5.0]])
+    a, b = (TWO.step(TWO.start([PRIOR, m]), 1.0, [[1.0, 0.2], None]) for m in (OTHER, odd))
+    assert np.array_equal(a.mixtures[0].means, b.mixtures[0].means)
+    # Nobody hears beyond its neighbours.
+    three = MixtureFilter([SMALL] * 3, [None] * 3, graphs.path(3), target_dim=1, agreement=fuse)
+    far = GaussianMixture.gaussian([9.0, 0.0], np.eye(2))
+    a, b = (three.step(three.start([OTHER, OTHER, m]), 1.0, [None] * 3) for m in (OTHER, far))
+    assert np.array_equal(a.mixtures[0].means, b.mixtures[0].means)
+    assert not np.array_equal(a.mixtures[1].means, b.mixtures[1].means)
+
+
+def test_lost_messages_leave_the_own_belief() -> None:
+    f = MixtureFilter(
+        [SMALL] * 2, [None] * 2, graphs.path(2), target_dim=1, agreement=fuse,
+        faults=Faults(loss=1.0, seed=1),
+    )
+    after = f.step(f.start([OTHER, OTHER]), 1.0, [None, None])
+    assert np.allclose(after.mixtures[0].covs[0], OTHER.covs[0] + 0.1 * np.eye(2))
+    assert after.ledger.lost.sum() == 2
+
+
+def test_a_far_reading_is_gated_and_the_mixture_never_empties() -> None:
+    f = MixtureFilter([SMALL], [direct([0], std=0.1)], target_dim=1, gate=4.0)
+    start = f.start([OTHER])
+    far = f.step(start, 1.0, [[500.0]])
+    assert np.allclose(far.mixtures[0].means, OTHER.means)
+    near = f.step(start, 1.0, [[1.5]])
+    assert abs(near.mixtures[0].means[0, 0] - 1.5) < 0.05
+    free = MixtureFilter([SMALL], [direct([0], std=0.1)], target_dim=1)
+    wild = free.step(free.start([OTHER]), 1.0, [[1e6]])
+    assert np.isfinite(wild.mixtures[0].means).all()
+    assert np.isclose(wild.mixtures[0].weights.sum(), 1)
+
+
+def test_the_same_time_forecasts_nothing() -> None:
+    state = ONE.start([PRIOR], t=3.0)
+    assert ONE.step(state, 3.0, [None]).mixtures[0].means is PRIOR.means
+
+
+def test_saved_and_resumed_to_the_same_bits(tmp_path) -> None:
+    f = MixtureFilter(
+        [BENT, BENT], [SEE2 := direct([0], std=0.2), SEE2], graphs.path(2), target_dim=1,
+        agreement=partial(fuse, rule="C2"), stretch=0.05,
+    )
+    y = [[[0.4], [0.5]], [[0.6], None]]
+    middle = f.step(f.start([OTHER, OTHER]), 1.0, y[0])
+    middle.save(tmp_path / "state.npz")
+    again = MixtureState.load(tmp_path / "state.npz")
+    a, b = (f.step(s, 2.0, y[1]) for s in (middle, again))
+    for p, q in zip(a.mixtures, b.mixtures, strict=True):
+        assert np.array_equal(p.means, q.means)
+        assert np.array_equal(p.weights, q.weights)
+
+
+def test_a_sensor_that_cannot_see_says_so() -> None:
+    from distfilt.sensors import Sensor
+
+    blind = Sensor(1, lambda x: np.where(x[..., :1] > 0, x[..., :1], np.nan), [[1.0]])
+    f = MixtureFilter([SMALL], [stack([blind])], target_dim=1)
+    hidden = GaussianMixture.gaussian([-5.0, 0.0], np.eye(2))
+    with pytest.raises(ValueError, match="observations: needs a target that can be seen"):
+        f.step(f.start([hidden]), 1.0, [[1.0]])
+
+
+def test_single_gaussians_are_factorised_intersection() -> None:
+    f = MixtureFilter(
+        [SMALL] * 2, [direct([0], std=1.0)] * 2, graphs.path(2), target_dim=1, size=1, most=1,
+        agreement=fuse_moments,
+    )
+    after = f.step(f.start([OTHER, OTHER]), 1.0, [[1.0], [2.0]])
+    one, two = (m.marginal([0]) for m in after.mixtures)
+    assert np.allclose(one.means, two.means) and np.allclose(one.covs, two.covs)

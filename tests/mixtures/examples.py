@@ -1,0 +1,37 @@
+"""Mixtures that the tests of this folder share; none is diagonal or centred."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from distfilt.mixtures import GaussianMixture, arc
+
+A2 = (7.2 * np.cos(np.deg2rad(85)) - 0.85, -7.2 * np.sin(np.deg2rad(85)) - 0.55)
+TARGET = [0, 1]
+
+
+def random_mixture(size: int, dim: int, seed: int, spread: float = 3.0) -> GaussianMixture:
+    """Full covariances of differing shape, uneven weights."""
+    rng = np.random.default_rng(seed)
+    roots = rng.standard_normal((size, dim, dim)) + 0.5 * np.eye(dim)
+    covs = roots @ np.swapaxes(roots, -1, -2) + 0.2 * np.eye(dim)
+    w = rng.dirichlet(np.full(size, 2.0))
+    return GaussianMixture(w, spread * rng.standard_normal((size, dim)) + 1.0, covs)
+
+
+def pair(which: str) -> tuple[GaussianMixture, GaussianMixture]:
+    """The fixed pairs of Table 1 ("A") and Table 2 ("B")."""
+    (n1, w1), (n2, w2) = {"A": ((4, 0.22), (5, 0.31)), "B": ((7, 0.45), (8, 0.45))}[which]
+    return (
+        arc(n1, (-10, 0), angle_std=0.6, range_std=0.41, ego_std=0.38, width=w1),
+        arc(n2, A2, angle_std=0.295, range_std=0.32, ego_std=0.38, width=w2),
+    )
+
+
+def wide(a: GaussianMixture, b: GaussianMixture, share: float = 0.9) -> GaussianMixture:
+    """A proposal that covers both."""
+    return GaussianMixture(
+        np.r_[share * a.weights, (1 - share) * b.weights],
+        np.r_[a.means, b.means],
+        np.r_[a.covs, b.covs],
+    )

@@ -1,0 +1,192 @@
+"""The pendulum: both forms on the manifold, the growth off it, energy, chart, Jacobians."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.special import ellipk
+
+from distfilt.models import (
+    pendulum,
+    pendulum_angle,
+    pendulum_chart,
+    pendulum_energy,
+    pendulum_rate,
+    pendulum_states,
+    rk4,
+)
+from distfilt.models.pendulum import FORMS
+
+G = 9.8
+START = np.array([np.sin(np.pi / 3), np.cos(np.pi / 3), 0.0, 0.0])
+_P = "distfilt.models.pendulum."
+
+BAD_INPUT: dict[str, list[tuple[str, Callable[[], object]]]] = {
+    _P + "pendulum_rate": [
+        ("states", lambda: pendulum_rate([1.0, 0.0])),
+        ("length", lambda: pendulum_rate(START, length=0.0)),
+        ("gravity", lambda: pendulum_rate(START, gravity=-1.0)),
+        ("form", lambda: pendulum_rate(START, form="exact")),
+    ],
+    _P + "pendulum": [
+        ("length", lambda: pendulum(length=-1.0)),
+        ("gravity", lambda: pendulum(gravity=float("nan"))),
+        ("form", lambda: pendulum(form="")),
+        ("sigma", lambda: pendulum(sigma=(0.1, -0.1))),
+        ("sigma", lambda: pendulum(sigma=0.1)),
+        ("step", lambda: pendulum(step=0.0)),
+        ("x", lambda: pendulum().step([1.0, 0.0], 0.0, 0.1)),
+    ],
+    _P + "pendulum_angle": [
+        ("length", lambda: pendulum_angle(length=0.0)),
+        ("gravity", lambda: pendulum_angle(gravity=-1.0)),
+        ("sigma", lambda: pendulum_angle(sigma=(-0.1, 0.1))),
+        ("step", lambda: pendulum_angle(step=-1.0)),
+    ],
+    _P + "pendulum_states": [
+        ("chart", lambda: pendulum_states([1.0])),
+        ("length", lambda: pendulum_states([1.0, 0.0], length=0.0)),
+    ],
+    _P + "pendulum_chart": [
+        ("states", lambda: pendulum_chart([1.0, 0.0])),
+        ("states", lambda: pendulum_chart([0.0, 0.0, 1.0, 1.0])),
+    ],
+    _P + "pendulum_energy": [
+        ("states", lambda: pendulum_energy([1.0])),
+        ("gravity", lambda: pendulum_energy(START, gravity=-1.0)),
+    ],
+}
+EXEMPT = {_P + "FORMS": "a tuple of names"}
+
+
+def _path(step: float, form: str = "printed", n: int = 200) -> np.ndarray:
+    """States at every 0.05 s over 10 s, (n + 1, 4)."""
+    model, out = pendulum(step=step, form=form), [START]
+    for k in range(n):
+        out.append(model.step(out[-1], 0.05 * k, 0.05))
+    return np.array(out)
+
+
+def _multiplier(form: str, theta: float = np.pi / 3) -> np.ndarray:
+    """Floquet multipliers of c'' = -k(t) c over half a period, c = r² - L² linearised."""
+
+    def rate(s: np.ndarray, _: float) -> np.ndarray:
+        c, slope, angle, omega = np.moveaxis(s, -1, 0)
+        k = 2 * omega**2 + (2 * G * np.cos(angle) if form == "multiplier" else 0.0)
+        return np.stack([slope, -k * c, omega, -G * np.sin(angle)], axis=-1)
+
+    half = 2 * np.sqrt(1 / G) * ellipk(np.sin(theta / 2) ** 2)
+    basis = np.array([[1.0, 0.0, theta, 0.0], [0.0, 1.0, theta, 0.0]])
+    ends = rk4(rate, basis, 0.0, half, longest=1e-3)[:, :2].T
+    assert abs(np.linalg.det(ends) - 1) < 1e-10
+    return np.asarray(np.linalg.eigvals(ends))
+
+
+def test_the_printed_equations() -> None:
+    x, y, u, v = s = np.array([0.3, -1.1, 0.7, 2.0])
+    size = 1.4
+    square = u**2 + v**2
+    expected = [u, v, (-G * x * y - x * square) / size**2, (G * x**2 - y * square) / size**2]
+    assert np.allclose(pendulum_rate(s, length=size), expected, atol=1e-13)
+    pull = -(square + G * y) / size**2
+    expected[2:] = [pull * x, G + pull * y]
+    assert np.allclose(pendulum_rate(s, length=size, form="multiplier"), expected, atol=1e-13)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_both_forms_are_the_pendulum_on_the_manifold(form: str) -> None:
+    q = np.random.default_rng(0).uniform(-3, 3, (50, 2))
+    rate = pendulum_rate(pendulum_states(q, length=1.3), length=1.3, form=form)
+    h = 1e-6
+    turn = np.stack([q[:, 1], -(G / 1.3) * np.sin(q[:, 0])], axis=1)
+    ahead, behind = (pendulum_states(q + s * h * turn, length=1.3) for s in (1, -1))
+    assert np.abs(rate - (ahead - behind) / (2 * h)).max() < 1e-7
+    one = pendulum(form=form, step=0.001).step(pendulum_states(q), 0.0, 0.5)
+    other = pendulum_states(pendulum_angle(step=0.001).step(q, 0.0, 0.5))
+    assert np.abs(one - other).max() < 1e-8
+
+
+@pytest.mark.parametrize(("form", "k"), [("printed", 0.0), ("multiplier", 2 * G)])
+def test_the_constraint_obeys_hill_s_equation_off_the_manifold(form: str, k: float) -> None:
+    """c'' = -(2 v² + k y) c / L² exactly, c = r² - L², at any state."""
+    s = np.random.default_rng(1).uniform(-2, 2, (30, 4))
+    rate = pendulum_rate(s, length=1.2, form=form)
+    c = s[:, 0] ** 2 + s[:, 1] ** 2 - 1.44
+    speed = s[:, 2] ** 2 + s[:, 3] ** 2
+    second = 2 * speed + 2 * (s[:, :2] * rate[:, 2:]).sum(axis=1)
+    assert np.allclose(second, -(2 * speed + k * s[:, 1]) * c / 1.44, atol=1e-12)
+
+
+def test_floquet_multipliers() -> None:
+    printed, stable = _multiplier("printed"), _multiplier("multiplier")
+    assert abs(np.abs(printed).max() - 2.283) < 0.005
+    assert np.abs(np.abs(stable) - 1).max() < 1e-6
+    for degrees in (10, 20, 30, 45):
+        assert abs(np.abs(_multiplier("printed", np.deg2rad(degrees))).max() - 1) < 1e-6
+
+
+def test_a_length_error_grows_in_the_printed_form_only() -> None:
+    """Over ten seconds an error of 1e-6 m grows by the multiplier's power, or not at all."""
+    errors = {}
+    for form in FORMS:
+        model, x = pendulum(form=form, step=0.005), START * [1 + 1e-6, 1 + 1e-6, 1, 1]
+        for k in range(200):
+            x = model.step(x, 0.05 * k, 0.05)
+        errors[form] = abs(np.hypot(*x[:2]) - 1)
+    assert errors["printed"] > 2e-4 and errors["multiplier"] < 5e-6
+
+
+@pytest.mark.parametrize(("step", "bound"), [(0.05, 4e-2), (0.01, 1e-4), (0.0025, 4e-7)])
+def test_the_length_drifts_with_the_fourth_power_of_the_step(step: float, bound: float) -> None:
+    drift = np.abs(np.hypot(*_path(step)[:, :2].T) - 1).max()
+    assert bound / 4 < drift < bound
+
+
+def test_energy_is_kept() -> None:
+    energy = pendulum_energy(_path(0.0025, "multiplier"))
+    assert np.abs(energy - energy[0]).max() < 1e-6
+    assert abs(pendulum_energy([0.3, 0.5, 3.0, 4.0], gravity=2.0) - 11.5) < 1e-12
+
+
+def test_the_period_is_the_elliptic_integral_s() -> None:
+    period = 4 * np.sqrt(1 / G) * ellipk(0.25)
+    back = pendulum_angle(step=0.001).step([np.pi / 3, 0.0], 0.0, period)
+    assert np.abs(back - [np.pi / 3, 0.0]).max() < 1e-9
+
+
+def test_the_chart_and_back() -> None:
+    q = np.random.default_rng(2).uniform(-3.1, 3.1, (40, 2))
+    assert np.abs(pendulum_chart(pendulum_states(q, length=0.7)) - q).max() < 1e-12
+    hang = pendulum_states([0.0, 0.0])
+    assert np.allclose(hang, [0.0, 1.0, 0.0, 0.0])
+    away = pendulum_states([[1.0, 2.0]]) * 3.0
+    assert np.allclose(pendulum_chart(away), [[1.0, 2.0]])
+
+
+@pytest.mark.parametrize("model", [pendulum(), pendulum(form="multiplier", length=1.4),
+                                   pendulum_angle(gravity=5.0)])
+def test_jacobians_by_differences(model: object) -> None:
+    x = np.random.default_rng(3).uniform(-1, 1, (5, model.dim))  # type: ignore[attr-defined]
+    numeric = replace(model, derivative=None)  # type: ignore[type-var]
+    gap = model.jacobian(x, 0.0, 0.05) - numeric.jacobian(x, 0.0, 0.05)  # type: ignore[attr-defined]
+    assert np.abs(gap).max() < 1e-8
+
+
+def test_noise_and_names() -> None:
+    model = pendulum(sigma=(0.1, 0.2))
+    assert np.allclose(model.noise(0.0, 0.5), np.diag([0.005, 0.005, 0.02, 0.02]))
+    chart = pendulum_angle(sigma=(0.1, 0.2))
+    assert np.allclose(chart.noise(0.0, 0.5), np.diag([0.005, 0.02]))
+    assert model.names == ("x", "y", "vx", "vy") and chart.units == ("rad", "rad/s")
+    assert (pendulum().noise(0.0, 0.1) == 0).all()
+
+
+def test_batches_and_inputs() -> None:
+    x = np.random.default_rng(4).uniform(-1, 1, (2, 3, 4))
+    kept = x.copy()
+    moved = pendulum().step(x, 0.0, 0.05)
+    assert np.allclose(moved[1, 2], pendulum().step(x[1, 2], 0.0, 0.05), atol=1e-14)
+    assert (x == kept).all()

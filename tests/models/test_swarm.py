@@ -1,0 +1,196 @@
+"""Swarms: reflection, the rotating mixture, and the law of the agents."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from distfilt.models import (
+    READINGS,
+    RotatingMixture,
+    Swarm,
+    mobility_and_diffusion,
+    reflected,
+    rotating_swarm,
+)
+
+CORNERS = [-1.0, 0.5], [1.0, 2.0]
+
+
+def _still(x: np.ndarray, t: float) -> np.ndarray:
+    return 0 * x
+
+
+@given(st.floats(-30, 30), st.floats(-30, 30))
+def test_reflection_is_even_and_periodic(a: float, b: float) -> None:
+    low, high = (np.array(c) for c in CORNERS)
+    width = high - low
+    here = reflected([a, b], low, high)
+    assert (here >= low).all() and (here <= high).all()
+    # Mirrored in either wall, or moved by twice the box, a point folds to the same place.
+    for other in (2 * low - [a, b], 2 * high - [a, b], np.array([a, b]) + 2 * width):
+        assert np.abs(reflected(other, low, high) - here).max() < 1e-12 * 40
+    inside = low + width * 0.3
+    assert np.abs(reflected(inside, low, high) - inside).max() < 1e-14
+
+
+def test_reflection_turns_back_at_the_wall() -> None:
+    got = reflected([[1.25, 0.4], [-1.5, 2.5], [3.25, 0.5]], *CORNERS)
+    assert np.allclose(got, [[0.75, 0.6], [-0.5, 1.5], [-0.75, 0.5]], atol=1e-14)
+
+
+def test_score_is_the_gradient_of_the_logarithm() -> None:
+    f = RotatingMixture(components=3, radius=0.2, phase=0.4)
+    x = np.random.default_rng(1).random((7, 2))
+    h = 1e-6
+    for k in range(2):
+        step = h * np.eye(2)[k]
+        slope = (np.log(f.density(x + step, 2.0)) - np.log(f.density(x - step, 2.0))) / (2 * h)
+        assert np.abs(slope - f.score(x, 2.0)[:, k]).max() < 1e-6
+
+
+def test_score_far_away_is_finite() -> None:
+    f = RotatingMixture(variance=1e-5)
+    assert f.density([0.0, 0.0], 0.0) == 0
+    assert np.isfinite(f.score([0.0, 0.0], 0.0)).all()
+
+
+def test_mixture_goes_round() -> None:
+    f = RotatingMixture()
+    assert np.allclose(f.means(np.pi / 2 / 0.04), [[0.5, 0.8], [0.5, 0.2]])
+    shifted = RotatingMixture(phase=0.3)
+    assert np.allclose(shifted.means(1.0), f.means(1.0 + 0.3 / 0.04))
+    # Its integral over the plane is one.
+    s = np.linspace(-1, 2, 301)
+    x = np.stack(np.meshgrid(s, s, indexing="ij"), axis=-1)
+    assert abs(f.density(x, 5.0).sum() * 0.01**2 - 1) < 1e-6
+
+
+def test_step_is_repeatable_and_leaves_its_input() -> None:
+    swarm = rotating_swarm()
+    x = np.random.default_rng(2).random((5, 2))
+    kept = x.copy()
+    a = swarm.step(x, 0.0, 0.1, rng=np.random.default_rng(3))
+    b = swarm.step(x, 0.0, 0.1, rng=np.random.default_rng(3))
+    assert np.array_equal(a, b) and np.array_equal(x, kept)
+    path = swarm.simulate(x, [0.1, 0.3], rng=np.random.default_rng(3))
+    assert np.array_equal(path[0], a) and path.shape == (2, 5, 2)
+
+
+def test_free_agents_spread_by_2_d_t_on_each_axis() -> None:
+    swarm = Swarm(_still, [1e-4, 4e-4])
+    x = swarm.step(np.full((40_000, 2), 0.5), 0.0, 2.0, rng=np.random.default_rng(4))
+    # Four standard errors of a variance of 40 000 draws.
+    assert np.abs(x.var(axis=0) / [4e-4, 16e-4] - 1).max() < 4 * np.sqrt(2 / 40_000)
+
+
+def test_tensors_and_functions_of_place_mean_the_same() -> None:
+    x = np.random.default_rng(5).random((2, 2))  # as many agents as coordinates
+    forms = [
+        0.02,
+        [0.02, 0.02],
+        0.02 * np.eye(2),
+        lambda x, t: 0.02 + 0 * x[..., 0],
+        lambda x, t: 0.02 + 0 * x,
+        lambda x, t: 0.02 * np.broadcast_to(np.eye(2), (*x.shape, 2)),
+    ]
+    steps = [Swarm(_still, f).step(x, 0.0, 0.1, rng=np.random.default_rng(6)) for f in forms]
+    for other in steps[1:]:
+        assert np.abs(other - steps[0]).max() < 1e-15
+    apart = Swarm(_still, lambda x, t: np.stack([x[..., 0], 1 + x[..., 1]], axis=-1))
+    assert np.allclose(apart.diffusion_at(x, 0.0), x + [0, 1])
+
+
+def test_euler_and_maruyama_inflate_the_variance_as_said() -> None:
+    # v = -k x about the middle: the stationary variance is D/k / (1 - k h / 2).
+    k, d, h = 4.0, 2e-3, 0.2
+    swarm = Swarm(lambda x, t: k * (0.5 - x), d, low=[0.0], high=[1.0])
+    x = swarm.simulate(np.full((40_000, 1), 0.5), np.arange(1, 21) * h,
+                       rng=np.random.default_rng(7), substeps=1)[-1]
+    wanted = d / k / (1 - k * h / 2)
+    assert abs(x.var() / wanted - 1) < 4 * np.sqrt(2 / 40_000)
+
+
+def test_literal_reading_follows_a_power_of_f_with_a_lag() -> None:
+    """E2: components of variance 0.02 D/c = 3e-4 that trail by speed over relaxation rate."""
+    swarm, f = rotating_swarm("literal"), RotatingMixture()
+    rng = np.random.default_rng(8)
+    side = rng.integers(2, size=20_000)
+    x = f.means(0.0)[side] + np.sqrt(3e-4) * rng.standard_normal((20_000, 2))
+    x = swarm.simulate(x, np.arange(1, 41) * 0.1, rng=rng)[-1]
+    gap = x - f.means(4.0)[side]
+    angle = 0.04 * 4.0 + np.pi * side
+    along = np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+    lag = -(gap * along).sum(axis=-1)
+    assert abs(lag.mean() / 0.008 - 1) < 0.05
+    within = np.concatenate([gap[side == s] - gap[side == s].mean(axis=0) for s in (0, 1)])
+    assert abs(within.var() / 3.0e-4 - 1) < 0.03
+
+
+@pytest.mark.parametrize("reading", READINGS)
+def test_readings_are_the_published_numbers(reading: str) -> None:
+    mobility, diffusion = mobility_and_diffusion(reading)
+    swarm, x = rotating_swarm(reading), np.array([[0.3, 0.9]])
+    assert np.allclose(swarm.drift_at(x, 1.0), mobility * RotatingMixture().score(x, 1.0))
+    assert np.allclose(swarm.diffusion_at(x, 1.0), diffusion)
+    wanted = {"literal": (0.2, 0.02), "gibbs": (0.2, 0.2), "slowgibbs": (0.02, 0.02)}
+    assert mobility_and_diffusion(reading, 0.2) == pytest.approx(wanted[reading])
+
+
+_RNG = np.random.default_rng(0)
+_SWARM = rotating_swarm()
+_HALF = np.full((3, 2), 0.5)
+BAD_INPUT = {
+    "distfilt.models.swarm.reflected": [
+        ("positions", lambda: reflected([0.1], [0.0, 0.0], [1.0, 1.0])),
+        ("positions", lambda: reflected([np.nan, 0.0], [0.0, 0.0], [1.0, 1.0])),
+        ("high", lambda: reflected([0.1], [0.0], [0.0])),
+    ],
+    "distfilt.models.swarm.Swarm": [
+        ("drift", lambda: Swarm(3, 0.1)),
+        ("diffusion", lambda: Swarm(_still, 0.0)),
+        ("diffusion", lambda: Swarm(_still, -0.1)),
+        ("diffusion", lambda: Swarm(_still, [0.1, 0.1, 0.1])),
+        ("diagonal", lambda: Swarm(_still, [[0.1, 0.05], [0.05, 0.1]])),
+        ("diagonal", lambda: Swarm(
+            _still, lambda x, t: np.broadcast_to([[1.0, 0.1], [0.1, 1.0]], (*x.shape, 2))
+        ).diffusion_at(_HALF, 0.0)),
+        ("high", lambda: Swarm(_still, 0.1, high=(0.0, 1.0))),
+    ],
+    "distfilt.models.swarm.Swarm.step": [
+        ("positions", lambda: _SWARM.step([[1.2, 0.5]], 0.0, 0.1, rng=_RNG)),
+        ("positions", lambda: _SWARM.step([[np.nan, 0.5]], 0.0, 0.1, rng=_RNG)),
+        ("dt", lambda: _SWARM.step(_HALF, 0.0, 0.0, rng=_RNG)),
+        ("rng", lambda: _SWARM.step(_HALF, 0.0, 0.1, rng=7)),
+        ("substeps", lambda: _SWARM.step(_HALF, 0.0, 0.1, rng=_RNG, substeps=0)),
+        ("drift", lambda: Swarm(lambda x, t: x[..., 0], 0.1).step(_HALF, 0.0, 0.1, rng=_RNG)),
+    ],
+    "distfilt.models.swarm.Swarm.simulate": [
+        ("times", lambda: _SWARM.simulate(_HALF, [0.0], rng=_RNG)),
+        ("times", lambda: _SWARM.simulate(_HALF, [0.2, 0.1], rng=_RNG)),
+    ],
+    "distfilt.models.swarm.RotatingMixture": [
+        ("variance", lambda: RotatingMixture(variance=0.0)),
+        ("components", lambda: RotatingMixture(components=0)),
+        ("radius", lambda: RotatingMixture(radius=-1.0)),
+    ],
+    "distfilt.models.swarm.mobility_and_diffusion": [
+        ("reading", lambda: mobility_and_diffusion("quick")),
+        ("strength", lambda: mobility_and_diffusion("gibbs", 0.0)),
+    ],
+    "distfilt.models.swarm.rotating_swarm": [
+        ("reading", lambda: rotating_swarm("quick")),
+        ("mixture", lambda: rotating_swarm("gibbs", mixture=3)),
+    ],
+}
+EXEMPT = {"distfilt.models.swarm.READINGS": "a table of numbers"}
+
+
+@pytest.mark.parametrize(
+    ("word", "call"), [case for cases in BAD_INPUT.values() for case in cases]
+)
+def test_bad_input(word: str, call: object) -> None:
+    with pytest.raises(ValueError, match=word):
+        call()  # type: ignore[operator]

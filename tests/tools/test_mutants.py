@@ -1,0 +1,85 @@
+"""The sampler of faults: what it draws is a fault, is told apart, and leaves the copy as it was."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("cosmic_ray", reason="the extra mutants is not installed")
+
+from . import mutants
+
+LIBRARY = '''"""Text."""
+
+def half(x: int | None, scale: float = 2.0) -> float | None:
+    """Half."""
+    if x is None:
+        return None
+    return x / scale
+
+
+def unused(x: int) -> int:
+    return x + 1
+'''
+TESTS = """
+from distfilt.a import half
+
+def test_half():
+    assert half(3) == 1.5 and half(None) is None and half(9, 3.0) == 3.0
+"""
+
+
+@pytest.fixture
+def repository(tmp_path: Path) -> Path:
+    for name, text in (
+        ("distfilt/__init__.py", ""),
+        ("distfilt/a.py", LIBRARY),
+        ("tests/__init__.py", ""),
+        ("tests/test_a.py", TESTS),
+    ):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    return tmp_path
+
+
+def test_types_and_texts_are_no_faults(repository: Path) -> None:
+    same = LIBRARY.replace("int | None", "int & None").replace("Half.", "Whole.")
+    assert mutants.meaning(same) == mutants.meaning(LIBRARY)
+    assert mutants.meaning(LIBRARY.replace("x / scale", "x * scale")) != mutants.meaning(LIBRARY)
+    for mutant in mutants.drawn(repository, 50, 3, ""):
+        made = mutant.source(LIBRARY)
+        assert mutants.meaning(made) != mutants.meaning(LIBRARY)
+
+
+def test_a_sample_is_the_seed_s_and_has_one_change_a_place(repository: Path) -> None:
+    found = mutants.drawn(repository, 50, 3, "")
+    assert found == mutants.drawn(repository, 50, 3, "") and len(found) >= 4
+    assert len({(m.line, m.column) for m in found}) == len(found)
+    assert mutants.drawn(repository, 2, 3, "") == found[:2]
+    assert mutants.drawn(repository, 50, 3, "other") == []
+
+
+def test_nearest_tests_come_first() -> None:
+    found = mutants.stages("distfilt/network/channel.py", mutants.ROOT)
+    assert found[0] == ["distfilt/network/channel.py", "tests/network/test_channel.py"]
+    assert found[1] == ["tests/network"] and found[2][0] == "tests"
+    assert mutants.stages("distfilt/checks.py", mutants.ROOT)[0][1] == "tests/test_checks.py"
+
+
+@pytest.mark.slow
+def test_faults_are_found_or_survive(repository: Path, tmp_path: Path) -> None:
+    table = tmp_path / "out" / "mutants.csv"
+    assert mutants.main(["--sample", "50", "--jobs", "2"], repository, table) == 0
+    with table.open(newline="") as lines:
+        rows = {(r["was"], r["result"]) for r in csv.DictReader(lines)}
+    assert ("return x / scale", "killed") in rows and ("return x + 1", "survived") in rows
+    assert ("return x / scale", "survived") not in rows
+    assert (repository / "distfilt" / "a.py").read_text() == LIBRARY
+    text = table.read_text()
+    table.write_text("\n".join(
+        line + "dead code" if ",survived," in line else line for line in text.splitlines()
+    ) + "\n")  # fmt: skip
+    mutants.main(["--sample", "50", "--jobs", "2"], repository, table)
+    assert table.read_text().count("dead code") == text.count(",survived,") > 0
