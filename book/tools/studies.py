@@ -25,8 +25,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import cloudpickle
-
 from common import ROOT
 from distfilt import studies
 from distfilt.published import PAPERS, Scenario
@@ -46,11 +44,6 @@ def load_script(path: Path) -> ModuleType:
         If it lacks one of the names, or NAME or PAPER is not one.
     """
     script = studies.script(path)
-    folder = str(path.parent.resolve())
-    # A worker cannot import these by their names: send their functions themselves.
-    for module in list(sys.modules.values()):
-        if str(getattr(module, "__file__", None) or "").startswith(f"{folder}/"):
-            cloudpickle.register_pickle_by_value(module)
     lacking = [name for name in NEEDED if not hasattr(script, name)]
     if lacking:
         raise ValueError(f"{path.name}: has to define {', '.join(lacking)}")

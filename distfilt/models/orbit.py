@@ -156,10 +156,7 @@ def _moved(x: Array, dt: float, rule: str, longest: float) -> Array:
     turned: Callable[[Array, float], Array] = _rate if dt > 0 else lambda x, t: -_rate(x)
     for _ in range(steps):
         # A body that dives through the Earth and comes out again is found on its way.
-        if rule == "rk4":
-            x = rk4(turned, x, 0.0, abs(dt) / steps)
-        else:
-            x = _dop853(x, dt / steps)
+        x = rk4(turned, x, 0.0, abs(dt) / steps) if rule == "rk4" else _dop853(x, dt / steps)
         _above(x)
     return x
 

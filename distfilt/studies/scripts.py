@@ -47,7 +47,17 @@ def script(name: str | Path) -> ModuleType:
     if folder not in sys.path:
         sys.path.insert(0, folder)
     spec.loader.exec_module(module)
+    _sent_by_value(folder)
     return module
+
+
+def _sent_by_value(folder: str) -> None:
+    """A worker cannot import the scripts by their names: their functions are sent themselves."""
+    import cloudpickle
+
+    for module in list(sys.modules.values()):
+        if str(getattr(module, "__file__", None) or "").startswith(f"{folder}/"):
+            cloudpickle.register_pickle_by_value(module)
 
 
 def _folder() -> Path:
