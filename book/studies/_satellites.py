@@ -30,8 +30,8 @@ from distfilt.updates import (
 
 PAPER = "grange"
 SEED = 2024
-HALF_SECONDS = range(4, 200, 5)
-"""Steps at 0.5 s, 1 s, ...: the instants at which a comparison over time is stored."""
+EVERY = 5
+"""A comparison over time is stored at every fifth step: at 0.5 s, 1 s, ..."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,17 +233,22 @@ def score_columns(s: Setup, name: str, batch: int, *, each_agent: bool = True) -
 
 
 def over_time(name: str, error: np.ndarray, nees: np.ndarray) -> dict[str, float]:
-    """Means over the runs (T, R, ...) of a batch, of error and NEES/d, at every half second."""
+    """Means over the runs (T, R, ...) of a batch, of error and NEES/d, at every fifth step."""
     out = {}
-    for k in HALF_SECONDS:
+    for k in range(EVERY - 1, error.shape[0], EVERY):
         out[f"{name}_e{k:03d}"] = short(error[k].mean())
         out[f"{name}_n{k:03d}"] = short(nees[k].mean())
     return out
 
 
-def time_columns(name: str) -> list[str]:
+def instants(s: Setup) -> range:
+    """The steps at which `over_time` stores."""
+    return range(EVERY - 1, s.times.size, EVERY)
+
+
+def time_columns(s: Setup, name: str) -> list[str]:
     """The names of what `over_time` gives."""
-    return [f"{name}_{what}{k:03d}" for k in HALF_SECONDS for what in "en"]
+    return [f"{name}_{what}{k:03d}" for k in instants(s) for what in "en"]
 
 
 def of_every_step(s: Setup, name: str, result: Any) -> dict[str, float]:

@@ -31,10 +31,9 @@ APPLIES = [(a.kind, list(a.dims)) for a in SETUP.scenario.agents] == [
 ]  # fmt: skip
 columns = [
     *(f"bound_{what}_{r}" for what in ("mse", "nees", "share") for r in range(BATCH)),
-    *satellites.time_columns("bound"),
+    *satellites.time_columns(SETUP, "bound"),
 ]
-parameters = {
-    "batch": BATCH, "seed": 2024, "particles": 10_000, "nodes": 7}  # fmt: skip
+parameters = {"batch": BATCH, "seed": 2024, "particles": 10_000, "nodes": 7}
 seeds = np.random.SeedSequence(satellites.SEED).spawn(SETUP.runs // BATCH)
 scenarios = (SETUP.scenario,)
 rtol = 1e-4

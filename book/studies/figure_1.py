@@ -25,7 +25,7 @@ columns = [
         *satellites.score_columns(SETUP, name, BATCH),
         *(f"{name}_few_mse_{r}" for r in range(BATCH)),
         *satellites.step_columns(SETUP, name),
-        *satellites.time_columns(name),
+        *satellites.time_columns(SETUP, name),
     )
 ]
 parameters = {"batch": BATCH, "few": FEW, "seed": 2024}

@@ -31,7 +31,7 @@ columns = [
         for c in satellites.score_columns(SETUP, name, BATCH)
     ),
     *(f"{n}_{what}_{r}" for n in CENTRAL for what in ("mse", "nees") for r in range(BATCH)),
-    *satellites.time_columns("exact"),
+    *satellites.time_columns(SETUP, "exact"),
 ]
 parameters = {"batch": BATCH, "seed": 2024, "tuned": TUNED}
 seeds = np.random.SeedSequence(satellites.SEED).spawn(SETUP.runs // BATCH)

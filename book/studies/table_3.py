@@ -28,7 +28,7 @@ columns = [
         for c in satellites.score_columns(SETUP, name, BATCH)
     ),
     *(f"central_{what}_{r}" for what in ("mse", "nees") for r in range(BATCH)),
-    *(c for name in (*TIMED, "central") for c in satellites.time_columns(name)),
+    *(c for name in (*TIMED, "central") for c in satellites.time_columns(SETUP, name)),
 ]
 parameters = {"batch": BATCH, "seed": 2025, "tuned": TUNED}
 seeds = np.random.SeedSequence(satellites.SEED + 1).spawn(SETUP.runs // BATCH)
