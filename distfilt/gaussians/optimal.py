@@ -42,7 +42,8 @@ def _iterated(covs: Array, here: NDArray[np.bool_], determinant: bool) -> Array:
         value, slope, curvature = problem.derivatives(point)
         mean = (point * slope).sum(axis=-1, keepdims=True)
         gap = slope.max(axis=-1) / mean[:, 0] - 1
-        lower_gap = gap < lowest
+        # What is settled stays: the others' need for more steps must not move it.
+        lower_gap = (gap < lowest) & (lowest > _GAP)
         best[left[lower_gap]] = point[lower_gap]
         lowest = np.where(lower_gap, gap, lowest)
         open_ = lowest > _GAP

@@ -147,7 +147,7 @@ def test_items_are_complete():
     chapters = {paper: {i.chapter for i in found if i.paper == paper} for paper in PAPERS}
     assert chapters == {
         "grange": {"04-satellite-network"},
-        "das": {"06-constrained-pendulum"},
+        "das": {"05-optimal-transport", "06-constrained-pendulum"},
         "semeraro": {"07-partial-state-fusion", "08-tracking-in-orbit"},
         "zheng": {"10-swarm-that-knows"},
     }
