@@ -82,6 +82,33 @@ def _merge(w: Any, m: Any, p: Any, i: int, j: int) -> None:
 merge = _compiled(_merge)
 
 
+def _renew(
+    w: Any, m: Any, p: Any, dets: Any, alive: Any, table: Any, best: Any, nearest: Any,
+    i: int, j: int, work: Any,
+) -> None:  # fmt: skip
+    """Costs of the pairs with the merged mixand `i`, and cheapest pairs where `j` was in one."""
+    n = best.size
+    for k in range(n):
+        if not alive[k] or k == i:
+            continue
+        low, high = (k, i) if k < i else (i, k)
+        table[low, high] = cost(w, m, p, dets, low, high, work)
+    for k in range(n):
+        if not alive[k]:
+            continue
+        # Only rows that lost their neighbour, and the merged one, are searched again.
+        if k == i or nearest[k] == i or nearest[k] == j:
+            best[k] = np.inf
+            for c in range(k + 1, n):
+                if alive[c] and table[k, c] < best[k]:
+                    best[k], nearest[k] = table[k, c], c
+        elif k < i and table[k, i] < best[k]:
+            best[k], nearest[k] = table[k, i], i
+
+
+renew = _compiled(_renew)
+
+
 def _reduce(w: Any, m: Any, p: Any, alive: Any, size: int) -> None:
     """Merge the cheapest pair until `size` mixands are alive, in place."""
     n, d = m.shape
@@ -115,22 +142,7 @@ def _reduce(w: Any, m: Any, p: Any, alive: Any, size: int) -> None:
         alive[j] = False
         best[j] = np.inf
         left -= 1
-        for k in range(n):
-            if not alive[k] or k == i:
-                continue
-            low, high = (k, i) if k < i else (i, k)
-            table[low, high] = cost(w, m, p, dets, low, high, work)
-        for k in range(n):
-            if not alive[k]:
-                continue
-            # Only rows that lost their neighbour, and the merged one, are searched again.
-            if k == i or nearest[k] == i or nearest[k] == j:
-                best[k] = np.inf
-                for c in range(k + 1, n):
-                    if alive[c] and table[k, c] < best[k]:
-                        best[k], nearest[k] = table[k, c], c
-            elif k < i and table[k, i] < best[k]:
-                best[k], nearest[k] = table[k, i], i
+        renew(w, m, p, dets, alive, table, best, nearest, i, j, work)
 
 
 reduce = _compiled(_reduce)

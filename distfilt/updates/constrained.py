@@ -10,7 +10,8 @@ import numpy as np
 
 from ..checks import Array, callable_, choice, count, instance, number
 from ..coupling import READINGS, Constraint
-from ..coupling.constraints import Motion, _augmented, _project, _retract, clip
+from ..coupling.constraints import Motion, _project, _retract
+from ..coupling.rules import _augmented, clip
 from .door import Update, joined, unchecked
 
 __all__ = ["augmented", "clipped", "projected", "retracted"]

@@ -72,18 +72,18 @@ BAD_INPUT: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("motion", lambda: retract(_X, norm([0]), motion=[0, 1])),
         ("rank", lambda: retract([[0.0, 0.0]], norm([0, 1]))),
     ],
-    _C + "clip": [
+    "distfilt.coupling.rules.clip": [
         *_either(clip),
         ("states", lambda: clip(NAN * _X, _LINE)),
         ("constraint", lambda: clip(_X, Constraint(lambda x: x, [0.0, 0.0]))),
     ],
-    _C + "accepted": [
+    "distfilt.coupling.rules.accepted": [
         *_either(lambda x, g: accepted(np.zeros(3), x, g)),
         ("log_weights", lambda: accepted(np.zeros(2), _X, _LINE)),
         ("ensemble", lambda: accepted(np.zeros(3), _X + 100, _LINE)),
         ("tolerance", lambda: accepted(np.zeros(3), _X, _LINE, tolerance=-1.0)),
     ],
-    _C + "augmented_readings": [
+    "distfilt.coupling.rules.augmented_readings": [
         *_either(lambda x, g: augmented_readings(x, x, x[0], np.eye(2), g, std=1.0)),
         ("std", lambda: augmented_readings(_X, _X, _X[0], np.eye(2), _LINE, std=0.0)),
         ("predicted", lambda: augmented_readings(_X, _X[:2], _X[0], np.eye(2), _LINE, std=1.0)),

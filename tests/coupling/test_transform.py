@@ -20,7 +20,7 @@ from distfilt.coupling import (
     transform_along,
     transform_within,
 )
-from distfilt.coupling.transform import _chosen
+from distfilt.coupling.sampling import _chosen
 
 NAN = float("nan")
 _T = "distfilt.coupling.transform."
@@ -71,7 +71,7 @@ BAD_INPUT: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("bandwidth", lambda: rejuvenated(_X, _X, bandwidth=-0.1, rng=_rng())),
         ("rng", lambda: rejuvenated(_X, _X, bandwidth=0.1, rng=3)),
     ],
-    _T + "transform_within": [
+    "distfilt.coupling.sampling.transform_within": [
         ("ensemble", lambda: transform_within(_X[None], _W, [0, 0, 0], rng=_rng())),
         ("log_weights", lambda: transform_within(_X, NAN * _W, [0, 0, 0], rng=_rng())),
         ("pieces", lambda: transform_within(_X, _W, [0, 0], rng=_rng())),
@@ -79,7 +79,7 @@ BAD_INPUT: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("rng", lambda: transform_within(_X, _W, [0, 0, 0], rng=None)),
         ("solver", lambda: transform_within(_X, _W, [0, 0, 0], rng=_rng(), solver="best")),
     ],
-    _T + "transform_along": [
+    "distfilt.coupling.sampling.transform_along": [
         *_common(lambda x, w: transform_along(
             x, w, difference=np.subtract, retract=np.add)),
         ("difference", lambda: transform_along(_X, _W, difference=1, retract=np.add)),
