@@ -13,7 +13,7 @@ def test_script_is_found_from_any_folder(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.chdir(tmp_path)
     found = studies.script("lorenz-63")
     assert found.NAME == "lorenz-63" and callable(found.trial)
-    assert studies.stored("grange", "lorenz-63").columns == tuple(found.columns)
+    assert tuple(studies.stored("grange", "lorenz-63").columns) == tuple(found.columns)
 
 
 BAD_INPUT = {

@@ -46,7 +46,7 @@ BAD_INPUT: dict[str, list[tuple[str, Callable[[], object]]]] = {
     _U + "transform_by_agreement": [
         ("channel", lambda: transform_by_agreement(_FOUR, _LOGS, graphs.ring(4))),
         ("channel", lambda: transform_by_agreement(
-            _FOUR, _LOGS, Channel(graphs.ring(4), faults=Faults(loss=0.5), rng=_rng()))),
+            _FOUR, _LOGS, Channel(graphs.ring(4), faults=Faults(loss=0.5)))),
         ("ensembles", lambda: transform_by_agreement(_FOUR[:3], _LOGS, _ring())),
         ("log_likelihoods", lambda: transform_by_agreement(_FOUR, _LOGS[:, :5], _ring())),
         ("rounds", lambda: transform_by_agreement(_FOUR, _LOGS, _ring(), rounds=0)),
