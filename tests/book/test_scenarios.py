@@ -29,9 +29,31 @@ def texts(tree: ast.AST) -> set[str]:
             and isinstance(n.value, str)}  # fmt: skip
 
 
+def listed(node: ast.AST) -> set[str]:
+    """The words of a tuple or list of words."""
+    parts = node.elts if isinstance(node, ast.Tuple | ast.List) else []
+    return {str(p.value) for p in parts if isinstance(p, ast.Constant)}
+
+
+def looped(tree: ast.AST) -> set[str]:
+    """What a loop takes by the words of a list: ``{n: row[n] for n in names}``."""
+    named: dict[str, set[str]] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
+            named.setdefault(node.targets[0].id, set()).update(listed(node.value))
+    out: set[str] = set()
+    for node in ast.walk(tree):
+        for loop in getattr(node, "generators", []):
+            words = listed(loop.iter) or named.get(getattr(loop.iter, "id", ""), set())
+            uses = (n.slice for n in ast.walk(node) if isinstance(n, ast.Subscript))
+            if any(isinstance(u, ast.Name) and u.id == getattr(loop.target, "id", "") for u in uses):
+                out |= words
+    return out
+
+
 def taken(tree: ast.AST) -> set[str]:
-    """What is taken by name: ``["gain"]``, ``.noise``."""
-    out = set()
+    """What is taken by name: ``["gain"]``, ``.noise``, ``row[n] for n in names``."""
+    out = looped(tree)
     for node in ast.walk(tree):
         if isinstance(node, ast.Subscript) and isinstance(node.slice, ast.Constant):
             out.add(str(node.slice.value))
