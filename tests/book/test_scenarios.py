@@ -45,8 +45,10 @@ def looped(tree: ast.AST) -> set[str]:
     for node in ast.walk(tree):
         for loop in getattr(node, "generators", []):
             words = listed(loop.iter) or named.get(getattr(loop.iter, "id", ""), set())
-            uses = (n.slice for n in ast.walk(node) if isinstance(n, ast.Subscript))
-            if any(isinstance(u, ast.Name) and u.id == getattr(loop.target, "id", "") for u in uses):
+            uses = {
+                getattr(n.slice, "id", None) for n in ast.walk(node) if isinstance(n, ast.Subscript)
+            }
+            if getattr(loop.target, "id", "") in uses:
                 out |= words
     return out
 
