@@ -32,6 +32,7 @@ def clip(states: ArrayLike, constraint: Constraint) -> Array:
 
     Examples
     --------
+    >>> from distfilt.coupling import norm
     >>> clip([[3.0, 4.0], [0.1, 0.0]], norm([0, 1])).round(12)
     array([[0.6, 0.8],
            [0.1, 0. ]])
@@ -74,6 +75,7 @@ def accepted(
 
     Examples
     --------
+    >>> from distfilt.coupling import norm
     >>> accepted([0.0, 0.0], [[2.0], [0.5]], norm([0]))
     array([-inf,   0.])
     """
@@ -116,6 +118,7 @@ def augmented_readings(
 
     Examples
     --------
+    >>> from distfilt.coupling import norm
     >>> _, y, r = augmented_readings([[1.0]], [[1.0]], [2.0], [[4.0]], norm([0]), std=0.1)
     >>> y, np.diag(r)
     (array([2., 1.]), array([4.  , 0.01]))
