@@ -101,6 +101,8 @@ def norm(indices: Sequence[int], *, length: float = 1.0) -> Constraint:
     >>> norm([0, 1]).residual([0.6, 0.8, 5.0]).round(15) + 0.0
     array([0.])
     """
+    if not np.iterable(indices):
+        raise ValueError(f"indices: needs a list of integers, got {indices!r}")
     rows = [count(i, "indices", at_least=0) for i in indices]
     if not rows or len(set(rows)) != len(rows):
         raise ValueError(f"indices: needs at least one, all different, got {list(indices)}")

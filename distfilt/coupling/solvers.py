@@ -211,7 +211,7 @@ def _solver(name: str, regularisation: float) -> Solve:
 def _network(cost: Array, a: Array, b: Array) -> tuple[Array, Array]:
     """POT's network simplex, without the layers around it: they cost more than it at N = 50."""
     emd = needed("ot.lp.emd_wrap", "maps")
-    matrix, _, _, g, status = emd.emd_c(a, b, cost, _PIVOTS, 1)
+    matrix, _, _, g, status = emd.emd_c(a, b, np.ascontiguousarray(cost), _PIVOTS, 1)
     if status != 1:
         raise SolverError(f"network simplex: stopped with status {status}, {_sizes(cost)}")
     return np.asarray(matrix), np.asarray(g)

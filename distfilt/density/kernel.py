@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import erf
 
-from ..checks import Array, array, choice, count, number
+from ..checks import Array, array, choice, count, instance, number
 from .grid import Grid
 
 __all__ = [
@@ -201,6 +201,7 @@ def kernel_covariance(
     >>> print(round(cov[middle, middle] / (1 / (400 * np.pi * 0.08**2)), 2))
     0.89
     """
+    instance(grid, "grid", Grid)
     p = array(density, "density", (grid.size,))
     total = float(grid.integral(p))
     if p.min() < 0 or abs(total - 1) > 1e-8:
@@ -239,6 +240,7 @@ def bandwidth(
     >>> round(bandwidth(x, Grid((30, 30))), 3)
     0.129
     """
+    instance(grid, "grid", Grid)
     x = _agents(array(positions, "positions", ("N", grid.dim)), grid)
     choice(rule, "rule", ("silverman", "least_squares"))
     n, d = x.shape
@@ -297,6 +299,7 @@ def adaptive_bandwidths(
     >>> bool(h[2] > 0.1 > h[0])
     True
     """
+    instance(grid, "grid", Grid)
     x = _agents(array(positions, "positions", ("N", grid.dim)), grid)
     s = number(sensitivity, "sensitivity", at_least=0, at_most=1)
     h = number(bandwidth, "bandwidth", above=0)

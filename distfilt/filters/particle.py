@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
-from ..checks import Array, array, choice, count, generator, number
+from ..checks import Array, array, choice, count, generator, instance, number
 from ..network import Ledger
 from ..updates import effective_size
 from ..updates.particles import RESAMPLING, _jittered, _levels, _picked, _resampled
@@ -187,6 +187,7 @@ class ParticleFilter(SensorFilter):
 
     def summary(self, state: ParticleState) -> Summary:
         """Weighted means and covariances, effective sizes and the share of distinct particles."""
+        instance(state, "state", ParticleState)
         return _summary(state, state.points)
 
     def past(self, state: ParticleState) -> tuple[tuple[float, Summary], ...]:

@@ -90,7 +90,7 @@ def lorenz63(
     (3,)
     """
     s, r, b = number(prandtl, "prandtl"), number(rho, "rho"), number(beta, "beta")
-    density = number(sigma, "sigma", at_least=0) ** 2 * np.eye(3)
+    density = number(sigma, "sigma", at_least=0, at_most=1e150) ** 2 * np.eye(3)
     longest = number(step, "step", above=0)
 
     def rate(x: Array, _: float) -> Array:

@@ -219,7 +219,7 @@ def judge_table(
     'match'
     """
     known = known_item(paper, item)
-    if not all(isinstance(v, Value) for v in values):
+    if not np.iterable(values) or not all(isinstance(v, Value) for v in values):
         raise ValueError("values: needs a sequence of Value")
     distinct([v.id for v in values], "values")
     missed = [str(v) for v in values if not v.matches]

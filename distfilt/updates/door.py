@@ -15,7 +15,7 @@ from typing import Any, Concatenate, ParamSpec, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, covariance, generator
+from ..checks import Array, array, callable_, covariance, generator
 
 __all__ = ["Update", "joined", "stackable", "unchecked", "update"]
 
@@ -56,6 +56,8 @@ def update(
     array([[2.],
            [3.]])
     """
+
+    callable_(function, "function")
 
     @wraps(function)
     def checked(

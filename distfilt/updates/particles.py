@@ -97,6 +97,8 @@ def effective_size(log_weights: ArrayLike) -> Array:
     2.6667
     """
     w = array(log_weights, "log_weights", (..., "N"), finite=False)
+    if not w.shape[-1]:
+        raise ValueError(f"log_weights: needs at least one, got shape {w.shape}")
     return np.asarray(np.exp(-logsumexp(2.0 * _normalised(w, w.shape), axis=-1)))
 
 
@@ -268,6 +270,8 @@ def jitter(
     """
     x = array(points, "points", (..., "N", "d"))
     n, d = x.shape[-2:]
+    if not n:
+        raise ValueError(f"points: needs at least one, got shape {x.shape}")
     h = min(1.0, (4 / (n * (d + 2))) ** (1 / (d + 4)))
     if bandwidth is not None:
         h = number(bandwidth, "bandwidth", above=0, at_most=1)
