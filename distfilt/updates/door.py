@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, array, callable_, covariance, generator
+from ..linalg import _cholesky
 
 __all__ = ["Update", "joined", "stackable", "unchecked", "update"]
 
@@ -76,7 +77,8 @@ def update(
         y = array(observed, "observed", (..., m))
         if y.shape not in ((m,), (*x.shape[:-2], m)):
             raise ValueError(f"observed: needs shape {(*x.shape[:-2], m)}, got {y.shape}")
-        y = np.broadcast_to(y, (*x.shape[:-2], m))
+        if y.ndim < x.ndim - 1:
+            y = np.broadcast_to(y, (*x.shape[:-2], m))
         r = covariance(noise, "noise", m)
         if r.shape[:-2] and np.broadcast_shapes(r.shape[:-2], x.shape[:-2]) != x.shape[:-2]:
             raise ValueError(f"noise: needs leading axes {x.shape[:-2]}, got {r.shape[:-2]}")
@@ -133,7 +135,7 @@ def perturbed(
     predicted: Array, noise: Array, rng: np.random.Generator
 ) -> Array:
     """Predictions with a draw of the noise each, (..., N, m)."""
-    root = np.linalg.cholesky(noise)
+    root = _cholesky(noise)
     return predicted + rng.standard_normal(predicted.shape) @ np.swapaxes(root, -1, -2)
 
 
