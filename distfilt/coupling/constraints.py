@@ -64,7 +64,10 @@ class Constraint:
         return self._residual(array(x, "x", (..., "d")))
 
     def _residual(self, x: Array) -> Array:
-        g = np.asarray(self.function(x.copy()))
+        try:
+            g = np.asarray(self.function(x.copy()))
+        except IndexError as error:
+            raise ValueError(f"function: needs states of more components, got {x.shape}") from error
         if g.shape != (*x.shape[:-1], self.value.size):
             raise ValueError(
                 f"function: needs to return {(*x.shape[:-1], self.value.size)} for states "

@@ -348,7 +348,10 @@ def sorted_plan(
         b = _masses(columns, "columns", y.size)
     i, j = np.argsort(x, kind="stable"), np.argsort(y, kind="stable")
     matrix, g = np.zeros((x.size, y.size)), np.zeros(y.size)
-    cost = np.abs(x[:, None] - y) ** p
+    with np.errstate(over="ignore"):
+        cost = np.abs(x[:, None] - y) ** p
+    if not np.isfinite(cost).all():
+        raise ValueError(f"source, target: needs distances of finite power {p:g}, got infinity")
     rank_i, rank_j, mass = _staircase(a[i], b[j])
     np.add.at(matrix, (i[rank_i], j[rank_j]), mass)
     # Along the staircase f + g = c holds on every cell: a step sideways changes g only.

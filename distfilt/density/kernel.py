@@ -46,6 +46,8 @@ def _width(value: ArrayLike, grid: Grid, agents: int, name: str = "bandwidth") -
         raise ValueError(f"{name}: needs a number or one for each of {agents} agents, "
                          f"got shape {h.shape}")
     least = float(h.min(initial=np.inf))
+    if h.max(initial=0.0) > 20 * grid.width.max():
+        raise ValueError(f"{name}: needs at most 20 widths of the box, got {h.max():g}")
     if not least > 0:
         raise ValueError(f"{name}: needs a number above 0, got {least:g}")
     widest = float(grid.spacing.max())

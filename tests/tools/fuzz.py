@@ -1,6 +1,6 @@
 """Bad input for every argument of every public callable: refused by name, or right.
 
-    python tests/tools/fuzz.py [room …]
+    python tests/tools/fuzz.py [--dry] [room …]
 
 The valid calls are those of the doctests: the examples run once with every public function, class
 and method recorded. Then each argument of each recorded call is exchanged, one at a time, for
@@ -11,7 +11,7 @@ other is refused by an error that names an argument or what was computed from it
 without NaN. No call may change its arguments. What is otherwise stands in ``ALLOWED`` with the
 reason.
 
-Writes ``data/bench/fuzz.csv``, a line a room and kind of value.
+Writes ``data/bench/fuzz.csv``, a line a room with the counts, unless ``--dry``.
 """
 
 from __future__ import annotations
@@ -222,7 +222,15 @@ def numeric(value: Any) -> bool:
 
 def array_kinds(value: Any) -> Iterator[tuple[str, Any]]:
     with np.errstate(all="ignore"):
-        yield from exchanged_arrays(np.asarray(value), np.asarray(value, dtype=float))
+        for kind, exchanged in exchanged_arrays(np.array(value), np.array(value, dtype=float)):
+            yield kind, exchanged if isinstance(exchanged, list) else copied(exchanged)
+
+
+def copied(value: Any) -> Any:
+    """A value of its own, laid out as it was, so that no call can change the next one's."""
+    if type(value) is not np.ndarray or not value.flags.writeable or value.base is None:
+        return value
+    return value if not value.flags.c_contiguous else value.copy()
 
 
 def exchanged_arrays(a: Any, f: Any) -> Iterator[tuple[str, Any]]:
@@ -234,7 +242,7 @@ def exchanged_arrays(a: Any, f: Any) -> Iterator[tuple[str, Any]]:
         yield from (("read-only", frozen), ("strided", wide))
     yield from (("complex", f + 1j), ("dates", np.zeros(a.shape, "datetime64[s]")))
     yield from (("durations", np.ones(a.shape, "timedelta64[s]")), ("text", a.astype(str)))
-    yield "masked", np.ma.masked_array(f, np.arange(f.size).reshape(f.shape) == 0)
+    yield "masked", np.ma.masked_array(f.copy(), np.arange(f.size).reshape(f.shape) == 0)
     yield from (("booleans", np.ones(a.shape, bool)), ("dict", {"a": 1.0}), ("object", object()))
     nothing = a.astype(object)
     nothing.flat[0] = None
@@ -483,6 +491,10 @@ def allowed(found: Finding) -> str:
     return ""
 
 
+def judged(found: Finding) -> str:
+    return "allowed" if found.result not in GOOD and allowed(found) else found.result
+
+
 def run(chosen: list[str]) -> list[Finding]:
     """All findings of the chosen rooms, in a folder of its own."""
     here = Path.cwd()
@@ -495,32 +507,34 @@ def run(chosen: list[str]) -> list[Finding]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    chosen = list(arguments if arguments is not None else sys.argv[1:]) or rooms()
+    given = list(arguments if arguments is not None else sys.argv[1:])
+    chosen = [a for a in given if a != "--dry"] or rooms()
     began = time.perf_counter()
     found = run(chosen)
-    faults = [f for f in found if f.result not in GOOD and not allowed(f)]
+    faults = [f for f in found if judged(f) not in {*GOOD, "allowed"}]
     for f in faults:
         print(f"{f.result:9} {f.name}({f.argument}): {f.kind}: {f.text}", flush=True)
-    counts = Counter(f.result if not allowed(f) else "allowed" for f in found)
+    counts = Counter(judged(f) for f in found)
     callables, named = len({f.name for f in found}), len({(f.name, f.argument) for f in found})
     print(f"{len(found)} calls, {callables} callables, {named} arguments: {dict(counts)}, "
           f"{time.perf_counter() - began:.0f} s")  # fmt: skip
-    if set(chosen) == set(rooms()):
+    if "--dry" not in given and set(chosen) == set(rooms()):
         write(found)
     return len(faults)
 
 
 def write(found: list[Finding]) -> None:
     """The counts, a line a room and result."""
-    results = sorted({*GOOD, *(f.result for f in found)})
+    results = sorted({*GOOD, *(judged(f) for f in found)} - {"allowed"})
     with TABLE.open("w", encoding="utf-8", newline="") as lines:
         writer = csv.writer(lines, lineterminator="\n")
-        writer.writerow(["room", "callables", "arguments", "calls", *results])
+        writer.writerow(["room", "callables", "arguments", "calls", *results, "allowed"])
         for room in rooms():
             mine = [f for f in found if f.name.partition(".")[0] == room]
             names = len({f.name for f in mine}), len({(f.name, f.argument) for f in mine})
-            counts = Counter(f.result for f in mine)
-            writer.writerow([room, *names, len(mine), *(counts[r] for r in results)])
+            counts = Counter(judged(f) for f in mine)
+            row = [*(counts[r] for r in results), counts["allowed"]]
+            writer.writerow([room, *names, len(mine), *row])
 
 
 if __name__ == "__main__":
