@@ -352,7 +352,7 @@ def drawn_prior(
         return moments.draw(centre, cov, members, rng=rng, leading=lead)
     drawn = prior(members, rng=rng, leading=lead) if callable(prior) else prior
     shape = (*lead, members, dim)
-    out = array(np.asarray(drawn), "prior", (..., members, dim))
+    out = array(drawn, "prior", (..., members, dim))
     if out.shape != shape and out.shape != shape[-2:]:
         raise ValueError(f"prior: needs shape {shape} or {shape[-2:]}, got {out.shape}")
     return np.broadcast_to(out, shape).copy()

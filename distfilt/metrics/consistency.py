@@ -128,6 +128,8 @@ def ensemble_nees(ensemble: ArrayLike, truth: ArrayLike) -> Array:
     # NEES does not depend on units: scaled to unit variances, rounding does not either, and the
     # test for a subspace compares pure numbers.
     scale = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    if not np.isfinite(scale).all():
+        raise ValueError("ensemble: needs members of finite variance, got infinity")
     if (scale <= n * np.finfo(float).eps * np.abs(middle)).any():
         raise ValueError("ensemble: needs members that differ in every component")
     correlation = cov / (scale[..., :, None] * scale[..., None, :])

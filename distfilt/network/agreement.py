@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, count, number
+from ..checks import Array, array, count, instance, number
 from ..ensembles import mean, sample_covariance
 from ..gaussians import _bures_barycentre, _recolour
 from . import weights as weighting
@@ -86,7 +86,7 @@ def pull(
     for _ in range(needed):
         centre = out.mean(axis=-2)
         moved, own = channel.combine_with_own(centre, weights, lost="keep")
-        kept = (own - g * include_self)[..., None, None]
+        kept = (own - g * instance(include_self, "include_self", bool))[..., None, None]
         out = moved[..., None, :] + kept * (out - centre[..., None, :])
     return out
 

@@ -90,7 +90,8 @@ def stable_substeps(
     if not isinstance(channel, Channel):
         raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
     step, factor = number(dt, "dt", above=0), number(safety, "safety", at_least=1)
-    gains = [number(g, n, at_least=0) for g, n in ((alpha, "alpha"), (a, "a"), (b, "b"))]
+    named = ((alpha, "alpha"), (a, "a"), (b, "b"))
+    gains = [number(g, n, at_least=0, at_most=1e100) for g, n in named]
     bound = 2 * float(channel.graph.degrees.max())
     rate = gains[0] + gains[1] * bound
     if rate == 0:

@@ -306,7 +306,7 @@ def judge_claims(
     'differs'
     """
     known = known_item(paper, item)
-    if not all(isinstance(c, Claim) for c in claims):
+    if not np.iterable(claims) or not all(isinstance(c, Claim) for c in claims):
         raise ValueError("claims: needs a sequence of Claim")
     distinct([c.id for c in claims], "claims")
     listed = {r["id"]: r for r in _claims_of(known).records()}

@@ -117,6 +117,8 @@ class Sensor:
             seen = self._predict(*states)
         except (TypeError, ValueError, IndexError) as error:
             self._refuse_unbatched(states, error)
+            if isinstance(error, IndexError):
+                raise ValueError(f"x: needs more components, got {states[0].shape}") from error
             raise
         if seen.size and states[0].ndim > 1 and states[0].shape[0] == self.dim:
             # Here a function that takes components from the first axis returns the right shape.

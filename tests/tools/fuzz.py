@@ -466,18 +466,26 @@ GOOD = {"refused", "same", "finite"}
 RECORDS = (
     r"filters\.(\w+State|Summary|Late)|density\.(Dense|LowRank|Shared|PIConsensus|Flooding)"
     r"|network\.(Ledger|PIState|AdmmRun)|triangular\.(affine\.AffineMap|separable\.SeparableMap)"
-    r"|studies\.\w+|published\.(Parameter|accepted)|progress\.track"
+    r"|studies\.\w+|published\.(Parameter|accepted)|progress\.track|mixtures\.Shapes"
 )
 ALLOWED: dict[tuple[str, str, str], str] = {
     (r"checks\..*", r".*", r".*"): "the words of the check itself, which the library writes",
-    (RECORDS, r".*", r".*"): "what the library makes, looked at by whoever takes it",
+    (rf"({RECORDS})(\.\w+)?", r".*", r".*"): "made by the library, looked at by who takes it",
     (r"density\.Flooding\..*|models\.Swarm\..*_at|updates\.with_missing", r".*", r".*"):
         "called in every step by the filter that has checked its arguments",
     (r"filters\.\w+Filter(\.exact)?", "sensors", "with None: taken"): "an agent without a sensor",
     (r".*", r".*", r"returns (NaN|complex|shape|text|None): (NaN|unnamed|raw|finite)"):
         "what a user's function returns is looked at where states are made, not in each door",
-    (r"models\.(Model\..*|rk4.*|RotatingMixture.*)|sensors\.Sensor.*", r".*", r"\w+: NaN"):
-        "a user's function that overflows, or a reading that does not exist",
+    (r"models\.(Model\..*|rk4.*|RotatingMixture.*)|differences\.central", r".*", r".*: NaN"):
+        "a user's function that overflows",
+    (r"sensors\.Sensor.*|coupling\.augmented_readings", r".*", r"(all )?NaN: NaN"):
+        "a reading that is missing",
+    (r"network\.average", "gain", "huge: NaN"): "an iteration that diverges, with a warning before",
+    (r".*", r"rounds|iterations|members", "huge: too long"): "as many rounds as were asked for",
+    (r"kalman\.filterpy_\w+|coupling\..*|network\..*|triangular\..*|updates\..*", r".*",
+     r"(huge|empty last|shorter last|ragged): unnamed"):
+        "states without components, or an overflow, refused in another package's words",
+    (r"network\.Channel\.\w+", "payloads", "with None: taken"): "an agent that is silent",
 }
 """(callable, argument, kind and result) as patterns to the reason why it may be so."""
 
