@@ -10,12 +10,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import logsumexp
 
 from ..checks import Array, array, choice, count, generator, instance, number
+from ..linalg import _cholesky, _solve_lower
 from ..network import Ledger
-from ..updates import effective_size
-from ..updates.particles import RESAMPLING, _jittered, _levels, _picked, _resampled
+from ..updates.particles import (
+    RESAMPLING,
+    _effective_size,
+    _jittered,
+    _levels,
+    _log_sum,
+    _picked,
+    _resampled,
+)
 from .driver import Late, Summary
 from .ensemble import drawn_prior
 from .failures import guarded, not_finite
@@ -167,7 +174,7 @@ class ParticleFilter(SensorFilter):
         kept = (*state.history, (state.t, state.points))[-self.lag :] if self.lag else ()
         times = [time for time, _ in kept]
         earlier = [self.slot(item, times, state) for item in late]
-        poor = effective_size(state.log_weights) < self.threshold * self.members
+        poor = _effective_size(state.log_weights) < self.threshold * self.members
         stack, weights = self._resampled([e for _, e in kept], state, poor, rng)
         moved = self.model.sample_step(stack[-1], state.t, dt, rng=rng)
         agents = range(len(self.sensors))
@@ -229,7 +236,7 @@ class ParticleFilter(SensorFilter):
 
         def compute(h: Array, y: Array, w: Array, noise: Array, _: Any) -> tuple[Array, ...]:
             joint = w + _log_likelihood(h, y, noise)
-            total = logsumexp(joint, axis=-1, keepdims=True)
+            total = _log_sum(joint)
             if not np.isfinite(total).all():
                 raise ArithmeticError("every particle has a likelihood of zero")
             # A weight of zero is minus infinity; kept finite, so that it can be told from failure.
@@ -269,7 +276,7 @@ def _summary(state: ParticleState, points: Array) -> Summary:
     cov = np.swapaxes(around, -1, -2) @ (w[..., None] * around)
     if state.failed.any():
         mean[state.failed], cov[state.failed] = np.nan, np.nan
-    numbers = {"effective_size": effective_size(state.log_weights), "distinct": _distinct(points)}
+    numbers = {"effective_size": _effective_size(state.log_weights), "distinct": _distinct(points)}
     return Summary(mean, np.diagonal(cov, axis1=-2, axis2=-1), cov, points, w, numbers)
 
 
@@ -290,5 +297,5 @@ def _log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
         cov = np.where(here, noise, np.eye(noise.shape[-1]))
         gap = np.where(missing[..., None, :], 0.0, gap)
     # One solve with all particles as right-hand sides: the factor is the same for them.
-    half = np.linalg.solve(np.linalg.cholesky(cov), np.swapaxes(gap, -1, -2))
+    half = _solve_lower(_cholesky(cov), np.swapaxes(gap, -1, -2))
     return np.asarray(-0.5 * (half**2).sum(axis=-2))
