@@ -58,13 +58,13 @@ def by_particles(package: Any, n: int, seen: np.ndarray) -> np.ndarray:
     laws, collectors = peer("particles.distributions"), peer("particles.collectors")
 
     class Walk(spaces.StateSpaceModel):  # type: ignore[misc,name-defined]
-        def PX0(self) -> Any:  # noqa: N802
+        def PX0(self) -> Any:
             return laws.MvNormal(loc=np.zeros(3), cov=np.eye(3) + Q)
 
-        def PX(self, t: int, xp: Any) -> Any:  # noqa: N802
+        def PX(self, t: int, xp: Any) -> Any:
             return laws.MvNormal(loc=xp, cov=Q)
 
-        def PY(self, t: int, xp: Any, x: Any) -> Any:  # noqa: N802
+        def PY(self, t: int, xp: Any, x: Any) -> Any:
             return laws.MvNormal(loc=x @ H.T, cov=R)
 
     run = package.SMC(
