@@ -3,6 +3,10 @@
 The rooms are packages with a face each, ``from distfilt.filters import EnsembleFilter``. All of
 them are attributes here too, imported when they are first asked for, so that ``import distfilt``
 itself costs next to nothing.
+
+Every public function checks its arguments once: what does not fit raises a ``ValueError`` that
+names the argument, what it needs and what it got. A section Raises is for what else can happen,
+a section Returns for what the first line and the signature do not tell.
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ def draw(
     rng: np.random.Generator,
     leading: tuple[int, ...] = (),
 ) -> Array:
-    """Draw ensembles from a Gaussian.
+    """Draw ensembles (*leading, N, d) from a Gaussian.
 
     Parameters
     ----------
@@ -43,10 +43,6 @@ def draw(
         Source of the draw.
     leading : tuple of int
         Leading axes, such as (runs, agents); every ensemble is drawn independently.
-
-    Returns
-    -------
-    ndarray, (*leading, N, d)
 
     Examples
     --------
@@ -94,11 +90,6 @@ def _anomalies(e: Array) -> Array:
 def sample_covariance(ensemble: ArrayLike) -> Array:
     """Sample covariance with N - 1 in the denominator, (..., d, d).
 
-    Raises
-    ------
-    ValueError
-        With fewer than two members.
-
     Examples
     --------
     >>> sample_covariance([[0.0, 0.0], [2.0, 4.0]])
@@ -135,7 +126,7 @@ def _cross_covariance(a: Array, b: Array) -> Array:
 def exact_noise(
     anomalies_to_avoid: ArrayLike, cov: ArrayLike, *, rng: np.random.Generator
 ) -> Array:
-    r"""Draw noise whose sample moments are exact: second-order exact draws.
+    r"""Draw noise (..., N, k) whose sample moments are exact: second-order exact draws.
 
     Over the members the draws average to zero, are uncorrelated with the given anomalies, and have
     exactly the sample covariance `cov`. An ensemble with such noise added has the sum of both
@@ -150,10 +141,6 @@ def exact_noise(
         Covariance of the noise, positive semidefinite. Leading axes broadcast.
     rng : numpy.random.Generator
         Source of the draw.
-
-    Returns
-    -------
-    ndarray, (..., N, k)
 
     Raises
     ------

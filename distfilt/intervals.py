@@ -26,11 +26,6 @@ class Interval:
     error : float
         The estimate's standard error, at least 0.
 
-    Raises
-    ------
-    ValueError
-        If a value is not finite, the error is negative or low <= estimate <= high fails.
-
     Examples
     --------
     >>> share = Interval(0.25, 0.15, 0.375, 0.06)

@@ -60,11 +60,6 @@ def factor(cov: ArrayLike, *, name: str = "cov") -> Array:
         Lower triangular with a nonnegative diagonal: the Cholesky factor, with zero columns where a
         matrix is singular.
 
-    Raises
-    ------
-    ValueError
-        If a matrix is not symmetric or has a negative eigenvalue.
-
     Notes
     -----
     :math:`\mathbf L\mathbf L^\top` meets `cov` to some 50 d units of rounding of
@@ -131,7 +126,7 @@ def _from_eigenvectors(cov: Array) -> Array:
 
 
 def cholesky_solve(cov: ArrayLike, right: ArrayLike) -> Array:
-    """Solve ``cov @ out = right`` for a positive definite `cov` by its Cholesky factor.
+    """Solve ``cov @ out = right`` for a positive definite `cov` by its factor, (..., d, k).
 
     Parameters
     ----------
@@ -139,15 +134,6 @@ def cholesky_solve(cov: ArrayLike, right: ArrayLike) -> Array:
         Symmetric positive definite.
     right : array_like, (..., d, k)
         Right-hand sides, as columns. Leading axes broadcast.
-
-    Returns
-    -------
-    ndarray, (..., d, k)
-
-    Raises
-    ------
-    ValueError
-        If `cov` is not symmetric positive definite or the sizes differ.
 
     Examples
     --------
@@ -242,7 +228,7 @@ def _whiten(lower: Array, vectors: Array) -> Array:
 
 
 def quadratic_form(cov: ArrayLike, vector: ArrayLike) -> Array:
-    r"""Squared Mahalanobis length :math:`\mathbf v^\top \mathbf P^{-1} \mathbf v`.
+    r"""Squared Mahalanobis length :math:`\mathbf v^\top \mathbf P^{-1} \mathbf v`, (...).
 
     Parameters
     ----------
@@ -250,10 +236,6 @@ def quadratic_form(cov: ArrayLike, vector: ArrayLike) -> Array:
         Symmetric positive definite.
     vector : array_like, (..., d)
         Leading axes broadcast.
-
-    Returns
-    -------
-    ndarray, (...)
 
     Examples
     --------

@@ -252,11 +252,6 @@ def final_state(run: xarray.Dataset) -> State:
     run : xarray.Dataset
         As :meth:`Filter.run` returned it; a selection or a copy has no state.
 
-    Raises
-    ------
-    ValueError
-        If there is none.
-
     Examples
     --------
     >>> import xarray

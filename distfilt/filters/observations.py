@@ -34,11 +34,6 @@ def at_one_time(
     list
         None where nothing was observed in any run.
 
-    Raises
-    ------
-    ValueError
-        If an observation does not fit its sensor, or an agent without a sensor has one.
-
     Examples
     --------
     >>> from distfilt.sensors import direct
@@ -81,11 +76,6 @@ def over_times(
         What each agent sees with.
     times : array_like, (T,)
         Strictly increasing, in s.
-
-    Raises
-    ------
-    ValueError
-        If the times do not increase, or a series has another length.
 
     Examples
     --------

@@ -87,7 +87,7 @@ class SensorFilter(Filter):
             callable_(self.agreement, "agreement")
         if not isinstance(self.share, bool):
             raise ValueError(f"share: needs True or False, got {self.share!r}")
-        if self.faults is not None and (not isinstance(self.faults, Faults) or self.faults.delay):
+        if self.faults is not None and (not isinstance(self.faults, Faults) or self.faults.late):
             raise ValueError(f"faults: needs Faults without a delay, got {self.faults!r}")
         count(self.lag, "lag", at_least=0)
         choice(self.failures, "failures", ("raise", "keep"))
@@ -134,7 +134,7 @@ class SensorFilter(Filter):
         if self.graph is None:
             return None
         graph = self.graph if isinstance(self.graph, Graph) else self._check_graph(self.graph(t))
-        return Channel(graph, ledger=state.ledger, runs=state.runs, faults=self.faults)
+        return Channel(graph, ledger=state.ledger, runs=state.runs, faults=self.faults, t=t)
 
     def gather(self, observed: Sequence[Array | None], channel: Channel | None) -> list[Heard]:
         """What every agent knows of the observations once they are shared."""

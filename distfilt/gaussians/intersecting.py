@@ -45,11 +45,6 @@ def intersection(
     mean : ndarray, (..., d)
     cov : ndarray, (..., d, d)
 
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, or a source with weight is not a Gaussian.
-
     Notes
     -----
     S. J. Julier and J. K. Uhlmann, American Control Conference (1997) 2369-2373. Solved in the
@@ -113,7 +108,7 @@ def _beside(left: Array, right: Array) -> Array:
 def intersection_weights(
     covs: ArrayLike, *, rule: str = "equal", here: ArrayLike | None = None
 ) -> Array:
-    r"""Weights for :func:`intersection`.
+    r"""Weights (..., S) for :func:`intersection`, nonnegative with sum 1.
 
     Parameters
     ----------
@@ -126,16 +121,6 @@ def intersection_weights(
     here : array_like of bool, (..., S), optional
         Which sources arrived, at least one; all by default. The others get weight 0, and their
         covariances may be anything, NaN included.
-
-    Returns
-    -------
-    ndarray, (..., S)
-        Nonnegative with sum 1.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, the rule is not known, or a source that is here has no covariance.
 
     Notes
     -----

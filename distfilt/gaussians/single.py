@@ -12,7 +12,7 @@ __all__ = ["log_density"]
 
 
 def log_density(x: ArrayLike, mean: ArrayLike, cov: ArrayLike) -> Array:
-    r"""Logarithm of the Gaussian density.
+    r"""Logarithm of the Gaussian density, (...), relative to the volume in the state's units.
 
     .. math:: \log N(\mathbf x;\mathbf m,\mathbf P)=-\tfrac12\bigl(
         (\mathbf x-\mathbf m)^\top\mathbf P^{-1}(\mathbf x-\mathbf m)
@@ -24,16 +24,6 @@ def log_density(x: ArrayLike, mean: ArrayLike, cov: ArrayLike) -> Array:
         Points and means.
     cov : array_like, (..., d, d)
         Covariances, positive definite. Leading axes of the three broadcast.
-
-    Returns
-    -------
-    ndarray, (...)
-        Relative to the volume in the state's units.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit or a covariance is not symmetric positive definite.
 
     Examples
     --------

@@ -82,10 +82,6 @@ def kalman_filter(
     H, R : array_like, (m, d) and (m, m), or (T, m, d) and (T, m, m)
         Observation matrix and noise covariance (positive definite), constant or per step.
 
-    Returns
-    -------
-    GaussianRun
-
     Raises
     ------
     ValueError
@@ -205,7 +201,7 @@ def _recursion(
 
 
 def predict(mean: ArrayLike, cov: ArrayLike, *, F: ArrayLike, Q: ArrayLike) -> tuple[Array, Array]:
-    r"""Forecast a Gaussian by a linear step.
+    r"""Forecast a Gaussian by a linear step: the new mean (..., d) and covariance.
 
     The mean becomes :math:`\mathbf F\mathbf x`, the covariance
     :math:`\mathbf F\mathbf P\mathbf F^\top+\mathbf Q`.
@@ -217,16 +213,6 @@ def predict(mean: ArrayLike, cov: ArrayLike, *, F: ArrayLike, Q: ArrayLike) -> t
         Positive definite.
     F, Q : array_like, (d, d)
         Transition, and process noise covariance (positive semidefinite).
-
-    Returns
-    -------
-    mean : ndarray, (..., d)
-    cov : ndarray, (..., d, d)
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, a number is not finite or a covariance is none.
 
     Examples
     --------
@@ -270,11 +256,6 @@ def update(
         The run axes have length 1 where all runs share the covariance.
     log_likelihood : ndarray, (...)
         Log density of the observation.
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, a number is not finite or a covariance is none.
 
     Examples
     --------

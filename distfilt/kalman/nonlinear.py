@@ -38,7 +38,7 @@ __all__ = [
 def extended_predict(
     mean: ArrayLike, cov: ArrayLike, model: Model, t: float, dt: float
 ) -> tuple[Array, Array]:
-    r"""Forecast Gaussians by a model that is linearised about each mean.
+    r"""Forecast Gaussians by a model that is linearised about each mean: means, covariances.
 
     The mean takes the model's own step; the covariance becomes
     :math:`\mathbf J\mathbf P\mathbf J^\top+\mathbf Q` with the step's Jacobian J.
@@ -52,16 +52,6 @@ def extended_predict(
         Its `jacobian` is used.
     t, dt : float
         The time of the Gaussians and how far to go, in s.
-
-    Returns
-    -------
-    mean : ndarray, (..., d)
-    cov : ndarray, (..., d, d)
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, a number is not finite or a covariance is none.
 
     Examples
     --------
@@ -98,12 +88,6 @@ def extended_update(
         In Joseph's form.
     log_likelihood : ndarray, (...)
         Log density of the innovations, those of the linearised problem.
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, a number is not finite, a covariance is none, or the sensor needs the
-        previous state.
 
     Examples
     --------
@@ -194,7 +178,7 @@ def unscented_predict(
     beta: float = 0.0,
     kappa: float = 1.0,
 ) -> tuple[Array, Array]:
-    r"""Forecast Gaussians by 2 d + 1 points that the model moves.
+    r"""Forecast Gaussians by 2 d + 1 points that the model moves: means and covariances.
 
     Parameters
     ----------
@@ -203,16 +187,6 @@ def unscented_predict(
     alpha, beta, kappa : float
         Of the scaled points, which lie :math:`\alpha\sqrt{d+\kappa}` standard deviations from the
         mean. The defaults keep every weight positive, and with it the covariance.
-
-    Returns
-    -------
-    mean : ndarray, (..., d)
-    cov : ndarray, (..., d, d)
-
-    Raises
-    ------
-    ValueError
-        As :func:`extended_predict`, or if `alpha` or d + `kappa` is not positive.
 
     Notes
     -----
@@ -262,11 +236,6 @@ def unscented_update(
         Positive definite by construction, where the weights are positive: the points' own form of
         Joseph's sum of squares.
     log_likelihood : ndarray, (...)
-
-    Raises
-    ------
-    ValueError
-        As :func:`extended_update`, or if `alpha` or d + `kappa` is not positive.
 
     Examples
     --------

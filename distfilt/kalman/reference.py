@@ -54,11 +54,6 @@ def filterpy_kf(
     GaussianRun
         Covariances have all run axes.
 
-    Raises
-    ------
-    ValueError
-        As :func:`distfilt.kalman.kalman_filter`.
-
     Examples
     --------
     >>> run = filterpy_kf([0.0], [[1.0]], [[2.0]], F=[[1.0]], H=[[1.0]], Q=[[0.0]], R=[[1.0]])
@@ -122,15 +117,6 @@ def filterpy_ekf(
     likelihood : bool
         Whether to ask filterpy for the log density of each innovation.
 
-    Returns
-    -------
-    GaussianRun
-
-    Raises
-    ------
-    ValueError
-        If a shape, a covariance or a time is wrong, or a sensor needs the previous state.
-
     Examples
     --------
     >>> from distfilt.sensors import direct
@@ -193,15 +179,6 @@ def filterpy_ukf(
         Of the scaled sigma points: the points lie :math:`\alpha\sqrt{d+\kappa}` standard
         deviations from the mean. The defaults keep every weight positive, and with it the
         covariance.
-
-    Returns
-    -------
-    GaussianRun
-
-    Raises
-    ------
-    ValueError
-        As :func:`filterpy_ekf`, or if `alpha` or d + `kappa` is not positive.
 
     Examples
     --------

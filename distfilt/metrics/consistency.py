@@ -16,7 +16,7 @@ __all__ = ["ensemble_nees", "nees", "nees_band", "nis"]
 
 
 def nees(estimate: ArrayLike, cov: ArrayLike, truth: ArrayLike) -> Array:
-    r"""Normalised estimation error squared.
+    r"""Normalised estimation error squared, (...).
 
     :math:`\epsilon = (\hat{\mathbf x}-\mathbf x)^\top\mathbf P^{-1}(\hat{\mathbf x}-\mathbf x)`. If
     the error is N(0, P), as an honest filter claims, it is chi-square with d degrees of freedom and
@@ -28,10 +28,6 @@ def nees(estimate: ArrayLike, cov: ArrayLike, truth: ArrayLike) -> Array:
         Leading axes broadcast.
     cov : array_like, (..., d, d)
         The filter's own covariance P, positive definite.
-
-    Returns
-    -------
-    ndarray, (...)
 
     Notes
     -----
@@ -62,7 +58,7 @@ def _spread(value: ArrayLike, like: tuple[int, ...]) -> Array:
 
 
 def nis(innovation: ArrayLike, cov: ArrayLike) -> Array:
-    r"""Normalised innovation squared: how far a reading is from its prediction.
+    r"""Normalised innovation squared, (...): how far a reading is from its prediction.
 
     :math:`\mathbf d^\top\mathbf S^{-1}\mathbf d`. Of an honest filter it is chi-square with m
     degrees of freedom, so that ``nees_band(m, n)`` holds the average of n independent ones. Needs
@@ -76,10 +72,6 @@ def nis(innovation: ArrayLike, cov: ArrayLike) -> Array:
         Covariance S of the innovation, HPHᵀ + R: the prediction's and the noise's. Positive
         definite; leading axes broadcast.
 
-    Returns
-    -------
-    ndarray, (...)
-
     Examples
     --------
     >>> float(nis([2.0, 3.0], [[4.0, 0.0], [0.0, 1.0]]))
@@ -90,17 +82,13 @@ def nis(innovation: ArrayLike, cov: ArrayLike) -> Array:
 
 
 def ensemble_nees(ensemble: ArrayLike, truth: ArrayLike) -> Array:
-    r"""NEES of an ensemble: its mean against the truth, in units of its sample covariance.
+    r"""NEES of an ensemble, (...): its mean against the truth, in units of its sample covariance.
 
     Parameters
     ----------
     ensemble : array_like, (..., N, d)
         Members; the covariance has N - 1 in the denominator.
     truth : array_like, (..., d)
-
-    Returns
-    -------
-    ndarray, (...)
 
     Raises
     ------

@@ -48,10 +48,6 @@ def squared_error(
     per_component : bool
         Give the squared error of each component instead.
 
-    Returns
-    -------
-    ndarray, (...) or (..., d)
-
     Examples
     --------
     >>> float(squared_error([1.0, 2.0], [4.0, 6.0]))

@@ -22,7 +22,7 @@ def crps(
     fair: bool = False,
     weights: ArrayLike | None = None,
 ) -> Array:
-    r"""Continuous ranked probability score of each component of an ensemble; smaller is better.
+    r"""Continuous ranked probability score (..., d) of an ensemble by component; smaller is better.
 
     :math:`\operatorname{mean}_i|x_i-y|-\tfrac12\operatorname{mean}_{i,j}|x_i-x_j|`, the integral of
     the squared difference between the members' distribution function and the truth's step. It
@@ -38,10 +38,6 @@ def crps(
         that the members are drawn from. Needs N >= 2.
     weights : array_like, (..., N), optional
         Of the members, with sum one; equal by default. Not together with `fair`.
-
-    Returns
-    -------
-    ndarray, (..., d)
 
     Notes
     -----
@@ -80,7 +76,7 @@ def _weighted_crps(gap: Array, weights: ArrayLike, fair: bool) -> Array:
 
 
 def gaussian_crps(mean: ArrayLike, std: ArrayLike, truth: ArrayLike) -> Array:
-    r"""Continuous ranked probability score of Gaussians, componentwise.
+    r"""Continuous ranked probability score of Gaussians, componentwise, (...).
 
     :math:`\sigma\,[z(2\Phi(z)-1)+2\varphi(z)-1/\sqrt\pi]` with :math:`z=(y-\mu)/\sigma`.
 
@@ -89,10 +85,6 @@ def gaussian_crps(mean: ArrayLike, std: ArrayLike, truth: ArrayLike) -> Array:
     mean, truth : array_like, (...)
     std : array_like, (...)
         Standard deviations, positive. The three arrays broadcast.
-
-    Returns
-    -------
-    ndarray, (...)
 
     Notes
     -----
@@ -122,7 +114,7 @@ def gaussian_crps(mean: ArrayLike, std: ArrayLike, truth: ArrayLike) -> Array:
 
 
 def log_score(estimate: ArrayLike, cov: ArrayLike, truth: ArrayLike) -> Array:
-    r"""Minus the log-density of a Gaussian estimate at the truth; smaller is better.
+    r"""Minus the log-density of a Gaussian estimate at the truth, (...); smaller is better.
 
     It rewards a small error and a covariance that fits, of all components together. The score of
     an honest Gaussian is :math:`\tfrac12\log\det(2\pi e\mathbf P)` on average, and every other
@@ -134,10 +126,6 @@ def log_score(estimate: ArrayLike, cov: ArrayLike, truth: ArrayLike) -> Array:
         Leading axes broadcast.
     cov : array_like, (..., d, d)
         The estimate's covariance, positive definite.
-
-    Returns
-    -------
-    ndarray, (...)
 
     Examples
     --------

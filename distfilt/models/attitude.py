@@ -31,7 +31,7 @@ __all__ = ["angular_acceleration", "attitude", "satellite_pose"]
 def angular_acceleration(
     quaternion: ArrayLike, angular_velocity: ArrayLike, *, rate: float
 ) -> Array:
-    r"""The angular velocity's derivative without noise, equation (20).
+    r"""The angular velocity's derivative without noise in rad/s², (..., 3), equation (20).
 
     .. math:: \dot{\boldsymbol\omega} = [\boldsymbol\omega]_\times\mathbf R(\mathbf q)
         \,(0, 0, \alpha)^\top
@@ -46,11 +46,6 @@ def angular_acceleration(
         In rad/s.
     rate : float
         Orbital rate α of the chief, in rad/s, at least 0.
-
-    Returns
-    -------
-    ndarray, (..., 3)
-        In rad/s².
 
     Examples
     --------

@@ -230,11 +230,6 @@ def simulate(
     ndarray, (T, ..., d)
         The states at `times`; `x0` is not repeated.
 
-    Raises
-    ------
-    ValueError
-        If `x0` does not fit the model, or `times` do not increase from `t0`.
-
     Examples
     --------
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))

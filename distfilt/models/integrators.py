@@ -76,7 +76,7 @@ def rk4_jacobian(
     *,
     longest: float | None = None,
 ) -> Array:
-    r"""Derivative of :func:`rk4` in the states it starts from, to rounding.
+    r"""Derivative (..., d, d) of :func:`rk4` in the states it starts from, to rounding.
 
     The rule applied to :math:`\dot{\mathbf x} = \mathbf f`, :math:`\dot{\mathbf J} =
     (\partial\mathbf f/\partial\mathbf x)\,\mathbf J` together gives exactly the derivative of the
@@ -88,15 +88,6 @@ def rk4_jacobian(
         As for :func:`rk4`, with x (..., d).
     slope : callable
         ``slope(x, t)``, the derivative of `rate` in x, (..., d, d).
-
-    Returns
-    -------
-    ndarray, (..., d, d)
-
-    Raises
-    ------
-    ValueError
-        As :func:`rk4`, or if `slope` returns another shape.
 
     Examples
     --------

@@ -15,7 +15,7 @@ __all__ = ["lorenz63", "lorenz63_rate"]
 def lorenz63_rate(
     x: ArrayLike, *, prandtl: float = 10.0, rho: float = 28.0, beta: float = 8 / 3
 ) -> Array:
-    r"""Right-hand side of Lorenz's equations.
+    r"""Right-hand side of Lorenz's equations, (..., 3).
 
     .. math:: \dot x = p(y-x),\quad \dot y = x(\rho-z)-y,\quad \dot z = xy-\beta z
 
@@ -25,10 +25,6 @@ def lorenz63_rate(
         States.
     prandtl, rho, beta : float
         Prandtl number, scaled Rayleigh number and geometry.
-
-    Returns
-    -------
-    ndarray, (..., 3)
 
     Notes
     -----

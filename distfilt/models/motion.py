@@ -109,11 +109,6 @@ def coordinated_turn(
     LinearModel or Model
         A model with four components, or one with five and its Jacobian.
 
-    Raises
-    ------
-    ValueError
-        If both or none of `rate` and `turn_sigma` are given.
-
     Notes
     -----
     Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking and

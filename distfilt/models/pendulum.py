@@ -30,7 +30,7 @@ FORMS = ("printed", "multiplier")
 def pendulum_rate(
     states: ArrayLike, *, length: float = 1.0, gravity: float = 9.8, form: str = "printed"
 ) -> Array:
-    r"""Right-hand side of the pendulum's equations, (14)-(15) of Das and Bhattacharya.
+    r"""Right-hand side (..., 4) of the pendulum's equations, (14)-(15) of Das and Bhattacharya.
 
     .. math:: \ddot x=\frac{-gxy-x|\mathbf v|^2}{L^2},\qquad
         \ddot y=\frac{gx^2-y|\mathbf v|^2}{L^2}
@@ -50,10 +50,6 @@ def pendulum_rate(
         g, in m/s², at least 0.
     form : {"printed", "multiplier"}
         `FORMS`.
-
-    Returns
-    -------
-    ndarray, (..., 4)
 
     Examples
     --------
@@ -210,7 +206,7 @@ def pendulum_angle(
 
 
 def pendulum_states(chart: ArrayLike, *, length: float = 1.0) -> Array:
-    r"""Cartesian states of chart coordinates, :math:`L(\sin\theta,\cos\theta)` and its velocity.
+    r"""Cartesian states (..., 4), position and velocity, of chart coordinates.
 
     Parameters
     ----------
@@ -218,10 +214,6 @@ def pendulum_states(chart: ArrayLike, *, length: float = 1.0) -> Array:
         Angles in rad and rates in rad/s.
     length : float
         L, in m, positive.
-
-    Returns
-    -------
-    ndarray, (..., 4)
 
     Examples
     --------

@@ -56,10 +56,6 @@ def clohessy_wiltshire_transition(rate: float, dt: float) -> Array:
     dt : float
         The step, in s, at least 0.
 
-    Returns
-    -------
-    ndarray, (6, 6)
-
     Notes
     -----
     W. H. Clohessy and R. S. Wiltshire, Journal of the Aerospace Sciences 27 (1960) 653-658.

@@ -90,10 +90,6 @@ def admm(
         ``agree(values, channel) -> values``: how the average is found. With a rule that is only
         approximate the agents' copies of Z differ.
 
-    Returns
-    -------
-    AdmmRun
-
     Raises
     ------
     SolverError

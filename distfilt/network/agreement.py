@@ -55,15 +55,6 @@ def pull(
         Whether Nbs(l) holds l itself, as the paper's tables print. The means do not notice, but
         the spread shrinks by 1 - γ|Nbs(l)| either way, one neighbour more with it.
 
-    Returns
-    -------
-    ndarray, (*runs, A, N, d)
-
-    Raises
-    ------
-    ValueError
-        If the ensembles do not fit the channel, or `gain` is negative.
-
     Warns
     -----
     UnstableGain
@@ -125,11 +116,6 @@ def intersection(
     ndarray, (*runs, A, N, d)
         Sample means and covariances are the fused ones.
 
-    Raises
-    ------
-    ValueError
-        If the ensembles do not fit the channel or their covariances are singular.
-
     Examples
     --------
     >>> from distfilt.network import Channel, graphs
@@ -165,10 +151,6 @@ def barycentre(
         divided by it: unlike covariance intersection with equal weights, it depends on the units.
     tolerance : float
         As for :func:`distfilt.gaussians.bures_barycentre`, relative.
-
-    Returns
-    -------
-    ndarray, (*runs, A, N, d)
 
     Examples
     --------

@@ -36,10 +36,6 @@ def gossip(
     rng : numpy.random.Generator
         Draws the pairs. All runs of a batch meet in the same order.
 
-    Returns
-    -------
-    ndarray, (*runs, A, k)
-
     Notes
     -----
     S. Boyd, A. Ghosh, B. Prabhakar and D. Shah, IEEE Transactions on Information Theory 52 (2006)
@@ -114,10 +110,6 @@ def event_triggered(
         second largest modulus of the weights' eigenvalues.
     weights : Weights, optional
         Symmetric; Metropolis by default.
-
-    Returns
-    -------
-    ndarray, (A, k)
 
     Notes
     -----

@@ -117,13 +117,6 @@ class Channel:
             For each agent what arrived, by sender, in ascending order; the arrays are read-only.
             In a batch, the runs that lost a message find NaN in its place, and integers become
             floats there.
-
-        Raises
-        ------
-        ValueError
-            If there is not one payload per agent, or a payload is an object, a dict, a nested
-            tuple, text or anything else whose numbers cannot be counted, or lacks the leading run
-            axes.
         """
         sent = _payloads.checked(payloads, self.graph.size, self.runs, copy=self.faults.late > 0)
         speaks = np.array([p is not None for p in sent])[self.graph.senders]
@@ -171,16 +164,6 @@ class Channel:
               that it has, ``"zero"``: to nothing. These move the average.
         rounds : int
             How many times; the values are checked once.
-
-        Returns
-        -------
-        ndarray, (*runs, A, k)
-
-        Raises
-        ------
-        ValueError
-            If the shapes do not fit, an agent weights one that it does not hear, or the rule needs
-            links both ways and some go one way.
         """
         v, w = self._checked(values, weights)
         choice(lost, "lost", LOST)

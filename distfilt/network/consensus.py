@@ -93,16 +93,6 @@ def average(
     lost : str
         What to do about lost messages: see :meth:`Channel.combine`.
 
-    Returns
-    -------
-    ndarray, (*runs, A, k)
-
-    Raises
-    ------
-    ValueError
-        If the values do not fit the channel, `gain` is not positive or given beside `weights`, or
-        the columns of the weights do not sum to one, so that the average would move.
-
     Examples
     --------
     >>> from distfilt.network import Channel, graphs
@@ -137,10 +127,6 @@ def finite_time(values: ArrayLike, channel: Channel) -> Array:
         One vector per agent.
     channel : Channel
         Connected, with links both ways, and without faults: one lost message spoils the product.
-
-    Returns
-    -------
-    ndarray, (*runs, A, k)
 
     Notes
     -----
@@ -254,10 +240,6 @@ def maximum(values: ArrayLike, channel: Channel, *, rounds: int | None = None) -
     rounds : int, optional
         By default the graph's diameter; with more than 1 000 agents ``graph.diameter_bound``, which
         is enough, and at most twice as much, where the diameter itself would take long to find.
-
-    Returns
-    -------
-    ndarray, (*runs, A, k)
 
     Examples
     --------

@@ -61,17 +61,6 @@ def covariance_intersection(
     rounds : int
         How many times.
 
-    Returns
-    -------
-    means : ndarray, (*runs, A, d)
-    covs : ndarray, (*runs, A, d, d)
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit, a covariance is not positive definite, the rule is unknown, or
-        given weights are negative, do not sum to one or weight an agent that is not heard.
-
     Notes
     -----
     S. J. Julier and J. K. Uhlmann, American Control Conference (1997) 2369-2373. The weights in
@@ -256,11 +245,6 @@ def consensus_pull(
     rounds : int
         How many times.
 
-    Returns
-    -------
-    means : ndarray, (*runs, A, d)
-    covs : ndarray, (*runs, A, d, d)
-
     Warns
     -----
     UnstableGain
@@ -312,11 +296,6 @@ def exchanged(
         first. It is called once for all agents that hear equally many.
     rounds : int
         How many times.
-
-    Returns
-    -------
-    means : ndarray, (*runs, A, d)
-    covs : ndarray, (*runs, A, d, d)
 
     Examples
     --------

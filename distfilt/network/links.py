@@ -60,12 +60,6 @@ class Graph:
             Row i marks the agents that agent i hears.
         directed : bool
             Accept links that go one way only.
-
-        Raises
-        ------
-        ValueError
-            If the matrix is not square, has entries other than 0 and 1 or a self-loop, or is not
-            symmetric although the graph is undirected.
         """
         a = array(adjacency, "adjacency", ("A", "A"))
         if a.shape[0] != a.shape[1] or a.shape[0] == 0:

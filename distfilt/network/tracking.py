@@ -144,10 +144,6 @@ def pi_step(
     substeps : int, optional
         Explicit steps that make up `dt`; by default as many as stability asks for.
 
-    Returns
-    -------
-    PIState
-
     Examples
     --------
     >>> from distfilt.network import Channel, graphs
@@ -211,10 +207,6 @@ def first_order(
         Metropolis by default. Columns have to sum to one.
     lost : str
         See :meth:`Channel.combine`.
-
-    Returns
-    -------
-    ndarray, (*runs, A, k)
 
     Notes
     -----

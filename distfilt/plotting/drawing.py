@@ -45,10 +45,6 @@ def ellipse(
     label : str, optional
         For the legend.
 
-    Returns
-    -------
-    matplotlib Axes
-
     Examples
     --------
     >>> from distfilt.plotting import axes
@@ -92,10 +88,6 @@ def band(
         Number of the colour and line style.
     label : str, optional
         For the legend.
-
-    Returns
-    -------
-    matplotlib Axes
 
     Examples
     --------
@@ -145,10 +137,6 @@ def graph(
         How much each agent knows, from 0, an empty disc, to 1, a full one.
     notes : sequence of str, optional
         A text below each agent, such as what it measures; may be empty.
-
-    Returns
-    -------
-    matplotlib Axes
 
     Examples
     --------

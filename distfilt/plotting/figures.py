@@ -186,10 +186,6 @@ def axes(
     size : (float, float)
         Width and height of a new figure, in inches.
 
-    Returns
-    -------
-    matplotlib Axes
-
     Examples
     --------
     >>> axes(xlabel="time", xunit="s", ylabel="error", yunit="m").get_xlabel()
@@ -223,10 +219,6 @@ def save(figure: Figure, path: str | Path) -> Path:
         What to write.
     path : str or Path
         Ends in .png or .svg.
-
-    Returns
-    -------
-    Path
 
     Examples
     --------

@@ -73,10 +73,6 @@ def read_scenario(path: str | Path) -> Scenario:
     path : str or Path
         A UTF-8 file.
 
-    Returns
-    -------
-    Scenario
-
     Raises
     ------
     ValueError
@@ -167,10 +163,6 @@ def scenario(paper: str, name: str) -> Scenario:
         The paper's key.
     name : str
         Such as ``table-2``.
-
-    Returns
-    -------
-    Scenario
 
     Examples
     --------

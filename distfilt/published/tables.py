@@ -131,10 +131,6 @@ def read_table(
     numbers : sequence of str
         Columns that have to hold finite numbers.
 
-    Returns
-    -------
-    Table
-
     Raises
     ------
     ValueError
@@ -201,10 +197,6 @@ def table(paper: str, name: str, *, numbers: Sequence[str] = ()) -> Table:
         Such as ``table-2``; or ``figure-1``, the claims that a figure's caption and text make.
     numbers : sequence of str
         Columns that have to hold finite numbers.
-
-    Returns
-    -------
-    Table
 
     Examples
     --------

@@ -286,10 +286,6 @@ def judge_claims(
     scenario : Scenario, optional
         What the study ran, as of `judge_table`.
 
-    Returns
-    -------
-    Verdict
-
     Raises
     ------
     ValueError

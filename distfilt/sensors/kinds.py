@@ -282,11 +282,6 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
         It wraps the components that the given sensors wrap, it is linear if all of them are, and
         it needs the previous state if one of them does.
 
-    Raises
-    ------
-    ValueError
-        If there is no sensor or an entry is none.
-
     Examples
     --------
     >>> both = stack([direct([0], std=0.1), angle([0, 1], std=0.2)])

@@ -212,11 +212,6 @@ def stored(paper: str, name: str) -> Stored:
         The paper's key.
     name : str
         Such as ``figure-2``.
-
-    Raises
-    ------
-    ValueError
-        If there is none of that name, or as of `load`.
     """
     root = data_root() / "studies"
     there = sorted(p.relative_to(root).with_suffix("").as_posix() for p in root.glob("*/*.csv"))

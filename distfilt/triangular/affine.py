@@ -124,10 +124,6 @@ def fit(y: ArrayLike, x: ArrayLike) -> AffineMap:
     x : array_like, (..., N, d)
         Members.
 
-    Returns
-    -------
-    AffineMap
-
     Raises
     ------
     ValueError
@@ -161,15 +157,6 @@ def from_moments(mean: ArrayLike, cov: ArrayLike, m: int) -> AffineMap:
         Their covariance, symmetric and positive definite.
     m : int
         Number of observations, at least 0.
-
-    Returns
-    -------
-    AffineMap
-
-    Raises
-    ------
-    ValueError
-        If `cov` is no covariance, or a variable is constant or a combination of others.
 
     Examples
     --------
@@ -205,10 +192,6 @@ def from_rows(rows: ArrayLike, observed_mean: ArrayLike) -> AffineMap:
         the right of the diagonal and positive on it.
     observed_mean : array_like, (..., m)
         The y about which the map is written; any will do.
-
-    Returns
-    -------
-    AffineMap
 
     Examples
     --------
@@ -280,7 +263,7 @@ def objective(map_: ConditionalMap, y: ArrayLike, x: ArrayLike) -> Array:
 
 
 def gradient(coefficients: ArrayLike, samples: ArrayLike) -> Array:
-    r"""Gradient of (12) for one affine component, the corrected equation (14).
+    r"""Gradient (k + 1,) of (12) for one affine component, the corrected equation (14).
 
     .. math:: \frac{\partial\mathcal L^k}{\partial u_l}
         = \frac1N\sum_i U^k(\mathbf z_i)\, z_{i,l} - \frac{\delta_{lk}}{u_k}
@@ -293,10 +276,6 @@ def gradient(coefficients: ArrayLike, samples: ArrayLike) -> Array:
         :math:`u_0` and :math:`u_1,\dots,u_k`, with :math:`u_k > 0`.
     samples : array_like, (N, k)
         The first k variables.
-
-    Returns
-    -------
-    ndarray, (k + 1,)
 
     Examples
     --------
@@ -331,10 +310,6 @@ def fit_convex(
         A conic solver, at its default tolerances.
     max_iters : int, optional
         Stop the solver early, which raises.
-
-    Returns
-    -------
-    AffineMap
 
     Raises
     ------

@@ -55,15 +55,6 @@ def compose(map_: ConditionalMap, y: ArrayLike, x: ArrayLike, observed: ArrayLik
     observed : array_like, (..., m)
         What was observed, y*.
 
-    Returns
-    -------
-    ndarray, (..., N, d)
-
-    Raises
-    ------
-    ValueError
-        If `map_` is no map or the shapes do not fit.
-
     Examples
     --------
     >>> import numpy as np

@@ -50,11 +50,6 @@ def invert(
     name : str
         What an error calls the targets.
 
-    Returns
-    -------
-    ndarray
-        Of the shape of `target`.
-
     Raises
     ------
     ValueError

@@ -51,12 +51,6 @@ def pool_by_moments(
     AffineMap
         With the leading axes (*runs, A): each agent's copy.
 
-    Raises
-    ------
-    ValueError
-        If shapes do not fit the channel, there are too few samples in all (A N ≤ D), or a variable
-        is constant or repeats others.
-
     Examples
     --------
     >>> from distfilt.network import Channel, graphs

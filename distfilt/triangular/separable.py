@@ -225,10 +225,6 @@ def fit(
         Lower bound of the linear coefficient :math:`a_0`, per standard deviation, at least 0. A
         positive one gives the map the whole line as its range. The best affine map has at least 1.
 
-    Returns
-    -------
-    SeparableMap
-
     Raises
     ------
     ValueError

@@ -68,16 +68,6 @@ def sampled_noise(
     rng : numpy.random.Generator
         Source of the perturbations :math:`\zeta_i\sim N(0, \mathbf R)`.
 
-    Returns
-    -------
-    ndarray, (..., N, d)
-        Analysis members.
-
-    Raises
-    ------
-    ValueError
-        If a shape or the covariance is wrong, a number is not finite, or N ≤ m.
-
     Notes
     -----
     G. Burgers, P. J. van Leeuwen, G. Evensen, Monthly Weather Review 126 (1998) 1719-1724.
@@ -127,15 +117,6 @@ def known_noise(
         At least 0: the diagonal of :math:`\hat{\mathbf C}_{hh}+\mathbf R` is multiplied by one plus
         it.
 
-    Returns
-    -------
-    ndarray, (..., N, d)
-
-    Raises
-    ------
-    ValueError
-        As in :func:`sampled_noise`, or if an option is out of its bounds.
-
     Examples
     --------
     >>> rng = np.random.default_rng(3)
@@ -181,15 +162,6 @@ def exact_draws(
         As in :func:`sampled_noise`; more than d + 2m members (d + m where the predictions are
         linear in the members).
 
-    Returns
-    -------
-    ndarray, (..., N, d)
-
-    Raises
-    ------
-    ValueError
-        As in :func:`sampled_noise`, or if there are too few members for such draws.
-
     Examples
     --------
     Halfway between prior and observation, with half the variance, whatever was drawn:
@@ -230,10 +202,6 @@ def square_root(
         As in :func:`sampled_noise`; two members are enough.
     rotation : {"random", "none"}
         Whether the anomalies are turned.
-
-    Returns
-    -------
-    ndarray, (..., N, d)
 
     Notes
     -----

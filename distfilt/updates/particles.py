@@ -29,11 +29,6 @@ class Particles:
     log_weights : array_like, (..., N)
         Logarithms of the weights; they are normalised here, and -inf is a weight of zero.
 
-    Raises
-    ------
-    ValueError
-        If the shapes differ, a point is not finite, or all weights of a set are zero.
-
     Examples
     --------
     >>> cloud = Particles([[0.0], [4.0]], np.log([3.0, 1.0]))
@@ -86,11 +81,6 @@ def effective_size(log_weights: ArrayLike) -> Array:
     log_weights : array_like, (..., N)
         Logarithms of weights, in any normalisation.
 
-    Raises
-    ------
-    ValueError
-        If all weights are zero or one is not a number.
-
     Examples
     --------
     >>> float(effective_size(np.log([0.5, 0.25, 0.25])).round(4))
@@ -119,11 +109,6 @@ def resampled(
     -------
     ndarray of int, (..., N)
         Indices; in ascending order but for the rule ``"residual"``.
-
-    Raises
-    ------
-    ValueError
-        If a weight is negative, the sum is not one, or the rule is unknown.
 
     Notes
     -----
@@ -205,11 +190,6 @@ def resample(
     rng : numpy.random.Generator
     rule : {"systematic", "stratified", "residual", "multinomial"}
         As for :func:`resampled`.
-
-    Raises
-    ------
-    ValueError
-        If an argument is of another kind or the rule is unknown.
 
     Examples
     --------

@@ -70,15 +70,6 @@ def transport(
         By what the drawn noise is multiplied. Anything but one is a mistake; chapter 4 shows what
         zero and a hundredth do.
 
-    Returns
-    -------
-    ndarray, (..., N, d)
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, `noise` is not positive definite, or N is too small for the map.
-
     Examples
     --------
     >>> rng = np.random.default_rng(3)
@@ -115,10 +106,6 @@ def transport_sample(
         As in :func:`transport`.
     rng : numpy.random.Generator
         Source of the noise in the predictions and of the reference samples.
-
-    Returns
-    -------
-    ndarray, (..., N, d)
 
     Examples
     --------
@@ -192,15 +179,6 @@ def principal_components(
         ``"drop"`` sets it to the mean. ``"literal"`` is line 8 as printed, which maps uncentred
         states and so also drops the mean there.
 
-    Returns
-    -------
-    ndarray, (..., N, d)
-
-    Raises
-    ------
-    ValueError
-        As in :func:`transport`, or if `n_state` exceeds d.
-
     Examples
     --------
     >>> rng = np.random.default_rng(3)
@@ -255,10 +233,6 @@ def informed_directions(
         As in :func:`transport`; two members are enough.
     threshold : float
         Smallest signal-to-noise ratio τ that counts, at least 0; 0 leaves nothing out.
-
-    Returns
-    -------
-    ndarray, (..., N, d)
 
     Examples
     --------

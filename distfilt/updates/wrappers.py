@@ -33,11 +33,6 @@ def inflated(update: Update, *, factor: float) -> Update:
     factor : float
         Positive; the standard deviations grow by it in every update.
 
-    Returns
-    -------
-    callable
-        An update.
-
     Notes
     -----
     J. L. Anderson, S. L. Anderson, Monthly Weather Review 127 (1999) 2741-2758.
@@ -62,7 +57,7 @@ def inflated(update: Update, *, factor: float) -> Update:
 
 
 def gated(update: Update, *, probability: float = 0.999) -> Update:
-    r"""Leave out readings whose innovation is too large to believe.
+    r"""Leave out readings whose innovation is too large to believe; with none left, nothing moves.
 
     A component passes where :math:`(y^*-\bar h)^2 \le q^2(\hat C_{hh}+R)`, each judged alone, with
     q such that a consistent filter rejects a reading with probability one minus `probability`.
@@ -73,11 +68,6 @@ def gated(update: Update, *, probability: float = 0.999) -> Update:
         Any update.
     probability : float
         Between 0 and 1: how likely a good reading passes.
-
-    Returns
-    -------
-    callable
-        An update; with no reading left it returns the forecast.
 
     Examples
     --------
@@ -130,11 +120,6 @@ def centred(update: Update) -> Update:
     ----------
     update : callable
         An update that perturbs by ``rng.standard_normal((..., N, m))``, as all of this package do.
-
-    Returns
-    -------
-    callable
-        An update that advances `rng` as the given one does.
 
     Examples
     --------
