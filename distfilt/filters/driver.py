@@ -95,14 +95,7 @@ class Filter(ABC):
     """
 
     @abstractmethod
-    def start(
-        self,
-        prior: Any,
-        *,
-        rng: Any,
-        runs: tuple[int, ...] = (),
-        t: float = 0.0,
-    ) -> Any:
+    def start(self, prior: Any, *, rng: Any, runs: tuple[int, ...] = (), t: float = 0.0) -> Any:
         """The state before the first step."""
 
     @abstractmethod

@@ -64,9 +64,7 @@ class GaussianState(State):
             semidefinite=True,
         )
         if self.ledger.messages.size != m.shape[-2]:
-            raise ValueError(
-                f"ledger: needs {m.shape[-2]} agents, got {self.ledger.messages.size}"
-            )
+            raise ValueError(f"ledger: needs {m.shape[-2]} agents, got {self.ledger.messages.size}")
         object.__setattr__(self, "failed", np.broadcast_to(self.failed, self.runs))
 
     @property

@@ -106,9 +106,7 @@ class Heard:
 
 
 def gather(
-    observed: Sequence[Array | None],
-    sensors: Sequence[Sensor | None],
-    channel: Channel | None,
+    observed: Sequence[Array | None], sensors: Sequence[Sensor | None], channel: Channel | None
 ) -> list[Heard]:
     """Let agents send what they observed, and collect what each of them then knows.
 

@@ -62,9 +62,7 @@ def at_one_time(
 
 
 def over_times(
-    observations: Sequence[ArrayLike | None],
-    sensors: Sequence[Sensor | None],
-    times: ArrayLike,
+    observations: Sequence[ArrayLike | None], sensors: Sequence[Sensor | None], times: ArrayLike
 ) -> tuple[Array, list[Array | None]]:
     """The times (T,) and the series of observations, per agent (T, ..., m) or None.
 

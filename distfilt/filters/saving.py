@@ -106,9 +106,7 @@ class State:
             OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, ImportError,
             IndexError, zipfile.BadZipFile,
         ) as error:
-            raise ValueError(
-                f"path: needs a saved {cls.__name__}, got {path}: {error}"
-            ) from None
+            raise ValueError(f"path: needs a saved {cls.__name__}, got {path}: {error}") from None
 
 
 def _name(kind: type) -> str:

@@ -20,9 +20,7 @@ __all__ = ["intersection", "intersection_weights"]
 _RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
 
 
-def intersection(
-    means: ArrayLike, covs: ArrayLike, weights: ArrayLike
-) -> tuple[Array, Array]:
+def intersection(means: ArrayLike, covs: ArrayLike, weights: ArrayLike) -> tuple[Array, Array]:
     r"""Covariance intersection: the normalised weighted geometric mean of Gaussians.
 
     .. math:: \mathbf P^{-1}=\sum_b\omega_b\mathbf P_b^{-1},\qquad

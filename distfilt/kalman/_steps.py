@@ -24,9 +24,7 @@ Forecast = Callable[[Array, Array, float, float], tuple[Array, Array]]
 Analysis = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
 
 
-def extended_forecast(
-    x: Array, p: Array, model: Model, t: float, dt: float
-) -> tuple[Array, Array]:
+def extended_forecast(x: Array, p: Array, model: Model, t: float, dt: float) -> tuple[Array, Array]:
     """Means moved by the model, covariances by its Jacobian."""
     slope = model._jacobian(x, t, dt)
     return model._step(x, t, dt), moved_cov(p, slope, model.noise(t, dt))
@@ -43,9 +41,7 @@ def last(a: Array) -> Array:
     return np.ascontiguousarray(np.moveaxis(a, 0, -1)) if a.ndim == 3 else a
 
 
-def extended_analysis(
-    x: Array, p: Array, y: Array, sensor: Sensor
-) -> tuple[Array, Array, Array]:
+def extended_analysis(x: Array, p: Array, y: Array, sensor: Sensor) -> tuple[Array, Array, Array]:
     """Means, covariances and log densities after readings (R, m) of a linearised sensor."""
     innovation, slope = linearised(x, y, sensor)
     moved, p, density = analysed(np.zeros_like(x), p, innovation, slope, sensor.cov)

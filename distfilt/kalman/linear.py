@@ -12,14 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, array, covariance
-from ._algebra import (
-    Indices,
-    analysis,
-    forecast_cov,
-    log_density,
-    shared_gains,
-    whitened,
-)
+from ._algebra import Indices, analysis, forecast_cov, log_density, shared_gains, whitened
 from ._inputs import common_runs, fill_axes, prior
 
 __all__ = ["GaussianRun", "kalman_filter", "predict", "update"]
@@ -164,9 +157,7 @@ def _groups(y: Array, cov: Array, runs: tuple[int, ...]) -> tuple[Array, Indices
     return np.repeat(cov[..., None], count, axis=-1), group
 
 
-def _shared(
-    x: Array, p: Array, y: Array, f: Array, h: Array, q: Array, r: Array
-) -> GaussianRun:
+def _shared(x: Array, p: Array, y: Array, f: Array, h: Array, q: Array, r: Array) -> GaussianRun:
     """All steps of runs x (R, d), y (T, R, m) that share their covariance p (d, d)."""
     steps = len(y)
     here = np.asarray(~np.isnan(y).any(axis=1))

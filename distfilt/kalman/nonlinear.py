@@ -26,13 +26,9 @@ from ._steps import (
 )
 from .linear import GaussianRun
 
-__all__ = [
-    "extended_filter",
-    "extended_predict",
-    "extended_update",
-    "unscented_filter",
-    "unscented_predict",
-    "unscented_update",
+__all__ = [  # fmt: skip
+    "extended_filter", "extended_predict", "extended_update", "unscented_filter",
+    "unscented_predict", "unscented_update",
 ]
 
 def extended_predict(

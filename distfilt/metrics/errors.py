@@ -34,9 +34,7 @@ def _truth(value: ArrayLike, like: tuple[int, ...], other: str) -> Array:
     return out
 
 
-def squared_error(
-    estimate: ArrayLike, truth: ArrayLike, *, per_component: bool = False
-) -> Array:
+def squared_error(estimate: ArrayLike, truth: ArrayLike, *, per_component: bool = False) -> Array:
     r"""Squared length of the error, :math:`\lVert\hat{\mathbf x}-\mathbf x\rVert^2`.
 
     A sum over the components, not a mean, in units of the state squared.

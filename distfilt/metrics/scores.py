@@ -16,11 +16,7 @@ __all__ = ["crps", "gaussian_crps", "log_score"]
 
 
 def crps(
-    ensemble: ArrayLike,
-    truth: ArrayLike,
-    *,
-    fair: bool = False,
-    weights: ArrayLike | None = None,
+    ensemble: ArrayLike, truth: ArrayLike, *, fair: bool = False, weights: ArrayLike | None = None
 ) -> Array:
     r"""Continuous ranked probability score (..., d) of an ensemble by component; smaller is better.
 

@@ -16,13 +16,7 @@ from numpy.typing import ArrayLike
 from ..checks import Array, array, number
 from .base import Model
 from .integrators import rk4, rk4_jacobian
-from .rotations import (
-    _quaternion,
-    _quaternion_rate,
-    cross_matrix,
-    left_directions,
-    rotation_matrix,
-)
+from .rotations import _quaternion, _quaternion_rate, cross_matrix, left_directions, rotation_matrix
 from .satellite import clohessy_wiltshire
 
 __all__ = ["angular_acceleration", "attitude", "satellite_pose"]

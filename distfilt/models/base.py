@@ -94,9 +94,7 @@ class Model:
         q = covariance(q, "noise_cov", self.dim, semidefinite=True)
         return array(q, "noise_cov", (self.dim, self.dim)).copy()
 
-    def sample_step(
-        self, x: ArrayLike, t: float, dt: float, *, rng: np.random.Generator
-    ) -> Array:
+    def sample_step(self, x: ArrayLike, t: float, dt: float, *, rng: np.random.Generator) -> Array:
         """Move states (..., d) from `t` to `t` + `dt` and add a draw of the noise to each."""
         state = array(x, "x", (..., self.dim))
         now, length = number(t, "t"), number(dt, "dt", at_least=0)
@@ -183,12 +181,7 @@ class LinearModel(Model):
             return x @ phi.T
 
         return cls(
-            dim,
-            flow,
-            noise_cov,
-            names=names,
-            units=units,
-            transition_matrix=transition_matrix,
+            dim, flow, noise_cov, names=names, units=units, transition_matrix=transition_matrix
         )
 
     def transition(self, dt: float) -> Array:
@@ -203,12 +196,7 @@ class LinearModel(Model):
 
 
 def simulate(
-    model: Model,
-    x0: ArrayLike,
-    times: ArrayLike,
-    *,
-    rng: np.random.Generator,
-    t0: float = 0.0,
+    model: Model, x0: ArrayLike, times: ArrayLike, *, rng: np.random.Generator, t0: float = 0.0
 ) -> Array:
     """Draw trajectories of a model at the given times.
 

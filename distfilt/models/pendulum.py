@@ -13,13 +13,8 @@ from ..checks import Array, array, choice, number
 from .base import Model
 from .integrators import rk4, rk4_jacobian
 
-__all__ = [
-    "FORMS",
-    "pendulum",
-    "pendulum_angle",
-    "pendulum_chart",
-    "pendulum_energy",
-    "pendulum_rate",
+__all__ = [  # fmt: skip
+    "FORMS", "pendulum", "pendulum_angle", "pendulum_chart", "pendulum_energy", "pendulum_rate",
     "pendulum_states",
 ]
 

@@ -11,12 +11,8 @@ from numpy.typing import ArrayLike
 
 from ..checks import Array, array
 
-__all__ = [
-    "cross_matrix",
-    "left_directions",
-    "quaternion_rate",
-    "rotation_matrix",
-    "turn_between",
+__all__ = [  # fmt: skip
+    "cross_matrix", "left_directions", "quaternion_rate", "rotation_matrix", "turn_between",
     "turned",
 ]
 

@@ -177,9 +177,7 @@ def _ensembles(ensembles: ArrayLike, channel: Channel) -> Array:
     return array(ensembles, "ensembles", (*channel.runs, channel.graph.size, "N", "d"))
 
 
-def _scaled(
-    ensembles: ArrayLike, channel: Channel, scale: ArrayLike | None
-) -> tuple[Array, Array]:
+def _scaled(ensembles: ArrayLike, channel: Channel, scale: ArrayLike | None) -> tuple[Array, Array]:
     """Ensembles divided by the scale of each component, and the scale."""
     x = _ensembles(ensembles, channel)
     size = np.ones(x.shape[-1]) if scale is None else array(scale, "scale", (x.shape[-1],))

@@ -13,9 +13,7 @@ from .weights import Weights
 __all__ = ["event_triggered", "flood", "gossip"]
 
 
-def gossip(
-    values: ArrayLike, channel: Channel, *, rounds: int, rng: np.random.Generator
-) -> Array:
+def gossip(values: ArrayLike, channel: Channel, *, rounds: int, rng: np.random.Generator) -> Array:
     r"""Average in pairs: in each round one agent wakes and meets one neighbour, both drawn evenly.
 
     .. math:: \mathbf x_i,\mathbf x_j\leftarrow\tfrac12(\mathbf x_i+\mathbf x_j)
@@ -145,9 +143,7 @@ def event_triggered(
     return x
 
 
-def flood(
-    values: ArrayLike, channel: Channel, *, rounds: int | None = None
-) -> tuple[Array, Array]:
+def flood(values: ArrayLike, channel: Channel, *, rounds: int | None = None) -> tuple[Array, Array]:
     """Every agent passes on each value when it first hears of it, with its owner's number.
 
     The rival of every averaging rule: after as many rounds as the diameter all know everything.

@@ -15,12 +15,8 @@ from .consensus import warn_if_unstable
 from .links import Graph
 from .weights import Weights
 
-__all__ = [
-    "arithmetic_average",
-    "consensus_pull",
-    "covariance_intersection",
-    "exchanged",
-    "naive_fusion",
+__all__ = [  # fmt: skip
+    "arithmetic_average", "consensus_pull", "covariance_intersection", "exchanged", "naive_fusion",
 ]
 
 RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
@@ -106,9 +102,7 @@ def _given(graph: Graph, weights: Weights | ArrayLike) -> Weights:
         w = Weights.from_matrix(graph, w.matrix)
     least = min(w.own.min(), w.links.min(initial=0.0))
     if least < 0 or w.own.min() <= 0:
-        raise ValueError(
-            f"weights: needs positive own weights and no negative ones, got {least:g}"
-        )
+        raise ValueError(f"weights: needs positive own weights and no negative ones, got {least:g}")
     rows = w.own + graph.incidence @ w.links
     worst = int(np.abs(rows - 1).argmax())
     if abs(rows[worst] - 1) > 1e-8:

@@ -70,12 +70,7 @@ class Graph:
 
     @classmethod
     def from_edges(
-        cls,
-        agents: int,
-        edges: ArrayLike,
-        *,
-        directed: bool = False,
-        name: str = "edges",
+        cls, agents: int, edges: ArrayLike, *, directed: bool = False, name: str = "edges"
     ) -> Graph:
         """Build a graph from its links, listed as pairs (listener, speaker).
 

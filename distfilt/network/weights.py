@@ -13,17 +13,9 @@ from ..checks import Array, array, count, number
 from ._spectral import left_null_vector
 from .links import Graph, Indices
 
-__all__ = [
-    "Weights",
-    "balanced",
-    "best_constant",
-    "fastest",
-    "gossip",
-    "keeping",
-    "laplacian",
-    "maximum_degree",
-    "metropolis",
-    "push",
+__all__ = [  # fmt: skip
+    "Weights", "balanced", "best_constant", "fastest", "gossip", "keeping", "laplacian",
+    "maximum_degree", "metropolis", "push",
 ]
 
 

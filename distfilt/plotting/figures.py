@@ -15,15 +15,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "LINE_STYLES",
-    "PALETTE",
-    "SIZE",
-    "axes",
-    "colour",
-    "line_style",
-    "save",
-    "use_style",
+__all__ = [  # fmt: skip
+    "LINE_STYLES", "PALETTE", "SIZE", "axes", "colour", "line_style", "save", "use_style",
 ]
 
 PALETTE = (

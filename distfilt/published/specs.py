@@ -230,12 +230,7 @@ class Scenario:
     def reading(self) -> Reading:
         """The same scenario, which remembers what was read of it."""
         return Reading(
-            self.paper,
-            self.name,
-            self.title,
-            self.parameters,
-            notes=self.notes,
-            tables=self.tables,
+            self.paper, self.name, self.title, self.parameters, notes=self.notes, tables=self.tables
         )
 
     def _shown(self) -> list[tuple[Sequence[str], list[Sequence[str]]]]:

@@ -14,14 +14,8 @@ from .parts import text
 from .specs import Scenario
 from .tables import PAPERS, Item, Table, items, table
 
-__all__ = [
-    "VERDICTS",
-    "Claim",
-    "Value",
-    "Verdict",
-    "judge_claims",
-    "judge_table",
-    "judge_value",
+__all__ = [  # fmt: skip
+    "VERDICTS", "Claim", "Value", "Verdict", "judge_claims", "judge_table", "judge_value",
 ]
 
 VERDICTS = ("read", "match", "differs", "not comparable")

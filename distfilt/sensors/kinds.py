@@ -11,14 +11,8 @@ from numpy.typing import ArrayLike
 from ..checks import Array, array, choice, count, number
 from .base import Sensor, _wrapped
 
-__all__ = [
-    "angle",
-    "differential",
-    "direct",
-    "distance",
-    "distance_and_angle",
-    "of_kind",
-    "stack",
+__all__ = [  # fmt: skip
+    "angle", "differential", "direct", "distance", "distance_and_angle", "of_kind", "stack",
 ]
 
 
@@ -109,9 +103,7 @@ def differential(indices: Sequence[int], *, std: float) -> Sensor:
     )
 
 
-def distance(
-    indices: Sequence[int], *, std: float, origin: ArrayLike | None = None
-) -> Sensor:
+def distance(indices: Sequence[int], *, std: float, origin: ArrayLike | None = None) -> Sensor:
     """See the distance from a place in some components, ``h(x) = |x[indices] - origin|``.
 
     Parameters

@@ -74,9 +74,7 @@ def check(
     return stored
 
 
-def _differences(
-    stored: Stored, chosen: Sequence[int], study: Study, rtol: float
-) -> list[str]:
+def _differences(stored: Stored, chosen: Sequence[int], study: Study, rtol: float) -> list[str]:
     """What the new study of the chosen trials does not give as it is stored."""
     names = tuple(stored.columns)
     kinds = {failure.index: failure.kind for failure in study.failures}

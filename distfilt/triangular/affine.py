@@ -24,14 +24,8 @@ from ._conic import LIMIT, solve_component
 if TYPE_CHECKING:
     from .composition import ConditionalMap
 
-__all__ = [
-    "AffineMap",
-    "fit",
-    "fit_convex",
-    "from_moments",
-    "from_rows",
-    "gradient",
-    "objective",
+__all__ = [  # fmt: skip
+    "AffineMap", "fit", "fit_convex", "from_moments", "from_rows", "gradient", "objective",
 ]
 
 _ROUNDING = 1e-13

@@ -40,12 +40,7 @@ def _inner(b: Array) -> Array:
 
 @update
 def sampled_noise(
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
-    rng: np.random.Generator,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator
 ) -> Array:
     r"""The ensemble Kalman filter's update with both covariances sampled, perturbations included.
 
@@ -142,12 +137,7 @@ def known_noise(
 
 @update
 def exact_draws(
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
-    rng: np.random.Generator,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator
 ) -> Array:
     r"""Update with perturbations that are exact to second order.
 

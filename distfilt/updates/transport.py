@@ -13,11 +13,8 @@ from ..ensembles import anomalies, cross_covariance, sample_covariance
 from ..triangular import ConditionalMap, affine, compose
 from .door import perturbed, update
 
-__all__ = [
-    "informed_directions",
-    "principal_components",
-    "principal_directions",
-    "transport",
+__all__ = [  # fmt: skip
+    "informed_directions", "principal_components", "principal_directions", "transport",
     "transport_sample",
 ]
 
