@@ -370,7 +370,10 @@ def instance(value: Any, name: str, kind: type[_T]) -> _T:
     ValueError: rng: needs a Generator, got int
     """
     if not isinstance(value, kind):
-        raise ValueError(f"{name}: needs a {kind.__name__}, got {type(value).__name__}")
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        raise ValueError(
+            f"{name}: needs {article} {kind.__name__}, got {type(value).__name__}"
+        )
     return value
 
 

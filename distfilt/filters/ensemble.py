@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import ensembles as moments
-from ..checks import Array, array, callable_, count, covariance, generator, number
+from ..checks import Array, array, callable_, count, covariance, generator, instance, number
 from ..models import Model
 from ..network import Graph, Ledger, intersection
 from ..sensors import Sensor
@@ -325,8 +325,7 @@ class EnsembleFilter(SensorFilter):
         return out
 
     def _check_state(self, state: Any) -> None:
-        if not isinstance(state, EnsembleState):
-            raise ValueError(f"state: needs an EnsembleState, got {type(state).__name__}")
+        instance(state, "state", EnsembleState)
         needed = (len(self.sensors), self.members, self.model.dim)
         if state.ensembles.shape[-3:] != needed:
             raise ValueError(f"state: needs ensembles (..., {needed}), got {state.ensembles.shape}")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, choice, count, covariance, number
+from ..checks import Array, array, choice, count, covariance, instance, number
 from ..network import Ledger
 from .driver import Late, Summary
 from .failures import guarded, not_finite
@@ -166,8 +166,7 @@ class GaussianFilter(SensorFilter):
         state, t, observations, late
             As for :meth:`distfilt.filters.EnsembleFilter.step`.
         """
-        if not isinstance(state, GaussianState):
-            raise ValueError(f"state: needs a GaussianState, got {type(state).__name__}")
+        instance(state, "state", GaussianState)
         dt = self.elapsed(state, t)
         seen = self.observed(state, observations)
         channel = self.channel(state, t)

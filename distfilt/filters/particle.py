@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import logsumexp
 
-from ..checks import Array, array, choice, count, generator, number
+from ..checks import Array, array, choice, count, generator, instance, number
 from ..network import Ledger
 from ..updates import effective_size
 from ..updates.particles import RESAMPLING, _jittered, _levels, _picked, _resampled
@@ -158,8 +158,7 @@ class ParticleFilter(SensorFilter):
         ParticleCollapse
             If less than a hundredth of an agent's particles differ from each other.
         """
-        if not isinstance(state, ParticleState):
-            raise ValueError(f"state: needs a ParticleState, got {type(state).__name__}")
+        instance(state, "state", ParticleState)
         dt = self.elapsed(state, t)
         seen = self.observed(state, observations)
         rng = copy.deepcopy(generator(state.rng))

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..checks import generator, number
+from ..checks import generator, instance, number
 from ..network import Ledger
 
 __all__ = ["State"]
@@ -52,8 +52,7 @@ class State:
 
     def __post_init__(self) -> None:
         number(self.t, "t")
-        if not isinstance(self.ledger, Ledger):
-            raise ValueError(f"ledger: needs a Ledger, got {type(self.ledger).__name__}")
+        instance(self.ledger, "ledger", Ledger)
         if self.rng is not None:
             generator(self.rng)
 

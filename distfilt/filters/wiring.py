@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, callable_, choice, count, number
+from ..checks import Array, callable_, choice, count, instance, number
 from ..models import Model
 from ..network import Channel, Faults, Graph
 from ..sensors import Sensor
@@ -64,8 +64,7 @@ class SensorFilter(Filter):
     failures: str = "raise"
 
     def __post_init__(self) -> None:
-        if not isinstance(self.model, Model):
-            raise ValueError(f"model: needs a Model, got {type(self.model).__name__}")
+        instance(self.model, "model", Model)
         if isinstance(self.sensors, Sensor) or not isinstance(self.sensors, Sequence):
             raise ValueError(
                 f"sensors: needs one Sensor or None for each agent, in a list, "
@@ -95,8 +94,7 @@ class SensorFilter(Filter):
             raise ValueError(f"names: needs {len(self.sensors)} names, got {len(self.names)}")
 
     def _check_graph(self, graph: Any) -> Graph:
-        if not isinstance(graph, Graph):
-            raise ValueError(f"graph: needs a Graph, got {type(graph).__name__}")
+        instance(graph, "graph", Graph)
         if graph.size != len(self.sensors):
             raise ValueError(
                 f"graph: needs {len(self.sensors)} agents like sensors, got {graph.size}"

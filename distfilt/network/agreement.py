@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, count, number
+from ..checks import Array, array, count, instance, number
 from ..ensembles import mean, sample_covariance
 from ..gaussians import _bures_barycentre, _recolour
 from . import weights as weighting
@@ -172,8 +172,7 @@ def barycentre(
 
 
 def _ensembles(ensembles: ArrayLike, channel: Channel) -> Array:
-    if not isinstance(channel, Channel):
-        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
+    instance(channel, "channel", Channel)
     return array(ensembles, "ensembles", (*channel.runs, channel.graph.size, "N", "d"))
 
 

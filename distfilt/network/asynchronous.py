@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, count, generator, number
+from ..checks import Array, array, count, generator, instance, number
 from . import weights as weighting
 from .channel import Channel
 from .weights import Weights
@@ -198,8 +198,7 @@ def flood(values: ArrayLike, channel: Channel, *, rounds: int | None = None) -> 
 
 
 def _values(values: ArrayLike, channel: Channel) -> Array:
-    if not isinstance(channel, Channel):
-        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
+    instance(channel, "channel", Channel)
     return array(values, "values", (*channel.runs, channel.graph.size, "k"))
 
 

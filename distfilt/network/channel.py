@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from ..checks import Array, array, choice, count, number
+from ..checks import Array, array, choice, count, instance, number
 from . import _payloads
 from .faults import Faults
 from .ledger import Ledger
@@ -67,8 +67,7 @@ class Channel:
         faults: Faults | None = None,
         t: float | None = None,
     ) -> None:
-        if not isinstance(graph, Graph):
-            raise ValueError(f"graph: needs a Graph, got {type(graph).__name__}")
+        instance(graph, "graph", Graph)
         if ledger is not None and not isinstance(ledger, Ledger):
             raise ValueError(f"ledger: needs a Ledger, got {type(ledger).__name__}")
         if ledger is not None and ledger.messages.size != graph.size:

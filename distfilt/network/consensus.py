@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, count, number
+from ..checks import Array, array, count, instance, number
 from . import weights as weighting
 from .channel import Channel
 from .links import Graph
@@ -51,8 +51,7 @@ def warn_if_unstable(graph: Graph, gain: float) -> None:
 
 
 def _values(values: ArrayLike, channel: Channel) -> Array:
-    if not isinstance(channel, Channel):
-        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
+    instance(channel, "channel", Channel)
     return array(values, "values", (*channel.runs, channel.graph.size, "k"))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, callable_, choice, count, covariance, number
+from ..checks import Array, array, callable_, choice, count, covariance, instance, number
 from ..gaussians import _intersection_weights
 from ..linalg import _solve_lower, _symmetrise
 from . import weights as weighting
@@ -306,8 +306,7 @@ def exchanged(
 
 
 def _checked(means: ArrayLike, covs: ArrayLike, channel: Channel) -> tuple[Array, Array]:
-    if not isinstance(channel, Channel):
-        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
+    instance(channel, "channel", Channel)
     m = array(means, "means", (*channel.runs, channel.graph.size, "d"))
     return m, covariance(array(covs, "covs", (*m.shape, m.shape[-1])), "covs")
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, count, number
+from ..checks import Array, array, count, instance, number
 from . import weights as weighting
 from .channel import Channel
 from .weights import Weights
@@ -87,8 +87,7 @@ def stable_substeps(
     >>> stable_substeps(Channel(graphs.complete(100)), 0.1, alpha=0.2, a=0.4, b=0.04)
     8
     """
-    if not isinstance(channel, Channel):
-        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
+    instance(channel, "channel", Channel)
     step, factor = number(dt, "dt", above=0), number(safety, "safety", at_least=1)
     gains = [number(g, n, at_least=0) for g, n in ((alpha, "alpha"), (a, "a"), (b, "b"))]
     bound = 2 * float(channel.graph.degrees.max())
@@ -153,10 +152,8 @@ def pi_step(
     >>> state.estimate.ravel().round(6)
     array([2., 2.])
     """
-    if not isinstance(state, PIState):
-        raise ValueError(f"state: needs a PIState, got {type(state).__name__}")
-    if not isinstance(channel, Channel):
-        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
+    instance(state, "state", PIState)
+    instance(channel, "channel", Channel)
     if channel.graph.directed:
         raise ValueError("channel: needs links both ways to keep the sum, got one-way links")
     shape = (*channel.runs, channel.graph.size, state.estimate.shape[-1])
@@ -219,8 +216,7 @@ def first_order(
     >>> first_order([[0.0], [2.0]], [[1.0], [3.0]], [[0.0], [2.0]], channel).ravel()
     array([2., 2.])
     """
-    if not isinstance(channel, Channel):
-        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
+    instance(channel, "channel", Channel)
     x = array(estimates, "estimates", (*channel.runs, channel.graph.size, "k"))
     change = array(inputs, "inputs", x.shape) - array(previous, "previous", x.shape)
     w = weighting.metropolis(channel.graph) if weights is None else weighting.keeping(weights)

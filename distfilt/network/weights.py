@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import sparse
 
-from ..checks import Array, array, count, number
+from ..checks import Array, array, count, instance, number
 from ._spectral import left_null_vector
 from .links import Graph, Indices
 
@@ -46,8 +46,7 @@ class Weights:
     links: Array
 
     def __post_init__(self) -> None:
-        if not isinstance(self.graph, Graph):
-            raise ValueError(f"graph: needs a Graph, got {type(self.graph).__name__}")
+        instance(self.graph, "graph", Graph)
         array(self.own, "own", (self.graph.size,))
         array(self.links, "links", (self.graph.senders.size,))
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.random import SeedSequence
 from numpy.typing import NDArray
 
-from ..checks import Array, callable_, choice, count
+from ..checks import Array, callable_, choice, count, instance
 from ..folders import data_root
 from ._worker import versions
 from .seeds import POOL_SIZE, Recipe
@@ -116,8 +116,7 @@ def store(
         If trials are missing, a worker died or a trial took too long (which may say nothing of
         the trial), a metric is not a real number, or a parameter is not JSON.
     """
-    if not isinstance(study, Study):
-        raise ValueError(f"study: needs a Study, got {type(study).__name__}")
+    instance(study, "study", Study)
     names = column_names(columns)
     if set(names) & set(_FIRST):
         raise ValueError(f"columns: needs names other than {', '.join(_FIRST)}, got {names}")
