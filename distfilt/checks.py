@@ -130,11 +130,6 @@ def covariance(
     semidefinite : bool
         Also accept singular matrices (a process noise that drives only some components).
 
-    Raises
-    ------
-    ValueError
-        If the matrix is not square of size `dim`, not symmetric, or not positive (semi)definite.
-
     Examples
     --------
     >>> covariance([[1.0, 2.0], [2.0, 1.0]], "noise")
@@ -211,11 +206,6 @@ def flags(value: Any, name: str, shape: tuple[Any, ...] | None = None) -> NDArra
 
 def weights(value: ArrayLike, name: str, size: int | None = None) -> Array:
     """Return `value` as nonnegative weights that sum to one along the last axis.
-
-    Raises
-    ------
-    ValueError
-        If a weight is negative or a sum differs from one by more than 1e-8.
 
     Examples
     --------
@@ -371,9 +361,7 @@ def instance(value: Any, name: str, kind: type[_T]) -> _T:
     """
     if not isinstance(value, kind):
         article = "an" if kind.__name__[0] in "AEIOU" else "a"
-        raise ValueError(
-            f"{name}: needs {article} {kind.__name__}, got {type(value).__name__}"
-        )
+        raise ValueError(f"{name}: needs {article} {kind.__name__}, got {type(value).__name__}")
     return value
 
 

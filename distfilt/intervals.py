@@ -72,11 +72,6 @@ def mean_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
     level : float
         Confidence, in (0, 1).
 
-    Returns
-    -------
-    Interval
-        The mean, the interval, and the standard error s/√n.
-
     Examples
     --------
     >>> print(mean_interval([1.0, 2.0, 3.0, 4.0]))
@@ -105,12 +100,6 @@ def median_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
         Independent values; enough of them for `level`: 6 for 95%.
     level : float
         Confidence that the interval has at least, in (0, 1).
-
-    Returns
-    -------
-    Interval
-        The sample median, the order statistics, and as error the half width divided by the normal
-        quantile of `level`, which tends to the standard error for large n.
 
     Examples
     --------
@@ -144,11 +133,6 @@ def proportion_interval(successes: int, trials: int, *, level: float = 0.95) -> 
         Independent trials, at least one.
     level : float
         Confidence that the interval has at least, in (0, 1).
-
-    Returns
-    -------
-    Interval
-        The share, the interval, and the plug-in standard error √(p(1-p)/n), 0 at p = 0 and 1.
 
     Notes
     -----

@@ -27,8 +27,8 @@ class GaussianRun:
     means : ndarray, (T, ..., d)
         Analysis means, one for each observation time; leading axes are the runs.
     covariances : ndarray, (T, ..., d, d)
-        Analysis covariances. The run axes have length 1 where all runs share the covariance, so
-        that the array broadcasts against the means.
+        Analysis covariances. Of :func:`kalman_filter` the run axes have length 1 where all runs
+        share the covariance, so that the array broadcasts against the means.
     log_likelihood : ndarray, (T, ...)
         Log density of each observation given those before it; its sum over time is the log
         likelihood of the model. Zero where nothing was observed.
@@ -77,9 +77,6 @@ def kalman_filter(
 
     Raises
     ------
-    ValueError
-        If a shape or a covariance is wrong, or a number other than a missing component is not
-        finite.
     numpy.linalg.LinAlgError
         If an innovation covariance is not positive definite in floating point.
 

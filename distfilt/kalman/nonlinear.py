@@ -129,15 +129,8 @@ def extended_filter(
     t0 : float
         The time of the prior, in s.
 
-    Returns
-    -------
-    GaussianRun
-        Covariances have all run axes.
-
     Raises
     ------
-    ValueError
-        If a shape, a covariance or a time is wrong, or a sensor needs the previous state.
     numpy.linalg.LinAlgError
         If a run leaves the finite numbers or its covariance is no longer positive definite; the
         message has the time.
@@ -269,18 +262,6 @@ def unscented_filter(
         As for :func:`extended_filter`.
     alpha, beta, kappa : float
         As for :func:`unscented_predict`.
-
-    Returns
-    -------
-    GaussianRun
-        Covariances have all run axes.
-
-    Raises
-    ------
-    ValueError
-        As :func:`extended_filter`, or if `alpha` or d + `kappa` is not positive.
-    numpy.linalg.LinAlgError
-        As :func:`extended_filter`.
 
     Examples
     --------

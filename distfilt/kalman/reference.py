@@ -49,11 +49,6 @@ def filterpy_kf(
         Whether to ask filterpy for the log density of each observation, which takes longer than
         the filter. Without it `log_likelihood` is zero.
 
-    Returns
-    -------
-    GaussianRun
-        Covariances have all run axes.
-
     Examples
     --------
     >>> run = filterpy_kf([0.0], [[1.0]], [[2.0]], F=[[1.0]], H=[[1.0]], Q=[[0.0]], R=[[1.0]])

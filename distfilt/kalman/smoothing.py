@@ -24,20 +24,13 @@ def rts_smoother(run: GaussianRun, *, F: ArrayLike, Q: ArrayLike) -> GaussianRun
     Parameters
     ----------
     run : GaussianRun
-        What :func:`kalman_filter` left, with any number of runs and gaps.
+        What :func:`kalman_filter` left, with any number of runs and gaps. The result has its
+        shapes and its log-likelihoods.
     F, Q : array_like, (d, d) or (T, d, d)
         Those that the filter had: the first of T leads from the prior to the first observation.
 
-    Returns
-    -------
-    GaussianRun
-        Smoothed means and covariances, symmetric, in the shapes of `run`; the log-likelihoods are
-        the filter's.
-
     Raises
     ------
-    ValueError
-        If `run` is none or a shape is wrong.
     numpy.linalg.LinAlgError
         If a forecast covariance is not positive definite.
 

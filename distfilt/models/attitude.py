@@ -116,6 +116,8 @@ def _slope_of_flow(x: Array, t: float, dt: float, alpha: float, step: float) -> 
 def attitude(*, rate: float, sigma: float, step: float = 0.01) -> Model:
     r"""The attitude model (20)-(21) of Grange et al., integrated by Runge-Kutta of order 4.
 
+    Its seven components are :math:`(\boldsymbol\omega, \mathbf q)`.
+
     Parameters
     ----------
     rate : float
@@ -125,11 +127,6 @@ def attitude(*, rate: float, sigma: float, step: float = 0.01) -> Model:
         standard deviation of :math:`\sigma\sqrt{dt}`. Equation (21) has no noise.
     step : float
         Longest integration step, in s, positive.
-
-    Returns
-    -------
-    Model
-        With the seven components :math:`(\boldsymbol\omega, \mathbf q)`.
 
     Examples
     --------
@@ -155,18 +152,14 @@ def satellite_pose(*, rate: float, sigma: float, step: float = 0.01) -> Model:
     r"""Translation and attitude together: the 13-component model of Table III of Grange et al.
 
     Translation (18) moves by its exact transition and exact noise, attitude (20)-(21) as in
-    :func:`attitude`; the two do not act on each other.
+    :func:`attitude`; the two do not act on each other. The components are
+    :math:`(x, y, z, \dot x, \dot y, \dot z, \boldsymbol\omega, \mathbf q)`.
 
     Parameters
     ----------
     rate, sigma, step : float
         As for :func:`attitude`; `sigma` drives all six components of the translation and the
         angular velocity.
-
-    Returns
-    -------
-    Model
-        With the components :math:`(x, y, z, \dot x, \dot y, \dot z, \boldsymbol\omega, \mathbf q)`.
 
     Examples
     --------

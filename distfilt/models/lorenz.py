@@ -75,11 +75,6 @@ def lorenz63(
     step : float
         Longest integration step, positive, in units of time.
 
-    Returns
-    -------
-    Model
-        With three components and its Jacobian, which is that of the integration to rounding.
-
     Examples
     --------
     >>> lorenz63().step([1.0, 1.0, 20.0], 0.0, 0.1).shape

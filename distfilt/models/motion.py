@@ -24,7 +24,7 @@ _QUARTER = np.array([[0.0, -1.0], [1.0, 0.0]])
 
 
 def constant_velocity(*, sigma: float, axes: int = 2) -> LinearModel:
-    r"""Straight motion whose velocity wanders, with white noise on the acceleration.
+    r"""Straight motion whose velocity wanders: positions, then velocities, along `axes` axes.
 
     .. math:: \ddot{\mathbf p} = \sigma\,\dot{\mathbf w},\qquad
         \mathbf Q = \sigma^2\begin{pmatrix} dt^3/3 & dt^2/2\\ dt^2/2 & dt\end{pmatrix}
@@ -37,11 +37,6 @@ def constant_velocity(*, sigma: float, axes: int = 2) -> LinearModel:
         of :math:`\sigma\sqrt{dt}` m/s.
     axes : int
         1, 2 or 3 axes.
-
-    Returns
-    -------
-    LinearModel
-        With 2 `axes` components: positions, then velocities.
 
     Notes
     -----
@@ -103,11 +98,6 @@ def coordinated_turn(
         In place of `rate`: the turn rate is the fifth component and wanders with this strength,
         at least 0, in rad/s per root second. Its noise and the one on the position and velocity
         are those of straight motion, as usual.
-
-    Returns
-    -------
-    LinearModel or Model
-        A model with four components, or one with five and its Jacobian.
 
     Notes
     -----

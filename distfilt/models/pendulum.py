@@ -95,7 +95,7 @@ def pendulum(
     sigma: tuple[float, float] = (0.0, 0.0),
     step: float = 0.01,
 ) -> Model:
-    """The pendulum in Cartesian coordinates, integrated by Runge-Kutta of order 4.
+    """The pendulum in Cartesian coordinates x, y, vx, vy, by Runge-Kutta of order 4.
 
     Parameters
     ----------
@@ -106,11 +106,6 @@ def pendulum(
         m/s/√s; none by default. It does not know of the constraint.
     step : float
         Longest integration step, in s, positive.
-
-    Returns
-    -------
-    Model
-        Components x, y, vx, vy, with the Jacobian of the integration.
 
     Examples
     --------
@@ -153,7 +148,7 @@ def pendulum_angle(
     sigma: tuple[float, float] = (0.0, 0.0),
     step: float = 0.01,
 ) -> Model:
-    r"""The pendulum in its chart: the angle θ from the vertical and its rate.
+    r"""The pendulum in its chart: the angle θ from the vertical, not wrapped, and its rate.
 
     .. math:: \ddot\theta = -\frac gL\sin\theta
 
@@ -163,11 +158,6 @@ def pendulum_angle(
         As for :func:`pendulum`.
     sigma : (float, float)
         Strength of white noise on the angle, in rad/√s, and on the rate, in rad/s/√s.
-
-    Returns
-    -------
-    Model
-        Components theta and omega; the angle is not wrapped.
 
     Examples
     --------
@@ -222,17 +212,12 @@ def pendulum_states(chart: ArrayLike, *, length: float = 1.0) -> Array:
 
 
 def pendulum_chart(states: ArrayLike) -> Array:
-    r"""Angle and rate of Cartesian states; the distance from the pivot and its rate are dropped.
+    r"""Angle in (-π, π] and rate :math:`(\dot xy-x\dot y)/r^2` of Cartesian states, (..., 2).
 
     Parameters
     ----------
     states : array_like, (..., 4)
         Not at the pivot.
-
-    Returns
-    -------
-    ndarray, (..., 2)
-        The angle in (-π, π] and :math:`(\dot xy-x\dot y)/r^2`.
 
     Examples
     --------

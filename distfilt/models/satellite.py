@@ -18,17 +18,12 @@ __all__ = ["clohessy_wiltshire", "clohessy_wiltshire_drift", "clohessy_wiltshire
 
 
 def clohessy_wiltshire_drift(rate: float) -> Array:
-    r"""The matrix A of the Clohessy-Wiltshire equations :math:`\dot{\mathbf x}=\mathbf A\mathbf x`.
+    r"""The matrix A, (6, 6), of the Clohessy-Wiltshire equations, (18) of Grange et al.
 
     Parameters
     ----------
     rate : float
         The chief's orbital rate :math:`\alpha=\sqrt{\mu/a^3}`, in rad/s, positive.
-
-    Returns
-    -------
-    ndarray, (6, 6)
-        The matrix of equation (18) of Grange et al.
 
     Examples
     --------
@@ -91,11 +86,6 @@ def clohessy_wiltshire(*, rate: float, sigma: float) -> LinearModel:
     sigma : float
         The noise's strength: each row receives white noise of spectral density sigma² (per s), so
         that a component gathers a standard deviation of about :math:`\sigma\sqrt{dt}`.
-
-    Returns
-    -------
-    LinearModel
-        With six components; the discretised noise is exact (Van Loan).
 
     Examples
     --------

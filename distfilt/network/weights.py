@@ -309,11 +309,6 @@ def balanced(graph: Graph) -> Weights:
     =\mathbf p^\top\mathbf L=\mathbf 0`. Averaging then keeps the average on a digraph too. The
     vector is global knowledge: agents compute it together once, or are told.
 
-    Raises
-    ------
-    ValueError
-        If the graph is not strongly connected.
-
     Examples
     --------
     >>> from distfilt.network import Graph

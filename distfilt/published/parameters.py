@@ -40,11 +40,6 @@ def judge_parameters(
     scenario : Scenario, optional
         What the study ran, as of `judge_table`; the reading itself without it.
 
-    Returns
-    -------
-    Verdict
-        If it differs, the first difference is the reason.
-
     Examples
     --------
     >>> from distfilt.published import scenario

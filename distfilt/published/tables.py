@@ -35,11 +35,6 @@ def root() -> Path:
     It is the working copy's that the process runs in, or the one that the library carries;
     :func:`distfilt.folders.data_root` has the rule.
 
-    Raises
-    ------
-    FileNotFoundError
-        If the library was installed without its data.
-
     Examples
     --------
     >>> (root() / "published" / "items.csv").is_file()

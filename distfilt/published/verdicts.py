@@ -201,11 +201,6 @@ def judge_table(
         What the study ran; if it is not the paper's, the verdict is "not comparable" and names
         what was changed.
 
-    Returns
-    -------
-    Verdict
-        With the number of values that match, and those that do not.
-
     Examples
     --------
     >>> one = Value("C1", 0.0899, 0.0004, 0.0896)

@@ -203,21 +203,16 @@ def angle(
 def distance_and_angle(
     indices: Sequence[int], *, std: Sequence[float], origin: ArrayLike | None = None
 ) -> Sensor:
-    """See the distance of two components from a place and their direction, as a radar does.
+    """See the distance from a place in two components and the direction, as a radar does.
 
     Parameters
     ----------
     indices : sequence of two int
-        The components a and b.
+        The components a and b; the angle is ``arctan2(b, a)``, which repeats after 2π.
     std : (float, float)
         Standard deviations of the distance, in the components' unit, and of the angle, in rad.
     origin : array_like, (2,), optional
         Where the sensor stands; zero by default.
-
-    Returns
-    -------
-    Sensor
-        Of two components; the angle is ``arctan2(b, a)``, which repeats after 2π.
 
     Examples
     --------
@@ -263,16 +258,13 @@ def of_kind(kind: str, indices: Sequence[int], *, std: float) -> Sensor:
 def stack(sensors: Sequence[Sensor]) -> Sensor:
     """One sensor whose observation is the observations of `sensors`, one after the other.
 
+    It wraps the components that the given sensors wrap, is linear if all of them are, and needs
+    the previous state if one of them does.
+
     Parameters
     ----------
     sensors : sequence of Sensor
         At least one. The noise of different sensors is independent.
-
-    Returns
-    -------
-    Sensor
-        It wraps the components that the given sensors wrap, it is linear if all of them are, and
-        it needs the previous state if one of them does.
 
     Examples
     --------

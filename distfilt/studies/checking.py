@@ -46,11 +46,6 @@ def check(
     workers, executor
         As in `run`; by default in this process.
 
-    Returns
-    -------
-    Stored
-        What the file holds.
-
     Raises
     ------
     AssertionError

@@ -74,11 +74,6 @@ def run(
     blas_threads : int or None
         Threads of the linear algebra in each process; None leaves them as they are.
 
-    Returns
-    -------
-    Study
-        Values in the order of the seeds, and failures.
-
     Raises
     ------
     ValueError

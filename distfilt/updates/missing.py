@@ -21,7 +21,7 @@ def with_missing(
     *,
     rng: np.random.Generator,
 ) -> Array:
-    """Apply an update where NaN marks a missing component of the observation.
+    """Apply an update where NaN marks a missing component; without any reading nothing moves.
 
     Ensembles that miss the same components are updated together, so a batch costs one call for
     each pattern.
@@ -37,11 +37,6 @@ def with_missing(
         NaN where a component is missing.
     noise : ndarray, (m, m) or (..., m, m)
     rng : numpy.random.Generator
-
-    Returns
-    -------
-    ndarray, (..., N, d)
-        Ensembles without any reading are returned as they came.
 
     Examples
     --------

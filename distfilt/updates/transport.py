@@ -127,11 +127,6 @@ def principal_directions(ensemble: ArrayLike, n: int) -> Array:
     n : int
         How many, at most d.
 
-    Returns
-    -------
-    ndarray, (..., d, n)
-        By descending variance. Signs are free, and cancel in every use here.
-
     Examples
     --------
     >>> principal_directions([[-3.0, 0.1], [3.0, 0.1], [0.0, -0.1]], 1).round(2).tolist()
