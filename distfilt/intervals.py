@@ -63,7 +63,7 @@ def _values(values: ArrayLike, least: int) -> Array:
 
 
 def mean_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
-    """Student's t interval for the mean of independent values.
+    """Student's t interval for the mean of independent values, with the standard error s/√n.
 
     Parameters
     ----------
@@ -92,7 +92,8 @@ def median_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
     """Interval for the median that assumes nothing about the distribution.
 
     The k-th smallest and the k-th largest value miss the median with probability
-    2 P(B < k), B binomial (n, 1/2); k is the largest with which they miss it seldom enough.
+    2 P(B < k), B binomial (n, 1/2); k is the largest with which they miss it seldom enough. The
+    error is the half width divided by the normal quantile of `level`.
 
     Parameters
     ----------
@@ -124,6 +125,8 @@ def median_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
 
 def proportion_interval(successes: int, trials: int, *, level: float = 0.95) -> Interval:
     """Clopper-Pearson interval for a probability: it covers with at least `level`, for every n.
+
+    The error is the plug-in one, √(p(1-p)/n), 0 at p = 0 and 1.
 
     Parameters
     ----------

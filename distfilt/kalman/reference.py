@@ -95,22 +95,10 @@ def filterpy_ekf(
 
     Parameters
     ----------
-    mean : array_like, (d,) or (..., d)
-        Prior mean at `t0`.
-    cov : array_like, (d, d) or (..., d, d)
-        Prior covariance.
-    observations : array_like, (T, ..., m)
-        The observations of all sensors, one after the other; NaN marks a missing component.
-    model : Model
-        Linearised about each analysis mean, by its Jacobian.
-    sensors : sequence of Sensor
-        Linearised about each forecast mean; residuals wrap where the sensor wraps.
-    times : array_like, (T,)
-        Observation times, in s.
-    t0 : float
-        The time of the prior, in s.
+    mean, cov, observations, model, sensors, times, t0
+        As for :func:`~distfilt.kalman.extended_filter`.
     likelihood : bool
-        Whether to ask filterpy for the log density of each innovation.
+        As for :func:`filterpy_kf`.
 
     Examples
     --------
@@ -171,9 +159,7 @@ def filterpy_ukf(
     mean, cov, observations, model, sensors, times, t0, likelihood
         As for :func:`filterpy_ekf`.
     alpha, beta, kappa : float
-        Of the scaled sigma points: the points lie :math:`\alpha\sqrt{d+\kappa}` standard
-        deviations from the mean. The defaults keep every weight positive, and with it the
-        covariance.
+        As for :func:`~distfilt.kalman.unscented_predict`.
 
     Examples
     --------

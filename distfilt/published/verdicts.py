@@ -187,7 +187,7 @@ def judge_table(
     why: str = "",
     scenario: Scenario | None = None,
 ) -> Verdict:
-    """The verdict on a table of numbers: a match if every value matches.
+    """The verdict on a table of numbers: a match if every value matches; it lists the others.
 
     Parameters
     ----------

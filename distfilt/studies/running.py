@@ -76,8 +76,6 @@ def run(
 
     Raises
     ------
-    ValueError
-        If an argument is not as above, or the trial cannot be pickled.
     StudyError
         If a trial failed and `errors` is ``"raise"``, or if the pool failed: a caller's pool that
         broke or was shut down, a worker with another version of Python, numpy or this library.

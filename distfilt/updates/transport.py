@@ -49,17 +49,9 @@ def transport(
 
     Parameters
     ----------
-    ensemble : array_like, (..., N, d)
-        Forecast members.
-    predicted : array_like, (..., N, m)
-        What each member would observe, without noise. Readings that wrap have to lie on the
-        branch of `observed`.
-    observed : array_like, (..., m)
-        The observation y*.
-    noise : array_like, (m, m) or (..., m, m)
-        Its covariance; a draw of it is added to each prediction.
-    rng : numpy.random.Generator
-        Source of that draw.
+    ensemble, predicted, observed, noise, rng
+        As in :func:`~distfilt.updates.sampled_noise`; a draw of the noise is added to each
+        prediction.
     fit : callable
         ``fit(y, x) -> map``: an estimator of the map, such as
         :func:`distfilt.triangular.separable.fit` with its options.
@@ -99,10 +91,8 @@ def transport_sample(
 
     Parameters
     ----------
-    ensemble, predicted, observed, noise, fit
-        As in :func:`transport`.
-    rng : numpy.random.Generator
-        Source of the noise in the predictions and of the reference samples.
+    ensemble, predicted, observed, noise, rng, fit
+        As in :func:`transport`; the reference samples are drawn too.
 
     Examples
     --------
