@@ -146,9 +146,10 @@ def cholesky_solve(cov: ArrayLike, right: ArrayLike) -> Array:
     return _cholesky_solve(_cholesky(c), b)
 
 
-def _leading(wanted: tuple[int, ...], got: tuple[int, ...], name: str) -> None:
+def _leading(wanted: tuple[int, ...], got: tuple[int, ...], name: str) -> tuple[int, ...]:
+    """What leading axes broadcast to, or an error that names the argument that does not fit."""
     try:
-        np.broadcast_shapes(wanted, got)
+        return np.broadcast_shapes(wanted, got)
     except ValueError:
         raise ValueError(
             f"{name}: needs leading axes that broadcast with {wanted}, got {got}"

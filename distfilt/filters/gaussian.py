@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..checks import Array, array, choice, count, covariance, instance, number
+from ..linalg import _symmetrise
 from ..network import Ledger
 from .driver import Late, Summary
 from .failures import guarded, not_finite
@@ -186,7 +187,7 @@ class GaussianFilter(SensorFilter):
             means, covs = self._agreed(means, covs, channel)
         ledger = state.ledger if channel is None else channel.ledger
         return GaussianState(
-            float(t), ledger, None, means, _symmetric(covs), state.dim, times, failed
+            float(t), ledger, None, means, _symmetrise(covs), state.dim, times, failed
         )
 
     def summary(self, state: GaussianState) -> Summary:
@@ -272,7 +273,7 @@ class GaussianFilter(SensorFilter):
     def _agreed(self, means: Array, covs: Array, channel: Any) -> tuple[Array, Array]:
         """Fuse the present states; what is believed of the past follows by its regression."""
         d = self.model.dim
-        old, now = means[..., :d], _symmetric(covs[..., :d, :d])
+        old, now = means[..., :d], _symmetrise(covs[..., :d, :d])
         assert self.agreement is not None
         m, p = self.agreement(old, now, channel)
         m, p = array(m, "agreement", old.shape), array(p, "agreement", now.shape)
@@ -296,11 +297,7 @@ def _updated(m: Array, p: Array, gap: Array, h: Array, r: Array) -> tuple[Array,
     gain = np.swapaxes(np.linalg.solve(h @ cross + r, np.swapaxes(cross, -1, -2)), -1, -2)
     rest = np.eye(p.shape[-1]) - gain @ h
     new = rest @ p @ np.swapaxes(rest, -1, -2) + gain @ r @ np.swapaxes(gain, -1, -2)
-    return m + (gain @ gap[..., None])[..., 0], _symmetric(new)
-
-
-def _symmetric(p: Array) -> Array:
-    return np.asarray(0.5 * (p + np.swapaxes(p, -1, -2)))
+    return m + (gain @ gap[..., None])[..., 0], _symmetrise(new)
 
 
 def _summary(state: GaussianState, slot: int) -> Summary:

@@ -32,9 +32,9 @@ def log_density(x: ArrayLike, mean: ArrayLike, cov: ArrayLike) -> Array:
     """
     at = array(x, "x", (..., "d"))
     centre = array(mean, "mean", (..., at.shape[-1]))
-    _leading(at.shape[:-1], centre.shape[:-1], "mean")
+    lead = _leading(at.shape[:-1], centre.shape[:-1], "mean")
     spread = covariance(cov, "cov", at.shape[-1])
-    _leading(np.broadcast_shapes(at.shape, centre.shape)[:-1], spread.shape[:-2], "cov")
+    _leading(lead, spread.shape[:-2], "cov")
     return _log_density(at - centre, _cholesky(spread))
 
 

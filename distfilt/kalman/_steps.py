@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, number
+from ..linalg import _symmetrise
 from ..models import Model
 from ..sensors import Sensor
 from ._algebra import analysis, forecast_cov
@@ -113,8 +114,7 @@ def unscented_forecast(
 
 def _weighted(away: Array, weights: Array) -> Array:
     """Symmetric second moments (R, d, d) of deviations (R, n, d)."""
-    out = np.swapaxes(away * weights[:, None], -1, -2) @ away
-    return np.asarray(0.5 * (out + np.swapaxes(out, -1, -2)))
+    return _symmetrise(np.swapaxes(away * weights[:, None], -1, -2) @ away)
 
 
 def unscented_analysis(
@@ -147,8 +147,7 @@ def unscented_analysis(
     log_det = 2.0 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
     size = here.sum(axis=-1)
     density = -0.5 * (size * np.log(2.0 * np.pi) + log_det + (white**2).sum(axis=-1))
-    after = 0.5 * (after + np.swapaxes(after, -1, -2))
-    return x + (gain @ innovation[..., None])[..., 0], after, density
+    return x + (gain @ innovation[..., None])[..., 0], _symmetrise(after), density
 
 
 def over_time(

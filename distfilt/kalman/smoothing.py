@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, instance
+from ..linalg import _symmetrise
 from .linear import GaussianRun, _noise_per_step, _per_step
 
 __all__ = ["rts_smoother"]
@@ -62,7 +63,7 @@ def rts_smoother(run: GaussianRun, *, F: ArrayLike, Q: ArrayLike) -> GaussianRun
         kept = np.eye(d) - gain @ f[k + 1]
         back = np.swapaxes(gain, -1, -2)
         after = kept @ p @ np.swapaxes(kept, -1, -2) + gain @ (covs[k + 1] + q[k + 1]) @ back
-        covs[k] = 0.5 * (after + np.swapaxes(after, -1, -2))
+        covs[k] = _symmetrise(after)
     return GaussianRun(means, covs, run.log_likelihood.copy())
 
 
@@ -71,7 +72,7 @@ def _gain(p: Array, f: Array, q: Array) -> Array:
     forward = f @ p
     ahead = forward @ f.T + q
     try:
-        lower = np.linalg.cholesky(0.5 * (ahead + np.swapaxes(ahead, -1, -2)))
+        lower = np.linalg.cholesky(_symmetrise(ahead))
     except np.linalg.LinAlgError:
         raise np.linalg.LinAlgError("a forecast covariance is not positive definite") from None
     half = np.linalg.solve(lower, forward)

@@ -9,7 +9,7 @@ from ..checks import Array, array, covariance, number
 from ..checks import count as whole
 from ..ensembles import _mean, _sample_covariance
 from ..intervals import Interval
-from ..linalg import _cholesky, _quadratic_form
+from ..linalg import _cholesky, _leading, _quadratic_form
 from .errors import _ensemble, _truth
 
 __all__ = ["ensemble_nees", "nees", "nees_band", "nis"]
@@ -40,20 +40,14 @@ def nees(estimate: ArrayLike, cov: ArrayLike, truth: ArrayLike) -> Array:
     10.0
     """
     e = array(estimate, "estimate", (..., "d"))
-    gap = e - _truth(truth, e.shape, "estimate")
+    gap = e - _truth(truth, e.shape)
     return _quadratic_form(_cholesky(_spread(cov, gap.shape)), gap)
 
 
 def _spread(value: ArrayLike, like: tuple[int, ...]) -> Array:
     """A covariance (..., d, d) for differences of shape `like`, (..., d)."""
     out = covariance(value, "cov", like[-1])
-    try:
-        np.broadcast_shapes(like[:-1], out.shape[:-2])
-    except ValueError:
-        raise ValueError(
-            f"cov: needs leading axes that broadcast with those of the error {like[:-1]}, "
-            f"got {out.shape[:-2]}"
-        ) from None
+    _leading(like[:-1], out.shape[:-2], "cov")
     return out
 
 
@@ -111,7 +105,7 @@ def ensemble_nees(ensemble: ArrayLike, truth: ArrayLike) -> Array:
     if n <= d:
         raise ValueError(f"ensemble: needs more members than components ({d}), got {n}")
     middle = _mean(x)
-    t = _truth(truth, middle.shape, "ensemble")
+    t = _truth(truth, middle.shape)
     cov = _sample_covariance(x)
     # NEES does not depend on units: scaled to unit variances, rounding does not either, and the
     # test for a subspace compares pure numbers.

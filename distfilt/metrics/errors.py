@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, array
+from ..linalg import _leading
 
 __all__ = ["rmse", "spread", "squared_error"]
 
@@ -21,16 +22,10 @@ def _ensemble(value: ArrayLike, members: int = 1) -> Array:
     return out
 
 
-def _truth(value: ArrayLike, like: tuple[int, ...], other: str) -> Array:
+def _truth(value: ArrayLike, like: tuple[int, ...]) -> Array:
     """The truth as (..., d), where `like` is the shape (..., d) that it has to broadcast with."""
     out = array(value, "truth", (..., like[-1]))
-    try:
-        np.broadcast_shapes(out.shape, like)
-    except ValueError:
-        raise ValueError(
-            f"truth: needs leading axes that broadcast with those of {other} {like[:-1]}, "
-            f"got {out.shape[:-1]}"
-        ) from None
+    _leading(like[:-1], out.shape[:-1], "truth")
     return out
 
 
@@ -54,7 +49,7 @@ def squared_error(estimate: ArrayLike, truth: ArrayLike, *, per_component: bool 
     array([ 9., 16.])
     """
     e = array(estimate, "estimate", (..., "d"))
-    square = (e - _truth(truth, e.shape, "estimate")) ** 2
+    square = (e - _truth(truth, e.shape)) ** 2
     return square if _flag(per_component) else np.asarray(square.sum(axis=-1))
 
 

@@ -50,7 +50,7 @@ def crps(
     """
     x = _ensemble(ensemble, 2 if fair else 1)
     n = x.shape[-2]
-    t = _truth(truth, (*x.shape[:-2], x.shape[-1]), "ensemble")
+    t = _truth(truth, (*x.shape[:-2], x.shape[-1]))
     if weights is not None:
         return _weighted_crps(x - t[..., None, :], weights, fair)
     # Distances from the truth are as good as the members, and lose fewer digits far from zero.
@@ -129,5 +129,5 @@ def log_score(estimate: ArrayLike, cov: ArrayLike, truth: ArrayLike) -> Array:
     1.418939
     """
     e = array(estimate, "estimate", (..., "d"))
-    gap = e - _truth(truth, e.shape, "estimate")
+    gap = e - _truth(truth, e.shape)
     return -_log_density(gap, _cholesky(_spread(cov, gap.shape)))

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, count, generator, instance, number
+from ..checks import Array, count, generator, number
 from . import weights as weighting
 from .channel import Channel
+from .consensus import _values
 from .weights import Weights
 
 __all__ = ["event_triggered", "flood", "gossip"]
@@ -197,19 +198,12 @@ def flood(values: ArrayLike, channel: Channel, *, rounds: int | None = None) -> 
     return average, np.array([[a in k for a in range(size)] for k in known])
 
 
-def _values(values: ArrayLike, channel: Channel) -> Array:
-    instance(channel, "channel", Channel)
-    return array(values, "values", (*channel.runs, channel.graph.size, "k"))
-
-
 def _symmetric(channel: Channel, weights: Weights | None) -> Weights:
     _pairwise(channel)
     graph = channel.graph
     if weights is None:
         return weighting.metropolis(graph)
-    w = weighting.keeping(weights)
-    if w.graph is not graph:
-        w = Weights.from_matrix(graph, w.matrix)
+    w = Weights.from_matrix(graph, weighting.keeping(weights))
     gap = np.abs(w.links - w.links[graph.reverse]).max(initial=0.0)
     if gap > 1e-12:
         raise ValueError(f"weights: needs symmetric weights, got a difference of {gap:.3g}")

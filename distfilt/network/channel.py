@@ -191,10 +191,6 @@ class Channel:
         self, values: ArrayLike, weights: Weights | ArrayLike | sparse.sparray
     ) -> tuple[Array, Weights]:
         v = array(values, "values", (*self.runs, self.graph.size, "k"))
-        if isinstance(weights, Weights):
-            if weights.graph is self.graph:
-                return v, weights
-            weights = weights.matrix
         return v, Weights.from_matrix(self.graph, weights)
 
     def _combine_all(self, v: Array, w: Weights, rounds: int) -> Array:

@@ -50,9 +50,9 @@ def warn_if_unstable(graph: Graph, gain: float) -> None:
         )
 
 
-def _values(values: ArrayLike, channel: Channel) -> Array:
+def _values(values: ArrayLike, channel: Channel, name: str = "values") -> Array:
     instance(channel, "channel", Channel)
-    return array(values, "values", (*channel.runs, channel.graph.size, "k"))
+    return array(values, name, (*channel.runs, channel.graph.size, "k"))
 
 
 def _connected(channel: Channel) -> None:

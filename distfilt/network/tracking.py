@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from ..checks import Array, array, count, instance, number
 from . import weights as weighting
 from .channel import Channel
+from .consensus import _values
 from .weights import Weights
 
 __all__ = ["PIState", "first_order", "pi_start", "pi_step", "stable_substeps"]
@@ -216,8 +217,7 @@ def first_order(
     >>> first_order([[0.0], [2.0]], [[1.0], [3.0]], [[0.0], [2.0]], channel).ravel()
     array([2., 2.])
     """
-    instance(channel, "channel", Channel)
-    x = array(estimates, "estimates", (*channel.runs, channel.graph.size, "k"))
+    x = _values(estimates, channel, "estimates")
     change = array(inputs, "inputs", x.shape) - array(previous, "previous", x.shape)
     w = weighting.metropolis(channel.graph) if weights is None else weighting.keeping(weights)
     return channel.combine(x, w, lost=lost) + change

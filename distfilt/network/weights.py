@@ -51,8 +51,12 @@ class Weights:
         array(self.links, "links", (self.graph.senders.size,))
 
     @classmethod
-    def from_matrix(cls, graph: Graph, matrix: ArrayLike | sparse.sparray) -> Weights:
+    def from_matrix(cls, graph: Graph, matrix: Weights | ArrayLike | sparse.sparray) -> Weights:
         """Read the weights from a matrix (A, A); off its diagonal only links may be weighted."""
+        if isinstance(matrix, Weights):
+            if matrix.graph is graph:
+                return matrix
+            matrix = matrix.matrix
         if not sparse.issparse(matrix):
             matrix = array(matrix, "weights", graph.links.shape, finite=False)
         w = sparse.csr_array(matrix)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.fft import dct
 
 from ..checks import Array, choice, number
-from ..ensembles import exact_noise
+from ..ensembles import _mean, exact_noise
 from .door import perturbed, update
 
 __all__ = ["exact_draws", "known_noise", "sampled_noise", "square_root"]
@@ -23,8 +23,7 @@ __all__ = ["exact_draws", "known_noise", "sampled_noise", "square_root"]
 
 def _centred(members: Array) -> tuple[Array, Array]:
     """Mean (..., 1, d) and anomalies of members (..., N, d)."""
-    n = members.shape[-2]
-    centre = (np.full(n, 1 / n) @ members)[..., None, :]
+    centre = _mean(members)[..., None, :]
     return centre, members - centre
 
 
