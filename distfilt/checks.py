@@ -224,13 +224,8 @@ def weights(value: ArrayLike, name: str, size: int | None = None) -> Array:
 
 
 def number(
-    value: Any,
-    name: str,
-    *,
-    above: float | None = None,
-    at_least: float | None = None,
-    below: float | None = None,
-    at_most: float | None = None,
+    value: Any, name: str, *, above: float | None = None, at_least: float | None = None,
+    below: float | None = None, at_most: float | None = None,
 ) -> float:
     """Return `value` as a finite float inside the given bounds.
 

@@ -22,11 +22,7 @@ def _ensemble(value: ArrayLike, name: str, members: int = 1) -> Array:
 
 
 def draw(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    members: int,
-    *,
-    rng: np.random.Generator,
+    mean: ArrayLike, cov: ArrayLike, members: int, *, rng: np.random.Generator,
     leading: tuple[int, ...] = (),
 ) -> Array:
     """Draw ensembles (*leading, N, d) from a Gaussian.

@@ -133,12 +133,7 @@ class Filter(ABC):
         return list(observations)
 
     def steps(
-        self,
-        state: Any,
-        times: ArrayLike,
-        observations: Any,
-        *,
-        late: Sequence[Late] = (),
+        self, state: Any, times: ArrayLike, observations: Any, *, late: Sequence[Late] = (),
         progress: bool = False,
     ) -> Iterator[Any]:
         """The states at `times`, one after the other; arguments as in :meth:`run`."""
@@ -156,15 +151,8 @@ class Filter(ABC):
             yield state
 
     def run(
-        self,
-        state: Any,
-        times: ArrayLike,
-        observations: Any,
-        *,
-        truth: ArrayLike | None = None,
-        scores: Collection[str] = SCORES,
-        late: Sequence[Late] = (),
-        progress: bool = False,
+        self, state: Any, times: ArrayLike, observations: Any, *, truth: ArrayLike | None = None,
+        scores: Collection[str] = SCORES, late: Sequence[Late] = (), progress: bool = False,
     ) -> xarray.Dataset:
         """Step through a series and record it.
 
@@ -205,15 +193,8 @@ class Filter(ABC):
 
 
     def smooth(
-        self,
-        state: Any,
-        times: ArrayLike,
-        observations: Any,
-        *,
-        truth: ArrayLike | None = None,
-        scores: Collection[str] = SCORES,
-        late: Sequence[Late] = (),
-        progress: bool = False,
+        self, state: Any, times: ArrayLike, observations: Any, *, truth: ArrayLike | None = None,
+        scores: Collection[str] = SCORES, late: Sequence[Late] = (), progress: bool = False,
     ) -> xarray.Dataset:
         """Fixed-lag smoothing: of each time what is believed when `lag` more have been observed.
 

@@ -140,11 +140,8 @@ class EnsembleFilter(SensorFilter):
 
     @classmethod
     def exact(
-        cls,
-        model: Model,
-        sensors: Sequence[Sensor | None],
-        graph: Graph | Callable[[float], Graph] | None = None,
-        **options: Any,
+        cls, model: Model, sensors: Sequence[Sensor | None],
+        graph: Graph | Callable[[float], Graph] | None = None, **options: Any,
     ) -> EnsembleFilter:
         """Second-order exact draws and covariance intersection of least determinant.
 
@@ -175,12 +172,8 @@ class EnsembleFilter(SensorFilter):
         return cls(model, sensors, graph, **(own | options))
 
     def start(
-        self,
-        prior: ArrayLike | Callable[..., Array] | tuple[ArrayLike, ArrayLike],
-        *,
-        rng: np.random.Generator,
-        runs: tuple[int, ...] = (),
-        t: float = 0.0,
+        self, prior: ArrayLike | Callable[..., Array] | tuple[ArrayLike, ArrayLike], *,
+        rng: np.random.Generator, runs: tuple[int, ...] = (), t: float = 0.0,
     ) -> EnsembleState:
         """The state before the first step.
 
@@ -205,11 +198,7 @@ class EnsembleFilter(SensorFilter):
         return EnsembleState(number(t, "t"), ledger, rng.spawn(1)[0], drawn)
 
     def step(
-        self,
-        state: EnsembleState,
-        t: float,
-        observations: Sequence[ArrayLike | None],
-        *,
+        self, state: EnsembleState, t: float, observations: Sequence[ArrayLike | None], *,
         late: Sequence[Late] = (),
     ) -> EnsembleState:
         """Move to time `t` and take in what was observed there.
@@ -268,12 +257,7 @@ class EnsembleFilter(SensorFilter):
         return tuple((t, _summary(e, state.failed)) for t, e in state.history)
 
     def _condition(
-        self,
-        stack: list[Array],
-        slot: int,
-        group: Heard,
-        failed: Mask,
-        rng: np.random.Generator,
+        self, stack: list[Array], slot: int, group: Heard, failed: Mask, rng: np.random.Generator,
         previous: Array | None,
     ) -> dict[tuple[int, ...], str]:
         """Condition every time's ensembles of a group's agents, in place; the rows that failed."""

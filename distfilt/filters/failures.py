@@ -49,13 +49,8 @@ class FilterError(RuntimeError):
 
 
 def guarded(
-    compute: Compute,
-    arrays: tuple[Array, ...],
-    fallback: tuple[Array, ...],
-    lead: int,
-    *,
-    shared: Array,
-    rng: np.random.Generator | None,
+    compute: Compute, arrays: tuple[Array, ...], fallback: tuple[Array, ...], lead: int, *,
+    shared: Array, rng: np.random.Generator | None,
 ) -> tuple[tuple[Array, ...], dict[Row, str]]:
     """A computation on a batch, and if it fails on each row alone.
 
@@ -124,13 +119,8 @@ def not_finite(values: Array, axes: int) -> dict[Row, str]:
 
 
 def _row_by_row(
-    compute: Compute,
-    arrays: tuple[Array, ...],
-    fallback: tuple[Array, ...],
-    lead: int,
-    shared: Array,
-    rng: np.random.Generator | None,
-    first: Exception,
+    compute: Compute, arrays: tuple[Array, ...], fallback: tuple[Array, ...], lead: int,
+    shared: Array, rng: np.random.Generator | None, first: Exception,
 ) -> tuple[tuple[Array, ...], dict[Row, str]]:
     out = tuple(f.copy() for f in fallback)
     errors: dict[Row, str] = {}

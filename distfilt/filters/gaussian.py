@@ -124,12 +124,8 @@ class GaussianFilter(SensorFilter):
             raise ValueError("sensors: needs sensors of the present state, got a differential one")
 
     def start(
-        self,
-        prior: tuple[ArrayLike, ArrayLike],
-        *,
-        rng: np.random.Generator | None = None,
-        runs: tuple[int, ...] = (),
-        t: float = 0.0,
+        self, prior: tuple[ArrayLike, ArrayLike], *, rng: np.random.Generator | None = None,
+        runs: tuple[int, ...] = (), t: float = 0.0,
     ) -> GaussianState:
         """The state before the first step.
 
@@ -153,11 +149,7 @@ class GaussianFilter(SensorFilter):
         return GaussianState(number(t, "t"), Ledger.empty(agents), None, m.copy(), p.copy(), d)
 
     def step(
-        self,
-        state: GaussianState,
-        t: float,
-        observations: Sequence[ArrayLike | None],
-        *,
+        self, state: GaussianState, t: float, observations: Sequence[ArrayLike | None], *,
         late: Sequence[Late] = (),
     ) -> GaussianState:
         """Move to time `t` and take in what was observed there.
@@ -220,10 +212,7 @@ class GaussianFilter(SensorFilter):
         return np.concatenate([moved, old], axis=-1), covs
 
     def _linearised(
-        self,
-        function: Callable[[Array], Array],
-        jacobian: Callable[[Array], Array],
-        mean: Array,
+        self, function: Callable[[Array], Array], jacobian: Callable[[Array], Array], mean: Array,
         cov: Array,
     ) -> tuple[Array, Array, Array]:
         """Value, slope and extra covariance of a function of a Gaussian (..., d)."""

@@ -123,12 +123,8 @@ class ParticleFilter(SensorFilter):
         number(self.jitter, "jitter", at_least=0, at_most=1)
 
     def start(
-        self,
-        prior: ArrayLike | Callable[..., Array] | tuple[ArrayLike, ArrayLike],
-        *,
-        rng: np.random.Generator,
-        runs: tuple[int, ...] = (),
-        t: float = 0.0,
+        self, prior: ArrayLike | Callable[..., Array] | tuple[ArrayLike, ArrayLike], *,
+        rng: np.random.Generator, runs: tuple[int, ...] = (), t: float = 0.0,
     ) -> ParticleState:
         """The state before the first step; arguments as for `EnsembleFilter.start`."""
         generator(rng)
@@ -139,11 +135,7 @@ class ParticleFilter(SensorFilter):
         return ParticleState(number(t, "t"), ledger, rng.spawn(1)[0], points, equal)
 
     def step(
-        self,
-        state: ParticleState,
-        t: float,
-        observations: Sequence[ArrayLike | None],
-        *,
+        self, state: ParticleState, t: float, observations: Sequence[ArrayLike | None], *,
         late: Sequence[Late] = (),
     ) -> ParticleState:
         """Move to time `t` and weigh the particles by what was observed there.

@@ -53,11 +53,7 @@ class Recorder:
     """
 
     def __init__(
-        self,
-        filter_: Any,
-        times: Array,
-        start: Any,
-        truth: ArrayLike | None,
+        self, filter_: Any, times: Array, start: Any, truth: ArrayLike | None,
         scores: Collection[str],
     ) -> None:
         self.filter, self.times = filter_, times

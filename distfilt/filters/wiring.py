@@ -158,11 +158,8 @@ class SensorFilter(Filter):
         return match[0], self.observed(state, observations)
 
     def settle(
-        self,
-        errors: dict[tuple[int, ...], str],
-        agents: Sequence[int] | NDArray[np.intp],
-        t: float,
-        failed: Mask,
+        self, errors: dict[tuple[int, ...], str], agents: Sequence[int] | NDArray[np.intp],
+        t: float, failed: Mask,
     ) -> Mask:
         """The runs that have failed by now, or the error that names the first of them."""
         if not errors:

@@ -151,14 +151,8 @@ def unscented_analysis(
 
 
 def over_time(
-    y: Array,
-    grid: Array,
-    mean: ArrayLike,
-    cov: ArrayLike,
-    dim: int,
-    forecast: Forecast,
-    analyse: Analysis,
-    error_dim: int | None = None,
+    y: Array, grid: Array, mean: ArrayLike, cov: ArrayLike, dim: int, forecast: Forecast,
+    analyse: Analysis, error_dim: int | None = None,
 ) -> GaussianRun:
     """Forecast and analysis of checked observations (T, ..., m) at times after the first of grid.
 

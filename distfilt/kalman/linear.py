@@ -46,14 +46,8 @@ class GaussianRun:
 
 
 def kalman_filter(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    observations: ArrayLike,
-    *,
-    F: ArrayLike,
-    H: ArrayLike,
-    Q: ArrayLike,
-    R: ArrayLike,
+    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, F: ArrayLike, H: ArrayLike,
+    Q: ArrayLike, R: ArrayLike,
 ) -> GaussianRun:
     r"""Filter T observations of a linear Gaussian model, for any number of runs at once.
 

@@ -118,15 +118,8 @@ def quaternion_chart(dim: int, first: int) -> Chart:
 
 
 def multiplicative_filter(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    observations: ArrayLike,
-    *,
-    chart: Chart,
-    model: Model,
-    sensors: Sequence[Sensor],
-    times: ArrayLike,
-    t0: float = 0.0,
+    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, chart: Chart, model: Model,
+    sensors: Sequence[Sensor], times: ArrayLike, t0: float = 0.0,
 ) -> GaussianRun:
     r"""The extended Kalman filter on a chart's errors, over series of observations.
 

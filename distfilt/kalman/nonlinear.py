@@ -100,14 +100,8 @@ def extended_update(
 
 
 def extended_filter(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    observations: ArrayLike,
-    *,
-    model: Model,
-    sensors: Sequence[Sensor],
-    times: ArrayLike,
-    t0: float = 0.0,
+    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, model: Model,
+    sensors: Sequence[Sensor], times: ArrayLike, t0: float = 0.0,
 ) -> GaussianRun:
     r"""The extended Kalman filter over series of observations, all runs at once.
 
@@ -157,15 +151,8 @@ def extended_filter(
 
 
 def unscented_predict(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    model: Model,
-    t: float,
-    dt: float,
-    *,
-    alpha: float = 1.0,
-    beta: float = 0.0,
-    kappa: float = 1.0,
+    mean: ArrayLike, cov: ArrayLike, model: Model, t: float, dt: float, *, alpha: float = 1.0,
+    beta: float = 0.0, kappa: float = 1.0,
 ) -> tuple[Array, Array]:
     r"""Forecast Gaussians by 2 d + 1 points that the model moves: means and covariances.
 
@@ -198,14 +185,8 @@ def unscented_predict(
 
 
 def unscented_update(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    observed: ArrayLike,
-    sensor: Sensor,
-    *,
-    alpha: float = 1.0,
-    beta: float = 0.0,
-    kappa: float = 1.0,
+    mean: ArrayLike, cov: ArrayLike, observed: ArrayLike, sensor: Sensor, *, alpha: float = 1.0,
+    beta: float = 0.0, kappa: float = 1.0,
 ) -> tuple[Array, Array, Array]:
     r"""Condition Gaussians on readings, by what the sensor makes of 2 d + 1 points.
 
@@ -242,17 +223,9 @@ def unscented_update(
 
 
 def unscented_filter(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    observations: ArrayLike,
-    *,
-    model: Model,
-    sensors: Sequence[Sensor],
-    times: ArrayLike,
-    t0: float = 0.0,
-    alpha: float = 1.0,
-    beta: float = 0.0,
-    kappa: float = 1.0,
+    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, model: Model,
+    sensors: Sequence[Sensor], times: ArrayLike, t0: float = 0.0, alpha: float = 1.0,
+    beta: float = 0.0, kappa: float = 1.0,
 ) -> GaussianRun:
     r"""The unscented Kalman filter over series of observations, all runs at once.
 

@@ -29,15 +29,8 @@ __all__ = ["filterpy_ekf", "filterpy_kf", "filterpy_ukf"]
 
 
 def filterpy_kf(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    observations: ArrayLike,
-    *,
-    F: ArrayLike,
-    H: ArrayLike,
-    Q: ArrayLike,
-    R: ArrayLike,
-    likelihood: bool = True,
+    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, F: ArrayLike, H: ArrayLike,
+    Q: ArrayLike, R: ArrayLike, likelihood: bool = True,
 ) -> GaussianRun:
     """Filterpy's Kalman filter over a series: arguments and result of :func:`kalman_filter`.
 
@@ -81,15 +74,8 @@ def filterpy_kf(
 
 
 def filterpy_ekf(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    observations: ArrayLike,
-    *,
-    model: Model,
-    sensors: Sequence[Sensor],
-    times: ArrayLike,
-    t0: float = 0.0,
-    likelihood: bool = False,
+    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, model: Model,
+    sensors: Sequence[Sensor], times: ArrayLike, t0: float = 0.0, likelihood: bool = False,
 ) -> GaussianRun:
     r"""Filterpy's extended Kalman filter over a series: linearise the model and the sensors.
 
@@ -139,18 +125,9 @@ def filterpy_ekf(
 
 
 def filterpy_ukf(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    observations: ArrayLike,
-    *,
-    model: Model,
-    sensors: Sequence[Sensor],
-    times: ArrayLike,
-    t0: float = 0.0,
-    alpha: float = 1.0,
-    beta: float = 0.0,
-    kappa: float = 1.0,
-    likelihood: bool = False,
+    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, model: Model,
+    sensors: Sequence[Sensor], times: ArrayLike, t0: float = 0.0, alpha: float = 1.0,
+    beta: float = 0.0, kappa: float = 1.0, likelihood: bool = False,
 ) -> GaussianRun:
     r"""Filterpy's unscented Kalman filter over a series: 2d + 1 points instead of derivatives.
 
@@ -219,13 +196,8 @@ def _unscented(
 
 
 def _over_runs(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    y: Array,
-    start: Callable[[Array, Array], Any],
-    step: Callable[[Any, int, Array, _Mask], None],
-    likelihood: bool,
-    dim: int | None = None,
+    mean: ArrayLike, cov: ArrayLike, y: Array, start: Callable[[Array, Array], Any],
+    step: Callable[[Any, int, Array, _Mask], None], likelihood: bool, dim: int | None = None,
 ) -> GaussianRun:
     """Run one of filterpy's objects over every run and every step."""
     x0, p0 = prior(mean, cov)

@@ -60,10 +60,7 @@ def _flag(value: Any) -> bool:
 
 
 def rmse(
-    estimate: ArrayLike,
-    truth: ArrayLike,
-    *,
-    axis: int | tuple[int, ...] | None = None,
+    estimate: ArrayLike, truth: ArrayLike, *, axis: int | tuple[int, ...] | None = None,
     per_component: bool = False,
 ) -> Array:
     r"""Root of the mean squared length of the error.

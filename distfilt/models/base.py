@@ -165,12 +165,8 @@ class LinearModel(Model):
 
     @classmethod
     def from_transition(
-        cls,
-        dim: int,
-        transition_matrix: Callable[[float], Array],
-        noise_cov: Callable[[float, float], Array],
-        *,
-        names: tuple[str, ...] = (),
+        cls, dim: int, transition_matrix: Callable[[float], Array],
+        noise_cov: Callable[[float, float], Array], *, names: tuple[str, ...] = (),
         units: tuple[str, ...] = (),
     ) -> LinearModel:
         """Build the model from its transition matrix, ``transition_matrix(dt) -> (d, d)``."""

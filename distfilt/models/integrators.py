@@ -17,11 +17,7 @@ _MOST = 10_000_000
 
 
 def rk4(
-    rate: Callable[[Array, float], Array],
-    x: ArrayLike,
-    t: float,
-    dt: float,
-    *,
+    rate: Callable[[Array, float], Array], x: ArrayLike, t: float, dt: float, *,
     longest: float | None = None,
 ) -> Array:
     r"""Advance :math:`\dot{\mathbf x} = \mathbf f(\mathbf x, t)` by the classical Runge-Kutta rule.
@@ -68,13 +64,8 @@ def rk4(
 
 
 def rk4_jacobian(
-    rate: Callable[[Array, float], Array],
-    slope: Callable[[Array, float], Array],
-    x: ArrayLike,
-    t: float,
-    dt: float,
-    *,
-    longest: float | None = None,
+    rate: Callable[[Array, float], Array], slope: Callable[[Array, float], Array], x: ArrayLike,
+    t: float, dt: float, *, longest: float | None = None,
 ) -> Array:
     r"""Derivative (..., d, d) of :func:`rk4` in the states it starts from, to rounding.
 

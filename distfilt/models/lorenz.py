@@ -56,11 +56,7 @@ def _slope(state: Array, prandtl: float, rho: float, beta: float) -> Array:
 
 
 def lorenz63(
-    *,
-    prandtl: float = 10.0,
-    rho: float = 28.0,
-    beta: float = 8 / 3,
-    sigma: float = 0.0,
+    *, prandtl: float = 10.0, rho: float = 28.0, beta: float = 8 / 3, sigma: float = 0.0,
     step: float = 0.01,
 ) -> Model:
     """Lorenz's model of 1963, integrated by Runge-Kutta of order 4 with a fixed step.

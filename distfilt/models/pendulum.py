@@ -88,12 +88,8 @@ def _slope(s: Array, size: float, g: float, printed: bool) -> Array:
 
 
 def pendulum(
-    *,
-    length: float = 1.0,
-    gravity: float = 9.8,
-    form: str = "printed",
-    sigma: tuple[float, float] = (0.0, 0.0),
-    step: float = 0.01,
+    *, length: float = 1.0, gravity: float = 9.8, form: str = "printed",
+    sigma: tuple[float, float] = (0.0, 0.0), step: float = 0.01,
 ) -> Model:
     """The pendulum in Cartesian coordinates x, y, vx, vy, by Runge-Kutta of order 4.
 
@@ -142,10 +138,7 @@ def _density(sigma: tuple[float, float], each: int) -> Array:
 
 
 def pendulum_angle(
-    *,
-    length: float = 1.0,
-    gravity: float = 9.8,
-    sigma: tuple[float, float] = (0.0, 0.0),
+    *, length: float = 1.0, gravity: float = 9.8, sigma: tuple[float, float] = (0.0, 0.0),
     step: float = 0.01,
 ) -> Model:
     r"""The pendulum in its chart: the angle θ from the vertical, not wrapped, and its rate.

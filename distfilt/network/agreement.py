@@ -28,11 +28,7 @@ _SINGULAR = 1e-13
 
 
 def pull(
-    ensembles: ArrayLike,
-    channel: Channel,
-    *,
-    gain: float,
-    rounds: int = 1,
+    ensembles: ArrayLike, channel: Channel, *, gain: float, rounds: int = 1,
     include_self: bool = True,
 ) -> Array:
     r"""Pull every member towards the neighbours' ensemble means, equation (16) of Grange et al.
@@ -83,13 +79,8 @@ def pull(
 
 
 def intersection(
-    ensembles: ArrayLike,
-    channel: Channel,
-    *,
-    rule: str = "min_determinant",
-    weights: Weights | ArrayLike | None = None,
-    scale: ArrayLike | None = None,
-    rounds: int = 1,
+    ensembles: ArrayLike, channel: Channel, *, rule: str = "min_determinant",
+    weights: Weights | ArrayLike | None = None, scale: ArrayLike | None = None, rounds: int = 1,
 ) -> Array:
     """Fuse mean and covariance by covariance intersection, then re-colour each ensemble.
 
@@ -130,11 +121,7 @@ def intersection(
 
 
 def barycentre(
-    ensembles: ArrayLike,
-    channel: Channel,
-    *,
-    scale: ArrayLike | None = None,
-    rounds: int = 1,
+    ensembles: ArrayLike, channel: Channel, *, scale: ArrayLike | None = None, rounds: int = 1,
     tolerance: float = 1e-10,
 ) -> Array:
     """Take the Bures-Wasserstein barycentre of the neighbourhood's Gaussians, then re-colour.

@@ -75,12 +75,7 @@ def gossip(values: ArrayLike, channel: Channel, *, rounds: int, rng: np.random.G
 
 
 def event_triggered(
-    values: ArrayLike,
-    channel: Channel,
-    *,
-    rounds: int,
-    threshold: float,
-    decay: float = 1.0,
+    values: ArrayLike, channel: Channel, *, rounds: int, threshold: float, decay: float = 1.0,
     weights: Weights | None = None,
 ) -> Array:
     r"""Average, but send only what has moved by more than a threshold since it was sent last.

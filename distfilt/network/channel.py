@@ -59,13 +59,8 @@ class Channel:
     """
 
     def __init__(
-        self,
-        graph: Graph,
-        *,
-        ledger: Ledger | None = None,
-        runs: tuple[int, ...] = (),
-        faults: Faults | None = None,
-        t: float | None = None,
+        self, graph: Graph, *, ledger: Ledger | None = None, runs: tuple[int, ...] = (),
+        faults: Faults | None = None, t: float | None = None,
     ) -> None:
         instance(graph, "graph", Graph)
         if ledger is not None and not isinstance(ledger, Ledger):
@@ -136,12 +131,8 @@ class Channel:
         ]
 
     def combine(
-        self,
-        values: ArrayLike,
-        weights: Weights | ArrayLike | sparse.sparray,
-        *,
-        lost: str = "mutual",
-        rounds: int = 1,
+        self, values: ArrayLike, weights: Weights | ArrayLike | sparse.sparray, *,
+        lost: str = "mutual", rounds: int = 1,
     ) -> Array:
         """Let every agent replace its value by a weighted sum of its own and what it hears.
 
@@ -174,10 +165,7 @@ class Channel:
         return v
 
     def combine_with_own(
-        self,
-        values: ArrayLike,
-        weights: Weights | ArrayLike | sparse.sparray,
-        *,
+        self, values: ArrayLike, weights: Weights | ArrayLike | sparse.sparray, *,
         lost: str = "mutual",
     ) -> tuple[Array, Array]:
         """As :meth:`combine`, with the weight that each agent's own value got, (*runs, A)."""
@@ -281,12 +269,7 @@ class Channel:
         return out.reshape(v.shape), own.reshape(*self.runs, size)
 
     def _sent(
-        self,
-        kind: str,
-        v: Array,
-        sizes: Any,
-        *,
-        speaks: Mask | None = None,
+        self, kind: str, v: Array, sizes: Any, *, speaks: Mask | None = None,
         acknowledged: bool = False,
     ) -> tuple[Array, Mask]:
         """Send vectors: those that arrive in this round, and on which links, (R, E)."""

@@ -62,13 +62,8 @@ def _connected(channel: Channel) -> None:
 
 
 def average(
-    values: ArrayLike,
-    channel: Channel,
-    *,
-    rounds: int = 1,
-    gain: float | None = None,
-    weights: Weights | None = None,
-    lost: str = "mutual",
+    values: ArrayLike, channel: Channel, *, rounds: int = 1, gain: float | None = None,
+    weights: Weights | None = None, lost: str = "mutual",
 ) -> Array:
     r"""Move every agent's value towards its neighbours', the averaging behind equation (16).
 

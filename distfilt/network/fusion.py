@@ -23,13 +23,8 @@ RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
 
 
 def covariance_intersection(
-    means: ArrayLike,
-    covs: ArrayLike,
-    channel: Channel,
-    *,
-    rule: str = "equal",
-    weights: Weights | ArrayLike | None = None,
-    rounds: int = 1,
+    means: ArrayLike, covs: ArrayLike, channel: Channel, *, rule: str = "equal",
+    weights: Weights | ArrayLike | None = None, rounds: int = 1,
 ) -> tuple[Array, Array]:
     r"""Each agent fuses its Gaussian with its neighbours', safely whatever they share.
 
@@ -74,11 +69,7 @@ def covariance_intersection(
 
 
 def _intersected(
-    means: Array,
-    covs: Array,
-    channel: Channel,
-    rule: str,
-    weights: Weights | ArrayLike | None,
+    means: Array, covs: Array, channel: Channel, rule: str, weights: Weights | ArrayLike | None,
     rounds: int,
 ) -> tuple[Array, Array]:
     """The same of arrays that were checked."""
@@ -204,12 +195,7 @@ def arithmetic_average(
 
 
 def consensus_pull(
-    means: ArrayLike,
-    covs: ArrayLike,
-    channel: Channel,
-    *,
-    gain: float,
-    rule: str = "scalar",
+    means: ArrayLike, covs: ArrayLike, channel: Channel, *, gain: float, rule: str = "scalar",
     rounds: int = 1,
 ) -> tuple[Array, Array]:
     r"""Pull each mean towards the neighbours': the consensus Kalman filter's step.

@@ -49,13 +49,8 @@ class Ledger:
         return cls(0, zero, zero, zero, np.zeros(zero.size))
 
     def charge(
-        self,
-        messages: Counts,
-        scalars: int | Counts,
-        bytes_: int | Counts,
-        *,
-        lost: Array | float = 0.0,
-        rounds: int = 1,
+        self, messages: Counts, scalars: int | Counts, bytes_: int | Counts, *,
+        lost: Array | float = 0.0, rounds: int = 1,
     ) -> Ledger:
         """The ledger after more rounds.
 

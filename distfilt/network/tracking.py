@@ -103,16 +103,8 @@ def stable_substeps(
 
 
 def pi_step(
-    state: PIState,
-    inputs: ArrayLike,
-    channel: Channel,
-    *,
-    dt: float,
-    alpha: float,
-    a: float,
-    b: float,
-    rate: ArrayLike | None = None,
-    substeps: int | None = None,
+    state: PIState, inputs: ArrayLike, channel: Channel, *, dt: float, alpha: float, a: float,
+    b: float, rate: ArrayLike | None = None, substeps: int | None = None,
 ) -> PIState:
     r"""One step of the proportional-integral estimator, equation (25) of Zheng et al.
 
@@ -178,13 +170,8 @@ def pi_step(
 
 
 def first_order(
-    estimates: ArrayLike,
-    inputs: ArrayLike,
-    previous: ArrayLike,
-    channel: Channel,
-    *,
-    weights: Weights | None = None,
-    lost: str = "mutual",
+    estimates: ArrayLike, inputs: ArrayLike, previous: ArrayLike, channel: Channel, *,
+    weights: Weights | None = None, lost: str = "mutual",
 ) -> Array:
     r"""One round of first-order dynamic average consensus.
 

@@ -18,12 +18,7 @@ __all__ = ["band", "ellipse", "graph"]
 
 
 def ellipse(
-    ax: Axes,
-    mean: ArrayLike,
-    covariance: ArrayLike,
-    *,
-    level: float = 0.95,
-    index: int = 0,
+    ax: Axes, mean: ArrayLike, covariance: ArrayLike, *, level: float = 0.95, index: int = 0,
     label: str | None = None,
 ) -> Axes:
     r"""Draw the ellipse that holds a share `level` of a plane Gaussian, and its mean.
@@ -64,13 +59,8 @@ def ellipse(
 
 
 def band(
-    ax: Axes,
-    x: ArrayLike,
-    runs: ArrayLike,
-    *,
-    quantiles: tuple[float, float] = (0.25, 0.75),
-    index: int = 0,
-    label: str | None = None,
+    ax: Axes, x: ArrayLike, runs: ArrayLike, *, quantiles: tuple[float, float] = (0.25, 0.75),
+    index: int = 0, label: str | None = None,
 ) -> Axes:
     """Draw the median over runs as a line, and a band between two quantiles over runs.
 
@@ -113,12 +103,8 @@ def band(
 
 
 def graph(
-    ax: Axes,
-    adjacency: ArrayLike,
-    *,
-    labels: tuple[str, ...] | list[str] | None = None,
-    positions: ArrayLike | None = None,
-    known: ArrayLike | None = None,
+    ax: Axes, adjacency: ArrayLike, *, labels: tuple[str, ...] | list[str] | None = None,
+    positions: ArrayLike | None = None, known: ArrayLike | None = None,
     notes: tuple[str, ...] | list[str] | None = None,
 ) -> Axes:
     """Draw agents as discs, the links between them as lines, and who knows how much.

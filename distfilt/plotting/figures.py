@@ -151,16 +151,9 @@ def check_axes(ax: Any) -> Axes:
 
 
 def axes(
-    *,
-    xlabel: str,
-    ylabel: str,
-    xunit: str | None = None,
-    yunit: str | None = None,
-    title: str | None = None,
-    ax: Axes | None = None,
-    xscale: str = "linear",
-    yscale: str = "linear",
-    size: tuple[float, float] = SIZE,
+    *, xlabel: str, ylabel: str, xunit: str | None = None, yunit: str | None = None,
+    title: str | None = None, ax: Axes | None = None, xscale: str = "linear",
+    yscale: str = "linear", size: tuple[float, float] = SIZE,
 ) -> Axes:
     """Labelled axes, in a new figure of the book's size unless `ax` is given.
 

@@ -164,15 +164,8 @@ class Slider:
 
 
 def slider(
-    draw: Callable[[Any], Any],
-    values: Sequence[Any],
-    *,
-    label: str,
-    alt: str,
-    unit: str | None = None,
-    form: str = "g",
-    start: int = 0,
-    seconds: float = 0.5,
+    draw: Callable[[Any], Any], values: Sequence[Any], *, label: str, alt: str,
+    unit: str | None = None, form: str = "g", start: int = 0, seconds: float = 0.5,
     colours: int = 32,
 ) -> Slider:
     """Draw a figure for each value, and go through them with a slider that needs no kernel.

@@ -16,11 +16,7 @@ __all__ = ["judge_parameters"]
 
 
 def judge_parameters(
-    paper: str,
-    item: str,
-    read: Reading | Sequence[Mapping[str, Any]],
-    *,
-    table: str = "agents",
+    paper: str, item: str, read: Reading | Sequence[Mapping[str, Any]], *, table: str = "agents",
     scenario: Scenario | None = None,
 ) -> Verdict:
     """The verdict on a table of parameters: "read" if the study read every cell as printed.

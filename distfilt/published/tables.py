@@ -104,10 +104,7 @@ class Table:
 
 
 def read_table(
-    path: str | Path,
-    *,
-    columns: Sequence[str] | None = None,
-    key: int = 1,
+    path: str | Path, *, columns: Sequence[str] | None = None, key: int = 1,
     numbers: Sequence[str] = (),
 ) -> Table:
     """Read a CSV file strictly.

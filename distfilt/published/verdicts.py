@@ -180,11 +180,7 @@ def distinct(ids: Sequence[str], name: str) -> None:
 
 
 def judge_table(
-    paper: str,
-    item: str,
-    values: Sequence[Value],
-    *,
-    why: str = "",
+    paper: str, item: str, values: Sequence[Value], *, why: str = "",
     scenario: Scenario | None = None,
 ) -> Verdict:
     """The verdict on a table of numbers: a match if every value matches; it lists the others.
@@ -255,11 +251,7 @@ class Claim:
 
 
 def judge_claims(
-    paper: str,
-    item: str,
-    claims: Sequence[Claim],
-    *,
-    why: str = "",
+    paper: str, item: str, claims: Sequence[Claim], *, why: str = "",
     scenario: Scenario | None = None,
 ) -> Verdict:
     """The verdict on a figure: a match if every claim listed for it is judged and holds.

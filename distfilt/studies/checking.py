@@ -21,12 +21,8 @@ __all__ = ["check"]
 
 
 def check(
-    path: str | Path | Stored,
-    trial: Callable[[SeedSequence], Any],
-    *,
-    indices: Iterable[int] | None = None,
-    rtol: float = 0.0,
-    workers: int | None = 1,
+    path: str | Path | Stored, trial: Callable[[SeedSequence], Any], *,
+    indices: Iterable[int] | None = None, rtol: float = 0.0, workers: int | None = 1,
     executor: Executor | None = None,
 ) -> Stored:
     """Run stored trials again and compare what they give now with what is stored.

@@ -82,11 +82,7 @@ class Stored:
 
 
 def store(
-    study: Study,
-    path: str | Path,
-    *,
-    parameters: Mapping[str, Any],
-    columns: Sequence[str],
+    study: Study, path: str | Path, *, parameters: Mapping[str, Any], columns: Sequence[str],
     code: Iterable[Callable[..., Any]] = (),
 ) -> Path:
     """Write a study's metrics to a CSV file: the same study gives the same bytes.

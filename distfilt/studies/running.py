@@ -25,15 +25,9 @@ __all__ = ["run"]
 
 
 def run(
-    trial: Callable[[SeedSequence], Any],
-    seeds: Iterable[SeedSequence | int],
-    *,
-    executor: Executor | None = None,
-    workers: int | None = None,
-    chunk: int | None = None,
-    errors: str = "raise",
-    timeout: float | None = None,
-    progress: bool = True,
+    trial: Callable[[SeedSequence], Any], seeds: Iterable[SeedSequence | int], *,
+    executor: Executor | None = None, workers: int | None = None, chunk: int | None = None,
+    errors: str = "raise", timeout: float | None = None, progress: bool = True,
     blas_threads: int | None = 1,
 ) -> Study:
     """Call ``trial(seed)`` for every seed, on as many processes as there are.

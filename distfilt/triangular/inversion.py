@@ -21,13 +21,8 @@ Function = Callable[[Array], tuple[Array, Array]]
 
 
 def invert(
-    function: Function,
-    target: ArrayLike,
-    *,
-    start: float = 0.0,
-    width: float = 1.0,
-    tolerance: float = 1e-13,
-    name: str = "target",
+    function: Function, target: ArrayLike, *, start: float = 0.0, width: float = 1.0,
+    tolerance: float = 1e-13, name: str = "target",
 ) -> Array:
     """Solve ``function(v) = target`` by Newton's method inside a shrinking bracket.
 

@@ -67,15 +67,8 @@ def pool_by_moments(
 
 
 def pool_by_admm(
-    y: ArrayLike,
-    x: ArrayLike,
-    channel: Channel,
-    *,
-    rho: float = 1.0,
-    tolerance: float = 1e-6,
-    iterations: int = 1000,
-    check: int | None = 1,
-    standardise: bool = True,
+    y: ArrayLike, x: ArrayLike, channel: Channel, *, rho: float = 1.0, tolerance: float = 1e-6,
+    iterations: int = 1000, check: int | None = 1, standardise: bool = True,
     agree: Agree = finite_time,
 ) -> tuple[AffineMap, AdmmRun]:
     r"""The same map by consensus ADMM on the components' coefficients, the paper's proposal.

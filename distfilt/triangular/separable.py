@@ -193,13 +193,8 @@ def _own_features(v: Array, steps: Array) -> tuple[Array, Array]:
 
 
 def fit(
-    y: ArrayLike,
-    x: ArrayLike,
-    *,
-    order: int | tuple[int, int],
-    regularisation: float = 0.0,
-    uses: Sequence[Collection[int]] | None = None,
-    least_slope: float = 0.1,
+    y: ArrayLike, x: ArrayLike, *, order: int | tuple[int, int], regularisation: float = 0.0,
+    uses: Sequence[Collection[int]] | None = None, least_slope: float = 0.1,
 ) -> SeparableMap:
     r"""Fit the separable map to samples: the minimiser of (12), regularised.
 

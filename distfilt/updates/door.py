@@ -26,7 +26,7 @@ Update = Callable[..., Array]
 
 
 def update(
-    function: Callable[Concatenate[Array, Array, Array, Array, P], Array],
+    function: Callable[Concatenate[Array, Array, Array, Array, P], Array]
 ) -> Callable[Concatenate[ArrayLike, ArrayLike, ArrayLike, ArrayLike, P], Array]:
     """Let a function that computes an update check what it is given.
 
@@ -59,12 +59,8 @@ def update(
 
     @wraps(function)
     def checked(
-        ensemble: ArrayLike,
-        predicted: ArrayLike,
-        observed: ArrayLike,
-        noise: ArrayLike,
-        *args: P.args,
-        **options: P.kwargs,
+        ensemble: ArrayLike, predicted: ArrayLike, observed: ArrayLike, noise: ArrayLike,
+        *args: P.args, **options: P.kwargs,
     ) -> Array:
         x = array(ensemble, "ensemble", (..., "N", "d"))
         if x.shape[-2] < 2:

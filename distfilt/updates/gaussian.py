@@ -86,14 +86,8 @@ def sampled_noise(
 
 @update
 def known_noise(
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
-    rng: np.random.Generator,
-    shrinkage: float = 0.0,
-    ridge: float = 0.0,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
+    shrinkage: float = 0.0, ridge: float = 0.0,
 ) -> Array:
     r"""Update with R itself in the gain, where :func:`sampled_noise` has a sample covariance.
 
@@ -168,12 +162,7 @@ def exact_draws(
 
 @update
 def square_root(
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
-    rng: np.random.Generator,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
     rotation: str = "random",
 ) -> Array:
     r"""Update mean and anomalies without perturbations, then turn the anomalies at random.

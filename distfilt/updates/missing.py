@@ -13,12 +13,7 @@ __all__ = ["Rows", "with_missing"]
 
 
 def with_missing(
-    update: Update,
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
+    update: Update, ensemble: Array, predicted: Array, observed: Array, noise: Array, *,
     rng: np.random.Generator,
 ) -> Array:
     """Apply an update where NaN marks a missing component; without any reading nothing moves.

@@ -206,10 +206,7 @@ def resample(
 
 
 def jitter(
-    points: ArrayLike,
-    *,
-    rng: np.random.Generator,
-    bandwidth: float | None = None,
+    points: ArrayLike, *, rng: np.random.Generator, bandwidth: float | None = None,
     cov: ArrayLike | None = None,
 ) -> Array:
     r"""Move equally weighted particles apart without moving their mean or covariance.

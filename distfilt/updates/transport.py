@@ -33,14 +33,8 @@ def _noisy(seen: Array, noise: Array, factor: float, rng: np.random.Generator) -
 
 @update
 def transport(
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
-    rng: np.random.Generator,
-    fit: Fit = affine.fit,
-    noise_factor: float = 1.0,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
+    fit: Fit = affine.fit, noise_factor: float = 1.0,
 ) -> Array:
     """Condition an ensemble with a composed map, equations (10)-(13) of Grange et al.
 
@@ -73,12 +67,7 @@ def transport(
 
 @update
 def transport_sample(
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
-    rng: np.random.Generator,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
     fit: Fit = affine.fit,
 ) -> Array:
     r"""Draw a new ensemble from the conditional by the inverse map alone, equation (9).
@@ -133,16 +122,8 @@ def principal_directions(ensemble: ArrayLike, n: int) -> Array:
 
 @update
 def principal_components(
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
-    rng: np.random.Generator,
-    n_state: int,
-    n_observed: int,
-    complement: str = "keep",
-    noise_factor: float = 1.0,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
+    n_state: int, n_observed: int, complement: str = "keep", noise_factor: float = 1.0,
     fit: Callable[[Array, Array], ConditionalMap] = affine.fit,
 ) -> Array:
     r"""Condition in the leading principal directions only, Algorithm 2 of Grange et al.
@@ -193,12 +174,7 @@ def principal_components(
 
 @update
 def informed_directions(
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
-    rng: np.random.Generator,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
     threshold: float = 0.05,
 ) -> Array:
     r"""Condition only on the directions of the observation in which signal stands above noise.

@@ -169,12 +169,7 @@ def serial(update: Update) -> Update:
     callable_(update, "update")
 
     def one_by_one(
-        x: Array,
-        h: Array,
-        y: Array,
-        r: Array,
-        *,
-        rng: np.random.Generator,
+        x: Array, h: Array, y: Array, r: Array, *, rng: np.random.Generator,
         predict: Callable[[Array], Array] | None = None,
     ) -> Array:
         d = x.shape[-1]
