@@ -41,15 +41,8 @@ _MEANING = {
 class Recorder:
     """Collects summaries and ledgers of a run, and makes one Dataset of them.
 
-    Parameters
-    ----------
-    filter_ : Filter
-        For names and units.
-    times : ndarray, (T,)
-    start : State
-        The state before the first step.
-    truth : array_like, (T, *runs, d), optional
-    scores : collection of {"squared_error", "nees", "crps"}
+    Names and units are the filter's; `start` is the state before the first step, `truth` (T, *runs,
+    d) what the scores compare with.
     """
 
     def __init__(

@@ -85,15 +85,9 @@ def _stream(
 
 
 class Rows(np.random.Generator):
-    """Normal draws for all ensembles of a batch, of which some are asked for.
+    """Normal draws for all ensembles of a batch (*lead), of which those in `where` are asked for.
 
-    Parameters
-    ----------
-    seed : list of int
-    lead : tuple of int
-        Leading axes of the batch.
-    where : ndarray of int or None
-        Which of its ensembles, counted flat; all of them if None.
+    `where` counts them flat; None stands for all.
     """
 
     def __init__(self, seed: list[int], lead: tuple[int, ...], where: Any) -> None:
