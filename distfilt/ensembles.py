@@ -54,8 +54,6 @@ def draw(
 def mean(ensemble: ArrayLike) -> Array:
     """Mean over the members, (..., d).
 
-    Examples
-    --------
     >>> mean([[1.0, 2.0], [3.0, 4.0]])
     array([2., 3.])
     """
@@ -70,8 +68,6 @@ def _mean(e: Array) -> Array:
 def anomalies(ensemble: ArrayLike) -> Array:
     """Members minus their mean, (..., N, d).
 
-    Examples
-    --------
     >>> anomalies([[1.0], [3.0]])
     array([[-1.],
            [ 1.]])
@@ -86,8 +82,6 @@ def _anomalies(e: Array) -> Array:
 def sample_covariance(ensemble: ArrayLike) -> Array:
     """Sample covariance with N - 1 in the denominator, (..., d, d).
 
-    Examples
-    --------
     >>> sample_covariance([[0.0, 0.0], [2.0, 4.0]])
     array([[2., 4.],
            [4., 8.]])
@@ -103,8 +97,6 @@ def _sample_covariance(e: Array) -> Array:
 def cross_covariance(ensemble: ArrayLike, other: ArrayLike) -> Array:
     """Sample covariance between two ensembles of the same members, (..., d, m).
 
-    Examples
-    --------
     >>> cross_covariance([[0.0], [2.0]], [[1.0], [5.0]])
     array([[4.]])
     """

@@ -28,8 +28,6 @@ def symmetrise(matrix: ArrayLike) -> Array:
 
     Called once, where a product loses symmetry by rounding.
 
-    Examples
-    --------
     >>> symmetrise([[1.0, 0.4], [0.2, 1.0]])
     array([[1. , 0.3],
            [0.3, 1. ]])
@@ -256,8 +254,6 @@ def _quadratic_form(lower: Array, vector: Array) -> Array:
 def log_det(cov: ArrayLike) -> Array:
     """Logarithm of the determinant of a positive definite matrix, (...).
 
-    Examples
-    --------
     >>> round(float(log_det([[2.0, 0.0], [0.0, 3.0]])), 6)
     1.791759
     """

@@ -25,8 +25,6 @@ class UnstableGain(RuntimeWarning):
 
     Turn it into an error, or off, by ``warnings.filterwarnings("error", category=UnstableGain)``.
 
-    Examples
-    --------
     >>> issubclass(UnstableGain, RuntimeWarning)
     True
     """

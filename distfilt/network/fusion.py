@@ -145,8 +145,6 @@ def naive_fusion(
     fused before: the covariance shrinks in every round, the error does not. Kept to show that.
     Parameters, returns and errors as for :func:`covariance_intersection`.
 
-    Examples
-    --------
     >>> from distfilt.network import Channel, graphs
     >>> two = naive_fusion([[0.0], [3.0]], [[[1.0]], [[2.0]]], Channel(graphs.path(2)))
     >>> two[1].ravel().round(6)
@@ -172,8 +170,6 @@ def arithmetic_average(
     With equal weights. Disagreement adds to the covariance, so an outlier does not go unnoticed.
     Parameters, returns and errors as for :func:`covariance_intersection`.
 
-    Examples
-    --------
     >>> from distfilt.network import Channel, graphs
     >>> two = arithmetic_average([[0.0], [3.0]], [[[1.0]], [[2.0]]], Channel(graphs.path(2)))
     >>> two[0].ravel(), two[1].ravel()

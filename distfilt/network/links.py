@@ -258,8 +258,6 @@ class Graph:
     def hops(self, agent: int) -> Indices:
         """How many rounds news of an agent takes to reach each, (A,); -1 where it never does.
 
-        Examples
-        --------
         >>> from distfilt.network import graphs
         >>> graphs.path(4).hops(1)
         array([1, 0, 1, 2])

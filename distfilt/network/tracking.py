@@ -45,8 +45,6 @@ class PIState:
 def pi_start(estimate: ArrayLike) -> PIState:
     """The state before the first step: any first estimates, (*runs, A, k), no integral.
 
-    Examples
-    --------
     >>> pi_start([[1.0], [3.0]]).estimate.shape
     (2, 1)
     """

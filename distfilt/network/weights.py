@@ -141,8 +141,6 @@ def metropolis(graph: Graph) -> Weights:
 def maximum_degree(graph: Graph) -> Weights:
     """Equal weights 1 / (1 + the largest degree) on every link; needs that one global number.
 
-    Examples
-    --------
     >>> from distfilt.network import graphs
     >>> maximum_degree(graphs.star(3)).own.round(3)
     array([0.333, 0.667, 0.667])
@@ -277,8 +275,6 @@ def gossip(graph: Graph) -> Weights:
     An agent wakes with probability 1 / A and meets one of its neighbours. The second largest
     eigenvalue bounds the factor by which the mean squared disagreement shrinks in each meeting.
 
-    Examples
-    --------
     >>> from distfilt.network import graphs
     >>> gossip(graphs.path(2)).own
     array([0.5, 0.5])
@@ -294,8 +290,6 @@ def push(graph: Graph) -> Weights:
 
     An agent needs to know only how many hear it.
 
-    Examples
-    --------
     >>> from distfilt.network import Graph
     >>> circle = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1)], directed=True)
     >>> push(circle).own
@@ -313,8 +307,6 @@ def balanced(graph: Graph) -> Weights:
     =\mathbf p^\top\mathbf L=\mathbf 0`. Averaging then keeps the average on a digraph too. The
     vector is global knowledge: agents compute it together once, or are told.
 
-    Examples
-    --------
     >>> from distfilt.network import Graph
     >>> circle = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1)], directed=True)
     >>> balanced(circle).matrix.toarray().sum(axis=0)
@@ -331,8 +323,6 @@ def balanced(graph: Graph) -> Weights:
 def keeping(weights: Weights) -> Weights:
     """The weights themselves, or a ValueError if their columns do not sum to one.
 
-    Examples
-    --------
     >>> from distfilt.network import graphs
     >>> keeping(metropolis(graphs.path(3))).own.round(3)
     array([0.667, 0.333, 0.667])

@@ -43,8 +43,6 @@ _DPI = 110
 def colour(index: int) -> str:
     """The palette's colour number `index`, counted from 0; it starts again after the last.
 
-    Examples
-    --------
     >>> colour(0), colour(8)
     ('#0072B2', '#0072B2')
     """
@@ -54,8 +52,6 @@ def colour(index: int) -> str:
 def line_style(index: int) -> Any:
     """The line style that goes with colour number `index`.
 
-    Examples
-    --------
     >>> line_style(0), line_style(1)
     ('-', '--')
     """
@@ -70,8 +66,6 @@ def use_style() -> None:
     picture, becomes the digest of what its axes hold (:func:`distfilt.digests.of_axes`): a curve
     that changes is noticed by whoever compares stored outputs.
 
-    Examples
-    --------
     >>> from matplotlib import rc_context, rcParams
     >>> with rc_context():  # so that this example leaves no trace
     ...     use_style()

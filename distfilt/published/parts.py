@@ -34,8 +34,6 @@ _UNITS = {
 class UnknownKey(KeyError, ValueError):
     """A scenario or a row has nothing of that name; the message lists the nearest names.
 
-    Examples
-    --------
     >>> from distfilt.published import scenario
     >>> try:
     ...     scenario("grange", "table-2")["gian"]

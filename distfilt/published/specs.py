@@ -138,8 +138,6 @@ class Scenario:
     def replace(self, **values: Any) -> Scenario:
         """The scenario with other values of some parameters; units and places stay.
 
-        Examples
-        --------
         >>> from distfilt.published import scenario
         >>> scenario("grange", "table-2").replace(members=50)["members"]
         50
@@ -151,8 +149,6 @@ class Scenario:
     def replace_row(self, name: str, *, table: str = _AGENTS, **cells: Any) -> Scenario:
         """The scenario with other cells in one row.
 
-        Examples
-        --------
         >>> from distfilt.published import scenario
         >>> s = scenario("grange", "table-2").replace_row("B", kind="range", unit="m")
         >>> s.changes
@@ -286,8 +282,6 @@ class Reading(Scenario):
     none. A copy that travels to a worker process remembers there, not here: take what a trial
     needs before the study starts.
 
-    Examples
-    --------
     >>> from distfilt.published import scenario
     >>> s = scenario("grange", "table-2").reading()
     >>> gain, noise = s["gain"], s.agents[1].noise

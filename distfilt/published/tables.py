@@ -35,8 +35,6 @@ def root() -> Path:
     It is the working copy's that the process runs in, or the one that the library carries;
     :func:`distfilt.folders.data_root` has the rule.
 
-    Examples
-    --------
     >>> (root() / "published" / "items.csv").is_file()
     True
     """
@@ -248,8 +246,6 @@ class Item:
 def items() -> tuple[Item, ...]:
     """The tables and figures of the four papers that the book reproduces.
 
-    Examples
-    --------
     >>> len(items())
     21
     >>> items()[1].item

@@ -14,8 +14,6 @@ __all__ = ["ConditionalMap", "compose"]
 class ConditionalMap(Protocol):
     """What a map offers: z = S(y, x), its inverse in x, the derivative's log-determinant.
 
-    Examples
-    --------
     Whatever has these three methods is one:
 
     >>> class Shift:

@@ -85,8 +85,6 @@ def update(
 def unchecked(update: Update) -> Update:
     """The update without its checks, with the options that :func:`functools.partial` gave it.
 
-    Examples
-    --------
     >>> unchecked(print) is print
     True
     """
@@ -100,8 +98,6 @@ def stackable(update: Update) -> bool:
 
     True for every update of this package; a plain function gets one agent's at a time.
 
-    Examples
-    --------
     >>> stackable(print)
     False
     """
@@ -113,8 +109,6 @@ def stackable(update: Update) -> bool:
 def joined(wrapper: Callable[..., Array], inner: Update) -> Update:
     """A wrapper's own door, as stackable as what it wraps.
 
-    Examples
-    --------
     >>> stackable(joined(lambda x, h, y, r, *, rng: x, print))
     False
     """
