@@ -108,11 +108,6 @@ def of_axes(drawn: Any) -> str:
         visible line, patch, collection (points, filled areas, contours, arrows) and image, in the
         order in which they were added. A coordinate that the artist before it has too is left out.
 
-    Raises
-    ------
-    ValueError
-        If something else is passed, or nothing is drawn.
-
     Notes
     -----
     Positions are in the units of the data, colours and texts are not read; of what is coloured by

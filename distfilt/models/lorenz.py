@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import Array, array, number
 from .base import Model
-from .integrators import rk4, rk4_jacobian
+from .integrators import _integrated
 
 __all__ = ["lorenz63", "lorenz63_rate"]
 
@@ -78,22 +78,7 @@ def lorenz63(
     """
     s, r, b = number(prandtl, "prandtl"), number(rho, "rho"), number(beta, "beta")
     density = number(sigma, "sigma", at_least=0) ** 2 * np.eye(3)
-    longest = number(step, "step", above=0)
-
-    def rate(x: Array, _: float) -> Array:
-        return _rate(x, s, r, b)
-
-    def flow(x: Array, t: float, dt: float) -> Array:
-        return rk4(rate, x, t, dt, longest=longest)
-
-    def derivative(x: Array, t: float, dt: float) -> Array:
-        return rk4_jacobian(rate, lambda v, _: _slope(v, s, r, b), x, t, dt, longest=longest)
-
-    return Model(
-        3,
-        flow,
-        lambda t, dt: density * dt,
-        derivative=derivative,
-        names=("x", "y", "z"),
-        units=("1",) * 3,
+    return _integrated(
+        lambda x, _: _rate(x, s, r, b), lambda x, _: _slope(x, s, r, b), density, step=step,
+        names=("x", "y", "z"), units=("1",) * 3,
     )

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import Array, array, choice, number
 from .base import Model
-from .integrators import rk4, rk4_jacobian
+from .integrators import _integrated
 
 __all__ = [  # fmt: skip
     "FORMS", "pendulum", "pendulum_angle", "pendulum_chart", "pendulum_energy", "pendulum_rate",
@@ -111,22 +111,9 @@ def pendulum(
     """
     size, g = number(length, "length", above=0), number(gravity, "gravity", at_least=0)
     printed = choice(form, "form", FORMS) == "printed"
-    longest = number(step, "step", above=0)
-    density = _density(sigma, 2)
-
-    def rate(x: Array, _: float) -> Array:
-        return _rate(x, size, g, printed)
-
-    def slope(x: Array, _: float) -> Array:
-        return _slope(x, size, g, printed)
-
-    return Model(
-        4,
-        lambda x, t, dt: rk4(rate, x, t, dt, longest=longest),
-        lambda t, dt: density * dt,
-        derivative=lambda x, t, dt: rk4_jacobian(rate, slope, x, t, dt, longest=longest),
-        names=("x", "y", "vx", "vy"),
-        units=("m", "m", "m/s", "m/s"),
+    return _integrated(
+        lambda x, _: _rate(x, size, g, printed), lambda x, _: _slope(x, size, g, printed),
+        _density(sigma, 2), step=step, names=("x", "y", "vx", "vy"), units=("m", "m", "m/s", "m/s"),
     )
 
 
@@ -158,8 +145,6 @@ def pendulum_angle(
     array([0.01  , 0.9995])
     """
     size, g = number(length, "length", above=0), number(gravity, "gravity", at_least=0)
-    longest = number(step, "step", above=0)
-    density = _density(sigma, 1)
 
     def rate(x: Array, _: float) -> Array:
         out = np.empty_like(x)
@@ -173,12 +158,8 @@ def pendulum_angle(
         out[..., 1, 0] = -(g / size) * np.cos(x[..., 0])
         return out
 
-    return Model(
-        2,
-        lambda x, t, dt: rk4(rate, x, t, dt, longest=longest),
-        lambda t, dt: density * dt,
-        derivative=lambda x, t, dt: rk4_jacobian(rate, slope, x, t, dt, longest=longest),
-        names=("theta", "omega"),
+    return _integrated(
+        rate, slope, _density(sigma, 1), step=step, names=("theta", "omega"),
         units=("rad", "rad/s"),
     )
 

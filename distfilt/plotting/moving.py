@@ -197,16 +197,6 @@ def slider(
     colours : int
         Colours of a frame's palette, 2 to 256. Few make a small file.
 
-    Returns
-    -------
-    Slider
-        The last value of a notebook's cell shows it.
-
-    Raises
-    ------
-    ValueError
-        If there is nothing to draw, sizes differ, or all frames together are too large for a page.
-
     Examples
     --------
     >>> from distfilt.plotting import axes, slider

@@ -261,16 +261,11 @@ def judge_claims(
     paper, item : str
         One of `items`; its claims are listed in ``published/KEY/figure-N.csv``.
     claims : sequence of Claim
-        Every listed claim, once.
+        Every listed claim, once; none may have its criterion open.
     why : str
         Why it differs; needed and used only if a claim fails.
     scenario : Scenario, optional
         What the study ran, as of `judge_table`.
-
-    Raises
-    ------
-    ValueError
-        If a claim is not listed, a listed one is missing, or its criterion is still open.
 
     Examples
     --------

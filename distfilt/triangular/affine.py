@@ -116,12 +116,7 @@ def fit(y: ArrayLike, x: ArrayLike) -> AffineMap:
     y : array_like, (..., N, m)
         Predicted observations, with noise; m may be 0 for a map of x alone.
     x : array_like, (..., N, d)
-        Members.
-
-    Raises
-    ------
-    ValueError
-        With too few members (N ≤ m + d), or where a variable is constant or repeats others.
+        Members, more than m + d. No variable may be constant or repeat others.
 
     Examples
     --------

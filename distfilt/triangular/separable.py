@@ -138,7 +138,7 @@ class SeparableMap:
         heights = _ROOT * self.steps[1][..., k, :] * rest
         low = (aim - heights.sum(axis=-1, keepdims=True)) / first
         high = aim / first
-        return _newton(own, aim, low, high, 0.5 * (low + high), 1e-13)
+        return _newton(own, aim, low, high, 0.5 * (low + high))
 
     def __call__(self, y: ArrayLike, x: ArrayLike) -> Array:
         """Reference samples S(y, x), (..., N, d), of members y (..., N, m) and x (..., N, d)."""
