@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -94,12 +94,10 @@ class SensorFilter(Filter):
             raise ValueError(f"names: needs {len(self.sensors)} names, got {len(self.names)}")
 
     def _check_graph(self, graph: Any) -> Graph:
-        instance(graph, "graph", Graph)
-        if graph.size != len(self.sensors):
-            raise ValueError(
-                f"graph: needs {len(self.sensors)} agents like sensors, got {graph.size}"
-            )
-        return graph
+        size, needed = instance(graph, "graph", Graph).size, len(self.sensors)
+        if size != needed:
+            raise ValueError(f"graph: needs {needed} agents like sensors, got {size}")
+        return cast(Graph, graph)
 
     @property
     def agents(self) -> tuple[str, ...]:
