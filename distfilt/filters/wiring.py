@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -94,10 +94,10 @@ class SensorFilter(Filter):
             raise ValueError(f"names: needs {len(self.sensors)} names, got {len(self.names)}")
 
     def _check_graph(self, graph: Any) -> Graph:
-        size, needed = instance(graph, "graph", Graph).size, len(self.sensors)
-        if size != needed:
-            raise ValueError(f"graph: needs {needed} agents like sensors, got {size}")
-        return cast(Graph, graph)
+        found, size = instance(graph, "graph", Graph), len(self.sensors)
+        if found.size != size:
+            raise ValueError(f"graph: needs {size} agents like sensors, got {found.size}")
+        return found
 
     @property
     def agents(self) -> tuple[str, ...]:
