@@ -190,9 +190,8 @@ def predict(mean: ArrayLike, cov: ArrayLike, *, F: ArrayLike, Q: ArrayLike) -> t
 
     Parameters
     ----------
-    mean : array_like, (..., d)
-    cov : array_like, (..., d, d)
-        Positive definite.
+    mean, cov : array_like, (..., d) and (..., d, d)
+        The covariance positive definite.
     F, Q : array_like, (d, d)
         Transition, and process noise covariance (positive semidefinite).
 
@@ -222,9 +221,8 @@ def update(
 
     Parameters
     ----------
-    mean : array_like, (..., d)
-    cov : array_like, (..., d, d)
-        Positive definite.
+    mean, cov : array_like, (..., d) and (..., d, d)
+        The covariance positive definite.
     observed : array_like, (..., m)
         NaN marks a missing component.
     H : array_like, (m, d)

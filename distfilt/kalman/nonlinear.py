@@ -41,9 +41,8 @@ def extended_predict(
 
     Parameters
     ----------
-    mean : array_like, (..., d)
-    cov : array_like, (..., d, d)
-        Positive definite.
+    mean, cov : array_like, (..., d) and (..., d, d)
+        The covariance positive definite.
     model : Model
         Its `jacobian` is used.
     t, dt : float
@@ -69,9 +68,8 @@ def extended_update(
 
     Parameters
     ----------
-    mean : array_like, (..., d)
-    cov : array_like, (..., d, d)
-        Positive definite.
+    mean, cov : array_like, (..., d) and (..., d, d)
+        The covariance positive definite.
     observed : array_like, (..., m)
         NaN marks a missing component.
     sensor : Sensor

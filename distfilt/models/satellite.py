@@ -46,10 +46,8 @@ def clohessy_wiltshire_transition(rate: float, dt: float) -> Array:
 
     Parameters
     ----------
-    rate : float
-        Orbital rate of the chief, in rad/s, positive.
-    dt : float
-        The step, in s, at least 0.
+    rate, dt : float
+        Orbital rate of the chief, in rad/s, positive; the step, in s, at least 0.
 
     Notes
     -----

@@ -115,10 +115,9 @@ def finite_time(values: ArrayLike, channel: Channel) -> Array:
 
     Parameters
     ----------
-    values : array_like, (*runs, A, k)
-        One vector per agent.
-    channel : Channel
-        Connected, with links both ways, and without faults: one lost message spoils the product.
+    values, channel
+        As for :func:`average`. Connected, with links both ways, and without faults: one lost
+        message spoils the product.
 
     Notes
     -----
@@ -173,10 +172,8 @@ def push_sum(values: ArrayLike, channel: Channel, *, rounds: int) -> Array:
 
     Parameters
     ----------
-    values : array_like, (*runs, A, k)
-        One vector per agent.
-    channel : Channel
-        Strongly connected; messages may be lost.
+    values, channel
+        As for :func:`average`. Strongly connected; messages may be lost.
     rounds : int
         How many rounds; k + 1 scalars a link and round.
 
@@ -225,10 +222,8 @@ def maximum(values: ArrayLike, channel: Channel, *, rounds: int | None = None) -
 
     Parameters
     ----------
-    values : array_like, (*runs, A, k)
-        One vector per agent.
-    channel : Channel
-        Connected. A lost message only costs time.
+    values, channel
+        As for :func:`average`. Connected; a lost message only costs time.
     rounds : int, optional
         By default the graph's diameter; with more than 1 000 agents ``graph.diameter_bound``, which
         is enough, and at most twice as much, where the diameter itself would take long to find.

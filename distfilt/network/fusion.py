@@ -206,10 +206,8 @@ def consensus_pull(
 
     Parameters
     ----------
-    means : array_like, (*runs, A, d)
-        Each agent's mean.
-    covs : array_like, (*runs, A, d, d)
-        Each agent's covariance, positive definite.
+    means, covs
+        As for :func:`covariance_intersection`.
     channel : Channel
         Only means go over each link, d scalars. A mean that is lost does not pull.
     gain : float

@@ -180,16 +180,10 @@ def first_order(
 
     Parameters
     ----------
-    estimates : array_like, (*runs, A, k)
-        One per agent.
-    inputs, previous : array_like, (*runs, A, k)
-        What the agents measure now and measured a round ago.
-    channel : Channel
-        The door between agents.
-    weights : Weights, optional
-        Metropolis by default. Columns have to sum to one.
-    lost : str
-        See :meth:`Channel.combine`.
+    estimates, inputs, previous : array_like, (*runs, A, k)
+        One per agent: what they believe, measure now, and measured a round ago.
+    channel, weights, lost
+        As for :func:`distfilt.network.average`.
 
     Notes
     -----

@@ -35,10 +35,8 @@ def ellipse(
         Positive semidefinite; a singular one gives a line.
     level : float
         Probability inside, in (0, 1). One standard deviation is 0.393.
-    index : int
-        Number of the colour and line style.
-    label : str, optional
-        For the legend.
+    index, label
+        Number of the colour and line style, and what the legend says.
 
     Examples
     --------
@@ -74,10 +72,8 @@ def band(
         One curve a run.
     quantiles : (float, float)
         Lower and upper end of the band, in [0, 1], increasing.
-    index : int
-        Number of the colour and line style.
-    label : str, optional
-        For the legend.
+    index, label
+        Number of the colour and line style, and what the legend says.
 
     Examples
     --------

@@ -159,10 +159,8 @@ def scenario(paper: str, name: str) -> Scenario:
 
     Parameters
     ----------
-    paper : {"grange", "das", "semeraro", "zheng"}
-        The paper's key.
-    name : str
-        Such as ``table-2``.
+    paper, name : str
+        One of `PAPERS`, and such as ``table-2``.
 
     Examples
     --------

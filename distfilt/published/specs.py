@@ -107,10 +107,6 @@ class Scenario:
         """Whether a parameter is given, inferred or assumed."""
         return self.parameter(key).source
 
-    def reason(self, key: str) -> str:
-        """Why a parameter has its value, or where the paper gives it."""
-        return self.parameter(key).why
-
     def rows(self, table: str = _AGENTS) -> tuple[Row, ...]:
         """The rows of one of its tables, in the file's order."""
         if table not in self.tables:

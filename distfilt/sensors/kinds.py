@@ -49,14 +49,7 @@ def _variance(std: float, size: int) -> Array:
 
 
 def direct(indices: Sequence[int], *, std: float) -> Sensor:
-    """See some components of the state as they are, ``h(x) = x[indices]``.
-
-    Parameters
-    ----------
-    indices : sequence of int
-        The components, counted from 0.
-    std : float
-        Standard deviation of each reading, in the component's unit, positive.
+    """See some components as they are, ``h(x) = x[indices]``, with a standard deviation `std` each.
 
     Examples
     --------
@@ -78,14 +71,7 @@ def direct(indices: Sequence[int], *, std: float) -> Sensor:
 
 
 def differential(indices: Sequence[int], *, std: float) -> Sensor:
-    """See how much some components changed since the previous observation time.
-
-    Parameters
-    ----------
-    indices : sequence of int
-        The components, counted from 0.
-    std : float
-        Standard deviation of each reading, positive.
+    """See how much some components changed since the previous observation time, to `std` each.
 
     Examples
     --------
@@ -211,8 +197,8 @@ def distance_and_angle(
         The components a and b; the angle is ``arctan2(b, a)``, which repeats after 2π.
     std : (float, float)
         Standard deviations of the distance, in the components' unit, and of the angle, in rad.
-    origin : array_like, (2,), optional
-        Where the sensor stands; zero by default.
+    origin
+        Where the sensor stands, as for :func:`angle`.
 
     Examples
     --------

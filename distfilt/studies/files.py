@@ -203,10 +203,8 @@ def stored(paper: str, name: str) -> Stored:
 
     Parameters
     ----------
-    paper : str
-        The paper's key.
-    name : str
-        Such as ``figure-2``.
+    paper, name : str
+        The paper's key, and such as ``figure-2``.
     """
     root = data_root() / "studies"
     there = sorted(p.relative_to(root).with_suffix("").as_posix() for p in root.glob("*/*.csv"))

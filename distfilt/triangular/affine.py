@@ -291,10 +291,8 @@ def fit_convex(
 
     Parameters
     ----------
-    y : array_like, (N, m)
-        Predicted observations, with noise.
-    x : array_like, (N, d)
-        Members.
+    y, x : array_like, (N, m) and (N, d)
+        As for :func:`fit`.
     solver : {"ECOS", "CLARABEL"}
         A conic solver, at its default tolerances.
     max_iters : int, optional

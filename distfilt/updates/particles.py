@@ -186,10 +186,8 @@ def resample(
 
     Parameters
     ----------
-    particles : Particles
-    rng : numpy.random.Generator
-    rule : {"systematic", "stratified", "residual", "multinomial"}
-        As for :func:`resampled`.
+    particles, rng, rule
+        Of what; the others as for :func:`resampled`.
 
     Examples
     --------

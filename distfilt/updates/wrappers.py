@@ -28,10 +28,8 @@ def inflated(update: Update, *, factor: float) -> Update:
 
     Parameters
     ----------
-    update : callable
-        Any update.
-    factor : float
-        Positive; the standard deviations grow by it in every update.
+    update, factor
+        Any update; by what its standard deviations grow each time, positive.
 
     Notes
     -----
@@ -64,10 +62,8 @@ def gated(update: Update, *, probability: float = 0.999) -> Update:
 
     Parameters
     ----------
-    update : callable
-        Any update.
-    probability : float
-        Between 0 and 1: how likely a good reading passes.
+    update, probability
+        Any update; how likely a good reading passes, between 0 and 1.
 
     Examples
     --------
