@@ -139,10 +139,7 @@ def extended_filter(
     sensor = instantaneous(sensors)
     instance(model, "model", Model)
     return over_time(
-        *series(observations, times, t0, sensor.dim),
-        mean,
-        cov,
-        model.dim,
+        *series(observations, times, t0, sensor.dim), mean, cov, model.dim,
         lambda x, p, t, dt: extended_forecast(x, p, model, t, dt),
         lambda x, p, y: extended_analysis(x, p, y, sensor),
     )
@@ -247,10 +244,7 @@ def unscented_filter(
     instance(model, "model", Model)
     points = Points.of(model.dim, alpha, beta, kappa)
     return over_time(
-        *series(observations, times, t0, sensor.dim),
-        mean,
-        cov,
-        model.dim,
+        *series(observations, times, t0, sensor.dim), mean, cov, model.dim,
         lambda x, p, t, dt: unscented_forecast(x, p, model, t, dt, points),
         lambda x, p, y: unscented_analysis(x, p, y, sensor, points),
     )

@@ -139,12 +139,9 @@ def attitude(*, rate: float, sigma: float, step: float = 0.01) -> Model:
     density = number(sigma, "sigma", at_least=0) ** 2 * np.diag([1.0] * 3 + [0.0] * 4)
     longest = number(step, "step", above=0)
     return Model(
-        7,
-        lambda x, t, dt: _flow(x, t, dt, alpha, longest),
-        lambda t, dt: density * dt,
+        7, lambda x, t, dt: _flow(x, t, dt, alpha, longest), lambda t, dt: density * dt,
         derivative=lambda x, t, dt: _slope_of_flow(x, t, dt, alpha, longest),
-        names=("w1", "w2", "w3", "q1", "q2", "q3", "q4"),
-        units=("rad/s",) * 3 + ("1",) * 4,
+        names=("w1", "w2", "w3", "q1", "q2", "q3", "q4"), units=("rad/s",) * 3 + ("1",) * 4,
     )
 
 
@@ -188,10 +185,6 @@ def satellite_pose(*, rate: float, sigma: float, step: float = 0.01) -> Model:
         return cov
 
     return Model(
-        13,
-        flow,
-        lambda t, dt: noise(dt),
-        derivative=derivative,
-        names=orbit.names + body.names,
+        13, flow, lambda t, dt: noise(dt), derivative=derivative, names=orbit.names + body.names,
         units=orbit.units + body.units,
     )

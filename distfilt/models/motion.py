@@ -129,10 +129,7 @@ def coordinated_turn(
 
     straight = constant_velocity(sigma=sigma)
     return LinearModel.from_transition(
-        4,
-        lambda dt: _turn(np.asarray(omega), dt),
-        lambda t, dt: noise(dt),
-        names=straight.names,
+        4, lambda dt: _turn(np.asarray(omega), dt), lambda t, dt: noise(dt), names=straight.names,
         units=straight.units,
     )
 
@@ -159,11 +156,7 @@ def _estimated_turn(sigma: float, turn_sigma: float) -> Model:
         return cov
 
     return Model(
-        5,
-        flow,
-        noise,
-        derivative=derivative,
-        names=(*straight.names, "turn rate"),
+        5, flow, noise, derivative=derivative, names=(*straight.names, "turn rate"),
         units=(*straight.units, "rad/s"),
     )
 

@@ -102,9 +102,6 @@ def clohessy_wiltshire(*, rate: float, sigma: float) -> LinearModel:
         return phi, noise
 
     return LinearModel.from_transition(
-        6,
-        lambda dt: discretised(dt)[0],
-        lambda t, dt: discretised(dt)[1],
-        names=("x", "y", "z", "vx", "vy", "vz"),
-        units=("m", "m", "m", "m/s", "m/s", "m/s"),
+        6, lambda dt: discretised(dt)[0], lambda t, dt: discretised(dt)[1],
+        names=("x", "y", "z", "vx", "vy", "vz"), units=("m", "m", "m", "m/s", "m/s", "m/s"),
     )

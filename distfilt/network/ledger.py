@@ -66,11 +66,8 @@ class Ledger:
             How many rounds this was.
         """
         return Ledger(
-            self.rounds + rounds,
-            self.messages + messages,
-            self.scalars + messages * scalars,
-            self.bytes + messages * bytes_,
-            self.lost + lost,
+            self.rounds + rounds, self.messages + messages, self.scalars + messages * scalars,
+            self.bytes + messages * bytes_, self.lost + lost,
         )
 
     def __repr__(self) -> str:

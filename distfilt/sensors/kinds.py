@@ -62,10 +62,7 @@ def direct(indices: Sequence[int], *, std: float) -> Sensor:
         return _pick(np.eye(dim), picked).T
 
     return Sensor(
-        len(picked),
-        lambda x: _pick(x, picked),
-        _variance(std, len(picked)),
-        kind="direct",
+        len(picked), lambda x: _pick(x, picked), _variance(std, len(picked)), kind="direct",
         linear=matrix,
     )
 
@@ -80,11 +77,8 @@ def differential(indices: Sequence[int], *, std: float) -> Sensor:
     """
     picked = _indices(indices)
     return Sensor(
-        len(picked),
-        lambda x, previous: _pick(x, picked) - _pick(previous, picked),
-        _variance(std, len(picked)),
-        uses_previous=True,
-        kind="differential",
+        len(picked), lambda x, previous: _pick(x, picked) - _pick(previous, picked),
+        _variance(std, len(picked)), uses_previous=True, kind="differential",
         derivative=lambda x, previous: _pick(np.eye(x.shape[-1]), picked).T,
     )
 
@@ -120,11 +114,8 @@ def distance(indices: Sequence[int], *, std: float, origin: ArrayLike | None = N
         return _spread(slope[..., None, :], picked, x.shape[-1])
 
     return Sensor(
-        1,
-        lambda x: np.linalg.norm(_pick(x, picked) - place, axis=-1, keepdims=True),
-        _variance(std, 1),
-        kind="distance",
-        derivative=derivative,
+        1, lambda x: np.linalg.norm(_pick(x, picked) - place, axis=-1, keepdims=True),
+        _variance(std, 1), kind="distance", derivative=derivative,
     )
 
 
@@ -176,13 +167,8 @@ def angle(
         return _spread(slope[..., None, :], picked, x.shape[-1])
 
     return Sensor(
-        1,
-        function,
-        _variance(std, 1),
-        difference=lambda y, p: _wrapped(y - p, period),
-        kind="angle",
-        derivative=derivative,
-        units=("rad",),
+        1, function, _variance(std, 1), difference=lambda y, p: _wrapped(y - p, period),
+        kind="angle", derivative=derivative, units=("rad",),
     )
 
 
@@ -286,12 +272,9 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
     known = any(s.units for s in parts)
     linear = all(s.linear is not None for s in parts)
     return Sensor(
-        int(ends[-1]),
-        function,
-        cov,
+        int(ends[-1]), function, cov,
         difference=None if all(s.difference is None for s in parts) else difference,
-        uses_previous=any(s.uses_previous for s in parts),
-        kind="stacked",
+        uses_previous=any(s.uses_previous for s in parts), kind="stacked",
         linear=(lambda d: np.concatenate([s.matrix(d) for s in parts])) if linear else None,
         derivative=derivative,
         units=tuple(u for s in parts for u in s.units or ("",) * s.dim) if known else (),

@@ -53,11 +53,8 @@ def check(
     limit = number(rtol, "rtol", at_least=0)
     chosen = _indices(range(len(stored)) if indices is None else indices, len(stored))
     study = run(
-        callable_(trial, "trial"),
-        [stored.seed(i) for i in chosen],
-        errors="collect",
-        workers=workers,
-        executor=executor,
+        callable_(trial, "trial"), [stored.seed(i) for i in chosen], errors="collect",
+        workers=workers, executor=executor,
     )
     wrong = _differences(stored, chosen, study, limit)
     if wrong:

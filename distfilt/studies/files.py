@@ -322,12 +322,8 @@ class _Reader:
             raise ValueError(f"path: {self.path}, line {self.lines}: {got}")
         table = np.array(self.rows)
         return Stored(
-            self.path,
-            self.heads["parameter"],
-            self.heads["version"],
-            self.heads["code"],
-            tuple(self.recipes),
-            tuple(self.failures),
+            self.path, self.heads["parameter"], self.heads["version"], self.heads["code"],
+            tuple(self.recipes), tuple(self.failures),
             {name: table[:, k] for k, name in enumerate(self.names)},
         )
 
