@@ -19,7 +19,7 @@ from scipy.linalg.lapack import dpotrf
 
 __all__ = [  # fmt: skip
     "Array", "SolverError", "array", "callable_", "choice", "count", "covariance", "flags",
-    "generator", "increasing", "instance", "needed", "number", "same_length", "weights",
+    "generator", "increasing", "instance", "needed", "nonblank", "number", "same_length", "weights",
 ]
 
 Array = NDArray[np.float64]
@@ -292,6 +292,18 @@ def callable_(value: Any, name: str) -> Callable[..., Any]:
     if not callable(value):
         raise ValueError(f"{name}: needs a function, got {type(value).__name__}")
     return value  # type: ignore[no-any-return]
+
+
+def nonblank(value: Any, name: str) -> str:
+    """Return `value` if it is a text that is not blank.
+
+    >>> nonblank(" ", "label")
+    Traceback (most recent call last):
+    ValueError: label: needs a text, got ' '
+    """
+    if not isinstance(value, str) or not value.strip():
+        raise ValueError(f"{name}: needs a text, got {value!r}")
+    return value
 
 
 def increasing(value: ArrayLike, name: str) -> Array:

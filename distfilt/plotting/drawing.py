@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, increasing, number
+from ..checks import Array, array, increasing, nonblank, number
 from ..linalg import factor
-from .figures import check_axes, colour, line_style, nonblank
+from .figures import check_axes, colour, line_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

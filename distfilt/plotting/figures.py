@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..checks import array, choice, count, needed, number
+from ..checks import array, choice, count, needed, nonblank, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -122,12 +122,6 @@ def _print_digests() -> None:
         pyplot.switch_backend(get_backend())
         text = shell.display_formatter.formatters["text/plain"]
         text.for_type(Figure, lambda figure, printer, cycle: printer.text(said(figure)))
-
-
-def nonblank(value: Any, name: str) -> str:
-    if not isinstance(value, str) or not value.strip():
-        raise ValueError(f"{name}: needs a text, got {value!r}")
-    return value
 
 
 def _labelled(label: Any, unit: Any, axis: str) -> str:

@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from ..checks import callable_, count, needed, number
-from .figures import check_axes, nonblank
+from ..checks import callable_, count, needed, nonblank, number
+from .figures import check_axes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

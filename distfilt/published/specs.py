@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array
+from ..checks import Array, array, nonblank
 from ._files import html_table, markdown_table, text_table
-from .parts import ORIGIN, Parameter, Row, UnknownKey, link_fault, nearest, plain, text
+from .parts import ORIGIN, Parameter, Row, UnknownKey, link_fault, nearest, plain
 from .tables import accepted
 
 __all__ = ["Reading", "Scenario"]
@@ -64,7 +64,7 @@ class Scenario:
 
     def __post_init__(self) -> None:
         for name in ("paper", "name", "title"):
-            text(getattr(self, name), name)
+            nonblank(getattr(self, name), name)
         names = [p.name for p in (*self.parameters, *self.notes)]
         if len(set(names)) != len(names):
             raise ValueError("parameters: needs distinct names, those of the notes included")

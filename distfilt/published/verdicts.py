@@ -8,9 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import choice, number
+from ..checks import choice, nonblank, number
 from ._files import html_table
-from .parts import text
 from .specs import Scenario
 from .tables import PAPERS, Item, Table, items, table
 
@@ -68,10 +67,10 @@ class Verdict:
         kind = known_item(self.paper, self.item).kind
         other = "match" if kind == "parameters" else "read"
         choice(self.verdict, "verdict", [v for v in VERDICTS if v != other])
-        text(self.ours, "ours")
-        text(self.published, "published")
+        nonblank(self.ours, "ours")
+        nonblank(self.published, "published")
         if self.verdict in ("differs", "not comparable") or self.why != "":
-            text(self.why, "why")
+            nonblank(self.why, "why")
 
     def _fields(self) -> list[tuple[str, str]]:
         pairs = [("ours", self.ours), ("published", self.published), ("why", self.why)]
@@ -159,7 +158,7 @@ class Value:
     tolerance: float = 0.0
 
     def __post_init__(self) -> None:
-        text(self.id, "id")
+        nonblank(self.id, "id")
         judge_value(self.ours, self.error, self.published, tolerance=self.tolerance)
 
     @property
@@ -241,7 +240,7 @@ class Claim:
 
     def __post_init__(self) -> None:
         for name in ("id", "text", "evidence"):
-            text(getattr(self, name), name)
+            nonblank(getattr(self, name), name)
         if not isinstance(self.holds, bool | np.bool_):
             raise ValueError(f"holds: needs True or False, got {self.holds!r}")
 
