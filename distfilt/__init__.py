@@ -16,23 +16,10 @@ from types import ModuleType
 
 __version__ = "0.2.0"
 
-_ROOMS = (
-    "digests",
-    "ensembles",
-    "filters",
-    "gaussians",
-    "intervals",
-    "kalman",
-    "linalg",
-    "metrics",
-    "models",
-    "network",
-    "plotting",
-    "published",
-    "sensors",
-    "studies",
-    "triangular",
-    "updates",
+_ROOMS = (  # fmt: skip
+    "coupling", "density", "digests", "ensembles", "filters", "gaussians", "intervals", "kalman",
+    "linalg", "metrics", "mixtures", "models", "network", "plotting", "published", "sensors",
+    "studies", "triangular", "updates",
 )
 
 __all__ = ["__version__", *_ROOMS]
@@ -45,4 +32,4 @@ def __getattr__(name: str) -> ModuleType:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})
