@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import logsumexp
 
 from ..checks import Array, array, choice, count, generator, instance, number
 from ..network import Ledger
 from ..updates import effective_size
-from ..updates.particles import RESAMPLING, _jittered, _levels, _picked, _resampled
+from ..updates.particles import RESAMPLING, _distinct, _jittered, _levels, _picked, _weighed
 from .driver import Late, Summary
 from .ensemble import drawn_prior
 from .failures import guarded, not_finite
@@ -218,12 +217,7 @@ class ParticleFilter(SensorFilter):
         old = weights[..., rows, :]
 
         def compute(h: Array, y: Array, w: Array, noise: Array, _: Any) -> tuple[Array, ...]:
-            joint = w + _log_likelihood(h, y, noise)
-            total = logsumexp(joint, axis=-1, keepdims=True)
-            if not np.isfinite(total).all():
-                raise ArithmeticError("every particle has a likelihood of zero")
-            # A weight of zero is minus infinity; kept finite, so that it can be told from failure.
-            return (np.maximum(joint - total, -1e300),)
+            return (_weighed(w, h, y, noise),)
 
         (new,), errors = guarded(
             compute, (predicted, target, old), (old,), target.ndim - 1, shared=group.noise, rng=None
@@ -235,7 +229,7 @@ class ParticleFilter(SensorFilter):
         self, stack: list[Array], weights: Array, channel: Any, rng: np.random.Generator
     ) -> tuple[list[Array], Array]:
         """Everybody resamples, so that the particles are an ensemble that the agreement moves."""
-        picked = _resampled(np.exp(weights), rng, self.rule)
+        picked = _picked(np.exp(weights), _levels(weights.shape, rng, self.rule), self.rule)
         out = [np.take_along_axis(p, picked[..., None], axis=-2) for p in stack]
         assert self.agreement is not None
         out[-1] = array(self.agreement(out[-1], channel), "agreement", out[-1].shape)
@@ -261,24 +255,3 @@ def _summary(state: ParticleState, points: Array) -> Summary:
         mean[state.failed], cov[state.failed] = np.nan, np.nan
     numbers = {"effective_size": effective_size(state.log_weights), "distinct": _distinct(points)}
     return Summary(mean, np.diagonal(cov, axis1=-2, axis2=-1), cov, points, w, numbers)
-
-
-def _distinct(points: Array) -> Array:
-    """Share of particles that differ from all before them, (...)."""
-    first = np.sort(points[..., 0], axis=-1)
-    return np.asarray((1 + (np.diff(first, axis=-1) > 0).sum(axis=-1)) / points.shape[-2])
-
-
-def _log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
-    """Log-likelihood of each particle's prediction (..., N, m) but for a constant, (..., N)."""
-    missing = np.isnan(observed) | np.isnan(predicted).any(axis=-2)
-    gap = observed[..., None, :] - predicted
-    cov = noise
-    if missing.any():
-        # A missing component gets a zero residual and a unit of its own in R.
-        here = ~missing[..., :, None] & ~missing[..., None, :]
-        cov = np.where(here, noise, np.eye(noise.shape[-1]))
-        gap = np.where(missing[..., None, :], 0.0, gap)
-    # One solve with all particles as right-hand sides: the factor is the same for them.
-    half = np.linalg.solve(np.linalg.cholesky(cov), np.swapaxes(gap, -1, -2))
-    return np.asarray(-0.5 * (half**2).sum(axis=-2))

@@ -258,3 +258,33 @@ def _jittered(x: Array, cov: Array, h: float, drawn: Array) -> Array:
     centre = x.mean(axis=-2, keepdims=True)
     moved = drawn @ np.swapaxes(factor(cov), -1, -2)
     return np.asarray(centre + np.sqrt(1 - h * h) * (x - centre) + h * moved)
+
+def _weighed(log_weights: Array, predicted: Array, observed: Array, noise: Array) -> Array:
+    """Log-weights (..., N), normalised, after a reading; refused where it rules out every point."""
+    joint = log_weights + _log_likelihood(predicted, observed, noise)
+    total = logsumexp(joint, axis=-1, keepdims=True)
+    if not np.isfinite(total).all():
+        raise ArithmeticError("every particle has a likelihood of zero")
+    # A weight of zero is minus infinity; kept finite, so that it can be told from failure.
+    return np.asarray(np.maximum(joint - total, -1e300))
+
+
+def _log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
+    """Log-likelihood of each particle's prediction (..., N, m) but for a constant, (..., N)."""
+    missing = np.isnan(observed) | np.isnan(predicted).any(axis=-2)
+    gap = observed[..., None, :] - predicted
+    cov = noise
+    if missing.any():
+        # A missing component gets a zero residual and a unit of its own in R.
+        here = ~missing[..., :, None] & ~missing[..., None, :]
+        cov = np.where(here, noise, np.eye(noise.shape[-1]))
+        gap = np.where(missing[..., None, :], 0.0, gap)
+    # One solve with all particles as right-hand sides: the factor is the same for them.
+    half = np.linalg.solve(np.linalg.cholesky(cov), np.swapaxes(gap, -1, -2))
+    return np.asarray(-0.5 * (half**2).sum(axis=-2))
+
+
+def _distinct(points: Array) -> Array:
+    """Share of particles that differ from all before them, (...)."""
+    first = np.sort(points[..., 0], axis=-1)
+    return np.asarray((1 + (np.diff(first, axis=-1) > 0).sum(axis=-1)) / points.shape[-2])
