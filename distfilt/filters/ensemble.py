@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import ensembles as moments
-from ..checks import Array, array, callable_, count, covariance, generator, instance, number
+from ..checks import Array, array, callable_, count, generator, instance, number
 from ..models import Model
 from ..network import Graph, Ledger, intersection
 from ..sensors import Sensor
@@ -191,9 +191,7 @@ class EnsembleFilter(SensorFilter):
         t : float
             The time of the prior, in s.
         """
-        generator(rng)
-        lead = (*(count(n, "runs") for n in runs), len(self.sensors))
-        drawn = drawn_prior(prior, self.members, self.model.dim, lead, rng)
+        drawn = self.drawn(prior, self.members, runs, rng)
         ledger = Ledger.empty(len(self.sensors))
         return EnsembleState(number(t, "t"), ledger, rng.spawn(1)[0], drawn)
 
@@ -323,19 +321,3 @@ def _summary(e: Array, failed: Mask) -> Summary:
         mean, variance = mean.copy(), variance.copy()
         mean[failed], variance[failed] = np.nan, np.nan
     return Summary(mean, variance, members=e)
-
-
-def drawn_prior(
-    prior: Any, members: int, dim: int, lead: tuple[int, ...], rng: np.random.Generator
-) -> Array:
-    """Members (*lead, N, d) of a prior in any of the forms that a filter's start accepts."""
-    if isinstance(prior, tuple) and len(prior) == 2:
-        centre = array(prior[0], "prior", (dim,))
-        cov = covariance(prior[1], "prior", dim, semidefinite=True)
-        return moments.draw(centre, cov, members, rng=rng, leading=lead)
-    drawn = prior(members, rng=rng, leading=lead) if callable(prior) else prior
-    shape = (*lead, members, dim)
-    out = array(np.asarray(drawn), "prior", (..., members, dim))
-    if out.shape != shape and out.shape != shape[-2:]:
-        raise ValueError(f"prior: needs shape {shape} or {shape[-2:]}, got {out.shape}")
-    return np.broadcast_to(out, shape).copy()

@@ -16,7 +16,6 @@ from ..network import Ledger
 from ..updates import effective_size
 from ..updates.particles import RESAMPLING, _distinct, _jittered, _levels, _picked, _weighed
 from .driver import Late, Summary
-from .ensemble import drawn_prior
 from .failures import guarded, not_finite
 from .heard import Heard
 from .saving import State
@@ -126,9 +125,7 @@ class ParticleFilter(SensorFilter):
         rng: np.random.Generator, runs: tuple[int, ...] = (), t: float = 0.0,
     ) -> ParticleState:
         """The state before the first step; arguments as for `EnsembleFilter.start`."""
-        generator(rng)
-        lead = (*(count(n, "runs") for n in runs), len(self.sensors))
-        points = drawn_prior(prior, self.members, self.model.dim, lead, rng)
+        points = self.drawn(prior, self.members, runs, rng)
         equal = np.full(points.shape[:-1], -np.log(self.members))
         ledger = Ledger.empty(len(self.sensors))
         return ParticleState(number(t, "t"), ledger, rng.spawn(1)[0], points, equal)
@@ -160,8 +157,7 @@ class ParticleFilter(SensorFilter):
         poor = effective_size(state.log_weights) < self.threshold * self.members
         stack, weights = self._resampled([e for _, e in kept], state, poor, rng)
         moved = self.model.sample_step(stack[-1], state.t, dt, rng=rng)
-        agents = range(len(self.sensors))
-        failed = self.settle(not_finite(moved, 2), agents, t, state.failed)
+        failed = self.settle(not_finite(moved, 2), range(len(self.sensors)), t, state.failed)
         stack[-1] = np.where(failed[..., None, None, None], stack[-1], moved)
         for slot, observed in [*earlier, (len(times), seen)]:
             before = state.points if slot == len(times) else None

@@ -9,7 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, callable_, choice, count, instance, number
+from ..checks import (
+    Array,
+    array,
+    callable_,
+    choice,
+    count,
+    covariance,
+    generator,
+    instance,
+    number,
+)
+from ..ensembles import draw
 from ..models import Model
 from ..network import Channel, Faults, Graph
 from ..sensors import Sensor
@@ -114,6 +125,26 @@ class SensorFilter(Filter):
         """Per time the agents' observations, from per agent their series (T, *runs, m)."""
         _, series = over_times(observations, self.sensors, times)
         return [[None if o is None else o[k] for o in series] for k in range(times.size)]
+
+    def drawn(
+        self, prior: Any, members: int, runs: tuple[int, ...], rng: np.random.Generator
+    ) -> Array:
+        """Members (*runs, A, N, d) of a Gaussian (mean, cov), of a function, or as they are given.
+
+        The function is called as ``prior(members, rng=rng, leading=(*runs, A))``.
+        """
+        lead, dim = (*(count(n, "runs") for n in runs), len(self.sensors)), self.model.dim
+        generator(rng)
+        if isinstance(prior, tuple) and len(prior) == 2:
+            centre = array(prior[0], "prior", (dim,))
+            cov = covariance(prior[1], "prior", dim, semidefinite=True)
+            return draw(centre, cov, members, rng=rng, leading=lead)
+        found = prior(members, rng=rng, leading=lead) if callable(prior) else prior
+        shape = (*lead, members, dim)
+        out = array(np.asarray(found), "prior", (..., members, dim))
+        if out.shape != shape and out.shape != shape[-2:]:
+            raise ValueError(f"prior: needs shape {shape} or {shape[-2:]}, got {out.shape}")
+        return np.broadcast_to(out, shape).copy()
 
     def elapsed(self, state: State, t: float) -> float:
         """Seconds from the state's time to `t`, which has to be later."""
