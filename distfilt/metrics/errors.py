@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .. import ensembles
 from ..checks import Array, array
 from ..linalg import _leading
 
@@ -14,11 +15,9 @@ __all__ = ["rmse", "spread", "squared_error"]
 
 
 def _ensemble(value: ArrayLike, members: int = 1) -> Array:
-    out = array(value, "ensemble", (..., "N", "d"))
+    out = ensembles._ensemble(value, "ensemble", members)
     if out.shape[-1] < 1:
         raise ValueError(f"ensemble: needs at least one component, got shape {out.shape}")
-    if out.shape[-2] < members:
-        raise ValueError(f"ensemble: needs at least {members} members, got {out.shape[-2]}")
     return out
 
 

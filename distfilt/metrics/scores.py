@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 from ..checks import Array, array
 from ..checks import weights as unit_weights
 from ..gaussians import _log_density
-from ..linalg import _cholesky
+from ..linalg import _cholesky, _leading
 from .consistency import _spread
 from .errors import _ensemble, _truth
 
@@ -97,13 +97,7 @@ def gaussian_crps(mean: ArrayLike, std: ArrayLike, truth: ArrayLike) -> Array:
     m, s, t = array(mean, "mean"), array(std, "std"), array(truth, "truth")
     if s.size and s.min() <= 0:
         raise ValueError(f"std: needs positive standard deviations, got {s.min():.6g}")
-    try:
-        np.broadcast_shapes(m.shape, s.shape, t.shape)
-    except ValueError:
-        raise ValueError(
-            f"truth: needs a shape that broadcasts with mean {m.shape} and std {s.shape}, "
-            f"got {t.shape}"
-        ) from None
+    _leading(_leading(m.shape, s.shape, "std"), t.shape, "truth")
     z = (t - m) / s
     density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
     return np.asarray(s * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi)))

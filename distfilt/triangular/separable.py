@@ -22,6 +22,7 @@ from scipy.special import ndtr
 
 from .. import ensembles
 from ..checks import Array, array, count, number
+from ..linalg import _leading
 from ._convex import SINGULAR, best_coefficients
 from .inversion import _newton, invert
 
@@ -96,17 +97,12 @@ class SeparableMap:
         """Number m of observations."""
         return int(self.centre.shape[-1]) - self.dim
 
-    def _standard(self, y: ArrayLike, x: Array, name: str) -> Array:
+    def _standard(self, y: ArrayLike, x: Array) -> Array:
         """Standardised (y, x), (..., N, m + d); one y for all members is repeated."""
         seen = array(y, "y", (..., self.observed))
         if seen.ndim == self.centre.ndim:
             seen = seen[..., None, :]
-        try:
-            lead = np.broadcast_shapes(seen.shape[:-1], x.shape[:-1])
-        except ValueError:
-            raise ValueError(
-                f"y: needs as many rows as {name} {x.shape}, got shape {seen.shape}"
-            ) from None
+        lead = _leading(x.shape[:-1], seen.shape[:-1], "y")
         parts = [np.broadcast_to(v, (*lead, v.shape[-1])) for v in (seen, x)]
         joint = np.concatenate(parts, axis=-1)
         return np.asarray((joint - self.centre[..., None, :]) / self.spread[..., None, :])
@@ -142,7 +138,7 @@ class SeparableMap:
 
     def __call__(self, y: ArrayLike, x: ArrayLike) -> Array:
         """Reference samples S(y, x), (..., N, d), of members y (..., N, m) and x (..., N, d)."""
-        joint = self._standard(y, array(x, "x", (..., "N", self.dim)), "x")
+        joint = self._standard(y, array(x, "x", (..., "N", self.dim)))
         parts = [
             self._earlier(joint, k) + self._own(joint[..., self.observed + k], k)[0]
             for k in range(self.dim)
@@ -156,7 +152,7 @@ class SeparableMap:
         linear coefficient is zero.
         """
         reference = array(z, "z", (..., "N", self.dim))
-        joint = self._standard(y, reference, "z")
+        joint = self._standard(y, reference)
         m = self.observed
         for k in range(self.dim):
             joint[..., m + k] = self._inverted(reference[..., k] - self._earlier(joint, k), k)
@@ -164,7 +160,7 @@ class SeparableMap:
 
     def log_det(self, y: ArrayLike, x: ArrayLike) -> Array:
         """Logarithm of the determinant of the map's derivative in x at each member, (..., N)."""
-        joint = self._standard(y, array(x, "x", (..., "N", self.dim)), "x")
+        joint = self._standard(y, array(x, "x", (..., "N", self.dim)))
         m = self.observed
         total = -np.log(self.spread[..., m:]).sum(axis=-1)[..., None]
         for k in range(self.dim):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,11 +18,8 @@ __all__ = [  # fmt: skip
 ]
 
 
-class Fit(Protocol):
-    """An estimator of a map from samples."""
-
-    def __call__(self, y: Array, x: Array, /) -> ConditionalMap:
-        """The map that takes the samples to the reference."""
+Fit = Callable[[Array, Array], ConditionalMap]
+"""``fit(y, x) -> map``: an estimator of the map that takes the samples to the reference."""
 
 
 def _noisy(seen: Array, noise: Array, factor: float, rng: np.random.Generator) -> Array:
@@ -124,7 +120,7 @@ def principal_directions(ensemble: ArrayLike, n: int) -> Array:
 def principal_components(
     ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
     n_state: int, n_observed: int, complement: str = "keep", noise_factor: float = 1.0,
-    fit: Callable[[Array, Array], ConditionalMap] = affine.fit,
+    fit: Fit = affine.fit,
 ) -> Array:
     r"""Condition in the leading principal directions only, Algorithm 2 of Grange et al.
 
