@@ -191,7 +191,6 @@ class Filter(ABC):
             recorder.add(last, self.summary(last))
         return recorder.dataset(last)
 
-
     def smooth(
         self, state: Any, times: ArrayLike, observations: Any, *, truth: ArrayLike | None = None,
         scores: Collection[str] = SCORES, late: Sequence[Late] = (), progress: bool = False,

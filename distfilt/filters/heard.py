@@ -135,5 +135,3 @@ def _group(
     same = bool((noise == noise[:1]).all())
     agents = np.array([agent for agent, _ in members], dtype=np.intp)
     return Heard(agents, target, noise[0] if same else noise, tuple(parts))
-
-

@@ -195,5 +195,3 @@ def _restored(listed: dict[str, Any], seed: dict[str, Any] | None) -> np.random.
         bits = getattr(np.random, kind)(np.random.SeedSequence(**seed))
     bits.state = _arrays(listed)
     return np.random.Generator(bits)
-
-

@@ -1,7 +1,8 @@
 r"""Motion of whatever moves: straight on, or in a turn, in a plane or in space.
 
 States are positions first, then velocities, in m and m/s. The noise is white noise on the
-acceleration.
+acceleration: Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking
+and Navigation, Wiley 2001, sections 6.2.2 and 11.7.
 """
 
 from __future__ import annotations
@@ -37,11 +38,6 @@ def constant_velocity(*, sigma: float, axes: int = 2) -> LinearModel:
         of :math:`\sigma\sqrt{dt}` m/s.
     axes : int
         1, 2 or 3 axes.
-
-    Notes
-    -----
-    Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking and
-    Navigation, Wiley 2001, section 6.2.2.
 
     Examples
     --------
@@ -98,11 +94,6 @@ def coordinated_turn(
         In place of `rate`: the turn rate is the fifth component and wanders with this strength,
         at least 0, in rad/s per root second. Its noise and the one on the position and velocity
         are those of straight motion, as usual.
-
-    Notes
-    -----
-    Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking and
-    Navigation, Wiley 2001, section 11.7.
 
     Examples
     --------

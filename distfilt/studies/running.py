@@ -178,4 +178,3 @@ def _partial(flight: Flight, record: _Record) -> Study:
     for outcome in flight.arrived():
         record.add(outcome)
     return record.study()
-

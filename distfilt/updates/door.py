@@ -121,5 +121,3 @@ def perturbed(predicted: Array, noise: Array, rng: np.random.Generator) -> Array
     """Predictions with a draw of the noise each, (..., N, m)."""
     root = np.linalg.cholesky(noise)
     return predicted + rng.standard_normal(predicted.shape) @ np.swapaxes(root, -1, -2)
-
-
