@@ -112,10 +112,6 @@ class EnsembleFilter(SensorFilter):
     members : int
         Number N of members of each agent.
 
-    See Also
-    --------
-    EnsembleFilter.exact : exact draws and covariance intersection, in one line.
-
     Examples
     --------
     >>> from distfilt.network import graphs

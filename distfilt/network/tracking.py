@@ -65,10 +65,8 @@ def stable_substeps(
 
     Parameters
     ----------
-    channel : Channel
-        For the graph.
-    dt : float
-        The step that is wanted, in s, positive.
+    channel, dt
+        For the graph; the step that is wanted, in s, positive.
     alpha, a, b : float
         The gains of :func:`pi_step`.
     safety : float

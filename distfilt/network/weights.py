@@ -155,10 +155,8 @@ def laplacian(graph: Graph, gain: float) -> Weights:
 
     Parameters
     ----------
-    graph : Graph
-        The links, one way or both.
-    gain : float
-        The gain γ, at least 0.
+    graph, gain
+        The links, one way or both, and the gain γ, at least 0.
 
     Examples
     --------

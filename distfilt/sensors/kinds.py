@@ -208,10 +208,8 @@ def of_kind(kind: str, indices: Sequence[int], *, std: float) -> Sensor:
     kind : {"direct", "differential", "range", "angle"}
         The types of Grange et al., Table I; ``"range"`` is :func:`distance`, ``"angle"`` is
         ``arctan(b/a)``.
-    indices : sequence of int
-        The components, counted from 0.
-    std : float
-        Standard deviation of each reading, positive.
+    indices, std
+        As for :func:`direct`.
 
     Examples
     --------

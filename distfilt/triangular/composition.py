@@ -46,10 +46,8 @@ def compose(map_: ConditionalMap, y: ArrayLike, x: ArrayLike, observed: ArrayLik
     ----------
     map_ : ConditionalMap
         The x-block S of a triangular map.
-    y : array_like, (..., N, m)
-        Predicted observations of the members, with noise.
-    x : array_like, (..., N, d)
-        Members.
+    y, x : array_like, (..., N, m) and (..., N, d)
+        Predicted observations, with noise, and members.
     observed : array_like, (..., m)
         What was observed, y*.
 
