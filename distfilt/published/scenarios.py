@@ -160,7 +160,7 @@ def scenario(paper: str, name: str) -> Scenario:
     Parameters
     ----------
     paper, name : str
-        One of `PAPERS`, and such as ``table-2``.
+        One of `PAPERS` and the scenario's, such as ``table-2``.
 
     Examples
     --------

@@ -209,7 +209,7 @@ def of_kind(kind: str, indices: Sequence[int], *, std: float) -> Sensor:
         The types of Grange et al., Table I; ``"range"`` is :func:`distance`, ``"angle"`` is
         ``arctan(b/a)``.
     indices, std
-        As for :func:`direct`.
+        The components, counted from 0; the standard deviation of each reading, positive.
 
     Examples
     --------

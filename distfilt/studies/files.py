@@ -204,7 +204,7 @@ def stored(paper: str, name: str) -> Stored:
     Parameters
     ----------
     paper, name : str
-        The paper's key, and such as ``figure-2``.
+        The paper's key and the study's, such as ``figure-2``.
     """
     root = data_root() / "studies"
     there = sorted(p.relative_to(root).with_suffix("").as_posix() for p in root.glob("*/*.csv"))

@@ -187,7 +187,7 @@ def resample(
     Parameters
     ----------
     particles, rng, rule
-        Of what; the others as for :func:`resampled`.
+        What to resample; the others as for :func:`resampled`.
 
     Examples
     --------
