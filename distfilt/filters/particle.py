@@ -27,7 +27,7 @@ Mask = NDArray[np.bool_]
 
 
 class ParticleCollapse(RuntimeWarning):
-    """Few of a filter's particles differ from each other."""
+    """A filter's belief rests on few particles: the others are copies, or have no weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +144,8 @@ class ParticleFilter(SensorFilter):
         Warns
         -----
         ParticleCollapse
-            If less than a hundredth of an agent's particles differ from each other.
+            If less than a hundredth of an agent's particles, or only one, differ from the others,
+            or if the effective size of its weights is below two.
         """
         instance(state, "state", ParticleState)
         dt = self.elapsed(state, t)
@@ -168,7 +169,7 @@ class ParticleFilter(SensorFilter):
             stack, weights = self._agreed(stack, weights, channel, rng)
         ledger = state.ledger if channel is None else channel.ledger
         history = tuple(zip(times, stack[:-1], strict=True))
-        self._warn(stack[-1], t)
+        self._warn(stack[-1], weights, failed, t)
         return ParticleState(float(t), ledger, rng, stack[-1], weights, history, failed)
 
     def summary(self, state: ParticleState) -> Summary:
@@ -231,15 +232,23 @@ class ParticleFilter(SensorFilter):
         out[-1] = array(self.agreement(out[-1], channel), "agreement", out[-1].shape)
         return out, np.full_like(weights, -np.log(self.members))
 
-    def _warn(self, points: Array, t: float) -> None:
-        share = _distinct(points)
-        if share.min() < 0.01:
-            warnings.warn(
-                f"t = {t:g} s: {share.min():.2%} of an agent's particles are distinct; more "
-                f"members, jitter=, or more process noise keep them apart",
-                ParticleCollapse,
-                stacklevel=3,
-            )
+    def _warn(self, points: Array, weights: Array, failed: Mask, t: float) -> None:
+        """Distinct particles may have no weight, and particles of equal weight may be copies."""
+        if failed.all():
+            return
+        distinct, size = _distinct(points[~failed]), effective_size(weights[~failed])
+        if distinct.min() < max(0.01, 2 / self.members):
+            what = f"{distinct.min():.2%} of an agent's particles are distinct"
+        elif size.min() < 2:
+            what = f"an agent's weights have an effective size of {size.min():.1f}"
+        else:
+            return
+        warnings.warn(
+            f"t = {t:g} s: {what}; more members, jitter=, or more process noise keep its belief "
+            f"alive",
+            ParticleCollapse,
+            stacklevel=3,
+        )
 
 
 def _summary(state: ParticleState, points: Array) -> Summary:

@@ -55,10 +55,10 @@ def admm(
     r"""Minimise :math:`\sum_l f_l(\mathbf Z)` when agent l knows only its own :math:`f_l`.
 
     .. math::
-        \mathbf U_l \leftarrow \arg\min_{\mathbf U} f_l(\mathbf U)
-        + \tfrac\rho2\|\mathbf U-(\mathbf Z-\mathbf W_l)\|^2,\quad
-        \mathbf Z\leftarrow\tfrac1A\sum_l(\mathbf U_l+\mathbf W_l),\quad
-        \mathbf W_l\leftarrow\mathbf W_l+\mathbf U_l-\mathbf Z
+        \mathbf U_l &\leftarrow \arg\min_{\mathbf U} f_l(\mathbf U)
+        + \tfrac\rho2\|\mathbf U-(\mathbf Z-\mathbf W_l)\|^2,\\
+        \mathbf Z &\leftarrow\tfrac1A\textstyle\sum_l(\mathbf U_l+\mathbf W_l),\\
+        \mathbf W_l &\leftarrow\mathbf W_l+\mathbf U_l-\mathbf Z
 
     Parameters
     ----------

@@ -2,8 +2,9 @@ r"""Separable triangular maps: curved in every variable, one variable at a time.
 
 Component k of the x-block is
 
-.. math:: S^k(\mathbf z) = c_0 + \sum_{l<k}\Bigl(c_l z_l + \sum_j c_{lj}\,\varphi_{lj}(z_l)\Bigr)
-    + a_0 z_k + \sum_j a_j\int_{-\infty}^{z_k}\varphi_{kj},\qquad a_0 > 0,\; a_j\ge 0,
+.. math::
+    S^k(\mathbf z) &= c_0 + \sum_{l<k}\Bigl(c_l z_l + \sum_j c_{lj}\,\varphi_{lj}(z_l)\Bigr)\\
+    &\quad + a_0 z_k + \sum_j a_j\int_{-\infty}^{z_k}\varphi_{kj},\qquad a_0 > 0,\; a_j\ge 0,
 
 on standardised variables, with bumps :math:`\varphi_{lj}(z)=e^{-(z-\xi_{lj})^2/2\sigma_{lj}^2}` at
 sample quantiles. The signs make it increase in :math:`z_k`. The objective (12) of Grange et al. is
