@@ -42,7 +42,14 @@ def central(
     """
     callable_(function, "function")
     callable_(difference, "difference")
-    return _central(function, array(x, "x", (..., "d")), difference)
+    place = array(x, "x", (..., "d"))
+    value = np.asarray(function(place.copy()))
+    if value.dtype.kind not in "fiub" or value.shape[:-1] != place.shape[:-1] or not value.ndim:
+        raise ValueError(
+            f"function: needs to return numbers (..., m) for {place.shape}, "
+            f"got {value.dtype} of shape {value.shape}"
+        )
+    return _central(function, place, difference)
 
 
 def _central(

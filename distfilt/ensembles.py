@@ -47,6 +47,8 @@ def draw(
     """
     centre = array(mean, "mean", ("d",))
     root = factor(array(cov, "cov", (centre.size, centre.size)))
+    if not np.iterable(leading):
+        raise ValueError(f"leading: needs a tuple of integers, got {leading!r}")
     size = (*(count(n, "leading") for n in leading), count(members, "members"), centre.size)
     return centre + generator(rng).standard_normal(size) @ root.T
 
@@ -155,6 +157,8 @@ def exact_noise(
     True
     """
     a = array(anomalies_to_avoid, "anomalies_to_avoid", (..., "N", "p"))
+    if a.shape[-2] < 2:
+        raise ValueError(f"anomalies_to_avoid: needs at least 2 members, got {a.shape[-2]}")
     root = factor(cov)
     _leading(a.shape[:-2], root.shape[:-2], "cov")
     return _exact_noise(a, root, generator(rng))

@@ -13,8 +13,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..checks import Array, array, choice, count, generator, instance, number
 from ..network import Ledger
-from ..updates import effective_size
-from ..updates.particles import RESAMPLING, _distinct, _jittered, _levels, _picked, _weighed
+from ..updates.particles import (
+    RESAMPLING,
+    _distinct,
+    _effective_size,
+    _jittered,
+    _levels,
+    _picked,
+    _weighed,
+)
 from .driver import Late, Summary
 from .failures import guarded, not_finite
 from .heard import Heard
@@ -155,7 +162,7 @@ class ParticleFilter(SensorFilter):
         kept = (*state.history, (state.t, state.points))[-self.lag :] if self.lag else ()
         times = [time for time, _ in kept]
         earlier = [self.slot(item, times, state) for item in late]
-        poor = effective_size(state.log_weights) < self.threshold * self.members
+        poor = _effective_size(state.log_weights) < self.threshold * self.members
         stack, weights = self._resampled([e for _, e in kept], state, poor, rng)
         moved = self.model.sample_step(stack[-1], state.t, dt, rng=rng)
         failed = self.settle(not_finite(moved, 2), range(len(self.sensors)), t, state.failed)
@@ -174,6 +181,7 @@ class ParticleFilter(SensorFilter):
 
     def summary(self, state: ParticleState) -> Summary:
         """Weighted means and covariances, effective sizes and the share of distinct particles."""
+        instance(state, "state", ParticleState)
         return _summary(state, state.points)
 
     def past(self, state: ParticleState) -> tuple[tuple[float, Summary], ...]:
@@ -236,7 +244,7 @@ class ParticleFilter(SensorFilter):
         """Distinct particles may have no weight, and particles of equal weight may be copies."""
         if failed.all():
             return
-        distinct, size = _distinct(points[~failed]), effective_size(weights[~failed])
+        distinct, size = _distinct(points[~failed]), _effective_size(weights[~failed])
         if distinct.min() < max(0.01, 2 / self.members):
             what = f"{distinct.min():.2%} of an agent's particles are distinct"
         elif size.min() < 2:
@@ -258,5 +266,5 @@ def _summary(state: ParticleState, points: Array) -> Summary:
     cov = np.swapaxes(around, -1, -2) @ (w[..., None] * around)
     if state.failed.any():
         mean[state.failed], cov[state.failed] = np.nan, np.nan
-    numbers = {"effective_size": effective_size(state.log_weights), "distinct": _distinct(points)}
+    numbers = {"effective_size": _effective_size(state.log_weights), "distinct": _distinct(points)}
     return Summary(mean, np.diagonal(cov, axis1=-2, axis2=-1), cov, points, w, numbers)

@@ -141,7 +141,7 @@ class SensorFilter(Filter):
             return draw(centre, cov, members, rng=rng, leading=lead)
         found = prior(members, rng=rng, leading=lead) if callable(prior) else prior
         shape = (*lead, members, dim)
-        out = array(np.asarray(found), "prior", (..., members, dim))
+        out = array(found, "prior", (..., members, dim))
         if out.shape != shape and out.shape != shape[-2:]:
             raise ValueError(f"prior: needs shape {shape} or {shape[-2:]}, got {out.shape}")
         return np.broadcast_to(out, shape).copy()

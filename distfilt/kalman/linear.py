@@ -105,6 +105,8 @@ def kalman_filter(
     own = p.shape[-1] > 1
     model = (f, h, q, r)
     out = _recursion(x, p, group, y, *model) if own else _shared(x, p[..., 0], y, *model)
+    if not np.isfinite(out.means).all():
+        raise np.linalg.LinAlgError("kalman_filter: needs matrices without overflow, got infinity")
     covs = out.covariances.reshape(steps, *(runs if own else (1,) * len(runs)), d, d)
     density = out.log_likelihood.reshape(steps, *runs)
     return GaussianRun(out.means.reshape(steps, *runs, d), covs, density)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, covariance, number
+from ..checks import Array, array, covariance, instance, number
 from ..checks import count as whole
 from ..ensembles import _mean, _sample_covariance
 from ..intervals import Interval
@@ -110,6 +110,8 @@ def ensemble_nees(ensemble: ArrayLike, truth: ArrayLike) -> Array:
     # NEES does not depend on units: scaled to unit variances, rounding does not either, and the
     # test for a subspace compares pure numbers.
     scale = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    if not np.isfinite(scale).all():
+        raise ValueError("ensemble: needs members of finite variance, got infinity")
     if (scale <= n * np.finfo(float).eps * np.abs(middle)).any():
         raise ValueError("ensemble: needs members that differ in every component")
     correlation = cov / (scale[..., :, None] * scale[..., None, :])
@@ -152,7 +154,7 @@ def nees_band(dim: int, count: int, *, level: float = 0.95, normalised: bool = F
 
     d, n = whole(dim, "dim"), whole(count, "count")
     tail = (1 - number(level, "level", above=0, below=1)) / 2
-    unit = n * d if normalised else n
+    unit = n * d if instance(normalised, "normalised", bool) else n
     low, high = (float(chi2.ppf(p, n * d)) / unit for p in (tail, 1 - tail))
     middle = n * d / unit
     # At tiny levels the band lies below the mean, because the chi-square's median does.

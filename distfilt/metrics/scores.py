@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array
+from ..checks import Array, array, instance
 from ..checks import weights as unit_weights
 from ..gaussians import _log_density
 from ..linalg import _cholesky, _leading
@@ -48,7 +48,7 @@ def crps(
     >>> crps([[0.0], [2.0]], [1.0], fair=True)
     array([0.])
     """
-    x = _ensemble(ensemble, 2 if fair else 1)
+    x = _ensemble(ensemble, 2 if instance(fair, "fair", bool) else 1)
     n = x.shape[-2]
     t = _truth(truth, (*x.shape[:-2], x.shape[-1]))
     if weights is not None:

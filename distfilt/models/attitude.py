@@ -136,7 +136,8 @@ def attitude(*, rate: float, sigma: float, step: float = 0.01) -> Model:
     1.0
     """
     alpha = number(rate, "rate", above=0)
-    density = number(sigma, "sigma", at_least=0) ** 2 * np.diag([1.0] * 3 + [0.0] * 4)
+    strength = number(sigma, "sigma", at_least=0, at_most=1e150)
+    density = strength**2 * np.diag([1.0] * 3 + [0.0] * 4)
     longest = number(step, "step", above=0)
     return Model(
         7, lambda x, t, dt: _flow(x, t, dt, alpha, longest), lambda t, dt: density * dt,

@@ -79,6 +79,7 @@ def rk4_jacobian(
     f, g = callable_(rate, "rate"), callable_(slope, "slope")
     state = array(x, "x", (..., "d"))
     d = state.shape[-1]
+    _rated(f(state.copy(), number(t, "t")), state)
     now, length = number(t, "t"), number(dt, "dt", at_least=0)
 
     def both(joint: Array, s: float) -> Array:
@@ -122,14 +123,23 @@ def _steps(dt: float, longest: float | None) -> int:
     return max(1, math.ceil(needed))
 
 
+def _rated(value: object, state: Array) -> Array:
+    """What a rate returned, if it fits the states."""
+    first = np.asarray(value)
+    if first.shape != state.shape or first.dtype.kind not in "fiu":
+        raise ValueError(
+            f"rate: needs to return numbers of shape {state.shape}, "
+            f"got {first.dtype} of shape {first.shape}"
+        )
+    return first
+
+
 def _rk4(
     f: Callable[[Array, float], Array], state: Array, t: float, dt: float, steps: int
 ) -> Array:
     """`rk4` of checked arguments in a given number of equal steps."""
     h = dt / steps
-    first = np.asarray(f(state, t))
-    if first.shape != state.shape:
-        raise ValueError(f"rate: needs to return shape {state.shape}, got {first.shape}")
+    first = _rated(f(state, t), state)
     for k in range(steps):
         s = t + k * h
         k1 = first if k == 0 else f(state, s)

@@ -77,7 +77,7 @@ def lorenz63(
     (3,)
     """
     s, r, b = number(prandtl, "prandtl"), number(rho, "rho"), number(beta, "beta")
-    density = number(sigma, "sigma", at_least=0) ** 2 * np.eye(3)
+    density = number(sigma, "sigma", at_least=0, at_most=1e150) ** 2 * np.eye(3)
     return _integrated(
         lambda x, _: _rate(x, s, r, b), lambda x, _: _slope(x, s, r, b), density, step=step,
         names=("x", "y", "z"), units=("1",) * 3,

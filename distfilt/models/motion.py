@@ -45,7 +45,7 @@ def constant_velocity(*, sigma: float, axes: int = 2) -> LinearModel:
     >>> model.step([1.0, 2.0, 0.5, -0.5], 0.0, 2.0)
     array([ 2. ,  1. ,  0.5, -0.5])
     """
-    density = number(sigma, "sigma", at_least=0) ** 2
+    density = number(sigma, "sigma", at_least=0, at_most=1e150) ** 2
     n = count(axes, "axes")
     if n > 3:
         raise ValueError(f"axes: needs 1, 2 or 3 axes, got {axes}")
@@ -110,7 +110,7 @@ def coordinated_turn(
     omega = number(rate, "rate")
     drift = np.zeros((4, 4))
     drift[:2, 2:], drift[2:, 2:] = np.eye(2), omega * _QUARTER
-    density = number(sigma, "sigma", at_least=0) ** 2 * np.diag([0.0, 0.0, 1.0, 1.0])
+    density = number(sigma, "sigma", at_least=0, at_most=1e150) ** 2 * np.diag([0.0, 0.0, 1.0, 1.0])
 
     @lru_cache(maxsize=64)
     def noise(dt: float) -> Array:

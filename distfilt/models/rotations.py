@@ -36,10 +36,14 @@ def cross_matrix(vector: ArrayLike) -> Array:
     return out
 
 
-def _quaternion(value: ArrayLike) -> Array:
-    q = array(value, "quaternion", (..., 4))
+def _quaternion(value: ArrayLike, name: str = "quaternion") -> Array:
+    q = array(value, name, (..., 4))
     if not (q != 0).any(axis=-1).all():
-        raise ValueError("quaternion: needs quaternions that are not zero, got a zero one")
+        raise ValueError(f"{name}: needs quaternions that are not zero, got a zero one")
+    with np.errstate(over="ignore", under="ignore"):
+        squares = (q**2).sum(axis=-1)
+    if not (np.isfinite(squares) & (squares > 1e-280)).all():
+        raise ValueError(f"{name}: needs lengths between 1e-140 and 1e154, got {abs(q).max():g}")
     return q
 
 
@@ -119,6 +123,8 @@ def turned(quaternion: ArrayLike, angle: ArrayLike) -> Array:
     """
     q = _quaternion(quaternion)
     theta = array(angle, "angle", (..., 3))
+    if np.abs(theta).max(initial=0.0) > 1e150:
+        raise ValueError(f"angle: needs turns whose square is finite, got {np.abs(theta).max():g}")
     half = 0.5 * np.linalg.norm(theta, axis=-1)[..., None]
     move = (left_directions(q) @ theta[..., None])[..., 0]
     return np.asarray(np.cos(half) * q + np.sinc(half / np.pi) * move)
@@ -142,7 +148,7 @@ def turn_between(quaternion: ArrayLike, other: ArrayLike) -> Array:
     >>> turn_between([1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, -1.0]).round(4)
     array([ 0.    ,  0.    , -1.5708])
     """
-    q, p = _quaternion(quaternion), _quaternion(other)
+    q, p = _quaternion(quaternion), _quaternion(other, "other")
     cos = (q * p).sum(axis=-1)
     # Twice the directions are |q| long and orthogonal: they read off the sine's vector.
     sin = 2 * (np.swapaxes(left_directions(q), -1, -2) @ p[..., None])[..., 0]

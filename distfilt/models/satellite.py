@@ -92,7 +92,7 @@ def clohessy_wiltshire(*, rate: float, sigma: float) -> LinearModel:
     array([0.00401, 0.00401, 0.00401, 0.004  , 0.004  , 0.004  ])
     """
     drift = clohessy_wiltshire_drift(rate)
-    density = number(sigma, "sigma", at_least=0) ** 2 * np.eye(6)
+    density = number(sigma, "sigma", at_least=0, at_most=1e150) ** 2 * np.eye(6)
 
     @lru_cache(maxsize=64)
     def discretised(dt: float) -> tuple[Array, Array]:

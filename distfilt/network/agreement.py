@@ -73,7 +73,7 @@ def pull(
     for _ in range(needed):
         centre = out.mean(axis=-2)
         moved, own = channel.combine_with_own(centre, weights, lost="keep")
-        kept = (own - g * include_self)[..., None, None]
+        kept = (own - g * instance(include_self, "include_self", bool))[..., None, None]
         out = moved[..., None, :] + kept * (out - centre[..., None, :])
     return out
 

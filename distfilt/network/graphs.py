@@ -130,6 +130,8 @@ def disk(positions: ArrayLike, radius: float) -> Graph:
     places = array(positions, "positions", ("A", "p"))
     if places.size == 0:
         raise ValueError(f"positions: needs at least one agent, got shape {places.shape}")
+    if np.abs(places).max() > 1e150:
+        raise ValueError(f"positions: needs finite squares, got {np.abs(places).max():g}")
     reach = number(radius, "radius", above=0)
     pairs = cKDTree(places).query_pairs(reach, output_type="ndarray").astype(np.int64)
     return _both_ways(len(places), pairs[:, 0], pairs[:, 1])

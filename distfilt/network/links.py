@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from ..checks import Array, array, count
+from ..checks import Array, array, count, instance
 from . import _spectral
 
 __all__ = ["Graph"]
@@ -86,6 +86,7 @@ class Graph:
             What an error calls the links.
         """
         size = count(agents, "agents")
+        instance(directed, "directed", bool)
         pairs = array(edges, name)
         pairs = pairs.reshape(-1, 2) if pairs.size == 0 else array(pairs, name, ("E", 2))
         listed = pairs.astype(np.int64)

@@ -86,7 +86,8 @@ def stable_substeps(
     """
     instance(channel, "channel", Channel)
     step, factor = number(dt, "dt", above=0), number(safety, "safety", at_least=1)
-    gains = [number(g, n, at_least=0) for g, n in ((alpha, "alpha"), (a, "a"), (b, "b"))]
+    named = ((alpha, "alpha"), (a, "a"), (b, "b"))
+    gains = [number(g, n, at_least=0, at_most=1e100) for g, n in named]
     bound = 2 * float(channel.graph.degrees.max())
     rate = gains[0] + gains[1] * bound
     if rate == 0:

@@ -106,11 +106,13 @@ def stacked(graph: Graph, own: Array, links: Array, *, heard_at: int) -> sparse.
 
 
 def _both_ways(graph: Graph) -> None:
+    instance(graph, "graph", Graph)
     if graph.directed:
         raise ValueError("graph: needs links both ways for these weights, got one-way links")
 
 
 def _connected(graph: Graph) -> None:
+    instance(graph, "graph", Graph)
     if not graph.connected:
         raise ValueError(
             f"graph: needs a strongly connected graph, got {graph.components.max() + 1} components"
@@ -165,6 +167,7 @@ def laplacian(graph: Graph, gain: float) -> Weights:
     array([0. , 0.5, 0.5])
     """
     g = number(gain, "gain", at_least=0)
+    instance(graph, "graph", Graph)
     return Weights(graph, 1 - g * graph.degrees, np.full(graph.senders.size, g))
 
 

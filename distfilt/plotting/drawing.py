@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, increasing, nonblank, number
+from ..checks import Array, array, increasing, instance, nonblank, number
 from ..linalg import factor
 from .figures import check_axes, colour, line_style
 
@@ -133,6 +134,7 @@ def graph(
     if n == 0 or links.shape != (n, n) or (links != links.T).any():
         raise ValueError(f"adjacency: needs a symmetric square matrix, got shape {links.shape}")
     given = [str(k + 1) for k in range(n)] if labels is None else labels
+    instance(given, "labels", Sequence)  # type: ignore[type-abstract]
     names = [nonblank(label, "labels") for label in given]
     if len(names) != n:
         raise ValueError(f"labels: needs one for each of {n} agents, got {len(names)}")

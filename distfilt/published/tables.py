@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..checks import Array, array, choice, count
+from ..checks import Array, array, choice, count, instance
 from ..folders import data_root
 from ._files import fault, named_file, read_text, shown
 
@@ -232,7 +232,7 @@ class Item:
             raise ValueError(f"item: needs a name like 'Table II' or 'Fig. 1', got {self.item!r}")
         choice(self.kind, "kind", KINDS)
         for name in ("title", "chapter"):
-            if not str(getattr(self, name)).strip():
+            if not instance(getattr(self, name), name, str).strip():
                 raise ValueError(f"{name}: needs a text, got {getattr(self, name)!r}")
 
     @property

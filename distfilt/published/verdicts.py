@@ -203,7 +203,7 @@ def judge_table(
     'match'
     """
     known = known_item(paper, item)
-    if not all(isinstance(v, Value) for v in values):
+    if not np.iterable(values) or not all(isinstance(v, Value) for v in values):
         raise ValueError("values: needs a sequence of Value")
     distinct([v.id for v in values], "values")
     missed = [str(v) for v in values if not v.matches]
@@ -277,7 +277,7 @@ def judge_claims(
     'differs'
     """
     known = known_item(paper, item)
-    if not all(isinstance(c, Claim) for c in claims):
+    if not np.iterable(claims) or not all(isinstance(c, Claim) for c in claims):
         raise ValueError("claims: needs a sequence of Claim")
     distinct([c.id for c in claims], "claims")
     listed = {r["id"]: r for r in _claims_of(known).records()}

@@ -17,6 +17,8 @@ __all__ = [  # fmt: skip
 
 
 def _indices(indices: Sequence[int], needed: int | None = None) -> tuple[int, ...]:
+    if not np.iterable(indices):
+        raise ValueError(f"indices: needs a list of integers, got {indices!r}")
     picked = tuple(count(i, "indices", at_least=0) for i in indices)
     if not picked or len(set(picked)) != len(picked):
         raise ValueError(f"indices: needs distinct components, got {tuple(indices)}")
@@ -45,7 +47,8 @@ def _place(origin: ArrayLike | None, size: int) -> Array:
 
 
 def _variance(std: float, size: int) -> Array:
-    return number(std, "std", above=0) ** 2 * np.eye(size)
+    # Its square is a variance that is neither zero nor infinite.
+    return number(std, "std", at_least=1e-150, at_most=1e150) ** 2 * np.eye(size)
 
 
 def direct(indices: Sequence[int], *, std: float) -> Sensor:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import ensembles
-from ..checks import Array, array, choice, count, covariance
+from ..checks import Array, array, callable_, choice, count, covariance
 from ._conic import LIMIT, solve_component
 
 if TYPE_CHECKING:
@@ -246,6 +246,7 @@ def objective(map_: ConditionalMap, y: ArrayLike, x: ArrayLike) -> Array:
     >>> float(objective(fit(np.empty((4, 0)), x), np.empty((4, 0)), x))
     0.5
     """
+    callable_(map_, "map_")
     seen, members = _samples(y, x)
     squares = 0.5 * (map_(seen, members) ** 2).sum(axis=-1)
     return np.asarray((squares - map_.log_det(seen, members)).mean(axis=-1))
@@ -272,6 +273,8 @@ def gradient(coefficients: ArrayLike, samples: ArrayLike) -> Array:
     array([0., 0.])
     """
     z = array(samples, "samples", ("N", "k"))
+    if not len(z):
+        raise ValueError("samples: needs at least one, got none")
     u = array(coefficients, "coefficients", (z.shape[1] + 1,))
     if u[-1] <= 0:
         raise ValueError(f"coefficients: needs a positive last entry, got {u[-1]:g}")

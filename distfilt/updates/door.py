@@ -15,7 +15,8 @@ from typing import Any, Concatenate, ParamSpec, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, covariance, generator
+from ..checks import Array, array, callable_, covariance, generator
+from ..linalg import _cholesky
 
 __all__ = ["Update", "joined", "stackable", "unchecked", "update"]
 
@@ -57,6 +58,8 @@ def update(
            [3.]])
     """
 
+    callable_(function, "function")
+
     @wraps(function)
     def checked(
         ensemble: ArrayLike, predicted: ArrayLike, observed: ArrayLike, noise: ArrayLike,
@@ -70,7 +73,8 @@ def update(
         y = array(observed, "observed", (..., m))
         if y.shape not in ((m,), (*x.shape[:-2], m)):
             raise ValueError(f"observed: needs shape {(*x.shape[:-2], m)}, got {y.shape}")
-        y = np.broadcast_to(y, (*x.shape[:-2], m))
+        if y.ndim < x.ndim - 1:
+            y = np.broadcast_to(y, (*x.shape[:-2], m))
         r = covariance(noise, "noise", m)
         if r.shape[:-2] and np.broadcast_shapes(r.shape[:-2], x.shape[:-2]) != x.shape[:-2]:
             raise ValueError(f"noise: needs leading axes {x.shape[:-2]}, got {r.shape[:-2]}")
@@ -119,5 +123,5 @@ def joined(wrapper: Callable[..., Array], inner: Update) -> Update:
 
 def perturbed(predicted: Array, noise: Array, rng: np.random.Generator) -> Array:
     """Predictions with a draw of the noise each, (..., N, m)."""
-    root = np.linalg.cholesky(noise)
+    root = _cholesky(noise)
     return predicted + rng.standard_normal(predicted.shape) @ np.swapaxes(root, -1, -2)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import Array
+from ..checks import Array, callable_
 from .door import Update, unchecked
 
 __all__ = ["Rows", "with_missing"]
@@ -43,7 +43,7 @@ def with_missing(
     >>> float(after.mean().round(12))
     0.5
     """
-    inner = unchecked(update)
+    inner = unchecked(callable_(update, "update"))
     m = observed.shape[-1]
     lead = observed.shape[:-1]
     # What is drawn for an ensemble depends on its place and on how many readings it has, not on

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import logsumexp
 
 from ..checks import Array, array, choice, covariance, generator, number, weights
-from ..linalg import factor
+from ..linalg import _cholesky, _solve_lower, factor
 
 __all__ = ["RESAMPLING", "Particles", "effective_size", "jitter", "resample", "resampled"]
 
@@ -68,7 +67,7 @@ def _normalised(log_weights: ArrayLike, shape: tuple[int, ...]) -> Array:
         raise ValueError("log_weights: needs numbers below infinity, got NaN or infinity")
     if np.isneginf(w.max(axis=-1)).any():
         raise ValueError("log_weights: needs a positive weight in every set, got only zeros")
-    return np.asarray(w - logsumexp(w, axis=-1, keepdims=True))
+    return w - _log_sum(w)
 
 
 def effective_size(log_weights: ArrayLike) -> Array:
@@ -87,7 +86,23 @@ def effective_size(log_weights: ArrayLike) -> Array:
     2.6667
     """
     w = array(log_weights, "log_weights", (..., "N"), finite=False)
-    return np.asarray(np.exp(-logsumexp(2.0 * _normalised(w, w.shape), axis=-1)))
+    if not w.shape[-1]:
+        raise ValueError(f"log_weights: needs at least one, got shape {w.shape}")
+    return _effective_size(_normalised(w, w.shape))
+
+
+def _effective_size(log_weights: Array) -> Array:
+    """As the public one, of normalised weights."""
+    w = np.exp(log_weights)
+    return np.asarray(1 / (w * w).sum(axis=-1))
+
+
+def _log_sum(logs: Array) -> Array:
+    """Logarithm of the sum of exponentials (..., 1), a tenth of scipy's time for short vectors."""
+    most = logs.max(axis=-1, keepdims=True)
+    most = np.where(np.isfinite(most), most, 0.0)
+    with np.errstate(divide="ignore"):
+        return np.asarray(most + np.log(np.exp(logs - most).sum(axis=-1, keepdims=True)))
 
 
 def resampled(
@@ -243,6 +258,8 @@ def jitter(
     """
     x = array(points, "points", (..., "N", "d"))
     n, d = x.shape[-2:]
+    if not n:
+        raise ValueError(f"points: needs at least one, got shape {x.shape}")
     h = min(1.0, (4 / (n * (d + 2))) ** (1 / (d + 4)))
     if bandwidth is not None:
         h = number(bandwidth, "bandwidth", above=0, at_most=1)
@@ -262,7 +279,7 @@ def _jittered(x: Array, cov: Array, h: float, drawn: Array) -> Array:
 def _weighed(log_weights: Array, predicted: Array, observed: Array, noise: Array) -> Array:
     """Log-weights (..., N), normalised, after a reading; refused where it rules out every point."""
     joint = log_weights + _log_likelihood(predicted, observed, noise)
-    total = logsumexp(joint, axis=-1, keepdims=True)
+    total = _log_sum(joint)
     if not np.isfinite(total).all():
         raise ArithmeticError("every particle has a likelihood of zero")
     # A weight of zero is minus infinity; kept finite, so that it can be told from failure.
@@ -280,7 +297,7 @@ def _log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
         cov = np.where(here, noise, np.eye(noise.shape[-1]))
         gap = np.where(missing[..., None, :], 0.0, gap)
     # One solve with all particles as right-hand sides: the factor is the same for them.
-    half = np.linalg.solve(np.linalg.cholesky(cov), np.swapaxes(gap, -1, -2))
+    half = _solve_lower(_cholesky(cov), np.swapaxes(gap, -1, -2))
     return np.asarray(-0.5 * (half**2).sum(axis=-2))
 
 

@@ -108,6 +108,8 @@ def principal_directions(ensemble: ArrayLike, n: int) -> Array:
     [[1.0], [0.0]]
     """
     cov = sample_covariance(ensemble)
+    if not np.isfinite(cov).all():
+        raise ValueError("ensemble: needs members of finite variance, got infinity")
     if count(n, "n") > cov.shape[-1]:
         raise ValueError(f"n: needs at most {cov.shape[-1]} directions, got {n}")
     _, vectors = np.linalg.eigh(cov)
