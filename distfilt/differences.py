@@ -21,7 +21,9 @@ def central(
     *,
     difference: Callable[[Array, Array], Array] = np.subtract,
 ) -> Array:
-    """Derivative of a batched function by central differences, all 2 d moves in two calls.
+    """Derivative (..., m, d) by central differences, all 2 d moves in two calls.
+
+    Its error is about 1e-10 of the function's scale.
 
     Parameters
     ----------
@@ -31,11 +33,6 @@ def central(
         Where.
     difference : callable
         ``difference(ahead, behind)``, for values that wrap; subtraction by default.
-
-    Returns
-    -------
-    ndarray, (..., m, d)
-        Its error is about 1e-10 of the function's scale.
 
     Examples
     --------

@@ -22,14 +22,10 @@ def _ensemble(value: ArrayLike, name: str, members: int = 1) -> Array:
 
 
 def draw(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    members: int,
-    *,
-    rng: np.random.Generator,
+    mean: ArrayLike, cov: ArrayLike, members: int, *, rng: np.random.Generator,
     leading: tuple[int, ...] = (),
 ) -> Array:
-    """Draw ensembles from a Gaussian.
+    """Draw ensembles (*leading, N, d) from a Gaussian.
 
     Parameters
     ----------
@@ -43,10 +39,6 @@ def draw(
         Source of the draw.
     leading : tuple of int
         Leading axes, such as (runs, agents); every ensemble is drawn independently.
-
-    Returns
-    -------
-    ndarray, (*leading, N, d)
 
     Examples
     --------
@@ -64,8 +56,6 @@ def draw(
 def mean(ensemble: ArrayLike) -> Array:
     """Mean over the members, (..., d).
 
-    Examples
-    --------
     >>> mean([[1.0, 2.0], [3.0, 4.0]])
     array([2., 3.])
     """
@@ -80,8 +70,6 @@ def _mean(e: Array) -> Array:
 def anomalies(ensemble: ArrayLike) -> Array:
     """Members minus their mean, (..., N, d).
 
-    Examples
-    --------
     >>> anomalies([[1.0], [3.0]])
     array([[-1.],
            [ 1.]])
@@ -96,13 +84,6 @@ def _anomalies(e: Array) -> Array:
 def sample_covariance(ensemble: ArrayLike) -> Array:
     """Sample covariance with N - 1 in the denominator, (..., d, d).
 
-    Raises
-    ------
-    ValueError
-        With fewer than two members.
-
-    Examples
-    --------
     >>> sample_covariance([[0.0, 0.0], [2.0, 4.0]])
     array([[2., 4.],
            [4., 8.]])
@@ -118,8 +99,6 @@ def _sample_covariance(e: Array) -> Array:
 def cross_covariance(ensemble: ArrayLike, other: ArrayLike) -> Array:
     """Sample covariance between two ensembles of the same members, (..., d, m).
 
-    Examples
-    --------
     >>> cross_covariance([[0.0], [2.0]], [[1.0], [5.0]])
     array([[4.]])
     """
@@ -137,7 +116,7 @@ def _cross_covariance(a: Array, b: Array) -> Array:
 def exact_noise(
     anomalies_to_avoid: ArrayLike, cov: ArrayLike, *, rng: np.random.Generator
 ) -> Array:
-    r"""Draw noise whose sample moments are exact: second-order exact draws.
+    r"""Draw noise (..., N, k) whose sample moments are exact: second-order exact draws.
 
     Over the members the draws average to zero, are uncorrelated with the given anomalies, and have
     exactly the sample covariance `cov`. An ensemble with such noise added has the sum of both
@@ -152,10 +131,6 @@ def exact_noise(
         Covariance of the noise, positive semidefinite. Leading axes broadcast.
     rng : numpy.random.Generator
         Source of the draw.
-
-    Returns
-    -------
-    ndarray, (..., N, k)
 
     Raises
     ------

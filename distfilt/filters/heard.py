@@ -33,21 +33,12 @@ class _Part:
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """The readings of G agents that have equally many numbers, M.
+    """The readings of G agents that have equally many numbers, M: those of `parts`, their sensors.
 
-    Parameters
-    ----------
-    agents : ndarray of int, (G,)
-        Who they are.
-    target : ndarray, (*runs, G, M)
-        What they know of the observations; NaN where a component is missing.
-    noise : ndarray, (M, M) or (G, M, M)
-        Its covariance, once if it is the same for all.
-    parts : tuple
-        The sensors behind it.
+    `agents` (G,) says who they are; `target` (*runs, G, M) is what they know of the observations,
+    NaN where a component is missing; `noise` is its covariance, (M, M) if it is the same for all,
+    else (G, M, M).
 
-    Examples
-    --------
     >>> from distfilt.network import Channel, graphs
     >>> from distfilt.sensors import direct
     >>> sensor = direct([0], std=0.5)
@@ -91,32 +82,15 @@ class Heard:
         """The noise covariance of one agent of the group, (M, M)."""
         return self.noise if self.noise.ndim == 2 else self.noise[row]
 
-    @property
-    def needs_previous(self) -> bool:
-        """Whether one of the sensors sees changes."""
-        return any(part.sensor.uses_previous for part in self.parts)
 
 
 def gather(
-    observed: Sequence[Array | None],
-    sensors: Sequence[Sensor | None],
-    channel: Channel | None,
+    observed: Sequence[Array | None], sensors: Sequence[Sensor | None], channel: Channel | None
 ) -> list[Heard]:
-    """Let agents send what they observed, and collect what each of them then knows.
+    """Let agents send what they observed, (*runs, m) or None, and collect what each then knows.
 
-    Parameters
-    ----------
-    observed : sequence of length A
-        Per agent (*runs, m), with NaN where a component is missing, or None.
-    sensors : sequence of Sensor or None
-        What each agent sees with.
-    channel : Channel or None
-        Carries each observation to those that hear its agent; None where nobody tells another.
-
-    Returns
-    -------
-    list of Heard
-        One for each number of readings that occurs, ascending; agents without any are left out.
+    Without a channel nobody tells another. There is one entry for each number of readings that
+    occurs, ascending; agents without any are left out.
     """
     inbox = channel.exchange(observed) if channel is not None else [{} for _ in observed]
     groups: dict[int, list[tuple[int, dict[int, Array]]]] = {}

@@ -24,9 +24,10 @@ def gaussian_divergences(
 ) -> Array:
     r"""Kullback-Leibler divergences of each Gaussian from each of others, (L, L'), in nats.
 
-    .. math:: D_{KL}=\tfrac12\bigl[\operatorname{tr}\mathbf P_r^{-1}\mathbf P_q-d
-        +(\mathbf m_q-\mathbf m_r)^\top\mathbf P_r^{-1}(\mathbf m_q-\mathbf m_r)
-        +\log|\mathbf P_r|-\log|\mathbf P_q|\bigr]
+    .. math::
+        D_{KL}&=\tfrac12\bigl[\operatorname{tr}\mathbf P_r^{-1}\mathbf P_q-d
+        +\log|\mathbf P_r|-\log|\mathbf P_q|\\
+        &\qquad+(\mathbf m_q-\mathbf m_r)^\top\mathbf P_r^{-1}(\mathbf m_q-\mathbf m_r)\bigr]
 
     never negative: what rounding leaves below zero is zero.
 

@@ -11,26 +11,18 @@ from numpy.typing import ArrayLike
 
 from ..checks import Array, array
 
-__all__ = [
-    "cross_matrix",
-    "left_directions",
-    "quaternion_rate",
-    "rotation_matrix",
-    "turn_between",
+__all__ = [  # fmt: skip
+    "cross_matrix", "left_directions", "quaternion_rate", "rotation_matrix", "turn_between",
     "turned",
 ]
 
 
 def cross_matrix(vector: ArrayLike) -> Array:
-    r"""The matrix :math:`[\boldsymbol\omega]_\times` of the cross product, equation (19).
+    r"""The cross product :math:`[\boldsymbol\omega]_\times` as a matrix (..., 3, 3), equation (19).
 
     Parameters
     ----------
     vector : array_like, (..., 3)
-
-    Returns
-    -------
-    ndarray, (..., 3, 3)
 
     Examples
     --------
@@ -56,7 +48,7 @@ def _quaternion(value: ArrayLike, name: str = "quaternion") -> Array:
 
 
 def rotation_matrix(quaternion: ArrayLike) -> Array:
-    r"""The active rotation matrix R(q) of a quaternion with its scalar part first.
+    r"""The active rotation matrix R(q), (..., 3, 3), of a quaternion with its scalar part first.
 
     Members of an ensemble need not have unit length, so the length is divided out.
 
@@ -64,10 +56,6 @@ def rotation_matrix(quaternion: ArrayLike) -> Array:
     ----------
     quaternion : array_like, (..., 4)
         Not zero.
-
-    Returns
-    -------
-    ndarray, (..., 3, 3)
 
     Examples
     --------
@@ -119,7 +107,7 @@ def left_directions(quaternion: ArrayLike) -> Array:
 
 
 def turned(quaternion: ArrayLike, angle: ArrayLike) -> Array:
-    r"""The attitude turned further by rotation vectors, :math:`e^{\boldsymbol\theta/2}\mathbf q`.
+    r"""The attitude (..., 4) turned further, :math:`e^{\boldsymbol\theta/2}\mathbf q`.
 
     Parameters
     ----------
@@ -127,10 +115,6 @@ def turned(quaternion: ArrayLike, angle: ArrayLike) -> Array:
         Not zero; its length is kept.
     angle : array_like, (..., 3)
         Rotation vector in the frame that R(q) leads to, in rad.
-
-    Returns
-    -------
-    ndarray, (..., 4)
 
     Examples
     --------
@@ -176,18 +160,13 @@ def turn_between(quaternion: ArrayLike, other: ArrayLike) -> Array:
 
 
 def quaternion_rate(quaternion: ArrayLike, angular_velocity: ArrayLike) -> Array:
-    """The quaternion's derivative, equation (21); it keeps the length.
+    """The quaternion's derivative in 1/s, (..., 4), equation (21); it keeps the length.
 
     Parameters
     ----------
     quaternion : array_like, (..., 4)
     angular_velocity : array_like, (..., 3)
         Of the body relative to the Hill frame, in rad/s.
-
-    Returns
-    -------
-    ndarray, (..., 4)
-        In 1/s.
 
     Examples
     --------

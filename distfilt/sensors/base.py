@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import Array, array, callable_, count, covariance, generator, instance, number
 from ..differences import _central
-from ..linalg import factor
+from ..linalg import _leading, factor
 
 __all__ = ["Sensor", "wrap"]
 
@@ -147,12 +147,8 @@ class Sensor:
         if previous is None:
             raise ValueError(f"previous: a {self.kind} sensor needs the previous states, got None")
         before = array(previous, "previous", (..., state.shape[-1]))
-        try:
-            return tuple(np.broadcast_arrays(state, before))
-        except ValueError:
-            raise ValueError(
-                f"previous: needs states that go with {state.shape}, got {before.shape}"
-            ) from None
+        _leading(state.shape[:-1], before.shape[:-1], "previous")
+        return tuple(np.broadcast_arrays(state, before))
 
     def _predict(self, state: Array, previous: Array | None = None) -> Array:
         """`predict` of checked arguments. The copies are for functions that work in place."""

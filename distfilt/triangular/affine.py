@@ -24,14 +24,8 @@ from ._conic import LIMIT, solve_component
 if TYPE_CHECKING:
     from .composition import ConditionalMap
 
-__all__ = [
-    "AffineMap",
-    "fit",
-    "fit_convex",
-    "from_moments",
-    "from_rows",
-    "gradient",
-    "objective",
+__all__ = [  # fmt: skip
+    "AffineMap", "fit", "fit_convex", "from_moments", "from_rows", "gradient", "objective",
 ]
 
 _ROUNDING = 1e-13
@@ -122,16 +116,7 @@ def fit(y: ArrayLike, x: ArrayLike) -> AffineMap:
     y : array_like, (..., N, m)
         Predicted observations, with noise; m may be 0 for a map of x alone.
     x : array_like, (..., N, d)
-        Members.
-
-    Returns
-    -------
-    AffineMap
-
-    Raises
-    ------
-    ValueError
-        With too few members (N ≤ m + d), or where a variable is constant or repeats others.
+        Members, more than m + d. No variable may be constant or repeat others.
 
     Examples
     --------
@@ -161,15 +146,6 @@ def from_moments(mean: ArrayLike, cov: ArrayLike, m: int) -> AffineMap:
         Their covariance, symmetric and positive definite.
     m : int
         Number of observations, at least 0.
-
-    Returns
-    -------
-    AffineMap
-
-    Raises
-    ------
-    ValueError
-        If `cov` is no covariance, or a variable is constant or a combination of others.
 
     Examples
     --------
@@ -205,10 +181,6 @@ def from_rows(rows: ArrayLike, observed_mean: ArrayLike) -> AffineMap:
         the right of the diagonal and positive on it.
     observed_mean : array_like, (..., m)
         The y about which the map is written; any will do.
-
-    Returns
-    -------
-    AffineMap
 
     Examples
     --------
@@ -281,7 +253,7 @@ def objective(map_: ConditionalMap, y: ArrayLike, x: ArrayLike) -> Array:
 
 
 def gradient(coefficients: ArrayLike, samples: ArrayLike) -> Array:
-    r"""Gradient of (12) for one affine component, the corrected equation (14).
+    r"""Gradient (k + 1,) of (12) for one affine component, the corrected equation (14).
 
     .. math:: \frac{\partial\mathcal L^k}{\partial u_l}
         = \frac1N\sum_i U^k(\mathbf z_i)\, z_{i,l} - \frac{\delta_{lk}}{u_k}
@@ -294,10 +266,6 @@ def gradient(coefficients: ArrayLike, samples: ArrayLike) -> Array:
         :math:`u_0` and :math:`u_1,\dots,u_k`, with :math:`u_k > 0`.
     samples : array_like, (N, k)
         The first k variables.
-
-    Returns
-    -------
-    ndarray, (k + 1,)
 
     Examples
     --------
@@ -326,18 +294,12 @@ def fit_convex(
 
     Parameters
     ----------
-    y : array_like, (N, m)
-        Predicted observations, with noise.
-    x : array_like, (N, d)
-        Members.
+    y, x : array_like, (N, m) and (N, d)
+        As for :func:`fit`.
     solver : {"ECOS", "CLARABEL"}
         A conic solver, at its default tolerances.
     max_iters : int, optional
         Stop the solver early, which raises.
-
-    Returns
-    -------
-    AffineMap
 
     Raises
     ------

@@ -27,7 +27,7 @@ Update = Callable[..., Array]
 
 
 def update(
-    function: Callable[Concatenate[Array, Array, Array, Array, P], Array],
+    function: Callable[Concatenate[Array, Array, Array, Array, P], Array]
 ) -> Callable[Concatenate[ArrayLike, ArrayLike, ArrayLike, ArrayLike, P], Array]:
     """Let a function that computes an update check what it is given.
 
@@ -62,12 +62,8 @@ def update(
 
     @wraps(function)
     def checked(
-        ensemble: ArrayLike,
-        predicted: ArrayLike,
-        observed: ArrayLike,
-        noise: ArrayLike,
-        *args: P.args,
-        **options: P.kwargs,
+        ensemble: ArrayLike, predicted: ArrayLike, observed: ArrayLike, noise: ArrayLike,
+        *args: P.args, **options: P.kwargs,
     ) -> Array:
         x = array(ensemble, "ensemble", (..., "N", "d"))
         if x.shape[-2] < 2:
@@ -93,8 +89,6 @@ def update(
 def unchecked(update: Update) -> Update:
     """The update without its checks, with the options that :func:`functools.partial` gave it.
 
-    Examples
-    --------
     >>> unchecked(print) is print
     True
     """
@@ -108,8 +102,6 @@ def stackable(update: Update) -> bool:
 
     True for every update of this package; a plain function gets one agent's at a time.
 
-    Examples
-    --------
     >>> stackable(print)
     False
     """
@@ -121,8 +113,6 @@ def stackable(update: Update) -> bool:
 def joined(wrapper: Callable[..., Array], inner: Update) -> Update:
     """A wrapper's own door, as stackable as what it wraps.
 
-    Examples
-    --------
     >>> stackable(joined(lambda x, h, y, r, *, rng: x, print))
     False
     """
@@ -131,11 +121,7 @@ def joined(wrapper: Callable[..., Array], inner: Update) -> Update:
     return out
 
 
-def perturbed(
-    predicted: Array, noise: Array, rng: np.random.Generator
-) -> Array:
+def perturbed(predicted: Array, noise: Array, rng: np.random.Generator) -> Array:
     """Predictions with a draw of the noise each, (..., N, m)."""
     root = _cholesky(noise)
     return predicted + rng.standard_normal(predicted.shape) @ np.swapaxes(root, -1, -2)
-
-

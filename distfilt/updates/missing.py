@@ -13,15 +13,10 @@ __all__ = ["Rows", "with_missing"]
 
 
 def with_missing(
-    update: Update,
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
+    update: Update, ensemble: Array, predicted: Array, observed: Array, noise: Array, *,
     rng: np.random.Generator,
 ) -> Array:
-    """Apply an update where NaN marks a missing component of the observation.
+    """Apply an update where NaN marks a missing component; without any reading nothing moves.
 
     Ensembles that miss the same components are updated together, so a batch costs one call for
     each pattern.
@@ -37,11 +32,6 @@ def with_missing(
         NaN where a component is missing.
     noise : ndarray, (m, m) or (..., m, m)
     rng : numpy.random.Generator
-
-    Returns
-    -------
-    ndarray, (..., N, d)
-        Ensembles without any reading are returned as they came.
 
     Examples
     --------
@@ -95,15 +85,9 @@ def _stream(
 
 
 class Rows(np.random.Generator):
-    """Normal draws for all ensembles of a batch, of which some are asked for.
+    """Normal draws for all ensembles of a batch (*lead), of which those in `where` are asked for.
 
-    Parameters
-    ----------
-    seed : list of int
-    lead : tuple of int
-        Leading axes of the batch.
-    where : ndarray of int or None
-        Which of its ensembles, counted flat; all of them if None.
+    `where` counts them flat; None stands for all.
     """
 
     def __init__(self, seed: list[int], lead: tuple[int, ...], where: Any) -> None:

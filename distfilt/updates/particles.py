@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..checks import Array, array, choice, covariance, generator, number, weights
-from ..linalg import factor
+from ..linalg import _cholesky, _solve_lower, factor
 
 __all__ = ["RESAMPLING", "Particles", "effective_size", "jitter", "resample", "resampled"]
 
@@ -27,11 +27,6 @@ class Particles:
     points : array_like, (..., N, d)
     log_weights : array_like, (..., N)
         Logarithms of the weights; they are normalised here, and -inf is a weight of zero.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ, a point is not finite, or all weights of a set are zero.
 
     Examples
     --------
@@ -85,11 +80,6 @@ def effective_size(log_weights: ArrayLike) -> Array:
     log_weights : array_like, (..., N)
         Logarithms of weights, in any normalisation.
 
-    Raises
-    ------
-    ValueError
-        If all weights are zero or one is not a number.
-
     Examples
     --------
     >>> float(effective_size(np.log([0.5, 0.25, 0.25])).round(4))
@@ -134,11 +124,6 @@ def resampled(
     -------
     ndarray of int, (..., N)
         Indices; in ascending order but for the rule ``"residual"``.
-
-    Raises
-    ------
-    ValueError
-        If a weight is negative, the sum is not one, or the rule is unknown.
 
     Notes
     -----
@@ -216,15 +201,8 @@ def resample(
 
     Parameters
     ----------
-    particles : Particles
-    rng : numpy.random.Generator
-    rule : {"systematic", "stratified", "residual", "multinomial"}
-        As for :func:`resampled`.
-
-    Raises
-    ------
-    ValueError
-        If an argument is of another kind or the rule is unknown.
+    particles, rng, rule
+        What to resample; the others as for :func:`resampled`.
 
     Examples
     --------
@@ -241,10 +219,7 @@ def resample(
 
 
 def jitter(
-    points: ArrayLike,
-    *,
-    rng: np.random.Generator,
-    bandwidth: float | None = None,
+    points: ArrayLike, *, rng: np.random.Generator, bandwidth: float | None = None,
     cov: ArrayLike | None = None,
 ) -> Array:
     r"""Move equally weighted particles apart without moving their mean or covariance.
@@ -300,3 +275,33 @@ def _jittered(x: Array, cov: Array, h: float, drawn: Array) -> Array:
     centre = x.mean(axis=-2, keepdims=True)
     moved = drawn @ np.swapaxes(factor(cov), -1, -2)
     return np.asarray(centre + np.sqrt(1 - h * h) * (x - centre) + h * moved)
+
+def _weighed(log_weights: Array, predicted: Array, observed: Array, noise: Array) -> Array:
+    """Log-weights (..., N), normalised, after a reading; refused where it rules out every point."""
+    joint = log_weights + _log_likelihood(predicted, observed, noise)
+    total = _log_sum(joint)
+    if not np.isfinite(total).all():
+        raise ArithmeticError("every particle has a likelihood of zero")
+    # A weight of zero is minus infinity; kept finite, so that it can be told from failure.
+    return np.asarray(np.maximum(joint - total, -1e300))
+
+
+def _log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
+    """Log-likelihood of each particle's prediction (..., N, m) but for a constant, (..., N)."""
+    missing = np.isnan(observed) | np.isnan(predicted).any(axis=-2)
+    gap = observed[..., None, :] - predicted
+    cov = noise
+    if missing.any():
+        # A missing component gets a zero residual and a unit of its own in R.
+        here = ~missing[..., :, None] & ~missing[..., None, :]
+        cov = np.where(here, noise, np.eye(noise.shape[-1]))
+        gap = np.where(missing[..., None, :], 0.0, gap)
+    # One solve with all particles as right-hand sides: the factor is the same for them.
+    half = _solve_lower(_cholesky(cov), np.swapaxes(gap, -1, -2))
+    return np.asarray(-0.5 * (half**2).sum(axis=-2))
+
+
+def _distinct(points: Array) -> Array:
+    """Share of particles that differ from all before them, (...)."""
+    first = np.sort(points[..., 0], axis=-1)
+    return np.asarray((1 + (np.diff(first, axis=-1) > 0).sum(axis=-1)) / points.shape[-2])
