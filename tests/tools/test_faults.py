@@ -29,7 +29,8 @@ def test_every_fault_is_found(tmp_path: Path) -> None:
     import sys
 
     tool = Path(faults.__file__)
-    call = f"import faults; from pathlib import Path; faults.main([], Path({str(tmp_path)!r}) / 'f')"
+    call = "import faults; from pathlib import Path; "
+    call += f"faults.main([], Path({str(tmp_path)!r}) / 'f')"
     done = subprocess.run(
         [sys.executable, "-c", call], cwd=tool.parent, capture_output=True, text=True
     )
