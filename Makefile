@@ -81,7 +81,7 @@ regress: $(STAMP)
 	$(PY) book/tools/regress.py --jobs $(JOBS)
 
 slow: $(STAMP)
-	HYPOTHESIS_PROFILE=explore $(PY) -m pytest -q -m slow
+	HYPOTHESIS_PROFILE=explore $(PY) -m pytest -q -m "slow or hypothesis"
 
 outputs: $(STAMP)
 	$(PY) book/tools/execute.py

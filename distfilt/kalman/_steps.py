@@ -46,6 +46,8 @@ def extended_analysis(x: Array, p: Array, y: Array, sensor: Sensor) -> tuple[Arr
     """Means, covariances and log densities after readings (R, m) of a linearised sensor."""
     innovation, slope = linearised(x, y, sensor)
     moved, p, density = analysed(np.zeros_like(x), p, innovation, slope, sensor.cov)
+    if not np.isfinite(moved).all():
+        raise np.linalg.LinAlgError("mean: needs a prediction without overflow, got infinity")
     return x + moved, p, density
 
 

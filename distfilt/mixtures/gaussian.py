@@ -204,6 +204,8 @@ class GaussianMixture:
         t = array(values, "values", (known.size,))
         part = self.marginal(known.tolist())
         logs = self.log_weights + part._components(t)
+        if not np.isfinite(logs.max()):
+            raise ValueError(f"values: needs some whose density is a number, got {t.tolist()}")
         cross = self.covs[:, known[:, None], rest]
         gain = np.swapaxes(np.linalg.solve(part.covs, cross), -1, -2)
         means = self.means[:, rest] + (gain @ (t - part.means)[..., None])[..., 0]

@@ -200,7 +200,10 @@ def pendulum_chart(states: ArrayLike) -> Array:
     """
     s = array(states, "states", (..., 4))
     x, y, u, v = s[..., 0], s[..., 1], s[..., 2], s[..., 3]
-    square = x * x + y * y
+    with np.errstate(over="ignore"):
+        square = x * x + y * y
+    if not np.isfinite(square).all() or np.abs(s[..., 2:]).max(initial=0.0) > 1e150:
+        raise ValueError(f"states: needs numbers of finite square, got {np.abs(s).max():g}")
     if (square == 0).any():
         raise ValueError("states: needs positions away from the pivot, got one at it")
     return np.stack([np.arctan2(x, y), (u * y - x * v) / square], axis=-1)

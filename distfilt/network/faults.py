@@ -85,6 +85,7 @@ class Faults:
         count(self.seed, "seed", at_least=0)
         count(self.delay, "delay", at_least=0)
         choice(self.clock, "clock", ("rounds", "time"))
+        instance(self.symmetric, "symmetric", bool)
         if isinstance(self.silent, str) or not isinstance(self.silent, Collection):
             raise ValueError(
                 f"silent: needs a collection of agents such as [3], got {self.silent!r}"

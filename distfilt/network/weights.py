@@ -296,6 +296,7 @@ def push(graph: Graph) -> Weights:
     >>> push(circle).own
     array([0.5, 0.5, 0.5])
     """
+    instance(graph, "graph", Graph)
     share = 1 / (1 + graph.listeners)
     return Weights(graph, share, share[graph.senders])
 

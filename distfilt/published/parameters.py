@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -56,7 +56,8 @@ def judge_parameters(
             raise ValueError("read: needs what the study read: Scenario.reading() notes it")
         rows = list(read.cells(table))
     else:
-        if isinstance(read, str) or not all(isinstance(row, Mapping) for row in read):
+        rows_of = not isinstance(read, str) and isinstance(read, Iterable)
+        if not rows_of or not all(isinstance(row, Mapping) for row in read):
             raise ValueError("read: needs a Reading or rows from column to value")
         rows = [dict(row) for row in read]
     first = printed.columns[0]

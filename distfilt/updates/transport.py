@@ -210,6 +210,8 @@ def informed_directions(
     signal = whitened(predicted)
     values, vectors = np.linalg.eigh(sample_covariance(signal))
     kept = np.where(values >= least, 1 / (1 + np.maximum(values, 0.0)), 0.0)
+    if not np.isfinite(values).all():
+        raise ValueError("predicted: needs predictions of finite variance, got infinity")
     cross = cross_covariance(ensemble, signal) @ vectors
     innovation = whitened(observed[..., None, :] - drawn) @ vectors
     return np.asarray(ensemble + (innovation * kept[..., None, :]) @ np.swapaxes(cross, -1, -2))

@@ -97,14 +97,15 @@ def peak_mb() -> float:
 
 
 def machine() -> str:
-    """Processor and core count in one line; `timed` holds BLAS to one thread."""
+    """Processor, core count, and how busy the machine is; `timed` holds BLAS to one thread."""
     name = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         name = next(line.split(":", 1)[1].strip() for line in lines if "model name" in line)
     except (OSError, StopIteration):
         pass
-    return f"{name}; {os.cpu_count()} cores; one BLAS thread"
+    load = f"; load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
+    return f"{name}; {os.cpu_count()} cores; one BLAS thread{load}"
 
 
 def versions(packages: Sequence[str]) -> str:

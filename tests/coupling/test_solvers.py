@@ -249,3 +249,12 @@ def test_inputs_stay_as_they_were() -> None:
 
 def test_a_plan_knows_its_gap() -> None:
     assert Plan(np.eye(1), 3.0, (np.zeros(1), np.zeros(1)), 2.5).gap == 0.5
+
+
+@pytest.mark.parametrize("solver", ["network", "linprog", "highs"])
+def test_a_cost_in_any_order_of_memory(solver: str) -> None:
+    cost = np.random.default_rng(4).random((4, 3))
+    plain = plan(cost, np.full(4, 0.25), solver=solver)
+    for same in (np.asfortranarray(cost), np.repeat(cost, 2, axis=1)[:, ::2], cost.tolist()):
+        found = plan(same, np.full(4, 0.25), solver=solver)
+        np.testing.assert_allclose(found.matrix, plain.matrix, atol=1e-12)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.special import erf
 
 from distfilt.filters import FilterError, Late, final_state
 from distfilt.models import Model
@@ -147,6 +148,11 @@ def test_recorded_scores_by_their_definitions(family: str) -> None:
     if members is None:
         cov = states[k].covariances[r, a]
         assert np.allclose(mean, states[k].means[r, a])
+        std = np.sqrt(np.diag(cov))
+        z = (truth[k, r] - mean) / std
+        below, at = 0.5 * (1 + erf(z / np.sqrt(2))), np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
+        crps = std * (z * (2 * below - 1) + 2 * at - 1 / np.sqrt(np.pi))
+        assert np.allclose(run["crps"].values[k, r, a], crps, atol=1e-12)
     else:
         assert np.allclose(mean, w @ members, atol=1e-12)
         gap = members - w @ members
