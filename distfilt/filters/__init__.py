@@ -7,6 +7,7 @@ from .failures import FilterError
 from .gaussian import GaussianFilter, GaussianState
 from .particle import ParticleCollapse, ParticleFilter, ParticleState
 from .saving import State
+from .transport import TransportFilter
 from .wiring import SensorFilter
 
 __all__ = [
@@ -25,5 +26,6 @@ __all__ = [
     "SensorFilter",
     "State",
     "Summary",
+    "TransportFilter",
     "final_state",
 ]
