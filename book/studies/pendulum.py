@@ -51,10 +51,12 @@ UPDATES = {
 ALGORITHMS = ("OTF", "OTProj", "OTMA", "OTNLeq", "OTNLeqMA", "retraction", "rejuvenated")
 
 
-def data(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def data(
+    rng: np.random.Generator, degrees=setting["start_angle"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """True states (T, 4), readings (T, 2), and first members (N, 4)."""
-    angle = np.deg2rad(setting["start_angle"])
-    state = pendulum_states([angle, setting["start_rate"]], length=setting["length"])
+    start = [np.deg2rad(degrees), setting["start_rate"]]
+    state = pendulum_states(start, length=setting["length"])
     size = setting["prior_std"]
     centre = state + size * rng.standard_normal(4)
     members = centre + size * rng.standard_normal((setting["members"], 4))
@@ -65,7 +67,8 @@ def data(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def run(
-    readings: np.ndarray, members: np.ndarray, names=tuple(UPDATES), updates=UPDATES, draws=0
+    readings: np.ndarray, members: np.ndarray, names=tuple(UPDATES), updates=UPDATES, draws=0,
+    model=swing,
 ):
     """Analysis members of several filters side by side, (T, F, N, 4); NaN after a failure.
 
@@ -78,7 +81,7 @@ def run(
     alive = np.ones(len(inner), dtype=bool)
     with np.errstate(all="ignore"):
         for k, y in enumerate(readings):
-            x = swing.flow(x, 0.0, DT)
+            x = model.flow(x, 0.0, DT)
             for f in np.flatnonzero(alive):
                 try:
                     x[f] = inner[f](x[f], x[f, :, :2], y, NOISE, rng=rng)
