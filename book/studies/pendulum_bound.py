@@ -32,7 +32,7 @@ NAME = "pendulum-bound"
 PAPER = "das"
 
 setting = scenario("das", "pendulum")
-RUNS, PARTICLES, CELLS, REACH = 40, 4000, 161, 0.45
+RUNS, PARTICLES, CELLS, REACH = 24, 4000, 161, 0.45
 REJUVENATION = 0.2
 DT = setting["dt_observe"]
 STEPS = round(setting["end_time"] / DT)
