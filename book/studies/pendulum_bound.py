@@ -32,8 +32,7 @@ NAME = "pendulum-bound"
 PAPER = "das"
 
 setting = scenario("das", "pendulum")
-RUNS, PARTICLES, CELLS, REACH = 24, 4000, 161, 0.45
-REJUVENATION = 0.2
+RUNS, PARTICLES, CELLS, REACH = 12, 4000, 161, 0.45
 DT = setting["dt_observe"]
 STEPS = round(setting["end_time"] / DT)
 TIMES = DT * np.arange(1, STEPS + 1)
@@ -55,9 +54,6 @@ CARTESIAN = {
     "OTNLeq": projected(ensemble_transform, rod, **how),
     "OTNLeqMA": projected(seen_too, rod, **how),
     "OT_retracted": retracted(ensemble_transform, rod, motion=motion),
-    "OT_rejuvenated_retracted": retracted(
-        partial(ensemble_transform, rejuvenation=REJUVENATION), rod, motion=motion
-    ),
     "EnKF_retracted": retracted(known_noise, rod, motion=motion),
     "EnKF": known_noise,
 }
@@ -250,7 +246,6 @@ SCORES = ("constraint", "position", "velocity", "honest", "nees", "crps")
 parameters = {
     **{name: np.asarray(setting[name]).tolist() for name in setting},
     "bound_runs": RUNS, "particles": PARTICLES, "cells": CELLS, "reach": REACH,
-    "rejuvenation": REJUVENATION,
     "mirror_prior": [v.tolist() for v in MIRROR],
 }  # fmt: skip
 columns = (
