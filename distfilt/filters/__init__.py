@@ -7,10 +7,11 @@ from .failures import FilterError
 from .gaussian import GaussianFilter, GaussianState
 from .particle import ParticleCollapse, ParticleFilter, ParticleState
 from .saving import State
+from .transport import TransportFilter
 from .wiring import SensorFilter
 
 __all__ = [  # fmt: skip
     "DensityFilter", "DensityState", "EnsembleFilter", "EnsembleState", "Filter", "FilterError",
     "GaussianFilter", "GaussianState", "Late", "ParticleCollapse", "ParticleFilter",
-    "ParticleState", "SensorFilter", "State", "Summary", "final_state",
+    "ParticleState", "SensorFilter", "State", "Summary", "TransportFilter", "final_state",
 ]
