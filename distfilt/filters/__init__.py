@@ -5,6 +5,7 @@ from .driver import Filter, Late, Summary, final_state
 from .ensemble import EnsembleFilter, EnsembleState
 from .failures import FilterError
 from .gaussian import GaussianFilter, GaussianState
+from .mixture import MixtureFilter, MixtureState
 from .particle import ParticleCollapse, ParticleFilter, ParticleState
 from .saving import State
 from .wiring import SensorFilter
@@ -19,6 +20,8 @@ __all__ = [
     "GaussianFilter",
     "GaussianState",
     "Late",
+    "MixtureFilter",
+    "MixtureState",
     "ParticleCollapse",
     "ParticleFilter",
     "ParticleState",

@@ -8,7 +8,7 @@ from .divergence import (
     jeffreys_by_sampling,
     jeffreys_of_many,
 )
-from .fusion import PartialFusion, average, fuse, fuse_moments
+from .fusion import PartialFusion, average, fuse, fuse_in_turn, fuse_moments
 from .gaussian import GaussianMixture
 from .quadratics import ExponentialQuadratics
 from .reduction import (
@@ -33,6 +33,7 @@ __all__ = [
     "average",
     "cross_relevance",
     "fuse",
+    "fuse_in_turn",
     "fuse_moments",
     "jeffreys_by_quadrature",
     "jeffreys_by_sampling",

@@ -5,6 +5,7 @@ from .base import LinearModel, Model, simulate
 from .integrators import rk4, rk4_jacobian
 from .lorenz import lorenz63, lorenz63_rate
 from .motion import constant_velocity, coordinated_turn
+from .orbit import occulted, orbits, propagate, rsw_frame
 from .pendulum import (
     pendulum,
     pendulum_angle,
@@ -52,19 +53,23 @@ __all__ = [
     "left_directions",
     "lorenz63",
     "lorenz63_rate",
+    "mobility_and_diffusion",
+    "occulted",
+    "orbits",
     "pendulum",
     "pendulum_angle",
     "pendulum_chart",
     "pendulum_energy",
     "pendulum_rate",
     "pendulum_states",
-    "mobility_and_diffusion",
+    "propagate",
     "quaternion_rate",
     "reflected",
     "rk4",
     "rk4_jacobian",
     "rotating_swarm",
     "rotation_matrix",
+    "rsw_frame",
     "satellite_pose",
     "simulate",
     "turn_between",

@@ -2,6 +2,7 @@
 
 from .base import Sensor, wrap
 from .kinds import angle, differential, direct, distance, distance_and_angle, of_kind, stack
+from .orbital import ephemeris, line_of_sight
 
 __all__ = [
     "Sensor",
@@ -10,6 +11,8 @@ __all__ = [
     "direct",
     "distance",
     "distance_and_angle",
+    "ephemeris",
+    "line_of_sight",
     "of_kind",
     "stack",
     "wrap",
