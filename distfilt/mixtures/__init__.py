@@ -1,5 +1,6 @@
 """Gaussian mixtures: densities, fusion of a shared part of the state, reduction, divergences."""
 
+from . import unscented
 from .arcs import arc
 from .collocation import nonnegative_least_squares, tikhonov
 from .divergence import (
@@ -49,4 +50,5 @@ __all__ = [
     "stretching",
     "tikhonov",
     "two_stage",
+    "unscented",
 ]

@@ -1,5 +1,6 @@
 """Models of motion: how a state moves from one time to the next, and how uncertain that is."""
 
+from . import orbit
 from .attitude import angular_acceleration, attitude, satellite_pose
 from .base import LinearModel, Model, simulate
 from .integrators import rk4, rk4_jacobian
@@ -55,6 +56,7 @@ __all__ = [
     "lorenz63_rate",
     "mobility_and_diffusion",
     "occulted",
+    "orbit",
     "orbits",
     "pendulum",
     "pendulum_angle",
