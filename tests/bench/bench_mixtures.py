@@ -162,7 +162,7 @@ def in_orbit() -> tuple[list[Row], int]:
 
     rows, missed = [], 0
     truth = study.data(study.SETTING, np.random.default_rng(7))[1:]
-    for name in ("none", "c3", "printed", "moments", "one_ci"):
+    for name in ("none", "matched", "one_ci"):
         took = timed(lambda n=name: study.run(study.SETTING, study.ROWS[n], *truth), 3)
         missed += int(took.cpu > 2)
         size = took.result[-1].mixtures[0].size
