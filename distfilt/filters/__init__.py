@@ -10,23 +10,8 @@ from .particle import ParticleCollapse, ParticleFilter, ParticleState
 from .saving import State
 from .wiring import SensorFilter
 
-__all__ = [
-    "DensityFilter",
-    "DensityState",
-    "EnsembleFilter",
-    "EnsembleState",
-    "Filter",
-    "FilterError",
-    "GaussianFilter",
-    "GaussianState",
-    "Late",
-    "MixtureFilter",
-    "MixtureState",
-    "ParticleCollapse",
-    "ParticleFilter",
-    "ParticleState",
-    "SensorFilter",
-    "State",
-    "Summary",
-    "final_state",
+__all__ = [  # fmt: skip
+    "DensityFilter", "DensityState", "EnsembleFilter", "EnsembleState", "Filter", "FilterError",
+    "GaussianFilter", "GaussianState", "Late", "MixtureFilter", "MixtureState", "ParticleCollapse",
+    "ParticleFilter", "ParticleState", "SensorFilter", "State", "Summary", "final_state",
 ]

@@ -67,6 +67,7 @@ BAD_INPUT = {
     ],
     "distfilt.mixtures.fusion.fuse_in_turn": [
         ("heard", lambda: fuse_in_turn(OWN, [])),
+        ("heard", lambda: fuse_in_turn(OWN, 3)),  # type: ignore[arg-type]
         ("heard", lambda: fuse_in_turn(OTHER, OWN)),
         ("omega", lambda: fuse_in_turn(OWN, OTHER, omega="half")),
         ("omega", lambda: fuse_in_turn(OWN, OTHER, omega=1.5)),
