@@ -2,10 +2,13 @@
 
 A trial is one run: a true swing, its readings and one first ensemble for all algorithms. OTProj
 reports a projection of OTF's members and goes on without it, so it needs no run of its own.
+Retraction runs twice, without and with rejuvenation.
 """
 
 # ruff: noqa: SIM300
 from __future__ import annotations
+
+from functools import partial
 
 import numpy as np
 
@@ -25,7 +28,9 @@ TIMES = DT * np.arange(1, STEPS + 1)
 NOISE = setting["noise_variance"] * np.eye(2)
 MOTION = ([0, 1], [2, 3])
 TRACED = tuple(range(STEPS // 20))
-"""Half seconds over which the constraint error is averaged for the figure."""
+"""Spans of twenty readings over which the constraint error is averaged for the figure."""
+REJUVENATION = 0.2
+"""Bandwidth of rejuvenation; the paper's algorithms draw nothing."""
 
 rod = norm([0, 1], length=setting["length"])
 swing = pendulum(
@@ -39,14 +44,19 @@ UPDATES = {
     "OTNLeq": projected(ensemble_transform, rod, **how),
     "OTNLeqMA": projected(seen_too, rod, **how),
     "retraction": retracted(ensemble_transform, rod, motion=MOTION),
+    "rejuvenated": retracted(
+        partial(ensemble_transform, rejuvenation=REJUVENATION), rod, motion=MOTION
+    ),
 }
-ALGORITHMS = ("OTF", "OTProj", "OTMA", "OTNLeq", "OTNLeqMA", "retraction")
+ALGORITHMS = ("OTF", "OTProj", "OTMA", "OTNLeq", "OTNLeqMA", "retraction", "rejuvenated")
 
 
-def data(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def data(
+    rng: np.random.Generator, degrees=setting["start_angle"]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """True states (T, 4), readings (T, 2), and first members (N, 4)."""
-    angle = np.deg2rad(setting["start_angle"])
-    state = pendulum_states([angle, setting["start_rate"]], length=setting["length"])
+    start = [np.deg2rad(degrees), setting["start_rate"]]
+    state = pendulum_states(start, length=setting["length"])
     size = setting["prior_std"]
     centre = state + size * rng.standard_normal(4)
     members = centre + size * rng.standard_normal((setting["members"], 4))
@@ -56,16 +66,22 @@ def data(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return truth, truth[:, :2] + np.sqrt(NOISE[0, 0]) * rng.standard_normal((STEPS, 2)), members
 
 
-def run(readings: np.ndarray, members: np.ndarray, names=tuple(UPDATES), updates=UPDATES):
-    """Analysis members of several filters side by side, (T, F, N, 4); NaN after a failure."""
-    rng = np.random.default_rng(0)  # no update here draws
+def run(
+    readings: np.ndarray, members: np.ndarray, names=tuple(UPDATES), updates=UPDATES, draws=0,
+    model=swing,
+):
+    """Analysis members of several filters side by side, (T, F, N, 4); NaN after a failure.
+
+    `draws` seeds the draws of rejuvenation; no other update here draws.
+    """
+    rng = np.random.default_rng(draws)
     inner = [unchecked(updates[name]) for name in names]
     x = np.stack([members] * len(inner))
     out = np.full((len(readings), *x.shape), np.nan)
     alive = np.ones(len(inner), dtype=bool)
     with np.errstate(all="ignore"):
         for k, y in enumerate(readings):
-            x = swing.flow(x, 0.0, DT)
+            x = model.flow(x, 0.0, DT)
             for f in np.flatnonzero(alive):
                 try:
                     x[f] = inner[f](x[f], x[f, :, :2], y, NOISE, rng=rng)
@@ -81,7 +97,7 @@ def run(readings: np.ndarray, members: np.ndarray, names=tuple(UPDATES), updates
 def estimates(members: np.ndarray, name: str) -> np.ndarray:
     """What is reported: the mean; on the manifold the retracted mean."""
     mean = members.mean(axis=-2)
-    if name == "retraction" and np.isfinite(mean).all():
+    if name in ("retraction", "rejuvenated") and np.isfinite(mean).all():
         return retract(mean, rod, motion=MOTION)
     return mean
 
@@ -115,7 +131,7 @@ def scores(name: str, members: np.ndarray, truth: np.ndarray) -> dict[str, float
         "onset": TIMES[away.argmax()] if away.any() else np.nan,
         "finite": float(np.isfinite(gap).all()),
     }
-    traced = np.sqrt((missed.reshape(-1, 10) ** 2).mean(axis=1))
+    traced = np.sqrt((missed.reshape(-1, 20) ** 2).mean(axis=1))
     found |= {f"trace{h:02d}": traced[h] for h in TRACED}
     return {f"{name}_{key}": float(value) for key, value in found.items()}
 
@@ -123,7 +139,9 @@ def scores(name: str, members: np.ndarray, truth: np.ndarray) -> dict[str, float
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """All algorithms on one run."""
     truth, readings, members = data(np.random.default_rng(seed))
-    found = dict(zip(UPDATES, np.moveaxis(run(readings, members), 1, 0), strict=True))
+    draws = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 0))
+    found = run(readings, members, draws=draws)
+    found = dict(zip(UPDATES, np.moveaxis(found, 1, 0), strict=True))
     with np.errstate(all="ignore"):
         whole = np.isfinite(found["OTF"]).all(axis=(1, 2))
         found["OTProj"] = found["OTF"].copy()
@@ -132,6 +150,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
 
 
 parameters = {name: np.asarray(setting[name]).tolist() for name in setting}
+parameters["rejuvenation"] = REJUVENATION
 SCORES = (
     "constraint", "growth", "position", "velocity", "spread", "spread_velocity", "nees", "ratio_yx",
     "diverged", "onset", "finite",

@@ -155,8 +155,10 @@ def project(
     regularisation : float
         ε, at least 0, in the units of g squared: on the manifold the covariance is singular.
     guarded : bool
-        Return an ensemble as it came if the projection makes its mean :math:`|\mathbf g-\mathbf d|`
-        larger or is not finite. The printed formula needs ``False`` to show what it does.
+        Return an ensemble as it came if the projection is not finite or makes larger what it is to
+        make small: for ``"shift"``, which keeps the spread, the miss of the mean
+        :math:`|\hat{\mathbf d}-\mathbf d|`; for the others the mean of the members' misses
+        :math:`|\mathbf D_i-\mathbf d|`. The printed formula needs ``False`` to show what it does.
 
     Returns
     -------
@@ -197,9 +199,10 @@ def _project(x: Array, constraint: Constraint, reading: str, eps: float, guarded
     if not guarded:
         return np.asarray(out)
     worse = ~np.isfinite(out).all(axis=(-1, -2))
-    safe = np.where(worse[..., None, None], x, out)
-    missed = np.abs(constraint._residual(safe)).sum(axis=(-1, -2))
-    worse |= missed > np.abs(gap).sum(axis=(-1, -2))
+    left = constraint._residual(np.where(worse[..., None, None], x, out))
+    # The members' own misses may grow where only their mean is moved: g is curved.
+    before, after = (mean, left.mean(axis=-2, keepdims=True)) if reading == "shift" else (gap, left)
+    worse |= np.abs(after).sum(axis=(-1, -2)) > np.abs(before).sum(axis=(-1, -2))
     return np.asarray(np.where(worse[..., None, None], x, out))
 
 

@@ -175,15 +175,18 @@ def _transform(
     x: Array, w: Array, solve: Solve, *, debias: bool = False, correct: bool = False
 ) -> Array:
     """`ensemble_transform` of checked arguments."""
-    n = x.shape[-2]
-    centre = (w[..., None, :] @ x)
-    around = x - centre
-    moved = n * (np.swapaxes(_plans(x, w, solve), -1, -2) @ around)
+    out = _carried(x, w, _plans(x, w, solve))
     if debias:
-        equal = np.full(w.shape, 1 / n)
-        moved += around - n * (np.swapaxes(_plans(x, equal, solve), -1, -2) @ around)
-        moved -= moved.mean(axis=-2, keepdims=True)
-    out = np.asarray(centre + moved)
+        equal = np.full(w.shape, 1 / x.shape[-2])
+        out += x - _carried(x, equal, _plans(x, equal, solve))
+        out += w[..., None, :] @ x - out.mean(axis=-2, keepdims=True)
+    return _second_order(out, x, w) if correct else out
+
+
+def _carried(x: Array, w: Array, matrix: Array, *, correct: bool = False) -> Array:
+    """Members with weights w after a coupling `matrix` of w to equal masses, (3)."""
+    centre = w[..., None, :] @ x
+    out = np.asarray(centre + x.shape[-2] * (np.swapaxes(matrix, -1, -2) @ (x - centre)))
     return _second_order(out, x, w) if correct else out
 
 

@@ -5,12 +5,15 @@ from .driver import Filter, Late, Summary, final_state
 from .ensemble import EnsembleFilter, EnsembleState
 from .failures import FilterError
 from .gaussian import GaussianFilter, GaussianState
+from .mixture import MixtureFilter, MixtureState
 from .particle import ParticleCollapse, ParticleFilter, ParticleState
 from .saving import State
+from .transport import TransportFilter
 from .wiring import SensorFilter
 
 __all__ = [  # fmt: skip
     "DensityFilter", "DensityState", "EnsembleFilter", "EnsembleState", "Filter", "FilterError",
-    "GaussianFilter", "GaussianState", "Late", "ParticleCollapse", "ParticleFilter",
-    "ParticleState", "SensorFilter", "State", "Summary", "final_state",
+    "GaussianFilter", "GaussianState", "Late", "MixtureFilter", "MixtureState", "ParticleCollapse",
+    "ParticleFilter", "ParticleState", "SensorFilter", "State", "Summary", "TransportFilter",
+    "final_state",
 ]

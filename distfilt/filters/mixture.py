@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, array, callable_, choice, count, instance, number
-from ..mixtures import GaussianMixture, runnalls, split, stretching
+from ..mixtures import GaussianMixture, split, stretching, two_stage
 from ..mixtures.gaussian import trusted
 from ..mixtures.unscented import POINT_RULES, forecast, update
 from ..models import Model
@@ -27,6 +27,8 @@ _LIGHT = 1e-3
 """Mixands lighter than this are not split."""
 _NOTHING = 1e-9
 """Mixands lighter than this are left out after an update."""
+_EXACT = 400
+"""Up to how many mixands every pair is a candidate for a merger."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +68,9 @@ class MixtureFilter(Filter):
 
     In a step an agent splits the mixands that its model stretches most, forecasts all of them,
     conditions them on its reading, sends its target marginal, fuses what it hears, and merges down
-    to `size` mixands. Agents' states may differ in size.
+    to `size` mixands. Agents' states may differ in size. A mixand that the sensor cannot see (it
+    predicts NaN for one of its points) contradicts a reading and is left out; a reading that all
+    mixands contradict in this way is refused by an error.
 
     Parameters
     ----------
@@ -225,7 +229,8 @@ class MixtureFilter(Filter):
             channel = Channel(graph, ledger=ledger, faults=self.faults)
             beliefs = self._agreed(beliefs, channel)
             ledger = channel.ledger
-        kept = [runnalls(belief, self.size) for belief in beliefs]
+        most = max(_EXACT, self.size)
+        kept = [two_stage(belief, self.size, heaviest=most) for belief in beliefs]
         # Without the square roots that they came with: a loaded state has to go on alike.
         plain = tuple(trusted(m.weights, m.means, m.covs) for m in kept)
         return MixtureState(now, ledger, None, plain)
@@ -278,8 +283,6 @@ class MixtureFilter(Filter):
     def _seen(self, belief: GaussianMixture, sensor: Sensor, y: Array) -> GaussianMixture:
         """Condition on what of a reading is there; a reading out of every gate changes nothing."""
         there = np.flatnonzero(~np.isnan(y))
-        if np.isnan(sensor._predict(belief.means)[..., there]).any():
-            raise ValueError("observations: needs a target that can be seen, got one that cannot")
 
         def residual(a: Array, b: Array) -> Array:
             full = np.zeros((2, *np.broadcast_shapes(a.shape, b.shape)[:-1], sensor.dim))
@@ -290,9 +293,13 @@ class MixtureFilter(Filter):
             belief.means, belief.factors, y[there], lambda x: sensor._predict(x)[..., there],
             sensor.cov[np.ix_(there, there)], residual=residual, rule=self.rule,
         )
-        if self.gate is not None and distance.min() > self.gate**2:
+        # A mixand with a point that cannot be seen contradicts the reading.
+        visible = np.isfinite(logs)
+        logs = np.where(visible, belief.log_weights + logs, -np.inf)
+        if not np.isfinite(logs.max()):
+            raise ValueError("observations: needs a target that can be seen, got one that cannot")
+        if self.gate is not None and distance[visible].min() > self.gate**2:
             return belief
-        logs = belief.log_weights + logs
         w = np.exp(logs - logs.max())
         w /= w.sum()
         keep = w > _NOTHING
@@ -309,6 +316,12 @@ class MixtureFilter(Filter):
             fused: Any = self.agreement(belief, others) if others else belief
             if instance(fused, "agreement", GaussianMixture).dim != belief.dim:
                 raise ValueError(f"agreement: needs dimension {belief.dim}, got {fused.dim}")
+            try:
+                fused.factors  # noqa: B018
+            except np.linalg.LinAlgError:
+                raise np.linalg.LinAlgError(
+                    "agreement: needs positive definite covariances, got one that is not"
+                ) from None
             out.append(fused)
         return out
 

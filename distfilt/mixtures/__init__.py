@@ -1,5 +1,6 @@
 """Gaussian mixtures: densities, fusion of a shared part of the state, reduction, divergences."""
 
+from . import unscented
 from .arcs import arc
 from .collocation import nonnegative_least_squares, tikhonov
 from .divergence import (
@@ -8,7 +9,7 @@ from .divergence import (
     jeffreys_by_sampling,
     jeffreys_of_many,
 )
-from .fusion import PartialFusion, average, fuse, fuse_moments
+from .fusion import PartialFusion, average, fuse, fuse_in_turn, fuse_moments
 from .gaussian import GaussianMixture
 from .quadratics import ExponentialQuadratics
 from .reduction import (
@@ -33,6 +34,7 @@ __all__ = [
     "average",
     "cross_relevance",
     "fuse",
+    "fuse_in_turn",
     "fuse_moments",
     "jeffreys_by_quadrature",
     "jeffreys_by_sampling",
@@ -48,4 +50,5 @@ __all__ = [
     "stretching",
     "tikhonov",
     "two_stage",
+    "unscented",
 ]

@@ -11,7 +11,7 @@ equations (14)-(15) of Semeraro, LeGrand and Kulik for one other agent.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from ..checks import Array, array, choice, instance, number
+from ..checks import Array, array, callable_, choice, instance, number
 from .collocation import collocation_weights
 from .gaussian import GaussianMixture, trusted
 from .reduction import runnalls
@@ -32,7 +32,7 @@ from .terms import (
     _regression,
 )
 
-__all__ = ["PartialFusion", "average", "fuse", "fuse_moments"]
+__all__ = ["PartialFusion", "average", "fuse", "fuse_in_turn", "fuse_moments"]
 
 TERMS = ("matched", "all")
 FORMS = ("conditional", "literal")
@@ -48,9 +48,9 @@ class PartialFusion:
         The agent's belief about [t; e].
     heard : GaussianMixture or sequence of them
         Others' beliefs about t; all of one dimension, at most that of `own`.
-    omega : float or array_like
-        Exponent of the own target marginal, in [0, 1]; the others share the rest equally. Or one
-        exponent each, own first, nonnegative with sum 1.
+    omega : float, "equal" or array_like
+        Exponent of the own target marginal, in [0, 1]; the others share the rest equally. "equal"
+        gives all the same. Or one exponent each, own first, nonnegative with sum 1.
 
     Examples
     --------
@@ -63,14 +63,14 @@ class PartialFusion:
 
     own: GaussianMixture
     heard: tuple[GaussianMixture, ...]
-    omega: float | ArrayLike = 0.5
+    omega: float | str | ArrayLike = 0.5
 
     def __init__(
         self,
         own: GaussianMixture,
         heard: GaussianMixture | Sequence[GaussianMixture],
         *,
-        omega: float | ArrayLike = 0.5,
+        omega: float | str | ArrayLike = 0.5,
     ) -> None:
         instance(own, "own", GaussianMixture)
         if not isinstance(heard, GaussianMixture | Iterable):
@@ -216,7 +216,7 @@ def fuse(
     own: GaussianMixture,
     heard: GaussianMixture | Sequence[GaussianMixture],
     *,
-    omega: float | ArrayLike = 0.5,
+    omega: float | str | ArrayLike = 0.5,
     terms: str = "matched",
     rule: str = "C3",
     size: int | None = None,
@@ -247,7 +247,7 @@ def fuse_moments(
     own: GaussianMixture,
     heard: GaussianMixture | Sequence[GaussianMixture],
     *,
-    omega: float | ArrayLike = 0.5,
+    omega: float | str | ArrayLike = 0.5,
 ) -> GaussianMixture:
     """Factorised covariance intersection: fuse the Gaussians that have the mixtures' moments.
 
@@ -273,6 +273,49 @@ def fuse_moments(
     )
     shapes = alone.shapes()
     return trusted(np.ones(1), shapes.means, shapes.covs)
+
+
+def fuse_in_turn(
+    own: GaussianMixture,
+    heard: GaussianMixture | Sequence[GaussianMixture],
+    *,
+    omega: float | str = "equal",
+    pair: Callable[..., GaussianMixture] = fuse,
+) -> GaussianMixture:
+    """Fuse what is heard one belief after another: fewer mixands at a time than in one pass.
+
+    With the own exponent m / (m + 1) at the m-th belief all exponents end up equal, in whatever
+    order, up to what the approximations lose. With a fixed one the last belief counts most.
+
+    Parameters
+    ----------
+    own, heard
+        As of :class:`PartialFusion`.
+    omega : "equal" or float
+        m / (m + 1), or the own exponent each time.
+    pair : callable
+        ``pair(own, heard, omega=...) -> mixture``, such as :func:`fuse` and :func:`fuse_moments`.
+
+    Examples
+    --------
+    >>> ends = [GaussianMixture.gaussian([m], [[1.0]]) for m in (3.0, 6.0)]
+    >>> own = GaussianMixture.gaussian([0.0], [[1.0]])
+    >>> fuse_in_turn(own, ends).means.round(9)
+    array([[3.]])
+    >>> fuse_in_turn(own, ends, omega=0.5).means.round(9)
+    array([[3.75]])
+    """
+    callable_(pair, "pair")
+    if isinstance(omega, str):
+        choice(omega, "omega", ("equal",))
+    if not isinstance(heard, GaussianMixture | Iterable):
+        raise ValueError(f"heard: needs mixtures, got {type(heard).__name__}")
+    others = (heard,) if isinstance(heard, GaussianMixture) else tuple(heard)
+    if not others:
+        raise ValueError("heard: needs at least one belief, got none")
+    for m, other in enumerate(others, start=1):
+        own = pair(own, other, omega=m / (m + 1) if isinstance(omega, str) else omega)
+    return own
 
 
 def average(

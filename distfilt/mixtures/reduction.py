@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from ..checks import Array, choice, count, instance, number
+from ..checks import Array, choice, count, instance, needed, number
 from .divergence import gaussian_divergences
 from .gaussian import GaussianMixture, symmetric, trusted
 from .shapes import Shapes
@@ -39,7 +39,8 @@ def runnalls(mixture: GaussianMixture, size: int, *, engine: str = "auto") -> Ga
     size : int
         How many to keep; a mixture that is no larger is returned as it is.
     engine : {"auto", "numba", "numpy"}
-        What computes; "auto" takes numba where it is installed. Same merges, other speed.
+        What computes; "auto" takes numba where it is installed (the extra `speed`). Same merges,
+        other speed.
 
     Examples
     --------
@@ -57,6 +58,7 @@ def runnalls(mixture: GaussianMixture, size: int, *, engine: str = "auto") -> Ga
     w, m, p, root = _whitened(mixture)
     alive = np.ones(w.size, dtype=bool)
     if how == "numba":
+        needed("numba", "speed")
         from . import _merging
 
         _merging.reduce(w, m, p, alive, n)

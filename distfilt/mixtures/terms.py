@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, number, weights
+from ..checks import Array, choice, number, weights
 from .gaussian import GaussianMixture, symmetric
 from .quadratics import ExponentialQuadratics, inverse
 from .shapes import Shapes
@@ -15,7 +15,10 @@ from .shapes import Shapes
 __all__: list[str] = []
 
 
-def _exponents(omega: float | ArrayLike, others: int) -> Array:
+def _exponents(omega: float | str | ArrayLike, others: int) -> Array:
+    if isinstance(omega, str):
+        choice(omega, "omega", ("equal",))
+        return np.full(others + 1, 1 / (others + 1))
     if np.ndim(omega) == 0:
         w = number(omega, "omega", at_least=0, at_most=1)
         return np.concatenate([[w], np.full(others, (1 - w) / others)])

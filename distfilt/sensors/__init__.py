@@ -2,8 +2,9 @@
 
 from .base import Sensor, wrap
 from .kinds import angle, differential, direct, distance, distance_and_angle, of_kind, stack
+from .orbital import ephemeris, line_of_sight
 
 __all__ = [  # fmt: skip
-    "Sensor", "angle", "differential", "direct", "distance", "distance_and_angle", "of_kind",
-    "stack", "wrap",
+    "Sensor", "angle", "differential", "direct", "distance", "distance_and_angle", "ephemeris",
+    "line_of_sight", "of_kind", "stack", "wrap",
 ]

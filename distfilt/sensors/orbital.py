@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from ..checks import Array, choice, number
+from ..checks import Array, callable_, choice, count, number
 from .base import Sensor
 from .kinds import direct
 
@@ -14,7 +15,12 @@ __all__ = ["ephemeris", "line_of_sight"]
 
 
 def line_of_sight(
-    *, std: float, form: str = "arctan2", target: int = 0, observer: int = 6
+    *,
+    std: float,
+    form: str = "arctan2",
+    target: int = 0,
+    observer: int = 6,
+    hidden: Callable[[Array, Array], Array] | None = None,
 ) -> Sensor:
     r"""The direction from one body to another, two angles in rad.
 
@@ -27,6 +33,9 @@ def line_of_sight(
         vector's y component where the right ascension is meant.
     target, observer : int
         Where the bodies' positions begin in the state.
+    hidden : callable, optional
+        ``hidden(target, observer) -> bool (...)`` of positions (..., 3), such as
+        :func:`distfilt.models.occulted`; a direction that it hides is NaN.
 
     Examples
     --------
@@ -38,7 +47,10 @@ def line_of_sight(
     """
     noise = number(std, "std", above=0) ** 2 * np.eye(2)
     choice(form, "form", ("arctan2", "printed"))
-    here, there = (slice(k, k + 3) for k in (target, observer))
+    places = (count(target, "target", at_least=0), count(observer, "observer", at_least=0))
+    here, there = (slice(k, k + 3) for k in places)
+    if hidden is not None:
+        callable_(hidden, "hidden")
 
     def function(x: Array) -> Array:
         way = x[..., here] - x[..., there]
@@ -48,7 +60,10 @@ def line_of_sight(
             first = np.arcsin(np.clip(unit[..., 1], -1, 1))
         else:
             first = np.arctan2(unit[..., 1], unit[..., 0])
-        return np.stack([first, second], axis=-1)
+        out = np.stack([first, second], axis=-1)
+        if hidden is not None:
+            out[np.asarray(hidden(x[..., here], x[..., there]))] = np.nan
+        return out
 
     def difference(a: Array, b: Array) -> Array:
         gap = a - b

@@ -1,4 +1,4 @@
-"""Runnalls' reduction beside pyest and Stone Soup, its growth, and the cost of one fusion.
+"""Runnalls' reduction beside pyest and Stone Soup, its growth, one fusion, one seed in orbit.
 
 Every library gets the same mixtures in one run. Stone Soup's reducer merges within a gate, which
 is another algorithm: its time is told, its result not compared. Writes data/bench/mixtures.csv;
@@ -20,7 +20,9 @@ from distfilt.mixtures import (
     PartialFusion,
     kept_by_relevance,
     runnalls,
+    split,
     two_stage,
+    unscented,
 )
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "book" / "studies"))
@@ -153,12 +155,10 @@ def fusion() -> list[Row]:
 
 
 def in_orbit() -> tuple[list[Row], int]:
-    """One seed of chapter 8's rows, a day of 10 000 states, and a split beside pyest's."""
+    """One seed of chapter 8's rows, and a day of 10 000 states."""
     import orbit as study
-    from pyest.gm import GaussSplitOptions, split_gaussian
 
-    from distfilt.mixtures import split
-    from distfilt.models.orbit import propagate
+    from distfilt.models import propagate
 
     rows, missed = [], 0
     truth = study.data(study.SETTING, np.random.default_rng(7))[1:]
@@ -169,6 +169,16 @@ def in_orbit() -> tuple[list[Row], int]:
         rows.append(row(f"track, {name}", 12, size, took.cpu, needed=2000))
     many = np.tile(study.SETTING["target"], (10_000, 1))
     rows.append(row("propagate 24 h", 6, 10_000, timed(lambda: propagate(many, 86400.0), 1).cpu))
+    return rows, missed
+
+
+def splits_and_points() -> tuple[list[Row], int]:
+    """A split and an unscented forecast of a mixture, beside pyest's."""
+    from pyest.filters import GmukfPredict
+    from pyest.filters.sigma_points import SigmaPointOptions
+    from pyest.gm import GaussianMixture as TheirMixture
+    from pyest.gm import GaussSplitOptions, split_gaussian
+
     p = mixture(1, 12)
     u = p.factors[:, :, 0]
     options = GaussSplitOptions(L=3, lam=1e-3)
@@ -176,17 +186,37 @@ def in_orbit() -> tuple[list[Row], int]:
     theirs = timed(lambda: [
         split_gaussian(1.0, p.means[0], p.covs[0], options, direction=u[0]) for _ in range(200)
     ], 3).cpu / 200
-    rows.append(row("split", 12, 1, ours))
+    rows = [row("split", 12, 1, ours)]
     rows.append(row("split, pyest", 12, 1, theirs, ratio=f"{theirs / ours:.1f}"))
-    return rows, missed
+    p = mixture(12, 12)
+    noise = 0.1 * np.eye(12)
+    peer = GmukfPredict(
+        lambda x, before, after: x + 0.1 * np.sin(x), noise,
+        sigma_pt_opts=SigmaPointOptions(1.0, 0.0, 0.0),
+    )
+    there = TheirMixture(p.weights, p.means, p.covs)
+    root = np.linalg.cholesky(noise)
+    mine = timed(lambda: [unscented.forecast(
+        p.means, p.factors, lambda x: x + 0.1 * np.sin(x), root, rule="unscented"
+    ) for _ in range(50)], 3)
+    other = timed(lambda: [peer.predict((0.0, 1.0), there) for _ in range(50)], 3)
+    means, factors = mine.result[0]
+    covs = factors @ np.swapaxes(factors, -1, -2)
+    after = other.result[0]
+    apart = float(max(np.abs(means - after.m).max(), np.abs(covs - after.P).max()))
+    rows.append(row("unscented forecast", 12, 12, mine.cpu / 50))
+    rows.append(row("unscented forecast, pyest", 12, 12, other.cpu / 50,
+                    ratio=f"{other.cpu / mine.cpu:.1f}", gap=f"{apart:.0e}"))
+    return rows, int(apart > 1e-10)
 
 
 def main() -> int:
     """Measure, write the table, and count what is missed."""
     rows, missed = beside_peers()
     rows += growth() + fusion()
-    more, late = in_orbit()
-    rows, missed = rows + more, missed + late
+    for part in (in_orbit, splits_and_points):
+        more, late = part()
+        rows, missed = rows + more, missed + late
     write("mixtures", rows, ("numpy", "numba", "pyest", "stonesoup"))
     return missed + int(peak_mb() > LIMIT_MB)
 

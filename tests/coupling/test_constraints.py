@@ -177,6 +177,30 @@ def test_a_projection_that_makes_it_worse_is_refused() -> None:
     assert (both[0] == far).all()
 
 
+def test_the_guard_judges_what_the_reading_moves() -> None:
+    """The shift takes the mean of g to d; where g is curved the members' own misses may grow."""
+    g = norm([0, 1])
+    rng = np.random.default_rng(16)
+    miss, own = [], []
+    for _ in range(40):
+        centre = np.array([0.5, 0.87]) + 0.02 * rng.standard_normal(2)
+        x = centre + 0.1 * rng.standard_normal((50, 2))
+        out = project(x, g)
+        free = project(x, g, guarded=False)
+        before, after = g.residual(x), g.residual(free)
+        miss.append(abs(after.mean()) <= abs(before.mean()))
+        own.append(np.abs(after).mean() <= np.abs(before).mean())
+        assert (out == (free if miss[-1] else x)).all()
+    assert sum(miss) > 30 and sum(own) < sum(miss) - 5
+
+
+def test_a_shift_that_overshoots_is_refused() -> None:
+    """At the bottom of g = x² the regression's slope is small, and the step to d far too long."""
+    g = Constraint(lambda x: x**2, [1.0])
+    x = np.array([[-0.3], [0.31]])
+    assert (project(x, g) == x).all() and (project(x, g, guarded=False) != x).all()
+
+
 def test_a_singular_covariance_without_regularisation_raises() -> None:
     x = np.array([[1.0, 0.0], [1.0, 1.0], [1.0, 2.0]])
     with pytest.raises(np.linalg.LinAlgError):

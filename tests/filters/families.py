@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from distfilt.filters import EnsembleFilter, GaussianFilter, ParticleFilter
+from distfilt.filters import EnsembleFilter, GaussianFilter, ParticleFilter, TransportFilter
 from distfilt.models import LinearModel, simulate
 from distfilt.network import (
     arithmetic_average,
+    average,
     barycentre,
     consensus_pull,
     covariance_intersection,
@@ -39,6 +40,7 @@ FAMILIES: dict[str, Callable[..., Any]] = {
     "gaussian, unscented": partial(GaussianFilter, rule="unscented"),
     "particle": partial(ParticleFilter, members=500),
     "particle, residual": partial(ParticleFilter, members=500, rule="residual", jitter=0.2),
+    "ensemble, common": partial(TransportFilter, members=40, agreement=average, rejuvenation=0.1),
 }
 
 ENSEMBLE_RULES = {
@@ -56,16 +58,25 @@ GAUSSIAN_RULES = {
     "arithmetic": arithmetic_average,
     "pull": partial(consensus_pull, gain=0.1),
 }
-RULED = [
-    (family, rule)
-    for family in FAMILIES
-    for rule in (GAUSSIAN_RULES if family.startswith("gaussian") else ENSEMBLE_RULES)
-]
+LIKELIHOOD_RULES = {
+    "average": average,
+    "average, gain": partial(average, gain=0.2),
+}
+
+
+def rules(family: str) -> dict[str, Callable[..., Any]]:
+    """Agreements that fit the family: of Gaussians, of log-likelihoods or of ensembles."""
+    if family.startswith("gaussian"):
+        return GAUSSIAN_RULES
+    return LIKELIHOOD_RULES if family.endswith("common") else ENSEMBLE_RULES
+
+
+RULED = [(family, rule) for family in FAMILIES for rule in rules(family)]
 
 
 def rule_of(family: str, name: str) -> Any:
     """An agreement that fits the family."""
-    return (GAUSSIAN_RULES if family.startswith("gaussian") else ENSEMBLE_RULES)[name]
+    return rules(family)[name]
 
 
 Q = np.array([[0.3, 0.1], [0.1, 0.2]])

@@ -7,11 +7,12 @@ from functools import partial
 import numpy as np
 import pytest
 
-from distfilt.filters.mixture import MixtureFilter, MixtureState
+from distfilt.filters import MixtureFilter, MixtureState
 from distfilt.mixtures import GaussianMixture, fuse, fuse_moments
-from distfilt.models import Model
+from distfilt.mixtures.gaussian import trusted
+from distfilt.models import Model, occulted, orbits
 from distfilt.network import Faults, Ledger, graphs
-from distfilt.sensors import direct, stack
+from distfilt.sensors import direct, ephemeris, line_of_sight, stack
 
 PUSH = np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 0.9]])
 Q = np.array([[0.2, 0.05, 0.0], [0.05, 0.1, 0.0], [0.0, 0.0, 0.3]])
@@ -185,3 +186,68 @@ def test_single_gaussians_are_factorised_intersection() -> None:
     after = f.step(f.start([OTHER, OTHER]), 1.0, [[1.0], [2.0]])
     one, two = (m.marginal([0]) for m in after.mixtures)
     assert np.allclose(one.means, two.means) and np.allclose(one.covs, two.covs)
+
+
+MEO = np.array([26491.58, 2980.266, -357.1760, -173.028, 2191.596, 3178.45])
+GEO = np.array([42241.10, 0.0, 0.0, 0.0, 3071.859, 0.0])
+
+
+def in_orbit(target: np.ndarray, observer: np.ndarray, **options: object) -> tuple:
+    """A filter with an eye that the Earth blinds and a fix, and its belief."""
+    see = stack([
+        line_of_sight(std=1e-4, hidden=occulted),
+        ephemeris(position_std=1e-3, velocity_std=1e-5),
+    ])
+    f = MixtureFilter([orbits(2)], [see], target_dim=6, **options)  # type: ignore[arg-type]
+    cov = np.diag(np.tile([1.0, 1, 1, 0.1, 0.1, 0.1], 2))
+    return f, f.start([GaussianMixture.gaussian(np.concatenate([target, observer]), cov)])
+
+
+def test_an_orbit_below_the_surface_is_refused() -> None:
+    falls = np.array([7000.0, 0, 0, 0, 100.0, 0])
+    f, state = in_orbit(falls, GEO)
+    with pytest.raises(ValueError, match="orbits above"):
+        f.step(state, 3000.0, [None])
+
+
+def test_a_reading_of_an_occulted_target_is_refused_and_a_missing_one_is_not() -> None:
+    f, state = in_orbit(-MEO, GEO)
+    nothing = np.full(8, np.nan)
+    angles = nothing.copy()
+    angles[:2] = 0.1
+    with pytest.raises(ValueError, match="observations: needs a target that can be seen"):
+        f.step(state, 0.0, [angles])
+    assert np.array_equal(f.step(state, 0.0, [nothing]).mixtures[0].means, state.mixtures[0].means)
+    fix = nothing.copy()
+    fix[2:] = -MEO
+    after = f.step(state, 0.0, [fix]).mixtures[0]
+    assert np.sqrt(after.covs[0, 0, 0]) < 2e-3
+
+
+def test_a_mixand_that_cannot_see_the_target_contradicts_a_reading() -> None:
+    f, state = in_orbit(MEO, GEO)
+    one = state.mixtures[0]
+    away = np.concatenate([-MEO, GEO])
+    two = GaussianMixture([0.1, 0.9], np.stack([one.means[0], away]), np.repeat(one.covs, 2, 0))
+    y = np.full(8, np.nan)
+    y[:2] = line_of_sight(std=1e-4).predict(one.means[0])
+    after = f.step(f.start([two]), 0.0, [y]).mixtures[0]
+    alone = f.step(state, 0.0, [y]).mixtures[0]
+    assert after.size == 1 and np.array_equal(after.means, alone.means)
+
+
+def test_an_agreement_that_loses_definiteness_is_refused() -> None:
+    def broken(own: GaussianMixture, heard: object) -> GaussianMixture:
+        return trusted(own.weights, own.means, own.covs - 10 * np.eye(2))
+
+    f = MixtureFilter([SMALL] * 2, [None] * 2, graphs.path(2), target_dim=1, agreement=broken)
+    with pytest.raises(np.linalg.LinAlgError, match="agreement: needs positive definite"):
+        f.step(f.start([OTHER, OTHER]), 1.0, [None, None])
+
+
+def test_time_does_not_run_backwards() -> None:
+    f, state = in_orbit(MEO, GEO)
+    with pytest.raises(ValueError, match="t: needs"):
+        f.step(state, -1.0, [None])
+    with pytest.raises(ValueError, match="times"):
+        f.run(state, [3600.0, 1800.0], [None])

@@ -16,7 +16,7 @@ from distfilt.kalman import (
     kalman_filter,
     unscented_filter,
 )
-from distfilt.models import Model, clohessy_wiltshire, coordinated_turn, satellite_pose
+from distfilt.models import Model, clohessy_wiltshire, coordinated_turn, satellite_pose, simulate
 from distfilt.sensors import angle, direct, distance, distance_and_angle, stack
 from tests.kalman.bad_input import linear_cases, of_changes, series_cases, with_option
 from tests.kalman.problems import D, M, problem, spd, walk
@@ -76,6 +76,24 @@ def test_linear_case_equals_the_kalman_filter(filter_: Callable[..., Any]) -> No
     )
     np.testing.assert_allclose(run.means, exact.means, rtol=0, atol=1e-10)
     np.testing.assert_allclose(run.covariances, exact.covariances, rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs"), [(extended_filter, filterpy_ekf), (unscented_filter, filterpy_ukf)]
+)
+def test_angles_of_a_satellite_as_the_library_s_own_filters(
+    ours: Callable[..., Any], theirs: Callable[..., Any]
+) -> None:
+    rng = np.random.default_rng(8)
+    model = clohessy_wiltshire(rate=0.1, sigma=0.2)
+    sensors = [direct([0, 1], std=0.2), angle([1, 2], std=0.2), direct([3, 4, 5], std=0.1)]
+    times, start = 0.1 * np.arange(1, 61), np.array([100.0, 0, 0, 10, 0.1, 0])
+    truth = simulate(model, start, times, rng=rng)
+    y = stack(sensors).observe(truth, rng=rng)
+    args = (start + 3, 25 * np.eye(6), y)
+    one, two = (f(*args, model=model, sensors=sensors, times=times) for f in (ours, theirs))
+    np.testing.assert_allclose(one.means, two.means, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(one.covariances, two.covariances, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("filter_", [filterpy_ekf, filterpy_ukf])

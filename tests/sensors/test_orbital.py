@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from distfilt.sensors.orbital import ephemeris, line_of_sight
+from distfilt.models import occulted
+from distfilt.sensors import ephemeris, line_of_sight
 
 BAD_INPUT = {
     "distfilt.sensors.orbital.line_of_sight": [
         ("std", lambda: line_of_sight(std=0.0)),
         ("form", lambda: line_of_sight(std=1.0, form="cosine")),
+        ("target", lambda: line_of_sight(std=1.0, target=-3)),
+        ("observer", lambda: line_of_sight(std=1.0, observer=0.5)),  # type: ignore[arg-type]
+        ("hidden", lambda: line_of_sight(std=1.0, hidden=True)),  # type: ignore[arg-type]
     ],
     "distfilt.sensors.orbital.ephemeris": [
         ("position_std", lambda: ephemeris(position_std=0.0, velocity_std=1.0)),
@@ -50,3 +54,12 @@ def test_places_in_the_state_and_the_ephemeris() -> None:
     fix = ephemeris(position_std=1e-3, velocity_std=1e-5, start=6)
     assert fix.predict(x).tolist() == x[6:12].tolist()
     assert np.allclose(np.sqrt(np.diag(fix.cov)), [1e-3] * 3 + [1e-5] * 3)
+
+
+def test_a_hidden_direction_is_nan() -> None:
+    x = np.zeros((2, 12))
+    x[:, 0], x[0, 6], x[1, 7] = 26000.0, -42000.0, 42000.0
+    eye = line_of_sight(std=1e-4, hidden=occulted)
+    assert np.isnan(eye.predict(x)).tolist() == [[True, True], [False, False]]
+    assert np.isnan(eye.observe(x, rng=np.random.default_rng(0))[0]).all()
+    assert np.array_equal(eye.predict(x)[1], line_of_sight(std=1e-4).predict(x)[1])

@@ -129,7 +129,7 @@ def test_fit_minimises_the_convex_program(penalty: float) -> None:
 
     y, x, _ = banana(3, 120)
     s = fit(y, x, order=2, regularisation=penalty)
-    joint = s._standard(y, x, "x")
+    joint = s._standard(y, x)
     psi = _earlier_features(joint[:, :2], s.bumps[:, :2])
     phi, rates = _own_features(joint[:, 2], s.steps[:, 1])
     c, a = cp.Variable(psi.shape[1]), cp.Variable(phi.shape[1])

@@ -6,14 +6,20 @@ from functools import partial
 
 import numpy as np
 
+from distfilt.coupling import Constraint
 from distfilt.updates import (
+    augmented,
     centred,
+    clipped,
+    ensemble_transform,
     exact_draws,
     gated,
     inflated,
     informed_directions,
     known_noise,
     principal_components,
+    projected,
+    retracted,
     sampled_noise,
     serial,
     square_root,
@@ -26,6 +32,10 @@ R = np.array([[0.5, 0.3], [0.3, 0.9]])
 Y = np.array([1.2, -0.7])
 MEAN = np.array([1.0, -2.0, 0.5])
 COV = np.array([[2.0, 0.6, 0.2], [0.6, 1.0, -0.3], [0.2, -0.3, 0.7]])
+
+PLANE = Constraint(lambda x: 0.5 * x.sum(axis=-1, keepdims=True), [-0.3])
+"""A plane near the prior's mean, for any number of components."""
+FRESH = partial(ensemble_transform, rejuvenation=0.1)
 
 UPDATES = {
     "sampled_noise": sampled_noise,
@@ -42,12 +52,29 @@ UPDATES = {
     "centred": centred(known_noise),
     "serial": serial(known_noise),
     "inflated gated serial": inflated(gated(serial(square_root)), factor=1.01),
+    "ensemble_transform": FRESH,
+    "ensemble_transform, corrected": partial(FRESH, correct=True),
+    "augmented": augmented(known_noise, PLANE, std=0.5),
+    "augmented transform": augmented(FRESH, PLANE, std=0.5),
+    "projected": projected(known_noise, PLANE),
+    "projected transform": projected(FRESH, PLANE, reading="particle"),
+    "retracted": retracted(known_noise, PLANE),
+    "retracted transform": retracted(FRESH, PLANE),
+    "clipped": clipped(known_noise, PLANE),
 }
 CONSISTENT = [
     "sampled_noise", "known_noise", "exact_draws", "square_root", "transport", "transport_sample",
     "informed_directions", "gated", "centred", "serial",
 ]
 """Those whose moments tend to the Kalman filter's."""
+_WRAPPERS = ("augmented", "projected", "retracted", "clipped")
+CONSTRAINED = [name for name in UPDATES if name.startswith(_WRAPPERS)]
+"""Those whose answer is not the one without the constraint."""
+
+
+def enough(name: str) -> int:
+    """Members for a comparison of moments; a coupling of thousands takes its time."""
+    return 300 if "transform" in name else 4000
 
 
 def members(n: int, *leading: int, seed: int = 0) -> np.ndarray:
