@@ -46,6 +46,8 @@ class Seen:
         Of every agent's kernel.
     t : float
         In s.
+    wanted : tuple of int, optional
+        The agents whose estimate is used; a rule may leave the rows of others at zero.
 
     Examples
     --------
@@ -59,6 +61,7 @@ class Seen:
     grid: Grid
     bandwidth: float
     t: float
+    wanted: tuple[int, ...] | None = None
 
     @property
     def kernels(self) -> Array:
@@ -275,6 +278,9 @@ class Flooding:
 
 def _mean_kernels(table: Array, known: Mask, seen: Seen) -> Array:
     """Kernel estimates of the known entries of each table; equal entries are computed once."""
+    if seen.wanted is not None:
+        known = known.copy()
+        known[np.delete(np.arange(len(known)), seen.wanted)] = False
     row, owner = np.nonzero(known)
     stamp = table[row, owner, -1]
     order = np.lexsort((stamp, owner))

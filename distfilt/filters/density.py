@@ -273,7 +273,8 @@ class DensityFilter(Filter):
         if gone.all():
             raise ValueError(f"{name}: needs at least one agent, got none")
         grid.inside(x[~gone], name)
-        return Seen(np.where(gone[:, None], 0.0, x), ~gone, grid, self.bandwidth, t)
+        return Seen(
+            np.where(gone[:, None], 0.0, x), ~gone, grid, self.bandwidth, t, self.local)
 
     def _linked(self, t: float, seen: Seen) -> Graph:
         here = np.flatnonzero(seen.present)
