@@ -204,7 +204,7 @@ def test_local_filters_of_the_literal_swarm_are_lost() -> None:
     grid, rng = Grid((30, 30)), np.random.default_rng(6)
     model, x, p = FokkerPlanck(LITERAL, grid), rng.random((100, 2)), np.ones(900)
     f = DensityFilter(model, 100, 0.25, PIConsensus(modes=64), bandwidth=0.08, local=(0, 1, 2),
-                      rank=60)
+                      rank=60, noise="observed")
     state = f.start(x)
     for j in range(200):
         x = LITERAL.step(x, 0.1 * j, 0.1, rng=rng, substeps=3)
@@ -296,6 +296,26 @@ def test_first_estimates() -> None:
     assert np.allclose(central.estimates[3], kernel_density(START, GRID, bandwidth=H))
 
 
+def test_mass_can_change_where_the_prior_says_so() -> None:
+    """The constant wave's variance is mass_std squared, and R from what is seen leaks mass."""
+    f = make(0.5, Flooding(), mass_std=0.2, noise="observed")
+    state = f.start(START)
+    P = state.filters.covariance(0) * GRID.volume**2
+    assert P.sum() == pytest.approx(0.04, rel=1e-9)
+    assert np.abs(GRID.integral(last(f).estimates) - 1).max() > 1e-4
+    kept = last(make(0.5, Flooding(), noise="observed"))
+    assert np.abs(GRID.integral(kept.estimates) - 1).max() < 1e-12
+
+
+def test_consensus_may_start_flat() -> None:
+    """(14) and Section VI at once: consensus and filter start at one flat Gaussian."""
+    f = make(0.5, PIConsensus(first_std=0.3), first_std=0.3)
+    state = f.start(START)
+    assert np.abs(state.carried[0][:, :100] - state.estimates).max() < 1e-14
+    assert np.array_equal(state.carried[2], make(0.5, PIConsensus()).start(START).carried[2])
+    assert np.abs(GRID.integral(last(f).observed) - 1).max() < 1e-12
+
+
 _STATE = make(0.5, Flooding()).start(START)
 BAD_INPUT = {
     "distfilt.filters.density.DensityFilter": [
@@ -310,6 +330,7 @@ BAD_INPUT = {
         ("first", lambda: make(0.5, Flooding(), first="guess")),
         ("noise", lambda: make(0.5, Flooding(), noise="white")),
         ("floor", lambda: make(0.5, Flooding(), floor=0.0)),
+        ("mass_std", lambda: make(0.5, Flooding(), mass_std=-0.1)),
         ("process", lambda: make(0.5, Flooding(), process=0.0)),
         ("faults", lambda: make(0.5, Flooding(), faults=0.1)),
         ("names", lambda: make(0.5, Flooding(), names=("a",))),
@@ -336,6 +357,7 @@ BAD_INPUT = {
     "distfilt.density.sharing.PIConsensus": [
         ("alpha", lambda: PIConsensus(alpha=-1.0)),
         ("modes", lambda: PIConsensus(modes=0)),
+        ("first_std", lambda: PIConsensus(first_std=0.0)),
     ],
     "distfilt.density.sharing.DynamicAverage": [
         ("modes", lambda: DynamicAverage(modes=0)),
