@@ -258,13 +258,13 @@ def _weighted_products(s: Array, weights: Array) -> Array:
         return np.stack([(s.T * w) @ s for w in weights])
     place, turned = _places(r), np.ascontiguousarray(s.T)
     half = np.empty((len(weights), r * (r + 1) // 2))
-    # Products of two columns, a few hundred at a time: they stay in the processor's cache.
-    block = np.empty((256 + r, s.shape[0]))
+    # Products of two columns, about a hundred at a time: they stay in the processor's cache.
+    block = np.empty((96 + r, s.shape[0]))
     done = held = 0
     for i in range(r):
         np.multiply(turned[i], turned[i:], out=block[held : held + r - i])
         held += r - i
-        if held >= 256 or i == r - 1:
+        if held >= 96 or i == r - 1:
             half[:, done : done + held] = weights @ block[:held].T
             done, held = done + held, 0
     return np.asarray(np.take(half, place, axis=1).reshape(len(weights), r, r))
