@@ -12,6 +12,7 @@ PY := $(VENV)/bin/python
 STAMP := $(VENV)/stamp
 HTML := _build/html
 LAB := _build/lab
+JOBS := 2
 SAMPLE := 300
 
 # One thread in each BLAS, so that two runs give the same digits; book/tools pins the same for kernels.
@@ -63,7 +64,7 @@ book: $(STAMP)
 test: book unit types style pairs regress
 
 unit: $(STAMP)
-	HYPOTHESIS_PROFILE=gate $(PY) -m pytest -q
+	HYPOTHESIS_PROFILE=gate $(PY) -m pytest -q -n $(JOBS) --dist loadscope
 
 types: $(STAMP)
 	$(PY) -m mypy
@@ -77,7 +78,7 @@ pairs: $(STAMP)
 	$(PY) book/tools/ledger.py --check
 
 regress: $(STAMP)
-	$(PY) book/tools/regress.py
+	$(PY) book/tools/regress.py --jobs $(JOBS)
 
 slow: $(STAMP)
 	HYPOTHESIS_PROFILE=explore $(PY) -m pytest -q -m slow

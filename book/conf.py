@@ -140,6 +140,8 @@ html_theme_options = {
     "use_issues_button": False,
     "use_repository_button": False,
     "use_source_button": False,
+    # Pages of wide tables and long lines take the room of the bar on the right.
+    "secondary_sidebar_items": {"**": ["page-toc"], "book/api": [], "book/reproductions": []},
 }
 pygments_style = "tango"
 copybutton_exclude = ".linenos, .gp, .go"
