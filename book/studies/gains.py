@@ -20,13 +20,13 @@ from distfilt.studies import spawn
 
 NAME, PAPER = "gains", "zheng"
 CHOICES, CASE = swarm.CHOICES, figure.CASE
-READINGS = ("paper", "paper_flat", "paper_printed", "fast", "fast_flat", "steps_flat",
+READINGS = ("paper", "paper_flat", "fast", "fast_flat", "steps_flat",
             "steps_printed")
 KINDS = ("error", "ratio", "ratio_high", "falls_high", "below")
 columns = ["kde", "central", "central_printed", "central_below", "central_printed_below",
            *(f"{r}_{k}" for r in READINGS for k in KINDS)]
 parameters = {"seed": CHOICES["seed"], "end": CASE.end, "local": swarm.LOCAL}
-seeds = spawn(CHOICES["seed"] + 1, 3)
+seeds = spawn(CHOICES["seed"] + 1, 2)
 scenarios = swarm.scenarios
 rtol = 1e-4
 

@@ -36,8 +36,8 @@ columns = [
     *(f"wrong_{s}_{q}" for s in BASES for q in ("exact", "process")),
     *(f"wrong_{n}" for n in OPEN),
 ]
-parameters = {"seed": CHOICES["seed"], "local": 4, "rules": RULES}
-seeds = spawn(CHOICES["seed"] + 2, 3)
+parameters = {"seed": CHOICES["seed"], "local": 3, "rules": RULES}
+seeds = spawn(CHOICES["seed"] + 2, 2)
 scenarios = swarm.scenarios
 rtol = 1e-4
 
@@ -54,8 +54,8 @@ def scored(state: object, p: np.ndarray) -> dict[str, float]:
 def wrong_model(rng: np.random.Generator) -> dict[str, float]:
     """Local filters whose f is out of phase, with Q = 0 and with Q > 0."""
     scale = dict(zip(CHOICES["readings"], CHOICES["process_scale"], strict=True))["gibbs"]
-    filters = {f"{s}_exact": swarm.network(s, WRONG, 4) for s in BASES}
-    filters |= {f"{s}_process": swarm.network(s, WRONG, 4, process=scale,
+    filters = {f"{s}_exact": swarm.network(s, WRONG, 3) for s in BASES}
+    filters |= {f"{s}_process": swarm.network(s, WRONG, 3, process=scale,
                                               rank=CHOICES["low_rank"]) for s in BASES}
     run, _ = swarm.compared(WRONG, rng, filters)
     out = {f"wrong_{s}": swarm.average(run[f"{s}_error"], WRONG, 10.0).mean() for s in filters}
@@ -73,7 +73,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     out: dict[str, float] = {}
     for case, rng, names, key in ((TABLE, table, RULES, "table"), (QUICK, quick, BASES, "gibbs"),
                                   (DROP, drop, DROPS, "drop")):
-        filters = {s: swarm.network(s, case, 4) for s in names}
+        filters = {s: swarm.network(s, case, 3) for s in names}
         run, ends = swarm.compared(case, rng, filters, keep)
         late = {k: swarm.average(v, case, 10.0) for k, v in run.items()}
         out |= {f"{key}_{n}": late[n] for n in OPEN}
@@ -83,7 +83,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
                 continue
             out[f"{key}_{s}_error"] = late[f"{s}_error"].mean()
             out[f"{key}_{s}_consensus"] = late[f"{s}_consensus"].mean()
-            out[f"{key}_{s}_counted"] = float(np.median(ends[s].counted[:4]))
+            out[f"{key}_{s}_counted"] = float(np.median(ends[s].counted[:3]))
             out |= {f"{key}_{s}_{k}": v for k, v in scored(ends[s], last[0]).items()}
     out |= wrong_model(wrong)
     return {name: float(out[name]) for name in columns}
