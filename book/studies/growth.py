@@ -20,7 +20,7 @@ from distfilt.studies import spawn
 NAME, PAPER = "growth", "zheng"
 CHOICES = swarm.CHOICES
 SIZES, GRIDS = (50, 100, 300, 1000, 3000, 10_000), (15, 30, 60)
-END, FROM, SIXTEEN, TABLES = 10.0, 6.0, 16, 1000
+END, FROM, SIXTEEN, TABLES = 6.0, 4.0, 16, 1000
 RULES = ("central", "paper", "average", "flooding")
 columns = [
     *(f"{kind}_{n}_{k}" for kind, sizes in (("agents", SIZES), ("cells", GRIDS)) for n in sizes
