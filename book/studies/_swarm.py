@@ -1,11 +1,14 @@
 """A swarm's local density filters: the paper's, its variants, and flooding, on the same agents.
 
-Chapter 10 runs it live: every scheme sees the same positions, with eight local filters.
+Chapter 10 runs it live, and the stored studies of local filters run it longer: every scheme sees
+the same positions.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,68 +17,139 @@ import numpy as np
 from distfilt import density
 from distfilt.filters import DensityFilter
 from distfilt.network import Faults
+from distfilt.published import scenario
 
 sys.path.insert(0, str(Path(__file__).parent))
 import densities
 
 SWARM, CHOICES = densities.SWARM, densities.CHOICES
-LOCAL, END = 8, 20.0
+SHARING = scenario("zheng", "locals")
+LOCAL, FLAT, MODES = int(SHARING["local"]), CHOICES["local_prior_std"], SHARING["modes"]
 GAINS = {"alpha": SWARM["pi_alpha"], "a": SWARM["pi_proportional"]}
 PAPERS = {**GAINS, "b": SWARM["pi_integral"]}
 FAST = {**GAINS, "b": 10 * SWARM["pi_integral"]}
+STEPS = {k: v / SWARM["dt"] for k, v in PAPERS.items()}
+PRINTED = {"noise": "observed", "mass_std": SHARING["mass_std"]}
+HALF = Faults(loss=0.5, seed=3)
 SCHEMES: dict[str, tuple[Any, dict[str, Any]]] = {
     "central": (density.Centralised(), {"first": "observed"}),
-    "paper": (density.PIConsensus(modes=64, **PAPERS), {}),
-    "fast": (density.PIConsensus(modes=64, **FAST), {}),
+    "central_printed": (density.Centralised(), {"first": "observed", **PRINTED}),
+    "paper": (density.PIConsensus(modes=MODES, **PAPERS), {}),
+    "paper_printed": (density.PIConsensus(modes=MODES, **PAPERS), PRINTED),
+    "paper_flat": (density.PIConsensus(modes=MODES, first_std=FLAT, **PAPERS), {}),
+    "fast": (density.PIConsensus(modes=MODES, **FAST), {}),
+    "fast_flat": (density.PIConsensus(modes=MODES, first_std=FLAT, **FAST), {}),
+    "steps_flat": (density.PIConsensus(modes=MODES, first_std=FLAT, **STEPS), {}),
+    "steps_printed": (density.PIConsensus(modes=MODES, first_std=FLAT, **STEPS), PRINTED),
     "average": (density.DynamicAverage(), {}),
     "flooding": (density.Flooding(), {}),
-    "flooding_half": (density.Flooding(), {"faults": Faults(loss=0.5, seed=3)}),
-    "paper_half": (density.PIConsensus(modes=64, **PAPERS), {"faults": Faults(loss=0.5, seed=3)}),
+    "flooding_forgets": (density.Flooding(forget=SHARING["forget"]), {}),
+    "flooding_half": (density.Flooding(), {"faults": HALF}),
+    "paper_half": (density.PIConsensus(modes=MODES, **PAPERS), {"faults": HALF}),
     "neighbours": (density.Neighbours(), {}),
 }
+"""By name: how agents share, and what else of the filter is not the scenario's."""
 
 
-def network(scheme: str, reading: str, agents: int, local: int = LOCAL) -> DensityFilter:
+@dataclass(frozen=True)
+class Case:
+    """A swarm to be filtered: a reading of (23), a first density, and what goes wrong.
+
+    `phase` turns the filters' f against the swarm's; of all agents the share `gone` drops out at
+    `gone_at`; `agents` and `cells` scale the study, with as many neighbours for each agent.
+    """
+
+    reading: str = "slowgibbs"
+    start: str = "uniform"
+    end: float = 20.0
+    phase: float = 0.0
+    gone: float = 0.0
+    gone_at: float = SHARING["gone_at"]
+    agents: int = int(SWARM["agents"])
+    cells: tuple[int, int] = tuple(int(n) for n in SWARM["cells"])
+
+    @property
+    def grid(self) -> density.Grid:
+        return density.Grid(self.cells)
+
+    @property
+    def bandwidth(self) -> float:
+        """The scenario's; with more agents narrower, by the power that is best."""
+        return float(CHOICES["bandwidth"] * (self.agents / SWARM["agents"]) ** (-1 / 6))
+
+    @property
+    def radio_range(self) -> float:
+        return float(SWARM["radio_range"] * np.sqrt(SWARM["agents"] / self.agents))
+
+
+def network(
+    scheme: str, case: Case, local: int | Sequence[int] = LOCAL, **options: Any
+) -> DensityFilter:
     """A scheme's filter with the scenario's choices."""
-    sharing, options = SCHEMES[scheme]
-    model = density.FokkerPlanck(densities.swarm(reading), densities.grid())
+    sharing, own = SCHEMES[scheme]
+    model = density.FokkerPlanck(densities.swarm(case.reading, case.phase), case.grid)
+    who = tuple(range(local)) if isinstance(local, int) else tuple(local)
     return DensityFilter(
-        model, agents, SWARM["radio_range"], sharing, bandwidth=CHOICES["bandwidth"],
-        local=(0,) if scheme == "central" else tuple(range(local)), rank=CHOICES["rank"],
+        model, case.agents, case.radio_range, sharing, bandwidth=case.bandwidth,
+        local=who[:1] if scheme.startswith("central") else who,
         prior_length=CHOICES["prior_length"], prior_std=CHOICES["prior_std"],
-        first_std=CHOICES["local_prior_std"], floor=CHOICES["floor"], **options,
+        first_std=FLAT, floor=CHOICES["floor"],
+        **{"rank": CHOICES["rank"], **own, **options},
     )
 
 
+def drawn(case: Case, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Agents (N, 2) and the density that they are drawn from, on the case's grid."""
+    x = densities.first_agents(case.start, case.agents, rng)
+    first = densities.first_density(case.start)
+    return x, case.grid.normalised(first[densities.grid().cells(case.grid.centres)])
+
+
 def compared(
-    reading: str, start: str, rng: np.random.Generator, schemes: Any = tuple(SCHEMES),
-    end: float = END, local: int = LOCAL, watch: Any = None,
+    case: Case, rng: np.random.Generator, filters: dict[str, DensityFilter],
+    watch: Callable[..., None] | None = None, every: int = 1,
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Errors over time, (T, filters) or (T,), and the last states, by scheme."""
-    cells, dt, n = densities.grid(), SWARM["dt"], int(SWARM["agents"])
-    swarm = densities.swarm(reading)
-    x, p = densities.first_agents(start, n, rng), densities.first_density(start)
-    filters = {s: network(s, reading, n, local) for s in schemes}
+    """Errors over time, (T, filters) or (T,), and the last states, by scheme.
+
+    The errors are noted every so many steps.
+    """
+    cells, dt = case.grid, SWARM["dt"]
+    swarm = densities.swarm(case.reading)
+    x, p = drawn(case, rng)
     states = {s: f.start(x) for s, f in filters.items()}
     model = density.FokkerPlanck(swarm, cells)
-    opened = np.stack([density.kernel_density(x, cells, bandwidth=CHOICES["bandwidth"]),
-                       density.kernels(x[:1], cells, bandwidth=CHOICES["local_prior_std"])[0]])
+    believed = density.FokkerPlanck(densities.swarm(case.reading, case.phase), cells)
+    opened = np.stack([density.kernel_density(x, cells, bandwidth=case.bandwidth),
+                       density.kernels(x[:1], cells, bandwidth=FLAT)[0]])
     out: dict[str, list[Any]] = {}
-
-    def note(name: str, value: Any) -> None:
-        out.setdefault(name, []).append(value)
-
-    for j in range(round(end / dt)):
+    gone = np.arange(case.agents) >= round((1 - case.gone) * case.agents)
+    for j in range(round(case.end / dt)):
         x = swarm.step(x, j * dt, dt, rng=rng, substeps=CHOICES["substeps"])
-        p, *opened = model.step(np.stack([p, *opened]), j * dt, dt)
-        y = density.kernel_density(x, cells, bandwidth=CHOICES["bandwidth"])
+        p, opened = model.step(p, j * dt, dt), believed.step(opened, j * dt, dt)
+        late = (j + 1) * dt > case.gone_at
+        seen = np.where((gone & late)[:, None], np.nan, x)
         for s, f in filters.items():
-            states[s] = f.step(states[s], (j + 1) * dt, x)
-            note(f"{s}_error", cells.norm(states[s].estimates - p))
-            note(f"{s}_consensus", cells.norm(states[s].observed - y))
+            states[s] = f.step(states[s], (j + 1) * dt, seen)
         if watch is not None:
             watch((j + 1) * dt, x, p, states)
-        note("kde", cells.norm(y - p))
-        note("open", cells.norm(opened[0] - p))
-        note("open_flat", cells.norm(opened[1] - p))
+        if (j + 1) % every:
+            continue
+        y = density.kernel_density(x[~(gone & late)], cells, bandwidth=case.bandwidth)
+        noted = {"kde": cells.norm(y - p), "open": cells.norm(opened[0] - p),
+                 "open_flat": cells.norm(opened[1] - p)}
+        for s, state in states.items():
+            noted[f"{s}_error"] = cells.norm(state.estimates - p)
+            noted[f"{s}_consensus"] = cells.norm(state.observed - y)
+        for name, value in noted.items():
+            out.setdefault(name, []).append(value)
     return {name: np.array(values) for name, values in out.items()}, states
+
+
+def average(values: np.ndarray, case: Case, start: float, end: float | None = None) -> np.ndarray:
+    """Mean over the times from `start` to `end`."""
+    k = len(values) / case.end
+    return values[round(start * k): None if end is None else round(end * k)].mean(axis=0)
+
+
+code = (compared, network, drawn, average)
+scenarios = (SWARM, CHOICES, SHARING)

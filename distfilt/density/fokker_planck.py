@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
-from scipy.linalg.lapack import dgttrf, dgttrs
 from scipy.sparse.linalg import splu
 
 from ..checks import Array, array, choice, count, increasing, number
@@ -193,36 +192,46 @@ class FokkerPlanck:
         return move
 
     def _split(self, t: float, dt: float) -> Callable[[Array], Array]:
-        """Backward Euler along one axis after the other, all lines of an axis in one solve."""
+        """Backward Euler along one axis after the other, all lines of an axis at once.
+
+        The tridiagonal elimination has no subtraction, so it keeps signs to the last bit.
+        """
         grid, rates = self.grid, self.rates(t + dt)
-        factors = []
-        for k in range(grid.dim):
-            forwards, backwards = (dt * self._lines(rate, k) for rate in rates)
-            diagonal = 1 + forwards + np.concatenate([[0.0], backwards[:-1]])
-            # Column sums are one: what leaves a cell arrives in its neighbour.
-            *factor, info = dgttrf(-forwards[:-1], diagonal, -backwards[:-1])
-            if info:
-                raise np.linalg.LinAlgError(f"tridiagonal factorisation stopped at row {info}")
-            factors.append(factor)
+        factors = [self._eliminated(*(dt * self._across(r, k) for r in rates))
+                   for k in range(grid.dim)]
 
         def move(p: Array) -> Array:
-            x = p.reshape(-1, *grid.shape)
-            for k, factor in enumerate(factors):
-                lines = np.ascontiguousarray(np.moveaxis(x, k + 1, -1))
-                solved, _ = dgttrs(*factor, lines.reshape(-1, grid.size).T)
-                x = np.moveaxis(solved.T.reshape(lines.shape), -1, k + 1)
-            return np.ascontiguousarray(x).reshape(p.shape)
+            x = np.array(p.reshape(-1, grid.size).T, order="C").reshape(*grid.shape, -1)
+            for k, (down, up, pivot) in enumerate(factors):
+                lines = np.moveaxis(x, k, 0)
+                for i in range(len(down)):
+                    lines[i + 1] += down[i] * lines[i]
+                lines[-1] *= pivot[-1]
+                for i in range(len(up) - 1, -1, -1):
+                    lines[i] *= pivot[i]
+                    lines[i] += up[i] * lines[i + 1]
+            return np.ascontiguousarray(x.reshape(grid.size, -1).T).reshape(p.shape)
 
         return move
 
-    def _lines(self, rate: Array, k: int) -> Array:
-        """Rates at the faces across axis k with that axis last, 0 at the end of each line, (n,)."""
+    @staticmethod
+    def _eliminated(forwards: Array, backwards: Array) -> tuple[Array, Array, Array]:
+        """Factors of I - Δ A along one axis, the first here: down, up and one over the pivot."""
+        pivot = np.ones((len(forwards) + 1, *forwards.shape[1:]))
+        stays = np.ones(forwards.shape[1:])
+        for i, (there, back) in enumerate(zip(forwards, backwards, strict=True)):
+            pivot[i] = stays + there
+            stays = 1 + back * (stays / pivot[i])
+        pivot[-1] = stays
+        pivot = 1 / pivot
+        down, up = forwards * pivot[:-1], backwards * pivot[:-1]
+        return down[..., None], up[..., None], pivot[..., None]
+
+    def _across(self, rate: Array, k: int) -> Array:
+        """Rates at the faces across axis k, with that axis first, (n_k - 1, ...)."""
         shape = list(self.grid.shape)
         shape[k] -= 1
-        inner = np.moveaxis(rate[self._faces.axis == k].reshape(shape), k, -1)
-        padded = np.zeros((*inner.shape[:-1], inner.shape[-1] + 1))
-        padded[..., :-1] = inner
-        return padded.ravel()
+        return np.moveaxis(rate[self._faces.axis == k].reshape(shape), k, 0)
 
     def evolve(
         self, values: ArrayLike, times: ArrayLike, *, t0: float = 0.0, substeps: int = 1

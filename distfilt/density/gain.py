@@ -254,21 +254,29 @@ def shared_step(
 def _weighted_products(s: Array, weights: Array) -> Array:
     """Sᵀ diag(w) S for each row w of the weights, (F, r, r)."""
     r = s.shape[1]
-    if len(weights) < r // 16:
+    if len(weights) < 16:
         return np.stack([(s.T * w) @ s for w in weights])
-    rows, columns, place = _pairs(r)
-    turned = np.ascontiguousarray(s.T)
-    half = weights @ (turned[rows] * turned[columns]).T
+    place, turned = _places(r), np.ascontiguousarray(s.T)
+    half = np.empty((len(weights), r * (r + 1) // 2))
+    # Products of two columns, about a hundred at a time: they stay in the processor's cache.
+    block = np.empty((96 + r, s.shape[0]))
+    done = held = 0
+    for i in range(r):
+        np.multiply(turned[i], turned[i:], out=block[held : held + r - i])
+        held += r - i
+        if held >= 96 or i == r - 1:
+            half[:, done : done + held] = weights @ block[:held].T
+            done, held = done + held, 0
     return np.asarray(np.take(half, place, axis=1).reshape(len(weights), r, r))
 
 
 @lru_cache(maxsize=8)
-def _pairs(r: int) -> tuple[Indices, Indices, Indices]:
-    """Rows and columns of an upper triangle, and where each entry of the whole matrix is in it."""
+def _places(r: int) -> Indices:
+    """Where each entry of a symmetric matrix is in the list of its upper triangle's rows."""
     rows, columns = np.triu_indices(r)
     place = np.empty((r, r), dtype=np.int64)
     place[rows, columns] = place[columns, rows] = np.arange(rows.size)
-    return rows, columns, place.ravel()
+    return place.ravel()
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,12 +26,14 @@ def _along(x: Array, grid: Grid, k: int, width: Array, reflect: bool) -> Array:
     span = edges[-1] - edges[0]
     total = _steps(x, edges, scale)
     if reflect:
-        images = int(np.ceil(float(np.max(width, initial=0.0)) * 9 / span / 2))
-        # Images in both walls, and images of images where kernels are as wide as the box.
-        for m in range(-images, images + 1):
-            if m:
+        # Images in both walls, and images of images where kernels are as wide as the box; what is
+        # more than nine widths away adds nothing.
+        reach = 9 * float(np.max(width, initial=0.0)) / span
+        for m in range(-int(reach / 2 + 1), int(reach / 2 + 1) + 1):
+            if m and 2 * abs(m) - 1 < reach:
                 total = total + _steps(x + 2 * m * span, edges, scale)
-            total = total + _steps(2 * edges[0] - x + 2 * m * span, edges, scale)
+            if max(2 * m, -2 * m - 2) < reach:
+                total = total + _steps(2 * edges[0] - x + 2 * (m + 1) * span, edges, scale)
     return np.asarray(total / grid.spacing[k])
 
 

@@ -46,6 +46,8 @@ class Seen:
         Of every agent's kernel.
     t : float
         In s.
+    wanted : tuple of int, optional
+        The agents whose estimate is used; a rule may leave the rows of others at zero.
 
     Examples
     --------
@@ -59,6 +61,7 @@ class Seen:
     grid: Grid
     bandwidth: float
     t: float
+    wanted: tuple[int, ...] | None = None
 
     @property
     def kernels(self) -> Array:
@@ -66,6 +69,13 @@ class Seen:
         x = np.where(self.present[:, None], self.positions, self.grid.centres[0])
         z = _kernels(x, self.grid, np.full(len(x), self.bandwidth))
         return np.asarray(z * self.present[:, None])
+
+    def flat(self, std: float) -> Array:
+        """A Gaussian about each agent, cut off at the walls; in the middle for the gone, (A, n)."""
+        middle = self.grid.corner + 0.5 * self.grid.width
+        centre = np.where(self.present[:, None], self.positions, middle)
+        gap = ((self.grid.centres - centre[:, None, :]) ** 2).sum(axis=-1)
+        return self.grid.normalised(np.exp(-0.5 * gap / std**2))
 
 
 class Sharing(Protocol):
@@ -97,9 +107,9 @@ class Sharing(Protocol):
         ...
 
 
-def _coordinates(seen: Seen, modes: int | None) -> Array:
+def _coordinates(seen: Seen, modes: int | None, values: Array | None = None) -> Array:
     """Each agent's kernel, whole or as cosine coefficients, and a 1 of the first that is here."""
-    z = seen.kernels
+    z = seen.kernels if values is None else values
     if modes is not None:
         z = z @ seen.grid.cosines(modes) * seen.grid.volume
     leader = np.zeros((len(z), 1))
@@ -133,6 +143,8 @@ class PIConsensus:
         Agree on so many cosine coefficients of the density instead of on all cells.
     rate : bool
         Add the inputs' derivative, which (16) lacks, so that the average is followed without a lag.
+    first_std : float, optional
+        Start at a Gaussian of this width about the agent instead of at the own kernel.
 
     Examples
     --------
@@ -145,17 +157,22 @@ class PIConsensus:
     b: float = field(default=0.04, kw_only=True)
     modes: int | None = field(default=None, kw_only=True)
     rate: bool = field(default=False, kw_only=True)
+    first_std: float | None = field(default=None, kw_only=True)
     reference = False
 
     def __post_init__(self) -> None:
         for name in ("alpha", "a", "b"):
             number(getattr(self, name), name, at_least=0)
         _modes(self.modes)
+        if self.first_std is not None:
+            number(self.first_std, "first_std", above=0)
 
     def begin(self, seen: Seen) -> Carried:
-        """Estimates that are the own kernels, no integral, and the inputs of now."""
+        """First estimates, no integral, and the inputs of now."""
         u = _coordinates(seen, self.modes)
-        return u, np.zeros_like(u), u
+        if self.first_std is None:
+            return u, np.zeros_like(u), u
+        return _coordinates(seen, self.modes, seen.flat(self.first_std)), np.zeros_like(u), u
 
     def learn(
         self, carried: Carried, seen: Seen, channel: Channel, dt: float
@@ -275,6 +292,9 @@ class Flooding:
 
 def _mean_kernels(table: Array, known: Mask, seen: Seen) -> Array:
     """Kernel estimates of the known entries of each table; equal entries are computed once."""
+    if seen.wanted is not None:
+        known = known.copy()
+        known[np.delete(np.arange(len(known)), seen.wanted)] = False
     row, owner = np.nonzero(known)
     stamp = table[row, owner, -1]
     order = np.lexsort((stamp, owner))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -114,6 +115,9 @@ class DensityFilter(Filter):
         Width of the flat Gaussian.
     rank, prior_length, prior_std
         Of :func:`~distfilt.density.zero_mean_prior`.
+    mass_std : float
+        Standard deviation of the prior's total mass. With 0, the default, no measurement can change
+        the mass; above 0 it can, as in the paper.
     noise : {"forecast", "observed"}
         Whether R is k̄ times the filter's own density, or times what it observes as printed; the
         second weighs by the noise itself and is biased.
@@ -152,6 +156,7 @@ class DensityFilter(Filter):
     rank: int = field(default=48, kw_only=True)
     prior_length: float = field(default=0.1, kw_only=True)
     prior_std: float = field(default=1.0, kw_only=True)
+    mass_std: float = field(default=0.0, kw_only=True)
     noise: str = field(default="forecast", kw_only=True)
     floor: float = field(default=0.1, kw_only=True)
     number_known: bool = field(default=True, kw_only=True)
@@ -180,6 +185,7 @@ class DensityFilter(Filter):
         else:
             array(self.first, "first", (self.model.grid.size,))
         number(self.first_std, "first_std", above=0)
+        number(self.mass_std, "mass_std", at_least=0)
         choice(self.noise, "noise", ("forecast", "observed"))
         number(self.floor, "floor", above=0)
         if self.process is not None:
@@ -236,9 +242,7 @@ class DensityFilter(Filter):
         if runs:
             raise ValueError(f"runs: needs (), as every run has a graph of its own, got {runs}")
         seen = self._seen(prior, "prior", number(t, "t"))
-        here, grid = self.filtering, self.model.grid
-        basis = zero_mean_prior(
-            grid, rank=self.rank, length=self.prior_length, std=self.prior_std)
+        here, basis = self.filtering, self._basis
         base = self._base(seen)[here]
         x = np.where(seen.present[:, None], seen.positions, np.nan)
         state = DensityState(
@@ -250,6 +254,17 @@ class DensityFilter(Filter):
         rows = tuple(LowRank(m, basis) for m in base)
         return replace(state, filters=None, low=rows)
 
+    @cached_property
+    def _basis(self) -> Array:
+        """A factor of the prior covariance, (n, r)."""
+        grid = self.model.grid
+        basis = zero_mean_prior(
+            grid, rank=self.rank, length=self.prior_length, std=self.prior_std)
+        if self.mass_std == 0:
+            return basis
+        even = np.full((grid.size, 1), self.mass_std / (grid.size * grid.volume))
+        return np.concatenate([even, basis], axis=1)
+
     def _base(self, seen: Seen) -> Array:
         grid = self.model.grid
         if not isinstance(self.first, str):
@@ -259,10 +274,7 @@ class DensityFilter(Filter):
                 door = Channel(Graph.from_edges(self.size, np.zeros((0, 2))))
                 return self.sharing.learn((), seen, door, 1.0)[1]
             return seen.kernels
-        middle = grid.corner + 0.5 * grid.width
-        centre = np.where(seen.present[:, None], seen.positions, middle)
-        gap = ((grid.centres - centre[:, None, :]) ** 2).sum(axis=-1)
-        return grid.normalised(np.exp(-0.5 * gap / self.first_std**2))
+        return seen.flat(self.first_std)
 
     def _seen(self, positions: ArrayLike, name: str, t: float) -> Seen:
         grid = self.model.grid
@@ -274,7 +286,8 @@ class DensityFilter(Filter):
         if gone.all():
             raise ValueError(f"{name}: needs at least one agent, got none")
         grid.inside(x[~gone], name)
-        return Seen(np.where(gone[:, None], 0.0, x), ~gone, grid, self.bandwidth, t)
+        return Seen(
+            np.where(gone[:, None], 0.0, x), ~gone, grid, self.bandwidth, t, self.local)
 
     def _linked(self, t: float, seen: Seen) -> Graph:
         here = np.flatnonzero(seen.present)
@@ -352,10 +365,8 @@ class DensityFilter(Filter):
         level = means if self.noise == "forecast" else y
         noise = scale * np.maximum(level, self.floor)
         noise[gone] = np.inf
-        basis = zero_mean_prior(self.model.grid, rank=self.rank, length=self.prior_length,
-                                std=self.prior_std)
         assert self.process is not None
-        q = self.process * basis
+        q = self.process * self._basis
         return None, tuple(
             low_rank_step(s, move, y[i], noise[i], dt, process=q)
             for i, s in enumerate(state.low)

@@ -100,6 +100,16 @@ def growth() -> list[dict[str, Any]]:
         x = rng.random((agents, 2))
         rows.append(row("kernel estimate, agents", agents,
                         lambda x=x: kernel_density(x, grid, bandwidth=H), 7))
+    x = rng.random((AGENTS, 2))
+    for n in (30, 60, 120):
+        fine = Grid((n, n))
+        rows.append(row("kernel estimate of 100 agents, cells", n * n,
+                        lambda fine=fine: kernel_density(x, fine, bandwidth=H), 7))
+    near, values = graphs.disk(x, 0.25), {n: rng.random((AGENTS, n * n)) for n in (15, 30, 60)}
+    for n, u in values.items():
+        rows.append(row(
+            "consensus step of 100 agents, cells", n * n,
+            lambda u=u: pi_step(pi_start(u), u, Channel(near), dt=DT, alpha=0.2, a=0.4, b=0.04), 5))
     for agents in (100, 1000, 10_000):
         # The range shrinks, so that everybody keeps as many neighbours.
         reach = 0.25 * np.sqrt(100 / agents)

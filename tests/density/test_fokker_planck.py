@@ -65,6 +65,18 @@ def test_mass_and_sign_over_600_steps(reading: str) -> None:
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
+def test_a_step_leaves_its_input(scheme: str) -> None:
+    flow = FokkerPlanck(rotating_swarm(), Grid((6, 5)), scheme=scheme)
+    p = np.random.default_rng(1).random((3, 30))
+    before = p.copy()
+    many = flow.step(p, 0.0, 0.1)
+    assert np.array_equal(p, before)
+    for row, wanted in zip(p, many, strict=True):
+        assert np.abs(flow.step(row, 0.0, 0.1) - wanted).max() < 1e-14
+    assert np.array_equal(p, before)
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
 def test_schemes_are_their_definitions(scheme: str) -> None:
     swarm = Swarm(lambda x, t: np.stack([np.sin(t + x[..., 1]), x[..., 0]], axis=-1), [0.1, 0.3])
     grid = Grid((4, 5))

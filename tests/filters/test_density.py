@@ -20,7 +20,7 @@ from distfilt.density import (
 )
 from distfilt.density.sharing import Seen, present_graph
 from distfilt.filters import DensityFilter, DensityState, final_state
-from distfilt.models import rotating_swarm
+from distfilt.models import Swarm, rotating_swarm
 from distfilt.network import Faults, Graph, graphs
 
 SIZE, H = 12, 0.12
@@ -150,6 +150,79 @@ def test_a_network_that_falls_apart_is_told() -> None:
     assert np.allclose(run["mass"].values, 1)
 
 
+def test_a_network_that_falls_apart_is_in_the_ledger() -> None:
+    """Nobody hears anything any more: no messages, and each filter goes on with what it has."""
+    def graph(t: float, x: np.ndarray) -> Graph:
+        return graphs.ring(SIZE) if t < 0.45 else Graph.from_edges(SIZE, np.zeros((0, 2)))
+
+    for rule in (Flooding(), PIConsensus(), DynamicAverage(modes=30)):
+        f = make(graph, rule)
+        run = f.run(f.start(START), np.arange(1, 9) * 0.1, PATH)
+        sent = run["messages"].sum("agent").values
+        assert (sent[:4] > 0).all() and (sent[4:] == 0).all()
+        assert run["parts"].isel(agent=0).values.tolist() == [1] * 4 + [SIZE] * 4
+        assert np.isfinite(run["mean"].values).all() and np.allclose(run["mass"].values, 1)
+
+
+def test_the_sum_forgets_agents_that_drop_out() -> None:
+    """Equation (26) and Remark 3: after a dropout Σ(y_i - z_i) over those left decays by
+    1 - α h in each step, whatever the integrators of the others held.
+    """
+    f = make(graphs.ring(SIZE), PIConsensus(b=0.4), first=np.ones(100))
+    state, x = f.start(START), START.copy()
+    for k in range(10):
+        state = f.step(state, 0.1 * (k + 1), x)
+    x[[2, 7]] = np.nan
+    left = ~np.isnan(x).any(axis=-1)
+    z = kernels(x[left], GRID, bandwidth=H)
+    before = (state.carried[0][left, :100] - z).sum(axis=0)
+    for k in range(10, 20):
+        state = f.step(state, 0.1 * (k + 1), x)
+    after = (state.carried[0][left, :100] - z).sum(axis=0)
+    assert state.ledger.rounds == 20  # one substep each
+    assert np.abs(before).max() > 0.1  # what the two took with them
+    assert np.abs(after - (1 - 0.2 * 0.1) ** 10 * before).max() < 1e-12
+
+
+LITERAL = rotating_swarm("literal")
+
+
+def test_the_literal_swarm_falls_apart() -> None:
+    """Criterion 10, first half: no disk graph is connected after ten seconds."""
+    times = np.arange(1, 161) * 0.1
+    joined = []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        path = LITERAL.simulate(rng.random((100, 2)), times, rng=rng, substeps=3)
+        joined += [graphs.disk(x, 0.25).connected for x in path[100::4]]
+    assert np.mean(joined) <= 0.01
+
+
+@pytest.mark.slow
+def test_local_filters_of_the_literal_swarm_are_lost() -> None:
+    """Criterion 10, second half: a local filter's error is that of knowing nothing."""
+    grid, rng = Grid((30, 30)), np.random.default_rng(6)
+    model, x, p = FokkerPlanck(LITERAL, grid), rng.random((100, 2)), np.ones(900)
+    f = DensityFilter(model, 100, 0.25, PIConsensus(modes=64), bandwidth=0.08, local=(0, 1, 2),
+                      rank=60, noise="observed")
+    state = f.start(x)
+    for j in range(200):
+        x = LITERAL.step(x, 0.1 * j, 0.1, rng=rng, substeps=3)
+        p = model.step(p, 0.1 * j, 0.1)
+        state = f.step(state, 0.1 * (j + 1), x)
+    assert state.parts == 2
+    assert (grid.norm(state.estimates - p) >= 0.9 * grid.norm(p)).all()
+
+
+def test_only_the_wanted_estimates_are_made() -> None:
+    """Agents without a filter share as before; what the others learn does not change."""
+    for rule in RULES.values():
+        everyone, few = last(make(0.5, rule)), last(make(0.5, rule, local=(7, 2)))
+        assert np.array_equal(everyone.ledger.scalars, few.ledger.scalars)
+        assert np.abs(everyone.observed[[7, 2]] - few.observed).max() < 1e-13
+        assert np.abs(everyone.estimates[[7, 2]] - few.estimates).max() < 1e-11
+
+
 def test_directed_graphs_flood_and_average() -> None:
     one_way = Graph.from_edges(
         SIZE, [[i, (i - 1) % SIZE] for i in range(SIZE)], directed=True)
@@ -223,6 +296,26 @@ def test_first_estimates() -> None:
     assert np.allclose(central.estimates[3], kernel_density(START, GRID, bandwidth=H))
 
 
+def test_mass_can_change_where_the_prior_says_so() -> None:
+    """The constant wave's variance is mass_std squared, and R from what is seen leaks mass."""
+    f = make(0.5, Flooding(), mass_std=0.2, noise="observed")
+    state = f.start(START)
+    P = state.filters.covariance(0) * GRID.volume**2
+    assert P.sum() == pytest.approx(0.04, rel=1e-9)
+    assert np.abs(GRID.integral(last(f).estimates) - 1).max() > 1e-4
+    kept = last(make(0.5, Flooding(), noise="observed"))
+    assert np.abs(GRID.integral(kept.estimates) - 1).max() < 1e-12
+
+
+def test_consensus_may_start_flat() -> None:
+    """(14) and Section VI at once: consensus and filter start at one flat Gaussian."""
+    f = make(0.5, PIConsensus(first_std=0.3), first_std=0.3)
+    state = f.start(START)
+    assert np.abs(state.carried[0][:, :100] - state.estimates).max() < 1e-14
+    assert np.array_equal(state.carried[2], make(0.5, PIConsensus()).start(START).carried[2])
+    assert np.abs(GRID.integral(last(f).observed) - 1).max() < 1e-12
+
+
 _STATE = make(0.5, Flooding()).start(START)
 BAD_INPUT = {
     "distfilt.filters.density.DensityFilter": [
@@ -237,6 +330,7 @@ BAD_INPUT = {
         ("first", lambda: make(0.5, Flooding(), first="guess")),
         ("noise", lambda: make(0.5, Flooding(), noise="white")),
         ("floor", lambda: make(0.5, Flooding(), floor=0.0)),
+        ("mass_std", lambda: make(0.5, Flooding(), mass_std=-0.1)),
         ("process", lambda: make(0.5, Flooding(), process=0.0)),
         ("faults", lambda: make(0.5, Flooding(), faults=0.1)),
         ("names", lambda: make(0.5, Flooding(), names=("a",))),
@@ -248,6 +342,14 @@ BAD_INPUT = {
         ("observations", lambda: make(0.5, Flooding()).step(_STATE, 0.1, START[:3])),
         ("observations", lambda: make(0.5, Flooding()).step(
             _STATE, 0.1, np.where(np.arange(24).reshape(12, 2) == 4, np.nan, START))),
+        ("outside", lambda: make(0.5, Flooding()).step(
+            _STATE, 0.1, np.where(np.arange(24).reshape(12, 2) == 4, 1.01, START))),
+        ("bandwidth", lambda: make(0.5, Flooding(), bandwidth=-0.1)),
+        ("diagonal", lambda: DensityFilter(FokkerPlanck(Swarm(
+            lambda x, t: 0 * x, [[0.1, 0.02], [0.02, 0.1]]), GRID), SIZE, 0.5, Flooding(),
+            bandwidth=H)),
+        ("diffusion", lambda: DensityFilter(FokkerPlanck(Swarm(
+            lambda x, t: 0 * x, 0.0), GRID), SIZE, 0.5, Flooding(), bandwidth=H)),
         ("graph", lambda: make(lambda t, x: 3, Flooding()).step(_STATE, 0.1, START)),
         ("late", lambda: make(0.5, Flooding()).step(_STATE, 0.1, START, late=[1])),
         ("observations", lambda: make(0.5, Flooding()).run(_STATE, [0.1], PATH)),
@@ -255,6 +357,7 @@ BAD_INPUT = {
     "distfilt.density.sharing.PIConsensus": [
         ("alpha", lambda: PIConsensus(alpha=-1.0)),
         ("modes", lambda: PIConsensus(modes=0)),
+        ("first_std", lambda: PIConsensus(first_std=0.0)),
     ],
     "distfilt.density.sharing.DynamicAverage": [
         ("modes", lambda: DynamicAverage(modes=0)),

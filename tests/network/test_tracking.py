@@ -124,6 +124,33 @@ def test_sum_of_the_estimates_forgets_at_the_rate_alpha() -> None:
         assert np.abs(now - (1 - 0.2 * 0.1) ** k * start).max() < 1e-12
 
 
+def test_sum_decays_on_a_moving_network_from_any_start() -> None:
+    """Criterion 5: graph, integrators and first estimates do not matter to the sum."""
+    draw = rng(5)
+    u, nu, eta = draw.standard_normal((3, 20, 2))
+    state = PIState(nu, eta)
+    for k in range(1, 61):
+        channel = Channel(graphs.disk(draw.random((20, 2)), 0.3))
+        state = pi_step(state, u, channel, dt=0.1, substeps=1, **GAINS)
+        gap = (state.estimate - u).sum(axis=0)
+        assert np.abs(gap - (1 - 0.2 * 0.1) ** k * (nu - u).sum(axis=0)).max() < 1e-12
+
+
+@pytest.mark.parametrize("b", [0.04, 0.2])
+def test_disagreement_shrinks_as_the_spectrum_says(b: float) -> None:
+    """Criterion 6: the slowest mode of a well-connected graph, against its two by two matrix."""
+    graph = graphs.complete(12)
+    lam = graph.spectrum[1]
+    modes = np.linalg.eigvals([[-0.2 - 0.4 * lam, b * lam], [-b * lam, 0.0]]).real
+    state, size = pi_start(rng(3).standard_normal((12, 1))), []
+    for _ in range(400):
+        state = pi_step(state, np.zeros((12, 1)), Channel(graph), dt=0.05, alpha=0.2, a=0.4, b=b,
+                        substeps=6)
+        size.append(np.linalg.norm(state.integral - state.integral.mean(axis=0)))
+    rate = np.log(size[199] / size[399]) / (200 * 0.05)
+    assert abs(rate / -modes.max() - 1) < 0.02
+
+
 def test_pi_agrees_on_the_average_of_still_inputs() -> None:
     u = rng(1).standard_normal((6, 2))
     before = u.copy()

@@ -1,0 +1,71 @@
+"""Fig. 1 of Zheng and Lin, six runs: local filters with the paper's gains, and flooding.
+
+The slow reading of (23), uniform start, 60 s. One trial is one run of all filters on the same
+agents; errors are L2, averaged over time.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+import _swarm as swarm
+
+from distfilt.studies import spawn
+
+NAME, PAPER = "locals", "zheng"
+CHOICES = swarm.CHOICES
+CASE = swarm.Case(end=float(CHOICES["end_times"][CHOICES["readings"].index("slowgibbs")]))
+NAMES = ("central", "paper", "flooding")
+MARKS = tuple(range(2, round(CASE.end) + 1, 2))
+LINES = ("kde", "open", "open_flat", "central",
+         *(f"{s}_{i}" for s in NAMES[1:] for i in range(swarm.LOCAL)))
+columns = [
+    *LINES, "central_20_40", "flooding_20_40", "central_half",
+    "paper_consensus", "flooding_consensus", "central_below", "paper_below",
+    *(f"paper_{k}_{i}" for k in ("half", "falls") for i in range(swarm.LOCAL)),
+    *(f"{line}_at_{t}" for line in LINES for t in MARKS),
+]
+parameters = {"seed": CHOICES["seed"], "end": CASE.end, "local": swarm.LOCAL}
+seeds = spawn(CHOICES["seed"] + 1, CHOICES["runs"])
+scenarios = swarm.scenarios
+rtol = 1e-4
+
+
+def below(error: np.ndarray, level: float) -> float:
+    """Time from which an error stays below a level; the end if it never does."""
+    above = np.flatnonzero(error > level)
+    return 0.0 if not above.size else float(above[-1] + 1) * CASE.end / len(error)
+
+
+def trial(seed: np.random.SeedSequence) -> dict[str, float]:
+    """One run."""
+    filters = {s: swarm.network(s, CASE) for s in NAMES}
+    run, _ = swarm.compared(CASE, np.random.default_rng(seed), filters)
+    lines = {n: run[n] for n in LINES[:3]} | {"central": run["central_error"][:, 0]}
+    lines |= {f"{s}_{i}": run[f"{s}_error"][:, i] for s in NAMES[1:] for i in range(swarm.LOCAL)}
+    late, half = CHOICES["average_from"], CASE.end / 2
+    out = {n: swarm.average(e, CASE, late) for n, e in lines.items()}
+    out |= {f"{n}_at_{t}": e[round(t / swarm.SWARM["dt"]) - 1]
+            for n, e in lines.items() for t in MARKS}
+    for s in NAMES[:1] + NAMES[2:]:
+        out[f"{s}_20_40"] = swarm.average(run[f"{s}_error"], CASE, 20.0, 40.0).mean()
+    for s in NAMES[1:]:
+        out[f"{s}_consensus"] = swarm.average(run[f"{s}_consensus"], CASE, late).mean()
+    local, level = run["paper_error"], float(run["kde"].mean())
+    k = round(5.0 / swarm.SWARM["dt"])
+    falls = local[-k:].mean(axis=0) / local[:k].mean(axis=0)
+    out |= {
+        "central_half": swarm.average(lines["central"], CASE, half),
+        "central_below": below(lines["central"], level),
+        "paper_below": below(local.mean(axis=1), level),
+    }
+    out |= {f"paper_falls_{i}": v for i, v in enumerate(falls)}
+    out |= {f"paper_half_{i}": v for i, v in enumerate(swarm.average(local, CASE, half))}
+    return {name: float(out[name]) for name in columns}
+
+
+code = (*swarm.code, below)

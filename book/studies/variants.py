@@ -1,0 +1,92 @@
+"""Ways of sharing beside each other, and what goes wrong: losses, dropout, a wrong model.
+
+A peaked start for the table of rules; agents that drop out; and filters whose f is out of phase,
+with and without process noise.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+import _swarm as swarm
+
+from distfilt.studies import spawn
+
+NAME, PAPER = "variants", "zheng"
+CHOICES = swarm.CHOICES
+RULES = ("central", "paper", "paper_half", "fast", "average", "flooding", "flooding_half",
+         "neighbours")
+TABLE = swarm.Case(start="peaked", end=15.0)
+QUICK = swarm.Case(reading="gibbs", start="peaked", end=15.0)
+WRONG = swarm.Case(reading="gibbs", start="peaked", end=15.0, phase=CHOICES["wrong_phase"])
+DROP = swarm.Case(start="peaked", end=15.0, gone=swarm.SHARING["gone"])
+DROPS = ("central", "paper", "flooding", "flooding_forgets")
+BASES = ("central", "paper", "flooding")
+OPEN = ("kde", "open", "open_flat")
+columns = [
+    *(f"table_{s}_{k}" for s in RULES for k in ("error", "consensus", "nees", "crps")),
+    *(f"table_{n}" for n in OPEN),
+    *(f"gibbs_{s}" for s in (*OPEN, *BASES)),
+    *(f"drop_{s}_{k}" for s in DROPS for k in ("error", "consensus", "counted")),
+    *(f"drop_{n}" for n in OPEN),
+    *(f"wrong_{s}_{q}" for s in BASES for q in ("exact", "process")),
+    *(f"wrong_{n}" for n in OPEN),
+]
+parameters = {"seed": CHOICES["seed"], "local": 3, "rules": RULES}
+seeds = spawn(CHOICES["seed"] + 2, 2)
+scenarios = swarm.scenarios
+rtol = 1e-4
+
+
+def scored(state: object, p: np.ndarray) -> dict[str, float]:
+    """NEES and CRPS per cell at the end."""
+    from distfilt.metrics import gaussian_crps
+
+    gap, variance = state.estimates - p, np.maximum(state.variances, 1e-12)
+    return {"nees": (gap**2 / variance).mean(),
+            "crps": gaussian_crps(0 * gap, np.sqrt(variance), gap).mean()}
+
+
+def wrong_model(rng: np.random.Generator) -> dict[str, float]:
+    """Local filters whose f is out of phase, with Q = 0 and with Q > 0."""
+    scale = dict(zip(CHOICES["readings"], CHOICES["process_scale"], strict=True))["gibbs"]
+    filters = {f"{s}_exact": swarm.network(s, WRONG, 3) for s in BASES}
+    filters |= {f"{s}_process": swarm.network(s, WRONG, 3, process=scale,
+                                              rank=CHOICES["low_rank"]) for s in BASES}
+    run, _ = swarm.compared(WRONG, rng, filters)
+    out = {f"wrong_{s}": swarm.average(run[f"{s}_error"], WRONG, 10.0).mean() for s in filters}
+    return out | {f"wrong_{n}": swarm.average(run[n], WRONG, 10.0) for n in OPEN}
+
+
+def trial(seed: np.random.SeedSequence) -> dict[str, float]:
+    """One run of each case."""
+    table, quick, drop, wrong = (np.random.default_rng(s) for s in seed.spawn(4))
+    last: list[np.ndarray] = [np.empty(0)]
+
+    def keep(t: float, x: np.ndarray, p: np.ndarray, states: object) -> None:
+        last[0] = p
+
+    out: dict[str, float] = {}
+    for case, rng, names, key in ((TABLE, table, RULES, "table"), (QUICK, quick, BASES, "gibbs"),
+                                  (DROP, drop, DROPS, "drop")):
+        filters = {s: swarm.network(s, case, 3) for s in names}
+        run, ends = swarm.compared(case, rng, filters, keep)
+        late = {k: swarm.average(v, case, 10.0) for k, v in run.items()}
+        out |= {f"{key}_{n}": late[n] for n in OPEN}
+        for s in names:
+            if key == "gibbs":
+                out[f"gibbs_{s}"] = late[f"{s}_error"].mean()
+                continue
+            out[f"{key}_{s}_error"] = late[f"{s}_error"].mean()
+            out[f"{key}_{s}_consensus"] = late[f"{s}_consensus"].mean()
+            out[f"{key}_{s}_counted"] = float(np.median(ends[s].counted[:3]))
+            out |= {f"{key}_{s}_{k}": v for k, v in scored(ends[s], last[0]).items()}
+    out |= wrong_model(wrong)
+    return {name: float(out[name]) for name in columns}
+
+
+code = (*swarm.code, scored, wrong_model)
