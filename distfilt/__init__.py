@@ -3,6 +3,10 @@
 The rooms are packages with a face each, ``from distfilt.filters import EnsembleFilter``. All of
 them are attributes here too, imported when they are first asked for, so that ``import distfilt``
 itself costs next to nothing.
+
+Every public function checks its arguments once: what does not fit raises a ``ValueError`` that
+names the argument, what it needs and what it got. A section Raises is for what else can happen,
+a section Returns for what the first line and the signature do not tell.
 """
 
 from __future__ import annotations
@@ -12,23 +16,10 @@ from types import ModuleType
 
 __version__ = "0.2.0"
 
-_ROOMS = (
-    "digests",
-    "ensembles",
-    "filters",
-    "gaussians",
-    "intervals",
-    "kalman",
-    "linalg",
-    "metrics",
-    "models",
-    "network",
-    "plotting",
-    "published",
-    "sensors",
-    "studies",
-    "triangular",
-    "updates",
+_ROOMS = (  # fmt: skip
+    "coupling", "density", "digests", "ensembles", "filters", "gaussians", "intervals", "kalman",
+    "linalg", "metrics", "mixtures", "models", "network", "plotting", "published", "sensors",
+    "studies", "triangular", "updates",
 )
 
 __all__ = ["__version__", *_ROOMS]
@@ -41,4 +32,4 @@ def __getattr__(name: str) -> ModuleType:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})

@@ -19,7 +19,7 @@ from scipy.linalg.lapack import dpotrf
 
 __all__ = [  # fmt: skip
     "Array", "SolverError", "array", "callable_", "choice", "count", "covariance", "flags",
-    "generator", "increasing", "instance", "needed", "number", "same_length", "weights",
+    "generator", "increasing", "instance", "needed", "nonblank", "number", "same_length", "weights",
 ]
 
 Array = NDArray[np.float64]
@@ -63,8 +63,6 @@ def array(
         If the value is not made of real numbers (masked arrays, dates, complex numbers, booleans
         and text are refused, not converted), has another shape, or holds NaN or infinity.
 
-    Examples
-    --------
     >>> array([[1, 2], [3, 4]], "ensemble", (..., "N", 2)).shape
     (2, 2)
     >>> array([1.0, np.nan], "mean", (2,))
@@ -130,13 +128,6 @@ def covariance(
     semidefinite : bool
         Also accept singular matrices (a process noise that drives only some components).
 
-    Raises
-    ------
-    ValueError
-        If the matrix is not square of size `dim`, not symmetric, or not positive (semi)definite.
-
-    Examples
-    --------
     >>> covariance([[1.0, 2.0], [2.0, 1.0]], "noise")
     Traceback (most recent call last):
     ValueError: noise: needs a positive definite matrix, got smallest eigenvalue -1
@@ -192,8 +183,6 @@ def _why_not_definite(cov: Array, name: str, semidefinite: bool) -> None:
 def flags(value: Any, name: str, shape: tuple[Any, ...] | None = None) -> NDArray[np.bool_]:
     """Return `value` as an array of booleans of the wanted shape; numbers are refused.
 
-    Examples
-    --------
     >>> flags([True, False], "here", ("S",))
     array([ True, False])
     >>> flags([1, 0], "here")
@@ -212,13 +201,6 @@ def flags(value: Any, name: str, shape: tuple[Any, ...] | None = None) -> NDArra
 def weights(value: ArrayLike, name: str, size: int | None = None) -> Array:
     """Return `value` as nonnegative weights that sum to one along the last axis.
 
-    Raises
-    ------
-    ValueError
-        If a weight is negative or a sum differs from one by more than 1e-8.
-
-    Examples
-    --------
     >>> weights([0.5, 0.6], "weights")
     Traceback (most recent call last):
     ValueError: weights: needs a sum of 1, got 1.1
@@ -234,18 +216,11 @@ def weights(value: ArrayLike, name: str, size: int | None = None) -> Array:
 
 
 def number(
-    value: Any,
-    name: str,
-    *,
-    above: float | None = None,
-    at_least: float | None = None,
-    below: float | None = None,
-    at_most: float | None = None,
+    value: Any, name: str, *, above: float | None = None, at_least: float | None = None,
+    below: float | None = None, at_most: float | None = None,
 ) -> float:
     """Return `value` as a finite float inside the given bounds.
 
-    Examples
-    --------
     >>> number(-0.2, "sigma", at_least=0)
     Traceback (most recent call last):
     ValueError: sigma: needs a number at least 0, got -0.2
@@ -272,8 +247,6 @@ def number(
 def count(value: Any, name: str, *, at_least: int = 1) -> int:
     """Return `value` as an integer of at least `at_least`.
 
-    Examples
-    --------
     >>> count(1.5, "members")
     Traceback (most recent call last):
     ValueError: members: needs an integer of at least 1, got 1.5
@@ -287,8 +260,6 @@ def count(value: Any, name: str, *, at_least: int = 1) -> int:
 def choice(value: Any, name: str, options: Collection[str]) -> str:
     """Return `value` if it is one of the options.
 
-    Examples
-    --------
     >>> choice("svd", "solver", ("ECOS", "CLARABEL"))
     Traceback (most recent call last):
     ValueError: solver: needs one of ECOS, CLARABEL, got 'svd'
@@ -301,8 +272,6 @@ def choice(value: Any, name: str, options: Collection[str]) -> str:
 def generator(value: Any, name: str = "rng") -> np.random.Generator:
     """Return `value` if it is a numpy random generator; integers and None are refused.
 
-    Examples
-    --------
     >>> generator(7)
     Traceback (most recent call last):
     ValueError: rng: needs a numpy.random.Generator (np.random.default_rng(seed)), got int
@@ -316,8 +285,6 @@ def generator(value: Any, name: str = "rng") -> np.random.Generator:
 def callable_(value: Any, name: str) -> Callable[..., Any]:
     """Return `value` if it can be called.
 
-    Examples
-    --------
     >>> callable_(3, "step")
     Traceback (most recent call last):
     ValueError: step: needs a function, got int
@@ -327,11 +294,21 @@ def callable_(value: Any, name: str) -> Callable[..., Any]:
     return value  # type: ignore[no-any-return]
 
 
+def nonblank(value: Any, name: str) -> str:
+    """Return `value` if it is a text that is not blank.
+
+    >>> nonblank(" ", "label")
+    Traceback (most recent call last):
+    ValueError: label: needs a text, got ' '
+    """
+    if not isinstance(value, str) or not value.strip():
+        raise ValueError(f"{name}: needs a text, got {value!r}")
+    return value
+
+
 def increasing(value: ArrayLike, name: str) -> Array:
     """Return `value` as a strictly increasing vector of times.
 
-    Examples
-    --------
     >>> increasing([0.0, 0.2, 0.2], "times")
     Traceback (most recent call last):
     ValueError: times: needs strictly increasing values, got 0.2 after 0.2
@@ -348,8 +325,6 @@ def increasing(value: ArrayLike, name: str) -> Array:
 def same_length(a: Collection[Any], b: Collection[Any], name_a: str, name_b: str) -> None:
     """Refuse two collections of different length.
 
-    Examples
-    --------
     >>> same_length([1, 2], [1], "sensors", "agents")
     Traceback (most recent call last):
     ValueError: sensors: needs as many entries as agents (1), got 2
@@ -363,14 +338,13 @@ def same_length(a: Collection[Any], b: Collection[Any], name_a: str, name_b: str
 def instance(value: Any, name: str, kind: type[_T]) -> _T:
     """Return `value` if it is of the wanted class.
 
-    Examples
-    --------
     >>> instance(3, "rng", np.random.Generator)
     Traceback (most recent call last):
     ValueError: rng: needs a Generator, got int
     """
     if not isinstance(value, kind):
-        raise ValueError(f"{name}: needs a {kind.__name__}, got {type(value).__name__}")
+        article = "an" if kind.__name__[0] in "AEIOU" else "a"
+        raise ValueError(f"{name}: needs {article} {kind.__name__}, got {type(value).__name__}")
     return value
 
 
@@ -382,8 +356,6 @@ def needed(module: str, extra: str) -> ModuleType:
     ModuleNotFoundError
         If the package `module` is not installed. An error inside an installed one is passed on.
 
-    Examples
-    --------
     >>> needed("math", "maps").sqrt(4.0)
     2.0
     >>> needed("no_such_solver", "maps")

@@ -21,7 +21,9 @@ def central(
     *,
     difference: Callable[[Array, Array], Array] = np.subtract,
 ) -> Array:
-    """Derivative of a batched function by central differences, all 2 d moves in two calls.
+    """Derivative (..., m, d) by central differences, all 2 d moves in two calls.
+
+    Its error is about 1e-10 of the function's scale.
 
     Parameters
     ----------
@@ -32,11 +34,6 @@ def central(
     difference : callable
         ``difference(ahead, behind)``, for values that wrap; subtraction by default.
 
-    Returns
-    -------
-    ndarray, (..., m, d)
-        Its error is about 1e-10 of the function's scale.
-
     Examples
     --------
     >>> central(lambda x: x**2, [1.0, 3.0]).round(8)
@@ -45,7 +42,14 @@ def central(
     """
     callable_(function, "function")
     callable_(difference, "difference")
-    return _central(function, array(x, "x", (..., "d")), difference)
+    place = array(x, "x", (..., "d"))
+    value = np.asarray(function(place.copy()))
+    if value.dtype.kind not in "fiub" or value.shape[:-1] != place.shape[:-1] or not value.ndim:
+        raise ValueError(
+            f"function: needs to return numbers (..., m) for {place.shape}, "
+            f"got {value.dtype} of shape {value.shape}"
+        )
+    return _central(function, place, difference)
 
 
 def _central(

@@ -54,7 +54,7 @@ def _summary(values: Array) -> str:
 
 
 def digest(**arrays: ArrayLike) -> str:
-    """Describe plotted data in a line each, so that a test of stored outputs sees a changed curve.
+    """Describe plotted data, a line an array: who compares stored outputs sees a changed curve.
 
     A picture is not compared, this text is: the number of values, their range, their mean and
     their inner product with one fixed unit vector, to four digits. Range digits are relative to
@@ -64,11 +64,6 @@ def digest(**arrays: ArrayLike) -> str:
     ----------
     **arrays : array_like
         The plotted arrays by name, of any shape. NaN and infinity are allowed and counted.
-
-    Returns
-    -------
-    str
-        One line an array, in the order given.
 
     Notes
     -----
@@ -107,11 +102,6 @@ def of_axes(drawn: Any) -> str:
         One line an axes with the numbers of its artists, then one line for each coordinate of each
         visible line, patch, collection (points, filled areas, contours, arrows) and image, in the
         order in which they were added. A coordinate that the artist before it has too is left out.
-
-    Raises
-    ------
-    ValueError
-        If something else is passed, or nothing is drawn.
 
     Notes
     -----

@@ -22,14 +22,10 @@ def _ensemble(value: ArrayLike, name: str, members: int = 1) -> Array:
 
 
 def draw(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    members: int,
-    *,
-    rng: np.random.Generator,
+    mean: ArrayLike, cov: ArrayLike, members: int, *, rng: np.random.Generator,
     leading: tuple[int, ...] = (),
 ) -> Array:
-    """Draw ensembles from a Gaussian.
+    """Draw ensembles (*leading, N, d) from a Gaussian.
 
     Parameters
     ----------
@@ -44,10 +40,6 @@ def draw(
     leading : tuple of int
         Leading axes, such as (runs, agents); every ensemble is drawn independently.
 
-    Returns
-    -------
-    ndarray, (*leading, N, d)
-
     Examples
     --------
     >>> draw([0.0, 0.0], np.eye(2), 5, rng=np.random.default_rng(0), leading=(3,)).shape
@@ -55,6 +47,8 @@ def draw(
     """
     centre = array(mean, "mean", ("d",))
     root = factor(array(cov, "cov", (centre.size, centre.size)))
+    if not np.iterable(leading):
+        raise ValueError(f"leading: needs a tuple of integers, got {leading!r}")
     size = (*(count(n, "leading") for n in leading), count(members, "members"), centre.size)
     return centre + generator(rng).standard_normal(size) @ root.T
 
@@ -62,8 +56,6 @@ def draw(
 def mean(ensemble: ArrayLike) -> Array:
     """Mean over the members, (..., d).
 
-    Examples
-    --------
     >>> mean([[1.0, 2.0], [3.0, 4.0]])
     array([2., 3.])
     """
@@ -78,8 +70,6 @@ def _mean(e: Array) -> Array:
 def anomalies(ensemble: ArrayLike) -> Array:
     """Members minus their mean, (..., N, d).
 
-    Examples
-    --------
     >>> anomalies([[1.0], [3.0]])
     array([[-1.],
            [ 1.]])
@@ -94,13 +84,6 @@ def _anomalies(e: Array) -> Array:
 def sample_covariance(ensemble: ArrayLike) -> Array:
     """Sample covariance with N - 1 in the denominator, (..., d, d).
 
-    Raises
-    ------
-    ValueError
-        With fewer than two members.
-
-    Examples
-    --------
     >>> sample_covariance([[0.0, 0.0], [2.0, 4.0]])
     array([[2., 4.],
            [4., 8.]])
@@ -116,8 +99,6 @@ def _sample_covariance(e: Array) -> Array:
 def cross_covariance(ensemble: ArrayLike, other: ArrayLike) -> Array:
     """Sample covariance between two ensembles of the same members, (..., d, m).
 
-    Examples
-    --------
     >>> cross_covariance([[0.0], [2.0]], [[1.0], [5.0]])
     array([[4.]])
     """
@@ -135,7 +116,7 @@ def _cross_covariance(a: Array, b: Array) -> Array:
 def exact_noise(
     anomalies_to_avoid: ArrayLike, cov: ArrayLike, *, rng: np.random.Generator
 ) -> Array:
-    r"""Draw noise whose sample moments are exact: second-order exact draws.
+    r"""Draw noise (..., N, k) whose sample moments are exact: second-order exact draws.
 
     Over the members the draws average to zero, are uncorrelated with the given anomalies, and have
     exactly the sample covariance `cov`. An ensemble with such noise added has the sum of both
@@ -150,10 +131,6 @@ def exact_noise(
         Covariance of the noise, positive semidefinite. Leading axes broadcast.
     rng : numpy.random.Generator
         Source of the draw.
-
-    Returns
-    -------
-    ndarray, (..., N, k)
 
     Raises
     ------
@@ -180,6 +157,8 @@ def exact_noise(
     True
     """
     a = array(anomalies_to_avoid, "anomalies_to_avoid", (..., "N", "p"))
+    if a.shape[-2] < 2:
+        raise ValueError(f"anomalies_to_avoid: needs at least 2 members, got {a.shape[-2]}")
     root = factor(cov)
     _leading(a.shape[:-2], root.shape[:-2], "cov")
     return _exact_noise(a, root, generator(rng))

@@ -30,11 +30,6 @@ def data_root() -> Path:
     A folder counts only if it holds ``published/items.csv`` and ``scenarios/accepted.csv``: the
     ``data`` of another project is passed over.
 
-    Returns
-    -------
-    Path
-        An absolute path.
-
     Raises
     ------
     FileNotFoundError

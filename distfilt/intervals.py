@@ -26,11 +26,6 @@ class Interval:
     error : float
         The estimate's standard error, at least 0.
 
-    Raises
-    ------
-    ValueError
-        If a value is not finite, the error is negative or low <= estimate <= high fails.
-
     Examples
     --------
     >>> share = Interval(0.25, 0.15, 0.375, 0.06)
@@ -68,7 +63,7 @@ def _values(values: ArrayLike, least: int) -> Array:
 
 
 def mean_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
-    """Student's t interval for the mean of independent values.
+    """Student's t interval for the mean of independent values, with the standard error s/√n.
 
     Parameters
     ----------
@@ -76,11 +71,6 @@ def mean_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
         One number a run, at least two.
     level : float
         Confidence, in (0, 1).
-
-    Returns
-    -------
-    Interval
-        The mean, the interval, and the standard error s/√n.
 
     Examples
     --------
@@ -102,7 +92,8 @@ def median_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
     """Interval for the median that assumes nothing about the distribution.
 
     The k-th smallest and the k-th largest value miss the median with probability
-    2 P(B < k), B binomial (n, 1/2); k is the largest with which they miss it seldom enough.
+    2 P(B < k), B binomial (n, 1/2); k is the largest with which they miss it seldom enough. The
+    error is the half width divided by the normal quantile of `level`.
 
     Parameters
     ----------
@@ -110,12 +101,6 @@ def median_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
         Independent values; enough of them for `level`: 6 for 95%.
     level : float
         Confidence that the interval has at least, in (0, 1).
-
-    Returns
-    -------
-    Interval
-        The sample median, the order statistics, and as error the half width divided by the normal
-        quantile of `level`, which tends to the standard error for large n.
 
     Examples
     --------
@@ -141,6 +126,8 @@ def median_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
 def proportion_interval(successes: int, trials: int, *, level: float = 0.95) -> Interval:
     """Clopper-Pearson interval for a probability: it covers with at least `level`, for every n.
 
+    The error is the plug-in one, √(p(1-p)/n), 0 at p = 0 and 1.
+
     Parameters
     ----------
     successes : int
@@ -149,11 +136,6 @@ def proportion_interval(successes: int, trials: int, *, level: float = 0.95) -> 
         Independent trials, at least one.
     level : float
         Confidence that the interval has at least, in (0, 1).
-
-    Returns
-    -------
-    Interval
-        The share, the interval, and the plug-in standard error √(p(1-p)/n), 0 at p = 0 and 1.
 
     Notes
     -----

@@ -1,7 +1,7 @@
 """Batched linear algebra on covariances: Cholesky factors and triangular solves, no inverse.
 
-A name with an underscore is the same computation without checks, for loops of this package: it
-takes float64 arrays that fit, and factors where its public twin takes covariances.
+A name with an underscore makes no checks and serves the loops of this package: it takes float64
+arrays that fit, and Cholesky factors in place of covariances.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from .checks import Array, array, covariance, number
 
-__all__ = ["cholesky_solve", "factor", "log_det", "quadratic_form", "symmetrise", "van_loan"]
+__all__ = ["factor", "van_loan"]
 
 _EPS = float(np.finfo(np.float64).eps)
 _TINY = float(np.finfo(np.float64).tiny)
@@ -23,24 +23,8 @@ _POWERS = (0.5 * (_NODES + 1))[:, None] ** np.arange(21)
 """Powers 0 to 20 of the Gauss-Legendre points of [0, 1]."""
 
 
-def symmetrise(matrix: ArrayLike) -> Array:
-    """Average of a square matrix and its transpose, (..., d, d).
-
-    Called once, where a product loses symmetry by rounding.
-
-    Examples
-    --------
-    >>> symmetrise([[1.0, 0.4], [0.2, 1.0]])
-    array([[1. , 0.3],
-           [0.3, 1. ]])
-    """
-    m = array(matrix, "matrix", (..., "d", "d"))
-    if m.shape[-1] != m.shape[-2]:
-        raise ValueError(f"matrix: needs a square matrix, got shape {m.shape}")
-    return _symmetrise(m)
-
-
 def _symmetrise(m: Array) -> Array:
+    """Average of a square matrix and its transpose, where a product loses symmetry by rounding."""
     return np.asarray(0.5 * (m + m.swapaxes(-1, -2)))
 
 
@@ -59,11 +43,6 @@ def factor(cov: ArrayLike, *, name: str = "cov") -> Array:
     ndarray, (..., d, d)
         Lower triangular with a nonnegative diagonal: the Cholesky factor, with zero columns where a
         matrix is singular.
-
-    Raises
-    ------
-    ValueError
-        If a matrix is not symmetric or has a negative eigenvalue.
 
     Notes
     -----
@@ -130,47 +109,14 @@ def _from_eigenvectors(cov: Array) -> Array:
     return lower
 
 
-def cholesky_solve(cov: ArrayLike, right: ArrayLike) -> Array:
-    """Solve ``cov @ out = right`` for a positive definite `cov` by its Cholesky factor.
-
-    Parameters
-    ----------
-    cov : array_like, (..., d, d)
-        Symmetric positive definite.
-    right : array_like, (..., d, k)
-        Right-hand sides, as columns. Leading axes broadcast.
-
-    Returns
-    -------
-    ndarray, (..., d, k)
-
-    Raises
-    ------
-    ValueError
-        If `cov` is not symmetric positive definite or the sizes differ.
-
-    Examples
-    --------
-    >>> cholesky_solve([[4.0, 0.0], [0.0, 2.0]], [[8.0], [1.0]]).ravel()
-    array([2. , 0.5])
-    """
-    c = covariance(cov, "cov")
-    b = array(right, "right", (..., c.shape[-1], "k"))
-    _leading(c.shape[:-2], b.shape[:-2], "right")
-    return _cholesky_solve(_cholesky(c), b)
-
-
-def _leading(wanted: tuple[int, ...], got: tuple[int, ...], name: str) -> None:
+def _leading(wanted: tuple[int, ...], got: tuple[int, ...], name: str) -> tuple[int, ...]:
+    """What leading axes broadcast to, or an error that names the argument that does not fit."""
     try:
-        np.broadcast_shapes(wanted, got)
+        return np.broadcast_shapes(wanted, got)
     except ValueError:
         raise ValueError(
             f"{name}: needs leading axes that broadcast with {wanted}, got {got}"
         ) from None
-
-
-def _cholesky_solve(lower: Array, right: Array) -> Array:
-    return _solve_upper(lower, _solve_lower(lower, right))
 
 
 def _solve_lower(lower: Array, right: Array) -> Array:
@@ -241,47 +187,13 @@ def _whiten(lower: Array, vectors: Array) -> Array:
     return np.asarray(_triangular(lower, vectors[..., None], 0)[..., 0])
 
 
-def quadratic_form(cov: ArrayLike, vector: ArrayLike) -> Array:
-    r"""Squared Mahalanobis length :math:`\mathbf v^\top \mathbf P^{-1} \mathbf v`.
-
-    Parameters
-    ----------
-    cov : array_like, (..., d, d)
-        Symmetric positive definite.
-    vector : array_like, (..., d)
-        Leading axes broadcast.
-
-    Returns
-    -------
-    ndarray, (...)
-
-    Examples
-    --------
-    >>> float(quadratic_form([[4.0]], [6.0]))
-    9.0
-    """
-    c = covariance(cov, "cov")
-    v = array(vector, "vector", (..., c.shape[-1]))
-    _leading(c.shape[:-2], v.shape[:-1], "vector")
-    return _quadratic_form(_cholesky(c), v)
-
-
 def _quadratic_form(lower: Array, vector: Array) -> Array:
+    """Squared Mahalanobis length of vectors (..., d), by the covariance's Cholesky factor."""
     return np.asarray((_whiten(lower, vector) ** 2).sum(axis=-1))
 
 
-def log_det(cov: ArrayLike) -> Array:
-    """Logarithm of the determinant of a positive definite matrix, (...).
-
-    Examples
-    --------
-    >>> round(float(log_det([[2.0, 0.0], [0.0, 3.0]])), 6)
-    1.791759
-    """
-    return _log_det(_cholesky(covariance(cov, "cov")))
-
-
 def _log_det(lower: Array) -> Array:
+    """Logarithm of a covariance's determinant, by its Cholesky factor."""
     return np.asarray(2.0 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1))
 
 

@@ -85,6 +85,7 @@ BAD_INPUT = {
     ],
     _C + "instance": [("model", lambda: checks.instance(3, "model", dict))],
     _C + "needed": [("no_such_solver", lambda: checks.needed("no_such_solver", "maps"))],
+    _C + "nonblank": [("label", lambda: checks.nonblank(" ", "label"))],
     _C + "number": [
         ("a", lambda: checks.number(NAN, "a")),
         ("a", lambda: checks.number(float("inf"), "a")),

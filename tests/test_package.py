@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+import distfilt
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "distfilt"
 PATHS = sorted(PACKAGE.rglob("*.py"))
@@ -185,6 +187,16 @@ def test_functions_fit_a_screen(path: Path) -> None:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             assert length(node) <= 40, f"{node.name} has {length(node)} lines, at most 40"
+
+
+def test_every_room_is_seen_and_shows_what_it_exports() -> None:
+    """`dir` and completion find each room, and in it what a reader calls; helpers stay inside."""
+    seen = {name for name in dir(distfilt) if not name.startswith("__")}
+    helpers = {"checks", "differences", "folders", "progress"}
+    assert seen == {part(dotted(path)) for path in PATHS} - helpers - {""}
+    for room in seen:
+        face = getattr(distfilt, room)
+        assert set(face.__all__) <= set(dir(face)), room
 
 
 def test_every_folder_is_a_package() -> None:

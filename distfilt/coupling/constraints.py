@@ -64,7 +64,10 @@ class Constraint:
         return self._residual(array(x, "x", (..., "d")))
 
     def _residual(self, x: Array) -> Array:
-        g = np.asarray(self.function(x.copy()))
+        try:
+            g = np.asarray(self.function(x.copy()))
+        except IndexError as error:
+            raise ValueError(f"function: needs states of more components, got {x.shape}") from error
         if g.shape != (*x.shape[:-1], self.value.size):
             raise ValueError(
                 f"function: needs to return {(*x.shape[:-1], self.value.size)} for states "
@@ -101,6 +104,8 @@ def norm(indices: Sequence[int], *, length: float = 1.0) -> Constraint:
     >>> norm([0, 1]).residual([0.6, 0.8, 5.0]).round(15) + 0.0
     array([0.])
     """
+    if not np.iterable(indices):
+        raise ValueError(f"indices: needs a list of integers, got {indices!r}")
     rows = [count(i, "indices", at_least=0) for i in indices]
     if not rows or len(set(rows)) != len(rows):
         raise ValueError(f"indices: needs at least one, all different, got {list(indices)}")

@@ -81,6 +81,8 @@ def accepted(
     """
     x = array(ensemble, "ensemble", (..., "N", "d"))
     w = array(log_weights, "log_weights", x.shape[:-1], finite=False)
+    if not (w < np.inf).all():
+        raise ValueError("log_weights: needs numbers or minus infinity, got NaN or infinity")
     least = number(tolerance, "tolerance", at_least=0)
     inside = (_constraint(constraint)._residual(x) <= least).all(axis=-1)
     if not inside.any(axis=-1).all():
@@ -127,7 +129,8 @@ def augmented_readings(
     h = array(predicted, "predicted", (*x.shape[:-1], "m"))
     y = array(observed, "observed", (*x.shape[:-2], h.shape[-1]), finite=False)
     r = array(noise, "noise", (..., h.shape[-1], h.shape[-1]))
-    return _augmented(x, h, y, r, _constraint(constraint), number(std, "std", above=0))
+    spread = number(std, "std", above=0, at_most=1e150)
+    return _augmented(x, h, y, r, _constraint(constraint), spread)
 
 
 def _augmented(

@@ -172,6 +172,7 @@ class FokkerPlanck:
 
     def solver(self, t: float, dt: float) -> Callable[[Array], Array]:
         """The step from `t` to `t` + `dt` as a function: one factorisation for any number."""
+        t, dt = number(t, "t"), number(dt, "dt", at_least=0)
         if self.scheme == "split":
             return self._split(t, dt)
         half = self.scheme == "crank_nicolson"

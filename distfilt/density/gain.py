@@ -16,7 +16,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, number
+from ..checks import Array, array, callable_, number
 
 __all__ = [
     "Dense",
@@ -104,7 +104,7 @@ def dense_step(
         raise ValueError(f"state: needs a Dense state, got {type(state).__name__}")
     n, length = state.mean.size, number(dt, "dt", above=0)
     y, r = array(observed, "observed", (n,)), _variance(noise, (n,))
-    mean = move(state.mean)
+    mean = callable_(move, "move")(state.mean)
     p = move(move(state.covariance).T)
     if process is not None:
         q = array(process, "process", (n, "q"))
@@ -198,7 +198,7 @@ def shared_moved(state: Shared, move: Move) -> Shared:
     if not isinstance(state, Shared):
         raise ValueError(f"state: needs a Shared state, got {type(state).__name__}")
     r = state.basis.shape[1]
-    moved = move(np.concatenate([state.basis.T, state.base]))
+    moved = callable_(move, "move")(np.concatenate([state.basis.T, state.base]))
     basis = np.ascontiguousarray(moved[:r].T)
     return Shared(basis, moved[r:], state.information, state.vector)
 
@@ -341,6 +341,7 @@ def low_rank_step(
     n, r = state.factor.shape
     length = number(dt, "dt", above=0)
     y, variance = array(observed, "observed", (n,)), _variance(noise, (n,))
+    callable_(move, "move")
     mean, factor, lost = move(state.mean), move(state.factor.T).T, state.lost
     if process is not None:
         q = array(process, "process", (n, "q"))

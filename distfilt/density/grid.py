@@ -220,7 +220,7 @@ class Grid:
         >>> bool(np.abs(basis.T @ basis / 64 - np.eye(10)).max() < 1e-12)
         True
         """
-        if rank in self._kept:
+        if count(rank, "rank") in self._kept:
             return self._kept[rank]
         k = self.wavenumbers(rank)
         x = (self.centres - self.corner) / self.width

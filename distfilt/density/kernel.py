@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import erf
 
-from ..checks import Array, array, choice, count, number
+from ..checks import Array, array, choice, count, instance, number
 from .grid import Grid
 
 __all__ = [
@@ -46,6 +46,8 @@ def _width(value: ArrayLike, grid: Grid, agents: int, name: str = "bandwidth") -
         raise ValueError(f"{name}: needs a number or one for each of {agents} agents, "
                          f"got shape {h.shape}")
     least = float(h.min(initial=np.inf))
+    if h.max(initial=0.0) > 20 * grid.width.max():
+        raise ValueError(f"{name}: needs at most 20 widths of the box, got {h.max():g}")
     if not least > 0:
         raise ValueError(f"{name}: needs a number above 0, got {least:g}")
     widest = float(grid.spacing.max())
@@ -201,6 +203,7 @@ def kernel_covariance(
     >>> print(round(cov[middle, middle] / (1 / (400 * np.pi * 0.08**2)), 2))
     0.89
     """
+    instance(grid, "grid", Grid)
     p = array(density, "density", (grid.size,))
     total = float(grid.integral(p))
     if p.min() < 0 or abs(total - 1) > 1e-8:
@@ -239,6 +242,7 @@ def bandwidth(
     >>> round(bandwidth(x, Grid((30, 30))), 3)
     0.129
     """
+    instance(grid, "grid", Grid)
     x = _agents(array(positions, "positions", ("N", grid.dim)), grid)
     choice(rule, "rule", ("silverman", "least_squares"))
     n, d = x.shape
@@ -297,6 +301,7 @@ def adaptive_bandwidths(
     >>> bool(h[2] > 0.1 > h[0])
     True
     """
+    instance(grid, "grid", Grid)
     x = _agents(array(positions, "positions", ("N", grid.dim)), grid)
     s = number(sensitivity, "sensitivity", at_least=0, at_most=1)
     h = number(bandwidth, "bandwidth", above=0)

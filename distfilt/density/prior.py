@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import Array, number
+from ..checks import Array, count, number
 from .grid import Grid
 
 __all__ = ["zero_mean_prior"]
@@ -43,8 +43,8 @@ def zero_mean_prior(
     """
     if not isinstance(grid, Grid):
         raise ValueError(f"grid: needs a Grid, got {type(grid).__name__}")
-    ell, sigma = number(length, "length", above=0), number(std, "std", above=0)
-    if isinstance(rank, int) and rank >= grid.size:
+    ell, sigma = number(length, "length", above=0, at_most=1e100), number(std, "std", above=0)
+    if count(rank, "rank") >= grid.size:
         raise ValueError(f"rank: needs at most {grid.size - 1} modes besides the constant, "
                          f"got {rank}")
     k = grid.wavenumbers(rank + 1)

@@ -10,22 +10,9 @@ from .saving import State
 from .transport import TransportFilter
 from .wiring import SensorFilter
 
-__all__ = [
-    "DensityFilter",
-    "DensityState",
-    "EnsembleFilter",
-    "EnsembleState",
-    "Filter",
-    "FilterError",
-    "GaussianFilter",
-    "GaussianState",
-    "Late",
-    "ParticleCollapse",
-    "ParticleFilter",
-    "ParticleState",
-    "SensorFilter",
-    "State",
-    "Summary",
-    "TransportFilter",
+__all__ = [  # fmt: skip
+    "DensityFilter", "DensityState", "EnsembleFilter", "EnsembleState", "Filter", "FilterError",
+    "GaussianFilter", "GaussianState", "Late", "ParticleCollapse", "ParticleFilter",
+    "ParticleState", "SensorFilter", "State", "Summary", "TransportFilter",
     "final_state",
 ]

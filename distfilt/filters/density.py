@@ -163,6 +163,7 @@ class DensityFilter(Filter):
         if not isinstance(self.model, FokkerPlanck):
             raise ValueError(f"model: needs a FokkerPlanck, got {type(self.model).__name__}")
         size = count(self.size, "size")
+        count(self.rank, "rank")
         if not callable(self.graph) and not isinstance(self.graph, Graph):
             number(self.graph, "graph", above=0)
         for name in ("begin", "learn"):

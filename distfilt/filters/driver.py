@@ -95,14 +95,7 @@ class Filter(ABC):
     """
 
     @abstractmethod
-    def start(
-        self,
-        prior: Any,
-        *,
-        rng: Any,
-        runs: tuple[int, ...] = (),
-        t: float = 0.0,
-    ) -> Any:
+    def start(self, prior: Any, *, rng: Any, runs: tuple[int, ...] = (), t: float = 0.0) -> Any:
         """The state before the first step."""
 
     @abstractmethod
@@ -140,12 +133,7 @@ class Filter(ABC):
         return list(observations)
 
     def steps(
-        self,
-        state: Any,
-        times: ArrayLike,
-        observations: Any,
-        *,
-        late: Sequence[Late] = (),
+        self, state: Any, times: ArrayLike, observations: Any, *, late: Sequence[Late] = (),
         progress: bool = False,
     ) -> Iterator[Any]:
         """The states at `times`, one after the other; arguments as in :meth:`run`."""
@@ -163,15 +151,8 @@ class Filter(ABC):
             yield state
 
     def run(
-        self,
-        state: Any,
-        times: ArrayLike,
-        observations: Any,
-        *,
-        truth: ArrayLike | None = None,
-        scores: Collection[str] = SCORES,
-        late: Sequence[Late] = (),
-        progress: bool = False,
+        self, state: Any, times: ArrayLike, observations: Any, *, truth: ArrayLike | None = None,
+        scores: Collection[str] = SCORES, late: Sequence[Late] = (), progress: bool = False,
     ) -> xarray.Dataset:
         """Step through a series and record it.
 
@@ -210,17 +191,9 @@ class Filter(ABC):
             recorder.add(last, self.summary(last))
         return recorder.dataset(last)
 
-
     def smooth(
-        self,
-        state: Any,
-        times: ArrayLike,
-        observations: Any,
-        *,
-        truth: ArrayLike | None = None,
-        scores: Collection[str] = SCORES,
-        late: Sequence[Late] = (),
-        progress: bool = False,
+        self, state: Any, times: ArrayLike, observations: Any, *, truth: ArrayLike | None = None,
+        scores: Collection[str] = SCORES, late: Sequence[Late] = (), progress: bool = False,
     ) -> xarray.Dataset:
         """Fixed-lag smoothing: of each time what is believed when `lag` more have been observed.
 
@@ -251,11 +224,6 @@ def final_state(run: xarray.Dataset) -> State:
     ----------
     run : xarray.Dataset
         As :meth:`Filter.run` returned it; a selection or a copy has no state.
-
-    Raises
-    ------
-    ValueError
-        If there is none.
 
     Examples
     --------

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from .. import ensembles as moments
-from ..checks import Array, array, callable_, count, covariance, generator, number
+from ..checks import Array, array, callable_, count, generator, instance, number
 from ..models import Model
 from ..network import Graph, Ledger, intersection
 from ..sensors import Sensor
@@ -112,10 +112,6 @@ class EnsembleFilter(SensorFilter):
     members : int
         Number N of members of each agent.
 
-    See Also
-    --------
-    EnsembleFilter.exact : exact draws and covariance intersection, in one line.
-
     Examples
     --------
     >>> from distfilt.network import graphs
@@ -140,11 +136,8 @@ class EnsembleFilter(SensorFilter):
 
     @classmethod
     def exact(
-        cls,
-        model: Model,
-        sensors: Sequence[Sensor | None],
-        graph: Graph | Callable[[float], Graph] | None = None,
-        **options: Any,
+        cls, model: Model, sensors: Sequence[Sensor | None],
+        graph: Graph | Callable[[float], Graph] | None = None, **options: Any,
     ) -> EnsembleFilter:
         """Second-order exact draws and covariance intersection of least determinant.
 
@@ -175,12 +168,8 @@ class EnsembleFilter(SensorFilter):
         return cls(model, sensors, graph, **(own | options))
 
     def start(
-        self,
-        prior: ArrayLike | Callable[..., Array] | tuple[ArrayLike, ArrayLike],
-        *,
-        rng: np.random.Generator,
-        runs: tuple[int, ...] = (),
-        t: float = 0.0,
+        self, prior: ArrayLike | Callable[..., Array] | tuple[ArrayLike, ArrayLike], *,
+        rng: np.random.Generator, runs: tuple[int, ...] = (), t: float = 0.0,
     ) -> EnsembleState:
         """The state before the first step.
 
@@ -198,18 +187,12 @@ class EnsembleFilter(SensorFilter):
         t : float
             The time of the prior, in s.
         """
-        generator(rng)
-        lead = (*(count(n, "runs") for n in runs), len(self.sensors))
-        drawn = drawn_prior(prior, self.members, self.model.dim, lead, rng)
+        drawn = self.drawn(prior, self.members, runs, rng)
         ledger = Ledger.empty(len(self.sensors))
         return EnsembleState(number(t, "t"), ledger, rng.spawn(1)[0], drawn)
 
     def step(
-        self,
-        state: EnsembleState,
-        t: float,
-        observations: Sequence[ArrayLike | None],
-        *,
+        self, state: EnsembleState, t: float, observations: Sequence[ArrayLike | None], *,
         late: Sequence[Late] = (),
     ) -> EnsembleState:
         """Move to time `t` and take in what was observed there.
@@ -268,12 +251,7 @@ class EnsembleFilter(SensorFilter):
         return tuple((t, _summary(e, state.failed)) for t, e in state.history)
 
     def _condition(
-        self,
-        stack: list[Array],
-        slot: int,
-        group: Heard,
-        failed: Mask,
-        rng: np.random.Generator,
+        self, stack: list[Array], slot: int, group: Heard, failed: Mask, rng: np.random.Generator,
         previous: Array | None,
     ) -> dict[tuple[int, ...], str]:
         """Condition every time's ensembles of a group's agents, in place; the rows that failed."""
@@ -325,8 +303,7 @@ class EnsembleFilter(SensorFilter):
         return out
 
     def _check_state(self, state: Any) -> None:
-        if not isinstance(state, EnsembleState):
-            raise ValueError(f"state: needs an EnsembleState, got {type(state).__name__}")
+        instance(state, "state", EnsembleState)
         needed = (len(self.sensors), self.members, self.model.dim)
         if state.ensembles.shape[-3:] != needed:
             raise ValueError(f"state: needs ensembles (..., {needed}), got {state.ensembles.shape}")
@@ -340,19 +317,3 @@ def _summary(e: Array, failed: Mask) -> Summary:
         mean, variance = mean.copy(), variance.copy()
         mean[failed], variance[failed] = np.nan, np.nan
     return Summary(mean, variance, members=e)
-
-
-def drawn_prior(
-    prior: Any, members: int, dim: int, lead: tuple[int, ...], rng: np.random.Generator
-) -> Array:
-    """Members (*lead, N, d) of a prior in any of the forms that a filter's start accepts."""
-    if isinstance(prior, tuple) and len(prior) == 2:
-        centre = array(prior[0], "prior", (dim,))
-        cov = covariance(prior[1], "prior", dim, semidefinite=True)
-        return moments.draw(centre, cov, members, rng=rng, leading=lead)
-    drawn = prior(members, rng=rng, leading=lead) if callable(prior) else prior
-    shape = (*lead, members, dim)
-    out = array(np.asarray(drawn), "prior", (..., members, dim))
-    if out.shape != shape and out.shape != shape[-2:]:
-        raise ValueError(f"prior: needs shape {shape} or {shape[-2:]}, got {out.shape}")
-    return np.broadcast_to(out, shape).copy()

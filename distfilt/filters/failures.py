@@ -49,42 +49,16 @@ class FilterError(RuntimeError):
 
 
 def guarded(
-    compute: Compute,
-    arrays: tuple[Array, ...],
-    fallback: tuple[Array, ...],
-    lead: int,
-    *,
-    shared: Array,
-    rng: np.random.Generator | None,
+    compute: Compute, arrays: tuple[Array, ...], fallback: tuple[Array, ...], lead: int, *,
+    shared: Array, rng: np.random.Generator | None,
 ) -> tuple[tuple[Array, ...], dict[Row, str]]:
-    """A computation on a batch, and if it fails on each row alone.
+    """A computation on a batch (*lead, …), and if it fails on each row alone.
 
-    Parameters
-    ----------
-    compute : callable
-        ``compute(*arrays, shared, rng)``, batched over leading axes.
-    arrays : tuple of ndarray, (*lead, …)
-    fallback : tuple of ndarray, (*lead, …)
-        What stands in for the result of a row that fails.
-    lead : int
-        How many leading axes count rows.
-    shared : ndarray, (m, m) or (G, m, m)
-        One more argument, for all rows or for each entry of the last leading axis.
-    rng : numpy.random.Generator or None
+    `compute` gets the arrays, `shared`, (m, m) for all rows or (G, m, m) for each entry of the last
+    leading axis, and `rng`; `lead` axes count rows, and a row that fails keeps its `fallback`. The
+    results come with the reason for each failure, by the row's index. Where every row fails with a
+    ValueError the call is wrong, not a row, and the error is passed on.
 
-    Returns
-    -------
-    results : tuple of ndarray
-    errors : dict
-        Why a row failed, by its index.
-
-    Raises
-    ------
-    ValueError
-        The computation's own, where every row fails with one: then the call is wrong, not a row.
-
-    Examples
-    --------
     >>> def root(x, shared, rng):
     ...     return (np.linalg.cholesky(x),)
     >>> x = np.array([[[4.0]], [[-1.0]]])
@@ -112,8 +86,6 @@ def guarded(
 def not_finite(values: Array, axes: int) -> dict[Row, str]:
     """The rows whose last `axes` axes hold NaN or infinity, as errors.
 
-    Examples
-    --------
     >>> not_finite(np.array([[1.0], [np.nan]]), 1)
     {(1,): 'the forecast is not finite'}
     """
@@ -124,13 +96,8 @@ def not_finite(values: Array, axes: int) -> dict[Row, str]:
 
 
 def _row_by_row(
-    compute: Compute,
-    arrays: tuple[Array, ...],
-    fallback: tuple[Array, ...],
-    lead: int,
-    shared: Array,
-    rng: np.random.Generator | None,
-    first: Exception,
+    compute: Compute, arrays: tuple[Array, ...], fallback: tuple[Array, ...], lead: int,
+    shared: Array, rng: np.random.Generator | None, first: Exception,
 ) -> tuple[tuple[Array, ...], dict[Row, str]]:
     out = tuple(f.copy() for f in fallback)
     errors: dict[Row, str] = {}

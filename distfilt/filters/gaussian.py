@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, choice, count, covariance, number
+from ..checks import Array, array, choice, count, covariance, instance, number
+from ..linalg import _symmetrise
 from ..network import Ledger
 from .driver import Late, Summary
 from .failures import guarded, not_finite
@@ -64,9 +65,7 @@ class GaussianState(State):
             semidefinite=True,
         )
         if self.ledger.messages.size != m.shape[-2]:
-            raise ValueError(
-                f"ledger: needs {m.shape[-2]} agents, got {self.ledger.messages.size}"
-            )
+            raise ValueError(f"ledger: needs {m.shape[-2]} agents, got {self.ledger.messages.size}")
         object.__setattr__(self, "failed", np.broadcast_to(self.failed, self.runs))
 
     @property
@@ -125,12 +124,8 @@ class GaussianFilter(SensorFilter):
             raise ValueError("sensors: needs sensors of the present state, got a differential one")
 
     def start(
-        self,
-        prior: tuple[ArrayLike, ArrayLike],
-        *,
-        rng: np.random.Generator | None = None,
-        runs: tuple[int, ...] = (),
-        t: float = 0.0,
+        self, prior: tuple[ArrayLike, ArrayLike], *, rng: np.random.Generator | None = None,
+        runs: tuple[int, ...] = (), t: float = 0.0,
     ) -> GaussianState:
         """The state before the first step.
 
@@ -154,11 +149,7 @@ class GaussianFilter(SensorFilter):
         return GaussianState(number(t, "t"), Ledger.empty(agents), None, m.copy(), p.copy(), d)
 
     def step(
-        self,
-        state: GaussianState,
-        t: float,
-        observations: Sequence[ArrayLike | None],
-        *,
+        self, state: GaussianState, t: float, observations: Sequence[ArrayLike | None], *,
         late: Sequence[Late] = (),
     ) -> GaussianState:
         """Move to time `t` and take in what was observed there.
@@ -168,8 +159,7 @@ class GaussianFilter(SensorFilter):
         state, t, observations, late
             As for :meth:`distfilt.filters.EnsembleFilter.step`.
         """
-        if not isinstance(state, GaussianState):
-            raise ValueError(f"state: needs a GaussianState, got {type(state).__name__}")
+        instance(state, "state", GaussianState)
         dt = self.elapsed(state, t)
         seen = self.observed(state, observations)
         channel = self.channel(state, t)
@@ -189,7 +179,7 @@ class GaussianFilter(SensorFilter):
             means, covs = self._agreed(means, covs, channel)
         ledger = state.ledger if channel is None else channel.ledger
         return GaussianState(
-            float(t), ledger, None, means, _symmetric(covs), state.dim, times, failed
+            float(t), ledger, None, means, _symmetrise(covs), state.dim, times, failed
         )
 
     def summary(self, state: GaussianState) -> Summary:
@@ -222,10 +212,7 @@ class GaussianFilter(SensorFilter):
         return np.concatenate([moved, old], axis=-1), covs
 
     def _linearised(
-        self,
-        function: Callable[[Array], Array],
-        jacobian: Callable[[Array], Array],
-        mean: Array,
+        self, function: Callable[[Array], Array], jacobian: Callable[[Array], Array], mean: Array,
         cov: Array,
     ) -> tuple[Array, Array, Array]:
         """Value, slope and extra covariance of a function of a Gaussian (..., d)."""
@@ -275,7 +262,7 @@ class GaussianFilter(SensorFilter):
     def _agreed(self, means: Array, covs: Array, channel: Any) -> tuple[Array, Array]:
         """Fuse the present states; what is believed of the past follows by its regression."""
         d = self.model.dim
-        old, now = means[..., :d], _symmetric(covs[..., :d, :d])
+        old, now = means[..., :d], _symmetrise(covs[..., :d, :d])
         assert self.agreement is not None
         m, p = self.agreement(old, now, channel)
         m, p = array(m, "agreement", old.shape), array(p, "agreement", now.shape)
@@ -299,11 +286,7 @@ def _updated(m: Array, p: Array, gap: Array, h: Array, r: Array) -> tuple[Array,
     gain = np.swapaxes(np.linalg.solve(h @ cross + r, np.swapaxes(cross, -1, -2)), -1, -2)
     rest = np.eye(p.shape[-1]) - gain @ h
     new = rest @ p @ np.swapaxes(rest, -1, -2) + gain @ r @ np.swapaxes(gain, -1, -2)
-    return m + (gain @ gap[..., None])[..., 0], _symmetric(new)
-
-
-def _symmetric(p: Array) -> Array:
-    return np.asarray(0.5 * (p + np.swapaxes(p, -1, -2)))
+    return m + (gain @ gap[..., None])[..., 0], _symmetrise(new)
 
 
 def _summary(state: GaussianState, slot: int) -> Summary:

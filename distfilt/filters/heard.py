@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,28 +26,19 @@ class _Part:
     starts: Indices
 
     @property
-    def places(self) -> Iterator[tuple[int, int]]:
-        """Agent of the group and first column, one after the other."""
-        return zip(self.rows, self.starts, strict=True)
+    def columns(self) -> Indices:
+        """Where each reading's components stand, (K, m)."""
+        return np.asarray(self.starts[:, None] + np.arange(self.sensor.dim))
 
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """The readings of G agents that have equally many numbers, M.
+    """The readings of G agents that have equally many numbers, M: those of `parts`, their sensors.
 
-    Parameters
-    ----------
-    agents : ndarray of int, (G,)
-        Who they are.
-    target : ndarray, (*runs, G, M)
-        What they know of the observations; NaN where a component is missing.
-    noise : ndarray, (M, M) or (G, M, M)
-        Its covariance, once if it is the same for all.
-    parts : tuple
-        The sensors behind it.
+    `agents` (G,) says who they are; `target` (*runs, G, M) is what they know of the observations,
+    NaN where a component is missing; `noise` is its covariance, (M, M) if it is the same for all,
+    else (G, M, M).
 
-    Examples
-    --------
     >>> from distfilt.network import Channel, graphs
     >>> from distfilt.sensors import direct
     >>> sensor = direct([0], std=0.5)
@@ -67,64 +58,39 @@ class Heard:
         A reading that wraps lies on the branch of the observation. `previous` holds the states at
         the observation time before, for sensors that see changes.
         """
-        out = np.empty((*states.shape[:-1], self.target.shape[-1]))
-        for part, cells in self._spread():
+        out = np.empty((*states.shape[:-2], self.target.shape[-1], states.shape[-2]))
+        for part in self.parts:
             before = None if previous is None else previous[..., part.rows, :, :]
             seen = part.sensor.predict(states[..., part.rows, :, :], before)
             # On the branch of the observation: y* - wrap(y* - h).
-            aim = np.stack([self.target[..., g, c] for g, c in cells], axis=-2)[..., None, :]
+            cells = part.rows[:, None], part.columns
+            aim = self.target[..., *cells][..., None, :]
             gap = part.sensor.residual(np.broadcast_to(aim, seen.shape), seen)
             seen = np.where(np.isnan(gap), seen, aim - gap)
-            for k, (g, columns) in enumerate(cells):
-                out[..., g, :, columns] = seen[..., k, :, :]
-        return out
+            out[..., *cells, :] = seen.swapaxes(-1, -2)
+        return np.ascontiguousarray(out.swapaxes(-1, -2))
 
     def jacobian(self, states: Array) -> Array:
         """Derivatives of the readings at states (*runs, G, d), (*runs, G, M, d)."""
         out = np.empty((*self.target.shape, states.shape[-1]))
-        for part, cells in self._spread():
+        for part in self.parts:
             slope = part.sensor.jacobian(states[..., part.rows, :])
-            for k, (g, columns) in enumerate(cells):
-                out[..., g, columns, :] = slope[..., k, :, :]
+            out[..., part.rows[:, None], part.columns, :] = slope
         return out
 
     def covariance(self, row: int) -> Array:
         """The noise covariance of one agent of the group, (M, M)."""
         return self.noise if self.noise.ndim == 2 else self.noise[row]
 
-    @property
-    def needs_previous(self) -> bool:
-        """Whether one of the sensors sees changes."""
-        return any(part.sensor.uses_previous for part in self.parts)
-
-    def _spread(self) -> list[tuple[_Part, list[tuple[int, slice]]]]:
-        """Each part, and the cells (agent of the group, columns) that it fills."""
-        return [
-            (p, [(int(g), slice(int(s), int(s) + p.sensor.dim)) for g, s in p.places])
-            for p in self.parts
-        ]
 
 
 def gather(
-    observed: Sequence[Array | None],
-    sensors: Sequence[Sensor | None],
-    channel: Channel | None,
+    observed: Sequence[Array | None], sensors: Sequence[Sensor | None], channel: Channel | None
 ) -> list[Heard]:
-    """Let agents send what they observed, and collect what each of them then knows.
+    """Let agents send what they observed, (*runs, m) or None, and collect what each then knows.
 
-    Parameters
-    ----------
-    observed : sequence of length A
-        Per agent (*runs, m), with NaN where a component is missing, or None.
-    sensors : sequence of Sensor or None
-        What each agent sees with.
-    channel : Channel or None
-        Carries each observation to those that hear its agent; None where nobody tells another.
-
-    Returns
-    -------
-    list of Heard
-        One for each number of readings that occurs, ascending; agents without any are left out.
+    Without a channel nobody tells another. There is one entry for each number of readings that
+    occurs, ascending; agents without any are left out.
     """
     inbox = channel.exchange(observed) if channel is not None else [{} for _ in observed]
     groups: dict[int, list[tuple[int, dict[int, Array]]]] = {}
@@ -144,23 +110,23 @@ def _group(
     target = np.stack(
         [np.concatenate(list(heard.values()), axis=-1) for _, heard in members], axis=-2
     )
-    places: dict[int, list[tuple[int, int]]] = {}
+    # Agents with one and the same sensor are predicted together.
+    places: dict[int, tuple[Sensor, list[tuple[int, int]]]] = {}
     for g, (_, heard) in enumerate(members):
         start = 0
         for sender, value in heard.items():
-            places.setdefault(sender, []).append((g, start))
+            sensor = sensors[sender]
+            if sensor is None:
+                raise ValueError(f"sensors: needs a sensor for agent {sender}, which observed")
+            places.setdefault(id(sensor), (sensor, []))[1].append((g, start))
             start += value.shape[-1]
     parts, noise = [], np.zeros((len(members), size, size))
-    for sender, cells in places.items():
-        sensor = sensors[sender]
-        if sensor is None:
-            raise ValueError(f"sensors: needs a sensor for agent {sender}, which observed")
+    for sensor, cells in places.values():
         rows, starts = (np.array(c, dtype=np.intp) for c in zip(*cells, strict=True))
-        parts.append(_Part(sensor, rows, starts))
-        for g, s in cells:
-            noise[g, s : s + sensor.dim, s : s + sensor.dim] = sensor.cov
+        part = _Part(sensor, rows, starts)
+        parts.append(part)
+        at = part.columns
+        noise[rows[:, None, None], at[:, :, None], at[:, None, :]] = sensor.cov
     same = bool((noise == noise[:1]).all())
     agents = np.array([agent for agent, _ in members], dtype=np.intp)
     return Heard(agents, target, noise[0] if same else noise, tuple(parts))
-
-

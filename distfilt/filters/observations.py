@@ -20,27 +20,9 @@ def at_one_time(
 ) -> list[Array | None]:
     """Observations of one time, per agent (*runs, m) with NaN where a component is missing.
 
-    Parameters
-    ----------
-    observations : sequence of length A
-        Per agent (*runs, m), or (m,) for all runs, or None.
-    sensors : sequence of Sensor or None, length A
-        What each agent sees with.
-    runs : tuple of int
-        Leading axes.
+    Each may be given as (m,) for all runs, or None; None comes back where nothing was observed in
+    any run.
 
-    Returns
-    -------
-    list
-        None where nothing was observed in any run.
-
-    Raises
-    ------
-    ValueError
-        If an observation does not fit its sensor, or an agent without a sensor has one.
-
-    Examples
-    --------
     >>> from distfilt.sensors import direct
     >>> at_one_time([[1.0], None], [direct([0], std=1.0), None], (2,))
     [array([[1.],
@@ -67,28 +49,10 @@ def at_one_time(
 
 
 def over_times(
-    observations: Sequence[ArrayLike | None],
-    sensors: Sequence[Sensor | None],
-    times: ArrayLike,
+    observations: Sequence[ArrayLike | None], sensors: Sequence[Sensor | None], times: ArrayLike
 ) -> tuple[Array, list[Array | None]]:
-    """The times (T,) and the series of observations, per agent (T, ..., m) or None.
+    """The times (T,), increasing, and the series of observations, per agent (T, ..., m) or None.
 
-    Parameters
-    ----------
-    observations : sequence of length A
-        Per agent (T, *runs, m), or (T, m) for all runs, or None.
-    sensors : sequence of Sensor or None, length A
-        What each agent sees with.
-    times : array_like, (T,)
-        Strictly increasing, in s.
-
-    Raises
-    ------
-    ValueError
-        If the times do not increase, or a series has another length.
-
-    Examples
-    --------
     >>> times, series = over_times([[[1.0], [2.0]], None], [None, None], [0.1, 0.2])
     >>> series[0].shape
     (2, 1)

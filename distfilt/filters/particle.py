@@ -10,14 +10,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import logsumexp
 
-from ..checks import Array, array, choice, count, generator, number
+from ..checks import Array, array, choice, count, generator, instance, number
 from ..network import Ledger
-from ..updates import effective_size
-from ..updates.particles import RESAMPLING, _jittered, _levels, _picked, _resampled
+from ..updates.particles import (
+    RESAMPLING,
+    _distinct,
+    _effective_size,
+    _jittered,
+    _levels,
+    _picked,
+    _weighed,
+)
 from .driver import Late, Summary
-from .ensemble import drawn_prior
 from .failures import guarded, not_finite
 from .heard import Heard
 from .saving import State
@@ -29,7 +34,7 @@ Mask = NDArray[np.bool_]
 
 
 class ParticleCollapse(RuntimeWarning):
-    """Few of a filter's particles differ from each other."""
+    """A filter's belief rests on few particles: the others are copies, or have no weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,27 +128,17 @@ class ParticleFilter(SensorFilter):
         number(self.jitter, "jitter", at_least=0, at_most=1)
 
     def start(
-        self,
-        prior: ArrayLike | Callable[..., Array] | tuple[ArrayLike, ArrayLike],
-        *,
-        rng: np.random.Generator,
-        runs: tuple[int, ...] = (),
-        t: float = 0.0,
+        self, prior: ArrayLike | Callable[..., Array] | tuple[ArrayLike, ArrayLike], *,
+        rng: np.random.Generator, runs: tuple[int, ...] = (), t: float = 0.0,
     ) -> ParticleState:
         """The state before the first step; arguments as for `EnsembleFilter.start`."""
-        generator(rng)
-        lead = (*(count(n, "runs") for n in runs), len(self.sensors))
-        points = drawn_prior(prior, self.members, self.model.dim, lead, rng)
+        points = self.drawn(prior, self.members, runs, rng)
         equal = np.full(points.shape[:-1], -np.log(self.members))
         ledger = Ledger.empty(len(self.sensors))
         return ParticleState(number(t, "t"), ledger, rng.spawn(1)[0], points, equal)
 
     def step(
-        self,
-        state: ParticleState,
-        t: float,
-        observations: Sequence[ArrayLike | None],
-        *,
+        self, state: ParticleState, t: float, observations: Sequence[ArrayLike | None], *,
         late: Sequence[Late] = (),
     ) -> ParticleState:
         """Move to time `t` and weigh the particles by what was observed there.
@@ -156,10 +151,10 @@ class ParticleFilter(SensorFilter):
         Warns
         -----
         ParticleCollapse
-            If less than a hundredth of an agent's particles differ from each other.
+            If less than a hundredth of an agent's particles, or only one, differ from the others,
+            or if the effective size of its weights is below two.
         """
-        if not isinstance(state, ParticleState):
-            raise ValueError(f"state: needs a ParticleState, got {type(state).__name__}")
+        instance(state, "state", ParticleState)
         dt = self.elapsed(state, t)
         seen = self.observed(state, observations)
         rng = copy.deepcopy(generator(state.rng))
@@ -167,11 +162,10 @@ class ParticleFilter(SensorFilter):
         kept = (*state.history, (state.t, state.points))[-self.lag :] if self.lag else ()
         times = [time for time, _ in kept]
         earlier = [self.slot(item, times, state) for item in late]
-        poor = effective_size(state.log_weights) < self.threshold * self.members
+        poor = _effective_size(state.log_weights) < self.threshold * self.members
         stack, weights = self._resampled([e for _, e in kept], state, poor, rng)
         moved = self.model.sample_step(stack[-1], state.t, dt, rng=rng)
-        agents = range(len(self.sensors))
-        failed = self.settle(not_finite(moved, 2), agents, t, state.failed)
+        failed = self.settle(not_finite(moved, 2), range(len(self.sensors)), t, state.failed)
         stack[-1] = np.where(failed[..., None, None, None], stack[-1], moved)
         for slot, observed in [*earlier, (len(times), seen)]:
             before = state.points if slot == len(times) else None
@@ -182,11 +176,12 @@ class ParticleFilter(SensorFilter):
             stack, weights = self._agreed(stack, weights, channel, rng)
         ledger = state.ledger if channel is None else channel.ledger
         history = tuple(zip(times, stack[:-1], strict=True))
-        self._warn(stack[-1], t)
+        self._warn(stack[-1], weights, failed, t)
         return ParticleState(float(t), ledger, rng, stack[-1], weights, history, failed)
 
     def summary(self, state: ParticleState) -> Summary:
         """Weighted means and covariances, effective sizes and the share of distinct particles."""
+        instance(state, "state", ParticleState)
         return _summary(state, state.points)
 
     def past(self, state: ParticleState) -> tuple[tuple[float, Summary], ...]:
@@ -227,12 +222,7 @@ class ParticleFilter(SensorFilter):
         old = weights[..., rows, :]
 
         def compute(h: Array, y: Array, w: Array, noise: Array, _: Any) -> tuple[Array, ...]:
-            joint = w + _log_likelihood(h, y, noise)
-            total = logsumexp(joint, axis=-1, keepdims=True)
-            if not np.isfinite(total).all():
-                raise ArithmeticError("every particle has a likelihood of zero")
-            # A weight of zero is minus infinity; kept finite, so that it can be told from failure.
-            return (np.maximum(joint - total, -1e300),)
+            return (_weighed(w, h, y, noise),)
 
         (new,), errors = guarded(
             compute, (predicted, target, old), (old,), target.ndim - 1, shared=group.noise, rng=None
@@ -244,21 +234,29 @@ class ParticleFilter(SensorFilter):
         self, stack: list[Array], weights: Array, channel: Any, rng: np.random.Generator
     ) -> tuple[list[Array], Array]:
         """Everybody resamples, so that the particles are an ensemble that the agreement moves."""
-        picked = _resampled(np.exp(weights), rng, self.rule)
+        picked = _picked(np.exp(weights), _levels(weights.shape, rng, self.rule), self.rule)
         out = [np.take_along_axis(p, picked[..., None], axis=-2) for p in stack]
         assert self.agreement is not None
         out[-1] = array(self.agreement(out[-1], channel), "agreement", out[-1].shape)
         return out, np.full_like(weights, -np.log(self.members))
 
-    def _warn(self, points: Array, t: float) -> None:
-        share = _distinct(points)
-        if share.min() < 0.01:
-            warnings.warn(
-                f"t = {t:g} s: {share.min():.2%} of an agent's particles are distinct; more "
-                f"members, jitter=, or more process noise keep them apart",
-                ParticleCollapse,
-                stacklevel=3,
-            )
+    def _warn(self, points: Array, weights: Array, failed: Mask, t: float) -> None:
+        """Distinct particles may have no weight, and particles of equal weight may be copies."""
+        if failed.all():
+            return
+        distinct, size = _distinct(points[~failed]), _effective_size(weights[~failed])
+        if distinct.min() < max(0.01, 2 / self.members):
+            what = f"{distinct.min():.2%} of an agent's particles are distinct"
+        elif size.min() < 2:
+            what = f"an agent's weights have an effective size of {size.min():.1f}"
+        else:
+            return
+        warnings.warn(
+            f"t = {t:g} s: {what}; more members, jitter=, or more process noise keep its belief "
+            f"alive",
+            ParticleCollapse,
+            stacklevel=3,
+        )
 
 
 def _summary(state: ParticleState, points: Array) -> Summary:
@@ -268,26 +266,5 @@ def _summary(state: ParticleState, points: Array) -> Summary:
     cov = np.swapaxes(around, -1, -2) @ (w[..., None] * around)
     if state.failed.any():
         mean[state.failed], cov[state.failed] = np.nan, np.nan
-    numbers = {"effective_size": effective_size(state.log_weights), "distinct": _distinct(points)}
+    numbers = {"effective_size": _effective_size(state.log_weights), "distinct": _distinct(points)}
     return Summary(mean, np.diagonal(cov, axis1=-2, axis2=-1), cov, points, w, numbers)
-
-
-def _distinct(points: Array) -> Array:
-    """Share of particles that differ from all before them, (...)."""
-    first = np.sort(points[..., 0], axis=-1)
-    return np.asarray((1 + (np.diff(first, axis=-1) > 0).sum(axis=-1)) / points.shape[-2])
-
-
-def _log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
-    """Log-likelihood of each particle's prediction (..., N, m) but for a constant, (..., N)."""
-    missing = np.isnan(observed) | np.isnan(predicted).any(axis=-2)
-    gap = observed[..., None, :] - predicted
-    cov = noise
-    if missing.any():
-        # A missing component gets a zero residual and a unit of its own in R.
-        here = ~missing[..., :, None] & ~missing[..., None, :]
-        cov = np.where(here, noise, np.eye(noise.shape[-1]))
-        gap = np.where(missing[..., None, :], 0.0, gap)
-    # One solve with all particles as right-hand sides: the factor is the same for them.
-    half = np.linalg.solve(np.linalg.cholesky(cov), np.swapaxes(gap, -1, -2))
-    return np.asarray(-0.5 * (half**2).sum(axis=-2))

@@ -41,23 +41,12 @@ _MEANING = {
 class Recorder:
     """Collects summaries and ledgers of a run, and makes one Dataset of them.
 
-    Parameters
-    ----------
-    filter_ : Filter
-        For names and units.
-    times : ndarray, (T,)
-    start : State
-        The state before the first step.
-    truth : array_like, (T, *runs, d), optional
-    scores : collection of {"squared_error", "nees", "crps"}
+    Names and units are the filter's; `start` is the state before the first step, `truth` (T, *runs,
+    d) what the scores compare with.
     """
 
     def __init__(
-        self,
-        filter_: Any,
-        times: Array,
-        start: Any,
-        truth: ArrayLike | None,
+        self, filter_: Any, times: Array, start: Any, truth: ArrayLike | None,
         scores: Collection[str],
     ) -> None:
         self.filter, self.times = filter_, times

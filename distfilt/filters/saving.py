@@ -14,7 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from ..checks import generator, number
+from ..checks import generator, instance, number
 from ..network import Ledger
 
 __all__ = ["State"]
@@ -52,8 +52,7 @@ class State:
 
     def __post_init__(self) -> None:
         number(self.t, "t")
-        if not isinstance(self.ledger, Ledger):
-            raise ValueError(f"ledger: needs a Ledger, got {type(self.ledger).__name__}")
+        instance(self.ledger, "ledger", Ledger)
         if self.rng is not None:
             generator(self.rng)
 
@@ -106,9 +105,7 @@ class State:
             OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, ImportError,
             IndexError, zipfile.BadZipFile,
         ) as error:
-            raise ValueError(
-                f"path: needs a saved {cls.__name__}, got {path}: {error}"
-            ) from None
+            raise ValueError(f"path: needs a saved {cls.__name__}, got {path}: {error}") from None
 
 
 def _name(kind: type) -> str:
@@ -198,5 +195,3 @@ def _restored(listed: dict[str, Any], seed: dict[str, Any] | None) -> np.random.
         bits = getattr(np.random, kind)(np.random.SeedSequence(**seed))
     bits.state = _arrays(listed)
     return np.random.Generator(bits)
-
-

@@ -9,7 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, callable_, choice, count, number
+from ..checks import (
+    Array,
+    array,
+    callable_,
+    choice,
+    count,
+    covariance,
+    generator,
+    instance,
+    number,
+)
+from ..ensembles import draw
 from ..models import Model
 from ..network import Channel, Faults, Graph
 from ..sensors import Sensor
@@ -64,8 +75,7 @@ class SensorFilter(Filter):
     failures: str = "raise"
 
     def __post_init__(self) -> None:
-        if not isinstance(self.model, Model):
-            raise ValueError(f"model: needs a Model, got {type(self.model).__name__}")
+        instance(self.model, "model", Model)
         if isinstance(self.sensors, Sensor) or not isinstance(self.sensors, Sequence):
             raise ValueError(
                 f"sensors: needs one Sensor or None for each agent, in a list, "
@@ -87,7 +97,7 @@ class SensorFilter(Filter):
             callable_(self.agreement, "agreement")
         if not isinstance(self.share, bool):
             raise ValueError(f"share: needs True or False, got {self.share!r}")
-        if self.faults is not None and (not isinstance(self.faults, Faults) or self.faults.delay):
+        if self.faults is not None and (not isinstance(self.faults, Faults) or self.faults.late):
             raise ValueError(f"faults: needs Faults without a delay, got {self.faults!r}")
         count(self.lag, "lag", at_least=0)
         choice(self.failures, "failures", ("raise", "keep"))
@@ -95,13 +105,10 @@ class SensorFilter(Filter):
             raise ValueError(f"names: needs {len(self.sensors)} names, got {len(self.names)}")
 
     def _check_graph(self, graph: Any) -> Graph:
-        if not isinstance(graph, Graph):
-            raise ValueError(f"graph: needs a Graph, got {type(graph).__name__}")
-        if graph.size != len(self.sensors):
-            raise ValueError(
-                f"graph: needs {len(self.sensors)} agents like sensors, got {graph.size}"
-            )
-        return graph
+        found, size = instance(graph, "graph", Graph), len(self.sensors)
+        if found.size != size:
+            raise ValueError(f"graph: needs {size} agents like sensors, got {found.size}")
+        return found
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -119,6 +126,26 @@ class SensorFilter(Filter):
         _, series = over_times(observations, self.sensors, times)
         return [[None if o is None else o[k] for o in series] for k in range(times.size)]
 
+    def drawn(
+        self, prior: Any, members: int, runs: tuple[int, ...], rng: np.random.Generator
+    ) -> Array:
+        """Members (*runs, A, N, d) of a Gaussian (mean, cov), of a function, or as they are given.
+
+        The function is called as ``prior(members, rng=rng, leading=(*runs, A))``.
+        """
+        lead, dim = (*(count(n, "runs") for n in runs), len(self.sensors)), self.model.dim
+        generator(rng)
+        if isinstance(prior, tuple) and len(prior) == 2:
+            centre = array(prior[0], "prior", (dim,))
+            cov = covariance(prior[1], "prior", dim, semidefinite=True)
+            return draw(centre, cov, members, rng=rng, leading=lead)
+        found = prior(members, rng=rng, leading=lead) if callable(prior) else prior
+        shape = (*lead, members, dim)
+        out = array(found, "prior", (..., members, dim))
+        if out.shape != shape and out.shape != shape[-2:]:
+            raise ValueError(f"prior: needs shape {shape} or {shape[-2:]}, got {out.shape}")
+        return np.broadcast_to(out, shape).copy()
+
     def elapsed(self, state: State, t: float) -> float:
         """Seconds from the state's time to `t`, which has to be later."""
         return number(t, "t", above=state.t) - state.t
@@ -134,7 +161,7 @@ class SensorFilter(Filter):
         if self.graph is None:
             return None
         graph = self.graph if isinstance(self.graph, Graph) else self._check_graph(self.graph(t))
-        return Channel(graph, ledger=state.ledger, runs=state.runs, faults=self.faults)
+        return Channel(graph, ledger=state.ledger, runs=state.runs, faults=self.faults, t=t)
 
     def gather(self, observed: Sequence[Array | None], channel: Channel | None) -> list[Heard]:
         """What every agent knows of the observations once they are shared."""
@@ -160,11 +187,8 @@ class SensorFilter(Filter):
         return match[0], self.observed(state, observations)
 
     def settle(
-        self,
-        errors: dict[tuple[int, ...], str],
-        agents: Sequence[int] | NDArray[np.intp],
-        t: float,
-        failed: Mask,
+        self, errors: dict[tuple[int, ...], str], agents: Sequence[int] | NDArray[np.intp],
+        t: float, failed: Mask,
     ) -> Mask:
         """The runs that have failed by now, or the error that names the first of them."""
         if not errors:

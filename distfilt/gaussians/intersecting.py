@@ -20,9 +20,7 @@ __all__ = ["intersection", "intersection_weights"]
 _RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
 
 
-def intersection(
-    means: ArrayLike, covs: ArrayLike, weights: ArrayLike
-) -> tuple[Array, Array]:
+def intersection(means: ArrayLike, covs: ArrayLike, weights: ArrayLike) -> tuple[Array, Array]:
     r"""Covariance intersection: the normalised weighted geometric mean of Gaussians.
 
     .. math:: \mathbf P^{-1}=\sum_b\omega_b\mathbf P_b^{-1},\qquad
@@ -45,11 +43,6 @@ def intersection(
     mean : ndarray, (..., d)
     cov : ndarray, (..., d, d)
 
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, or a source with weight is not a Gaussian.
-
     Notes
     -----
     S. J. Julier and J. K. Uhlmann, American Control Conference (1997) 2369-2373. Solved in the
@@ -71,10 +64,8 @@ def intersection(
     omega = unit_weights(weights, "weights")
     m = array(means, "means", (..., omega.shape[-1], "d"), finite=False)
     p = array(covs, "covs", (..., *m.shape[-2:], m.shape[-1]), finite=False)
-    _leading(omega.shape[:-1], m.shape[:-2], "means")
-    leading = np.broadcast_shapes(omega.shape[:-1], m.shape[:-2])
-    _leading(leading, p.shape[:-3], "covs")
-    leading = np.broadcast_shapes(leading, p.shape[:-3])
+    leading = _leading(omega.shape[:-1], m.shape[:-2], "means")
+    leading = _leading(leading, p.shape[:-3], "covs")
     here = np.broadcast_to(omega > 0, (*leading, omega.shape[-1]))
     array(np.broadcast_to(m, (*leading, *m.shape[-2:]))[here], "means")
     covariance(np.broadcast_to(p, (*leading, *p.shape[-3:]))[here], "covs")
@@ -113,7 +104,7 @@ def _beside(left: Array, right: Array) -> Array:
 def intersection_weights(
     covs: ArrayLike, *, rule: str = "equal", here: ArrayLike | None = None
 ) -> Array:
-    r"""Weights for :func:`intersection`.
+    r"""Weights (..., S) for :func:`intersection`, nonnegative with sum 1.
 
     Parameters
     ----------
@@ -126,16 +117,6 @@ def intersection_weights(
     here : array_like of bool, (..., S), optional
         Which sources arrived, at least one; all by default. The others get weight 0, and their
         covariances may be anything, NaN included.
-
-    Returns
-    -------
-    ndarray, (..., S)
-        Nonnegative with sum 1.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, the rule is not known, or a source that is here has no covariance.
 
     Notes
     -----
@@ -180,8 +161,7 @@ def intersection_weights(
     there = flags([True] * p.shape[-3] if here is None else here, "here", (..., p.shape[-3]))
     if not there.any(axis=-1).all():
         raise ValueError("here: needs at least one source that arrived, got none")
-    _leading(there.shape[:-1], p.shape[:-3], "covs")
-    leading = np.broadcast_shapes(there.shape[:-1], p.shape[:-3])
+    leading = _leading(there.shape[:-1], p.shape[:-3], "covs")
     there = np.broadcast_to(there, (*leading, p.shape[-3]))
     p = np.broadcast_to(p, (*leading, *p.shape[-3:]))
     covariance(p[there], "covs")

@@ -31,16 +31,6 @@ def recolour(ensemble: ArrayLike, mean: ArrayLike, cov: ArrayLike) -> Array:
     cov : array_like, (..., d, d)
         The new sample covariance, positive definite.
 
-    Returns
-    -------
-    ndarray, (..., N, d)
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, `cov` is not positive definite, or the ensemble's covariance is
-        singular.
-
     Notes
     -----
     Anomalies in units of the new standard deviations are :math:`\mathbf Q\mathbf R`, so that
@@ -92,7 +82,7 @@ def _refuse_flat(r: Array, size: Array) -> None:
 def bures_barycentre(
     covs: ArrayLike, weights: ArrayLike, *, tolerance: float = 1e-10, iterations: int = 500
 ) -> Array:
-    r"""Covariance of the Wasserstein barycentre of centred Gaussians.
+    r"""Covariance (..., d, d) of the Wasserstein barycentre of centred Gaussians.
 
     The solution of
     :math:`\mathbf S=\sum_b\omega_b(\mathbf S^{1/2}\mathbf P_b\mathbf S^{1/2})^{1/2}` by the fixed
@@ -111,10 +101,6 @@ def bures_barycentre(
         Stop when the largest change of any run, relative to its largest entry, is below it.
     iterations : int
         At most this many.
-
-    Returns
-    -------
-    ndarray, (..., d, d)
 
     Raises
     ------

@@ -12,7 +12,7 @@ __all__ = ["log_density"]
 
 
 def log_density(x: ArrayLike, mean: ArrayLike, cov: ArrayLike) -> Array:
-    r"""Logarithm of the Gaussian density.
+    r"""Logarithm of the Gaussian density, (...), relative to the volume in the state's units.
 
     .. math:: \log N(\mathbf x;\mathbf m,\mathbf P)=-\tfrac12\bigl(
         (\mathbf x-\mathbf m)^\top\mathbf P^{-1}(\mathbf x-\mathbf m)
@@ -25,16 +25,6 @@ def log_density(x: ArrayLike, mean: ArrayLike, cov: ArrayLike) -> Array:
     cov : array_like, (..., d, d)
         Covariances, positive definite. Leading axes of the three broadcast.
 
-    Returns
-    -------
-    ndarray, (...)
-        Relative to the volume in the state's units.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit or a covariance is not symmetric positive definite.
-
     Examples
     --------
     >>> log_density([[0.0], [2.0]], [0.0], [[4.0]]).round(6)
@@ -42,9 +32,9 @@ def log_density(x: ArrayLike, mean: ArrayLike, cov: ArrayLike) -> Array:
     """
     at = array(x, "x", (..., "d"))
     centre = array(mean, "mean", (..., at.shape[-1]))
-    _leading(at.shape[:-1], centre.shape[:-1], "mean")
+    lead = _leading(at.shape[:-1], centre.shape[:-1], "mean")
     spread = covariance(cov, "cov", at.shape[-1])
-    _leading(np.broadcast_shapes(at.shape, centre.shape)[:-1], spread.shape[:-2], "cov")
+    _leading(lead, spread.shape[:-2], "cov")
     return _log_density(at - centre, _cholesky(spread))
 
 

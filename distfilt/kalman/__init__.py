@@ -16,22 +16,9 @@ from .nonlinear import (
 from .reference import filterpy_ekf, filterpy_kf, filterpy_ukf
 from .smoothing import rts_smoother
 
-__all__ = [
-    "Chart",
-    "GaussianRun",
-    "extended_filter",
-    "extended_predict",
-    "extended_update",
-    "filterpy_ekf",
-    "filterpy_kf",
-    "filterpy_ukf",
-    "kalman_filter",
-    "multiplicative_filter",
-    "predict",
-    "quaternion_chart",
-    "rts_smoother",
-    "unscented_filter",
-    "unscented_predict",
-    "unscented_update",
-    "update",
+__all__ = [  # fmt: skip
+    "Chart", "GaussianRun", "extended_filter", "extended_predict", "extended_update",
+    "filterpy_ekf", "filterpy_kf", "filterpy_ukf", "kalman_filter", "multiplicative_filter",
+    "predict", "quaternion_chart", "rts_smoother", "unscented_filter", "unscented_predict",
+    "unscented_update", "update",
 ]

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, array, covariance, increasing, instance, number
+from ..linalg import _leading
 from ..sensors import Sensor, stack
 
 __all__: list[str] = []
@@ -48,12 +49,7 @@ def prior(
 def common_runs(runs: tuple[int, ...], mean: Array, cov: Array) -> tuple[int, ...]:
     """The run axes that observations, prior means and prior covariances have in common."""
     for name, axes in (("mean", mean.shape[:-1]), ("cov", cov.shape[:-2])):
-        try:
-            runs = np.broadcast_shapes(runs, axes)
-        except ValueError:
-            raise ValueError(
-                f"{name}: needs run axes that broadcast with {runs}, got {axes}"
-            ) from None
+        runs = _leading(runs, axes, name)
     return runs
 
 

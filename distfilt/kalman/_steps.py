@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, number
+from ..linalg import _symmetrise
 from ..models import Model
 from ..sensors import Sensor
 from ._algebra import analysis, forecast_cov
@@ -24,9 +25,7 @@ Forecast = Callable[[Array, Array, float, float], tuple[Array, Array]]
 Analysis = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
 
 
-def extended_forecast(
-    x: Array, p: Array, model: Model, t: float, dt: float
-) -> tuple[Array, Array]:
+def extended_forecast(x: Array, p: Array, model: Model, t: float, dt: float) -> tuple[Array, Array]:
     """Means moved by the model, covariances by its Jacobian."""
     slope = model._jacobian(x, t, dt)
     return model._step(x, t, dt), moved_cov(p, slope, model.noise(t, dt))
@@ -43,9 +42,7 @@ def last(a: Array) -> Array:
     return np.ascontiguousarray(np.moveaxis(a, 0, -1)) if a.ndim == 3 else a
 
 
-def extended_analysis(
-    x: Array, p: Array, y: Array, sensor: Sensor
-) -> tuple[Array, Array, Array]:
+def extended_analysis(x: Array, p: Array, y: Array, sensor: Sensor) -> tuple[Array, Array, Array]:
     """Means, covariances and log densities after readings (R, m) of a linearised sensor."""
     innovation, slope = linearised(x, y, sensor)
     moved, p, density = analysed(np.zeros_like(x), p, innovation, slope, sensor.cov)
@@ -117,8 +114,7 @@ def unscented_forecast(
 
 def _weighted(away: Array, weights: Array) -> Array:
     """Symmetric second moments (R, d, d) of deviations (R, n, d)."""
-    out = np.swapaxes(away * weights[:, None], -1, -2) @ away
-    return np.asarray(0.5 * (out + np.swapaxes(out, -1, -2)))
+    return _symmetrise(np.swapaxes(away * weights[:, None], -1, -2) @ away)
 
 
 def unscented_analysis(
@@ -151,19 +147,12 @@ def unscented_analysis(
     log_det = 2.0 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1)
     size = here.sum(axis=-1)
     density = -0.5 * (size * np.log(2.0 * np.pi) + log_det + (white**2).sum(axis=-1))
-    after = 0.5 * (after + np.swapaxes(after, -1, -2))
-    return x + (gain @ innovation[..., None])[..., 0], after, density
+    return x + (gain @ innovation[..., None])[..., 0], _symmetrise(after), density
 
 
 def over_time(
-    y: Array,
-    grid: Array,
-    mean: ArrayLike,
-    cov: ArrayLike,
-    dim: int,
-    forecast: Forecast,
-    analyse: Analysis,
-    error_dim: int | None = None,
+    y: Array, grid: Array, mean: ArrayLike, cov: ArrayLike, dim: int, forecast: Forecast,
+    analyse: Analysis, error_dim: int | None = None,
 ) -> GaussianRun:
     """Forecast and analysis of checked observations (T, ..., m) at times after the first of grid.
 

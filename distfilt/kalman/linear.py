@@ -12,14 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, array, covariance
-from ._algebra import (
-    Indices,
-    analysis,
-    forecast_cov,
-    log_density,
-    shared_gains,
-    whitened,
-)
+from ._algebra import Indices, analysis, forecast_cov, log_density, shared_gains, whitened
 from ._inputs import common_runs, fill_axes, prior
 
 __all__ = ["GaussianRun", "kalman_filter", "predict", "update"]
@@ -34,8 +27,8 @@ class GaussianRun:
     means : ndarray, (T, ..., d)
         Analysis means, one for each observation time; leading axes are the runs.
     covariances : ndarray, (T, ..., d, d)
-        Analysis covariances. The run axes have length 1 where all runs share the covariance, so
-        that the array broadcasts against the means.
+        Analysis covariances. Of :func:`kalman_filter` the run axes have length 1 where all runs
+        share the covariance, so that the array broadcasts against the means.
     log_likelihood : ndarray, (T, ...)
         Log density of each observation given those before it; its sum over time is the log
         likelihood of the model. Zero where nothing was observed.
@@ -53,14 +46,8 @@ class GaussianRun:
 
 
 def kalman_filter(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    observations: ArrayLike,
-    *,
-    F: ArrayLike,
-    H: ArrayLike,
-    Q: ArrayLike,
-    R: ArrayLike,
+    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, F: ArrayLike, H: ArrayLike,
+    Q: ArrayLike, R: ArrayLike,
 ) -> GaussianRun:
     r"""Filter T observations of a linear Gaussian model, for any number of runs at once.
 
@@ -82,15 +69,8 @@ def kalman_filter(
     H, R : array_like, (m, d) and (m, m), or (T, m, d) and (T, m, m)
         Observation matrix and noise covariance (positive definite), constant or per step.
 
-    Returns
-    -------
-    GaussianRun
-
     Raises
     ------
-    ValueError
-        If a shape or a covariance is wrong, or a number other than a missing component is not
-        finite.
     numpy.linalg.LinAlgError
         If an innovation covariance is not positive definite in floating point.
 
@@ -125,6 +105,8 @@ def kalman_filter(
     own = p.shape[-1] > 1
     model = (f, h, q, r)
     out = _recursion(x, p, group, y, *model) if own else _shared(x, p[..., 0], y, *model)
+    if not np.isfinite(out.means).all():
+        raise np.linalg.LinAlgError("kalman_filter: needs matrices without overflow, got infinity")
     covs = out.covariances.reshape(steps, *(runs if own else (1,) * len(runs)), d, d)
     density = out.log_likelihood.reshape(steps, *runs)
     return GaussianRun(out.means.reshape(steps, *runs, d), covs, density)
@@ -168,9 +150,7 @@ def _groups(y: Array, cov: Array, runs: tuple[int, ...]) -> tuple[Array, Indices
     return np.repeat(cov[..., None], count, axis=-1), group
 
 
-def _shared(
-    x: Array, p: Array, y: Array, f: Array, h: Array, q: Array, r: Array
-) -> GaussianRun:
+def _shared(x: Array, p: Array, y: Array, f: Array, h: Array, q: Array, r: Array) -> GaussianRun:
     """All steps of runs x (R, d), y (T, R, m) that share their covariance p (d, d)."""
     steps = len(y)
     here = np.asarray(~np.isnan(y).any(axis=1))
@@ -205,28 +185,17 @@ def _recursion(
 
 
 def predict(mean: ArrayLike, cov: ArrayLike, *, F: ArrayLike, Q: ArrayLike) -> tuple[Array, Array]:
-    r"""Forecast a Gaussian by a linear step.
+    r"""Forecast a Gaussian by a linear step: the new mean (..., d) and covariance.
 
     The mean becomes :math:`\mathbf F\mathbf x`, the covariance
     :math:`\mathbf F\mathbf P\mathbf F^\top+\mathbf Q`.
 
     Parameters
     ----------
-    mean : array_like, (..., d)
-    cov : array_like, (..., d, d)
-        Positive definite.
+    mean, cov : array_like, (..., d) and (..., d, d)
+        The covariance positive definite.
     F, Q : array_like, (d, d)
         Transition, and process noise covariance (positive semidefinite).
-
-    Returns
-    -------
-    mean : ndarray, (..., d)
-    cov : ndarray, (..., d, d)
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, a number is not finite or a covariance is none.
 
     Examples
     --------
@@ -254,9 +223,8 @@ def update(
 
     Parameters
     ----------
-    mean : array_like, (..., d)
-    cov : array_like, (..., d, d)
-        Positive definite.
+    mean, cov : array_like, (..., d) and (..., d, d)
+        The covariance positive definite.
     observed : array_like, (..., m)
         NaN marks a missing component.
     H : array_like, (m, d)
@@ -270,11 +238,6 @@ def update(
         The run axes have length 1 where all runs share the covariance.
     log_likelihood : ndarray, (...)
         Log density of the observation.
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, a number is not finite or a covariance is none.
 
     Examples
     --------

@@ -78,7 +78,7 @@ def quaternion_chart(dim: int, first: int) -> Chart:
     """States with a quaternion among their components, and the rest as it is.
 
     The error's components are the state's, with the rotation vector of
-    :func:`distfilt.models.turned` in the quaternion's place.
+    :func:`distfilt.models.turned` in the quaternion's place: one fewer.
 
     Parameters
     ----------
@@ -86,11 +86,6 @@ def quaternion_chart(dim: int, first: int) -> Chart:
         Size d of the state.
     first : int
         Where the quaternion begins; its scalar part is first.
-
-    Returns
-    -------
-    Chart
-        With d - 1 error components.
 
     Examples
     --------
@@ -123,22 +118,16 @@ def quaternion_chart(dim: int, first: int) -> Chart:
 
 
 def multiplicative_filter(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    observations: ArrayLike,
-    *,
-    chart: Chart,
-    model: Model,
-    sensors: Sequence[Sensor],
-    times: ArrayLike,
-    t0: float = 0.0,
+    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, chart: Chart, model: Model,
+    sensors: Sequence[Sensor], times: ArrayLike, t0: float = 0.0,
 ) -> GaussianRun:
     r"""The extended Kalman filter on a chart's errors, over series of observations.
 
     With the directions B of the chart and their pseudo-inverse, the errors' transition is
     :math:`\mathbf B(\mathbf x')^+\,\mathbf J\,\mathbf B(\mathbf x)`, their noise
     :math:`\mathbf B(\mathbf x')^+\mathbf Q\,\mathbf B(\mathbf x')^{+\top}`, and a sensor's matrix
-    :math:`\mathbf H\,\mathbf B(\mathbf x)`; an analysis moves the mean by `retract`.
+    :math:`\mathbf H\,\mathbf B(\mathbf x)`; an analysis moves the mean by `retract`. The
+    covariances (T, ..., k, k) are those of the errors ``chart.local(means, truth)``.
 
     Parameters
     ----------
@@ -153,19 +142,6 @@ def multiplicative_filter(
     model, sensors, times, t0
         As for :func:`extended_filter`; sensors of changes are welcome too: the errors of the
         previous state are kept beside those of the present one until the reading is used.
-
-    Returns
-    -------
-    GaussianRun
-        Means (T, ..., d) and covariances of the errors (T, ..., k, k): those of
-        ``chart.local(means, truth)``.
-
-    Raises
-    ------
-    ValueError
-        As :func:`extended_filter`, or if `chart` does not fit the model.
-    numpy.linalg.LinAlgError
-        As :func:`extended_filter`.
 
     Notes
     -----

@@ -26,42 +26,27 @@ from ._steps import (
 )
 from .linear import GaussianRun
 
-__all__ = [
-    "extended_filter",
-    "extended_predict",
-    "extended_update",
-    "unscented_filter",
-    "unscented_predict",
-    "unscented_update",
+__all__ = [  # fmt: skip
+    "extended_filter", "extended_predict", "extended_update", "unscented_filter",
+    "unscented_predict", "unscented_update",
 ]
 
 def extended_predict(
     mean: ArrayLike, cov: ArrayLike, model: Model, t: float, dt: float
 ) -> tuple[Array, Array]:
-    r"""Forecast Gaussians by a model that is linearised about each mean.
+    r"""Forecast Gaussians by a model that is linearised about each mean: means, covariances.
 
     The mean takes the model's own step; the covariance becomes
     :math:`\mathbf J\mathbf P\mathbf J^\top+\mathbf Q` with the step's Jacobian J.
 
     Parameters
     ----------
-    mean : array_like, (..., d)
-    cov : array_like, (..., d, d)
-        Positive definite.
+    mean, cov : array_like, (..., d) and (..., d, d)
+        The covariance positive definite.
     model : Model
         Its `jacobian` is used.
     t, dt : float
         The time of the Gaussians and how far to go, in s.
-
-    Returns
-    -------
-    mean : ndarray, (..., d)
-    cov : ndarray, (..., d, d)
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, a number is not finite or a covariance is none.
 
     Examples
     --------
@@ -83,9 +68,8 @@ def extended_update(
 
     Parameters
     ----------
-    mean : array_like, (..., d)
-    cov : array_like, (..., d, d)
-        Positive definite.
+    mean, cov : array_like, (..., d) and (..., d, d)
+        The covariance positive definite.
     observed : array_like, (..., m)
         NaN marks a missing component.
     sensor : Sensor
@@ -98,12 +82,6 @@ def extended_update(
         In Joseph's form.
     log_likelihood : ndarray, (...)
         Log density of the innovations, those of the linearised problem.
-
-    Raises
-    ------
-    ValueError
-        If a shape is wrong, a number is not finite, a covariance is none, or the sensor needs the
-        previous state.
 
     Examples
     --------
@@ -120,14 +98,8 @@ def extended_update(
 
 
 def extended_filter(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    observations: ArrayLike,
-    *,
-    model: Model,
-    sensors: Sequence[Sensor],
-    times: ArrayLike,
-    t0: float = 0.0,
+    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, model: Model,
+    sensors: Sequence[Sensor], times: ArrayLike, t0: float = 0.0,
 ) -> GaussianRun:
     r"""The extended Kalman filter over series of observations, all runs at once.
 
@@ -149,15 +121,8 @@ def extended_filter(
     t0 : float
         The time of the prior, in s.
 
-    Returns
-    -------
-    GaussianRun
-        Covariances have all run axes.
-
     Raises
     ------
-    ValueError
-        If a shape, a covariance or a time is wrong, or a sensor needs the previous state.
     numpy.linalg.LinAlgError
         If a run leaves the finite numbers or its covariance is no longer positive definite; the
         message has the time.
@@ -174,27 +139,17 @@ def extended_filter(
     sensor = instantaneous(sensors)
     instance(model, "model", Model)
     return over_time(
-        *series(observations, times, t0, sensor.dim),
-        mean,
-        cov,
-        model.dim,
+        *series(observations, times, t0, sensor.dim), mean, cov, model.dim,
         lambda x, p, t, dt: extended_forecast(x, p, model, t, dt),
         lambda x, p, y: extended_analysis(x, p, y, sensor),
     )
 
 
 def unscented_predict(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    model: Model,
-    t: float,
-    dt: float,
-    *,
-    alpha: float = 1.0,
-    beta: float = 0.0,
-    kappa: float = 1.0,
+    mean: ArrayLike, cov: ArrayLike, model: Model, t: float, dt: float, *, alpha: float = 1.0,
+    beta: float = 0.0, kappa: float = 1.0,
 ) -> tuple[Array, Array]:
-    r"""Forecast Gaussians by 2 d + 1 points that the model moves.
+    r"""Forecast Gaussians by 2 d + 1 points that the model moves: means and covariances.
 
     Parameters
     ----------
@@ -203,16 +158,6 @@ def unscented_predict(
     alpha, beta, kappa : float
         Of the scaled points, which lie :math:`\alpha\sqrt{d+\kappa}` standard deviations from the
         mean. The defaults keep every weight positive, and with it the covariance.
-
-    Returns
-    -------
-    mean : ndarray, (..., d)
-    cov : ndarray, (..., d, d)
-
-    Raises
-    ------
-    ValueError
-        As :func:`extended_predict`, or if `alpha` or d + `kappa` is not positive.
 
     Notes
     -----
@@ -235,14 +180,8 @@ def unscented_predict(
 
 
 def unscented_update(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    observed: ArrayLike,
-    sensor: Sensor,
-    *,
-    alpha: float = 1.0,
-    beta: float = 0.0,
-    kappa: float = 1.0,
+    mean: ArrayLike, cov: ArrayLike, observed: ArrayLike, sensor: Sensor, *, alpha: float = 1.0,
+    beta: float = 0.0, kappa: float = 1.0,
 ) -> tuple[Array, Array, Array]:
     r"""Condition Gaussians on readings, by what the sensor makes of 2 d + 1 points.
 
@@ -263,11 +202,6 @@ def unscented_update(
         Joseph's sum of squares.
     log_likelihood : ndarray, (...)
 
-    Raises
-    ------
-    ValueError
-        As :func:`extended_update`, or if `alpha` or d + `kappa` is not positive.
-
     Examples
     --------
     >>> from distfilt.sensors import direct
@@ -284,17 +218,9 @@ def unscented_update(
 
 
 def unscented_filter(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    observations: ArrayLike,
-    *,
-    model: Model,
-    sensors: Sequence[Sensor],
-    times: ArrayLike,
-    t0: float = 0.0,
-    alpha: float = 1.0,
-    beta: float = 0.0,
-    kappa: float = 1.0,
+    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, model: Model,
+    sensors: Sequence[Sensor], times: ArrayLike, t0: float = 0.0, alpha: float = 1.0,
+    beta: float = 0.0, kappa: float = 1.0,
 ) -> GaussianRun:
     r"""The unscented Kalman filter over series of observations, all runs at once.
 
@@ -304,18 +230,6 @@ def unscented_filter(
         As for :func:`extended_filter`.
     alpha, beta, kappa : float
         As for :func:`unscented_predict`.
-
-    Returns
-    -------
-    GaussianRun
-        Covariances have all run axes.
-
-    Raises
-    ------
-    ValueError
-        As :func:`extended_filter`, or if `alpha` or d + `kappa` is not positive.
-    numpy.linalg.LinAlgError
-        As :func:`extended_filter`.
 
     Examples
     --------
@@ -330,10 +244,7 @@ def unscented_filter(
     instance(model, "model", Model)
     points = Points.of(model.dim, alpha, beta, kappa)
     return over_time(
-        *series(observations, times, t0, sensor.dim),
-        mean,
-        cov,
-        model.dim,
+        *series(observations, times, t0, sensor.dim), mean, cov, model.dim,
         lambda x, p, t, dt: unscented_forecast(x, p, model, t, dt, points),
         lambda x, p, y: unscented_analysis(x, p, y, sensor, points),
     )

@@ -29,15 +29,8 @@ __all__ = ["filterpy_ekf", "filterpy_kf", "filterpy_ukf"]
 
 
 def filterpy_kf(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    observations: ArrayLike,
-    *,
-    F: ArrayLike,
-    H: ArrayLike,
-    Q: ArrayLike,
-    R: ArrayLike,
-    likelihood: bool = True,
+    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, F: ArrayLike, H: ArrayLike,
+    Q: ArrayLike, R: ArrayLike, likelihood: bool = True,
 ) -> GaussianRun:
     """Filterpy's Kalman filter over a series: arguments and result of :func:`kalman_filter`.
 
@@ -48,16 +41,6 @@ def filterpy_kf(
     likelihood : bool
         Whether to ask filterpy for the log density of each observation, which takes longer than
         the filter. Without it `log_likelihood` is zero.
-
-    Returns
-    -------
-    GaussianRun
-        Covariances have all run axes.
-
-    Raises
-    ------
-    ValueError
-        As :func:`distfilt.kalman.kalman_filter`.
 
     Examples
     --------
@@ -91,45 +74,17 @@ def filterpy_kf(
 
 
 def filterpy_ekf(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    observations: ArrayLike,
-    *,
-    model: Model,
-    sensors: Sequence[Sensor],
-    times: ArrayLike,
-    t0: float = 0.0,
-    likelihood: bool = False,
+    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, model: Model,
+    sensors: Sequence[Sensor], times: ArrayLike, t0: float = 0.0, likelihood: bool = False,
 ) -> GaussianRun:
     r"""Filterpy's extended Kalman filter over a series: linearise the model and the sensors.
 
     Parameters
     ----------
-    mean : array_like, (d,) or (..., d)
-        Prior mean at `t0`.
-    cov : array_like, (d, d) or (..., d, d)
-        Prior covariance.
-    observations : array_like, (T, ..., m)
-        The observations of all sensors, one after the other; NaN marks a missing component.
-    model : Model
-        Linearised about each analysis mean, by its Jacobian.
-    sensors : sequence of Sensor
-        Linearised about each forecast mean; residuals wrap where the sensor wraps.
-    times : array_like, (T,)
-        Observation times, in s.
-    t0 : float
-        The time of the prior, in s.
+    mean, cov, observations, model, sensors, times, t0
+        As for :func:`~distfilt.kalman.extended_filter`.
     likelihood : bool
-        Whether to ask filterpy for the log density of each innovation.
-
-    Returns
-    -------
-    GaussianRun
-
-    Raises
-    ------
-    ValueError
-        If a shape, a covariance or a time is wrong, or a sensor needs the previous state.
+        As for :func:`filterpy_kf`.
 
     Examples
     --------
@@ -170,18 +125,9 @@ def filterpy_ekf(
 
 
 def filterpy_ukf(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    observations: ArrayLike,
-    *,
-    model: Model,
-    sensors: Sequence[Sensor],
-    times: ArrayLike,
-    t0: float = 0.0,
-    alpha: float = 1.0,
-    beta: float = 0.0,
-    kappa: float = 1.0,
-    likelihood: bool = False,
+    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, model: Model,
+    sensors: Sequence[Sensor], times: ArrayLike, t0: float = 0.0, alpha: float = 1.0,
+    beta: float = 0.0, kappa: float = 1.0, likelihood: bool = False,
 ) -> GaussianRun:
     r"""Filterpy's unscented Kalman filter over a series: 2d + 1 points instead of derivatives.
 
@@ -190,18 +136,7 @@ def filterpy_ukf(
     mean, cov, observations, model, sensors, times, t0, likelihood
         As for :func:`filterpy_ekf`.
     alpha, beta, kappa : float
-        Of the scaled sigma points: the points lie :math:`\alpha\sqrt{d+\kappa}` standard
-        deviations from the mean. The defaults keep every weight positive, and with it the
-        covariance.
-
-    Returns
-    -------
-    GaussianRun
-
-    Raises
-    ------
-    ValueError
-        As :func:`filterpy_ekf`, or if `alpha` or d + `kappa` is not positive.
+        As for :func:`~distfilt.kalman.unscented_predict`.
 
     Examples
     --------
@@ -261,13 +196,8 @@ def _unscented(
 
 
 def _over_runs(
-    mean: ArrayLike,
-    cov: ArrayLike,
-    y: Array,
-    start: Callable[[Array, Array], Any],
-    step: Callable[[Any, int, Array, _Mask], None],
-    likelihood: bool,
-    dim: int | None = None,
+    mean: ArrayLike, cov: ArrayLike, y: Array, start: Callable[[Array, Array], Any],
+    step: Callable[[Any, int, Array, _Mask], None], likelihood: bool, dim: int | None = None,
 ) -> GaussianRun:
     """Run one of filterpy's objects over every run and every step."""
     x0, p0 = prior(mean, cov)

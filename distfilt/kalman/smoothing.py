@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, instance
+from ..linalg import _symmetrise
 from .linear import GaussianRun, _noise_per_step, _per_step
 
 __all__ = ["rts_smoother"]
@@ -24,20 +25,13 @@ def rts_smoother(run: GaussianRun, *, F: ArrayLike, Q: ArrayLike) -> GaussianRun
     Parameters
     ----------
     run : GaussianRun
-        What :func:`kalman_filter` left, with any number of runs and gaps.
+        What :func:`kalman_filter` left, with any number of runs and gaps. The result has its
+        shapes and its log-likelihoods.
     F, Q : array_like, (d, d) or (T, d, d)
         Those that the filter had: the first of T leads from the prior to the first observation.
 
-    Returns
-    -------
-    GaussianRun
-        Smoothed means and covariances, symmetric, in the shapes of `run`; the log-likelihoods are
-        the filter's.
-
     Raises
     ------
-    ValueError
-        If `run` is none or a shape is wrong.
     numpy.linalg.LinAlgError
         If a forecast covariance is not positive definite.
 
@@ -69,7 +63,7 @@ def rts_smoother(run: GaussianRun, *, F: ArrayLike, Q: ArrayLike) -> GaussianRun
         kept = np.eye(d) - gain @ f[k + 1]
         back = np.swapaxes(gain, -1, -2)
         after = kept @ p @ np.swapaxes(kept, -1, -2) + gain @ (covs[k + 1] + q[k + 1]) @ back
-        covs[k] = 0.5 * (after + np.swapaxes(after, -1, -2))
+        covs[k] = _symmetrise(after)
     return GaussianRun(means, covs, run.log_likelihood.copy())
 
 
@@ -78,7 +72,7 @@ def _gain(p: Array, f: Array, q: Array) -> Array:
     forward = f @ p
     ahead = forward @ f.T + q
     try:
-        lower = np.linalg.cholesky(0.5 * (ahead + np.swapaxes(ahead, -1, -2)))
+        lower = np.linalg.cholesky(_symmetrise(ahead))
     except np.linalg.LinAlgError:
         raise np.linalg.LinAlgError("a forecast covariance is not positive definite") from None
     half = np.linalg.solve(lower, forward)

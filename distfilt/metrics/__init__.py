@@ -12,19 +12,8 @@ from .consistency import ensemble_nees, nees, nees_band, nis
 from .errors import rmse, spread, squared_error
 from .scores import crps, gaussian_crps, log_score
 
-__all__ = [
-    "Interval",
-    "crps",
-    "ensemble_nees",
-    "gaussian_crps",
-    "log_score",
-    "mean_interval",
-    "median_interval",
-    "nees",
-    "nees_band",
-    "nis",
-    "proportion_interval",
-    "rmse",
-    "spread",
+__all__ = [  # fmt: skip
+    "Interval", "crps", "ensemble_nees", "gaussian_crps", "log_score", "mean_interval",
+    "median_interval", "nees", "nees_band", "nis", "proportion_interval", "rmse", "spread",
     "squared_error",
 ]

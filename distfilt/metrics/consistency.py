@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, covariance, number
+from ..checks import Array, array, covariance, instance, number
 from ..checks import count as whole
 from ..ensembles import _mean, _sample_covariance
 from ..intervals import Interval
-from ..linalg import _cholesky, _quadratic_form
+from ..linalg import _cholesky, _leading, _quadratic_form
 from .errors import _ensemble, _truth
 
 __all__ = ["ensemble_nees", "nees", "nees_band", "nis"]
 
 
 def nees(estimate: ArrayLike, cov: ArrayLike, truth: ArrayLike) -> Array:
-    r"""Normalised estimation error squared.
+    r"""Normalised estimation error squared, (...).
 
     :math:`\epsilon = (\hat{\mathbf x}-\mathbf x)^\top\mathbf P^{-1}(\hat{\mathbf x}-\mathbf x)`. If
     the error is N(0, P), as an honest filter claims, it is chi-square with d degrees of freedom and
@@ -29,10 +29,6 @@ def nees(estimate: ArrayLike, cov: ArrayLike, truth: ArrayLike) -> Array:
     cov : array_like, (..., d, d)
         The filter's own covariance P, positive definite.
 
-    Returns
-    -------
-    ndarray, (...)
-
     Notes
     -----
     Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking and
@@ -44,25 +40,19 @@ def nees(estimate: ArrayLike, cov: ArrayLike, truth: ArrayLike) -> Array:
     10.0
     """
     e = array(estimate, "estimate", (..., "d"))
-    gap = e - _truth(truth, e.shape, "estimate")
+    gap = e - _truth(truth, e.shape)
     return _quadratic_form(_cholesky(_spread(cov, gap.shape)), gap)
 
 
 def _spread(value: ArrayLike, like: tuple[int, ...]) -> Array:
     """A covariance (..., d, d) for differences of shape `like`, (..., d)."""
     out = covariance(value, "cov", like[-1])
-    try:
-        np.broadcast_shapes(like[:-1], out.shape[:-2])
-    except ValueError:
-        raise ValueError(
-            f"cov: needs leading axes that broadcast with those of the error {like[:-1]}, "
-            f"got {out.shape[:-2]}"
-        ) from None
+    _leading(like[:-1], out.shape[:-2], "cov")
     return out
 
 
 def nis(innovation: ArrayLike, cov: ArrayLike) -> Array:
-    r"""Normalised innovation squared: how far a reading is from its prediction.
+    r"""Normalised innovation squared, (...): how far a reading is from its prediction.
 
     :math:`\mathbf d^\top\mathbf S^{-1}\mathbf d`. Of an honest filter it is chi-square with m
     degrees of freedom, so that ``nees_band(m, n)`` holds the average of n independent ones. Needs
@@ -76,10 +66,6 @@ def nis(innovation: ArrayLike, cov: ArrayLike) -> Array:
         Covariance S of the innovation, HPHᵀ + R: the prediction's and the noise's. Positive
         definite; leading axes broadcast.
 
-    Returns
-    -------
-    ndarray, (...)
-
     Examples
     --------
     >>> float(nis([2.0, 3.0], [[4.0, 0.0], [0.0, 1.0]]))
@@ -90,17 +76,13 @@ def nis(innovation: ArrayLike, cov: ArrayLike) -> Array:
 
 
 def ensemble_nees(ensemble: ArrayLike, truth: ArrayLike) -> Array:
-    r"""NEES of an ensemble: its mean against the truth, in units of its sample covariance.
+    r"""NEES of an ensemble, (...): its mean against the truth, in units of its sample covariance.
 
     Parameters
     ----------
     ensemble : array_like, (..., N, d)
         Members; the covariance has N - 1 in the denominator.
     truth : array_like, (..., d)
-
-    Returns
-    -------
-    ndarray, (...)
 
     Raises
     ------
@@ -123,11 +105,13 @@ def ensemble_nees(ensemble: ArrayLike, truth: ArrayLike) -> Array:
     if n <= d:
         raise ValueError(f"ensemble: needs more members than components ({d}), got {n}")
     middle = _mean(x)
-    t = _truth(truth, middle.shape, "ensemble")
+    t = _truth(truth, middle.shape)
     cov = _sample_covariance(x)
     # NEES does not depend on units: scaled to unit variances, rounding does not either, and the
     # test for a subspace compares pure numbers.
     scale = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    if not np.isfinite(scale).all():
+        raise ValueError("ensemble: needs members of finite variance, got infinity")
     if (scale <= n * np.finfo(float).eps * np.abs(middle)).any():
         raise ValueError("ensemble: needs members that differ in every component")
     correlation = cov / (scale[..., :, None] * scale[..., None, :])
@@ -170,7 +154,7 @@ def nees_band(dim: int, count: int, *, level: float = 0.95, normalised: bool = F
 
     d, n = whole(dim, "dim"), whole(count, "count")
     tail = (1 - number(level, "level", above=0, below=1)) / 2
-    unit = n * d if normalised else n
+    unit = n * d if instance(normalised, "normalised", bool) else n
     low, high = (float(chi2.ppf(p, n * d)) / unit for p in (tail, 1 - tail))
     middle = n * d / unit
     # At tiny levels the band lies below the mean, because the chi-square's median does.

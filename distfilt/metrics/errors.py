@@ -7,36 +7,28 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .. import ensembles
 from ..checks import Array, array
+from ..linalg import _leading
 
 __all__ = ["rmse", "spread", "squared_error"]
 
 
 def _ensemble(value: ArrayLike, members: int = 1) -> Array:
-    out = array(value, "ensemble", (..., "N", "d"))
+    out = ensembles._ensemble(value, "ensemble", members)
     if out.shape[-1] < 1:
         raise ValueError(f"ensemble: needs at least one component, got shape {out.shape}")
-    if out.shape[-2] < members:
-        raise ValueError(f"ensemble: needs at least {members} members, got {out.shape[-2]}")
     return out
 
 
-def _truth(value: ArrayLike, like: tuple[int, ...], other: str) -> Array:
+def _truth(value: ArrayLike, like: tuple[int, ...]) -> Array:
     """The truth as (..., d), where `like` is the shape (..., d) that it has to broadcast with."""
     out = array(value, "truth", (..., like[-1]))
-    try:
-        np.broadcast_shapes(out.shape, like)
-    except ValueError:
-        raise ValueError(
-            f"truth: needs leading axes that broadcast with those of {other} {like[:-1]}, "
-            f"got {out.shape[:-1]}"
-        ) from None
+    _leading(like[:-1], out.shape[:-1], "truth")
     return out
 
 
-def squared_error(
-    estimate: ArrayLike, truth: ArrayLike, *, per_component: bool = False
-) -> Array:
+def squared_error(estimate: ArrayLike, truth: ArrayLike, *, per_component: bool = False) -> Array:
     r"""Squared length of the error, :math:`\lVert\hat{\mathbf x}-\mathbf x\rVert^2`.
 
     A sum over the components, not a mean, in units of the state squared.
@@ -48,10 +40,6 @@ def squared_error(
     per_component : bool
         Give the squared error of each component instead.
 
-    Returns
-    -------
-    ndarray, (...) or (..., d)
-
     Examples
     --------
     >>> float(squared_error([1.0, 2.0], [4.0, 6.0]))
@@ -60,7 +48,7 @@ def squared_error(
     array([ 9., 16.])
     """
     e = array(estimate, "estimate", (..., "d"))
-    square = (e - _truth(truth, e.shape, "estimate")) ** 2
+    square = (e - _truth(truth, e.shape)) ** 2
     return square if _flag(per_component) else np.asarray(square.sum(axis=-1))
 
 
@@ -71,10 +59,7 @@ def _flag(value: Any) -> bool:
 
 
 def rmse(
-    estimate: ArrayLike,
-    truth: ArrayLike,
-    *,
-    axis: int | tuple[int, ...] | None = None,
+    estimate: ArrayLike, truth: ArrayLike, *, axis: int | tuple[int, ...] | None = None,
     per_component: bool = False,
 ) -> Array:
     r"""Root of the mean squared length of the error.

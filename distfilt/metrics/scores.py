@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array
+from ..checks import Array, array, instance
 from ..checks import weights as unit_weights
 from ..gaussians import _log_density
-from ..linalg import _cholesky
+from ..linalg import _cholesky, _leading
 from .consistency import _spread
 from .errors import _ensemble, _truth
 
@@ -16,13 +16,9 @@ __all__ = ["crps", "gaussian_crps", "log_score"]
 
 
 def crps(
-    ensemble: ArrayLike,
-    truth: ArrayLike,
-    *,
-    fair: bool = False,
-    weights: ArrayLike | None = None,
+    ensemble: ArrayLike, truth: ArrayLike, *, fair: bool = False, weights: ArrayLike | None = None
 ) -> Array:
-    r"""Continuous ranked probability score of each component of an ensemble; smaller is better.
+    r"""Continuous ranked probability score (..., d) of an ensemble by component; smaller is better.
 
     :math:`\operatorname{mean}_i|x_i-y|-\tfrac12\operatorname{mean}_{i,j}|x_i-x_j|`, the integral of
     the squared difference between the members' distribution function and the truth's step. It
@@ -39,10 +35,6 @@ def crps(
     weights : array_like, (..., N), optional
         Of the members, with sum one; equal by default. Not together with `fair`.
 
-    Returns
-    -------
-    ndarray, (..., d)
-
     Notes
     -----
     T. Gneiting and A. E. Raftery, Journal of the American Statistical Association 102 (2007)
@@ -56,9 +48,9 @@ def crps(
     >>> crps([[0.0], [2.0]], [1.0], fair=True)
     array([0.])
     """
-    x = _ensemble(ensemble, 2 if fair else 1)
+    x = _ensemble(ensemble, 2 if instance(fair, "fair", bool) else 1)
     n = x.shape[-2]
-    t = _truth(truth, (*x.shape[:-2], x.shape[-1]), "ensemble")
+    t = _truth(truth, (*x.shape[:-2], x.shape[-1]))
     if weights is not None:
         return _weighted_crps(x - t[..., None, :], weights, fair)
     # Distances from the truth are as good as the members, and lose fewer digits far from zero.
@@ -80,7 +72,7 @@ def _weighted_crps(gap: Array, weights: ArrayLike, fair: bool) -> Array:
 
 
 def gaussian_crps(mean: ArrayLike, std: ArrayLike, truth: ArrayLike) -> Array:
-    r"""Continuous ranked probability score of Gaussians, componentwise.
+    r"""Continuous ranked probability score of Gaussians, componentwise, (...).
 
     :math:`\sigma\,[z(2\Phi(z)-1)+2\varphi(z)-1/\sqrt\pi]` with :math:`z=(y-\mu)/\sigma`.
 
@@ -89,10 +81,6 @@ def gaussian_crps(mean: ArrayLike, std: ArrayLike, truth: ArrayLike) -> Array:
     mean, truth : array_like, (...)
     std : array_like, (...)
         Standard deviations, positive. The three arrays broadcast.
-
-    Returns
-    -------
-    ndarray, (...)
 
     Notes
     -----
@@ -109,20 +97,14 @@ def gaussian_crps(mean: ArrayLike, std: ArrayLike, truth: ArrayLike) -> Array:
     m, s, t = array(mean, "mean"), array(std, "std"), array(truth, "truth")
     if s.size and s.min() <= 0:
         raise ValueError(f"std: needs positive standard deviations, got {s.min():.6g}")
-    try:
-        np.broadcast_shapes(m.shape, s.shape, t.shape)
-    except ValueError:
-        raise ValueError(
-            f"truth: needs a shape that broadcasts with mean {m.shape} and std {s.shape}, "
-            f"got {t.shape}"
-        ) from None
+    _leading(_leading(m.shape, s.shape, "std"), t.shape, "truth")
     z = (t - m) / s
     density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
     return np.asarray(s * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi)))
 
 
 def log_score(estimate: ArrayLike, cov: ArrayLike, truth: ArrayLike) -> Array:
-    r"""Minus the log-density of a Gaussian estimate at the truth; smaller is better.
+    r"""Minus the log-density of a Gaussian estimate at the truth, (...); smaller is better.
 
     It rewards a small error and a covariance that fits, of all components together. The score of
     an honest Gaussian is :math:`\tfrac12\log\det(2\pi e\mathbf P)` on average, and every other
@@ -135,15 +117,11 @@ def log_score(estimate: ArrayLike, cov: ArrayLike, truth: ArrayLike) -> Array:
     cov : array_like, (..., d, d)
         The estimate's covariance, positive definite.
 
-    Returns
-    -------
-    ndarray, (...)
-
     Examples
     --------
     >>> float(log_score([0.0], [[1.0]], [1.0]).round(6))
     1.418939
     """
     e = array(estimate, "estimate", (..., "d"))
-    gap = e - _truth(truth, e.shape, "estimate")
+    gap = e - _truth(truth, e.shape)
     return -_log_density(gap, _cholesky(_spread(cov, gap.shape)))

@@ -47,9 +47,9 @@ def tikhonov(largest: float, smallest: float, *, condition: float = _CONDITION) 
     >>> tikhonov(1.0, 0.5, condition=10.0)
     0.0
     """
-    top = number(largest, "largest", at_least=0)
+    top = number(largest, "largest", at_least=0, at_most=1e150)
     low = number(smallest, "smallest", at_least=0, at_most=top)
-    k = number(condition, "condition", above=1)
+    k = number(condition, "condition", above=1, at_most=1e150)
     return float(np.sqrt(max(top**2 - (k * low) ** 2, 0.0) / (k**2 - 1)))
 
 
@@ -81,6 +81,8 @@ def nonnegative_least_squares(
     """
     a = array(matrix, "matrix", ("n", "S"))
     b = array(right, "right", (a.shape[0],))
+    if not a.size or np.abs(a).max() > 1e150:
+        raise ValueError(f"matrix: needs entries of finite square, got shape {a.shape}")
     values = svdvals(a)
     small = float(values[-1]) if a.shape[0] >= a.shape[1] else 0.0
     alpha = tikhonov(float(values[0]), min(small, float(values[0])), condition=condition)

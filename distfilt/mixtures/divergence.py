@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, callable_, count, covariance, generator, instance
+from ..checks import Array, array, callable_, count, covariance, generator, instance, number
 from .gaussian import GaussianMixture
 
 __all__ = [
@@ -24,9 +24,10 @@ def gaussian_divergences(
 ) -> Array:
     r"""Kullback-Leibler divergences of each Gaussian from each of others, (L, L'), in nats.
 
-    .. math:: D_{KL}=\tfrac12\bigl[\operatorname{tr}\mathbf P_r^{-1}\mathbf P_q-d
-        +(\mathbf m_q-\mathbf m_r)^\top\mathbf P_r^{-1}(\mathbf m_q-\mathbf m_r)
-        +\log|\mathbf P_r|-\log|\mathbf P_q|\bigr]
+    .. math::
+        D_{KL}&=\tfrac12\bigl[\operatorname{tr}\mathbf P_r^{-1}\mathbf P_q-d
+        +\log|\mathbf P_r|-\log|\mathbf P_q|\\
+        &\qquad+(\mathbf m_q-\mathbf m_r)^\top\mathbf P_r^{-1}(\mathbf m_q-\mathbf m_r)\bigr]
 
     never negative: what rounding leaves below zero is zero.
 
@@ -80,8 +81,8 @@ class Divergence:
     share: float
 
     def __post_init__(self) -> None:
-        if not np.isfinite([self.value, self.error, self.share]).all():
-            raise ValueError("value: needs finite numbers, got NaN or infinity")
+        for name in ("value", "error", "share"):
+            number(getattr(self, name), name)
 
     def __str__(self) -> str:
         return f"{self.value:.3g} ± {self.error:.1g}"
@@ -166,6 +167,8 @@ def jeffreys_of_many(
     >>> [round(d.value, 6) for d in found]
     [0.0, 0.5]
     """
+    if not np.iterable(log_qs):
+        raise ValueError(f"log_qs: needs a list of functions, got {type(log_qs).__name__}")
     functions = [callable_(log_p, "log_p"), *(callable_(f, "log_qs") for f in log_qs)]
     low = array(lower, "lower", ("d",))
     high = array(upper, "upper", low.shape)

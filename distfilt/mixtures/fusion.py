@@ -11,7 +11,7 @@ equations (14)-(15) of Semeraro, LeGrand and Kulik for one other agent.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -73,6 +73,8 @@ class PartialFusion:
         omega: float | ArrayLike = 0.5,
     ) -> None:
         instance(own, "own", GaussianMixture)
+        if not isinstance(heard, GaussianMixture | Iterable):
+            raise ValueError(f"heard: needs mixtures, got {type(heard).__name__}")
         others = (heard,) if isinstance(heard, GaussianMixture) else tuple(heard)
         if not others:
             raise ValueError("heard: needs at least one belief, got none")

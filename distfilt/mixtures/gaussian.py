@@ -321,8 +321,8 @@ class GaussianMixture:
         >>> GaussianMixture.unpack(one.pack()).covs.tolist() == one.covs.tolist()
         True
         """
-        if len(payload) != 3:
-            raise ValueError(f"payload: needs weights, means and triangles, got {len(payload)}")
+        if not isinstance(payload, list | tuple) or len(payload) != 3:
+            raise ValueError(f"payload: needs weights, means and triangles, got {payload!r}")
         m = array(payload[1], "payload", ("L", "d"))
         d = m.shape[1]
         flat = array(payload[2], "payload", (m.shape[0], d * (d + 1) // 2))
@@ -333,6 +333,8 @@ class GaussianMixture:
         return cls(array(payload[0], "payload", (m.shape[0],)), m, covs)
 
     def _indices(self, indices: Sequence[int]) -> Any:
+        if not np.iterable(indices):
+            raise ValueError(f"indices: needs a list of integers, got {indices!r}")
         at = np.array([count(i, "indices", at_least=0) for i in indices], dtype=np.intp)
         if not at.size or at.max() >= self.dim or np.unique(at).size != at.size:
             raise ValueError(

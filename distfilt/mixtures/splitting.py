@@ -129,8 +129,9 @@ def split(
     (3, [[1.0, 0.0], [0.0, 1.0]])
     """
     instance(mixture, "mixture", GaussianMixture)
+    array(which, "which")
     at = np.array(
-        [count(int(i), "which", at_least=0) for i in np.atleast_1d(np.asarray(which, dtype=int))],
+        [count(i, "which", at_least=0) for i in np.atleast_1d(np.asarray(which)).tolist()],
         dtype=np.intp,
     )
     if at.size and (at.max() >= mixture.size or np.unique(at).size != at.size):

@@ -21,11 +21,7 @@ from .rotations import (
     turn_between,
     turned,
 )
-from .satellite import (
-    clohessy_wiltshire,
-    clohessy_wiltshire_drift,
-    clohessy_wiltshire_transition,
-)
+from .satellite import clohessy_wiltshire, clohessy_wiltshire_drift, clohessy_wiltshire_transition
 from .swarm import (
     READINGS,
     RotatingMixture,
@@ -35,38 +31,12 @@ from .swarm import (
     rotating_swarm,
 )
 
-__all__ = [
-    "READINGS",
-    "LinearModel",
-    "Model",
-    "RotatingMixture",
-    "Swarm",
-    "angular_acceleration",
-    "attitude",
-    "clohessy_wiltshire",
-    "clohessy_wiltshire_drift",
-    "clohessy_wiltshire_transition",
-    "constant_velocity",
-    "coordinated_turn",
-    "cross_matrix",
-    "left_directions",
-    "lorenz63",
-    "lorenz63_rate",
-    "pendulum",
-    "pendulum_angle",
-    "pendulum_chart",
-    "pendulum_energy",
-    "pendulum_rate",
-    "pendulum_states",
-    "mobility_and_diffusion",
-    "quaternion_rate",
-    "reflected",
-    "rk4",
-    "rk4_jacobian",
-    "rotating_swarm",
-    "rotation_matrix",
-    "satellite_pose",
-    "simulate",
-    "turn_between",
-    "turned",
+__all__ = [  # fmt: skip
+    "READINGS", "LinearModel", "Model", "RotatingMixture", "Swarm", "angular_acceleration",
+    "attitude", "clohessy_wiltshire", "clohessy_wiltshire_drift", "clohessy_wiltshire_transition",
+    "constant_velocity", "coordinated_turn", "cross_matrix", "left_directions", "lorenz63",
+    "lorenz63_rate", "pendulum", "pendulum_angle", "pendulum_chart", "pendulum_energy",
+    "pendulum_rate", "pendulum_states", "mobility_and_diffusion", "quaternion_rate", "reflected",
+    "rk4", "rk4_jacobian", "rotating_swarm", "rotation_matrix", "satellite_pose", "simulate",
+    "turn_between", "turned",
 ]

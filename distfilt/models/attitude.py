@@ -16,13 +16,7 @@ from numpy.typing import ArrayLike
 from ..checks import Array, array, number
 from .base import Model
 from .integrators import rk4, rk4_jacobian
-from .rotations import (
-    _quaternion,
-    _quaternion_rate,
-    cross_matrix,
-    left_directions,
-    rotation_matrix,
-)
+from .rotations import _quaternion, _quaternion_rate, cross_matrix, left_directions, rotation_matrix
 from .satellite import clohessy_wiltshire
 
 __all__ = ["angular_acceleration", "attitude", "satellite_pose"]
@@ -31,7 +25,7 @@ __all__ = ["angular_acceleration", "attitude", "satellite_pose"]
 def angular_acceleration(
     quaternion: ArrayLike, angular_velocity: ArrayLike, *, rate: float
 ) -> Array:
-    r"""The angular velocity's derivative without noise, equation (20).
+    r"""The angular velocity's derivative without noise in rad/s², (..., 3), equation (20).
 
     .. math:: \dot{\boldsymbol\omega} = [\boldsymbol\omega]_\times\mathbf R(\mathbf q)
         \,(0, 0, \alpha)^\top
@@ -46,11 +40,6 @@ def angular_acceleration(
         In rad/s.
     rate : float
         Orbital rate α of the chief, in rad/s, at least 0.
-
-    Returns
-    -------
-    ndarray, (..., 3)
-        In rad/s².
 
     Examples
     --------
@@ -127,6 +116,8 @@ def _slope_of_flow(x: Array, t: float, dt: float, alpha: float, step: float) -> 
 def attitude(*, rate: float, sigma: float, step: float = 0.01) -> Model:
     r"""The attitude model (20)-(21) of Grange et al., integrated by Runge-Kutta of order 4.
 
+    Its seven components are :math:`(\boldsymbol\omega, \mathbf q)`.
+
     Parameters
     ----------
     rate : float
@@ -137,11 +128,6 @@ def attitude(*, rate: float, sigma: float, step: float = 0.01) -> Model:
     step : float
         Longest integration step, in s, positive.
 
-    Returns
-    -------
-    Model
-        With the seven components :math:`(\boldsymbol\omega, \mathbf q)`.
-
     Examples
     --------
     >>> model = attitude(rate=0.1, sigma=0.2)
@@ -150,15 +136,13 @@ def attitude(*, rate: float, sigma: float, step: float = 0.01) -> Model:
     1.0
     """
     alpha = number(rate, "rate", above=0)
-    density = number(sigma, "sigma", at_least=0) ** 2 * np.diag([1.0] * 3 + [0.0] * 4)
+    strength = number(sigma, "sigma", at_least=0, at_most=1e150)
+    density = strength**2 * np.diag([1.0] * 3 + [0.0] * 4)
     longest = number(step, "step", above=0)
     return Model(
-        7,
-        lambda x, t, dt: _flow(x, t, dt, alpha, longest),
-        lambda t, dt: density * dt,
+        7, lambda x, t, dt: _flow(x, t, dt, alpha, longest), lambda t, dt: density * dt,
         derivative=lambda x, t, dt: _slope_of_flow(x, t, dt, alpha, longest),
-        names=("w1", "w2", "w3", "q1", "q2", "q3", "q4"),
-        units=("rad/s",) * 3 + ("1",) * 4,
+        names=("w1", "w2", "w3", "q1", "q2", "q3", "q4"), units=("rad/s",) * 3 + ("1",) * 4,
     )
 
 
@@ -166,18 +150,14 @@ def satellite_pose(*, rate: float, sigma: float, step: float = 0.01) -> Model:
     r"""Translation and attitude together: the 13-component model of Table III of Grange et al.
 
     Translation (18) moves by its exact transition and exact noise, attitude (20)-(21) as in
-    :func:`attitude`; the two do not act on each other.
+    :func:`attitude`; the two do not act on each other. The components are
+    :math:`(x, y, z, \dot x, \dot y, \dot z, \boldsymbol\omega, \mathbf q)`.
 
     Parameters
     ----------
     rate, sigma, step : float
         As for :func:`attitude`; `sigma` drives all six components of the translation and the
         angular velocity.
-
-    Returns
-    -------
-    Model
-        With the components :math:`(x, y, z, \dot x, \dot y, \dot z, \boldsymbol\omega, \mathbf q)`.
 
     Examples
     --------
@@ -206,10 +186,6 @@ def satellite_pose(*, rate: float, sigma: float, step: float = 0.01) -> Model:
         return cov
 
     return Model(
-        13,
-        flow,
-        lambda t, dt: noise(dt),
-        derivative=derivative,
-        names=orbit.names + body.names,
+        13, flow, lambda t, dt: noise(dt), derivative=derivative, names=orbit.names + body.names,
         units=orbit.units + body.units,
     )

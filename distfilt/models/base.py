@@ -94,9 +94,7 @@ class Model:
         q = covariance(q, "noise_cov", self.dim, semidefinite=True)
         return array(q, "noise_cov", (self.dim, self.dim)).copy()
 
-    def sample_step(
-        self, x: ArrayLike, t: float, dt: float, *, rng: np.random.Generator
-    ) -> Array:
+    def sample_step(self, x: ArrayLike, t: float, dt: float, *, rng: np.random.Generator) -> Array:
         """Move states (..., d) from `t` to `t` + `dt` and add a draw of the noise to each."""
         state = array(x, "x", (..., self.dim))
         now, length = number(t, "t"), number(dt, "dt", at_least=0)
@@ -167,12 +165,8 @@ class LinearModel(Model):
 
     @classmethod
     def from_transition(
-        cls,
-        dim: int,
-        transition_matrix: Callable[[float], Array],
-        noise_cov: Callable[[float, float], Array],
-        *,
-        names: tuple[str, ...] = (),
+        cls, dim: int, transition_matrix: Callable[[float], Array],
+        noise_cov: Callable[[float, float], Array], *, names: tuple[str, ...] = (),
         units: tuple[str, ...] = (),
     ) -> LinearModel:
         """Build the model from its transition matrix, ``transition_matrix(dt) -> (d, d)``."""
@@ -183,12 +177,7 @@ class LinearModel(Model):
             return x @ phi.T
 
         return cls(
-            dim,
-            flow,
-            noise_cov,
-            names=names,
-            units=units,
-            transition_matrix=transition_matrix,
+            dim, flow, noise_cov, names=names, units=units, transition_matrix=transition_matrix
         )
 
     def transition(self, dt: float) -> Array:
@@ -203,12 +192,7 @@ class LinearModel(Model):
 
 
 def simulate(
-    model: Model,
-    x0: ArrayLike,
-    times: ArrayLike,
-    *,
-    rng: np.random.Generator,
-    t0: float = 0.0,
+    model: Model, x0: ArrayLike, times: ArrayLike, *, rng: np.random.Generator, t0: float = 0.0
 ) -> Array:
     """Draw trajectories of a model at the given times.
 
@@ -229,11 +213,6 @@ def simulate(
     -------
     ndarray, (T, ..., d)
         The states at `times`; `x0` is not repeated.
-
-    Raises
-    ------
-    ValueError
-        If `x0` does not fit the model, or `times` do not increase from `t0`.
 
     Examples
     --------

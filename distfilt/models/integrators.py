@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, array, callable_, number
+from .base import Model
 
 __all__ = ["rk4", "rk4_jacobian"]
 
@@ -17,11 +18,7 @@ _MOST = 10_000_000
 
 
 def rk4(
-    rate: Callable[[Array, float], Array],
-    x: ArrayLike,
-    t: float,
-    dt: float,
-    *,
+    rate: Callable[[Array, float], Array], x: ArrayLike, t: float, dt: float, *,
     longest: float | None = None,
 ) -> Array:
     r"""Advance :math:`\dot{\mathbf x} = \mathbf f(\mathbf x, t)` by the classical Runge-Kutta rule.
@@ -38,18 +35,7 @@ def rk4(
         How far, in s, at least 0.
     longest : float, optional
         Longest integration step, in s, positive: `dt` is cut into the fewest equal steps that are
-        not longer. One step by default. The error falls with its fourth power.
-
-    Returns
-    -------
-    ndarray, (..., d)
-        States at `t` + `dt`.
-
-    Raises
-    ------
-    ValueError
-        If an argument is wrong, `rate` returns another shape, or `longest` asks for more than ten
-        million steps.
+        not longer, ten million at most. One step by default. The error falls with its fourth power.
 
     Notes
     -----
@@ -68,15 +54,10 @@ def rk4(
 
 
 def rk4_jacobian(
-    rate: Callable[[Array, float], Array],
-    slope: Callable[[Array, float], Array],
-    x: ArrayLike,
-    t: float,
-    dt: float,
-    *,
-    longest: float | None = None,
+    rate: Callable[[Array, float], Array], slope: Callable[[Array, float], Array], x: ArrayLike,
+    t: float, dt: float, *, longest: float | None = None,
 ) -> Array:
-    r"""Derivative of :func:`rk4` in the states it starts from, to rounding.
+    r"""Derivative (..., d, d) of :func:`rk4` in the states it starts from, to rounding.
 
     The rule applied to :math:`\dot{\mathbf x} = \mathbf f`, :math:`\dot{\mathbf J} =
     (\partial\mathbf f/\partial\mathbf x)\,\mathbf J` together gives exactly the derivative of the
@@ -89,15 +70,6 @@ def rk4_jacobian(
     slope : callable
         ``slope(x, t)``, the derivative of `rate` in x, (..., d, d).
 
-    Returns
-    -------
-    ndarray, (..., d, d)
-
-    Raises
-    ------
-    ValueError
-        As :func:`rk4`, or if `slope` returns another shape.
-
     Examples
     --------
     >>> rk4_jacobian(lambda x, t: -x**2, lambda x, t: -2 * x[..., None], [1.0], 0.0, 1.0,
@@ -107,6 +79,7 @@ def rk4_jacobian(
     f, g = callable_(rate, "rate"), callable_(slope, "slope")
     state = array(x, "x", (..., "d"))
     d = state.shape[-1]
+    _rated(f(state.copy(), number(t, "t")), state)
     now, length = number(t, "t"), number(dt, "dt", at_least=0)
 
     def both(joint: Array, s: float) -> Array:
@@ -119,6 +92,22 @@ def rk4_jacobian(
     first = np.broadcast_to(np.eye(d), (*state.shape, d))
     start = np.concatenate([state[..., None], first], axis=-1)
     return _rk4(both, start, now, length, _steps(length, longest))[..., 1:]
+
+
+def _integrated(
+    rate: Callable[[Array, float], Array], slope: Callable[[Array, float], Array], density: Array,
+    *, step: float, names: tuple[str, ...], units: tuple[str, ...],
+) -> Model:
+    """The model that :func:`rk4` makes of a rate, with white noise of a spectral density (d, d)."""
+    longest = number(step, "step", above=0)
+    return Model(
+        len(density),
+        lambda x, t, dt: rk4(rate, x, t, dt, longest=longest),
+        lambda t, dt: density * dt,
+        derivative=lambda x, t, dt: rk4_jacobian(rate, slope, x, t, dt, longest=longest),
+        names=names,
+        units=units,
+    )
 
 
 def _steps(dt: float, longest: float | None) -> int:
@@ -134,14 +123,23 @@ def _steps(dt: float, longest: float | None) -> int:
     return max(1, math.ceil(needed))
 
 
+def _rated(value: object, state: Array) -> Array:
+    """What a rate returned, if it fits the states."""
+    first = np.asarray(value)
+    if first.shape != state.shape or first.dtype.kind not in "fiu":
+        raise ValueError(
+            f"rate: needs to return numbers of shape {state.shape}, "
+            f"got {first.dtype} of shape {first.shape}"
+        )
+    return first
+
+
 def _rk4(
     f: Callable[[Array, float], Array], state: Array, t: float, dt: float, steps: int
 ) -> Array:
     """`rk4` of checked arguments in a given number of equal steps."""
     h = dt / steps
-    first = np.asarray(f(state, t))
-    if first.shape != state.shape:
-        raise ValueError(f"rate: needs to return shape {state.shape}, got {first.shape}")
+    first = _rated(f(state, t), state)
     for k in range(steps):
         s = t + k * h
         k1 = first if k == 0 else f(state, s)

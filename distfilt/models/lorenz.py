@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import Array, array, number
 from .base import Model
-from .integrators import rk4, rk4_jacobian
+from .integrators import _integrated
 
 __all__ = ["lorenz63", "lorenz63_rate"]
 
@@ -15,7 +15,7 @@ __all__ = ["lorenz63", "lorenz63_rate"]
 def lorenz63_rate(
     x: ArrayLike, *, prandtl: float = 10.0, rho: float = 28.0, beta: float = 8 / 3
 ) -> Array:
-    r"""Right-hand side of Lorenz's equations.
+    r"""Right-hand side of Lorenz's equations, (..., 3).
 
     .. math:: \dot x = p(y-x),\quad \dot y = x(\rho-z)-y,\quad \dot z = xy-\beta z
 
@@ -25,10 +25,6 @@ def lorenz63_rate(
         States.
     prandtl, rho, beta : float
         Prandtl number, scaled Rayleigh number and geometry.
-
-    Returns
-    -------
-    ndarray, (..., 3)
 
     Notes
     -----
@@ -60,11 +56,7 @@ def _slope(state: Array, prandtl: float, rho: float, beta: float) -> Array:
 
 
 def lorenz63(
-    *,
-    prandtl: float = 10.0,
-    rho: float = 28.0,
-    beta: float = 8 / 3,
-    sigma: float = 0.0,
+    *, prandtl: float = 10.0, rho: float = 28.0, beta: float = 8 / 3, sigma: float = 0.0,
     step: float = 0.01,
 ) -> Model:
     """Lorenz's model of 1963, integrated by Runge-Kutta of order 4 with a fixed step.
@@ -79,34 +71,14 @@ def lorenz63(
     step : float
         Longest integration step, positive, in units of time.
 
-    Returns
-    -------
-    Model
-        With three components and its Jacobian, which is that of the integration to rounding.
-
     Examples
     --------
     >>> lorenz63().step([1.0, 1.0, 20.0], 0.0, 0.1).shape
     (3,)
     """
     s, r, b = number(prandtl, "prandtl"), number(rho, "rho"), number(beta, "beta")
-    density = number(sigma, "sigma", at_least=0) ** 2 * np.eye(3)
-    longest = number(step, "step", above=0)
-
-    def rate(x: Array, _: float) -> Array:
-        return _rate(x, s, r, b)
-
-    def flow(x: Array, t: float, dt: float) -> Array:
-        return rk4(rate, x, t, dt, longest=longest)
-
-    def derivative(x: Array, t: float, dt: float) -> Array:
-        return rk4_jacobian(rate, lambda v, _: _slope(v, s, r, b), x, t, dt, longest=longest)
-
-    return Model(
-        3,
-        flow,
-        lambda t, dt: density * dt,
-        derivative=derivative,
-        names=("x", "y", "z"),
-        units=("1",) * 3,
+    density = number(sigma, "sigma", at_least=0, at_most=1e150) ** 2 * np.eye(3)
+    return _integrated(
+        lambda x, _: _rate(x, s, r, b), lambda x, _: _slope(x, s, r, b), density, step=step,
+        names=("x", "y", "z"), units=("1",) * 3,
     )

@@ -1,7 +1,8 @@
 r"""Motion of whatever moves: straight on, or in a turn, in a plane or in space.
 
 States are positions first, then velocities, in m and m/s. The noise is white noise on the
-acceleration.
+acceleration: Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking
+and Navigation, Wiley 2001, sections 6.2.2 and 11.7.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _QUARTER = np.array([[0.0, -1.0], [1.0, 0.0]])
 
 
 def constant_velocity(*, sigma: float, axes: int = 2) -> LinearModel:
-    r"""Straight motion whose velocity wanders, with white noise on the acceleration.
+    r"""Straight motion whose velocity wanders: positions, then velocities, along `axes` axes.
 
     .. math:: \ddot{\mathbf p} = \sigma\,\dot{\mathbf w},\qquad
         \mathbf Q = \sigma^2\begin{pmatrix} dt^3/3 & dt^2/2\\ dt^2/2 & dt\end{pmatrix}
@@ -38,23 +39,13 @@ def constant_velocity(*, sigma: float, axes: int = 2) -> LinearModel:
     axes : int
         1, 2 or 3 axes.
 
-    Returns
-    -------
-    LinearModel
-        With 2 `axes` components: positions, then velocities.
-
-    Notes
-    -----
-    Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking and
-    Navigation, Wiley 2001, section 6.2.2.
-
     Examples
     --------
     >>> model = constant_velocity(sigma=0.1)
     >>> model.step([1.0, 2.0, 0.5, -0.5], 0.0, 2.0)
     array([ 2. ,  1. ,  0.5, -0.5])
     """
-    density = number(sigma, "sigma", at_least=0) ** 2
+    density = number(sigma, "sigma", at_least=0, at_most=1e150) ** 2
     n = count(axes, "axes")
     if n > 3:
         raise ValueError(f"axes: needs 1, 2 or 3 axes, got {axes}")
@@ -104,21 +95,6 @@ def coordinated_turn(
         at least 0, in rad/s per root second. Its noise and the one on the position and velocity
         are those of straight motion, as usual.
 
-    Returns
-    -------
-    LinearModel or Model
-        A model with four components, or one with five and its Jacobian.
-
-    Raises
-    ------
-    ValueError
-        If both or none of `rate` and `turn_sigma` are given.
-
-    Notes
-    -----
-    Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking and
-    Navigation, Wiley 2001, section 11.7.
-
     Examples
     --------
     A quarter of a circle of radius 1:
@@ -134,7 +110,7 @@ def coordinated_turn(
     omega = number(rate, "rate")
     drift = np.zeros((4, 4))
     drift[:2, 2:], drift[2:, 2:] = np.eye(2), omega * _QUARTER
-    density = number(sigma, "sigma", at_least=0) ** 2 * np.diag([0.0, 0.0, 1.0, 1.0])
+    density = number(sigma, "sigma", at_least=0, at_most=1e150) ** 2 * np.diag([0.0, 0.0, 1.0, 1.0])
 
     @lru_cache(maxsize=64)
     def noise(dt: float) -> Array:
@@ -144,10 +120,7 @@ def coordinated_turn(
 
     straight = constant_velocity(sigma=sigma)
     return LinearModel.from_transition(
-        4,
-        lambda dt: _turn(np.asarray(omega), dt),
-        lambda t, dt: noise(dt),
-        names=straight.names,
+        4, lambda dt: _turn(np.asarray(omega), dt), lambda t, dt: noise(dt), names=straight.names,
         units=straight.units,
     )
 
@@ -174,11 +147,7 @@ def _estimated_turn(sigma: float, turn_sigma: float) -> Model:
         return cov
 
     return Model(
-        5,
-        flow,
-        noise,
-        derivative=derivative,
-        names=(*straight.names, "turn rate"),
+        5, flow, noise, derivative=derivative, names=(*straight.names, "turn rate"),
         units=(*straight.units, "rad/s"),
     )
 

@@ -11,15 +11,10 @@ from numpy.typing import ArrayLike
 
 from ..checks import Array, array, choice, number
 from .base import Model
-from .integrators import rk4, rk4_jacobian
+from .integrators import _integrated
 
-__all__ = [
-    "FORMS",
-    "pendulum",
-    "pendulum_angle",
-    "pendulum_chart",
-    "pendulum_energy",
-    "pendulum_rate",
+__all__ = [  # fmt: skip
+    "FORMS", "pendulum", "pendulum_angle", "pendulum_chart", "pendulum_energy", "pendulum_rate",
     "pendulum_states",
 ]
 
@@ -30,7 +25,7 @@ FORMS = ("printed", "multiplier")
 def pendulum_rate(
     states: ArrayLike, *, length: float = 1.0, gravity: float = 9.8, form: str = "printed"
 ) -> Array:
-    r"""Right-hand side of the pendulum's equations, (14)-(15) of Das and Bhattacharya.
+    r"""Right-hand side (..., 4) of the pendulum's equations, (14)-(15) of Das and Bhattacharya.
 
     .. math:: \ddot x=\frac{-gxy-x|\mathbf v|^2}{L^2},\qquad
         \ddot y=\frac{gx^2-y|\mathbf v|^2}{L^2}
@@ -50,10 +45,6 @@ def pendulum_rate(
         g, in m/s², at least 0.
     form : {"printed", "multiplier"}
         `FORMS`.
-
-    Returns
-    -------
-    ndarray, (..., 4)
 
     Examples
     --------
@@ -97,14 +88,10 @@ def _slope(s: Array, size: float, g: float, printed: bool) -> Array:
 
 
 def pendulum(
-    *,
-    length: float = 1.0,
-    gravity: float = 9.8,
-    form: str = "printed",
-    sigma: tuple[float, float] = (0.0, 0.0),
-    step: float = 0.01,
+    *, length: float = 1.0, gravity: float = 9.8, form: str = "printed",
+    sigma: tuple[float, float] = (0.0, 0.0), step: float = 0.01,
 ) -> Model:
-    """The pendulum in Cartesian coordinates, integrated by Runge-Kutta of order 4.
+    """The pendulum in Cartesian coordinates x, y, vx, vy, by Runge-Kutta of order 4.
 
     Parameters
     ----------
@@ -116,11 +103,6 @@ def pendulum(
     step : float
         Longest integration step, in s, positive.
 
-    Returns
-    -------
-    Model
-        Components x, y, vx, vy, with the Jacobian of the integration.
-
     Examples
     --------
     >>> swing = pendulum().step([np.sin(1.0), np.cos(1.0), 0.0, 0.0], 0.0, 1.0)
@@ -129,22 +111,9 @@ def pendulum(
     """
     size, g = number(length, "length", above=0), number(gravity, "gravity", at_least=0)
     printed = choice(form, "form", FORMS) == "printed"
-    longest = number(step, "step", above=0)
-    density = _density(sigma, 2)
-
-    def rate(x: Array, _: float) -> Array:
-        return _rate(x, size, g, printed)
-
-    def slope(x: Array, _: float) -> Array:
-        return _slope(x, size, g, printed)
-
-    return Model(
-        4,
-        lambda x, t, dt: rk4(rate, x, t, dt, longest=longest),
-        lambda t, dt: density * dt,
-        derivative=lambda x, t, dt: rk4_jacobian(rate, slope, x, t, dt, longest=longest),
-        names=("x", "y", "vx", "vy"),
-        units=("m", "m", "m/s", "m/s"),
+    return _integrated(
+        lambda x, _: _rate(x, size, g, printed), lambda x, _: _slope(x, size, g, printed),
+        _density(sigma, 2), step=step, names=("x", "y", "vx", "vy"), units=("m", "m", "m/s", "m/s"),
     )
 
 
@@ -156,13 +125,10 @@ def _density(sigma: tuple[float, float], each: int) -> Array:
 
 
 def pendulum_angle(
-    *,
-    length: float = 1.0,
-    gravity: float = 9.8,
-    sigma: tuple[float, float] = (0.0, 0.0),
+    *, length: float = 1.0, gravity: float = 9.8, sigma: tuple[float, float] = (0.0, 0.0),
     step: float = 0.01,
 ) -> Model:
-    r"""The pendulum in its chart: the angle θ from the vertical and its rate.
+    r"""The pendulum in its chart: the angle θ from the vertical, not wrapped, and its rate.
 
     .. math:: \ddot\theta = -\frac gL\sin\theta
 
@@ -173,19 +139,12 @@ def pendulum_angle(
     sigma : (float, float)
         Strength of white noise on the angle, in rad/√s, and on the rate, in rad/s/√s.
 
-    Returns
-    -------
-    Model
-        Components theta and omega; the angle is not wrapped.
-
     Examples
     --------
     >>> pendulum_angle().step([0.0, 1.0], 0.0, 0.01).round(4)
     array([0.01  , 0.9995])
     """
     size, g = number(length, "length", above=0), number(gravity, "gravity", at_least=0)
-    longest = number(step, "step", above=0)
-    density = _density(sigma, 1)
 
     def rate(x: Array, _: float) -> Array:
         out = np.empty_like(x)
@@ -199,18 +158,14 @@ def pendulum_angle(
         out[..., 1, 0] = -(g / size) * np.cos(x[..., 0])
         return out
 
-    return Model(
-        2,
-        lambda x, t, dt: rk4(rate, x, t, dt, longest=longest),
-        lambda t, dt: density * dt,
-        derivative=lambda x, t, dt: rk4_jacobian(rate, slope, x, t, dt, longest=longest),
-        names=("theta", "omega"),
+    return _integrated(
+        rate, slope, _density(sigma, 1), step=step, names=("theta", "omega"),
         units=("rad", "rad/s"),
     )
 
 
 def pendulum_states(chart: ArrayLike, *, length: float = 1.0) -> Array:
-    r"""Cartesian states of chart coordinates, :math:`L(\sin\theta,\cos\theta)` and its velocity.
+    r"""Cartesian states (..., 4), position and velocity, of chart coordinates.
 
     Parameters
     ----------
@@ -218,10 +173,6 @@ def pendulum_states(chart: ArrayLike, *, length: float = 1.0) -> Array:
         Angles in rad and rates in rad/s.
     length : float
         L, in m, positive.
-
-    Returns
-    -------
-    ndarray, (..., 4)
 
     Examples
     --------
@@ -235,17 +186,12 @@ def pendulum_states(chart: ArrayLike, *, length: float = 1.0) -> Array:
 
 
 def pendulum_chart(states: ArrayLike) -> Array:
-    r"""Angle and rate of Cartesian states; the distance from the pivot and its rate are dropped.
+    r"""Angle in (-π, π] and rate :math:`(\dot xy-x\dot y)/r^2` of Cartesian states, (..., 2).
 
     Parameters
     ----------
     states : array_like, (..., 4)
         Not at the pivot.
-
-    Returns
-    -------
-    ndarray, (..., 2)
-        The angle in (-π, π] and :math:`(\dot xy-x\dot y)/r^2`.
 
     Examples
     --------

@@ -11,26 +11,18 @@ from numpy.typing import ArrayLike
 
 from ..checks import Array, array
 
-__all__ = [
-    "cross_matrix",
-    "left_directions",
-    "quaternion_rate",
-    "rotation_matrix",
-    "turn_between",
+__all__ = [  # fmt: skip
+    "cross_matrix", "left_directions", "quaternion_rate", "rotation_matrix", "turn_between",
     "turned",
 ]
 
 
 def cross_matrix(vector: ArrayLike) -> Array:
-    r"""The matrix :math:`[\boldsymbol\omega]_\times` of the cross product, equation (19).
+    r"""The cross product :math:`[\boldsymbol\omega]_\times` as a matrix (..., 3, 3), equation (19).
 
     Parameters
     ----------
     vector : array_like, (..., 3)
-
-    Returns
-    -------
-    ndarray, (..., 3, 3)
 
     Examples
     --------
@@ -44,15 +36,19 @@ def cross_matrix(vector: ArrayLike) -> Array:
     return out
 
 
-def _quaternion(value: ArrayLike) -> Array:
-    q = array(value, "quaternion", (..., 4))
+def _quaternion(value: ArrayLike, name: str = "quaternion") -> Array:
+    q = array(value, name, (..., 4))
     if not (q != 0).any(axis=-1).all():
-        raise ValueError("quaternion: needs quaternions that are not zero, got a zero one")
+        raise ValueError(f"{name}: needs quaternions that are not zero, got a zero one")
+    with np.errstate(over="ignore", under="ignore"):
+        squares = (q**2).sum(axis=-1)
+    if not (np.isfinite(squares) & (squares > 1e-280)).all():
+        raise ValueError(f"{name}: needs lengths between 1e-140 and 1e154, got {abs(q).max():g}")
     return q
 
 
 def rotation_matrix(quaternion: ArrayLike) -> Array:
-    r"""The active rotation matrix R(q) of a quaternion with its scalar part first.
+    r"""The active rotation matrix R(q), (..., 3, 3), of a quaternion with its scalar part first.
 
     Members of an ensemble need not have unit length, so the length is divided out.
 
@@ -60,10 +56,6 @@ def rotation_matrix(quaternion: ArrayLike) -> Array:
     ----------
     quaternion : array_like, (..., 4)
         Not zero.
-
-    Returns
-    -------
-    ndarray, (..., 3, 3)
 
     Examples
     --------
@@ -115,7 +107,7 @@ def left_directions(quaternion: ArrayLike) -> Array:
 
 
 def turned(quaternion: ArrayLike, angle: ArrayLike) -> Array:
-    r"""The attitude turned further by rotation vectors, :math:`e^{\boldsymbol\theta/2}\mathbf q`.
+    r"""The attitude (..., 4) turned further, :math:`e^{\boldsymbol\theta/2}\mathbf q`.
 
     Parameters
     ----------
@@ -124,10 +116,6 @@ def turned(quaternion: ArrayLike, angle: ArrayLike) -> Array:
     angle : array_like, (..., 3)
         Rotation vector in the frame that R(q) leads to, in rad.
 
-    Returns
-    -------
-    ndarray, (..., 4)
-
     Examples
     --------
     >>> turned([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2]).round(4)
@@ -135,6 +123,8 @@ def turned(quaternion: ArrayLike, angle: ArrayLike) -> Array:
     """
     q = _quaternion(quaternion)
     theta = array(angle, "angle", (..., 3))
+    if np.abs(theta).max(initial=0.0) > 1e150:
+        raise ValueError(f"angle: needs turns whose square is finite, got {np.abs(theta).max():g}")
     half = 0.5 * np.linalg.norm(theta, axis=-1)[..., None]
     move = (left_directions(q) @ theta[..., None])[..., 0]
     return np.asarray(np.cos(half) * q + np.sinc(half / np.pi) * move)
@@ -158,7 +148,7 @@ def turn_between(quaternion: ArrayLike, other: ArrayLike) -> Array:
     >>> turn_between([1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, -1.0]).round(4)
     array([ 0.    ,  0.    , -1.5708])
     """
-    q, p = _quaternion(quaternion), _quaternion(other)
+    q, p = _quaternion(quaternion), _quaternion(other, "other")
     cos = (q * p).sum(axis=-1)
     # Twice the directions are |q| long and orthogonal: they read off the sine's vector.
     sin = 2 * (np.swapaxes(left_directions(q), -1, -2) @ p[..., None])[..., 0]
@@ -170,18 +160,13 @@ def turn_between(quaternion: ArrayLike, other: ArrayLike) -> Array:
 
 
 def quaternion_rate(quaternion: ArrayLike, angular_velocity: ArrayLike) -> Array:
-    """The quaternion's derivative, equation (21); it keeps the length.
+    """The quaternion's derivative in 1/s, (..., 4), equation (21); it keeps the length.
 
     Parameters
     ----------
     quaternion : array_like, (..., 4)
     angular_velocity : array_like, (..., 3)
         Of the body relative to the Hill frame, in rad/s.
-
-    Returns
-    -------
-    ndarray, (..., 4)
-        In 1/s.
 
     Examples
     --------

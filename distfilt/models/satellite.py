@@ -18,17 +18,12 @@ __all__ = ["clohessy_wiltshire", "clohessy_wiltshire_drift", "clohessy_wiltshire
 
 
 def clohessy_wiltshire_drift(rate: float) -> Array:
-    r"""The matrix A of the Clohessy-Wiltshire equations :math:`\dot{\mathbf x}=\mathbf A\mathbf x`.
+    r"""The matrix A, (6, 6), of the Clohessy-Wiltshire equations, (18) of Grange et al.
 
     Parameters
     ----------
     rate : float
         The chief's orbital rate :math:`\alpha=\sqrt{\mu/a^3}`, in rad/s, positive.
-
-    Returns
-    -------
-    ndarray, (6, 6)
-        The matrix of equation (18) of Grange et al.
 
     Examples
     --------
@@ -51,14 +46,8 @@ def clohessy_wiltshire_transition(rate: float, dt: float) -> Array:
 
     Parameters
     ----------
-    rate : float
-        Orbital rate of the chief, in rad/s, positive.
-    dt : float
-        The step, in s, at least 0.
-
-    Returns
-    -------
-    ndarray, (6, 6)
+    rate, dt : float
+        Orbital rate of the chief, in rad/s, positive; the step, in s, at least 0.
 
     Notes
     -----
@@ -96,11 +85,6 @@ def clohessy_wiltshire(*, rate: float, sigma: float) -> LinearModel:
         The noise's strength: each row receives white noise of spectral density sigma² (per s), so
         that a component gathers a standard deviation of about :math:`\sigma\sqrt{dt}`.
 
-    Returns
-    -------
-    LinearModel
-        With six components; the discretised noise is exact (Van Loan).
-
     Examples
     --------
     >>> model = clohessy_wiltshire(rate=0.1, sigma=0.2)
@@ -108,7 +92,7 @@ def clohessy_wiltshire(*, rate: float, sigma: float) -> LinearModel:
     array([0.00401, 0.00401, 0.00401, 0.004  , 0.004  , 0.004  ])
     """
     drift = clohessy_wiltshire_drift(rate)
-    density = number(sigma, "sigma", at_least=0) ** 2 * np.eye(6)
+    density = number(sigma, "sigma", at_least=0, at_most=1e150) ** 2 * np.eye(6)
 
     @lru_cache(maxsize=64)
     def discretised(dt: float) -> tuple[Array, Array]:
@@ -118,9 +102,6 @@ def clohessy_wiltshire(*, rate: float, sigma: float) -> LinearModel:
         return phi, noise
 
     return LinearModel.from_transition(
-        6,
-        lambda dt: discretised(dt)[0],
-        lambda t, dt: discretised(dt)[1],
-        names=("x", "y", "z", "vx", "vy", "vz"),
-        units=("m", "m", "m", "m/s", "m/s", "m/s"),
+        6, lambda dt: discretised(dt)[0], lambda t, dt: discretised(dt)[1],
+        names=("x", "y", "z", "vx", "vy", "vz"), units=("m", "m", "m", "m/s", "m/s", "m/s"),
     )

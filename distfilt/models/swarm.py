@@ -301,13 +301,16 @@ class RotatingMixture:
 
     def means(self, t: float) -> Array:
         """Where the components are at time `t`, (K, 2)."""
+        return self._means(number(t, "t"))
+
+    def _means(self, t: float) -> Array:
         k = np.arange(self.components)
         angle = self.rate * t + self.phase + 2 * np.pi * k / self.components
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         return np.asarray(np.asarray(self.centre) + self.radius * circle)
 
     def _logs(self, x: Array, t: float) -> tuple[Array, Array]:
-        means = self.means(t)
+        means = self._means(t)
         gap = x[..., None, :] - means
         return -0.5 * (gap**2).sum(axis=-1) / self.variance, means
 

@@ -66,9 +66,7 @@ class Heard:
             agents = np.flatnonzero(degrees == degree)
             yield agents, starts[agents, None] + np.arange(degree)
 
-    def collected(
-        self, agents: Indices, links: Indices
-    ) -> tuple[Array, Array, Mask]:
+    def collected(self, agents: Indices, links: Indices) -> tuple[Array, Array, Mask]:
         """Means (R, n, S, d), covariances and who is there, (R, n, S), the own first."""
         here = self.arrived[:, links]
         who = self.graph.senders[links]

@@ -48,23 +48,17 @@ class AdmmRun:
 
 
 def admm(
-    local_solve: Callable[[Array, float], Array],
-    start: ArrayLike,
-    channel: Channel,
-    *,
-    rho: float = 1.0,
-    tolerance: float = 1e-6,
-    iterations: int = 1000,
-    check: int | None = 1,
+    local_solve: Callable[[Array, float], Array], start: ArrayLike, channel: Channel, *,
+    rho: float = 1.0, tolerance: float = 1e-6, iterations: int = 1000, check: int | None = 1,
     agree: Callable[[Array, Channel], Array] = finite_time,
 ) -> AdmmRun:
     r"""Minimise :math:`\sum_l f_l(\mathbf Z)` when agent l knows only its own :math:`f_l`.
 
     .. math::
-        \mathbf U_l \leftarrow \arg\min_{\mathbf U} f_l(\mathbf U)
-        + \tfrac\rho2\|\mathbf U-(\mathbf Z-\mathbf W_l)\|^2,\quad
-        \mathbf Z\leftarrow\tfrac1A\sum_l(\mathbf U_l+\mathbf W_l),\quad
-        \mathbf W_l\leftarrow\mathbf W_l+\mathbf U_l-\mathbf Z
+        \mathbf U_l &\leftarrow \arg\min_{\mathbf U} f_l(\mathbf U)
+        + \tfrac\rho2\|\mathbf U-(\mathbf Z-\mathbf W_l)\|^2,\\
+        \mathbf Z &\leftarrow\tfrac1A\textstyle\sum_l(\mathbf U_l+\mathbf W_l),\\
+        \mathbf W_l &\leftarrow\mathbf W_l+\mathbf U_l-\mathbf Z
 
     Parameters
     ----------
@@ -89,10 +83,6 @@ def admm(
     agree : callable
         ``agree(values, channel) -> values``: how the average is found. With a rule that is only
         approximate the agents' copies of Z differ.
-
-    Returns
-    -------
-    AdmmRun
 
     Raises
     ------

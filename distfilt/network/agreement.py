@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, count, number
+from ..checks import Array, array, count, instance, number
 from ..ensembles import mean, sample_covariance
 from ..gaussians import _bures_barycentre, _recolour
 from . import weights as weighting
@@ -28,11 +28,7 @@ _SINGULAR = 1e-13
 
 
 def pull(
-    ensembles: ArrayLike,
-    channel: Channel,
-    *,
-    gain: float,
-    rounds: int = 1,
+    ensembles: ArrayLike, channel: Channel, *, gain: float, rounds: int = 1,
     include_self: bool = True,
 ) -> Array:
     r"""Pull every member towards the neighbours' ensemble means, equation (16) of Grange et al.
@@ -54,15 +50,6 @@ def pull(
     include_self : bool
         Whether Nbs(l) holds l itself, as the paper's tables print. The means do not notice, but
         the spread shrinks by 1 - γ|Nbs(l)| either way, one neighbour more with it.
-
-    Returns
-    -------
-    ndarray, (*runs, A, N, d)
-
-    Raises
-    ------
-    ValueError
-        If the ensembles do not fit the channel, or `gain` is negative.
 
     Warns
     -----
@@ -86,19 +73,14 @@ def pull(
     for _ in range(needed):
         centre = out.mean(axis=-2)
         moved, own = channel.combine_with_own(centre, weights, lost="keep")
-        kept = (own - g * include_self)[..., None, None]
+        kept = (own - g * instance(include_self, "include_self", bool))[..., None, None]
         out = moved[..., None, :] + kept * (out - centre[..., None, :])
     return out
 
 
 def intersection(
-    ensembles: ArrayLike,
-    channel: Channel,
-    *,
-    rule: str = "min_determinant",
-    weights: Weights | ArrayLike | None = None,
-    scale: ArrayLike | None = None,
-    rounds: int = 1,
+    ensembles: ArrayLike, channel: Channel, *, rule: str = "min_determinant",
+    weights: Weights | ArrayLike | None = None, scale: ArrayLike | None = None, rounds: int = 1,
 ) -> Array:
     """Fuse mean and covariance by covariance intersection, then re-colour each ensemble.
 
@@ -125,11 +107,6 @@ def intersection(
     ndarray, (*runs, A, N, d)
         Sample means and covariances are the fused ones.
 
-    Raises
-    ------
-    ValueError
-        If the ensembles do not fit the channel or their covariances are singular.
-
     Examples
     --------
     >>> from distfilt.network import Channel, graphs
@@ -144,11 +121,7 @@ def intersection(
 
 
 def barycentre(
-    ensembles: ArrayLike,
-    channel: Channel,
-    *,
-    scale: ArrayLike | None = None,
-    rounds: int = 1,
+    ensembles: ArrayLike, channel: Channel, *, scale: ArrayLike | None = None, rounds: int = 1,
     tolerance: float = 1e-10,
 ) -> Array:
     """Take the Bures-Wasserstein barycentre of the neighbourhood's Gaussians, then re-colour.
@@ -165,10 +138,6 @@ def barycentre(
         divided by it: unlike covariance intersection with equal weights, it depends on the units.
     tolerance : float
         As for :func:`distfilt.gaussians.bures_barycentre`, relative.
-
-    Returns
-    -------
-    ndarray, (*runs, A, N, d)
 
     Examples
     --------
@@ -190,14 +159,11 @@ def barycentre(
 
 
 def _ensembles(ensembles: ArrayLike, channel: Channel) -> Array:
-    if not isinstance(channel, Channel):
-        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
+    instance(channel, "channel", Channel)
     return array(ensembles, "ensembles", (*channel.runs, channel.graph.size, "N", "d"))
 
 
-def _scaled(
-    ensembles: ArrayLike, channel: Channel, scale: ArrayLike | None
-) -> tuple[Array, Array]:
+def _scaled(ensembles: ArrayLike, channel: Channel, scale: ArrayLike | None) -> tuple[Array, Array]:
     """Ensembles divided by the scale of each component, and the scale."""
     x = _ensembles(ensembles, channel)
     size = np.ones(x.shape[-1]) if scale is None else array(scale, "scale", (x.shape[-1],))

@@ -5,17 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, count, generator, number
+from ..checks import Array, count, generator, number
 from . import weights as weighting
 from .channel import Channel
+from .consensus import _values
 from .weights import Weights
 
 __all__ = ["event_triggered", "flood", "gossip"]
 
 
-def gossip(
-    values: ArrayLike, channel: Channel, *, rounds: int, rng: np.random.Generator
-) -> Array:
+def gossip(values: ArrayLike, channel: Channel, *, rounds: int, rng: np.random.Generator) -> Array:
     r"""Average in pairs: in each round one agent wakes and meets one neighbour, both drawn evenly.
 
     .. math:: \mathbf x_i,\mathbf x_j\leftarrow\tfrac12(\mathbf x_i+\mathbf x_j)
@@ -35,10 +34,6 @@ def gossip(
         How many meetings; 2 messages of k scalars each.
     rng : numpy.random.Generator
         Draws the pairs. All runs of a batch meet in the same order.
-
-    Returns
-    -------
-    ndarray, (*runs, A, k)
 
     Notes
     -----
@@ -80,12 +75,7 @@ def gossip(
 
 
 def event_triggered(
-    values: ArrayLike,
-    channel: Channel,
-    *,
-    rounds: int,
-    threshold: float,
-    decay: float = 1.0,
+    values: ArrayLike, channel: Channel, *, rounds: int, threshold: float, decay: float = 1.0,
     weights: Weights | None = None,
 ) -> Array:
     r"""Average, but send only what has moved by more than a threshold since it was sent last.
@@ -114,10 +104,6 @@ def event_triggered(
         second largest modulus of the weights' eigenvalues.
     weights : Weights, optional
         Symmetric; Metropolis by default.
-
-    Returns
-    -------
-    ndarray, (A, k)
 
     Notes
     -----
@@ -153,9 +139,7 @@ def event_triggered(
     return x
 
 
-def flood(
-    values: ArrayLike, channel: Channel, *, rounds: int | None = None
-) -> tuple[Array, Array]:
+def flood(values: ArrayLike, channel: Channel, *, rounds: int | None = None) -> tuple[Array, Array]:
     """Every agent passes on each value when it first hears of it, with its owner's number.
 
     The rival of every averaging rule: after as many rounds as the diameter all know everything.
@@ -209,20 +193,12 @@ def flood(
     return average, np.array([[a in k for a in range(size)] for k in known])
 
 
-def _values(values: ArrayLike, channel: Channel) -> Array:
-    if not isinstance(channel, Channel):
-        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
-    return array(values, "values", (*channel.runs, channel.graph.size, "k"))
-
-
 def _symmetric(channel: Channel, weights: Weights | None) -> Weights:
     _pairwise(channel)
     graph = channel.graph
     if weights is None:
         return weighting.metropolis(graph)
-    w = weighting.keeping(weights)
-    if w.graph is not graph:
-        w = Weights.from_matrix(graph, w.matrix)
+    w = Weights.from_matrix(graph, weighting.keeping(weights))
     gap = np.abs(w.links - w.links[graph.reverse]).max(initial=0.0)
     if gap > 1e-12:
         raise ValueError(f"weights: needs symmetric weights, got a difference of {gap:.3g}")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from ..checks import Array, array, choice, count, number
+from ..checks import Array, array, choice, count, instance, number
 from . import _payloads
 from .faults import Faults
 from .ledger import Ledger
@@ -59,16 +59,10 @@ class Channel:
     """
 
     def __init__(
-        self,
-        graph: Graph,
-        *,
-        ledger: Ledger | None = None,
-        runs: tuple[int, ...] = (),
-        faults: Faults | None = None,
-        t: float | None = None,
+        self, graph: Graph, *, ledger: Ledger | None = None, runs: tuple[int, ...] = (),
+        faults: Faults | None = None, t: float | None = None,
     ) -> None:
-        if not isinstance(graph, Graph):
-            raise ValueError(f"graph: needs a Graph, got {type(graph).__name__}")
+        instance(graph, "graph", Graph)
         if ledger is not None and not isinstance(ledger, Ledger):
             raise ValueError(f"ledger: needs a Ledger, got {type(ledger).__name__}")
         if ledger is not None and ledger.messages.size != graph.size:
@@ -117,13 +111,6 @@ class Channel:
             For each agent what arrived, by sender, in ascending order; the arrays are read-only.
             In a batch, the runs that lost a message find NaN in its place, and integers become
             floats there.
-
-        Raises
-        ------
-        ValueError
-            If there is not one payload per agent, or a payload is an object, a dict, a nested
-            tuple, text or anything else whose numbers cannot be counted, or lacks the leading run
-            axes.
         """
         sent = _payloads.checked(payloads, self.graph.size, self.runs, copy=self.faults.late > 0)
         speaks = np.array([p is not None for p in sent])[self.graph.senders]
@@ -144,12 +131,8 @@ class Channel:
         ]
 
     def combine(
-        self,
-        values: ArrayLike,
-        weights: Weights | ArrayLike | sparse.sparray,
-        *,
-        lost: str = "mutual",
-        rounds: int = 1,
+        self, values: ArrayLike, weights: Weights | ArrayLike | sparse.sparray, *,
+        lost: str = "mutual", rounds: int = 1,
     ) -> Array:
         """Let every agent replace its value by a weighted sum of its own and what it hears.
 
@@ -171,16 +154,6 @@ class Channel:
               that it has, ``"zero"``: to nothing. These move the average.
         rounds : int
             How many times; the values are checked once.
-
-        Returns
-        -------
-        ndarray, (*runs, A, k)
-
-        Raises
-        ------
-        ValueError
-            If the shapes do not fit, an agent weights one that it does not hear, or the rule needs
-            links both ways and some go one way.
         """
         v, w = self._checked(values, weights)
         choice(lost, "lost", LOST)
@@ -192,10 +165,7 @@ class Channel:
         return v
 
     def combine_with_own(
-        self,
-        values: ArrayLike,
-        weights: Weights | ArrayLike | sparse.sparray,
-        *,
+        self, values: ArrayLike, weights: Weights | ArrayLike | sparse.sparray, *,
         lost: str = "mutual",
     ) -> tuple[Array, Array]:
         """As :meth:`combine`, with the weight that each agent's own value got, (*runs, A)."""
@@ -209,10 +179,6 @@ class Channel:
         self, values: ArrayLike, weights: Weights | ArrayLike | sparse.sparray
     ) -> tuple[Array, Weights]:
         v = array(values, "values", (*self.runs, self.graph.size, "k"))
-        if isinstance(weights, Weights):
-            if weights.graph is self.graph:
-                return v, weights
-            weights = weights.matrix
         return v, Weights.from_matrix(self.graph, weights)
 
     def _combine_all(self, v: Array, w: Weights, rounds: int) -> Array:
@@ -303,12 +269,7 @@ class Channel:
         return out.reshape(v.shape), own.reshape(*self.runs, size)
 
     def _sent(
-        self,
-        kind: str,
-        v: Array,
-        sizes: Any,
-        *,
-        speaks: Mask | None = None,
+        self, kind: str, v: Array, sizes: Any, *, speaks: Mask | None = None,
         acknowledged: bool = False,
     ) -> tuple[Array, Mask]:
         """Send vectors: those that arrive in this round, and on which links, (R, E)."""

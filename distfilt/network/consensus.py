@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, count, number
+from ..checks import Array, array, count, instance, number
 from . import weights as weighting
 from .channel import Channel
 from .links import Graph
@@ -25,8 +25,6 @@ class UnstableGain(RuntimeWarning):
 
     Turn it into an error, or off, by ``warnings.filterwarnings("error", category=UnstableGain)``.
 
-    Examples
-    --------
     >>> issubclass(UnstableGain, RuntimeWarning)
     True
     """
@@ -50,10 +48,9 @@ def warn_if_unstable(graph: Graph, gain: float) -> None:
         )
 
 
-def _values(values: ArrayLike, channel: Channel) -> Array:
-    if not isinstance(channel, Channel):
-        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
-    return array(values, "values", (*channel.runs, channel.graph.size, "k"))
+def _values(values: ArrayLike, channel: Channel, name: str = "values") -> Array:
+    instance(channel, "channel", Channel)
+    return array(values, name, (*channel.runs, channel.graph.size, "k"))
 
 
 def _connected(channel: Channel) -> None:
@@ -63,13 +60,8 @@ def _connected(channel: Channel) -> None:
 
 
 def average(
-    values: ArrayLike,
-    channel: Channel,
-    *,
-    rounds: int = 1,
-    gain: float | None = None,
-    weights: Weights | None = None,
-    lost: str = "mutual",
+    values: ArrayLike, channel: Channel, *, rounds: int = 1, gain: float | None = None,
+    weights: Weights | None = None, lost: str = "mutual",
 ) -> Array:
     r"""Move every agent's value towards its neighbours', the averaging behind equation (16).
 
@@ -92,16 +84,6 @@ def average(
         account: symmetric, or :func:`distfilt.network.weights.balanced` on a digraph.
     lost : str
         What to do about lost messages: see :meth:`Channel.combine`.
-
-    Returns
-    -------
-    ndarray, (*runs, A, k)
-
-    Raises
-    ------
-    ValueError
-        If the values do not fit the channel, `gain` is not positive or given beside `weights`, or
-        the columns of the weights do not sum to one, so that the average would move.
 
     Examples
     --------
@@ -133,14 +115,9 @@ def finite_time(values: ArrayLike, channel: Channel) -> Array:
 
     Parameters
     ----------
-    values : array_like, (*runs, A, k)
-        One vector per agent.
-    channel : Channel
-        Connected, with links both ways, and without faults: one lost message spoils the product.
-
-    Returns
-    -------
-    ndarray, (*runs, A, k)
+    values, channel
+        As for :func:`average`. Connected, with links both ways, and without faults: one lost
+        message spoils the product.
 
     Notes
     -----
@@ -195,10 +172,8 @@ def push_sum(values: ArrayLike, channel: Channel, *, rounds: int) -> Array:
 
     Parameters
     ----------
-    values : array_like, (*runs, A, k)
-        One vector per agent.
-    channel : Channel
-        Strongly connected; messages may be lost.
+    values, channel
+        As for :func:`average`. Strongly connected; messages may be lost.
     rounds : int
         How many rounds; k + 1 scalars a link and round.
 
@@ -247,17 +222,11 @@ def maximum(values: ArrayLike, channel: Channel, *, rounds: int | None = None) -
 
     Parameters
     ----------
-    values : array_like, (*runs, A, k)
-        One vector per agent.
-    channel : Channel
-        Connected. A lost message only costs time.
+    values, channel
+        As for :func:`average`. Connected; a lost message only costs time.
     rounds : int, optional
         By default the graph's diameter; with more than 1 000 agents ``graph.diameter_bound``, which
         is enough, and at most twice as much, where the diameter itself would take long to find.
-
-    Returns
-    -------
-    ndarray, (*runs, A, k)
 
     Examples
     --------

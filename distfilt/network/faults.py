@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, choice, count, number
+from ..checks import Array, array, choice, count, instance, number
 from .links import Graph
 
 __all__ = ["Faults"]
@@ -95,7 +95,7 @@ class Faults:
             _check_burst(number(self.burst, "burst", at_least=1), np.asarray(self.loss))
         if self.during is not None:
             object.__setattr__(self, "during", _windows(self.during))
-        if not all(isinstance(other, Faults) for other in self.also):
+        if not isinstance(self.also, tuple) or not all(isinstance(o, Faults) for o in self.also):
             raise ValueError(f"also: needs a tuple of Faults, got {self.also!r}")
 
     def __or__(self, other: Faults) -> Faults:
@@ -155,7 +155,9 @@ class Faults:
 
     def lost(self, graph: Graph, round_: int, runs: int, t: float | None = None) -> Mask:
         """Which links lose the message of round `round_` in each of `runs` runs, (runs, E)."""
-        out = np.zeros((runs, graph.senders.size), dtype=bool)
+        instance(graph, "graph", Graph)
+        round_ = count(round_, "round_", at_least=0)
+        out = np.zeros((count(runs, "runs", at_least=0), graph.senders.size), dtype=bool)
         for faults in self._all():
             if np.any(faults.loss) and faults._active(round_, t):
                 out |= faults._losses(graph, round_, runs)

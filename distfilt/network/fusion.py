@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, callable_, choice, count, covariance, number
+from ..checks import Array, array, callable_, choice, count, covariance, instance, number
 from ..gaussians import _intersection_weights
 from ..linalg import _solve_lower, _symmetrise
 from . import weights as weighting
@@ -15,25 +15,16 @@ from .consensus import warn_if_unstable
 from .links import Graph
 from .weights import Weights
 
-__all__ = [
-    "arithmetic_average",
-    "consensus_pull",
-    "covariance_intersection",
-    "exchanged",
-    "naive_fusion",
+__all__ = [  # fmt: skip
+    "arithmetic_average", "consensus_pull", "covariance_intersection", "exchanged", "naive_fusion",
 ]
 
 RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
 
 
 def covariance_intersection(
-    means: ArrayLike,
-    covs: ArrayLike,
-    channel: Channel,
-    *,
-    rule: str = "equal",
-    weights: Weights | ArrayLike | None = None,
-    rounds: int = 1,
+    means: ArrayLike, covs: ArrayLike, channel: Channel, *, rule: str = "equal",
+    weights: Weights | ArrayLike | None = None, rounds: int = 1,
 ) -> tuple[Array, Array]:
     r"""Each agent fuses its Gaussian with its neighbours', safely whatever they share.
 
@@ -61,17 +52,6 @@ def covariance_intersection(
     rounds : int
         How many times.
 
-    Returns
-    -------
-    means : ndarray, (*runs, A, d)
-    covs : ndarray, (*runs, A, d, d)
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit, a covariance is not positive definite, the rule is unknown, or
-        given weights are negative, do not sum to one or weight an agent that is not heard.
-
     Notes
     -----
     S. J. Julier and J. K. Uhlmann, American Control Conference (1997) 2369-2373. The weights in
@@ -89,11 +69,7 @@ def covariance_intersection(
 
 
 def _intersected(
-    means: Array,
-    covs: Array,
-    channel: Channel,
-    rule: str,
-    weights: Weights | ArrayLike | None,
+    means: Array, covs: Array, channel: Channel, rule: str, weights: Weights | ArrayLike | None,
     rounds: int,
 ) -> tuple[Array, Array]:
     """The same of arrays that were checked."""
@@ -112,14 +88,10 @@ def _intersected(
 
 
 def _given(graph: Graph, weights: Weights | ArrayLike) -> Weights:
-    w = weights if isinstance(weights, Weights) else Weights.from_matrix(graph, weights)
-    if w.graph is not graph:
-        w = Weights.from_matrix(graph, w.matrix)
+    w = Weights.from_matrix(graph, weights)
     least = min(w.own.min(), w.links.min(initial=0.0))
     if least < 0 or w.own.min() <= 0:
-        raise ValueError(
-            f"weights: needs positive own weights and no negative ones, got {least:g}"
-        )
+        raise ValueError(f"weights: needs positive own weights and no negative ones, got {least:g}")
     rows = w.own + graph.incidence @ w.links
     worst = int(np.abs(rows - 1).argmax())
     if abs(rows[worst] - 1) > 1e-8:
@@ -173,8 +145,6 @@ def naive_fusion(
     fused before: the covariance shrinks in every round, the error does not. Kept to show that.
     Parameters, returns and errors as for :func:`covariance_intersection`.
 
-    Examples
-    --------
     >>> from distfilt.network import Channel, graphs
     >>> two = naive_fusion([[0.0], [3.0]], [[[1.0]], [[2.0]]], Channel(graphs.path(2)))
     >>> two[1].ravel().round(6)
@@ -200,8 +170,6 @@ def arithmetic_average(
     With equal weights. Disagreement adds to the covariance, so an outlier does not go unnoticed.
     Parameters, returns and errors as for :func:`covariance_intersection`.
 
-    Examples
-    --------
     >>> from distfilt.network import Channel, graphs
     >>> two = arithmetic_average([[0.0], [3.0]], [[[1.0]], [[2.0]]], Channel(graphs.path(2)))
     >>> two[0].ravel(), two[1].ravel()
@@ -223,12 +191,7 @@ def arithmetic_average(
 
 
 def consensus_pull(
-    means: ArrayLike,
-    covs: ArrayLike,
-    channel: Channel,
-    *,
-    gain: float,
-    rule: str = "scalar",
+    means: ArrayLike, covs: ArrayLike, channel: Channel, *, gain: float, rule: str = "scalar",
     rounds: int = 1,
 ) -> tuple[Array, Array]:
     r"""Pull each mean towards the neighbours': the consensus Kalman filter's step.
@@ -243,10 +206,8 @@ def consensus_pull(
 
     Parameters
     ----------
-    means : array_like, (*runs, A, d)
-        Each agent's mean.
-    covs : array_like, (*runs, A, d, d)
-        Each agent's covariance, positive definite.
+    means, covs
+        As for :func:`covariance_intersection`.
     channel : Channel
         Only means go over each link, d scalars. A mean that is lost does not pull.
     gain : float
@@ -255,11 +216,6 @@ def consensus_pull(
         The same gain for all components, or more where an agent is less sure.
     rounds : int
         How many times.
-
-    Returns
-    -------
-    means : ndarray, (*runs, A, d)
-    covs : ndarray, (*runs, A, d, d)
 
     Warns
     -----
@@ -313,11 +269,6 @@ def exchanged(
     rounds : int
         How many times.
 
-    Returns
-    -------
-    means : ndarray, (*runs, A, d)
-    covs : ndarray, (*runs, A, d, d)
-
     Examples
     --------
     The own estimate, whatever the neighbours say:
@@ -333,8 +284,7 @@ def exchanged(
 
 
 def _checked(means: ArrayLike, covs: ArrayLike, channel: Channel) -> tuple[Array, Array]:
-    if not isinstance(channel, Channel):
-        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
+    instance(channel, "channel", Channel)
     m = array(means, "means", (*channel.runs, channel.graph.size, "d"))
     return m, covariance(array(covs, "covs", (*m.shape, m.shape[-1])), "covs")
 

@@ -22,8 +22,6 @@ def _both_ways(size: int, first: Indices, second: Indices) -> Graph:
 def path(agents: int) -> Graph:
     """Agents in a row.
 
-    Examples
-    --------
     >>> path(3).neighbours(1)
     (0, 2)
     """
@@ -34,8 +32,6 @@ def path(agents: int) -> Graph:
 def ring(agents: int) -> Graph:
     """Agents in a circle, at least three.
 
-    Examples
-    --------
     >>> ring(4).neighbours(0)
     (1, 3)
     """
@@ -46,8 +42,6 @@ def ring(agents: int) -> Graph:
 def star(agents: int) -> Graph:
     """Agent 0 hears all the others and they hear only it; Tables II and III of Grange et al.
 
-    Examples
-    --------
     >>> star(5).spectrum.round(6) + 0.0
     array([0., 1., 1., 1., 5.])
     """
@@ -58,8 +52,6 @@ def star(agents: int) -> Graph:
 def grid(rows: int, columns: int) -> Graph:
     """Agents on a rectangular grid, numbered row by row.
 
-    Examples
-    --------
     >>> grid(2, 3).neighbours(4)
     (1, 3, 5)
     """
@@ -73,8 +65,6 @@ def grid(rows: int, columns: int) -> Graph:
 def complete(agents: int) -> Graph:
     """Everybody hears everybody.
 
-    Examples
-    --------
     >>> complete(4).degrees
     array([3., 3., 3., 3.])
     """
@@ -140,6 +130,8 @@ def disk(positions: ArrayLike, radius: float) -> Graph:
     places = array(positions, "positions", ("A", "p"))
     if places.size == 0:
         raise ValueError(f"positions: needs at least one agent, got shape {places.shape}")
+    if np.abs(places).max() > 1e150:
+        raise ValueError(f"positions: needs finite squares, got {np.abs(places).max():g}")
     reach = number(radius, "radius", above=0)
     pairs = cKDTree(places).query_pairs(reach, output_type="ndarray").astype(np.int64)
     return _both_ways(len(places), pairs[:, 0], pairs[:, 1])

@@ -49,13 +49,8 @@ class Ledger:
         return cls(0, zero, zero, zero, np.zeros(zero.size))
 
     def charge(
-        self,
-        messages: Counts,
-        scalars: int | Counts,
-        bytes_: int | Counts,
-        *,
-        lost: Array | float = 0.0,
-        rounds: int = 1,
+        self, messages: Counts, scalars: int | Counts, bytes_: int | Counts, *,
+        lost: Array | float = 0.0, rounds: int = 1,
     ) -> Ledger:
         """The ledger after more rounds.
 
@@ -71,11 +66,8 @@ class Ledger:
             How many rounds this was.
         """
         return Ledger(
-            self.rounds + rounds,
-            self.messages + messages,
-            self.scalars + messages * scalars,
-            self.bytes + messages * bytes_,
-            self.lost + lost,
+            self.rounds + rounds, self.messages + messages, self.scalars + messages * scalars,
+            self.bytes + messages * bytes_, self.lost + lost,
         )
 
     def __repr__(self) -> str:

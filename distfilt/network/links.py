@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from ..checks import Array, array, count
+from ..checks import Array, array, count, instance
 from . import _spectral
 
 __all__ = ["Graph"]
@@ -60,12 +60,6 @@ class Graph:
             Row i marks the agents that agent i hears.
         directed : bool
             Accept links that go one way only.
-
-        Raises
-        ------
-        ValueError
-            If the matrix is not square, has entries other than 0 and 1 or a self-loop, or is not
-            symmetric although the graph is undirected.
         """
         a = array(adjacency, "adjacency", ("A", "A"))
         if a.shape[0] != a.shape[1] or a.shape[0] == 0:
@@ -76,12 +70,7 @@ class Graph:
 
     @classmethod
     def from_edges(
-        cls,
-        agents: int,
-        edges: ArrayLike,
-        *,
-        directed: bool = False,
-        name: str = "edges",
+        cls, agents: int, edges: ArrayLike, *, directed: bool = False, name: str = "edges"
     ) -> Graph:
         """Build a graph from its links, listed as pairs (listener, speaker).
 
@@ -97,6 +86,7 @@ class Graph:
             What an error calls the links.
         """
         size = count(agents, "agents")
+        instance(directed, "directed", bool)
         pairs = array(edges, name)
         pairs = pairs.reshape(-1, 2) if pairs.size == 0 else array(pairs, name, ("E", 2))
         listed = pairs.astype(np.int64)
@@ -269,8 +259,6 @@ class Graph:
     def hops(self, agent: int) -> Indices:
         """How many rounds news of an agent takes to reach each, (A,); -1 where it never does.
 
-        Examples
-        --------
         >>> from distfilt.network import graphs
         >>> graphs.path(4).hops(1)
         array([1, 0, 1, 2])

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, count, number
+from ..checks import Array, array, count, instance, number
 from . import weights as weighting
 from .channel import Channel
+from .consensus import _values
 from .weights import Weights
 
 __all__ = ["PIState", "first_order", "pi_start", "pi_step", "stable_substeps"]
@@ -44,8 +45,6 @@ class PIState:
 def pi_start(estimate: ArrayLike) -> PIState:
     """The state before the first step: any first estimates, (*runs, A, k), no integral.
 
-    Examples
-    --------
     >>> pi_start([[1.0], [3.0]]).estimate.shape
     (2, 1)
     """
@@ -66,10 +65,8 @@ def stable_substeps(
 
     Parameters
     ----------
-    channel : Channel
-        For the graph.
-    dt : float
-        The step that is wanted, in s, positive.
+    channel, dt
+        For the graph; the step that is wanted, in s, positive.
     alpha, a, b : float
         The gains of :func:`pi_step`.
     safety : float
@@ -87,10 +84,10 @@ def stable_substeps(
     >>> stable_substeps(Channel(graphs.complete(100)), 0.1, alpha=0.2, a=0.4, b=0.04)
     8
     """
-    if not isinstance(channel, Channel):
-        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
+    instance(channel, "channel", Channel)
     step, factor = number(dt, "dt", above=0), number(safety, "safety", at_least=1)
-    gains = [number(g, n, at_least=0) for g, n in ((alpha, "alpha"), (a, "a"), (b, "b"))]
+    named = ((alpha, "alpha"), (a, "a"), (b, "b"))
+    gains = [number(g, n, at_least=0, at_most=1e100) for g, n in named]
     bound = 2 * float(channel.graph.degrees.max())
     rate = gains[0] + gains[1] * bound
     if rate == 0:
@@ -103,16 +100,8 @@ def stable_substeps(
 
 
 def pi_step(
-    state: PIState,
-    inputs: ArrayLike,
-    channel: Channel,
-    *,
-    dt: float,
-    alpha: float,
-    a: float,
-    b: float,
-    rate: ArrayLike | None = None,
-    substeps: int | None = None,
+    state: PIState, inputs: ArrayLike, channel: Channel, *, dt: float, alpha: float, a: float,
+    b: float, rate: ArrayLike | None = None, substeps: int | None = None,
 ) -> PIState:
     r"""One step of the proportional-integral estimator, equation (25) of Zheng et al.
 
@@ -144,10 +133,6 @@ def pi_step(
     substeps : int, optional
         Explicit steps that make up `dt`; by default as many as stability asks for.
 
-    Returns
-    -------
-    PIState
-
     Examples
     --------
     >>> from distfilt.network import Channel, graphs
@@ -157,10 +142,8 @@ def pi_step(
     >>> state.estimate.ravel().round(6)
     array([2., 2.])
     """
-    if not isinstance(state, PIState):
-        raise ValueError(f"state: needs a PIState, got {type(state).__name__}")
-    if not isinstance(channel, Channel):
-        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
+    instance(state, "state", PIState)
+    instance(channel, "channel", Channel)
     if channel.graph.directed:
         raise ValueError("channel: needs links both ways to keep the sum, got one-way links")
     shape = (*channel.runs, channel.graph.size, state.estimate.shape[-1])
@@ -184,13 +167,8 @@ def pi_step(
 
 
 def first_order(
-    estimates: ArrayLike,
-    inputs: ArrayLike,
-    previous: ArrayLike,
-    channel: Channel,
-    *,
-    weights: Weights | None = None,
-    lost: str = "mutual",
+    estimates: ArrayLike, inputs: ArrayLike, previous: ArrayLike, channel: Channel, *,
+    weights: Weights | None = None, lost: str = "mutual",
 ) -> Array:
     r"""One round of first-order dynamic average consensus.
 
@@ -201,20 +179,10 @@ def first_order(
 
     Parameters
     ----------
-    estimates : array_like, (*runs, A, k)
-        One per agent.
-    inputs, previous : array_like, (*runs, A, k)
-        What the agents measure now and measured a round ago.
-    channel : Channel
-        The door between agents.
-    weights : Weights, optional
-        Metropolis by default. Columns have to sum to one.
-    lost : str
-        See :meth:`Channel.combine`.
-
-    Returns
-    -------
-    ndarray, (*runs, A, k)
+    estimates, inputs, previous : array_like, (*runs, A, k)
+        One per agent: what they believe, measure now, and measured a round ago.
+    channel, weights, lost
+        As for :func:`distfilt.network.average`.
 
     Notes
     -----
@@ -227,9 +195,7 @@ def first_order(
     >>> first_order([[0.0], [2.0]], [[1.0], [3.0]], [[0.0], [2.0]], channel).ravel()
     array([2., 2.])
     """
-    if not isinstance(channel, Channel):
-        raise ValueError(f"channel: needs a Channel, got {type(channel).__name__}")
-    x = array(estimates, "estimates", (*channel.runs, channel.graph.size, "k"))
+    x = _values(estimates, channel, "estimates")
     change = array(inputs, "inputs", x.shape) - array(previous, "previous", x.shape)
     w = weighting.metropolis(channel.graph) if weights is None else weighting.keeping(weights)
     return channel.combine(x, w, lost=lost) + change

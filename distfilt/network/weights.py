@@ -9,21 +9,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import sparse
 
-from ..checks import Array, array, count, number
+from ..checks import Array, array, count, instance, number
 from ._spectral import left_null_vector
 from .links import Graph, Indices
 
-__all__ = [
-    "Weights",
-    "balanced",
-    "best_constant",
-    "fastest",
-    "gossip",
-    "keeping",
-    "laplacian",
-    "maximum_degree",
-    "metropolis",
-    "push",
+__all__ = [  # fmt: skip
+    "Weights", "balanced", "best_constant", "fastest", "gossip", "keeping", "laplacian",
+    "maximum_degree", "metropolis", "push",
 ]
 
 
@@ -54,14 +46,17 @@ class Weights:
     links: Array
 
     def __post_init__(self) -> None:
-        if not isinstance(self.graph, Graph):
-            raise ValueError(f"graph: needs a Graph, got {type(self.graph).__name__}")
+        instance(self.graph, "graph", Graph)
         array(self.own, "own", (self.graph.size,))
         array(self.links, "links", (self.graph.senders.size,))
 
     @classmethod
-    def from_matrix(cls, graph: Graph, matrix: ArrayLike | sparse.sparray) -> Weights:
+    def from_matrix(cls, graph: Graph, matrix: Weights | ArrayLike | sparse.sparray) -> Weights:
         """Read the weights from a matrix (A, A); off its diagonal only links may be weighted."""
+        if isinstance(matrix, Weights):
+            if matrix.graph is graph:
+                return matrix
+            matrix = matrix.matrix
         if not sparse.issparse(matrix):
             matrix = array(matrix, "weights", graph.links.shape, finite=False)
         w = sparse.csr_array(matrix)
@@ -111,11 +106,13 @@ def stacked(graph: Graph, own: Array, links: Array, *, heard_at: int) -> sparse.
 
 
 def _both_ways(graph: Graph) -> None:
+    instance(graph, "graph", Graph)
     if graph.directed:
         raise ValueError("graph: needs links both ways for these weights, got one-way links")
 
 
 def _connected(graph: Graph) -> None:
+    instance(graph, "graph", Graph)
     if not graph.connected:
         raise ValueError(
             f"graph: needs a strongly connected graph, got {graph.components.max() + 1} components"
@@ -146,8 +143,6 @@ def metropolis(graph: Graph) -> Weights:
 def maximum_degree(graph: Graph) -> Weights:
     """Equal weights 1 / (1 + the largest degree) on every link; needs that one global number.
 
-    Examples
-    --------
     >>> from distfilt.network import graphs
     >>> maximum_degree(graphs.star(3)).own.round(3)
     array([0.333, 0.667, 0.667])
@@ -162,10 +157,8 @@ def laplacian(graph: Graph, gain: float) -> Weights:
 
     Parameters
     ----------
-    graph : Graph
-        The links, one way or both.
-    gain : float
-        The gain γ, at least 0.
+    graph, gain
+        The links, one way or both, and the gain γ, at least 0.
 
     Examples
     --------
@@ -174,6 +167,7 @@ def laplacian(graph: Graph, gain: float) -> Weights:
     array([0. , 0.5, 0.5])
     """
     g = number(gain, "gain", at_least=0)
+    instance(graph, "graph", Graph)
     return Weights(graph, 1 - g * graph.degrees, np.full(graph.senders.size, g))
 
 
@@ -282,8 +276,6 @@ def gossip(graph: Graph) -> Weights:
     An agent wakes with probability 1 / A and meets one of its neighbours. The second largest
     eigenvalue bounds the factor by which the mean squared disagreement shrinks in each meeting.
 
-    Examples
-    --------
     >>> from distfilt.network import graphs
     >>> gossip(graphs.path(2)).own
     array([0.5, 0.5])
@@ -299,8 +291,6 @@ def push(graph: Graph) -> Weights:
 
     An agent needs to know only how many hear it.
 
-    Examples
-    --------
     >>> from distfilt.network import Graph
     >>> circle = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1)], directed=True)
     >>> push(circle).own
@@ -318,13 +308,6 @@ def balanced(graph: Graph) -> Weights:
     =\mathbf p^\top\mathbf L=\mathbf 0`. Averaging then keeps the average on a digraph too. The
     vector is global knowledge: agents compute it together once, or are told.
 
-    Raises
-    ------
-    ValueError
-        If the graph is not strongly connected.
-
-    Examples
-    --------
     >>> from distfilt.network import Graph
     >>> circle = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1)], directed=True)
     >>> balanced(circle).matrix.toarray().sum(axis=0)
@@ -341,8 +324,6 @@ def balanced(graph: Graph) -> Weights:
 def keeping(weights: Weights) -> Weights:
     """The weights themselves, or a ValueError if their columns do not sum to one.
 
-    Examples
-    --------
     >>> from distfilt.network import graphs
     >>> keeping(metropolis(graphs.path(3))).own.round(3)
     array([0.667, 0.333, 0.667])

@@ -8,19 +8,7 @@ from .drawing import band, ellipse, graph
 from .figures import LINE_STYLES, PALETTE, SIZE, axes, colour, line_style, save, use_style
 from .moving import Slider, slider
 
-__all__ = [
-    "LINE_STYLES",
-    "PALETTE",
-    "SIZE",
-    "Slider",
-    "axes",
-    "band",
-    "colour",
-    "digest",
-    "ellipse",
-    "graph",
-    "line_style",
-    "save",
-    "slider",
-    "use_style",
+__all__ = [  # fmt: skip
+    "LINE_STYLES", "PALETTE", "SIZE", "Slider", "axes", "band", "colour", "digest", "ellipse",
+    "graph", "line_style", "save", "slider", "use_style",
 ]

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, increasing, number
+from ..checks import Array, array, increasing, instance, nonblank, number
 from ..linalg import factor
-from .figures import check_axes, colour, line_style, nonblank
+from .figures import check_axes, colour, line_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -18,12 +19,7 @@ __all__ = ["band", "ellipse", "graph"]
 
 
 def ellipse(
-    ax: Axes,
-    mean: ArrayLike,
-    covariance: ArrayLike,
-    *,
-    level: float = 0.95,
-    index: int = 0,
+    ax: Axes, mean: ArrayLike, covariance: ArrayLike, *, level: float = 0.95, index: int = 0,
     label: str | None = None,
 ) -> Axes:
     r"""Draw the ellipse that holds a share `level` of a plane Gaussian, and its mean.
@@ -40,14 +36,8 @@ def ellipse(
         Positive semidefinite; a singular one gives a line.
     level : float
         Probability inside, in (0, 1). One standard deviation is 0.393.
-    index : int
-        Number of the colour and line style.
-    label : str, optional
-        For the legend.
-
-    Returns
-    -------
-    matplotlib Axes
+    index, label
+        Number of the colour and line style, and what the legend says.
 
     Examples
     --------
@@ -68,13 +58,8 @@ def ellipse(
 
 
 def band(
-    ax: Axes,
-    x: ArrayLike,
-    runs: ArrayLike,
-    *,
-    quantiles: tuple[float, float] = (0.25, 0.75),
-    index: int = 0,
-    label: str | None = None,
+    ax: Axes, x: ArrayLike, runs: ArrayLike, *, quantiles: tuple[float, float] = (0.25, 0.75),
+    index: int = 0, label: str | None = None,
 ) -> Axes:
     """Draw the median over runs as a line, and a band between two quantiles over runs.
 
@@ -88,14 +73,8 @@ def band(
         One curve a run.
     quantiles : (float, float)
         Lower and upper end of the band, in [0, 1], increasing.
-    index : int
-        Number of the colour and line style.
-    label : str, optional
-        For the legend.
-
-    Returns
-    -------
-    matplotlib Axes
+    index, label
+        Number of the colour and line style, and what the legend says.
 
     Examples
     --------
@@ -121,12 +100,8 @@ def band(
 
 
 def graph(
-    ax: Axes,
-    adjacency: ArrayLike,
-    *,
-    labels: tuple[str, ...] | list[str] | None = None,
-    positions: ArrayLike | None = None,
-    known: ArrayLike | None = None,
+    ax: Axes, adjacency: ArrayLike, *, labels: tuple[str, ...] | list[str] | None = None,
+    positions: ArrayLike | None = None, known: ArrayLike | None = None,
     notes: tuple[str, ...] | list[str] | None = None,
 ) -> Axes:
     """Draw agents as discs, the links between them as lines, and who knows how much.
@@ -146,10 +121,6 @@ def graph(
     notes : sequence of str, optional
         A text below each agent, such as what it measures; may be empty.
 
-    Returns
-    -------
-    matplotlib Axes
-
     Examples
     --------
     >>> from distfilt.plotting import axes
@@ -163,6 +134,7 @@ def graph(
     if n == 0 or links.shape != (n, n) or (links != links.T).any():
         raise ValueError(f"adjacency: needs a symmetric square matrix, got shape {links.shape}")
     given = [str(k + 1) for k in range(n)] if labels is None else labels
+    instance(given, "labels", Sequence)  # type: ignore[type-abstract]
     names = [nonblank(label, "labels") for label in given]
     if len(names) != n:
         raise ValueError(f"labels: needs one for each of {n} agents, got {len(names)}")

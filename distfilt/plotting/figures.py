@@ -9,21 +9,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..checks import array, choice, count, needed, number
+from ..checks import array, choice, count, needed, nonblank, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = [
-    "LINE_STYLES",
-    "PALETTE",
-    "SIZE",
-    "axes",
-    "colour",
-    "line_style",
-    "save",
-    "use_style",
+__all__ = [  # fmt: skip
+    "LINE_STYLES", "PALETTE", "SIZE", "axes", "colour", "line_style", "save", "use_style",
 ]
 
 PALETTE = (
@@ -50,8 +43,6 @@ _DPI = 110
 def colour(index: int) -> str:
     """The palette's colour number `index`, counted from 0; it starts again after the last.
 
-    Examples
-    --------
     >>> colour(0), colour(8)
     ('#0072B2', '#0072B2')
     """
@@ -61,8 +52,6 @@ def colour(index: int) -> str:
 def line_style(index: int) -> Any:
     """The line style that goes with colour number `index`.
 
-    Examples
-    --------
     >>> line_style(0), line_style(1)
     ('-', '--')
     """
@@ -77,8 +66,6 @@ def use_style() -> None:
     picture, becomes the digest of what its axes hold (:func:`distfilt.digests.of_axes`): a curve
     that changes is noticed by whoever compares stored outputs.
 
-    Examples
-    --------
     >>> from matplotlib import rc_context, rcParams
     >>> with rc_context():  # so that this example leaves no trace
     ...     use_style()
@@ -137,12 +124,6 @@ def _print_digests() -> None:
         text.for_type(Figure, lambda figure, printer, cycle: printer.text(said(figure)))
 
 
-def nonblank(value: Any, name: str) -> str:
-    if not isinstance(value, str) or not value.strip():
-        raise ValueError(f"{name}: needs a text, got {value!r}")
-    return value
-
-
 def _labelled(label: Any, unit: Any, axis: str) -> str:
     text = nonblank(label, f"{axis}label")
     return text if unit is None else f"{text} ({nonblank(unit, f'{axis}unit')})"
@@ -158,16 +139,9 @@ def check_axes(ax: Any) -> Axes:
 
 
 def axes(
-    *,
-    xlabel: str,
-    ylabel: str,
-    xunit: str | None = None,
-    yunit: str | None = None,
-    title: str | None = None,
-    ax: Axes | None = None,
-    xscale: str = "linear",
-    yscale: str = "linear",
-    size: tuple[float, float] = SIZE,
+    *, xlabel: str, ylabel: str, xunit: str | None = None, yunit: str | None = None,
+    title: str | None = None, ax: Axes | None = None, xscale: str = "linear",
+    yscale: str = "linear", size: tuple[float, float] = SIZE,
 ) -> Axes:
     """Labelled axes, in a new figure of the book's size unless `ax` is given.
 
@@ -185,10 +159,6 @@ def axes(
         Scales.
     size : (float, float)
         Width and height of a new figure, in inches.
-
-    Returns
-    -------
-    matplotlib Axes
 
     Examples
     --------
@@ -223,10 +193,6 @@ def save(figure: Figure, path: str | Path) -> Path:
         What to write.
     path : str or Path
         Ends in .png or .svg.
-
-    Returns
-    -------
-    Path
 
     Examples
     --------

@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from ..checks import callable_, count, needed, number
-from .figures import check_axes, nonblank
+from ..checks import callable_, count, needed, nonblank, number
+from .figures import check_axes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -164,15 +164,8 @@ class Slider:
 
 
 def slider(
-    draw: Callable[[Any], Any],
-    values: Sequence[Any],
-    *,
-    label: str,
-    alt: str,
-    unit: str | None = None,
-    form: str = "g",
-    start: int = 0,
-    seconds: float = 0.5,
+    draw: Callable[[Any], Any], values: Sequence[Any], *, label: str, alt: str,
+    unit: str | None = None, form: str = "g", start: int = 0, seconds: float = 0.5,
     colours: int = 32,
 ) -> Slider:
     """Draw a figure for each value, and go through them with a slider that needs no kernel.
@@ -203,16 +196,6 @@ def slider(
         How long a frame stays while the slider plays.
     colours : int
         Colours of a frame's palette, 2 to 256. Few make a small file.
-
-    Returns
-    -------
-    Slider
-        The last value of a notebook's cell shows it.
-
-    Raises
-    ------
-    ValueError
-        If there is nothing to draw, sizes differ, or all frames together are too large for a page.
 
     Examples
     --------

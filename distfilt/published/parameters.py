@@ -16,11 +16,7 @@ __all__ = ["judge_parameters"]
 
 
 def judge_parameters(
-    paper: str,
-    item: str,
-    read: Reading | Sequence[Mapping[str, Any]],
-    *,
-    table: str = "agents",
+    paper: str, item: str, read: Reading | Sequence[Mapping[str, Any]], *, table: str = "agents",
     scenario: Scenario | None = None,
 ) -> Verdict:
     """The verdict on a table of parameters: "read" if the study read every cell as printed.
@@ -39,11 +35,6 @@ def judge_parameters(
         Which of the reading's tables holds the printed rows.
     scenario : Scenario, optional
         What the study ran, as of `judge_table`; the reading itself without it.
-
-    Returns
-    -------
-    Verdict
-        If it differs, the first difference is the reason.
 
     Examples
     --------

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import choice, count, number
+from ..checks import choice, count, nonblank, number
 
 __all__ = ["Parameter", "Row", "UnknownKey"]
 
@@ -34,8 +34,6 @@ _UNITS = {
 class UnknownKey(KeyError, ValueError):
     """A scenario or a row has nothing of that name; the message lists the nearest names.
 
-    Examples
-    --------
     >>> from distfilt.published import scenario
     >>> try:
     ...     scenario("grange", "table-2")["gian"]
@@ -54,19 +52,12 @@ def nearest(key: Any, names: list[str]) -> str:
     return ", ".join(near) or "none"
 
 
-def text(value: Any, name: str) -> str:
-    """A text that is not blank."""
-    if not isinstance(value, str) or not value.strip():
-        raise ValueError(f"{name}: needs a text, got {value!r}")
-    return value
-
-
 def _check_origin(unit: Any, source: Any, where: Any, reason: Any) -> None:
     """What is given says where, and what is not says why."""
-    text(unit, "unit")
+    nonblank(unit, "unit")
     choice(source, "source", _SOURCES)
     needed, words = ("where", where) if source == "given" else ("reason", reason)
-    text(words, needed)
+    nonblank(words, needed)
     for name, value in (("where", where), ("reason", reason)):
         if not isinstance(value, str):
             raise ValueError(f"{name}: needs a text, got {value!r}")
@@ -79,7 +70,7 @@ def plain(value: Any, name: str = "value") -> Any:
     if isinstance(value, bool):
         return value
     if isinstance(value, str):
-        return text(value, name)
+        return nonblank(value, name)
     if isinstance(value, int | float):
         number(value, name)
         return value
@@ -165,7 +156,7 @@ def _components(value: Any, name: str) -> tuple[int, ...]:
 
 
 def _names(value: Any, name: str) -> tuple[str, ...]:
-    return tuple(text(other, name) for other in _distinct(value, name))
+    return tuple(nonblank(other, name) for other in _distinct(value, name))
 
 
 def _positive(value: Any, name: str) -> Any:
@@ -174,9 +165,9 @@ def _positive(value: Any, name: str) -> Any:
 
 
 _COLUMNS: dict[str, Callable[[Any, str], Any]] = {
-    "name": text,
-    "kind": text,
-    "unit": text,
+    "name": nonblank,
+    "kind": nonblank,
+    "unit": nonblank,
     "dims": _components,
     "neighbours": _names,
     "noise": _positive,
@@ -222,7 +213,7 @@ class Row(Mapping[str, Any]):
             if key not in ORIGIN:
                 kept[key] = _COLUMNS.get(key, plain)(value, key)
         for key in ("name", "unit"):
-            text(cells.get(key), key)
+            nonblank(cells.get(key), key)
         origin = {key: cells.get(key, "") for key in ORIGIN}
         _check_origin(kept["unit"], origin["source"], origin["where"], origin["reason"])
         if not isinstance(origin["note"], str):

@@ -73,10 +73,6 @@ def read_scenario(path: str | Path) -> Scenario:
     path : str or Path
         A UTF-8 file.
 
-    Returns
-    -------
-    Scenario
-
     Raises
     ------
     ValueError
@@ -163,14 +159,8 @@ def scenario(paper: str, name: str) -> Scenario:
 
     Parameters
     ----------
-    paper : {"grange", "das", "semeraro", "zheng"}
-        The paper's key.
-    name : str
-        Such as ``table-2``.
-
-    Returns
-    -------
-    Scenario
+    paper, name : str
+        One of `PAPERS` and the scenario's, such as ``table-2``.
 
     Examples
     --------

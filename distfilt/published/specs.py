@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array
+from ..checks import Array, array, nonblank
 from ._files import html_table, markdown_table, text_table
-from .parts import ORIGIN, Parameter, Row, UnknownKey, link_fault, nearest, plain, text
+from .parts import ORIGIN, Parameter, Row, UnknownKey, link_fault, nearest, plain
 from .tables import accepted
 
 __all__ = ["Reading", "Scenario"]
@@ -64,7 +64,7 @@ class Scenario:
 
     def __post_init__(self) -> None:
         for name in ("paper", "name", "title"):
-            text(getattr(self, name), name)
+            nonblank(getattr(self, name), name)
         names = [p.name for p in (*self.parameters, *self.notes)]
         if len(set(names)) != len(names):
             raise ValueError("parameters: needs distinct names, those of the notes included")
@@ -107,10 +107,6 @@ class Scenario:
         """Whether a parameter is given, inferred or assumed."""
         return self.parameter(key).source
 
-    def reason(self, key: str) -> str:
-        """Why a parameter has its value, or where the paper gives it."""
-        return self.parameter(key).why
-
     def rows(self, table: str = _AGENTS) -> tuple[Row, ...]:
         """The rows of one of its tables, in the file's order."""
         if table not in self.tables:
@@ -138,8 +134,6 @@ class Scenario:
     def replace(self, **values: Any) -> Scenario:
         """The scenario with other values of some parameters; units and places stay.
 
-        Examples
-        --------
         >>> from distfilt.published import scenario
         >>> scenario("grange", "table-2").replace(members=50)["members"]
         50
@@ -151,8 +145,6 @@ class Scenario:
     def replace_row(self, name: str, *, table: str = _AGENTS, **cells: Any) -> Scenario:
         """The scenario with other cells in one row.
 
-        Examples
-        --------
         >>> from distfilt.published import scenario
         >>> s = scenario("grange", "table-2").replace_row("B", kind="range", unit="m")
         >>> s.changes
@@ -230,12 +222,7 @@ class Scenario:
     def reading(self) -> Reading:
         """The same scenario, which remembers what was read of it."""
         return Reading(
-            self.paper,
-            self.name,
-            self.title,
-            self.parameters,
-            notes=self.notes,
-            tables=self.tables,
+            self.paper, self.name, self.title, self.parameters, notes=self.notes, tables=self.tables
         )
 
     def _shown(self) -> list[tuple[Sequence[str], list[Sequence[str]]]]:
@@ -291,8 +278,6 @@ class Reading(Scenario):
     none. A copy that travels to a worker process remembers there, not here: take what a trial
     needs before the study starts.
 
-    Examples
-    --------
     >>> from distfilt.published import scenario
     >>> s = scenario("grange", "table-2").reading()
     >>> gain, noise = s["gain"], s.agents[1].noise

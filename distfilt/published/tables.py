@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..checks import Array, array, choice, count
+from ..checks import Array, array, choice, count, instance
 from ..folders import data_root
 from ._files import fault, named_file, read_text, shown
 
@@ -35,13 +35,6 @@ def root() -> Path:
     It is the working copy's that the process runs in, or the one that the library carries;
     :func:`distfilt.folders.data_root` has the rule.
 
-    Raises
-    ------
-    FileNotFoundError
-        If the library was installed without its data.
-
-    Examples
-    --------
     >>> (root() / "published" / "items.csv").is_file()
     True
     """
@@ -109,10 +102,7 @@ class Table:
 
 
 def read_table(
-    path: str | Path,
-    *,
-    columns: Sequence[str] | None = None,
-    key: int = 1,
+    path: str | Path, *, columns: Sequence[str] | None = None, key: int = 1,
     numbers: Sequence[str] = (),
 ) -> Table:
     """Read a CSV file strictly.
@@ -130,10 +120,6 @@ def read_table(
         How many leading columns form the key.
     numbers : sequence of str
         Columns that have to hold finite numbers.
-
-    Returns
-    -------
-    Table
 
     Raises
     ------
@@ -202,10 +188,6 @@ def table(paper: str, name: str, *, numbers: Sequence[str] = ()) -> Table:
     numbers : sequence of str
         Columns that have to hold finite numbers.
 
-    Returns
-    -------
-    Table
-
     Examples
     --------
     >>> table("grange", "table-3").text("name")
@@ -250,7 +232,7 @@ class Item:
             raise ValueError(f"item: needs a name like 'Table II' or 'Fig. 1', got {self.item!r}")
         choice(self.kind, "kind", KINDS)
         for name in ("title", "chapter"):
-            if not str(getattr(self, name)).strip():
+            if not instance(getattr(self, name), name, str).strip():
                 raise ValueError(f"{name}: needs a text, got {getattr(self, name)!r}")
 
     @property
@@ -264,8 +246,6 @@ class Item:
 def items() -> tuple[Item, ...]:
     """The tables and figures of the four papers that the book reproduces.
 
-    Examples
-    --------
     >>> len(items())
     21
     >>> items()[1].item

@@ -8,20 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import choice, number
+from ..checks import choice, nonblank, number
 from ._files import html_table
-from .parts import text
 from .specs import Scenario
 from .tables import PAPERS, Item, Table, items, table
 
-__all__ = [
-    "VERDICTS",
-    "Claim",
-    "Value",
-    "Verdict",
-    "judge_claims",
-    "judge_table",
-    "judge_value",
+__all__ = [  # fmt: skip
+    "VERDICTS", "Claim", "Value", "Verdict", "judge_claims", "judge_table", "judge_value",
 ]
 
 VERDICTS = ("read", "match", "differs", "not comparable")
@@ -74,10 +67,10 @@ class Verdict:
         kind = known_item(self.paper, self.item).kind
         other = "match" if kind == "parameters" else "read"
         choice(self.verdict, "verdict", [v for v in VERDICTS if v != other])
-        text(self.ours, "ours")
-        text(self.published, "published")
+        nonblank(self.ours, "ours")
+        nonblank(self.published, "published")
         if self.verdict in ("differs", "not comparable") or self.why != "":
-            text(self.why, "why")
+            nonblank(self.why, "why")
 
     def _fields(self) -> list[tuple[str, str]]:
         pairs = [("ours", self.ours), ("published", self.published), ("why", self.why)]
@@ -165,7 +158,7 @@ class Value:
     tolerance: float = 0.0
 
     def __post_init__(self) -> None:
-        text(self.id, "id")
+        nonblank(self.id, "id")
         judge_value(self.ours, self.error, self.published, tolerance=self.tolerance)
 
     @property
@@ -186,14 +179,10 @@ def distinct(ids: Sequence[str], name: str) -> None:
 
 
 def judge_table(
-    paper: str,
-    item: str,
-    values: Sequence[Value],
-    *,
-    why: str = "",
+    paper: str, item: str, values: Sequence[Value], *, why: str = "",
     scenario: Scenario | None = None,
 ) -> Verdict:
-    """The verdict on a table of numbers: a match if every value matches.
+    """The verdict on a table of numbers: a match if every value matches; it lists the others.
 
     Parameters
     ----------
@@ -207,11 +196,6 @@ def judge_table(
         What the study ran; if it is not the paper's, the verdict is "not comparable" and names
         what was changed.
 
-    Returns
-    -------
-    Verdict
-        With the number of values that match, and those that do not.
-
     Examples
     --------
     >>> one = Value("C1", 0.0899, 0.0004, 0.0896)
@@ -219,7 +203,7 @@ def judge_table(
     'match'
     """
     known = known_item(paper, item)
-    if not all(isinstance(v, Value) for v in values):
+    if not np.iterable(values) or not all(isinstance(v, Value) for v in values):
         raise ValueError("values: needs a sequence of Value")
     distinct([v.id for v in values], "values")
     missed = [str(v) for v in values if not v.matches]
@@ -256,7 +240,7 @@ class Claim:
 
     def __post_init__(self) -> None:
         for name in ("id", "text", "evidence"):
-            text(getattr(self, name), name)
+            nonblank(getattr(self, name), name)
         if not isinstance(self.holds, bool | np.bool_):
             raise ValueError(f"holds: needs True or False, got {self.holds!r}")
 
@@ -266,11 +250,7 @@ class Claim:
 
 
 def judge_claims(
-    paper: str,
-    item: str,
-    claims: Sequence[Claim],
-    *,
-    why: str = "",
+    paper: str, item: str, claims: Sequence[Claim], *, why: str = "",
     scenario: Scenario | None = None,
 ) -> Verdict:
     """The verdict on a figure: a match if every claim listed for it is judged and holds.
@@ -280,20 +260,11 @@ def judge_claims(
     paper, item : str
         One of `items`; its claims are listed in ``published/KEY/figure-N.csv``.
     claims : sequence of Claim
-        Every listed claim, once.
+        Every listed claim, once; none may have its criterion open.
     why : str
         Why it differs; needed and used only if a claim fails.
     scenario : Scenario, optional
         What the study ran, as of `judge_table`.
-
-    Returns
-    -------
-    Verdict
-
-    Raises
-    ------
-    ValueError
-        If a claim is not listed, a listed one is missing, or its criterion is still open.
 
     Examples
     --------
@@ -306,7 +277,7 @@ def judge_claims(
     'differs'
     """
     known = known_item(paper, item)
-    if not all(isinstance(c, Claim) for c in claims):
+    if not np.iterable(claims) or not all(isinstance(c, Claim) for c in claims):
         raise ValueError("claims: needs a sequence of Claim")
     distinct([c.id for c in claims], "claims")
     listed = {r["id"]: r for r in _claims_of(known).records()}

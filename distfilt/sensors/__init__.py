@@ -3,14 +3,7 @@
 from .base import Sensor, wrap
 from .kinds import angle, differential, direct, distance, distance_and_angle, of_kind, stack
 
-__all__ = [
-    "Sensor",
-    "angle",
-    "differential",
-    "direct",
-    "distance",
-    "distance_and_angle",
-    "of_kind",
-    "stack",
-    "wrap",
+__all__ = [  # fmt: skip
+    "Sensor", "angle", "differential", "direct", "distance", "distance_and_angle", "of_kind",
+    "stack", "wrap",
 ]

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, callable_, count, covariance, generator, number
+from ..checks import Array, array, callable_, count, covariance, generator, instance, number
 from ..differences import _central
-from ..linalg import factor
+from ..linalg import _leading, factor
 
 __all__ = ["Sensor", "wrap"]
 
@@ -95,6 +95,8 @@ class Sensor:
     def __post_init__(self) -> None:
         count(self.dim, "dim")
         callable_(self.function, "function")
+        instance(self.uses_previous, "uses_previous", bool)
+        instance(self.kind, "kind", str)
         for name in ("difference", "linear", "derivative"):
             if getattr(self, name) is not None:
                 callable_(getattr(self, name), name)
@@ -115,6 +117,8 @@ class Sensor:
             seen = self._predict(*states)
         except (TypeError, ValueError, IndexError) as error:
             self._refuse_unbatched(states, error)
+            if isinstance(error, IndexError):
+                raise ValueError(f"x: needs more components, got {states[0].shape}") from error
             raise
         if seen.size and states[0].ndim > 1 and states[0].shape[0] == self.dim:
             # Here a function that takes components from the first axis returns the right shape.
@@ -137,16 +141,14 @@ class Sensor:
     def _states(self, x: ArrayLike, previous: ArrayLike | None) -> tuple[Array, ...]:
         state = array(x, "x", (..., "d"))
         if not self.uses_previous:
+            if previous is not None:
+                array(previous, "previous", (..., state.shape[-1]))
             return (state,)
         if previous is None:
             raise ValueError(f"previous: a {self.kind} sensor needs the previous states, got None")
         before = array(previous, "previous", (..., state.shape[-1]))
-        try:
-            return tuple(np.broadcast_arrays(state, before))
-        except ValueError:
-            raise ValueError(
-                f"previous: needs states that go with {state.shape}, got {before.shape}"
-            ) from None
+        _leading(state.shape[:-1], before.shape[:-1], "previous")
+        return tuple(np.broadcast_arrays(state, before))
 
     def _predict(self, state: Array, previous: Array | None = None) -> Array:
         """`predict` of checked arguments. The copies are for functions that work in place."""
@@ -177,8 +179,15 @@ class Sensor:
 
         NaN, a missing component or one that the sensor cannot see, stays NaN.
         """
-        y = _readings(observed, "observed", self.dim)
-        return self._residual(y, _readings(predicted, "predicted", self.dim))
+        y, p = (_readings(v, n, self.dim) for v, n in
+                ((observed, "observed"), (predicted, "predicted")))  # fmt: skip
+        try:
+            np.broadcast_shapes(y.shape, p.shape)
+        except ValueError:
+            raise ValueError(
+                f"predicted: needs a shape that goes with observed {y.shape}, got {p.shape}"
+            ) from None
+        return self._residual(y, p)
 
     def _residual(self, y: Array, p: Array) -> Array:
         """`residual` of checked arguments."""

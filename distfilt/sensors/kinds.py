@@ -11,18 +11,14 @@ from numpy.typing import ArrayLike
 from ..checks import Array, array, choice, count, number
 from .base import Sensor, _wrapped
 
-__all__ = [
-    "angle",
-    "differential",
-    "direct",
-    "distance",
-    "distance_and_angle",
-    "of_kind",
-    "stack",
+__all__ = [  # fmt: skip
+    "angle", "differential", "direct", "distance", "distance_and_angle", "of_kind", "stack",
 ]
 
 
 def _indices(indices: Sequence[int], needed: int | None = None) -> tuple[int, ...]:
+    if not np.iterable(indices):
+        raise ValueError(f"indices: needs a list of integers, got {indices!r}")
     picked = tuple(count(i, "indices", at_least=0) for i in indices)
     if not picked or len(set(picked)) != len(picked):
         raise ValueError(f"indices: needs distinct components, got {tuple(indices)}")
@@ -51,18 +47,12 @@ def _place(origin: ArrayLike | None, size: int) -> Array:
 
 
 def _variance(std: float, size: int) -> Array:
-    return number(std, "std", above=0) ** 2 * np.eye(size)
+    # Its square is a variance that is neither zero nor infinite.
+    return number(std, "std", at_least=1e-150, at_most=1e150) ** 2 * np.eye(size)
 
 
 def direct(indices: Sequence[int], *, std: float) -> Sensor:
-    """See some components of the state as they are, ``h(x) = x[indices]``.
-
-    Parameters
-    ----------
-    indices : sequence of int
-        The components, counted from 0.
-    std : float
-        Standard deviation of each reading, in the component's unit, positive.
+    """See some components as they are, ``h(x) = x[indices]``, with a standard deviation `std` each.
 
     Examples
     --------
@@ -75,23 +65,13 @@ def direct(indices: Sequence[int], *, std: float) -> Sensor:
         return _pick(np.eye(dim), picked).T
 
     return Sensor(
-        len(picked),
-        lambda x: _pick(x, picked),
-        _variance(std, len(picked)),
-        kind="direct",
+        len(picked), lambda x: _pick(x, picked), _variance(std, len(picked)), kind="direct",
         linear=matrix,
     )
 
 
 def differential(indices: Sequence[int], *, std: float) -> Sensor:
-    """See how much some components changed since the previous observation time.
-
-    Parameters
-    ----------
-    indices : sequence of int
-        The components, counted from 0.
-    std : float
-        Standard deviation of each reading, positive.
+    """See how much some components changed since the previous observation time, to `std` each.
 
     Examples
     --------
@@ -100,18 +80,13 @@ def differential(indices: Sequence[int], *, std: float) -> Sensor:
     """
     picked = _indices(indices)
     return Sensor(
-        len(picked),
-        lambda x, previous: _pick(x, picked) - _pick(previous, picked),
-        _variance(std, len(picked)),
-        uses_previous=True,
-        kind="differential",
+        len(picked), lambda x, previous: _pick(x, picked) - _pick(previous, picked),
+        _variance(std, len(picked)), uses_previous=True, kind="differential",
         derivative=lambda x, previous: _pick(np.eye(x.shape[-1]), picked).T,
     )
 
 
-def distance(
-    indices: Sequence[int], *, std: float, origin: ArrayLike | None = None
-) -> Sensor:
+def distance(indices: Sequence[int], *, std: float, origin: ArrayLike | None = None) -> Sensor:
     """See the distance from a place in some components, ``h(x) = |x[indices] - origin|``.
 
     Parameters
@@ -142,11 +117,8 @@ def distance(
         return _spread(slope[..., None, :], picked, x.shape[-1])
 
     return Sensor(
-        1,
-        lambda x: np.linalg.norm(_pick(x, picked) - place, axis=-1, keepdims=True),
-        _variance(std, 1),
-        kind="distance",
-        derivative=derivative,
+        1, lambda x: np.linalg.norm(_pick(x, picked) - place, axis=-1, keepdims=True),
+        _variance(std, 1), kind="distance", derivative=derivative,
     )
 
 
@@ -198,34 +170,24 @@ def angle(
         return _spread(slope[..., None, :], picked, x.shape[-1])
 
     return Sensor(
-        1,
-        function,
-        _variance(std, 1),
-        difference=lambda y, p: _wrapped(y - p, period),
-        kind="angle",
-        derivative=derivative,
-        units=("rad",),
+        1, function, _variance(std, 1), difference=lambda y, p: _wrapped(y - p, period),
+        kind="angle", derivative=derivative, units=("rad",),
     )
 
 
 def distance_and_angle(
     indices: Sequence[int], *, std: Sequence[float], origin: ArrayLike | None = None
 ) -> Sensor:
-    """See the distance of two components from a place and their direction, as a radar does.
+    """See the distance from a place in two components and the direction, as a radar does.
 
     Parameters
     ----------
     indices : sequence of two int
-        The components a and b.
+        The components a and b; the angle is ``arctan2(b, a)``, which repeats after 2π.
     std : (float, float)
         Standard deviations of the distance, in the components' unit, and of the angle, in rad.
-    origin : array_like, (2,), optional
-        Where the sensor stands; zero by default.
-
-    Returns
-    -------
-    Sensor
-        Of two components; the angle is ``arctan2(b, a)``, which repeats after 2π.
+    origin
+        Where the sensor stands, as for :func:`angle`.
 
     Examples
     --------
@@ -249,10 +211,8 @@ def of_kind(kind: str, indices: Sequence[int], *, std: float) -> Sensor:
     kind : {"direct", "differential", "range", "angle"}
         The types of Grange et al., Table I; ``"range"`` is :func:`distance`, ``"angle"`` is
         ``arctan(b/a)``.
-    indices : sequence of int
-        The components, counted from 0.
-    std : float
-        Standard deviation of each reading, positive.
+    indices, std
+        The components, counted from 0; the standard deviation of each reading, positive.
 
     Examples
     --------
@@ -271,21 +231,13 @@ def of_kind(kind: str, indices: Sequence[int], *, std: float) -> Sensor:
 def stack(sensors: Sequence[Sensor]) -> Sensor:
     """One sensor whose observation is the observations of `sensors`, one after the other.
 
+    It wraps the components that the given sensors wrap, is linear if all of them are, and needs
+    the previous state if one of them does.
+
     Parameters
     ----------
     sensors : sequence of Sensor
         At least one. The noise of different sensors is independent.
-
-    Returns
-    -------
-    Sensor
-        It wraps the components that the given sensors wrap, it is linear if all of them are, and
-        it needs the previous state if one of them does.
-
-    Raises
-    ------
-    ValueError
-        If there is no sensor or an entry is none.
 
     Examples
     --------
@@ -321,12 +273,9 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
     known = any(s.units for s in parts)
     linear = all(s.linear is not None for s in parts)
     return Sensor(
-        int(ends[-1]),
-        function,
-        cov,
+        int(ends[-1]), function, cov,
         difference=None if all(s.difference is None for s in parts) else difference,
-        uses_previous=any(s.uses_previous for s in parts),
-        kind="stacked",
+        uses_previous=any(s.uses_previous for s in parts), kind="stacked",
         linear=(lambda d: np.concatenate([s.matrix(d) for s in parts])) if linear else None,
         derivative=derivative,
         units=tuple(u for s in parts for u in s.units or ("",) * s.dim) if known else (),

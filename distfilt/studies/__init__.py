@@ -14,18 +14,7 @@ from .seeds import spawn
 from .sources import fingerprint
 from .study import Failure, Study, StudyError, StudyInterrupted
 
-__all__ = [
-    "Failure",
-    "Stored",
-    "Study",
-    "StudyError",
-    "StudyInterrupted",
-    "check",
-    "fingerprint",
-    "load",
-    "run",
-    "script",
-    "spawn",
-    "store",
-    "stored",
+__all__ = [  # fmt: skip
+    "Failure", "Stored", "Study", "StudyError", "StudyInterrupted", "check", "fingerprint", "load",
+    "run", "script", "spawn", "store", "stored",
 ]

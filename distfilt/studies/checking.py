@@ -21,12 +21,8 @@ __all__ = ["check"]
 
 
 def check(
-    path: str | Path | Stored,
-    trial: Callable[[SeedSequence], Any],
-    *,
-    indices: Iterable[int] | None = None,
-    rtol: float = 0.0,
-    workers: int | None = 1,
+    path: str | Path | Stored, trial: Callable[[SeedSequence], Any], *,
+    indices: Iterable[int] | None = None, rtol: float = 0.0, workers: int | None = 1,
     executor: Executor | None = None,
 ) -> Stored:
     """Run stored trials again and compare what they give now with what is stored.
@@ -46,11 +42,6 @@ def check(
     workers, executor
         As in `run`; by default in this process.
 
-    Returns
-    -------
-    Stored
-        What the file holds.
-
     Raises
     ------
     AssertionError
@@ -62,11 +53,8 @@ def check(
     limit = number(rtol, "rtol", at_least=0)
     chosen = _indices(range(len(stored)) if indices is None else indices, len(stored))
     study = run(
-        callable_(trial, "trial"),
-        [stored.seed(i) for i in chosen],
-        errors="collect",
-        workers=workers,
-        executor=executor,
+        callable_(trial, "trial"), [stored.seed(i) for i in chosen], errors="collect",
+        workers=workers, executor=executor,
     )
     wrong = _differences(stored, chosen, study, limit)
     if wrong:
@@ -74,9 +62,7 @@ def check(
     return stored
 
 
-def _differences(
-    stored: Stored, chosen: Sequence[int], study: Study, rtol: float
-) -> list[str]:
+def _differences(stored: Stored, chosen: Sequence[int], study: Study, rtol: float) -> list[str]:
     """What the new study of the chosen trials does not give as it is stored."""
     names = tuple(stored.columns)
     kinds = {failure.index: failure.kind for failure in study.failures}

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.random import SeedSequence
 from numpy.typing import NDArray
 
-from ..checks import Array, callable_, choice, count
+from ..checks import Array, callable_, choice, count, instance
 from ..folders import data_root
 from ._worker import versions
 from .seeds import POOL_SIZE, Recipe
@@ -82,11 +82,7 @@ class Stored:
 
 
 def store(
-    study: Study,
-    path: str | Path,
-    *,
-    parameters: Mapping[str, Any],
-    columns: Sequence[str],
+    study: Study, path: str | Path, *, parameters: Mapping[str, Any], columns: Sequence[str],
     code: Iterable[Callable[..., Any]] = (),
 ) -> Path:
     """Write a study's metrics to a CSV file: the same study gives the same bytes.
@@ -116,8 +112,7 @@ def store(
         If trials are missing, a worker died or a trial took too long (which may say nothing of
         the trial), a metric is not a real number, or a parameter is not JSON.
     """
-    if not isinstance(study, Study):
-        raise ValueError(f"study: needs a Study, got {type(study).__name__}")
+    instance(study, "study", Study)
     names = column_names(columns)
     if set(names) & set(_FIRST):
         raise ValueError(f"columns: needs names other than {', '.join(_FIRST)}, got {names}")
@@ -208,15 +203,8 @@ def stored(paper: str, name: str) -> Stored:
 
     Parameters
     ----------
-    paper : str
-        The paper's key.
-    name : str
-        Such as ``figure-2``.
-
-    Raises
-    ------
-    ValueError
-        If there is none of that name, or as of `load`.
+    paper, name : str
+        The paper's key and the study's, such as ``figure-2``.
     """
     root = data_root() / "studies"
     there = sorted(p.relative_to(root).with_suffix("").as_posix() for p in root.glob("*/*.csv"))
@@ -334,12 +322,8 @@ class _Reader:
             raise ValueError(f"path: {self.path}, line {self.lines}: {got}")
         table = np.array(self.rows)
         return Stored(
-            self.path,
-            self.heads["parameter"],
-            self.heads["version"],
-            self.heads["code"],
-            tuple(self.recipes),
-            tuple(self.failures),
+            self.path, self.heads["parameter"], self.heads["version"], self.heads["code"],
+            tuple(self.recipes), tuple(self.failures),
             {name: table[:, k] for k, name in enumerate(self.names)},
         )
 

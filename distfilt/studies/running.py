@@ -25,15 +25,9 @@ __all__ = ["run"]
 
 
 def run(
-    trial: Callable[[SeedSequence], Any],
-    seeds: Iterable[SeedSequence | int],
-    *,
-    executor: Executor | None = None,
-    workers: int | None = None,
-    chunk: int | None = None,
-    errors: str = "raise",
-    timeout: float | None = None,
-    progress: bool = True,
+    trial: Callable[[SeedSequence], Any], seeds: Iterable[SeedSequence | int], *,
+    executor: Executor | None = None, workers: int | None = None, chunk: int | None = None,
+    errors: str = "raise", timeout: float | None = None, progress: bool = True,
     blas_threads: int | None = 1,
 ) -> Study:
     """Call ``trial(seed)`` for every seed, on as many processes as there are.
@@ -74,15 +68,8 @@ def run(
     blas_threads : int or None
         Threads of the linear algebra in each process; None leaves them as they are.
 
-    Returns
-    -------
-    Study
-        Values in the order of the seeds, and failures.
-
     Raises
     ------
-    ValueError
-        If an argument is not as above, or the trial cannot be pickled.
     StudyError
         If a trial failed and `errors` is ``"raise"``, or if the pool failed: a caller's pool that
         broke or was shut down, a worker with another version of Python, numpy or this library.
@@ -191,4 +178,3 @@ def _partial(flight: Flight, record: _Record) -> Study:
     for outcome in flight.arrived():
         record.add(outcome)
     return record.study()
-

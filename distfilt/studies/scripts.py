@@ -13,22 +13,14 @@ __all__ = ["script"]
 
 
 def script(name: str | Path) -> ModuleType:
-    """The module of a stored study, from ``book/studies`` beside the data.
+    """The module of a stored study, from ``book/studies`` beside the data, which no wheel carries.
+
+    It has the study's ``trial``, ``parameters``, ``columns`` and ``seeds``.
 
     Parameters
     ----------
     name : str or Path
         The study's name, such as ``lorenz-63`` for ``lorenz_63.py``, or a script's path.
-
-    Returns
-    -------
-    module
-        With the study's ``trial``, ``parameters``, ``columns`` and ``seeds``.
-
-    Raises
-    ------
-    ValueError
-        If there is no such script; an installed library carries none.
 
     Examples
     --------

@@ -35,12 +35,7 @@ def fingerprint(function: Callable[..., Any]) -> str:
     ----------
     function : callable
         A function, a method, a class, a partial (its function) or an object that can be called
-        (its class).
-
-    Raises
-    ------
-    ValueError
-        If its source is not at hand, as for a compiled function.
+        (its class), with its source at hand.
 
     Examples
     --------

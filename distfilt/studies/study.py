@@ -130,13 +130,7 @@ class Study:
         return [recipe.seed() for recipe in self.recipes]
 
     def array(self) -> Array:
-        """The values of the trials that are done, stacked: (done, ...).
-
-        Raises
-        ------
-        ValueError
-            If the values are not numbers or arrays of one shape.
-        """
+        """The values of the trials that are done, stacked: (done, ...)."""
         kept = [v for v, done in zip(self.values, self.done, strict=True) if done]
         try:
             return array(np.array(kept), "values", finite=False)

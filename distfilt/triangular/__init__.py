@@ -7,14 +7,7 @@ from .inversion import invert
 from .pooling import pool_by_admm, pool_by_moments
 from .separable import SeparableMap
 
-__all__ = [
-    "AffineMap",
-    "ConditionalMap",
-    "SeparableMap",
-    "affine",
-    "compose",
-    "invert",
-    "pool_by_admm",
-    "pool_by_moments",
-    "separable",
+__all__ = [  # fmt: skip
+    "AffineMap", "ConditionalMap", "SeparableMap", "affine", "compose", "invert", "pool_by_admm",
+    "pool_by_moments", "separable",
 ]

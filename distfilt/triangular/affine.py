@@ -18,20 +18,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import ensembles
-from ..checks import Array, array, choice, count, covariance
+from ..checks import Array, array, callable_, choice, count, covariance
 from ._conic import LIMIT, solve_component
 
 if TYPE_CHECKING:
     from .composition import ConditionalMap
 
-__all__ = [
-    "AffineMap",
-    "fit",
-    "fit_convex",
-    "from_moments",
-    "from_rows",
-    "gradient",
-    "objective",
+__all__ = [  # fmt: skip
+    "AffineMap", "fit", "fit_convex", "from_moments", "from_rows", "gradient", "objective",
 ]
 
 _ROUNDING = 1e-13
@@ -122,16 +116,7 @@ def fit(y: ArrayLike, x: ArrayLike) -> AffineMap:
     y : array_like, (..., N, m)
         Predicted observations, with noise; m may be 0 for a map of x alone.
     x : array_like, (..., N, d)
-        Members.
-
-    Returns
-    -------
-    AffineMap
-
-    Raises
-    ------
-    ValueError
-        With too few members (N ≤ m + d), or where a variable is constant or repeats others.
+        Members, more than m + d. No variable may be constant or repeat others.
 
     Examples
     --------
@@ -161,15 +146,6 @@ def from_moments(mean: ArrayLike, cov: ArrayLike, m: int) -> AffineMap:
         Their covariance, symmetric and positive definite.
     m : int
         Number of observations, at least 0.
-
-    Returns
-    -------
-    AffineMap
-
-    Raises
-    ------
-    ValueError
-        If `cov` is no covariance, or a variable is constant or a combination of others.
 
     Examples
     --------
@@ -205,10 +181,6 @@ def from_rows(rows: ArrayLike, observed_mean: ArrayLike) -> AffineMap:
         the right of the diagonal and positive on it.
     observed_mean : array_like, (..., m)
         The y about which the map is written; any will do.
-
-    Returns
-    -------
-    AffineMap
 
     Examples
     --------
@@ -274,13 +246,14 @@ def objective(map_: ConditionalMap, y: ArrayLike, x: ArrayLike) -> Array:
     >>> float(objective(fit(np.empty((4, 0)), x), np.empty((4, 0)), x))
     0.5
     """
+    callable_(map_, "map_")
     seen, members = _samples(y, x)
     squares = 0.5 * (map_(seen, members) ** 2).sum(axis=-1)
     return np.asarray((squares - map_.log_det(seen, members)).mean(axis=-1))
 
 
 def gradient(coefficients: ArrayLike, samples: ArrayLike) -> Array:
-    r"""Gradient of (12) for one affine component, the corrected equation (14).
+    r"""Gradient (k + 1,) of (12) for one affine component, the corrected equation (14).
 
     .. math:: \frac{\partial\mathcal L^k}{\partial u_l}
         = \frac1N\sum_i U^k(\mathbf z_i)\, z_{i,l} - \frac{\delta_{lk}}{u_k}
@@ -294,16 +267,14 @@ def gradient(coefficients: ArrayLike, samples: ArrayLike) -> Array:
     samples : array_like, (N, k)
         The first k variables.
 
-    Returns
-    -------
-    ndarray, (k + 1,)
-
     Examples
     --------
     >>> gradient([0.0, 1.0], [[-1.0], [1.0]])
     array([0., 0.])
     """
     z = array(samples, "samples", ("N", "k"))
+    if not len(z):
+        raise ValueError("samples: needs at least one, got none")
     u = array(coefficients, "coefficients", (z.shape[1] + 1,))
     if u[-1] <= 0:
         raise ValueError(f"coefficients: needs a positive last entry, got {u[-1]:g}")
@@ -323,18 +294,12 @@ def fit_convex(
 
     Parameters
     ----------
-    y : array_like, (N, m)
-        Predicted observations, with noise.
-    x : array_like, (N, d)
-        Members.
+    y, x : array_like, (N, m) and (N, d)
+        As for :func:`fit`.
     solver : {"ECOS", "CLARABEL"}
         A conic solver, at its default tolerances.
     max_iters : int, optional
         Stop the solver early, which raises.
-
-    Returns
-    -------
-    AffineMap
 
     Raises
     ------

@@ -14,8 +14,6 @@ __all__ = ["ConditionalMap", "compose"]
 class ConditionalMap(Protocol):
     """What a map offers: z = S(y, x), its inverse in x, the derivative's log-determinant.
 
-    Examples
-    --------
     Whatever has these three methods is one:
 
     >>> class Shift:
@@ -48,21 +46,10 @@ def compose(map_: ConditionalMap, y: ArrayLike, x: ArrayLike, observed: ArrayLik
     ----------
     map_ : ConditionalMap
         The x-block S of a triangular map.
-    y : array_like, (..., N, m)
-        Predicted observations of the members, with noise.
-    x : array_like, (..., N, d)
-        Members.
+    y, x : array_like, (..., N, m) and (..., N, d)
+        Predicted observations, with noise, and members.
     observed : array_like, (..., m)
         What was observed, y*.
-
-    Returns
-    -------
-    ndarray, (..., N, d)
-
-    Raises
-    ------
-    ValueError
-        If `map_` is no map or the shapes do not fit.
 
     Examples
     --------

@@ -12,7 +12,10 @@ from ..checks import Array, SolverError, array, callable_, number
 __all__ = ["invert"]
 
 _DOUBLINGS = 60
-"""Brackets grow to 2^60 initial widths before a target counts as out of range."""
+"""Brackets grow to 2^60 before a target counts as out of range."""
+
+_ROUNDING = 1e-13
+"""A step settles below this share of one plus the value's size."""
 
 _ITERATIONS = 200
 
@@ -21,13 +24,7 @@ Function = Callable[[Array], tuple[Array, Array]]
 
 
 def invert(
-    function: Function,
-    target: ArrayLike,
-    *,
-    start: float = 0.0,
-    width: float = 1.0,
-    tolerance: float = 1e-13,
-    name: str = "target",
+    function: Function, target: ArrayLike, *, start: float = 0.0, name: str = "target"
 ) -> Array:
     """Solve ``function(v) = target`` by Newton's method inside a shrinking bracket.
 
@@ -43,17 +40,8 @@ def invert(
         The values to reach.
     start : float
         Where the search for a bracket begins.
-    width : float
-        Half the width of the first bracket, positive.
-    tolerance : float
-        Stop when every step is below `tolerance` times one plus the size of the value.
     name : str
         What an error calls the targets.
-
-    Returns
-    -------
-    ndarray
-        Of the shape of `target`.
 
     Raises
     ------
@@ -70,15 +58,14 @@ def invert(
     """
     f = callable_(function, "function")
     aim = array(target, name, (...,))
-    centre, half = number(start, "start"), number(width, "width", above=0)
-    small = number(tolerance, "tolerance", above=0)
+    centre = number(start, "start")
     if not aim.size:
         return aim.copy()
-    low, high = _bracket(f, aim, centre, half, name)
-    return _newton(f, aim, low, high, 0.5 * (low + high), small)
+    low, high = _bracket(f, aim, centre, name)
+    return _newton(f, aim, low, high, 0.5 * (low + high))
 
 
-def _newton(f: Function, aim: Array, low: Array, high: Array, v: Array, small: float) -> Array:
+def _newton(f: Function, aim: Array, low: Array, high: Array, v: Array) -> Array:
     """Newton's method from `v` between ends where the targets are reached."""
     moved = high - low
     for _ in range(_ITERATIONS):
@@ -88,7 +75,7 @@ def _newton(f: Function, aim: Array, low: Array, high: Array, v: Array, small: f
         steep = slope > 0
         newton = v - gap / np.where(steep, slope, 1.0)
         step = np.abs(newton - v)
-        enough = small * (1 + np.abs(v))
+        enough = _ROUNDING * (1 + np.abs(v))
         # A step that has settled may stand on an end of its bracket; any other has to be inside
         # and half as long as the last, or Newton's method could go to and fro for ever.
         good = (newton > low) & (newton < high) & (step <= 0.5 * moved)
@@ -116,12 +103,12 @@ def _evaluated(f: Function, v: Array) -> tuple[Array, Array]:
     return value, slope
 
 
-def _bracket(f: Function, aim: Array, centre: float, half: float, name: str) -> tuple[Array, Array]:
+def _bracket(f: Function, aim: Array, centre: float, name: str) -> tuple[Array, Array]:
     """Ends between which each target is reached."""
     ends = []
     for sign in (-1.0, 1.0):
-        end = np.full(aim.shape, centre + sign * half)
-        size = half
+        end = np.full(aim.shape, centre + sign)
+        size = 1.0
         for _ in range(_DOUBLINGS):
             short = sign * (_evaluated(f, end)[0] - aim) < 0
             if not short.any():

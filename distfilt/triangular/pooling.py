@@ -29,7 +29,7 @@ Agree = Callable[[Array, Channel], Array]
 def pool_by_moments(
     y: ArrayLike, x: ArrayLike, channel: Channel, *, agree: Agree = finite_time
 ) -> AffineMap:
-    """The affine map of all agents' samples together, from averaged moments.
+    """The affine map of all agents' samples together, from averaged moments: each agent's copy.
 
     Agents agree on the mean first and then on the second moments about it, which keeps the digits
     that raw second moments would lose.
@@ -45,17 +45,6 @@ def pool_by_moments(
     agree : callable
         ``agree(values, channel) -> values``: how an average is found. The default is exact; with an
         approximate rule the agents' maps differ.
-
-    Returns
-    -------
-    AffineMap
-        With the leading axes (*runs, A): each agent's copy.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit the channel, there are too few samples in all (A N ≤ D), or a variable
-        is constant or repeats others.
 
     Examples
     --------
@@ -73,15 +62,8 @@ def pool_by_moments(
 
 
 def pool_by_admm(
-    y: ArrayLike,
-    x: ArrayLike,
-    channel: Channel,
-    *,
-    rho: float = 1.0,
-    tolerance: float = 1e-6,
-    iterations: int = 1000,
-    check: int | None = 1,
-    standardise: bool = True,
+    y: ArrayLike, x: ArrayLike, channel: Channel, *, rho: float = 1.0, tolerance: float = 1e-6,
+    iterations: int = 1000, check: int | None = 1, standardise: bool = True,
     agree: Agree = finite_time,
 ) -> tuple[AffineMap, AdmmRun]:
     r"""The same map by consensus ADMM on the components' coefficients, the paper's proposal.
@@ -111,13 +93,6 @@ def pool_by_admm(
         of iterations grows with the condition number of the variables' correlation matrix.
     run : AdmmRun
         How ADMM ended; its ``common`` holds the coefficients.
-
-    Raises
-    ------
-    ValueError
-        As in :func:`pool_by_moments`.
-    SolverError
-        If the residuals are not below `tolerance` after `iterations`.
 
     Examples
     --------

@@ -2,8 +2,9 @@ r"""Separable triangular maps: curved in every variable, one variable at a time.
 
 Component k of the x-block is
 
-.. math:: S^k(\mathbf z) = c_0 + \sum_{l<k}\Bigl(c_l z_l + \sum_j c_{lj}\,\varphi_{lj}(z_l)\Bigr)
-    + a_0 z_k + \sum_j a_j\int_{-\infty}^{z_k}\varphi_{kj},\qquad a_0 > 0,\; a_j\ge 0,
+.. math::
+    S^k(\mathbf z) &= c_0 + \sum_{l<k}\Bigl(c_l z_l + \sum_j c_{lj}\,\varphi_{lj}(z_l)\Bigr)\\
+    &\quad + a_0 z_k + \sum_j a_j\int_{-\infty}^{z_k}\varphi_{kj},\qquad a_0 > 0,\; a_j\ge 0,
 
 on standardised variables, with bumps :math:`\varphi_{lj}(z)=e^{-(z-\xi_{lj})^2/2\sigma_{lj}^2}` at
 sample quantiles. The signs make it increase in :math:`z_k`. The objective (12) of Grange et al. is
@@ -22,6 +23,7 @@ from scipy.special import ndtr
 
 from .. import ensembles
 from ..checks import Array, array, count, number
+from ..linalg import _leading
 from ._convex import SINGULAR, best_coefficients
 from .inversion import _newton, invert
 
@@ -96,17 +98,12 @@ class SeparableMap:
         """Number m of observations."""
         return int(self.centre.shape[-1]) - self.dim
 
-    def _standard(self, y: ArrayLike, x: Array, name: str) -> Array:
+    def _standard(self, y: ArrayLike, x: Array) -> Array:
         """Standardised (y, x), (..., N, m + d); one y for all members is repeated."""
         seen = array(y, "y", (..., self.observed))
         if seen.ndim == self.centre.ndim:
             seen = seen[..., None, :]
-        try:
-            lead = np.broadcast_shapes(seen.shape[:-1], x.shape[:-1])
-        except ValueError:
-            raise ValueError(
-                f"y: needs as many rows as {name} {x.shape}, got shape {seen.shape}"
-            ) from None
+        lead = _leading(x.shape[:-1], seen.shape[:-1], "y")
         parts = [np.broadcast_to(v, (*lead, v.shape[-1])) for v in (seen, x)]
         joint = np.concatenate(parts, axis=-1)
         return np.asarray((joint - self.centre[..., None, :]) / self.spread[..., None, :])
@@ -138,11 +135,11 @@ class SeparableMap:
         heights = _ROOT * self.steps[1][..., k, :] * rest
         low = (aim - heights.sum(axis=-1, keepdims=True)) / first
         high = aim / first
-        return _newton(own, aim, low, high, 0.5 * (low + high), 1e-13)
+        return _newton(own, aim, low, high, 0.5 * (low + high))
 
     def __call__(self, y: ArrayLike, x: ArrayLike) -> Array:
         """Reference samples S(y, x), (..., N, d), of members y (..., N, m) and x (..., N, d)."""
-        joint = self._standard(y, array(x, "x", (..., "N", self.dim)), "x")
+        joint = self._standard(y, array(x, "x", (..., "N", self.dim)))
         parts = [
             self._earlier(joint, k) + self._own(joint[..., self.observed + k], k)[0]
             for k in range(self.dim)
@@ -156,7 +153,7 @@ class SeparableMap:
         linear coefficient is zero.
         """
         reference = array(z, "z", (..., "N", self.dim))
-        joint = self._standard(y, reference, "z")
+        joint = self._standard(y, reference)
         m = self.observed
         for k in range(self.dim):
             joint[..., m + k] = self._inverted(reference[..., k] - self._earlier(joint, k), k)
@@ -164,7 +161,7 @@ class SeparableMap:
 
     def log_det(self, y: ArrayLike, x: ArrayLike) -> Array:
         """Logarithm of the determinant of the map's derivative in x at each member, (..., N)."""
-        joint = self._standard(y, array(x, "x", (..., "N", self.dim)), "x")
+        joint = self._standard(y, array(x, "x", (..., "N", self.dim)))
         m = self.observed
         total = -np.log(self.spread[..., m:]).sum(axis=-1)[..., None]
         for k in range(self.dim):
@@ -193,13 +190,8 @@ def _own_features(v: Array, steps: Array) -> tuple[Array, Array]:
 
 
 def fit(
-    y: ArrayLike,
-    x: ArrayLike,
-    *,
-    order: int | tuple[int, int],
-    regularisation: float = 0.0,
-    uses: Sequence[Collection[int]] | None = None,
-    least_slope: float = 0.1,
+    y: ArrayLike, x: ArrayLike, *, order: int | tuple[int, int], regularisation: float = 0.0,
+    uses: Sequence[Collection[int]] | None = None, least_slope: float = 0.1,
 ) -> SeparableMap:
     r"""Fit the separable map to samples: the minimiser of (12), regularised.
 
@@ -224,10 +216,6 @@ def fit(
     least_slope : float
         Lower bound of the linear coefficient :math:`a_0`, per standard deviation, at least 0. A
         positive one gives the map the whole line as its range. The best affine map has at least 1.
-
-    Returns
-    -------
-    SeparableMap
 
     Raises
     ------

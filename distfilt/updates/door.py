@@ -15,7 +15,8 @@ from typing import Any, Concatenate, ParamSpec, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, covariance, generator
+from ..checks import Array, array, callable_, covariance, generator
+from ..linalg import _cholesky
 
 __all__ = ["Update", "joined", "stackable", "unchecked", "update"]
 
@@ -26,7 +27,7 @@ Update = Callable[..., Array]
 
 
 def update(
-    function: Callable[Concatenate[Array, Array, Array, Array, P], Array],
+    function: Callable[Concatenate[Array, Array, Array, Array, P], Array]
 ) -> Callable[Concatenate[ArrayLike, ArrayLike, ArrayLike, ArrayLike, P], Array]:
     """Let a function that computes an update check what it is given.
 
@@ -57,14 +58,12 @@ def update(
            [3.]])
     """
 
+    callable_(function, "function")
+
     @wraps(function)
     def checked(
-        ensemble: ArrayLike,
-        predicted: ArrayLike,
-        observed: ArrayLike,
-        noise: ArrayLike,
-        *args: P.args,
-        **options: P.kwargs,
+        ensemble: ArrayLike, predicted: ArrayLike, observed: ArrayLike, noise: ArrayLike,
+        *args: P.args, **options: P.kwargs,
     ) -> Array:
         x = array(ensemble, "ensemble", (..., "N", "d"))
         if x.shape[-2] < 2:
@@ -74,7 +73,8 @@ def update(
         y = array(observed, "observed", (..., m))
         if y.shape not in ((m,), (*x.shape[:-2], m)):
             raise ValueError(f"observed: needs shape {(*x.shape[:-2], m)}, got {y.shape}")
-        y = np.broadcast_to(y, (*x.shape[:-2], m))
+        if y.ndim < x.ndim - 1:
+            y = np.broadcast_to(y, (*x.shape[:-2], m))
         r = covariance(noise, "noise", m)
         if r.shape[:-2] and np.broadcast_shapes(r.shape[:-2], x.shape[:-2]) != x.shape[:-2]:
             raise ValueError(f"noise: needs leading axes {x.shape[:-2]}, got {r.shape[:-2]}")
@@ -89,8 +89,6 @@ def update(
 def unchecked(update: Update) -> Update:
     """The update without its checks, with the options that :func:`functools.partial` gave it.
 
-    Examples
-    --------
     >>> unchecked(print) is print
     True
     """
@@ -104,8 +102,6 @@ def stackable(update: Update) -> bool:
 
     True for every update of this package; a plain function gets one agent's at a time.
 
-    Examples
-    --------
     >>> stackable(print)
     False
     """
@@ -117,8 +113,6 @@ def stackable(update: Update) -> bool:
 def joined(wrapper: Callable[..., Array], inner: Update) -> Update:
     """A wrapper's own door, as stackable as what it wraps.
 
-    Examples
-    --------
     >>> stackable(joined(lambda x, h, y, r, *, rng: x, print))
     False
     """
@@ -127,11 +121,7 @@ def joined(wrapper: Callable[..., Array], inner: Update) -> Update:
     return out
 
 
-def perturbed(
-    predicted: Array, noise: Array, rng: np.random.Generator
-) -> Array:
+def perturbed(predicted: Array, noise: Array, rng: np.random.Generator) -> Array:
     """Predictions with a draw of the noise each, (..., N, m)."""
-    root = np.linalg.cholesky(noise)
+    root = _cholesky(noise)
     return predicted + rng.standard_normal(predicted.shape) @ np.swapaxes(root, -1, -2)
-
-

@@ -15,7 +15,7 @@ __all__ = ["exact_forecast", "sampled_forecast"]
 def sampled_forecast(
     ensemble: ArrayLike, model: Model, t: float, dt: float, *, rng: np.random.Generator
 ) -> Array:
-    """Move every member with the model and add an independent draw of the noise.
+    """Move every member with the model and add an independent draw of the noise, (..., N, d).
 
     Parameters
     ----------
@@ -25,11 +25,6 @@ def sampled_forecast(
     t, dt : float
         From when, and how far, in s.
     rng : numpy.random.Generator
-
-    Returns
-    -------
-    ndarray, (..., N, d)
-        Members at time `t` + `dt`.
 
     Examples
     --------
@@ -53,15 +48,6 @@ def exact_forecast(
     ----------
     ensemble, model, t, dt, rng
         As for :func:`sampled_forecast`; more members than d + the rank of Q.
-
-    Returns
-    -------
-    ndarray, (..., N, d)
-
-    Raises
-    ------
-    ValueError
-        If there are too few members for such draws.
 
     Examples
     --------

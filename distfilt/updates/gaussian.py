@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.fft import dct
+from scipy.linalg.lapack import dposv
 
 from ..checks import Array, choice, number
-from ..ensembles import exact_noise
+from ..ensembles import _mean, exact_noise
 from .door import perturbed, update
 
 __all__ = ["exact_draws", "known_noise", "sampled_noise", "square_root"]
@@ -23,14 +24,17 @@ __all__ = ["exact_draws", "known_noise", "sampled_noise", "square_root"]
 
 def _centred(members: Array) -> tuple[Array, Array]:
     """Mean (..., 1, d) and anomalies of members (..., N, d)."""
-    n = members.shape[-2]
-    centre = (np.full(n, 1 / n) @ members)[..., None, :]
+    centre = _mean(members)[..., None, :]
     return centre, members - centre
 
 
 def _gain(inner: Array, a: Array, b: Array) -> Array:
     """The gain transposed, (..., m, d): one solve for all members."""
     cross = np.swapaxes(b, -1, -2) @ a / (a.shape[-2] - 1)
+    if inner.ndim == 2 and inner.size:
+        _, gain, failed = dposv(inner, cross, lower=1)  # a third of numpy's time for one ensemble
+        if not failed:
+            return np.asarray(gain)
     return np.asarray(np.linalg.solve(inner, cross))
 
 
@@ -40,12 +44,7 @@ def _inner(b: Array) -> Array:
 
 @update
 def sampled_noise(
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
-    rng: np.random.Generator,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator
 ) -> Array:
     r"""The ensemble Kalman filter's update with both covariances sampled, perturbations included.
 
@@ -67,16 +66,6 @@ def sampled_noise(
         Covariance R of the observation's noise, positive definite.
     rng : numpy.random.Generator
         Source of the perturbations :math:`\zeta_i\sim N(0, \mathbf R)`.
-
-    Returns
-    -------
-    ndarray, (..., N, d)
-        Analysis members.
-
-    Raises
-    ------
-    ValueError
-        If a shape or the covariance is wrong, a number is not finite, or N ≤ m.
 
     Notes
     -----
@@ -102,14 +91,8 @@ def sampled_noise(
 
 @update
 def known_noise(
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
-    rng: np.random.Generator,
-    shrinkage: float = 0.0,
-    ridge: float = 0.0,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
+    shrinkage: float = 0.0, ridge: float = 0.0,
 ) -> Array:
     r"""Update with R itself in the gain, where :func:`sampled_noise` has a sample covariance.
 
@@ -126,15 +109,6 @@ def known_noise(
     ridge : float
         At least 0: the diagonal of :math:`\hat{\mathbf C}_{hh}+\mathbf R` is multiplied by one plus
         it.
-
-    Returns
-    -------
-    ndarray, (..., N, d)
-
-    Raises
-    ------
-    ValueError
-        As in :func:`sampled_noise`, or if an option is out of its bounds.
 
     Examples
     --------
@@ -161,12 +135,7 @@ def known_noise(
 
 @update
 def exact_draws(
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
-    rng: np.random.Generator,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator
 ) -> Array:
     r"""Update with perturbations that are exact to second order.
 
@@ -180,15 +149,6 @@ def exact_draws(
     ensemble, predicted, observed, noise, rng
         As in :func:`sampled_noise`; more than d + 2m members (d + m where the predictions are
         linear in the members).
-
-    Returns
-    -------
-    ndarray, (..., N, d)
-
-    Raises
-    ------
-    ValueError
-        As in :func:`sampled_noise`, or if there are too few members for such draws.
 
     Examples
     --------
@@ -207,12 +167,7 @@ def exact_draws(
 
 @update
 def square_root(
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
-    rng: np.random.Generator,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
     rotation: str = "random",
 ) -> Array:
     r"""Update mean and anomalies without perturbations, then turn the anomalies at random.
@@ -230,10 +185,6 @@ def square_root(
         As in :func:`sampled_noise`; two members are enough.
     rotation : {"random", "none"}
         Whether the anomalies are turned.
-
-    Returns
-    -------
-    ndarray, (..., N, d)
 
     Notes
     -----

@@ -6,22 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import Array
+from ..checks import Array, callable_
 from .door import Update, unchecked
 
 __all__ = ["Rows", "with_missing"]
 
 
 def with_missing(
-    update: Update,
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
+    update: Update, ensemble: Array, predicted: Array, observed: Array, noise: Array, *,
     rng: np.random.Generator,
 ) -> Array:
-    """Apply an update where NaN marks a missing component of the observation.
+    """Apply an update where NaN marks a missing component; without any reading nothing moves.
 
     Ensembles that miss the same components are updated together, so a batch costs one call for
     each pattern.
@@ -38,11 +33,6 @@ def with_missing(
     noise : ndarray, (m, m) or (..., m, m)
     rng : numpy.random.Generator
 
-    Returns
-    -------
-    ndarray, (..., N, d)
-        Ensembles without any reading are returned as they came.
-
     Examples
     --------
     >>> from distfilt.updates import exact_draws
@@ -53,7 +43,7 @@ def with_missing(
     >>> float(after.mean().round(12))
     0.5
     """
-    inner = unchecked(update)
+    inner = unchecked(callable_(update, "update"))
     m = observed.shape[-1]
     lead = observed.shape[:-1]
     # What is drawn for an ensemble depends on its place and on how many readings it has, not on
@@ -95,15 +85,9 @@ def _stream(
 
 
 class Rows(np.random.Generator):
-    """Normal draws for all ensembles of a batch, of which some are asked for.
+    """Normal draws for all ensembles of a batch (*lead), of which those in `where` are asked for.
 
-    Parameters
-    ----------
-    seed : list of int
-    lead : tuple of int
-        Leading axes of the batch.
-    where : ndarray of int or None
-        Which of its ensembles, counted flat; all of them if None.
+    `where` counts them flat; None stands for all.
     """
 
     def __init__(self, seed: list[int], lead: tuple[int, ...], where: Any) -> None:

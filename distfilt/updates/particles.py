@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import logsumexp
 
 from ..checks import Array, array, choice, covariance, generator, number, weights
-from ..linalg import factor
+from ..linalg import _cholesky, _solve_lower, factor
 
 __all__ = ["RESAMPLING", "Particles", "effective_size", "jitter", "resample", "resampled"]
 
@@ -28,11 +27,6 @@ class Particles:
     points : array_like, (..., N, d)
     log_weights : array_like, (..., N)
         Logarithms of the weights; they are normalised here, and -inf is a weight of zero.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ, a point is not finite, or all weights of a set are zero.
 
     Examples
     --------
@@ -73,7 +67,7 @@ def _normalised(log_weights: ArrayLike, shape: tuple[int, ...]) -> Array:
         raise ValueError("log_weights: needs numbers below infinity, got NaN or infinity")
     if np.isneginf(w.max(axis=-1)).any():
         raise ValueError("log_weights: needs a positive weight in every set, got only zeros")
-    return np.asarray(w - logsumexp(w, axis=-1, keepdims=True))
+    return w - _log_sum(w)
 
 
 def effective_size(log_weights: ArrayLike) -> Array:
@@ -86,18 +80,29 @@ def effective_size(log_weights: ArrayLike) -> Array:
     log_weights : array_like, (..., N)
         Logarithms of weights, in any normalisation.
 
-    Raises
-    ------
-    ValueError
-        If all weights are zero or one is not a number.
-
     Examples
     --------
     >>> float(effective_size(np.log([0.5, 0.25, 0.25])).round(4))
     2.6667
     """
     w = array(log_weights, "log_weights", (..., "N"), finite=False)
-    return np.asarray(np.exp(-logsumexp(2.0 * _normalised(w, w.shape), axis=-1)))
+    if not w.shape[-1]:
+        raise ValueError(f"log_weights: needs at least one, got shape {w.shape}")
+    return _effective_size(_normalised(w, w.shape))
+
+
+def _effective_size(log_weights: Array) -> Array:
+    """As the public one, of normalised weights."""
+    w = np.exp(log_weights)
+    return np.asarray(1 / (w * w).sum(axis=-1))
+
+
+def _log_sum(logs: Array) -> Array:
+    """Logarithm of the sum of exponentials (..., 1), a tenth of scipy's time for short vectors."""
+    most = logs.max(axis=-1, keepdims=True)
+    most = np.where(np.isfinite(most), most, 0.0)
+    with np.errstate(divide="ignore"):
+        return np.asarray(most + np.log(np.exp(logs - most).sum(axis=-1, keepdims=True)))
 
 
 def resampled(
@@ -119,11 +124,6 @@ def resampled(
     -------
     ndarray of int, (..., N)
         Indices; in ascending order but for the rule ``"residual"``.
-
-    Raises
-    ------
-    ValueError
-        If a weight is negative, the sum is not one, or the rule is unknown.
 
     Notes
     -----
@@ -201,15 +201,8 @@ def resample(
 
     Parameters
     ----------
-    particles : Particles
-    rng : numpy.random.Generator
-    rule : {"systematic", "stratified", "residual", "multinomial"}
-        As for :func:`resampled`.
-
-    Raises
-    ------
-    ValueError
-        If an argument is of another kind or the rule is unknown.
+    particles, rng, rule
+        What to resample; the others as for :func:`resampled`.
 
     Examples
     --------
@@ -226,10 +219,7 @@ def resample(
 
 
 def jitter(
-    points: ArrayLike,
-    *,
-    rng: np.random.Generator,
-    bandwidth: float | None = None,
+    points: ArrayLike, *, rng: np.random.Generator, bandwidth: float | None = None,
     cov: ArrayLike | None = None,
 ) -> Array:
     r"""Move equally weighted particles apart without moving their mean or covariance.
@@ -268,6 +258,8 @@ def jitter(
     """
     x = array(points, "points", (..., "N", "d"))
     n, d = x.shape[-2:]
+    if not n:
+        raise ValueError(f"points: needs at least one, got shape {x.shape}")
     h = min(1.0, (4 / (n * (d + 2))) ** (1 / (d + 4)))
     if bandwidth is not None:
         h = number(bandwidth, "bandwidth", above=0, at_most=1)
@@ -283,3 +275,33 @@ def _jittered(x: Array, cov: Array, h: float, drawn: Array) -> Array:
     centre = x.mean(axis=-2, keepdims=True)
     moved = drawn @ np.swapaxes(factor(cov), -1, -2)
     return np.asarray(centre + np.sqrt(1 - h * h) * (x - centre) + h * moved)
+
+def _weighed(log_weights: Array, predicted: Array, observed: Array, noise: Array) -> Array:
+    """Log-weights (..., N), normalised, after a reading; refused where it rules out every point."""
+    joint = log_weights + _log_likelihood(predicted, observed, noise)
+    total = _log_sum(joint)
+    if not np.isfinite(total).all():
+        raise ArithmeticError("every particle has a likelihood of zero")
+    # A weight of zero is minus infinity; kept finite, so that it can be told from failure.
+    return np.asarray(np.maximum(joint - total, -1e300))
+
+
+def _log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
+    """Log-likelihood of each particle's prediction (..., N, m) but for a constant, (..., N)."""
+    missing = np.isnan(observed) | np.isnan(predicted).any(axis=-2)
+    gap = observed[..., None, :] - predicted
+    cov = noise
+    if missing.any():
+        # A missing component gets a zero residual and a unit of its own in R.
+        here = ~missing[..., :, None] & ~missing[..., None, :]
+        cov = np.where(here, noise, np.eye(noise.shape[-1]))
+        gap = np.where(missing[..., None, :], 0.0, gap)
+    # One solve with all particles as right-hand sides: the factor is the same for them.
+    half = _solve_lower(_cholesky(cov), np.swapaxes(gap, -1, -2))
+    return np.asarray(-0.5 * (half**2).sum(axis=-2))
+
+
+def _distinct(points: Array) -> Array:
+    """Share of particles that differ from all before them, (...)."""
+    first = np.sort(points[..., 0], axis=-1)
+    return np.asarray((1 + (np.diff(first, axis=-1) > 0).sum(axis=-1)) / points.shape[-2])

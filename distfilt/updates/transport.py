@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,20 +12,14 @@ from ..ensembles import anomalies, cross_covariance, sample_covariance
 from ..triangular import ConditionalMap, affine, compose
 from .door import perturbed, update
 
-__all__ = [
-    "informed_directions",
-    "principal_components",
-    "principal_directions",
-    "transport",
+__all__ = [  # fmt: skip
+    "informed_directions", "principal_components", "principal_directions", "transport",
     "transport_sample",
 ]
 
 
-class Fit(Protocol):
-    """An estimator of a map from samples."""
-
-    def __call__(self, y: Array, x: Array, /) -> ConditionalMap:
-        """The map that takes the samples to the reference."""
+Fit = Callable[[Array, Array], ConditionalMap]
+"""``fit(y, x) -> map``: an estimator of the map that takes the samples to the reference."""
 
 
 def _noisy(seen: Array, noise: Array, factor: float, rng: np.random.Generator) -> Array:
@@ -36,14 +29,8 @@ def _noisy(seen: Array, noise: Array, factor: float, rng: np.random.Generator) -
 
 @update
 def transport(
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
-    rng: np.random.Generator,
-    fit: Fit = affine.fit,
-    noise_factor: float = 1.0,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
+    fit: Fit = affine.fit, noise_factor: float = 1.0,
 ) -> Array:
     """Condition an ensemble with a composed map, equations (10)-(13) of Grange et al.
 
@@ -52,32 +39,15 @@ def transport(
 
     Parameters
     ----------
-    ensemble : array_like, (..., N, d)
-        Forecast members.
-    predicted : array_like, (..., N, m)
-        What each member would observe, without noise. Readings that wrap have to lie on the
-        branch of `observed`.
-    observed : array_like, (..., m)
-        The observation y*.
-    noise : array_like, (m, m) or (..., m, m)
-        Its covariance; a draw of it is added to each prediction.
-    rng : numpy.random.Generator
-        Source of that draw.
+    ensemble, predicted, observed, noise, rng
+        As in :func:`~distfilt.updates.sampled_noise`; a draw of the noise is added to each
+        prediction.
     fit : callable
         ``fit(y, x) -> map``: an estimator of the map, such as
         :func:`distfilt.triangular.separable.fit` with its options.
     noise_factor : float
         By what the drawn noise is multiplied. Anything but one is a mistake; chapter 4 shows what
         zero and a hundredth do.
-
-    Returns
-    -------
-    ndarray, (..., N, d)
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit, `noise` is not positive definite, or N is too small for the map.
 
     Examples
     --------
@@ -93,12 +63,7 @@ def transport(
 
 @update
 def transport_sample(
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
-    rng: np.random.Generator,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
     fit: Fit = affine.fit,
 ) -> Array:
     r"""Draw a new ensemble from the conditional by the inverse map alone, equation (9).
@@ -111,14 +76,8 @@ def transport_sample(
 
     Parameters
     ----------
-    ensemble, predicted, observed, noise, fit
-        As in :func:`transport`.
-    rng : numpy.random.Generator
-        Source of the noise in the predictions and of the reference samples.
-
-    Returns
-    -------
-    ndarray, (..., N, d)
+    ensemble, predicted, observed, noise, rng, fit
+        As in :func:`transport`; the reference samples are drawn too.
 
     Examples
     --------
@@ -143,17 +102,14 @@ def principal_directions(ensemble: ArrayLike, n: int) -> Array:
     n : int
         How many, at most d.
 
-    Returns
-    -------
-    ndarray, (..., d, n)
-        By descending variance. Signs are free, and cancel in every use here.
-
     Examples
     --------
     >>> principal_directions([[-3.0, 0.1], [3.0, 0.1], [0.0, -0.1]], 1).round(2).tolist()
     [[1.0], [0.0]]
     """
     cov = sample_covariance(ensemble)
+    if not np.isfinite(cov).all():
+        raise ValueError("ensemble: needs members of finite variance, got infinity")
     if count(n, "n") > cov.shape[-1]:
         raise ValueError(f"n: needs at most {cov.shape[-1]} directions, got {n}")
     _, vectors = np.linalg.eigh(cov)
@@ -164,17 +120,9 @@ def principal_directions(ensemble: ArrayLike, n: int) -> Array:
 
 @update
 def principal_components(
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
-    rng: np.random.Generator,
-    n_state: int,
-    n_observed: int,
-    complement: str = "keep",
-    noise_factor: float = 1.0,
-    fit: Callable[[Array, Array], ConditionalMap] = affine.fit,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
+    n_state: int, n_observed: int, complement: str = "keep", noise_factor: float = 1.0,
+    fit: Fit = affine.fit,
 ) -> Array:
     r"""Condition in the leading principal directions only, Algorithm 2 of Grange et al.
 
@@ -191,15 +139,6 @@ def principal_components(
         What happens to the state outside the leading directions. ``"keep"`` leaves it as it was.
         ``"drop"`` sets it to the mean. ``"literal"`` is line 8 as printed, which maps uncentred
         states and so also drops the mean there.
-
-    Returns
-    -------
-    ndarray, (..., N, d)
-
-    Raises
-    ------
-    ValueError
-        As in :func:`transport`, or if `n_state` exceeds d.
 
     Examples
     --------
@@ -233,12 +172,7 @@ def principal_components(
 
 @update
 def informed_directions(
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
-    *,
-    rng: np.random.Generator,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
     threshold: float = 0.05,
 ) -> Array:
     r"""Condition only on the directions of the observation in which signal stands above noise.
@@ -255,10 +189,6 @@ def informed_directions(
         As in :func:`transport`; two members are enough.
     threshold : float
         Smallest signal-to-noise ratio τ that counts, at least 0; 0 leaves nothing out.
-
-    Returns
-    -------
-    ndarray, (..., N, d)
 
     Examples
     --------

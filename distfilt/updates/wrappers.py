@@ -28,15 +28,8 @@ def inflated(update: Update, *, factor: float) -> Update:
 
     Parameters
     ----------
-    update : callable
-        Any update.
-    factor : float
-        Positive; the standard deviations grow by it in every update.
-
-    Returns
-    -------
-    callable
-        An update.
+    update, factor
+        Any update; by what its standard deviations grow each time, positive.
 
     Notes
     -----
@@ -62,22 +55,15 @@ def inflated(update: Update, *, factor: float) -> Update:
 
 
 def gated(update: Update, *, probability: float = 0.999) -> Update:
-    r"""Leave out readings whose innovation is too large to believe.
+    r"""Leave out readings whose innovation is too large to believe; with none left, nothing moves.
 
     A component passes where :math:`(y^*-\bar h)^2 \le q^2(\hat C_{hh}+R)`, each judged alone, with
     q such that a consistent filter rejects a reading with probability one minus `probability`.
 
     Parameters
     ----------
-    update : callable
-        Any update.
-    probability : float
-        Between 0 and 1: how likely a good reading passes.
-
-    Returns
-    -------
-    callable
-        An update; with no reading left it returns the forecast.
+    update, probability
+        Any update; how likely a good reading passes, between 0 and 1.
 
     Examples
     --------
@@ -131,11 +117,6 @@ def centred(update: Update) -> Update:
     update : callable
         An update that perturbs by ``rng.standard_normal((..., N, m))``, as all of this package do.
 
-    Returns
-    -------
-    callable
-        An update that advances `rng` as the given one does.
-
     Examples
     --------
     >>> from distfilt.updates import known_noise
@@ -184,12 +165,7 @@ def serial(update: Update) -> Update:
     callable_(update, "update")
 
     def one_by_one(
-        x: Array,
-        h: Array,
-        y: Array,
-        r: Array,
-        *,
-        rng: np.random.Generator,
+        x: Array, h: Array, y: Array, r: Array, *, rng: np.random.Generator,
         predict: Callable[[Array], Array] | None = None,
     ) -> Array:
         d = x.shape[-1]

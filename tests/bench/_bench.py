@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib
 import os
 import platform
 import resource
@@ -17,7 +18,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-__all__ = ["Timing", "machine", "timed", "versions", "write"]
+__all__ = ["Timing", "interleaved", "machine", "peer", "timed", "versions", "write"]
 
 FOLDER = Path(__file__).resolve().parents[2] / "data" / "bench"
 
@@ -47,6 +48,46 @@ def timed(function: Callable[[], Any], repeats: int = 3) -> Timing:
             wall.append(time.perf_counter() - start)
             cpu.append(time.process_time() - start_cpu)
     return Timing(statistics.median(cpu), statistics.median(wall), repeats, peak_mb(), result)
+
+
+def interleaved(
+    functions: Mapping[str, Callable[[], Any]], rounds: int = 15, seconds: float = 0.02
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Processor time in s of a call of each, and the first one's speed as a multiple of each.
+
+    After a warm-up the functions take turns, so that what disturbs one disturbs all: medians over
+    the rounds, of the times and of the ratios within a round. A turn is as many calls as take
+    `seconds`.
+    """
+    times: dict[str, list[float]] = {name: [] for name in functions}
+    with threadpool_limits(limits=1):
+        calls = {}
+        for name, function in functions.items():
+            function()
+            began = time.perf_counter()
+            function()
+            calls[name] = max(1, int(seconds / max(time.perf_counter() - began, 1e-7)))
+        for _ in range(rounds):
+            for name, function in functions.items():
+                began = time.process_time()
+                for _ in range(calls[name]):
+                    function()
+                times[name].append((time.process_time() - began) / calls[name])
+    first = next(iter(times.values()))
+    ratios = {
+        name: statistics.median(b / a for a, b in zip(first, spent, strict=True))
+        for name, spent in times.items()
+    }
+    return {name: statistics.median(spent) for name, spent in times.items()}, ratios
+
+
+def peer(name: str) -> Any:
+    """A module of another package (the extra ``peers``), or None with a word that it is missing."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        print(f"{name}: left out ({error})", file=sys.stderr)
+        return None
 
 
 def peak_mb() -> float:

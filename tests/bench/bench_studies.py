@@ -5,8 +5,9 @@
 A trial sleeps for 10 ms and returns how long it really took. The overhead per trial is what the
 workers spent on anything else: workers * wall time / trials - mean time of a trial. It is measured
 on a pool whose processes run already, the median of several studies; starting the processes is
-timed apart. Beside it: every trial as a chunk of its own, and loky itself with one call a trial.
-Ends with an error if `run` takes more than 0.5 ms a trial.
+timed apart. Beside it: every trial as a chunk of its own, loky itself with one call a trial, the
+standard library's pool with chunks, and joblib. Ends with an error if `run` on two workers takes
+more than 0.15 ms a trial.
 """
 
 from __future__ import annotations
@@ -15,17 +16,18 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from _bench import write
+from _bench import peer, write
 from loky import get_reusable_executor
 from numpy.random import SeedSequence
 
 from distfilt import studies
 
-TRIALS, REPEATS, LENGTH, REQUIRED_MS = 400, 7, 0.010, 0.5
+TRIALS, REPEATS, LENGTH, REQUIRED_MS = 400, 7, 0.010, 0.15
 
 
 def trial(seed: SeedSequence) -> float:
@@ -44,6 +46,20 @@ def by_loky(workers: int) -> Callable[[], Sequence[float]]:
     return lambda: list(get_reusable_executor(workers).map(trial, seeds))
 
 
+def by_pool(workers: int) -> Callable[[], Sequence[float]]:
+    """What a user of the standard library writes, with a chunk size found by trying."""
+    seeds, pool = studies.spawn(1, TRIALS), ProcessPoolExecutor(workers)
+    return lambda: list(pool.map(trial, seeds, chunksize=20))
+
+
+def by_joblib(workers: int) -> Callable[[], Sequence[float]] | None:
+    joblib = peer("joblib")
+    if joblib is None:
+        return None
+    seeds = studies.spawn(1, TRIALS)
+    return lambda: joblib.Parallel(n_jobs=workers)(joblib.delayed(trial)(s) for s in seeds)
+
+
 def overheads(call: Callable[[], Sequence[float]], workers: int) -> tuple[list[float], float]:
     """Overhead of each repeat, in ms a trial, and what the first call took longer, in s."""
     out, walls = [], []
@@ -60,11 +76,18 @@ def main() -> int:
     for workers in (1, 2):
         cases = {"run": by_run(workers, None)}
         if workers > 1:
-            cases |= {"run, chunk=1": by_run(workers, 1), "loky, a call a trial": by_loky(workers)}
+            cases |= {
+                "run, chunk=1": by_run(workers, 1),
+                "loky, a call a trial": by_loky(workers),
+                "ProcessPoolExecutor, chunks of 20": by_pool(workers),
+                "joblib": by_joblib(workers),
+            }
         for name, call in cases.items():
+            if call is None:
+                continue
             found, start = overheads(call, workers)
             median = statistics.median(found)
-            required = REQUIRED_MS if name == "run" else None
+            required = REQUIRED_MS if name == "run" and workers > 1 else None
             if required is not None and median > required:
                 missed.append(f"{name} on {workers} workers: {median:.2f} ms")
             rows.append(

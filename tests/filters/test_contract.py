@@ -106,6 +106,19 @@ def test_observations_reach_one_link(family: str) -> None:
 
 
 @EACH
+def test_faults_between_two_times(family: str) -> None:
+    """Agent 0's radio is off from 1 s to before 2 s: who hears it is blind at 1 s only."""
+    off = Faults(silent=[0], during=[(1.0, 2.0)], clock="time")
+    sensors = [direct([0], std=0.5), None]
+    f, state = made(family, sensors=sensors, agreement=None, faults=off)
+    heard = []
+    for t in (0.5, 1.0, 2.0):
+        before, state = state, f.step(state, t, [[0.3], None])
+        heard.append(int((state.ledger.messages - before.ledger.messages)[0]))
+    assert heard == [1, 0, 1]
+
+
+@EACH
 def test_share_false_sends_nothing(family: str) -> None:
     f, start = made(family, share=False, sensors=[direct([0], std=0.5), None], agreement=None)
     out = f.step(start, 0.5, [[0.3], None])
@@ -325,6 +338,7 @@ def test_bad_run_is_named_and_others_go_on(family: str) -> None:
         ("share", {"share": 1}),
         ("faults", {"faults": 0.2}),
         ("faults", {"faults": Faults(delay=1)}),
+        ("faults", {"faults": Faults(loss=0.1) | Faults(delay=1)}),
         ("lag", {"lag": -1}),
         ("names", {"names": ("A",)}),
         ("failures", {"failures": "hide"}),

@@ -177,6 +177,24 @@ def test_collapse_warns_with_step_and_share_and_jitter_helps() -> None:
     assert run["distinct"].values[-1] > 0.5 and run["variance"].values[-1] > 1e-7
 
 
+@pytest.mark.parametrize("jitter", [0.0, 0.3])
+def test_one_weight_for_all_warns_although_the_particles_are_distinct(jitter: float) -> None:
+    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    f = ParticleFilter(still, [direct([0], std=1e-4)], members=800, jitter=jitter)
+    start = f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0))
+    with pytest.warns(ParticleCollapse, match=r"t = 1 s: an agent's weights .* size of 1\.\d;"):
+        summary = f.summary(f.step(start, 1.0, [[0.5]]))
+    assert summary.numbers["distinct"] == 1.0 and summary.numbers["effective_size"] < 2
+
+
+def test_copies_of_one_particle_warn_at_any_number() -> None:
+    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    f = ParticleFilter(still, [None], members=50)
+    start = f.start(([0.0], [[0.0]]), rng=np.random.default_rng(0))
+    with pytest.warns(ParticleCollapse, match="2.00% of an agent's particles are distinct"):
+        f.step(start, 1.0, [None])
+
+
 def test_update_that_fails_in_one_run_is_named() -> None:
     def fragile(x: np.ndarray, h: np.ndarray, y: np.ndarray, r: np.ndarray, *, rng: object):
         if (y > 5).any():

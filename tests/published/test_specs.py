@@ -27,7 +27,6 @@ BAD_INPUT = named(
             ("key", lambda: S["solver"]),
             ("key", lambda: S.unit("gian")),
             ("key", lambda: S.source("gian")),
-            ("key", lambda: S.reason("gian")),
             ("key", lambda: S.parameter(3)),
             ("key", lambda: S.replace(gian=0.1)),
             ("value", lambda: S.replace(gain=None)),
@@ -171,7 +170,7 @@ def test_a_reading_remembers_what_was_taken():
     s = S.reading()
     assert s.used == () and len(s.unread) == len(S.parameters) + 4 * 3
     assert isinstance(s, Reading) and s["gain"] == S["gain"] and "members" in s
-    assert s.unit("members") == "1" and s.reason("members") and list(s) == list(S)
+    assert s.unit("members") == "1" and s.parameter("members").why and list(s) == list(S)
     repr(s), s._repr_html_(), s._repr_markdown_(), s.digest, s.changes, s.entries()
     assert s.used == ("gain",)
     first = s.agents[0]

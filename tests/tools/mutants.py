@@ -1,16 +1,20 @@
 """How many random faults in the library do its tests find?
 
     python tests/tools/mutants.py [--sample 300] [--seed 1] [--jobs 2] [--only network]
+        [--stages 4] [--minutes 30]
 
 cosmic-ray lists the places where the library's code can be changed (an operator, a comparison, a
 number, a keyword) and makes the change; a seeded sample of places is drawn, and one change at each.
 A mutant is tested in stages, the nearest tests first: the file that mirrors the module with its own
-examples, then the module's folder of tests, then all tests but those of the book. It survives if
-all pass. A change of a type or a text only is no fault and is not drawn.
+examples, then the contracts that every family passes, then the module's folder of tests, then all
+tests but those of the book. It survives if all pass; ``--stages`` stops earlier, and the table's
+column says how far a survivor came. A change of a type or a text only is no fault and is not drawn.
 
 Writes ``data/bench/mutants.csv``, a line a mutant. A survivor that is equivalent to the original
 gets a reason there by hand, which a later run of the same mutant keeps; the share of the others is
-the result. Each job works in a copy of the repository.
+the result. With ``--minutes`` the run ends after that time, and the next one goes on: a mutant that
+was killed, or has a reason, or survived as many stages, is not run again. Each job works in a copy
+of the repository, in processes forked from one that has numpy and the other packages in memory.
 """
 
 from __future__ import annotations
@@ -18,25 +22,40 @@ from __future__ import annotations
 import argparse
 import ast
 import csv
+import importlib
+import importlib.util
+import json
 import os
 import random
 import shutil
-import subprocess
+import signal
 import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from queue import Queue
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = ROOT / "data" / "bench" / "mutants.csv"
 COLUMNS = ("module", "line", "was", "becomes", "result", "stage", "seconds", "reason")
-SECONDS = (120, 600, 3000)
+SECONDS = (120, 120, 600, 3000)
 """What the tests of each stage may take; a mutant that takes longer hangs, and so is found."""
+CONTRACTS = (
+    "tests/updates/test_contract.py", "tests/filters/test_families.py",
+    "tests/filters/test_contract.py",
+)  # fmt: skip
+FAMILIES = (
+    "linalg", "ensembles", "gaussians", "models", "network", "sensors", "updates", "filters",
+)  # fmt: skip
+"""The rooms that the contracts run through."""
+WARM = (
+    "numpy", "scipy.linalg", "scipy.optimize", "scipy.sparse.csgraph", "scipy.sparse.linalg",
+    "scipy.spatial", "scipy.special", "scipy.stats", "scipy.integrate", "networkx", "xarray",
+    "pandas", "cvxpy", "ot", "filterpy.kalman", "matplotlib.figure", "pytest", "hypothesis",
+    "hypothesis.internal.conjecture.engine", "nbval.plugin", "nbval.kernel", "PIL.Image",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -73,13 +92,13 @@ def mutants(root: Path, only: str) -> Iterator[Mutant]:
     """Every change that can be made to the library's modules."""
     from cosmic_ray.ast import ast_nodes, get_ast
 
-    known = list(operators())
+    every = list(operators())
     for path in sorted((root / "distfilt").rglob("*.py")):
         module = path.relative_to(root).as_posix()
         if path.name == "__init__.py" or not module.startswith(f"distfilt/{only}"):
             continue
         nodes = list(ast_nodes(get_ast(path.read_text(encoding="utf-8"))))
-        for name, arguments, operator in known:
+        for name, arguments, operator in every:
             places = (place for node in nodes for place in operator.mutation_positions(node))
             for occurrence, (start, _) in enumerate(places):
                 yield Mutant(module, name, arguments, occurrence, *start)
@@ -127,56 +146,87 @@ def stages(module: str, root: Path) -> list[list[str]]:
     """The tests to run for a module, nearest first."""
     parts = Path(module).with_suffix("").parts[1:]
     name = f"test_{parts[-1].lstrip('_')}.py"
-    mirror = root.joinpath("tests", *parts[:-1], name)
-    near = [module, *([mirror.relative_to(root).as_posix()] if mirror.is_file() else [])]
-    out = [near]
-    folder = root / "tests" / parts[0]
+    folder = root.joinpath("tests", *parts[:-1])
+    mirrors = [folder / name, root / "tests" / f"test_{parts[0]}.py"]
+    near = [p.relative_to(root).as_posix() for p in mirrors if p.is_file()][:1]
+    out = [[module, *near]]
+    if parts[0] in FAMILIES:
+        out.append([p for p in CONTRACTS if (root / p).is_file()])
     if len(parts) > 1 and folder.is_dir():
-        out.append([folder.relative_to(root).as_posix()])
+        rest = sorted(p.relative_to(root).as_posix() for p in folder.rglob("test_*.py"))
+        out.append([p for p in rest if p not in (*near, *CONTRACTS)])
     left_out = ("book", "tools", "test_package.py")
-    return [*out, ["tests", *(f"--ignore=tests/{name}" for name in left_out)]]
+    out.append(["tests", *(f"--ignore=tests/{name}" for name in left_out)])
+    return [stage for stage in out if stage]
 
 
-def passes(tests: list[str], folder: Path, seconds: int) -> bool:
+def warm() -> None:
+    """Import what the tests import from elsewhere, once for all mutants."""
+    for name in WARM:
+        if importlib.util.find_spec(name.partition(".")[0]) is not None:
+            importlib.import_module(name)
+
+
+def tests_pass(tests: list[str], folder: Path) -> int:
+    """pytest's exit code, in this process, which has not imported the library."""
+    os.setsid()
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(nowhere, stream)
+    os.chdir(folder)
+    os.environ |= {"PYTHONPATH": str(folder), "HYPOTHESIS_PROFILE": "gate"}
+    sys.path.insert(0, str(folder))
+    sys.dont_write_bytecode = True
+    import pytest
+
+    return int(pytest.main(["-q", "-x", "-p", "no:cacheprovider", *tests]))
+
+
+def passes(tests: list[str], folder: Path, seconds: float) -> bool:
     """Whether the tests pass in a copy, in time."""
-    command = [sys.executable, "-B", "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
-    environment = {
-        **os.environ,
-        "PYTHONPATH": str(folder),
-        "HYPOTHESIS_PROFILE": "gate",
-        "OPENBLAS_NUM_THREADS": "1",
-        "OMP_NUM_THREADS": "1",
-    }
-    try:
-        done = subprocess.run(
-            command, cwd=folder, env=environment, timeout=seconds, stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL, start_new_session=True,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        return False
-    return done.returncode in (0, 5)  # 5: no test there
+    child = os.fork()
+    if not child:
+        code = 1
+        try:
+            code = tests_pass(tests, folder)
+        finally:
+            os._exit(code)
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        done, status = os.waitpid(child, os.WNOHANG)
+        if done:
+            return os.waitstatus_to_exitcode(status) in (0, 5)  # 5: no test there
+        time.sleep(0.02)
+    os.killpg(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return False
 
 
-def tested(mutant: Mutant, folder: Path) -> dict[str, Any]:
-    """The line of the table for one mutant, from the copy in that folder."""
-    path = folder / mutant.module
-    text = path.read_text(encoding="utf-8")
-    changed = mutant.source(text)
-    pairs = zip(text.splitlines(), changed.splitlines(), strict=False)
+def described(mutant: Mutant, root: Path) -> dict[str, Any]:
+    """The line of the table for a mutant that was not run."""
+    text = (root / mutant.module).read_text(encoding="utf-8")
+    pairs = zip(text.splitlines(), mutant.source(text).splitlines(), strict=False)
     was, becomes = next((a.strip(), b.strip()) for a, b in pairs if a != b)
     row: dict[str, Any] = {"module": mutant.module, "line": mutant.line, "was": was}
-    row |= {"becomes": becomes, "result": "survived", "stage": "", "reason": ""}
+    return row | {"becomes": becomes, "result": "", "stage": "", "seconds": "", "reason": ""}
+
+
+def tested(mutant: Mutant, folder: Path, most: int) -> dict[str, Any]:
+    """What became of one mutant in the copy in that folder."""
+    path = folder / mutant.module
+    text = path.read_text(encoding="utf-8")
+    found: dict[str, Any] = {"result": "survived"}
     began = time.perf_counter()
-    path.write_text(changed, encoding="utf-8")
+    path.write_text(mutant.source(text), encoding="utf-8")
     try:
-        tests = stages(mutant.module, folder)
-        for stage, names in enumerate(tests, start=1):
-            if not passes(names, folder, SECONDS[min(stage, len(SECONDS)) - 1]):
-                row |= {"result": "killed", "stage": stage}
+        for stage, names in enumerate(stages(mutant.module, folder)[:most], start=1):
+            found["stage"] = stage
+            if not passes(names, folder, SECONDS[stage - 1]):
+                found["result"] = "killed"
                 break
     finally:
         path.write_text(text, encoding="utf-8")
-    return row | {"seconds": f"{time.perf_counter() - began:.0f}"}
+    return found | {"seconds": f"{time.perf_counter() - began:.0f}"}
 
 
 def copied(root: Path, folder: Path) -> Path:
@@ -186,32 +236,59 @@ def copied(root: Path, folder: Path) -> Path:
     return folder
 
 
-def run(chosen: list[Mutant], root: Path, jobs: int) -> list[dict[str, Any]]:
-    """Every mutant's line, in the sample's order."""
+def run(
+    rows: list[tuple[Mutant, dict[str, Any]]], root: Path, options: argparse.Namespace
+) -> Iterator[None]:
+    """Complete the rows, a job each in a process of its own; yields after each one."""
     with tempfile.TemporaryDirectory(prefix="mutants-") as scratch:
-        free: Queue[Path] = Queue()
-        for k in range(jobs):
-            free.put(copied(root, Path(scratch) / str(k)))
-
-        def one(mutant: Mutant) -> dict[str, Any]:
-            folder = free.get()
-            try:
-                row = tested(mutant, folder)
-            finally:
-                free.put(folder)
+        free = [copied(root, Path(scratch) / str(k)) for k in range(options.jobs)]
+        busy: dict[int, tuple[Path, Path, dict[str, Any]]] = {}
+        end = time.monotonic() + 60 * options.minutes
+        waiting = rows[::-1]
+        while busy or (waiting and time.monotonic() < end):
+            if free and waiting and time.monotonic() < end:
+                folder, (mutant, row) = free.pop(), waiting.pop()
+                answer = Path(scratch) / f"{folder.name}.json"
+                child = os.fork()
+                if not child:
+                    try:
+                        answer.write_text(json.dumps(tested(mutant, folder, options.stages)))
+                    finally:
+                        os._exit(0)
+                busy[child] = folder, answer, row
+                continue
+            folder, answer, row = busy.pop(os.wait()[0])
+            row |= json.loads(answer.read_text())
+            free.append(folder)
             print(f"{row['result']:8} {row['module']}:{row['line']}: {row['becomes']}", flush=True)
-            return row
-
-        with ThreadPoolExecutor(jobs) as pool:
-            return list(pool.map(one, chosen))
+            yield
 
 
-def reasons(table: Path) -> dict[tuple[str, str, str], str]:
-    """The reasons that were given by hand, by module and change."""
+def known(table: Path) -> dict[tuple[str, str, str], dict[str, Any]]:
+    """The lines of an earlier run, by module and change."""
     if not table.is_file():
         return {}
     with table.open(encoding="utf-8", newline="") as lines:
-        return {(r["module"], r["was"], r["becomes"]): r["reason"] for r in csv.DictReader(lines)}
+        return {(r["module"], r["was"], r["becomes"]): r for r in csv.DictReader(lines)}
+
+
+def finished(row: dict[str, Any], root: Path, most: int) -> bool:
+    """Whether another run of the mutant would show nothing new."""
+    if row["result"] == "killed":
+        return True
+    every = len(stages(row["module"], root))
+    return row["result"] == "survived" and int(row["stage"] or 0) >= min(most, every)
+
+
+def stored(rows: list[dict[str, Any]], table: Path) -> None:
+    """Write the table; one write, so that a run that is ended leaves a whole one."""
+    table.parent.mkdir(parents=True, exist_ok=True)
+    part = table.with_suffix(".part")
+    with part.open("w", encoding="utf-8", newline="") as lines:
+        writer = csv.DictWriter(lines, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    part.replace(table)
 
 
 def main(arguments: list[str] | None = None, root: Path = ROOT, table: Path = TABLE) -> int:
@@ -220,21 +297,32 @@ def main(arguments: list[str] | None = None, root: Path = ROOT, table: Path = TA
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", default="", help="a folder or module of the library")
+    parser.add_argument("--stages", type=int, default=len(SECONDS), help="how far to go")
+    parser.add_argument("--minutes", type=float, default=1e6, help="when to stop for now")
+    parser.add_argument("--again", action="store_true", help="run the survivors again")
     options = parser.parse_args(arguments)
+    before = known(table)
     chosen = drawn(root, options.sample, options.seed, options.only)
-    kept = reasons(table)
-    rows = run(chosen, root, options.jobs)
-    for row in rows:
-        row["reason"] = kept.get((row["module"], row["was"], row["becomes"]), "")
-    table.parent.mkdir(parents=True, exist_ok=True)
-    with table.open("w", encoding="utf-8", newline="") as lines:
-        writer = csv.DictWriter(lines, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    killed = sum(row["result"] == "killed" for row in rows)
-    equivalent = sum(row["result"] == "survived" and bool(row["reason"]) for row in rows)
-    share = killed / max(len(rows) - equivalent, 1)
-    print(f"{killed} of {len(rows)} killed, {equivalent} equivalent: {share:.1%} of the others")
+    pairs = []
+    for mutant in chosen:
+        row = described(mutant, root)
+        old = before.get((row["module"], row["was"], row["becomes"]), {})
+        pairs.append((mutant, row | {n: old[n] for n in COLUMNS[4:] if n in old}))
+    again = {"survived"} if options.again else set()
+    waiting = [
+        (m, row) for m, row in pairs
+        if not finished(row, root, options.stages) or (row["result"] in again and not row["reason"])
+    ]  # fmt: skip
+    rows = [row for _, row in pairs]
+    warm()
+    for _ in run(waiting, root, options):
+        stored(rows, table)
+    stored(rows, table)
+    ran = [row for row in rows if row["result"]]
+    killed = sum(row["result"] == "killed" for row in ran)
+    equivalent = sum(row["result"] == "survived" and bool(row["reason"]) for row in ran)
+    share = killed / max(len(ran) - equivalent, 1)
+    print(f"{killed} of {len(ran)} killed, {equivalent} equivalent: {share:.1%} of the others")
     return 0
 
 

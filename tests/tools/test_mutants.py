@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -64,14 +66,44 @@ def test_a_sample_is_the_seed_s_and_has_one_change_a_place(repository: Path) -> 
 def test_nearest_tests_come_first() -> None:
     found = mutants.stages("distfilt/network/channel.py", mutants.ROOT)
     assert found[0] == ["distfilt/network/channel.py", "tests/network/test_channel.py"]
-    assert found[1] == ["tests/network"] and found[2][0] == "tests"
-    assert mutants.stages("distfilt/checks.py", mutants.ROOT)[0][1] == "tests/test_checks.py"
+    assert found[1] == list(mutants.CONTRACTS) and found[3][0] == "tests"
+    assert "tests/network/test_weights.py" in found[2] and found[0][1] not in found[2]
+    for module, test in (("checks", "checks"), ("gaussians/optimal", "gaussians")):
+        near = mutants.stages(f"distfilt/{module}.py", mutants.ROOT)[0]
+        assert near == [f"distfilt/{module}.py", f"tests/test_{test}.py"]
+    update = mutants.stages("distfilt/updates/gaussian.py", mutants.ROOT)
+    assert not set(update[2]) & {*update[0], *mutants.CONTRACTS}
+    assert all((mutants.ROOT / path).is_file() for path in mutants.CONTRACTS)
+
+
+def run(repository: Path, table: Path, *options: str) -> str:
+    """The tool in a process of its own, on that repository."""
+    call = f"import mutants; from pathlib import Path; mutants.main({['--jobs', '2', *options]}, "
+    call += f"Path({str(repository)!r}), Path({str(table)!r}))"
+    tools = Path(mutants.__file__).parent
+    return subprocess.run(
+        [sys.executable, "-c", call], cwd=tools, check=True, capture_output=True, text=True
+    ).stdout
+
+
+@pytest.mark.slow
+def test_a_run_goes_on_where_the_last_one_ended(repository: Path, tmp_path: Path) -> None:
+    table = tmp_path / "mutants.csv"
+    assert "0 of 0 killed" in run(repository, table, "--sample", "4", "--minutes", "0")
+    first = run(repository, table, "--sample", "4")
+    assert first.count("distfilt/a.py") == 4
+    whole = table.read_text()
+    assert run(repository, table, "--sample", "4").count("distfilt/a.py") == 0
+    assert table.read_text() == whole
+    survived = whole.count(",survived,")
+    again = run(repository, table, "--sample", "4", "--again")
+    assert again.count("distfilt/a.py") == survived
 
 
 @pytest.mark.slow
 def test_faults_are_found_or_survive(repository: Path, tmp_path: Path) -> None:
     table = tmp_path / "out" / "mutants.csv"
-    assert mutants.main(["--sample", "50", "--jobs", "2"], repository, table) == 0
+    run(repository, table, "--sample", "50")
     with table.open(newline="") as lines:
         rows = {(r["was"], r["result"]) for r in csv.DictReader(lines)}
     assert ("return x / scale", "killed") in rows and ("return x + 1", "survived") in rows
@@ -81,5 +113,7 @@ def test_faults_are_found_or_survive(repository: Path, tmp_path: Path) -> None:
     table.write_text("\n".join(
         line + "dead code" if ",survived," in line else line for line in text.splitlines()
     ) + "\n")  # fmt: skip
-    mutants.main(["--sample", "50", "--jobs", "2"], repository, table)
+    table.write_text(table.read_text().replace(",killed,", ",,"))
+    run(repository, table, "--sample", "50")
+    assert ",,,dead" not in table.read_text()
     assert table.read_text().count("dead code") == text.count(",survived,") > 0

@@ -21,8 +21,6 @@ BAD_INPUT = {
         ("target", lambda: invert(lambda v: (v, np.ones_like(v)), [NAN])),
         ("target", lambda: invert(lambda v: (np.tanh(v), np.cosh(np.clip(v, -9, 9)) ** -2), [2.0])),
         ("start", lambda: invert(lambda v: (v, np.ones_like(v)), [0.0], start=NAN)),
-        ("width", lambda: invert(lambda v: (v, np.ones_like(v)), [0.0], width=0.0)),
-        ("tolerance", lambda: invert(lambda v: (v, np.ones_like(v)), [0.0], tolerance=0.0)),
     ],
 }
 
