@@ -25,7 +25,7 @@ from ..density import (
 from ..density.kernel import _width
 from ..density.sharing import Seen, Sharing, present_graph
 from ..network import Channel, Faults, Graph, Ledger, graphs
-from .driver import Filter, Late, Summary
+from .driver import Filter, Late, Summary, check_faults
 from .saving import State
 
 __all__ = ["DensityFilter", "DensityState"]
@@ -190,8 +190,7 @@ class DensityFilter(Filter):
         number(self.floor, "floor", above=0)
         if self.process is not None:
             number(self.process, "process", above=0)
-        if self.faults is not None and not isinstance(self.faults, Faults):
-            raise ValueError(f"faults: needs Faults, got {type(self.faults).__name__}")
+        check_faults(self.faults)
         if self.names and len(self.names) != size:
             raise ValueError(f"names: needs {size} names, got {len(self.names)}")
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import ArrayLike
 
 from ..checks import Array, array, count, increasing, number
+from ..network import Faults
 from ..progress import track
 from .record import SCORES, Recorder
 from .saving import State
@@ -215,6 +216,12 @@ class Filter(ABC):
         for then, summary in waiting:
             recorder.add(then, summary)
         return recorder.dataset(last)
+
+
+def check_faults(faults: Any) -> None:
+    """Refuse what is no Faults, and delays: a step's messages arrive within it or never."""
+    if faults is not None and (not isinstance(faults, Faults) or faults.late):
+        raise ValueError(f"faults: needs Faults without a delay, got {faults!r}")
 
 
 def final_state(run: xarray.Dataset) -> State:

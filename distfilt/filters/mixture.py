@@ -16,7 +16,7 @@ from ..mixtures.unscented import POINT_RULES, forecast, update
 from ..models import Model
 from ..network import Channel, Faults, Graph, Ledger
 from ..sensors import Sensor
-from .driver import Filter, Summary
+from .driver import Filter, Summary, check_faults
 from .observations import at_one_time
 from .saving import State
 
@@ -149,6 +149,7 @@ class MixtureFilter(Filter):
             callable_(self.agreement, "agreement")
             if self.graph is None:
                 raise ValueError("graph: needs a Graph for the agreement, got None")
+        check_faults(self.faults)
         count(self.most, "most", at_least=count(self.size, "size"))
         choice(self.rule, "rule", POINT_RULES)
         for name in ("stretch", "gate"):
@@ -226,7 +227,7 @@ class MixtureFilter(Filter):
         ledger = state.ledger
         if self.agreement is not None:
             graph = self.graph if isinstance(self.graph, Graph) else self.graph(now)  # type: ignore[misc]
-            channel = Channel(graph, ledger=ledger, faults=self.faults)
+            channel = Channel(graph, ledger=ledger, faults=self.faults, t=now)
             beliefs = self._agreed(beliefs, channel)
             ledger = channel.ledger
         most = max(_EXACT, self.size)

@@ -24,7 +24,7 @@ from ..ensembles import draw
 from ..models import Model
 from ..network import Channel, Faults, Graph
 from ..sensors import Sensor
-from .driver import Filter, Late
+from .driver import Filter, Late, check_faults
 from .failures import FilterError
 from .heard import Heard, gather
 from .observations import at_one_time, over_times
@@ -97,8 +97,7 @@ class SensorFilter(Filter):
             callable_(self.agreement, "agreement")
         if not isinstance(self.share, bool):
             raise ValueError(f"share: needs True or False, got {self.share!r}")
-        if self.faults is not None and (not isinstance(self.faults, Faults) or self.faults.late):
-            raise ValueError(f"faults: needs Faults without a delay, got {self.faults!r}")
+        check_faults(self.faults)
         count(self.lag, "lag", at_least=0)
         choice(self.failures, "failures", ("raise", "keep"))
         if self.names and len(self.names) != len(self.sensors):
@@ -127,13 +126,15 @@ class SensorFilter(Filter):
         return [[None if o is None else o[k] for o in series] for k in range(times.size)]
 
     def drawn(
-        self, prior: Any, members: int, runs: tuple[int, ...], rng: np.random.Generator
-    ) -> Array:
+        self, prior: Any, members: int, runs: tuple[int, ...], rng: np.random.Generator,
+        *, agents: int | None = None,
+    ) -> Array:  # fmt: skip
         """Members (*runs, A, N, d) of a Gaussian (mean, cov), of a function, or as they are given.
 
         The function is called as ``prior(members, rng=rng, leading=(*runs, A))``.
         """
-        lead, dim = (*(count(n, "runs") for n in runs), len(self.sensors)), self.model.dim
+        lead = (*(count(n, "runs") for n in runs), agents or len(self.sensors))
+        dim = self.model.dim
         generator(rng)
         if isinstance(prior, tuple) and len(prior) == 2:
             centre = array(prior[0], "prior", (dim,))

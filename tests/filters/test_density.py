@@ -333,6 +333,7 @@ BAD_INPUT = {
         ("mass_std", lambda: make(0.5, Flooding(), mass_std=-0.1)),
         ("process", lambda: make(0.5, Flooding(), process=0.0)),
         ("faults", lambda: make(0.5, Flooding(), faults=0.1)),
+        ("faults", lambda: make(0.5, Flooding(), faults=Faults(delay=1))),
         ("names", lambda: make(0.5, Flooding(), names=("a",))),
         ("runs", lambda: make(0.5, Flooding()).start(START, runs=(2,))),
         ("prior", lambda: make(0.5, Flooding()).start(START + 1)),

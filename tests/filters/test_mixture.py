@@ -44,6 +44,7 @@ BAD_INPUT = {
         ("gate", lambda: MixtureFilter([SMALL], [None], target_dim=1, gate=0.0)),
         ("rule", lambda: MixtureFilter([SMALL], [None], target_dim=1, rule="x")),
         ("names", lambda: MixtureFilter([SMALL], [None], target_dim=1, names=("a", "b"))),
+        ("faults", lambda: MixtureFilter([SMALL], [None], target_dim=1, faults=Faults(delay=1))),
     ],
     "distfilt.filters.mixture.MixtureFilter.start": [
         ("prior", lambda: ONE.start([PRIOR, PRIOR])),
