@@ -16,7 +16,7 @@ from ..coupling.solvers import _solver
 from ..coupling.transform import _carried, _normalised, _plans, _rejuvenated
 from ..network import Channel, Ledger, finite_time
 from .driver import Late, Summary
-from .ensemble import EnsembleState, _summary, drawn_prior
+from .ensemble import EnsembleState, _summary
 from .failures import guarded, not_finite
 from .particle import _log_likelihood
 from .wiring import SensorFilter
@@ -91,9 +91,7 @@ class TransportFilter(SensorFilter):
 
         Members are (N, d), or (*runs, 1, N, d): one set for all agents.
         """
-        generator(rng)
-        lead = tuple(count(n, "runs") for n in runs)
-        drawn = drawn_prior(prior, self.members, self.model.dim, (*lead, 1), rng)
+        drawn = self.drawn(prior, self.members, runs, rng, sets=1)
         everywhere = np.repeat(drawn, len(self.sensors), axis=-3)
         ledger = Ledger.empty(len(self.sensors))
         return EnsembleState(number(t, "t"), ledger, rng.spawn(1)[0], everywhere)
