@@ -15,10 +15,10 @@ from ..checks import Array, array, count, generator, number
 from ..coupling.solvers import _solver
 from ..coupling.transform import _carried, _normalised, _plans, _rejuvenated
 from ..network import Channel, Ledger, finite_time
+from ..updates.particles import _log_likelihood
 from .driver import Late, Summary
 from .ensemble import EnsembleState, _summary
 from .failures import guarded, not_finite
-from .particle import _log_likelihood
 from .wiring import SensorFilter
 
 __all__ = ["TransportFilter"]
