@@ -183,6 +183,7 @@ def scores(name, members, truth) -> dict[str, float]:
     if flat or "retracted" in name:
         mean = retract(mean, rod, motion=motion)
         missed = np.abs(np.hypot(mean[:, 0], mean[:, 1]) - LENGTH)
+    missed = np.where(missed < 1e-14, 0.0, missed)  # rounding is no number to store
     gap = mean - aim
     q = own if flat else pendulum_chart(own)
     off = (q.mean(axis=1) - truth[LATE] + np.pi) % (2 * np.pi) - np.pi

@@ -91,7 +91,7 @@ class TransportFilter(SensorFilter):
 
         Members are (N, d), or (*runs, 1, N, d): one set for all agents.
         """
-        drawn = self.drawn(prior, self.members, runs, rng, agents=1)
+        drawn = self.drawn(prior, self.members, runs, rng, sets=1)
         everywhere = np.repeat(drawn, len(self.sensors), axis=-3)
         ledger = Ledger.empty(len(self.sensors))
         return EnsembleState(number(t, "t"), ledger, rng.spawn(1)[0], everywhere)

@@ -127,14 +127,15 @@ class SensorFilter(Filter):
 
     def drawn(
         self, prior: Any, members: int, runs: tuple[int, ...], rng: np.random.Generator,
-        *, agents: int | None = None,
+        sets: int | None = None,
     ) -> Array:  # fmt: skip
         """Members (*runs, A, N, d) of a Gaussian (mean, cov), of a function, or as they are given.
 
-        The function is called as ``prior(members, rng=rng, leading=(*runs, A))``.
+        The function is called as ``prior(members, rng=rng, leading=(*runs, A))``. With `sets` there
+        are so many of them in place of one for each agent.
         """
-        lead = (*(count(n, "runs") for n in runs), agents or len(self.sensors))
-        dim = self.model.dim
+        many = len(self.sensors) if sets is None else sets
+        lead, dim = (*(count(n, "runs") for n in runs), many), self.model.dim
         generator(rng)
         if isinstance(prior, tuple) and len(prior) == 2:
             centre = array(prior[0], "prior", (dim,))
