@@ -291,8 +291,8 @@ class Kept:
         return np.stack([self.columns[f"{name}{k:03d}"] for k in steps], axis=1)
 
 
-def kept(script: ModuleType, *, repeat: int = 2) -> Kept:
-    """A study's stored numbers, with a few of its trials run again and found equal.
+def kept(script: ModuleType, *, repeat: int = 1) -> Kept:
+    """A study's stored numbers, with its first trials, batches of runs, run again and found equal.
 
     Of a scenario that a reader has changed nothing is stored: two trials of it run now.
     """
@@ -300,7 +300,7 @@ def kept(script: ModuleType, *, repeat: int = 2) -> Kept:
         found = studies.stored(script.PAPER, script.NAME)
         if repeat:
             studies.check(
-                found, script.trial, indices=range(repeat), rtol=script.rtol, workers=2
+                found, script.trial, indices=range(repeat), rtol=script.rtol, workers=repeat
             )
         return Kept({c: found.metric(c) for c in script.columns}, script.BATCH)
     few = studies.run(script.trial, script.seeds[:2], workers=2)
