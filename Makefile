@@ -31,7 +31,7 @@ help:
 	@echo "make test       the book, then unit, property and doc tests, types, style, pairs, stored outputs, browser"
 	@echo "make slow       the tests that take minutes, and new examples for the property tests"
 	@echo "make outputs    execute every chapter, store its outputs, write the ledger of reproductions"
-	@echo "make identical  execute every chapter again and compare texts byte for byte, pictures as seen"
+	@echo "make identical  execute chapters again (all, or CHAPTERS=...): texts byte for byte, pictures as seen"
 	@echo "make accept     take the scenarios as they are for the book's own"
 	@echo "make studies    run the studies that take too long for a chapter, store them in data/studies"
 	@echo "make check-studies  run every stored study again and compare"
@@ -88,7 +88,7 @@ outputs: $(STAMP)
 	$(PY) book/tools/ledger.py
 
 identical: $(STAMP)
-	$(PY) book/tools/execute.py --check
+	$(PY) book/tools/execute.py --check $(CHAPTERS)
 
 accept: $(STAMP)
 	$(PY) book/tools/scenarios.py --accept

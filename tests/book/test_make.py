@@ -81,15 +81,19 @@ def test_an_environment_whose_python_is_gone_is_made_again(clone: Path) -> None:
 def test_an_old_python_is_named_and_leaves_nothing(clone: Path) -> None:
     before = sorted(clone.rglob("*"))
     old = clone / "old python"
-    old.write_text(
-        f'#!{sys.executable}\nimport runpy, sys\nsys.version_info = (3, 10, 4)\n'
+    pretender = clone / "old.py"
+    pretender.write_text(
+        "import runpy, sys\nsys.version_info = (3, 10, 4)\n"
         'sys.argv = sys.argv[2:]\nrunpy.run_path(sys.argv[0], run_name="__main__")\n'
     )
+    # Not by its first line: a path with a space in it is none there.
+    old.write_text(f'#!/bin/sh\nexec "{sys.executable}" "{pretender}" "$@"\n')
     old.chmod(0o755)
     done = make(clone, "environment", f"PYTHON={old}")
     assert done.returncode != 0
     assert "Python 3.11 or newer is needed, got 3.10.4" in done.stderr
     old.unlink()
+    pretender.unlink()
     assert sorted(clone.rglob("*")) == before
 
 

@@ -332,8 +332,10 @@ def test_a_limit_stops_a_study_that_raises_and_leaves_no_alarm() -> None:
 # Ctrl-C.
 
 INTERRUPTED = """
-import sys, time
+import signal, sys, time
 from distfilt import studies
+
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell ignores it
 
 def trial(seed):
     if seed.spawn_key[0] == 30:

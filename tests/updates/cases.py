@@ -33,7 +33,10 @@ Y = np.array([1.2, -0.7])
 MEAN = np.array([1.0, -2.0, 0.5])
 COV = np.array([[2.0, 0.6, 0.2], [0.6, 1.0, -0.3], [0.2, -0.3, 0.7]])
 
-PLANE = Constraint(lambda x: 0.5 * x.sum(axis=-1, keepdims=True), [-0.3])
+PLANE = Constraint(
+    lambda x: 0.5 * x.sum(axis=-1, keepdims=True), [-0.3],
+    derivative=lambda x: np.full((*x.shape[:-1], 1, x.shape[-1]), 0.5),
+)  # fmt: skip
 """A plane near the prior's mean, for any number of components."""
 FRESH = partial(ensemble_transform, rejuvenation=0.1)
 
