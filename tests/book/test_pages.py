@@ -44,6 +44,19 @@ def test_every_pair_is_in_step() -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_chapters_import_nothing_of_the_folder_they_lie_in() -> None:
+    """So a chapter runs from any folder: what lies beside it comes by `studies.script`."""
+    own = {path.stem for path in (ROOT / "book").iterdir()}
+    for name in toc_pages():
+        cells = re.findall(
+            r"^```\{code-cell\}.*?^```$", (ROOT / f"{name}.md").read_text(encoding="utf-8"),
+            flags=re.MULTILINE | re.DOTALL,
+        )  # fmt: skip
+        for cell in cells:
+            imported = set(re.findall(r"^\s*(?:from|import)\s+(\w+)", cell, flags=re.MULTILINE))
+            assert not imported & own, f"{name} imports {imported & own}"
+
+
 def test_api_page_documents_every_public_name_once() -> None:
     text = page("book/api")
     anchors = re.findall(r'<dt[^>]* id="(distfilt[^"]*)"', text)
