@@ -30,7 +30,9 @@ BOUNDS = {
 }
 
 
-def belief(bearing: float, rng: np.random.Generator) -> GaussianMixture:
+def belief(
+    bearing: float, rng: np.random.Generator, *, mixands: tuple[int, int] = BOUNDS["mixands"]
+) -> GaussianMixture:
     """One agent's belief, drawn within the bounds; its arc misses the origin a little."""
     draws = {
         name: rng.uniform(*BOUNDS[name])
@@ -38,7 +40,7 @@ def belief(bearing: float, rng: np.random.Generator) -> GaussianMixture:
     }
     r = draws.pop("distance")
     place = r * np.array([np.cos(bearing), np.sin(bearing)])
-    bent = arc(int(rng.integers(BOUNDS["mixands"][0], BOUNDS["mixands"][1] + 1)), place, **draws)
+    bent = arc(int(rng.integers(mixands[0], mixands[1] + 1)), place, **draws)
     shift = np.tile(rng.normal(scale=0.3, size=2), 2)
     return GaussianMixture(bent.weights, bent.means + shift, bent.covs)
 

@@ -1,12 +1,14 @@
 """Readings of what Zheng and Lin leave open about consensus, and what Fig. 1 looks like in each.
 
-Gains per second or per step, a larger integral gain, where consensus starts, and R as printed with
-a prior whose mass may change. Slow reading of (23), uniform start, 60 s.
+Gains per second or per step, a larger integral gain, where consensus starts, R as printed with a
+prior whose mass may change, and the widths that the paper does not give: of the flat Gaussian and
+of the kernel. Slow reading of (23), uniform start, 60 s.
 """
 
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,35 +17,56 @@ sys.path.insert(0, str(Path(__file__).parent))
 import _swarm as swarm
 import locals as figure
 
+from distfilt.filters import DensityFilter
 from distfilt.metrics import mean_interval
 from distfilt.studies import spawn
 
 NAME, PAPER = "gains", "zheng"
 CHOICES, CASE = swarm.CHOICES, figure.CASE
+WIDE, KERNELS = 1.0, {"narrow": 0.05, "broad": 0.12}
 READINGS = ("paper", "paper_flat", "fast", "fast_flat", "steps_flat",
-            "steps_printed")
+            "steps_printed", "paper_wide", "paper_narrow", "paper_broad")
+CENTRALS = ("central", "central_printed", *(f"central_{k}" for k in KERNELS))
 KINDS = ("error", "ratio", "ratio_high", "falls_high", "below")
-columns = ["kde", "central", "central_printed", "central_below", "central_printed_below",
+columns = ["kde", *CENTRALS, *(f"{s}_below" for s in CENTRALS),
            *(f"{r}_{k}" for r in READINGS for k in KINDS)]
-parameters = {"seed": CHOICES["seed"], "end": CASE.end, "local": swarm.LOCAL}
+parameters = {"seed": CHOICES["seed"], "end": CASE.end, "local": swarm.LOCAL, "wide": WIDE,
+              "kernels": KERNELS}
 seeds = spawn(CHOICES["seed"] + 1, 2)
 scenarios = swarm.scenarios
 rtol = 1e-4
 
 
+def own_central(reading: str) -> str:
+    """The centralised filter that a reading is compared with: of the same R and kernel."""
+    name = f"central_{reading.split('_')[-1]}"
+    return name if name in CENTRALS else "central"
+
+
+def network(scheme: str) -> DensityFilter:
+    """A scheme's filter, with another kernel or a wider flat Gaussian where its name says so."""
+    base, _, last = scheme.rpartition("_")
+    if last in KERNELS:
+        f = swarm.network("paper_flat" if base == "paper" else base, CASE)
+        return replace(f, bandwidth=KERNELS[last])
+    if last == "wide":
+        f = swarm.network("paper_flat", CASE)
+        return replace(f, first_std=WIDE, sharing=replace(f.sharing, first_std=WIDE))
+    return swarm.network(scheme, CASE)
+
+
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One run: per reading the claims of the caption, each from eight local filters."""
-    filters = {s: swarm.network(s, CASE) for s in ("central", "central_printed", *READINGS)}
+    filters = {s: network(s) for s in (*CENTRALS, *READINGS)}
     run, _ = swarm.compared(CASE, np.random.default_rng(seed), filters)
     half, k, level = CASE.end / 2, len(run["kde"]) // 12, float(run["kde"].mean())
     out = {"kde": swarm.average(run["kde"], CASE, half)}
-    for s in ("central", "central_printed"):
+    for s in CENTRALS:
         out[s] = swarm.average(run[f"{s}_error"], CASE, half)[0]
         out[f"{s}_below"] = figure.below(run[f"{s}_error"][:, 0], level)
     for r in READINGS:
         error = run[f"{r}_error"]
-        own = "central_printed" if r.endswith("printed") else "central"
-        ratio = mean_interval(swarm.average(error, CASE, half) / out[own])
+        ratio = mean_interval(swarm.average(error, CASE, half) / out[own_central(r)])
         falls = mean_interval(error[-k:].mean(axis=0) / error[:k].mean(axis=0))
         out |= {
             f"{r}_error": swarm.average(error, CASE, half).mean(),
@@ -54,4 +77,4 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     return {name: float(out[name]) for name in columns}
 
 
-code = (*swarm.code, figure.below)
+code = (*swarm.code, figure.below, network, own_central)

@@ -1,7 +1,7 @@
 """Ways of sharing beside each other, and what goes wrong: losses, dropout, a wrong model.
 
 A peaked start for the table of rules; agents that drop out; and filters whose f is out of phase,
-with and without process noise.
+with and without process noise. Errors over time of the first and the last, for a figure.
 """
 
 from __future__ import annotations
@@ -27,6 +27,9 @@ DROP = swarm.Case(start="peaked", end=15.0, gone=swarm.SHARING["gone"])
 DROPS = ("central", "paper", "flooding", "flooding_forgets")
 BASES = ("central", "paper", "flooding")
 OPEN = ("kde", "open", "open_flat")
+MARKS = tuple(range(1, 16))
+CURVES = {"table": (*OPEN, *BASES), "wrong": (*OPEN, *(f"{s}_{q}" for s in BASES
+                                                       for q in ("exact", "process")))}
 columns = [
     *(f"table_{s}_{k}" for s in RULES for k in ("error", "consensus", "nees", "crps")),
     *(f"table_{n}" for n in OPEN),
@@ -35,6 +38,7 @@ columns = [
     *(f"drop_{n}" for n in OPEN),
     *(f"wrong_{s}_{q}" for s in BASES for q in ("exact", "process")),
     *(f"wrong_{n}" for n in OPEN),
+    *(f"{case}_{line}_at_{t}" for case, lines in CURVES.items() for line in lines for t in MARKS),
 ]
 parameters = {"seed": CHOICES["seed"], "local": 3, "rules": RULES}
 seeds = spawn(CHOICES["seed"] + 2, 2)
@@ -51,6 +55,13 @@ def scored(state: object, p: np.ndarray) -> dict[str, float]:
             "crps": gaussian_crps(0 * gap, np.sqrt(variance), gap).mean()}
 
 
+def curves(key: str, run: dict[str, np.ndarray]) -> dict[str, float]:
+    """Errors at the marks by rule, the mean over the local filters."""
+    dt = swarm.SWARM["dt"]
+    lines = {n: run[n] if n in OPEN else run[f"{n}_error"].mean(axis=1) for n in CURVES[key]}
+    return {f"{key}_{n}_at_{t}": e[round(t / dt) - 1] for n, e in lines.items() for t in MARKS}
+
+
 def wrong_model(rng: np.random.Generator) -> dict[str, float]:
     """Local filters whose f is out of phase, with Q = 0 and with Q > 0."""
     scale = dict(zip(CHOICES["readings"], CHOICES["process_scale"], strict=True))["gibbs"]
@@ -59,7 +70,8 @@ def wrong_model(rng: np.random.Generator) -> dict[str, float]:
                                               rank=CHOICES["low_rank"]) for s in BASES}
     run, _ = swarm.compared(WRONG, rng, filters)
     out = {f"wrong_{s}": swarm.average(run[f"{s}_error"], WRONG, 10.0).mean() for s in filters}
-    return out | {f"wrong_{n}": swarm.average(run[n], WRONG, 10.0) for n in OPEN}
+    out |= {f"wrong_{n}": swarm.average(run[n], WRONG, 10.0) for n in OPEN}
+    return out | curves("wrong", run)
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
@@ -77,6 +89,8 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         run, ends = swarm.compared(case, rng, filters, keep)
         late = {k: swarm.average(v, case, 10.0) for k, v in run.items()}
         out |= {f"{key}_{n}": late[n] for n in OPEN}
+        if key == "table":
+            out |= curves(key, run)
         for s in names:
             if key == "gibbs":
                 out[f"gibbs_{s}"] = late[f"{s}_error"].mean()
@@ -89,4 +103,4 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     return {name: float(out[name]) for name in columns}
 
 
-code = (*swarm.code, scored, wrong_model)
+code = (*swarm.code, scored, wrong_model, curves)

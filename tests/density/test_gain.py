@@ -90,6 +90,29 @@ def test_truncated_prior_is_close_to_the_whole() -> None:
     assert np.linalg.norm(cut.estimates[0] - whole.mean) < 1e-5 * np.linalg.norm(whole.mean)
 
 
+@pytest.mark.slow
+def test_truncated_prior_on_the_papers_grid() -> None:
+    """Criterion 8 on 30 by 30 cells over six seconds, fast case: r = 100 to 1e-5, fifty to 1e-4."""
+    grid, swarm, rng = Grid((30, 30)), rotating_swarm("gibbs"), np.random.default_rng(2)
+    flow, full = FokkerPlanck(swarm, grid), zero_mean_prior(grid, rank=899)
+    x = rng.random((100, 2))
+    y = kernel_density(x, grid, bandwidth=0.08)
+    dense = Dense(y, full @ full.T)
+    cut = {r: shared_start(full[:, :r], y[None]) for r in (50, 100)}
+    k = kernel_information(grid, bandwidth=0.08, agents=100)
+    for j in range(60):
+        move = flow.solver(0.1 * j, 0.1)
+        x = swarm.step(x, 0.1 * j, 0.1, rng=rng, substeps=2)
+        y = kernel_density(x, grid, bandwidth=0.08)
+        r = k * np.maximum(move(dense.mean), 0.1)
+        dense = dense_step(dense, move, y, r, 0.1)
+        cut = {n: shared_step(shared_moved(s, move), y, r, 0.1) for n, s in cut.items()}
+    apart = {n: np.linalg.norm(s.estimates[0] - dense.mean) for n, s in cut.items()}
+    size = np.linalg.norm(dense.mean)
+    assert apart[100] < 1e-5 * size and apart[50] < 1e-4 * size
+    assert apart[100] < 0.1 * apart[50]
+
+
 def test_mass_stays_over_hundreds_of_steps() -> None:
     grid = Grid((12, 12))
     dense, shared, low = _case("slowgibbs", rank=60, steps=600)
