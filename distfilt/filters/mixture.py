@@ -16,7 +16,7 @@ from ..mixtures.unscented import POINT_RULES, forecast, update
 from ..models import Model
 from ..network import Channel, Faults, Graph, Ledger
 from ..sensors import Sensor
-from .driver import Filter, Summary, check_faults
+from .driver import Summary, TeamFilter, described
 from .observations import at_one_time
 from .saving import State
 
@@ -63,7 +63,7 @@ class MixtureState(State):
 
 
 @dataclass(frozen=True, eq=False)
-class MixtureFilter(Filter):
+class MixtureFilter(TeamFilter):
     """Every agent holds a mixture over [target; its own state]; only target marginals travel.
 
     In a step an agent splits the mixands that its model stretches most, forecasts all of them,
@@ -149,26 +149,22 @@ class MixtureFilter(Filter):
             callable_(self.agreement, "agreement")
             if self.graph is None:
                 raise ValueError("graph: needs a Graph for the agreement, got None")
-        check_faults(self.faults)
+        self.check_team()
         count(self.most, "most", at_least=count(self.size, "size"))
         choice(self.rule, "rule", POINT_RULES)
         for name in ("stretch", "gate"):
             if getattr(self, name) is not None:
                 number(getattr(self, name), name, above=0)
-        if self.names and len(self.names) != len(self.models):
-            raise ValueError(f"names: needs {len(self.models)} names, got {len(self.names)}")
 
     @property
-    def agents(self) -> tuple[str, ...]:
-        """Names of the agents."""
-        return tuple(self.names) or tuple(str(k) for k in range(len(self.models)))
+    def count(self) -> int:
+        """Number A of agents."""
+        return len(self.models)
 
     @property
     def components(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Names and units of the components, those of the largest state."""
-        model = max(self.models, key=lambda m: m.dim)
-        names = model.names or tuple(f"x{k}" for k in range(model.dim))
-        return names, model.units or ("",) * model.dim
+        return described(max(self.models, key=lambda m: m.dim))
 
     def start(
         self,
