@@ -215,12 +215,8 @@ class DensityFilter(TeamFilter):
         return list(x)
 
     def start(
-        self,
-        prior: ArrayLike,
-        *,
-        rng: np.random.Generator | None = None,
-        runs: tuple[int, ...] = (),
-        t: float = 0.0,
+        self, prior: ArrayLike, *, rng: np.random.Generator | None = None,
+        runs: tuple[int, ...] = (), t: float = 0.0,
     ) -> DensityState:
         """The state before the first step.
 
@@ -276,12 +272,7 @@ class DensityFilter(TeamFilter):
         )
 
     def step(
-        self,
-        state: DensityState,
-        t: float,
-        observations: ArrayLike,
-        *,
-        late: Sequence[Late] = (),
+        self, state: DensityState, t: float, observations: ArrayLike, *, late: Sequence[Late] = ()
     ) -> DensityState:
         """Move to time `t` and take in the agents' positions of then.
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, count, increasing, instance, number
+from ..checks import Array, array, callable_, count, increasing, instance, number
 from ..models import Model
 from ..network import Channel, Faults, Graph
 from ..progress import track
@@ -222,7 +222,7 @@ class Filter(ABC):
 class TeamFilter(Filter):
     """What filters of several agents share: names, and faults of the channel between them.
 
-    A subclass is a dataclass with these three fields.
+    A subclass is a dataclass with these fields; one whose agents do not agree has no `agreement`.
 
     Examples
     --------
@@ -234,6 +234,7 @@ class TeamFilter(Filter):
     names: Any
     faults: Any
     graph: Any
+    agreement: Any = None
 
     @property
     @abstractmethod
@@ -255,6 +256,16 @@ class TeamFilter(Filter):
             raise ValueError(f"faults: needs Faults without a delay, got {faults!r}")
         if self.names and len(self.names) != self.count:
             raise ValueError(f"names: needs {self.count} names, got {len(self.names)}")
+
+    def check_network(self) -> None:
+        """The same, for a filter whose agents talk and agree on a graph, which may move."""
+        self.check_team()
+        if isinstance(self.graph, Graph):
+            self.graph_at()
+        elif self.graph is not None:
+            callable_(self.graph, "graph")
+        if self.agreement is not None:
+            callable_(self.agreement, "agreement")
 
     def graph_at(self, *now: Any) -> Graph:
         """The graph, or what the function that stands for it returns: one of all the agents."""

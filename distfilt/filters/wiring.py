@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from ..checks import (
     Array,
     array,
-    callable_,
     choice,
     count,
     covariance,
@@ -87,18 +86,11 @@ class SensorFilter(TeamFilter):
             if sensor is not None and not isinstance(sensor, Sensor):
                 raise ValueError(f"sensors: needs Sensor or None, got {type(sensor).__name__}")
         count(len(self.sensors), "sensors")
-        if self.graph is None:
-            if len(self.sensors) > 1:
-                raise ValueError(f"graph: needs a Graph of {len(self.sensors)} agents, got None")
-        elif isinstance(self.graph, Graph):
-            self.graph_at()
-        else:
-            callable_(self.graph, "graph")
-        if self.agreement is not None:
-            callable_(self.agreement, "agreement")
+        if self.graph is None and len(self.sensors) > 1:
+            raise ValueError(f"graph: needs a Graph of {len(self.sensors)} agents, got None")
+        self.check_network()
         if not isinstance(self.share, bool):
             raise ValueError(f"share: needs True or False, got {self.share!r}")
-        self.check_team()
         count(self.lag, "lag", at_least=0)
         choice(self.failures, "failures", ("raise", "keep"))
 
