@@ -8,12 +8,13 @@ from .gaussian import GaussianFilter, GaussianState
 from .mixture import MixtureFilter, MixtureState
 from .particle import ParticleCollapse, ParticleFilter, ParticleState
 from .saving import State
+from .stepping import SensorState, Step
 from .transport import TransportFilter
 from .wiring import SensorFilter
 
 __all__ = [  # fmt: skip
     "DensityFilter", "DensityState", "EnsembleFilter", "EnsembleState", "Filter", "FilterError",
     "GaussianFilter", "GaussianState", "Late", "MixtureFilter", "MixtureState", "ParticleCollapse",
-    "ParticleFilter", "ParticleState", "SensorFilter", "State", "Summary", "TransportFilter",
-    "final_state",
+    "ParticleFilter", "ParticleState", "SensorFilter", "SensorState", "State", "Step", "Summary",
+    "TransportFilter", "final_state",
 ]

@@ -281,11 +281,13 @@ BAD_INPUT = {
         ("ledger", lambda: EnsembleState(0.0, Ledger.empty(2), START["rng"], np.zeros((1, 2, 1)))),
         ("rng", lambda: EnsembleState(0.0, Ledger.empty(1), None, np.zeros((1, 2, 1)))),
         ("history", lambda: EnsembleState(0.0, Ledger.empty(1), START["rng"], np.zeros((1, 2, 1)),
-                                          ((0.0, np.zeros(2)),))),
+                                          history=((0.0, np.zeros(2)),))),
     ],
     "distfilt.filters.gaussian.GaussianFilter": [
         ("rule", lambda: GaussianFilter(LINE, [None], rule="cubature")),
         ("kappa", lambda: GaussianFilter(LINE, [None], kappa=-1)),
+        ("agreement", lambda: made("gaussian", agents=2, agreement=lambda m, p, channel: (m,))[0]
+            .step(made("gaussian", agents=2)[1], 0.5, [None, None])),
         ("prior", lambda: GaussianFilter(LINE, [None]).start(np.zeros(2))),
     ],
     "distfilt.filters.gaussian.GaussianState": [
@@ -346,6 +348,7 @@ BAD_INPUT = {
 }
 EXEMPT = {
     "distfilt.filters.driver.Filter": "abstract: what it refuses is tested through its families",
+    "distfilt.filters.driver.TeamFilter": "abstract, as Filter",
     "distfilt.filters.driver.Summary": "a record of what a filter computed, nothing is passed in",
     "distfilt.filters.failures.FilterError": "an error",
     "distfilt.filters.failures.not_finite": "says which rows are bad, whatever they hold",
@@ -353,6 +356,8 @@ EXEMPT = {
     "distfilt.filters.particle.ParticleCollapse": "a warning",
     "distfilt.filters.record.Recorder": "made by a filter's run: truth and scores, above",
     "distfilt.filters.record.SCORES": "names",
+    "distfilt.filters.stepping.SensorState": "what it refuses is tested through its families",
+    "distfilt.filters.stepping.Step": "made by a filter's begin, which checks what it is given",
 }
 
 
