@@ -89,3 +89,6 @@ code = (belief, both)
 seeds = np.random.SeedSequence(20260).spawn(300)
 rtol = 1e-4
 atol = 1e-12
+# Which of nearly equal shapes least squares keep hangs on the last bit, and so does a divergence
+# that a thin tail decides.
+rough = [name for name in columns if name.startswith("c3")]

@@ -40,6 +40,9 @@ parameters = {"members": MEMBERS, "mixands": MIXANDS, "bounds": arcs.BOUNDS,
 seeds = np.random.SeedSequence(20261).spawn(200)
 scenarios = (SCENARIO,)
 rtol, atol = 1e-3, 1e-9
+# Which of nearly equal shapes least squares keep hangs on the last bit, and so does a divergence
+# that a thin tail decides.
+rough = [name for name in columns if "_qr_" in name or name.endswith("target")]
 
 
 def scores(exact: list[PartialFusion], pair: list[GaussianMixture], first: int) -> list[float]:
