@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,11 +15,11 @@ from ..checks import Array, array, choice, count, generator, instance, number
 from ..updates.particles import (
     RESAMPLING,
     _distinct,
-    _size_of,
-    _taken,
     _jittered,
     _levels,
     _picked,
+    _size_of,
+    _taken,
     _weighed,
 )
 from .driver import Late, Summary
@@ -240,8 +239,8 @@ class ParticleFilter(SensorFilter):
         else:
             return
         warnings.warn(
-            f"t = {state.t:g} s: {what}; more members, jitter=, or more process noise keep its belief "
-            f"alive",
+            f"t = {state.t:g} s: {what}; more members, jitter=, or more process noise keep its "
+            f"belief alive",
             ParticleCollapse,
             stacklevel=3,
         )
