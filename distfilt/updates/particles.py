@@ -105,7 +105,7 @@ def _taken(points: Array, picked: Indices) -> Array:
     n, d = points.shape[-2:]
     first = n * np.arange(picked.size // n)[:, None]
     rows = (picked.reshape(-1, n) + first).ravel()
-    return points.reshape(-1, d).take(rows, axis=0).reshape(points.shape)
+    return np.asarray(points.reshape(-1, d)[rows].reshape(points.shape))
 
 
 def _log_sum(logs: Array) -> Array:
