@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from ..checks import (
     Array,
     array,
-    callable_,
     choice,
     count,
     covariance,
@@ -24,7 +23,7 @@ from ..ensembles import draw
 from ..models import Model
 from ..network import Channel, Faults, Graph, Ledger
 from ..sensors import Sensor
-from .driver import Filter, Late, Summary, check_faults
+from .driver import Late, Summary, TeamFilter, described
 from .heard import Heard, gather
 from .observations import at_one_time, over_times
 from .saving import State
@@ -37,7 +36,7 @@ S = TypeVar("S", bound=SensorState)
 
 
 @dataclass(frozen=True, eq=False)
-class SensorFilter(Filter):
+class SensorFilter(TeamFilter):
     """The part of a filter that knows the agents, and what every family asks of it.
 
     Parameters
@@ -87,39 +86,23 @@ class SensorFilter(Filter):
             if sensor is not None and not isinstance(sensor, Sensor):
                 raise ValueError(f"sensors: needs Sensor or None, got {type(sensor).__name__}")
         count(len(self.sensors), "sensors")
-        if self.graph is None:
-            if len(self.sensors) > 1:
-                raise ValueError(f"graph: needs a Graph of {len(self.sensors)} agents, got None")
-        elif isinstance(self.graph, Graph):
-            self._check_graph(self.graph)
-        else:
-            callable_(self.graph, "graph")
-        if self.agreement is not None:
-            callable_(self.agreement, "agreement")
+        if self.graph is None and len(self.sensors) > 1:
+            raise ValueError(f"graph: needs a Graph of {len(self.sensors)} agents, got None")
+        self.check_network()
         if not isinstance(self.share, bool):
             raise ValueError(f"share: needs True or False, got {self.share!r}")
-        check_faults(self.faults)
         count(self.lag, "lag", at_least=0)
         choice(self.failures, "failures", ("raise", "keep"))
-        if self.names and len(self.names) != len(self.sensors):
-            raise ValueError(f"names: needs {len(self.sensors)} names, got {len(self.names)}")
-
-    def _check_graph(self, graph: Any) -> Graph:
-        found, size = instance(graph, "graph", Graph), len(self.sensors)
-        if found.size != size:
-            raise ValueError(f"graph: needs {size} agents like sensors, got {found.size}")
-        return found
 
     @property
-    def agents(self) -> tuple[str, ...]:
-        """Names of the agents."""
-        return tuple(self.names) or tuple(str(i) for i in range(len(self.sensors)))
+    def count(self) -> int:
+        """Number A of agents."""
+        return len(self.sensors)
 
     @property
     def components(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Names and units of the state's components."""
-        names = self.model.names or tuple(str(i) for i in range(self.model.dim))
-        return tuple(names), tuple(self.model.units or ("",) * self.model.dim)
+        return described(self.model)
 
     def past(self, state: SensorState) -> tuple[tuple[float, Summary], ...]:
         """Earlier times that the state keeps, oldest first, and what is believed of them by now."""
@@ -180,13 +163,6 @@ class SensorFilter(Filter):
     ) -> list[Array | None]:
         """Observations of one time, checked, per agent (*runs, m) or None."""
         return at_one_time(observations, self.sensors, state.runs)
-
-    def channel(self, state: State, t: float) -> Channel | None:
-        """The door of this step; a single agent without a graph has none."""
-        if self.graph is None:
-            return None
-        graph = self.graph if isinstance(self.graph, Graph) else self._check_graph(self.graph(t))
-        return Channel(graph, ledger=state.ledger, runs=state.runs, faults=self.faults, t=t)
 
     def gather(self, observed: Sequence[Array | None], channel: Channel | None) -> list[Heard]:
         """What every agent knows of the observations once they are shared."""

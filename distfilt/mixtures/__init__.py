@@ -23,6 +23,7 @@ from .reduction import (
 )
 from .shapes import Shapes
 from .splitting import split, split_library, stretching
+from .steps import conditioned, moved, split_stretched
 
 __all__ = [
     "Divergence",
@@ -32,6 +33,7 @@ __all__ = [
     "Shapes",
     "arc",
     "average",
+    "conditioned",
     "cross_relevance",
     "fuse",
     "fuse_in_turn",
@@ -41,12 +43,14 @@ __all__ = [
     "jeffreys_of_many",
     "kept_by_relevance",
     "merge_costs",
+    "moved",
     "nonnegative_least_squares",
     "pivoted_qr",
     "prune",
     "runnalls",
     "split",
     "split_library",
+    "split_stretched",
     "stretching",
     "tikhonov",
     "two_stage",

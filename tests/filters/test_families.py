@@ -348,6 +348,7 @@ BAD_INPUT = {
 }
 EXEMPT = {
     "distfilt.filters.driver.Filter": "abstract: what it refuses is tested through its families",
+    "distfilt.filters.driver.TeamFilter": "abstract, as Filter",
     "distfilt.filters.driver.Summary": "a record of what a filter computed, nothing is passed in",
     "distfilt.filters.failures.FilterError": "an error",
     "distfilt.filters.failures.not_finite": "says which rows are bad, whatever they hold",
