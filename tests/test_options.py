@@ -1,10 +1,11 @@
-"""What has a default is given by its name; what may stand in a row is the data."""
+"""Options are given by name, and structures cannot be changed."""
 
 from __future__ import annotations
 
 import importlib
 import inspect
-from dataclasses import is_dataclass
+import re
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 
 import pytest
@@ -46,3 +47,19 @@ def test_options_are_given_by_name(module: str) -> None:
             if p.default is not p.empty and p.kind is not p.KEYWORD_ONLY
         }  # fmt: skip
         assert row <= DATA.get(name, set()), f"{name}: {sorted(row)} can stand in a row"
+
+
+CHANGING = {"Step"}
+"""What a filter fills in during one step, and nobody else sees."""
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_structures_are_frozen_and_arrays_make_no_equality(module: str) -> None:
+    """Two structures of arrays would be compared entry by entry, which is no truth value."""
+    for name, made in vars(importlib.import_module(module)).items():
+        if not (isinstance(made, type) and is_dataclass(made) and made.__module__ == module):
+            continue
+        options = made.__dataclass_params__  # type: ignore[attr-defined]
+        assert options.frozen or name in CHANGING, f"{name} can be changed"
+        types = " ".join(re.sub(r"Callable\[.*\]", "", str(f.type)) for f in fields(made))
+        assert not (options.eq and "Array" in types), f"{name} compares arrays"
