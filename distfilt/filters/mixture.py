@@ -220,16 +220,7 @@ class MixtureFilter(Filter):
             self._moved(belief, model, state.t, now - state.t)
             for belief, model in zip(state.mixtures, self.models, strict=True)
         ]
-        beliefs = [
-            belief if y is None or sensor is None else self._seen(belief, sensor, y)
-            for belief, sensor, y in zip(beliefs, self.sensors, seen, strict=True)
-        ]
-        ledger = state.ledger
-        if self.agreement is not None:
-            graph = self.graph if isinstance(self.graph, Graph) else self.graph(now)  # type: ignore[misc]
-            channel = Channel(graph, ledger=ledger, faults=self.faults, t=now)
-            beliefs = self._agreed(beliefs, channel)
-            ledger = channel.ledger
+        beliefs, ledger = self._told(beliefs, seen, state.ledger, now)
         most = max(_EXACT, self.size)
         kept = [two_stage(belief, self.size, heaviest=most) for belief in beliefs]
         # Without the square roots that they came with: a loaded state has to go on alike.
@@ -305,6 +296,31 @@ class MixtureFilter(Filter):
         w /= w.sum()
         keep = w > _NOTHING
         return _from_factors(w[keep] / w[keep].sum(), means[keep], factors[keep])
+
+    def _read(
+        self, beliefs: Sequence[GaussianMixture], seen: Sequence[Array | None]
+    ) -> list[GaussianMixture]:
+        """Each agent's belief after its own reading."""
+        return [
+            belief if y is None or sensor is None or np.isnan(y).all()
+            else self._seen(belief, sensor, y)
+            for belief, sensor, y in zip(beliefs, self.sensors, seen, strict=True)
+        ]
+
+    def _told(
+        self, beliefs: list[GaussianMixture], seen: Sequence[Array | None], ledger: Ledger,
+        now: float,
+    ) -> tuple[list[GaussianMixture], Ledger]:
+        """The beliefs after the agents' readings and their exchange."""
+        after = self._read(beliefs, seen)
+        if self.agreement is None:
+            return after, ledger
+        channel = self._channel(ledger, now)
+        return self._agreed(after, channel), channel.ledger
+
+    def _channel(self, ledger: Ledger, now: float) -> Channel:
+        graph = self.graph if isinstance(self.graph, Graph) else self.graph(now)  # type: ignore[misc]
+        return Channel(graph, ledger=ledger, faults=self.faults, t=now)
 
     def _agreed(self, beliefs: list[GaussianMixture], channel: Channel) -> list[GaussianMixture]:
         """Send target marginals, and fuse what arrived; who hears nothing changes nothing."""
