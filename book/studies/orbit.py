@@ -299,8 +299,8 @@ def watched(scene: str, seed: np.random.SeedSequence) -> dict[str, float]:
         pairs = zip(bound(s, options, *rest), truth, strict=True)
         found = [scored(mixtures, true) for mixtures, true in pairs]
         out |= {f"{name}_{m}": v for m, v in kept(scene, name, found).items()}
-    # Agents that agree to a thousandth of a millimetre agree.
-    exact = {m: 0.0 if "_apart" in m and v < 1e-18 else v for m, v in out.items()}
+    # Agents that agree to a millimetre agree.
+    exact = {m: 0.0 if "_apart" in m and v < 1e-12 else v for m, v in out.items()}
     return {f"{scene}_{m}" if scene else m: float(SIX.format(v)) for m, v in exact.items()}
 
 

@@ -15,8 +15,8 @@ from .mixture import MixtureFilter, _from_factors
 
 __all__ = ["NewsFilter", "increment"]
 
-_NOTHING = 1e-7
-"""A share of the largest gain in information below which a direction has learned nothing."""
+_NOTHING = 1e-6
+"""A gain in information, as a share of what was there before, below which nothing was learned."""
 
 
 def increment(before: GaussianMixture, after: GaussianMixture) -> Array:
@@ -54,7 +54,7 @@ def increment(before: GaussianMixture, after: GaussianMixture) -> Array:
     narrower = np.linalg.solve(two.factors[0], one.factors[0])
     _, size, axes = np.linalg.svd(narrower)
     gain = size**2 - 1
-    learned = gain > _NOTHING * max(gain[0], 1.0)
+    learned = gain > _NOTHING
     root, axes = np.sqrt(gain[learned]), axes[learned]
     moved = axes @ np.linalg.solve(one.factors[0], two.means[0] - one.means[0])
     rows = root[:, None] * np.linalg.solve(one.factors[0].T, axes.T).T

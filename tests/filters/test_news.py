@@ -123,6 +123,15 @@ def test_an_increment_is_the_readings_that_taught_it(rank: int) -> None:
     assert increment(before, before).shape == (0, 5)
 
 
+def test_a_large_gain_does_not_hide_a_small_one() -> None:
+    before = GaussianMixture.gaussian([0.0, 0.0, 0.0], np.eye(3))
+    after = GaussianMixture.gaussian([2.0, -1.0, 0.0], np.diag([1e-10, 0.5, 1.0]))
+    news = increment(before, after)
+    assert news.shape == (2, 4)
+    assert np.allclose(news[:, :-1].T @ news[:, :-1], np.diag([1e10, 1.0, 0.0]), rtol=1e-6)
+    assert np.allclose(news[:, :-1].T @ news[:, -1], [2e10, -2.0, 0.0], rtol=1e-6)
+
+
 @pytest.mark.parametrize(("rank", "numbers"), [(1, 7), (2, 13), (3, 18), (6, 27)])
 def test_no_zero_is_sent(rank: int, numbers: int) -> None:
     still = Model(6, lambda x, t, dt: x, lambda t, dt: np.zeros((6, 6)))
