@@ -300,7 +300,8 @@ def kept(script: ModuleType, *, repeat: int = 1) -> Kept:
         found = studies.stored(script.PAPER, script.NAME)
         if repeat:
             studies.check(
-                found, script.trial, indices=range(repeat), rtol=script.rtol, workers=repeat
+                found, script.trial, indices=range(repeat), rtol=script.rtol,
+                rough=getattr(script, "rough", ()), workers=repeat,
             )
         return Kept({c: found.metric(c) for c in script.columns}, script.BATCH)
     few = studies.run(script.trial, script.seeds[:2], workers=2)

@@ -86,3 +86,4 @@ columns = tuple(f"{m}_{k}" for m in (*RULES, "moments") for k in (1, 2, "target"
 code = (belief, both)
 seeds = np.random.SeedSequence(20260).spawn(300)
 rtol = 1e-4
+atol = 1e-12

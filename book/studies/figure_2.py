@@ -27,7 +27,8 @@ columns = [
 parameters = {"batch": BATCH, "seed": 2025, "gains": GAINS}
 seeds = np.random.SeedSequence(satellites.SEED + 1).spawn(SETUP.runs // BATCH)
 scenarios = (SETUP.scenario,)
-rtol = 1e-4
+# The error of a filter on its own grows, and with it a difference of the last bit.
+rtol = 1e-3
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:

@@ -107,3 +107,6 @@ columns = (
 code = (particles, data, scores)
 seeds = np.random.SeedSequence(512).spawn(TRIALS)
 rtol = 1e-3
+# In these filters a difference of the last bit grows with the model's chaos, tenfold in ten steps:
+# another processor's members part from the stored ones before the end.
+rough = [name for name in columns if name.startswith(("transport", "second", "particles"))]

@@ -9,20 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..checks import Array, count, number
-from ..network import Channel, Graph, tracking
+from ..network import Channel, tracking
 from ..network import weights as weighting
-from .grid import Grid
 from .kernel import _kernel_density, _kernels
+from .seen import Seen
 
-__all__ = [
-    "Centralised",
-    "DynamicAverage",
-    "Flooding",
-    "Neighbours",
-    "PIConsensus",
-    "Seen",
-    "Sharing",
-    "present_graph",
+__all__ = [  # fmt: skip
+    "Centralised", "DynamicAverage", "Flooding", "Neighbours", "PIConsensus", "Sharing",
 ]
 
 Carried = tuple[Array, ...]
@@ -30,52 +23,6 @@ Mask = NDArray[np.bool_]
 
 _NEVER = -1e30
 """Time stamp of what an agent has not heard of."""
-
-
-@dataclass(frozen=True, eq=False)
-class Seen:
-    """What the agents themselves see at one time, and on which grid they think.
-
-    Parameters
-    ----------
-    positions : ndarray, (A, d)
-        Of agents that are present; rows of the others mean nothing.
-    present : ndarray of bool, (A,)
-    grid : Grid
-    bandwidth : float
-        Of every agent's kernel.
-    t : float
-        In s.
-    wanted : tuple of int, optional
-        The agents whose estimate is used; a rule may leave the rows of others at zero.
-
-    Examples
-    --------
-    >>> seen = Seen(np.full((1, 2), 0.5), np.ones(1, bool), Grid((9, 9)), 0.1, 0.0)
-    >>> seen.kernels.shape
-    (1, 81)
-    """
-
-    positions: Array
-    present: Mask
-    grid: Grid
-    bandwidth: float
-    t: float
-    wanted: tuple[int, ...] | None = None
-
-    @property
-    def kernels(self) -> Array:
-        """Each agent's own kernel, zero for those that are gone, (A, n)."""
-        x = np.where(self.present[:, None], self.positions, self.grid.centres[0])
-        z = _kernels(x, self.grid, np.full(len(x), self.bandwidth))
-        return np.asarray(z * self.present[:, None])
-
-    def flat(self, std: float) -> Array:
-        """A Gaussian about each agent, cut off at the walls; in the middle for the gone, (A, n)."""
-        middle = self.grid.corner + 0.5 * self.grid.width
-        centre = np.where(self.present[:, None], self.positions, middle)
-        gap = ((self.grid.centres - centre[:, None, :]) ** 2).sum(axis=-1)
-        return self.grid.normalised(np.exp(-0.5 * gap / std**2))
 
 
 class Sharing(Protocol):
@@ -370,22 +317,3 @@ class Centralised:
         x, size = seen.positions[seen.present], len(seen.present)
         y = _kernel_density(x, seen.grid, np.full(len(x), seen.bandwidth))
         return (), np.tile(y, (size, 1)), np.full(size, float(len(x)))
-
-
-def present_graph(graph: Graph, present: Mask) -> Graph:
-    """The graph without the links of agents that are gone.
-
-    Examples
-    --------
-    >>> from distfilt.network import graphs
-    >>> present_graph(graphs.path(3), np.array([True, True, False])).degrees
-    array([1., 1., 0.])
-    """
-    if not isinstance(graph, Graph):
-        raise ValueError(f"graph: needs a Graph, got {type(graph).__name__}")
-    if present.all():
-        return graph
-    keep = present[graph.receivers] & present[graph.senders]
-    pairs = np.stack([graph.receivers[keep], graph.senders[keep]], axis=1)
-    return Graph.from_edges(graph.size, pairs, directed=True)
-

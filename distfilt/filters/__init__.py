@@ -9,12 +9,13 @@ from .mixture import MixtureFilter, MixtureState
 from .news import NewsFilter, increment
 from .particle import ParticleCollapse, ParticleFilter, ParticleState
 from .saving import State
+from .stepping import SensorState, Step
 from .transport import TransportFilter
 from .wiring import SensorFilter
 
 __all__ = [  # fmt: skip
     "DensityFilter", "DensityState", "EnsembleFilter", "EnsembleState", "Filter", "FilterError",
     "GaussianFilter", "GaussianState", "Late", "MixtureFilter", "MixtureState", "NewsFilter",
-    "ParticleCollapse", "ParticleFilter", "ParticleState", "SensorFilter", "State", "Summary",
-    "TransportFilter", "final_state", "increment",
+    "ParticleCollapse", "ParticleFilter", "ParticleState", "SensorFilter", "SensorState", "State",
+    "Step", "Summary", "TransportFilter", "final_state", "increment",
 ]

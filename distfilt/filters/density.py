@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, choice, count, number
+from ..checks import Array, array, choice, count, instance, number
 from ..density import (
     FokkerPlanck,
     LowRank,
@@ -23,9 +23,10 @@ from ..density import (
     zero_mean_prior,
 )
 from ..density.kernel import _width
-from ..density.sharing import Seen, Sharing, present_graph
-from ..network import Channel, Faults, Graph, Ledger, graphs
-from .driver import Filter, Late, Summary, check_faults
+from ..density.seen import Seen, present_graph
+from ..density.sharing import Sharing
+from ..network import Channel, Faults, Graph, Ledger
+from .driver import Late, Summary, TeamFilter
 from .saving import State
 
 __all__ = ["DensityFilter", "DensityState"]
@@ -87,7 +88,7 @@ class DensityState(State):
 
 
 @dataclass(frozen=True, eq=False)
-class DensityFilter(Filter):
+class DensityFilter(TeamFilter):
     r"""Local filters of a swarm's density, equations (14) to (16) of Zheng and Lin.
 
     In each step every agent sees its own position, learns by `sharing` an estimate y_i of the
@@ -165,8 +166,7 @@ class DensityFilter(Filter):
     names: tuple[str, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.model, FokkerPlanck):
-            raise ValueError(f"model: needs a FokkerPlanck, got {type(self.model).__name__}")
+        instance(self.model, "model", FokkerPlanck)
         size = count(self.size, "size")
         count(self.rank, "rank")
         if not callable(self.graph) and not isinstance(self.graph, Graph):
@@ -174,7 +174,8 @@ class DensityFilter(Filter):
         for name in ("begin", "learn"):
             if not callable(getattr(self.sharing, name, None)):
                 raise ValueError(f"sharing: needs {name}, got {type(self.sharing).__name__}")
-        number(self.bandwidth, "bandwidth", above=0)
+        for name in ("bandwidth", "first_std", "floor"):
+            number(getattr(self, name), name, above=0)
         _width(self.bandwidth, self.model.grid, 1)
         if self.local is not None:
             found = [count(i, "local", at_least=0) for i in self.local]
@@ -184,20 +185,16 @@ class DensityFilter(Filter):
             choice(self.first, "first", ("flat", "observed"))
         else:
             array(self.first, "first", (self.model.grid.size,))
-        number(self.first_std, "first_std", above=0)
         number(self.mass_std, "mass_std", at_least=0)
         choice(self.noise, "noise", ("forecast", "observed"))
-        number(self.floor, "floor", above=0)
         if self.process is not None:
             number(self.process, "process", above=0)
-        check_faults(self.faults)
-        if self.names and len(self.names) != size:
-            raise ValueError(f"names: needs {size} names, got {len(self.names)}")
+        self.check_team()
 
     @property
-    def agents(self) -> tuple[str, ...]:
-        """Names of the agents."""
-        return tuple(self.names) or tuple(str(i) for i in range(self.size))
+    def count(self) -> int:
+        """Number A of agents."""
+        return self.size
 
     @property
     def components(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -218,12 +215,8 @@ class DensityFilter(Filter):
         return list(x)
 
     def start(
-        self,
-        prior: ArrayLike,
-        *,
-        rng: np.random.Generator | None = None,
-        runs: tuple[int, ...] = (),
-        t: float = 0.0,
+        self, prior: ArrayLike, *, rng: np.random.Generator | None = None,
+        runs: tuple[int, ...] = (), t: float = 0.0,
     ) -> DensityState:
         """The state before the first step.
 
@@ -243,15 +236,13 @@ class DensityFilter(Filter):
         seen = self._seen(prior, "prior", number(t, "t"))
         here, basis = self.filtering, self._basis
         base = self._base(seen)[here]
-        x = np.where(seen.present[:, None], seen.positions, np.nan)
-        state = DensityState(
-            float(t), Ledger.empty(self.size), None, x, self.sharing.begin(seen),
-            seen.kernels[here], np.full(self.size, float(self.size)), 1, shared_start(basis, base),
+        exact = self.process is None
+        return DensityState(
+            float(t), Ledger.empty(self.size), None, seen.places, self.sharing.begin(seen),
+            seen.kernels[here], np.full(self.size, float(self.size)), 1,
+            shared_start(basis, base) if exact else None,
+            () if exact else tuple(LowRank(m, basis) for m in base),
         )
-        if self.process is None:
-            return state
-        rows = tuple(LowRank(m, basis) for m in base)
-        return replace(state, filters=None, low=rows)
 
     @cached_property
     def _basis(self) -> Array:
@@ -276,42 +267,12 @@ class DensityFilter(Filter):
         return seen.flat(self.first_std)
 
     def _seen(self, positions: ArrayLike, name: str, t: float) -> Seen:
-        grid = self.model.grid
-        x = array(positions, name, (self.size, grid.dim), finite=False)
-        gone = np.asarray(np.isnan(x).all(axis=-1), dtype=bool)
-        if not np.isfinite(x[~gone]).all():
-            raise ValueError(f"{name}: needs finite positions, or NaN in a whole row for an agent "
-                             f"that has gone, got {x[~gone][~np.isfinite(x[~gone]).all(-1)][0]}")
-        if gone.all():
-            raise ValueError(f"{name}: needs at least one agent, got none")
-        grid.inside(x[~gone], name)
-        return Seen(
-            np.where(gone[:, None], 0.0, x), ~gone, grid, self.bandwidth, t, self.local)
-
-    def _linked(self, t: float, seen: Seen) -> Graph:
-        here = np.flatnonzero(seen.present)
-        if isinstance(self.graph, Graph):
-            graph = self.graph
-        elif callable(self.graph):
-            graph = self.graph(t, np.where(seen.present[:, None], seen.positions, np.nan))
-        else:
-            near = graphs.disk(seen.positions[here], float(self.graph))
-            if seen.present.all():
-                return near
-            pairs = np.stack([here[near.receivers], here[near.senders]], axis=1)
-            graph = Graph.from_edges(self.size, pairs)
-        if not isinstance(graph, Graph) or graph.size != self.size:
-            raise ValueError(f"graph: needs a Graph of {self.size} agents, got "
-                             f"{getattr(graph, 'size', type(graph).__name__)}")
-        return present_graph(graph, seen.present)
+        return Seen.checked(
+            positions, name, self.size, self.model.grid, self.bandwidth, t, self.local
+        )
 
     def step(
-        self,
-        state: DensityState,
-        t: float,
-        observations: ArrayLike,
-        *,
-        late: Sequence[Late] = (),
+        self, state: DensityState, t: float, observations: ArrayLike, *, late: Sequence[Late] = ()
     ) -> DensityState:
         """Move to time `t` and take in the agents' positions of then.
 
@@ -326,49 +287,42 @@ class DensityFilter(Filter):
         late : sequence of Late
             Has to be empty: a swarm's positions cannot be taken in afterwards.
         """
-        if not isinstance(state, DensityState):
-            raise ValueError(f"state: needs a DensityState, got {type(state).__name__}")
+        instance(state, "state", DensityState)
         if late:
             raise ValueError(f"late: needs none, as positions are of now, got {len(late)}")
         dt = number(t, "t", above=state.t) - state.t
         seen = self._seen(observations, "observations", float(t))
-        graph = self._linked(float(t), seen)
+        if isinstance(self.graph, Graph) or callable(self.graph):
+            graph = present_graph(self.graph_at(float(t), seen.places), seen.present)
+        else:
+            graph = seen.near(self.graph)
         channel = Channel(graph, ledger=state.ledger, faults=self.faults, t=float(t))
         carried, y, counted = self.sharing.learn(state.carried, seen, channel, dt)
-        move = self.model.solver(state.t, dt)
-        filters, low = self._filtered(state, move, y, counted, seen, dt)
+        y = y[self.filtering]
+        filters, low = self._filtered(state, y, counted, seen, dt)
         parts = np.unique(graph.components[seen.present]).size
-        x = np.where(seen.present[:, None], seen.positions, np.nan)
         return DensityState(
-            float(t), channel.ledger, None, x, carried, y[self.filtering], counted, parts,
-            filters, low,
+            float(t), channel.ledger, None, seen.places, carried, y, counted, parts, filters, low
         )
 
     def _filtered(
-        self, state: DensityState, move: Any, y: Array, counted: Array, seen: Seen, dt: float
+        self, state: DensityState, y: Array, counted: Array, seen: Seen, dt: float
     ) -> tuple[Shared | None, tuple[LowRank, ...]]:
-        here = self.filtering
-        y = y[here]
+        """The filters after they have moved and taken in what their agents learned."""
+        here, move = self.filtering, self.model.solver(state.t, dt)
         known = self.number_known
         size = np.full(here.size, float(seen.present.sum())) if known else counted[here]
         unit = kernel_information(self.model.grid, bandwidth=self.bandwidth, agents=1)
-        scale = (unit / np.maximum(size, 1.0))[:, None]
-        gone = ~seen.present[here]
-        if state.filters is not None:
-            moved = shared_moved(state.filters, move)
-            level = moved.estimates if self.noise == "forecast" else y
-            noise = scale * np.maximum(level, self.floor)
-            noise[gone] = np.inf
-            return shared_step(moved, y, noise, dt), ()
-        means = move(np.stack([s.mean for s in state.low]))
-        level = means if self.noise == "forecast" else y
-        noise = scale * np.maximum(level, self.floor)
-        noise[gone] = np.inf
-        assert self.process is not None
-        q = self.process * self._basis
+        shared = None if state.filters is None else shared_moved(state.filters, move)
+        moved = move(state.estimates) if shared is None else shared.estimates
+        level = moved if self.noise == "forecast" else y
+        noise = (unit / np.maximum(size, 1.0))[:, None] * np.maximum(level, self.floor)
+        noise[~seen.present[here]] = np.inf
+        if shared is not None:
+            return shared_step(shared, y, noise, dt), ()
+        q = (self.process or 0.0) * self._basis
         return None, tuple(
-            low_rank_step(s, move, y[i], noise[i], dt, process=q)
-            for i, s in enumerate(state.low)
+            low_rank_step(s, move, y[i], noise[i], dt, process=q) for i, s in enumerate(state.low)
         )
 
     def summary(self, state: DensityState) -> Summary:

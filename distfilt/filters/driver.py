@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, count, increasing, number
-from ..network import Faults
+from ..checks import Array, array, callable_, count, increasing, instance, number
+from ..models import Model
+from ..network import Channel, Faults, Graph
 from ..progress import track
 from .record import SCORES, Recorder
 from .saving import State
@@ -21,7 +22,7 @@ from .saving import State
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["Filter", "Late", "Summary", "final_state"]
+__all__ = ["Filter", "Late", "Summary", "TeamFilter", "final_state"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,10 +219,74 @@ class Filter(ABC):
         return recorder.dataset(last)
 
 
-def check_faults(faults: Any) -> None:
-    """Refuse what is no Faults, and delays: a step's messages arrive within it or never."""
-    if faults is not None and (not isinstance(faults, Faults) or faults.late):
-        raise ValueError(f"faults: needs Faults without a delay, got {faults!r}")
+class TeamFilter(Filter):
+    """What filters of several agents share: names, and faults of the channel between them.
+
+    A subclass is a dataclass with these fields; one whose agents do not agree has no `agreement`.
+
+    Examples
+    --------
+    >>> from distfilt.filters import GaussianFilter
+    >>> issubclass(GaussianFilter, TeamFilter)
+    True
+    """
+
+    names: Any
+    faults: Any
+    graph: Any
+    agreement: Any = None
+
+    @property
+    @abstractmethod
+    def count(self) -> int:
+        """Number A of agents."""
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """Names of the agents; their numbers by default."""
+        return tuple(self.names) or tuple(str(k) for k in range(self.count))
+
+    def check_team(self) -> None:
+        """Refuse names that are not one for each agent, and faults with a delay.
+
+        A step's messages arrive within it or never.
+        """
+        faults = self.faults
+        if faults is not None and (not isinstance(faults, Faults) or faults.late):
+            raise ValueError(f"faults: needs Faults without a delay, got {faults!r}")
+        if self.names and len(self.names) != self.count:
+            raise ValueError(f"names: needs {self.count} names, got {len(self.names)}")
+
+    def check_network(self) -> None:
+        """The same, for a filter whose agents talk and agree on a graph, which may move."""
+        self.check_team()
+        if isinstance(self.graph, Graph):
+            self.graph_at()
+        elif self.graph is not None:
+            callable_(self.graph, "graph")
+        if self.agreement is not None:
+            callable_(self.agreement, "agreement")
+
+    def graph_at(self, *now: Any) -> Graph:
+        """The graph, or what the function that stands for it returns: one of all the agents."""
+        found = self.graph if isinstance(self.graph, Graph) else self.graph(*now)
+        if instance(found, "graph", Graph).size != self.count:
+            raise ValueError(f"graph: needs {self.count} agents, got {found.size}")
+        return found
+
+    def channel(self, state: State, t: float) -> Channel | None:
+        """The door of this step; without a graph there is none."""
+        if self.graph is None:
+            return None
+        return Channel(
+            self.graph_at(t), ledger=state.ledger, runs=state.runs, faults=self.faults, t=t
+        )
+
+
+def described(model: Model) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names and units of a model's components; their numbers where it has no names."""
+    names = tuple(model.names) or tuple(str(k) for k in range(model.dim))
+    return names, tuple(model.units) or ("",) * model.dim
 
 
 def final_state(run: xarray.Dataset) -> State:

@@ -12,28 +12,26 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from .. import ensembles as moments
-from ..checks import Array, array, callable_, count, generator, instance, number
+from ..checks import Array, array, callable_, count, generator
 from ..models import Model
-from ..network import Graph, Ledger, intersection
+from ..network import Graph, intersection
 from ..sensors import Sensor
 from ..updates import exact_draws, exact_forecast, known_noise, sampled_forecast, with_missing
 from ..updates.door import Update, stackable, unchecked
 from .driver import Late, Summary
-from .failures import guarded, not_finite
+from .failures import guarded
 from .heard import Heard
-from .saving import State
-from .wiring import SensorFilter
+from .stepping import SensorState, Step
+from .wiring import Prior, SensorFilter
 
 __all__ = ["EnsembleFilter", "EnsembleState"]
 
-Mask = NDArray[np.bool_]
-
 
 @dataclass(frozen=True, eq=False)
-class EnsembleState(State):
+class EnsembleState(SensorState):
     """What the agents' ensembles are between two steps.
 
     Parameters
@@ -49,31 +47,21 @@ class EnsembleState(State):
 
     Examples
     --------
+    >>> from distfilt.network import Ledger
     >>> state = EnsembleState(0.0, Ledger.empty(2), np.random.default_rng(0), np.zeros((2, 5, 3)))
     >>> state.agents, state.members, state.dim
     (2, 5, 3)
     """
 
     ensembles: Array
-    history: tuple[tuple[float, Array], ...] = ()
-    failed: Mask = field(default_factory=lambda: np.zeros((), dtype=bool))
+
+    _belief = "ensembles", (..., "A", "N", "d")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        ensembles = array(self.ensembles, "ensembles", (..., "A", "N", "d"))
         generator(self.rng)
-        if self.ledger.messages.size != ensembles.shape[-3]:
-            raise ValueError(
-                f"ledger: needs {ensembles.shape[-3]} agents, got {self.ledger.messages.size}"
-            )
         for _, earlier in self.history:
-            array(earlier, "history", ensembles.shape)
-        object.__setattr__(self, "failed", np.broadcast_to(self.failed, self.runs))
-
-    @property
-    def runs(self) -> tuple[int, ...]:
-        """Leading axes: independent runs of the network."""
-        return tuple(self.ensembles.shape[:-3])
+            array(earlier, "history", self.ensembles.shape)
 
     @property
     def agents(self) -> int:
@@ -168,8 +156,7 @@ class EnsembleFilter(SensorFilter):
         return cls(model, sensors, graph, **(own | options))
 
     def start(
-        self, prior: ArrayLike | Callable[..., Array] | tuple[ArrayLike, ArrayLike], *,
-        rng: np.random.Generator, runs: tuple[int, ...] = (), t: float = 0.0,
+        self, prior: Prior, *, rng: np.random.Generator, runs: tuple[int, ...] = (), t: float = 0.0
     ) -> EnsembleState:
         """The state before the first step.
 
@@ -187,9 +174,7 @@ class EnsembleFilter(SensorFilter):
         t : float
             The time of the prior, in s.
         """
-        drawn = self.drawn(prior, self.members, runs, rng)
-        ledger = Ledger.empty(len(self.sensors))
-        return EnsembleState(number(t, "t"), ledger, rng.spawn(1)[0], drawn)
+        return self.first(EnsembleState, t, rng, self.drawn(prior, self.members, runs, rng))
 
     def step(
         self, state: EnsembleState, t: float, observations: Sequence[ArrayLike | None], *,
@@ -216,69 +201,44 @@ class EnsembleFilter(SensorFilter):
         FilterError
             If a run fails; see `failures`.
         """
-        self._check_state(state)
-        dt = self.elapsed(state, t)
-        seen = self.observed(state, observations)
-        kept = (*state.history, (state.t, state.ensembles)) if self.lag else ()
-        times = [time for time, _ in kept]
-        earlier = [self.slot(item, times, state) for item in late]
-        rng = copy.deepcopy(generator(state.rng))
-        channel = self.channel(state, t)
-        moved = self.forecast(state.ensembles, self.model, state.t, dt, rng=rng)
+        sizes = self.members, self.model.dim
+        step = self.begin(state, EnsembleState, t, observations, late, sizes)
+        moved = self.forecast(state.ensembles, self.model, state.t, step.dt, rng=step.rng)
         moved = array(moved, "forecast", state.ensembles.shape, finite=False)
-        failed = self.settle(not_finite(moved, 2), range(state.agents), t, state.failed)
-        moved = np.where(failed[..., None, None, None], state.ensembles, moved)
-        stack = [*(e.copy() for _, e in kept), moved]
-        readings = [*earlier, (len(times), seen)]
-        for slot, observed in readings:
-            before = state.ensembles if slot == len(times) else None
-            for group in self.gather(observed, channel):
-                errors = self._condition(stack, slot, group, failed, rng, before)
-                failed = self.settle(errors, group.agents, t, failed)
-        now = stack[-1]
-        if self.agreement is not None and channel is not None:
-            now = array(self.agreement(now, channel), "agreement", now.shape)
-        history = tuple(zip(times, stack[:-1], strict=True))[-self.lag :] if self.lag else ()
-        ledger = state.ledger if channel is None else channel.ledger
-        return EnsembleState(float(t), ledger, rng, now, history, failed)
+        stack = step.stack(step.moved(moved, state.ensembles, 2))
+        for place, group in step.heard():
+            step.settle(self._condition(stack, place, group, step), group.agents)
+        (now,) = step.agreed(stack[-1])
+        return step.end(EnsembleState, now, history=zip(step.times, stack[:-1], strict=True))
 
     def summary(self, state: EnsembleState) -> Summary:
         """Ensemble means and variances; the members for the scores."""
-        return _summary(state.ensembles, state.failed)
-
-    def past(self, state: EnsembleState) -> tuple[tuple[float, Summary], ...]:
-        """Earlier times, oldest first, and what is believed of them by now."""
-        return tuple((t, _summary(e, state.failed)) for t, e in state.history)
+        return ensemble_summary(state)
 
     def _condition(
-        self, stack: list[Array], slot: int, group: Heard, failed: Mask, rng: np.random.Generator,
-        previous: Array | None,
+        self, stack: list[Array], place: int, group: Heard, step: Step
     ) -> dict[tuple[int, ...], str]:
         """Condition every time's ensembles of a group's agents, in place; the rows that failed."""
         rows = group.agents
         members = tuple(e[..., rows, :, :] for e in stack)
-        before = None if previous is None else previous[..., rows, :, :]
-        predicted = group.predict(members[slot], before)
-        target = np.where(failed[..., None, None], np.nan, group.target)
-        repredicts = bool(getattr(self.update, "repredicts", False)) and len(stack) == 1
+        before = step.before(place, rows)
+        predicted = group.predict(members[place], before)
+        repredicts = getattr(self.update, "repredicts", False) and len(stack) == 1
 
         def compute(h: Array, y: Array, *rest: Any) -> tuple[Array, ...]:
             *ensembles, noise, source = rest
-            whole = h.shape == predicted.shape
             options: dict[str, Any] = {}
-            if repredicts and whole:
+            if repredicts and h.shape == predicted.shape:
                 options["predict"] = lambda x: group.predict(x, before)
-            out = []
-            for k, x in enumerate(ensembles):
-                # Every time's members meet the same draw of the noise, so that all the separate
-                # updates are one joint update; the last one advances the generator.
-                own = source if k == len(ensembles) - 1 else copy.deepcopy(source)
-                out.append(self._updated(x, h, y, noise, own, options))
-            return tuple(out)
+            # Every time's members meet the same draw of the noise, so that all the separate
+            # updates are one joint update; the last one advances the generator.
+            sources = [copy.deepcopy(source) for _ in ensembles[1:]] + [source]
+            both = zip(ensembles, sources, strict=True)
+            return tuple(self._updated(x, h, y, noise, own, options) for x, own in both)
 
-        arrays = (predicted, target, *members)
         result, errors = guarded(
-            compute, arrays, members, target.ndim - 1, shared=group.noise, rng=rng
+            compute, (predicted, group.target, *members), members, group.target.ndim - 1,
+            shared=group.noise, rng=step.rng,
         )
         for e, new in zip(stack, result, strict=True):
             e[..., rows, :, :] = new
@@ -302,18 +262,10 @@ class EnsembleFilter(SensorFilter):
             out[..., g, :, :] = array(new, "update", x[..., g, :, :].shape, finite=False)
         return out
 
-    def _check_state(self, state: Any) -> None:
-        instance(state, "state", EnsembleState)
-        needed = (len(self.sensors), self.members, self.model.dim)
-        if state.ensembles.shape[-3:] != needed:
-            raise ValueError(f"state: needs ensembles (..., {needed}), got {state.ensembles.shape}")
 
-
-def _summary(e: Array, failed: Mask) -> Summary:
-    mean = moments.mean(e)
-    squares = moments.mean(moments.anomalies(e) ** 2)
-    variance = squares * e.shape[-2] / (e.shape[-2] - 1)
-    if failed.any():
-        mean, variance = mean.copy(), variance.copy()
-        mean[failed], variance[failed] = np.nan, np.nan
-    return Summary(mean, variance, members=e)
+def ensemble_summary(state: EnsembleState) -> Summary:
+    """Means and variances of the agents' ensembles, and the members for the scores."""
+    x = state.ensembles
+    squares = moments.mean(moments.anomalies(x) ** 2)
+    variance = squares * state.members / (state.members - 1)
+    return Summary(state.shown(moments.mean(x)), state.shown(variance), members=x)

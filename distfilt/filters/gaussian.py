@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..checks import Array, array, choice, count, covariance, instance, number
+from ..checks import Array, array, choice, count, covariance, number
 from ..linalg import _symmetrise
-from ..network import Ledger
 from .driver import Late, Summary
-from .failures import guarded, not_finite
+from .failures import guarded
 from .heard import Heard
-from .saving import State
+from .stepping import SensorState, Step
 from .wiring import SensorFilter
 
 __all__ = ["GaussianFilter", "GaussianState"]
 
-Mask = NDArray[np.bool_]
-
 
 @dataclass(frozen=True, eq=False)
-class GaussianState(State):
+class GaussianState(SensorState):
     """What the agents believe between two steps.
 
     Parameters
@@ -44,6 +41,7 @@ class GaussianState(State):
 
     Examples
     --------
+    >>> from distfilt.network import Ledger
     >>> state = GaussianState(0.0, Ledger.empty(2), None, np.zeros((2, 1)), np.ones((2, 1, 1)), 1)
     >>> state.means.shape, state.runs
     ((2, 1), ())
@@ -52,26 +50,30 @@ class GaussianState(State):
     joint_means: Array
     joint_covariances: Array
     dim: int
-    history: tuple[float, ...] = ()
-    failed: Mask = field(default_factory=lambda: np.zeros((), dtype=bool))
+
+    _belief = "joint_means", (..., "A", "D")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        d = count(self.dim, "dim")
-        m = array(self.joint_means, "joint_means", (..., "A", d * (1 + len(self.history))))
-        wanted = (*m.shape, m.shape[-1])
-        covariance(
-            array(self.joint_covariances, "joint_covariances", wanted), "joint_covariances",
-            semidefinite=True,
-        )
-        if self.ledger.messages.size != m.shape[-2]:
-            raise ValueError(f"ledger: needs {m.shape[-2]} agents, got {self.ledger.messages.size}")
-        object.__setattr__(self, "failed", np.broadcast_to(self.failed, self.runs))
+        size = count(self.dim, "dim") * (1 + len(self.history))
+        m = array(self.joint_means, "joint_means", (..., "A", size))
+        p = array(self.joint_covariances, "joint_covariances", (*m.shape, size))
+        covariance(p, "joint_covariances", semidefinite=True)
 
     @property
-    def runs(self) -> tuple[int, ...]:
-        """Leading axes: independent runs of the network."""
-        return tuple(self.joint_means.shape[:-2])
+    def times(self) -> tuple[float, ...]:
+        """The earlier times that are kept, oldest first."""
+        return self.history[::-1]
+
+    @property
+    def earlier(self) -> tuple[Self, ...]:
+        """A state for each of these times, as what is believed of it by now."""
+        m, p, d = self.joint_means, self.joint_covariances, self.dim
+        own = [slice(k * d, (k + 1) * d) for k in range(len(self.history), 0, -1)]
+        return tuple(
+            replace(self, t=t, history=(), joint_means=m[..., k], joint_covariances=p[..., k, k])
+            for t, k in zip(self.times, own, strict=True)
+        )
 
     @property
     def means(self) -> Array:
@@ -133,20 +135,13 @@ class GaussianFilter(SensorFilter):
         ----------
         prior : tuple
             ``(mean, cov)``, (d,) and (d, d), the same for all agents and runs.
-        rng : numpy.random.Generator, optional
-            Not used: nothing is drawn. It is accepted so that all filters start alike.
-        runs : tuple of int
-            Leading axes: independent runs.
-        t : float
-            The time of the prior, in s.
+        rng, runs, t
+            As for :meth:`distfilt.filters.EnsembleFilter.start`; the generator is not needed, as
+            nothing is drawn.
         """
-        if not isinstance(prior, tuple) or len(prior) != 2:
-            raise ValueError(f"prior: needs a tuple (mean, cov), got {type(prior).__name__}")
-        d, agents = self.model.dim, len(self.sensors)
-        lead = (*(count(n, "runs") for n in runs), agents)
-        m = np.broadcast_to(array(prior[0], "prior", (d,)), (*lead, d))
-        p = np.broadcast_to(covariance(prior[1], "prior", d), (*lead, d, d))
-        return GaussianState(number(t, "t"), Ledger.empty(agents), None, m.copy(), p.copy(), d)
+        lead, both = self.leading(runs), self.moments(prior)
+        m, p = (np.broadcast_to(x, (*lead, *x.shape)).copy() for x in both)
+        return self.first(GaussianState, t, None, m, p, self.model.dim)
 
     def step(
         self, state: GaussianState, t: float, observations: Sequence[ArrayLike | None], *,
@@ -159,55 +154,35 @@ class GaussianFilter(SensorFilter):
         state, t, observations, late
             As for :meth:`distfilt.filters.EnsembleFilter.step`.
         """
-        instance(state, "state", GaussianState)
-        dt = self.elapsed(state, t)
-        seen = self.observed(state, observations)
-        channel = self.channel(state, t)
-        times = (state.t, *state.history)[: self.lag]
-        earlier = [self.slot(item, times, state) for item in late]
-        means, covs = self._forecast(state, dt, len(times))
-        agents = range(len(self.sensors))
-        failed = self.settle(not_finite(means, 1), agents, t, state.failed)
-        if failed.any():
-            means = np.where(failed[..., None, None], 0.0, means)
-            covs = np.where(failed[..., None, None, None], np.eye(means.shape[-1]), covs)
-        for slot, observed in [*((k + 1, o) for k, o in earlier), (0, seen)]:
-            for group in self.gather(observed, channel):
-                errors = self._condition(means, covs, slot, group, failed)
-                failed = self.settle(errors, group.agents, t, failed)
-        if self.agreement is not None and channel is not None:
-            means, covs = self._agreed(means, covs, channel)
-        ledger = state.ledger if channel is None else channel.ledger
-        return GaussianState(
-            float(t), ledger, None, means, _symmetrise(covs), state.dim, times, failed
-        )
+        step = self.begin(state, GaussianState, t, observations, late)
+        means, covs = self._forecast(state, step.dt, len(step.times))
+        means = step.moved(means, 0.0, 1)
+        covs = step.kept(covs, np.eye(means.shape[-1]))
+        for place, group in step.heard():
+            slot = len(step.times) - place
+            step.settle(self._condition(means, covs, slot, group), group.agents)
+        if step.agrees:
+            means, covs = self._agreed(means, covs, step)
+        covs = _symmetrise(covs)
+        return step.end(GaussianState, means, covs, state.dim, history=reversed(step.times))
 
     def summary(self, state: GaussianState) -> Summary:
         """Means and covariances of the present state."""
-        return _summary(state, 0)
-
-    def past(self, state: GaussianState) -> tuple[tuple[float, Summary], ...]:
-        """Earlier times, oldest first, and what is believed of them by now."""
-        return tuple(
-            (t, _summary(state, k + 1)) for k, t in reversed(list(enumerate(state.history)))
-        )
+        cov = state.shown(state.covariances)
+        return Summary(state.shown(state.means), np.diagonal(cov, axis1=-2, axis2=-1), cov)
 
     def _forecast(self, state: GaussianState, dt: float, kept: int) -> tuple[Array, Array]:
         """Joint mean and covariance of the moved state and of `kept` earlier ones."""
         d, model = state.dim, self.model
-
-        def flow(x: Array) -> Array:
-            return model.step(x, state.t, dt)
-
         moved, slope, extra = self._linearised(
-            flow, lambda x: model.jacobian(x, state.t, dt), state.means, state.covariances
+            lambda x: model.step(x, state.t, dt), lambda x: model.jacobian(x, state.t, dt),
+            state.means, state.covariances,
         )
         old = state.joint_means[..., : kept * d]
-        size = state.joint_means.shape[-1]
-        shift = np.zeros((*slope.shape[:-2], (1 + kept) * d, size))
+        shift = np.zeros((*slope.shape[:-2], (1 + kept) * d, state.joint_means.shape[-1]))
         shift[..., :d, :d] = slope
         shift[..., d:, : kept * d] = np.eye(kept * d)
-        covs = shift @ state.joint_covariances @ np.swapaxes(shift, -1, -2)
+        covs = shift @ state.joint_covariances @ shift.mT
         covs[..., :d, :d] += model.noise(state.t, dt) + extra
         return np.concatenate([moved, old], axis=-1), covs
 
@@ -222,20 +197,19 @@ class GaussianFilter(SensorFilter):
             return at, slope, np.zeros((*slope.shape[:-1], slope.shape[-2]))
         d = mean.shape[-1]
         root = np.linalg.cholesky((d + self.kappa) * cov)
-        moves = np.swapaxes(np.concatenate([root, -root], axis=-1), -1, -2)
+        moves = np.concatenate([root, -root], axis=-1).mT
         points = mean[..., None, :] + np.concatenate([0 * moves[..., :1, :], moves], axis=-2)
         w = np.full(2 * d + 1, 0.5 / (d + self.kappa))
         w[0] = self.kappa / (d + self.kappa)
         values = function(points)
         at = w @ values
         gap = values - at[..., None, :]
-        around = points - mean[..., None, :]
-        weighed = np.swapaxes(w[:, None] * gap, -1, -2)
-        slope = np.swapaxes(np.linalg.solve(cov, np.swapaxes(weighed @ around, -1, -2)), -1, -2)
-        return at, slope, weighed @ gap - slope @ cov @ np.swapaxes(slope, -1, -2)
+        weighed = (w[:, None] * gap).mT
+        slope = np.linalg.solve(cov, (weighed @ (points - mean[..., None, :])).mT).mT
+        return at, slope, weighed @ gap - slope @ cov @ slope.mT
 
     def _condition(
-        self, means: Array, covs: Array, slot: int, group: Heard, failed: Mask
+        self, means: Array, covs: Array, slot: int, group: Heard
     ) -> dict[tuple[int, ...], str]:
         """Condition a group's joint Gaussians in place; the rows that failed."""
         d, rows = self.model.dim, group.agents
@@ -244,33 +218,26 @@ class GaussianFilter(SensorFilter):
         at, slope, extra = self._linearised(
             group.predict, group.jacobian, m[..., here], p[..., here, here]
         )
-        target = np.where(failed[..., None, None], np.nan, group.target)
         big = np.zeros((*slope.shape[:-1], m.shape[-1]))
         big[..., here] = slope
-
-        def compute(m: Array, p: Array, *rest: Array) -> tuple[Array, ...]:
-            at, big, extra, target, noise, _ = rest
-            return _updated(m, p, target - at, big, noise + extra)
-
         (m, p), errors = guarded(
-            compute, (m, p, at, big, extra, target), (m, p), target.ndim - 1,
+            lambda m, p, gap, big, extra, noise, _: _updated(m, p, gap, big, noise + extra),
+            (m, p, group.target - at, big, extra), (m, p), group.target.ndim - 1,
             shared=group.noise, rng=None,
         )
         means[..., rows, :], covs[..., rows, :, :] = m, p
         return errors
 
-    def _agreed(self, means: Array, covs: Array, channel: Any) -> tuple[Array, Array]:
+    def _agreed(self, means: Array, covs: Array, step: Step) -> tuple[Array, Array]:
         """Fuse the present states; what is believed of the past follows by its regression."""
         d = self.model.dim
         old, now = means[..., :d], _symmetrise(covs[..., :d, :d])
-        assert self.agreement is not None
-        m, p = self.agreement(old, now, channel)
-        m, p = array(m, "agreement", old.shape), array(p, "agreement", now.shape)
+        m, p = step.agreed(old, now)
         if means.shape[-1] == d:
             return m, p
-        gain = np.swapaxes(np.linalg.solve(now, covs[..., :d, :]), -1, -2)
+        gain = np.linalg.solve(now, covs[..., :d, :]).mT
         moved = means + (gain @ (m - old)[..., None])[..., 0]
-        return moved, covs + gain @ (p - now) @ np.swapaxes(gain, -1, -2)
+        return moved, covs + gain @ (p - now) @ gain.mT
 
 
 def _updated(m: Array, p: Array, gap: Array, h: Array, r: Array) -> tuple[Array, Array]:
@@ -281,18 +248,8 @@ def _updated(m: Array, p: Array, gap: Array, h: Array, r: Array) -> tuple[Array,
         here = ~missing[..., :, None] & ~missing[..., None, :]
         r = np.where(here, r, np.eye(r.shape[-1]))
         gap = np.where(missing, 0.0, gap)
-    turned = np.swapaxes(h, -1, -2)
-    cross = p @ turned
-    gain = np.swapaxes(np.linalg.solve(h @ cross + r, np.swapaxes(cross, -1, -2)), -1, -2)
+    cross = p @ h.mT
+    gain = np.linalg.solve(h @ cross + r, cross.mT).mT
     rest = np.eye(p.shape[-1]) - gain @ h
-    new = rest @ p @ np.swapaxes(rest, -1, -2) + gain @ r @ np.swapaxes(gain, -1, -2)
+    new = rest @ p @ rest.mT + gain @ r @ gain.mT
     return m + (gain @ gap[..., None])[..., 0], _symmetrise(new)
-
-
-def _summary(state: GaussianState, slot: int) -> Summary:
-    here = slice(slot * state.dim, (slot + 1) * state.dim)
-    mean, cov = state.joint_means[..., here], state.joint_covariances[..., here, here]
-    if state.failed.any():
-        gone = state.failed[..., None, None]
-        mean, cov = np.where(gone, np.nan, mean), np.where(gone[..., None], np.nan, cov)
-    return Summary(mean, np.diagonal(cov, axis1=-2, axis2=-1), cov)

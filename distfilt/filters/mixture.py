@@ -9,24 +9,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, callable_, choice, count, instance, number
-from ..mixtures import GaussianMixture, split, stretching, two_stage
+from ..checks import Array, choice, count, instance, number, same_length
+from ..mixtures import GaussianMixture, moved, split_stretched, two_stage
 from ..mixtures.gaussian import trusted
-from ..mixtures.unscented import POINT_RULES, forecast, update
+from ..mixtures.steps import _conditioned
+from ..mixtures.unscented import POINT_RULES
 from ..models import Model
 from ..network import Channel, Faults, Graph, Ledger
 from ..sensors import Sensor
-from .driver import Filter, Summary, check_faults
+from .driver import Summary, TeamFilter, described
 from .observations import at_one_time
 from .saving import State
 
 __all__ = ["MixtureFilter", "MixtureState"]
 
 Agreement = Callable[[GaussianMixture, Sequence[GaussianMixture]], GaussianMixture]
-_LIGHT = 1e-3
-"""Mixands lighter than this are not split."""
-_NOTHING = 1e-9
-"""Mixands lighter than this are left out after an update."""
 _EXACT = 400
 """Up to how many mixands every pair is a candidate for a merger."""
 
@@ -63,7 +60,7 @@ class MixtureState(State):
 
 
 @dataclass(frozen=True, eq=False)
-class MixtureFilter(Filter):
+class MixtureFilter(TeamFilter):
     """Every agent holds a mixture over [target; its own state]; only target marginals travel.
 
     In a step an agent splits the mixands that its model stretches most, forecasts all of them,
@@ -138,45 +135,32 @@ class MixtureFilter(Filter):
         for model in self.models:
             if instance(model, "models", Model).dim < n:
                 raise ValueError(f"models: needs at least {n} components, got {model.dim}")
-        if len(self.sensors) != len(self.models):
-            raise ValueError(f"sensors: needs {len(self.models)}, got {len(self.sensors)}")
+        same_length(self.sensors, self.models, "sensors", "models")
         for sensor in self.sensors:
             if sensor is not None and instance(sensor, "sensors", Sensor).uses_previous:
                 raise ValueError("sensors: needs sensors of the present state, got a differential")
-        if self.graph is not None and not isinstance(self.graph, Graph):
-            callable_(self.graph, "graph")
-        if self.agreement is not None:
-            callable_(self.agreement, "agreement")
-            if self.graph is None:
-                raise ValueError("graph: needs a Graph for the agreement, got None")
-        check_faults(self.faults)
+        self.check_network()
+        if self.agreement is not None and self.graph is None:
+            raise ValueError("graph: needs a Graph for the agreement, got None")
         count(self.most, "most", at_least=count(self.size, "size"))
         choice(self.rule, "rule", POINT_RULES)
         for name in ("stretch", "gate"):
             if getattr(self, name) is not None:
                 number(getattr(self, name), name, above=0)
-        if self.names and len(self.names) != len(self.models):
-            raise ValueError(f"names: needs {len(self.models)} names, got {len(self.names)}")
 
     @property
-    def agents(self) -> tuple[str, ...]:
-        """Names of the agents."""
-        return tuple(self.names) or tuple(str(k) for k in range(len(self.models)))
+    def count(self) -> int:
+        """Number A of agents."""
+        return len(self.models)
 
     @property
     def components(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Names and units of the components, those of the largest state."""
-        model = max(self.models, key=lambda m: m.dim)
-        names = model.names or tuple(f"x{k}" for k in range(model.dim))
-        return names, model.units or ("",) * model.dim
+        return described(max(self.models, key=lambda m: m.dim))
 
     def start(
-        self,
-        prior: Sequence[GaussianMixture],
-        *,
-        rng: np.random.Generator | None = None,
-        runs: tuple[int, ...] = (),
-        t: float = 0.0,
+        self, prior: Sequence[GaussianMixture], *, rng: np.random.Generator | None = None,
+        runs: tuple[int, ...] = (), t: float = 0.0,
     ) -> MixtureState:
         """The state before the first step.
 
@@ -220,7 +204,7 @@ class MixtureFilter(Filter):
             self._moved(belief, model, state.t, now - state.t)
             for belief, model in zip(state.mixtures, self.models, strict=True)
         ]
-        beliefs, ledger = self._told(beliefs, seen, state.ledger, now)
+        beliefs, ledger = self._told(beliefs, seen, state, now)
         most = max(_EXACT, self.size)
         kept = [two_stage(belief, self.size, heaviest=most) for belief in beliefs]
         # Without the square roots that they came with: a loaded state has to go on alike.
@@ -247,55 +231,19 @@ class MixtureFilter(Filter):
         if dt == 0:
             return belief
         if self.stretch is not None:
-            belief = self._split(belief, model, t, dt)
-        means, factors = forecast(
-            belief.means, belief.factors, lambda x: model._step(x, t, dt), model._root(t, dt),
-            rule=self.rule,
-        )
-        return _from_factors(belief.weights, means, factors)
-
-    def _split(self, belief: GaussianMixture, model: Model, t: float, dt: float) -> GaussianMixture:
-        """Up to three rounds of splits in three, the worst mixands first."""
-        for _ in range(3):
-            room = (self.most - belief.size) // 2
-            if room < 1:
-                break
-            slope = np.broadcast_to(
-                model._jacobian(belief.means, t, dt), (belief.size, model.dim, model.dim)
+            belief = split_stretched(
+                belief, lambda x: model._jacobian(x, t, dt), most=self.most,
+                stretch=self.stretch, scale=self.scale,
             )
-            directions, lengths = stretching(belief.factors, slope, scale=self.scale)
-            cost = np.where(belief.weights > _LIGHT, belief.weights * lengths, 0.0)
-            worst = np.argsort(-cost, kind="stable")[:room]
-            worst = worst[cost[worst] > (self.stretch or 0.0)]
-            if not worst.size:
-                break
-            belief = split(belief, worst, directions[worst])
-        return belief
+        return moved(belief, lambda x: model._step(x, t, dt), model._root(t, dt), rule=self.rule)
 
     def _seen(self, belief: GaussianMixture, sensor: Sensor, y: Array) -> GaussianMixture:
         """Condition on what of a reading is there; a reading out of every gate changes nothing."""
-        there = np.flatnonzero(~np.isnan(y))
-
-        def residual(a: Array, b: Array) -> Array:
-            full = np.zeros((2, *np.broadcast_shapes(a.shape, b.shape)[:-1], sensor.dim))
-            full[0][..., there], full[1][..., there] = a, b
-            return np.asarray(sensor._residual(full[0], full[1])[..., there])
-
-        means, factors, logs, distance = update(
-            belief.means, belief.factors, y[there], lambda x: sensor._predict(x)[..., there],
-            sensor.cov[np.ix_(there, there)], residual=residual, rule=self.rule,
+        gate = np.inf if self.gate is None else self.gate
+        return _conditioned(
+            belief, y, sensor._predict, sensor.cov, sensor._residual, self.rule, gate,
+            "observations",
         )
-        # A mixand with a point that cannot be seen contradicts the reading.
-        visible = np.isfinite(logs)
-        logs = np.where(visible, belief.log_weights + logs, -np.inf)
-        if not np.isfinite(logs.max()):
-            raise ValueError("observations: needs a target that can be seen, got one that cannot")
-        if self.gate is not None and distance[visible].min() > self.gate**2:
-            return belief
-        w = np.exp(logs - logs.max())
-        w /= w.sum()
-        keep = w > _NOTHING
-        return _from_factors(w[keep] / w[keep].sum(), means[keep], factors[keep])
 
     def _read(
         self, beliefs: Sequence[GaussianMixture], seen: Sequence[Array | None]
@@ -308,19 +256,15 @@ class MixtureFilter(Filter):
         ]
 
     def _told(
-        self, beliefs: list[GaussianMixture], seen: Sequence[Array | None], ledger: Ledger,
+        self, beliefs: list[GaussianMixture], seen: Sequence[Array | None], state: MixtureState,
         now: float,
     ) -> tuple[list[GaussianMixture], Ledger]:
         """The beliefs after the agents' readings and their exchange."""
         after = self._read(beliefs, seen)
-        if self.agreement is None:
-            return after, ledger
-        channel = self._channel(ledger, now)
+        channel = self.channel(state, now) if self.agreement else None
+        if channel is None:
+            return after, state.ledger
         return self._agreed(after, channel), channel.ledger
-
-    def _channel(self, ledger: Ledger, now: float) -> Channel:
-        graph = self.graph if isinstance(self.graph, Graph) else self.graph(now)  # type: ignore[misc]
-        return Channel(graph, ledger=ledger, faults=self.faults, t=now)
 
     def _agreed(self, beliefs: list[GaussianMixture], channel: Channel) -> list[GaussianMixture]:
         """Send target marginals, and fuse what arrived; who hears nothing changes nothing."""
@@ -341,11 +285,3 @@ class MixtureFilter(Filter):
                 ) from None
             out.append(fused)
         return out
-
-
-def _from_factors(weights: Array, means: Array, factors: Array) -> GaussianMixture:
-    """A mixture that keeps the square roots it came with."""
-    array(means, "means", (weights.size, "d"))
-    out = trusted(weights, means, factors @ np.swapaxes(factors, -1, -2))
-    out.__dict__["factors"] = factors
-    return out

@@ -8,10 +8,9 @@ from dataclasses import KW_ONLY, dataclass
 import numpy as np
 
 from ..checks import Array, count, instance
-from ..mixtures import GaussianMixture
-from ..mixtures.unscented import update
+from ..mixtures import GaussianMixture, conditioned
 from ..network import Ledger
-from .mixture import MixtureFilter, _from_factors
+from .mixture import MixtureFilter, MixtureState
 
 __all__ = ["NewsFilter", "increment"]
 
@@ -115,7 +114,7 @@ class NewsFilter(MixtureFilter):
         object.__setattr__(self, "common", alike)
 
     def _told(
-        self, beliefs: list[GaussianMixture], seen: Sequence[Array | None], ledger: Ledger,
+        self, beliefs: list[GaussianMixture], seen: Sequence[Array | None], state: MixtureState,
         now: float,
     ) -> tuple[list[GaussianMixture], Ledger]:
         """Own readings, then others' news, then what all received alike."""
@@ -126,7 +125,8 @@ class NewsFilter(MixtureFilter):
             None if old is new else increment(old.marginal(part), new.marginal(part))
             for old, new in zip(beliefs, after, strict=True)
         ]
-        channel = self._channel(ledger, now)
+        channel = self.channel(state, now)
+        assert channel is not None
         inbox = channel.exchange([None if s is None or not s.size else _packed(s) for s in said])
         for k, heard in enumerate(inbox):
             for news in heard.values():
@@ -164,11 +164,6 @@ def _unpacked(numbers: Array, n: int) -> Array:
 def _learned(belief: GaussianMixture, news: Array) -> GaussianMixture:
     """A belief after news of its first components."""
     rows, values = news[:, :-1], news[:, -1]
-    n = rows.shape[1]
-    means, factors, logs, _ = update(
-        belief.means, belief.factors, values, lambda x: x[..., :n] @ rows.T, np.eye(values.size)
+    return conditioned(
+        belief, values, lambda x: x[..., : rows.shape[1]] @ rows.T, np.eye(values.size)
     )
-    logs = belief.log_weights + logs
-    w = np.exp(logs - logs.max())
-    keep = w > 1e-9 * w.sum()
-    return _from_factors(w[keep] / w[keep].sum(), means[keep], factors[keep])

@@ -2,31 +2,31 @@
 
 from __future__ import annotations
 
-import copy
+import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..checks import Array, array, choice, count, generator, instance, number
-from ..network import Ledger
 from ..updates.particles import (
     RESAMPLING,
     _distinct,
-    _effective_size,
     _jittered,
     _levels,
     _picked,
+    _size_of,
+    _taken,
     _weighed,
 )
 from .driver import Late, Summary
-from .failures import guarded, not_finite
+from .failures import guarded
 from .heard import Heard
-from .saving import State
-from .wiring import SensorFilter
+from .stepping import SensorState
+from .wiring import Prior, SensorFilter
 
 __all__ = ["ParticleCollapse", "ParticleFilter", "ParticleState"]
 
@@ -38,7 +38,7 @@ class ParticleCollapse(RuntimeWarning):
 
 
 @dataclass(frozen=True, eq=False)
-class ParticleState(State):
+class ParticleState(SensorState):
     """What the agents' weighted particles are between two steps.
 
     Parameters
@@ -55,6 +55,7 @@ class ParticleState(State):
 
     Examples
     --------
+    >>> from distfilt.network import Ledger
     >>> state = ParticleState(0.0, Ledger.empty(1), np.random.default_rng(0),
     ...                       np.zeros((1, 5, 3)), np.full((1, 5), -np.log(5)))
     >>> state.runs
@@ -63,22 +64,25 @@ class ParticleState(State):
 
     points: Array
     log_weights: Array
-    history: tuple[tuple[float, Array], ...] = ()
-    failed: Mask = field(default_factory=lambda: np.zeros((), dtype=bool))
+
+    _belief = "points", (..., "A", "N", "d")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        points = array(self.points, "points", (..., "A", "N", "d"))
-        array(self.log_weights, "log_weights", points.shape[:-1], finite=False)
         generator(self.rng)
+        array(self.log_weights, "log_weights", self.points.shape[:-1], finite=False)
         for _, earlier in self.history:
-            array(earlier, "history", points.shape)
-        object.__setattr__(self, "failed", np.broadcast_to(self.failed, self.runs))
+            array(earlier, "history", self.points.shape)
 
-    @property
-    def runs(self) -> tuple[int, ...]:
-        """Leading axes: independent runs of the network."""
-        return tuple(self.points.shape[:-3])
+    @cached_property
+    def weights(self) -> Array:
+        """The normalised weights, (*runs, A, N)."""
+        return np.exp(self.log_weights)
+
+    @cached_property
+    def effective_size(self) -> Array:
+        """Effective sample size of each agent's weights, (*runs, A)."""
+        return _size_of(self.weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,14 +132,12 @@ class ParticleFilter(SensorFilter):
         number(self.jitter, "jitter", at_least=0, at_most=1)
 
     def start(
-        self, prior: ArrayLike | Callable[..., Array] | tuple[ArrayLike, ArrayLike], *,
-        rng: np.random.Generator, runs: tuple[int, ...] = (), t: float = 0.0,
+        self, prior: Prior, *, rng: np.random.Generator, runs: tuple[int, ...] = (), t: float = 0.0
     ) -> ParticleState:
         """The state before the first step; arguments as for `EnsembleFilter.start`."""
         points = self.drawn(prior, self.members, runs, rng)
         equal = np.full(points.shape[:-1], -np.log(self.members))
-        ledger = Ledger.empty(len(self.sensors))
-        return ParticleState(number(t, "t"), ledger, rng.spawn(1)[0], points, equal)
+        return self.first(ParticleState, t, rng, points, equal)
 
     def step(
         self, state: ParticleState, t: float, observations: Sequence[ArrayLike | None], *,
@@ -154,117 +156,102 @@ class ParticleFilter(SensorFilter):
             If less than a hundredth of an agent's particles, or only one, differ from the others,
             or if the effective size of its weights is below two.
         """
-        instance(state, "state", ParticleState)
-        dt = self.elapsed(state, t)
-        seen = self.observed(state, observations)
-        rng = copy.deepcopy(generator(state.rng))
-        channel = self.channel(state, t)
-        kept = (*state.history, (state.t, state.points))[-self.lag :] if self.lag else ()
-        times = [time for time, _ in kept]
-        earlier = [self.slot(item, times, state) for item in late]
-        poor = _effective_size(state.log_weights) < self.threshold * self.members
-        stack, weights = self._resampled([e for _, e in kept], state, poor, rng)
-        moved = self.model.sample_step(stack[-1], state.t, dt, rng=rng)
-        failed = self.settle(not_finite(moved, 2), range(len(self.sensors)), t, state.failed)
-        stack[-1] = np.where(failed[..., None, None, None], stack[-1], moved)
-        for slot, observed in [*earlier, (len(times), seen)]:
-            before = state.points if slot == len(times) else None
-            for group in self.gather(observed, channel):
-                errors = self._weigh(weights, stack[slot], group, failed, before)
-                failed = self.settle(errors, group.agents, t, failed)
-        if self.agreement is not None and channel is not None:
-            stack, weights = self._agreed(stack, weights, channel, rng)
-        ledger = state.ledger if channel is None else channel.ledger
-        history = tuple(zip(times, stack[:-1], strict=True))
-        self._warn(stack[-1], weights, failed, t)
-        return ParticleState(float(t), ledger, rng, stack[-1], weights, history, failed)
+        sizes = self.members, self.model.dim
+        step = self.begin(state, ParticleState, t, observations, late, sizes)
+        stack = step.stack(state.points.copy())
+        weights = self._resampled(stack, state, step.rng)
+        moved = self.model.sample_step(stack[-1], state.t, step.dt, rng=step.rng)
+        stack[-1] = step.moved(moved, stack[-1], 2)
+        for place, group in step.heard():
+            predicted = group.predict(
+                stack[place][..., group.agents, :, :], step.before(place, group.agents)
+            )
+            step.settle(_weigh(weights, predicted, group), group.agents)
+        if step.agrees:
+            # The particles have to be an ensemble, which the agreement can move.
+            levels = _levels(weights.shape, step.rng, self.rule)
+            self._pick(stack, weights, np.exp(weights), np.ones(weights.shape[:-1], bool), levels)
+        (now,) = step.agreed(stack[-1])
+        past = zip(step.times, stack[:-1], strict=True)
+        after = step.end(ParticleState, now, weights, history=past)
+        self._warn(after)
+        return after
 
     def summary(self, state: ParticleState) -> Summary:
         """Weighted means and covariances, effective sizes and the share of distinct particles."""
         instance(state, "state", ParticleState)
-        return _summary(state, state.points)
-
-    def past(self, state: ParticleState) -> tuple[tuple[float, Summary], ...]:
-        """Earlier times, oldest first, and what is believed of them by now."""
-        return tuple((t, _summary(state, points)) for t, points in state.history)
+        w = state.weights
+        mean = (w[..., None, :] @ state.points)[..., 0, :]
+        # Components first: weights then multiply along all particles.
+        around = np.subtract(np.swapaxes(state.points, -1, -2), mean[..., None], order="C")
+        cov = state.shown((w[..., None, :] * around) @ np.swapaxes(around, -1, -2))
+        numbers = {"effective_size": state.effective_size, "distinct": _distinct(state.points)}
+        variance = np.diagonal(cov, axis1=-2, axis2=-1)
+        return Summary(state.shown(mean), variance, cov, state.points, w, numbers)
 
     def _resampled(
-        self, earlier: list[Array], state: ParticleState, poor: Mask, rng: np.random.Generator
-    ) -> tuple[list[Array], Array]:
-        """Paths, and log-weights, after agents with a poor effective size have resampled."""
-        paths = [*earlier, state.points]
+        self, stack: list[Array], state: ParticleState, rng: np.random.Generator
+    ) -> Array:
+        """Log-weights after agents with a poor effective size have resampled, in place."""
+        weights, before = state.log_weights.copy(), stack[-1]
         # Everybody draws, needed or not: an agent's luck must not depend on another's weights.
-        drawn = _levels(state.log_weights.shape, rng, self.rule)
-        noise = rng.standard_normal(state.points.shape) if self.jitter else None
-        weights = state.log_weights.copy()
-        out = [p.copy() for p in paths]
+        levels = _levels(weights.shape, rng, self.rule)
+        noise = rng.standard_normal(before.shape) if self.jitter else None
+        poor = state.effective_size < self.threshold * self.members
         if not poor.any():
-            return out, weights
-        picked = _picked(np.exp(weights[poor]), drawn[poor], self.rule)[..., None]
-        for target, path in zip(out, paths, strict=True):
-            target[poor] = np.take_along_axis(path[poor], picked, axis=-2)
-        if noise is not None:
-            around = paths[-1][poor] - paths[-1][poor].mean(axis=-2, keepdims=True)
+            return weights
+        around = before[poor] if noise is not None else None
+        self._pick(stack, weights, state.weights, poor, levels)
+        if noise is not None and around is not None:
+            around -= around.mean(axis=-2, keepdims=True)
             # Of all particles, weighted or not: after one weight dominated its copies have none.
             cov = np.swapaxes(around, -1, -2) @ around / self.members
-            out[-1][poor] = _jittered(out[-1][poor], cov, self.jitter, noise[poor])
-        weights[poor] = -np.log(self.members)
-        return out, weights
+            stack[-1][poor] = _jittered(stack[-1][poor], cov, self.jitter, noise[poor])
+        return weights
 
-    def _weigh(
-        self, weights: Array, points: Array, group: Heard, failed: Mask, previous: Array | None
-    ) -> dict[tuple[int, ...], str]:
-        """Multiply a group's weights by the likelihood, in place; the rows that failed."""
-        rows = group.agents
-        before = None if previous is None else previous[..., rows, :, :]
-        predicted = group.predict(points[..., rows, :, :], before)
-        target = np.where(failed[..., None, None], np.nan, group.target)
-        old = weights[..., rows, :]
+    def _pick(
+        self, stack: list[Array], log_weights: Array, weights: Array, poor: Mask, levels: Array
+    ) -> None:
+        """Resample some agents' paths in place; their weights are equal then."""
+        rows = slice(None) if poor.all() else poor
+        picked = _picked(weights[rows], levels[rows], self.rule)
+        for path in stack:
+            path[rows] = _taken(path[rows], picked)
+        log_weights[rows] = -np.log(self.members)
 
-        def compute(h: Array, y: Array, w: Array, noise: Array, _: Any) -> tuple[Array, ...]:
-            return (_weighed(w, h, y, noise),)
-
-        (new,), errors = guarded(
-            compute, (predicted, target, old), (old,), target.ndim - 1, shared=group.noise, rng=None
-        )
-        weights[..., rows, :] = new
-        return errors
-
-    def _agreed(
-        self, stack: list[Array], weights: Array, channel: Any, rng: np.random.Generator
-    ) -> tuple[list[Array], Array]:
-        """Everybody resamples, so that the particles are an ensemble that the agreement moves."""
-        picked = _picked(np.exp(weights), _levels(weights.shape, rng, self.rule), self.rule)
-        out = [np.take_along_axis(p, picked[..., None], axis=-2) for p in stack]
-        assert self.agreement is not None
-        out[-1] = array(self.agreement(out[-1], channel), "agreement", out[-1].shape)
-        return out, np.full_like(weights, -np.log(self.members))
-
-    def _warn(self, points: Array, weights: Array, failed: Mask, t: float) -> None:
+    def _warn(self, state: ParticleState) -> None:
         """Distinct particles may have no weight, and particles of equal weight may be copies."""
-        if failed.all():
+        if state.failed.all():
             return
-        distinct, size = _distinct(points[~failed]), _effective_size(weights[~failed])
-        if distinct.min() < max(0.01, 2 / self.members):
-            what = f"{distinct.min():.2%} of an agent's particles are distinct"
+        points, size = state.points, state.effective_size
+        if state.failed.any():
+            points, size = points[~state.failed], size[~state.failed]
+        least = max(0.01 * self.members, 2.0)
+        # A few that differ are proof enough; all are looked at only where they do not.
+        few = points[..., :: max(1, self.members // (4 * math.ceil(least))), :]
+        distinct = _distinct(few).min() * few.shape[-2] / self.members
+        if distinct * self.members < least:
+            distinct = _distinct(points).min()
+        if distinct * self.members < least:
+            what = f"{distinct:.2%} of an agent's particles are distinct"
         elif size.min() < 2:
             what = f"an agent's weights have an effective size of {size.min():.1f}"
         else:
             return
         warnings.warn(
-            f"t = {t:g} s: {what}; more members, jitter=, or more process noise keep its belief "
-            f"alive",
+            f"t = {state.t:g} s: {what}; more members, jitter=, or more process noise keep its "
+            f"belief alive",
             ParticleCollapse,
             stacklevel=3,
         )
 
 
-def _summary(state: ParticleState, points: Array) -> Summary:
-    w = np.exp(state.log_weights)
-    mean = (w[..., None, :] @ points)[..., 0, :]
-    around = points - mean[..., None, :]
-    cov = np.swapaxes(around, -1, -2) @ (w[..., None] * around)
-    if state.failed.any():
-        mean[state.failed], cov[state.failed] = np.nan, np.nan
-    numbers = {"effective_size": _effective_size(state.log_weights), "distinct": _distinct(points)}
-    return Summary(mean, np.diagonal(cov, axis1=-2, axis2=-1), cov, points, w, numbers)
+def _weigh(weights: Array, predicted: Array, group: Heard) -> dict[tuple[int, ...], str]:
+    """Multiply a group's weights by the likelihood, in place; the rows that failed."""
+    old = weights[..., group.agents, :]
+    (new,), errors = guarded(
+        lambda h, y, w, noise, _: (_weighed(w, h, y, noise),),
+        (predicted, group.target, old), (old,), group.target.ndim - 1, shared=group.noise, rng=None,
+    )
+    weights[..., group.agents, :] = new
+    return errors

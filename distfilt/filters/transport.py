@@ -9,17 +9,18 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..checks import Array, array, count, generator, number
+from ..checks import Array, count, number
 from ..coupling.solvers import _solver
 from ..coupling.transform import _carried, _normalised, _plans, _rejuvenated
-from ..network import Channel, Ledger, finite_time
+from ..network import finite_time
 from ..updates.particles import _log_likelihood
 from .driver import Late, Summary
-from .ensemble import EnsembleState, _summary
-from .failures import guarded, not_finite
-from .wiring import SensorFilter
+from .ensemble import EnsembleState, ensemble_summary
+from .failures import guarded
+from .stepping import Step
+from .wiring import Prior, SensorFilter
 
 __all__ = ["TransportFilter"]
 
@@ -80,12 +81,7 @@ class TransportFilter(SensorFilter):
         number(self.rejuvenation, "rejuvenation", at_least=0)
 
     def start(
-        self,
-        prior: ArrayLike | Callable[..., Array] | tuple[ArrayLike, ArrayLike],
-        *,
-        rng: np.random.Generator,
-        runs: tuple[int, ...] = (),
-        t: float = 0.0,
+        self, prior: Prior, *, rng: np.random.Generator, runs: tuple[int, ...] = (), t: float = 0.0
     ) -> EnsembleState:
         """The state before the first step; arguments as for `EnsembleFilter.start`.
 
@@ -93,53 +89,29 @@ class TransportFilter(SensorFilter):
         """
         drawn = self.drawn(prior, self.members, runs, rng, sets=1)
         everywhere = np.repeat(drawn, len(self.sensors), axis=-3)
-        ledger = Ledger.empty(len(self.sensors))
-        return EnsembleState(number(t, "t"), ledger, rng.spawn(1)[0], everywhere)
+        return self.first(EnsembleState, t, rng, everywhere)
 
     def step(
-        self,
-        state: EnsembleState,
-        t: float,
-        observations: Sequence[ArrayLike | None],
-        *,
+        self, state: EnsembleState, t: float, observations: Sequence[ArrayLike | None], *,
         late: Sequence[Late] = (),
     ) -> EnsembleState:
         """Move to time `t` and take in what was observed there; as `EnsembleFilter.step`."""
-        if not isinstance(state, EnsembleState):
-            raise ValueError(f"state: needs an EnsembleState, got {type(state).__name__}")
-        dt = self.elapsed(state, t)
-        seen = self.observed(state, observations)
-        kept = (*state.history, (state.t, state.ensembles)) if self.lag else ()
-        times = [time for time, _ in kept]
-        readings = [self.slot(item, times, state) for item in late]
-        rng = copy.deepcopy(generator(state.rng))
-        channel = self.channel(state, t)
+        sizes = self.members, self.model.dim
+        step = self.begin(state, EnsembleState, t, observations, late, sizes)
         moved = self._for_all(
-            partial(self.model.sample_step, t=state.t, dt=dt), (state.ensembles,), rng
+            partial(self.model.sample_step, t=state.t, dt=step.dt), (state.ensembles,), step.rng
         )
-        agents = range(state.agents)
-        failed = self.settle(not_finite(moved, 2), agents, t, state.failed)
-        moved = np.where(failed[..., None, None, None], state.ensembles, moved)
-        stack = [*(e for _, e in kept), moved]
-        logs = np.zeros(moved.shape[:-1])
-        for slot, observed in [*readings, (len(times), seen)]:
-            before = state.ensembles if slot == len(times) else None
-            self._weigh(logs, stack[slot], observed, failed, before, channel)
-        if self.agreement is not None and channel is not None:
-            logs = len(agents) * array(self.agreement(logs, channel), "agreement", logs.shape)
-        stack, errors = self._transported(stack, logs, rng)
-        failed = self.settle(errors, agents, t, failed)
-        history = tuple(zip(times, stack[:-1], strict=True))[-self.lag :] if self.lag else ()
-        ledger = state.ledger if channel is None else channel.ledger
-        return EnsembleState(float(t), ledger, rng, stack[-1], history, failed)
+        stack = step.stack(step.moved(moved, state.ensembles, 2))
+        (logs,) = step.agreed(self._log_likelihoods(stack, step))
+        if step.agrees:
+            logs = state.agents * logs
+        stack, errors = self._transported(stack, logs, step.rng)
+        step.settle(errors, range(state.agents))
+        return step.end(EnsembleState, stack[-1], history=zip(step.times, stack[:-1], strict=True))
 
     def summary(self, state: EnsembleState) -> Summary:
         """Ensemble means and variances; the members for the scores."""
-        return _summary(state.ensembles, state.failed)
-
-    def past(self, state: EnsembleState) -> tuple[tuple[float, Summary], ...]:
-        """Earlier times, oldest first, and what is believed of them by now."""
-        return tuple((t, _summary(e, state.failed)) for t, e in state.history)
+        return ensemble_summary(state)
 
     def _for_all(
         self, draw: Callable[..., Array], arrays: tuple[Array, ...], rng: np.random.Generator
@@ -151,22 +123,14 @@ class TransportFilter(SensorFilter):
         ]
         return np.stack(parts, axis=-3)
 
-    def _weigh(
-        self,
-        logs: Array,
-        members: Array,
-        observed: list[Array | None],
-        failed: NDArray[np.bool_],
-        previous: Array | None,
-        channel: Channel | None,
-    ) -> None:
-        """Add to the log-likelihoods, in place, what each agent makes of the readings it has."""
-        for group in self.gather(observed, channel if self.agreement is None else None):
+    def _log_likelihoods(self, stack: list[Array], step: Step) -> Array:
+        """What each agent makes of the readings it has, (*runs, A, N)."""
+        logs = np.zeros(stack[-1].shape[:-1])
+        for place, group in step.heard(shared=self.agreement is None):
             rows = group.agents
-            before = None if previous is None else previous[..., rows, :, :]
-            target = np.where(failed[..., None, None], np.nan, group.target)
-            predicted = group.predict(members[..., rows, :, :], before)
-            logs[..., rows, :] += _log_likelihood(predicted, target, group.noise)
+            predicted = group.predict(stack[place][..., rows, :, :], step.before(place, rows))
+            logs[..., rows, :] += _log_likelihood(predicted, group.target, group.noise)
+        return logs
 
     def _transported(
         self, stack: list[Array], logs: Array, rng: np.random.Generator

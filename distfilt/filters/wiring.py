@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..checks import (
     Array,
     array,
-    callable_,
     choice,
     count,
     covariance,
@@ -22,21 +21,22 @@ from ..checks import (
 )
 from ..ensembles import draw
 from ..models import Model
-from ..network import Channel, Faults, Graph
+from ..network import Channel, Faults, Graph, Ledger
 from ..sensors import Sensor
-from .driver import Filter, Late, check_faults
-from .failures import FilterError
+from .driver import Late, Summary, TeamFilter, described
 from .heard import Heard, gather
 from .observations import at_one_time, over_times
 from .saving import State
+from .stepping import SensorState, Step
 
 __all__ = ["SensorFilter"]
 
-Mask = NDArray[np.bool_]
+Prior = ArrayLike | Callable[..., Array] | tuple[ArrayLike, ArrayLike]
+S = TypeVar("S", bound=SensorState)
 
 
 @dataclass(frozen=True, eq=False)
-class SensorFilter(Filter):
+class SensorFilter(TeamFilter):
     """The part of a filter that knows the agents, and what every family asks of it.
 
     Parameters
@@ -86,47 +86,55 @@ class SensorFilter(Filter):
             if sensor is not None and not isinstance(sensor, Sensor):
                 raise ValueError(f"sensors: needs Sensor or None, got {type(sensor).__name__}")
         count(len(self.sensors), "sensors")
-        if self.graph is None:
-            if len(self.sensors) > 1:
-                raise ValueError(f"graph: needs a Graph of {len(self.sensors)} agents, got None")
-        elif isinstance(self.graph, Graph):
-            self._check_graph(self.graph)
-        else:
-            callable_(self.graph, "graph")
-        if self.agreement is not None:
-            callable_(self.agreement, "agreement")
+        if self.graph is None and len(self.sensors) > 1:
+            raise ValueError(f"graph: needs a Graph of {len(self.sensors)} agents, got None")
+        self.check_network()
         if not isinstance(self.share, bool):
             raise ValueError(f"share: needs True or False, got {self.share!r}")
-        check_faults(self.faults)
         count(self.lag, "lag", at_least=0)
         choice(self.failures, "failures", ("raise", "keep"))
-        if self.names and len(self.names) != len(self.sensors):
-            raise ValueError(f"names: needs {len(self.sensors)} names, got {len(self.names)}")
-
-    def _check_graph(self, graph: Any) -> Graph:
-        found, size = instance(graph, "graph", Graph), len(self.sensors)
-        if found.size != size:
-            raise ValueError(f"graph: needs {size} agents like sensors, got {found.size}")
-        return found
 
     @property
-    def agents(self) -> tuple[str, ...]:
-        """Names of the agents."""
-        return tuple(self.names) or tuple(str(i) for i in range(len(self.sensors)))
+    def count(self) -> int:
+        """Number A of agents."""
+        return len(self.sensors)
 
     @property
     def components(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Names and units of the state's components."""
-        names = self.model.names or tuple(str(i) for i in range(self.model.dim))
-        return tuple(names), tuple(self.model.units or ("",) * self.model.dim)
+        return described(self.model)
+
+    def past(self, state: SensorState) -> tuple[tuple[float, Summary], ...]:
+        """Earlier times that the state keeps, oldest first, and what is believed of them by now."""
+        return tuple((then.t, self.summary(then)) for then in state.earlier)
 
     def series(self, observations: Any, times: Array) -> Sequence[Any]:
         """Per time the agents' observations, from per agent their series (T, *runs, m)."""
         _, series = over_times(observations, self.sensors, times)
         return [[None if o is None else o[k] for o in series] for k in range(times.size)]
 
+    def leading(self, runs: tuple[int, ...], sets: int | None = None) -> tuple[int, ...]:
+        """Leading axes (*runs, A); with `sets` there are so many of them in the agents' place."""
+        return (*(count(n, "runs") for n in runs), len(self.sensors) if sets is None else sets)
+
+    def first(
+        self, kind: type[S], t: float, rng: np.random.Generator | None, *belief: Any
+    ) -> S:
+        """The state at the start; what steps draw comes from a child of the generator."""
+        child = None if rng is None else rng.spawn(1)[0]
+        return kind(number(t, "t"), Ledger.empty(len(self.sensors)), child, *belief)
+
+    def moments(self, prior: Any, *, semidefinite: bool = False) -> tuple[Array, Array]:
+        """The mean and the covariance that a Gaussian prior is given by, checked."""
+        if not isinstance(prior, tuple) or len(prior) != 2:
+            raise ValueError(f"prior: needs a tuple (mean, cov), got {type(prior).__name__}")
+        d = self.model.dim
+        return array(prior[0], "prior", (d,)), covariance(
+            prior[1], "prior", d, semidefinite=semidefinite
+        )
+
     def drawn(
-        self, prior: Any, members: int, runs: tuple[int, ...], rng: np.random.Generator,
+        self, prior: Prior, members: int, runs: tuple[int, ...], rng: np.random.Generator,
         sets: int | None = None,
     ) -> Array:  # fmt: skip
         """Members (*runs, A, N, d) of a Gaussian (mean, cov), of a function, or as they are given.
@@ -134,13 +142,11 @@ class SensorFilter(Filter):
         The function is called as ``prior(members, rng=rng, leading=(*runs, A))``. With `sets` there
         are so many of them in place of one for each agent.
         """
-        many = len(self.sensors) if sets is None else sets
-        lead, dim = (*(count(n, "runs") for n in runs), many), self.model.dim
+        lead, dim = self.leading(runs, sets), self.model.dim
         generator(rng)
         if isinstance(prior, tuple) and len(prior) == 2:
-            centre = array(prior[0], "prior", (dim,))
-            cov = covariance(prior[1], "prior", dim, semidefinite=True)
-            return draw(centre, cov, members, rng=rng, leading=lead)
+            mean, cov = self.moments(prior, semidefinite=True)
+            return draw(mean, cov, members, rng=rng, leading=lead)
         found = prior(members, rng=rng, leading=lead) if callable(prior) else prior
         shape = (*lead, members, dim)
         out = array(found, "prior", (..., members, dim))
@@ -158,24 +164,34 @@ class SensorFilter(Filter):
         """Observations of one time, checked, per agent (*runs, m) or None."""
         return at_one_time(observations, self.sensors, state.runs)
 
-    def channel(self, state: State, t: float) -> Channel | None:
-        """The door of this step; a single agent without a graph has none."""
-        if self.graph is None:
-            return None
-        graph = self.graph if isinstance(self.graph, Graph) else self._check_graph(self.graph(t))
-        return Channel(graph, ledger=state.ledger, runs=state.runs, faults=self.faults, t=t)
-
     def gather(self, observed: Sequence[Array | None], channel: Channel | None) -> list[Heard]:
         """What every agent knows of the observations once they are shared."""
         return gather(observed, self.sensors, channel if self.share else None)
 
-    def slot(
-        self, item: Late, kept: Sequence[float], state: State
+    def begin(
+        self, state: SensorState, kind: type[SensorState], t: float,
+        observations: Sequence[ArrayLike | None], late: Sequence[Late], sizes: tuple[int, ...] = (),
+    ) -> Step:  # fmt: skip
+        """The step from a state of this kind to `t`, with its inputs checked.
+
+        `sizes` are those of an agent's belief, where the filter says them.
+        """
+        instance(state, "state", kind)
+        needed, got = (len(self.sensors), *sizes), state.belief.shape[len(state.runs) :]
+        if got[: len(needed)] != needed:
+            raise ValueError(f"state: needs {needed} for each run, got {got}")
+        dt, seen = self.elapsed(state, t), self.observed(state, observations)
+        times = (*state.times, state.t)[-self.lag :] if self.lag else ()
+        readings = [*(self._late(item, times, state) for item in late), (len(times), seen)]
+        return Step(self, state, float(t), dt, self.channel(state, t), times, readings)
+
+    def _late(
+        self, item: Late, times: Sequence[float], state: State
     ) -> tuple[int, list[Array | None]]:
         """Where among the kept times a late observation belongs, and the observations of then."""
-        match = [k for k, t in enumerate(kept) if abs(t - item.measured) <= 1e-9 * max(1, abs(t))]
+        match = [k for k, t in enumerate(times) if abs(t - item.measured) <= 1e-9 * max(1, abs(t))]
         if not match:
-            known = ", ".join(f"{t:g}" for t in kept) or "none (lag = 0)"
+            known = ", ".join(f"{t:g}" for t in times) or "none (lag = 0)"
             raise ValueError(
                 f"late: needs an earlier time that is kept ({known}), got {item.measured:g}"
             )
@@ -187,18 +203,3 @@ class SensorFilter(Filter):
         observations: list[ArrayLike | None] = [None] * len(self.sensors)
         observations[item.agent] = item.value
         return match[0], self.observed(state, observations)
-
-    def settle(
-        self, errors: dict[tuple[int, ...], str], agents: Sequence[int] | NDArray[np.intp],
-        t: float, failed: Mask,
-    ) -> Mask:
-        """The runs that have failed by now, or the error that names the first of them."""
-        if not errors:
-            return failed
-        row, why = next(iter(errors.items()))
-        if self.failures == "raise" or not failed.shape:
-            raise FilterError(row[:-1], int(agents[row[-1]]), t, why)
-        out = failed.copy()
-        for row in errors:
-            out[row[:-1]] = True
-        return out

@@ -23,32 +23,12 @@ from .reduction import (
 )
 from .shapes import Shapes
 from .splitting import split, split_library, stretching
+from .steps import conditioned, moved, split_stretched
 
-__all__ = [
-    "Divergence",
-    "ExponentialQuadratics",
-    "GaussianMixture",
-    "PartialFusion",
-    "Shapes",
-    "arc",
-    "average",
-    "cross_relevance",
-    "fuse",
-    "fuse_in_turn",
-    "fuse_moments",
-    "jeffreys_by_quadrature",
-    "jeffreys_by_sampling",
-    "jeffreys_of_many",
-    "kept_by_relevance",
-    "merge_costs",
-    "nonnegative_least_squares",
-    "pivoted_qr",
-    "prune",
-    "runnalls",
-    "split",
-    "split_library",
-    "stretching",
-    "tikhonov",
-    "two_stage",
-    "unscented",
+__all__ = [  # fmt: skip
+    "Divergence", "ExponentialQuadratics", "GaussianMixture", "PartialFusion", "Shapes", "arc",
+    "average", "conditioned", "cross_relevance", "fuse", "fuse_in_turn", "fuse_moments",
+    "jeffreys_by_quadrature", "jeffreys_by_sampling", "jeffreys_of_many", "kept_by_relevance",
+    "merge_costs", "moved", "nonnegative_least_squares", "pivoted_qr", "prune", "runnalls", "split",
+    "split_library", "split_stretched", "stretching", "tikhonov", "two_stage", "unscented",
 ]

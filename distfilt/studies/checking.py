@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,8 @@ __all__ = ["check"]
 
 def check(
     path: str | Path | Stored, trial: Callable[[SeedSequence], Any], *,
-    indices: Iterable[int] | None = None, rtol: float = 0.0, workers: int | None = 1,
-    executor: Executor | None = None,
+    indices: Iterable[int] | None = None, rtol: float = 0.0, atol: float = 0.0,
+    rough: Collection[str] = (), workers: int | None = 1, executor: Executor | None = None,
 ) -> Stored:
     """Run stored trials again and compare what they give now with what is stored.
 
@@ -39,6 +39,13 @@ def check(
         Largest relative difference. 0 asks for the same bits, which is right on the kind of
         machine that stored the study; another processor's linear algebra, exponentials and
         logarithms differ in the last bits, and a trial carries that along.
+    atol : float
+        Largest absolute difference that passes whatever `rtol` is, for a metric that is zero to
+        rounding.
+    rough : collection of str
+        Metrics that another processor need not repeat, because the last bit decides in the trial
+        (which of two couplings, which way an unstable filter goes). Such a metric may differ from
+        its stored value by as much as the stored trials differ from each other.
     workers, executor
         As in `run`; by default in this process.
 
@@ -47,22 +54,37 @@ def check(
     AssertionError
         If a metric, or the kind of a failure, is not the stored one.
     ValueError
-        If the file is malformed, or an index is not in it.
+        If the file is malformed, or an index or a name of `rough` is not in it.
     """
     stored = path if isinstance(path, Stored) else load(path)
-    limit = number(rtol, "rtol", at_least=0)
+    number(rtol, "rtol", at_least=0)
+    allowed = _allowed(stored, number(atol, "atol", at_least=0), rough)
     chosen = _indices(range(len(stored)) if indices is None else indices, len(stored))
     study = run(
         callable_(trial, "trial"), [stored.seed(i) for i in chosen], errors="collect",
         workers=workers, executor=executor,
     )
-    wrong = _differences(stored, chosen, study, limit)
+    wrong = _differences(stored, chosen, study, rtol, allowed)
     if wrong:
         raise AssertionError(_report(stored, trial, wrong))
     return stored
 
 
-def _differences(stored: Stored, chosen: Sequence[int], study: Study, rtol: float) -> list[str]:
+def _allowed(stored: Stored, atol: float, rough: Collection[str]) -> dict[str, float]:
+    """The absolute difference that passes, for each metric."""
+    if isinstance(rough, str) or not set(rough) <= set(stored.columns):
+        raise ValueError(f"rough: needs names of metrics that are stored, got {rough!r}")
+    allowed = dict.fromkeys(stored.columns, atol)
+    for name in rough:
+        values = np.asarray(stored.columns[name])
+        finite = values[np.isfinite(values)]
+        allowed[name] = max(atol, float(np.ptp(finite)) if finite.size else 0.0)
+    return allowed
+
+
+def _differences(
+    stored: Stored, chosen: Sequence[int], study: Study, rtol: float, allowed: dict[str, float]
+) -> list[str]:
     """What the new study of the chosen trials does not give as it is stored."""
     names = tuple(stored.columns)
     kinds = {failure.index: failure.kind for failure in study.failures}
@@ -74,7 +96,7 @@ def _differences(stored: Stored, chosen: Sequence[int], study: Study, rtol: floa
         elif k not in kinds:
             for name, value in zip(names, row(study.values[k], names), strict=True):
                 kept = float(stored.columns[name][i])
-                if not _same(kept, value, rtol):
+                if not _same(kept, value, rtol, allowed[name]):
                     wrong.append(f"trial {i}: {name} stored {kept!r}, now {value!r}")
     return wrong
 
@@ -89,12 +111,12 @@ def _indices(indices: Any, n: int) -> tuple[int, ...]:
     return out
 
 
-def _same(was: float, now: float, rtol: float) -> bool:
+def _same(was: float, now: float, rtol: float, atol: float) -> bool:
     if was != was or now != now:
         return was != was and now != now
-    if rtol == 0 or np.isinf(was) or np.isinf(now):
+    if rtol == atol == 0 or np.isinf(was) or np.isinf(now):
         return was == now and np.signbit(was) == np.signbit(now)
-    return abs(was - now) <= rtol * abs(was)
+    return abs(was - now) <= max(rtol * abs(was), atol)
 
 
 def _report(stored: Stored, trial: Any, wrong: list[str]) -> str:

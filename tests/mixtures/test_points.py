@@ -8,7 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from distfilt.kalman import update as kalman_update
-from distfilt.mixtures import GaussianMixture, split, split_library, stretching
+from distfilt.mixtures import (
+    GaussianMixture,
+    conditioned,
+    moved,
+    split,
+    split_library,
+    split_stretched,
+    stretching,
+)
 from distfilt.mixtures.unscented import forecast, update
 
 from .examples import random_mixture
@@ -54,6 +62,24 @@ BAD_INPUT = {
         ("noise", lambda: update([0.0, 0.0], EYE, [1.0, 1.0], same, -EYE)),
         ("factors", lambda: update([0.0, 0.0], np.zeros((2, 2)), [0.0, 0.0], same, EYE)),
         ("rule", lambda: update([0.0, 0.0], EYE, [0.0, 0.0], same, EYE, rule="cubature")),
+    ],
+    "distfilt.mixtures.steps.split_stretched": [
+        ("mixture", lambda: split_stretched(3, np.sin, most=3, stretch=1.0)),
+        ("jacobian", lambda: split_stretched(P, 3, most=3, stretch=1.0)),
+        ("most", lambda: split_stretched(P, np.sin, most=0, stretch=1.0)),
+        ("stretch", lambda: split_stretched(P, np.sin, most=3, stretch=0.0)),
+    ],
+    "distfilt.mixtures.steps.moved": [
+        ("mixture", lambda: moved(3, np.sin, np.eye(2))),
+        ("noise_factor", lambda: moved(P, np.sin, np.eye(4))),
+        ("rule", lambda: moved(P, np.sin, np.eye(3), rule="best")),
+    ],
+    "distfilt.mixtures.steps.conditioned": [
+        ("mixture", lambda: conditioned(3, [1.0], np.sin, np.eye(1))),
+        ("observed", lambda: conditioned(P, 1.0, np.sin, np.eye(2))),
+        ("observed", lambda: conditioned(P, [1.0], lambda x: x[..., :1] * np.nan, np.eye(1))),
+        ("noise", lambda: conditioned(P, [1.0, 2.0], np.sin, np.eye(4))),
+        ("gate", lambda: conditioned(P, [1.0, 2.0, 3.0], np.sin, np.eye(3), gate=0.0)),
     ],
 }
 EXEMPT = {"distfilt.mixtures.unscented.POINT_RULES": "a constant"}

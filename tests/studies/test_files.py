@@ -172,6 +172,23 @@ def test_check_finds_the_last_bit(tmp_path: Path) -> None:
         studies.check(path, other, indices=[0], rtol=0.1)
 
 
+def test_a_rough_metric_stays_within_the_trials_and_others_are_held(tmp_path: Path) -> None:
+    path = _store(path=tmp_path / "a.csv")
+    values = studies.load(path).columns["rmse"]
+    wide = float(np.ptp(values))
+
+    def moved(by: float, seed: SeedSequence) -> Scores:
+        found = scores(seed)
+        return found._replace(rmse=found.rmse + by)
+
+    near, far = partial(moved, 0.99 * wide), partial(moved, 1.01 * wide)
+    studies.check(path, near, rough=["rmse"])
+    studies.check(path, near, atol=wide)
+    for trial, options in ((far, {"rough": ["rmse"]}), (near, {"rough": ["nees"]}), (near, {})):
+        with pytest.raises(AssertionError, match="rmse stored"):
+            studies.check(path, trial, **options)
+
+
 @pytest.mark.parametrize(
     ("options", "name"),
     [
@@ -180,6 +197,9 @@ def test_check_finds_the_last_bit(tmp_path: Path) -> None:
         ({"indices": [1, 1]}, "indices"),
         ({"indices": 3}, "indices"),
         ({"rtol": -1.0}, "rtol"),
+        ({"atol": -1.0}, "atol"),
+        ({"rough": ["speed"]}, "rough"),
+        ({"rough": "rmse"}, "rough"),
         ({"workers": 0}, "workers"),
     ],
 )

@@ -5,6 +5,7 @@
 
 cosmic-ray lists the places where the library's code can be changed (an operator, a comparison, a
 number, a keyword) and makes the change; a seeded sample of places is drawn, and one change at each.
+The draw looks at a place's own line, so that most of a sample stays when other code changes.
 A mutant is tested in stages, the nearest tests first: the file that mirrors the module with its own
 examples, then the contracts that every family passes, then the module's folder of tests, then all
 tests but those of the book. It survives if all pass; ``--stages`` stops earlier, and the table's
@@ -32,8 +33,10 @@ import signal
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -120,19 +123,29 @@ def meaning(text: str) -> str:
     return ast.dump(tree)
 
 
+def keys(places: list[tuple[str, int, int]], root: Path, seed: int) -> dict[Any, str]:
+    """A place's number in the lottery, from its line's text: it stays when other code changes."""
+    out, seen, lines = {}, Counter[str](), dict[str, list[str]]()
+    for module, line, column in sorted(places):
+        if module not in lines:
+            lines[module] = (root / module).read_text(encoding="utf-8").splitlines()
+        text = f"{seed} {module} {lines[module][line - 1].strip()} {column}"
+        seen[text] += 1
+        out[module, line, column] = sha256(f"{text} {seen[text]}".encode()).hexdigest()
+    return out
+
+
 def drawn(root: Path, size: int, seed: int, only: str) -> list[Mutant]:
     """A sample of places, and one change at each, that is a change of what the code does."""
-    rng = random.Random(seed)
     places: dict[tuple[str, int, int], list[Mutant]] = {}
     for mutant in mutants(root, only):
         places.setdefault((mutant.module, mutant.line, mutant.column), []).append(mutant)
-    order = sorted(places)
-    rng.shuffle(order)
+    numbers = keys(list(places), root, seed)
     out: list[Mutant] = []
-    for place in order:
+    for place in sorted(places, key=numbers.__getitem__):
         if len(out) == size:
             break
-        mutant = rng.choice(places[place])
+        mutant = random.Random(numbers[place]).choice(places[place])
         text = (root / mutant.module).read_text(encoding="utf-8")
         try:
             if meaning(mutant.source(text)) != meaning(text):

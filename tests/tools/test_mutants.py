@@ -63,6 +63,16 @@ def test_a_sample_is_the_seed_s_and_has_one_change_a_place(repository: Path) -> 
     assert mutants.drawn(repository, 50, 3, "other") == []
 
 
+def test_a_sample_stays_when_other_lines_change(repository: Path) -> None:
+    module = repository / "distfilt" / "a.py"
+    before = [m.source(LIBRARY) for m in mutants.drawn(repository, 50, 3, "")]
+    module.write_text(LIBRARY.replace("def unused", "FIRST = 7\n\n\ndef unused"), encoding="utf-8")
+    found = mutants.drawn(repository, 50, 3, "")
+    kept = [m.source(module.read_text(encoding="utf-8")) for m in found]
+    kept = [t.replace("FIRST = 7\n\n\n", "") for t in kept if "FIRST = 7" in t]
+    assert len(found) > len(before) and kept == before
+
+
 def test_nearest_tests_come_first() -> None:
     found = mutants.stages("distfilt/network/channel.py", mutants.ROOT)
     assert found[0] == ["distfilt/network/channel.py", "tests/network/test_channel.py"]
