@@ -6,24 +6,8 @@ from .sampling import transform_along, transform_within
 from .solvers import SOLVERS, Plan, distances, plan, sorted_plan
 from .transform import ensemble_transform, plans, rejuvenated, second_order
 
-__all__ = [
-    "READINGS",
-    "SOLVERS",
-    "Constraint",
-    "Plan",
-    "accepted",
-    "augmented_readings",
-    "clip",
-    "distances",
-    "ensemble_transform",
-    "norm",
-    "plan",
-    "plans",
-    "project",
-    "rejuvenated",
-    "retract",
-    "second_order",
-    "sorted_plan",
-    "transform_along",
-    "transform_within",
+__all__ = [  # fmt: skip
+    "READINGS", "SOLVERS", "Constraint", "Plan", "accepted", "augmented_readings", "clip",
+    "distances", "ensemble_transform", "norm", "plan", "plans", "project", "rejuvenated", "retract",
+    "second_order", "sorted_plan", "transform_along", "transform_within",
 ]

@@ -14,12 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..checks import Array, SolverError, array, callable_, choice, count, instance, number
 from ..differences import _central
 
-__all__ = [
-    "READINGS",
-    "Constraint",
-    "norm",
-    "project",
-    "retract",
+__all__ = [  # fmt: skip
+    "READINGS", "Constraint", "norm", "project", "retract",
 ]
 
 READINGS = ("printed", "reversed", "particle", "shift")

@@ -24,30 +24,10 @@ from .kernel import (
 from .prior import zero_mean_prior
 from .sharing import Centralised, DynamicAverage, Flooding, Neighbours, PIConsensus, Sharing
 
-__all__ = [
-    "Centralised",
-    "Dense",
-    "DynamicAverage",
-    "Flooding",
-    "FokkerPlanck",
-    "Grid",
-    "LowRank",
-    "Neighbours",
-    "PIConsensus",
-    "Shared",
-    "Sharing",
-    "adaptive_bandwidths",
-    "bandwidth",
-    "bernoulli",
-    "dense_step",
-    "kernel_covariance",
-    "kernel_density",
-    "kernel_information",
-    "kernels",
-    "low_rank_start",
-    "low_rank_step",
-    "shared_moved",
-    "shared_start",
-    "shared_step",
+__all__ = [  # fmt: skip
+    "Centralised", "Dense", "DynamicAverage", "Flooding", "FokkerPlanck", "Grid", "LowRank",
+    "Neighbours", "PIConsensus", "Shared", "Sharing", "adaptive_bandwidths", "bandwidth",
+    "bernoulli", "dense_step", "kernel_covariance", "kernel_density", "kernel_information",
+    "kernels", "low_rank_start", "low_rank_step", "shared_moved", "shared_start", "shared_step",
     "zero_mean_prior",
 ]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from ..checks import Array, array, choice, count, increasing, number
+from ..checks import Array, array, choice, count, increasing, instance, number
 from ..models.swarm import Swarm
 from .grid import Grid
 
@@ -111,8 +111,7 @@ class FokkerPlanck:
     scheme: str = field(default="split", kw_only=True)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.swarm, Swarm):
-            raise ValueError(f"swarm: needs a Swarm, got {type(self.swarm).__name__}")
+        instance(self.swarm, "swarm", Swarm)
         if not isinstance(self.grid, Grid) or not self.grid.same_box(self.swarm):
             raise ValueError("grid: needs a Grid of the swarm's box, got "
                              f"{getattr(self.grid, 'shape', self.grid)!r} of another")

@@ -18,16 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..checks import Array, array, callable_, number
 
-__all__ = [
-    "Dense",
-    "LowRank",
-    "Shared",
-    "dense_step",
-    "low_rank_start",
-    "low_rank_step",
-    "shared_moved",
-    "shared_start",
-    "shared_step",
+__all__ = [  # fmt: skip
+    "Dense", "LowRank", "Shared", "dense_step", "low_rank_start", "low_rank_step", "shared_moved",
+    "shared_start", "shared_step",
 ]
 
 Move = Callable[[Array], Array]

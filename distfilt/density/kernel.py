@@ -9,12 +9,8 @@ from scipy.special import erf
 from ..checks import Array, array, choice, count, instance, number
 from .grid import Grid
 
-__all__ = [
-    "adaptive_bandwidths",
-    "bandwidth",
-    "kernel_covariance",
-    "kernel_density",
-    "kernel_information",
+__all__ = [  # fmt: skip
+    "adaptive_bandwidths", "bandwidth", "kernel_covariance", "kernel_density", "kernel_information",
     "kernels",
 ]
 
@@ -62,8 +58,7 @@ def _width(value: ArrayLike, grid: Grid, agents: int, name: str = "bandwidth") -
 
 
 def _agents(positions: ArrayLike, grid: Grid) -> Array:
-    if not isinstance(grid, Grid):
-        raise ValueError(f"grid: needs a Grid, got {type(grid).__name__}")
+    instance(grid, "grid", Grid)
     x = grid.inside(array(positions, "positions", (..., "N", grid.dim)))
     if x.shape[-2] == 0:
         raise ValueError("positions: needs at least one agent, got none")
@@ -165,8 +160,7 @@ def kernel_information(grid: Grid, *, bandwidth: float, agents: int) -> float:
     0.1243
     """
     n = count(agents, "agents")
-    if not isinstance(grid, Grid):
-        raise ValueError(f"grid: needs a Grid, got {type(grid).__name__}")
+    instance(grid, "grid", Grid)
     h = number(bandwidth, "bandwidth", above=0)
     return float(1 / (n * (2 * np.sqrt(np.pi) * h) ** grid.dim))
 

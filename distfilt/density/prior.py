@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import Array, count, number
+from ..checks import Array, count, instance, number
 from .grid import Grid
 
 __all__ = ["zero_mean_prior"]
@@ -41,8 +41,7 @@ def zero_mean_prior(
     >>> S.shape, bool(abs(S.sum(axis=0)).max() < 1e-10)
     ((900, 50), True)
     """
-    if not isinstance(grid, Grid):
-        raise ValueError(f"grid: needs a Grid, got {type(grid).__name__}")
+    instance(grid, "grid", Grid)
     ell, sigma = number(length, "length", above=0, at_most=1e100), number(std, "std", above=0)
     if count(rank, "rank") >= grid.size:
         raise ValueError(f"rank: needs at most {grid.size - 1} modes besides the constant, "

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array
+from ..checks import Array, array, instance
 from ..network import Graph
 from ..network.graphs import disk
 from .grid import Grid
@@ -107,8 +107,7 @@ def present_graph(graph: Graph, present: Mask) -> Graph:
     >>> present_graph(graphs.path(3), np.array([True, True, False])).degrees
     array([1., 1., 0.])
     """
-    if not isinstance(graph, Graph):
-        raise ValueError(f"graph: needs a Graph, got {type(graph).__name__}")
+    instance(graph, "graph", Graph)
     if present.all():
         return graph
     keep = present[graph.receivers] & present[graph.senders]

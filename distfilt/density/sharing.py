@@ -14,13 +14,8 @@ from ..network import weights as weighting
 from .kernel import _kernel_density, _kernels
 from .seen import Seen
 
-__all__ = [
-    "Centralised",
-    "DynamicAverage",
-    "Flooding",
-    "Neighbours",
-    "PIConsensus",
-    "Sharing",
+__all__ = [  # fmt: skip
+    "Centralised", "DynamicAverage", "Flooding", "Neighbours", "PIConsensus", "Sharing",
 ]
 
 Carried = tuple[Array, ...]

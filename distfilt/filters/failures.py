@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from ..checks import Array, SolverError
+from .streams import bookmarked
 
 __all__ = ["FilterError", "guarded", "not_finite"]
 
@@ -66,11 +66,11 @@ def guarded(
     >>> out[0].ravel(), errors
     (array([ 2., -1.]), {(1,): 'Matrix is not positive definite'})
     """
-    saved = copy.deepcopy(rng)
+    again = bookmarked(rng)
     try:
         out = compute(*arrays, shared, rng)
     except _RECOVERABLE as error:
-        return _row_by_row(compute, arrays, fallback, lead, shared, saved, error)
+        return _row_by_row(compute, arrays, fallback, lead, shared, again, error)
     for got, stands in zip(out, fallback, strict=True):
         if got.shape != stands.shape:
             raise ValueError(f"fallback: needs shape {got.shape}, got {stands.shape}")
@@ -97,7 +97,7 @@ def not_finite(values: Array, axes: int) -> dict[Row, str]:
 
 def _row_by_row(
     compute: Compute, arrays: tuple[Array, ...], fallback: tuple[Array, ...], lead: int,
-    shared: Array, rng: np.random.Generator | None, first: Exception,
+    shared: Array, again: Callable[[], np.random.Generator | None], first: Exception,
 ) -> tuple[tuple[Array, ...], dict[Row, str]]:
     out = tuple(f.copy() for f in fallback)
     errors: dict[Row, str] = {}
@@ -105,7 +105,7 @@ def _row_by_row(
     for row in np.ndindex(arrays[0].shape[:lead]):
         part = shared[row[-1]] if shared.ndim > 2 else shared
         try:
-            results = compute(*(a[row] for a in arrays), part, copy.deepcopy(rng))
+            results = compute(*(a[row] for a in arrays), part, again())
             if not all(np.isfinite(r).all() for r in results):
                 raise ArithmeticError("the result is not finite")
         except _RECOVERABLE as error:

@@ -135,12 +135,9 @@ class GaussianFilter(SensorFilter):
         ----------
         prior : tuple
             ``(mean, cov)``, (d,) and (d, d), the same for all agents and runs.
-        rng : numpy.random.Generator, optional
-            Not used: nothing is drawn. It is accepted so that all filters start alike.
-        runs : tuple of int
-            Leading axes: independent runs.
-        t : float
-            The time of the prior, in s.
+        rng, runs, t
+            As for :meth:`distfilt.filters.EnsembleFilter.start`; the generator is not needed, as
+            nothing is drawn.
         """
         lead, both = self.leading(runs), self.moments(prior)
         m, p = (np.broadcast_to(x, (*lead, *x.shape)).copy() for x in both)

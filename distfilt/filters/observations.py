@@ -37,14 +37,16 @@ def at_one_time(
         if sensor is None:
             raise ValueError(f"observations: needs None for agent {agent}, which has no sensor")
         seen = array(value, f"observations[{agent}]", (..., sensor.dim), finite=False)
-        if np.isinf(seen).any():
+        whole = bool(np.isfinite(seen).all())
+        if not whole and np.isinf(seen).any():
             raise ValueError(f"observations[{agent}]: needs numbers or NaN, got infinity")
-        if seen.shape[:-1] not in ((), runs):
-            raise ValueError(
-                f"observations[{agent}]: needs shape {(*runs, sensor.dim)}, got {seen.shape}"
-            )
-        full = np.broadcast_to(seen, (*runs, sensor.dim))
-        out.append(None if np.isnan(full).all() else full)
+        if seen.shape[:-1] != runs:
+            if seen.ndim > 1:
+                raise ValueError(
+                    f"observations[{agent}]: needs shape {(*runs, sensor.dim)}, got {seen.shape}"
+                )
+            seen = np.broadcast_to(seen, (*runs, sensor.dim))
+        out.append(seen if whole or not np.isnan(seen).all() else None)
     return out
 
 

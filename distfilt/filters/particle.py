@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,10 +15,11 @@ from ..checks import Array, array, choice, count, generator, instance, number
 from ..updates.particles import (
     RESAMPLING,
     _distinct,
-    _effective_size,
     _jittered,
     _levels,
     _picked,
+    _size_of,
+    _taken,
     _weighed,
 )
 from .driver import Late, Summary
@@ -71,6 +73,16 @@ class ParticleState(SensorState):
         array(self.log_weights, "log_weights", self.points.shape[:-1], finite=False)
         for _, earlier in self.history:
             array(earlier, "history", self.points.shape)
+
+    @cached_property
+    def weights(self) -> Array:
+        """The normalised weights, (*runs, A, N)."""
+        return np.exp(self.log_weights)
+
+    @cached_property
+    def effective_size(self) -> Array:
+        """Effective sample size of each agent's weights, (*runs, A)."""
+        return _size_of(self.weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +159,7 @@ class ParticleFilter(SensorFilter):
         sizes = self.members, self.model.dim
         step = self.begin(state, ParticleState, t, observations, late, sizes)
         stack = step.stack(state.points.copy())
-        weights = self._resampled(stack, state.log_weights, step.rng)
+        weights = self._resampled(stack, state, step.rng)
         moved = self.model.sample_step(stack[-1], state.t, step.dt, rng=step.rng)
         stack[-1] = step.moved(moved, stack[-1], 2)
         for place, group in step.heard():
@@ -157,64 +169,78 @@ class ParticleFilter(SensorFilter):
             step.settle(_weigh(weights, predicted, group), group.agents)
         if step.agrees:
             # The particles have to be an ensemble, which the agreement can move.
-            self._pick(stack, weights, ..., _levels(weights.shape, step.rng, self.rule))
+            levels = _levels(weights.shape, step.rng, self.rule)
+            self._pick(stack, weights, np.exp(weights), np.ones(weights.shape[:-1], bool), levels)
         (now,) = step.agreed(stack[-1])
-        self._warn(now, weights, step.failed, t)
         past = zip(step.times, stack[:-1], strict=True)
-        return step.end(ParticleState, now, weights, history=past)
+        after = step.end(ParticleState, now, weights, history=past)
+        self._warn(after)
+        return after
 
     def summary(self, state: ParticleState) -> Summary:
         """Weighted means and covariances, effective sizes and the share of distinct particles."""
         instance(state, "state", ParticleState)
-        w = np.exp(state.log_weights)
+        w = state.weights
         mean = (w[..., None, :] @ state.points)[..., 0, :]
-        around = state.points - mean[..., None, :]
-        cov = state.shown(np.swapaxes(around, -1, -2) @ (w[..., None] * around))
-        sizes = _effective_size(state.log_weights)
-        numbers = {"effective_size": sizes, "distinct": _distinct(state.points)}
+        # Components first: weights then multiply along all particles.
+        around = np.subtract(np.swapaxes(state.points, -1, -2), mean[..., None], order="C")
+        cov = state.shown((w[..., None, :] * around) @ np.swapaxes(around, -1, -2))
+        numbers = {"effective_size": state.effective_size, "distinct": _distinct(state.points)}
         variance = np.diagonal(cov, axis1=-2, axis2=-1)
         return Summary(state.shown(mean), variance, cov, state.points, w, numbers)
 
     def _resampled(
-        self, stack: list[Array], log_weights: Array, rng: np.random.Generator
+        self, stack: list[Array], state: ParticleState, rng: np.random.Generator
     ) -> Array:
         """Log-weights after agents with a poor effective size have resampled, in place."""
-        weights, before = log_weights.copy(), stack[-1].copy()
+        weights, before = state.log_weights.copy(), stack[-1]
         # Everybody draws, needed or not: an agent's luck must not depend on another's weights.
         levels = _levels(weights.shape, rng, self.rule)
         noise = rng.standard_normal(before.shape) if self.jitter else None
-        poor = _effective_size(weights) < self.threshold * self.members
+        poor = state.effective_size < self.threshold * self.members
         if not poor.any():
             return weights
-        self._pick(stack, weights, poor, levels)
-        if noise is not None:
-            around = before[poor] - before[poor].mean(axis=-2, keepdims=True)
+        around = before[poor] if noise is not None else None
+        self._pick(stack, weights, state.weights, poor, levels)
+        if noise is not None and around is not None:
+            around -= around.mean(axis=-2, keepdims=True)
             # Of all particles, weighted or not: after one weight dominated its copies have none.
             cov = np.swapaxes(around, -1, -2) @ around / self.members
             stack[-1][poor] = _jittered(stack[-1][poor], cov, self.jitter, noise[poor])
         return weights
 
-    def _pick(self, stack: list[Array], weights: Array, rows: Any, levels: Array) -> None:
+    def _pick(
+        self, stack: list[Array], log_weights: Array, weights: Array, poor: Mask, levels: Array
+    ) -> None:
         """Resample some agents' paths in place; their weights are equal then."""
-        picked = _picked(np.exp(weights[rows]), levels[rows], self.rule)[..., None]
+        rows = slice(None) if poor.all() else poor
+        picked = _picked(weights[rows], levels[rows], self.rule)
         for path in stack:
-            path[rows] = np.take_along_axis(path[rows], picked, axis=-2)
-        weights[rows] = -np.log(self.members)
+            path[rows] = _taken(path[rows], picked)
+        log_weights[rows] = -np.log(self.members)
 
-    def _warn(self, points: Array, weights: Array, failed: Mask, t: float) -> None:
+    def _warn(self, state: ParticleState) -> None:
         """Distinct particles may have no weight, and particles of equal weight may be copies."""
-        if failed.all():
+        if state.failed.all():
             return
-        distinct, size = _distinct(points[~failed]), _effective_size(weights[~failed])
-        if distinct.min() < max(0.01, 2 / self.members):
-            what = f"{distinct.min():.2%} of an agent's particles are distinct"
+        points, size = state.points, state.effective_size
+        if state.failed.any():
+            points, size = points[~state.failed], size[~state.failed]
+        least = max(0.01 * self.members, 2.0)
+        # A few that differ are proof enough; all are looked at only where they do not.
+        few = points[..., :: max(1, self.members // (4 * math.ceil(least))), :]
+        distinct = _distinct(few).min() * few.shape[-2] / self.members
+        if distinct * self.members < least:
+            distinct = _distinct(points).min()
+        if distinct * self.members < least:
+            what = f"{distinct:.2%} of an agent's particles are distinct"
         elif size.min() < 2:
             what = f"an agent's weights have an effective size of {size.min():.1f}"
         else:
             return
         warnings.warn(
-            f"t = {t:g} s: {what}; more members, jitter=, or more process noise keep its belief "
-            f"alive",
+            f"t = {state.t:g} s: {what}; more members, jitter=, or more process noise keep its "
+            f"belief alive",
             ParticleCollapse,
             stacklevel=3,
         )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self, TypeVar
@@ -15,6 +14,7 @@ from ..network import Channel, Ledger
 from .failures import FilterError, not_finite
 from .heard import Heard
 from .saving import State
+from .streams import bookmarked
 
 __all__ = ["SensorState", "Step"]
 
@@ -122,7 +122,7 @@ class Step:
 
     def __post_init__(self) -> None:
         self.failed = self.state.failed
-        self.rng: Any = copy.deepcopy(self.state.rng)
+        self.rng: Any = bookmarked(self.state.rng)()
 
     def settle(
         self, errors: dict[tuple[int, ...], str], agents: Sequence[int] | NDArray[np.intp]
@@ -144,6 +144,8 @@ class Step:
 
     def kept(self, values: Array, old: Any) -> Array:
         """A copy of the values, but `old` in failed runs."""
+        if not self.failed.any():
+            return np.array(values)
         failed = self.failed.reshape(*self.failed.shape, *(1,) * (values.ndim - self.failed.ndim))
         return np.asarray(np.where(failed, old, values))
 
@@ -160,7 +162,9 @@ class Step:
         channel = self.channel if shared else None
         for place, observed in self.readings:
             for group in self.filter.gather(observed, channel):
-                yield place, replace(group, target=self.kept(group.target, np.nan))
+                if self.failed.any():
+                    group = replace(group, target=self.kept(group.target, np.nan))
+                yield place, group
 
     def before(self, place: int, agents: Any) -> Array | None:
         """The agents' members at the time before now, for sensors that see changes."""

@@ -59,8 +59,9 @@ def _recolour(x: Array, mean: Array, cov: Array) -> Array:
     unit = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
     scaled = x / unit[..., None, :]
     average = np.full(n, 1 / n)
-    q, r = np.linalg.qr(scaled - (average @ scaled)[..., None, :])
-    _refuse_flat(r, np.abs(scaled).max(axis=-2, initial=0.0))
+    centre = average @ scaled
+    q, r = np.linalg.qr(scaled - centre[..., None, :])
+    _refuse_flat(r, np.abs(centre))
     target = _cholesky(cov / (unit[..., :, None] * unit[..., None, :])).swapaxes(-1, -2)
     u, _, vh = np.linalg.svd(target @ r.swapaxes(-1, -2))
     out = q @ (vh.swapaxes(-1, -2) @ (u.swapaxes(-1, -2) @ target)) * np.sqrt(n - 1)
@@ -69,12 +70,12 @@ def _recolour(x: Array, mean: Array, cov: Array) -> Array:
     return np.asarray(mean[..., None, :] + out * unit[..., None, :])
 
 
-def _refuse_flat(r: Array, size: Array) -> None:
+def _refuse_flat(r: Array, centre: Array) -> None:
     """Refuse anomalies, by their triangular factor, that are combinations of one another."""
     length = np.sqrt((r**2).sum(axis=-2))
     own = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
     # What a component has that those before it have not, against the rounding of the members.
-    if (own <= 32 * r.shape[-1] * _EPS * np.maximum(length, size)).any():
+    if (own <= 32 * r.shape[-1] * _EPS * (length + centre)).any():
         raise ValueError("ensemble: needs components that are not constant and not combinations "
                          "of others, got a singular sample covariance")
 

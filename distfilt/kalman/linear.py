@@ -18,7 +18,7 @@ from ._inputs import common_runs, fill_axes, prior
 __all__ = ["GaussianRun", "kalman_filter", "predict", "update"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class GaussianRun:
     """What a filter with Gaussian output leaves behind.
 

@@ -73,11 +73,7 @@ class PartialFusion:
         omega: float | str | ArrayLike = 0.5,
     ) -> None:
         instance(own, "own", GaussianMixture)
-        if not isinstance(heard, GaussianMixture | Iterable):
-            raise ValueError(f"heard: needs mixtures, got {type(heard).__name__}")
-        others = (heard,) if isinstance(heard, GaussianMixture) else tuple(heard)
-        if not others:
-            raise ValueError("heard: needs at least one belief, got none")
+        others = _beliefs(heard)
         for other in others:
             instance(other, "heard", GaussianMixture)
         sizes = {other.dim for other in others}
@@ -308,14 +304,20 @@ def fuse_in_turn(
     callable_(pair, "pair")
     if isinstance(omega, str):
         choice(omega, "omega", ("equal",))
+    others = _beliefs(heard)
+    for m, other in enumerate(others, start=1):
+        own = pair(own, other, omega=m / (m + 1) if isinstance(omega, str) else omega)
+    return own
+
+
+def _beliefs(heard: GaussianMixture | Iterable[GaussianMixture]) -> tuple[GaussianMixture, ...]:
+    """One or several mixtures as a tuple."""
     if not isinstance(heard, GaussianMixture | Iterable):
         raise ValueError(f"heard: needs mixtures, got {type(heard).__name__}")
     others = (heard,) if isinstance(heard, GaussianMixture) else tuple(heard)
     if not others:
         raise ValueError("heard: needs at least one belief, got none")
-    for m, other in enumerate(others, start=1):
-        own = pair(own, other, omega=m / (m + 1) if isinstance(omega, str) else omega)
-    return own
+    return others
 
 
 def average(

@@ -103,7 +103,9 @@ class Model:
     def _sample_step(self, state: Array, t: float, dt: float, rng: np.random.Generator) -> Array:
         """`sample_step` of checked arguments."""
         moved = self._step(state, t, dt)
-        return moved + rng.standard_normal(moved.shape) @ self._root(t, dt).T
+        noise = rng.standard_normal(moved.shape) @ self._root(t, dt).T
+        noise += moved
+        return noise
 
     def _root(self, t: float, dt: float) -> Array:
         """A factor of the noise's covariance, (d, d)."""

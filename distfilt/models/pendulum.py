@@ -119,7 +119,7 @@ def pendulum(
 
 def _density(sigma: tuple[float, float], each: int) -> Array:
     pair = array(sigma, "sigma", (2,))
-    for value in pair:
+    for value in pair.tolist():
         number(value, "sigma", at_least=0)
     return np.diag(np.repeat(pair, each) ** 2)
 

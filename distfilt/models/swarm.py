@@ -9,15 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, callable_, choice, count, generator, increasing, number
+from ..checks import Array, array, callable_, choice, count, generator, increasing, instance, number
 
-__all__ = [
-    "READINGS",
-    "RotatingMixture",
-    "Swarm",
-    "mobility_and_diffusion",
-    "reflected",
-    "rotating_swarm",
+__all__ = [  # fmt: skip
+    "READINGS", "RotatingMixture", "Swarm", "mobility_and_diffusion", "reflected", "rotating_swarm",
 ]
 
 READINGS = ("literal", "gibbs", "slowgibbs")
@@ -358,6 +353,5 @@ def rotating_swarm(
     """
     mobility, diffusion = mobility_and_diffusion(reading, strength)
     f = RotatingMixture() if mixture is None else mixture
-    if not isinstance(f, RotatingMixture):
-        raise ValueError(f"mixture: needs a RotatingMixture, got {type(f).__name__}")
+    instance(f, "mixture", RotatingMixture)
     return Swarm(lambda x, t: mobility * f._score(x, t), diffusion)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -87,7 +88,7 @@ def _thinned(part: Part, arrived: Mask) -> Part:
 
 def sizes(sent: list[Payload | None], runs: tuple[int, ...]) -> tuple[Any, Any]:
     """Scalars and bytes of each agent's payload in one run."""
-    copies = int(np.prod(runs, dtype=np.int64))
+    copies = math.prod(runs)
     parts = [() if p is None else p if isinstance(p, tuple) else (p,) for p in sent]
-    scalars = np.array([sum(a.size for a in p) // copies for p in parts])
-    return scalars, np.array([sum(a.nbytes for a in p) // copies for p in parts])
+    scalars = [sum([a.size for a in p]) // copies for p in parts]
+    return np.array(scalars), np.array([sum([a.nbytes for a in p]) // copies for p in parts])

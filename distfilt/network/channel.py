@@ -22,6 +22,8 @@ __all__ = ["Channel", "LOST"]
 
 Mask = NDArray[np.bool_]
 
+_PERFECT = Faults()
+
 LOST = ("mutual", "metropolis", "keep", "renormalise", "zero")
 """What :meth:`Channel.combine` can do about a lost message; the last three are biased."""
 
@@ -75,23 +77,23 @@ class Channel:
         if not isinstance(runs, tuple | list):
             raise ValueError(f"runs: needs a tuple of sizes such as (20,), got {runs!r}")
         self.runs = tuple(count(n, "runs") for n in runs)
-        self.faults = Faults() if faults is None else faults
-        self.faults.check(graph)
+        self.faults = _PERFECT if faults is None else faults
+        if faults is not None:
+            faults.check(graph)
         self.t = None if t is None else number(t, "t")
         if self.faults.needs_time and t is None:
             raise ValueError("t: needs the time for faults with windows in seconds, got None")
         self._ledger = Ledger.empty(graph.size) if ledger is None else ledger
         self._owed: dict[int, int] = {}
         self._late: dict[Any, deque[Any]] = {}
-        self._perfect = self.faults.none
-        self._listeners = graph.listeners.astype(np.int64)
+        self._perfect = faults is None or faults.none
 
     @property
     def ledger(self) -> Ledger:
         """The account so far."""
         for size, rounds in self._owed.items():
             self._ledger = self._ledger.charge(
-                rounds * self._listeners, size, 8 * size, rounds=rounds
+                rounds * self.graph.listeners.astype(np.int64), size, 8 * size, rounds=rounds
             )
         self._owed = {}
         return self._ledger
@@ -113,22 +115,22 @@ class Channel:
             floats there.
         """
         sent = _payloads.checked(payloads, self.graph.size, self.runs, copy=self.faults.late > 0)
-        speaks = np.array([p is not None for p in sent])[self.graph.senders]
+        graph = self.graph
+        speaks = np.array([p is not None for p in sent])[graph.senders]
         arrived = self._transmit(speaks, *_payloads.sizes(sent, self.runs))
+        if self._perfect:
+            return _by_receiver(graph, sent, np.flatnonzero(speaks))
         late = self._delayed("exchange", (sent, arrived))
         if late is None:
             return [{} for _ in range(self.graph.size)]
         sent, arrived = late
         some = np.flatnonzero(arrived.any(axis=0))
-        senders = self.graph.senders[some].tolist()
-        messages: list[Any] = [sent[j] for j in senders]
-        for k in np.flatnonzero(~arrived[:, some].all(axis=0)).tolist():
-            here = arrived[:, some[k]].reshape(self.runs)
-            messages[k] = _payloads.thinned(messages[k], here)
-        ends = np.searchsorted(self.graph.receivers[some], np.arange(self.graph.size + 1))
-        return [
-            dict(zip(senders[i:j], messages[i:j], strict=True)) for i, j in pairwise(ends.tolist())
-        ]
+        inbox = _by_receiver(graph, sent, some)
+        for k in some[~arrived[:, some].all(axis=0)].tolist():
+            receiver, sender = int(graph.receivers[k]), int(graph.senders[k])
+            here = arrived[:, k].reshape(self.runs)
+            inbox[receiver][sender] = _payloads.thinned(sent[sender], here)
+        return inbox
 
     def combine(
         self, values: ArrayLike, weights: Weights | ArrayLike | sparse.sparray, *,
@@ -308,6 +310,14 @@ class Channel:
         queue = self._late.setdefault(key, deque())
         queue.append(now)
         return queue.popleft() if len(queue) > self.faults.late else None
+
+
+def _by_receiver(graph: Graph, sent: Sequence[Any], links: Any) -> list[dict[int, Any]]:
+    """What arrives on some links, given by their ascending numbers, for each agent by sender."""
+    senders = graph.senders[links].tolist()
+    messages = [sent[j] for j in senders]
+    ends = np.searchsorted(graph.receivers[links], np.arange(graph.size + 1)).tolist()
+    return [dict(zip(senders[i:j], messages[i:j], strict=True)) for i, j in pairwise(ends)]
 
 
 def _after_loss(graph: Graph, w: Weights, arrived: Mask, lost: str) -> tuple[Array, Array]:

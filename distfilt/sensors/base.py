@@ -112,7 +112,10 @@ class Sensor:
         `previous` holds the states at the previous observation time; only a sensor that sees
         changes needs it.
         """
-        states = self._states(x, previous)
+        return self._seen(*self._states(x, previous))
+
+    def _seen(self, *states: Array) -> Array:
+        """`predict` of checked arguments; it tells a function that takes only one state."""
         try:
             seen = self._predict(*states)
         except (TypeError, ValueError, IndexError) as error:

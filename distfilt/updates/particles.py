@@ -93,8 +93,19 @@ def effective_size(log_weights: ArrayLike) -> Array:
 
 def _effective_size(log_weights: Array) -> Array:
     """As the public one, of normalised weights."""
-    w = np.exp(log_weights)
+    return _size_of(np.exp(log_weights))
+
+
+def _size_of(w: Array) -> Array:
     return np.asarray(1 / (w * w).sum(axis=-1))
+
+
+def _taken(points: Array, picked: Indices) -> Array:
+    """Rows of points (..., N, d) by their indices (..., N)."""
+    n, d = points.shape[-2:]
+    first = n * np.arange(picked.size // n)[:, None]
+    rows = (picked.reshape(-1, n) + first).ravel()
+    return np.asarray(points.reshape(-1, d)[rows].reshape(points.shape))
 
 
 def _log_sum(logs: Array) -> Array:
@@ -172,11 +183,18 @@ def _systematic(w: Array, offset: Array) -> Indices:
     """Index of the weight that holds each of the levels (k + offset) / n."""
     n = w.shape[-1]
     # How many levels lie below each edge; the last edge has all of them.
-    below = np.clip(np.ceil(n * _edges(w) - offset), 0, n).astype(np.intp)
+    levels = n * _edges(w)
+    levels -= offset
+    below = np.ceil(levels, out=levels).clip(0, n, out=levels).astype(np.intp)
     below[..., -1] = n
-    copies = np.diff(below, axis=-1, prepend=0).reshape(-1)
-    flat = np.repeat(np.tile(np.arange(n), copies.size // n), copies)
-    return np.asarray(flat.reshape(w.shape), dtype=np.intp)
+    return _repeated(np.diff(below, axis=-1, prepend=0))
+
+
+def _repeated(copies: Indices) -> Indices:
+    """Each index of the last axis as often as its count says; N in all."""
+    n = copies.shape[-1]
+    each = np.arange(n) if copies.size == n else np.tile(np.arange(n), copies.size // n)
+    return np.repeat(each, copies.reshape(-1)).reshape(copies.shape)
 
 
 def _residual(w: Array, offset: Array) -> Indices:
@@ -189,9 +207,7 @@ def _residual(w: Array, offset: Array) -> Indices:
     edges = np.cumsum(rest, axis=-1) / np.where(total > 0, total, 1.0)
     below = np.clip(np.ceil(left[..., None] * edges - offset), 0, left[..., None]).astype(np.intp)
     below[..., -1] = left
-    copies = (sure + np.diff(below, axis=-1, prepend=0)).reshape(-1)
-    flat = np.repeat(np.tile(np.arange(n), copies.size // n), copies)
-    return np.asarray(flat.reshape(w.shape), dtype=np.intp)
+    return _repeated(sure + np.diff(below, axis=-1, prepend=0))
 
 
 def resample(
@@ -288,17 +304,20 @@ def _weighed(log_weights: Array, predicted: Array, observed: Array, noise: Array
 
 def _log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
     """Log-likelihood of each particle's prediction (..., N, m) but for a constant, (..., N)."""
-    missing = np.isnan(observed) | np.isnan(predicted).any(axis=-2)
-    gap = observed[..., None, :] - predicted
-    cov = noise
+    # Components first: sums over a few of them then run along all particles.
+    seen = np.ascontiguousarray(np.swapaxes(predicted, -1, -2))
+    gap, cov = observed[..., None] - seen, noise
+    missing = np.isnan(observed)
+    if np.isnan(seen).any():
+        missing = missing | np.isnan(seen).any(axis=-1)
     if missing.any():
         # A missing component gets a zero residual and a unit of its own in R.
         here = ~missing[..., :, None] & ~missing[..., None, :]
         cov = np.where(here, noise, np.eye(noise.shape[-1]))
-        gap = np.where(missing[..., None, :], 0.0, gap)
+        gap = np.where(missing[..., None], 0.0, gap)
     # One solve with all particles as right-hand sides: the factor is the same for them.
-    half = _solve_lower(_cholesky(cov), np.swapaxes(gap, -1, -2))
-    return np.asarray(-0.5 * (half**2).sum(axis=-2))
+    half = np.ascontiguousarray(_solve_lower(_cholesky(cov), gap))
+    return np.asarray(-0.5 * (half * half).sum(axis=-2))
 
 
 def _distinct(points: Array) -> Array:

@@ -26,9 +26,9 @@ from distfilt.filters.failures import guarded, not_finite
 from distfilt.filters.heard import gather
 from distfilt.filters.observations import at_one_time, over_times
 from distfilt.kalman import kalman_filter, rts_smoother
-from distfilt.models import LinearModel, Model, lorenz63, simulate
+from distfilt.models import LinearModel, Model, constant_velocity, lorenz63, simulate
 from distfilt.network import Channel, Ledger, covariance_intersection, graphs, intersection
-from distfilt.sensors import Sensor, direct, distance
+from distfilt.sensors import Sensor, direct, distance, stack
 from distfilt.updates import exact_draws, exact_forecast, known_noise, sampled_noise
 
 from .families import NOISE, PRIOR, TIMES, Q, data, made, model, team
@@ -97,6 +97,27 @@ def test_network_of_exact_ensembles_is_the_network_of_kalman_filters() -> None:
     assert np.allclose(a["variance"], b["variance"], atol=1e-8)
     for name in ("messages", "scalars", "lost", "rounds"):
         assert np.array_equal(a[name], b[name])
+
+
+def test_linear_network_of_exact_draws_errs_like_the_kalman_filter_of_all_readings() -> None:
+    """Three agents who hear each other, random priors: ratio of the errors, and honest NEES."""
+    sensors = [direct([0], std=1.0), direct([1], std=0.7), direct([0, 1], std=1.5)]
+    walker, times = constant_velocity(sigma=0.3), np.arange(1, 26) * 0.5
+    prior, rng = (np.zeros(4), np.diag([4.0, 4.0, 1.0, 1.0])), np.random.default_rng(7)
+    truth = simulate(walker, rng.multivariate_normal(*prior, size=500), times, rng=rng)
+    seen = [sensor.observe(truth, rng=rng) for sensor in sensors]
+    f = EnsembleFilter.exact(walker, sensors, graphs.complete(3), members=20)
+    run = f.run(f.start(prior, rng=rng, runs=(500,)), times, seen, truth=truth,
+                scores=("squared_error", "nees"))
+    everything = stack(sensors)
+    exact = kalman_filter(
+        *prior, np.concatenate(seen, axis=-1), F=walker.jacobian(np.zeros(4), 0.0, 0.5),
+        Q=walker.noise(0.0, 0.5), H=everything.matrix(4), R=everything.cov,
+    )
+    settled = slice(10, None)
+    best = ((exact.means - truth) ** 2).sum(axis=-1)[settled].mean()
+    assert abs(run["total_squared_error"].values[settled].mean() / best - 1.0) < 0.005
+    assert 0.97 < run["nees"].values[settled].mean() / 4 < 1.03
 
 
 @pytest.mark.parametrize("rule", ["extended", "unscented"])

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distfilt.network import Graph, Weights, graphs, weights
+from distfilt.network import Graph, Weights, _spectral, graphs, weights
 from tests.network.helpers import APART, ONE_WAY, REFERENCE, STAR, random_graph, rng
 
 named = pytest.mark.parametrize("graph", REFERENCE.values(), ids=REFERENCE.keys())
@@ -89,6 +89,33 @@ def test_balanced_weights_of_many_agents() -> None:
     for axis in (0, 1):
         assert np.abs(np.asarray(w.sum(axis=axis)) - 1).max() < 1e-12
     assert (weights.balanced(graphs.path(1)).matrix.toarray() == 1).all()
+
+
+def test_balanced_weights_of_links_across(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sparse factor of random links fills up, so that a walk finds the null vector."""
+    n, ring = 2500, np.arange(2500)
+    heard = [np.roll(ring, -1), *rng(4).integers(n, size=(2, n))]
+    edges = np.concatenate([np.stack([ring, who], axis=1) for who in heard])
+    graph = Graph.from_edges(n, edges[edges[:, 0] != edges[:, 1]], directed=True)
+    walked = _spectral._walked(graph.laplacian)
+    assert walked is not None and np.ptp(walked) > 0.5
+    assert np.array_equal(_spectral.left_null_vector(graph.laplacian), walked)
+    w = weights.balanced(graph).matrix
+    for axis in (0, 1):
+        assert np.abs(np.asarray(w.sum(axis=axis)) - 1).max() < 1e-12
+    monkeypatch.setattr(_spectral, "_LARGE", n)
+    factored = _spectral.left_null_vector(graph.laplacian)
+    assert np.abs(walked / factored - 1).max() < 1e-11
+
+
+def test_a_walk_along_a_ring_is_given_up() -> None:
+    n, ring = 2500, np.arange(2500)
+    both = np.stack([ring, np.roll(ring, -1)], axis=1)
+    edges = np.concatenate([both, both[: n // 2, ::-1]])
+    graph = Graph.from_edges(n, edges, directed=True)
+    assert _spectral._walked(graph.laplacian) is None
+    w = weights.balanced(graph).matrix
+    assert np.abs(np.asarray(w.sum(axis=0)) - 1).max() < 1e-12
 
 
 def test_balanced_weights_of_an_undirected_graph_are_the_laplacian_s() -> None:
