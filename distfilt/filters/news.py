@@ -9,8 +9,8 @@ import numpy as np
 
 from ..checks import Array, count, instance
 from ..mixtures import GaussianMixture, conditioned
-from ..network import Ledger
-from .mixture import MixtureFilter, MixtureState
+from ..network import Channel
+from .mixture import MixtureFilter
 
 __all__ = ["NewsFilter", "increment"]
 
@@ -114,9 +114,8 @@ class NewsFilter(MixtureFilter):
         object.__setattr__(self, "common", alike)
 
     def _told(
-        self, beliefs: list[GaussianMixture], seen: Sequence[Array | None], state: MixtureState,
-        now: float,
-    ) -> tuple[list[GaussianMixture], Ledger]:
+        self, beliefs: list[GaussianMixture], seen: Sequence[Array | None], channel: Channel | None
+    ) -> list[GaussianMixture]:
         """Own readings, then others' news, then what all received alike."""
         own, alike = self._parted(seen)
         after = self._read(beliefs, own)
@@ -125,22 +124,22 @@ class NewsFilter(MixtureFilter):
             None if old is new else increment(old.marginal(part), new.marginal(part))
             for old, new in zip(beliefs, after, strict=True)
         ]
-        channel = self.channel(state, now)
-        assert channel is not None
+        assert channel is not None  # there is a graph
         inbox = channel.exchange([None if s is None or not s.size else _packed(s) for s in said])
         for k, heard in enumerate(inbox):
             for news in heard.values():
                 after[k] = _learned(after[k], _unpacked(news, self.target_dim))
-        return self._read(after, alike), channel.ledger
+        return self._read(after, alike)
 
     def _parted(self, seen: Sequence[Array | None]) -> tuple[list[Array | None], ...]:
-        """Readings without and with nothing but the common components."""
+        """Readings without and with nothing but the common components; None where none is left."""
         own: list[Array | None] = []
         alike: list[Array | None] = []
         for y in seen:
             everybody = np.isin(np.arange(0 if y is None else y.size), self.common)
-            own.append(None if y is None else np.where(everybody, np.nan, y))
-            alike.append(None if y is None else np.where(everybody, y, np.nan))
+            for part, gone in ((own, everybody), (alike, ~everybody)):
+                left = None if y is None else np.where(gone, np.nan, y)
+                part.append(None if left is None or np.isnan(left).all() else left)
         return own, alike
 
 
