@@ -200,8 +200,9 @@ def code_lines(path: Path) -> int:
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type not in idle:
             found |= set(range(token.start[0], token.end[0] + 1))
+    told = ast.Module | ast.ClassDef | ast.FunctionDef
     for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
+        if isinstance(node, told) and ast.get_docstring(node):
             first = node.body[0]
             found -= set(range(first.lineno, (first.end_lineno or first.lineno) + 1))
     return len(found)
