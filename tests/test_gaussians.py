@@ -247,6 +247,20 @@ def test_optimal_weights_meet_the_conditions_of_the_optimum(
 
 
 @pytest.mark.parametrize("rule", ["min_trace", "min_determinant"])
+def test_optimal_weights_of_many_sources_that_each_know_something_else(rule: str) -> None:
+    """Newton's steps overshoot here again and again, unless they are cut."""
+    for seed in (16, 58, 97):
+        rng, information = np.random.default_rng(seed), []
+        for _ in range(9):
+            seen = np.eye(6)[rng.integers(6, size=rng.integers(2, 9))]
+            information.append(np.eye(6) / 25 + seen.T @ seen / 0.04)
+        p = np.linalg.inv(information)
+        w = intersection_weights(p, rule=rule)
+        slopes = _slopes(w, p, rule)
+        assert slopes.max() <= (1 + 2e-7) * float(w @ slopes)
+
+
+@pytest.mark.parametrize("rule", ["min_trace", "min_determinant"])
 def test_optimal_weights_against_a_general_optimiser(rule: str) -> None:
     rng = generator(6)
     for _ in range(40):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import ast
 import importlib
+import io
 import os
 import subprocess
 import sys
+import tokenize
 import tomllib
 import zipfile
 from pathlib import Path
@@ -187,6 +189,33 @@ def test_functions_fit_a_screen(path: Path) -> None:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             assert length(node) <= 40, f"{node.name} has {length(node)} lines, at most 40"
+
+
+def code_lines(path: Path) -> int:
+    """Count the lines that hold code: no docstring, no comment, no blank line."""
+    text = path.read_text(encoding="utf-8")
+    idle = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT,
+            tokenize.ENDMARKER}  # fmt: skip
+    found: set[int] = set()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type not in idle:
+            found |= set(range(token.start[0], token.end[0] + 1))
+    told = ast.Module | ast.ClassDef | ast.FunctionDef
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, told) and ast.get_docstring(node):
+            first = node.body[0]
+            found -= set(range(first.lineno, (first.end_lineno or first.lineno) + 1))
+    return len(found)
+
+
+@pytest.mark.parametrize(
+    ("family", "most"),
+    [("ensemble", 150), ("gaussian", 150), ("mixture", 150), ("particle", 150), ("transport", 150),
+     ("density", 200)],
+)  # fmt: skip
+def test_a_family_of_filters_is_short(family: str, most: int) -> None:
+    """What families share stands once beside them; a swarm's sharing makes the last one longer."""
+    assert code_lines(PACKAGE / "filters" / f"{family}.py") <= most
 
 
 def test_every_room_is_seen_and_shows_what_it_exports() -> None:

@@ -2,7 +2,7 @@
 
 A trial is one run: a true swing, its readings and one first ensemble for all algorithms. OTProj
 reports a projection of OTF's members and goes on without it, so it needs no run of its own.
-Retraction runs twice, without and with rejuvenation.
+Retraction runs three times: as it is, with rejuvenation, and with the second-order correction.
 """
 
 # ruff: noqa: SIM300
@@ -47,8 +47,10 @@ UPDATES = {
     "rejuvenated": retracted(
         partial(ensemble_transform, rejuvenation=REJUVENATION), rod, motion=MOTION
     ),
+    "corrected": retracted(partial(ensemble_transform, correct=True), rod, motion=MOTION),
 }
-ALGORITHMS = ("OTF", "OTProj", "OTMA", "OTNLeq", "OTNLeqMA", "retraction", "rejuvenated")
+ON_CIRCLE = ("retraction", "rejuvenated", "corrected")
+ALGORITHMS = ("OTF", "OTProj", "OTMA", "OTNLeq", "OTNLeqMA", *ON_CIRCLE)
 
 
 def data(
@@ -97,7 +99,7 @@ def run(
 def estimates(members: np.ndarray, name: str) -> np.ndarray:
     """What is reported: the mean; on the manifold the retracted mean."""
     mean = members.mean(axis=-2)
-    if name in ("retraction", "rejuvenated") and np.isfinite(mean).all():
+    if name in ON_CIRCLE and np.isfinite(mean).all():
         return retract(mean, rod, motion=MOTION)
     return mean
 
@@ -163,3 +165,9 @@ columns = tuple(
 code = (data, run, estimates, scores)
 seeds = np.random.SeedSequence(2024).spawn(setting["runs"])
 rtol = 1e-4
+# A run that has lost the swing multiplies the last bit until it decides, also whether OTNLeq
+# overflows: on three kinds of processor seven or eight of the hundred runs were other ones.
+odd = 10
+# The corrected members' covariance is nearly singular where they have collapsed, and roots of it
+# carry the last bit into their scores.
+rough = [name for name in columns if name.startswith("corrected")]

@@ -9,7 +9,7 @@ the chart.
 # ruff: noqa: SIM300
 from __future__ import annotations
 
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 
@@ -125,14 +125,20 @@ def extended(readings, centre, noisy, rng):
     return np.array(out)
 
 
-@cache
+KEPT: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+"""What `paths` found. A function with a cache of its own could not be sent to a worker."""
+
+
 def paths() -> tuple[np.ndarray, np.ndarray]:
     """A grid of initial conditions (G, 2), and where each is at every time, (T, G, 2)."""
+    if CELLS in KEPT:
+        return KEPT[CELLS]
     side = REACH * np.linspace(-1, 1, CELLS)
     grid = START + np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
     x, out = grid, np.empty((STEPS, len(grid), 2), dtype=np.float32)
     for k in range(STEPS):
         x = out[k] = chart.flow(x.copy(), 0.0, DT)
+    KEPT[CELLS] = grid, out
     return grid, out
 
 

@@ -4,12 +4,12 @@
 
 Each ``book/studies/*.py`` defines one study, which serves one item: ``NAME`` (the item's, such as
 ``figure-2``), ``PAPER`` (a key of the papers), ``trial``, ``parameters``, ``columns`` and
-``seeds``; and if it wants ``code`` (other functions whose source is recorded), ``rtol``, ``atol``
-and ``rough`` (what a later run may differ by, as in ``studies.check``; the same bits without them),
-``timeout`` (seconds for one trial) and ``scenarios`` (those that it reads). A scenario's digest is
-stored among the parameters, and one that is not as accepted is refused: what is stored is the
-book's own study. What several scripts share stands in ``book/studies/_NAME.py``, which they import
-by that name.
+``seeds``; and if it wants ``code`` (other functions whose source is recorded), ``rtol``, ``atol``,
+``rough`` and ``odd`` (what a later run may differ by, as in ``studies.check``; the same bits
+without them), ``timeout`` (seconds for one trial) and ``scenarios`` (those that it reads). A
+scenario's digest is stored among the parameters, and one that is not as accepted is refused: what
+is stored is the book's own study. What several scripts share stands in
+``book/studies/_NAME.py``, which they import by that name.
 
 Metrics go to ``data/studies/PAPER/NAME.csv``; ``studies.stored(PAPER, NAME)`` finds them. With
 ``--check`` nothing is written: every stored trial runs again and is compared.
@@ -33,7 +33,7 @@ from distfilt.studies.files import jsons
 from distfilt.studies.seeds import recipes
 from distfilt.studies.study import column_names
 
-ALLOWED = ("rtol", "atol", "rough")
+ALLOWED = ("rtol", "atol", "rough", "odd")
 NEEDED = ("NAME", "PAPER", "trial", "parameters", "columns", "seeds")
 
 

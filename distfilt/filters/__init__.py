@@ -6,6 +6,7 @@ from .ensemble import EnsembleFilter, EnsembleState
 from .failures import FilterError
 from .gaussian import GaussianFilter, GaussianState
 from .mixture import MixtureFilter, MixtureState
+from .news import NewsFilter, increment
 from .particle import ParticleCollapse, ParticleFilter, ParticleState
 from .saving import State
 from .stepping import SensorState, Step
@@ -14,7 +15,7 @@ from .wiring import SensorFilter
 
 __all__ = [  # fmt: skip
     "DensityFilter", "DensityState", "EnsembleFilter", "EnsembleState", "Filter", "FilterError",
-    "GaussianFilter", "GaussianState", "Late", "MixtureFilter", "MixtureState", "ParticleCollapse",
-    "ParticleFilter", "ParticleState", "SensorFilter", "SensorState", "State", "Step", "Summary",
-    "TransportFilter", "final_state",
+    "GaussianFilter", "GaussianState", "Late", "MixtureFilter", "MixtureState", "NewsFilter",
+    "ParticleCollapse", "ParticleFilter", "ParticleState", "SensorFilter", "SensorState", "State",
+    "Step", "Summary", "TransportFilter", "final_state", "increment",
 ]

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import Array, choice, count, instance, number, same_length
 from ..mixtures import GaussianMixture, moved, split_stretched, two_stage
-from ..mixtures.gaussian import trusted
+from ..mixtures.gaussian import definite, trusted
 from ..mixtures.steps import _conditioned
 from ..mixtures.unscented import POINT_RULES
 from ..models import Model
@@ -204,18 +204,13 @@ class MixtureFilter(TeamFilter):
             self._moved(belief, model, state.t, now - state.t)
             for belief, model in zip(state.mixtures, self.models, strict=True)
         ]
-        beliefs = [
-            belief if y is None or sensor is None else self._seen(belief, sensor, y)
-            for belief, sensor, y in zip(beliefs, self.sensors, seen, strict=True)
-        ]
-        ledger, channel = state.ledger, self.channel(state, now) if self.agreement else None
-        if channel is not None:
-            beliefs, ledger = self._agreed(beliefs, channel), channel.ledger
+        channel = self.channel(state, now)
+        beliefs = self._told(beliefs, seen, channel)
         most = max(_EXACT, self.size)
         kept = [two_stage(belief, self.size, heaviest=most) for belief in beliefs]
         # Without the square roots that they came with: a loaded state has to go on alike.
         plain = tuple(trusted(m.weights, m.means, m.covs) for m in kept)
-        return MixtureState(now, ledger, None, plain)
+        return MixtureState(now, state.ledger if channel is None else channel.ledger, None, plain)
 
     def summary(self, state: MixtureState) -> Summary:
         """Means, variances and covariances of the whole mixtures, and their sizes.
@@ -243,13 +238,24 @@ class MixtureFilter(TeamFilter):
             )
         return moved(belief, lambda x: model._step(x, t, dt), model._root(t, dt), rule=self.rule)
 
-    def _seen(self, belief: GaussianMixture, sensor: Sensor, y: Array) -> GaussianMixture:
-        """Condition on what of a reading is there; a reading out of every gate changes nothing."""
-        gate = np.inf if self.gate is None else self.gate
-        return _conditioned(
-            belief, y, sensor._predict, sensor.cov, sensor._residual, self.rule, gate,
-            "observations",
-        )
+    def _read(
+        self, beliefs: Sequence[GaussianMixture], seen: Sequence[Array | None]
+    ) -> list[GaussianMixture]:
+        """Each agent's belief after its own reading; one out of every gate changes nothing."""
+        return [
+            belief if y is None or sensor is None else _conditioned(
+                belief, y, sensor._predict, sensor.cov, sensor._residual, self.rule, self.gate,
+                "observations",
+            )
+            for belief, sensor, y in zip(beliefs, self.sensors, seen, strict=True)
+        ]  # fmt: skip
+
+    def _told(
+        self, beliefs: list[GaussianMixture], seen: Sequence[Array | None], channel: Channel | None
+    ) -> list[GaussianMixture]:
+        """The beliefs after the agents' readings and their exchange."""
+        after = self._read(beliefs, seen)
+        return after if self.agreement is None or channel is None else self._agreed(after, channel)
 
     def _agreed(self, beliefs: list[GaussianMixture], channel: Channel) -> list[GaussianMixture]:
         """Send target marginals, and fuse what arrived; who hears nothing changes nothing."""
@@ -262,11 +268,5 @@ class MixtureFilter(TeamFilter):
             fused: Any = self.agreement(belief, others) if others else belief
             if instance(fused, "agreement", GaussianMixture).dim != belief.dim:
                 raise ValueError(f"agreement: needs dimension {belief.dim}, got {fused.dim}")
-            try:
-                fused.factors  # noqa: B018
-            except np.linalg.LinAlgError:
-                raise np.linalg.LinAlgError(
-                    "agreement: needs positive definite covariances, got one that is not"
-                ) from None
-            out.append(fused)
+            out.append(definite(fused, "agreement"))
         return out

@@ -60,14 +60,18 @@ def _recolour(x: Array, mean: Array, cov: Array) -> Array:
     scaled = x / unit[..., None, :]
     average = np.full(n, 1 / n)
     centre = average @ scaled
-    q, r = np.linalg.qr(scaled - centre[..., None, :])
+    scaled -= centre[..., None, :]
+    q, r = np.linalg.qr(scaled)
     _refuse_flat(r, np.abs(centre))
     target = _cholesky(cov / (unit[..., :, None] * unit[..., None, :])).swapaxes(-1, -2)
     u, _, vh = np.linalg.svd(target @ r.swapaxes(-1, -2))
-    out = q @ (vh.swapaxes(-1, -2) @ (u.swapaxes(-1, -2) @ target)) * np.sqrt(n - 1)
+    turn = vh.swapaxes(-1, -2) @ (u.swapaxes(-1, -2) @ target)
+    out = q @ (np.sqrt(n - 1) * turn)
     # Where the old spread is almost flat, Q is centred only to rounding over the flatness.
     out -= (average @ out)[..., None, :]
-    return np.asarray(mean[..., None, :] + out * unit[..., None, :])
+    out *= unit[..., None, :]
+    out += mean[..., None, :]
+    return np.asarray(out)
 
 
 def _refuse_flat(r: Array, centre: Array) -> None:

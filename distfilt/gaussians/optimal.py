@@ -36,8 +36,8 @@ def _iterated(covs: Array, here: NDArray[np.bool_], determinant: bool) -> Array:
     problem = _Problem(roots, _square(roots.swapaxes(-1, -2)), lower[:, 0], there, determinant)
     point = there / there.sum(axis=-1, keepdims=True)
     best, sure = point.copy(), point
-    left, lowest = np.arange(len(point)), np.full(len(point), np.inf)
-    bound = lowest
+    left, share = np.arange(len(point)), np.ones((len(point), 1))
+    lowest = bound = np.full(len(point), np.inf)
     for _ in range(_STEPS):
         value, slope, curvature = problem.derivatives(point)
         mean = (point * slope).sum(axis=-1, keepdims=True)
@@ -49,22 +49,21 @@ def _iterated(covs: Array, here: NDArray[np.bool_], determinant: bool) -> Array:
         open_ = lowest > _GAP
         if not open_.any():
             break
-        newton = _newton(point, slope, mean, curvature, problem.there)
-        ratio = slope / mean
-        scaled = point * (ratio if determinant else np.sqrt(ratio))
-        scaled /= scaled.sum(axis=-1, keepdims=True)
         # A Newton step counts if it gains a share of what its slope promised; else its start's
-        # sure step does, whatever the value there.
-        taken = value <= bound
+        # sure step does, whatever the value there, and the next Newton step is cut.
+        at = (value <= bound)[:, None]
+        share = np.where(at, np.minimum(2 * share, 1.0), 0.25 * share)
+        newton = _newton(point, slope, mean, curvature, problem.there)
+        newton = point + share * (newton - point)
+        scaled = _scaled(point, slope / mean, determinant)
         gain = (slope * (newton - point)).sum(axis=-1)
         aim = np.where(gain > 0, value - 1e-3 * gain + 1e-13 * (1 + np.abs(value)), -np.inf)
-        bound = np.where(taken, aim, np.inf)
-        at = taken[:, None]
+        bound = np.where(at[:, 0], aim, np.inf)
         point, sure = np.where(at, newton, sure), np.where(at, scaled, sure)
         if 2 * np.count_nonzero(open_) <= len(open_):
             problem = problem.part(open_)
             left, lowest, bound = left[open_], lowest[open_], bound[open_]
-            point, sure = point[open_], sure[open_]
+            point, sure, share = point[open_], sure[open_], share[open_]
     return np.asarray(best.reshape(*leading, s))
 
 
@@ -119,6 +118,12 @@ def _newton(weights: Array, slope: Array, mean: Array, curvature: Array, there: 
     pull, ones = solved.sum(axis=1).T[..., None]
     out = weights + solved[..., 0] - pull / ones * solved[..., 1]
     out = np.maximum(out, np.maximum(1e-3 * weights, _LEAST * there))
+    return np.asarray(out / out.sum(axis=-1, keepdims=True))
+
+
+def _scaled(weights: Array, ratio: Array, determinant: bool) -> Array:
+    """The sure step: weights times their slopes over the mean one, or the root of that."""
+    out = weights * (ratio if determinant else np.sqrt(ratio))
     return np.asarray(out / out.sum(axis=-1, keepdims=True))
 
 

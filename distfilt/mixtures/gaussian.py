@@ -353,6 +353,17 @@ def trusted(weights: Array, means: Array, covs: Array) -> GaussianMixture:
     return out
 
 
+def definite(mixture: GaussianMixture, name: str) -> GaussianMixture:
+    """The mixture, if all its covariances are positive definite."""
+    try:
+        mixture.factors  # noqa: B018
+    except np.linalg.LinAlgError:
+        raise np.linalg.LinAlgError(
+            f"{name}: needs positive definite covariances, got one that is not"
+        ) from None
+    return mixture
+
+
 def symmetric(covs: Array) -> Array:
     return np.asarray(0.5 * (covs + np.swapaxes(covs, -1, -2)))
 

@@ -120,16 +120,20 @@ def conditioned(
     instance(mixture, "mixture", GaussianMixture)
     y = array(observed, "observed", ("m",), finite=False)
     r = array(noise, "noise", (y.size, y.size))
-    limit = np.inf if gate is None else number(gate, "gate", above=0)
-    return _conditioned(mixture, y, function, r, residual, rule, limit, "observed")
+    if gate is not None:
+        number(gate, "gate", above=0)
+    return _conditioned(mixture, y, function, r, residual, rule, gate, "observed")
 
 
 def _conditioned(
     mixture: GaussianMixture, y: Array, function: Callable[[Array], Array], noise: Array,
-    residual: Callable[[Array, Array], Array], rule: str, gate: float, name: str,
+    residual: Callable[[Array, Array], Array], rule: str, gate: float | None,
+    name: str,
 ) -> GaussianMixture:
     """The same without checks; `name` is what a reading that nothing explains is called."""
     there = np.flatnonzero(~np.isnan(y))
+    if not there.size:
+        return mixture
 
     def gap(a: Array, b: Array) -> Array:
         # A residual may need every component; those that are missing are zeros in both.
@@ -145,7 +149,7 @@ def _conditioned(
     logs = np.where(visible, mixture.log_weights + logs, -np.inf)
     if not np.isfinite(logs.max()):
         raise ValueError(f"{name}: needs a target that can be seen, got one that cannot")
-    if distance[visible].min() > gate**2:
+    if gate is not None and distance[visible].min() > gate**2:
         return mixture
     w = np.exp(logs - logs.max())
     w /= w.sum()

@@ -146,5 +146,12 @@ def _rk4(
         k2 = f(state + 0.5 * h * k1, s + 0.5 * h)
         k3 = f(state + 0.5 * h * k2, s + 0.5 * h)
         k4 = f(state + h * k3, s + h)
-        state = state + (h / 6) * (k1 + 2 * k2 + 2 * k3 + k4)
+        # In place where nobody else holds the array: members are many, and memory is slow.
+        total = np.multiply(k2, 2.0, out=np.empty_like(state))
+        total += k1
+        total += 2 * k3
+        total += k4
+        total *= h / 6
+        total += state
+        state = total
     return np.asarray(state)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..checks import Array, array, count, instance, number
-from ..ensembles import mean, sample_covariance
+from ..ensembles import _mean, _sample_covariance
 from ..gaussians import _bures_barycentre, _recolour
 from . import weights as weighting
 from ._neighbourhood import fused_by
@@ -116,8 +116,9 @@ def intersection(
            [0.5, 2.5]])
     """
     x, size = _scaled(ensembles, channel, scale)
-    fused = _intersected(mean(x), _sampled(x), channel, rule, weights, rounds)
-    return _recolour(x, *fused) * size
+    fused = _intersected(_mean(x), _sampled(x), channel, rule, weights, rounds)
+    out = _recolour(x, *fused)
+    return out if size is None else out * size
 
 
 def barycentre(
@@ -155,7 +156,8 @@ def barycentre(
         centre = (omega[..., None] * means).sum(axis=-2)
         return centre, _bures_barycentre(covs, omega, small, _SWEEPS)
 
-    return _recolour(x, *fused_by(mean(x), _sampled(x), channel, fuse, rounds)) * size
+    out = _recolour(x, *fused_by(_mean(x), _sampled(x), channel, fuse, rounds))
+    return out if size is None else out * size
 
 
 def _ensembles(ensembles: ArrayLike, channel: Channel) -> Array:
@@ -163,10 +165,14 @@ def _ensembles(ensembles: ArrayLike, channel: Channel) -> Array:
     return array(ensembles, "ensembles", (*channel.runs, channel.graph.size, "N", "d"))
 
 
-def _scaled(ensembles: ArrayLike, channel: Channel, scale: ArrayLike | None) -> tuple[Array, Array]:
-    """Ensembles divided by the scale of each component, and the scale."""
+def _scaled(
+    ensembles: ArrayLike, channel: Channel, scale: ArrayLike | None
+) -> tuple[Array, Array | None]:
+    """Ensembles divided by the scale of each component, and the scale, if there is one."""
     x = _ensembles(ensembles, channel)
-    size = np.ones(x.shape[-1]) if scale is None else array(scale, "scale", (x.shape[-1],))
+    if scale is None:
+        return x, None
+    size = array(scale, "scale", (x.shape[-1],))
     if not (size > 0).all():
         raise ValueError(f"scale: needs positive sizes, got {size.min():g}")
     return x / size, size
@@ -179,7 +185,7 @@ def _sampled(x: Array) -> Array:
         raise ValueError(
             f"ensembles: needs more than {d} members for {d} components, got {members}"
         )
-    cov = sample_covariance(x)
+    cov = _sample_covariance(x)
     spread = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
     size = np.where(spread > 0, spread, 1.0)
     try:

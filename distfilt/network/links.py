@@ -191,7 +191,9 @@ class Graph:
     @cached_property
     def directed(self) -> bool:
         """Whether some link goes one way only."""
-        return bool((self.reverse < 0).any())
+        turned = self.links.T.tocsr()
+        same = (turned.indptr == self.links.indptr).all() and (turned.indices == self.senders).all()
+        return not same
 
     @cached_property
     def laplacian(self) -> sparse.csr_array:

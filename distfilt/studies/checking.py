@@ -23,7 +23,8 @@ __all__ = ["check"]
 def check(
     path: str | Path | Stored, trial: Callable[[SeedSequence], Any], *,
     indices: Iterable[int] | None = None, rtol: float = 0.0, atol: float = 0.0,
-    rough: Collection[str] = (), workers: int | None = 1, executor: Executor | None = None,
+    rough: Collection[str] = (), odd: int = 0,
+    workers: int | None = 1, executor: Executor | None = None,
 ) -> Stored:
     """Run stored trials again and compare what they give now with what is stored.
 
@@ -46,6 +47,9 @@ def check(
         Metrics that another processor need not repeat, because the last bit decides in the trial
         (which of two couplings, which way an unstable filter goes). Such a metric may differ from
         its stored value by as much as the stored trials differ from each other.
+    odd : int
+        How many of the trials may go another way altogether, in any metric: an unstable filter
+        overflows on one processor and not on the next.
     workers, executor
         As in `run`; by default in this process.
 
@@ -59,14 +63,15 @@ def check(
     stored = path if isinstance(path, Stored) else load(path)
     number(rtol, "rtol", at_least=0)
     allowed = _allowed(stored, number(atol, "atol", at_least=0), rough)
+    spared = count(odd, "odd", at_least=0)
     chosen = _indices(range(len(stored)) if indices is None else indices, len(stored))
     study = run(
         callable_(trial, "trial"), [stored.seed(i) for i in chosen], errors="collect",
         workers=workers, executor=executor,
     )
     wrong = _differences(stored, chosen, study, rtol, allowed)
-    if wrong:
-        raise AssertionError(_report(stored, trial, wrong))
+    if len(wrong) > spared:
+        raise AssertionError(_report(stored, trial, [text for each in wrong for text in each]))
     return stored
 
 
@@ -84,20 +89,22 @@ def _allowed(stored: Stored, atol: float, rough: Collection[str]) -> dict[str, f
 
 def _differences(
     stored: Stored, chosen: Sequence[int], study: Study, rtol: float, allowed: dict[str, float]
-) -> list[str]:
-    """What the new study of the chosen trials does not give as it is stored."""
+) -> list[list[str]]:
+    """What the new study does not give as it is stored, for each trial that differs."""
     names = tuple(stored.columns)
     kinds = {failure.index: failure.kind for failure in study.failures}
     wrong = []
     for k, i in enumerate(chosen):
+        found = []
         if kinds.get(k, "") != stored.failures[i]:
             was, now = stored.failures[i] or "a value", kinds.get(k) or "a value"
-            wrong.append(f"trial {i}: stored {was}, now {now}")
+            found.append(f"trial {i}: stored {was}, now {now}")
         elif k not in kinds:
             for name, value in zip(names, row(study.values[k], names), strict=True):
                 kept = float(stored.columns[name][i])
                 if not _same(kept, value, rtol, allowed[name]):
-                    wrong.append(f"trial {i}: {name} stored {kept!r}, now {value!r}")
+                    found.append(f"trial {i}: {name} stored {kept!r}, now {value!r}")
+        wrong += [found] if found else []
     return wrong
 
 

@@ -49,7 +49,9 @@ def with_missing(
     # What is drawn for an ensemble depends on its place and on how many readings it has, not on
     # what others miss: each number of readings has a stream, which is drawn from for all places.
     base = [int(b) for b in rng.integers(2**63, size=2)]
-    present = ~(np.isnan(observed) | np.isnan(predicted).any(axis=-2))
+    present, gone = ~np.isnan(observed), np.isnan(predicted)
+    if gone.any():
+        present = present & ~gone.any(axis=-2)
     if present.all():
         stream = _stream(rng, [*base, m], lead, None)
         return inner(ensemble, predicted, observed, noise, rng=stream)

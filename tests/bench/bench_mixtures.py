@@ -162,8 +162,9 @@ def in_orbit() -> tuple[list[Row], int]:
 
     rows, missed = [], 0
     truth = study.data(study.SETTING, np.random.default_rng(7))[1:]
-    for name in ("none", "matched", "one_ci"):
-        took = timed(lambda n=name: study.run(study.SETTING, study.ROWS[n], *truth), 3)
+    for name in ("none", "c2", "c3", "one_ci", "news"):
+        options = study.ROWS[""][name]
+        took = timed(lambda o=options: study.run(study.SETTING, o, *truth), 3)
         missed += int(took.cpu > 2)
         size = took.result[-1].mixtures[0].size
         rows.append(row(f"track, {name}", 12, size, took.cpu, needed=2000))

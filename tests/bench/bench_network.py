@@ -9,12 +9,10 @@ shown too.
 from __future__ import annotations
 
 import sys
-from statistics import median
-from time import perf_counter
 from typing import Any
 
 import numpy as np
-from _bench import timed, write
+from _bench import interleaved, timed, write
 
 from distfilt.network import Channel, Faults, Graph, graphs, weights
 
@@ -34,19 +32,6 @@ def radius(agents: int) -> float:
     return float(np.sqrt(10 / (np.pi * agents)))
 
 
-def paired(a: Any, b: Any, calls: int, rounds: int = 15) -> tuple[float, float, float]:
-    """Median times in s of a call of `a` and of `b`, taken in turn, and the median of a / b."""
-    times = np.empty((rounds, 2))
-    for k in range(rounds):
-        for j, function in enumerate((a, b)):
-            start = perf_counter()
-            for _ in range(calls):
-                function()
-            times[k, j] = (perf_counter() - start) / calls
-    ratios = times[:, 0] / times[:, 1]
-    return float(median(times[:, 0])), float(median(times[:, 1])), float(median(ratios))
-
-
 def channel_rows() -> tuple[list[dict[str, Any]], int]:
     """The channel's combine against ``matrix @ values``, without loss and with 10%."""
     rows, missed = [], 0
@@ -58,21 +43,20 @@ def channel_rows() -> tuple[list[dict[str, Any]], int]:
         whole, lossy = Channel(graph), Channel(graph, faults=Faults(loss=0.1, seed=1))
         matrix = w.matrix
         rounds = ROUNDS if agents * k < 1e5 else 10
-        calls = max(1, int(2e3 / (agents * k)))
 
         def products(m: Any = matrix, v: Any = values, n: int = rounds) -> Any:
             for _ in range(n):
                 v = m @ v
             return v
 
-        ours, bare, ratio = paired(
-            lambda c=whole, v=values, w=w, n=rounds: c.combine(v, w, rounds=n), products, calls
-        )
-        one = paired(
-            lambda c=whole, v=values, w=w: c.combine(v, w), lambda m=matrix, v=values: m @ v,
-            rounds * calls,
-        )[2]
-        lost = timed(lambda c=lossy, v=values, w=w: c.combine(v, w), 5).wall
+        many, ratios = interleaved({
+            "bare": products, "channel": lambda c=whole, v=values, w=w, n=rounds: c.combine(
+                v, w, rounds=n)})  # fmt: skip
+        one = interleaved({
+            "bare": lambda m=matrix, v=values: m @ v,
+            "channel": lambda c=whole, v=values, w=w: c.combine(v, w)})[1]["channel"]  # fmt: skip
+        ours, bare, ratio = many["channel"], many["bare"], ratios["channel"]
+        lost = timed(lambda c=lossy, v=values, w=w: c.combine(v, w), 5).cpu
         missed += ratio > LIMIT
         rows.append({
             "agents": agents, "values": k, "product_us": f"{bare / rounds * 1e6:.1f}",
@@ -101,11 +85,11 @@ def graph_rows() -> list[dict[str, Any]]:
         fiedler = timed(lambda p=places, r=2 * reach: graphs.disk(p, r).fiedler_value, 3)
         rows.append({
             "agents": agents, "links": graph.senders.size // 2,
-            "disk_ms": f"{build.wall * 1e3:.2f}",
-            "networkx_disk_ms": f"{timed(theirs, 3).wall * 1e3:.2f}",
-            "components_ms": f"{(parts.wall - build.wall) * 1e3:.2f}",
-            "metropolis_ms": f"{metro.wall * 1e3:.2f}",
-            "fiedler_ms": f"{fiedler.wall * 1e3:.1f}",
+            "disk_ms": f"{build.cpu * 1e3:.2f}",
+            "networkx_disk_ms": f"{timed(theirs, 3).cpu * 1e3:.2f}",
+            "components_ms": f"{(parts.cpu - build.cpu) * 1e3:.2f}",
+            "metropolis_ms": f"{metro.cpu * 1e3:.2f}",
+            "fiedler_ms": f"{fiedler.cpu * 1e3:.1f}",
         })
     return rows
 

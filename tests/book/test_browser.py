@@ -14,7 +14,7 @@ from urllib.parse import unquote, urldefrag, urlparse
 
 import pytest
 
-from common import toc_pages
+from common import chapters, toc_pages
 
 ROOT = Path(__file__).resolve().parents[2]
 BUILT = ROOT / "_build" / "html"
@@ -141,7 +141,7 @@ def visit(driver: Any, page: Path) -> Visit:
     """Open a page, wide and narrow, and collect what happened."""
     for kind in ("performance", "browser"):
         driver.get_log(kind)
-    widths, fit = {}, {}
+    widths, fit, sliders = {}, {}, []
     tab = driver.current_window_handle
     for width in WIDTHS:
         size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
@@ -152,7 +152,7 @@ def visit(driver: Any, page: Path) -> Visit:
         scroll, client = driver.execute_script(PAGE)
         widths[width] = (scroll, client)
         fit[width] = driver.execute_script(FIT)
-    sliders = driver.execute_async_script(MOVE)
+        sliders += driver.execute_async_script(MOVE)
     entries = [json.loads(entry["message"]) for entry in driver.get_log("performance")]
     requests = asked(entries, tab)
     console = [e["message"] for e in driver.get_log("browser") if e["level"] == "SEVERE"]
@@ -314,6 +314,12 @@ def test_every_slider_moves_and_plays(visits: dict[Path, Visit]) -> None:
         if not all(slider.values())
     }
     assert still == {}
+    moved = {
+        page.stem: len(seen.sliders) for page, seen in visits.items() if page.parent.name == "book"
+    }
+    for source in chapters():
+        drawn = source.read_text(encoding="utf-8").count("plotting.slider(")
+        assert moved[source.stem] == drawn * len(WIDTHS), f"{source.stem}: {drawn} sliders"
 
 
 def test_what_chromium_asks_for_itself_is_not_the_book_s() -> None:

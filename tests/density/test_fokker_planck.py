@@ -199,11 +199,3 @@ BAD_INPUT = {
             Swarm(_still, lambda x, t: x[..., 0] - 0.5), Grid((5, 5))).generator(0.0)),
     ],
 }
-
-
-@pytest.mark.parametrize(
-    ("word", "call"), [case for cases in BAD_INPUT.values() for case in cases]
-)
-def test_bad_input(word: str, call: object) -> None:
-    with pytest.raises(ValueError, match=word):
-        call()  # type: ignore[operator]

@@ -91,11 +91,3 @@ BAD_INPUT = {
         ("coarse", lambda: Grid((4, 6)).aggregated(np.ones(24), Grid((3, 2)))),
     ],
 }
-
-
-@pytest.mark.parametrize(
-    ("word", "call"), [case for cases in BAD_INPUT.values() for case in cases]
-)
-def test_bad_input(word: str, call: object) -> None:
-    with pytest.raises(ValueError, match=word):
-        call()  # type: ignore[operator]

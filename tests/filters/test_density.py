@@ -378,14 +378,6 @@ EXEMPT = {
 }
 
 
-@pytest.mark.parametrize(
-    ("word", "call"), [case for cases in BAD_INPUT.values() for case in cases]
-)
-def test_bad_input(word: str, call: object) -> None:
-    with pytest.raises(ValueError, match=word):
-        call()  # type: ignore[operator]
-
-
 def test_seen_kernels_of_the_gone_are_zero() -> None:
     present = np.array([True, False])
     seen = Seen(np.array([[0.5, 0.5], [0.0, 0.0]]), present, GRID, H, 0.0)

@@ -98,3 +98,15 @@ def test_jacobian_of_a_bent_flow_in_time() -> None:
     ours = rk4_jacobian(rate, slope, x, 0.5, 1.0, longest=0.3)
     numeric = central(lambda v: rk4(rate, v, 0.5, 1.0, longest=0.3), x)
     assert np.abs(ours - numeric).max() < 1e-8
+
+
+def test_a_rate_in_integers_or_in_half_the_digits_keeps_the_states_type() -> None:
+    def slow(x: np.ndarray, t: float) -> np.ndarray:
+        return np.ones(x.shape, dtype=np.int64)
+
+    def coarse(x: np.ndarray, t: float) -> np.ndarray:
+        return np.full(x.shape, 0.5, dtype=np.float32)
+
+    start = np.array([1.0 + 1e-12, 2.0])
+    assert np.allclose(rk4(slow, start, 0.0, 1.0, longest=0.25), start + 1, rtol=0, atol=1e-15)
+    assert np.allclose(rk4(coarse, start, 0.0, 1.0, longest=0.25), start + 0.5, rtol=0, atol=1e-15)

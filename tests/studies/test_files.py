@@ -189,6 +189,20 @@ def test_a_rough_metric_stays_within_the_trials_and_others_are_held(tmp_path: Pa
             studies.check(path, trial, **options)
 
 
+def test_a_few_odd_trials_pass_and_one_more_does_not(tmp_path: Path) -> None:
+    path = _store(path=tmp_path / "a.csv")
+    last = [studies.load(path).seed(i).spawn_key for i in (4, 5)]
+
+    def trial(seed: SeedSequence) -> Scores:
+        found = scores(seed)
+        return found._replace(rmse=np.nan, nees=0.5) if seed.spawn_key in last else found
+
+    studies.check(path, trial, odd=2)
+    with pytest.raises(AssertionError, match=r"trial 4: rmse(.|\n)*trial 5: nees stored"):
+        studies.check(path, trial, odd=1)
+    studies.check(path, trial, indices=[3, 4], odd=1)
+
+
 @pytest.mark.parametrize(
     ("options", "name"),
     [
@@ -200,6 +214,7 @@ def test_a_rough_metric_stays_within_the_trials_and_others_are_held(tmp_path: Pa
         ({"atol": -1.0}, "atol"),
         ({"rough": ["speed"]}, "rough"),
         ({"rough": "rmse"}, "rough"),
+        ({"odd": -1}, "odd"),
         ({"workers": 0}, "workers"),
     ],
 )

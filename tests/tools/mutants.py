@@ -1,15 +1,16 @@
 """How many random faults in the library do its tests find?
 
     python tests/tools/mutants.py [--sample 300] [--seed 1] [--jobs 2] [--only network]
-        [--stages 4] [--minutes 30]
+        [--stages 2] [--minutes 30]
 
 cosmic-ray lists the places where the library's code can be changed (an operator, a comparison, a
 number, a keyword) and makes the change; a seeded sample of places is drawn, and one change at each.
 The draw looks at a place's own line, so that most of a sample stays when other code changes.
-A mutant is tested in stages, the nearest tests first: the file that mirrors the module with its own
-examples, then the contracts that every family passes, then the module's folder of tests, then all
-tests but those of the book. It survives if all pass; ``--stages`` stops earlier, and the table's
-column says how far a survivor came. A change of a type or a text only is no fault and is not drawn.
+A mutant is tested in two stages: by the file that mirrors the module and the module's own examples,
+then by every test that runs the changed line, but for those of the book (the suite runs once with a
+tracer for that; a line that runs on import only is tested by what runs its function or module). It
+survives if all pass; ``--stages 1`` stops earlier, and the table's column says how far a survivor
+came. A change of a type or a text only is no fault and is not drawn.
 
 Writes ``data/bench/mutants.csv``, a line a mutant. A survivor that is equivalent to the original
 gets a reason there by hand, which a later run of the same mutant keeps; the share of the others is
@@ -30,6 +31,7 @@ import os
 import random
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -43,16 +45,10 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = ROOT / "data" / "bench" / "mutants.csv"
 COLUMNS = ("module", "line", "was", "becomes", "result", "stage", "seconds", "reason")
-SECONDS = (120, 120, 600, 3000)
+SECONDS = (120, 1800)
 """What the tests of each stage may take; a mutant that takes longer hangs, and so is found."""
-CONTRACTS = (
-    "tests/updates/test_contract.py", "tests/filters/test_families.py",
-    "tests/filters/test_contract.py",
-)  # fmt: skip
-FAMILIES = (
-    "linalg", "ensembles", "gaussians", "models", "network", "sensors", "updates", "filters",
-)  # fmt: skip
-"""The rooms that the contracts run through."""
+EVERY = ("distfilt", "tests", *(f"--ignore=tests/{name}" for name in ("book", "tools")),
+         "--ignore=tests/test_package.py")  # fmt: skip
 WARM = (
     "numpy", "scipy.linalg", "scipy.optimize", "scipy.sparse.csgraph", "scipy.sparse.linalg",
     "scipy.spatial", "scipy.special", "scipy.stats", "scipy.integrate", "networkx", "xarray",
@@ -155,22 +151,45 @@ def drawn(root: Path, size: int, seed: int, only: str) -> list[Mutant]:
     return out
 
 
-def stages(module: str, root: Path) -> list[list[str]]:
-    """The tests to run for a module, nearest first."""
+def nearest(module: str, root: Path) -> list[str]:
+    """The module's own examples, and the file of tests that mirrors it."""
     parts = Path(module).with_suffix("").parts[1:]
     name = f"test_{parts[-1].lstrip('_')}.py"
-    folder = root.joinpath("tests", *parts[:-1])
-    mirrors = [folder / name, root / "tests" / f"test_{parts[0]}.py"]
-    near = [p.relative_to(root).as_posix() for p in mirrors if p.is_file()][:1]
-    out = [[module, *near]]
-    if parts[0] in FAMILIES:
-        out.append([p for p in CONTRACTS if (root / p).is_file()])
-    if len(parts) > 1 and folder.is_dir():
-        rest = sorted(p.relative_to(root).as_posix() for p in folder.rglob("test_*.py"))
-        out.append([p for p in rest if p not in (*near, *CONTRACTS)])
-    left_out = ("book", "tools", "test_package.py")
-    out.append(["tests", *(f"--ignore=tests/{name}" for name in left_out)])
-    return [stage for stage in out if stage]
+    mirrors = [root.joinpath("tests", *parts[:-1], name), root / "tests" / f"test_{parts[0]}.py"]
+    return [module, *(p.relative_to(root).as_posix() for p in mirrors if p.is_file())][:2]
+
+
+def traced(root: Path, jobs: int) -> Any:
+    """Which tests run which lines: the stored trace of the suite, or a new one."""
+    from coverage import CoverageData
+
+    path = root / "_build" / "lines.coverage"
+    sources = [p for name in ("distfilt", "tests") for p in (root / name).rglob("*.py")]
+    if not path.is_file() or path.stat().st_mtime < max(p.stat().st_mtime for p in sources):
+        path.parent.mkdir(exist_ok=True)
+        subprocess.run(
+            [sys.executable, "-m", "pytest", "-q", "-n", str(jobs), "--dist", "loadscope",
+             "--cov=distfilt", "--cov-context=test", "--cov-report=", *EVERY],
+            cwd=root, check=True, stdin=subprocess.DEVNULL,
+            env=os.environ | {"COVERAGE_FILE": str(path), "PYTHONPATH": str(root),
+                              "HYPOTHESIS_PROFILE": "gate"},
+        )  # fmt: skip
+    data = CoverageData(basename=str(path))
+    data.read()
+    return data
+
+
+def running(contexts: dict[int, list[str]], text: str, line: int) -> list[str]:
+    """The tests that run a line's statement, else its function, else its module."""
+    nodes = [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.stmt)]
+    spans = [(n.lineno, n.end_lineno or n.lineno) for n in nodes]
+    around = [(a, b) for a, b in spans if a <= line <= b]
+    for first, last in (*sorted(around, key=lambda s: s[1] - s[0]), (1, text.count("\n") + 1)):
+        found = {c for n in range(first, last + 1) for c in contexts.get(n, ()) if c}
+        if found:
+            # Without the parameters, whose names may come from the library.
+            return sorted({c.rpartition("|")[0].partition("[")[0] for c in found})
+    return []
 
 
 def warm() -> None:
@@ -224,7 +243,7 @@ def described(mutant: Mutant, root: Path) -> dict[str, Any]:
     return row | {"becomes": becomes, "result": "", "stage": "", "seconds": "", "reason": ""}
 
 
-def tested(mutant: Mutant, folder: Path, most: int) -> dict[str, Any]:
+def tested(mutant: Mutant, folder: Path, stages: list[list[str]]) -> dict[str, Any]:
     """What became of one mutant in the copy in that folder."""
     path = folder / mutant.module
     text = path.read_text(encoding="utf-8")
@@ -232,9 +251,9 @@ def tested(mutant: Mutant, folder: Path, most: int) -> dict[str, Any]:
     began = time.perf_counter()
     path.write_text(mutant.source(text), encoding="utf-8")
     try:
-        for stage, names in enumerate(stages(mutant.module, folder)[:most], start=1):
+        for stage, names in enumerate(stages, start=1):
             found["stage"] = stage
-            if not passes(names, folder, SECONDS[stage - 1]):
+            if names and not passes(names, folder, SECONDS[stage - 1]):
                 found["result"] = "killed"
                 break
     finally:
@@ -253,6 +272,7 @@ def run(
     rows: list[tuple[Mutant, dict[str, Any]]], root: Path, options: argparse.Namespace
 ) -> Iterator[None]:
     """Complete the rows, a job each in a process of its own; yields after each one."""
+    trace = traced(root, options.jobs) if rows and options.stages > 1 else None
     with tempfile.TemporaryDirectory(prefix="mutants-") as scratch:
         free = [copied(root, Path(scratch) / str(k)) for k in range(options.jobs)]
         busy: dict[int, tuple[Path, Path, dict[str, Any]]] = {}
@@ -262,10 +282,16 @@ def run(
             if free and waiting and time.monotonic() < end:
                 folder, (mutant, row) = free.pop(), waiting.pop()
                 answer = Path(scratch) / f"{folder.name}.json"
+                tests = [nearest(mutant.module, root)]
+                if trace is not None:
+                    path = root / mutant.module
+                    lines = trace.contexts_by_lineno(str(path))
+                    text = path.read_text(encoding="utf-8")
+                    tests.append(running(lines, text, mutant.line))
                 child = os.fork()
                 if not child:
                     try:
-                        answer.write_text(json.dumps(tested(mutant, folder, options.stages)))
+                        answer.write_text(json.dumps(tested(mutant, folder, tests)))
                     finally:
                         os._exit(0)
                 busy[child] = folder, answer, row
@@ -285,12 +311,11 @@ def known(table: Path) -> dict[tuple[str, str, str], dict[str, Any]]:
         return {(r["module"], r["was"], r["becomes"]): r for r in csv.DictReader(lines)}
 
 
-def finished(row: dict[str, Any], root: Path, most: int) -> bool:
+def finished(row: dict[str, Any], most: int) -> bool:
     """Whether another run of the mutant would show nothing new."""
     if row["result"] == "killed":
         return True
-    every = len(stages(row["module"], root))
-    return row["result"] == "survived" and int(row["stage"] or 0) >= min(most, every)
+    return row["result"] == "survived" and int(row["stage"] or 0) >= most
 
 
 def stored(rows: list[dict[str, Any]], table: Path) -> None:
@@ -324,7 +349,7 @@ def main(arguments: list[str] | None = None, root: Path = ROOT, table: Path = TA
     again = {"survived"} if options.again else set()
     waiting = [
         (m, row) for m, row in pairs
-        if not finished(row, root, options.stages) or (row["result"] in again and not row["reason"])
+        if not finished(row, options.stages) or (row["result"] in again and not row["reason"])
     ]  # fmt: skip
     rows = [row for _, row in pairs]
     warm()

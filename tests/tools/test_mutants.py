@@ -74,16 +74,23 @@ def test_a_sample_stays_when_other_lines_change(repository: Path) -> None:
 
 
 def test_nearest_tests_come_first() -> None:
-    found = mutants.stages("distfilt/network/channel.py", mutants.ROOT)
-    assert found[0] == ["distfilt/network/channel.py", "tests/network/test_channel.py"]
-    assert found[1] == list(mutants.CONTRACTS) and found[3][0] == "tests"
-    assert "tests/network/test_weights.py" in found[2] and found[0][1] not in found[2]
-    for module, test in (("checks", "checks"), ("gaussians/optimal", "gaussians")):
-        near = mutants.stages(f"distfilt/{module}.py", mutants.ROOT)[0]
-        assert near == [f"distfilt/{module}.py", f"tests/test_{test}.py"]
-    update = mutants.stages("distfilt/updates/gaussian.py", mutants.ROOT)
-    assert not set(update[2]) & {*update[0], *mutants.CONTRACTS}
-    assert all((mutants.ROOT / path).is_file() for path in mutants.CONTRACTS)
+    for module, test in (
+        ("network/channel", "network/test_channel"), ("checks", "test_checks"),
+        ("gaussians/optimal", "test_gaussians"),
+    ):  # fmt: skip
+        near = mutants.nearest(f"distfilt/{module}.py", mutants.ROOT)
+        assert near == [f"distfilt/{module}.py", f"tests/{test}.py"]
+        assert all((mutants.ROOT / path).is_file() for path in near)
+
+
+def test_a_line_is_tested_by_what_runs_its_statement_or_function_or_module() -> None:
+    text = "A = (\n    1\n)\n\ndef f(x,\n      y=2):\n    z = (x +\n         y)\n    return z\n"
+    contexts = {1: [""], 5: [""], 7: ["t.py::a[1]|run", "t.py::a[2]|run", ""], 9: ["t.py::b|call"]}
+    assert mutants.running(contexts, text, 8) == ["t.py::a"]
+    assert mutants.running(contexts, text, 9) == ["t.py::b"]
+    assert mutants.running(contexts, text, 6) == ["t.py::a", "t.py::b"]
+    assert mutants.running(contexts, text, 2) == ["t.py::a", "t.py::b"]
+    assert mutants.running({1: [""]}, text, 8) == []
 
 
 def run(repository: Path, table: Path, *options: str) -> str:

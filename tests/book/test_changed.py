@@ -1,0 +1,57 @@
+"""Chapter 4 as a template: with other links, and another sensor, it runs to its end and says so."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import execute
+from common import ROOT, VERDICT
+
+CHAPTER = "04-satellite-network.md"
+LINKS = (('neighbours = ["A", "B"]', 'neighbours = ["A", "B", "C"]'),
+         ('neighbours = ["A", "C"]', 'neighbours = ["A", "B", "C"]'))  # fmt: skip
+SENSOR = (('kind = "angle"\nnoise = 0.2\nunit = "rad"', 'kind = "range"\nnoise = 0.2\nunit = "m"'),)
+
+
+def copied(target: Path, changes: tuple[tuple[str, str], ...]) -> Path:
+    """A copy of what the chapter needs, with another scenario of Table II."""
+    for name in ("book", "data"):
+        shutil.copytree(ROOT / name, target / name, ignore=shutil.ignore_patterns("__pycache__"))
+    path = target / "data" / "scenarios" / "grange" / "table-2.toml"
+    text = path.read_text(encoding="utf-8")
+    for old, new in changes:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    path.write_text(text, encoding="utf-8")
+    return target / "book"
+
+
+def verdicts(notebook: Any) -> dict[str, tuple[str, str]]:
+    """Verdict and reason of each item, from what the cells show."""
+    out = {}
+    for cell in notebook.cells:
+        for output in cell.get("outputs", []):
+            found = output.get("data", {}).get(VERDICT)
+            if found:
+                out[found["item"]] = (found["verdict"], found["why"])
+    return out
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("changes", [LINKS, SENSOR, LINKS + SENSOR], ids=["links", "range", "both"])
+def test_a_changed_scenario_runs_to_the_end_and_is_not_compared(
+    changes: tuple[tuple[str, str], ...], tmp_path: Path
+) -> None:
+    folder = copied(tmp_path, changes)
+    notebook = execute.read(folder / CHAPTER)
+    execute.run(notebook, folder)
+    assert execute.complaints(notebook) == []
+    found = verdicts(notebook)
+    for item in ("Table II", "Fig. 1"):
+        verdict, why = found[item]
+        assert verdict == "not comparable" and why.startswith("changed scenario: agents.")
+    assert found["Table III"][0] == "read" and found["Fig. 2"][0] == "match"

@@ -1,0 +1,25 @@
+"""What every chapter's source keeps to."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from common import chosen
+from execute import read
+
+CHAPTERS = [source for source in chosen([]) if source.stem[0].isdigit()]
+
+
+def import_lines(source: Path) -> int:
+    """Count the lines of the import statements in a chapter's first code cell."""
+    cell = next(cell for cell in read(source).cells if cell.cell_type == "code")
+    found = [n for n in ast.parse(cell.source).body if isinstance(n, ast.Import | ast.ImportFrom)]
+    return sum((n.end_lineno or n.lineno) - n.lineno + 1 for n in found)
+
+
+@pytest.mark.parametrize("source", CHAPTERS, ids=lambda p: p.stem)
+def test_import_cell_is_short(source: Path) -> None:
+    assert 1 <= import_lines(source) <= 8

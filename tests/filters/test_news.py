@@ -1,0 +1,193 @@
+"""News: against one Kalman filter of everybody's readings, and what must not be counted twice."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from distfilt.filters import MixtureFilter, NewsFilter, increment
+from distfilt.mixtures import GaussianMixture, fuse
+from distfilt.models import Model
+from distfilt.network import Faults, graphs
+from distfilt.sensors import Sensor, direct, stack
+
+T = np.array([[1.0, 0.3], [0.0, 1.0]])
+E = np.array([[0.9]])
+MOVE = np.block([[T, np.zeros((2, 1))], [np.zeros((1, 2)), E]])
+NOISE = np.diag([0.0, 0.0, 0.2])
+MODEL = Model(3, lambda x, t, dt: x @ MOVE.T, lambda t, dt: NOISE)
+# How far the target is from the agent, and a reading of the target's speed that all receive.
+SEEN = Sensor(1, lambda x: x[..., :1] - x[..., 2:], np.array([[0.3]]))
+EYE = stack([SEEN, direct([1], std=0.5)])
+TARGET_COV = np.array([[2.0, 0.4], [0.4, 1.0]])
+EGO_COV = 0.7
+PRIOR = GaussianMixture.gaussian(
+    [1.0, -0.5, 0.2], np.block([[TARGET_COV, np.zeros((2, 1))], [np.zeros((1, 2)), EGO_COV]])
+)
+
+
+def network(agents: int, **options: object) -> NewsFilter:
+    full = {"target_dim": 2, "common": [1], **options}
+    return NewsFilter([MODEL] * agents, [EYE] * agents, graphs.complete(agents), **full)
+
+
+BAD_INPUT = {
+    "distfilt.filters.news.NewsFilter": [
+        ("agreement", lambda: network(2, agreement=fuse)),
+        ("graph", lambda: NewsFilter([MODEL], [EYE], target_dim=2)),
+        ("common", lambda: network(2, common=[2])),
+        ("common", lambda: network(2, common=[-1])),
+        ("most", lambda: network(2, size=3)),
+    ],
+    "distfilt.filters.news.increment": [
+        ("before", lambda: increment(3, PRIOR)),
+        ("after", lambda: increment(PRIOR, 3)),
+        ("after", lambda: increment(PRIOR, PRIOR.marginal([0]))),
+    ],
+}
+
+
+def joint(agents: int, readings: np.ndarray, speed: np.ndarray) -> tuple:
+    """The Kalman filter of [target; all egos] with all readings, (steps, agents) and (steps,)."""
+    d = 2 + agents
+    m = np.concatenate([PRIOR.means[0, :2], np.full(agents, PRIOR.means[0, 2])])
+    p = np.diag(np.concatenate([np.zeros(2), np.full(agents, EGO_COV)]))
+    p[:2, :2] = TARGET_COV
+    f = np.eye(d)
+    f[:2, :2] = T
+    f[2:, 2:] *= E
+    h = np.zeros((agents + 1, d))
+    h[:agents, 0], h[agents, 1] = 1.0, 1.0
+    h[:agents, 2:] = -np.eye(agents)
+    r = np.diag(np.concatenate([np.full(agents, 0.3), [0.25]]))
+    for y, v in zip(readings, speed, strict=True):
+        m, p = f @ m, f @ p @ f.T + np.diag(np.concatenate([np.zeros(2), np.full(agents, 0.2)]))
+        here = ~np.isnan(np.append(y, v))
+        hh = h[here]
+        gain = p @ hh.T @ np.linalg.inv(hh @ p @ hh.T + r[np.ix_(here, here)])
+        m = m + gain @ (np.append(y, v)[here] - hh @ m)
+        p = p - gain @ hh @ p
+    return m, p
+
+
+@pytest.mark.parametrize("agents", [2, 3, 5])
+def test_news_are_one_filter_with_everybodys_readings(agents: int) -> None:
+    rng = np.random.default_rng(agents)
+    readings = rng.standard_normal((4, agents))
+    readings[1, 0] = np.nan
+    speed = np.array([np.nan, 0.3, np.nan, -0.2])
+    f = network(agents)
+    state = f.start([PRIOR] * agents)
+    for k, (y, v) in enumerate(zip(readings, speed, strict=True)):
+        state = f.step(state, k + 1.0, [[one, v] for one in y])
+    m, p = joint(agents, readings, speed)
+    for a, belief in enumerate(state.mixtures):
+        own = [0, 1, 2 + a]
+        assert np.allclose(belief.means[0], m[own], rtol=0, atol=1e-10)
+        # Egos have noise of their own, so an agent's target and its ego miss nothing else.
+        assert np.allclose(belief.covs[0], p[np.ix_(own, own)], rtol=0, atol=1e-10)
+
+
+def test_what_all_receive_counts_twice_if_it_is_told() -> None:
+    readings, speed = np.full((1, 2), np.nan), np.array([0.4])
+    _, p = joint(2, readings, speed)
+    once, twice = (
+        network(2, common=c).step(network(2).start([PRIOR] * 2), 1.0, [[np.nan, 0.4]] * 2)
+        for c in ([1], [])
+    )
+    assert np.allclose(once.mixtures[0].covs[0, :2, :2], p[:2, :2], atol=1e-10)
+    assert once.ledger.scalars.sum() == 0
+    told = np.linalg.inv(twice.mixtures[0].covs[0, :2, :2])
+    alone = np.linalg.inv(T @ TARGET_COV @ T.T)
+    assert np.allclose(told - alone, 2 * (np.linalg.inv(p[:2, :2]) - alone), atol=1e-9)
+
+
+@pytest.mark.parametrize("rank", range(1, 5))
+def test_an_increment_is_the_readings_that_taught_it(rank: int) -> None:
+    rng = np.random.default_rng(rank)
+    root = rng.standard_normal((4, 4))
+    before = GaussianMixture.gaussian(rng.standard_normal(4), root @ root.T)
+    h, z = rng.standard_normal((rank, 4)), rng.standard_normal(rank)
+    p = before.covs[0]
+    gain = p @ h.T @ np.linalg.inv(h @ p @ h.T + np.eye(rank))
+    after = GaussianMixture.gaussian(
+        before.means[0] + gain @ (z - h @ before.means[0]), p - gain @ h @ p
+    )
+    news = increment(before, after)
+    assert news.shape == (rank, 5)
+    assert np.allclose(news[:, :-1].T @ news[:, :-1], h.T @ h, atol=1e-9)
+    assert np.allclose(news[:, :-1].T @ news[:, -1], h.T @ z, atol=1e-9)
+    assert np.array_equal(news[:, :-1], np.triu(news[:, :-1]))
+    assert increment(before, before).shape == (0, 5)
+
+
+def test_a_large_gain_does_not_hide_a_small_one() -> None:
+    before = GaussianMixture.gaussian([0.0, 0.0, 0.0], np.eye(3))
+    after = GaussianMixture.gaussian([2.0, -1.0, 0.0], np.diag([1e-10, 0.5, 1.0]))
+    news = increment(before, after)
+    assert news.shape == (2, 4)
+    assert np.allclose(news[:, :-1].T @ news[:, :-1], np.diag([1e10, 1.0, 0.0]), rtol=1e-6)
+    assert np.allclose(news[:, :-1].T @ news[:, -1], [2e10, -2.0, 0.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("rank", "numbers"), [(1, 7), (2, 13), (3, 18), (6, 27)])
+def test_no_zero_is_sent(rank: int, numbers: int) -> None:
+    still = Model(6, lambda x, t, dt: x, lambda t, dt: np.zeros((6, 6)))
+    eye = direct(range(rank), std=1.0)
+    f = NewsFilter([still] * 2, [eye, None], graphs.path(2), target_dim=6)
+    prior = GaussianMixture.gaussian(np.zeros(6), np.eye(6) + 0.3)
+    after = f.step(f.start([prior] * 2), 1.0, [np.ones(rank), None])
+    assert after.ledger.scalars.tolist() == [numbers, 0]
+    assert np.allclose(after.mixtures[0].covs, after.mixtures[1].covs, atol=1e-12)
+    assert np.allclose(after.mixtures[0].means, after.mixtures[1].means, atol=1e-12)
+
+
+def test_news_that_are_lost_leave_the_own_belief() -> None:
+    seen = [[0.7, np.nan], [-0.4, np.nan]]
+    deaf = network(2, faults=Faults(loss=1.0))
+    alone = MixtureFilter([MODEL] * 2, [EYE] * 2, target_dim=2, size=1, most=1)
+    a, b = (f.step(f.start([PRIOR] * 2), 1.0, seen) for f in (deaf, alone))
+    assert all(
+        np.allclose(x.covs, y.covs) and np.allclose(x.means, y.means)
+        for x, y in zip(a.mixtures, b.mixtures, strict=True)
+    )
+    assert a.ledger.lost.sum() == 2
+
+
+def test_mixands_are_weighed_by_the_news() -> None:
+    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    f = NewsFilter(
+        [still] * 2, [direct([0], std=1.0), None], graphs.path(2), target_dim=1, size=2, most=2
+    )
+    prior = GaussianMixture([0.3, 0.7], [[-2.0], [1.0]], [[[1.0]], [[2.0]]])
+    one = GaussianMixture.gaussian([0.0], [[3.0]])
+    after = f.step(f.start([one, prior]), 1.0, [[0.5], None]).mixtures[1]
+    exact, _ = prior.product(GaussianMixture.gaussian([0.5], [[1.0]]))
+    assert np.allclose(after.weights, exact.weights)
+    assert np.allclose(after.means, exact.means) and np.allclose(after.covs, exact.covs)
+
+
+def test_a_gated_reading_is_no_news() -> None:
+    f = network(2, gate=3.0)
+    after = f.step(f.start([PRIOR] * 2), 1.0, [[500.0, np.nan], None])
+    assert after.ledger.scalars.sum() == 0
+
+
+def test_saved_and_resumed(tmp_path) -> None:
+    f = network(2)
+    half = f.step(f.start([PRIOR] * 2), 1.0, [[0.2, np.nan], [0.1, np.nan]])
+    half.save(tmp_path / "s.npz")
+    again = type(half).load(tmp_path / "s.npz")
+    a, b = (f.step(s, 2.0, [[0.3, 0.1], [0.5, 0.1]]) for s in (half, again))
+    for x, y in zip(a.mixtures, b.mixtures, strict=True):
+        assert np.array_equal(x.means, y.means) and np.array_equal(x.covs, y.covs)
+
+
+def test_everybody_hears_only_neighbours() -> None:
+    f = NewsFilter([MODEL] * 3, [EYE] * 3, graphs.path(3), target_dim=2, common=[1])
+    step = partial(f.step, f.start([PRIOR] * 3), 1.0)
+    a, b = (step([[0.1, np.nan], None, [y, np.nan]]) for y in (0.2, 9.0))
+    assert np.array_equal(a.mixtures[0].means, b.mixtures[0].means)
+    assert not np.array_equal(a.mixtures[1].means, b.mixtures[1].means)
