@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from distfilt import density, ensembles, linalg, mixtures, models, sensors, studies
-from distfilt.coupling import sorted_plan
+from distfilt.coupling import ensemble_transform, sorted_plan
 from distfilt.kalman import kalman_filter
 from distfilt.mixtures import GaussianMixture, PartialFusion, unscented
 from distfilt.models import constant_velocity, simulate
@@ -51,13 +51,15 @@ BOUNDS: list[tuple[str, Callable[[], object]]] = [
     ("x: needs more than 3 members .* got 3", lambda: separable.fit(
         DRAWN[:3, :0], DRAWN[:3, :2], order=2, regularisation=0.1)),
     ("m: needs at most 2 observations, got 3", lambda: affine.from_moments(
-        np.zeros(2), np.eye(2), 3)),
+        np.zeros((5, 2)), np.broadcast_to(np.eye(2), (5, 2, 2)), 3)),
     ("times: .* after t0 = 2, got 1", lambda: simulate(
         constant_velocity(sigma=0.1), np.zeros(4), [1.0, 5.0], rng=RNG(0), t0=2.0)),
     ("anomalies_to_avoid: needs at least 2 members, got 1", lambda: ensembles.exact_noise(
         np.ones((1, 3)), np.eye(3), rng=RNG(0))),
     ("ensemble: needs at least 2 members, got 1", lambda: ensembles.sample_covariance(
-        np.ones((1, 3)))),
+        np.ones((5, 1, 3)))),
+    ("log_weights: .* got only zeros", lambda: ensemble_transform(
+        np.zeros((2, 3, 1)), [[-np.inf] * 3, [0.0] * 3])),
     ("noise_factor: needs 2 rows, got 1", lambda: unscented.forecast(
         [0.0, 0.0], np.eye(2), lambda x: x, np.ones((1, 3)))),
     ("agents from 0 to 1", lambda: Graph.from_edges(2, [[0, 2]])),

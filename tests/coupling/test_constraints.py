@@ -329,3 +329,11 @@ def test_inputs_stay_as_they_were() -> None:
     held = Constraint(spoils, value)
     value[0] = 5.0
     assert held.value[0] == 1.0
+
+
+def test_jacobian_of_a_length_in_a_batch_is_each_member_s() -> None:
+    x = np.random.default_rng(3).standard_normal((2, 5, 4))
+    slope = norm([0, 2]).jacobian(x)
+    assert slope.shape == (2, 5, 1, 4)
+    assert np.array_equal(slope[..., 0, [0, 2]], 2 * x[..., [0, 2]])
+    assert not slope[..., 0, [1, 3]].any()

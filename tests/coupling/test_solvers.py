@@ -284,3 +284,10 @@ def test_the_compiled_programme_keeps_no_products_of_parameters_and_unknowns() -
         assert tracemalloc.get_traced_memory()[1] < 60e6
     finally:
         tracemalloc.stop()
+
+
+def test_rounding_drops_what_is_below_zero() -> None:
+    half = np.array([0.5, 0.5])
+    off = np.array([[0.5 + 1e-9, -1e-9], [-1e-9, 0.5 + 1e-9]])
+    found = solvers._rounded(off, half, half, "any")
+    assert found.min() == 0 and np.allclose(found, np.diag(half), atol=1e-15)

@@ -190,3 +190,14 @@ def test_a_lost_covariance_raises(shared: bool) -> None:
     with pytest.raises(np.linalg.LinAlgError, match="innovation"):
         kalman_filter([0.0], [[1e30]], y, F=[[1.0]], Q=[[0.0]], H=[[1.0], [1.0]],
                       R=1e-10 * np.eye(2))
+
+
+def test_scalar_states_with_gaps_of_their_own_are_each_run_s() -> None:
+    y = np.random.default_rng(5).standard_normal((6, 4, 1))
+    y[1, 0], y[2, 1], y[4, 1:3] = np.nan, np.nan, np.nan
+    matrices = {"F": [[0.9]], "H": [[1.0]], "Q": [[0.3]], "R": [[0.5]]}
+    together = kalman_filter([0.0], [[2.0]], y, **matrices)
+    for r in range(4):
+        alone = kalman_filter([0.0], [[2.0]], y[:, r], **matrices)
+        assert np.allclose(together.means[:, r], alone.means, atol=1e-13)
+        assert np.allclose(together.covariances[:, r], alone.covariances, atol=1e-13)

@@ -198,3 +198,10 @@ def test_asking_whether_weights_keep_the_average_leaves_their_order_alone() -> N
     before = w.matrix.indices.copy()
     weights.keeping(w)
     assert (w.matrix.indices == before).all()
+
+
+def test_an_agent_alone_keeps_its_value() -> None:
+    alone = Graph.from_edges(1, [], directed=True)
+    for rule in (weights.balanced, weights.metropolis, weights.push):
+        found = rule(alone)
+        assert found.own.tolist() == [1.0] and found.links.size == 0

@@ -8,6 +8,7 @@ import pickle
 import pytest
 
 from distfilt.published import Parameter, Reading, Scenario, UnknownKey, scenario
+from distfilt.published._files import text_table
 
 from .files import named, parameter, row
 
@@ -209,3 +210,14 @@ def test_a_reading_travels_and_is_changed_like_a_scenario():
     assert copy.used == ("members", "gain") and s.used == ("gain",)
     other = S.replace(gain=0.2).reading()
     assert other["gain"] == 0.2 and other.changed and other.changes == ("gain: 0.2, not 0.05",)
+
+
+def test_entries_keep_letters_that_are_not_ascii() -> None:
+    made = Scenario("das", "x", "Title", (parameter(value=["é", "µ"]),))
+    assert made.entries() == {"gain": '["é", "µ"] 1'}
+
+
+def test_a_text_table_is_ruled_over_all_its_columns() -> None:
+    head, *body, last = text_table(["a", "bb", "c", "d"], [["1", "2", "333", "4"]]).splitlines()
+    assert head == last == body[1] == "-" * (1 + 2 + 3 + 1 + 3 * 2)
+    assert body[0] == "a  bb  c    d" and body[2] == "1  2   333  4"

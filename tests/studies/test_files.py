@@ -172,6 +172,23 @@ def test_check_finds_the_last_bit(tmp_path: Path) -> None:
         studies.check(path, other, indices=[0], rtol=0.1)
 
 
+def test_infinity_is_like_infinity_only(tmp_path: Path) -> None:
+    def infinite(seed: SeedSequence) -> Scores:
+        return scores(seed)._replace(rmse=np.inf)
+
+    def finite(seed: SeedSequence) -> Scores:
+        return scores(seed)
+
+    study = studies.run(infinite, studies.spawn(5, 3), workers=1)
+    path = _store(study, tmp_path / "a.csv")
+    studies.check(path, infinite, rtol=0.1)
+    with pytest.raises(AssertionError, match="rmse stored inf"):
+        studies.check(path, finite, rtol=0.1)
+    study = studies.run(finite, studies.spawn(5, 3), workers=1)
+    with pytest.raises(AssertionError, match="now inf"):
+        studies.check(_store(study, tmp_path / "b.csv"), infinite, rtol=0.1)
+
+
 def test_a_rough_metric_stays_within_the_trials_and_others_are_held(tmp_path: Path) -> None:
     path = _store(path=tmp_path / "a.csv")
     values = studies.load(path).columns["rmse"]

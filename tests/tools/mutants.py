@@ -152,11 +152,13 @@ def drawn(root: Path, size: int, seed: int, only: str) -> list[Mutant]:
 
 
 def nearest(module: str, root: Path) -> list[str]:
-    """The module's own examples, and the file of tests that mirrors it."""
+    """The module's own examples, the file of tests that mirrors it, and what holds for all."""
     parts = Path(module).with_suffix("").parts[1:]
     name = f"test_{parts[-1].lstrip('_')}.py"
     mirrors = [root.joinpath("tests", *parts[:-1], name), root / "tests" / f"test_{parts[0]}.py"]
-    return [module, *(p.relative_to(root).as_posix() for p in mirrors if p.is_file())][:2]
+    options = [p for p in (root / "tests" / "test_options.py",) if p.is_file()]
+    near = [*[p for p in mirrors if p.is_file()][:1], *options]
+    return [module, *(p.relative_to(root).as_posix() for p in near)]
 
 
 def traced(root: Path, jobs: int) -> Any:

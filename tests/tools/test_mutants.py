@@ -79,7 +79,7 @@ def test_nearest_tests_come_first() -> None:
         ("gaussians/optimal", "test_gaussians"),
     ):  # fmt: skip
         near = mutants.nearest(f"distfilt/{module}.py", mutants.ROOT)
-        assert near == [f"distfilt/{module}.py", f"tests/{test}.py"]
+        assert near == [f"distfilt/{module}.py", f"tests/{test}.py", "tests/test_options.py"]
         assert all((mutants.ROOT / path).is_file() for path in near)
 
 

@@ -48,6 +48,14 @@ def test_gate_is_the_update_without_the_wild_reading() -> None:
     assert np.allclose(np.cov(out.T), np.cov(alone.T), atol=1e-12)
 
 
+def test_gate_uses_the_sample_variance_of_few_members() -> None:
+    """Of -1 and 1 it is 2, so with noise 0.5 a reading passes within q times the root of 2.5."""
+    x, q = np.array([[-1.0], [1.0]]), 1.959963984540054
+    for y, passes in ((0.999 * q * np.sqrt(2.5), True), (1.001 * q * np.sqrt(2.5), False)):
+        out = gated(known_noise, probability=0.95)(x, x, [y], [[0.5]], rng=rng())
+        assert bool((out != x).any()) is passes
+
+
 def test_gate_lets_the_stated_share_pass() -> None:
     """Of consistent readings 5% are rejected at probability .95, run by run."""
     x = members(400, 2000)
