@@ -291,3 +291,14 @@ def test_rounding_drops_what_is_below_zero() -> None:
     off = np.array([[0.5 + 1e-9, -1e-9], [-1e-9, 0.5 + 1e-9]])
     found = solvers._rounded(off, half, half, "any")
     assert found.min() == 0 and np.allclose(found, np.diag(half), atol=1e-15)
+
+
+def test_a_solver_that_raises_is_named_with_the_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    import cvxpy as cp
+
+    def fails(*_: object, **__: object) -> None:
+        raise cp.error.SolverError("out of luck")
+
+    monkeypatch.setattr(cp.Problem, "solve", fails)
+    with pytest.raises(SolverError, match="out of luck"):
+        plan(np.ones((2, 2)) - np.eye(2), [0.5, 0.5], solver="clarabel")

@@ -227,3 +227,10 @@ BAD_INPUT = {
         ("process", lambda: low_rank_step(_LOW, _same, _Y, _R, 0.1, process=np.ones((3, 1)))),
     ],
 }
+
+
+def test_a_prior_is_a_tenth_of_the_box_long_and_has_unit_deviation() -> None:
+    grid = Grid((12, 12))
+    plain = zero_mean_prior(grid, rank=20)
+    assert np.array_equal(plain, zero_mean_prior(grid, rank=20, length=0.1, std=1.0))
+    assert not np.allclose(plain, zero_mean_prior(grid, rank=20, length=0.2), atol=0.1)

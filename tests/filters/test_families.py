@@ -330,6 +330,8 @@ BAD_INPUT = {
                                          np.zeros(2))),
         ("log_weights", lambda: ParticleState(0.0, Ledger.empty(1), START["rng"],
                                               np.zeros((1, 2, 1)), np.zeros(2))),
+        ("history", lambda: ParticleState(0.0, Ledger.empty(1), START["rng"], np.zeros((1, 2, 1)),
+                                          np.zeros((1, 2)), history=((0.0, np.zeros((1, 3, 1))),))),
     ],
     "distfilt.filters.driver.Late": [
         ("agent", lambda: Late(-1, 0.0, [1.0], arrived=1.0)),

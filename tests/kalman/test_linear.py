@@ -201,3 +201,13 @@ def test_scalar_states_with_gaps_of_their_own_are_each_run_s() -> None:
         alone = kalman_filter([0.0], [[2.0]], y[:, r], **matrices)
         assert np.allclose(together.means[:, r], alone.means, atol=1e-13)
         assert np.allclose(together.covariances[:, r], alone.covariances, atol=1e-13)
+
+
+def test_many_readings_update_one_belief_each_for_itself() -> None:
+    y = np.random.default_rng(6).standard_normal((5, 3, 2))
+    h, r = np.array([[1.0, 0.5], [0.0, 1.0]]), np.diag([0.5, 0.2])
+    mean, cov, density = update([0.0, 1.0], np.diag([2.0, 1.0]), y, H=h, R=r)
+    assert mean.shape == (5, 3, 2) and density.shape == (5, 3)
+    alone = update([0.0, 1.0], np.diag([2.0, 1.0]), y[4, 2], H=h, R=r)
+    for found, one in zip((mean[4, 2], cov[0, 0], density[4, 2]), alone, strict=True):
+        assert np.allclose(found, one, atol=1e-13)

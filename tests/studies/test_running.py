@@ -24,6 +24,7 @@ from numpy.random import SeedSequence
 
 from distfilt import studies
 from distfilt.studies import Study, StudyError, StudyInterrupted
+from distfilt.studies._pool import Pool
 
 from .trials import dies_at, draw, fails_at, number
 
@@ -436,3 +437,9 @@ def test_workers_end_with_their_parent(how: signal.Signals, tmp_path: Path) -> N
     while any(map(_alive, workers)) and time.monotonic() - began < 20:
         time.sleep(0.05)
     assert not any(map(_alive, workers))
+
+
+def test_an_executor_s_own_number_of_workers_is_used_unless_another_is_given() -> None:
+    with ThreadPoolExecutor(max_workers=3) as threads:
+        assert Pool(threads, None).workers == 3
+        assert Pool(threads, 2).workers == 2

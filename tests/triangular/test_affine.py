@@ -189,3 +189,12 @@ def test_the_program_forgets_the_samples_before() -> None:
     fit_convex(*samples(4, m=1, d=2))
     fit_convex(y, x, solver="CLARABEL")
     assert np.array_equal(fit_convex(y, x).scale, first.scale)
+
+
+def test_objective_of_many_ensembles_is_each_one_s() -> None:
+    x = np.random.default_rng(8).standard_normal((3, 30, 2))
+    found = objective(fit(x[..., :0], x), x[..., :0], x)
+    assert found.shape == (3,)
+    for k in range(3):
+        alone = objective(fit(x[k, :, :0], x[k]), x[k, :, :0], x[k])
+        assert np.allclose(found[k], alone, atol=1e-13)
