@@ -7,13 +7,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from distfilt import density, ensembles, linalg, mixtures, models, sensors, studies
+from distfilt import checks, density, ensembles, linalg, mixtures, models, sensors, studies
 from distfilt.coupling import ensemble_transform, sorted_plan
 from distfilt.kalman import kalman_filter
 from distfilt.mixtures import GaussianMixture, PartialFusion, unscented
 from distfilt.models import constant_velocity, simulate
 from distfilt.network import Channel, Graph, covariance_intersection, graphs, stable_substeps
 from distfilt.triangular import affine, pool_by_moments, separable
+from distfilt.updates import known_noise
 
 RNG = np.random.default_rng
 GRID = density.Grid((8, 8))
@@ -60,6 +61,13 @@ BOUNDS: list[tuple[str, Callable[[], object]]] = [
         np.ones((5, 1, 3)))),
     ("log_weights: .* got only zeros", lambda: ensemble_transform(
         np.zeros((2, 3, 1)), [[-np.inf] * 3, [0.0] * 3])),
+    ("uses: .* -1", lambda: separable.fit(DRAWN[:, :1], DRAWN[:, 1:2], order=1, uses=[[-1]])),
+    ("bandwidth: .* -0.5", lambda: density.kernel_covariance(
+        np.ones(64), GRID, bandwidth=-0.5, agents=10)),
+    (r"needs shape \(\), got \(1,\)", lambda: checks.array([1.0], "x", ())),
+    ("noise: needs leading axes \\(4,\\), got \\(3,\\)", lambda: known_noise(
+        np.tile(DRAWN, (4, 1, 1)), np.tile(DRAWN[:, :1], (4, 1, 1)), np.zeros((4, 1)),
+        np.ones((3, 1, 1)), rng=RNG(0))),
     ("noise_factor: needs 2 rows, got 1", lambda: unscented.forecast(
         [0.0, 0.0], np.eye(2), lambda x: x, np.ones((1, 3)))),
     ("agents from 0 to 1", lambda: Graph.from_edges(2, [[0, 2]])),

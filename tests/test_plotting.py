@@ -452,3 +452,8 @@ def test_digest_is_the_documented_projection():
     expected = weights @ values / np.linalg.norm(weights)
     printed = float(digest(a=values).rsplit(" ", 1)[1])
     assert printed == pytest.approx(expected, rel=6e-4)
+
+
+def test_each_axis_has_its_own_scale() -> None:
+    ax = plotting.axes(xlabel="time", ylabel="error", yscale="log")
+    assert (ax.get_xscale(), ax.get_yscale()) == ("linear", "log")

@@ -76,8 +76,10 @@ def update(
         if y.ndim < x.ndim - 1:
             y = np.broadcast_to(y, (*x.shape[:-2], m))
         r = covariance(noise, "noise", m)
-        if r.shape[:-2] and np.broadcast_shapes(r.shape[:-2], x.shape[:-2]) != x.shape[:-2]:
-            raise ValueError(f"noise: needs leading axes {x.shape[:-2]}, got {r.shape[:-2]}")
+        runs, given = x.shape[:-2], r.shape[:-2]
+        fits = all(n in (1, k) for n, k in zip(given[::-1], runs[::-1], strict=False))
+        if len(given) > len(runs) or not fits:
+            raise ValueError(f"noise: needs leading axes {runs}, got {given}")
         generator(options.get("rng"))
         return function(x, h, y, r, *args, **options)
 

@@ -199,3 +199,9 @@ BAD_INPUT = {
             Swarm(_still, lambda x, t: x[..., 0] - 0.5), Grid((5, 5))).generator(0.0)),
     ],
 }
+
+
+def test_times_before_the_start_are_refused() -> None:
+    box = FokkerPlanck(Swarm(lambda x, t: 0 * x, 0.1, low=[0.0], high=[1.0]), Grid((4,)))
+    with pytest.raises(ValueError, match="times: .* after t0 = 1, got 0.5"):
+        box.evolve(np.ones(4), [0.5, 2.0], t0=1.0)

@@ -215,3 +215,11 @@ def test_first_order_tracking_keeps_the_average_exactly(loss: float) -> None:
         u = new
         assert np.abs(x.mean(axis=0) - u.mean(axis=0)).max() < 1e-12
     assert np.ptp(x, axis=0).max() < np.ptp(u, axis=0).max()
+
+
+def test_substeps_stay_below_the_bound_of_a_swinging_mode() -> None:
+    """Where 2 b λ exceeds α + a λ the bound is (α + a λ) / (b λ)², with λ twice the degree."""
+    for b in (3.0, 0.9):
+        wanted = np.ceil(5.0 * (b * 2) ** 2 / (0.3 + 0.1 * 2))
+        channel = Channel(graphs.path(2))
+        assert stable_substeps(channel, 5.0, alpha=0.3, a=0.1, b=b, safety=1.0) == wanted
