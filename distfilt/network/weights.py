@@ -315,8 +315,6 @@ def balanced(graph: Graph) -> Weights:
     array([1., 1., 1.])
     """
     _connected(graph)
-    if graph.size == 1:
-        return Weights(graph, np.ones(1), np.zeros(0))
     p = left_null_vector(graph.laplacian) if graph.directed else np.ones(graph.size)
     links = p[graph.receivers] / (2 * (p * graph.degrees).max())
     return Weights(graph, 1 - _row_sums(graph, links), links)
