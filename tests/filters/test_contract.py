@@ -357,6 +357,13 @@ def test_bad_wiring(family: str, argument: str, options: dict[str, Any]) -> None
 
 
 @EACH
+def test_every_late_reading_arrives_by_the_end(family: str) -> None:
+    f, start = made(family, sensors=[direct([0], std=1.0), None])
+    late = [Late(0, 0.1, [1.0], arrived=0.5), Late(0, 0.1, [1.0], arrived=9.0)]
+    with pytest.raises(ValueError, match="late: needs arrivals up to 1, got 9"):
+        f.run(start, [0.5, 1.0], [np.ones((2, 1)), None], late=late)
+
+
 @pytest.mark.parametrize(
     ("argument", "change"),
     [

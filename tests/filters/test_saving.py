@@ -77,6 +77,11 @@ def test_another_kind_of_state_is_refused(tmp_path: Path) -> None:
     state.save(tmp_path / "a.npz")
     with pytest.raises(ValueError, match="needs a saved ParticleState"):
         ParticleState.load(tmp_path / "a.npz")
+    kept(np.random.default_rng(3)).save(tmp_path / "b.npz")
+    with pytest.raises(ValueError, match="needs a saved EnsembleState"):
+        EnsembleState.load(tmp_path / "b.npz")
+    with pytest.raises(ValueError, match="needs a saved Kept"):
+        Kept.load(tmp_path / "a.npz")
 
 
 def test_damage_is_found_at_every_byte(tmp_path: Path) -> None:
