@@ -364,6 +364,7 @@ def test_every_late_reading_arrives_by_the_end(family: str) -> None:
         f.run(start, [0.5, 1.0], [np.ones((2, 1)), None], late=late)
 
 
+@EACH
 @pytest.mark.parametrize(
     ("argument", "change"),
     [
