@@ -65,6 +65,8 @@ def check(
     allowed = _allowed(stored, number(atol, "atol", at_least=0), rough)
     spared = count(odd, "odd", at_least=0)
     chosen = _indices(range(len(stored)) if indices is None else indices, len(stored))
+    if spared >= len(chosen):
+        raise ValueError(f"odd: needs fewer than the {len(chosen)} trials that run, got {spared}")
     study = run(
         callable_(trial, "trial"), [stored.seed(i) for i in chosen], errors="collect",
         workers=workers, executor=executor,

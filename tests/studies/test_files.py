@@ -232,6 +232,7 @@ def test_a_few_odd_trials_pass_and_one_more_does_not(tmp_path: Path) -> None:
         ({"rough": ["speed"]}, "rough"),
         ({"rough": "rmse"}, "rough"),
         ({"odd": -1}, "odd"),
+        ({"odd": 2, "indices": [0, 1]}, "odd"),
         ({"workers": 0}, "workers"),
     ],
 )
