@@ -195,22 +195,30 @@ def _projected(drawn: Array, avoid: Array) -> Array:
     centred = _anomalies(avoid)
     size = np.sqrt((centred**2).sum(axis=-2, keepdims=True))
     unit = centred / np.where(size > 0, size, 1.0)
-    # A frame by two orthogonal factors, the second one small; anomalies that repeat others, as
-    # linear predictions do, leave a zero among the singular values.
     constant = np.full((*unit.shape[:-1], 1), n**-0.5)
-    q, r = np.linalg.qr(np.concatenate([constant, unit], axis=-1))
-    u, values, _ = np.linalg.svd(r, full_matrices=False)
-    good = values > n * _EPS * values.max(axis=-1, initial=0.0, keepdims=True)
-    independent, rank = int(good.sum(axis=-1).max(initial=1)) - 1, drawn.shape[-1]
+    frame, independent = _frame(np.concatenate([constant, unit], axis=-1))
+    independent, rank = independent - 1, drawn.shape[-1]
     if n <= independent + rank:
         raise ValueError(
             f"anomalies_to_avoid: needs more than {independent} + {rank} members, for "
             f"{independent} independent anomalies and noise of rank {rank}, got {n}"
         )
-    frame = q @ (u * good[..., None, :])
     for _ in range(2):
         drawn = drawn - frame @ (frame.swapaxes(-1, -2) @ drawn)
     return drawn
+
+
+def _frame(columns: Array) -> tuple[Array, int]:
+    """Orthonormal columns, or zeros, that span unit columns (..., n, p), and the largest rank."""
+    tiny = columns.shape[-2] * _EPS
+    q, r = np.linalg.qr(columns)
+    # Columns that repeat earlier ones, as linear predictions do, leave rows of zeros at the end.
+    good = np.abs(r).max(axis=-1) > tiny
+    if (good != (np.abs(np.diagonal(r, axis1=-2, axis2=-1)) > tiny)).any():
+        u, values, _ = np.linalg.svd(r, full_matrices=False)
+        good = values > tiny * values.max(axis=-1, initial=0.0, keepdims=True)
+        q = q @ u
+    return np.asarray(q * good[..., None, :]), int(good.sum(axis=-1).max(initial=1))
 
 
 def _coloured(drawn: Array, root: Array) -> Array:

@@ -152,15 +152,16 @@ def _triangular(lower: Array, right: Array, transposed: int) -> Array:
 
 def _one_triangular(lower: Array, right: Array, transposed: int) -> Array:
     """One factor; all of `right` (..., d, k) are its columns."""
-    d = lower.shape[-1]
-    flat = right if right.ndim == 2 else np.moveaxis(right, -2, 0).reshape(d, -1)
-    if not flat.size:
+    d, k = right.shape[-2:]
+    if not right.size:
         return np.array(right)
+    alone = right.size == d * k
+    flat = right.reshape(d, k) if alone else np.moveaxis(right, -2, 0).reshape(d, -1)
     out, failed = dtrtrs(lower, flat, lower=1, trans=transposed)
     if failed:
         raise np.linalg.LinAlgError("Singular matrix")
-    if right.ndim == 2:
-        return np.asarray(out)
+    if alone:
+        return np.asarray(out).reshape(right.shape)
     return np.moveaxis(out.reshape(d, *right.shape[:-2], right.shape[-1]), 0, -2)
 
 

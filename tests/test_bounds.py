@@ -68,6 +68,9 @@ BOUNDS: list[tuple[str, Callable[[], object]]] = [
     ("noise: needs leading axes \\(4,\\), got \\(3,\\)", lambda: known_noise(
         np.tile(DRAWN, (4, 1, 1)), np.tile(DRAWN[:, :1], (4, 1, 1)), np.zeros((4, 1)),
         np.ones((3, 1, 1)), rng=RNG(0))),
+    ("noise: needs leading axes \\(3, 2\\), got \\(4, 2\\)", lambda: known_noise(
+        np.tile(DRAWN, (3, 2, 1, 1)), np.tile(DRAWN[:, :1], (3, 2, 1, 1)), np.zeros((3, 2, 1)),
+        np.ones((4, 2, 1, 1)), rng=RNG(0))),
     ("noise_factor: needs 2 rows, got 1", lambda: unscented.forecast(
         [0.0, 0.0], np.eye(2), lambda x: x, np.ones((1, 3)))),
     ("agents from 0 to 1", lambda: Graph.from_edges(2, [[0, 2]])),

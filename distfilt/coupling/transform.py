@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, array, choice, generator, number
+from ..linalg import _EPS
 from .solvers import SOLVERS, Solve, _scaled, _solver, _squares
 
 __all__ = [
@@ -237,19 +238,15 @@ def _second_order(y: Array, x: Array, w: Array) -> Array:
     centre = w[..., None, :] @ x
     around, spread = x - centre, y - y.mean(axis=-2, keepdims=True)
     target = np.swapaxes(around, -1, -2) @ (w[..., None] * around)
-    now = np.swapaxes(spread, -1, -2) @ spread / n
-    root = _power(target, 0.5)
-    inner = _power(root @ now @ root, -0.5)
-    return np.asarray(centre + spread @ (root @ inner @ root))
-
-
-def _power(matrix: Array, power: float) -> Array:
-    """A power of symmetric matrices; null directions stay null."""
-    values, vectors = np.linalg.eigh(0.5 * (matrix + np.swapaxes(matrix, -1, -2)))
-    least = 1e-13 * np.maximum(values[..., -1:], 0.0)
-    kept = values > least
-    raised = np.where(kept, np.where(kept, values, 1.0) ** power, 0.0)
-    return np.asarray((vectors * raised[..., None, :]) @ np.swapaxes(vectors, -1, -2))
+    values, vectors = np.linalg.eigh(0.5 * (target + np.swapaxes(target, -1, -2)))
+    root = (vectors * np.sqrt(values.clip(0))[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    # The anomalies times B are the nearest orthonormal columns to those times the root, times the
+    # root: P comes out to rounding, however little C has left of it in some direction.
+    u, sizes, v = np.linalg.svd(spread @ root, full_matrices=False)
+    lost = n * _EPS * np.abs(y).max(axis=(-2, -1)) * np.sqrt(values[..., -1].clip(0))
+    u = u * (sizes > lost[..., None])[..., None, :]
+    u -= u.mean(axis=-2, keepdims=True)
+    return np.asarray(centre + np.sqrt(n) * (u @ v @ root))
 
 
 def rejuvenated(

@@ -158,9 +158,9 @@ class ParticleFilter(SensorFilter):
         """
         sizes = self.members, self.model.dim
         step = self.begin(state, ParticleState, t, observations, late, sizes)
-        stack = step.stack(state.points.copy())
+        stack = step.stack(state.points)
         weights = self._resampled(stack, state, step.rng)
-        moved = self.model.sample_step(stack[-1], state.t, step.dt, rng=step.rng)
+        moved = self.model._sample_step(stack[-1], state.t, step.dt, step.rng)
         stack[-1] = step.moved(moved, stack[-1], 2)
         for place, group in step.heard():
             predicted = group.predict(
@@ -213,10 +213,15 @@ class ParticleFilter(SensorFilter):
         self, stack: list[Array], log_weights: Array, weights: Array, poor: Mask, levels: Array
     ) -> None:
         """Resample some agents' paths in place; their weights are equal then."""
-        rows = slice(None) if poor.all() else poor
+        everyone = bool(poor.all())
+        rows = slice(None) if everyone else poor
         picked = _picked(weights[rows], levels[rows], self.rule)
-        for path in stack:
-            path[rows] = _taken(path[rows], picked)
+        for k, path in enumerate(stack):
+            taken = _taken(path[rows], picked)
+            if not everyone:
+                path = path.copy()
+                path[poor] = taken
+            stack[k] = taken if everyone else path
         log_weights[rows] = -np.log(self.members)
 
     def _warn(self, state: ParticleState) -> None:

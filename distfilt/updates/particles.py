@@ -187,7 +187,9 @@ def _systematic(w: Array, offset: Array) -> Indices:
     levels -= offset
     below = np.ceil(levels, out=levels).clip(0, n, out=levels).astype(np.intp)
     below[..., -1] = n
-    return _repeated(np.diff(below, axis=-1, prepend=0))
+    copies = below.copy()
+    copies[..., 1:] -= below[..., :-1]
+    return _repeated(copies)
 
 
 def _repeated(copies: Indices) -> Indices:
@@ -323,4 +325,4 @@ def _log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
 def _distinct(points: Array) -> Array:
     """Share of particles that differ from all before them, (...)."""
     first = np.sort(points[..., 0], axis=-1)
-    return np.asarray((1 + (np.diff(first, axis=-1) > 0).sum(axis=-1)) / points.shape[-2])
+    return np.asarray((1 + (first[..., 1:] > first[..., :-1]).sum(axis=-1)) / points.shape[-2])

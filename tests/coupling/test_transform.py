@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import ot.lp.emd_wrap  # noqa: F401  (its import takes seconds, an example should not)
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from distfilt.coupling import (
@@ -202,6 +202,7 @@ def test_in_one_dimension_the_order_stays() -> None:
     assert (np.diff(moved) > -1e-12).all()
 
 
+@example(200, 40, 3)  # hardly any spread in one direction, before and after
 @given(st.integers(0, 10_000), st.integers(20, 40), st.integers(1, 4))
 def test_the_correction_gives_both_moments(seed: int, n: int, d: int) -> None:
     x, logs, w = _case(seed, n, d)
@@ -209,7 +210,7 @@ def test_the_correction_gives_both_moments(seed: int, n: int, d: int) -> None:
     moved = ensemble_transform(x, np.log(w), correct=True)
     assert np.abs(moved.mean(axis=0) - w @ x).max() < 1e-12 * np.abs(x).max()
     p = _covariance(x, w)
-    assert np.abs(_covariance(moved) - p).max() < 1e-8 * np.abs(p).max()
+    assert np.abs(_covariance(moved) - p).max() < 1e-12 * np.abs(p).max()
     plain = ensemble_transform(x, np.log(w))
     assert np.trace(_covariance(plain)) <= np.trace(p) + 1e-9 * np.trace(p)
 

@@ -235,6 +235,26 @@ def test_update_that_fails_in_one_run_is_named() -> None:
     assert np.isnan(summary.mean[1]).all() and np.isfinite(summary.mean[[0, 2]]).all()
 
 
+def test_an_update_that_fails_in_one_run_leaves_the_draws_of_the_others() -> None:
+    def fragile(x: np.ndarray, h: np.ndarray, y: np.ndarray, r: np.ndarray, *, rng: object):
+        after = sampled_noise(x, h, y, r, rng=rng)
+        return np.where(y[..., None, :] > 5, np.nan, after)
+
+    f = EnsembleFilter(model(), [direct([0], std=1.0)] * 2, graphs.path(2), update=fragile,
+                       share=False, members=5, failures="keep")
+    start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(3,))
+    good = f.step(start, 0.5, [np.zeros((3, 1))] * 2)
+    some = f.step(start, 0.5, [np.zeros((3, 1)), np.array([[0.0], [9.0], [0.0]])])
+    assert some.failed.tolist() == [False, True, False]
+    np.testing.assert_array_equal(some.ensembles[[0, 2]], good.ensembles[[0, 2]])
+
+
+def test_two_particles_are_enough() -> None:
+    f = ParticleFilter(model(), [direct([0], std=1.0)], members=2)
+    start = f.start(PRIOR, rng=np.random.default_rng(0))
+    assert f.step(start, 0.5, [None]).points.shape == (1, 2, len(PRIOR[0]))
+
+
 def test_wrong_call_of_every_run_is_no_failure_of_one() -> None:
     f = EnsembleFilter(model(), [BOTH], update=exact_draws, members=3)
     start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(3,))

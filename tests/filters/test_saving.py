@@ -84,6 +84,18 @@ def test_another_kind_of_state_is_refused(tmp_path: Path) -> None:
         Kept.load(tmp_path / "a.npz")
 
 
+def test_a_twin_with_the_same_fields_is_another_kind(tmp_path: Path) -> None:
+    class Twin(EnsembleState):
+        pass
+
+    for made, asked in ((Twin, EnsembleState), (EnsembleState, Twin)):
+        made(0.0, Ledger.empty(1), np.random.default_rng(0), np.zeros((1, 2, 1))).save(
+            tmp_path / "a.npz")
+        assert made.load(tmp_path / "a.npz").members == 2
+        with pytest.raises(ValueError, match=f"needs a saved {asked.__name__}"):
+            asked.load(tmp_path / "a.npz")
+
+
 def test_damage_is_found_at_every_byte(tmp_path: Path) -> None:
     """No flipped bit gives another state in silence: it is refused, or changes nothing."""
     path = tmp_path / "a.npz"

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -24,7 +24,7 @@ from numpy.random import SeedSequence
 
 from distfilt import studies
 from distfilt.studies import Study, StudyError, StudyInterrupted
-from distfilt.studies._pool import Pool
+from distfilt.studies._pool import Flight, Pool
 
 from .trials import dies_at, draw, fails_at, number
 
@@ -443,3 +443,13 @@ def test_an_executor_s_own_number_of_workers_is_used_unless_another_is_given() -
     with ThreadPoolExecutor(max_workers=3) as threads:
         assert Pool(threads, None).workers == 3
         assert Pool(threads, 2).workers == 2
+
+
+def test_what_came_back_is_kept_when_the_taker_stops() -> None:
+    back, broken, dropped, away = (Future[Any]() for _ in range(4))
+    back.set_result(["one", "two"])
+    broken.set_exception(OSError())
+    dropped.cancel()
+    flight = Flight(Pool(None, 1), Any, [], None)
+    flight.flying = {future: [] for future in (away, broken, back, dropped)}
+    assert flight.arrived() == ["one", "two"]

@@ -161,6 +161,13 @@ def test_moments_are_looked_at() -> None:
     assert np.allclose(s.mean, mean[1:]) and np.allclose(s.observed_mean, mean[:1])
 
 
+def test_a_repeated_variable_s_rounding_is_no_variance() -> None:
+    almost = np.array([[4.0, 4.0], [4.0, 4.0 + 4e-15]])  # which has a factor
+    assert np.linalg.cholesky(almost)[1, 1] > 0
+    with pytest.raises(ValueError, match="x: .* not combinations of others"):
+        affine.from_moments([1.0, 1.0], almost, 1)
+
+
 def test_rows_and_moments_are_one_map() -> None:
     y, x = samples(21, m=2, d=3)
     s = fit(y, x)
