@@ -10,7 +10,7 @@ import pytest
 from scipy.special import erf
 
 from distfilt.filters import FilterError, Late, final_state
-from distfilt.models import Model
+from distfilt.models import LinearModel, Model
 from distfilt.network import Faults, graphs
 from distfilt.sensors import Sensor, direct
 
@@ -288,6 +288,32 @@ def test_late_reading_is_in_time_after_all(family: str) -> None:
                    1.5, [[0.1]])
     gap = np.abs(a.mean.mean(axis=0) - b.mean.mean(axis=0)).max()
     assert gap < 0.12 < np.abs(g.summary(blind).mean.mean(axis=0) - b.mean.mean(axis=0)).max()
+
+
+@EACH
+@pytest.mark.parametrize(("origin", "dt"), [(0.0, 1.0), (1.7e9, 1.0), (0.0, 1e-10)])
+def test_a_late_reading_belongs_to_its_own_time(family: str, origin: float, dt: float) -> None:
+    """Whatever the clock's zero and its unit; between the times it belongs to none."""
+    walk = LinearModel.from_transition(
+        1, lambda h: np.eye(1), lambda t, h: h / dt * np.eye(1)
+    )
+    agree = {"agreement": None} if family.endswith("common") else {}
+    f = FAMILIES[family](walk, [direct([0], std=0.1)], None, lag=3, **agree)
+    prior = (np.zeros(1), np.eye(1))
+    state = f.start(prior, rng=np.random.default_rng(0), runs=(20,), t=origin)
+    for k in (1, 2, 3):
+        state = f.step(state, origin + k * dt, [None])
+    times = [t for t, _ in f.past(state)] + [state.t]
+
+    def late(measured: float) -> list[Late]:
+        return [Late(0, measured, [0.0], arrived=origin + 4 * dt)]
+
+    for k in (1, 2):
+        after = f.step(state, origin + 4 * dt, [None], late=late(times[k + 1]))
+        spread = [summary.variance.mean() for _, summary in f.past(after)]
+        assert np.argmin(spread) == k
+    with pytest.raises(ValueError, match="late: needs an earlier time that is kept"):
+        f.step(state, origin + 4 * dt, [None], late=late(origin + 2.4 * dt))
 
 
 @EACH
