@@ -185,7 +185,8 @@ class ParticleFilter(SensorFilter):
         # Components first: weights then multiply along all particles.
         around = np.subtract(np.swapaxes(state.points, -1, -2), mean[..., None], order="C")
         cov = state.shown((w[..., None, :] * around) @ np.swapaxes(around, -1, -2))
-        numbers = {"effective_size": state.effective_size, "distinct": _distinct(state.points)}
+        sizes, distinct = state.effective_size, _distinct(state.points)
+        numbers = {"effective_size": state.shown(sizes), "distinct": state.shown(distinct)}
         variance = np.diagonal(cov, axis1=-2, axis2=-1)
         return Summary(state.shown(mean), variance, cov, state.points, w, numbers)
 
