@@ -15,9 +15,11 @@ from distfilt.density import (
     Grid,
     Neighbours,
     PIConsensus,
+    filters_step,
     kernel_density,
     kernel_noise,
     kernels,
+    zero_mean_prior,
 )
 from distfilt.density.seen import Seen, present_graph
 from distfilt.density.sharing import alone
@@ -251,6 +253,29 @@ def test_unknown_number_is_learnt() -> None:
     f = make(graphs.complete(SIZE), PIConsensus(b=0.4, a=1.0), number_known=False)
     path = np.repeat(PATH[-1:], 200, axis=0)
     assert np.allclose(last(f, path).counted, SIZE, rtol=0.05)
+
+
+@pytest.mark.parametrize("process", [None, 0.5])
+@pytest.mark.parametrize("noise", ["forecast", "observed"])
+@pytest.mark.parametrize("known", [True, False])
+def test_a_step_is_the_forms_step_with_the_noise_that_was_asked_for(
+    process: float | None, noise: str, known: bool
+) -> None:
+    f = make(graphs.path(SIZE), Flooding(), local=(7, 2), noise=noise, number_known=known,
+             floor=0.7, process=process)
+    start = f.start(START)
+    state = f.step(start, 0.1, PATH[0])
+    agents = SIZE if known else state.counted[[7, 2]]
+
+    def strength(forecast: np.ndarray) -> np.ndarray:
+        level = forecast if noise == "forecast" else state.observed
+        return kernel_noise(level, GRID, bandwidth=H, agents=agents, floor=0.7)
+
+    q = None if process is None else process * zero_mean_prior(GRID, rank=20)
+    wanted = filters_step(
+        start.filters, MODEL.solver(0.0, 0.1), state.observed, strength, 0.1, process=q)
+    assert np.allclose(state.estimates, wanted.estimates, rtol=1e-12)
+    assert np.allclose(state.variances, wanted.variances, rtol=1e-12)
 
 
 def test_process_noise_keeps_the_filter_open() -> None:
