@@ -128,8 +128,8 @@ class MixtureFilter(TeamFilter):
     names: Sequence[str] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "models", tuple(self.models))
-        object.__setattr__(self, "sensors", tuple(self.sensors))
+        for name in ("models", "sensors"):
+            object.__setattr__(self, name, tuple(instance(getattr(self, name), name, Sequence)))
         count(len(self.models), "models")
         n = count(self.target_dim, "target_dim")
         for model in self.models:
@@ -177,7 +177,8 @@ class MixtureFilter(TeamFilter):
         """
         if runs != ():
             raise ValueError(f"runs: needs (), one run at a time, got {runs!r}")
-        beliefs = (prior,) if isinstance(prior, GaussianMixture) else tuple(prior)
+        beliefs = (prior,) if isinstance(prior, GaussianMixture) else prior
+        beliefs = tuple(instance(beliefs, "prior", Sequence))
         if len(beliefs) != len(self.models):
             raise ValueError(f"prior: needs {len(self.models)} mixtures, got {len(beliefs)}")
         for belief, model in zip(beliefs, self.models, strict=True):

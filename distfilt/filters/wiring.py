@@ -176,7 +176,8 @@ class SensorFilter(TeamFilter):
 
         `sizes` are those of an agent's belief, where the filter says them.
         """
-        instance(state, "state", kind)
+        instance(state, "state", instance(kind, "kind", type))
+        instance(late, "late", Sequence)
         needed, got = (len(self.sensors), *sizes), state.belief.shape[len(state.runs) :]
         if got[: len(needed)] != needed:
             raise ValueError(f"state: needs {needed} for each run, got {got}")
@@ -189,6 +190,7 @@ class SensorFilter(TeamFilter):
         self, item: Late, times: Sequence[float], state: State
     ) -> tuple[int, list[Array | None]]:
         """Where among the kept times a late observation belongs, and the observations of then."""
+        instance(item, "late", Late)
         match = [k for k, t in enumerate(times) if abs(t - item.measured) <= 1e-9 * max(1, abs(t))]
         if not match:
             known = ", ".join(f"{t:g}" for t in times) or "none (lag = 0)"
