@@ -177,7 +177,7 @@ class SensorFilter(TeamFilter):
         `sizes` are those of an agent's belief, where the filter says them.
         """
         instance(state, "state", instance(kind, "kind", type))
-        instance(late, "late", Sequence)
+        instance(late, "late", Sequence)  # type: ignore[type-abstract]
         needed, got = (len(self.sensors), *sizes), state.belief.shape[len(state.runs) :]
         if got[: len(needed)] != needed:
             raise ValueError(f"state: needs {needed} for each run, got {got}")

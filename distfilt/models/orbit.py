@@ -31,8 +31,8 @@ RADIUS = 6378.1363
 J2 = 1.08262668e-3
 """Coefficient of the Earth's oblateness."""
 
-_FARTHEST = 1e150
-"""Distances up to this have finite squares, km."""
+_LARGEST = 1e75
+"""Positions and velocities up to this have products whose squares are finite."""
 
 
 def potential(position: ArrayLike) -> Array:
@@ -77,13 +77,17 @@ def acceleration(position: ArrayLike) -> Array:
 
 def _outside(position: ArrayLike, name: str = "position") -> Array:
     r = array(position, name, (..., 3))
-    size = np.linalg.norm(r, axis=-1)
-    least, most = float(size.min(initial=np.inf)), float(size.max(initial=0.0))
+    _bounded(r, name)
+    least = float(np.linalg.norm(r, axis=-1).min(initial=np.inf))
     if least < RADIUS:
         raise ValueError(f"{name}: needs a distance above {RADIUS:g} km, got {least:g}")
-    if most > _FARTHEST:
-        raise ValueError(f"{name}: needs a distance up to {_FARTHEST:g} km, got {most:g}")
     return r
+
+
+def _bounded(x: Array, name: str) -> None:
+    largest = float(np.abs(x).max(initial=0.0))
+    if largest > _LARGEST:
+        raise ValueError(f"{name}: needs components up to {_LARGEST:g}, got {largest:g}")
 
 
 def _acceleration(r: Array) -> Array:
@@ -261,10 +265,11 @@ def rsw_frame(x: ArrayLike) -> Array:
            [0., 0., 1.]])
     """
     state = array(x, "x", (..., 6))
+    _bounded(state, "x")
     radial = state[..., :3] / np.linalg.norm(state[..., :3], axis=-1, keepdims=True)
     normal = np.cross(state[..., :3], state[..., 3:])
     size = np.linalg.norm(normal, axis=-1, keepdims=True)
-    if not ((size > 0) & (size < np.inf)).all() or not np.isfinite(radial).all():
+    if (size == 0).any() or not np.isfinite(radial).all():
         raise ValueError("x: needs positions and velocities that span a plane, got others")
     normal = normal / size
     return np.stack([radial, np.cross(normal, radial), normal], axis=-1)
