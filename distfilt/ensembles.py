@@ -196,8 +196,9 @@ def _projected(drawn: Array, avoid: Array) -> Array:
     size = np.sqrt((centred**2).sum(axis=-2, keepdims=True))
     unit = centred / np.where(size > 0, size, 1.0)
     constant = np.full((*unit.shape[:-1], 1), n**-0.5)
-    frame, independent = _frame(np.concatenate([constant, unit], axis=-1))
-    independent, rank = independent - 1, drawn.shape[-1]
+    rank = drawn.shape[-1]
+    frame, independent = _frame(np.concatenate([constant, unit], axis=-1), n - rank)
+    independent -= 1
     if n <= independent + rank:
         raise ValueError(
             f"anomalies_to_avoid: needs more than {independent} + {rank} members, for "
@@ -208,13 +209,19 @@ def _projected(drawn: Array, avoid: Array) -> Array:
     return drawn
 
 
-def _frame(columns: Array) -> tuple[Array, int]:
-    """Orthonormal columns, or zeros, that span unit columns (..., n, p), and the largest rank."""
+def _frame(columns: Array, most: int) -> tuple[Array, int]:
+    """Orthonormal columns, or zeros, that span unit columns (..., n, p), and the largest rank.
+
+    Where columns depend on each other only to rounding, the rank may be too large, but not
+    needlessly above `most`.
+    """
     tiny = columns.shape[-2] * _EPS
     q, r = np.linalg.qr(columns)
     # Columns that repeat earlier ones, as linear predictions do, leave rows of zeros at the end.
     good = np.abs(r).max(axis=-1) > tiny
-    if (good != (np.abs(np.diagonal(r, axis1=-2, axis2=-1)) > tiny)).any():
+    pivots = np.abs(np.diagonal(r, axis1=-2, axis2=-1)) > tiny
+    if (good != pivots).any() or good.sum(axis=-1).max(initial=0) > most:
+        # A pivot of what depends on close columns is rounding times their closeness.
         u, values, _ = np.linalg.svd(r, full_matrices=False)
         good = values > tiny * values.max(axis=-1, initial=0.0, keepdims=True)
         q = q @ u

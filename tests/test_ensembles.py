@@ -155,6 +155,16 @@ def test_exact_noise_beside_anomalies_that_depend_on_each_other(n: int) -> None:
     _exact(flat[..., :6], FULL, exact_noise(flat, FULL, rng=rng))
 
 
+def test_exact_noise_beside_combinations_of_close_anomalies() -> None:
+    """A difference of correlated components is no anomaly of its own and costs no member."""
+    for seed in range(20):
+        rng = generator(seed)
+        x = rng.standard_normal((3, 7, 3))
+        x[..., 1:] = x[..., :1] + 1e-3 * x[..., 1:]
+        both = np.concatenate([x, x @ [[0.0, 1.0], [1.0, -1.0], [-1.0, 0.0]]], axis=-1)
+        _exact(both, FULL, exact_noise(both, FULL, rng=rng))
+
+
 def test_exact_noise_says_how_many_members_it_needs() -> None:
     x = generator(7).standard_normal((9, 4))
     assert exact_noise(x[:8], FULL, rng=generator()).shape == (8, 3)

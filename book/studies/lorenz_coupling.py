@@ -110,3 +110,5 @@ rtol = 1e-3
 # In these filters a difference of the last bit grows with the model's chaos, tenfold in ten steps:
 # another processor's members part from the stored ones before the end.
 rough = [name for name in columns if name.startswith(("transport", "second", "particles"))]
+# With twenty members it may also lose the path, farther than it did in any stored trial.
+odd = 5

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, array, choice, generator, number
-from ..linalg import _EPS
+from ..linalg import _EPS, _factor
 from .solvers import SOLVERS, Solve, _scaled, _solver, _squares
 
 __all__ = [
@@ -237,16 +237,33 @@ def _second_order(y: Array, x: Array, w: Array) -> Array:
     n = x.shape[-2]
     centre = w[..., None, :] @ x
     around, spread = x - centre, y - y.mean(axis=-2, keepdims=True)
-    target = np.swapaxes(around, -1, -2) @ (w[..., None] * around)
-    values, vectors = np.linalg.eigh(0.5 * (target + np.swapaxes(target, -1, -2)))
-    root = (vectors * np.sqrt(values.clip(0))[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    # The anomalies times B are the nearest orthonormal columns to those times the root, times the
-    # root: P comes out to rounding, however little C has left of it in some direction.
-    u, sizes, v = np.linalg.svd(spread @ root, full_matrices=False)
-    lost = n * _EPS * np.abs(y).max(axis=(-2, -1)) * np.sqrt(values[..., -1].clip(0))
-    u = u * (sizes > lost[..., None])[..., None, :]
+    with np.errstate(over="ignore", invalid="ignore"):
+        target = np.swapaxes(around, -1, -2) @ (w[..., None] * around)
+    if not np.isfinite(target).all():
+        raise ValueError("ensemble: needs members with a finite covariance, got an overflow")
+    root = _graded(target)
+    # With P = K K' the anomalies times B are the nearest orthonormal columns to those times K,
+    # times K': P comes out to rounding, however little C has left of it in some direction.
+    turned = spread @ root
+    u, sizes, v = np.linalg.svd(turned, full_matrices=False)
+    # What rounding leaves in a direction where there is nothing: of the members, of the columns.
+    axes = np.swapaxes(v, -1, -2)
+    members, columns = (np.abs(z).max(axis=-2, keepdims=True) for z in (y, turned))
+    lost = n * _EPS * (members @ np.abs(root @ axes) + columns @ np.abs(axes))
+    u = u * (sizes[..., None, :] > lost)
     u -= u.mean(axis=-2, keepdims=True)
-    return np.asarray(centre + np.sqrt(n) * (u @ v @ root))
+    return np.asarray(centre + np.sqrt(n) * (u @ v @ np.swapaxes(root, -1, -2)))
+
+
+def _graded(cov: Array) -> Array:
+    """A factor K of covariances K K', triangular from the widest component to the narrowest.
+
+    Its columns then shrink as the components do, and no unit drowns in the rounding of another.
+    """
+    order = np.argsort(-np.diagonal(cov, axis1=-2, axis2=-1), axis=-1, kind="stable")
+    rows = np.take_along_axis(cov, order[..., :, None], axis=-2)
+    lower = _factor(np.take_along_axis(rows, order[..., None, :], axis=-1))
+    return np.take_along_axis(lower, np.argsort(order, axis=-1)[..., :, None], axis=-2)
 
 
 def rejuvenated(

@@ -25,7 +25,7 @@ from ..updates.particles import (
 from .driver import Late, Summary
 from .failures import guarded
 from .heard import Heard
-from .stepping import SensorState
+from .stepping import SensorState, Step
 from .wiring import Prior, SensorFilter
 
 __all__ = ["ParticleCollapse", "ParticleFilter", "ParticleState"]
@@ -159,7 +159,7 @@ class ParticleFilter(SensorFilter):
         sizes = self.members, self.model.dim
         step = self.begin(state, ParticleState, t, observations, late, sizes)
         stack = step.stack(state.points)
-        weights = self._resampled(stack, state, step.rng)
+        weights = self._resampled(stack, state, step)
         moved = self.model._sample_step(stack[-1], state.t, step.dt, step.rng)
         stack[-1] = step.moved(moved, stack[-1], 2)
         for place, group in step.heard():
@@ -185,25 +185,23 @@ class ParticleFilter(SensorFilter):
         # Components first: weights then multiply along all particles.
         around = np.subtract(np.swapaxes(state.points, -1, -2), mean[..., None], order="C")
         cov = state.shown((w[..., None, :] * around) @ np.swapaxes(around, -1, -2))
-        numbers = {"effective_size": state.effective_size, "distinct": _distinct(state.points)}
+        sizes, distinct = state.effective_size, _distinct(state.points)
+        numbers = {"effective_size": state.shown(sizes), "distinct": state.shown(distinct)}
         variance = np.diagonal(cov, axis1=-2, axis2=-1)
         return Summary(state.shown(mean), variance, cov, state.points, w, numbers)
 
-    def _resampled(
-        self, stack: list[Array], state: ParticleState, rng: np.random.Generator
-    ) -> Array:
+    def _resampled(self, stack: list[Array], state: ParticleState, step: Step) -> Array:
         """Log-weights after agents with a poor effective size have resampled, in place."""
         weights, before = state.log_weights.copy(), stack[-1]
         # Everybody draws, needed or not: an agent's luck must not depend on another's weights.
-        levels = _levels(weights.shape, rng, self.rule)
-        noise = rng.standard_normal(before.shape) if self.jitter else None
+        levels = _levels(weights.shape, step.rng, self.rule)
+        noise = step.rng.standard_normal(before.shape) if self.jitter else None
         poor = state.effective_size < self.threshold * self.members
         if not poor.any():
             return weights
-        around = before[poor] if noise is not None else None
         self._pick(stack, weights, state.weights, poor, levels)
-        if noise is not None and around is not None:
-            around -= around.mean(axis=-2, keepdims=True)
+        if noise is not None:
+            around = before[poor] - before[poor].mean(axis=-2, keepdims=True)
             # Of all particles, weighted or not: after one weight dominated its copies have none.
             cov = np.swapaxes(around, -1, -2) @ around / self.members
             stack[-1][poor] = _jittered(stack[-1][poor], cov, self.jitter, noise[poor])
@@ -212,16 +210,13 @@ class ParticleFilter(SensorFilter):
     def _pick(
         self, stack: list[Array], log_weights: Array, weights: Array, poor: Mask, levels: Array
     ) -> None:
-        """Resample some agents' paths in place; their weights are equal then."""
-        everyone = bool(poor.all())
-        rows = slice(None) if everyone else poor
+        """Resample some agents' paths in the stack; their weights are equal then."""
+        rows = slice(None) if poor.all() else poor
         picked = _picked(weights[rows], levels[rows], self.rule)
         for k, path in enumerate(stack):
             taken = _taken(path[rows], picked)
-            if not everyone:
-                path = path.copy()
-                path[poor] = taken
-            stack[k] = taken if everyone else path
+            stack[k] = path.copy() if rows is poor else taken
+            stack[k][rows] = taken
         log_weights[rows] = -np.log(self.members)
 
     def _warn(self, state: ParticleState) -> None:

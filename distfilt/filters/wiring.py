@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
@@ -183,16 +184,22 @@ class SensorFilter(TeamFilter):
             raise ValueError(f"state: needs {needed} for each run, got {got}")
         dt, seen = self.elapsed(state, t), self.observed(state, observations)
         times = (*state.times, state.t)[-self.lag :] if self.lag else ()
-        readings = [*(self._late(item, times, state) for item in late), (len(times), seen)]
+        shortest = min((b - a for a, b in pairwise((*times, float(t)))), default=0.0)
+        old = [self._late(item, times, shortest, state) for item in late]
+        readings = [*old, (len(times), seen)]
         return Step(self, state, float(t), dt, self.channel(state, t), times, readings)
 
     def _late(
-        self, item: Late, times: Sequence[float], state: State
+        self, item: Late, times: Sequence[float], shortest: float, state: State
     ) -> tuple[int, list[Array | None]]:
-        """Where among the kept times a late observation belongs, and the observations of then."""
+        """Where among the kept times a late observation belongs, and the observations of then.
+
+        A sum of steps may differ by rounding, but by far less than the `shortest` of them.
+        """
         instance(item, "late", Late)
-        match = [k for k, t in enumerate(times) if abs(t - item.measured) <= 1e-9 * max(1, abs(t))]
-        if not match:
+        away = [abs(t - item.measured) for t in times]
+        slack = min(1e-9 * max(1.0, abs(item.measured)), 1e-3 * shortest)
+        if not away or min(away) > slack:
             known = ", ".join(f"{t:g}" for t in times) or "none (lag = 0)"
             raise ValueError(
                 f"late: needs an earlier time that is kept ({known}), got {item.measured:g}"
@@ -204,4 +211,4 @@ class SensorFilter(TeamFilter):
             raise ValueError(f"late: a {sensor.kind} sensor cannot be late, it compares two times")
         observations: list[ArrayLike | None] = [None] * len(self.sensors)
         observations[item.agent] = item.value
-        return match[0], self.observed(state, observations)
+        return away.index(min(away)), self.observed(state, observations)

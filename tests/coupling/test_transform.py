@@ -64,6 +64,7 @@ BAD_INPUT: dict[str, list[tuple[str, Callable[[], object]]]] = {
     _T + "second_order": [
         *_common(lambda x, w: second_order(x, x, w)),
         ("moved", lambda: second_order(_X[:2], _X, _W)),
+        ("ensemble", lambda: second_order(_X, 1e200 * _X, _W)),
     ],
     _T + "rejuvenated": [
         ("ensemble", lambda: rejuvenated(_X[:1], _X[:1], bandwidth=0.1, rng=_rng())),
@@ -223,6 +224,35 @@ def test_the_correction_is_the_symmetric_map() -> None:
     matrix = np.linalg.lstsq(a, b, rcond=None)[0]
     assert np.abs(a @ matrix - b).max() < 1e-10
     assert np.abs(matrix - matrix.T).max() < 1e-9 and np.linalg.eigvalsh(matrix).min() > 0
+
+
+@pytest.mark.parametrize(
+    ("std", "place"),
+    [
+        ([1e3, 1e-3], [7e6, 0.0]),
+        ([1e-3, 1e3], [0.0, 7e6]),
+        ([1e-6, 1e6], [0.0, 0.0]),
+        ([1e3, 1e3, 1e3, 1e-3, 1e-3, 1e-3], [7e6, 0.0, 0.0, 0.0, 7e3, 0.0]),
+    ],
+)
+def test_the_correction_in_any_units(std: list[float], place: list[float]) -> None:
+    """A small unit beside a large one, far from zero, keeps its moments too."""
+    x, logs, w = _case(11, 30, len(std))
+    x = place + x * std
+    moved = second_order(ensemble_transform(x, logs), x, logs)
+    unit = np.outer(std, std)
+    assert (np.abs(moved.mean(axis=0) - w @ x) < 1e-12 * (np.abs(place) + std)).all()
+    assert np.abs((_covariance(moved) - _covariance(x, w)) / unit).max() < 1e-8
+
+
+def test_the_correction_stretches_nothing_where_there_is_nothing() -> None:
+    for seed in range(40):
+        x, logs, _ = _case(seed, 12, 4)
+        flat = x.copy()
+        flat[:, 0] = 0.3
+        moved = second_order(flat, x, logs)
+        sizes = np.linalg.svd(moved - moved.mean(axis=0), compute_uv=False)
+        assert sizes[3] < 1e-12 * sizes[0] and sizes[2] > 1e-6 * sizes[0]
 
 
 def test_the_correction_with_fewer_members_than_components() -> None:
