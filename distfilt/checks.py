@@ -19,7 +19,8 @@ from scipy.linalg.lapack import dpotrf
 
 __all__ = [  # fmt: skip
     "Array", "SolverError", "array", "callable_", "choice", "count", "covariance", "flags",
-    "generator", "increasing", "instance", "needed", "nonblank", "number", "same_length", "weights",
+    "generator", "increasing", "instance", "needed", "nonblank", "number", "places", "same_length",
+    "weights",
 ]
 
 Array = NDArray[np.float64]
@@ -255,6 +256,24 @@ def count(value: Any, name: str, *, at_least: int = 1) -> int:
     if not integral or isinstance(value, bool | np.timedelta64) or value < at_least:
         raise ValueError(f"{name}: needs an integer of at least {at_least}, got {value!r}")
     return int(value)
+
+
+def places(value: Any, name: str, size: int | None = None) -> tuple[int, ...]:
+    """Return `value` as distinct integers, one or more, from 0 on and below `size`.
+
+    >>> places([2, 0], "local", size=3)
+    (2, 0)
+    >>> places([2, 3], "local", size=3)
+    Traceback (most recent call last):
+    ValueError: local: needs distinct integers below 3, got [2, 3]
+    """
+    if not np.iterable(value):
+        raise ValueError(f"{name}: needs a list of integers, got {value!r}")
+    found = [count(i, name, at_least=0) for i in value]
+    if not found or len(set(found)) < len(found) or (size is not None and max(found) >= size):
+        below = "" if size is None else f" below {size}"
+        raise ValueError(f"{name}: needs distinct integers{below}, got {found}")
+    return tuple(found)
 
 
 def choice(value: Any, name: str, options: Collection[str]) -> str:

@@ -103,6 +103,15 @@ BAD_INPUT = {
         ("a", lambda: checks.number(2, "a", at_most=1)),
         ("a", lambda: checks.number(-1, "a", at_least=0)),
     ],
+    _C + "places": [
+        ("a", lambda: checks.places(3, "a")),
+        ("a", lambda: checks.places([], "a")),
+        ("a", lambda: checks.places([1, 1], "a")),
+        ("a", lambda: checks.places([0, 3], "a", 3)),
+        ("a", lambda: checks.places([-1], "a")),
+        ("a", lambda: checks.places([0.5], "a")),
+        ("a", lambda: checks.places("12", "a")),
+    ],
     _C + "same_length": [
         ("a", lambda: checks.same_length([1], [], "a", "b")),
         ("a", lambda: checks.same_length(3, [], "a", "b")),

@@ -15,7 +15,7 @@ import distfilt
 DATA = {
     "array": {"shape"}, "covariance": {"dim"}, "flags": {"shape"}, "generator": {"name"},
     "weights": {"size"}, "distances": {"target"}, "plan": {"columns"}, "sorted_plan": {"columns"},
-    "LowRank": {"lost"}, "Seen": {"wanted"}, "DensityState": {"low"}, "MixtureState": {"mixtures"},
+    "LowRank": {"lost"}, "Seen": {"wanted"}, "places": {"size"}, "MixtureState": {"mixtures"},
     "EnsembleFilter": {"graph"}, "GaussianFilter": {"graph"}, "MixtureFilter": {"graph"},
     "NewsFilter": {"graph"}, "ParticleFilter": {"graph"}, "SensorFilter": {"graph"},
     "TransportFilter": {"graph"},

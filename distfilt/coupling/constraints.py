@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, SolverError, array, callable_, choice, count, instance, number
+from ..checks import Array, SolverError, array, callable_, choice, count, instance, number, places
 from ..differences import _central
 
 __all__ = [  # fmt: skip
@@ -100,11 +100,7 @@ def norm(indices: Sequence[int], *, length: float = 1.0) -> Constraint:
     >>> norm([0, 1]).residual([0.6, 0.8, 5.0]).round(15) + 0.0
     array([0.])
     """
-    if not np.iterable(indices):
-        raise ValueError(f"indices: needs a list of integers, got {indices!r}")
-    rows = [count(i, "indices", at_least=0) for i in indices]
-    if not rows or len(set(rows)) != len(rows):
-        raise ValueError(f"indices: needs at least one, all different, got {list(indices)}")
+    rows = list(places(indices, "indices"))
     size = number(length, "length", above=0)
 
     def squares(x: Array) -> Array:

@@ -1,6 +1,7 @@
 """Densities on grids: kernel estimates, the Fokker-Planck equation, and the filter of both."""
 
 from .fokker_planck import FokkerPlanck, bernoulli
+from .forms import Separate, filters_start, filters_step
 from .gain import (
     Dense,
     LowRank,
@@ -19,6 +20,7 @@ from .kernel import (
     kernel_covariance,
     kernel_density,
     kernel_information,
+    kernel_noise,
     kernels,
 )
 from .prior import zero_mean_prior
@@ -26,8 +28,8 @@ from .sharing import Centralised, DynamicAverage, Flooding, Neighbours, PIConsen
 
 __all__ = [  # fmt: skip
     "Centralised", "Dense", "DynamicAverage", "Flooding", "FokkerPlanck", "Grid", "LowRank",
-    "Neighbours", "PIConsensus", "Shared", "Sharing", "adaptive_bandwidths", "bandwidth",
-    "bernoulli", "dense_step", "kernel_covariance", "kernel_density", "kernel_information",
-    "kernels", "low_rank_start", "low_rank_step", "shared_moved", "shared_start", "shared_step",
-    "zero_mean_prior",
+    "Neighbours", "PIConsensus", "Separate", "Shared", "Sharing", "adaptive_bandwidths",
+    "bandwidth", "bernoulli", "dense_step", "filters_start", "filters_step", "kernel_covariance",
+    "kernel_density", "kernel_information", "kernel_noise", "kernels", "low_rank_start",
+    "low_rank_step", "shared_moved", "shared_start", "shared_step", "zero_mean_prior",
 ]

@@ -11,7 +11,7 @@ from .grid import Grid
 
 __all__ = [  # fmt: skip
     "adaptive_bandwidths", "bandwidth", "kernel_covariance", "kernel_density", "kernel_information",
-    "kernels",
+    "kernel_noise", "kernels",
 ]
 
 
@@ -163,6 +163,44 @@ def kernel_information(grid: Grid, *, bandwidth: float, agents: int) -> float:
     instance(grid, "grid", Grid)
     h = number(bandwidth, "bandwidth", above=0)
     return float(1 / (n * (2 * np.sqrt(np.pi) * h) ** grid.dim))
+
+
+def kernel_noise(
+    density: ArrayLike, grid: Grid, *, bandwidth: float, agents: ArrayLike, floor: float = 0.1
+) -> Array:
+    r"""Strength R of a kernel estimate's noise, :math:`\bar k\max(p,\epsilon)` cell by cell.
+
+    Parameters
+    ----------
+    density : array_like, (..., n)
+        The density p about which the estimate is made.
+    grid : Grid
+    bandwidth : float
+    agents : float or array_like, (...)
+        How many agents there are behind each estimate, which need not be whole where that is an
+        estimate itself. No agents measure nothing: their noise is infinite.
+    floor : float
+        The least density ε, positive: no finite sample shows that a cell is empty.
+
+    Returns
+    -------
+    ndarray, (..., n)
+
+    Examples
+    --------
+    >>> grid = Grid((2, 2))
+    >>> kernel_noise([[1.0, 2.0, 0.0, 1.0]] * 2, grid, bandwidth=0.5, agents=[10, 0]).round(4)
+    array([[0.0318, 0.0637, 0.0032, 0.0318],
+           [   inf,    inf,    inf,    inf]])
+    """
+    unit = kernel_information(grid, bandwidth=bandwidth, agents=1)
+    p = grid.check(density, "density")
+    n, least = array(agents, "agents"), number(floor, "floor", above=0)
+    if n.shape not in ((), p.shape[:-1]) or n.min(initial=0.0) < 0:
+        raise ValueError(f"agents: needs numbers of at least 0, one or of shape {p.shape[:-1]}, "
+                         f"got shape {n.shape} with a least of {n.min(initial=0.0):g}")
+    k = np.divide(unit, n, out=np.full(n.shape, np.inf), where=n > 0)
+    return np.asarray(k[..., None] * np.maximum(p, least))
 
 
 def kernel_covariance(

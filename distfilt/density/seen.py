@@ -11,7 +11,7 @@ from ..checks import Array, array, instance
 from ..network import Graph
 from ..network.graphs import disk
 from .grid import Grid
-from .kernel import _kernels
+from .kernel import _kernels, kernel_noise
 
 __all__ = ["Seen", "present_graph"]
 
@@ -89,6 +89,17 @@ class Seen:
         x = np.where(self.present[:, None], self.positions, self.grid.centres[0])
         z = _kernels(x, self.grid, np.full(len(x), self.bandwidth))
         return np.asarray(z * self.present[:, None])
+
+    def noise(self, density: Array, agents: ArrayLike, floor: float) -> Array:
+        """Strength R of what the wanted agents have learnt, about their rows of `density`.
+
+        `agents` is how many each of all A agents heard of; it is infinite for those that are gone.
+        """
+        heard = np.where(self.present, np.maximum(agents, 1.0), 0.0)
+        if self.wanted is not None:
+            heard = heard[list(self.wanted)]
+        return kernel_noise(
+            density, self.grid, bandwidth=self.bandwidth, agents=heard, floor=floor)
 
     def flat(self, std: float) -> Array:
         """A Gaussian about each agent, cut off at the walls; in the middle for the gone, (A, n)."""

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import Array, count, number
-from ..network import Channel, tracking
+from ..checks import Array, count, instance, number
+from ..network import Channel, Graph, tracking
 from ..network import weights as weighting
 from .kernel import _kernel_density, _kernels
 from .seen import Seen
 
 __all__ = [  # fmt: skip
-    "Centralised", "DynamicAverage", "Flooding", "Neighbours", "PIConsensus", "Sharing",
+    "Centralised", "DynamicAverage", "Flooding", "Neighbours", "PIConsensus", "Sharing", "alone",
 ]
 
 Carried = tuple[Array, ...]
@@ -25,6 +25,7 @@ _NEVER = -1e30
 """Time stamp of what an agent has not heard of."""
 
 
+@runtime_checkable
 class Sharing(Protocol):
     """A rule by which agents learn the swarm's kernel estimate.
 
@@ -52,6 +53,25 @@ class Sharing(Protocol):
     ) -> tuple[Carried, Array, Array]:
         """One step of talking."""
         ...
+
+
+def alone(sharing: Sharing, seen: Seen) -> Array:
+    """What each agent believes of the swarm before anybody has spoken, (A, n).
+
+    Its own kernel, whatever it will say; only a reference knows of all without a word.
+
+    Examples
+    --------
+    >>> from distfilt.density import Grid
+    >>> seen = Seen(np.full((2, 2), 0.5), np.ones(2, bool), Grid((9, 9)), 0.1, 0.0)
+    >>> np.array_equal(alone(Flooding(), seen), seen.kernels)
+    True
+    """
+    instance(sharing, "sharing", Sharing)  # type: ignore[type-abstract]
+    if not sharing.reference:
+        return seen.kernels
+    silent = Channel(Graph.from_edges(len(seen.present), np.zeros((0, 2))))
+    return sharing.learn(sharing.begin(seen), seen, silent, 1.0)[1]
 
 
 def _coordinates(seen: Seen, modes: int | None, values: Array | None = None) -> Array:

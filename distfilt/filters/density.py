@@ -3,28 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, choice, count, instance, number
-from ..density import (
-    FokkerPlanck,
-    LowRank,
-    Shared,
-    kernel_information,
-    low_rank_step,
-    shared_moved,
-    shared_start,
-    shared_step,
-    zero_mean_prior,
-)
+from ..checks import Array, array, choice, count, instance, number, places
+from ..density import FokkerPlanck, Separate, Shared, Sharing, zero_mean_prior
+from ..density.forms import filters_start, filters_step
 from ..density.kernel import _width
 from ..density.seen import Seen, present_graph
-from ..density.sharing import Sharing
+from ..density.sharing import alone
 from ..network import Channel, Faults, Graph, Ledger
 from .driver import Late, Summary, TeamFilter
 from .saving import State
@@ -52,15 +43,14 @@ class DensityState(State):
         How many agents each believes there are.
     parts : int
         Into how many parts the network of the present agents fell in the last step.
-    filters : Shared or None
-        The filters of the agents that have one, if the model is taken as exact.
-    low : tuple of LowRank
-        The same, if it is not.
+    filters : Shared or Separate
+        The filters of the agents that have one, in the form that the model allows.
 
     Examples
     --------
+    >>> filters = filters_start(np.ones((4, 1)), np.ones((1, 4)), exact=True)
     >>> DensityState(0.0, Ledger.empty(1), None, np.zeros((1, 2)), (), np.ones((1, 4)),
-    ...              np.ones(1), 1, shared_start(np.ones((4, 1)), np.ones((1, 4)))).estimates.shape
+    ...              np.ones(1), 1, filters).estimates.shape
     (1, 4)
     """
 
@@ -69,22 +59,17 @@ class DensityState(State):
     observed: Array
     counted: Array
     parts: int
-    filters: Shared | None
-    low: tuple[LowRank, ...] = ()
+    filters: Shared | Separate
 
     @property
     def estimates(self) -> Array:
         """The estimated densities of the agents that have a filter, (F, n)."""
-        if self.filters is not None:
-            return self.filters.estimates
-        return np.stack([state.mean for state in self.low])
+        return self.filters.estimates
 
     @property
     def variances(self) -> Array:
         """Their variances, cell by cell, (F, n)."""
-        if self.filters is not None:
-            return self.filters.variances
-        return np.stack([(state.factor**2).sum(axis=-1) for state in self.low])
+        return self.filters.variances
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,11 +99,9 @@ class DensityFilter(TeamFilter):
         Prior mean: a flat Gaussian about the agent, its own kernel, or a density for all.
     first_std : float
         Width of the flat Gaussian.
-    rank, prior_length, prior_std
-        Of :func:`~distfilt.density.zero_mean_prior`.
-    mass_std : float
-        Standard deviation of the prior's total mass. With 0, the default, no measurement can change
-        the mass; above 0 it can, as in the paper.
+    rank, prior_length, prior_std, mass_std
+        Of :func:`~distfilt.density.zero_mean_prior`. With a `mass_std` of 0, the default, no
+        measurement can change the mass; above 0 it can, as in the paper.
     noise : {"forecast", "observed"}
         Whether R is k̄ times the filter's own density, or times what it observes as printed; the
         second weighs by the noise itself and is biased.
@@ -150,20 +133,21 @@ class DensityFilter(TeamFilter):
     size: int
     graph: Graphs
     sharing: Sharing
-    bandwidth: float = field(kw_only=True)
-    local: tuple[int, ...] | None = field(default=None, kw_only=True)
-    first: str | ArrayLike = field(default="flat", kw_only=True)
-    first_std: float = field(default=0.3, kw_only=True)
-    rank: int = field(default=48, kw_only=True)
-    prior_length: float = field(default=0.1, kw_only=True)
-    prior_std: float = field(default=1.0, kw_only=True)
-    mass_std: float = field(default=0.0, kw_only=True)
-    noise: str = field(default="forecast", kw_only=True)
-    floor: float = field(default=0.1, kw_only=True)
-    number_known: bool = field(default=True, kw_only=True)
-    process: float | None = field(default=None, kw_only=True)
-    faults: Faults | None = field(default=None, kw_only=True)
-    names: tuple[str, ...] = field(default=(), kw_only=True)
+    _: KW_ONLY
+    bandwidth: float
+    local: tuple[int, ...] | None = None
+    first: str | ArrayLike = "flat"
+    first_std: float = 0.3
+    rank: int = 48
+    prior_length: float = 0.1
+    prior_std: float = 1.0
+    mass_std: float = 0.0
+    noise: str = "forecast"
+    floor: float = 0.1
+    number_known: bool = True
+    process: float | None = None
+    faults: Faults | None = None
+    names: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         instance(self.model, "model", FokkerPlanck)
@@ -171,16 +155,12 @@ class DensityFilter(TeamFilter):
         count(self.rank, "rank")
         if not callable(self.graph) and not isinstance(self.graph, Graph):
             number(self.graph, "graph", above=0)
-        for name in ("begin", "learn"):
-            if not callable(getattr(self.sharing, name, None)):
-                raise ValueError(f"sharing: needs {name}, got {type(self.sharing).__name__}")
+        instance(self.sharing, "sharing", Sharing)  # type: ignore[type-abstract]
         for name in ("bandwidth", "first_std", "floor"):
             number(getattr(self, name), name, above=0)
         _width(self.bandwidth, self.model.grid, 1)
         if self.local is not None:
-            found = [count(i, "local", at_least=0) for i in self.local]
-            if not found or max(found) >= size or len(set(found)) < len(found):
-                raise ValueError(f"local: needs distinct agents below {size}, got {self.local}")
+            places(self.local, "local", size)
         if isinstance(self.first, str):
             choice(self.first, "first", ("flat", "observed"))
         else:
@@ -210,9 +190,8 @@ class DensityFilter(TeamFilter):
 
     def series(self, observations: Any, times: Array) -> Sequence[Any]:
         """Per time the agents' positions, from (T, A, d); NaN rows are agents that have gone."""
-        x = array(observations, "observations",
-                  (times.size, self.size, self.model.grid.dim), finite=False)
-        return list(x)
+        shape = times.size, self.size, self.model.grid.dim
+        return list(array(observations, "observations", shape, finite=False))
 
     def start(
         self, prior: ArrayLike, *, rng: np.random.Generator | None = None,
@@ -234,37 +213,26 @@ class DensityFilter(TeamFilter):
         if runs:
             raise ValueError(f"runs: needs (), as every run has a graph of its own, got {runs}")
         seen = self._seen(prior, "prior", number(t, "t"))
-        here, basis = self.filtering, self._basis
-        base = self._base(seen)[here]
-        exact = self.process is None
+        here = self.filtering
+        filters = filters_start(self._basis, self._base(seen)[here], exact=self.process is None)
         return DensityState(
             float(t), Ledger.empty(self.size), None, seen.places, self.sharing.begin(seen),
-            seen.kernels[here], np.full(self.size, float(self.size)), 1,
-            shared_start(basis, base) if exact else None,
-            () if exact else tuple(LowRank(m, basis) for m in base),
+            seen.kernels[here], np.full(self.size, float(self.size)), 1, filters,
         )
 
     @cached_property
     def _basis(self) -> Array:
         """A factor of the prior covariance, (n, r)."""
-        grid = self.model.grid
-        basis = zero_mean_prior(
-            grid, rank=self.rank, length=self.prior_length, std=self.prior_std)
-        if self.mass_std == 0:
-            return basis
-        even = np.full((grid.size, 1), self.mass_std / (grid.size * grid.volume))
-        return np.concatenate([even, basis], axis=1)
+        return zero_mean_prior(
+            self.model.grid, rank=self.rank, length=self.prior_length, std=self.prior_std,
+            mass_std=self.mass_std,
+        )
 
     def _base(self, seen: Seen) -> Array:
-        grid = self.model.grid
+        """Prior means of all agents, (A, n)."""
         if not isinstance(self.first, str):
-            return np.tile(array(self.first, "first", (grid.size,)), (self.size, 1))
-        if self.first == "observed":
-            if self.sharing.reference:
-                door = Channel(Graph.from_edges(self.size, np.zeros((0, 2))))
-                return self.sharing.learn((), seen, door, 1.0)[1]
-            return seen.kernels
-        return seen.flat(self.first_std)
+            return np.tile(np.asarray(self.first, dtype=np.float64), (self.size, 1))
+        return alone(self.sharing, seen) if self.first == "observed" else seen.flat(self.first_std)
 
     def _seen(self, positions: ArrayLike, name: str, t: float) -> Seen:
         return Seen.checked(
@@ -299,30 +267,18 @@ class DensityFilter(TeamFilter):
         channel = Channel(graph, ledger=state.ledger, faults=self.faults, t=float(t))
         carried, y, counted = self.sharing.learn(state.carried, seen, channel, dt)
         y = y[self.filtering]
-        filters, low = self._filtered(state, y, counted, seen, dt)
+        agents = seen.present.sum() if self.number_known else counted
+
+        def noise(forecast: Array) -> Array:
+            level = forecast if self.noise == "forecast" else y
+            return seen.noise(level, agents, self.floor)
+
+        move = self.model.solver(state.t, dt)
+        q = None if self.process is None else self.process * self._basis
+        filters = filters_step(state.filters, move, y, noise, dt, process=q)
         parts = np.unique(graph.components[seen.present]).size
         return DensityState(
-            float(t), channel.ledger, None, seen.places, carried, y, counted, parts, filters, low
-        )
-
-    def _filtered(
-        self, state: DensityState, y: Array, counted: Array, seen: Seen, dt: float
-    ) -> tuple[Shared | None, tuple[LowRank, ...]]:
-        """The filters after they have moved and taken in what their agents learned."""
-        here, move = self.filtering, self.model.solver(state.t, dt)
-        known = self.number_known
-        size = np.full(here.size, float(seen.present.sum())) if known else counted[here]
-        unit = kernel_information(self.model.grid, bandwidth=self.bandwidth, agents=1)
-        shared = None if state.filters is None else shared_moved(state.filters, move)
-        moved = move(state.estimates) if shared is None else shared.estimates
-        level = moved if self.noise == "forecast" else y
-        noise = (unit / np.maximum(size, 1.0))[:, None] * np.maximum(level, self.floor)
-        noise[~seen.present[here]] = np.inf
-        if shared is not None:
-            return shared_step(shared, y, noise, dt), ()
-        q = (self.process or 0.0) * self._basis
-        return None, tuple(
-            low_rank_step(s, move, y[i], noise[i], dt, process=q) for i, s in enumerate(state.low)
+            float(t), channel.ledger, None, seen.places, carried, y, counted, parts, filters
         )
 
     def summary(self, state: DensityState) -> Summary:
@@ -334,9 +290,8 @@ class DensityFilter(TeamFilter):
         n, here = self.model.grid.size, self.filtering
         mean, variance = (np.full((self.size, n), np.nan) for _ in range(2))
         mean[here], variance[here] = state.estimates, state.variances
-        numbers = {
+        return Summary(mean, variance, numbers={
             "parts": np.full(self.size, float(state.parts)),
             "counted": state.counted,
             "mass": mean.sum(axis=-1) * self.model.grid.volume,
-        }
-        return Summary(mean, variance, numbers=numbers)
+        })

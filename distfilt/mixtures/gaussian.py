@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from ..checks import Array, array, count, covariance, generator, instance, weights
+from ..checks import Array, array, count, covariance, generator, instance, places, weights
 from .quadratics import ExponentialQuadratics, inverse, log_sum
 
 __all__ = ["GaussianMixture"]
@@ -174,7 +173,7 @@ class GaussianMixture:
         >>> GaussianMixture.gaussian([0.0, 1.0], np.eye(2)).marginal([1]).means
         array([[1.]])
         """
-        at = self._indices(indices)
+        at = np.array(places(indices, "indices", self.dim))
         return trusted(self.weights, self.means[:, at], self.covs[:, at[:, None], at])
 
     def conditional(self, indices: Sequence[int], values: ArrayLike) -> GaussianMixture:
@@ -197,7 +196,7 @@ class GaussianMixture:
         >>> rest.means, rest.covs
         (array([[1.]]), array([[[0.75]]]))
         """
-        known = self._indices(indices)
+        known = np.array(places(indices, "indices", self.dim))
         rest = np.setdiff1d(np.arange(self.dim), known)
         if not rest.size:
             raise ValueError("indices: needs a component that is left, got all of them")
@@ -333,16 +332,6 @@ class GaussianMixture:
         covs[:, upper[0], upper[1]] = flat
         covs[:, upper[1], upper[0]] = flat
         return cls(array(payload[0], "payload", (m.shape[0],)), m, covs)
-
-    def _indices(self, indices: Sequence[int]) -> Any:
-        if not np.iterable(indices):
-            raise ValueError(f"indices: needs a list of integers, got {indices!r}")
-        at = np.array([count(i, "indices", at_least=0) for i in indices], dtype=np.intp)
-        if not at.size or at.max() >= self.dim or np.unique(at).size != at.size:
-            raise ValueError(
-                f"indices: needs distinct integers below {self.dim}, got {list(indices)!r}"
-            )
-        return at
 
 
 def trusted(weights: Array, means: Array, covs: Array) -> GaussianMixture:

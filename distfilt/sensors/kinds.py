@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, choice, count, number
+from ..checks import Array, array, choice, number, places
 from .base import Sensor, _wrapped
 
 __all__ = [  # fmt: skip
@@ -17,11 +17,7 @@ __all__ = [  # fmt: skip
 
 
 def _indices(indices: Sequence[int], needed: int | None = None) -> tuple[int, ...]:
-    if not np.iterable(indices):
-        raise ValueError(f"indices: needs a list of integers, got {indices!r}")
-    picked = tuple(count(i, "indices", at_least=0) for i in indices)
-    if not picked or len(set(picked)) != len(picked):
-        raise ValueError(f"indices: needs distinct components, got {tuple(indices)}")
+    picked = places(indices, "indices")
     if needed is not None and len(picked) != needed:
         raise ValueError(f"indices: needs {needed} components, got {len(picked)}")
     return picked

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.random import SeedSequence
 
-from ..checks import callable_, count, number
+from ..checks import callable_, count, number, places
 from ._worker import versions
 from .files import Stored, load
 from .running import run
@@ -64,7 +64,7 @@ def check(
     number(rtol, "rtol", at_least=0)
     allowed = _allowed(stored, number(atol, "atol", at_least=0), rough)
     spared = count(odd, "odd", at_least=0)
-    chosen = _indices(range(len(stored)) if indices is None else indices, len(stored))
+    chosen = places(range(len(stored)) if indices is None else indices, "indices", len(stored))
     if spared >= len(chosen):
         raise ValueError(f"odd: needs fewer than the {len(chosen)} trials that run, got {spared}")
     study = run(
@@ -108,16 +108,6 @@ def _differences(
                     found.append(f"trial {i}: {name} stored {kept!r}, now {value!r}")
         wrong += [found] if found else []
     return wrong
-
-
-def _indices(indices: Any, n: int) -> tuple[int, ...]:
-    given = tuple(indices) if isinstance(indices, Iterable) else ()
-    if not given:
-        raise ValueError(f"indices: needs at least one trial, got {indices!r}")
-    out = tuple(count(i, "indices", at_least=0) for i in given)
-    if max(out) >= n or len(set(out)) != len(out):
-        raise ValueError(f"indices: needs different trials of {n}, got {list(out)}")
-    return out
 
 
 def _same(was: float, now: float, rtol: float, atol: float) -> bool:

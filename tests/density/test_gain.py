@@ -167,6 +167,13 @@ def test_prior_has_the_variance_and_the_mass_that_it_says() -> None:
     assert np.array_equal(zero_mean_prior(grid, rank=50, length=0.2, std=0.7), s[:, :50])
 
 
+def test_prior_may_leave_the_mass_open() -> None:
+    grid = Grid((20, 20), high=[2.0, 1.0])
+    s = zero_mean_prior(grid, rank=30, mass_std=0.2)
+    assert np.array_equal(s[:, 1:], zero_mean_prior(grid, rank=30))
+    assert np.ptp(s[:, 0]) == 0 and grid.integral(s[:, 0]) == pytest.approx(0.2, rel=1e-12)
+
+
 def test_gain_from_the_observed_density_loses_mass() -> None:
     """Criterion 11: P0 = R0 and R from y lose mass, R from the forecast does not as much."""
     grid, swarm = Grid((14, 14)), rotating_swarm("gibbs")
@@ -199,6 +206,7 @@ BAD_INPUT = {
         ("rank", lambda: zero_mean_prior(Grid((4, 4)), rank=16)),
         ("length", lambda: zero_mean_prior(Grid((4, 4)), rank=3, length=0.0)),
         ("std", lambda: zero_mean_prior(Grid((4, 4)), rank=3, std=0.0)),
+        ("mass_std", lambda: zero_mean_prior(Grid((4, 4)), rank=3, mass_std=-0.1)),
     ],
     "distfilt.density.gain.Dense": [("covariance", lambda: Dense(np.ones(3), np.eye(2)))],
     "distfilt.density.gain.dense_step": [

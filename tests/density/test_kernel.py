@@ -13,6 +13,7 @@ from distfilt.density import (
     kernel_covariance,
     kernel_density,
     kernel_information,
+    kernel_noise,
     kernels,
 )
 
@@ -72,6 +73,17 @@ def test_the_constant_is_the_integral_of_the_kernel_squared() -> None:
         wanted = float((z**2).sum() * grid.volume) / 100
         got = kernel_information(grid, bandwidth=0.05, agents=100)
         assert got == pytest.approx(wanted, rel=5e-3)
+
+
+def test_noise_is_the_constant_times_a_density_that_is_nowhere_zero() -> None:
+    p, n = np.random.default_rng(3).random((4, 600)), np.array([1.0, 7.0, 2.5, 0.0])
+    got = kernel_noise(p, GRID, bandwidth=0.1, agents=n, floor=0.3)
+    one = kernel_information(GRID, bandwidth=0.1, agents=1)
+    for row, density, agents in zip(got[:3], p, n, strict=False):
+        assert np.allclose(row, one / agents * np.where(density < 0.3, 0.3, density), rtol=1e-14)
+    assert np.isinf(got[3]).all()
+    seven = kernel_noise(p, GRID, bandwidth=0.1, agents=7)
+    assert np.allclose(seven, kernel_information(GRID, bandwidth=0.1, agents=7) * p.clip(0.1))
 
 
 def test_covariance_is_that_of_many_swarms() -> None:
@@ -164,6 +176,14 @@ BAD_INPUT = {
         ("agents", lambda: kernel_information(GRID, bandwidth=0.1, agents=0)),
         ("bandwidth", lambda: kernel_information(GRID, bandwidth=0.0, agents=5)),
         ("grid", lambda: kernel_information(3, bandwidth=0.1, agents=5)),
+    ],
+    "distfilt.density.kernel.kernel_noise": [
+        ("density", lambda: kernel_noise(np.ones(5), GRID, bandwidth=0.1, agents=5)),
+        ("grid", lambda: kernel_noise(np.ones(600), 3, bandwidth=0.1, agents=5)),
+        ("bandwidth", lambda: kernel_noise(np.ones(600), GRID, bandwidth=0.0, agents=5)),
+        ("agents", lambda: kernel_noise(np.ones(600), GRID, bandwidth=0.1, agents=-1)),
+        ("agents", lambda: kernel_noise(np.ones((2, 600)), GRID, bandwidth=0.1, agents=[5] * 3)),
+        ("floor", lambda: kernel_noise(np.ones(600), GRID, bandwidth=0.1, agents=5, floor=0)),
     ],
     "distfilt.density.kernel.kernel_covariance": [
         ("density", lambda: kernel_covariance(np.zeros(600), GRID, bandwidth=0.1, agents=5)),

@@ -16,9 +16,11 @@ from distfilt.density import (
     Neighbours,
     PIConsensus,
     kernel_density,
+    kernel_noise,
     kernels,
 )
 from distfilt.density.seen import Seen, present_graph
+from distfilt.density.sharing import alone
 from distfilt.filters import DensityFilter, DensityState, final_state
 from distfilt.models import Swarm, rotating_swarm
 from distfilt.network import Faults, Graph, graphs
@@ -259,15 +261,17 @@ def test_process_noise_keeps_the_filter_open() -> None:
     assert opened.variances.mean() > 2 * closed.variances.mean()
 
 
-def test_saving_and_going_on_gives_the_same_bits(tmp_path: object) -> None:
+@pytest.mark.parametrize("process", [None, 1.0])
+def test_saving_and_going_on_gives_the_same_bits(tmp_path: object, process: float | None) -> None:
     for rule in RULES.values():
-        f = make(0.5, rule)
+        f = make(0.5, rule, process=process)
         half = last(f, PATH[:4])
         half.save(f"{tmp_path}/state.npz")
         again = DensityState.load(f"{tmp_path}/state.npz")
         for k in range(4, 8):
             half, again = (f.step(s, 0.1 * (k + 1), PATH[k]) for s in (half, again))
         assert np.array_equal(half.estimates, again.estimates)
+        assert np.array_equal(half.variances, again.variances)
         assert np.array_equal(half.ledger.scalars, again.ledger.scalars)
 
 
@@ -323,10 +327,13 @@ BAD_INPUT = {
         ("size", lambda: DensityFilter(MODEL, 0, 0.5, Flooding(), bandwidth=H)),
         ("graph", lambda: make(-0.5, Flooding())),
         ("sharing", lambda: make(0.5, 3)),
+        ("process", lambda: make(0.5, Flooding(), process=1.0).step(_STATE, 0.1, START)),
         ("bandwidth", lambda: make(0.5, Flooding(), bandwidth=0.0)),
         ("too coarse", lambda: make(0.5, Flooding(), bandwidth=0.01)),
         ("local", lambda: make(0.5, Flooding(), local=(SIZE,))),
         ("local", lambda: make(0.5, Flooding(), local=())),
+        ("local", lambda: make(0.5, Flooding(), local=(1, 1))),
+        ("local", lambda: make(0.5, Flooding(), local=3)),
         ("first", lambda: make(0.5, Flooding(), first="guess")),
         ("noise", lambda: make(0.5, Flooding(), noise="white")),
         ("floor", lambda: make(0.5, Flooding(), floor=0.0)),
@@ -364,6 +371,9 @@ BAD_INPUT = {
         ("modes", lambda: DynamicAverage(modes=0)),
         ("rounds", lambda: DynamicAverage(rounds=0)),
     ],
+    "distfilt.density.sharing.alone": [
+        ("sharing", lambda: alone(3, Seen(START, np.ones(SIZE, bool), GRID, H, 0.0)))
+    ],
     "distfilt.density.sharing.Flooding": [("forget", lambda: Flooding(forget=0.0))],
     "distfilt.density.seen.present_graph": [
         ("graph", lambda: present_graph(3, np.ones(2, bool)))
@@ -376,6 +386,19 @@ EXEMPT = {
     "distfilt.density.sharing.Centralised": "takes no input",
     "distfilt.density.sharing.Neighbours": "takes no input",
 }
+
+
+def test_an_agent_that_has_gone_measures_nothing_and_nobody_hears_of_less_than_one() -> None:
+    present = np.array([True, False, True, True])
+    x = np.full((4, 2), 0.5)
+    seen = Seen(x, present, GRID, H, 0.0)
+    one = kernel_noise(np.ones(100), GRID, bandwidth=H, agents=1)
+    got = seen.noise(np.ones((4, 100)), np.array([4.0, 9.0, 0.5, 1.0]), 0.1)
+    assert np.isinf(got[1]).all()
+    assert np.allclose(got[[0, 2, 3]], one / np.array([[4.0], [1.0], [1.0]]))
+    few = Seen(x, present, GRID, H, 0.0, (3, 1, 0))
+    assert np.array_equal(few.noise(np.ones((3, 100)), np.array([4.0, 9.0, 0.5, 1.0]), 0.1),
+                          got[[3, 1, 0]])
 
 
 def test_seen_kernels_of_the_gone_are_zero() -> None:

@@ -468,7 +468,7 @@ def findings(calls: dict[str, list[Call]]) -> Iterator[Finding]:
 
 GOOD = {"refused", "same", "finite"}
 RECORDS = (
-    r"filters\.(\w+State|Summary|Late)|density\.(Dense|LowRank|Shared|PIConsensus|Flooding)"
+    r"filters\.(\w+State|Summary|Late)|density\.(Dense|LowRank|Separate|Shared|PIConsensus|Flooding)"
     r"|network\.(Ledger|PIState|AdmmRun)|triangular\.(affine\.AffineMap|separable\.SeparableMap)"
     r"|studies\.\w+|published\.(Parameter|accepted)|progress\.track|mixtures\.Shapes"
 )
