@@ -237,7 +237,10 @@ def _second_order(y: Array, x: Array, w: Array) -> Array:
     n = x.shape[-2]
     centre = w[..., None, :] @ x
     around, spread = x - centre, y - y.mean(axis=-2, keepdims=True)
-    target = np.swapaxes(around, -1, -2) @ (w[..., None] * around)
+    with np.errstate(over="ignore", invalid="ignore"):
+        target = np.swapaxes(around, -1, -2) @ (w[..., None] * around)
+    if not np.isfinite(target).all():
+        raise ValueError("ensemble: needs members with a finite covariance, got an overflow")
     root = _graded(target)
     # With P = K K' the anomalies times B are the nearest orthonormal columns to those times K,
     # times K': P comes out to rounding, however little C has left of it in some direction.

@@ -9,7 +9,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import Array
+from ..checks import Array, array, instance, same_length
 from ..network import Channel
 from ..sensors import Sensor
 
@@ -121,15 +121,40 @@ def gather(
     Without a channel nobody tells another. There is one entry for each number of readings that
     occurs, ascending; agents without any are left out.
     """
-    inbox = channel.exchange(observed) if channel is not None else [{} for _ in observed]
+    seen = _checked(observed, sensors)
+    inbox: list[dict[int, Array]] = [{} for _ in seen]
+    if channel is not None:
+        inbox = instance(channel, "channel", Channel).exchange(seen)
     known = []
-    for agent, (own, heard) in enumerate(zip(observed, inbox, strict=True)):
+    for agent, (own, heard) in enumerate(zip(seen, inbox, strict=True)):
         told = heard if own is None else {**heard, agent: own}
         known.append(dict(sorted(told.items())))
     return [
         Heard(plan.agents, plan.collected(known), plan.noise, plan.parts)
         for plan in _plans(tuple(tuple(k) for k in known), tuple(sensors))
     ]
+
+
+def _checked(
+    observed: Sequence[Array | None], sensors: Sequence[Sensor | None]
+) -> list[Array | None]:
+    """The observations, if each fits its sensor and all are of the same runs."""
+    same_length(observed, sensors, "observed", "sensors")
+    out: list[Array | None] = []
+    runs: tuple[int, ...] | None = None
+    for value, sensor in zip(observed, sensors, strict=True):
+        if value is None:
+            out.append(None)
+            continue
+        size = "m" if sensor is None else sensor.dim
+        seen = array(value, "observed", (..., size), finite=False)
+        runs = seen.shape[:-1] if runs is None else runs
+        if seen.shape[:-1] != runs:
+            raise ValueError(f"observed: needs shape {(*runs, size)}, got {seen.shape}")
+        if np.isinf(seen).any():
+            raise ValueError("observed: needs numbers or NaN, got infinity")
+        out.append(seen)
+    return out
 
 
 @dataclass(frozen=True, eq=False)

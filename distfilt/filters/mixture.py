@@ -128,6 +128,7 @@ class MixtureFilter(TeamFilter):
     names: Sequence[str] = ()
 
     def __post_init__(self) -> None:
+        same_length(self.sensors, self.models, "sensors", "models")
         object.__setattr__(self, "models", tuple(self.models))
         object.__setattr__(self, "sensors", tuple(self.sensors))
         count(len(self.models), "models")
@@ -135,7 +136,6 @@ class MixtureFilter(TeamFilter):
         for model in self.models:
             if instance(model, "models", Model).dim < n:
                 raise ValueError(f"models: needs at least {n} components, got {model.dim}")
-        same_length(self.sensors, self.models, "sensors", "models")
         for sensor in self.sensors:
             if sensor is not None and instance(sensor, "sensors", Sensor).uses_previous:
                 raise ValueError("sensors: needs sensors of the present state, got a differential")
@@ -177,13 +177,12 @@ class MixtureFilter(TeamFilter):
         """
         if runs != ():
             raise ValueError(f"runs: needs (), one run at a time, got {runs!r}")
-        beliefs = (prior,) if isinstance(prior, GaussianMixture) else tuple(prior)
-        if len(beliefs) != len(self.models):
-            raise ValueError(f"prior: needs {len(self.models)} mixtures, got {len(beliefs)}")
+        beliefs = (prior,) if isinstance(prior, GaussianMixture) else prior
+        same_length(beliefs, self.models, "prior", "models")
         for belief, model in zip(beliefs, self.models, strict=True):
             if instance(belief, "prior", GaussianMixture).dim != model.dim:
                 raise ValueError(f"prior: needs dimension {model.dim}, got {belief.dim}")
-        return MixtureState(number(t, "t"), Ledger.empty(len(beliefs)), None, beliefs)
+        return MixtureState(number(t, "t"), Ledger.empty(len(beliefs)), None, tuple(beliefs))
 
     def step(
         self, state: MixtureState, t: float, observations: Sequence[ArrayLike | None]

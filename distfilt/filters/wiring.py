@@ -177,7 +177,8 @@ class SensorFilter(TeamFilter):
 
         `sizes` are those of an agent's belief, where the filter says them.
         """
-        instance(state, "state", kind)
+        instance(state, "state", instance(kind, "kind", type))
+        instance(late, "late", Sequence)  # type: ignore[type-abstract]
         needed, got = (len(self.sensors), *sizes), state.belief.shape[len(state.runs) :]
         if got[: len(needed)] != needed:
             raise ValueError(f"state: needs {needed} for each run, got {got}")
@@ -195,6 +196,7 @@ class SensorFilter(TeamFilter):
 
         A sum of steps may differ by rounding, but by far less than the `shortest` of them.
         """
+        instance(item, "late", Late)
         away = [abs(t - item.measured) for t in times]
         slack = min(1e-9 * max(1.0, abs(item.measured)), 1e-3 * shortest)
         if not away or min(away) > slack:

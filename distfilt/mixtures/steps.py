@@ -120,6 +120,8 @@ def conditioned(
     instance(mixture, "mixture", GaussianMixture)
     y = array(observed, "observed", ("m",), finite=False)
     r = array(noise, "noise", (y.size, y.size))
+    callable_(function, "function")
+    callable_(residual, "residual")
     if gate is not None:
         number(gate, "gate", above=0)
     return _conditioned(mixture, y, function, r, residual, rule, gate, "observed")

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, choice, covariance
+from ..checks import Array, array, callable_, choice, covariance
 
 __all__ = ["POINT_RULES", "forecast", "update"]
 
@@ -22,6 +22,8 @@ POINT_RULES = ("dd2", "unscented")
 _LOG_2PI = float(np.log(2 * np.pi))
 _STEP = 3.0
 """Square of DD2's step."""
+_LARGEST = 1e150
+"""Entries of square roots have finite squares."""
 
 
 def forecast(
@@ -60,7 +62,9 @@ def forecast(
     m, s = _gaussians(means, factors)
     choice(rule, "rule", POINT_RULES)
     noise = array(noise_factor, "noise_factor", ("m", "k"))
-    mean, first, second = _differences(m, s, function, rule)
+    mean, first, second = _differences(m, s, callable_(function, "function"), rule)
+    if not (np.isfinite(mean).all() and np.isfinite(first).all() and np.isfinite(second).all()):
+        raise ValueError("function: needs finite values at the points, got NaN or an overflow")
     if noise.shape[0] != mean.shape[-1]:
         raise ValueError(f"noise_factor: needs {mean.shape[-1]} rows, got {noise.shape[0]}")
     spread = np.broadcast_to(noise, (*mean.shape[:-1], *noise.shape))
@@ -106,8 +110,8 @@ def update(
     choice(rule, "rule", POINT_RULES)
     y = array(observed, "observed", ("m",))
     r = np.linalg.cholesky(covariance(array(noise, "noise", (y.size, y.size)), "noise"))
-    gap = np.subtract if residual is None else residual
-    centre = np.asarray(function(m))
+    gap = np.subtract if residual is None else callable_(residual, "residual")
+    centre = np.asarray(callable_(function, "function")(m))
 
     def about(x: Array) -> Array:
         # Relative to the prediction at the mean, so that angles do not wrap between points.
@@ -136,6 +140,9 @@ def _gaussians(means: ArrayLike, factors: ArrayLike) -> tuple[Array, Array]:
     s = array(factors, "factors", (*m.shape, m.shape[-1]))
     if (np.abs(np.diagonal(s, axis1=-2, axis2=-1)) == 0).any():
         raise ValueError("factors: needs square roots of full rank, got a zero on a diagonal")
+    largest = float(np.abs(s).max(initial=0.0))
+    if largest > _LARGEST:
+        raise ValueError(f"factors: needs entries up to {_LARGEST:g}, got {largest:g}")
     return m, s
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..checks import Array, callable_, choice, count, number
 from .base import Sensor
-from .kinds import direct
+from .kinds import _variance, direct
 
 __all__ = ["ephemeris", "line_of_sight"]
 
@@ -45,7 +45,7 @@ def line_of_sight(
     >>> eye.predict(x).round(4) + 0.0
     array([-2.3562,  0.    ])
     """
-    noise = number(std, "std", above=0) ** 2 * np.eye(2)
+    noise = _variance(std, 2)
     choice(form, "form", ("arctan2", "printed"))
     places = (count(target, "target", at_least=0), count(observer, "observer", at_least=0))
     here, there = (slice(k, k + 3) for k in places)
@@ -89,7 +89,7 @@ def ephemeris(*, position_std: float, velocity_std: float, start: int = 0) -> Se
     >>> ephemeris(position_std=1e-3, velocity_std=1e-5).dim
     6
     """
-    stds = [number(position_std, "position_std", above=0)] * 3
-    stds += [number(velocity_std, "velocity_std", above=0)] * 3
+    stds = [number(position_std, "position_std", at_least=1e-150, at_most=1e150)] * 3
+    stds += [number(velocity_std, "velocity_std", at_least=1e-150, at_most=1e150)] * 3
     exact = direct(range(start, start + 6), std=1.0)
     return replace(exact, cov=np.diag(np.square(stds)), units=("km",) * 3 + ("m/s",) * 3)

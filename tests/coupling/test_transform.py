@@ -64,6 +64,7 @@ BAD_INPUT: dict[str, list[tuple[str, Callable[[], object]]]] = {
     _T + "second_order": [
         *_common(lambda x, w: second_order(x, x, w)),
         ("moved", lambda: second_order(_X[:2], _X, _W)),
+        ("ensemble", lambda: second_order(_X, 1e200 * _X, _W)),
     ],
     _T + "rejuvenated": [
         ("ensemble", lambda: rejuvenated(_X[:1], _X[:1], bandwidth=0.1, rng=_rng())),

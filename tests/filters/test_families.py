@@ -309,6 +309,15 @@ def test_late_readings_of_a_distance_in_a_network() -> None:
 
 START = {"rng": np.random.default_rng(0)}
 LINE: LinearModel = model()
+EYE = direct([0], std=1.0)
+
+
+def begun(**exchanged: object) -> object:
+    team, state = made("gaussian", agents=2)
+    given = {"kind": GaussianState, "late": ()} | exchanged
+    return team.begin(state, t=1.0, observations=[None, None], **given)
+
+
 BAD_INPUT = {
     "distfilt.filters.ensemble.EnsembleFilter": [
         ("update", lambda: EnsembleFilter(LINE, [None], update=3)),
@@ -380,6 +389,24 @@ BAD_INPUT = {
     ],
     "distfilt.filters.heard.gather": [
         ("sensors", lambda: gather([np.zeros(1), None], [None, None], Channel(graphs.path(2)))),
+        ("observed", lambda: gather(3.5, [EYE], None)),
+        ("observed", lambda: gather([[1.0], [1.0]], [EYE], None)),
+        ("observed", lambda: gather([np.zeros(1, "datetime64[s]")], [EYE], None)),
+        ("observed", lambda: gather([np.ma.masked_array([1.0], [True])], [EYE], None)),
+        ("observed", lambda: gather([np.zeros(2)], [EYE], None)),
+        ("observed", lambda: gather([np.array([np.inf])], [EYE], None)),
+        ("observed", lambda: gather([np.zeros((2, 1)), np.zeros((3, 1))], [EYE, EYE], None)),
+        ("channel", lambda: gather([np.zeros(1)], [EYE], "channel")),
+    ],
+    "distfilt.filters.wiring.SensorFilter.gather": [
+        ("observed", lambda: made("gaussian", agents=2)[0].gather([None], None)),
+        ("channel", lambda: made("gaussian", agents=2)[0].gather([None, None], 3.5)),
+    ],
+    "distfilt.filters.wiring.SensorFilter.begin": [
+        ("kind", lambda: begun(kind=3.5)),
+        ("kind", lambda: begun(kind="GaussianState")),
+        ("late", lambda: begun(late=3.5)),
+        ("late", lambda: begun(late="late")),
     ],
     "distfilt.filters.failures.guarded": [
         ("fallback", lambda: guarded(lambda x, s, r: (x[:, :1],), (np.zeros((2, 2)),),

@@ -33,6 +33,9 @@ BAD_INPUT = {
     "distfilt.filters.mixture.MixtureFilter": [
         ("models", lambda: MixtureFilter([], [], target_dim=1)),
         ("models", lambda: MixtureFilter([SMALL], [None], target_dim=3)),
+        ("models", lambda: MixtureFilter(2.0, [None], target_dim=1)),
+        ("models", lambda: MixtureFilter(SMALL, [None], target_dim=1)),
+        ("sensors", lambda: MixtureFilter([SMALL], 2.0, target_dim=1)),
         ("sensors", lambda: MixtureFilter([SMALL], [], target_dim=1)),
         ("sensors", lambda: MixtureFilter([SMALL], [3], target_dim=1)),
         ("graph", lambda: MixtureFilter([SMALL], [None], target_dim=1, agreement=fuse)),
@@ -49,6 +52,7 @@ BAD_INPUT = {
     "distfilt.filters.mixture.MixtureFilter.start": [
         ("prior", lambda: ONE.start([PRIOR, PRIOR])),
         ("prior", lambda: ONE.start([OTHER])),
+        ("prior", lambda: ONE.start(3.5)),
         ("runs", lambda: ONE.start([PRIOR], runs=(2,))),
     ],
     "distfilt.filters.mixture.MixtureFilter.step": [

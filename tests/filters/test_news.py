@@ -40,6 +40,8 @@ BAD_INPUT = {
         ("common", lambda: network(2, common=[2])),
         ("common", lambda: network(2, common=[-1])),
         ("most", lambda: network(2, size=3)),
+        ("models", lambda: NewsFilter(MODEL, [EYE], target_dim=2)),
+        ("sensors", lambda: NewsFilter([MODEL], EYE, target_dim=2)),
     ],
     "distfilt.filters.news.increment": [
         ("before", lambda: increment(3, PRIOR)),

@@ -56,12 +56,18 @@ BAD_INPUT = {
         ("factors", lambda: forecast([0.0, 0.0], np.eye(3), same, EYE)),
         ("noise_factor", lambda: forecast([0.0, 0.0], EYE, same, np.eye(3))),
         ("rule", lambda: forecast([0.0, 0.0], EYE, same, EYE, rule="cubature")),
+        ("function", lambda: forecast([0.0, 0.0], EYE, 3, EYE)),
+        ("function", lambda: forecast([0.0, 0.0], EYE, lambda x: np.nan * x, EYE)),
+        ("factors", lambda: forecast([0.0, 0.0], 1e151 * EYE, same, EYE)),
     ],
     "distfilt.mixtures.unscented.update": [
         ("observed", lambda: update([0.0, 0.0], EYE, 1.0, same, EYE)),
         ("noise", lambda: update([0.0, 0.0], EYE, [1.0, 1.0], same, -EYE)),
         ("factors", lambda: update([0.0, 0.0], np.zeros((2, 2)), [0.0, 0.0], same, EYE)),
         ("rule", lambda: update([0.0, 0.0], EYE, [0.0, 0.0], same, EYE, rule="cubature")),
+        ("function", lambda: update([0.0, 0.0], EYE, [0.0, 0.0], "same", EYE)),
+        ("residual", lambda: update([0.0, 0.0], EYE, [0.0, 0.0], same, EYE, residual=3)),
+        ("factors", lambda: update([0.0, 0.0], 1e300 * EYE, [0.0, 0.0], same, EYE)),
     ],
     "distfilt.mixtures.steps.split_stretched": [
         ("mixture", lambda: split_stretched(3, np.sin, most=3, stretch=1.0)),
@@ -72,6 +78,7 @@ BAD_INPUT = {
     "distfilt.mixtures.steps.moved": [
         ("mixture", lambda: moved(3, np.sin, np.eye(2))),
         ("noise_factor", lambda: moved(P, np.sin, np.eye(4))),
+        ("function", lambda: moved(P, 3, np.eye(3))),
         ("rule", lambda: moved(P, np.sin, np.eye(3), rule="best")),
     ],
     "distfilt.mixtures.steps.conditioned": [
@@ -79,6 +86,8 @@ BAD_INPUT = {
         ("observed", lambda: conditioned(P, 1.0, np.sin, np.eye(2))),
         ("observed", lambda: conditioned(P, [1.0], lambda x: x[..., :1] * np.nan, np.eye(1))),
         ("noise", lambda: conditioned(P, [1.0, 2.0], np.sin, np.eye(4))),
+        ("function", lambda: conditioned(P, [1.0], 3, np.eye(1))),
+        ("residual", lambda: conditioned(P, [1.0], np.sin, np.eye(1), residual=3)),
         ("gate", lambda: conditioned(P, [1.0, 2.0, 3.0], np.sin, np.eye(3), gate=0.0)),
     ],
 }

@@ -10,6 +10,7 @@ from distfilt.sensors import ephemeris, line_of_sight
 BAD_INPUT = {
     "distfilt.sensors.orbital.line_of_sight": [
         ("std", lambda: line_of_sight(std=0.0)),
+        ("std", lambda: line_of_sight(std=1e160)),
         ("form", lambda: line_of_sight(std=1.0, form="cosine")),
         ("target", lambda: line_of_sight(std=1.0, target=-3)),
         ("observer", lambda: line_of_sight(std=1.0, observer=0.5)),  # type: ignore[arg-type]
@@ -18,6 +19,8 @@ BAD_INPUT = {
     "distfilt.sensors.orbital.ephemeris": [
         ("position_std", lambda: ephemeris(position_std=0.0, velocity_std=1.0)),
         ("velocity_std", lambda: ephemeris(position_std=1.0, velocity_std=-1.0)),
+        ("position_std", lambda: ephemeris(position_std=1e160, velocity_std=1.0)),
+        ("velocity_std", lambda: ephemeris(position_std=1.0, velocity_std=1e-160)),
     ],
 }
 
