@@ -168,6 +168,3 @@ rtol = 1e-4
 # A run that has lost the swing multiplies the last bit until it decides, also whether OTNLeq
 # overflows: on three kinds of processor seven or eight of the hundred runs were other ones.
 odd = 10
-# The corrected members' covariance is nearly singular where they have collapsed, and roots of it
-# carry the last bit into their scores.
-rough = [name for name in columns if name.startswith("corrected")]
