@@ -101,7 +101,7 @@ def norm(indices: Sequence[int], *, length: float = 1.0) -> Constraint:
     array([0.])
     """
     rows = list(places(indices, "indices"))
-    size = number(length, "length", above=0)
+    size = number(length, "length", above=0, at_most=1e150)
 
     def squares(x: Array) -> Array:
         return np.asarray((x[..., rows] ** 2).sum(axis=-1, keepdims=True))

@@ -254,8 +254,9 @@ class TeamFilter(Filter):
         faults = self.faults
         if faults is not None and (not isinstance(faults, Faults) or faults.late):
             raise ValueError(f"faults: needs Faults without a delay, got {faults!r}")
-        if self.names and len(self.names) != self.count:
-            raise ValueError(f"names: needs {self.count} names, got {len(self.names)}")
+        names = instance(self.names, "names", Collection)  # type: ignore[type-abstract]
+        if len(names) not in (0, self.count):
+            raise ValueError(f"names: needs {self.count} names, got {len(names)}")
 
     def check_network(self) -> None:
         """The same, for a filter whose agents talk and agree on a graph, which may move."""

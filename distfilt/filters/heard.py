@@ -121,12 +121,18 @@ def gather(
     Without a channel nobody tells another. There is one entry for each number of readings that
     occurs, ascending; agents without any are left out.
     """
-    seen = _checked(observed, sensors)
-    inbox: list[dict[int, Array]] = [{} for _ in seen]
     if channel is not None:
-        inbox = instance(channel, "channel", Channel).exchange(seen)
+        instance(channel, "channel", Channel)
+    return gathered(_checked(observed, sensors), sensors, channel)
+
+
+def gathered(
+    observed: Sequence[Array | None], sensors: Sequence[Sensor | None], channel: Channel | None
+) -> list[Heard]:
+    """The same without checks, for a step that has made them."""
+    inbox = channel.exchange(observed) if channel is not None else [{} for _ in observed]
     known = []
-    for agent, (own, heard) in enumerate(zip(seen, inbox, strict=True)):
+    for agent, (own, heard) in enumerate(zip(observed, inbox, strict=True)):
         told = heard if own is None else {**heard, agent: own}
         known.append(dict(sorted(told.items())))
     return [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
@@ -108,6 +108,7 @@ class NewsFilter(MixtureFilter):
         if self.graph is None:
             raise ValueError("graph: needs a Graph, got None")
         least = min((s.dim for s in self.sensors if s is not None), default=0)
+        instance(self.common, "common", Collection)  # type: ignore[type-abstract]
         alike = tuple(count(k, "common", at_least=0) for k in self.common)
         if alike and max(alike) >= least:
             raise ValueError(f"common: needs components below {least}, got {max(alike)}")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..checks import Array, array
 from ..network import Channel, Ledger
 from .failures import FilterError, not_finite
-from .heard import Heard
+from .heard import Heard, gathered
 from .saving import State
 from .streams import bookmarked
 
@@ -159,9 +159,9 @@ class Step:
 
         A target is NaN in failed runs, so that they are left alone. If not `shared`, nobody speaks.
         """
-        channel = self.channel if shared else None
+        channel = self.channel if shared and self.filter.share else None
         for place, observed in self.readings:
-            for group in self.filter.gather(observed, channel):
+            for group in gathered(observed, self.filter.sensors, channel):
                 if self.failed.any():
                     group = replace(group, target=self.kept(group.target, np.nan))
                 yield place, group

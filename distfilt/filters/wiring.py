@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import KW_ONLY, dataclass
 from itertools import pairwise
 from typing import Any, TypeVar
@@ -116,6 +116,7 @@ class SensorFilter(TeamFilter):
 
     def leading(self, runs: tuple[int, ...], sets: int | None = None) -> tuple[int, ...]:
         """Leading axes (*runs, A); with `sets` there are so many of them in the agents' place."""
+        instance(runs, "runs", Collection)  # type: ignore[type-abstract]
         return (*(count(n, "runs") for n in runs), len(self.sensors) if sets is None else sets)
 
     def first(
@@ -166,7 +167,17 @@ class SensorFilter(TeamFilter):
         return at_one_time(observations, self.sensors, state.runs)
 
     def gather(self, observed: Sequence[Array | None], channel: Channel | None) -> list[Heard]:
-        """What every agent knows of the observations once they are shared."""
+        """What every agent knows of the observations once they are shared.
+
+        Examples
+        --------
+        >>> from distfilt.filters import GaussianFilter
+        >>> from distfilt.models import constant_velocity
+        >>> from distfilt.sensors import direct
+        >>> f = GaussianFilter(constant_velocity(sigma=0.1), [direct([0], std=1.0)])
+        >>> [group.target.tolist() for group in f.gather([np.array([1.5])], None)]
+        [[[1.5]]]
+        """
         return gather(observed, self.sensors, channel if self.share else None)
 
     def begin(

@@ -41,7 +41,7 @@ def mobility_and_diffusion(reading: str, strength: float = 0.03) -> tuple[float,
     >>> mobility_and_diffusion("literal")
     (0.03, 0.00045)
     """
-    s = number(strength, "strength", above=0)
+    s = number(strength, "strength", above=0, at_most=1e150)
     small = s**2 / 2
     choice(reading, "reading", READINGS)
     return (small if reading == "slowgibbs" else s), (s if reading == "gibbs" else small)

@@ -150,6 +150,8 @@ def angle(
     """
     picked = _indices(indices, 2)
     place = _place(origin, 2)
+    if not isinstance(full, bool):
+        raise ValueError(f"full: needs True or False, got {full!r}")
     period = 2 * np.pi if full else np.pi
 
     def function(x: Array) -> Array:

@@ -91,5 +91,6 @@ def ephemeris(*, position_std: float, velocity_std: float, start: int = 0) -> Se
     """
     stds = [number(position_std, "position_std", at_least=1e-150, at_most=1e150)] * 3
     stds += [number(velocity_std, "velocity_std", at_least=1e-150, at_most=1e150)] * 3
-    exact = direct(range(start, start + 6), std=1.0)
+    first = count(start, "start", at_least=0)
+    exact = direct(range(first, first + 6), std=1.0)
     return replace(exact, cov=np.diag(np.square(stds)), units=("km",) * 3 + ("m/s",) * 3)

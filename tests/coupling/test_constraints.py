@@ -52,6 +52,7 @@ BAD_INPUT: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("indices", lambda: norm([0, 0])),
         ("indices", lambda: norm([-1])),
         ("indices", lambda: norm([0.5])),
+        ("length", lambda: norm([0, 1], length=1e200)),
         ("length", lambda: norm([0], length=0.0)),
     ],
     _C + "project": [

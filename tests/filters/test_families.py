@@ -336,6 +336,8 @@ BAD_INPUT = {
     "distfilt.filters.gaussian.GaussianFilter": [
         ("rule", lambda: GaussianFilter(LINE, [None], rule="cubature")),
         ("kappa", lambda: GaussianFilter(LINE, [None], kappa=-1)),
+        ("names", lambda: GaussianFilter(LINE, [None], names=3.5)),
+        ("runs", lambda: GaussianFilter(LINE, [None]).start(PRIOR, runs=3.5)),
         ("agreement", lambda: made("gaussian", agents=2, agreement=lambda m, p, channel: (m,))[0]
             .step(made("gaussian", agents=2)[1], 0.5, [None, None])),
         ("prior", lambda: GaussianFilter(LINE, [None]).start(np.zeros(2))),

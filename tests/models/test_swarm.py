@@ -179,6 +179,7 @@ BAD_INPUT = {
     "distfilt.models.swarm.mobility_and_diffusion": [
         ("reading", lambda: mobility_and_diffusion("quick")),
         ("strength", lambda: mobility_and_diffusion("gibbs", 0.0)),
+        ("strength", lambda: mobility_and_diffusion("gibbs", 1e200)),
     ],
     "distfilt.models.swarm.rotating_swarm": [
         ("reading", lambda: rotating_swarm("quick")),

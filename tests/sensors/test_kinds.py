@@ -33,6 +33,7 @@ BAD_INPUT = {
         ("indices", lambda: angle([0], std=0.1)),
         ("std", lambda: angle([0, 1], std=-0.1)),
         ("origin", lambda: angle([0, 1], std=0.1, origin=[1.0])),
+        ("full", lambda: angle([0, 1], std=0.1, full="no")),
     ],
     _K + "differential": [
         ("std", lambda: differential([0], std=0.0)),

@@ -20,6 +20,8 @@ BAD_INPUT = {
         ("position_std", lambda: ephemeris(position_std=0.0, velocity_std=1.0)),
         ("velocity_std", lambda: ephemeris(position_std=1.0, velocity_std=-1.0)),
         ("position_std", lambda: ephemeris(position_std=1e160, velocity_std=1.0)),
+        ("start", lambda: ephemeris(position_std=1.0, velocity_std=1.0, start=0.5)),
+        ("start", lambda: ephemeris(position_std=1.0, velocity_std=1.0, start=True)),
         ("velocity_std", lambda: ephemeris(position_std=1.0, velocity_std=1e-160)),
     ],
 }
