@@ -13,6 +13,9 @@ from .linalg import _EPS, _cholesky, _leading, _solve_upper, _symmetrise, factor
 
 __all__ = ["anomalies", "cross_covariance", "draw", "exact_noise", "mean", "sample_covariance"]
 
+_CLOSE = 1e-6
+"""The share of a unit column beside others below which singular values say if it is one more."""
+
 
 def _ensemble(value: ArrayLike, name: str, members: int = 1) -> Array:
     out = array(value, name, (..., "N", "d"))
@@ -197,7 +200,7 @@ def _projected(drawn: Array, avoid: Array) -> Array:
     unit = centred / np.where(size > 0, size, 1.0)
     constant = np.full((*unit.shape[:-1], 1), n**-0.5)
     rank = drawn.shape[-1]
-    frame, independent = _frame(np.concatenate([constant, unit], axis=-1), n - rank)
+    frame, independent = _frame(np.concatenate([constant, unit], axis=-1))
     independent -= 1
     if n <= independent + rank:
         raise ValueError(
@@ -209,19 +212,16 @@ def _projected(drawn: Array, avoid: Array) -> Array:
     return drawn
 
 
-def _frame(columns: Array, most: int) -> tuple[Array, int]:
-    """Orthonormal columns, or zeros, that span unit columns (..., n, p), and the largest rank.
-
-    Where columns depend on each other only to rounding, the rank may be too large, but not
-    needlessly above `most`.
-    """
+def _frame(columns: Array) -> tuple[Array, int]:
+    """Orthonormal columns, or zeros, that span unit columns (..., n, p), and the largest rank."""
     tiny = columns.shape[-2] * _EPS
     q, r = np.linalg.qr(columns)
     # Columns that repeat earlier ones, as linear predictions do, leave rows of zeros at the end.
     good = np.abs(r).max(axis=-1) > tiny
-    pivots = np.abs(np.diagonal(r, axis1=-2, axis2=-1)) > tiny
-    if (good != pivots).any() or good.sum(axis=-1).max(initial=0) > most:
-        # A pivot of what depends on close columns is rounding times their closeness.
+    pivots = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
+    # A small pivot may be rounding, magnified by columns that are close to one another: to avoid
+    # its direction would cost a member, and would leave the draw to the last bit.
+    if (good != (pivots > tiny)).any() or ((pivots > tiny) & (pivots < _CLOSE)).any():
         u, values, _ = np.linalg.svd(r, full_matrices=False)
         good = values > tiny * values.max(axis=-1, initial=0.0, keepdims=True)
         q = q @ u

@@ -165,6 +165,17 @@ def test_exact_noise_beside_combinations_of_close_anomalies() -> None:
         _exact(both, FULL, exact_noise(both, FULL, rng=rng))
 
 
+def test_exact_noise_does_not_turn_with_the_last_bit() -> None:
+    """Combinations of close anomalies leave no direction that only rounding has."""
+    for seed in range(300):
+        rng = generator(seed)
+        x = rng.standard_normal((10, 4))
+        x[:, 1:] = x[:, :1] + 1e-2 * x[:, 1:]
+        both = np.concatenate([x, x @ rng.standard_normal((4, 2))], axis=-1)
+        alone, beside = (exact_noise(a, FULL, rng=generator(1)) for a in (x, both))
+        assert np.abs(alone - beside).max() < 1e-6
+
+
 def test_exact_noise_says_how_many_members_it_needs() -> None:
     x = generator(7).standard_normal((9, 4))
     assert exact_noise(x[:8], FULL, rng=generator()).shape == (8, 3)
