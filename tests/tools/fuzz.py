@@ -26,6 +26,7 @@ import io
 import os
 import pkgutil
 import re
+import runpy
 import signal
 import sys
 import tempfile
@@ -107,6 +108,15 @@ def public(room: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def complete(bound: inspect.BoundArguments) -> inspect.BoundArguments:
+    """The arguments with those that the call left at their defaults, but for made defaults."""
+    for name, parameter in bound.signature.parameters.items():
+        made = type(parameter.default).__module__ == "dataclasses"
+        if parameter.default is not parameter.empty and not made:
+            bound.arguments.setdefault(name, parameter.default)
+    return bound
+
+
 class Recorder:
     """Keeps a copy of the arguments of every call that an example makes itself."""
 
@@ -130,7 +140,7 @@ class Recorder:
                 out = function(*args, **options)
                 with suppress(Exception):
                     called = target or inner
-                    bound = inspect.signature(called).bind(*kept[0], **kept[1])
+                    bound = complete(inspect.signature(called).bind(*kept[0], **kept[1]))
                     self.calls.setdefault(name, []).append(Call(name, called, bound))
                 return out
             finally:
@@ -188,6 +198,10 @@ def recorded(chosen: list[str]) -> dict[str, list[Call]]:
                 with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
                     runner.run(test, out=lambda _: None)
                 recorder.inside = 1
+    recorder.inside = 0
+    for extra in sorted(Path(__file__).parent.glob("fuzz_calls_*.py")):
+        runpy.run_path(str(extra))  # valid calls that no doctest makes
+    recorder.inside = 1
     return {
         name: varied(calls) for name, calls in sorted(recorder.calls.items())
         if name.partition(".")[0] in chosen
