@@ -2,14 +2,14 @@
 
     python tests/tools/fuzz.py [--dry] [room …]
 
-The valid calls are those of the doctests: the examples run once with every public function, class
-and method recorded. Then each argument of each recorded call is exchanged, one at a time, for
-values of other types, shapes and sizes, the same ones each time. A value that means the same (a
-list, Fortran order, read-only memory) has to give the same result. One that means nothing (dates,
-complex numbers, masked arrays, text) has to be refused by an error that names the argument. Any
-other is refused by an error that names an argument or what was computed from it, or gives a result
-without NaN. No call may change its arguments. What is otherwise stands in ``ALLOWED`` with the
-reason.
+The valid calls are those of the doctests and of ``fuzz_calls_*.py`` beside this file: they run once
+with every public function, class and method recorded, and their defaults filled in. Then each
+argument of each recorded call is exchanged, one at a time, for values of other types, shapes and
+sizes, the same ones each time. A value that means the same (a list, Fortran order, read-only
+memory) has to give the same result. One that means nothing (dates, complex numbers, masked arrays,
+text) has to be refused by an error that names the argument. Any other is refused by an error that
+names an argument or what was computed from it, or gives a result without NaN. No call may change
+its arguments. What is otherwise stands in ``ALLOWED`` with the reason.
 
 Writes ``data/bench/fuzz.csv``, a line a room with the counts, unless ``--dry``.
 """
@@ -199,8 +199,9 @@ def recorded(chosen: list[str]) -> dict[str, list[Call]]:
                     runner.run(test, out=lambda _: None)
                 recorder.inside = 1
     recorder.inside = 0
-    for extra in sorted(Path(__file__).parent.glob("fuzz_calls_*.py")):
-        runpy.run_path(str(extra))  # valid calls that no doctest makes
+    with quiet():
+        for extra in sorted(Path(__file__).parent.glob("fuzz_calls_*.py")):
+            runpy.run_path(str(extra))  # valid calls that no doctest makes
     recorder.inside = 1
     return {
         name: varied(calls) for name, calls in sorted(recorder.calls.items())
