@@ -158,6 +158,8 @@ class Faults:
         """Which links lose the message of round `round_` in each of `runs` runs, (runs, E)."""
         instance(graph, "graph", Graph)
         round_ = count(round_, "round_", at_least=0)
+        if t is not None:
+            number(t, "t")
         out = np.zeros((count(runs, "runs", at_least=0), graph.senders.size), dtype=bool)
         for faults in self._all():
             if np.any(faults.loss) and faults._active(round_, t):

@@ -483,13 +483,14 @@ def findings(calls: dict[str, list[Call]]) -> Iterator[Finding]:
 
 GOOD = {"refused", "same", "finite"}
 RECORDS = (
-    r"filters\.(\w+State|Summary|Late)|density\.(Dense|LowRank|Separate|Shared|PIConsensus|Flooding)"
+    r"filters\.Summary|density\.(Dense|LowRank|Separate|Shared|PIConsensus|Flooding)"
     r"|network\.(Ledger|PIState|AdmmRun)|triangular\.(affine\.AffineMap|separable\.SeparableMap)"
-    r"|studies\.\w+|published\.(Parameter|accepted)|progress\.track|mixtures\.Shapes"
+    r"|published\.(Parameter|Table|accepted)|progress\.track|mixtures\.Shapes"
 )
 ALLOWED: dict[tuple[str, str, str], str] = {
     (r"checks\..*", r".*", r".*"): "the words of the check itself, which the library writes",
-    (rf"({RECORDS})(\.\w+)?", r".*", r".*"): "made by the library, looked at by who takes it",
+    (rf"({RECORDS})(\.\w+)?|studies\.(Failure|Stored|Study)|filters\.\w*State", r".*", r".*"):
+        "made by the library, looked at by who takes it",
     (r"density\.Flooding\..*|models\.Swarm\..*_at|updates\.with_missing", r".*", r".*"):
         "called in every step by the filter that has checked its arguments",
     (r"filters\.\w+Filter(\.exact)?", "sensors", "with None: taken"): "an agent without a sensor",
@@ -499,14 +500,21 @@ ALLOWED: dict[tuple[str, str, str], str] = {
         "a user's function that overflows",
     (r"sensors\.Sensor\.predict", "x", r"(tiny|zero): NaN"): "a direction to where the sensor is",
     (r"network\.pi_step", "dt", "huge: too long"): "as many substeps as are stable",
-    (r"sensors\.Sensor.*|coupling\.augmented_readings|filters\.SensorFilter\.gather", r".*",
+    (r"sensors\.Sensor.*|coupling\.augmented_readings|filters\.\w+Filter\.(gather|series)", r".*",
      r"(all )?NaN: NaN"):
         "a reading that is missing",
     (r"network\.average", "gain", "huge: NaN"): "an iteration that diverges, with a warning before",
-    (r".*", r"rounds|iterations|members", "huge: too long"): "as many rounds as were asked for",
+    (r".*", r"rounds|iterations|members|substeps", "huge: too long"):
+        "as many rounds as were asked for",
     (r"kalman\.filterpy_\w+|coupling\..*|network\..*|triangular\..*|updates\..*", r".*",
      r"(huge|empty last|shorter last|ragged): unnamed"):
         "states without components, or an overflow, refused in another package's words",
+    (r"filters\.(Step\.(?!heard)\w+|SensorState\.shown)", r".*", r".*"):
+        "called in every step by a family of filters, which made the arguments",
+    (r"filters\.(Filter\.series|SensorFilter\.observed)", "observations", "with None: taken"):
+        "looked at by the step that takes it, or nothing observed",
+    (r"studies\.check", "workers", "None: taken"): "one for each core",
+    (r"studies\.spawn", "n", "huge: too long"): "as many seeds as were asked for",
     (r"network\.Channel\.\w+", "payloads", "with None: taken"): "an agent that is silent",
 }
 """(callable, argument, kind and result) as patterns to the reason why it may be so."""
