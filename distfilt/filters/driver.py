@@ -56,7 +56,8 @@ class Late:
         count(self.agent, "agent", at_least=0)
         number(self.measured, "measured")
         number(self.arrived, "arrived", above=self.measured)
-        array(self.value, "value", (..., "m"), finite=False)
+        value = array(self.value, "value", (..., "m"), finite=False).copy()
+        object.__setattr__(self, "value", value)
 
 
 @dataclass(frozen=True, eq=False)

@@ -110,8 +110,8 @@ class SensorFilter(TeamFilter):
 
     def series(self, observations: Any, times: Array) -> Sequence[Any]:
         """Per time the agents' observations, from per agent their series (T, *runs, m)."""
-        _, series = over_times(observations, self.sensors, times)
-        return [[None if o is None else o[k] for o in series] for k in range(times.size)]
+        grid, series = over_times(observations, self.sensors, times)
+        return [[None if o is None else o[k] for o in series] for k in range(grid.size)]
 
     def leading(self, runs: tuple[int, ...], sets: int | None = None) -> tuple[int, ...]:
         """Leading axes (*runs, A); with `sets` there are so many of them in the agents' place."""

@@ -500,8 +500,8 @@ ALLOWED: dict[tuple[str, str, str], str] = {
         "a user's function that overflows",
     (r"sensors\.Sensor\.predict", "x", r"(tiny|zero): NaN"): "a direction to where the sensor is",
     (r"network\.pi_step", "dt", "huge: too long"): "as many substeps as are stable",
-    (r"sensors\.Sensor.*|coupling\.augmented_readings|filters\.\w+Filter\.(gather|series)", r".*",
-     r"(all )?NaN: NaN"):
+    (r"sensors\.Sensor.*|coupling\.augmented_readings|filters\.(Late|\w+\.gather|\w+\.series)",
+     r".*", r"(all )?NaN: NaN"):
         "a reading that is missing",
     (r"network\.average", "gain", "huge: NaN"): "an iteration that diverges, with a warning before",
     (r".*", r"rounds|iterations|members|substeps", "huge: too long"):
@@ -513,6 +513,7 @@ ALLOWED: dict[tuple[str, str, str], str] = {
         "called in every step by a family of filters, which made the arguments",
     (r"filters\.(Filter\.series|SensorFilter\.observed)", "observations", "with None: taken"):
         "looked at by the step that takes it, or nothing observed",
+    (r"sensors\.Sensor\.matrix", "dim", "huge: unnamed"): "numpy refuses such a size itself",
     (r"studies\.check", "workers", "None: taken"): "one for each core",
     (r"studies\.spawn", "n", "huge: too long"): "as many seeds as were asked for",
     (r"network\.Channel\.\w+", "payloads", "with None: taken"): "an agent that is silent",
