@@ -257,7 +257,7 @@ def retract(
     return _retract(x, g, pair, least, most)
 
 
-def _motion(motion: Motion, dim: int) -> Motion:
+def _motion(motion: Motion, dim: float = np.inf) -> Motion:
     if not isinstance(motion, tuple) or len(motion) != 2 or len(motion[0]) != len(motion[1]):
         raise ValueError(f"motion: needs two lists of indices of one length, got {motion!r}")
     found = [count(i, "motion", at_least=0) for part in motion for i in part]

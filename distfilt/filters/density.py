@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, choice, count, instance, number, places
+from ..checks import Array, array, choice, count, increasing, instance, number, places
 from ..density import FokkerPlanck, Separate, Shared, Sharing, zero_mean_prior
 from ..density.forms import filters_start, filters_step
 from ..density.kernel import _width
@@ -156,7 +156,7 @@ class DensityFilter(TeamFilter):
         if not callable(self.graph) and not isinstance(self.graph, Graph):
             number(self.graph, "graph", above=0)
         instance(self.sharing, "sharing", Sharing)  # type: ignore[type-abstract]
-        for name in ("bandwidth", "first_std", "floor"):
+        for name in ("bandwidth", "first_std", "floor", "prior_length", "prior_std"):
             number(getattr(self, name), name, above=0)
         _width(self.bandwidth, self.model.grid, 1)
         if self.local is not None:
@@ -190,7 +190,7 @@ class DensityFilter(TeamFilter):
 
     def series(self, observations: Any, times: Array) -> Sequence[Any]:
         """Per time the agents' positions, from (T, A, d); NaN rows are agents that have gone."""
-        shape = times.size, self.size, self.model.grid.dim
+        shape = increasing(times, "times").size, self.size, self.model.grid.dim
         return list(array(observations, "observations", shape, finite=False))
 
     def start(
@@ -210,8 +210,7 @@ class DensityFilter(TeamFilter):
         t : float
             In s.
         """
-        if runs:
-            raise ValueError(f"runs: needs (), as every run has a graph of its own, got {runs}")
+        self.check_alone(rng, runs)
         seen = self._seen(prior, "prior", number(t, "t"))
         here = self.filtering
         filters = filters_start(self._basis, self._base(seen)[here], exact=self.process is None)
@@ -256,7 +255,7 @@ class DensityFilter(TeamFilter):
             Has to be empty: a swarm's positions cannot be taken in afterwards.
         """
         instance(state, "state", DensityState)
-        if late:
+        if instance(late, "late", Sequence):  # type: ignore[type-abstract]
             raise ValueError(f"late: needs none, as positions are of now, got {len(late)}")
         dt = number(t, "t", above=state.t) - state.t
         seen = self._seen(observations, "observations", float(t))
@@ -287,6 +286,7 @@ class DensityFilter(TeamFilter):
         ``parts`` is the number of parts of the network, ``counted`` how many agents each believes
         in, ``mass`` the estimate's integral.
         """
+        instance(state, "state", DensityState)
         n, here = self.model.grid.size, self.filtering
         mean, variance = (np.full((self.size, n), np.nan) for _ in range(2))
         mean[here], variance[here] = state.estimates, state.variances

@@ -6,13 +6,14 @@ Nothing here assumes one array for all agents, equal states, or readings of sens
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Mapping, Sequence, Sized
+from dataclasses import dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, callable_, count, increasing, instance, number
+from ..checks import Array, array, callable_, count, generator, increasing, instance, number
 from ..models import Model
 from ..network import Channel, Faults, Graph
 from ..progress import track
@@ -55,7 +56,8 @@ class Late:
         count(self.agent, "agent", at_least=0)
         number(self.measured, "measured")
         number(self.arrived, "arrived", above=self.measured)
-        array(self.value, "value", (..., "m"), finite=False)
+        value = array(self.value, "value", (..., "m"), finite=False).copy()
+        object.__setattr__(self, "value", value)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +112,7 @@ class Filter(ABC):
 
     def past(self, state: Any) -> tuple[tuple[float, Summary], ...]:
         """Earlier times that the state keeps, oldest first, and what is believed of them by now."""
+        instance(state, "state", State)
         return ()
 
     @property
@@ -128,10 +131,10 @@ class Filter(ABC):
         Here `observations` has one entry for each time; filters that read sensors take one series
         for each agent instead.
         """
-        if len(observations) != times.size:
-            raise ValueError(
-                f"observations: needs one for each time ({times.size}), got {len(observations)}"
-            )
+        size = increasing(times, "times").size
+        if not isinstance(observations, Sequence | np.ndarray) or len(observations) != size:
+            got = len(observations) if isinstance(observations, Sized) else repr(observations)
+            raise ValueError(f"observations: needs one for each time ({size}), got {got}")
         return list(observations)
 
     def steps(
@@ -139,9 +142,11 @@ class Filter(ABC):
         progress: bool = False,
     ) -> Iterator[Any]:
         """The states at `times`, one after the other; arguments as in :meth:`run`."""
+        instance(state, "state", State)
         grid = increasing(times, "times")
         series = self.series(observations, grid)
-        waiting = sorted(late, key=lambda item: item.arrived)
+        waiting = _waiting(late)
+        instance(progress, "progress", bool)
         if waiting and (not grid.size or waiting[-1].arrived > grid[-1]):
             end = f"{grid[-1]:g}" if grid.size else "no time at all"
             raise ValueError(f"late: needs arrivals up to {end}, got {waiting[-1].arrived:g}")
@@ -186,6 +191,7 @@ class Filter(ABC):
             and ``rounds`` are those of each step, the same names with ``_total`` their sums.
             :func:`final_state` gives the state at the end.
         """
+        instance(state, "state", State)
         grid = increasing(times, "times")
         recorder = Recorder(self, grid, state, truth, scores)
         last = state
@@ -202,6 +208,7 @@ class Filter(ABC):
         Parameters and result are those of :meth:`run`. The filter needs a `lag`; near the end
         fewer times follow, and the last estimate is the filter's.
         """
+        instance(state, "state", State)
         grid = increasing(times, "times")
         recorder = Recorder(self, grid, state, truth, scores)
         waiting: list[tuple[Any, Summary]] = []
@@ -217,6 +224,12 @@ class Filter(ABC):
         for then, summary in waiting:
             recorder.add(then, summary)
         return recorder.dataset(last)
+
+
+def _waiting(late: Any) -> list[Late]:
+    """Late observations by their arrival."""
+    instance(late, "late", Sequence)  # type: ignore[type-abstract]
+    return sorted((instance(item, "late", Late) for item in late), key=lambda item: item.arrived)
 
 
 class TeamFilter(Filter):
@@ -247,16 +260,28 @@ class TeamFilter(Filter):
         return tuple(self.names) or tuple(str(k) for k in range(self.count))
 
     def check_team(self) -> None:
-        """Refuse names that are not one for each agent, and faults with a delay.
+        """Refuse names that are not one for each agent, faults with a delay, and no flags.
 
-        A step's messages arrive within it or never.
+        A step's messages arrive within it or never. A family's flags are its fields that are True
+        or False by default.
         """
+        for option in fields(self):  # type: ignore[arg-type]
+            if isinstance(option.default, bool):
+                instance(getattr(self, option.name), option.name, bool)
         faults = self.faults
         if faults is not None and (not isinstance(faults, Faults) or faults.late):
             raise ValueError(f"faults: needs Faults without a delay, got {faults!r}")
         names = instance(self.names, "names", Collection)  # type: ignore[type-abstract]
         if len(names) not in (0, self.count):
             raise ValueError(f"names: needs {self.count} names, got {len(names)}")
+
+    @staticmethod
+    def check_alone(rng: Any, runs: Any) -> None:
+        """Refuse runs, for a filter that takes one at a time and draws nothing."""
+        if rng is not None:
+            generator(rng)
+        if runs != ():
+            raise ValueError(f"runs: needs (), one run at a time, got {runs!r}")
 
     def check_network(self) -> None:
         """The same, for a filter whose agents talk and agree on a graph, which may move."""
@@ -305,7 +330,7 @@ def final_state(run: xarray.Dataset) -> State:
     Traceback (most recent call last):
     ValueError: run: needs the Dataset that a filter's run returned, got one without a state
     """
-    state = run.encoding.get("final_state")
+    state = getattr(run, "encoding", {}).get("final_state")
     if not isinstance(state, State):
         raise ValueError(
             "run: needs the Dataset that a filter's run returned, got one without a state"

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .. import ensembles as moments
-from ..checks import Array, array, callable_, count, generator
+from ..checks import Array, array, callable_, count, generator, instance
 from ..models import Model
 from ..network import Graph, intersection
 from ..sensors import Sensor
@@ -265,7 +265,7 @@ class EnsembleFilter(SensorFilter):
 
 def ensemble_summary(state: EnsembleState) -> Summary:
     """Means and variances of the agents' ensembles, and the members for the scores."""
-    x = state.ensembles
+    x = instance(state, "state", EnsembleState).ensembles
     squares = moments.mean(moments.anomalies(x) ** 2)
     variance = squares * state.members / (state.members - 1)
     return Summary(state.shown(moments.mean(x)), state.shown(variance), members=x)

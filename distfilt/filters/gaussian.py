@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, choice, count, covariance, number
+from ..checks import Array, array, choice, count, covariance, instance, number
 from ..linalg import _symmetrise
 from .driver import Late, Summary
 from .failures import guarded
@@ -141,7 +141,7 @@ class GaussianFilter(SensorFilter):
         """
         lead, both = self.leading(runs), self.moments(prior)
         m, p = (np.broadcast_to(x, (*lead, *x.shape)).copy() for x in both)
-        return self.first(GaussianState, t, None, m, p, self.model.dim)
+        return self.first(GaussianState, t, rng, m, p, self.model.dim, draws=False)
 
     def step(
         self, state: GaussianState, t: float, observations: Sequence[ArrayLike | None], *,
@@ -168,7 +168,7 @@ class GaussianFilter(SensorFilter):
 
     def summary(self, state: GaussianState) -> Summary:
         """Means and covariances of the present state."""
-        cov = state.shown(state.covariances)
+        cov = instance(state, "state", GaussianState).shown(state.covariances)
         return Summary(state.shown(state.means), np.diagonal(cov, axis1=-2, axis2=-1), cov)
 
     def _forecast(self, state: GaussianState, dt: float, kept: int) -> tuple[Array, Array]:

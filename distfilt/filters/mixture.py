@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, choice, count, instance, number, same_length
+from ..checks import Array, array, choice, count, instance, number, same_length
 from ..mixtures import GaussianMixture, moved, split_stretched, two_stage
 from ..mixtures.gaussian import definite, trusted
 from ..mixtures.steps import _conditioned
@@ -136,6 +136,9 @@ class MixtureFilter(TeamFilter):
         for model in self.models:
             if instance(model, "models", Model).dim < n:
                 raise ValueError(f"models: needs at least {n} components, got {model.dim}")
+            if self.scale is not None:
+                scale = array(self.scale, "scale", (model.dim,)).copy()
+                object.__setattr__(self, "scale", scale)
         for sensor in self.sensors:
             if sensor is not None and instance(sensor, "sensors", Sensor).uses_previous:
                 raise ValueError("sensors: needs sensors of the present state, got a differential")
@@ -175,8 +178,7 @@ class MixtureFilter(TeamFilter):
         t : float
             The time of the prior, in s.
         """
-        if runs != ():
-            raise ValueError(f"runs: needs (), one run at a time, got {runs!r}")
+        self.check_alone(rng, runs)
         beliefs = (prior,) if isinstance(prior, GaussianMixture) else prior
         same_length(beliefs, self.models, "prior", "models")
         for belief, model in zip(beliefs, self.models, strict=True):
@@ -219,7 +221,7 @@ class MixtureFilter(TeamFilter):
         d = max(model.dim for model in self.models)
         mean = np.full((len(self.models), d), np.nan)
         cov = np.full((len(self.models), d, d), np.nan)
-        for k, belief in enumerate(state.mixtures):
+        for k, belief in enumerate(instance(state, "state", MixtureState).mixtures):
             n = belief.dim
             mean[k, :n], cov[k, :n, :n] = belief.moments()
         sizes = np.array([belief.size for belief in state.mixtures], dtype=np.float64)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, choice
+from ..checks import Array, array, choice, instance
 from ..metrics import crps, ensemble_nees, gaussian_crps, nees
 
 if TYPE_CHECKING:
@@ -51,7 +51,8 @@ class Recorder:
     ) -> None:
         self.filter, self.times = filter_, times
         self.runs: tuple[int, ...] = tuple(start.runs)
-        self.scores = [choice(s, "scores", SCORES) for s in scores]
+        chosen = instance(scores, "scores", Collection)  # type: ignore[type-abstract]
+        self.scores = [choice(s, "scores", SCORES) for s in chosen]
         self.ledgers = [start.ledger]
         self.columns: dict[str, list[Array]] = {}
         self.truth: Array | None = None

@@ -66,7 +66,7 @@ class State:
 
         The file appears whole or not at all: a full disk leaves an earlier one as it was.
         """
-        target = Path(path)
+        target = _path(path)
         arrays: list[Any] = []
         header = {"format": _FORMAT, "kind": _name(type(self)), "state": _encoded(self, arrays)}
         parts = {f"a{k}": a for k, a in enumerate(arrays)}
@@ -92,8 +92,9 @@ class State:
         ValueError
             If the file is no saved state of this kind, or is damaged.
         """
+        source = _path(path)
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with np.load(source, allow_pickle=False) as file:
                 parts = {name: file[name] for name in file.files}
             header = json.loads(str(parts["header"]))
             if header["format"] != _FORMAT or header["kind"] != _name(cls):
@@ -106,6 +107,15 @@ class State:
             IndexError, zipfile.BadZipFile,
         ) as error:
             raise ValueError(f"path: needs a saved {cls.__name__}, got {path}: {error}") from None
+
+
+def _path(path: Any) -> Path:
+    """A path that names a file."""
+    if not isinstance(path, str | PathLike) or not isinstance(os.fspath(path), str):
+        raise ValueError(f"path: needs a path, got {type(path).__name__}")
+    if not Path(path).name or Path(path).is_dir():
+        raise ValueError(f"path: needs a file's name, got {str(path)!r}")
+    return Path(path)
 
 
 def _name(kind: type) -> str:

@@ -9,7 +9,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import Array, array
+from ..checks import Array, array, instance
 from ..network import Channel, Ledger
 from .failures import FilterError, not_finite
 from .heard import Heard, gathered
@@ -159,7 +159,8 @@ class Step:
 
         A target is NaN in failed runs, so that they are left alone. If not `shared`, nobody speaks.
         """
-        channel = self.channel if shared and self.filter.share else None
+        told = instance(shared, "shared", bool) and self.filter.share
+        channel = self.channel if told else None
         for place, observed in self.readings:
             for group in gathered(observed, self.filter.sensors, channel):
                 if self.failed.any():

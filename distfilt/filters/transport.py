@@ -76,8 +76,6 @@ class TransportFilter(SensorFilter):
     def __post_init__(self) -> None:
         super().__post_init__()
         count(self.members, "members", at_least=2)
-        if not isinstance(self.correct, bool):
-            raise ValueError(f"correct: needs True or False, got {self.correct!r}")
         number(self.rejuvenation, "rejuvenation", at_least=0)
 
     def start(

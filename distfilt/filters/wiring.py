@@ -90,8 +90,6 @@ class SensorFilter(TeamFilter):
         if self.graph is None and len(self.sensors) > 1:
             raise ValueError(f"graph: needs a Graph of {len(self.sensors)} agents, got None")
         self.check_network()
-        if not isinstance(self.share, bool):
-            raise ValueError(f"share: needs True or False, got {self.share!r}")
         count(self.lag, "lag", at_least=0)
         choice(self.failures, "failures", ("raise", "keep"))
 
@@ -107,33 +105,37 @@ class SensorFilter(TeamFilter):
 
     def past(self, state: SensorState) -> tuple[tuple[float, Summary], ...]:
         """Earlier times that the state keeps, oldest first, and what is believed of them by now."""
-        return tuple((then.t, self.summary(then)) for then in state.earlier)
+        earlier = instance(state, "state", SensorState).earlier
+        return tuple((then.t, self.summary(then)) for then in earlier)
 
     def series(self, observations: Any, times: Array) -> Sequence[Any]:
         """Per time the agents' observations, from per agent their series (T, *runs, m)."""
-        _, series = over_times(observations, self.sensors, times)
-        return [[None if o is None else o[k] for o in series] for k in range(times.size)]
+        grid, series = over_times(observations, self.sensors, times)
+        return [[None if o is None else o[k] for o in series] for k in range(grid.size)]
 
     def leading(self, runs: tuple[int, ...], sets: int | None = None) -> tuple[int, ...]:
         """Leading axes (*runs, A); with `sets` there are so many of them in the agents' place."""
         instance(runs, "runs", Collection)  # type: ignore[type-abstract]
-        return (*(count(n, "runs") for n in runs), len(self.sensors) if sets is None else sets)
+        agents = len(self.sensors) if sets is None else count(sets, "sets")
+        return (*(count(n, "runs") for n in runs), agents)
 
     def first(
-        self, kind: type[S], t: float, rng: np.random.Generator | None, *belief: Any
-    ) -> S:
+        self, kind: type[S], t: float, rng: np.random.Generator | None, *belief: Any,
+        draws: bool = True,
+    ) -> S:  # fmt: skip
         """The state at the start; what steps draw comes from a child of the generator."""
-        child = None if rng is None else rng.spawn(1)[0]
+        source = None if rng is None else generator(rng)
+        child = source.spawn(1)[0] if source and instance(draws, "draws", bool) else None
+        instance(kind, "kind", type)
         return kind(number(t, "t"), Ledger.empty(len(self.sensors)), child, *belief)
 
     def moments(self, prior: Any, *, semidefinite: bool = False) -> tuple[Array, Array]:
         """The mean and the covariance that a Gaussian prior is given by, checked."""
         if not isinstance(prior, tuple) or len(prior) != 2:
             raise ValueError(f"prior: needs a tuple (mean, cov), got {type(prior).__name__}")
-        d = self.model.dim
-        return array(prior[0], "prior", (d,)), covariance(
-            prior[1], "prior", d, semidefinite=semidefinite
-        )
+        d, singular = self.model.dim, instance(semidefinite, "semidefinite", bool)
+        cov = covariance(prior[1], "prior", d, semidefinite=singular)
+        return array(prior[0], "prior", (d,)), cov
 
     def drawn(
         self, prior: Prior, members: int, runs: tuple[int, ...], rng: np.random.Generator,
@@ -158,13 +160,13 @@ class SensorFilter(TeamFilter):
 
     def elapsed(self, state: State, t: float) -> float:
         """Seconds from the state's time to `t`, which has to be later."""
-        return number(t, "t", above=state.t) - state.t
+        return number(t, "t", above=instance(state, "state", State).t) - state.t
 
     def observed(
         self, state: State, observations: Sequence[ArrayLike | None]
     ) -> list[Array | None]:
         """Observations of one time, checked, per agent (*runs, m) or None."""
-        return at_one_time(observations, self.sensors, state.runs)
+        return at_one_time(observations, self.sensors, instance(state, "state", State).runs)
 
     def gather(self, observed: Sequence[Array | None], channel: Channel | None) -> list[Heard]:
         """What every agent knows of the observations once they are shared.
@@ -190,7 +192,8 @@ class SensorFilter(TeamFilter):
         """
         instance(state, "state", instance(kind, "kind", type))
         instance(late, "late", Sequence)  # type: ignore[type-abstract]
-        needed, got = (len(self.sensors), *sizes), state.belief.shape[len(state.runs) :]
+        needed = (len(self.sensors), *instance(sizes, "sizes", tuple))
+        got = state.belief.shape[len(state.runs) :]
         if got[: len(needed)] != needed:
             raise ValueError(f"state: needs {needed} for each run, got {got}")
         dt, seen = self.elapsed(state, t), self.observed(state, observations)

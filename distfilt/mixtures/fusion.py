@@ -109,7 +109,9 @@ class PartialFusion:
         ----------
         t : array_like, (..., n_t)
         """
-        return _numbers(self._log_update(array(t, "t", (..., self.target_dim))), "t")
+        at = array(t, "t", (..., self.target_dim))
+        with np.errstate(invalid="ignore"):  # `_numbers` refuses what is none
+            return _numbers(self._log_update(at), "t")
 
     def log_value(self, x: ArrayLike) -> Array:
         """Logarithm of the fused density (14), not normalised, (...).
@@ -119,13 +121,15 @@ class PartialFusion:
         x : array_like, (..., d)
         """
         at = array(x, "x", (..., self.own.dim))
-        logs = self.own.log_density(at) + self._log_update(at[..., : self.target_dim])
+        with np.errstate(invalid="ignore"):
+            logs = self.own.log_density(at) + self._log_update(at[..., : self.target_dim])
         return _numbers(logs, "x")
 
     def log_target(self, t: ArrayLike) -> Array:
         """Logarithm of the fused target marginal, not normalised; it needs no ego state."""
         at = array(t, "t", (..., self.target_dim))
-        return _numbers(self.target.log_density(at) + self._log_update(at), "t")
+        with np.errstate(invalid="ignore"):
+            return _numbers(self.target.log_density(at) + self._log_update(at), "t")
 
     def _log_update(self, t: Array) -> Array:
         w = self.exponents

@@ -52,8 +52,13 @@ def pendulum_rate(
     array([ 0. ,  0. , -0. ,  9.8])
     """
     x = array(states, "states", (..., 4))
-    size, g = number(length, "length", above=0), number(gravity, "gravity", at_least=0)
+    size, g = _length(length), number(gravity, "gravity", at_least=0)
     return _rate(x, size, g, choice(form, "form", FORMS) == "printed")
+
+
+def _length(value: float) -> float:
+    """A length whose square is a positive number."""
+    return number(value, "length", at_least=1e-100, at_most=1e100)
 
 
 def _rate(s: Array, size: float, g: float, printed: bool) -> Array:
@@ -109,7 +114,7 @@ def pendulum(
     >>> float(np.hypot(*swing[:2]).round(6))
     1.0
     """
-    size, g = number(length, "length", above=0), number(gravity, "gravity", at_least=0)
+    size, g = _length(length), number(gravity, "gravity", at_least=0)
     printed = choice(form, "form", FORMS) == "printed"
     return _integrated(
         lambda x, _: _rate(x, size, g, printed), lambda x, _: _slope(x, size, g, printed),
@@ -144,7 +149,7 @@ def pendulum_angle(
     >>> pendulum_angle().step([0.0, 1.0], 0.0, 0.01).round(4)
     array([0.01  , 0.9995])
     """
-    size, g = number(length, "length", above=0), number(gravity, "gravity", at_least=0)
+    size, g = _length(length), number(gravity, "gravity", at_least=0)
 
     def rate(x: Array, _: float) -> Array:
         out = np.empty_like(x)
@@ -180,7 +185,7 @@ def pendulum_states(chart: ArrayLike, *, length: float = 1.0) -> Array:
     array([ 1.,  0.,  0., -2.])
     """
     q = array(chart, "chart", (..., 2))
-    size = number(length, "length", above=0)
+    size = _length(length)
     sine, cosine, rate = np.sin(q[..., 0]), np.cos(q[..., 0]), q[..., 1]
     return size * np.stack([sine, cosine, rate * cosine, -rate * sine], axis=-1)
 

@@ -287,8 +287,7 @@ class RotatingMixture:
     phase: float = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
-        centre = array(self.centre, "centre", (2,)).tolist()
-        object.__setattr__(self, "centre", tuple(centre))  # the caller's array stays the caller's
+        object.__setattr__(self, "centre", tuple(array(self.centre, "centre", (2,)).tolist()))
         number(self.radius, "radius", at_least=0)
         number(self.rate, "rate")
         number(self.variance, "variance", above=0)

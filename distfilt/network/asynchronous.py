@@ -198,7 +198,7 @@ def _symmetric(channel: Channel, weights: Weights | None) -> Weights:
     graph = channel.graph
     if weights is None:
         return weighting.metropolis(graph)
-    w = Weights.from_matrix(graph, weighting.keeping(weights))
+    w = Weights.from_matrix(graph, weighting.keeping(weights), name="weights")
     gap = np.abs(w.links - w.links[graph.reverse]).max(initial=0.0)
     if gap > 1e-12:
         raise ValueError(f"weights: needs symmetric weights, got a difference of {gap:.3g}")

@@ -181,7 +181,7 @@ class Channel:
         self, values: ArrayLike, weights: Weights | ArrayLike | sparse.sparray
     ) -> tuple[Array, Weights]:
         v = array(values, "values", (*self.runs, self.graph.size, "k"))
-        return v, Weights.from_matrix(self.graph, weights)
+        return v, Weights.from_matrix(self.graph, weights, name="weights")
 
     def _combine_all(self, v: Array, w: Weights, rounds: int) -> Array:
         """Rounds without faults, agents in front throughout."""
@@ -251,6 +251,7 @@ class Channel:
                 f"{speaks.shape}"
             )
         sizes = np.full(self.graph.size, v.shape[-1])
+        instance(acknowledged, "acknowledged", bool)
         sent, arrived = self._sent("carry", v, sizes, speaks=speaks, acknowledged=acknowledged)
         return np.where(arrived.reshape(*self.runs, edges)[..., None], sent, np.nan)
 

@@ -114,6 +114,7 @@ class Faults:
 
     def check(self, graph: Graph) -> None:
         """Refuse a graph whose agents do not fit."""
+        instance(graph, "graph", Graph)
         for faults in self._all():
             needed = (graph.size,) * np.ndim(faults.loss)
             if np.shape(faults.loss) != needed:
@@ -148,6 +149,7 @@ class Faults:
 
     def speaking(self, graph: Graph, round_: int = 0, t: float | None = None) -> Mask:
         """Links whose both ends have their radio on in a round, (E,)."""
+        round_, t = _now(graph, round_, t)
         off = np.zeros(graph.size, dtype=bool)
         for faults in self._all():
             if faults.silent and faults._active(round_, t):
@@ -156,8 +158,7 @@ class Faults:
 
     def lost(self, graph: Graph, round_: int, runs: int, t: float | None = None) -> Mask:
         """Which links lose the message of round `round_` in each of `runs` runs, (runs, E)."""
-        instance(graph, "graph", Graph)
-        round_ = count(round_, "round_", at_least=0)
+        round_, t = _now(graph, round_, t)
         out = np.zeros((count(runs, "runs", at_least=0), graph.senders.size), dtype=bool)
         for faults in self._all():
             if np.any(faults.loss) and faults._active(round_, t):
@@ -200,6 +201,12 @@ class Faults:
     def _runs(self, round_: int, runs: int) -> Hashes:
         key = _mixed((self.seed + _GOLDEN * (round_ + 1)) % 2**64)
         return _mixed(key ^ (np.arange(runs, dtype=np.uint64) * np.uint64(_GOLDEN)))
+
+
+def _now(graph: Graph, round_: int, t: float | None) -> tuple[int, float | None]:
+    instance(graph, "graph", Graph)
+    now = None if t is None else number(t, "t")
+    return count(round_, "round_", at_least=0), now
 
 
 def _probabilities(loss: float | ArrayLike) -> float | Array:

@@ -88,7 +88,7 @@ def _intersected(
 
 
 def _given(graph: Graph, weights: Weights | ArrayLike) -> Weights:
-    w = Weights.from_matrix(graph, weights)
+    w = Weights.from_matrix(graph, weights, name="weights")
     least = min(w.own.min(), w.links.min(initial=0.0))
     if least < 0 or w.own.min() <= 0:
         raise ValueError(f"weights: needs positive own weights and no negative ones, got {least:g}")

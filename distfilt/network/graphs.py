@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import array, count, generator, number
+from ..checks import array, count, generator, instance, number
 from .links import Graph, Indices, linked
 
 __all__ = ["Graph", "complete", "disk", "grid", "path", "random", "ring", "star"]
@@ -96,6 +96,7 @@ def random(
     size = count(agents, "agents")
     p = number(probability, "probability", at_least=0, at_most=1)
     source, rows = generator(rng), max(1, _BLOCK // size)
+    instance(directed, "directed", bool)
     found = []
     for start in range(0, size, rows):
         block = np.argwhere(source.random((min(rows, size - start), size)) < p)

@@ -47,23 +47,32 @@ class Weights:
 
     def __post_init__(self) -> None:
         instance(self.graph, "graph", Graph)
-        array(self.own, "own", (self.graph.size,))
-        array(self.links, "links", (self.graph.senders.size,))
+        size, edges = (self.graph.size,), (self.graph.senders.size,)
+        object.__setattr__(self, "own", array(self.own, "own", size))
+        object.__setattr__(self, "links", array(self.links, "links", edges))
 
     @classmethod
-    def from_matrix(cls, graph: Graph, matrix: Weights | ArrayLike | sparse.sparray) -> Weights:
-        """Read the weights from a matrix (A, A); off its diagonal only links may be weighted."""
+    def from_matrix(
+        cls, graph: Graph, matrix: Weights | ArrayLike | sparse.sparray, *, name: str = "matrix"
+    ) -> Weights:
+        """Read the weights from a matrix (A, A); off its diagonal only links may be weighted.
+
+        `name` is what an error calls the matrix.
+        """
         if isinstance(matrix, Weights):
             if matrix.graph is graph:
                 return matrix
             matrix = matrix.matrix
+        instance(graph, "graph", Graph)
         if not sparse.issparse(matrix):
-            matrix = array(matrix, "weights", graph.links.shape, finite=False)
+            matrix = array(matrix, name, graph.links.shape, finite=False)
         w = sparse.csr_array(matrix)
         if w.shape != graph.links.shape:
-            raise ValueError(f"weights: needs shape {graph.links.shape}, got {w.shape}")
+            raise ValueError(f"{name}: needs shape {graph.links.shape}, got {w.shape}")
+        if w.dtype.kind not in "fiu":
+            raise ValueError(f"{name}: needs real numbers, got {w.dtype}")
         if not np.isfinite(w.data).all():
-            raise ValueError("weights: needs finite numbers, got NaN or infinite entries")
+            raise ValueError(f"{name}: needs finite numbers, got NaN or infinite entries")
         own = w.diagonal()
         entries = w.tocoo()
         row, column = (np.asarray(c, dtype=np.int64) for c in entries.coords)
@@ -71,7 +80,7 @@ class Weights:
         key = graph.receivers * graph.size + graph.senders
         wanted = (row * graph.size + column)[used]
         if not np.isin(wanted, key).all():
-            raise ValueError("weights: needs zeros where an agent does not hear another")
+            raise ValueError(f"{name}: needs zeros where an agent does not hear another")
         links = np.zeros(key.size)
         links[np.searchsorted(key, wanted)] = entries.data[used]
         return cls(graph, np.asarray(own, dtype=np.float64), links)

@@ -133,7 +133,8 @@ def read_table(
     ('paper', 'item', 'kind', 'title', 'chapter')
     """
     source, text = read_text(path)
-    leading = count(key, "key")
+    leading, checked = count(key, "key"), _names(numbers, "numbers")
+    header = None if columns is None else _names(columns, "columns")
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     rows, lines = [], []
     line = 1
@@ -144,16 +145,23 @@ def read_table(
             line = reader.line_num + 1
     except csv.Error as error:
         raise fault(source, line, f"needs well-formed CSV: {error}") from None
-    _check_header(source, rows[0], columns)
+    _check_header(source, rows[0], header)
     _check_rows(source, rows, lines, leading)
     found = Table(rows[0], tuple(rows[1:]), source, tuple(lines[1:]))
-    for name in numbers:
+    for name in checked:
         found.numbers(choice(name, "numbers", found.columns))
     return found
 
 
-def _check_header(path: Path, header: tuple[str, ...], needed: Sequence[str] | None) -> None:
-    if needed is not None and header != tuple(needed):
+def _names(value: Sequence[str], name: str) -> tuple[str, ...]:
+    """The names of columns, of which a text alone would be its letters."""
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise ValueError(f"{name}: needs a list of columns, got {value!r}")
+    return tuple(instance(v, name, str) for v in value)
+
+
+def _check_header(path: Path, header: tuple[str, ...], needed: tuple[str, ...] | None) -> None:
+    if needed is not None and header != needed:
         raise fault(path, 1, f"needs the header {','.join(needed)}, got {','.join(header)}")
     for name in header:
         if not _COLUMN.fullmatch(name):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import choice, nonblank, number
+from ..checks import choice, instance, nonblank, number
 from ._files import html_table
 from .specs import Scenario
 from .tables import PAPERS, Item, Table, items, table
@@ -93,6 +93,7 @@ class Verdict:
 def judged(item: Item, good: bool, ours: str, published: str, why: str, study: Any) -> Verdict:
     """What was found, unless the study was another one; the reason is needed for a difference."""
     named = (item.paper, item.item)
+    instance(why, "why", str)
     if study is not None and not isinstance(study, Scenario):
         raise ValueError(f"scenario: needs a Scenario, got {type(study).__name__}")
     if study is not None and study.changed:

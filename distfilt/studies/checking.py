@@ -79,7 +79,8 @@ def check(
 
 def _allowed(stored: Stored, atol: float, rough: Collection[str]) -> dict[str, float]:
     """The absolute difference that passes, for each metric."""
-    if isinstance(rough, str) or not set(rough) <= set(stored.columns):
+    named = isinstance(rough, Collection) and not isinstance(rough, str)
+    if not named or not set(rough) <= set(stored.columns):
         raise ValueError(f"rough: needs names of metrics that are stored, got {rough!r}")
     allowed = dict.fromkeys(stored.columns, atol)
     for name in rough:

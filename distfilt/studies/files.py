@@ -145,6 +145,8 @@ def _functions(code: Any) -> tuple[Callable[..., Any], ...]:
 def _path(path: Any) -> Path:
     if not isinstance(path, str | Path):
         raise ValueError(f"path: needs a path, got {type(path).__name__}")
+    if not Path(path).name:
+        raise ValueError(f"path: needs a file's name, got {str(path)!r}")
     return Path(path)
 
 

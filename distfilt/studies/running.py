@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.random import SeedSequence
 
-from ..checks import callable_, choice, count, number
+from ..checks import callable_, choice, count, instance, number
 from ..progress import track
 from . import _worker
 from ._pool import Flight, Pool, PoolError, quiet
@@ -101,6 +101,7 @@ def run(
     stops = choice(errors, "errors", ("raise", "collect")) == "raise"
     threads = None if blas_threads is None else count(blas_threads, "blas_threads")
     limit = None if timeout is None else number(timeout, "timeout", above=0)
+    instance(progress, "progress", bool)
     pool = Pool(executor, n_workers)
     job = Job(_pickled(call), limit, threads, _worker.home(), pool.own, _worker.versions())
     record = _Record(call, made)

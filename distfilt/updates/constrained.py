@@ -10,7 +10,7 @@ import numpy as np
 
 from ..checks import Array, callable_, choice, count, instance, number
 from ..coupling import READINGS, Constraint
-from ..coupling.constraints import Motion, _project, _retract
+from ..coupling.constraints import Motion, _motion, _project, _retract
 from ..coupling.rules import _augmented, clip
 from .door import Update, joined, unchecked
 
@@ -91,7 +91,7 @@ def projected(
     g = instance(constraint, "constraint", Constraint)
     choice(reading, "reading", READINGS)
     eps = number(regularisation, "regularisation", at_least=0)
-    careful = bool(guarded)
+    careful = instance(guarded, "guarded", bool)
 
     def follow(x: Array, h: Array, y: Array, r: Array, *, rng: np.random.Generator) -> Array:
         return _project(inner(x, h, y, r, rng=rng), g, reading, eps, careful)
@@ -136,9 +136,12 @@ def retracted(
     g = instance(constraint, "constraint", Constraint)
     least = number(tolerance, "tolerance", above=0)
     most = count(iterations, "iterations")
+    if motion is not None:
+        _motion(motion)
 
     def follow(x: Array, h: Array, y: Array, r: Array, *, rng: np.random.Generator) -> Array:
-        return _retract(inner(x, h, y, r, rng=rng), g, motion, least, most)
+        pair = None if motion is None else _motion(motion, x.shape[-1])
+        return _retract(inner(x, h, y, r, rng=rng), g, pair, least, most)
 
     return joined(follow, update)
 

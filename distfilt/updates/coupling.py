@@ -86,7 +86,7 @@ def ensemble_transform(
         if not good.any(axis=-1).all():
             raise ValueError("inside: needs a member inside, got an ensemble without any")
         logs = np.where(good, logs, -np.inf)
-    out = _transform(ensemble, _normalised(logs), solve, correct=bool(correct))
+    out = _transform(ensemble, _normalised(logs), solve, correct=instance(correct, "correct", bool))
     return _rejuvenated(out, ensemble, h, rng) if h else out
 
 
@@ -150,9 +150,10 @@ def transform_by_agreement(
     agents = door.graph.size
     x = array(ensembles, "ensembles", (*door.runs, agents, "N", "d"))
     logs = array(log_likelihoods, "log_likelihoods", x.shape[:-1])
+    full = instance(correct, "correct", bool)
     solve = _solver(choice(solver, "solver", SOLVERS), 0.01)
     if rounds is None:
         shared = finite_time(logs, door)
     else:
         shared = average(logs, door, rounds=count(rounds, "rounds"))
-    return _transform(x, _normalised(agents * shared), solve, correct=bool(correct))
+    return _transform(x, _normalised(agents * shared), solve, correct=full)

@@ -121,13 +121,13 @@ def known_noise(
     drawn = perturbed(predicted, noise, rng)
     b = _centred(predicted)[1]
     inner, factor = _inner(b), 1.0
-    if shrinkage:
+    if type(shrinkage) is not float or shrinkage != 0:  # a check costs more than a nought
         # A component that is observed directly is correlated with its prediction by more than
         # chance, and shrinks all the same: the update does not know which is which.
         factor = 1 - number(shrinkage, "shrinkage", at_least=0, at_most=1)
         inner = factor * inner + (1 - factor) * inner * np.eye(inner.shape[-1])
     inner = inner + noise
-    if ridge:
+    if type(ridge) is not float or ridge != 0:
         inner = inner * (1 + number(ridge, "ridge", at_least=0) * np.eye(inner.shape[-1]))
     gain = factor * _gain(inner, _centred(ensemble)[1], b)
     return np.asarray(ensemble + (observed[..., None, :] - drawn) @ gain)

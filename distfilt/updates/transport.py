@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, choice, count, number
+from ..checks import Array, callable_, choice, count, number
 from ..ensembles import anomalies, cross_covariance, sample_covariance
 from ..triangular import ConditionalMap, affine, compose
 from .door import perturbed, update
@@ -23,7 +23,7 @@ Fit = Callable[[Array, Array], ConditionalMap]
 
 
 def _noisy(seen: Array, noise: Array, factor: float, rng: np.random.Generator) -> Array:
-    share = number(factor, "noise_factor", at_least=0)
+    share = number(factor, "noise_factor", at_least=0, at_most=1e100)
     return perturbed(seen, share**2 * noise, rng) if share else seen
 
 
@@ -57,6 +57,7 @@ def transport(
     >>> posterior.mean().round(1), posterior.var().round(1)
     (np.float64(0.5), np.float64(0.5))
     """
+    callable_(fit, "fit")
     seen = _noisy(predicted, noise, noise_factor, rng)
     return compose(fit(seen, ensemble), seen, ensemble, observed)
 
@@ -87,6 +88,7 @@ def transport_sample(
     >>> posterior.mean().round(1), posterior.var().round(1)
     (np.float64(0.5), np.float64(0.5))
     """
+    callable_(fit, "fit")
     seen = perturbed(predicted, noise, rng)
     reference = rng.standard_normal(ensemble.shape)
     return fit(seen, ensemble).inverse(observed, reference)
@@ -151,6 +153,7 @@ def principal_components(
     array([0.8, 1. ])
     """
     choice(complement, "complement", ("keep", "drop", "literal"))
+    callable_(fit, "fit")
     seen = _noisy(predicted, noise, noise_factor, rng)
     m, d = seen.shape[-1], ensemble.shape[-1]
     if count(n_state, "n_state") > d:

@@ -17,8 +17,8 @@ BAD_INPUT = {
         ("graph", lambda: Weights([[0, 1], [1, 0]], np.ones(3), np.ones(4))),
         ("own", lambda: Weights(STAR, np.ones(2), np.ones(4))),
         ("links", lambda: Weights(STAR, np.ones(3), np.ones(3))),
-        ("weights", lambda: Weights.from_matrix(STAR, np.ones((3, 3)))),
-        ("weights", lambda: Weights.from_matrix(STAR, np.eye(2))),
+        ("matrix", lambda: Weights.from_matrix(STAR, np.ones((3, 3)))),
+        ("matrix", lambda: Weights.from_matrix(STAR, np.eye(2))),
     ],
     _W + "balanced": [("graph", lambda: weights.balanced(APART))],
     _W + "best_constant": [

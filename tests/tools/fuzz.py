@@ -483,12 +483,12 @@ def findings(calls: dict[str, list[Call]]) -> Iterator[Finding]:
 
 GOOD = {"refused", "same", "finite"}
 RECORDS = (
-    r"filters\.(\w+State|Summary|Late)|network\.(Ledger|PIState|AdmmRun)"
-    r"|studies\.\w+|published\.(Parameter|accepted)"
+    r"filters\.Summary|network\.(Ledger|PIState|AdmmRun)|published\.(Parameter|Table|accepted)"
 )
 ALLOWED: dict[tuple[str, str, str], str] = {
     (r"checks\..*", r".*", r".*"): "the words of the check itself, which the library writes",
-    (rf"({RECORDS})(\.\w+)?", r".*", r".*"): "made by the library, looked at by who takes it",
+    (rf"({RECORDS})(\.\w+)?|studies\.(Failure|Stored|Study)|filters\.\w*State", r".*", r".*"):
+        "made by the library, looked at by who takes it",
     (r"models\.Swarm\..*_at|updates\.with_missing", r".*", r".*"):
         "called in every step by the filter that has checked its arguments",
     (r"coupling\.Plan|kalman\.GaussianRun", r".*", r".*"):
@@ -496,7 +496,6 @@ ALLOWED: dict[tuple[str, str, str], str] = {
     (r"plotting\.\w+", r"xunit|yunit|title|label", "text: taken"): "an optional text",
     (r"density\.DynamicAverage|triangular\.pool_by_admm", r"modes|check", "None: taken"):
         "means what its docstring says: all cells, no check",
-    (r"density\.FokkerPlanck\.evolve", "substeps", "huge: too long"): "as many as were asked for",
     (r"density\.PIConsensus\.learn", "dt", "huge: too long"): "as many substeps as are stable",
     (r"progress\.track", "items", r".*"): "hands on, unlooked at, whatever can be iterated over",
     (r"filters\.\w+Filter(\.exact)?", "sensors", "with None: taken"): "an agent without a sensor",
@@ -506,14 +505,22 @@ ALLOWED: dict[tuple[str, str, str], str] = {
         "a user's function that overflows",
     (r"sensors\.Sensor\.predict", "x", r"(tiny|zero): NaN"): "a direction to where the sensor is",
     (r"network\.pi_step", "dt", "huge: too long"): "as many substeps as are stable",
-    (r"sensors\.Sensor.*|coupling\.augmented_readings|filters\.SensorFilter\.gather", r".*",
-     r"(all )?NaN: NaN"):
+    (r"sensors\.Sensor.*|coupling\.augmented_readings|filters\.(Late|\w+\.gather|\w+\.series)",
+     r".*", r"(all )?NaN: NaN"):
         "a reading that is missing",
     (r"network\.average", "gain", "huge: NaN"): "an iteration that diverges, with a warning before",
-    (r".*", r"rounds|iterations|members", "huge: too long"): "as many rounds as were asked for",
+    (r".*", r"rounds|iterations|members|substeps", "huge: too long"):
+        "as many rounds as were asked for",
     (r"kalman\.filterpy_\w+|coupling\..*|network\..*|triangular\..*|updates\..*", r".*",
      r"(huge|empty last|shorter last|ragged): unnamed"):
         "states without components, or an overflow, refused in another package's words",
+    (r"filters\.(Step\.(?!heard)\w+|SensorState\.shown)", r".*", r".*"):
+        "called in every step by a family of filters, which made the arguments",
+    (r"filters\.(Filter\.series|SensorFilter\.observed)", "observations", "with None: taken"):
+        "looked at by the step that takes it, or nothing observed",
+    (r"sensors\.Sensor\.matrix", "dim", "huge: unnamed"): "numpy refuses such a size itself",
+    (r"studies\.check", "workers", "None: taken"): "one for each core",
+    (r"studies\.spawn", "n", "huge: too long"): "as many seeds as were asked for",
     (r"network\.Channel\.\w+", "payloads", "with None: taken"): "an agent that is silent",
 }
 """(callable, argument, kind and result) as patterns to the reason why it may be so."""
