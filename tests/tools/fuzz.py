@@ -196,7 +196,8 @@ def recorded(chosen: list[str]) -> dict[str, list[Call]]:
             if test.examples:
                 recorder.inside = 0
                 with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
-                    runner.run(test, out=lambda _: None)
+                    # With their globals: functions that an example defines are called again.
+                    runner.run(test, out=lambda _: None, clear_globs=False)
                 recorder.inside = 1
     recorder.inside = 0
     with quiet():
@@ -466,7 +467,8 @@ def findings(calls: dict[str, list[Call]]) -> Iterator[Finding]:
             try:
                 with limited(SECONDS), quiet():
                     reference, _ = call.run()
-            except (Exception, TooLong):
+            except (Exception, TooLong) as error:
+                yield Finding(name, "", "as recorded", "fails", f"{error!r}"[:200])
                 continue
             for argument, valid in call.bound.arguments.items():
                 parameter = call.bound.signature.parameters[argument]
