@@ -111,6 +111,9 @@ def median_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
     from scipy.stats import binom
 
     confidence = _level(level)
+    width = 2 * float(ndtri(0.5 + confidence / 2))
+    if width == 0:
+        raise ValueError(f"level: needs a number that differs from 0 in 1 + level, got {level!r}")
     v = np.sort(_values(values, 1))
     n = v.size
     # P(B <= k - 1) for k = 1, 2, ...: the chance that the k-th smallest lies above the median.
@@ -119,7 +122,7 @@ def median_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
     if k == 0:
         raise ValueError(f"values: needs more values for level {confidence:g}, got {n}")
     low, high = float(v[k - 1]), float(v[n - k])
-    error = (high - low) / (2 * float(ndtri(0.5 + confidence / 2)))
+    error = (high - low) / width
     return Interval(float(np.median(v)), low, high, error)
 
 

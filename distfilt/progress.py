@@ -6,6 +6,8 @@ import os
 from collections.abc import Iterable
 from typing import Any
 
+from .checks import count, instance
+
 __all__ = ["track"]
 
 _SILENT = ("TQDM_DISABLE", "CI", "PYTEST_CURRENT_TEST")
@@ -31,7 +33,9 @@ def track(items: Iterable[Any], *, show: bool, total: int | None = None) -> Iter
     """
     if not isinstance(items, Iterable):
         raise ValueError(f"items: needs something to iterate over, got {type(items).__name__}")
-    if not show or any(os.environ.get(name) for name in _SILENT):
+    if total is not None:
+        count(total, "total", at_least=0)
+    if not instance(show, "show", bool) or any(os.environ.get(name) for name in _SILENT):
         return items
     from tqdm.auto import tqdm
 

@@ -21,6 +21,7 @@ BAD_INPUT = {
         ("values", lambda: median_interval([])),
         ("values", lambda: median_interval([1.0, 2.0, 3.0, 4.0, 5.0])),
         ("level", lambda: median_interval(np.arange(9.0), level=95)),
+        ("level", lambda: median_interval(np.arange(9.0), level=1e-300)),
     ],
     _I + "proportion_interval": [
         ("successes", lambda: proportion_interval(5, 4)),

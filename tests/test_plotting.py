@@ -90,6 +90,7 @@ _CASES = {
         ("covariance", lambda: ellipse(blank(), [0, 0], [[1, 0.5], [0, 1]])),
         ("level", lambda: ellipse(blank(), [0, 0], EYE, level=1)),
         ("index", lambda: ellipse(blank(), [0, 0], EYE, index=-1)),
+        ("label", lambda: ellipse(blank(), [0, 0], EYE, label=3)),
     ],
     "band": [
         ("ax", lambda: band(3, np.arange(3), RUNS)),
@@ -101,6 +102,7 @@ _CASES = {
         ("quantiles", lambda: band(blank(), np.arange(3), RUNS, quantiles=(-0.1, 0.9))),
         ("quantiles", lambda: band(blank(), np.arange(3), RUNS, quantiles=(25, 75))),
         ("index", lambda: band(blank(), np.arange(3), RUNS, index=None)),
+        ("label", lambda: band(blank(), np.arange(3), RUNS, label=" ")),
     ],
     "graph": [
         ("ax", lambda: graph(None, PAIR)),
@@ -114,6 +116,9 @@ _CASES = {
         ("known", lambda: graph(blank(), PAIR, known=[-0.1, 1.0])),
         ("known", lambda: graph(blank(), PAIR, known=[1.0])),
         ("notes", lambda: graph(blank(), PAIR, notes=["one"])),
+        ("notes", lambda: graph(blank(), PAIR, notes=3.5)),
+        ("notes", lambda: graph(blank(), PAIR, notes="ab")),
+        ("labels", lambda: graph(blank(), PAIR, labels="AB")),
         ("notes", lambda: graph(blank(), PAIR, notes=["one", 2])),
     ],
     "save": [
@@ -147,6 +152,12 @@ _CASES |= {
     ],
     "Slider": [
         ("frames", lambda: Slider((), (), (), label="x", alt="y")),
+        ("frames", lambda: Slider(3.5, ("a",), ("b",), label="x", alt="y")),
+        ("frames", lambda: Slider(("a",), ("a",), ("b",), label="x", alt="y")),
+        ("said", lambda: Slider((b"",), "a", ("b",), label="x", alt="y")),
+        ("said", lambda: Slider((b"",), (None,), ("b",), label="x", alt="y")),
+        ("digests", lambda: Slider((b"",), ("a",), {"b": 1}, label="x", alt="y")),
+        ("digests", lambda: Slider((b"",), ("a",), (7.5,), label="x", alt="y")),
         ("frames", lambda: Slider((b"",), (), ("",), label="x", alt="y")),
     ],
 }  # fmt: skip

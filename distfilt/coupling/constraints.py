@@ -174,7 +174,8 @@ def project(
         raise ValueError(f"ensemble: needs at least 2 members, got {x.shape[-2]}")
     choice(reading, "reading", READINGS)
     eps = number(regularisation, "regularisation", at_least=0)
-    return _project(x, _constraint(constraint), reading, eps, bool(guarded))
+    guard = instance(guarded, "guarded", bool)
+    return _project(x, _constraint(constraint), reading, eps, guard)
 
 
 def _project(x: Array, constraint: Constraint, reading: str, eps: float, guarded: bool) -> Array:

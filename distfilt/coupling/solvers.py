@@ -198,12 +198,12 @@ Solve = Callable[[Array, Array, Array], tuple[Array, Array]]
 
 
 def _solver(name: str, regularisation: float) -> Solve:
+    strength = number(regularisation, "regularisation", above=0)
     if name == "network":
         return _network
     if name == "linprog":
         return _linprog
     if name == "entropic":
-        strength = number(regularisation, "regularisation", above=0)
         return lambda c, a, b: _entropic(c, a, b, strength)
     return lambda c, a, b: _cvxpy(c, a, b, {"highs": "HIGHS", "clarabel": "CLARABEL"}[name])
 

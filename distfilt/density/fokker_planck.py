@@ -133,7 +133,7 @@ class FokkerPlanck:
 
     def rates(self, t: float) -> tuple[Array, Array]:
         """Rates at which mass crosses each face, forwards and backwards, in 1/s."""
-        f = self._faces
+        f, t = self._faces, number(t, "t")
         pick = np.arange(f.axis.size), f.axis
         drift = self.swarm.drift_at(f.points, t)[pick]
         between = self.swarm.diffusion_at(f.points, t)[pick]

@@ -32,6 +32,8 @@ class Separate:
     filters: tuple[LowRank, ...]
 
     def __post_init__(self) -> None:
+        if not isinstance(self.filters, tuple | list):
+            raise ValueError(f"filters: needs a tuple, got {type(self.filters).__name__}")
         sizes = {instance(f, "filters", LowRank).mean.size for f in self.filters}
         if len(sizes) != 1:
             raise ValueError(f"filters: needs one or more of one size, got sizes {sorted(sizes)}")

@@ -16,7 +16,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, callable_, number
+from ..checks import Array, array, callable_, count, number
 
 __all__ = [  # fmt: skip
     "Dense", "LowRank", "Shared", "dense_step", "low_rank_start", "low_rank_step", "shared_moved",
@@ -54,7 +54,9 @@ class Dense:
 
     def __post_init__(self) -> None:
         mean = array(self.mean, "mean", ("n",))
-        array(self.covariance, "covariance", (mean.size, mean.size))
+        object.__setattr__(self, "mean", mean)
+        covariance = array(self.covariance, "covariance", (mean.size, mean.size))
+        object.__setattr__(self, "covariance", covariance)
 
 
 def dense_step(
@@ -141,10 +143,15 @@ class Shared:
     vector: Array
 
     def __post_init__(self) -> None:
-        n, r = array(self.basis, "basis", ("n", "r")).shape
-        filters = array(self.base, "base", ("F", n)).shape[0]
-        array(self.information, "information", (filters, r, r))
-        array(self.vector, "vector", (filters, r))
+        basis = array(self.basis, "basis", ("n", "r"))
+        base = array(self.base, "base", ("F", len(basis)))
+        filters, r = len(base), basis.shape[1]
+        for name, value in (
+            ("basis", basis), ("base", base),
+            ("information", array(self.information, "information", (filters, r, r))),
+            ("vector", array(self.vector, "vector", (filters, r))),
+        ):
+            object.__setattr__(self, name, value)
 
     @property
     def estimates(self) -> Array:
@@ -162,6 +169,8 @@ class Shared:
 
     def covariance(self, k: int) -> Array:
         """Covariance of filter `k`, (n, n)."""
+        if count(k, "k", at_least=0) >= len(self.information):
+            raise ValueError(f"k: needs a filter below {len(self.information)}, got {k}")
         return np.asarray(self.basis @ np.linalg.solve(self.information[k], self.basis.T))
 
 
@@ -295,7 +304,8 @@ class LowRank:
 
     def __post_init__(self) -> None:
         mean = array(self.mean, "mean", ("n",))
-        array(self.factor, "factor", (mean.size, "r"))
+        object.__setattr__(self, "mean", mean)
+        object.__setattr__(self, "factor", array(self.factor, "factor", (mean.size, "r")))
         number(self.lost, "lost", at_least=0)
 
 

@@ -190,6 +190,8 @@ class Grid:
 
     def same_box(self, other: Any) -> bool:
         """Whether another grid, or a swarm, fills the same box."""
+        if not hasattr(other, "low") or not hasattr(other, "high"):
+            raise ValueError(f"other: needs a grid or a swarm, got {type(other).__name__}")
         low, high = np.asarray(other.low), np.asarray(other.high)
         return np.array_equal(low, self.corner) and np.array_equal(high, np.asarray(self.high))
 

@@ -103,8 +103,8 @@ def kernels(
     >>> z.shape, bool(abs(grid.integral(z) - 1).max() < 1e-12)
     ((2, 400), True)
     """
-    x = _agents(positions, grid)
-    return _kernels(x, grid, _width(bandwidth, grid, x.shape[-2]), reflect)
+    x, folded = _agents(positions, grid), instance(reflect, "reflect", bool)
+    return _kernels(x, grid, _width(bandwidth, grid, x.shape[-2]), folded)
 
 
 def _kernels(x: Array, grid: Grid, h: Array, reflect: bool = True) -> Array:
@@ -133,8 +133,8 @@ def kernel_density(
     >>> round(float(p.max() * 2 * np.pi * 0.1**2), 2)
     0.92
     """
-    x = _agents(positions, grid)
-    return _kernel_density(x, grid, _width(bandwidth, grid, x.shape[-2]), reflect)
+    x, folded = _agents(positions, grid), instance(reflect, "reflect", bool)
+    return _kernel_density(x, grid, _width(bandwidth, grid, x.shape[-2]), folded)
 
 
 def _kernel_density(x: Array, grid: Grid, h: Array, reflect: bool = True) -> Array:

@@ -8,7 +8,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import Array, count, instance, number
+from ..checks import Array, array, count, instance, number
 from ..network import Channel, Graph, tracking
 from ..network import weights as weighting
 from .kernel import _kernel_density, _kernels
@@ -76,6 +76,7 @@ def alone(sharing: Sharing, seen: Seen) -> Array:
 
 def _coordinates(seen: Seen, modes: int | None, values: Array | None = None) -> Array:
     """Each agent's kernel, whole or as cosine coefficients, and a 1 of the first that is here."""
+    instance(seen, "seen", Seen)
     z = seen.kernels if values is None else values
     if modes is not None:
         z = z @ seen.grid.cosines(modes) * seen.grid.volume
@@ -91,6 +92,19 @@ def _read(values: Array, seen: Seen, modes: int | None) -> tuple[Array, Array]:
         y = y @ seen.grid.cosines(modes).T
     # The average of one 1 among zeros is 1/N; a transient may be zero or negative.
     return y, 1 / np.clip(values[:, -1], 1e-6, 1.0)
+
+
+def _door(
+    carried: Carried, shapes: tuple[tuple[int, ...], ...], seen: Seen, channel: Channel, dt: float
+) -> Carried:
+    """Refuse what a rule cannot have carried, and steps that are none."""
+    instance(channel, "channel", Channel)
+    number(dt, "dt", above=0)
+    if channel.graph.size != len(seen.present):
+        raise ValueError(f"channel: needs {len(seen.present)} agents, got {channel.graph.size}")
+    if not isinstance(carried, tuple | list | np.ndarray) or len(carried) != len(shapes):
+        raise ValueError(f"carried: needs {len(shapes)} arrays, as `begin` and `learn` return them")
+    return tuple(array(c, "carried", s) for c, s in zip(carried, shapes, strict=True))
 
 
 def _modes(value: int | None) -> None:
@@ -131,6 +145,7 @@ class PIConsensus:
         for name in ("alpha", "a", "b"):
             number(getattr(self, name), name, at_least=0)
         _modes(self.modes)
+        instance(self.rate, "rate", bool)
         if self.first_std is not None:
             number(self.first_std, "first_std", above=0)
 
@@ -146,7 +161,7 @@ class PIConsensus:
     ) -> tuple[Carried, Array, Array]:
         """One step of (16), in as many substeps as stability asks for."""
         u = _coordinates(seen, self.modes)
-        estimate, integral, before = carried
+        estimate, integral, before = _door(carried, (u.shape,) * 3, seen, channel, dt)
         after = tracking.pi_step(
             tracking.PIState(estimate, integral), before, channel, dt=dt, alpha=self.alpha,
             a=self.a, b=self.b, rate=(u - before) / dt if self.rate else None,
@@ -192,7 +207,7 @@ class DynamicAverage:
     ) -> tuple[Carried, Array, Array]:
         """Average, and add what the own input has changed by."""
         u = _coordinates(seen, self.modes)
-        x, before = carried
+        x, before = _door(carried, (u.shape,) * 2, seen, channel, dt)
         graph = channel.graph
         weights = weighting.balanced(graph) if graph.directed else weighting.metropolis(graph)
         lost = "keep" if graph.directed else "mutual"
@@ -222,12 +237,12 @@ class Flooding:
     reference = False
 
     def __post_init__(self) -> None:
-        if self.forget != float("inf"):
+        if not isinstance(self.forget, float) or self.forget != float("inf"):
             number(self.forget, "forget", above=0)
 
     def begin(self, seen: Seen) -> Carried:
         """Tables (A, A, d + 1) of positions and times, with the own entry only."""
-        size, d = seen.positions.shape
+        size, d = instance(seen, "seen", Seen).positions.shape
         table = np.zeros((size, size, d + 1))
         table[..., d] = _NEVER
         return (self._noted(table, seen),)
@@ -243,7 +258,9 @@ class Flooding:
         self, carried: Carried, seen: Seen, channel: Channel, dt: float
     ) -> tuple[Carried, Array, Array]:
         """Note the own position, send the table, keep the newest of each entry."""
-        table = self._noted(carried[0], seen)
+        size, d = instance(seen, "seen", Seen).positions.shape
+        (before,) = _door(carried, ((size, size, d + 1),), seen, channel, dt)
+        table = self._noted(before, seen)
         inbox = channel.exchange(
             [table[i] if here else None for i, here in enumerate(seen.present)]
         )
@@ -294,16 +311,18 @@ class Neighbours:
 
     def begin(self, seen: Seen) -> Carried:
         """Nothing to remember."""
+        instance(seen, "seen", Seen)
         return ()
 
     def learn(
         self, carried: Carried, seen: Seen, channel: Channel, dt: float
     ) -> tuple[Carried, Array, Array]:
         """Send the own position; the mean of the kernels at all positions that arrive."""
+        size, d = instance(seen, "seen", Seen).positions.shape
+        _door(carried, (), seen, channel, dt)
         inbox = channel.exchange(
             [x if here else None for x, here in zip(seen.positions, seen.present, strict=True)]
         )
-        size, d = seen.positions.shape
         table = np.zeros((size, size, d + 1))
         table[..., d] = _NEVER
         for i, box in enumerate(inbox):
@@ -328,12 +347,15 @@ class Centralised:
 
     def begin(self, seen: Seen) -> Carried:
         """Nothing to remember."""
+        instance(seen, "seen", Seen)
         return ()
 
     def learn(
         self, carried: Carried, seen: Seen, channel: Channel, dt: float
     ) -> tuple[Carried, Array, Array]:
         """The kernel estimate of all that are here."""
+        instance(seen, "seen", Seen)
+        _door(carried, (), seen, channel, dt)
         x, size = seen.positions[seen.present], len(seen.present)
         y = _kernel_density(x, seen.grid, np.full(len(x), seen.bandwidth))
         return (), np.tile(y, (size, 1)), np.full(size, float(len(x)))

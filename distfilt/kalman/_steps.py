@@ -77,6 +77,12 @@ def analysed(
     return np.ascontiguousarray(mean.T), stack, density
 
 
+_NEAR = 1e-9
+"""Squared distance of the points, for each component, below which sums lose half their digits."""
+_FAR = 1e6
+"""Larger options weigh the rounding of the central point by more than 1e12."""
+
+
 @dataclass(frozen=True, eq=False)
 class Points:
     """Weights of the mean and of the covariance, (2 d + 1,), and the points' distance."""
@@ -88,9 +94,13 @@ class Points:
     @classmethod
     def of(cls, dim: int, alpha: float, beta: float, kappa: float) -> Points:
         """The scaled points of `dim` components."""
-        a = number(alpha, "alpha", above=0)
-        b, c = number(beta, "beta", at_least=0), number(kappa, "kappa", above=-dim)
+        a = number(alpha, "alpha", above=0, at_most=_FAR)
+        b = number(beta, "beta", at_least=0, at_most=_FAR)
+        c = number(kappa, "kappa", above=-dim)
         spread = a**2 * (dim + c)
+        if spread < _NEAR * dim:
+            needs = f"points that rounding leaves apart, alpha^2 (d + kappa) >= {_NEAR * dim:.3g}"
+            raise ValueError(f"alpha, kappa: needs {needs}, got {spread:.3g}")
         mean = np.full(2 * dim + 1, 0.5 / spread)
         mean[0] = 1.0 - dim / spread
         cov = mean.copy()

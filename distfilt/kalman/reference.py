@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, instance, needed, number
+from ..checks import Array, array, instance, needed
 from ..models import Model
 from ..sensors import Sensor
 from ._inputs import common_runs, fill_axes, instantaneous, prior, series
+from ._steps import Points
 from .linear import GaussianRun, _noise_per_step, _per_step
 
 _Mask = NDArray[np.bool_]
@@ -150,9 +151,7 @@ def filterpy_ukf(
     instance(model, "model", Model)
     sensor = instantaneous(sensors)
     y, grid = series(observations, times, t0, sensor.dim)
-    number(alpha, "alpha", above=0)
-    number(beta, "beta", at_least=0)
-    number(kappa, "kappa", above=-model.dim)
+    Points.of(model.dim, alpha, beta, kappa)  # refuses what it refuses of our own filter
     start = _unscented(model, sensor.dim, alpha, beta, kappa)
 
     def step(kf: Any, k: int, z: Array, seen: _Mask) -> None:
@@ -200,6 +199,7 @@ def _over_runs(
     step: Callable[[Any, int, Array, _Mask], None], likelihood: bool, dim: int | None = None,
 ) -> GaussianRun:
     """Run one of filterpy's objects over every run and every step."""
+    instance(likelihood, "likelihood", bool)
     x0, p0 = prior(mean, cov)
     d = x0.shape[-1]
     if dim is not None and d != dim:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, instance
+from ..checks import Array, array, instance
 from ..linalg import _symmetrise
 from .linear import GaussianRun, _noise_per_step, _per_step
 
@@ -51,6 +51,7 @@ def rts_smoother(run: GaussianRun, *, F: ArrayLike, Q: ArrayLike) -> GaussianRun
     array([1. , 1.5])
     """
     instance(run, "run", GaussianRun)
+    _series(run)
     steps, d = len(run.means), run.means.shape[-1]
     f = _per_step(F, "F", steps, (d, d))
     q = _noise_per_step(Q, "Q", steps, d, semidefinite=True)
@@ -65,6 +66,19 @@ def rts_smoother(run: GaussianRun, *, F: ArrayLike, Q: ArrayLike) -> GaussianRun
         after = kept @ p @ np.swapaxes(kept, -1, -2) + gain @ (covs[k + 1] + q[k + 1]) @ back
         covs[k] = _symmetrise(after)
     return GaussianRun(means, covs, run.log_likelihood.copy())
+
+
+def _series(run: GaussianRun) -> None:
+    """Refuse arrays that are not those of one filter's run."""
+    x = array(run.means, "run.means")
+    if x.ndim < 2:
+        raise ValueError(f"run.means: needs shape (T, ..., d), got {x.shape}")
+    p = array(run.covariances, "run.covariances", (..., x.shape[-1], x.shape[-1]))
+    axes = zip(p.shape[:-2], x.shape[:-1], strict=False)
+    if p.ndim != x.ndim + 1 or len(p) != len(x) or any(n not in (1, m) for n, m in axes):
+        needs = (*x.shape, x.shape[-1])
+        raise ValueError(f"run.covariances: needs shape {needs}, or runs of 1, got {p.shape}")
+    array(run.log_likelihood, "run.log_likelihood", x.shape[:-1], finite=False)
 
 
 def _gain(p: Array, f: Array, q: Array) -> Array:

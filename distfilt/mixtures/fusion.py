@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from ..checks import Array, array, callable_, choice, instance, number
-from .collocation import collocation_weights
+from ..checks import Array, array, callable_, choice, count, instance, number
+from .collocation import RULES, collocation_weights
 from .gaussian import GaussianMixture, trusted
 from .reduction import runnalls
 from .shapes import Shapes
@@ -109,7 +109,9 @@ class PartialFusion:
         ----------
         t : array_like, (..., n_t)
         """
-        return self._log_update(array(t, "t", (..., self.target_dim)))
+        at = array(t, "t", (..., self.target_dim))
+        with np.errstate(invalid="ignore"):  # `_numbers` refuses what is none
+            return _numbers(self._log_update(at), "t")
 
     def log_value(self, x: ArrayLike) -> Array:
         """Logarithm of the fused density (14), not normalised, (...).
@@ -119,12 +121,15 @@ class PartialFusion:
         x : array_like, (..., d)
         """
         at = array(x, "x", (..., self.own.dim))
-        return self.own.log_density(at) + self._log_update(at[..., : self.target_dim])
+        with np.errstate(invalid="ignore"):
+            logs = self.own.log_density(at) + self._log_update(at[..., : self.target_dim])
+        return _numbers(logs, "x")
 
     def log_target(self, t: ArrayLike) -> Array:
         """Logarithm of the fused target marginal, not normalised; it needs no ego state."""
         at = array(t, "t", (..., self.target_dim))
-        return self.target.log_density(at) + self._log_update(at)
+        with np.errstate(invalid="ignore"):
+            return _numbers(self.target.log_density(at) + self._log_update(at), "t")
 
     def _log_update(self, t: Array) -> Array:
         w = self.exponents
@@ -160,22 +165,18 @@ class PartialFusion:
         choice(form, "form", FORMS)
         if marginal is not None and terms == "matched":
             raise ValueError("marginal: needs terms='all', since matched terms use the own mixands")
-        divided = self._target_like(marginal, "marginal", self.target)
-        others = self.heard if received is None else tuple(received)
+        divided = self.target if marginal is None else self._target_like(marginal, "marginal")
+        others = self.heard if received is None else _beliefs(received, "received")
         if len(others) != len(self.heard):
             raise ValueError(f"received: needs {len(self.heard)} mixtures, got {len(others)}")
-        sent = [self._target_like(m, "received", m) for m in others]
+        sent = [self._target_like(m, "received") for m in others]
         pairs = np.indices((self.own.size, divided.size)).reshape(2, -1)
         if terms == "matched":
             pairs = np.repeat(np.arange(self.own.size)[None], 2, axis=0)
         make = _conditional_shapes if form == "conditional" else _literal_shapes
         return make(self.own, divided, sent, self.exponents, pairs)
 
-    def _target_like(
-        self, mixture: GaussianMixture | None, name: str, default: GaussianMixture
-    ) -> GaussianMixture:
-        if mixture is None:
-            return default
+    def _target_like(self, mixture: GaussianMixture, name: str) -> GaussianMixture:
         instance(mixture, name, GaussianMixture)
         if mixture.dim != self.target_dim:
             raise ValueError(f"{name}: needs dimension {self.target_dim}, got {mixture.dim}")
@@ -202,10 +203,13 @@ class PartialFusion:
         self, *, terms: str = "matched", rule: str = "C3", size: int | None = None
     ) -> GaussianMixture:
         """The fused mixture: shapes, weights, and Runnalls' reduction to `size` mixands."""
+        most = None if size is None else count(size, "size")
         if self.exponents[0] == 1:
+            choice(terms, "terms", TERMS)
+            choice(rule, "rule", RULES)
             return self.own
         fused = self.weigh(self.shapes(terms=terms), rule=rule)
-        return fused if size is None or fused.size <= size else runnalls(fused, size)
+        return fused if most is None or fused.size <= most else runnalls(fused, most)
 
 
 def fuse(
@@ -310,14 +314,23 @@ def fuse_in_turn(
     return own
 
 
-def _beliefs(heard: GaussianMixture | Iterable[GaussianMixture]) -> tuple[GaussianMixture, ...]:
+def _beliefs(
+    heard: GaussianMixture | Iterable[GaussianMixture], name: str = "heard"
+) -> tuple[GaussianMixture, ...]:
     """One or several mixtures as a tuple."""
     if not isinstance(heard, GaussianMixture | Iterable):
-        raise ValueError(f"heard: needs mixtures, got {type(heard).__name__}")
+        raise ValueError(f"{name}: needs mixtures, got {type(heard).__name__}")
     others = (heard,) if isinstance(heard, GaussianMixture) else tuple(heard)
     if not others:
-        raise ValueError("heard: needs at least one belief, got none")
+        raise ValueError(f"{name}: needs at least one belief, got none")
     return others
+
+
+def _numbers(logs: Array, name: str) -> Array:
+    """Refuse points so far out that one density is divided by another and both are zero."""
+    if np.isnan(logs).any():
+        raise ValueError(f"{name}: needs points whose densities are numbers, got one too far out")
+    return logs
 
 
 def average(

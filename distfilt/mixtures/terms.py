@@ -19,7 +19,7 @@ def _exponents(omega: float | str | ArrayLike, others: int) -> Array:
     if isinstance(omega, str):
         choice(omega, "omega", ("equal",))
         return np.full(others + 1, 1 / (others + 1))
-    if np.ndim(omega) == 0:
+    if not np.iterable(omega):
         w = number(omega, "omega", at_least=0, at_most=1)
         return np.concatenate([[w], np.full(others, (1 - w) / others)])
     return weights(omega, "omega", others + 1)
@@ -104,7 +104,13 @@ def _literal_shapes(
     j = (w[0] - 1) * inv(divided.covs)
     information = (j[p, None] + terms.precisions).reshape(-1, n, n)
     vector = ((j @ divided.means[..., None])[p, None, :, 0] + terms.vectors).reshape(-1, n)
-    factor_cov = inv(information)
+    try:
+        factor_cov = inv(information)
+    except np.linalg.LinAlgError:
+        raise np.linalg.LinAlgError(
+            "form: 'literal' inverts the information of what updates the target, got a singular "
+            "one; 'conditional' does not invert it"
+        ) from None
     factor_mean = (factor_cov @ vector[..., None])[..., 0]
     source = np.repeat(q, terms.size)
     full = np.zeros((source.size, d, d))

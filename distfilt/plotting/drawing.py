@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, increasing, instance, nonblank, number
+from ..checks import Array, array, increasing, nonblank, number
 from ..linalg import factor
 from .figures import check_axes, colour, line_style
 
@@ -52,7 +52,8 @@ def ellipse(
     radius = np.sqrt(-2 * np.log1p(-number(level, "level", above=0, below=1)))
     turn = np.linspace(0, 2 * np.pi, 181)
     x, y = centre[:, None] + radius * root @ np.stack([np.cos(turn), np.sin(turn)])
-    found.plot(x, y, color=colour(index), linestyle=line_style(index), label=label)
+    text = _legend(label)
+    found.plot(x, y, color=colour(index), linestyle=line_style(index), label=text)
     found.plot(*centre, marker="+", color=colour(index), linestyle="none")
     return found
 
@@ -93,10 +94,14 @@ def band(
     number(ends[0], "quantiles", at_least=0)
     number(ends[1], "quantiles", at_most=1)
     low, middle, high = np.quantile(curves, [ends[0], 0.5, ends[1]], axis=0)
-    shade = colour(index)
+    shade, text = colour(index), _legend(label)
     found.fill_between(t, low, high, color=shade, alpha=0.2, linewidth=0)
-    found.plot(t, middle, color=shade, linestyle=line_style(index), label=label)
+    found.plot(t, middle, color=shade, linestyle=line_style(index), label=text)
     return found
+
+
+def _legend(label: str | None) -> str | None:
+    return None if label is None else nonblank(label, "label")
 
 
 def graph(
@@ -134,15 +139,14 @@ def graph(
     if n == 0 or links.shape != (n, n) or (links != links.T).any():
         raise ValueError(f"adjacency: needs a symmetric square matrix, got shape {links.shape}")
     given = [str(k + 1) for k in range(n)] if labels is None else labels
-    instance(given, "labels", Sequence)  # type: ignore[type-abstract]
-    names = [nonblank(label, "labels") for label in given]
+    names = [nonblank(label, "labels") for label in _listed(given, "labels")]
     if len(names) != n:
         raise ValueError(f"labels: needs one for each of {n} agents, got {len(names)}")
     place = _circle(n) if positions is None else array(positions, "positions", (n, 2))
     share = np.zeros(n) if known is None else array(known, "known", (n,))
     if share.min() < 0 or share.max() > 1:
         raise ValueError(f"known: needs shares from 0 to 1, got {share.min():g} to {share.max():g}")
-    below = [""] * n if notes is None else list(notes)
+    below = [""] * n if notes is None else _listed(notes, "notes")
     if len(below) != n or not all(isinstance(note, str) for note in below):
         raise ValueError(f"notes: needs a text for each of {n} agents, got {notes!r}")
     for i, j in zip(*np.nonzero(np.triu(links, 1)), strict=True):
@@ -152,6 +156,13 @@ def graph(
     found.margins(0.2)
     found.set_axis_off()
     return found
+
+
+def _listed(value: Any, name: str) -> list[Any]:
+    """The entries of a list or tuple; one text is no list of its letters."""
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        raise ValueError(f"{name}: needs a list of texts, got {type(value).__name__}")
+    return list(value)
 
 
 def _discs(ax: Axes, place: Array, share: Array, names: list[str], notes: list[str]) -> None:

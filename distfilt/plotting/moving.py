@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from ..checks import callable_, count, needed, nonblank, number
+from ..checks import callable_, count, instance, needed, nonblank, number
 from .figures import check_axes
 
 if TYPE_CHECKING:
@@ -110,6 +110,9 @@ class Slider:
     seconds: float = field(kw_only=True, default=0.5)
 
     def __post_init__(self) -> None:
+        for name, kind in (("frames", bytes), ("said", str), ("digests", str)):
+            for entry in instance(getattr(self, name), name, tuple):
+                instance(entry, name, kind)
         if not self.frames or len({len(self.frames), len(self.said), len(self.digests)}) != 1:
             got = f"{len(self.frames)}, {len(self.said)}, {len(self.digests)}"
             raise ValueError(f"frames: needs one text and one digest a frame, got {got}")

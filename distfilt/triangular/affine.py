@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 
 from .. import ensembles
 from ..checks import Array, array, callable_, choice, count, covariance
+from ..linalg import _leading
 from ._conic import LIMIT, solve_component
 
 if TYPE_CHECKING:
@@ -62,31 +63,39 @@ class AffineMap:
     scale: Array
 
     def __post_init__(self) -> None:
-        m, d = self.observed_mean.shape[-1], self.mean.shape[-1]
-        array(self.gain, "gain", (..., d, m))
+        seen = array(self.observed_mean, "observed_mean", (..., "m"))
+        mean = array(self.mean, "mean", (..., "d"))
+        m, d = seen.shape[-1], mean.shape[-1]
+        gain = array(self.gain, "gain", (..., d, m))
         scale = array(self.scale, "scale", (..., d, d))
+        for name, value in (
+            ("observed_mean", seen), ("mean", mean), ("gain", gain), ("scale", scale)
+        ):
+            object.__setattr__(self, name, value)
         diagonal = np.diagonal(scale, axis1=-2, axis2=-1)
         if np.triu(scale, 1).any() or not (diagonal > 0).all():
             raise ValueError("scale: needs lower triangular matrices with a positive diagonal")
 
-    def _predicted(self, y: ArrayLike) -> Array:
-        """The regression of x on y, (..., N, d)."""
+    def _predicted(self, y: ArrayLike, members: Array) -> Array:
+        """The regression of x on y, (..., N, d), which broadcasts with these members."""
         seen = array(y, "y", (..., self.observed_mean.shape[-1]))
         if seen.ndim == self.observed_mean.ndim:
             seen = seen[..., None, :]
         centred = seen - self.observed_mean[..., None, :]
-        return self.mean[..., None, :] + centred @ np.swapaxes(self.gain, -1, -2)
+        out = self.mean[..., None, :] + centred @ np.swapaxes(self.gain, -1, -2)
+        _leading(members.shape[:-1], out.shape[:-1], "y")
+        return np.asarray(out)
 
     def __call__(self, y: ArrayLike, x: ArrayLike) -> Array:
         """Reference samples S(y, x), (..., N, d), of members y (..., N, m) and x (..., N, d)."""
         members = array(x, "x", (..., "N", self.mean.shape[-1]))
-        left = np.swapaxes(members - self._predicted(y), -1, -2)
+        left = np.swapaxes(members - self._predicted(y, members), -1, -2)
         return np.swapaxes(np.linalg.solve(self.scale, left), -1, -2)
 
     def inverse(self, y: ArrayLike, z: ArrayLike) -> Array:
         """Members x with S(y, x) = z, (..., N, d); `y` is (..., N, m), or (..., m) for all."""
         reference = array(z, "z", (..., "N", self.mean.shape[-1]))
-        return self._predicted(y) + reference @ np.swapaxes(self.scale, -1, -2)
+        return self._predicted(y, reference) + reference @ np.swapaxes(self.scale, -1, -2)
 
     def log_det(self, y: ArrayLike, x: ArrayLike) -> Array:
         """Logarithm of the determinant of the map's derivative in x at each member, (..., N)."""

@@ -105,6 +105,7 @@ def pool_by_admm(
     """
     joint, m = _joint(y, x, channel)
     callable_(agree, "agree")
+    instance(standardise, "standardise", bool)
     size = joint.shape[-1]
     if channel.runs:
         raise ValueError(f"channel: needs a single run for ADMM, got runs {channel.runs}")

@@ -16,13 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
 from .. import ensembles
-from ..checks import Array, array, count, number
+from ..checks import Array, array, count, instance, number
 from ..linalg import _leading
 from ._convex import SINGULAR, best_coefficients
 from .inversion import _newton, invert
@@ -72,16 +73,23 @@ class SeparableMap:
     slopes: tuple[Array, ...]
 
     def __post_init__(self) -> None:
-        size, d = self.centre.shape[-1], len(self.uses)
-        if not (array(self.spread, "spread", (..., size)) > 0).all():
-            raise ValueError(f"spread: needs positive entries, got {self.spread.min():g}")
-        array(self.bumps, "bumps", (..., size, "p"))
-        array(self.steps, "steps", (..., d, "q"))
-        p, q = self.bumps.shape[-1], self.steps.shape[-1]
+        centre = array(self.centre, "centre", (..., "D"))
+        size, d = centre.shape[-1], len(instance(self.uses, "uses", tuple))
+        spread = array(self.spread, "spread", (..., size))
+        if not (spread > 0).all():
+            raise ValueError(f"spread: needs positive entries, got {spread.min():g}")
+        bumps = array(self.bumps, "bumps", (..., size, "p"))
+        steps = array(self.steps, "steps", (..., d, "q"))
+        p, q = bumps.shape[-1], steps.shape[-1]
         _uses(self.uses, size - d, d)
-        for k, used in enumerate(self.uses):
-            array(self.weights[k], "weights", (..., 1 + len(used) * (1 + p)))
-            slopes = array(self.slopes[k], "slopes", (..., 1 + q))
+        parts: dict[str, Any] = {"centre": centre, "spread": spread, "bumps": bumps, "steps": steps}
+        own = (1 + q,) * d
+        earlier = tuple(1 + len(used) * (1 + p) for used in self.uses)
+        parts |= {n: _each(getattr(self, n), n, sizes)
+                  for n, sizes in (("weights", earlier), ("slopes", own))}
+        for name, value in parts.items():
+            object.__setattr__(self, name, value)
+        for k, slopes in enumerate(self.slopes):
             if (slopes < 0).any() or not (slopes > 0).any(axis=-1).all():
                 raise ValueError(
                     f"slopes: needs nonnegative coefficients, one of them positive, so that the "
@@ -167,6 +175,16 @@ class SeparableMap:
         for k in range(self.dim):
             total = total + np.log(self._own(joint[..., m + k], k)[1])
         return np.asarray(total)
+
+
+def _each(value: Sequence[Array], name: str, sizes: tuple[int, ...]) -> tuple[Array, ...]:
+    """A component's coefficients each, (..., size)."""
+    if not isinstance(value, tuple | list | np.ndarray) or getattr(value, "shape", 1) == ():
+        raise ValueError(f"{name}: needs a tuple of arrays, got {type(value).__name__}")
+    if len(value) != len(sizes):
+        raise ValueError(f"{name}: needs one array for each of {len(sizes)} components, "
+                         f"got {len(value)}")
+    return tuple(array(v, name, (..., n)) for v, n in zip(value, sizes, strict=True))
 
 
 def _earlier_features(v: Array, bumps: Array) -> Array:
@@ -271,10 +289,11 @@ def _pair(order: int | tuple[int, int]) -> tuple[int, int]:
 
 
 def _uses(uses: Sequence[Collection[int]], m: int, d: int) -> tuple[tuple[int, ...], ...]:
-    if len(uses) != d:
+    if len(instance(uses, "uses", Sequence)) != d:  # type: ignore[type-abstract]
         raise ValueError(f"uses: needs one collection for each of {d} components, got {len(uses)}")
     for k, used in enumerate(uses):
-        numbers = [count(v, "uses", at_least=0) for v in used]
+        given = instance(used, "uses", Collection)  # type: ignore[type-abstract]
+        numbers = [count(v, "uses", at_least=0) for v in given]
         if len(set(numbers)) < len(numbers) or (numbers and max(numbers) >= m + k):
             raise ValueError(
                 f"uses: needs different variables below {m + k} for component {k}, got {numbers}"

@@ -60,6 +60,7 @@ BAD_INPUT: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("ensemble", lambda: project(_X[:1], _LINE)),
         ("ensemble", lambda: project(NAN * _X, _LINE)),
         ("reading", lambda: project(_X, _LINE, reading="as meant")),
+        ("guarded", lambda: project(_X, _LINE, guarded="no")),
         ("regularisation", lambda: project(_X, _LINE, regularisation=-1.0)),
     ],
     _C + "retract": [

@@ -41,6 +41,7 @@ BAD_INPUT: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("solver", lambda: plan(_SQUARE, [0.5, 0.5], solver="simplex")),
         ("regularisation", lambda: plan(
             _SQUARE, [0.5, 0.5], solver="entropic", regularisation=0.0)),
+        ("regularisation", lambda: plan(_SQUARE, [0.5, 0.5], regularisation=None)),
     ],
     _S + "sorted_plan": [
         ("source", lambda: sorted_plan([[1.0]], [1.0], [1.0])),

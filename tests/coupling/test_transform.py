@@ -52,6 +52,7 @@ BAD_INPUT: dict[str, list[tuple[str, Callable[[], object]]]] = {
     _T + "plans": [
         *_common(plans),
         ("solver", lambda: plans(_X, _W, solver="best")),
+        ("regularisation", lambda: plans(_X, _W, regularisation="0.01")),
     ],
     _T + "ensemble_transform": [
         *_common(ensemble_transform),
@@ -60,6 +61,7 @@ BAD_INPUT: dict[str, list[tuple[str, Callable[[], object]]]] = {
         ("correct", lambda: ensemble_transform(_X, _W, correct="yes")),
         ("regularisation", lambda: ensemble_transform(
             _X, _W, solver="entropic", regularisation=-1.0)),
+        ("regularisation", lambda: ensemble_transform(_X, _W, regularisation=True)),
     ],
     _T + "second_order": [
         *_common(lambda x, w: second_order(x, x, w)),

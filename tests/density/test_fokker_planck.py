@@ -195,6 +195,8 @@ BAD_INPUT = {
         ("values", lambda: _FLOW.step(np.ones(24), 0.0, 0.1)),
         ("dt", lambda: _FLOW.step(np.ones(25), 0.0, 0.0)),
         ("times", lambda: _FLOW.evolve(np.ones(25), [0.0])),
+        ("t", lambda: _FLOW.rates(np.nan)),
+        ("t", lambda: _FLOW.rates(True)),
         ("diffusion", lambda: FokkerPlanck(
             Swarm(_still, lambda x, t: x[..., 0] - 0.5), Grid((5, 5))).generator(0.0)),
     ],

@@ -78,6 +78,7 @@ _EXACT, _OTHER = (filters_start(BASIS, BASE, exact=exact) for exact in (True, Fa
 BAD_INPUT = {
     "distfilt.density.forms.Separate": [
         ("filters", lambda: Separate(())),
+        ("filters", lambda: Separate(3.5)),
         ("filters", lambda: Separate((3,))),
         ("filters", lambda: Separate(tuple(LowRank(np.ones(n), np.eye(n)) for n in (2, 3)))),
     ],

@@ -217,6 +217,9 @@ BAD_INPUT = {
     ],
     "distfilt.density.gain.Shared": [
         ("information", lambda: Shared(_S, np.ones((2, 16)), np.eye(3), np.ones((2, 3)))),
+        ("k", lambda: _SHARED.covariance(2)),
+        ("k", lambda: _SHARED.covariance(-1)),
+        ("k", lambda: _SHARED.covariance(True)),
     ],
     "distfilt.density.gain.shared_start": [("base", lambda: shared_start(_S, np.ones((2, 9))))],
     "distfilt.density.gain.shared_moved": [("state", lambda: shared_moved(_DENSE, _same))],
@@ -242,3 +245,14 @@ def test_a_prior_is_a_tenth_of_the_box_long_and_has_unit_deviation() -> None:
     plain = zero_mean_prior(grid, rank=20)
     assert np.array_equal(plain, zero_mean_prior(grid, rank=20, length=0.1, std=1.0))
     assert not np.allclose(plain, zero_mean_prior(grid, rank=20, length=0.2), atol=0.1)
+
+
+def test_states_of_lists_are_those_of_arrays() -> None:
+    basis, eye = _S.tolist(), np.eye(3).tolist()
+    shared = Shared(basis, [[1.0] * 16], [eye], [[0.5, 1.0, 2.0]])
+    wanted = Shared(_S, np.ones((1, 16)), np.eye(3)[None], np.array([[0.5, 1.0, 2.0]]))
+    assert np.array_equal(shared.estimates, wanted.estimates)
+    low = low_rank_step(LowRank([1.0] * 16, basis), _same, 2 * _Y, _R, 0.1)
+    assert np.array_equal(low.mean, low_rank_step(_LOW, _same, 2 * _Y, _R, 0.1).mean)
+    dense = dense_step(Dense([1.0] * 16, np.eye(16).tolist()), _same, 2 * _Y, _R, 0.1)
+    assert np.array_equal(dense.mean, dense_step(_DENSE, _same, 2 * _Y, _R, 0.1).mean)

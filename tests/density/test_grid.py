@@ -87,6 +87,7 @@ BAD_INPUT = {
         ("positions", lambda: BOX.cells([np.nan, 3.0])),
         ("rank", lambda: BOX.cosines(25)),
         ("k", lambda: BOX.edges(2)),
+        ("other", lambda: BOX.same_box(3.5)),
         ("coarse", lambda: BOX.aggregated(np.ones(24), Grid((2, 2)))),
         ("coarse", lambda: Grid((4, 6)).aggregated(np.ones(24), Grid((3, 2)))),
     ],

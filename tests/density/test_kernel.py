@@ -167,10 +167,12 @@ BAD_INPUT = {
         ("bandwidth", lambda: kernels(_ONE, GRID, bandwidth=[0.1, 0.1])),
         ("too coarse", lambda: kernels(_ONE, GRID, bandwidth=0.02)),
         ("grid", lambda: kernels(_ONE, 30, bandwidth=0.02)),
+        ("reflect", lambda: kernels(_ONE, GRID, bandwidth=0.1, reflect="no")),
     ],
     "distfilt.density.kernel.kernel_density": [
         ("positions", lambda: kernel_density(np.zeros((0, 2)), GRID, bandwidth=0.1)),
         ("bandwidth", lambda: kernel_density(_ONE, GRID, bandwidth=-0.1)),
+        ("reflect", lambda: kernel_density(_ONE, GRID, bandwidth=0.1, reflect=None)),
     ],
     "distfilt.density.kernel.kernel_information": [
         ("agents", lambda: kernel_information(GRID, bandwidth=0.1, agents=0)),

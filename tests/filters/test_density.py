@@ -25,7 +25,7 @@ from distfilt.density.seen import Seen, present_graph
 from distfilt.density.sharing import alone
 from distfilt.filters import DensityFilter, DensityState, final_state
 from distfilt.models import Swarm, rotating_swarm
-from distfilt.network import Faults, Graph, graphs
+from distfilt.network import Channel, Faults, Graph, graphs
 
 SIZE, H = 12, 0.12
 GRID = Grid((10, 10))
@@ -391,6 +391,7 @@ BAD_INPUT = {
         ("alpha", lambda: PIConsensus(alpha=-1.0)),
         ("modes", lambda: PIConsensus(modes=0)),
         ("first_std", lambda: PIConsensus(first_std=0.0)),
+        ("rate", lambda: PIConsensus(rate="yes")),
     ],
     "distfilt.density.sharing.DynamicAverage": [
         ("modes", lambda: DynamicAverage(modes=0)),
@@ -399,7 +400,10 @@ BAD_INPUT = {
     "distfilt.density.sharing.alone": [
         ("sharing", lambda: alone(3, Seen(START, np.ones(SIZE, bool), GRID, H, 0.0)))
     ],
-    "distfilt.density.sharing.Flooding": [("forget", lambda: Flooding(forget=0.0))],
+    "distfilt.density.sharing.Flooding": [
+        ("forget", lambda: Flooding(forget=0.0)),
+        ("forget", lambda: Flooding(forget=np.ma.masked_array(1.0, True))),
+    ],
     "distfilt.density.seen.present_graph": [
         ("graph", lambda: present_graph(3, np.ones(2, bool)))
     ],
@@ -430,3 +434,28 @@ def test_seen_kernels_of_the_gone_are_zero() -> None:
     present = np.array([True, False])
     seen = Seen(np.array([[0.5, 0.5], [0.0, 0.0]]), present, GRID, H, 0.0)
     assert seen.kernels[1].max() == 0 and GRID.integral(seen.kernels[0]) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    "rule", [PIConsensus(), DynamicAverage(), Flooding(), Neighbours(), Centralised()]
+)
+def test_a_rule_refuses_what_it_cannot_have_carried(rule) -> None:
+    seen = Seen(START, np.ones(SIZE, bool), GRID, H, 0.0)
+    channel, kept = Channel(graphs.path(SIZE)), rule.begin(seen)
+    for name, call in {
+        "seen": lambda: rule.begin(3.5),
+        "carried": lambda: rule.learn((*kept, np.ones(3)), seen, channel, 0.1),
+        "channel": lambda: rule.learn(kept, seen, graphs.path(SIZE), 0.1),
+        "channel:": lambda: rule.learn(kept, seen, Channel(graphs.path(SIZE - 1)), 0.1),
+        "dt": lambda: rule.learn(kept, seen, channel, 0.0),
+    }.items():
+        with pytest.raises(ValueError, match=rf"^{name}"):
+            call()
+    with pytest.raises(ValueError, match="^seen"):
+        rule.learn(kept, "text", channel, 0.1)
+    for part in range(len(kept)):
+        for wrong in (np.nan * kept[part], kept[part][:-1], kept[part].astype(str)):
+            with pytest.raises(ValueError, match="^carried"):
+                rule.learn((*kept[:part], wrong, *kept[part + 1 :]), seen, channel, 0.1)
+    again = rule.learn([part.tolist() for part in kept], seen, channel, 0.1)
+    assert np.array_equal(again[1], rule.learn(kept, seen, channel, 0.1)[1])

@@ -77,6 +77,10 @@ def _update_cases(f: Callable[..., Any]) -> list[tuple[str, Callable[[], Any]]]:
 def _weights(call: Callable[..., Any], f: Callable[..., Any]) -> list[tuple[str, Any]]:
     return [
         ("alpha", lambda: call(f, alpha=0.0)),
+        ("alpha", lambda: call(f, alpha=1e-8)),
+        ("alpha", lambda: call(f, alpha=1e300)),
+        ("kappa", lambda: call(f, kappa=-2.0 + 1e-12)),
+        ("beta", lambda: call(f, beta=1e300)),
         ("beta", lambda: call(f, beta=-1.0)),
         ("kappa", lambda: call(f, kappa=-2.0)),
     ]

@@ -22,12 +22,19 @@ from tests.kalman.bad_input import linear_cases, of_changes, series_cases, with_
 from tests.kalman.problems import D, M, problem, spd, walk
 
 BAD_INPUT: dict[str, Any] = {
-    "distfilt.kalman.filterpy_kf": linear_cases(filterpy_kf),
+    "distfilt.kalman.filterpy_kf": [
+        *linear_cases(filterpy_kf),
+        ("likelihood", lambda: filterpy_kf(
+            [0.0], [[1.0]], [[2.0]], F=[[1.0]], H=[[1.0]], Q=[[0.0]], R=[[1.0]],
+            likelihood="yes")),
+    ],
     "distfilt.kalman.filterpy_ekf": [*series_cases(filterpy_ekf), of_changes(filterpy_ekf)],
     "distfilt.kalman.filterpy_ukf": [
         *series_cases(filterpy_ukf),
         of_changes(filterpy_ukf),
         with_option(filterpy_ukf, alpha=0.0),
+        with_option(filterpy_ukf, alpha=1e-9),
+        with_option(filterpy_ukf, likelihood=None),
         with_option(filterpy_ukf, beta=-1.0),
         with_option(filterpy_ukf, kappa=-2.0),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,19 @@ from tests.kalman.problems import RUNS, STEPS, D, M, posterior, problem, spd
 
 _RUN = kalman_filter([0.0], [[1.0]], np.zeros((2, 1)), F=[[1.0]], H=[[1.0]], Q=[[1.0]], R=[[1.0]])
 _LOST = GaussianRun(np.zeros((2, 1)), np.zeros((2, 1, 1)), np.zeros(2))
+_WRONG = [
+    replace(_RUN, means=_RUN.means.astype(str)),
+    replace(_RUN, means=np.nan * _RUN.means),
+    replace(_RUN, means=_RUN.means[0]),
+    replace(_RUN, covariances=_RUN.covariances[:1]),
+    replace(_RUN, covariances=_RUN.covariances[..., 0]),
+    replace(_RUN, covariances=np.ones((2, 3, 1, 1))),
+    replace(_RUN, log_likelihood=_RUN.log_likelihood[:1]),
+]
 BAD_INPUT: dict[str, Any] = {
     "distfilt.kalman.rts_smoother": [
         ("run", lambda: rts_smoother(3, F=[[1.0]], Q=[[1.0]])),
+        *[("run", lambda run=run: rts_smoother(run, F=[[1.0]], Q=[[1.0]])) for run in _WRONG],
         ("F", lambda: rts_smoother(_RUN, F=np.eye(2), Q=[[1.0]])),
         ("F", lambda: rts_smoother(_RUN, F=np.ones((3, 1, 1)), Q=[[1.0]])),
         ("Q", lambda: rts_smoother(_RUN, F=[[1.0]], Q=[[-1.0]])),

@@ -45,6 +45,7 @@ BAD_INPUT = {
         ("omega", lambda: PartialFusion(OWN, OTHER, omega=np.nan)),
         ("omega", lambda: PartialFusion(OWN, OTHER, omega="half")),
         ("omega", lambda: PartialFusion(OWN, OTHER, omega=[0.5, 0.4])),
+        ("omega", lambda: PartialFusion(OWN, OTHER, omega=[[0.5, 0.4], [1.0]])),
         ("omega", lambda: PartialFusion(OWN, OTHER, omega=[0.5, 0.25, 0.25])),
     ],
     "distfilt.mixtures.fusion.PartialFusion.shapes": [
@@ -54,13 +55,30 @@ BAD_INPUT = {
         ("marginal", lambda: EXACT.shapes(terms="all", marginal=OWN)),
         ("received", lambda: EXACT.shapes(received=[OTHER, OTHER])),
         ("received", lambda: EXACT.shapes(received=[OWN])),
+        ("received", lambda: EXACT.shapes(received=[None])),
+        ("received", lambda: EXACT.shapes(received=3.5)),
     ],
     "distfilt.mixtures.fusion.PartialFusion.weigh": [
         ("shapes", lambda: EXACT.weigh(OWN)),  # type: ignore[arg-type]
         ("rule", lambda: EXACT.weigh(SHAPES, rule="C4")),
         ("at_most", lambda: EXACT.weigh(SHAPES, at_most=0)),
     ],
-    "distfilt.mixtures.fusion.PartialFusion.log_value": [("x", lambda: EXACT.log_value([1.0]))],
+    "distfilt.mixtures.fusion.PartialFusion.log_value": [
+        ("x", lambda: EXACT.log_value([1.0])),
+        ("x", lambda: EXACT.log_value(np.full(4, 1e300))),
+    ],
+    "distfilt.mixtures.fusion.PartialFusion.log_update": [
+        ("t", lambda: EXACT.log_update(np.full(2, 1e300))),
+    ],
+    "distfilt.mixtures.fusion.PartialFusion.log_target": [
+        ("t", lambda: EXACT.log_target(np.full((5, 2), 1e300))),
+    ],
+    "distfilt.mixtures.fusion.PartialFusion.approximation": [
+        ("size", lambda: EXACT.approximation(size="two")),
+        ("size", lambda: EXACT.approximation(size=10**6 + 0.5)),
+        ("terms", lambda: PartialFusion(OWN, OTHER, omega=1.0).approximation(terms="some")),
+        ("rule", lambda: PartialFusion(OWN, OTHER, omega=1.0).approximation(rule="C9")),
+    ],
     "distfilt.mixtures.fusion.fuse": [
         ("heard", lambda: fuse(OTHER, OWN)),
         ("size", lambda: fuse(OWN, OTHER, size=0)),
@@ -84,9 +102,17 @@ BAD_INPUT = {
         ("source", lambda: Shapes([[0.0]], [[[1.0]]], [0, 1])),
         ("source", lambda: Shapes([[0.0]], [[[1.0]]], [-1])),
         ("source", lambda: Shapes([[0.0]], [[[1.0]]], [0.5])),
+        ("source", lambda: Shapes([[0.0]], [[[1.0]]], [[0, 1], [0]])),
+        ("source", lambda: Shapes([[0.0]], [[[1.0]]], [True])),
         ("dropped", lambda: Shapes([[0.0]], [[[1.0]]], [0], -1)),
     ],
-    "distfilt.mixtures.shapes.Shapes.select": [("keep", lambda: SHAPES.select([0.5]))],
+    "distfilt.mixtures.shapes.Shapes.select": [
+        ("keep", lambda: SHAPES.select([0.5])),
+        ("keep", lambda: SHAPES.select([True])),
+        ("keep", lambda: SHAPES.select([SHAPES.size])),
+        ("keep", lambda: SHAPES.select([[0, 1], [0]])),
+        ("keep", lambda: SHAPES.select(np.ma.masked_array([0], [True]))),
+    ],
     "distfilt.mixtures.collocation.tikhonov": [
         ("largest", lambda: tikhonov(-1.0, 0.0)),
         ("smallest", lambda: tikhonov(1.0, 2.0)),
@@ -470,3 +496,12 @@ def test_pair_b_orders_the_reductions() -> None:
     by_qr = divergences(exact, pivoted)[0]
     assert (by_kld <= by_runnalls).all()
     assert (by_qr[:2] >= 2 * by_runnalls[:2]).all() and (by_qr[:2] >= 2 * by_kld[:2]).all()
+
+
+def test_the_literal_form_says_where_it_has_no_inverse() -> None:
+    # The own target marginal is what is heard, so that the update's information is zero.
+    own = GaussianMixture.gaussian([0.5, 1.0], [[4.0, 1.0], [1.0, 2.0]])
+    fused = PartialFusion(own, own.marginal([0]), omega=0.5)
+    assert np.allclose(fused.shapes().means, own.means)
+    with pytest.raises(np.linalg.LinAlgError, match="^form: .*'conditional'"):
+        fused.shapes(form="literal")

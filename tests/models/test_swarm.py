@@ -68,6 +68,15 @@ def test_mixture_goes_round() -> None:
     assert abs(f.density(x, 5.0).sum() * 0.01**2 - 1) < 1e-6
 
 
+def test_a_mixture_keeps_its_centre_when_the_array_changes() -> None:
+    centre = np.array([0.25, 0.75])
+    f = RotatingMixture(centre=centre)
+    before = f.means(1.0)
+    centre[:] = 0.0
+    assert np.array_equal(f.means(1.0), before)
+    assert np.array_equal(before, RotatingMixture(centre=(0.25, 0.75)).means(1.0))
+
+
 def test_step_is_repeatable_and_leaves_its_input() -> None:
     swarm = rotating_swarm()
     x = np.random.default_rng(2).random((5, 2))
@@ -172,6 +181,7 @@ BAD_INPUT = {
         ("times", lambda: _SWARM.simulate(_HALF, [0.2, 0.1], rng=_RNG)),
     ],
     "distfilt.models.swarm.RotatingMixture": [
+        ("centre", lambda: RotatingMixture(centre=[0.5])),
         ("variance", lambda: RotatingMixture(variance=0.0)),
         ("components", lambda: RotatingMixture(components=0)),
         ("radius", lambda: RotatingMixture(radius=-1.0)),

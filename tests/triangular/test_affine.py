@@ -24,6 +24,13 @@ BAD_INPUT = {
         ("scale", lambda: AffineMap(np.zeros(1), np.zeros(1), np.zeros((1, 1)), -np.eye(1))),
         ("scale", lambda: AffineMap(
             np.zeros(1), np.zeros(2), np.zeros((2, 1)), np.ones((2, 2)))),
+        ("observed_mean", lambda: AffineMap(["0"], [0.0], [[0.5]], [[1.0]])),
+        ("observed_mean", lambda: AffineMap([NAN], [0.0], [[0.5]], [[1.0]])),
+        ("observed_mean", lambda: AffineMap(0.0, [0.0], [[0.5]], [[1.0]])),
+        ("mean", lambda: AffineMap([0.0], [True], [[0.5]], [[1.0]])),
+        ("mean", lambda: AffineMap([0.0], {"a": 1.0}, [[0.5]], [[1.0]])),
+        ("y", lambda: _MAP(_Y[:3], _X)),
+        ("y", lambda: _MAP.inverse(_Y[:3], _X)),
         ("x", lambda: _MAP(_Y, _X[:, :1])),
         ("y", lambda: _MAP(_X, _X)),
         ("z", lambda: _MAP.inverse([0.1], [[NAN, 0.0]])),
@@ -205,3 +212,12 @@ def test_objective_of_many_ensembles_is_each_one_s() -> None:
     for k in range(3):
         alone = objective(fit(x[k, :, :0], x[k]), x[k, :, :0], x[k])
         assert np.allclose(found[k], alone, atol=1e-13)
+
+
+def test_a_map_of_lists_is_that_of_arrays() -> None:
+    parts = ([0.5], [1.0, 2.0], [[0.5], [0.25]], [[2.0, 0.0], [1.0, 3.0]])
+    one, two = AffineMap(*parts), AffineMap(*map(np.array, parts))
+    y, x = [[1.0], [2.0]], [[0.0, 1.0], [2.0, 3.0]]
+    assert np.array_equal(one(y, x), two(y, x))
+    assert np.array_equal(one.inverse(y, x), two.inverse(y, x))
+    assert np.array_equal(one.log_det(y, x), two.log_det(y, x))

@@ -68,6 +68,7 @@ BAD_INPUT = {
         *_cases(pool_by_admm),
         ("channel", lambda: pool_by_admm(_Y[None], _X[None], Channel(graphs.path(3), runs=(1,)))),
         ("rho", lambda: pool_by_admm(_Y, _X, Channel(graphs.path(3)), rho=0.0)),
+        ("standardise", lambda: pool_by_admm(_Y, _X, Channel(graphs.path(3)), standardise=1)),
         ("admm", lambda: pool_by_admm(_Y, _X, Channel(graphs.path(3)), iterations=2)),
     ],
 }

@@ -1,0 +1,167 @@
+"""Valid calls that no doctest makes, of maps, couplings, mixtures, densities and what is beside.
+
+``tests/tools/fuzz.py`` runs this file after the doctests and exchanges the arguments.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from distfilt import checks, coupling, intervals, kalman, mixtures, plotting, triangular
+from distfilt import density as densities
+from distfilt.density.seen import Seen
+from distfilt.digests import digest, of_axes
+from distfilt.models import Swarm
+from distfilt.network import Channel, graphs
+
+Array = np.ndarray
+
+
+def a_line(x: Array) -> Array:
+    return np.asarray(x[..., :1] + 2.0 * x[..., 1:])
+
+
+def a_drift(x: Array, t: float) -> Array:
+    return np.asarray(0.1 - x)
+
+
+def a_drift_in_time(x: Array, t: float) -> Array:
+    return np.asarray(0.1 * np.cos(t) - x)
+
+
+def the_checks() -> None:
+    checks.callable_(len, "here")
+    checks.nonblank("a text", "here")
+    checks.weights([0.5, 0.5], "here")
+    for find in (intervals.mean_interval, intervals.median_interval):
+        find(np.array([2.0, 1.0, 4.0, 3.0, 7.0, 5.5, 8.0]), level=0.9)
+    intervals.proportion_interval(3, 10, level=0.9)
+    intervals.Interval(0.25, 0.15, 0.375, 0.06)
+    digest(error=[4.0, 2.0, 1.0])
+
+
+def the_maps() -> None:
+    rng = np.random.default_rng(0)
+    x = rng.standard_normal((40, 2))
+    y = x[:, :1] + 0.1 * rng.standard_normal((40, 1))
+    for fitted in (triangular.affine.fit(y, x), triangular.separable.fit(y, x, order=1)):
+        z = fitted(y, x)
+        fitted.inverse(y, z)
+        fitted.inverse(y[0], z)
+        fitted.log_det(y, x)
+    triangular.affine.fit_convex(y, x, solver="ECOS", max_iters=100)
+    triangular.separable.fit(y, x, order=(1, 2), uses=[[0], [0, 1]], regularisation=0.1)
+
+
+def the_couplings() -> None:
+    found = coupling.plan([[1.0, 0.0], [0.0, 1.0]], [0.5, 0.5])
+    coupling.Plan(found.matrix, found.value, found.potentials, found.bound)
+    for slope in (None, lambda x: np.tile([1.0, 2.0], (*x.shape[:-1], 1, 1))):
+        line = coupling.Constraint(a_line, [1.0], derivative=slope)
+        line.residual([[0.25, 1.5], [2.0, 0.5]])
+        line.jacobian([[0.25, 1.5], [2.0, 0.5]])
+
+
+def the_grids() -> None:
+    grid = densities.Grid((4, 6), low=[0.0, 0.0], high=[1.0, 1.5])
+    values = 1.0 + np.arange(24.0) / 24
+    places = np.array([[0.2, 0.3], [0.9, 1.4], [0.5, 0.75]])
+    grid.check(values)
+    grid.norm(values)
+    grid.normalised(values)
+    grid.mean(values)
+    grid.integral(values)
+    grid.inside(places)
+    grid.cells(places)
+    grid.histogram(places)
+    grid.at(values, places)
+    grid.aggregated(values, densities.Grid((2, 3), low=[0.0, 0.0], high=[1.0, 1.5]))
+    grid.same_box(densities.Grid((2, 3)))
+    grid.axis(1)
+    grid.edges(1)
+    grid.wavenumbers(5)
+    grid.cosines(5)
+
+
+def the_flows() -> None:
+    grid = densities.Grid((4, 5))
+    values = np.ones(20)
+    for scheme in ("split", "backward_euler", "crank_nicolson"):
+        flow = densities.FokkerPlanck(Swarm(a_drift_in_time, 0.05), grid, scheme=scheme)
+        flow.rates(0.5)
+        flow.generator(0.5)
+        flow.solver(0.5, 0.1)
+        flow.step(values, 0.5, 0.1)
+        flow.evolve(values, [0.5, 1.0], t0=0.25, substeps=2)
+    state = densities.Shared(np.eye(3)[:, :2], np.ones((2, 3)), np.tile(np.eye(2), (2, 1, 1)),
+                             np.ones((2, 2)))  # fmt: skip
+    state.covariance(1)
+
+
+def the_sharing() -> None:
+    grid = densities.Grid((5, 5))
+    positions = np.array([[0.2, 0.3], [0.8, 0.7], [0.5, 0.5]])
+    seen = Seen(positions, np.ones(3, dtype=bool), grid, 0.2, 0.0)
+    for rule in (
+        densities.Centralised(), densities.Neighbours(), densities.Flooding(),
+        densities.PIConsensus(modes=4, first_std=0.3, rate=True),
+        densities.DynamicAverage(modes=4),
+    ):  # fmt: skip
+        rule.learn(rule.begin(seen), seen, Channel(graphs.path(3)), 0.5)
+
+
+def the_mixtures() -> None:
+    own = mixtures.GaussianMixture(
+        [0.4, 0.6], [[0.0, 1.0], [2.0, -1.0]], [[[2.0, 0.5], [0.5, 1.0]], [[1.0, 0.2], [0.2, 1.0]]]
+    )
+    heard = mixtures.GaussianMixture([0.5, 0.5], [[1.0], [2.0]], [[[1.0]], [[2.0]]])
+    points = np.array([[0.5, 0.25], [1.5, -0.5], [0.1, 2.0]])
+    own.component_log_densities(points)
+    own.log_density(points)
+    own.collapsed()
+    own.quadratics()
+    own.sample(5, rng=np.random.default_rng(1))
+    own.marginal([1])
+    own.conditional([1], [0.5])
+    own.product(own.collapsed())
+    mixtures.GaussianMixture.unpack(own.pack())
+    narrow = mixtures.GaussianMixture([0.5, 0.5], [[1.0], [2.0]], [[[0.5]], [[0.8]]])
+    fusion = mixtures.PartialFusion(own, [heard, heard], omega=[0.4, 0.3, 0.3])
+    fusion.log_target(points[:, :1])
+    fusion.log_update(points[:, :1])
+    fusion.log_value(points)
+    shapes = fusion.shapes(terms="all")
+    fusion.shapes(terms="all", form="literal", marginal=narrow, received=[heard, heard])
+    fusion.weigh(shapes, rule="C2", at_most=3)
+    fusion.weigh(shapes)
+    fusion.approximation(size=3)
+
+
+def the_runs() -> None:
+    run = kalman.kalman_filter(
+        [0.0], [[1.0]], [[2.0], [1.0]], F=[[1.0]], H=[[1.0]], Q=[[0.5]], R=[[1.0]]
+    )
+    kalman.GaussianRun(run.means, run.covariances, run.log_likelihood)
+
+
+def the_pictures() -> None:
+    from matplotlib import pyplot
+
+    ax = plotting.axes(xlabel="x", ylabel="y", xunit="m", yunit="s", title="A title", size=(3, 2))
+    plotting.ellipse(ax, [0.0, 0.5], [[4.0, 0.0], [0.0, 1.0]], index=1, label="a share")
+    plotting.band(ax, [0.0, 1.0], [[1.0, 5.0], [2.0, 4.0]], index=1, label="a run")
+    plotting.graph(ax, [[0, 1], [1, 0]], labels=["A", "B"], positions=[[0.0, 0.0], [1.0, 0.5]],
+                   known=[0.5, 1.0], notes=["angle", ""])  # fmt: skip
+    of_axes(ax)
+    plotting.colour(3)
+    plotting.line_style(3)
+    plotting.Slider((b"PNG",), ("gain 0.1",), ("axes 1",), label="gain", alt="A curve that falls",
+                    start=0, seconds=0.5)  # fmt: skip
+    pyplot.close("all")
+
+
+for calls in (
+    the_checks, the_maps, the_couplings, the_grids, the_flows, the_sharing, the_mixtures, the_runs,
+    the_pictures,
+):  # fmt: skip
+    calls()
