@@ -33,7 +33,7 @@ import tempfile
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sized
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -215,8 +215,8 @@ def varied(calls: list[Call]) -> list[Call]:
     seen: set[tuple[str, str, bool]] = set()
     for call in calls:
         given = call.bound.arguments.items()
-        new = {(n, type(v).__name__, isinstance(v, Sized) and not len(v)) for n, v in given} - seen
-        if new and len(out) < MOST_CALLS:
+        new = {(n, type(v).__name__, isinstance(v, list | tuple | str) and not v) for n, v in given}
+        if new - seen and len(out) < MOST_CALLS:
             out.append(call)
             seen |= new
     return out
