@@ -76,12 +76,14 @@ BAD_INPUT: dict[str, Cases] = {
     "distfilt.filters.DensityFilter": [
         *flag("number_known", density),
         *option("prior_length", density, "0.1", None, 0.0, np.nan),
+        *option("names", density, "abcdef", [None, *"abcde"], 3.5),
         *option("prior_std", density, "1", None, -1.0, np.nan),
         ("rng: needs a numpy", lambda: density().start(X, rng=3)),
         ("runs: needs ()", lambda: density().start(X, runs=3)),
         ("late: needs a Sequence", lambda: density().step(density().start(X), 0.1, X, late=3.5)),
     ],
     "distfilt.filters.GaussianFilter": [
+        *option("names", lambda **o: team(filters.GaussianFilter, **o), "ab", ["a", 2.0]),
         *flag("share", lambda **o: team(filters.GaussianFilter, **o)),
         ("rng: needs a numpy", lambda: STEP.start(GAUSS, rng="text")),
     ],
@@ -182,8 +184,11 @@ BAD_INPUT: dict[str, Cases] = {
         "numbers", lambda **o: table(PAPERS[0], "table-2", **o), "noise", 3.5, [3.5]),
     "distfilt.published.judge_table": option(
         "why", lambda **o: judge_table("semeraro", "Table 1", [VALUE], **o), None, 3.5, object()),
-    "distfilt.studies.run": flag(
-        "progress", lambda **o: studies.run(lambda seed: 1.0, [1], workers=1, **o)),
+    "distfilt.studies.run": [
+        *flag("progress", lambda **o: studies.run(lambda seed: 1.0, [1], workers=1, **o)),
+        ("workers: needs at most", lambda: studies.run(lambda seed: 1.0, [1], workers=10**13)),
+        ("seeds: needs", lambda: studies.run(lambda seed: 1.0, [np.timedelta64(1, "s")])),
+    ],
     "distfilt.studies.check": option("rough", lambda **o: studies.check(
         studies.stored("grange", "figure-2"), lambda seed: 1.0, **o), 3.5, object(), "draw"),
     "distfilt.studies.store": [("path: needs a file's name", lambda: studies.store(
@@ -193,12 +198,14 @@ BAD_INPUT: dict[str, Cases] = {
 
 def test_what_a_structure_keeps_is_its_own() -> None:
     """Who made it may change the array afterwards; a list is kept as the array that it means."""
-    scale, centre, value = np.ones(2), np.full(2, 0.5), np.ones(1)
+    scale, centre, value, first = np.ones(2), np.full(2, 0.5), np.ones(1), np.ones(49)
+    swarm = density(first=first)
     f, late = mixture(scale=scale), filters.Late(0, 1.0, value, arrived=2.0)
     round_ = models.RotatingMixture(centre=centre)
-    for given in (scale, centre, value):
+    for given in (scale, centre, value, first):
         given[:] = 7.0
     assert f.scale.tolist() == [1.0, 1.0] and np.asarray(late.value).tolist() == [1.0]
+    assert (swarm.first == 1).all()
     assert round_.centre == (0.5, 0.5)
     weights = network.Weights(PATH, [0.5, 0.25], [0.5, 0.75])  # type: ignore[arg-type]
     assert weights.matrix.toarray().tolist() == [[0.5, 0.5], [0.75, 0.25]]

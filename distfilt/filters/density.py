@@ -151,8 +151,7 @@ class DensityFilter(TeamFilter):
 
     def __post_init__(self) -> None:
         instance(self.model, "model", FokkerPlanck)
-        size = count(self.size, "size")
-        count(self.rank, "rank")
+        sizes = count(self.size, "size"), count(self.rank, "rank")
         if not callable(self.graph) and not isinstance(self.graph, Graph):
             number(self.graph, "graph", above=0)
         instance(self.sharing, "sharing", Sharing)  # type: ignore[type-abstract]
@@ -160,11 +159,12 @@ class DensityFilter(TeamFilter):
             number(getattr(self, name), name, above=0)
         _width(self.bandwidth, self.model.grid, 1)
         if self.local is not None:
-            places(self.local, "local", size)
+            places(self.local, "local", sizes[0])
         if isinstance(self.first, str):
             choice(self.first, "first", ("flat", "observed"))
         else:
-            array(self.first, "first", (self.model.grid.size,))
+            first = array(self.first, "first", (self.model.grid.size,)).copy()
+            object.__setattr__(self, "first", first)
         number(self.mass_std, "mass_std", at_least=0)
         choice(self.noise, "noise", ("forecast", "observed"))
         if self.process is not None:

@@ -272,6 +272,8 @@ class TeamFilter(Filter):
         if faults is not None and (not isinstance(faults, Faults) or faults.late):
             raise ValueError(f"faults: needs Faults without a delay, got {faults!r}")
         names = instance(self.names, "names", Collection)  # type: ignore[type-abstract]
+        if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"names: needs a list of texts, got {names!r}")
         if len(names) not in (0, self.count):
             raise ValueError(f"names: needs {self.count} names, got {len(names)}")
 

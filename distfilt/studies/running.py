@@ -23,6 +23,8 @@ from .study import Failure, Study, StudyError, StudyInterrupted
 
 __all__ = ["run"]
 
+_MOST_WORKERS = 10_000
+
 
 def run(
     trial: Callable[[SeedSequence], Any], seeds: Iterable[SeedSequence | int], *,
@@ -97,6 +99,8 @@ def run(
             f"executor: needs a concurrent.futures.Executor, got {type(executor).__name__}"
         )
     n_workers = None if workers is None else count(workers, "workers")
+    if n_workers is not None and n_workers > _MOST_WORKERS:
+        raise ValueError(f"workers: needs at most {_MOST_WORKERS}, got {n_workers}")
     size = None if chunk is None else count(chunk, "chunk")
     stops = choice(errors, "errors", ("raise", "collect")) == "raise"
     threads = None if blas_threads is None else count(blas_threads, "blas_threads")

@@ -54,7 +54,7 @@ def spawn(root: int, n: int) -> list[SeedSequence]:
 
 
 def _is_count(value: Any) -> bool:
-    integral = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    integral = isinstance(value, int | np.integer) and not isinstance(value, bool | np.timedelta64)
     return integral and value >= 0
 
 

@@ -7,7 +7,8 @@ from typing import Any
 import networkx
 import numpy as np
 
-from distfilt import filters, models, network, published, sensors, studies
+from distfilt import filters, models, network, published, sensors, studies, updates
+from distfilt.coupling import norm
 from distfilt.density import Flooding, FokkerPlanck, Grid, PIConsensus
 from distfilt.mixtures import GaussianMixture, fuse
 
@@ -161,7 +162,7 @@ def of_papers_and_studies() -> None:
     study.metrics(["draw"])
     study.frame(["draw"])
     study.seed(2)
-    studies.store(study, "study.csv", parameters={"mean": 0.5}, columns=["draw"])
+    studies.store(study, "study.csv", parameters={"mean": 0.5}, columns=["draw"], code=[trial])
     kept = studies.load("study.csv")
     kept.metric("draw")
     kept.seed(1)
@@ -171,6 +172,114 @@ def of_papers_and_studies() -> None:
     studies.script("lorenz-63")
 
 
+def filters_with_every_option() -> None:
+    names = ["left", "right"]
+    some = network.Faults(loss=0.1, seed=3)
+    team: dict[str, Any] = {"names": names, "faults": some, "share": True, "failures": "keep"}
+    for kind, options in (
+        (filters.GaussianFilter,
+         {"agreement": network.covariance_intersection, "rule": "unscented", "kappa": 0.5}),
+        (filters.EnsembleFilter, {"agreement": network.intersection, "members": 8}),
+        (filters.ParticleFilter, {"agreement": paired, "members": 20, "jitter": 0.1}),
+        (filters.TransportFilter,
+         {"agreement": network.finite_time, "members": 8, "rejuvenation": 0.1}),
+    ):  # fmt: skip
+        f = kind(WALK, EYES, PATH, **team, **options)
+        f.start(PRIOR, rng=RNG(0), runs=(2,), t=0.5)
+    filters.EnsembleFilter.exact(WALK, EYES, PATH, members=12)
+    mixed: dict[str, Any] = {"names": names, "faults": some, "stretch": 0.5, "gate": 3.0}
+    for mixture, options in (
+        (filters.MixtureFilter, {"agreement": fuse}), (filters.NewsFilter, {"common": [0]})
+    ):
+        mixture(
+            [WALK, WALK], EYES, PATH, target_dim=1, scale=np.array([1.0, 2.0]), **mixed, **options
+        )
+    grid = Grid((7, 7))
+    swarm = FokkerPlanck(models.rotating_swarm(), grid)
+    filters.DensityFilter(
+        swarm, 6, 0.6, PIConsensus(), bandwidth=0.2, rank=9, local=(0, 2), first=np.ones(49),
+        process=0.1, faults=some, names=["a", "b", "c", "d", "e", "f"], mass_std=0.1,
+    )
+    filters.Summary(
+        np.zeros((2, 1)), np.ones((2, 1)), np.ones((2, 1, 1)), np.zeros((2, 4, 1)),
+        np.full((2, 4), 0.25), {"size": np.ones(2)},
+    )
+    step = filters.GaussianFilter(WALK, EYES, PATH, lag=1)
+    state = step.step(step.start(PRIOR), 1.0, [[0.5], None])
+    step.begin(state, type(state), 2.0, [[0.5], None], [filters.Late(1, 1.0, [0.5], arrived=2.0)])
+    step.gather([np.array([0.5]), None], network.Channel(PATH))
+
+
+def paired(points: Any, logs: Any, channel: Any) -> Any:
+    return points, logs
+
+
+def others_with_every_option() -> None:
+    words: dict[str, Any] = {"names": ("x", "y"), "units": ("m", "m")}
+    still = lambda t, dt: dt * np.eye(2)  # noqa: E731
+    models.Model(2, lambda x, t, dt: x, still, derivative=lambda x, t, dt: np.eye(2), **words)
+    models.LinearModel(
+        2, lambda x, t, dt: x, still, derivative=lambda x, t, dt: np.eye(2),
+        transition_matrix=lambda dt: np.eye(2), **words,
+    )
+    models.LinearModel.from_transition(2, lambda dt: np.eye(2), still, **words)
+    models.coordinated_turn(sigma=0.1, turn_sigma=0.2)
+    models.rotating_swarm(mixture=models.RotatingMixture(centre=np.array([0.5, 0.6])))
+    models.Swarm(lambda x, t: 0 * x, np.array([0.01, 0.02]), low=[0.0, 0.0], high=[2.0, 1.0])
+    sensors.Sensor(
+        1, lambda x: x[..., :1], [[0.5]], difference=np.subtract, kind="first",
+        linear=lambda d: np.eye(1, d), derivative=lambda x: np.eye(1, 2), units=("m",),
+    )
+    channel = network.Channel(PATH, ledger=network.Ledger.empty(2), runs=(), t=0.5)
+    weights = network.weights.metropolis(PATH)
+    x, members = np.array([[1.0], [3.0]]), RNG(0).standard_normal((2, 6, 2))
+    means, covs = np.zeros((2, 2)), np.tile(np.eye(2), (2, 1, 1))
+    matrix = np.array([[0.5, 0.5], [0.25, 0.75]])
+    for given in (weights, matrix):
+        network.covariance_intersection(means, covs, channel, weights=given)
+        network.intersection(members, channel, weights=given, scale=np.array([1.0, 2.0]))
+    network.average(x, channel, weights=weights, rounds=2)
+    network.barycentre(members, channel, scale=np.array([1.0, 2.0]))
+    network.event_triggered(x, channel, rounds=3, threshold=0.1, weights=weights)
+    network.first_order(x, x + 0.5, x, channel, weights=weights)
+    network.flood(x, channel, rounds=2)
+    network.maximum(x, channel, rounds=2)
+    network.pi_step(network.pi_start(x), x, channel, dt=0.1, alpha=0.2, a=0.4, b=0.04,
+                    rate=0.5 * x, substeps=3)  # fmt: skip
+    network.Faults(loss=0.1, also=(network.Faults(silent=[1]),), burst=3.0, delay=1)
+    sensors.angle([0, 1], std=0.1, full=True, origin=np.array([0.5, 1.5]))
+    sensors.distance([0, 1], std=0.1, origin=np.array([0.5, 1.5]))
+    sensors.line_of_sight(std=1e-4, hidden=models.occulted)
+    study = published.scenario("grange", "table-2")
+    one = published.Value("C1", 0.0899, 0.0004, 0.0896)
+    published.judge_table("semeraro", "Table 1", [one], why="drawn", scenario=study)
+    published.judge_parameters("grange", "Table II", study.reading(), scenario=study)
+    published.table("grange", "table-2", numbers=["noise"])
+    file = published.root() / "published" / "grange" / "table-2.csv"
+    columns = published.table("grange", "table-2").columns
+    published.read_table(file, columns=columns, numbers=["noise"])
+    seen, logs = RNG(0).standard_normal((8, 2)), np.zeros((2, 3))
+    given: dict[str, Any] = {"rng": RNG(0), "inside": lambda x: x[..., 0] > -9}
+    updates.ensemble_transform(seen, seen[:, :1], [0.5], [[1.0]], **given)
+    updates.retracted(updates.known_noise, norm([0]), motion=([0], [1]))
+    points = np.tile([[0.0], [1.0], [2.0]], (2, 1, 1))
+    updates.transform_by_agreement(points, logs, channel, rounds=2)
+    swarm, start = models.rotating_swarm(), np.array([[0.25, 0.5]])
+    swarm.diffusion_at(start, 0.0)
+    network.Graph.from_adjacency([[0, 1], [0, 0]], directed=True)
+    for team in (filters.GaussianFilter(WALK, EYES, PATH),
+                 filters.EnsembleFilter(WALK, EYES, PATH, members=4),
+                 filters.ParticleFilter(WALK, EYES, PATH, members=4),
+                 filters.TransportFilter(WALK, EYES, PATH, members=4)):  # fmt: skip
+        team.start(PRIOR, rng=RNG(0), runs=(2,), t=0.5)
+    published.Verdict("grange", "Table I", "read", "4 rows read", "4 rows", "printed so")
+    studies.run(
+        trial, [1, 2], workers=1, chunk=1, errors="collect", timeout=5.0, progress=False,
+        blas_threads=None,
+    )
+
+
 for each in (with_sensors, step_by_step, of_densities_and_mixtures, of_models_and_sensors,
-             of_networks, of_papers_and_studies):  # fmt: skip
+             of_networks, of_papers_and_studies, filters_with_every_option,
+             others_with_every_option):  # fmt: skip
     each()
