@@ -43,6 +43,8 @@ _CASES = {
         ("axis", lambda: rmse(np.zeros((4, 2)), np.zeros(2), axis=1)),
         ("axis", lambda: rmse(np.zeros((4, 2)), np.zeros(2), axis=(0, -1))),
         ("axis", lambda: rmse(np.zeros((4, 2)), np.zeros(2), axis="runs")),
+        ("axis", lambda: rmse(np.zeros((3, 4, 2)), np.zeros(2), axis=True)),
+        ("axis", lambda: rmse(np.zeros((3, 4, 2)), np.zeros(2), axis=np.timedelta64(1, "s"))),
         ("axis", lambda: rmse(np.zeros((4, 2)), np.zeros(2), axis=1, per_component=True)),
         ("per_component", lambda: rmse([[1.0]], [1.0], per_component=None)),
     ],

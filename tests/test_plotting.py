@@ -140,6 +140,8 @@ _CASES |= {
         ("draw", lambda: slider(lambda v: curve(v, width=v), [3.0, 4.0], label="x", alt="y")),
         ("values", lambda: slider(curve, [], label="x", alt="y")),
         ("values", lambda: slider(curve, "abc", label="x", alt="y")),
+        ("values", lambda: slider(curve, object(), label="x", alt="y")),
+        ("values", lambda: slider(curve, np.array(1.0), label="x", alt="y")),
         ("label", lambda: slider(curve, [1.0], label=" ", alt="y")),
         ("alt", lambda: slider(curve, [1.0], label="x", alt="")),
         ("unit", lambda: slider(curve, [1.0], label="x", alt="y", unit="")),

@@ -149,7 +149,7 @@ class MixtureFilter(TeamFilter):
         choice(self.rule, "rule", POINT_RULES)
         for name in ("stretch", "gate"):
             if getattr(self, name) is not None:
-                number(getattr(self, name), name, above=0)
+                number(getattr(self, name), name, above=0, at_most=1e150)
 
     @property
     def count(self) -> int:
@@ -199,7 +199,7 @@ class MixtureFilter(TeamFilter):
         observations : sequence of length A
             Per agent (m,) with NaN where a component is missing, or None.
         """
-        now = number(t, "t", at_least=state.t)
+        now = number(t, "t", at_least=instance(state, "state", MixtureState).t)
         seen = at_one_time(observations, self.sensors, ())
         beliefs = [
             self._moved(belief, model, state.t, now - state.t)

@@ -102,7 +102,9 @@ def _axes(axis: int | tuple[int, ...] | None, ndim: int) -> tuple[int, ...]:
     if axis is None:
         return tuple(range(ndim))
     given = axis if isinstance(axis, tuple) else (axis,)
-    whole = all(isinstance(k, int | np.integer) for k in given)
+    whole = all(
+        isinstance(k, int | np.integer) and not isinstance(k, bool | np.timedelta64) for k in given
+    )
     if not whole or any(not -ndim <= k < ndim for k in given):
         raise ValueError(f"axis: needs integers among the {ndim} leading axes, got {axis!r}")
     found = tuple(int(k) % ndim for k in given)

@@ -123,7 +123,7 @@ def conditioned(
     callable_(function, "function")
     callable_(residual, "residual")
     if gate is not None:
-        number(gate, "gate", above=0)
+        number(gate, "gate", above=0, at_most=1e150)  # its square is a number
     return _conditioned(mixture, y, function, r, residual, rule, gate, "observed")
 
 

@@ -11,6 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ..checks import callable_, count, instance, needed, nonblank, number
 from .figures import check_axes
 
@@ -213,7 +215,8 @@ def slider(
     """
     needed("matplotlib", "plots")
     make = callable_(draw, "draw")
-    if isinstance(values, str) or not len(values):
+    listed = isinstance(values, Sequence) or np.ndim(values) > 0
+    if isinstance(values, str) or not listed or not len(values):
         raise ValueError(f"values: needs at least one value, got {values!r}")
     name = nonblank(label, "label")
     palette = count(colours, "colours", at_least=2)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, generator
+from ..checks import Array, array, generator, instance, number
 from ..ensembles import anomalies, exact_noise
 from ..models import Model
 
@@ -32,7 +32,9 @@ def sampled_forecast(
     >>> sampled_forecast([[1.0], [2.0]], still, 0.0, 0.1, rng=np.random.default_rng(0)).ravel()
     array([1., 2.])
     """
-    return model.sample_step(ensemble, t, dt, rng=rng)
+    x = array(ensemble, "ensemble", (..., "N", instance(model, "model", Model).dim))
+    now, length = number(t, "t"), number(dt, "dt", at_least=0)
+    return model._sample_step(x, now, length, generator(rng))
 
 
 def exact_forecast(
@@ -57,7 +59,7 @@ def exact_forecast(
     >>> bool(abs(moved.mean()) < 1e-12), float(moved.var(ddof=1).round(12))
     (True, 1.0)
     """
-    x = array(ensemble, "ensemble", (..., "N", model.dim))
+    x = array(ensemble, "ensemble", (..., "N", instance(model, "model", Model).dim))
     moved = model.step(x, t, dt)
     q = model.noise(t, dt)
     if not q.any():

@@ -89,6 +89,7 @@ BAD_INPUT = {
         ("function", lambda: conditioned(P, [1.0], 3, np.eye(1))),
         ("residual", lambda: conditioned(P, [1.0], np.sin, np.eye(1), residual=3)),
         ("gate", lambda: conditioned(P, [1.0, 2.0, 3.0], np.sin, np.eye(3), gate=0.0)),
+        ("gate", lambda: conditioned(P, [1.0, 2.0, 3.0], np.sin, np.eye(3), gate=1e300)),
     ],
 }
 EXEMPT = {"distfilt.mixtures.unscented.POINT_RULES": "a constant"}

@@ -497,15 +497,20 @@ ALLOWED: dict[tuple[str, str, str], str] = {
         "called in every step by the filter that has checked its arguments",
     (r"coupling\.Plan|kalman\.GaussianRun", r".*", r".*"):
         "a result; rts_smoother, which takes a run, looks at it",
-    (r"plotting\.\w+", r"xunit|yunit|title|label", "text: taken"): "an optional text",
-    (r"density\.DynamicAverage|triangular\.pool_by_admm", r"modes|check", "None: taken"):
+    (r"plotting\.\w+", r"x?unit|yunit|title|label", "text: taken"): "an optional text",
+    (r"density\.DynamicAverage|triangular\.pool_by_admm|network\.admm", r"modes|check",
+     "None: taken"):
         "means what its docstring says: all cells, no check",
     (r"density\.PIConsensus\.learn", "dt", "huge: too long"): "as many substeps as are stable",
+    (r"plotting\.slider", "values", r".*: (taken|unnamed)"):
+        "whatever the format takes; an error names the format and the value",
+    (r"filters\.\w+Filter\.step", "observations", "with None: taken"): "an agent without reading",
     (r"progress\.track", "items", r".*"): "hands on, unlooked at, whatever can be iterated over",
     (r"filters\.\w+Filter(\.exact)?", "sensors", "with None: taken"): "an agent without a sensor",
     (r".*", r".*", r"returns (NaN|complex|shape|text|None): (NaN|unnamed|raw|finite)"):
         "what a user's function returns is looked at where states are made, not in each door",
-    (r"models\.(Model\..*|rk4.*|RotatingMixture.*)|differences\.central", r".*", r".*: NaN"):
+    (r"models\.(Model\..*|rk4.*|RotatingMixture.*)|differences\.central|kalman\.\w+_predict",
+     r".*", r".*: NaN"):
         "a user's function that overflows",
     (r"sensors\.Sensor\.predict", "x", r"(tiny|zero): NaN"): "a direction to where the sensor is",
     (r"network\.pi_step", "dt", "huge: too long"): "as many substeps as are stable",

@@ -7,7 +7,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from distfilt import checks, coupling, intervals, kalman, mixtures, plotting, triangular
+from distfilt import (
+    checks,
+    coupling,
+    gaussians,
+    intervals,
+    kalman,
+    metrics,
+    mixtures,
+    plotting,
+    progress,
+    triangular,
+)
 from distfilt import density as densities
 from distfilt.density.seen import Seen
 from distfilt.digests import digest, of_axes
@@ -60,6 +71,38 @@ def the_couplings() -> None:
         line = coupling.Constraint(a_line, [1.0], derivative=slope)
         line.residual([[0.25, 1.5], [2.0, 0.5]])
         line.jacobian([[0.25, 1.5], [2.0, 0.5]])
+
+
+def the_options() -> None:
+    """Options that examples leave out."""
+    x, y = np.array([[0.0], [1.0]]), np.array([[0.5], [2.0], [3.0]])
+    coupling.distances(x, y, power=1.0)
+    coupling.plan(coupling.distances(x, y), [0.5, 0.5], [0.25, 0.5, 0.25])
+    coupling.sorted_plan([0.0, 1.0], [0.5, 2.0], [0.5, 0.5], [0.25, 0.75])
+    metrics.crps(np.array([[1.0], [2.0], [4.0]]), [2.5], weights=[0.25, 0.25, 0.5])
+    metrics.rmse(np.ones((3, 4, 2)), np.zeros((3, 4, 2)), axis=-1)
+    metrics.rmse(np.ones((3, 4, 2)), np.zeros((3, 4, 2)), axis=(0, 1))
+    covs = np.array([[[2.0]], [[1.0]], [[0.5]]])
+    gaussians.intersection_weights(covs, rule="trace", here=[True, False, True])
+    progress.track([1, 2], show=False, total=2)
+    two = mixtures.GaussianMixture([0.5, 0.5], [[-2.0], [2.0]], [[[1.0]], [[1.0]]])
+    mixtures.conditioned(two, [1.0], np.asarray, [[1.0]], gate=5.0)
+    mixtures.fuse(two, two, size=1)
+    three = mixtures.Shapes([[0.0], [1e-6], [9.0]], [[[1.0]]] * 3, [0, 0, 0])
+    mixtures.pivoted_qr(three, size=2)
+    mixtures.stretching([[[2.0]]], [[[0.5]]], scale=[3.0])
+    mixtures.unscented.update(
+        [0.0], [[1.0]], [2.0], np.asarray, [[1.0]], residual=np.subtract, rule="dd2"
+    )
+
+
+def the_processes() -> None:
+    mean, q = np.zeros(2), np.array([[0.1], [0.2]])
+    dense, low = densities.Dense(mean, np.eye(2)), densities.LowRank(mean, np.eye(2))
+    densities.dense_step(dense, np.asarray, [1.0, 1.0], [1.0, 3.0], 1.0, process=q)
+    densities.low_rank_step(low, np.asarray, [1.0, 1.0], [1.0, 3.0], 1.0, process=q)
+    each = densities.filters_start(np.eye(2), np.zeros((1, 2)), exact=False)
+    densities.filters_step(each, np.asarray, [[1.0, 1.0]], np.ones_like, 1.0, process=q)
 
 
 def the_grids() -> None:
@@ -148,6 +191,7 @@ def the_pictures() -> None:
     from matplotlib import pyplot
 
     ax = plotting.axes(xlabel="x", ylabel="y", xunit="m", yunit="s", title="A title", size=(3, 2))
+    plotting.axes(xlabel="x", ylabel="y", ax=ax)
     plotting.ellipse(ax, [0.0, 0.5], [[4.0, 0.0], [0.0, 1.0]], index=1, label="a share")
     plotting.band(ax, [0.0, 1.0], [[1.0, 5.0], [2.0, 4.0]], index=1, label="a run")
     plotting.graph(ax, [[0, 1], [1, 0]], labels=["A", "B"], positions=[[0.0, 0.0], [1.0, 0.5]],
@@ -161,7 +205,7 @@ def the_pictures() -> None:
 
 
 for calls in (
-    the_checks, the_maps, the_couplings, the_grids, the_flows, the_sharing, the_mixtures, the_runs,
-    the_pictures,
+    the_checks, the_maps, the_couplings, the_options, the_processes, the_grids, the_flows,
+    the_sharing, the_mixtures, the_runs, the_pictures,
 ):  # fmt: skip
     calls()
