@@ -45,6 +45,7 @@ BAD_INPUT = {
         ("most", lambda: MixtureFilter([SMALL], [None], target_dim=1, size=5, most=3)),
         ("stretch", lambda: MixtureFilter([SMALL], [None], target_dim=1, stretch=-1.0)),
         ("gate", lambda: MixtureFilter([SMALL], [None], target_dim=1, gate=0.0)),
+        ("gate", lambda: MixtureFilter([SMALL], [None], target_dim=1, gate=1e300)),
         ("rule", lambda: MixtureFilter([SMALL], [None], target_dim=1, rule="x")),
         ("names", lambda: MixtureFilter([SMALL], [None], target_dim=1, names=("a", "b"))),
         ("faults", lambda: MixtureFilter([SMALL], [None], target_dim=1, faults=Faults(delay=1))),
@@ -56,6 +57,7 @@ BAD_INPUT = {
         ("runs", lambda: ONE.start([PRIOR], runs=(2,))),
     ],
     "distfilt.filters.mixture.MixtureFilter.step": [
+        ("state", lambda: ONE.step(3.5, 0.5, [None])),
         ("t", lambda: ONE.step(ONE.start([PRIOR], t=1.0), 0.5, [None])),
         ("observations", lambda: ONE.step(ONE.start([PRIOR]), 1.0, [[1.0]])),
     ],

@@ -529,6 +529,7 @@ ALLOWED: dict[tuple[str, str, str], str] = {
         "looked at by the step that takes it, or nothing observed",
     (r"sensors\.Sensor\.matrix", "dim", "huge: unnamed"): "numpy refuses such a size itself",
     (r"studies\.check", "workers", "None: taken"): "one for each core",
+    (r"studies\.run", "blas_threads", "None: taken"): "the threads are left as they are",
     (r"studies\.spawn", "n", "huge: too long"): "as many seeds as were asked for",
     (r"network\.Channel\.\w+", "payloads", "with None: taken"): "an agent that is silent",
 }

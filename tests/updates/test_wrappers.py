@@ -205,8 +205,12 @@ BAD_INPUT = {
     ],
     "distfilt.updates.wrappers.centred": [("update", lambda: centred(3))],
     "distfilt.updates.wrappers.serial": [("update", lambda: serial(3))],
+    "distfilt.updates.forecasts.exact_forecast": [
+        ("model", lambda: exact_forecast(np.zeros((3, 1)), "text", 0.0, 0.1, rng=rng())),
+    ],
     "distfilt.updates.forecasts.sampled_forecast": [
-        ("x", lambda: sampled_forecast(np.zeros((3, 2)), Model(1, lambda x, t, dt: x,
+        ("model", lambda: sampled_forecast(np.zeros((3, 1)), 3.5, 0.0, 0.1, rng=rng())),
+        ("ensemble", lambda: sampled_forecast(np.zeros((3, 2)), Model(1, lambda x, t, dt: x,
                                        lambda t, dt: np.eye(1)), 0.0, 0.1, rng=rng())),
     ],
 }
