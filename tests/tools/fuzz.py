@@ -526,7 +526,8 @@ ALLOWED: dict[tuple[str, str, str], str] = {
         "states without components, or an overflow, refused in another package's words",
     (r"filters\.(Step\.(?!heard)\w+|SensorState\.shown)", r".*", r".*"):
         "called in every step by a family of filters, which made the arguments",
-    (r"filters\.(Filter\.series|SensorFilter\.observed)", "observations", "with None: taken"):
+    (r"filters\.(Filter\.series|SensorFilter\.observed|\w+Filter\.step)", "observations",
+     "with None: taken"):
         "looked at by the step that takes it, or nothing observed",
     (r"sensors\.Sensor\.matrix", "dim", "huge: unnamed"): "numpy refuses such a size itself",
     (r"studies\.check", "workers", "None: taken"): "one for each core",
