@@ -12,3 +12,6 @@ settings.register_profile(
     "explore", max_examples=2000, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "gate"))
+
+# Not tests: calls that the fuzz records, which write files where they run.
+collect_ignore_glob = ["tools/fuzz_calls_*.py"]
