@@ -1,12 +1,15 @@
 """Execute chapters and store their outputs beside them, the same bytes every time.
 
     python book/tools/execute.py [CHAPTER ...] [--check] [--bytes] [--jobs N]
+    python book/tools/execute.py [CHAPTER ...] --sources
 
 The Markdown is the source; the notebook is written from it. A chapter that raises, warns, writes to
 stderr or stores a path of this machine is refused, and its stored notebook stays as it was. With
 ``--check`` nothing is written: the chapters run again and are compared with what is stored, every
 byte of text, and pictures as a reader sees them. ``--bytes`` compares the pictures' bytes too: they
 are the same on the machine that stored them, while another processor may shade a pixel otherwise.
+With ``--sources`` nothing is run: the stored notebook takes the Markdown's cells and keeps its
+outputs, for edits that change no output, such as a new name for an import.
 """
 
 from __future__ import annotations
@@ -158,18 +161,37 @@ def execute(source: Path, check: bool = False, whole: bool = False) -> str:
     return ""
 
 
+def copy_sources(source: Path) -> str:
+    """Give the stored notebook the Markdown's cells, outputs kept; return what is wrong, or ''."""
+    target = source.with_suffix(".ipynb")
+    fresh, stored = read(source), nbformat.read(target, as_version=4)
+    if [c.cell_type for c in fresh.cells] != [c.cell_type for c in stored.cells]:
+        return f"{target.name}: has other cells than the Markdown: make outputs"
+    for new, old in zip(fresh.cells, stored.cells, strict=True):
+        if new.cell_type == "code":
+            new.outputs, new.execution_count = old.outputs, old.execution_count
+    if "widgets" in stored.metadata:
+        fresh.metadata["widgets"] = stored.metadata["widgets"]
+    target.write_text(dump(fresh), encoding="utf-8", newline="\n")
+    return ""
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description="Execute chapters and store their outputs.")
     parser.add_argument("chapters", nargs="*", help="names or numbers; all without one")
     parser.add_argument("--check", action="store_true", help="compare, write nothing")
     parser.add_argument("--bytes", action="store_true", help="compare the bytes of pictures too")
+    parser.add_argument("--sources", action="store_true", help="run nothing, keep the outputs")
     parser.add_argument("--jobs", type=int, default=2, help="chapters at a time")
     options = parser.parse_args()
     sources = chosen(options.chapters)
-    with ProcessPoolExecutor(max_workers=options.jobs) as pool:
-        many = len(sources)
-        whole = [options.bytes] * many
-        found = list(pool.map(execute, sources, [options.check or options.bytes] * many, whole))
+    if options.sources:
+        found = [copy_sources(source) for source in sources]
+    else:
+        with ProcessPoolExecutor(max_workers=options.jobs) as pool:
+            many = len(sources)
+            whole = [options.bytes] * many
+            found = list(pool.map(execute, sources, [options.check or options.bytes] * many, whole))
     for problem in filter(None, found):
         print(problem, file=sys.stderr)
     if not sources:

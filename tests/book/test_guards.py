@@ -308,3 +308,17 @@ def test_stored_notebook_names_no_version_and_no_path(executed: Path) -> None:
     notebook = json.loads(text)
     assert "version" not in notebook["metadata"]["language_info"]
     assert "jupytext_version" not in text and str(ROOT) not in text
+
+
+def test_new_sources_keep_the_outputs(chapter: Path) -> None:
+    before = stored(chapter)
+    text = chapter.read_text(encoding="utf-8")
+    chapter.write_text(text.replace("rate {rate:.4f}", "rate {rate:.5f}"), encoding="utf-8")
+    assert tool("execute.py", "--sources", str(chapter)).returncode == 0
+    after = stored(chapter)
+    assert pairs.check(chapter) == []
+    assert [c.source for c in before.cells] != [c.source for c in after.cells]
+    assert [c.get("outputs") for c in before.cells] == [c.get("outputs") for c in after.cells]
+    chapter.write_text(text + "\n```{code-cell} ipython3\n1 + 1\n```\n", encoding="utf-8")
+    done = tool("execute.py", "--sources", str(chapter))
+    assert done.returncode == 1 and "other cells" in done.stderr
