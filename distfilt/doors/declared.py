@@ -1,0 +1,219 @@
+"""Doors of functions and of frozen dataclasses, made from their annotations."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import MISSING as _NO_DEFAULT
+from dataclasses import fields
+from functools import cache, cached_property, partial, wraps
+from inspect import Parameter, signature
+from types import MethodType
+from typing import Any, Self, TypeVar, cast
+
+import numpy as np
+
+from .kinds import Kind, Scope, kind_of
+
+__all__ = ["Record", "describe", "door", "unchecked"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def _declared(annotations: Mapping[str, Any], names: Mapping[str, Any]) -> dict[str, Kind]:
+    """The kinds of named annotations, arrays last: their shapes may speak of the others."""
+    found: dict[str, Kind] = {}
+    for name, annotation in annotations.items():
+        with suppress(NameError):  # a name that only the type checker imports
+            meant = eval(annotation, dict(names)) if isinstance(annotation, str) else annotation
+            kind = kind_of(meant)
+            if kind is not None and name != "return":
+                found[name] = kind
+    return _arrays_last(found)
+
+
+def _arrays_last(kinds: dict[str, Kind]) -> dict[str, Kind]:
+    return dict(sorted(kinds.items(), key=lambda item: "an array" in item[1].needs))
+
+
+class _Plan:
+    """The kinds of a function's arguments, read when it is first called."""
+
+    def __init__(self, function: Any) -> None:
+        self.function = function
+
+    @cached_property
+    def kinds(self) -> dict[str, Kind]:
+        """Of each argument that has one."""
+        return _declared(self.function.__annotations__, self.function.__globals__)
+
+    @cached_property
+    def row(self) -> tuple[str, ...]:
+        """The names of the arguments that may stand in a row."""
+        known = signature(self.function).parameters.values()
+        return tuple(p.name for p in known if p.kind <= Parameter.POSITIONAL_OR_KEYWORD)
+
+    @cached_property
+    def defaults(self) -> dict[str, Any]:
+        """What stands for the arguments that are left out."""
+        known = signature(self.function).parameters.values()
+        return {p.name: p.default for p in known if p.default is not Parameter.empty}
+
+    def taken(
+        self, args: tuple[Any, ...], options: dict[str, Any]
+    ) -> tuple[list[Any], dict[str, Any]]:
+        """The arguments converted, or the error for the first that does not fit."""
+        given = dict(zip(self.row, args, strict=False)) | options
+        scope = Scope(self.defaults | given)
+        for name, kind in self.kinds.items():
+            if name in given:
+                given[name] = scope.values[name] = kind.take(given[name], name, scope)
+        placed = [given[name] for name in self.row[: len(args)]]
+        return [*placed, *args[len(self.row) :]], {name: given[name] for name in options}
+
+
+def door(function: F) -> F:
+    """Let a function's annotations check what it is given.
+
+    Parameters
+    ----------
+    function : callable
+        Its annotations are kinds as in the table of :mod:`distfilt.doors`. Defaults are not
+        checked.
+
+    Returns
+    -------
+    callable
+        The same with a door; :func:`unchecked` gives the function back.
+
+    Examples
+    --------
+    >>> from typing import Annotated
+    >>> from distfilt.doors import Array, Positive
+    >>> @door
+    ... def scaled(x: Annotated[Array, "... d"], factor: Positive = 2.0) -> Array:
+    ...     return factor * x
+    >>> scaled([1.0, 2.0])
+    array([2., 4.])
+    >>> scaled([1.0, 2.0], factor=-1.0)
+    Traceback (most recent call last):
+    ValueError: factor: needs a number above 0, got -1.0
+    """
+    plan = _Plan(function)
+
+    @wraps(function)
+    def checked(*args: Any, **options: Any) -> Any:
+        args_, options_ = plan.taken(args, options)
+        return function(*args_, **options_)
+
+    checked.unchecked = function  # type: ignore[attr-defined]
+    checked.plan = plan  # type: ignore[attr-defined]
+    return cast(F, checked)
+
+
+def unchecked(function: F) -> F:
+    """The function, or the bound method, without its door; options of a partial stay.
+
+    Examples
+    --------
+    >>> unchecked(print) is print
+    True
+    """
+    if isinstance(function, partial):
+        inner = unchecked(function.func)
+        return cast(F, partial(inner, *function.args, **function.keywords))
+    if isinstance(function, MethodType):
+        return cast(F, MethodType(unchecked(function.__func__), function.__self__))
+    return cast(F, getattr(function, "unchecked", function))
+
+
+def describe(thing: Any) -> dict[str, Kind]:
+    """The kinds that a function with a door, or a class of records, declares by name.
+
+    Examples
+    --------
+    >>> [kind.needs for kind in describe(door).values()]
+    []
+    """
+    if isinstance(thing, type):
+        made: Any = thing
+        return _of_fields(made) if issubclass(thing, Record) else {}
+    plan = getattr(thing, "plan", None)
+    return {} if plan is None else dict(plan.kinds)
+
+
+class Record:
+    """A base of frozen dataclasses: their fields' annotations are the door of the constructor.
+
+    Arrays are copied and kept read-only. A subclass with relations between its fields extends
+    `__post_init__`.
+
+    Examples
+    --------
+    >>> from dataclasses import dataclass
+    >>> @dataclass(frozen=True, eq=False)
+    ... class Label(Record):
+    ...     text: str
+    ...     size: int
+    >>> Label("a", 1.5)
+    Traceback (most recent call last):
+    ValueError: size: needs an integer, got 1.5
+    """
+
+    def __post_init__(self) -> None:
+        cls: Any = type(self)
+        scope = Scope({name: getattr(self, name) for name in _names(cls)})
+        for name, kind in _of_fields(cls).items():
+            scope.values[name] = _kept(kind.take(scope.values[name], name, scope))
+            object.__setattr__(self, name, scope.values[name])
+
+    @classmethod
+    def unchecked(cls, *args: Any, **options: Any) -> Self:
+        """Build one from what the library made itself: nothing is checked or copied."""
+        out, made = object.__new__(cls), cast(Any, cls)
+        given = dict(zip(_names(made), args, strict=False)) | options
+        for name, default in _defaults(made):
+            if name not in given:
+                given[name] = default()
+        out.__dict__.update(given)
+        return out
+
+    def changed(self, **changes: Any) -> Self:
+        """The same with other values in some fields, unchecked."""
+        known = {name: getattr(self, name) for name in _names(cast(Any, type(self)))}
+        return self.unchecked(**known | changes)
+
+
+@cache
+def _names(cls: Any) -> tuple[str, ...]:
+    return tuple(f.name for f in fields(cls))
+
+
+@cache
+def _defaults(cls: Any) -> list[tuple[str, Callable[[], Any]]]:
+    plain = [(f.name, f.default) for f in fields(cls) if f.default is not _NO_DEFAULT]
+    made = [(f.name, f.default_factory) for f in fields(cls)]
+    return [(name, lambda value=value: value) for name, value in plain] + [
+        (name, factory) for name, factory in made if factory is not _NO_DEFAULT
+    ]
+
+
+@cache
+def _of_fields(cls: Any) -> dict[str, Kind]:
+    found: dict[str, Kind] = {}
+    for base in reversed(cls.__mro__):
+        own = {n: a for n, a in vars(base).get("__annotations__", {}).items() if n in _names(cls)}
+        found |= _declared(own, vars(sys.modules[base.__module__]))
+    return _arrays_last(found)
+
+
+def _kept(value: Any) -> Any:
+    """Arrays as the record's own."""
+    if isinstance(value, tuple) and type(value) is tuple:
+        return tuple(_kept(v) for v in value)
+    if not isinstance(value, np.ndarray):
+        return value
+    own = value.copy()
+    own.setflags(write=False)
+    return own

@@ -1,0 +1,262 @@
+"""What an annotation declares: how a value is converted, by which rules, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
+from types import UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from .values import (
+    Array,
+    Bounds,
+    _fits,
+    _real,
+    _shape_text,
+    array,
+    definite,
+    distinct,
+    increasing,
+    semidefinite,
+    summing_to_one,
+)
+
+__all__ = [  # fmt: skip
+    "Count", "Cov", "Index", "Kind", "MISSING", "Mask", "NonNegative", "Places", "Positive", "Rng",
+    "Scope", "Semidefinite", "Share", "Times", "Weights", "kind_of",
+]
+
+MISSING = "missing allowed"
+"""Beside an array's shape: NaN may stand for what is missing; infinity may not."""
+
+Mask = NDArray[np.bool_]
+Rng = np.random.Generator
+Cov = Annotated[Array, "... d d", definite]
+Semidefinite = Annotated[Array, "... d d", semidefinite]
+Weights = Annotated[Array, "... N", summing_to_one]
+Times = Annotated[Array, "T", increasing]
+Positive = Annotated[float, Bounds(above=0)]
+NonNegative = Annotated[float, Bounds(at_least=0)]
+Share = Annotated[float, Bounds(at_least=0, at_most=1)]
+Count = Annotated[int, Bounds(at_least=1)]
+Index = Annotated[int, Bounds(at_least=0)]
+Places = Annotated[Sequence[Index], distinct]
+
+
+@dataclass(frozen=True)
+class Scope:
+    """The arguments of one call by name, and the sizes that their shapes have bound."""
+
+    values: dict[str, Any]
+    sizes: dict[str, int] = field(default_factory=dict)
+
+    def size(self, word: str) -> Any:
+        """What a word of a shape stands for: a size, sizes, or itself while it is free."""
+        if word.isdigit():
+            return int(word)
+        if word in self.sizes:
+            return self.sizes[word]
+        if "+" in word:
+            parts = [self.size(part) for part in word.split("+")]
+            return word if any(isinstance(part, str) for part in parts) else sum(parts)
+        head, *path = word.lstrip("*").split(".")
+        found = self.values.get(head)
+        for part in path:
+            found = getattr(found, part, None)
+        return found if isinstance(found, int | np.integer | tuple) else word
+
+    def shape(self, words: Sequence[str]) -> tuple[Any, ...]:
+        """A shape as far as it is known."""
+        known = [... if word == "..." else self.size(word) for word in words]
+        return tuple(n for size in known for n in (size if isinstance(size, tuple) else (size,)))
+
+    def fits(self, got: tuple[int, ...], words: Sequence[str]) -> bool:
+        """Whether a shape is what is needed; if so its free sizes are bound."""
+        wanted = self.shape(words)
+        if not _fits(got, wanted):
+            return False
+        pairs = zip(reversed(wanted), reversed(got), strict=False)
+        free = [(word, size) for word, size in pairs if isinstance(word, str)]
+        return all([self.sizes.setdefault(word, size) == size for word, size in free])
+
+
+@dataclass(frozen=True)
+class Kind:
+    """What an argument may be: what it needs in words, its conversion, and rules for the result."""
+
+    needs: str
+    convert: Callable[[Any, str, Scope], Any]
+    rules: tuple[Callable[[Any, str], None], ...] = ()
+
+    def take(self, value: Any, name: str, scope: Scope) -> Any:
+        """The value as the function gets it, or an error that names it."""
+        try:
+            out = self.convert(value, name, scope)
+        except TypeError:
+            got = repr(value) if isinstance(value, str | int | float) else type(value).__name__
+            raise ValueError(f"{name}: needs {self.needs}, got {got}") from None
+        for rule in self.rules:
+            rule(out, name)
+        return out
+
+
+def _number(value: Any, name: str, scope: Scope) -> float:
+    if type(value) not in (float, int):
+        try:
+            value = _real(value, name)[()]
+        except ValueError:
+            raise TypeError from None
+    out = float(value)  # a TypeError for an array
+    if not np.isfinite(out):
+        raise TypeError
+    return out
+
+
+def _integer(value: Any, name: str, scope: Scope) -> int:
+    if not isinstance(value, int | np.integer) or isinstance(value, bool | np.timedelta64):
+        raise TypeError
+    return int(value)
+
+
+def _instance(cls: Any, value: Any, name: str, scope: Scope) -> Any:
+    if not isinstance(value, cls) or (cls is str and not value.strip()):
+        raise TypeError
+    return value
+
+
+def _callable(value: Any, name: str, scope: Scope) -> Any:
+    if not callable(value):
+        raise TypeError
+    return value
+
+
+def _one_of(options: tuple[Any, ...], value: Any, name: str, scope: Scope) -> Any:
+    if not any(type(value) is type(option) and value == option for option in options):
+        raise TypeError
+    return value
+
+
+def _numbers(
+    dtype: type, words: Sequence[str] | None, missing: bool, value: Any, name: str, scope: Scope
+) -> Any:
+    if dtype is np.float64:
+        out: Any = array(value, name, finite=not missing)
+        if missing and np.isinf(out).any():
+            raise ValueError(f"{name}: needs finite numbers or NaN (missing), got infinity")
+    else:
+        out = np.asarray(value)
+        kinds = "b" if dtype is np.bool_ else "iu"
+        if out.dtype.kind not in kinds or isinstance(value, np.ma.MaskedArray):
+            raise TypeError
+    if words is not None and not scope.fits(out.shape, words):
+        needs = _shape_text(scope.shape(words))
+        raise ValueError(f"{name}: needs shape {needs}, got {out.shape}")
+    return out
+
+
+def _many(
+    kinds: tuple[Kind | None, ...], fixed: bool, value: Any, name: str, scope: Scope
+) -> tuple[Any, ...]:
+    if isinstance(value, str | bytes | Mapping) or not np.iterable(value):
+        raise TypeError
+    items = tuple(value)
+    each = kinds if fixed else kinds * len(items)
+    if len(each) != len(items):
+        raise ValueError(f"{name}: needs {len(each)} entries, got {len(items)}")
+    pairs = zip(each, items, strict=True)
+    return tuple([kind.take(item, name, scope) if kind else item for kind, item in pairs])
+
+
+def _either(kinds: tuple[Kind, ...], value: Any, name: str, scope: Scope) -> Any:
+    for kind in kinds:
+        try:
+            return kind.take(value, name, scope)
+        except ValueError:
+            if len(kinds) == 1:
+                raise
+    raise TypeError
+
+
+def _optional(kind: Kind, value: Any, name: str, scope: Scope) -> Any:
+    return None if value is None else kind.take(value, name, scope)
+
+
+_PLAIN = {
+    float: Kind("a finite number", _number),
+    int: Kind("an integer", _integer),
+    str: Kind("a text", partial(_instance, str)),
+    bool: Kind("a bool, True or False", partial(_instance, bool)),
+    Callable: Kind("a function", _callable),
+    Rng: Kind("a numpy.random.Generator (np.random.default_rng(seed))", partial(_instance, Rng)),
+}
+_SEQUENCES = (Sequence, Collection, Iterable, tuple, list)
+
+
+@cache
+def kind_of(annotation: Any) -> Kind | None:
+    """The kind that an annotation declares; None lets everything pass.
+
+    Examples
+    --------
+    >>> kind_of(Count).take(0, "members", Scope({}))
+    Traceback (most recent call last):
+    ValueError: members: needs an integer of at least 1, got 0
+    """
+    origin, args = get_origin(annotation), get_args(annotation)
+    if annotation is Any or annotation == ArrayLike:
+        return None
+    if origin is Annotated:
+        return _noted(args[0], args[1:])
+    if origin in (Union, UnionType):
+        return _union(args)
+    if origin is Literal:
+        return Kind(f"one of {', '.join(map(str, args))}", partial(_one_of, args))
+    if origin is np.ndarray:
+        return _array_of(annotation, None, missing=False)
+    if origin is tuple and args[-1] is not ...:
+        kinds = tuple(kind_of(a) for a in args)
+        return Kind(_words(kinds, ", "), partial(_many, kinds, True))
+    if origin in _SEQUENCES:
+        kinds = (kind_of(args[0]),)
+        return Kind(f"a list, of {_words(kinds, '')} each", partial(_many, kinds, False))
+    found = origin or annotation
+    if found in _PLAIN or not isinstance(found, type):
+        return _PLAIN.get(found)
+    article = "an" if found.__name__[0] in "AEIOU" else "a"
+    return Kind(f"{article} {found.__name__}", partial(_instance, found))
+
+
+def _words(kinds: tuple[Kind | None, ...], between: str) -> str:
+    return between.join(kind.needs if kind else "anything" for kind in kinds)
+
+
+def _union(args: tuple[Any, ...]) -> Kind | None:
+    """What fits one of several annotations, the first that does."""
+    found = tuple(kind_of(a) for a in args if a is not type(None))
+    kinds = tuple(kind for kind in found if kind is not None)
+    if len(kinds) < len(found):
+        return None
+    one = Kind(_words(kinds, " or "), partial(_either, kinds))
+    return replace(one, convert=partial(_optional, one)) if type(None) in args else one
+
+
+def _noted(base: Any, notes: tuple[Any, ...]) -> Kind | None:
+    """A type with a shape and rules beside it; the last shape counts, so that aliases can vary."""
+    rules = tuple(note for note in notes if callable(note))
+    if get_origin(base) is not np.ndarray:
+        kind = kind_of(base)
+        return None if kind is None else replace(kind, rules=kind.rules + rules)
+    shapes = [note.split() for note in notes if isinstance(note, str) and note != MISSING]
+    kind = _array_of(base, shapes[-1] if shapes else None, missing=MISSING in notes)
+    return replace(kind, rules=rules)
+
+
+def _array_of(base: Any, words: Sequence[str] | None, *, missing: bool) -> Kind:
+    dtype = get_args(get_args(base)[1])[0]
+    what = {np.float64: "real numbers", np.bool_: "True and False"}.get(dtype, "integers")
+    shape = "" if words is None else f" of shape ({', '.join(words)})"
+    return Kind(f"an array of {what}{shape}", partial(_numbers, dtype, words, missing))
