@@ -55,6 +55,12 @@ class _Plan:
         return tuple(p.name for p in known if p.kind <= Parameter.POSITIONAL_OR_KEYWORD)
 
     @cached_property
+    def places(self) -> list[tuple[str, int, Kind]]:
+        """Each kind with the argument's name, and its place where it may stand in a row."""
+        place = {name: k for k, name in enumerate(self.row)}
+        return [(name, place.get(name, sys.maxsize), kind) for name, kind in self.kinds.items()]
+
+    @cached_property
     def defaults(self) -> dict[str, Any]:
         """What stands for the arguments that are left out."""
         known = signature(self.function).parameters.values()
@@ -64,13 +70,14 @@ class _Plan:
         self, args: tuple[Any, ...], options: dict[str, Any]
     ) -> tuple[list[Any], dict[str, Any]]:
         """The arguments converted, or the error for the first that does not fit."""
-        given = dict(zip(self.row, args, strict=False)) | options
-        scope = Scope(self.defaults | given)
-        for name, kind in self.kinds.items():
-            if name in given:
+        row, given = list(args), dict(options)
+        scope = Scope({**self.defaults, **dict(zip(self.row, args, strict=False)), **options})
+        for name, place, kind in self.places:
+            if place < len(row):
+                row[place] = scope.values[name] = kind.take(row[place], name, scope)
+            elif name in given:
                 given[name] = scope.values[name] = kind.take(given[name], name, scope)
-        placed = [given[name] for name in self.row[: len(args)]]
-        return [*placed, *args[len(self.row) :]], {name: given[name] for name in options}
+        return row, given
 
 
 def door(function: F) -> F:
@@ -104,8 +111,8 @@ def door(function: F) -> F:
 
     @wraps(function)
     def checked(*args: Any, **options: Any) -> Any:
-        args_, options_ = plan.taken(args, options)
-        return function(*args_, **options_)
+        row, given = plan.taken(args, options)
+        return function(*row, **given)
 
     checked.unchecked = function  # type: ignore[attr-defined]
     checked.plan = plan  # type: ignore[attr-defined]

@@ -54,34 +54,28 @@ class Scope:
     values: dict[str, Any]
     sizes: dict[str, int] = field(default_factory=dict)
 
-    def size(self, word: str) -> Any:
-        """What a word of a shape stands for: a size, sizes, or itself while it is free."""
-        if word.isdigit():
-            return int(word)
+    def shape(self, words: Sequence[str]) -> tuple[Any, ...]:
+        """A shape as far as it is known."""
+        out: list[Any] = []
+        for word in words:
+            known = ... if word == "..." else self._size(word)
+            out.extend(known if isinstance(known, tuple) else (known,))
+        return tuple(out)
+
+    def _size(self, word: str) -> Any:
+        """What a word stands for: a size, sizes, or itself while it is free."""
         if word in self.sizes:
             return self.sizes[word]
+        if word.isdigit():
+            return int(word)
         if "+" in word:
-            parts = [self.size(part) for part in word.split("+")]
+            parts = [self._size(part) for part in word.split("+")]
             return word if any(isinstance(part, str) for part in parts) else sum(parts)
         head, *path = word.lstrip("*").split(".")
         found = self.values.get(head)
         for part in path:
             found = getattr(found, part, None)
         return found if isinstance(found, int | np.integer | tuple) else word
-
-    def shape(self, words: Sequence[str]) -> tuple[Any, ...]:
-        """A shape as far as it is known."""
-        known = [... if word == "..." else self.size(word) for word in words]
-        return tuple(n for size in known for n in (size if isinstance(size, tuple) else (size,)))
-
-    def fits(self, got: tuple[int, ...], words: Sequence[str]) -> bool:
-        """Whether a shape is what is needed; if so its free sizes are bound."""
-        wanted = self.shape(words)
-        if not _fits(got, wanted):
-            return False
-        pairs = zip(reversed(wanted), reversed(got), strict=False)
-        free = [(word, size) for word, size in pairs if isinstance(word, str)]
-        return all([self.sizes.setdefault(word, size) == size for word, size in free])
 
 
 @dataclass(frozen=True)
@@ -152,9 +146,8 @@ def _numbers(
         kinds = "b" if dtype is np.bool_ else "iu"
         if out.dtype.kind not in kinds or isinstance(value, np.ma.MaskedArray):
             raise TypeError
-    if words is not None and not scope.fits(out.shape, words):
-        needs = _shape_text(scope.shape(words))
-        raise ValueError(f"{name}: needs shape {needs}, got {out.shape}")
+    if words is not None and not _fits(out.shape, wanted := scope.shape(words), scope.sizes):
+        raise ValueError(f"{name}: needs shape {_shape_text(wanted)}, got {out.shape}")
     return out
 
 

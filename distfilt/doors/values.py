@@ -63,7 +63,7 @@ def array(
     """
     plain = type(value) is np.ndarray and value.dtype == np.float64
     out: Array = value if plain else _real(value, name)  # type: ignore[assignment]
-    if shape is not None and not _fits(out.shape, shape):
+    if shape is not None and not _fits(out.shape, shape, {}):
         raise ValueError(f"{name}: needs shape {_shape_text(shape)}, got {out.shape}")
     if finite and not np.isfinite(out).all():
         bad = int((~np.isfinite(out)).sum())
@@ -89,13 +89,18 @@ def _real(value: Any, name: str) -> Array:
     raise ValueError(f"{name}: needs an array of real numbers, got {got}") from None
 
 
-def _fits(got: tuple[int, ...], needed: tuple[Any, ...]) -> bool:
-    free = bool(needed) and needed[0] is ...
-    tail = needed[1:] if free else needed
-    if len(got) < len(tail) if free else len(got) != len(tail):
-        return False
-    pairs = zip(reversed(tail), reversed(got), strict=False)
-    return all([n == g or (isinstance(n, str) and (g > 0 or n[0].isupper())) for n, g in pairs])
+def _fits(got: tuple[int, ...], wanted: tuple[Any, ...], sizes: dict[str, int]) -> bool:
+    """Whether a shape is what is wanted; if so the free words of `wanted` are among `sizes`."""
+    left = list(got)
+    for n in reversed(wanted):
+        if n is ...:
+            return True
+        size = left.pop() if left else -1
+        if isinstance(n, str) and (size > 0 or (size == 0 and n[0].isupper())):
+            n = sizes.setdefault(n, size)
+        if n != size:
+            return False
+    return not left
 
 
 def _shape_text(shape: tuple[Any, ...]) -> str:
