@@ -49,7 +49,7 @@ environment: $(STAMP)
 ifneq ($(shell $(PY) -c "" 2>/dev/null && cat $(STAMP) 2>/dev/null),$(CURDIR))
 $(STAMP): remake
 endif
-$(STAMP): requirements.txt pyproject.toml
+$(STAMP): requirements.txt pyproject.toml book/kit/pyproject.toml
 	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer was not found: make PYTHON=/path/to/python"; exit 1; }
 	@"$(PYTHON)" -B book/tools/environment.py $(VENV)
 

@@ -17,9 +17,8 @@ from types import ModuleType
 __version__ = "0.2.0"
 
 _ROOMS = (  # fmt: skip
-    "coupling", "density", "digests", "ensembles", "filters", "gaussians", "intervals", "kalman",
-    "linalg", "metrics", "mixtures", "models", "network", "plotting", "published", "sensors",
-    "studies", "triangular", "updates",
+    "coupling", "density", "ensembles", "filters", "gaussians", "intervals", "kalman", "linalg",
+    "metrics", "mixtures", "models", "network", "sensors", "triangular", "updates",
 )
 
 __all__ = ["__version__", *_ROOMS]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from distfilt import checks, density, ensembles, linalg, mixtures, models, sensors, studies
+from distfilt import checks, density, ensembles, linalg, mixtures, models, sensors
 from distfilt.coupling import ensemble_transform, sorted_plan
 from distfilt.kalman import kalman_filter
 from distfilt.mixtures import GaussianMixture, PartialFusion, unscented
@@ -76,8 +76,6 @@ BOUNDS: list[tuple[str, Callable[[], object]]] = [
     ("agents from 0 to 1", lambda: Graph.from_edges(2, [[0, 2]])),
     ("agents from 0 to 1", lambda: Graph.from_edges(2, [[0, 0.5]])),
     ("adjacency: needs zeros and ones, got 7", lambda: Graph.from_adjacency([[0, 7], [1, 0]])),
-    ("seeds: .* got str", lambda: studies.run(lambda seed: 1.0, "12")),
-    ("seeds: .* got int", lambda: studies.run(lambda seed: 1.0, 12)),
 ]  # fmt: skip
 
 

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from scipy import sparse
 
-from distfilt import filters, models, network, sensors, studies, updates
+from distfilt import filters, models, network, sensors, updates
 from distfilt.coupling import norm
 from distfilt.density import Flooding, FokkerPlanck, Grid
 from distfilt.mixtures import GaussianMixture
-from distfilt.published import PAPERS, Value, judge_table, read_table, root, table
 
 Cases = list[tuple[str, Callable[[], object]]]
 
@@ -44,10 +43,6 @@ def updated(function: Any, **options: Any) -> Any:
     return function(SEEN, SEEN[:, :1], [0.5], [[1.0]], rng=RNG(0), **options)
 
 
-def items(**options: Any) -> object:
-    return read_table(root() / "published" / "items.csv", key=2, **options)
-
-
 def flag(name: str, call: Callable[..., object]) -> Cases:
     """What is neither True nor False."""
     return [(f"{name}: needs a bool, got", lambda v=v: call(**{name: v})) for v in NO_FLAGS]
@@ -66,7 +61,6 @@ def ran(**options: Any) -> object:
     return STEP.run(BEGUN, [1.0], NONE, **options)
 
 
-VALUE = Value("C1", 0.0899, 0.0004, 0.0896)
 LOGS = np.zeros((2, 3))
 STEP = team(filters.GaussianFilter)
 GAUSS = np.zeros(2), np.eye(2)
@@ -176,23 +170,6 @@ BAD_INPUT: dict[str, Cases] = {
         (updates.transport, {}), (updates.transport_sample, {}),
         (updates.principal_components, {"n_state": 1, "n_observed": 1}),
     )},
-    "distfilt.published.read_table": [
-        *option("columns", items, "title", 3.5, [3.5], object()),
-        *option("numbers", items, "title", 3.5, [3.5], {"title"}),
-    ],
-    "distfilt.published.table": option(
-        "numbers", lambda **o: table(PAPERS[0], "table-2", **o), "noise", 3.5, [3.5]),
-    "distfilt.published.judge_table": option(
-        "why", lambda **o: judge_table("semeraro", "Table 1", [VALUE], **o), None, 3.5, object()),
-    "distfilt.studies.run": [
-        *flag("progress", lambda **o: studies.run(lambda seed: 1.0, [1], workers=1, **o)),
-        ("workers: needs at most", lambda: studies.run(lambda seed: 1.0, [1], workers=10**13)),
-        ("seeds: needs", lambda: studies.run(lambda seed: 1.0, [np.timedelta64(1, "s")])),
-    ],
-    "distfilt.studies.check": option("rough", lambda **o: studies.check(
-        studies.stored("grange", "figure-2"), lambda seed: 1.0, **o), 3.5, object(), "draw"),
-    "distfilt.studies.store": [("path: needs a file's name", lambda: studies.store(
-        studies.run(lambda seed: 1.0, [1], workers=1), "", parameters={}, columns=["draw"]))],
 }  # fmt: skip
 
 

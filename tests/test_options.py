@@ -21,8 +21,6 @@ DATA = {
     "TransportFilter": {"graph"},
     "Summary": {"covariance", "members", "weights", "numbers"}, "Shapes": {"dropped"},
     "mobility_and_diffusion": {"strength"}, "orbits": {"bodies"}, "rotating_swarm": {"reading"},
-    "Parameter": {"where", "reason", "note"}, "Value": {"tolerance"}, "Verdict": {"why"},
-    "Study": {"code"},
 }  # fmt: skip
 """Data that a call may leave out: a filter's graph, a second set of columns, a reason."""
 

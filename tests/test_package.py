@@ -24,9 +24,7 @@ PATHS = sorted(PACKAGE.rglob("*.py"))
 # Who may import whom: a module imports from floors below its own, or within its own folder.
 FLOORS = {
     "checks": 0,
-    "folders": 0,
     "linalg": 1,
-    "digests": 1,
     "differences": 1,
     "intervals": 1,
     "progress": 1,
@@ -44,24 +42,17 @@ FLOORS = {
     "updates": 5,
     "filters": 6,
 }
-# Apart from the floors: no floor imports them, and they build on what is listed.
-APART = {
-    "studies": {"checks", "folders", "progress"},
-    "published": {"checks", "folders", "linalg", "intervals"},
-    "plotting": {"checks", "digests", "linalg"},
-}
 # A heavy package has a home; all of them are imported inside functions only.
 HOMES = {
     "cvxpy": {"triangular", "coupling"},
     "ot": {"coupling"},
     "filterpy": {"kalman"},
     "networkx": {"network"},
-    "matplotlib": {"plotting"},
-    "xarray": {"filters", "studies"},
-    "loky": {"studies"},
-    "cloudpickle": {"studies"},
+    "xarray": {"filters"},
 }
-LATE = {*HOMES, "pandas", "scipy.stats", "threadpoolctl", "tqdm"}
+LATE = {*HOMES, "scipy.stats", "tqdm"}
+# What only the book's tools need: the library knows nothing of them.
+BOOK = ("bookkit", "matplotlib", "loky", "cloudpickle", "threadpoolctl", "pandas")
 
 
 def dotted(path: Path) -> str:
@@ -115,13 +106,15 @@ def test_module_imports_only_from_floors_below(path: Path) -> None:
     if not here:
         return
     wanted = inner(imports(path, ast.parse(path.read_text(encoding="utf-8")))) - {"__version__"}
-    assert here in FLOORS or here in APART, f"{here} has no floor: add it to FLOORS"
+    assert here in FLOORS, f"{here} has no floor: add it to FLOORS"
     for other in wanted - {here}:
-        assert other not in APART, f"{here} imports {other}, which stands apart"
-        if here in APART:
-            assert other in APART[here], f"{here} stands apart and imports {other}"
-        else:
-            assert FLOORS[other] < FLOORS[here], f"{here} imports {other}, which is not below it"
+        assert FLOORS[other] < FLOORS[here], f"{here} imports {other}, which is not below it"
+
+
+@pytest.mark.parametrize("path", PATHS, ids=dotted)
+def test_the_library_knows_nothing_of_the_book(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert [name for name in BOOK if name in text] == []
 
 
 def test_no_circle_of_imports() -> None:
@@ -221,7 +214,7 @@ def test_a_family_of_filters_is_short(family: str, most: int) -> None:
 def test_every_room_is_seen_and_shows_what_it_exports() -> None:
     """`dir` and completion find each room, and in it what a reader calls; helpers stay inside."""
     seen = {name for name in dir(distfilt) if not name.startswith("__")}
-    helpers = {"checks", "differences", "folders", "progress"}
+    helpers = {"checks", "differences", "progress"}
     assert seen == {part(dotted(path)) for path in PATHS} - helpers - {""}
     for room in seen:
         face = getattr(distfilt, room)
@@ -283,39 +276,17 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
-def test_wheel_carries_the_data(wheel: Path) -> None:
-    carried = wheel / "distfilt" / "_data"
-    for name in ("published", "scenarios"):
-        source = ROOT / "data" / name
-        files = sorted(p.relative_to(source) for p in source.rglob("*") if p.is_file())
-        found = [p.relative_to(carried / name) for p in (carried / name).rglob("*") if p.is_file()]
-        assert files and files == sorted(found)
-        for file in files:
-            assert (source / file).read_bytes() == (carried / name / file).read_bytes()
-
-
 def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
     tops = {p.name for p in wheel.iterdir()}
     assert tops == {"distfilt", next(t for t in tops if t.endswith(".dist-info"))}
-    found = sorted(p.relative_to(wheel / "distfilt") for p in (wheel / "distfilt").rglob("*.py"))
-    assert found == [p.relative_to(PACKAGE) for p in PATHS]
+    files = (p for p in (wheel / "distfilt").rglob("*") if p.is_file())
+    found = sorted(p.relative_to(wheel / "distfilt") for p in files)
+    assert found == sorted(p.relative_to(PACKAGE) for p in [*PATHS, PACKAGE / "py.typed"])
 
 
-READ_FROM_WHEEL = """
-from pathlib import Path
-import distfilt
-from distfilt import published
-here = Path.cwd()
-assert Path(distfilt.__file__).is_relative_to(here), distfilt.__file__
-assert published.root().is_relative_to(here), published.root()
-print(len(published.items()), len(published.table("grange", "table-2").rows))
-print(published.scenario("grange", "table-2").name)
-"""
-
-
-def test_installed_library_reads_the_data_it_carries(wheel: Path) -> None:
-    items, rows, _ = run(READ_FROM_WHEEL, wheel).split(maxsplit=2)
-    assert int(items) == 21 and int(rows) > 0
+def test_installed_library_runs_alone(wheel: Path) -> None:
+    code = "import distfilt; from distfilt import filters; print(distfilt.__file__)"
+    assert Path(run(code, wheel).strip()).is_relative_to(wheel)
 
 
 TIMED = """

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from distfilt import studies
+from bookkit import studies
+from bookkit.published import Reading, scenario
 from distfilt.filters import EnsembleFilter
 from distfilt.models import Model, clohessy_wiltshire, satellite_pose, simulate
 from distfilt.network import Graph, intersection, pull
-from distfilt.published import Reading, scenario
 from distfilt.sensors import Sensor, of_kind
 from distfilt.updates import (
     known_noise,

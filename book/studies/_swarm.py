@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from bookkit.published import scenario
 from distfilt import density
 from distfilt.filters import DensityFilter
 from distfilt.network import Faults
-from distfilt.published import scenario
 
 sys.path.insert(0, str(Path(__file__).parent))
 import densities

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from bookkit.published import scenario
+from bookkit.studies import spawn
 from distfilt import density
 from distfilt.models import RotatingMixture, rotating_swarm
-from distfilt.published import scenario
-from distfilt.studies import spawn
 
 NAME, PAPER = "densities", "zheng"
 SWARM, CHOICES = scenario("zheng", "swarm"), scenario("zheng", "figure-1")

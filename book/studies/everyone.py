@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import _swarm as swarm
 import locals as figure
 
-from distfilt.studies import spawn
+from bookkit.studies import spawn
 
 NAME, PAPER = "everyone", "zheng"
 CHOICES, CASE = swarm.CHOICES, figure.CASE

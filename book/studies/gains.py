@@ -17,9 +17,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 import _swarm as swarm
 import locals as figure
 
+from bookkit.studies import spawn
 from distfilt.filters import DensityFilter
 from distfilt.metrics import mean_interval
-from distfilt.studies import spawn
 
 NAME, PAPER = "gains", "zheng"
 CHOICES, CASE = swarm.CHOICES, figure.CASE

@@ -12,6 +12,7 @@ from functools import partial
 
 import numpy as np
 
+from bookkit.published import scenario
 from distfilt.filters import MixtureFilter, MixtureState, NewsFilter
 from distfilt.mixtures import (
     GaussianMixture,
@@ -24,7 +25,6 @@ from distfilt.mixtures import (
 )
 from distfilt.models import occulted, orbits, rsw_frame
 from distfilt.network import graphs
-from distfilt.published import scenario
 from distfilt.sensors import ephemeris, line_of_sight, stack
 
 NAME, PAPER = "orbit", "semeraro"

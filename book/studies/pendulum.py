@@ -12,9 +12,9 @@ from functools import partial
 
 import numpy as np
 
+from bookkit.published import scenario
 from distfilt.coupling import norm, project, retract
 from distfilt.models import pendulum, pendulum_states
-from distfilt.published import scenario
 from distfilt.updates import augmented, ensemble_transform, projected, retracted
 from distfilt.updates.door import unchecked
 

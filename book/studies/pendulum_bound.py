@@ -13,10 +13,10 @@ from functools import partial
 
 import numpy as np
 
+from bookkit.published import scenario
 from distfilt.coupling import norm, retract
 from distfilt.metrics import crps
 from distfilt.models import pendulum, pendulum_angle, pendulum_chart, pendulum_states
-from distfilt.published import scenario
 from distfilt.updates import (
     augmented,
     ensemble_transform,

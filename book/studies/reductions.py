@@ -16,6 +16,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import arcs
 
+from bookkit.published import scenario
 from distfilt.mixtures import (
     GaussianMixture,
     PartialFusion,
@@ -25,7 +26,6 @@ from distfilt.mixtures import (
     pivoted_qr,
     runnalls,
 )
-from distfilt.published import scenario
 
 NAME, PAPER = "reductions", "semeraro"
 SCENARIO = scenario("semeraro", "table-2")

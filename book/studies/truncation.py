@@ -14,8 +14,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import densities
 
+from bookkit.studies import spawn
 from distfilt import density
-from distfilt.studies import spawn
 
 NAME, PAPER = "truncation", "zheng"
 CHOICES, DT = densities.CHOICES, densities.SWARM["dt"]

@@ -14,7 +14,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import _swarm as swarm
 
-from distfilt.studies import spawn
+from bookkit.studies import spawn
 
 NAME, PAPER = "variants", "zheng"
 CHOICES = swarm.CHOICES

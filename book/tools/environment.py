@@ -47,7 +47,8 @@ def main():
         run(sys.executable, "-m", "venv", folder)
     pip = ("-m", "pip", "install", "--quiet", "--disable-pip-version-check")
     run(python, *pip, "-r", "requirements.txt")
-    run(python, *pip, "--no-deps", "--no-build-isolation", "--editable", ".")
+    for package in (".", "book/kit"):
+        run(python, *pip, "--no-deps", "--no-build-isolation", "--editable", package)
     run(python, "-W", "ignore", "-c", "import matplotlib.font_manager")
     with open(stamp + ".new", "w", encoding="utf-8") as out:
         out.write(here + "\n")

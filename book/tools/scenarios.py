@@ -14,8 +14,8 @@ import io
 import sys
 from pathlib import Path
 
+from bookkit.published import PAPERS, read_scenario
 from common import ROOT
-from distfilt.published import PAPERS, read_scenario
 
 COLUMNS = ("paper", "scenario", "entry", "value")
 

@@ -26,12 +26,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from bookkit import studies
+from bookkit.published import PAPERS, Scenario
+from bookkit.studies.files import jsons
+from bookkit.studies.seeds import recipes
+from bookkit.studies.study import column_names
 from common import ROOT
-from distfilt import studies
-from distfilt.published import PAPERS, Scenario
-from distfilt.studies.files import jsons
-from distfilt.studies.seeds import recipes
-from distfilt.studies.study import column_names
 
 ALLOWED = ("rtol", "atol", "rough", "odd")
 NEEDED = ("NAME", "PAPER", "trial", "parameters", "columns", "seeds")
@@ -56,7 +56,7 @@ def load_script(path: Path) -> ModuleType:
     if not isinstance(script.NAME, str) or not re.fullmatch(r"[a-z0-9][a-z0-9-]*", script.NAME):
         raise ValueError(f"{path.name}: NAME needs small letters, digits, -, got {script.NAME!r}")
     if not all(isinstance(s, Scenario) for s in getattr(script, "scenarios", ())):
-        raise ValueError(f"{path.name}: scenarios needs what distfilt.published.scenario returns")
+        raise ValueError(f"{path.name}: scenarios needs what bookkit.published.scenario returns")
     return script
 
 

@@ -120,7 +120,7 @@ def growth() -> list[dict[str, object]]:
 
 def one(seed: np.random.SeedSequence) -> float:
     """The paper's five algorithms on one run; OTProj reuses OTF's."""
-    from distfilt import studies
+    from bookkit import studies
     from distfilt.coupling import project
 
     paper = studies.script("pendulum")
@@ -134,7 +134,7 @@ def one(seed: np.random.SeedSequence) -> float:
 
 def study(runs: int) -> list[dict[str, object]]:
     """The five algorithms over `runs` runs on all cores."""
-    from distfilt import studies
+    from bookkit import studies
 
     seeds = np.random.SeedSequence(2024).spawn(runs)
     began = time.perf_counter()

@@ -25,7 +25,7 @@ from _bench import peer, write
 from loky import get_reusable_executor
 from numpy.random import SeedSequence
 
-from distfilt import studies
+from bookkit import studies
 
 TRIALS, REPEATS, LENGTH, REQUIRED_MS = 400, 7, 0.010, 0.15
 

@@ -19,8 +19,10 @@ ROOT = Path(__file__).resolve().parents[2]
 def clone(tmp_path: Path) -> Path:
     """A folder with what make looks at, under a name with a space in it."""
     folder = tmp_path / "a clone"
-    (folder / "book" / "tools").mkdir(parents=True)
-    for name in ("Makefile", "requirements.txt", "pyproject.toml", "book/tools/environment.py"):
+    names = ("Makefile", "requirements.txt", "pyproject.toml", "book/tools/environment.py",
+             "book/kit/pyproject.toml")  # fmt: skip
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, folder / name)
     return folder
 
@@ -124,7 +126,7 @@ def steps(clone: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 def test_the_stamp_comes_last_and_names_the_folder(clone: Path, steps: list[str]) -> None:
     environment.main()
-    assert steps[0] == "venv" and steps.count("pip") == 2
+    assert steps[0] == "venv" and steps.count("pip") == 3
     assert (clone / ".venv" / "stamp").read_text() == f"{clone}\n" and not makes_it(clone)
     steps.clear()
     (clone / ".venv" / "kept").touch()

@@ -10,8 +10,8 @@ from types import ModuleType
 import jupytext
 import pytest
 
+from bookkit.published import items, root, scenario
 from common import BOOK, ROOT, chapters
-from distfilt.published import items, root, scenario
 
 NAMES = sorted((p.parent.name, p.stem) for p in (root() / "scenarios").glob("*/*.toml"))
 

@@ -10,11 +10,11 @@ from types import ModuleType
 
 import pytest
 
-from distfilt import studies
+from bookkit import studies
 
 ROOT = Path(__file__).resolve().parents[2]
 GOOD = """
-from distfilt.studies import spawn
+from bookkit.studies import spawn
 NAME, PAPER, columns, parameters = "small", "grange", ["a", "b"], {}
 seeds = spawn(1, 2)
 def trial(seed):
@@ -69,7 +69,7 @@ def test_a_bad_script_is_refused_before_it_runs(
 
 SCRIPT = """
 import numpy as np
-from distfilt import studies
+from bookkit import studies
 
 NAME, PAPER = "spread", "zheng"
 parameters = {"members": 20}
@@ -137,8 +137,8 @@ def shared(seed):
 """
 USES = """
 import _common
-from distfilt.published import scenario
-from distfilt.studies import spawn
+from bookkit.published import scenario
+from bookkit.studies import spawn
 NAME, PAPER, columns, parameters = "table-2", "grange", ["a", "b"], {"gain": 1}
 seeds, scenarios, timeout = spawn(1, 4), [scenario("grange", "table-2")], 30.0
 def trial(seed):
@@ -157,7 +157,7 @@ def test_scripts_share_a_module_and_store_what_their_scenario_was(
     assert tool.main(["--workers", "2"], tmp_path) == 0
     stored = studies.load(tmp_path / "data" / "studies" / "grange" / "table-2.csv")
     assert stored.metric("a").tolist() == [0.0, 1.0, 2.0, 3.0]
-    from distfilt.published import scenario
+    from bookkit.published import scenario
 
     digest = scenario("grange", "table-2").digest
     assert stored.parameters == {"gain": 1, "scenario_table_2": digest}

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from distfilt import studies
+from bookkit import studies
 from distfilt.intervals import median_interval, proportion_interval
 
 STORED = studies.stored("das", "pendulum")

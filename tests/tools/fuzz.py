@@ -487,24 +487,21 @@ def findings(calls: dict[str, list[Call]]) -> Iterator[Finding]:
 
 GOOD = {"refused", "same", "finite"}
 RECORDS = (
-    r"filters\.Summary|network\.(Ledger|PIState|AdmmRun)|published\.(Parameter|accepted)"
+    r"filters\.Summary|network\.(Ledger|PIState|AdmmRun)"
 )
 ALLOWED: dict[tuple[str, str, str], str] = {
     (r"checks\..*", r".*", r".*"): "the words of the check itself, which the library writes",
-    (rf"({RECORDS})(\.\w+)?|studies\.(Failure|Stored|Study)|published\.Table|filters\.\w*State",
+    (rf"({RECORDS})(\.\w+)?|filters\.\w*State",
      r".*", r".*"):
         "made by the library, looked at by who takes it",
     (r"models\.Swarm\..*_at|updates\.with_missing", r".*", r".*"):
         "called in every step by the filter that has checked its arguments",
     (r"coupling\.Plan|kalman\.GaussianRun", r".*", r".*"):
         "a result; rts_smoother, which takes a run, looks at it",
-    (r"plotting\.\w+", r"x?unit|yunit|title|label", "text: taken"): "an optional text",
     (r"density\.DynamicAverage|triangular\.pool_by_admm|network\.admm", r"modes|check",
      "None: taken"):
         "means what its docstring says: all cells, no check",
     (r"density\.PIConsensus\.learn", "dt", "huge: too long"): "as many substeps as are stable",
-    (r"plotting\.slider", "values", r".*: (taken|unnamed)"):
-        "whatever the format takes; an error names the format and the value",
     (r"filters\.\w+Filter\.step", "observations", "with None: taken"): "an agent without reading",
     (r"progress\.track", "items", r".*"): "hands on, unlooked at, whatever can be iterated over",
     (r"filters\.\w+Filter(\.exact)?", "sensors", "with None: taken"): "an agent without a sensor",
@@ -530,9 +527,6 @@ ALLOWED: dict[tuple[str, str, str], str] = {
      "with None: taken"):
         "looked at by the step that takes it, or nothing observed",
     (r"sensors\.Sensor\.matrix", "dim", "huge: unnamed"): "numpy refuses such a size itself",
-    (r"studies\.check", "workers", "None: taken"): "one for each core",
-    (r"studies\.run", "blas_threads", "None: taken"): "the threads are left as they are",
-    (r"studies\.spawn", "n", "huge: too long"): "as many seeds as were asked for",
     (r"network\.Channel\.\w+", "payloads", "with None: taken"): "an agent that is silent",
 }
 """(callable, argument, kind and result) as patterns to the reason why it may be so."""

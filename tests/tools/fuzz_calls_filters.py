@@ -1,4 +1,4 @@
-"""Valid calls, which no doctest makes, for ``fuzz.py``: filters, networks, sensors, studies."""
+"""Valid calls, which no doctest makes, for ``fuzz.py``: filters, networks, sensors."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import networkx
 import numpy as np
 
-from distfilt import filters, models, network, published, sensors, studies, updates
+from distfilt import filters, models, network, sensors, updates
 from distfilt.coupling import norm
 from distfilt.density import Flooding, FokkerPlanck, Grid, PIConsensus
 from distfilt.mixtures import GaussianMixture, fuse
@@ -23,10 +23,6 @@ PRIOR = np.zeros(2), np.eye(2)
 TIMES = np.array([1.0, 2.0])
 SERIES = [np.array([[0.8], [0.7]]), np.array([[-0.8], [-0.6]])]
 LATE = [filters.Late(0, 1.0, [0.7], arrived=2.0)]
-
-
-def trial(seed: Any) -> float:
-    return float(np.random.default_rng(seed).normal())
 
 
 def with_sensors() -> None:
@@ -151,27 +147,6 @@ def of_networks() -> None:
         channel.carry(values)
 
 
-def of_papers_and_studies() -> None:
-    scenario = published.scenario("grange", "table-2")
-    reading = scenario.reading()
-    reading.cells()
-    printed = published.table("grange", "table-2")
-    printed.records()
-    published.Table(printed.columns, printed.rows, printed.path, printed.lines)
-    study = studies.run(trial, studies.spawn(1, 4), workers=1)
-    study.metrics(["draw"])
-    study.frame(["draw"])
-    study.seed(2)
-    studies.store(study, "study.csv", parameters={"mean": 0.5}, columns=["draw"], code=[trial])
-    kept = studies.load("study.csv")
-    kept.metric("draw")
-    kept.seed(1)
-    studies.check("study.csv", trial)
-    studies.check(kept, trial, indices=[0, 1], rough=["draw"], odd=1)
-    studies.stored("grange", "figure-2")
-    studies.script("lorenz-63")
-
-
 def filters_with_every_option() -> None:
     names = ["left", "right"]
     some = network.Faults(loss=0.1, seed=3)
@@ -250,14 +225,6 @@ def others_with_every_option() -> None:
     sensors.angle([0, 1], std=0.1, full=True, origin=np.array([0.5, 1.5]))
     sensors.distance([0, 1], std=0.1, origin=np.array([0.5, 1.5]))
     sensors.line_of_sight(std=1e-4, hidden=models.occulted)
-    study = published.scenario("grange", "table-2")
-    one = published.Value("C1", 0.0899, 0.0004, 0.0896)
-    published.judge_table("semeraro", "Table 1", [one], why="drawn", scenario=study)
-    published.judge_parameters("grange", "Table II", study.reading(), scenario=study)
-    published.table("grange", "table-2", numbers=["noise"])
-    file = published.root() / "published" / "grange" / "table-2.csv"
-    columns = published.table("grange", "table-2").columns
-    published.read_table(file, columns=columns, numbers=["noise"])
     seen, logs = RNG(0).standard_normal((8, 2)), np.zeros((2, 3))
     given: dict[str, Any] = {"rng": RNG(0), "inside": lambda x: x[..., 0] > -9}
     updates.ensemble_transform(seen, seen[:, :1], [0.5], [[1.0]], **given)
@@ -272,14 +239,9 @@ def others_with_every_option() -> None:
                  filters.ParticleFilter(WALK, EYES, PATH, members=4),
                  filters.TransportFilter(WALK, EYES, PATH, members=4)):  # fmt: skip
         team.start(PRIOR, rng=RNG(0), runs=(2,), t=0.5)
-    published.Verdict("grange", "Table I", "read", "4 rows read", "4 rows", "printed so")
-    studies.run(
-        trial, [1, 2], workers=1, chunk=1, errors="collect", timeout=5.0, progress=False,
-        blas_threads=None,
-    )
 
 
 for each in (with_sensors, step_by_step, of_densities_and_mixtures, of_models_and_sensors,
-             of_networks, of_papers_and_studies, filters_with_every_option,
+             of_networks, filters_with_every_option,
              others_with_every_option):  # fmt: skip
     each()

@@ -15,13 +15,11 @@ from distfilt import (
     kalman,
     metrics,
     mixtures,
-    plotting,
     progress,
     triangular,
 )
 from distfilt import density as densities
 from distfilt.density.seen import Seen
-from distfilt.digests import digest, of_axes
 from distfilt.models import Swarm
 from distfilt.network import Channel, graphs
 
@@ -48,7 +46,6 @@ def the_checks() -> None:
         find(np.array([2.0, 1.0, 4.0, 3.0, 7.0, 5.5, 8.0]), level=0.9)
     intervals.proportion_interval(3, 10, level=0.9)
     intervals.Interval(0.25, 0.15, 0.375, 0.06)
-    digest(error=[4.0, 2.0, 1.0])
 
 
 def the_maps() -> None:
@@ -187,25 +184,8 @@ def the_runs() -> None:
     kalman.GaussianRun(run.means, run.covariances, run.log_likelihood)
 
 
-def the_pictures() -> None:
-    from matplotlib import pyplot
-
-    ax = plotting.axes(xlabel="x", ylabel="y", xunit="m", yunit="s", title="A title", size=(3, 2))
-    plotting.axes(xlabel="x", ylabel="y", ax=ax)
-    plotting.ellipse(ax, [0.0, 0.5], [[4.0, 0.0], [0.0, 1.0]], index=1, label="a share")
-    plotting.band(ax, [0.0, 1.0], [[1.0, 5.0], [2.0, 4.0]], index=1, label="a run")
-    plotting.graph(ax, [[0, 1], [1, 0]], labels=["A", "B"], positions=[[0.0, 0.0], [1.0, 0.5]],
-                   known=[0.5, 1.0], notes=["angle", ""])  # fmt: skip
-    of_axes(ax)
-    plotting.colour(3)
-    plotting.line_style(3)
-    plotting.Slider((b"PNG",), ("gain 0.1",), ("axes 1",), label="gain", alt="A curve that falls",
-                    start=0, seconds=0.5)  # fmt: skip
-    pyplot.close("all")
-
-
 for calls in (
     the_checks, the_maps, the_couplings, the_options, the_processes, the_grids, the_flows,
-    the_sharing, the_mixtures, the_runs, the_pictures,
+    the_sharing, the_mixtures, the_runs,
 ):  # fmt: skip
     calls()

@@ -1,0 +1,213 @@
+"""What digests notice and overlook: of arrays, and of what was drawn."""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+matplotlib.use("Agg")
+
+from matplotlib import pyplot
+from matplotlib.figure import Figure
+
+from bookkit.digests import digest, of_axes
+
+_D = "bookkit.digests."
+_REFUSED = {
+    _D + "digest": [
+        ("arrays", lambda: digest()),
+        ("curve", lambda: digest(curve="abc")),
+        ("curve", lambda: digest(curve=[[1, 2], [3]])),
+        ("curve", lambda: digest(curve=np.ma.masked_array([1.0], [True]))),
+    ],
+    _D + "of_axes": [
+        ("drawn", lambda: of_axes(None)),
+        ("drawn", lambda: of_axes("figure")),
+        ("drawn", lambda: of_axes([Figure().subplots(), 3])),
+        ("drawn", lambda: of_axes(Figure())),
+        ("drawn", lambda: of_axes(Figure().subplots(2))),
+    ],
+}
+
+CURVES = st.lists(st.floats(-1e6, 1e6).map(lambda v: round(v, 3)), min_size=1, max_size=60)
+
+
+@settings(derandomize=True)  # a number may lie 1e-9 from a tie, by a chance of 1e-5 a number
+@given(CURVES, st.integers(0, 2**32 - 1))
+def test_digest_survives_rounding(values, seed):
+    curve = np.array(values)
+    noise = np.random.default_rng(seed).uniform(-1, 1, curve.size)
+    assert digest(curve=curve * (1 + 1e-9 * noise)) == digest(curve=curve)
+    assert digest(curve=curve + 1e-16 * np.abs(curve).max() * noise) == digest(curve=curve)
+
+
+@pytest.mark.parametrize("value", [1.0, 10.0, 1e-3, 0.12345, 12.345, 1.0005, 9.9995, -2.5e7, 1e-9])
+def test_digest_is_steady_at_round_numbers(value):
+    curve = np.array([value, 0.3 * value, -0.7 * value, 1.0])
+    texts = {digest(c=curve * (1 + e)) for e in (0.0, 1e-9, -1e-9, 1e-13, -1e-13)}
+    assert len(texts) == 1
+
+
+@given(
+    st.lists(st.integers(-50, 50), min_size=2, max_size=60), st.data(), st.sampled_from([-20, 20])
+)
+def test_digest_sees_one_changed_entry(values, data, change):
+    curve = np.array(values, dtype=float)
+    moved = curve.copy()
+    moved[data.draw(st.integers(0, len(values) - 1))] += change
+    # The projection moves by 20/sqrt(4n), at least 1.2, and its last digit is worth at most 0.1.
+    assert digest(c=curve) != digest(c=moved)
+
+
+def test_digest_sees_order_sign_and_size():
+    t = np.linspace(0, 6, 200)
+    curve = np.sin(t)
+    for other in (curve[::-1], -curve, 1.001 * curve, curve + 0.001, np.sin(t + 0.01), curve[:-1]):
+        assert digest(c=curve) != digest(c=other)
+    swapped = curve.copy()
+    swapped[[40, 60]] = swapped[[60, 40]]  # same range, mean and parity
+    assert digest(c=curve) != digest(c=swapped)
+    bumped = curve.copy()
+    bumped[100] += 0.02
+    assert digest(c=curve) != digest(c=bumped)
+
+
+def test_digest_text():
+    assert digest(a=[], b=np.zeros(3)) == ("a: 0 values\nb: 3 values, 0..0, mean 0, projection 0")
+    assert digest(a=[np.nan, np.nan]) == "a: 2 values, 2 NaN"
+    text = digest(a=[1.0, np.nan, np.inf, 2.0])
+    assert text.endswith("1 NaN, 1 infinite") and text.startswith("a: 4 values, 1..2, mean 1.5,")
+    moved = digest(a=[np.nan, 1.0, np.inf, 2.0])
+    assert moved != text
+    turn = np.linspace(0, 2 * np.pi, 101)[:-1]
+    assert "mean 0," in digest(a=np.sin(turn))
+    assert digest(a=np.array([123456, 234567])).startswith("a: 2 values, 1.235e+05..2.346e+05")
+
+
+def test_digest_is_the_documented_projection():
+    values = np.array([3.0, -1.0, 4.0, 1.5])
+    k = np.arange(4)
+    weights = np.array([1, -1, 1, -1]) * (1 + (k * (np.sqrt(5) - 1) / 2) % 1)
+    expected = weights @ values / np.linalg.norm(weights)
+    printed = float(digest(a=values).rsplit(" ", 1)[1])
+    assert printed == pytest.approx(expected, rel=6e-4)
+
+
+# --- what was drawn ---------------------------------------------------------------------------
+
+T = np.linspace(0.0, 6.0, 50)
+GRID = np.add.outer(np.sin(T[:8]), np.cos(T[:9]))
+
+
+def picture(change: str = "") -> Figure:
+    """Two panels with every kind of artist, and one of them changed."""
+    figure = Figure(figsize=(6, 3))
+    left, right = figure.subplots(1, 2)
+    scale = {name: 1.01 if name == change else 1.0 for name in CHANGED}
+    if change == "swapped panels":
+        left, right = right, left
+    left.plot(T, 1000 * np.cos(T))
+    left.plot(T, scale["small curve"] * np.sin(T))
+    left.plot(scale["times"] * T, np.sin(2 * T), visible=change != "hidden curve")
+    left.bar([1, 2, 3], [2.0, scale["bar"] * 5.0, 4.0])
+    left.fill_between(T, np.sin(T), scale["band"] * (2 + np.cos(T)))
+    left.add_patch(matplotlib.patches.Ellipse((0, 0), scale["ellipse"] * 3.0, 1.0, angle=30))
+    left.inset_axes([0.6, 0.6, 0.3, 0.3]).plot(T, scale["inset"] * T**2)
+    if change != "missing points":
+        right.scatter(T, scale["points"] * T**2, c=scale["colours"] * np.cos(T))
+    right.scatter([scale["one point"] * 3.0], [4.0])
+    right.quiver(T[:5], T[:5], scale["arrows"] * T[:5], -T[:5])
+    right.contour(scale["levels"] * GRID, levels=[-0.5, 0.5, 1.0])
+    right.pcolormesh(scale["mesh"] * GRID)
+    right.imshow(scale["image"] * GRID, extent=(0, scale["extent"] * 2.0, 0, 1))
+    right.errorbar(T[:4], T[:4], scale["bars of error"] * 0.1 * np.ones(4))
+    right.vlines([1.0, scale["rules"] * 2.0], 0, 1)
+    return figure
+
+
+CHANGED = [
+    "small curve", "times", "bar", "band", "ellipse", "inset", "points", "colours", "one point",
+    "arrows", "levels", "mesh", "image", "extent", "bars of error", "rules",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("change", [*CHANGED, "swapped panels", "hidden curve", "missing points"])
+def test_one_changed_artist_changes_the_text(change):
+    assert of_axes(picture(change)) != of_axes(picture())
+    assert of_axes(picture(change)) == of_axes(picture(change))
+
+
+def test_drawing_and_style_do_not_change_the_text(tmp_path):
+    figure = picture()
+    before = of_axes(figure)
+    figure.savefig(tmp_path / "a.png", dpi=40)
+    assert of_axes(figure) == before
+    for axes in figure.axes:
+        for line in axes.lines:
+            line.set(color="red", linewidth=3)
+    assert of_axes(figure) == before
+
+
+@settings(derandomize=True, max_examples=15)  # as above: a number may lie close to a tie
+@given(st.integers(0, 2**32 - 1))
+def test_text_survives_the_last_bits_of_another_processor(seed):
+    def drawn(noise):
+        axes = Figure().subplots()
+        axes.plot(T, np.sin(T) * (1 + noise[0]))
+        axes.plot(T * (1 + noise[1]), np.exp(T) * (1 + noise[2]))
+        axes.fill_between(T, np.cos(T) * (1 + noise[3]))
+        axes.bar(T[:5], T[1:6] * (1 + noise[4, :5]))
+        return of_axes(axes)
+
+    noise = np.random.default_rng(seed).uniform(-1e-12, 1e-12, (5, 50))
+    assert drawn(noise) == drawn(0 * noise)
+
+
+def test_text_of_each_kind():
+    axes = Figure().subplots()
+    axes.plot([0.0, 1.0], [2.0, np.nan])
+    axes.plot([0.0, 1.0], [5.0, 7.0])
+    axes.bar([1.0, 3.0], [2.0, 4.0], width=1.0)
+    axes.imshow(np.ma.masked_greater([[1.0, 2.0], [3.0, 4.0]], 3.5))
+    lines = of_axes(axes).splitlines()
+    assert lines[0] == "axes 1: 2 lines, 2 patches, 1 image"
+    assert lines[1].startswith("line 1 x: 2 values, 0..1, mean 0.5,")
+    assert lines[2].startswith("line 1 y: 2 values, 2..2,") and lines[2].endswith("1 NaN")
+    assert lines[3].startswith("line 2 y: 2 values, 5..7,")  # x is that of the line before
+    assert lines[4].startswith("patch 1-2 x: 10 values, 0.5..3.5,")
+    assert lines[5].startswith("patch 1-2 y: 10 values, 0..4,")
+    assert lines[6].startswith("image 1 value: 4 values, 1..3,") and "1 NaN" in lines[6]
+    assert lines[7].startswith("image 1 extent: 4 values, -0.5..1.5,")
+    assert len(lines) == 8
+
+
+def test_figures_axes_and_arrays_of_axes_read_alike():
+    figure = Figure()
+    panels = figure.subplots(2, 2)
+    for k, axes in enumerate(panels.ravel()):
+        axes.plot(T, T**k)
+    assert of_axes(panels) == of_axes(figure) == of_axes(list(panels.ravel()))
+    alone = of_axes(panels[0, 1]).splitlines()[1:]
+    whole = of_axes(figure).splitlines()
+    at = whole.index("axes 2: 1 line")
+    assert whole[at + 1 : at + 3] == alone and len(alone) == 2
+
+
+def test_three_dimensions():
+    def drawn(z, surface, points):
+        axes = pyplot.figure().add_subplot(projection="3d")
+        axes.plot(T, T, z * T)
+        axes.plot_wireframe(*np.meshgrid(T[:3], T[:4]), surface * np.ones((4, 3)))
+        axes.plot_surface(*np.meshgrid(T[:3], T[:4]), surface * np.ones((4, 3)))
+        axes.scatter(T, T, points * T)
+        text = of_axes(axes)
+        pyplot.close("all")
+        return text
+
+    plain = drawn(1.0, 1.0, 1.0)
+    assert plain == drawn(1.0, 1.0, 1.0) and "line 1 z" in plain
+    for other in ((1.01, 1, 1), (1, 1.01, 1), (1, 1, 1.01)):
+        assert drawn(*other) != plain
