@@ -44,7 +44,7 @@ BOUNDS: list[tuple[str, Callable[[], object]]] = [
     ("F: needs shape .* got \\(2, 4, 1, 1\\)", lambda: kalman_filter(
         [0.0], [[1.0]], np.zeros((4, 1)), **(STEPS | {"F": np.ones((2, 4, 1, 1))}))),
     ("weights: .* positive own weights .* 0$", lambda: covariance_intersection(
-        np.zeros((2, 1)), np.ones((2, 1, 1)), PATH, weights=[[0.0, 1.0], [1.0, 0.0]])),
+        (np.zeros((2, 1)), np.ones((2, 1, 1))), PATH, weights=[[0.0, 1.0], [1.0, 0.0]])),
     ("x: needs more than 4 members .* 4 variables, got 4", lambda: pool_by_moments(
         DRAWN[:4, :1].reshape(2, 2, 1), DRAWN[:4].reshape(2, 2, 3), PATH)),
     ("x: needs more than 7 members .* got 7", lambda: separable.fit(

@@ -94,7 +94,7 @@ class GaussianFilter(SensorFilter):
     ----------
     model, sensors, graph, agreement, share, faults, lag, names, failures
         As for :class:`~distfilt.filters.SensorFilter`. The agreement is a function
-        ``agreement(means, covs, channel) -> means, covs``, such as
+        ``agreement((means, covs), channel) -> (means, covs)``, such as
         :func:`distfilt.network.covariance_intersection`.
     rule : {"extended", "unscented"}
         How a curved model or sensor is made linear: by its derivative at the mean, or by 2d + 1

@@ -180,7 +180,8 @@ class Step:
         """Values (*runs, A, ...) after the agreement, if there is one."""
         if not self.agrees:
             return values
-        out = self.filter.agreement(*values, self.channel)
+        belief: Any = values[0] if len(values) == 1 else values
+        out = self.filter.agreement(belief, self.channel)
         out = (out,) if len(values) == 1 else tuple(out)
         if len(out) != len(values):
             raise ValueError(f"agreement: needs to return {len(values)} arrays, got {len(out)}")

@@ -14,7 +14,7 @@ from ..gaussians import _bures_barycentre, _recolour
 from . import weights as weighting
 from ._neighbourhood import fused_by
 from .channel import Channel
-from .consensus import warn_if_unstable
+from .consensus import fuses, warn_if_unstable
 from .fusion import _intersected
 from .weights import Weights
 
@@ -27,6 +27,7 @@ _SINGULAR = 1e-13
 """Least share of a component's variance that the components before it do not explain."""
 
 
+@fuses("ensembles")
 def pull(
     ensembles: ArrayLike, channel: Channel, *, gain: float, rounds: int = 1,
     include_self: bool = True,
@@ -78,6 +79,7 @@ def pull(
     return out
 
 
+@fuses("ensembles")
 def intersection(
     ensembles: ArrayLike, channel: Channel, *, rule: str = "min_determinant",
     weights: Weights | ArrayLike | None = None, scale: ArrayLike | None = None, rounds: int = 1,
@@ -121,6 +123,7 @@ def intersection(
     return out if size is None else out * size
 
 
+@fuses("ensembles")
 def barycentre(
     ensembles: ArrayLike, channel: Channel, *, scale: ArrayLike | None = None, rounds: int = 1,
     tolerance: float = 1e-10,

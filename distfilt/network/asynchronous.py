@@ -8,12 +8,13 @@ from numpy.typing import ArrayLike
 from ..checks import Array, count, generator, number
 from . import weights as weighting
 from .channel import Channel
-from .consensus import _values
+from .consensus import _values, fuses
 from .weights import Weights
 
 __all__ = ["event_triggered", "flood", "gossip"]
 
 
+@fuses("vectors")
 def gossip(values: ArrayLike, channel: Channel, *, rounds: int, rng: np.random.Generator) -> Array:
     r"""Average in pairs: in each round one agent wakes and meets one neighbour, both drawn evenly.
 
@@ -74,6 +75,7 @@ def gossip(values: ArrayLike, channel: Channel, *, rounds: int, rng: np.random.G
     return out
 
 
+@fuses("vectors")
 def event_triggered(
     values: ArrayLike, channel: Channel, *, rounds: int, threshold: float, decay: float = 1.0,
     weights: Weights | None = None,

@@ -3,21 +3,66 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, array, count, instance, number
+from ..doors import unchecked
 from . import weights as weighting
 from .channel import Channel
 from .links import Graph
 from .weights import Weights
 
-__all__ = ["UnstableGain", "average", "finite_time", "maximum", "push_sum"]
+__all__ = [  # fmt: skip
+    "UnstableGain", "average", "finite_time", "fused_kind", "fuses", "maximum", "push_sum",
+]
 
+F = TypeVar("F", bound=Callable[..., Any])
+
+Fused = Literal["vectors", "ensembles", "gaussians", "mixtures", "densities", "particles"]
 
 _SMALL = 1000
 """Up to this many agents :func:`maximum` looks for the diameter itself."""
+
+
+def fuses(kind: Fused) -> Callable[[F], F]:
+    """Say what a rule of agreement fuses, so that a filter can tell if the rule is for it.
+
+    Parameters
+    ----------
+    kind : {"vectors", "ensembles", "gaussians", "mixtures", "densities", "particles"}
+        What ``rule(belief, channel, *, …) -> belief`` takes and returns.
+
+    Examples
+    --------
+    >>> @fuses("vectors")
+    ... def stubborn(belief, channel):
+    ...     return belief
+    >>> stubborn.fuses
+    'vectors'
+    """
+
+    def named(rule: F) -> F:
+        for function in (rule, unchecked(rule)):
+            function.fuses = kind  # type: ignore[attr-defined]
+        return rule
+
+    return named
+
+
+def fused_kind(rule: Callable[..., Any]) -> str | None:
+    """What a rule says that it fuses, also with options given by a partial; None if nothing.
+
+    >>> fused_kind(partial(average, rounds=3)), fused_kind(print)
+    ('vectors', None)
+    """
+    while isinstance(rule, partial):
+        rule = rule.func
+    return getattr(rule, "fuses", None)
 
 
 class UnstableGain(RuntimeWarning):
@@ -59,6 +104,7 @@ def _connected(channel: Channel) -> None:
         raise ValueError(f"channel: needs a connected graph to agree, got {parts} components")
 
 
+@fuses("vectors")
 def average(
     values: ArrayLike, channel: Channel, *, rounds: int = 1, gain: float | None = None,
     weights: Weights | None = None, lost: str = "mutual",
@@ -105,6 +151,7 @@ def average(
     return channel.combine(out, weights, lost=lost, rounds=rounds)
 
 
+@fuses("vectors")
 def finite_time(values: ArrayLike, channel: Channel) -> Array:
     r"""The exact average in as many rounds as the Laplacian has distinct nonzero eigenvalues.
 
@@ -163,6 +210,7 @@ def _leja(points: Array) -> list[float]:
     return [float(p) for p in points[order]]
 
 
+@fuses("vectors")
 def push_sum(values: ArrayLike, channel: Channel, *, rounds: int) -> Array:
     r"""Averages on any strongly connected digraph, also when messages are lost, without answers.
 
@@ -217,6 +265,7 @@ def _summed(per_link: Array, channel: Channel) -> Array:
     return np.moveaxis(out.reshape(channel.graph.size, *front.shape[1:]), 0, -2)
 
 
+@fuses("vectors")
 def maximum(values: ArrayLike, channel: Channel, *, rounds: int | None = None) -> Array:
     """The largest value, component by component; exact after as many rounds as the diameter.
 

@@ -5,25 +5,28 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..checks import Array, array, callable_, choice, count, covariance, instance, number
+from ..checks import Array, array, choice, count, covariance, instance, number
 from ..gaussians import _intersection_weights
 from ..linalg import _solve_lower, _symmetrise
 from . import weights as weighting
-from ._neighbourhood import Fuse, Heard, fused_by, in_rounds
+from ._neighbourhood import Heard, in_rounds
 from .channel import Channel
-from .consensus import warn_if_unstable
+from .consensus import fuses, warn_if_unstable
 from .links import Graph
 from .weights import Weights
 
 __all__ = [  # fmt: skip
-    "arithmetic_average", "consensus_pull", "covariance_intersection", "exchanged", "naive_fusion",
+    "arithmetic_average", "consensus_pull", "covariance_intersection", "naive_fusion",
 ]
+
+Belief = tuple[ArrayLike, ArrayLike]
 
 RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
 
 
+@fuses("gaussians")
 def covariance_intersection(
-    means: ArrayLike, covs: ArrayLike, channel: Channel, *, rule: str = "equal",
+    belief: Belief, channel: Channel, *, rule: str = "equal",
     weights: Weights | ArrayLike | None = None, rounds: int = 1,
 ) -> tuple[Array, Array]:
     r"""Each agent fuses its Gaussian with its neighbours', safely whatever they share.
@@ -37,10 +40,8 @@ def covariance_intersection(
 
     Parameters
     ----------
-    means : array_like, (*runs, A, d)
-        Each agent's mean.
-    covs : array_like, (*runs, A, d, d)
-        Each agent's covariance, positive definite.
+    belief : tuple (means, covs)
+        Each agent's mean, (*runs, A, d), and covariance, (*runs, A, d, d), positive definite.
     channel : Channel
         Mean and covariance go over each link, d + d(d+1)/2 scalars. What is lost is left out.
     rule : {"equal", "trace", "determinant", "min_trace", "min_determinant"}
@@ -61,11 +62,11 @@ def covariance_intersection(
     --------
     >>> from distfilt.network import Channel, graphs
     >>> two = covariance_intersection(
-    ...     [[0.0], [3.0]], [[[1.0]], [[2.0]]], Channel(graphs.path(2)), rule="trace")
+    ...     ([[0.0], [3.0]], [[[1.0]], [[2.0]]]), Channel(graphs.path(2)), rule="trace")
     >>> two[0].ravel().round(6), two[1].ravel().round(6)
     (array([0.6, 0.6]), array([1.2, 1.2]))
     """
-    return _intersected(*_checked(means, covs, channel), channel, rule, weights, rounds)
+    return _intersected(*_checked(belief, channel), channel, rule, weights, rounds)
 
 
 def _intersected(
@@ -136,9 +137,8 @@ def _shared(own: Array, links: Array, heard: Heard) -> tuple[Array, Array]:
     return own / total, links / total[:, heard.graph.receivers]
 
 
-def naive_fusion(
-    means: ArrayLike, covs: ArrayLike, channel: Channel, *, rounds: int = 1
-) -> tuple[Array, Array]:
+@fuses("gaussians")
+def naive_fusion(belief: Belief, channel: Channel, *, rounds: int = 1) -> tuple[Array, Array]:
     """Multiply the densities as if their errors were independent: counts shared data twice.
 
     Right for a single fusion of independent estimates, wrong as soon as agents exchange what they
@@ -146,7 +146,7 @@ def naive_fusion(
     Parameters, returns and errors as for :func:`covariance_intersection`.
 
     >>> from distfilt.network import Channel, graphs
-    >>> two = naive_fusion([[0.0], [3.0]], [[[1.0]], [[2.0]]], Channel(graphs.path(2)))
+    >>> two = naive_fusion(([[0.0], [3.0]], [[[1.0]], [[2.0]]]), Channel(graphs.path(2)))
     >>> two[1].ravel().round(6)
     array([0.666667, 0.666667])
     """
@@ -155,12 +155,11 @@ def naive_fusion(
         ones = np.ones(heard.means.shape[:2])
         return _information_sum(heard, ones, heard.arrived.astype(np.float64))
 
-    return in_rounds(*_checked(means, covs, channel), channel, rounds, step)
+    return in_rounds(*_checked(belief, channel), channel, rounds, step)
 
 
-def arithmetic_average(
-    means: ArrayLike, covs: ArrayLike, channel: Channel, *, rounds: int = 1
-) -> tuple[Array, Array]:
+@fuses("gaussians")
+def arithmetic_average(belief: Belief, channel: Channel, *, rounds: int = 1) -> tuple[Array, Array]:
     r"""Each agent takes mean and covariance of the mixture of its own and the heard densities.
 
     .. math:: \mathbf m=\sum_j\omega_j\mathbf m_j,\qquad
@@ -171,7 +170,7 @@ def arithmetic_average(
     Parameters, returns and errors as for :func:`covariance_intersection`.
 
     >>> from distfilt.network import Channel, graphs
-    >>> two = arithmetic_average([[0.0], [3.0]], [[[1.0]], [[2.0]]], Channel(graphs.path(2)))
+    >>> two = arithmetic_average(([[0.0], [3.0]], [[[1.0]], [[2.0]]]), Channel(graphs.path(2)))
     >>> two[0].ravel(), two[1].ravel()
     (array([1.5, 1.5]), array([3.75, 3.75]))
     """
@@ -187,12 +186,12 @@ def arithmetic_average(
         covs = heard.mixed(own, links, heard.covs, heard.sent_covs)
         return heard.means + moved, _symmetrise(covs + spread)
 
-    return in_rounds(*_checked(means, covs, channel), channel, rounds, step)
+    return in_rounds(*_checked(belief, channel), channel, rounds, step)
 
 
+@fuses("gaussians")
 def consensus_pull(
-    means: ArrayLike, covs: ArrayLike, channel: Channel, *, gain: float, rule: str = "scalar",
-    rounds: int = 1,
+    belief: Belief, channel: Channel, *, gain: float, rule: str = "scalar", rounds: int = 1
 ) -> tuple[Array, Array]:
     r"""Pull each mean towards the neighbours': the consensus Kalman filter's step.
 
@@ -206,7 +205,7 @@ def consensus_pull(
 
     Parameters
     ----------
-    means, covs
+    belief
         As for :func:`covariance_intersection`.
     channel : Channel
         Only means go over each link, d scalars. A mean that is lost does not pull.
@@ -229,11 +228,12 @@ def consensus_pull(
     Examples
     --------
     >>> from distfilt.network import Channel, graphs
-    >>> consensus_pull([[0.0], [4.0]], [[[1.0]], [[2.0]]], Channel(graphs.path(2)), gain=0.25)[0]
+    >>> two = [[0.0], [4.0]], [[[1.0]], [[2.0]]]
+    >>> consensus_pull(two, Channel(graphs.path(2)), gain=0.25)[0]
     array([[1.],
            [3.]])
     """
-    m, p = _checked(means, covs, channel)
+    m, p = _checked(belief, channel)
     g = number(gain, "gain", at_least=0)
     choice(rule, "rule", ("scalar", "covariance"))
     needed = count(rounds, "rounds")
@@ -253,40 +253,12 @@ def consensus_pull(
     return m, p.copy()
 
 
-def exchanged(
-    means: ArrayLike, covs: ArrayLike, channel: Channel, fuse: Fuse, *, rounds: int = 1
-) -> tuple[Array, Array]:
-    """Let agents exchange means and covariances, and fuse all that each has by a rule of yours.
-
-    Parameters
-    ----------
-    means, covs, channel
-        As for :func:`covariance_intersection`.
-    fuse : callable
-        ``fuse(means, covs, here) -> mean, cov`` of S sources: (..., S, d), (..., S, d, d), and
-        (..., S) telling which of them arrived, to (..., d) and (..., d, d). The agent's own comes
-        first. It is called once for all agents that hear equally many.
-    rounds : int
-        How many times.
-
-    Examples
-    --------
-    The own estimate, whatever the neighbours say:
-
-    >>> from distfilt.network import Channel, graphs
-    >>> own = exchanged([[0.0], [3.0]], [[[1.0]], [[2.0]]], Channel(graphs.path(2)),
-    ...                 lambda means, covs, here: (means[..., 0, :], covs[..., 0, :, :]))
-    >>> own[0].ravel()
-    array([0., 3.])
-    """
-    callable_(fuse, "fuse")
-    return fused_by(*_checked(means, covs, channel), channel, fuse, rounds)
-
-
-def _checked(means: ArrayLike, covs: ArrayLike, channel: Channel) -> tuple[Array, Array]:
+def _checked(belief: Belief, channel: Channel) -> tuple[Array, Array]:
     instance(channel, "channel", Channel)
-    m = array(means, "means", (*channel.runs, channel.graph.size, "d"))
-    return m, covariance(array(covs, "covs", (*m.shape, m.shape[-1])), "covs")
+    if not isinstance(belief, tuple | list) or len(belief) != 2:
+        raise ValueError(f"belief: needs a pair (means, covs), got {type(belief).__name__}")
+    m = array(belief[0], "belief", (*channel.runs, channel.graph.size, "d"))
+    return m, covariance(array(belief[1], "belief", (*m.shape, m.shape[-1])), "belief")
 
 
 def _information_sum(heard: Heard, own: Array, links: Array) -> tuple[Array, Array]:

@@ -421,7 +421,7 @@ def test_bad_start_and_bad_agreement(family: str) -> None:
     with pytest.raises(ValueError, match="runs"):
         f.start(PRIOR, rng=np.random.default_rng(0), runs=(0,))
     if family.startswith("gaussian"):
-        wrong = lambda means, covs, channel: (means[:1], covs)  # noqa: E731
+        wrong = lambda belief, channel: (belief[0][:1], belief[1])  # noqa: E731
     else:
         wrong = lambda ensembles, channel: ensembles[:1]  # noqa: E731
     g, start = made(family, agents=2, agreement=wrong)

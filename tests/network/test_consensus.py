@@ -266,3 +266,14 @@ def test_maximum_of_many_agents_looks_for_no_diameter() -> None:
     channel = Channel(graph)
     assert (maximum(values, channel) == values.max()).all()
     assert "diameter" not in vars(graph) and 108 <= channel.ledger.rounds <= 2 * 108
+
+
+def test_a_rule_says_what_it_fuses_with_and_without_its_door() -> None:
+    from functools import partial
+
+    from distfilt import network
+    from distfilt.doors import unchecked
+
+    assert network.fused_kind(partial(partial(network.pull, gain=0.1), rounds=2)) == "ensembles"
+    assert network.fused_kind(unchecked(network.naive_fusion)) == "gaussians"
+    assert network.fused_kind(lambda belief, channel: belief) is None

@@ -211,7 +211,7 @@ def others_with_every_option() -> None:
     means, covs = np.zeros((2, 2)), np.tile(np.eye(2), (2, 1, 1))
     matrix = np.array([[0.5, 0.5], [0.25, 0.75]])
     for given in (weights, matrix):
-        network.covariance_intersection(means, covs, channel, weights=given)
+        network.covariance_intersection((means, covs), channel, weights=given)
         network.intersection(members, channel, weights=given, scale=np.array([1.0, 2.0]))
     network.average(x, channel, weights=weights, rounds=2)
     network.barycentre(members, channel, scale=np.array([1.0, 2.0]))
