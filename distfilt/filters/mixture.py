@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import Array, array, choice, count, instance, number, same_length
 from ..mixtures import GaussianMixture, moved, split_stretched, two_stage
-from ..mixtures.gaussian import definite, trusted
+from ..mixtures.gaussian import trusted
 from ..mixtures.steps import _conditioned
 from ..mixtures.unscented import POINT_RULES
 from ..models import Model
@@ -269,5 +269,6 @@ class MixtureFilter(TeamFilter):
             fused: Any = self.agreement(belief, others) if others else belief
             if instance(fused, "agreement", GaussianMixture).dim != belief.dim:
                 raise ValueError(f"agreement: needs dimension {belief.dim}, got {fused.dim}")
-            out.append(definite(fused, "agreement"))
+            fused.factors  # a LinAlgError where the fusion has collapsed
+            out.append(fused)
         return out

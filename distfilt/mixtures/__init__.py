@@ -1,6 +1,7 @@
 """Gaussian mixtures: densities, fusion of a shared part of the state, reduction, divergences."""
 
 from . import unscented
+from .agreement import target_fusion
 from .arcs import arc
 from .collocation import nonnegative_least_squares, tikhonov
 from .divergence import (
@@ -30,5 +31,6 @@ __all__ = [  # fmt: skip
     "average", "conditioned", "cross_relevance", "fuse", "fuse_in_turn", "fuse_moments",
     "jeffreys_by_quadrature", "jeffreys_by_sampling", "jeffreys_of_many", "kept_by_relevance",
     "merge_costs", "moved", "nonnegative_least_squares", "pivoted_qr", "prune", "runnalls", "split",
-    "split_library", "split_stretched", "stretching", "tikhonov", "two_stage", "unscented",
+    "split_library", "split_stretched", "stretching", "target_fusion", "tikhonov", "two_stage",
+    "unscented",
 ]

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import logsumexp
 
-from ..checks import Array, array, count, covariance, generator, instance, places, weights
+from ..checks import array, count, generator, instance, places
+from ..doors import Array, Record, definite, summing_to_one
 from .quadratics import ExponentialQuadratics, inverse, log_sum
 
 __all__ = ["GaussianMixture"]
@@ -21,7 +23,7 @@ _CHUNK = 60_000
 
 
 @dataclass(frozen=True, eq=False)
-class GaussianMixture:
+class GaussianMixture(Record):
     r"""A weighted sum of Gaussian densities.
 
     .. math:: p(\mathbf x)=\sum_{\ell=1}^L w_\ell\,
@@ -53,21 +55,9 @@ class GaussianMixture:
     array([[2.]])
     """
 
-    weights: Array
-    means: Array
-    covs: Array
-
-    def __post_init__(self) -> None:
-        w = weights(self.weights, "weights")
-        if w.ndim != 1 or not w.size:
-            raise ValueError(f"weights: needs shape (L,) with L at least 1, got {w.shape}")
-        m = array(self.means, "means", (w.size, "d"))
-        if not m.shape[1]:
-            raise ValueError("means: needs at least one component, got none")
-        p = array(self.covs, "covs", (w.size, m.shape[1], m.shape[1]))
-        covariance(p, "covs")
-        for name, value in (("weights", w), ("means", m), ("covs", p)):
-            object.__setattr__(self, name, value)
+    weights: Annotated[Array, "L", summing_to_one]
+    means: Annotated[Array, "L d"]
+    covs: Annotated[Array, "L d d", definite]
 
     @classmethod
     def gaussian(cls, mean: ArrayLike, cov: ArrayLike) -> GaussianMixture:
@@ -105,7 +95,10 @@ class GaussianMixture:
     @cached_property
     def factors(self) -> Array:
         """Cholesky factors of the covariances, (L, d, d)."""
-        return np.asarray(np.linalg.cholesky(self.covs))
+        try:
+            return np.asarray(np.linalg.cholesky(self.covs))
+        except np.linalg.LinAlgError:
+            raise np.linalg.LinAlgError(_collapsed(self.covs)) from None
 
     @cached_property
     def log_peaks(self) -> Array:
@@ -334,23 +327,20 @@ class GaussianMixture:
         return cls(array(payload[0], "payload", (m.shape[0],)), m, covs)
 
 
-def trusted(weights: Array, means: Array, covs: Array) -> GaussianMixture:
-    """A mixture of arrays that are known to be right, without the checks."""
-    out = object.__new__(GaussianMixture)
-    for name, value in (("weights", weights), ("means", means), ("covs", covs)):
-        object.__setattr__(out, name, value)
-    return out
+trusted = GaussianMixture.unchecked
 
 
-def definite(mixture: GaussianMixture, name: str) -> GaussianMixture:
-    """The mixture, if all its covariances are positive definite."""
-    try:
-        mixture.factors  # noqa: B018
-    except np.linalg.LinAlgError:
-        raise np.linalg.LinAlgError(
-            f"{name}: needs positive definite covariances, got one that is not"
-        ) from None
-    return mixture
+def _collapsed(covs: Array) -> str:
+    """Which mixand has no square root, and what that comes from."""
+    std = np.sqrt(np.abs(np.diagonal(covs, axis1=-2, axis2=-1)))
+    unit = np.where(std > 0, std, 1.0)
+    least = np.linalg.eigvalsh(covs / (unit[:, :, None] * unit[:, None, :]))
+    worst = int(least[:, 0].argmin())
+    return (
+        f"mixand {worst} of {len(covs)} has a covariance that is not positive definite (smallest "
+        f"eigenvalue {least[worst, 0]:.3g} in units of its variances): a belief collapses where "
+        "information is counted more than once, as by fusing beliefs as if they were independent"
+    )
 
 
 def symmetric(covs: Array) -> Array:
