@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf
 
+from .linalg import SolverError
+
 __all__ = [  # fmt: skip
     "Array", "SolverError", "array", "callable_", "choice", "count", "covariance", "flags",
     "generator", "increasing", "instance", "needed", "nonblank", "number", "places", "same_length",
@@ -25,11 +27,6 @@ __all__ = [  # fmt: skip
 
 Array = NDArray[np.float64]
 _T = TypeVar("_T")
-
-
-class SolverError(RuntimeError):
-    """A solver stopped without a solution; the message names it, its status and the problem."""
-
 
 _ROUNDING = 1e-9
 """Largest asymmetry and negative eigenvalue, in units of the variances, that count as rounding."""

@@ -1,32 +1,45 @@
-"""Ensembles: arrays (..., N, d) whose rows are members, their moments and how to draw them.
-
-Names with an underscore are the same without checks, for loops of this package.
-"""
+"""Ensembles: arrays (..., N, d) whose rows are members, their moments and how to draw them."""
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Annotated
+
 import numpy as np
-from numpy.typing import ArrayLike
 
-from .checks import Array, array, count, generator
-from .linalg import _EPS, _cholesky, _leading, _solve_upper, _symmetrise, factor
+from .doors import Array, Count, Rng, Semidefinite, door, unchecked
+from .linalg import EPS, cholesky, factor, leading, solve_upper, symmetrise
 
-__all__ = ["anomalies", "cross_covariance", "draw", "exact_noise", "mean", "sample_covariance"]
+__all__ = [  # fmt: skip
+    "Ensemble",
+    "Members",
+    "anomalies",
+    "cross_covariance",
+    "draw",
+    "exact_noise",
+    "mean",
+    "sample_covariance",
+]
+
+
+def _at_least(members: int, value: Array, name: str) -> None:
+    if value.shape[-2] < members:
+        raise ValueError(f"{name}: needs at least {members} members, got {value.shape[-2]}")
+
+
+Members = Annotated[Array, "... N d", partial(_at_least, 1)]
+"""The kind of what has members."""
+Ensemble = Annotated[Array, "... N d", partial(_at_least, 2)]
+"""The kind of what has a sample covariance."""
 
 _CLOSE = 1e-6
 """The share of a unit column beside others below which singular values say if it is one more."""
 
 
-def _ensemble(value: ArrayLike, name: str, members: int = 1) -> Array:
-    out = array(value, name, (..., "N", "d"))
-    if out.shape[-2] < members:
-        raise ValueError(f"{name}: needs at least {members} members, got {out.shape[-2]}")
-    return out
-
-
+@door
 def draw(
-    mean: ArrayLike, cov: ArrayLike, members: int, *, rng: np.random.Generator,
-    leading: tuple[int, ...] = (),
+    mean: Annotated[Array, "d"], cov: Annotated[Semidefinite, "d d"], members: Count, *, rng: Rng,
+    leading: tuple[Count, ...] = ()
 ) -> Array:
     """Draw ensembles (*leading, N, d) from a Gaussian.
 
@@ -48,76 +61,60 @@ def draw(
     >>> draw([0.0, 0.0], np.eye(2), 5, rng=np.random.default_rng(0), leading=(3,)).shape
     (3, 5, 2)
     """
-    centre = array(mean, "mean", ("d",))
-    root = factor(array(cov, "cov", (centre.size, centre.size)))
-    if not np.iterable(leading):
-        raise ValueError(f"leading: needs a tuple of integers, got {leading!r}")
-    size = (*(count(n, "leading") for n in leading), count(members, "members"), centre.size)
-    return centre + generator(rng).standard_normal(size) @ root.T
+    root = unchecked(factor)(cov)
+    return mean + rng.standard_normal((*leading, members, mean.size)) @ root.T
 
 
-def mean(ensemble: ArrayLike) -> Array:
+@door
+def mean(ensemble: Members) -> Array:
     """Mean over the members, (..., d).
 
     >>> mean([[1.0, 2.0], [3.0, 4.0]])
     array([2., 3.])
     """
-    return _mean(_ensemble(ensemble, "ensemble"))
-
-
-def _mean(e: Array) -> Array:
     # A product with equal weights: ten times faster than a reduction over a short inner axis.
-    return np.asarray(np.full(e.shape[-2], 1 / e.shape[-2]) @ e)
+    return np.asarray(np.full(ensemble.shape[-2], 1 / ensemble.shape[-2]) @ ensemble)
 
 
-def anomalies(ensemble: ArrayLike) -> Array:
+@door
+def anomalies(ensemble: Members) -> Array:
     """Members minus their mean, (..., N, d).
 
     >>> anomalies([[1.0], [3.0]])
     array([[-1.],
            [ 1.]])
     """
-    return _anomalies(_ensemble(ensemble, "ensemble"))
+    return np.asarray(ensemble - unchecked(mean)(ensemble)[..., None, :])
 
 
-def _anomalies(e: Array) -> Array:
-    return np.asarray(e - _mean(e)[..., None, :])
-
-
-def sample_covariance(ensemble: ArrayLike) -> Array:
+@door
+def sample_covariance(ensemble: Ensemble) -> Array:
     """Sample covariance with N - 1 in the denominator, (..., d, d).
 
     >>> sample_covariance([[0.0, 0.0], [2.0, 4.0]])
     array([[2., 4.],
            [4., 8.]])
     """
-    return _sample_covariance(_ensemble(ensemble, "ensemble", 2))
+    a = unchecked(anomalies)(ensemble)
+    return symmetrise(a.swapaxes(-1, -2) @ a / (a.shape[-2] - 1))
 
 
-def _sample_covariance(e: Array) -> Array:
-    a = _anomalies(e)
-    return _symmetrise(a.swapaxes(-1, -2) @ a / (a.shape[-2] - 1))
-
-
-def cross_covariance(ensemble: ArrayLike, other: ArrayLike) -> Array:
+@door
+def cross_covariance(ensemble: Ensemble, other: Annotated[Array, "... N m"]) -> Array:
     """Sample covariance between two ensembles of the same members, (..., d, m).
 
     >>> cross_covariance([[0.0], [2.0]], [[1.0], [5.0]])
     array([[4.]])
     """
-    a, b = _ensemble(ensemble, "ensemble", 2), _ensemble(other, "other", 2)
-    if a.shape[-2] != b.shape[-2]:
-        raise ValueError(f"other: needs {a.shape[-2]} members like ensemble, got {b.shape[-2]}")
-    _leading(a.shape[:-2], b.shape[:-2], "other")
-    return _cross_covariance(a, b)
+    leading(ensemble.shape[:-2], other.shape[:-2], "other")
+    a, b = unchecked(anomalies)(ensemble), unchecked(anomalies)(other)
+    return np.asarray(a.swapaxes(-1, -2) @ b / (a.shape[-2] - 1))
 
 
-def _cross_covariance(a: Array, b: Array) -> Array:
-    return np.asarray(_anomalies(a).swapaxes(-1, -2) @ _anomalies(b) / (a.shape[-2] - 1))
-
-
+@door
 def exact_noise(
-    anomalies_to_avoid: ArrayLike, cov: ArrayLike, *, rng: np.random.Generator
+    anomalies_to_avoid: Annotated[Array, "... N P", partial(_at_least, 2)], cov: Semidefinite, *,
+    rng: Rng
 ) -> Array:
     r"""Draw noise (..., N, k) whose sample moments are exact: second-order exact draws.
 
@@ -159,22 +156,14 @@ def exact_noise(
     >>> bool((abs(cross_covariance(x, noise)) < 1e-12).all())
     True
     """
-    a = array(anomalies_to_avoid, "anomalies_to_avoid", (..., "N", "p"))
-    if a.shape[-2] < 2:
-        raise ValueError(f"anomalies_to_avoid: needs at least 2 members, got {a.shape[-2]}")
-    root = factor(cov)
-    _leading(a.shape[:-2], root.shape[:-2], "cov")
-    return _exact_noise(a, root, generator(rng))
-
-
-def _exact_noise(avoid: Array, root: Array, rng: np.random.Generator) -> Array:
-    """As the public one, with a lower factor of the covariance; it too needs enough members."""
+    leading(anomalies_to_avoid.shape[:-2], cov.shape[:-2], "cov")
+    avoid, root = anomalies_to_avoid, unchecked(factor)(cov)
     n = avoid.shape[-2]
     if n <= avoid.shape[-1] + root.shape[-1]:
         root = _narrow(root)
     rank = root.shape[-1]
-    leading = np.broadcast_shapes(avoid.shape[:-2], root.shape[:-2])
-    drawn = _projected(rng.standard_normal((*leading, n, rank)), avoid)
+    shape = np.broadcast_shapes(avoid.shape[:-2], root.shape[:-2])
+    drawn = _projected(rng.standard_normal((*shape, n, rank)), avoid)
     return _coloured(drawn, root)
 
 
@@ -183,7 +172,7 @@ def _narrow(root: Array) -> Array:
     std = np.sqrt((root**2).sum(axis=-1))
     unit = np.where(std > 0, std, 1.0)[..., None]
     u, s, _ = np.linalg.svd(root / unit)
-    kept = s**2 > 64 * s.shape[-1] * _EPS * s.max(axis=-1, initial=0.0, keepdims=True) ** 2
+    kept = s**2 > 64 * s.shape[-1] * EPS * s.max(axis=-1, initial=0.0, keepdims=True) ** 2
     width = int(kept.sum(axis=-1).max(initial=0))
     narrow = (u * (s * kept)[..., None, :])[..., :width]
     # Triangular again, which leaves no signs or rotations to the machine.
@@ -195,7 +184,7 @@ def _narrow(root: Array) -> Array:
 def _projected(drawn: Array, avoid: Array) -> Array:
     """What is left of a draw without the constant and the anomalies."""
     n = avoid.shape[-2]
-    centred = _anomalies(avoid)
+    centred = unchecked(anomalies)(avoid)
     size = np.sqrt((centred**2).sum(axis=-2, keepdims=True))
     unit = centred / np.where(size > 0, size, 1.0)
     constant = np.full((*unit.shape[:-1], 1), n**-0.5)
@@ -214,7 +203,7 @@ def _projected(drawn: Array, avoid: Array) -> Array:
 
 def _frame(columns: Array) -> tuple[Array, int]:
     """Orthonormal columns, or zeros, that span unit columns (..., n, p), and the largest rank."""
-    tiny = columns.shape[-2] * _EPS
+    tiny = columns.shape[-2] * EPS
     q, r = np.linalg.qr(columns)
     # Columns that repeat earlier ones, as linear predictions do, leave rows of zeros at the end.
     good = np.abs(r).max(axis=-1) > tiny
@@ -233,7 +222,7 @@ def _coloured(drawn: Array, root: Array) -> Array:
     n = drawn.shape[-2]
     lower = _steady(np.ascontiguousarray(drawn.swapaxes(-1, -2)) @ drawn / (n - 1), 0.1)
     if lower is not None:
-        return np.asarray(drawn @ _solve_upper(lower, root.swapaxes(-1, -2)))
+        return np.asarray(drawn @ solve_upper(lower, root.swapaxes(-1, -2)))
     q, r = np.linalg.qr(drawn)
     # A positive diagonal makes the frame that of whitening, whatever signs LAPACK prefers.
     sign = np.where(np.diagonal(r, axis1=-2, axis2=-1) < 0, -1.0, 1.0)[..., None, :]
@@ -243,8 +232,12 @@ def _coloured(drawn: Array, root: Array) -> Array:
 def _steady(gram: Array, least: float) -> Array | None:
     """The Cholesky factor, unless a pivot is so small that solving with it would lose digits."""
     try:
-        lower = _cholesky(gram)
+        lower = cholesky(gram)
     except np.linalg.LinAlgError:
         return None
     small = np.diagonal(lower, axis1=-2, axis2=-1).min(initial=1.0) < np.sqrt(least)
     return None if small else lower
+
+
+_mean, _anomalies = unchecked(mean), unchecked(anomalies)
+_sample_covariance, _cross_covariance = unchecked(sample_covariance), unchecked(cross_covariance)

@@ -9,7 +9,7 @@ import pytest
 
 from distfilt import models, sensors
 from distfilt.coupling import accepted, norm, sorted_plan
-from distfilt.differences import central
+from distfilt.linalg import central
 from distfilt.ensembles import draw, exact_noise
 from distfilt.kalman import kalman_filter
 from distfilt.metrics import crps, ensemble_nees, nees_band

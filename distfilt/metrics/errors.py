@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .. import ensembles
 from ..checks import Array, array
 from ..linalg import _leading
 
@@ -15,7 +14,9 @@ __all__ = ["rmse", "spread", "squared_error"]
 
 
 def _ensemble(value: ArrayLike, members: int = 1) -> Array:
-    out = ensembles._ensemble(value, "ensemble", members)
+    out = array(value, "ensemble", (..., "N", "d"))
+    if out.shape[-2] < members:
+        raise ValueError(f"ensemble: needs at least {members} members, got {out.shape[-2]}")
     if out.shape[-1] < 1:
         raise ValueError(f"ensemble: needs at least one component, got shape {out.shape}")
     return out

@@ -4,30 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache, partial
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..checks import (
+from ..batches import batched
+from ..doors import (
     Array,
+    Count,
+    NonNegative,
+    Record,
+    Rng,
+    Times,
     array,
-    callable_,
-    count,
-    covariance,
-    generator,
-    increasing,
-    instance,
-    number,
+    door,
+    semidefinite,
+    unchecked,
 )
-from ..differences import _central
-from ..linalg import factor
+from ..linalg import central, factor
 
 __all__ = ["LinearModel", "Model", "simulate"]
 
 
-@dataclass(frozen=True)
-class Model:
+@dataclass(frozen=True, eq=False)
+class Model(Record):
     """A stochastic model of motion, x(t + dt) = f(x(t), t, dt) + w, w ~ N(0, Q(t, dt)).
 
     Parameters
@@ -36,7 +37,8 @@ class Model:
         Size d of the state.
     flow : callable
         ``flow(x, t, dt) -> x`` on arrays (..., d), without noise; times in s. It gets a copy of
-        the states, which it may change.
+        the states, which it may change. One that takes a single state only is refused when it
+        first gets several.
     noise_cov : callable
         ``noise_cov(t, dt) -> Q``, (d, d), positive semidefinite.
     derivative : callable, optional
@@ -54,7 +56,7 @@ class Model:
     array([[0.5]])
     """
 
-    dim: int
+    dim: Count
     flow: Callable[[Array, float, float], Array]
     noise_cov: Callable[[float, float], Array]
     derivative: Callable[[Array, float, float], Array] | None = field(default=None, kw_only=True)
@@ -62,86 +64,84 @@ class Model:
     units: tuple[str, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
-        count(self.dim, "dim")
-        callable_(self.flow, "flow")
-        callable_(self.noise_cov, "noise_cov")
-        if self.derivative is not None:
-            callable_(self.derivative, "derivative")
+        super().__post_init__()
         for name, labels in (("names", self.names), ("units", self.units)):
-            if not isinstance(labels, tuple) or not all(isinstance(v, str) for v in labels):
-                raise ValueError(f"{name}: needs a tuple of words, got {labels!r}")
             if labels and len(labels) != self.dim:
                 raise ValueError(f"{name}: needs {self.dim} entries, got {len(labels)}")
 
-    def step(self, x: ArrayLike, t: float, dt: float) -> Array:
+    @cached_property
+    def _compared(self) -> dict[str, bool]:
+        """Which functions are known to take many states."""
+        return {}
+
+    @door
+    def step(self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegative) -> Array:
         """Move states (..., d) from `t` to `t` + `dt`, without noise."""
-        state = array(x, "x", (..., self.dim))
-        return self._step(state, number(t, "t"), number(dt, "dt", at_least=0))
+        return batched(self.flow, "flow", (x,), self.dim, self._compared, t, dt)
 
-    def _step(self, state: Array, t: float, dt: float) -> Array:
-        """`step` of checked arguments. The copy is for flows that work in place."""
-        moved = np.asarray(self.flow(state.copy(), t, dt))
-        if moved.shape != state.shape:
-            raise ValueError(
-                f"flow: needs to return the shape of the states it gets, many at once, "
-                f"{state.shape}, got {moved.shape}"
-            )
-        return moved
+    @door
+    def noise(self, t: float, dt: NonNegative) -> Array:
+        """Covariance of the noise that a step from `t` to `t` + `dt` adds, (d, d), read-only."""
+        return self._noise(t, dt)[0]
 
-    def noise(self, t: float, dt: float) -> Array:
-        """Covariance of the noise that a step from `t` to `t` + `dt` adds, (d, d)."""
-        q = self.noise_cov(number(t, "t"), number(dt, "dt", at_least=0))
-        q = covariance(q, "noise_cov", self.dim, semidefinite=True)
-        return array(q, "noise_cov", (self.dim, self.dim)).copy()
+    @door
+    def root(self, t: float, dt: NonNegative) -> Array:
+        """A factor of the noise's covariance, (d, d), read-only."""
+        return self._noise(t, dt)[1]
 
-    def sample_step(self, x: ArrayLike, t: float, dt: float, *, rng: np.random.Generator) -> Array:
+    def _noise(self, t: float, dt: float) -> tuple[Array, Array]:
+        q = array(self.noise_cov(t, dt), "noise_cov", (self.dim, self.dim))
+        return _with_factor(q.tobytes(), self.dim)
+
+    @door
+    def sample_step(
+        self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegative, *, rng: Rng
+    ) -> Array:
         """Move states (..., d) from `t` to `t` + `dt` and add a draw of the noise to each."""
-        state = array(x, "x", (..., self.dim))
-        now, length = number(t, "t"), number(dt, "dt", at_least=0)
-        return self._sample_step(state, now, length, generator(rng))
-
-    def _sample_step(self, state: Array, t: float, dt: float, rng: np.random.Generator) -> Array:
-        """`sample_step` of checked arguments."""
-        moved = self._step(state, t, dt)
-        noise = rng.standard_normal(moved.shape) @ self._root(t, dt).T
+        moved = unchecked(self.step)(x, t, dt)
+        noise = rng.standard_normal(moved.shape) @ unchecked(self.root)(t, dt).T
         noise += moved
         return noise
 
-    def _root(self, t: float, dt: float) -> Array:
-        """A factor of the noise's covariance, (d, d)."""
-        q = array(self.noise_cov(t, dt), "noise_cov", (self.dim, self.dim))
-        return _factor_of(q.tobytes(), self.dim)
-
-    def jacobian(self, x: ArrayLike, t: float, dt: float) -> Array:
+    @door
+    def jacobian(self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegative) -> Array:
         """Derivative of a step from states (..., d), as (..., d, d).
 
         `derivative` where the model has it, central differences of `flow` otherwise.
         """
-        state = array(x, "x", (..., self.dim))
-        slope = self._jacobian(state, number(t, "t"), number(dt, "dt", at_least=0))
-        return np.broadcast_to(slope, (*state.shape, self.dim)).copy()
-
-    def _jacobian(self, state: Array, t: float, dt: float) -> Array:
-        """`jacobian` of checked arguments; (d, d) where it is the same for all states."""
         if self.derivative is None:
-            return _central(lambda x: self._step(x, t, dt), state, np.subtract)
-        slope = np.asarray(self.derivative(state.copy(), t, dt))
-        if slope.shape not in ((*state.shape, self.dim), (self.dim, self.dim)):
+            return central(lambda state: unchecked(self.step)(state, t, dt), x)
+        slope = np.asarray(self.derivative(x.copy(), t, dt))
+        if slope.shape not in ((*x.shape, self.dim), (self.dim, self.dim)):
             raise ValueError(
-                f"derivative: needs to return shape {(*state.shape, self.dim)}, got {slope.shape}"
+                f"derivative: needs to return shape {(*x.shape, self.dim)}, got {slope.shape}"
             )
-        return slope
+        return np.broadcast_to(slope, (*x.shape, self.dim))
+
+    def _step(self, x: Array, t: float, dt: float) -> Array:
+        return unchecked(self.step)(x, t, dt)
+
+    def _sample_step(self, x: Array, t: float, dt: float, rng: np.random.Generator) -> Array:
+        return unchecked(self.sample_step)(x, t, dt, rng=rng)
+
+    def _root(self, t: float, dt: float) -> Array:
+        return unchecked(self.root)(t, dt)
+
+    def _jacobian(self, x: Array, t: float, dt: float) -> Array:
+        return unchecked(self.jacobian)(x, t, dt)
 
 
 @lru_cache(maxsize=64)
-def _factor_of(data: bytes, dim: int) -> Array:
-    """The factor of a covariance; the same few come in every step of a run."""
-    root = factor(np.frombuffer(data).reshape(dim, dim), name="noise_cov")
+def _with_factor(data: bytes, dim: int) -> tuple[Array, Array]:
+    """A covariance and its factor; the same few come in every step of a run."""
+    cov = np.frombuffer(data).reshape(dim, dim)
+    semidefinite(cov, "noise_cov")
+    root = unchecked(factor)(cov)
     root.setflags(write=False)
-    return root
+    return cov, root
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LinearModel(Model):
     """A model whose step is a matrix: x(t + dt) = Φ(dt) x(t) + w.
 
@@ -161,40 +161,46 @@ class LinearModel(Model):
 
     transition_matrix: Callable[[float], Array] = field(kw_only=True)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        callable_(self.transition_matrix, "transition_matrix")
-
     @classmethod
     def from_transition(
         cls, dim: int, transition_matrix: Callable[[float], Array],
         noise_cov: Callable[[float, float], Array], *, names: tuple[str, ...] = (),
-        units: tuple[str, ...] = (),
+        units: tuple[str, ...] = ()
     ) -> LinearModel:
         """Build the model from its transition matrix, ``transition_matrix(dt) -> (d, d)``."""
-        callable_(transition_matrix, "transition_matrix")
-
-        def flow(x: Array, t: float, dt: float) -> Array:
-            phi = array(transition_matrix(dt), "transition_matrix", (dim, dim))
-            return x @ phi.T
-
+        flow = partial(_product, transition_matrix, dim)
         return cls(
             dim, flow, noise_cov, names=names, units=units, transition_matrix=transition_matrix
         )
 
-    def transition(self, dt: float) -> Array:
+    @door
+    def transition(self, dt: NonNegative) -> Array:
         """The matrix Φ of a step of `dt` seconds, (d, d)."""
-        return self._transition(number(dt, "dt", at_least=0)).copy()
+        return _matrix(self.transition_matrix, self.dim, dt)
+
+    @door
+    def jacobian(self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegative) -> Array:
+        """Derivative of a step, the same matrix for all states, as (..., d, d)."""
+        return np.broadcast_to(unchecked(self.transition)(dt), (*x.shape, self.dim))
 
     def _transition(self, dt: float) -> Array:
-        return array(self.transition_matrix(dt), "transition_matrix", (self.dim, self.dim))
-
-    def _jacobian(self, state: Array, t: float, dt: float) -> Array:
-        return self._transition(dt)
+        return unchecked(self.transition)(dt)
 
 
+def _matrix(transition_matrix: Callable[[float], Array], dim: int, dt: float) -> Array:
+    return array(transition_matrix(dt), "transition_matrix", (dim, dim))
+
+
+def _product(
+    transition_matrix: Callable[[float], Array], dim: int, x: Array, t: float, dt: float
+) -> Array:
+    """The flow of a linear model."""
+    return np.asarray(x @ _matrix(transition_matrix, dim, dt).T)
+
+
+@door
 def simulate(
-    model: Model, x0: ArrayLike, times: ArrayLike, *, rng: np.random.Generator, t0: float = 0.0
+    model: Model, x0: Annotated[Array, "... model.dim"], times: Times, *, rng: Rng, t0: float = 0.0
 ) -> Array:
     """Draw trajectories of a model at the given times.
 
@@ -222,15 +228,10 @@ def simulate(
     >>> simulate(walk, [0.0], [1.0, 2.0], rng=np.random.default_rng(1)).shape
     (2, 1)
     """
-    instance(model, "model", Model)
-    state = array(x0, "x0", (..., model.dim))
-    grid = increasing(times, "times")
-    now = number(t0, "t0")
-    if grid.size and grid[0] <= now:
-        raise ValueError(f"times: needs times after t0 = {now:g}, got {grid[0]:g}")
-    generator(rng)
-    path = np.empty((grid.size, *state.shape))
-    for k, t in enumerate(grid):
-        state = path[k] = model._sample_step(state, now, float(t) - now, rng)
-        now = float(t)
+    if times.size and times[0] <= t0:
+        raise ValueError(f"times: needs times after t0 = {t0:g}, got {times[0]:g}")
+    path, state, now = np.empty((times.size, *x0.shape)), x0, t0
+    for k, t in enumerate(times.tolist()):
+        state = path[k] = unchecked(model.sample_step)(state, now, t - now, rng=rng)
+        now = t
     return path

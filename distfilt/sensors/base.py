@@ -10,24 +10,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..checks import Array, array, callable_, count, covariance, generator, instance, number
-from ..differences import _central
-from ..linalg import _leading, factor
+from ..batches import batched
+from ..doors import MISSING, Array, Count, Cov, Positive, Record, Rng, array, door, unchecked
+from ..linalg import central, factor, leading
 
 __all__ = ["Sensor", "wrap"]
 
 
-def wrap(angles: ArrayLike, *, period: float = 2 * np.pi) -> Array:
+@door
+def wrap(angles: Annotated[Array, "...", MISSING], *, period: Positive = 2 * np.pi) -> Array:
     """Bring angles into [-period/2, period/2).
 
     Parameters
     ----------
     angles : array_like, (...)
-        Angles, in rad. One that lies there already is returned as it is.
+        Angles, in rad. One that lies there already is returned as it is, and so is NaN (missing).
     period : float
         2π for directions; π for the angle of a line, which `arctan(b/a)` measures.
 
@@ -36,19 +38,15 @@ def wrap(angles: ArrayLike, *, period: float = 2 * np.pi) -> Array:
     >>> float(wrap(3 * np.pi / 2).round(6))
     -1.570796
     """
-    return _wrapped(array(angles, "angles"), number(period, "period", above=0))
-
-
-def _wrapped(a: Array, period: float) -> Array:
     half = 0.5 * period
-    moved = (a + half) % period - half
+    moved = (angles + half) % period - half
     # Rounding can put an angle just below -half at +half, which stands for the same direction.
     moved = np.where(moved >= half, -half, moved)
-    return np.asarray(np.where((a >= -half) & (a < half), a, moved))
+    return np.asarray(np.where((angles >= -half) & (angles < half), angles, moved))
 
 
 @dataclass(frozen=True, eq=False)
-class Sensor:
+class Sensor(Record):
     """A sensor y = h(x) + ζ, ζ ~ N(0, R), possibly of two successive states.
 
     Parameters
@@ -58,7 +56,7 @@ class Sensor:
     function : callable
         ``function(x) -> y`` on (..., d) to (..., m), without noise; with `uses_previous`,
         ``function(x, previous) -> y``. It gets copies of the states. NaN where the state cannot be
-        seen.
+        seen. One that takes a single state only is refused when it first gets several.
     cov : array_like, (m, m)
         The covariance R, positive definite.
     difference : callable, optional
@@ -82,9 +80,9 @@ class Sensor:
     array([3.])
     """
 
-    dim: int
+    dim: Count
     function: Callable[..., Array]
-    cov: Array
+    cov: Annotated[Cov, "dim dim"]
     difference: Callable[[Array, Array], Array] | None = field(default=None, kw_only=True)
     uses_previous: bool = field(default=False, kw_only=True)
     kind: str = field(default="sensor", kw_only=True)
@@ -93,162 +91,112 @@ class Sensor:
     units: tuple[str, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
-        count(self.dim, "dim")
-        callable_(self.function, "function")
-        instance(self.uses_previous, "uses_previous", bool)
-        instance(self.kind, "kind", str)
-        for name in ("difference", "linear", "derivative"):
-            if getattr(self, name) is not None:
-                callable_(getattr(self, name), name)
-        if not isinstance(self.units, tuple) or len(self.units) not in (0, self.dim):
-            raise ValueError(f"units: needs a tuple of {self.dim} words, got {self.units!r}")
-        cov = array(covariance(self.cov, "cov", self.dim), "cov", (self.dim, self.dim)).copy()
-        cov.setflags(write=False)
-        object.__setattr__(self, "cov", cov)
+        super().__post_init__()
+        if len(self.units) not in (0, self.dim):
+            raise ValueError(f"units: needs {self.dim} entries, got {len(self.units)}")
 
-    def predict(self, x: ArrayLike, previous: ArrayLike | None = None) -> Array:
+    @cached_property
+    def _compared(self) -> dict[str, bool]:
+        """Which functions are known to take many states."""
+        return {}
+
+    @cached_property
+    def root(self) -> Array:
+        """A factor of R, (m, m)."""
+        return unchecked(factor)(self.cov)
+
+    @door
+    def predict(
+        self, x: Annotated[Array, "... d"], previous: Annotated[Array, "... d"] | None = None
+    ) -> Array:
         """The observation without noise of states (..., d), as (..., m).
 
         `previous` holds the states at the previous observation time; only a sensor that sees
         changes needs it.
         """
-        return self._seen(*self._states(x, previous))
+        return batched(
+            self.function, "function", self._states(x, previous), self.dim, self._compared
+        )
 
-    def _seen(self, *states: Array) -> Array:
-        """`predict` of checked arguments; it tells a function that takes only one state."""
-        try:
-            seen = self._predict(*states)
-        except (TypeError, ValueError, IndexError) as error:
-            self._refuse_unbatched(states, error)
-            if isinstance(error, IndexError):
-                raise ValueError(f"x: needs more components, got {states[0].shape}") from error
-            raise
-        if seen.size and states[0].ndim > 1 and states[0].shape[0] == self.dim:
-            # Here a function that takes components from the first axis returns the right shape.
-            alone = self._predict(*(s.reshape(-1, s.shape[-1])[-1] for s in states))
-            last = seen.reshape(-1, self.dim)[-1]
-            if not np.allclose(last, alone, rtol=1e-6, atol=1e-9, equal_nan=True):
-                raise ValueError(_UNBATCHED.format(states[0].shape, "other values than for one"))
-        return seen
-
-    def _refuse_unbatched(self, states: tuple[Array, ...], error: Exception) -> None:
-        """Say so, if the function takes one state but not many."""
-        if states[0].ndim < 2 or not states[0].size:
-            return
-        try:
-            self._predict(*(s.reshape(-1, s.shape[-1])[0] for s in states))
-        except (TypeError, ValueError, IndexError):
-            return
-        raise ValueError(_UNBATCHED.format(states[0].shape, error)) from error
-
-    def _states(self, x: ArrayLike, previous: ArrayLike | None) -> tuple[Array, ...]:
-        state = array(x, "x", (..., "d"))
+    def _states(self, x: Array, previous: Array | None) -> tuple[Array, ...]:
+        """What the function gets."""
         if not self.uses_previous:
-            if previous is not None:
-                array(previous, "previous", (..., state.shape[-1]))
-            return (state,)
+            return (x,)
         if previous is None:
             raise ValueError(f"previous: a {self.kind} sensor needs the previous states, got None")
-        before = array(previous, "previous", (..., state.shape[-1]))
-        _leading(state.shape[:-1], before.shape[:-1], "previous")
-        return tuple(np.broadcast_arrays(state, before))
+        if x.shape != previous.shape:
+            leading(x.shape[:-1], previous.shape[:-1], "previous")
+            x, previous = np.broadcast_arrays(x, previous)
+        return x, previous
 
-    def _predict(self, state: Array, previous: Array | None = None) -> Array:
-        """`predict` of checked arguments. The copies are for functions that work in place."""
-        seen = np.asarray(self.function(*self._copies(state, previous)), dtype=np.float64)
-        wanted = (*state.shape[:-1], self.dim)
-        if seen.shape != wanted:
-            raise ValueError(
-                f"function: needs to return shape {wanted} for states {state.shape}, "
-                f"got {seen.shape}"
-            )
-        return seen
-
-    def _copies(self, state: Array, previous: Array | None) -> tuple[Array, ...]:
-        if previous is None or not self.uses_previous:
-            return (state.copy(),)
-        return state.copy(), previous.copy()
-
+    @door
     def observe(
-        self, x: ArrayLike, *, rng: np.random.Generator, previous: ArrayLike | None = None
+        self, x: Annotated[Array, "... d"], *, rng: Rng,
+        previous: Annotated[Array, "... d"] | None = None
     ) -> Array:
         """A noisy observation of each of the states (..., d), as (..., m)."""
-        seen = self.predict(x, previous)
-        root = factor(self.cov, name="cov")
-        return seen + generator(rng).standard_normal(seen.shape) @ root.T
+        seen = unchecked(self.predict)(x, previous)
+        return seen + rng.standard_normal(seen.shape) @ self.root.T
 
-    def residual(self, observed: ArrayLike, predicted: ArrayLike) -> Array:
+    @door
+    def residual(
+        self, observed: Annotated[Array, "... self.dim", MISSING],
+        predicted: Annotated[Array, "... self.dim", MISSING]
+    ) -> Array:
         """How far observations are from predictions, (..., m), wrapped where the sensor wraps.
 
         NaN, a missing component or one that the sensor cannot see, stays NaN.
         """
-        y, p = (_readings(v, n, self.dim) for v, n in
-                ((observed, "observed"), (predicted, "predicted")))  # fmt: skip
-        try:
-            np.broadcast_shapes(y.shape, p.shape)
-        except ValueError:
-            raise ValueError(
-                f"predicted: needs a shape that goes with observed {y.shape}, got {p.shape}"
-            ) from None
-        return self._residual(y, p)
-
-    def _residual(self, y: Array, p: Array) -> Array:
-        """`residual` of checked arguments."""
         if self.difference is None:
-            return np.asarray(y - p)
-        gap = np.asarray(self.difference(y, p))
-        wanted = np.broadcast_shapes(y.shape, p.shape)
+            return np.asarray(observed - predicted)
+        wanted = leading(observed.shape, predicted.shape, "predicted")
+        gap = np.asarray(self.difference(observed, predicted))
         if gap.shape != wanted:
             raise ValueError(f"difference: needs to return shape {wanted}, got {gap.shape}")
         return gap
 
-    def matrix(self, dim: int) -> Array:
+    @door
+    def matrix(self, dim: Count) -> Array:
         """The matrix H, (m, `dim`), of a linear sensor."""
         if self.linear is None:
             raise ValueError(f"sensor: needs a linear sensor, got a {self.kind} sensor")
-        n = count(dim, "dim")
-        return array(self.linear(n), "linear", (self.dim, n))
+        return array(self.linear(dim), "linear", (self.dim, dim))
 
-    def jacobian(self, x: ArrayLike, previous: ArrayLike | None = None) -> Array:
+    @door
+    def jacobian(
+        self, x: Annotated[Array, "... d"], previous: Annotated[Array, "... d"] | None = None
+    ) -> Array:
         """Derivative of h in the present states (..., d), as (..., m, d).
 
         `derivative` where the sensor has it, central differences otherwise. NaN where the state
         cannot be seen.
         """
         states = self._states(x, previous)
-        slope = self._jacobian(*states)
-        return np.broadcast_to(slope, (*states[0].shape[:-1], *slope.shape[-2:])).copy()
-
-    def _jacobian(self, state: Array, previous: Array | None = None) -> Array:
-        """`jacobian` of checked arguments; (m, d) where it is the same for all states."""
+        d = x.shape[-1]
+        full = (*states[0].shape[:-1], self.dim, d)
         if self.linear is not None:
-            return self.matrix(state.shape[-1])
+            return np.broadcast_to(unchecked(self.matrix)(d), full)
         if self.derivative is None:
-            return self._differences(state, previous)
-        slope = np.asarray(self.derivative(*self._copies(state, previous)))
-        each = (self.dim, state.shape[-1])
-        if slope.shape not in ((*state.shape[:-1], *each), each):
-            wanted = (*state.shape[:-1], *each)
-            raise ValueError(f"derivative: needs to return shape {wanted}, got {slope.shape}")
-        return slope
+            return central(lambda moved: self._moved(moved, states[1:]), states[0], self._gap)
+        slope = np.asarray(self.derivative(*[s.copy() for s in states]))
+        if slope.shape not in (full, full[-2:]):
+            raise ValueError(f"derivative: needs to return shape {full}, got {slope.shape}")
+        return np.broadcast_to(slope, full)
 
-    def _differences(self, state: Array, previous: Array | None) -> Array:
-        def function(x: Array) -> Array:
-            if previous is None:
-                return self._predict(x)
-            return self._predict(x, np.broadcast_to(previous[..., None, :], x.shape))
+    def _moved(self, moved: Array, before: tuple[Array, ...]) -> Array:
+        """Predictions of states (..., k, d) that all have the same previous one."""
+        return unchecked(self.predict)(moved, *[b[..., None, :] for b in before])
 
-        return _central(function, state, self._residual)
+    def _gap(self, observed: Array, predicted: Array) -> Array:
+        return unchecked(self.residual)(observed, predicted)
 
+    def _seen(self, *states: Array) -> Array:
+        return unchecked(self.predict)(*states)
 
-_UNBATCHED = (
-    "function: needs to take many states at once, (..., d), with the components last "
-    "(x[..., 0], not x[0]); for states {} it gives {}"
-)
+    _predict = _seen
 
+    def _residual(self, observed: Array, predicted: Array) -> Array:
+        return unchecked(self.residual)(observed, predicted)
 
-def _readings(value: ArrayLike, name: str, dim: int) -> Array:
-    out = array(value, name, (..., dim), finite=False)
-    if np.isinf(out).any():
-        raise ValueError(f"{name}: needs finite numbers or NaN (missing), got infinity")
-    return out
+    def _jacobian(self, x: Array, previous: Array | None = None) -> Array:
+        return unchecked(self.jacobian)(x, previous)

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from functools import partial
+from typing import Literal
 
 import numpy as np
 
-from ..checks import Array, callable_, choice, count, number
+from ..doors import Array, Index, door, unchecked
 from .base import Sensor
-from .kinds import _variance, direct
+from .kinds import Deviation, _angular, diagonal, direct
 
 __all__ = ["ephemeris", "line_of_sight"]
 
 
+@door
 def line_of_sight(
-    *,
-    std: float,
-    form: str = "arctan2",
-    target: int = 0,
-    observer: int = 6,
-    hidden: Callable[[Array, Array], Array] | None = None,
+    *, std: Deviation, form: Literal["arctan2", "printed"] = "arctan2", target: Index = 0,
+    observer: Index = 6, hidden: Callable[[Array, Array], Array] | None = None
 ) -> Sensor:
     r"""The direction from one body to another, two angles in rad.
 
@@ -45,36 +43,39 @@ def line_of_sight(
     >>> eye.predict(x).round(4) + 0.0
     array([-2.3562,  0.    ])
     """
-    noise = _variance(std, 2)
-    choice(form, "form", ("arctan2", "printed"))
-    places = (count(target, "target", at_least=0), count(observer, "observer", at_least=0))
-    here, there = (slice(k, k + 3) for k in places)
+    here, there = slice(target, target + 3), slice(observer, observer + 3)
+    return Sensor.unchecked(
+        2, partial(_sight, form=form, here=here, there=there, hidden=hidden),
+        diagonal(_angular(std), std), units=("rad", "rad"),
+        difference=partial(_shorter_ways, turns=form == "arctan2")
+    )
+
+
+def _sight(
+    x: Array, form: str, here: slice, there: slice, hidden: Callable[[Array, Array], Array] | None
+) -> Array:
+    way = x[..., here] - x[..., there]
+    unit = way / np.linalg.norm(way, axis=-1, keepdims=True)
+    second = np.arcsin(np.clip(unit[..., 2], -1, 1))
+    if form == "printed":
+        first = np.arcsin(np.clip(unit[..., 1], -1, 1))
+    else:
+        first = np.arctan2(unit[..., 1], unit[..., 0])
+    out = np.stack([first, second], axis=-1)
     if hidden is not None:
-        callable_(hidden, "hidden")
-
-    def function(x: Array) -> Array:
-        way = x[..., here] - x[..., there]
-        unit = way / np.linalg.norm(way, axis=-1, keepdims=True)
-        second = np.arcsin(np.clip(unit[..., 2], -1, 1))
-        if form == "printed":
-            first = np.arcsin(np.clip(unit[..., 1], -1, 1))
-        else:
-            first = np.arctan2(unit[..., 1], unit[..., 0])
-        out = np.stack([first, second], axis=-1)
-        if hidden is not None:
-            out[np.asarray(hidden(x[..., here], x[..., there]))] = np.nan
-        return out
-
-    def difference(a: Array, b: Array) -> Array:
-        gap = a - b
-        if form == "arctan2":
-            gap[..., 0] = (gap[..., 0] + np.pi) % (2 * np.pi) - np.pi
-        return gap
-
-    return Sensor(2, function, noise, difference=difference, units=("rad", "rad"))
+        out[np.asarray(hidden(x[..., here], x[..., there]))] = np.nan
+    return out
 
 
-def ephemeris(*, position_std: float, velocity_std: float, start: int = 0) -> Sensor:
+def _shorter_ways(observed: Array, predicted: Array, turns: bool) -> Array:
+    gap = np.asarray(observed - predicted)
+    if turns:
+        gap[..., 0] = (gap[..., 0] + np.pi) % (2 * np.pi) - np.pi
+    return gap
+
+
+@door
+def ephemeris(*, position_std: Deviation, velocity_std: Deviation, start: Index = 0) -> Sensor:
     """A body's full state, read directly, in km and m/s.
 
     Parameters
@@ -89,8 +90,6 @@ def ephemeris(*, position_std: float, velocity_std: float, start: int = 0) -> Se
     >>> ephemeris(position_std=1e-3, velocity_std=1e-5).dim
     6
     """
-    stds = [number(position_std, "position_std", at_least=1e-150, at_most=1e150)] * 3
-    stds += [number(velocity_std, "velocity_std", at_least=1e-150, at_most=1e150)] * 3
-    first = count(start, "start", at_least=0)
-    exact = direct(range(first, first + 6), std=1.0)
-    return replace(exact, cov=np.diag(np.square(stds)), units=("km",) * 3 + ("m/s",) * 3)
+    read = unchecked(direct)(tuple(range(start, start + 6)), std=1.0)
+    cov = diagonal(*[position_std] * 3, *[velocity_std] * 3)
+    return read.changed(cov=cov, units=("km",) * 3 + ("m/s",) * 3)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from distfilt.differences import central
+from distfilt.linalg import central
 from distfilt.kalman import (
     Chart,
     extended_filter,

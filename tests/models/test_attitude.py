@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import distfilt.models as att
-from distfilt.differences import central
+from distfilt.linalg import central
 from distfilt.models import clohessy_wiltshire
 
 NAN = float("nan")

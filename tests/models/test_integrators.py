@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from distfilt.differences import central
+from distfilt.linalg import central
 from distfilt.models import rk4, rk4_jacobian
 
 NAN = float("nan")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from distfilt.differences import central
+from distfilt.linalg import central
 from distfilt.models import lorenz63, lorenz63_rate
 
 NAN = float("nan")

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from distfilt.differences import central
+from distfilt.linalg import central
 from distfilt.models import LinearModel, constant_velocity, coordinated_turn
 
 NAN = float("nan")

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from distfilt import sensors
-from distfilt.differences import central
+from distfilt.linalg import central
 from distfilt.sensors import (
     Sensor,
     angle,

@@ -49,7 +49,7 @@ def ellipse(
     """
     found = check_axes(ax)
     centre = array(mean, "mean", (2,))
-    root = factor(array(covariance, "covariance", (2, 2)), name="covariance")
+    root = factor(array(covariance, "covariance", (2, 2)))
     radius = np.sqrt(-2 * np.log1p(-number(level, "level", above=0, below=1)))
     turn = np.linspace(0, 2 * np.pi, 181)
     x, y = centre[:, None] + radius * root @ np.stack([np.cos(turn), np.sin(turn)])
