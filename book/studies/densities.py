@@ -76,9 +76,9 @@ def informed(basis: np.ndarray, positions: np.ndarray) -> Any:
     """
     cells, level = grid(), np.ones(grid().size)
     for _ in range(2):
-        state = density.shared_start(basis, np.ones((1, cells.size)))
+        state = density.low_rank_start(basis, np.ones((1, cells.size)))
         noise = np.maximum(level, CHOICES["floor"]) / (len(positions) * cells.volume)
-        state = density.shared_step(state, cells.histogram(positions), noise, 1.0)
+        state = density.low_rank_step(state, cells.histogram(positions), noise, 1.0)
         level = state.estimates[0]
     return state
 
@@ -102,7 +102,8 @@ def case(
     flat = np.exp(-0.5 * ((cells.centres - x[0]) ** 2).sum(axis=-1)
                   / CHOICES["local_prior_std"] ** 2)
     filters = beginning(basis, np.stack([y, y, y, cells.normalised(flat)]), x)
-    low = density.low_rank_start(y, basis[:, : CHOICES["low_rank"]])
+    few = basis[:, : CHOICES["low_rank"]]
+    low = density.low_rank_start(few, y[None])
     scale = dict(zip(READINGS, CHOICES["process_scale"], strict=True))[reading]
     floor, rows = CHOICES["floor"], []
     noise = np.full(filters.base.shape, np.inf)
@@ -112,15 +113,14 @@ def case(
         x = true.step(x, t, dt, rng=rng, substeps=CHOICES["substeps"])
         p = truth.step(p, t, dt)
         y = density.kernel_density(x, cells, bandwidth=h)
-        filters = density.shared_moved(filters, move)
+        filters = density.low_rank_moved(filters, move)
         noise[0] = k * np.maximum(filters.estimates[0], floor)
         noise[1] = k * np.maximum(y, floor)
-        filters = density.shared_step(filters, y, noise, dt)
+        filters = density.low_rank_step(filters, y, noise, dt)
         if phase:
-            low = density.low_rank_step(
-                low, move, y, k * np.maximum(move(low.mean), floor), dt,
-                process=scale * basis[:, : CHOICES["low_rank"]])
-        found = np.stack([y, *filters.estimates, low.mean])
+            low = density.low_rank_moved(low, move, process=scale * few, dt=dt)
+            low = density.low_rank_step(low, y, k * np.maximum(low.estimates, floor), dt)
+        found = np.stack([y, *filters.estimates, *low.estimates])
         rows.append(np.concatenate([cells.norm(found - p), scored(filters, p, j)]))
     names = (*EXACT, "process", "filter_nees", "bound_nees", "filter_crps", "bound_crps")
     return dict(zip(names, np.array(rows).T, strict=True))
@@ -128,8 +128,8 @@ def case(
 
 def beginning(basis: np.ndarray, base: np.ndarray, positions: np.ndarray) -> Any:
     """Filters that start from the rows of `base`, and the bound's, informed once, as the last."""
-    known, state = informed(basis, positions), density.shared_start(basis, base)
-    return density.Shared(
+    known, state = informed(basis, positions), density.low_rank_start(basis, base)
+    return density.LowRank(
         basis, np.concatenate([base, known.base]),
         np.concatenate([state.information, known.information]),
         np.concatenate([state.vector, known.vector]),

@@ -5,21 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from ..checks import Array, array, choice, count, increasing, instance, number
+from ..doors import Array, Count, NonNegative, Positive, Record, Times, door, unchecked
 from ..models.swarm import Swarm
 from .grid import Grid
 
 __all__ = ["FokkerPlanck", "bernoulli"]
 
 
-def bernoulli(z: ArrayLike) -> Array:
+@door
+def bernoulli(z: Annotated[Array, "..."]) -> Array:
     """The function z / (exp(z) - 1), 1 at 0: the weight of Scharfetter and Gummel's flux.
 
     Examples
@@ -27,10 +28,6 @@ def bernoulli(z: ArrayLike) -> Array:
     >>> bernoulli([-1.0, 0.0, 1.0]).round(6)
     array([1.581977, 1.      , 0.581977])
     """
-    return _bernoulli(array(z, "z"))
-
-
-def _bernoulli(z: Array) -> Array:
     small = np.abs(z) < 1e-4
     safe = np.where(small, 1.0, np.clip(z, -700.0, 700.0))
     return np.where(small, 1 - z / 2 + z**2 / 12, safe / np.expm1(safe))
@@ -48,23 +45,16 @@ class _Faces:
 
 
 def _faces(grid: Grid) -> _Faces:
-    number_ = np.arange(grid.size).reshape(grid.shape)
-    centres = grid.centres
-    points, left, right, axes = [], [], [], []
-    for k in range(grid.dim):
-        a = np.delete(number_, -1, axis=k).ravel()
-        b = np.delete(number_, 0, axis=k).ravel()
-        points.append(0.5 * (centres[a] + centres[b]))
-        left.append(a)
-        right.append(b)
-        axes.append(np.full(a.size, k))
-    axis = np.concatenate(axes)
-    return _Faces(np.concatenate(points), np.concatenate(left), np.concatenate(right), axis,
-                  grid.spacing[axis])
+    cells = np.arange(grid.size).reshape(grid.shape)
+    left = [np.delete(cells, -1, axis=k).ravel() for k in range(grid.dim)]
+    right = [np.delete(cells, 0, axis=k).ravel() for k in range(grid.dim)]
+    axis = np.repeat(np.arange(grid.dim), [len(cells) for cells in left])
+    a, b = np.concatenate(left), np.concatenate(right)
+    return _Faces(0.5 * (grid.centres[a] + grid.centres[b]), a, b, axis, grid.spacing[axis])
 
 
 @dataclass(frozen=True, eq=False)
-class FokkerPlanck:
+class FokkerPlanck(Record):
     r"""The density of a swarm's agents, as finite volumes with walls that nothing passes.
 
     Through the face between two cells goes Scharfetter and Gummel's flux, exact where drift and
@@ -108,14 +98,14 @@ class FokkerPlanck:
 
     swarm: Swarm
     grid: Grid
-    scheme: str = field(default="split", kw_only=True)
+    scheme: Literal["split", "backward_euler", "crank_nicolson"] = field(
+        default="split", kw_only=True)
 
     def __post_init__(self) -> None:
-        instance(self.swarm, "swarm", Swarm)
-        if not isinstance(self.grid, Grid) or not self.grid.same_box(self.swarm):
-            raise ValueError("grid: needs a Grid of the swarm's box, got "
-                             f"{getattr(self.grid, 'shape', self.grid)!r} of another")
-        choice(self.scheme, "scheme", ("split", "backward_euler", "crank_nicolson"))
+        super().__post_init__()
+        if not self.grid._same_box(self.swarm):
+            raise ValueError("grid: needs a grid of the swarm's box, got "
+                             f"{self.grid.shape!r} of another")
 
     @cached_property
     def _faces(self) -> _Faces:
@@ -131,9 +121,10 @@ class FokkerPlanck:
         pointers = np.concatenate([[0], np.cumsum(np.bincount(columns, minlength=n))])
         return pointers.astype(np.int32), rows[order].astype(np.int32), order
 
+    @door
     def rates(self, t: float) -> tuple[Array, Array]:
         """Rates at which mass crosses each face, forwards and backwards, in 1/s."""
-        f, t = self._faces, number(t, "t")
+        f = self._faces
         pick = np.arange(f.axis.size), f.axis
         drift = self.swarm.drift_at(f.points, t)[pick]
         between = self.swarm.diffusion_at(f.points, t)[pick]
@@ -144,33 +135,33 @@ class FokkerPlanck:
             at_left = at_right = between
         peclet = drift * f.width / between
         # B(-z) = z + B(z): one exponential serves both directions, without cancellation.
-        small = _bernoulli(np.abs(peclet))
+        small = unchecked(bernoulli)(np.abs(peclet))
         forwards = small + np.maximum(peclet, 0.0)
         backwards = small + np.maximum(-peclet, 0.0)
         return forwards * at_left / f.width**2, backwards * at_right / f.width**2
 
     def _assembled(self, t: float, scale: float, identity: float) -> sparse.csc_array:
         """identity I + scale A(t)."""
-        forwards, backwards = self.rates(t)
+        forwards, backwards = unchecked(self.rates)(t)
         n, f = self.grid.size, self._faces
         leaving = np.bincount(f.left, forwards, n) + np.bincount(f.right, backwards, n)
         data = np.concatenate([identity - scale * leaving, scale * forwards, scale * backwards])
         pointers, indices, order = self._pattern
         return sparse.csc_array((data[order], indices, pointers), (n, n))
 
+    @door
     def generator(self, t: float) -> sparse.csc_array:
         """The matrix A(t) of dp/dt = A p, (n, n), sparse."""
-        return self._assembled(number(t, "t"), 1.0, 0.0)
+        return self._assembled(t, 1.0, 0.0)
 
-    def step(self, values: ArrayLike, t: float, dt: float) -> Array:
+    @door
+    def step(self, values: Annotated[Array, "... self.grid.size"], t: float, dt: Positive) -> Array:
         """Densities (..., n), or any cell values, moved from `t` to `t` + `dt`."""
-        p = self.grid.check(values)
-        start, length = number(t, "t"), number(dt, "dt", above=0)
-        return self.solver(start, length)(p)
+        return unchecked(self.solver)(t, dt)(values)
 
-    def solver(self, t: float, dt: float) -> Callable[[Array], Array]:
+    @door
+    def solver(self, t: float, dt: NonNegative) -> Callable[[Array], Array]:
         """The step from `t` to `t` + `dt` as a function: one factorisation for any number."""
-        t, dt = number(t, "t"), number(dt, "dt", at_least=0)
         if self.scheme == "split":
             return self._split(t, dt)
         half = self.scheme == "crank_nicolson"
@@ -195,7 +186,7 @@ class FokkerPlanck:
 
         The tridiagonal elimination has no subtraction, so it keeps signs to the last bit.
         """
-        grid, rates = self.grid, self.rates(t + dt)
+        grid, rates = self.grid, unchecked(self.rates)(t + dt)
         factors = [self._eliminated(*(dt * self._across(r, k) for r in rates))
                    for k in range(grid.dim)]
 
@@ -232,8 +223,10 @@ class FokkerPlanck:
         shape[k] -= 1
         return np.moveaxis(rate[self._faces.axis == k].reshape(shape), k, 0)
 
+    @door
     def evolve(
-        self, values: ArrayLike, times: ArrayLike, *, t0: float = 0.0, substeps: int = 1
+        self, values: Annotated[Array, "... self.grid.size"], times: Times, *, t0: float = 0.0,
+        substeps: Count = 1,
     ) -> Array:
         """Densities at `times`, (T, ..., n), of one that is `values` at `t0`.
 
@@ -246,15 +239,12 @@ class FokkerPlanck:
         substeps : int
             Steps between two times.
         """
-        p = self.grid.check(values)
-        grid, n = increasing(times, "times"), count(substeps, "substeps")
-        now = number(t0, "t0")
-        if grid.size and grid[0] <= now:
-            raise ValueError(f"times: needs times after t0 = {now:g}, got {grid[0]:g}")
-        out = np.empty((grid.size, *p.shape))
-        for k, t in enumerate(grid):
-            h = (float(t) - now) / n
-            for j in range(n):
-                p = self.solver(now + j * h, h)(p)
+        if times.size and times[0] <= t0:
+            raise ValueError(f"times: needs times after t0 = {t0:g}, got {times[0]:g}")
+        p, now, out = values, t0, np.empty((times.size, *values.shape))
+        for k, t in enumerate(times):
+            h = (float(t) - now) / substeps
+            for j in range(substeps):
+                p = unchecked(self.solver)(now + j * h, h)(p)
             out[k], now = p, float(t)
         return out

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from typing import Annotated, Literal
+
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.special import erf
 
-from ..checks import Array, array, choice, count, instance, number
+from ..doors import Array, Bounds, Count, Positive, Share, door
 from .grid import Grid
 
 __all__ = [  # fmt: skip
     "adaptive_bandwidths", "bandwidth", "kernel_covariance", "kernel_density", "kernel_information",
-    "kernel_noise", "kernels",
+    "kernels",
 ]
+
+Widths = Positive | Annotated[Array, "n", Bounds(above=0)]
 
 
 def _along(x: Array, grid: Grid, k: int, width: Array, reflect: bool) -> Array:
     """Means of one-dimensional kernels at x (...) over the cells of axis k, (..., n_k)."""
-    edges = grid.edges(k)
+    edges = grid.edges[k]
     scale = np.sqrt(2.0) * width[..., None]
     span = edges[-1] - edges[0]
     total = _steps(x, edges, scale)
@@ -37,32 +40,18 @@ def _steps(x: Array, edges: Array, scale: Array) -> Array:
     return np.asarray(0.5 * np.diff(erf((edges - x[..., None]) / scale), axis=-1))
 
 
-def _width(value: ArrayLike, grid: Grid, agents: int, name: str = "bandwidth") -> Array:
-    """Bandwidths of all agents, (N,), positive and not below half a cell."""
-    h = array(value, name)
-    if h.shape not in ((), (agents,)):
-        raise ValueError(f"{name}: needs a number or one for each of {agents} agents, "
-                         f"got shape {h.shape}")
-    least = float(h.min(initial=np.inf))
-    if h.max(initial=0.0) > 20 * grid.width.max():
-        raise ValueError(f"{name}: needs at most 20 widths of the box, got {h.max():g}")
-    if not least > 0:
-        raise ValueError(f"{name}: needs a number above 0, got {least:g}")
-    widest = float(grid.spacing.max())
+def widths(value: float | Array, grid: Grid, agents: int = 1) -> Array:
+    """Bandwidths of all agents, (N,), refused below half a cell."""
+    h = np.broadcast_to(value, (agents,))
+    if h.max() > 20 * grid.width.max():
+        raise ValueError(f"bandwidth: needs at most 20 widths of the box, got {h.max():g}")
+    least, widest = float(h.min()), float(grid.spacing.max())
     if widest > 2 * least * (1 + 1e-12):
         raise ValueError(
             f"grid: needs cells no wider than two bandwidths ({2 * least:g}), got {widest:g}: "
             f"too coarse for the kernel"
         )
-    return np.broadcast_to(h, (agents,))
-
-
-def _agents(positions: ArrayLike, grid: Grid) -> Array:
-    instance(grid, "grid", Grid)
-    x = grid.inside(array(positions, "positions", (..., "N", grid.dim)))
-    if x.shape[-2] == 0:
-        raise ValueError("positions: needs at least one agent, got none")
-    return x
+    return h
 
 
 def _factors(x: Array, grid: Grid, h: Array, reflect: bool) -> list[Array]:
@@ -70,8 +59,10 @@ def _factors(x: Array, grid: Grid, h: Array, reflect: bool) -> list[Array]:
     return [_along(x[..., k], grid, k, wide, reflect) for k in range(grid.dim)]
 
 
+@door
 def kernels(
-    positions: ArrayLike, grid: Grid, *, bandwidth: ArrayLike, reflect: bool = True
+    positions: Annotated[Array, "... n grid.dim"], grid: Grid, *, bandwidth: Widths,
+    reflect: bool = True,
 ) -> Array:
     """Each agent's own kernel, the z_i of equation (13) of Zheng and Lin.
 
@@ -103,19 +94,22 @@ def kernels(
     >>> z.shape, bool(abs(grid.integral(z) - 1).max() < 1e-12)
     ((2, 400), True)
     """
-    x, folded = _agents(positions, grid), instance(reflect, "reflect", bool)
-    return _kernels(x, grid, _width(bandwidth, grid, x.shape[-2]), folded)
+    h = widths(bandwidth, grid, positions.shape[-2])
+    return each(grid._inside(positions), grid, h, reflect)
 
 
-def _kernels(x: Array, grid: Grid, h: Array, reflect: bool = True) -> Array:
+def each(x: Array, grid: Grid, h: Array, reflect: bool = True) -> Array:
+    """The kernels of agents inside, with a bandwidth (N,) for each."""
     out, *rest = _factors(x, grid, h, reflect)
     for factor in rest:
         out = (out[..., :, None] * factor[..., None, :]).reshape(*out.shape[:-1], -1)
     return out
 
 
+@door
 def kernel_density(
-    positions: ArrayLike, grid: Grid, *, bandwidth: ArrayLike, reflect: bool = True
+    positions: Annotated[Array, "... n grid.dim"], grid: Grid, *, bandwidth: Widths,
+    reflect: bool = True,
 ) -> Array:
     """The kernel estimate of agents' density, equation (4) of Zheng and Lin.
 
@@ -133,22 +127,19 @@ def kernel_density(
     >>> round(float(p.max() * 2 * np.pi * 0.1**2), 2)
     0.92
     """
-    x, folded = _agents(positions, grid), instance(reflect, "reflect", bool)
-    return _kernel_density(x, grid, _width(bandwidth, grid, x.shape[-2]), folded)
-
-
-def _kernel_density(x: Array, grid: Grid, h: Array, reflect: bool = True) -> Array:
-    factors = _factors(x, grid, h, reflect)
+    h = widths(bandwidth, grid, positions.shape[-2])
+    factors = _factors(grid._inside(positions), grid, h, reflect)
     if grid.dim == 2:
-        out = np.swapaxes(factors[0], -1, -2) @ factors[1]
+        out = factors[0].mT @ factors[1]
     elif grid.dim == 1:
         out = factors[0].sum(axis=-2)
     else:
         out = np.einsum("...ni,...nj,...nk->...ijk", *factors, optimize=True)
-    return np.asarray(out.reshape(*x.shape[:-2], grid.size) / x.shape[-2])
+    return np.asarray(out.reshape(*positions.shape[:-2], grid.size) / positions.shape[-2])
 
 
-def kernel_information(grid: Grid, *, bandwidth: float, agents: int) -> float:
+@door
+def kernel_information(grid: Grid, *, bandwidth: Positive, agents: Count) -> float:
     r"""The constant k̄ of Zheng and Lin: ∫K²/(N hᵈ), for which Var p_KDE ≈ k̄ p.
 
     For a Gaussian, :math:`\bar k = 1/\bigl(N(2\sqrt\pi h)^d\bigr)`. It is the variance of one cell.
@@ -159,52 +150,13 @@ def kernel_information(grid: Grid, *, bandwidth: float, agents: int) -> float:
     >>> round(kernel_information(Grid((30, 30)), bandwidth=0.08, agents=100), 4)
     0.1243
     """
-    n = count(agents, "agents")
-    instance(grid, "grid", Grid)
-    h = number(bandwidth, "bandwidth", above=0)
-    return float(1 / (n * (2 * np.sqrt(np.pi) * h) ** grid.dim))
+    return float(1 / (agents * (2 * np.sqrt(np.pi) * bandwidth) ** grid.dim))
 
 
-def kernel_noise(
-    density: ArrayLike, grid: Grid, *, bandwidth: float, agents: ArrayLike, floor: float = 0.1
-) -> Array:
-    r"""Strength R of a kernel estimate's noise, :math:`\bar k\max(p,\epsilon)` cell by cell.
-
-    Parameters
-    ----------
-    density : array_like, (..., n)
-        The density p about which the estimate is made.
-    grid : Grid
-    bandwidth : float
-    agents : float or array_like, (...)
-        How many agents there are behind each estimate, which need not be whole where that is an
-        estimate itself. No agents measure nothing: their noise is infinite.
-    floor : float
-        The least density ε, positive: no finite sample shows that a cell is empty.
-
-    Returns
-    -------
-    ndarray, (..., n)
-
-    Examples
-    --------
-    >>> grid = Grid((2, 2))
-    >>> kernel_noise([[1.0, 2.0, 0.0, 1.0]] * 2, grid, bandwidth=0.5, agents=[10, 0]).round(4)
-    array([[0.0318, 0.0637, 0.0032, 0.0318],
-           [   inf,    inf,    inf,    inf]])
-    """
-    unit = kernel_information(grid, bandwidth=bandwidth, agents=1)
-    p = grid.check(density, "density")
-    n, least = array(agents, "agents"), number(floor, "floor", above=0)
-    if n.shape not in ((), p.shape[:-1]) or n.min(initial=0.0) < 0:
-        raise ValueError(f"agents: needs numbers of at least 0, one or of shape {p.shape[:-1]}, "
-                         f"got shape {n.shape} with a least of {n.min(initial=0.0):g}")
-    k = np.divide(unit, n, out=np.full(n.shape, np.inf), where=n > 0)
-    return np.asarray(k[..., None] * np.maximum(p, least))
-
-
+@door
 def kernel_covariance(
-    density: ArrayLike, grid: Grid, *, bandwidth: float, agents: int
+    density: Annotated[Array, "grid.size", Bounds(at_least=0)], grid: Grid, *,
+    bandwidth: Positive, agents: Count,
 ) -> tuple[Array, Array]:
     r"""Mean and covariance of the kernel estimate of N independent agents, without approximation.
 
@@ -237,21 +189,18 @@ def kernel_covariance(
     >>> print(round(cov[middle, middle] / (1 / (400 * np.pi * 0.08**2)), 2))
     0.89
     """
-    instance(grid, "grid", Grid)
-    p = array(density, "density", (grid.size,))
-    total = float(grid.integral(p))
-    if p.min() < 0 or abs(total - 1) > 1e-8:
-        raise ValueError(f"density: needs values of at least 0 and integral 1, got a least value "
-                         f"{p.min():g} and integral {total:g}")
-    n = count(agents, "agents")
-    h = number(bandwidth, "bandwidth", above=0)
-    g = kernels(grid.centres, grid, bandwidth=h).T * grid.volume
-    mean = g @ p
-    return mean, ((g * p) @ g.T / grid.volume - np.outer(mean, mean)) / n
+    total = float(density.sum() * grid.volume)
+    if abs(total - 1) > 1e-8:
+        raise ValueError(f"density: needs an integral of 1, got {total:g}")
+    g = kernels(grid.centres, grid, bandwidth=bandwidth).T * grid.volume
+    mean = g @ density
+    return mean, ((g * density) @ g.T / grid.volume - np.outer(mean, mean)) / agents
 
 
+@door
 def bandwidth(
-    positions: ArrayLike, grid: Grid, *, rule: str = "silverman"
+    positions: Annotated[Array, "n grid.dim"], grid: Grid, *,
+    rule: Literal["silverman", "least_squares"] = "silverman",
 ) -> float:
     r"""A bandwidth from the agents themselves.
 
@@ -276,10 +225,7 @@ def bandwidth(
     >>> round(bandwidth(x, Grid((30, 30))), 3)
     0.129
     """
-    instance(grid, "grid", Grid)
-    x = _agents(array(positions, "positions", ("N", grid.dim)), grid)
-    choice(rule, "rule", ("silverman", "least_squares"))
-    n, d = x.shape
+    x, (n, d) = grid._inside(positions), positions.shape
     spread = float(np.sqrt(x.var(axis=0).mean()))
     if n < 2 or spread == 0:
         raise ValueError(f"positions: needs two agents or more in different places, got {n} "
@@ -295,15 +241,17 @@ def bandwidth(
 
 def _least_squares(x: Array, grid: Grid, h: float) -> float:
     n = len(x)
-    z = _kernels(x, grid, np.full(n, h))
+    z = each(x, grid, np.full(n, h))
     mean = z.mean(axis=0)
     at = z[:, grid.cells(x)]  # kernel of agent i in the cell of agent j
     others = (at.sum() - np.trace(at)) / (n * (n - 1))
     return float((mean**2).sum() * grid.volume - 2 * others)
 
 
+@door
 def adaptive_bandwidths(
-    positions: ArrayLike, grid: Grid, *, bandwidth: float, sensitivity: float = 0.5
+    positions: Annotated[Array, "n grid.dim"], grid: Grid, *, bandwidth: Positive,
+    sensitivity: Share = 0.5,
 ) -> Array:
     r"""Abramson's bandwidths: narrow where agents are many, wide where they are few.
 
@@ -335,10 +283,6 @@ def adaptive_bandwidths(
     >>> bool(h[2] > 0.1 > h[0])
     True
     """
-    instance(grid, "grid", Grid)
-    x = _agents(array(positions, "positions", ("N", grid.dim)), grid)
-    s = number(sensitivity, "sensitivity", at_least=0, at_most=1)
-    h = number(bandwidth, "bandwidth", above=0)
-    pilot = kernel_density(x, grid, bandwidth=h)[grid.cells(x)]
-    local = h * (pilot / np.exp(np.log(pilot).mean())) ** -s
+    pilot = kernel_density(positions, grid, bandwidth=bandwidth)[grid.cells(positions)]
+    local = bandwidth * (pilot / np.exp(np.log(pilot).mean())) ** -sensitivity
     return np.asarray(np.maximum(local, 0.5 * float(grid.spacing.max())))

@@ -3,31 +3,146 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol, runtime_checkable
+from functools import cached_property
+from typing import Annotated, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike
 
-from ..checks import Array, array, count, instance, number
+from ..doors import MISSING, Array, Count, Mask, NonNegative, Places, Positive, Record, unchecked
 from ..network import Channel, Graph, tracking
 from ..network import weights as weighting
-from .kernel import _kernel_density, _kernels
-from .seen import Seen
+from ..network.graphs import disk
+from .grid import Grid
+from .kernel import each, kernel_density, kernel_information
 
 __all__ = [  # fmt: skip
-    "Centralised", "DynamicAverage", "Flooding", "Neighbours", "PIConsensus", "Sharing", "alone",
+    "Centralised", "DynamicAverage", "Flooding", "Neighbours", "PIConsensus", "Seen", "Sharing",
+    "alone", "present_graph",
 ]
 
 Carried = tuple[Array, ...]
-Mask = NDArray[np.bool_]
+Learnt = tuple[Carried, Array, Array]
 
 _NEVER = -1e30
 """Time stamp of what an agent has not heard of."""
 
 
+@dataclass(frozen=True, eq=False)
+class Seen(Record):
+    """What the agents themselves see at one time, and on which grid they think.
+
+    Parameters
+    ----------
+    positions : ndarray, (A, d)
+        Of agents inside the box; a row of NaN is an agent that has gone. One at least is here.
+    grid : Grid
+    bandwidth : float
+        Of every agent's kernel.
+    t : float
+        In s.
+    wanted : tuple of int, optional
+        The agents whose estimate is used; a rule may leave the rows of others at zero.
+
+    Examples
+    --------
+    >>> seen = Seen([[0.5, 0.5], [np.nan, np.nan]], Grid((9, 9)), 0.1, 0.0)
+    >>> seen.present, seen.kernels.shape
+    (array([ True, False]), (2, 81))
+    """
+
+    positions: Annotated[Array, "A grid.dim", MISSING]
+    grid: Grid
+    bandwidth: Positive
+    t: float
+    wanted: Places | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        here = self.positions[~np.isnan(self.positions).all(axis=-1)]
+        if np.isnan(here).any() or not len(here):
+            raise ValueError("positions: needs one agent at least, and NaN in a whole row for one "
+                             f"that has gone, got {self.positions.tolist()}")
+        self.grid._inside(here)
+
+    @cached_property
+    def present(self) -> Mask:
+        """Which agents are here, (A,)."""
+        return ~np.isnan(self.positions[:, 0])
+
+    def near(self, radius: float) -> Graph:
+        """The graph of a radio's range, without links to agents that are gone."""
+        here = np.flatnonzero(self.present)
+        found = disk(self.positions[here], radius)
+        pairs = np.stack([here[found.receivers], here[found.senders]], axis=1)
+        return found if self.present.all() else Graph.from_edges(len(self.positions), pairs)
+
+    def only_here(self, payloads: Array) -> list[Array | None]:
+        """What each agent sends, None for those that are gone."""
+        return [x if here else None for x, here in zip(payloads, self.present, strict=True)]
+
+    def _or(self, place: Array) -> Array:
+        """The positions, with a place for agents that are gone."""
+        return np.where(self.present[:, None], self.positions, place)
+
+    @property
+    def kernels(self) -> Array:
+        """Each agent's own kernel, zero for those that are gone, (A, n)."""
+        x = self._or(self.grid.centres[0])
+        z = each(x, self.grid, np.full(len(x), self.bandwidth))
+        return np.asarray(z * self.present[:, None])
+
+    def noise(self, density: Array, agents: ArrayLike, floor: float | None = None) -> Array:
+        r"""Strength R of what the wanted agents have learnt: :math:`\bar k\max(p,\epsilon)`.
+
+        Parameters
+        ----------
+        density : ndarray, (F, n)
+            The density p about which each wanted agent's estimate is made.
+        agents : array_like
+            How many each of all A agents heard of. Those that are gone heard nothing: their R is
+            infinite.
+        floor : float, optional
+            The least density ε, positive: no finite sample shows that a cell is empty. By default
+            a tenth of the box's mean density.
+        """
+        least = 0.1 / self.grid.box if floor is None else floor
+        heard = np.where(self.present, np.maximum(agents, 1.0), 0.0)
+        chosen = heard if self.wanted is None else heard[list(self.wanted)]
+        unit = unchecked(kernel_information)(self.grid, bandwidth=self.bandwidth, agents=1)
+        k = np.divide(unit, chosen, out=np.full(chosen.shape, np.inf), where=chosen > 0)
+        return np.asarray(k[:, None] * np.maximum(density, least))
+
+    def flat(self, std: float | None = None) -> Array:
+        """A Gaussian about each agent, cut off at the walls; in the middle for the gone, (A, n).
+
+        Its standard deviation is .3 of the box's side, unless it is given.
+        """
+        width = 0.3 * self.grid.side if std is None else std
+        centre = self._or(self.grid.corner + 0.5 * self.grid.width)
+        gap = ((self.grid.centres - centre[:, None, :]) ** 2).sum(axis=-1)
+        return self.grid.normalised(np.exp(-0.5 * gap / width**2))
+
+
+def present_graph(graph: Graph, present: Mask) -> Graph:
+    """The graph without the links of agents that are gone.
+
+    Examples
+    --------
+    >>> from distfilt.network import graphs
+    >>> present_graph(graphs.path(3), np.array([True, True, False])).degrees
+    array([1., 1., 0.])
+    """
+    if present.all():
+        return graph
+    keep = present[graph.receivers] & present[graph.senders]
+    pairs = np.stack([graph.receivers[keep], graph.senders[keep]], axis=1)
+    return Graph.from_edges(graph.size, pairs, directed=True)
+
+
 @runtime_checkable
 class Sharing(Protocol):
-    """A rule by which agents learn the swarm's kernel estimate.
+    """A rule by which agents learn the swarm's kernel estimate: what a density filter agrees by.
 
     `begin` gives what the agents remember before their first step. `learn` takes what they see
     and what they remember, lets them talk, and returns what they remember then, each agent's
@@ -35,22 +150,19 @@ class Sharing(Protocol):
 
     Examples
     --------
-    >>> isinstance(Centralised().reference, bool)
-    True
+    >>> Centralised().reference, Flooding().fuses
+    (True, 'densities')
     """
 
-    @property
-    def reference(self) -> bool:
-        """Whether this is no network's rule, but what it is compared with."""
-        ...
+    fuses: str = "densities"
+    reference: bool = False
+    """Whether this is no network's rule, but what it is compared with."""
 
     def begin(self, seen: Seen) -> Carried:
-        """What the agents remember before the first step."""
-        ...
+        """What the agents remember before the first step: nothing, unless a rule says."""
+        return ()
 
-    def learn(
-        self, carried: Carried, seen: Seen, channel: Channel, dt: float
-    ) -> tuple[Carried, Array, Array]:
+    def learn(self, carried: Carried, seen: Seen, channel: Channel, dt: float) -> Learnt:
         """One step of talking."""
         ...
 
@@ -62,24 +174,19 @@ def alone(sharing: Sharing, seen: Seen) -> Array:
 
     Examples
     --------
-    >>> from distfilt.density import Grid
-    >>> seen = Seen(np.full((2, 2), 0.5), np.ones(2, bool), Grid((9, 9)), 0.1, 0.0)
+    >>> seen = Seen(np.full((2, 2), 0.5), Grid((9, 9)), 0.1, 0.0)
     >>> np.array_equal(alone(Flooding(), seen), seen.kernels)
     True
     """
-    instance(sharing, "sharing", Sharing)  # type: ignore[type-abstract]
     if not sharing.reference:
         return seen.kernels
-    silent = Channel(Graph.from_edges(len(seen.present), np.zeros((0, 2))))
+    silent = Channel(Graph.from_edges(len(seen.positions), np.zeros((0, 2))))
     return sharing.learn(sharing.begin(seen), seen, silent, 1.0)[1]
 
 
-def _coordinates(seen: Seen, modes: int | None, values: Array | None = None) -> Array:
-    """Each agent's kernel, whole or as cosine coefficients, and a 1 of the first that is here."""
-    instance(seen, "seen", Seen)
-    z = seen.kernels if values is None else values
-    if modes is not None:
-        z = z @ seen.grid.cosines(modes) * seen.grid.volume
+def _coordinates(seen: Seen, modes: int | None, values: Array) -> Array:
+    """Densities, whole or as cosine coefficients, and a 1 of the first agent that is here."""
+    z = values if modes is None else values @ seen.grid.cosines(modes) * seen.grid.volume
     leader = np.zeros((len(z), 1))
     leader[int(np.argmax(seen.present)), 0] = 1.0
     return np.concatenate([z, leader], axis=1)
@@ -94,26 +201,8 @@ def _read(values: Array, seen: Seen, modes: int | None) -> tuple[Array, Array]:
     return y, 1 / np.clip(values[:, -1], 1e-6, 1.0)
 
 
-def _door(
-    carried: Carried, shapes: tuple[tuple[int, ...], ...], seen: Seen, channel: Channel, dt: float
-) -> Carried:
-    """Refuse what a rule cannot have carried, and steps that are none."""
-    instance(channel, "channel", Channel)
-    number(dt, "dt", above=0)
-    if channel.graph.size != len(seen.present):
-        raise ValueError(f"channel: needs {len(seen.present)} agents, got {channel.graph.size}")
-    if not isinstance(carried, tuple | list | np.ndarray) or len(carried) != len(shapes):
-        raise ValueError(f"carried: needs {len(shapes)} arrays, as `begin` and `learn` return them")
-    return tuple(array(c, "carried", s) for c, s in zip(carried, shapes, strict=True))
-
-
-def _modes(value: int | None) -> None:
-    if value is not None:
-        count(value, "modes")
-
-
 @dataclass(frozen=True)
-class PIConsensus:
+class PIConsensus(Record, Sharing):
     """The proportional-integral estimator of equation (16) of Zheng and Lin.
 
     Parameters
@@ -133,45 +222,33 @@ class PIConsensus:
     64
     """
 
-    alpha: float = field(default=0.2, kw_only=True)
-    a: float = field(default=0.4, kw_only=True)
-    b: float = field(default=0.04, kw_only=True)
-    modes: int | None = field(default=None, kw_only=True)
+    alpha: NonNegative = field(default=0.2, kw_only=True)
+    a: NonNegative = field(default=0.4, kw_only=True)
+    b: NonNegative = field(default=0.04, kw_only=True)
+    modes: Count | None = field(default=None, kw_only=True)
     rate: bool = field(default=False, kw_only=True)
-    first_std: float | None = field(default=None, kw_only=True)
-    reference = False
-
-    def __post_init__(self) -> None:
-        for name in ("alpha", "a", "b"):
-            number(getattr(self, name), name, at_least=0)
-        _modes(self.modes)
-        instance(self.rate, "rate", bool)
-        if self.first_std is not None:
-            number(self.first_std, "first_std", above=0)
+    first_std: Positive | None = field(default=None, kw_only=True)
 
     def begin(self, seen: Seen) -> Carried:
         """First estimates, no integral, and the inputs of now."""
-        u = _coordinates(seen, self.modes)
+        u = _coordinates(seen, self.modes, seen.kernels)
         if self.first_std is None:
             return u, np.zeros_like(u), u
         return _coordinates(seen, self.modes, seen.flat(self.first_std)), np.zeros_like(u), u
 
-    def learn(
-        self, carried: Carried, seen: Seen, channel: Channel, dt: float
-    ) -> tuple[Carried, Array, Array]:
+    def learn(self, carried: Carried, seen: Seen, channel: Channel, dt: float) -> Learnt:
         """One step of (16), in as many substeps as stability asks for."""
-        u = _coordinates(seen, self.modes)
-        estimate, integral, before = _door(carried, (u.shape,) * 3, seen, channel, dt)
+        u = _coordinates(seen, self.modes, seen.kernels)
+        estimate, integral, before = carried
         after = tracking.pi_step(
             tracking.PIState(estimate, integral), before, channel, dt=dt, alpha=self.alpha,
             a=self.a, b=self.b, rate=(u - before) / dt if self.rate else None,
         )
-        y, agents = _read(after.estimate, seen, self.modes)
-        return (after.estimate, after.integral, u), y, agents
+        return (after.estimate, after.integral, u), *_read(after.estimate, seen, self.modes)
 
 
 @dataclass(frozen=True)
-class DynamicAverage:
+class DynamicAverage(Record, Sharing):
     """First-order dynamic average consensus on cosine coefficients of the density.
 
     Metropolis weights where all links go both ways, else weights that balance the graph.
@@ -189,41 +266,32 @@ class DynamicAverage:
     100
     """
 
-    modes: int | None = field(default=100, kw_only=True)
-    rounds: int = field(default=1, kw_only=True)
-    reference = False
-
-    def __post_init__(self) -> None:
-        _modes(self.modes)
-        count(self.rounds, "rounds")
+    modes: Count | None = field(default=100, kw_only=True)
+    rounds: Count = field(default=1, kw_only=True)
 
     def begin(self, seen: Seen) -> Carried:
         """Estimates that are the own kernels, which the rule needs for an exact average."""
-        u = _coordinates(seen, self.modes)
+        u = _coordinates(seen, self.modes, seen.kernels)
         return u, u
 
-    def learn(
-        self, carried: Carried, seen: Seen, channel: Channel, dt: float
-    ) -> tuple[Carried, Array, Array]:
+    def learn(self, carried: Carried, seen: Seen, channel: Channel, dt: float) -> Learnt:
         """Average, and add what the own input has changed by."""
-        u = _coordinates(seen, self.modes)
-        x, before = _door(carried, (u.shape,) * 2, seen, channel, dt)
-        graph = channel.graph
+        u = _coordinates(seen, self.modes, seen.kernels)
+        (x, before), graph = carried, channel.graph
         weights = weighting.balanced(graph) if graph.directed else weighting.metropolis(graph)
         lost = "keep" if graph.directed else "mutual"
-        for k in range(self.rounds):
-            x = tracking.first_order(
-                x, u if k == 0 else before, before, channel, weights=weights, lost=lost)
+        for now in (u, *(before,) * (self.rounds - 1)):  # the change belongs to the first round
+            x = tracking.first_order(x, now, before, channel, weights=weights, lost=lost)
         return (x, u), *_read(x, seen, self.modes)
 
 
 @dataclass(frozen=True)
-class Flooding:
+class Flooding(Record, Sharing):
     """Every agent passes on where it last knew each agent, with the time, and keeps the newest.
 
     Parameters
     ----------
-    forget : float
+    forget : float, optional
         Age in s from which an entry is left out of the estimate: agents that have gone are
         forgotten then, and parts of a broken network stop believing in each other.
 
@@ -233,70 +301,54 @@ class Flooding:
     5.0
     """
 
-    forget: float = field(default=float("inf"), kw_only=True)
-    reference = False
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.forget, float) or self.forget != float("inf"):
-            number(self.forget, "forget", above=0)
+    forget: Positive | None = field(default=None, kw_only=True)
 
     def begin(self, seen: Seen) -> Carried:
         """Tables (A, A, d + 1) of positions and times, with the own entry only."""
-        size, d = instance(seen, "seen", Seen).positions.shape
-        table = np.zeros((size, size, d + 1))
-        table[..., d] = _NEVER
-        return (self._noted(table, seen),)
+        return (_noted(seen),)
 
-    @staticmethod
-    def _noted(table: Array, seen: Seen) -> Array:
-        here = np.flatnonzero(seen.present)
-        out = table.copy()
-        out[here, here, :-1], out[here, here, -1] = seen.positions[here], seen.t
-        return out
-
-    def learn(
-        self, carried: Carried, seen: Seen, channel: Channel, dt: float
-    ) -> tuple[Carried, Array, Array]:
+    def learn(self, carried: Carried, seen: Seen, channel: Channel, dt: float) -> Learnt:
         """Note the own position, send the table, keep the newest of each entry."""
-        size, d = instance(seen, "seen", Seen).positions.shape
-        (before,) = _door(carried, ((size, size, d + 1),), seen, channel, dt)
-        table = self._noted(before, seen)
-        inbox = channel.exchange(
-            [table[i] if here else None for i, here in enumerate(seen.present)]
-        )
-        owners = np.arange(len(table))
-        new = table.copy()
-        for i, box in enumerate(inbox):
-            if box and seen.present[i]:
-                heard = np.stack([table[i], *box.values()])
-                new[i] = heard[heard[..., -1].argmax(axis=0), owners]
-        known = new[..., -1] > max(seen.t - self.forget, _NEVER / 2)
-        return (new,), _mean_kernels(new, known, seen), known.sum(axis=1).astype(np.float64)
+        table = _noted(seen, carried[0])
+        heard = channel.exchange(seen.only_here(table))
+        new, owners = table.copy(), np.arange(len(table))
+        for i in np.flatnonzero(seen.present):
+            rows = np.stack([table[i], *heard[i].values()])
+            new[i] = rows[rows[..., -1].argmax(axis=0), owners]
+        oldest = _NEVER / 2 if self.forget is None else seen.t - self.forget
+        return (new,), *_mean_kernels(new, oldest, seen)
 
 
-def _mean_kernels(table: Array, known: Mask, seen: Seen) -> Array:
-    """Kernel estimates of the known entries of each table; equal entries are computed once."""
+def _noted(seen: Seen, table: Array | None = None) -> Array:
+    """Each agent's table of all agents' positions and times, with the own entry of now."""
+    size, d = seen.positions.shape
+    out = np.full((size, size, d + 1), [0.0] * d + [_NEVER]) if table is None else table.copy()
+    here = np.flatnonzero(seen.present)
+    out[here, here, :-1], out[here, here, -1] = seen.positions[here], seen.t
+    return out
+
+
+def _mean_kernels(table: Array, oldest: float, seen: Seen) -> tuple[Array, Array]:
+    """Kernel estimates of each table's newer entries, and their numbers.
+
+    Equal entries are computed once.
+    """
+    known = table[..., -1] > oldest
+    counted = known.sum(axis=1).astype(np.float64)
     if seen.wanted is not None:
-        known = known.copy()
         known[np.delete(np.arange(len(known)), seen.wanted)] = False
     row, owner = np.nonzero(known)
-    stamp = table[row, owner, -1]
-    order = np.lexsort((stamp, owner))
-    first = np.ones(order.size, dtype=bool)
-    first[1:] = (np.diff(owner[order]) != 0) | (np.diff(stamp[order]) != 0)
-    at = np.empty(order.size, dtype=np.int64)
-    at[order] = np.cumsum(first) - 1
-    chosen = order[first]
-    x = table[row[chosen], owner[chosen], :-1]
-    z = _kernels(x, seen.grid, np.full(len(x), seen.bandwidth))
+    both = np.stack([owner, table[row, owner, -1]], axis=1)
+    _, first, at = np.unique(both, axis=0, return_index=True, return_inverse=True)
+    x = table[row[first], owner[first], :-1]
+    z = each(x, seen.grid, np.full(len(x), seen.bandwidth))
     weights = np.zeros((len(table), len(x)))
     weights[row, at] = 1.0
-    total = weights.sum(axis=1, keepdims=True)
-    return np.asarray(weights @ z / np.maximum(total, 1.0))
+    return np.asarray(weights @ z / np.maximum(weights.sum(axis=1, keepdims=True), 1.0)), counted
 
 
 @dataclass(frozen=True)
-class Neighbours:
+class Neighbours(Record, Sharing):
     """Remark 4 of Zheng and Lin as it stands: positions go to neighbours, and that is all.
 
     Each agent's estimate is the kernel estimate of itself and of those that it hears.
@@ -307,34 +359,17 @@ class Neighbours:
     False
     """
 
-    reference = False
-
-    def begin(self, seen: Seen) -> Carried:
-        """Nothing to remember."""
-        instance(seen, "seen", Seen)
-        return ()
-
-    def learn(
-        self, carried: Carried, seen: Seen, channel: Channel, dt: float
-    ) -> tuple[Carried, Array, Array]:
+    def learn(self, carried: Carried, seen: Seen, channel: Channel, dt: float) -> Learnt:
         """Send the own position; the mean of the kernels at all positions that arrive."""
-        size, d = instance(seen, "seen", Seen).positions.shape
-        _door(carried, (), seen, channel, dt)
-        inbox = channel.exchange(
-            [x if here else None for x, here in zip(seen.positions, seen.present, strict=True)]
-        )
-        table = np.zeros((size, size, d + 1))
-        table[..., d] = _NEVER
-        for i, box in enumerate(inbox):
+        table = _noted(seen)
+        for i, box in enumerate(channel.exchange(seen.only_here(seen.positions))):
             for j, x in box.items():
-                table[i, j, :-1], table[i, j, -1] = x, seen.t
-        table = Flooding._noted(table, seen)
-        known = table[..., -1] > _NEVER / 2
-        return (), _mean_kernels(table, known, seen), known.sum(axis=1).astype(np.float64)
+                table[i, j] = *x, seen.t
+        return (), *_mean_kernels(table, _NEVER / 2, seen)
 
 
 @dataclass(frozen=True)
-class Centralised:
+class Centralised(Record, Sharing):
     """All positions known to all at no cost: the reference that no network is.
 
     Examples
@@ -345,17 +380,8 @@ class Centralised:
 
     reference = True
 
-    def begin(self, seen: Seen) -> Carried:
-        """Nothing to remember."""
-        instance(seen, "seen", Seen)
-        return ()
-
-    def learn(
-        self, carried: Carried, seen: Seen, channel: Channel, dt: float
-    ) -> tuple[Carried, Array, Array]:
+    def learn(self, carried: Carried, seen: Seen, channel: Channel, dt: float) -> Learnt:
         """The kernel estimate of all that are here."""
-        instance(seen, "seen", Seen)
-        _door(carried, (), seen, channel, dt)
-        x, size = seen.positions[seen.present], len(seen.present)
-        y = _kernel_density(x, seen.grid, np.full(len(x), seen.bandwidth))
+        x, size = seen.positions[seen.present], len(seen.positions)
+        y = unchecked(kernel_density)(x, seen.grid, bandwidth=seen.bandwidth)
         return (), np.tile(y, (size, 1)), np.full(size, float(len(x)))

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..checks import Array, array, choice, count, increasing, instance, number, places
-from ..density import FokkerPlanck, Separate, Shared, Sharing, zero_mean_prior
-from ..density.forms import filters_start, filters_step
-from ..density.kernel import _width
-from ..density.seen import Seen, present_graph
-from ..density.sharing import alone
+from ..density import FokkerPlanck, LowRank, Sharing, low_rank, zero_mean_prior
+from ..density.kernel import widths
+from ..density.sharing import Seen, alone, present_graph
+from ..doors import unchecked
 from ..network import Channel, Faults, Graph, Ledger
 from .driver import Late, Summary, TeamFilter
 from .saving import State
@@ -43,12 +42,12 @@ class DensityState(State):
         How many agents each believes there are.
     parts : int
         Into how many parts the network of the present agents fell in the last step.
-    filters : Shared or Separate
-        The filters of the agents that have one, in the form that the model allows.
+    filters : LowRank
+        The filters of the agents that have one.
 
     Examples
     --------
-    >>> filters = filters_start(np.ones((4, 1)), np.ones((1, 4)), exact=True)
+    >>> filters = low_rank_start(np.ones((4, 1)), np.ones((1, 4)))
     >>> DensityState(0.0, Ledger.empty(1), None, np.zeros((1, 2)), (), np.ones((1, 4)),
     ...              np.ones(1), 1, filters).estimates.shape
     (1, 4)
@@ -59,7 +58,7 @@ class DensityState(State):
     observed: Array
     counted: Array
     parts: int
-    filters: Shared | Separate
+    filters: LowRank
 
     @property
     def estimates(self) -> Array:
@@ -97,16 +96,16 @@ class DensityFilter(TeamFilter):
         The agents that run a filter; all by default. All agents share.
     first : {"flat", "observed"} or array_like (n,)
         Prior mean: a flat Gaussian about the agent, its own kernel, or a density for all.
-    first_std : float
-        Width of the flat Gaussian.
+    first_std : float, optional
+        Width of the flat Gaussian; by default .3 of the box's side.
     rank, prior_length, prior_std, mass_std
         Of :func:`~distfilt.density.zero_mean_prior`. With a `mass_std` of 0, the default, no
         measurement can change the mass; above 0 it can, as in the paper.
     noise : {"forecast", "observed"}
         Whether R is k̄ times the filter's own density, or times what it observes as printed; the
         second weighs by the noise itself and is biased.
-    floor : float
-        Least density in R, positive.
+    floor : float, optional
+        Least density in R, positive; by default a tenth of the mean density.
     number_known : bool
         Whether agents know A; otherwise k̄ takes the number that their sharing tells.
     process : float, optional
@@ -137,13 +136,13 @@ class DensityFilter(TeamFilter):
     bandwidth: float
     local: tuple[int, ...] | None = None
     first: str | ArrayLike = "flat"
-    first_std: float = 0.3
+    first_std: float | None = None
     rank: int = 48
-    prior_length: float = 0.1
-    prior_std: float = 1.0
+    prior_length: float | None = None
+    prior_std: float | None = None
     mass_std: float = 0.0
     noise: str = "forecast"
-    floor: float = 0.1
+    floor: float | None = None
     number_known: bool = True
     process: float | None = None
     faults: Faults | None = None
@@ -156,8 +155,9 @@ class DensityFilter(TeamFilter):
             number(self.graph, "graph", above=0)
         instance(self.sharing, "sharing", Sharing)  # type: ignore[type-abstract]
         for name in ("bandwidth", "first_std", "floor", "prior_length", "prior_std"):
-            number(getattr(self, name), name, above=0)
-        _width(self.bandwidth, self.model.grid, 1)
+            if getattr(self, name) is not None:
+                number(getattr(self, name), name, above=0)
+        widths(self.bandwidth, self.model.grid)
         if self.local is not None:
             places(self.local, "local", sizes[0])
         if isinstance(self.first, str):
@@ -213,9 +213,9 @@ class DensityFilter(TeamFilter):
         self.check_alone(rng, runs)
         seen = self._seen(prior, "prior", number(t, "t"))
         here = self.filtering
-        filters = filters_start(self._basis, self._base(seen)[here], exact=self.process is None)
+        filters = unchecked(low_rank.low_rank_start)(self._basis, self._base(seen)[here])
         return DensityState(
-            float(t), Ledger.empty(self.size), None, seen.places, self.sharing.begin(seen),
+            float(t), Ledger.empty(self.size), None, seen.positions, self.sharing.begin(seen),
             seen.kernels[here], np.full(self.size, float(self.size)), 1, filters,
         )
 
@@ -234,9 +234,8 @@ class DensityFilter(TeamFilter):
         return alone(self.sharing, seen) if self.first == "observed" else seen.flat(self.first_std)
 
     def _seen(self, positions: ArrayLike, name: str, t: float) -> Seen:
-        return Seen.checked(
-            positions, name, self.size, self.model.grid, self.bandwidth, t, self.local
-        )
+        x = array(positions, name, (self.size, self.model.grid.dim), finite=False)
+        return Seen(x, self.model.grid, self.bandwidth, t, self.local)
 
     def step(
         self, state: DensityState, t: float, observations: ArrayLike, *, late: Sequence[Late] = ()
@@ -260,7 +259,7 @@ class DensityFilter(TeamFilter):
         dt = number(t, "t", above=state.t) - state.t
         seen = self._seen(observations, "observations", float(t))
         if isinstance(self.graph, Graph) or callable(self.graph):
-            graph = present_graph(self.graph_at(float(t), seen.places), seen.present)
+            graph = present_graph(self.graph_at(float(t), seen.positions), seen.present)
         else:
             graph = seen.near(self.graph)
         channel = Channel(graph, ledger=state.ledger, faults=self.faults, t=float(t))
@@ -268,16 +267,15 @@ class DensityFilter(TeamFilter):
         y = y[self.filtering]
         agents = seen.present.sum() if self.number_known else counted
 
-        def noise(forecast: Array) -> Array:
-            level = forecast if self.noise == "forecast" else y
-            return seen.noise(level, agents, self.floor)
-
         move = self.model.solver(state.t, dt)
         q = None if self.process is None else self.process * self._basis
-        filters = filters_step(state.filters, move, y, noise, dt, process=q)
+        moved = unchecked(low_rank.low_rank_moved)(state.filters, move, process=q, dt=dt)
+        level = moved.estimates if self.noise == "forecast" else y
+        noise = seen.noise(level, agents, self.floor)
+        filters = unchecked(low_rank.low_rank_step)(moved, y, noise, dt)
         parts = np.unique(graph.components[seen.present]).size
         return DensityState(
-            float(t), channel.ledger, None, seen.places, carried, y, counted, parts, filters
+            float(t), channel.ledger, None, seen.positions, carried, y, counted, parts, filters
         )
 
     def summary(self, state: DensityState) -> Summary:

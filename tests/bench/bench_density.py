@@ -27,9 +27,9 @@ from distfilt.density import (
     dense_step,
     kernel_density,
     kernel_information,
-    shared_moved,
-    shared_start,
-    shared_step,
+    low_rank_moved,
+    low_rank_start,
+    low_rank_step,
     zero_mean_prior,
 )
 from distfilt.models import rotating_swarm
@@ -66,11 +66,11 @@ def filters(n: int, number: int) -> Callable[[], Any]:
     flow, rng = FokkerPlanck(rotating_swarm("slowgibbs"), grid), np.random.default_rng(1)
     y = kernel_density(rng.random((AGENTS, 2)), grid, bandwidth=H)
     k = kernel_information(grid, bandwidth=H, agents=AGENTS)
-    state = shared_start(zero_mean_prior(grid, rank=RANK), np.tile(y, (number, 1)))
+    state = low_rank_start(zero_mean_prior(grid, rank=RANK), np.tile(y, (number, 1)))
 
     def step() -> Any:
-        moved = shared_moved(state, flow.solver(0.0, DT))
-        return shared_step(moved, y, k * np.maximum(moved.estimates, 0.1), DT)
+        moved = low_rank_moved(state, flow.solver(0.0, DT))
+        return low_rank_step(moved, y, k * np.maximum(moved.estimates, 0.1), DT)
 
     return step
 

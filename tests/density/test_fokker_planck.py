@@ -126,7 +126,7 @@ def test_ornstein_and_uhlenbeck(n: int, bound: float) -> None:
     grid = Grid((n, n))
     flow = FokkerPlanck(Swarm(lambda x, t: k * (0.5 - x), d), grid, scheme="backward_euler")
     line = [quad(lambda s: np.exp(-k * (s - 0.5) ** 2 / (2 * d)), a, b)[0] / (b - a)
-            for a, b in zip(grid.edges(0)[:-1], grid.edges(0)[1:], strict=True)]
+            for a, b in zip(grid.edges[0][:-1], grid.edges[0][1:], strict=True)]
     exact = grid.normalised(np.outer(line, line).ravel())
     p = flow.evolve(np.ones(grid.size), [50.0, 200.0, 1e4])[-1]
     assert grid.norm(p - exact) / grid.norm(exact) < bound
@@ -182,28 +182,3 @@ def test_agents_and_density_agree_in_the_literal_case() -> None:
     h = coarse.histogram(swarm.simulate(x, times, rng=rng)[-1])
     p = fine.aggregated(p, coarse)
     assert coarse.norm(h - p) / coarse.norm(p) < 0.02
-
-
-_FLOW = FokkerPlanck(rotating_swarm(), Grid((5, 5)))
-BAD_INPUT = {
-    "distfilt.density.fokker_planck.bernoulli": [("z", lambda: bernoulli([np.nan]))],
-    "distfilt.density.fokker_planck.FokkerPlanck": [
-        ("swarm", lambda: FokkerPlanck(3, Grid((5, 5)))),
-        ("grid", lambda: FokkerPlanck(rotating_swarm(), Grid((5,)))),
-        ("grid", lambda: FokkerPlanck(rotating_swarm(), Grid((5, 5), high=[1.0, 2.0]))),
-        ("scheme", lambda: FokkerPlanck(rotating_swarm(), Grid((5, 5)), scheme="explicit")),
-        ("values", lambda: _FLOW.step(np.ones(24), 0.0, 0.1)),
-        ("dt", lambda: _FLOW.step(np.ones(25), 0.0, 0.0)),
-        ("times", lambda: _FLOW.evolve(np.ones(25), [0.0])),
-        ("t", lambda: _FLOW.rates(np.nan)),
-        ("t", lambda: _FLOW.rates(True)),
-        ("diffusion", lambda: FokkerPlanck(
-            Swarm(_still, lambda x, t: x[..., 0] - 0.5), Grid((5, 5))).generator(0.0)),
-    ],
-}
-
-
-def test_times_before_the_start_are_refused() -> None:
-    box = FokkerPlanck(Swarm(lambda x, t: 0 * x, 0.1, low=[0.0], high=[1.0]), Grid((4,)))
-    with pytest.raises(ValueError, match="times: .* after t0 = 1, got 0.5"):
-        box.evolve(np.ones(4), [0.5, 2.0], t0=1.0)

@@ -15,17 +15,17 @@ from distfilt.density import (
     Grid,
     Neighbours,
     PIConsensus,
-    filters_step,
     kernel_density,
-    kernel_noise,
+    kernel_information,
     kernels,
+    low_rank_moved,
+    low_rank_step,
     zero_mean_prior,
 )
-from distfilt.density.seen import Seen, present_graph
-from distfilt.density.sharing import alone
+from distfilt.density.sharing import Seen
 from distfilt.filters import DensityFilter, DensityState, final_state
 from distfilt.models import Swarm, rotating_swarm
-from distfilt.network import Channel, Faults, Graph, graphs
+from distfilt.network import Faults, Graph, graphs
 
 SIZE, H = 12, 0.12
 GRID = Grid((10, 10))
@@ -267,13 +267,11 @@ def test_a_step_is_the_forms_step_with_the_noise_that_was_asked_for(
     state = f.step(start, 0.1, PATH[0])
     agents = SIZE if known else state.counted[[7, 2]]
 
-    def strength(forecast: np.ndarray) -> np.ndarray:
-        level = forecast if noise == "forecast" else state.observed
-        return kernel_noise(level, GRID, bandwidth=H, agents=agents, floor=0.7)
-
     q = None if process is None else process * zero_mean_prior(GRID, rank=20)
-    wanted = filters_step(
-        start.filters, MODEL.solver(0.0, 0.1), state.observed, strength, 0.1, process=q)
+    moved = low_rank_moved(start.filters, MODEL.solver(0.0, 0.1), process=q, dt=0.1)
+    level = moved.estimates if noise == "forecast" else state.observed
+    unit = kernel_information(GRID, bandwidth=H, agents=1) / np.reshape(agents, (-1, 1))
+    wanted = low_rank_step(moved, state.observed, unit * level.clip(0.7), 0.1)
     assert np.allclose(state.estimates, wanted.estimates, rtol=1e-12)
     assert np.allclose(state.variances, wanted.variances, rtol=1e-12)
 
@@ -368,12 +366,12 @@ BAD_INPUT = {
         ("faults", lambda: make(0.5, Flooding(), faults=Faults(delay=1))),
         ("names", lambda: make(0.5, Flooding(), names=("a",))),
         ("runs", lambda: make(0.5, Flooding()).start(START, runs=(2,))),
-        ("prior", lambda: make(0.5, Flooding()).start(START + 1)),
-        ("prior", lambda: make(0.5, Flooding()).start(np.full((SIZE, 2), np.nan))),
+        ("positions", lambda: make(0.5, Flooding()).start(START + 1)),
+        ("positions", lambda: make(0.5, Flooding()).start(np.full((SIZE, 2), np.nan))),
         ("state", lambda: make(0.5, Flooding()).step(3, 0.1, START)),
         ("t", lambda: make(0.5, Flooding()).step(_STATE, 0.0, START)),
         ("observations", lambda: make(0.5, Flooding()).step(_STATE, 0.1, START[:3])),
-        ("observations", lambda: make(0.5, Flooding()).step(
+        ("positions", lambda: make(0.5, Flooding()).step(
             _STATE, 0.1, np.where(np.arange(24).reshape(12, 2) == 4, np.nan, START))),
         ("outside", lambda: make(0.5, Flooding()).step(
             _STATE, 0.1, np.where(np.arange(24).reshape(12, 2) == 4, 1.01, START))),
@@ -387,75 +385,12 @@ BAD_INPUT = {
         ("late", lambda: make(0.5, Flooding()).step(_STATE, 0.1, START, late=[1])),
         ("observations", lambda: make(0.5, Flooding()).run(_STATE, [0.1], PATH)),
     ],
-    "distfilt.density.sharing.PIConsensus": [
-        ("alpha", lambda: PIConsensus(alpha=-1.0)),
-        ("modes", lambda: PIConsensus(modes=0)),
-        ("first_std", lambda: PIConsensus(first_std=0.0)),
-        ("rate", lambda: PIConsensus(rate="yes")),
-    ],
-    "distfilt.density.sharing.DynamicAverage": [
-        ("modes", lambda: DynamicAverage(modes=0)),
-        ("rounds", lambda: DynamicAverage(rounds=0)),
-    ],
-    "distfilt.density.sharing.alone": [
-        ("sharing", lambda: alone(3, Seen(START, np.ones(SIZE, bool), GRID, H, 0.0)))
-    ],
-    "distfilt.density.sharing.Flooding": [
-        ("forget", lambda: Flooding(forget=0.0)),
-        ("forget", lambda: Flooding(forget=np.ma.masked_array(1.0, True))),
-    ],
-    "distfilt.density.seen.present_graph": [
-        ("graph", lambda: present_graph(3, np.ones(2, bool)))
-    ],
 }
 EXEMPT = {
     "distfilt.filters.density.DensityState": "made by the filter; its fields are checked there",
-    "distfilt.density.seen.Seen": "made by the filter from checked positions",
-    "distfilt.density.sharing.Sharing": "a protocol",
-    "distfilt.density.sharing.Centralised": "takes no input",
-    "distfilt.density.sharing.Neighbours": "takes no input",
 }
 
 
-def test_an_agent_that_has_gone_measures_nothing_and_nobody_hears_of_less_than_one() -> None:
-    present = np.array([True, False, True, True])
-    x = np.full((4, 2), 0.5)
-    seen = Seen(x, present, GRID, H, 0.0)
-    one = kernel_noise(np.ones(100), GRID, bandwidth=H, agents=1)
-    got = seen.noise(np.ones((4, 100)), np.array([4.0, 9.0, 0.5, 1.0]), 0.1)
-    assert np.isinf(got[1]).all()
-    assert np.allclose(got[[0, 2, 3]], one / np.array([[4.0], [1.0], [1.0]]))
-    few = Seen(x, present, GRID, H, 0.0, (3, 1, 0))
-    assert np.array_equal(few.noise(np.ones((3, 100)), np.array([4.0, 9.0, 0.5, 1.0]), 0.1),
-                          got[[3, 1, 0]])
-
-
 def test_seen_kernels_of_the_gone_are_zero() -> None:
-    present = np.array([True, False])
-    seen = Seen(np.array([[0.5, 0.5], [0.0, 0.0]]), present, GRID, H, 0.0)
+    seen = Seen(np.array([[0.5, 0.5], [np.nan, np.nan]]), GRID, H, 0.0)
     assert seen.kernels[1].max() == 0 and GRID.integral(seen.kernels[0]) == pytest.approx(1)
-
-
-@pytest.mark.parametrize(
-    "rule", [PIConsensus(), DynamicAverage(), Flooding(), Neighbours(), Centralised()]
-)
-def test_a_rule_refuses_what_it_cannot_have_carried(rule) -> None:
-    seen = Seen(START, np.ones(SIZE, bool), GRID, H, 0.0)
-    channel, kept = Channel(graphs.path(SIZE)), rule.begin(seen)
-    for name, call in {
-        "seen": lambda: rule.begin(3.5),
-        "carried": lambda: rule.learn((*kept, np.ones(3)), seen, channel, 0.1),
-        "channel": lambda: rule.learn(kept, seen, graphs.path(SIZE), 0.1),
-        "channel:": lambda: rule.learn(kept, seen, Channel(graphs.path(SIZE - 1)), 0.1),
-        "dt": lambda: rule.learn(kept, seen, channel, 0.0),
-    }.items():
-        with pytest.raises(ValueError, match=rf"^{name}"):
-            call()
-    with pytest.raises(ValueError, match="^seen"):
-        rule.learn(kept, "text", channel, 0.1)
-    for part in range(len(kept)):
-        for wrong in (np.nan * kept[part], kept[part][:-1], kept[part].astype(str)):
-            with pytest.raises(ValueError, match="^carried"):
-                rule.learn((*kept[:part], wrong, *kept[part + 1 :]), seen, channel, 0.1)
-    again = rule.learn([part.tolist() for part in kept], seen, channel, 0.1)
-    assert np.array_equal(again[1], rule.learn(kept, seen, channel, 0.1)[1])

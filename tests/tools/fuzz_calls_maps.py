@@ -19,7 +19,7 @@ from distfilt import (
     triangular,
 )
 from distfilt import density as densities
-from distfilt.density.seen import Seen
+from distfilt.density.sharing import Seen
 from distfilt.models import Swarm
 from distfilt.network import Channel, graphs
 
@@ -95,30 +95,24 @@ def the_options() -> None:
 
 def the_processes() -> None:
     mean, q = np.zeros(2), np.array([[0.1], [0.2]])
-    dense, low = densities.Dense(mean, np.eye(2)), densities.LowRank(mean, np.eye(2))
+    dense = densities.Dense(mean, np.eye(2))
     densities.dense_step(dense, np.asarray, [1.0, 1.0], [1.0, 3.0], 1.0, process=q)
-    densities.low_rank_step(low, np.asarray, [1.0, 1.0], [1.0, 3.0], 1.0, process=q)
-    each = densities.filters_start(np.eye(2), np.zeros((1, 2)), exact=False)
-    densities.filters_step(each, np.asarray, [[1.0, 1.0]], np.ones_like, 1.0, process=q)
+    each = densities.low_rank_start(np.eye(2), np.zeros((1, 2)))
+    moved = densities.low_rank_moved(each, np.asarray, process=q, dt=1.0)
+    densities.low_rank_step(moved, [[1.0, 1.0]], [1.0, 3.0], 1.0)
 
 
 def the_grids() -> None:
     grid = densities.Grid((4, 6), low=[0.0, 0.0], high=[1.0, 1.5])
     values = 1.0 + np.arange(24.0) / 24
     places = np.array([[0.2, 0.3], [0.9, 1.4], [0.5, 0.75]])
-    grid.check(values)
     grid.norm(values)
     grid.normalised(values)
-    grid.mean(values)
     grid.integral(values)
-    grid.inside(places)
     grid.cells(places)
     grid.histogram(places)
     grid.at(values, places)
     grid.aggregated(values, densities.Grid((2, 3), low=[0.0, 0.0], high=[1.0, 1.5]))
-    grid.same_box(densities.Grid((2, 3)))
-    grid.axis(1)
-    grid.edges(1)
     grid.wavenumbers(5)
     grid.cosines(5)
 
@@ -133,7 +127,7 @@ def the_flows() -> None:
         flow.solver(0.5, 0.1)
         flow.step(values, 0.5, 0.1)
         flow.evolve(values, [0.5, 1.0], t0=0.25, substeps=2)
-    state = densities.Shared(np.eye(3)[:, :2], np.ones((2, 3)), np.tile(np.eye(2), (2, 1, 1)),
+    state = densities.LowRank(np.eye(3)[:, :2], np.ones((2, 3)), np.tile(np.eye(2), (2, 1, 1)),
                              np.ones((2, 2)))  # fmt: skip
     state.covariance(1)
 
@@ -141,7 +135,7 @@ def the_flows() -> None:
 def the_sharing() -> None:
     grid = densities.Grid((5, 5))
     positions = np.array([[0.2, 0.3], [0.8, 0.7], [0.5, 0.5]])
-    seen = Seen(positions, np.ones(3, dtype=bool), grid, 0.2, 0.0)
+    seen = Seen(positions, grid, 0.2, 0.0)
     for rule in (
         densities.Centralised(), densities.Neighbours(), densities.Flooding(),
         densities.PIConsensus(modes=4, first_std=0.3, rate=True),
