@@ -47,7 +47,7 @@ class DensityState(State):
 
     Examples
     --------
-    >>> filters = low_rank_start(np.ones((4, 1)), np.ones((1, 4)))
+    >>> filters = low_rank.low_rank_start(np.ones((4, 1)), np.ones((1, 4)))
     >>> DensityState(0.0, Ledger.empty(1), None, np.zeros((1, 2)), (), np.ones((1, 4)),
     ...              np.ones(1), 1, filters).estimates.shape
     (1, 4)
