@@ -10,7 +10,7 @@ import pytest
 from distfilt import checks, density, ensembles, linalg, mixtures, models, sensors
 from distfilt.coupling import ensemble_transform, sorted_plan
 from distfilt.kalman import kalman_filter
-from distfilt.mixtures import GaussianMixture, PartialFusion, unscented
+from distfilt.mixtures import GaussianMixture, PartialFusion, moved
 from distfilt.models import constant_velocity, simulate
 from distfilt.network import Channel, Graph, covariance_intersection, graphs, stable_substeps
 from distfilt.triangular import affine, pool_by_moments, separable
@@ -71,8 +71,7 @@ BOUNDS: list[tuple[str, Callable[[], object]]] = [
     ("noise: needs leading axes \\(3, 2\\), got \\(4, 2\\)", lambda: known_noise(
         np.tile(DRAWN, (3, 2, 1, 1)), np.tile(DRAWN[:, :1], (3, 2, 1, 1)), np.zeros((3, 2, 1)),
         np.ones((4, 2, 1, 1)), rng=RNG(0))),
-    ("noise_factor: needs 2 rows, got 1", lambda: unscented.forecast(
-        [0.0, 0.0], np.eye(2), lambda x: x, np.ones((1, 3)))),
+    ("noise_factor: needs 2 rows, got 1", lambda: moved(TWO, lambda x: x, np.ones((1, 3)))),
     ("agents from 0 to 1", lambda: Graph.from_edges(2, [[0, 2]])),
     ("agents from 0 to 1", lambda: Graph.from_edges(2, [[0, 0.5]])),
     ("adjacency: needs zeros and ones, got 7", lambda: Graph.from_adjacency([[0, 7], [1, 0]])),
