@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -126,8 +126,8 @@ class MixtureFilter(TeamFilter):
     size: int = 12
     most: int = 12
     stretch: float | None = None
-    scale: ArrayLike | None = None
-    rule: str = "dd2"
+    scale: Any = None
+    rule: Literal["dd2", "unscented"] = "dd2"
     gate: float | None = None
     faults: Faults | None = None
     names: Sequence[str] = ()

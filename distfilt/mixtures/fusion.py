@@ -19,9 +19,9 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..checks import SolverError
 from ..doors import Array, Count, Record, Share, door, summing_to_one, unchecked
 from ..gaussians.points import unscented_points
+from ..linalg import SolverError
 from .gaussian import GaussianMixture, log_sum
 from .mixands import Shapes, conditional_shapes, literal_shapes, nonnegative_least_squares
 from .reduction import runnalls

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 
 from ..doors import Array, Count, Cov, Places, Record, Rng, definite, door, summing_to_one
-from ..linalg import _symmetrise as symmetrise
+from ..linalg import symmetrise
 
 __all__ = ["ExponentialQuadratics", "GaussianMixture"]
 

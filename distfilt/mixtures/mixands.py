@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from scipy.linalg import svdvals
 from scipy.optimize import nnls
 
-from ..checks import SolverError
 from ..doors import Array, Bounds, Index, Mask, Record, definite, door, unchecked
-from ..linalg import _symmetrise as symmetrise
+from ..linalg import SolverError, symmetrise
 from .gaussian import GaussianMixture, inverse
 
 __all__ = ["Shapes", "conditional_shapes", "literal_shapes", "nonnegative_least_squares",

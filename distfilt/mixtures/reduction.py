@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from ..doors import Array, Bounds, Count, Mask, NonNegative, door, needed, unchecked
-from ..linalg import _symmetrise as symmetrise
+from ..linalg import symmetrise
 from .divergence import gaussian_divergences
 from .gaussian import GaussianMixture
 from .mixands import Shapes

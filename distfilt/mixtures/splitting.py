@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from ..doors import Array, Bounds, Count, Positive, door, unchecked
-from ..linalg import _symmetrise as symmetrise
+from ..linalg import symmetrise
 from .gaussian import GaussianMixture
 
 __all__ = ["arc", "split", "split_library", "split_stretched", "stretching"]
