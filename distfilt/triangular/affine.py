@@ -18,7 +18,7 @@ from threading import Lock
 from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from .. import ensembles
 from ..doors import Array, Count, Record, door, needed, unchecked
@@ -54,13 +54,13 @@ class ConditionalMap(Protocol):
            [13.]])
     """
 
-    def __call__(self, y: ArrayLike, x: ArrayLike) -> Array:
+    def __call__(self, y: Array, x: Array) -> Array:
         """Reference samples of members."""
 
-    def inverse(self, y: ArrayLike, z: ArrayLike) -> Array:
+    def inverse(self, y: Array, z: Array) -> Array:
         """Members of reference samples."""
 
-    def log_det(self, y: ArrayLike, x: ArrayLike) -> Array:
+    def log_det(self, y: Array, x: Array) -> Array:
         """Log-determinant at each member."""
 
 
