@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from bookkit import studies
-from bookkit.published import Reading, scenario
+from bookkit.published import Scenario, scenario
 from distfilt.filters import EnsembleFilter
 from distfilt.models import Model, clohessy_wiltshire, satellite_pose, simulate
 from distfilt.network import Graph, intersection, pull
@@ -39,7 +39,7 @@ EVERY = 5
 class Setup:
     """Everything that a study of one table reads of its scenario, read when it is made."""
 
-    scenario: Reading
+    scenario: Scenario
     model: Model
     still: Model
     sensors: tuple[Sensor, ...]

@@ -7,13 +7,10 @@ Every family runs with three strengths of its own remedy for a spread that is to
 
 from __future__ import annotations
 
-import warnings
 from functools import partial
 
 import numpy as np
 
-from distfilt.doors import unchecked
-from distfilt.filters import ParticleCollapse
 from distfilt.metrics import crps
 from distfilt.models import lorenz63, simulate
 from distfilt.updates import (
@@ -24,9 +21,7 @@ from distfilt.updates import (
     resampled,
     square_root,
 )
-
-# Strengths that are too weak are part of the study.
-warnings.filterwarnings("ignore", category=ParticleCollapse)
+from distfilt.updates.door import unchecked
 
 NAME = "lorenz-coupling"
 PAPER = "das"

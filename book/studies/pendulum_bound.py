@@ -9,15 +9,12 @@ the chart.
 # ruff: noqa: SIM300
 from __future__ import annotations
 
-import warnings
 from functools import partial
 
 import numpy as np
 
 from bookkit.published import scenario
 from distfilt.coupling import norm, retract
-from distfilt.doors import unchecked
-from distfilt.filters import ParticleCollapse
 from distfilt.metrics import crps
 from distfilt.models import pendulum, pendulum_angle, pendulum_chart, pendulum_states
 from distfilt.updates import (
@@ -29,9 +26,7 @@ from distfilt.updates import (
     retracted,
     square_root,
 )
-
-# The study counts the runs that lose the truth.
-warnings.filterwarnings("ignore", category=ParticleCollapse)
+from distfilt.updates.door import unchecked
 
 NAME = "pendulum-bound"
 PAPER = "das"

@@ -19,29 +19,17 @@ from typing import Any
 
 import nbformat
 
+from bookkit import published
+from bookkit.rows import read_rows
 from common import ROOT, VERDICT, chapters
 
 ITEMS = ROOT / "data" / "published" / "items.csv"
 LEDGER = ROOT / "data" / "published" / "ledger.csv"
 COLUMNS = ("paper", "item", "kind", "chapter", "verdict", "ours", "published", "why")
 OPEN = "not yet"
-VERDICTS = {
-    "parameters": ("read", "differs", "not comparable", OPEN),
-    "results": ("match", "differs", "not comparable", OPEN),
-}
-"""What can be found of each kind of item: a study reads parameters and reproduces results."""
+VERDICTS = {kind: (*found, OPEN) for kind, found in published.VERDICTS.items()}
+"""What can stand in the ledger for each kind of item."""
 WORDS = {"parameters": "tables of parameters", "results": "tables and figures of results"}
-
-
-def rows_of(path: Path) -> list[dict[str, str]]:
-    """Return a CSV file's rows; a row that does not fit its header is an error."""
-    with path.open(encoding="utf-8", newline="") as lines:
-        reader = csv.DictReader(lines, strict=True)
-        rows = list(reader)
-    for number, row in enumerate(rows, start=2):
-        if None in row or None in row.values():
-            sys.exit(f"{path.name}, row {number}: needs {len(reader.fieldnames or [])} values")
-    return rows
 
 
 def verdicts_of(notebook: Path) -> list[dict[str, str]]:
@@ -107,7 +95,7 @@ def current() -> str:
     """Return the ledger that the stored chapters give now."""
     stored = [chapter.with_suffix(".ipynb") for chapter in chapters()]
     verdicts = [v for path in stored if path.is_file() for v in verdicts_of(path)]
-    return text_of(ledger(rows_of(ITEMS), verdicts))
+    return text_of(ledger(read_rows(ITEMS), verdicts))
 
 
 def main() -> int:
@@ -119,7 +107,7 @@ def main() -> int:
         LEDGER.write_text(text, encoding="utf-8")
     elif not LEDGER.is_file() or LEDGER.read_text(encoding="utf-8") != text:
         sys.exit(f"{LEDGER.name} is not what the stored chapters give: make outputs")
-    for kind, (total, counts) in summaries(rows_of(LEDGER)).items():
+    for kind, (total, counts) in summaries(read_rows(LEDGER)).items():
         print(f"{total} {WORDS[kind]}: " + ", ".join(f"{n} {v}" for v, n in counts.items()))
     return 0
 

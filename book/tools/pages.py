@@ -12,8 +12,9 @@ from typing import Any
 from docutils import nodes
 from sphinx.pycode import ModuleAnalyzer
 
+from bookkit.rows import read_rows
 from common import ROOT, SLIDER, toc_pages
-from ledger import ITEMS, LEDGER, WORDS, rows_of, summaries
+from ledger import ITEMS, LEDGER, WORDS, summaries
 
 PAPERS = {
     "grange": "Triangular transport maps",
@@ -197,8 +198,8 @@ def chapter_link(chapter: str) -> str:
 
 def reproductions_text() -> str:
     """Return the count of verdicts and one table for each paper."""
-    titles = {(item["paper"], item["item"]): item["title"] for item in rows_of(ITEMS)}
-    rows = rows_of(LEDGER)
+    titles = {(item["paper"], item["item"]): item["title"] for item in read_rows(ITEMS)}
+    rows = read_rows(LEDGER)
     lines = []
     for kind, (total, counts) in summaries(rows).items():
         shown = ", ".join(f"{n} *{verdict}*" for verdict, n in counts.items())

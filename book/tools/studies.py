@@ -6,13 +6,13 @@ Each ``book/studies/*.py`` defines one study, which serves one item: ``NAME`` (t
 ``figure-2``), ``PAPER`` (a key of the papers), ``trial``, ``parameters``, ``columns`` and
 ``seeds``; and if it wants ``code`` (other functions whose source is recorded), ``rtol``, ``atol``,
 ``rough`` and ``odd`` (what a later run may differ by, as in ``studies.check``; the same bits
-without them), ``timeout`` (seconds for one trial) and ``scenarios`` (those that it reads). A
-scenario's digest is stored among the parameters, and one that is not as accepted is refused: what
-is stored is the book's own study. What several scripts share stands in
-``book/studies/_NAME.py``, which they import by that name.
+without them) and ``scenarios`` (those that it reads). A scenario's digest is stored among the
+parameters, and one that is not as accepted is refused: what is stored is the book's own study.
+What several scripts share stands in ``book/studies/_NAME.py``, which they import by that name.
 
-Metrics go to ``data/studies/PAPER/NAME.csv``; ``studies.stored(PAPER, NAME)`` finds them. With
-``--check`` nothing is written: every stored trial runs again and is compared.
+Metrics go to ``data/studies/PAPER/NAME.csv``; ``studies.stored(PAPER, NAME)`` finds them. A run
+that is stopped goes on with the same command. With ``--check`` nothing is written: every stored
+trial runs again and is compared.
 """
 
 from __future__ import annotations
@@ -27,10 +27,8 @@ from types import ModuleType
 from typing import Any
 
 from bookkit import studies
-from bookkit.published import PAPERS, Scenario
-from bookkit.studies.files import jsons
-from bookkit.studies.seeds import recipes
-from bookkit.studies.study import column_names
+from bookkit.published import PAPERS
+from bookkit.studies.files import plain_json, seed_text
 from common import ROOT
 
 ALLOWED = ("rtol", "atol", "rough", "odd")
@@ -45,18 +43,14 @@ def load_script(path: Path) -> ModuleType:
     ValueError
         If it lacks one of the names, or NAME or PAPER is not one.
     """
-    script = studies.script(path)
+    script = studies.script(path.stem, folder=path.parent)
     lacking = [name for name in NEEDED if not hasattr(script, name)]
     if lacking:
         raise ValueError(f"{path.name}: has to define {', '.join(lacking)}")
-    # A name that cannot be stored is found out now, not after the last trial.
-    column_names(script.columns)
     if script.PAPER not in PAPERS:
         raise ValueError(f"{path.name}: PAPER needs one of {PAPERS}, got {script.PAPER!r}")
     if not isinstance(script.NAME, str) or not re.fullmatch(r"[a-z0-9][a-z0-9-]*", script.NAME):
         raise ValueError(f"{path.name}: NAME needs small letters, digits, -, got {script.NAME!r}")
-    if not all(isinstance(s, Scenario) for s in getattr(script, "scenarios", ())):
-        raise ValueError(f"{path.name}: scenarios needs what bookkit.published.scenario returns")
     return script
 
 
@@ -99,43 +93,41 @@ def orphans(root: Path, known: list[ModuleType]) -> list[str]:
 
 
 def run(script: ModuleType, root: Path, workers: int | None) -> None:
-    """Run one study at full size and store it."""
-    study = studies.run(
+    """Run one study at full size, or what is left of it, and store it."""
+    began = time.perf_counter()
+    path = studies.store(
+        target(script, root),
         script.trial,
         script.seeds,
-        errors="collect",
-        workers=workers,
-        timeout=getattr(script, "timeout", None),
-    )
-    for failure in study.failures:
-        print(f"  {failure}", file=sys.stderr)
-    path = studies.store(
-        study,
-        target(script, root),
-        parameters=parameters_of(script),
         columns=script.columns,
+        parameters=parameters_of(script),
         code=getattr(script, "code", ()),
+        workers=workers,
     )
-    print(f"{path.relative_to(root)}: {study!r}, {study.seconds:.0f} s", flush=True)
+    stored, seconds = studies.load(path), time.perf_counter() - began
+    failed = [f"trial {k}: {kind}" for k, kind in enumerate(stored.failures) if kind]
+    print(*failed, sep="\n", end="\n" * bool(failed), file=sys.stderr)
+    print(f"{path.relative_to(root)}: {len(stored)} trials, {seconds:.0f} s", flush=True)
 
 
 def check(script: ModuleType, root: Path, workers: int | None) -> str:
     """Run one study's stored trials again; return what is wrong, or ''."""
     path, began = target(script, root), time.perf_counter()
+    shown = path.relative_to(root)
     if not path.is_file():
-        return f"{path.relative_to(root)}: not stored yet: make studies"
+        return f"{shown}: not stored yet: make studies"
     options = {name: getattr(script, name) for name in ALLOWED if hasattr(script, name)}
     try:
         stored = studies.check(path, script.trial, workers=workers, **options)
     except (AssertionError, ValueError) as error:
         return str(error)
-    if recipes(script.seeds) != stored.recipes:
-        return f"{path.relative_to(root)}: the script has other seeds: make studies"
-    written = {name: json.loads(text) for name, text in jsons(parameters_of(script)).items()}
+    if tuple(map(seed_text, script.seeds)) != stored.seeds:
+        return f"{shown}: the script has other seeds: make studies"
+    written = {name: json.loads(text) for name, text in plain_json(parameters_of(script)).items()}
     if written != stored.parameters or tuple(script.columns) != tuple(stored.columns):
-        return f"{path.relative_to(root)}: the script has other parameters: make studies"
-    print(f"{path.relative_to(root)}: {len(stored)} trials agree, "
-          f"{time.perf_counter() - began:.0f} s", flush=True)
+        return f"{shown}: the script has other parameters: make studies"
+    seconds = time.perf_counter() - began
+    print(f"{shown}: {len(stored)} trials agree, {seconds:.0f} s", flush=True)
     return ""
 
 

@@ -5,9 +5,9 @@
 A trial sleeps for 10 ms and returns how long it really took. The overhead per trial is what the
 workers spent on anything else: workers * wall time / trials - mean time of a trial. It is measured
 on a pool whose processes run already, the median of several studies; starting the processes is
-timed apart. Beside it: every trial as a chunk of its own, loky itself with one call a trial, the
-standard library's pool with chunks, and joblib. Ends with an error if `run` on two workers takes
-more than 0.15 ms a trial.
+timed apart. Beside it: `store`, which puts every trial on disk, loky itself with one call a trial,
+the standard library's pool with chunks, and joblib. Ends with an error if `run` on two workers
+takes more than 0.15 ms a trial.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from tempfile import mkdtemp
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
@@ -36,9 +37,21 @@ def trial(seed: SeedSequence) -> float:
     return time.perf_counter() - began
 
 
-def by_run(workers: int, chunk: int | None) -> Callable[[], Sequence[float]]:
+def by_run(workers: int) -> Callable[[], Sequence[float]]:
     seeds = studies.spawn(1, TRIALS)
-    return lambda: studies.run(trial, seeds, workers=workers, chunk=chunk, progress=False).values
+    return lambda: studies.run(trial, seeds, workers=workers, progress=False).values
+
+
+def by_store(workers: int) -> Callable[[], Sequence[float]]:
+    """Each trial on disk before its worker gets the next one."""
+    seeds, path = studies.spawn(1, TRIALS), Path(mkdtemp()) / "study.csv"
+
+    def call() -> Sequence[float]:
+        studies.store(path, trial, seeds, columns=["seconds"], parameters={}, workers=workers,
+                      progress=False)  # fmt: skip
+        return list(studies.load(path).metric("seconds"))
+
+    return call
 
 
 def by_loky(workers: int) -> Callable[[], Sequence[float]]:
@@ -74,10 +87,10 @@ def overheads(call: Callable[[], Sequence[float]], workers: int) -> tuple[list[f
 def main() -> int:
     rows, missed = [], []
     for workers in (1, 2):
-        cases = {"run": by_run(workers, None)}
+        cases = {"run": by_run(workers)}
         if workers > 1:
             cases |= {
-                "run, chunk=1": by_run(workers, 1),
+                "store": by_store(workers),
                 "loky, a call a trial": by_loky(workers),
                 "ProcessPoolExecutor, chunks of 20": by_pool(workers),
                 "joblib": by_joblib(workers),

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ledger import COLUMNS, ITEMS, LEDGER, VERDICTS, current, ledger, rows_of, summaries, text_of
+from bookkit.rows import read_rows
+from ledger import COLUMNS, ITEMS, LEDGER, VERDICTS, current, ledger, summaries, text_of
 
 ITEM = {
     "paper": "grange",
@@ -33,10 +34,10 @@ def test_ledger_is_what_the_chapters_give() -> None:
 
 
 def test_ledger_has_every_item_once() -> None:
-    papers = Counter(row["paper"] for row in rows_of(ITEMS))
+    papers = Counter(row["paper"] for row in read_rows(ITEMS))
     assert papers == {"grange": 5, "das": 5, "semeraro": 9, "zheng": 2}
-    items = [(row["paper"], row["item"]) for row in rows_of(ITEMS)]
-    rows = rows_of(LEDGER)
+    items = [(row["paper"], row["item"]) for row in read_rows(ITEMS)]
+    rows = read_rows(LEDGER)
     assert [(row["paper"], row["item"]) for row in rows] == items
     assert len(set(items)) == 21
     for row in rows:
@@ -83,4 +84,4 @@ def test_malformed_items_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "items.csv"
     path.write_text("paper,item\ngrange\n", encoding="utf-8")
     with pytest.raises(SystemExit, match="row 2"):
-        rows_of(path)
+        read_rows(path)

@@ -10,10 +10,11 @@ from types import ModuleType
 import jupytext
 import pytest
 
-from bookkit.published import items, root, scenario
+from bookkit.folders import data_root
+from bookkit.published import items, scenario
 from common import BOOK, ROOT, chapters
 
-NAMES = sorted((p.parent.name, p.stem) for p in (root() / "scenarios").glob("*/*.toml"))
+NAMES = sorted((p.parent.name, p.stem) for p in (data_root() / "scenarios").glob("*/*.toml"))
 
 
 def code_of(path: Path) -> str:

@@ -51,8 +51,6 @@ def test_a_good_script_is_taken(tool: ModuleType, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [
-        ('["a", "b"]', '["a b", "c"]', "columns"),
-        ('["a", "b"]', '["a", "a"]', "columns"),
         ("def trial", "def try_it", "has to define trial"),
         ('"grange"', '"grunge"', "PAPER"),
         ('"small"', '"Small one"', "NAME"),
@@ -99,7 +97,8 @@ def test_make_studies_stores_and_checks(
     assert tool.main(["--workers", "2"], tmp_path) == 0
     path = tmp_path / "data" / "studies" / "zheng" / "spread.csv"
     stored = studies.load(path)
-    assert len(stored) == 12 and stored.parameters == {"members": 20} and "trial" in stored.code
+    assert len(stored) == 12 and stored.parameters == {"members": 20}
+    assert "trial" in stored.heads["code"]
     assert tool.main(["spread", "--check", "--workers", "1"], tmp_path) == 0
     assert tool.main(["sprawl"], tmp_path) == 1
     capsys.readouterr()
@@ -140,7 +139,7 @@ import _common
 from bookkit.published import scenario
 from bookkit.studies import spawn
 NAME, PAPER, columns, parameters = "table-2", "grange", ["a", "b"], {"gain": 1}
-seeds, scenarios, timeout = spawn(1, 4), [scenario("grange", "table-2")], 30.0
+seeds, scenarios = spawn(1, 4), [scenario("grange", "table-2")]
 def trial(seed):
     return _common.shared(seed)
 """

@@ -1,4 +1,4 @@
-"""What the figures draw, and what their digests notice and overlook."""
+"""What the figures draw, and pictures that move."""
 
 from __future__ import annotations
 
@@ -10,27 +10,21 @@ import re
 import matplotlib
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 matplotlib.use("Agg")
 from matplotlib import pyplot
 from matplotlib.colors import to_rgb
 
-from bookkit import plotting
 from bookkit.plotting import (
     LINE_STYLES,
     PALETTE,
     SIZE,
-    Slider,
     axes,
     band,
     colour,
-    digest,
     ellipse,
     graph,
     line_style,
-    save,
     slider,
     use_style,
 )
@@ -61,129 +55,7 @@ def noise(seed):
     return ax.figure
 
 
-EYE = np.eye(2)
-RUNS = np.arange(12.0).reshape(4, 3)
 PAIR = [[0, 1], [1, 0]]
-
-_CASES = {
-    "colour": [("index", lambda: colour(-1)), ("index", lambda: colour(0.5))],
-    "line_style": [("index", lambda: line_style(-1)), ("index", lambda: line_style("-"))],
-    "axes": [
-        ("xlabel", lambda: axes(xlabel="", ylabel="y")),
-        ("ylabel", lambda: axes(xlabel="x", ylabel=None)),
-        ("xunit", lambda: axes(xlabel="x", ylabel="y", xunit=" ")),
-        ("yunit", lambda: axes(xlabel="x", ylabel="y", yunit=1)),
-        ("title", lambda: axes(xlabel="x", ylabel="y", title="")),
-        ("ax", lambda: axes(xlabel="x", ylabel="y", ax="here")),
-        ("xscale", lambda: axes(xlabel="x", ylabel="y", xscale="cubic")),
-        ("yscale", lambda: axes(xlabel="x", ylabel="y", yscale="dB")),
-        ("size", lambda: axes(xlabel="x", ylabel="y", size=(6, 0))),
-        ("size", lambda: axes(xlabel="x", ylabel="y", size=6)),
-    ],
-    "ellipse": [
-        ("ax", lambda: ellipse(None, [0, 0], EYE)),
-        ("mean", lambda: ellipse(blank(), [0, 0, 0], EYE)),
-        ("covariance", lambda: ellipse(blank(), [0, 0], np.eye(3))),
-        ("covariance", lambda: ellipse(blank(), [0, 0], [[1, 2], [2, 1]])),
-        ("covariance", lambda: ellipse(blank(), [0, 0], [[1, 0.5], [0, 1]])),
-        ("level", lambda: ellipse(blank(), [0, 0], EYE, level=1)),
-        ("index", lambda: ellipse(blank(), [0, 0], EYE, index=-1)),
-        ("label", lambda: ellipse(blank(), [0, 0], EYE, label=3)),
-    ],
-    "band": [
-        ("ax", lambda: band(3, np.arange(3), RUNS)),
-        ("x", lambda: band(blank(), [0, 0, 1], RUNS)),
-        ("runs", lambda: band(blank(), np.arange(4), RUNS)),
-        ("runs", lambda: band(blank(), np.arange(3), np.full((2, 3), np.nan))),
-        ("runs", lambda: band(blank(), np.arange(3), np.zeros((0, 3)))),
-        ("quantiles", lambda: band(blank(), np.arange(3), RUNS, quantiles=(0.9, 0.1))),
-        ("quantiles", lambda: band(blank(), np.arange(3), RUNS, quantiles=(-0.1, 0.9))),
-        ("quantiles", lambda: band(blank(), np.arange(3), RUNS, quantiles=(25, 75))),
-        ("index", lambda: band(blank(), np.arange(3), RUNS, index=None)),
-        ("label", lambda: band(blank(), np.arange(3), RUNS, label=" ")),
-    ],
-    "graph": [
-        ("ax", lambda: graph(None, PAIR)),
-        ("adjacency", lambda: graph(blank(), [[0, 1], [0, 0]])),
-        ("adjacency", lambda: graph(blank(), [[0, 1]])),
-        ("adjacency", lambda: graph(blank(), np.zeros((0, 0)))),
-        ("labels", lambda: graph(blank(), PAIR, labels=["A"])),
-        ("labels", lambda: graph(blank(), PAIR, labels=["A", 2])),
-        ("positions", lambda: graph(blank(), PAIR, positions=[[0, 1]])),
-        ("known", lambda: graph(blank(), PAIR, known=[0.0, 1.5])),
-        ("known", lambda: graph(blank(), PAIR, known=[-0.1, 1.0])),
-        ("known", lambda: graph(blank(), PAIR, known=[1.0])),
-        ("notes", lambda: graph(blank(), PAIR, notes=["one"])),
-        ("notes", lambda: graph(blank(), PAIR, notes=3.5)),
-        ("notes", lambda: graph(blank(), PAIR, notes="ab")),
-        ("labels", lambda: graph(blank(), PAIR, labels="AB")),
-        ("notes", lambda: graph(blank(), PAIR, notes=["one", 2])),
-    ],
-    "save": [
-        ("figure", lambda: save(blank(), "a.png")),
-        ("path", lambda: save(blank().figure, "a.bmp")),
-        ("path", lambda: save(blank().figure, None)),
-    ],
-    "digest": [
-        ("arrays", lambda: digest()),
-        ("curve", lambda: digest(curve="abc")),
-        ("curve", lambda: digest(curve=[[1, 2], [3]])),
-    ],
-}
-_CASES |= {
-    "slider": [
-        ("draw", lambda: slider(3, [1.0], label="x", alt="y")),
-        ("draw", lambda: slider(lambda v: 3, [1.0], label="x", alt="y")),
-        ("draw", lambda: slider(lambda v: blank(), [1.0], label="x", alt="y")),
-        ("draw", lambda: slider(lambda v: curve(v, width=v), [3.0, 4.0], label="x", alt="y")),
-        ("values", lambda: slider(curve, [], label="x", alt="y")),
-        ("values", lambda: slider(curve, "abc", label="x", alt="y")),
-        ("values", lambda: slider(curve, object(), label="x", alt="y")),
-        ("values", lambda: slider(curve, np.array(1.0), label="x", alt="y")),
-        ("label", lambda: slider(curve, [1.0], label=" ", alt="y")),
-        ("alt", lambda: slider(curve, [1.0], label="x", alt="")),
-        ("unit", lambda: slider(curve, [1.0], label="x", alt="y", unit="")),
-        ("form", lambda: slider(curve, [1.0], label="x", alt="y", form="d")),
-        ("start", lambda: slider(curve, [1.0], label="x", alt="y", start=1)),
-        ("seconds", lambda: slider(curve, [1.0], label="x", alt="y", seconds=0)),
-        ("colours", lambda: slider(curve, [1.0], label="x", alt="y", colours=1)),
-        ("colours", lambda: slider(curve, [1.0], label="x", alt="y", colours=300)),
-        ("frames", lambda: slider(noise, range(4), label="x", alt="y", form="d", colours=256)),
-    ],
-    "Slider": [
-        ("frames", lambda: Slider((), (), (), label="x", alt="y")),
-        ("frames", lambda: Slider(3.5, ("a",), ("b",), label="x", alt="y")),
-        ("frames", lambda: Slider(("a",), ("a",), ("b",), label="x", alt="y")),
-        ("said", lambda: Slider((b"",), "a", ("b",), label="x", alt="y")),
-        ("said", lambda: Slider((b"",), (None,), ("b",), label="x", alt="y")),
-        ("digests", lambda: Slider((b"",), ("a",), {"b": 1}, label="x", alt="y")),
-        ("digests", lambda: Slider((b"",), ("a",), (7.5,), label="x", alt="y")),
-        ("frames", lambda: Slider((b"",), (), ("",), label="x", alt="y")),
-    ],
-}  # fmt: skip
-_REFUSED = {f"bookkit.plotting.{name}": cases for name, cases in _CASES.items()} | {
-    "bookkit.digests.digest": _CASES["digest"]
-}
-_NONE = {
-    "bookkit.plotting.LINE_STYLES": "a constant",
-    "bookkit.plotting.PALETTE": "a constant",
-    "bookkit.plotting.SIZE": "a constant",
-    "bookkit.plotting.use_style": "takes no input",
-}
-
-
-@pytest.mark.parametrize("name", sorted(_REFUSED))
-def test_bad_input_is_named(name):
-    for argument, call in _REFUSED[name]:
-        with pytest.raises(ValueError, match=rf"^{argument}: "):
-            call()
-        pyplot.close("all")
-
-
-def test_every_public_name_has_bad_input_or_a_reason():
-    names = {f"bookkit.plotting.{name}" for name in plotting.__all__}
-    assert names <= _REFUSED.keys() | _NONE.keys()
-
 
 # --- figures ----------------------------------------------------------------------------------
 
@@ -271,19 +143,6 @@ def test_graph_draws_links_once():
     assert not alone.lines and alone.collections[0].get_offsets().tolist() == [[0.0, 0.0]]
     placed = graph(blank(), PAIR, positions=[[0, 0], [2, 1]])
     assert placed.lines[0].get_xydata().tolist() == [[0, 0], [2, 1]]
-
-
-@pytest.mark.parametrize("suffix", [".png", ".svg"])
-def test_the_same_figure_is_the_same_file(tmp_path, suffix):
-    use_style()
-    files = []
-    for k in range(2):
-        ax = axes(xlabel="time", xunit="s", ylabel=r"error $\epsilon$", yunit="m")
-        band(ax, np.arange(3), RUNS, label="runs")
-        ax.legend()
-        files.append(save(ax.figure, tmp_path / f"{k}{suffix}").read_bytes())
-    assert files[0] == files[1]
-    assert b"matplotlib.org/" not in files[0] if suffix == ".png" else b"<dc:date>" not in files[0]
 
 
 def test_style_fixes_size_and_resolution():
@@ -375,72 +234,8 @@ def test_texts_of_a_slider_cannot_end_its_script():
     assert json.loads(page.scripts[0])["alt"] == "</script><b>x</b>" and not page.find("b")
 
 
-# --- the digest -------------------------------------------------------------------------------
-
-CURVES = st.lists(st.floats(-1e6, 1e6).map(lambda v: round(v, 3)), min_size=1, max_size=60)
-
-
-@settings(derandomize=True)  # a number may lie 1e-9 from a tie, by a chance of 1e-5 a number
-@given(CURVES, st.integers(0, 2**32 - 1))
-def test_digest_survives_rounding(values, seed):
-    curve = np.array(values)
-    noise = np.random.default_rng(seed).uniform(-1, 1, curve.size)
-    assert digest(curve=curve * (1 + 1e-9 * noise)) == digest(curve=curve)
-    assert digest(curve=curve + 1e-16 * np.abs(curve).max() * noise) == digest(curve=curve)
-
-
-@pytest.mark.parametrize("value", [1.0, 10.0, 1e-3, 0.12345, 12.345, 1.0005, 9.9995, -2.5e7, 1e-9])
-def test_digest_is_steady_at_round_numbers(value):
-    curve = np.array([value, 0.3 * value, -0.7 * value, 1.0])
-    texts = {digest(c=curve * (1 + e)) for e in (0.0, 1e-9, -1e-9, 1e-13, -1e-13)}
-    assert len(texts) == 1
-
-
-@given(
-    st.lists(st.integers(-50, 50), min_size=2, max_size=60), st.data(), st.sampled_from([-20, 20])
-)
-def test_digest_sees_one_changed_entry(values, data, change):
-    curve = np.array(values, dtype=float)
-    moved = curve.copy()
-    moved[data.draw(st.integers(0, len(values) - 1))] += change
-    # The projection moves by 20/sqrt(4n), at least 1.2, and its last digit is worth at most 0.1.
-    assert digest(c=curve) != digest(c=moved)
-
-
-def test_digest_sees_order_sign_and_size():
-    t = np.linspace(0, 6, 200)
-    curve = np.sin(t)
-    for other in (curve[::-1], -curve, 1.001 * curve, curve + 0.001, np.sin(t + 0.01), curve[:-1]):
-        assert digest(c=curve) != digest(c=other)
-    swapped = curve.copy()
-    swapped[[40, 60]] = swapped[[60, 40]]  # same range, mean and parity
-    assert digest(c=curve) != digest(c=swapped)
-    bumped = curve.copy()
-    bumped[100] += 0.02
-    assert digest(c=curve) != digest(c=bumped)
-
-
-def test_digest_text():
-    assert digest(a=[], b=np.zeros(3)) == ("a: 0 values\nb: 3 values, 0..0, mean 0, projection 0")
-    assert digest(a=[np.nan, np.nan]) == "a: 2 values, 2 NaN"
-    text = digest(a=[1.0, np.nan, np.inf, 2.0])
-    assert text.endswith("1 NaN, 1 infinite") and text.startswith("a: 4 values, 1..2, mean 1.5,")
-    moved = digest(a=[np.nan, 1.0, np.inf, 2.0])
-    assert moved != text
-    turn = np.linspace(0, 2 * np.pi, 101)[:-1]
-    assert "mean 0," in digest(a=np.sin(turn))
-    assert digest(a=np.array([123456, 234567])).startswith("a: 2 values, 1.235e+05..2.346e+05")
-
-
-def test_digest_is_the_documented_projection():
-    values = np.array([3.0, -1.0, 4.0, 1.5])
-    k = np.arange(4)
-    weights = np.array([1, -1, 1, -1]) * (1 + (k * (np.sqrt(5) - 1) / 2) % 1)
-    expected = weights @ values / np.linalg.norm(weights)
-    printed = float(digest(a=values).rsplit(" ", 1)[1])
-    assert printed == pytest.approx(expected, rel=6e-4)
-
-
-def test_each_axis_has_its_own_scale() -> None:
-    ax = plotting.axes(xlabel="time", ylabel="error", yscale="log")
-    assert (ax.get_xscale(), ax.get_yscale()) == ("linear", "log")
+def test_a_page_s_sliders_stay_small_and_of_one_size():
+    with pytest.raises(ValueError, match="^frames: needs at most 400000"):
+        slider(noise, range(4), label="x", alt="y", colours=256)
+    with pytest.raises(ValueError, match="^draw: needs figures of one size"):
+        slider(lambda v: curve(v, width=v), [3.0, 4.0], label="x", alt="y")

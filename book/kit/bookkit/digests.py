@@ -7,11 +7,11 @@ from itertools import groupby
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
-
-from distfilt.checks import Array, array
+from numpy.typing import ArrayLike, NDArray
 
 __all__ = ["digest", "of_axes"]
+
+Array = NDArray[np.float64]
 
 _GOLDEN = (np.sqrt(5) - 1) / 2
 _OFFSET = 0.03183098861837907
@@ -78,11 +78,7 @@ def digest(**arrays: ArrayLike) -> str:
     time: 3 values, 0..0.2, mean 0.1, projection 0.03765
     error: 3 values, 2..4, mean 3, projection 0.3368, 1 NaN
     """
-    if not arrays:
-        raise ValueError("arrays: needs at least one named array, got none")
-    return "\n".join(
-        f"{name}: {_summary(array(value, name, finite=False))}" for name, value in arrays.items()
-    )
+    return "\n".join(f"{name}: {_summary(_plain(value))}" for name, value in arrays.items())
 
 
 def of_axes(drawn: Any) -> str:
@@ -128,14 +124,13 @@ def of_axes(drawn: Any) -> str:
         for kind, many, coordinates in entries:
             first, counts[kind] = counts[kind] + 1, counts[kind] + many
             name = f"{kind} {first}" + (f"-{counts[kind]}" if many > 1 else "")
-            now = {axis: f"{_summary(values)}" for axis, values in coordinates.items()}
+            now = {axis: _summary(values) for axis, values in coordinates.items()}
             lines += [f"{name} {axis}: {t}" for axis, t in now.items() if before.get(axis) != t]
             before = now
         told = ", ".join(f"{n} {kind if n == 1 else _MANY[kind]}" for kind, n in counts.items())
         out += [f"axes {k}: {told or 'empty'}", *lines]
-    if all(line.endswith(": empty") for line in out):
-        raise ValueError("drawn: needs something that was drawn, got empty axes")
-    return "\n".join(out)
+    empty = all(line.endswith(": empty") for line in out)
+    return "an empty figure" if empty else "\n".join(out)
 
 
 _MANY = {"line": "lines", "patch": "patches", "collection": "collections", "image": "images"}
@@ -149,13 +144,7 @@ def _panels(drawn: Any) -> Iterator[Any]:
         drawn = drawn.get_axes()
     elif hasattr(drawn, "transData"):
         drawn = [drawn]
-    elif isinstance(drawn, np.ndarray):
-        drawn = drawn.ravel().tolist()
-    if not isinstance(drawn, Iterable):
-        raise ValueError(f"drawn: needs a figure or axes, got {type(drawn).__name__}")
-    for axes in drawn:
-        if not hasattr(axes, "transData"):
-            raise ValueError(f"drawn: needs a figure or axes, got {type(axes).__name__}")
+    for axes in np.ravel(np.asarray(drawn, dtype=object)):
         yield axes
         yield from _panels(axes.child_axes)
 

@@ -2,59 +2,43 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
-__all__ = ["data_root"]
+__all__ = ["data_root", "inside"]
 
-_PACKAGE = Path(__file__).resolve().parent
-_VARIABLE = "DISTFILT_DATA"
-
-
-def _complete(folder: Path) -> bool:
-    """Whether a folder is the data of this book: two known files tell it from another `data`."""
-    known = ("published/items.csv", "scenarios/accepted.csv")
-    return all((folder / name).is_file() for name in known)
+_REPOSITORY = Path(__file__).resolve().parents[3]
 
 
 def data_root() -> Path:
     """The folder that holds ``published``, ``scenarios`` and ``studies``.
 
-    The first of these that exists:
-
-    1. the folder that the environment variable ``DISTFILT_DATA`` names, and no other if it is set;
-    2. ``data`` in the folder where the process runs, or in the nearest folder above it, so that a
-       chapter reads the working copy that it belongs to;
-    3. ``data`` of the repository that holds this package.
-
-    A folder counts only if it holds ``published/items.csv`` and ``scenarios/accepted.csv``: the
-    ``data`` of another project is passed over.
-
-    Raises
-    ------
-    FileNotFoundError
-        If ``DISTFILT_DATA`` names a folder without these files, or there is no such folder.
+    It is ``data`` in the folder where the process runs or in the nearest one above it, so that a
+    chapter reads the working copy that it belongs to; else that of this repository. The ``data``
+    of another project, without ``published/items.csv``, is passed over.
 
     Examples
     --------
     >>> (data_root() / "published" / "items.csv").is_file()
     True
     """
-    named = os.environ.get(_VARIABLE, "")
-    if named:
-        folder = Path(named).expanduser().resolve()
-        if not _complete(folder):
-            raise FileNotFoundError(
-                f"{_VARIABLE}: needs a folder with published/items.csv and "
-                f"scenarios/accepted.csv, got {named!r}"
-            )
-        return folder
-    try:
-        here = Path.cwd()
-        above = [folder / "data" for folder in (here, *here.parents)]
-    except FileNotFoundError:  # the folder was deleted under the process
-        above = []
-    for folder in (*above, _PACKAGE.parents[2] / "data"):
-        if _complete(folder):
-            return folder
-    raise FileNotFoundError("no folder data with published and scenarios was found here or above")
+    here = Path.cwd()
+    for folder in (here, *here.parents, _REPOSITORY):
+        if (folder / "data" / "published" / "items.csv").is_file():
+            return folder / "data"
+    raise FileNotFoundError(f"no folder data with published/items.csv at {here} or above")
+
+
+def inside(folder: Path, paper: str, name: str, suffix: str) -> Path:
+    """The file ``FOLDER/PAPER/NAME.SUFFIX``; a name that is not one of those there is refused.
+
+    >>> inside(data_root() / "scenarios", "grange", "../das/pendulum", ".toml")
+    Traceback (most recent call last):
+    ValueError: name: needs one of table-2, table-3, got '../das/pendulum'
+    """
+    papers = ["", *sorted(p.name for p in folder.iterdir() if p.is_dir())]
+    if paper not in papers:
+        raise ValueError(f"paper: needs one of {', '.join(papers[1:])}, got {paper!r}")
+    there = sorted(p.stem for p in (folder / paper).glob(f"*{suffix}"))
+    if name not in there:
+        raise ValueError(f"name: needs one of {', '.join(there) or 'none yet'}, got {name!r}")
+    return folder / paper / f"{name}{suffix}"

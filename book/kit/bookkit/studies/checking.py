@@ -1,30 +1,58 @@
-"""Stored trials run again, and compared."""
+"""Stored trials run again and compared, and the scripts that made them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+import importlib.util
+import sys
+from collections.abc import Collection, Iterable, Mapping
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any
+from types import ModuleType
 
 import numpy as np
-from numpy.random import SeedSequence
 
-from distfilt.checks import callable_, count, number, places
+from ..folders import data_root, inside
+from .files import Stored, fingerprint, load
+from .running import Study, Trial, plain, row, run, sent_by_value, versions
 
-from ._worker import versions
-from .files import Stored, load
-from .running import run
-from .sources import fingerprints, name_of
-from .study import Study, row
+__all__ = ["check", "script"]
 
-__all__ = ["check"]
+
+def script(name: str, *, folder: Path | None = None) -> ModuleType:
+    """The module of a stored study, from ``book/studies`` beside the data.
+
+    It has the study's ``trial``, ``parameters``, ``columns`` and ``seeds``.
+
+    Parameters
+    ----------
+    name : str
+        The study's name, such as ``lorenz-63`` for ``lorenz_63.py``.
+    folder : Path, optional
+        Another folder of scripts.
+
+    Examples
+    --------
+    >>> script("../studies/lorenz-63")
+    Traceback (most recent call last):
+    ValueError: name: needs one of ... got '../studies/lorenz_63'
+    """
+    there = folder or data_root().parent / "book" / "studies"
+    path = inside(there, "", name.replace("-", "_"), ".py")
+    spec = importlib.util.spec_from_file_location(f"stored_study_{path.stem}", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    # inspect finds a class's source through sys.modules, and scripts share modules of their folder.
+    sys.modules[spec.name] = module
+    if str(path.parent) not in sys.path:
+        sys.path.insert(0, str(path.parent))
+    spec.loader.exec_module(module)
+    sent_by_value(path.parent)
+    return module
 
 
 def check(
-    path: str | Path | Stored, trial: Callable[[SeedSequence], Any], *,
-    indices: Iterable[int] | None = None, rtol: float = 0.0, atol: float = 0.0,
-    rough: Collection[str] = (), odd: int = 0,
+    path: str | Path | Stored, trial: Trial, *, indices: Iterable[int] | None = None,
+    rtol: float = 0.0, atol: float = 0.0, rough: Collection[str] = (), odd: int = 0,
     workers: int | None = 1, executor: Executor | None = None,
 ) -> Stored:
     """Run stored trials again and compare what they give now with what is stored.
@@ -52,80 +80,61 @@ def check(
         How many of the trials may go another way altogether, in any metric: an unstable filter
         overflows on one processor and not on the next.
     workers, executor
-        As in `run`; by default in this process.
+        As of `run`; by default in this process.
 
     Raises
     ------
     AssertionError
         If a metric, or the kind of a failure, is not the stored one.
-    ValueError
-        If the file is malformed, or an index or a name of `rough` is not in it.
     """
     stored = path if isinstance(path, Stored) else load(path)
-    number(rtol, "rtol", at_least=0)
-    allowed = _allowed(stored, number(atol, "atol", at_least=0), rough)
-    spared = count(odd, "odd", at_least=0)
-    chosen = places(range(len(stored)) if indices is None else indices, "indices", len(stored))
-    if spared >= len(chosen):
-        raise ValueError(f"odd: needs fewer than the {len(chosen)} trials that run, got {spared}")
-    study = run(
-        callable_(trial, "trial"), [stored.seed(i) for i in chosen], errors="collect",
-        workers=workers, executor=executor,
-    )
-    wrong = _differences(stored, chosen, study, rtol, allowed)
-    if len(wrong) > spared:
+    chosen = list(range(len(stored)) if indices is None else indices)
+    if odd >= len(chosen):
+        raise ValueError(f"odd: needs fewer than the {len(chosen)} trials that run, got {odd}")
+    allowed = dict.fromkeys(stored.columns, atol)
+    for name in rough:
+        finite = stored.columns[name][np.isfinite(stored.columns[name])]
+        allowed[name] = max(atol, float(np.ptp(finite)) if finite.size else 0.0)
+    study = run(trial, [stored.seed(i) for i in chosen], errors="collect", workers=workers,
+                executor=executor)  # fmt: skip
+    kinds = {failure.which: failure.kind for failure in study.failures}
+    wrong = [
+        found for k, i in enumerate(chosen)
+        if (found := _differences(stored, i, study, k, kinds.get(k, ""), rtol, allowed))
+    ]  # fmt: skip
+    if len(wrong) > odd:
         raise AssertionError(_report(stored, trial, [text for each in wrong for text in each]))
     return stored
 
 
-def _allowed(stored: Stored, atol: float, rough: Collection[str]) -> dict[str, float]:
-    """The absolute difference that passes, for each metric."""
-    named = isinstance(rough, Collection) and not isinstance(rough, str)
-    if not named or not set(rough) <= set(stored.columns):
-        raise ValueError(f"rough: needs names of metrics that are stored, got {rough!r}")
-    allowed = dict.fromkeys(stored.columns, atol)
-    for name in rough:
-        values = np.asarray(stored.columns[name])
-        finite = values[np.isfinite(values)]
-        allowed[name] = max(atol, float(np.ptp(finite)) if finite.size else 0.0)
-    return allowed
-
-
 def _differences(
-    stored: Stored, chosen: Sequence[int], study: Study, rtol: float, allowed: dict[str, float]
-) -> list[list[str]]:
-    """What the new study does not give as it is stored, for each trial that differs."""
+    stored: Stored, i: int, study: Study, k: int, kind: str, rtol: float,
+    allowed: Mapping[str, float],
+) -> list[str]:
+    """What one trial does not give as it is stored."""
+    if kind or stored.failures[i]:
+        was, now = stored.failures[i] or "a value", kind or "a value"
+        return [f"trial {i}: stored {was}, now {now}"] if was != now else []
     names = tuple(stored.columns)
-    kinds = {failure.index: failure.kind for failure in study.failures}
-    wrong = []
-    for k, i in enumerate(chosen):
-        found = []
-        if kinds.get(k, "") != stored.failures[i]:
-            was, now = stored.failures[i] or "a value", kinds.get(k) or "a value"
-            found.append(f"trial {i}: stored {was}, now {now}")
-        elif k not in kinds:
-            for name, value in zip(names, row(study.values[k], names), strict=True):
-                kept = float(stored.columns[name][i])
-                if not _same(kept, value, rtol, allowed[name]):
-                    found.append(f"trial {i}: {name} stored {kept!r}, now {value!r}")
-        wrong += [found] if found else []
-    return wrong
+    pairs = [(c, float(stored.columns[c][i]), v) for c, v in
+             zip(names, row(study.values[k], names), strict=True)]  # fmt: skip
+    return [f"trial {i}: {c} stored {was!r}, now {now!r}" for c, was, now in pairs
+            if not _same(was, now, rtol, allowed[c])]  # fmt: skip
 
 
 def _same(was: float, now: float, rtol: float, atol: float) -> bool:
     if was != was or now != now:
         return was != was and now != now
     if rtol == atol == 0 or np.isinf(was) or np.isinf(now):
-        return was == now and np.signbit(was) == np.signbit(now)
+        return was == now and bool(np.signbit(was) == np.signbit(now))
     return abs(was - now) <= max(rtol * abs(was), atol)
 
 
-def _report(stored: Stored, trial: Any, wrong: list[str]) -> str:
+def _report(stored: Stored, trial: Trial, wrong: list[str]) -> str:
     kept = [*wrong[:5], *([f"and {len(wrong) - 5} more"] if len(wrong) > 5 else [])]
-    name = name_of(trial)
-    was, now = stored.code.get(name), fingerprints([trial], strict=False).get(name)
-    if was != now:
-        kept.append(f"the source of {name} is another one: stored {was}, now {now}")
-    elif dict(stored.versions) != dict(versions()):
-        kept.append(f"the versions are others: stored {dict(stored.versions)}")
+    was = stored.heads["code"].get(plain(trial).__qualname__)
+    if was and was != (now := fingerprint(trial)):
+        kept.append(f"the source of the trial is another one: stored {was}, now {now}")
+    elif stored.heads["version"] != versions():
+        kept.append(f"the versions are others: stored {dict(stored.heads['version'])}")
     return f"{stored.path.name}: another run does not give what is stored\n" + "\n".join(kept)

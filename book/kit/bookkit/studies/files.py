@@ -1,12 +1,22 @@
-"""Long studies as files: one row a trial, written to the last digit and read strictly."""
+"""Long studies as files: every finished trial is on disk before the next begins."""
 
 from __future__ import annotations
 
+import errno
+import hashlib
+import inspect
+import io
 import json
 import os
+import pickle
 import re
+import textwrap
+import time
 import uuid
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,20 +25,17 @@ import numpy as np
 from numpy.random import SeedSequence
 from numpy.typing import NDArray
 
-from distfilt.checks import Array, callable_, choice, count, instance
+from ..folders import data_root, inside
+from . import running
+from .running import Outcome, StudyError, Trial, fresh, plain
 
-from ..folders import data_root
-from ._worker import versions
-from .seeds import POOL_SIZE, Recipe
-from .sources import fingerprints
-from .study import DIED, LATE, Study, column_names, row
+__all__ = ["Stored", "fingerprint", "load", "merge", "store", "stored"]
 
-__all__ = ["Stored", "load", "store", "stored"]
-
-_FORMAT = "# distfilt study, format 2"
-_TRIALS = re.compile(r"# trials ([1-9][0-9]*)")
+_FORMAT = b"# distfilt study, format 3"
 _FIRST = ("index", "entropy", "spawn_key", "failure")
-_HEADER = re.compile(r"# (version|code|parameter) ([^\s:]+): (.+)")
+_HEADER = re.compile(r"# (version|code|parameter) (\S+): (.+)")
+_SYNC_SECONDS = 0.2
+"""The disk is asked to keep what it was given no more often than this."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,12 +46,11 @@ class Stored:
     ----------
     path : Path
         Where it was read.
-    parameters : mapping
-        The study's parameters.
-    versions, code : mapping from str to str
-        Versions of Python, numpy and this library, and `fingerprint` of the functions named.
-    recipes : tuple of Recipe
-        What makes each trial's seed.
+    heads : mapping
+        Under ``"parameter"``, ``"version"`` and ``"code"`` the study's parameters, the versions it
+        was made with, and the `fingerprint` of the functions that made it.
+    seeds : tuple of str
+        What makes each trial's seed, as the file has it.
     failures : tuple of str
         For each trial the class of what it raised, or ''.
     columns : mapping from str to array, (n,)
@@ -52,297 +58,272 @@ class Stored:
     """
 
     path: Path
-    parameters: Mapping[str, Any]
-    versions: Mapping[str, str]
-    code: Mapping[str, str]
-    recipes: tuple[Recipe, ...]
+    heads: Mapping[str, Mapping[str, Any]]
+    seeds: tuple[str, ...]
     failures: tuple[str, ...]
-    columns: Mapping[str, Array]
+    columns: Mapping[str, NDArray[np.float64]]
 
     def __len__(self) -> int:
-        return len(self.recipes)
-
-    def __repr__(self) -> str:
-        failed = len(self) - int(self.done.sum())
-        return f"Stored({self.path.name}: {len(self)} trials, {failed} failed)"
+        return len(self.seeds)
 
     @property
-    def done(self) -> NDArray[np.bool_]:
-        """Which trials returned a value, (n,)."""
-        return np.array([not kind for kind in self.failures], dtype=bool)
+    def parameters(self) -> Mapping[str, Any]:
+        """The study's parameters."""
+        return self.heads["parameter"]
 
-    def metric(self, column: str) -> Array:
+    def metric(self, column: str) -> NDArray[np.float64]:
         """A metric of the trials that are done, (done,)."""
-        return self.columns[choice(column, "column", self.columns)][self.done]
+        return self.columns[column][[not kind for kind in self.failures]]
 
     def seed(self, index: int) -> SeedSequence:
         """The seed of a trial, made afresh."""
-        if count(index, "index", at_least=0) >= len(self):
-            raise ValueError(f"index: needs one of {len(self)} trials, got {index}")
-        return self.recipes[index].seed()
+        entropy, key = (tuple(map(int, t.split())) for t in self.seeds[index].split(","))
+        return SeedSequence(entropy if len(entropy) > 1 else entropy[0], spawn_key=key)
 
 
-def store(
-    study: Study, path: str | Path, *, parameters: Mapping[str, Any], columns: Sequence[str],
-    code: Iterable[Callable[..., Any]] = (),
-) -> Path:
-    """Write a study's metrics to a CSV file: the same study gives the same bytes.
+def seed_text(seed: SeedSequence | int) -> str:
+    """What makes a seed, as a file has it: its entropy and its spawn key."""
+    made: Any = fresh(seed)
+    words = made.entropy if isinstance(made.entropy, Sequence) else [made.entropy]
+    return f"{' '.join(map(str, words))},{' '.join(map(str, made.spawn_key))}"
 
-    Lines that begin with ``#`` say how many trials follow, with which versions it was made, the
-    `fingerprint` of the trial and of the functions in `code`, and the parameters as JSON. Then one
-    row a trial: its index,
-    the entropy and the spawn key of its seed, the class of what it raised or nothing, and the
-    metrics with as many digits as give the same float back.
 
-    Parameters
-    ----------
-    study : Study
-        Every trial has to be run to an end: a value, or something raised.
-    path : path
-        ``data/studies/KEY/NAME.csv``; missing folders are made, a file that is there is replaced.
-    parameters : mapping from str to what JSON holds
-        Everything that the trial does not draw. Arrays are written as lists.
-    columns : sequence of str
-        Names of the metrics, as in `Study.metrics`.
-    code : iterable of callable
-        Functions, besides the trial, whose source decides what the numbers are.
+def fingerprint(function: Callable[..., Any]) -> str:
+    """A digest of a function's source: the first 16 digits of its SHA-256.
 
-    Raises
-    ------
-    ValueError
-        If trials are missing, a worker died or a trial took too long (which may say nothing of
-        the trial), a metric is not a real number, or a parameter is not JSON.
+    The text is that of ``inspect.getsource`` without its indentation. It changes with any edit of
+    the function, comments included, and not with an edit of what the function calls: it tells a
+    reader whether a stored study was made by the function that is printed, and running trials
+    again (`check`) tells whether everything below still gives the same numbers.
+
+    Examples
+    --------
+    >>> len(fingerprint(fingerprint))
+    16
     """
-    instance(study, "study", Study)
-    names = column_names(columns)
-    if set(names) & set(_FIRST):
-        raise ValueError(f"columns: needs names other than {', '.join(_FIRST)}, got {names}")
-    if study.missing:
-        raise ValueError(f"study: needs every trial run, got {len(study.missing)} not run")
-    kinds = {failure.index: failure.kind for failure in study.failures}
-    for kind, what in ((DIED, "whose worker died"), (LATE, "that took too long")):
-        if kind in kinds.values():
-            raise ValueError(f"study: needs trials that raise or return, got one {what}")
-    made_by = {**study.code, **fingerprints(_functions(code), strict=True)}
-    lines = [
-        _FORMAT,
-        f"# trials {len(study)}",
-        *(f"# version {k}: {json.dumps(v)}" for k, v in versions()),
-        *(f"# code {k}: {json.dumps(v)}" for k, v in sorted(made_by.items())),
-        *(f"# parameter {k}: {v}" for k, v in jsons(parameters).items()),
-        ",".join([*_FIRST, *names]),
-    ]
-    for i, (recipe, value) in enumerate(zip(study.recipes, study.values, strict=True)):
-        cells = [""] * len(names) if i in kinds else [repr(x) for x in row(value, names)]
-        lines.append(",".join([str(i), *_seed_cells(recipe), kinds.get(i, ""), *cells]))
-    return _write(_path(path), "\n".join(lines) + "\n")
+    source = textwrap.dedent(inspect.getsource(plain(function))).strip()
+    return hashlib.sha256(source.encode()).hexdigest()[:16]
 
 
-def _functions(code: Any) -> tuple[Callable[..., Any], ...]:
-    given = tuple(code) if isinstance(code, Iterable) else (code,)
-    return tuple(callable_(function, "code") for function in given)
+def plain_json(parameters: Mapping[str, Any]) -> dict[str, str]:
+    """The parameters as they are written: each one's JSON, arrays as lists."""
 
-
-def _path(path: Any) -> Path:
-    if not isinstance(path, str | Path):
-        raise ValueError(f"path: needs a path, got {type(path).__name__}")
-    if not Path(path).name:
-        raise ValueError(f"path: needs a file's name, got {str(path)!r}")
-    return Path(path)
-
-
-def jsons(parameters: Any) -> dict[str, str]:
-    """The parameters as they are written: each one's JSON."""
-    if not isinstance(parameters, Mapping):
-        raise ValueError(f"parameters: needs a mapping, got {type(parameters).__name__}")
-
-    def plain(value: Any) -> Any:
+    def listed(value: Any) -> Any:
         if isinstance(value, np.ndarray | np.generic):
             return value.tolist()
         raise TypeError(f"{type(value).__name__} is not JSON")
 
-    out = {}
-    for key, value in parameters.items():
-        if not isinstance(key, str) or not key.isidentifier():
-            raise ValueError(f"parameters: needs identifiers as names, got {key!r}")
-        try:
-            out[key] = json.dumps(value, default=plain, allow_nan=False)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"parameters: {key} needs a value that JSON holds: {error}") from None
-    return out
+    return {k: json.dumps(v, default=listed, allow_nan=False) for k, v in parameters.items()}
 
 
-def _seed_cells(recipe: Recipe) -> tuple[str, str]:
-    if recipe.pool_size != POOL_SIZE:
-        raise ValueError(f"study: needs seeds of numpy's pool size, got {recipe}")
-    words = recipe.entropy if isinstance(recipe.entropy, tuple) else (recipe.entropy,)
-    return " ".join(map(str, words)), " ".join(map(str, recipe.spawn_key))
+def _head(
+    trial: Trial, columns: Sequence[str], parameters: Mapping[str, Any], code: Iterable[Any]
+) -> str:
+    """What a study's file says of its making, and the names of its columns."""
+    if not all(name.isidentifier() for name in columns) or len(set(columns)) != len(columns):
+        raise ValueError(f"columns: needs different identifiers, got {columns}")
+    made_by = {plain(f).__qualname__: fingerprint(f) for f in (trial, *code)}
+    lines = [f"# version {k}: {json.dumps(v)}" for k, v in running.versions().items()]
+    lines += [f"# code {k}: {json.dumps(v)}" for k, v in sorted(made_by.items())]
+    lines += [f"# parameter {k}: {v}" for k, v in plain_json(parameters).items()]
+    return "\n".join([*lines, ",".join([*_FIRST, *columns])])
 
 
-def _write(path: Path, text: str) -> Path:
-    """Write a file whole or not at all: a study that took an hour is not lost to an interrupt.
+def store(
+    path: str | Path, trial: Trial, seeds: Iterable[SeedSequence | int], *,
+    columns: Sequence[str], parameters: Mapping[str, Any], code: Iterable[Callable[..., Any]] = (),
+    indices: Iterable[int] | None = None, executor: Executor | None = None,
+    workers: int | None = None, progress: bool = True,
+) -> Path:
+    """Run a study and write its metrics to a CSV file: the same study gives the same bytes.
 
-    The name on the way is this writer's own, so that two writers leave one of two whole files.
+    Each trial that is finished goes to ``PATH.part`` before its worker gets the next one. Where
+    this process is killed, the executor dies or the disk is full, the same call goes on: what was
+    in flight runs again, nothing else, and the file comes out the same.
+
+    Parameters
+    ----------
+    path : path
+        ``data/studies/KEY/NAME.csv``; missing folders are made, a file that is there is replaced.
+    trial, seeds, executor, workers, progress
+        As of `run`. A trial that raises is a row with the class of what it raised.
+    columns : sequence of str
+        Names of the metrics: keys of what a trial returns, or of its numbers in their order.
+    parameters : mapping from str to what JSON holds
+        Everything that the trial does not draw.
+    code : iterable of callable
+        Functions, besides the trial, whose source decides what the numbers are.
+    indices : iterable of int, optional
+        Run these trials alone, as one machine of several; `merge` brings their parts together.
+
+    Returns
+    -------
+    Path
+        The file, or ``PATH.part`` where `indices` leaves trials to be run.
+
+    Raises
+    ------
+    ValueError
+        If ``PATH.part`` is of another study: other code, parameters, seeds or versions.
+    StudyError
+        If the executor failed, or a trial took its worker down, which may say nothing of it.
+    OSError
+        If the disk is full; the message names the file.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    new = path.with_name(f".{path.name}-{uuid.uuid4().hex}.new")
+    target, given = Path(path), [fresh(seed) for seed in seeds]
+    part, head = _Part(target, _head(trial, columns, parameters, code)), len(_FIRST)
+    rows = part.rows()
+    texts = [seed_text(seed) for seed in given]
+    for i, text in rows.items():
+        if i >= len(given) or ",".join(text.split(",")[1 : head - 1]) != texts[i]:
+            raise ValueError(f"{part.path}: its trial {i} has another seed: remove it")
+    wanted = range(len(given)) if indices is None else indices
+    items = [(i, given[i]) for i in wanted if i not in rows]
+    died = []
     try:
-        with new.open("x", encoding="utf-8", newline="\n") as out:
-            out.write(text)
-            out.flush()
-            os.fsync(out.fileno())
-        os.replace(new, path)
-    except BaseException:
-        new.unlink(missing_ok=True)
-        raise
-    return path
+        flight = running.outcomes(trial, items, executor, workers, one_by_one=True)
+        for outcome in running.track(flight, len(items), progress):
+            if outcome.kind == running.DIED:
+                died.append(outcome.failure(given[outcome.which]))
+            else:
+                rows[outcome.which] = _row(outcome, texts[outcome.which], columns)
+                part.append(rows[outcome.which])
+    except running.ExecutorError as error:
+        raise StudyError(f"{error}; the trials that are done are in {part.path}") from error
+    if died:
+        raise StudyError(f"{died[0]}\nthe other trials are in {part.path}")
+    return part.finished(rows) if len(rows) == len(given) else part.path
+
+
+def _row(outcome: Outcome, seed: str, columns: Sequence[str]) -> str:
+    value = None if outcome.kind else pickle.loads(outcome.value)
+    numbers = [""] * len(columns) if outcome.kind else map(repr, running.row(value, columns))
+    return ",".join([str(outcome.which), seed, outcome.kind, *numbers])
+
+
+class _Part:
+    """What is done of a study: its head, then a row a trial as they come, each with a checksum."""
+
+    def __init__(self, target: Path, head: str) -> None:
+        self.target, self.head = target, head
+        self.path = target.with_name(f"{target.name}.part")
+        self.synced = 0.0
+
+    def rows(self) -> dict[int, str]:
+        """The rows by their index; one that was cut off or damaged counts as not done."""
+        if not self.path.is_file():
+            return {}
+        text = self.path.read_text(encoding="utf-8", errors="replace")
+        if self.head.startswith(text):  # it was cut off before its first row
+            self.path.unlink()
+        elif not text.startswith(f"{self.head}\n"):
+            raise ValueError(f"{self.path}: begun with other code, parameters or versions: remove "
+                             "it to begin again")  # fmt: skip
+        out = {}
+        for line in text[len(self.head) :].split("\n"):
+            made, _, checksum = line.rpartition(",")
+            if made and checksum == _checksum(made):
+                out[int(made.split(",")[0])] = made
+        return out
+
+    def append(self, made: str) -> None:
+        """Put a row on the disk."""
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        text = "" if self.path.is_file() else self.head
+        # Each begins its own line: the one before it may have been cut off.
+        text += f"\n{made},{_checksum(made)}"
+        with _named(self.path), self.path.open("ab", buffering=0) as out:
+            if out.write(text.encode()) != len(text.encode()):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            if time.monotonic() - self.synced > _SYNC_SECONDS:
+                os.fsync(out.fileno())
+                self.synced = time.monotonic()
+
+    def finished(self, rows: Mapping[int, str]) -> Path:
+        """Write the whole file, or none of it, and remove the part."""
+        body = "\n".join([self.head, *(rows[i] for i in sorted(rows)), ""]).encode()
+        # A name of this writer's own, so that two writers leave one of two whole files.
+        new = self.target.with_name(f".{self.target.name}-{uuid.uuid4().hex}.new")
+        try:
+            with _named(self.target), new.open("xb") as out:
+                out.write(_FORMAT + b"\n" + _seal(body) + b"\n" + body)
+                out.flush()
+                os.fsync(out.fileno())
+            os.replace(new, self.target)
+        finally:
+            new.unlink(missing_ok=True)
+        self.path.unlink(missing_ok=True)
+        return self.target
+
+
+def _checksum(text: str) -> str:
+    return f"{zlib.crc32(text.encode()):08x}"
+
+
+def _seal(body: bytes) -> bytes:
+    return b"# sha256 " + hashlib.sha256(body).hexdigest().encode()
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Errors of the disk with the file in them, which a write does not tell."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, os.strerror(error.errno or 0), str(path)) from error
+
+
+def merge(path: str | Path, *parts: str | Path) -> Path:
+    """Add the trials of other machines' parts to a study's own part; `store` then goes on.
+
+    Parameters
+    ----------
+    path : path
+        The study's file, as given to `store`; its part need not be there yet.
+    *parts : path
+        Parts of the same study, made with the same code, parameters and versions.
+    """
+    texts = [Path(part).read_text(encoding="utf-8", errors="replace") for part in parts]
+    head = next(m[0] for m in [re.match(r"(#.*\n)*index,.*", texts[0])] if m)
+    own = _Part(Path(path), head)
+    known = own.rows()
+    for part in parts:
+        other = _Part(Path(path), head)
+        other.path = Path(part)
+        for i, made in other.rows().items():
+            if known.setdefault(i, made) != made:
+                raise ValueError(f"{part}: its trial {i} differs from another part's")
+            own.append(made)
+    return own.path
 
 
 def stored(paper: str, name: str) -> Stored:
     """The stored study of one item of a paper, from ``data/studies/PAPER/NAME.csv``.
-
-    It is found from any folder, in the working copy or beside the library
-    (:func:`bookkit.folders.data_root`).
 
     Parameters
     ----------
     paper, name : str
         The paper's key and the study's, such as ``figure-2``.
     """
-    root = data_root() / "studies"
-    there = sorted(p.relative_to(root).with_suffix("").as_posix() for p in root.glob("*/*.csv"))
-    if f"{paper}/{name}" not in there:
-        known = ", ".join(there) or "none yet"
-        raise ValueError(f"name: needs one of {known}, got {paper}/{name}: make studies")
-    return load(root / str(paper) / f"{name}.csv")
+    return load(inside(data_root() / "studies", paper, name, ".csv"))
 
 
 def load(path: str | Path) -> Stored:
-    """Read a stored study strictly.
+    """Read a stored study; a file that is damaged, or another one, is refused by its name."""
+    import pandas
 
-    Raises
-    ------
-    ValueError
-        If the file is not one that `store` writes; the error names the file and the line.
-    """
-    source = _path(path)
-    if not source.is_file():
-        raise ValueError(f"path: needs a file, got {source}")
-    reader = _Reader(source)
-    for k, line in enumerate(source.read_bytes().split(b"\n"), start=1):
-        try:
-            reader.take(line.decode("utf-8"))
-        except ValueError as error:  # a UnicodeDecodeError is one too
-            raise ValueError(f"path: {source}, line {k}: {error}") from None
-    return reader.stored()
-
-
-class _Reader:
-    """The lines of a file, one after the other."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.lines = self.trials = 0
-        self.heads: dict[str, dict[str, Any]] = {"version": {}, "code": {}, "parameter": {}}
-        self.names: tuple[str, ...] = ()
-        self.recipes: list[Recipe] = []
-        self.failures: list[str] = []
-        self.rows: list[list[float]] = []
-        self.seen: set[Recipe] = set()
-        self.ended = False
-
-    def take(self, line: str) -> None:
-        self.lines += 1
-        if self.ended:
-            raise ValueError("needs a row, got an empty line before it")
-        if self.lines == 1:
-            if line != _FORMAT:
-                raise ValueError(f"needs {_FORMAT!r}, got {line[:60]!r}")
-        elif self.lines == 2:
-            found = _TRIALS.fullmatch(line)
-            if found is None:
-                raise ValueError(f"needs '# trials NUMBER', got {line[:60]!r}")
-            self.trials = int(found[1])
-        elif not line:
-            self.ended = True
-        elif line.startswith("#") and not self.names:
-            self._head(line)
-        elif not self.names:
-            self._names(line)
-        else:
-            self._row(line)
-
-    def _head(self, line: str) -> None:
-        found = _HEADER.fullmatch(line)
-        if found is None:
-            raise ValueError(f"needs '# version|code|parameter NAME: JSON', got {line[:60]!r}")
-        kind, name, text = found.groups()
-        if name in self.heads[kind]:
-            raise ValueError(f"{kind} {name} is there already")
-        self.heads[kind][name] = json.loads(text)
-
-    def _names(self, line: str) -> None:
-        cells = tuple(line.split(","))
-        if cells[: len(_FIRST)] != _FIRST:
-            raise ValueError(f"needs columns that begin with {','.join(_FIRST)}, got {line[:60]!r}")
-        self.names = column_names(cells[len(_FIRST) :])
-
-    def _row(self, line: str) -> None:
-        cells = line.split(",")
-        if len(cells) != len(_FIRST) + len(self.names):
-            raise ValueError(f"needs {len(_FIRST) + len(self.names)} cells, got {len(cells)}")
-        index, entropy, key, kind = cells[: len(_FIRST)]
-        if index != str(len(self.rows)):
-            raise ValueError(f"needs index {len(self.rows)}, got {index!r}")
-        words = _integers(entropy, "entropy")
-        if not words:
-            raise ValueError("needs an entropy, got none")
-        whole = words[0] if len(words) == 1 else words
-        made = Recipe(whole, _integers(key, "spawn_key"), POOL_SIZE)
-        if made in self.seen:
-            raise ValueError(f"needs different seeds, got {made} again")
-        self.seen.add(made)
-        if kind and not kind.isidentifier():
-            raise ValueError(f"failure needs the name of a class or nothing, got {kind!r}")
-        metrics = cells[len(_FIRST) :]
-        if kind and any(metrics):
-            raise ValueError("a trial that failed has no metrics")
-        self.recipes.append(made)
-        self.failures.append(kind)
-        self.rows.append(
-            [
-                float("nan") if kind else _real(cell, name)
-                for cell, name in zip(metrics, self.names, strict=True)
-            ]
-        )
-
-    def stored(self) -> Stored:
-        if not self.ended or not self.rows:
-            what = "an end of line after the last row" if self.rows else "at least one trial"
-            raise ValueError(f"path: {self.path}, line {self.lines}: needs {what}")
-        if len(self.rows) != self.trials:
-            got = f"needs {self.trials} trials, as its second line says, got {len(self.rows)}"
-            raise ValueError(f"path: {self.path}, line {self.lines}: {got}")
-        table = np.array(self.rows)
-        return Stored(
-            self.path, self.heads["parameter"], self.heads["version"], self.heads["code"],
-            tuple(self.recipes), tuple(self.failures),
-            {name: table[:, k] for k, name in enumerate(self.names)},
-        )
-
-
-def _integers(cell: str, name: str) -> tuple[int, ...]:
-    words = cell.split(" ") if cell else []
-    if not all(word.isascii() and word.isdigit() for word in words):
-        raise ValueError(f"{name} needs nonnegative integers, got {cell!r}")
-    return tuple(int(word) for word in words)
-
-
-def _real(cell: str, name: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        raise ValueError(f"{name} needs a number, got {cell!r}") from None
-    if repr(value) != cell:  # a spreadsheet has been here, and may have dropped digits
-        raise ValueError(f"{name} needs a number as Python writes it, {value!r}, got {cell!r}")
-    return value
+    source = Path(path)
+    form, seal, body = (source.read_bytes().split(b"\n", 2) + [b"", b""])[:3]
+    if form != _FORMAT or seal != _seal(body):
+        raise ValueError(f"path: {source} is damaged, or no study that store wrote")
+    heads: dict[str, dict[str, Any]] = {"version": {}, "code": {}, "parameter": {}}
+    lines = body.decode().split("\n")
+    for found in filter(None, map(_HEADER.fullmatch, lines)):
+        heads[found[1]][found[2]] = json.loads(found[3])
+    skipped = sum(line.startswith("#") for line in lines)
+    table = pandas.read_csv(io.BytesIO(body), skiprows=skipped, dtype=str, keep_default_na=False)
+    metrics = table.columns[len(_FIRST) :]
+    # Python's own reading of a number, which gives back every bit that was written.
+    columns = {str(c): np.array([float(text or "nan") for text in table[c]]) for c in metrics}
+    seeds = tuple(table["entropy"] + "," + table["spawn_key"])
+    return Stored(source, heads, seeds, tuple(table["failure"]), columns)

@@ -1,0 +1,292 @@
+"""What the papers print, and verdicts on our reproductions by rules fixed before."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .folders import data_root, inside
+from .rows import html_table, read_rows
+from .scenarios import Scenario, read_scenario, scenario
+
+__all__ = [  # fmt: skip
+    "PAPERS", "VERDICTS", "Claim", "Item", "Scenario", "Verdict", "items", "judge_claims",
+    "judge_parameters", "read_scenario", "scenario", "table",
+]
+
+PAPERS = ("grange", "das", "semeraro", "zheng")
+"""Keys of the papers: triangular maps, constrained transport, mixture fusion, density."""
+
+VERDICTS = {
+    "parameters": ("read", "differs", "not comparable"),
+    "results": ("match", "differs", "not comparable"),
+}
+"""What can be found of each kind of item: a study reads parameters and reproduces results.
+
+A study that read its parameters has reproduced nothing yet. An item without a verdict is "not yet"
+in the ledger.
+"""
+
+_MIME = "application/vnd.distfilt.verdict+json"
+
+
+def table(paper: str, name: str) -> list[dict[str, str]]:
+    """The rows of a paper's table as printed, from ``published/PAPER/NAME.csv``.
+
+    Parameters
+    ----------
+    paper, name : str
+        One of `PAPERS`, and such as ``table-2``; or ``figure-1``, the claims that a figure's
+        caption and text make.
+
+    Examples
+    --------
+    >>> [row["kind"] for row in table("grange", "table-2")]
+    ['direct', 'angle', 'direct']
+    """
+    return read_rows(inside(data_root() / "published", paper, name, ".csv"))
+
+
+class Item(NamedTuple):
+    """A table or figure to reproduce: ``Table II`` or ``Fig. 1`` of a paper, in a chapter."""
+
+    paper: str
+    item: str
+    kind: str
+    title: str
+    chapter: str
+
+    @property
+    def file(self) -> str:
+        """Name of its file in ``published/PAPER``, without the ending."""
+        kind, number = self.item.split()
+        arabic = len(number) if set(number) == {"I"} else int(number)
+        return f"{'table' if kind == 'Table' else 'figure'}-{arabic}"
+
+
+def items() -> list[Item]:
+    """The tables and figures of the four papers that the book reproduces.
+
+    >>> len(items()), items()[1].item, items()[1].file
+    (21, 'Table II', 'table-2')
+    """
+    return [Item(**row) for row in read_rows(data_root() / "published" / "items.csv")]
+
+
+def _known(paper: str, item: str) -> Item:
+    for known in items():
+        if (known.paper, known.item) == (paper, item):
+            return known
+    raise ValueError(f"item: needs one of items(), got {paper} {item}")
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What came of reproducing one item; a notebook shows it and the ledger collects it.
+
+    Parameters
+    ----------
+    paper, item : str
+        One of `items`.
+    verdict : {"read", "match", "differs", "not comparable"}
+        The finding: "read" only for an item of kind "parameters", "match" only for results.
+    ours, published : str
+        What we find and what the paper prints.
+    why : str
+        Needed if it differs or is not comparable: the reason, or the input that the paper does
+        not give.
+
+    Examples
+    --------
+    >>> print(Verdict("grange", "Table I", "read", "4 rows read", "4 rows"))
+    grange Table I: read
+      ours       4 rows read
+      published  4 rows
+    """
+
+    paper: str
+    item: str
+    verdict: str
+    ours: str
+    published: str
+    why: str = ""
+
+    def __post_init__(self) -> None:
+        known = VERDICTS[_known(self.paper, self.item).kind]
+        if self.verdict not in known:
+            raise ValueError(f"verdict: needs one of {', '.join(known)}, got {self.verdict!r}")
+        if self.verdict in known[1:] and not self.why.strip():
+            raise ValueError(f"why: needs a reason for {self.verdict!r}")
+
+    def _fields(self) -> list[tuple[str, str]]:
+        pairs = [("ours", self.ours), ("published", self.published), ("why", self.why)]
+        return [(name, text) for name, text in pairs if text]
+
+    def __str__(self) -> str:
+        head = f"{self.paper} {self.item}: {self.verdict}"
+        return "\n".join([head, *(f"  {name:<9}  {text}" for name, text in self._fields())])
+
+    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
+        head = (f"{self.paper} {self.item}", self.verdict)
+        return {
+            "text/plain": str(self),
+            "text/html": html_table(head, self._fields()),
+            _MIME: dict(vars(self)),
+        }
+
+
+def _judged(
+    item: Item, good: bool, ours: str, published: str, why: str, study: Scenario | None
+) -> Verdict:
+    """What was found, unless the study was another one; the reason is needed for a difference."""
+    named, word = (item.paper, item.item), VERDICTS[item.kind][0]
+    if study is not None and study.changed:
+        reason = "changed scenario: " + "; ".join(study.changes)
+        return Verdict(*named, "not comparable", ours, published, reason)
+    return Verdict(*named, word if good else "differs", ours, published, "" if good else why)
+
+
+class Claim(NamedTuple):
+    """One claim that a figure's caption or text makes, judged by our computation.
+
+    Parameters
+    ----------
+    id : str
+        Its key in ``published/PAPER/figure-N.csv``.
+    text : str
+        What we computed for it, in words.
+    holds : bool
+        Whether its criterion is met.
+    evidence : str
+        The numbers, with their interval.
+
+    Examples
+    --------
+    >>> print(Claim("pca-stable", "share of unstable runs", True, "0 [0, 0.0362]"))
+    pca-stable holds: share of unstable runs 0 [0, 0.0362]
+    """
+
+    id: str
+    text: str
+    holds: bool
+    evidence: str
+
+    def __str__(self) -> str:
+        return f"{self.id} {'holds' if self.holds else 'fails'}: {self.text} {self.evidence}"
+
+
+def judge_claims(
+    paper: str, item: str, claims: Sequence[Claim], *, why: str = "",
+    scenario: Scenario | None = None,
+) -> Verdict:
+    """The verdict on a figure: a match if every claim listed for it is judged and holds.
+
+    Parameters
+    ----------
+    paper, item : str
+        One of `items`; its claims are listed in ``published/PAPER/figure-N.csv``.
+    claims : sequence of Claim
+        Every listed claim, once; none may have its criterion open.
+    why : str
+        Why it differs; needed and used only if a claim fails.
+    scenario : Scenario, optional
+        What the study ran; if it is not the paper's, the verdict is "not comparable" and names
+        what was changed.
+
+    Examples
+    --------
+    >>> judged = [
+    ...     Claim("without-pca-unstable", "share of unstable runs", False, "0 [0, 0.0362]"),
+    ...     Claim("pca-stable", "share of unstable runs", True, "0.02 [0.00243, 0.0704]"),
+    ...     Claim("small-samples", "difference of shares", False, "0.05 [-0.03, 0.13]"),
+    ... ]
+    >>> judge_claims("grange", "Fig. 1", judged, why="a run must exceed the prior").verdict
+    'differs'
+    """
+    known = _known(paper, item)
+    listed = {row["id"]: row for row in table(paper, known.file)}
+    given = [claim.id for claim in claims]
+    if sorted(given) != sorted(listed):
+        raise ValueError(f"claims: needs those of {paper} {item}, {', '.join(listed)}, each once, "
+                         f"got {', '.join(given)}")  # fmt: skip
+    undecided = [i for i, row in listed.items() if row["criterion"].startswith("open:")]
+    if undecided:
+        raise ValueError(f"claims: needs a fixed criterion, open for {', '.join(undecided)}")
+    ours = "; ".join(str(c) for c in claims)
+    said = "; ".join(row["claim"] for row in listed.values())
+    return _judged(known, all(c.holds for c in claims), ours, said, why, scenario)
+
+
+def judge_parameters(
+    paper: str, item: str, read: Scenario | Sequence[Mapping[str, Any]], *,
+    scenario: Scenario | None = None,
+) -> Verdict:
+    """The verdict on a table of parameters: "read" if the study read every cell as printed.
+
+    Rows are paired by the first printed column, and cells compared as numbers where both are
+    numbers, else as text without spaces. A cell that the study did not take counts as not read.
+
+    Parameters
+    ----------
+    paper, item : str
+        One of `items`, of kind "parameters".
+    read : Scenario or sequence of mappings
+        What the study used: the `Scenario.reading` of which it took its values, or rows from
+        column to value that are made of what ran, such as a sensor's kind and standard deviation.
+    scenario : Scenario, optional
+        What the study ran, as of `judge_claims`; the reading itself without it.
+
+    Examples
+    --------
+    >>> study = scenario("grange", "table-2").reading()
+    >>> used = [(a.kind, a.dims, a.noise) for a in study.agents]
+    >>> judge_parameters("grange", "Table II", study).why
+    'row A, neighbours: printed [A,B,C], not read by the study'
+    >>> links = study.adjacency
+    >>> judge_parameters("grange", "Table II", study).verdict
+    'read'
+    """
+    known = _known(paper, item)
+    printed = table(paper, known.file)
+    rows = read.cells() if isinstance(read, Scenario) else read
+    study = read if scenario is None and isinstance(read, Scenario) else scenario
+    why = _first_difference(rows, printed)
+    ours, said = f"{len(rows)} rows read", f"{len(printed)} rows printed"
+    return _judged(known, not why, ours, said, why, study)
+
+
+def _cell(value: Any) -> str:
+    """A value as a paper's table prints it: lists in brackets."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return f"[{','.join(str(v) for v in value)}]"
+    return str(value)
+
+
+def _same(a: str, b: str) -> bool:
+    try:
+        return float(a) == float(b)
+    except ValueError:
+        return re.sub(r"\s+", "", a) == re.sub(r"\s+", "", b)
+
+
+def _first_difference(rows: Sequence[Mapping[str, Any]], printed: list[dict[str, str]]) -> str:
+    """The first printed cell that was not read, or read otherwise, or nothing."""
+    first = next(iter(printed[0]))
+    by_key = {str(row[first]): row for row in rows}
+    for wanted in printed:
+        key = wanted.get(first, "")
+        if key not in by_key:
+            return f"row {key} is printed but was not read"
+        for column, text in wanted.items():
+            if column not in by_key[key]:
+                return f"row {key}, {column}: printed {text}, not read by the study"
+            if not _same(got := _cell(by_key[key][column]), text):
+                return f"row {key}, {column}: read {got}, printed {text}"
+    extra = by_key.keys() - {wanted[first] for wanted in printed}
+    return f"row {min(extra)} was read but is not printed" if extra else ""

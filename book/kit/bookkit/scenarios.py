@@ -1,0 +1,401 @@
+"""Scenarios: every parameter of a study with its source, what was changed, what a study read."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .folders import data_root, inside
+from .rows import html_table, markdown_table, read_rows, text_table
+
+__all__ = ["Parameter", "Row", "Scenario", "read_scenario", "scenario"]
+
+_SOURCES = ("given", "inferred", "assumed")
+_ORIGIN = ("source", "where", "reason", "note")
+"""Columns of a row that say where it comes from; the others are its values."""
+
+_UNITS = {"range": ("m", "km"), "distance": ("m", "km"), "angle": ("rad", "deg")}
+"""Units in which a reading of that kind can be; every other kind may have any."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a study.
+
+    Parameters
+    ----------
+    name : str
+    value : bool, int, float, str or (nested) tuple
+    unit : str
+        ``1`` for a pure number, ``-`` where a unit has no meaning.
+    source : {"given", "inferred", "assumed"}
+        Whether the paper gives it, it follows from what the paper gives, or we chose it.
+    where : str
+        The place in the paper; needed if given.
+    reason : str
+        Why this value; needed if inferred or assumed.
+    note : str
+        A remark.
+
+    Examples
+    --------
+    >>> Parameter("gain", 0.05, "1", "assumed", reason="a sweep goes with it").why
+    'a sweep goes with it'
+    """
+
+    name: str
+    value: Any
+    unit: str
+    source: str
+    where: str = ""
+    reason: str = ""
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "value", _plain(self.value))
+        _check_origin(vars(self))
+
+    @property
+    def why(self) -> str:
+        """Where it is given, or the reason for it; with the note."""
+        return _why(vars(self))
+
+
+def _plain(value: Any) -> Any:
+    """A value of TOML or numpy as a scalar or as (nested) tuples."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    return tuple(map(_plain, value)) if isinstance(value, list | tuple) else value
+
+
+def _check_origin(cells: Mapping[str, Any]) -> None:
+    """What is given says where, and what is not says why."""
+    if cells.get("source") not in _SOURCES:
+        raise ValueError(f"source: needs one of {', '.join(_SOURCES)}, got {cells.get('source')!r}")
+    needed = "where" if cells["source"] == "given" else "reason"
+    for key in ("name", "unit", needed):
+        if not str(cells.get(key) or "").strip():
+            raise ValueError(f"{key}: needs a text, got {cells.get(key)!r}")
+
+
+def _why(cells: Mapping[str, Any]) -> str:
+    text = cells.get("reason") or f"{cells.get('where')}."
+    return " ".join(t for t in (text, cells.get("note")) if t)
+
+
+class UnknownKey(KeyError, ValueError):
+    """A scenario or a row has nothing of that name; the message lists the nearest names."""
+
+    def __init__(self, what: str, key: Any, names: list[str]) -> None:
+        near = get_close_matches(str(key), names, n=3, cutoff=0.4) or names[:3]
+        super().__init__(f"{what} {key!r}; nearest: {', '.join(near) or 'none'}")
+
+    def __str__(self) -> str:  # KeyError would print the message in quotes
+        return str(self.args[0])
+
+
+class Row(Mapping[str, Any]):
+    """One row of a scenario's table, such as an agent: ``row["kind"]`` or ``row.kind``.
+
+    A row has a ``name``, a ``unit``, a ``source`` with ``where`` or ``reason``, and its own
+    columns. The unit of a reading has to fit its ``kind``: an angle is no length.
+
+    Examples
+    --------
+    >>> row = Row({"name": "B", "kind": "angle", "dims": [1, 2], "noise": 0.2, "unit": "rad",
+    ...            "source": "given", "where": "Table II"})
+    >>> row.kind, row["dims"], row.why
+    ('angle', (1, 2), 'Table II.')
+    >>> Row({**row, "kind": "range"})
+    Traceback (most recent call last):
+    ValueError: unit: needs one of m, km for kind 'range', got 'rad'
+    """
+
+    def __init__(self, cells: Mapping[str, Any], note: Callable[[str], Any] = len) -> None:
+        self._cells = {key: _plain(value) for key, value in cells.items()}
+        self._note = note
+        _check_origin(cells)
+        allowed = _UNITS.get(cells.get("kind", ""), (cells["unit"],))
+        if cells["unit"] not in allowed:
+            raise ValueError(f"unit: needs one of {', '.join(allowed)} for kind {cells['kind']!r}, "
+                             f"got {cells['unit']!r}")  # fmt: skip
+
+    def __getitem__(self, key: str) -> Any:
+        if key not in self._cells:
+            raise UnknownKey(f"row {self._cells['name']!r} has no column", key, list(self._cells))
+        self._note(key)
+        return self._cells[key]
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_") or name not in self._cells:
+            raise AttributeError(name)
+        return self[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._cells)
+
+    def __len__(self) -> int:
+        return len(self._cells)
+
+    @property
+    def why(self) -> str:
+        """Where it is given, or the reason for it; with the note."""
+        return _why(self._cells)
+
+    @property
+    def value_columns(self) -> tuple[str, ...]:
+        """The columns that hold values, without those that say where they come from."""
+        return tuple(key for key in self._cells if key not in _ORIGIN)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Scenario:
+    """Every parameter of a study; ``s["gain"]`` is a value. It prints as a table.
+
+    Parameters
+    ----------
+    paper, name : str
+        The paper's key and the scenario's name.
+    title : str
+        What is studied.
+    parameters, notes : mapping from str to Parameter
+        What the study reads, and what describes it but is read by nothing: choices that are built
+        into a method, and values of the paper that ours does not need.
+    tables : mapping from str to tuple of Row
+        The file's arrays of tables, such as ``agents``.
+    seen : set of str, optional
+        Where it notes what was read, after `reading`.
+
+    Examples
+    --------
+    >>> s = scenario("grange", "table-2")
+    >>> s["gain"], s.unit("dt_observe"), s.source("gain")
+    (0.05, 's', 'assumed')
+    >>> s["initial_state"]
+    array([100. ,   0. ,   0. ,  10. ,   0.1,   0. ])
+    >>> s.adjacency
+    array([[0., 1., 1.],
+           [1., 0., 0.],
+           [1., 0., 0.]])
+    >>> s.replace(gain=0.1).changes
+    ('gain: 0.1, not 0.05',)
+    """
+
+    paper: str
+    name: str
+    title: str
+    parameters: Mapping[str, Parameter]
+    notes: Mapping[str, Parameter]
+    tables: Mapping[str, tuple[Row, ...]]
+    seen: set[str] | None = None
+
+    def parameter(self, key: str) -> Parameter:
+        """The parameter of that name."""
+        if key not in self.parameters:
+            lacks = "keeps among its notes, which no study reads," if key in self.notes else "lacks"
+            raise UnknownKey(f"scenario {self.paper}/{self.name} {lacks}", key, list(self))
+        return self.parameters[key]
+
+    def __getitem__(self, key: str) -> Any:
+        value = self.parameter(key).value
+        if not isinstance(value, tuple) or isinstance(value[0], str):
+            return value
+        out = np.array(value)
+        out.setflags(write=False)
+        return out
+
+    def __contains__(self, key: object) -> bool:
+        return key in self.parameters
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.parameters)
+
+    def unit(self, key: str) -> str:
+        """Unit of a parameter."""
+        return self.parameter(key).unit
+
+    def source(self, key: str) -> str:
+        """Whether a parameter is given, inferred or assumed."""
+        return self.parameter(key).source
+
+    @property
+    def agents(self) -> tuple[Row, ...]:
+        """The rows of the table ``agents``; none if it has no such table."""
+        rows = self.tables.get("agents", ())
+        if self.seen is None:
+            return rows
+        # Each notes in what is seen that a column of it was read.
+        return tuple(Row(r._cells, _Note(self.seen, r._cells["name"])) for r in rows)
+
+    @property
+    def adjacency(self) -> NDArray[np.float64]:
+        """Who talks to whom, (A, A): 1 or 0, without links to oneself; from ``neighbours``."""
+        names = [row["name"] for row in self.agents]
+        talks = [[float(a in row["neighbours"]) for a in names] for row in self.agents]
+        return np.array(talks) * (1 - np.eye(len(names)))
+
+    def replace(self, **values: Any) -> Scenario:
+        """The scenario with other values of some parameters; units and places stay."""
+        made = {key: replace(self.parameter(key), value=value) for key, value in values.items()}
+        return replace(self, parameters={**self.parameters, **made})
+
+    def reading(self) -> Scenario:
+        """The same scenario, which remembers what is read of its agents from now on."""
+        return replace(self, seen=set())
+
+    def cells(self) -> list[dict[str, Any]]:
+        """What was read of each agent, with its name."""
+        seen = self.seen or set()
+        return [
+            {"name": row["name"]}
+            | {c: row[c] for c in row.value_columns if f"{row['name']}.{c}" in seen}
+            for row in self.tables["agents"]
+        ]
+
+    def entries(self) -> dict[str, str]:
+        """Everything that a study can read, each as JSON: the values, not where they come from."""
+        out = {p.name: f"{_json(p.value)} {p.unit}" for p in self.parameters.values()}
+        for table, rows in self.tables.items():
+            out[table] = _json([row["name"] for row in rows])
+            for row in rows:
+                cells = {c: row[c] for c in row.value_columns if c != "name"}
+                out |= {f"{table}.{row['name']}.{c}": _json(v) for c, v in cells.items()}
+        return out
+
+    @property
+    def digest(self) -> str:
+        """16 digits that change with every value that a study can read, and with no text."""
+        return hashlib.sha256(_json(self.entries()).encode()).hexdigest()[:16]
+
+    @property
+    def changes(self) -> tuple[str, ...]:
+        """What differs from the paper's study as the book accepts it; empty for that study itself.
+
+        ``scenarios/accepted.csv`` has a line for every entry of every scenario. One of a reader's
+        own, which it does not have, is one change.
+        """
+        lines = read_rows(data_root() / "scenarios" / "accepted.csv")
+        here = [r for r in lines if (r["paper"], r["scenario"]) == (self.paper, self.name)]
+        known, found = {r["entry"]: r["value"] for r in here}, self.entries()
+        if not known:
+            return (f"{self.paper}/{self.name} is no scenario of the book",)
+        return tuple(
+            f"{name}: {_said(found, name)}, not {_said(known, name)}"
+            for name in [*found, *(name for name in known if name not in found)]
+            if found.get(name) != known.get(name)
+        )
+
+    @property
+    def changed(self) -> bool:
+        """Whether it differs from the paper's study as the book accepts it."""
+        return bool(self.changes)
+
+    def _shown(self) -> list[tuple[list[str], list[list[str]]]]:
+        heads = ["unit", "source", "where or why"]
+        out = []
+        for head, entries in (("parameter", self.parameters), ("note", self.notes)):
+            lines = [[p.name, _text(p.value), p.unit, p.source, p.why] for p in entries.values()]
+            out += [([head, "value", *heads], lines)] if lines else []
+        for name, rows in self.tables.items():
+            columns = list(dict.fromkeys(c for row in rows for c in row.value_columns))
+            columns = [c for c in columns if c not in ("name", "unit")]
+            lines = [[row["name"], *(_text(row.get(c, "")) for c in columns),
+                      row["unit"], row["source"], row.why] for row in rows]  # fmt: skip
+            out.append(([name, *columns, *heads], lines))
+        return out
+
+    def __repr__(self) -> str:
+        head = f"{self.paper}/{self.name}: {self.title}"
+        return "\n".join([head, *(text_table(*t) for t in self._shown())])
+
+    def _repr_html_(self) -> str:
+        return "\n".join(html_table(*t) for t in self._shown())
+
+    def _repr_markdown_(self) -> str:
+        return "\n\n".join(markdown_table(*t) for t in self._shown())
+
+
+@dataclass(frozen=True)
+class _Note:
+    """Notes a column of a row as read; it travels to a worker, which a closure does not."""
+
+    seen: set[str]
+    name: str
+
+    def __call__(self, column: str) -> None:
+        self.seen.add(f"{self.name}.{column}")
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False, sort_keys=isinstance(value, dict))
+
+
+def _said(entries: Mapping[str, str], name: str) -> str:
+    """An entry as a change prints it: without quotes and without the unit 1."""
+    value = entries.get(name, "absent")
+    return value.removesuffix(" 1").removesuffix(" -").replace('"', "")
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, tuple):
+        return ", ".join(f"({_text(v)})" if isinstance(v, tuple) else _text(v) for v in value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def read_scenario(path: Path) -> Scenario:
+    """Read a scenario from a TOML file; a fault is refused with the file and the entry.
+
+    The file has a ``title``, one table ``[parameters.NAME]`` for each parameter that the study
+    reads, one table ``[notes.NAME]`` of the same form for what no study can read, and any arrays of
+    tables, such as one ``[[agents]]`` for each agent (see `Row`). The folder's name becomes the
+    paper, the file's the name.
+    """
+    entry = "its form"
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        title = data.pop("title")
+        groups: dict[str, dict[str, Parameter]] = {}
+        for group in ("parameters", "notes"):
+            groups[group] = {}
+            for name, cells in data.pop(group, {}).items():
+                entry = f"[{group}.{name}]"
+                groups[group][name] = Parameter(name, **cells)
+        tables: dict[str, tuple[Row, ...]] = {}
+        for entry, rows in data.items():
+            tables[entry] = tuple(Row(cells) for cells in rows)
+            _check_links({row["name"]: row for row in tables[entry]}, len(rows))
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise ValueError(f"{path.parent.name}/{path.name}: {entry}: {error}") from error
+    named = path.parent.name, path.stem, title
+    return Scenario(*named, groups["parameters"], groups["notes"], tables)
+
+
+def _check_links(rows: Mapping[str, Row], count: int) -> None:
+    if len(rows) != count:
+        raise ValueError("needs distinct names")
+    for name, row in rows.items():
+        for other in row.get("neighbours", ()):
+            if other not in rows or name not in rows[other]["neighbours"]:
+                raise ValueError(f"needs mutual neighbours, got {name!r} beside {other!r}")
+
+
+def scenario(paper: str, name: str) -> Scenario:
+    """The scenario of a paper's study, from ``scenarios/PAPER/NAME.toml``.
+
+    Examples
+    --------
+    >>> [agent.kind for agent in scenario("grange", "table-2").agents]
+    ['direct', 'angle', 'direct']
+    """
+    return read_scenario(inside(data_root() / "scenarios", paper, name, ".toml"))

@@ -1,0 +1,362 @@
+"""What the papers print, scenarios, and verdicts that can fail."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bookkit.folders import data_root
+from bookkit.published import (
+    PAPERS,
+    Claim,
+    Scenario,
+    Verdict,
+    items,
+    judge_claims,
+    judge_parameters,
+    read_scenario,
+    scenario,
+    table,
+)
+from bookkit.rows import markdown_table, read_rows, text_table
+from bookkit.scenarios import UnknownKey
+
+S = scenario("grange", "table-2")
+CHANGED = S.replace(gain=0.1)
+ROWS = [{"name": a.name, "dims": a.dims, "kind": a.kind, "noise": a.noise,
+         "neighbours": a.neighbours} for a in S.agents]  # fmt: skip
+UNSTABLE, STABLE, SMALL = CLAIMS = [
+    Claim("without-pca-unstable", "share", True, "0.4 [0.3, 0.5]"),
+    Claim("pca-stable", "share", True, "0 [0, 0.04]"),
+    Claim("small-samples", "difference", True, "0.3 [0.2, 0.4]"),
+]
+FAILED = STABLE._replace(holds=False)
+
+
+# Files.
+
+
+def test_items_are_complete() -> None:
+    found = items()
+    assert Counter(i.paper for i in found) == {"grange": 5, "das": 5, "semeraro": 9, "zheng": 2}
+    assert len({(i.paper, i.file) for i in found}) == 21
+    read = {(i.paper, i.item) for i in found if i.kind == "parameters"}
+    satellites = {("grange", f"Table {k}") for k in ("I", "II", "III")}
+    assert read == {("semeraro", "Table 3")} | satellites
+    assert {i.paper for i in found} == set(PAPERS)
+
+
+def test_every_published_file_is_of_an_item_and_lists_its_claims() -> None:
+    files = sorted((data_root() / "published").glob("*/*.csv"))
+    of_item = {(i.paper, i.file) for i in items()}
+    assert files
+    for path in files:
+        rows = table(path.parent.name, path.stem)
+        assert rows and (path.parent.name, path.stem) in of_item
+        if path.stem.startswith("figure"):
+            assert list(rows[0]) == ["id", "claim", "criterion"]
+            assert all(cell.strip() for row in rows for cell in row.values())
+
+
+def test_a_table_is_kept_cell_by_cell() -> None:
+    rows = table("grange", "table-2")
+    assert rows[1] == {"name": "B", "dims": "[1, 2]", "kind": "angle", "noise": "0.2",
+                       "neighbours": "[A,B]"}  # fmt: skip
+    for paper, name in (("grange", "../das/figure-1"), ("..", "items"), ("grange", "table-9")):
+        with pytest.raises(ValueError, match="^(paper|name): needs one of"):
+            table(paper, name)
+
+
+@pytest.mark.parametrize("text", ["a,b\n1\n", "a,b\n1,2,3\n"])
+def test_a_row_that_does_not_fit_is_refused_by_name(tmp_path: Path, text: str) -> None:
+    (tmp_path / "odd.csv").write_text(text)
+    with pytest.raises(ValueError, match=r"^odd\.csv, row 1: "):
+        read_rows(tmp_path / "odd.csv")
+
+
+def test_the_data_are_those_of_the_working_copy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = data_root()
+    (tmp_path / "data").mkdir()
+    deep = tmp_path / "book" / "deep"
+    deep.mkdir(parents=True)
+    monkeypatch.chdir(deep)
+    assert data_root() == own  # another project's data is passed over
+    (tmp_path / "data" / "published").mkdir()
+    (tmp_path / "data" / "published" / "items.csv").touch()
+    assert data_root() == tmp_path / "data" and os.getcwd() == str(deep)
+
+
+# Scenarios.
+
+GAIN = '[parameters.gain]\nvalue = 0.05\nunit = "1"\nsource = "assumed"\nreason = "a sweep"\n'
+
+
+def agent(name: str, neighbours: str, kind: str = "direct") -> str:
+    return (
+        f'[[agents]]\nname = "{name}"\nkind = "{kind}"\nunit = "m"\nsource = "given"\n'
+        f'where = "Table II"\nneighbours = {list(neighbours)}\n'
+    )
+
+
+GOOD = 'title = "A study"\n' + GAIN + agent("A", "AB") + agent("B", "AB")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("value = 0.05\n", "", r"\[parameters.gain\]: .*value"),
+        ("value = 0.05", "value =", r"its form: .*line 3"),
+        ("reason", "reson", r"\[parameters.gain\]: .*reson"),
+        ('reason = "a sweep"\n', "", r"\[parameters.gain\]: reason: needs a text"),
+        ("assumed", "given", r"\[parameters.gain\]: where: needs a text"),
+        ("assumed", "guessed", "source: needs one of given, inferred, assumed"),
+        ('title = "A study"\n', "", "title"),
+        ("neighbours = ['A', 'B']", "neighbours = ['A']", "agents: needs mutual neighbours"),
+        ("neighbours = ['A', 'B']", "neighbours = ['A', 'Z']", "agents: needs mutual neighbours"),
+        ('name = "B"', 'name = "A"', "agents: needs distinct names"),
+        ('kind = "direct"', 'kind = "angle"', "unit: needs one of rad, deg for kind 'angle'"),
+    ],
+)
+def test_a_fault_is_named_with_the_file(tmp_path: Path, old: str, new: str, words: str) -> None:
+    (tmp_path / "some").mkdir()
+    path = tmp_path / "some" / "study.toml"
+    path.write_text(GOOD)
+    assert read_scenario(path)["gain"] == 0.05
+    path.write_text(GOOD.replace(old, new, 1))
+    with pytest.raises(ValueError, match=f"^some/study.toml: (?s:.*){words}"):
+        read_scenario(path)
+
+
+def test_values_are_the_file_s_and_cannot_be_changed() -> None:
+    assert S["gain"] == 0.05 and S["members"] == 200 and "gain" in S and "gian" not in S
+    assert S["initial_state"].tolist() == [100.0, 0.0, 0.0, 10.0, 0.1, 0.0]
+    with pytest.raises(ValueError, match="read-only"):
+        S["initial_state"][0] = 0.0
+    assert S.agents[1].dims == (1, 2) and S.agents[1]["noise"] == 0.2
+    assert S.adjacency.tolist() == [[0, 1, 1], [1, 0, 0], [1, 0, 0]]
+
+
+def test_an_unknown_key_is_both_errors_and_names_the_nearest() -> None:
+    with pytest.raises(KeyError, match="table-2 lacks 'members_'; nearest: members") as caught:
+        S["members_"]
+    assert isinstance(caught.value, UnknownKey) and isinstance(caught.value, ValueError)
+    with pytest.raises(UnknownKey, match="among its notes, which no study reads, 'solver'"):
+        S["solver"]
+    with pytest.raises(UnknownKey, match="row 'A' has no column 'noice'; nearest: noise"):
+        S.agents[0]["noice"]
+
+
+def test_a_change_is_noticed_and_named() -> None:
+    assert S.changes == () and not S.changed
+    other = S.replace(gain=0.1, initial_state=[0.0] * 6)
+    assert other.changes == (
+        "initial_state: [0.0, 0.0, 0.0, 0.0, 0.0, 0.0] m, m/s, "
+        "not [100.0, 0.0, 0.0, 10.0, 0.1, 0.0] m, m/s",
+        "gain: 0.1, not 0.05",
+    )
+    back = other.replace(gain=0.05, initial_state=S["initial_state"])
+    assert not back.changed and back.digest == S.digest != other.digest
+
+
+def replaced(text: str, tmp_path: Path, old: str, new: str) -> Scenario:
+    path = tmp_path / "grange" / "table-2.toml"
+    path.parent.mkdir()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    return read_scenario(path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "changes"),
+    [
+        ('kind = "angle"\nnoise = 0.2\nunit = "rad"', 'kind = "range"\nnoise = 0.3\nunit = "m"',
+         ("agents.B.kind: range, not angle", "agents.B.noise: 0.3, not 0.2",
+          "agents.B.unit: m, not rad")),
+        ("[parameters.members]", "[parameters.pieces]",
+         ("pieces: 200, not absent", "members: absent, not 200")),
+        ('where = "Section V.B, (18)"', 'where = "elsewhere"', ()),
+        ("[parameters.orbital_rate]", "[notes.orbital_rate]",
+         ("orbital_rate: absent, not 0.1 rad/s",)),
+    ],
+)  # fmt: skip
+def test_a_changed_file_is_noticed_by_its_values(
+    tmp_path: Path, old: str, new: str, changes: tuple[str, ...]
+) -> None:
+    text = (data_root() / "scenarios" / "grange" / "table-2.toml").read_text(encoding="utf-8")
+    other = replaced(text, tmp_path, old, new)
+    assert other.changes == changes and (other.digest == S.digest) == (not changes)
+
+
+def test_a_scenario_of_a_reader_s_own_is_a_change(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(GOOD)
+    assert read_scenario(path).changes == (f"{tmp_path.name}/mine is no scenario of the book",)
+
+
+def test_a_scenario_prints_every_parameter_and_its_reason() -> None:
+    text, page, markdown = " ".join(repr(S).split()), S._repr_html_(), S._repr_markdown_()
+    for p in (*S.parameters.values(), *S.notes.values()):
+        assert p.name in text and f">{p.name}<" in page and f"| {p.name} |" in markdown
+        assert p.source in markdown and p.why.replace("|", r"\|") in markdown
+    assert ">100, 0, 0, 10, 0.1, 0<" in page and ">A, B, C<" in page and "A, B, C" in text
+    assert len({len(line.split("|")) for line in markdown.split("\n\n")[0].splitlines()}) == 1
+
+
+def test_tables_are_ruled_and_escaped() -> None:
+    head, *body, last = text_table(["a", "bb", "c", "d"], [["1", "2", "333", "4"]]).splitlines()
+    assert head == last == body[1] == "-" * (1 + 2 + 3 + 1 + 3 * 2)
+    assert body[0] == "a  bb  c    d" and body[2] == "1  2   333  4"
+    assert markdown_table(["a"], [["x | \\y"]]).endswith(r"| x \| \\y |")
+    assert "a &lt; b" in Verdict("grange", "Table I", "read", "a < b", "b")._repr_mimebundle_()[
+        "text/html"]  # fmt: skip
+
+
+# What was read.
+
+
+def test_a_reading_remembers_what_was_taken() -> None:
+    one, two = S.reading(), S.reading()
+    repr(one), one._repr_html_(), one.digest, one.changes
+    first = one.agents[0]
+    assert first.dims == (0, 1) and first.get("noise") == 0.2 and first.where == "Table II"
+    travelled = pickle.loads(pickle.dumps(one))
+    assert one.cells() == [{"name": "A", "dims": (0, 1), "noise": 0.2}, {"name": "B"},
+                           {"name": "C"}] == travelled.cells()  # fmt: skip
+    assert two.cells()[0] == {"name": "A"}
+    assert (one.adjacency == S.adjacency).all() and "neighbours" in one.cells()[2]
+
+
+def used(study: Scenario) -> Scenario:
+    """Read every printed number of the agents, as a study does."""
+    taken = [(a.kind, a.dims, a.noise) for a in study.agents]
+    assert len(taken) == len(study.adjacency)
+    return study
+
+
+@pytest.mark.parametrize(("item", "name"), [("Table II", "table-2"), ("Table III", "table-3")])
+def test_what_a_study_took_is_read_as_printed(item: str, name: str) -> None:
+    found = judge_parameters("grange", item, used(scenario("grange", name).reading()))
+    assert (found.verdict, found.why) == ("read", "")
+    assert judge_parameters("grange", item, table("grange", name)[::-1]).verdict == "read"
+
+
+def test_a_cell_that_no_study_took_is_not_read() -> None:
+    study = S.reading()
+    found = judge_parameters("grange", "Table II", study)
+    why = "row A, dims: printed [0, 1], not read by the study"
+    assert (found.verdict, found.why) == ("differs", why)
+    for a in study.agents:
+        a.dims, a.noise, a.kind  # noqa: B018
+    found = judge_parameters("grange", "Table II", study)
+    assert found.why == "row A, neighbours: printed [A,B,C], not read by the study"
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"noise": 0.3}, "row B, noise: read 0.3, printed 0.2"),
+        ({"noise": "0.2"}, ""),
+        ({"noise": np.float64(0.2)}, ""),
+        ({"dims": (2, 1)}, "row B, dims: read [2,1], printed [1, 2]"),
+        ({"dims": np.array([1, 2])}, ""),
+        ({"kind": "range"}, "row B, kind: read range, printed angle"),
+        ({"neighbours": ["A"]}, "row B, neighbours: read [A], printed [A,B]"),
+        ({"name": "Z"}, "row B is printed but was not read"),
+    ],
+)
+def test_rows_of_what_ran_are_judged_to_the_first_difference(
+    change: dict[str, Any], why: str
+) -> None:
+    found = judge_parameters("grange", "Table II", [ROWS[0], {**ROWS[1], **change}, ROWS[2]])
+    assert (found.verdict, found.why) == ("differs" if why else "read", why)
+    assert judge_parameters("grange", "Table II", ROWS[:2]).why.startswith("row C is printed")
+    extra = judge_parameters("grange", "Table II", [*ROWS, {**ROWS[0], "name": "D"}])
+    assert extra.why == "row D was read but is not printed"
+
+
+def test_formulas_are_compared_without_spaces() -> None:
+    rows = table("grange", "table-1")
+    for function, verdict in (("h( x )=x", "read"), ("h(x) = 2x", "differs")):
+        changed = [{**rows[0], "function": function}, *rows[1:]]
+        assert judge_parameters("grange", "Table I", changed).verdict == verdict
+
+
+# Verdicts.
+
+
+def test_every_claim_has_to_hold() -> None:
+    match = judge_claims("grange", "Fig. 1", [SMALL, STABLE, UNSTABLE])
+    assert match.verdict == "match" and "pca-stable holds: share 0" in match.ours
+    assert "unstable" in match.published and match.why == ""
+    differs = judge_claims("grange", "Fig. 1", [UNSTABLE, FAILED, SMALL], why="it is an EnKF")
+    assert (differs.verdict, differs.why) == ("differs", "it is an EnKF")
+    assert "pca-stable fails" in differs.ours
+    with pytest.raises(ValueError, match="^why: needs a reason"):
+        judge_claims("grange", "Fig. 1", [UNSTABLE, FAILED, SMALL])
+    for claims in (CLAIMS[:2], [*CLAIMS, SMALL], [*CLAIMS[:2], SMALL._replace(id="other")]):
+        with pytest.raises(ValueError, match="^claims: needs those of grange Fig. 1"):
+            judge_claims("grange", "Fig. 1", claims)
+
+
+def test_an_open_criterion_cannot_be_judged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "data" / "published" / "grange"
+    folder.mkdir(parents=True)
+    (folder.parent / "items.csv").write_bytes((data_root() / "published/items.csv").read_bytes())
+    (folder / "figure-2.csv").write_text("id,claim,criterion\nagreement,similar,open: how much\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"^claims: .*open for agreement"):
+        judge_claims("grange", "Fig. 2", [Claim("agreement", "ratio", True, "1.1")])
+
+
+@pytest.mark.parametrize(
+    ("item", "word", "why", "good"),
+    [
+        ("Table II", "read", "", True), ("Table II", "match", "", False),
+        ("Fig. 1", "match", "", True), ("Fig. 1", "read", "", False),
+        ("Fig. 1", "differs", "", False), ("Fig. 1", "differs", "so", True),
+        ("Fig. 1", "not comparable", " ", False), ("Fig. 1", "not comparable", "so", True),
+        ("Fig. 9", "match", "", False), ("Fig. 1", "not yet", "so", False),
+    ],
+)  # fmt: skip
+def test_a_verdict_fits_its_item(item: str, word: str, why: str, good: bool) -> None:
+    if good:
+        assert Verdict("grange", item, word, "a", "b", why).verdict == word
+    else:
+        with pytest.raises(ValueError, match="^(item|verdict|why): needs"):
+            Verdict("grange", item, word, "a", "b", why)
+
+
+def test_a_verdict_travels_in_a_notebook() -> None:
+    found = Verdict("grange", "Fig. 1", "differs", "a", "b", "because <so>")
+    bundle = found._repr_mimebundle_()
+    data = bundle["application/vnd.distfilt.verdict+json"]
+    assert Verdict(**json.loads(json.dumps(data))) == found
+    assert bundle["text/plain"] == (
+        "grange Fig. 1: differs\n  ours       a\n  published  b\n  why        because <so>"
+    )
+    assert "because &lt;so&gt;" in bundle["text/html"]
+
+
+def test_a_changed_scenario_is_not_compared() -> None:
+    for found in (
+        judge_claims("grange", "Fig. 1", CLAIMS, scenario=CHANGED),
+        judge_claims("grange", "Fig. 1", [UNSTABLE, FAILED, SMALL], why="x", scenario=CHANGED),
+        judge_parameters("grange", "Table II", ROWS, scenario=CHANGED),
+        judge_parameters("grange", "Table II", used(CHANGED.reading())),
+    ):
+        why = "changed scenario: gain: 0.1, not 0.05"
+        assert (found.verdict, found.why) == ("not comparable", why)
+        assert found.ours and found.published
+    for study in (None, S, S.reading()):
+        assert judge_claims("grange", "Fig. 1", CLAIMS, scenario=study).verdict == "match"

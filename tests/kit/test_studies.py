@@ -1,0 +1,410 @@
+"""Studies: the same bits everywhere, and nothing lost when a trial, a worker or a client stops."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Callable
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.random import SeedSequence
+
+from bookkit import studies
+from bookkit.folders import data_root
+from bookkit.studies import StudyError, running
+
+COLUMNS = ["mean", "norm"]
+
+
+def draw(seed: SeedSequence) -> list[float]:
+    """Numbers whose last bits depend on the order of the sums."""
+    rng = np.random.default_rng(seed.spawn(1)[0])
+    a = rng.standard_normal((40, 40))
+    return [float((a @ a).mean()), float(np.linalg.norm(a))]
+
+
+def fails_at(bad: tuple[int, ...], seed: SeedSequence) -> list[float]:
+    if seed.spawn_key[0] in bad:
+        raise ArithmeticError(f"no value for {seed.spawn_key[0]}")
+    return draw(seed)
+
+
+def dies_at(bad: int, seed: SeedSequence) -> list[float]:
+    if seed.spawn_key[0] == bad:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return draw(seed)
+
+
+def bits(study: studies.Study) -> bytes:
+    return np.array(study.values, dtype=float).tobytes()
+
+
+REFERENCE = np.array([draw(seed) for seed in studies.spawn(7, 30)]).tobytes()
+
+
+@pytest.mark.parametrize("workers", [1, 2, 4])
+def test_the_number_of_workers_changes_no_bit(workers: int) -> None:
+    assert bits(studies.run(draw, studies.spawn(7, 30), workers=workers)) == REFERENCE
+
+
+def test_any_executor_changes_no_bit() -> None:
+    with ThreadPoolExecutor(3) as threads:
+        assert bits(studies.run(draw, studies.spawn(7, 30), executor=threads)) == REFERENCE
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        assert bits(studies.run(draw, studies.spawn(7, 30), executor=pool)) == REFERENCE
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**128), st.lists(st.integers(0, 2**31), max_size=3))
+def test_a_seed_is_rebuilt_whatever_was_spawned_from_it(entropy: int, key: list[int]) -> None:
+    seed = SeedSequence(entropy, spawn_key=key)
+    first = seed.spawn(3)[0].generate_state(2)
+    study = studies.run(lambda s: s.spawn(1)[0].generate_state(2), [seed], workers=1)
+    assert (study.values[0] == first).all() and seed.n_children_spawned == 3
+
+
+def test_seeds_are_numpy_s_own_children() -> None:
+    for ours, theirs in zip(studies.spawn(2023, 5), SeedSequence(2023).spawn(5), strict=True):
+        assert (ours.generate_state(4) == theirs.generate_state(4)).all()
+    study = studies.run(lambda s: s.generate_state(2), [5], workers=1)
+    assert (study.values[0] == SeedSequence(5).generate_state(2)).all()
+
+
+def test_values_that_share_a_buffer_are_kept_apart() -> None:
+    buffer = np.zeros(1)
+
+    def trial(seed: SeedSequence) -> np.ndarray:
+        buffer[0] = seed.spawn_key[0]
+        return buffer
+
+    with ThreadPoolExecutor(1) as pool:
+        study = studies.run(trial, studies.spawn(1, 9), executor=pool)
+    assert study.metrics(["k"])["k"].tolist() == list(range(9))
+
+
+def test_metrics_are_taken_by_name_or_in_order() -> None:
+    study = studies.run(lambda s: {"b": 2, "a": s.spawn_key[0]}, studies.spawn(1, 2), workers=1)
+    assert study.metrics(["a"])["a"].tolist() == [0.0, 1.0]
+    with pytest.raises(ValueError, match="^columns: needs 2"):
+        studies.run(draw, [1], workers=1).metrics(["one"])
+
+
+def test_one_blas_thread_in_every_worker() -> None:
+    def threads(seed: SeedSequence) -> list[int]:
+        import scipy.linalg  # noqa: F401
+        from threadpoolctl import threadpool_info
+
+        return [lib["num_threads"] for lib in threadpool_info() if lib["user_api"] == "blas"]
+
+    for workers in (1, 2):
+        study = studies.run(threads, [1, 2], workers=workers)
+        assert all(set(found) == {1} for found in study.values)
+
+
+# What goes wrong.
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_raised_trial_is_reported_with_its_seed_and_the_others_are_kept(workers: int) -> None:
+    trial, seeds = partial(fails_at, (3, 11)), studies.spawn(7, 30)
+    study = studies.run(trial, seeds, workers=workers, errors="collect")
+    assert [f.which for f in study.failures] == [3, 11] and study.done.sum() == 28
+    assert study.failures[1].kind == "ArithmeticError"
+    assert "spawn_key=(11,)" in str(study.failures[1])
+    assert "no value for 11" in str(study.failures[1])
+    with pytest.raises(ArithmeticError):
+        trial(study.failures[0].seed)
+    with pytest.raises(StudyError, match="trial 3, SeedSequence") as caught:
+        studies.run(trial, seeds, workers=workers)
+    assert caught.value.study is not None and caught.value.study.done.sum() == 28
+
+
+def test_a_killed_worker_costs_its_own_trial_only() -> None:
+    study = studies.run(partial(dies_at, 5), studies.spawn(7, 30), workers=2, errors="collect")
+    (failure,) = study.failures
+    assert (failure.which, failure.kind) == (5, "died")
+    kept = np.frombuffer(REFERENCE).reshape(30, 2)
+    assert (study.metrics(COLUMNS)["mean"] == np.delete(kept[:, 0], 5)).all()
+
+
+def test_a_broken_executor_leaves_what_was_done() -> None:
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        with pytest.raises(StudyError, match="the executor broke") as caught:
+            studies.run(partial(dies_at, 29), studies.spawn(7, 30), executor=pool)
+        assert caught.value.study is not None and 0 < caught.value.study.done.sum() < 30
+    with pytest.raises(StudyError, match="takes no trial"):
+        studies.run(draw, [1], executor=pool)
+
+
+def test_a_worker_with_other_versions_is_refused() -> None:
+    job = running.Job(b"", "elsewhere", {**running.versions(), "numpy": "1.0"})
+    with pytest.raises(RuntimeError, match="1.0"):
+        running.chunk(job, [])
+
+
+class Cluster(Executor):
+    """Calls that nobody runs until they are asked for, on as many slots as it says."""
+
+    def __init__(self, slots: int, asked: Callable[[list[Any]], None]) -> None:
+        self.num_workers, self.asked, self.calls = slots, asked, []  # type: ignore[var-annotated]
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        self.calls.append((future, fn, args))
+        if len(self.calls) == self.num_workers:
+            self.asked(self.calls)
+            for made, call, given in self.calls:
+                made.set_result(call(*given))
+            self.calls = []
+        return future
+
+
+def test_as_many_trials_are_in_flight_as_the_executor_has_slots(tmp_path: Path) -> None:
+    part, seen = tmp_path / "a.csv.part", []
+
+    def asked(calls: list[Any]) -> None:
+        rows = part.read_text().count("\n") - studies_head if part.exists() else 0
+        seen.append((len(calls), rows))
+
+    studies_head = 3 + 2 + 1  # versions, code and parameter; the line before the first row
+    studies.store(tmp_path / "a.csv", draw, studies.spawn(7, 48), columns=COLUMNS,
+                  parameters={"size": 40}, code=[bits], executor=Cluster(24, asked))  # fmt: skip
+    assert seen == [(24, 0), (24, 24)]  # each on disk before the next begins
+
+
+# Files.
+
+
+def stored(path: Path, **options: Any) -> Path:
+    options = {"workers": 1, "columns": COLUMNS, "parameters": {"size": 40}} | options
+    return studies.store(path, options.pop("trial", draw), options.pop("seeds", SEEDS), **options)
+
+
+SEEDS = studies.spawn(7, 30)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return stored(tmp_path_factory.mktemp("whole") / "a.csv")
+
+
+def test_a_file_gives_back_every_bit(whole: Path) -> None:
+    kept = studies.load(whole)
+    assert np.stack([kept.columns[c] for c in COLUMNS], axis=1).tobytes() == REFERENCE
+    assert kept.parameters == {"size": 40} and len(kept) == 30
+    assert kept.heads["code"] == {"draw": studies.fingerprint(draw)}
+    assert bits(studies.run(draw, [kept.seed(k) for k in range(30)], workers=1)) == REFERENCE
+
+
+@settings(max_examples=30)
+@given(st.lists(st.floats(), min_size=1, max_size=4), st.integers(0, 2**128),
+       st.lists(st.integers(0, 2**31), max_size=3))  # fmt: skip
+def test_any_number_and_seed_comes_back(
+    tmp_path_factory: pytest.TempPathFactory, numbers: list[float], entropy: int, key: list[int]
+) -> None:
+    seed, path = SeedSequence(entropy, spawn_key=key), tmp_path_factory.mktemp("any") / "a.csv"
+    columns = [f"c{k}" for k in range(len(numbers))]
+    found = studies.load(stored(path, trial=lambda s: numbers, seeds=[seed], columns=columns))
+    for name, number in zip(columns, numbers, strict=True):
+        assert np.array_equal(found.metric(name), [number], equal_nan=True)
+        assert np.signbit(found.metric(name)[0]) == np.signbit(number) or number != number
+    assert (found.seed(0).generate_state(4) == seed.generate_state(4)).all()
+
+
+def test_a_failure_is_stored_by_its_class(tmp_path: Path) -> None:
+    kept = studies.load(stored(tmp_path / "a.csv", trial=partial(fails_at, (3,))))
+    assert kept.failures[3] == "ArithmeticError" and np.isnan(kept.columns["mean"][3])
+    assert kept.metric("mean").shape == (29,)
+    studies.check(kept, partial(fails_at, (3,)))
+    with pytest.raises(AssertionError, match="trial 3: stored ArithmeticError, now a value"):
+        studies.check(kept, draw)
+
+
+def test_every_flipped_bit_is_refused_by_name(whole: Path, tmp_path: Path) -> None:
+    raw, path = whole.read_bytes(), tmp_path / "b.csv"
+    rng = np.random.default_rng(1)
+    for place in [0, 30, len(raw) - 1, *rng.integers(len(raw), size=200)]:
+        flipped = bytearray(raw)
+        flipped[place] ^= 1 << rng.integers(8)
+        path.write_bytes(flipped)
+        with pytest.raises(ValueError, match="b.csv is damaged"):
+            studies.load(path)
+    for text in (b"", raw[:-20], raw + b"\n", raw.split(b"\n")[0]):
+        path.write_bytes(text)
+        with pytest.raises(ValueError, match="b.csv is damaged"):
+            studies.load(path)
+
+
+def test_the_book_s_own_studies_are_whole() -> None:
+    for path in (data_root() / "studies").glob("*/*.csv"):
+        assert len(studies.stored(path.parent.name, path.stem)) > 0
+    for paper, name in [("grange", "../das/pendulum"), ("..", "a"), ("grange", "none")]:
+        with pytest.raises(ValueError, match="^(paper|name): needs one of"):
+            studies.stored(paper, name)
+    with pytest.raises(ValueError, match="^name: needs one of"):
+        studies.script("../studies/table-2")
+
+
+CLIENT = """
+    import os, sys
+    from pathlib import Path
+    import beside
+    from bookkit import studies
+
+    def trial(seed):
+        Path("log", str(seed.spawn_key[0])).open("a").write("x")
+        return beside.value(seed)
+
+    studies.store("a.csv", trial, studies.spawn(7, 30), columns=["mean", "norm"],
+                  parameters={}, workers=2, progress=False)
+"""
+BESIDE = """
+    import time
+    import numpy as np
+
+    def value(seed):
+        time.sleep(0.05)
+        x = np.random.default_rng(seed).standard_normal(9)
+        return x.mean(), np.sqrt(x @ x)
+"""
+
+
+def client(folder: Path) -> subprocess.Popen[bytes]:
+    (folder / "log").mkdir(exist_ok=True)
+    (folder / "client.py").write_text(textwrap.dedent(CLIENT))
+    (folder / "beside.py").write_text(textwrap.dedent(BESIDE))
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+    return subprocess.Popen([sys.executable, "client.py"], cwd=folder, env=env)
+
+
+def runs(folder: Path) -> list[int]:
+    return [len(path.read_text()) for path in sorted((folder / "log").iterdir())]
+
+
+def test_a_killed_client_goes_on_and_runs_again_what_was_in_flight(tmp_path: Path) -> None:
+    """Its trial calls a module beside the script, which no worker can import by name."""
+    (tmp_path / "one").mkdir()
+    (tmp_path / "two").mkdir()
+    assert client(tmp_path / "one").wait() == 0
+    folder = tmp_path / "two"
+    running_client = client(folder)
+    while len(list((folder / "log").iterdir())) < 15:
+        time.sleep(0.01)
+    running_client.kill()
+    running_client.wait()
+    assert not (folder / "a.csv").exists() and (folder / "a.csv.part").exists()
+    time.sleep(1.0)  # its workers see that it is gone
+    assert client(folder).wait() == 0
+    assert (folder / "a.csv").read_bytes() == (tmp_path / "one" / "a.csv").read_bytes()
+    assert not (folder / "a.csv.part").exists()
+    assert len(runs(folder)) == 30 and sum(runs(folder)) <= 32  # two slots
+
+
+def test_a_row_that_was_cut_off_or_damaged_runs_again(whole: Path, tmp_path: Path) -> None:
+    path, part = tmp_path / "a.csv", tmp_path / "a.csv.part"
+    assert stored(path, indices=range(20)) == part
+    text = part.read_text()
+    at = text.index("\n4,")
+    for damaged in (text[:-9], text[: at + 6] + "9" + text[at + 7 :], text[:40], ""):
+        part.write_text(damaged)
+        assert stored(path).read_bytes() == whole.read_bytes()
+
+
+def test_parts_of_several_machines_merge(whole: Path, tmp_path: Path) -> None:
+    for k in range(3):
+        stored(tmp_path / f"{k}.csv", indices=range(8 * k, 8 * k + 10))
+    studies.merge(tmp_path / "a.csv", *(tmp_path / f"{k}.csv.part" for k in range(3)))
+    assert (tmp_path / "a.csv.part").read_text().count("\n7,") == 1
+    assert stored(tmp_path / "a.csv").read_bytes() == whole.read_bytes()
+    stored(tmp_path / "b.csv", indices=[0], parameters={"size": 41})
+    with pytest.raises(ValueError, match="other code, parameters or versions"):
+        studies.merge(tmp_path / "c.csv", tmp_path / "0.csv.part", tmp_path / "b.csv.part")
+
+
+@pytest.mark.parametrize("other", [{"parameters": {}}, {"trial": partial(fails_at, ())},
+                                   {"seeds": studies.spawn(8, 30)}])  # fmt: skip
+def test_a_part_of_another_study_is_refused(tmp_path: Path, other: dict[str, Any]) -> None:
+    stored(tmp_path / "a.csv", indices=[2])
+    with pytest.raises(ValueError, match="a.csv.part"):
+        stored(tmp_path / "a.csv", **other)
+
+
+def test_a_full_disk_is_named_and_loses_nothing(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = [18]
+
+    def full(descriptor: int) -> None:
+        left[0] -= 1
+        if left[0] < 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("bookkit.studies.files._SYNC_SECONDS", -1.0)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.raises(OSError, match=r"No space left on device: .*a\.csv\.part"):
+            stored(tmp_path / "a.csv")
+    assert (tmp_path / "a.csv.part").read_text().count("\n") >= 18
+    assert stored(tmp_path / "a.csv").read_bytes() == whole.read_bytes()
+
+
+def test_a_worker_s_death_is_not_stored(tmp_path: Path) -> None:
+    with pytest.raises(StudyError, match="trial 5, .*(?s:.*)the other trials are in .*a.csv.part"):
+        stored(tmp_path / "a.csv", trial=partial(dies_at, 5), workers=2)
+    assert (tmp_path / "a.csv.part").is_file() and not (tmp_path / "a.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "passes"),
+    [
+        (1e-9, {}, False), (1e-9, {"rtol": 1e-6}, True), (1e-3, {"rtol": 1e-6}, False),
+        (1e-3, {"atol": 1.0}, True), (1e-3, {"rough": ["mean", "norm"]}, True),
+        (1e-3, {"odd": 2}, False),
+    ],
+)  # fmt: skip
+def test_another_run_is_compared(
+    whole: Path, change: float, options: dict[str, Any], passes: bool
+) -> None:
+    def trial(seed: SeedSequence) -> list[float]:
+        return [x * (1 + change) for x in draw(seed)]
+
+    chosen = [0, 4, 29]
+    if passes:
+        assert len(studies.check(whole, trial, indices=chosen, **options)) == 30
+    else:
+        with pytest.raises(AssertionError, match=r"a\.csv: another run(?s:.*)stored"):
+            studies.check(whole, trial, indices=chosen, **options)
+    assert studies.check(whole, draw, indices=chosen, workers=2) is not None
+
+
+def test_a_few_trials_may_go_another_way(whole: Path) -> None:
+    other = partial(fails_at, (4,))
+    studies.check(whole, other, indices=[0, 4, 29], odd=1)
+    with pytest.raises(AssertionError, match="trial 4: stored a value, now ArithmeticError"):
+        studies.check(whole, other, indices=[0, 4, 29])
+
+
+def test_a_difference_names_another_code(tmp_path: Path) -> None:
+    def trial(seed: SeedSequence) -> list[float]:
+        return draw(seed)
+
+    def other(seed: SeedSequence) -> list[float]:
+        return [2 * x for x in draw(seed)]
+
+    other.__qualname__ = trial.__qualname__
+    kept = studies.load(stored(tmp_path / "a.csv", trial=trial))
+    with pytest.raises(AssertionError, match="the source of the trial is another one"):
+        studies.check(kept, other, indices=[0])
