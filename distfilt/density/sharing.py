@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..doors import MISSING, Array, Count, Mask, NonNegative, Places, Positive, Record, unchecked
-from ..network import Channel, Graph, tracking
+from ..network import Channel, Graph, PIState, first_order, pi_step
 from ..network import weights as weighting
 from ..network.graphs import disk
 from .grid import Grid
@@ -208,7 +208,7 @@ class PIConsensus(Record, Sharing):
     Parameters
     ----------
     alpha, a, b : float
-        Gains, in 1/s, of :func:`distfilt.network.tracking.pi_step`.
+        Gains, in 1/s, of :func:`distfilt.network.pi_step`.
     modes : int, optional
         Agree on so many cosine coefficients of the density instead of on all cells.
     rate : bool
@@ -240,8 +240,8 @@ class PIConsensus(Record, Sharing):
         """One step of (16), in as many substeps as stability asks for."""
         u = _coordinates(seen, self.modes, seen.kernels)
         estimate, integral, before = carried
-        after = tracking.pi_step(
-            tracking.PIState(estimate, integral), before, channel, dt=dt, alpha=self.alpha,
+        after = pi_step(
+            PIState(estimate, integral), before, channel, dt=dt, alpha=self.alpha,
             a=self.a, b=self.b, rate=(u - before) / dt if self.rate else None,
         )
         return (after.estimate, after.integral, u), *_read(after.estimate, seen, self.modes)
@@ -281,7 +281,7 @@ class DynamicAverage(Record, Sharing):
         weights = weighting.balanced(graph) if graph.directed else weighting.metropolis(graph)
         lost = "keep" if graph.directed else "mutual"
         for now in (u, *(before,) * (self.rounds - 1)):  # the change belongs to the first round
-            x = tracking.first_order(x, now, before, channel, weights=weights, lost=lost)
+            x = first_order(x, now, before, channel, weights=weights, lost=lost)
         return (x, u), *_read(x, seen, self.modes)
 
 

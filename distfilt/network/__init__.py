@@ -1,12 +1,11 @@
 """Who hears whom, what a message costs, and how neighbours agree."""
 
 from . import graphs, weights
-from .admm import AdmmRun, admm
-from .agreement import barycentre, intersection, pull
-from .asynchronous import event_triggered, flood, gossip
 from .channel import Channel
 from .consensus import (
-    UnstableGain,
+    AdmmRun,
+    Disconnected,
+    admm,
     average,
     finite_time,
     fused_kind,
@@ -14,22 +13,33 @@ from .consensus import (
     maximum,
     push_sum,
 )
+from .dynamic import (
+    PIState,
+    event_triggered,
+    first_order,
+    flood,
+    gossip,
+    pi_start,
+    pi_step,
+    stable_substeps,
+)
 from .faults import Faults
 from .fusion import (
     arithmetic_average,
     consensus_pull,
     covariance_intersection,
+    intersection,
     naive_fusion,
+    pull,
 )
+from .graphs import Graph, as_graph
 from .ledger import Ledger
-from .links import Graph
-from .tracking import PIState, first_order, pi_start, pi_step, stable_substeps
-from .weights import Weights
+from .weights import UnstableGain, Weights
 
 __all__ = [  # fmt: skip
-    "AdmmRun", "Channel", "Faults", "Graph", "Ledger", "PIState", "UnstableGain", "Weights", "admm",
-    "arithmetic_average", "average", "barycentre", "consensus_pull", "covariance_intersection",
-    "event_triggered", "finite_time", "first_order", "flood", "fused_kind", "fuses", "gossip",
-    "graphs", "intersection", "maximum", "naive_fusion", "pi_start", "pi_step", "pull", "push_sum",
-    "stable_substeps", "weights",
+    "AdmmRun", "Channel", "Disconnected", "Faults", "Graph", "Ledger", "PIState", "UnstableGain",
+    "Weights", "admm", "arithmetic_average", "as_graph", "average", "consensus_pull",
+    "covariance_intersection", "event_triggered", "finite_time", "first_order", "flood",
+    "fused_kind", "fuses", "gossip", "graphs", "intersection", "maximum", "naive_fusion",
+    "pi_start", "pi_step", "pull", "push_sum", "stable_substeps", "weights",
 ]

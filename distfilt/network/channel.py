@@ -5,26 +5,26 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy import sparse
 
-from ..checks import Array, array, choice, count, instance, number
-from . import _payloads
+from ..doors import Array, Count, Mask, door, unchecked
+from . import ledger as accounts
 from .faults import Faults
+from .graphs import Graph, as_graph
 from .ledger import Ledger
-from .links import Graph
-from .weights import Weights, stacked
+from .weights import Weights, _matching, stacked
 
-__all__ = ["Channel", "LOST"]
-
-Mask = NDArray[np.bool_]
+__all__ = ["Channel", "Lost", "PerAgent"]
 
 _PERFECT = Faults()
+_Own = Annotated[Array, "*self.runs self.graph.size k"]
 
-LOST = ("mutual", "metropolis", "keep", "renormalise", "zero")
+PerAgent = Annotated[Array, "*channel.runs channel.graph.size k"]
+"""One vector for each agent of an argument named `channel`."""
+
+Lost = Literal["mutual", "metropolis", "keep", "renormalise", "zero"]
 """What :meth:`Channel.combine` can do about a lost message; the last three are biased."""
 
 
@@ -38,7 +38,8 @@ class Channel:
     Parameters
     ----------
     graph : Graph
-        The links at this time.
+        The links at this time; or a networkx graph, a matrix of links, or edges: see
+        :func:`distfilt.network.as_graph`.
     ledger : Ledger, optional
         What was sent before; empty by default. Its count of rounds numbers the losses.
     runs : tuple of int
@@ -60,43 +61,41 @@ class Channel:
     Ledger(rounds=1, messages=4, scalars=4, bytes=32, lost=0)
     """
 
+    @door
     def __init__(
-        self, graph: Graph, *, ledger: Ledger | None = None, runs: tuple[int, ...] = (),
+        self, graph: Any, *, ledger: Ledger | None = None, runs: tuple[Count, ...] = (),
         faults: Faults | None = None, t: float | None = None,
     ) -> None:
-        instance(graph, "graph", Graph)
-        if ledger is not None and not isinstance(ledger, Ledger):
-            raise ValueError(f"ledger: needs a Ledger, got {type(ledger).__name__}")
-        if ledger is not None and ledger.messages.size != graph.size:
-            raise ValueError(
-                f"ledger: needs {graph.size} agents like the graph, got {ledger.messages.size}"
-            )
-        if faults is not None and not isinstance(faults, Faults):
-            raise ValueError(f"faults: needs Faults, got {type(faults).__name__}")
-        self.graph = graph
-        if not isinstance(runs, tuple | list):
-            raise ValueError(f"runs: needs a tuple of sizes such as (20,), got {runs!r}")
-        self.runs = tuple(count(n, "runs") for n in runs)
+        self.graph: Graph = as_graph(graph, None if ledger is None else ledger.messages.size)
+        self.runs = runs
         self.faults = _PERFECT if faults is None else faults
-        if faults is not None:
-            faults.check(graph)
-        self.t = None if t is None else number(t, "t")
+        self.faults.check(self.graph)
+        self.t = t
         if self.faults.needs_time and t is None:
             raise ValueError("t: needs the time for faults with windows in seconds, got None")
-        self._ledger = Ledger.empty(graph.size) if ledger is None else ledger
+        self._ledger = Ledger.empty(self.graph.size) if ledger is None else ledger
         self._owed: dict[int, int] = {}
         self._late: dict[Any, deque[Any]] = {}
-        self._perfect = faults is None or faults.none
+        self._perfect = self.faults.none
 
     @property
     def ledger(self) -> Ledger:
         """The account so far."""
         for size, rounds in self._owed.items():
-            self._ledger = self._ledger.charge(
-                rounds * self.graph.listeners.astype(np.int64), size, 8 * size, rounds=rounds
-            )
+            messages = rounds * self.graph.listeners.astype(np.int64)
+            self._ledger = self._charged(self._ledger, messages, size, 8 * size, rounds=rounds)
         self._owed = {}
         return self._ledger
+
+    def _charged(self, ledger: Ledger, messages: Any, scalars: Any, bytes_: Any, *,
+                 rounds: int = 1, lost: Any = 0.0) -> Ledger:  # fmt: skip
+        """The account after more rounds, in which agents sent so many messages of these sizes."""
+        spoke = self.graph.senders.size > 0
+        return ledger.changed(
+            rounds=ledger.rounds + rounds * spoke, messages=ledger.messages + messages,
+            scalars=ledger.scalars + messages * scalars, bytes=ledger.bytes + messages * bytes_,
+            lost=ledger.lost + lost,
+        )
 
     def exchange(self, payloads: Sequence[Any]) -> list[dict[int, Any]]:
         """Let every agent send its payload to all that hear it.
@@ -105,7 +104,8 @@ class Channel:
         ----------
         payloads : sequence of length A
             Per agent a numeric array (*runs, ...), a flat tuple of them, or None to stay silent.
-            Nothing but NaN is silence too. Each entry counts as one scalar, of its own item size.
+            Each entry counts as one scalar, of its own item size. What is missing is not sent:
+            entries that are NaN (in all runs) cost nothing, and nothing but NaN is silence.
 
         Returns
         -------
@@ -114,27 +114,27 @@ class Channel:
             In a batch, the runs that lost a message find NaN in its place, and integers become
             floats there.
         """
-        sent = _payloads.checked(payloads, self.graph.size, self.runs, copy=self.faults.late > 0)
         graph = self.graph
+        sent = accounts.taken(payloads, graph.size, self.runs, copy=self.faults.late > 0)
         speaks = np.array([p is not None for p in sent])[graph.senders]
-        arrived = self._transmit(speaks, *_payloads.sizes(sent, self.runs))
+        arrived = self._transmit(speaks, *accounts.sizes(sent, self.runs))
         if self._perfect:
             return _by_receiver(graph, sent, np.flatnonzero(speaks))
         late = self._delayed("exchange", (sent, arrived))
         if late is None:
-            return [{} for _ in range(self.graph.size)]
+            return [{} for _ in range(graph.size)]
         sent, arrived = late
         some = np.flatnonzero(arrived.any(axis=0))
         inbox = _by_receiver(graph, sent, some)
         for k in some[~arrived[:, some].all(axis=0)].tolist():
             receiver, sender = int(graph.receivers[k]), int(graph.senders[k])
             here = arrived[:, k].reshape(self.runs)
-            inbox[receiver][sender] = _payloads.thinned(sent[sender], here)
+            inbox[receiver][sender] = accounts.thinned(sent[sender], here)
         return inbox
 
+    @door
     def combine(
-        self, values: ArrayLike, weights: Weights | ArrayLike | sparse.sparray, *,
-        lost: str = "mutual", rounds: int = 1,
+        self, values: _Own, weights: Weights, *, lost: Lost = "mutual", rounds: Count = 1
     ) -> Array:
         """Let every agent replace its value by a weighted sum of its own and what it hears.
 
@@ -142,7 +142,7 @@ class Channel:
         ----------
         values : array_like, (*runs, A, k)
             One vector per agent.
-        weights : Weights, or matrix (A, A)
+        weights : Weights
             What each agent makes of the values.
         lost : {"mutual", "metropolis", "keep", "renormalise", "zero"}
             What an agent does about a message that it misses.
@@ -155,33 +155,20 @@ class Channel:
             - ``"keep"``: the receiver gives the weight to its own value, ``"renormalise"``: to all
               that it has, ``"zero"``: to nothing. These move the average.
         rounds : int
-            How many times; the values are checked once.
+            How many times.
         """
-        v, w = self._checked(values, weights)
-        choice(lost, "lost", LOST)
-        times = count(rounds, "rounds")
+        w = _matching(self.graph, weights)
         if self._perfect:
-            return self._combine_all(v, w, times)
-        for _ in range(times):
-            v = self._combine_what_arrives(v, w, lost)[0]
-        return v
+            return self._combine_all(values, w, rounds)
+        for _ in range(rounds):
+            values = self._combine_what_arrives(values, w, lost)[0]
+        return values
 
-    def combine_with_own(
-        self, values: ArrayLike, weights: Weights | ArrayLike | sparse.sparray, *,
-        lost: str = "mutual",
-    ) -> tuple[Array, Array]:
+    def _combine_with_own(self, values: Array, weights: Weights, lost: Lost) -> tuple[Array, Array]:
         """As :meth:`combine`, with the weight that each agent's own value got, (*runs, A)."""
-        v, w = self._checked(values, weights)
-        choice(lost, "lost", LOST)
         if self._perfect:
-            return self._combine_all(v, w, 1), w.own
-        return self._combine_what_arrives(v, w, lost)
-
-    def _checked(
-        self, values: ArrayLike, weights: Weights | ArrayLike | sparse.sparray
-    ) -> tuple[Array, Weights]:
-        v = array(values, "values", (*self.runs, self.graph.size, "k"))
-        return v, Weights.from_matrix(self.graph, weights, name="weights")
+            return self._combine_all(values, weights, 1), weights.own
+        return self._combine_what_arrives(values, weights, lost)
 
     def _combine_all(self, v: Array, w: Weights, rounds: int) -> Array:
         """Rounds without faults, agents in front throughout."""
@@ -192,7 +179,8 @@ class Channel:
             flat = w.matrix @ flat
         return np.ascontiguousarray(np.moveaxis(flat.reshape(front.shape), 0, -2))
 
-    def broadcast(self, values: ArrayLike) -> tuple[Array, Mask]:
+    @door
+    def broadcast(self, values: _Own) -> tuple[Array, Mask]:
         """Let every agent send one vector to all that hear it.
 
         Parameters
@@ -216,15 +204,17 @@ class Channel:
         >>> heard.ravel(), arrived
         (array([1., 3.]), array([ True,  True]))
         """
-        v = array(values, "values", (*self.runs, self.graph.size, "k"))
-        sizes = np.full(self.graph.size, v.shape[-1])
-        heard, arrived = self._sent("broadcast", v, sizes)
+        sizes = np.full(self.graph.size, values.shape[-1])
+        heard, arrived = self._sent("broadcast", values, sizes)
         heard = heard.view()
         heard.flags.writeable = False
         return heard, arrived.reshape(*self.runs, self.graph.senders.size)
 
+    @door
     def carry(
-        self, values: ArrayLike, *, links: ArrayLike | None = None, acknowledged: bool = False
+        self, values: Annotated[Array, "*self.runs self.graph.senders.size k"], *,
+        links: Annotated[Mask, "self.graph.senders.size"] | None = None,
+        acknowledged: bool = False,
     ) -> Array:
         """Send a payload of its own along each link.
 
@@ -235,7 +225,7 @@ class Channel:
         links : array_like of bool, (E,), optional
             The links that are used in this round; all by default. The others are not charged.
         acknowledged : bool
-            Charge an acknowledgement for each message.
+            Charge an acknowledgement for each message, of one byte, to the agent that it was for.
 
         Returns
         -------
@@ -243,19 +233,12 @@ class Channel:
             The same, with NaN where nothing arrives.
         """
         edges = self.graph.senders.size
-        v = array(values, "values", (*self.runs, edges, "k"))
-        speaks = np.ones(edges, dtype=bool) if links is None else np.asarray(links)
-        if speaks.dtype != bool or speaks.shape != (edges,):
-            raise ValueError(
-                f"links: needs booleans for each of {edges} links, got {speaks.dtype} of shape "
-                f"{speaks.shape}"
-            )
-        sizes = np.full(self.graph.size, v.shape[-1])
-        instance(acknowledged, "acknowledged", bool)
-        sent, arrived = self._sent("carry", v, sizes, speaks=speaks, acknowledged=acknowledged)
+        speaks = np.ones(edges, dtype=bool) if links is None else links
+        sizes = np.full(self.graph.size, values.shape[-1])
+        sent, arrived = self._sent("carry", values, sizes, speaks=speaks, acknowledged=acknowledged)
         return np.where(arrived.reshape(*self.runs, edges)[..., None], sent, np.nan)
 
-    def _combine_what_arrives(self, v: Array, w: Weights, lost: str) -> tuple[Array, Array]:
+    def _combine_what_arrives(self, v: Array, w: Weights, lost: Lost) -> tuple[Array, Array]:
         k, size = v.shape[-1], self.graph.size
         both = lost in ("mutual", "metropolis")
         if both and self.graph.directed:
@@ -292,15 +275,16 @@ class Channel:
         if self._perfect:
             arrived, lost = np.broadcast_to(speaks, (runs, speaks.size)), np.zeros(size)
         else:
-            speaks = speaks & self.faults.speaking(self.graph, now.rounds, self.t)
-            arrived = speaks & ~self.faults.lost(self.graph, now.rounds, runs, self.t)
+            speaking, losing = unchecked(self.faults.speaking), unchecked(self.faults.lost)
+            speaks = speaks & speaking(self.graph, now.rounds, self.t)
+            arrived = speaks & ~losing(self.graph, now.rounds, runs, self.t)
             missing = (speaks & ~arrived).sum(axis=0) / runs
             lost = np.bincount(self.graph.senders, weights=missing, minlength=size).astype(float)
         messages = np.bincount(self.graph.senders[speaks], minlength=size)
-        after = now.charge(messages, sizes, bytes_, lost=lost)
+        after = self._charged(now, messages, sizes, bytes_, lost=lost)
         if acknowledged:
             back = np.bincount(self.graph.receivers[speaks], minlength=size)
-            after = after.charge(back, 0, 1, rounds=0)
+            after = self._charged(after, back, 0, 1, rounds=0)
         self._ledger = after
         return np.asarray(arrived)
 

@@ -1,24 +1,24 @@
-"""Rules by which agents agree on an average or a maximum: ``(values, channel, *, …) -> values``."""
+"""Rules by which agents agree, ``(values, channel, *, …) -> values``, and minimise a sum."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..checks import Array, array, count, instance, number
-from ..doors import unchecked
-from . import weights as weighting
-from .channel import Channel
-from .links import Graph
-from .weights import Weights
+from ..checks import SolverError
+from ..doors import Array, Count, Positive, Record, array, door, unchecked
+from ._links import diameter_bound
+from .channel import Channel, Lost, PerAgent
+from .weights import Weights, _keeping, _laplacian, _matching, _warn_if_unstable, metropolis
 
 __all__ = [  # fmt: skip
-    "UnstableGain", "average", "finite_time", "fused_kind", "fuses", "maximum", "push_sum",
+    "AdmmRun", "Disconnected", "admm", "average", "finite_time", "fused_kind",
+    "fuses", "maximum", "push_sum",
 ]
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -35,7 +35,7 @@ def fuses(kind: Fused) -> Callable[[F], F]:
     Parameters
     ----------
     kind : {"vectors", "ensembles", "gaussians", "mixtures", "densities", "particles"}
-        What ``rule(belief, channel, *, …) -> belief`` takes and returns.
+        What ``rule(belief, channel, *, …)`` takes and returns.
 
     Examples
     --------
@@ -65,37 +65,12 @@ def fused_kind(rule: Callable[..., Any]) -> str | None:
     return getattr(rule, "fuses", None)
 
 
-class UnstableGain(RuntimeWarning):
-    """A gain above 2/λ_max: what the agents exchange drives them apart instead of together.
+class Disconnected(RuntimeWarning):
+    """A graph in several parts, each of which agrees on an average of its own.
 
-    Turn it into an error, or off, by ``warnings.filterwarnings("error", category=UnstableGain)``.
-
-    >>> issubclass(UnstableGain, RuntimeWarning)
+    >>> issubclass(Disconnected, RuntimeWarning)
     True
     """
-
-
-def warn_if_unstable(graph: Graph, gain: float) -> None:
-    """Warn the caller's caller of a gain at which averaging on the graph diverges.
-
-    A bound from the degrees clears most gains; eigenvalues are computed, once for a graph, only
-    beyond it.
-    """
-    if gain <= graph.safe_gain:
-        return
-    limit = graph.largest_gain
-    if gain > limit * (1 + 1e-9):
-        warnings.warn(
-            f"gain: {gain:.6g} is above 2/λ_max = {limit:.6g} of this graph, so the agents drift "
-            f"apart",
-            UnstableGain,
-            stacklevel=3,
-        )
-
-
-def _values(values: ArrayLike, channel: Channel, name: str = "values") -> Array:
-    instance(channel, "channel", Channel)
-    return array(values, name, (*channel.runs, channel.graph.size, "k"))
 
 
 def _connected(channel: Channel) -> None:
@@ -105,9 +80,10 @@ def _connected(channel: Channel) -> None:
 
 
 @fuses("vectors")
+@door
 def average(
-    values: ArrayLike, channel: Channel, *, rounds: int = 1, gain: float | None = None,
-    weights: Weights | None = None, lost: str = "mutual",
+    values: PerAgent, channel: Channel, *, rounds: Count = 1, gain: Positive | None = None,
+    weights: Weights | None = None, lost: Lost = "mutual",
 ) -> Array:
     r"""Move every agent's value towards its neighbours', the averaging behind equation (16).
 
@@ -121,7 +97,8 @@ def average(
     channel : Channel
         The door between agents. On a graph that is not connected each component agrees for itself.
     rounds : int
-        How many times.
+        How many times. More than one on a graph in several parts raise a :class:`Disconnected`
+        warning; one does not, as graphs that change may be connected over time.
     gain : float, optional
         The gain γ, positive. The values agree if and only if the graph is connected and
         γ < 2/λ_max of its Laplacian; above it an :class:`UnstableGain` warns.
@@ -139,20 +116,25 @@ def average(
            [0.5],
            [0.5]])
     """
-    out = _values(values, channel)
+    graph = channel.graph
     if gain is not None and weights is not None:
         raise ValueError("gain: needs to stand alone, got weights too")
     if gain is not None:
-        weights = weighting.laplacian(channel.graph, number(gain, "gain", above=0))
-        warn_if_unstable(channel.graph, gain)
+        _warn_if_unstable(graph, gain)
+        weights = _laplacian(graph, gain)
     elif weights is None:
-        weights = weighting.metropolis(channel.graph)
-    weighting.keeping(weights)
-    return channel.combine(out, weights, lost=lost, rounds=rounds)
+        weights = metropolis(graph)
+    _matching(graph, _keeping(weights))
+    if rounds > 1 and not graph.connected:
+        parts = graph.components.max() + 1
+        text = f"channel: the graph has {parts} parts, and each agrees on an average of its own"
+        warnings.warn(text, Disconnected, stacklevel=3)
+    return unchecked(channel.combine)(values, weights, lost=lost, rounds=rounds)
 
 
 @fuses("vectors")
-def finite_time(values: ArrayLike, channel: Channel) -> Array:
+@door
+def finite_time(values: PerAgent, channel: Channel) -> Array:
     r"""The exact average in as many rounds as the Laplacian has distinct nonzero eigenvalues.
 
     .. math:: \prod_{k}\Bigl(\mathbf I-\tfrac1{\lambda_k}\mathbf L\Bigr)\mathbf x
@@ -180,12 +162,12 @@ def finite_time(values: ArrayLike, channel: Channel) -> Array:
     >>> channel.ledger.rounds
     2
     """
-    out = _values(values, channel)
     _connected(channel)
     if not channel.faults.none:
         raise ValueError("channel: needs no faults for a finite-time rule, got a faulty channel")
+    combine, out = unchecked(channel.combine), values.copy()
     for eigenvalue in _leja(_distinct(channel.graph.spectrum[1:])):
-        out = channel.combine(out, weighting.laplacian(channel.graph, 1 / eigenvalue))
+        out = combine(out, _laplacian(channel.graph, 1 / eigenvalue))
     return out
 
 
@@ -211,7 +193,8 @@ def _leja(points: Array) -> list[float]:
 
 
 @fuses("vectors")
-def push_sum(values: ArrayLike, channel: Channel, *, rounds: int) -> Array:
+@door
+def push_sum(values: PerAgent, channel: Channel, *, rounds: Count) -> Array:
     r"""Averages on any strongly connected digraph, also when messages are lost, without answers.
 
     Each agent pushes shares of its value and of a weight that began at one, and the ratio tends to
@@ -242,16 +225,15 @@ def push_sum(values: ArrayLike, channel: Channel, *, rounds: int) -> Array:
     >>> push_sum([[0.0], [3.0], [6.0]], Channel(circle), rounds=80).ravel().round(9)
     array([3., 3., 3.])
     """
-    v = _values(values, channel)
     _connected(channel)
-    graph = channel.graph
-    mass = np.concatenate([v, np.ones((*v.shape[:-1], 1))], axis=-1)
+    graph, carry = channel.graph, unchecked(channel.carry)
+    mass = np.concatenate([values, np.ones((*values.shape[:-1], 1))], axis=-1)
     share = 1 / (1 + graph.listeners)[:, None]
     pushed = np.zeros_like(mass)
     heard = np.zeros((*channel.runs, graph.senders.size, mass.shape[-1]))
-    for _ in range(count(rounds, "rounds")):
+    for _ in range(rounds):
         pushed = pushed + share * mass
-        arrived = channel.carry(pushed[..., graph.senders, :])
+        arrived = carry(pushed[..., graph.senders, :])
         latest = np.where(np.isnan(arrived), heard, arrived)
         mass = share * mass + _summed(latest - heard, channel)
         heard = latest
@@ -266,7 +248,8 @@ def _summed(per_link: Array, channel: Channel) -> Array:
 
 
 @fuses("vectors")
-def maximum(values: ArrayLike, channel: Channel, *, rounds: int | None = None) -> Array:
+@door
+def maximum(values: PerAgent, channel: Channel, *, rounds: Count | None = None) -> Array:
     """The largest value, component by component; exact after as many rounds as the diameter.
 
     Parameters
@@ -274,8 +257,8 @@ def maximum(values: ArrayLike, channel: Channel, *, rounds: int | None = None) -
     values, channel
         As for :func:`average`. Connected; a lost message only costs time.
     rounds : int, optional
-        By default the graph's diameter; with more than 1 000 agents ``graph.diameter_bound``, which
-        is enough, and at most twice as much, where the diameter itself would take long to find.
+        By default the graph's diameter; with more than 1 000 agents, where that would take long to
+        find, a bound that is at most twice as much.
 
     Examples
     --------
@@ -283,17 +266,132 @@ def maximum(values: ArrayLike, channel: Channel, *, rounds: int | None = None) -
     >>> maximum([[1.0], [5.0], [2.0]], Channel(graphs.path(3))).ravel()
     array([5., 5., 5.])
     """
-    out = _values(values, channel)
     _connected(channel)
-    graph = channel.graph
-    small = graph.size <= _SMALL
-    enough = graph.diameter if small else graph.diameter_bound
-    needed = enough if rounds is None else count(rounds, "rounds")
-    for _ in range(needed):
-        arrived = channel.carry(out[..., graph.senders, :])
-        if graph.senders.size:
-            hears = graph.degrees > 0
-            best = np.fmax.reduceat(arrived, graph.links.indptr[:-1][hears], axis=-2)
-            out = out.copy()
-            out[..., hears, :] = np.fmax(out[..., hears, :], best)
-    return out.copy()
+    graph, carry, out = channel.graph, unchecked(channel.carry), values.copy()
+    if graph.size == 1:
+        return out
+    if rounds is None:
+        rounds = graph.diameter if graph.size <= _SMALL else diameter_bound(graph.links)
+    for _ in range(rounds):
+        arrived = carry(out[..., graph.senders, :])
+        out = np.fmax(out, np.fmax.reduceat(arrived, graph.links.indptr[:-1], axis=-2))
+    return out
+
+
+@dataclass(frozen=True, eq=False)
+class AdmmRun(Record):
+    """What consensus ADMM found.
+
+    Parameters
+    ----------
+    common : ndarray, (A, k)
+        Each agent's copy of the common variable Z.
+    local : ndarray, (A, k)
+        Each agent's own variable.
+    multipliers : ndarray, (A, k)
+        Scaled multipliers; they sum to zero.
+    iterations : int
+        How many.
+    primal, dual : float
+        The residuals at the end, over all agents: the largest distance of local from common, and ρ
+        times the largest change of the common variable.
+
+    Examples
+    --------
+    >>> AdmmRun(np.zeros((2, 1)), np.zeros((2, 1)), np.zeros((2, 1)), 3, 1e-9, 1e-9).iterations
+    3
+    """
+
+    common: Array
+    local: Array
+    multipliers: Array
+    iterations: int
+    primal: float
+    dual: float
+
+
+@door
+def admm(
+    local_solve: Callable[[Array, float], Array],
+    start: Annotated[Array, "channel.graph.size k"], channel: Channel, *, rho: Positive = 1.0,
+    tolerance: Positive = 1e-6, iterations: Count = 1000, check: Count | None = 1,
+    agree: Callable[[Array, Channel], Array] = finite_time,
+) -> AdmmRun:  # fmt: skip
+    r"""Minimise :math:`\sum_l f_l(\mathbf Z)` when agent l knows only its own :math:`f_l`.
+
+    .. math::
+        \mathbf U_l &\leftarrow \arg\min_{\mathbf U} f_l(\mathbf U)
+        + \tfrac\rho2\|\mathbf U-(\mathbf Z-\mathbf W_l)\|^2,\\
+        \mathbf Z &\leftarrow\tfrac1A\textstyle\sum_l(\mathbf U_l+\mathbf W_l),\\
+        \mathbf W_l &\leftarrow\mathbf W_l+\mathbf U_l-\mathbf Z
+
+    Parameters
+    ----------
+    local_solve : callable
+        ``local_solve(target, rho) -> U`` on (A, k): the proximal step of every agent for its own
+        objective at its own row of `target` = Z - W.
+    start : array_like, (A, k)
+        Each agent's first Z.
+    channel : Channel
+        The door between agents; a single run, connected.
+    rho : float
+        Penalty, positive.
+    tolerance : float
+        Stop when both residuals, of every agent, are below it.
+    iterations : int
+        At most this many.
+    check : int or None
+        After every so many iterations the agents agree on their largest residuals, so that all stop
+        at once: :func:`maximum` of 2 scalars, as many rounds as the
+        diameter, charged like everything else. It needs a channel that loses nothing. None: no
+        agent looks, and all iterations are made.
+    agree : callable
+        ``agree(values, channel) -> values``: how the average is found. With a rule that is only
+        approximate the agents' copies of Z differ.
+
+    Raises
+    ------
+    SolverError
+        If the residuals are not below `tolerance` after `iterations` although `check` is given; the
+        message has them.
+
+    Notes
+    -----
+    S. Boyd et al., Foundations and Trends in Machine Learning 3 (2010) 1-122, section 7.1; proposed
+    for (22) of Grange et al.
+
+    Examples
+    --------
+    The average of private numbers, each the minimiser of its agent's :math:`(u-c_l)^2/2`:
+
+    >>> from distfilt.network import Channel, graphs
+    >>> own = np.array([[1.0], [2.0], [6.0]])
+    >>> run = admm(lambda v, rho: (own + rho * v) / (1 + rho), np.zeros((3, 1)),
+    ...            Channel(graphs.path(3)))
+    >>> run.common.round(5).ravel()
+    array([3., 3., 3.])
+    """
+    if channel.runs:
+        raise ValueError(f"channel: needs a single run, got runs of shape {channel.runs}")
+    if check is not None and not channel.faults.none:  # agents would stop apart
+        raise ValueError(
+            "check: needs a channel without faults, or None to make all iterations, got faults"
+        )
+    z, w = start, np.zeros_like(start)
+    for n in range(1, iterations + 1):
+        u = array(local_solve(z - w, rho), "local_solve", z.shape)
+        new = array(agree(u + w, channel), "agree", z.shape)
+        w = w + u - new
+        gaps = np.stack([np.abs(u - new).max(axis=1), np.abs(new - z).max(axis=1)], axis=1)
+        residuals, z = gaps * [1.0, rho], new
+        if check is not None and (n % check == 0 or n == iterations):
+            # After the maximum all agents hold the same two numbers; any row will do.
+            primal, dual = (float(r) for r in unchecked(maximum)(residuals, channel)[0])
+            if primal < tolerance and dual < tolerance:
+                return AdmmRun.unchecked(z, u, w, n, primal, dual)
+    if check is None:
+        return AdmmRun.unchecked(z, u, w, iterations, *residuals.max(axis=0).tolist())
+    raise SolverError(
+        f"admm: residuals {primal:.3g} and {dual:.3g} after {iterations} iterations, "
+        f"needs both below {tolerance:g}"
+    )

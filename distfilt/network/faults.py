@@ -4,23 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..checks import Array, array, choice, count, instance, number
-from .links import Graph
+from ..doors import Array, Bounds, Index, Mask, Record, Share, array, door
+from .graphs import Graph
 
 __all__ = ["Faults"]
 
 _GOLDEN = 0x9E3779B97F4A7C15
 
-Mask = NDArray[np.bool_]
 Hashes = NDArray[np.uint64]
 
 
+_BETWEEN = Bounds(at_least=0, at_most=1)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Faults:
+class Faults(Record):
     r"""How a channel fails. ``faults | other`` fails in both ways.
 
     Parameters
@@ -70,38 +73,26 @@ class Faults:
     False
     """
 
-    loss: float | ArrayLike = 0.0
-    seed: int = 0
+    loss: Share | Annotated[Array, "A", _BETWEEN] | Annotated[Array, "A A", _BETWEEN] = 0.0
+    seed: Index = 0
     symmetric: bool = False
-    burst: float | None = None
-    delay: int = 0
-    silent: Collection[int] = ()
-    during: Sequence[tuple[float, float]] | None = None
-    clock: str = "rounds"
+    burst: Annotated[float, Bounds(at_least=1)] | None = None
+    delay: Index = 0
+    silent: Collection[Index] = ()
+    during: Sequence[tuple[Any, Any]] | None = None
+    clock: Literal["rounds", "time"] = "rounds"
     also: tuple[Faults, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "loss", _probabilities(self.loss))
-        count(self.seed, "seed", at_least=0)
-        count(self.delay, "delay", at_least=0)
-        choice(self.clock, "clock", ("rounds", "time"))
-        instance(self.symmetric, "symmetric", bool)
-        if isinstance(self.silent, str) or not isinstance(self.silent, Collection):
-            raise ValueError(
-                f"silent: needs a collection of agents such as [3], got {self.silent!r}"
-            )
-        off = tuple(count(a, "silent", at_least=0) for a in self.silent)
-        object.__setattr__(self, "silent", off)
+        super().__post_init__()
         if self.burst is not None:
-            _check_burst(number(self.burst, "burst", at_least=1), np.asarray(self.loss))
+            _check_burst(self.burst, np.asarray(self.loss))
         if self.during is not None:
             object.__setattr__(self, "during", _windows(self.during))
-        if not isinstance(self.also, tuple) or not all(isinstance(o, Faults) for o in self.also):
-            raise ValueError(f"also: needs a tuple of Faults, got {self.also!r}")
 
     def __or__(self, other: Faults) -> Faults:
         if not isinstance(other, Faults):
-            raise ValueError(f"faults: needs Faults on both sides of |, got {other!r}")
+            return NotImplemented
         mine, theirs = ({f.seed for f in x._all() if np.any(f.loss)} for x in (self, other))
         if mine & theirs:
             raise ValueError(
@@ -114,7 +105,6 @@ class Faults:
 
     def check(self, graph: Graph) -> None:
         """Refuse a graph whose agents do not fit."""
-        instance(graph, "graph", Graph)
         for faults in self._all():
             needed = (graph.size,) * np.ndim(faults.loss)
             if np.shape(faults.loss) != needed:
@@ -133,11 +123,6 @@ class Faults:
         return not any(np.any(f.loss) or f.delay or f.silent for f in self._all())
 
     @property
-    def lossless(self) -> bool:
-        """Whether every message arrives at last: no losses, and nobody silent."""
-        return not any(np.any(f.loss) or f.silent for f in self._all())
-
-    @property
     def late(self) -> int:
         """Rounds that a message takes on top of its own, all delays together."""
         return sum(f.delay for f in self._all())
@@ -147,19 +132,19 @@ class Faults:
         """Whether some windows are in seconds, so that a channel needs to know the time."""
         return any(f.during is not None and f.clock == "time" for f in self._all())
 
-    def speaking(self, graph: Graph, round_: int = 0, t: float | None = None) -> Mask:
+    @door
+    def speaking(self, graph: Graph, round_: Index = 0, t: float | None = None) -> Mask:
         """Links whose both ends have their radio on in a round, (E,)."""
-        round_, t = _now(graph, round_, t)
         off = np.zeros(graph.size, dtype=bool)
         for faults in self._all():
             if faults.silent and faults._active(round_, t):
                 off[list(faults.silent)] = True
         return ~(off[graph.receivers] | off[graph.senders])
 
-    def lost(self, graph: Graph, round_: int, runs: int, t: float | None = None) -> Mask:
+    @door
+    def lost(self, graph: Graph, round_: Index, runs: Index, t: float | None = None) -> Mask:
         """Which links lose the message of round `round_` in each of `runs` runs, (runs, E)."""
-        round_, t = _now(graph, round_, t)
-        out = np.zeros((count(runs, "runs", at_least=0), graph.senders.size), dtype=bool)
+        out = np.zeros((runs, graph.senders.size), dtype=bool)
         for faults in self._all():
             if np.any(faults.loss) and faults._active(round_, t):
                 out |= faults._losses(graph, round_, runs)
@@ -170,8 +155,9 @@ class Faults:
             return True
         if self.clock == "time" and t is None:
             raise ValueError("t: needs the channel's time for windows in seconds, got None")
-        now = round_ if self.clock == "rounds" else t
-        return any(start <= now < stop for start, stop in self.during)  # type: ignore[operator]
+        now: Any = round_ if self.clock == "rounds" else t
+        windows: Any = self.during
+        return any(start <= now < stop for start, stop in windows)
 
     def _losses(self, graph: Graph, round_: int, runs: int) -> Mask:
         i, j = graph.receivers, graph.senders
@@ -203,26 +189,6 @@ class Faults:
         return _mixed(key ^ (np.arange(runs, dtype=np.uint64) * np.uint64(_GOLDEN)))
 
 
-def _now(graph: Graph, round_: int, t: float | None) -> tuple[int, float | None]:
-    instance(graph, "graph", Graph)
-    now = None if t is None else number(t, "t")
-    return count(round_, "round_", at_least=0), now
-
-
-def _probabilities(loss: float | ArrayLike) -> float | Array:
-    if np.ndim(loss) == 0:
-        return number(loss, "loss", at_least=0, at_most=1)
-    rates = array(loss, "loss").copy()
-    if rates.ndim > 2 or rates.shape[0] != rates.shape[-1]:
-        raise ValueError(f"loss: needs a number, shape (A,) or (A, A), got {rates.shape}")
-    if rates.min(initial=0) < 0 or rates.max(initial=0) > 1:
-        raise ValueError(
-            f"loss: needs probabilities in [0, 1], got {rates.min():g} to {rates.max():g}"
-        )
-    rates.flags.writeable = False
-    return rates
-
-
 def _check_burst(burst: float, loss: Array) -> None:
     rates = loss[(loss > 0) & (loss < 1)]
     shortest = 1 / (1 - rates.max(initial=0.0))
@@ -233,7 +199,7 @@ def _check_burst(burst: float, loss: Array) -> None:
         )
 
 
-def _windows(during: Sequence[tuple[float, float]]) -> tuple[tuple[float, float], ...]:
+def _windows(during: Any) -> tuple[tuple[float, float], ...]:
     ends = array(during, "during", finite=False)
     if ends.ndim != 2 or ends.shape[1] != 2 or not (ends[:, 0] < ends[:, 1]).all():
         raise ValueError(

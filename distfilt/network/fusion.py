@@ -1,34 +1,47 @@
-"""Fusing Gaussian estimates whose errors may share information nobody kept track of."""
+"""Rules by which Gaussians and ensembles agree, whose errors may share what nobody kept track of.
+
+``rule((means, covs), channel, *, …) -> (means, covs)`` and ``rule(ensembles, channel, *, …) ->
+ensembles``: a filter's ``agreement=``, with :func:`functools.partial` for the options.
+"""
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
-from ..checks import Array, array, choice, count, covariance, instance, number
-from ..gaussians import _intersection_weights
+import numpy as np
+from numpy.typing import NDArray
+
+from ..doors import Array, Count, Mask, NonNegative, definite, door, unchecked
+from ..ensembles import _mean, _sample_covariance
+from ..gaussians import _intersection_weights, _recolour
 from ..linalg import _solve_lower, _symmetrise
-from . import weights as weighting
-from ._neighbourhood import Heard, in_rounds
 from .channel import Channel
-from .consensus import fuses, warn_if_unstable
-from .links import Graph
-from .weights import Weights
+from .consensus import fuses
+from .graphs import Graph
+from .weights import _laplacian, _warn_if_unstable
 
 __all__ = [  # fmt: skip
-    "arithmetic_average", "consensus_pull", "covariance_intersection", "naive_fusion",
+    "arithmetic_average", "consensus_pull", "covariance_intersection", "intersection",
+    "naive_fusion", "pull",
 ]
 
-Belief = tuple[ArrayLike, ArrayLike]
-
-RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
+Gaussians = tuple[
+    Annotated[Array, "*channel.runs channel.graph.size d"],
+    Annotated[Array, "*channel.runs channel.graph.size d d", definite],
+]
+Ensembles = Annotated[Array, "*channel.runs channel.graph.size N d"]
+Pair = tuple[Array, Array]
+Indices = NDArray[np.int64]
+Rule = Literal["equal", "trace", "determinant", "min_trace", "min_determinant"]
 
 
 @fuses("gaussians")
+@door
 def covariance_intersection(
-    belief: Belief, channel: Channel, *, rule: str = "equal",
-    weights: Weights | ArrayLike | None = None, rounds: int = 1,
-) -> tuple[Array, Array]:
+    belief: Gaussians, channel: Channel, *, rule: Rule = "equal", rounds: Count = 1
+) -> Pair:
     r"""Each agent fuses its Gaussian with its neighbours', safely whatever they share.
 
     .. math:: \mathbf P^{-1}=\sum_j\omega_j\mathbf P_j^{-1},\qquad
@@ -47,9 +60,6 @@ def covariance_intersection(
     rule : {"equal", "trace", "determinant", "min_trace", "min_determinant"}
         How an agent weights what it has: see
         :func:`distfilt.gaussians.intersection_weights`.
-    weights : Weights or array_like, (A, A), optional
-        Given weights instead of a rule, nonnegative, each row's sum one. Where messages are lost,
-        those of what arrived are scaled up to one again.
     rounds : int
         How many times.
 
@@ -66,79 +76,16 @@ def covariance_intersection(
     >>> two[0].ravel().round(6), two[1].ravel().round(6)
     (array([0.6, 0.6]), array([1.2, 1.2]))
     """
-    return _intersected(*_checked(belief, channel), channel, rule, weights, rounds)
 
+    def step(heard: _Heard) -> Pair:
+        return _information_sum(heard, *_by_rule(heard, rule))
 
-def _intersected(
-    means: Array, covs: Array, channel: Channel, rule: str, weights: Weights | ArrayLike | None,
-    rounds: int,
-) -> tuple[Array, Array]:
-    """The same of arrays that were checked."""
-    choice(rule, "rule", RULES)
-    given = None if weights is None else _given(channel.graph, weights)
-
-    def step(heard: Heard) -> tuple[Array, Array]:
-        if given is None:
-            own, links = _by_rule(heard, rule)
-        else:
-            own, links = _shared(np.broadcast_to(given.own, heard.means.shape[:2]),
-                                 given.links * heard.arrived, heard)
-        return _information_sum(heard, own, links)
-
-    return in_rounds(means, covs, channel, rounds, step)
-
-
-def _given(graph: Graph, weights: Weights | ArrayLike) -> Weights:
-    w = Weights.from_matrix(graph, weights, name="weights")
-    least = min(w.own.min(), w.links.min(initial=0.0))
-    if least < 0 or w.own.min() <= 0:
-        raise ValueError(f"weights: needs positive own weights and no negative ones, got {least:g}")
-    rows = w.own + graph.incidence @ w.links
-    worst = int(np.abs(rows - 1).argmax())
-    if abs(rows[worst] - 1) > 1e-8:
-        raise ValueError(
-            f"weights: needs rows that sum to 1, got {rows[worst]:.6g} for agent {worst}"
-        )
-    return w
-
-
-def _by_rule(heard: Heard, rule: str) -> tuple[Array, Array]:
-    """Own weights (R, A) and those of links (R, E); each agent's sum to one."""
-    graph = heard.graph
-    if rule == "equal":
-        ones = np.ones(heard.means.shape[:2])
-        return _shared(ones, heard.arrived.astype(np.float64), heard)
-    if rule in ("trace", "determinant"):
-        mine = _size_weights(heard.covs, rule)
-        sent = mine if heard.sent_covs is heard.covs else _size_weights(heard.sent_covs, rule)
-        return _shared(mine, sent[:, graph.senders] * heard.arrived, heard)
-    own, links = np.empty(heard.means.shape[:2]), np.zeros(heard.arrived.shape)
-    for agents, at in heard.groups():
-        _, covs, here = heard.collected(agents, at)
-        omega = _intersection_weights(covs, rule, here)
-        own[:, agents], links[:, at] = omega[..., 0], omega[..., 1:]
-    return own, links
-
-
-def _size_weights(covs: Array, rule: str) -> Array:
-    """Weights in closed form up to a factor: a number of each source alone, (R, A).
-
-    The odds against a unit covariance: no agent's number depends on another's, not even in its
-    last digit.
-    """
-    unit = np.broadcast_to(np.eye(covs.shape[-1]), covs.shape)
-    both = np.stack([covs, unit], axis=-3)
-    share = _intersection_weights(both, rule, np.ones(both.shape[:-2], dtype=bool))
-    return np.asarray(share[..., 0] / share[..., 1])
-
-
-def _shared(own: Array, links: Array, heard: Heard) -> tuple[Array, Array]:
-    total = own + heard.sums(links)
-    return own / total, links / total[:, heard.graph.receivers]
+    return _in_rounds(belief, channel, rounds, step)
 
 
 @fuses("gaussians")
-def naive_fusion(belief: Belief, channel: Channel, *, rounds: int = 1) -> tuple[Array, Array]:
+@door
+def naive_fusion(belief: Gaussians, channel: Channel, *, rounds: Count = 1) -> Pair:
     """Multiply the densities as if their errors were independent: counts shared data twice.
 
     Right for a single fusion of independent estimates, wrong as soon as agents exchange what they
@@ -151,15 +98,16 @@ def naive_fusion(belief: Belief, channel: Channel, *, rounds: int = 1) -> tuple[
     array([0.666667, 0.666667])
     """
 
-    def step(heard: Heard) -> tuple[Array, Array]:
+    def step(heard: _Heard) -> Pair:
         ones = np.ones(heard.means.shape[:2])
         return _information_sum(heard, ones, heard.arrived.astype(np.float64))
 
-    return in_rounds(*_checked(belief, channel), channel, rounds, step)
+    return _in_rounds(belief, channel, rounds, step)
 
 
 @fuses("gaussians")
-def arithmetic_average(belief: Belief, channel: Channel, *, rounds: int = 1) -> tuple[Array, Array]:
+@door
+def arithmetic_average(belief: Gaussians, channel: Channel, *, rounds: Count = 1) -> Pair:
     r"""Each agent takes mean and covariance of the mixture of its own and the heard densities.
 
     .. math:: \mathbf m=\sum_j\omega_j\mathbf m_j,\qquad
@@ -175,7 +123,7 @@ def arithmetic_average(belief: Belief, channel: Channel, *, rounds: int = 1) -> 
     (array([1.5, 1.5]), array([3.75, 3.75]))
     """
 
-    def step(heard: Heard) -> tuple[Array, Array]:
+    def step(heard: _Heard) -> Pair:
         own, links = _by_rule(heard, "equal")
         gap = heard.gaps()
         moved = heard.sums(links[..., None] * gap)
@@ -186,13 +134,15 @@ def arithmetic_average(belief: Belief, channel: Channel, *, rounds: int = 1) -> 
         covs = heard.mixed(own, links, heard.covs, heard.sent_covs)
         return heard.means + moved, _symmetrise(covs + spread)
 
-    return in_rounds(*_checked(belief, channel), channel, rounds, step)
+    return _in_rounds(belief, channel, rounds, step)
 
 
 @fuses("gaussians")
+@door
 def consensus_pull(
-    belief: Belief, channel: Channel, *, gain: float, rule: str = "scalar", rounds: int = 1
-) -> tuple[Array, Array]:
+    belief: Gaussians, channel: Channel, *, gain: NonNegative,
+    rule: Literal["scalar", "covariance"] = "scalar", rounds: Count = 1,
+) -> Pair:
     r"""Pull each mean towards the neighbours': the consensus Kalman filter's step.
 
     .. math:: \mathbf m_i\leftarrow\mathbf m_i
@@ -233,11 +183,8 @@ def consensus_pull(
     array([[1.],
            [3.]])
     """
-    m, p = _checked(belief, channel)
-    g = number(gain, "gain", at_least=0)
-    choice(rule, "rule", ("scalar", "covariance"))
-    needed = count(rounds, "rounds")
-    if g == 0:
+    m, p = belief
+    if gain == 0:
         return m.copy(), p.copy()
     trust = np.broadcast_to(np.eye(m.shape[-1]), p.shape)
     largest = 1.0
@@ -245,27 +192,196 @@ def consensus_pull(
         norm = np.sqrt((p**2).sum(axis=(-2, -1), keepdims=True))
         trust = p / (1 + norm)
         largest = float((norm / (1 + norm)).max())
-    warn_if_unstable(channel.graph, g * largest)
-    weights = weighting.laplacian(channel.graph, g)
-    for _ in range(needed):
-        change = channel.combine(m, weights, lost="keep") - m
+    _warn_if_unstable(channel.graph, gain * largest)
+    weights, combine = _laplacian(channel.graph, gain), unchecked(channel.combine)
+    for _ in range(rounds):
+        change = combine(m, weights, lost="keep") - m
         m = m + (trust @ change[..., None])[..., 0]
     return m, p.copy()
 
 
-def _checked(belief: Belief, channel: Channel) -> tuple[Array, Array]:
-    instance(channel, "channel", Channel)
-    if not isinstance(belief, tuple | list) or len(belief) != 2:
-        raise ValueError(f"belief: needs a pair (means, covs), got {type(belief).__name__}")
-    m = array(belief[0], "belief", (*channel.runs, channel.graph.size, "d"))
-    return m, covariance(array(belief[1], "belief", (*m.shape, m.shape[-1])), "belief")
+@fuses("ensembles")
+@door
+def pull(
+    ensembles: Ensembles, channel: Channel, *, gain: NonNegative, rounds: Count = 1,
+    include_self: bool = True,
+) -> Array:
+    r"""Pull every member towards the neighbours' ensemble means, equation (16) of Grange et al.
 
+    .. math:: \mathbf x_i^l \leftarrow \mathbf x_i^l
+        + \gamma\sum_{l'\in\mathrm{Nbs}(l)}(\hat{\mathbf x}^{l'}-\mathbf x_i^l)
 
-def _information_sum(heard: Heard, own: Array, links: Array) -> tuple[Array, Array]:
-    """Weighted sum of information matrices and vectors, turned back into mean and covariance.
+    Parameters
+    ----------
+    ensembles : array_like, (*runs, A, N, d)
+        One ensemble per agent.
+    channel : Channel
+        The door between agents; only means pass through it, d scalars a link and round. A mean
+        that is lost does not pull.
+    gain : float
+        The gain γ, at least 0; 0 sends nothing and changes nothing.
+    rounds : int
+        How many times.
+    include_self : bool
+        Whether Nbs(l) holds l itself, as the paper's tables print. The means do not notice, but
+        the spread shrinks by 1 - γ|Nbs(l)| either way, one neighbour more with it.
 
-    The same as :func:`distfilt.gaussians.intersection`, for all neighbourhoods at once.
+    Warns
+    -----
+    UnstableGain
+        If the gain is above 2/λ_max, so that the means drift apart.
+
+    Examples
+    --------
+    >>> from distfilt.network import Channel, graphs
+    >>> two = [[[0.0], [2.0]], [[4.0], [6.0]]]
+    >>> pull(two, Channel(graphs.path(2)), gain=0.25, include_self=False)[0].ravel()
+    array([1.25, 2.75])
     """
+    out = ensembles.copy()
+    if gain == 0:
+        return out
+    _warn_if_unstable(channel.graph, gain)
+    weights = _laplacian(channel.graph, gain)
+    for _ in range(rounds):
+        centre = out.mean(axis=-2)
+        moved, own = channel._combine_with_own(centre, weights, "keep")
+        kept = (own - gain * include_self)[..., None, None]
+        out = moved[..., None, :] + kept * (out - centre[..., None, :])
+    return out
+
+
+@fuses("ensembles")
+@door
+def intersection(
+    ensembles: Ensembles, channel: Channel, *, rule: Rule = "min_determinant", rounds: Count = 1
+) -> Array:
+    """Fuse sample means and covariances by intersection, and move each ensemble to have those.
+
+    Safe whatever the agents' errors share, which in a network that exchanges observations is much.
+
+    Parameters
+    ----------
+    ensembles : array_like, (*runs, A, N, d)
+        One ensemble per agent, N > d.
+    channel : Channel
+        d + d(d+1)/2 scalars a link and round. Whoever misses a message fuses without it.
+    rule : {"equal", "trace", "determinant", "min_trace", "min_determinant"}
+        As for :func:`covariance_intersection`; traces add variances of different units.
+    rounds : int
+        How many times.
+
+    Examples
+    --------
+    >>> from distfilt.network import Channel, graphs
+    >>> two = [[[-1.0], [1.0]], [[2.0], [4.0]]]
+    >>> intersection(two, Channel(graphs.path(2)), rule="equal")[..., 0]
+    array([[0.5, 2.5],
+           [0.5, 2.5]])
+    """
+    members, d = ensembles.shape[-2:]
+    if members <= d:
+        raise ValueError(f"ensembles: needs more than {d} members, as components, got {members}")
+    belief = _mean(ensembles), _sample_covariance(ensembles)
+    definite(belief[1], "ensembles")
+    fused = unchecked(covariance_intersection)(belief, channel, rule=rule, rounds=rounds)
+    return _recolour(ensembles, *fused)
+
+
+@dataclass(eq=False)
+class _Heard:
+    """One round's Gaussians, runs in one axis: own ones, those by sender, and who may use them."""
+
+    graph: Graph
+    means: Array
+    covs: Array
+    sent_means: Array
+    sent_covs: Array
+    arrived: Mask
+
+    def sums(self, per_link: Array) -> Array:
+        """What each agent's links carry, added: (R, E, ...) to (R, A, ...)."""
+        runs, edges, *rest = per_link.shape
+        flat = per_link.swapaxes(0, 1).reshape(edges, -1)
+        out = np.asarray(self.graph.incidence @ flat)
+        return out.reshape(self.graph.size, runs, *rest).swapaxes(0, 1)
+
+    def mixed(self, own: Array, links: Array, mine: Array, sent: Array) -> Array:
+        """Weighted sums of matrices (R, A, d, d), the own one and what each sender sent."""
+        heard = links[..., None, None] * sent[:, self.graph.senders]
+        return own[..., None, None] * mine + self.sums(heard)
+
+    def gaps(self) -> Array:
+        """The heard mean less the own one, on each link, (R, E, d)."""
+        graph = self.graph
+        return np.asarray(self.sent_means[:, graph.senders] - self.means[:, graph.receivers])
+
+    def groups(self) -> Iterator[tuple[Indices, Indices, Array, Mask]]:
+        """Agents that hear equally many, (n,), and their links, (n, S - 1).
+
+        With the covariances that they have, the own first, (R, n, S, d, d), and which arrived.
+        """
+        starts, degrees = self.graph.links.indptr, np.diff(self.graph.links.indptr)
+        unit = np.eye(self.means.shape[-1])
+        for degree in np.unique(degrees):
+            agents = np.flatnonzero(degrees == degree)
+            links = starts[agents, None] + np.arange(degree)
+            got, who = self.arrived[:, links], self.graph.senders[links]
+            sent = np.where(got[..., None, None], self.sent_covs[:, who], unit)
+            covs = np.concatenate([self.covs[:, agents, None], sent], axis=2)
+            yield agents, links, covs, np.concatenate([np.ones_like(got[..., :1]), got], axis=2)
+
+
+def _in_rounds(
+    belief: Pair, channel: Channel, rounds: int, step: Callable[[_Heard], Pair]
+) -> Pair:
+    """Exchange means and upper triangles and take a step, some times."""
+    means, covs = belief
+    graph, d, broadcast = channel.graph, means.shape[-1], unchecked(channel.broadcast)
+    row, column = np.triu_indices(d)
+    m, p = means.reshape(-1, graph.size, d), covs.reshape(-1, graph.size, d, d)
+    for _ in range(rounds):
+        packed = np.concatenate([m, p[..., row, column]], axis=-1)
+        heard, arrived = broadcast(packed.reshape(*channel.runs, graph.size, -1))
+        sent_m, sent_p = m, p
+        # Before the first late message is there, zeros stand in its place: no covariances.
+        if channel.faults.late and heard.any():
+            heard = heard.reshape(packed.shape)
+            sent_m, sent_p = heard[..., :d], np.empty_like(p)
+            sent_p[..., row, column] = sent_p[..., column, row] = heard[..., d:]
+        m, p = step(_Heard(graph, m, p, sent_m, sent_p, arrived.reshape(len(m), -1)))
+    return m.reshape(means.shape), p.reshape(covs.shape)
+
+
+def _by_rule(heard: _Heard, rule: str) -> Pair:
+    """Own weights (R, A) and those of links (R, E); each agent's sum to one."""
+    own, links = np.ones(heard.means.shape[:2]), heard.arrived.astype(np.float64)
+    if rule.startswith("min"):
+        for agents, at, covs, here in heard.groups():
+            omega = _intersection_weights(covs, rule, here)
+            own[:, agents], links[:, at] = omega[..., 0], omega[..., 1:]
+        return own, links
+    if rule != "equal":
+        own = _size_weights(heard.covs, rule)
+        sent = own if heard.sent_covs is heard.covs else _size_weights(heard.sent_covs, rule)
+        links = sent[:, heard.graph.senders] * heard.arrived
+    total = own + heard.sums(links)
+    return own / total, links / total[:, heard.graph.receivers]
+
+
+def _size_weights(covs: Array, rule: str) -> Array:
+    """Weights in closed form up to a factor: a number of each source alone, (R, A).
+
+    The odds against a unit covariance: no agent's number depends on another's in any digit.
+    """
+    unit = np.broadcast_to(np.eye(covs.shape[-1]), covs.shape)
+    both = np.stack([covs, unit], axis=-3)
+    share = _intersection_weights(both, rule, np.ones(both.shape[:-2], dtype=bool))
+    return np.asarray(share[..., 0] / share[..., 1])
+
+
+def _information_sum(heard: _Heard, own: Array, links: Array) -> Pair:
+    """Weighted sum of information matrices and vectors, turned back into mean and covariance."""
     mine = _inverse(heard.covs)
     sent = mine if heard.sent_covs is heard.covs else _inverse(heard.sent_covs)
     total = _inverse(heard.mixed(own, links, mine, sent))

@@ -1,113 +1,348 @@
-"""Graphs of agents in common shapes, at random, and by the range of radios."""
+"""Who hears whom: a graph of agents, what follows from its links, and graphs in common shapes."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Any
+
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from scipy import sparse
 
-from ..checks import array, count, generator, instance, number
-from .links import Graph, Indices, linked
+from ..doors import Array, Bounds, Count, Index, Positive, Record, door
+from . import _links
 
-__all__ = ["Graph", "complete", "disk", "grid", "path", "random", "ring", "star"]
+__all__ = ["Graph", "as_graph", "complete", "disk", "grid", "path", "ring", "star"]
 
-_BLOCK = 4_000_000
-"""Numbers that :func:`random` draws at a time."""
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Graph(Record):
+    """Links between agents, without self-loops: an agent always knows what it knows itself.
+
+    Build it with :meth:`from_adjacency`, :meth:`from_edges`, :meth:`from_networkx` or a function of
+    :mod:`distfilt.network.graphs`. A graph that changes in time is a function ``t -> Graph``.
+
+    Parameters
+    ----------
+    links : scipy.sparse.csr_array, (A, A)
+        ``links[i, j] = 1`` when agent i hears agent j; indices ascending in each row.
+
+    Examples
+    --------
+    >>> graph = Graph.from_adjacency([[0, 1, 1], [1, 0, 0], [1, 0, 0]])
+    >>> graph.neighbours(0)
+    (1, 2)
+    >>> graph.spectrum.round(6) + 0.0
+    array([0., 1., 3.])
+    """
+
+    links: sparse.csr_array
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        a = self.links
+        if a.ndim != 2 or a.shape[0] != a.shape[1] or a.shape[0] == 0:
+            raise ValueError(f"links: needs a square matrix, got shape {a.shape}")
+        if not a.has_canonical_format or (a.data != 1).any() or a.diagonal().any():
+            raise ValueError("links: needs ones off the diagonal, sorted and listed once")
+
+    @classmethod
+    @door
+    def from_adjacency(cls, adjacency: Any, *, directed: bool = False) -> Graph:
+        """Build a graph from a matrix of zeros and ones, an array or sparse.
+
+        Parameters
+        ----------
+        adjacency : array_like or scipy.sparse array, (A, A)
+            Row i marks the agents that agent i hears.
+        directed : bool
+            Accept links that go one way only.
+        """
+        return cls.unchecked(_links.of_matrix(adjacency, "adjacency", directed=directed))
+
+    @classmethod
+    @door
+    def from_edges(cls, agents: Count, edges: ArrayLike, *, directed: bool = False) -> Graph:
+        """Build a graph from its links, listed as pairs (listener, speaker).
+
+        Parameters
+        ----------
+        agents : int
+            Number A of agents.
+        edges : array_like of int, (E, 2)
+            The links; of an undirected graph each may be listed once or both ways.
+        directed : bool
+            Links go one way only, unless both are listed.
+
+        Examples
+        --------
+        >>> Graph.from_edges(3, [(0, 1), (1, 2)]).neighbours(1)
+        (0, 2)
+        """
+        return cls.unchecked(_links.of_edges(agents, edges, "edges", directed=directed))
+
+    @classmethod
+    def from_networkx(cls, graph: Any) -> Graph:
+        """Build a graph from a networkx one, agents in the order of its nodes.
+
+        Parameters
+        ----------
+        graph : networkx.Graph or networkx.DiGraph
+            Of a digraph an edge runs from speaker to listener, as in :meth:`to_networkx`. Names,
+            weights and parallel edges are left behind.
+
+        Examples
+        --------
+        >>> import networkx
+        >>> Graph.from_networkx(networkx.path_graph(["ground", "relay", "probe"])).neighbours(1)
+        (0, 2)
+        """
+        if not _links.is_networkx(graph):
+            raise ValueError(f"graph: needs a networkx graph, got {type(graph).__name__}")
+        return cls.unchecked(_links.of_networkx(graph, "graph"))
+
+    @property
+    def size(self) -> int:
+        """Number A of agents."""
+        return int(self.links.shape[0])
+
+    @cached_property
+    def receivers(self) -> Indices:
+        """The listener of each link, (E,), ascending."""
+        return np.repeat(np.arange(self.size), np.diff(self.links.indptr))
+
+    @cached_property
+    def senders(self) -> Indices:
+        """The speaker of each link, (E,), ascending for each listener."""
+        return np.asarray(self.links.indices, dtype=np.int64)
+
+    @cached_property
+    def reverse(self) -> Indices:
+        """For each link the number of the one that goes the other way, (E,); -1 for none."""
+        return _links.reverse(self.links, self.receivers, self.senders)
+
+    @cached_property
+    def incidence(self) -> sparse.csr_array:
+        """Sums what arrives over an agent's links: ``incidence[i, e] = 1`` if link e ends at i."""
+        edges = self.senders.size
+        parts = np.ones(edges), np.arange(edges), self.links.indptr
+        return sparse.csr_array(parts, (self.size, edges))
+
+    @door
+    def neighbours(self, agent: Index) -> tuple[int, ...]:
+        """The agents that `agent` hears, ascending, without itself."""
+        i = self._below(agent)
+        row = self.links.indices[self.links.indptr[i] : self.links.indptr[i + 1]]
+        return tuple(row.tolist())
+
+    @cached_property
+    def degrees(self) -> Array:
+        """How many agents each agent hears, (A,)."""
+        return np.asarray(np.diff(self.links.indptr), dtype=np.float64)
+
+    @cached_property
+    def listeners(self) -> Array:
+        """How many agents hear each agent, (A,)."""
+        return np.bincount(self.senders, minlength=self.size).astype(np.float64)
+
+    @cached_property
+    def directed(self) -> bool:
+        """Whether some link goes one way only."""
+        turned = self.links.T.tocsr()
+        same = (turned.indptr == self.links.indptr).all() and (turned.indices == self.senders).all()
+        return not same
+
+    @cached_property
+    def laplacian(self) -> sparse.csr_array:
+        """The Laplacian, sparse: degrees on the diagonal, -1 where an agent hears another."""
+        return (sparse.diags_array(self.degrees) - self.links).tocsr()
+
+    @cached_property
+    def spectrum(self) -> Array:
+        """Eigenvalues of the Laplacian of an undirected graph, ascending, (A,).
+
+        All, by a dense solver, in seconds at 2 000 agents; :attr:`largest_gain` needs only an end.
+        """
+        self._undirected()
+        return np.asarray(np.linalg.eigvalsh(self.laplacian.toarray()), dtype=np.float64)
+
+    @cached_property
+    def fiedler_value(self) -> float:
+        """The second smallest eigenvalue of the Laplacian; 0 where the graph is not connected."""
+        self._undirected()
+        if self.size == 1 or not self.connected:
+            return 0.0
+        if self.size <= _links.DENSE:
+            return float(self.spectrum[1])
+        return _links.fiedler_value(self.laplacian, self.degrees)
+
+    @cached_property
+    def largest_gain(self) -> float:
+        r"""The bound below which averaging agrees, :math:`2/\lambda_{\max}` with links both ways.
+
+        With one-way links the eigenvalues are complex and it is the least
+        :math:`2\operatorname{Re}\lambda/|\lambda|^2`, by a dense solver. Infinite without links.
+        """
+        if self.senders.size == 0:
+            return float("inf")
+        if self.directed:
+            return _links.one_way_gain(self.laplacian)
+        if self.size <= _links.DENSE:
+            return float(2 / self.spectrum[-1])
+        bound = _links.degree_bound(self.links, self.degrees)
+        return 2 / _links.largest_eigenvalue(self.laplacian, bound)
+
+    @cached_property
+    def safe_gain(self) -> float:
+        """A gain from the degrees alone, at most :attr:`largest_gain`; agents can compute it."""
+        if self.senders.size == 0:
+            return float("inf")
+        if self.directed:
+            return float(1 / self.degrees.max())  # Gershgorin's discs
+        return 2 / _links.degree_bound(self.links, self.degrees)
+
+    @cached_property
+    def components(self) -> Indices:
+        """For each agent the number of its (strongly) connected component, (A,)."""
+        _, labels = sparse.csgraph.connected_components(self.links, connection="strong")
+        return np.asarray(labels, dtype=np.int64)
+
+    @property
+    def connected(self) -> bool:
+        """Whether every agent can reach every other along the links."""
+        return int(self.components.max()) == 0
+
+    @door
+    def hops(self, agent: Index) -> Indices:
+        """How many rounds news of an agent takes to reach each, (A,); -1 where it never does.
+
+        >>> from distfilt.network import graphs
+        >>> graphs.path(4).hops(1)
+        array([1, 0, 1, 2])
+        """
+        return _links.hops(sparse.csr_array(self.links.T), self._below(agent))
+
+    @cached_property
+    def diameter(self) -> int:
+        """The largest number of hops between two agents of a connected graph."""
+        if not self.connected:
+            parts = self.components.max() + 1
+            raise ValueError(f"graph: needs a connected graph, got {parts} parts")
+        return _links.diameter(self.links, symmetric=not self.directed)
+
+    def _below(self, agent: int) -> int:
+        if agent < self.size:
+            return agent
+        raise ValueError(f"agent: needs an agent below {self.size}, got {agent}")
+
+    def _undirected(self) -> None:
+        if self.directed:
+            raise ValueError("graph: needs links both ways for a real spectrum, got one-way links")
+
+    def to_networkx(self) -> Any:
+        """The same graph as a networkx DiGraph whose edges run from speaker to listener."""
+        import networkx as nx
+
+        return nx.from_scipy_sparse_array(self.links.T, create_using=nx.DiGraph)
+
+
+def as_graph(value: Any, size: int | None = None) -> Graph:
+    """A graph from whatever describes one.
+
+    Parameters
+    ----------
+    value : Graph, networkx graph, matrix or edges
+        A matrix of zeros and ones, an array or sparse, as in :meth:`Graph.from_adjacency`, or edges
+        as in :meth:`Graph.from_edges`, both with links both ways.
+    size : int, optional
+        The number of agents that it needs to have; of edges, one more than the largest in them.
+
+    Examples
+    --------
+    >>> as_graph([(0, 1), (1, 2)]).degrees
+    array([1., 2., 1.])
+    """
+    if isinstance(value, Graph):
+        graph = value
+    elif _links.is_networkx(value):
+        graph = Graph.from_networkx(value)
+    elif sparse.issparse(value) or isinstance(value, np.ndarray | list | tuple):
+        graph = Graph.unchecked(_links.of_either(value, size, "graph"))
+    else:
+        raise ValueError(
+            "graph: needs a Graph (see Graph.from_networkx, Graph.from_adjacency, Graph.from_edges "
+            f"and distfilt.network.graphs), got {type(value).__name__}"
+        )
+    if size is not None and graph.size != size:
+        raise ValueError(f"graph: needs a graph of {size} agents, got {graph.size}")
+    return graph
 
 
 def _both_ways(size: int, first: Indices, second: Indices) -> Graph:
     one_way = np.stack([first.ravel(), second.ravel()], axis=1)
-    return Graph(linked(size, np.concatenate([one_way, one_way[:, ::-1]])))
+    return Graph.unchecked(_links.linked(size, np.concatenate([one_way, one_way[:, ::-1]])))
 
 
-def path(agents: int) -> Graph:
+@door
+def path(agents: Count) -> Graph:
     """Agents in a row.
 
     >>> path(3).neighbours(1)
     (0, 2)
     """
-    number_of = np.arange(count(agents, "agents"))
-    return _both_ways(number_of.size, number_of[:-1], number_of[1:])
+    number_of = np.arange(agents)
+    return _both_ways(agents, number_of[:-1], number_of[1:])
 
 
-def ring(agents: int) -> Graph:
+@door
+def ring(agents: Annotated[int, Bounds(at_least=3)]) -> Graph:
     """Agents in a circle, at least three.
 
     >>> ring(4).neighbours(0)
     (1, 3)
     """
-    number_of = np.arange(count(agents, "agents", at_least=3))
-    return _both_ways(number_of.size, number_of, np.roll(number_of, -1))
+    number_of = np.arange(agents)
+    return _both_ways(agents, number_of, np.roll(number_of, -1))
 
 
-def star(agents: int) -> Graph:
+@door
+def star(agents: Count) -> Graph:
     """Agent 0 hears all the others and they hear only it; Tables II and III of Grange et al.
 
     >>> star(5).spectrum.round(6) + 0.0
     array([0., 1., 1., 1., 5.])
     """
-    others = np.arange(1, count(agents, "agents"))
-    return _both_ways(others.size + 1, np.zeros_like(others), others)
+    others = np.arange(1, agents)
+    return _both_ways(agents, np.zeros_like(others), others)
 
 
-def grid(rows: int, columns: int) -> Graph:
+@door
+def grid(rows: Count, columns: Count) -> Graph:
     """Agents on a rectangular grid, numbered row by row.
 
     >>> grid(2, 3).neighbours(4)
     (1, 3, 5)
     """
-    shape = count(rows, "rows"), count(columns, "columns")
-    number_of = np.arange(shape[0] * shape[1]).reshape(shape)
-    first = np.concatenate([number_of[:, :-1].ravel(), number_of[:-1].ravel()])
-    second = np.concatenate([number_of[:, 1:].ravel(), number_of[1:].ravel()])
-    return _both_ways(number_of.size, first, second)
+    at = np.arange(rows * columns).reshape(rows, columns)
+    first = np.concatenate([at[:, :-1].ravel(), at[:-1].ravel()])
+    return _both_ways(at.size, first, np.concatenate([at[:, 1:].ravel(), at[1:].ravel()]))
 
 
-def complete(agents: int) -> Graph:
+@door
+def complete(agents: Count) -> Graph:
     """Everybody hears everybody.
 
     >>> complete(4).degrees
     array([3., 3., 3., 3.])
     """
-    size = count(agents, "agents")
-    return _both_ways(size, *np.triu_indices(size, 1))
+    return _both_ways(agents, *np.triu_indices(agents, 1))
 
 
-def random(
-    agents: int, probability: float, *, rng: np.random.Generator, directed: bool = False
-) -> Graph:
-    """Each pair of agents is linked with the given probability; it may fall apart.
-
-    Parameters
-    ----------
-    agents : int
-        Number A of agents.
-    probability : float
-        Of each link, in [0, 1].
-    rng : numpy.random.Generator
-        Source of the draw.
-    directed : bool
-        Draw both directions apart.
-
-    Examples
-    --------
-    >>> random(6, 1.0, rng=np.random.default_rng(0)).connected
-    True
-    """
-    size = count(agents, "agents")
-    p = number(probability, "probability", at_least=0, at_most=1)
-    source, rows = generator(rng), max(1, _BLOCK // size)
-    instance(directed, "directed", bool)
-    found = []
-    for start in range(0, size, rows):
-        block = np.argwhere(source.random((min(rows, size - start), size)) < p)
-        found.append(block + [start, 0])
-    i, j = np.concatenate(found).T
-    if not directed:
-        return _both_ways(size, i[i < j], j[i < j])
-    return Graph(linked(size, np.stack([i[i != j], j[i != j]], axis=1)))
-
-
-def disk(positions: ArrayLike, radius: float) -> Graph:
+@door
+def disk(positions: Annotated[Array, "A p"], radius: Positive) -> Graph:
     """Agents hear each other within a distance: the graph of radios of one range.
 
     Parameters
@@ -128,11 +363,9 @@ def disk(positions: ArrayLike, radius: float) -> Graph:
     """
     from scipy.spatial import cKDTree
 
-    places = array(positions, "positions", ("A", "p"))
-    if places.size == 0:
-        raise ValueError(f"positions: needs at least one agent, got shape {places.shape}")
-    if np.abs(places).max() > 1e150:
-        raise ValueError(f"positions: needs finite squares, got {np.abs(places).max():g}")
-    reach = number(radius, "radius", above=0)
-    pairs = cKDTree(places).query_pairs(reach, output_type="ndarray").astype(np.int64)
-    return _both_ways(len(places), pairs[:, 0], pairs[:, 1])
+    if positions.size == 0:
+        raise ValueError(f"positions: needs at least one agent, got shape {positions.shape}")
+    if np.abs(positions).max() > 1e150:
+        raise ValueError(f"positions: needs finite squares, got {np.abs(positions).max():g}")
+    pairs = cKDTree(positions).query_pairs(radius, output_type="ndarray").astype(np.int64)
+    return _both_ways(len(positions), pairs[:, 0], pairs[:, 1])

@@ -2,25 +2,36 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy import sparse
 
-from ..checks import Array, array, count, instance, number
-from ._spectral import left_null_vector
-from .links import Graph, Indices
+from ..doors import Array, Count, Record, door
+from ._links import left_null_vector
+from .graphs import Graph, Indices
 
 __all__ = [  # fmt: skip
-    "Weights", "balanced", "best_constant", "fastest", "gossip", "keeping", "laplacian",
-    "maximum_degree", "metropolis", "push",
+    "UnstableGain", "Weights", "balanced", "best_constant", "fastest", "gossip", "metropolis",
+    "push",
 ]
 
 
+class UnstableGain(RuntimeWarning):
+    """A gain above 2/λ_max: what the agents exchange drives them apart instead of together.
+
+    Turn it into an error, or off, by ``warnings.filterwarnings("error", category=UnstableGain)``.
+
+    >>> issubclass(UnstableGain, RuntimeWarning)
+    True
+    """
+
+
 @dataclass(frozen=True, eq=False)
-class Weights:
+class Weights(Record):
     """One weight for each agent's own value, and one for each link.
 
     Parameters
@@ -42,48 +53,8 @@ class Weights:
     """
 
     graph: Graph
-    own: Array
-    links: Array
-
-    def __post_init__(self) -> None:
-        instance(self.graph, "graph", Graph)
-        size, edges = (self.graph.size,), (self.graph.senders.size,)
-        object.__setattr__(self, "own", array(self.own, "own", size))
-        object.__setattr__(self, "links", array(self.links, "links", edges))
-
-    @classmethod
-    def from_matrix(
-        cls, graph: Graph, matrix: Weights | ArrayLike | sparse.sparray, *, name: str = "matrix"
-    ) -> Weights:
-        """Read the weights from a matrix (A, A); off its diagonal only links may be weighted.
-
-        `name` is what an error calls the matrix.
-        """
-        if isinstance(matrix, Weights):
-            if matrix.graph is graph:
-                return matrix
-            matrix = matrix.matrix
-        instance(graph, "graph", Graph)
-        if not sparse.issparse(matrix):
-            matrix = array(matrix, name, graph.links.shape, finite=False)
-        w = sparse.csr_array(matrix)
-        if w.shape != graph.links.shape:
-            raise ValueError(f"{name}: needs shape {graph.links.shape}, got {w.shape}")
-        if w.dtype.kind not in "fiu":
-            raise ValueError(f"{name}: needs real numbers, got {w.dtype}")
-        if not np.isfinite(w.data).all():
-            raise ValueError(f"{name}: needs finite numbers, got NaN or infinite entries")
-        own = w.diagonal()
-        entries = w.tocoo()
-        row, column = (np.asarray(c, dtype=np.int64) for c in entries.coords)
-        used = (entries.data != 0) & (row != column)
-        key = graph.receivers * graph.size + graph.senders
-        wanted = (row * graph.size + column)[used]
-        if not np.isin(wanted, key).all():
-            raise ValueError(f"{name}: needs zeros where an agent does not hear another")
-        links = np.zeros(key.size)
-        links[np.searchsorted(key, wanted)] = entries.data[used]
-        return cls(graph, np.asarray(own, dtype=np.float64), links)
+    own: Annotated[Array, "graph.size"]
+    links: Annotated[Array, "graph.senders.size"]
 
     @cached_property
     def matrix(self) -> sparse.csr_array:
@@ -114,20 +85,32 @@ def stacked(graph: Graph, own: Array, links: Array, *, heard_at: int) -> sparse.
     return sparse.csr_array((data.ravel(), indices.ravel(), pointers), shape)
 
 
+def _matching(graph: Graph, weights: Weights) -> Weights:
+    """The weights themselves, or a ValueError if they are those of other links."""
+    ours, theirs = graph.links, weights.graph.links
+    same = np.array_equal(ours.indptr, theirs.indptr)
+    if not (ours is theirs or (same and np.array_equal(ours.indices, theirs.indices))):
+        raise ValueError("weights: needs weights of the channel's graph, got those of other links")
+    return weights
+
+
 def _both_ways(graph: Graph) -> None:
-    instance(graph, "graph", Graph)
     if graph.directed:
         raise ValueError("graph: needs links both ways for these weights, got one-way links")
 
 
 def _connected(graph: Graph) -> None:
-    instance(graph, "graph", Graph)
     if not graph.connected:
-        raise ValueError(
-            f"graph: needs a strongly connected graph, got {graph.components.max() + 1} components"
-        )
+        parts = graph.components.max() + 1
+        raise ValueError(f"graph: needs a strongly connected graph, got {parts} components")
 
 
+def _by_links(graph: Graph, links: Array) -> Weights:
+    """Weights of links, and what is left of one for the own value."""
+    return Weights.unchecked(graph, 1 - np.asarray(graph.incidence @ links), links)
+
+
+@door
 def metropolis(graph: Graph) -> Weights:
     r"""Metropolis weights :math:`w_{ij}=1/(1+\max(d_i,d_j))`: symmetric, rows sum to one.
 
@@ -146,40 +129,34 @@ def metropolis(graph: Graph) -> Weights:
     _both_ways(graph)
     d = graph.degrees
     links = 1 / (1 + np.maximum(d[graph.receivers], d[graph.senders]))
-    return Weights(graph, 1 - _row_sums(graph, links), links)
+    return _by_links(graph, links)
 
 
-def maximum_degree(graph: Graph) -> Weights:
-    """Equal weights 1 / (1 + the largest degree) on every link; needs that one global number.
+def _laplacian(graph: Graph, gain: float) -> Weights:
+    """The weights of one averaging step, I - gain L."""
+    own = 1 - gain * graph.degrees
+    return Weights.unchecked(graph, own, np.full(graph.senders.size, gain))
 
-    >>> from distfilt.network import graphs
-    >>> maximum_degree(graphs.star(3)).own.round(3)
-    array([0.333, 0.667, 0.667])
+
+def _warn_if_unstable(graph: Graph, gain: float) -> None:
+    """Warn the caller's caller of a gain at which averaging on the graph diverges.
+
+    A bound from the degrees clears most gains; eigenvalues are computed, once for a graph, only
+    beyond it.
     """
-    _both_ways(graph)
-    links = np.full(graph.senders.size, 1 / (1 + graph.degrees.max()))
-    return Weights(graph, 1 - _row_sums(graph, links), links)
+    if gain <= graph.safe_gain:
+        return
+    limit = graph.largest_gain
+    if gain > limit * (1 + 1e-9):
+        warnings.warn(
+            f"gain: {gain:.6g} is above 2/λ_max = {limit:.6g} of this graph, so the agents drift "
+            f"apart",
+            UnstableGain,
+            stacklevel=4,  # the rule, its door, its caller
+        )
 
 
-def laplacian(graph: Graph, gain: float) -> Weights:
-    r"""The weights of one averaging step, :math:`\mathbf I-\gamma\mathbf L`.
-
-    Parameters
-    ----------
-    graph, gain
-        The links, one way or both, and the gain γ, at least 0.
-
-    Examples
-    --------
-    >>> from distfilt.network import graphs
-    >>> laplacian(graphs.star(3), 0.5).own
-    array([0. , 0.5, 0.5])
-    """
-    g = number(gain, "gain", at_least=0)
-    instance(graph, "graph", Graph)
-    return Weights(graph, 1 - g * graph.degrees, np.full(graph.senders.size, g))
-
-
+@door
 def best_constant(graph: Graph) -> Weights:
     r"""The best weights that are equal on all links, :math:`2/(\lambda_2+\lambda_{\max})`.
 
@@ -199,11 +176,12 @@ def best_constant(graph: Graph) -> Weights:
     """
     _connected(graph)
     if graph.size == 1:
-        return laplacian(graph, 0.0)
-    return laplacian(graph, 2 / (graph.fiedler_value + 2 / graph.largest_gain))
+        return _laplacian(graph, 0.0)
+    return _laplacian(graph, 2 / (graph.fiedler_value + 2 / graph.largest_gain))
 
 
-def fastest(graph: Graph, *, iterations: int = 200) -> Weights:
+@door
+def fastest(graph: Graph, *, iterations: Count = 200) -> Weights:
     r"""Symmetric weights with the (nearly) smallest second largest modulus of an eigenvalue.
 
     Fastest linear averaging on the graph: a convex problem, here smoothed by
@@ -229,7 +207,7 @@ def fastest(graph: Graph, *, iterations: int = 200) -> Weights:
 
     >>> from distfilt.network import Graph
     >>> edges = [(0, 1), (0, 2), (1, 2), (2, 3), (3, 4), (3, 5), (4, 5)]
-    >>> pair = Graph.from_edges(6, [e for i, j in edges for e in ((i, j), (j, i))])
+    >>> pair = Graph.from_edges(6, edges)
     >>> w = fastest(pair).matrix.toarray()
     >>> bool(w[2, 3] > 1.4 * w[0, 2])
     True
@@ -240,11 +218,10 @@ def fastest(graph: Graph, *, iterations: int = 200) -> Weights:
     at = np.flatnonzero(graph.receivers < graph.senders)
     if at.size < 2:
         return start
-    most = count(iterations, "iterations")
     best, slowest = start.links[at], _modulus(graph, at, start.links[at])
     x = best
     for mu in (1e-1, 1e-2, 1e-3, 1e-4):
-        options = {"maxiter": most}
+        options = {"maxiter": iterations}
         x = minimize(_smoothed, x, (graph, at, mu), "L-BFGS-B", jac=True, options=options).x
         now = _modulus(graph, at, x)
         if now < slowest:
@@ -255,7 +232,7 @@ def fastest(graph: Graph, *, iterations: int = 200) -> Weights:
 def _from_pairs(graph: Graph, at: Indices, pairs: Array) -> Weights:
     links = np.empty(graph.senders.size)
     links[at] = links[graph.reverse[at]] = pairs
-    return Weights(graph, 1 - _row_sums(graph, links), links)
+    return _by_links(graph, links)
 
 
 def _modes(graph: Graph, at: Indices, pairs: Array) -> tuple[Array, Array]:
@@ -279,6 +256,7 @@ def _smoothed(pairs: Array, graph: Graph, at: Indices, mu: float) -> tuple[float
     return float(top + mu * np.log(total)), 2 * mean[i, j] - mean[i, i] - mean[j, j]
 
 
+@door
 def gossip(graph: Graph) -> Weights:
     """The mean of one meeting's averaging matrix in :func:`distfilt.network.gossip`.
 
@@ -292,9 +270,10 @@ def gossip(graph: Graph) -> Weights:
     _both_ways(graph)
     d = np.maximum(graph.degrees, 1)
     links = (1 / d[graph.receivers] + 1 / d[graph.senders]) / (2 * graph.size)
-    return Weights(graph, 1 - _row_sums(graph, links), links)
+    return _by_links(graph, links)
 
 
+@door
 def push(graph: Graph) -> Weights:
     """Each agent splits its value evenly between itself and its listeners: columns sum to one.
 
@@ -305,11 +284,11 @@ def push(graph: Graph) -> Weights:
     >>> push(circle).own
     array([0.5, 0.5, 0.5])
     """
-    instance(graph, "graph", Graph)
     share = 1 / (1 + graph.listeners)
-    return Weights(graph, share, share[graph.senders])
+    return Weights.unchecked(graph, share, share[graph.senders])
 
 
+@door
 def balanced(graph: Graph) -> Weights:
     r"""Weights of a strongly connected digraph whose rows and columns sum to one.
 
@@ -326,18 +305,11 @@ def balanced(graph: Graph) -> Weights:
     _connected(graph)
     p = left_null_vector(graph.laplacian) if graph.directed else np.ones(graph.size)
     links = p[graph.receivers] / (2 * (p * graph.degrees).max())
-    return Weights(graph, 1 - _row_sums(graph, links), links)
+    return _by_links(graph, links)
 
 
-def keeping(weights: Weights) -> Weights:
-    """The weights themselves, or a ValueError if their columns do not sum to one.
-
-    >>> from distfilt.network import graphs
-    >>> keeping(metropolis(graphs.path(3))).own.round(3)
-    array([0.667, 0.333, 0.667])
-    """
-    if not isinstance(weights, Weights):
-        raise ValueError(f"weights: needs Weights, got {type(weights).__name__}")
+def _keeping(weights: Weights) -> Weights:
+    """The weights themselves, or a ValueError if their columns do not sum to one."""
     # Not by the matrix: scipy's sums sort its entries in place, which changes how sums round.
     graph = weights.graph
     columns, sizes = (
@@ -356,7 +328,3 @@ def keeping(weights: Weights) -> Weights:
             f"for agent {worst}"
         )
     return weights
-
-
-def _row_sums(graph: Graph, links: Array) -> Array:
-    return np.asarray(graph.incidence @ links)

@@ -15,9 +15,7 @@ from numpy.typing import ArrayLike
 
 from ..checks import Array, array, callable_, instance
 from ..ensembles import mean
-from ..network import Channel
-from ..network.admm import AdmmRun, admm
-from ..network.consensus import finite_time
+from ..network import AdmmRun, Channel, admm, finite_time
 from . import affine
 from .affine import AffineMap
 
@@ -81,7 +79,7 @@ def pool_by_admm(
     y, x, channel
         As in :func:`pool_by_moments`; a channel of a single run.
     rho, tolerance, iterations, check, agree
-        As in :func:`distfilt.network.admm.admm`.
+        As in :func:`distfilt.network.admm`.
     standardise : bool
         Agree on each variable's mean and variance first, 2 D scalars more, and work on standardised
         variables. Without it badly scaled data take thousands of iterations.

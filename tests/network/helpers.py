@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from distfilt.network import Channel, Faults, Graph, graphs
+from distfilt.network import Channel, Faults, Graph, Weights, graphs
 
 NAN = float("nan")
 STAR = graphs.star(3)
@@ -26,6 +26,12 @@ def lossy(loss: float = 0.3, graph: Graph | None = None, **options: object) -> C
     return Channel(graph or STAR, faults=Faults(loss=loss, seed=5), **options)
 
 
+def of_matrix(graph: Graph, matrix: object) -> Weights:
+    """The weights that stand in a matrix at the graph's links and on its diagonal."""
+    dense = np.asarray(matrix, dtype=float)
+    return Weights(graph, dense.diagonal(), dense[graph.receivers, graph.senders])
+
+
 def random_graph(seed: int, agents: int, *, directed: bool = False) -> Graph:
     """Each link with probability one half."""
     a = rng(seed).random((agents, agents)) < 0.5
@@ -43,10 +49,8 @@ def gaussians(seed: int, *leading: int, d: int = 2) -> tuple[np.ndarray, np.ndar
 
 
 REFERENCE = {
-    "path": graphs.path(6),
-    "ring": graphs.ring(7),
+        "ring": graphs.ring(7),
     "star": graphs.star(5),
     "grid": graphs.grid(3, 4),
-    "complete": graphs.complete(5),
     "disk": graphs.disk(rng(3).random((30, 2)), 0.4),
 }

@@ -9,68 +9,11 @@ from hypothesis import strategies as st
 from scipy import sparse
 from scipy.sparse.csgraph import shortest_path
 
-from distfilt.network import Graph, graphs
-from distfilt.network.links import linked
-from tests.network.helpers import APART, NAN, ONE_WAY, REFERENCE, STAR, random_graph, rng
+from distfilt.network import Graph, as_graph, graphs
+from distfilt.network._links import diameter_bound, linked
+from tests.network.helpers import REFERENCE, STAR, random_graph, rng
 
 named = pytest.mark.parametrize("graph", REFERENCE.values(), ids=REFERENCE.keys())
-_G = "distfilt.network.graphs."
-
-
-def _networkx_loop() -> object:
-    import networkx as nx
-
-    return nx.Graph([(0, 1), (1, 1)])
-
-
-BAD_INPUT = {
-    "distfilt.network.links.Graph": [
-        ("links", lambda: Graph(np.eye(2))),
-        ("links", lambda: Graph(sparse.csr_array(np.eye(2)))),
-        ("links", lambda: Graph(sparse.csr_array(2.0 * np.eye(2)[::-1]))),
-        ("links", lambda: Graph(sparse.csr_array(np.ones((2, 3))))),
-        ("links", lambda: Graph(3)),
-        ("adjacency", lambda: Graph.from_adjacency([[0, 1]])),
-        ("adjacency", lambda: Graph.from_adjacency(np.zeros((0, 0)))),
-        ("adjacency", lambda: Graph.from_adjacency([[0, 2], [2, 0]])),
-        ("adjacency", lambda: Graph.from_adjacency([[1, 1], [1, 0]])),
-        ("adjacency", lambda: Graph.from_adjacency([[0, 1], [0, 0]])),
-        ("adjacency", lambda: Graph.from_adjacency([[0, NAN], [NAN, 0]])),
-        ("edges", lambda: Graph.from_edges(2, [(0, 0)])),
-        ("edges", lambda: Graph.from_edges(2, [(0, 2), (2, 0)])),
-        ("edges", lambda: Graph.from_edges(2, [(0, 0.5)])),
-        ("edges", lambda: Graph.from_edges(2, [(0, 1)])),
-        ("edges", lambda: Graph.from_edges(2, [0, 1, 1])),
-        ("agents", lambda: Graph.from_edges(0, [])),
-        ("graph", lambda: Graph.from_networkx(3)),
-        ("graph", lambda: Graph.from_networkx(_networkx_loop())),
-        ("agent", lambda: STAR.neighbours(3)),
-        ("agent", lambda: STAR.hops(3)),
-        ("graph", lambda: ONE_WAY.spectrum),
-        ("graph", lambda: ONE_WAY.fiedler_value),
-        ("graph", lambda: APART.diameter),
-        ("graph", lambda: APART.diameter_bound),
-    ],
-    _G + "complete": [("agents", lambda: graphs.complete(0))],
-    _G + "disk": [
-        ("positions", lambda: graphs.disk([1.0, 2.0], 1.0)),
-        ("positions", lambda: graphs.disk([[NAN, 0.0]], 1.0)),
-        ("positions", lambda: graphs.disk(np.zeros((0, 2)), 1.0)),
-        ("radius", lambda: graphs.disk([[0.0, 0.0]], 0.0)),
-    ],
-    _G + "grid": [
-        ("rows", lambda: graphs.grid(0, 2)),
-        ("columns", lambda: graphs.grid(2, 1.5)),
-    ],
-    _G + "path": [("agents", lambda: graphs.path(0))],
-    _G + "random": [
-        ("agents", lambda: graphs.random(0, 0.5, rng=rng())),
-        ("probability", lambda: graphs.random(3, 1.5, rng=rng())),
-        ("rng", lambda: graphs.random(3, 0.5, rng=1)),
-    ],
-    _G + "ring": [("agents", lambda: graphs.ring(2))],
-    _G + "star": [("agents", lambda: graphs.star(0))],
-}
 
 
 def test_shapes_are_networkx_s() -> None:
@@ -184,7 +127,7 @@ def test_hops_and_diameters(seed: int, agents: int, directed: bool) -> None:
         assert (graph.hops(agent) == exact).all()
     if graph.connected:
         assert graph.diameter == away.max()
-        assert away.max() <= graph.diameter_bound <= 2 * away.max()
+        assert away.max() <= diameter_bound(graph.links) <= 2 * away.max()
 
 
 @pytest.mark.parametrize("graph", [
@@ -195,7 +138,7 @@ def test_diameters_of_larger_graphs(graph: Graph) -> None:
     if not graph.connected:
         pytest.fail("needs a connected example")
     exact = int(shortest_path(graph.links, unweighted=True).max())
-    assert graph.diameter == exact and exact <= graph.diameter_bound <= 2 * exact
+    assert graph.diameter == exact and exact <= diameter_bound(graph.links) <= 2 * exact
 
 
 @given(st.integers(0, 1000), st.integers(1, 40), st.floats(0.05, 1.0))
@@ -206,26 +149,43 @@ def test_disk_links_are_the_close_pairs(seed: int, agents: int, radius: float) -
     assert (graphs.disk(places, radius).links.toarray() == wanted).all()
 
 
-@pytest.mark.parametrize("directed", [False, True])
-def test_random_links_are_one_draw_however_it_is_cut(
-    directed: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn = rng(3).random((20, 20)) < 0.3
-    np.fill_diagonal(drawn, False)
-    if not directed:
-        drawn = np.triu(drawn) | np.triu(drawn).T
-    for block in (4_000_000, 65, 1):
-        monkeypatch.setattr(graphs, "_BLOCK", block)
-        graph = graphs.random(20, 0.3, rng=rng(3), directed=directed)
-        assert (graph.links.toarray() == drawn).all()
-
-
 def test_the_first_one_way_link_is_named_without_a_dense_matrix() -> None:
     size = 50_000
-    chain = np.stack([np.arange(1, size), np.arange(size - 1)], axis=1)
+    chain = sparse.diags_array(np.ones(size - 1), offsets=-1).tocsr()
     with pytest.raises(ValueError, match="one way only between agents 0 and 1"):
-        Graph.from_edges(size, chain)
+        Graph.from_adjacency(chain)
 
 
-def test_repeated_links_count_once() -> None:
+def test_repeated_links_count_once_and_edges_once_or_twice() -> None:
     assert (linked(2, np.array([[0, 1], [1, 0], [0, 1]])).toarray() == [[0, 1], [1, 0]]).all()
+    for edges in ([(0, 1), (1, 2)], [(0, 1), (1, 0), (2, 1), (1, 2), (0, 1)]):
+        assert (Graph.from_edges(3, edges).links != graphs.path(3).links).nnz == 0
+    one_way = Graph.from_edges(3, [(0, 1), (1, 2)], directed=True)
+    assert one_way.directed and one_way.neighbours(2) == ()
+
+
+@given(st.integers(0, 1000), st.integers(1, 8))
+def test_a_graph_is_read_from_what_describes_it(seed: int, agents: int) -> None:
+    graph = random_graph(seed, agents)
+    dense = graph.links.toarray()
+    edges = np.argwhere(np.triu(dense))
+    forms = [graph, graph.to_networkx(), graph.links, sparse.coo_matrix(dense), dense,
+             dense.tolist(), dense.astype(bool), dense.astype(int), edges, edges.tolist()]
+    for value in forms:
+        assert (as_graph(value, agents).links != graph.links).nnz == 0
+    assert as_graph([(0, 1), (1, 0)]).size == 2 and as_graph([(0, 1), (1, 2)]).size == 3
+    assert as_graph([(0, 1), (1, 0)], 3).degrees.tolist() == [1.0, 1.0, 0.0]
+
+
+def test_what_describes_no_graph_is_refused_with_the_ways_to_make_one() -> None:
+    refused = {
+        "Graph.from_networkx, Graph.from_adjacency, Graph.from_edges": 3,
+        "directed=True": np.array([[0, 1, 0], [0, 0, 0], [0, 0, 0]]),
+        "no self-loops": [(0, 1), (1, 1), (2, 0), (0, 2)],
+        "zeros and ones, got 0.5": 0.5 * sparse.csr_array(STAR.links),
+        "agents from 0 to 2": [(0, 1), (1, 7)],
+        "a graph of 3 agents, got 4": graphs.path(4),
+    }
+    for text, value in refused.items():
+        with pytest.raises(ValueError, match=f"graph: needs .*{text}"):
+            as_graph(value, 3)

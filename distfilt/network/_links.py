@@ -1,4 +1,4 @@
-"""What follows from a graph's links, for graphs too large for dense matrices."""
+"""Links as sparse matrices: how they are built and what follows from them, for large graphs too."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from ..checks import Array
+from ..doors import Array, array
 
 __all__: list[str] = []
 
@@ -26,6 +26,101 @@ _LARGE = 2000
 
 _STEPS = 600
 """So many steps of a walk cost as much as the sparse factor of a graph in the plane."""
+
+
+def of_matrix(value: Any, name: str, *, directed: bool) -> sparse.csr_array:
+    """The links that a matrix of zeros and ones marks, an array or sparse."""
+    if not sparse.issparse(value):
+        flags = isinstance(value, np.ndarray) and value.dtype == bool
+        value = array(value * 1.0 if flags else value, name, ("A", "A"))
+    a = sparse.csr_array(value)
+    a.sum_duplicates()
+    if a.shape[0] != a.shape[1] or a.shape[0] == 0:
+        raise ValueError(f"{name}: needs a square matrix, got shape {a.shape}")
+    odd = (a.data != 0) & (a.data != 1)
+    if odd.any():
+        raise ValueError(f"{name}: needs zeros and ones, got {a.data[odd][0]:g}")
+    links = _without_loops(a.shape[0], np.stack(a.nonzero(), axis=1), name)
+    row, column = (links - links.T).nonzero()
+    if row.size and not directed:
+        i, j = sorted((int(row[0]), int(column[0])))
+        raise ValueError(
+            f"{name}: needs every link both ways in an undirected graph, got one way only between "
+            f"agents {i} and {j} (Graph.from_adjacency(..., directed=True) takes it)"
+        )
+    return links
+
+
+def of_edges(size: int, edges: Any, name: str, *, directed: bool) -> sparse.csr_array:
+    """The links of pairs (listener, speaker), both ways unless the graph is directed."""
+    pairs = array(edges, name)
+    pairs = pairs.reshape(-1, 2) if pairs.size == 0 else array(pairs, name, ("E", 2))
+    listed = pairs.astype(np.int64)
+    inside = not listed.size or 0 <= listed.min() <= listed.max() < size
+    if (listed != pairs).any() or not inside:
+        raise ValueError(f"{name}: needs agents from 0 to {size - 1}, got {pairs.tolist()[:3]}")
+    both = listed if directed else np.concatenate([listed, listed[:, ::-1]])
+    return _without_loops(size, both, name)
+
+
+def of_either(value: Any, size: int | None, name: str) -> sparse.csr_array:
+    """The links of a matrix or of a list of edges, both ways."""
+    if sparse.issparse(value) or getattr(value, "dtype", None) == np.dtype(bool):
+        return of_matrix(value, name, directed=False)
+    a = array(value, name)
+    square = a.ndim == 2 and 0 < a.shape[0] == a.shape[1] and size in (None, a.shape[0])
+    # Two edges look like a matrix of two agents.
+    if square and not (a.shape[0] == 2 and (a.diagonal().any() or (a > 1).any())):
+        return of_matrix(a, name, directed=False)
+    most = int(a.max()) + 1 if min(a.shape) else 0
+    return of_edges(most if size is None else size, a, name, directed=False)
+
+
+def is_networkx(value: Any) -> bool:
+    """Whether a value has what networkx's graphs have."""
+    return all(hasattr(value, name) for name in ("nodes", "edges", "is_directed"))
+
+
+def of_networkx(graph: Any, name: str) -> sparse.csr_array:
+    """The links of a networkx graph, agents in the order of its nodes."""
+    number_of = {node: k for k, node in enumerate(graph.nodes)}
+    listed = [(number_of[edge[1]], number_of[edge[0]]) for edge in graph.edges]
+    return of_edges(len(number_of), listed, name, directed=bool(graph.is_directed()))
+
+
+def _without_loops(size: int, pairs: Indices, name: str) -> sparse.csr_array:
+    loops = pairs[pairs[:, 0] == pairs[:, 1], 0]
+    if loops.size:
+        raise ValueError(f"{name}: needs no self-loops, got one at agent {loops[0]}")
+    return linked(size, pairs)
+
+
+def linked(size: int, pairs: Indices) -> sparse.csr_array:
+    """The matrix of a graph's links from pairs (listener, speaker), which may repeat."""
+    links = sparse.csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (size, size))
+    links.sum_duplicates()
+    links.data[:] = 1.0
+    links.sort_indices()
+    return links
+
+
+def reverse(links: sparse.csr_array, receivers: Indices, senders: Indices) -> Indices:
+    """For each link the number of the one that goes the other way; -1 for none."""
+    edges, size = senders.size, links.shape[0]
+    numbered = sparse.csr_array((np.arange(edges), links.indices, links.indptr), links.shape)
+    turned = numbered.T.tocsr()
+    if (turned.indptr == links.indptr).all() and (turned.indices == senders).all():
+        return np.asarray(turned.data, dtype=np.int64)
+    key, other = receivers * size + senders, senders * size + receivers
+    found = np.searchsorted(key, other).clip(max=edges - 1)
+    return np.where(key[found] == other, found, -1)
+
+
+def one_way_gain(laplacian: sparse.csr_array) -> float:
+    """The least 2 Re(λ) / |λ|² of the nonzero eigenvalues, by a dense solver."""
+    values = np.linalg.eigvals(laplacian.toarray())
+    values = values[np.abs(values) > 1e-9 * np.abs(values).max()]
+    return float((2 * values.real / np.abs(values) ** 2).min(initial=np.inf))
 
 
 def degree_bound(links: sparse.csr_array, degrees: Array) -> float:
@@ -124,17 +219,8 @@ def _start(size: int) -> Array:
 
 def hops(forward: sparse.csr_array, agent: int) -> Indices:
     """Hops from an agent along ``forward[i, j] = 1``, j after i; -1 where there is no way."""
-    order, before = sparse.csgraph.breadth_first_order(forward, agent)
-    place = np.empty(forward.shape[0], dtype=np.int64)
-    place[order] = np.arange(order.size)
-    out = np.full(forward.shape[0], -1, dtype=np.int64)
-    # In breadth-first order each level is a block, found by its predecessors' places.
-    reached = place[before[order[1:]]]
-    start, stop, level = 0, 1, 0
-    while start < stop:
-        out[order[start:stop]] = level
-        start, stop, level = stop, 1 + int(np.searchsorted(reached, stop)), level + 1
-    return out
+    away = sparse.csgraph.dijkstra(forward, indices=agent, unweighted=True)
+    return np.where(np.isinf(away), -1, away).astype(np.int64)
 
 
 def diameter(links: sparse.csr_array, *, symmetric: bool) -> int:
@@ -161,14 +247,7 @@ def diameter(links: sparse.csr_array, *, symmetric: bool) -> int:
     return int(low.max())
 
 
-def diameter_bound(links: sparse.csr_array, *, symmetric: bool) -> int:
-    """At least the diameter and at most twice as much, from a few searches."""
-    forward, backward = sparse.csr_array(links.T), sparse.csr_array(links)
-    there = hops(forward, 0)
-    far = hops(forward, int(there.argmax()))
-    # Half way between two agents far apart the hops to all others are fewest.
-    total = there + far
-    middle = int(np.where(total == total.min(), np.abs(there - far), links.shape[0]).argmin())
-    out = hops(forward, middle)
-    back = out if symmetric else hops(backward, middle)
-    return int(out.max() + back.max())
+def diameter_bound(links: sparse.csr_array) -> int:
+    """At least the diameter and at most twice as much, from two searches."""
+    there, back = (hops(sparse.csr_array(a), 0) for a in (links.T, links))
+    return int(there.max() + back.max())

@@ -1,0 +1,337 @@
+"""Agreement in time: lags, stability, gossip, sending on events, flooding, and what they cost."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from distfilt.network import (
+    Channel,
+    Faults,
+    Graph,
+    PIState,
+    event_triggered,
+    first_order,
+    flood,
+    gossip,
+    graphs,
+    pi_start,
+    pi_step,
+    stable_substeps,
+    weights,
+)
+from tests.network.helpers import REFERENCE, UNBALANCED, lossy, rng
+
+named = pytest.mark.parametrize("graph", REFERENCE.values(), ids=REFERENCE.keys())
+GAINS = {"alpha": 0.2, "a": 0.4, "b": 0.04}
+def _follow_ramp(graph: Graph, *, with_rate: bool, faults: Faults | None = None) -> np.ndarray:
+    """Errors of the estimates' average after 100 s on inputs u_i = i + t, α = .2."""
+    base = np.arange(graph.size, dtype=float)[:, None]
+    state, ledger = pi_start(base), None
+    for k in range(1000):
+        channel = Channel(graph, ledger=ledger, faults=faults)
+        rate = np.ones_like(base) if with_rate else None
+        state = pi_step(state, base + 0.1 * k, channel, dt=0.1, rate=rate, **GAINS)
+        ledger = channel.ledger
+    return state.estimate - (base.mean() + 100.0)
+
+
+@pytest.mark.parametrize("faults", [None, Faults(loss=0.2, seed=4)], ids=["whole", "lossy"])
+def test_the_lag_behind_a_ramp_is_one_over_alpha(faults: Faults | None) -> None:
+    lag = _follow_ramp(graphs.ring(5), with_rate=False, faults=faults).mean()
+    assert abs(lag + 1 / GAINS["alpha"]) < 1e-6
+
+
+@pytest.mark.parametrize("faults", [None, Faults(loss=0.2, seed=4)], ids=["whole", "lossy"])
+def test_no_lag_with_the_derivative(faults: Faults | None) -> None:
+    lag = _follow_ramp(graphs.ring(5), with_rate=True, faults=faults).mean()
+    assert abs(lag) < 1e-10
+
+
+@pytest.mark.parametrize("with_rate", [False, True])
+def test_a_step_of_substeps_by_its_equations(with_rate: bool) -> None:
+    """Euler steps of (25) with the inputs moving on inside the step, or standing still."""
+    graph, n, dt = REFERENCE["grid"], 7, 0.3
+    draw = rng(2)
+    u, nu, eta = draw.standard_normal((3, graph.size, 2))
+    slope = draw.standard_normal(u.shape) if with_rate else np.zeros_like(u)
+    laplacian, h = graph.laplacian.toarray(), dt / n
+    wanted_nu, wanted_eta = nu, eta
+    for j in range(n):
+        now = u + j * h * slope
+        change = (-GAINS["alpha"] * (wanted_nu - now) - GAINS["a"] * laplacian @ wanted_nu
+                  + GAINS["b"] * laplacian.T @ wanted_eta + slope)
+        wanted_nu, wanted_eta = (
+            wanted_nu + h * change, wanted_eta - h * GAINS["b"] * laplacian @ wanted_nu)
+    channel = Channel(graph)
+    state = pi_step(PIState(nu, eta), u, channel, dt=dt, rate=slope if with_rate else None,
+                    substeps=n, **GAINS)
+    assert np.abs(state.estimate - wanted_nu).max() < 1e-13
+    assert np.abs(state.integral - wanted_eta).max() < 1e-13
+    assert channel.ledger.rounds == n and (channel.ledger.scalars == 4 * n * graph.listeners).all()
+
+
+def test_sum_decays_on_a_moving_network_from_any_start() -> None:
+    """Criterion 5: graph, integrators and first estimates do not matter to the sum."""
+    draw = rng(5)
+    u, nu, eta = draw.standard_normal((3, 20, 2))
+    state = PIState(nu, eta)
+    for k in range(1, 61):
+        channel = Channel(graphs.disk(draw.random((20, 2)), 0.3))
+        state = pi_step(state, u, channel, dt=0.1, substeps=1, **GAINS)
+        gap = (state.estimate - u).sum(axis=0)
+        assert np.abs(gap - (1 - 0.2 * 0.1) ** k * (nu - u).sum(axis=0)).max() < 1e-12
+
+
+@pytest.mark.parametrize("b", [0.04, 0.2])
+def test_disagreement_shrinks_as_the_spectrum_says(b: float) -> None:
+    """Criterion 6: the slowest mode of a well-connected graph, against its two by two matrix."""
+    graph = graphs.complete(12)
+    lam = graph.spectrum[1]
+    modes = np.linalg.eigvals([[-0.2 - 0.4 * lam, b * lam], [-b * lam, 0.0]]).real
+    state, size = pi_start(rng(3).standard_normal((12, 1))), []
+    for _ in range(400):
+        state = pi_step(state, np.zeros((12, 1)), Channel(graph), dt=0.05, alpha=0.2, a=0.4, b=b,
+                        substeps=6)
+        size.append(np.linalg.norm(state.integral - state.integral.mean(axis=0)))
+    rate = np.log(size[199] / size[399]) / (200 * 0.05)
+    assert abs(rate / -modes.max() - 1) < 0.02
+
+
+def test_pi_agrees_on_the_average_of_still_inputs() -> None:
+    u = rng(1).standard_normal((6, 2))
+    before = u.copy()
+    state = pi_start(u)
+    for _ in range(800):
+        state = pi_step(state, u, Channel(graphs.ring(6)), dt=0.2, alpha=1.0, a=1.0, b=1.0)
+    assert np.abs(state.estimate - u.mean(axis=0)).max() < 1e-9
+    assert np.abs(state.integral.sum(axis=0)).max() < 1e-9 and (u == before).all()
+
+
+def test_explicit_steps_blow_up_where_the_substeps_do_not() -> None:
+    """A crowded graph, λ_max = 100: one step of .1 s is unstable, the chosen substeps are not."""
+    graph, u = graphs.complete(100), rng(1).standard_normal((100, 1))
+    ends = []
+    for substeps in (1, None):
+        state = pi_start(u)
+        for _ in range(150):
+            state = pi_step(state, u, Channel(graph), dt=0.1, substeps=substeps, **GAINS)
+        ends.append(np.abs(state.estimate - u.mean()).max())
+    assert ends[0] > 1e6 and ends[1] < 0.1
+
+
+def test_the_safety_factor_is_what_it_says() -> None:
+    """Twice the steps of the bound itself; at the bound the fastest possible mode only swings."""
+    channel = Channel(graphs.complete(100))
+    few, many = (stable_substeps(channel, 9.9, **GAINS, safety=s) for s in (1.0, 2.0))
+    assert many in (2 * few, 2 * few - 1)
+    bound = 2 * 99
+    assert few == np.ceil(9.9 * (GAINS["alpha"] + GAINS["a"] * bound) / 2)
+    assert stable_substeps(channel, 9.9, **GAINS) == many
+    assert stable_substeps(channel, 1e-6, **GAINS) == 1
+
+
+@given(st.integers(0, 500), st.floats(0.01, 2), st.floats(0, 2), st.floats(0, 2))
+def test_the_chosen_substeps_are_stable(seed: int, alpha: float, a: float, b: float) -> None:
+    """Every eigenvalue of every mode stays inside the unit circle."""
+    graph = graphs.disk(rng(seed).random((12, 2)), 0.5)
+    for safety in (1.0, 2.0):
+        h = 0.1 / stable_substeps(Channel(graph), 0.1, alpha=alpha, a=a, b=b, safety=safety)
+        for value in graph.spectrum:
+            mode = np.array([[-alpha - a * value, b * value], [-b * value, 0.0]])
+            moduli = np.abs(1 + h * np.linalg.eigvals(mode))
+            assert (moduli <= 1 + 1e-12).all()
+
+
+def test_a_round_of_first_order_tracking_by_its_equation() -> None:
+    """W x + Δu: the change is added after the averaging, not averaged."""
+    graph = REFERENCE["grid"]
+    x, u, before = rng(1).standard_normal((3, graph.size, 2))
+    w = weights.best_constant(graph)
+    channel = Channel(graph)
+    out = first_order(x, u, before, channel, weights=w)
+    assert np.abs(out - (w.matrix.toarray() @ x + u - before)).max() < 1e-14
+    assert (channel.ledger.scalars == 2 * graph.listeners).all() and channel.ledger.rounds == 1
+
+
+def test_first_order_tracking_on_a_digraph_with_balanced_weights() -> None:
+    u = x = rng(3).standard_normal((3, 2))
+    channel = Channel(UNBALANCED)
+    for _ in range(200):
+        new = u + 0.1 * np.array([1.0, -2.0])
+        x, u = first_order(x, new, u, channel, weights=weights.balanced(UNBALANCED)), new
+    assert np.abs(x - u.mean(axis=0)).max() < 1e-10
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_first_order_tracking_keeps_the_average_exactly(loss: float) -> None:
+    graph, draw = graphs.ring(7), rng(3)
+    u = x = draw.standard_normal((7, 2))
+    for k in range(50):
+        new = u + 0.1 * draw.standard_normal(u.shape)
+        x = first_order(x, new, u, Channel(graph, faults=Faults(loss=loss, seed=k)))
+        u = new
+        assert np.abs(x.mean(axis=0) - u.mean(axis=0)).max() < 1e-12
+    assert np.ptp(x, axis=0).max() < np.ptp(u, axis=0).max()
+
+
+def test_substeps_stay_below_the_bound_of_a_swinging_mode() -> None:
+    """Where 2 b λ exceeds α + a λ the bound is (α + a λ) / (b λ)², with λ twice the degree."""
+    for b in (3.0, 0.9):
+        wanted = np.ceil(5.0 * (b * 2) ** 2 / (0.3 + 0.1 * 2))
+        channel = Channel(graphs.path(2))
+        assert stable_substeps(channel, 5.0, alpha=0.3, a=0.1, b=b, safety=1.0) == wanted
+
+
+@named
+def test_gossip_keeps_the_average_and_two_change_at_a_time(graph: Graph) -> None:
+    values = rng(1).standard_normal((graph.size, 2))
+    before = values.copy()
+    draw = rng(3)
+    for _ in range(30):
+        channel = Channel(graph)
+        new = gossip(values, channel, rounds=1, rng=draw)
+        moved = np.flatnonzero((new != values).any(axis=1))
+        assert moved.size == 2 and moved[1] in graph.neighbours(int(moved[0]))
+        assert (new[moved] == values[moved].mean(axis=0)).all()
+        assert (channel.ledger.messages[moved] == 1).all() and channel.ledger.messages.sum() == 2
+        assert channel.ledger.scalars.sum() == 4 and channel.ledger.rounds == 1
+    assert (values == before).all()
+    whole = gossip(values, Channel(graph), rounds=4000, rng=rng(5))
+    assert np.abs(whole - values.mean(axis=0)).max() < 1e-6
+    assert np.abs(whole.mean(axis=0) - values.mean(axis=0)).max() < 1e-13
+
+
+@pytest.mark.parametrize("name", ["ring", "star"])
+def test_gossip_contracts_as_its_mean_matrix(name: str) -> None:
+    """For a matrix W of one meeting W'W = W: the mean square after a round is a quadratic form."""
+    graph = REFERENCE[name]
+    mean = weights.gossip(graph).matrix.toarray()
+    values, vectors = np.linalg.eigh(mean)
+    for k in (0, -2):
+        start = vectors[:, k, None]
+        draw = rng(2)
+        squares = np.array([
+            (gossip(start, Channel(graph), rounds=1, rng=draw) ** 2).sum() for _ in range(1500)
+        ])
+        error = squares.std() / np.sqrt(squares.size)
+        assert abs(squares.mean() - values[k]) < 3.5 * error + 1e-12
+
+
+def test_meetings_are_drawn_evenly() -> None:
+    """Each agent wakes with probability 1 / A and chooses its neighbours alike, at 99.9%."""
+    from scipy.stats import chisquare
+
+    graph, meetings = graphs.path(4), 2000
+    values, counts = np.arange(4.0)[:, None] ** 2, np.zeros(3)
+    draw = rng(8)
+    for _ in range(meetings):
+        moved = gossip(values, Channel(graph), rounds=1, rng=draw) != values
+        counts[np.flatnonzero(moved)[0]] += 1
+    expected = meetings * np.array([1 + 0.5, 0.5 + 0.5, 0.5 + 1]) / 4
+    assert chisquare(counts, expected).pvalue > 1e-3
+
+
+def test_gossip_through_losses_keeps_the_average() -> None:
+    graph = REFERENCE["grid"]
+    values = rng(1).standard_normal((6, graph.size, 1))
+    channel = Channel(graph, runs=(6,), faults=Faults(loss=0.4, seed=2))
+    out = gossip(values, channel, rounds=1500, rng=rng(3))
+    assert np.abs(out.mean(axis=1) - values.mean(axis=1)).max() < 1e-13
+    assert np.ptp(out, axis=1).max() < 1e-3
+    assert (np.ptp(out[:, :, 0], axis=1) > 0).all() and channel.ledger.messages.sum() == 4 * 1500
+    assert (gossip(values, Channel(graph, runs=(6,), faults=Faults(loss=1.0)), rounds=50,
+                   rng=rng(3)) == values).all()
+
+
+def test_gossip_with_a_lone_agent() -> None:
+    graph = Graph.from_adjacency([[0, 1, 0], [1, 0, 0], [0, 0, 0]])
+    channel = Channel(graph)
+    out = gossip([[0.0], [2.0], [7.0]], channel, rounds=30, rng=rng(1))
+    assert (out.ravel() == [1.0, 1.0, 7.0]).all() and channel.ledger.messages[2] == 0
+
+
+@named
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_events_keep_the_average_and_their_bound(graph: Graph, loss: float) -> None:
+    values = 10 * rng(1).standard_normal((graph.size, 2))
+    before = values.copy()
+    channel = Channel(graph, faults=Faults(loss=loss, seed=4))
+    limit = 0.05
+    out = event_triggered(values, channel, rounds=600, threshold=limit)
+    assert np.abs(out.mean(axis=0) - values.mean(axis=0)).max() < 1e-12
+    assert (values == before).all()
+    if loss == 0:
+        dense = weights.metropolis(graph).matrix.toarray()
+        slow = np.sort(np.abs(np.linalg.eigvalsh(dense)))[-2]
+        gain = np.linalg.norm(np.eye(graph.size) - dense, 2) / (1 - slow)
+        bound = np.sqrt(out.size) * gain * limit
+        assert np.linalg.norm(out - values.mean(axis=0)) <= bound + 1e-9
+        assert channel.ledger.messages.sum() < 0.5 * 600 * graph.senders.size
+
+
+def test_without_a_threshold_events_are_plain_averaging() -> None:
+    graph = REFERENCE["grid"]
+    values = rng(1).standard_normal((graph.size, 2))
+    channel, plain = Channel(graph), Channel(graph)
+    out = event_triggered(values, channel, rounds=25, threshold=0.0)
+    exact = plain.combine(values, weights.metropolis(graph), rounds=25)
+    assert np.abs(out - exact).max() < 1e-13
+    assert (channel.ledger.scalars == plain.ledger.scalars).all()
+    chosen = weights.best_constant(graph)
+    out = event_triggered(values, Channel(graph), rounds=25, threshold=0.0, weights=chosen)
+    assert np.abs(out - Channel(graph).combine(values, chosen, rounds=25)).max() < 1e-12
+
+
+def test_a_shrinking_threshold_leads_to_agreement() -> None:
+    graph = REFERENCE["grid"]
+    values = rng(1).standard_normal((graph.size, 1))
+    fixed, shrinking = (
+        event_triggered(values, Channel(graph), rounds=300, threshold=0.3, decay=d)
+        for d in (1.0, 0.93)
+    )
+    gaps = [np.abs(v - values.mean()).max() for v in (shrinking, fixed)]
+    assert gaps[0] < 1e-6 < 1e-3 < gaps[1]
+
+
+def test_only_what_moved_is_sent() -> None:
+    """All equal but one: after the first round only it and its neighbours have news."""
+    graph, values = graphs.path(5), np.array([[0.0], [0.0], [0.0], [0.0], [9.0]])
+    channel = Channel(graph)
+    event_triggered(values, channel, rounds=2, threshold=0.5)
+    # All send once, both ends of four links; then agents 3 (two links) and 4 (one).
+    assert (channel.ledger.messages == [1, 2, 2, 4, 2]).all()
+    assert channel.ledger.rounds == 2
+
+
+def test_an_event_that_was_lost_is_sent_again() -> None:
+    graph, values = graphs.path(2), np.array([[0.0], [4.0]])
+    faults = Faults(loss=1.0, during=[(0, 3)])
+    channel = Channel(graph, faults=faults)
+    assert (event_triggered(values, channel, rounds=3, threshold=1.0) == values).all()
+    again = Channel(graph, faults=faults)
+    assert (event_triggered(values, again, rounds=4, threshold=1.0) == 2.0).all()
+    assert (again.ledger.lost == 3).all()
+    assert (again.ledger.messages == 2 * 4).all()  # an acknowledgement for each
+
+
+@named
+def test_flooding_tells_everybody_everything(graph: Graph) -> None:
+    values = rng(1).standard_normal((graph.size, 2))
+    channel = Channel(graph)
+    mean, known = flood(values, channel)
+    assert known.all() and np.abs(mean - values.mean(axis=0)).max() < 1e-14
+    # Each agent says each thing once to each of its listeners.
+    assert (channel.ledger.scalars == 3 * graph.size * graph.listeners).all()
+    assert channel.ledger.rounds == graph.diameter + 1
+    some, known = flood(values, Channel(graph), rounds=1)
+    near = graph.links.toarray().astype(bool) | np.eye(graph.size, dtype=bool)
+    assert (known == near).all()
+    assert np.allclose(some, np.stack([values[row].mean(axis=0) for row in near]))
+
+
+def test_flooding_loses_what_is_lost() -> None:
+    _, known = flood(np.zeros((3, 1)), lossy(1.0))
+    assert (known == np.eye(3, dtype=bool)).all()
