@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 
-from ..checks import SolverError
 from ..doors import Array, Count, Positive, Record, array, door, unchecked
+from ..linalg import SolverError
 from ._links import diameter_bound
 from .channel import Channel, Lost, PerAgent
 from .weights import Weights, _keeping, _laplacian, _matching, _warn_if_unstable, metropolis

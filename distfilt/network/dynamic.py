@@ -324,9 +324,7 @@ def event_triggered(
 
 @door
 def flood(values: PerAgent, channel: Channel, *, rounds: Count | None = None) -> tuple[Array, Mask]:
-    """Every agent passes on each value when it first hears of it, with its owner's number.
-
-    The rival of every averaging rule: after as many rounds as the diameter all know everything.
+    """Every agent passes on each value when it first hears of it: the rival of all averaging.
 
     Parameters
     ----------

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..doors import Array, Count, Mask, NonNegative, definite, door, unchecked
-from ..ensembles import _mean, _sample_covariance
+from ..ensembles import mean, sample_covariance
 from ..gaussians import _intersection_weights, _recolour
-from ..linalg import _solve_lower, _symmetrise
+from ..linalg import cholesky, solve_lower, symmetrise
 from .channel import Channel
 from .consensus import fuses
 from .graphs import Graph
@@ -132,7 +132,7 @@ def arithmetic_average(belief: Gaussians, channel: Channel, *, rounds: Count = 1
         spread = heard.sums(links[..., None, None] * left[..., :, None] * left[..., None, :])
         spread += own[..., None, None] * moved[..., :, None] * moved[..., None, :]
         covs = heard.mixed(own, links, heard.covs, heard.sent_covs)
-        return heard.means + moved, _symmetrise(covs + spread)
+        return heard.means + moved, symmetrise(covs + spread)
 
     return _in_rounds(belief, channel, rounds, step)
 
@@ -282,7 +282,7 @@ def intersection(
     members, d = ensembles.shape[-2:]
     if members <= d:
         raise ValueError(f"ensembles: needs more than {d} members, as components, got {members}")
-    belief = _mean(ensembles), _sample_covariance(ensembles)
+    belief = unchecked(mean)(ensembles), unchecked(sample_covariance)(ensembles)
     definite(belief[1], "ensembles")
     fused = unchecked(covariance_intersection)(belief, channel, rule=rule, rounds=rounds)
     return _recolour(ensembles, *fused)
@@ -388,11 +388,11 @@ def _information_sum(heard: _Heard, own: Array, links: Array) -> Pair:
     # About the own mean, so that equal means stay and large ones lose no digits.
     turned = (sent[:, heard.graph.senders] @ heard.gaps()[..., None])[..., 0]
     moved = (total @ heard.sums(links[..., None] * turned)[..., None])[..., 0]
-    return heard.means + moved, _symmetrise(total)
+    return heard.means + moved, symmetrise(total)
 
 
 def _inverse(spd: Array) -> Array:
     """Inverse of positive definite matrices by the inverse of their Cholesky factors."""
-    lower: Array = np.asarray(np.linalg.cholesky(spd), dtype=np.float64)
-    half = _solve_lower(lower, np.broadcast_to(np.eye(spd.shape[-1]), spd.shape))
+    lower = cholesky(spd)
+    half = solve_lower(lower, np.broadcast_to(np.eye(spd.shape[-1]), spd.shape))
     return np.asarray(half.swapaxes(-1, -2) @ half)

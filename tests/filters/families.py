@@ -16,7 +16,6 @@ from distfilt.models import LinearModel, simulate
 from distfilt.network import (
     arithmetic_average,
     average,
-    barycentre,
     consensus_pull,
     covariance_intersection,
     graphs,
@@ -49,7 +48,6 @@ ENSEMBLE_RULES = {
     "intersection, equal": partial(intersection, rule="equal"),
     "intersection, trace": partial(intersection, rule="trace"),
     "intersection, least trace": partial(intersection, rule="min_trace"),
-    "barycentre": barycentre,
 }
 GAUSSIAN_RULES = {
     "intersection": covariance_intersection,

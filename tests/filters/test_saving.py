@@ -26,7 +26,8 @@ class Kept(State):
 
 
 def kept(rng: np.random.Generator | None) -> Kept:
-    ledger = Ledger.empty(2).charge(np.array([3, 4]), 5, 40, lost=np.array([0.5, 0.0]))
+    sent = np.array([3, 4])
+    ledger = Ledger(1, sent, 5 * sent, 40 * sent, np.array([0.5, 0.0]))
     nested = ((0.1, np.arange(3.0)), (0.2, np.array([np.nan, np.inf, -0.0])))
     return Kept(1.5, ledger, rng, 7, "a b", nested, None, True, np.array([1, 2], dtype=np.int32))
 

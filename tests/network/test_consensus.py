@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import shortest_path
 
-from distfilt.checks import SolverError
+from distfilt.linalg import SolverError
 from distfilt.network import (
     AdmmRun,
     Channel,
