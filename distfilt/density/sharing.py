@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from ..doors import MISSING, Array, Count, Mask, NonNegative, Places, Positive, Record, unchecked
 from ..network import Channel, Graph, PIState, first_order, pi_step
 from ..network import weights as weighting
+from ..network.channel import Lost
 from ..network.graphs import disk
 from .grid import Grid
 from .kernel import each, kernel_density, kernel_information
@@ -279,7 +280,7 @@ class DynamicAverage(Record, Sharing):
         u = _coordinates(seen, self.modes, seen.kernels)
         (x, before), graph = carried, channel.graph
         weights = weighting.balanced(graph) if graph.directed else weighting.metropolis(graph)
-        lost = "keep" if graph.directed else "mutual"
+        lost: Lost = "keep" if graph.directed else "mutual"
         for now in (u, *(before,) * (self.rounds - 1)):  # the change belongs to the first round
             x = first_order(x, now, before, channel, weights=weights, lost=lost)
         return (x, u), *_read(x, seen, self.modes)
