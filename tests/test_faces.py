@@ -15,7 +15,7 @@ ROOMS = sorted(
 )
 CALLED = {
     "filters": ["MixtureFilter", "MixtureState"],
-    "mixtures": ["fuse", "fuse_in_turn", "fuse_moments", "runnalls", "split", "unscented"],
+    "mixtures": ["fuse", "fuse_in_turn", "fuse_moments", "runnalls", "split"],
     "models": ["occulted", "orbit", "orbits", "propagate", "rsw_frame"],
     "sensors": ["ephemeris", "line_of_sight"],
 }

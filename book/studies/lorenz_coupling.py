@@ -7,10 +7,13 @@ Every family runs with three strengths of its own remedy for a spread that is to
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 
 import numpy as np
 
+from distfilt.doors import unchecked
+from distfilt.filters import ParticleCollapse
 from distfilt.metrics import crps
 from distfilt.models import lorenz63, simulate
 from distfilt.updates import (
@@ -21,7 +24,9 @@ from distfilt.updates import (
     resampled,
     square_root,
 )
-from distfilt.updates.door import unchecked
+
+# Strengths that are too weak are part of the study.
+warnings.filterwarnings("ignore", category=ParticleCollapse)
 
 NAME = "lorenz-coupling"
 PAPER = "das"

@@ -125,7 +125,11 @@ def _instance(cls: Any, value: Any, name: str, scope: Scope) -> Any:
 def _callable(value: Any, name: str, scope: Scope) -> Any:
     if not callable(value):
         raise TypeError
-    return value
+    plan = getattr(value.func, "plan", None) if isinstance(value, partial) else None
+    if plan is None:
+        return value
+    # Loops call it without its door, so the options that a partial holds are looked at here.
+    return partial(value.func, *value.args, **plan.taken((), value.keywords)[1])
 
 
 def _one_of(options: tuple[Any, ...], value: Any, name: str, scope: Scope) -> Any:

@@ -16,11 +16,12 @@ from numpy.typing import ArrayLike
 
 from .. import ensembles as moments
 from ..checks import Array, array, callable_, count, generator, instance
+from ..doors import unchecked
 from ..models import Model
 from ..network import Graph, intersection
 from ..sensors import Sensor
 from ..updates import exact_draws, exact_forecast, known_noise, sampled_forecast, with_missing
-from ..updates.door import Update, stackable, unchecked
+from ..updates.door import Update, stackable
 from .driver import Late, Summary
 from .failures import guarded
 from .heard import Heard

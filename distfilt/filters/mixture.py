@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..checks import Array, array, choice, count, instance, number, same_length
-from ..mixtures import GaussianMixture, moved, split_stretched, two_stage
-from ..mixtures.gaussian import trusted
-from ..mixtures.steps import _conditioned
-from ..mixtures.unscented import POINT_RULES
+from ..doors import unchecked
+from ..mixtures import (
+    GaussianMixture,
+    conditioned,
+    moved,
+    split_stretched,
+    two_stage,
+    within_gate,
+)
 from ..models import Model
 from ..network import Channel, Faults, Graph, Ledger
 from ..sensors import Sensor
@@ -121,8 +126,8 @@ class MixtureFilter(TeamFilter):
     size: int = 12
     most: int = 12
     stretch: float | None = None
-    scale: ArrayLike | None = None
-    rule: str = "dd2"
+    scale: Any = None
+    rule: Literal["dd2", "unscented"] = "dd2"
     gate: float | None = None
     faults: Faults | None = None
     names: Sequence[str] = ()
@@ -146,7 +151,7 @@ class MixtureFilter(TeamFilter):
         if self.agreement is not None and self.graph is None:
             raise ValueError("graph: needs a Graph for the agreement, got None")
         count(self.most, "most", at_least=count(self.size, "size"))
-        choice(self.rule, "rule", POINT_RULES)
+        choice(self.rule, "rule", ("dd2", "unscented"))
         for name in ("stretch", "gate"):
             if getattr(self, name) is not None:
                 number(getattr(self, name), name, above=0, at_most=1e150)
@@ -210,7 +215,7 @@ class MixtureFilter(TeamFilter):
         most = max(_EXACT, self.size)
         kept = [two_stage(belief, self.size, heaviest=most) for belief in beliefs]
         # Without the square roots that they came with: a loaded state has to go on alike.
-        plain = tuple(trusted(m.weights, m.means, m.covs) for m in kept)
+        plain = tuple(m.changed() for m in kept)
         return MixtureState(now, state.ledger if channel is None else channel.ledger, None, plain)
 
     def summary(self, state: MixtureState) -> Summary:
@@ -243,13 +248,15 @@ class MixtureFilter(TeamFilter):
         self, beliefs: Sequence[GaussianMixture], seen: Sequence[Array | None]
     ) -> list[GaussianMixture]:
         """Each agent's belief after its own reading; one out of every gate changes nothing."""
-        return [
-            belief if y is None or sensor is None else _conditioned(
-                belief, y, sensor._predict, sensor.cov, sensor._residual, self.rule, self.gate,
-                "observations",
-            )
-            for belief, sensor, y in zip(beliefs, self.sensors, seen, strict=True)
-        ]  # fmt: skip
+        out = list(beliefs)
+        for k, (belief, sensor, y) in enumerate(zip(beliefs, self.sensors, seen, strict=True)):
+            if y is not None and sensor is not None:
+                known: Any = {"residual": sensor._residual, "rule": self.rule}
+                reading = (sensor._predict, sensor.cov)
+                if self.gate is not None:
+                    y = unchecked(within_gate)(belief, y, *reading, gate=self.gate, **known)
+                out[k] = unchecked(conditioned)(belief, y, *reading, **known)
+        return out
 
     def _told(
         self, beliefs: list[GaussianMixture], seen: Sequence[Array | None], channel: Channel | None

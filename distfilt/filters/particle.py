@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..checks import Array, array, choice, count, generator, instance, number
 from ..updates.particles import (
     RESAMPLING,
+    ParticleCollapse,
     _distinct,
     _jittered,
     _levels,
@@ -31,10 +32,6 @@ from .wiring import Prior, SensorFilter
 __all__ = ["ParticleCollapse", "ParticleFilter", "ParticleState"]
 
 Mask = NDArray[np.bool_]
-
-
-class ParticleCollapse(RuntimeWarning):
-    """A filter's belief rests on few particles: the others are copies, or have no weight."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ from ..checks import Array, count, number
 from ..coupling.solvers import _solver
 from ..coupling.transform import _carried, _normalised, _plans, _rejuvenated
 from ..network import finite_time
-from ..updates.particles import _log_likelihood
+from ..updates.particles import log_likelihood
 from .driver import Late, Summary
 from .ensemble import EnsembleState, ensemble_summary
 from .failures import guarded
@@ -50,10 +50,6 @@ class TransportFilter(SensorFilter):
         Give the members the weighted covariance too.
     rejuvenation : float
         h of :func:`distfilt.coupling.rejuvenated`; 0 draws nothing.
-
-    See Also
-    --------
-    distfilt.updates.transform_by_agreement : the same step without a filter round it.
 
     Examples
     --------
@@ -127,7 +123,7 @@ class TransportFilter(SensorFilter):
         for place, group in step.heard(shared=self.agreement is None):
             rows = group.agents
             predicted = group.predict(stack[place][..., rows, :, :], step.before(place, rows))
-            logs[..., rows, :] += _log_likelihood(predicted, group.target, group.noise)
+            logs[..., rows, :] += log_likelihood(predicted, group.target, group.noise)
         return logs
 
     def _transported(

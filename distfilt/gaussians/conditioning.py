@@ -6,7 +6,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import MISSING, Array, Cov, Semidefinite, door
+from ..doors import MISSING, Array, Cov, Mask, Semidefinite, door
 
 __all__ = ["conditioned"]
 
@@ -50,13 +50,26 @@ def conditioned(
     """
     missing = np.isnan(gap)
     if missing.any():
-        # A zero row of H with a one in R takes a component out of every sum exactly.
-        H = np.where(missing[..., None], 0.0, H)
-        here = ~missing[..., :, None] & ~missing[..., None, :]
-        R = np.where(here, R, np.eye(R.shape[-1]))
+        H, R = left_out(missing, H, R)
         gap = np.where(missing, 0.0, gap)
+    gain, after, _ = analysis(cov, H, R)
+    return mean + (gain @ gap[..., None])[..., 0], after
+
+
+def left_out(missing: Mask, H: Array, R: Array) -> tuple[Array, Array]:
+    """H and R where components (..., m) are missing: a zero row, a one on the diagonal.
+
+    That takes them out of every sum exactly.
+    """
+    here = ~missing[..., :, None] & ~missing[..., None, :]
+    return np.where(missing[..., None], 0.0, H), np.where(here, R, np.eye(R.shape[-1]))
+
+
+def analysis(cov: Array, H: Array, R: Array) -> tuple[Array, Array, Array]:
+    """Gain, analysis covariance in Joseph's form, and innovation covariance."""
     cross = cov @ H.mT
-    gain = np.linalg.solve(H @ cross + R, cross.mT).mT
+    inner = H @ cross + R
+    gain = np.linalg.solve(inner, cross.mT).mT
     rest = np.eye(cov.shape[-1]) - gain @ H
     after = rest @ cov @ rest.mT + gain @ R @ gain.mT
-    return mean + (gain @ gap[..., None])[..., 0], np.asarray(0.5 * (after + after.mT))
+    return np.asarray(gain), np.asarray(0.5 * (after + after.mT)), inner

@@ -1,24 +1,15 @@
-"""Kalman filters for many runs at once: linear, extended, unscented, with a smoother.
+"""Kalman filters for many runs at once: the linear one, its smoother, one on unit quaternions.
 
-Filterpy's stand beside them as the reference.
+Filterpy's stand beside them as the reference. Extended and unscented filters are
+:class:`distfilt.filters.GaussianFilter`, of one agent or of many.
 """
 
-from .linear import GaussianRun, kalman_filter, predict, update
+from .linear import GaussianRun, kalman_filter
 from .multiplicative import Chart, multiplicative_filter, quaternion_chart
-from .nonlinear import (
-    extended_filter,
-    extended_predict,
-    extended_update,
-    unscented_filter,
-    unscented_predict,
-    unscented_update,
-)
 from .reference import filterpy_ekf, filterpy_kf, filterpy_ukf
 from .smoothing import rts_smoother
 
 __all__ = [  # fmt: skip
-    "Chart", "GaussianRun", "extended_filter", "extended_predict", "extended_update",
-    "filterpy_ekf", "filterpy_kf", "filterpy_ukf", "kalman_filter", "multiplicative_filter",
-    "predict", "quaternion_chart", "rts_smoother", "unscented_filter", "unscented_predict",
-    "unscented_update", "update",
+    "Chart", "GaussianRun", "filterpy_ekf", "filterpy_kf", "filterpy_ukf", "kalman_filter",
+    "multiplicative_filter", "quaternion_chart", "rts_smoother",
 ]

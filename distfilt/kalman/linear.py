@@ -1,28 +1,26 @@
-"""The Kalman filter for many runs at once: exact, with single components of observations missing.
-
-The functions that a caller sees keep runs in front; inside, the run axis stands last.
-"""
+"""The Kalman filter for many runs at once: exact, with single components missing."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..checks import Array, array, covariance
-from ._algebra import Indices, analysis, forecast_cov, log_density, shared_gains, whitened
-from ._inputs import common_runs, fill_axes, prior
+from ..doors import MISSING, Array, Cov, Mask, Record, Semidefinite, door
+from ..gaussians.conditioning import analysis, left_out
+from ..linalg import cholesky, leading, log_det, quadratic_form
+from ..sensors import Sensor
 
-__all__ = ["GaussianRun", "kalman_filter", "predict", "update"]
+__all__ = ["GaussianRun", "kalman_filter"]
 
 
 @dataclass(frozen=True, eq=False)
-class GaussianRun:
+class GaussianRun(Record):
     """What a filter with Gaussian output leaves behind.
 
-    Attributes
+    Parameters
     ----------
     means : ndarray, (T, ..., d)
         Analysis means, one for each observation time; leading axes are the runs.
@@ -40,14 +38,33 @@ class GaussianRun:
     (array([[1.]]), array([[[0.5]]]))
     """
 
-    means: Array
-    covariances: Array
+    means: Annotated[Array, "... N d"]
+    covariances: Annotated[Array, "... k k"]
     log_likelihood: Array
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        x, p = self.means.shape, self.covariances.shape
+        if len(p) != len(x) + 1 or p[0] != x[0]:
+            raise ValueError(f"covariances: needs one for each of the means {x}, got {p}")
+        leading(x[:-1], p[:-2], "covariances")
 
+    @property
+    def dim(self) -> int:
+        """Number d of a state's components."""
+        return int(self.means.shape[-1])
+
+
+@door
 def kalman_filter(
-    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, F: ArrayLike, H: ArrayLike,
-    Q: ArrayLike, R: ArrayLike,
+    mean: Annotated[Array, "... d"],
+    cov: Cov,
+    observations: Annotated[Array, "... N m", MISSING],
+    *,
+    F: Annotated[Array, "... d d"],
+    H: Annotated[Array, "... m d"],
+    Q: Semidefinite,
+    R: Annotated[Cov, "... m m"],
 ) -> GaussianRun:
     r"""Filter T observations of a linear Gaussian model, for any number of runs at once.
 
@@ -77,8 +94,8 @@ def kalman_filter(
     Notes
     -----
     R. E. Kalman, Journal of Basic Engineering 82 (1960) 35-45. The covariance does not depend on
-    the observed values, only on which of them are there: runs that share their pattern of missing
-    components share one recursion. The update is in Joseph's form.
+    the observed values, only on which of them are there: runs that all miss the same components
+    share one recursion. The update is :func:`distfilt.gaussians.conditioned`.
 
     Examples
     --------
@@ -87,184 +104,74 @@ def kalman_filter(
     >>> run.means.ravel().round(4)
     array([0.7143, 0.7143, 1.5263])
     """
-    y = array(observations, "observations", None, finite=False)
-    if y.ndim < 2:
-        raise ValueError(f"observations: needs shape (T, ..., m), got {y.shape}")
-    if np.isinf(y).any():
-        raise ValueError("observations: needs finite numbers or NaN (missing), got infinity")
-    steps, runs, m = y.shape[0], y.shape[1:-1], y.shape[-1]
-    x0, p0 = prior(mean, cov)
-    d = x0.shape[-1]
-    f, q = _per_step(F, "F", steps, (d, d)), _noise_per_step(Q, "Q", steps, d, semidefinite=True)
-    h, r = _per_step(H, "H", steps, (m, d)), _noise_per_step(R, "R", steps, m)
-    runs = common_runs(runs, x0, p0)
-    size = math.prod(runs)
-    y = np.broadcast_to(fill_axes(y, len(runs)), (steps, *runs, m)).reshape(steps, size, m)
-    x = np.broadcast_to(x0, (*runs, d)).reshape(size, d)
-    p, group = _groups(y, p0, runs)
-    own = p.shape[-1] > 1
-    model = (f, h, q, r)
-    out = _recursion(x, p, group, y, *model) if own else _shared(x, p[..., 0], y, *model)
-    if not np.isfinite(out.means).all():
+    runs = common_runs(observations, mean, cov)
+    f, h, q, r = per_step(len(observations), F=F, H=H, Q=Q, R=R)
+    y = flat_runs(observations, runs)
+    missing, d = np.isnan(y), mean.shape[-1]
+    shared = cov.ndim == 2 and bool((missing == missing[:, :1]).all())
+    x = np.broadcast_to(mean, (*runs, d)).reshape(-1, d)
+    p = cov[None] if shared else np.broadcast_to(cov, (*runs, d, d)).reshape(-1, d, d)
+    means, covs = np.empty((*y.shape[:2], d)), np.empty((len(y), *p.shape))
+    gaps, inner = np.empty_like(y), np.empty((len(y), len(p), *r.shape[1:]))
+    for k in range(len(y)):
+        x, p = x @ f[k].T, f[k] @ p @ f[k].T + q[k]
+        gaps[k] = y[k] - x @ h[k].T
+        seen, noise = h[k], r[k]
+        if missing[k].any():
+            seen, noise = left_out(missing[k, : len(p)], seen, noise)
+            gaps[k][missing[k]] = 0.0
+        gain, p, inner[k] = analysis(p, seen, noise)
+        x = x + (gaps[k] @ gain[0].T if shared else (gain @ gaps[k, ..., None])[..., 0])
+        means[k], covs[k] = x, p
+    if not np.isfinite(means).all():
         raise np.linalg.LinAlgError("kalman_filter: needs matrices without overflow, got infinity")
-    covs = out.covariances.reshape(steps, *(runs if own else (1,) * len(runs)), d, d)
-    density = out.log_likelihood.reshape(steps, *runs)
-    return GaussianRun(out.means.reshape(steps, *runs, d), covs, density)
-
-
-def _per_step(value: ArrayLike, name: str, steps: int, shape: tuple[int, int]) -> Array:
-    """Check a matrix that is constant or given per step, and return it per step."""
-    out = array(value, name, (..., *shape))
-    if out.ndim > 3 or (out.ndim == 3 and out.shape[0] != steps):
-        raise ValueError(f"{name}: needs shape {shape} or {(steps, *shape)}, got {out.shape}")
-    return np.broadcast_to(out, (steps, *shape))
-
-
-def _noise_per_step(
-    value: ArrayLike, name: str, steps: int, dim: int, *, semidefinite: bool = False
-) -> Array:
-    return _per_step(
-        covariance(value, name, dim, semidefinite=semidefinite), name, steps, (dim, dim)
+    density = log_likelihood(gaps, inner, missing)
+    return GaussianRun.unchecked(
+        means.reshape(len(y), *runs, d),
+        covs.reshape(len(y), *((1,) * len(runs) if shared else runs), d, d),
+        density.reshape(len(y), *runs),
     )
 
 
-def _groups(y: Array, cov: Array, runs: tuple[int, ...]) -> tuple[Array, Indices]:
-    """Prior covariances (d, d, G), and for each run the index of the covariance it uses.
-
-    Two runs of y (T, R, m) with the same missing components at all times have the same covariances.
-    """
-    d, size = cov.shape[-1], y.shape[1]
-    if cov.ndim > 2:
-        full = np.broadcast_to(cov, (*runs, d, d)).reshape(-1, d, d)
-        return np.moveaxis(full, 0, -1).copy(), np.arange(size)
-    missing = np.isnan(y)
-    if (missing == missing[:, :1]).all():
-        group: Indices = np.zeros(size, dtype=np.intp)
-    else:
-        bits = np.packbits(np.moveaxis(missing, 1, -1).reshape(-1, size), axis=0)
-        _, group = np.unique(bits, axis=1, return_inverse=True)
-        group = np.asarray(group, dtype=np.intp).reshape(-1)
-    count = int(group.max(initial=0)) + 1
-    if count == size:
-        group = np.arange(size)
-    return np.repeat(cov[..., None], count, axis=-1), group
+def common_runs(observations: Array, mean: Array, cov: Array) -> tuple[int, ...]:
+    """The run axes that observations (T, ..., m), prior means and covariances have in common."""
+    runs = leading(observations.shape[1:-1], mean.shape[:-1], "mean")
+    return leading(runs, cov.shape[:-2], "cov")
 
 
-def _shared(x: Array, p: Array, y: Array, f: Array, h: Array, q: Array, r: Array) -> GaussianRun:
-    """All steps of runs x (R, d), y (T, R, m) that share their covariance p (d, d)."""
-    steps = len(y)
-    here = np.asarray(~np.isnan(y).any(axis=1))
-    gains, lowers, covs = shared_gains(p, f, h, q, r, here)
-    means, squares = np.empty((steps, *x.shape)), np.empty((steps, len(x)))
-    for k in range(steps):
-        x = x @ f[k].T
-        innovation = y[k] - x @ h[k].T
-        if not here[k].all():
-            innovation[:, ~here[k]] = 0.0
-        means[k] = x = x + innovation @ gains[k].T
-        white = whitened(lowers[k], innovation)
-        squares[k] = np.einsum("rm,rm->r", white, white)
-    log_det = 2.0 * np.log(np.diagonal(lowers, axis1=1, axis2=2)).sum(axis=-1)
-    size = np.count_nonzero(here, axis=1)
-    return GaussianRun(means, covs, log_density(size[:, None], log_det[:, None], squares))
+def per_step(steps: int, **matrices: Array) -> list[Array]:
+    """Matrices that are constant, or given per step, for every step."""
+    for name, a in matrices.items():
+        if a.shape[:-2] not in ((), (steps,)):
+            needs = f"shape {a.shape[-2:]} or {(steps, *a.shape[-2:])}"
+            raise ValueError(f"{name}: needs {needs}, got {a.shape}")
+    return [np.broadcast_to(a, (steps, *a.shape[-2:])) for a in matrices.values()]
 
 
-def _recursion(
-    x: Array, p: Array, group: Indices, y: Array, f: Array, h: Array, q: Array, r: Array
-) -> GaussianRun:
-    """All steps of runs x (R, d), y (T, R, m) with covariances p (d, d, G)."""
-    steps, x = len(y), np.ascontiguousarray(x.T)
-    means, covs = np.empty((steps, *x.shape)), np.empty((steps, *p.shape))
-    density = np.empty((steps, x.shape[-1]))
-    for k in range(steps):
-        x, p = f[k] @ x, forecast_cov(p, f[k], q[k])
-        x, p, density[k] = analysis(x, p, y[k].T - h[k] @ x, h[k], r[k], group)
-        means[k], covs[k] = x, p
-    covs = np.moveaxis(covs[..., group], -1, 1)
-    return GaussianRun(np.moveaxis(means, -1, 1), covs, density)
+def flat_runs(observations: Array, runs: tuple[int, ...]) -> Array:
+    """Observations (T, R, m) of all runs along one axis; new run axes come in front."""
+    steps, *axes, m = observations.shape
+    y = observations.reshape(steps, *(1,) * (len(runs) - len(axes)), *axes, m)
+    return np.broadcast_to(y, (steps, *runs, m)).reshape(steps, math.prod(runs), m)
 
 
-def predict(mean: ArrayLike, cov: ArrayLike, *, F: ArrayLike, Q: ArrayLike) -> tuple[Array, Array]:
-    r"""Forecast a Gaussian by a linear step: the new mean (..., d) and covariance.
-
-    The mean becomes :math:`\mathbf F\mathbf x`, the covariance
-    :math:`\mathbf F\mathbf P\mathbf F^\top+\mathbf Q`.
-
-    Parameters
-    ----------
-    mean, cov : array_like, (..., d) and (..., d, d)
-        The covariance positive definite.
-    F, Q : array_like, (d, d)
-        Transition, and process noise covariance (positive semidefinite).
-
-    Examples
-    --------
-    >>> predict([1.0], [[2.0]], F=[[3.0]], Q=[[0.5]])
-    (array([3.]), array([[18.5]]))
-    """
-    x, p = prior(mean, cov)
-    d = x.shape[-1]
-    f = array(F, "F", (d, d))
-    q = array(covariance(Q, "Q", d, semidefinite=True), "Q", (d, d))
-    return _predict(x, p, f, q)
+def grid(times: Array, t0: float, observations: Array, sensor: Sensor) -> Array:
+    """The T + 1 times of the prior and of a sensor's T observations."""
+    wanted = len(times), sensor.dim
+    if (len(observations), observations.shape[-1]) != wanted:
+        needs = f"shape ({wanted[0]}, ..., {wanted[1]})"
+        raise ValueError(f"observations: needs {needs}, got {observations.shape}")
+    if times.min(initial=np.inf) <= t0:
+        raise ValueError(f"times: needs times after t0 = {t0:g}, got {times[0]:g}")
+    return np.concatenate([[t0], times])
 
 
-def _predict(x: Array, p: Array, f: Array, q: Array) -> tuple[Array, Array]:
-    """`predict` of checked arguments."""
-    d = x.shape[-1]
-    stack = np.ascontiguousarray(np.moveaxis(p.reshape(-1, d, d), 0, -1))
-    return x @ f.T, np.moveaxis(forecast_cov(stack, f, q), -1, 0).reshape(p.shape)
-
-
-def update(
-    mean: ArrayLike, cov: ArrayLike, observed: ArrayLike, *, H: ArrayLike, R: ArrayLike
-) -> tuple[Array, Array, Array]:
-    r"""Condition a Gaussian on one observation :math:`\mathbf y=\mathbf H\mathbf x+\text{noise}`.
-
-    Parameters
-    ----------
-    mean, cov : array_like, (..., d) and (..., d, d)
-        The covariance positive definite.
-    observed : array_like, (..., m)
-        NaN marks a missing component.
-    H : array_like, (m, d)
-    R : array_like, (m, m)
-        Positive definite.
-
-    Returns
-    -------
-    mean : ndarray, (..., d)
-    cov : ndarray, (..., d, d)
-        The run axes have length 1 where all runs share the covariance.
-    log_likelihood : ndarray, (...)
-        Log density of the observation.
-
-    Examples
-    --------
-    >>> x, p, _ = update([0.0], [[1.0]], [2.0], H=[[1.0]], R=[[1.0]])
-    >>> x, p
-    (array([1.]), array([[0.5]]))
-    """
-    x, p = prior(mean, cov)
-    h = array(H, "H", ("m", x.shape[-1]))
-    m = h.shape[0]
-    y = array(observed, "observed", (..., m), finite=False)
-    if np.isinf(y).any():
-        raise ValueError("observed: needs finite numbers or NaN (missing), got infinity")
-    r = array(covariance(R, "R", m), "R", (m, m))
-    common_runs(y.shape[:-1], x, p)
-    return _update(x, p, y, h, r)
-
-
-def _update(x: Array, p: Array, y: Array, h: Array, r: Array) -> tuple[Array, Array, Array]:
-    """`update` of checked arguments."""
-    d, m = x.shape[-1], y.shape[-1]
-    runs = np.broadcast_shapes(y.shape[:-1], x.shape[:-1], p.shape[:-2])
-    seen = np.broadcast_to(y, (*runs, m)).reshape(-1, m).T
-    mean = np.ascontiguousarray(np.broadcast_to(x, (*runs, d)).reshape(-1, d).T)
-    stack, group = _groups(seen.T[None], p, runs)
-    shared = stack.shape[-1] == 1
-    mean, stack, density = analysis(mean, stack, seen - h @ mean, h, r, group)
-    covs = np.moveaxis(stack if shared else stack[..., group], -1, 0)
-    covs = covs.reshape(*((1,) * len(runs) if shared else runs), d, d)
-    return np.ascontiguousarray(mean.T).reshape(*runs, d), covs, density.reshape(runs)
+def log_likelihood(gaps: Array, inner: Array, missing: Mask) -> Array:
+    """Log densities of innovations (..., R, m), which are 0 with variance 1 where missing."""
+    try:
+        lower = cholesky(inner)
+    except np.linalg.LinAlgError:
+        needs = "the innovation covariance is not positive definite"
+        raise np.linalg.LinAlgError(needs) from None
+    constant = np.log(2 * np.pi) * (~missing).sum(axis=-1)
+    return np.asarray(-0.5 * (quadratic_form(lower, gaps) + log_det(lower) + constant))

@@ -9,24 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..checks import Array, array, callable_, count, instance
-from ..differences import _central
-from ..models import Model
-from ..models.rotations import left_directions, turn_between, turned
+from ..doors import MISSING, Array, Count, Cov, Index, Record, Times, door, unchecked
+from ..gaussians.conditioning import analysis, left_out
+from ..linalg import central
+from ..models import Model, left_directions, turn_between, turned
 from ..sensors import Sensor, stack
-from ._inputs import series
-from ._steps import analysed, linearised, moved_cov, over_time
-from .linear import GaussianRun
+from .linear import GaussianRun, common_runs, flat_runs, grid, log_likelihood
 
 __all__ = ["Chart", "multiplicative_filter", "quaternion_chart"]
 
 
-@dataclass(frozen=True)
-class Chart:
+@dataclass(frozen=True, eq=False)
+class Chart(Record):
     """How errors with k components move a state with d.
 
     Parameters
@@ -48,33 +46,33 @@ class Chart:
            [0., 1.]])
     """
 
-    dim: int
-    error_dim: int
+    dim: Count
+    error_dim: Count
     retract: Callable[[Array, Array], Array]
     local: Callable[[Array, Array], Array]
     directions: Callable[[Array], Array]
 
     def __post_init__(self) -> None:
-        if count(self.error_dim, "error_dim") > count(self.dim, "dim"):
+        super().__post_init__()
+        if self.error_dim > self.dim:
             raise ValueError(f"error_dim: needs at most {self.dim}, got {self.error_dim}")
-        for name in ("retract", "local", "directions"):
-            callable_(getattr(self, name), name)
 
-    def project(self, x: ArrayLike, cov: ArrayLike) -> Array:
+    @door
+    def project(
+        self, x: Annotated[Array, "... self.dim"], cov: Annotated[Array, "... self.dim self.dim"]
+    ) -> Array:
         """Covariance of the errors, (..., k, k), of states with covariance `cov`, (..., d, d)."""
-        state = array(x, "x", (..., self.dim))
-        p = array(cov, "cov", (..., self.dim, self.dim))
-        inwards = self._inwards(state)
-        return np.asarray(inwards @ p @ np.swapaxes(inwards, -1, -2))
+        inwards = self._inwards(x)
+        return inwards @ cov @ inwards.mT
 
     def _inwards(self, x: Array) -> Array:
         """The errors (..., k, d) of small moves of the state: the directions' pseudo-inverse."""
         b = self.directions(x)
-        across = np.swapaxes(b, -1, -2)
-        return np.asarray(np.linalg.solve(across @ b, across))
+        return np.asarray(np.linalg.solve(b.mT @ b, b.mT))
 
 
-def quaternion_chart(dim: int, first: int) -> Chart:
+@door
+def quaternion_chart(dim: Count, first: Index) -> Chart:
     """States with a quaternion among their components, and the rest as it is.
 
     The error's components are the state's, with the rotation vector of
@@ -93,7 +91,7 @@ def quaternion_chart(dim: int, first: int) -> Chart:
     >>> chart.retract(np.array([2.0, 1, 0, 0, 0]), np.array([0.5, np.pi, 0, 0])).round(3) + 0.0
     array([2.5, 0. , 1. , 0. , 0. ])
     """
-    d, at = count(dim, "dim"), count(first, "first", at_least=0)
+    d, at = dim, first
     if at + 4 > d:
         raise ValueError(f"first: needs four components from there on, got {first} of {dim}")
 
@@ -117,9 +115,17 @@ def quaternion_chart(dim: int, first: int) -> Chart:
     return Chart(d, d - 1, retract, local, directions)
 
 
+@door
 def multiplicative_filter(
-    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, chart: Chart, model: Model,
-    sensors: Sequence[Sensor], times: ArrayLike, t0: float = 0.0,
+    mean: Annotated[Array, "... model.dim"],
+    cov: Annotated[Cov, "... chart.error_dim chart.error_dim"],
+    observations: Annotated[Array, "... N m", MISSING],
+    *,
+    chart: Chart,
+    model: Model,
+    sensors: Sequence[Sensor],
+    times: Times,
+    t0: float = 0.0,
 ) -> GaussianRun:
     r"""The extended Kalman filter on a chart's errors, over series of observations.
 
@@ -136,12 +142,25 @@ def multiplicative_filter(
     cov : array_like, (k, k) or (..., k, k)
         Prior covariance of the error; :meth:`Chart.project` makes it of the state's.
     observations : array_like, (T, ..., m)
-        As for :func:`extended_filter`.
+        The observations of all sensors, one after the other; the middle axes are the runs. NaN
+        marks a missing component.
     chart : Chart
         Such as :func:`quaternion_chart`.
-    model, sensors, times, t0
-        As for :func:`extended_filter`; sensors of changes are welcome too: the errors of the
+    model : Model
+        Linearised about each analysis mean.
+    sensors : sequence of Sensor
+        Linearised about each forecast mean. Sensors of changes are welcome too: the errors of the
         previous state are kept beside those of the present one until the reading is used.
+    times : array_like, (T,)
+        Observation times, in s.
+    t0 : float
+        The time of the prior, in s.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If a run leaves the finite numbers or its covariance is no longer positive definite; the
+        message has the time.
 
     Notes
     -----
@@ -160,45 +179,66 @@ def multiplicative_filter(
     >>> float((run.means[0, 9:] ** 2).sum().round(9)), run.covariances.shape
     (1.0, (1, 12, 12))
     """
-    sensor = stack(sensors)
-    instance(model, "model", Model)
-    instance(chart, "chart", Chart)
+    sensor, k = stack(sensors), chart.error_dim
     if chart.dim != model.dim:
         raise ValueError(f"chart: needs {model.dim} components like the model, got {chart.dim}")
-
-    def forecast(x: Array, p: Array, t: float, dt: float) -> tuple[Array, Array]:
-        moved = model._step(x, t, dt)
-        inwards = chart._inwards(moved)
-        slope = inwards @ model._jacobian(x, t, dt) @ chart.directions(x)
-        after = moved_cov(p, slope, inwards @ model.noise(t, dt) @ inwards.swapaxes(-1, -2))
-        if not sensor.uses_previous:
-            return moved, after
-        across = slope @ p
-        joint = np.block([[after, across], [across.swapaxes(-1, -2), p]])
-        return np.concatenate([moved, x], axis=-1), joint
-
-    def analyse(x: Array, p: Array, y: Array) -> tuple[Array, Array, Array]:
-        innovation, slope = _errors_seen(x, y, sensor, chart)
-        error, p, density = analysed(np.zeros(p.shape[:-1]), p, innovation, slope, sensor.cov)
-        k = chart.error_dim
-        return chart.retract(x[:, : chart.dim], error[:, :k]), p[:, :k, :k], density
-
-    checked = series(observations, times, t0, sensor.dim)
-    return over_time(*checked, mean, cov, model.dim, forecast, analyse, chart.error_dim)
+    clock = grid(times, t0, observations, sensor)
+    runs = common_runs(observations, mean, cov)
+    y = flat_runs(observations, runs)
+    x = np.broadcast_to(mean, (*runs, model.dim)).reshape(-1, model.dim)
+    p = np.broadcast_to(cov, (*runs, k, k)).reshape(-1, k, k)
+    means, covs, density = np.empty((len(y), *x.shape)), np.empty((len(y), *p.shape)), []
+    for n, t in enumerate(times):
+        try:
+            x, p, logs = _step(x, p, y[n], chart, model, sensor, clock[n], t - clock[n])
+        except np.linalg.LinAlgError as error:
+            raise np.linalg.LinAlgError(f"at t = {t:g}: {error}") from None
+        means[n], covs[n] = x, p
+        density.append(logs)
+    return GaussianRun.unchecked(
+        means.reshape(len(y), *runs, model.dim),
+        covs.reshape(len(y), *runs, k, k),
+        np.array(density).reshape(len(y), *runs),
+    )
 
 
-def _errors_seen(x: Array, y: Array, sensor: Sensor, chart: Chart) -> tuple[Array, Array]:
-    """Innovations, and how a sensor sees the errors, of the previous state too if it uses it."""
-    if not sensor.uses_previous:
-        innovation, slope = linearised(x, y, sensor)
-        return innovation, np.asarray(slope @ chart.directions(x))
-    now, before = x[:, : chart.dim], x[:, chart.dim :]
-    innovation, slope = linearised(now, y, sensor, before)
+def _step(
+    x: Array, p: Array, y: Array, chart: Chart, model: Model, sensor: Sensor, t: float, dt: float
+) -> tuple[Array, Array, Array]:
+    """Means (R, d), covariances (R, k, k) and log densities (R,) one reading later."""
+    moved = _finite(unchecked(model.step)(x, t, dt))
+    inwards = chart._inwards(moved)
+    slope = inwards @ unchecked(model.jacobian)(x, t, dt) @ chart.directions(x)
+    joint = slope @ p @ slope.mT + inwards @ model.noise(t, dt) @ inwards.mT
+    previous = None
+    if sensor.uses_previous:
+        across, previous = slope @ p, x
+        joint = np.block([[joint, across], [across.mT, p]])
+    gap = unchecked(sensor.residual)(y, unchecked(sensor.predict)(moved, previous))
+    missing = np.isnan(gap)
+    h, r = left_out(missing, _errors_seen(moved, previous, sensor, chart), sensor.cov)
+    gap = np.where(missing, 0.0, gap)
+    gain, joint, inner = analysis(joint, h, r)
+    error, k = (gain @ gap[..., None])[..., 0], chart.error_dim
+    density = log_likelihood(gap, inner, missing)
+    return _finite(chart.retract(moved, error[:, :k])), joint[:, :k, :k], density
 
-    def of_before(v: Array) -> Array:
-        return sensor._predict(np.broadcast_to(now[:, None], v.shape), v)
 
-    back = _central(of_before, before, sensor._residual)
-    back = np.where(np.isnan(innovation)[..., None], 0.0, back)
-    both = [slope @ chart.directions(now), back @ chart.directions(before)]
-    return innovation, np.concatenate(both, axis=-1)
+def _finite(x: Array) -> Array:
+    lost = ~np.isfinite(x).all(axis=-1)
+    if lost.any():
+        raise np.linalg.LinAlgError(f"run {lost.argmax()} is no longer finite")
+    return x
+
+
+def _errors_seen(x: Array, previous: Array | None, sensor: Sensor, chart: Chart) -> Array:
+    """How a sensor sees the errors (R, m, k), of the previous state too if it uses it."""
+    slope = unchecked(sensor.jacobian)(x, previous) @ chart.directions(x)
+    if previous is None:
+        return np.asarray(slope)
+
+    def of_previous(v: Array) -> Array:
+        return unchecked(sensor.predict)(np.broadcast_to(x[:, None], v.shape), v)
+
+    back = central(of_previous, previous, difference=unchecked(sensor.residual))
+    return np.concatenate([slope, back @ chart.directions(previous)], axis=-1)

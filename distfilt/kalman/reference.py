@@ -12,26 +12,29 @@ update on the same sigma points can give a negative variance.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, instance, needed
+from ..doors import MISSING, Array, Cov, Mask, Semidefinite, Times, door, needed
 from ..models import Model
-from ..sensors import Sensor
-from ._inputs import common_runs, fill_axes, instantaneous, prior, series
-from ._steps import Points
-from .linear import GaussianRun, _noise_per_step, _per_step
-
-_Mask = NDArray[np.bool_]
+from ..sensors import Sensor, stack
+from .linear import GaussianRun, common_runs, flat_runs, grid, per_step
 
 __all__ = ["filterpy_ekf", "filterpy_kf", "filterpy_ukf"]
 
 
+@door
 def filterpy_kf(
-    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, F: ArrayLike, H: ArrayLike,
-    Q: ArrayLike, R: ArrayLike, likelihood: bool = True,
+    mean: Annotated[Array, "... d"],
+    cov: Cov,
+    observations: Annotated[Array, "... N m", MISSING],
+    *,
+    F: Annotated[Array, "... d d"],
+    H: Annotated[Array, "... m d"],
+    Q: Semidefinite,
+    R: Annotated[Cov, "... m m"],
+    likelihood: bool = True,
 ) -> GaussianRun:
     """Filterpy's Kalman filter over a series: arguments and result of :func:`kalman_filter`.
 
@@ -51,39 +54,43 @@ def filterpy_kf(
     """
     filterpy = needed("filterpy.kalman", "reference")
 
-    y = array(observations, "observations", None, finite=False)
-    if y.ndim < 2 or np.isinf(y).any():
-        raise ValueError(f"observations: needs (T, ..., m), finite or NaN, got shape {y.shape}")
-    steps, m = y.shape[0], y.shape[-1]
-    d = prior(mean, cov)[0].shape[-1]
-    f, q = _per_step(F, "F", steps, (d, d)), _noise_per_step(Q, "Q", steps, d, semidefinite=True)
-    h, r = _per_step(H, "H", steps, (m, d)), _noise_per_step(R, "R", steps, m)
+    f, h, q, r = per_step(len(observations), F=F, H=H, Q=Q, R=R)
+    m, d = h.shape[1:]
 
     def start(x: Array, p: Array) -> Any:
         kf = filterpy.KalmanFilter(dim_x=d, dim_z=m)
         kf.x, kf.P = x.copy(), p.copy()
         return kf
 
-    def step(kf: Any, k: int, z: Array, seen: _Mask) -> None:
+    def step(kf: Any, k: int, z: Array, seen: Mask) -> None:
         kf.predict(F=f[k], Q=q[k])
         if seen.all():
             kf.update(z, H=h[k], R=r[k])
         elif seen.any():
             kf.update(z[seen], H=h[k][seen], R=r[k][np.ix_(seen, seen)])
 
-    return _over_runs(mean, cov, y, start, step, likelihood)
+    return _over_runs(mean, cov, observations, start, step, likelihood)
 
 
+@door
 def filterpy_ekf(
-    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, model: Model,
-    sensors: Sequence[Sensor], times: ArrayLike, t0: float = 0.0, likelihood: bool = False,
+    mean: Annotated[Array, "... model.dim"],
+    cov: Annotated[Cov, "... model.dim model.dim"],
+    observations: Annotated[Array, "... N m", MISSING],
+    *,
+    model: Model,
+    sensors: Sequence[Sensor],
+    times: Times,
+    t0: float = 0.0,
+    likelihood: bool = False,
 ) -> GaussianRun:
     r"""Filterpy's extended Kalman filter over a series: linearise the model and the sensors.
 
     Parameters
     ----------
     mean, cov, observations, model, sensors, times, t0
-        As for :func:`~distfilt.kalman.extended_filter`.
+        As for :func:`~distfilt.kalman.multiplicative_filter`, with the state's covariance, and
+        sensors of the present state.
     likelihood : bool
         As for :func:`filterpy_kf`.
 
@@ -96,19 +103,16 @@ def filterpy_ekf(
     >>> run.means.round(6)
     array([[2.]])
     """
-    filterpy = needed("filterpy.kalman", "reference")
-
-    instance(model, "model", Model)
-    sensor = instantaneous(sensors)
-    y, grid = series(observations, times, t0, sensor.dim)
+    filterpy, sensor = needed("filterpy.kalman", "reference"), _present(sensors)
+    clock = grid(times, t0, observations, sensor)
 
     def start(x: Array, p: Array) -> Any:
         kf = filterpy.ExtendedKalmanFilter(dim_x=model.dim, dim_z=sensor.dim)
         kf.x, kf.P = x.copy(), p.copy()
         return kf
 
-    def step(kf: Any, k: int, z: Array, seen: _Mask) -> None:
-        t, dt = float(grid[k]), float(grid[k + 1] - grid[k])
+    def step(kf: Any, k: int, z: Array, seen: Mask) -> None:
+        t, dt = float(clock[k]), float(clock[k + 1] - clock[k])
         kf.F, kf.Q = model.jacobian(kf.x, t, dt), model.noise(t, dt)
         moved = model.step(kf.x, t, dt)
         kf.predict()
@@ -122,13 +126,21 @@ def filterpy_ekf(
                 residual=_residual_of(sensor, seen),
             )
 
-    return _over_runs(mean, cov, y, start, step, likelihood, model.dim)
+    return _over_runs(mean, cov, observations, start, step, likelihood)
 
 
+@door
 def filterpy_ukf(
-    mean: ArrayLike, cov: ArrayLike, observations: ArrayLike, *, model: Model,
-    sensors: Sequence[Sensor], times: ArrayLike, t0: float = 0.0, alpha: float = 1.0,
-    beta: float = 0.0, kappa: float = 1.0, likelihood: bool = False,
+    mean: Annotated[Array, "... model.dim"],
+    cov: Annotated[Cov, "... model.dim model.dim"],
+    observations: Annotated[Array, "... N m", MISSING],
+    *,
+    model: Model,
+    sensors: Sequence[Sensor],
+    times: Times,
+    t0: float = 0.0,
+    kappa: float = 1.0,
+    likelihood: bool = False,
 ) -> GaussianRun:
     r"""Filterpy's unscented Kalman filter over a series: 2d + 1 points instead of derivatives.
 
@@ -136,8 +148,8 @@ def filterpy_ukf(
     ----------
     mean, cov, observations, model, sensors, times, t0, likelihood
         As for :func:`filterpy_ekf`.
-    alpha, beta, kappa : float
-        As for :func:`~distfilt.kalman.unscented_predict`.
+    kappa : float
+        The points lie :math:`\sqrt{d+\kappa}` standard deviations from the mean.
 
     Examples
     --------
@@ -148,14 +160,14 @@ def filterpy_ukf(
     >>> run.means.round(6)
     array([[2.]])
     """
-    instance(model, "model", Model)
-    sensor = instantaneous(sensors)
-    y, grid = series(observations, times, t0, sensor.dim)
-    Points.of(model.dim, alpha, beta, kappa)  # refuses what it refuses of our own filter
-    start = _unscented(model, sensor.dim, alpha, beta, kappa)
+    sensor = _present(sensors)
+    clock = grid(times, t0, observations, sensor)
+    if kappa <= -model.dim:
+        raise ValueError(f"kappa: needs more than -{model.dim}, got {kappa:g}")
+    start = _unscented(model, sensor.dim, kappa)
 
-    def step(kf: Any, k: int, z: Array, seen: _Mask) -> None:
-        t, dt = float(grid[k]), float(grid[k + 1] - grid[k])
+    def step(kf: Any, k: int, z: Array, seen: Mask) -> None:
+        t, dt = float(clock[k]), float(clock[k + 1] - clock[k])
         kf.Q = model.noise(t, dt)
         kf.predict(dt=dt, t=t)
         if seen.any():
@@ -169,12 +181,18 @@ def filterpy_ukf(
             # filterpy calls hx once for each sigma point, in their order.
             kf.update(near[seen], R=sensor.cov[np.ix_(seen, seen)], hx=lambda s: next(rows))
 
-    return _over_runs(mean, cov, y, start, step, likelihood, model.dim)
+    return _over_runs(mean, cov, observations, start, step, likelihood)
 
 
-def _unscented(
-    model: Model, observed: int, alpha: float, beta: float, kappa: float
-) -> Callable[[Array, Array], Any]:
+def _present(sensors: Sequence[Sensor]) -> Sensor:
+    """The stacked sensor, if none of the sensors needs the previous state."""
+    sensor = stack(sensors)
+    if sensor.uses_previous:
+        raise ValueError("sensors: needs sensors of the present state, got a differential sensor")
+    return sensor
+
+
+def _unscented(model: Model, observed: int, kappa: float) -> Callable[[Array, Array], Any]:
     """What starts filterpy's filter at a mean and a covariance."""
     filterpy = needed("filterpy.kalman", "reference")
 
@@ -186,7 +204,7 @@ def _unscented(
             self.sigmas_f = model.step(points, fx_args["t"], dt)
 
     def start(x: Array, p: Array) -> Any:
-        points = filterpy.MerweScaledSigmaPoints(model.dim, alpha, beta, kappa)
+        points = filterpy.MerweScaledSigmaPoints(model.dim, 1.0, 0.0, kappa)
         kf = Batched(model.dim, observed, 0.0, None, None, points)
         kf.x, kf.P = x.copy(), p.copy()
         return kf
@@ -195,35 +213,35 @@ def _unscented(
 
 
 def _over_runs(
-    mean: ArrayLike, cov: ArrayLike, y: Array, start: Callable[[Array, Array], Any],
-    step: Callable[[Any, int, Array, _Mask], None], likelihood: bool, dim: int | None = None,
+    mean: Array, cov: Array, observations: Array, start: Callable[[Array, Array], Any],
+    step: Callable[[Any, int, Array, Mask], None], likelihood: bool,
 ) -> GaussianRun:
     """Run one of filterpy's objects over every run and every step."""
-    instance(likelihood, "likelihood", bool)
-    x0, p0 = prior(mean, cov)
-    d = x0.shape[-1]
-    if dim is not None and d != dim:
-        raise ValueError(f"mean: needs {dim} components like the model, got {d}")
-    runs = common_runs(y.shape[1:-1], x0, p0)
-    y = np.broadcast_to(fill_axes(y, len(runs)), (len(y), *runs, y.shape[-1]))
-    x0, p0 = np.broadcast_to(x0, (*runs, d)), np.broadcast_to(p0, (*runs, d, d))
-    means, covs = np.empty((len(y), *runs, d)), np.empty((len(y), *runs, d, d))
-    density = np.zeros((len(y), *runs))
-    for run in np.ndindex(runs):
+    runs, d = common_runs(observations, mean, cov), mean.shape[-1]
+    y = flat_runs(observations, runs)
+    steps, size = y.shape[:2]
+    x0 = np.broadcast_to(mean, (*runs, d)).reshape(size, d)
+    p0 = np.broadcast_to(cov, (*runs, d, d)).reshape(size, d, d)
+    means, covs = np.empty((steps, size, d)), np.empty((steps, size, d, d))
+    density = np.zeros((steps, size))
+    for run in range(size):
         kf = start(x0[run], p0[run])
-        for k in range(len(y)):
-            z = y[(k, *run)]
+        for k, z in enumerate(y[:, run]):
             seen = ~np.isnan(z)
             step(kf, k, z, seen)
-            means[(k, *run)], covs[(k, *run)] = kf.x, kf.P
+            means[k, run], covs[k, run] = kf.x, kf.P
             if likelihood and seen.any():
-                density[(k, *run)] = kf.log_likelihood
+                density[k, run] = kf.log_likelihood
     if not np.isfinite(means).all():
         raise np.linalg.LinAlgError("filterpy's filter ended in NaN")
-    return GaussianRun(means, covs, density)
+    return GaussianRun.unchecked(
+        means.reshape(steps, *runs, d),
+        covs.reshape(steps, *runs, d, d),
+        density.reshape(steps, *runs),
+    )
 
 
-def _residual_of(sensor: Sensor, seen: _Mask) -> Callable[[Array, Array], Array]:
+def _residual_of(sensor: Sensor, seen: Mask) -> Callable[[Array, Array], Array]:
     """The sensor's residual on the observed components only."""
 
     def residual(a: Array, b: Array) -> Array:

@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike
+from typing import Annotated
 
-from ..checks import Array, array, instance
-from ..linalg import _symmetrise
-from .linear import GaussianRun, _noise_per_step, _per_step
+import numpy as np
+
+from ..doors import Array, Semidefinite, door
+from ..linalg import symmetrise
+from .linear import GaussianRun, per_step
 
 __all__ = ["rts_smoother"]
 
 
-def rts_smoother(run: GaussianRun, *, F: ArrayLike, Q: ArrayLike) -> GaussianRun:
+@door
+def rts_smoother(
+    run: GaussianRun,
+    *,
+    F: Annotated[Array, "... run.dim run.dim"],
+    Q: Annotated[Semidefinite, "... run.dim run.dim"],
+) -> GaussianRun:
     r"""States given all observations, backwards through a Kalman filter's run.
 
     With the forecast :math:`\mathbf P^-_{k+1} = \mathbf F\mathbf P_k\mathbf F^\top+\mathbf Q` and
@@ -50,44 +57,24 @@ def rts_smoother(run: GaussianRun, *, F: ArrayLike, Q: ArrayLike) -> GaussianRun
     >>> rts_smoother(run, **model).means.ravel()
     array([1. , 1.5])
     """
-    instance(run, "run", GaussianRun)
-    _series(run)
-    steps, d = len(run.means), run.means.shape[-1]
-    f = _per_step(F, "F", steps, (d, d))
-    q = _noise_per_step(Q, "Q", steps, d, semidefinite=True)
+    f, q = per_step(len(run.means), F=F, Q=Q)
     means, covs = run.means.copy(), run.covariances.copy()
-    for k in reversed(range(steps - 1)):
+    for k in reversed(range(len(f) - 1)):
         x, p = run.means[k], run.covariances[k]
         gain = _gain(p, f[k + 1], q[k + 1])
         gap = means[k + 1] - x @ f[k + 1].T
         means[k] = x + (gain @ gap[..., None])[..., 0]
-        kept = np.eye(d) - gain @ f[k + 1]
-        back = np.swapaxes(gain, -1, -2)
-        after = kept @ p @ np.swapaxes(kept, -1, -2) + gain @ (covs[k + 1] + q[k + 1]) @ back
-        covs[k] = _symmetrise(after)
-    return GaussianRun(means, covs, run.log_likelihood.copy())
-
-
-def _series(run: GaussianRun) -> None:
-    """Refuse arrays that are not those of one filter's run."""
-    x = array(run.means, "run.means")
-    if x.ndim < 2:
-        raise ValueError(f"run.means: needs shape (T, ..., d), got {x.shape}")
-    p = array(run.covariances, "run.covariances", (..., x.shape[-1], x.shape[-1]))
-    axes = zip(p.shape[:-2], x.shape[:-1], strict=False)
-    if p.ndim != x.ndim + 1 or len(p) != len(x) or any(n not in (1, m) for n, m in axes):
-        needs = (*x.shape, x.shape[-1])
-        raise ValueError(f"run.covariances: needs shape {needs}, or runs of 1, got {p.shape}")
-    array(run.log_likelihood, "run.log_likelihood", x.shape[:-1], finite=False)
+        kept = np.eye(run.dim) - gain @ f[k + 1]
+        covs[k] = symmetrise(kept @ p @ kept.mT + gain @ (covs[k + 1] + q[k + 1]) @ gain.mT)
+    return run.changed(means=means, covariances=covs)
 
 
 def _gain(p: Array, f: Array, q: Array) -> Array:
     """P F' (F P F' + Q)^-1, (..., d, d), by a Cholesky factor."""
     forward = f @ p
-    ahead = forward @ f.T + q
     try:
-        lower = np.linalg.cholesky(_symmetrise(ahead))
+        lower = np.linalg.cholesky(symmetrise(forward @ f.T + q))
     except np.linalg.LinAlgError:
         raise np.linalg.LinAlgError("a forecast covariance is not positive definite") from None
     half = np.linalg.solve(lower, forward)
-    return np.asarray(np.swapaxes(np.linalg.solve(np.swapaxes(lower, -1, -2), half), -1, -2))
+    return np.linalg.solve(lower.mT, half).mT

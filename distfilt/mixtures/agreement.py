@@ -1,17 +1,156 @@
-"""How agents that hold mixtures agree on a target: only beliefs about it travel."""
+"""How agents that hold mixtures agree on a target: rules of fusion, and one over a channel."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Literal
 
 import numpy as np
 
-from ..doors import Count, door
+from ..doors import Count, Share, door, unchecked
 from ..network import Channel, fuses
-from .fusion import fuse
-from .gaussian import GaussianMixture
+from .fusion import Exponents, Others, PartialFusion, Rule, Terms
+from .gaussian import GaussianMixture, log_sum
+from .mixands import joined, regression
 
-__all__ = ["target_fusion"]
+__all__ = ["average", "fuse", "fuse_in_turn", "fuse_moments", "target_fusion"]
+
+
+@door
+def fuse(
+    own: GaussianMixture,
+    heard: Others,
+    *,
+    omega: Exponents = "equal",
+    terms: Terms = "matched",
+    rule: Rule = "C3",
+    size: Count | None = None,
+) -> GaussianMixture:
+    """Fuse a belief about [target; ego] with others' beliefs about the target.
+
+    Parameters
+    ----------
+    own, heard, omega
+        As of :class:`PartialFusion`.
+    terms : {"matched", "all"}
+        As of :meth:`PartialFusion.shapes`.
+    rule : {"C1", "C2", "C3", "points"}
+        As of :meth:`PartialFusion.weigh`.
+    size : int, optional
+        Reduce the result to so many mixands by Runnalls' algorithm.
+
+    Examples
+    --------
+    >>> own = GaussianMixture.gaussian([0.0, 0.0], [[2.0, 1.0], [1.0, 1.0]])
+    >>> fuse(own, own.marginal([0])).covs.round(6).tolist()
+    [[[2.0, 1.0], [1.0, 1.0]]]
+    """
+    exact = PartialFusion(own, heard, omega=omega)
+    return unchecked(exact.approximation)(terms=terms, rule=rule, size=size)
+
+
+@door
+def fuse_moments(
+    own: GaussianMixture, heard: Others, *, omega: Exponents = "equal"
+) -> GaussianMixture:
+    """Factorised covariance intersection: fuse the Gaussians that have the mixtures' moments.
+
+    Parameters
+    ----------
+    own, heard, omega
+        As of :class:`PartialFusion`.
+
+    Returns
+    -------
+    GaussianMixture
+        Of one mixand.
+
+    Examples
+    --------
+    >>> own = GaussianMixture.gaussian([0.0], [[2.0]])
+    >>> fuse_moments(own, GaussianMixture.gaussian([3.0], [[1.0]])).means.round(6)
+    array([[2.]])
+    """
+    others = PartialFusion(own, heard, omega=omega).others
+    alone = PartialFusion(own.collapsed(), [m.collapsed() for m in others], omega=omega)
+    return unchecked(alone.shapes)().equally_weighed()
+
+
+@door
+def fuse_in_turn(
+    own: GaussianMixture,
+    heard: Others,
+    *,
+    omega: Share | Literal["equal"] = "equal",
+    pair: Callable[..., GaussianMixture] = fuse,
+) -> GaussianMixture:
+    """Fuse what is heard one belief after another: fewer mixands at a time than in one pass.
+
+    With the own exponent m / (m + 1) at the m-th belief all exponents end up equal, in whatever
+    order, up to what the approximations lose. With a fixed one the last belief counts most.
+
+    Parameters
+    ----------
+    own, heard
+        As of :class:`PartialFusion`.
+    omega : "equal" or float
+        m / (m + 1), or the own exponent each time.
+    pair : callable
+        ``pair(own, heard, omega=...) -> mixture``, such as :func:`fuse` and :func:`fuse_moments`.
+
+    Examples
+    --------
+    >>> ends = [GaussianMixture.gaussian([m], [[1.0]]) for m in (3.0, 6.0)]
+    >>> own = GaussianMixture.gaussian([0.0], [[1.0]])
+    >>> fuse_in_turn(own, ends).means.round(9)
+    array([[3.]])
+    >>> fuse_in_turn(own, ends, omega=0.5).means.round(9)
+    array([[3.75]])
+    """
+    for m, other in enumerate(PartialFusion(own, heard).others, start=1):
+        own = pair(own, other, omega=m / (m + 1) if isinstance(omega, str) else omega)
+    return own
+
+
+@door
+def average(
+    own: GaussianMixture, heard: GaussianMixture, *, omega: Share = 0.5
+) -> GaussianMixture:
+    r"""Arithmetic average of the target beliefs, with the own conditional belief about the rest.
+
+    :math:`p(\mathbf e|\mathbf t)\,[\omega\,p(\mathbf t)+(1-\omega)\,p_b(\mathbf t)]`. The weights
+    of the own mixands given t are taken at the means of the heard mixands; with one own mixand the
+    result is exact.
+
+    Parameters
+    ----------
+    own, heard : GaussianMixture
+        As of :class:`PartialFusion`.
+    omega : float
+        The own share, in [0, 1].
+
+    Examples
+    --------
+    >>> own = GaussianMixture.gaussian([0.0, 0.0], [[1.0, 0.5], [0.5, 1.0]])
+    >>> average(own, GaussianMixture.gaussian([2.0], [[1.0]])).mean
+    array([1. , 0.5])
+    """
+    target, n = PartialFusion(own, heard).target, heard.dim
+    logs = target.log_weights + unchecked(target.component_log_densities)(heard.means)
+    share = np.exp(logs - log_sum(logs)[:, None])
+    gain, rest = regression(own, n)
+    gap = heard.means[:, None] - own.means[:, :n]
+    ego = own.means[:, n:] + (gain @ gap[..., None])[..., 0]
+    told = np.broadcast_to(heard.means[:, None], gap.shape)
+    means = np.concatenate([told, ego], axis=-1)
+    covs = joined(heard.covs[:, None], gain, rest)
+    new = (heard.weights[:, None] * share).ravel() * (1 - omega)
+    d, keep = own.dim, new > 0
+    return GaussianMixture.unchecked(
+        np.concatenate([omega * own.weights, new[keep]]),
+        np.concatenate([own.means, means.reshape(-1, d)[keep]]),
+        np.concatenate([own.covs, covs.reshape(-1, d, d)[keep]]),
+    )
 
 
 @fuses("mixtures")
@@ -57,10 +196,12 @@ def target_fusion(
     >>> [m.means.round(6).tolist() for m in fused]
     [[[1.5]], [[1.5]]]
     """
-    inbox = channel.exchange([belief.marginal(range(target_dim)).pack() for belief in beliefs])
+    said = [belief.marginal(range(target_dim)).pack() for belief in beliefs]
+    unpack = unchecked(GaussianMixture.unpack)
+    inbox = [[unpack(part) for part in told.values()] for told in channel.exchange(said)]
     return tuple(
-        _fused(agent, belief, [GaussianMixture.unpack(part) for part in arrived.values()], fuse)
-        for agent, (belief, arrived) in enumerate(zip(beliefs, inbox, strict=True))
+        _fused(agent, own, heard, fuse) if heard else own
+        for agent, (own, heard) in enumerate(zip(beliefs, inbox, strict=True))
     )
 
 
@@ -70,9 +211,7 @@ def _fused(
     heard: Sequence[GaussianMixture],
     fuse: Callable[..., GaussianMixture],
 ) -> GaussianMixture:
-    """One agent's belief after what it heard; what fails names the agent."""
-    if not heard:
-        return own
+    """One agent's belief after what it heard; where it collapses, the error names the agent."""
     try:
         fused = fuse(own, heard)
         fused.factors  # noqa: B018

@@ -11,35 +11,34 @@ equations (14)-(15) of Semeraro, LeGrand and Kulik for one other agent.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
+from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.special import logsumexp
+from numpy.typing import NDArray
 
-from ..checks import Array, array, callable_, choice, count, instance, number
-from .collocation import RULES, collocation_weights
-from .gaussian import GaussianMixture, trusted
+from ..doors import Array, Count, Record, Share, door, summing_to_one, unchecked
+from ..gaussians.points import unscented_points
+from ..linalg import SolverError
+from .gaussian import GaussianMixture, log_sum
+from .mixands import Shapes, conditional_shapes, literal_shapes, nonnegative_least_squares
 from .reduction import runnalls
-from .shapes import Shapes
-from .terms import (
-    _conditional_shapes,
-    _exponents,
-    _joined,
-    _literal_shapes,
-    _regression,
-)
 
-__all__ = ["PartialFusion", "average", "fuse", "fuse_in_turn", "fuse_moments"]
+__all__ = ["Exponents", "Others", "PartialFusion", "Rule", "Terms"]
 
-TERMS = ("matched", "all")
-FORMS = ("conditional", "literal")
+Others = GaussianMixture | Sequence[GaussianMixture]
+Exponents = Share | Literal["equal"] | Annotated[Array, "K", summing_to_one]
+Terms = Literal["matched", "all"]
+Rule = Literal["C1", "C2", "C3", "points"]
+
+_FLOOR = 1e-3
+"""Relative density below which the rows of "points" stop gaining weight."""
 
 
 @dataclass(frozen=True, eq=False)
-class PartialFusion:
+class PartialFusion(Record):
     r"""The exact fused density, which can be evaluated but is no mixture, and its approximations.
 
     Parameters
@@ -62,87 +61,91 @@ class PartialFusion:
     """
 
     own: GaussianMixture
-    heard: tuple[GaussianMixture, ...]
-    omega: float | str | ArrayLike = 0.5
+    heard: Others
+    _: KW_ONLY
+    omega: Exponents = "equal"
 
-    def __init__(
-        self,
-        own: GaussianMixture,
-        heard: GaussianMixture | Sequence[GaussianMixture],
-        *,
-        omega: float | str | ArrayLike = 0.5,
-    ) -> None:
-        instance(own, "own", GaussianMixture)
-        others = _beliefs(heard)
-        for other in others:
-            instance(other, "heard", GaussianMixture)
-        sizes = {other.dim for other in others}
-        if len(sizes) > 1 or max(sizes) > own.dim:
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        sizes = {other.dim for other in self.others}
+        if len(sizes) != 1 or max(sizes) > self.own.dim:
             raise ValueError(
-                f"heard: needs target beliefs of one size, at most own's {own.dim}, "
-                f"got {sorted(sizes)}"
+                f"heard: needs target beliefs, one or more, of one size, at most own's "
+                f"{self.own.dim}, got {sorted(sizes)}"
             )
-        for name, value in (
-            ("own", own), ("heard", others), ("omega", _exponents(omega, len(others))),
-        ):
-            object.__setattr__(self, name, value)
+        if np.ndim(self.omega) and len(self.exponents) != len(self.others) + 1:
+            raise ValueError(
+                f"omega: needs {len(self.others) + 1} exponents, got {len(self.exponents)}"
+            )
 
     @property
+    def others(self) -> tuple[GaussianMixture, ...]:
+        """What is heard, one or several."""
+        return (self.heard,) if isinstance(self.heard, GaussianMixture) else tuple(self.heard)
+
+    @cached_property
     def exponents(self) -> Array:
         """Exponents of the own and of the others' target marginals; their sum is 1."""
-        return np.asarray(self.omega)
+        others = len(self.others)
+        if isinstance(self.omega, np.ndarray):
+            return self.omega
+        if isinstance(self.omega, str):
+            return np.full(others + 1, 1 / (others + 1))
+        return np.array([self.omega] + [(1 - self.omega) / others] * others)
 
     @property
     def target_dim(self) -> int:
         """Number of components of the target."""
-        return self.heard[0].dim
+        return self.others[0].dim
 
     @cached_property
     def target(self) -> GaussianMixture:
         """The own belief about the target."""
-        return self.own.marginal(range(self.target_dim))
+        return unchecked(self.own.marginal)(range(self.target_dim))
 
-    def log_update(self, t: ArrayLike) -> Array:
+    @door
+    def log_update(self, t: Annotated[Array, "... self.target_dim"]) -> Array:
         """Logarithm of the update factor g(t) of (15), not normalised, (...).
 
         Parameters
         ----------
         t : array_like, (..., n_t)
         """
-        at = array(t, "t", (..., self.target_dim))
+        w = self.exponents
+        out = np.zeros(t.shape[:-1])
         with np.errstate(invalid="ignore"):  # `_numbers` refuses what is none
-            return _numbers(self._log_update(at), "t")
+            if w[0] != 1:
+                out = (w[0] - 1) * unchecked(self.target.log_density)(t)
+            for weight, other in zip(w[1:], self.others, strict=True):
+                if weight:
+                    out = out + weight * unchecked(other.log_density)(t)
+        return _numbers(out, "t")
 
-    def log_value(self, x: ArrayLike) -> Array:
+    @door
+    def log_value(self, x: Annotated[Array, "... self.own.dim"]) -> Array:
         """Logarithm of the fused density (14), not normalised, (...).
 
         Parameters
         ----------
         x : array_like, (..., d)
         """
-        at = array(x, "x", (..., self.own.dim))
+        update = unchecked(self.log_update)(x[..., : self.target_dim])
         with np.errstate(invalid="ignore"):
-            logs = self.own.log_density(at) + self._log_update(at[..., : self.target_dim])
-        return _numbers(logs, "x")
+            return _numbers(unchecked(self.own.log_density)(x) + update, "x")
 
-    def log_target(self, t: ArrayLike) -> Array:
+    @door
+    def log_target(self, t: Annotated[Array, "... self.target_dim"]) -> Array:
         """Logarithm of the fused target marginal, not normalised; it needs no ego state."""
-        at = array(t, "t", (..., self.target_dim))
+        update = unchecked(self.log_update)(t)
         with np.errstate(invalid="ignore"):
-            return _numbers(self.target.log_density(at) + self._log_update(at), "t")
+            return _numbers(unchecked(self.target.log_density)(t) + update, "t")
 
-    def _log_update(self, t: Array) -> Array:
-        w = self.exponents
-        out = (w[0] - 1) * self.target.log_density(t) if w[0] != 1 else np.zeros(t.shape[:-1])
-        for weight, other in zip(w[1:], self.heard, strict=True):
-            out = out + (weight * other.log_density(t) if weight else 0.0)
-        return np.asarray(out)
-
+    @door
     def shapes(
         self,
         *,
-        terms: str = "matched",
-        form: str = "conditional",
+        terms: Terms = "matched",
+        form: Literal["conditional", "literal"] = "conditional",
         marginal: GaussianMixture | None = None,
         received: Sequence[GaussianMixture] | None = None,
     ) -> Shapes:
@@ -161,29 +164,26 @@ class PartialFusion:
         received : sequence of GaussianMixture, optional
             What to multiply by in place of `heard` (reduced ones).
         """
-        choice(terms, "terms", TERMS)
-        choice(form, "form", FORMS)
         if marginal is not None and terms == "matched":
             raise ValueError("marginal: needs terms='all', since matched terms use the own mixands")
-        divided = self.target if marginal is None else self._target_like(marginal, "marginal")
-        others = self.heard if received is None else _beliefs(received, "received")
-        if len(others) != len(self.heard):
-            raise ValueError(f"received: needs {len(self.heard)} mixtures, got {len(others)}")
-        sent = [self._target_like(m, "received") for m in others]
-        pairs = np.indices((self.own.size, divided.size)).reshape(2, -1)
+        divided = self.target if marginal is None else marginal
+        sent = self.others if received is None else received
+        if len(sent) != len(self.others):
+            raise ValueError(f"received: needs {len(self.others)} mixtures, got {len(sent)}")
+        for name, mixture in (("marginal", divided), *(("received", other) for other in sent)):
+            if mixture.dim != self.target_dim:
+                raise ValueError(f"{name}: needs dimension {self.target_dim}, got {mixture.dim}")
+        pairs: NDArray[np.intp] = np.indices((self.own.size, divided.size)).reshape(2, -1)
         if terms == "matched":
             pairs = np.repeat(np.arange(self.own.size)[None], 2, axis=0)
-        make = _conditional_shapes if form == "conditional" else _literal_shapes
+        make = conditional_shapes if form == "conditional" else literal_shapes
         return make(self.own, divided, sent, self.exponents, pairs)
 
-    def _target_like(self, mixture: GaussianMixture, name: str) -> GaussianMixture:
-        instance(mixture, name, GaussianMixture)
-        if mixture.dim != self.target_dim:
-            raise ValueError(f"{name}: needs dimension {self.target_dim}, got {mixture.dim}")
-        return mixture
-
-    def weigh(self, shapes: Shapes, *, rule: str = "C3", at_most: int = 500) -> GaussianMixture:
+    @door
+    def weigh(self, shapes: Shapes, *, rule: Rule = "C3", at_most: Count = 500) -> GaussianMixture:
         """The mixture of these shapes, with weights from the exact density at collocation points.
+
+        Mixands whose weight is zero are left out.
 
         Parameters
         ----------
@@ -192,138 +192,52 @@ class PartialFusion:
             (30), (31), (32)-(34), or C3 with the mixands' sigma points as further points.
         at_most : int
             For "C3" and "points": how many mixands may take part, the largest by C2.
-        """
-        instance(shapes, "shapes", Shapes)
-        return collocation_weights(
-            shapes, self.own, self.log_value, self.log_update, self.target_dim,
-            rule=rule, at_most=at_most,
-        )
 
+        Raises
+        ------
+        SolverError
+            If no mixand has a weight, or least squares do not end.
+        """
+        mixture = shapes.equally_weighed()
+        logs = self._at_means(shapes, alone=rule == "C1")
+        if rule in ("C1", "C2"):
+            return _weighed(mixture, logs)
+        if shapes.size > at_most:
+            keep = np.sort(np.argsort(mixture.log_peaks - logs, kind="stable")[:at_most])
+            shapes, logs = unchecked(shapes.select)(keep), logs[keep]
+            mixture = shapes.equally_weighed()
+        points = shapes.means
+        if rule == "points":
+            points = unchecked(unscented_points)(mixture.means, mixture.factors)[0]
+            points = points.reshape(-1, mixture.dim)
+            logs = unchecked(self.log_value)(points)
+        matrix = np.exp(unchecked(mixture.component_log_densities)(points) - mixture.log_peaks)
+        right = np.exp(logs - logs.max())
+        if rule == "points":
+            rows = 1 / np.sqrt(right + _FLOOR)
+            matrix, right = matrix * rows[:, None], right * rows
+        found = unchecked(nonnegative_least_squares)(matrix, right)
+        with np.errstate(divide="ignore"):
+            return _weighed(mixture, np.log(found))
+
+    def _at_means(self, shapes: Shapes, *, alone: bool) -> Array:
+        """Log density at the shapes' means, exact or with the mixand alone that each came from."""
+        if not alone:
+            return unchecked(self.log_value)(shapes.means)
+        own, q = self.own, shapes.source
+        white = np.linalg.solve(own.factors[q], (shapes.means - own.means[q])[..., None])[..., 0]
+        logs = (own.log_weights + own.log_peaks)[q] - 0.5 * (white**2).sum(axis=-1)
+        return np.asarray(logs + unchecked(self.log_update)(shapes.means[:, : self.target_dim]))
+
+    @door
     def approximation(
-        self, *, terms: str = "matched", rule: str = "C3", size: int | None = None
+        self, *, terms: Terms = "matched", rule: Rule = "C3", size: Count | None = None
     ) -> GaussianMixture:
         """The fused mixture: shapes, weights, and Runnalls' reduction to `size` mixands."""
-        most = None if size is None else count(size, "size")
         if self.exponents[0] == 1:
-            choice(terms, "terms", TERMS)
-            choice(rule, "rule", RULES)
             return self.own
-        fused = self.weigh(self.shapes(terms=terms), rule=rule)
-        return fused if most is None or fused.size <= most else runnalls(fused, most)
-
-
-def fuse(
-    own: GaussianMixture,
-    heard: GaussianMixture | Sequence[GaussianMixture],
-    *,
-    omega: float | str | ArrayLike = 0.5,
-    terms: str = "matched",
-    rule: str = "C3",
-    size: int | None = None,
-) -> GaussianMixture:
-    """Fuse a belief about [target; ego] with others' beliefs about the target.
-
-    Parameters
-    ----------
-    own, heard, omega
-        As of :class:`PartialFusion`.
-    terms : {"matched", "all"}
-        As of :meth:`PartialFusion.shapes`.
-    rule : {"C1", "C2", "C3", "points"}
-        As of :meth:`PartialFusion.weigh`.
-    size : int, optional
-        Reduce the result to so many mixands by Runnalls' algorithm.
-
-    Examples
-    --------
-    >>> own = GaussianMixture.gaussian([0.0, 0.0], [[2.0, 1.0], [1.0, 1.0]])
-    >>> fuse(own, own.marginal([0])).covs.round(6).tolist()
-    [[[2.0, 1.0], [1.0, 1.0]]]
-    """
-    return PartialFusion(own, heard, omega=omega).approximation(terms=terms, rule=rule, size=size)
-
-
-def fuse_moments(
-    own: GaussianMixture,
-    heard: GaussianMixture | Sequence[GaussianMixture],
-    *,
-    omega: float | str | ArrayLike = 0.5,
-) -> GaussianMixture:
-    """Factorised covariance intersection: fuse the Gaussians that have the mixtures' moments.
-
-    Parameters
-    ----------
-    own, heard, omega
-        As of :class:`PartialFusion`.
-
-    Returns
-    -------
-    GaussianMixture
-        Of one mixand.
-
-    Examples
-    --------
-    >>> own = GaussianMixture.gaussian([0.0], [[2.0]])
-    >>> fuse_moments(own, GaussianMixture.gaussian([3.0], [[1.0]])).means.round(6)
-    array([[2.]])
-    """
-    exact = PartialFusion(own, heard, omega=omega)
-    alone = PartialFusion(
-        own.collapsed(), [m.collapsed() for m in exact.heard], omega=exact.exponents
-    )
-    shapes = alone.shapes()
-    return trusted(np.ones(1), shapes.means, shapes.covs)
-
-
-def fuse_in_turn(
-    own: GaussianMixture,
-    heard: GaussianMixture | Sequence[GaussianMixture],
-    *,
-    omega: float | str = "equal",
-    pair: Callable[..., GaussianMixture] = fuse,
-) -> GaussianMixture:
-    """Fuse what is heard one belief after another: fewer mixands at a time than in one pass.
-
-    With the own exponent m / (m + 1) at the m-th belief all exponents end up equal, in whatever
-    order, up to what the approximations lose. With a fixed one the last belief counts most.
-
-    Parameters
-    ----------
-    own, heard
-        As of :class:`PartialFusion`.
-    omega : "equal" or float
-        m / (m + 1), or the own exponent each time.
-    pair : callable
-        ``pair(own, heard, omega=...) -> mixture``, such as :func:`fuse` and :func:`fuse_moments`.
-
-    Examples
-    --------
-    >>> ends = [GaussianMixture.gaussian([m], [[1.0]]) for m in (3.0, 6.0)]
-    >>> own = GaussianMixture.gaussian([0.0], [[1.0]])
-    >>> fuse_in_turn(own, ends).means.round(9)
-    array([[3.]])
-    >>> fuse_in_turn(own, ends, omega=0.5).means.round(9)
-    array([[3.75]])
-    """
-    callable_(pair, "pair")
-    if isinstance(omega, str):
-        choice(omega, "omega", ("equal",))
-    others = _beliefs(heard)
-    for m, other in enumerate(others, start=1):
-        own = pair(own, other, omega=m / (m + 1) if isinstance(omega, str) else omega)
-    return own
-
-
-def _beliefs(
-    heard: GaussianMixture | Iterable[GaussianMixture], name: str = "heard"
-) -> tuple[GaussianMixture, ...]:
-    """One or several mixtures as a tuple."""
-    if not isinstance(heard, GaussianMixture | Iterable):
-        raise ValueError(f"{name}: needs mixtures, got {type(heard).__name__}")
-    others = (heard,) if isinstance(heard, GaussianMixture) else tuple(heard)
-    if not others:
-        raise ValueError(f"{name}: needs at least one belief, got none")
-    return others
+        fused = unchecked(self.weigh)(unchecked(self.shapes)(terms=terms), rule=rule)
+        return fused if size is None else unchecked(runnalls)(fused, size)
 
 
 def _numbers(logs: Array, name: str) -> Array:
@@ -333,45 +247,14 @@ def _numbers(logs: Array, name: str) -> Array:
     return logs
 
 
-def average(
-    own: GaussianMixture, heard: GaussianMixture, *, omega: float = 0.5
-) -> GaussianMixture:
-    r"""Arithmetic average of the target beliefs, with the own conditional belief about the rest.
-
-    :math:`p(\mathbf e|\mathbf t)\,[\omega\,p(\mathbf t)+(1-\omega)\,p_b(\mathbf t)]`. The weights
-    of the own mixands given t are taken at the means of the heard mixands; with one own mixand the
-    result is exact.
-
-    Parameters
-    ----------
-    own, heard : GaussianMixture
-        As of :class:`PartialFusion`.
-    omega : float
-        The own share, in [0, 1].
-
-    Examples
-    --------
-    >>> own = GaussianMixture.gaussian([0.0, 0.0], [[1.0, 0.5], [0.5, 1.0]])
-    >>> average(own, GaussianMixture.gaussian([2.0], [[1.0]])).moments()[0]
-    array([1. , 0.5])
-    """
-    w = number(omega, "omega", at_least=0, at_most=1)
-    exact = PartialFusion(own, heard, omega=w)
-    target, n = exact.target, exact.target_dim
-    logs = target.log_weights + target.component_log_densities(heard.means)
-    share = np.exp(logs - logsumexp(logs, axis=1, keepdims=True))
-    means = np.empty((heard.size, own.size, own.dim))
-    covs = np.empty((heard.size, own.size, own.dim, own.dim))
-    gain, rest = _regression(own, n)
-    means[..., :n] = heard.means[:, None]
-    gap = heard.means[:, None] - own.means[:, :n]
-    means[..., n:] = own.means[:, n:] + (gain @ gap[..., None])[..., 0]
-    covs[:] = _joined(np.broadcast_to(heard.covs[:, None], (*means.shape[:2], n, n)), gain, rest)
-    new = (heard.weights[:, None] * share).ravel() * (1 - w)
-    d = own.dim
-    keep = new > 0
-    return trusted(
-        np.concatenate([w * own.weights, new[keep]]),
-        np.concatenate([own.means, means.reshape(-1, d)[keep]]),
-        np.concatenate([own.covs, covs.reshape(-1, d, d)[keep]]),
+def _weighed(mixture: GaussianMixture, logs: Array) -> GaussianMixture:
+    """Weights from the logarithms of EQ coefficients, by (18); what vanishes is left out."""
+    mass = logs - mixture.log_peaks
+    total = log_sum(mass)
+    if not np.isfinite(total):
+        raise SolverError("no fused mixand has a weight: the exact density is zero at every point")
+    w = np.exp(mass - total)
+    keep = w > 0
+    return GaussianMixture.unchecked(
+        w[keep] / w[keep].sum(), mixture.means[keep], mixture.covs[keep]
     )

@@ -1,28 +1,25 @@
-"""Gaussian mixtures: densities, marginals, conditionals, moments, draws, products."""
+"""Gaussian mixtures: densities, marginals, conditionals, moments, draws, powers."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated
+from typing import Annotated, Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
-from scipy.special import logsumexp
 
-from ..checks import array, count, generator, instance, places
-from ..doors import Array, Record, definite, summing_to_one
-from .quadratics import ExponentialQuadratics, inverse, log_sum
+from ..doors import Array, Count, Cov, Places, Record, Rng, definite, door, summing_to_one
+from ..linalg import symmetrise
 
-__all__ = ["GaussianMixture"]
+__all__ = ["ExponentialQuadratics", "GaussianMixture"]
 
 _LOG_2PI = float(np.log(2 * np.pi))
 _CHUNK = 60_000
 """Numbers that one block of an evaluation may hold: half a megabyte stays in the cache."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class GaussianMixture(Record):
     r"""A weighted sum of Gaussian densities.
 
@@ -49,9 +46,9 @@ class GaussianMixture(Record):
     Examples
     --------
     >>> two = GaussianMixture([0.5, 0.5], [[-1.0], [1.0]], [[[1.0]], [[1.0]]])
-    >>> two.size, two.dim
-    (2, 1)
-    >>> two.moments()[1]
+    >>> two
+    GaussianMixture(2 mixands of 1 component)
+    >>> two.cov
     array([[2.]])
     """
 
@@ -60,7 +57,10 @@ class GaussianMixture(Record):
     covs: Annotated[Array, "L d d", definite]
 
     @classmethod
-    def gaussian(cls, mean: ArrayLike, cov: ArrayLike) -> GaussianMixture:
+    @door
+    def gaussian(
+        cls, mean: Annotated[Array, "d"], cov: Annotated[Cov, "d d"]
+    ) -> GaussianMixture:
         """A single Gaussian as a mixture of one mixand.
 
         Parameters
@@ -70,11 +70,25 @@ class GaussianMixture(Record):
 
         Examples
         --------
-        >>> GaussianMixture.gaussian([0.0, 1.0], np.eye(2)).size
-        1
+        >>> GaussianMixture.gaussian([0.0, 1.0], np.eye(2))
+        GaussianMixture(1 mixand of 2 components)
         """
-        m = array(mean, "mean", ("d",))
-        return cls(np.ones(1), m[None], array(cov, "cov", (m.size, m.size))[None])
+        return cls(np.ones(1), mean[None], cov[None])
+
+    @classmethod
+    def unchecked(cls, *args: Any, **options: Any) -> Self:
+        """Build one from what the library made itself, and freeze its arrays."""
+        out = super().unchecked(*args, **options)
+        for part in (out.weights, out.means, out.covs):
+            part.setflags(write=False)  # what is cached of them stays right
+        return out
+
+    def __repr__(self) -> str:
+        mixands, components = (
+            f"{n} {word}{'s' * (n > 1)}"
+            for n, word in ((self.size, "mixand"), (self.dim, "component"))
+        )
+        return f"GaussianMixture({mixands} of {components})"
 
     @property
     def size(self) -> int:
@@ -94,7 +108,13 @@ class GaussianMixture(Record):
 
     @cached_property
     def factors(self) -> Array:
-        """Cholesky factors of the covariances, (L, d, d)."""
+        """Cholesky factors of the covariances, (L, d, d).
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the mixture has collapsed: it names the mixand.
+        """
         try:
             return np.asarray(np.linalg.cholesky(self.covs))
         except np.linalg.LinAlgError:
@@ -106,16 +126,22 @@ class GaussianMixture(Record):
         half = np.log(np.diagonal(self.factors, axis1=-2, axis2=-1)).sum(axis=-1)
         return np.asarray(-half - 0.5 * self.dim * _LOG_2PI)
 
-    def component_log_densities(self, x: ArrayLike) -> Array:
+    @door
+    def component_log_densities(self, x: Annotated[Array, "... self.dim"]) -> Array:
         """Logarithm of each mixand's density, without its weight, (..., L).
 
         Parameters
         ----------
         x : array_like, (..., d)
         """
-        return self._components(array(x, "x", (..., self.dim)))
+        flat = x.reshape(-1, self.dim)
+        out = np.empty((flat.shape[0], self.size))
+        for rows in self._blocks(flat):
+            out[rows] = self.log_peaks - 0.5 * self._distances(flat[rows])
+        return out.reshape(*x.shape[:-1], self.size)
 
-    def log_density(self, x: ArrayLike) -> Array:
+    @door
+    def log_density(self, x: Annotated[Array, "... self.dim"]) -> Array:
         """Logarithm of the density, (...).
 
         Parameters
@@ -128,22 +154,16 @@ class GaussianMixture(Record):
         >>> one.log_density([[0.0], [60.0]]).round(2).tolist()
         [-0.92, -1800.92]
         """
-        return self._log_density(array(x, "x", (..., self.dim)))
-
-    def _components(self, x: Array) -> Array:
-        flat = x.reshape(-1, self.dim)
-        out = np.empty((flat.shape[0], self.size))
-        for rows in _blocks(flat.shape[0], self.size * self.dim):
-            out[rows] = self.log_peaks - 0.5 * _distances(flat[rows], *self._whitening)
-        return out.reshape(*x.shape[:-1], self.size)
-
-    def _log_density(self, x: Array) -> Array:
         flat = x.reshape(-1, self.dim)
         out = np.empty(flat.shape[0])
         constant = self.log_weights + self.log_peaks
-        for rows in _blocks(flat.shape[0], self.size * self.dim):
-            out[rows] = log_sum(constant - 0.5 * _distances(flat[rows], *self._whitening))
+        for rows in self._blocks(flat):
+            out[rows] = log_sum(constant - 0.5 * self._distances(flat[rows]))
         return out.reshape(x.shape[:-1])
+
+    def _blocks(self, flat: Array) -> Iterator[slice]:
+        step = max(1, _CHUNK // self.means.size)
+        return (slice(start, start + step) for start in range(0, len(flat), step))
 
     @cached_property
     def _whitening(self) -> tuple[Array, Array, Array]:
@@ -153,7 +173,14 @@ class GaussianMixture(Record):
         at = (white @ (self.means - centre)[..., None])[..., 0]
         return centre, np.array(white.reshape(-1, self.dim).T), at
 
-    def marginal(self, indices: Sequence[int]) -> GaussianMixture:
+    def _distances(self, x: Array) -> Array:
+        """Squared Mahalanobis distances of points (n, d) to the mixands, (n, L)."""
+        centre, white, at = self._whitening
+        gap = ((x - centre) @ white).reshape(x.shape[0], *at.shape) - at
+        return np.asarray(np.einsum("nld,nld->nl", gap, gap))
+
+    @door
+    def marginal(self, indices: Places) -> GaussianMixture:
         """The density of some components.
 
         Parameters
@@ -166,137 +193,50 @@ class GaussianMixture(Record):
         >>> GaussianMixture.gaussian([0.0, 1.0], np.eye(2)).marginal([1]).means
         array([[1.]])
         """
-        at = np.array(places(indices, "indices", self.dim))
-        return trusted(self.weights, self.means[:, at], self.covs[:, at[:, None], at])
+        at = np.array(indices)
+        if at.max() >= self.dim:
+            raise ValueError(f"indices: needs integers below {self.dim}, got {at.max()}")
+        return self.unchecked(self.weights, self.means[:, at], self.covs[:, at[:, None], at])
 
-    def conditional(self, indices: Sequence[int], values: ArrayLike) -> GaussianMixture:
-        r"""The density of the other components, given some.
+    @property
+    def mean(self) -> Array:
+        """Mean of the whole mixture, (d,)."""
+        return np.asarray(self.weights @ self.means)
 
-        The mixands' weights become :math:`w_\ell\,\mathcal N(\mathbf t;\mathbf m_{t,\ell},
-        \mathbf P_{t,\ell})`, normalised in logarithms, so that values far in the tails are fine.
-
-        Parameters
-        ----------
-        indices : sequence of int
-            The components that are known; at least one must remain.
-        values : array_like, (len(indices),)
-            Their values.
-
-        Examples
-        --------
-        >>> pair = GaussianMixture.gaussian([0.0, 0.0], [[1.0, 0.5], [0.5, 1.0]])
-        >>> rest = pair.conditional([0], [2.0])
-        >>> rest.means, rest.covs
-        (array([[1.]]), array([[[0.75]]]))
-        """
-        known = np.array(places(indices, "indices", self.dim))
-        rest = np.setdiff1d(np.arange(self.dim), known)
-        if not rest.size:
-            raise ValueError("indices: needs a component that is left, got all of them")
-        t = array(values, "values", (known.size,))
-        part = self.marginal(known.tolist())
-        logs = self.log_weights + part._components(t)
-        if not np.isfinite(logs.max()):
-            raise ValueError(f"values: needs some whose density is a number, got {t.tolist()}")
-        cross = self.covs[:, known[:, None], rest]
-        gain = np.swapaxes(np.linalg.solve(part.covs, cross), -1, -2)
-        means = self.means[:, rest] + (gain @ (t - part.means)[..., None])[..., 0]
-        covs = self.covs[:, rest[:, None], rest] - gain @ cross
-        return trusted(np.exp(logs - logsumexp(logs)), means, symmetric(covs))
+    @property
+    def cov(self) -> Array:
+        """Covariance of the whole mixture, (d, d)."""
+        gap = self.means - self.mean
+        cov = np.einsum("l,lij->ij", self.weights, self.covs) + (gap.T * self.weights) @ gap
+        return symmetrise(cov)
 
     def moments(self) -> tuple[Array, Array]:
         """Mean (d,) and covariance (d, d) of the whole mixture."""
-        mean = self.weights @ self.means
-        gap = self.means - mean
-        cov = np.einsum("l,lij->ij", self.weights, self.covs) + (gap.T * self.weights) @ gap
-        return mean, symmetric(cov)
+        return self.mean, self.cov
 
     def collapsed(self) -> GaussianMixture:
         """The one Gaussian that has the mixture's mean and covariance, as a mixture."""
-        mean, cov = self.moments()
-        return trusted(np.ones(1), mean[None], cov[None])
+        return self.unchecked(np.ones(1), self.mean[None], self.cov[None])
 
-    def sample(self, n: int, *, rng: np.random.Generator) -> Array:
-        """Draw `n` points, (n, d).
+    @door
+    def rvs(self, size: Count, *, rng: Rng) -> Array:
+        """Draw `size` points, (size, d).
 
         Parameters
         ----------
-        n : int
+        size : int
         rng : numpy.random.Generator
         """
-        random = generator(rng)
-        which = random.choice(self.size, size=count(n, "n"), p=self.weights / self.weights.sum())
-        noise = random.standard_normal((which.size, self.dim))
-        return np.asarray(
-            self.means[which] + (self.factors[which] @ noise[..., None])[..., 0]
-        )
-
-    def product(self, other: GaussianMixture) -> tuple[GaussianMixture, float]:
-        r"""The normalised product with another mixture, and the logarithm of its integral.
-
-        Parameters
-        ----------
-        other : GaussianMixture
-            Of the same dimension.
-
-        Returns
-        -------
-        mixture : GaussianMixture
-            Of L L' mixands, those of `other` running fastest.
-        log_integral : float
-            :math:`\log\int p\,p'\,d\mathbf x`.
-
-        Examples
-        --------
-        >>> one = GaussianMixture.gaussian([0.0], [[1.0]])
-        >>> both, _ = one.product(GaussianMixture.gaussian([2.0], [[1.0]]))
-        >>> both.means, both.covs
-        (array([[1.]]), array([[[0.5]]]))
-        """
-        instance(other, "other", GaussianMixture)
-        if other.dim != self.dim:
-            raise ValueError(f"other: needs dimension {self.dim}, got {other.dim}")
-        return self.from_quadratics(self.quadratics().times(other.quadratics()))
+        which = rng.choice(self.size, size=size, p=self.weights / self.weights.sum())
+        noise = rng.standard_normal((size, self.dim))
+        return np.asarray(self.means[which] + (self.factors[which] @ noise[..., None])[..., 0])
 
     def quadratics(self) -> ExponentialQuadratics:
         r"""The mixture as a sum of exponential quadratics, equation (18)."""
         precision = inverse(self.factors)
         vector = (precision @ self.means[..., None])[..., 0]
         top = self.log_weights + self.log_peaks - 0.5 * np.einsum("li,li->l", vector, self.means)
-        return ExponentialQuadratics(precision, vector, top)
-
-    @classmethod
-    def from_quadratics(cls, terms: ExponentialQuadratics) -> tuple[GaussianMixture, float]:
-        """The density proportional to a sum of exponential quadratics, and its log integral.
-
-        Raises
-        ------
-        ValueError
-            If a term has no integral: its precision is not positive definite.
-
-        Examples
-        --------
-        >>> terms = ExponentialQuadratics([[[2.0]]], [[2.0]], [0.0])
-        >>> GaussianMixture.from_quadratics(terms)[0].means
-        array([[1.]])
-        """
-        instance(terms, "terms", ExponentialQuadratics)
-        try:
-            factors = np.linalg.cholesky(terms.precisions)
-        except np.linalg.LinAlgError:
-            least = float(np.linalg.eigvalsh(terms.precisions).min())
-            raise ValueError(
-                f"terms: needs positive definite precisions, got smallest eigenvalue {least:.6g}"
-            ) from None
-        covs = inverse(np.asarray(factors))
-        means = (covs @ terms.vectors[..., None])[..., 0]
-        half = np.log(np.diagonal(factors, axis1=-2, axis2=-1)).sum(axis=-1)
-        logs = terms.log_coefficients + 0.5 * np.einsum("li,li->l", terms.vectors, means)
-        logs = logs - half + 0.5 * means.shape[1] * _LOG_2PI
-        total = float(logsumexp(logs))
-        if not np.isfinite(total):
-            raise ValueError("terms: needs a term that is there, got none")
-        return trusted(np.exp(logs - total), means, covs), total
+        return ExponentialQuadratics.unchecked(precision, vector, top)
 
     def pack(self) -> tuple[Array, Array, Array]:
         """The mixture as a channel's payload: weights, means, and upper triangles (L, d(d+1)/2)."""
@@ -304,7 +244,11 @@ class GaussianMixture(Record):
         return self.weights, self.means, self.covs[:, upper[0], upper[1]]
 
     @classmethod
-    def unpack(cls, payload: Sequence[ArrayLike]) -> GaussianMixture:
+    @door
+    def unpack(
+        cls,
+        payload: tuple[Annotated[Array, "L"], Annotated[Array, "L d"], Annotated[Array, "L m"]],
+    ) -> GaussianMixture:
         """The mixture from what :meth:`pack` made of it.
 
         Examples
@@ -315,19 +259,69 @@ class GaussianMixture(Record):
         >>> GaussianMixture.unpack(one.pack()).covs.tolist() == one.covs.tolist()
         True
         """
-        if not isinstance(payload, list | tuple) or len(payload) != 3:
-            raise ValueError(f"payload: needs weights, means and triangles, got {payload!r}")
-        m = array(payload[1], "payload", ("L", "d"))
-        d = m.shape[1]
-        flat = array(payload[2], "payload", (m.shape[0], d * (d + 1) // 2))
-        upper = np.triu_indices(d)
-        covs = np.empty((m.shape[0], d, d))
-        covs[:, upper[0], upper[1]] = flat
-        covs[:, upper[1], upper[0]] = flat
-        return cls(array(payload[0], "payload", (m.shape[0],)), m, covs)
+        weights, means, triangles = payload
+        d = means.shape[1]
+        rows, columns = np.triu_indices(d)
+        covs = np.empty((len(means), d, d))
+        covs[:, rows, columns] = covs[:, columns, rows] = triangles
+        return cls.unchecked(weights, means, covs)
 
 
-trusted = GaussianMixture.unchecked
+@dataclass(frozen=True, eq=False)
+class ExponentialQuadratics(Record):
+    r"""A sum :math:`\sum_\ell\exp(c_\ell+\boldsymbol\eta_\ell^\top\mathbf x
+    -\tfrac12\mathbf x^\top\boldsymbol\Lambda_\ell\mathbf x)`.
+
+    Equation (16) in information form: a precision may be indefinite or singular, so that powers
+    of Gaussians and Gaussians that cancel have a representation.
+
+    Parameters
+    ----------
+    precisions : array_like, (L, d, d)
+        Symmetric, of any sign.
+    vectors : array_like, (L, d)
+    log_coefficients : array_like, (L,)
+
+    Examples
+    --------
+    >>> one = ExponentialQuadratics([[[0.5]]], [[1.5]], [-1.0])
+    >>> float(one.log_value([2.0]))
+    1.0
+    """
+
+    precisions: Annotated[Array, "L d d"]
+    vectors: Annotated[Array, "L d"]
+    log_coefficients: Annotated[Array, "L"]
+
+    @door
+    def log_value(self, x: Annotated[Array, "... d"]) -> Array:
+        """Logarithm of the sum, (...).
+
+        Parameters
+        ----------
+        x : array_like, (..., d)
+        """
+        square = np.einsum("...i,lij,...j->...l", x, self.precisions, x)
+        return log_sum(self.log_coefficients + x @ self.vectors.T - 0.5 * square)
+
+    @door
+    def power(self, exponent: float) -> ExponentialQuadratics:
+        r"""Each term to a power: the first-order power approximation (19)-(20).
+
+        Exact for one term. For more it is the sum of powers where the power of the sum is meant.
+
+        Parameters
+        ----------
+        exponent : float
+            May be negative; not zero where a term is missing.
+        """
+        if exponent <= 0 and np.isinf(self.log_coefficients).any():
+            raise ValueError(
+                f"exponent: needs a positive one for terms of weight 0, got {exponent:g}"
+            )
+        return self.unchecked(
+            exponent * self.precisions, exponent * self.vectors, exponent * self.log_coefficients
+        )
 
 
 def _collapsed(covs: Array) -> str:
@@ -343,17 +337,15 @@ def _collapsed(covs: Array) -> str:
     )
 
 
-def symmetric(covs: Array) -> Array:
-    return np.asarray(0.5 * (covs + np.swapaxes(covs, -1, -2)))
+def inverse(factors: Array) -> Array:
+    """The inverse of L L', symmetric, for Cholesky factors (..., d, d)."""
+    white = np.linalg.solve(factors, np.broadcast_to(np.eye(factors.shape[-1]), factors.shape))
+    return np.asarray(white.mT @ white)
 
 
-def _blocks(rows: int, width: int) -> Iterator[slice]:
-    step = max(1, _CHUNK // max(width, 1))
-    for start in range(0, rows, step):
-        yield slice(start, start + step)
-
-
-def _distances(x: Array, centre: Array, white: Array, at: Array) -> Array:
-    """Squared Mahalanobis distances of points (n, d) to L mixands, (n, L)."""
-    gap = ((x - centre) @ white).reshape(x.shape[0], *at.shape) - at
-    return np.asarray(np.einsum("nld,nld->nl", gap, gap))
+def log_sum(logs: Array) -> Array:
+    """Logarithm of the sum of exponentials along the last axis; -inf where all are."""
+    top = logs.max(axis=-1, keepdims=True)
+    top = np.where(np.isfinite(top), top, 0.0)
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.log(np.exp(logs - top).sum(axis=-1)) + top[..., 0])

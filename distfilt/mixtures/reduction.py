@@ -1,27 +1,31 @@
-"""Fewer mixands: by the cheapest merger, by relevance to another's belief, by rank, by weight."""
+"""Fewer mixands: by the cheapest merger, by relevance to another's belief, by rank."""
 
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
+from functools import cache
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from ..checks import Array, choice, count, instance, needed, number
+from ..doors import Array, Bounds, Count, Mask, NonNegative, door, needed, unchecked
+from ..linalg import symmetrise
 from .divergence import gaussian_divergences
-from .gaussian import GaussianMixture, symmetric, trusted
-from .shapes import Shapes
+from .gaussian import GaussianMixture
+from .mixands import Shapes
 
 __all__ = [
-    "cross_relevance", "kept_by_relevance", "merge_costs", "pivoted_qr", "prune", "runnalls",
-    "two_stage",
-]
+    "cross_relevance", "kept_by_relevance", "merge_costs", "pivoted_qr", "runnalls", "two_stage",
+]  # fmt: skip
 
-ENGINES = ("auto", "numba", "numpy")
+Engine = Literal["auto", "numba", "numpy"]
 
 
-def runnalls(mixture: GaussianMixture, size: int, *, engine: str = "auto") -> GaussianMixture:
+@door
+def runnalls(mixture: GaussianMixture, size: Count, *, engine: Engine = "auto") -> GaussianMixture:
     r"""Merge, pair by pair, the mixands whose merger may lose least, until `size` are left.
 
     Merging i and j keeps their weight, mean and covariance. The loss of information is at most
@@ -49,25 +53,16 @@ def runnalls(mixture: GaussianMixture, size: int, *, engine: str = "auto") -> Ga
     array([[0.1],
            [9. ]])
     """
-    n = count(size, "size")
-    how = choice(engine, "engine", ENGINES)
-    if instance(mixture, "mixture", GaussianMixture).size <= n:
+    if mixture.size <= size:
         return mixture
-    if how == "auto":
-        how = "numba" if importlib.util.find_spec("numba") is not None else "numpy"
     w, m, p, root = _whitened(mixture)
-    alive = np.ones(w.size, dtype=bool)
-    if how == "numba":
-        needed("numba", "speed")
-        from . import _merging
-
-        _merging.reduce(w, m, p, alive, n)
-    else:
-        _reduce_by_rows(w, m, p, alive, n)
-    means = mixture.moments()[0] + m[alive] @ root.T
-    return trusted(w[alive] / w[alive].sum(), means, symmetric(root @ p[alive] @ root.T))
+    alive = _merged(w, m, p, size, _costs_by(engine))
+    means = mixture.mean + m[alive] @ root.T
+    covs = symmetrise(root @ p[alive] @ root.T)
+    return GaussianMixture.unchecked(w[alive] / w[alive].sum(), means, covs)
 
 
+@door
 def merge_costs(mixture: GaussianMixture) -> Array:
     """Runnalls' bound for each pair of mixands, (L, L); zero on the diagonal.
 
@@ -77,34 +72,13 @@ def merge_costs(mixture: GaussianMixture) -> Array:
     >>> merge_costs(two)[0, 1].round(6) == np.round(0.5 * np.log(2), 6)
     np.True_
     """
-    w, m, p, _ = _whitened(instance(mixture, "mixture", GaussianMixture))
-    dets = np.linalg.slogdet(p)[1]
-    return np.stack([_costs(w, m, p, dets, i, np.arange(w.size)) for i in range(w.size)])
+    w, m, p, _ = _whitened(mixture)
+    dets, every = np.linalg.slogdet(p)[1], np.arange(mixture.size)
+    return np.stack([_costs(w, m, p, dets, i, every) for i in range(mixture.size)])
 
 
-def prune(mixture: GaussianMixture, least: float) -> GaussianMixture:
-    """Drop the mixands that weigh less than `least`; the heaviest always stays.
-
-    Parameters
-    ----------
-    mixture : GaussianMixture
-    least : float
-        In [0, 1).
-
-    Examples
-    --------
-    >>> two = GaussianMixture([0.999, 0.001], [[0.0], [1.0]], [[[1.0]], [[1.0]]])
-    >>> prune(two, 0.01).size
-    1
-    """
-    limit = number(least, "least", at_least=0, below=1)
-    w = instance(mixture, "mixture", GaussianMixture).weights
-    keep = (w >= limit) & (w > 0)
-    keep[np.argmax(w)] = True
-    return trusted(w[keep] / w[keep].sum(), mixture.means[keep], mixture.covs[keep])
-
-
-def two_stage(mixture: GaussianMixture, size: int, *, heaviest: int = 400) -> GaussianMixture:
+@door
+def two_stage(mixture: GaussianMixture, size: Count, *, heaviest: Count = 400) -> GaussianMixture:
     """Runnalls' reduction for thousands of mixands: the heaviest absorb the others first.
 
     Each other mixand joins the heavy one with which its merger costs least, all at once; then
@@ -125,23 +99,21 @@ def two_stage(mixture: GaussianMixture, size: int, *, heaviest: int = 400) -> Ga
     array([[0. ],
            [8.8]])
     """
-    n = count(size, "size")
-    top = count(heaviest, "heaviest", at_least=n)
-    if instance(mixture, "mixture", GaussianMixture).size <= top:
-        return runnalls(mixture, n)
+    if heaviest < size:
+        raise ValueError(f"heaviest: needs an integer of at least size, {size}, got {heaviest}")
+    if mixture.size <= heaviest:
+        return unchecked(runnalls)(mixture, size)
     w, m, p, _ = _whitened(mixture)
     order = np.argsort(-w, kind="stable")
-    heavy, rest = order[:top], order[top:]
-    dets = np.linalg.slogdet(p)[1]
-    joins = np.concatenate([
-        np.stack([_costs(w, m, p, dets, i, heavy) for i in block]).argmin(axis=1)
-        for block in np.array_split(rest, max(1, rest.size // 256))
-    ])
+    heavy, rest = order[:heaviest], order[heaviest:]
+    costs, dets = _costs_by("auto"), np.linalg.slogdet(p)[1]
     labels = np.empty(w.size, dtype=np.intp)
-    labels[heavy], labels[rest] = np.arange(top), joins
-    return runnalls(_grouped(mixture, labels), n)
+    labels[heavy] = np.arange(heaviest)
+    labels[rest] = [costs(w, m, p, dets, i, heavy).argmin() for i in rest]
+    return unchecked(runnalls)(_grouped(mixture, labels), size)
 
 
+@door
 def cross_relevance(mixture: GaussianMixture, other: GaussianMixture) -> Array:
     r"""The matrix (38)-(39): :math:`w_q D_{KL}(\mathcal N_q\|\mathcal N_r)`, (L, L').
 
@@ -158,19 +130,17 @@ def cross_relevance(mixture: GaussianMixture, other: GaussianMixture) -> Array:
     >>> cross_relevance(one, GaussianMixture.gaussian([2.0], [[1.0]]))
     array([[2.]])
     """
-    _same_dim(mixture, other)
-    return mixture.weights[:, None] * gaussian_divergences(
-        mixture.means, mixture.covs, other.means, other.covs
-    )
+    return mixture.weights[:, None] * _divergences(mixture, other)
 
 
+@door
 def kept_by_relevance(
     mixture: GaussianMixture,
     other: GaussianMixture,
     *,
-    threshold: float,
-    gate: float = 0.5,
-    floor: float = 1e-4,
+    threshold: Annotated[float, Bounds(above=1)],
+    gate: NonNegative = 0.5,
+    floor: NonNegative = 1e-4,
 ) -> GaussianMixture:
     r"""Merge into one the mixands that overlap with none of another's: the KLD rule (40)-(41).
 
@@ -197,25 +167,21 @@ def kept_by_relevance(
     array([[0. ],
            [8.5]])
     """
-    _same_dim(mixture, other)
-    eps = number(threshold, "threshold", above=1)
-    far = number(gate, "gate", at_least=0)
-    least = number(floor, "floor", at_least=0)
-    nearest = gaussian_divergences(
-        mixture.means, mixture.covs, other.means, other.covs
-    ).min(axis=1)
+    nearest = _divergences(mixture, other).min(axis=1)
     delta = mixture.weights * nearest
-    out = (delta > eps * max(float(delta.min()), least)) & (nearest > far)
+    out = (delta > threshold * max(float(delta.min()), floor)) & (nearest > gate)
     out[np.argmin(delta)] = False
-    if out.sum() < 2:
-        return mixture
     labels = np.where(out, mixture.size, np.arange(mixture.size))
     return _grouped(mixture, np.unique(labels, return_inverse=True)[1])
 
 
+@door
 def pivoted_qr(
-    shapes: Shapes, *, size: int | None = None, tolerance: float | None = None,
-    rest: str = "merge",
+    shapes: Shapes,
+    *,
+    size: Count | None = None,
+    tolerance: Annotated[float, Bounds(above=0, below=1)] | None = None,
+    rest: Literal["merge", "drop"] = "merge",
 ) -> Shapes:
     r"""Keep the mixands that a pivoted QR decomposition of (33) finds independent, (42)-(43).
 
@@ -236,49 +202,42 @@ def pivoted_qr(
     array([[0.],
            [9.]])
     """
-    instance(shapes, "shapes", Shapes)
-    choice(rest, "rest", ("merge", "drop"))
     if (size is None) == (tolerance is None):
         raise ValueError("size: needs either a size or a tolerance, got both or none")
-    mixture = trusted(np.full(shapes.size, 1 / shapes.size), shapes.means, shapes.covs)
-    values = np.exp(mixture._components(shapes.means) - mixture.log_peaks)
-    upper, order = qr(values, mode="r", pivoting=True)
+    mixture = shapes.equally_weighed()
+    logs = unchecked(mixture.component_log_densities)(shapes.means) - mixture.log_peaks
+    upper, order = qr(np.exp(logs), mode="r", pivoting=True)
     pivots = np.abs(np.diagonal(upper))
-    if tolerance is not None:
-        limit = number(tolerance, "tolerance", above=0, below=1)
-        kept = int((pivots >= limit * pivots[0]).sum())
-    else:
-        kept = min(count(size, "size"), shapes.size)
-        kept -= rest == "merge" and 1 < kept < shapes.size
-    keep = np.sort(order[:kept])
+    kept = int((pivots >= (tolerance or 0.0) * pivots[0]).sum()) if size is None else size
+    kept = min(kept, shapes.size)
+    if size is not None and rest == "merge" and 1 < kept < shapes.size:
+        kept -= 1
+    select = unchecked(shapes.select)
+    first = select(np.sort(order[:kept]))
     if rest == "drop" or kept == shapes.size:
-        return shapes.select(keep)
-    lost = order[kept:]
-    mean, cov = trusted(
-        np.full(lost.size, 1 / lost.size), shapes.means[lost], shapes.covs[lost]
-    ).moments()
-    first = shapes.select(keep)
-    return Shapes(
-        np.concatenate([first.means, mean[None]]), np.concatenate([first.covs, cov[None]]),
-        np.append(first.source, shapes.source[lost[0]]), shapes.dropped,
-    )
+        return first
+    lost = select(order[kept:])
+    one = lost.equally_weighed()
+    return Shapes.unchecked(
+        np.concatenate([first.means, one.mean[None]]), np.concatenate([first.covs, one.cov[None]]),
+        np.append(first.source, lost.source[0]), shapes.dropped,
+    )  # fmt: skip
 
 
-def _same_dim(mixture: GaussianMixture, other: GaussianMixture) -> None:
-    instance(mixture, "mixture", GaussianMixture)
-    if instance(other, "other", GaussianMixture).dim != mixture.dim:
+def _divergences(mixture: GaussianMixture, other: GaussianMixture) -> Array:
+    if other.dim != mixture.dim:
         raise ValueError(f"other: needs dimension {mixture.dim}, got {other.dim}")
+    return gaussian_divergences(mixture.means, mixture.covs, other.means, other.covs)
 
 
 def _whitened(mixture: GaussianMixture) -> tuple[Array, Array, Array, Array]:
     """Copies in the frame of the global moments, where the costs are the same and well scaled."""
-    mean, cov = mixture.moments()
-    root = np.linalg.cholesky(cov)
+    root = np.linalg.cholesky(mixture.cov)
     white = np.linalg.solve(root, np.eye(mixture.dim))
     return (
         mixture.weights.copy(),
-        np.ascontiguousarray((mixture.means - mean) @ white.T),
-        np.ascontiguousarray(symmetric(white @ mixture.covs @ white.T)),
+        np.ascontiguousarray((mixture.means - mixture.mean) @ white.T),
+        np.ascontiguousarray(symmetrise(white @ mixture.covs @ white.T)),
         np.asarray(root),
     )
 
@@ -296,29 +255,77 @@ def _costs(
     return np.asarray(np.where(others == i, 0.0, bound))
 
 
-def _reduce_by_rows(w: Array, m: Array, p: Array, alive: NDArray[np.bool_], size: int) -> None:
-    """As the compiled kernel, a row of costs at a time, in place."""
+def _costs_by(engine: Engine) -> Callable[..., Array]:
+    """What computes a row of costs; "auto" takes numba where it is installed."""
+    if engine == "numpy" or (engine == "auto" and importlib.util.find_spec("numba") is None):
+        return _costs
+    return _compiled()
+
+
+@cache
+def _compiled() -> Callable[..., Array]:
+    compiled: Callable[..., Array] = needed("numba", "speed").njit(cache=True)(_costs_in_loops)
+    return compiled
+
+
+def _costs_in_loops(w: Any, m: Any, p: Any, dets: Any, i: Any, others: Any) -> Any:
+    """As :func:`_costs`, for numba: each merged covariance is formed and factored in one pass."""
+    d = m.shape[1]
+    lower, out = np.empty((d, d)), np.zeros(others.size)
+    for k, j in enumerate(others):
+        total = w[i] + w[j]
+        if total <= 0.0 or i == j:
+            continue
+        a, b = w[i] / total, w[j] / total
+        half = 0.0
+        for r in range(d):
+            for c in range(r + 1):
+                s = a * p[i, r, c] + b * p[j, r, c]
+                s += a * b * (m[i, r] - m[j, r]) * (m[i, c] - m[j, c])
+                for e in range(c):
+                    s -= lower[r, e] * lower[c, e]
+                lower[r, c] = np.sqrt(s) if r == c else s / lower[c, c]
+            half += np.log(lower[r, r])
+        out[k] = total * half - 0.5 * (w[i] * dets[i] + w[j] * dets[j])
+    return out
+
+
+def _merged(w: Array, m: Array, p: Array, size: int, costs: Callable[..., Array]) -> Mask:
+    """Merge the cheapest pair until `size` mixands are left, in place; which are left."""
     n = w.size
+    every, alive = np.arange(n), np.ones(n, dtype=bool)
     dets = np.linalg.slogdet(p)[1]
     table = np.full((n, n), np.inf)
     for i in range(n - 1):
-        table[i, i + 1 :] = _costs(w, m, p, dets, i, np.arange(i + 1, n))
+        table[i, i + 1 :] = costs(w, m, p, dets, i, every[i + 1 :])
+    nearest = table.argmin(axis=1)
     for _ in range(n - size):
-        lowest = table.min()
-        first = np.argmax(table <= lowest + 1e-12 + 1e-9 * abs(lowest))
-        i, j = (int(k) for k in np.unravel_index(first, table.shape))
-        total = w[i] + w[j]
-        a = w[i] / total if total > 0 else 0.5
-        gap = m[i] - m[j]
-        p[i] = a * p[i] + (1 - a) * p[j] + a * (1 - a) * np.outer(gap, gap)
-        m[i] = a * m[i] + (1 - a) * m[j]
-        w[i], w[j], alive[j] = total, 0.0, False
+        best = table[every, nearest]
+        # The first of the pairs that cost the same, so that rounding does not choose.
+        limit = best.min() + 1e-12 + 1e-9 * abs(best.min())
+        i = int(np.argmax(best <= limit))
+        j = int(np.argmax(table[i] <= limit))
+        _merge(w, m, p, i, j)
+        alive[j] = False
         table[j, :] = table[:, j] = np.inf
         dets[i] = np.linalg.slogdet(p[i])[1]
-        others = np.flatnonzero(alive)
-        others = others[others != i]
-        row = _costs(w, m, p, dets, i, others)
-        table[np.minimum(i, others), np.maximum(i, others)] = row
+        others = every[alive & (every != i)]
+        table[np.minimum(i, others), np.maximum(i, others)] = costs(w, m, p, dets, i, others)
+        # Only rows that lost their neighbour, and the merged one, are searched again.
+        lost = np.flatnonzero((nearest == i) | (nearest == j) | (every == i))
+        nearest[lost] = table[lost].argmin(axis=1)
+        nearest[table[:, i] < table[every, nearest]] = i
+    return alive
+
+
+def _merge(w: Array, m: Array, p: Array, i: int, j: int) -> None:
+    """Put j into i, keeping mean and covariance of the pair."""
+    total = w[i] + w[j]
+    a = w[i] / total if total > 0 else 0.5
+    gap = m[i] - m[j]
+    p[i] = a * p[i] + (1 - a) * p[j] + a * (1 - a) * np.outer(gap, gap)
+    m[i] = a * m[i] + (1 - a) * m[j]
+    w[i], w[j] = total, 0.0
 
 
 def _grouped(mixture: GaussianMixture, labels: NDArray[np.intp]) -> GaussianMixture:
@@ -334,4 +341,4 @@ def _grouped(mixture: GaussianMixture, labels: NDArray[np.intp]) -> GaussianMixt
     covs = np.zeros((groups, mixture.dim, mixture.dim))
     spread = mixture.covs + gap[:, :, None] * gap[:, None, :]
     np.add.at(covs, labels, share[:, None, None] * spread)
-    return trusted(w, means, symmetric(covs))
+    return GaussianMixture.unchecked(w, means, symmetrise(covs))

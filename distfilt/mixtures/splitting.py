@@ -1,20 +1,29 @@
-"""More mixands where a map bends: split along the direction that the map stretches most."""
+"""More mixands where a density bends: along the direction that a map stretches, along an arc."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from ..checks import Array, array, count, instance, number
-from .gaussian import GaussianMixture, symmetric, trusted
+from ..doors import Array, Bounds, Count, Positive, door, unchecked
+from ..linalg import symmetrise
+from .gaussian import GaussianMixture
 
-__all__ = ["split", "split_library", "stretching"]
+__all__ = ["arc", "split", "split_library", "split_stretched", "stretching"]
+
+Fraction = Annotated[float, Bounds(above=0, below=1)]
+
+_LIGHT = 1e-3
+"""Mixands lighter than this are not split."""
 
 
-def split_library(*, std: float = 0.7) -> tuple[Array, Array]:
+@door
+def split_library(*, std: Fraction = 0.7) -> tuple[Array, Array]:
     r"""Weights and means of three Gaussians of deviation `std` that stand for the standard normal.
 
     Mean 0 and variance 1 are kept: with weights a, 1 - 2a, a at -m, 0, m that is
@@ -36,7 +45,7 @@ def split_library(*, std: float = 0.7) -> tuple[Array, Array]:
     >>> round(float(w @ m**2 + 0.7**2), 12)
     1.0
     """
-    w, m = _library(number(std, "std", above=0, below=1))
+    w, m = _library(std)
     return w.copy(), m.copy()
 
 
@@ -58,8 +67,12 @@ def _library(std: float) -> tuple[Array, Array]:
     return parts(float(found.x))
 
 
+@door
 def stretching(
-    factors: ArrayLike, jacobians: ArrayLike, *, scale: ArrayLike | None = None
+    factors: Annotated[Array, "L d d"],
+    jacobians: Annotated[Array, "L m d"],
+    *,
+    scale: Annotated[Array, "m"] | None = None,
 ) -> tuple[Array, Array]:
     r"""How far a linearised map takes each mixand, and from where: first-order stretching.
 
@@ -90,21 +103,22 @@ def stretching(
     >>> np.abs(direction), length
     (array([[3., 0.]]), array([3.]))
     """
-    s = array(factors, "factors", ("L", "d", "d"))
-    g = array(jacobians, "jacobians", (s.shape[0], "m", s.shape[-1]))
-    if s.shape[-1] != s.shape[-2]:
-        raise ValueError(f"factors: needs square matrices, got shape {s.shape}")
     if scale is not None:
-        g = array(scale, "scale", (g.shape[1],))[:, None] * g
-    _, values, right = np.linalg.svd(g @ s)
+        jacobians = scale[:, None] * jacobians
+    _, values, right = np.linalg.svd(jacobians @ factors)
     first = right[:, 0]
     # A singular vector's sign is arbitrary: fix it, though a split does not see it.
     sign = np.sign(first[np.arange(first.shape[0]), np.abs(first).argmax(axis=1)])
-    return (s @ (sign[:, None] * first)[..., None])[..., 0], values[:, 0]
+    return (factors @ (sign[:, None] * first)[..., None])[..., 0], values[:, 0]
 
 
+@door
 def split(
-    mixture: GaussianMixture, which: ArrayLike, directions: ArrayLike, *, std: float = 0.7
+    mixture: GaussianMixture,
+    which: Annotated[NDArray[np.intp], "K", Bounds(at_least=0)],
+    directions: Annotated[Array, "K mixture.dim"],
+    *,
+    std: Fraction = 0.7,
 ) -> GaussianMixture:
     r"""Replace some mixands by three along a direction, keeping their mean and covariance.
 
@@ -128,25 +142,128 @@ def split(
     >>> three.size, three.moments()[1].round(12).tolist()
     (3, [[1.0, 0.0], [0.0, 1.0]])
     """
-    instance(mixture, "mixture", GaussianMixture)
-    array(which, "which")
-    at = np.array(
-        [count(i, "which", at_least=0) for i in np.atleast_1d(np.asarray(which)).tolist()],
-        dtype=np.intp,
-    )
-    if at.size and (at.max() >= mixture.size or np.unique(at).size != at.size):
-        raise ValueError(f"which: needs distinct indices below {mixture.size}, got {at.tolist()}")
-    u = array(directions, "directions", (at.size, mixture.dim))
-    length = np.linalg.solve(mixture.factors[at], u[..., None])[..., 0]
-    if at.size and np.abs((length**2).sum(axis=1) - 1).max() > 1e-6:
+    if (which >= mixture.size).any() or np.unique(which).size != which.size:
+        raise ValueError(
+            f"which: needs distinct indices below {mixture.size}, got {which.tolist()}"
+        )
+    white = np.linalg.solve(mixture.factors[which], directions[..., None])[..., 0]
+    if np.abs((white**2).sum(axis=1) - 1).max(initial=0.0) > 1e-6:
         raise ValueError("directions: needs one standard deviation, got another length")
-    w, m = _library(number(std, "std", above=0, below=1))
-    d = mixture.dim
-    means = mixture.means[at][:, None] + m[:, None] * u[:, None]
-    less = mixture.covs[at] - (1 - std**2) * u[:, :, None] * u[:, None, :]
-    stay = np.setdiff1d(np.arange(mixture.size), at)
-    return trusted(
-        np.concatenate([mixture.weights[stay], (mixture.weights[at][:, None] * w).ravel()]),
-        np.concatenate([mixture.means[stay], means.reshape(-1, d)]),
-        np.concatenate([mixture.covs[stay], np.repeat(symmetric(less), 3, axis=0)]),
+    w, m = _library(std)
+    means = mixture.means[which][:, None] + m[:, None] * directions[:, None]
+    less = mixture.covs[which] - (1 - std**2) * directions[:, :, None] * directions[:, None, :]
+    stay = np.setdiff1d(np.arange(mixture.size), which)
+    return GaussianMixture.unchecked(
+        np.concatenate([mixture.weights[stay], (mixture.weights[which][:, None] * w).ravel()]),
+        np.concatenate([mixture.means[stay], means.reshape(-1, mixture.dim)]),
+        np.concatenate([mixture.covs[stay], np.repeat(symmetrise(less), 3, axis=0)]),
     )
+
+
+@door
+def split_stretched(
+    mixture: GaussianMixture,
+    jacobian: Callable[[Array], Array],
+    *,
+    most: Count,
+    stretch: Positive,
+    scale: Annotated[Array, "m"] | None = None,
+) -> GaussianMixture:
+    """Split the mixands that a map stretches most in three, up to three times over.
+
+    Parameters
+    ----------
+    mixture : GaussianMixture
+    jacobian : callable
+        The map's derivatives (L, m, d), or one (m, d) for all, at means (L, d).
+    most : int
+        How many mixands there may be.
+    stretch : float
+        A mixand is split if its weight times its largest stretching is above this.
+    scale : array_like, (m,), optional
+        As of :func:`stretching`.
+
+    Examples
+    --------
+    >>> one = GaussianMixture.gaussian([0.0], [[1.0]])
+    >>> split_stretched(one, lambda x: 2 * np.ones((1, 1)), most=4, stretch=1.0).size
+    3
+    """
+    for _ in range(3):
+        room = (most - mixture.size) // 2
+        if room < 1:
+            break
+        slope = jacobian(mixture.means)
+        slope = np.broadcast_to(slope, (mixture.size, *np.shape(slope)[-2:]))
+        directions, lengths = unchecked(stretching)(mixture.factors, slope, scale=scale)
+        cost = np.where(mixture.weights > _LIGHT, mixture.weights * lengths, 0.0)
+        worst = np.argsort(-cost, kind="stable")[:room]
+        worst = worst[cost[worst] > stretch]
+        if not worst.size:
+            break
+        mixture = unchecked(split)(mixture, worst, directions[worst])
+    return mixture
+
+
+@door
+def arc(
+    mixands: Annotated[int, Bounds(at_least=2)],
+    agent: Annotated[Array, "2"],
+    *,
+    angle_std: Positive,
+    range_std: Positive,
+    ego_std: Positive,
+    width: Positive = 0.31,
+    span: Positive = 1.46,
+) -> GaussianMixture:
+    r"""What knows a distance well and a bearing badly: a belief about [target; ego], bent.
+
+    Both are in the plane, four components in all.
+
+    The agent aims at the origin from a distance R. Mixand k lies at the angle
+    :math:`\theta_k=\theta_0+\sigma_\theta s_k` with :math:`s_k` equally spaced in ± `span`,
+    weighs :math:`\propto e^{-s_k^2/2}`, and has the target at distance R, the ego position moved
+    half as far the other way. Within a mixand the errors are independent along the line of sight
+    (`range_std`) and across it (R, `width` and the spacing of the angles multiplied); the ego
+    position takes half of the error across, and has `ego_std` of its own in both directions.
+
+    Parameters
+    ----------
+    mixands : int
+        At least 2.
+    agent : array_like, (2,)
+        Where the agent stands, not at the origin.
+    angle_std : float
+        In rad, above 0.
+    range_std, ego_std : float
+        In the agent's units of length, above 0.
+    width, span : float
+        Without unit, above 0.
+
+    Returns
+    -------
+    GaussianMixture
+        Of dimension 4: target (2), ego (2).
+
+    Examples
+    --------
+    >>> bent = arc(5, [-10.0, 0.0], angle_std=0.6, range_std=0.4, ego_std=0.4)
+    >>> bent.means[2].round(6) + 0.0
+    array([  0.,   0., -10.,   0.])
+    """
+    r = float(np.hypot(*agent))
+    if r == 0:
+        raise ValueError("agent: needs a place apart from the origin, got the origin")
+    s = np.linspace(-1, 1, mixands) * span
+    theta = np.arctan2(-agent[1], -agent[0]) + angle_std * s
+    across = r * width * angle_std * (s[1] - s[0])
+    variances = np.array([range_std, across, ego_std, ego_std]) ** 2
+    u = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+    v = np.stack([-u[:, 1], u[:, 0]], axis=-1)
+    slope = np.zeros((mixands, 4, 4))
+    slope[:, :2, 0], slope[:, :2, 1] = u, v
+    slope[:, 2:, 1], slope[:, 2:, 2], slope[:, 2:, 3] = -0.5 * v, u, v
+    means = np.concatenate([agent + r * u, agent - 0.5 * r * (u + agent / r)], axis=-1)
+    w = np.exp(-0.5 * s**2)
+    covs = symmetrise((slope * variances) @ slope.mT)
+    return GaussianMixture(w / w.sum(), means, covs)

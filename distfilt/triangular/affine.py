@@ -11,30 +11,95 @@ minimiser of (12) over affine maps has this form with sample moments, so no solv
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import lru_cache
+from threading import Lock
+from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import NDArray
 
 from .. import ensembles
-from ..checks import Array, array, callable_, choice, count, covariance
-from ..linalg import _leading
-from ._conic import LIMIT, solve_component
-
-if TYPE_CHECKING:
-    from .composition import ConditionalMap
+from ..doors import Array, Count, Record, door, needed, unchecked
+from ..linalg import SolverError, leading
 
 __all__ = [  # fmt: skip
-    "AffineMap", "fit", "fit_convex", "from_moments", "from_rows", "gradient", "objective",
+    "AffineMap", "ConditionalMap", "compose", "fit", "fit_convex", "gradient", "objective",
 ]
+
+Seen = Annotated[Array, "... N M"]
+Members = Annotated[Array, "... N d"]
+Observed = Annotated[Array, "... M"]
+OwnSeen = Annotated[Array, "... self.observed"]
+OwnMembers = Annotated[Array, "... N self.dim"]
 
 _ROUNDING = 1e-13
 """Share of a variable's variance, or of its mean, that counts as rounding."""
 
 
+@runtime_checkable
+class ConditionalMap(Protocol):
+    """What a map offers: z = S(y, x), its inverse in x, the derivative's log-determinant.
+
+    Whatever has these three methods is one:
+
+    >>> class Shift:
+    ...     def __call__(self, y, x): return x - y
+    ...     def inverse(self, y, z): return z + y
+    ...     def log_det(self, y, x): return 0 * x[..., 0]
+    >>> import numpy as np
+    >>> compose(Shift(), np.array([[1.0], [2.0]]), [[3.0], [5.0]], [10.0])
+    array([[12.],
+           [13.]])
+    """
+
+    def __call__(self, y: Array, x: Array) -> Array:
+        """Reference samples of members."""
+
+    def inverse(self, y: Array, z: Array) -> Array:
+        """Members of reference samples."""
+
+    def log_det(self, y: Array, x: Array) -> Array:
+        """Log-determinant at each member."""
+
+
+@door
+def compose(map_: ConditionalMap, y: Seen, x: Members, observed: Observed) -> Array:
+    r"""The composed map (10) of Grange et al.: from joint samples to samples given the observation.
+
+    .. math:: \mathbf T(\mathbf y,\mathbf x)
+        = \mathbf S(\mathbf y^*,\cdot)^{-1}\circ\mathbf S(\mathbf y,\mathbf x)
+
+    Parameters
+    ----------
+    map_ : ConditionalMap
+        The x-block S of a triangular map.
+    y, x : array_like, (..., N, m) and (..., N, d)
+        Predicted observations, with noise, and members.
+    observed : array_like, (..., m)
+        What was observed, y*.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from distfilt.triangular import affine
+    >>> rng = np.random.default_rng(0)
+    >>> x = rng.standard_normal((400, 1))
+    >>> y = x + rng.standard_normal((400, 1))
+    >>> compose(affine.fit(y, x), y, x, [2.0]).mean().round(1)
+    np.float64(1.0)
+    """
+    return unchecked(map_.inverse)(observed, unchecked(map_.__call__)(y, x))
+
+
+def _lower_triangular(value: Array, name: str) -> None:
+    if np.triu(value, 1).any() or not (np.diagonal(value, axis1=-2, axis2=-1) > 0).all():
+        raise ValueError(f"{name}: needs lower triangular matrices with a positive diagonal")
+
+
 @dataclass(frozen=True, eq=False)
-class AffineMap:
+class AffineMap(Record):
     """The affine map S(y, x) that takes x given y to the standard normal.
 
     Parameters
@@ -57,67 +122,70 @@ class AffineMap:
     array([[2.]])
     """
 
-    observed_mean: Array
-    mean: Array
-    gain: Array
-    scale: Array
+    observed_mean: Annotated[Array, "... M"]
+    mean: Annotated[Array, "... d"]
+    gain: Annotated[Array, "... d M"]
+    scale: Annotated[Array, "... d d", _lower_triangular]
 
-    def __post_init__(self) -> None:
-        seen = array(self.observed_mean, "observed_mean", (..., "m"))
-        mean = array(self.mean, "mean", (..., "d"))
-        m, d = seen.shape[-1], mean.shape[-1]
-        gain = array(self.gain, "gain", (..., d, m))
-        scale = array(self.scale, "scale", (..., d, d))
-        for name, value in (
-            ("observed_mean", seen), ("mean", mean), ("gain", gain), ("scale", scale)
-        ):
-            object.__setattr__(self, name, value)
-        diagonal = np.diagonal(scale, axis1=-2, axis2=-1)
-        if np.triu(scale, 1).any() or not (diagonal > 0).all():
-            raise ValueError("scale: needs lower triangular matrices with a positive diagonal")
+    @property
+    def observed(self) -> int:
+        """Number m of observations."""
+        return int(self.observed_mean.shape[-1])
 
-    def _predicted(self, y: ArrayLike, members: Array) -> Array:
+    @property
+    def dim(self) -> int:
+        """Number d of components."""
+        return int(self.mean.shape[-1])
+
+    def _predicted(self, y: Array, members: Array) -> Array:
         """The regression of x on y, (..., N, d), which broadcasts with these members."""
-        seen = array(y, "y", (..., self.observed_mean.shape[-1]))
-        if seen.ndim == self.observed_mean.ndim:
-            seen = seen[..., None, :]
+        seen = y[..., None, :] if y.ndim == self.observed_mean.ndim else y
         centred = seen - self.observed_mean[..., None, :]
-        out = self.mean[..., None, :] + centred @ np.swapaxes(self.gain, -1, -2)
-        _leading(members.shape[:-1], out.shape[:-1], "y")
+        out = self.mean[..., None, :] + centred @ self.gain.mT
+        leading(members.shape[:-1], out.shape[:-1], "y")
         return np.asarray(out)
 
-    def __call__(self, y: ArrayLike, x: ArrayLike) -> Array:
+    @door
+    def __call__(self, y: OwnSeen, x: OwnMembers) -> Array:
         """Reference samples S(y, x), (..., N, d), of members y (..., N, m) and x (..., N, d)."""
-        members = array(x, "x", (..., "N", self.mean.shape[-1]))
-        left = np.swapaxes(members - self._predicted(y, members), -1, -2)
-        return np.swapaxes(np.linalg.solve(self.scale, left), -1, -2)
+        return np.asarray(np.linalg.solve(self.scale, (x - self._predicted(y, x)).mT).mT)
 
-    def inverse(self, y: ArrayLike, z: ArrayLike) -> Array:
+    @door
+    def inverse(self, y: OwnSeen, z: OwnMembers) -> Array:
         """Members x with S(y, x) = z, (..., N, d); `y` is (..., N, m), or (..., m) for all."""
-        reference = array(z, "z", (..., "N", self.mean.shape[-1]))
-        return self._predicted(y, reference) + reference @ np.swapaxes(self.scale, -1, -2)
+        return self._predicted(y, z) + z @ self.scale.mT
 
-    def log_det(self, y: ArrayLike, x: ArrayLike) -> Array:
+    @door
+    def log_det(self, y: OwnSeen, x: OwnMembers) -> Array:
         """Logarithm of the determinant of the map's derivative in x at each member, (..., N)."""
-        members = array(x, "x", (..., "N", self.mean.shape[-1]))
-        array(y, "y", (..., self.observed_mean.shape[-1]))
-        diagonal = np.diagonal(self.scale, axis1=-2, axis2=-1)
-        total = -np.log(diagonal).sum(axis=-1)
-        return np.asarray(np.broadcast_to(total[..., None], members.shape[:-1])).copy()
+        total = -np.log(np.diagonal(self.scale, axis1=-2, axis2=-1)).sum(axis=-1)
+        return np.broadcast_to(total[..., None], x.shape[:-1]).copy()
 
 
-def _samples(y: ArrayLike, x: ArrayLike) -> tuple[Array, Array]:
-    members = array(x, "x", (..., "N", "d"))
-    seen = array(y, "y", (*members.shape[:-1], "m"))
-    needed = seen.shape[-1] + members.shape[-1]
-    if members.shape[-2] <= needed:
-        raise ValueError(
-            f"x: needs more than {needed} members for {needed} variables, got {members.shape[-2]}"
-        )
-    return seen, members
+def joined(y: Array, x: Array) -> Array:
+    """The variables (y, x) of each member, (..., N, m + d)."""
+    if y.shape[:-1] != x.shape[:-1]:
+        raise ValueError(f"y: needs members {x.shape[:-1]} as x has them, got {y.shape[:-1]}")
+    return np.concatenate([y, x], axis=-1)
 
 
-def fit(y: ArrayLike, x: ArrayLike) -> AffineMap:
+def enough(y: Array, x: Array, members: int) -> Array:
+    """The variables joined, refused unless there are more members than variables."""
+    joint = joined(y, x)
+    if members <= joint.shape[-1]:
+        raise ValueError(f"x: needs more than {joint.shape[-1]} members for {joint.shape[-1]} "
+                         f"variables, got {members}")
+    return joint
+
+
+def refuse(wrong: NDArray[np.bool_], m: int, needs: str) -> None:
+    """An error if variables (..., m + d) are not what a fit needs, y blamed before x."""
+    if wrong.any():
+        raise ValueError(f"{'y' if wrong[..., :m].any() else 'x'}: needs {needs}")
+
+
+@door
+def fit(y: Seen, x: Members) -> AffineMap:
     """Fit the affine map to samples in closed form: the minimiser of (12).
 
     Parameters
@@ -135,109 +203,55 @@ def fit(y: ArrayLike, x: ArrayLike) -> AffineMap:
     >>> s.gain.round(1).ravel() + 0.0
     array([1., 0.])
     """
-    seen, members = _samples(y, x)
-    m = seen.shape[-1]
-    joint = np.concatenate([seen, members], axis=-1)
-    mean = ensembles.mean(joint)
+    joint = enough(y, x, x.shape[-2])
+    mean = unchecked(ensembles.mean)(joint)
     joint -= mean[..., None, :]
-    cov = np.swapaxes(joint, -1, -2) @ joint / joint.shape[-2]
-    return _from_moments(mean, cov, m)
+    return from_moments(mean, joint.mT @ joint / joint.shape[-2], y.shape[-1])
 
 
-def from_moments(mean: ArrayLike, cov: ArrayLike, m: int) -> AffineMap:
-    """The affine map of a Gaussian (y, x), or of samples with these moments (divided by N).
-
-    Parameters
-    ----------
-    mean : array_like, (..., m + d)
-        Mean of (y, x).
-    cov : array_like, (..., m + d, m + d)
-        Their covariance, symmetric and positive definite.
-    m : int
-        Number of observations, at least 0.
-
-    Examples
-    --------
-    >>> from_moments([0.0, 1.0], [[2.0, 1.0], [1.0, 1.0]], 1).gain
-    array([[0.5]])
-    """
-    centre = array(mean, "mean", (..., "D"))
-    joint = covariance(cov, "cov", centre.shape[-1], semidefinite=True)
-    joint = array(joint, "cov", (*centre.shape, centre.shape[-1]))
-    if count(m, "m", at_least=0) > centre.shape[-1]:
-        raise ValueError(f"m: needs at most {centre.shape[-1]} observations, got {m}")
-    return _from_moments(centre, joint, m)
-
-
-def _from_moments(centre: Array, joint: Array, m: int) -> AffineMap:
-    """`from_moments` of checked arguments."""
-    lower = _cholesky(joint, centre, m)
+def from_moments(mean: Array, cov: Array, m: int) -> AffineMap:
+    """The affine map of a Gaussian (y, x), or of samples with these moments (divided by N)."""
+    lower = _cholesky(cov, mean, m)
     # The factor of the joint covariance holds the map: its lower blocks are K L_yy and L.
-    across = np.swapaxes(lower[..., m:, :m], -1, -2)
-    gain = np.linalg.solve(np.swapaxes(lower[..., :m, :m], -1, -2), across)
-    return AffineMap(
-        centre[..., :m], centre[..., m:], np.swapaxes(gain, -1, -2), lower[..., m:, m:]
-    )
+    gain = np.linalg.solve(lower[..., :m, :m].mT, lower[..., m:, :m].mT)
+    return AffineMap.unchecked(mean[..., :m], mean[..., m:], gain.mT, lower[..., m:, m:])
 
 
-def from_rows(rows: ArrayLike, observed_mean: ArrayLike) -> AffineMap:
+def from_rows(u: Array, observed_mean: Array) -> AffineMap:
     """The affine map of the coefficients of (13), component by component.
 
-    Parameters
-    ----------
-    rows : array_like, (..., d, 1 + m + d)
-        Per component of the x-block: the constant, the coefficients of y and those of x, zero to
-        the right of the diagonal and positive on it.
-    observed_mean : array_like, (..., m)
-        The y about which the map is written; any will do.
-
-    Examples
-    --------
-    >>> from_rows([[-1.0, 0.0, 2.0]], [0.0]).inverse([5.0], [[1.0]])
-    array([[1.]])
+    Per component of the x-block, (..., d, 1 + m + d): the constant, the coefficients of y and those
+    of x, zero to the right of the diagonal and positive on it. The map is written about any y.
     """
-    ybar = array(observed_mean, "observed_mean", (..., "m"))
-    m = ybar.shape[-1]
-    u = array(rows, "rows", (*ybar.shape[:-1], "d", "D"))
-    d = u.shape[-2]
-    if u.shape[-1] != 1 + m + d:
-        raise ValueError(f"rows: needs {1 + m + d} columns for m = {m}, d = {d}, got {u.shape}")
-    upper = u[..., 1 + m :]
-    if not (np.diagonal(upper, axis1=-2, axis2=-1) > 0).all():
-        raise ValueError("rows: needs positive coefficients of each component's own variable")
-    scale = np.linalg.solve(upper, np.broadcast_to(np.eye(d), upper.shape))
-    gain = np.asarray(-np.linalg.solve(upper, u[..., 1 : 1 + m]), dtype=np.float64)
-    offset = -np.linalg.solve(upper, u[..., :1])[..., 0]
-    mean = offset + (gain @ ybar[..., None])[..., 0]
-    if np.triu(upper, 1).any():
-        raise ValueError("rows: needs zeros to the right of the diagonal")
-    return AffineMap(ybar, mean, gain, np.tril(scale))
+    upper = u[..., 1 + observed_mean.shape[-1] :]
+    solved = np.linalg.solve(upper, u[..., : 1 + observed_mean.shape[-1]])
+    gain = -solved[..., 1:]
+    mean = (gain @ observed_mean[..., None])[..., 0] - solved[..., 0]
+    scale = np.linalg.solve(upper, np.broadcast_to(np.eye(upper.shape[-1]), upper.shape))
+    return AffineMap.unchecked(observed_mean, mean, gain, np.tril(scale))
 
 
 def _cholesky(cov: Array, mean: Array, m: int) -> Array:
     """Factor of the joint covariance of (y, x); an error says which of them is to blame."""
+    needs = ("variables that are not constant and not combinations of others, "
+             "got a sample covariance that is not positive definite")
     variance = np.diagonal(cov, axis1=-2, axis2=-1)
     try:
-        lower = np.asarray(np.linalg.cholesky(cov), dtype=np.float64)
-        # Rounding may leave a repeated variable a tiny variance of its own.
-        left = np.diagonal(lower, axis1=-2, axis2=-1) ** 2
-        repeated = (left <= _ROUNDING * variance) | (variance <= (_ROUNDING * mean) ** 2)
-        if not repeated.any():
-            return lower
-        name = "y" if repeated[..., :m].any() else "x"
+        lower = np.asarray(np.linalg.cholesky(cov))
     except np.linalg.LinAlgError:
         try:
             np.linalg.cholesky(cov[..., :m, :m])
-            name = "x"
         except np.linalg.LinAlgError:
-            name = "y"
-    raise ValueError(
-        f"{name}: needs variables that are not constant and not combinations of others, "
-        f"got a sample covariance that is not positive definite"
-    )
+            raise ValueError(f"y: needs {needs}") from None
+        raise ValueError(f"x: needs {needs}") from None
+    # Rounding may leave a repeated variable a tiny variance of its own.
+    left = np.diagonal(lower, axis1=-2, axis2=-1) ** 2
+    refuse((left <= _ROUNDING * variance) | (variance <= (_ROUNDING * mean) ** 2), m, needs)
+    return lower
 
 
-def objective(map_: ConditionalMap, y: ArrayLike, x: ArrayLike) -> Array:
+@door
+def objective(map_: ConditionalMap, y: Seen, x: Members) -> Array:
     """The objective (12) of the x-block, summed over its components, (...).
 
     Up to a constant it is the negative mean log-likelihood of x given y under the map.
@@ -255,13 +269,12 @@ def objective(map_: ConditionalMap, y: ArrayLike, x: ArrayLike) -> Array:
     >>> float(objective(fit(np.empty((4, 0)), x), np.empty((4, 0)), x))
     0.5
     """
-    callable_(map_, "map_")
-    seen, members = _samples(y, x)
-    squares = 0.5 * (map_(seen, members) ** 2).sum(axis=-1)
-    return np.asarray((squares - map_.log_det(seen, members)).mean(axis=-1))
+    squares = 0.5 * (map_(y, x) ** 2).sum(axis=-1)
+    return np.asarray((squares - map_.log_det(y, x)).mean(axis=-1))
 
 
-def gradient(coefficients: ArrayLike, samples: ArrayLike) -> Array:
+@door
+def gradient(coefficients: Annotated[Array, "K"], samples: Annotated[Array, "n k"]) -> Array:
     r"""Gradient (k + 1,) of (12) for one affine component, the corrected equation (14).
 
     .. math:: \frac{\partial\mathcal L^k}{\partial u_l}
@@ -281,20 +294,18 @@ def gradient(coefficients: ArrayLike, samples: ArrayLike) -> Array:
     >>> gradient([0.0, 1.0], [[-1.0], [1.0]])
     array([0., 0.])
     """
-    z = array(samples, "samples", ("N", "k"))
-    if not len(z):
-        raise ValueError("samples: needs at least one, got none")
-    u = array(coefficients, "coefficients", (z.shape[1] + 1,))
-    if u[-1] <= 0:
-        raise ValueError(f"coefficients: needs a positive last entry, got {u[-1]:g}")
-    ones = np.column_stack([np.ones(len(z)), z])
-    out = np.asarray(ones.T @ (ones @ u) / len(z))
+    u, ones = coefficients, np.column_stack([np.ones(len(samples)), samples])
+    if len(u) != ones.shape[1] or u[-1] <= 0:
+        raise ValueError(f"coefficients: needs {ones.shape[1]} of them, the last positive, got {u}")
+    out = np.asarray(ones.T @ (ones @ u) / len(ones))
     out[-1] -= 1 / u[-1]
     return out
 
 
+@door
 def fit_convex(
-    y: ArrayLike, x: ArrayLike, *, solver: str = "ECOS", max_iters: int | None = None
+    y: Annotated[Array, "N M"], x: Annotated[Array, "N d"], *,
+    solver: Literal["ECOS", "CLARABEL"] = "ECOS", max_iters: Count | None = None,
 ) -> AffineMap:
     """Fit the affine map by the convex program (12), component by component, in cvxpy.
 
@@ -322,12 +333,46 @@ def fit_convex(
     >>> bool(abs(exact.scale - solved.scale).max() < 1e-4)
     True
     """
-    seen, members = _samples(y, x)
-    array(members, "x", ("N", "d"))
-    choice(solver, "solver", tuple(LIMIT))
-    m, d = seen.shape[-1], members.shape[-1]
-    joint = np.concatenate([seen, members], axis=-1)
-    rows = np.zeros((d, 1 + m + d))
-    for k in range(d):
-        rows[k, : m + k + 2] = solve_component(joint[:, : m + k + 1], solver, max_iters)
-    return from_rows(rows, ensembles.mean(seen))
+    joint, m = enough(y, x, len(x)), y.shape[-1]
+    rows = np.zeros((x.shape[-1], 1 + joint.shape[-1]))
+    for k in range(len(rows)):
+        rows[k, : m + k + 2] = _solved(joint[:, : m + k + 1], solver, max_iters)
+    return from_rows(rows, unchecked(ensembles.mean)(y))
+
+
+_LIMIT = {"ECOS": "max_iters", "CLARABEL": "max_iter"}
+"""The solvers, and what each calls its limit of iterations."""
+_SOLVING = Lock()
+"""A compiled program holds its last data: one thread at a time."""
+
+
+def _solved(z: Array, solver: str, max_iters: int | None) -> Array:
+    """Coefficients (u_0, u_1 … u_k) that minimise (12) for the last column of `z`."""
+    cp, (n, k) = needed("cvxpy", "maps"), z.shape
+    problem, root, u = _program(k)
+    limit = {} if max_iters is None else {_LIMIT[solver]: max_iters}
+    # What cvxpy would warn of, the status below tells, and it becomes an error.
+    with _SOLVING, warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        root.value = np.linalg.qr(np.column_stack([np.ones(n), z]) / np.sqrt(n), mode="r")
+        try:
+            problem.solve(solver=solver, warm_start=False, **limit)
+            status = problem.status
+        except cp.error.SolverError as error:
+            status = error
+        if status != cp.OPTIMAL:
+            raise SolverError(f"{solver}: component {k} of the map stopped with {status!r}")
+        return np.asarray(u.value, dtype=np.float64).copy()
+
+
+@lru_cache(maxsize=32)
+def _program(k: int) -> tuple[Any, Any, Any]:
+    """The program (12) of component k, compiled once, with the samples' triangular factor open.
+
+    The samples enter by |u_0 + Z u|² only, which their QR factor keeps.
+    """
+    cp = needed("cvxpy", "maps")
+
+    root, u = cp.Parameter((k + 1, k + 1)), cp.Variable(k + 1)
+    loss = cp.sum_squares(root @ u) / 2 - cp.log(u[k])
+    return cp.Problem(cp.Minimize(loss)), root, u

@@ -16,25 +16,31 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.special import ndtr
 
 from .. import ensembles
-from ..checks import Array, array, count, instance, number
-from ..linalg import _leading
-from ._convex import SINGULAR, best_coefficients
-from .inversion import _newton, invert
+from ..doors import Array, Bounds, Index, NonNegative, Record, door, unchecked
+from ..linalg import leading
+from .affine import Members, OwnMembers, OwnSeen, Seen, joined, refuse
+from .newton import SINGULAR, best_coefficients, invert
 
 __all__ = ["SeparableMap", "fit"]
 
 _ROOT = np.sqrt(2 * np.pi)
 
 
+def _increasing(slopes: tuple[Array, ...], name: str) -> None:
+    for k, a in enumerate(slopes):
+        if (a < 0).any() or not (a > 0).any(axis=-1).all():
+            raise ValueError(f"{name}: needs nonnegative coefficients, one of them positive, so "
+                             f"that the map increases, got {a.min():.6g} in component {k}")
+
+
 @dataclass(frozen=True, eq=False)
-class SeparableMap:
+class SeparableMap(Record):
     """The map S(y, x) that takes x given y to the standard normal, component by component.
 
     Variables are numbered through: the m observations, then the d components of the state.
@@ -64,37 +70,13 @@ class SeparableMap:
     array([[6.]])
     """
 
-    centre: Array
-    spread: Array
-    bumps: Array
-    steps: Array
-    uses: tuple[tuple[int, ...], ...]
-    weights: tuple[Array, ...]
-    slopes: tuple[Array, ...]
-
-    def __post_init__(self) -> None:
-        centre = array(self.centre, "centre", (..., "D"))
-        size, d = centre.shape[-1], len(instance(self.uses, "uses", tuple))
-        spread = array(self.spread, "spread", (..., size))
-        if not (spread > 0).all():
-            raise ValueError(f"spread: needs positive entries, got {spread.min():g}")
-        bumps = array(self.bumps, "bumps", (..., size, "p"))
-        steps = array(self.steps, "steps", (..., d, "q"))
-        p, q = bumps.shape[-1], steps.shape[-1]
-        _uses(self.uses, size - d, d)
-        parts: dict[str, Any] = {"centre": centre, "spread": spread, "bumps": bumps, "steps": steps}
-        own = (1 + q,) * d
-        earlier = tuple(1 + len(used) * (1 + p) for used in self.uses)
-        parts |= {n: _each(getattr(self, n), n, sizes)
-                  for n, sizes in (("weights", earlier), ("slopes", own))}
-        for name, value in parts.items():
-            object.__setattr__(self, name, value)
-        for k, slopes in enumerate(self.slopes):
-            if (slopes < 0).any() or not (slopes > 0).any(axis=-1).all():
-                raise ValueError(
-                    f"slopes: needs nonnegative coefficients, one of them positive, so that the "
-                    f"map increases, got {slopes.min():.6g} in component {k}"
-                )
+    centre: Annotated[Array, "... D"]
+    spread: Annotated[Array, "... D", Bounds(above=0)]
+    bumps: Annotated[Array, "... D P"]
+    steps: Annotated[Array, "... d Q"]
+    uses: tuple[tuple[Index, ...], ...]
+    weights: tuple[Annotated[Array, "..."], ...]
+    slopes: Annotated[tuple[Annotated[Array, "..."], ...], _increasing]
 
     @property
     def dim(self) -> int:
@@ -106,14 +88,11 @@ class SeparableMap:
         """Number m of observations."""
         return int(self.centre.shape[-1]) - self.dim
 
-    def _standard(self, y: ArrayLike, x: Array) -> Array:
+    def _standard(self, y: Array, x: Array) -> Array:
         """Standardised (y, x), (..., N, m + d); one y for all members is repeated."""
-        seen = array(y, "y", (..., self.observed))
-        if seen.ndim == self.centre.ndim:
-            seen = seen[..., None, :]
-        lead = _leading(x.shape[:-1], seen.shape[:-1], "y")
-        parts = [np.broadcast_to(v, (*lead, v.shape[-1])) for v in (seen, x)]
-        joint = np.concatenate(parts, axis=-1)
+        seen = y[..., None, :] if y.ndim == self.centre.ndim else y
+        lead = leading(x.shape[:-1], seen.shape[:-1], "y")
+        joint = np.concatenate([np.broadcast_to(v, (*lead, v.shape[-1])) for v in (seen, x)], -1)
         return np.asarray((joint - self.centre[..., None, :]) / self.spread[..., None, :])
 
     def _earlier(self, joint: Array, k: int) -> Array:
@@ -124,67 +103,47 @@ class SeparableMap:
 
     def _own(self, v: Array, k: int) -> tuple[Array, Array]:
         """The increasing part of component k and its slope, (..., N)."""
-        centres, widths = self.steps[..., k, None, :]
-        first, rest = self.slopes[k][..., :1], self.slopes[k][..., 1:, None]
-        u = (v[..., None] - centres) / widths
-        value = first * v + ((_ROOT * widths * ndtr(u)) @ rest)[..., 0]
-        return np.asarray(value), np.asarray(first + (np.exp(-0.5 * u**2) @ rest)[..., 0])
+        values, rates = _own_features(v, self.steps[..., k, :])
+        a = self.slopes[k][..., None]
+        return np.asarray((values @ a)[..., 0]), np.asarray((rates @ a)[..., 0])
 
     def _inverted(self, aim: Array, k: int) -> Array:
         """Where the increasing part of component k has the values `aim`, (..., N)."""
-
-        def own(v: Array) -> tuple[Array, Array]:
-            return self._own(v, k)
-
         first, rest = self.slopes[k][..., :1], self.slopes[k][..., 1:]
         if not (first > 1e-6).all():
-            return invert(own, aim, name="z")
+            return invert(lambda v: self._own(v, k), aim)
         # A line plus steps of known heights: its ends need no search.
         heights = _ROOT * self.steps[1][..., k, :] * rest
         low = (aim - heights.sum(axis=-1, keepdims=True)) / first
-        high = aim / first
-        return _newton(own, aim, low, high, 0.5 * (low + high))
+        return invert(lambda v: self._own(v, k), aim, low, aim / first)
 
-    def __call__(self, y: ArrayLike, x: ArrayLike) -> Array:
+    @door
+    def __call__(self, y: OwnSeen, x: OwnMembers) -> Array:
         """Reference samples S(y, x), (..., N, d), of members y (..., N, m) and x (..., N, d)."""
-        joint = self._standard(y, array(x, "x", (..., "N", self.dim)))
-        parts = [
-            self._earlier(joint, k) + self._own(joint[..., self.observed + k], k)[0]
-            for k in range(self.dim)
-        ]
-        return np.stack(parts, axis=-1)
+        joint, m = self._standard(y, x), self.observed
+        own = [self._own(joint[..., m + k], k)[0] for k in range(self.dim)]
+        return np.stack([self._earlier(joint, k) + v for k, v in enumerate(own)], axis=-1)
 
-    def inverse(self, y: ArrayLike, z: ArrayLike) -> Array:
+    @door
+    def inverse(self, y: OwnSeen, z: OwnMembers) -> Array:
         """Members x with S(y, x) = z, (..., N, d); `y` is (..., N, m), or (..., m) for all.
 
         Raises ValueError for a z outside the map's range, which is bounded where the slope's
         linear coefficient is zero.
         """
-        reference = array(z, "z", (..., "N", self.dim))
-        joint = self._standard(y, reference)
-        m = self.observed
+        joint, m = self._standard(y, z), self.observed
         for k in range(self.dim):
-            joint[..., m + k] = self._inverted(reference[..., k] - self._earlier(joint, k), k)
+            joint[..., m + k] = self._inverted(z[..., k] - self._earlier(joint, k), k)
         return joint[..., m:] * self.spread[..., None, m:] + self.centre[..., None, m:]
 
-    def log_det(self, y: ArrayLike, x: ArrayLike) -> Array:
+    @door
+    def log_det(self, y: OwnSeen, x: OwnMembers) -> Array:
         """Logarithm of the determinant of the map's derivative in x at each member, (..., N)."""
-        joint = self._standard(y, array(x, "x", (..., "N", self.dim)))
-        m = self.observed
+        joint, m = self._standard(y, x), self.observed
         total = -np.log(self.spread[..., m:]).sum(axis=-1)[..., None]
         for k in range(self.dim):
             total = total + np.log(self._own(joint[..., m + k], k)[1])
         return np.asarray(total)
-
-
-def _each(value: Sequence[Array], name: str, sizes: tuple[int, ...]) -> tuple[Array, ...]:
-    """A component's coefficients each, (..., size)."""
-    if not isinstance(value, tuple | list | np.ndarray) or getattr(value, "shape", 1) == ():
-        raise ValueError(f"{name}: needs a tuple of arrays, got {type(value).__name__}")
-    if len(value) != len(sizes):
-        raise ValueError(f"{name}: needs one array for each of {len(sizes)} components, "
-                         f"got {len(value)}")
-    return tuple(array(v, name, (..., n)) for v, n in zip(value, sizes, strict=True))
 
 
 def _earlier_features(v: Array, bumps: Array) -> Array:
@@ -207,9 +166,10 @@ def _own_features(v: Array, steps: Array) -> tuple[Array, Array]:
     )
 
 
+@door
 def fit(
-    y: ArrayLike, x: ArrayLike, *, order: int | tuple[int, int], regularisation: float = 0.0,
-    uses: Sequence[Collection[int]] | None = None, least_slope: float = 0.1,
+    y: Seen, x: Members, *, order: Index | tuple[Index, Index], regularisation: NonNegative = 0.0,
+    uses: Sequence[Collection[Index]] | None = None, least_slope: NonNegative = 0.1,
 ) -> SeparableMap:
     r"""Fit the separable map to samples: the minimiser of (12), regularised.
 
@@ -259,76 +219,50 @@ def fit(
     >>> bool(abs(s(x[:, :0], x) - u).mean() < 0.1)
     True
     """
-    members = array(x, "x", (..., "N", "d"))
-    seen = array(y, "y", (*members.shape[:-1], "m"))
-    m, d = seen.shape[-1], members.shape[-1]
-    p, q = (count(n, "order", at_least=0) for n in _pair(order))
-    penalty = number(regularisation, "regularisation", at_least=0)
-    floor = number(least_slope, "least_slope", at_least=0)
-    allowed = _uses([range(m + k) for k in range(d)] if uses is None else uses, m, d)
-    _enough(members, allowed, p, q, penalty)
-    joint, centre, spread = _standardised(np.concatenate([seen, members], axis=-1), m)
-    _independent(joint, allowed, m)
-    bumps, steps = _nodes(joint, p, m), _nodes(joint[..., m:], q, 0)
-    weights, slopes = [], []
-    for k, used in enumerate(allowed):
-        features = _earlier_features(joint[..., list(used)], bumps[..., list(used), :])
-        own = _own_features(joint[..., m + k], steps[..., k, :])
-        c, a = best_coefficients(features, *own, 1 + len(used), penalty, floor)
-        weights.append(c)
-        slopes.append(a)
-    return SeparableMap(centre, spread, bumps, steps, allowed, tuple(weights), tuple(slopes))
-
-
-def _pair(order: int | tuple[int, int]) -> tuple[int, int]:
-    if isinstance(order, tuple):
-        if len(order) != 2:
-            raise ValueError(f"order: needs an integer or two, got {order!r}")
-        return order
-    return order, order
-
-
-def _uses(uses: Sequence[Collection[int]], m: int, d: int) -> tuple[tuple[int, ...], ...]:
-    if len(instance(uses, "uses", Sequence)) != d:  # type: ignore[type-abstract]
-        raise ValueError(f"uses: needs one collection for each of {d} components, got {len(uses)}")
-    for k, used in enumerate(uses):
-        given = instance(used, "uses", Collection)  # type: ignore[type-abstract]
-        numbers = [count(v, "uses", at_least=0) for v in given]
-        if len(set(numbers)) < len(numbers) or (numbers and max(numbers) >= m + k):
-            raise ValueError(
-                f"uses: needs different variables below {m + k} for component {k}, got {numbers}"
-            )
-    return tuple(tuple(sorted(used)) for used in uses)
-
-
-def _enough(x: Array, uses: tuple[tuple[int, ...], ...], p: int, q: int, penalty: float) -> None:
-    """Refuse more free coefficients than members; penalised ones need none."""
-    most = max((len(used) for used in uses), default=0)
-    needed = 2 + most if penalty else 2 + q + most * (1 + p)
+    m, d = y.shape[-1], x.shape[-1]
+    p, q = (order, order) if isinstance(order, int) else order
+    allowed = _allowed([range(m + k) for k in range(d)] if uses is None else uses, m, d)
+    most = max(map(len, allowed))
+    needed = 2 + most if regularisation else 2 + q + most * (1 + p)
     if x.shape[-2] <= needed:
         raise ValueError(f"x: needs more than {needed} members for as many coefficients, "
                          f"got {x.shape[-2]}")
+    joint = joined(y, x)
+    centre = unchecked(ensembles.mean)(joint)
+    joint -= centre[..., None, :]
+    spread = np.sqrt((joint**2).mean(axis=-2))
+    refuse(spread <= 1e-13 * np.abs(centre), m, "variables that are not constant, got one")
+    joint /= spread[..., None, :]
+    _refuse_combinations(joint, allowed, m)
+    bumps, steps = _nodes(joint, p, m), _nodes(joint[..., m:], q, 0)
+    weights, slopes = [], []
+    for k, used in enumerate(allowed):
+        features = _earlier_features(joint[..., used], bumps[..., used, :])
+        own = _own_features(joint[..., m + k], steps[..., k, :])
+        c, a = best_coefficients(features, *own, 1 + len(used), regularisation, least_slope)
+        weights.append(c)
+        slopes.append(a)
+    return SeparableMap.unchecked(
+        centre, spread, bumps, steps, tuple(map(tuple, allowed)), tuple(weights), tuple(slopes))
 
 
-def _standardised(joint: Array, m: int) -> tuple[Array, Array, Array]:
-    centre = ensembles.mean(joint)
-    shifted = joint - centre[..., None, :]
-    spread = np.sqrt((shifted**2).mean(axis=-2))
-    constant = (spread <= 1e-13 * np.abs(centre)).any(axis=tuple(range(spread.ndim - 1)))
-    if constant.any():
-        k = int(np.argmax(constant))
-        raise ValueError(f"{'y' if k < m else 'x'}: needs variables that are not constant, "
-                         f"got one in column {k if k < m else k - m}")
-    return shifted / spread[..., None, :], centre, spread
+def _allowed(uses: Sequence[Collection[int]], m: int, d: int) -> list[list[int]]:
+    """Which earlier variables each component may use, in order."""
+    found = [sorted(set(used)) for used in uses]
+    if len(uses) != d or any(len(used) < len(given) or used[-1:] >= [m + k]
+                             for k, (used, given) in enumerate(zip(found, uses, strict=True))):
+        raise ValueError(f"uses: needs for each of {d} components different variables before its "
+                         f"own, the {m} observations first, got {uses}")
+    return found
 
 
-def _independent(joint: Array, uses: tuple[tuple[int, ...], ...], m: int) -> None:
+def _refuse_combinations(joint: Array, uses: list[list[int]], m: int) -> None:
     """Refuse variables that are combinations of others that the same component uses."""
-    cov = np.swapaxes(joint, -1, -2) @ joint / joint.shape[-2]
+    cov = joint.mT @ joint / joint.shape[-2]
 
-    def singular(used: Sequence[int]) -> bool:
-        part = cov[..., used, :][..., :, used]
-        return bool(len(used) and (np.linalg.eigvalsh(part)[..., 0] < SINGULAR).any())
+    def singular(used: list[int]) -> bool:
+        part = cov[..., used, :][..., used]
+        return bool(used and (np.linalg.eigvalsh(part)[..., 0] < SINGULAR).any())
 
     for k, used in enumerate(uses):
         if singular([*used, m + k]):
@@ -342,8 +276,6 @@ def _nodes(joint: Array, n: int, m: int) -> Array:
     levels = np.arange(1, 2 * n + 2) / (2 * (n + 1))
     found = np.moveaxis(np.quantile(joint, levels, axis=-2), 0, -1)
     widths = found[..., 2::2] - found[..., :-2:2]
-    if not (widths > 0).all():
-        k = int(np.argwhere(~(widths > 0))[0][-2])
-        raise ValueError(f"{'y' if k < m else 'x'}: needs quantiles that differ for its basis "
-                         f"functions, got many equal values in one variable")
+    needs = "quantiles that differ for its basis functions, got many equal values in one variable"
+    refuse(np.any(widths <= 0, axis=-1), m, needs)
     return np.stack([found[..., 1::2], widths])

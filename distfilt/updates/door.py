@@ -1,46 +1,60 @@
-"""The door of an update: its arguments are checked once, and loops go round it.
+"""The door of an update, and readings that are missing.
 
 Every update has the signature ``(ensemble, predicted, observed, noise, *, rng, …) -> ensemble``
 and is told four things: the forecast members (..., N, d); what each of them would observe without
 noise (..., N, m), on the branch of the observation where a reading wraps; the observation (..., m);
-and the covariance of its noise, (m, m) or (..., m, m).
+and the covariance of its noise, (m, m) or (..., m, m). Loops go round the door by
+:func:`distfilt.doors.unchecked`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial, wraps
-from typing import Any, Concatenate, ParamSpec, cast
+from inspect import signature
+from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..checks import Array, array, callable_, covariance, generator
-from ..linalg import _cholesky
+from ..doors import Array, Cov, Rng, door, unchecked
+from ..linalg import _cholesky as cholesky
 
-__all__ = ["Update", "joined", "stackable", "unchecked", "update"]
+__all__ = ["Update", "around", "perturbed", "stackable", "update", "with_missing"]
 
-P = ParamSpec("P")
+F = TypeVar("F", bound=Callable[..., Array])
 
 Update = Callable[..., Array]
 """``update(ensemble, predicted, observed, noise, *, rng) -> ensemble``"""
 
 
-def update(
-    function: Callable[Concatenate[Array, Array, Array, Array, P], Array]
-) -> Callable[Concatenate[ArrayLike, ArrayLike, ArrayLike, ArrayLike, P], Array]:
+def _several(ensemble: Array, name: str) -> None:
+    if ensemble.shape[-2] < 2:
+        raise ValueError(f"{name}: needs at least 2 members, got {ensemble.shape[-2]}")
+
+
+_KINDS = (
+    Annotated[Array, "... N d", _several],
+    Annotated[Array, "... N m"],
+    Annotated[Array, "... m"],
+    Annotated[Cov, "... m m"],
+)
+"""Of an update's first four arguments, whatever their own annotations say."""
+
+
+def update(function: F) -> F:
     """Let a function that computes an update check what it is given.
 
     Parameters
     ----------
     function : callable
         ``function(ensemble, predicted, observed, noise, *, rng, …)`` for float64 arrays that fit,
-        with a noise covariance for each ensemble or one for all.
+        with a noise covariance for each ensemble or one for all. The annotations of its options
+        are checked too, as :mod:`distfilt.doors` says.
 
     Returns
     -------
     callable
-        The same with checks; :func:`unchecked` gives the function back.
+        The same with checks; :func:`distfilt.doors.unchecked` gives the function back.
 
     Raises
     ------
@@ -57,46 +71,38 @@ def update(
     array([[2.],
            [3.]])
     """
-
-    callable_(function, "function")
+    if not hasattr(function, "__annotations__"):
+        raise ValueError(f"function: needs a function, got {type(function).__name__}")
+    names = list(signature(function).parameters)[:4]
+    function.__annotations__ |= dict(zip(names, _KINDS, strict=True)) | {"rng": Rng}
+    plan: Any = cast(Any, door(function)).plan
 
     @wraps(function)
-    def checked(
-        ensemble: ArrayLike, predicted: ArrayLike, observed: ArrayLike, noise: ArrayLike,
-        *args: P.args, **options: P.kwargs,
-    ) -> Array:
-        x = array(ensemble, "ensemble", (..., "N", "d"))
-        if x.shape[-2] < 2:
-            raise ValueError(f"ensemble: needs at least 2 members, got {x.shape[-2]}")
-        h = array(predicted, "predicted", (*x.shape[:-1], "m"))
-        m = h.shape[-1]
-        y = array(observed, "observed", (..., m))
-        if y.shape not in ((m,), (*x.shape[:-2], m)):
-            raise ValueError(f"observed: needs shape {(*x.shape[:-2], m)}, got {y.shape}")
-        if y.ndim < x.ndim - 1:
-            y = np.broadcast_to(y, (*x.shape[:-2], m))
-        r = covariance(noise, "noise", m)
-        runs, given = x.shape[:-2], r.shape[:-2]
-        fits = all(n in (1, k) for n, k in zip(given[::-1], runs[::-1], strict=False))
-        if len(given) > len(runs) or not fits:
-            raise ValueError(f"noise: needs leading axes {runs}, got {given}")
-        generator(options.get("rng"))
-        return function(x, h, y, r, *args, **options)
+    def checked(*args: Any, **options: Any) -> Array:
+        placed, named = plan.taken(args, options)
+        given = dict(zip(plan.row, placed, strict=False)) | named
+        return function(**given | _related(*((name, given[name]) for name in names)))
 
-    checked.unchecked = function  # type: ignore[attr-defined]
-    # The wrapper has named parameters, where the type knows places only.
-    return cast(Any, checked)  # type: ignore[no-any-return]
+    made: Any = checked
+    made.unchecked, made.plan, made.stacks = function, plan, True
+    return cast(F, made)
 
 
-def unchecked(update: Update) -> Update:
-    """The update without its checks, with the options that :func:`functools.partial` gave it.
+def _related(*four: tuple[str, Array]) -> dict[str, Array]:
+    """The arguments whose leading axes have to fit the ensemble's; the reading for each."""
+    lead = four[0][1].shape[:-2]
+    tails = {name: value.shape[-k:] for (name, value), k in zip(four, (2, 2, 1, 2), strict=True)}
+    for name, value in four[1:]:
+        own = value.shape[: value.ndim - len(tails[name])]
+        fits = all(n in (1, k) for n, k in zip(own[::-1], lead[::-1], strict=False))
+        if len(own) > len(lead) or not fits:
+            raise ValueError(f"{name}: needs leading axes {lead}, got {own}")
+    return {name: np.broadcast_to(value, (*lead, *tails[name])) for name, value in four[1:3]}
 
-    >>> unchecked(print) is print
-    True
-    """
-    if isinstance(update, partial):
-        return partial(unchecked(update.func), *update.args, **update.keywords)
-    return getattr(update, "unchecked", update)
+
+def says(update: Update, what: str) -> bool:
+    """What an update says of itself: that it ``stacks``, or takes missing readings ``whole``."""
+    return bool(getattr(update.func if isinstance(update, partial) else update, what, False))
 
 
 def stackable(update: Update) -> bool:
@@ -107,23 +113,114 @@ def stackable(update: Update) -> bool:
     >>> stackable(print)
     False
     """
-    if isinstance(update, partial):
-        return stackable(update.func)
-    return bool(getattr(update, "stacks", hasattr(update, "unchecked")))
+    return says(update, "stacks")
 
 
-def joined(wrapper: Callable[..., Array], inner: Update) -> Update:
-    """A wrapper's own door, as stackable as what it wraps.
+def around(inner: Update) -> Callable[[F], F]:
+    """The door of a wrapper, which says of itself what the update says that it wraps.
 
-    >>> stackable(joined(lambda x, h, y, r, *, rng: x, print))
+    >>> stackable(around(print)(lambda x, h, y, r, *, rng: x))
     False
     """
-    out = update(wrapper)
-    out.stacks = stackable(inner)  # type: ignore[attr-defined]
-    return out
+
+    def made(wrapper: F) -> F:
+        out: Any = update(wrapper)
+        out.stacks, out.whole = says(inner, "stacks"), says(inner, "whole")
+        return cast(F, out)
+
+    return made
 
 
-def perturbed(predicted: Array, noise: Array, rng: np.random.Generator) -> Array:
+def perturbed(predicted: Array, noise: Array, rng: Rng) -> Array:
     """Predictions with a draw of the noise each, (..., N, m)."""
-    root = _cholesky(noise)
+    root = cholesky(noise)
     return predicted + rng.standard_normal(predicted.shape) @ np.swapaxes(root, -1, -2)
+
+
+def with_missing(
+    update: Update, ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
+) -> Array:
+    """Apply an update where NaN marks a missing component; without any reading nothing moves.
+
+    Ensembles that miss the same components are updated together, so a batch costs one call for
+    each pattern.
+
+    Parameters
+    ----------
+    update : callable
+        ``update(ensemble, predicted, observed, noise, *, rng)``; its checks are left out.
+    ensemble : ndarray, (..., N, d)
+    predicted : ndarray, (..., N, m)
+        NaN for every member where a prediction does not exist; it is a missing reading too.
+    observed : ndarray, (..., m)
+        NaN where a component is missing.
+    noise : ndarray, (m, m) or (..., m, m)
+    rng : numpy.random.Generator
+
+    Examples
+    --------
+    >>> from distfilt.updates import exact_draws
+    >>> x = np.array([[-1.0], [0.0], [0.5], [0.5]])
+    >>> seen = np.concatenate([x, x], axis=1)
+    >>> after = with_missing(exact_draws, x, seen, np.array([1.0, np.nan]), 0.5 * np.eye(2),
+    ...                      rng=np.random.default_rng(0))
+    >>> float(after.mean().round(12))
+    0.5
+    """
+    inner = unchecked(update)
+    m = observed.shape[-1]
+    lead = observed.shape[:-1]
+    # What is drawn for an ensemble depends on its place and on how many readings it has, not on
+    # what others miss: each number of readings has a stream, which is drawn from for all places.
+    base = [int(b) for b in rng.integers(2**63, size=2)]
+    present, gone = ~np.isnan(observed), np.isnan(predicted)
+    if gone.any():
+        present = present & ~gone.any(axis=-2)
+    if present.all() or says(update, "whole"):
+        stream = _stream(rng, [*base, m], lead, None)
+        known = np.where(present, observed, np.nan)
+        return inner(ensemble, predicted, known, noise, rng=stream)
+    flat, aim = present.reshape(-1, m), observed.reshape(-1, m)
+    rows, seen = (a.reshape(-1, *a.shape[-2:]) for a in (ensemble, predicted))
+    cov = np.broadcast_to(noise, (*lead, m, m)).reshape(-1, m, m) if noise.ndim > 2 else noise
+    out = rows.copy()
+    for pattern in np.unique(flat, axis=0):
+        keep = np.flatnonzero(pattern)
+        if not keep.size:
+            continue
+        where = np.flatnonzero((flat == pattern).all(axis=1))
+        part = cov[np.ix_(where, keep, keep)] if cov.ndim > 2 else cov[np.ix_(keep, keep)]
+        stream = _stream(rng, [*base, keep.size], lead, where)
+        given = rows[where], seen[where][..., keep], aim[where][:, keep]
+        out[where] = inner(*given, part, rng=stream)
+    return np.asarray(out.reshape(ensemble.shape))
+
+
+def _stream(rng: Rng, seed: list[int], lead: tuple[int, ...], where: Any) -> Rng:
+    """A stream of draws for the rows `where` (all if None) of a batch."""
+    return rng.stream(seed, where) if isinstance(rng, Rows) else Rows(seed, lead, where)
+
+
+class Rows(Rng):
+    """Normal draws for all ensembles of a batch (*lead), of which those in `where` are asked for.
+
+    `where` counts them flat; None stands for all.
+    """
+
+    def __init__(self, seed: list[int], lead: tuple[int, ...], where: Any) -> None:
+        super().__init__(np.random.PCG64(np.random.SeedSequence(seed)))
+        self.lead, self.where = lead, where
+
+    def stream(self, seed: list[int], where: Any) -> Rows:
+        """Another stream for these ensembles, or for some of them: their places stay."""
+        if where is None:
+            return Rows(seed, self.lead, self.where)
+        return Rows(seed, self.lead, where if self.where is None else self.where[where])
+
+    def standard_normal(self, size: Any = None, *args: Any, **options: Any) -> Any:
+        """As numpy's, but of a batch's rows those that are asked for."""
+        if self.where is None or not np.iterable(size) or tuple(size)[:1] != self.where.shape:
+            return super().standard_normal(size, *args, **options)
+        rest = tuple(size)[1:]
+        drawn = super().standard_normal((*self.lead, *rest), *args, **options)
+        return drawn.reshape(-1, *rest)[self.where]

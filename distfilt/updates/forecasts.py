@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike
+from typing import Annotated
 
-from ..checks import Array, array, generator, instance, number
+import numpy as np
+
+from ..doors import Array, NonNegative, Rng, door, unchecked
 from ..ensembles import anomalies, exact_noise
 from ..models import Model
 
 __all__ = ["exact_forecast", "sampled_forecast"]
 
+Members = Annotated[Array, "... N model.dim"]
 
+
+@door
 def sampled_forecast(
-    ensemble: ArrayLike, model: Model, t: float, dt: float, *, rng: np.random.Generator
+    ensemble: Members, model: Model, t: float, dt: NonNegative, *, rng: Rng
 ) -> Array:
     """Move every member with the model and add an independent draw of the noise, (..., N, d).
 
@@ -32,13 +36,12 @@ def sampled_forecast(
     >>> sampled_forecast([[1.0], [2.0]], still, 0.0, 0.1, rng=np.random.default_rng(0)).ravel()
     array([1., 2.])
     """
-    x = array(ensemble, "ensemble", (..., "N", instance(model, "model", Model).dim))
-    now, length = number(t, "t"), number(dt, "dt", at_least=0)
-    return model._sample_step(x, now, length, generator(rng))
+    return unchecked(model.sample_step)(ensemble, t, dt, rng=rng)
 
 
+@door
 def exact_forecast(
-    ensemble: ArrayLike, model: Model, t: float, dt: float, *, rng: np.random.Generator
+    ensemble: Members, model: Model, t: float, dt: NonNegative, *, rng: Rng
 ) -> Array:
     r"""Move the members and add noise that is exact to second order.
 
@@ -59,13 +62,12 @@ def exact_forecast(
     >>> bool(abs(moved.mean()) < 1e-12), float(moved.var(ddof=1).round(12))
     (True, 1.0)
     """
-    x = array(ensemble, "ensemble", (..., "N", instance(model, "model", Model).dim))
-    moved = model.step(x, t, dt)
+    moved = unchecked(model.step)(ensemble, t, dt)
     q = model.noise(t, dt)
     if not q.any():
         return moved
     bad = ~np.isfinite(moved).all(axis=(-2, -1), keepdims=True)
-    clean = np.where(bad, x, moved)
-    noisy = clean + exact_noise(anomalies(clean), q, rng=generator(rng))
+    clean = np.where(bad, ensemble, moved)
+    noisy = clean + exact_noise(anomalies(clean), q, rng=rng)
     # Members that the model lost stay lost, and do not take the others' noise with them.
     return np.where(bad, np.nan, noisy)

@@ -11,11 +11,13 @@ What differs is what stands for R in the gain, and how the draws are made.
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from scipy.fft import dct
 from scipy.linalg.lapack import dposv
 
-from ..checks import Array, choice, number
+from ..doors import Array, Rng
 from ..ensembles import _mean, exact_noise
 from .door import perturbed, update
 
@@ -44,7 +46,7 @@ def _inner(b: Array) -> Array:
 
 @update
 def sampled_noise(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
 ) -> Array:
     r"""The ensemble Kalman filter's update with both covariances sampled, perturbations included.
 
@@ -91,8 +93,7 @@ def sampled_noise(
 
 @update
 def known_noise(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
-    shrinkage: float = 0.0, ridge: float = 0.0,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
 ) -> Array:
     r"""Update with R itself in the gain, where :func:`sampled_noise` has a sample covariance.
 
@@ -103,12 +104,6 @@ def known_noise(
     ----------
     ensemble, predicted, observed, noise, rng
         As in :func:`sampled_noise`; two members are enough.
-    shrinkage : float
-        Between 0 and 1: every sample correlation of two different variables is multiplied by one
-        minus it, which takes from the chance correlations of small ensembles.
-    ridge : float
-        At least 0: the diagonal of :math:`\hat{\mathbf C}_{hh}+\mathbf R` is multiplied by one plus
-        it.
 
     Examples
     --------
@@ -120,22 +115,13 @@ def known_noise(
     """
     drawn = perturbed(predicted, noise, rng)
     b = _centred(predicted)[1]
-    inner, factor = _inner(b), 1.0
-    if type(shrinkage) is not float or shrinkage != 0:  # a check costs more than a nought
-        # A component that is observed directly is correlated with its prediction by more than
-        # chance, and shrinks all the same: the update does not know which is which.
-        factor = 1 - number(shrinkage, "shrinkage", at_least=0, at_most=1)
-        inner = factor * inner + (1 - factor) * inner * np.eye(inner.shape[-1])
-    inner = inner + noise
-    if type(ridge) is not float or ridge != 0:
-        inner = inner * (1 + number(ridge, "ridge", at_least=0) * np.eye(inner.shape[-1]))
-    gain = factor * _gain(inner, _centred(ensemble)[1], b)
+    gain = _gain(_inner(b) + noise, _centred(ensemble)[1], b)
     return np.asarray(ensemble + (observed[..., None, :] - drawn) @ gain)
 
 
 @update
 def exact_draws(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
 ) -> Array:
     r"""Update with perturbations that are exact to second order.
 
@@ -167,8 +153,8 @@ def exact_draws(
 
 @update
 def square_root(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
-    rotation: str = "random",
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
+    rotation: Literal["random", "none"] = "random",
 ) -> Array:
     r"""Update mean and anomalies without perturbations, then turn the anomalies at random.
 
@@ -198,7 +184,6 @@ def square_root(
     >>> float(after.mean().round(12)), float(after.var(ddof=1).round(12))
     (1.0, 1.0)
     """
-    choice(rotation, "rotation", ("random", "none"))
     n = ensemble.shape[-2]
     (centre, a), (seen, b) = _centred(ensemble), _centred(predicted)
     gain = _gain(_inner(b) + noise, a, b)
@@ -212,7 +197,7 @@ def square_root(
     return np.asarray(centre + (observed[..., None, :] - seen) @ gain + spread)
 
 
-def _turned(spread: Array, rng: np.random.Generator) -> Array:
+def _turned(spread: Array, rng: Rng) -> Array:
     """Anomalies (..., N, d) after a random rotation of the members that keeps the vector of ones.
 
     Random signs and cosine transforms in turn, in the space of centred members: orthogonal to

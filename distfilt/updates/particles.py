@@ -1,73 +1,28 @@
-"""Weighted particles: weights from likelihoods, four ways to resample, and jitter."""
+"""Weighted particles: weights from likelihoods, three ways to resample, jitter, and collapse."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, choice, covariance, generator, number, weights
-from ..linalg import _cholesky, _solve_lower, factor
+from ..doors import Array, Bounds, Mask, Rng, Semidefinite, Weights, array, door
+from ..linalg import _cholesky as cholesky
+from ..linalg import _factor as factor
+from ..linalg import _solve_lower as solve_lower
 
-__all__ = ["RESAMPLING", "Particles", "effective_size", "jitter", "resample", "resampled"]
+__all__ = ["ParticleCollapse", "Resampling", "effective_size", "jitter", "resampled"]
 
 Indices = NDArray[np.intp]
-
-RESAMPLING = ("systematic", "stratified", "residual", "multinomial")
+Resampling = Literal["systematic", "stratified", "multinomial"]
 """The names of the rules by which :func:`resampled` draws."""
+Bandwidth = Annotated[float, Bounds(above=0, at_most=1)]
 
 
-@dataclass(frozen=True, eq=False)
-class Particles:
-    """Weighted members of a distribution.
-
-    Parameters
-    ----------
-    points : array_like, (..., N, d)
-    log_weights : array_like, (..., N)
-        Logarithms of the weights; they are normalised here, and -inf is a weight of zero.
-
-    Examples
-    --------
-    >>> cloud = Particles([[0.0], [4.0]], np.log([3.0, 1.0]))
-    >>> cloud.mean, cloud.covariance
-    (array([1.]), array([[3.]]))
-    """
-
-    points: Array
-    log_weights: Array
-
-    def __post_init__(self) -> None:
-        points = array(self.points, "points", (..., "N", "d"))
-        log_weights = _normalised(self.log_weights, points.shape[:-1])
-        object.__setattr__(self, "points", points)
-        object.__setattr__(self, "log_weights", log_weights)
-
-    @property
-    def weights(self) -> Array:
-        """The weights, (..., N); they sum to one."""
-        return np.asarray(np.exp(self.log_weights))
-
-    @property
-    def mean(self) -> Array:
-        """Weighted mean, (..., d)."""
-        return np.asarray((self.weights[..., None, :] @ self.points)[..., 0, :])
-
-    @property
-    def covariance(self) -> Array:
-        """Weighted covariance, (..., d, d)."""
-        around = self.points - self.mean[..., None, :]
-        return np.asarray(np.swapaxes(around, -1, -2) @ (self.weights[..., None] * around))
-
-
-def _normalised(log_weights: ArrayLike, shape: tuple[int, ...]) -> Array:
-    w = array(log_weights, "log_weights", shape, finite=False)
-    if np.isnan(w).any() or np.isposinf(w).any():
-        raise ValueError("log_weights: needs numbers below infinity, got NaN or infinity")
-    if np.isneginf(w.max(axis=-1)).any():
-        raise ValueError("log_weights: needs a positive weight in every set, got only zeros")
-    return w - _log_sum(w)
+class ParticleCollapse(RuntimeWarning):
+    """A belief rests on few members: the others are copies, or have no weight."""
 
 
 def effective_size(log_weights: ArrayLike) -> Array:
@@ -78,29 +33,46 @@ def effective_size(log_weights: ArrayLike) -> Array:
     Parameters
     ----------
     log_weights : array_like, (..., N)
-        Logarithms of weights, in any normalisation.
+        Logarithms of weights, in any normalisation; minus infinity is a weight of zero.
 
     Examples
     --------
     >>> float(effective_size(np.log([0.5, 0.25, 0.25])).round(4))
     2.6667
     """
-    w = array(log_weights, "log_weights", (..., "N"), finite=False)
-    if not w.shape[-1]:
-        raise ValueError(f"log_weights: needs at least one, got shape {w.shape}")
-    return _effective_size(_normalised(w, w.shape))
+    w = array(log_weights, "log_weights", (..., "n"), finite=False)
+    if not (w < np.inf).all() or np.isneginf(w.max(axis=-1)).any():
+        raise ValueError("log_weights: needs numbers below infinity, and a positive weight a set")
+    return size_of(np.exp(w - _log_sum(w)))
 
 
-def _effective_size(log_weights: Array) -> Array:
-    """As the public one, of normalised weights."""
-    return _size_of(np.exp(log_weights))
-
-
-def _size_of(w: Array) -> Array:
+def size_of(w: Array) -> Array:
+    """Effective sample size of normalised weights."""
     return np.asarray(1 / (w * w).sum(axis=-1))
 
 
-def _taken(points: Array, picked: Indices) -> Array:
+def warn_of_collapse(log_weights: Array, predicted: Array, observed: Array, noise: Array) -> None:
+    """Warn where one member has all the weight, or the reading is beyond what members believe."""
+    m = observed.shape[-1]
+    gap = observed - predicted.mean(axis=-2)
+    around = predicted - predicted.mean(axis=-2, keepdims=True)
+    cov = np.swapaxes(around, -1, -2) @ around / predicted.shape[-2] + noise
+    miss = (gap * np.linalg.solve(cov, gap[..., None])[..., 0]).sum(axis=-1).max(initial=0.0)
+    least = size_of(np.exp(log_weights - _log_sum(log_weights))).min(initial=np.inf)
+    if least < 1.1:
+        what = f"an ensemble's weights have an effective size of {least:.1f}"
+    elif miss > m + 10 * np.sqrt(2 * m):
+        what = f"a reading's squared distance from an ensemble's belief is {miss:.0f}, not {m}"
+    else:
+        return
+    warnings.warn(
+        f"{what}; more members, rejuvenation=, or more process noise keep its belief alive",
+        ParticleCollapse,
+        stacklevel=3,
+    )
+
+
+def taken(points: Array, picked: Indices) -> Array:
     """Rows of points (..., N, d) by their indices (..., N)."""
     n, d = points.shape[-2:]
     first = n * np.arange(picked.size // n)[:, None]
@@ -116,8 +88,9 @@ def _log_sum(logs: Array) -> Array:
         return np.asarray(most + np.log(np.exp(logs - most).sum(axis=-1, keepdims=True)))
 
 
+@door
 def resampled(
-    probabilities: ArrayLike, *, rng: np.random.Generator, rule: str = "systematic"
+    probabilities: Annotated[Weights, "... n"], *, rng: Rng, rule: Resampling = "systematic"
 ) -> Indices:
     """Draw N indices, each as often as its weight says on average.
 
@@ -126,15 +99,14 @@ def resampled(
     probabilities : array_like, (..., N)
         Weights that sum to one.
     rng : numpy.random.Generator
-    rule : {"systematic", "stratified", "residual", "multinomial"}
+    rule : {"systematic", "stratified", "multinomial"}
         One random number for all, so that an index appears within one of N times its weight; one
-        in each of N equal strata; the whole part of N times the weight for sure and the rest
-        systematically; or N independent draws, which vary most.
+        in each of N equal strata; or N independent draws, which vary most.
 
     Returns
     -------
     ndarray of int, (..., N)
-        Indices; in ascending order but for the rule ``"residual"``.
+        Indices, in ascending order.
 
     Notes
     -----
@@ -145,25 +117,17 @@ def resampled(
     >>> resampled([0.5, 0.0, 0.25, 0.25], rng=np.random.default_rng(0))
     array([0, 0, 2, 3])
     """
-    w = weights(probabilities, "probabilities")
-    return _resampled(w, generator(rng), choice(rule, "rule", RESAMPLING))
+    return picked_by(probabilities, levels_of(probabilities.shape, rng, rule), rule)
 
 
-def _resampled(w: Array, rng: np.random.Generator, rule: str) -> Indices:
-    return _picked(w, _levels(w.shape, rng, rule), rule)
-
-
-def _levels(shape: tuple[int, ...], rng: np.random.Generator, rule: str) -> Array:
+def levels_of(shape: tuple[int, ...], rng: Rng, rule: str) -> Array:
     """The random numbers that a rule needs; as many whatever the weights are."""
-    one = rule in ("systematic", "residual")
-    return rng.random((*shape[:-1], 1 if one else shape[-1]))
+    return rng.random((*shape[:-1], 1 if rule == "systematic" else shape[-1]))
 
 
-def _picked(w: Array, drawn: Array, rule: str) -> Indices:
-    """The indices of weights (..., N) that the random numbers of :func:`_levels` pick."""
+def picked_by(w: Array, drawn: Array, rule: str) -> Indices:
+    """The indices of weights (..., N) that the random numbers of :func:`levels_of` pick."""
     n = w.shape[-1]
-    if rule == "residual":
-        return _residual(w, drawn)
     if rule == "systematic":
         return _systematic(w, drawn)
     levels = (np.arange(n) + drawn) / n if rule == "stratified" else np.sort(drawn, axis=-1)
@@ -189,63 +153,22 @@ def _systematic(w: Array, offset: Array) -> Indices:
     below[..., -1] = n
     copies = below.copy()
     copies[..., 1:] -= below[..., :-1]
-    return _repeated(copies)
-
-
-def _repeated(copies: Indices) -> Indices:
-    """Each index of the last axis as often as its count says; N in all."""
-    n = copies.shape[-1]
     each = np.arange(n) if copies.size == n else np.tile(np.arange(n), copies.size // n)
     return np.repeat(each, copies.reshape(-1)).reshape(copies.shape)
 
 
-def _residual(w: Array, offset: Array) -> Indices:
-    n = w.shape[-1]
-    scaled = n * w
-    sure = np.floor(scaled + 1e-12 * n).astype(np.intp)
-    rest = np.clip(scaled - sure, 0.0, None)
-    left = n - sure.sum(axis=-1)
-    total = rest.sum(axis=-1, keepdims=True)
-    edges = np.cumsum(rest, axis=-1) / np.where(total > 0, total, 1.0)
-    below = np.clip(np.ceil(left[..., None] * edges - offset), 0, left[..., None]).astype(np.intp)
-    below[..., -1] = left
-    return _repeated(sure + np.diff(below, axis=-1, prepend=0))
-
-
-def resample(
-    particles: Particles, *, rng: np.random.Generator, rule: str = "systematic"
-) -> Particles:
-    """Replace weighted particles by equally weighted copies.
-
-    Parameters
-    ----------
-    particles, rng, rule
-        What to resample; the others as for :func:`resampled`.
-
-    Examples
-    --------
-    >>> cloud = Particles([[0.0], [4.0]], [0.0, -np.inf])
-    >>> resample(cloud, rng=np.random.default_rng(0)).points.ravel()
-    array([0., 0.])
-    """
-    if not isinstance(particles, Particles):
-        raise ValueError(f"particles: needs Particles, got {type(particles).__name__}")
-    w = particles.weights
-    picked = _resampled(w, generator(rng), choice(rule, "rule", RESAMPLING))
-    points = np.take_along_axis(particles.points, picked[..., None], axis=-2)
-    return Particles(points, np.zeros(w.shape))
-
-
+@door
 def jitter(
-    points: ArrayLike, *, rng: np.random.Generator, bandwidth: float | None = None,
-    cov: ArrayLike | None = None,
+    points: Annotated[Array, "... n d"], *, rng: Rng, bandwidth: Bandwidth | None = None,
+    cov: Semidefinite | None = None, copied: Annotated[Mask, "... n"] | None = None,
 ) -> Array:
     r"""Move equally weighted particles apart without moving their mean or covariance.
 
     .. math:: \mathbf x_i' = \bar{\mathbf x} + \sqrt{1-h^2}\,(\mathbf x_i-\bar{\mathbf x})
         + h\,\mathbf C^{1/2}\boldsymbol\xi_i
 
-    Copies of one particle separate, which a model without noise never does for them.
+    Copies of one particle separate, which a model without noise never does for them. Where it is
+    known which were `copied`, these alone move, by :math:`h\,\mathbf C^{1/2}\boldsymbol\xi_i`.
 
     Parameters
     ----------
@@ -258,6 +181,9 @@ def jitter(
         C; by default the particles' own. When one weight dominated before resampling the copies
         have none: pass the covariance of the unweighted particles.
 
+    copied : ndarray of bool, (..., N), optional
+        Which are copies, as :func:`copies` says: the others stay.
+
     Returns
     -------
     ndarray, (..., N, d)
@@ -265,7 +191,8 @@ def jitter(
 
     Notes
     -----
-    J. Liu, M. West, in: Sequential Monte Carlo Methods in Practice (2001) 197-223.
+    J. Liu, M. West, in: Sequential Monte Carlo Methods in Practice (2001) 197-223; C. Musso,
+    N. Oudjane, F. Le Gland, same book, 247-271, for copies alone.
 
     Examples
     --------
@@ -274,29 +201,40 @@ def jitter(
     >>> len(set(moved.ravel().tolist()))
     4
     """
-    x = array(points, "points", (..., "N", "d"))
-    n, d = x.shape[-2:]
-    if not n:
-        raise ValueError(f"points: needs at least one, got shape {x.shape}")
-    h = min(1.0, (4 / (n * (d + 2))) ** (1 / (d + 4)))
-    if bandwidth is not None:
-        h = number(bandwidth, "bandwidth", above=0, at_most=1)
+    n, d = points.shape[-2:]
+    h = silverman(n, d) if bandwidth is None else bandwidth
     if cov is None:
-        around = x - x.mean(axis=-2, keepdims=True)
-        c = np.swapaxes(around, -1, -2) @ around / n
-    else:
-        c = covariance(cov, "cov", d, semidefinite=True)
-    return _jittered(x, c, h, generator(rng).standard_normal(x.shape))
+        around = points - points.mean(axis=-2, keepdims=True)
+        cov = np.swapaxes(around, -1, -2) @ around / n
+    return jittered(points, cov, h, rng.standard_normal(points.shape), copied)
 
 
-def _jittered(x: Array, cov: Array, h: float, drawn: Array) -> Array:
-    centre = x.mean(axis=-2, keepdims=True)
+def silverman(n: int, d: int) -> float:
+    """The bandwidth for n particles of d components, at most one."""
+    return float(min(1.0, (4 / (n * (d + 2))) ** (1 / (d + 4))))
+
+
+def copies(picked: Indices) -> Mask:
+    """Which of the sorted indices (..., N) stand there more than once."""
+    out = np.zeros(picked.shape, dtype=bool)
+    same = picked[..., 1:] == picked[..., :-1]
+    out[..., 1:] |= same
+    out[..., :-1] |= same
+    return out
+
+
+def jittered(x: Array, cov: Array, h: float, drawn: Array, copied: Mask | None = None) -> Array:
+    """As :func:`jitter`, with standard normal draws."""
     moved = drawn @ np.swapaxes(factor(cov), -1, -2)
+    if copied is not None:
+        return np.asarray(np.where(copied[..., None], x + h * moved, x))
+    centre = x.mean(axis=-2, keepdims=True)
     return np.asarray(centre + np.sqrt(1 - h * h) * (x - centre) + h * moved)
 
-def _weighed(log_weights: Array, predicted: Array, observed: Array, noise: Array) -> Array:
+
+def weighed(log_weights: Array, predicted: Array, observed: Array, noise: Array) -> Array:
     """Log-weights (..., N), normalised, after a reading; refused where it rules out every point."""
-    joint = log_weights + _log_likelihood(predicted, observed, noise)
+    joint = log_weights + log_likelihood(predicted, observed, noise)
     total = _log_sum(joint)
     if not np.isfinite(total).all():
         raise ArithmeticError("every particle has a likelihood of zero")
@@ -304,7 +242,7 @@ def _weighed(log_weights: Array, predicted: Array, observed: Array, noise: Array
     return np.asarray(np.maximum(joint - total, -1e300))
 
 
-def _log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
+def log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
     """Log-likelihood of each particle's prediction (..., N, m) but for a constant, (..., N)."""
     # Components first: sums over a few of them then run along all particles.
     seen = np.ascontiguousarray(np.swapaxes(predicted, -1, -2))
@@ -318,11 +256,17 @@ def _log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
         cov = np.where(here, noise, np.eye(noise.shape[-1]))
         gap = np.where(missing[..., None], 0.0, gap)
     # One solve with all particles as right-hand sides: the factor is the same for them.
-    half = np.ascontiguousarray(_solve_lower(_cholesky(cov), gap))
+    half = np.ascontiguousarray(solve_lower(cholesky(cov), gap))
     return np.asarray(-0.5 * (half * half).sum(axis=-2))
 
 
-def _distinct(points: Array) -> Array:
+def distinct_share(points: Array) -> Array:
     """Share of particles that differ from all before them, (...)."""
     first = np.sort(points[..., 0], axis=-1)
     return np.asarray((1 + (first[..., 1:] > first[..., :-1]).sum(axis=-1)) / points.shape[-2])
+
+
+# The filters' names for these, until they use the ones above.
+RESAMPLING = ("systematic", "stratified", "multinomial")
+_distinct, _jittered, _levels, _picked = distinct_share, jittered, levels_of, picked_by
+_size_of, _taken, _weighed, _log_likelihood = size_of, taken, weighed, log_likelihood

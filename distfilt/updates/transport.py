@@ -1,36 +1,37 @@
-"""Updates by transport: from the joint ensemble of (y, x) to the conditional one of x given y*."""
+"""Updates by transport: maps of the joint ensemble of (y, x), and couplings of its weights."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..checks import Array, callable_, choice, count, number
-from ..ensembles import anomalies, cross_covariance, sample_covariance
+from .. import coupling
+from ..doors import Array, Bounds, Count, NonNegative, Rng, door, unchecked
+from ..ensembles import sample_covariance
 from ..triangular import ConditionalMap, affine, compose
 from .door import perturbed, update
+from .particles import log_likelihood, warn_of_collapse
 
-__all__ = [  # fmt: skip
-    "informed_directions", "principal_components", "principal_directions", "transport",
+__all__ = [
+    "ensemble_transform", "principal_components", "principal_directions", "transport",
     "transport_sample",
-]
+]  # fmt: skip
 
-
+Factor = Annotated[float, Bounds(at_least=0, at_most=1e100)]
 Fit = Callable[[Array, Array], ConditionalMap]
 """``fit(y, x) -> map``: an estimator of the map that takes the samples to the reference."""
 
 
-def _noisy(seen: Array, noise: Array, factor: float, rng: np.random.Generator) -> Array:
-    share = number(factor, "noise_factor", at_least=0, at_most=1e100)
-    return perturbed(seen, share**2 * noise, rng) if share else seen
+def _noisy(seen: Array, noise: Array, factor: float, rng: Rng) -> Array:
+    return perturbed(seen, factor**2 * noise, rng) if factor else seen
 
 
 @update
 def transport(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
-    fit: Fit = affine.fit, noise_factor: float = 1.0,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
+    fit: Fit = affine.fit, noise_factor: Factor = 1.0,
 ) -> Array:
     """Condition an ensemble with a composed map, equations (10)-(13) of Grange et al.
 
@@ -57,14 +58,13 @@ def transport(
     >>> posterior.mean().round(1), posterior.var().round(1)
     (np.float64(0.5), np.float64(0.5))
     """
-    callable_(fit, "fit")
     seen = _noisy(predicted, noise, noise_factor, rng)
     return compose(fit(seen, ensemble), seen, ensemble, observed)
 
 
 @update
 def transport_sample(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
     fit: Fit = affine.fit,
 ) -> Array:
     r"""Draw a new ensemble from the conditional by the inverse map alone, equation (9).
@@ -88,13 +88,13 @@ def transport_sample(
     >>> posterior.mean().round(1), posterior.var().round(1)
     (np.float64(0.5), np.float64(0.5))
     """
-    callable_(fit, "fit")
     seen = perturbed(predicted, noise, rng)
     reference = rng.standard_normal(ensemble.shape)
     return fit(seen, ensemble).inverse(observed, reference)
 
 
-def principal_directions(ensemble: ArrayLike, n: int) -> Array:
+@door
+def principal_directions(ensemble: Annotated[Array, "... N d"], n: Count) -> Array:
     """The `n` orthonormal directions of largest sample variance, as columns.
 
     Parameters
@@ -112,7 +112,7 @@ def principal_directions(ensemble: ArrayLike, n: int) -> Array:
     cov = sample_covariance(ensemble)
     if not np.isfinite(cov).all():
         raise ValueError("ensemble: needs members of finite variance, got infinity")
-    if count(n, "n") > cov.shape[-1]:
+    if n > cov.shape[-1]:
         raise ValueError(f"n: needs at most {cov.shape[-1]} directions, got {n}")
     _, vectors = np.linalg.eigh(cov)
     chosen = vectors[..., ::-1][..., :n]
@@ -122,8 +122,9 @@ def principal_directions(ensemble: ArrayLike, n: int) -> Array:
 
 @update
 def principal_components(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
-    n_state: int, n_observed: int, complement: str = "keep", noise_factor: float = 1.0,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
+    n_state: Count, n_observed: Count, complement: Literal["keep", "literal"] = "keep",
+    noise_factor: Factor = 1.0,
     fit: Fit = affine.fit,
 ) -> Array:
     r"""Condition in the leading principal directions only, Algorithm 2 of Grange et al.
@@ -137,10 +138,9 @@ def principal_components(
     n_observed : int
         Directions :math:`q_y` of the observations that are used; where there are fewer
         observations, all of them.
-    complement : {"keep", "drop", "literal"}
+    complement : {"keep", "literal"}
         What happens to the state outside the leading directions. ``"keep"`` leaves it as it was.
-        ``"drop"`` sets it to the mean. ``"literal"`` is line 8 as printed, which maps uncentred
-        states and so also drops the mean there.
+        ``"literal"`` is line 8 as printed, which loses it, and the mean there too.
 
     Examples
     --------
@@ -152,69 +152,75 @@ def principal_components(
     >>> post.var(axis=0).round(1)
     array([0.8, 1. ])
     """
-    choice(complement, "complement", ("keep", "drop", "literal"))
-    callable_(fit, "fit")
     seen = _noisy(predicted, noise, noise_factor, rng)
     m, d = seen.shape[-1], ensemble.shape[-1]
-    if count(n_state, "n_state") > d:
+    if n_state > d:
         raise ValueError(f"n_state: needs at most {d} directions, got {n_state}")
-    v = principal_directions(seen, min(count(n_observed, "n_observed"), m))
-    w = principal_directions(ensemble, n_state)
+    v = unchecked(principal_directions)(seen, min(n_observed, m))
+    w = unchecked(principal_directions)(ensemble, n_state)
     latent, reduced = ensemble @ w, seen @ v
     aim = (observed[..., None, :] @ v)[..., 0, :]
     moved = compose(fit(reduced, latent), reduced, latent, aim)
     back = np.swapaxes(w, -1, -2)
     if complement == "literal":
         return np.asarray(moved @ back)
-    if complement == "keep":
-        return np.asarray(ensemble + (moved - latent) @ back)
-    spread = anomalies(ensemble)
-    rest = spread - (spread @ w) @ back
-    return np.asarray(ensemble - rest + (moved - latent) @ back)
+    return np.asarray(ensemble + (moved - latent) @ back)
 
 
 @update
-def informed_directions(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: np.random.Generator,
-    threshold: float = 0.05,
+def ensemble_transform(
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
+    correct: bool = False, rejuvenation: NonNegative = 0.0,
 ) -> Array:
-    r"""Condition only on the directions of the observation in which signal stands above noise.
+    r"""Weigh the members by their likelihoods and transport the weights to equal ones, (3)-(5).
 
-    With the noise whitened, the predictions have the covariance
-    :math:`\mathbf R^{-1/2}\hat{\mathbf C}_{hh}\mathbf R^{-\top/2}`. Its eigenvalues are
-    signal-to-noise ratios; directions below the threshold are left out of the gain of
-    :func:`~distfilt.updates.known_noise`. Unlike principal components, they do not depend on
-    units.
+    Reich's ensemble transform particle filter: nothing is Gaussian but the noise of the reading,
+    and nothing is drawn.
 
     Parameters
     ----------
-    ensemble, predicted, observed, noise, rng
-        As in :func:`transport`; two members are enough.
-    threshold : float
-        Smallest signal-to-noise ratio τ that counts, at least 0; 0 leaves nothing out.
+    ensemble : array_like, (..., N, d)
+        Forecast members.
+    predicted : array_like, (..., N, m)
+        What they would observe, without noise.
+    observed : array_like, (..., m)
+        The observation y*.
+    noise : array_like, (m, m) or (..., m, m)
+        Its covariance.
+    rng : numpy.random.Generator
+        Used for `rejuvenation` only.
+    correct : bool
+        Give the members the weighted covariance too.
+    rejuvenation : float
+        h of :func:`distfilt.coupling.rejuvenated`; 0 draws nothing.
+
+    Returns
+    -------
+    ndarray, (..., N, d)
+        The mean is the weighted mean to rounding.
+
+    Warns
+    -----
+    ParticleCollapse
+        If one member has nearly all the weight, so that the others become its copies, or the
+        reading is far beyond the spread that is left of the members.
+
+    Raises
+    ------
+    SolverError
+        If a linear programme is not solved.
 
     Examples
     --------
-    The second component is seen, but hardly varies against the noise: one direction is used.
-
     >>> rng = np.random.default_rng(3)
-    >>> prior = rng.standard_normal((1000, 2)) * [1.0, 0.01]
-    >>> after = informed_directions(prior, prior, [1.0, 1.0], np.eye(2), rng=rng)
-    >>> int(np.linalg.matrix_rank(after - prior, tol=1e-9)), after[:, 0].var().round(1)
-    (1, np.float64(0.5))
+    >>> prior = rng.standard_normal((400, 1))
+    >>> posterior = ensemble_transform(prior, prior, [1.0], [[1.0]], rng=rng)
+    >>> posterior.mean().round(1), posterior.var().round(1)
+    (np.float64(0.5), np.float64(0.5))
     """
-    least = number(threshold, "threshold", at_least=0)
-    drawn = perturbed(predicted, noise, rng)
-    root = np.linalg.cholesky(noise)
-
-    def whitened(v: Array) -> Array:
-        return np.asarray(np.swapaxes(np.linalg.solve(root, np.swapaxes(v, -1, -2)), -1, -2))
-
-    signal = whitened(predicted)
-    values, vectors = np.linalg.eigh(sample_covariance(signal))
-    kept = np.where(values >= least, 1 / (1 + np.maximum(values, 0.0)), 0.0)
-    if not np.isfinite(values).all():
-        raise ValueError("predicted: needs predictions of finite variance, got infinity")
-    cross = cross_covariance(ensemble, signal) @ vectors
-    innovation = whitened(observed[..., None, :] - drawn) @ vectors
-    return np.asarray(ensemble + (innovation * kept[..., None, :]) @ np.swapaxes(cross, -1, -2))
+    logs = log_likelihood(predicted, observed, noise)
+    warn_of_collapse(logs, predicted, observed, noise)
+    out = unchecked(coupling.ensemble_transform)(ensemble, logs, correct=correct)
+    if not rejuvenation:
+        return out
+    return unchecked(coupling.rejuvenated)(out, ensemble, bandwidth=rejuvenation, rng=rng)

@@ -1,29 +1,50 @@
 """Wrappers: what can be put around any update, one round another.
 
-``inflated(gated(known_noise), factor=1.02)`` is an update like any other.
+``inflated(gated(known_noise), factor=1.02)`` is an update like any other, and so is
+``projected(augmented(ensemble_transform, g, std=0.1), g)``, Das and Bhattacharya's OTNLeqMA.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
 from scipy.special import ndtri
 
-from ..checks import Array, callable_, number
-from .door import Update, joined, unchecked
-from .missing import Rows, with_missing
+from .. import coupling
+from ..coupling import Constraint
+from ..doors import Array, Bounds, NonNegative, Positive, Rng, door, unchecked
+from .door import Update, around, with_missing
 
-__all__ = ["centred", "gated", "inflated", "serial"]
+__all__ = [
+    "augmented", "gated", "inflated", "localised", "projected", "retracted", "serial",
+]  # fmt: skip
 
 Indices = NDArray[np.intp]
+Motion = tuple[Sequence[int], Sequence[int]]
+"""Indices of positions and of their velocities, in the same order."""
+_Open = Annotated[float, Bounds(above=0, below=1)]
 
 
-def inflated(update: Update, *, factor: float) -> Update:
+def _followed(update: Update, change: Callable[[Array], Array]) -> Update:
+    """An update, and then what `change` makes of its members."""
+    inner = unchecked(update)
+
+    @around(update)
+    def both(
+        ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
+    ) -> Array:
+        return change(inner(ensemble, predicted, observed, noise, rng=rng))
+
+    return both
+
+
+@door
+def inflated(update: Update, *, factor: Positive) -> Update:
     """Multiply the analysis anomalies by a factor: the remedy for a spread that is too small.
 
     Parameters
@@ -43,18 +64,130 @@ def inflated(update: Update, *, factor: float) -> Update:
     >>> float(wider(x, x, [1.0], [[0.5]], rng=np.random.default_rng(0)).var(ddof=1).round(12))
     1.0
     """
-    inner = unchecked(callable_(update, "update"))
-    by = number(factor, "factor", above=0)
 
-    def inflate(x: Array, h: Array, y: Array, r: Array, *, rng: np.random.Generator) -> Array:
-        after = inner(x, h, y, r, rng=rng)
+    def inflate(after: Array) -> Array:
         centre = after.mean(axis=-2, keepdims=True)
-        return np.asarray(centre + by * (after - centre))
+        return np.asarray(centre + factor * (after - centre))
 
-    return joined(inflate, update)
+    return _followed(update, inflate)
 
 
-def gated(update: Update, *, probability: float = 0.999) -> Update:
+@door
+def projected(
+    update: Update, constraint: Constraint, *,
+    reading: Literal["printed", "reversed", "particle", "shift"] = "shift",
+    regularisation: NonNegative = 1e-6,
+) -> Update:
+    """Project the analysis members by regression, equations (6)-(12), and go on from them.
+
+    Parameters
+    ----------
+    update : callable
+        Any update.
+    constraint, reading, regularisation
+        As for :func:`distfilt.coupling.project`.
+
+    Returns
+    -------
+    callable
+        An update; round :func:`ensemble_transform` it is OTNLeq. OTProj projects what is reported
+        only: call :func:`distfilt.coupling.project` on recorded members.
+
+    Examples
+    --------
+    >>> from distfilt.coupling import norm
+    >>> from distfilt.updates import square_root
+    >>> x = 1.3 * np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
+    >>> on = projected(square_root, norm([0, 1]))
+    >>> after = on(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
+    >>> bool(abs((after**2).sum(axis=1).mean() - 1) < abs((x**2).sum(axis=1).mean() - 1) / 3)
+    True
+    """
+    project = unchecked(coupling.project)
+    return _followed(
+        update, lambda x: project(x, constraint, reading=reading, regularisation=regularisation)
+    )
+
+
+@door
+def retracted(
+    update: Update, constraint: Constraint, *, motion: Motion | None = None
+) -> Update:
+    """Put every analysis member on the constraint by itself.
+
+    Parameters
+    ----------
+    update : callable
+        Any update.
+    constraint, motion
+        As for :func:`distfilt.coupling.retract`; with `motion` the velocities become tangent.
+
+    Returns
+    -------
+    callable
+        An update whose members obey the constraint to rounding. Their mean does not: a point
+        estimate has to be retracted too.
+
+    Examples
+    --------
+    >>> from distfilt.coupling import norm
+    >>> from distfilt.updates import square_root
+    >>> x = 1.3 * np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
+    >>> on = retracted(square_root, norm([0, 1]))
+    >>> after = on(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
+    >>> bool(abs((after**2).sum(axis=1) - 1).max() < 1e-14)
+    True
+    """
+    retract = unchecked(coupling.retract)
+    return _followed(update, lambda x: retract(x, constraint, motion=motion))
+
+
+@door
+def augmented(update: Update, constraint: Constraint, *, std: Positive) -> Update:
+    r"""Observe the constraint too, as a reading that is nearly perfect, equation (13).
+
+    Parameters
+    ----------
+    update : callable
+        Any update.
+    constraint : Constraint
+        :math:`\mathbf g(\mathbf x)=\mathbf d`.
+    std : float
+        Standard deviation of the pretended noise, in the units of g, positive.
+
+    Returns
+    -------
+    callable
+        An update; round :func:`ensemble_transform` it is OTMA.
+
+    Examples
+    --------
+    >>> from distfilt.coupling import norm
+    >>> from distfilt.updates import square_root
+    >>> x = 1.3 * np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
+    >>> knows = augmented(square_root, norm([0, 1]), std=0.01)
+    >>> after = knows(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
+    >>> bool(abs((after**2).sum(axis=1) - 1).mean() < abs((x**2).sum(axis=1) - 1).mean() / 5)
+    True
+    """
+    inner, g = unchecked(update), unchecked(constraint.residual)
+
+    @around(update)
+    def augment(
+        ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
+    ) -> Array:
+        m, s = predicted.shape[-1], constraint.value.size
+        seen = np.concatenate([predicted, g(ensemble) + constraint.value], axis=-1)
+        target = np.broadcast_to(constraint.value, (*observed.shape[:-1], s))
+        both = np.zeros((*noise.shape[:-2], m + s, m + s))
+        both[..., :m, :m], both[..., m:, m:] = noise, std**2 * np.eye(s)
+        return inner(ensemble, seen, np.concatenate([observed, target], axis=-1), both, rng=rng)
+
+    return augment
+
+
+@door
+def gated(update: Update, *, probability: _Open = 0.999) -> Update:
     r"""Leave out readings whose innovation is too large to believe; with none left, nothing moves.
 
     A component passes where :math:`(y^*-\bar h)^2 \le q^2(\hat C_{hh}+R)`, each judged alone, with
@@ -73,66 +206,21 @@ def gated(update: Update, *, probability: float = 0.999) -> Update:
     >>> bool((careful(x, x, [90.0], [[0.5]], rng=np.random.default_rng(0)) == x).all())
     True
     """
-    callable_(update, "update")
-    share = number(probability, "probability", above=0, below=1)
-    width = float(ndtri(0.5 + 0.5 * share))
+    width = float(ndtri(0.5 + 0.5 * probability))
 
-    def gate(x: Array, h: Array, y: Array, r: Array, *, rng: np.random.Generator) -> Array:
-        variance = h.var(axis=-2, ddof=1) + np.diagonal(r, axis1=-2, axis2=-1)
-        passes = (y - h.mean(axis=-2)) ** 2 <= width**2 * variance
-        return with_missing(update, x, h, np.where(passes, y, np.nan), r, rng=rng)
+    @around(update)
+    def gate(
+        ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
+    ) -> Array:
+        variance = predicted.var(axis=-2, ddof=1) + np.diagonal(noise, axis1=-2, axis2=-1)
+        passes = (observed - predicted.mean(axis=-2)) ** 2 <= width**2 * variance
+        kept = np.where(passes, observed, np.nan)
+        return with_missing(update, ensemble, predicted, kept, noise, rng=rng)
 
-    return joined(gate, update)
-
-
-class _Centred(np.random.Generator):
-    """A generator whose normal draws have mean zero over the members and keep their variance."""
-
-    def __init__(self, source: np.random.Generator) -> None:
-        super().__init__(source.bit_generator)
-        self.source = source
-
-    def stream(self, seed: list[int], where: Any) -> _Centred:
-        """What the wrapped update's own wrappers draw from, centred too."""
-        maker = getattr(self.source, "stream", None)
-        return _Centred(Rows(seed, (), None) if maker is None else maker(seed, where))
-
-    def standard_normal(self, size: Any = None, *args: Any, **options: Any) -> Any:
-        """As the source's, centred along the last axis but one."""
-        drawn = self.source.standard_normal(size, *args, **options)
-        if np.ndim(drawn) < 2 or drawn.shape[-2] < 2:
-            return drawn
-        n = drawn.shape[-2]
-        return (drawn - drawn.mean(axis=-2, keepdims=True)) * np.sqrt(n / (n - 1))
+    return gate
 
 
-def centred(update: Update) -> Update:
-    """Let an update draw its perturbations with mean zero over the members.
-
-    The mean of the analysis is then free of the draws. :func:`~distfilt.updates.exact_draws` goes
-    further and costs a factorisation.
-
-    Parameters
-    ----------
-    update : callable
-        An update that perturbs by ``rng.standard_normal((..., N, m))``, as all of this package do.
-
-    Examples
-    --------
-    >>> from distfilt.updates import known_noise
-    >>> x = np.array([[-1.0], [1.0]])
-    >>> quiet = centred(known_noise)
-    >>> float(quiet(x, x, [1.0], [[2.0]], rng=np.random.default_rng(0)).mean().round(12))
-    0.5
-    """
-    inner = unchecked(callable_(update, "update"))
-
-    def centre(x: Array, h: Array, y: Array, r: Array, *, rng: np.random.Generator) -> Array:
-        return inner(x, h, y, r, rng=_Centred(rng))
-
-    return joined(centre, update)
-
-
+@door
 def serial(update: Update) -> Update:
     """Take independent readings in one after the other.
 
@@ -162,36 +250,109 @@ def serial(update: Update) -> Update:
     >>> float(after.mean().round(12)), float(after.var(ddof=1).round(12))
     (0.5, 0.25)
     """
-    callable_(update, "update")
+    return _one_by_one(update, None)
 
+
+@door
+def localised(
+    update: Update,
+    *,
+    places: Annotated[Array, "d k"],
+    readings: Annotated[Array, "m k"],
+    radius: Positive,
+    period: Positive | None = None,
+) -> Update:
+    r"""Let each reading move only components near it: the remedy for few members in a large space.
+
+    Readings are taken in one after the other, as by :func:`serial`, and what one changes in a
+    component at distance r is multiplied by Gaspari and Cohn's function of r over `radius`, which
+    falls from 1 to 0.21 at one radius and to 0 at two. For updates by a gain with independent
+    noise that multiplies the sample covariances by the same numbers: chance correlations of far
+    components are left out.
+
+    Parameters
+    ----------
+    update : callable
+        An update whose draws stay with the readings: :func:`~distfilt.updates.known_noise`, or
+        ``partial(square_root, rotation="none")``; not a random rotation, which mixes the members of
+        near components and not of far ones.
+    places : array_like, (d, k)
+        Where each component of the state is.
+    readings : array_like, (m, k)
+        Where each reading is, in the same coordinates; the update always gets all m, of which some
+        may be missing.
+    radius : float
+        In the units of the coordinates.
+    period : float, optional
+        Length of a ring, along each coordinate, on which distances are the shorter way round.
+
+    Notes
+    -----
+    G. Gaspari, S. E. Cohn, Quarterly Journal of the Royal Meteorological Society 125 (1999)
+    723-757, equation (4.10); P. L. Houtekamer, H. L. Mitchell, Monthly Weather Review 129 (2001)
+    123-137.
+
+    Examples
+    --------
+    Two components, of which the first is seen; the second is too far to be moved.
+
+    >>> from distfilt.updates import known_noise
+    >>> near = localised(known_noise, places=[[0.0], [9.0]], readings=[[0.0]], radius=1.0)
+    >>> x = np.array([[-1.0, -1.1], [1.0, 0.9]])
+    >>> after = near(x, x[:, :1], [1.0], [[2.0]], rng=np.random.default_rng(0))
+    >>> (after != x).any(axis=0)
+    array([ True, False])
+    """
+    if places.shape[1] != readings.shape[1]:
+        raise ValueError(f"readings: needs {places.shape[1]} coordinates, got {readings.shape[1]}")
+    both = np.concatenate([places, readings])
+    gap = np.abs(both[:, None] - readings)
+    if period is not None:
+        gap = np.minimum(gap % period, -gap % period)
+    return _one_by_one(update, gaspari_cohn(np.linalg.norm(gap, axis=-1) / radius))
+
+
+def gaspari_cohn(ratio: Array) -> Array:
+    """The taper of covariances, by distances over the radius: a polynomial that ends at two."""
+    r = np.asarray(ratio)
+    near = 1 + r**2 * (-5 / 3 + r * (5 / 8 + r * (1 / 2 - r / 4)))
+    far = 4 + r * (-5 + r * (5 / 3 + r * (5 / 8 + r * (-1 / 2 + r / 12))))
+    with np.errstate(divide="ignore"):
+        far = far - 2 / (3 * r)
+    return np.asarray(np.where(r <= 1, near, np.where(r < 2, far, 0.0)))
+
+
+def _one_by_one(update: Update, taper: Array | None) -> Update:
+    """Groups of correlated readings in turn; what each changes is tapered, (d + m, m)."""
+
+    @around(update)
     def one_by_one(
-        x: Array, h: Array, y: Array, r: Array, *, rng: np.random.Generator,
+        ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
         predict: Callable[[Array], Array] | None = None,
     ) -> Array:
-        d = x.shape[-1]
-        for k, rows in enumerate(_groups(r)):
-            if predict is not None:
-                seen = (h if k == 0 else predict(x))[..., rows]
-                x = with_missing(update, x, seen, y[..., rows], _block(r, rows), rng=rng)
-            else:
-                both = np.concatenate([x, h], axis=-1)
-                moved = with_missing(
-                    update, both, h[..., rows], y[..., rows], _block(r, rows), rng=rng
-                )
-                x, h = moved[..., :d], moved[..., d:]
+        x, h, d = ensemble, predicted, ensemble.shape[-1]
+        if taper is not None and taper.shape != (d + h.shape[-1], h.shape[-1]):
+            m = taper.shape[1]
+            raise ValueError(f"readings: needs {m}, of {len(taper) - m} components, for each of "
+                             f"which there is a place; got {h.shape[-1]} of {d}")  # fmt: skip
+        for k, rows in enumerate(_groups(noise)):
+            if predict is not None and k:
+                h = predict(x)
+            both = np.concatenate([x, h], axis=-1) if predict is None else x
+            block = noise[..., rows[:, None], rows]
+            moved = with_missing(update, both, h[..., rows], observed[..., rows], block, rng=rng)
+            if taper is not None:
+                moved = both + taper[: both.shape[-1], rows].max(axis=-1) * (moved - both)
+            x, h = moved[..., :d], moved[..., d:] if predict is None else h
         return x
 
-    out = joined(one_by_one, update)
-    out.repredicts = True  # type: ignore[attr-defined]
-    return out
+    made: Any = one_by_one
+    made.repredicts, made.whole = True, taper is not None
+    return one_by_one
 
 
-def _groups(noise: ArrayLike) -> list[Indices]:
+def _groups(noise: Array) -> list[Indices]:
     """Indices of readings that are correlated with each other, in the order of their first."""
-    linked = (np.asarray(noise) != 0).reshape(-1, *np.shape(noise)[-2:]).any(axis=0)
+    linked = (noise != 0).reshape(-1, *noise.shape[-2:]).any(axis=0)
     labels = csgraph.connected_components(sparse.csr_array(linked), directed=False)[1]
     return [np.flatnonzero(labels == k) for k in dict.fromkeys(labels.tolist())]
-
-
-def _block(noise: Array, rows: Indices) -> Array:
-    return np.asarray(noise[..., rows[:, None], rows])

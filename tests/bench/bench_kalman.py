@@ -19,7 +19,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 import numpy as np
 from _bench import interleaved, write
 
-from distfilt.kalman import filterpy_kf, filterpy_ukf, kalman_filter, unscented_filter
+from distfilt.filters import GaussianFilter
+from distfilt.kalman import filterpy_kf, filterpy_ukf, kalman_filter
 from distfilt.models import clohessy_wiltshire, coordinated_turn, simulate
 from distfilt.sensors import direct, distance_and_angle, stack
 
@@ -103,27 +104,36 @@ def curved_case(rng: np.random.Generator) -> tuple[tuple[np.ndarray, ...], dict[
     return (x0, 0.05 * np.eye(model.dim), seen), options
 
 
+def unscented(mean: Any, cov: Any, y: Any, *, model: Any, sensors: Any, times: Any) -> Any:
+    f = GaussianFilter(model, sensors, rule="unscented")
+    states = list(f.steps(f.start((mean, cov), runs=y.shape[1:-1]), times, [y]))
+    means = np.array([s.means[:, 0] for s in states])
+    return means, np.array([s.covariances[:, 0] for s in states])
+
+
+def moments(found: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Means and covariances of a filter's result, ours or a pair."""
+    return found[:2] if isinstance(found, tuple) else (found.means, found.covariances)
+
+
 def compared(case: str, calls: dict[str, Any], rounds: int) -> tuple[list[dict[str, Any]], int]:
     """The table's rows: ours first, each other's time, our speed, and the largest difference."""
     results = {name: call() for name, call in calls.items()}
     times, ratios = interleaved(calls, rounds)
-    first = results["distfilt"]
-    scale = np.abs(first.means).max()
+    first, mine = moments(results["distfilt"])
+    scale = np.abs(first).max()
     rows, missed = [], 0
     for name, other in results.items():
-        means, covs = (
-            other if isinstance(other, tuple) and len(other) == 2
-            else (other.means, other.covariances)
-        )  # fmt: skip
-        gap = np.abs(means - first.means).max() / scale
+        means, covs = moments(other)
+        gap = np.abs(means - first).max() / scale
         covs = covs.reshape(len(covs), -1, *covs.shape[-2:])
-        mine = first.covariances.reshape(len(covs), -1, *covs.shape[-2:])
-        gap = max(gap, np.abs(covs - mine).max() / np.abs(mine).max())
+        own = mine.reshape(len(covs), -1, *covs.shape[-2:])
+        gap = max(gap, np.abs(covs - own).max() / np.abs(own).max())
         floor = FLOORS.get((case, name))
         missed += gap > 1e-9 or (floor is not None and ratios[name] < floor)
         rows.append({
-            "case": case, "runs": first.means.shape[1], "steps": len(first.means),
-            "components": first.means.shape[-1], "filter": name,
+            "case": case, "runs": first.shape[1], "steps": len(first),
+            "components": first.shape[-1], "filter": name,
             "seconds": f"{times[name]:.4f}", "distfilt_is_faster": f"{ratios[name]:.2f}",
             "floor": floor or "", "gap": f"{gap:.0e}",
         })
@@ -148,7 +158,7 @@ def main() -> int:
         rows, missed = rows + found[0], missed + found[1]
     (mean, cov, y), options = curved_case(rng)
     calls = {
-        "distfilt": lambda: unscented_filter(mean, cov, y, **options),
+        "distfilt": lambda: unscented(mean, cov, y, **options),
         "filterpy": lambda: filterpy_ukf(mean, cov, y, **options),
     }
     found = compared("unscented", calls, 3)

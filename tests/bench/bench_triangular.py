@@ -13,7 +13,7 @@ import sys
 import numpy as np
 from _bench import timed, write
 
-from distfilt.triangular import _conic, compose
+from distfilt.triangular import affine, compose
 from distfilt.triangular.affine import fit, fit_convex
 
 SIZES = ((1, 6, 80), (3, 13, 150), (10, 40, 500))
@@ -40,7 +40,7 @@ def main() -> int:
         exact = compose(closed.result, y, x, y[0])
         for solver in ("ECOS", "CLARABEL"):
             def newcomer(y: np.ndarray = y, x: np.ndarray = x, s: str = solver) -> object:
-                _conic._program.cache_clear()
+                affine._program.cache_clear()
                 return fit_convex(y, x, solver=s)
 
             compiled_each_time = timed(newcomer, 3)

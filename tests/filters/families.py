@@ -38,7 +38,7 @@ FAMILIES: dict[str, Callable[..., Any]] = {
     "gaussian": GaussianFilter,
     "gaussian, unscented": partial(GaussianFilter, rule="unscented"),
     "particle": partial(ParticleFilter, members=500),
-    "particle, residual": partial(ParticleFilter, members=500, rule="residual", jitter=0.2),
+    "particle, stratified": partial(ParticleFilter, members=500, rule="stratified", jitter=0.2),
     "ensemble, common": partial(TransportFilter, members=40, agreement=average, rejuvenation=0.1),
 }
 

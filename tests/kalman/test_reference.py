@@ -1,44 +1,41 @@
-"""Filterpy's filters behind our shapes, and ours against them."""
+"""Filterpy's filters behind our shapes; ours, and one agent's Gaussian filter, against them."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from distfilt.kalman import (
-    extended_filter,
-    filterpy_ekf,
-    filterpy_kf,
-    filterpy_ukf,
-    kalman_filter,
-    unscented_filter,
-)
+from distfilt.filters import GaussianFilter
+from distfilt.gaussians import conditioned
+from distfilt.kalman import GaussianRun, filterpy_ekf, filterpy_kf, filterpy_ukf, kalman_filter
 from distfilt.models import Model, clohessy_wiltshire, coordinated_turn, satellite_pose, simulate
-from distfilt.sensors import angle, direct, distance, distance_and_angle, stack
-from tests.kalman.bad_input import linear_cases, of_changes, series_cases, with_option
+from distfilt.sensors import Sensor, angle, direct, distance, distance_and_angle, stack
 from tests.kalman.problems import D, M, problem, spd, walk
 
-BAD_INPUT: dict[str, Any] = {
-    "distfilt.kalman.filterpy_kf": [
-        *linear_cases(filterpy_kf),
-        ("likelihood", lambda: filterpy_kf(
-            [0.0], [[1.0]], [[2.0]], F=[[1.0]], H=[[1.0]], Q=[[0.0]], R=[[1.0]],
-            likelihood="yes")),
-    ],
-    "distfilt.kalman.filterpy_ekf": [*series_cases(filterpy_ekf), of_changes(filterpy_ekf)],
-    "distfilt.kalman.filterpy_ukf": [
-        *series_cases(filterpy_ukf),
-        of_changes(filterpy_ukf),
-        with_option(filterpy_ukf, alpha=0.0),
-        with_option(filterpy_ukf, alpha=1e-9),
-        with_option(filterpy_ukf, likelihood=None),
-        with_option(filterpy_ukf, beta=-1.0),
-        with_option(filterpy_ukf, kappa=-2.0),
-    ],
-}
+FULL = np.array([[4.0, 1.2], [1.2, 1.0]])
+
+
+def one_agent(
+    mean: Any, cov: Any, y: Any, *, model: Model, sensors: Any, times: Any, t0: float = 0.0,
+    **options: Any,
+) -> GaussianRun:
+    """The Gaussian filter of one agent that holds all sensors."""
+    y = np.asarray(y)
+    f = GaussianFilter(model, [stack(sensors)], **options)
+    states = list(f.steps(f.start((mean, cov), runs=y.shape[1:-1], t=t0), times, [y]))
+    means = np.array([s.means[..., 0, :] for s in states])
+    covs = np.array([s.covariances[..., 0, :, :] for s in states])
+    return GaussianRun(means, covs, np.zeros(means.shape[:-1]))
+
+
+extended, unscented = one_agent, partial(one_agent, rule="unscented")
+FILTERS = (filterpy_ekf, filterpy_ukf, extended, unscented)
 
 
 @pytest.mark.parametrize("varying", [False, True])
@@ -63,61 +60,26 @@ def test_equal_to_filterpy(varying: bool, pattern: str) -> None:
     assert ours.covariances.shape == (30, 1 if shared else runs, D, D)
 
 
-@pytest.mark.parametrize("filter_", [filterpy_ekf, filterpy_ukf])
-def test_linear_case_equals_the_kalman_filter(filter_: Callable[..., Any]) -> None:
+@pytest.mark.parametrize("filter_", FILTERS)
+@pytest.mark.parametrize("runs", [(), (2, 3)])
+def test_linear_case_equals_the_kalman_filter(
+    filter_: Callable[..., Any], runs: tuple[int, ...]
+) -> None:
     rng = np.random.default_rng(7)
     model = clohessy_wiltshire(rate=0.1, sigma=0.2)
-    sensors = [direct([0, 1], std=0.2), direct([1, 2], std=0.2)]
-    times = np.array([0.1, 0.2, 0.4])
-    y = rng.standard_normal((3, 2, 4))
-    y[1, 0, 2], y[2, 1] = np.nan, np.nan
+    both = stack([direct([0, 1], std=0.2), direct([1, 2], std=0.2)])
+    times, y = np.array([0.6, 0.7, 0.9]), rng.standard_normal((3, *runs, 4))
+    y[1, ..., 2], y[2] = np.nan, np.nan
     args = (rng.standard_normal(6), spd(rng, 6), y)
-    run = filter_(*args, model=model, sensors=sensors, times=times)
-    steps = np.diff(times, prepend=0.0)
+    run = filter_(*args, model=model, sensors=[both], times=times, t0=0.5)
+    steps = np.diff(times, prepend=0.5)
     exact = kalman_filter(
-        *args,
-        F=np.array([model.transition(dt) for dt in steps]),
+        *args, F=np.array([model.transition(dt) for dt in steps]), H=both.matrix(6), R=both.cov,
         Q=np.array([model.noise(0.0, dt) for dt in steps]),
-        H=stack(sensors).matrix(6),
-        R=stack(sensors).cov,
-    )
+    )  # fmt: skip
     np.testing.assert_allclose(run.means, exact.means, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(run.covariances, exact.covariances, rtol=0, atol=1e-10)
-
-
-@pytest.mark.parametrize(
-    ("ours", "theirs"), [(extended_filter, filterpy_ekf), (unscented_filter, filterpy_ukf)]
-)
-def test_angles_of_a_satellite_as_the_library_s_own_filters(
-    ours: Callable[..., Any], theirs: Callable[..., Any]
-) -> None:
-    rng = np.random.default_rng(8)
-    model = clohessy_wiltshire(rate=0.1, sigma=0.2)
-    sensors = [direct([0, 1], std=0.2), angle([1, 2], std=0.2), direct([3, 4, 5], std=0.1)]
-    times, start = 0.1 * np.arange(1, 61), np.array([100.0, 0, 0, 10, 0.1, 0])
-    truth = simulate(model, start, times, rng=rng)
-    y = stack(sensors).observe(truth, rng=rng)
-    args = (start + 3, 25 * np.eye(6), y)
-    one, two = (f(*args, model=model, sensors=sensors, times=times) for f in (ours, theirs))
-    np.testing.assert_allclose(one.means, two.means, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(one.covariances, two.covariances, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("filter_", [filterpy_ekf, filterpy_ukf])
-def test_an_angle_may_wrap(filter_: Callable[..., Any]) -> None:
-    # A bearing just above -pi, seen from a prior whose bearing is just below pi.
-    run = filter_(
-        [-1.0, 0.02], 0.01 * np.eye(2), [[-np.pi + 0.02]], model=walk(2),
-        sensors=[angle([0, 1], std=0.01, full=True)], times=[1e-6],
-    )
-    np.testing.assert_allclose(run.means[0], [-1.0, -0.02], atol=0.005)
-
-
-def test_ekf_differences_a_nonlinear_model() -> None:
-    bent = Model(1, lambda x, t, dt: np.sin(x), lambda t, dt: np.zeros((1, 1)))
-    run = filterpy_ekf([0.3], [[0.5]], [[np.nan]], model=bent,
-                       sensors=[direct([0], std=1.0)], times=[1.0])
-    np.testing.assert_allclose(run.covariances[0, 0, 0], 0.5 * np.cos(0.3) ** 2, rtol=1e-8)
+    full = np.broadcast_to(exact.covariances, run.covariances.shape)
+    np.testing.assert_allclose(run.covariances, full, rtol=0, atol=1e-10)
 
 
 def _turn() -> dict[str, Any]:
@@ -127,27 +89,27 @@ def _turn() -> dict[str, Any]:
 
 
 def _pose() -> dict[str, Any]:
-    start = np.r_[1.0, 0.0, 0.3, 0.0, -0.2, 0.0, 0.3, 0.2, 0.1, 1.0, 0.0, 0.0, 0.0]
+    start = np.r_[1.0, 2.0, 0.3, 0.0, -0.2, 0.0, 0.3, 0.2, 0.1, 1.0, 0.0, 0.0, 0.0]
     sensors = [direct([0, 1], std=0.2), angle([1, 2], std=0.2), distance([0, 1, 2], std=0.3),
-               direct(range(6, 13), std=0.1)]
+               direct(range(6, 13), std=0.1)]  # fmt: skip
     return {"start": start, "model": satellite_pose(rate=0.1, sigma=0.2, step=0.1),
-            "sensors": sensors, "spread": 0.01}
+            "sensors": sensors, "spread": 0.01}  # fmt: skip
 
 
 @pytest.mark.parametrize("make", [_turn, _pose])
 @pytest.mark.parametrize(
     ("ours", "theirs", "options"),
     [
-        (extended_filter, filterpy_ekf, {}),
-        (unscented_filter, filterpy_ukf, {}),
-        (unscented_filter, filterpy_ukf, {"alpha": 0.5, "beta": 2.0, "kappa": 0.5}),
+        (extended, filterpy_ekf, {}),
+        (unscented, filterpy_ukf, {}),
+        (unscented, filterpy_ukf, {"kappa": 0.5}),
     ],
 )
 def test_nonlinear_filters_agree_with_filterpy(
     ours: Callable[..., Any], theirs: Callable[..., Any], options: dict[str, float],
     make: Callable[[], dict[str, Any]],
 ) -> None:
-    """Runs with gaps of their own, angles that wrap, irregular times: to 1e-12."""
+    """Runs with gaps of their own, angles that wrap, irregular times."""
     case, rng = make(), np.random.default_rng(19)
     sensor, times = stack(case["sensors"]), np.array([0.1, 0.3, 0.4, 0.8])
     truth = case["start"] + np.sqrt(case["spread"]) * rng.standard_normal((3, case["start"].size))
@@ -155,8 +117,94 @@ def test_nonlinear_filters_agree_with_filterpy(
     y[1, 0], y[2, 1, 0], y[3, 2, 1] = np.nan, np.nan, np.nan
     cov = case["spread"] * spd(rng, case["start"].size)
     setting = {"model": case["model"], "sensors": case["sensors"], "times": times, **options}
-    run = ours(case["start"], cov, y, **setting)
-    other = theirs(case["start"], cov, y, **setting, likelihood=True)
+    run, other = (f(case["start"], cov, y, **setting) for f in (ours, theirs))
     np.testing.assert_allclose(run.means, other.means, rtol=0, atol=1e-12)
     np.testing.assert_allclose(run.covariances, other.covariances, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(run.log_likelihood, other.log_likelihood, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [(extended, filterpy_ekf), (unscented, filterpy_ukf)])
+def test_angles_of_a_satellite_over_many_steps(
+    ours: Callable[..., Any], theirs: Callable[..., Any]
+) -> None:
+    rng = np.random.default_rng(8)
+    model = clohessy_wiltshire(rate=0.1, sigma=0.2)
+    sensors = [direct([0, 1], std=0.2), angle([1, 2], std=0.2), direct([3, 4, 5], std=0.1)]
+    times, start = 0.1 * np.arange(1, 61), np.array([100.0, 9, 4, 10, 0.1, 0])
+    y = stack(sensors).observe(simulate(model, start, times, rng=rng), rng=rng)
+    args = (start + 0.5, np.eye(6), y)
+    one, two = (f(*args, model=model, sensors=sensors, times=times) for f in (ours, theirs))
+    np.testing.assert_allclose(one.means, two.means, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(one.covariances, two.covariances, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("filter_", FILTERS)
+def test_an_angle_may_wrap(filter_: Callable[..., Any]) -> None:
+    """Bearings on either side of the cut: turned by half a turn, nothing but the signs changes."""
+    options = {"model": walk(2), "sensors": [angle([0, 1], std=0.01, full=True)], "times": [1e-9]}
+    mean, cov = np.array([-1.0, 0.02]), 0.01 * FULL / 4
+    run = filter_(mean, cov, [[-np.pi + 0.02]], **options)
+    assert run.means[0, 1] < -0.01
+    other = filter_(-mean, cov, [[0.02]], **options)
+    np.testing.assert_allclose(run.means, -other.means, atol=1e-12)
+    np.testing.assert_allclose(run.covariances, other.covariances, atol=1e-12)
+    turned = filter_(mean, cov, [[np.pi + 0.02]], **options)
+    np.testing.assert_allclose(turned.means, run.means, atol=1e-12)
+
+
+def test_what_the_sensor_cannot_see_is_missing() -> None:
+    """A mean at the sensor's place has no angle; its distance is used all the same."""
+    options = {"model": walk(2), "times": [1e-9],
+               "sensors": [distance_and_angle([0, 1], std=[0.3, 0.1])]}  # fmt: skip
+    here = extended([0.0, 0.0], FULL, [[0.5, 0.1]], **options)
+    blind = extended([0.0, 0.0], FULL, [[0.5, np.nan]], **options)
+    np.testing.assert_allclose(here.means, blind.means, atol=1e-14)
+    np.testing.assert_allclose(here.covariances, blind.covariances, atol=1e-14)
+
+
+@pytest.mark.parametrize("filter_", [extended, filterpy_ekf])
+def test_extended_steps_are_the_linearised_formulas(filter_: Callable[..., Any]) -> None:
+    def flow(x: np.ndarray, t: float, dt: float) -> np.ndarray:
+        return np.stack([np.sin(x[..., 0]) + t, x[..., 0] * x[..., 1] * dt], axis=-1)
+
+    model = Model(2, flow, lambda t, dt: (1 + t) * dt * FULL)
+    sensor = Sensor(2, lambda x: np.stack([x[..., 0] ** 2, x.sum(-1)], -1), FULL)
+    options = {"model": model, "sensors": [sensor], "times": [2.5], "t0": 2.0}
+    slope = np.array([[np.cos(0.3), 0.0], [-0.35, 0.15]])
+    x, p = np.array([np.sin(0.3) + 2, -0.105]), slope @ FULL @ slope.T + 1.5 * FULL
+    ahead = filter_([0.3, -0.7], FULL, [[np.nan, np.nan]], **options)
+    np.testing.assert_allclose(ahead.means[0], x)
+    np.testing.assert_allclose(ahead.covariances[0], p, atol=1e-8)
+    run = filter_([0.3, -0.7], FULL, [[1.0, -1.0]], **options)
+    gap, h = [1.0 - x[0] ** 2, -1.0 - x.sum()], np.array([[2 * x[0], 0.0], [1.0, 1.0]])
+    for ours, exact in zip((run.means, run.covariances), conditioned(x, p, gap, h, FULL),
+                           strict=True):  # fmt: skip
+        np.testing.assert_allclose(ours[0], exact, atol=1e-7)
+
+
+@pytest.mark.parametrize("filter_", [unscented, filterpy_ukf])
+@pytest.mark.parametrize("kappa", [0.5, 1.0])
+def test_unscented_moments_of_a_square(filter_: Callable[..., Any], kappa: float) -> None:
+    """Of x² + x y the points know the mean exactly: E = m² + P11 + m n + P12, in any scaling."""
+    def flow(x: np.ndarray, t: float, dt: float) -> np.ndarray:
+        return np.stack([x[..., 0] ** 2 + x[..., 0] * x[..., 1], x[..., 1]], axis=-1)
+
+    model = Model(2, flow, lambda t, dt: np.zeros((2, 2)))
+    run = filter_([0.5, -1.0], FULL, [[np.nan]], model=model, sensors=[direct([0], std=1.0)],
+                  times=[1.0], kappa=kappa)  # fmt: skip
+    np.testing.assert_allclose(run.means[0], [0.25 + 4.0 - 0.5 + 1.2, -1.0], atol=1e-12)
+    # Cov(x² + x y, y) = 2 m P12 + m P22 + n P12 for a Gaussian, and for any symmetric points.
+    expected = 2 * 0.5 * 1.2 + 0.5 * 1.0 - 1.2
+    np.testing.assert_allclose(run.covariances[0, 0, 1], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("filter_", [extended, unscented])
+@given(seed=st.integers(0, 10**6))
+def test_covariances_stay_symmetric_and_positive(filter_: Callable[..., Any], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    sensor = distance_and_angle([0, 1], std=[1e-4, 1e-4])
+    mean, cov = rng.standard_normal(3), 10.0 ** rng.uniform(-6, 6) * spd(rng, 3)
+    y = sensor.observe(mean + rng.standard_normal((1, 5, 3)), rng=rng)
+    p = filter_(mean, cov, y, model=walk(3), sensors=[sensor], times=[1e-9]).covariances[0]
+    assert (p == p.mT).all()
+    scale = np.sqrt(np.diagonal(p, axis1=1, axis2=2))
+    assert np.linalg.eigvalsh(p / scale[:, :, None] / scale[:, None, :]).min() > 0

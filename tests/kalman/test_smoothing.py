@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,27 +9,6 @@ from hypothesis import strategies as st
 
 from distfilt.kalman import GaussianRun, kalman_filter, rts_smoother
 from tests.kalman.problems import RUNS, STEPS, D, M, posterior, problem, spd
-
-_RUN = kalman_filter([0.0], [[1.0]], np.zeros((2, 1)), F=[[1.0]], H=[[1.0]], Q=[[1.0]], R=[[1.0]])
-_LOST = GaussianRun(np.zeros((2, 1)), np.zeros((2, 1, 1)), np.zeros(2))
-_WRONG = [
-    replace(_RUN, means=_RUN.means.astype(str)),
-    replace(_RUN, means=np.nan * _RUN.means),
-    replace(_RUN, means=_RUN.means[0]),
-    replace(_RUN, covariances=_RUN.covariances[:1]),
-    replace(_RUN, covariances=_RUN.covariances[..., 0]),
-    replace(_RUN, covariances=np.ones((2, 3, 1, 1))),
-    replace(_RUN, log_likelihood=_RUN.log_likelihood[:1]),
-]
-BAD_INPUT: dict[str, Any] = {
-    "distfilt.kalman.rts_smoother": [
-        ("run", lambda: rts_smoother(3, F=[[1.0]], Q=[[1.0]])),
-        *[("run", lambda run=run: rts_smoother(run, F=[[1.0]], Q=[[1.0]])) for run in _WRONG],
-        ("F", lambda: rts_smoother(_RUN, F=np.eye(2), Q=[[1.0]])),
-        ("F", lambda: rts_smoother(_RUN, F=np.ones((3, 1, 1)), Q=[[1.0]])),
-        ("Q", lambda: rts_smoother(_RUN, F=[[1.0]], Q=[[-1.0]])),
-    ]
-}
 
 
 @given(seed=st.integers(0, 10**6), share=st.sampled_from([0.0, 0.3, 1.0]))
@@ -78,8 +54,15 @@ def test_later_observations_only_help() -> None:
 
 
 def test_a_state_that_cannot_be_forecast_raises() -> None:
+    lost = GaussianRun(np.zeros((2, 1)), np.zeros((2, 1, 1)), np.zeros(2))
     with pytest.raises(np.linalg.LinAlgError, match="forecast"):
-        rts_smoother(_LOST, F=[[1.0]], Q=[[0.0]])
+        rts_smoother(lost, F=[[1.0]], Q=[[0.0]])
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1), (2, 3, 1, 1)])
+def test_a_run_s_covariances_have_its_means_axes(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="covariances: needs"):
+        GaussianRun(np.zeros((2, 4, 1)), np.ones(shape), np.zeros((2, 4)))
 
 
 def test_one_step_and_none() -> None:

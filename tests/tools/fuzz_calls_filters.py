@@ -220,12 +220,10 @@ def others_with_every_option() -> None:
     sensors.angle([0, 1], std=0.1, full=True, origin=np.array([0.5, 1.5]))
     sensors.distance([0, 1], std=0.1, origin=np.array([0.5, 1.5]))
     sensors.line_of_sight(std=1e-4, hidden=models.occulted)
-    seen, logs = RNG(0).standard_normal((8, 2)), np.zeros((2, 3))
-    given: dict[str, Any] = {"rng": RNG(0), "inside": lambda x: x[..., 0] > -9}
+    seen = RNG(0).standard_normal((8, 2))
+    given: dict[str, Any] = {"rng": RNG(0)}
     updates.ensemble_transform(seen, seen[:, :1], [0.5], [[1.0]], **given)
     updates.retracted(updates.known_noise, norm([0]), motion=([0], [1]))
-    points = np.tile([[0.0], [1.0], [2.0]], (2, 1, 1))
-    updates.transform_by_agreement(points, logs, channel, rounds=2)
     swarm, start = models.rotating_swarm(), np.array([[0.25, 0.5]])
     swarm.diffusion_at(start, 0.0)
     network.Graph.from_adjacency([[0, 1], [0, 0]], directed=True)

@@ -83,14 +83,12 @@ def the_options() -> None:
     gaussians.intersection_weights(covs, rule="trace", here=[True, False, True])
     progress.track([1, 2], show=False, total=2)
     two = mixtures.GaussianMixture([0.5, 0.5], [[-2.0], [2.0]], [[[1.0]], [[1.0]]])
-    mixtures.conditioned(two, [1.0], np.asarray, [[1.0]], gate=5.0)
+    mixtures.conditioned(two, [1.0], np.asarray, [[1.0]])
     mixtures.fuse(two, two, size=1)
     three = mixtures.Shapes([[0.0], [1e-6], [9.0]], [[[1.0]]] * 3, [0, 0, 0])
     mixtures.pivoted_qr(three, size=2)
     mixtures.stretching([[[2.0]]], [[[0.5]]], scale=[3.0])
-    mixtures.unscented.update(
-        [0.0], [[1.0]], [2.0], np.asarray, [[1.0]], residual=np.subtract, rule="dd2"
-    )
+    mixtures.conditioned(two, [2.0], np.asarray, [[1.0]], residual=np.subtract, rule="dd2")
 
 
 def the_processes() -> None:
@@ -154,10 +152,8 @@ def the_mixtures() -> None:
     own.log_density(points)
     own.collapsed()
     own.quadratics()
-    own.sample(5, rng=np.random.default_rng(1))
+    own.rvs(5, rng=np.random.default_rng(1))
     own.marginal([1])
-    own.conditional([1], [0.5])
-    own.product(own.collapsed())
     mixtures.GaussianMixture.unpack(own.pack())
     narrow = mixtures.GaussianMixture([0.5, 0.5], [[1.0], [2.0]], [[[0.5]], [[0.8]]])
     fusion = mixtures.PartialFusion(own, [heard, heard], omega=[0.4, 0.3, 0.3])

@@ -7,13 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distfilt.checks import SolverError
+from distfilt.linalg import SolverError
 from distfilt.network import Channel, graphs
 from distfilt.network.consensus import average
 from distfilt.triangular import AffineMap, affine, compose
 from distfilt.triangular.pooling import _proximal, pool_by_admm, pool_by_moments
-
-NAN = float("nan")
 
 
 def _samples(
@@ -34,44 +32,6 @@ def _centralised(y: np.ndarray, x: np.ndarray) -> AffineMap:
 
 
 _Y, _X = _samples(0)
-_P = "distfilt.triangular.pooling."
-
-
-def _cases(pool: object) -> list[tuple[str, object]]:
-    def with_constant(v: np.ndarray) -> np.ndarray:
-        out = v.copy()
-        out[..., 0] = 0.1
-        return out
-
-    return [
-        ("channel", lambda: pool(_Y, _X, graphs.path(3))),
-        ("agree", lambda: pool(_Y, _X, Channel(graphs.path(3)), agree=3)),
-        ("agree", lambda: pool(_Y, _X, Channel(graphs.path(3)), agree=lambda v, c: 1000 * v)),
-        ("agree", lambda: pool(_Y, _X, Channel(graphs.path(3)), agree=lambda v, c: NAN * v)),
-        ("agree", lambda: pool(_Y, _X, Channel(graphs.path(3)), agree=lambda v, c: v[:1])),
-        ("x", lambda: pool(_Y, _X[:2], Channel(graphs.path(3)))),
-        ("x", lambda: pool(_Y[:, :1], _X[:, :1], Channel(graphs.path(3)))),
-        ("x", lambda: pool(_Y, NAN * _X, Channel(graphs.path(3)))),
-        ("x", lambda: pool(_Y, with_constant(_X), Channel(graphs.path(3)))),
-        ("y", lambda: pool(with_constant(_Y), _X, Channel(graphs.path(3)))),
-        ("y", lambda: pool(_Y[:, :5], _X, Channel(graphs.path(3)))),
-        ("channel", lambda: pool(_Y, _X, Channel(graphs.Graph.from_edges(3, [(0, 1), (1, 0)])))),
-    ]
-
-
-BAD_INPUT = {
-    _P + "pool_by_moments": [
-        *_cases(pool_by_moments),
-        ("x", lambda: pool_by_moments(_Y, _X[..., [0, 0]], Channel(graphs.path(3)))),
-    ],
-    _P + "pool_by_admm": [
-        *_cases(pool_by_admm),
-        ("channel", lambda: pool_by_admm(_Y[None], _X[None], Channel(graphs.path(3), runs=(1,)))),
-        ("rho", lambda: pool_by_admm(_Y, _X, Channel(graphs.path(3)), rho=0.0)),
-        ("standardise", lambda: pool_by_admm(_Y, _X, Channel(graphs.path(3)), standardise=1)),
-        ("admm", lambda: pool_by_admm(_Y, _X, Channel(graphs.path(3)), iterations=2)),
-    ],
-}
 
 
 @given(st.integers(0, 10_000), st.sampled_from([graphs.path(3), graphs.star(5), graphs.ring(4)]))

@@ -14,81 +14,7 @@ from distfilt.triangular import SeparableMap, affine, compose
 from distfilt.triangular.separable import fit
 from tests.triangular.samples import banana, rng_of
 
-NAN = float("nan")
-
-
 _Y, _X, _ = banana(9, 60)
-_MAP = fit(_Y, _X, order=1)
-_NONE = np.empty((2, 1, 0))
-_ONE_STEP = np.array([[[0.0]], [[1.0]]])
-
-
-def _raw(**change: object) -> SeparableMap:
-    parts: dict[str, object] = {
-        "centre": np.zeros(1), "spread": np.ones(1), "bumps": _NONE, "steps": _ONE_STEP,
-        "uses": ((),), "weights": (np.zeros(1),), "slopes": (np.array([1.0, 1.0]),),
-    }
-    parts.update(change)
-    return SeparableMap(**parts)
-
-
-def _bounded() -> SeparableMap:
-    """A map whose values lie between 0 and sqrt(2 pi)."""
-    return _raw(slopes=(np.array([0.0, 1.0]),))
-
-
-_S = "distfilt.triangular.separable."
-BAD_INPUT = {
-    _S + "SeparableMap": [
-        ("slopes", lambda: _raw(slopes=(np.array([1.0, -0.1]),))),
-        ("slopes", lambda: _raw(slopes=(np.array([0.0, 0.0]),))),
-        ("slopes", lambda: _raw(slopes=(np.array([1.0]),))),
-        ("weights", lambda: _raw(weights=(np.zeros(2),))),
-        ("weights", lambda: _raw(weights=())),
-        ("weights", lambda: _raw(weights=np.array(1.0))),
-        ("weights", lambda: _raw(weights={0: np.zeros(1)})),
-        ("slopes", lambda: _raw(slopes=())),
-        ("centre", lambda: _raw(centre=["0"])),
-        ("centre", lambda: _raw(centre=NAN * np.ones(1))),
-        ("uses", lambda: _raw(uses=3.5)),
-        ("spread", lambda: _raw(spread=np.zeros(1))),
-        ("bumps", lambda: _raw(bumps=np.empty((2, 2, 0)))),
-        ("steps", lambda: _raw(steps=np.empty((2, 3, 1)))),
-        ("uses", lambda: _raw(uses=((0,),))),
-        ("z", lambda: _bounded().inverse([], [[3.0]])),
-        ("z", lambda: _bounded().inverse([], [[1.0], [-0.1]])),
-        ("z", lambda: _MAP.inverse([0.1], [[NAN, 0.0]])),
-        ("z", lambda: _MAP.inverse([0.1], [[0.0]])),
-        ("x", lambda: _MAP(_Y, _X[:, :1])),
-        ("y", lambda: _MAP(_X, _X)),
-        ("y", lambda: _MAP(_Y[:7], _X)),
-        ("y", lambda: _MAP.log_det(_X, _X)),
-    ],
-    _S + "fit": [
-        ("uses", lambda: fit(_Y, _X, order=1, uses=3.5)),
-        ("uses", lambda: fit(_Y, _X, order=1, uses=[[0], None])),
-        ("order", lambda: fit(_Y, _X, order=-1)),
-        ("order", lambda: fit(_Y, _X, order=(1, 1, 1))),
-        ("order", lambda: fit(_Y, _X, order=1.5)),
-        ("regularisation", lambda: fit(_Y, _X, order=1, regularisation=-0.1)),
-        ("regularisation", lambda: fit(np.arange(60.0)[:, None] % 3, _X, order=(2, 0))),
-        ("least_slope", lambda: fit(_Y, _X, order=1, least_slope=NAN)),
-        ("uses", lambda: fit(_Y, _X, order=1, uses=[[0]])),
-        ("uses", lambda: fit(_Y, _X, order=1, uses=[[1], []])),
-        ("uses", lambda: fit(_Y, _X, order=1, uses=[[0], [0, 0]])),
-        ("x", lambda: fit(_Y[:7], _X[:7], order=1)),
-        ("x", lambda: fit(_Y[:4], _X[:4], order=1, regularisation=1.0)),
-        ("x", lambda: fit(_Y, np.ones((60, 2)), order=1)),
-        ("x", lambda: fit(_Y, _X[:, [0, 0]], order=1)),
-        ("x", lambda: fit(_X[:, :1], _X, order=1)),
-        ("x", lambda: fit(_Y, NAN * _X, order=1)),
-        ("x", lambda: fit(_Y, np.column_stack([_X[:, 0], np.arange(60) > 57]), order=1)),
-        ("y", lambda: fit(np.full((60, 1), 0.1), _X, order=1)),
-        ("y", lambda: fit(_Y[:, [0, 0]], _X, order=0)),
-        ("y", lambda: fit(_Y[:10], _X, order=1)),
-    ],
-}
-EXEMPT = {"distfilt.triangular.separable": "a module"}
 
 
 @given(st.integers(0, 10_000), st.integers(0, 3), st.integers(1, 4))
@@ -120,45 +46,10 @@ def test_map_increases_inverts_and_is_triangular(seed: int, p: int, q: int) -> N
     assert (s(y, moved)[:, 0] == z[:, 0]).all() and (s(y, moved)[:, 1] > z[:, 1]).all()
 
 
-@given(st.integers(0, 10_000), st.integers(0, 3))
-def test_log_det_is_the_derivative_s(seed: int, order: int) -> None:
-    y, x, _ = banana(seed)
-    s, h = fit(y, x, order=order), 1e-5
-    columns = [(s(y, x + h * e) - s(y, x - h * e)) / (2 * h) for e in np.eye(2)]
-    numeric = np.linalg.slogdet(np.stack(columns, axis=-1))[1]
-    assert np.abs(numeric - s.log_det(y, x)).max() < 1e-6
-
-
-@pytest.mark.parametrize("penalty", [0.0, 0.05])
-def test_fit_minimises_the_convex_program(penalty: float) -> None:
-    """cvxpy on the last component's program, all coefficients free: the same minimum and map."""
-    import cvxpy as cp
-
-    from distfilt.triangular.separable import _earlier_features, _own_features
-
-    y, x, _ = banana(3, 120)
-    s = fit(y, x, order=2, regularisation=penalty)
-    joint = s._standard(y, x)
-    psi = _earlier_features(joint[:, :2], s.bumps[:, :2])
-    phi, rates = _own_features(joint[:, 2], s.steps[:, 1])
-    c, a = cp.Variable(psi.shape[1]), cp.Variable(phi.shape[1])
-    extra = cp.sum_squares(c[3:]) + cp.sum_squares(a[1:])
-    loss = cp.sum_squares(psi @ c + phi @ a) / 240 - cp.sum(cp.log(rates @ a)) / 120
-    problem = cp.Problem(cp.Minimize(loss + penalty / 2 * extra), [a >= [0.1, 0, 0]])
-    problem.solve(solver="CLARABEL", tol_gap_abs=1e-12, tol_gap_rel=1e-12, tol_feas=1e-12)
-    mine = [s.weights[1], s.slopes[1]]
-    value = (
-        ((psi @ mine[0] + phi @ mine[1]) ** 2).sum() / 240 - np.log(rates @ mine[1]).mean()
-        + penalty / 2 * ((mine[0][3:] ** 2).sum() + (mine[1][1:] ** 2).sum())
-    )
-    assert abs(value - problem.value) < 1e-8
-    assert np.abs(psi @ mine[0] + phi @ mine[1] - psi @ c.value - phi @ a.value).max() < 1e-4
-
-
 @given(st.integers(0, 10_000))
 def test_newton_stops_at_the_constrained_minimum(seed: int) -> None:
     """Kuhn-Tucker: no slope along free coefficients, none downwards at a bound."""
-    from distfilt.triangular._convex import _nonnegative
+    from distfilt.triangular.newton import _nonnegative
 
     rng = rng_of(seed)
     root = rng.standard_normal((5, 4, 4))
@@ -291,10 +182,10 @@ def test_fitted_bumps_stand_at_quantiles() -> None:
         assert np.allclose(s.steps[1, k], quantile[[2, 4, 6]] - quantile[[0, 2, 4]])
 
 
-def test_fit_minimises_a_program_built_by_hand() -> None:
+@pytest.mark.parametrize("penalty", [0.0, 0.05])
+def test_fit_minimises_a_program_built_by_hand(penalty: float) -> None:
     """No feature of the library's: the loss at its coefficients is below that of all neighbours."""
     y, x, _ = banana(32, 150)
-    penalty = 0.02
     s = fit(y, x, order=2, regularisation=penalty)
     v = (np.hstack([y, x]) - s.centre) / s.spread
 
@@ -322,9 +213,24 @@ def test_fit_minimises_a_program_built_by_hand() -> None:
                 assert loss(c, moved) > best
 
 
+def _one(*slopes: float) -> SeparableMap:
+    """A map of one variable, of a line and one step."""
+    step = np.array([[[0.0]], [[1.0]]])
+    return SeparableMap(np.zeros(1), np.ones(1), np.empty((2, 1, 0)), step, ((),), (np.zeros(1),),
+                        (np.array(slopes),))
+
+
 def test_inverse_of_a_map_that_hardly_has_a_line() -> None:
     """A line so flat that its ends are no use: the bracket is searched for."""
     for flat in (1e-9, 1e-3):
-        s = _raw(slopes=(np.array([flat, 1.0]),))
-        z = s(np.empty((3, 0)), [[-1.0], [0.3], [1.5]])
-        assert np.abs(s.inverse([], z) - [[-1.0], [0.3], [1.5]]).max() < 1e-9
+        z = _one(flat, 1.0)(np.empty((3, 0)), [[-1.0], [0.3], [1.5]])
+        assert np.abs(_one(flat, 1.0).inverse([], z) - [[-1.0], [0.3], [1.5]]).max() < 1e-9
+
+
+@pytest.mark.parametrize("z", [3.0, -0.1])
+def test_values_that_a_bounded_map_does_not_have_are_refused(z: float) -> None:
+    """Without a line the map's values lie between 0 and sqrt(2 pi)."""
+    with pytest.raises(ValueError, match="z: needs targets inside the range"):
+        _one(0.0, 1.0).inverse([], [[1.0], [z]])
+    with pytest.raises(ValueError, match="slopes: .* so that the map increases"):
+        _one(z, -1.0)

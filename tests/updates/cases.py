@@ -9,14 +9,12 @@ import numpy as np
 from distfilt.coupling import Constraint
 from distfilt.updates import (
     augmented,
-    centred,
-    clipped,
     ensemble_transform,
     exact_draws,
     gated,
     inflated,
-    informed_directions,
     known_noise,
+    localised,
     principal_components,
     projected,
     retracted,
@@ -43,17 +41,17 @@ FRESH = partial(ensemble_transform, rejuvenation=0.1)
 UPDATES = {
     "sampled_noise": sampled_noise,
     "known_noise": known_noise,
-    "shrunk": partial(known_noise, shrinkage=0.1, ridge=0.05),
     "exact_draws": exact_draws,
     "square_root": square_root,
     "transport": transport,
     "transport_sample": transport_sample,
     "principal_components": partial(principal_components, n_state=2, n_observed=2),
-    "informed_directions": informed_directions,
     "inflated": inflated(known_noise, factor=1.1),
     "gated": gated(known_noise),
-    "centred": centred(known_noise),
     "serial": serial(known_noise),
+    "localised": localised(
+        known_noise, places=np.zeros((3, 1)), readings=np.zeros((2, 1)), radius=9.0
+    ),
     "inflated gated serial": inflated(gated(serial(square_root)), factor=1.01),
     "ensemble_transform": FRESH,
     "ensemble_transform, corrected": partial(FRESH, correct=True),
@@ -63,14 +61,13 @@ UPDATES = {
     "projected transform": projected(FRESH, PLANE, reading="particle"),
     "retracted": retracted(known_noise, PLANE),
     "retracted transform": retracted(FRESH, PLANE),
-    "clipped": clipped(known_noise, PLANE),
 }
 CONSISTENT = [
     "sampled_noise", "known_noise", "exact_draws", "square_root", "transport", "transport_sample",
-    "informed_directions", "gated", "centred", "serial",
+    "gated", "serial", "localised",
 ]
 """Those whose moments tend to the Kalman filter's."""
-_WRAPPERS = ("augmented", "projected", "retracted", "clipped")
+_WRAPPERS = ("augmented", "projected", "retracted")
 CONSTRAINED = [name for name in UPDATES if name.startswith(_WRAPPERS)]
 """Those whose answer is not the one without the constraint."""
 

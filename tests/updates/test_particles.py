@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distfilt.updates import Particles, effective_size, jitter, resample, resampled
-from distfilt.updates.particles import RESAMPLING
+from distfilt.updates import effective_size, jitter, resampled
+from distfilt.updates.particles import copies, distinct_share, weighed
+
+RESAMPLING = ("systematic", "stratified", "multinomial")
 
 
 def rng(seed: int = 0) -> np.random.Generator:
@@ -27,21 +29,16 @@ def test_counts_are_where_the_rule_says(seed: int, n: int, rule: str) -> None:
         assert np.abs(counts - n * w).max() < 1 + 1e-9
     if rule == "stratified":
         assert np.abs(counts - n * w).max() < 2 + 1e-9
-    if rule == "residual":
-        assert (counts >= np.floor(n * w - 1e-9)).all()
-        assert np.abs(counts - n * w).max() < 1 + 1e-9
+    assert np.array_equal(np.sort(picked), picked)
 
 
 @pytest.mark.parametrize("rule", RESAMPLING)
 def test_resampling_is_unbiased(rule: str) -> None:
     w = np.array([0.5, 0.1, 0.0, 0.4])
-    points = np.tile(np.arange(4.0)[:, None], (20_000, 1, 1))
-    cloud = Particles(points, np.tile(np.log(w + 1e-300), (20_000, 1)))
-    fresh = resample(cloud, rng=rng(13), rule=rule)
-    shares = np.bincount(fresh.points.astype(int).ravel(), minlength=4) / fresh.points.size
+    picked = resampled(np.tile(w, (20_000, 1)), rng=rng(13), rule=rule)
+    shares = np.bincount(picked.ravel(), minlength=4) / picked.size
     # Four standard errors of the loosest rule, independent draws.
     assert np.allclose(shares, w, atol=4 * 0.5 / np.sqrt(80_000))
-    assert np.allclose(effective_size(fresh.log_weights), 4.0)
 
 
 def test_systematic_has_the_smallest_variance_and_multinomial_the_largest() -> None:
@@ -52,7 +49,6 @@ def test_systematic_has_the_smallest_variance_and_multinomial_the_largest() -> N
         for rule in RESAMPLING
     }
     assert spread["systematic"] < spread["stratified"] < 0.7 * spread["multinomial"]
-    assert spread["residual"] < 0.7 * spread["multinomial"]
 
 
 def test_systematic_is_the_inverse_of_the_distribution_function() -> None:
@@ -71,15 +67,15 @@ def test_effective_size_between_one_and_n() -> None:
     assert effective_size(np.log([0.5, 0.5])) == pytest.approx(2.0)
 
 
-def test_moments_with_weights_far_apart() -> None:
-    x = rng(1).standard_normal((6, 2))
-    w = np.array([0.1, 0.2, 0.3, 0.15, 0.25, 0.0])
-    with np.errstate(divide="ignore"):
-        cloud = Particles(x, np.log(w) - 800.0)
-    mean = w @ x
-    assert np.allclose(cloud.mean, mean)
-    assert np.allclose(cloud.covariance, (x - mean).T @ (w[:, None] * (x - mean)))
-    assert np.allclose(cloud.weights, w)
+def test_weights_by_bayes_rule_with_a_missing_component() -> None:
+    """Log-weights plus a Gaussian's exponent, normalised; a full noise matrix, a part of it."""
+    h, before = rng(1).standard_normal((6, 2)), np.log(rng(2).dirichlet(np.ones(6)))
+    noise, y = np.array([[0.5, 0.3], [0.3, 0.9]]), np.array([0.4, -0.2])
+    both = before - 0.5 * np.einsum("ni,ij,nj->n", y - h, np.linalg.inv(noise), y - h)
+    one = before - 0.5 * (y[0] - h[:, 0]) ** 2 / 0.5
+    for seen, wanted in ((y, both), (np.array([y[0], np.nan]), one)):
+        w = np.exp(wanted) / np.exp(wanted).sum()
+        assert np.allclose(np.exp(weighed(before, h, seen, noise)), w)
 
 
 def test_jitter_keeps_mean_and_covariance_on_average() -> None:
@@ -103,29 +99,12 @@ def test_jitter_s_default_is_silverman_s() -> None:
     assert np.array_equal(jitter(x, rng=rng(1)), jitter(x, rng=rng(1), bandwidth=h))
 
 
-BAD_INPUT = {
-    "distfilt.updates.particles.Particles": [
-        ("points", lambda: Particles([1.0], [0.0])),
-        ("log_weights", lambda: Particles([[1.0]], [0.0, 0.0])),
-        ("log_weights", lambda: Particles([[1.0]], [np.nan])),
-        ("log_weights", lambda: Particles([[1.0]], [-np.inf])),
-    ],
-    "distfilt.updates.particles.effective_size": [
-        ("log_weights", lambda: effective_size([np.inf, 0.0])),
-    ],
-    "distfilt.updates.particles.resampled": [
-        ("probabilities", lambda: resampled([0.5, 0.6], rng=rng())),
-        ("rule", lambda: resampled([0.5, 0.5], rng=rng(), rule="best")),
-        ("rng", lambda: resampled([0.5, 0.5], rng=3)),
-    ],
-    "distfilt.updates.particles.resample": [
-        ("particles", lambda: resample(np.zeros((3, 1)), rng=rng())),
-        ("rule", lambda: resample(Particles([[1.0]], [0.0]), rng=rng(), rule="best")),
-    ],
-    "distfilt.updates.particles.jitter": [
-        ("points", lambda: jitter([1.0], rng=rng())),
-        ("bandwidth", lambda: jitter([[1.0]], rng=rng(), bandwidth=2.0)),
-        ("cov", lambda: jitter([[1.0]], rng=rng(), cov=[[-1.0]])),
-    ],
-}
-EXEMPT = {"distfilt.updates.particles.RESAMPLING": "names"}
+def test_jitter_of_copies_moves_them_only_and_from_the_covariance_given() -> None:
+    picked = np.tile([0, 0, 1, 2, 2, 2, 3], (4000, 1))
+    assert np.array_equal(copies(picked)[0], [1, 1, 0, 1, 1, 1, 0])
+    x, cov = picked[..., None] * np.array([1.0, -2.0]), np.array([[2.0, 0.6], [0.6, 0.5]])
+    out = jitter(x, rng=rng(), bandwidth=0.5, cov=cov, copied=copies(picked))
+    assert (out[:, [2, 6]] == x[:, [2, 6]]).all() and (distinct_share(out) == 1).all()
+    moved = (out - x)[:, [0, 1, 3, 4, 5]].reshape(-1, 2)
+    assert np.abs(moved.mean(axis=0)).max() < 4 * 0.5 * np.sqrt(2 / len(moved))
+    assert np.allclose(np.cov(moved.T), 0.25 * cov, atol=4 * 0.25 * 2 * np.sqrt(2 / len(moved)))

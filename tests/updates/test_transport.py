@@ -1,21 +1,25 @@
-"""Updates by transport: principal and informed directions, direct sampling, and what maps keep."""
+"""Updates by transport: principal directions, direct sampling, what maps keep, and couplings."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from distfilt.coupling import ensemble_transform as transform
 from distfilt.ensembles import sample_covariance
 from distfilt.triangular import affine
 from distfilt.updates import (
-    informed_directions,
-    known_noise,
+    ensemble_transform,
     principal_components,
     principal_directions,
     transport,
     transport_sample,
 )
+from distfilt.updates.particles import ParticleCollapse, log_likelihood
+
+from .cases import COV, MEAN, H, R, Y, kalman, members
 
 
 def _rng(seed: int = 0) -> np.random.Generator:
@@ -66,7 +70,7 @@ def test_pca_with_all_directions_is_the_whole_update() -> None:
     y, x = _samples(7)
     inputs = (x, y, np.zeros(2), np.diag([0.3, 0.2]))
     whole = transport(*inputs, rng=_rng(3))
-    for complement in ("keep", "drop", "literal"):
+    for complement in ("keep", "literal"):
         out = principal_components(
             *inputs, rng=_rng(3), n_state=3, n_observed=5, complement=complement
         )
@@ -74,71 +78,18 @@ def test_pca_with_all_directions_is_the_whole_update() -> None:
 
 
 def test_pca_complement() -> None:
-    """Outside the leading directions: kept, set to the mean, or lost with the mean."""
+    """Outside the leading directions: kept, or lost with the mean."""
     y, x = _samples(7)
     inputs = (x, y, np.zeros(2), np.diag([0.3, 0.2]))
     w = principal_directions(x, 2)
     outside = np.eye(3) - w @ w.T
     out = {
         c: principal_components(*inputs, rng=_rng(3), n_state=2, n_observed=2, complement=c)
-        for c in ("keep", "drop", "literal")
+        for c in ("keep", "literal")
     }
     assert np.allclose(out["keep"] @ outside, x @ outside, atol=1e-9)
-    assert np.allclose(out["drop"] @ outside, (x @ outside).mean(axis=0), atol=1e-9)
     assert np.allclose(out["literal"] @ outside, 0, atol=1e-9)
     assert np.allclose(out["keep"] @ w, out["literal"] @ w, atol=1e-8)
-
-
-def test_another_fit_can_be_handed_in() -> None:
-    y, x = _samples(9, n=40, m=1, d=2)
-    x, y = x / x.std(axis=0), y / y.std(axis=0)
-    inputs = (x, y, np.zeros(1), np.eye(1))
-    closed = transport(*inputs, rng=_rng(3))
-    solved = transport(*inputs, rng=_rng(3), fit=affine.fit_convex)
-    assert np.abs(closed - solved).max() < 1e-6
-
-
-def test_known_noise_has_the_smaller_error_in_small_ensembles() -> None:
-    """Posterior means of 4000 ensembles of 8 members, four components, all observed."""
-    rng = _rng(5)
-    x = rng.standard_normal((4000, 10, 4))
-    inputs = (x, x, np.ones((4000, 4)), np.eye(4))
-    error = {
-        name: ((update(*inputs, rng=_rng(6)).mean(axis=1) - 0.5) ** 2).mean()
-        for name, update in (("sampled", transport), ("known", known_noise))
-    }
-    assert error["known"] < 0.8 * error["sampled"]
-
-
-def test_shrinkage_and_ridge_have_their_limits() -> None:
-    y, x = _samples(11)
-    inputs = (x, y, np.zeros(2), np.diag([0.3, 0.2]))
-    plain = known_noise(*inputs, rng=_rng(3))
-    none = known_noise(*inputs, rng=_rng(3), shrinkage=1.0)
-    assert np.array_equal(none, x)
-    assert np.abs(known_noise(*inputs, rng=_rng(3), ridge=1e12) - x).max() < 1e-6
-    little = known_noise(*inputs, rng=_rng(3), shrinkage=1e-9, ridge=1e-9)
-    assert np.abs(little - plain).max() < 1e-5
-
-
-def test_informed_directions_without_a_threshold_leaves_nothing_out() -> None:
-    y, x = _samples(13, leading=(4,))
-    inputs = (x, y, np.zeros((4, 2)), np.array([[0.3, 0.1], [0.1, 0.2]]))
-    whole = known_noise(*inputs, rng=_rng(3))
-    assert np.abs(informed_directions(*inputs, rng=_rng(3), threshold=0.0) - whole).max() < 1e-8
-    assert np.array_equal(informed_directions(*inputs, rng=_rng(3), threshold=1e12), x)
-
-
-def test_informed_directions_do_not_depend_on_units() -> None:
-    y, x = _samples(14)
-    units, noise, target = np.diag([1e3, 1e-2]), np.diag([0.3, 0.2]), np.zeros(2)
-    level = np.linalg.eigvalsh(sample_covariance(y) / np.sqrt(np.outer([0.3, 0.2], [0.3, 0.2])))
-    for threshold in (0.0, level.mean()):
-        plain = informed_directions(x, y, target, noise, rng=_rng(3), threshold=threshold)
-        other = informed_directions(
-            x, y @ units, target, units @ noise @ units, rng=_rng(3), threshold=threshold
-        )
-        assert np.allclose(plain, other, atol=1e-8)
 
 
 def test_direct_sampling_and_the_composed_map_agree_where_the_map_fits() -> None:
@@ -180,29 +131,60 @@ def test_noise_factor_scales_the_draw_and_nothing_else() -> None:
         assert np.allclose(pca, wanted, atol=1e-8)
 
 
-BAD_INPUT = {
-    "distfilt.updates.transport.transport": [
-        ("noise_factor", lambda: transport(np.ones((3, 1)), np.ones((3, 1)), [0.0], [[1.0]],
-                                           rng=_rng(), noise_factor=-1)),
-        ("ensemble", lambda: transport(np.ones(3), np.ones((3, 1)), [0.0], [[1.0]], rng=_rng())),
-    ],
-    "distfilt.updates.transport.transport_sample": [
-        ("observed", lambda: transport_sample(np.eye(3), np.eye(3), [0.0], np.eye(3), rng=_rng())),
-    ],
-    "distfilt.updates.transport.principal_components": [
-        ("n_state", lambda: principal_components(np.eye(3), np.eye(3), np.zeros(3), np.eye(3),
-                                                 rng=_rng(), n_state=4, n_observed=1)),
-        ("n_observed", lambda: principal_components(np.eye(3), np.eye(3), np.zeros(3), np.eye(3),
-                                                    rng=_rng(), n_state=1, n_observed=0)),
-        ("complement", lambda: principal_components(np.eye(3), np.eye(3), np.zeros(3), np.eye(3),
-                                                    rng=_rng(), n_state=1, n_observed=1,
-                                                    complement="lose")),
-    ],
-    "distfilt.updates.transport.principal_directions": [
-        ("n", lambda: principal_directions(np.eye(3), 4)),
-    ],
-    "distfilt.updates.transport.informed_directions": [
-        ("threshold", lambda: informed_directions(np.eye(3), np.eye(3), np.zeros(3), np.eye(3),
-                                                  rng=_rng(), threshold=-1)),
-    ],
-}
+def _weights(x: np.ndarray) -> np.ndarray:
+    gap = Y - x @ H.T
+    w = np.exp(-0.5 * np.einsum("ni,ij,nj->n", gap, np.linalg.inv(R), gap))
+    return np.asarray(w / w.sum())
+
+
+def test_the_update_by_its_formula() -> None:
+    x = members(40)
+    out = ensemble_transform(x, x @ H.T, Y, R, rng=_rng())
+    assert np.allclose(out, transform(x, np.log(_weights(x))), atol=1e-10)
+    assert np.abs(out.mean(axis=0) - _weights(x) @ x).max() < 1e-13
+
+
+def test_the_moments_tend_to_the_kalman_filter_s() -> None:
+    """Mean and covariance within five standard errors at N = 900; the noise matrix is full."""
+    means, covs = [], []
+    for seed in range(6):
+        x = members(900, seed=seed)
+        out = ensemble_transform(x, x @ H.T, Y, R, rng=_rng(), correct=True)
+        means.append(out.mean(axis=0))
+        covs.append(np.cov(out.T))
+    mean, cov = kalman(MEAN, COV, H, R, Y)
+    assert (np.abs(np.mean(means, axis=0) - mean)
+            < 5 * np.std(means, axis=0, ddof=1) / 6**0.5 + 0.01).all()
+    assert (np.abs(np.mean(covs, axis=0) - cov)
+            < 5 * np.std(covs, axis=0, ddof=1) / 6**0.5 + 0.02).all()
+
+
+def test_a_reading_far_away_underflows_nothing_and_warns() -> None:
+    x = members(40)
+    with pytest.warns(ParticleCollapse, match="effective size of 1"):
+        out = ensemble_transform(x, x @ H.T, Y + 1e4, R, rng=_rng())
+    assert np.isfinite(out).all()
+
+
+def test_a_spread_that_is_lost_warns() -> None:
+    """Weights of members that have run together are equal: the reading tells."""
+    x = MEAN + 1e-3 * (members(40) - MEAN)
+    near = x.mean(axis=0) @ H.T
+    ensemble_transform(x, x @ H.T, near + 3 * np.sqrt(np.diagonal(R)), R, rng=_rng())
+    with pytest.warns(ParticleCollapse, match="squared distance"):
+        ensemble_transform(x, x @ H.T, near + 6 * np.sqrt(np.diagonal(R)), R, rng=_rng())
+
+
+def test_nothing_is_drawn_without_rejuvenation() -> None:
+    x = members(30)
+    a, b = (ensemble_transform(x, x @ H.T, Y, R, rng=_rng(s)) for s in (1, 2))
+    assert (a == b).all()
+    c, d = (ensemble_transform(x, x @ H.T, Y, R, rng=_rng(s), rejuvenation=0.2) for s in (1, 2))
+    assert (c != d).any()
+    assert np.abs(c.mean(axis=0) - a.mean(axis=0)).max() < 1e-13
+
+
+def test_likelihoods_of_a_full_noise_matrix() -> None:
+    x = members(9)
+    logs = log_likelihood(x @ H.T, Y, R)
+    assert np.allclose(np.exp(logs - logs.max()), _weights(x) / _weights(x).max())
