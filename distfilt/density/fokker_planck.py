@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,15 +42,6 @@ class _Faces:
     right: NDArray[np.int64]
     axis: NDArray[np.int64]
     width: Array
-
-
-def _faces(grid: Grid) -> _Faces:
-    cells = np.arange(grid.size).reshape(grid.shape)
-    left = [np.delete(cells, -1, axis=k).ravel() for k in range(grid.dim)]
-    right = [np.delete(cells, 0, axis=k).ravel() for k in range(grid.dim)]
-    axis = np.repeat(np.arange(grid.dim), [len(cells) for cells in left])
-    a, b = np.concatenate(left), np.concatenate(right)
-    return _Faces(0.5 * (grid.centres[a] + grid.centres[b]), a, b, axis, grid.spacing[axis])
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,17 +100,13 @@ class FokkerPlanck(Record):
 
     @cached_property
     def _faces(self) -> _Faces:
-        return _faces(self.grid)
-
-    @cached_property
-    def _pattern(self) -> tuple[Any, Any, NDArray[np.int64]]:
-        """Index pointers and indices of the sparse matrix, and where each entry goes in them."""
-        n, f = self.grid.size, self._faces
-        rows = np.concatenate([np.arange(n), f.right, f.left])
-        columns = np.concatenate([np.arange(n), f.left, f.right])
-        order = np.lexsort((rows, columns))
-        pointers = np.concatenate([[0], np.cumsum(np.bincount(columns, minlength=n))])
-        return pointers.astype(np.int32), rows[order].astype(np.int32), order
+        grid = self.grid
+        cells = np.arange(grid.size).reshape(grid.shape)
+        left = [np.delete(cells, -1, axis=k).ravel() for k in range(grid.dim)]
+        right = [np.delete(cells, 0, axis=k).ravel() for k in range(grid.dim)]
+        axis = np.repeat(np.arange(grid.dim), [len(cells) for cells in left])
+        a, b = np.concatenate(left), np.concatenate(right)
+        return _Faces(0.5 * (grid.centres[a] + grid.centres[b]), a, b, axis, grid.spacing[axis])
 
     @door
     def rates(self, t: float) -> tuple[Array, Array]:
@@ -146,8 +133,9 @@ class FokkerPlanck(Record):
         n, f = self.grid.size, self._faces
         leaving = np.bincount(f.left, forwards, n) + np.bincount(f.right, backwards, n)
         data = np.concatenate([identity - scale * leaving, scale * forwards, scale * backwards])
-        pointers, indices, order = self._pattern
-        return sparse.csc_array((data[order], indices, pointers), (n, n))
+        rows = np.concatenate([np.arange(n), f.right, f.left])
+        columns = np.concatenate([np.arange(n), f.left, f.right])
+        return sparse.csc_array((data, (rows, columns)), (n, n))
 
     @door
     def generator(self, t: float) -> sparse.csc_array:

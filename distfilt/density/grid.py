@@ -25,7 +25,7 @@ class Grid(Record):
     ----------
     shape : tuple of int
         Cells along each axis, at least 2 each.
-    low, high : array_like, (d,), optional
+    low, high : array_like, (d,), or float, optional
         The box's corners; zeros and ones by default.
 
     Examples
@@ -38,31 +38,25 @@ class Grid(Record):
     """
 
     shape: tuple[Annotated[int, Bounds(at_least=2)], ...]
-    low: Annotated[Array, "d"] | None = field(default=None, kw_only=True)
-    high: Annotated[Array, "d"] | None = field(default=None, kw_only=True)
+    low: Annotated[Array, "..."] = field(default_factory=lambda: np.zeros(()), kw_only=True)
+    high: Annotated[Array, "..."] = field(default_factory=lambda: np.ones(()), kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        d = len(self.shape)
-        if not 1 <= d <= 3:
+        if not 1 <= self.dim <= 3:
             raise ValueError(f"shape: needs one to three sizes, got {self.shape!r}")
-        for name, default in (("low", np.zeros(d)), ("high", np.ones(d))):
-            corner = default if getattr(self, name) is None else getattr(self, name)
-            if corner.shape != (d,):
-                raise ValueError(f"{name}: needs {d} numbers, got {corner.size}")
-            object.__setattr__(self, name, corner)
+        for name in ("low", "high"):
+            corner = getattr(self, name)
+            if corner.shape not in ((), (self.dim,)):
+                raise ValueError(f"{name}: needs {self.dim} numbers, got {corner.size}")
+            object.__setattr__(self, name, np.broadcast_to(corner, (self.dim,)))
         if (self.width <= 0).any():
             raise ValueError(f"high: needs corners above low = {self.low}, got {self.high}")
 
     @cached_property
-    def corner(self) -> Array:
-        """The lower corner, (d,)."""
-        return np.asarray(self.low, dtype=np.float64)
-
-    @cached_property
     def width(self) -> Array:
         """Width of the box along each axis, (d,)."""
-        return np.asarray(np.asarray(self.high, dtype=np.float64) - self.corner)
+        return np.asarray(self.high - self.low)
 
     @property
     def box(self) -> float:
@@ -97,7 +91,7 @@ class Grid(Record):
     @cached_property
     def edges(self) -> tuple[Array, ...]:
         """Edges of the cells along each axis, (n_k + 1,)."""
-        ends = zip(self.corner, self.corner + self.width, self.shape, strict=True)
+        ends = zip(self.low, self.low + self.width, self.shape, strict=True)
         return tuple(np.linspace(low, high, n + 1) for low, high, n in ends)
 
     @cached_property
@@ -108,7 +102,7 @@ class Grid(Record):
 
     def _inside(self, positions: Array, name: str = "positions") -> Array:
         """Positions (..., d); those outside the box are refused."""
-        outside = ((positions < self.corner) | (positions > np.asarray(self.high))).any(axis=-1)
+        outside = ((positions < self.low) | (positions > self.high)).any(axis=-1)
         if outside.any():
             raise ValueError(
                 f"{name}: needs agents inside the grid's box, got {int(outside.sum())} outside, "
@@ -137,7 +131,7 @@ class Grid(Record):
     @door
     def cells(self, positions: Annotated[Array, "... self.dim"]) -> NDArray[np.int64]:
         """Number of the cell in which each of the positions (..., d) lies, (...)."""
-        at = ((self._inside(positions) - self.corner) / self.spacing).astype(np.int64)
+        at = ((self._inside(positions) - self.low) / self.spacing).astype(np.int64)
         at = np.minimum(at, np.array(self.shape) - 1)
         return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(at, -1, 0)), self.shape))
 
@@ -155,7 +149,7 @@ class Grid(Record):
     ) -> Array:
         """Multilinear interpolation of cell values (n,) at positions (..., d); flat at walls."""
         v = values.reshape(self.shape)
-        place = (self._inside(positions) - self.corner) / self.spacing - 0.5
+        place = (self._inside(positions) - self.low) / self.spacing - 0.5
         first = np.clip(np.floor(place), 0, np.array(self.shape) - 2).astype(np.int64)
         share = np.clip(place - first, 0.0, 1.0)
         out = np.zeros(positions.shape[:-1])
@@ -181,8 +175,7 @@ class Grid(Record):
 
     def _same_box(self, other: Any) -> bool:
         """Whether another grid, or a swarm, fills the same box."""
-        low, high = np.asarray(other.low), np.asarray(other.high)
-        return np.array_equal(low, self.corner) and np.array_equal(high, np.asarray(self.high))
+        return np.array_equal(self.low, other.low) and np.array_equal(self.high, other.high)
 
     @door
     def wavenumbers(self, rank: Count) -> NDArray[np.int64]:
@@ -215,7 +208,7 @@ class Grid(Record):
         True
         """
         if rank not in self._kept:
-            x = (self.centres - self.corner) / self.width
+            x = (self.centres - self.low) / self.width
             waves = np.cos(np.pi * x[:, None, :] * self.wavenumbers(rank)).prod(axis=-1)
             self._kept[rank] = np.asarray(waves / np.sqrt((waves**2).sum(axis=0) * self.volume))
             self._kept[rank].setflags(write=False)

@@ -28,7 +28,7 @@ __all__ = [  # fmt: skip
 
 Length = Annotated[float, Bounds(above=0, at_most=1e100)]
 Move = Callable[[Array], Array]
-Seen = Annotated[Array, "*state.base.shape"] | Annotated[Array, "state.size"]
+Observed = Annotated[Array, "*state.base.shape"] | Annotated[Array, "state.size"]
 
 
 @door
@@ -310,7 +310,7 @@ def _compressed(factor: Array, rank: int) -> tuple[Array, float]:
 
 
 @door
-def low_rank_step(state: LowRank, observed: Seen, noise: ArrayLike, dt: Positive) -> LowRank:
+def low_rank_step(state: LowRank, observed: Observed, noise: ArrayLike, dt: Positive) -> LowRank:
     r"""All filters take in a measurement each: one matrix product.
 
     .. math::

@@ -73,10 +73,7 @@ class Seen(Record):
 
     def near(self, radius: float) -> Graph:
         """The graph of a radio's range, without links to agents that are gone."""
-        here = np.flatnonzero(self.present)
-        found = disk(self.positions[here], radius)
-        pairs = np.stack([here[found.receivers], here[found.senders]], axis=1)
-        return found if self.present.all() else Graph.from_edges(len(self.positions), pairs)
+        return present_graph(disk(self._or(self.grid.low), radius), self.present)
 
     def only_here(self, payloads: Array) -> list[Array | None]:
         """What each agent sends, None for those that are gone."""
@@ -120,7 +117,7 @@ class Seen(Record):
         Its standard deviation is .3 of the box's side, unless it is given.
         """
         width = 0.3 * self.grid.side if std is None else std
-        centre = self._or(self.grid.corner + 0.5 * self.grid.width)
+        centre = self._or(self.grid.low + 0.5 * self.grid.width)
         gap = ((self.grid.centres - centre[:, None, :]) ** 2).sum(axis=-1)
         return self.grid.normalised(np.exp(-0.5 * gap / width**2))
 

@@ -179,9 +179,12 @@ def enough(y: Array, x: Array, members: int) -> Array:
 
 
 def refuse(wrong: NDArray[np.bool_], m: int, needs: str) -> None:
-    """An error if variables (..., m + d) are not what a fit needs, y blamed before x."""
-    if wrong.any():
-        raise ValueError(f"{'y' if wrong[..., :m].any() else 'x'}: needs {needs}")
+    """An error if a variable of (..., m + d) is not what a fit needs, y blamed before x."""
+    columns = np.flatnonzero(wrong.reshape(-1, wrong.shape[-1]).any(axis=0))
+    if columns.size:
+        k = int(columns[0])
+        name, column = ("y", k) if k < m else ("x", k - m)
+        raise ValueError(f"{name}: needs variables that {needs}, got one in column {column}")
 
 
 @door
@@ -233,8 +236,7 @@ def from_rows(u: Array, observed_mean: Array) -> AffineMap:
 
 def _cholesky(cov: Array, mean: Array, m: int) -> Array:
     """Factor of the joint covariance of (y, x); an error says which of them is to blame."""
-    needs = ("variables that are not constant and not combinations of others, "
-             "got a sample covariance that is not positive definite")
+    needs = "are not constant and not combinations of others"
     variance = np.diagonal(cov, axis1=-2, axis2=-1)
     try:
         lower = np.asarray(np.linalg.cholesky(cov))
@@ -242,8 +244,8 @@ def _cholesky(cov: Array, mean: Array, m: int) -> Array:
         try:
             np.linalg.cholesky(cov[..., :m, :m])
         except np.linalg.LinAlgError:
-            raise ValueError(f"y: needs {needs}") from None
-        raise ValueError(f"x: needs {needs}") from None
+            raise ValueError(f"y: needs variables that {needs}") from None
+        raise ValueError(f"x: needs variables that {needs}") from None
     # Rounding may leave a repeated variable a tiny variance of its own.
     left = np.diagonal(lower, axis1=-2, axis2=-1) ** 2
     refuse((left <= _ROUNDING * variance) | (variance <= (_ROUNDING * mean) ** 2), m, needs)

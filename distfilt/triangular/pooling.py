@@ -140,7 +140,7 @@ def _joint(y: Array, x: Array) -> Array:
     """All agents' variables, refused where they cannot have a map."""
     joint = enough(y, x, x.shape[-3] * x.shape[-2])
     constant = np.ptp(joint, axis=(-3, -2)) <= 1e-13 * np.abs(joint).max(axis=(-3, -2))
-    refuse(constant, y.shape[-1], "variables that are not constant, got one")
+    refuse(constant, y.shape[-1], "are not constant")
     return joint
 
 

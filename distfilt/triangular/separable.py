@@ -231,7 +231,7 @@ def fit(
     centre = unchecked(ensembles.mean)(joint)
     joint -= centre[..., None, :]
     spread = np.sqrt((joint**2).mean(axis=-2))
-    refuse(spread <= 1e-13 * np.abs(centre), m, "variables that are not constant, got one")
+    refuse(spread <= 1e-13 * np.abs(centre), m, "are not constant")
     joint /= spread[..., None, :]
     _refuse_combinations(joint, allowed, m)
     bumps, steps = _nodes(joint, p, m), _nodes(joint[..., m:], q, 0)
@@ -276,6 +276,5 @@ def _nodes(joint: Array, n: int, m: int) -> Array:
     levels = np.arange(1, 2 * n + 2) / (2 * (n + 1))
     found = np.moveaxis(np.quantile(joint, levels, axis=-2), 0, -1)
     widths = found[..., 2::2] - found[..., :-2:2]
-    needs = "quantiles that differ for its basis functions, got many equal values in one variable"
-    refuse(np.any(widths <= 0, axis=-1), m, needs)
+    refuse(np.any(widths <= 0, axis=-1), m, "have quantiles that differ for the basis functions")
     return np.stack([found[..., 1::2], widths])
