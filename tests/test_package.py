@@ -44,7 +44,7 @@ FLOORS = {
 }
 # A heavy package has a home; all of them are imported inside functions only.
 HOMES = {
-    "cvxpy": {"triangular", "coupling"},
+    "cvxpy": {"triangular"},
     "ot": {"coupling"},
     "filterpy": {"kalman"},
     "networkx": {"network"},

@@ -1,29 +1,30 @@
 r"""Constraints :math:`\mathbf g(\mathbf x)=\mathbf d` on members: projection and retraction.
 
-Equations (2) and (6)-(13) of Das and Bhattacharya, with what they leave open as options.
+Equations (2) and (6)-(12) of Das and Bhattacharya, with what they leave open as options.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from ..checks import Array, SolverError, array, callable_, choice, count, instance, number, places
-from ..differences import _central
+from ..doors import Array, Count, NonNegative, Places, Positive, Record, array, door, unchecked
+from ..linalg import SolverError, central
 
-__all__ = [  # fmt: skip
-    "READINGS", "Constraint", "norm", "project", "retract",
-]
+__all__ = ["Constraint", "norm", "project", "retract"]
 
-READINGS = ("printed", "reversed", "particle", "shift")
+Reading = Literal["printed", "reversed", "particle", "shift"]
 """Four readings of (12): the gain times D_i - d̂, d̂ - D_i, d - D_i, or d - d̂."""
+Motion = tuple[Places, Places]
+"""Indices of positions and of their velocities, in the same order."""
 
 
 @dataclass(frozen=True, eq=False)
-class Constraint:
+class Constraint(Record):
     """What every state obeys, g(x) = d.
 
     Parameters
@@ -43,49 +44,37 @@ class Constraint:
     """
 
     function: Callable[[Array], Array]
-    value: Array
+    value: Annotated[Array, "s"]
     derivative: Callable[[Array], Array] | None = field(default=None, kw_only=True)
 
-    def __post_init__(self) -> None:
-        callable_(self.function, "function")
-        value = array(self.value, "value", ("s",)).copy()
-        count(value.size, "value")
-        value.setflags(write=False)
-        object.__setattr__(self, "value", value)
-        if self.derivative is not None:
-            callable_(self.derivative, "derivative")
-
-    def residual(self, x: ArrayLike) -> Array:
+    @door
+    def residual(self, x: Annotated[Array, "... d"]) -> Array:
         """By how much states (..., d) miss, g(x) - d, (..., s)."""
-        return self._residual(array(x, "x", (..., "d")))
+        out = self.missed(x)
+        if not np.isfinite(out).all():
+            at = np.argwhere(~np.isfinite(out))[0, :-1].tolist()
+            raise ValueError(f"function: needs finite values, got NaN or infinity at state {at}")
+        return out
 
-    def _residual(self, x: Array) -> Array:
+    def missed(self, x: Array) -> Array:
+        """The same without a door, for trial steps: NaN where the function has no value."""
         try:
-            g = np.asarray(self.function(x.copy()))
+            g = self.function(x.copy())
         except IndexError as error:
             raise ValueError(f"function: needs states of more components, got {x.shape}") from error
-        if g.shape != (*x.shape[:-1], self.value.size):
-            raise ValueError(
-                f"function: needs to return {(*x.shape[:-1], self.value.size)} for states "
-                f"{x.shape}, got {g.shape}"
-            )
-        return np.asarray(g - self.value)
+        return array(g, "function", (*x.shape[:-1], self.value.size), finite=False) - self.value
 
-    def jacobian(self, x: ArrayLike) -> Array:
+    @door
+    def jacobian(self, x: Annotated[Array, "... d"]) -> Array:
         """Derivative of g at states (..., d), (..., s, d)."""
-        return self._jacobian(array(x, "x", (..., "d")))
-
-    def _jacobian(self, x: Array) -> Array:
         if self.derivative is None:
-            return _central(self._residual, x, np.subtract)
-        slope = np.asarray(self.derivative(x.copy()))
-        needed = (*x.shape[:-1], self.value.size, x.shape[-1])
-        if slope.shape != needed:
-            raise ValueError(f"derivative: needs to return shape {needed}, got {slope.shape}")
-        return slope
+            return central(self.missed, x)
+        shape = (*x.shape[:-1], self.value.size, x.shape[-1])
+        return array(self.derivative(x.copy()), "derivative", shape)
 
 
-def norm(indices: Sequence[int], *, length: float = 1.0) -> Constraint:
+@door
+def norm(indices: Places, *, length: Positive = 1.0) -> Constraint:
     r"""Some components form a vector of given length, :math:`|\mathbf x_I|^2=L^2`.
 
     Parameters
@@ -100,8 +89,7 @@ def norm(indices: Sequence[int], *, length: float = 1.0) -> Constraint:
     >>> norm([0, 1]).residual([0.6, 0.8, 5.0]).round(15) + 0.0
     array([0.])
     """
-    rows = list(places(indices, "indices"))
-    size = number(length, "length", above=0, at_most=1e150)
+    rows = list(indices)
 
     def squares(x: Array) -> Array:
         return np.asarray((x[..., rows] ** 2).sum(axis=-1, keepdims=True))
@@ -111,20 +99,13 @@ def norm(indices: Sequence[int], *, length: float = 1.0) -> Constraint:
         out[..., 0, rows] = 2 * x[..., rows]
         return out
 
-    return Constraint(squares, np.array([size**2]), derivative=slope)
+    return Constraint(squares, np.array([length**2]), derivative=slope)
 
 
-def _constraint(value: Constraint) -> Constraint:
-    return instance(value, "constraint", Constraint)
-
-
+@door
 def project(
-    ensemble: ArrayLike,
-    constraint: Constraint,
-    *,
-    reading: str = "shift",
-    regularisation: float = 1e-6,
-    guarded: bool = True,
+    ensemble: Annotated[Array, "... N d"], constraint: Constraint, *, reading: Reading = "shift",
+    regularisation: NonNegative = 1e-6, guarded: bool = True,
 ) -> Array:
     r"""Regress the members on the constraint and correct them, equations (6)-(12).
 
@@ -143,7 +124,7 @@ def project(
         Members, at least two.
     constraint : Constraint
     reading : {"printed", "reversed", "particle", "shift"}
-        `READINGS`.
+        Of (12), as above.
     regularisation : float
         ε, at least 0, in the units of g squared: on the manifold the covariance is singular.
     guarded : bool
@@ -169,47 +150,31 @@ def project(
     >>> bool(abs(line.residual(y)).max() < 1e-14)
     True
     """
-    x = array(ensemble, "ensemble", (..., "N", "d"))
-    if x.shape[-2] < 2:
-        raise ValueError(f"ensemble: needs at least 2 members, got {x.shape[-2]}")
-    choice(reading, "reading", READINGS)
-    eps = number(regularisation, "regularisation", at_least=0)
-    guard = instance(guarded, "guarded", bool)
-    return _project(x, _constraint(constraint), reading, eps, guard)
-
-
-def _project(x: Array, constraint: Constraint, reading: str, eps: float, guarded: bool) -> Array:
-    gap = constraint._residual(x)
+    x, n = ensemble, ensemble.shape[-2]
+    if n < 2:
+        raise ValueError(f"ensemble: needs at least 2 members, got {n}")
+    gap = unchecked(constraint.residual)(x)
     mean = gap.mean(axis=-2, keepdims=True)
     anomalies = gap - mean
-    n = x.shape[-2]
     around = x - x.mean(axis=-2, keepdims=True)
-    spread = np.swapaxes(anomalies, -1, -2) @ anomalies / n + eps * np.eye(gap.shape[-1])
-    cross = np.swapaxes(anomalies, -1, -2) @ around / n
-    gain = np.linalg.solve(spread, cross)
+    spread = anomalies.mT @ anomalies / n + regularisation * np.eye(gap.shape[-1])
+    gain = np.linalg.solve(spread, anomalies.mT @ around / n)
     aim = {"printed": anomalies, "reversed": -anomalies, "particle": -gap, "shift": -mean}[reading]
     out = x + aim @ gain
     if not guarded:
         return np.asarray(out)
-    worse = ~np.isfinite(out).all(axis=(-1, -2))
-    left = constraint._residual(np.where(worse[..., None, None], x, out))
+    bad = ~np.isfinite(out).all(axis=(-1, -2))
+    left = constraint.missed(np.where(bad[..., None, None], x, out))
     # The members' own misses may grow where only their mean is moved: g is curved.
     before, after = (mean, left.mean(axis=-2, keepdims=True)) if reading == "shift" else (gap, left)
-    worse |= np.abs(after).sum(axis=(-1, -2)) > np.abs(before).sum(axis=(-1, -2))
-    return np.asarray(np.where(worse[..., None, None], x, out))
+    better = np.abs(after).sum(axis=(-1, -2)) <= np.abs(before).sum(axis=(-1, -2))
+    return np.asarray(np.where((better & ~bad)[..., None, None], out, x))
 
 
-Motion = tuple[Sequence[int], Sequence[int]]
-"""Indices of positions and of their velocities, in the same order."""
-
-
+@door
 def retract(
-    states: ArrayLike,
-    constraint: Constraint,
-    *,
-    motion: Motion | None = None,
-    tolerance: float = 1e-15,
-    iterations: int = 50,
+    states: Annotated[Array, "... d"], constraint: Constraint, *, motion: Motion | None = None,
+    tolerance: Positive = 1e-15, iterations: Count = 50,
 ) -> Array:
     r"""Move every state to the constraint by Newton steps along its normals.
 
@@ -228,7 +193,9 @@ def retract(
     motion : (sequence of int, sequence of int), optional
         Indices of positions and of their velocities.
     tolerance : float
-        Largest :math:`|\mathbf g-\mathbf d|` that is left, relative to :math:`1+|\mathbf d|`.
+        Largest :math:`|g_i-d_i|` that is left, relative to :math:`|d_i|` or to what the rounding
+        of a state changes, :math:`|\nabla g_i|\,|\mathbf x|`, whichever is larger: the same for
+        every unit of length.
     iterations : int
         How many Newton steps at most.
 
@@ -240,7 +207,8 @@ def retract(
     Raises
     ------
     ValueError
-        If the Jacobian loses rank at a state: there is no normal to move along.
+        If the Jacobian loses rank at a state, so that there is no normal to move along, or g is
+        not finite there.
     SolverError
         If the steps do not converge: the constraint may have no solution nearby.
 
@@ -249,68 +217,54 @@ def retract(
     >>> retract([3.0, 4.0, 1.0, 0.0], norm([0, 1]), motion=([0, 1], [2, 3])).round(12)
     array([ 0.6 ,  0.8 ,  0.64, -0.48])
     """
-    x = array(states, "states", (..., "d"))
-    g = _constraint(constraint)
-    least = number(tolerance, "tolerance", above=0)
-    most = count(iterations, "iterations")
-    pair = None if motion is None else _motion(motion, x.shape[-1])
-    return _retract(x, g, pair, least, most)
-
-
-def _motion(motion: Motion, dim: float = np.inf) -> Motion:
-    if not isinstance(motion, tuple) or len(motion) != 2 or len(motion[0]) != len(motion[1]):
-        raise ValueError(f"motion: needs two lists of indices of one length, got {motion!r}")
-    found = [count(i, "motion", at_least=0) for part in motion for i in part]
-    if len(set(found)) != len(found) or max(found, default=dim) >= dim:
-        raise ValueError(f"motion: needs different indices below {dim}, got {found}")
-    return list(motion[0]), list(motion[1])
-
-
-def _retract(
-    x: Array, constraint: Constraint, motion: Motion | None, tolerance: float, iterations: int
-) -> Array:
-    flat = x.reshape(-1, x.shape[-1]).copy()
-    limit = tolerance * (1 + float(np.linalg.norm(constraint.value)))
-    gap = constraint._residual(flat)
-    size = np.linalg.norm(gap, axis=-1)
+    x = states.reshape(-1, states.shape[-1]).copy()
+    gap, left = unchecked(constraint.residual)(x), np.arange(len(x))
     for _ in range(iterations):
-        far = np.flatnonzero(size > limit)
-        if not far.size:
+        slope, excess = _excess(constraint, x[left], gap[left])
+        left, slope = left[excess > tolerance], slope[excess > tolerance]
+        if not left.size:
             break
-        step = _along_normals(constraint._jacobian(flat[far]), gap[far])
-        flat[far], gap[far], better = _shortened(constraint, flat[far], gap[far], step)
-        size[far] = np.where(better, np.linalg.norm(gap[far], axis=-1), size[far])
-        # Rounding ends the descent a little above the limit where g is large.
-        stuck = far[~better]
-        if (size[stuck] > 1e3 * limit).any():
+        step = _along_normals(slope, gap[left])
+        x[left], gap[left], better = _shortened(constraint, x[left], gap[left], step)
+        stuck = left[~better]
+        # Rounding ends the descent a little above the tolerance where g is large.
+        lost = stuck[_excess(constraint, x[stuck], gap[stuck])[1] > 1e3 * tolerance]
+        left = lost if lost.size else left[better]
+        if lost.size:
             break
-        size[stuck] = 0.0
-    if (size > limit).any():
+    else:
+        left = left[_excess(constraint, x[left], gap[left])[1] > tolerance]
+    if left.size:
         raise SolverError(
-            f"retract: {int((size > limit).sum())} of {size.size} states did not reach the "
-            f"constraint in {iterations} Newton steps, |g - d| up to {size.max():.3g}"
+            f"retract: {left.size} of {len(x)} states did not reach the constraint in {iterations} "
+            f"Newton steps, |g - d| up to {np.abs(gap[left]).max():.3g}"
         )
     if motion is not None:
-        places, rates = motion
-        slope = constraint._jacobian(flat)[..., places]
-        along = (slope @ flat[:, rates, None])[..., 0]
-        flat[:, rates] += _along_normals(slope, along)
-    return np.asarray(flat.reshape(x.shape))
+        _make_tangent(x, constraint, motion)
+    return np.asarray(x.reshape(states.shape))
+
+
+def _excess(constraint: Constraint, x: Array, gap: Array) -> tuple[Array, Array]:
+    """Jacobians at states (n, d), and how far each is off in units of what rounding explains."""
+    slope = unchecked(constraint.jacobian)(x)
+    reach = np.linalg.norm(slope, axis=-1) * np.linalg.norm(x, axis=-1)[:, None]
+    unit = np.maximum(np.abs(constraint.value), reach)
+    return slope, (np.abs(gap) / np.where(gap == 0, 1.0, unit)).max(axis=-1)
 
 
 def _along_normals(slope: Array, gap: Array) -> Array:
     """The shortest step that takes away `gap` to first order; refuses a lost rank."""
-    gram = slope @ np.swapaxes(slope, -1, -2)
-    values = np.linalg.eigvalsh(gram)
-    lost = values[..., 0] <= 1e-24 + 1e-14 * values[..., -1]
+    with np.errstate(invalid="ignore"):
+        rows = slope / np.linalg.norm(slope, axis=-1, keepdims=True)
+    least = np.linalg.eigvalsh(np.nan_to_num(rows @ rows.mT))[..., 0]
+    lost = ~(least > 1e-14)
     if lost.any():
-        row = int(np.argmax(lost))
         raise ValueError(
-            f"constraint: needs a Jacobian of full rank, got one that loses rank at state {row} "
-            f"({int(lost.sum())} of {lost.size})"
+            "constraint: needs a Jacobian of full rank, got one that loses rank at state "
+            f"{lost.argmax()} ({lost.sum()} of {lost.size})"
         )
-    dual = np.linalg.solve(gram, gap[..., None])
-    return np.asarray(-(np.swapaxes(slope, -1, -2) @ dual)[..., 0])
+    dual = np.linalg.solve(slope @ slope.mT, gap[..., None])
+    return np.asarray(-(slope.mT @ dual)[..., 0])
 
 
 def _shortened(
@@ -325,9 +279,20 @@ def _shortened(
         if not todo.size:
             break
         trial = x[todo] + share[todo, None] * step[todo]
-        missed = constraint._residual(trial)
+        missed = constraint.missed(trial)
         falls = np.linalg.norm(missed, axis=-1) < before[todo]
         place[todo[falls]], left[todo[falls]] = trial[falls], missed[falls]
         better[todo[falls]] = True
         share[todo] *= 0.5
     return place, left, better
+
+
+def _make_tangent(x: Array, constraint: Constraint, motion: Motion) -> None:
+    """Take from the velocities in states (n, d) their part along the normals, in place."""
+    places, rates = (list(part) for part in motion)
+    if len(places) != len(rates) or {*places} & {*rates} or max(places + rates) >= x.shape[-1]:
+        needs = f"as many other indices below {x.shape[-1]} for velocities as for positions"
+        raise ValueError(f"motion: needs {needs}, got {motion}")
+    slope = unchecked(constraint.jacobian)(x)[..., places]
+    along = (slope @ x[:, rates, None])[..., 0]
+    x[:, rates] += _along_normals(slope, along)

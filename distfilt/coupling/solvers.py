@@ -9,29 +9,33 @@ are targets.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any
+from functools import lru_cache, partial
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from scipy.special import logsumexp
 
-from ..checks import Array, SolverError, array, choice, needed, number, weights
+from ..doors import Array, Bounds, Positive, Record, Weights, door, needed
+from ..linalg import SolverError
 
-__all__ = ["SOLVERS", "Plan", "distances", "plan", "sorted_plan"]
+__all__ = ["Plan", "distances", "plan", "sorted_plan"]
 
-SOLVERS = ("network", "highs", "clarabel", "linprog", "entropic")
-"""POT's network simplex; HiGHS and Clarabel through cvxpy; scipy's HiGHS; POT's Sinkhorn."""
+Solver = Literal["network", "linprog", "entropic"]
+"""POT's network simplex; scipy's HiGHS; Newton's method on the entropic problem."""
 
 _PIVOTS = 10_000_000
 """More pivots of the network simplex than this mean that it cycles."""
+_NEWTON = 1000
+"""Steps of Newton's method; twenty are enough as a rule."""
 _LOOSE = 1e-5
 """Largest error of the marginals, in units of the total mass, that is rounded away."""
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class Plan(Record):
     r"""A coupling, its cost and the dual solution that bounds the cost from below.
 
     Parameters
@@ -55,7 +59,7 @@ class Plan:
     (0.0, 0.0)
     """
 
-    matrix: Array
+    matrix: Annotated[Array, "n m"]
     value: float
     potentials: tuple[Array, Array]
     bound: float
@@ -66,7 +70,11 @@ class Plan:
         return self.value - self.bound
 
 
-def distances(source: ArrayLike, target: ArrayLike | None = None, *, power: float = 2.0) -> Array:
+@door
+def distances(
+    source: Annotated[Array, "n d"], target: Annotated[Array, "m d"] | None = None, *,
+    power: Positive = 2.0,
+) -> Array:
     r"""Costs :math:`c_{ij}=|\mathbf x_i-\mathbf y_j|^p` of moving mass between two sets of points.
 
     Parameters
@@ -89,29 +97,20 @@ def distances(source: ArrayLike, target: ArrayLike | None = None, *, power: floa
     array([[0., 9.],
            [9., 0.]])
     """
-    x = array(source, "source", ("N", "d"))
-    y = x if target is None else array(target, "target", ("M", x.shape[1]))
-    p = number(power, "power", above=0)
-    squares = _squares(x, y)
-    return squares if p == 2 else np.asarray(squares ** (0.5 * p))
+    y = source if target is None else target
+    squares = np.zeros((len(source), len(y)))
+    # By differences: products would lose what is close.
+    for k in range(source.shape[1]):
+        gap = source[:, k, None] - y[:, k]
+        squares += gap * gap
+    return squares if power == 2 else np.asarray(squares ** (0.5 * power))
 
 
-def _squares(x: Array, y: Array) -> Array:
-    """Squared distances (N, M), by differences: products would lose what is close."""
-    out = np.zeros((x.shape[0], y.shape[0]))
-    for k in range(x.shape[1]):
-        gap = x[:, k, None] - y[:, k]
-        out += gap * gap
-    return out
-
-
+@door
 def plan(
-    cost: ArrayLike,
-    rows: ArrayLike,
-    columns: ArrayLike | None = None,
-    *,
-    solver: str = "network",
-    regularisation: float = 0.01,
+    cost: Annotated[Array, "n m"], rows: Annotated[Weights, "n"],
+    columns: Annotated[Weights, "m"] | None = None, *, solver: Solver = "network",
+    regularisation: Positive = 0.01,
 ) -> Plan:
     """The cheapest coupling of two sets of masses.
 
@@ -124,8 +123,9 @@ def plan(
         Nonnegative masses that sum to one.
     columns : array_like, (M,), optional
         The same; equal masses by default.
-    solver : {"network", "highs", "clarabel", "linprog", "entropic"}
-        `SOLVERS`. All but the last solve the linear programme.
+    solver : {"network", "linprog", "entropic"}
+        POT's network simplex, which needs the extra ``maps``, and scipy's HiGHS solve the linear
+        programme. The third adds the plan's entropy to the cost.
     regularisation : float
         For ``"entropic"``: the weight of the entropy in units of the cost's range. Its plan is
         spread out and costs more than the optimal one.
@@ -133,8 +133,8 @@ def plan(
     Returns
     -------
     Plan
-        The marginals hold to rounding with every solver: what an interior point or an iteration
-        leaves of their error, at most 1e-5, is moved along the row and column sums.
+        The marginals hold to rounding with every solver: what an iteration leaves of their
+        error, at most 1e-5, is moved along the row and column sums.
 
     Raises
     ------
@@ -142,6 +142,8 @@ def plan(
         If sizes differ, a mass is negative, a sum is not one or a cost is not finite.
     SolverError
         With the solver's status, if it stops without a solution.
+    ModuleNotFoundError
+        If the solver's package is not installed; the message names the extra that brings it.
 
     Notes
     -----
@@ -158,27 +160,19 @@ def plan(
     >>> float(round(moved.value, 9)), moved.gap < 1e-12
     (1.5, True)
     """
-    c = array(cost, "cost", ("N", "M"))
-    if 0 in c.shape:
-        raise ValueError(f"cost: needs at least one row and one column, got {c.shape}")
-    a = _masses(rows, "rows", c.shape[0])
-    b = np.full(c.shape[1], 1 / c.shape[1])
-    if columns is not None:
-        b = _masses(columns, "columns", c.shape[1])
-    solve = _solver(choice(solver, "solver", SOLVERS), regularisation)
-    unit, low, scale = _scaled(c)
-    matrix, g = solve(unit, a, b)
-    return _certified(c, a, b, matrix, low + scale * g)
+    a, b = _masses(rows, columns, cost.shape[1])
+    unit, low, scale = scaled(cost)
+    matrix, g = solver_of(solver, regularisation)(unit, a, b)
+    return _certified(cost, a, b, matrix, low + scale * g)
 
 
-def _masses(value: ArrayLike, name: str, size: int) -> Array:
-    w = weights(value, name, size)
-    if w.ndim != 1:
-        raise ValueError(f"{name}: needs shape ({size},), got {w.shape}")
-    return np.asarray(w / w.sum())
+def _masses(rows: Array, columns: Array | None, size: int) -> tuple[Array, Array]:
+    """Masses that sum to one, equal ones by default."""
+    b = np.full(size, 1 / size) if columns is None else columns / columns.sum()
+    return rows / rows.sum(), b
 
 
-def _scaled(cost: Array) -> tuple[Array, float, float]:
+def scaled(cost: Array) -> tuple[Array, float, float]:
     """The cost between zero and one, its minimum and its range."""
     low = float(cost.min())
     scale = float(cost.max()) - low
@@ -190,22 +184,21 @@ def _certified(cost: Array, a: Array, b: Array, matrix: Array, g: Array) -> Plan
     # A solver leaves out columns without mass, and what it says of them is nothing.
     f = (cost - np.where(b > 0, g, -np.inf)).min(axis=1)
     g = (cost - f[:, None]).min(axis=0)
-    return Plan(matrix, float((matrix * cost).sum()), (f, g), float(f @ a + g @ b))
+    return Plan.unchecked(matrix, float((matrix * cost).sum()), (f, g), float(f @ a + g @ b))
 
 
 Solve = Callable[[Array, Array, Array], tuple[Array, Array]]
 """``solve(cost, rows, columns) -> (matrix, column potential)`` for a cost between zero and one."""
 
 
-def _solver(name: str, regularisation: float) -> Solve:
-    strength = number(regularisation, "regularisation", above=0)
-    if name == "network":
-        return _network
-    if name == "linprog":
-        return _linprog
+def solver_of(name: Solver, regularisation: float) -> Solve:
+    """The solver of that name, for a cost between zero and one."""
     if name == "entropic":
-        return lambda c, a, b: _entropic(c, a, b, strength)
-    return lambda c, a, b: _cvxpy(c, a, b, {"highs": "HIGHS", "clarabel": "CLARABEL"}[name])
+        return partial(_entropic, strength=regularisation)
+    return _network if name == "network" else _linprog
+
+
+_solver = solver_of
 
 
 def _network(cost: Array, a: Array, b: Array) -> tuple[Array, Array]:
@@ -247,52 +240,58 @@ def _equalities(n: int, m: int) -> Any:
     return sparse.vstack([rows, columns]).tocsr()[:-1]
 
 
-@lru_cache(maxsize=16)
-def _problem(n: int, m: int) -> tuple[Any, ...]:
-    """The linear programme of one size with cost and masses as parameters: compiled once.
-
-    All entries are one long vector. A matrix of parameters times a matrix of unknowns would make
-    cvxpy keep all products of the two, 13 GB at N = 200.
-    """
-    cp = needed("cvxpy", "maps")
-    t = cp.Variable(n * m, nonneg=True)
-    cost, masses = cp.Parameter(n * m), cp.Parameter(n + m - 1)
-    ends = _equalities(n, m) @ t == masses
-    return cp.Problem(cp.Minimize(cost @ t), [ends]), t, cost, masses, ends
-
-
-def _cvxpy(cost: Array, a: Array, b: Array, solver: str) -> tuple[Array, Array]:
-    cp = needed("cvxpy", "maps")
-    n, m = cost.shape
-    problem, t, c, masses, ends = _problem(n, m)
-    size = max(n, m)
-    c.value, masses.value = cost.ravel(), size * np.concatenate([a, b])[:-1]
-    try:
-        problem.solve(solver=solver)
-    except cp.error.SolverError as error:
-        raise SolverError(f"{solver}: {error}, {_sizes(cost)}") from None
-    if problem.status != "optimal" or t.value is None:
-        raise SolverError(f"{solver}: status {problem.status}, {_sizes(cost)}")
-    matrix = np.asarray(t.value, dtype=np.float64).reshape(n, m) / size
-    g = np.append(-np.asarray(ends.dual_value)[n:], 0.0)
-    return _rounded(matrix, a, b, solver), g
-
-
 def _entropic(cost: Array, a: Array, b: Array, strength: float) -> tuple[Array, Array]:
-    """Sinkhorn's iteration in logarithms; masses of zero take no part."""
-    ot = needed("ot", "maps")
+    """Newton's method under an entropy that is halved down to `strength`.
+
+    Sinkhorn's iteration creeps along plateaus where the entropy is small. Masses of zero take no
+    part.
+    """
     i, j = np.flatnonzero(a), np.flatnonzero(b)
-    matrix, log = ot.sinkhorn(
-        a[i], b[j], cost[np.ix_(i, j)], strength, method="sinkhorn_log",
-        numItermax=100_000, stopThr=1e-9, log=True, warn=False,
-    )
-    left = float(log["err"][-1]) if len(log["err"]) else np.inf
-    if not left <= 1e-8:
-        raise SolverError(f"entropic: marginals off by {left:.3g} after 100000 iterations")
-    whole, g = np.zeros(cost.shape), np.zeros(cost.shape[1])
-    whole[np.ix_(i, j)] = matrix
-    g[j] = strength * log["log_v"]
-    return _rounded(whole, a, b, "entropic"), g
+    part, g = cost[np.ix_(i, j)], np.zeros(len(j))
+    for k in range(max(0, math.ceil(math.log2(0.1 / strength))), -1, -1):
+        eps = strength * 2.0**k
+        matrix, g, off = _newton(part / eps, a[i], b[j], g / eps, 1e-3 if k else 1e-10)
+        g = eps * g
+    if not off < 1e-8:
+        raise SolverError(
+            f"entropic: marginals off by {off:.3g} after {_NEWTON} Newton steps, {_sizes(cost)}: "
+            f"regularisation {strength:g} needs to be larger, or another solver"
+        )
+    whole, potential = np.zeros(cost.shape), np.zeros(cost.shape[1])
+    whole[np.ix_(i, j)], potential[j] = matrix, g
+    return _rounded(whole, a, b, "entropic"), potential
+
+
+def _newton(
+    cost: Array, rows: Array, columns: Array, g: Array, close: float
+) -> tuple[Array, Array, float]:
+    """Plan of unit entropy, column potentials, and the error of its column sums.
+
+    The step is damped as by Levenberg and Marquardt.
+    """
+
+    def at(g: Array) -> tuple[Array, float]:
+        """The plan with these potentials, whose row sums are right, and the dual to be least."""
+        exponents = g - cost
+        total = logsumexp(exponents, axis=1)
+        return rows[:, None] * np.exp(exponents - total[:, None]), float(rows @ total - columns @ g)
+
+    damping, (matrix, value) = 1e-2, at(g)
+    for _ in range(_NEWTON):
+        sums = matrix.sum(axis=0)
+        off = float(np.abs(sums - columns).sum())
+        if off < close or damping > 1e9:
+            break
+        slope = np.diag(sums + damping * columns) - matrix.T @ (matrix / rows[:, None])
+        trial = g - np.linalg.solve(slope, sums - columns)
+        moved, after = at(trial)
+        # Near the solution the dual falls by less than rounding; its gradient still shrinks.
+        flat = abs(after - value) < 1e-9 * abs(value)
+        if after < value or (flat and np.abs(moved.sum(axis=0) - columns).sum() < 0.5 * off):
+            g, matrix, value, damping = trial - trial.mean(), moved, after, max(damping / 10, 1e-14)
+        else:
+            damping *= 10
+    return matrix, g, off
 
 
 def _rounded(matrix: Array, a: Array, b: Array, solver: str) -> Array:
@@ -310,13 +309,11 @@ def _rounded(matrix: Array, a: Array, b: Array, solver: str) -> Array:
     return t if missing <= 0 else t + np.outer(left, right) / max(right.sum(), missing)
 
 
+@door
 def sorted_plan(
-    source: ArrayLike,
-    target: ArrayLike,
-    rows: ArrayLike,
-    columns: ArrayLike | None = None,
-    *,
-    power: float = 2.0,
+    source: Annotated[Array, "n"], target: Annotated[Array, "m"], rows: Annotated[Weights, "n"],
+    columns: Annotated[Weights, "m"] | None = None, *,
+    power: Annotated[float, Bounds(at_least=1)] = 2.0,
 ) -> Plan:
     """The cheapest coupling on a line: smallest with smallest, in sorted order.
 
@@ -341,20 +338,14 @@ def sorted_plan(
     array([[0.25, 0.5 ],
            [0.25, 0.  ]])
     """
-    x, y = array(source, "source", ("N",)), array(target, "target", ("M",))
-    p = number(power, "power", at_least=1)
-    if not x.size or not y.size:
-        raise ValueError(f"source, target: needs at least one point each, got {x.size}, {y.size}")
-    a = _masses(rows, "rows", x.size)
-    b = np.full(y.size, 1 / y.size)
-    if columns is not None:
-        b = _masses(columns, "columns", y.size)
+    x, y = source, target
+    a, b = _masses(rows, columns, y.size)
     i, j = np.argsort(x, kind="stable"), np.argsort(y, kind="stable")
     matrix, g = np.zeros((x.size, y.size)), np.zeros(y.size)
     with np.errstate(over="ignore"):
-        cost = np.abs(x[:, None] - y) ** p
+        cost = np.abs(x[:, None] - y) ** power
     if not np.isfinite(cost).all():
-        raise ValueError(f"source, target: needs distances of finite power {p:g}, got infinity")
+        raise ValueError(f"source, target: needs distances of finite power {power:g}, got infinity")
     rank_i, rank_j, mass = _staircase(a[i], b[j])
     np.add.at(matrix, (i[rank_i], j[rank_j]), mass)
     # Along the staircase f + g = c holds on every cell: a step sideways changes g only.

@@ -6,65 +6,44 @@ average of old ones,
 .. math:: \mathbf x_j^+ = N\sum_i t_{ij}\,\mathbf x_i,
 
 equation (3) of Das and Bhattacharya after S. Reich, SIAM Journal on Scientific Computing 35 (2013)
-A2013-A2024. The mean of the new members is the weighted mean, exactly.
+A2013-A2024. The mean of the new members is the weighted mean, exactly. Within convex pieces and
+along a curved surface it samples sets.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ..checks import Array, array, choice, generator, number
-from ..linalg import _EPS, _factor
-from .solvers import SOLVERS, Solve, _scaled, _solver, _squares
+from ..doors import Array, NonNegative, Positive, Rng, array, door, unchecked
+from ..linalg import EPS, factor
+from .solvers import Solve, Solver, distances, scaled, solver_of
 
-__all__ = [
-    "ensemble_transform",
-    "plans",
-    "rejuvenated",
-    "second_order",
+__all__ = [  # fmt: skip
+    "ensemble_transform", "plans", "rejuvenated", "second_order", "transform_along",
+    "transform_within",
 ]
 
+Members = Annotated[Array, "... n d"]
 
 _TIE = 1e-7
 """In units of the largest cost. The weighted mean stays exact, the plan costs at most this more."""
 
 
-def _weights(log_weights: ArrayLike, shape: tuple[int, ...]) -> Array:
+def normalised(log_weights: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
     """Weights (..., N) that sum to one, from logarithms of any size; -inf is a weight of zero."""
     w = array(log_weights, "log_weights", shape, finite=False)
-    if np.isnan(w).any() or np.isposinf(w).any():
-        raise ValueError("log_weights: needs numbers below infinity, got NaN or infinity")
-    if np.isneginf(w.max(axis=-1)).any():
+    top = w.max(axis=-1, keepdims=True)
+    if np.isneginf(top).any():
         raise ValueError("log_weights: needs a positive weight in every ensemble, got only zeros")
-    return _normalised(w)
-
-
-def _normalised(log_weights: Array) -> Array:
-    w = np.exp(log_weights - log_weights.max(axis=-1, keepdims=True))
+    if not np.isfinite(top).all():
+        raise ValueError("log_weights: needs numbers below infinity, got NaN or infinity")
+    w = np.exp(w - top)
     return np.asarray(w / w.sum(axis=-1, keepdims=True))
-
-
-def _members(value: ArrayLike, name: str = "ensemble") -> Array:
-    x = array(value, name, (..., "N", "d"))
-    if 0 in x.shape:
-        raise ValueError(f"{name}: needs at least one member and one component, got {x.shape}")
-    return x
-
-
-def _plans(x: Array, w: Array, solve: Solve) -> Array:
-    """Couplings (..., N, N) of the weights to equal masses, for the squared distance."""
-    n, d = x.shape[-2:]
-    equal = np.full(n, 1 / n)
-    out = np.empty((*x.shape[:-1], n))
-    rows = zip(x.reshape(-1, n, d), w.reshape(-1, n), out.reshape(-1, n, n), strict=True)
-    ties = _ties(n)
-    for points, masses, target in rows:
-        cost, _, _ = _scaled(_squares(points, points))
-        target[...], _ = solve(cost + ties, masses, equal)
-    return out
 
 
 @lru_cache(maxsize=8)
@@ -80,12 +59,10 @@ def _ties(n: int) -> Array:
     return fixed
 
 
+@door
 def plans(
-    ensemble: ArrayLike,
-    log_weights: ArrayLike,
-    *,
-    solver: str = "network",
-    regularisation: float = 0.01,
+    ensemble: Members, log_weights: ArrayLike, *, solver: Solver = "network",
+    regularisation: Positive = 0.01,
 ) -> Array:
     """Optimal couplings of weighted members to the same members with equal weights.
 
@@ -111,19 +88,26 @@ def plans(
     array([[0.5 , 0.25],
            [0.  , 0.25]])
     """
-    x = _members(ensemble)
-    w = _weights(log_weights, x.shape[:-1])
-    return _plans(x, w, _solver(choice(solver, "solver", SOLVERS), regularisation))
+    w = normalised(log_weights, ensemble.shape[:-1])
+    return _plans(ensemble, w, solver_of(solver, regularisation))
 
 
+def _plans(x: Array, w: Array, solve: Solve) -> Array:
+    """Couplings (..., N, N) of the weights to equal masses, for the squared distance."""
+    n, d = x.shape[-2:]
+    equal, ties = np.full(n, 1 / n), _ties(n)
+    out = np.empty((*x.shape[:-1], n))
+    rows = zip(x.reshape(-1, n, d), w.reshape(-1, n), out.reshape(-1, n, n), strict=True)
+    for points, masses, target in rows:
+        cost = scaled(unchecked(distances)(points))[0]
+        target[...], _ = solve(cost + ties, masses, equal)
+    return out
+
+
+@door
 def ensemble_transform(
-    ensemble: ArrayLike,
-    log_weights: ArrayLike,
-    *,
-    solver: str = "network",
-    regularisation: float = 0.01,
-    debias: bool = False,
-    correct: bool = False,
+    ensemble: Members, log_weights: ArrayLike, *, solver: Solver = "network",
+    regularisation: Positive = 0.01, debias: bool = False, correct: bool = False,
 ) -> Array:
     r"""Replace weighted members by as many with equal weights.
 
@@ -163,35 +147,25 @@ def ensemble_transform(
     >>> bool(ensemble_transform([[0.0], [1.0]], [-1e4, -2e4])[1, 0] == 0.0)
     True
     """
-    x = _members(ensemble)
-    w = _weights(log_weights, x.shape[:-1])
-    solve = _solver(choice(solver, "solver", SOLVERS), regularisation)
-    for name, value in (("debias", debias), ("correct", correct)):
-        if not isinstance(value, bool):
-            raise ValueError(f"{name}: needs True or False, got {value!r}")
-    return _transform(x, w, solve, debias=debias, correct=correct)
-
-
-def _transform(
-    x: Array, w: Array, solve: Solve, *, debias: bool = False, correct: bool = False
-) -> Array:
-    """`ensemble_transform` of checked arguments."""
-    out = _carried(x, w, _plans(x, w, solve))
+    x, w = ensemble, normalised(log_weights, ensemble.shape[:-1])
+    solve = solver_of(solver, regularisation)
+    out = carried(x, w, _plans(x, w, solve))
     if debias:
         equal = np.full(w.shape, 1 / x.shape[-2])
-        out += x - _carried(x, equal, _plans(x, equal, solve))
+        out += x - carried(x, equal, _plans(x, equal, solve))
         out += w[..., None, :] @ x - out.mean(axis=-2, keepdims=True)
     return _second_order(out, x, w) if correct else out
 
 
-def _carried(x: Array, w: Array, matrix: Array, *, correct: bool = False) -> Array:
+def carried(x: Array, w: Array, matrix: Array, *, correct: bool = False) -> Array:
     """Members with weights w after a coupling `matrix` of w to equal masses, (3)."""
     centre = w[..., None, :] @ x
-    out = np.asarray(centre + x.shape[-2] * (np.swapaxes(matrix, -1, -2) @ (x - centre)))
+    out = np.asarray(centre + x.shape[-2] * (matrix.mT @ (x - centre)))
     return _second_order(out, x, w) if correct else out
 
 
-def second_order(moved: ArrayLike, ensemble: ArrayLike, log_weights: ArrayLike) -> Array:
+@door
+def second_order(moved: Members, ensemble: Members, log_weights: ArrayLike) -> Array:
     r"""Give transformed members the mean and covariance of the weighted ones, exactly.
 
     Averages vary less than what they average, so :math:`\mathbf X^+` has too small a covariance.
@@ -228,9 +202,13 @@ def second_order(moved: ArrayLike, ensemble: ArrayLike, log_weights: ArrayLike) 
     >>> float(second_order(ensemble_transform(x, logs), x, logs).var().round(12))
     0.1875
     """
-    x = _members(ensemble)
-    y = array(moved, "moved", x.shape)
-    return _second_order(y, x, _weights(log_weights, x.shape[:-1]))
+    _same_members(moved, ensemble)
+    return _second_order(moved, ensemble, normalised(log_weights, ensemble.shape[:-1]))
+
+
+def _same_members(moved: Array, ensemble: Array) -> None:
+    if moved.shape != ensemble.shape:
+        raise ValueError(f"moved: needs shape {ensemble.shape}, got {moved.shape}")
 
 
 def _second_order(y: Array, x: Array, w: Array) -> Array:
@@ -238,7 +216,7 @@ def _second_order(y: Array, x: Array, w: Array) -> Array:
     centre = w[..., None, :] @ x
     around, spread = x - centre, y - y.mean(axis=-2, keepdims=True)
     with np.errstate(over="ignore", invalid="ignore"):
-        target = np.swapaxes(around, -1, -2) @ (w[..., None] * around)
+        target = around.mT @ (w[..., None] * around)
     if not np.isfinite(target).all():
         raise ValueError("ensemble: needs members with a finite covariance, got an overflow")
     root = _graded(target)
@@ -247,12 +225,12 @@ def _second_order(y: Array, x: Array, w: Array) -> Array:
     turned = spread @ root
     u, sizes, v = np.linalg.svd(turned, full_matrices=False)
     # What rounding leaves in a direction where there is nothing: of the members, of the columns.
-    axes = np.swapaxes(v, -1, -2)
+    axes = v.mT
     members, columns = (np.abs(z).max(axis=-2, keepdims=True) for z in (y, turned))
-    lost = n * _EPS * (members @ np.abs(root @ axes) + columns @ np.abs(axes))
+    lost = n * EPS * (members @ np.abs(root @ axes) + columns @ np.abs(axes))
     u = u * (sizes[..., None, :] > lost)
     u -= u.mean(axis=-2, keepdims=True)
-    return np.asarray(centre + np.sqrt(n) * (u @ v @ np.swapaxes(root, -1, -2)))
+    return np.asarray(centre + np.sqrt(n) * (u @ v @ root.mT))
 
 
 def _graded(cov: Array) -> Array:
@@ -262,12 +240,13 @@ def _graded(cov: Array) -> Array:
     """
     order = np.argsort(-np.diagonal(cov, axis1=-2, axis2=-1), axis=-1, kind="stable")
     rows = np.take_along_axis(cov, order[..., :, None], axis=-2)
-    lower = _factor(np.take_along_axis(rows, order[..., None, :], axis=-1))
+    lower = unchecked(factor)(np.take_along_axis(rows, order[..., None, :], axis=-1))
     return np.take_along_axis(lower, np.argsort(order, axis=-1)[..., :, None], axis=-2)
 
 
+@door
 def rejuvenated(
-    moved: ArrayLike, ensemble: ArrayLike, *, bandwidth: float, rng: np.random.Generator
+    moved: Members, ensemble: Members, *, bandwidth: NonNegative, rng: Rng
 ) -> Array:
     r"""Add combinations of the forecast's anomalies: new places, and the same mean.
 
@@ -296,18 +275,141 @@ def rejuvenated(
     >>> bool(abs(after.mean()) < 1e-15), len(set(after.ravel()))
     (True, 3)
     """
-    x = _members(ensemble)
-    y = array(moved, "moved", x.shape)
-    if x.shape[-2] < 2:
-        raise ValueError(f"ensemble: needs at least 2 members, got {x.shape[-2]}")
-    h = number(bandwidth, "bandwidth", at_least=0)
-    return _rejuvenated(y, x, h, generator(rng))
-
-
-def _rejuvenated(y: Array, x: Array, h: float, rng: np.random.Generator) -> Array:
-    n = x.shape[-2]
+    _same_members(moved, ensemble)
+    x, n = ensemble, ensemble.shape[-2]
+    if n < 2:
+        raise ValueError(f"ensemble: needs at least 2 members, got {n}")
     drawn = rng.standard_normal((*x.shape[:-1], n))
     # Centring costs one part in N of the variance.
     drawn = (drawn - drawn.mean(axis=-2, keepdims=True)) * np.sqrt(n / (n - 1))
     around = x - x.mean(axis=-2, keepdims=True)
-    return np.asarray(y + h / np.sqrt(n - 1) * (drawn @ around))
+    return np.asarray(moved + bandwidth / np.sqrt(n - 1) * (drawn @ around))
+
+
+@door
+def transform_within(
+    ensemble: Annotated[Array, "n d"], log_weights: ArrayLike,
+    pieces: Annotated[NDArray[np.intp], "n"], *, rng: Rng, solver: Solver = "network",
+) -> Array:
+    r"""The transform on a set cut into pieces: no average crosses from one piece to another.
+
+    Each new member chooses a piece p with probability :math:`N\sum_{i\in p}t_{ij}` and is the
+    average within it. Convex pieces hold their averages, so no member leaves the set. One piece is
+    :func:`ensemble_transform`; a piece for every member is random resampling by the plan.
+
+    Parameters
+    ----------
+    ensemble : array_like, (N, d)
+        Members.
+    log_weights : array_like, (N,)
+        Logarithms of their weights.
+    pieces : array_like of int, (N,)
+        The number of each member's piece.
+    rng : numpy.random.Generator
+        Chooses the pieces, systematically: each gets its share of the members to within one or
+        two.
+    solver : str
+        As for :func:`~distfilt.coupling.plan`.
+
+    Returns
+    -------
+    ndarray, (N, d)
+        The mean is the weighted mean on average over the choice.
+
+    Examples
+    --------
+    >>> x = [[-1.0], [-0.9], [0.9], [1.0]]
+    >>> y = transform_within(x, np.log([0.4, 0.1, 0.1, 0.4]), [0, 0, 1, 1],
+    ...                      rng=np.random.default_rng(0))
+    >>> bool((np.abs(y) >= 0.9).all())
+    True
+    """
+    x = ensemble
+    matrix = len(x) * unchecked(plans)(x, log_weights, solver=solver)
+    names, index = np.unique(pieces, return_inverse=True)
+    belongs = (index == np.arange(names.size)[:, None]).astype(np.float64)
+    chosen = _chosen(belongs @ matrix, rng)
+    kept = matrix * belongs[chosen].T
+    return np.asarray(kept.T @ x / kept.sum(axis=0)[:, None])
+
+
+def _chosen(share: Array, rng: np.random.Generator) -> Array:
+    """For each column one row, as probable as its share; each row's total hardly varies.
+
+    Row by row, the columns that are still free are laid end to end, each as long as its chance,
+    and those that hold a level k + u are taken.
+    """
+    left, order = np.arange(share.shape[1]), np.full(share.shape[1], share.shape[0] - 1)
+    rest = np.cumsum(share[::-1], axis=0)[::-1]
+    for row in range(share.shape[0] - 1):
+        chance = share[row, left] / np.where(rest[row, left] > 0, rest[row, left], 1.0)
+        levels = np.floor(np.cumsum(chance) + rng.random())
+        taken = np.diff(levels, prepend=0.0) > 0
+        order[left[taken]] = row
+        left = left[~taken]
+    # By rounding a column could be left with a row of zero share.
+    bare = share[order, np.arange(order.size)] <= 0
+    return np.asarray(np.where(bare, share.argmax(axis=0), order))
+
+
+@door
+def transform_along(
+    ensemble: Members, log_weights: ArrayLike, *, difference: Callable[[Array, Array], Array],
+    retract: Callable[[Array, Array], Array], solver: Solver = "network",
+) -> Array:
+    r"""The transform on a curved set: averages of tangent vectors, moved back onto the set.
+
+    .. math:: \mathbf x_j^+ = \operatorname{retract}\Bigl(\mathbf x_j,\;
+        N\sum_it_{ij}\operatorname{difference}(\mathbf x_i,\mathbf x_j)\Bigr)
+
+    with the cost :math:`|\operatorname{difference}(\mathbf x_i,\mathbf x_j)|^2`.
+
+    Parameters
+    ----------
+    ensemble : array_like, (..., N, d)
+        Members on the set.
+    log_weights : array_like, (..., N)
+        Logarithms of their weights.
+    difference : callable
+        ``difference(to, here) -> v``, (..., k): the tangent vector at `here` that points to `to`,
+        both (..., d). On a circle the angle between them, wrapped.
+    retract : callable
+        ``retract(here, v) -> x``, (..., d): where it leads.
+    solver : str
+        As for :func:`~distfilt.coupling.plan`.
+
+    Returns
+    -------
+    ndarray, (..., N, d)
+        On the set as nearly as `retract` leads there.
+
+    Examples
+    --------
+    Angles on both sides of ±π; the plain average of the second pair would be near zero.
+
+    >>> def wrapped(a, b):
+    ...     return (a - b + np.pi) % (2 * np.pi) - np.pi
+    >>> transform_along([[3.0], [-3.0]], np.log([0.75, 0.25]), difference=wrapped,
+    ...                 retract=lambda x, v: wrapped(x + v, 0.0)).round(3)
+    array([[ 3.   ],
+           [-3.142]])
+    """
+    x, n = ensemble, ensemble.shape[-2]
+    w, solve = normalised(log_weights, x.shape[:-1]), solver_of(solver, 0.01)
+    equal = np.full(n, 1 / n)
+    there, here = np.broadcast_arrays(x[..., :, None, :], x[..., None, :, :])
+    v = array(difference(there.copy(), here.copy()), "difference", (*x.shape[:-1], n, "k"))
+    costs = (v * v).sum(axis=-1)
+    steps = np.empty((*x.shape[:-1], v.shape[-1]))
+    for row in np.ndindex(x.shape[:-2]):
+        matrix, _ = solve(scaled(costs[row])[0] + _ties(n), w[row], equal)
+        steps[row] = n * np.einsum("ij,ijk->jk", matrix, v[row])
+    return array(retract(x.copy(), steps), "retract", x.shape)
+
+
+# Names of before, until the filters take those above.
+_normalised, _carried = normalised, carried
+
+
+def _rejuvenated(y: Array, x: Array, h: float, rng: Rng) -> Array:
+    return unchecked(rejuvenated)(y, x, bandwidth=h, rng=rng)

@@ -1,12 +1,11 @@
 """Couplings: the network simplex beside general solvers, alone up to N = 2000, and a whole study.
 
 Writes data/bench/coupling.csv, coupling-growth.csv and coupling-study.csv. Fails where scipy's
-linprog or cvxpy is less than thirty times slower, or the solvers disagree. cvxpy runs twice: as
-equations (4) and (5) are written down, built anew for every reading as a filter would, and built
-once for all problems of a size, which is the library's way; of that one the ratio is reported, for
-a compiled programme leaves little but HiGHS. No general solver gets more than 200 members: its
-matrices have 2 N^3 entries. The study is that of book/studies/pendulum.py, the paper's five
-algorithms without retraction; give the number of its runs as an argument, 100 by default.
+linprog or cvxpy is less than thirty times slower, or the solvers disagree. cvxpy runs as equations
+(4) and (5) are written down, built anew for every reading as a filter would. No general solver
+gets more than 200 members: its matrices have 2 N^3 entries. The study is the one of
+book/studies/pendulum.py, the paper's five algorithms without retraction; give the number of its
+runs as an argument, 100 by default.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from distfilt.coupling import Plan, distances, plan, sorted_plan
 SIZES = (50, 100, 200)
 GROWTH = (50, 100, 200, 500, 1000, 2000)
 NEEDED = {"linprog": 30, "cvxpy, built anew": 30}
-BOUNDS = {"clarabel": 1e-5, "entropic": np.inf}
+BOUNDS = {"entropic": np.inf}
 """Largest difference of the value from the network simplex's; 1e-11 for the others."""
 
 
@@ -75,8 +74,6 @@ def ratios() -> tuple[list[dict[str, object]], int]:
         others = {
             "linprog": partial(value, "linprog", cost, w),
             "cvxpy, built anew": partial(built_anew, cost, w),
-            "cvxpy HiGHS, built once": partial(value, "highs", cost, w),
-            "cvxpy Clarabel, built once": partial(value, "clarabel", cost, w),
             "entropic, 0.01": partial(value, "entropic", cost, w),
         }
         for solver, call in others.items():
@@ -148,7 +145,7 @@ def study(runs: int) -> list[dict[str, object]]:
 
 def main() -> int:
     """Measure, write the tables, and count what is missed."""
-    packages = ("numpy", "scipy", "POT", "cvxpy", "highspy", "clarabel")
+    packages = ("numpy", "scipy", "POT", "cvxpy", "highspy")
     write("coupling-growth", growth(), packages)
     rows, missed = ratios()
     write("coupling", rows, packages)
