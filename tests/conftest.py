@@ -13,5 +13,3 @@ settings.register_profile(
 )
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "gate"))
 
-# Not tests: calls that the fuzz records, which write files where they run.
-collect_ignore_glob = ["tools/fuzz_calls_*.py"]

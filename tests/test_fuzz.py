@@ -4,21 +4,17 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from tests.tools import fuzz
 
-TOOL = Path(fuzz.__file__)
-
 
 @pytest.mark.slow
 def test_no_argument_is_misread_and_no_input_changed() -> None:
     """Every exchange is refused by name, or right, or allowed with a reason; prints the counts."""
-    done = subprocess.run(
-        [sys.executable, str(TOOL), "--dry"], capture_output=True, text=True, cwd=TOOL.parents[2]
-    )
+    command = [sys.executable, "-m", "tests.tools.fuzz", "--dry"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=fuzz.ROOT)
     print(done.stdout.splitlines()[-1] if done.stdout else done.stderr[-2000:])
     assert done.returncode == 0, done.stdout[-20000:] + done.stderr[-2000:]
 
@@ -30,9 +26,9 @@ def test_a_door_left_open_is_found() -> None:
     import numpy as np
 
     def of(function: object, *args: object) -> dict[str, str]:
-        bound = inspect.signature(function).bind(*args)  # type: ignore[arg-type]
-        call = fuzz.Call("f", function, bound)  # type: ignore[arg-type]
-        return {f.kind: f.result for f in fuzz.findings({"f": [call]})}
+        signature = inspect.signature(function)  # type: ignore[arg-type]
+        call = fuzz.Call(function, signature, dict(signature.bind(*args).arguments))  # type: ignore[arg-type]
+        return {f.kind: f.result for f in fuzz.of("f", [call])}
 
     def careless(x: object) -> object:
         return np.asarray(x, dtype=complex).real * 2

@@ -5,7 +5,8 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable
 from functools import cache
-from typing import Annotated, Any, Literal
+from types import FunctionType
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +57,7 @@ def runnalls(mixture: GaussianMixture, size: Count, *, engine: Engine = "auto") 
     if mixture.size <= size:
         return mixture
     w, m, p, root = _whitened(mixture)
-    alive = _merged(w, m, p, size, _costs_by(engine))
+    alive = _merging(engine)(w, m, p, size)
     means = mixture.mean + m[alive] @ root.T
     covs = symmetrise(root @ p[alive] @ root.T)
     return GaussianMixture.unchecked(w[alive] / w[alive].sum(), means, covs)
@@ -106,10 +107,10 @@ def two_stage(mixture: GaussianMixture, size: Count, *, heaviest: Count = 400) -
     w, m, p, _ = _whitened(mixture)
     order = np.argsort(-w, kind="stable")
     heavy, rest = order[:heaviest], order[heaviest:]
-    costs, dets = _costs_by("auto"), np.linalg.slogdet(p)[1]
+    dets = np.linalg.slogdet(p)[1]
     labels = np.empty(w.size, dtype=np.intp)
     labels[heavy] = np.arange(heaviest)
-    labels[rest] = [costs(w, m, p, dets, i, heavy).argmin() for i in rest]
+    labels[rest] = [_costs(w, m, p, dets, i, heavy).argmin() for i in rest]
     return unchecked(runnalls)(_grouped(mixture, labels), size)
 
 
@@ -243,7 +244,7 @@ def _whitened(mixture: GaussianMixture) -> tuple[Array, Array, Array, Array]:
 
 
 def _costs(
-    w: Array, m: Array, p: Array, dets: Array, i: int, others: NDArray[np.intp]
+    w: Array, m: Array, p: Array, dets: Array, i: Any, others: NDArray[np.intp]
 ) -> Array:
     """Runnalls' bound of mixand i with others; a pair without weight costs nothing."""
     total = w[i] + w[others]
@@ -255,17 +256,20 @@ def _costs(
     return np.asarray(np.where(others == i, 0.0, bound))
 
 
-def _costs_by(engine: Engine) -> Callable[..., Array]:
-    """What computes a row of costs; "auto" takes numba where it is installed."""
+def _merging(engine: Engine) -> Callable[..., Mask]:
+    """What merges; "auto" takes numba where it is installed."""
     if engine == "numpy" or (engine == "auto" and importlib.util.find_spec("numba") is None):
-        return _costs
+        return _merged
     return _compiled()
 
 
 @cache
-def _compiled() -> Callable[..., Array]:
-    compiled: Callable[..., Array] = needed("numba", "speed").njit(cache=True)(_costs_in_loops)
-    return compiled
+def _compiled() -> Callable[..., Mask]:
+    compiled = needed("numba", "speed").njit(cache=True)
+    # The same function, with the other way to compute a row: numba keeps it between processes
+    # only if that is a global name.
+    names = globals() | {"_costs": compiled(_costs_in_loops)}
+    return cast(Callable[..., Mask], compiled(FunctionType(_merged.__code__, names)))
 
 
 def _costs_in_loops(w: Any, m: Any, p: Any, dets: Any, i: Any, others: Any) -> Any:
@@ -277,55 +281,60 @@ def _costs_in_loops(w: Any, m: Any, p: Any, dets: Any, i: Any, others: Any) -> A
         if total <= 0.0 or i == j:
             continue
         a, b = w[i] / total, w[j] / total
-        half = 0.0
+        one, other, gap = p[i], p[j], np.sqrt(a * b) * (m[i] - m[j])
+        log_det = 0.0
         for r in range(d):
-            for c in range(r + 1):
-                s = a * p[i, r, c] + b * p[j, r, c]
-                s += a * b * (m[i, r] - m[j, r]) * (m[i, c] - m[j, c])
+            for c in range(r):
+                s = a * one[r, c] + b * other[r, c] + gap[r] * gap[c]
                 for e in range(c):
                     s -= lower[r, e] * lower[c, e]
-                lower[r, c] = np.sqrt(s) if r == c else s / lower[c, c]
-            half += np.log(lower[r, r])
-        out[k] = total * half - 0.5 * (w[i] * dets[i] + w[j] * dets[j])
+                lower[r, c] = s * lower[c, c]
+            s = a * one[r, r] + b * other[r, r] + gap[r] ** 2
+            for e in range(r):
+                s -= lower[r, e] ** 2
+            lower[r, r] = 1.0 / np.sqrt(s)  # the reciprocal, so that columns need no division
+            log_det += np.log(s)
+        out[k] = 0.5 * (total * log_det - w[i] * dets[i] - w[j] * dets[j])
     return out
 
 
-def _merged(w: Array, m: Array, p: Array, size: int, costs: Callable[..., Array]) -> Mask:
+def _merged(w: Any, m: Any, p: Any, size: Any) -> Any:
     """Merge the cheapest pair until `size` mixands are left, in place; which are left."""
     n = w.size
-    every, alive = np.arange(n), np.ones(n, dtype=bool)
-    dets = np.linalg.slogdet(p)[1]
-    table = np.full((n, n), np.inf)
-    for i in range(n - 1):
-        table[i, i + 1 :] = costs(w, m, p, dets, i, every[i + 1 :])
-    nearest = table.argmin(axis=1)
+    every, alive = np.arange(n), np.full(n, True)
+    dets = np.array([np.linalg.slogdet(p[i])[1] for i in range(n)])
+    table, best, nearest = np.full((n, n), np.inf), np.full(n, np.inf), np.zeros(n, np.int64)
+    for k in range(n - 1):
+        table[k, k + 1 :] = _costs(w, m, p, dets, k, every[k + 1 :])
+        nearest[k] = np.argmin(table[k])
+        best[k] = table[k, nearest[k]]
     for _ in range(n - size):
-        best = table[every, nearest]
         # The first of the pairs that cost the same, so that rounding does not choose.
         limit = best.min() + 1e-12 + 1e-9 * abs(best.min())
-        i = int(np.argmax(best <= limit))
-        j = int(np.argmax(table[i] <= limit))
-        _merge(w, m, p, i, j)
-        alive[j] = False
-        table[j, :] = table[:, j] = np.inf
+        i = np.argmax(best <= limit)
+        j = np.argmax(table[i] <= limit)
+        total = w[i] + w[j]
+        a = w[i] / total if total > 0 else 0.5
+        gap = m[i] - m[j]
+        p[i] = a * p[i] + (1 - a) * p[j] + a * (1 - a) * np.outer(gap, gap)
+        m[i] = a * m[i] + (1 - a) * m[j]
+        w[i], w[j], alive[j], best[j] = total, 0.0, False, np.inf
+        table[j, :] = np.inf
+        table[:, j] = np.inf
         dets[i] = np.linalg.slogdet(p[i])[1]
         others = every[alive & (every != i)]
-        table[np.minimum(i, others), np.maximum(i, others)] = costs(w, m, p, dets, i, others)
+        row = _costs(w, m, p, dets, i, others)
+        below = others < i
+        table[others[below], i] = row[below]
+        table[i, others[~below]] = row[~below]
         # Only rows that lost their neighbour, and the merged one, are searched again.
-        lost = np.flatnonzero((nearest == i) | (nearest == j) | (every == i))
-        nearest[lost] = table[lost].argmin(axis=1)
-        nearest[table[:, i] < table[every, nearest]] = i
+        for lost in np.flatnonzero(alive & ((nearest == i) | (nearest == j) | (every == i))):
+            nearest[lost] = np.argmin(table[lost])
+            best[lost] = table[lost, nearest[lost]]
+        closer = table[:, i] < best
+        nearest = np.where(closer, i, nearest)
+        best = np.where(closer, table[:, i], best)
     return alive
-
-
-def _merge(w: Array, m: Array, p: Array, i: int, j: int) -> None:
-    """Put j into i, keeping mean and covariance of the pair."""
-    total = w[i] + w[j]
-    a = w[i] / total if total > 0 else 0.5
-    gap = m[i] - m[j]
-    p[i] = a * p[i] + (1 - a) * p[j] + a * (1 - a) * np.outer(gap, gap)
-    m[i] = a * m[i] + (1 - a) * m[j]
-    w[i], w[j] = total, 0.0
 
 
 def _grouped(mixture: GaussianMixture, labels: NDArray[np.intp]) -> GaussianMixture:

@@ -1,0 +1,114 @@
+"""Every public name stands behind its declared door, and refuses by name what does not fit."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import re
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import fields, is_dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+
+from distfilt.doors import describe
+from distfilt.doors.kinds import Scope
+from tests.tools.calls import Call, callables, calls, public, rooms
+from tests.tools.fuzz import exact
+
+PUBLIC = {name: thing for room in rooms() for name, thing in public(room).items()}
+WITHOUT = {
+    r"linalg\..*": "for loops, which have checked before",
+    r".*(Error|Collapse|Gain)": "an error or a warning, which a user catches",
+    r"filters\.(\w*State|Summary|Filter)|network\.\w*(State|Run)|metrics\.Interval|coupling\.Plan":
+        "made by the library, or derived from by a user",
+    r"ensembles\.(Ensemble|Members)|models\.Swarm|triangular\.ConditionalMap": "a type",
+    r"updates\.(update|effective_size|with_missing)":
+        "looks at what has no kind: a function's signature, logarithms with -inf, a step's own",
+}  # fmt: skip
+"""Public names without a door, as patterns, and why."""
+LEFT = 150
+"""How many more there may be: none at the end."""
+IN_A_ROW = {
+    "graph", "covariance", "members", "weights", "numbers", "columns", "target", "lost", "dropped",
+    "strength", "bodies", "reading", "wanted", "mixtures",
+}  # fmt: skip
+"""Data that a call may leave out, such as a filter's graph; options are given by name."""
+
+
+def wrong(valid: Any) -> Iterator[Any]:
+    """Values of other kinds, and the valid one made worse; a kind refuses some of them."""
+    yield from (object(), "no such", 1.5, -1, 0, 2, True, np.nan, 1j, [], [1.0, "text"])
+    with suppress(TypeError, ValueError):
+        x = np.atleast_1d(np.asarray(valid, dtype=float))
+        yield from (-x, 0 * x - 1, x + 1j, x.astype(str), x[..., None, None], x[:0], 3 * x + 2)
+        if x.size:
+            flat = x.copy()
+            flat.flat[-1] = np.nan
+            yield from (flat, np.where(np.isnan(flat), np.inf, x), x.flat[0], x.ravel()[::-1])
+
+
+def refuses(value: Any, call: Call, name: str) -> bool:
+    """Whether the kinds themselves, asked in the door's order, refuse a value by its name."""
+    given = call.given | {name: copy.deepcopy(value)}
+    scope = Scope(dict(given))
+    for other, kind in describe(call.function).items():
+        try:
+            if other in given:
+                kind.take(given[other], other, scope)
+        except ValueError as error:
+            return other == name and str(error).startswith(name)
+        except Exception:  # an object of which an array cannot be made
+            return False
+    return False
+
+
+def is_doorless(thing: Any) -> bool:
+    """Whether a public name takes arguments and declares nothing about them."""
+    return callable(thing) and not callables(thing) and not isinstance(thing, type(Iterator[int]))
+
+
+@pytest.mark.parametrize("name", sorted(PUBLIC))
+def test_a_door_refuses_by_name(name: str) -> None:
+    thing = PUBLIC[name]
+    for method, function in callables(thing).items():
+        found = calls(thing, function)
+        assert found or method or inspect.isclass(thing), f"{name}: no example calls it"
+        for call, (argument, kind) in product(found[:1], describe(function).items()):
+            if argument not in call.given:
+                continue
+            bad = [v for v in wrong(call.given[argument]) if refuses(v, call, argument)]
+            assert bad, f"{name}{method}({argument}): {kind.needs} refuses nothing"
+            for value in bad:
+                before = copy.deepcopy(call.given)
+                with pytest.raises(ValueError) as caught:
+                    call.run(**{argument: value})
+                assert str(caught.value).startswith(argument), f"{name}{method}: {caught.value}"
+                assert exact(before, call.given)
+
+
+def test_every_public_name_has_a_door_or_a_reason() -> None:
+    found = [name for name, thing in PUBLIC.items() if is_doorless(thing)]
+    doorless = [n for n in found if not any(re.fullmatch(p, n) for p in WITHOUT)]
+    assert len(doorless) <= LEFT, doorless
+
+
+def test_options_are_given_by_name() -> None:
+    for name, thing in PUBLIC.items():
+        if function := callables(thing).get(""):
+            parameters = inspect.signature(function).parameters.values()
+            row = {p.name for p in parameters if p.kind < 2 and p.default is not p.empty}
+            assert row <= IN_A_ROW, f"{name}: {sorted(row - IN_A_ROW)} can stand in a row"
+
+
+def test_structures_are_frozen_and_arrays_make_no_equality() -> None:
+    """Two structures of arrays would be compared entry by entry, which is no truth value."""
+    for name, made in PUBLIC.items():
+        if inspect.isclass(made) and is_dataclass(made):
+            options: Any = made.__dataclass_params__  # type: ignore[attr-defined]
+            assert options.frozen or name == "filters.Step", f"{name} can be changed"
+            types = " ".join(re.sub(r"Callable\[.*\]", "", str(f.type)) for f in fields(made))
+            assert not (options.eq and "Array" in types), f"{name} compares arrays"

@@ -1,0 +1,195 @@
+"""Doors: what the kinds let through and refuse, how shapes are bound, records, and ways round."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from distfilt import doors
+from distfilt.doors import (
+    MISSING,
+    Array,
+    Bounds,
+    Count,
+    Cov,
+    Mask,
+    Places,
+    Positive,
+    Record,
+    Rng,
+    Semidefinite,
+    Times,
+    Weights,
+    definite,
+    describe,
+    door,
+    semidefinite,
+    unchecked,
+)
+from distfilt.doors.kinds import Scope, kind_of
+from tests.support import ASYMMETRIC, INDEFINITE, NAN, generator, spd
+
+MASKED = np.ma.masked_array([1.0, 2.0], [False, True])
+ODD = (["1.0"], "three", True, [True, 2.0], 1j, np.array([1 + 0j]), np.array(["2020"], "M8[D]"),
+       np.timedelta64(1, "s"), MASKED, [MASKED], None, [None, 1.0], {}, object(),
+       [[1.0, 2.0], [3.0]], [10**400])  # fmt: skip
+KINDS: list[tuple[Any, Sequence[Any], Sequence[Any]]] = [
+    (float, [1, 2.5, np.float32(0.5), np.array(2.0)], [*ODD, NAN, np.inf, [1.0]]),
+    (Positive, [0.5], [0, -1.0]),
+    (Annotated[float, Bounds(at_least=0, below=1)], [0, 0.5], [-0.1, 1.0]),
+    (int, [3, np.int64(3)], [2.0, True, "2", np.timedelta64(2), np.array([2])]),
+    (Count, [1], [0]),
+    (bool, [True], [1, "yes"]),
+    (str, ["a"], ["", " ", 3]),
+    (Literal["a", "b"], ["a"], ["c", None, [], np.array(["a", "b"])]),
+    (Rng, [generator()], [None, np.random.RandomState(0)]),
+    (Callable[..., Any], [len], [3]),
+    (dict, [{}], [3]),
+    (float | None, [None, 1.0], ["a"]),
+    (float | Literal["all"], ["all", 1], ["some"]),
+    (Places, [[0, 2], np.array([1])], [3, [], [1, 1], [-1], [0.5], "12"]),
+    (tuple[int, str], [(1, "a")], [(1,), (1, 2), 3]),
+    (Annotated[Array, "2 N"], [[[1, 2], [3, 4]], np.zeros((2, 0))], [*ODD, [1.0, 2.0], [[1, NAN]]]),
+    (Annotated[Array, "m", MISSING], [[1.0, NAN]], [[np.inf], [], [[1.0]]]),
+    (Annotated[Mask, "A"], [[True, False]], [[1, 0], ["True"], np.ma.masked_array([True])]),
+    (Annotated[Times, "T"], [[0.0, 1.0], []], [[1.0, 1.0], [0.0, 2.0, 1.0]]),
+    (Weights, [[[0.25, 0.75], [1, 0]]], [[0.5, 0.4], [1.5, -0.5], [[0.5, 0.5], [0.5, 0.6]]]),
+    (Cov, [np.eye(2)], [INDEFINITE, ASYMMETRIC, [[1.0, 0.0]], np.zeros((2, 2))]),
+    (Semidefinite, [np.zeros((2, 2))], [INDEFINITE, -np.eye(2), [[1.0, 0.1], [0.1, 0.0]]]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("annotation", "good", "bad"), KINDS, ids=lambda v: str(v)[:40])
+def test_a_kind_lets_through_and_refuses(annotation: Any, good: Any, bad: Any) -> None:
+    kind = kind_of(annotation)
+    assert kind is not None
+    for value in good:
+        out = kind.take(value, "x", Scope({}))
+        np.testing.assert_array_equal(out, value)
+    for value in bad:
+        with pytest.raises(ValueError, match="^x: needs .*got "):
+            kind.take(value, "x", Scope({}))
+
+
+def test_numbers_are_converted_and_arrays_are_not_copied() -> None:
+    x = np.zeros((3, 4))
+    assert doors.array(x, "x", (..., "N", 4)) is x
+    for given_ in ([[1, 2]], np.array([[1, 2]], dtype=np.int32), np.array([[1, 2]], dtype=">f8")):
+        out = doors.array(given_, "x", (1, 2))
+        assert type(out) is np.ndarray and out.dtype == np.float64 and out.tolist() == [[1.0, 2.0]]
+    with pytest.raises(ValueError, match=r"^x: needs shape \(\.\.\., N, 2\), got \(3,\)$"):
+        doors.array(np.zeros(3), "x", (..., "N", 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Line(Record):
+    """A record with a shape bound by another field, an option, and a method with a door."""
+
+    dim: Count
+    cov: Annotated[Cov, "dim dim"]
+    names: tuple[str, ...] = field(default=(), kw_only=True)
+
+    @door
+    def moved(self, x: Annotated[Array, "... self.dim"], by: float = 1.0) -> Array:
+        return x + by
+
+
+def test_shapes_are_bound_by_arguments_fields_and_paths() -> None:
+    @door
+    def both(x: Annotated[Array, "N d"], y: Annotated[Array, "N"], line: Line,
+             z: Annotated[Array, "line.dim+1 d"]) -> tuple[Any, ...]:  # fmt: skip
+        return x, y, z
+
+    fits = {"x": np.ones((3, 4)), "y": np.ones(3), "line": Line(2, np.eye(2)), "z": np.ones((3, 4))}
+    both(**fits)
+    for name, bad in (("y", np.ones(4)), ("z", np.ones((2, 4))), ("line", 3)):
+        with pytest.raises(ValueError, match=f"^{name}: "):
+            both(**(fits | {name: bad}))
+
+
+def test_records_copy_and_freeze_and_a_way_round_does_neither() -> None:
+    cov = np.eye(2)
+    line = Line(2, cov, names=["a"])
+    cov[0, 0] = 9.0
+    assert line.cov[0, 0] == 1.0 and line.names == ("a",) and not line.cov.flags.writeable
+    assert Line.unchecked(2, cov).cov is cov and Line.unchecked(2, cov).names == ()
+    assert line.changed(dim=7).dim == 7 and pickle.loads(pickle.dumps(line)).dim == 2
+    with pytest.raises(ValueError, match="^cov: "):
+        Line(3, cov)
+    assert list(describe(Line)) == ["dim", "names", "cov"]
+
+
+def test_the_way_round_a_door() -> None:
+    line = Line(1, [[1.0]])
+    with pytest.raises(ValueError, match="^x: "):
+        line.moved([1.0, 2.0])
+    assert unchecked(line.moved)(np.ones(2)).tolist() == [2.0, 2.0]
+    assert unchecked(partial(line.moved, by=2.0))(np.ones(2)).tolist() == [3.0, 3.0]
+    assert unchecked(len) is len
+
+
+def test_a_partial_s_options_are_looked_at_where_it_is_handed_in() -> None:
+    @door
+    def apply(f: Callable[..., Array], x: float) -> Any:
+        return unchecked(f)(x)
+
+    scaled = door(lambda x, by: x * by)
+    scaled.plan.function.__annotations__ = {"by": Positive}
+    assert apply(partial(scaled, by=2), 3.0) == 6.0
+    with pytest.raises(ValueError, match="^by: needs a number above 0"):
+        apply(partial(scaled, by=-2), 3.0)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 6))
+def test_covariances_pass_in_any_units(seed: int, d: int) -> None:
+    rng = generator(seed)
+    size = 10.0 ** rng.uniform(-100, 100, (3, d))
+    cov = spd(rng, d, (3,)) * size[:, :, None] * size[:, None, :]
+    for rule in (definite, semidefinite):
+        rule(0.5 * (cov + cov.swapaxes(1, 2)), "P")
+
+
+@pytest.mark.parametrize("rule", [definite, semidefinite])
+def test_each_matrix_is_judged_alone_and_each_component_in_its_units(rule: Any) -> None:
+    hidden = np.diag([1e12, 1.0, 1.0])
+    hidden[1, 2] = hidden[2, 1] = 1.1
+    for cov, words in (
+        (np.diag([1e12, -100.0]), "-100"),
+        ([[1e12, 0, 0], [0, 1.0, 0.9], [0, -0.9, 1.0]], "asymmetry of 1.8"),
+        ([np.diag([1e12, 1e12]), INDEFINITE], r"at \[1\]"),
+        ([[1e12 * np.eye(2), np.diag([1.0, -1e-9])]], r"at \[0, 1\]"),
+        (hidden, "smallest eigenvalue -0.1"),
+        ([[1e12, 0, 0], [0, 1.0, 0.5], [0, 0.5 + 1e-8, 1.0]], "symmetric"),
+    ):
+        with pytest.raises(ValueError, match=f"^P: .*{words}"):
+            rule(np.array(cov), "P")
+
+
+def test_rounding_is_no_asymmetry_and_no_negative_eigenvalue() -> None:
+    definite(np.array([[1e12, 3e5], [3e5 * (1 + 1e-11), 1.0]]), "P")
+    definite(1e-310 * np.eye(2), "P")
+    for cov in (np.outer([1.0, 1e-6, 1e6], [1.0, 1e-6, 1e6]), np.diag([0.0, 2.0])):
+        semidefinite(cov, "P")
+    with pytest.raises(ValueError, match="smallest eigenvalue"):
+        semidefinite(np.array([[1.0, 1.0 + 1e-8], [1.0 + 1e-8, 1.0]]), "P")
+
+
+def test_a_missing_package_names_its_extra_and_an_installed_one_s_errors_pass(
+    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'distfilt\[maps\]'$") as caught:
+        doors.needed("no_such.package", "maps")
+    assert caught.value.name == "no_such.package"
+    (tmp_path / "half_there.py").write_text("import not_there_at_all")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(ModuleNotFoundError) as caught:
+        doors.needed("half_there", "maps")
+    assert caught.value.name == "not_there_at_all" and "extra" not in str(caught.value)
