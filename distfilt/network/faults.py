@@ -105,17 +105,14 @@ class Faults(Record):
 
     def check(self, graph: Graph) -> None:
         """Refuse a graph whose agents do not fit."""
+        agents = graph.size
         for faults in self._all():
-            needed = (graph.size,) * np.ndim(faults.loss)
-            if np.shape(faults.loss) != needed:
-                raise ValueError(
-                    f"loss: needs a number for each of {graph.size} agents, shape {needed}, "
-                    f"got {np.shape(faults.loss)}"
-                )
-            if faults.silent and max(faults.silent) >= graph.size:
-                raise ValueError(
-                    f"silent: needs agents below {graph.size}, got {max(faults.silent)}"
-                )
+            got = np.shape(faults.loss)
+            if got != (agents,) * len(got):
+                raise ValueError(f"loss: needs a number for each of {agents} agents, got {got}")
+            most = max(faults.silent, default=-1)
+            if most >= agents:
+                raise ValueError(f"silent: needs agents below {agents}, got {most}")
 
     @property
     def none(self) -> bool:

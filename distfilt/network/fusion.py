@@ -1,7 +1,6 @@
 """Rules by which Gaussians and ensembles agree, whose errors may share what nobody kept track of.
 
-``rule((means, covs), channel, *, …) -> (means, covs)`` and ``rule(ensembles, channel, *, …) ->
-ensembles``: a filter's ``agreement=``, with :func:`functools.partial` for the options.
+A filter takes one as its ``agreement=``, with :func:`functools.partial` for the options.
 """
 
 from __future__ import annotations
@@ -11,15 +10,14 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..doors import Array, Count, Mask, NonNegative, definite, door, unchecked
+from ..doors import Array, Bounds, Count, Mask, NonNegative, definite, door, unchecked
 from ..ensembles import mean, sample_covariance
 from ..gaussians import _intersection_weights, _recolour
 from ..linalg import cholesky, solve_lower, symmetrise
 from .channel import Channel
 from .consensus import fuses
-from .graphs import Graph
+from .graphs import Graph, Indices
 from .weights import _laplacian, _warn_if_unstable
 
 __all__ = [  # fmt: skip
@@ -33,7 +31,6 @@ Gaussians = tuple[
 ]
 Ensembles = Annotated[Array, "*channel.runs channel.graph.size N d"]
 Pair = tuple[Array, Array]
-Indices = NDArray[np.int64]
 Rule = Literal["equal", "trace", "determinant", "min_trace", "min_determinant"]
 
 
@@ -186,8 +183,7 @@ def consensus_pull(
     m, p = belief
     if gain == 0:
         return m.copy(), p.copy()
-    trust = np.broadcast_to(np.eye(m.shape[-1]), p.shape)
-    largest = 1.0
+    trust, largest = np.broadcast_to(np.eye(m.shape[-1]), p.shape), 1.0
     if rule == "covariance":
         norm = np.sqrt((p**2).sum(axis=(-2, -1), keepdims=True))
         trust = p / (1 + norm)
@@ -254,7 +250,8 @@ def pull(
 @fuses("ensembles")
 @door
 def intersection(
-    ensembles: Ensembles, channel: Channel, *, rule: Rule = "min_determinant", rounds: Count = 1
+    ensembles: Ensembles, channel: Channel, *, rule: Rule = "min_determinant",
+    scale: Annotated[Array, "d", Bounds(above=0)] | None = None, rounds: Count = 1,
 ) -> Array:
     """Fuse sample means and covariances by intersection, and move each ensemble to have those.
 
@@ -267,7 +264,9 @@ def intersection(
     channel : Channel
         d + d(d+1)/2 scalars a link and round. Whoever misses a message fuses without it.
     rule : {"equal", "trace", "determinant", "min_trace", "min_determinant"}
-        As for :func:`covariance_intersection`; traces add variances of different units.
+        As for :func:`covariance_intersection`.
+    scale : array_like, (d,), optional
+        A size of each component, by which to divide before traces add variances of unlike units.
     rounds : int
         How many times.
 
@@ -279,13 +278,15 @@ def intersection(
     array([[0.5, 2.5],
            [0.5, 2.5]])
     """
-    members, d = ensembles.shape[-2:]
-    if members <= d:
-        raise ValueError(f"ensembles: needs more than {d} members, as components, got {members}")
-    belief = unchecked(mean)(ensembles), unchecked(sample_covariance)(ensembles)
+    n, d = ensembles.shape[-2:]
+    if n <= d:
+        raise ValueError(f"ensembles: needs more members than its {d} components, got {n}")
+    size = 1.0 if scale is None else scale
+    x = ensembles / size
+    belief = unchecked(mean)(x), unchecked(sample_covariance)(x)
     definite(belief[1], "ensembles")
     fused = unchecked(covariance_intersection)(belief, channel, rule=rule, rounds=rounds)
-    return _recolour(ensembles, *fused)
+    return _recolour(x, *fused) * size
 
 
 @dataclass(eq=False)
@@ -313,8 +314,8 @@ class _Heard:
 
     def gaps(self) -> Array:
         """The heard mean less the own one, on each link, (R, E, d)."""
-        graph = self.graph
-        return np.asarray(self.sent_means[:, graph.senders] - self.means[:, graph.receivers])
+        senders, receivers = self.graph.senders, self.graph.receivers
+        return self.sent_means[:, senders] - self.means[:, receivers]
 
     def groups(self) -> Iterator[tuple[Indices, Indices, Array, Mask]]:
         """Agents that hear equally many, (n,), and their links, (n, S - 1).

@@ -78,46 +78,45 @@ def taken(
             out.append(None)
             continue
         flat = payload if type(payload) is tuple else (payload,)
-        parts = tuple([_part(p, f"payloads[{agent}]", runs, copy) for p in flat])
+        parts = tuple([_part(p, agent, runs, copy) for p in flat])
         if not parts:
             raise ValueError(f"payloads[{agent}]: needs arrays, or None to stay silent, got ()")
-        silent = all([p.size > 0 and _missing(p, 1) == p.size for p in parts])
+        silent = all([p.size and p.item(0) != p.item(0) and _missing(p) == p.size for p in parts])
         out.append(None if silent else parts if type(payload) is tuple else parts[0])
     return out
 
 
-def _part(part: Any, name: str, runs: tuple[int, ...], copy: bool) -> Part:
-    if not isinstance(part, np.ndarray) or isinstance(part, np.ma.MaskedArray):
-        raise ValueError(
-            f"{name}: needs a numeric array, a flat tuple of them or None, "
-            f"got {type(part).__name__}"
-        )
-    if part.dtype.kind not in "biuf":
-        raise ValueError(
-            f"{name}: needs booleans, integers or real numbers, got dtype {part.dtype}"
-        )
+def _part(part: Any, agent: int, runs: tuple[int, ...], copy: bool) -> Part:
+    plain = isinstance(part, np.ndarray) and not isinstance(part, np.ma.MaskedArray)
+    if not plain or part.dtype.kind not in "biuf":
+        got = f"dtype {part.dtype}" if plain else type(part).__name__
+        needs = "an array of real numbers, a flat tuple of them or None"
+        raise ValueError(f"payloads[{agent}]: needs {needs}, got {got}")
     if part.shape[: len(runs)] != runs:
-        raise ValueError(f"{name}: needs leading axes {runs}, got shape {part.shape}")
+        raise ValueError(f"payloads[{agent}]: needs leading axes {runs}, got shape {part.shape}")
     out = np.array(part) if copy else part.view(np.ndarray)
     out.flags.writeable = False
     return out
 
 
-def _missing(part: Part, copies: int) -> int:
+def _missing(part: Part, copies: int = 1) -> int:
     """How many of a payload's entries are NaN in all of so many copies, and so not sent."""
-    if part.dtype.kind != "f":
+    if part.dtype.kind != "f" or not part.size:
         return 0
-    gone = np.isnan(part)
-    return int(gone.reshape(copies, -1).all(axis=0).sum()) if gone.any() else 0
+    least = np.minimum.reduce(part, axis=None)  # NaN if one is
+    return 0 if least == least else int(np.isnan(part).reshape(copies, -1).all(axis=0).sum())
 
 
 def sizes(sent: list[Payload | None], runs: tuple[int, ...]) -> tuple[Any, Any]:
     """Scalars and bytes of each agent's payload in one run; what is missing in all is not sent."""
     copies = math.prod(runs)
-    parts = [() if p is None else p if isinstance(p, tuple) else (p,) for p in sent]
-    counts = [[(a.size // copies - _missing(a, copies), a.itemsize) for a in p] for p in parts]
-    scalars = [sum([n for n, _ in c]) for c in counts]
-    return np.array(scalars), np.array([sum([n * size for n, size in c]) for c in counts])
+    counts = []
+    for payload in sent:
+        parts = payload if isinstance(payload, tuple) else () if payload is None else (payload,)
+        here = [(p.size // copies - _missing(p, copies), p.itemsize) for p in parts]
+        counts.append((sum([n for n, _ in here]), sum([n * size for n, size in here])))
+    scalars, bytes_ = np.array(counts).T
+    return scalars, bytes_
 
 
 def thinned(payload: Payload, arrived: Mask) -> Payload:

@@ -310,21 +310,14 @@ def balanced(graph: Graph) -> Weights:
 
 def _keeping(weights: Weights) -> Weights:
     """The weights themselves, or a ValueError if their columns do not sum to one."""
+    graph, own, links = weights.graph, weights.own, weights.links
     # Not by the matrix: scipy's sums sort its entries in place, which changes how sums round.
-    graph = weights.graph
-    columns, sizes = (
-        own + np.bincount(graph.senders, weights=links, minlength=graph.size)
-        for own, links in (
-            (weights.own, weights.links),
-            (np.abs(weights.own), np.abs(weights.links)),
-        )
-    )
+    columns = own + np.bincount(graph.senders, links, graph.size)
     # Rounding grows with the weights that cancel in a sum.
-    off = np.abs(columns - 1) / np.maximum(1.0, sizes)
+    size = np.abs(own) + np.bincount(graph.senders, np.abs(links), graph.size)
+    off = np.abs(columns - 1) / np.maximum(1.0, size)
     worst = int(off.argmax())
-    if off[worst] > 1e-9:
-        raise ValueError(
-            f"weights: needs columns that sum to 1 to keep the average, got {columns[worst]:.6g} "
-            f"for agent {worst}"
-        )
-    return weights
+    if off[worst] <= 1e-9:
+        return weights
+    got = f"{columns[worst]:.6g} for agent {worst}"
+    raise ValueError(f"weights: needs columns that sum to 1 to keep the average, got {got}")

@@ -131,14 +131,6 @@ def test_a_late_message_is_what_was_sent(delay: int) -> None:
     assert got == expected
 
 
-def test_a_late_message_arrives_though_its_sender_fell_silent() -> None:
-    channel = Channel(graphs.path(2), faults=Faults(delay=1))
-    assert channel.exchange([np.ones(1), None])[1] == {}
-    assert channel.exchange([None, None])[1][0] == 1.0
-    assert channel.exchange([None, None])[1] == {}
-    assert (channel.ledger.messages == [1, 0]).all()
-
-
 def test_what_is_lost_is_lost_when_it_is_sent() -> None:
     """With a delay the same messages get through, a round later."""
     faults = {"loss": 0.5, "seed": 3}
@@ -309,39 +301,6 @@ def test_rules_for_losses_by_their_definition(lost: str) -> None:
         expected[i] = own * values[i] + share @ values
     out = Channel(graph, faults=faults).combine(values, w, lost=lost)
     assert np.abs(out - expected).max() < 1e-14
-
-
-def test_agents_still_agree_through_losses_on_their_average() -> None:
-    """Disagreement too, not only the average, which no rounds at all would keep."""
-    graph = REFERENCE["disk"]
-    values = rng(4).standard_normal((20, graph.size, 1))
-    centre = values.mean(axis=-2, keepdims=True)
-    for lost in ("mutual", "metropolis"):
-        channel = Channel(graph, runs=(20,), faults=Faults(loss=0.3, seed=8))
-        half = channel.combine(values, weights.metropolis(graph), lost=lost, rounds=100)
-        late = channel.combine(half, weights.metropolis(graph), lost=lost, rounds=200)
-        gaps = [np.abs(v - centre).max() for v in (values, half, late)]
-        assert gaps[1] < 0.25 * gaps[0] and gaps[2] < 0.02 * gaps[1]
-        assert np.abs(late.mean(axis=-2) - centre[..., 0, :]).max() < 1e-13
-
-
-def test_one_lost_message_stops_both_sides() -> None:
-    """Only 0 -> 1 is lost: with "mutual" neither moves, with "keep" agent 0 does."""
-    graph, values = graphs.path(2), np.array([[0.0], [2.0]])
-    half = of_matrix(graph, np.full((2, 2), 0.5))
-    faults = Faults(loss=[[0.0, 0.0], [1.0, 0.0]])
-    mutual = Channel(graph, faults=faults).combine(values, half, lost="mutual")
-    assert (mutual == values).all()
-    keep = Channel(graph, faults=faults).combine(values, half, lost="keep")
-    assert (keep.ravel() == [1.0, 2.0]).all()
-
-
-def test_certain_loss_and_its_account() -> None:
-    channel = lossy(1.0)
-    assert all(not box for box in channel.exchange([np.zeros(2)] * 3))
-    assert (channel.ledger.messages == channel.ledger.lost).all()
-    values = rng(1).standard_normal((3, 2))
-    assert (lossy(1.0).combine(values, weights.metropolis(STAR), rounds=3) == values).all()
 
 
 def test_losses_in_a_batch_are_counted_on_average() -> None:

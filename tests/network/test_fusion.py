@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from distfilt import gaussians as pure
 from distfilt.doors import unchecked
 from distfilt.ensembles import mean, sample_covariance
-from distfilt.gaussians import recolour
 from distfilt.network import (
     Channel,
     Faults,
@@ -37,6 +36,7 @@ ALL = [*(partial(covariance_intersection, rule=r) for r in RULES), naive_fusion,
 NAMES = [*RULES, "naive", "arithmetic", "pull"]
 every = pytest.mark.parametrize("rule", ALL, ids=NAMES)
 MOVES = (intersection, partial(intersection, rule="equal"), partial(pull, gain=0.1))
+SIZES = np.logspace(-1, 2, 4)
 moves = pytest.mark.parametrize("rule", MOVES, ids=["least", "equal", "pull"])
 
 
@@ -179,29 +179,11 @@ def test_what_uses_determinants_does_not_depend_on_units(rule: str) -> None:
     assert np.allclose(other[1], units @ plain[1] @ units, rtol=1e-6)
 
 
-@pytest.mark.parametrize("d", [1, 2, 3])
-def test_closed_weights_by_their_formula(d: int) -> None:
-    """Isotropic covariances s² I: both rules give 1 / s², not the determinant's (1 / s²)^d."""
-    s2 = np.array([1.0, 2.0, 5.0])
-    p = s2[:, None, None] * np.eye(d)
-    omega = (1 / s2) / (1 / s2).sum()
-    expected = 1 / (omega / s2).sum()
-    for rule in ("trace", "determinant"):
-        cov = covariance_intersection((np.zeros((3, d)), p), star(), rule=rule)[1]
-        assert np.allclose(cov[0], expected * np.eye(d))
-
-
 def test_naive_fusion_grows_sure_of_one_measurement() -> None:
     """The same datum passed round and round: variance falls, although nothing new was learned."""
     m, p = np.zeros((3, 1)), np.ones((3, 1, 1))
     assert naive_fusion((m, p), star(), rounds=5)[1].max() < 0.02
     assert np.allclose(covariance_intersection((m, p), star(), rounds=5)[1], 1.0)
-
-
-def test_repeated_intersection_agrees() -> None:
-    m, p = gaussians(5, 5)
-    mean, cov = covariance_intersection((m, p), Channel(graphs.ring(5)), rounds=60)
-    assert np.ptp(mean, axis=0).max() < 1e-6 and np.ptp(cov, axis=0).max() < 1e-6
 
 
 def test_a_consensus_pull_by_covariance() -> None:
@@ -300,6 +282,15 @@ def test_the_default_weights_give_the_least_determinant() -> None:
     assert (sizes[0] < sizes[1] - 1e-3).any()
 
 
+def test_scale_matters_to_traces_only() -> None:
+    e = _ensembles(4)
+    for rule in RULES:
+        plain = intersection(e, star(), rule=rule)
+        scaled = intersection(e, star(), rule=rule, scale=SIZES)
+        assert np.allclose(plain, scaled, rtol=1e-6, atol=1e-6) == ("trace" not in rule)
+        assert np.allclose(scaled, intersection(e / SIZES, star(), rule=rule) * SIZES)
+
+
 @moves
 def test_ensembles_one_hop_units_equality_and_loss(rule: object) -> None:
     """What every rule does: news travels a hop a round, units do not matter, inputs stay."""
@@ -318,57 +309,9 @@ def test_ensembles_one_hop_units_equality_and_loss(rule: object) -> None:
 
 
 @pytest.mark.parametrize("rule", MOVES[:2], ids=["least", "equal"])
-def test_a_lost_message_is_left_out(rule: object) -> None:
-    """Run by run: with everything lost an ensemble stays; with one lost, as if never sent."""
-    e = _ensembles(5)
-    deaf = rule(e, star(faults=Faults(loss=1.0, seed=0)))
-    assert np.abs(deaf - e).max() < 1e-9 * np.abs(e).max()
-    faults, runs = Faults(loss=0.5, seed=3), np.stack([e] * 40)
-    out = rule(runs, star(runs=(40,), faults=faults))
-    gone = faults.lost(STAR, 0, 40)[:, (STAR.receivers == 1)][:, 0]
-    expected = np.where(gone[:, None, None], e[1], rule(e, star())[1])
-    assert np.allclose(out[:, 1], expected, rtol=1e-6) and 8 < gone.sum() < 32
-
-
-@pytest.mark.parametrize("rule", MOVES[:2], ids=["least", "equal"])
 def test_flat_ensembles_are_refused(rule: object) -> None:
     e = _ensembles(0)
     flat = (e[:, :4], np.zeros_like(e), e[..., [0, 0]], e[..., [0, 1]] @ [[1.0, 1, 2], [1, -1, 3]])
     for ensembles in flat:
         with pytest.raises(ValueError, match="ensemble"):
             rule(ensembles, star())
-
-
-def _nees(rule: object) -> tuple[float, np.ndarray]:
-    """A drifting pair of numbers; agent 0 sees the first, 1 the second, 2 nothing: NEES / d."""
-    draw, graph, runs = rng(8), graphs.path(3), 20
-    truth = draw.standard_normal((runs, 2))
-    e = draw.standard_normal((runs, 3, 60, 2))
-    total, errors = [], []
-    for k in range(30):
-        truth = truth + np.sqrt(0.1) * draw.standard_normal(truth.shape)
-        e = e + np.sqrt(0.1) * draw.standard_normal(e.shape)
-        for a in (0, 1):
-            y = truth[:, a] + 0.5 * draw.standard_normal(runs)
-            m, p = mean(e[:, a]), sample_covariance(e[:, a])
-            gain = p[:, :, a] / (p[:, a, a] + 0.25)[:, None]
-            m = m + gain * (y - m[:, a])[:, None]
-            p = p - gain[:, :, None] * p[:, a, None, :]
-            e[:, a] = recolour(e[:, a], m, 0.5 * (p + np.swapaxes(p, 1, 2)))
-        e = rule(e, Channel(graph, runs=(runs,)))
-        if k >= 10:
-            gap = mean(e) - truth[:, None]
-            solved = np.linalg.solve(sample_covariance(e), gap[..., None])[..., 0]
-            total.append((gap * solved).sum(axis=-1).mean() / 2)
-            errors.append((gap**2).mean(axis=(0, 2)))
-    return float(np.mean(total)), np.mean(errors, axis=0)
-
-
-def test_rules_keep_a_filter_honest() -> None:
-    """Intersection keeps NEES / d near 1 and helps the blind; a pull destroys it."""
-    alone = _nees(lambda e, channel: e)[1]
-    pulled = _nees(partial(pull, gain=0.2))[0]
-    for rule in (intersection, partial(intersection, rule="trace")):
-        nees, errors = _nees(rule)
-        assert 0.5 < nees < 1.3 < pulled
-        assert errors[2] < 0.8 * alone[2]

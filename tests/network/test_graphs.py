@@ -69,12 +69,6 @@ def test_laplacian_rows_sum_to_zero(seed: int, agents: int) -> None:
         assert back < 0 or (graph.receivers[back], graph.senders[back]) == (j, i)
 
 
-def test_spectra_of_the_satellite_networks() -> None:
-    assert np.allclose(graphs.star(3).spectrum, [0, 1, 3], atol=1e-12)
-    assert np.allclose(graphs.star(5).spectrum, [0, 1, 1, 1, 5], atol=1e-12)
-    assert np.isclose(graphs.star(5).largest_gain, 2 / 5)
-
-
 @named
 def test_spectra_agree_with_networkx(graph: Graph) -> None:
     import networkx as nx

@@ -48,17 +48,12 @@ def test_balanced_weights_of_a_digraph(seed: int, agents: int) -> None:
     assert np.abs(weights.push(graph).matrix.toarray().sum(axis=0) - 1).max() < 1e-12
 
 
-def test_balanced_weights_of_many_agents() -> None:
-    """Sparse throughout: five thousand agents on a digraph cost no dense matrix."""
-    disk = graphs.disk(rng(1).random((5000, 2)), 0.05)
-    keep = rng(2).random(disk.senders.size) < 0.9
-    edges = np.stack([disk.receivers, disk.senders], axis=1)[keep]
-    graph = Graph.from_edges(5000, edges, directed=True)
-    assert graph.connected
-    w = weights.balanced(graph).matrix
-    for axis in (0, 1):
-        assert np.abs(np.asarray(w.sum(axis=axis)) - 1).max() < 1e-12
-    assert (weights.balanced(graphs.path(1)).matrix.toarray() == 1).all()
+def test_balanced_weights_of_an_undirected_graph_are_the_laplacian_s() -> None:
+    graph = REFERENCE["disk"]
+    expected = weights._laplacian(graph, 0.5 / graph.degrees.max())
+    assert np.allclose(weights.balanced(graph).links, expected.links, rtol=1e-14)
+    alone = graphs.path(1)
+    assert weights.balanced(alone).own == weights.metropolis(alone).own == weights.push(alone).own
 
 
 def test_balanced_weights_of_links_across(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -86,12 +81,6 @@ def test_a_walk_along_a_ring_is_given_up() -> None:
     assert _links._walked(graph.laplacian) is None
     w = weights.balanced(graph).matrix
     assert np.abs(np.asarray(w.sum(axis=0)) - 1).max() < 1e-12
-
-
-def test_balanced_weights_of_an_undirected_graph_are_the_laplacian_s() -> None:
-    graph = REFERENCE["disk"]
-    expected = weights._laplacian(graph, 0.5 / graph.degrees.max())
-    assert np.allclose(weights.balanced(graph).links, expected.links, rtol=1e-14)
 
 
 @named
@@ -124,11 +113,6 @@ def test_the_fastest_weights_reach_the_convex_optimum(name: str) -> None:
     assert _slowest(w) <= _slowest(weights.best_constant(graph)) + 1e-12
 
 
-def test_the_fastest_weights_gain_where_links_differ() -> None:
-    graph = REFERENCE["disk"]
-    assert _slowest(weights.fastest(graph)) < 0.85 * _slowest(weights.best_constant(graph))
-
-
 @named
 def test_gossip_weights_are_the_mean_of_all_meetings(graph: Graph) -> None:
     total = np.zeros((graph.size, graph.size))
@@ -154,17 +138,3 @@ def test_keeping_looks_at_columns_relative_to_what_cancels_in_them() -> None:
     off = weights.metropolis(STAR)
     with pytest.raises(ValueError, match="columns"):
         weights._keeping(Weights(STAR, off.own + [0, 1e-8, 0], off.links))
-
-
-def test_asking_whether_weights_keep_the_average_leaves_their_order_alone() -> None:
-    w = weights.metropolis(graphs.ring(6))
-    before = w.matrix.indices.copy()
-    weights._keeping(w)
-    assert (w.matrix.indices == before).all()
-
-
-def test_an_agent_alone_keeps_its_value() -> None:
-    alone = Graph.from_edges(1, [], directed=True)
-    for rule in (weights.balanced, weights.metropolis, weights.push):
-        found = rule(alone)
-        assert found.own.tolist() == [1.0] and found.links.size == 0
