@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from scipy.special import erf
 
-from ..doors import Array, Bounds, Count, Positive, Share, door
+from ..doors import Array, Bounds, Count, Positive, Share, door, unchecked
 from .grid import Grid
 
 __all__ = [  # fmt: skip
@@ -40,23 +40,22 @@ def _steps(x: Array, edges: Array, scale: Array) -> Array:
     return np.asarray(0.5 * np.diff(erf((edges - x[..., None]) / scale), axis=-1))
 
 
-def widths(value: float | Array, grid: Grid, agents: int = 1) -> Array:
-    """Bandwidths of all agents, (N,), refused below half a cell."""
-    h = np.broadcast_to(value, (agents,))
-    if h.max() > 20 * grid.width.max():
-        raise ValueError(f"bandwidth: needs at most 20 widths of the box, got {h.max():g}")
-    least, widest = float(h.min()), float(grid.spacing.max())
+def fine_enough(grid: Grid, bandwidth: float | Array) -> None:
+    """Refuse bandwidths below half a cell, and far beyond the box."""
+    if np.max(bandwidth) > 20 * grid.width.max():
+        raise ValueError(f"bandwidth: needs at most 20 widths of the box, got {bandwidth}")
+    least, widest = float(np.min(bandwidth)), float(grid.spacing.max())
     if widest > 2 * least * (1 + 1e-12):
         raise ValueError(
             f"grid: needs cells no wider than two bandwidths ({2 * least:g}), got {widest:g}: "
             f"too coarse for the kernel"
         )
-    return h
 
 
-def _factors(x: Array, grid: Grid, h: Array, reflect: bool) -> list[Array]:
-    wide = np.broadcast_to(h, x.shape[:-1])
-    return [_along(x[..., k], grid, k, wide, reflect) for k in range(grid.dim)]
+def _factors(positions: Array, grid: Grid, bandwidth: float | Array, reflect: bool) -> list[Array]:
+    fine_enough(grid, bandwidth)
+    x, h = grid._inside(positions), np.broadcast_to(bandwidth, positions.shape[:-1])
+    return [_along(x[..., k], grid, k, h, reflect) for k in range(grid.dim)]
 
 
 @door
@@ -94,13 +93,7 @@ def kernels(
     >>> z.shape, bool(abs(grid.integral(z) - 1).max() < 1e-12)
     ((2, 400), True)
     """
-    h = widths(bandwidth, grid, positions.shape[-2])
-    return each(grid._inside(positions), grid, h, reflect)
-
-
-def each(x: Array, grid: Grid, h: Array, reflect: bool = True) -> Array:
-    """The kernels of agents inside, with a bandwidth (N,) for each."""
-    out, *rest = _factors(x, grid, h, reflect)
+    out, *rest = _factors(positions, grid, bandwidth, reflect)
     for factor in rest:
         out = (out[..., :, None] * factor[..., None, :]).reshape(*out.shape[:-1], -1)
     return out
@@ -127,8 +120,7 @@ def kernel_density(
     >>> round(float(p.max() * 2 * np.pi * 0.1**2), 2)
     0.92
     """
-    h = widths(bandwidth, grid, positions.shape[-2])
-    factors = _factors(grid._inside(positions), grid, h, reflect)
+    factors = _factors(positions, grid, bandwidth, reflect)
     if grid.dim == 2:
         out = factors[0].mT @ factors[1]
     elif grid.dim == 1:
@@ -241,7 +233,7 @@ def bandwidth(
 
 def _least_squares(x: Array, grid: Grid, h: float) -> float:
     n = len(x)
-    z = each(x, grid, np.full(n, h))
+    z = unchecked(kernels)(x, grid, bandwidth=h)
     mean = z.mean(axis=0)
     at = z[:, grid.cells(x)]  # kernel of agent i in the cell of agent j
     others = (at.sum() - np.trace(at)) / (n * (n - 1))

@@ -15,7 +15,7 @@ from ..network import weights as weighting
 from ..network.channel import Lost
 from ..network.graphs import disk
 from .grid import Grid
-from .kernel import each, kernel_density, kernel_information
+from .kernel import kernel_density, kernel_information, kernels
 
 __all__ = [  # fmt: skip
     "Centralised", "DynamicAverage", "Flooding", "Neighbours", "PIConsensus", "Seen", "Sharing",
@@ -87,8 +87,7 @@ class Seen(Record):
     def kernels(self) -> Array:
         """Each agent's own kernel, zero for those that are gone, (A, n)."""
         x = self._or(self.grid.centres[0])
-        z = each(x, self.grid, np.full(len(x), self.bandwidth))
-        return np.asarray(z * self.present[:, None])
+        return unchecked(kernels)(x, self.grid, bandwidth=self.bandwidth) * self.present[:, None]
 
     def noise(self, density: Array, agents: ArrayLike, floor: float | None = None) -> Array:
         r"""Strength R of what the wanted agents have learnt: :math:`\bar k\max(p,\epsilon)`.
@@ -339,7 +338,7 @@ def _mean_kernels(table: Array, oldest: float, seen: Seen) -> tuple[Array, Array
     both = np.stack([owner, table[row, owner, -1]], axis=1)
     _, first, at = np.unique(both, axis=0, return_index=True, return_inverse=True)
     x = table[row[first], owner[first], :-1]
-    z = each(x, seen.grid, np.full(len(x), seen.bandwidth))
+    z = unchecked(kernels)(x, seen.grid, bandwidth=seen.bandwidth)
     weights = np.zeros((len(table), len(x)))
     weights[row, at] = 1.0
     return np.asarray(weights @ z / np.maximum(weights.sum(axis=1, keepdims=True), 1.0)), counted

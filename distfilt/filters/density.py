@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..checks import Array, array, choice, count, increasing, instance, number, places
 from ..density import FokkerPlanck, LowRank, Sharing, low_rank, zero_mean_prior
-from ..density.kernel import widths
+from ..density.kernel import fine_enough
 from ..density.sharing import Seen, alone, present_graph
 from ..doors import unchecked
 from ..network import Channel, Faults, Graph, Ledger
@@ -157,7 +157,7 @@ class DensityFilter(TeamFilter):
         for name in ("bandwidth", "first_std", "floor", "prior_length", "prior_std"):
             if getattr(self, name) is not None:
                 number(getattr(self, name), name, above=0)
-        widths(self.bandwidth, self.model.grid)
+        fine_enough(self.model.grid, self.bandwidth)
         if self.local is not None:
             places(self.local, "local", sizes[0])
         if isinstance(self.first, str):

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
-from scipy.linalg import expm
 
 from distfilt.density import FokkerPlanck, Grid, bernoulli
 from distfilt.models import READINGS, RotatingMixture, Swarm, rotating_swarm
@@ -65,18 +64,6 @@ def test_mass_and_sign_over_600_steps(reading: str) -> None:
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)
-def test_a_step_leaves_its_input(scheme: str) -> None:
-    flow = FokkerPlanck(rotating_swarm(), Grid((6, 5)), scheme=scheme)
-    p = np.random.default_rng(1).random((3, 30))
-    before = p.copy()
-    many = flow.step(p, 0.0, 0.1)
-    assert np.array_equal(p, before)
-    for row, wanted in zip(p, many, strict=True):
-        assert np.abs(flow.step(row, 0.0, 0.1) - wanted).max() < 1e-14
-    assert np.array_equal(p, before)
-
-
-@pytest.mark.parametrize("scheme", SCHEMES)
 def test_schemes_are_their_definitions(scheme: str) -> None:
     swarm = Swarm(lambda x, t: np.stack([np.sin(t + x[..., 1]), x[..., 0]], axis=-1), [0.1, 0.3])
     grid = Grid((4, 5))
@@ -97,7 +84,9 @@ def test_schemes_are_their_definitions(scheme: str) -> None:
         assert np.allclose(first + second, then)
         wanted = np.linalg.solve(eye - dt * first, p.T)
         wanted = np.linalg.solve(eye - dt * second, wanted).T
+    before = p.copy()
     assert np.abs(flow.step(p, t, dt) - wanted).max() < 1e-12
+    assert np.array_equal(p, before)
 
 
 @pytest.mark.parametrize(("scheme", "order"), [
@@ -148,20 +137,8 @@ def test_diffusion_that_varies_is_meant_in_the_sense_of_ito() -> None:
     assert np.abs(p * (1 + grid.centres[:, 0]) * np.log(2) - 1).max() < 1e-5
 
 
-def test_small_steps_approach_the_exponential() -> None:
-    flow = FokkerPlanck(rotating_swarm("gibbs", mixture=RotatingMixture(rate=0.0)), Grid((6, 6)))
-    p = np.random.default_rng(2).random(36)
-    exact = expm(0.5 * flow.generator(0.0).toarray()) @ p
-    for scheme in SCHEMES:
-        near = FokkerPlanck(flow.swarm, flow.grid, scheme=scheme)
-        got = near.evolve(p, [0.5], substeps=500)[-1]
-        assert np.abs(got - exact).max() < (1e-6 if scheme == "crank_nicolson" else 2e-3)
-
-
 def test_time_enters_the_drift() -> None:
     flow = FokkerPlanck(rotating_swarm("gibbs"), Grid((20, 20)))
-    early, late = flow.generator(0.0), flow.generator(20.0)
-    assert np.abs((early - late).toarray()).max() > 0.1
     p = flow.evolve(np.ones(400), np.arange(1, 400) * 0.5)[-1]
     f = flow.grid.normalised(RotatingMixture().density(flow.grid.centres, 199.5))
     # p follows f with a lag of one relaxation time, 1.5 s.
