@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections import namedtuple
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
@@ -33,15 +33,8 @@ def bernoulli(z: Annotated[Array, "..."]) -> Array:
     return np.where(small, 1 - z / 2 + z**2 / 12, safe / np.expm1(safe))
 
 
-@dataclass(frozen=True, eq=False)
-class _Faces:
-    """Inner faces of a grid: where they are, which cells they part, and along which axis."""
-
-    points: Array
-    left: NDArray[np.int64]
-    right: NDArray[np.int64]
-    axis: NDArray[np.int64]
-    width: Array
+_Faces = namedtuple("_Faces", "points left right axis width")
+"""Inner faces of a grid: where they are, which cells they part, and along which axis."""
 
 
 @dataclass(frozen=True, eq=False)

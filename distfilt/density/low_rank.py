@@ -70,12 +70,10 @@ def zero_mean_prior(
         raise ValueError(f"rank: needs at most {grid.size - 1} modes besides the constant, "
                          f"got {rank}")
     ell = 0.1 * grid.side if length is None else length
-    every = np.stack([a.ravel() for a in np.indices(grid.shape)], axis=-1)[1:]
-    waves = every, grid.wavenumbers(rank + 1)[1:]
-    squared = [((k / grid.width) ** 2).sum(axis=-1) for k in waves]
+    squared = ((grid.wavenumbers(grid.size)[1:] / grid.width) ** 2).sum(axis=-1)
     # About the lowest mode: a length beyond the box leaves that alone, and no zero in its place.
-    spectra = [np.exp(-0.5 * (np.pi * ell) ** 2 * (s - squared[0].min())) for s in squared]
-    scale = np.sqrt(spectra[1] / (spectra[0].sum() / grid.box))
+    spectrum = np.exp(-0.5 * (np.pi * ell) ** 2 * (squared - squared[0]))
+    scale = np.sqrt(spectrum[:rank] / (spectrum.sum() / grid.box))
     scale *= 1 / grid.box if std is None else std
     basis = np.asarray(grid.cosines(rank + 1)[:, 1:] * scale)
     even = np.full((grid.size, 1), mass_std / (grid.size * grid.volume))
@@ -217,8 +215,6 @@ class LowRank(Record):
         """Every filter's density, (F, n)."""
         with _named():
             weights = np.linalg.solve(self.information, self.vector[..., None])[..., 0]
-        if self.basis.ndim == 2:
-            return np.asarray(self.base + weights @ self.basis.T)
         return np.asarray(self.base + (self.basis @ weights[..., None])[..., 0])
 
     @property
@@ -339,12 +335,8 @@ def low_rank_step(state: LowRank, observed: Observed, noise: ArrayLike, dt: Posi
     """
     precision = dt / _strength(noise, state.base.shape)
     gap = precision * (observed - state.base)
-    shared = state.basis.ndim == 2
-    seen = gap @ state.basis if shared else (gap[:, None, :] @ state.basis)[:, 0]
-    informed = precision.any(axis=-1)
-    information = state.information.copy()
-    basis = state.basis if shared else state.basis[informed]
-    information[informed] += _weighted_products(basis, precision[informed])
+    seen = (gap[:, None, :] @ state.basis)[:, 0]
+    information = state.information + _weighted_products(state.basis, precision)
     if not information.max() < _MOST:
         with _named():
             least, most = np.linalg.eigvalsh(information)[:, [0, -1]].T
