@@ -50,36 +50,49 @@ def batched(
     ValueError: flow: needs to take many states at once, (..., d), with the components last \
 (x[..., 0], not x[0]); for states (2, 2) it gives other values than for one
     """
-    x = states[0]
+    x, wanted = states[0], (*states[0].shape[:-1], size)
     try:
         out = np.asarray(function(*[s.copy() for s in states], *rest), dtype=np.float64)
     except (TypeError, ValueError, IndexError) as error:
-        if x.ndim > 1 and _alone(function, states, size, rest) is not None:
+        if _takes_one_only(function, states, size, rest):
             raise ValueError(_UNBATCHED.format(name, x.shape, error)) from error
         if isinstance(error, IndexError):
             raise ValueError(f"x: needs more components, got {x.shape}") from error
         raise
-    if out.shape != (*x.shape[:-1], size):
-        if x.ndim > 1 and _alone(function, states, size, rest) is not None:
+    if out.shape != wanted:
+        if _takes_one_only(function, states, size, rest):
             raise ValueError(_UNBATCHED.format(name, x.shape, f"shape {out.shape}"))
-        wanted = (*x.shape[:-1], size)
-        raise ValueError(f"{name}: needs to return shape {wanted} for states {x.shape}, "
-                         f"got {out.shape}")  # fmt: skip
+        raise ValueError(
+            f"{name}: needs to return shape {wanted} for states {x.shape}, got {out.shape}"
+        )
     if name not in seen and x.ndim > 1 and x.size:
         _compare(function, name, states, out, seen, rest)
     return out
 
 
-def _alone(
-    function: Callable[..., Any], states: tuple[Array, ...], size: int, rest: tuple[float, ...]
-) -> Array | None:
-    """What the function makes of the last state alone, unless it takes no single state."""
+def _made(function: Callable[..., Any], states: tuple[Array, ...], *rest: Any) -> Array | None:
+    """What a function returns, if anything."""
     try:
-        rows = [s.reshape(-1, s.shape[-1])[-1].copy() for s in states]
-        out = np.asarray(function(*rows, *rest), dtype=np.float64)
+        return np.asarray(function(*[s.copy() for s in states], *rest), dtype=np.float64)
     except (TypeError, ValueError, IndexError):
         return None
-    return out if out.shape == (size,) else None
+
+
+def _last(states: tuple[Array, ...]) -> tuple[Array, ...]:
+    return tuple(s.reshape(-1, s.shape[-1])[-1] for s in states)
+
+
+def _takes_one_only(
+    function: Callable[..., Any], states: tuple[Array, ...], size: int, rest: tuple[float, ...]
+) -> bool:
+    """Whether a function that failed takes the last state alone, but not in many copies."""
+    if states[0].ndim < 2 or not states[0].size:
+        return False
+    last = _last(states)
+    copies = tuple(np.broadcast_to(s, like.shape) for s, like in zip(last, states, strict=True))
+    alone, many = _made(function, last, *rest), _made(function, copies, *rest)
+    wanted = (*states[0].shape[:-1], size)
+    return alone is not None and alone.shape == (size,) and (many is None or many.shape != wanted)
 
 
 def _compare(
@@ -87,8 +100,8 @@ def _compare(
     seen: dict[str, bool], rest: tuple[float, ...]
 ) -> None:
     rows, last = states[0].reshape(-1, states[0].shape[-1]), out.reshape(-1, out.shape[-1])[-1]
-    alone = _alone(function, states, out.shape[-1], rest)
-    if alone is not None:
+    alone = _made(function, _last(states), *rest)
+    if alone is not None and alone.shape == last.shape:
         # Rules of adaptive step differ a little; wrong rows differ as much as the states move.
         moved = alone - rows[-1] if alone.shape == rows[-1].shape else alone
         bound = 1e-2 * np.abs(moved).max() + 1e-9 * np.abs(alone).max()

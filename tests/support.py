@@ -6,6 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from distfilt.models import Model, constant_velocity
+
 NAN = float("nan")
 INDEFINITE = [[1.0, 2.0], [2.0, 1.0]]
 ASYMMETRIC = [[1.0, 0.5], [0.0, 1.0]]
@@ -47,3 +49,22 @@ def assert_unchanged(call: Callable[..., object], *arrays: np.ndarray) -> None:
     call(*arrays)
     for a, b in zip(arrays, before, strict=True):
         np.testing.assert_array_equal(a, b)
+
+
+def turning(*, sigma: float, turn_sigma: float) -> Model:
+    """Position, velocity and turn rate in the plane: a turn at constant speed, not linear."""
+    straight = constant_velocity(sigma=sigma)
+
+    def flow(x: np.ndarray, t: float, dt: float) -> np.ndarray:
+        p, v, tau = x[..., :2], x[..., 2:4], x[..., 4:] * dt
+        left = np.stack([-v[..., 1], v[..., 0]], axis=-1)
+        along, aside = np.sinc(tau / np.pi), 0.5 * tau * np.sinc(0.5 * tau / np.pi) ** 2
+        moved = p + dt * (along * v + aside * left)
+        return np.concatenate([moved, np.cos(tau) * v + np.sin(tau) * left, x[..., 4:]], axis=-1)
+
+    def noise(t: float, dt: float) -> np.ndarray:
+        cov = np.zeros((5, 5))
+        cov[:4, :4], cov[4, 4] = straight.noise(t, dt), turn_sigma**2 * dt
+        return cov
+
+    return Model(5, flow, noise)

@@ -18,48 +18,12 @@ from distfilt.ensembles import (
     sample_covariance,
 )
 from distfilt.linalg import factor
-from tests.support import INDEFINITE, NAN, assert_unchanged, generator, singular, spd, unit_gap
+from tests.support import assert_unchanged, generator, singular, spd, unit_gap
 
 SEEDS = st.integers(0, 10_000)
 E = np.arange(12.0).reshape(4, 3) ** 2
 FULL = np.array([[4.0, 1.8, -0.6], [1.8, 1.5, 0.1], [-0.6, 0.1, 0.5]])
 """Its Cholesky factor and the factor's transpose give different covariances."""
-
-_E = "distfilt.ensembles."
-BAD_INPUT = {
-    _E + "draw": [
-        ("mean", lambda: draw([[0.0]], np.eye(1), 3, rng=generator())),
-        ("cov", lambda: draw([0.0, 0.0], np.eye(3), 3, rng=generator())),
-        ("cov", lambda: draw([0.0, 0.0], INDEFINITE, 3, rng=generator())),
-        ("members", lambda: draw([0.0], np.eye(1), 0, rng=generator())),
-        ("rng", lambda: draw([0.0], np.eye(1), 3, rng=None)),
-        ("leading", lambda: draw([0.0], np.eye(1), 3, rng=generator(), leading=(2.5,))),
-    ],
-    _E + "mean": [("ensemble", lambda: mean([1.0])), ("ensemble", lambda: mean(np.zeros((0, 2))))],
-    _E + "anomalies": [
-        ("ensemble", lambda: anomalies(NAN * E)),
-        ("ensemble", lambda: anomalies(np.zeros((0, 2)))),
-    ],
-    _E + "sample_covariance": [
-        ("ensemble", lambda: sample_covariance(E[:1])),
-        ("ensemble", lambda: sample_covariance([1.0, 2.0])),
-    ],
-    _E + "cross_covariance": [
-        ("ensemble", lambda: cross_covariance(E[:1], E[:1])),
-        ("other", lambda: cross_covariance(E, E[:3])),
-        ("other", lambda: cross_covariance(E, [1.0])),
-        ("other", lambda: cross_covariance(np.zeros((2, 4, 1)), np.zeros((3, 4, 1)))),
-    ],
-    _E + "exact_noise": [
-        ("anomalies_to_avoid", lambda: exact_noise([1.0, 2.0], np.eye(1), rng=generator())),
-        ("anomalies_to_avoid", lambda: exact_noise(NAN * E, np.eye(1), rng=generator())),
-        ("anomalies_to_avoid", lambda: exact_noise(E, np.eye(2), rng=generator())),
-        ("anomalies_to_avoid", lambda: exact_noise(np.zeros((3, 0)), FULL, rng=generator())),
-        ("cov", lambda: exact_noise(np.zeros((9, 1)), INDEFINITE, rng=generator())),
-        ("cov", lambda: exact_noise(np.zeros((2, 9, 1)), [FULL] * 3, rng=generator())),
-        ("rng", lambda: exact_noise(np.zeros((9, 1)), FULL, rng=3)),
-    ],
-}
 
 
 def test_moments_are_their_definitions() -> None:

@@ -1,26 +1,38 @@
 """Covariance intersection of several Gaussians, and the weights that it takes.
 
 Sources (agents that sent theirs, say) lie on the axis before the components: means (..., S, d),
-covariances (..., S, d, d), weights (..., S). A source of weight 0 may hold anything, NaN included.
-Names with an underscore are the same without checks, for loops of this package.
+covariances (..., S, d, d), weights (..., S). NaN may stand at a source that did not come.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from dataclasses import dataclass
+from typing import Annotated, Literal
 
-from ..checks import Array, array, choice, covariance, flags
-from ..checks import weights as unit_weights
-from ..linalg import _leading, _log_det, _solve_lower, _symmetrise
-from .optimal import _cholesky_or_qr, _factors, _least
+import numpy as np
+
+from ..doors import MISSING, Array, Mask, Weights, definite, door
+from ..linalg import cholesky, leading, log_det, solve_lower, symmetrise
 
 __all__ = ["intersection", "intersection_weights"]
 
-_RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
+
+def _definite_or_missing(value: Array, name: str) -> None:
+    definite(value[~np.isnan(value).any(axis=(-2, -1))], name)
 
 
-def intersection(means: ArrayLike, covs: ArrayLike, weights: ArrayLike) -> tuple[Array, Array]:
+Covs = Annotated[Array, "... S d d", MISSING, _definite_or_missing]
+_GAP = 1e-7
+"""How far the derivatives may be from the conditions of the optimum, relative to their mean."""
+_STEPS = 60
+_LEAST = 1e-30
+"""A weight that vanishes stays above it: zero could not grow again."""
+
+
+@door
+def intersection(
+    means: Annotated[Array, "... S d", MISSING], covs: Covs, weights: Annotated[Weights, "... S"]
+) -> tuple[Array, Array]:
     r"""Covariance intersection: the normalised weighted geometric mean of Gaussians.
 
     .. math:: \mathbf P^{-1}=\sum_b\omega_b\mathbf P_b^{-1},\qquad
@@ -36,7 +48,7 @@ def intersection(means: ArrayLike, covs: ArrayLike, weights: ArrayLike) -> tuple
     covs : array_like, (..., S, d, d)
         Their covariances, positive definite.
     weights : array_like, (..., S)
-        Nonnegative with sum 1. What stands at a source of weight 0 does not matter.
+        Nonnegative with sum 1. NaN may stand at a source of weight 0.
 
     Returns
     -------
@@ -61,36 +73,27 @@ def intersection(means: ArrayLike, covs: ArrayLike, weights: ArrayLike) -> tuple
     >>> mean.round(6), cov.round(6)
     (array([1.]), array([[1.333333]]))
     """
-    omega = unit_weights(weights, "weights")
-    m = array(means, "means", (..., omega.shape[-1], "d"), finite=False)
-    p = array(covs, "covs", (..., *m.shape[-2:], m.shape[-1]), finite=False)
-    leading = _leading(omega.shape[:-1], m.shape[:-2], "means")
-    leading = _leading(leading, p.shape[:-3], "covs")
-    here = np.broadcast_to(omega > 0, (*leading, omega.shape[-1]))
-    array(np.broadcast_to(m, (*leading, *m.shape[-2:]))[here], "means")
-    covariance(np.broadcast_to(p, (*leading, *p.shape[-3:]))[here], "covs")
-    return _intersection(m, p, omega)
-
-
-def _intersection(means: Array, covs: Array, weights: Array) -> tuple[Array, Array]:
-    """As the public one, for any nonnegative weights that are not all zero: ones multiply."""
+    lead = leading(weights.shape[:-1], means.shape[:-2], "means")
+    leading(lead, covs.shape[:-3], "covs")
     d = means.shape[-1]
     here = weights > 0
     m = means if here.all() else np.where(here[..., None], means, 0.0)
+    if np.isnan(m).any():
+        raise ValueError("means: needs finite numbers where a weight is positive, got NaN")
     lower = _factors(covs, here)
     first, centre = lower[..., 0, :, :], m[..., 0, :]
     own, others = weights[..., :1, None], np.sqrt(weights[..., 1:, None, None])
     gap = m[..., 1:, :, None] - centre[..., None, :, None]
-    wide = others * _solve_lower(lower[..., 1:, :, :], _beside(first[..., None, :, :], gap))
+    wide = others * solve_lower(lower[..., 1:, :, :], _beside(first[..., None, :, :], gap))
     tall = wide.reshape(*wide.shape[:-3], -1, d + 1)
     turned = np.ascontiguousarray(tall[..., :d].swapaxes(-1, -2))
     total = turned @ tall
     total[..., :d] += own * np.eye(d)
     inner = _cholesky_or_qr(total[..., :d], own, np.ones(wide.shape[:-2]), wide[..., :d])
-    both = _solve_lower(inner, _beside(first.swapaxes(-1, -2), total[..., d:]))
+    both = solve_lower(inner, _beside(first.swapaxes(-1, -2), total[..., d:]))
     root = np.ascontiguousarray(both[..., :d].swapaxes(-1, -2))
     fused = root @ both
-    return centre + fused[..., d], _symmetrise(fused[..., :d])
+    return centre + fused[..., d], symmetrise(fused[..., :d])
 
 
 def _beside(left: Array, right: Array) -> Array:
@@ -101,8 +104,11 @@ def _beside(left: Array, right: Array) -> Array:
     return out
 
 
+@door
 def intersection_weights(
-    covs: ArrayLike, *, rule: str = "equal", here: ArrayLike | None = None
+    covs: Covs, *,
+    rule: Literal["equal", "trace", "determinant", "min_trace", "min_determinant"] = "equal",
+    here: Annotated[Mask, "... S"] | None = None,
 ) -> Array:
     r"""Weights (..., S) for :func:`intersection`, nonnegative with sum 1.
 
@@ -116,7 +122,7 @@ def intersection_weights(
         uses determinants does not depend on them.
     here : array_like of bool, (..., S), optional
         Which sources arrived, at least one; all by default. The others get weight 0, and their
-        covariances may be anything, NaN included.
+        covariances may be NaN.
 
     Notes
     -----
@@ -154,28 +160,147 @@ def intersection_weights(
     >>> intersection_weights(crossed, rule="min_determinant")
     array([0.5, 0.5])
     """
-    choice(rule, "rule", _RULES)
-    p = array(covs, "covs", (..., "S", "d", "d"), finite=False)
-    if p.shape[-1] != p.shape[-2]:
-        raise ValueError(f"covs: needs square matrices, got shape {p.shape}")
-    there = flags([True] * p.shape[-3] if here is None else here, "here", (..., p.shape[-3]))
+    there = np.ones(covs.shape[-3], dtype=bool) if here is None else here
     if not there.any(axis=-1).all():
         raise ValueError("here: needs at least one source that arrived, got none")
-    leading = _leading(there.shape[:-1], p.shape[:-3], "covs")
-    there = np.broadcast_to(there, (*leading, p.shape[-3]))
-    p = np.broadcast_to(p, (*leading, *p.shape[-3:]))
-    covariance(p[there], "covs")
-    return _intersection_weights(p, rule, there)
-
-
-def _intersection_weights(covs: Array, rule: str, here: NDArray[np.bool_]) -> Array:
+    lead = leading(there.shape[:-1], covs.shape[:-3], "covs")
+    here = np.broadcast_to(there, (*lead, *covs.shape[-3:-2]))
+    covs = np.broadcast_to(covs, (*lead, *covs.shape[-3:]))
     if rule in ("min_trace", "min_determinant") and here.shape[-1] > 1:
         return _least(covs, here, rule == "min_determinant")
     logs = np.zeros(here.shape)
     if rule == "trace":
         logs = np.log(np.where(here, np.trace(covs, axis1=-2, axis2=-1), 1.0))
     elif rule == "determinant":
-        logs = _log_det(_factors(covs, here)) / covs.shape[-1]
+        logs = log_det(_factors(covs, here)) / covs.shape[-1]
     logs = np.where(here, logs, np.inf)
     weights = np.exp(logs.min(axis=-1, keepdims=True) - logs)
     return np.asarray(weights / weights.sum(axis=-1, keepdims=True))
+
+
+def _least(covs: Array, here: Mask, determinant: bool) -> Array:
+    """Weights of least determinant or trace; :func:`.intersection_weights` says how and why."""
+    # Where ratios of covariances leave the range of numbers, no gap is found, and none is taken.
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        return _iterated(covs, here, determinant)
+
+
+def _iterated(covs: Array, here: Mask, determinant: bool) -> Array:
+    leading, (s, d) = here.shape[:-1], covs.shape[-3:-1]
+    there = here.reshape(-1, s).astype(np.float64)
+    lower = _factors(covs, here).reshape(-1, s, d, d)
+    # In the first one's coordinates, as in an intersection; traces are taken in the state's own.
+    roots = solve_lower(lower, np.broadcast_to(lower[:, :1], lower.shape))
+    roots *= there[..., None, None]
+    problem = _Problem(roots, _square(roots.swapaxes(-1, -2)), lower[:, 0], there, determinant)
+    point = there / there.sum(axis=-1, keepdims=True)
+    best, sure = point.copy(), point
+    left, share = np.arange(len(point)), np.ones((len(point), 1))
+    lowest = bound = np.full(len(point), np.inf)
+    for _ in range(_STEPS):
+        value, slope, curvature = problem.derivatives(point)
+        mean = (point * slope).sum(axis=-1, keepdims=True)
+        gap = slope.max(axis=-1) / mean[:, 0] - 1
+        # What is settled stays: the others' need for more steps must not move it.
+        lower_gap = (gap < lowest) & (lowest > _GAP)
+        best[left[lower_gap]] = point[lower_gap]
+        lowest = np.where(lower_gap, gap, lowest)
+        open_ = lowest > _GAP
+        if not open_.any():
+            break
+        # A Newton step counts if it gains a share of what its slope promised; else its start's
+        # sure step does, whatever the value there, and the next Newton step is cut.
+        at = (value <= bound)[:, None]
+        share = np.where(at, np.minimum(2 * share, 1.0), 0.25 * share)
+        newton = _newton(point, slope, mean, curvature, problem.there)
+        newton = point + share * (newton - point)
+        scaled = _scaled(point, slope / mean, determinant)
+        gain = (slope * (newton - point)).sum(axis=-1)
+        aim = np.where(gain > 0, value - 1e-3 * gain + 1e-13 * (1 + np.abs(value)), -np.inf)
+        bound = np.where(at[:, 0], aim, np.inf)
+        point, sure = np.where(at, newton, sure), np.where(at, scaled, sure)
+        if 2 * np.count_nonzero(open_) <= len(open_):
+            problem = problem.part(open_)
+            left, lowest, bound = left[open_], lowest[open_], bound[open_]
+            point, sure, share = point[open_], sure[open_], share[open_]
+    return np.asarray(best.reshape(*leading, s))
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """Sources of n intersections in coordinates in which the first has the unit covariance."""
+
+    roots: Array
+    information: Array
+    first: Array
+    there: Array
+    determinant: bool
+
+    def part(self, keep: Mask) -> _Problem:
+        parts = (self.roots[keep], self.information[keep], self.first[keep], self.there[keep])
+        return _Problem(*parts, self.determinant)
+
+    def derivatives(self, weights: Array) -> tuple[Array, Array, Array]:
+        """What is made least (n,), minus its gradient (n, S), its second derivatives (n, S, S)."""
+        n, s, d, _ = self.roots.shape
+        total = weights[:, None, :] @ self.information.reshape(n, s, d * d)
+        lower = _cholesky_or_qr(total.reshape(n, d, d), np.zeros((1, 1)), weights, self.roots)
+        half = solve_lower(lower, self.roots.reshape(n, s * d, d).swapaxes(-1, -2))
+        # Each source's information where that of the result is the identity, (n, S, d, d).
+        shares = _square(half.reshape(n, d, s, d).swapaxes(1, 2))
+        if self.determinant:
+            flat = shares.reshape(n, s, d * d)
+            return -log_det(lower), np.einsum("nsii->ns", shares), flat @ flat.swapaxes(-1, -2)
+        spread = solve_lower(lower, self.first.swapaxes(-1, -2))
+        flat = (shares @ spread[:, None]).reshape(n, s, d * d)
+        slope = (flat @ spread.reshape(n, d * d, 1))[..., 0]
+        return (spread**2).sum(axis=(-2, -1)), slope, 2 * flat @ flat.swapaxes(-1, -2)
+
+
+def _square(root: Array) -> Array:
+    """A A' of small matrices; a copy of A' is five times as fast as its view."""
+    return np.asarray(np.ascontiguousarray(root) @ np.ascontiguousarray(root.swapaxes(-1, -2)))
+
+
+def _newton(weights: Array, slope: Array, mean: Array, curvature: Array, there: Array) -> Array:
+    """A Newton step on the simplex; a weight that wants to vanish shrinks a thousandfold."""
+    size = curvature.max(axis=(-2, -1))[:, None]
+    held = np.maximum(mean - slope, 0.0) / np.maximum(weights, _LEAST)
+    ridge = there * (held + 1e-12 * size) + (1 - there) * size
+    matrix = curvature + ridge[..., None] * np.eye(weights.shape[-1])
+    scale = np.sqrt(np.diagonal(matrix, axis1=-2, axis2=-1))[..., None]
+    matrix /= scale * scale.swapaxes(-1, -2)
+    try:
+        solved = np.linalg.solve(matrix, np.stack([slope, there], axis=-1) / scale) / scale
+    except np.linalg.LinAlgError:
+        return weights  # which is not better: the sure step follows
+    pull, ones = solved.sum(axis=1).T[..., None]
+    out = weights + solved[..., 0] - pull / ones * solved[..., 1]
+    out = np.maximum(out, np.maximum(1e-3 * weights, _LEAST * there))
+    return np.asarray(out / out.sum(axis=-1, keepdims=True))
+
+
+def _scaled(weights: Array, ratio: Array, determinant: bool) -> Array:
+    """The sure step: weights times their slopes over the mean one, or the root of that."""
+    out = weights * (ratio if determinant else np.sqrt(ratio))
+    return np.asarray(out / out.sum(axis=-1, keepdims=True))
+
+
+def _factors(covs: Array, here: Mask) -> Array:
+    """Cholesky factors (..., S, d, d) of the sources; the identity for one that is not here."""
+    full = covs if here.all() else np.where(here[..., None, None], covs, np.eye(covs.shape[-1]))
+    return cholesky(full)
+
+
+def _cholesky_or_qr(total: Array, own: Array, weights: Array, roots: Array) -> Array:
+    """Cholesky factor of own I + sum of w G' G; from the G where rounding spoils their squares."""
+    try:
+        return cholesky(total)
+    except np.linalg.LinAlgError:
+        d = roots.shape[-1]
+        tall = np.sqrt(weights)[..., None, None] * roots
+        tall = tall.reshape(*tall.shape[:-3], -1, d)
+        first = np.broadcast_to(np.sqrt(own) * np.eye(d), (*tall.shape[:-2], d, d))
+        upper: Array = np.asarray(np.linalg.qr(np.concatenate([first, tall], axis=-2), mode="r"))
+        sign = np.where(np.diagonal(upper, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
+        return np.asarray((upper * sign[..., None]).swapaxes(-1, -2))

@@ -12,6 +12,7 @@ import numpy as np
 from ..batches import batched
 from ..doors import (
     Array,
+    Bounds,
     Count,
     NonNegative,
     Record,
@@ -25,6 +26,15 @@ from ..doors import (
 from ..linalg import central, factor
 
 __all__ = ["LinearModel", "Model", "simulate"]
+
+
+Strength = Annotated[float, Bounds(at_least=0, at_most=1e150)]
+"""Of white noise, per root second: its square is finite."""
+
+
+def white(density: Array, t: float, dt: float) -> Array:
+    """The covariance that white noise of a spectral density gathers in a step."""
+    return np.asarray(density * dt)
 
 
 @dataclass(frozen=True, eq=False)

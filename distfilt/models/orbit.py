@@ -9,13 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..checks import Array, array, choice, count, number
-from .base import Model
-from .integrators import _steps, rk4
+from ..doors import Array, Bounds, Count, Positive, door, unchecked
+from .base import Model, Strength
+from .integrators import equal_steps, rk4
 
 __all__ = [
     "J2", "MU", "RADIUS", "acceleration", "occulted", "orbits", "potential", "propagate",
@@ -35,7 +35,20 @@ _LARGEST = 1e75
 """Positions and velocities up to this have products whose squares are finite."""
 
 
-def potential(position: ArrayLike) -> Array:
+def _outside(value: Array, name: str) -> None:
+    least = float(np.linalg.norm(value, axis=-1).min(initial=np.inf))
+    if least < RADIUS:
+        raise ValueError(f"{name}: needs a distance above {RADIUS:g} km, got {least:g}")
+
+
+_BOUNDED = Bounds(at_least=-_LARGEST, at_most=_LARGEST)
+Place = Annotated[Array, "... 3", _BOUNDED, _outside]
+Orbits = Annotated[Array, "... 6", _BOUNDED]
+Rule = Literal["dop853", "rk4"]
+
+
+@door
+def potential(position: Place) -> Array:
     r"""Potential whose gradient is the acceleration, in km²/s².
 
     .. math:: U=\frac\mu r\Bigl[1-\frac{J_2R^2}{2r^2}\Bigl(3\frac{z^2}{r^2}-1\Bigr)\Bigr]
@@ -50,13 +63,14 @@ def potential(position: ArrayLike) -> Array:
     >>> float(potential([42164.0, 0.0, 0.0]).round(4))
     9.4537
     """
-    r = _outside(position)
+    r = position
     size = np.linalg.norm(r, axis=-1)
     shape = 3 * (r[..., 2] / size) ** 2 - 1
     return np.asarray(MU / size * (1 - 0.5 * J2 * (RADIUS / size) ** 2 * shape))
 
 
-def acceleration(position: ArrayLike) -> Array:
+@door
+def acceleration(position: Place) -> Array:
     r"""Acceleration of a satellite, in km/s²: the mended (47).
 
     .. math:: \mathbf a=-\frac{\mu\mathbf r}{r^3}+\frac{J_2\mu R^2}{2r^5}
@@ -72,25 +86,7 @@ def acceleration(position: ArrayLike) -> Array:
     >>> acceleration([7000.0, 0.0, 0.0]).round(8) + 0.0
     array([-0.00814567,  0.        ,  0.        ])
     """
-    return _acceleration(_outside(position))
-
-
-def _outside(position: ArrayLike, name: str = "position") -> Array:
-    r = array(position, name, (..., 3))
-    _bounded(r, name)
-    least = float(np.linalg.norm(r, axis=-1).min(initial=np.inf))
-    if least < RADIUS:
-        raise ValueError(f"{name}: needs a distance above {RADIUS:g} km, got {least:g}")
-    return r
-
-
-def _bounded(x: Array, name: str) -> None:
-    largest = float(np.abs(x).max(initial=0.0))
-    if largest > _LARGEST:
-        raise ValueError(f"{name}: needs components up to {_LARGEST:g}, got {largest:g}")
-
-
-def _acceleration(r: Array) -> Array:
+    r = position
     square = np.einsum("...i,...i->...", r, r)
     inverse = 1 / square
     pull = MU * inverse * np.sqrt(inverse)
@@ -105,12 +101,17 @@ def _rate(x: Array, t: float = 0.0) -> Array:
     """Time derivative of states (..., 6) in km and m/s."""
     out = np.empty_like(x)
     out[..., :3] = 1e-3 * x[..., 3:]
-    out[..., 3:] = 1e3 * _acceleration(x[..., :3])
+    out[..., 3:] = 1e3 * unchecked(acceleration)(x[..., :3])
     return out
 
 
+def _back(x: Array, t: float) -> Array:
+    return -_rate(x)
+
+
+@door
 def propagate(
-    x: ArrayLike, dt: float, *, rule: str = "dop853", longest: float = 900.0
+    x: Annotated[Array, "... 6"], dt: float, *, rule: Rule = "dop853", longest: Positive = 900.0
 ) -> Array:
     """Move satellites by a fixed number of equal steps.
 
@@ -143,13 +144,20 @@ def propagate(
     >>> bool(np.abs(back - start).max() < 1e-6)
     True
     """
-    states = array(x, "x", (..., 6)).copy()
-    length = number(dt, "dt")
-    choice(rule, "rule", ("dop853", "rk4"))
-    step = number(longest, "longest", above=0)
-    _above(states)
+    _above(x)
+    if dt == 0:
+        return x.copy()
+    steps = equal_steps(abs(dt), longest)
+    turned = _rate if dt > 0 else _back
     with np.errstate(all="ignore"):
-        return _moved(states, length, rule, _steps(abs(length), step))
+        for _ in range(steps):
+            # A body that dives through the Earth and comes out again is found on its way.
+            if rule == "rk4":
+                x = unchecked(rk4)(turned, x, 0.0, abs(dt) / steps)
+            else:
+                x = _dop853(x, dt / steps)
+            _above(x)
+    return x
 
 
 def _above(x: Array) -> None:
@@ -157,17 +165,6 @@ def _above(x: Array) -> None:
     if not (size >= RADIUS).all():
         least = float(np.nanmin(size, initial=np.inf))
         raise ValueError(f"x: needs orbits above {RADIUS:g} km, got a distance of {least:g} km")
-
-
-def _moved(x: Array, dt: float, rule: str, steps: int) -> Array:
-    if dt == 0:
-        return x
-    turned: Callable[[Array, float], Array] = _rate if dt > 0 else lambda x, t: -_rate(x)
-    for _ in range(steps):
-        # A body that dives through the Earth and comes out again is found on its way.
-        x = rk4(turned, x, 0.0, abs(dt) / steps) if rule == "rk4" else _dop853(x, dt / steps)
-        _above(x)
-    return x
 
 
 def _dop853(x: Array, h: float) -> Array:
@@ -183,13 +180,10 @@ def _dop853(x: Array, h: float) -> Array:
     return np.asarray(x + (b @ flat).reshape(x.shape))
 
 
+@door
 def orbits(
-    bodies: int = 1,
-    *,
-    position_std: float = 0.0,
-    velocity_std: float = 0.0,
-    rule: str = "dop853",
-    longest: float = 900.0,
+    bodies: Count = 1, *, position_std: Strength = 0.0, velocity_std: Strength = 0.0,
+    rule: Rule = "dop853", longest: Positive = 900.0,
 ) -> Model:
     """Several satellites as one model; the state is theirs one after the other.
 
@@ -209,30 +203,31 @@ def orbits(
     >>> pair.dim, pair.names[6], pair.units[3]
     (12, 'x2', 'm/s')
     """
-    n = count(bodies, "bodies")
-    r = number(position_std, "position_std", at_least=0, at_most=1e150)
-    v = number(velocity_std, "velocity_std", at_least=0, at_most=1e150)
-    choice(rule, "rule", ("dop853", "rk4"))
-    step = number(longest, "longest", above=0)
-    noise = np.diag(np.tile([r**2] * 3 + [v**2] * 3, n))
-    flow = partial(_flow, bodies=n, rule=rule, longest=step)
+    noise = np.diag(np.tile([position_std**2] * 3 + [velocity_std**2] * 3, bodies))
+    flow = partial(_flow, rule=rule, longest=longest)
+    axes = ("x", "y", "z", "vx", "vy", "vz")
     return Model(
-        6 * n, flow, lambda t, dt: noise, derivative=partial(_slope, bodies=n, flow=flow),
-        names=tuple(f"{c}{k + 1}" for k in range(n) for c in ("x", "y", "z", "vx", "vy", "vz")),
-        units=("km", "km", "km", "m/s", "m/s", "m/s") * n,
+        6 * bodies, flow, partial(_noise, noise),
+        derivative=partial(_slope, bodies=bodies, flow=flow),
+        names=tuple(f"{c}{k + 1}" for k in range(bodies) for c in axes),
+        units=("km", "km", "km", "m/s", "m/s", "m/s") * bodies,
     )
 
 
-def _flow(x: Array, t: float, dt: float, *, bodies: int, rule: str, longest: float) -> Array:
+def _noise(noise: Array, t: float, dt: float) -> Array:
+    return noise
+
+
+def _flow(x: Array, t: float, dt: float, *, rule: Rule, longest: float) -> Array:
     states = x.reshape(*x.shape[:-1], -1, 6)
-    return propagate(states, dt, rule=rule, longest=longest).reshape(x.shape)
+    return unchecked(propagate)(states, dt, rule=rule, longest=longest).reshape(x.shape)
 
 
 def _slope(
     x: Array, t: float, dt: float, *, bodies: int, flow: Callable[[Array, float, float], Array]
 ) -> Array:
     """Central differences, body by body: a body's motion depends on its own state only."""
-    size = np.array([1e-2] * 3 + [1e-2] * 3)
+    size = np.full(6, 1e-2)
     states = x.reshape(*x.shape[:-1], bodies, 6)
     moved = np.stack([states[..., None, :] + np.diag(size), states[..., None, :] - np.diag(size)])
     ends = flow(moved, t, dt)
@@ -244,7 +239,8 @@ def _slope(
     return out
 
 
-def rsw_frame(x: ArrayLike) -> Array:
+@door
+def rsw_frame(x: Orbits) -> Array:
     """Axes along the radius, across it along the motion, and along the orbit's normal, (58).
 
     Parameters
@@ -264,10 +260,8 @@ def rsw_frame(x: ArrayLike) -> Array:
            [0., 1., 0.],
            [0., 0., 1.]])
     """
-    state = array(x, "x", (..., 6))
-    _bounded(state, "x")
-    radial = state[..., :3] / np.linalg.norm(state[..., :3], axis=-1, keepdims=True)
-    normal = np.cross(state[..., :3], state[..., 3:])
+    radial = x[..., :3] / np.linalg.norm(x[..., :3], axis=-1, keepdims=True)
+    normal = np.cross(x[..., :3], x[..., 3:])
     size = np.linalg.norm(normal, axis=-1, keepdims=True)
     if (size == 0).any() or not np.isfinite(radial).all():
         raise ValueError("x: needs positions and velocities that span a plane, got others")
@@ -275,7 +269,8 @@ def rsw_frame(x: ArrayLike) -> Array:
     return np.stack([radial, np.cross(normal, radial), normal], axis=-1)
 
 
-def occulted(a: ArrayLike, b: ArrayLike) -> Array:
+@door
+def occulted(a: Place, b: Place) -> Array:
     """Whether the Earth's equatorial sphere hides two positions from each other, (...).
 
     Parameters
@@ -290,9 +285,8 @@ def occulted(a: ArrayLike, b: ArrayLike) -> Array:
     >>> bool(occulted([42164.0, 0, 0], [0, 42164.0, 0]))
     False
     """
-    p, q = _outside(a, "a"), _outside(b, "b")
-    way = q - p
+    way = b - a
     size = np.einsum("...i,...i->...", way, way)
-    along = -np.einsum("...i,...i->...", p, way) / np.where(size > 0, size, 1.0)
-    nearest = p + np.clip(along, 0, 1)[..., None] * way
+    along = -np.einsum("...i,...i->...", a, way) / np.where(size > 0, size, 1.0)
+    nearest = a + np.clip(along, 0, 1)[..., None] * way
     return np.asarray(np.linalg.norm(nearest, axis=-1) < RADIUS)

@@ -6,24 +6,29 @@ pendulum hangs at :math:`(0, L)`; or, in the chart, the angle from there and its
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike
+from functools import partial
+from typing import Annotated, Any, Literal
 
-from ..checks import Array, array, choice, number
+import numpy as np
+
+from ..doors import Array, Bounds, NonNegative, Positive, door
 from .base import Model
-from .integrators import _integrated
+from .integrators import integrated
 
 __all__ = [  # fmt: skip
-    "FORMS", "pendulum", "pendulum_angle", "pendulum_chart", "pendulum_energy", "pendulum_rate",
+    "pendulum", "pendulum_angle", "pendulum_chart", "pendulum_energy", "pendulum_rate",
     "pendulum_states",
 ]
 
-FORMS = ("printed", "multiplier")
-"""Equations (14)-(15) as the paper prints them, and with the multiplier written out."""
+Length = Annotated[float, Bounds(at_least=1e-100, at_most=1e100)]
+"""A length whose square is a positive number."""
+Form = Literal["printed", "multiplier"]
+States = Annotated[Array, "... 4"]
 
 
+@door
 def pendulum_rate(
-    states: ArrayLike, *, length: float = 1.0, gravity: float = 9.8, form: str = "printed"
+    states: States, *, length: Length = 1.0, gravity: NonNegative = 9.8, form: Form = "printed"
 ) -> Array:
     r"""Right-hand side (..., 4) of the pendulum's equations, (14)-(15) of Das and Bhattacharya.
 
@@ -44,24 +49,17 @@ def pendulum_rate(
     gravity : float
         g, in m/s², at least 0.
     form : {"printed", "multiplier"}
-        `FORMS`.
+        The equations as the paper prints them, or with the multiplier written out.
 
     Examples
     --------
     >>> pendulum_rate([1.0, 0.0, 0.0, 0.0])
     array([ 0. ,  0. , -0. ,  9.8])
     """
-    x = array(states, "states", (..., 4))
-    size, g = _length(length), number(gravity, "gravity", at_least=0)
-    return _rate(x, size, g, choice(form, "form", FORMS) == "printed")
+    return _rate(states, 0.0, length, gravity, form == "printed")
 
 
-def _length(value: float) -> float:
-    """A length whose square is a positive number."""
-    return number(value, "length", at_least=1e-100, at_most=1e100)
-
-
-def _rate(s: Array, size: float, g: float, printed: bool) -> Array:
+def _rate(s: Array, t: float, size: float, g: float, printed: bool) -> Array:
     x, y, u, v = s[..., 0], s[..., 1], s[..., 2], s[..., 3]
     pull = (u * u + v * v + g * y) / -(size * size)
     out = np.empty_like(s)
@@ -75,7 +73,7 @@ def _rate(s: Array, size: float, g: float, printed: bool) -> Array:
     return out
 
 
-def _slope(s: Array, size: float, g: float, printed: bool) -> Array:
+def _slope(s: Array, t: float, size: float, g: float, printed: bool) -> Array:
     """Derivative of the right-hand side, (..., 4, 4)."""
     x, y, u, v = s[..., 0], s[..., 1], s[..., 2], s[..., 3]
     k = -1.0 / (size * size)
@@ -92,9 +90,10 @@ def _slope(s: Array, size: float, g: float, printed: bool) -> Array:
     return out
 
 
+@door
 def pendulum(
-    *, length: float = 1.0, gravity: float = 9.8, form: str = "printed",
-    sigma: tuple[float, float] = (0.0, 0.0), step: float = 0.01,
+    *, length: Length = 1.0, gravity: NonNegative = 9.8, form: Form = "printed",
+    sigma: tuple[NonNegative, NonNegative] = (0.0, 0.0), step: Positive = 0.01,
 ) -> Model:
     """The pendulum in Cartesian coordinates x, y, vx, vy, by Runge-Kutta of order 4.
 
@@ -114,24 +113,17 @@ def pendulum(
     >>> float(np.hypot(*swing[:2]).round(6))
     1.0
     """
-    size, g = _length(length), number(gravity, "gravity", at_least=0)
-    printed = choice(form, "form", FORMS) == "printed"
-    return _integrated(
-        lambda x, _: _rate(x, size, g, printed), lambda x, _: _slope(x, size, g, printed),
-        _density(sigma, 2), step=step, names=("x", "y", "vx", "vy"), units=("m", "m", "m/s", "m/s"),
+    given: dict[str, Any] = {"size": length, "g": gravity, "printed": form == "printed"}
+    return integrated(
+        partial(_rate, **given), partial(_slope, **given), np.diag(np.repeat(sigma, 2) ** 2),
+        step=step, names=("x", "y", "vx", "vy"), units=("m", "m", "m/s", "m/s"),
     )
 
 
-def _density(sigma: tuple[float, float], each: int) -> Array:
-    pair = array(sigma, "sigma", (2,))
-    for value in pair.tolist():
-        number(value, "sigma", at_least=0)
-    return np.diag(np.repeat(pair, each) ** 2)
-
-
+@door
 def pendulum_angle(
-    *, length: float = 1.0, gravity: float = 9.8, sigma: tuple[float, float] = (0.0, 0.0),
-    step: float = 0.01,
+    *, length: Length = 1.0, gravity: NonNegative = 9.8,
+    sigma: tuple[NonNegative, NonNegative] = (0.0, 0.0), step: Positive = 0.01,
 ) -> Model:
     r"""The pendulum in its chart: the angle θ from the vertical, not wrapped, and its rate.
 
@@ -149,27 +141,29 @@ def pendulum_angle(
     >>> pendulum_angle().step([0.0, 1.0], 0.0, 0.01).round(4)
     array([0.01  , 0.9995])
     """
-    size, g = _length(length), number(gravity, "gravity", at_least=0)
-
-    def rate(x: Array, _: float) -> Array:
-        out = np.empty_like(x)
-        out[..., 0] = x[..., 1]
-        out[..., 1] = -(g / size) * np.sin(x[..., 0])
-        return out
-
-    def slope(x: Array, _: float) -> Array:
-        out = np.zeros((*x.shape, 2))
-        out[..., 0, 1] = 1.0
-        out[..., 1, 0] = -(g / size) * np.cos(x[..., 0])
-        return out
-
-    return _integrated(
-        rate, slope, _density(sigma, 1), step=step, names=("theta", "omega"),
-        units=("rad", "rad/s"),
+    pull = gravity / length
+    return integrated(
+        partial(_swing, pull=pull), partial(_swing_slope, pull=pull),
+        np.diag(np.square(sigma)), step=step, names=("theta", "omega"), units=("rad", "rad/s"),
     )
 
 
-def pendulum_states(chart: ArrayLike, *, length: float = 1.0) -> Array:
+def _swing(x: Array, t: float, pull: float) -> Array:
+    out = np.empty_like(x)
+    out[..., 0] = x[..., 1]
+    out[..., 1] = -pull * np.sin(x[..., 0])
+    return out
+
+
+def _swing_slope(x: Array, t: float, pull: float) -> Array:
+    out = np.zeros((*x.shape, 2))
+    out[..., 0, 1] = 1.0
+    out[..., 1, 0] = -pull * np.cos(x[..., 0])
+    return out
+
+
+@door
+def pendulum_states(chart: Annotated[Array, "... 2"], *, length: Length = 1.0) -> Array:
     r"""Cartesian states (..., 4), position and velocity, of chart coordinates.
 
     Parameters
@@ -184,13 +178,12 @@ def pendulum_states(chart: ArrayLike, *, length: float = 1.0) -> Array:
     >>> pendulum_states([np.pi / 2, 2.0]).round(12) + 0.0
     array([ 1.,  0.,  0., -2.])
     """
-    q = array(chart, "chart", (..., 2))
-    size = _length(length)
-    sine, cosine, rate = np.sin(q[..., 0]), np.cos(q[..., 0]), q[..., 1]
-    return size * np.stack([sine, cosine, rate * cosine, -rate * sine], axis=-1)
+    sine, cosine, rate = np.sin(chart[..., 0]), np.cos(chart[..., 0]), chart[..., 1]
+    return length * np.stack([sine, cosine, rate * cosine, -rate * sine], axis=-1)
 
 
-def pendulum_chart(states: ArrayLike) -> Array:
+@door
+def pendulum_chart(states: States) -> Array:
     r"""Angle in (-π, π] and rate :math:`(\dot xy-x\dot y)/r^2` of Cartesian states, (..., 2).
 
     Parameters
@@ -203,18 +196,15 @@ def pendulum_chart(states: ArrayLike) -> Array:
     >>> pendulum_chart(pendulum_states([2.0, -1.5])).round(12)
     array([ 2. , -1.5])
     """
-    s = array(states, "states", (..., 4))
-    x, y, u, v = s[..., 0], s[..., 1], s[..., 2], s[..., 3]
-    with np.errstate(over="ignore"):
-        square = x * x + y * y
-    if not np.isfinite(square).all() or np.abs(s[..., 2:]).max(initial=0.0) > 1e150:
-        raise ValueError(f"states: needs numbers of finite square, got {np.abs(s).max():g}")
+    x, y, u, v = states[..., 0], states[..., 1], states[..., 2], states[..., 3]
+    square = x * x + y * y
     if (square == 0).any():
         raise ValueError("states: needs positions away from the pivot, got one at it")
     return np.stack([np.arctan2(x, y), (u * y - x * v) / square], axis=-1)
 
 
-def pendulum_energy(states: ArrayLike, *, gravity: float = 9.8) -> Array:
+@door
+def pendulum_energy(states: States, *, gravity: NonNegative = 9.8) -> Array:
     r"""Energy per mass, :math:`\frac12|\mathbf v|^2-gy`, in m²/s², (...).
 
     Parameters
@@ -228,6 +218,4 @@ def pendulum_energy(states: ArrayLike, *, gravity: float = 9.8) -> Array:
     >>> float(pendulum_energy([0.0, 1.0, 2.0, 0.0]).round(12))
     -7.8
     """
-    s = array(states, "states", (..., 4))
-    g = number(gravity, "gravity", at_least=0)
-    return np.asarray(0.5 * (s[..., 2] ** 2 + s[..., 3] ** 2) - g * s[..., 1])
+    return np.asarray(0.5 * (states[..., 2] ** 2 + states[..., 3] ** 2) - gravity * states[..., 1])

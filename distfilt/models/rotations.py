@@ -1,15 +1,16 @@
 r"""Rotations and unit quaternions, scalar part first, with the *active* rotation matrix.
 
 The attitude's kinematics (19) and (21) of Grange et al. are here; its dynamics in
-:mod:`distfilt.models.attitude`.
+:mod:`distfilt.models.satellite`.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import ArrayLike
+from typing import Annotated
 
-from ..checks import Array, array
+import numpy as np
+
+from ..doors import Array, door, unchecked
 
 __all__ = [  # fmt: skip
     "cross_matrix", "left_directions", "quaternion_rate", "rotation_matrix", "turn_between",
@@ -17,7 +18,20 @@ __all__ = [  # fmt: skip
 ]
 
 
-def cross_matrix(vector: ArrayLike) -> Array:
+def _far_from_zero(value: Array, name: str) -> None:
+    with np.errstate(over="ignore", under="ignore"):
+        squares = (value**2).sum(axis=-1)
+    if not (np.isfinite(squares) & (squares > 1e-280)).all():
+        got = np.abs(value).max()
+        raise ValueError(f"{name}: needs quaternions that are not zero or infinite, got {got:g}")
+
+
+Quaternion = Annotated[Array, "... 4", _far_from_zero]
+Vector = Annotated[Array, "... 3"]
+
+
+@door
+def cross_matrix(vector: Vector) -> Array:
     r"""The cross product :math:`[\boldsymbol\omega]_\times` as a matrix (..., 3, 3), equation (19).
 
     Parameters
@@ -29,25 +43,15 @@ def cross_matrix(vector: ArrayLike) -> Array:
     >>> cross_matrix([0.0, 0.0, 1.0]) @ [1.0, 0.0, 0.0]
     array([0., 1., 0.])
     """
-    w = array(vector, "vector", (..., 3))
+    w = vector
     out = np.zeros((*w.shape, 3))
     out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
     out[..., 1, 2], out[..., 2, 0], out[..., 0, 1] = -w[..., 0], -w[..., 1], -w[..., 2]
     return out
 
 
-def _quaternion(value: ArrayLike, name: str = "quaternion") -> Array:
-    q = array(value, name, (..., 4))
-    if not (q != 0).any(axis=-1).all():
-        raise ValueError(f"{name}: needs quaternions that are not zero, got a zero one")
-    with np.errstate(over="ignore", under="ignore"):
-        squares = (q**2).sum(axis=-1)
-    if not (np.isfinite(squares) & (squares > 1e-280)).all():
-        raise ValueError(f"{name}: needs lengths between 1e-140 and 1e154, got {abs(q).max():g}")
-    return q
-
-
-def rotation_matrix(quaternion: ArrayLike) -> Array:
+@door
+def rotation_matrix(quaternion: Quaternion) -> Array:
     r"""The active rotation matrix R(q), (..., 3, 3), of a quaternion with its scalar part first.
 
     Members of an ensemble need not have unit length, so the length is divided out.
@@ -64,7 +68,7 @@ def rotation_matrix(quaternion: ArrayLike) -> Array:
     >>> (rotation_matrix([1.0, 0.0, 0.0, 1.0]) @ [1.0, 0.0, 0.0]).round(12)
     array([0., 1., 0.])
     """
-    q = _quaternion(quaternion)
+    q = quaternion
     a, b, c, d = (q[..., k] for k in range(4))
     rows = [
         [a * a + b * b - c * c - d * d, 2 * (b * c - a * d), 2 * (b * d + a * c)],
@@ -75,7 +79,8 @@ def rotation_matrix(quaternion: ArrayLike) -> Array:
     return np.asarray(stacked / (q**2).sum(axis=-1)[..., None, None])
 
 
-def left_directions(quaternion: ArrayLike) -> Array:
+@door
+def left_directions(quaternion: Quaternion) -> Array:
     r"""How a quaternion changes as the body turns a little further about the frame's axes.
 
     The derivative at zero of :func:`turned` in its angle. Equation (21) is
@@ -98,15 +103,16 @@ def left_directions(quaternion: ArrayLike) -> Array:
            [0. , 0.5, 0. ],
            [0. , 0. , 0.5]])
     """
-    q = _quaternion(quaternion)
+    q = quaternion
     out = np.empty((*q.shape, 3))
     out[..., 0, :] = -q[..., 1:]
-    out[..., 1:, :] = -cross_matrix(q[..., 1:])
+    out[..., 1:, :] = -unchecked(cross_matrix)(q[..., 1:])
     out[..., 1:, :] += q[..., :1, None] * np.eye(3)
     return 0.5 * out + 0.0
 
 
-def turned(quaternion: ArrayLike, angle: ArrayLike) -> Array:
+@door
+def turned(quaternion: Quaternion, angle: Vector) -> Array:
     r"""The attitude (..., 4) turned further, :math:`e^{\boldsymbol\theta/2}\mathbf q`.
 
     Parameters
@@ -121,16 +127,13 @@ def turned(quaternion: ArrayLike, angle: ArrayLike) -> Array:
     >>> turned([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2]).round(4)
     array([0.7071, 0.    , 0.    , 0.7071])
     """
-    q = _quaternion(quaternion)
-    theta = array(angle, "angle", (..., 3))
-    if np.abs(theta).max(initial=0.0) > 1e150:
-        raise ValueError(f"angle: needs turns whose square is finite, got {np.abs(theta).max():g}")
-    half = 0.5 * np.linalg.norm(theta, axis=-1)[..., None]
-    move = (left_directions(q) @ theta[..., None])[..., 0]
-    return np.asarray(np.cos(half) * q + np.sinc(half / np.pi) * move)
+    half = 0.5 * np.linalg.norm(angle, axis=-1)[..., None]
+    move = (unchecked(left_directions)(quaternion) @ angle[..., None])[..., 0]
+    return np.asarray(np.cos(half) * quaternion + np.sinc(half / np.pi) * move)
 
 
-def turn_between(quaternion: ArrayLike, other: ArrayLike) -> Array:
+@door
+def turn_between(quaternion: Quaternion, other: Quaternion) -> Array:
     """The rotation vector that takes one attitude to another, the inverse of :func:`turned`.
 
     Parameters
@@ -148,10 +151,9 @@ def turn_between(quaternion: ArrayLike, other: ArrayLike) -> Array:
     >>> turn_between([1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, -1.0]).round(4)
     array([ 0.    ,  0.    , -1.5708])
     """
-    q, p = _quaternion(quaternion), _quaternion(other, "other")
-    cos = (q * p).sum(axis=-1)
+    cos = (quaternion * other).sum(axis=-1)
     # Twice the directions are |q| long and orthogonal: they read off the sine's vector.
-    sin = 2 * (np.swapaxes(left_directions(q), -1, -2) @ p[..., None])[..., 0]
+    sin = 2 * (unchecked(left_directions)(quaternion).mT @ other[..., None])[..., 0]
     sin = np.where(cos < 0, -1.0, 1.0)[..., None] * sin
     size = np.linalg.norm(sin, axis=-1)
     half = np.arctan2(size, np.abs(cos))
@@ -159,7 +161,8 @@ def turn_between(quaternion: ArrayLike, other: ArrayLike) -> Array:
     return np.asarray(2 * scale[..., None] * sin)
 
 
-def quaternion_rate(quaternion: ArrayLike, angular_velocity: ArrayLike) -> Array:
+@door
+def quaternion_rate(quaternion: Quaternion, angular_velocity: Vector) -> Array:
     """The quaternion's derivative in 1/s, (..., 4), equation (21); it keeps the length.
 
     Parameters
@@ -173,12 +176,11 @@ def quaternion_rate(quaternion: ArrayLike, angular_velocity: ArrayLike) -> Array
     >>> quaternion_rate([1.0, 0.0, 0.0, 0.0], [0.2, 0.0, 0.0]) + 0.0
     array([ 0. , -0.1,  0. ,  0. ])
     """
-    q = _quaternion(quaternion)
-    w = array(angular_velocity, "angular_velocity", (*q.shape[:-1], 3))
-    return np.stack(_quaternion_rate(np.moveaxis(q, -1, 0), np.moveaxis(w, -1, 0)), axis=-1)
+    rows = kinematics(np.moveaxis(quaternion, -1, 0), np.moveaxis(angular_velocity, -1, 0))
+    return np.stack(rows, axis=-1)
 
 
-def _quaternion_rate(q: Array, w: Array) -> list[Array]:
+def kinematics(q: Array, w: Array) -> list[Array]:
     """Equation (21), components first."""
     a, b, c, d = q
     w1, w2, w3 = w

@@ -21,8 +21,9 @@ from _bench import interleaved, write
 
 from distfilt.filters import GaussianFilter
 from distfilt.kalman import filterpy_kf, filterpy_ukf, kalman_filter
-from distfilt.models import clohessy_wiltshire, coordinated_turn, simulate
+from distfilt.models import clohessy_wiltshire, simulate
 from distfilt.sensors import direct, distance_and_angle, stack
+from tests.support import turning
 
 RUNS, STEPS, DT = 200, 100, 0.1
 CURVED_RUNS, CURVED_STEPS = 100, 15
@@ -94,7 +95,7 @@ def plain_numpy(mean: Any, cov: Any, y: Any, *, F: Any, H: Any, Q: Any, R: Any) 
 
 
 def curved_case(rng: np.random.Generator) -> tuple[tuple[np.ndarray, ...], dict[str, Any]]:
-    model = coordinated_turn(sigma=0.1, turn_sigma=0.02)
+    model = turning(sigma=0.1, turn_sigma=0.02)
     sensors = (distance_and_angle([0, 1], std=(0.3, 0.02), origin=[-9.0, -7.0]),)
     x0 = np.array([0.0, 0.0, 1.0, 0.5, 0.1])[: model.dim]
     times = 0.5 * np.arange(1, CURVED_STEPS + 1)

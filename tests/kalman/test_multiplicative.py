@@ -13,16 +13,11 @@ from distfilt.kalman import (
     quaternion_chart,
 )
 from distfilt.linalg import central
-from distfilt.models import (
-    Model,
-    constant_velocity,
-    coordinated_turn,
-    satellite_pose,
-    simulate,
-    turned,
-)
+from distfilt.models import Model, constant_velocity, satellite_pose, simulate
+from distfilt.models.rotations import turned
 from distfilt.sensors import differential, direct, distance_and_angle, stack
 from tests.kalman.problems import spd
+from tests.support import turning
 
 POSE = quaternion_chart(13, 9)
 
@@ -62,7 +57,7 @@ def test_a_projected_covariance_is_that_of_small_errors() -> None:
 
 def test_a_flat_chart_is_the_extended_filter() -> None:
     rng = np.random.default_rng(2)
-    model = coordinated_turn(sigma=0.1, turn_sigma=0.05)
+    model = turning(sigma=0.1, turn_sigma=0.05)
     start, cov = np.array([0.0, 0.0, 1.0, 0.0, 0.2]), 0.1 * spd(rng, 5)
     sensors = [distance_and_angle([0, 1], std=[0.1, 0.05], origin=[3.0, 0.1])]
     y = stack(sensors).observe(start + 0.1 * rng.standard_normal((3, 4, 5)), rng=rng)

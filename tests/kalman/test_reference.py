@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from distfilt.filters import GaussianFilter
 from distfilt.gaussians import conditioned
 from distfilt.kalman import GaussianRun, filterpy_ekf, filterpy_kf, filterpy_ukf, kalman_filter
-from distfilt.models import Model, clohessy_wiltshire, coordinated_turn, satellite_pose, simulate
+from distfilt.models import Model, clohessy_wiltshire, satellite_pose, simulate
 from distfilt.sensors import Sensor, angle, direct, distance, distance_and_angle, stack
 from tests.kalman.problems import D, M, problem, spd, walk
+from tests.support import turning
 
 FULL = np.array([[4.0, 1.2], [1.2, 1.0]])
 
@@ -83,7 +84,7 @@ def test_linear_case_equals_the_kalman_filter(
 
 
 def _turn() -> dict[str, Any]:
-    start, model = np.array([0.0, 0.0, 1.0, 0.0, 0.2]), coordinated_turn(sigma=0.1, turn_sigma=0.05)
+    start, model = np.array([0.0, 0.0, 1.0, 0.0, 0.2]), turning(sigma=0.1, turn_sigma=0.05)
     sensors = [distance_and_angle([0, 1], std=[0.1, 0.05], origin=[3.0, 0.1])]
     return {"start": start, "model": model, "sensors": sensors, "spread": 0.1}
 

@@ -1,42 +1,84 @@
-"""Straight motion and turns against closed forms, with no gap at a turn rate of zero."""
+"""The Runge-Kutta rule, straight motion and Lorenz's model against closed forms and other rules."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from scipy.linalg import expm
+from scipy.integrate import solve_ivp
 
 from distfilt.linalg import central
-from distfilt.models import LinearModel, constant_velocity, coordinated_turn
-
-NAN = float("nan")
-_M = "distfilt.models.motion."
-BAD_INPUT = {
-    _M + "constant_velocity": [
-        ("sigma", lambda: constant_velocity(sigma=-1.0)),
-        ("axes", lambda: constant_velocity(sigma=1.0, axes=4)),
-        ("axes", lambda: constant_velocity(sigma=1.0, axes=0)),
-        ("x", lambda: constant_velocity(sigma=1.0).step([1.0, 2.0], 0.0, 1.0)),
-    ],
-    _M + "coordinated_turn": [
-        ("sigma", lambda: coordinated_turn(sigma=-1.0, rate=0.1)),
-        ("sigma", lambda: coordinated_turn(sigma=NAN, turn_sigma=0.1)),
-        ("rate", lambda: coordinated_turn(sigma=1.0, rate=NAN)),
-        ("rate", lambda: coordinated_turn(sigma=1.0)),
-        ("rate", lambda: coordinated_turn(sigma=1.0, rate=0.1, turn_sigma=0.1)),
-        ("turn_sigma", lambda: coordinated_turn(sigma=1.0, turn_sigma=-0.1)),
-        ("x", lambda: coordinated_turn(sigma=1.0, turn_sigma=0.1).step([1.0] * 4, 0.0, 1.0)),
-    ],
-}
+from distfilt.models import constant_velocity, lorenz63, rk4
+from distfilt.models.integrators import rk4_jacobian
+from distfilt.models.motion import _rate
 
 
-def _turn_drift(omega: float) -> np.ndarray:
-    a = np.zeros((4, 4))
-    a[0, 2] = a[1, 3] = 1.0
-    a[2, 3], a[3, 2] = -omega, omega
-    return a
+@pytest.mark.parametrize("longest", [None, 0.5, 0.34])
+def test_rk4_is_batched_and_exact_for_cubics_in_time(longest: float | None) -> None:
+    x = np.zeros((3, 2))
+    out = rk4(lambda x, t: np.full_like(x, 4 * t**3), x, 1.0, 1.0, longest=longest)
+    assert np.allclose(out, 15.0, atol=1e-12) and not x.any()
+
+
+@pytest.mark.parametrize(
+    ("dt", "longest", "steps"),
+    [(1.0, None, 1), (1.0, 2.0, 1), (1.0, 0.5, 2), (1.0, 0.4, 3), (0.1, 0.01, 10), (0.0, 0.1, 1)],
+)
+def test_a_step_is_cut_into_the_fewest(dt: float, longest: float | None, steps: int) -> None:
+    times = []
+
+    def rate(x: np.ndarray, t: float) -> np.ndarray:
+        times.append(t)
+        return -x
+
+    moved = rk4(rate, [1.0], 3.0, dt, longest=longest)
+    assert len(times) == 4 * steps
+    assert np.allclose(times[::4], 3.0 + dt / steps * np.arange(steps))
+    h = dt / steps
+    assert np.allclose(moved, (1 - h + h**2 / 2 - h**3 / 6 + h**4 / 24) ** steps, rtol=1e-14)
+
+
+def test_the_error_falls_with_the_fourth_power() -> None:
+    steps = np.array([0.2, 0.1, 0.05])
+    gaps = [abs(rk4(lambda x, t: x * np.cos(t), [1.0], 0.0, 2.0, longest=h)[0]
+                - np.exp(np.sin(2.0))) for h in steps]
+    assert abs(np.polyfit(np.log(steps), np.log(gaps), 1)[0] - 4) < 0.2
+
+
+def test_a_rate_that_works_in_place_leaves_the_caller_s_states() -> None:
+    def rate(x: np.ndarray, t: float) -> np.ndarray:
+        x *= -1
+        return x.copy()
+
+    x = np.ones(2)
+    rk4(rate, x, 0.0, 0.1)
+    assert (x == 1).all()
+
+
+def test_jacobian_of_a_bent_flow_in_time() -> None:
+    def rate(x: np.ndarray, t: float) -> np.ndarray:
+        return np.stack([x[..., 1], -np.sin(x[..., 0]) * (1 + t)], axis=-1)
+
+    def slope(x: np.ndarray, t: float) -> np.ndarray:
+        out = np.zeros((*x.shape, 2))
+        out[..., 0, 1], out[..., 1, 0] = 1.0, -np.cos(x[..., 0]) * (1 + t)
+        return out
+
+    x = np.random.default_rng(0).standard_normal((4, 2))
+    ours = rk4_jacobian(rate, slope, x, 0.5, 1.0, longest=0.3)
+    numeric = central(lambda v: rk4(rate, v, 0.5, 1.0, longest=0.3), x)
+    assert np.abs(ours - numeric).max() < 1e-8
+
+
+def test_a_rate_in_integers_or_in_half_the_digits_keeps_the_states_type() -> None:
+    def slow(x: np.ndarray, t: float) -> np.ndarray:
+        return np.ones(x.shape, dtype=np.int64)
+
+    def coarse(x: np.ndarray, t: float) -> np.ndarray:
+        return np.full(x.shape, 0.5, dtype=np.float32)
+
+    start = np.array([1.0 + 1e-12, 2.0])
+    assert np.allclose(rk4(slow, start, 0.0, 1.0, longest=0.25), start + 1, rtol=0, atol=1e-15)
+    assert np.allclose(rk4(coarse, start, 0.0, 1.0, longest=0.25), start + 0.5, rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("axes", [1, 2, 3])
@@ -53,61 +95,36 @@ def test_straight_motion(axes: int) -> None:
     assert model.units == ("m",) * axes + ("m/s",) * axes
 
 
-@given(st.floats(-3, 3), st.floats(0, 3))
-def test_known_turn_is_the_exponential_of_its_drift(omega: float, dt: float) -> None:
-    model = coordinated_turn(sigma=0.2, rate=omega)
-    assert isinstance(model, LinearModel)
-    assert np.abs(model.transition(dt) - expm(_turn_drift(omega) * dt)).max() < 1e-12
+def test_lorenz_agrees_with_an_adaptive_rule() -> None:
+    """From twenty states near the attractor: close, and closer with the step's fourth power."""
+    starts = np.array([1.5, -1.5, 25.5]) + np.random.default_rng(0).standard_normal((20, 3))
+
+    def rate(t: float, x: np.ndarray) -> np.ndarray:
+        return _rate(x.reshape(20, 3), t, 10.0, 28.0, 8 / 3).ravel()
+
+    run = solve_ivp(rate, (0, 1), starts.ravel(), method="DOP853", rtol=1e-13, atol=1e-13)
+    exact = run.y[:, -1].reshape(20, 3)
+    steps = np.array([0.01, 0.005, 0.0025, 0.00125])
+    gaps = [lorenz63(step=h).step(starts, 0.0, 1.0) - exact for h in steps]
+    error = [np.sqrt((gap**2).mean()) for gap in gaps]
+    assert error[-1] < 1e-7
+    assert abs(np.polyfit(np.log(steps), np.log(error), 1)[0] - 4) < 0.3
 
 
-@pytest.mark.parametrize("omega", [-1.3, 0.7, 2.0])
-def test_noise_in_a_turn_in_closed_form(omega: float) -> None:
-    """Complex numbers for the plane: S = (exp(iτ) - 1) / iω, R = exp(iτ), integrated by hand."""
-    dt, sigma = 0.8, 0.3
-    tau = omega * dt
-    pp = 2 * (tau - np.sin(tau)) / omega**3
-    pv = (1 - np.cos(tau)) / omega**2 - 1j * (tau - np.sin(tau)) / omega**2
-    q = coordinated_turn(sigma=sigma, rate=omega).noise(0.0, dt)
-    block = np.array([[pv.real, -pv.imag], [pv.imag, pv.real]])
-    assert np.allclose(q[:2, :2], sigma**2 * pp * np.eye(2), rtol=1e-9)
-    assert np.allclose(q[:2, 2:], sigma**2 * block, rtol=1e-9, atol=1e-12)
-    assert np.allclose(q[2:, 2:], sigma**2 * dt * np.eye(2), rtol=1e-9)
+def test_lorenz_noise() -> None:
+    assert np.allclose(lorenz63(sigma=0.5).noise(0.0, 0.1), 0.025 * np.eye(3))
+    assert not lorenz63().noise(0.0, 0.1).any()
 
 
-@given(st.floats(-2, 2), st.floats(0.01, 2))
-def test_estimated_turn_moves_along_the_circle(omega: float, dt: float) -> None:
-    model = coordinated_turn(sigma=0.2, turn_sigma=0.1)
-    x = np.array([1.0, -2.0, 3.0, 0.5, omega])
-    moved = model.step(x, 0.0, dt)
-    assert np.abs(moved[:4] - expm(_turn_drift(omega) * dt) @ x[:4]).max() < 1e-12
-    assert moved[4] == omega and np.isclose(np.hypot(*moved[2:4]), np.hypot(3.0, 0.5))
+def test_every_parameter_is_in_its_place() -> None:
+    x = np.array([1.0, 2.0, 3.0])
+    small = 1e-6
+    moved = lorenz63(prandtl=5.0, rho=7.0, beta=11.0).step(x, 0.0, small) - x
+    assert np.allclose(moved / small, [5, 2, -31], rtol=1e-4)
 
 
-def test_the_limit_at_no_turn_is_straight_motion() -> None:
-    turn, straight = coordinated_turn(sigma=0.2, turn_sigma=0.1), constant_velocity(sigma=0.2)
-    x = np.array([1.0, -2.0, 3.0, 0.5])
-    for omega in (0.0, 1e-300, -1e-12, 1e-8):
-        moved = turn.step([*x, omega], 0.0, 1.5)[:4]
-        assert np.abs(moved - straight.step(x, 0.0, 1.5)).max() < 1e-6 * abs(omega) ** 0.1 + 1e-15
-        known = coordinated_turn(sigma=0.2, rate=omega)
-        assert np.allclose(known.noise(0.0, 1.5), straight.noise(0.0, 1.5), atol=1e-7)
-    exact = turn.step([*x, 0.0], 0.0, 1.5)[:4]
-    assert (exact == straight.step(x, 0.0, 1.5)).all()
-    slope = turn.jacobian([*x, 0.0], 0.0, 1.5)
-    # dx/dω at zero: dt²/2 times the velocity turned left, and dt times it.
-    assert np.allclose(slope[:4, 4], [-1.125 * 0.5, 1.125 * 3.0, -1.5 * 0.5, 1.5 * 3.0])
-
-
-@given(st.floats(-4, 4), st.floats(0.01, 2), st.integers(0, 1000))
-def test_the_turn_s_jacobian_is_its_derivative(omega: float, dt: float, seed: int) -> None:
-    model = coordinated_turn(sigma=0.2, turn_sigma=0.1)
-    x = np.random.default_rng(seed).standard_normal((3, 5))
-    x[:, 4] = omega
-    numeric = central(lambda v: model.step(v, 0.0, dt), x)
-    assert np.abs(model.jacobian(x, 0.0, dt) - numeric).max() < 1e-8
-
-
-def test_noise_of_the_estimated_turn() -> None:
-    q = coordinated_turn(sigma=0.2, turn_sigma=0.1).noise(0.0, 2.0)
-    assert np.allclose(q[:4, :4], constant_velocity(sigma=0.2).noise(0.0, 2.0))
-    assert np.isclose(q[4, 4], 0.02) and not q[4, :4].any()
+def test_jacobian_is_that_of_the_integration() -> None:
+    x = np.random.default_rng(1).standard_normal((5, 3)) * 8
+    model = lorenz63(prandtl=9.0, rho=27.0, beta=2.5, step=0.03)
+    numeric = central(lambda v: model.step(v, 0.0, 0.1), x)
+    assert np.abs(model.jacobian(x, 0.0, 0.1) - numeric).max() < 1e-7

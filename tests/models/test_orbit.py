@@ -21,46 +21,6 @@ from distfilt.models.orbit import (
 
 MEO = np.array([26491.58, 2980.266, -357.1760, -173.028, 2191.596, 3178.45])
 GEO = np.array([42241.10, 0.0, 0.0, 0.0, 3071.859, 0.0])
-BELOW = [6000.0, 0, 0, 0, 7000.0, 0]
-
-BAD_INPUT = {
-    "distfilt.models.orbit.potential": [("position", lambda: potential([0.0, 0.0, 0.0]))],
-    "distfilt.models.orbit.acceleration": [
-        ("position", lambda: acceleration([6000.0, 0.0, 0.0])),
-        ("position", lambda: acceleration([7000.0, 0.0])),
-        ("position", lambda: acceleration([1e151, 0.0, 0.0])),
-    ],
-    "distfilt.models.orbit.propagate": [
-        ("x", lambda: propagate(BELOW, 10.0)),
-        ("x", lambda: propagate([7000.0, 0, 0, 0, 100.0, 0], 3000.0, longest=10.0)),
-        ("dt", lambda: propagate(GEO, np.inf)),
-        ("rule", lambda: propagate(GEO, 1.0, rule="euler")),
-        ("longest", lambda: propagate(GEO, 1.0, longest=0.0)),
-        ("longest", lambda: propagate(GEO, 1.0, longest=1e-300)),
-        ("longest", lambda: propagate(GEO, -1e300)),
-    ],
-    "distfilt.models.orbit.orbits": [
-        ("bodies", lambda: orbits(0)),
-        ("position_std", lambda: orbits(1, position_std=-1.0)),
-        ("velocity_std", lambda: orbits(1, velocity_std=-1.0)),
-        ("position_std", lambda: orbits(1, position_std=1e160)),
-        ("velocity_std", lambda: orbits(1, velocity_std=1e160)),
-        ("rule", lambda: orbits(1, rule="euler")),
-        ("longest", lambda: orbits(1, longest=-1.0)),
-    ],
-    "distfilt.models.orbit.rsw_frame": [
-        ("x", lambda: rsw_frame([7000.0, 0, 0, 1.0, 0, 0])),
-        ("x", lambda: rsw_frame([7000.0, 0, 0])),
-        ("x", lambda: rsw_frame(1e300 * np.array([7.0, 0, 0, 0, 7.0, 0]))),
-    ],
-    "distfilt.models.orbit.occulted": [
-        ("a: ", lambda: occulted([1.0, 0, 0], [42000.0, 0, 0])),
-        ("a: ", lambda: occulted([42000.0, 0], [42000.0, 0, 0])),
-        ("b: ", lambda: occulted([42000.0, 0, 0], ["42000", "0", "0"])),
-        ("b: ", lambda: occulted([42000.0, 0, 0], [-1e300, 0, 0])),
-    ],
-}
-EXEMPT = {f"distfilt.models.orbit.{n}": "a constant" for n in ("MU", "RADIUS", "J2")}
 
 
 def test_acceleration_is_the_gradient_of_the_potential() -> None:

@@ -24,45 +24,6 @@ def _one(**options: object) -> Sensor:
     return Sensor(1, lambda x: x[..., :1], [[1.0]], **options)
 
 
-_S = "distfilt.sensors.base."
-BAD_INPUT = {
-    _S + "Sensor": [
-        ("dim", lambda: Sensor(0, lambda x: x, np.eye(1))),
-        ("function", lambda: Sensor(1, 2, np.eye(1))),
-        ("cov", lambda: Sensor(2, lambda x: x, np.eye(1))),
-        ("cov", lambda: Sensor(1, lambda x: x, [[-1.0]])),
-        ("cov", lambda: Sensor(1, lambda x: x, np.eye(1)[None])),
-        ("difference", lambda: _one(difference=3)),
-        ("linear", lambda: _one(linear=np.eye(1))),
-        ("derivative", lambda: _one(derivative=np.eye(1))),
-        ("units", lambda: _one(units=("m", "s"))),
-        ("units", lambda: _one(units="m")),
-        ("function", lambda: Sensor(2, lambda x: x, np.eye(2)).predict([1.0])),
-        ("difference", lambda: _one(difference=lambda y, p: 0.0).residual([1.0], [1.0])),
-        ("derivative", lambda: _one(derivative=lambda x: np.eye(3)).jacobian([1.0])),
-        ("linear", lambda: _one(linear=lambda d: np.eye(3)).jacobian([1.0])),
-        ("previous", lambda: differential([0], std=1.0).predict([1.0])),
-        ("previous", lambda: differential([0], std=1.0).jacobian([1.0])),
-        ("previous", lambda: differential([0], std=1.0).predict([1.0], [1.0, 2.0])),
-        ("previous", lambda: differential([0], std=1.0).predict(np.ones((2, 1)), np.ones((3, 1)))),
-        ("x", lambda: direct([3], std=1.0).predict([1.0])),
-        ("x", lambda: direct([0], std=1.0).predict([NAN])),
-        ("x", lambda: distance([0, 1], std=1.0).jacobian([NAN, 1.0])),
-        ("rng", lambda: direct([0], std=1.0).observe([1.0], rng=0)),
-        ("observed", lambda: direct([0], std=1.0).residual([1.0, 2.0], [1.0])),
-        ("observed", lambda: direct([0], std=1.0).residual([INF], [1.0])),
-        ("predicted", lambda: direct([0], std=1.0).residual([1.0], [1.0, 2.0])),
-        ("predicted", lambda: direct([0], std=1.0).residual([1.0], [INF])),
-        ("sensor", lambda: distance([0, 1], std=1.0).matrix(2)),
-        ("dim", lambda: direct([0], std=1.0).matrix(0)),
-    ],
-    _S + "wrap": [
-        ("angles", lambda: wrap([NAN])),
-        ("period", lambda: wrap([1.0], period=0.0)),
-    ],
-}
-
-
 @given(st.floats(-50, 50), st.integers(-5, 5))
 def test_wrap_forgets_whole_turns(value: float, turns: int) -> None:
     once, again = wrap([value]), wrap([value + turns * 2 * np.pi])

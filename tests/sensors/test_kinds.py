@@ -27,48 +27,6 @@ def _rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-_K = "distfilt.sensors.kinds."
-BAD_INPUT = {
-    _K + "angle": [
-        ("indices", lambda: angle([0], std=0.1)),
-        ("std", lambda: angle([0, 1], std=-0.1)),
-        ("origin", lambda: angle([0, 1], std=0.1, origin=[1.0])),
-        ("full", lambda: angle([0, 1], std=0.1, full="no")),
-    ],
-    _K + "differential": [
-        ("std", lambda: differential([0], std=0.0)),
-        ("indices", lambda: differential([0, 0], std=0.1)),
-    ],
-    _K + "direct": [
-        ("indices", lambda: direct([0, 0], std=0.1)),
-        ("indices", lambda: direct([], std=0.1)),
-        ("indices", lambda: direct([-1], std=0.1)),
-        ("std", lambda: direct([0], std=-1.0)),
-    ],
-    _K + "distance": [
-        ("std", lambda: distance([0], std=NAN)),
-        ("indices", lambda: distance([0.5], std=1.0)),
-        ("origin", lambda: distance([0, 1], std=1.0, origin=[NAN, 0.0])),
-    ],
-    _K + "distance_and_angle": [
-        ("std", lambda: distance_and_angle([0, 1], std=0.1)),
-        ("std", lambda: distance_and_angle([0, 1], std=[0.1, 0.0])),
-        ("indices", lambda: distance_and_angle([0, 1, 2], std=[0.1, 0.1])),
-        ("origin", lambda: distance_and_angle([0, 1], std=[0.1, 0.1], origin=0.0)),
-    ],
-    _K + "of_kind": [
-        ("kind", lambda: sensors.of_kind("radar", [0], std=0.1)),
-        ("indices", lambda: sensors.of_kind("angle", [0], std=0.1)),
-        ("std", lambda: sensors.of_kind("angle", [0, 1], std=-0.1)),
-    ],
-    _K + "stack": [
-        ("sensors", lambda: stack([])),
-        ("sensors", lambda: stack([direct([0], std=1.0), 3])),
-        ("sensors", lambda: stack(direct([0], std=1.0))),
-    ],
-}
-
-
 @given(st.floats(-10, 10), st.floats(-10, 10))
 def test_angle_is_arctan_up_to_its_branch(a: float, b: float) -> None:
     if abs(a) < 1e-6:

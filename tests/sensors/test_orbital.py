@@ -7,25 +7,6 @@ import numpy as np
 from distfilt.models import occulted
 from distfilt.sensors import ephemeris, line_of_sight
 
-BAD_INPUT = {
-    "distfilt.sensors.orbital.line_of_sight": [
-        ("std", lambda: line_of_sight(std=0.0)),
-        ("std", lambda: line_of_sight(std=1e160)),
-        ("form", lambda: line_of_sight(std=1.0, form="cosine")),
-        ("target", lambda: line_of_sight(std=1.0, target=-3)),
-        ("observer", lambda: line_of_sight(std=1.0, observer=0.5)),  # type: ignore[arg-type]
-        ("hidden", lambda: line_of_sight(std=1.0, hidden=True)),  # type: ignore[arg-type]
-    ],
-    "distfilt.sensors.orbital.ephemeris": [
-        ("position_std", lambda: ephemeris(position_std=0.0, velocity_std=1.0)),
-        ("velocity_std", lambda: ephemeris(position_std=1.0, velocity_std=-1.0)),
-        ("position_std", lambda: ephemeris(position_std=1e160, velocity_std=1.0)),
-        ("start", lambda: ephemeris(position_std=1.0, velocity_std=1.0, start=0.5)),
-        ("start", lambda: ephemeris(position_std=1.0, velocity_std=1.0, start=True)),
-        ("velocity_std", lambda: ephemeris(position_std=1.0, velocity_std=1e-160)),
-    ],
-}
-
 
 def test_angles_point_at_the_target() -> None:
     rng = np.random.default_rng(0)

@@ -1,0 +1,308 @@
+"""How good an estimate is: error, consistency and score, with intervals.
+
+Lengths sum over the components, which has a meaning only where they have one unit; otherwise ask
+for each component with ``per_component=True``.
+
+Shapes: estimates and truths are (..., d), ensembles (..., N, d), covariances (..., d, d). Leading
+axes (runs, agents, times) broadcast between an estimate and its truth.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+
+from .doors import Array, Bounds, Count, Cov, Weights, door, unchecked
+from .ensembles import Ensemble, Members, mean, sample_covariance
+from .gaussians import log_density
+from .intervals import Interval, mean_interval, median_interval, proportion_interval
+from .linalg import EPS, cholesky, leading, quadratic_form
+
+__all__ = [  # fmt: skip
+    "Interval", "crps", "ensemble_nees", "gaussian_crps", "log_score", "mean_interval",
+    "median_interval", "nees", "nees_band", "nis", "proportion_interval", "squared_error",
+]
+
+Vector = Annotated[Array, "... d"]
+
+
+@door
+def squared_error(estimate: Vector, truth: Vector, *, per_component: bool = False) -> Array:
+    r"""Squared length of the error, :math:`\lVert\hat{\mathbf x}-\mathbf x\rVert^2`.
+
+    A sum over the components, not a mean, in units of the state squared.
+
+    Parameters
+    ----------
+    estimate, truth : array_like, (..., d)
+        Leading axes broadcast.
+    per_component : bool
+        Give the squared error of each component instead.
+
+    Examples
+    --------
+    >>> float(squared_error([1.0, 2.0], [4.0, 6.0]))
+    25.0
+    >>> squared_error([1.0, 2.0], [4.0, 6.0], per_component=True)
+    array([ 9., 16.])
+    """
+    leading(estimate.shape[:-1], truth.shape[:-1], "truth")
+    square = (estimate - truth) ** 2
+    return square if per_component else np.asarray(square.sum(axis=-1))
+
+
+@door
+def nees(estimate: Vector, cov: Cov, truth: Vector) -> Array:
+    r"""Normalised estimation error squared, (...).
+
+    :math:`\epsilon = (\hat{\mathbf x}-\mathbf x)^\top\mathbf P^{-1}(\hat{\mathbf x}-\mathbf x)`. If
+    the error is N(0, P), as an honest filter claims, it is chi-square with d degrees of freedom and
+    averages d. More means overconfidence, less means caution.
+
+    Parameters
+    ----------
+    estimate, truth : array_like, (..., d)
+        Leading axes broadcast.
+    cov : array_like, (..., d, d)
+        The filter's own covariance P, positive definite.
+
+    Notes
+    -----
+    Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications to Tracking and
+    Navigation (2001), section 5.4.
+
+    Examples
+    --------
+    >>> float(nees([2.0, 0.0], [[4.0, 0.0], [0.0, 1.0]], [0.0, 3.0]))
+    10.0
+    """
+    leading(estimate.shape[:-1], truth.shape[:-1], "truth")
+    return unchecked(nis)(estimate - truth, cov)
+
+
+@door
+def nis(innovation: Annotated[Array, "... m"], cov: Annotated[Cov, "... m m"]) -> Array:
+    r"""Normalised innovation squared, (...): how far a reading is from its prediction.
+
+    :math:`\mathbf d^\top\mathbf S^{-1}\mathbf d`. Of an honest filter it is chi-square with m
+    degrees of freedom, so that ``nees_band(m, n)`` holds the average of n independent ones. Needs
+    no truth.
+
+    Parameters
+    ----------
+    innovation : array_like, (..., m)
+        Reading minus predicted reading; angles as the shorter way round.
+    cov : array_like, (..., m, m)
+        Covariance S of the innovation, HPHᵀ + R: the prediction's and the noise's. Positive
+        definite; leading axes broadcast.
+
+    Examples
+    --------
+    >>> float(nis([2.0, 3.0], [[4.0, 0.0], [0.0, 1.0]]))
+    10.0
+    """
+    leading(innovation.shape[:-1], cov.shape[:-2], "cov")
+    return quadratic_form(cholesky(cov), innovation)
+
+
+@door
+def ensemble_nees(ensemble: Ensemble, truth: Vector) -> Array:
+    r"""NEES of an ensemble, (...): its mean against the truth, in units of its sample covariance.
+
+    Parameters
+    ----------
+    ensemble : array_like, (..., N, d)
+        Members; the covariance has N - 1 in the denominator.
+    truth : array_like, (..., d)
+
+    Raises
+    ------
+    ValueError
+        If N <= d, where the sample covariance is singular, or if the members lie in a subspace.
+
+    Notes
+    -----
+    When truth and members come from one Gaussian, :math:`\epsilon/(1+1/N)` is Hotelling's T², so
+    the average is :math:`d\,(1+1/N)(N-1)/(N-d-2)` for N > d + 2, a little above d: by 4% for d = 6
+    and N = 200.
+
+    Examples
+    --------
+    >>> float(ensemble_nees([[0.0], [1.0], [2.0]], [3.0]))
+    4.0
+    """
+    n, d = ensemble.shape[-2:]
+    if n <= d:
+        raise ValueError(f"ensemble: needs more members than components ({d}), got {n}")
+    leading(ensemble.shape[:-2], truth.shape[:-1], "truth")
+    middle, cov = unchecked(mean)(ensemble), unchecked(sample_covariance)(ensemble)
+    # NEES does not depend on units: scaled to unit variances, rounding does not either, and the
+    # test for a subspace compares pure numbers.
+    scale = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    if not np.isfinite(scale).all():
+        raise ValueError("ensemble: needs members of finite variance, got infinity")
+    if (scale <= n * EPS * np.abs(middle)).any():
+        raise ValueError("ensemble: needs members that differ in every component")
+    correlation = cov / (scale[..., :, None] * scale[..., None, :])
+    if np.linalg.eigvalsh(correlation).min(initial=1.0) <= 10 * n * EPS:
+        raise ValueError("ensemble: needs members that span all components, got a subspace")
+    return quadratic_form(cholesky(correlation), (middle - truth) / scale)
+
+
+@door
+def nees_band(
+    dim: Count, count: Count, *, level: Annotated[float, Bounds(above=0, below=1)] = 0.95,
+    normalised: bool = False,
+) -> Interval:
+    r"""Where the average of independent NEES values of an honest filter falls.
+
+    The sum of `count` values is chi-square with ``count * dim`` degrees of freedom, so the average
+    lies between its quantiles divided by `count`. The average itself is not divided by `dim`: it is
+    near `dim`. With `normalised` everything is divided by `dim`, for NEES/d near 1.
+
+    Parameters
+    ----------
+    dim : int
+        Number d of components.
+    count : int
+        Number of *independent* values in the average: runs, not times of one run.
+    level : float
+        Probability of the band, in (0, 1); both tails are equal.
+    normalised : bool
+        Divide by `dim`.
+
+    Returns
+    -------
+    Interval
+        The expected average, the band, and the average's standard deviation.
+
+    Examples
+    --------
+    >>> print(nees_band(6, 100))
+    6 [5.34, 6.7]
+    >>> print(nees_band(6, 100, normalised=True))
+    1 [0.89, 1.12]
+    """
+    from scipy.stats import chi2
+
+    tail, total = (1 - level) / 2, count * dim
+    unit = total if normalised else count
+    low, high = (float(chi2.ppf(p, total)) / unit for p in (tail, 1 - tail))
+    # At tiny levels the band lies below the mean, because the chi-square's median does.
+    middle = float(min(max(total / unit, low), high))
+    return Interval(middle, low, high, float(np.sqrt(2 * total)) / unit)
+
+
+@door
+def crps(
+    ensemble: Members, truth: Vector, *, fair: bool = False,
+    weights: Annotated[Weights, "... N"] | None = None,
+) -> Array:
+    r"""Continuous ranked probability score (..., d) of an ensemble by component; smaller is better.
+
+    :math:`\operatorname{mean}_i|x_i-y|-\tfrac12\operatorname{mean}_{i,j}|x_i-x_j|`, the integral of
+    the squared difference between the members' distribution function and the truth's step. It
+    rewards a small error and a spread that fits, in the state's unit. O(N log N) by sorting.
+
+    Parameters
+    ----------
+    ensemble : array_like, (..., N, d)
+        Members.
+    truth : array_like, (..., d)
+    fair : bool
+        Average the pairs over i ≠ j, N (N - 1) of them: unbiased for the score of the distribution
+        that the members are drawn from. Needs N >= 2.
+    weights : array_like, (..., N), optional
+        Of the members, with sum one; equal by default. Not together with `fair`.
+
+    Notes
+    -----
+    T. Gneiting and A. E. Raftery, Journal of the American Statistical Association 102 (2007)
+    359-378, equation (21); C. A. T. Ferro, Quarterly Journal of the Royal Meteorological Society
+    140 (2014) 1917-1923, for the fair version.
+
+    Examples
+    --------
+    >>> crps([[0.0], [2.0]], [1.0])
+    array([0.5])
+    >>> crps([[0.0], [2.0]], [1.0], fair=True)
+    array([0.])
+    """
+    n = ensemble.shape[-2]
+    if fair and (n < 2 or weights is not None):
+        raise ValueError("fair: needs two members or more of equal weight, got others")
+    leading(ensemble.shape[:-2], truth.shape[:-1], "truth")
+    # Distances from the truth are as good as the members, and lose fewer digits far from zero.
+    gap = ensemble - truth[..., None, :]
+    if weights is not None:
+        return _weighted_crps(gap, weights)
+    gap = np.sort(gap, axis=-2)
+    rank = 2.0 * np.arange(1, n + 1) - n - 1
+    pairs = (rank[:, None] * gap).sum(axis=-2) / (n * (n - 1 if fair else n))
+    return np.asarray(np.abs(gap).mean(axis=-2) - pairs)
+
+
+def _weighted_crps(gap: Array, weights: Array) -> Array:
+    leading(gap.shape[:-2], weights.shape[:-1], "weights")
+    order = np.argsort(gap, axis=-2)
+    gap = np.take_along_axis(gap, order, axis=-2)
+    share = np.take_along_axis(np.broadcast_to(weights[..., None], gap.shape), order, axis=-2)
+    above = 2 * np.cumsum(share, axis=-2) - share - 1
+    return np.asarray((share * (np.abs(gap) - above * gap)).sum(axis=-2))
+
+
+@door
+def gaussian_crps(
+    mean: Annotated[Array, "..."], std: Annotated[Array, "...", Bounds(above=0)],
+    truth: Annotated[Array, "..."],
+) -> Array:
+    r"""Continuous ranked probability score of Gaussians, componentwise, (...).
+
+    :math:`\sigma\,[z(2\Phi(z)-1)+2\varphi(z)-1/\sqrt\pi]` with :math:`z=(y-\mu)/\sigma`.
+
+    Parameters
+    ----------
+    mean, truth : array_like, (...)
+    std : array_like, (...)
+        Standard deviations, positive. The three arrays broadcast.
+
+    Notes
+    -----
+    T. Gneiting and A. E. Raftery, Journal of the American Statistical Association 102 (2007)
+    359-378, section 4.2.
+
+    Examples
+    --------
+    >>> float(gaussian_crps(0.0, 1.0, 0.0).round(6))
+    0.233695
+    """
+    from scipy.special import ndtr
+
+    leading(leading(mean.shape, std.shape, "std"), truth.shape, "truth")
+    z = (truth - mean) / std
+    density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
+    return np.asarray(std * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi)))
+
+
+@door
+def log_score(estimate: Vector, cov: Cov, truth: Vector) -> Array:
+    r"""Minus the log-density of a Gaussian estimate at the truth, (...); smaller is better.
+
+    It rewards a small error and a covariance that fits, of all components together. The score of
+    an honest Gaussian is :math:`\tfrac12\log\det(2\pi e\mathbf P)` on average, and every other
+    covariance scores worse.
+
+    Parameters
+    ----------
+    estimate, truth : array_like, (..., d)
+        Leading axes broadcast.
+    cov : array_like, (..., d, d)
+        The estimate's covariance, positive definite.
+
+    Examples
+    --------
+    >>> float(log_score([0.0], [[1.0]], [1.0]).round(6))
+    1.418939
+    """
+    return -unchecked(log_density)(truth, estimate, cov)
