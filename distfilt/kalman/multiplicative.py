@@ -16,7 +16,8 @@ import numpy as np
 from ..doors import MISSING, Array, Count, Cov, Index, Record, Times, door, unchecked
 from ..gaussians.conditioning import analysis, left_out
 from ..linalg import central
-from ..models import Model, left_directions, turn_between, turned
+from ..models import Model
+from ..models.rotations import left_directions, turn_between, turned
 from ..sensors import Sensor, stack
 from .linear import GaussianRun, common_runs, flat_runs, grid, log_likelihood
 
@@ -76,7 +77,7 @@ def quaternion_chart(dim: Count, first: Index) -> Chart:
     """States with a quaternion among their components, and the rest as it is.
 
     The error's components are the state's, with the rotation vector of
-    :func:`distfilt.models.turned` in the quaternion's place: one fewer.
+    :func:`distfilt.models.rotations.turned` in the quaternion's place: one fewer.
 
     Parameters
     ----------
@@ -96,19 +97,19 @@ def quaternion_chart(dim: Count, first: Index) -> Chart:
         raise ValueError(f"first: needs four components from there on, got {first} of {dim}")
 
     def retract(x: Array, e: Array) -> Array:
-        turn = turned(x[..., at : at + 4], e[..., at : at + 3])
+        turn = unchecked(turned)(x[..., at : at + 4], e[..., at : at + 3])
         before, behind = x[..., :at] + e[..., :at], x[..., at + 4 :] + e[..., at + 3 :]
         return np.concatenate([before, turn, behind], axis=-1)
 
     def local(x: Array, other: Array) -> Array:
-        turn = turn_between(x[..., at : at + 4], other[..., at : at + 4])
+        turn = unchecked(turn_between)(x[..., at : at + 4], other[..., at : at + 4])
         gap = other - x
         return np.concatenate([gap[..., :at], turn, gap[..., at + 4 :]], axis=-1)
 
     def directions(x: Array) -> Array:
         out = np.zeros((*x.shape, d - 1))
         out[..., :at, :at] = np.eye(at)
-        out[..., at : at + 4, at : at + 3] = left_directions(x[..., at : at + 4])
+        out[..., at : at + 4, at : at + 3] = unchecked(left_directions)(x[..., at : at + 4])
         out[..., at + 4 :, at + 3 :] = np.eye(d - at - 4)
         return out
 

@@ -17,7 +17,7 @@ from typing import Annotated, Any, TypeVar, cast
 import numpy as np
 
 from ..doors import Array, Cov, Rng, door, unchecked
-from ..linalg import _cholesky as cholesky
+from ..linalg import cholesky
 
 __all__ = ["Update", "around", "perturbed", "stackable", "update", "with_missing"]
 

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.fft import dct
 from scipy.linalg.lapack import dposv
 
-from ..doors import Array, Rng
-from ..ensembles import _mean, exact_noise
+from ..doors import Array, Rng, unchecked
+from ..ensembles import exact_noise, mean
 from .door import perturbed, update
 
 __all__ = ["exact_draws", "known_noise", "sampled_noise", "square_root"]
@@ -26,7 +26,7 @@ __all__ = ["exact_draws", "known_noise", "sampled_noise", "square_root"]
 
 def _centred(members: Array) -> tuple[Array, Array]:
     """Mean (..., 1, d) and anomalies of members (..., N, d)."""
-    centre = _mean(members)[..., None, :]
+    centre = unchecked(mean)(members)[..., None, :]
     return centre, members - centre
 
 

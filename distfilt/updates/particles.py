@@ -8,10 +8,8 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..doors import Array, Bounds, Mask, Rng, Semidefinite, Weights, array, door
-from ..linalg import _cholesky as cholesky
-from ..linalg import _factor as factor
-from ..linalg import _solve_lower as solve_lower
+from ..doors import Array, Bounds, Mask, Rng, Semidefinite, Weights, array, door, unchecked
+from ..linalg import cholesky, factor, solve_lower
 
 __all__ = ["ParticleCollapse", "Resampling", "effective_size", "jitter", "resampled"]
 
@@ -225,7 +223,7 @@ def copies(picked: Indices) -> Mask:
 
 def jittered(x: Array, cov: Array, h: float, drawn: Array, copied: Mask | None = None) -> Array:
     """As :func:`jitter`, with standard normal draws."""
-    moved = drawn @ np.swapaxes(factor(cov), -1, -2)
+    moved = drawn @ np.swapaxes(unchecked(factor)(cov), -1, -2)
     if copied is not None:
         return np.asarray(np.where(copied[..., None], x + h * moved, x))
     centre = x.mean(axis=-2, keepdims=True)
