@@ -13,7 +13,7 @@ import numpy as np
 
 from ..doors import Array, Bounds, Count, Mask, NonNegative, definite, door, unchecked
 from ..ensembles import mean, sample_covariance
-from ..gaussians import _intersection_weights, _recolour
+from ..gaussians import intersection_weights, recolour
 from ..linalg import cholesky, solve_lower, symmetrise
 from .channel import Channel
 from .consensus import fuses
@@ -286,7 +286,7 @@ def intersection(
     belief = unchecked(mean)(x), unchecked(sample_covariance)(x)
     definite(belief[1], "ensembles")
     fused = unchecked(covariance_intersection)(belief, channel, rule=rule, rounds=rounds)
-    return _recolour(x, *fused) * size
+    return unchecked(recolour)(x, *fused) * size
 
 
 @dataclass(eq=False)
@@ -359,7 +359,7 @@ def _by_rule(heard: _Heard, rule: str) -> Pair:
     own, links = np.ones(heard.means.shape[:2]), heard.arrived.astype(np.float64)
     if rule.startswith("min"):
         for agents, at, covs, here in heard.groups():
-            omega = _intersection_weights(covs, rule, here)
+            omega = unchecked(intersection_weights)(covs, rule=rule, here=here)
             own[:, agents], links[:, at] = omega[..., 0], omega[..., 1:]
         return own, links
     if rule != "equal":
@@ -377,7 +377,7 @@ def _size_weights(covs: Array, rule: str) -> Array:
     """
     unit = np.broadcast_to(np.eye(covs.shape[-1]), covs.shape)
     both = np.stack([covs, unit], axis=-3)
-    share = _intersection_weights(both, rule, np.ones(both.shape[:-2], dtype=bool))
+    share = unchecked(intersection_weights)(both, rule=rule)
     return np.asarray(share[..., 0] / share[..., 1])
 
 
