@@ -12,19 +12,15 @@ from ..network import Channel, fuses
 from .fusion import Exponents, Others, PartialFusion, Rule, Terms
 from .gaussian import GaussianMixture, log_sum
 from .mixands import joined, regression
+from .reduction import runnalls
 
 __all__ = ["average", "fuse", "fuse_in_turn", "fuse_moments", "target_fusion"]
 
 
 @door
 def fuse(
-    own: GaussianMixture,
-    heard: Others,
-    *,
-    omega: Exponents = "equal",
-    terms: Terms = "matched",
-    rule: Rule = "C3",
-    size: Count | None = None,
+    own: GaussianMixture, heard: Others, *, omega: Exponents = "equal", terms: Terms = "matched",
+    rule: Rule = "C3", size: Count | None = None,
 ) -> GaussianMixture:
     """Fuse a belief about [target; ego] with others' beliefs about the target.
 
@@ -46,7 +42,10 @@ def fuse(
     [[[2.0, 1.0], [1.0, 1.0]]]
     """
     exact = PartialFusion(own, heard, omega=omega)
-    return unchecked(exact.approximation)(terms=terms, rule=rule, size=size)
+    if exact.exponents[0] == 1:
+        return own
+    fused = unchecked(exact.weigh)(unchecked(exact.shapes)(terms=terms), rule=rule)
+    return fused if size is None else unchecked(runnalls)(fused, size)
 
 
 @door
@@ -78,10 +77,7 @@ def fuse_moments(
 
 @door
 def fuse_in_turn(
-    own: GaussianMixture,
-    heard: Others,
-    *,
-    omega: Share | Literal["equal"] = "equal",
+    own: GaussianMixture, heard: Others, *, omega: Share | Literal["equal"] = "equal",
     pair: Callable[..., GaussianMixture] = fuse,
 ) -> GaussianMixture:
     """Fuse what is heard one belief after another: fewer mixands at a time than in one pass.
@@ -113,9 +109,7 @@ def fuse_in_turn(
 
 
 @door
-def average(
-    own: GaussianMixture, heard: GaussianMixture, *, omega: Share = 0.5
-) -> GaussianMixture:
+def average(own: GaussianMixture, heard: GaussianMixture, *, omega: Share = 0.5) -> GaussianMixture:
     r"""Arithmetic average of the target beliefs, with the own conditional belief about the rest.
 
     :math:`p(\mathbf e|\mathbf t)\,[\omega\,p(\mathbf t)+(1-\omega)\,p_b(\mathbf t)]`. The weights
@@ -156,10 +150,7 @@ def average(
 @fuses("mixtures")
 @door
 def target_fusion(
-    beliefs: Sequence[GaussianMixture],
-    channel: Channel,
-    *,
-    target_dim: Count,
+    beliefs: Sequence[GaussianMixture], channel: Channel, *, target_dim: Count,
     fuse: Callable[..., GaussianMixture] = fuse,
 ) -> tuple[GaussianMixture, ...]:
     """Every agent sends what it believes of the target, and fuses its belief with what arrives.
@@ -197,24 +188,12 @@ def target_fusion(
     [[[1.5]], [[1.5]]]
     """
     said = [belief.marginal(range(target_dim)).pack() for belief in beliefs]
-    unpack = unchecked(GaussianMixture.unpack)
-    inbox = [[unpack(part) for part in told.values()] for told in channel.exchange(said)]
-    return tuple(
-        _fused(agent, own, heard, fuse) if heard else own
-        for agent, (own, heard) in enumerate(zip(beliefs, inbox, strict=True))
-    )
-
-
-def _fused(
-    agent: int,
-    own: GaussianMixture,
-    heard: Sequence[GaussianMixture],
-    fuse: Callable[..., GaussianMixture],
-) -> GaussianMixture:
-    """One agent's belief after what it heard; where it collapses, the error names the agent."""
-    try:
-        fused = fuse(own, heard)
-        fused.factors  # noqa: B018
-    except np.linalg.LinAlgError as error:
-        raise np.linalg.LinAlgError(f"agent {agent}: {error}") from error
-    return fused
+    unpack, out = unchecked(GaussianMixture.unpack), list(beliefs)
+    for agent, told in enumerate(channel.exchange(said)):
+        try:
+            if told:
+                out[agent] = fuse(out[agent], [unpack(part) for part in told.values()])
+            out[agent].factors  # noqa: B018
+        except np.linalg.LinAlgError as error:
+            raise np.linalg.LinAlgError(f"agent {agent}: {error}") from error
+    return tuple(out)

@@ -32,11 +32,8 @@ _NOTHING = 1e-9
 
 @door
 def moved(
-    mixture: GaussianMixture,
-    function: Callable[[Array], Array],
-    noise_factor: Annotated[Array, "m k"],
-    *,
-    rule: PointRule = "dd2",
+    mixture: GaussianMixture, function: Callable[[Array], Array],
+    noise_factor: Annotated[Array, "m k"], *, rule: PointRule = "dd2",
 ) -> GaussianMixture:
     """The mixture after a function and added noise, mixand by mixand.
 
@@ -66,13 +63,9 @@ def moved(
 
 @door
 def conditioned(
-    mixture: GaussianMixture,
-    observed: Annotated[Array, "m", MISSING],
-    function: Callable[[Array], Array],
-    noise: Annotated[Cov, "m m"],
-    *,
-    residual: Callable[[Array, Array], Array] = np.subtract,
-    rule: PointRule = "dd2",
+    mixture: GaussianMixture, observed: Annotated[Array, "m", MISSING],
+    function: Callable[[Array], Array], noise: Annotated[Cov, "m m"], *,
+    residual: Callable[[Array, Array], Array] = np.subtract, rule: PointRule = "dd2",
 ) -> GaussianMixture:
     """Condition a mixture on a reading: its mixands, and their weights by how likely it was.
 
@@ -126,15 +119,10 @@ def conditioned(
 
 @door
 def within_gate(
-    mixture: GaussianMixture,
-    observed: Annotated[Array, "m", MISSING],
-    function: Callable[[Array], Array],
-    noise: Annotated[Cov, "m m"],
-    *,
-    gate: Positive,
+    mixture: GaussianMixture, observed: Annotated[Array, "m", MISSING],
+    function: Callable[[Array], Array], noise: Annotated[Cov, "m m"], *, gate: Positive,
     readings: Sequence[slice] = (slice(None),),
-    residual: Callable[[Array, Array], Array] = np.subtract,
-    rule: PointRule = "dd2",
+    residual: Callable[[Array, Array], Array] = np.subtract, rule: PointRule = "dd2",
 ) -> Array:
     """What is left of a reading after a gate: NaN takes the place of what no mixand expects.
 

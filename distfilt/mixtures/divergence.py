@@ -76,12 +76,8 @@ class Divergence(Record):
 
 @door
 def jeffreys_of_many(
-    log_p: Callable[[Array], Array],
-    log_qs: Sequence[Callable[[Array], Array]],
-    lower: Annotated[Array, "d"],
-    upper: Annotated[Array, "d"],
-    *,
-    nodes: Several = 50,
+    log_p: Callable[[Array], Array], log_qs: Sequence[Callable[[Array], Array]],
+    lower: Annotated[Array, "d"], upper: Annotated[Array, "d"], *, nodes: Several = 50,
 ) -> list[Divergence]:
     r"""Jeffreys' divergences of one density from several, by the trapezoid rule on a box.
 
@@ -140,12 +136,8 @@ def _tensor_grid(low: Array, high: Array, nodes: int) -> tuple[Array, Array]:
 
 @door
 def jeffreys_by_sampling(
-    log_p: Callable[[Array], Array],
-    log_q: Callable[[Array], Array],
-    proposal: GaussianMixture,
-    *,
-    members: Several,
-    rng: Rng,
+    log_p: Callable[[Array], Array], log_q: Callable[[Array], Array], proposal: GaussianMixture, *,
+    members: Several, rng: Rng,
 ) -> Divergence:
     r"""Jeffreys' divergence by importance sampling, with its standard error.
 

@@ -24,7 +24,6 @@ from ..gaussians.points import unscented_points
 from ..linalg import SolverError
 from .gaussian import GaussianMixture, log_sum
 from .mixands import Shapes, conditional_shapes, literal_shapes, nonnegative_least_squares
-from .reduction import runnalls
 
 __all__ = ["Exponents", "Others", "PartialFusion", "Rule", "Terms"]
 
@@ -55,7 +54,8 @@ class PartialFusion(Record):
     --------
     >>> own = GaussianMixture.gaussian([0.0, 0.0], [[2.0, 1.0], [1.0, 1.0]])
     >>> other = GaussianMixture.gaussian([3.0], [[1.0]])
-    >>> fused = PartialFusion(own, other, omega=0.5).approximation()
+    >>> exact = PartialFusion(own, other)
+    >>> fused = exact.weigh(exact.shapes())
     >>> fused.means.round(4), fused.covs[0, 0, 0].round(4)
     (array([[2., 1.]]), np.float64(1.3333))
     """
@@ -111,15 +111,20 @@ class PartialFusion(Record):
         ----------
         t : array_like, (..., n_t)
         """
+        return self._with_update(np.zeros(t.shape[:-1]), t, "t")
+
+    def _with_update(self, logs: Array, t: Array, name: str) -> Array:
+        """Logarithms of densities and that of the update factor, added."""
         w = self.exponents
-        out = np.zeros(t.shape[:-1])
-        with np.errstate(invalid="ignore"):  # `_numbers` refuses what is none
+        with np.errstate(invalid="ignore"):
             if w[0] != 1:
-                out = (w[0] - 1) * unchecked(self.target.log_density)(t)
+                logs = logs + (w[0] - 1) * unchecked(self.target.log_density)(t)
             for weight, other in zip(w[1:], self.others, strict=True):
                 if weight:
-                    out = out + weight * unchecked(other.log_density)(t)
-        return _numbers(out, "t")
+                    logs = logs + weight * unchecked(other.log_density)(t)
+        if np.isnan(logs).any():  # one density is divided by another, and both are zero
+            raise ValueError(f"{name}: needs points whose density is a number, got one too far out")
+        return logs
 
     @door
     def log_value(self, x: Annotated[Array, "... self.own.dim"]) -> Array:
@@ -129,25 +134,18 @@ class PartialFusion(Record):
         ----------
         x : array_like, (..., d)
         """
-        update = unchecked(self.log_update)(x[..., : self.target_dim])
-        with np.errstate(invalid="ignore"):
-            return _numbers(unchecked(self.own.log_density)(x) + update, "x")
+        logs = unchecked(self.own.log_density)(x)
+        return self._with_update(logs, x[..., : self.target_dim], "x")
 
     @door
     def log_target(self, t: Annotated[Array, "... self.target_dim"]) -> Array:
         """Logarithm of the fused target marginal, not normalised; it needs no ego state."""
-        update = unchecked(self.log_update)(t)
-        with np.errstate(invalid="ignore"):
-            return _numbers(unchecked(self.target.log_density)(t) + update, "t")
+        return self._with_update(unchecked(self.target.log_density)(t), t, "t")
 
     @door
     def shapes(
-        self,
-        *,
-        terms: Terms = "matched",
-        form: Literal["conditional", "literal"] = "conditional",
-        marginal: GaussianMixture | None = None,
-        received: Sequence[GaussianMixture] | None = None,
+        self, *, terms: Terms = "matched", form: Literal["conditional", "literal"] = "conditional",
+        marginal: GaussianMixture | None = None, received: Sequence[GaussianMixture] | None = None,
     ) -> Shapes:
         """Means and covariances of the fused mixands, (22)-(28), without weights.
 
@@ -228,23 +226,6 @@ class PartialFusion(Record):
         white = np.linalg.solve(own.factors[q], (shapes.means - own.means[q])[..., None])[..., 0]
         logs = (own.log_weights + own.log_peaks)[q] - 0.5 * (white**2).sum(axis=-1)
         return np.asarray(logs + unchecked(self.log_update)(shapes.means[:, : self.target_dim]))
-
-    @door
-    def approximation(
-        self, *, terms: Terms = "matched", rule: Rule = "C3", size: Count | None = None
-    ) -> GaussianMixture:
-        """The fused mixture: shapes, weights, and Runnalls' reduction to `size` mixands."""
-        if self.exponents[0] == 1:
-            return self.own
-        fused = unchecked(self.weigh)(unchecked(self.shapes)(terms=terms), rule=rule)
-        return fused if size is None else unchecked(runnalls)(fused, size)
-
-
-def _numbers(logs: Array, name: str) -> Array:
-    """Refuse points so far out that one density is divided by another and both are zero."""
-    if np.isnan(logs).any():
-        raise ValueError(f"{name}: needs points whose densities are numbers, got one too far out")
-    return logs
 
 
 def _weighed(mixture: GaussianMixture, logs: Array) -> GaussianMixture:

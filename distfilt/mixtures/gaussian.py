@@ -1,8 +1,8 @@
-"""Gaussian mixtures: densities, marginals, conditionals, moments, draws, powers."""
+"""Gaussian mixtures: densities, marginals, moments, draws, payloads."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any, Self
@@ -12,7 +12,7 @@ import numpy as np
 from ..doors import Array, Count, Cov, Places, Record, Rng, definite, door, summing_to_one
 from ..linalg import symmetrise
 
-__all__ = ["ExponentialQuadratics", "GaussianMixture"]
+__all__ = ["GaussianMixture"]
 
 _LOG_2PI = float(np.log(2 * np.pi))
 _CHUNK = 60_000
@@ -47,7 +47,7 @@ class GaussianMixture(Record):
     --------
     >>> two = GaussianMixture([0.5, 0.5], [[-1.0], [1.0]], [[[1.0]], [[1.0]]])
     >>> two
-    GaussianMixture(2 mixands of 1 component)
+    GaussianMixture(size=2, dim=1)
     >>> two.cov
     array([[2.]])
     """
@@ -58,9 +58,7 @@ class GaussianMixture(Record):
 
     @classmethod
     @door
-    def gaussian(
-        cls, mean: Annotated[Array, "d"], cov: Annotated[Cov, "d d"]
-    ) -> GaussianMixture:
+    def gaussian(cls, mean: Annotated[Array, "d"], cov: Annotated[Cov, "d d"]) -> GaussianMixture:
         """A single Gaussian as a mixture of one mixand.
 
         Parameters
@@ -71,7 +69,7 @@ class GaussianMixture(Record):
         Examples
         --------
         >>> GaussianMixture.gaussian([0.0, 1.0], np.eye(2))
-        GaussianMixture(1 mixand of 2 components)
+        GaussianMixture(size=1, dim=2)
         """
         return cls(np.ones(1), mean[None], cov[None])
 
@@ -84,11 +82,7 @@ class GaussianMixture(Record):
         return out
 
     def __repr__(self) -> str:
-        mixands, components = (
-            f"{n} {word}{'s' * (n > 1)}"
-            for n, word in ((self.size, "mixand"), (self.dim, "component"))
-        )
-        return f"GaussianMixture({mixands} of {components})"
+        return f"GaussianMixture(size={self.size}, dim={self.dim})"
 
     @property
     def size(self) -> int:
@@ -134,11 +128,7 @@ class GaussianMixture(Record):
         ----------
         x : array_like, (..., d)
         """
-        flat = x.reshape(-1, self.dim)
-        out = np.empty((flat.shape[0], self.size))
-        for rows in self._blocks(flat):
-            out[rows] = self.log_peaks - 0.5 * self._distances(flat[rows])
-        return out.reshape(*x.shape[:-1], self.size)
+        return self._in_blocks(x, (self.size,), lambda logs: logs)
 
     @door
     def log_density(self, x: Annotated[Array, "... self.dim"]) -> Array:
@@ -154,16 +144,18 @@ class GaussianMixture(Record):
         >>> one.log_density([[0.0], [60.0]]).round(2).tolist()
         [-0.92, -1800.92]
         """
-        flat = x.reshape(-1, self.dim)
-        out = np.empty(flat.shape[0])
-        constant = self.log_weights + self.log_peaks
-        for rows in self._blocks(flat):
-            out[rows] = log_sum(constant - 0.5 * self._distances(flat[rows]))
-        return out.reshape(x.shape[:-1])
+        return self._in_blocks(x, (), lambda logs: log_sum(self.log_weights + logs))
 
-    def _blocks(self, flat: Array) -> Iterator[slice]:
+    def _in_blocks(self, x: Array, shape: tuple[int, ...], of: Callable[[Array], Array]) -> Array:
+        """What is made of the mixands' log densities (n, L) at points, some points at a time."""
+        flat, (centre, white, at) = x.reshape(-1, self.dim), self._whitening
+        out = np.empty((len(flat), *shape))
         step = max(1, _CHUNK // self.means.size)
-        return (slice(start, start + step) for start in range(0, len(flat), step))
+        for start in range(0, len(flat), step):
+            rows = slice(start, start + step)
+            gap = ((flat[rows] - centre) @ white).reshape(-1, *at.shape) - at
+            out[rows] = of(self.log_peaks - 0.5 * np.einsum("nld,nld->nl", gap, gap))
+        return out.reshape((*x.shape[:-1], *shape))
 
     @cached_property
     def _whitening(self) -> tuple[Array, Array, Array]:
@@ -172,12 +164,6 @@ class GaussianMixture(Record):
         white = np.linalg.solve(self.factors, np.broadcast_to(np.eye(self.dim), self.covs.shape))
         at = (white @ (self.means - centre)[..., None])[..., 0]
         return centre, np.array(white.reshape(-1, self.dim).T), at
-
-    def _distances(self, x: Array) -> Array:
-        """Squared Mahalanobis distances of points (n, d) to the mixands, (n, L)."""
-        centre, white, at = self._whitening
-        gap = ((x - centre) @ white).reshape(x.shape[0], *at.shape) - at
-        return np.asarray(np.einsum("nld,nld->nl", gap, gap))
 
     @door
     def marginal(self, indices: Places) -> GaussianMixture:
@@ -231,13 +217,6 @@ class GaussianMixture(Record):
         noise = rng.standard_normal((size, self.dim))
         return np.asarray(self.means[which] + (self.factors[which] @ noise[..., None])[..., 0])
 
-    def quadratics(self) -> ExponentialQuadratics:
-        r"""The mixture as a sum of exponential quadratics, equation (18)."""
-        precision = inverse(self.factors)
-        vector = (precision @ self.means[..., None])[..., 0]
-        top = self.log_weights + self.log_peaks - 0.5 * np.einsum("li,li->l", vector, self.means)
-        return ExponentialQuadratics.unchecked(precision, vector, top)
-
     def pack(self) -> tuple[Array, Array, Array]:
         """The mixture as a channel's payload: weights, means, and upper triangles (L, d(d+1)/2)."""
         upper = np.triu_indices(self.dim)
@@ -265,63 +244,6 @@ class GaussianMixture(Record):
         covs = np.empty((len(means), d, d))
         covs[:, rows, columns] = covs[:, columns, rows] = triangles
         return cls.unchecked(weights, means, covs)
-
-
-@dataclass(frozen=True, eq=False)
-class ExponentialQuadratics(Record):
-    r"""A sum :math:`\sum_\ell\exp(c_\ell+\boldsymbol\eta_\ell^\top\mathbf x
-    -\tfrac12\mathbf x^\top\boldsymbol\Lambda_\ell\mathbf x)`.
-
-    Equation (16) in information form: a precision may be indefinite or singular, so that powers
-    of Gaussians and Gaussians that cancel have a representation.
-
-    Parameters
-    ----------
-    precisions : array_like, (L, d, d)
-        Symmetric, of any sign.
-    vectors : array_like, (L, d)
-    log_coefficients : array_like, (L,)
-
-    Examples
-    --------
-    >>> one = ExponentialQuadratics([[[0.5]]], [[1.5]], [-1.0])
-    >>> float(one.log_value([2.0]))
-    1.0
-    """
-
-    precisions: Annotated[Array, "L d d"]
-    vectors: Annotated[Array, "L d"]
-    log_coefficients: Annotated[Array, "L"]
-
-    @door
-    def log_value(self, x: Annotated[Array, "... d"]) -> Array:
-        """Logarithm of the sum, (...).
-
-        Parameters
-        ----------
-        x : array_like, (..., d)
-        """
-        square = np.einsum("...i,lij,...j->...l", x, self.precisions, x)
-        return log_sum(self.log_coefficients + x @ self.vectors.T - 0.5 * square)
-
-    @door
-    def power(self, exponent: float) -> ExponentialQuadratics:
-        r"""Each term to a power: the first-order power approximation (19)-(20).
-
-        Exact for one term. For more it is the sum of powers where the power of the sum is meant.
-
-        Parameters
-        ----------
-        exponent : float
-            May be negative; not zero where a term is missing.
-        """
-        if exponent <= 0 and np.isinf(self.log_coefficients).any():
-            raise ValueError(
-                f"exponent: needs a positive one for terms of weight 0, got {exponent:g}"
-            )
-        return self.unchecked(
-            exponent * self.precisions, exponent * self.vectors, exponent * self.log_coefficients
-        )
 
 
 def _collapsed(covs: Array) -> str:

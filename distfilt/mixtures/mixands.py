@@ -182,8 +182,7 @@ def _factored(matrices: Array) -> tuple[Array, Mask]:
 @door
 def tikhonov(
     largest: Annotated[float, Bounds(at_least=0, at_most=1e150)],
-    smallest: Annotated[float, Bounds(at_least=0)],
-    *,
+    smallest: Annotated[float, Bounds(at_least=0)], *,
     condition: Annotated[float, Bounds(above=1, at_most=1e150)] = _CONDITION,
 ) -> float:
     r"""The smallest factor that brings a matrix's condition number down to `condition`, (66).
@@ -208,8 +207,6 @@ def tikhonov(
     >>> tikhonov(1.0, 0.5, condition=10.0)
     0.0
     """
-    if smallest > largest:
-        raise ValueError(f"smallest: needs a number up to largest, got {smallest:g}")
     gap = largest**2 - (condition * smallest) ** 2
     return float(np.sqrt(max(gap, 0.0) / (condition**2 - 1)))
 
@@ -217,8 +214,7 @@ def tikhonov(
 @door
 def nonnegative_least_squares(
     matrix: Annotated[Array, "n s", Bounds(at_least=-1e150, at_most=1e150)],
-    right: Annotated[Array, "n"],
-    *,
+    right: Annotated[Array, "n"], *,
     condition: Annotated[float, Bounds(above=1, at_most=1e150)] = _CONDITION,
 ) -> Array:
     """Nonnegative weights that solve ``matrix @ w = right`` best, regularised by (60) and (66).

@@ -136,11 +136,8 @@ def cross_relevance(mixture: GaussianMixture, other: GaussianMixture) -> Array:
 
 @door
 def kept_by_relevance(
-    mixture: GaussianMixture,
-    other: GaussianMixture,
-    *,
-    threshold: Annotated[float, Bounds(above=1)],
-    gate: NonNegative = 0.5,
+    mixture: GaussianMixture, other: GaussianMixture, *,
+    threshold: Annotated[float, Bounds(above=1)], gate: NonNegative = 0.5,
     floor: NonNegative = 1e-4,
 ) -> GaussianMixture:
     r"""Merge into one the mixands that overlap with none of another's: the KLD rule (40)-(41).
@@ -178,9 +175,7 @@ def kept_by_relevance(
 
 @door
 def pivoted_qr(
-    shapes: Shapes,
-    *,
-    size: Count | None = None,
+    shapes: Shapes, *, size: Count | None = None,
     tolerance: Annotated[float, Bounds(above=0, below=1)] | None = None,
     rest: Literal["merge", "drop"] = "merge",
 ) -> Shapes:
@@ -209,8 +204,8 @@ def pivoted_qr(
     logs = unchecked(mixture.component_log_densities)(shapes.means) - mixture.log_peaks
     upper, order = qr(np.exp(logs), mode="r", pivoting=True)
     pivots = np.abs(np.diagonal(upper))
-    kept = int((pivots >= (tolerance or 0.0) * pivots[0]).sum()) if size is None else size
-    kept = min(kept, shapes.size)
+    kept = int((pivots >= (tolerance or 0.0) * pivots[0]).sum())
+    kept = kept if size is None else min(size, shapes.size)
     if size is not None and rest == "merge" and 1 < kept < shapes.size:
         kept -= 1
     select = unchecked(shapes.select)
@@ -243,9 +238,7 @@ def _whitened(mixture: GaussianMixture) -> tuple[Array, Array, Array, Array]:
     )
 
 
-def _costs(
-    w: Array, m: Array, p: Array, dets: Array, i: Any, others: NDArray[np.intp]
-) -> Array:
+def _costs(w: Array, m: Array, p: Array, dets: Array, i: Any, others: NDArray[np.intp]) -> Array:
     """Runnalls' bound of mixand i with others; a pair without weight costs nothing."""
     total = w[i] + w[others]
     a = np.divide(w[i], total, out=np.full(total.shape, 0.5), where=total > 0)
@@ -256,15 +249,11 @@ def _costs(
     return np.asarray(np.where(others == i, 0.0, bound))
 
 
+@cache
 def _merging(engine: Engine) -> Callable[..., Mask]:
     """What merges; "auto" takes numba where it is installed."""
     if engine == "numpy" or (engine == "auto" and importlib.util.find_spec("numba") is None):
         return _merged
-    return _compiled()
-
-
-@cache
-def _compiled() -> Callable[..., Mask]:
     compiled = needed("numba", "speed").njit(cache=True)
     # The same function, with the other way to compute a row: numba keeps it between processes
     # only if that is a global name.
@@ -306,9 +295,11 @@ def _merged(w: Any, m: Any, p: Any, size: Any) -> Any:
     table, best, nearest = np.full((n, n), np.inf), np.full(n, np.inf), np.zeros(n, np.int64)
     for k in range(n - 1):
         table[k, k + 1 :] = _costs(w, m, p, dets, k, every[k + 1 :])
-        nearest[k] = np.argmin(table[k])
-        best[k] = table[k, nearest[k]]
+    searched = every[:-1]
     for _ in range(n - size):
+        for k in searched:
+            nearest[k] = np.argmin(table[k])
+            best[k] = table[k, nearest[k]]
         # The first of the pairs that cost the same, so that rounding does not choose.
         limit = best.min() + 1e-12 + 1e-9 * abs(best.min())
         i = np.argmax(best <= limit)
@@ -319,8 +310,7 @@ def _merged(w: Any, m: Any, p: Any, size: Any) -> Any:
         p[i] = a * p[i] + (1 - a) * p[j] + a * (1 - a) * np.outer(gap, gap)
         m[i] = a * m[i] + (1 - a) * m[j]
         w[i], w[j], alive[j], best[j] = total, 0.0, False, np.inf
-        table[j, :] = np.inf
-        table[:, j] = np.inf
+        table[j, :] = table[:, j] = np.inf
         dets[i] = np.linalg.slogdet(p[i])[1]
         others = every[alive & (every != i)]
         row = _costs(w, m, p, dets, i, others)
@@ -328,12 +318,9 @@ def _merged(w: Any, m: Any, p: Any, size: Any) -> Any:
         table[others[below], i] = row[below]
         table[i, others[~below]] = row[~below]
         # Only rows that lost their neighbour, and the merged one, are searched again.
-        for lost in np.flatnonzero(alive & ((nearest == i) | (nearest == j) | (every == i))):
-            nearest[lost] = np.argmin(table[lost])
-            best[lost] = table[lost, nearest[lost]]
-        closer = table[:, i] < best
-        nearest = np.where(closer, i, nearest)
-        best = np.where(closer, table[:, i], best)
+        searched = np.flatnonzero(alive & ((nearest == i) | (nearest == j) | (every == i)))
+        nearest = np.where(table[:, i] < best, i, nearest)
+        best = np.minimum(table[:, i], best)
     return alive
 
 

@@ -69,9 +69,7 @@ def _library(std: float) -> tuple[Array, Array]:
 
 @door
 def stretching(
-    factors: Annotated[Array, "L d d"],
-    jacobians: Annotated[Array, "L m d"],
-    *,
+    factors: Annotated[Array, "L d d"], jacobians: Annotated[Array, "L m d"], *,
     scale: Annotated[Array, "m"] | None = None,
 ) -> tuple[Array, Array]:
     r"""How far a linearised map takes each mixand, and from where: first-order stretching.
@@ -114,11 +112,8 @@ def stretching(
 
 @door
 def split(
-    mixture: GaussianMixture,
-    which: Annotated[NDArray[np.intp], "K", Bounds(at_least=0)],
-    directions: Annotated[Array, "K mixture.dim"],
-    *,
-    std: Fraction = 0.7,
+    mixture: GaussianMixture, which: Annotated[NDArray[np.intp], "K", Bounds(at_least=0)],
+    directions: Annotated[Array, "K mixture.dim"], *, std: Fraction = 0.7,
 ) -> GaussianMixture:
     r"""Replace some mixands by three along a direction, keeping their mean and covariance.
 
@@ -162,11 +157,7 @@ def split(
 
 @door
 def split_stretched(
-    mixture: GaussianMixture,
-    jacobian: Callable[[Array], Array],
-    *,
-    most: Count,
-    stretch: Positive,
+    mixture: GaussianMixture, jacobian: Callable[[Array], Array], *, most: Count, stretch: Positive,
     scale: Annotated[Array, "m"] | None = None,
 ) -> GaussianMixture:
     """Split the mixands that a map stretches most in three, up to three times over.
@@ -207,13 +198,8 @@ def split_stretched(
 
 @door
 def arc(
-    mixands: Annotated[int, Bounds(at_least=2)],
-    agent: Annotated[Array, "2"],
-    *,
-    angle_std: Positive,
-    range_std: Positive,
-    ego_std: Positive,
-    width: Positive = 0.31,
+    mixands: Annotated[int, Bounds(at_least=2)], agent: Annotated[Array, "2"], *,
+    angle_std: Positive, range_std: Positive, ego_std: Positive, width: Positive = 0.31,
     span: Positive = 1.46,
 ) -> GaussianMixture:
     r"""What knows a distance well and a bearing badly: a belief about [target; ego], bent.

@@ -19,10 +19,10 @@ from distfilt.mixtures import (
     GaussianMixture,
     PartialFusion,
     kept_by_relevance,
+    moved,
     runnalls,
     split,
     two_stage,
-    unscented,
 )
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "book" / "studies"))
@@ -143,13 +143,13 @@ def fusion() -> list[Row]:
         ):
             took = timed(lambda f=f, o=options: f.weigh(f.shapes(**o), rule="C2"), 1)
             rows.append(row(f"fuse, {name}", 12, size, took.cpu))
-        least = [runnalls(m, min(6, size)) for m in (f.target, f.heard[0])]
+        least = [runnalls(m, min(6, size)) for m in (f.target, f.others[0])]
         took = timed(lambda f=f, r=least: f.weigh(
             f.shapes(terms="all", marginal=r[0], received=[r[1]]), rule="C2"), 3)
         rows.append(row("fuse, marginals reduced to 6", 12, size, took.cpu))
         took = timed(lambda f=f, r=least: f.weigh(f.shapes(received=[r[1]]), rule="C3"), 3)
         rows.append(row("fuse, matched, heard reduced to 6, C3", 12, size, took.cpu))
-        took = timed(lambda f=f: kept_by_relevance(f.target, f.heard[0], threshold=40.0), 3)
+        took = timed(lambda f=f: kept_by_relevance(f.target, f.others[0], threshold=40.0), 3)
         rows.append(row("relevance", 6, size, took.cpu))
     return rows
 
@@ -197,14 +197,12 @@ def splits_and_points() -> tuple[list[Row], int]:
     )
     there = TheirMixture(p.weights, p.means, p.covs)
     root = np.linalg.cholesky(noise)
-    mine = timed(lambda: [unscented.forecast(
-        p.means, p.factors, lambda x: x + 0.1 * np.sin(x), root, rule="unscented"
-    ) for _ in range(50)], 3)
+    mine = timed(lambda: [
+        moved(p, lambda x: x + 0.1 * np.sin(x), root, rule="unscented") for _ in range(50)
+    ], 3)
     other = timed(lambda: [peer.predict((0.0, 1.0), there) for _ in range(50)], 3)
-    means, factors = mine.result[0]
-    covs = factors @ np.swapaxes(factors, -1, -2)
-    after = other.result[0]
-    apart = float(max(np.abs(means - after.m).max(), np.abs(covs - after.P).max()))
+    ahead, after = mine.result[0], other.result[0]
+    apart = float(max(np.abs(ahead.means - after.m).max(), np.abs(ahead.covs - after.P).max()))
     rows.append(row("unscented forecast", 12, 12, mine.cpu / 50))
     rows.append(row("unscented forecast, pyest", 12, 12, other.cpu / 50,
                     ratio=f"{other.cpu / mine.cpu:.1f}", gap=f"{apart:.0e}"))

@@ -16,10 +16,7 @@ from distfilt.mixtures import (
     fuse_moments,
     jeffreys_by_sampling,
     jeffreys_of_many,
-    kept_by_relevance,
     nonnegative_least_squares,
-    pivoted_qr,
-    runnalls,
     tikhonov,
 )
 
@@ -105,13 +102,6 @@ def test_the_counterexample_to_26() -> None:
     assert np.allclose(np.sort(1 / every.covs.ravel()), [0.055, 0.505, 0.955])
 
 
-def test_order_of_the_terms_and_their_sources() -> None:
-    every = EXACT.shapes(terms="all")
-    if every.dropped == 0:
-        assert every.source.tolist() == np.repeat(np.arange(3), 6).tolist()
-    assert EXACT.shapes().source.tolist() == [0, 0, 1, 1, 2, 2]
-
-
 def test_target_marginals_agree_when_the_weights_sum_to_one() -> None:
     one, two = pair("A")
     t = np.random.default_rng(0).standard_normal((200, 2)) * 2
@@ -135,7 +125,7 @@ def test_identical_beliefs_change_nothing() -> None:
     f = PartialFusion(own, own.marginal(TARGET), omega=0.4)
     x = np.random.default_rng(1).standard_normal((50, 4)) * 3
     assert np.abs(f.log_value(x) - own.log_density(x)).max() < 1e-10
-    fused = f.approximation()
+    fused = f.weigh(f.shapes())
     d = jeffreys_by_sampling(
         fused.log_density, own.log_density, own, members=4000, rng=np.random.default_rng(2)
     )
@@ -162,15 +152,6 @@ def test_exponents_are_equal_by_default() -> None:
         PartialFusion(OTHER, OWN)
 
 
-def test_ego_states_of_different_size_and_no_ego_state_at_all() -> None:
-    t1, t2 = random_mixture(2, 2, 20, 1.0), random_mixture(2, 3, 21, 1.0)
-    assert fuse(t2, t1).dim == 3
-    bare = fuse(t1, t2.marginal(TARGET))
-    x = np.random.default_rng(4).standard_normal((30, 2))
-    exact = PartialFusion(t1, t2.marginal(TARGET)).log_value(x)
-    assert bare.dim == 2 and np.std(bare.log_density(x) - exact) < 1.0
-
-
 def test_many_agents_in_one_pass_and_one_after_the_other() -> None:
     own = random_mixture(1, 5, 30)
     others = [random_mixture(1, 2, 31 + k) for k in range(3)]
@@ -181,16 +162,6 @@ def test_many_agents_in_one_pass_and_one_after_the_other() -> None:
     same(halves, fuse(own, others, omega=[1 / 8, 1 / 8, 1 / 4, 1 / 2]))
     # With halves the order matters.
     assert not np.allclose(halves.means, fuse_in_turn(own, others[::-1], omega=0.5).means)
-
-
-def test_mixtures_in_turn_are_near_the_one_pass() -> None:
-    own, others = random_mixture(2, 3, 70, 1.0), [random_mixture(2, 2, 71 + k, 1.0) for k in (0, 1)]
-    exact, turn = PartialFusion(own, others), fuse_in_turn(own, others)
-    found = jeffreys_by_sampling(
-        turn.log_density, exact.log_value, wide(turn, own), members=4000,
-        rng=np.random.default_rng(0),
-    )  # fmt: skip
-    assert found.value < 0.1
 
 
 def test_three_mixtures_have_all_combinations() -> None:
@@ -299,7 +270,7 @@ def test_mixands_far_apart_leave_no_nan(rule: str, terms: str) -> None:
 
 def test_points_too_far_out_are_refused() -> None:
     for at in (EXACT.log_value, EXACT.log_update, EXACT.log_target):
-        with pytest.raises(ValueError, match="needs points whose densities are numbers"):
+        with pytest.raises(ValueError, match="needs points whose density is a number"):
             at(np.full(4 if at == EXACT.log_value else 2, 1e300))
 
 
@@ -390,28 +361,3 @@ def test_pair_a_by_quadrature() -> None:
     assert np.allclose(got[30], got[50], rtol=2e-3)
     sampled = [divergences(exact, pair, 100_000)[0] for pair in fused.values()]
     assert np.allclose(sampled, got[50], rtol=0.05)
-
-
-def test_pair_b_orders_the_reductions() -> None:
-    one, two = pair("B")
-    exact, _ = both("B", "matched", "C2")
-    marginals = [one.marginal(TARGET), two.marginal(TARGET)]
-    kept = [kept_by_relevance(marginals[k], marginals[1 - k], threshold=2.0) for k in (0, 1)]
-    cheap = [runnalls(marginals[k], kept[k].size) for k in (0, 1)]
-    assert [m.size for m in kept] == [2, 3]
-
-    def through(reduced: list[GaussianMixture]) -> np.ndarray:
-        fused = [
-            f.weigh(f.shapes(terms="all", marginal=reduced[k], received=[reduced[1 - k]]))
-            for k, f in enumerate(exact)
-        ]
-        return divergences(exact, fused)[0]
-
-    by_kld, by_runnalls = through(kept), through(cheap)
-    pivoted = [
-        f.weigh(pivoted_qr(f.shapes(terms="all"), size=n))
-        for f, n in zip(exact, (40, 48), strict=True)
-    ]
-    by_qr = divergences(exact, pivoted)[0]
-    assert (by_kld <= by_runnalls).all()
-    assert (by_qr[:2] >= 2 * by_runnalls[:2]).all() and (by_qr[:2] >= 2 * by_kld[:2]).all()

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from distfilt.mixtures import GaussianMixture
@@ -81,24 +79,6 @@ def test_moments_are_the_draws() -> None:
     assert np.allclose(p.cov, by_hand, rtol=1e-13)
     one = p.collapsed()
     assert one.size == 1 and np.allclose(one.mean, p.mean) and np.allclose(one.cov, p.cov)
-
-
-@given(st.floats(-3, 3), st.integers(1, 4), st.integers(0, 50))
-def test_quadratics_have_the_value_of_the_density(power: float, size: int, seed: int) -> None:
-    p = random_mixture(size, 2, seed)
-    x = np.random.default_rng(seed).standard_normal((3, 2)) * 3
-    assert np.allclose(p.quadratics().log_value(x), p.log_density(x), atol=1e-8)
-    one = GaussianMixture.gaussian(p.means[0], p.covs[0])
-    assert np.allclose(
-        one.quadratics().power(power).log_value(x), power * one.log_density(x), atol=1e-7
-    )
-
-
-def test_a_negative_power_needs_all_terms() -> None:
-    terms = GaussianMixture([1.0, 0.0], [[0.0], [1.0]], UNIT).quadratics()
-    assert np.isfinite(terms.power(0.5).log_value([0.0]))
-    with pytest.raises(ValueError, match="^exponent: needs a positive one"):
-        terms.power(-0.5)
 
 
 def test_pack_goes_through_a_channel_and_every_number_is_charged() -> None:

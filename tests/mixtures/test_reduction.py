@@ -85,7 +85,7 @@ def test_reduction_keeps_the_moments_in_any_coordinates(size: int, dim: int, see
 
 def test_without_numba_its_engine_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "numba", None)
-    reduction._compiled.cache_clear()
+    reduction._merging.cache_clear()
     with pytest.raises(ModuleNotFoundError, match=r"numba.*speed"):
         runnalls(random_mixture(4, 2, 1), 2, engine="numba")
 
