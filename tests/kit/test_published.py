@@ -123,7 +123,7 @@ GOOD = 'title = "A study"\n' + GAIN + agent("A", "AB") + agent("B", "AB")
         ("neighbours = ['A', 'B']", "neighbours = ['A']", "agents: needs mutual neighbours"),
         ("neighbours = ['A', 'B']", "neighbours = ['A', 'Z']", "agents: needs mutual neighbours"),
         ('name = "B"', 'name = "A"', "agents: needs distinct names"),
-        ('kind = "direct"', 'kind = "angle"', "unit: needs one of rad, deg for kind 'angle'"),
+        ('kind = "direct"', 'kind = "angle"', "unit: needs rad or deg for 'angle'"),
     ],
 )
 def test_a_fault_is_named_with_the_file(tmp_path: Path, old: str, new: str, words: str) -> None:

@@ -150,7 +150,7 @@ def test_a_broken_executor_leaves_what_was_done() -> None:
 
 
 def test_a_worker_with_other_versions_is_refused() -> None:
-    job = running.Job(b"", "elsewhere", {**running.versions(), "numpy": "1.0"})
+    job = (b"", "elsewhere", {**running.versions(), "numpy": "1.0"})
     with pytest.raises(RuntimeError, match="1.0"):
         running.chunk(job, [])
 

@@ -127,13 +127,12 @@ def of_axes(drawn: Any) -> str:
             now = {axis: _summary(values) for axis, values in coordinates.items()}
             lines += [f"{name} {axis}: {t}" for axis, t in now.items() if before.get(axis) != t]
             before = now
-        told = ", ".join(f"{n} {kind if n == 1 else _MANY[kind]}" for kind, n in counts.items())
+        ends = {kind: ("es" if kind == "patch" else "s") * (n > 1) for kind, n in counts.items()}
+        told = ", ".join(f"{n} {kind}{ends[kind]}" for kind, n in counts.items())
         out += [f"axes {k}: {told or 'empty'}", *lines]
-    empty = all(line.endswith(": empty") for line in out)
-    return "an empty figure" if empty else "\n".join(out)
+    return "\n".join(out) if any(": empty" not in line for line in out) else "an empty figure"
 
 
-_MANY = {"line": "lines", "patch": "patches", "collection": "collections", "image": "images"}
 _Entry = tuple[str, int, dict[str, Array]]
 """Kind of artist, how many of them, and their coordinates by name."""
 

@@ -22,10 +22,10 @@ def data_root() -> Path:
     True
     """
     here = Path.cwd()
-    for folder in (here, *here.parents, _REPOSITORY):
+    for folder in (here, *here.parents):
         if (folder / "data" / "published" / "items.csv").is_file():
             return folder / "data"
-    raise FileNotFoundError(f"no folder data with published/items.csv at {here} or above")
+    return _REPOSITORY / "data"
 
 
 def inside(folder: Path, paper: str, name: str, suffix: str) -> Path:

@@ -16,7 +16,7 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from distfilt.linalg import factor
 
@@ -68,10 +68,10 @@ def line_style(index: int) -> Any:
 def use_style() -> None:
     """Set matplotlib's defaults for a chapter; call it once, before the first figure.
 
-    Page size, resolution and fonts are fixed, and so are the ids in an SVG, so that a figure drawn
-    twice is the same file. In a notebook the text form of a figure, which is stored beside its
-    picture, becomes the digest of what its axes hold (`bookkit.digests.of_axes`): a curve that
-    changes is noticed by whoever compares stored outputs.
+    Page size, resolution and fonts are fixed, so that a figure drawn twice is the same file. In a
+    notebook the text form of a figure, which is stored beside its picture, becomes the digest of
+    what its axes hold (`bookkit.digests.of_axes`): a curve that changes is noticed by whoever
+    compares stored outputs.
 
     >>> with matplotlib.rc_context():  # so that this example leaves no trace
     ...     use_style()
@@ -84,9 +84,6 @@ def use_style() -> None:
             "figure.dpi": 110,
             "figure.constrained_layout.use": True,
             "savefig.dpi": 110,
-            "savefig.bbox": None,
-            "svg.hashsalt": "distfilt",
-            "svg.fonttype": "path",
             "font.family": "DejaVu Sans",  # comes with matplotlib, the same on every machine
             "font.size": 9.0,
             "axes.titlesize": 9.0,
@@ -252,7 +249,9 @@ def graph(
     links = np.asarray(adjacency)
     n = len(links)
     names = [str(k + 1) for k in range(n)] if labels is None else labels
-    place = _circle(n) if positions is None else np.asarray(positions, dtype=float)
+    turn = 2 * np.pi * np.arange(n) / n
+    circle = np.stack([np.sin(turn), np.cos(turn)], axis=-1) * (n > 1)
+    place = circle if positions is None else np.asarray(positions, dtype=float)
     share = np.zeros(n) if known is None else np.asarray(known, dtype=float)
     for i, j in zip(*np.nonzero(np.triu(links, 1)), strict=True):
         ax.plot(*place[[i, j]].T, color="0.55", linewidth=1.2, zorder=1)
@@ -271,8 +270,3 @@ def graph(
     ax.margins(0.2)
     ax.set_axis_off()
     return ax
-
-
-def _circle(n: int) -> NDArray[np.float64]:
-    turn = 2 * np.pi * np.arange(n) / n
-    return np.stack([np.sin(turn), np.cos(turn)], axis=-1) * (n > 1)

@@ -78,10 +78,10 @@ def items() -> list[Item]:
 
 
 def _known(paper: str, item: str) -> Item:
-    for known in items():
-        if (known.paper, known.item) == (paper, item):
-            return known
-    raise ValueError(f"item: needs one of items(), got {paper} {item}")
+    found = [known for known in items() if known[:2] == (paper, item)]
+    if not found:
+        raise ValueError(f"item: needs one of items(), got {paper} {item}")
+    return found[0]
 
 
 @dataclass(frozen=True)
@@ -131,10 +131,9 @@ class Verdict:
         return "\n".join([head, *(f"  {name:<9}  {text}" for name, text in self._fields())])
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
-        head = (f"{self.paper} {self.item}", self.verdict)
         return {
             "text/plain": str(self),
-            "text/html": html_table(head, self._fields()),
+            "text/html": html_table((f"{self.paper} {self.item}", self.verdict), self._fields()),
             _MIME: dict(vars(self)),
         }
 
@@ -255,8 +254,8 @@ def judge_parameters(
     rows = read.cells() if isinstance(read, Scenario) else read
     study = read if scenario is None and isinstance(read, Scenario) else scenario
     why = _first_difference(rows, printed)
-    ours, said = f"{len(rows)} rows read", f"{len(printed)} rows printed"
-    return _judged(known, not why, ours, said, why, study)
+    said = f"{len(printed)} rows printed"
+    return _judged(known, not why, f"{len(rows)} rows read", said, why, study)
 
 
 def _cell(value: Any) -> str:

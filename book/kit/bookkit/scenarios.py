@@ -8,6 +8,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -117,17 +118,16 @@ class Row(Mapping[str, Any]):
     ('angle', (1, 2), 'Table II.')
     >>> Row({**row, "kind": "range"})
     Traceback (most recent call last):
-    ValueError: unit: needs one of m, km for kind 'range', got 'rad'
+    ValueError: unit: needs m or km for 'range', got 'rad'
     """
 
     def __init__(self, cells: Mapping[str, Any], note: Callable[[str], Any] = len) -> None:
         self._cells = {key: _plain(value) for key, value in cells.items()}
         self._note = note
         _check_origin(cells)
-        allowed = _UNITS.get(cells.get("kind", ""), (cells["unit"],))
-        if cells["unit"] not in allowed:
-            raise ValueError(f"unit: needs one of {', '.join(allowed)} for kind {cells['kind']!r}, "
-                             f"got {cells['unit']!r}")  # fmt: skip
+        kind, unit = cells.get("kind", ""), cells["unit"]
+        if unit not in (allowed := _UNITS.get(kind, (unit,))):
+            raise ValueError(f"unit: needs {' or '.join(allowed)} for {kind!r}, got {unit!r}")
 
     def __getitem__(self, key: str) -> Any:
         if key not in self._cells:
@@ -178,7 +178,7 @@ class Scenario:
     Examples
     --------
     >>> s = scenario("grange", "table-2")
-    >>> s["gain"], s.unit("dt_observe"), s.source("gain")
+    >>> s["gain"], s.parameter("dt_observe").unit, s.parameter("gain").source
     (0.05, 's', 'assumed')
     >>> s["initial_state"]
     array([100. ,   0. ,   0. ,  10. ,   0.1,   0. ])
@@ -213,19 +213,8 @@ class Scenario:
         out.setflags(write=False)
         return out
 
-    def __contains__(self, key: object) -> bool:
-        return key in self.parameters
-
     def __iter__(self) -> Iterator[str]:
         return iter(self.parameters)
-
-    def unit(self, key: str) -> str:
-        """Unit of a parameter."""
-        return self.parameter(key).unit
-
-    def source(self, key: str) -> str:
-        """Whether a parameter is given, inferred or assumed."""
-        return self.parameter(key).source
 
     @property
     def agents(self) -> tuple[Row, ...]:
@@ -234,7 +223,7 @@ class Scenario:
         if self.seen is None:
             return rows
         # Each notes in what is seen that a column of it was read.
-        return tuple(Row(r._cells, _Note(self.seen, r._cells["name"])) for r in rows)
+        return tuple(Row(r._cells, partial(_noted, self.seen, r._cells["name"])) for r in rows)
 
     @property
     def adjacency(self) -> NDArray[np.float64]:
@@ -324,15 +313,8 @@ class Scenario:
         return "\n\n".join(markdown_table(*t) for t in self._shown())
 
 
-@dataclass(frozen=True)
-class _Note:
-    """Notes a column of a row as read; it travels to a worker, which a closure does not."""
-
-    seen: set[str]
-    name: str
-
-    def __call__(self, column: str) -> None:
-        self.seen.add(f"{self.name}.{column}")
+def _noted(seen: set[str], name: str, column: str) -> None:
+    seen.add(f"{name}.{column}")
 
 
 def _json(value: Any) -> str:

@@ -19,7 +19,10 @@ from .digests import of_axes
 __all__ = ["Slider", "slider"]
 
 LIMIT = 400_000
-"""Characters of HTML at most: a page with three of them still opens at once."""
+"""Characters of HTML at most: a page with three of them still opens at once.
+
+Fewer or smaller frames, fewer colours and less fine detail make it shorter.
+"""
 
 _PAGE = """\
 <div class="frames" data-frames="{key}" role="group" aria-label="{label}">
@@ -96,8 +99,6 @@ class Slider:
         What the slider sets, and what the picture shows, for readers who do not see it.
     start : int
         The frame that is shown first.
-    seconds : float
-        How long a frame stays while the slider plays.
     """
 
     frames: tuple[bytes, ...]
@@ -106,16 +107,12 @@ class Slider:
     label: str
     alt: str
     start: int
-    seconds: float
 
     def __post_init__(self) -> None:
         if len({frame[16:24] for frame in self.frames}) != 1:
             raise ValueError("draw: needs figures of one size")
         if len(self.html) > LIMIT:
-            raise ValueError(
-                f"frames: needs at most {LIMIT} characters of HTML, got {len(self.html)}: fewer or "
-                "smaller frames, fewer colours or less fine detail"
-            )
+            raise ValueError(f"frames: needs at most {LIMIT} characters, got {len(self.html)}")
 
     def __repr__(self) -> str:
         lines = [f"slider of {len(self.frames)} frames, first {self.said[self.start]}"]
@@ -130,7 +127,7 @@ class Slider:
         data = {
             "alt": self.alt,
             "said": self.said,
-            "milliseconds": round(1000 * self.seconds),
+            "milliseconds": 500,
             "frames": pictures,
         }
         width, height = (int.from_bytes(self.frames[0][k : k + 4]) for k in (16, 20))
@@ -158,8 +155,7 @@ class Slider:
 
 def slider(
     draw: Callable[[Any], Any], values: Sequence[Any], *, label: str, alt: str,
-    unit: str | None = None, form: str = "g", start: int = 0, seconds: float = 0.5,
-    colours: int = 32,
+    unit: str | None = None, form: str = "g", start: int = 0, colours: int = 32,
 ) -> Slider:
     """Draw a figure for each value, and go through them with a slider that needs no kernel.
 
@@ -185,8 +181,6 @@ def slider(
     start : int
         The frame that is shown first, counted from 0. Choose the one that says most: it is also
         the picture in print.
-    seconds : float
-        How long a frame stays while the slider plays.
     colours : int
         Colours of a frame's palette, 2 to 256. Few make a small file.
 
@@ -204,7 +198,7 @@ def slider(
     ending = "" if unit is None else f" {unit}"
     said = tuple(f"{label} {format(value, form)}{ending}" for value in values)
     frames, digests = zip(*(_frame(draw(value), colours) for value in values), strict=True)
-    return Slider(frames, said, digests, label, alt, start, seconds)
+    return Slider(frames, said, digests, label, alt, start)
 
 
 def _frame(drawn: Any, colours: int) -> tuple[bytes, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import inspect
 import io
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 
 from ..folders import data_root, inside
 from . import running
-from .running import Outcome, StudyError, Trial, fresh, plain
+from .running import Failure, Outcome, StudyError, Trial, fresh, plain
 
 __all__ = ["Stored", "fingerprint", "load", "merge", "store", "stored"]
 
@@ -184,7 +183,7 @@ def store(
         flight = running.outcomes(trial, items, executor, workers, one_by_one=True)
         for outcome in running.track(flight, len(items), progress):
             if outcome.kind == running.DIED:
-                died.append(outcome.failure(given[outcome.which]))
+                died.append(Failure(outcome.which, given[outcome.which], *outcome[2:]))
             else:
                 rows[outcome.which] = _row(outcome, texts[outcome.which], columns)
                 part.append(rows[outcome.which])
@@ -232,9 +231,9 @@ class _Part:
         text = "" if self.path.is_file() else self.head
         # Each begins its own line: the one before it may have been cut off.
         text += f"\n{made},{_checksum(made)}"
-        with _named(self.path), self.path.open("ab", buffering=0) as out:
-            if out.write(text.encode()) != len(text.encode()):
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        with _named(self.path), self.path.open("ab") as out:
+            out.write(text.encode())
+            out.flush()
             if time.monotonic() - self.synced > _SYNC_SECONDS:
                 os.fsync(out.fileno())
                 self.synced = time.monotonic()

@@ -25,8 +25,12 @@ from typing import Any, NamedTuple
 
 import cloudpickle
 import numpy as np
+import scipy.linalg  # noqa: F401  its BLAS is loaded before threads are held
+from loky import cpu_count, get_reusable_executor
 from numpy.random import SeedSequence
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+from tqdm.auto import tqdm
 
 from distfilt import __version__
 
@@ -200,7 +204,7 @@ def run(
 
 
 def _study(seeds: tuple[SeedSequence, ...], found: Mapping[int, Outcome]) -> Study:
-    failed = tuple(found[i].failure(seeds[i]) for i in sorted(found) if found[i].kind)
+    failed = tuple(Failure(i, seeds[i], *found[i][2:]) for i in sorted(found) if found[i].kind)
     done = np.array([i in found and not found[i].kind for i in range(len(seeds))])
     values = tuple(pickle.loads(found[i].value) if good else None for i, good in enumerate(done))
     return Study(seeds, values, failed, done)
@@ -208,8 +212,6 @@ def _study(seeds: tuple[SeedSequence, ...], found: Mapping[int, Outcome]) -> Stu
 
 def track(items: Iterable[Any], total: int, show: bool) -> Iterable[Any]:
     """The items, behind a progress bar where a person may be watching."""
-    from tqdm.auto import tqdm
-
     silent = any(os.environ.get(name) for name in ("TQDM_DISABLE", "CI", "PYTEST_CURRENT_TEST"))
     hidden = True if silent or not show else None  # None: where the output is no terminal
     shown: Iterable[Any] = tqdm(items, total=total, leave=False, disable=hidden)
@@ -240,29 +242,25 @@ class Outcome(NamedTuple):
     kind: str = ""
     text: str = ""
 
-    def failure(self, seed: SeedSequence) -> Failure:
-        """What a caller sees of a failure."""
-        return Failure(self.which, seed, self.kind, self.text)
 
-
-class Job(NamedTuple):
-    """What all trials of a study share."""
-
-    trial: bytes
-    home: str
-    versions: dict[str, str]
+Job = tuple[bytes, str, dict[str, str]]
+"""What all trials of a study share: the pickled trial, where it started, its versions."""
 
 
 def chunk(job: Job, items: Sequence[Item]) -> tuple[float, list[Outcome]]:
     """Run some trials; say how long they took, and what came of each."""
-    if job.versions != versions():
-        raise RuntimeError(f"a worker has {versions()}, the study {job.versions}")
-    trial = pickle.loads(job.trial)
-    if job.home != home():
+    trial, started, wanted = job
+    if wanted != versions():
+        raise RuntimeError(f"a worker has {versions()}, the study {wanted}")
+    call = _loaded(trial)
+    if started != home():
         _one_blas_thread()
     began = time.perf_counter()
-    found = [_outcome(trial, *item) for item in items]
+    found = [_outcome(call, *item) for item in items]
     return time.perf_counter() - began, found
+
+
+_loaded = functools.lru_cache(maxsize=1)(pickle.loads)
 
 
 def _outcome(trial: Trial, which: int, seed: SeedSequence) -> Outcome:
@@ -278,9 +276,6 @@ def _outcome(trial: Trial, which: int, seed: SeedSequence) -> Outcome:
 @functools.cache
 def _one_blas_thread() -> None:
     """Hold a worker's linear algebra to one thread: with another number its last bits differ."""
-    import scipy.linalg  # noqa: F401
-    from threadpoolctl import threadpool_limits
-
     threadpool_limits(1, user_api="blas")
 
 
@@ -307,21 +302,7 @@ class ExecutorError(Exception):
     """The executor failed, not a trial."""
 
 
-class Here(Executor):
-    """Runs what is submitted in this process, at once."""
-
-    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
-        future: Future[Any] = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
-        return future
-
-
 def _pool(workers: int) -> Executor:
-    from loky import get_reusable_executor
-
     # loky starts new workers where these arguments differ: a worker keeps the folder and the
     # import path that it was born with.
     here = (os.getcwd(), *sys.path)
@@ -331,8 +312,7 @@ def _pool(workers: int) -> Executor:
 
 def slots(executor: Executor) -> int:
     """How many calls an executor runs at a time: those of its cluster, not this machine's cores."""
-    client: Any = getattr(executor, "_client", None)  # dask's
-    if client is not None:
+    if client := getattr(executor, "_client", None):  # dask's
         return max(1, int(sum(client.nthreads().values())))
     known = getattr(executor, "num_workers", None) or getattr(executor, "_max_workers", None)
     return int(known or os.cpu_count() or 1)
@@ -360,9 +340,6 @@ def _held() -> Iterator[None]:
 
     It replaces one whose memory has grown, as a cache's does, which costs no result.
     """
-    import scipy.linalg  # noqa: F401
-    from threadpoolctl import threadpool_limits
-
     with warnings.catch_warnings(), threadpool_limits(1, user_api="blas"):
         warnings.filterwarnings("ignore", message="A worker (stopped|was restarted) while some")
         yield
@@ -378,13 +355,14 @@ def outcomes(
     one was taken here; else trials travel in chunks, two for each slot.
     """
     if executor is None and workers is None:
-        from loky import cpu_count
-
         workers = int(cpu_count())
-    own = executor is None and workers != 1
-    runner = executor or (_pool(workers or 1) if own else Here())
-    flight = _Flight(trial, items, runner, workers, own, one_by_one)
+    job = (_pickled(trial), home(), versions())
     with _held():
+        if executor is None and workers == 1:
+            for item in items:
+                yield from chunk(job, [item])[1]
+            return
+        flight = _Flight(job, items, executor, workers, one_by_one)
         try:
             yield from flight.outcomes()
         finally:
@@ -398,12 +376,11 @@ class _Flight:
     """The trials of a study on their way through an executor."""
 
     def __init__(
-        self, trial: Trial, items: Sequence[Item], executor: Executor, workers: int | None,
-        own: bool, one_by_one: bool,
+        self, job: Job, items: Sequence[Item], executor: Executor | None, workers: int | None,
+        one_by_one: bool,
     ) -> None:
-        self.job = Job(_pickled(trial), home(), versions())
-        self.executor, self.workers, self.own = executor, workers, own
-        self.one_by_one, self.size = one_by_one, 1
+        self.job, self.workers, self.one_by_one = job, workers, one_by_one
+        self.executor, self.own, self.size = executor or _pool(workers or 1), executor is None, 1
         self.waiting, self.suspects = deque(items), deque[Item]()
         self.flying: dict[Landed, list[Item]] = {}
         self.broken = False
@@ -442,14 +419,12 @@ class _Flight:
         if self.broken:
             self.executor, self.broken = _pool(self.workers or 1), False
         self.alone = bool(self.suspects)
-        if self.alone and not self.flying:
-            self._submit([self.suspects.popleft()])
-        if self.alone or not self.waiting:
+        if self.alone:
+            if not self.flying:
+                self._submit([self.suspects.popleft()])
             return
         room = self.workers or slots(self.executor)
         window = room if self.one_by_one else 2 * room
-        if isinstance(self.executor, Here):
-            window = 1
         while self.waiting and len(self.flying) < window and not self.broken:
             fair = ceil(len(self.waiting) / (2 * room))  # towards the end nobody is left alone
             size = 1 if self.one_by_one else min(self.size, fair)
