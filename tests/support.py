@@ -62,9 +62,22 @@ def turning(*, sigma: float, turn_sigma: float) -> Model:
         moved = p + dt * (along * v + aside * left)
         return np.concatenate([moved, np.cos(tau) * v + np.sin(tau) * left, x[..., 4:]], axis=-1)
 
+    def derivative(x: np.ndarray, t: float, dt: float) -> np.ndarray:
+        tau, v = x[..., 4, None, None] * dt, x[..., 2:4, None]  # turns that are not tiny
+        one, left = np.eye(2), np.array([[0.0, -1.0], [1.0, 0.0]])
+        sine, cosine = np.sin(tau) / tau, (1 - np.cos(tau)) / tau
+        out = np.zeros((*x.shape, 5))
+        out[..., :2, :2], out[..., 4, 4] = one, 1.0
+        out[..., :2, 2:4] = dt * (sine * one + cosine * left)
+        out[..., 2:4, 2:4] = np.cos(tau) * one + np.sin(tau) * left
+        bent = (np.cos(tau) - sine) * one + (np.sin(tau) - cosine) * left
+        out[..., :2, 4:] = dt**2 / tau * (bent @ v)
+        out[..., 2:4, 4:] = dt * (-np.sin(tau) * one + np.cos(tau) * left) @ v
+        return out
+
     def noise(t: float, dt: float) -> np.ndarray:
         cov = np.zeros((5, 5))
         cov[:4, :4], cov[4, 4] = straight.noise(t, dt), turn_sigma**2 * dt
         return cov
 
-    return Model(5, flow, noise)
+    return Model(5, flow, noise, derivative=derivative)
