@@ -4,33 +4,37 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from distfilt.filters import SensorFilter, State, Summary
-from distfilt.network import Ledger
+from distfilt.filters import Filter, SensorState, Summary, moments_of
 
 X = np.linspace(-6, 6, 241)[:, None]  # places, in m
 
 
-@dataclass(frozen=True, eq=False)
-class GridState(State):
-    belief: np.ndarray  # (A, places)
+@dataclass(frozen=True, eq=False, repr=False)
+class GridState(SensorState):
+    chances: np.ndarray
+    _belief = "chances", (..., "A", len(X))
 
 
-class GridFilter(SensorFilter):
-    def start(self, prior, *, rng=None, runs=(), t=0.0):
-        belief = np.exp(-((X.T - prior[0]) ** 2) / (2 * np.asarray(prior[1])))
-        belief = np.repeat(belief / belief.sum(), len(self.sensors), axis=0)
-        return GridState(t, Ledger.empty(len(belief)), None, belief)
+class GridFilter(Filter):
+    state = GridState
+    unused = {"agreement": "grids do not agree", "lag": "a grid keeps no past"}
 
-    def step(self, state, t, observations):
-        dt, channel = self.elapsed(state, t), self.channel(state, t)
-        gap = X.T - self.model.step(X, state.t, dt)
-        kernel = np.exp(-(gap**2) / (2 * self.model.noise(state.t, dt)))
-        belief = state.belief @ (kernel / kernel.sum(axis=1, keepdims=True))
-        for heard in self.gather(self.observed(state, observations), channel):
-            gap = heard.target[:, None] - heard.predict(np.repeat(X[None], len(heard.agents), 0))
-            belief[heard.agents] *= np.exp(-(gap**2 / np.diag(heard.covariance(0))).sum(-1) / 2)
-        return GridState(t, channel.ledger, None, belief / belief.sum(axis=1, keepdims=True))
+    def begin(self, prior, runs, rng):
+        mean, cov = moments_of(prior, 1)
+        belief = np.exp(-((X.T - mean) ** 2) / (2 * cov))
+        return {"chances": np.broadcast_to(belief / belief.sum(), (*runs, self.count, len(X)))}
+
+    def advance(self, step):
+        gap = X.T - self.model.step(X, step.state.t, step.dt)
+        kernel = np.exp(-(gap**2) / (2 * self.model.noise(step.state.t, step.dt)))
+        belief = step.state.chances @ (kernel / kernel.sum(axis=1, keepdims=True))
+        for _, heard in step.heard():
+            seen = heard.predict(np.broadcast_to(X, (*belief[..., heard.agents, :].shape, 1)))
+            gap = np.nan_to_num(heard.target[..., None, :] - seen)  # what is missing says nothing
+            noise = np.diagonal(heard.noise, axis1=-2, axis2=-1)[..., None, :]
+            belief[..., heard.agents, :] *= np.exp(-(gap**2 / noise).sum(-1) / 2)
+        return step.end(chances=belief / belief.sum(axis=-1, keepdims=True))
 
     def summary(self, state):
-        mean = state.belief @ X
-        return Summary(mean, state.belief @ X**2 - mean**2)
+        mean = state.chances @ X
+        return Summary(mean, state.chances @ X**2 - mean**2)

@@ -90,7 +90,7 @@ def network(
     model = density.FokkerPlanck(densities.swarm(case.reading, case.phase), case.grid)
     who = tuple(range(local)) if isinstance(local, int) else tuple(local)
     return DensityFilter(
-        model, case.agents, case.radio_range, sharing, bandwidth=case.bandwidth,
+        model, case.agents, case.radio_range, agreement=sharing, bandwidth=case.bandwidth,
         local=who[:1] if scheme.startswith("central") else who,
         prior_length=CHOICES["prior_length"], prior_std=CHOICES["prior_std"],
         first_std=FLAT, floor=CHOICES["floor"],

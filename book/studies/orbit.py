@@ -22,6 +22,7 @@ from distfilt.mixtures import (
     fuse_in_turn,
     fuse_moments,
     runnalls,
+    target_fusion,
 )
 from distfilt.models import occulted, orbits, rsw_frame
 from distfilt.network import graphs
@@ -183,8 +184,10 @@ def network(s: dict, options: dict) -> MixtureFilter:
     kind = MixtureFilter
     if chosen.pop("news", False):
         kind, chosen = NewsFilter, {"common": range(2, 8) if s["one_fix"] else (), **chosen}
+    if "agreement" in chosen:
+        chosen["agreement"] = partial(target_fusion, target_dim=6, fuse=chosen["agreement"])
     return kind(
-        [moving(s, 2)] * n, [sensor(s)] * n, graphs.complete(n), target_dim=6,
+        moving(s, 2), [sensor(s)] * n, graphs.complete(n), target_dim=6,
         names=tuple(str(a + 1) for a in range(n)), **chosen,
     )
 
@@ -210,7 +213,7 @@ def bound(
     fix = ephemeris(position_std=s["fix_std"][0], velocity_std=s["fix_std"][1])
     fixes = 1 if s["one_fix"] else n
     every = stack([line_of_sight(observer=6 * a, **eye) for a in range(1, n + 1)] + [fix] * fixes)
-    f = MixtureFilter([moving(s, n + 1)], [every], target_dim=6, **options)
+    f = MixtureFilter(moving(s, n + 1), [every], target_dim=6, **options)
     state, out = f.start([GaussianMixture.gaussian(first, block(covs))]), []
     for k, hour in enumerate(HOURS):
         y = np.concatenate([seen[k, :, :2].ravel(), seen[k, :fixes, 2:].ravel()])

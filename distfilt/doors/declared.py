@@ -211,7 +211,7 @@ def _of_fields(cls: Any) -> dict[str, Kind]:
     found: dict[str, Kind] = {}
     for base in reversed(cls.__mro__):
         own = {n: a for n, a in vars(base).get("__annotations__", {}).items() if n in _names(cls)}
-        found |= _declared(own, vars(sys.modules[base.__module__]))
+        found |= _declared(own, vars(sys.modules.get(base.__module__, sys)))
     return _arrays_last(found)
 
 

@@ -1,21 +1,22 @@
 """Filters: a model, sensors, an update and a network, put together on one contract."""
 
+from .base import Filter
 from .density import DensityFilter, DensityState
-from .driver import Filter, Late, Summary, final_state
 from .ensemble import EnsembleFilter, EnsembleState
-from .failures import FilterError
 from .gaussian import GaussianFilter, GaussianState
+from .inputs import Late, Reading, members_of, mixture_of, moments_of
 from .mixture import MixtureFilter, MixtureState
 from .news import NewsFilter, increment
 from .particle import ParticleCollapse, ParticleFilter, ParticleState
-from .saving import State
-from .stepping import SensorState, Step
+from .record import Summary, final_state
+from .saving import SensorState, State
+from .step import FilterError, Step
 from .transport import TransportFilter
-from .wiring import SensorFilter
 
 __all__ = [  # fmt: skip
     "DensityFilter", "DensityState", "EnsembleFilter", "EnsembleState", "Filter", "FilterError",
     "GaussianFilter", "GaussianState", "Late", "MixtureFilter", "MixtureState", "NewsFilter",
-    "ParticleCollapse", "ParticleFilter", "ParticleState", "SensorFilter", "SensorState", "State",
-    "Step", "Summary", "TransportFilter", "final_state", "increment",
+    "ParticleCollapse", "ParticleFilter", "ParticleState", "Reading", "SensorState", "State",
+    "Step", "Summary", "TransportFilter", "final_state", "increment", "members_of", "mixture_of",
+    "moments_of",
 ]

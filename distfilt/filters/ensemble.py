@@ -7,44 +7,43 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
-from typing import Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from .. import ensembles as moments
-from ..checks import Array, array, callable_, count, generator, instance
-from ..doors import unchecked
+from ..doors import Array, Bounds, array, unchecked
 from ..models import Model
 from ..network import Graph, intersection
 from ..sensors import Sensor
 from ..updates import exact_draws, exact_forecast, known_noise, sampled_forecast, with_missing
-from ..updates.door import Update, stackable
-from .driver import Late, Summary
-from .failures import guarded
-from .heard import Heard
-from .stepping import SensorState, Step
-from .wiring import Prior, SensorFilter
+from ..updates.door import stackable
+from .base import Filter
+from .inbox import Heard
+from .inputs import members_of
+from .record import Summary
+from .saving import SensorState
+from .step import Step, guarded
 
 __all__ = ["EnsembleFilter", "EnsembleState"]
 
+Several = Annotated[int, Bounds(at_least=2)]
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class EnsembleState(SensorState):
     """What the agents' ensembles are between two steps.
 
     Parameters
     ----------
-    t, ledger, rng
-        As for :class:`~distfilt.filters.State`.
+    t, ledger, rng, refused, failed, waiting
+        As for :class:`~distfilt.filters.SensorState`.
     ensembles : ndarray, (*runs, A, N, d)
         Every agent's members.
     history : tuple of (float, ndarray)
         Earlier times and their ensembles, oldest first, conditioned on all that came since.
-    failed : ndarray of bool, (*runs)
-        Runs that failed and are no longer updated.
 
     Examples
     --------
@@ -57,12 +56,6 @@ class EnsembleState(SensorState):
     ensembles: Array
 
     _belief = "ensembles", (..., "A", "N", "d")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        generator(self.rng)
-        for _, earlier in self.history:
-            array(earlier, "history", self.ensembles.shape)
 
     @property
     def agents(self) -> int:
@@ -81,7 +74,7 @@ class EnsembleState(SensorState):
 
 
 @dataclass(frozen=True, eq=False)
-class EnsembleFilter(SensorFilter):
+class EnsembleFilter(Filter):
     """One ensemble per agent; agents share observations and agree with each other.
 
     In every step each agent moves its members with the model, sends its observation to those that
@@ -90,8 +83,8 @@ class EnsembleFilter(SensorFilter):
 
     Parameters
     ----------
-    model, sensors, graph, agreement, share, faults, lag, names, failures
-        As for :class:`~distfilt.filters.SensorFilter`. The agreement is a function
+    model, sensors, graph, agreement, share, faults, lag, names, failures, gate, every
+        As for :class:`~distfilt.filters.Filter`. The agreement is a function
         ``agreement(ensembles, channel) -> ensembles``, such as ``partial(pull, gain=0.05)``.
     update : callable
         ``update(ensemble, predicted, observed, noise, *, rng) -> ensemble``; one of
@@ -113,15 +106,15 @@ class EnsembleFilter(SensorFilter):
     array([0.7, 0.7])
     """
 
-    update: Update = field(default=known_noise, kw_only=True)
-    forecast: Callable[..., Array] = field(default=sampled_forecast, kw_only=True)
-    members: int = field(default=100, kw_only=True)
+    _: KW_ONLY
+    update: Callable[..., Array] = known_noise
+    forecast: Callable[..., Array] = sampled_forecast
+    members: Several = 100
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        callable_(self.update, "update")
-        callable_(self.forecast, "forecast")
-        count(self.members, "members", at_least=2)
+    state: ClassVar[type[EnsembleState]] = EnsembleState
+    draws: ClassVar[bool] = True
+    changes: ClassVar[bool] = True
+    fuses: ClassVar[str] = "ensembles"
 
     @classmethod
     def exact(
@@ -156,61 +149,27 @@ class EnsembleFilter(SensorFilter):
             own["agreement"] = partial(intersection, rule="min_determinant")
         return cls(model, sensors, graph, **(own | options))
 
-    def start(
-        self, prior: Prior, *, rng: np.random.Generator, runs: tuple[int, ...] = (), t: float = 0.0
-    ) -> EnsembleState:
-        """The state before the first step.
+    def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+        """Members drawn for each agent."""
+        lead = (*runs, self.count)
+        return {"ensembles": members_of(prior, self.members, lead, self.model.dim, rng)}
 
-        Parameters
-        ----------
-        prior : tuple, array_like or callable
-            A Gaussian's ``(mean, cov)``, (d,) and (d, d); members (N, d) for every agent and run,
-            or (*runs, A, N, d); or a function ``prior(members, rng=rng, leading=leading)`` that
-            draws (*leading, N, d).
-        rng : numpy.random.Generator
-            Draws the prior; a child stream of it, independent of whatever else is drawn from it,
-            serves all later steps.
-        runs : tuple of int
-            Leading axes: independent runs.
-        t : float
-            The time of the prior, in s.
-        """
-        return self.first(EnsembleState, t, rng, self.drawn(prior, self.members, runs, rng))
+    def fits(self, state: Any) -> None:
+        """Refuse a state of other sizes."""
+        super().fits(state)
+        same_sizes(state.ensembles, self)
 
-    def step(
-        self, state: EnsembleState, t: float, observations: Sequence[ArrayLike | None], *,
-        late: Sequence[Late] = (),
-    ) -> EnsembleState:
-        """Move to time `t` and take in what was observed there.
-
-        Parameters
-        ----------
-        state : EnsembleState
-            Not changed.
-        t : float
-            The new time, after the state's.
-        observations : sequence of length A
-            Per agent (*runs, m) or (m,), or None. NaN marks a missing component, run by run.
-        late : sequence of Late
-            Observations of earlier times that arrive now; needs a `lag` that reaches back to them.
-
-        Raises
-        ------
-        ValueError
-            If `t` is not later, or an observation does not fit its sensor or no earlier state is
-            kept for a late one.
-        FilterError
-            If a run fails; see `failures`.
-        """
-        sizes = self.members, self.model.dim
-        step = self.begin(state, EnsembleState, t, observations, late, sizes)
-        moved = self.forecast(state.ensembles, self.model, state.t, step.dt, rng=step.rng)
-        moved = array(moved, "forecast", state.ensembles.shape, finite=False)
-        stack = step.stack(step.moved(moved, state.ensembles, 2))
+    def advance(self, step: Step) -> Any:
+        """Forecast, condition on what was heard, agree."""
+        state, now = step.state, step.state.ensembles
+        if step.dt:
+            now = unchecked(self.forecast)(now, self.model, state.t, step.dt, rng=step.rng)
+            now = array(now, "forecast", state.ensembles.shape, finite=False)
+        stack = step.stack(step.moved(now, state.ensembles, 2))
         for place, group in step.heard():
             step.settle(self._condition(stack, place, group, step), group.agents)
         (now,) = step.agreed(stack[-1])
-        return step.end(EnsembleState, now, history=zip(step.times, stack[:-1], strict=True))
+        return step.end(ensembles=now, past=stack[:-1])
 
     def summary(self, state: EnsembleState) -> Summary:
         """Ensemble means and variances; the members for the scores."""
@@ -220,22 +179,23 @@ class EnsembleFilter(SensorFilter):
         self, stack: list[Array], place: int, group: Heard, step: Step
     ) -> dict[tuple[int, ...], str]:
         """Condition every time's ensembles of a group's agents, in place; the rows that failed."""
-        rows = group.agents
-        members = tuple(e[..., rows, :, :] for e in stack)
+        rows = group.rows
+        members = tuple([e[..., rows, :, :] for e in stack])
         before = step.before(place, rows)
         predicted = group.predict(members[place], before)
-        repredicts = getattr(self.update, "repredicts", False) and len(stack) == 1
+        group = step.gated(group, partial(sample_moments, predicted))
+        again = getattr(self.update, "repredicts", False)
 
         def compute(h: Array, y: Array, *rest: Any) -> tuple[Array, ...]:
             *ensembles, noise, source = rest
             options: dict[str, Any] = {}
-            if repredicts and h.shape == predicted.shape:
+            if again and len(stack) == 1 and h.shape == predicted.shape:
                 options["predict"] = lambda x: group.predict(x, before)
             # Every time's members meet the same draw of the noise, so that all the separate
             # updates are one joint update; the last one advances the generator.
             sources = [copy.deepcopy(source) for _ in ensembles[1:]] + [source]
             both = zip(ensembles, sources, strict=True)
-            return tuple(self._updated(x, h, y, noise, own, options) for x, own in both)
+            return tuple([self._updated(x, h, y, noise, own, options) for x, own in both])
 
         result, errors = guarded(
             compute, (predicted, group.target, *members), members, group.target.ndim - 1,
@@ -264,9 +224,22 @@ class EnsembleFilter(SensorFilter):
         return out
 
 
+def same_sizes(belief: Array, filter_: Any) -> None:
+    """Refuse a state whose members are more, fewer or longer than the filter's."""
+    needed = filter_.members, filter_.model.dim
+    if belief.shape[-2:] != needed:
+        raise ValueError(f"state: needs {needed} for each agent, got {belief.shape[-2:]}")
+
+
+def sample_moments(members: Array) -> tuple[Array, Array]:
+    """Mean and covariance of predictions (..., N, M); NaN where some member cannot be seen."""
+    return members.mean(axis=-2), unchecked(moments.sample_covariance)(members)
+
+
 def ensemble_summary(state: EnsembleState) -> Summary:
     """Means and variances of the agents' ensembles, and the members for the scores."""
-    x = instance(state, "state", EnsembleState).ensembles
-    squares = moments.mean(moments.anomalies(x) ** 2)
-    variance = squares * state.members / (state.members - 1)
-    return Summary(state.shown(moments.mean(x)), state.shown(variance), members=x)
+    x = state.ensembles
+    mean = unchecked(moments.mean)(x)
+    variance = unchecked(moments.mean)((x - mean[..., None, :]) ** 2)
+    variance = variance * (state.members / (state.members - 1))
+    return Summary(state.shown(mean), state.shown(variance), members=x)

@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Self
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..checks import Array, array, choice, count, covariance, instance, number
-from ..linalg import _symmetrise
-from .driver import Late, Summary
-from .failures import guarded
-from .heard import Heard
-from .stepping import SensorState, Step
-from .wiring import SensorFilter
+from ..doors import Array, Count, NonNegative, Positive, unchecked
+from ..gaussians import conditioned
+from ..gaussians.points import unscented_points
+from ..linalg import symmetrise
+from .base import Filter
+from .inbox import Heard
+from .inputs import moments_of
+from .record import Summary
+from .saving import SensorState
+from .step import Step, guarded
 
 __all__ = ["GaussianFilter", "GaussianState"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class GaussianState(SensorState):
     """What the agents believe between two steps.
 
     Parameters
     ----------
-    t, ledger, rng
-        As for :class:`~distfilt.filters.State`; `rng` is None, as nothing is drawn.
+    t, ledger, rng, refused, failed, waiting
+        As for :class:`~distfilt.filters.SensorState`; `rng` is None, as nothing is drawn.
     joint_means : ndarray, (*runs, A, D)
         Means of the present state and of the kept earlier ones, latest first: D = d (1 + kept).
     joint_covariances : ndarray, (*runs, A, D, D)
@@ -36,8 +38,6 @@ class GaussianState(SensorState):
         Size d of one state.
     history : tuple of float
         The earlier times, latest first.
-    failed : ndarray of bool, (*runs)
-        Runs that failed and are no longer updated.
 
     Examples
     --------
@@ -49,16 +49,18 @@ class GaussianState(SensorState):
 
     joint_means: Array
     joint_covariances: Array
-    dim: int
+    dim: Count
 
     _belief = "joint_means", (..., "A", "D")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        size = count(self.dim, "dim") * (1 + len(self.history))
-        m = array(self.joint_means, "joint_means", (..., "A", size))
-        p = array(self.joint_covariances, "joint_covariances", (*m.shape, size))
-        covariance(p, "joint_covariances", semidefinite=True)
+        m, size = self.joint_means.shape, self.dim * (1 + len(self.history))
+        if m[-1] != size:
+            raise ValueError(f"joint_means: needs {size} components, got {m[-1]}")
+        if self.joint_covariances.shape != (*m, size):
+            got = self.joint_covariances.shape
+            raise ValueError(f"joint_covariances: needs shape {(*m, size)}, got {got}")
 
     @property
     def times(self) -> tuple[float, ...]:
@@ -71,7 +73,7 @@ class GaussianState(SensorState):
         m, p, d = self.joint_means, self.joint_covariances, self.dim
         own = [slice(k * d, (k + 1) * d) for k in range(len(self.history), 0, -1)]
         return tuple(
-            replace(self, t=t, history=(), joint_means=m[..., k], joint_covariances=p[..., k, k])
+            self.changed(t=t, history=(), joint_means=m[..., k], joint_covariances=p[..., k, k])
             for t, k in zip(self.times, own, strict=True)
         )
 
@@ -87,13 +89,13 @@ class GaussianState(SensorState):
 
 
 @dataclass(frozen=True, eq=False)
-class GaussianFilter(SensorFilter):
+class GaussianFilter(Filter):
     """One Kalman filter per agent; for a linear model and linear sensors it is exact.
 
     Parameters
     ----------
-    model, sensors, graph, agreement, share, faults, lag, names, failures
-        As for :class:`~distfilt.filters.SensorFilter`. The agreement is a function
+    model, sensors, graph, agreement, share, faults, lag, names, failures, gate, every
+        As for :class:`~distfilt.filters.Filter`. The agreement is a function
         ``agreement((means, covs), channel) -> (means, covs)``, such as
         :func:`distfilt.network.covariance_intersection`.
     rule : {"extended", "unscented"}
@@ -102,6 +104,8 @@ class GaussianFilter(SensorFilter):
     kappa : float
         The unscented points lie :math:`\\sqrt{d+\\kappa}` standard deviations from the mean, at
         least 0, so that no weight is negative.
+    inflation : float
+        What the forecast's standard deviations are multiplied by.
 
     Examples
     --------
@@ -115,115 +119,100 @@ class GaussianFilter(SensorFilter):
     array([1.429, 1.429])
     """
 
-    rule: str = field(default="extended", kw_only=True)
-    kappa: float = field(default=1.0, kw_only=True)
+    _: KW_ONLY
+    rule: Literal["extended", "unscented"] = "extended"
+    kappa: NonNegative = 1.0
+    inflation: Positive = 1.0
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        choice(self.rule, "rule", ("extended", "unscented"))
-        number(self.kappa, "kappa", at_least=0)
-        if any(s is not None and s.uses_previous for s in self.sensors):
-            raise ValueError("sensors: needs sensors of the present state, got a differential one")
+    state: ClassVar[type[GaussianState]] = GaussianState
+    fuses: ClassVar[str] = "gaussians"
 
-    def start(
-        self, prior: tuple[ArrayLike, ArrayLike], *, rng: np.random.Generator | None = None,
-        runs: tuple[int, ...] = (), t: float = 0.0,
-    ) -> GaussianState:
-        """The state before the first step.
+    def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+        """The prior's mean and covariance, the same for all agents and runs."""
+        d = self.model.dim
+        both = moments_of(prior, d)
+        m, p = (np.broadcast_to(x, (*runs, self.count, *x.shape)).copy() for x in both)
+        return {"joint_means": m, "joint_covariances": p, "dim": d}
 
-        Parameters
-        ----------
-        prior : tuple
-            ``(mean, cov)``, (d,) and (d, d), the same for all agents and runs.
-        rng, runs, t
-            As for :meth:`distfilt.filters.EnsembleFilter.start`; the generator is not needed, as
-            nothing is drawn.
-        """
-        lead, both = self.leading(runs), self.moments(prior)
-        m, p = (np.broadcast_to(x, (*lead, *x.shape)).copy() for x in both)
-        return self.first(GaussianState, t, rng, m, p, self.model.dim, draws=False)
+    def fits(self, state: Any) -> None:
+        """Refuse a state of other sizes."""
+        super().fits(state)
+        if state.dim != self.model.dim:
+            raise ValueError(f"state: needs {self.model.dim} components, got {state.dim}")
 
-    def step(
-        self, state: GaussianState, t: float, observations: Sequence[ArrayLike | None], *,
-        late: Sequence[Late] = (),
-    ) -> GaussianState:
-        """Move to time `t` and take in what was observed there.
-
-        Parameters
-        ----------
-        state, t, observations, late
-            As for :meth:`distfilt.filters.EnsembleFilter.step`.
-        """
-        step = self.begin(state, GaussianState, t, observations, late)
-        means, covs = self._forecast(state, step.dt, len(step.times))
+    def advance(self, step: Step) -> Any:
+        """Forecast, condition on what was heard, fuse."""
+        means, covs = self._forecast(step)
         means = step.moved(means, 0.0, 1)
         covs = step.kept(covs, np.eye(means.shape[-1]))
         for place, group in step.heard():
             slot = len(step.times) - place
-            step.settle(self._condition(means, covs, slot, group), group.agents)
+            step.settle(self._condition(means, covs, slot, group, step), group.agents)
         if step.agrees:
             means, covs = self._agreed(means, covs, step)
-        covs = _symmetrise(covs)
-        return step.end(GaussianState, means, covs, state.dim, history=reversed(step.times))
+        covs, past = symmetrise(covs), step.times[::-1]
+        return step.end(joint_means=means, joint_covariances=covs, dim=step.state.dim, history=past)
 
     def summary(self, state: GaussianState) -> Summary:
         """Means and covariances of the present state."""
-        cov = instance(state, "state", GaussianState).shown(state.covariances)
+        cov = state.shown(state.covariances)
         return Summary(state.shown(state.means), np.diagonal(cov, axis1=-2, axis2=-1), cov)
 
-    def _forecast(self, state: GaussianState, dt: float, kept: int) -> tuple[Array, Array]:
-        """Joint mean and covariance of the moved state and of `kept` earlier ones."""
-        d, model = state.dim, self.model
+    def _forecast(self, step: Step) -> tuple[Array, Array]:
+        """Joint mean and covariance of the moved state and of the earlier ones that are kept."""
+        state, model, dt = step.state, self.model, step.dt
+        if not dt:
+            return state.joint_means.copy(), state.joint_covariances.copy()
+        d, kept = state.dim, len(step.times)
+        flow, derivative = unchecked(model.step), unchecked(model.jacobian)
         moved, slope, extra = self._linearised(
-            lambda x: model.step(x, state.t, dt), lambda x: model.jacobian(x, state.t, dt),
+            lambda x: flow(x, state.t, dt), lambda x: derivative(x, state.t, dt),
             state.means, state.covariances,
         )
         old = state.joint_means[..., : kept * d]
-        shift = np.zeros((*slope.shape[:-2], (1 + kept) * d, state.joint_means.shape[-1]))
+        shift = np.zeros((*moved.shape[:-1], (1 + kept) * d, state.joint_means.shape[-1]))
         shift[..., :d, :d] = slope
         shift[..., d:, : kept * d] = np.eye(kept * d)
         covs = shift @ state.joint_covariances @ shift.mT
-        covs[..., :d, :d] += model.noise(state.t, dt) + extra
+        covs[..., :d, :d] += unchecked(model.noise)(state.t, dt) + extra
+        if self.inflation != 1.0:
+            covs[..., :d, :] *= self.inflation
+            covs[..., :, :d] *= self.inflation
         return np.concatenate([moved, old], axis=-1), covs
 
     def _linearised(
         self, function: Callable[[Array], Array], jacobian: Callable[[Array], Array], mean: Array,
         cov: Array,
-    ) -> tuple[Array, Array, Array]:
+    ) -> tuple[Array, Array, Array | float]:
         """Value, slope and extra covariance of a function of a Gaussian (..., d)."""
         if self.rule == "extended":
-            slope = jacobian(mean)
-            at = function(mean[..., None, :])[..., 0, :]
-            return at, slope, np.zeros((*slope.shape[:-1], slope.shape[-2]))
-        d = mean.shape[-1]
-        root = np.linalg.cholesky((d + self.kappa) * cov)
-        moves = np.concatenate([root, -root], axis=-1).mT
-        points = mean[..., None, :] + np.concatenate([0 * moves[..., :1, :], moves], axis=-2)
-        w = np.full(2 * d + 1, 0.5 / (d + self.kappa))
-        w[0] = self.kappa / (d + self.kappa)
+            return function(mean[..., None, :])[..., 0, :], jacobian(mean), 0.0
+        root = np.asarray(np.linalg.cholesky(cov))
+        points, w = unchecked(unscented_points)(mean, root, kappa=self.kappa)
         values = function(points)
         at = w @ values
         gap = values - at[..., None, :]
         weighed = (w[:, None] * gap).mT
-        slope = np.linalg.solve(cov, (weighed @ (points - mean[..., None, :])).mT).mT
+        slope = np.asarray(np.linalg.solve(cov, (weighed @ (points - mean[..., None, :])).mT)).mT
         return at, slope, weighed @ gap - slope @ cov @ slope.mT
 
     def _condition(
-        self, means: Array, covs: Array, slot: int, group: Heard
+        self, means: Array, covs: Array, slot: int, group: Heard, step: Step
     ) -> dict[tuple[int, ...], str]:
         """Condition a group's joint Gaussians in place; the rows that failed."""
-        d, rows = self.model.dim, group.agents
+        d, rows = self.model.dim, group.rows
         here = slice(slot * d, (slot + 1) * d)
         m, p = means[..., rows, :], covs[..., rows, :, :]
         at, slope, extra = self._linearised(
             group.predict, group.jacobian, m[..., here], p[..., here, here]
         )
+        group = step.gated(group, lambda: (at, slope @ p[..., here, here] @ slope.mT + extra))
         big = np.zeros((*slope.shape[:-1], m.shape[-1]))
         big[..., here] = slope
+        noise = np.broadcast_to(group.noise + extra, (*big.shape[:-1], big.shape[-2]))
         (m, p), errors = guarded(
-            lambda m, p, gap, big, extra, noise, _: _updated(m, p, gap, big, noise + extra),
-            (m, p, group.target - at, big, extra), (m, p), group.target.ndim - 1,
-            shared=group.noise, rng=None,
+            lambda m, p, gap, big, noise, *_: unchecked(conditioned)(m, p, gap, big, noise),
+            (m, p, group.target - at, big, noise), (m, p), group.target.ndim - 1, shared=_NONE,
         )
         means[..., rows, :], covs[..., rows, :, :] = m, p
         return errors
@@ -231,7 +220,7 @@ class GaussianFilter(SensorFilter):
     def _agreed(self, means: Array, covs: Array, step: Step) -> tuple[Array, Array]:
         """Fuse the present states; what is believed of the past follows by its regression."""
         d = self.model.dim
-        old, now = means[..., :d], _symmetrise(covs[..., :d, :d])
+        old, now = means[..., :d], symmetrise(covs[..., :d, :d])
         m, p = step.agreed(old, now)
         if means.shape[-1] == d:
             return m, p
@@ -240,16 +229,4 @@ class GaussianFilter(SensorFilter):
         return moved, covs + gain @ (p - now) @ gain.mT
 
 
-def _updated(m: Array, p: Array, gap: Array, h: Array, r: Array) -> tuple[Array, Array]:
-    """One linear update in Joseph's form; NaN in the innovation leaves its reading out."""
-    missing = np.isnan(gap)
-    if missing.any():
-        h = np.where(missing[..., None], 0.0, h)
-        here = ~missing[..., :, None] & ~missing[..., None, :]
-        r = np.where(here, r, np.eye(r.shape[-1]))
-        gap = np.where(missing, 0.0, gap)
-    cross = p @ h.mT
-    gain = np.linalg.solve(h @ cross + r, cross.mT).mT
-    rest = np.eye(p.shape[-1]) - gain @ h
-    new = rest @ p @ rest.mT + gain @ r @ gain.mT
-    return m + (gain @ gap[..., None])[..., 0], _symmetrise(new)
+_NONE = np.zeros((0, 0))

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import KW_ONLY, dataclass
-from typing import Any, Literal
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
+from scipy.special import gammaincinv
 
-from ..checks import Array, array, choice, count, instance, number, same_length
-from ..doors import unchecked
+from ..doors import Array, Bounds, Count, unchecked
 from ..mixtures import (
     GaussianMixture,
     conditioned,
@@ -20,43 +20,47 @@ from ..mixtures import (
     within_gate,
 )
 from ..models import Model
-from ..network import Channel, Faults, Graph, Ledger
-from ..sensors import Sensor
-from .driver import Summary, TeamFilter, described
-from .observations import at_one_time
+from .base import Filter, described
+from .inputs import Said, mixture_of, priors_of
+from .record import Summary
 from .saving import State
+from .step import Step
 
 __all__ = ["MixtureFilter", "MixtureState"]
 
-Agreement = Callable[[GaussianMixture, Sequence[GaussianMixture]], GaussianMixture]
 _EXACT = 400
 """Up to how many mixands every pair is a candidate for a merger."""
 
+_ALONE = "one run at a time: mixtures of several runs differ in size"
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class MixtureState(State):
     """What the agents believe between two steps.
 
     Parameters
     ----------
-    t, ledger, rng
+    t, ledger, rng, refused
         As for :class:`~distfilt.filters.State`; `rng` is None, as nothing is drawn.
     mixtures : tuple of GaussianMixture
         One for each agent, over its own state [target; ego].
+    untold : tuple of (GaussianMixture or None)
+        What each agent would believe without the readings that it has not told yet; None where
+        there are none. For :class:`NewsFilter`.
 
     Examples
     --------
+    >>> from distfilt.network import Ledger
     >>> belief = GaussianMixture.gaussian([0.0], [[1.0]])
     >>> MixtureState(0.0, Ledger.empty(1), None, (belief,)).mixtures[0].size
     1
     """
 
     mixtures: tuple[GaussianMixture, ...] = ()
+    untold: tuple[GaussianMixture | None, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for belief in self.mixtures:
-            instance(belief, "mixtures", GaussianMixture)
         if len(self.mixtures) != self.ledger.messages.size:
             raise ValueError(
                 f"mixtures: needs {self.ledger.messages.size} like the ledger, "
@@ -65,7 +69,7 @@ class MixtureState(State):
 
 
 @dataclass(frozen=True, eq=False)
-class MixtureFilter(TeamFilter):
+class MixtureFilter(Filter):
     """Every agent holds a mixture over [target; its own state]; only target marginals travel.
 
     In a step an agent splits the mixands that its model stretches most, forecasts all of them,
@@ -76,16 +80,16 @@ class MixtureFilter(TeamFilter):
 
     Parameters
     ----------
-    models : sequence of Model, length A
-        How each agent's [target; ego] moves.
-    sensors : sequence of Sensor or None, length A
-        What each agent sees of its own state. NaN marks a missing component of a reading.
-    graph : Graph, or callable t -> Graph, optional
-        Who hears whom; without one nobody speaks.
+    model : Model or sequence of Model, length A
+        How each agent's [target; ego] moves; one for all where they are alike.
+    sensors, graph, faults, names, gate, every
+        As for :class:`~distfilt.filters.Filter`; without a graph nobody speaks. Agents' states
+        differ, so that readings stay with their agents and one run is filtered at a time.
+    agreement : callable, optional
+        ``agreement(beliefs, channel) -> beliefs`` of the agents' mixtures, such as
+        ``partial(target_fusion, target_dim=6)`` of :mod:`distfilt.mixtures`.
     target_dim : int
         How many components, the first of every state, are the target's.
-    agreement : callable, optional
-        ``agreement(own, heard) -> mixture``, such as :func:`distfilt.mixtures.fuse`.
     size : int
         How many mixands an agent keeps after a step.
     most : int
@@ -96,127 +100,81 @@ class MixtureFilter(TeamFilter):
         What each component is multiplied by before lengths are compared, the same for all agents.
     rule : {"dd2", "unscented"}
         How points stand for a mixand.
-    gate : float, optional
-        Leave a reading out if it is farther than so many standard deviations from every mixand.
-    faults : Faults, optional
-        How the channel fails.
-    names : sequence of str
-        Names of the agents.
 
     Examples
     --------
-    >>> from distfilt.mixtures import fuse
+    >>> from functools import partial
+    >>> from distfilt.mixtures import target_fusion
     >>> from distfilt.network import graphs
     >>> from distfilt.sensors import direct
     >>> still = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
-    >>> f = MixtureFilter([still, still], [direct([0], std=1.0), None], graphs.path(2),
-    ...                   target_dim=1, agreement=fuse)
+    >>> f = MixtureFilter(still, [direct([0], std=1.0), None], graphs.path(2),
+    ...                   target_dim=1, agreement=partial(target_fusion, target_dim=1))
     >>> prior = GaussianMixture.gaussian([0.0, 0.0], [[1.0, 0.5], [0.5, 1.0]])
     >>> after = f.step(f.start([prior, prior]), 1.0, [[2.0], None])
     >>> after.mixtures[1].means.round(4), after.ledger.scalars
     (array([[0.6667, 0.3333]]), array([3, 3]))
     """
 
-    models: Sequence[Model]
-    sensors: Sequence[Sensor | None]
-    graph: Graph | Callable[[float], Graph] | None = None
     _: KW_ONLY
-    target_dim: int
-    agreement: Agreement | None = None
-    size: int = 12
-    most: int = 12
-    stretch: float | None = None
-    scale: Any = None
+    share: bool = False
+    target_dim: Count
+    size: Count = 12
+    most: Count = 12
+    stretch: Annotated[float, Bounds(above=0, at_most=1e150)] | None = None
+    scale: Annotated[Array, "d"] | None = None
     rule: Literal["dd2", "unscented"] = "dd2"
-    gate: float | None = None
-    faults: Faults | None = None
-    names: Sequence[str] = ()
 
-    def __post_init__(self) -> None:
-        same_length(self.sensors, self.models, "sensors", "models")
-        object.__setattr__(self, "models", tuple(self.models))
-        object.__setattr__(self, "sensors", tuple(self.sensors))
-        count(len(self.models), "models")
-        n = count(self.target_dim, "target_dim")
+    state: ClassVar[type[MixtureState]] = MixtureState
+    batched: ClassVar[bool] = False
+    alone: ClassVar[bool] = True
+    fuses: ClassVar[str | None] = "mixtures"
+    unused: ClassVar[dict[str, str]] = {
+        "share": "agents' own states differ, so that their readings stay with them",
+        "lag": "a mixture filter keeps no past",
+        "failures": _ALONE,
+    }
+
+    def check_parts(self) -> None:
+        """Refuse models that are none, or smaller than the target."""
         for model in self.models:
-            if instance(model, "models", Model).dim < n:
-                raise ValueError(f"models: needs at least {n} components, got {model.dim}")
-            if self.scale is not None:
-                scale = array(self.scale, "scale", (model.dim,)).copy()
-                object.__setattr__(self, "scale", scale)
-        for sensor in self.sensors:
-            if sensor is not None and instance(sensor, "sensors", Sensor).uses_previous:
-                raise ValueError("sensors: needs sensors of the present state, got a differential")
+            if not isinstance(model, Model):
+                raise ValueError(f"model: needs a Model, got {type(model).__name__}")
+            if model.dim < self.target_dim:
+                raise ValueError(f"model: needs {self.target_dim} components, got {model.dim}")
+            if self.scale is not None and self.scale.size != model.dim:
+                raise ValueError(f"scale: needs {model.dim} numbers, got {self.scale.size}")
         self.check_network()
+        if len(self.models) != self.count:
+            raise ValueError(f"model: needs one for all or {self.count}, got {len(self.models)}")
         if self.agreement is not None and self.graph is None:
             raise ValueError("graph: needs a Graph for the agreement, got None")
-        count(self.most, "most", at_least=count(self.size, "size"))
-        choice(self.rule, "rule", ("dd2", "unscented"))
-        for name in ("stretch", "gate"):
-            if getattr(self, name) is not None:
-                number(getattr(self, name), name, above=0, at_most=1e150)
+        Bounds(at_least=self.size)(self.most, "most")
 
-    @property
-    def count(self) -> int:
-        """Number A of agents."""
-        return len(self.models)
+    @cached_property
+    def models(self) -> tuple[Model, ...]:
+        """Each agent's model."""
+        given = self.model
+        return tuple(given) if isinstance(given, Sequence) else (given,) * len(self.sensors)
 
     @property
     def components(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Names and units of the components, those of the largest state."""
         return described(max(self.models, key=lambda m: m.dim))
 
-    def start(
-        self, prior: Sequence[GaussianMixture], *, rng: np.random.Generator | None = None,
-        runs: tuple[int, ...] = (), t: float = 0.0,
-    ) -> MixtureState:
-        """The state before the first step.
+    def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+        """A mixture for each agent."""
+        priors = priors_of(prior, self.count)
+        both = zip(priors, self.models, strict=True)
+        return {"mixtures": tuple(mixture_of(p, model.dim) for p, model in both)}
 
-        Parameters
-        ----------
-        prior : sequence of GaussianMixture, length A
-            What each agent believes of its own state.
-        rng : numpy.random.Generator, optional
-            Not used: nothing is drawn.
-        runs : tuple of int
-            Must be empty: mixtures of several runs differ in size; use `studies.run`.
-        t : float
-            The time of the prior, in s.
-        """
-        self.check_alone(rng, runs)
-        beliefs = (prior,) if isinstance(prior, GaussianMixture) else prior
-        same_length(beliefs, self.models, "prior", "models")
-        for belief, model in zip(beliefs, self.models, strict=True):
-            if instance(belief, "prior", GaussianMixture).dim != model.dim:
-                raise ValueError(f"prior: needs dimension {model.dim}, got {belief.dim}")
-        return MixtureState(number(t, "t"), Ledger.empty(len(beliefs)), None, tuple(beliefs))
-
-    def step(
-        self, state: MixtureState, t: float, observations: Sequence[ArrayLike | None]
-    ) -> MixtureState:
-        """The state at time `t`: forecast, update, exchange, fuse, reduce.
-
-        Parameters
-        ----------
-        state : MixtureState
-        t : float
-            In s, not before the state's; at the state's time nothing is forecast.
-        observations : sequence of length A
-            Per agent (m,) with NaN where a component is missing, or None.
-        """
-        now = number(t, "t", at_least=instance(state, "state", MixtureState).t)
-        seen = at_one_time(observations, self.sensors, ())
-        beliefs = [
-            self._moved(belief, model, state.t, now - state.t)
-            for belief, model in zip(state.mixtures, self.models, strict=True)
-        ]
-        channel = self.channel(state, now)
-        beliefs = self._told(beliefs, seen, channel)
-        most = max(_EXACT, self.size)
-        kept = [two_stage(belief, self.size, heaviest=most) for belief in beliefs]
-        # Without the square roots that they came with: a loaded state has to go on alike.
-        plain = tuple(m.changed() for m in kept)
-        return MixtureState(now, state.ledger if channel is None else channel.ledger, None, plain)
+    def advance(self, step: Step) -> Any:
+        """Split and forecast, condition on the own readings, exchange, fuse, reduce."""
+        beliefs = [self._moved(b, k, step) for k, b in enumerate(step.state.mixtures)]
+        after, untold = self._told(beliefs, step)
+        plain = [None if b is None else self._reduced(b) for b in (*after, *untold)]
+        size = len(after)
+        return step.end(mixtures=tuple(plain[:size]), untold=tuple(plain[size:]))
 
     def summary(self, state: MixtureState) -> Summary:
         """Means, variances and covariances of the whole mixtures, and their sizes.
@@ -224,58 +182,70 @@ class MixtureFilter(TeamFilter):
         NaN fills the rows of agents whose states are smaller.
         """
         d = max(model.dim for model in self.models)
-        mean = np.full((len(self.models), d), np.nan)
-        cov = np.full((len(self.models), d, d), np.nan)
-        for k, belief in enumerate(instance(state, "state", MixtureState).mixtures):
+        mean = np.full((self.count, d), np.nan)
+        cov = np.full((self.count, d, d), np.nan)
+        for k, belief in enumerate(state.mixtures):
             n = belief.dim
             mean[k, :n], cov[k, :n, :n] = belief.moments()
         sizes = np.array([belief.size for belief in state.mixtures], dtype=np.float64)
         variance = np.diagonal(cov, axis1=-2, axis2=-1)
         return Summary(mean, variance, cov, numbers={"mixands": sizes})
 
-    def _moved(self, belief: GaussianMixture, model: Model, t: float, dt: float) -> GaussianMixture:
+    def _moved(self, belief: GaussianMixture, agent: int, step: Step) -> GaussianMixture:
         """Split where the model stretches, then forecast every mixand."""
+        t, dt, model = step.state.t, step.dt, self.models[agent]
         if dt == 0:
             return belief
-        if self.stretch is not None:
-            belief = split_stretched(
-                belief, lambda x: model._jacobian(x, t, dt), most=self.most,
-                stretch=self.stretch, scale=self.scale,
-            )
-        return moved(belief, lambda x: model._step(x, t, dt), model._root(t, dt), rule=self.rule)
+        flow, derivative = unchecked(model.step), unchecked(model.jacobian)
+        with step.of(agent):
+            if self.stretch is not None:
+                belief = unchecked(split_stretched)(
+                    belief, lambda x: derivative(x, t, dt), most=self.most,
+                    stretch=self.stretch, scale=self.scale,
+                )
+            root = unchecked(model.root)(t, dt)
+            return unchecked(moved)(belief, lambda x: flow(x, t, dt), root, rule=self.rule)
+
+    def _reduced(self, belief: GaussianMixture) -> GaussianMixture:
+        """So many mixands as are kept, without the square roots that they came with.
+
+        A loaded state has none, and has to go on alike.
+        """
+        most = max(_EXACT, self.size)
+        return unchecked(two_stage)(belief, self.size, heaviest=most).changed()
 
     def _read(
-        self, beliefs: Sequence[GaussianMixture], seen: Sequence[Array | None]
-    ) -> list[GaussianMixture]:
-        """Each agent's belief after its own reading; one out of every gate changes nothing."""
-        out = list(beliefs)
-        for k, (belief, sensor, y) in enumerate(zip(beliefs, self.sensors, seen, strict=True)):
-            if y is not None and sensor is not None:
-                known: Any = {"residual": sensor._residual, "rule": self.rule}
-                reading = (sensor._predict, sensor.cov)
+        self, belief: GaussianMixture, agent: int, said: Sequence[Said], step: Step, *,
+        counted: bool = True,
+    ) -> GaussianMixture:  # fmt: skip
+        """An agent's belief after readings; one that fails the gate changes nothing."""
+        for sensor, y, *_ in said:
+            about: Any = unchecked(sensor.predict), sensor.cov
+            known: Any = {"residual": unchecked(sensor.residual), "rule": self.rule}
+            with step.of(agent):
                 if self.gate is not None:
-                    y = unchecked(within_gate)(belief, y, *reading, gate=self.gate, **known)
-                out[k] = unchecked(conditioned)(belief, y, *reading, **known)
-        return out
+                    width = float(np.sqrt(2 * gammaincinv((~np.isnan(y)).sum() / 2, self.gate)))
+                    y = unchecked(within_gate)(belief, y, *about, gate=width, **known)
+                belief = unchecked(conditioned)(belief, y, *about, **known)
+            if counted and step.refused is not None:
+                step.refused[agent] += np.isnan(y).all()
+        return belief
 
     def _told(
-        self, beliefs: list[GaussianMixture], seen: Sequence[Array | None], channel: Channel | None
-    ) -> list[GaussianMixture]:
-        """The beliefs after the agents' readings and their exchange."""
-        after = self._read(beliefs, seen)
-        return after if self.agreement is None or channel is None else self._agreed(after, channel)
+        self, beliefs: list[GaussianMixture], step: Step
+    ) -> tuple[Sequence[GaussianMixture], Sequence[GaussianMixture | None]]:
+        """The beliefs after the agents' readings and their exchange, and what stays untold."""
+        after = [self._read(b, k, step.said[k], step) for k, b in enumerate(beliefs)]
+        return (self._agreed(after, step) if step.agrees else after), ()
 
-    def _agreed(self, beliefs: list[GaussianMixture], channel: Channel) -> list[GaussianMixture]:
-        """Send target marginals, and fuse what arrived; who hears nothing changes nothing."""
-        part = range(self.target_dim)
-        inbox = channel.exchange([belief.marginal(part).pack() for belief in beliefs])
-        out = []
-        for belief, heard in zip(beliefs, inbox, strict=True):
-            others = [GaussianMixture.unpack(payload) for payload in heard.values()]
-            assert self.agreement is not None
-            fused: Any = self.agreement(belief, others) if others else belief
-            if instance(fused, "agreement", GaussianMixture).dim != belief.dim:
-                raise ValueError(f"agreement: needs dimension {belief.dim}, got {fused.dim}")
-            fused.factors  # a LinAlgError where the fusion has collapsed
-            out.append(fused)
+    def _agreed(self, beliefs: list[GaussianMixture], step: Step) -> list[GaussianMixture]:
+        """What the rule of agreement makes of the beliefs, each of its own dimension."""
+        assert self.agreement is not None
+        out = list(self.agreement(beliefs, step.channel))
+        for k, (fused, belief) in enumerate(zip(out, beliefs, strict=True)):
+            if not isinstance(fused, GaussianMixture) or fused.dim != belief.dim:
+                got = fused.dim if isinstance(fused, GaussianMixture) else type(fused).__name__
+                raise ValueError(f"agreement: needs dimension {belief.dim}, got {got}")
+            with step.of(k):
+                fused.factors  # noqa: B018  # a LinAlgError where the fusion has collapsed
         return out

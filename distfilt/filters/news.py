@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
+from typing import ClassVar
 
 import numpy as np
 
-from ..checks import Array, count, instance
+from ..doors import Array, Count, Index, door
 from ..mixtures import GaussianMixture, conditioned
-from ..network import Channel
+from .inputs import Said
 from .mixture import MixtureFilter
+from .step import Step
 
 __all__ = ["NewsFilter", "increment"]
 
@@ -18,6 +20,7 @@ _NOTHING = 1e-6
 """A gain in information, as a share of what was there before, below which nothing was learned."""
 
 
+@door
 def increment(before: GaussianMixture, after: GaussianMixture) -> Array:
     r"""What a belief has gained, as readings of unit noise that would have taught the same.
 
@@ -45,8 +48,7 @@ def increment(before: GaussianMixture, after: GaussianMixture) -> Array:
     >>> np.abs(increment(old, new))
     array([[1., 0., 2.]])
     """
-    one = instance(before, "before", GaussianMixture).collapsed()
-    two = instance(after, "after", GaussianMixture).collapsed()
+    one, two = before.collapsed(), after.collapsed()
     if one.dim != two.dim:
         raise ValueError(f"after: needs dimension {one.dim}, got {two.dim}")
     # In the frame in which the old covariance is the identity.
@@ -74,8 +76,10 @@ class NewsFilter(MixtureFilter):
 
     Parameters
     ----------
-    models, sensors, graph, target_dim, stretch, scale, rule, gate, faults, names
-        As of :class:`MixtureFilter`; a `graph` is needed and an `agreement` is not taken.
+    model, sensors, graph, target_dim, stretch, scale, rule, gate, every, faults, names
+        As of :class:`MixtureFilter`; a `graph` is needed and an `agreement` is not taken. What was
+        learned while nobody could be told, for want of links or because it was not time (`every`),
+        is told at the next contact; where the target's motion has noise, that is an approximation.
     size, most : int
         As there. With more than one mixand the moments' news are told, which is an approximation.
     common : sequence of int
@@ -89,7 +93,7 @@ class NewsFilter(MixtureFilter):
     >>> from distfilt.network import graphs
     >>> from distfilt.sensors import direct
     >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-    >>> f = NewsFilter([still, still], [direct([0], std=1.0)] * 2, graphs.path(2), target_dim=1)
+    >>> f = NewsFilter(still, [direct([0], std=1.0)] * 2, graphs.path(2), target_dim=1)
     >>> prior = GaussianMixture.gaussian([0.0], [[1.0]])
     >>> after = f.step(f.start([prior, prior]), 1.0, [[3.0], [0.0]])
     >>> [float(m.means[0, 0].round(9)) for m in after.mixtures], after.ledger.scalars
@@ -97,50 +101,77 @@ class NewsFilter(MixtureFilter):
     """
 
     _: KW_ONLY
-    size: int = 1
-    most: int = 1
-    common: Sequence[int] = ()
+    size: Count = 1
+    most: Count = 1
+    common: Sequence[Index] = ()
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.agreement is not None:
-            raise ValueError("agreement: needs None, since news are added, got one")
+    fuses: ClassVar[None] = None
+    unused: ClassVar[dict[str, str]] = {
+        **MixtureFilter.unused, "agreement": "news are added, so that there is nothing to agree on"
+    }
+
+    def check_parts(self) -> None:
+        """Refuse what there is no news of."""
+        super().check_parts()
         if self.graph is None:
             raise ValueError("graph: needs a Graph, got None")
-        least = min((s.dim for s in self.sensors if s is not None), default=0)
-        instance(self.common, "common", Collection)  # type: ignore[type-abstract]
-        alike = tuple(count(k, "common", at_least=0) for k in self.common)
-        if alike and max(alike) >= least:
-            raise ValueError(f"common: needs components below {least}, got {max(alike)}")
-        object.__setattr__(self, "common", alike)
+        least = min((s.dim for own in self.team(0.0) for s in own), default=0)
+        if self.common and max(self.common) >= least:
+            raise ValueError(f"common: needs components below {least}, got {max(self.common)}")
 
     def _told(
-        self, beliefs: list[GaussianMixture], seen: Sequence[Array | None], channel: Channel | None
-    ) -> list[GaussianMixture]:
+        self, beliefs: list[GaussianMixture], step: Step
+    ) -> tuple[Sequence[GaussianMixture], Sequence[GaussianMixture | None]]:
         """Own readings, then others' news, then what all received alike."""
-        own, alike = self._parted(seen)
-        after = self._read(beliefs, own)
-        part = range(self.target_dim)
-        said = [
-            None if old is new else increment(old.marginal(part), new.marginal(part))
-            for old, new in zip(beliefs, after, strict=True)
+        own, alike = zip(*(self._parted(said) for said in step.said), strict=True)
+        after = [self._read(b, k, own[k], step) for k, b in enumerate(beliefs)]
+        # What an agent would believe without what it has not told: from before the readings of now,
+        # or from before those that wait.
+        waiting = step.state.untold or (None,) * len(beliefs)
+        untold = [
+            (old if new is not old else None) if kept is None else self._moved(kept, k, step)
+            for k, (old, new, kept) in enumerate(zip(beliefs, after, waiting, strict=True))
         ]
-        assert channel is not None  # there is a graph
-        inbox = channel.exchange([None if s is None or not s.size else _packed(s) for s in said])
-        for k, heard in enumerate(inbox):
-            for news in heard.values():
-                after[k] = _learned(after[k], _unpacked(news, self.target_dim))
-        return self._read(after, alike)
+        if step.channel is not None:
+            self._exchanged(after, untold, step)
+        for k, said in enumerate(alike):
+            after[k] = self._read(after[k], k, said, step)
+            before = untold[k]
+            if before is not None:
+                untold[k] = self._read(before, k, said, step, counted=False)
+        return after, untold if any(before is not None for before in untold) else ()
 
-    def _parted(self, seen: Sequence[Array | None]) -> tuple[list[Array | None], ...]:
-        """Readings without and with nothing but the common components; None where none is left."""
-        own: list[Array | None] = []
-        alike: list[Array | None] = []
-        for y in seen:
-            everybody = np.isin(np.arange(0 if y is None else y.size), self.common)
+    def _exchanged(
+        self, after: list[GaussianMixture], untold: list[GaussianMixture | None], step: Step
+    ) -> None:
+        """Tell what was learned to those who listen, and learn from them, in place."""
+        channel, part = step.channel, range(self.target_dim)
+        assert channel is not None
+        said: list[Array | None] = [None] * len(after)
+        for k, listeners in enumerate(channel.graph.listeners):
+            before = untold[k]
+            if before is not None and listeners:
+                with step.of(k):
+                    news = increment(before.marginal(part), after[k].marginal(part))
+                said[k], untold[k] = (_packed(news) if news.size else None), None
+        for k, heard in enumerate(channel.exchange(said)):
+            for payload in heard.values():
+                news = _unpacked(payload, self.target_dim)
+                before = untold[k]
+                with step.of(k):
+                    after[k] = _learned(after[k], news)
+                    untold[k] = None if before is None else _learned(before, news)
+
+    def _parted(self, said: Sequence[Said]) -> tuple[list[Said], list[Said]]:
+        """Readings without and with nothing but the common components; none where none is left."""
+        own: list[Said] = []
+        alike: list[Said] = []
+        for reading in said:
+            everybody = np.isin(np.arange(reading.value.size), self.common)
             for part, gone in ((own, everybody), (alike, ~everybody)):
-                left = None if y is None else np.where(gone, np.nan, y)
-                part.append(None if left is None or np.isnan(left).all() else left)
+                left = np.where(gone, np.nan, reading.value)
+                if not np.isnan(left).all():
+                    part.append(reading._replace(value=left))
         return own, alike
 
 

@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import TYPE_CHECKING, Any
+import os
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..checks import Array, array, choice, instance
+from ..doors import Array, array
+from ..ensembles import sample_covariance
 from ..metrics import crps, ensemble_nees, gaussian_crps, nees
+from .saving import State
 
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["SCORES", "Recorder"]
+__all__ = ["SCORES", "Recorder", "Score", "Summary", "final_state", "shown"]
 
-SCORES = ("squared_error", "nees", "crps")
+Score = Literal["squared_error", "nees", "crps"]
+SCORES: tuple[Score, ...] = ("squared_error", "nees", "crps")
 """What can be recorded beside a known truth."""
 
+_SILENT = ("TQDM_DISABLE", "CI", "PYTEST_CURRENT_TEST")
 _SENT = ("messages", "scalars", "bytes", "lost")
 
 _MEANING = {
@@ -30,6 +35,7 @@ _MEANING = {
     "total_squared_error": ("squared errors added over components, whatever their units", "mixed"),
     "crps": ("continuous ranked probability score", "of the component"),
     "nees": ("normalised estimation error squared; its mean is d for a consistent filter", "1"),
+    "refused": ("readings that the gate left out in this step", "1"),
     "messages": ("messages sent in this step", "1"),
     "scalars": ("numbers sent in this step", "1"),
     "bytes": ("bytes sent in this step", "B"),
@@ -38,55 +44,123 @@ _MEANING = {
 }
 
 
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """What a filter says of its state, for the record.
+
+    Parameters
+    ----------
+    mean, variance : ndarray, (*runs, A, d)
+        Estimates and their variances. Where agents' states differ in size, NaN fills the rest.
+    covariance : ndarray, (*runs, A, d, d), optional
+        For NEES.
+    members : ndarray, (*runs, A, N, d), optional
+        For CRPS, and for NEES where there is no covariance; without members CRPS is a Gaussian's.
+    weights : ndarray, (*runs, A, N), optional
+        The members' weights, if they differ.
+    numbers : mapping of str to ndarray, (*runs, A)
+        What else is worth a record, such as an effective sample size.
+
+    Examples
+    --------
+    >>> Summary(np.zeros((2, 3)), np.ones((2, 3))).numbers
+    {}
+    """
+
+    mean: Array
+    variance: Array
+    covariance: Array | None = None
+    members: Array | None = None
+    weights: Array | None = None
+    numbers: Mapping[str, Array] = field(default_factory=dict)
+
+
 class Recorder:
     """Collects summaries and ledgers of a run, and makes one Dataset of them.
 
-    Names and units are the filter's; `start` is the state before the first step, `truth` (T, *runs,
-    d) what the scores compare with.
+    Names and units are the filter's; `start` is the state before the first step, `truth` what the
+    scores compare with, as :meth:`distfilt.filters.Filter.run` describes it.
     """
 
     def __init__(
-        self, filter_: Any, times: Array, start: Any, truth: ArrayLike | None,
-        scores: Collection[str],
+        self, filter_: Any, times: Array, start: Any, truth: Any, scores: Collection[Score]
     ) -> None:
         self.filter, self.times = filter_, times
         self.runs: tuple[int, ...] = tuple(start.runs)
-        chosen = instance(scores, "scores", Collection)  # type: ignore[type-abstract]
-        self.scores = [choice(s, "scores", SCORES) for s in chosen]
+        self.scores = scores
         self.ledgers = [start.ledger]
         self.columns: dict[str, list[Array]] = {}
-        self.truth: Array | None = None
-        if truth is not None:
-            size = len(filter_.components[0])
-            self.truth = array(truth, "truth", (times.size, *self.runs, size))
+        self.chosen: Any = slice(None)
+        self.truth = None if truth is None else self._known(truth)
+
+    def _known(self, truth: Any) -> Array:
+        """The truth of the chosen components, (T, *runs, 1 or A, d)."""
+        names = self.filter.components[0]
+        shape, agents = (self.times.size, *self.runs), len(self.filter.agents)
+        if not isinstance(truth, Mapping):
+            x = array(truth, "truth", None, finite=False)
+            if x.shape == (*shape, len(names)):
+                return x[..., None, :]
+            return array(x, "truth", (*shape, agents, len(names)), finite=False)
+        unknown = [name for name in truth if name not in names]
+        if unknown or not truth:
+            raise ValueError(f"truth: needs components of {', '.join(names)}, got {unknown}")
+        self.chosen = [names.index(name) for name in truth]
+        parts = []
+        for name, given in truth.items():
+            x = array(given, f"truth[{name!r}]", None)
+            parts.append(x[..., None] if x.shape == shape else array(x, "truth", (*shape, agents)))
+        return np.stack(np.broadcast_arrays(*parts), axis=-1)
 
     def add(self, state: Any, summary: Any) -> None:
         """Record the next state."""
-        known = None
-        if self.truth is not None:
-            known = self.truth[len(self.ledgers) - 1][..., None, :]
+        known = None if self.truth is None else self.truth[len(self.ledgers) - 1]
         self.ledgers.append(state.ledger)
         out = {"mean": summary.mean, "variance": summary.variance}
         out["spread"] = np.sqrt(np.nansum(summary.variance, axis=-1))
         out["spread"][np.isnan(summary.variance).all(axis=-1)] = np.nan
         if summary.covariance is not None:
             out["covariance"] = summary.covariance
+        if state.refused is not None:
+            out["refused"] = state.refused
         out.update(summary.numbers)
         if known is not None:
-            out.update(self._scored(summary, np.broadcast_to(known, summary.mean.shape)))
+            out.update(self._scored(summary, known))
         for name, value in out.items():
             self.columns.setdefault(name, []).append(np.asarray(value))
 
     def _scored(self, summary: Any, known: Array) -> dict[str, Array]:
         out: dict[str, Array] = {}
-        good = np.isfinite(summary.mean).all(axis=-1)
+        at = self.chosen
+        mean = summary.mean[..., at]
+        known = np.broadcast_to(known, mean.shape)
+        good = np.isfinite(mean).all(axis=-1) & np.isfinite(known).all(axis=-1)
+        each = mean.shape[-1:]
+        some = None if summary.members is None else summary.members[..., at]
+        cov = None if summary.covariance is None else summary.covariance[..., at, :][..., at]
         if "squared_error" in self.scores:
-            out["squared_error"] = (summary.mean - known) ** 2
-            out["total_squared_error"] = out["squared_error"].sum(axis=-1)
+            squared = (mean - known) ** 2
+            out["squared_error"] = self._spread_out(squared, summary.mean.shape)
+            out["total_squared_error"] = squared.sum(axis=-1)
         if "crps" in self.scores:
-            out["crps"] = _where(good, lambda k: _crps(summary, known, k), known.shape[-1:])
-        if "nees" in self.scores and _has_nees(summary):
-            out["nees"] = _where(good, lambda k: _nees(summary, known, k), ())
+            if some is None:
+                std = np.sqrt(summary.variance[..., at])
+                found = _where(good, gaussian_crps, each, mean, std, known)
+            elif summary.weights is None:
+                found = _where(good, crps, each, some, known)
+            else:
+                found = _where(good, _weighted_crps, each, some, known, summary.weights)
+            out["crps"] = self._spread_out(found, summary.mean.shape)
+        if "nees" in self.scores and cov is not None:
+            out["nees"] = _where(good, _nees_or_infinite, (), mean, cov, known)
+        elif "nees" in self.scores and _spans(some, summary.weights):
+            out["nees"] = _where(good, _ensemble_nees, (), np.asarray(some), known)
+        return out
+
+    def _spread_out(self, values: Array, shape: tuple[int, ...]) -> Array:
+        """Values of the chosen components among all, NaN for the others."""
+        out = np.full(shape, np.nan)
+        out[..., self.chosen] = values
         return out
 
     def dataset(self, final: Any) -> xarray.Dataset:
@@ -115,8 +189,50 @@ class Recorder:
                 "unit": ("component", list(units)),
             },
         )
-        out.encoding["final_state"] = final
+        # A selection or another run joined to this one inherits the entry: these tell them apart.
+        last = np.array(data["mean"][1][-1]) if len(self.times) else None
+        out.encoding["final_state"] = final, list(self.filter.agents), last
         return out
+
+
+def shown(items: list[float], show: bool) -> Iterable[float]:
+    """The items, behind a progress bar if a person may be watching."""
+    if not show or any(os.environ.get(name) for name in _SILENT):
+        return items
+    from tqdm.auto import tqdm
+
+    bar: Iterable[float] = tqdm(items, leave=False, disable=None)
+    return bar
+
+
+def final_state(run: xarray.Dataset) -> State:
+    """The state in which a run ended, to be saved or gone on from.
+
+    Parameters
+    ----------
+    run : xarray.Dataset
+        As :meth:`Filter.run` returned it. A part of a run that ends earlier, or that lacks runs or
+        agents, has no state.
+
+    Examples
+    --------
+    >>> import xarray
+    >>> final_state(xarray.Dataset())
+    Traceback (most recent call last):
+    ValueError: run: needs the Dataset that a filter's run returned, got one without a state
+    """
+    kept = getattr(run, "encoding", {}).get("final_state")
+    if kept is not None:
+        state, agents, last = kept
+        same = "mean" in run and list(run["agent"].values) == agents and run["time"].size > 0
+        if (
+            same and np.array_equal(run["time"].values[-1], state.t)
+            and np.array_equal(run["mean"].values[-1], last, equal_nan=True)
+        ):
+            return state  # type: ignore[no-any-return]
+    raise ValueError(
+        "run: needs the Dataset that a filter's run returned, got one without a state"
+    )
 
 
 def _attributes(name: str) -> dict[str, str]:
@@ -135,29 +251,23 @@ def _counted(name: str, values: list[Any], *axes: str) -> dict[str, Any]:
     }
 
 
-def _where(good: Any, score: Any, shape: tuple[int, ...]) -> Array:
+def _where(good: Any, score: Any, tail: tuple[int, ...], *parts: Array) -> Array:
     """A score where there is an estimate, NaN elsewhere."""
     if good.all():
-        return np.asarray(score(...))
-    out = np.full((*good.shape, *shape), np.nan)
+        return np.asarray(score(*parts))
+    out = np.full((*good.shape, *tail), np.nan)
     if good.any():
-        out[good] = score(good)
+        out[good] = score(*(p[good] for p in parts))
     return out
 
 
-def _has_nees(summary: Any) -> bool:
-    if summary.covariance is not None:
-        return True
-    if summary.members is None or summary.weights is not None:
-        return False
-    members, dim = summary.members.shape[-2:]
-    return bool(members > dim)
+def _spans(members: Array | None, weights: Array | None) -> bool:
+    """Whether members of equal weight are enough for a covariance."""
+    return members is not None and weights is None and members.shape[-2] > members.shape[-1]
 
 
-def _nees(summary: Any, known: Array, keep: Any) -> Array:
-    if summary.covariance is not None:
-        return _nees_or_infinite(summary.mean[keep], summary.covariance[keep], known[keep])
-    return ensemble_nees(summary.members[keep], known[keep])
+def _weighted_crps(members: Array, known: Array, weights: Array) -> Array:
+    return crps(members, known, weights=weights)
 
 
 def _nees_or_infinite(mean: Array, cov: Array, known: Array) -> Array:
@@ -173,9 +283,9 @@ def _nees_or_infinite(mean: Array, cov: Array, known: Array) -> Array:
         return np.where(sure, np.inf, nees(mean, some, known))
 
 
-def _crps(summary: Any, known: Array, keep: Any) -> Array:
-    if summary.members is None:
-        return gaussian_crps(summary.mean[keep], np.sqrt(summary.variance[keep]), known[keep])
-    if summary.weights is not None:
-        return crps(summary.members[keep], known[keep], weights=summary.weights[keep])
-    return crps(summary.members[keep], known[keep])
+def _ensemble_nees(members: Array, known: Array) -> Array:
+    """The same of members."""
+    try:
+        return ensemble_nees(members, known)
+    except ValueError:
+        return _nees_or_infinite(members.mean(axis=-2), sample_covariance(members), known)

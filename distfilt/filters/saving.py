@@ -6,25 +6,25 @@ import json
 import os
 import tempfile
 import zipfile
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
 
-from ..checks import generator, instance, number
+from ..doors import Array, Mask, Record, array
 from ..network import Ledger
 
-__all__ = ["State"]
+__all__ = ["SensorState", "State"]
 
-_FORMAT = 2
+_FORMAT = 3
 _BITS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
 
 
-@dataclass(frozen=True, eq=False)
-class State:
+@dataclass(frozen=True, eq=False, repr=False)
+class State(Record):
     """All that a filter needs to go on: nothing is hidden elsewhere.
 
     A family of filters adds its own fields. They may be arrays, numbers, texts, None, tuples of
@@ -39,27 +39,42 @@ class State:
     rng : numpy.random.Generator or None
         Where the next draw comes from; none for a filter that draws nothing. A step copies it, so
         a state can be stepped twice.
+    refused : ndarray, (*runs, A), optional
+        How many readings each agent's gate left out in the last step; none without a gate.
 
     Examples
     --------
-    >>> State(0.0, Ledger.empty(2), None).runs
-    ()
+    >>> State(0.0, Ledger.empty(2), None)
+    State(t=0, 2 agents)
     """
 
     t: float
     ledger: Ledger
     rng: np.random.Generator | None
+    refused: Annotated[Array, "..."] | None = field(default=None, kw_only=True)
 
-    def __post_init__(self) -> None:
-        number(self.t, "t")
-        instance(self.ledger, "ledger", Ledger)
-        if self.rng is not None:
-            generator(self.rng)
+    def __repr__(self) -> str:
+        """Time, agents, and the shapes of what is believed: the numbers themselves are many."""
+        own = ((f.name, getattr(self, f.name)) for f in fields(self)[4:])
+        shapes = [f"{name} {v.shape}" for name, v in own if isinstance(v, np.ndarray) and v.ndim]
+        parts = [f"t={self.t:g}", f"{self.ledger.messages.size} agents", *shapes]
+        return f"{type(self).__name__}({', '.join(parts)})"
 
     @property
     def runs(self) -> tuple[int, ...]:
         """Leading axes: independent runs of the network."""
         return ()
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        """Earlier times that are kept; none, unless a family says otherwise."""
+        return ()
+
+    def kept(self, lag: int, t: float) -> tuple[float, ...]:
+        """The earlier times that a step to `t` keeps, oldest first."""
+        if not lag or t == self.t:
+            return self.times
+        return (*self.times, self.t)[-lag:]
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the state to one .npz file; :meth:`load` gives back the same bits.
@@ -104,9 +119,82 @@ class State:
             raise
         except (
             OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, ImportError,
-            IndexError, zipfile.BadZipFile,
+            IndexError, NotImplementedError, zipfile.BadZipFile,
         ) as error:
             raise ValueError(f"path: needs a saved {cls.__name__}, got {path}: {error}") from None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SensorState(State):
+    """A state of agents with sensors: what they believe is an array with axes (*runs, A, ...).
+
+    A family names that array and its axes in `_belief`, and adds it as a field.
+
+    Parameters
+    ----------
+    t, ledger, rng, refused
+        As for :class:`~distfilt.filters.State`.
+    history : tuple of (float, ndarray)
+        Earlier times and what is believed of them by now, oldest first.
+    failed : ndarray of bool, (*runs)
+        Runs that failed and are no longer updated.
+    waiting : tuple
+        Readings that have not been told to anybody yet: when, by whom, of which sensor, and what.
+
+    Examples
+    --------
+    >>> from distfilt.network import Ledger
+    >>> @dataclass(frozen=True, eq=False, repr=False)
+    ... class Levels(SensorState):
+    ...     levels: Array
+    ...     _belief = "levels", (..., "A")
+    >>> Levels(0.0, Ledger.empty(2), None, np.zeros((3, 2))).runs
+    (3,)
+    """
+
+    history: tuple[Any, ...] = field(default=(), kw_only=True)
+    failed: Mask = field(default_factory=lambda: np.zeros((), dtype=bool), kw_only=True)
+    waiting: tuple[Any, ...] = field(default=(), kw_only=True)
+
+    _belief = "belief", tuple[Any, ...]()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        name, axes = self._belief
+        shape = array(self.belief, name, axes).shape
+        agents = shape[len(self.runs)]
+        if self.ledger.messages.size != agents:
+            raise ValueError(f"ledger: needs {agents} agents, got {self.ledger.messages.size}")
+        object.__setattr__(self, "failed", np.broadcast_to(self.failed, self.runs))
+
+    @property
+    def belief(self) -> Array:
+        """What the agents believe, under the family's own name for it."""
+        return np.asarray(getattr(self, self._belief[0]))
+
+    @property
+    def runs(self) -> tuple[int, ...]:
+        """Leading axes: independent runs of the network."""
+        return tuple(self.belief.shape[: 1 - len(self._belief[1])])
+
+    @property
+    def times(self) -> tuple[float, ...]:
+        """The earlier times that are kept, oldest first."""
+        return tuple([t for t, _ in self.history])
+
+    @property
+    def earlier(self) -> tuple[Self, ...]:
+        """A state for each of these times, as what is believed of it by now."""
+        name = self._belief[0]
+        return tuple(self.changed(t=t, history=(), **{name: x}) for t, x in self.history)
+
+    def shown(self, values: Array) -> Array:
+        """Values (*runs, ...) for the record: NaN in runs that have failed."""
+        if not self.failed.any():
+            return values
+        out = np.array(values)
+        out[self.failed] = np.nan
+        return out
 
 
 def _path(path: Any) -> Path:

@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ..checks import Array, count, number
 from ..coupling.solvers import _solver
 from ..coupling.transform import _carried, _normalised, _plans, _rejuvenated
+from ..doors import Array, NonNegative, unchecked
 from ..network import finite_time
 from ..updates.particles import log_likelihood
-from .driver import Late, Summary
-from .ensemble import EnsembleState, ensemble_summary
-from .failures import guarded
-from .stepping import Step
-from .wiring import Prior, SensorFilter
+from .base import Filter
+from .ensemble import EnsembleState, Several, ensemble_summary, same_sizes, sample_moments
+from .inputs import members_of
+from .particle import warn_of_collapse
+from .record import Summary
+from .step import Step, guarded
 
 __all__ = ["TransportFilter"]
 
 
 @dataclass(frozen=True, eq=False)
-class TransportFilter(SensorFilter):
+class TransportFilter(Filter):
     r"""Agents that hold the same members, agree on their log-likelihoods, and transport alone.
 
     Readings of different agents are independent, so the log-likelihood of all of them is A times
@@ -36,8 +36,9 @@ class TransportFilter(SensorFilter):
 
     Parameters
     ----------
-    model, sensors, graph, faults, lag, names, failures
-        As for :class:`~distfilt.filters.SensorFilter`.
+    model, sensors, graph, faults, lag, names, failures, gate
+        As for :class:`~distfilt.filters.Filter`. Members in common need an agreement in every step,
+        so that `every` is refused.
     agreement : callable, optional
         ``agreement(log_likelihoods, channel) -> averages``, both (\*runs, A, N): exact finite-time
         averaging by default, or ``partial(average, rounds=20)``. With None nobody agrees.
@@ -50,6 +51,10 @@ class TransportFilter(SensorFilter):
         Give the members the weighted covariance too.
     rejuvenation : float
         h of :func:`distfilt.coupling.rejuvenated`; 0 draws nothing.
+
+    See Also
+    --------
+    distfilt.updates.transform_by_agreement : the same step without a filter round it.
 
     Examples
     --------
@@ -64,44 +69,56 @@ class TransportFilter(SensorFilter):
     (True, array([100, 100]))
     """
 
-    agreement: Callable[..., Any] | None = field(default=finite_time, kw_only=True)
-    members: int = field(default=100, kw_only=True)
-    correct: bool = field(default=False, kw_only=True)
-    rejuvenation: float = field(default=0.0, kw_only=True)
+    _: KW_ONLY
+    agreement: Callable[..., Any] | None = finite_time
+    members: Several = 100
+    correct: bool = False
+    rejuvenation: NonNegative = 0.0
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        count(self.members, "members", at_least=2)
-        number(self.rejuvenation, "rejuvenation", at_least=0)
+    state: ClassVar[type[EnsembleState]] = EnsembleState
+    draws: ClassVar[bool] = True
+    changes: ClassVar[bool] = True
+    fuses: ClassVar[str] = "vectors"
+    unused: ClassVar[dict[str, str]] = {
+        "every": "a transport filter's agents have their members in common, so that they have to "
+        "agree in every step"
+    }
 
-    def start(
-        self, prior: Prior, *, rng: np.random.Generator, runs: tuple[int, ...] = (), t: float = 0.0
-    ) -> EnsembleState:
-        """The state before the first step; arguments as for `EnsembleFilter.start`.
+    @property
+    def shares(self) -> bool:
+        """Readings are told only where nobody agrees on what they say."""
+        return self.share and self.agreement is None
 
-        Members are (N, d), or (*runs, 1, N, d): one set for all agents.
+    def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+        """One set of members, (N, d) or (*runs, 1, N, d), for all agents."""
+        drawn = members_of(prior, self.members, (*runs, 1), self.model.dim, rng)
+        return {"ensembles": np.repeat(drawn, self.count, axis=-3)}
+
+    def fits(self, state: Any) -> None:
+        """Refuse a state of other sizes."""
+        super().fits(state)
+        same_sizes(state.ensembles, self)
+
+    def advance(self, step: Step) -> Any:
+        """Forecast, weigh by what was seen, agree on the weights, transport.
+
+        Warns
+        -----
+        ParticleCollapse
+            If the weights that are carried over have an effective size below two.
         """
-        drawn = self.drawn(prior, self.members, runs, rng, sets=1)
-        everywhere = np.repeat(drawn, len(self.sensors), axis=-3)
-        return self.first(EnsembleState, t, rng, everywhere)
-
-    def step(
-        self, state: EnsembleState, t: float, observations: Sequence[ArrayLike | None], *,
-        late: Sequence[Late] = (),
-    ) -> EnsembleState:
-        """Move to time `t` and take in what was observed there; as `EnsembleFilter.step`."""
-        sizes = self.members, self.model.dim
-        step = self.begin(state, EnsembleState, t, observations, late, sizes)
-        moved = self._for_all(
-            partial(self.model.sample_step, t=state.t, dt=step.dt), (state.ensembles,), step.rng
-        )
-        stack = step.stack(step.moved(moved, state.ensembles, 2))
+        state, now = step.state, step.state.ensembles
+        if step.dt:
+            draw = partial(unchecked(self.model.sample_step), t=state.t, dt=step.dt)
+            now = self._for_all(draw, (now,), step.rng)
+        stack = step.stack(step.moved(now, state.ensembles, 2))
         (logs,) = step.agreed(self._log_likelihoods(stack, step))
         if step.agrees:
             logs = state.agents * logs
         stack, errors = self._transported(stack, logs, step.rng)
         step.settle(errors, range(state.agents))
-        return step.end(EnsembleState, stack[-1], history=zip(step.times, stack[:-1], strict=True))
+        self._warn(logs, step)
+        return step.end(ensembles=stack[-1], past=stack[:-1])
 
     def summary(self, state: EnsembleState) -> Summary:
         """Ensemble means and variances; the members for the scores."""
@@ -111,7 +128,7 @@ class TransportFilter(SensorFilter):
         self, draw: Callable[..., Array], arrays: tuple[Array, ...], rng: np.random.Generator
     ) -> Array:
         """Apply `draw` agent by agent, each with the same draws; the generator advances once."""
-        sources = [copy.deepcopy(rng) for _ in self.sensors[1:]] + [rng]
+        sources = [copy.deepcopy(rng) for _ in range(self.count - 1)] + [rng]
         parts = [
             draw(*(x[..., a, :, :] for x in arrays), rng=source) for a, source in enumerate(sources)
         ]
@@ -120,9 +137,10 @@ class TransportFilter(SensorFilter):
     def _log_likelihoods(self, stack: list[Array], step: Step) -> Array:
         """What each agent makes of the readings it has, (*runs, A, N)."""
         logs = np.zeros(stack[-1].shape[:-1])
-        for place, group in step.heard(shared=self.agreement is None):
-            rows = group.agents
+        for place, group in step.heard():
+            rows = group.rows
             predicted = group.predict(stack[place][..., rows, :, :], step.before(place, rows))
+            group = step.gated(group, partial(sample_moments, predicted))
             logs[..., rows, :] += log_likelihood(predicted, group.target, group.noise)
         return logs
 
@@ -137,7 +155,7 @@ class TransportFilter(SensorFilter):
             return tuple(_carried(x, w, matrix, correct=self.correct) for x in times)
 
         out, errors = guarded(
-            compute, (logs, *stack), tuple(stack), logs.ndim - 1, shared=np.eye(1), rng=None
+            compute, (logs, *stack), tuple(stack), logs.ndim - 1, shared=np.eye(1)
         )
         if self.rejuvenation:
             draw = partial(_rejuvenated, h=self.rejuvenation)
@@ -148,3 +166,13 @@ class TransportFilter(SensorFilter):
         # Where nothing was said of the members they stay as they were.
         told = (np.ptp(logs, axis=-1) > 0)[..., None, None]
         return [np.where(told, y, x) for y, x in zip(out, stack, strict=True)], errors
+
+    def _warn(self, logs: Array, step: Step) -> None:
+        """A coupling that carries all to one or two members leaves nothing to go on from."""
+        if step.failed.all():
+            return
+        w = _normalised(logs[~step.failed] if step.failed.any() else logs)
+        size = float((1 / (w * w).sum(axis=-1)).min())
+        if size < 1.1:
+            what = f"an agent's weights have an effective size of {size:.1f}"
+            warn_of_collapse(step.t, what, "rejuvenation=")

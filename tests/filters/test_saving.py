@@ -132,10 +132,3 @@ def test_what_cannot_be_saved_says_so(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-BAD_INPUT = {
-    "distfilt.filters.saving.State": [
-        ("t", lambda: State(np.nan, Ledger.empty(1), None)),
-        ("ledger", lambda: State(0.0, 3, None)),
-        ("rng", lambda: State(0.0, Ledger.empty(1), 3)),
-    ],
-}

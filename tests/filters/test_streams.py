@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from distfilt.filters.streams import bookmarked, copied
+from distfilt.filters.step import bookmarked, copied
 
 KINDS = [np.random.PCG64, np.random.PCG64DXSM, np.random.Philox, np.random.SFC64, np.random.MT19937]
 
@@ -44,7 +44,3 @@ def test_a_generator_without_a_seed_sequence_is_copied_too() -> None:
     assert np.array_equal(one.random(4), rng.random(4))
 
 
-EXEMPT = {
-    "distfilt.filters.streams.bookmarked": "gets a generator that its caller has checked",
-    "distfilt.filters.streams.copied": "gets a generator that its caller has checked",
-}

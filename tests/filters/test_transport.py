@@ -29,16 +29,6 @@ def _filter(**options: Any) -> TransportFilter:
     return TransportFilter(model(), options.pop("sensors", FOUR), graphs.ring(4), **options)
 
 
-BAD_INPUT = {
-    _T: [
-        ("members", lambda: _filter(members=1)),
-        ("correct", lambda: _filter(correct=1)),
-        ("rejuvenation", lambda: _filter(rejuvenation=-0.1)),
-        ("agreement", lambda: _filter(agreement=3)),
-        ("prior", lambda: _filter().start(np.zeros((4, 30, 2)), rng=np.random.default_rng(0))),
-        ("runs", lambda: _filter().start(PRIOR, rng=np.random.default_rng(0), runs=(0,))),
-    ]
-}
 
 
 def _start(f: TransportFilter, runs: tuple[int, ...] = ()) -> EnsembleState:

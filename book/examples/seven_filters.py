@@ -1,0 +1,39 @@
+"""Seven filters, one loop: six on one network of walkers, one on a swarm's density."""
+
+from functools import partial
+
+import numpy as np
+
+from distfilt import filters
+from distfilt.density import Flooding, FokkerPlanck, Grid
+from distfilt.mixtures import target_fusion
+from distfilt.models import constant_velocity, rotating_swarm, simulate
+from distfilt.network import covariance_intersection, graphs
+from distfilt.sensors import direct
+
+walk, rng, times = constant_velocity(sigma=0.1), np.random.default_rng(0), np.arange(1, 31) * 0.5
+eyes, net = [direct([k % 2], std=0.5) for k in range(4)], graphs.ring(4)
+prior = (np.zeros(4), np.diag([4.0, 4.0, 0.2, 0.2]))
+truth = simulate(walk, rng.multivariate_normal(*prior), times, rng=rng)
+walkers = prior, truth, [eye.observe(truth, rng=rng) for eye in eyes]
+swarm, grid, first = rotating_swarm("gibbs"), Grid((12, 12)), rng.random((40, 2))
+law, path = FokkerPlanck(swarm, grid), swarm.simulate(first, times, rng=rng, substeps=5)
+crowd = first, law.evolve(np.ones(144), times), path.swapaxes(0, 1)
+fuse, intersect = partial(target_fusion, target_dim=4), covariance_intersection
+
+problems = {
+    "ensemble": (filters.EnsembleFilter(walk, eyes, net), walkers),
+    "gaussian": (filters.GaussianFilter(walk, eyes, net, agreement=intersect), walkers),
+    "particle": (filters.ParticleFilter(walk, eyes, net, members=2000), walkers),
+    "transport": (filters.TransportFilter(walk, eyes, net, rejuvenation=0.2), walkers),
+    "mixture": (filters.MixtureFilter(walk, eyes, net, agreement=fuse, target_dim=4), walkers),
+    "news": (filters.NewsFilter(walk, eyes, net, target_dim=4), walkers),
+    "density": (filters.DensityFilter(law, 40, 0.4, agreement=Flooding(), bandwidth=0.12), crowd),
+}
+print("filter      error   NEES/d  floats")
+for name, (f, (begin, true, seen)) in problems.items():
+    run = f.run(f.start(begin, rng=np.random.default_rng(1)), times, seen, truth=true)
+    late = run.isel(time=slice(10, None))
+    error = np.sqrt(late["squared_error"].mean())
+    nees = late["nees"].mean() / len(run["component"]) if "nees" in run else np.nan
+    print(f"{name:9s} {error:7.3f} {nees:8.2f} {run['scalars_total'][-1].sum():8d}")

@@ -1,0 +1,399 @@
+"""The contract of all filters: a family supplies `begin`, `advance`, `summary`; the rest is here.
+
+One order of the constructor's arguments, one `start`, `step`, `run` and `smooth`, one meaning of
+each option. An option that means nothing to a family is refused by its name, with the reason.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, fields
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import numpy as np
+
+from ..doors import Array, Bounds, Index, Positive, Record, Rng, door
+from ..models import Model
+from ..network import Channel, Faults, Graph, Ledger, fused_kind
+from .inbox import Inbox
+from .inputs import Late, Team, belated, planned, said_by_all, team_of
+from .record import SCORES, Recorder, Score, Summary, shown
+from .saving import State
+from .step import RECOVERABLE, FilterError, Step
+
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = ["Filter", "described"]
+
+
+@dataclass(frozen=True, eq=False)
+class Filter(Record, ABC):
+    """What every family of filters is made of.
+
+    Parameters
+    ----------
+    model : Model
+        How the state moves; known to all agents.
+    sensors : sequence of length A, or callable t -> sequence
+        What each agent sees: a Sensor, several in a list, or None. Neighbours know each other's. A
+        function is asked at t = 0 how many agents there are.
+    graph : Graph, or callable t -> Graph, optional
+        Who hears whom; a single agent needs none. At a time without any link nobody speaks.
+    agreement : callable, optional
+        ``agreement(belief, channel) -> belief``: what agents do after the update to agree, if they
+        do; the belief is the family's. A rule of this package that fuses something else is refused.
+    share : bool
+        Whether agents send their readings to those that hear them, who use them too.
+    faults : Faults, optional
+        Messages lost and agents silenced; a lost observation is a missing one. A delay is not
+        accepted: an observation that comes late has its own time, pass it as :class:`Late`.
+    lag : int
+        How many earlier times are kept, for late observations and for smoothing.
+    names : sequence of str
+        Names of the agents; their numbers by default.
+    failures : {"raise", "keep"}
+        What happens when one run of a batch fails: a :class:`FilterError` that names it, or the
+        other runs go on and the failed one is recorded as NaN.
+    gate : float, optional
+        How likely a good reading passes, in (0, 1). Each sensor's reading is tested against what
+        was predicted; those that fail are left out and counted as ``refused`` in the record.
+    every : float or callable t -> bool, optional
+        When agents exchange anything: every so many seconds, or at the steps where the function
+        is true. Readings wait for it and are told as late ones, so that a `lag` has to reach back.
+
+    Notes
+    -----
+    A family of one's own is a dataclass that derives from this, names the kind of its `state`, and
+    has three methods: `begin` gives the fields of the first state, `advance` makes the next one of
+    a :class:`Step`, `summary` tells what is believed. `draws` says that steps need a generator,
+    `fuses` what its agreements fuse, and `unused` why options that it cannot have are refused.
+    """
+
+    model: Any
+    sensors: Any
+    graph: Any = None
+    _: KW_ONLY
+    agreement: Callable[..., Any] | None = None
+    share: bool = True
+    faults: Faults | None = None
+    lag: Index = 0
+    names: Sequence[str] = ()
+    failures: Literal["raise", "keep"] = "raise"
+    gate: Annotated[float, Bounds(above=0, below=1)] | None = None
+    every: Positive | Callable[[float], bool] | None = None
+
+    state: ClassVar[type[Any]] = State
+    draws: ClassVar[bool] = False
+    batched: ClassVar[bool] = True
+    changes: ClassVar[bool] = False
+    alone: ClassVar[bool] = False
+    fuses: ClassVar[str | None] = None
+    unused: ClassVar[Mapping[str, str]] = {}
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for option in fields(self):
+            if option.name in self.unused and getattr(self, option.name) != option.default:
+                raise ValueError(f"{option.name}: {self.unused[option.name]}")
+        self.check_parts()
+        if self.faults is not None and self.faults.late:
+            raise ValueError(f"faults: needs Faults without a delay, got {self.faults!r}")
+        if len(self.names) not in (0, self.count):
+            raise ValueError(f"names: needs {self.count} names, got {len(self.names)}")
+        kind = None if self.agreement is None else fused_kind(self.agreement)
+        if kind is not None and kind != self.fuses:
+            raise ValueError(f"agreement: needs a rule that fuses {self.fuses}, got one of {kind}")
+        if self.every is not None and self.shares and self.graph is not None and not self.lag:
+            raise ValueError("lag: needs at least 1 for readings that wait for a contact, got 0")
+
+    def check_parts(self) -> None:
+        """Refuse a model, sensors or a graph that this family cannot have."""
+        if not isinstance(self.model, Model):
+            raise ValueError(f"model: needs a Model, got {type(self.model).__name__}")
+        self.check_network()
+
+    def check_network(self) -> None:
+        """Refuse sensors and a graph that are none."""
+        if not callable(self.sensors):
+            team_of(self.sensors)
+            object.__setattr__(self, "sensors", tuple(self.sensors))
+        for sensor in (s for own in self.team(0.0) for s in own):
+            if not self.changes and sensor.uses_previous:
+                raise ValueError("sensors: needs sensors of the present state, got a differential")
+        if self.graph is None and self.count > 1 and not self.alone:
+            raise ValueError(f"graph: needs a Graph of {self.count} agents, got None")
+        if self.graph is not None and not callable(self.graph):
+            object.__setattr__(self, "graph", self._sized(self.graph))
+
+    def _sized(self, graph: Any) -> Graph:
+        """A graph of all the agents."""
+        if not isinstance(graph, Graph):
+            got = type(graph).__name__
+            raise ValueError(f"graph: needs a Graph (see Graph.from_networkx), got {got}")
+        if graph.size != self.count:
+            raise ValueError(f"graph: needs {self.count} agents, got {graph.size}")
+        return graph
+
+    @cached_property
+    def inbox(self) -> Inbox:
+        """Plans of who has which readings."""
+        return Inbox()
+
+    @cached_property
+    def count(self) -> int:
+        """Number A of agents."""
+        return len(self.sensors(0.0) if callable(self.sensors) else self.sensors)
+
+    @property
+    def shares(self) -> bool:
+        """Whether readings are told to neighbours."""
+        return self.share
+
+    @property
+    def components(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Names and units of the state's components; numbers where the model has no names."""
+        return described(self.model)
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """Names of the agents; their numbers by default."""
+        return tuple(self.names) or tuple(str(k) for k in range(self.count))
+
+    def team(self, t: float) -> Team:
+        """Each agent's sensors at a time."""
+        return team_of(self.sensors(t)) if callable(self.sensors) else self._fixed
+
+    @cached_property
+    def _fixed(self) -> Team:
+        return team_of(self.sensors)
+
+    def channel(self, state: State, t: float) -> Channel | None:
+        """The door of this step; none where nobody can speak, or it is not yet time."""
+        if self.graph is None or not self._contact(state.t, t):
+            return None
+        graph = self._sized(self.graph(t)) if callable(self.graph) else self.graph
+        if not graph.senders.size:
+            return None
+        return Channel(graph, ledger=state.ledger, runs=state.runs, faults=self.faults, t=t)
+
+    def _contact(self, before: float, t: float) -> bool:
+        if self.every is None or callable(self.every):
+            return self.every is None or bool(self.every(t))
+        # Whether one of the multiples lies after the step's start, and up to its end.
+        return math.floor(t / self.every + 1e-9) > math.floor(before / self.every + 1e-9)
+
+    @abstractmethod
+    def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+        """The fields of the first state that are the family's own."""
+
+    @abstractmethod
+    def advance(self, step: Step) -> Any:
+        """The state at the end of a step."""
+
+    @abstractmethod
+    def summary(self, state: Any) -> Summary:
+        """Estimates and spreads of a state."""
+
+    def past(self, state: Any) -> tuple[tuple[float, Summary], ...]:
+        """Earlier times that the state keeps, oldest first, and what is believed of them by now."""
+        return tuple((then.t, self.summary(then)) for then in getattr(state, "earlier", ()))
+
+    @door
+    def start(
+        self, prior: Any, *, rng: Rng | None = None, runs: tuple[int, ...] = (), t: float = 0.0
+    ) -> Any:
+        """The state before the first step.
+
+        Parameters
+        ----------
+        prior : tuple, distribution, GaussianMixture, array_like or callable
+            A Gaussian's ``(mean, cov)``, (d,) and (d, d); a frozen distribution of scipy; a
+            mixture; members (N, d), or (*runs, A, N, d); or a function
+            ``prior(members, rng=rng, leading=leading)`` that draws (*leading, N, d). What a family
+            cannot make of these it refuses. A family whose agents' states differ takes a list, one
+            for each agent.
+        rng : numpy.random.Generator, optional
+            Draws the prior; a child stream of it, independent of whatever else is drawn from it,
+            serves all later steps. Filters that draw nothing need none.
+        runs : tuple of int
+            Leading axes: independent runs.
+        t : float
+            The time of the prior, in s.
+        """
+        if self.draws and rng is None:
+            raise ValueError("rng: needs a numpy.random.Generator, got None")
+        if runs and (not self.batched or min(runs) < 1):
+            needs = "sizes of at least 1" if self.batched else "(), one run at a time"
+            raise ValueError(f"runs: needs {needs}, got {runs!r}")
+        own = self.begin(prior, runs, rng)
+        child = rng.spawn(1)[0] if self.draws and rng is not None else None
+        return self.state(t, Ledger.empty(self.count), child, **own)
+
+    @door
+    def step(
+        self, state: State, t: float, observations: Any, *, late: Sequence[Late] = ()
+    ) -> Any:
+        """Move to time `t` and take in what was observed there.
+
+        Parameters
+        ----------
+        state : State
+            Not changed.
+        t : float
+            The new time, in s; at the state's own nothing is forecast.
+        observations : sequence of length A
+            Per agent (*runs, m) or (m,), or None; or one :class:`Reading`, or a list of them. NaN
+            marks a missing component, run by run.
+        late : sequence of Late
+            Observations of earlier times that arrive now; needs a `lag` that reaches back to them.
+
+        Raises
+        ------
+        ValueError
+            If `t` is earlier, or an observation does not fit its sensor or no earlier state is
+            kept for a late one.
+        FilterError
+            If an agent's computation fails; see `failures`.
+        """
+        Bounds(at_least=state.t)(t, "t")
+        self.fits(state)
+        return self._advanced(state, t, observations, late, own=False)
+
+    def _advanced(
+        self, state: Any, t: float, observations: Any, late: Sequence[Late], *, own: bool
+    ) -> Any:
+        said = self.read(observations, state.runs, t)
+        old = belated(self, late, state, t) if late else ()
+        step = Step(self, state, t, said, old, own=own)
+        try:
+            return self.advance(step)
+        except RECOVERABLE as error:
+            if isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError):
+                raise
+            raise FilterError((), None, t, error) from error
+
+    def fits(self, state: Any) -> None:
+        """Refuse a state that is not this filter's."""
+        if not isinstance(state, self.state):
+            needs = self.state.__name__
+            raise ValueError(f"state: needs a {needs}, got a {type(state).__name__}")
+        if state.ledger.messages.size != self.count:
+            got = state.ledger.messages.size
+            raise ValueError(f"state: needs {self.count} agents, got {got}")
+
+    def read(self, observations: Any, runs: tuple[int, ...], t: float) -> Any:
+        """What is observed at one time, checked; as a rule each agent's readings."""
+        return said_by_all(self, observations, runs, t)
+
+    def _walk(
+        self, state: Any, grid: Array, entries: Iterable[Any], late: Sequence[Late],
+        progress: bool, *, own: bool,
+    ) -> Iterator[Any]:  # fmt: skip
+        waiting = sorted(late, key=lambda item: item.arrived)
+        if waiting and (not grid.size or waiting[-1].arrived > grid[-1]):
+            end = f"{grid[-1]:g}" if grid.size else "no time at all"
+            raise ValueError(f"late: needs arrivals up to {end}, got {waiting[-1].arrived:g}")
+        mine = False
+        for t, observed in zip(shown(grid.tolist(), progress), entries, strict=True):
+            due = [item for item in waiting if item.arrived <= t]
+            waiting = waiting[len(due) :]
+            state = self._advanced(state, t, observed, due, own=mine)
+            mine = own
+            yield state
+
+    @door
+    def steps(
+        self, state: State, times: Any, observations: Any, *, late: Sequence[Late] = (),
+        progress: bool = False,
+    ) -> Iterator[Any]:  # fmt: skip
+        """The states at `times`, one after the other; arguments as in :meth:`run`."""
+        self.fits(state)
+        grid, entries = planned(self, state, times, observations)
+        return self._walk(state, grid, entries, late, progress, own=False)
+
+    @door
+    def run(
+        self, state: State, times: Any, observations: Any, *, truth: Any = None,
+        scores: Collection[Score] = SCORES,
+        late: Sequence[Late] = (), progress: bool = False,
+    ) -> xarray.Dataset:
+        """Step through a series, or through events, and record it.
+
+        Parameters
+        ----------
+        state : State
+            Where to begin.
+        times : array_like, (T,), or None
+            Strictly increasing, in s, from the state's on; steps may differ in length. With events
+            there is a step at each of theirs too, and None is enough.
+        observations : sequence of length A, or of Reading
+            Per agent (T, *runs, m) or (T, m), or None; NaN marks what is missing. Or events of any
+            order, several of which may have one time.
+        truth : array_like, (T, *runs, d) or (T, *runs, A, d), or mapping, optional
+            If given, the scores are recorded too: of all agents alike, of each agent's own, or of
+            some components only, by their names, (T, *runs) or (T, *runs, A) each.
+        scores : collection of {"squared_error", "nees", "crps"}
+            Which of them; CRPS costs about as much as an ensemble filter.
+        late : sequence of Late
+            Each is taken in at the first of `times` that is not before its arrival.
+        progress : bool
+            Show a progress bar when a person watches.
+
+        Returns
+        -------
+        xarray.Dataset
+            Axes ``time``, ``run`` (``run0``, ``run1``, … where there are several), ``agent``,
+            ``component``; units and meaning stand in the attributes. ``mean``, ``variance`` and,
+            with `truth`, ``squared_error`` and ``crps`` for each component; ``spread`` and
+            ``total_squared_error`` add components up, whatever their units, and say so; ``nees``
+            is d on average for a consistent filter. ``messages``, ``scalars``, ``bytes``, ``lost``
+            and ``rounds`` are those of each step, the same names with ``_total`` their sums;
+            ``refused`` counts what the `gate` left out. :func:`final_state` gives the state at the
+            end.
+        """
+        self.fits(state)
+        grid, entries = planned(self, state, times, observations)
+        recorder = Recorder(self, grid, state, truth, scores)
+        last = state
+        for last in self._walk(state, grid, entries, late, progress, own=True):
+            recorder.add(last, self.summary(last))
+        return recorder.dataset(last)
+
+    @door
+    def smooth(
+        self, state: State, times: Any, observations: Any, *, truth: Any = None,
+        scores: Collection[Score] = SCORES,
+        late: Sequence[Late] = (), progress: bool = False,
+    ) -> xarray.Dataset:
+        """Fixed-lag smoothing: of each time what is believed when `lag` more have been observed.
+
+        Parameters and result are those of :meth:`run`. The filter needs a `lag`; near the end
+        fewer times follow, and the last estimate is the filter's.
+        """
+        if not self.lag:
+            raise ValueError(self.unused.get("lag", "lag: needs at least 1 for smoothing, got 0"))
+        self.fits(state)
+        grid, entries = planned(self, state, times, observations)
+        recorder = Recorder(self, grid, state, truth, scores)
+        waiting: list[tuple[Any, Summary]] = []
+        last = state
+        for last in self._walk(state, grid, entries, late, progress, own=True):
+            believed = [summary for t, summary in self.past(last) if t > state.t]
+            first = len(waiting) - len(believed)
+            renewed = zip((s for s, _ in waiting[first:]), believed, strict=True)
+            waiting = [*waiting[:first], *renewed, (last, self.summary(last))]
+        for then, summary in waiting:
+            recorder.add(then, summary)
+        return recorder.dataset(last)
+
+
+def described(model: Model) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Names and units of a model's components; their numbers where it has no names."""
+    names = tuple(model.names) or tuple(str(k) for k in range(model.dim))
+    return names, tuple(model.units) or ("",) * model.dim
+
+

@@ -1,0 +1,213 @@
+"""What agents know of the readings of one time, gathered so that one update serves many of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
+
+from ..doors import Array, unchecked
+from ..sensors import Sensor
+
+__all__ = ["Heard", "Inbox"]
+
+Indices = NDArray[np.intp]
+Known = Sequence[Sequence[tuple[Sensor, Array]]]
+"""Of each agent the readings that it has: their sensors, and their values (*runs, m)."""
+
+_PATTERNS = 16
+"""So many patterns of who knows what are kept with their plans."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One sensor: with which agents of a group its reading stands, `rows`, and in which columns."""
+
+    sensor: Sensor
+    rows: Indices
+    columns: Indices
+    everyone: bool  # all agents of the group, once each and in order
+
+    def of(self, states: Array) -> Array:
+        """Of a group's states (*runs, G, N, d) those of the agents with this reading."""
+        return states if self.everyone else states[..., self.rows, :, :]
+
+
+class _Plan:
+    """A group of agents that have equally many numbers: whose they are, and with what noise."""
+
+    def __init__(self, agents: list[int], sensors: Sequence[tuple[Sensor, ...]]) -> None:
+        self.agents = np.array(agents, dtype=np.intp)
+        everybody = agents == list(range(len(sensors)))
+        self.rows: Any = slice(None) if everybody else self.agents
+        cells: dict[Sensor, list[tuple[int, int]]] = {}
+        size = sum(s.dim for s in sensors[agents[0]])
+        self.owner = np.zeros((len(agents), size), dtype=np.intp)
+        for g, agent in enumerate(agents):
+            at = 0
+            for k, sensor in enumerate(sensors[agent]):
+                cells.setdefault(sensor, []).append((g, at))
+                self.owner[g, at : at + sensor.dim] = k
+                at += sensor.dim
+        # Agents with one and the same sensor are predicted together.
+        self.parts, noise = [], np.zeros((len(agents), size, size))
+        for sensor, found in cells.items():
+            rows, starts = (np.array(c, dtype=np.intp) for c in zip(*found, strict=True))
+            columns = starts[:, None] + np.arange(sensor.dim)
+            everyone = rows.tolist() == list(range(len(agents)))
+            self.parts.append(_Part(sensor, rows, columns, everyone))
+            across, down = columns[:, :, None], columns[:, None, :]
+            noise[rows[:, None, None], across, down] = sensor.cov
+        self.noise = noise[0] if (noise == noise[:1]).all() else noise
+        self.linear = all(part.sensor.linear is not None for part in self.parts)
+        self.matrices: dict[int, Array] = {}
+
+    def matrix(self, dim: int) -> Array:
+        """The matrices of linear sensors one below the other, (G, M, d), made once."""
+        if dim not in self.matrices:
+            h = np.zeros((*self.owner.shape, dim))
+            for part in self.parts:
+                h[part.rows[:, None], part.columns] = part.sensor.matrix(dim)
+            self.matrices[dim] = h
+        return self.matrices[dim]
+
+    def collected(self, known: Known) -> Array:
+        """The readings of each agent of the group side by side, (*runs, G, M)."""
+        rows = [value for agent in self.agents for _, value in known[agent]]
+        flat = rows[0] if len(rows) == 1 else np.concatenate(rows, axis=-1)
+        return flat.reshape(*flat.shape[:-1], *self.owner.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """The readings that G agents have, equally many numbers each, M.
+
+    `target` (*runs, G, M) is what they know of the observations, NaN where a component is missing.
+
+    >>> from distfilt.sensors import direct
+    >>> sensor = direct([0], std=0.5)
+    >>> (pair,) = Inbox().groups([[(sensor, np.array([1.0]))]] * 2)
+    >>> pair.agents, pair.target.ravel(), pair.noise
+    (array([0, 1]), array([1., 1.]), array([[0.25]]))
+    """
+
+    plan: _Plan
+    target: Array
+
+    @property
+    def agents(self) -> Indices:
+        """Who they are, (G,)."""
+        return self.plan.agents
+
+    @property
+    def rows(self) -> Any:
+        """The same as an index; a slice where they are all."""
+        return self.plan.rows
+
+    @property
+    def noise(self) -> Array:
+        """The noise's covariance, (M, M) if it is the same for all, else (G, M, M)."""
+        return self.plan.noise
+
+    def aimed(self, target: Array) -> Heard:
+        """The same with other values."""
+        return Heard(self.plan, target)
+
+    def predict(self, states: Array, previous: Array | None = None) -> Array:
+        """Readings of states (*runs, G, N, d) without noise, (*runs, G, N, M).
+
+        A reading that wraps lies on the branch of the observation. `previous` holds the states at
+        the observation time before, for sensors that see changes.
+        """
+        if self.plan.linear:
+            out = states @ self.plan.matrix(states.shape[-1]).mT
+        elif len(self.plan.parts) == 1 and self.plan.parts[0].everyone:
+            out = np.ascontiguousarray(self._seen(self.plan.parts[0], states, previous))
+        else:
+            out = self._stacked(states, previous)
+        if np.isinf(out).any():
+            raise ValueError("predicted: needs finite numbers or NaN (missing), got infinity")
+        return out
+
+    def _stacked(self, states: Array, previous: Array | None) -> Array:
+        """Readings of several sensors, (*runs, G, N, M)."""
+        out = np.empty((*states.shape[:-2], self.target.shape[-1], states.shape[-2]))
+        for part in self.plan.parts:
+            cells = part.rows[:, None], part.columns
+            out[..., *cells, :] = self._seen(part, states, previous).swapaxes(-1, -2)
+        return np.ascontiguousarray(out.swapaxes(-1, -2))
+
+    def _seen(self, part: _Part, states: Array, previous: Array | None) -> Array:
+        """Readings of one sensor, (*runs, K, N, m)."""
+        sensor, here = part.sensor, part.of(states)
+        predict = unchecked(sensor.predict)
+        if not sensor.uses_previous or previous is None:
+            seen = predict(here)  # which says so where states of before are missing
+        else:
+            seen = predict(here, part.of(previous))
+        if sensor.difference is None:
+            return seen
+        # On the branch of the observation: y* - wrap(y* - h).
+        aim = self.target[..., part.rows[:, None], part.columns][..., None, :]
+        gap = unchecked(sensor.residual)(np.broadcast_to(aim, seen.shape), seen)
+        return np.where(np.isnan(gap), seen, aim - gap)
+
+    def jacobian(self, states: Array) -> Array:
+        """Derivatives of the readings at states (*runs, G, d), (*runs, G, M, d)."""
+        d = states.shape[-1]
+        if self.plan.linear:
+            return np.broadcast_to(self.plan.matrix(d), (*self.target.shape, d))
+        out = np.empty((*self.target.shape, d))
+        for part in self.plan.parts:
+            slope = unchecked(part.sensor.jacobian)(states[..., part.rows, :])
+            out[..., part.rows[:, None], part.columns, :] = slope
+        return out
+
+    def gated(self, mean: Array, cov: Array, share: float) -> tuple[Heard, Array]:
+        """The readings that their predictions can explain, and how many they cannot, (*runs, G).
+
+        Each sensor's reading is judged alone, by what a good one's normalised innovation exceeds
+        with probability 1 - `share`; `mean` and `cov` are of the predictions without noise.
+        """
+        gap, spread = self.target - mean, cov + self.noise
+        refused, out = np.zeros(gap.shape[:-1]), self.target
+        for k in range(int(self.plan.owner.max()) + 1):
+            here = (self.plan.owner == k) & ~np.isnan(gap)
+            some = here.sum(axis=-1)
+            inner = np.where(here[..., :, None] & here[..., None, :], spread, np.eye(gap.shape[-1]))
+            part = np.where(here, gap, 0.0)
+            length = (part * np.linalg.solve(inner, part[..., None])[..., 0]).sum(axis=-1)
+            bad = (some > 0) & (length > 2 * gammaincinv(np.maximum(some, 1) / 2, share))
+            out = np.where(here & bad[..., None], np.nan, out)
+            refused += bad
+        return self.aimed(out), refused
+
+
+class Inbox:
+    """Plans of who has which readings, each made when it is first needed.
+
+    >>> Inbox().groups([[], []])
+    []
+    """
+
+    def __init__(self) -> None:
+        self.plans: dict[tuple[tuple[Sensor, ...], ...], list[_Plan]] = {}
+
+    def groups(self, known: Known) -> list[Heard]:
+        """One entry for each number of readings that occurs; agents without any are left out."""
+        pattern = tuple([tuple([sensor for sensor, _ in own]) for own in known])
+        plans = self.plans.get(pattern)
+        if plans is None:
+            if len(self.plans) >= _PATTERNS:
+                self.plans.clear()
+            sizes: dict[int, list[int]] = {}
+            for agent, sensors in enumerate(pattern):
+                if sensors:
+                    sizes.setdefault(sum(s.dim for s in sensors), []).append(agent)
+            plans = [_Plan(agents, pattern) for _, agents in sorted(sizes.items())]
+            self.plans[pattern] = plans
+        return [Heard(plan, plan.collected(known)) for plan in plans]

@@ -1,0 +1,363 @@
+"""One step of a filter on its way: who hears which readings, what fails, what becomes of it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..doors import Array, array
+from ..linalg import SolverError
+from ..network import Channel
+from ..sensors import Sensor
+from .inbox import Heard
+from .inputs import Said, sensor_of
+from .saving import SensorState
+
+__all__ = ["RECOVERABLE", "FilterError", "Step", "bookmarked", "copied", "guarded"]
+
+RECOVERABLE = (np.linalg.LinAlgError, ArithmeticError, SolverError, ValueError)
+"""What one row of a batch, or one agent, may fail with while the filter is right."""
+
+Row = tuple[int, ...]
+Compute = Callable[..., tuple[Array, ...]]
+"""``compute(*arrays, shared, rng) -> arrays`` for any leading axes."""
+
+
+class FilterError(RuntimeError):
+    """One agent's step failed: the message names run, agent and time, and why.
+
+    Parameters
+    ----------
+    run : tuple of int
+        Which of the independent runs.
+    agent : int or None
+        None where it failed for all of them at once.
+    t : float
+        The time of the step, in s.
+    why : object
+        The cause.
+
+    Examples
+    --------
+    >>> FilterError((3,), 1, 2.5, "singular matrix")
+    FilterError('run 3, agent 1, t = 2.5 s: singular matrix')
+    """
+
+    def __init__(self, run: tuple[int, ...], agent: int | None, t: float, why: object) -> None:
+        self.run, self.agent, self.t, self.why = run, agent, t, str(why)
+        where = f"run {', '.join(map(str, run))}, " if run else ""
+        who = "" if agent is None else f"agent {agent}, "
+        super().__init__(f"{where}{who}t = {t:g} s: {why}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return FilterError, (self.run, self.agent, self.t, self.why)
+
+
+class Step:
+    """A step from a state to time `t`, with its inputs checked; :meth:`end` makes a state of it.
+
+    `dt` is its length, `channel` its door (None where nobody speaks) and `rng` its own generator;
+    `times` are the earlier times that will be kept, oldest first. `said` are the agents' readings
+    of now, `late` those of earlier times: pairs of a place among the times and what was said.
+
+    Examples
+    --------
+    >>> from distfilt.filters import Filter, GaussianFilter
+    >>> from distfilt.models import constant_velocity
+    >>> from distfilt.sensors import direct
+    >>> class Telling(GaussianFilter):
+    ...     def advance(self, step):
+    ...         print(step.dt, [group.agents.tolist() for _, group in step.heard()])
+    ...         return super().advance(step)
+    >>> f = Telling(constant_velocity(sigma=0.1), [direct([0], std=1.0)])
+    >>> f.step(f.start((np.zeros(4), np.eye(4))), 0.5, [[1.0]]).t
+    0.5 [[0]]
+    0.5
+    """
+
+    def __init__(
+        self, filter_: Any, state: Any, t: float, said: Any,
+        late: Sequence[tuple[int, int, Said]] = (), *, own: bool = False,
+    ) -> None:
+        self.filter, self.state, self.t, self.dt = filter_, state, t, t - state.t
+        self.said, self.late = said, late
+        self.times = state.kept(filter_.lag, t)
+        self.channel: Channel | None = filter_.channel(state, t)
+        # A run's own generator need not be copied: nobody else draws from it.
+        self.rng: Any = state.rng if own or state.rng is None else copied(state.rng)
+        self.failed = getattr(state, "failed", _NOBODY)
+        self.waiting: tuple[Any, ...] = ()
+        self.refused: Array | None = None
+        if filter_.gate is not None:
+            self.refused = np.zeros((*state.runs, filter_.count))
+
+    def settle(
+        self, errors: dict[Row, str], agents: Sequence[int] | NDArray[np.intp]
+    ) -> None:
+        """Take the runs of these errors as failed, or raise the error that names the first."""
+        if not errors:
+            return
+        row, why = next(iter(errors.items()))
+        if self.filter.failures == "raise" or not self.failed.shape:
+            raise FilterError(row[:-1], int(agents[row[-1]]), self.t, why)
+        self.failed = self.failed.copy()
+        for row in errors:
+            self.failed[row[:-1]] = True
+
+    @contextmanager
+    def of(self, agent: int) -> Iterator[None]:
+        """What fails here is this agent's failure."""
+        try:
+            yield
+        except RECOVERABLE as error:
+            raise FilterError((), agent, self.t, error) from error
+
+    def moved(self, values: Array, old: Any, axes: int) -> Array:
+        """A forecast (*runs, A, ...) with so many axes after the agents'; `old` in failed runs."""
+        if not np.isfinite(values).all():
+            good = np.isfinite(values).all(axis=tuple(range(-axes, 0)))
+            bad = (tuple(map(int, row)) for row in np.argwhere(~good))
+            self.settle(
+                {row: "the forecast is not finite" for row in bad},
+                range(values.shape[-axes - 1]),
+            )
+        # Groups of agents are updated in place, which a state must not notice.
+        apart = not np.may_share_memory(values, self.state.belief)
+        return self.kept(values if apart else values.copy(), old)
+
+    def kept(self, values: Array, old: Any) -> Array:
+        """The values, but `old` in failed runs."""
+        if not self.failed.any():
+            return values
+        failed = self.failed.reshape(*self.failed.shape, *(1,) * (values.ndim - self.failed.ndim))
+        return np.asarray(np.where(failed, old, values))
+
+    def stack(self, now: Array) -> list[Array]:
+        """Copies of what is believed of the earlier times, then what is believed of now."""
+        before = [x for _, x in self.state.history] + [self.state.belief] * (self.dt > 0)
+        return [x.copy() for x in before[len(before) - len(self.times) :]] + [now]
+
+    def heard(self) -> Iterator[tuple[int, Heard]]:
+        """Who heard what: a place among the times, and a group of agents with their readings.
+
+        The last place is now. A target is NaN in failed runs, so that they are left alone.
+        """
+        for place, known in sorted(self._known().items()):
+            for group in self.filter.inbox.groups(known):
+                if self.failed.any():
+                    group = group.aimed(self.kept(group.target, np.nan))
+                yield place, group
+
+    def _known(self) -> dict[int, list[list[tuple[Sensor, Array]]]]:
+        """For each time the readings that each agent has, its own and what it heard, by sender."""
+        own = [[(len(self.times), said) for said in mine] for mine in self.said]
+        for place, agent, said in self.late:
+            own[agent].append((place, said))
+        outgoing = self._outgoing(own)
+        if outgoing is None:
+            found = [[(0, *reading) for reading in mine] for mine in own]
+        else:
+            assert self.channel is not None
+            inbox = self.channel.exchange([self._payload(items) for items in outgoing])
+            found = [[(a, *reading) for reading in mine] for a, mine in enumerate(own)]
+            for box, has in zip(inbox, found, strict=True):
+                for sender, payload in box.items():
+                    values = payload if isinstance(payload, tuple) else (payload,)
+                    for (place, said), value in zip(outgoing[sender], values, strict=False):
+                        has.append((sender, place, said._replace(value=value)))
+                has.sort(key=lambda item: item[0])
+        known: dict[int, list[list[tuple[Sensor, Array]]]] = {}
+        for agent, has in enumerate(found):
+            for _, place, said in has:
+                at = known.setdefault(place, [[] for _ in found])
+                at[agent].append((said.sensor, said.value))
+        return known
+
+    def _outgoing(self, own: list[list[tuple[int, Said]]]) -> list[list[tuple[int, Said]]] | None:
+        """What each agent tells now; None if nobody does. What is not told waits for a contact."""
+        f, before = self.filter, self.state.waiting
+        if not f.shares or f.graph is None:
+            return None
+        if self.channel is None:
+            if f.lag:
+                new = ((self._time(place), agent, said.place, said.value, said.about)
+                       for agent, mine in enumerate(own) for place, said in mine)
+                self.waiting = (*before, *new)
+            return None
+        out = [list(mine) for mine in own]
+        for t, agent, place, value, about in reversed(before):
+            if t not in self.times:
+                raise ValueError(
+                    f"lag: needs to reach back to t = {t:g}, from when a reading waited for this "
+                    f"contact at t = {self.t:g}, got {f.lag}"
+                )
+            sensor = sensor_of(f, agent, place, t)
+            out[agent].insert(0, (self.times.index(t), Said(sensor, value, place, about)))
+        return out
+
+    def _time(self, place: int) -> float:
+        return self.times[place] if place < len(self.times) else self.t
+
+    def _payload(self, items: list[tuple[int, Said]]) -> Any:
+        """Values, and for others than an only reading of now when and of which sensor each is."""
+        if not items:
+            return None
+        place, said = items[0]
+        if len(items) == 1 and place == len(self.times) and not said.about:
+            return said.value
+        about: list[float] = []
+        for place, said in items:
+            which = said.place if isinstance(said.place, int) else -1
+            about += [self._time(place), which, *said.about]
+        numbers = np.broadcast_to(np.array(about), (*self.state.runs, len(about)))
+        return (*(said.value for _, said in items), numbers)
+
+    def gated(self, group: Heard, predicted: Callable[[], tuple[Array, Array]]) -> Heard:
+        """A group without the readings that the gate refuses.
+
+        `predicted` gives their predictions' mean (*runs, G, M) and covariance without the noise.
+        """
+        if self.refused is None:
+            return group
+        group, refused = group.gated(*predicted(), self.filter.gate)
+        self.refused[..., group.agents] += refused
+        return group
+
+    def before(self, place: int, rows: Any) -> Array | None:
+        """The agents' members at the time before now, for sensors that see changes."""
+        return self.state.belief[..., rows, :, :] if place == len(self.times) else None
+
+    @property
+    def agrees(self) -> bool:
+        """Whether there is an agreement, and somebody to agree with."""
+        return self.filter.agreement is not None and self.channel is not None
+
+    def agreed(self, *values: Array) -> tuple[Array, ...]:
+        """Values (*runs, A, ...) after the agreement, if there is one."""
+        if not self.agrees:
+            return values
+        belief: Any = values[0] if len(values) == 1 else values
+        out = self.filter.agreement(belief, self.channel)
+        out = (out,) if len(values) == 1 else tuple(out)
+        if len(out) != len(values):
+            raise ValueError(f"agreement: needs to return {len(values)} arrays, got {len(out)}")
+        return tuple(array(x, "agreement", v.shape) for x, v in zip(out, values, strict=True))
+
+    def end(self, *, past: Iterable[Array] = (), **belief: Any) -> Any:
+        """The state after the step; `past` has one entry for each of the earlier times."""
+        state = self.state
+        if isinstance(state, SensorState):
+            if "history" not in belief:
+                belief["history"] = tuple(zip(self.times, past, strict=True))
+            belief |= {"failed": self.failed, "waiting": self.waiting}
+        ledger = state.ledger if self.channel is None else self.channel.ledger
+        return type(state).unchecked(self.t, ledger, self.rng, refused=self.refused, **belief)
+
+
+_NOBODY = np.zeros((), dtype=bool)
+
+
+def bookmarked(rng: np.random.Generator | None) -> Callable[[], np.random.Generator | None]:
+    """Where a generator stands: a function that gives one that goes on from there, each time.
+
+    Children included. It costs next to nothing until it is called.
+
+    >>> rng = np.random.default_rng(1)
+    >>> again = bookmarked(rng)
+    >>> bool(rng.random() == again().random() == again().random())
+    True
+    """
+    if rng is None:
+        return lambda: None
+    bits = rng.bit_generator
+    seed, state = bits.seed_seq, bits.state
+    if type(seed) is not np.random.SeedSequence:
+        kept = copy.deepcopy(rng)
+        return lambda: copy.deepcopy(kept)
+    children = seed.n_children_spawned
+
+    def again() -> np.random.Generator:
+        own = np.random.SeedSequence(
+            seed.entropy, spawn_key=seed.spawn_key, pool_size=seed.pool_size,
+            n_children_spawned=children,
+        )
+        fresh = type(bits)(own)
+        fresh.state = state
+        return np.random.Generator(fresh)
+
+    return again
+
+
+def copied(rng: np.random.Generator) -> np.random.Generator:
+    """A generator that goes on as this one would, and leaves it alone."""
+    again = bookmarked(rng)()
+    assert again is not None
+    return again
+
+
+def guarded(
+    compute: Compute, arrays: tuple[Array, ...], fallback: tuple[Array, ...], lead: int, *,
+    shared: Array, rng: np.random.Generator | None = None,
+) -> tuple[tuple[Array, ...], dict[Row, str]]:
+    """A computation on a batch (*lead, …), and if it fails on each row alone.
+
+    `compute` gets the arrays, `shared`, (m, m) for all rows or (G, m, m) for each entry of the last
+    leading axis, and `rng`; `lead` axes count rows, and a row that fails keeps its `fallback`. The
+    results come with the reason for each failure, by the row's index. Where every row fails with a
+    ValueError the call is wrong, not a row, and the error is passed on.
+
+    >>> def root(x, shared, rng):
+    ...     return (np.linalg.cholesky(x),)
+    >>> x = np.array([[[4.0]], [[-1.0]]])
+    >>> out, errors = guarded(root, (x,), (x,), 1, shared=np.eye(1))
+    >>> out[0].ravel(), errors
+    (array([ 2., -1.]), {(1,): 'Matrix is not positive definite'})
+    """
+    again = bookmarked(rng)
+    try:
+        out = compute(*arrays, shared, rng)
+    except RECOVERABLE as error:
+        return _row_by_row(compute, arrays, fallback, lead, shared, again, error)
+    errors: dict[Row, str] = {}
+    for got in out:
+        if not np.isfinite(got).all():
+            bad = ~np.isfinite(got).reshape(*got.shape[:lead], -1).all(axis=-1)
+            rows = [tuple(int(i) for i in row) for row in np.argwhere(bad)]
+            errors |= {row: "the result is not finite" for row in rows}
+    if errors:
+        out = tuple(o.copy() for o in out)
+    for row in errors:
+        for target, stands in zip(out, fallback, strict=True):
+            target[row] = stands[row]
+    return out, errors
+
+
+def _row_by_row(
+    compute: Compute, arrays: tuple[Array, ...], fallback: tuple[Array, ...], lead: int,
+    shared: Array, again: Callable[[], np.random.Generator | None], first: Exception,
+) -> tuple[tuple[Array, ...], dict[Row, str]]:
+    out = tuple(f.copy() for f in fallback)
+    errors: dict[Row, str] = {}
+    own = True
+    for row in np.ndindex(arrays[0].shape[:lead]):
+        part = shared[row[-1]] if shared.ndim > 2 else shared
+        try:
+            results = compute(*(a[row] for a in arrays), part, again())
+            if not all(np.isfinite(r).all() for r in results):
+                raise ArithmeticError("the result is not finite")
+        except RECOVERABLE as error:
+            errors[row] = str(error)
+            own = own and isinstance(error, ValueError)
+            continue
+        for target, result in zip(out, results, strict=True):
+            target[row] = result
+    # numpy's LinAlgError is a ValueError too, and says nothing of the arguments.
+    own = own and not isinstance(first, np.linalg.LinAlgError)
+    if own and len(errors) == int(np.prod(arrays[0].shape[:lead])):
+        raise first
+    return out, errors
