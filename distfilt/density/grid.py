@@ -38,15 +38,15 @@ class Grid(Record):
     """
 
     shape: tuple[Annotated[int, Bounds(at_least=2)], ...]
-    low: Annotated[Array, "..."] = field(default_factory=lambda: np.zeros(()), kw_only=True)
-    high: Annotated[Array, "..."] = field(default_factory=lambda: np.ones(()), kw_only=True)
+    low: float | Annotated[Array, "d"] = field(default=0.0, kw_only=True)
+    high: float | Annotated[Array, "d"] = field(default=1.0, kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 1 <= self.dim <= 3:
             raise ValueError(f"shape: needs one to three sizes, got {self.shape!r}")
         for name in ("low", "high"):
-            corner = getattr(self, name)
+            corner = np.asarray(getattr(self, name), dtype=np.float64)
             if corner.shape not in ((), (self.dim,)):
                 raise ValueError(f"{name}: needs {self.dim} numbers, got {corner.size}")
             object.__setattr__(self, name, np.broadcast_to(corner, (self.dim,)))
@@ -91,7 +91,8 @@ class Grid(Record):
     @cached_property
     def edges(self) -> tuple[Array, ...]:
         """Edges of the cells along each axis, (n_k + 1,)."""
-        ends = zip(self.low, self.low + self.width, self.shape, strict=True)
+        low = np.asarray(self.low)
+        ends = zip(low, low + self.width, self.shape, strict=True)
         return tuple(np.linspace(low, high, n + 1) for low, high, n in ends)
 
     @cached_property

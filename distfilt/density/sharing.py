@@ -79,7 +79,7 @@ class Seen(Record):
         """What each agent sends, None for those that are gone."""
         return [x if here else None for x, here in zip(payloads, self.present, strict=True)]
 
-    def _or(self, place: Array) -> Array:
+    def _or(self, place: float | Array) -> Array:
         """The positions, with a place for agents that are gone."""
         return np.where(self.present[:, None], self.positions, place)
 

@@ -76,7 +76,7 @@ class SeparableMap(Record):
     steps: Annotated[Array, "... d Q"]
     uses: tuple[tuple[Index, ...], ...]
     weights: tuple[Annotated[Array, "..."], ...]
-    slopes: Annotated[tuple[Annotated[Array, "..."], ...], _increasing]
+    slopes: Annotated[tuple[Annotated[Array, "... s"], ...], _increasing]
 
     @property
     def dim(self) -> int:

@@ -273,6 +273,8 @@ ALLOWED: dict[tuple[str, str, str], str] = {
         "an iteration that diverges, with a warning before; as many substeps as are stable",
     (r".*", r"rounds|iterations|members|substeps", "huge: too long"):
         "as many rounds as were asked for",
+    (r"density\.DynamicAverage|triangular\.pool_by_admm", "modes|check", "None: taken"):
+        "all cells in place of coefficients; no agreement on when to stop",
     (r"models\.(Model\..*|rk4.*|RotatingMixture.*)", r".*", r".*: NaN"):
         "a user's function that overflows",
     (r"sensors\.Sensor.*", r".*", r"(tiny|zero|NaN): NaN"):
