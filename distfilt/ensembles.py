@@ -11,13 +11,7 @@ from .doors import Array, Count, Rng, Semidefinite, door, unchecked
 from .linalg import EPS, cholesky, factor, leading, solve_upper, symmetrise
 
 __all__ = [  # fmt: skip
-    "Ensemble",
-    "Members",
-    "anomalies",
-    "cross_covariance",
-    "draw",
-    "exact_noise",
-    "mean",
+    "Ensemble", "Members", "anomalies", "cross_covariance", "draw", "exact_noise", "mean",
     "sample_covariance",
 ]
 
@@ -237,7 +231,3 @@ def _steady(gram: Array, least: float) -> Array | None:
         return None
     small = np.diagonal(lower, axis1=-2, axis2=-1).min(initial=1.0) < np.sqrt(least)
     return None if small else lower
-
-
-_mean, _anomalies = unchecked(mean), unchecked(anomalies)
-_sample_covariance, _cross_covariance = unchecked(sample_covariance), unchecked(cross_covariance)

@@ -16,19 +16,8 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 from .doors import Array, NonNegative, Semidefinite, door, unchecked
 
 __all__ = [  # fmt: skip
-    "EPS",
-    "SolverError",
-    "central",
-    "cholesky",
-    "factor",
-    "leading",
-    "log_det",
-    "quadratic_form",
-    "solve_lower",
-    "solve_upper",
-    "symmetrise",
-    "van_loan",
-    "whiten",
+    "EPS", "SolverError", "central", "cholesky", "factor", "leading", "log_det", "quadratic_form",
+    "solve_lower", "solve_upper", "symmetrise", "van_loan", "whiten",
 ]
 
 EPS = float(np.finfo(np.float64).eps)
@@ -322,7 +311,4 @@ def central(
     return np.asarray(np.swapaxes(slope, -1, -2))
 
 
-_EPS, _factor = EPS, unchecked(factor)
-_symmetrise, _cholesky, _leading, _whiten = symmetrise, cholesky, leading, whiten
-_solve_lower, _solve_upper = solve_lower, solve_upper
-_quadratic_form, _log_det = quadratic_form, log_det
+_symmetrise = symmetrise

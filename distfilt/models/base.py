@@ -10,19 +10,8 @@ from typing import Annotated
 import numpy as np
 
 from ..batches import batched
-from ..doors import (
-    Array,
-    Bounds,
-    Count,
-    NonNegative,
-    Record,
-    Rng,
-    Times,
-    array,
-    door,
-    semidefinite,
-    unchecked,
-)
+from ..doors import Array, Bounds, Count, NonNegative, Record, Rng, Times, array, door, unchecked
+from ..doors.values import semidefinite
 from ..linalg import central, factor
 
 __all__ = ["LinearModel", "Model", "simulate"]
@@ -192,9 +181,6 @@ class LinearModel(Model):
     def jacobian(self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegative) -> Array:
         """Derivative of a step, the same matrix for all states, as (..., d, d)."""
         return np.broadcast_to(unchecked(self.transition)(dt), (*x.shape, self.dim))
-
-    def _transition(self, dt: float) -> Array:
-        return unchecked(self.transition)(dt)
 
 
 def _matrix(transition_matrix: Callable[[float], Array], dim: int, dt: float) -> Array:

@@ -17,7 +17,7 @@ from ..doors import Array, Bounds, Count, Positive, door, unchecked
 from .base import Model, Strength
 from .integrators import equal_steps, rk4
 
-__all__ = [
+__all__ = [  # fmt: skip
     "J2", "MU", "RADIUS", "acceleration", "occulted", "orbits", "potential", "propagate",
     "rsw_frame",
 ]

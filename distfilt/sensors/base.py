@@ -197,6 +197,3 @@ class Sensor(Record):
 
     def _residual(self, observed: Array, predicted: Array) -> Array:
         return unchecked(self.residual)(observed, predicted)
-
-    def _jacobian(self, x: Array, previous: Array | None = None) -> Array:
-        return unchecked(self.jacobian)(x, previous)

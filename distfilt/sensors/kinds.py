@@ -12,15 +12,7 @@ import numpy as np
 from ..doors import Array, Bounds, Places, door, unchecked
 from .base import Sensor, wrap
 
-__all__ = [  # fmt: skip
-    "WideAngle",
-    "angle",
-    "direct",
-    "distance",
-    "distance_and_angle",
-    "of_kind",
-    "stack",
-]
+__all__ = ["WideAngle", "angle", "direct", "distance", "distance_and_angle", "of_kind", "stack"]
 
 Deviation = Annotated[float, Bounds(at_least=1e-150, at_most=1e150)]
 """A standard deviation whose square is a variance that is neither zero nor infinite."""
