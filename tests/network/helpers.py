@@ -8,8 +8,6 @@ from distfilt.network import Channel, Faults, Graph, Weights, graphs
 
 NAN = float("nan")
 STAR = graphs.star(3)
-ONE_WAY = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1)], directed=True)
-UNBALANCED = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1), (0, 1)], directed=True)
 APART = Graph.from_adjacency(np.zeros((3, 3)))
 
 
