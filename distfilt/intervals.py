@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from .checks import Array, array, count, number
+from .doors import Array, Bounds, Count, door
 
 __all__ = ["Interval", "mean_interval", "median_interval", "proportion_interval"]
+
+Values = Annotated[Array, "n"]
+Level = Annotated[float, Bounds(above=0, below=1)]
 
 
 @dataclass(frozen=True)
@@ -38,31 +40,15 @@ class Interval:
     high: float
     error: float
 
-    def __post_init__(self) -> None:
-        middle = number(self.estimate, "estimate")
-        number(self.low, "low", at_most=middle)
-        number(self.high, "high", at_least=middle)
-        number(self.error, "error", at_least=0)
-
-    def __contains__(self, value: object) -> bool:
-        return bool(self.low <= number(value, "value") <= self.high)
+    def __contains__(self, value: float) -> bool:
+        return bool(self.low <= value <= self.high)
 
     def __str__(self) -> str:
         return f"{self.estimate:.3g} [{self.low:.3g}, {self.high:.3g}]"
 
 
-def _level(value: Any) -> float:
-    return number(value, "level", above=0, below=1)
-
-
-def _values(values: ArrayLike, least: int) -> Array:
-    out = array(values, "values", ("n",))
-    if out.size < least:
-        raise ValueError(f"values: needs at least {least} values, got {out.size}")
-    return out
-
-
-def mean_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
+@door
+def mean_interval(values: Values, *, level: Level = 0.95) -> Interval:
     """Student's t interval for the mean of independent values, with the standard error s/√n.
 
     Parameters
@@ -79,16 +65,18 @@ def mean_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
     """
     from scipy.stats import t
 
-    v = _values(values, 2)
-    confidence = _level(level)
-    middle, error = float(v.mean()), float(v.std(ddof=1)) / float(np.sqrt(v.size))
+    if values.size < 2:
+        raise ValueError(f"values: needs at least 2 values, got {values.size}")
+    middle = float(values.mean())
+    error = float(values.std(ddof=1)) / float(np.sqrt(values.size))
     if error == 0:  # all alike, which a distribution of scale 0 is not made for
         return Interval(middle, middle, middle, 0.0)
-    low, high = t.interval(confidence, v.size - 1, loc=middle, scale=error)
+    low, high = t.interval(level, values.size - 1, loc=middle, scale=error)
     return Interval(middle, float(low), float(high), error)
 
 
-def median_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
+@door
+def median_interval(values: Values, *, level: Level = 0.95) -> Interval:
     """Interval for the median that assumes nothing about the distribution.
 
     The k-th smallest and the k-th largest value miss the median with probability
@@ -110,23 +98,21 @@ def median_interval(values: ArrayLike, *, level: float = 0.95) -> Interval:
     from scipy.special import ndtri
     from scipy.stats import binom
 
-    confidence = _level(level)
-    width = 2 * float(ndtri(0.5 + confidence / 2))
-    if width == 0:
-        raise ValueError(f"level: needs a number that differs from 0 in 1 + level, got {level!r}")
-    v = np.sort(_values(values, 1))
-    n = v.size
+    v, n = np.sort(values), values.size
     # P(B <= k - 1) for k = 1, 2, ...: the chance that the k-th smallest lies above the median.
     missed = 2 * binom.cdf(np.arange((n + 1) // 2), n, 0.5)
-    k = int((missed <= 1 - confidence).sum())
+    k = int((missed <= 1 - level).sum())
     if k == 0:
-        raise ValueError(f"values: needs more values for level {confidence:g}, got {n}")
+        raise ValueError(f"values: needs more values for level {level:g}, got {n}")
     low, high = float(v[k - 1]), float(v[n - k])
-    error = (high - low) / width
+    error = (high - low) / (2 * float(ndtri(0.5 + level / 2)))
     return Interval(float(np.median(v)), low, high, error)
 
 
-def proportion_interval(successes: int, trials: int, *, level: float = 0.95) -> Interval:
+@door
+def proportion_interval(
+    successes: Annotated[int, Bounds(at_least=0)], trials: Count, *, level: Level = 0.95
+) -> Interval:
     """Clopper-Pearson interval for a probability: it covers with at least `level`, for every n.
 
     The error is the plug-in one, √(p(1-p)/n), 0 at p = 0 and 1.
@@ -151,11 +137,9 @@ def proportion_interval(successes: int, trials: int, *, level: float = 0.95) -> 
     """
     from scipy.stats import beta
 
-    n = count(trials, "trials")
-    k = count(successes, "successes", at_least=0)
+    k, n, tail = successes, trials, (1 - level) / 2
     if k > n:
         raise ValueError(f"successes: needs at most as many as trials ({n}), got {k}")
-    tail = (1 - _level(level)) / 2
     low = 0.0 if k == 0 else float(beta.ppf(tail, k, n - k + 1))
     high = 1.0 if k == n else float(beta.ppf(1 - tail, k + 1, n - k))
     share = k / n

@@ -8,14 +8,6 @@ import pytest
 
 from distfilt.progress import track
 
-BAD_INPUT = {
-    "distfilt.progress.track": [
-        ("items", lambda: track(3, show=True)),  # type: ignore[arg-type]
-        ("show", lambda: track([1], show="yes")),  # type: ignore[arg-type]
-        ("total", lambda: track([1], show=False, total="one")),  # type: ignore[arg-type]
-    ]
-}
-
 
 def test_items_come_through_in_order(capsys: pytest.CaptureFixture[str]) -> None:
     for show in (True, False):

@@ -13,14 +13,6 @@ import pytest
 from bookkit import studies
 
 ROOT = Path(__file__).resolve().parents[2]
-GOOD = """
-from bookkit.studies import spawn
-NAME, PAPER, columns, parameters = "small", "grange", ["a", "b"], {}
-seeds = spawn(1, 2)
-def trial(seed):
-    return [0.0, 1.0]
-"""
-
 
 def load() -> ModuleType:
     """The tool as a module of its own."""
@@ -31,36 +23,6 @@ def load() -> ModuleType:
     sys.modules["study_tool"] = module
     spec.loader.exec_module(module)
     return module
-
-
-@pytest.fixture(name="tool")
-def _tool() -> ModuleType:
-    return load()
-
-
-def _script(tmp_path: Path, text: str) -> Path:
-    path = tmp_path / "small.py"
-    path.write_text(text, encoding="utf-8")
-    return path
-
-
-def test_a_good_script_is_taken(tool: ModuleType, tmp_path: Path) -> None:
-    assert tool.load_script(_script(tmp_path, GOOD)).NAME == "small"
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "complaint"),
-    [
-        ("def trial", "def try_it", "has to define trial"),
-        ('"grange"', '"grunge"', "PAPER"),
-        ('"small"', '"Small one"', "NAME"),
-    ],
-)
-def test_a_bad_script_is_refused_before_it_runs(
-    tool: ModuleType, tmp_path: Path, old: str, new: str, complaint: str
-) -> None:
-    with pytest.raises(ValueError, match=complaint):
-        tool.load_script(_script(tmp_path, GOOD.replace(old, new)))
 
 
 # `make studies`.
@@ -120,6 +82,10 @@ def test_make_studies_stores_and_checks(
         ("columns =", "names =", "columns"),
         ('"zheng"', '"chang"', "PAPER"),
         ('"spread", "zheng"', '"a/b", "zheng"', "NAME"),
+        ('"spread", "zheng"', '"Small one", "zheng"', "NAME"),
+        ("def trial", "def try_it", "has to define trial"),
+        ('["mean", "spread"]', '["a b", "c"]', "columns"),
+        ('["mean", "spread"]', '["a", "a"]', "columns"),
     ],
 )
 def test_make_studies_refuses_a_script(old: str, new: str, word: str, tmp_path: Path) -> None:
