@@ -191,7 +191,7 @@ Solve = Callable[[Array, Array, Array], tuple[Array, Array]]
 """``solve(cost, rows, columns) -> (matrix, column potential)`` for a cost between zero and one."""
 
 
-def solver_of(name: Solver, regularisation: float) -> Solve:
+def solver_of(name: Solver, regularisation: float = 0.01) -> Solve:
     """The solver of that name, for a cost between zero and one."""
     if name == "entropic":
         return partial(_entropic, strength=regularisation)

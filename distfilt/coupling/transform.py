@@ -60,10 +60,7 @@ def _ties(n: int) -> Array:
 
 
 @door
-def plans(
-    ensemble: Members, log_weights: ArrayLike, *, solver: Solver = "network",
-    regularisation: Positive = 0.01,
-) -> Array:
+def plans(ensemble: Members, log_weights: ArrayLike) -> Array:
     """Optimal couplings of weighted members to the same members with equal weights.
 
     Parameters
@@ -72,8 +69,6 @@ def plans(
         Members.
     log_weights : array_like, (..., N)
         Logarithms of their weights, in any normalisation.
-    solver, regularisation
-        As for :func:`~distfilt.coupling.plan`.
 
     Returns
     -------
@@ -89,7 +84,7 @@ def plans(
            [0.  , 0.25]])
     """
     w = normalised(log_weights, ensemble.shape[:-1])
-    return _plans(ensemble, w, solver_of(solver, regularisation))
+    return _plans(ensemble, w, solver_of("network"))
 
 
 def _plans(x: Array, w: Array, solve: Solve) -> Array:
@@ -134,10 +129,8 @@ def ensemble_transform(
 
     Raises
     ------
-    ValueError
-        If shapes do not fit, a number is not finite or all weights of an ensemble are zero.
     SolverError
-        If a linear programme is not solved.
+        If the solver stops without a solution.
 
     Examples
     --------
@@ -289,7 +282,7 @@ def rejuvenated(
 @door
 def transform_within(
     ensemble: Annotated[Array, "n d"], log_weights: ArrayLike,
-    pieces: Annotated[NDArray[np.intp], "n"], *, rng: Rng, solver: Solver = "network",
+    pieces: Annotated[NDArray[np.intp], "n"], *, rng: Rng,
 ) -> Array:
     r"""The transform on a set cut into pieces: no average crosses from one piece to another.
 
@@ -308,8 +301,6 @@ def transform_within(
     rng : numpy.random.Generator
         Chooses the pieces, systematically: each gets its share of the members to within one or
         two.
-    solver : str
-        As for :func:`~distfilt.coupling.plan`.
 
     Returns
     -------
@@ -325,7 +316,7 @@ def transform_within(
     True
     """
     x = ensemble
-    matrix = len(x) * unchecked(plans)(x, log_weights, solver=solver)
+    matrix = len(x) * unchecked(plans)(x, log_weights)
     names, index = np.unique(pieces, return_inverse=True)
     belongs = (index == np.arange(names.size)[:, None]).astype(np.float64)
     chosen = _chosen(belongs @ matrix, rng)
@@ -355,7 +346,7 @@ def _chosen(share: Array, rng: np.random.Generator) -> Array:
 @door
 def transform_along(
     ensemble: Members, log_weights: ArrayLike, *, difference: Callable[[Array, Array], Array],
-    retract: Callable[[Array, Array], Array], solver: Solver = "network",
+    retract: Callable[[Array, Array], Array],
 ) -> Array:
     r"""The transform on a curved set: averages of tangent vectors, moved back onto the set.
 
@@ -375,8 +366,6 @@ def transform_along(
         both (..., d). On a circle the angle between them, wrapped.
     retract : callable
         ``retract(here, v) -> x``, (..., d): where it leads.
-    solver : str
-        As for :func:`~distfilt.coupling.plan`.
 
     Returns
     -------
@@ -395,7 +384,7 @@ def transform_along(
            [-3.142]])
     """
     x, n = ensemble, ensemble.shape[-2]
-    w, solve = normalised(log_weights, x.shape[:-1]), solver_of(solver, 0.01)
+    w, solve = normalised(log_weights, x.shape[:-1]), solver_of("network")
     equal = np.full(n, 1 / n)
     there, here = np.broadcast_arrays(x[..., :, None, :], x[..., None, :, :])
     v = array(difference(there.copy(), here.copy()), "difference", (*x.shape[:-1], n, "k"))

@@ -27,19 +27,6 @@ def test_filter_is_conditioning_of_the_joint_gaussian(gaps: bool) -> None:
     np.testing.assert_allclose(run.log_likelihood.sum(), expected, rtol=1e-11)
 
 
-def test_static_state_is_least_squares() -> None:
-    rng = np.random.default_rng(2)
-    h, r = rng.standard_normal((STEPS, M, D)), spd(rng, M, (STEPS,))
-    y, mean, cov = rng.standard_normal((STEPS, M)), rng.standard_normal(D), spd(rng, D)
-    run = kalman_filter(mean, cov, y, F=np.eye(D), H=h, Q=np.zeros((D, D)), R=r)
-    # Stack the prior as D more rows and solve one whitened least-squares problem.
-    roots = [np.linalg.cholesky(cov), *np.linalg.cholesky(r)]
-    systems, values = (np.eye(D), *h), (mean, *y)
-    rows = np.concatenate([np.linalg.solve(c, a) for c, a in zip(roots, systems, strict=True)])
-    right = np.concatenate([np.linalg.solve(c, b) for c, b in zip(roots, values, strict=True)])
-    np.testing.assert_allclose(run.means[-1], np.linalg.lstsq(rows, right)[0], atol=1e-11)
-
-
 @given(seed=st.integers(0, 10**6), share=st.floats(0, 0.9))
 def test_covariances_stay_symmetric_and_positive(seed: int, share: float) -> None:
     rng = np.random.default_rng(seed)

@@ -45,14 +45,6 @@ def test_runs_are_smoothed_as_if_alone(gaps: bool) -> None:
     assert (smooth.covariances == np.swapaxes(smooth.covariances, -1, -2)).all()
 
 
-def test_later_observations_only_help() -> None:
-    rng = np.random.default_rng(4)
-    p = problem(rng)
-    run = kalman_filter(np.zeros(D), np.eye(D), rng.standard_normal((STEPS, M)), **p)
-    gain = run.covariances - rts_smoother(run, F=p["F"], Q=p["Q"]).covariances
-    assert np.linalg.eigvalsh(gain).min() > -1e-12
-
-
 def test_a_state_that_cannot_be_forecast_raises() -> None:
     lost = GaussianRun(np.zeros((2, 1)), np.zeros((2, 1, 1)), np.zeros(2))
     with pytest.raises(np.linalg.LinAlgError, match="forecast"):
