@@ -198,9 +198,6 @@ def solver_of(name: Solver, regularisation: float = 0.01) -> Solve:
     return _network if name == "network" else _linprog
 
 
-_solver = solver_of
-
-
 def _network(cost: Array, a: Array, b: Array) -> tuple[Array, Array]:
     """POT's network simplex; `ot.emd` round it would cost 0.2 ms more, half as much at N = 50."""
     emd = needed("ot.lp.emd_wrap", "maps")

@@ -394,11 +394,3 @@ def transform_along(
         matrix, _ = solve(scaled(costs[row])[0] + _ties(n), w[row], equal)
         steps[row] = n * np.einsum("ij,ijk->jk", matrix, v[row])
     return array(retract(x.copy(), steps), "retract", x.shape)
-
-
-# Names of before, until the filters take those above.
-_normalised, _carried = normalised, carried
-
-
-def _rejuvenated(y: Array, x: Array, h: float, rng: Rng) -> Array:
-    return unchecked(rejuvenated)(y, x, bandwidth=h, rng=rng)

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..coupling.solvers import _solver
-from ..coupling.transform import _carried, _normalised, _plans, _rejuvenated
+from ..coupling import plans, rejuvenated
+from ..coupling.transform import carried, normalised
 from ..doors import Array, NonNegative, unchecked
 from ..network import finite_time
 from ..updates.particles import log_likelihood
@@ -150,15 +150,15 @@ class TransportFilter(Filter):
         """All times' members, carried by the coupling of the last time's; the rows that failed."""
 
         def compute(here: Array, *rest: Any) -> tuple[Array, ...]:
-            times, w = rest[:-2], _normalised(here)
-            matrix = _plans(times[-1], w, _solver("network", 0.01))
-            return tuple(_carried(x, w, matrix, correct=self.correct) for x in times)
+            times, w = rest[:-2], normalised(here)
+            matrix = unchecked(plans)(times[-1], here)
+            return tuple(carried(x, w, matrix, correct=self.correct) for x in times)
 
         out, errors = guarded(
             compute, (logs, *stack), tuple(stack), logs.ndim - 1, shared=np.eye(1)
         )
         if self.rejuvenation:
-            draw = partial(_rejuvenated, h=self.rejuvenation)
+            draw = partial(unchecked(rejuvenated), bandwidth=self.rejuvenation)
             # Every time's members meet the same draws; the generator advances once.
             sources = [copy.deepcopy(rng) for _ in out[1:]] + [rng]
             both = zip(out, stack, sources, strict=True)
@@ -171,7 +171,7 @@ class TransportFilter(Filter):
         """A coupling that carries all to one or two members leaves nothing to go on from."""
         if step.failed.all():
             return
-        w = _normalised(logs[~step.failed] if step.failed.any() else logs)
+        w = normalised(logs[~step.failed] if step.failed.any() else logs)
         size = float((1 / (w * w).sum(axis=-1)).min())
         if size < 1.1:
             what = f"an agent's weights have an effective size of {size:.1f}"
