@@ -21,8 +21,6 @@ __all__ = ["PointRule", "conditioned", "moved", "within_gate"]
 PointRule = Literal["dd2", "unscented"]
 """How points about a mean stand for a Gaussian."""
 
-_Function = Callable[[Array], Array]
-_Residual = Callable[[Array, Array], Array]
 _LOG_2PI = float(np.log(2 * np.pi))
 _STEP = 3.0
 """Square of DD2's step."""
@@ -156,7 +154,8 @@ def within_gate(
 
 
 def _innovations(
-    mixture: GaussianMixture, observed: Array, function: _Function, residual: _Residual,
+    mixture: GaussianMixture, observed: Array, function: Callable[[Array], Array],
+    residual: Callable[[Array, Array], Array],
     rule: PointRule, here: np.ndarray[tuple[int], np.dtype[np.intp]],
 ) -> tuple[Array, Array, Array]:  # fmt: skip
     """Innovations (L, k) of the components that are there, and differences of their prediction."""

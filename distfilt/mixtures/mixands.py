@@ -60,15 +60,11 @@ class Shapes(Record):
         >>> Shapes([[0.0], [1.0]], [[[1.0]], [[2.0]]], [0, 0]).select([1]).means
         array([[1.]])
         """
-        return self.unchecked(
-            self.means[keep], self.covs[keep], self.source[keep], self.dropped
-        )
+        return self.unchecked(self.means[keep], self.covs[keep], self.source[keep], self.dropped)
 
     def equally_weighed(self) -> GaussianMixture:
         """A mixture of these mixands with equal weights."""
-        return GaussianMixture.unchecked(
-            np.full(self.size, 1 / self.size), self.means, self.covs
-        )
+        return GaussianMixture.unchecked(np.full(self.size, 1 / self.size), self.means, self.covs)
 
 
 def _told(sent: Sequence[GaussianMixture], w: Array, about: Array) -> tuple[Array, Array]:
