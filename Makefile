@@ -36,7 +36,7 @@ help:
 	@echo "make studies    run the studies that take too long for a chapter, store them in data/studies"
 	@echo "make check-studies  run every stored study again and compare"
 	@echo "make portable   stored outputs on another BLAS kernel and without numpy's newer SIMD"
-	@echo "make bench      side-by-side measurements, written to data/bench"
+	@echo "make bench      side-by-side measurements, written to data/bench if the machine is idle"
 	@echo "make mutants    how many of SAMPLE=300 random faults the tests find, written to data/bench"
 	@echo "make lab        JupyterLab on a working copy of the chapters (LAB=folder for another one)"
 	@echo "make lock       resolve requirements.txt again"
@@ -104,7 +104,7 @@ check-studies: $(STAMP)
 
 bench: $(STAMP)
 	mkdir -p data/bench
-	set -e; for script in tests/bench/bench_*.py; do echo "$$script"; $(PY) "$$script"; done
+	$(PY) tests/bench/run.py
 
 mutants: $(STAMP)
 	$(PY) tests/tools/mutants.py --sample $(SAMPLE)

@@ -1,4 +1,8 @@
-"""What every benchmark shares: repeated timing, and tables that say where they were measured."""
+"""What every benchmark shares: repeated timing, and tables that say where they were measured.
+
+A script writes its table unless others kept the machine busy meanwhile; ``--force`` writes it all
+the same. It ends with the number of floors that were missed.
+"""
 
 from __future__ import annotations
 
@@ -96,16 +100,38 @@ def peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
-def machine() -> str:
-    """Processor, core count, and how busy the machine is; `timed` holds BLAS to one thread."""
+def load(seconds: float = 1.0) -> float:
+    """How many cores others keep busy, while this process waits; NaN where nothing tells."""
+
+    def spent() -> tuple[int, int]:
+        line = Path("/proc/stat").read_text(encoding="utf-8").split("\n", 1)[0]
+        ticks = [int(v) for v in line.split()[1:9]]
+        return sum(ticks), ticks[3] + ticks[4]
+
+    try:
+        whole, idle = spent()
+        time.sleep(seconds)
+        now, rested = spent()
+    except (OSError, ValueError):
+        return float("nan")
+    return (os.cpu_count() or 1) * (1 - (rested - idle) / max(now - whole, 1))
+
+
+_BEFORE = load()
+"""Taken when the script begins; `write` looks again."""
+BUSY = 1.0
+"""Times that were taken under more load are shown and not kept."""
+
+
+def machine(busy: float) -> str:
+    """Processor, core count, and how busy others kept it; `timed` holds BLAS to one thread."""
     name = platform.processor() or platform.machine()
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         name = next(line.split(":", 1)[1].strip() for line in lines if "model name" in line)
     except (OSError, StopIteration):
         pass
-    load = f"; load {os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else ""
-    return f"{name}; {os.cpu_count()} cores; one BLAS thread{load}"
+    return f"{name}; {os.cpu_count()} cores; one BLAS thread; load {busy:.1f}"
 
 
 def versions(packages: Sequence[str]) -> str:
@@ -122,16 +148,19 @@ def versions(packages: Sequence[str]) -> str:
 def write(
     name: str, rows: Sequence[Mapping[str, Any]], packages: Sequence[str] = ("numpy", "scipy")
 ) -> Path:
-    """Write rows to data/bench/`name`.csv with versions and machine, and print them."""
-    columns = list(rows[0])
-    FOLDER.mkdir(parents=True, exist_ok=True)
+    """Print rows, and write them to data/bench/`name`.csv with versions, machine and its load."""
+    columns, busy = list(rows[0]), max(_BEFORE, load())
+    widths = [max(len(c), *(len(str(row[c])) for row in rows)) for c in columns]
+    for cells in (columns, *([row[c] for c in columns] for row in rows)):
+        print("  ".join(str(v).ljust(w) for v, w in zip(cells, widths, strict=True)).rstrip())
     path = FOLDER / f"{name}.csv"
-    where = {"versions": versions(packages), "machine": machine()}
+    if busy > BUSY and "--force" not in sys.argv:
+        print(f"{name}.csv: not written under a load of {busy:.1f}; --force writes it")
+        return path
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    where = {"versions": versions(packages), "machine": machine(busy)}
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [*columns, *where], lineterminator="\n")
         writer.writeheader()
         writer.writerows({**row, **where} for row in rows)
-    widths = [max(len(c), *(len(str(row[c])) for row in rows)) for c in columns]
-    for cells in (columns, *([row[c] for c in columns] for row in rows)):
-        print("  ".join(str(v).ljust(w) for v, w in zip(cells, widths, strict=True)).rstrip())
     return path

@@ -149,7 +149,7 @@ def main() -> int:
     write("coupling-growth", growth(), packages)
     rows, missed = ratios()
     write("coupling", rows, packages)
-    whole = study(int(sys.argv[1]) if len(sys.argv) > 1 else 100)
+    whole = study(100)
     write("coupling-study", whole, packages)
     slow = float(str(whole[0]["wall_s_for_100"])) > 30
     return int(missed + slow + int(str(whole[0]["failed"])))
