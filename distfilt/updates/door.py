@@ -81,23 +81,24 @@ def update(function: F) -> F:
     def checked(*args: Any, **options: Any) -> Array:
         placed, named = plan.taken(args, options)
         given = dict(zip(plan.row, placed, strict=False)) | named
-        return function(**given | _related(*((name, given[name]) for name in names)))
+        return function(**given | _related({name: given[name] for name in names}))
 
     made: Any = checked
     made.unchecked, made.plan, made.stacks = function, plan, True
     return cast(F, made)
 
 
-def _related(*four: tuple[str, Array]) -> dict[str, Array]:
-    """The arguments whose leading axes have to fit the ensemble's; the reading for each."""
-    lead = four[0][1].shape[:-2]
-    tails = {name: value.shape[-k:] for (name, value), k in zip(four, (2, 2, 1, 2), strict=True)}
-    for name, value in four[1:]:
-        own = value.shape[: value.ndim - len(tails[name])]
-        fits = all(n in (1, k) for n, k in zip(own[::-1], lead[::-1], strict=False))
-        if len(own) > len(lead) or not fits:
-            raise ValueError(f"{name}: needs leading axes {lead}, got {own}")
-    return {name: np.broadcast_to(value, (*lead, *tails[name])) for name, value in four[1:3]}
+def _related(four: dict[str, Array]) -> dict[str, Array]:
+    """What the arguments become whose leading axes have to fit the ensemble's."""
+    (lead, *own) = (v.shape[:-k] for v, k in zip(four.values(), (2, 2, 1, 2), strict=True))
+    if own[0] == own[1] == lead and own[2] in ((), lead):
+        return {}
+    for name, given in zip(list(four)[1:], own, strict=True):
+        fits = all(n in (1, k) for n, k in zip(given[::-1], lead[::-1], strict=False))
+        if len(given) > len(lead) or not fits:
+            raise ValueError(f"{name}: needs leading axes {lead}, got {given}")
+    tails = zip(list(four)[1:3], (2, 1), strict=True)
+    return {n: np.broadcast_to(four[n], (*lead, *four[n].shape[-k:])) for n, k in tails}
 
 
 def says(update: Update, what: str) -> bool:
