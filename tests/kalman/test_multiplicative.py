@@ -15,7 +15,8 @@ from distfilt.kalman import (
 from distfilt.linalg import central
 from distfilt.models import Model, constant_velocity, satellite_pose, simulate
 from distfilt.models.rotations import turned
-from distfilt.sensors import differential, direct, distance_and_angle, stack
+from distfilt.sensors import direct, distance_and_angle, stack
+from distfilt.sensors.kinds import differential
 from tests.kalman.problems import spd
 from tests.support import turning
 

@@ -18,7 +18,6 @@ from distfilt.sensors import (
     Sensor,
     WideAngle,
     angle,
-    differential,
     direct,
     distance,
     distance_and_angle,
@@ -26,6 +25,7 @@ from distfilt.sensors import (
     line_of_sight,
     stack,
 )
+from distfilt.sensors.kinds import differential
 
 PLACE = [0.7, -0.4]
 
