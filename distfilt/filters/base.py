@@ -375,7 +375,8 @@ class Filter(Record, ABC):
         fewer times follow, and the last estimate is the filter's.
         """
         if not self.lag:
-            raise ValueError(self.unused.get("lag", "lag: needs at least 1 for smoothing, got 0"))
+            why = self.unused.get("lag", "needs at least 1 for smoothing, got 0")
+            raise ValueError(f"lag: {why}")
         self.fits(state)
         grid, entries = planned(self, state, times, observations)
         recorder = Recorder(self, grid, state, truth, scores)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -194,7 +195,7 @@ def belated(f: Any, late: Sequence[Late], state: Any, t: float) -> list[tuple[in
     A sum of steps may differ by rounding, but by far less than the shortest of them.
     """
     times = state.kept(f.lag, t)
-    shortest = min((b - a for a, b in zip(times, (*times[1:], t), strict=True)), default=0.0)
+    shortest = min((b - a for a, b in pairwise((*times, t))), default=0.0)
     out = []
     for item in late:
         away = [abs(known - item.measured) for known in times]

@@ -1,0 +1,363 @@
+"""The contract of all seven families, through one list: runs, events, gates, contacts, scores."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import xarray
+from scipy.stats import chi2, multivariate_normal
+
+from distfilt.density import Flooding, FokkerPlanck, Grid
+from distfilt.filters import (
+    DensityFilter,
+    EnsembleFilter,
+    FilterError,
+    GaussianFilter,
+    Late,
+    MixtureFilter,
+    NewsFilter,
+    ParticleFilter,
+    Reading,
+    TransportFilter,
+    final_state,
+)
+from distfilt.kalman import kalman_filter
+from distfilt.mixtures import GaussianMixture, target_fusion
+from distfilt.models import LinearModel, lorenz63, rotating_swarm
+from distfilt.network import Graph, covariance_intersection, graphs, pull
+from distfilt.sensors import Sensor, direct, stack
+
+from .families import NOISE, PRIOR, TIMES, Q, data, model
+
+EYES = [direct([0], std=0.6), Sensor(2, lambda x: x, NOISE, linear=np.eye), direct([1], std=0.5)]
+NET = graphs.complete(3)
+SWARM, PLACES = rotating_swarm("gibbs"), np.random.default_rng(1).random((9, 2))
+LAW = FokkerPlanck(SWARM, Grid((9, 9)))
+SIX = {
+    "ensemble": partial(EnsembleFilter.exact, members=30, agreement=None),
+    "gaussian": GaussianFilter,
+    "particle": partial(ParticleFilter, members=300),
+    "transport": partial(TransportFilter, members=30),
+    "mixture": partial(MixtureFilter, target_dim=2, agreement=partial(target_fusion, target_dim=2)),
+    "news": partial(NewsFilter, target_dim=2),
+}
+EACH = pytest.mark.parametrize("family", [*SIX, "density"])
+OF_SIX = pytest.mark.parametrize("family", SIX)
+
+
+def made(family: str, times: Any = TIMES, **options: Any) -> tuple[Any, Any, Any, Any]:
+    """A filter, its first state, the readings agent by agent, and the truth."""
+    if family == "density":
+        path = SWARM.simulate(PLACES, times, rng=np.random.default_rng(2), substeps=2)
+        given = {"agreement": Flooding(), "bandwidth": 0.15, "rank": 20} | options
+        f: Any = DensityFilter(LAW, 9, given.pop("graph", 0.5), **given)
+        return f, f.start(PLACES), path.swapaxes(0, 1), LAW.evolve(np.ones(81), times)
+    truth, seen = data(options.get("sensors", EYES))
+    given = {"graph": NET, "sensors": EYES} | options
+    f = SIX[family](model(), given.pop("sensors"), given.pop("graph"), **given)
+    seen = [None if s is None else s[: len(times)] for s in seen]
+    return f, f.start(PRIOR, rng=np.random.default_rng(0)), seen, truth[: len(times)]
+
+
+def joint(seen: Any, sensors: Any = EYES) -> Any:
+    """The Kalman filter of everybody's readings."""
+    steps, every = np.diff(TIMES, prepend=0.0), stack(sensors)
+    f, q = np.array([model().transition(dt) for dt in steps]), np.array([dt * Q for dt in steps])
+    y = np.concatenate(seen, axis=-1)
+    return kalman_filter(*PRIOR, y, F=f, Q=q, H=every.matrix(2), R=every.cov)
+
+
+@EACH
+def test_a_run_is_its_steps_whether_saved_or_not(family: str, tmp_path: Path) -> None:
+    """With as many times as agents, so that a series cannot be taken for its transpose."""
+    times = TIMES[: 9 if family == "density" else 3]
+    f, start, seen, truth = made(family, times)
+    run = f.run(start, times, seen, truth=truth)
+    state = start
+    for k, t in enumerate(times):
+        state = f.step(state, t, [s[k] for s in seen])
+        state.save(tmp_path / "state.npz")
+        state = type(state).load(tmp_path / "state.npz")
+        again = f.summary(state)
+        assert np.array_equal(run["mean"].values[k], again.mean, equal_nan=True)
+        assert np.array_equal(run["variance"].values[k], again.variance, equal_nan=True)
+        assert np.array_equal(run["scalars_total"].values[k], state.ledger.scalars)
+    assert (run["squared_error"].values == (run["mean"].values - truth[:, None]) ** 2).all()
+    assert len(repr(state)) < 200 and f"t={times[-1]:g}" in repr(state)
+
+
+@OF_SIX
+def test_events_of_any_order_are_the_series(family: str) -> None:
+    f, start, seen, _ = made(family)
+    events = [Reading(t, a, y) for a, s in enumerate(seen) for t, y in zip(TIMES, s, strict=True)]
+    mixed = [events[k] for k in np.random.default_rng(0).permutation(len(events))]
+    a, b = f.run(start, TIMES, seen), f.run(start, None, mixed)
+    xarray.testing.assert_equal(a, b)
+    more = f.run(start, [0.05, TIMES[-1] + 1], mixed)
+    assert more["time"].size == len(TIMES) + 2
+    assert more["mean"].isel(time=slice(1, 2)).shape == a["mean"].isel(time=slice(0, 1)).shape
+
+
+@EACH
+def test_what_has_no_meaning_is_refused_by_name(family: str) -> None:
+    odd = {
+        "transport": {"every": 2.0}, "news": {"agreement": pull, "lag": 1, "share": True},
+        "mixture": {"share": True, "lag": 1, "failures": "keep", "agreement": pull},
+        "density": {"share": False, "lag": 1, "failures": "keep", "gate": 0.9},
+        "ensemble": {"agreement": covariance_intersection, "every": 1.0},
+        "gaussian": {"agreement": pull, "every": 1.0}, "particle": {"every": 1.0},
+    }  # fmt: skip
+    for name, value in odd[family].items():
+        told = "lag" if name == "every" and family != "transport" else name
+        with pytest.raises(ValueError, match=f"^{told}: "):
+            made(family, **{name: value})
+    f, start, seen, _ = made(family)
+    if family in ("mixture", "news", "density"):
+        with pytest.raises(ValueError, match="^runs: needs"):
+            f.start(PRIOR, runs=(2,))
+        with pytest.raises(ValueError, match="^lag: "):
+            f.smooth(start, TIMES, seen)
+    with pytest.raises(ValueError, match="^late: "):
+        f.step(start, 1.0, [s[0] for s in seen], late=[Late(0, 0.5, [1.0], arrived=1.0)])
+    with pytest.raises(ValueError, match="^times: "):
+        f.run(start, TIMES - 1.0, seen)
+    with pytest.raises(ValueError, match="^observations: "):
+        f.run(start, TIMES, seen[:-1])
+
+
+@pytest.mark.parametrize(
+    ("family", "bound"), [("gaussian", 1e-12), ("ensemble", 0.4), ("particle", 0.3), ("news", 1e-9)]
+)
+def test_everybody_who_hears_all_is_the_joint_filter(family: str, bound: float) -> None:
+    """Means and covariances; members are drawn, so that theirs differ by their number's share."""
+    f, start, seen, _ = made(family)
+    if family == "ensemble":
+        # Of a prior with exact moments the exact family is exact, forecast and update.
+        x = np.random.default_rng(3).standard_normal((30, 2))
+        x = np.linalg.solve(np.linalg.cholesky(np.cov(x.T)), (x - x.mean(axis=0)).T).T
+        prior = PRIOR[0] + x @ np.linalg.cholesky(PRIOR[1]).T
+        start, bound = f.start(prior, rng=np.random.default_rng(0)), 1e-10
+    exact = joint(seen)
+    for k, state in enumerate(f.steps(start, TIMES, seen)):
+        found = f.summary(state)
+        cov = found.covariance
+        if cov is None:
+            cov = np.array([np.cov(x.T) for x in state.ensembles])
+        assert np.abs(found.mean - exact.means[k]).max() < bound
+        assert np.abs(cov - exact.covariances[k]).max() < bound
+
+
+@OF_SIX
+def test_units_change_nothing(family: str) -> None:
+    """A state in millimetres in place of metres, to the rounding of a long product."""
+    big = 1e3
+    wide = LinearModel.from_transition(2, model().transition_matrix, lambda t, dt: big**2 * dt * Q)
+    eyes = [direct([0], std=0.6 * big), direct([1], std=0.5 * big), direct([0], std=0.3 * big)]
+    f, start, seen, _ = made(family, sensors=[direct([0], std=0.6), direct([1], std=0.5),
+                                              direct([0], std=0.3)])  # fmt: skip
+    g = SIX[family](wide, eyes, NET)
+    first = (big * PRIOR[0], big**2 * PRIOR[1])
+    a = f.run(start, TIMES, seen)
+    b = g.run(g.start(first, rng=np.random.default_rng(0)), TIMES, [big * s for s in seen])
+    assert np.allclose(big * a["mean"], b["mean"], rtol=1e-6, atol=1e-6 * big)
+    assert np.allclose(big * a["spread"], b["spread"], rtol=1e-6)
+
+
+@pytest.mark.parametrize("family", ["gaussian", "mixture", "news", "density"])
+def test_the_order_of_agents_changes_nothing(family: str) -> None:
+    f, start, seen, _ = made(family)
+    order = np.random.default_rng(4).permutation(len(seen))
+    if family == "density":
+        g, begin = f, f.start(PLACES[order])
+    else:
+        g = SIX[family](model(), [EYES[k] for k in order], NET)
+        begin = g.start(PRIOR)
+    a, b = f.run(start, TIMES, seen), g.run(begin, TIMES, [seen[k] for k in order])
+    assert np.allclose(a["mean"].values[:, order], b["mean"].values, atol=1e-10)
+    assert np.allclose(a["variance"].values[:, order], b["variance"].values, atol=1e-10)
+
+
+@pytest.mark.parametrize("family", SIX)
+def test_the_gate_lets_pass_what_its_share_says(family: str) -> None:
+    """Just inside the quantile a reading counts, just outside it is left out and counted."""
+    f, start, _, _ = made(family, sensors=[direct([0], std=0.6), None, None], gate=0.95)
+    blind = f.step(start, 0.1, [None] * 3)
+    mean, variance = (getattr(f.summary(blind), part)[0, 0] for part in ("mean", "variance"))
+    edge = np.sqrt(chi2.ppf(0.95, 1) * (variance + 0.36))
+    for factor, refused in ((0.97, 0), (1.03, 1)):
+        after = f.step(start, 0.1, [[mean + factor * edge], None, None])
+        assert after.refused[0] == refused
+        same = np.allclose(f.summary(after).mean[0], f.summary(blind).mean[0], atol=1e-12)
+        assert same == bool(refused)
+
+
+def test_each_reading_is_judged_alone() -> None:
+    """Of two readings that an agent has, its own and a neighbour's, only the wild one goes."""
+    f, start, _, _ = made("gaussian", gate=0.999)
+    plain = made("gaussian")[0]
+    good, wild = [0.9], [0.8, 40.0]
+    a = f.step(start, 0.1, [good, wild, None])
+    b = plain.step(start, 0.1, [good, None, None])
+    assert a.refused.tolist() == [1, 1, 1] and np.array_equal(a.means, b.means)
+    run = f.run(start, [0.1], [[good], [wild], None])
+    assert run["refused"].values.tolist() == [[1, 1, 1]]
+
+
+@pytest.mark.parametrize("how", ["every", "called", "graph"])
+@pytest.mark.parametrize("family", ["gaussian", "news"])
+def test_nothing_is_lost_until_the_next_contact(family: str, how: str) -> None:
+    """After it everybody knows what one filter with all readings knows; before, only its own."""
+    quiet = LinearModel.from_transition(2, model().transition_matrix, lambda t, dt: 0 * Q)
+    apart = Graph.from_edges(3, np.zeros((0, 2)))
+    options: dict[str, Any] = {
+        "every": {"every": 0.5}, "called": {"every": lambda t: t > 0.95},
+        "graph": {"graph": lambda t: NET if t > 0.95 else apart},
+    }[how]  # fmt: skip
+    options = {"graph": NET} | options | ({"lag": 8} if family == "gaussian" else {})
+    f = SIX[family](quiet, EYES, options.pop("graph"), **options)
+    g = GaussianFilter(quiet, EYES, NET)
+    own = GaussianFilter(quiet, EYES, NET, share=False)
+    _, seen = data(EYES)
+    times = TIMES[:4]  # .1, .4, .6, 1: multiples of .5 lie in the third step and in the fourth
+    told = [2, 3] if how == "every" else [3]
+    states, everything, alone = (
+        list(h.steps(h.start(PRIOR), times, [s[:4] for s in seen])) for h in (f, g, own)
+    )
+    for k in range(4):
+        spoke = states[k].ledger.rounds - (states[k - 1].ledger.rounds if k else 0)
+        assert spoke == (k in told)
+        wanted = everything[k] if k in told else alone[k] if k < told[0] else None
+        if wanted is not None:
+            found = f.summary(states[k])
+            assert np.allclose(found.mean, wanted.means, atol=1e-9)
+            assert np.allclose(found.covariance, wanted.covariances, atol=1e-9)
+
+
+def test_what_waits_survives_on_disk_and_a_lag_has_to_reach_it(tmp_path: Path) -> None:
+    f, start, seen, _ = made("gaussian", every=1.0, lag=8)
+    states = list(f.steps(start, TIMES, seen))
+    assert states[0].waiting and not states[3].waiting
+    states[1].save(tmp_path / "s.npz")
+    again = type(start).load(tmp_path / "s.npz")
+    for k in (2, 3):
+        again = f.step(again, TIMES[k], [s[k] for s in seen])
+    assert np.array_equal(again.joint_means, states[3].joint_means)
+    short, start, seen, _ = made("gaussian", every=1.0, lag=1)
+    with pytest.raises(ValueError, match="lag: needs to reach back to t = 0"):
+        short.run(start, TIMES, seen)
+
+
+def test_several_sensors_an_agent_and_one_of_its_own_at_each_time() -> None:
+    """Only the named one is read; what describes another is sent and charged."""
+    both = [[EYES[0], EYES[2]], None]
+    f = GaussianFilter(model(), both, graphs.path(2))
+    start = f.start(PRIOR)
+    one = f.step(start, 0.1, [Reading(0.1, 0, [0.3], 1), None])
+    two = f.step(start, 0.1, [[Reading(0.1, 0, [0.9]), Reading(0.1, 0, [0.3], 1)], None])
+    g = GaussianFilter(model(), [EYES[0], EYES[2]], graphs.path(2))
+    assert np.allclose(one.means, g.step(start, 0.1, [None, [0.3]]).means)
+    assert np.allclose(two.means, g.step(start, 0.1, [[0.9], [0.3]]).means)
+    posed = Reading(0.1, 0, [0.3], direct([1], std=0.5), about=(1.0, 2.0, 3.0))
+    moved = f.step(start, 0.1, [posed, None])
+    assert np.allclose(moved.means, one.means)
+    assert moved.ledger.scalars.tolist() == [1 + 2 + 3, 0] and one.ledger.scalars.sum() == 1
+    turning = GaussianFilter(model(), lambda t: both if t < 1 else both[::-1], graphs.path(2))
+    after = turning.step(start, 2.0, [None, Reading(2.0, 1, [0.3], 1)])
+    assert np.allclose(after.means, f.step(start, 2.0, [Reading(2.0, 0, [0.3], 1), None]).means)
+
+
+@pytest.mark.parametrize("family", ["gaussian", "ensemble", "mixture", "news"])
+def test_two_readings_at_one_time_are_taken_one_after_the_other(family: str) -> None:
+    f, start, _, _ = made(family)
+    now = f.step(f.step(start, 0.1, [[0.9], None, None]), 0.1, [None, None, [0.3]])
+    both = f.step(start, 0.1, [[0.9], None, [0.3]])
+    bound = {"ensemble": 0.3, "mixture": 0.2}.get(family, 1e-9)
+    assert np.abs(f.summary(now).mean - f.summary(both).mean).max() < bound
+
+
+@EACH
+def test_truth_of_each_agent_and_of_named_components(family: str) -> None:
+    f, start, seen, truth = made(family)
+    alike = f.run(start, TIMES, seen, truth=truth)
+    each = np.repeat(truth[:, None], len(seen), axis=1)
+    xarray.testing.assert_equal(alike, f.run(start, TIMES, seen, truth=each))
+    name = f.components[0][1]
+    some = f.run(start, TIMES, seen, truth={name: truth[:, 1]})
+    one = some["squared_error"].sel(component=name)
+    assert np.array_equal(one, alike["squared_error"].sel(component=name))
+    assert some["squared_error"].isel(component=0).isnull().all()
+    if "nees" in some and "covariance" in some:
+        assert np.allclose(some["nees"], one / some["variance"].sel(component=name))
+    with pytest.raises(ValueError, match="truth: needs components"):
+        f.run(start, TIMES, seen, truth={"speed": truth[:, 1]})
+
+
+@EACH
+def test_a_selection_has_no_wrong_state(family: str) -> None:
+    f, start, seen, _ = made(family)
+    run = f.run(start, TIMES, seen)
+    last = final_state(run)
+    assert last.t == TIMES[-1]
+    assert final_state(run.copy()) is last and final_state(run.assign(x=1)) is last
+    assert np.array_equal(f.summary(final_state(run.copy(deep=True))).mean, f.summary(last).mean)
+    assert final_state(run.isel(time=slice(3, None))) is last
+    for part in (run.isel(time=slice(2)), run.isel(agent=[0]), run[["variance"]],
+                 run.isel(agent=[1, 0, *range(2, len(seen))])):  # fmt: skip
+        with pytest.raises(ValueError, match="one without a state"):
+            final_state(part)
+
+
+def test_a_prior_of_any_kind() -> None:
+    f, _, _, _ = made("gaussian")
+    frozen, mixture = multivariate_normal(*PRIOR), GaussianMixture.gaussian(*PRIOR)
+    members = frozen.rvs(size=50, random_state=np.random.default_rng(0))
+    for prior in (PRIOR, frozen, mixture):
+        state = f.start(prior)
+        assert np.allclose(state.means, PRIOR[0]) and np.allclose(state.covariances, PRIOR[1])
+    assert np.allclose(f.start(members).covariances, np.cov(members.T))
+    with pytest.raises(ValueError, match="prior: needs .*, got a function"):
+        f.start(lambda n, rng, leading: None)
+    rng = np.random.default_rng(1)
+    e = EnsembleFilter(model(), EYES, NET, members=4000)
+    two = GaussianMixture([0.5, 0.5], [[-3.0, 0.0], [3.0, 0.0]], [np.eye(2)] * 2)
+    for prior, cov in ((PRIOR, PRIOR[1]), (frozen, PRIOR[1]), (two, two.cov)):
+        x = e.start(prior, rng=rng, runs=(2,)).ensembles
+        assert x.shape == (2, 3, 4000, 2) and np.allclose(np.cov(x[1, 2].T), cov, atol=0.5)
+    m = MixtureFilter(model(), EYES, target_dim=2)
+    begun = m.start([PRIOR, frozen, two]).mixtures
+    assert [b.size for b in begun] == [1, 1, 2]
+
+
+def test_failures_name_who_and_when() -> None:
+    def broken(belief: Any, channel: Any) -> Any:
+        raise np.linalg.LinAlgError("collapsed")
+
+    for family in ("gaussian", "ensemble", "mixture"):
+        f, start, seen, _ = made(family, agreement=broken)
+        with pytest.raises(FilterError, match=r"t = 0.1 s: collapsed"):
+            f.run(start, TIMES, seen)
+
+
+def test_the_extended_filter_bears_its_own_rounding() -> None:
+    chaos = lorenz63()
+    f = GaussianFilter(chaos, [direct([0, 1, 2], std=1.0)])
+    times = np.arange(1, 401) * 0.01
+    truth = np.array([chaos.step([1.0, 1.0, 20.0], 0.0, t) for t in times])
+    run = f.run(f.start(([1.0, 1.0, 20.0], np.eye(3))), times, [truth], truth=truth)
+    assert float(run["total_squared_error"][-1, 0]) < 0.1
+
+
+def test_inflation_widens_the_forecast_and_goes_with_fusion_and_the_past() -> None:
+    wide = GaussianFilter(model(), EYES, NET, inflation=1.3, lag=2)
+    plain = GaussianFilter(model(), EYES, NET, lag=2)
+    a, b = (f.step(f.start(PRIOR), 0.5, [None] * 3) for f in (wide, plain))
+    assert np.allclose(a.covariances, 1.69 * b.covariances)
+    assert np.allclose(a.joint_covariances[..., :2, 2:], 1.3 * b.joint_covariances[..., :2, 2:])
+    assert np.allclose(a.joint_covariances[..., 2:, 2:], b.joint_covariances[..., 2:, 2:])
+    fused = GaussianFilter(model(), EYES, NET, inflation=1.3, agreement=covariance_intersection)
+    c = fused.step(fused.start(PRIOR), 0.5, [None] * 3)
+    assert np.allclose(c.covariances, a.covariances)
