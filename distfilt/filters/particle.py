@@ -19,6 +19,7 @@ from ..updates.particles import (
     jittered,
     levels_of,
     picked_by,
+    silverman,
     size_of,
     taken,
     weighed,
@@ -93,9 +94,9 @@ class ParticleFilter(Filter):
     rule : {"systematic", "stratified", "multinomial"}
         How; see :func:`distfilt.updates.resampled`.
     jitter : float, optional
-        Bandwidth of the kernel that moves copies apart, in [0, 1]; 0 for none. Particles that were
-        not copied stay. With a model
-        without noise copies never part by themselves.
+        Bandwidth of the kernel that moves copies apart, in [0, 1], in units of the particles'
+        weighted spread; 0 for none. Particles that were not copied stay. By default Silverman's
+        for a model without noise, whose copies never part by themselves, and none for others.
 
     Notes
     -----
@@ -116,7 +117,7 @@ class ParticleFilter(Filter):
     members: Several = 1000
     threshold: Share = 0.5
     rule: Resampling = "systematic"
-    jitter: Share = 0.0
+    jitter: Share | None = None
 
     state: ClassVar[type[ParticleState]] = ParticleState
     draws: ClassVar[bool] = True
@@ -179,18 +180,27 @@ class ParticleFilter(Filter):
         weights, before = state.log_weights.copy(), stack[-1]
         # Everybody draws, needed or not: an agent's luck must not depend on another's weights.
         levels = levels_of(weights.shape, step.rng, self.rule)
-        noise = step.rng.standard_normal(before.shape) if self.jitter else None
+        width = self._bandwidth(state.t, step.dt)
+        noise = step.rng.standard_normal(before.shape) if width else None
         poor = state.effective_size < self.threshold * self.members
         if not poor.any():
             return weights
         picked = self._pick(stack, weights, state.weights, poor, levels)
         if noise is not None:
-            around = before[poor] - before[poor].mean(axis=-2, keepdims=True)
-            # Of all particles, weighted or not: after one weight dominated its copies have none.
-            cov = np.swapaxes(around, -1, -2) @ around / self.members
+            # Where one weight dominates, the spread of all particles: the weighted one is gone.
+            lost = state.effective_size[poor][:, None] < 2
+            shares = np.where(lost, 1 / self.members, state.weights[poor])
+            cov = weighted_moments(before[poor], shares)[1]
             copied = copies(picked).reshape(-1, self.members)
-            stack[-1][poor] = jittered(stack[-1][poor], cov, self.jitter, noise[poor], copied)
+            stack[-1][poor] = jittered(stack[-1][poor], cov, width, noise[poor], copied)
         return weights
+
+    def _bandwidth(self, t: float, dt: float) -> float:
+        """How far copies are moved apart: by default where the model never does it."""
+        if self.jitter is not None:
+            return self.jitter
+        still = not np.any(self.model.noise_cov(t, dt or 1.0))
+        return silverman(self.members, self.model.dim) if still else 0.0
 
     def _pick(
         self, stack: list[Array], log_weights: Array, weights: Array, poor: Mask, levels: Array

@@ -68,6 +68,14 @@ def exact_forecast(
         return moved
     bad = ~np.isfinite(moved).all(axis=(-2, -1), keepdims=True)
     clean = np.where(bad, ensemble, moved)
-    noisy = clean + exact_noise(anomalies(clean), q, rng=rng)
+    noisy = clean + exact(unchecked(anomalies)(clean), q, rng)
     # Members that the model lost stay lost, and do not take the others' noise with them.
     return np.where(bad, np.nan, noisy)
+
+
+def exact(avoid: Array, cov: Array, rng: Rng) -> Array:
+    """Exact draws, (..., N, k), that say of an update's ensemble if it has too few members."""
+    try:
+        return unchecked(exact_noise)(avoid, cov, rng=rng)
+    except ValueError as error:
+        raise ValueError(str(error).replace("anomalies_to_avoid", "ensemble")) from None

@@ -18,8 +18,9 @@ from scipy.fft import dct
 from scipy.linalg.lapack import dposv
 
 from ..doors import Array, Rng, unchecked
-from ..ensembles import exact_noise, mean
+from ..ensembles import mean
 from .door import perturbed, update
+from .forecasts import exact
 
 __all__ = ["exact_draws", "known_noise", "sampled_noise", "square_root"]
 
@@ -146,7 +147,7 @@ def exact_draws(
     (0.5, 0.25)
     """
     a, b = _centred(ensemble)[1], _centred(predicted)[1]
-    draws = exact_noise(np.concatenate([a, b], axis=-1), noise, rng=rng)
+    draws = exact(np.concatenate([a, b], axis=-1), noise, rng)
     gain = _gain(_inner(b) + noise, a, b)
     return np.asarray(ensemble + (observed[..., None, :] - predicted - draws) @ gain)
 

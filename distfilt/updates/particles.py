@@ -262,9 +262,3 @@ def distinct_share(points: Array) -> Array:
     """Share of particles that differ from all before them, (...)."""
     first = np.sort(points[..., 0], axis=-1)
     return np.asarray((1 + (first[..., 1:] > first[..., :-1]).sum(axis=-1)) / points.shape[-2])
-
-
-# The filters' names for these, until they use the ones above.
-RESAMPLING = ("systematic", "stratified", "multinomial")
-_distinct, _jittered, _levels, _picked = distinct_share, jittered, levels_of, picked_by
-_size_of, _taken, _weighed, _log_likelihood = size_of, taken, weighed, log_likelihood

@@ -109,7 +109,7 @@ def principal_directions(ensemble: Annotated[Array, "... N d"], n: Count) -> Arr
     >>> principal_directions([[-3.0, 0.1], [3.0, 0.1], [0.0, -0.1]], 1).round(2).tolist()
     [[1.0], [0.0]]
     """
-    cov = sample_covariance(ensemble)
+    cov = unchecked(sample_covariance)(ensemble)
     if not np.isfinite(cov).all():
         raise ValueError("ensemble: needs members of finite variance, got infinity")
     if n > cov.shape[-1]:

@@ -178,7 +178,7 @@ def test_collapse_warns_with_step_and_share_and_jitter_helps() -> None:
     """A model without noise: copies never part, although their weights look perfect."""
     still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
     sensors, readings = [direct([0], std=0.01)], [np.zeros((6, 1))]
-    f = ParticleFilter(still, sensors, members=800)
+    f = ParticleFilter(still, sensors, members=800, jitter=0.0)
     start = f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0))
     with pytest.warns(ParticleCollapse, match=r"t = \d s: 0\.\d+% of an agent's particles"):
         run = f.run(start, np.arange(1.0, 7.0), readings)
@@ -187,6 +187,19 @@ def test_collapse_warns_with_step_and_share_and_jitter_helps() -> None:
     run = g.run(g.start(([0.0], [[4.0]]), rng=np.random.default_rng(0)), np.arange(1.0, 7.0),
                 readings)
     assert run["distinct"].values[-1] > 0.5 and run["variance"].values[-1] > 1e-7
+
+
+def test_copies_are_regularised_by_default_where_the_model_never_parts_them() -> None:
+    """Of a constant the posterior is known; the kernel widens it by less than a tenth or so."""
+    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    f = ParticleFilter(still, [direct([0], std=0.5)], members=4000)
+    seen = [np.full((6, 1), 0.8)]
+    run = f.run(f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0)), np.arange(1.0, 7.0), seen)
+    variance = 1 / (1 / 4 + np.arange(1, 7) / 0.25)
+    mean = variance * 0.8 * np.arange(1, 7) / 0.25
+    assert run["distinct"].values.min() > 0.5
+    assert np.abs(run["mean"].values[:, 0, 0] - mean).max() < 0.02
+    assert np.allclose(run["variance"].values[:, 0, 0], variance, rtol=0.15)
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.3])
@@ -201,7 +214,7 @@ def test_one_weight_for_all_warns_although_the_particles_are_distinct(jitter: fl
 
 def test_copies_of_one_particle_warn_at_any_number() -> None:
     still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-    f = ParticleFilter(still, [None], members=50)
+    f = ParticleFilter(still, [None], members=50, jitter=0.0)
     start = f.start(([0.0], [[0.0]]), rng=np.random.default_rng(0))
     with pytest.warns(ParticleCollapse, match="2.00% of an agent's particles are distinct"):
         f.step(start, 1.0, [None])
