@@ -31,7 +31,6 @@ FLOORS = {
     "batches": 1,
     "differences": 1,
     "intervals": 1,
-    "progress": 1,
     "ensembles": 2,
     "gaussians": 2,
     "models": 2.5,

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..doors import Array, Bounds, Index, Positive, Record, Rng, door
 from ..models import Model
-from ..network import Channel, Faults, Graph, Ledger, fused_kind
+from ..network import Channel, Faults, Ledger, as_graph, fused_kind
 from .inbox import Inbox
 from .inputs import Late, Team, belated, planned, said_by_all, team_of
 from .record import SCORES, Recorder, Score, Summary, shown
@@ -41,7 +41,7 @@ class Filter(Record, ABC):
     sensors : sequence of length A, or callable t -> sequence
         What each agent sees: a Sensor, several in a list, or None. Neighbours know each other's. A
         function is asked at t = 0 how many agents there are.
-    graph : Graph, or callable t -> Graph, optional
+    graph : Graph, networkx graph, matrix or edges, or callable t -> one of them, optional
         Who hears whom; a single agent needs none. At a time without any link nobody speaks.
     agreement : callable, optional
         ``agreement(belief, channel) -> belief``: what agents do after the update to agree, if they
@@ -127,16 +127,7 @@ class Filter(Record, ABC):
         if self.graph is None and self.count > 1 and not self.alone:
             raise ValueError(f"graph: needs a Graph of {self.count} agents, got None")
         if self.graph is not None and not callable(self.graph):
-            object.__setattr__(self, "graph", self._sized(self.graph))
-
-    def _sized(self, graph: Any) -> Graph:
-        """A graph of all the agents."""
-        if not isinstance(graph, Graph):
-            got = type(graph).__name__
-            raise ValueError(f"graph: needs a Graph (see Graph.from_networkx), got {got}")
-        if graph.size != self.count:
-            raise ValueError(f"graph: needs {self.count} agents, got {graph.size}")
-        return graph
+            object.__setattr__(self, "graph", as_graph(self.graph, self.count))
 
     @cached_property
     def inbox(self) -> Inbox:
@@ -175,7 +166,7 @@ class Filter(Record, ABC):
         """The door of this step; none where nobody can speak, or it is not yet time."""
         if self.graph is None or not self._contact(state.t, t):
             return None
-        graph = self._sized(self.graph(t)) if callable(self.graph) else self.graph
+        graph = as_graph(self.graph(t), self.count) if callable(self.graph) else self.graph
         if not graph.senders.size:
             return None
         return Channel(graph, ledger=state.ledger, runs=state.runs, faults=self.faults, t=t)

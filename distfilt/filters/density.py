@@ -22,7 +22,7 @@ from ..density import (
 from ..density.kernel import fine_enough
 from ..density.sharing import Seen, alone, present_graph
 from ..doors import Array, Count, NonNegative, Places, Positive, array, unchecked
-from ..network import Channel, Graph
+from ..network import Channel, Graph, as_graph
 from .base import Filter
 from .record import Summary
 from .saving import State
@@ -239,7 +239,7 @@ class DensityFilter(Filter):
             graph = seen.near(self.graph)
         else:
             here = self.graph(t, seen.positions) if callable(self.graph) else self.graph
-            graph = present_graph(self._sized(here), seen.present)
+            graph = present_graph(as_graph(here, self.count), seen.present)
         if not self._contact(state.t, t):
             graph = Graph.from_edges(self.count, np.zeros((0, 2)))
         step.channel = channel = Channel(graph, ledger=state.ledger, faults=self.faults, t=t)
