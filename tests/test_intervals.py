@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from distfilt.intervals import Interval, mean_interval, median_interval, proportion_interval
+from distfilt.metrics import Interval, mean_interval, median_interval, proportion_interval
 
 RNG = np.random.default_rng(0)
 

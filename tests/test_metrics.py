@@ -10,15 +10,16 @@ from scipy import stats
 from scipy.integrate import quad
 
 from distfilt.ensembles import sample_covariance
-from distfilt.intervals import mean_interval, proportion_interval
 from distfilt.metrics import (
     crps,
     ensemble_nees,
     gaussian_crps,
     log_score,
+    mean_interval,
     nees,
     nees_band,
     nis,
+    proportion_interval,
     squared_error,
 )
 from tests.support import generator, spd

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import numpy as np
 
-from ..batches import batched
 from ..doors import Array, Bounds, Count, NonNegative, Record, Rng, Times, array, door, unchecked
+from ..doors.batched import batched
 from ..doors.values import semidefinite
 from ..linalg import central, factor
 

@@ -15,8 +15,8 @@ from typing import Annotated
 
 import numpy as np
 
-from ..batches import batched
 from ..doors import MISSING, Array, Count, Cov, Positive, Record, Rng, array, door, unchecked
+from ..doors.batched import batched
 from ..linalg import central, factor, leading
 
 __all__ = ["Sensor", "wrap"]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bookkit import studies
-from distfilt.intervals import median_interval, proportion_interval
+from distfilt.metrics import median_interval, proportion_interval
 
 STORED = studies.stored("das", "pendulum")
 

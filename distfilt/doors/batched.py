@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .doors import Array
+from .values import Array
 
 __all__ = ["batched"]
 
