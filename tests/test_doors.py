@@ -30,11 +30,11 @@ WITHOUT = {
         "looks at what has no kind: a function's signature, logarithms with -inf, a step's own",
 }  # fmt: skip
 """Public names without a door, as patterns, and why."""
-LEFT = 150
+LEFT = 16
 """How many more there may be: none at the end."""
 IN_A_ROW = {
     "graph", "covariance", "members", "weights", "numbers", "columns", "target", "lost", "dropped",
-    "strength", "bodies", "reading", "wanted", "mixtures",
+    "strength", "bodies", "reading", "wanted", "mixtures", "sensor",
 }  # fmt: skip
 """Data that a call may leave out, such as a filter's graph; options are given by name."""
 

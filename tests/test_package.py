@@ -201,7 +201,7 @@ def code_lines(path: Path) -> int:
 
 
 MODULE = 415
-LIMITS = {"lines": 10200, "files": 104, "rooms": 20, "names": 290, "unreached": 34, "private": 46}
+LIMITS = {"lines": 9500, "files": 90, "rooms": 17, "names": 268, "unreached": 25, "private": 0}
 
 
 def private_imports() -> list[str]:

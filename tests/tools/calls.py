@@ -58,7 +58,9 @@ class Recorder:
 
         def at_door(plan: Any, args: Any, options: Any) -> Any:
             out = taken(plan, args, options)
-            self.keep(plan.function, args, options)
+            with suppress(TypeError):  # the options of a partial come alone
+                inspect.signature(plan.function).bind(*args, **options)
+                self.keep(plan.function, args, options)
             return out
 
         def at_record(record: Any) -> None:
