@@ -15,10 +15,7 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from .doors import Array, NonNegative, Semidefinite, door, unchecked
 
-__all__ = [  # fmt: skip
-    "EPS", "SolverError", "central", "cholesky", "factor", "leading", "log_det", "quadratic_form",
-    "solve_lower", "solve_upper", "symmetrise", "van_loan", "whiten",
-]
+__all__ = ["SolverError", "factor", "van_loan"]
 
 EPS = float(np.finfo(np.float64).eps)
 _STEP = 6e-6

@@ -201,7 +201,7 @@ def code_lines(path: Path) -> int:
 
 
 MODULE = 415
-LIMITS = {"lines": 9500, "files": 90, "rooms": 17, "names": 268, "unreached": 25, "private": 0}
+LIMITS = {"lines": 9500, "files": 90, "rooms": 17, "names": 260, "unreached": 20, "private": 0}
 
 
 def private_imports() -> list[str]:
