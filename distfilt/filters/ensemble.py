@@ -154,10 +154,10 @@ class EnsembleFilter(Filter):
         lead = (*runs, self.count)
         return {"ensembles": members_of(prior, self.members, lead, self.model.dim, rng)}
 
-    def fits(self, state: Any) -> None:
-        """Refuse a state of other sizes."""
-        super().fits(state)
-        same_sizes(state.ensembles, self)
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Members, and their components."""
+        return self.members, self.model.dim
 
     def advance(self, step: Step) -> Any:
         """Forecast, condition on what was heard, agree."""
@@ -222,13 +222,6 @@ class EnsembleFilter(Filter):
             )
             out[..., g, :, :] = array(new, "update", x[..., g, :, :].shape, finite=False)
         return out
-
-
-def same_sizes(belief: Array, filter_: Any) -> None:
-    """Refuse a state whose members are more, fewer or longer than the filter's."""
-    needed = filter_.members, filter_.model.dim
-    if belief.shape[-2:] != needed:
-        raise ValueError(f"state: needs {needed} for each agent, got {belief.shape[-2:]}")
 
 
 def sample_moments(members: Array) -> tuple[Array, Array]:

@@ -78,6 +78,11 @@ class GaussianState(SensorState):
         )
 
     @property
+    def sizes(self) -> tuple[int, ...]:
+        """The components of one state."""
+        return (self.dim,)
+
+    @property
     def means(self) -> Array:
         """Means of the present state, (*runs, A, d)."""
         return self.joint_means[..., : self.dim]
@@ -134,11 +139,10 @@ class GaussianFilter(Filter):
         m, p = (np.broadcast_to(x, (*runs, self.count, *x.shape)).copy() for x in both)
         return {"joint_means": m, "joint_covariances": p, "dim": d}
 
-    def fits(self, state: Any) -> None:
-        """Refuse a state of other sizes."""
-        super().fits(state)
-        if state.dim != self.model.dim:
-            raise ValueError(f"state: needs {self.model.dim} components, got {state.dim}")
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """The state's components."""
+        return (self.model.dim,)
 
     def advance(self, step: Step) -> Any:
         """Forecast, condition on what was heard, fuse."""

@@ -170,6 +170,9 @@ def _said(f: Any, given: Any, agent: int, runs: tuple[int, ...], t: float) -> Sa
     if given is None:
         return None
     if isinstance(given, Reading):
+        if (given.agent, given.t) != (agent, t):
+            got = f"one of agent {given.agent} at t = {given.t:g}"
+            raise ValueError(f"{name}: needs a Reading of agent {agent} at t = {t:g}, got {got}")
         value, place, about = given.value, given.sensor, given.about
     elif len(own := f.team(t)[agent]) == 1:
         value = array(given, name, (..., own[0].dim), finite=False)
@@ -220,7 +223,7 @@ def planned(f: Any, state: Any, times: Any, observations: Any) -> tuple[Array, I
     """The times of a run's steps, and an iterator over what is observed at each of them."""
     grid = np.zeros(0) if times is None else array(times, "times", ("T",))
     entries: Iterator[Any]
-    if _is_readings(observations) or (times is None and not len(observations)):
+    if _is_readings(observations) or (times is None and observations == []):
         at: dict[float, list[list[Reading]]] = {t: [[] for _ in range(f.count)] for t in grid}
         for event in observations:
             if event.agent >= f.count:

@@ -25,7 +25,7 @@ from ..updates.particles import (
     weighed,
 )
 from .base import Filter
-from .ensemble import Several, same_sizes
+from .ensemble import Several
 from .inbox import Heard
 from .inputs import members_of
 from .record import Summary
@@ -129,10 +129,10 @@ class ParticleFilter(Filter):
         points = members_of(prior, self.members, (*runs, self.count), self.model.dim, rng)
         return {"points": points, "log_weights": np.full(points.shape[:-1], -np.log(self.members))}
 
-    def fits(self, state: Any) -> None:
-        """Refuse a state of other sizes."""
-        super().fits(state)
-        same_sizes(state.points, self)
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Members, and their components."""
+        return self.members, self.model.dim
 
     def advance(self, step: Step) -> Any:
         """Resample where it is due, forecast, weigh by what was heard, agree.

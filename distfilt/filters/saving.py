@@ -178,6 +178,11 @@ class SensorState(State):
         return tuple(self.belief.shape[: 1 - len(self._belief[1])])
 
     @property
+    def sizes(self) -> tuple[int, ...]:
+        """Sizes of one agent's belief."""
+        return self.belief.shape[len(self.runs) + 1 :]
+
+    @property
     def times(self) -> tuple[float, ...]:
         """The earlier times that are kept, oldest first."""
         return tuple([t for t, _ in self.history])

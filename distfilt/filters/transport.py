@@ -16,7 +16,7 @@ from ..doors import Array, NonNegative, unchecked
 from ..network import finite_time
 from ..updates.particles import log_likelihood
 from .base import Filter
-from .ensemble import EnsembleState, Several, ensemble_summary, same_sizes, sample_moments
+from .ensemble import EnsembleState, Several, ensemble_summary, sample_moments
 from .inputs import members_of
 from .particle import warn_of_collapse
 from .record import Summary
@@ -94,10 +94,10 @@ class TransportFilter(Filter):
         drawn = members_of(prior, self.members, (*runs, 1), self.model.dim, rng)
         return {"ensembles": np.repeat(drawn, self.count, axis=-3)}
 
-    def fits(self, state: Any) -> None:
-        """Refuse a state of other sizes."""
-        super().fits(state)
-        same_sizes(state.ensembles, self)
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Members, and their components."""
+        return self.members, self.model.dim
 
     def advance(self, step: Step) -> Any:
         """Forecast, weigh by what was seen, agree on the weights, transport.

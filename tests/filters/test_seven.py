@@ -311,6 +311,19 @@ def test_a_selection_has_no_wrong_state(family: str) -> None:
             final_state(part)
 
 
+def test_a_state_and_a_reading_of_another_are_refused() -> None:
+    f, start, seen, _ = made("gaussian")
+    with pytest.raises(ValueError, match="state: needs a GaussianState"):
+        f.step(made("particle")[1], 0.1, seen)
+    g, other, _, _ = made("ensemble")
+    with pytest.raises(ValueError, match="state: needs sizes"):
+        g.step(EnsembleFilter(model(), EYES, NET, members=7).start(
+            PRIOR, rng=np.random.default_rng(0)), 0.1, [None] * 3)  # fmt: skip
+    for reading in (Reading(0.1, 1, [0.3]), Reading(0.2, 0, [0.3])):
+        with pytest.raises(ValueError, match=r"observations\[0\]: needs a Reading of agent 0 at"):
+            f.step(start, 0.1, [reading, None, None])
+
+
 def test_a_graph_in_any_form() -> None:
     f, start, seen, _ = made("gaussian", graph=graphs.path(3))
     wanted = f.run(start, TIMES, seen)
