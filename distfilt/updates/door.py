@@ -27,13 +27,14 @@ Update = Callable[..., Array]
 """``update(ensemble, predicted, observed, noise, *, rng) -> ensemble``"""
 
 
-def _several(ensemble: Array, name: str) -> None:
+def several(ensemble: Array, name: str) -> None:
+    """Refuse a single member: it has no spread."""
     if ensemble.shape[-2] < 2:
         raise ValueError(f"{name}: needs at least 2 members, got {ensemble.shape[-2]}")
 
 
 _KINDS = (
-    Annotated[Array, "... N d", _several],
+    Annotated[Array, "... N d", several],
     Annotated[Array, "... N m"],
     Annotated[Array, "... m"],
     Annotated[Cov, "... m m"],

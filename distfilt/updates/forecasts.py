@@ -9,10 +9,11 @@ import numpy as np
 from ..doors import Array, NonNegative, Rng, door, unchecked
 from ..ensembles import anomalies, exact_noise
 from ..models import Model
+from .door import several
 
 __all__ = ["exact_forecast", "sampled_forecast"]
 
-Members = Annotated[Array, "... N model.dim"]
+Members = Annotated[Array, "... n model.dim"]
 
 
 @door
@@ -41,7 +42,7 @@ def sampled_forecast(
 
 @door
 def exact_forecast(
-    ensemble: Members, model: Model, t: float, dt: NonNegative, *, rng: Rng
+    ensemble: Annotated[Members, several], model: Model, t: float, dt: NonNegative, *, rng: Rng
 ) -> Array:
     r"""Move the members and add noise that is exact to second order.
 

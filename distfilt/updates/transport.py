@@ -11,7 +11,7 @@ from .. import coupling
 from ..doors import Array, Bounds, Count, NonNegative, Rng, door, unchecked
 from ..ensembles import sample_covariance
 from ..triangular import ConditionalMap, affine, compose
-from .door import perturbed, update
+from .door import perturbed, several, update
 from .particles import log_likelihood, warn_of_collapse
 
 __all__ = [
@@ -94,7 +94,7 @@ def transport_sample(
 
 
 @door
-def principal_directions(ensemble: Annotated[Array, "... N d"], n: Count) -> Array:
+def principal_directions(ensemble: Annotated[Array, "... N d", several], n: Count) -> Array:
     """The `n` orthonormal directions of largest sample variance, as columns.
 
     Parameters
