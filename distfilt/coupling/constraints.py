@@ -12,7 +12,18 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..doors import Array, Count, NonNegative, Places, Positive, Record, array, door, unchecked
+from ..doors import (
+    Array,
+    Bounds,
+    Count,
+    NonNegative,
+    Places,
+    Positive,
+    Record,
+    array,
+    door,
+    unchecked,
+)
 from ..linalg import SolverError, central
 
 __all__ = ["Constraint", "norm", "project", "retract"]
@@ -74,7 +85,9 @@ class Constraint(Record):
 
 
 @door
-def norm(indices: Places, *, length: Positive = 1.0) -> Constraint:
+def norm(
+    indices: Places, *, length: Annotated[float, Bounds(above=0, at_most=1e150)] = 1.0
+) -> Constraint:
     r"""Some components form a vector of given length, :math:`|\mathbf x_I|^2=L^2`.
 
     Parameters

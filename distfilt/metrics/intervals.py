@@ -12,7 +12,7 @@ from ..doors import Array, Bounds, Count, door
 __all__ = ["Interval", "mean_interval", "median_interval", "proportion_interval"]
 
 Values = Annotated[Array, "n"]
-Level = Annotated[float, Bounds(above=0, below=1)]
+Level = Annotated[float, Bounds(at_least=1e-9, below=1)]
 
 
 @dataclass(frozen=True)

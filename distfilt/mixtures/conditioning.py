@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..doors import MISSING, Array, Cov, Positive, door, unchecked
+from ..doors import MISSING, Array, Bounds, Cov, door, unchecked
 from ..gaussians.points import unscented_points
 from .gaussian import GaussianMixture
 
@@ -118,7 +118,8 @@ def conditioned(
 @door
 def within_gate(
     mixture: GaussianMixture, observed: Annotated[Array, "m", MISSING],
-    function: Callable[[Array], Array], noise: Annotated[Cov, "m m"], *, gate: Positive,
+    function: Callable[[Array], Array], noise: Annotated[Cov, "m m"], *,
+    gate: Annotated[float, Bounds(above=0, at_most=1e150)],
     readings: Sequence[slice] = (slice(None),),
     residual: Callable[[Array, Array], Array] = np.subtract, rule: PointRule = "dd2",
 ) -> Array:

@@ -178,7 +178,7 @@ def _factored(matrices: Array) -> tuple[Array, Mask]:
 @door
 def tikhonov(
     largest: Annotated[float, Bounds(at_least=0, at_most=1e150)],
-    smallest: Annotated[float, Bounds(at_least=0)], *,
+    smallest: Annotated[float, Bounds(at_least=0, at_most=1e150)], *,
     condition: Annotated[float, Bounds(above=1, at_most=1e150)] = _CONDITION,
 ) -> float:
     r"""The smallest factor that brings a matrix's condition number down to `condition`, (66).

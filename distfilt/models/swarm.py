@@ -9,7 +9,19 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from ..doors import Array, Bounds, Count, NonNegative, Positive, Record, Rng, Times, door, unchecked
+from ..doors import (
+    Array,
+    Bounds,
+    Count,
+    NonNegative,
+    Positive,
+    Record,
+    Rng,
+    Times,
+    array,
+    door,
+    unchecked,
+)
 
 __all__ = ["READINGS", "RotatingMixture", "Swarm", "rotating_swarm"]
 
@@ -29,7 +41,7 @@ def _reflected(x: Array, low: Array, high: Array) -> Array:
 
 def _diagonal(value: Any, points: tuple[int, ...], dim: int) -> Array:
     """A diffusion, isotropic, per axis or a tensor, as (*points, d), positive."""
-    d = np.asarray(value, dtype=np.float64)
+    d = array(value, "diffusion")
     lead = points if d.shape[: len(points)] == points and d.ndim else ()
     rest = d.shape[len(lead) :]
     if rest == (dim, dim):
