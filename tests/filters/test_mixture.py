@@ -27,7 +27,6 @@ ONE = MixtureFilter([LINEAR], [SEE], target_dim=1)
 TWO = MixtureFilter([LINEAR, SMALL], [SEE, None], graphs.path(2), target_dim=1, agreement=AGREE)
 
 
-
 def kalman(m: np.ndarray, p: np.ndarray, y: np.ndarray, rows: list[int]) -> tuple:
     m, p = PUSH @ m, PUSH @ p @ PUSH.T + Q
     h = np.eye(3)[[(0, 2)[r] for r in rows]]
@@ -217,11 +216,3 @@ def test_an_agreement_that_loses_definiteness_is_refused() -> None:
     f = MixtureFilter([SMALL] * 2, [None] * 2, graphs.path(2), target_dim=1, agreement=broken)
     with pytest.raises(FilterError, match="agent 0, t = 1 s: .*mixand 0 of 1 "):
         f.step(f.start([OTHER, OTHER]), 1.0, [None, None])
-
-
-def test_time_does_not_run_backwards() -> None:
-    f, state = in_orbit(MEO, GEO)
-    with pytest.raises(ValueError, match="t: needs"):
-        f.step(state, -1.0, [None])
-    with pytest.raises(ValueError, match="times"):
-        f.run(state, [3600.0, 1800.0], [None])
