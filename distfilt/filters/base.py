@@ -169,7 +169,9 @@ class Filter(Record, ABC):
         graph = as_graph(self.graph(t), self.count) if callable(self.graph) else self.graph
         if not graph.senders.size:
             return None
-        return Channel(graph, ledger=state.ledger, runs=state.runs, faults=self.faults, t=t)
+        return Channel.unchecked(
+            graph, ledger=state.ledger, runs=state.runs, faults=self.faults, t=t
+        )
 
     def _contact(self, before: float, t: float) -> bool:
         if self.every is None or callable(self.every):

@@ -69,14 +69,20 @@ class Channel:
         self.graph: Graph = as_graph(graph, None if ledger is None else ledger.messages.size)
         self.runs = runs
         self.faults = _PERFECT if faults is None else faults
-        self.faults.check(self.graph)
         self.t = t
-        if self.faults.needs_time and t is None:
-            raise ValueError("t: needs the time for faults with windows in seconds, got None")
         self._ledger = Ledger.empty(self.graph.size) if ledger is None else ledger
         self._owed: dict[int, int] = {}
         self._late: dict[Any, deque[Any]] = {}
         self._perfect = self.faults.none
+        if not self._perfect:
+            self.faults.check(self.graph, t)
+
+    @classmethod
+    def unchecked(cls, *args: Any, **options: Any) -> Channel:
+        """The same for a caller that made the graph and the ledger itself, as filters do."""
+        channel = cls.__new__(cls)
+        unchecked(channel.__init__)(*args, **options)  # type: ignore[misc]
+        return channel
 
     @property
     def ledger(self) -> Ledger:
@@ -115,15 +121,16 @@ class Channel:
             floats there.
         """
         graph = self.graph
-        sent = accounts.taken(payloads, graph.size, self.runs, copy=self.faults.late > 0)
+        late = self.faults.late > 0
+        sent, scalars, bytes_ = accounts.taken(payloads, graph.size, self.runs, copy=late)
         speaks = np.array([p is not None for p in sent])[graph.senders]
-        arrived = self._transmit(speaks, *accounts.sizes(sent, self.runs))
+        arrived = self._transmit(speaks, scalars, bytes_)
         if self._perfect:
             return _by_receiver(graph, sent, np.flatnonzero(speaks))
-        late = self._delayed("exchange", (sent, arrived))
-        if late is None:
+        now = self._delayed("exchange", (sent, arrived))
+        if now is None:
             return [{} for _ in range(graph.size)]
-        sent, arrived = late
+        sent, arrived = now
         some = np.flatnonzero(arrived.any(axis=0))
         inbox = _by_receiver(graph, sent, some)
         for k in some[~arrived[:, some].all(axis=0)].tolist():

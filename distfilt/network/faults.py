@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -103,8 +104,10 @@ class Faults(Record):
     def _all(self) -> tuple[Faults, ...]:
         return (replace(self, also=()), *self.also) if self.also else (self,)
 
-    def check(self, graph: Graph) -> None:
-        """Refuse a graph whose agents do not fit."""
+    def check(self, graph: Graph, t: float | None) -> None:
+        """Refuse a graph whose agents do not fit, and a channel that needs to know its time."""
+        if t is None and any(f.during is not None and f.clock == "time" for f in self._all()):
+            raise ValueError("t: needs the time for faults with windows in seconds, got None")
         agents = graph.size
         for faults in self._all():
             got = np.shape(faults.loss)
@@ -114,20 +117,15 @@ class Faults(Record):
             if most >= agents:
                 raise ValueError(f"silent: needs agents below {agents}, got {most}")
 
-    @property
+    @cached_property
     def none(self) -> bool:
         """Whether nothing ever fails."""
         return not any(np.any(f.loss) or f.delay or f.silent for f in self._all())
 
-    @property
+    @cached_property
     def late(self) -> int:
         """Rounds that a message takes on top of its own, all delays together."""
         return sum(f.delay for f in self._all())
-
-    @property
-    def needs_time(self) -> bool:
-        """Whether some windows are in seconds, so that a channel needs to know the time."""
-        return any(f.during is not None and f.clock == "time" for f in self._all())
 
     @door
     def speaking(self, graph: Graph, round_: Index = 0, t: float | None = None) -> Mask:

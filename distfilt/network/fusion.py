@@ -354,7 +354,7 @@ def _in_rounds(
     return m.reshape(means.shape), p.reshape(covs.shape)
 
 
-def _by_rule(heard: _Heard, rule: str) -> Pair:
+def _by_rule(heard: _Heard, rule: Rule) -> Pair:
     """Own weights (R, A) and those of links (R, E); each agent's sum to one."""
     own, links = np.ones(heard.means.shape[:2]), heard.arrived.astype(np.float64)
     if rule.startswith("min"):
@@ -370,7 +370,7 @@ def _by_rule(heard: _Heard, rule: str) -> Pair:
     return own / total, links / total[:, heard.graph.receivers]
 
 
-def _size_weights(covs: Array, rule: str) -> Array:
+def _size_weights(covs: Array, rule: Rule) -> Array:
     """Weights in closed form up to a factor: a number of each source alone, (R, A).
 
     The odds against a unit covariance: no agent's number depends on another's in any digit.

@@ -139,7 +139,6 @@ def test_windows_hold_losses_and_silence() -> None:
     assert off == [0, 0, 2, 2, 0, 0, 2, 2]
     timed = Faults(loss=1.0, during=[(0.5, 1.0)], clock="time")
     assert [bool(timed.lost(STAR, 9, 1, t).all()) for t in (0.4, 0.5, 1.0)] == [False, True, False]
-    assert timed.needs_time and not faults.needs_time
 
 
 def test_faults_together_fail_in_every_way() -> None:
@@ -152,7 +151,6 @@ def test_faults_together_fail_in_every_way() -> None:
     other = a | (b | c)
     assert (other.lost(STAR, 3, 9) == whole.lost(STAR, 3, 9)).all() and other.late == 2
     assert not whole.none and (Faults() | Faults()).none and not Faults(delay=1).none
-    assert (a | Faults(loss=0.1, seed=3, during=[(0, 1)], clock="time")).needs_time
 
 
 def test_what_cannot_be_said_of_a_network_is_refused() -> None:
