@@ -178,23 +178,3 @@ def test_a_covariance_that_is_none_is_refused_or_named() -> None:
         with (pytest.raises(np.linalg.LinAlgError, match="density filter: .* out of scale"),
               np.errstate(all="ignore")):
             call()
-
-
-def test_gain_from_the_observed_density_loses_mass() -> None:
-    """Criterion 11: P0 = R0 and R from y lose mass, R from the forecast does not as much."""
-    grid, swarm = Grid((14, 14)), rotating_swarm("gibbs")
-    flow, rng = FokkerPlanck(swarm, grid), np.random.default_rng(4)
-    k = kernel_information(grid, bandwidth=0.08, agents=100)
-    x = rng.random((100, 2))
-    first = kernel_density(x, grid, bandwidth=0.08)
-    states = {name: Dense(first, np.diag(k * np.maximum(first, 0.05))) for name in "yp"}
-    for j in range(300):
-        move = flow.solver(0.1 * j, 0.1)
-        x = swarm.step(x, 0.1 * j, 0.1, rng=rng, substeps=2)
-        y = kernel_density(x, grid, bandwidth=0.08)
-        for name, state in states.items():
-            level = y if name == "y" else move(state.mean)
-            states[name] = dense_step(state, move, y, k * np.maximum(level, 0.05), 0.1)
-    lost = {name: 1 - float(grid.integral(state.mean)) for name, state in states.items()}
-    assert lost["y"] > 0.05
-    assert abs(lost["p"]) < 0.02

@@ -46,7 +46,7 @@ def test_the_change_of_the_inputs_is_added_once_in_several_rounds() -> None:
 def test_agents_that_have_gone_do_not_count_in_the_noise() -> None:
     """Of six agents that all know each other two go: the others' data are worth four."""
     f = DensityFilter(FokkerPlanck(rotating_swarm(), GRID), 6, graphs.complete(6),
-                      Flooding(forget=0.05), bandwidth=H, rank=20, first=np.ones(100))
+                      agreement=Flooding(forget=0.05), bandwidth=H, rank=20, first=np.ones(100))
     x = X[1].copy()
     x[4:] = np.nan
     start = f.start(X[0])
@@ -70,8 +70,8 @@ def test_the_whole_chain_does_not_depend_on_units(unit: float, rule: object) -> 
         swarm = Swarm(lambda x, t: u * inside.drift_at(x / u, t), u**2 * 0.03, low=[0.0, 0.0],
                       high=[u, u])
         grid = Grid((10, 10), high=[u, u])
-        f = DensityFilter(FokkerPlanck(swarm, grid), 6, 0.6 * u, rule, bandwidth=H * u, rank=20,
-                          process=0.3)
+        f = DensityFilter(FokkerPlanck(swarm, grid), 6, 0.6 * u, agreement=rule, bandwidth=H * u,
+                          rank=20, process=0.3)
         state = f.start(u * X[0])
         for k in range(4):
             state = f.step(state, 0.1 * (k + 1), u * X[k % 2])

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from distfilt.mixtures import GaussianMixture, arc
+from distfilt.mixtures import GaussianMixture
 
-A2 = (7.2 * np.cos(np.deg2rad(85)) - 0.85, -7.2 * np.sin(np.deg2rad(85)) - 0.55)
 TARGET = [0, 1]
 
 
@@ -17,24 +16,6 @@ def random_mixture(size: int, dim: int, seed: int, spread: float = 3.0) -> Gauss
     covs = roots @ roots.mT + 0.2 * np.eye(dim)
     w = rng.dirichlet(np.full(size, 2.0))
     return GaussianMixture(w, spread * rng.standard_normal((size, dim)) + 1.0, covs)
-
-
-def pair(which: str) -> tuple[GaussianMixture, GaussianMixture]:
-    """The fixed pairs of Table 1 ("A") and Table 2 ("B")."""
-    (n1, w1), (n2, w2) = {"A": ((4, 0.22), (5, 0.31)), "B": ((7, 0.45), (8, 0.45))}[which]
-    return (
-        arc(n1, (-10, 0), angle_std=0.6, range_std=0.41, ego_std=0.38, width=w1),
-        arc(n2, A2, angle_std=0.295, range_std=0.32, ego_std=0.38, width=w2),
-    )
-
-
-def wide(a: GaussianMixture, b: GaussianMixture, share: float = 0.9) -> GaussianMixture:
-    """A proposal that covers both."""
-    return GaussianMixture(
-        np.r_[share * a.weights, (1 - share) * b.weights],
-        np.r_[a.means, b.means],
-        np.r_[a.covs, b.covs],
-    )
 
 
 def affine(p: GaussianMixture, matrix: np.ndarray, shift: np.ndarray) -> GaussianMixture:

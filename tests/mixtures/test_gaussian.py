@@ -7,7 +7,6 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from distfilt.mixtures import GaussianMixture
-from distfilt.network import Channel, graphs
 
 from .examples import affine, random_mixture, scales, shuffled
 
@@ -79,15 +78,6 @@ def test_moments_are_the_draws() -> None:
     assert np.allclose(p.cov, by_hand, rtol=1e-13)
     one = p.collapsed()
     assert one.size == 1 and np.allclose(one.mean, p.mean) and np.allclose(one.cov, p.cov)
-
-
-def test_pack_goes_through_a_channel_and_every_number_is_charged() -> None:
-    p = random_mixture(3, 4, 9)
-    channel = Channel(graphs.path(2))
-    got = GaussianMixture.unpack(channel.exchange([p.pack(), None])[1][0])
-    assert (got.weights == p.weights).all() and (got.means == p.means).all()
-    assert (got.covs == p.covs).all()
-    assert channel.ledger.scalars.tolist() == [3 * (1 + 4 + 10), 0]
 
 
 def test_a_mixture_owns_its_arrays() -> None:

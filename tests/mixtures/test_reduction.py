@@ -23,7 +23,7 @@ from distfilt.mixtures import (
 )
 from distfilt.mixtures.divergence import gaussian_divergences
 
-from .examples import TARGET, affine, pair, random_mixture, same, scales, shuffled
+from .examples import affine, random_mixture, same, scales, shuffled
 
 ENGINES = ["numpy", "loops", *(["numba"] if importlib.util.find_spec("numba") else [])]
 
@@ -128,7 +128,7 @@ def test_two_stage() -> None:
 
 
 def test_the_relevance_rule_is_41_where_no_guard_is_needed() -> None:
-    one, two = (m.marginal(TARGET) for m in pair("B"))
+    one, two = random_mixture(7, 2, 1), random_mixture(8, 2, 2)
     apart = gaussian_divergences(one.means, one.covs, two.means, two.covs)
     relevance = cross_relevance(one, two)
     assert np.allclose(relevance, one.weights[:, None] * apart)
