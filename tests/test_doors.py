@@ -30,7 +30,7 @@ WITHOUT = {
         "looks at what has no kind: a function's signature, logarithms with -inf, a step's own",
 }  # fmt: skip
 """Public names without a door, as patterns, and why."""
-LEFT = 16
+LEFT = 15
 """How many more there may be: none at the end."""
 IN_A_ROW = {
     "graph", "covariance", "members", "weights", "numbers", "columns", "target", "lost", "dropped",

@@ -200,8 +200,8 @@ def code_lines(path: Path) -> int:
     return len(found)
 
 
-MODULE = 444
-LIMITS = {"lines": 9500, "files": 90, "rooms": 17, "names": 260, "unreached": 20, "private": 0}
+MODULE = 401
+LIMITS = {"lines": 9550, "files": 90, "rooms": 16, "names": 260, "unreached": 20, "private": 0}
 
 
 def private_imports() -> list[str]:
