@@ -7,12 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distfilt.models import (
-    READINGS,
-    RotatingMixture,
-    Swarm,
-    rotating_swarm,
-)
+from distfilt.models import READINGS, RotatingMixture, Swarm, rotating_swarm
 from distfilt.models.swarm import _reflected
 
 CORNERS = [-1.0, 0.5], [1.0, 2.0]
