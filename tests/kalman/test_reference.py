@@ -40,11 +40,14 @@ FILTERS = (filterpy_ekf, filterpy_ukf, extended, unscented)
 
 
 @pytest.mark.parametrize("varying", [False, True])
+@pytest.mark.parametrize("priors", [(), (6,)])
 @pytest.mark.parametrize("pattern", ["whole", "common", "own", "few"])
-def test_equal_to_filterpy(varying: bool, pattern: str) -> None:
+def test_equal_to_filterpy(varying: bool, pattern: str, priors: tuple[int, ...]) -> None:
+    """Runs with gaps and priors of their own; covariances are shared where they are the same."""
     rng = np.random.default_rng(4)
     p, runs = problem(rng, steps=30, varying=varying), 6
-    mean, cov, y = rng.standard_normal(D), spd(rng, D), rng.standard_normal((30, runs, M))
+    mean, cov = rng.standard_normal((*priors, D)), spd(rng, D, priors)
+    y = rng.standard_normal((30, runs, M))
     if pattern == "common":
         y = np.where(rng.random((30, 1, M)) < 0.3, np.nan, y)
     elif pattern == "own":
@@ -57,8 +60,9 @@ def test_equal_to_filterpy(varying: bool, pattern: str) -> None:
     np.testing.assert_allclose(ours.means, theirs.means, rtol=0, atol=1e-12)
     np.testing.assert_allclose(full, theirs.covariances, rtol=0, atol=1e-12)
     np.testing.assert_allclose(ours.log_likelihood, theirs.log_likelihood, rtol=0, atol=1e-11)
-    shared = pattern in ("whole", "common")
+    shared = pattern in ("whole", "common") and not priors
     assert ours.covariances.shape == (30, 1 if shared else runs, D, D)
+    assert (full == full.mT).all() and np.linalg.eigvalsh(full).min() > 0
 
 
 @pytest.mark.parametrize("filter_", FILTERS)

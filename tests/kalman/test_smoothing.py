@@ -55,8 +55,3 @@ def test_a_state_that_cannot_be_forecast_raises() -> None:
 def test_a_run_s_covariances_have_its_means_axes(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="covariances: needs"):
         GaussianRun(np.zeros((2, 4, 1)), np.ones(shape), np.zeros((2, 4)))
-
-
-def test_one_step_and_none() -> None:
-    one = kalman_filter([0.0], [[1.0]], [[1.0]], F=[[1.0]], H=[[1.0]], Q=[[1.0]], R=[[1.0]])
-    assert rts_smoother(one, F=[[1.0]], Q=[[1.0]]).means == one.means
