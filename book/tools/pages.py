@@ -109,7 +109,13 @@ def home_of(module: Any, name: str) -> str:
         return value.__name__
     home = str(getattr(value, "__module__", "") or "")
     own = home.startswith("distfilt") and hasattr(value, "__qualname__")
-    return home if own else module.__name__
+    if own:
+        return home
+    # A constant does not know where it is from: the module below that shows the same one.
+    below = [n for n in modules() if n.startswith(f"{module.__name__}.")]
+    found = (n for n in below if vars(importlib.import_module(n)).get(name) is value)
+    shown = (n for n in found if name in importlib.import_module(n).__all__)
+    return next(shown, module.__name__)
 
 
 def plain_types(signature: str | None) -> str | None:

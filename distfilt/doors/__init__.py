@@ -5,23 +5,23 @@ module, or a plain type, is checked and converted before the function runs; what
 refused by an error that names the argument, what it needs and what it got. Nothing is repaired.
 :func:`unchecked` gives the function without its door, for loops.
 
-====================================  ===========================================================
-Annotation                            What may come, and what the function gets
-====================================  ===========================================================
-``Annotated[Array, "... N d"]``       finite real numbers of this shape, as float64
-``Annotated[Array, "m", MISSING]``    the same, where NaN stands for what is missing
-``Annotated[Array, "d d", definite]`` the same, if the rule ``definite(value, name)`` lets it pass
-``Annotated[Mask, "A"]``              booleans; ``NDArray[np.intp]`` for integers
-``float``, ``int``, ``bool``, ``str`` one finite number, one integer, one flag, a text not blank
-``Positive``, ``Count``, ``Share``    numbers in bounds; others by ``Annotated[float, Bounds(…)]``
-``Literal["a", "b"]``                 one of these words
-``Rng``                               a ``numpy.random.Generator``
-``Callable[..., Any]``                a function
-``Graph``, any other class            an instance
-``Sequence[X]``, ``tuple[X, ...]``    any sequence of such things, as a tuple
-``X | Y``, ``X | None``               what fits one of them
-``Any``, ``ArrayLike``                anything, as it came
-====================================  ===========================================================
+======================================  ==========================================================
+Annotation                              What may come, and what the function gets
+======================================  ==========================================================
+``Annotated[Array, "... N d"]``         finite real numbers of this shape, as float64
+``Annotated[Array, "m", MISSING]``      the same, where NaN stands for what is missing
+``Annotated[Array, "d d", definite]``   the same, if ``definite(value, name)`` lets it pass
+``Annotated[Mask, "A"]``                booleans; ``NDArray[np.intp]`` for integers
+``float``, ``int``, ``bool``, ``str``   one finite number, one integer, one flag, a text not blank
+``Positive``, ``Count``, ``Share``      numbers in bounds; others by ``Annotated[float, Bounds(…)]``
+``Literal["a", "b"]``                   one of these words
+``Rng``                                 a ``numpy.random.Generator``
+``Callable[..., Any]``                  a function
+``Graph``, any other class              an instance
+``Sequence[X]``, ``tuple[X, ...]``      any sequence of such things, as a tuple
+``X | Y``, ``X | None``                 what fits one of them
+``Any``, ``ArrayLike``                  anything, as it came
+======================================  ==========================================================
 
 In a shape each word is the size of an axis. A number is exact, and so is the name of an argument
 that is an integer, or a path such as ``model.dim`` or ``self.dim``; ``*channel.runs`` stands for
