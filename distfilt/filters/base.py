@@ -137,7 +137,10 @@ class Filter(Record, ABC):
     @cached_property
     def count(self) -> int:
         """Number A of agents."""
-        return len(self.sensors(0.0) if callable(self.sensors) else self.sensors)
+        given = self.sensors(0.0) if callable(self.sensors) else self.sensors
+        if isinstance(given, Sequence):
+            return len(given)
+        raise ValueError(f"sensors: needs one for each agent, got {type(given).__name__}")
 
     @property
     def shares(self) -> bool:

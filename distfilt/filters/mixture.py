@@ -155,7 +155,7 @@ class MixtureFilter(Filter):
     def models(self) -> tuple[Model, ...]:
         """Each agent's model."""
         given = self.model
-        return tuple(given) if isinstance(given, Sequence) else (given,) * len(self.sensors)
+        return tuple(given) if isinstance(given, Sequence) else (given,) * self.count
 
     @property
     def components(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
