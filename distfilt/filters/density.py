@@ -24,6 +24,7 @@ from ..density.sharing import Seen, alone, present_graph
 from ..doors import Array, Count, NonNegative, Places, Positive, array, unchecked
 from ..network import Channel, Graph, as_graph
 from .base import Filter
+from .inputs import one_each
 from .record import Summary
 from .saving import State
 from .step import Step
@@ -194,7 +195,8 @@ class DensityFilter(Filter):
     def read(self, observations: Any, runs: tuple[int, ...], t: float) -> Any:
         """The agents' positions (A, d); None and NaN are agents that have gone."""
         gone = np.full(self.model.grid.dim, np.nan)
-        return self._seen([gone if x is None else x for x in observations], "observations", t)
+        given = one_each(observations, self.count)
+        return self._seen([gone if x is None else x for x in given], "observations", t)
 
     def channel(self, state: State, t: float) -> None:
         """None yet: who hears whom depends on where the agents are."""

@@ -148,14 +148,15 @@ def said_by_all(f: Any, observations: Any, runs: tuple[int, ...], t: float) -> l
     [[array([1.5])]]
     """
     out: list[list[Said]] = []
-    for agent, given in enumerate(_one_each(observations, f.count)):
+    for agent, given in enumerate(one_each(observations, f.count)):
         several = _is_readings(given) or (isinstance(given, list) and not given)
         found = (_said(f, one, agent, runs, t) for one in (given if several else (given,)))
         out.append([said for said in found if said is not None])
     return out
 
 
-def _one_each(observations: Any, agents: int) -> Any:
+def one_each(observations: Any, agents: int) -> Any:
+    """Observations in a list, one entry for each agent."""
     if not isinstance(observations, Sequence | np.ndarray) or len(observations) != agents:
         got = len(observations) if hasattr(observations, "__len__") else repr(observations)
         raise ValueError(f"observations: needs one for each of {agents} agents, got {got}")
@@ -236,7 +237,7 @@ def planned(f: Any, state: Any, times: Any, observations: Any) -> tuple[Array, I
         raise ValueError("times: needs them, unless all observations are Readings, got None")
     else:
         size = grid.size
-        for agent, series in enumerate(_one_each(observations, f.count)):
+        for agent, series in enumerate(one_each(observations, f.count)):
             if series is not None and (got := len(np.atleast_1d(series))) != size:
                 raise ValueError(
                     f"observations: needs ({size}, ..., m) for agent {agent}, got {got}"
