@@ -67,9 +67,6 @@ CONSISTENT = [
     "gated", "serial", "localised",
 ]
 """Those whose moments tend to the Kalman filter's."""
-_WRAPPERS = ("augmented", "projected", "retracted")
-CONSTRAINED = [name for name in UPDATES if name.startswith(_WRAPPERS)]
-"""Those whose answer is not the one without the constraint."""
 
 
 def enough(name: str) -> int:

@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from distfilt.updates import exact_draws, known_noise, sampled_noise, square_root, transport
+from distfilt.updates.door import Update
 from distfilt.updates.gaussian import _turned
 
 from .cases import H, R, Y, members
 
 
-def test_sampled_noise_by_its_formula() -> None:
+def test_sampled_and_known_noise_by_their_formulas() -> None:
     x = members(40)
     zeta = np.random.default_rng(3).standard_normal((40, 2)) @ np.linalg.cholesky(R).T
     seen = x @ H.T + zeta
-    joint = np.cov(np.hstack([x, seen]).T)
-    gain = joint[:3, 3:] @ np.linalg.inv(joint[3:, 3:])
-    out = sampled_noise(x, x @ H.T, Y, R, rng=np.random.default_rng(3))
-    assert np.allclose(out, x + (Y - seen) @ gain.T, atol=1e-12)
-
-
-def test_known_noise_by_its_formula() -> None:
-    x = members(40)
-    zeta = np.random.default_rng(3).standard_normal((40, 2)) @ np.linalg.cholesky(R).T
-    joint = np.cov(np.hstack([x, x @ H.T]).T)
-    gain = joint[:3, 3:] @ np.linalg.inv(joint[3:, 3:] + R)
-    out = known_noise(x, x @ H.T, Y, R, rng=np.random.default_rng(3))
-    assert np.allclose(out, x + (Y - x @ H.T - zeta) @ gain.T, atol=1e-12)
+    for update, told, noise in ((sampled_noise, seen, 0 * R), (known_noise, x @ H.T, R)):
+        joint = np.cov(np.hstack([x, told]).T)
+        gain = joint[:3, 3:] @ np.linalg.inv(joint[3:, 3:] + noise)
+        out = update(x, x @ H.T, Y, R, rng=np.random.default_rng(3))
+        assert np.allclose(out, x + (Y - seen) @ gain.T, atol=1e-12)
 
 
 def test_composed_affine_map_is_the_filter_with_sampled_noise() -> None:
@@ -37,14 +31,15 @@ def test_composed_affine_map_is_the_filter_with_sampled_noise() -> None:
     assert np.allclose(a, b, atol=1e-11)
 
 
-def test_exact_draws_of_a_curved_reading() -> None:
+@pytest.mark.parametrize("update", [exact_draws, square_root])
+def test_moments_after_a_curved_reading_are_exact(update: Update) -> None:
     """P+ = P - K S K' for the sample covariances, also where h is not linear."""
     x = members(20)
     h = np.stack([x[:, 0] ** 2, x[:, 1] * x[:, 2]], axis=1)
     joint = np.cov(np.hstack([x, h]).T)
     s = joint[3:, 3:] + R
     gain = joint[:3, 3:] @ np.linalg.inv(s)
-    out = exact_draws(x, h, Y, R, rng=np.random.default_rng(0))
+    out = update(x, h, Y, R, rng=np.random.default_rng(0))
     assert np.allclose(out.mean(axis=0), x.mean(axis=0) + gain @ (Y - h.mean(axis=0)), atol=1e-12)
     assert np.allclose(np.cov(out.T), joint[:3, :3] - gain @ s @ gain.T, atol=1e-12)
 
@@ -75,14 +70,3 @@ def test_rotation_prefers_no_direction() -> None:
     turn = _turned(np.broadcast_to(np.eye(n), (draws, n, n)), np.random.default_rng(1))
     assert np.allclose(turn.mean(axis=0), 1 / n, atol=5 * 0.5 / np.sqrt(draws))
     assert np.allclose((turn - 1 / n).var(axis=0), (n - 1) / n**2, atol=0.03)
-
-
-def test_readings_may_come_in_any_order() -> None:
-    """The moments of exact draws do not depend on the order of readings."""
-    x = members(20)
-    turn = [1, 0]
-    a = exact_draws(x, x @ H.T, Y, R, rng=np.random.default_rng(0))
-    b = exact_draws(
-        x, (x @ H.T)[:, turn], Y[turn], R[np.ix_(turn, turn)], rng=np.random.default_rng(9)
-    )
-    assert np.allclose(a.mean(axis=0), b.mean(axis=0)) and np.allclose(np.cov(a.T), np.cov(b.T))

@@ -8,32 +8,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from distfilt.coupling import ensemble_transform as transform
-from distfilt.ensembles import sample_covariance
 from distfilt.triangular import affine
 from distfilt.updates import (
     ensemble_transform,
     principal_components,
     principal_directions,
     transport,
-    transport_sample,
 )
-from distfilt.updates.particles import ParticleCollapse, log_likelihood
+from distfilt.updates.particles import ParticleCollapse
+from tests.triangular.samples import rng_of as _rng
+from tests.triangular.samples import samples
 
-from .cases import COV, MEAN, H, R, Y, kalman, members
+from .cases import MEAN, H, R, Y, members
 
-
-def _rng(seed: int = 0) -> np.random.Generator:
-    return np.random.default_rng(seed)
-
-
-def _samples(
-    seed: int, n: int = 60, m: int = 2, d: int = 3, leading: tuple[int, ...] = ()
-) -> tuple[np.ndarray, np.ndarray]:
-    """Correlated, shifted, badly scaled samples (y, x)."""
-    rng = _rng(seed)
-    mixing = rng.standard_normal((m + d, m + d)) * np.logspace(-1, 1, m + d)
-    z = rng.standard_normal((*leading, n, m + d)) @ mixing + 10 * rng.standard_normal(m + d)
-    return z[..., :m], z[..., m:]
+_FOUR = (*samples(7)[::-1], np.array([0.4, -0.2]), np.array([[0.3, 0.1], [0.1, 0.2]]))
 
 
 def test_conditioning_a_gaussian_converges_at_the_monte_carlo_rate() -> None:
@@ -49,114 +37,60 @@ def test_conditioning_a_gaussian_converges_at_the_monte_carlo_rate() -> None:
 
 def test_updates_are_affine_equivariant() -> None:
     """Observing in other units and estimating in other coordinates changes nothing."""
-    y, x = _samples(7)
+    x, y, target, noise = _FOUR
     a, b = _rng(1).standard_normal((3, 3)), np.diag([10.0, 0.1])
-    noise, target = np.diag([0.3, 0.2]), np.zeros(2)
-    plain = transport(x, y, target, noise, rng=_rng(3))
-    other = transport(x @ a.T, y @ b, target, b @ noise @ b, rng=_rng(3))
-    assert np.allclose(other, plain @ a.T, rtol=1e-8, atol=1e-8)
+    other = transport(x @ a.T, y @ b, target @ b, b @ noise @ b, rng=_rng(3))
+    assert np.allclose(other, transport(*_FOUR, rng=_rng(3)) @ a.T, rtol=1e-8, atol=1e-8)
 
 
 @given(st.integers(0, 10_000), st.integers(1, 4))
 def test_principal_directions_hold_the_largest_variance(seed: int, n: int) -> None:
-    e = _samples(seed, m=1, d=4)[1]
+    e = samples(seed, m=1, d=4)[1]
     w = principal_directions(e, n)
     assert np.allclose(w.T @ w, np.eye(n), atol=1e-12)
     values = np.linalg.eigvalsh(np.cov(e, rowvar=False))[::-1]
     assert np.allclose(np.cov(e @ w, rowvar=False).reshape(n, n).diagonal(), values[:n], rtol=1e-8)
 
 
-def test_pca_with_all_directions_is_the_whole_update() -> None:
-    y, x = _samples(7)
-    inputs = (x, y, np.zeros(2), np.diag([0.3, 0.2]))
-    whole = transport(*inputs, rng=_rng(3))
-    for complement in ("keep", "literal"):
-        out = principal_components(
-            *inputs, rng=_rng(3), n_state=3, n_observed=5, complement=complement
-        )
-        assert np.allclose(out, whole, atol=1e-8)
-
-
 def test_pca_complement() -> None:
     """Outside the leading directions: kept, or lost with the mean."""
-    y, x = _samples(7)
-    inputs = (x, y, np.zeros(2), np.diag([0.3, 0.2]))
-    w = principal_directions(x, 2)
+    w = principal_directions(_FOUR[0], 2)
     outside = np.eye(3) - w @ w.T
-    out = {
-        c: principal_components(*inputs, rng=_rng(3), n_state=2, n_observed=2, complement=c)
+    keep, literal = (
+        principal_components(*_FOUR, rng=_rng(3), n_state=2, n_observed=2, complement=c)
         for c in ("keep", "literal")
-    }
-    assert np.allclose(out["keep"] @ outside, x @ outside, atol=1e-9)
-    assert np.allclose(out["literal"] @ outside, 0, atol=1e-9)
-    assert np.allclose(out["keep"] @ w, out["literal"] @ w, atol=1e-8)
+    )
+    assert np.allclose(keep @ outside, _FOUR[0] @ outside, atol=1e-9)
+    assert np.allclose(literal @ outside, 0, atol=1e-9)
+    assert np.allclose(keep @ w, literal @ w, atol=1e-8)
 
 
-def test_direct_sampling_and_the_composed_map_agree_where_the_map_fits() -> None:
-    rng = _rng(15)
-    x = rng.standard_normal((60, 2000, 2)) @ np.array([[1.0, 0.5], [0.0, 1.0]])
-    inputs = (x, x[..., :1], np.full((60, 1), 1.5), [[0.5]])
-    direct, composed = transport_sample(*inputs, rng=_rng(1)), transport(*inputs, rng=_rng(1))
-    assert np.abs(direct.mean(axis=(0, 1)) - composed.mean(axis=(0, 1))).max() < 0.01
-    gap = sample_covariance(direct).mean(axis=0) - sample_covariance(composed).mean(axis=0)
-    assert np.abs(gap).max() < 0.01
-
-
-def test_composed_map_keeps_what_a_misfitted_map_forgets() -> None:
-    """Of a skewed prior and an observation that says nothing, (10) keeps the skewness."""
-    x = _rng(16).exponential(size=(20, 2000, 1))
-    inputs = (x, _rng(17).standard_normal(x.shape), np.zeros((20, 1)), [[1.0]])
-
-    def skewness(e: np.ndarray) -> float:
-        gap = e - e.mean(axis=1, keepdims=True)
-        return float(((gap**3).mean(axis=1) / (gap**2).mean(axis=1) ** 1.5).mean())
-
-    assert skewness(transport(*inputs, rng=_rng(1))) > 1.8
-    assert abs(skewness(transport_sample(*inputs, rng=_rng(1)))) < 0.1
-
-
-def test_noise_factor_scales_the_draw_and_nothing_else() -> None:
-    """The composed map of predictions whose drawn noise is multiplied by a factor."""
-    y, x = _samples(7)
-    noise, target = np.array([[0.3, 0.1], [0.1, 0.2]]), np.array([0.4, -0.2])
-    drawn = _rng(3).standard_normal(y.shape) @ np.linalg.cholesky(noise).T
-    for factor in (0.25, 1.0):
-        seen = y + factor * drawn
-        map_ = affine.fit(seen, x)
-        wanted = map_.inverse(target, map_(seen, x))
-        out = transport(x, y, target, noise, rng=_rng(3), noise_factor=factor)
-        assert np.allclose(out, wanted, atol=1e-10)
-        same = {"n_state": 3, "n_observed": 2}
-        pca = principal_components(x, y, target, noise, rng=_rng(3), noise_factor=factor, **same)
+@pytest.mark.parametrize("factor", [0.25, 1.0])
+def test_noise_factor_scales_the_draw_and_nothing_else(factor: float) -> None:
+    """The composed map of predictions and multiplied noise; so is PCA with all directions."""
+    x, y, target, noise = _FOUR
+    seen = y + factor * _rng(3).standard_normal(y.shape) @ np.linalg.cholesky(noise).T
+    map_ = affine.fit(seen, x)
+    wanted = map_.inverse(target, map_(seen, x))
+    out = transport(*_FOUR, rng=_rng(3), noise_factor=factor)
+    assert np.allclose(out, wanted, atol=1e-10)
+    for complement in ("keep", "literal"):
+        pca = principal_components(*_FOUR, rng=_rng(3), noise_factor=factor, n_state=3,
+                                   n_observed=5, complement=complement)
         assert np.allclose(pca, wanted, atol=1e-8)
 
 
-def _weights(x: np.ndarray) -> np.ndarray:
+def test_the_ensemble_transform_by_its_formula() -> None:
+    """Weights of a full noise matrix; corrected, also their covariance."""
+    x = members(40)
     gap = Y - x @ H.T
     w = np.exp(-0.5 * np.einsum("ni,ij,nj->n", gap, np.linalg.inv(R), gap))
-    return np.asarray(w / w.sum())
-
-
-def test_the_update_by_its_formula() -> None:
-    x = members(40)
+    w /= w.sum()
     out = ensemble_transform(x, x @ H.T, Y, R, rng=_rng())
-    assert np.allclose(out, transform(x, np.log(_weights(x))), atol=1e-10)
-    assert np.abs(out.mean(axis=0) - _weights(x) @ x).max() < 1e-13
-
-
-def test_the_moments_tend_to_the_kalman_filter_s() -> None:
-    """Mean and covariance within five standard errors at N = 900; the noise matrix is full."""
-    means, covs = [], []
-    for seed in range(6):
-        x = members(900, seed=seed)
-        out = ensemble_transform(x, x @ H.T, Y, R, rng=_rng(), correct=True)
-        means.append(out.mean(axis=0))
-        covs.append(np.cov(out.T))
-    mean, cov = kalman(MEAN, COV, H, R, Y)
-    assert (np.abs(np.mean(means, axis=0) - mean)
-            < 5 * np.std(means, axis=0, ddof=1) / 6**0.5 + 0.01).all()
-    assert (np.abs(np.mean(covs, axis=0) - cov)
-            < 5 * np.std(covs, axis=0, ddof=1) / 6**0.5 + 0.02).all()
+    assert np.allclose(out, transform(x, np.log(w)), atol=1e-10)
+    assert np.abs(out.mean(axis=0) - w @ x).max() < 1e-13
+    both = ensemble_transform(x, x @ H.T, Y, R, rng=_rng(), correct=True)
+    assert np.allclose(np.cov(both.T, bias=True), np.cov(x.T, aweights=w, bias=True), atol=1e-12)
 
 
 def test_a_reading_far_away_underflows_nothing_and_warns() -> None:
@@ -182,9 +116,3 @@ def test_nothing_is_drawn_without_rejuvenation() -> None:
     c, d = (ensemble_transform(x, x @ H.T, Y, R, rng=_rng(s), rejuvenation=0.2) for s in (1, 2))
     assert (c != d).any()
     assert np.abs(c.mean(axis=0) - a.mean(axis=0)).max() < 1e-13
-
-
-def test_likelihoods_of_a_full_noise_matrix() -> None:
-    x = members(9)
-    logs = log_likelihood(x @ H.T, Y, R)
-    assert np.allclose(np.exp(logs - logs.max()), _weights(x) / _weights(x).max())
