@@ -65,7 +65,7 @@ class FokkerPlanck(Record):
     Raises
     ------
     ValueError
-        If the boxes differ. A diffusion tensor that is not diagonal is refused by the swarm.
+        If the boxes differ.
 
     Notes
     -----

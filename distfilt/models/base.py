@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
 from typing import Annotated
 
 import numpy as np
@@ -68,15 +68,10 @@ class Model(Record):
             if labels and len(labels) != self.dim:
                 raise ValueError(f"{name}: needs {self.dim} entries, got {len(labels)}")
 
-    @cached_property
-    def _compared(self) -> dict[str, bool]:
-        """Which functions are known to take many states."""
-        return {}
-
     @door
     def step(self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegative) -> Array:
         """Move states (..., d) from `t` to `t` + `dt`, without noise."""
-        return batched(self.flow, "flow", (x,), self.dim, self._compared, t, dt)
+        return batched(self, "flow", (x,), t, dt)
 
     @door
     def noise(self, t: float, dt: NonNegative) -> Array:
@@ -116,18 +111,6 @@ class Model(Record):
                 f"derivative: needs to return shape {(*x.shape, self.dim)}, got {slope.shape}"
             )
         return np.broadcast_to(slope, (*x.shape, self.dim))
-
-    def _step(self, x: Array, t: float, dt: float) -> Array:
-        return unchecked(self.step)(x, t, dt)
-
-    def _sample_step(self, x: Array, t: float, dt: float, rng: np.random.Generator) -> Array:
-        return unchecked(self.sample_step)(x, t, dt, rng=rng)
-
-    def _root(self, t: float, dt: float) -> Array:
-        return unchecked(self.root)(t, dt)
-
-    def _jacobian(self, x: Array, t: float, dt: float) -> Array:
-        return unchecked(self.jacobian)(x, t, dt)
 
 
 @lru_cache(maxsize=64)
@@ -175,7 +158,7 @@ class LinearModel(Model):
     @door
     def transition(self, dt: NonNegative) -> Array:
         """The matrix Φ of a step of `dt` seconds, (d, d)."""
-        return _matrix(self.transition_matrix, self.dim, dt)
+        return array(self.transition_matrix(dt), "transition_matrix", (self.dim, self.dim))
 
     @door
     def jacobian(self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegative) -> Array:
@@ -183,15 +166,11 @@ class LinearModel(Model):
         return np.broadcast_to(unchecked(self.transition)(dt), (*x.shape, self.dim))
 
 
-def _matrix(transition_matrix: Callable[[float], Array], dim: int, dt: float) -> Array:
-    return array(transition_matrix(dt), "transition_matrix", (dim, dim))
-
-
 def _product(
     transition_matrix: Callable[[float], Array], dim: int, x: Array, t: float, dt: float
 ) -> Array:
     """The flow of a linear model."""
-    return np.asarray(x @ _matrix(transition_matrix, dim, dt).T)
+    return np.asarray(x @ array(transition_matrix(dt), "transition_matrix", (dim, dim)).T)
 
 
 @door
@@ -224,10 +203,15 @@ def simulate(
     >>> simulate(walk, [0.0], [1.0, 2.0], rng=np.random.default_rng(1)).shape
     (2, 1)
     """
+    return path(partial(unchecked(model.sample_step), rng=rng), x0, times, t0)
+
+
+def path(move: Callable[[Array, float, float], Array], x: Array, times: Array, t0: float) -> Array:
+    """Where ``move(x, t, dt)`` takes states from `t0`, at the times."""
     if times.size and times[0] <= t0:
         raise ValueError(f"times: needs times after t0 = {t0:g}, got {times[0]:g}")
-    path, state, now = np.empty((times.size, *x0.shape)), x0, t0
+    states = np.empty((times.size, *x.shape))
     for k, t in enumerate(times.tolist()):
-        state = path[k] = unchecked(model.sample_step)(state, now, t - now, rng=rng)
-        now = t
-    return path
+        x = states[k] = move(x, t0, t - t0)
+        t0 = t
+    return states

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from ..doors import Array, NonNegative, Positive, door, unchecked
+from ..doors import Array, NonNegative, Positive, array, door, unchecked
 from .base import Model, white
 
 __all__ = ["integrated", "rk4"]
@@ -51,7 +51,7 @@ def rk4(
     h = dt / (steps := equal_steps(dt, longest))
     # A copy: a rate that works in place must not change the caller's states.
     state = x.copy()
-    first = _rated(rate(state, t), state)
+    first = array(rate(state, t), "rate", state.shape, finite=False)
     for k in range(steps):
         s = t + k * h
         k1 = first if k == 0 else rate(state, s)
@@ -67,17 +67,6 @@ def rk4(
         total += state
         state = total
     return np.asarray(state)
-
-
-def _rated(value: object, state: Array) -> Array:
-    """What a rate returned, if it fits the states."""
-    first = np.asarray(value)
-    if first.shape != state.shape or first.dtype.kind not in "fiu":
-        raise ValueError(
-            f"rate: needs to return numbers of shape {state.shape}, "
-            f"got {first.dtype} of shape {first.shape}"
-        )
-    return first
 
 
 def equal_steps(dt: float, longest: float | None) -> int:
@@ -120,16 +109,9 @@ def integrated(
     """The model that :func:`rk4` makes of a rate, with white noise of a spectral density (d, d)."""
     return Model(
         len(density), partial(_flow, rate=rate, longest=step), partial(white, density),
-        derivative=partial(_derivative, rate=rate, slope=slope, longest=step), names=names,
-        units=units,
+        derivative=partial(rk4_jacobian, rate, slope, longest=step), names=names, units=units,
     )
 
 
 def _flow(x: Array, t: float, dt: float, rate: Rate, longest: float) -> Array:
     return unchecked(rk4)(rate, x, t, dt, longest=longest)
-
-
-def _derivative(
-    x: Array, t: float, dt: float, rate: Rate, slope: Rate, longest: float
-) -> Array:
-    return rk4_jacobian(rate, slope, x, t, dt, longest)

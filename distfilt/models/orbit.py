@@ -7,7 +7,6 @@ LeGrand and Kulik, with the factor :math:`r^{-5}` and the term :math:`3\mathbf r
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from typing import Annotated, Literal
 
@@ -37,14 +36,13 @@ _LARGEST = 1e75
 
 def _outside(value: Array, name: str) -> None:
     least = float(np.linalg.norm(value, axis=-1).min(initial=np.inf))
-    if least < RADIUS:
+    if not least >= RADIUS:
         raise ValueError(f"{name}: needs a distance above {RADIUS:g} km, got {least:g}")
 
 
 _BOUNDED = Bounds(at_least=-_LARGEST, at_most=_LARGEST)
 Place = Annotated[Array, "... 3", _BOUNDED, _outside]
 Orbits = Annotated[Array, "... 6", _BOUNDED]
-Rule = Literal["dop853", "rk4"]
 
 
 @door
@@ -105,13 +103,10 @@ def _rate(x: Array, t: float = 0.0) -> Array:
     return out
 
 
-def _back(x: Array, t: float) -> Array:
-    return -_rate(x)
-
-
 @door
 def propagate(
-    x: Annotated[Array, "... 6"], dt: float, *, rule: Rule = "dop853", longest: Positive = 900.0
+    x: Annotated[Array, "... 6"], dt: float, *, rule: Literal["dop853", "rk4"] = "dop853",
+    longest: Positive = 900.0
 ) -> Array:
     """Move satellites by a fixed number of equal steps.
 
@@ -144,27 +139,19 @@ def propagate(
     >>> bool(np.abs(back - start).max() < 1e-6)
     True
     """
-    _above(x)
+    _outside(x[..., :3], "x")
     if dt == 0:
         return x.copy()
     steps = equal_steps(abs(dt), longest)
-    turned = _rate if dt > 0 else _back
     with np.errstate(all="ignore"):
         for _ in range(steps):
             # A body that dives through the Earth and comes out again is found on its way.
             if rule == "rk4":
-                x = unchecked(rk4)(turned, x, 0.0, abs(dt) / steps)
+                x = unchecked(rk4)(_rate, x, 0.0, dt / steps)
             else:
                 x = _dop853(x, dt / steps)
-            _above(x)
+            _outside(x[..., :3], "x")
     return x
-
-
-def _above(x: Array) -> None:
-    size = np.linalg.norm(x[..., :3], axis=-1)
-    if not (size >= RADIUS).all():
-        least = float(np.nanmin(size, initial=np.inf))
-        raise ValueError(f"x: needs orbits above {RADIUS:g} km, got a distance of {least:g} km")
 
 
 def _dop853(x: Array, h: float) -> Array:
@@ -183,7 +170,6 @@ def _dop853(x: Array, h: float) -> Array:
 @door
 def orbits(
     bodies: Count = 1, *, position_std: Strength = 0.0, velocity_std: Strength = 0.0,
-    rule: Rule = "dop853", longest: Positive = 900.0,
 ) -> Model:
     """Several satellites as one model; the state is theirs one after the other.
 
@@ -194,8 +180,6 @@ def orbits(
     position_std, velocity_std : float
         Standard deviations of the noise that a step adds to each component, in km and m/s, whatever
         the step's length, (50)-(51).
-    rule, longest
-        As of :func:`propagate`.
 
     Examples
     --------
@@ -204,11 +188,9 @@ def orbits(
     (12, 'x2', 'm/s')
     """
     noise = np.diag(np.tile([position_std**2] * 3 + [velocity_std**2] * 3, bodies))
-    flow = partial(_flow, rule=rule, longest=longest)
     axes = ("x", "y", "z", "vx", "vy", "vz")
     return Model(
-        6 * bodies, flow, partial(_noise, noise),
-        derivative=partial(_slope, bodies=bodies, flow=flow),
+        6 * bodies, _flow, partial(_noise, noise), derivative=partial(_slope, bodies=bodies),
         names=tuple(f"{c}{k + 1}" for k in range(bodies) for c in axes),
         units=("km", "km", "km", "m/s", "m/s", "m/s") * bodies,
     )
@@ -218,19 +200,17 @@ def _noise(noise: Array, t: float, dt: float) -> Array:
     return noise
 
 
-def _flow(x: Array, t: float, dt: float, *, rule: Rule, longest: float) -> Array:
+def _flow(x: Array, t: float, dt: float) -> Array:
     states = x.reshape(*x.shape[:-1], -1, 6)
-    return unchecked(propagate)(states, dt, rule=rule, longest=longest).reshape(x.shape)
+    return unchecked(propagate)(states, dt).reshape(x.shape)
 
 
-def _slope(
-    x: Array, t: float, dt: float, *, bodies: int, flow: Callable[[Array, float, float], Array]
-) -> Array:
+def _slope(x: Array, t: float, dt: float, bodies: int) -> Array:
     """Central differences, body by body: a body's motion depends on its own state only."""
     size = np.full(6, 1e-2)
     states = x.reshape(*x.shape[:-1], bodies, 6)
     moved = np.stack([states[..., None, :] + np.diag(size), states[..., None, :] - np.diag(size)])
-    ends = flow(moved, t, dt)
+    ends = _flow(moved, t, dt)
     blocks = np.swapaxes((ends[0] - ends[1]) / (2 * size[:, None]), -1, -2)
     out = np.zeros((*x.shape, x.shape[-1]))
     for k in range(bodies):

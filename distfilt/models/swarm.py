@@ -9,19 +9,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from ..doors import (
-    Array,
-    Bounds,
-    Count,
-    NonNegative,
-    Positive,
-    Record,
-    Rng,
-    Times,
-    array,
-    door,
-    unchecked,
-)
+from ..doors import Array, Bounds, Count, NonNegative, Positive, Record, Rng, Times, door, unchecked
+from ..doors.values import array
+from .base import path
 
 __all__ = ["READINGS", "RotatingMixture", "Swarm", "rotating_swarm"]
 
@@ -40,24 +30,13 @@ def _reflected(x: Array, low: Array, high: Array) -> Array:
 
 
 def _diagonal(value: Any, points: tuple[int, ...], dim: int) -> Array:
-    """A diffusion, isotropic, per axis or a tensor, as (*points, d), positive."""
+    """A diffusion, isotropic or per axis, as (*points, d), positive."""
     d = array(value, "diffusion")
-    lead = points if d.shape[: len(points)] == points and d.ndim else ()
-    rest = d.shape[len(lead) :]
-    if rest == (dim, dim):
-        off = np.abs(d * (1 - np.eye(dim))).max(initial=0.0)
-        if off > 0:
-            raise ValueError(
-                "diffusion: needs a diagonal tensor (finite volumes along the axes cannot "
-                f"carry mixed derivatives), got an entry {off:g} beside the diagonal"
-            )
-        d = np.diagonal(d, axis1=-2, axis2=-1)
-    elif rest == ():
+    if d.shape in ((), points):
         d = d[..., None]
-    elif rest != (dim,):
+    elif d.shape not in ((dim,), (*points, dim)):
         raise ValueError(
-            f"diffusion: needs a number, one for each axis or a tensor at each of {points} "
-            f"points, got shape {d.shape}"
+            f"diffusion: needs a number or one for each axis at {points} points, got {d.shape}"
         )
     least = float(d.min(initial=np.inf))
     if not least > 0:
@@ -78,15 +57,15 @@ class Swarm(Record):
     ----------
     drift : callable
         ``drift(x, t) -> v`` on positions (..., d), in 1/s times the positions' unit.
-    diffusion : float, array_like (d,) or (d, d), or callable
-        D, positive; a callable ``diffusion(x, t)`` returns (...), (..., d) or (..., d, d).
+    diffusion : float, array_like (d,), or callable
+        The diagonal of D, positive; a callable ``diffusion(x, t)`` returns (...) or (..., d).
     low, high : array_like, (d,)
         The box's corners; the unit square by default.
 
     Raises
     ------
     ValueError
-        If the diffusion is not positive, or a tensor that is not diagonal.
+        If the diffusion is not positive.
 
     Examples
     --------
@@ -116,11 +95,7 @@ class Swarm(Record):
 
     def drift_at(self, x: Array, t: float) -> Array:
         """The drift at positions (..., d), checked for its shape."""
-        v = np.asarray(self.drift(x, t), dtype=np.float64)
-        if v.shape != x.shape:
-            raise ValueError(f"drift: needs to return the positions' shape {x.shape}, "
-                             f"got {v.shape}")
-        return v
+        return array(self.drift(x, t), "drift", x.shape)
 
     def diffusion_at(self, x: Array, t: float) -> Array:
         """The diffusion along each axis at positions (..., d), as (..., d)."""
@@ -128,14 +103,11 @@ class Swarm(Record):
         points = x.shape[:-1] if callable(self.diffusion) else ()
         return np.broadcast_to(_diagonal(value, points, self.dim), x.shape)
 
-    @door
-    def check(self, positions: Positions, name: str = "positions") -> Array:
-        """Positions (..., d) as an array; those outside the box, or NaN, are refused."""
-        x = positions
+    def _inside(self, x: Array) -> Array:
         outside = ((x < self.low) | (x > self.high)).any(axis=-1)
         if outside.any():
             raise ValueError(
-                f"{name}: needs agents inside the box, got {int(outside.sum())} outside, one at "
+                f"positions: needs agents inside the box, got {int(outside.sum())} outside, one at "
                 f"{x[outside][0].tolist()}"
             )
         return x
@@ -162,7 +134,7 @@ class Swarm(Record):
         -------
         ndarray, (..., d)
         """
-        return self._step(unchecked(self.check)(positions), t, dt, rng, substeps)
+        return self._step(self._inside(positions), t, dt, rng, substeps)
 
     def _step(self, x: Array, t: float, dt: float, rng: np.random.Generator, n: int) -> Array:
         h = dt / n
@@ -181,14 +153,8 @@ class Swarm(Record):
 
         Parameters are those of :meth:`step`; `times` increase strictly from `t0`.
         """
-        x, now = unchecked(self.check)(positions), t0
-        if times.size and times[0] <= now:
-            raise ValueError(f"times: needs times after t0 = {now:g}, got {times[0]:g}")
-        path = np.empty((times.size, *x.shape))
-        for k, t in enumerate(times.tolist()):
-            x = path[k] = self._step(x, now, t - now, rng, substeps)
-            now = t
-        return path
+        move = partial(self._step, rng=rng, n=substeps)
+        return path(move, self._inside(positions), times, t0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,10 +1,10 @@
 """Sensors: what an agent sees of a state, how noisy it is, and how two readings are compared."""
 
 from .base import Sensor, wrap
-from .kinds import WideAngle, angle, direct, distance, distance_and_angle, of_kind, stack
+from .kinds import angle, direct, distance, distance_and_angle, of_kind, stack
 from .orbital import ephemeris, line_of_sight
 
 __all__ = [  # fmt: skip
-    "Sensor", "WideAngle", "angle", "direct", "distance", "distance_and_angle", "ephemeris",
+    "Sensor", "angle", "direct", "distance", "distance_and_angle", "ephemeris",
     "line_of_sight", "of_kind", "stack", "wrap",
 ]

@@ -70,8 +70,6 @@ class Sensor(Record):
     derivative : callable, optional
         ``derivative(x)``, the Jacobian of `function` in the present state, (..., m, d), called
         like it. Central differences stand in for it.
-    units : tuple of str, optional
-        Unit of each component of a reading.
 
     Examples
     --------
@@ -88,17 +86,6 @@ class Sensor(Record):
     kind: str = field(default="sensor", kw_only=True)
     linear: Callable[[int], Array] | None = field(default=None, kw_only=True)
     derivative: Callable[..., Array] | None = field(default=None, kw_only=True)
-    units: tuple[str, ...] = field(default=(), kw_only=True)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if len(self.units) not in (0, self.dim):
-            raise ValueError(f"units: needs {self.dim} entries, got {len(self.units)}")
-
-    @cached_property
-    def _compared(self) -> dict[str, bool]:
-        """Which functions are known to take many states."""
-        return {}
 
     @cached_property
     def root(self) -> Array:
@@ -114,9 +101,7 @@ class Sensor(Record):
         `previous` holds the states at the previous observation time; only a sensor that sees
         changes needs it.
         """
-        return batched(
-            self.function, "function", self._states(x, previous), self.dim, self._compared
-        )
+        return batched(self, "function", self._states(x, previous))
 
     def _states(self, x: Array, previous: Array | None) -> tuple[Array, ...]:
         """What the function gets."""
@@ -177,23 +162,10 @@ class Sensor(Record):
         if self.linear is not None:
             return np.broadcast_to(unchecked(self.matrix)(d), full)
         if self.derivative is None:
-            return central(lambda moved: self._moved(moved, states[1:]), states[0], self._gap)
+            before = [b[..., None, :] for b in states[1:]]
+            predict, residual = unchecked(self.predict), unchecked(self.residual)
+            return central(lambda moved: predict(moved, *before), states[0], residual)
         slope = np.asarray(self.derivative(*[s.copy() for s in states]))
         if slope.shape not in (full, full[-2:]):
             raise ValueError(f"derivative: needs to return shape {full}, got {slope.shape}")
         return np.broadcast_to(slope, full)
-
-    def _moved(self, moved: Array, before: tuple[Array, ...]) -> Array:
-        """Predictions of states (..., k, d) that all have the same previous one."""
-        return unchecked(self.predict)(moved, *[b[..., None, :] for b in before])
-
-    def _gap(self, observed: Array, predicted: Array) -> Array:
-        return unchecked(self.residual)(observed, predicted)
-
-    def _seen(self, *states: Array) -> Array:
-        return unchecked(self.predict)(*states)
-
-    _predict = _seen
-
-    def _residual(self, observed: Array, predicted: Array) -> Array:
-        return unchecked(self.residual)(observed, predicted)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -12,35 +11,18 @@ import numpy as np
 from ..doors import Array, Bounds, Places, door, unchecked
 from .base import Sensor, wrap
 
-__all__ = ["WideAngle", "angle", "direct", "distance", "distance_and_angle", "of_kind", "stack"]
+__all__ = ["angle", "direct", "distance", "distance_and_angle", "of_kind", "stack"]
 
 Deviation = Annotated[float, Bounds(at_least=1e-150, at_most=1e150)]
 """A standard deviation whose square is a variance that is neither zero nor infinite."""
 
 
-def _entries(*sizes: int) -> Callable[[Sequence[int], str], None]:
-    def refuse(value: Sequence[int], name: str) -> None:
-        if len(value) not in sizes:
-            needs = " or ".join(map(str, sizes))
-            raise ValueError(f"{name}: needs {needs} components, got {len(value)}")
-
-    return refuse
+def _two(value: Sequence[int], name: str) -> None:
+    if len(value) != 2:
+        raise ValueError(f"{name}: needs 2 components, got {len(value)}")
 
 
-Pair = Annotated[Places, _entries(2)]
-
-
-class WideAngle(RuntimeWarning):
-    """An angle is so uncertain that its readings go round: no Gaussian describes them."""
-
-
-def _angular(std: float) -> float:
-    if std > np.pi / 2:
-        warnings.warn(
-            f"std: {std:g} rad is more than a quarter of a turn, so that readings go round and a "
-            "Gaussian does not describe them; are these degrees?", WideAngle, stacklevel=4,
-        )  # fmt: skip
-    return std
+Pair = Annotated[Places, _two]
 
 
 def diagonal(*stds: float) -> Array:
@@ -170,7 +152,7 @@ def angle(
     indices : sequence of two int
         The components a and b.
     std : float
-        Standard deviation, in rad, positive. One above π/2 is warned of (:class:`WideAngle`).
+        Standard deviation, in rad, positive.
     full : bool
         False: ``arctan(b/a)``, the angle of a line, which repeats after π (Grange et al., Table I).
         True: ``arctan2(b, a)``, a direction, which repeats after 2π.
@@ -193,15 +175,16 @@ def angle(
     period = (2 if full else 1) * np.pi
     place: dict[str, Any] = {"indices": indices, "origin": origin}
     return Sensor.unchecked(
-        1, partial(_angle, period=period, **place), diagonal(_angular(std)), kind="angle",
-        difference=partial(_shorter_way, period=period), units=("rad",),
-        derivative=partial(_angle_slope, **place)
+        1, partial(_angle, period=period, **place), diagonal(std), kind="angle",
+        difference=partial(_shorter_way, period=period), derivative=partial(_angle_slope, **place)
     )
 
 
-def _angle(x: Array, period: float, indices: Sequence[int], origin: Array | None) -> Array:
+def _angle(
+    x: Array, period: float, indices: Sequence[int], origin: Array | None, heading: float = 0.0
+) -> Array:
     a, b = np.moveaxis(_gap(x, indices, origin), -1, 0)
-    direction = np.where((a == 0) & (b == 0), np.nan, np.arctan2(b, a))
+    direction = np.where((a == 0) & (b == 0), np.nan, np.arctan2(b, a)) - heading
     return unchecked(wrap)(direction, period=period)[..., None]
 
 
@@ -221,7 +204,7 @@ def _angle_slope(x: Array, indices: Sequence[int], origin: Array | None) -> Arra
 @door
 def distance_and_angle(
     indices: Pair, *, std: tuple[Deviation, Deviation], origin: Annotated[Array, "2"] | None = None,
-    heading: float = 0.0, places: Annotated[Places, _entries(2, 3)] | None = None
+    heading: float = 0.0
 ) -> Sensor:
     """See the distance and the direction of two components, as a radar or a robot does.
 
@@ -236,13 +219,10 @@ def distance_and_angle(
     heading : float
         Where it looks, in rad from the first axis to the second: the angle is measured from there,
         and repeats after 2π.
-    places : sequence of two or three int, optional
-        In place of `origin`: the components where the state has the sensor's own position, and
-        third the heading of what carries it, to which `heading` is added.
 
     Notes
     -----
-    Where the two positions are the same there is no angle: it and its derivative are NaN. A sensor
+    At the origin itself there is no angle: it and its derivative are NaN. A sensor
     with another pose at each reading is best made without checks,
     ``unchecked(distance_and_angle)(...)``: it takes some 10 µs.
 
@@ -251,40 +231,18 @@ def distance_and_angle(
     >>> radar = distance_and_angle([0, 1], std=[0.5, 0.01], origin=[1.0, 0.0])
     >>> radar.predict([1.0, 2.0]).round(4)
     array([2.    , 1.5708])
-
-    A robot at (3, 0) that looks along the second axis sees the same place behind its left:
-
-    >>> robot = distance_and_angle([0, 1], std=[0.5, 0.01], places=[2, 3, 4])
-    >>> robot.predict([1.0, 2.0, 3.0, 0.0, np.pi / 2]).round(4)
-    array([2.8284, 0.7854])
     """
-    if origin is not None and places is not None:
-        raise ValueError("places: needs no origin beside it, got both")
-    pose: dict[str, Any] = {"indices": indices, "origin": origin, "places": places}
+    place: dict[str, Any] = {"indices": indices, "origin": origin}
     return Sensor.unchecked(
-        2, partial(_sighting, heading=heading, **pose), diagonal(std[0], _angular(std[1])),
-        difference=_sighting_gap, kind="distance and angle", units=("", "rad"),
-        derivative=partial(_sighting_slope, **pose)
+        2, partial(_sighting, heading=heading, **place), diagonal(*std),
+        difference=_sighting_gap, kind="distance and angle",
+        derivative=partial(_sighting_slope, **place)
     )
 
 
-def _way(
-    x: Array, indices: Sequence[int], origin: Array | None, places: Sequence[int] | None
-) -> Array:
-    """From the sensor to what it sees."""
-    return _gap(x, indices, origin if places is None else _pick(x, places[:2]))
-
-
-def _sighting(
-    x: Array, heading: float, indices: Sequence[int], origin: Array | None,
-    places: Sequence[int] | None
-) -> Array:
-    way = _way(x, indices, origin, places)
-    a, b = way[..., 0], way[..., 1]
-    direction = np.where((a == 0) & (b == 0), np.nan, np.arctan2(b, a)) - heading
-    if places is not None and len(places) == 3:
-        direction -= _pick(x, places[2:])[..., 0]
-    return np.stack([np.linalg.norm(way, axis=-1), unchecked(wrap)(direction)], axis=-1)
+def _sighting(x: Array, heading: float, **place: Any) -> Array:
+    turned = _angle(x, 2 * np.pi, **place, heading=heading)
+    return np.concatenate([_distance(x, **place), turned], axis=-1)
 
 
 def _sighting_gap(observed: Array, predicted: Array) -> Array:
@@ -293,20 +251,8 @@ def _sighting_gap(observed: Array, predicted: Array) -> Array:
     return gap
 
 
-def _sighting_slope(
-    x: Array, indices: Sequence[int], origin: Array | None, places: Sequence[int] | None
-) -> Array:
-    way = _way(x, indices, origin, places)
-    length = np.linalg.norm(way, axis=-1, keepdims=True)
-    along = way / np.where(length > 0, length, 1.0)
-    aside = np.stack([-along[..., 1], along[..., 0]], axis=-1)
-    aside /= np.where(length > 0, length, np.nan)
-    slope = np.stack([along, aside], axis=-2)
-    out = _spread(slope, indices, x.shape[-1])
-    if places is not None:
-        out -= _spread(slope, places[:2], x.shape[-1])
-        out[..., 1, list(places[2:])] = -1.0
-    return out
+def _sighting_slope(x: Array, **place: Any) -> Array:
+    return np.concatenate([_distance_slope(x, **place), _angle_slope(x, **place)], axis=-2)
 
 
 @door
@@ -367,7 +313,6 @@ def stack(sensors: Annotated[Sequence[Sensor], _some]) -> Sensor:
     cov.setflags(write=False)
     differences = partial(_stacked_differences, parts=sensors, ends=ends[:-1])
     linear = all(s.linear is not None for s in sensors)
-    units = tuple(u for s in sensors for u in s.units or ("",) * s.dim)
     return Sensor.unchecked(
         ends[-1],
         partial(_stacked, parts=sensors),
@@ -377,7 +322,6 @@ def stack(sensors: Annotated[Sequence[Sensor], _some]) -> Sensor:
         kind="stacked",
         linear=partial(_stacked_rows, parts=sensors) if linear else None,
         derivative=partial(_stacked_slopes, parts=sensors),
-        units=units if any(units) else (),
     )
 
 

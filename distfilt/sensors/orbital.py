@@ -10,7 +10,7 @@ import numpy as np
 
 from ..doors import Array, Index, door, unchecked
 from .base import Sensor
-from .kinds import Deviation, _angular, diagonal, direct
+from .kinds import Deviation, diagonal, direct
 
 __all__ = ["ephemeris", "line_of_sight"]
 
@@ -46,8 +46,7 @@ def line_of_sight(
     here, there = slice(target, target + 3), slice(observer, observer + 3)
     return Sensor.unchecked(
         2, partial(_sight, form=form, here=here, there=there, hidden=hidden),
-        diagonal(_angular(std), std), units=("rad", "rad"),
-        difference=partial(_shorter_ways, turns=form == "arctan2")
+        diagonal(std, std), difference=partial(_shorter_ways, turns=form == "arctan2")
     )
 
 
@@ -92,4 +91,4 @@ def ephemeris(*, position_std: Deviation, velocity_std: Deviation, start: Index 
     """
     read = unchecked(direct)(tuple(range(start, start + 6)), std=1.0)
     cov = diagonal(*[position_std] * 3, *[velocity_std] * 3)
-    return read.changed(cov=cov, units=("km",) * 3 + ("m/s",) * 3)
+    return read.changed(cov=cov)
