@@ -15,7 +15,6 @@ from distfilt.mixtures import (
     Shapes,
     cross_relevance,
     kept_by_relevance,
-    merge_costs,
     pivoted_qr,
     reduction,
     runnalls,
@@ -107,13 +106,6 @@ def test_a_mixand_without_weight_goes_first(
     p = GaussianMixture([0.5, 0.0, 0.5], [[0.0], [5.0], [9.0]], np.ones((3, 1, 1)))
     left = by(engine, p, 2, monkeypatch)
     assert np.allclose(left.means.ravel(), [0.0, 9.0]) and np.allclose(left.weights, 0.5)
-
-
-def test_merge_costs_are_invariant_and_nonnegative() -> None:
-    p = random_mixture(6, 3, 8)
-    costs = merge_costs(p)
-    assert np.allclose(costs, merge_costs(affine(p, *scales(3))), rtol=1e-8, atol=1e-10)
-    assert costs.min() >= -1e-14 and np.allclose(costs, costs.T) and not np.diag(costs).any()
 
 
 def test_two_stage() -> None:
