@@ -330,7 +330,8 @@ class _Heard:
             got, who = self.arrived[:, links], self.graph.senders[links]
             sent = np.where(got[..., None, None], self.sent_covs[:, who], unit)
             covs = np.concatenate([self.covs[:, agents, None], sent], axis=2)
-            yield agents, links, covs, np.concatenate([np.ones_like(got[..., :1]), got], axis=2)
+            own = np.ones((*got.shape[:2], 1), dtype=bool)
+            yield agents, links, covs, np.concatenate([own, got], axis=2)
 
 
 def _in_rounds(

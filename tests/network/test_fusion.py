@@ -179,6 +179,14 @@ def test_what_uses_determinants_does_not_depend_on_units(rule: str) -> None:
     assert np.allclose(other[1], units @ plain[1] @ units, rtol=1e-6)
 
 
+@pytest.mark.parametrize("rule", RULES)
+def test_an_agent_that_hears_nobody_keeps_its_belief(rule: str) -> None:
+    means, covs = gaussians(2, 3)
+    door = Channel(Graph.from_edges(3, [[0, 1]]))
+    m, p = covariance_intersection((means, covs), door, rule=rule)
+    assert np.allclose(m[2], means[2], rtol=1e-14) and np.allclose(p[2], covs[2], rtol=1e-13)
+
+
 def test_naive_fusion_grows_sure_of_one_measurement() -> None:
     """The same datum passed round and round: variance falls, although nothing new was learned."""
     m, p = np.zeros((3, 1)), np.ones((3, 1, 1))
