@@ -90,6 +90,16 @@ def test_a_door_refuses_by_name(name: str) -> None:
                 assert exact(before, call.given)
 
 
+@pytest.mark.parametrize("name", sorted(PUBLIC))
+def test_a_valid_call_changes_none_of_its_arguments(name: str) -> None:
+    """But for generators, which are there to be drawn from."""
+    for function in callables(PUBLIC[name]).values():
+        for call in calls(PUBLIC[name], function)[:1]:
+            after = call.run()[1]
+            kept = {k: v for k, v in call.given.items() if not isinstance(v, np.random.Generator)}
+            assert exact(kept, {k: after[k] for k in kept}), function
+
+
 def test_every_public_name_has_a_door_or_a_reason() -> None:
     found = [name for name, thing in PUBLIC.items() if is_doorless(thing)]
     doorless = [n for n in found if not any(re.fullmatch(p, n) for p in WITHOUT)]

@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import stats
 from scipy.integrate import quad
 
-from distfilt.ensembles import sample_covariance
 from distfilt.metrics import (
     crps,
     ensemble_nees,
@@ -19,21 +16,11 @@ from distfilt.metrics import (
     nees,
     nees_band,
     nis,
-    proportion_interval,
     squared_error,
 )
 from tests.support import generator, spd
 
 RNG = np.random.default_rng(0)
-ENSEMBLE = np.arange(12.0).reshape(4, 3) ** 2 + np.eye(4, 3)
-
-
-def test_nothing_is_mutated():
-    before = ENSEMBLE.copy()
-    truth = np.zeros(3)
-    for call in (crps, ensemble_nees):
-        call(ENSEMBLE, truth)
-    assert (before == ENSEMBLE).all() and (truth == 0).all()
 
 
 def test_squared_error_is_a_sum_or_stays_apart():
@@ -73,38 +60,6 @@ def test_nees_and_nis_are_their_definitions(leading):
     assert np.allclose(nees(estimate, one, truth), exact, rtol=1e-10)
 
 
-def test_nis_of_an_honest_filter_lies_in_its_band():
-    """A scalar Kalman filter's innovations are independent and chi-square."""
-    rng, variance, values = generator(6), 1.0, []
-    state, guess = rng.standard_normal(2000), np.zeros(2000)
-    for _ in range(20):
-        reading = state + 0.7 * rng.standard_normal(2000)
-        s = variance + 0.49
-        values.append(nis((reading - guess)[:, None], [[s]]))
-        guess = guess + variance / s * (reading - guess)
-        variance = variance * 0.49 / s + 0.09
-        state = state + 0.3 * rng.standard_normal(2000)
-    assert np.mean(values) in nees_band(1, 40_000, level=0.999)
-    assert 1.1 * np.mean(values) not in nees_band(1, 40_000, level=0.999)
-
-
-# Multiples of 1/8 keep a random map away from both overflow and hidden cancellation.
-EIGHTHS = st.integers(-16, 16).map(lambda k: k / 8)
-
-
-@given(st.lists(EIGHTHS, min_size=9, max_size=9), st.lists(EIGHTHS, min_size=3, max_size=3))
-def test_nees_is_invariant_under_an_invertible_map(entries, gap):
-    linear = np.reshape(entries, (3, 3)) + 8 * np.eye(3)  # diagonally dominant: invertible
-    half = np.array([[2.0, 0.0, 0.0], [1.0, 1.5, 0.0], [-0.5, 0.25, 1.0]])
-    p = half @ half.T
-    mapped = linear @ p @ linear.T
-    before = nees(np.array(gap), p, np.zeros(3))
-    after = nees(linear @ gap, 0.5 * (mapped + mapped.T), np.zeros(3))
-    assert after == pytest.approx(before, rel=1e-10, abs=1e-12)
-    members = np.random.default_rng(1).standard_normal((9, 3))
-    before = ensemble_nees(members, np.array(gap))
-    assert ensemble_nees(members @ linear.T, linear @ gap) == pytest.approx(before, rel=1e-9)
-
 
 def test_ensemble_nees_equals_nees_with_the_sample_covariance():
     x = RNG.standard_normal((4, 30, 5)) @ np.diag([1e-6, 1.0, 1e6, 3.0, 1.0])
@@ -134,19 +89,6 @@ def test_nees_band_has_its_probability(dim, runs, level):
     assert band.error == pytest.approx(np.sqrt(2 * dim / runs), rel=1e-12)
 
 
-def test_nees_band_covers_gaussian_errors():
-    rng, trials = np.random.default_rng(4), 4000
-    half = np.array([[2.0, 0.0], [1.0, 0.5]])
-    errors = rng.standard_normal((trials, 25, 2)) @ half.T
-    averages = nees(errors, half @ half.T, np.zeros(2)).mean(axis=1)
-    band = nees_band(2, 25)
-    inside = int(sum(a in band for a in averages))
-    # With 99.9% confidence the share of a band of 95% lies in its Clopper-Pearson interval.
-    assert 0.95 in proportion_interval(inside, trials, level=0.999)
-    overconfident = nees(2 * errors, half @ half.T, np.zeros(2)).mean(axis=1)
-    assert np.mean([a in band for a in overconfident]) < 0.01
-
-
 # --- scores -----------------------------------------------------------------------------------
 
 
@@ -167,27 +109,6 @@ def test_crps_equals_its_definition(n, fair):
     assert np.abs(out - expected).max() < 1e-12
 
 
-def test_crps_equals_the_integral_of_squared_distribution_functions():
-    x, y = np.array([-1.0, 0.5, 0.5, 3.0]), 1.25
-    knots = np.sort(np.append(x, y))
-    middles = (knots[1:] + knots[:-1]) / 2
-    steps = ((x <= middles[:, None]).mean(axis=1) - (y <= middles)) ** 2
-    assert crps(x[:, None], [y])[0] == pytest.approx((steps * np.diff(knots)).sum(), abs=1e-14)
-
-
-@given(
-    st.lists(st.integers(-1000, 1000), min_size=1, max_size=20),
-    st.integers(-1000, 1000),
-    st.integers(-(2**20), 2**20),
-)
-def test_crps_is_translation_invariant_and_ordered(values, y, shift):
-    x = np.array(values, dtype=float)[:, None]
-    score = crps(x, [float(y)])
-    assert crps(x + shift, [float(y + shift)]) == score  # integers: no rounding
-    assert crps(x[::-1], [float(y)]) == score
-    assert 0 <= score[0] <= np.abs(x - y).mean()
-
-
 @pytest.mark.parametrize("mean, std, truth", [(0.0, 1.0, 0.0), (2.0, 0.3, 1.1), (-1.0, 5.0, 9.0)])
 def test_gaussian_crps_equals_its_integral(mean, std, truth):
     cdf = stats.norm(mean, std).cdf
@@ -201,14 +122,6 @@ def test_fair_crps_is_unbiased_for_the_gaussian():
     exact = float(gaussian_crps(0.0, 1.0, 0.7))
     assert exact in mean_interval(crps(x, [0.7], fair=True)[:, 0], level=0.999)
     assert exact not in mean_interval(crps(x, [0.7])[:, 0], level=0.999)
-
-
-def test_variance_matches_the_error_of_an_honest_ensemble():
-    n, scale = 10, np.array([1.0, 5.0, 0.1])
-    x = np.random.default_rng(6).standard_normal((20000, n + 1, 3)) * scale
-    square = np.trace(sample_covariance(x[:, 1:]), axis1=-2, axis2=-1)
-    gap = squared_error(x[:, 1:].mean(1), x[:, 0]) - (1 + 1 / n) * square
-    assert 0.0 in mean_interval(gap, level=0.999)
 
 
 @pytest.mark.parametrize("n", [1, 2, 7])
@@ -233,13 +146,3 @@ def test_log_score_is_minus_the_log_density():
     for k in range(5):
         exact = -stats.multivariate_normal(estimate[k], cov[k]).logpdf(truth)
         assert found[k] == pytest.approx(exact, rel=1e-10)
-
-
-def test_log_score_is_least_for_the_honest_covariance():
-    rng = generator(9)
-    cov = spd(rng, 2)
-    truth = rng.standard_normal((20_000, 2)) @ np.linalg.cholesky(cov).T
-    honest = log_score(np.zeros(2), cov, truth)
-    assert 0.5 * np.linalg.slogdet(2 * np.pi * np.e * cov)[1] in mean_interval(honest, level=0.999)
-    for other in (1.3 * cov, 0.7 * cov, np.diag(np.diag(cov))):
-        assert mean_interval(log_score(np.zeros(2), other, truth) - honest, level=0.999).low > 0
