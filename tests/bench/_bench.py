@@ -1,7 +1,8 @@
 """What every benchmark shares: repeated timing, and tables that say where they were measured.
 
-A script writes its table unless others kept the machine busy meanwhile; ``--force`` writes it all
-the same. It ends with the number of floors that were missed.
+A script yields the rows of its tables; a row whose floor or limit is not met says so by a number
+``missed``. `main` shows the tables and writes each unless others kept the machine busy meanwhile;
+``--force`` writes it all the same. It ends with the number of what was missed.
 """
 
 from __future__ import annotations
@@ -14,44 +15,42 @@ import resource
 import statistics
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from threadpoolctl import threadpool_limits
 
-__all__ = ["Timing", "interleaved", "machine", "peer", "timed", "versions", "write"]
+Row = dict[str, Any]
+Rows = Callable[[], Iterable[Row]]
 
 FOLDER = Path(__file__).resolve().parents[2] / "data" / "bench"
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Medians over the repeats, in s, the peak memory of the process so far, in MB, the result."""
+    """Median over the repeats, in s, the peak memory of the process so far, in MB, the result."""
 
     cpu: float
-    wall: float
-    repeats: int
     peak_mb: float
     result: Any
 
 
 def timed(function: Callable[[], Any], repeats: int = 3) -> Timing:
-    """Call `function` `repeats` times and take the median of processor and of wall time.
+    """Call `function` `repeats` times and take the median of processor time.
 
-    Ratios are taken from the processor time, which another program on the machine disturbs least.
+    Another program on the machine disturbs it less than wall time.
     """
-    cpu, wall, result = [], [], None
+    cpu, result = [], None
     # Waiting BLAS threads count as processor time and would hide what small matrices cost.
     with threadpool_limits(limits=1):
         for _ in range(repeats):
-            start_cpu, start = time.process_time(), time.perf_counter()
+            start = time.process_time()
             result = function()
-            wall.append(time.perf_counter() - start)
-            cpu.append(time.process_time() - start_cpu)
-    return Timing(statistics.median(cpu), statistics.median(wall), repeats, peak_mb(), result)
+            cpu.append(time.process_time() - start)
+    return Timing(statistics.median(cpu), peak_mb(), result)
 
 
 def interleaved(
@@ -145,9 +144,7 @@ def versions(packages: Sequence[str]) -> str:
     return "; ".join(found)
 
 
-def write(
-    name: str, rows: Sequence[Mapping[str, Any]], packages: Sequence[str] = ("numpy", "scipy")
-) -> Path:
+def write(name: str, rows: Sequence[Row], packages: Sequence[str]) -> None:
     """Print rows, and write them to data/bench/`name`.csv with versions, machine and its load."""
     columns, busy = list(rows[0]), max(_BEFORE, load())
     widths = [max(len(c), *(len(str(row[c])) for row in rows)) for c in columns]
@@ -156,11 +153,34 @@ def write(
     path = FOLDER / f"{name}.csv"
     if busy > BUSY and "--force" not in sys.argv:
         print(f"{name}.csv: not written under a load of {busy:.1f}; --force writes it")
-        return path
+        return
     FOLDER.mkdir(parents=True, exist_ok=True)
     where = {"versions": versions(packages), "machine": machine(busy)}
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, [*columns, *where], lineterminator="\n")
         writer.writeheader()
         writer.writerows({**row, **where} for row in rows)
-    return path
+
+
+_TABLES: dict[str, tuple[Rows, Sequence[str]]] = {}
+
+
+def table(name: str, *packages: str) -> Callable[[Rows], Rows]:
+    """Have `main` show and write the rows that a function yields, with the packages' versions."""
+
+    def kept(rows: Rows) -> Rows:
+        _TABLES[name] = rows, packages or ("numpy", "scipy")
+        return rows
+
+    return kept
+
+
+def main() -> NoReturn:
+    """Every table of the script in turn; ends with how many floors and limits were missed."""
+    missed = 0
+    for name, (rows, packages) in _TABLES.items():
+        found = [dict(row) for row in rows()]
+        missed += sum(int(row.pop("missed", 0)) for row in found)
+        if found:
+            write(name, found, packages)
+    sys.exit(missed)

@@ -1,24 +1,19 @@
 """Density filters: one shared basis against a dense covariance, and growth with agents and grid.
 
-    python tests/bench/bench_density.py
-
 All local filters of a hundred agents on 30 by 30 cells, one filter on 100 by 100, and one step each
 of the Fokker-Planck equation, the kernel estimate and the consensus, for several sizes. Memory is
-the largest that one call allocates. Ends with an error if a required time or ratio is missed.
+the largest that one call allocates. Misses where a time or a ratio is not met.
 """
 
 from __future__ import annotations
 
-import sys
 import tracemalloc
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-
 import numpy as np
-from _bench import timed, write
+from _bench import Row, main, table, timed
 
 from distfilt.density import (
     Dense,
@@ -38,6 +33,7 @@ from distfilt.network import Channel, graphs, pi_start, pi_step
 H, AGENTS, RANK, DT = 0.08, 100, 50, 0.1
 LIMITS = {"100 local filters, 30 x 30": 30.0, "one filter, 100 x 100": 100.0}
 RATIO = 300.0
+SWARM = rotating_swarm("slowgibbs")
 
 
 def peak_mb(function: Callable[[], Any]) -> float:
@@ -49,23 +45,24 @@ def peak_mb(function: Callable[[], Any]) -> float:
     return peak / 2**20
 
 
-def row(what: str, size: int, function: Callable[[], Any], repeats: int) -> dict[str, Any]:
+def row(what: str, size: int, function: Callable[[], Any], repeats: int) -> Row:
     """One line of the table."""
     took = timed(function, repeats)
-    return {
-        "what": what,
-        "size": size,
-        "cpu_ms": round(1e3 * took.cpu, 3),
-        "peak_mb": round(peak_mb(function), 2),
-    }
+    ms, limit = round(1e3 * took.cpu, 3), LIMITS.get(what, np.inf)
+    return {"what": what, "size": size, "cpu_ms": ms, "peak_mb": round(peak_mb(function), 2),
+            "missed": ms > limit}  # fmt: skip
+
+
+def case(n: int) -> tuple[Grid, FokkerPlanck, np.ndarray, Any]:
+    """A grid of n by n cells, the motion on it, an observed density and its information."""
+    grid, x = Grid((n, n)), np.random.default_rng(1).random((AGENTS, 2))
+    flow, y = FokkerPlanck(SWARM, grid), kernel_density(x, grid, bandwidth=H)
+    return grid, flow, y, kernel_information(grid, bandwidth=H, agents=AGENTS)
 
 
 def filters(n: int, number: int) -> Callable[[], Any]:
     """A whole step of `number` filters on n by n cells: move, forecast, weigh, take in."""
-    grid = Grid((n, n))
-    flow, rng = FokkerPlanck(rotating_swarm("slowgibbs"), grid), np.random.default_rng(1)
-    y = kernel_density(rng.random((AGENTS, 2)), grid, bandwidth=H)
-    k = kernel_information(grid, bandwidth=H, agents=AGENTS)
+    grid, flow, y, k = case(n)
     state = low_rank_start(zero_mean_prior(grid, rank=RANK), np.tile(y, (number, 1)))
 
     def step() -> Any:
@@ -77,81 +74,60 @@ def filters(n: int, number: int) -> Callable[[], Any]:
 
 def dense(n: int) -> Callable[[], Any]:
     """The same step of one filter with its whole covariance."""
-    grid = Grid((n, n))
-    flow, rng = FokkerPlanck(rotating_swarm("slowgibbs"), grid), np.random.default_rng(1)
-    y = kernel_density(rng.random((AGENTS, 2)), grid, bandwidth=H)
-    k = kernel_information(grid, bandwidth=H, agents=AGENTS)
+    grid, flow, y, k = case(n)
     s = zero_mean_prior(grid, rank=RANK)
     state = Dense(y, s @ s.T)
     return lambda: dense_step(state, flow.solver(0.0, DT), y, k * np.maximum(y, 0.1), DT)
 
 
-def growth() -> list[dict[str, Any]]:
+def consensus(x: np.ndarray, u: np.ndarray, reach: float) -> Any:
+    door = Channel(graphs.disk(x, reach))
+    return pi_step(pi_start(u), u, door, dt=DT, alpha=0.2, a=0.4, b=0.04)
+
+
+def growth() -> Iterator[Row]:
     """One step of each part, for several sizes."""
-    rows, rng = [], np.random.default_rng(2)
+    rng = np.random.default_rng(2)
     for n in (30, 60, 120, 240):
-        grid = Grid((n, n))
-        flow = FokkerPlanck(rotating_swarm("slowgibbs"), grid)
-        p = np.ones(grid.size)
-        rows.append(row("Fokker-Planck step, cells", n * n,
-                        lambda flow=flow, p=p: flow.step(p, 0.0, DT), 7))
-    grid = Grid((30, 30))
+        flow = FokkerPlanck(SWARM, Grid((n, n)))
+        step = partial(flow.step, np.ones(n * n), 0.0, DT)
+        yield row("Fokker-Planck step, cells", n * n, step, 7)
     for agents in (100, 1000, 10_000):
-        x = rng.random((agents, 2))
-        rows.append(row("kernel estimate, agents", agents,
-                        lambda x=x: kernel_density(x, grid, bandwidth=H), 7))
+        seen = partial(kernel_density, rng.random((agents, 2)), Grid((30, 30)), bandwidth=H)
+        yield row("kernel estimate, agents", agents, seen, 7)
     x = rng.random((AGENTS, 2))
     for n in (30, 60, 120):
-        fine = Grid((n, n))
-        rows.append(row("kernel estimate of 100 agents, cells", n * n,
-                        lambda fine=fine: kernel_density(x, fine, bandwidth=H), 7))
-    near, values = graphs.disk(x, 0.25), {n: rng.random((AGENTS, n * n)) for n in (15, 30, 60)}
-    for n, u in values.items():
-        rows.append(row(
-            "consensus step of 100 agents, cells", n * n,
-            lambda u=u: pi_step(pi_start(u), u, Channel(near), dt=DT, alpha=0.2, a=0.4, b=0.04), 5))
-    for agents in (100, 1000, 10_000):
+        seen = partial(kernel_density, x, Grid((n, n)), bandwidth=H)
+        yield row("kernel estimate of 100 agents, cells", n * n, seen, 7)
+    for agents, cells in (*((AGENTS, n * n) for n in (15, 30, 60)),
+                          *((n, 64) for n in (100, 1000, 10_000))):  # fmt: skip
         # The range shrinks, so that everybody keeps as many neighbours.
-        reach = 0.25 * np.sqrt(100 / agents)
-        x = rng.random((agents, 2))
-        u = rng.random((agents, 64))
-
-        def talk(x: Any = x, u: Any = u, reach: float = reach) -> Any:
-            door = Channel(graphs.disk(x, reach))
-            return pi_step(pi_start(u), u, door, dt=DT, alpha=0.2, a=0.4, b=0.04)
-
-        rows.append(row("consensus step on 64 numbers, agents", agents, talk, 5))
-    return rows
+        x, u = rng.random((agents, 2)), rng.random((agents, cells))
+        talk = partial(consensus, x, u, 0.25 * np.sqrt(100 / agents))
+        if cells == 64:
+            yield row("consensus step on 64 numbers, agents", agents, talk, 5)
+        else:
+            yield row("consensus step of 100 agents, cells", cells, talk, 5)
 
 
-def slopes(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The exponent of growth of each part, between its two largest sizes."""
-    out = []
-    for what in dict.fromkeys(r["what"] for r in rows):
-        a, b = [r for r in rows if r["what"] == what][-2:]
+@table("density")
+def rows() -> Iterator[Row]:
+    """The filters, and each part with the exponent of its growth between its largest sizes."""
+    ours, dear = (row("100 local filters, 30 x 30", 900, filters(30, AGENTS), 9),
+                  row("dense filter, 30 x 30", 900, dense(30), 3))  # fmt: skip
+    yield from (ours, row("one filter, 100 x 100", 10_000, filters(100, 1), 5), dear)
+    ratio = AGENTS * dear["cpu_ms"] / ours["cpu_ms"]
+    yield {"what": "ratio: dense for each of 100 agents", "size": 900, "cpu_ms": round(ratio, 1),
+           "peak_mb": "", "missed": ratio < RATIO}  # fmt: skip
+    parts: dict[str, list[Row]] = {}
+    for found in growth():
+        parts.setdefault(found["what"], []).append(found)
+        yield found
+    for what, (*_, a, b) in parts.items():
         slope = np.log(b["cpu_ms"] / a["cpu_ms"]) / np.log(b["size"] / a["size"])
-        out.append({"what": f"slope of: {what}", "size": b["size"],
-                    "cpu_ms": round(float(slope), 2), "peak_mb": ""})
-    return out
-
-
-def main() -> int:
-    rows = [row("100 local filters, 30 x 30", 900, filters(30, AGENTS), 9),
-            row("one filter, 100 x 100", 10_000, filters(100, 1), 5),
-            row("dense filter, 30 x 30", 900, dense(30), 3)]
-    ratio = AGENTS * rows[2]["cpu_ms"] / rows[0]["cpu_ms"]
-    rows.append({"what": "ratio: dense for each of 100 agents", "size": 900,
-                 "cpu_ms": round(ratio, 1), "peak_mb": ""})
-    missed = [f"{r['what']}: {r['cpu_ms']} ms, at most {LIMITS[r['what']]}" for r in rows
-              if r["cpu_ms"] > LIMITS.get(r["what"], np.inf)]
-    if ratio < RATIO:
-        missed.append(f"ratio {ratio:.0f}, at least {RATIO:.0f}")
-    parts = growth()
-    write("density", [*rows, *parts, *slopes(parts)])
-    for text in missed:
-        print(f"missed: {text}", file=sys.stderr)
-    return int(bool(missed))
+        yield {"what": f"slope of: {what}", "size": b["size"], "cpu_ms": round(float(slope), 2),
+               "peak_mb": ""}  # fmt: skip
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

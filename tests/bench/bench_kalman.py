@@ -1,24 +1,23 @@
 """Batched Kalman filters against filterpy, and against what a user of numpy would write.
 
-    python tests/bench/bench_kalman.py
-
 The linear case is that of chapter 1: 200 runs, 100 steps of the Clohessy-Wiltshire satellite, seen
 by sensors that read (x, y), (y, z) and the velocity, without gaps and with gaps that differ. The
-unscented filters see a distance, an angle and two components of a curved motion. Writes
-data/bench/kalman.csv; fails if results differ or a floor is missed.
+unscented filters see a distance and an angle of a curved motion. Misses where results differ or a
+floor is not reached.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
 sys.path.insert(1, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
-from _bench import interleaved, write
+from _bench import Row, interleaved, main, table
 
 from distfilt.filters import GaussianFilter
 from distfilt.kalman import filterpy_kf, filterpy_ukf, kalman_filter
@@ -45,10 +44,7 @@ def linear_case(rng: np.random.Generator) -> tuple[tuple[np.ndarray, ...], dict[
     )
     truth = simulate(model, np.tile(x0, (RUNS, 1)), DT * np.arange(1, STEPS + 1), rng=rng)
     matrices = {
-        "F": model.transition(DT),
-        "H": sensor.matrix(6),
-        "Q": model.noise(0.0, DT),
-        "R": sensor.cov,
+        "F": model.transition(DT), "H": sensor.matrix(6), "Q": model.noise(0.0, DT), "R": sensor.cov
     }
     return (x0 + 3.0, 25.0 * np.eye(6), sensor.observe(truth, rng=rng)), matrices
 
@@ -118,55 +114,48 @@ def moments(found: Any) -> tuple[np.ndarray, np.ndarray]:
     return found[:2] if isinstance(found, tuple) else (found.means, found.covariances)
 
 
-def compared(case: str, calls: dict[str, Any], rounds: int) -> tuple[list[dict[str, Any]], int]:
+def compared(case: str, calls: dict[str, Any], rounds: int) -> Iterator[Row]:
     """The table's rows: ours first, each other's time, our speed, and the largest difference."""
     results = {name: call() for name, call in calls.items()}
     times, ratios = interleaved(calls, rounds)
     first, mine = moments(results["distfilt"])
     scale = np.abs(first).max()
-    rows, missed = [], 0
     for name, other in results.items():
         means, covs = moments(other)
         gap = np.abs(means - first).max() / scale
         covs = covs.reshape(len(covs), -1, *covs.shape[-2:])
         own = mine.reshape(len(covs), -1, *covs.shape[-2:])
         gap = max(gap, np.abs(covs - own).max() / np.abs(own).max())
-        floor = FLOORS.get((case, name))
-        missed += gap > 1e-9 or (floor is not None and ratios[name] < floor)
-        rows.append({
+        floor = FLOORS.get((case, name), 0)
+        yield {
             "case": case, "runs": first.shape[1], "steps": len(first),
             "components": first.shape[-1], "filter": name,
             "seconds": f"{times[name]:.4f}", "distfilt_is_faster": f"{ratios[name]:.2f}",
             "floor": floor or "", "gap": f"{gap:.0e}",
-        })
-    return rows, missed
+            "missed": gap > 1e-9 or ratios[name] < floor,
+        }
 
 
-def main() -> int:
+@table("kalman", "numpy", "scipy", "filterpy")
+def filters() -> Iterator[Row]:
     rng = np.random.default_rng(20260)
     (mean, cov, whole), matrices = linear_case(rng)
     gaps = np.where(rng.random(whole.shape) < 0.1, np.nan, whole)
-    rows, missed = [], 0
     for case, y, by_hand, name in (
         ("common pattern", whole, shared_numpy, "numpy, one covariance"),
         ("gaps that differ by run", gaps, plain_numpy, "plain numpy"),
     ):
-        calls = {
-            "distfilt": lambda y=y: kalman_filter(mean, cov, y, **matrices),
-            name: lambda y=y, f=by_hand: f(mean, cov, y, **matrices),
-            "filterpy": lambda y=y: filterpy_kf(mean, cov, y, **matrices, likelihood=False),
-        }
-        found = compared(case, calls, 5)
-        rows, missed = rows + found[0], missed + found[1]
-    (mean, cov, y), options = curved_case(rng)
-    calls = {
-        "distfilt": lambda: unscented(mean, cov, y, **options),
-        "filterpy": lambda: filterpy_ukf(mean, cov, y, **options),
-    }
-    found = compared("unscented", calls, 3)
-    write("kalman", rows + found[0], ("numpy", "scipy", "filterpy"))
-    return missed + found[1]
+        yield from compared(case, {
+            "distfilt": partial(kalman_filter, mean, cov, y, **matrices),
+            name: partial(by_hand, mean, cov, y, **matrices),
+            "filterpy": partial(filterpy_kf, mean, cov, y, **matrices, likelihood=False),
+        }, 5)  # fmt: skip
+    given, options = curved_case(rng)
+    yield from compared("unscented", {
+        "distfilt": partial(unscented, *given, **options),
+        "filterpy": partial(filterpy_ukf, *given, **options),
+    }, 3)  # fmt: skip
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

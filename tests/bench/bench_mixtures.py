@@ -1,20 +1,20 @@
 """Runnalls' reduction beside pyest and Stone Soup, its growth, one fusion, one seed in orbit.
 
 Every library gets the same mixtures in one run. Stone Soup's reducer merges within a gate, which
-is another algorithm: its time is told, its result not compared. Writes data/bench/mixtures.csv;
-fails where a ratio, an agreement or the memory is missed.
+is another algorithm: its time is told, its result not compared. Misses where a ratio, an agreement
+or the memory is missed.
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
-from _bench import peak_mb, timed, write
+from _bench import Row, main, peak_mb, table, timed
 
+from bookkit import studies
 from distfilt.mixtures import (
     GaussianMixture,
     PartialFusion,
@@ -24,10 +24,8 @@ from distfilt.mixtures import (
     split,
     two_stage,
 )
+from distfilt.models.orbit import propagate
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "book" / "studies"))
-
-Row = dict[str, Any]
 LEFT = 36
 PEERS = ((4, 500, 15), (12, 500, 6))
 """Components, mixands, and the ratio that pyest has to lose by."""
@@ -51,6 +49,7 @@ def row(task: str, dim: int, size: int, seconds: float, **more: Any) -> Row:
     return {
         "task": task, "components": dim, "mixands": size, "ms": f"{1e3 * seconds:.1f}",
         **{**empty, **more}, "peak_mb": f"{peak_mb():.0f}",
+        "missed": more.get("missed", False) or peak_mb() > LIMIT_MB,
     }
 
 
@@ -79,105 +78,86 @@ def stone_soup(p: GaussianMixture) -> Callable[[], Any]:
     return lambda: reducer.reduce(list(states))
 
 
-def beside_peers() -> tuple[list[Row], int]:
-    """Our reduction, plain numpy's, pyest's and Stone Soup's."""
+def theirs_of(p: GaussianMixture) -> Any:
+    """The same mixture as pyest's."""
     from pyest.gm import GaussianMixture as TheirMixture
+
+    return TheirMixture(p.weights.copy(), p.means.copy(), p.covs.copy())
+
+
+def beside_peers() -> Iterator[Row]:
+    """Our reduction, plain numpy's, pyest's and Stone Soup's."""
     from pyest.gm import merge_runnalls
 
-    rows, missed = [], 0
     for dim, size, needed in PEERS:
         p = mixture(size, dim)
-        theirs = TheirMixture(p.weights.copy(), p.means.copy(), p.covs.copy())
         for warm in (mixture(40, dim), p):
             runnalls(warm, 30)
-        small = mixture(40, dim)
-        merge_runnalls(TheirMixture(small.weights, small.means, small.covs), 30)
-        ours = timed(lambda p=p: runnalls(p, LEFT, engine="numba"), 5)
-        plain = timed(lambda p=p: runnalls(p, LEFT, engine="numpy"), 1)
-        peer = timed(lambda t=theirs: merge_runnalls(t, LEFT), 1)
-        soup = timed(stone_soup(p), 1)
+        merge_runnalls(theirs_of(mixture(40, dim)), 30)
+        ours = timed(partial(runnalls, p, LEFT, engine="numba"), 5)
+        plain = timed(partial(runnalls, p, LEFT, engine="numpy"), 1)
+        peer = timed(partial(merge_runnalls, theirs_of(p), LEFT), 1)
+        soup, q = timed(stone_soup(p), 1), plain.result
         apart = gap(ours.result, peer.result.w, peer.result.m, peer.result.P)
         ratio = peer.cpu / ours.cpu
-        missed += int(ratio < needed or apart > 1e-12)
-        rows.append(row("reduce", dim, size, ours.cpu))
-        rows.append(row("reduce, numpy", dim, size, plain.cpu, ratio=f"{plain.cpu / ours.cpu:.1f}",
-                        gap=f"{gap(ours.result, *parts(plain.result)):.0e}"))
-        rows.append(row("reduce, pyest", dim, size, peer.cpu, ratio=f"{ratio:.1f}",
-                        needed=needed, gap=f"{apart:.0e}"))
-        rows.append(row("merge in a gate, Stone Soup", dim, size, soup.cpu,
-                        ratio=f"{soup.cpu / ours.cpu:.1f}"))
-    return rows, missed
+        yield row("reduce", dim, size, ours.cpu)
+        yield row("reduce, numpy", dim, size, plain.cpu, ratio=f"{plain.cpu / ours.cpu:.1f}",
+                  gap=f"{gap(ours.result, q.weights, q.means, q.covs):.0e}")
+        yield row("reduce, pyest", dim, size, peer.cpu, ratio=f"{ratio:.1f}", needed=needed,
+                  gap=f"{apart:.0e}", missed=ratio < needed or apart > 1e-12)
+        yield row("merge in a gate, Stone Soup", dim, size, soup.cpu,
+                  ratio=f"{soup.cpu / ours.cpu:.1f}")
 
 
-def parts(p: GaussianMixture) -> tuple[Any, Any, Any]:
-    """Weights, means, covariances."""
-    return p.weights, p.means, p.covs
-
-
-def growth() -> list[Row]:
+def growth() -> Iterator[Row]:
     """Time against the number of mixands, with the slope between neighbours."""
-    rows = []
     for reduce, name in ((runnalls, "reduce"), (two_stage, "reduce in two stages")):
         for dim, sizes in GROWTH:
             before: tuple[int, float] | None = None
             for size in sizes:
-                p = mixture(size, dim)
-                took = timed(lambda p=p, f=reduce: f(p, LEFT), 1 if size > 1000 else 3).cpu
+                took = timed(partial(reduce, mixture(size, dim), LEFT), 1 if size > 1000 else 3).cpu
                 slope = "" if before is None else (
                     f"{np.log(took / before[1]) / np.log(size / before[0]):.2f}"
                 )
-                rows.append(row(name, dim, size, took, slope=slope))
+                yield row(name, dim, size, took, slope=slope)
                 before = size, took
-    return rows
 
 
-def fusion() -> list[Row]:
+def fusion() -> Iterator[Row]:
     """Shapes and C2 weights of a 12-component fusion, and C3 weights where they are few."""
-    rows = []
     for size in FUSED:
         f = PartialFusion(mixture(size, 12, 1), mixture(size, 12, 2).marginal(range(6)))
-        for name, options in (
-            ("all terms", {"terms": "all"}),
-            ("all terms, literal", {"terms": "all", "form": "literal"}),
-            ("matched terms", {"terms": "matched"}),
+        mine, heard = (runnalls(m, min(6, size)) for m in (f.target, f.others[0]))
+        few = {"marginal": mine, "received": [heard]}
+        for name, rule, repeats, options in (
+            ("all terms", "C2", 1, {"terms": "all"}),
+            ("all terms, literal", "C2", 1, {"terms": "all", "form": "literal"}),
+            ("matched terms", "C2", 1, {"terms": "matched"}),
+            ("marginals reduced to 6", "C2", 3, {"terms": "all", **few}),
+            ("matched, heard reduced to 6, C3", "C3", 3, {"received": [heard]}),
         ):
-            took = timed(lambda f=f, o=options: f.weigh(f.shapes(**o), rule="C2"), 1)
-            rows.append(row(f"fuse, {name}", 12, size, took.cpu))
-        least = [runnalls(m, min(6, size)) for m in (f.target, f.others[0])]
-        took = timed(lambda f=f, r=least: f.weigh(
-            f.shapes(terms="all", marginal=r[0], received=[r[1]]), rule="C2"), 3)
-        rows.append(row("fuse, marginals reduced to 6", 12, size, took.cpu))
-        took = timed(lambda f=f, r=least: f.weigh(f.shapes(received=[r[1]]), rule="C3"), 3)
-        rows.append(row("fuse, matched, heard reduced to 6, C3", 12, size, took.cpu))
-        took = timed(lambda f=f: kept_by_relevance(f.target, f.others[0], threshold=40.0), 3)
-        rows.append(row("relevance", 6, size, took.cpu))
-    return rows
+            took = timed(lambda f=f, o=options, r=rule: f.weigh(f.shapes(**o), rule=r), repeats)
+            yield row(f"fuse, {name}", 12, size, took.cpu)
+        took = timed(partial(kept_by_relevance, f.target, f.others[0], threshold=40.0), 3)
+        yield row("relevance", 6, size, took.cpu)
 
 
-def in_orbit() -> tuple[list[Row], int]:
+def in_orbit() -> Iterator[Row]:
     """One seed of chapter 8's rows, and a day of 10 000 states."""
-    import orbit as study
-
-    from distfilt.models import propagate
-
-    rows, missed = [], 0
+    study = studies.script("orbit")
     truth = study.data(study.SETTING, np.random.default_rng(7))[1:]
     for name in ("none", "c2", "c3", "one_ci", "news"):
-        options = study.ROWS[""][name]
-        took = timed(lambda o=options: study.run(study.SETTING, o, *truth), 3)
-        missed += int(took.cpu > 2)
+        took = timed(partial(study.run, study.SETTING, study.ROWS[""][name], *truth), 3)
         size = took.result[-1].mixtures[0].size
-        rows.append(row(f"track, {name}", 12, size, took.cpu, needed=2000))
+        yield row(f"track, {name}", 12, size, took.cpu, needed=2000, missed=took.cpu > 2)
     many = np.tile(study.SETTING["target"], (10_000, 1))
-    rows.append(row("propagate 24 h", 6, 10_000, timed(lambda: propagate(many, 86400.0), 1).cpu))
-    return rows, missed
+    yield row("propagate 24 h", 6, 10_000, timed(lambda: propagate(many, 86400.0), 1).cpu)
 
 
-def splits_and_points() -> tuple[list[Row], int]:
+def splits_and_points() -> Iterator[Row]:
     """A split and an unscented forecast of a mixture, beside pyest's."""
     from pyest.filters import GmukfPredict
     from pyest.filters.sigma_points import SigmaPointOptions
-    from pyest.gm import GaussianMixture as TheirMixture
     from pyest.gm import GaussSplitOptions, split_gaussian
 
     p = mixture(1, 12)
@@ -187,38 +167,30 @@ def splits_and_points() -> tuple[list[Row], int]:
     theirs = timed(lambda: [
         split_gaussian(1.0, p.means[0], p.covs[0], options, direction=u[0]) for _ in range(200)
     ], 3).cpu / 200
-    rows = [row("split", 12, 1, ours)]
-    rows.append(row("split, pyest", 12, 1, theirs, ratio=f"{theirs / ours:.1f}"))
-    p = mixture(12, 12)
-    noise = 0.1 * np.eye(12)
+    yield row("split", 12, 1, ours)
+    yield row("split, pyest", 12, 1, theirs, ratio=f"{theirs / ours:.1f}")
+    p, noise = mixture(12, 12), 0.1 * np.eye(12)
     peer = GmukfPredict(
         lambda x, before, after: x + 0.1 * np.sin(x), noise,
         sigma_pt_opts=SigmaPointOptions(1.0, 0.0, 0.0),
     )
-    there = TheirMixture(p.weights, p.means, p.covs)
-    root = np.linalg.cholesky(noise)
+    there, root = theirs_of(p), np.linalg.cholesky(noise)
     mine = timed(lambda: [
         moved(p, lambda x: x + 0.1 * np.sin(x), root, rule="unscented") for _ in range(50)
     ], 3)
     other = timed(lambda: [peer.predict((0.0, 1.0), there) for _ in range(50)], 3)
     ahead, after = mine.result[0], other.result[0]
     apart = float(max(np.abs(ahead.means - after.m).max(), np.abs(ahead.covs - after.P).max()))
-    rows.append(row("unscented forecast", 12, 12, mine.cpu / 50))
-    rows.append(row("unscented forecast, pyest", 12, 12, other.cpu / 50,
-                    ratio=f"{other.cpu / mine.cpu:.1f}", gap=f"{apart:.0e}"))
-    return rows, int(apart > 1e-10)
+    yield row("unscented forecast", 12, 12, mine.cpu / 50)
+    yield row("unscented forecast, pyest", 12, 12, other.cpu / 50, missed=apart > 1e-10,
+              ratio=f"{other.cpu / mine.cpu:.1f}", gap=f"{apart:.0e}")
 
 
-def main() -> int:
-    """Measure, write the table, and count what is missed."""
-    rows, missed = beside_peers()
-    rows += growth() + fusion()
-    for part in (in_orbit, splits_and_points):
-        more, late = part()
-        rows, missed = rows + more, missed + late
-    write("mixtures", rows, ("numpy", "numba", "pyest", "stonesoup"))
-    return missed + int(peak_mb() > LIMIT_MB)
+@table("mixtures", "numpy", "numba", "pyest", "stonesoup")
+def rows() -> Iterator[Row]:
+    for part in (beside_peers, growth, fusion, in_orbit, splits_and_points):
+        yield from part()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -2,17 +2,18 @@
 
 A random walk in three components, of which two are seen with a full noise; 1 000 and 10 000
 particles, 50 steps, resampled in every step by the systematic rule, and the weighted mean of each.
-Beside the times: its error against the Kalman filter, in units of the standard deviation. Writes
-data/bench/particles.csv; fails where the package is faster.
+Beside the times: its error against the Kalman filter, in units of the standard deviation. Misses
+where the package is faster.
 """
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
-from _bench import interleaved, peer, write
+from _bench import Row, interleaved, main, peer, table
 
 from distfilt.filters import ParticleFilter
 from distfilt.kalman import kalman_filter
@@ -24,12 +25,12 @@ Q = np.array([[0.3, 0.1, 0.0], [0.1, 0.2, 0.05], [0.0, 0.05, 0.4]])
 R = np.array([[0.5, 0.2], [0.2, 0.4]])
 H = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]])
 TIMES = np.arange(1.0, STEPS + 1)
+MODEL = LinearModel.from_transition(3, lambda dt: np.eye(3), lambda t, dt: dt * Q)
 
 
 def by_distfilt(n: int, seen: np.ndarray) -> np.ndarray:
-    model = LinearModel.from_transition(3, lambda dt: np.eye(3), lambda t, dt: dt * Q)
     sensor = Sensor(2, lambda x: x @ H.T, R, linear=lambda d: H)
-    f = ParticleFilter(model, [sensor], members=n, threshold=1.0)
+    f = ParticleFilter(MODEL, [sensor], members=n, threshold=1.0)
     state = f.start((np.zeros(3), np.eye(3)), rng=np.random.default_rng(1))
     out = np.empty((STEPS, 3))
     for k in range(STEPS):
@@ -74,34 +75,30 @@ def by_particles(package: Any, n: int, seen: np.ndarray) -> np.ndarray:
     return np.array(run.summaries.moments)
 
 
-def main() -> int:
-    """Measure, write the table, and count what is missed."""
+@table("particles", "numpy", "scipy", "particles", "numba")
+def filters() -> Iterator[Row]:
     rng = np.random.default_rng(5)
-    model = LinearModel.from_transition(3, lambda dt: np.eye(3), lambda t, dt: dt * Q)
-    truth = simulate(model, np.zeros(3), TIMES, rng=rng)
+    truth = simulate(MODEL, np.zeros(3), TIMES, rng=rng)
     seen = truth @ H.T + rng.standard_normal((STEPS, 2)) @ np.linalg.cholesky(R).T
     exact = kalman_filter(np.zeros(3), np.eye(3), seen, F=np.eye(3), H=H, Q=Q, R=R)
     spread = np.sqrt(np.diagonal(exact.covariances, axis1=-2, axis2=-1))
-    package, rows, missed = peer("particles"), [], 0
+    package = peer("particles")
     for n in SIZES:
-        calls: dict[str, Any] = {"distfilt": lambda n=n: by_distfilt(n, seen)}
+        calls: dict[str, Any] = {"distfilt": partial(by_distfilt, n, seen)}
         if package is not None:
-            calls["particles"] = lambda n=n: by_particles(package, n, seen)
-        calls["plain numpy"] = lambda n=n: by_numpy(n, seen)
+            calls["particles"] = partial(by_particles, package, n, seen)
+        calls["plain numpy"] = partial(by_numpy, n, seen)
         times, ratios = interleaved(calls, 7)
         for name, call in calls.items():
-            floor = FLOOR if name == "particles" else None
-            missed += floor is not None and ratios[name] < floor
+            floor = FLOOR if name == "particles" else 0
             gap = np.sqrt((((call() - exact.means) / spread) ** 2).mean())
-            rows.append({
+            yield {
                 "particles": n, "steps": STEPS, "filter": name,
                 "ms_a_step": f"{1e3 * times[name] / STEPS:.3f}",
                 "distfilt_is_faster": f"{ratios[name]:.2f}", "floor": floor or "",
-                "mean_error": f"{gap:.3f}",
-            })
-    write("particles", rows, ("numpy", "scipy", "particles", "numba"))
-    return missed
+                "mean_error": f"{gap:.3f}", "missed": ratios[name] < floor,
+            }
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

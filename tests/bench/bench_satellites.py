@@ -4,36 +4,34 @@ Times one batch of each stored study and multiplies by the number of batches: pr
 whole study, in one process. A step of the network of Table III (five agents, 13 components, 200
 members, known noise and covariance intersection, or exact draws and moments) is held against what
 it cannot do without: the normal numbers that it draws, the model's motion of the members, and the
-products for means, covariances and gains, by numpy. Writes data/bench/satellites.csv; fails above
-3.7 times that floor for one run and 2.2 times for a batch of fifty.
+products for means, covariances and gains, by numpy. Misses above 3.7 times that floor for one run
+and 2.2 times for a batch of fifty.
 """
 
 from __future__ import annotations
 
-import sys
-from importlib import import_module
-from pathlib import Path
+from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
-from _bench import interleaved, timed, write
+from _bench import Row, interleaved, main, table, timed
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "book" / "studies"))
+from bookkit import studies
+
 LIMITS = {1: 3.7, 50: 2.2}
 
 
-def studied() -> list[dict[str, Any]]:
+def studied() -> Iterator[Row]:
     """Processor time of a batch of each study, and of all of them."""
-    rows = []
     for name in ("figure_1", "figure_2", "table_3"):
-        study = import_module(name)
-        spent = timed(lambda s=study: s.trial(s.seeds[0]), 1)
-        rows.append({
+        study = studies.script(name)
+        spent = timed(partial(study.trial, study.seeds[0]), 1)
+        yield {
             "part": f"study {name}, {len(study.seeds)} batches of {study.BATCH} runs", "runs": "",
             "ms": f"{1e3 * spent.cpu * len(study.seeds):.0f}", "floor_ms": "", "ratio": "",
             "limit": "", "peak_mb": f"{spent.peak_mb:.0f}",
-        })
-    return rows
+        }
 
 
 def floor_of(setup: Any, states: np.ndarray, rng: np.random.Generator) -> Any:
@@ -64,9 +62,10 @@ def floor_of(setup: Any, states: np.ndarray, rng: np.random.Generator) -> Any:
     return call
 
 
-def stepped() -> tuple[list[dict[str, Any]], int]:
-    satellites = import_module("_satellites")
-    setup, rows, missed = satellites.setup("table-3"), [], 0
+@table("satellites", "numpy", "scipy", "xarray")
+def rows() -> Iterator[Row]:
+    satellites = studies.script("_satellites")
+    setup = satellites.setup("table-3")
     t = float(setup.times[0])
     for kind in ("known_fused", "exact"):
         for runs, limit in LIMITS.items():
@@ -74,28 +73,19 @@ def stepped() -> tuple[list[dict[str, Any]], int]:
             rng = np.random.default_rng(1)
             _, seen = satellites.data(setup, rng, (runs,))
             state = f.start(setup.prior, rng=rng, runs=(runs,))
-            now = [y[0] for y in seen]
             calls = {
-                "ours": lambda f=f, s=state, y=now: f.step(s, t, y),
+                "ours": partial(f.step, state, t, [y[0] for y in seen]),
                 "floor": floor_of(setup, state.ensembles, rng),
             }
             times, ratios = interleaved(calls, 9, 0.05)
             ratio = 1 / ratios["floor"]
-            missed += ratio > limit
-            rows.append({
+            yield {
                 "part": f"a step of Table III, {kind}", "runs": runs,
                 "ms": f"{1e3 * times['ours']:.2f}", "floor_ms": f"{1e3 * times['floor']:.2f}",
-                "ratio": f"{ratio:.2f}", "limit": limit, "peak_mb": "",
-            })
-    return rows, missed
-
-
-def main() -> int:
-    """Measure, write the table, and count the limits that are passed."""
-    rows, missed = stepped()
-    write("satellites", [*rows, *studied()], ("numpy", "scipy", "xarray"))
-    return missed
+                "ratio": f"{ratio:.2f}", "limit": limit, "peak_mb": "", "missed": ratio > limit,
+            }
+    yield from studied()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -2,17 +2,17 @@
 
 A hundred members, a full noise covariance, half of the components observed. Shown beside the times:
 how far the mean of the analysis is from the exact one, over many draws, in units of its standard
-deviation, so that equal work is compared. Writes data/bench/updates.csv; fails below the floors.
+deviation, so that equal work is compared. Misses below the floors.
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
-from _bench import interleaved, peer, write
+from _bench import Row, interleaved, main, peer, table
 
 from distfilt.updates import exact_draws, known_noise, square_root
 
@@ -55,35 +55,30 @@ def error(call: Callable[[], Any], exact: np.ndarray, spread: np.ndarray) -> flo
     return float(np.sqrt((((means - exact) / spread) ** 2).mean()))
 
 
-def main() -> int:
-    """Measure, write the table, and count what is missed."""
-    rows, missed = [], 0
+@table("updates", "numpy", "scipy", "dapper")
+def analyses() -> Iterator[Row]:
     for d in DIMS:
         x, h, y, r, exact = case(d)
         rng = np.random.default_rng(0)
         calls: dict[str, Any] = {
-            "known_noise": lambda x=x, h=h, y=y, r=r, g=rng: known_noise(x, h, y, r, rng=g),
+            "known_noise": partial(known_noise, x, h, y, r, rng=rng),
             "DAPPER, perturbed observations": dapper(x, h, y, r),
-            "six lines of numpy": lambda x=x, h=h, y=y, r=r, g=rng: six_lines(x, h, y, r, g),
-            "known_noise, unchecked": lambda x=x, h=h, y=y, r=r, g=rng: known_noise.unchecked(
-                x, h, y, r, rng=g
-            ),
-            "exact_draws": lambda x=x, h=h, y=y, r=r, g=rng: exact_draws(x, h, y, r, rng=g),
-            "square_root": lambda x=x, h=h, y=y, r=r, g=rng: square_root(x, h, y, r, rng=g),
+            "six lines of numpy": partial(six_lines, x, h, y, r, rng),
+            "known_noise, unchecked": partial(known_noise.unchecked, x, h, y, r, rng=rng),
+            "exact_draws": partial(exact_draws, x, h, y, r, rng=rng),
+            "square_root": partial(square_root, x, h, y, r, rng=rng),
         }
         calls = {name: call for name, call in calls.items() if call is not None}
         times, ratios = interleaved(calls, 31)
         for name, call in calls.items():
-            floor = FLOORS.get(name)
-            missed += floor is not None and ratios[name] < floor
-            rows.append({
+            floor = FLOORS.get(name, 0)
+            yield {
                 "components": d, "readings": d // 2, "members": MEMBERS, "analysis": name,
                 "us": f"{1e6 * times[name]:.1f}", "known_noise_is_faster": f"{ratios[name]:.2f}",
                 "floor": floor or "", "mean_error": f"{error(call, exact, x.std(axis=0)):.3f}",
-            })
-    write("updates", rows, ("numpy", "scipy", "dapper"))
-    return int(missed)
+                "missed": ratios[name] < floor,
+            }
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
