@@ -1,31 +1,70 @@
-"""The linear Kalman filter: exact identities, gaps, shapes."""
+"""The linear Kalman filter and its smoother: the joint Gaussian, runs, gaps, shapes."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from distfilt.kalman import kalman_filter
+from distfilt.kalman import GaussianRun, kalman_filter, rts_smoother
 from tests.kalman.problems import RUNS, STEPS, D, M, posterior, problem, spd
 
 
-@pytest.mark.parametrize("gaps", [False, True])
-def test_filter_is_conditioning_of_the_joint_gaussian(gaps: bool) -> None:
-    rng = np.random.default_rng(1)
+@given(seed=st.integers(0, 10**6), share=st.sampled_from([0.0, 0.3, 1.0]))
+def test_filter_and_smoother_are_conditioning_of_the_joint_gaussian(
+    seed: int, share: float
+) -> None:
+    """All states (the filter's last is the smoother's) and the readings' likelihood."""
+    rng = np.random.default_rng(seed)
     p, mean, cov = problem(rng), rng.standard_normal(D), spd(rng, D)
     y = rng.standard_normal((STEPS, M))
-    if gaps:
-        y[1, 0] = y[4] = y[6, 1] = np.nan
+    y[rng.random(y.shape) < share] = np.nan
     before = [a.copy() for a in (mean, cov, y, *p.values())]
     run = kalman_filter(mean, cov, y, **p)
+    smooth = rts_smoother(run, F=p["F"], Q=p["Q"])
+    means, covs, my, yy, values = posterior(mean, cov, y, p)
+    np.testing.assert_allclose(smooth.means, means, rtol=0, atol=1e-9)
+    for k in range(STEPS):
+        block = covs[k * D : (k + 1) * D, k * D : (k + 1) * D]
+        np.testing.assert_allclose(smooth.covariances[k], block, rtol=0, atol=1e-9)
+    expected = multivariate_normal(my, yy).logpdf(values) if values.size else 0.0
+    np.testing.assert_allclose(run.log_likelihood.sum(), expected, rtol=1e-11, atol=1e-10)
     for a, b in zip((mean, cov, y, *p.values()), before, strict=True):
         np.testing.assert_array_equal(a, b)
-    means, covs, my, yy, values = posterior(mean, cov, y, p)
-    np.testing.assert_allclose(run.means[-1], means[-1], rtol=0, atol=1e-11)
-    np.testing.assert_allclose(run.covariances[-1], covs[-D:, -D:], rtol=0, atol=1e-11)
-    expected = multivariate_normal(my, yy).logpdf(values)
-    np.testing.assert_allclose(run.log_likelihood.sum(), expected, rtol=1e-11)
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+def test_runs_are_smoothed_as_if_alone(gaps: bool) -> None:
+    rng = np.random.default_rng(3)
+    p, y = problem(rng, varying=False), rng.standard_normal((STEPS, RUNS, M))
+    if gaps:
+        y[rng.random(y.shape) < 0.3] = np.nan
+    run = kalman_filter(np.zeros(D), np.eye(D), y, **p)
+    kept = run.means.copy(), run.covariances.copy()
+    smooth = rts_smoother(run, F=p["F"], Q=p["Q"])
+    assert smooth.covariances.shape == run.covariances.shape
+    assert (smooth.means[-1] == run.means[-1]).all()
+    assert np.array_equal(smooth.log_likelihood, run.log_likelihood)
+    for k in range(RUNS):
+        alone = kalman_filter(np.zeros(D), np.eye(D), y[:, k], **p)
+        alone = rts_smoother(alone, F=p["F"], Q=p["Q"])
+        np.testing.assert_allclose(smooth.means[:, k], alone.means, rtol=0, atol=1e-12)
+    assert (run.means == kept[0]).all() and (run.covariances == kept[1]).all()
+    assert (smooth.covariances == np.swapaxes(smooth.covariances, -1, -2)).all()
+
+
+def test_a_state_that_cannot_be_forecast_raises() -> None:
+    lost = GaussianRun(np.zeros((2, 1)), np.zeros((2, 1, 1)), np.zeros(2))
+    with pytest.raises(np.linalg.LinAlgError, match="forecast"):
+        rts_smoother(lost, F=[[1.0]], Q=[[0.0]])
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 1), (2, 3, 1, 1)])
+def test_a_run_s_covariances_have_its_means_axes(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ValueError, match="covariances: needs"):
+        GaussianRun(np.zeros((2, 4, 1)), np.ones(shape), np.zeros((2, 4)))
 
 
 def test_run_axes_broadcast() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from distfilt.updates import exact_draws, known_noise, sampled_noise, square_root, transport
+from distfilt.updates import exact_draws, known_noise, sampled_noise, square_root
 from distfilt.updates.door import Update
 from distfilt.updates.gaussian import _turned
 
@@ -21,14 +21,6 @@ def test_sampled_and_known_noise_by_their_formulas() -> None:
         gain = joint[:3, 3:] @ np.linalg.inv(joint[3:, 3:] + noise)
         out = update(x, x @ H.T, Y, R, rng=np.random.default_rng(3))
         assert np.allclose(out, x + (Y - seen) @ gain.T, atol=1e-12)
-
-
-def test_composed_affine_map_is_the_filter_with_sampled_noise() -> None:
-    x = members(40, 3)
-    y = np.tile(Y, (3, 1))
-    a = sampled_noise(x, x @ H.T, y, R, rng=np.random.default_rng(3))
-    b = transport(x, x @ H.T, y, R, rng=np.random.default_rng(3))
-    assert np.allclose(a, b, atol=1e-11)
 
 
 @pytest.mark.parametrize("update", [exact_draws, square_root])
