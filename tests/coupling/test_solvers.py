@@ -170,9 +170,14 @@ def test_the_entropic_plan_is_that_of_its_optimality_conditions(seed: int, eps: 
 def test_without_its_package_the_default_solver_names_the_extra(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for name in [n for n in sys.modules if n.startswith("ot.")]:
+    class Absent:
+        def find_spec(self, name: str, *_: object) -> None:
+            if name == "ot":
+                raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+    for name in [n for n in sys.modules if n == "ot" or n.startswith("ot.")]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "ot", None)
+    monkeypatch.setattr(sys, "meta_path", [Absent(), *sys.meta_path])
     with pytest.raises(ModuleNotFoundError, match=r"pip install 'distfilt\[maps\]'"):
         ensemble_transform([[0.0], [1.0]], [0.0, 0.0])
     assert plan([[0.0, 1.0]], [1.0], solver="linprog").value == 0.5
