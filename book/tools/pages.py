@@ -95,6 +95,9 @@ def directive(module: Any, name: str) -> list[str]:
         shown = str(value).replace("typing.", "").replace("numpy.", "np.")
         text = [f"   {line}" for line in [*meaning, "", f"The type ``{shown}``."]]
         return [f".. py:data:: {name}", "", *text, ""]
+    if inspect.isclass(value) and not value.__module__.startswith("distfilt"):
+        text = f"Short for ``{value.__module__}.{value.__qualname__}``."
+        return [f".. py:data:: {name}", "", f"   {text}", ""]
     if inspect.isclass(value):
         return [f".. autoclass:: {module.__name__}.{name}", "   :members:", ""]
     if inspect.isfunction(value):
