@@ -24,7 +24,7 @@ def batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Arr
         Where a user's function is, and as what.
     states : sequence of ndarray, (..., d)
         Its first arguments.
-    *rest
+    rest
         Its other arguments.
 
     Examples
