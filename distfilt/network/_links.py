@@ -17,17 +17,6 @@ Indices = NDArray[np.int64]
 DENSE = 200
 """Up to this many agents a dense eigenvalue solver is the faster one."""
 
-_FEW_LINKS = 6
-"""Up to this mean degree a sparse factor is cheaper than many of Lanczos's iterations."""
-
-
-_LARGE = 2000
-"""From so many agents on a walk is tried before a sparse factor."""
-
-_STEPS = 600
-"""So many steps of a walk cost as much as the sparse factor of a graph in the plane."""
-
-
 def of_matrix(value: Any, name: str, *, directed: bool) -> sparse.csr_array:
     """The links that a matrix of zeros and ones marks, an array or sparse."""
     if not sparse.issparse(value):
@@ -116,13 +105,6 @@ def reverse(links: sparse.csr_array, receivers: Indices, senders: Indices) -> In
     return np.where(key[found] == other, found, -1)
 
 
-def one_way_gain(laplacian: sparse.csr_array) -> float:
-    """The least 2 Re(λ) / |λ|² of the nonzero eigenvalues, by a dense solver."""
-    values = np.linalg.eigvals(laplacian.toarray())
-    values = values[np.abs(values) > 1e-9 * np.abs(values).max()]
-    return float((2 * values.real / np.abs(values) ** 2).min(initial=np.inf))
-
-
 def degree_bound(links: sparse.csr_array, degrees: Array) -> float:
     """An upper bound of the Laplacian's largest eigenvalue, exact for stars and even rings.
 
@@ -140,9 +122,8 @@ def largest_eigenvalue(laplacian: sparse.csr_array, bound: float) -> float:
     size = laplacian.shape[0]
     options: dict[str, Any] = {"k": 1, "which": "LA", "v0": _start(size), "tol": 1e-8,
                                "return_eigenvectors": False}
-    few = laplacian.nnz <= (_FEW_LINKS + 1) * size
     try:
-        return float(eigsh(laplacian, maxiter=4 if few else 60, **options)[0])
+        return float(eigsh(laplacian, maxiter=60, **options)[0])
     except ArpackNoConvergence:
         # Eigenvalues crowd below the bound, as on rings and grids: inverted there, they spread.
         shift = bound * (1 + 1e-6)
@@ -167,9 +148,6 @@ def left_null_vector(laplacian: sparse.csr_array) -> Array:
     size = laplacian.shape[0]
     if size == 1:
         return np.ones(1)
-    walked = _walked(laplacian) if size > _LARGE else None
-    if walked is not None:
-        return walked
     # One entry is set; the rest solves an M-matrix, which needs no pivoting.
     turned = laplacian.T.tocsc()
     factor = _factor(turned[1:, 1:])
@@ -178,31 +156,6 @@ def left_null_vector(laplacian: sparse.csr_array) -> Array:
     rest += factor.solve(right - turned[1:, 1:] @ rest)
     p = np.abs(np.concatenate([[1.0], rest]))
     return np.asarray(p / p.max())
-
-
-def _walked(laplacian: sparse.csr_array) -> Array | None:
-    """The left null vector by a lazy walk against the links, or None if that settles too late.
-
-    Of a graph that has links across in all directions a sparse factor fills up, but the walk
-    mixes in some hundred steps; along a plane it takes thousands, and the factor stays sparse.
-    """
-    degrees = laplacian.diagonal()
-    heard = (sparse.diags_array(degrees) - laplacian).T.tocsr()
-    p, before = np.ones(degrees.size), np.inf
-    for k in range(1, _STEPS + 1):
-        new = 0.5 * (p + (heard @ p) / degrees)
-        new /= new.max()
-        gap = float(np.abs(new / p - 1).max())
-        p = new
-        if gap < 1e-14:
-            return np.asarray(p)
-        if k % 20 == 0:
-            # As many steps more as the last twenty foretell.
-            pace = np.log(before / gap) / 20
-            if k > 20 and (pace <= 0 or k + np.log(gap / 1e-14) / pace > _STEPS):
-                return None
-            before = gap
-    return None
 
 
 def _factor(matrix: sparse.sparray) -> Any:

@@ -73,10 +73,9 @@ class Disconnected(RuntimeWarning):
     """
 
 
-def _connected(channel: Channel) -> None:
-    if not channel.graph.connected:
-        parts = channel.graph.components.max() + 1
-        raise ValueError(f"channel: needs a connected graph to agree, got {parts} components")
+def _alone(channel: Channel) -> None:
+    if channel.runs:
+        raise ValueError(f"channel: needs a single run, got runs {channel.runs}")
 
 
 @fuses("vectors")
@@ -162,7 +161,7 @@ def finite_time(values: PerAgent, channel: Channel) -> Array:
     >>> channel.ledger.rounds
     2
     """
-    _connected(channel)
+    channel.graph._joined()
     if not channel.faults.none:
         raise ValueError("channel: needs no faults for a finite-time rule, got a faulty channel")
     combine, out = unchecked(channel.combine), values.copy()
@@ -225,7 +224,7 @@ def push_sum(values: PerAgent, channel: Channel, *, rounds: Count) -> Array:
     >>> push_sum([[0.0], [3.0], [6.0]], Channel(circle), rounds=80).ravel().round(9)
     array([3., 3., 3.])
     """
-    _connected(channel)
+    channel.graph._joined()
     graph, carry = channel.graph, unchecked(channel.carry)
     mass = np.concatenate([values, np.ones((*values.shape[:-1], 1))], axis=-1)
     share = 1 / (1 + graph.listeners)[:, None]
@@ -266,7 +265,7 @@ def maximum(values: PerAgent, channel: Channel, *, rounds: Count | None = None) 
     >>> maximum([[1.0], [5.0], [2.0]], Channel(graphs.path(3))).ravel()
     array([5., 5., 5.])
     """
-    _connected(channel)
+    channel.graph._joined()
     graph, carry, out = channel.graph, unchecked(channel.carry), values.copy()
     if graph.size == 1:
         return out
@@ -371,8 +370,7 @@ def admm(
     >>> run.common.round(5).ravel()
     array([3., 3., 3.])
     """
-    if channel.runs:
-        raise ValueError(f"channel: needs a single run, got runs of shape {channel.runs}")
+    _alone(channel)
     if check is not None and not channel.faults.none:  # agents would stop apart
         raise ValueError(
             "check: needs a channel without faults, or None to make all iterations, got faults"

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..doors import Array, Bounds, Count, Mask, NonNegative, Positive, Record, Rng, door, unchecked
 from .channel import Channel, Lost, PerAgent
-from .consensus import fuses
+from .consensus import _alone, fuses
 from .weights import Weights, _keeping, _laplacian, _matching, metropolis
 
 __all__ = [  # fmt: skip
@@ -39,12 +39,6 @@ class PIState(Record):
     estimate: Annotated[Array, "... A k"]
     integral: Annotated[Array, "... A k"]
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        needed, got = self.estimate.shape, self.integral.shape
-        if got != needed:
-            raise ValueError(f"integral: needs shape {needed}, got {got}")
-
 
 @door
 def pi_start(estimate: Annotated[Array, "... A k"]) -> PIState:
@@ -58,8 +52,7 @@ def pi_start(estimate: Annotated[Array, "... A k"]) -> PIState:
 
 @door
 def stable_substeps(
-    channel: Channel, dt: Positive, *, alpha: _Gain, a: _Gain, b: _Gain,
-    safety: Annotated[float, Bounds(at_least=1)] = 2.0,
+    channel: Channel, dt: Positive, *, alpha: _Gain, a: _Gain, b: _Gain
 ) -> int:
     r"""How many explicit steps make up `dt` so that the estimator is stable.
 
@@ -74,14 +67,12 @@ def stable_substeps(
         For the graph; the step that is wanted, in s, positive.
     alpha, a, b : float
         The gains of :func:`pi_step`.
-    safety : float
-        Factor, at least 1, by which steps are shorter than the bound of stability, at which a mode
-        swings for ever. With 2 the fastest mode does not swing at all.
 
     Returns
     -------
     int
-        The smallest number for which h = `dt` / number is the bound / `safety` or less.
+        The smallest number for which h = `dt` / number is half of the bound of stability or less:
+        at the bound a mode swings for ever, with half of it the fastest mode does not swing at all.
 
     Examples
     --------
@@ -97,7 +88,7 @@ def stable_substeps(
     # modulus b λ and the real part -(α + a λ)/2, and the largest λ is the worst.
     spring = b * bound
     limit = 2 / rate if 2 * spring <= rate else min(2 / rate, rate / spring**2)
-    return max(1, int(np.ceil(safety * dt / limit)))
+    return max(1, int(np.ceil(2 * dt / limit)))
 
 
 @door
@@ -144,8 +135,7 @@ def pi_step(
     >>> state.estimate.ravel().round(6)
     array([2., 2.])
     """
-    if channel.graph.directed:
-        raise ValueError("channel: needs links both ways to keep the sum, got one-way links")
+    channel.graph._undirected()
     if state.estimate.shape != inputs.shape:
         raise ValueError(f"state: needs shape {inputs.shape}, got {state.estimate.shape}")
     nu, eta, u = state.estimate, state.integral, inputs
@@ -263,7 +253,7 @@ def gossip(values: PerAgent, channel: Channel, *, rounds: Count, rng: Rng) -> Ar
 @door
 def event_triggered(
     values: PerAgent, channel: Channel, *, rounds: Count, threshold: NonNegative,
-    decay: Annotated[float, Bounds(above=0, at_most=1)] = 1.0, weights: Weights | None = None,
+    decay: Annotated[float, Bounds(above=0, at_most=1)] = 1.0,
 ) -> Array:
     r"""Average, but send only what has moved by more than a threshold since it was sent last.
 
@@ -271,7 +261,8 @@ def event_triggered(
         +\sum_j w_{ij}(\hat{\mathbf x}_j-\hat{\mathbf x}_i)
 
     with the values :math:`\hat{\mathbf x}` that went over the link last; both its ends know both.
-    Symmetric weights keep the average exactly, also when messages are lost.
+    The Metropolis weights are symmetric: they keep the average exactly, also when messages are
+    lost.
 
     Parameters
     ----------
@@ -289,8 +280,6 @@ def event_triggered(
         limit. With 1 their Euclidean distance from the average is in the end at most
         :math:`\sqrt{Ak}\,\|\mathbf I-\mathbf W\|\,c/(1-\rho)`, where c is the threshold and ρ the
         second largest modulus of the weights' eigenvalues.
-    weights : Weights, optional
-        Symmetric; Metropolis by default.
 
     Notes
     -----
@@ -306,8 +295,9 @@ def event_triggered(
     (True, True)
     """
     _alone(channel)
+    _pairwise(channel)
     graph, carry, x = channel.graph, unchecked(channel.carry), values
-    w = _symmetric(channel, weights)
+    w = metropolis(graph)
     faulty = not channel.faults.none
     # What link e delivered last; its sender knows by the acknowledgement.
     known = np.full((graph.senders.size, x.shape[1]), np.nan)
@@ -372,29 +362,11 @@ def flood(values: PerAgent, channel: Channel, *, rounds: Count | None = None) ->
     return average, np.array([[a in k for a in range(size)] for k in known])
 
 
-def _symmetric(channel: Channel, weights: Weights | None) -> Weights:
-    _pairwise(channel)
-    graph = channel.graph
-    if weights is None:
-        return metropolis(graph)
-    w = _matching(graph, _keeping(weights))
-    gap = np.abs(w.links - w.links[graph.reverse]).max(initial=0.0)
-    if gap > 1e-12:
-        raise ValueError(f"weights: needs symmetric weights, got a difference of {gap:.3g}")
-    return w
-
-
 def _pairwise(channel: Channel) -> None:
-    if channel.graph.directed:
-        raise ValueError("channel: needs links both ways, got one-way links")
+    channel.graph._undirected()
     _prompt(channel)
 
 
 def _prompt(channel: Channel) -> None:
     if channel.faults.late:
         raise ValueError(f"channel: needs no delay, got {channel.faults.late} rounds")
-
-
-def _alone(channel: Channel) -> None:
-    if channel.runs:
-        raise ValueError(f"channel: needs a single run, got runs {channel.runs}")

@@ -19,7 +19,6 @@ _GOLDEN = 0x9E3779B97F4A7C15
 
 Hashes = NDArray[np.uint64]
 
-
 _BETWEEN = Bounds(at_least=0, at_most=1)
 
 
@@ -36,8 +35,6 @@ class Faults(Record):
         Of the losses. Whether a message is lost is a function of seed, run, round and link alone,
         so that every agent, or every process of a real network, can compute it, and no draw
         depends on what was drawn before.
-    symmetric : bool
-        A link fails both ways at once, with the larger of its two probabilities.
     burst : float, optional
         Mean number of rounds for which a link that fails keeps failing. Losses are independent by
         default, which is the shortest burst there is, 1 / (1 - loss) rounds.
@@ -76,7 +73,6 @@ class Faults(Record):
 
     loss: Share | Annotated[Array, "A", _BETWEEN] | Annotated[Array, "A A", _BETWEEN] = 0.0
     seed: Index = 0
-    symmetric: bool = False
     burst: Annotated[float, Bounds(at_least=1)] | None = None
     delay: Index = 0
     silent: Collection[Index] = ()
@@ -156,11 +152,9 @@ class Faults(Record):
 
     def _losses(self, graph: Graph, round_: int, runs: int) -> Mask:
         i, j = graph.receivers, graph.senders
-        ends = (np.minimum(i, j), np.maximum(i, j)) if self.symmetric else (i, j)
-        link = _mixed((ends[0] * graph.size + ends[1]).astype(np.uint64) + np.uint64(_GOLDEN))
-        rate = _rates(np.asarray(self.loss), i, j)
-        if self.symmetric and rate.ndim:
-            rate = np.maximum(rate, _rates(np.asarray(self.loss), j, i))
+        link = _mixed((i * graph.size + j).astype(np.uint64) + np.uint64(_GOLDEN))
+        loss = np.asarray(self.loss)
+        rate = loss[(i, j)[: loss.ndim]]
         drawn = _uniform(self._runs(round_, runs)[:, None] ^ link)
         if self.burst is None:
             return np.asarray(drawn < rate)
@@ -201,12 +195,6 @@ def _windows(during: Any) -> tuple[tuple[float, float], ...]:
             f"during: needs windows (start, stop) with start before stop, got {during!r}"
         )
     return tuple((float(start), float(stop)) for start, stop in ends)
-
-
-def _rates(loss: Array, receivers: NDArray[np.int64], senders: NDArray[np.int64]) -> Array:
-    if loss.ndim < 2:
-        return loss if loss.ndim == 0 else loss[receivers]
-    return np.asarray(loss[receivers, senders])
 
 
 def _uniform(bits: Hashes) -> Array:

@@ -15,9 +15,10 @@ from ..doors import Array, Bounds, Count, Mask, NonNegative, definite, door, unc
 from ..ensembles import mean, sample_covariance
 from ..gaussians import intersection_weights, recolour
 from ..linalg import cholesky, solve_lower, symmetrise
+from ._links import Indices
 from .channel import Channel
 from .consensus import fuses
-from .graphs import Graph, Indices
+from .graphs import Graph
 from .weights import _laplacian, _warn_if_unstable
 
 __all__ = [  # fmt: skip

@@ -7,15 +7,14 @@ from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import sparse
 
 from ..doors import Array, Bounds, Count, Index, Positive, Record, door
 from . import _links
+from ._links import Indices
 
 __all__ = ["Graph", "as_graph", "complete", "disk", "grid", "path", "ring", "star"]
-
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +90,8 @@ class Graph(Record):
         Parameters
         ----------
         graph : networkx.Graph or networkx.DiGraph
-            Of a digraph an edge runs from speaker to listener, as in :meth:`to_networkx`. Names,
-            weights and parallel edges are left behind.
+            Of a digraph an edge runs from speaker to listener. Names, weights and parallel edges
+            are left behind.
 
         Examples
         --------
@@ -189,7 +188,9 @@ class Graph(Record):
         if self.senders.size == 0:
             return float("inf")
         if self.directed:
-            return _links.one_way_gain(self.laplacian)
+            values = np.linalg.eigvals(self.laplacian.toarray())
+            values = values[np.abs(values) > 1e-9 * np.abs(values).max()]
+            return float((2 * values.real / np.abs(values) ** 2).min(initial=np.inf))
         if self.size <= _links.DENSE:
             return float(2 / self.spectrum[-1])
         bound = _links.degree_bound(self.links, self.degrees)
@@ -228,9 +229,7 @@ class Graph(Record):
     @cached_property
     def diameter(self) -> int:
         """The largest number of hops between two agents of a connected graph."""
-        if not self.connected:
-            parts = self.components.max() + 1
-            raise ValueError(f"graph: needs a connected graph, got {parts} parts")
+        self._joined()
         return _links.diameter(self.links, symmetric=not self.directed)
 
     def _below(self, agent: int) -> int:
@@ -238,15 +237,16 @@ class Graph(Record):
             return agent
         raise ValueError(f"agent: needs an agent below {self.size}, got {agent}")
 
+    def _joined(self) -> None:
+        """Refuse a graph in parts."""
+        if not self.connected:
+            parts = self.components.max() + 1
+            raise ValueError(f"graph: needs a (strongly) connected graph, got {parts} parts")
+
     def _undirected(self) -> None:
+        """Refuse one-way links."""
         if self.directed:
-            raise ValueError("graph: needs links both ways for a real spectrum, got one-way links")
-
-    def to_networkx(self) -> Any:
-        """The same graph as a networkx DiGraph whose edges run from speaker to listener."""
-        import networkx as nx
-
-        return nx.from_scipy_sparse_array(self.links.T, create_using=nx.DiGraph)
+            raise ValueError("graph: needs links both ways here, got one-way links")
 
 
 def as_graph(value: Any, size: int | None = None) -> Graph:

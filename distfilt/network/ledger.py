@@ -114,15 +114,11 @@ def _present(part: Part, copies: int) -> int:
     return int((~np.isnan(part)).reshape(copies, -1).any(axis=0).sum())
 
 
-def thinned(payload: Payload, arrived: Mask) -> Payload:
+def thinned(payload: Any, arrived: Mask) -> Any:
     """Read-only copies with NaN in the runs that lost the message."""
     if isinstance(payload, tuple):
-        return tuple(_thinned(part, arrived) for part in payload)
-    return _thinned(payload, arrived)
-
-
-def _thinned(part: Part, arrived: Mask) -> Part:
-    gone = ~arrived.reshape(arrived.shape + (1,) * (part.ndim - arrived.ndim))
-    out = np.where(gone, np.nan, part)
+        return tuple([thinned(part, arrived) for part in payload])
+    gone = ~arrived.reshape(arrived.shape + (1,) * (payload.ndim - arrived.ndim))
+    out = np.where(gone, np.nan, payload)
     out.flags.writeable = False
     return out

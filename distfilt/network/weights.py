@@ -10,9 +10,9 @@ from typing import Annotated
 import numpy as np
 from scipy import sparse
 
-from ..doors import Array, Count, Record, door
-from ._links import left_null_vector
-from .graphs import Graph, Indices
+from ..doors import Array, Record, door
+from ._links import Indices, left_null_vector
+from .graphs import Graph
 
 __all__ = [  # fmt: skip
     "UnstableGain", "Weights", "balanced", "best_constant", "fastest", "gossip", "metropolis",
@@ -94,17 +94,6 @@ def _matching(graph: Graph, weights: Weights) -> Weights:
     return weights
 
 
-def _both_ways(graph: Graph) -> None:
-    if graph.directed:
-        raise ValueError("graph: needs links both ways for these weights, got one-way links")
-
-
-def _connected(graph: Graph) -> None:
-    if not graph.connected:
-        parts = graph.components.max() + 1
-        raise ValueError(f"graph: needs a strongly connected graph, got {parts} components")
-
-
 def _by_links(graph: Graph, links: Array) -> Weights:
     """Weights of links, and what is left of one for the own value."""
     return Weights.unchecked(graph, 1 - np.asarray(graph.incidence @ links), links)
@@ -126,7 +115,7 @@ def metropolis(graph: Graph) -> Weights:
     >>> metropolis(graphs.star(3)).own.round(3)
     array([0.333, 0.667, 0.667])
     """
-    _both_ways(graph)
+    graph._undirected()
     d = graph.degrees
     links = 1 / (1 + np.maximum(d[graph.receivers], d[graph.senders]))
     return _by_links(graph, links)
@@ -174,14 +163,14 @@ def best_constant(graph: Graph) -> Weights:
     >>> float(best_constant(graphs.star(3)).links[0])
     0.5
     """
-    _connected(graph)
+    graph._joined()
     if graph.size == 1:
         return _laplacian(graph, 0.0)
     return _laplacian(graph, 2 / (graph.fiedler_value + 2 / graph.largest_gain))
 
 
 @door
-def fastest(graph: Graph, *, iterations: Count = 200) -> Weights:
+def fastest(graph: Graph) -> Weights:
     r"""Symmetric weights with the (nearly) smallest second largest modulus of an eigenvalue.
 
     Fastest linear averaging on the graph: a convex problem, here smoothed by
@@ -194,8 +183,6 @@ def fastest(graph: Graph, *, iterations: Count = 200) -> Weights:
     ----------
     graph : Graph
         Connected, links both ways.
-    iterations : int
-        At most this many for each of the four values of μ.
 
     Notes
     -----
@@ -221,7 +208,7 @@ def fastest(graph: Graph, *, iterations: Count = 200) -> Weights:
     best, slowest = start.links[at], _modulus(graph, at, start.links[at])
     x = best
     for mu in (1e-1, 1e-2, 1e-3, 1e-4):
-        options = {"maxiter": iterations}
+        options = {"maxiter": 200}
         x = minimize(_smoothed, x, (graph, at, mu), "L-BFGS-B", jac=True, options=options).x
         now = _modulus(graph, at, x)
         if now < slowest:
@@ -267,7 +254,7 @@ def gossip(graph: Graph) -> Weights:
     >>> gossip(graphs.path(2)).own
     array([0.5, 0.5])
     """
-    _both_ways(graph)
+    graph._undirected()
     d = np.maximum(graph.degrees, 1)
     links = (1 / d[graph.receivers] + 1 / d[graph.senders]) / (2 * graph.size)
     return _by_links(graph, links)
@@ -302,7 +289,7 @@ def balanced(graph: Graph) -> Weights:
     >>> balanced(circle).matrix.toarray().sum(axis=0)
     array([1., 1., 1.])
     """
-    _connected(graph)
+    graph._joined()
     p = left_null_vector(graph.laplacian) if graph.directed else np.ones(graph.size)
     links = p[graph.receivers] / (2 * (p * graph.degrees).max())
     return _by_links(graph, links)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from distfilt.network import Channel, Faults, Graph, Weights, graphs
 
@@ -15,13 +16,23 @@ def rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
+REFERENCE = {
+    "ring": graphs.ring(7),
+    "star": graphs.star(5),
+    "grid": graphs.grid(3, 4),
+    "disk": graphs.disk(rng(3).random((30, 2)), 0.4),
+}
+GRID, DISK = REFERENCE["grid"], REFERENCE["disk"]
+named = pytest.mark.parametrize("graph", REFERENCE.values(), ids=REFERENCE.keys())
+
+
 def star(**options: object) -> Channel:
     """A channel on a star of three."""
     return Channel(STAR, **options)
 
 
-def lossy(loss: float = 0.3, graph: Graph | None = None, **options: object) -> Channel:
-    return Channel(graph or STAR, faults=Faults(loss=loss, seed=5), **options)
+def lossy(loss: float = 0.3, graph: Graph = STAR, **options: object) -> Channel:
+    return Channel(graph, faults=Faults(loss=loss, seed=5), **options)
 
 
 def of_matrix(graph: Graph, matrix: object) -> Weights:
@@ -37,6 +48,13 @@ def random_graph(seed: int, agents: int, *, directed: bool = False) -> Graph:
     return Graph.from_adjacency(a.astype(float), directed=directed)
 
 
+def heard(faults: Faults, graph: Graph, round_: int = 0, runs: int = 1) -> np.ndarray:
+    """Whose message arrives at whom, (runs, A, A)."""
+    out = np.zeros((runs, graph.size, graph.size), dtype=bool)
+    out[:, graph.receivers, graph.senders] = ~faults.lost(graph, round_, runs)
+    return out
+
+
 def gaussians(seed: int, *leading: int, d: int = 2) -> tuple[np.ndarray, np.ndarray]:
     """Means and full covariances, components of different size."""
     draw = rng(seed)
@@ -44,11 +62,3 @@ def gaussians(seed: int, *leading: int, d: int = 2) -> tuple[np.ndarray, np.ndar
     size = np.logspace(-1, 1, d)
     covs = (a @ np.swapaxes(a, -1, -2) + 0.2 * np.eye(d)) * np.outer(size, size)
     return draw.standard_normal((*leading, d)) * size, 0.5 * (covs + np.swapaxes(covs, -1, -2))
-
-
-REFERENCE = {
-        "ring": graphs.ring(7),
-    "star": graphs.star(5),
-    "grid": graphs.grid(3, 4),
-    "disk": graphs.disk(rng(3).random((30, 2)), 0.4),
-}

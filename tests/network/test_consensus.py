@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,7 +13,6 @@ from scipy.sparse.csgraph import shortest_path
 
 from distfilt.linalg import SolverError
 from distfilt.network import (
-    AdmmRun,
     Channel,
     Disconnected,
     Faults,
@@ -27,9 +27,7 @@ from distfilt.network import (
     weights,
 )
 from distfilt.network.consensus import _distinct, _leja
-from tests.network.helpers import APART, REFERENCE, STAR, lossy, random_graph, rng, star
-
-named = pytest.mark.parametrize("graph", REFERENCE.values(), ids=REFERENCE.keys())
+from tests.network.helpers import APART, DISK, STAR, lossy, named, random_graph, rng, star
 
 
 @given(st.integers(0, 1000), st.integers(2, 7), st.floats(0.01, 1.5))
@@ -59,17 +57,14 @@ def test_a_gain_beyond_the_bound_warns_once_and_names_both() -> None:
 
 
 @pytest.mark.parametrize("graph", [graphs.path(5), graphs.disk(rng(2).random((250, 2)), 0.15)])
-def test_the_warning_s_edge(graph: Graph) -> None:
+def test_the_warning_s_edge_and_what_it_costs(graph: Graph) -> None:
+    """No eigenvalue is computed for a gain that degrees clear."""
     values = np.zeros((graph.size, 1))
+    average(values, Channel(graph), gain=0.99 * graph.safe_gain)
+    assert "largest_gain" not in vars(graph) and "spectrum" not in vars(graph)
     average(values, Channel(graph), gain=graph.largest_gain * (1 - 1e-6))
     with pytest.warns(UnstableGain):
         average(values, Channel(graph), gain=graph.largest_gain * (1 + 1e-6))
-
-
-def test_no_eigenvalue_is_computed_for_a_gain_that_degrees_clear() -> None:
-    graph = graphs.disk(rng(2).random((400, 2)), 0.15)
-    average(np.zeros((400, 1)), Channel(graph), gain=0.99 * graph.safe_gain)
-    assert "largest_gain" not in vars(graph) and "spectrum" not in vars(graph)
 
 
 @named
@@ -101,9 +96,8 @@ def test_a_perturbation_travels_one_hop_a_round(seed: int, rounds: int) -> None:
 @pytest.mark.parametrize("lost", ["mutual", "metropolis"])
 @given(st.integers(0, 500), st.floats(0, 1))
 def test_mutual_rules_keep_the_average_under_loss(lost: str, seed: int, loss: float) -> None:
-    graph = REFERENCE["disk"]
-    values = rng(seed).standard_normal((2, graph.size, 2))
-    channel = Channel(graph, runs=(2,), faults=Faults(loss=loss, seed=seed))
+    values = rng(seed).standard_normal((2, DISK.size, 2))
+    channel = Channel(DISK, runs=(2,), faults=Faults(loss=loss, seed=seed))
     after = average(values, channel, rounds=5, lost=lost)
     assert np.abs(after.mean(axis=-2) - values.mean(axis=-2)).max() < 1e-12
     assert loss > 0.5 or (np.ptp(after, axis=-2) < np.ptp(values, axis=-2)).all()
@@ -120,27 +114,26 @@ def test_averaging_a_graph_in_parts_warns() -> None:
     average(values, Channel(graph))
 
 
-@pytest.mark.parametrize("name", ["ring", "star", "grid"])
-def test_finite_time_is_exact(name: str) -> None:
-    graph = REFERENCE[name]
+@named
+def test_finite_time_is_exact(graph: Graph) -> None:
     values = rng(4).standard_normal((2, graph.size, 2))
     channel = Channel(graph, runs=(2,))
     after = finite_time(values, channel)
-    assert np.abs(after - values.mean(axis=-2, keepdims=True)).max() < 1e-12
+    assert np.abs(after - values.mean(axis=-2, keepdims=True)).max() < 1e-9
+    assert graph is DISK or np.abs(after - values.mean(axis=-2, keepdims=True)).max() < 1e-12
     assert channel.ledger.rounds == len(np.unique(graph.spectrum.round(9))) - 1
 
 
 def test_finite_time_on_many_eigenvalues_needs_leja_s_order() -> None:
-    """Thirty agents at random, and a row of forty: ascending and descending orders fail there."""
-    for graph in (REFERENCE["disk"], graphs.path(40)):
-        values = rng(4).standard_normal((graph.size, 1))
-        out = finite_time(values, Channel(graph))
-        assert np.abs(out - values.mean()).max() < 1e-9
-    points = _distinct(graphs.path(40).spectrum[1:])
+    """A row of forty: ascending and descending orders fail there."""
+    graph = graphs.path(40)
+    values = rng(4).standard_normal((40, 1))
+    assert np.abs(finite_time(values, Channel(graph)) - values.mean()).max() < 1e-9
+    points = _distinct(graph.spectrum[1:])
     for order in (points, points[::-1]):
         out = values
         for eigenvalue in order:
-            out = out - graphs.path(40).laplacian @ out / eigenvalue
+            out = out - graph.laplacian @ out / eigenvalue
         assert np.abs(out - values.mean()).max() > 1e-3
 
 
@@ -155,8 +148,8 @@ def test_leja_s_order_by_its_definition(points: list[float]) -> None:
 
 
 def test_finite_time_needs_every_message() -> None:
-    for channel, why in ((lossy(), "no faults"), (Channel(APART), "a connected graph")):
-        with pytest.raises(ValueError, match=f"channel: needs {why}"):
+    for channel, why in ((lossy(), "channel: needs no faults"), (Channel(APART), "connected")):
+        with pytest.raises(ValueError, match=why):
             finite_time(np.zeros((3, 1)), channel)
 
 
@@ -177,13 +170,13 @@ def test_push_sum_reaches_the_average_through_heavy_loss(graph: Graph) -> None:
         assert (channel.ledger.scalars == 2 * 900 * graph.listeners).all()
 
 
-def test_push_sum_on_a_digraph() -> None:
+def test_averages_on_a_digraph() -> None:
     graph = Graph.from_edges(4, [(1, 0), (2, 1), (3, 2), (0, 3), (2, 0)], directed=True)
     values = rng(2).standard_normal((5, 4, 2))
-    after = push_sum(values, Channel(graph, runs=(5,)), rounds=200)
-    assert np.abs(after - values.mean(axis=1, keepdims=True)).max() < 1e-12
-    kept = average(values[0], Channel(graph), weights=weights.balanced(graph), rounds=400)
-    assert np.abs(kept - values[0].mean(axis=0)).max() < 1e-12
+    balanced = partial(average, weights=weights.balanced(graph))
+    for rule in (push_sum, balanced):
+        after = rule(values, Channel(graph, runs=(5,)), rounds=400)
+        assert np.abs(after - values.mean(axis=1, keepdims=True)).max() < 1e-12
 
 
 @named
@@ -249,26 +242,20 @@ def test_admm_finds_the_common_minimiser(seed: int, agents: int, rho: float) -> 
 @pytest.mark.parametrize("rho", [0.05, 0.3, 1.0, 8.0])
 @pytest.mark.parametrize("check", [1, 3])
 def test_it_stops_at_the_first_check_below_the_tolerance(rho: float, check: int) -> None:
-    """Both residuals, the dual one with its ρ: each is the last to fall for some ρ."""
-    series = _by_hand(rho, 600)
-    tolerance = 1e-4
-    run = admm(_quadratic, _ZERO, star(), rho=rho, tolerance=tolerance, check=check)
+    """Both residuals, the dual one with its ρ: each is the last to fall for some ρ.
+
+    The decision is paid for: rounds of averaging, and of the maximum of two numbers, which take the
+    diameter each.
+    """
+    series, channel, tolerance = _by_hand(rho, 600), star(), 1e-4
+    run = admm(_quadratic, _ZERO, channel, rho=rho, tolerance=tolerance, check=check)
     good = [n for n, pair in enumerate(series, start=1) if max(pair) < tolerance]
-    assert run.iterations == next(n for n in good if n % check == 0)
-    assert np.isclose(run.primal, series[run.iterations - 1][0], rtol=1e-6, atol=1e-12)
-    assert np.isclose(run.dual, series[run.iterations - 1][1], rtol=1e-6, atol=1e-12)
-
-
-def test_the_decision_to_stop_is_paid_for() -> None:
-    """Rounds of averaging, and of the maximum of two numbers, which take the diameter each."""
-    for check in (1, 4):
-        channel = star()
-        run = admm(_quadratic, _ZERO, channel, check=check)
-        assert isinstance(run, AdmmRun)
-        looks = run.iterations // check
-        assert channel.ledger.rounds == 2 * run.iterations + 2 * looks
-        sent = (2 * run.iterations + 2 * 2 * looks) * STAR.listeners
-        assert (channel.ledger.scalars == sent).all()
+    n = run.iterations
+    assert n == next(k for k in good if k % check == 0)
+    assert np.allclose((run.primal, run.dual), series[n - 1], rtol=1e-6, atol=1e-12)
+    looks = n // check
+    assert channel.ledger.rounds == 2 * n + 2 * looks
+    assert (channel.ledger.scalars == (2 * n + 2 * 2 * looks) * STAR.listeners).all()
 
 
 def test_no_agent_looks_without_a_check() -> None:
@@ -276,15 +263,13 @@ def test_no_agent_looks_without_a_check() -> None:
     run = admm(_quadratic, _ZERO, channel, check=None, iterations=7)
     assert run.iterations == 7 and channel.ledger.rounds == 14
     assert np.isclose(run.primal, _by_hand(1.0, 7)[-1][0])
-    through = lossy(0.3)
-    run = admm(_quadratic, _ZERO, through, check=None, iterations=60,
-               agree=lambda v, c: average(v, c, rounds=60))
+    run = admm(_quadratic, _ZERO, lossy(0.3), check=None, iterations=60,
+               agree=partial(average, rounds=60))
     assert np.abs(run.common - 3.0).max() < 1e-3
 
 
-def test_it_says_when_it_stops_short() -> None:
+@pytest.mark.parametrize("check", [1, 5])
+def test_it_says_when_it_stops_short(check: int) -> None:
     primal, dual = _by_hand(1.0, 2)[-1]
     with pytest.raises(SolverError, match=f"{primal:.3g} and {dual:.3g} after 2 iterations"):
-        admm(_quadratic, _ZERO, star(), iterations=2)
-    with pytest.raises(SolverError, match="after 2 iterations"):
-        admm(_quadratic, _ZERO, star(), iterations=2, check=5)
+        admm(_quadratic, _ZERO, star(), iterations=2, check=check)
