@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import partial
 from typing import Annotated
 
@@ -11,8 +12,7 @@ from .doors import Array, Count, Rng, Semidefinite, door, unchecked
 from .linalg import EPS, cholesky, factor, leading, solve_upper, symmetrise
 
 __all__ = [  # fmt: skip
-    "Ensemble", "Members", "anomalies", "cross_covariance", "draw", "exact_noise", "mean",
-    "sample_covariance",
+    "Ensemble", "Members", "anomalies", "draw", "exact_noise", "mean", "sample_covariance",
 ]
 
 
@@ -94,18 +94,6 @@ def sample_covariance(ensemble: Ensemble) -> Array:
 
 
 @door
-def cross_covariance(ensemble: Ensemble, other: Annotated[Array, "... N m"]) -> Array:
-    """Sample covariance between two ensembles of the same members, (..., d, m).
-
-    >>> cross_covariance([[0.0], [2.0]], [[1.0], [5.0]])
-    array([[4.]])
-    """
-    leading(ensemble.shape[:-2], other.shape[:-2], "other")
-    a, b = unchecked(anomalies)(ensemble), unchecked(anomalies)(other)
-    return np.asarray(a.swapaxes(-1, -2) @ b / (a.shape[-2] - 1))
-
-
-@door
 def exact_noise(
     anomalies_to_avoid: Annotated[Array, "... N P", partial(_at_least, 2)], cov: Semidefinite, *,
     rng: Rng
@@ -147,7 +135,7 @@ def exact_noise(
     >>> sample_covariance(noise).round(12)
     array([[2., 1.],
            [1., 3.]])
-    >>> bool((abs(cross_covariance(x, noise)) < 1e-12).all())
+    >>> bool((abs(anomalies(x).T @ noise) < 1e-11).all())
     True
     """
     leading(anomalies_to_avoid.shape[:-2], cov.shape[:-2], "cov")
@@ -214,20 +202,12 @@ def _frame(columns: Array) -> tuple[Array, int]:
 def _coloured(drawn: Array, root: Array) -> Array:
     """The draw (..., N, r) turned linearly so that its sample covariance is root root'."""
     n = drawn.shape[-2]
-    lower = _steady(np.ascontiguousarray(drawn.swapaxes(-1, -2)) @ drawn / (n - 1), 0.1)
-    if lower is not None:
-        return np.asarray(drawn @ solve_upper(lower, root.swapaxes(-1, -2)))
+    # A pivot so small that solving with the factor would lose digits: by orthogonal steps.
+    with suppress(np.linalg.LinAlgError):
+        lower = cholesky(np.ascontiguousarray(drawn.swapaxes(-1, -2)) @ drawn / (n - 1))
+        if np.diagonal(lower, axis1=-2, axis2=-1).min(initial=1.0) >= np.sqrt(0.1):
+            return np.asarray(drawn @ solve_upper(lower, root.swapaxes(-1, -2)))
     q, r = np.linalg.qr(drawn)
     # A positive diagonal makes the frame that of whitening, whatever signs LAPACK prefers.
     sign = np.where(np.diagonal(r, axis1=-2, axis2=-1) < 0, -1.0, 1.0)[..., None, :]
     return np.asarray(np.sqrt(n - 1) * ((q * sign) @ root.swapaxes(-1, -2)))
-
-
-def _steady(gram: Array, least: float) -> Array | None:
-    """The Cholesky factor, unless a pivot is so small that solving with it would lose digits."""
-    try:
-        lower = cholesky(gram)
-    except np.linalg.LinAlgError:
-        return None
-    small = np.diagonal(lower, axis1=-2, axis2=-1).min(initial=1.0) < np.sqrt(least)
-    return None if small else lower

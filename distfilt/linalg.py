@@ -306,6 +306,3 @@ def central(
     moved = np.diagonal(ahead - behind, axis1=-2, axis2=-1)
     slope = difference(function(ahead), function(behind)) / moved[..., None]
     return np.asarray(np.swapaxes(slope, -1, -2))
-
-
-_symmetrise = symmetrise

@@ -9,8 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 
 from ..doors import Array, Count, NonNegative, Positive, unchecked
-from ..gaussians import conditioned
-from ..gaussians.points import unscented_points
+from ..gaussians import conditioned, unscented_points
 from ..linalg import symmetrise
 from .base import Filter
 from .inbox import Heard

@@ -178,14 +178,10 @@ def intersection_weights(
     return np.asarray(weights / weights.sum(axis=-1, keepdims=True))
 
 
+# Where ratios of covariances leave the range of numbers, no gap is found, and none is taken.
+@np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def _least(covs: Array, here: Mask, determinant: bool) -> Array:
     """Weights of least determinant or trace; :func:`.intersection_weights` says how and why."""
-    # Where ratios of covariances leave the range of numbers, no gap is found, and none is taken.
-    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
-        return _iterated(covs, here, determinant)
-
-
-def _iterated(covs: Array, here: Mask, determinant: bool) -> Array:
     leading, (s, d) = here.shape[:-1], covs.shape[-3:-1]
     there = here.reshape(-1, s).astype(np.float64)
     lower = _factors(covs, here).reshape(-1, s, d, d)

@@ -1,4 +1,4 @@
-"""One Gaussian: its density, and ensembles that are moved onto it."""
+"""One Gaussian: its density, its update, points that stand for it, ensembles moved onto it."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import Array, Cov, door
+from ..doors import MISSING, Array, Cov, Mask, Semidefinite, door
 from ..linalg import EPS, cholesky, leading, log_det, quadratic_form
 
-__all__ = ["log_density", "recolour"]
+__all__ = ["conditioned", "log_density", "recolour", "unscented_points"]
 
 
 @door
@@ -106,3 +106,108 @@ def _refuse_flat(r: Array, centre: Array) -> None:
     if (own <= 32 * r.shape[-1] * EPS * (length + centre)).any():
         raise ValueError("ensemble: needs components that are not constant and not combinations "
                          "of others, got a singular sample covariance")
+
+
+@door
+def conditioned(
+    mean: Annotated[Array, "... d"],
+    cov: Semidefinite,
+    gap: Annotated[Array, "... m", MISSING],
+    H: Annotated[Array, "... m d"],
+    R: Annotated[Cov, "... m m"],
+) -> tuple[Array, Array]:
+    r"""Condition Gaussians on readings :math:`\mathbf y=\mathbf H\mathbf x+\text{noise}`.
+
+    Parameters
+    ----------
+    mean, cov : array_like, (..., d) and (..., d, d)
+        The Gaussians; the covariance may be singular.
+    gap : array_like, (..., m)
+        The innovation, :math:`\mathbf y` less its prediction: :math:`\mathbf H` times the mean, or
+        what a curved sensor makes of it. NaN leaves that component out.
+    H, R : array_like, (..., m, d) and (..., m, m)
+        How a reading depends on the state, and its noise covariance.
+
+    Returns
+    -------
+    mean, cov : ndarray, (..., d) and (..., d, d)
+        The covariance in Joseph's form. All leading axes broadcast: one covariance serves any
+        number of means as long as no single component of theirs is missing.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If an innovation covariance is singular in floating point.
+
+    Examples
+    --------
+    >>> x, p = conditioned([0.0], [[1.0]], [2.0], [[1.0]], [[1.0]])
+    >>> x, p
+    (array([1.]), array([[0.5]]))
+    """
+    missing = np.isnan(gap)
+    if missing.any():
+        H, R = left_out(missing, H, R)
+        gap = np.where(missing, 0.0, gap)
+    gain, after, _ = analysis(cov, H, R)
+    return mean + (gain @ gap[..., None])[..., 0], after
+
+
+def left_out(missing: Mask, H: Array, R: Array) -> tuple[Array, Array]:
+    """H and R where components (..., m) are missing: a zero row, a one on the diagonal.
+
+    That takes them out of every sum exactly.
+    """
+    here = ~missing[..., :, None] & ~missing[..., None, :]
+    return np.where(missing[..., None], 0.0, H), np.where(here, R, np.eye(R.shape[-1]))
+
+
+def analysis(cov: Array, H: Array, R: Array) -> tuple[Array, Array, Array]:
+    """Gain, analysis covariance in Joseph's form, and innovation covariance."""
+    cross = cov @ H.mT
+    inner = H @ cross + R
+    gain = np.linalg.solve(inner, cross.mT).mT
+    rest = np.eye(cov.shape[-1]) - gain @ H
+    after = rest @ cov @ rest.mT + gain @ R @ gain.mT
+    return np.asarray(gain), np.asarray(0.5 * (after + after.mT)), inner
+
+
+@door
+def unscented_points(
+    mean: Annotated[Array, "... d"], root: Annotated[Array, "... d d"], *, kappa: float = 0.0
+) -> tuple[Array, Array]:
+    r"""The 2d + 1 unscented points of Gaussians and their weights, which sum to 1.
+
+    The mean, then :math:`\mathbf m\pm\sqrt{d+\kappa}\,\mathbf s_i` with the columns of the square
+    root, all plus first. Weighted sums over the points give the Gaussian's mean and covariance.
+    With :math:`\kappa=0` the mean weighs nothing; with :math:`\kappa=3-d` fourth moments along
+    each axis are a Gaussian's. Points scaled by :math:`\alpha` are those of
+    :math:`\kappa'=\alpha^2(d+\kappa)-d`.
+
+    Parameters
+    ----------
+    mean : array_like, (..., d)
+    root : array_like, (..., d, d)
+        S with :math:`\mathbf S\mathbf S^\top=\mathbf P`, such as a Cholesky factor.
+    kappa : float
+        Above -d.
+
+    Returns
+    -------
+    points : ndarray, (..., 2d + 1, d)
+    weights : ndarray, (2d + 1,)
+
+    Examples
+    --------
+    >>> points, weights = unscented_points([1.0], [[2.0]], kappa=2.0)
+    >>> points.round(3).ravel().tolist(), weights.round(3).tolist()
+    ([1.0, 4.464, -2.464], [0.667, 0.167, 0.167])
+    """
+    d = mean.shape[-1]
+    if d + kappa <= 0:
+        raise ValueError(f"kappa: needs a number above {-d}, got {kappa:g}")
+    moves = np.sqrt(d + kappa) * root.mT
+    moves = np.concatenate([np.zeros_like(moves[..., :1, :]), moves, -moves], axis=-2)
+    weights = np.full(2 * d + 1, 0.5 / (d + kappa))
+    weights[0] = kappa / (d + kappa)
+    return mean[..., None, :] + moves, weights

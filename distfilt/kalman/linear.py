@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from ..doors import MISSING, Array, Cov, Mask, Record, Semidefinite, door
-from ..gaussians.conditioning import analysis, left_out
+from ..gaussians.single import analysis, left_out
 from ..linalg import cholesky, leading, log_det, quadratic_form
 from ..sensors import Sensor
 

@@ -14,7 +14,7 @@ from typing import Annotated
 import numpy as np
 
 from ..doors import MISSING, Array, Count, Cov, Index, Record, Times, door, unchecked
-from ..gaussians.conditioning import analysis, left_out
+from ..gaussians.single import analysis, left_out
 from ..linalg import central
 from ..models import Model
 from ..models.rotations import left_directions, turn_between, turned

@@ -1,7 +1,6 @@
 """How good an estimate is: error, consistency and score, with intervals.
 
-Lengths sum over the components, which has a meaning only where they have one unit; otherwise ask
-for each component with ``per_component=True``.
+Lengths sum over the components, which has a meaning only where they have one unit.
 
 Shapes: estimates and truths are (..., d), ensembles (..., N, d), covariances (..., d, d). Leading
 axes (runs, agents, times) broadcast between an estimate and its truth.
@@ -17,7 +16,7 @@ from ..doors import Array, Bounds, Count, Cov, Weights, door, unchecked
 from ..ensembles import Ensemble, Members, mean, sample_covariance
 from ..gaussians import log_density
 from ..linalg import EPS, cholesky, leading, quadratic_form
-from .intervals import Interval
+from .intervals import Interval, Level
 
 __all__ = [  # fmt: skip
     "crps", "ensemble_nees", "gaussian_crps", "log_score", "nees", "nees_band", "nis",
@@ -25,11 +24,10 @@ __all__ = [  # fmt: skip
 ]
 
 Vector = Annotated[Array, "... d"]
-Level = Annotated[float, Bounds(above=0, below=1)]
 
 
 @door
-def squared_error(estimate: Vector, truth: Vector, *, per_component: bool = False) -> Array:
+def squared_error(estimate: Vector, truth: Vector) -> Array:
     r"""Squared length of the error, :math:`\lVert\hat{\mathbf x}-\mathbf x\rVert^2`.
 
     A sum over the components, not a mean, in units of the state squared.
@@ -38,19 +36,14 @@ def squared_error(estimate: Vector, truth: Vector, *, per_component: bool = Fals
     ----------
     estimate, truth : array_like, (..., d)
         Leading axes broadcast.
-    per_component : bool
-        Give the squared error of each component instead.
 
     Examples
     --------
     >>> float(squared_error([1.0, 2.0], [4.0, 6.0]))
     25.0
-    >>> squared_error([1.0, 2.0], [4.0, 6.0], per_component=True)
-    array([ 9., 16.])
     """
     leading(estimate.shape[:-1], truth.shape[:-1], "truth")
-    square = (estimate - truth) ** 2
-    return square if per_component else np.asarray(square.sum(axis=-1))
+    return np.asarray(((estimate - truth) ** 2).sum(axis=-1))
 
 
 @door
@@ -153,8 +146,7 @@ def ensemble_nees(ensemble: Ensemble, truth: Vector) -> Array:
 
 @door
 def nees_band(
-    dim: Count, count: Count, *, level: Annotated[float, Bounds(above=0, below=1)] = 0.95,
-    normalised: bool = False,
+    dim: Count, count: Count, *, level: Level = 0.95, normalised: bool = False
 ) -> Interval:
     r"""Where the average of independent NEES values of an honest filter falls.
 
@@ -197,8 +189,7 @@ def nees_band(
 
 @door
 def crps(
-    ensemble: Members, truth: Vector, *, fair: bool = False,
-    weights: Annotated[Weights, "... N"] | None = None,
+    ensemble: Members, truth: Vector, *, weights: Annotated[Weights, "... N"] | None = None
 ) -> Array:
     r"""Continuous ranked probability score (..., d) of an ensemble by component; smaller is better.
 
@@ -211,28 +202,20 @@ def crps(
     ensemble : array_like, (..., N, d)
         Members.
     truth : array_like, (..., d)
-    fair : bool
-        Average the pairs over i ≠ j, N (N - 1) of them: unbiased for the score of the distribution
-        that the members are drawn from. Needs N >= 2.
     weights : array_like, (..., N), optional
-        Of the members, with sum one; equal by default. Not together with `fair`.
+        Of the members, with sum one; equal by default.
 
     Notes
     -----
     T. Gneiting and A. E. Raftery, Journal of the American Statistical Association 102 (2007)
-    359-378, equation (21); C. A. T. Ferro, Quarterly Journal of the Royal Meteorological Society
-    140 (2014) 1917-1923, for the fair version.
+    359-378, equation (21).
 
     Examples
     --------
     >>> crps([[0.0], [2.0]], [1.0])
     array([0.5])
-    >>> crps([[0.0], [2.0]], [1.0], fair=True)
-    array([0.])
     """
     n = ensemble.shape[-2]
-    if fair and (n < 2 or weights is not None):
-        raise ValueError("fair: needs two members or more of equal weight, got others")
     leading(ensemble.shape[:-2], truth.shape[:-1], "truth")
     # Distances from the truth are as good as the members, and lose fewer digits far from zero.
     gap = ensemble - truth[..., None, :]
@@ -240,7 +223,7 @@ def crps(
         return _weighted_crps(gap, weights)
     gap = np.sort(gap, axis=-2)
     rank = 2.0 * np.arange(1, n + 1) - n - 1
-    pairs = (rank[:, None] * gap).sum(axis=-2) / (n * (n - 1 if fair else n))
+    pairs = (rank[:, None] * gap).sum(axis=-2) / (n * n)
     return np.asarray(np.abs(gap).mean(axis=-2) - pairs)
 
 
