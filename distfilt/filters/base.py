@@ -13,16 +13,14 @@ from dataclasses import KW_ONLY, dataclass, fields
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-import numpy as np
-
 from ..doors import Array, Bounds, Index, Positive, Record, Rng, door
 from ..models import Model
 from ..network import Channel, Faults, Ledger, as_graph, fused_kind
 from .inbox import Inbox
 from .inputs import Late, Team, belated, planned, said_by_all, team_of
-from .record import SCORES, Recorder, Score, Summary, shown
+from .record import SCORES, Recorder, Score, Summary
 from .saving import State
-from .step import RECOVERABLE, FilterError, Step
+from .step import RECOVERABLE, FilterError, Step, of_the_call
 
 if TYPE_CHECKING:
     import xarray
@@ -268,7 +266,7 @@ class Filter(Record, ABC):
         try:
             return self.advance(step)
         except RECOVERABLE as error:
-            if isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError):
+            if of_the_call(error):
                 raise
             raise FilterError((), None, t, error) from error
 
@@ -293,37 +291,57 @@ class Filter(Record, ABC):
         return said_by_all(self, observations, runs, t)
 
     def _walk(
-        self, state: Any, grid: Array, entries: Iterable[Any], late: Sequence[Late],
-        progress: bool, *, own: bool,
-    ) -> Iterator[Any]:  # fmt: skip
+        self, state: Any, grid: Array, entries: Iterable[Any], late: Sequence[Late], *, own: bool
+    ) -> Iterator[Any]:
         waiting = sorted(late, key=lambda item: item.arrived)
         if waiting and (not grid.size or waiting[-1].arrived > grid[-1]):
             end = f"{grid[-1]:g}" if grid.size else "no time at all"
             raise ValueError(f"late: needs arrivals up to {end}, got {waiting[-1].arrived:g}")
         mine = False
-        for t, observed in zip(shown(grid.tolist(), progress), entries, strict=True):
+        for t, observed in zip(grid.tolist(), entries, strict=True):
             due = [item for item in waiting if item.arrived <= t]
             waiting = waiting[len(due) :]
             state = self._advanced(state, t, observed, due, own=mine)
             mine = own
             yield state
 
+    def _recorded(
+        self, state: Any, times: Any, observations: Any, truth: Any, scores: Collection[Score],
+        late: Sequence[Late], lag: int,
+    ) -> xarray.Dataset:  # fmt: skip
+        """A run's record, each time as it is believed when `lag` more have been observed."""
+        self.fits(state)
+        grid, entries = planned(self, state, times, observations)
+        recorder = Recorder(self, grid, state, truth, scores)
+        waiting: list[tuple[Any, Summary]] = []
+        last = state
+        for last in self._walk(state, grid, entries, late, own=True):
+            past = [s for t, s in self.past(last) if t > state.t] if lag else []
+            first = len(waiting) - len(past)
+            waiting[first:] = [
+                (then, summary) for (then, _), summary in zip(waiting[first:], past, strict=True)
+            ]
+            waiting.append((last, self.summary(last)))
+            if len(waiting) > lag:
+                recorder.add(*waiting.pop(0))
+        for then, summary in waiting:
+            recorder.add(then, summary)
+        return recorder.dataset(last)
+
     @door
     def steps(
-        self, state: State, times: Any, observations: Any, *, late: Sequence[Late] = (),
-        progress: bool = False,
-    ) -> Iterator[Any]:  # fmt: skip
+        self, state: State, times: Any, observations: Any, *, late: Sequence[Late] = ()
+    ) -> Iterator[Any]:
         """The states at `times`, one after the other; arguments as in :meth:`run`."""
         self.fits(state)
         grid, entries = planned(self, state, times, observations)
-        return self._walk(state, grid, entries, late, progress, own=False)
+        return self._walk(state, grid, entries, late, own=False)
 
     @door
     def run(
         self, state: State, times: Any, observations: Any, *, truth: Any = None,
-        scores: Collection[Score] = SCORES,
-        late: Sequence[Late] = (), progress: bool = False,
-    ) -> xarray.Dataset:
+        scores: Collection[Score] = SCORES, late: Sequence[Late] = (),
+    ) -> xarray.Dataset:  # fmt: skip
         """Step through a series, or through events, and record it.
 
         Parameters
@@ -343,8 +361,6 @@ class Filter(Record, ABC):
             Which of them; CRPS costs about as much as an ensemble filter.
         late : sequence of Late
             Each is taken in at the first of `times` that is not before its arrival.
-        progress : bool
-            Show a progress bar when a person watches.
 
         Returns
         -------
@@ -358,20 +374,13 @@ class Filter(Record, ABC):
             ``refused`` counts what the `gate` left out. :func:`final_state` gives the state at the
             end.
         """
-        self.fits(state)
-        grid, entries = planned(self, state, times, observations)
-        recorder = Recorder(self, grid, state, truth, scores)
-        last = state
-        for last in self._walk(state, grid, entries, late, progress, own=True):
-            recorder.add(last, self.summary(last))
-        return recorder.dataset(last)
+        return self._recorded(state, times, observations, truth, scores, late, 0)
 
     @door
     def smooth(
         self, state: State, times: Any, observations: Any, *, truth: Any = None,
-        scores: Collection[Score] = SCORES,
-        late: Sequence[Late] = (), progress: bool = False,
-    ) -> xarray.Dataset:
+        scores: Collection[Score] = SCORES, late: Sequence[Late] = (),
+    ) -> xarray.Dataset:  # fmt: skip
         """Fixed-lag smoothing: of each time what is believed when `lag` more have been observed.
 
         Parameters and result are those of :meth:`run`. The filter needs a `lag`; near the end
@@ -380,19 +389,7 @@ class Filter(Record, ABC):
         if not self.lag:
             why = self.unused.get("lag", "needs at least 1 for smoothing, got 0")
             raise ValueError(f"lag: {why}")
-        self.fits(state)
-        grid, entries = planned(self, state, times, observations)
-        recorder = Recorder(self, grid, state, truth, scores)
-        waiting: list[tuple[Any, Summary]] = []
-        last = state
-        for last in self._walk(state, grid, entries, late, progress, own=True):
-            believed = [summary for t, summary in self.past(last) if t > state.t]
-            first = len(waiting) - len(believed)
-            renewed = zip((s for s, _ in waiting[first:]), believed, strict=True)
-            waiting = [*waiting[:first], *renewed, (last, self.summary(last))]
-        for then, summary in waiting:
-            recorder.add(then, summary)
-        return recorder.dataset(last)
+        return self._recorded(state, times, observations, truth, scores, late, self.lag)
 
 
 def described(model: Model) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ..doors import Array, array
+from ..doors import Array, array, unchecked
 from ..ensembles import sample_covariance
 from ..metrics import crps, ensemble_nees, gaussian_crps, nees
 from .saving import State
@@ -17,13 +16,12 @@ from .saving import State
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["SCORES", "Recorder", "Score", "Summary", "final_state", "shown"]
+__all__ = ["SCORES", "Recorder", "Score", "Summary", "final_state"]
 
 Score = Literal["squared_error", "nees", "crps"]
 SCORES: tuple[Score, ...] = ("squared_error", "nees", "crps")
 """What can be recorded beside a known truth."""
 
-_SILENT = ("TQDM_DISABLE", "CI", "PYTEST_CURRENT_TEST")
 _SENT = ("messages", "scalars", "bytes", "lost")
 
 _MEANING = {
@@ -135,7 +133,6 @@ class Recorder:
         mean = summary.mean[..., at]
         known = np.broadcast_to(known, mean.shape)
         good = np.isfinite(mean).all(axis=-1) & np.isfinite(known).all(axis=-1)
-        each = mean.shape[-1:]
         some = None if summary.members is None else summary.members[..., at]
         cov = None if summary.covariance is None else summary.covariance[..., at, :][..., at]
         if "squared_error" in self.scores:
@@ -144,17 +141,15 @@ class Recorder:
             out["total_squared_error"] = squared.sum(axis=-1)
         if "crps" in self.scores:
             if some is None:
-                std = np.sqrt(summary.variance[..., at])
-                found = _where(good, gaussian_crps, each, mean, std, known)
-            elif summary.weights is None:
-                found = _where(good, crps, each, some, known)
+                found = unchecked(gaussian_crps)(mean, np.sqrt(summary.variance[..., at]), known)
             else:
-                found = _where(good, _weighted_crps, each, some, known, summary.weights)
+                found = unchecked(crps)(some, known, weights=summary.weights)
+            found = np.where(good[..., None], found, np.nan)
             out["crps"] = self._spread_out(found, summary.mean.shape)
         if "nees" in self.scores and cov is not None:
-            out["nees"] = _where(good, _nees_or_infinite, (), mean, cov, known)
-        elif "nees" in self.scores and _spans(some, summary.weights):
-            out["nees"] = _where(good, _ensemble_nees, (), np.asarray(some), known)
+            out["nees"] = _where(good, _nees_or_infinite, mean, cov, known)
+        elif "nees" in self.scores and some is not None and some.shape[-2] > some.shape[-1]:
+            out["nees"] = _where(good, _ensemble_nees, some, known)
         return out
 
     def _spread_out(self, values: Array, shape: tuple[int, ...]) -> Array:
@@ -193,16 +188,6 @@ class Recorder:
         last = np.array(data["mean"][1][-1]) if len(self.times) else None
         out.encoding["final_state"] = final, list(self.filter.agents), last
         return out
-
-
-def shown(items: list[float], show: bool) -> Iterable[float]:
-    """The items, behind a progress bar if a person may be watching."""
-    if not show or any(os.environ.get(name) for name in _SILENT):
-        return items
-    from tqdm.auto import tqdm
-
-    bar: Iterable[float] = tqdm(items, leave=False, disable=None)
-    return bar
 
 
 def final_state(run: xarray.Dataset) -> State:
@@ -251,23 +236,12 @@ def _counted(name: str, values: list[Any], *axes: str) -> dict[str, Any]:
     }
 
 
-def _where(good: Any, score: Any, tail: tuple[int, ...], *parts: Array) -> Array:
+def _where(good: Any, score: Any, *parts: Array) -> Array:
     """A score where there is an estimate, NaN elsewhere."""
-    if good.all():
-        return np.asarray(score(*parts))
-    out = np.full((*good.shape, *tail), np.nan)
+    out = np.full(good.shape, np.nan)
     if good.any():
         out[good] = score(*(p[good] for p in parts))
     return out
-
-
-def _spans(members: Array | None, weights: Array | None) -> bool:
-    """Whether members of equal weight are enough for a covariance."""
-    return members is not None and weights is None and members.shape[-2] > members.shape[-1]
-
-
-def _weighted_crps(members: Array, known: Array, weights: Array) -> Array:
-    return crps(members, known, weights=weights)
 
 
 def _nees_or_infinite(mean: Array, cov: Array, known: Array) -> Array:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 import zipfile
 from dataclasses import dataclass, field, fields, is_dataclass
 from importlib import import_module
@@ -19,7 +18,11 @@ from ..network import Ledger
 
 __all__ = ["SensorState", "State"]
 
-_FORMAT = 3
+_FORMAT = 4
+_DAMAGE = (
+    OSError, ValueError, LookupError, TypeError, EOFError, AttributeError, ImportError,
+    NotImplementedError, zipfile.BadZipFile,
+)  # fmt: skip
 _BITS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
 
 
@@ -81,20 +84,18 @@ class State(Record):
 
         The file appears whole or not at all: a full disk leaves an earlier one as it was.
         """
-        target = _path(path)
         arrays: list[Any] = []
         header = {"format": _FORMAT, "kind": _name(type(self)), "state": _encoded(self, arrays)}
         parts = {f"a{k}": a for k, a in enumerate(arrays)}
-        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.")
+        unfinished = Path(path).with_name(f".{Path(path).name}.part")
         try:
-            with os.fdopen(handle, "wb") as file:
+            with unfinished.open("wb") as file:
                 np.savez(file, header=np.array(json.dumps(header)), **parts)
                 file.flush()
                 os.fsync(file.fileno())
-            os.replace(temporary, target)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+            unfinished.replace(path)
+        finally:
+            unfinished.unlink(missing_ok=True)
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> Self:
@@ -107,20 +108,16 @@ class State(Record):
         ValueError
             If the file is no saved state of this kind, or is damaged.
         """
-        source = _path(path)
         try:
-            with np.load(source, allow_pickle=False) as file:
+            with np.load(path, allow_pickle=False) as file:
                 parts = {name: file[name] for name in file.files}
             header = json.loads(str(parts["header"]))
             if header["format"] != _FORMAT or header["kind"] != _name(cls):
                 raise ValueError(f"format {header['format']}, a {header['kind']}")
-            return cls(**_fields(header["state"], parts))
+            return cls(**_decoded({"dict": header["state"]["dict"]}, parts))
         except FileNotFoundError:
             raise
-        except (
-            OSError, ValueError, KeyError, TypeError, EOFError, AttributeError, ImportError,
-            IndexError, NotImplementedError, zipfile.BadZipFile,
-        ) as error:
+        except _DAMAGE as error:
             raise ValueError(f"path: needs a saved {cls.__name__}, got {path}: {error}") from None
 
 
@@ -202,15 +199,6 @@ class SensorState(State):
         return out
 
 
-def _path(path: Any) -> Path:
-    """A path that names a file."""
-    if not isinstance(path, str | PathLike) or not isinstance(os.fspath(path), str):
-        raise ValueError(f"path: needs a path, got {type(path).__name__}")
-    if not Path(path).name or Path(path).is_dir():
-        raise ValueError(f"path: needs a file's name, got {str(path)!r}")
-    return Path(path)
-
-
 def _name(kind: type) -> str:
     return f"{kind.__module__}:{kind.__qualname__}"
 
@@ -224,18 +212,24 @@ def _encoded(value: Any, arrays: list[Any]) -> Any:
             raise ValueError("state: needs numeric arrays to be saved, got objects")
         arrays.append(np.asarray(value))
         return {"array": len(arrays) - 1}
-    if isinstance(value, tuple):
+    if isinstance(value, tuple | list):
         return {"tuple": [_encoded(v, arrays) for v in value]}
     if isinstance(value, np.random.Generator):
-        return {"rng": _listed(value.bit_generator.state), "seed": _seed(value)}
+        bits, seed = value.bit_generator, value.bit_generator.seed_seq
+        # With its seed's state, so that children that it spawns are the same too.
+        known = seed.state if isinstance(seed, np.random.SeedSequence) else None
+        return {"rng": [_pairs(bits.state, arrays), _pairs(known, arrays)]}
     if is_dataclass(value) and not isinstance(value, type):
-        parts = {f.name: _encoded(getattr(value, f.name), arrays) for f in fields(value)}
-        return {"fields": parts, "of": _name(type(value))}
+        own = {f.name: _encoded(getattr(value, f.name), arrays) for f in fields(value)}
+        return {"dict": own, "of": _name(type(value))}
     raise ValueError(f"state: needs fields that can be saved, got {type(value).__name__}")
 
 
-def _fields(coded: dict[str, Any], parts: dict[str, Any]) -> dict[str, Any]:
-    return {name: _decoded(v, parts) for name, v in coded["fields"].items()}
+def _pairs(given: Any, arrays: list[Any]) -> Any:
+    """A dictionary's entries, and those of the dictionaries in it."""
+    if not isinstance(given, dict):
+        return _encoded(given, arrays)
+    return {"dict": {name: _pairs(v, arrays) for name, v in given.items()}}
 
 
 def _decoded(coded: Any, parts: dict[str, Any]) -> Any:
@@ -246,55 +240,22 @@ def _decoded(coded: Any, parts: dict[str, Any]) -> Any:
     if "tuple" in coded:
         return tuple(_decoded(v, parts) for v in coded["tuple"])
     if "rng" in coded:
-        return _restored(coded["rng"], coded["seed"])
+        return _restored(*(_decoded(v, parts) for v in coded["rng"]))
+    known = {name: _decoded(v, parts) for name, v in coded["dict"].items()}
+    if "of" not in coded:
+        return known
     module, _, name = coded["of"].partition(":")
     # Nothing is imported that a file names, unless it is one of this package's own structures.
-    if not module.startswith("distfilt."):
-        raise ValueError(f"structure {coded['of']!r}")
-    kind = getattr(import_module(module), name)
+    kind = getattr(import_module(module), name) if module.startswith("distfilt.") else None
     if not (isinstance(kind, type) and is_dataclass(kind)):
         raise ValueError(f"structure {coded['of']!r}")
-    return kind(**_fields(coded, parts))
+    return kind(**known)
 
 
-def _seed(rng: np.random.Generator) -> dict[str, Any] | None:
-    """What :meth:`numpy.random.Generator.spawn` needs, so that children are the same too."""
-    sequence = rng.bit_generator.seed_seq
-    if not isinstance(sequence, np.random.SeedSequence):
-        return None
-    entropy: Any = sequence.entropy
-    return {
-        "entropy": np.asarray(entropy).tolist() if np.ndim(entropy) else entropy,
-        "spawn_key": [int(k) for k in sequence.spawn_key],
-        "pool_size": int(sequence.pool_size),
-        "n_children_spawned": int(sequence.n_children_spawned),
-    }
-
-
-def _listed(value: Any) -> Any:
-    """The generator's state with arrays as lists, for JSON."""
-    if isinstance(value, dict):
-        return {key: _listed(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return {"dtype": str(value.dtype), "values": value.tolist()}
-    return value.item() if isinstance(value, np.generic) else value
-
-
-def _arrays(value: Any) -> Any:
-    if isinstance(value, dict):
-        if set(value) == {"dtype", "values"}:
-            return np.array(value["values"], dtype=value["dtype"])
-        return {key: _arrays(item) for key, item in value.items()}
-    return value
-
-
-def _restored(listed: dict[str, Any], seed: dict[str, Any] | None) -> np.random.Generator:
-    kind = listed["bit_generator"]
+def _restored(state: dict[str, Any], seed: dict[str, Any] | None) -> np.random.Generator:
+    kind = state["bit_generator"]
     if kind not in _BITS:
         raise ValueError(f"bit generator {kind!r}")
-    if seed is None:
-        bits = getattr(np.random, kind)()
-    else:
-        bits = getattr(np.random, kind)(np.random.SeedSequence(**seed))
-    bits.state = _arrays(listed)
+    bits = getattr(np.random, kind)(None if seed is None else np.random.SeedSequence(**seed))
+    bits.state = state
     return np.random.Generator(bits)

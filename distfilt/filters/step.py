@@ -18,7 +18,7 @@ from .inbox import Heard
 from .inputs import Said, sensor_of
 from .saving import SensorState
 
-__all__ = ["RECOVERABLE", "FilterError", "Step", "bookmarked", "copied", "guarded"]
+__all__ = ["RECOVERABLE", "FilterError", "Step", "guarded", "of_the_call"]
 
 RECOVERABLE = (np.linalg.LinAlgError, ArithmeticError, SolverError, ValueError)
 """What one row of a batch, or one agent, may fail with while the filter is right."""
@@ -89,7 +89,7 @@ class Step:
         self.times = state.kept(filter_.lag, t)
         self.channel: Channel | None = filter_.channel(state, t)
         # A run's own generator need not be copied: nobody else draws from it.
-        self.rng: Any = state.rng if own or state.rng is None else copied(state.rng)
+        self.rng: Any = state.rng if own or state.rng is None else copy.deepcopy(state.rng)
         self.failed = getattr(state, "failed", _NOBODY)
         self.waiting: tuple[Any, ...] = ()
         self.refused: Array | None = None
@@ -262,44 +262,6 @@ class Step:
 _NOBODY = np.zeros((), dtype=bool)
 
 
-def bookmarked(rng: np.random.Generator | None) -> Callable[[], np.random.Generator | None]:
-    """Where a generator stands: a function that gives one that goes on from there, each time.
-
-    Children included. It costs next to nothing until it is called.
-
-    >>> rng = np.random.default_rng(1)
-    >>> again = bookmarked(rng)
-    >>> bool(rng.random() == again().random() == again().random())
-    True
-    """
-    if rng is None:
-        return lambda: None
-    bits = rng.bit_generator
-    seed, state = bits.seed_seq, bits.state
-    if type(seed) is not np.random.SeedSequence:
-        kept = copy.deepcopy(rng)
-        return lambda: copy.deepcopy(kept)
-    children = seed.n_children_spawned
-
-    def again() -> np.random.Generator:
-        own = np.random.SeedSequence(
-            seed.entropy, spawn_key=seed.spawn_key, pool_size=seed.pool_size,
-            n_children_spawned=children,
-        )
-        fresh = type(bits)(own)
-        fresh.state = state
-        return np.random.Generator(fresh)
-
-    return again
-
-
-def copied(rng: np.random.Generator) -> np.random.Generator:
-    """A generator that goes on as this one would, and leaves it alone."""
-    again = bookmarked(rng)()
-    assert again is not None
-    return again
-
-
 def guarded(
     compute: Compute, arrays: tuple[Array, ...], fallback: tuple[Array, ...], lead: int, *,
     shared: Array, rng: np.random.Generator | None = None,
@@ -318,17 +280,34 @@ def guarded(
     >>> out[0].ravel(), errors
     (array([ 2., -1.]), {(1,): 'Matrix is not positive definite'})
     """
-    again = bookmarked(rng)
+    at: Any = None if rng is None else rng.bit_generator.state
+    errors: dict[Row, str] = {}
     try:
         out = compute(*arrays, shared, rng)
     except RECOVERABLE as error:
-        return _row_by_row(compute, arrays, fallback, lead, shared, again, error)
-    errors: dict[Row, str] = {}
+        out = tuple(f.copy() for f in fallback)
+        wrong = of_the_call(error)
+        for row in np.ndindex(arrays[0].shape[:lead]):
+            source = copy.deepcopy(rng)
+            if source is not None:
+                source.bit_generator.state = at
+            part = shared[row[-1]] if shared.ndim > 2 else shared
+            try:
+                results = compute(*(a[row] for a in arrays), part, source)
+            except RECOVERABLE as own:
+                errors[row] = str(own)
+                wrong = wrong and isinstance(own, ValueError)
+                continue
+            for target, result in zip(out, results, strict=True):
+                target[row] = result
+        if wrong and len(errors) == np.prod(arrays[0].shape[:lead]):
+            raise
     for got in out:
         if not np.isfinite(got).all():
             bad = ~np.isfinite(got).reshape(*got.shape[:lead], -1).all(axis=-1)
-            rows = [tuple(int(i) for i in row) for row in np.argwhere(bad)]
-            errors |= {row: "the result is not finite" for row in rows}
+            errors |= {
+                tuple(map(int, row)): "the result is not finite" for row in np.argwhere(bad)
+            }
     if errors:
         out = tuple(o.copy() for o in out)
     for row in errors:
@@ -337,27 +316,6 @@ def guarded(
     return out, errors
 
 
-def _row_by_row(
-    compute: Compute, arrays: tuple[Array, ...], fallback: tuple[Array, ...], lead: int,
-    shared: Array, again: Callable[[], np.random.Generator | None], first: Exception,
-) -> tuple[tuple[Array, ...], dict[Row, str]]:
-    out = tuple(f.copy() for f in fallback)
-    errors: dict[Row, str] = {}
-    own = True
-    for row in np.ndindex(arrays[0].shape[:lead]):
-        part = shared[row[-1]] if shared.ndim > 2 else shared
-        try:
-            results = compute(*(a[row] for a in arrays), part, again())
-            if not all(np.isfinite(r).all() for r in results):
-                raise ArithmeticError("the result is not finite")
-        except RECOVERABLE as error:
-            errors[row] = str(error)
-            own = own and isinstance(error, ValueError)
-            continue
-        for target, result in zip(out, results, strict=True):
-            target[row] = result
-    # numpy's LinAlgError is a ValueError too, and says nothing of the arguments.
-    own = own and not isinstance(first, np.linalg.LinAlgError)
-    if own and len(errors) == int(np.prod(arrays[0].shape[:lead])):
-        raise first
-    return out, errors
+def of_the_call(error: Exception) -> bool:
+    """Whether an error tells of wrong arguments; numpy's LinAlgError is a ValueError too."""
+    return isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError)
