@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -171,11 +172,10 @@ class Step:
                     for (place, said), value in zip(outgoing[sender], values, strict=False):
                         has.append((sender, place, said._replace(value=value)))
                 has.sort(key=lambda item: item[0])
-        known: dict[int, list[list[tuple[Sensor, Array]]]] = {}
+        known: dict[int, list[list[tuple[Sensor, Array]]]] = defaultdict(lambda: [[] for _ in found])
         for agent, has in enumerate(found):
             for _, place, said in has:
-                at = known.setdefault(place, [[] for _ in found])
-                at[agent].append((said.sensor, said.value))
+                known[place][agent].append((said.sensor, said.value))
         return known
 
     def _outgoing(self, own: list[list[tuple[int, Said]]]) -> list[list[tuple[int, Said]]] | None:
