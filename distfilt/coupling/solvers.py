@@ -18,7 +18,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from scipy.special import logsumexp
 
-from ..doors import Array, Bounds, Positive, Record, Weights, door, needed
+from ..doors import Array, Positive, Record, Weights, door, needed
 from ..linalg import SolverError
 
 __all__ = ["Plan", "distances", "plan", "sorted_plan"]
@@ -72,10 +72,9 @@ class Plan(Record):
 
 @door
 def distances(
-    source: Annotated[Array, "n d"], target: Annotated[Array, "m d"] | None = None, *,
-    power: Positive = 2.0,
+    source: Annotated[Array, "n d"], target: Annotated[Array, "m d"] | None = None
 ) -> Array:
-    r"""Costs :math:`c_{ij}=|\mathbf x_i-\mathbf y_j|^p` of moving mass between two sets of points.
+    r"""Costs :math:`c_{ij}=|\mathbf x_i-\mathbf y_j|^2` of moving mass between two sets of points.
 
     Parameters
     ----------
@@ -83,9 +82,6 @@ def distances(
         Where mass is.
     target : array_like, (M, d), optional
         Where it goes; the same points by default.
-    power : float
-        The power p, positive: 2 makes the plan unique for points in general position, 1 is the
-        distance itself.
 
     Returns
     -------
@@ -103,7 +99,7 @@ def distances(
     for k in range(source.shape[1]):
         gap = source[:, k, None] - y[:, k]
         squares += gap * gap
-    return squares if power == 2 else np.asarray(squares ** (0.5 * power))
+    return squares
 
 
 @door
@@ -309,10 +305,9 @@ def _rounded(matrix: Array, a: Array, b: Array, solver: str) -> Array:
 @door
 def sorted_plan(
     source: Annotated[Array, "n"], target: Annotated[Array, "m"], rows: Annotated[Weights, "n"],
-    columns: Annotated[Weights, "m"] | None = None, *,
-    power: Annotated[float, Bounds(at_least=1)] = 2.0,
+    columns: Annotated[Weights, "m"] | None = None,
 ) -> Plan:
-    """The cheapest coupling on a line: smallest with smallest, in sorted order.
+    """The cheapest coupling on a line, for squared distances: smallest with smallest, in order.
 
     Parameters
     ----------
@@ -322,8 +317,6 @@ def sorted_plan(
         Positions to which they go.
     rows, columns
         As for :func:`plan`.
-    power : float
-        The cost is the distance to this power, at least 1: below it the order is not the cheapest.
 
     Returns
     -------
@@ -340,9 +333,9 @@ def sorted_plan(
     i, j = np.argsort(x, kind="stable"), np.argsort(y, kind="stable")
     matrix, g = np.zeros((x.size, y.size)), np.zeros(y.size)
     with np.errstate(over="ignore"):
-        cost = np.abs(x[:, None] - y) ** power
+        cost = (x[:, None] - y) ** 2
     if not np.isfinite(cost).all():
-        raise ValueError(f"source, target: needs distances of finite power {power:g}, got infinity")
+        raise ValueError("source, target: needs distances of finite squares, got infinity")
     rank_i, rank_j, mass = _staircase(a[i], b[j])
     np.add.at(matrix, (i[rank_i], j[rank_j]), mass)
     # Along the staircase f + g = c holds on every cell: a step sideways changes g only.

@@ -29,6 +29,7 @@ __all__ = [  # fmt: skip
 ]
 
 Members = Annotated[Array, "... n d"]
+AsMoved = Annotated[Array, "*moved.shape"]
 
 _TIE = 1e-7
 """In units of the largest cost. The weighted mean stays exact, the plan costs at most this more."""
@@ -158,7 +159,7 @@ def carried(x: Array, w: Array, matrix: Array, *, correct: bool = False) -> Arra
 
 
 @door
-def second_order(moved: Members, ensemble: Members, log_weights: ArrayLike) -> Array:
+def second_order(moved: Members, ensemble: AsMoved, log_weights: ArrayLike) -> Array:
     r"""Give transformed members the mean and covariance of the weighted ones, exactly.
 
     Averages vary less than what they average, so :math:`\mathbf X^+` has too small a covariance.
@@ -195,13 +196,7 @@ def second_order(moved: Members, ensemble: Members, log_weights: ArrayLike) -> A
     >>> float(second_order(ensemble_transform(x, logs), x, logs).var().round(12))
     0.1875
     """
-    _same_members(moved, ensemble)
     return _second_order(moved, ensemble, normalised(log_weights, ensemble.shape[:-1]))
-
-
-def _same_members(moved: Array, ensemble: Array) -> None:
-    if moved.shape != ensemble.shape:
-        raise ValueError(f"moved: needs shape {ensemble.shape}, got {moved.shape}")
 
 
 def _second_order(y: Array, x: Array, w: Array) -> Array:
@@ -239,7 +234,7 @@ def _graded(cov: Array) -> Array:
 
 @door
 def rejuvenated(
-    moved: Members, ensemble: Members, *, bandwidth: NonNegative, rng: Rng
+    moved: Members, ensemble: AsMoved, *, bandwidth: NonNegative, rng: Rng
 ) -> Array:
     r"""Add combinations of the forecast's anomalies: new places, and the same mean.
 
@@ -268,7 +263,6 @@ def rejuvenated(
     >>> bool(abs(after.mean()) < 1e-15), len(set(after.ravel()))
     (True, 3)
     """
-    _same_members(moved, ensemble)
     x, n = ensemble, ensemble.shape[-2]
     if n < 2:
         raise ValueError(f"ensemble: needs at least 2 members, got {n}")

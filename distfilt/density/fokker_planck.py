@@ -206,23 +206,21 @@ class FokkerPlanck(Record):
 
     @door
     def evolve(
-        self, values: Annotated[Array, "... self.grid.size"], times: Times, *, t0: float = 0.0,
-        substeps: Count = 1,
+        self, values: Annotated[Array, "... self.grid.size"], times: Times, *, substeps: Count = 1
     ) -> Array:
-        """Densities at `times`, (T, ..., n), of one that is `values` at `t0`.
+        """Densities at `times`, (T, ..., n), of one that is `values` at time 0.
 
         Parameters
         ----------
         values : array_like, (..., n)
         times : array_like, (T,)
-            Strictly increasing from `t0`, in s.
-        t0 : float
+            Strictly increasing from 0, in s.
         substeps : int
             Steps between two times.
         """
-        if times.size and times[0] <= t0:
-            raise ValueError(f"times: needs times after t0 = {t0:g}, got {times[0]:g}")
-        p, now, out = values, t0, np.empty((times.size, *values.shape))
+        if times.size and times[0] <= 0:
+            raise ValueError(f"times: needs times after 0, got {times[0]:g}")
+        p, now, out = values, 0.0, np.empty((times.size, *values.shape))
         for k, t in enumerate(times):
             h = (float(t) - now) / substeps
             for j in range(substeps):

@@ -18,21 +18,20 @@ __all__ = [  # fmt: skip
 Widths = Positive | Annotated[Array, "n", Bounds(above=0)]
 
 
-def _along(x: Array, grid: Grid, k: int, width: Array, reflect: bool) -> Array:
-    """Means of one-dimensional kernels at x (...) over the cells of axis k, (..., n_k)."""
+def _along(x: Array, grid: Grid, k: int, width: Array) -> Array:
+    """Means of kernels folded at the walls, at x (...), over the cells of axis k, (..., n_k)."""
     edges = grid.edges[k]
     scale = np.sqrt(2.0) * width[..., None]
     span = edges[-1] - edges[0]
     total = _steps(x, edges, scale)
-    if reflect:
-        # Images in both walls, and images of images where kernels are as wide as the box; what is
-        # more than nine widths away adds nothing.
-        reach = 9 * float(np.max(width, initial=0.0)) / span
-        for m in range(-int(reach / 2 + 1), int(reach / 2 + 1) + 1):
-            if m and 2 * abs(m) - 1 < reach:
-                total = total + _steps(x + 2 * m * span, edges, scale)
-            if max(2 * m, -2 * m - 2) < reach:
-                total = total + _steps(2 * edges[0] - x + 2 * (m + 1) * span, edges, scale)
+    # Images in both walls, and images of images where kernels are as wide as the box; what is more
+    # than nine widths away adds nothing.
+    reach = 9 * float(np.max(width, initial=0.0)) / span
+    for m in range(-int(reach / 2 + 1), int(reach / 2 + 1) + 1):
+        if m and 2 * abs(m) - 1 < reach:
+            total = total + _steps(x + 2 * m * span, edges, scale)
+        if max(2 * m, -2 * m - 2) < reach:
+            total = total + _steps(2 * edges[0] - x + 2 * (m + 1) * span, edges, scale)
     return np.asarray(total / grid.spacing[k])
 
 
@@ -52,18 +51,19 @@ def fine_enough(grid: Grid, bandwidth: float | Array) -> None:
         )
 
 
-def _factors(positions: Array, grid: Grid, bandwidth: float | Array, reflect: bool) -> list[Array]:
+def _factors(positions: Array, grid: Grid, bandwidth: float | Array) -> list[Array]:
     fine_enough(grid, bandwidth)
     x, h = grid._inside(positions), np.broadcast_to(bandwidth, positions.shape[:-1])
-    return [_along(x[..., k], grid, k, h, reflect) for k in range(grid.dim)]
+    return [_along(x[..., k], grid, k, h) for k in range(grid.dim)]
 
 
 @door
 def kernels(
-    positions: Annotated[Array, "... n grid.dim"], grid: Grid, *, bandwidth: Widths,
-    reflect: bool = True,
+    positions: Annotated[Array, "... n grid.dim"], grid: Grid, *, bandwidth: Widths
 ) -> Array:
     """Each agent's own kernel, the z_i of equation (13) of Zheng and Lin.
+
+    What would lie outside is folded back at the walls, so that each has mass 1 to rounding.
 
     Parameters
     ----------
@@ -73,8 +73,6 @@ def kernels(
         Where the kernels are wanted, as means over cells.
     bandwidth : float or array_like, (N,)
         Standard deviation of the Gaussian, in the positions' unit, at least half a cell.
-    reflect : bool
-        Fold back at the walls what lies outside, so that each kernel has mass 1 to rounding.
 
     Returns
     -------
@@ -93,7 +91,7 @@ def kernels(
     >>> z.shape, bool(abs(grid.integral(z) - 1).max() < 1e-12)
     ((2, 400), True)
     """
-    out, *rest = _factors(positions, grid, bandwidth, reflect)
+    out, *rest = _factors(positions, grid, bandwidth)
     for factor in rest:
         out = (out[..., :, None] * factor[..., None, :]).reshape(*out.shape[:-1], -1)
     return out
@@ -101,8 +99,7 @@ def kernels(
 
 @door
 def kernel_density(
-    positions: Annotated[Array, "... n grid.dim"], grid: Grid, *, bandwidth: Widths,
-    reflect: bool = True,
+    positions: Annotated[Array, "... n grid.dim"], grid: Grid, *, bandwidth: Widths
 ) -> Array:
     """The kernel estimate of agents' density, equation (4) of Zheng and Lin.
 
@@ -120,7 +117,7 @@ def kernel_density(
     >>> round(float(p.max() * 2 * np.pi * 0.1**2), 2)
     0.92
     """
-    factors = _factors(positions, grid, bandwidth, reflect)
+    factors = _factors(positions, grid, bandwidth)
     if grid.dim == 2:
         out = factors[0].mT @ factors[1]
     elif grid.dim == 1:

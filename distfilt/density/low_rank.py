@@ -18,7 +18,18 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..doors import Array, Bounds, Count, NonNegative, Positive, Record, array, door, semidefinite
+from ..doors import (
+    Array,
+    Bounds,
+    Count,
+    NonNegative,
+    Positive,
+    Record,
+    array,
+    door,
+    semidefinite,
+    unchecked,
+)
 from .grid import Grid
 
 __all__ = [  # fmt: skip
@@ -189,8 +200,6 @@ class LowRank(Record):
         M_i, at least the identity.
     vector : ndarray, (F, r)
         b_i.
-    lost : float
-        Largest share of the variance that the compression of one step has dropped so far.
 
     Examples
     --------
@@ -203,7 +212,6 @@ class LowRank(Record):
     base: Annotated[Array, "f n"]
     information: Annotated[Array, "f r r"]
     vector: Annotated[Array, "f r"]
-    lost: NonNegative = 0.0
 
     @property
     def size(self) -> int:
@@ -238,19 +246,19 @@ class LowRank(Record):
 
 
 @door
-def low_rank_start(basis: Annotated[Array, "n r"], base: Annotated[Array, "f n"]) -> LowRank:
-    """Filters before their first step: prior means `base` (F, n), prior covariance S Sᵀ.
+def low_rank_start(
+    basis: Annotated[Array, "n r"] | Annotated[Array, "f n r"], base: Annotated[Array, "f n"]
+) -> LowRank:
+    """Filters before their first step: prior means `base` (F, n), prior covariances S Sᵀ.
 
     Examples
     --------
     >>> low_rank_start(np.ones((4, 1)), np.zeros((2, 4))).information.shape
     (2, 1, 1)
     """
-    return LowRank.unchecked(basis.copy(), base.copy(), *_nothing_seen(len(base), basis.shape[1]))
-
-
-def _nothing_seen(filters: int, rank: int) -> tuple[Array, Array]:
-    return np.tile(np.eye(rank), (filters, 1, 1)), np.zeros((filters, rank))
+    filters, rank = len(base), basis.shape[-1]
+    nothing = np.tile(np.eye(rank), (filters, 1, 1)), np.zeros((filters, rank))
+    return LowRank.unchecked(basis.copy(), base.copy(), *nothing)
 
 
 @door
@@ -262,7 +270,7 @@ def low_rank_moved(
 
     With process noise the factor of the forecast is :math:`[\boldsymbol\Phi\mathbf L,\
     \sqrt\Delta\,\mathbf L_Q]`. As many of its leading left singular vectors as L has columns are
-    kept; the share of the variance that is dropped with the rest is told as ``lost``.
+    kept, which drops the least of the variance.
 
     Parameters
     ----------
@@ -291,18 +299,11 @@ def low_rank_moved(
     if dt is None:
         raise ValueError("dt: needs the step's length where there is process noise, got None")
     added = np.broadcast_to(np.sqrt(dt) * process, (len(base), *process.shape))
-    basis, lost = _compressed(np.concatenate([basis, added], axis=-1), basis.shape[-1])
-    nothing = _nothing_seen(len(base), basis.shape[-1])
-    return LowRank.unchecked(basis, moved[-len(base) :], *nothing, max(state.lost, lost))
-
-
-def _compressed(factor: Array, rank: int) -> tuple[Array, float]:
-    """Factors of `rank` columns with the largest part of the variance, and the share lost."""
+    factor = np.concatenate([basis, added], axis=-1)
     with _named():
-        values, vectors = np.linalg.eigh(factor.mT @ factor)
-    dropped, total = np.maximum(values[:, :-rank], 0.0).sum(axis=-1), values.sum(axis=-1)
-    lost = np.divide(dropped, total, out=np.zeros_like(total), where=total > 0)
-    return np.asarray(factor @ vectors[..., -rank:]), float(lost.max())
+        _, vectors = np.linalg.eigh(factor.mT @ factor)
+    kept = factor @ vectors[..., -basis.shape[-1] :]
+    return unchecked(low_rank_start)(kept, moved[-len(base) :])
 
 
 @door

@@ -254,8 +254,6 @@ class DynamicAverage(Record, Sharing):
     ----------
     modes : int, optional
         How many coefficients; None agrees on all cells.
-    rounds : int
-        Of averaging in a step.
 
     Examples
     --------
@@ -264,7 +262,6 @@ class DynamicAverage(Record, Sharing):
     """
 
     modes: Count | None = field(default=100, kw_only=True)
-    rounds: Count = field(default=1, kw_only=True)
 
     def begin(self, seen: Seen) -> Carried:
         """Estimates that are the own kernels, which the rule needs for an exact average."""
@@ -277,8 +274,7 @@ class DynamicAverage(Record, Sharing):
         (x, before), graph = carried, channel.graph
         weights = weighting.balanced(graph) if graph.directed else weighting.metropolis(graph)
         lost: Lost = "keep" if graph.directed else "mutual"
-        for now in (u, *(before,) * (self.rounds - 1)):  # the change belongs to the first round
-            x = first_order(x, now, before, channel, weights=weights, lost=lost)
+        x = first_order(x, u, before, channel, weights=weights, lost=lost)
         return (x, u), *_read(x, seen, self.modes)
 
 

@@ -4,10 +4,9 @@ Filterpy's stand beside them as the reference. Extended and unscented filters ar
 :class:`distfilt.filters.GaussianFilter`, of one agent or of many.
 """
 
-from .linear import GaussianRun, kalman_filter
+from .linear import GaussianRun, kalman_filter, rts_smoother
 from .multiplicative import Chart, multiplicative_filter, quaternion_chart
 from .reference import filterpy_ekf, filterpy_kf, filterpy_ukf
-from .smoothing import rts_smoother
 
 __all__ = [  # fmt: skip
     "Chart", "GaussianRun", "filterpy_ekf", "filterpy_kf", "filterpy_ukf", "kalman_filter",

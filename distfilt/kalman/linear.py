@@ -1,4 +1,4 @@
-"""The Kalman filter for many runs at once: exact, with single components missing."""
+"""The Kalman filter for many runs at once, with single components missing, and its smoother."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import numpy as np
 
 from ..doors import MISSING, Array, Cov, Mask, Record, Semidefinite, door
 from ..gaussians.single import analysis, left_out
-from ..linalg import cholesky, leading, log_det, quadratic_form
+from ..linalg import cholesky, leading, log_det, quadratic_form, symmetrise
 from ..sensors import Sensor
 
-__all__ = ["GaussianRun", "kalman_filter"]
+__all__ = ["GaussianRun", "kalman_filter", "rts_smoother"]
+
+Runs = tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,14 +106,12 @@ def kalman_filter(
     >>> run.means.ravel().round(4)
     array([0.7143, 0.7143, 1.5263])
     """
-    runs = common_runs(observations, mean, cov)
-    f, h, q, r = per_step(len(observations), F=F, H=H, Q=Q, R=R)
-    y = flat_runs(observations, runs)
-    missing, d = np.isnan(y), mean.shape[-1]
+    runs, y, x, p = flattened(mean, cov, observations)
+    f, h, q, r = per_step(len(y), F=F, H=H, Q=Q, R=R)
+    missing = np.isnan(y)
     shared = cov.ndim == 2 and bool((missing == missing[:, :1]).all())
-    x = np.broadcast_to(mean, (*runs, d)).reshape(-1, d)
-    p = cov[None] if shared else np.broadcast_to(cov, (*runs, d, d)).reshape(-1, d, d)
-    means, covs = np.empty((*y.shape[:2], d)), np.empty((len(y), *p.shape))
+    p = cov[None] if shared else p
+    means, covs = np.empty((len(y), *x.shape)), np.empty((len(y), *p.shape))
     gaps, inner = np.empty_like(y), np.empty((len(y), len(p), *r.shape[1:]))
     for k in range(len(y)):
         x, p = x @ f[k].T, f[k] @ p @ f[k].T + q[k]
@@ -126,17 +126,100 @@ def kalman_filter(
     if not np.isfinite(means).all():
         raise np.linalg.LinAlgError("kalman_filter: needs matrices without overflow, got infinity")
     density = log_likelihood(gaps, inner, missing)
-    return GaussianRun.unchecked(
-        means.reshape(len(y), *runs, d),
-        covs.reshape(len(y), *((1,) * len(runs) if shared else runs), d, d),
-        density.reshape(len(y), *runs),
-    )
+    return unflattened(means, covs, density, runs, (1,) * len(runs) if shared else runs)
 
 
-def common_runs(observations: Array, mean: Array, cov: Array) -> tuple[int, ...]:
-    """The run axes that observations (T, ..., m), prior means and covariances have in common."""
+@door
+def rts_smoother(
+    run: GaussianRun,
+    *,
+    F: Annotated[Array, "... run.dim run.dim"],
+    Q: Annotated[Semidefinite, "... run.dim run.dim"],
+) -> GaussianRun:
+    r"""States given all observations, backwards through a Kalman filter's run.
+
+    With the forecast :math:`\mathbf P^-_{k+1} = \mathbf F\mathbf P_k\mathbf F^\top+\mathbf Q` and
+    the gain :math:`\mathbf G_k = \mathbf P_k\mathbf F^\top(\mathbf P^-_{k+1})^{-1}`,
+
+    .. math:: \mathbf x^s_k = \mathbf x_k + \mathbf G_k(\mathbf x^s_{k+1}-\mathbf F\mathbf x_k),
+        \qquad \mathbf P^s_k = \mathbf P_k
+        + \mathbf G_k(\mathbf P^s_{k+1}-\mathbf P^-_{k+1})\mathbf G_k^\top.
+
+    Parameters
+    ----------
+    run : GaussianRun
+        What :func:`kalman_filter` left, with any number of runs and gaps. The result has its
+        shapes and its log-likelihoods.
+    F, Q : array_like, (d, d) or (T, d, d)
+        Those that the filter had: the first of T leads from the prior to the first observation.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If a forecast covariance is not positive definite.
+
+    Notes
+    -----
+    H. E. Rauch, F. Tung and C. T. Striebel, AIAA Journal 3 (1965) 1445-1450. The covariance is
+    computed as the sum of squares :math:`(\mathbf I-\mathbf G\mathbf F)\mathbf P
+    (\mathbf I-\mathbf G\mathbf F)^\top + \mathbf G(\mathbf P^s+\mathbf Q)\mathbf G^\top`.
+
+    Examples
+    --------
+    >>> model = {"F": [[1.0]], "Q": [[1.0]]}
+    >>> y = np.array([[np.nan], [2.0]])
+    >>> run = kalman_filter([0.0], [[1.0]], y, H=[[1.0]], R=[[1.0]], **model)
+    >>> rts_smoother(run, **model).means.ravel()
+    array([1. , 1.5])
+    """
+    f, q = per_step(len(run.means), F=F, Q=Q)
+    means, covs = run.means.copy(), run.covariances.copy()
+    for k in reversed(range(len(f) - 1)):
+        x, p = run.means[k], run.covariances[k]
+        gain = _gain(p, f[k + 1], q[k + 1])
+        gap = means[k + 1] - x @ f[k + 1].T
+        means[k] = x + (gain @ gap[..., None])[..., 0]
+        kept = np.eye(run.dim) - gain @ f[k + 1]
+        covs[k] = symmetrise(kept @ p @ kept.mT + gain @ (covs[k + 1] + q[k + 1]) @ gain.mT)
+    return run.changed(means=means, covariances=covs)
+
+
+def _gain(p: Array, f: Array, q: Array) -> Array:
+    """P F' (F P F' + Q)^-1, (..., d, d), by a Cholesky factor."""
+    forward = f @ p
+    try:
+        lower = np.linalg.cholesky(symmetrise(forward @ f.T + q))
+    except np.linalg.LinAlgError:
+        raise np.linalg.LinAlgError("a forecast covariance is not positive definite") from None
+    half = np.linalg.solve(lower, forward)
+    return np.linalg.solve(lower.mT, half).mT
+
+
+def flattened(mean: Array, cov: Array, observations: Array) -> tuple[Runs, Array, Array, Array]:
+    """The axes of all runs, with observations (T, R, m), means and covariances on one such axis.
+
+    New run axes of observations come in front.
+    """
     runs = leading(observations.shape[1:-1], mean.shape[:-1], "mean")
-    return leading(runs, cov.shape[:-2], "cov")
+    runs = leading(runs, cov.shape[:-2], "cov")
+    steps, *axes, m = observations.shape
+    y = observations.reshape(steps, *(1,) * (len(runs) - len(axes)), *axes, m)
+    y = np.broadcast_to(y, (steps, *runs, m)).reshape(steps, math.prod(runs), m)
+    x = np.broadcast_to(mean, (*runs, *mean.shape[-1:])).reshape(-1, mean.shape[-1])
+    p = np.broadcast_to(cov, (*runs, *cov.shape[-2:])).reshape(-1, *cov.shape[-2:])
+    return runs, y, x, p
+
+
+def unflattened(
+    means: Array, covs: Array, density: Array, runs: Runs, cov_runs: Runs | None = None
+) -> GaussianRun:
+    """What a filter found of all runs, (T, R, ...), with their axes apart."""
+    steps, lead = len(means), runs if cov_runs is None else cov_runs
+    return GaussianRun.unchecked(
+        means.reshape(steps, *runs, *means.shape[2:]),
+        covs.reshape(steps, *lead, *covs.shape[2:]),
+        density.reshape(steps, *runs),
+    )
 
 
 def per_step(steps: int, **matrices: Array) -> list[Array]:
@@ -148,22 +231,15 @@ def per_step(steps: int, **matrices: Array) -> list[Array]:
     return [np.broadcast_to(a, (steps, *a.shape[-2:])) for a in matrices.values()]
 
 
-def flat_runs(observations: Array, runs: tuple[int, ...]) -> Array:
-    """Observations (T, R, m) of all runs along one axis; new run axes come in front."""
-    steps, *axes, m = observations.shape
-    y = observations.reshape(steps, *(1,) * (len(runs) - len(axes)), *axes, m)
-    return np.broadcast_to(y, (steps, *runs, m)).reshape(steps, math.prod(runs), m)
-
-
-def grid(times: Array, t0: float, observations: Array, sensor: Sensor) -> Array:
-    """The T + 1 times of the prior and of a sensor's T observations."""
+def grid(times: Array, observations: Array, sensor: Sensor) -> Array:
+    """The T + 1 times of the prior, which is 0, and of a sensor's T observations."""
     wanted = len(times), sensor.dim
     if (len(observations), observations.shape[-1]) != wanted:
         needs = f"shape ({wanted[0]}, ..., {wanted[1]})"
         raise ValueError(f"observations: needs {needs}, got {observations.shape}")
-    if times.min(initial=np.inf) <= t0:
-        raise ValueError(f"times: needs times after t0 = {t0:g}, got {times[0]:g}")
-    return np.concatenate([[t0], times])
+    if times.min(initial=np.inf) <= 0:
+        raise ValueError(f"times: needs times after 0, got {times[0]:g}")
+    return np.concatenate([[0.0], times])
 
 
 def log_likelihood(gaps: Array, inner: Array, missing: Mask) -> Array:

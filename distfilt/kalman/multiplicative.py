@@ -19,7 +19,7 @@ from ..linalg import central
 from ..models import Model
 from ..models.rotations import left_directions, turn_between, turned
 from ..sensors import Sensor, stack
-from .linear import GaussianRun, common_runs, flat_runs, grid, log_likelihood
+from .linear import GaussianRun, flattened, grid, log_likelihood, unflattened
 
 __all__ = ["Chart", "multiplicative_filter", "quaternion_chart"]
 
@@ -126,7 +126,6 @@ def multiplicative_filter(
     model: Model,
     sensors: Sequence[Sensor],
     times: Times,
-    t0: float = 0.0,
 ) -> GaussianRun:
     r"""The extended Kalman filter on a chart's errors, over series of observations.
 
@@ -139,7 +138,7 @@ def multiplicative_filter(
     Parameters
     ----------
     mean : array_like, (d,) or (..., d)
-        Prior mean at `t0`.
+        Prior mean at time 0.
     cov : array_like, (k, k) or (..., k, k)
         Prior covariance of the error; :meth:`Chart.project` makes it of the state's.
     observations : array_like, (T, ..., m)
@@ -153,9 +152,7 @@ def multiplicative_filter(
         Linearised about each forecast mean. Sensors of changes are welcome too: the errors of the
         previous state are kept beside those of the present one until the reading is used.
     times : array_like, (T,)
-        Observation times, in s.
-    t0 : float
-        The time of the prior, in s.
+        Observation times after 0, in s.
 
     Raises
     ------
@@ -180,27 +177,20 @@ def multiplicative_filter(
     >>> float((run.means[0, 9:] ** 2).sum().round(9)), run.covariances.shape
     (1.0, (1, 12, 12))
     """
-    sensor, k = stack(sensors), chart.error_dim
+    sensor = stack(sensors)
     if chart.dim != model.dim:
         raise ValueError(f"chart: needs {model.dim} components like the model, got {chart.dim}")
-    clock = grid(times, t0, observations, sensor)
-    runs = common_runs(observations, mean, cov)
-    y = flat_runs(observations, runs)
-    x = np.broadcast_to(mean, (*runs, model.dim)).reshape(-1, model.dim)
-    p = np.broadcast_to(cov, (*runs, k, k)).reshape(-1, k, k)
-    means, covs, density = np.empty((len(y), *x.shape)), np.empty((len(y), *p.shape)), []
+    clock = grid(times, observations, sensor)
+    runs, y, x, p = flattened(mean, cov, observations)
+    means, covs = np.empty((len(y), *x.shape)), np.empty((len(y), *p.shape))
+    density = np.empty(y.shape[:2])
     for n, t in enumerate(times):
         try:
-            x, p, logs = _step(x, p, y[n], chart, model, sensor, clock[n], t - clock[n])
+            x, p, density[n] = _step(x, p, y[n], chart, model, sensor, clock[n], t - clock[n])
         except np.linalg.LinAlgError as error:
             raise np.linalg.LinAlgError(f"at t = {t:g}: {error}") from None
         means[n], covs[n] = x, p
-        density.append(logs)
-    return GaussianRun.unchecked(
-        means.reshape(len(y), *runs, model.dim),
-        covs.reshape(len(y), *runs, k, k),
-        np.array(density).reshape(len(y), *runs),
-    )
+    return unflattened(means, covs, density, runs)
 
 
 def _step(

@@ -19,7 +19,7 @@ import numpy as np
 from ..doors import MISSING, Array, Cov, Mask, Semidefinite, Times, door, needed
 from ..models import Model
 from ..sensors import Sensor, stack
-from .linear import GaussianRun, common_runs, flat_runs, grid, per_step
+from .linear import GaussianRun, flattened, grid, per_step, unflattened
 
 __all__ = ["filterpy_ekf", "filterpy_kf", "filterpy_ukf"]
 
@@ -34,7 +34,6 @@ def filterpy_kf(
     H: Annotated[Array, "... m d"],
     Q: Semidefinite,
     R: Annotated[Cov, "... m m"],
-    likelihood: bool = True,
 ) -> GaussianRun:
     """Filterpy's Kalman filter over a series: arguments and result of :func:`kalman_filter`.
 
@@ -42,9 +41,6 @@ def filterpy_kf(
     ----------
     mean, cov, observations, F, H, Q, R : array_like
         As for :func:`distfilt.kalman.kalman_filter`.
-    likelihood : bool
-        Whether to ask filterpy for the log density of each observation, which takes longer than
-        the filter. Without it `log_likelihood` is zero.
 
     Examples
     --------
@@ -69,7 +65,7 @@ def filterpy_kf(
         elif seen.any():
             kf.update(z[seen], H=h[k][seen], R=r[k][np.ix_(seen, seen)])
 
-    return _over_runs(mean, cov, observations, start, step, likelihood)
+    return _over_runs(mean, cov, observations, start, step)
 
 
 @door
@@ -81,18 +77,14 @@ def filterpy_ekf(
     model: Model,
     sensors: Sequence[Sensor],
     times: Times,
-    t0: float = 0.0,
-    likelihood: bool = False,
 ) -> GaussianRun:
     r"""Filterpy's extended Kalman filter over a series: linearise the model and the sensors.
 
     Parameters
     ----------
-    mean, cov, observations, model, sensors, times, t0
+    mean, cov, observations, model, sensors, times
         As for :func:`~distfilt.kalman.multiplicative_filter`, with the state's covariance, and
         sensors of the present state.
-    likelihood : bool
-        As for :func:`filterpy_kf`.
 
     Examples
     --------
@@ -104,7 +96,7 @@ def filterpy_ekf(
     array([[2.]])
     """
     filterpy, sensor = needed("filterpy.kalman", "reference"), _present(sensors)
-    clock = grid(times, t0, observations, sensor)
+    clock = grid(times, observations, sensor)
 
     def start(x: Array, p: Array) -> Any:
         kf = filterpy.ExtendedKalmanFilter(dim_x=model.dim, dim_z=sensor.dim)
@@ -126,7 +118,7 @@ def filterpy_ekf(
                 residual=_residual_of(sensor, seen),
             )
 
-    return _over_runs(mean, cov, observations, start, step, likelihood)
+    return _over_runs(mean, cov, observations, start, step)
 
 
 @door
@@ -138,15 +130,13 @@ def filterpy_ukf(
     model: Model,
     sensors: Sequence[Sensor],
     times: Times,
-    t0: float = 0.0,
     kappa: float = 1.0,
-    likelihood: bool = False,
 ) -> GaussianRun:
     r"""Filterpy's unscented Kalman filter over a series: 2d + 1 points instead of derivatives.
 
     Parameters
     ----------
-    mean, cov, observations, model, sensors, times, t0, likelihood
+    mean, cov, observations, model, sensors, times
         As for :func:`filterpy_ekf`.
     kappa : float
         The points lie :math:`\sqrt{d+\kappa}` standard deviations from the mean.
@@ -161,7 +151,7 @@ def filterpy_ukf(
     array([[2.]])
     """
     sensor = _present(sensors)
-    clock = grid(times, t0, observations, sensor)
+    clock = grid(times, observations, sensor)
     if kappa <= -model.dim:
         raise ValueError(f"kappa: needs more than -{model.dim}, got {kappa:g}")
     start = _unscented(model, sensor.dim, kappa)
@@ -181,7 +171,7 @@ def filterpy_ukf(
             # filterpy calls hx once for each sigma point, in their order.
             kf.update(near[seen], R=sensor.cov[np.ix_(seen, seen)], hx=lambda s: next(rows))
 
-    return _over_runs(mean, cov, observations, start, step, likelihood)
+    return _over_runs(mean, cov, observations, start, step)
 
 
 def _present(sensors: Sequence[Sensor]) -> Sensor:
@@ -214,31 +204,23 @@ def _unscented(model: Model, observed: int, kappa: float) -> Callable[[Array, Ar
 
 def _over_runs(
     mean: Array, cov: Array, observations: Array, start: Callable[[Array, Array], Any],
-    step: Callable[[Any, int, Array, Mask], None], likelihood: bool,
+    step: Callable[[Any, int, Array, Mask], None],
 ) -> GaussianRun:
     """Run one of filterpy's objects over every run and every step."""
-    runs, d = common_runs(observations, mean, cov), mean.shape[-1]
-    y = flat_runs(observations, runs)
-    steps, size = y.shape[:2]
-    x0 = np.broadcast_to(mean, (*runs, d)).reshape(size, d)
-    p0 = np.broadcast_to(cov, (*runs, d, d)).reshape(size, d, d)
-    means, covs = np.empty((steps, size, d)), np.empty((steps, size, d, d))
-    density = np.zeros((steps, size))
-    for run in range(size):
-        kf = start(x0[run], p0[run])
+    runs, y, x, p = flattened(mean, cov, observations)
+    means, covs = np.empty((len(y), *x.shape)), np.empty((len(y), *p.shape))
+    density = np.zeros(y.shape[:2])
+    for run in range(len(x)):
+        kf = start(x[run], p[run])
         for k, z in enumerate(y[:, run]):
             seen = ~np.isnan(z)
             step(kf, k, z, seen)
             means[k, run], covs[k, run] = kf.x, kf.P
-            if likelihood and seen.any():
+            if seen.any():
                 density[k, run] = kf.log_likelihood
     if not np.isfinite(means).all():
         raise np.linalg.LinAlgError("filterpy's filter ended in NaN")
-    return GaussianRun.unchecked(
-        means.reshape(steps, *runs, d),
-        covs.reshape(steps, *runs, d, d),
-        density.reshape(steps, *runs),
-    )
+    return unflattened(means, covs, density, runs)
 
 
 def _residual_of(sensor: Sensor, seen: Mask) -> Callable[[Array, Array], Array]:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import ensembles
-from ..doors import Array, Count, Record, door, needed, unchecked
+from ..doors import Array, Record, door, needed, unchecked
 from ..linalg import SolverError, leading
 
 __all__ = [  # fmt: skip
@@ -307,7 +307,7 @@ def gradient(coefficients: Annotated[Array, "K"], samples: Annotated[Array, "n k
 @door
 def fit_convex(
     y: Annotated[Array, "N M"], x: Annotated[Array, "N d"], *,
-    solver: Literal["ECOS", "CLARABEL"] = "ECOS", max_iters: Count | None = None,
+    solver: Literal["ECOS", "CLARABEL"] = "ECOS",
 ) -> AffineMap:
     """Fit the affine map by the convex program (12), component by component, in cvxpy.
 
@@ -320,8 +320,6 @@ def fit_convex(
         As for :func:`fit`.
     solver : {"ECOS", "CLARABEL"}
         A conic solver, at its default tolerances.
-    max_iters : int, optional
-        Stop the solver early, which raises.
 
     Raises
     ------
@@ -338,27 +336,24 @@ def fit_convex(
     joint, m = enough(y, x, len(x)), y.shape[-1]
     rows = np.zeros((x.shape[-1], 1 + joint.shape[-1]))
     for k in range(len(rows)):
-        rows[k, : m + k + 2] = _solved(joint[:, : m + k + 1], solver, max_iters)
+        rows[k, : m + k + 2] = _solved(joint[:, : m + k + 1], solver)
     return from_rows(rows, unchecked(ensembles.mean)(y))
 
 
-_LIMIT = {"ECOS": "max_iters", "CLARABEL": "max_iter"}
-"""The solvers, and what each calls its limit of iterations."""
 _SOLVING = Lock()
 """A compiled program holds its last data: one thread at a time."""
 
 
-def _solved(z: Array, solver: str, max_iters: int | None) -> Array:
+def _solved(z: Array, solver: str) -> Array:
     """Coefficients (u_0, u_1 … u_k) that minimise (12) for the last column of `z`."""
     cp, (n, k) = needed("cvxpy", "maps"), z.shape
     problem, root, u = _program(k)
-    limit = {} if max_iters is None else {_LIMIT[solver]: max_iters}
     # What cvxpy would warn of, the status below tells, and it becomes an error.
     with _SOLVING, warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         root.value = np.linalg.qr(np.column_stack([np.ones(n), z]) / np.sqrt(n), mode="r")
         try:
-            problem.solve(solver=solver, warm_start=False, **limit)
+            problem.solve(solver=solver, warm_start=False)
             status = problem.status
         except cp.error.SolverError as error:
             status = error

@@ -13,7 +13,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import Array, Count, Positive, array, door, unchecked
+from ..doors import Array, Positive, array, door, unchecked
 from ..ensembles import mean
 from ..network import AdmmRun, Channel, admm, finite_time
 from .affine import AffineMap, enough, from_moments, from_rows, refuse
@@ -69,12 +69,13 @@ def pool_by_moments(
 @door
 def pool_by_admm(
     y: Seen, x: Members, channel: Channel, *, rho: Positive = 1.0, tolerance: Positive = 1e-6,
-    iterations: Count = 1000, check: Count | None = 1, standardise: bool = True,
     agree: Agree = finite_time,
 ) -> tuple[AffineMap, AdmmRun]:
     r"""The same map by consensus ADMM on the components' coefficients, the paper's proposal.
 
-    Agent l's proximal step has a closed form. With :math:`\mathbf C_l` the second moments of
+    Agents agree on each variable's mean and variance first, 2 D scalars more, and work on
+    standardised variables: badly scaled data would take thousands of iterations. Agent l's proximal
+    step has a closed form. With :math:`\mathbf C_l` the second moments of
     :math:`(1, z_1,\dots,z_k)`, :math:`\mathbf H = (\mathbf C_l+\rho\mathbf I)^{-1}` and
     :math:`\mathbf b = \rho(\mathbf Z-\mathbf W_l)`,
 
@@ -86,11 +87,8 @@ def pool_by_admm(
     ----------
     y, x, channel
         As in :func:`pool_by_moments`; a channel of a single run.
-    rho, tolerance, iterations, check, agree
+    rho, tolerance, agree
         As in :func:`distfilt.network.admm`.
-    standardise : bool
-        Agree on each variable's mean and variance first, 2 D scalars more, and work on standardised
-        variables. Without it badly scaled data take thousands of iterations.
 
     Returns
     -------
@@ -112,18 +110,13 @@ def pool_by_admm(
     if channel.runs:
         raise ValueError(f"channel: needs a single run for ADMM, got runs {channel.runs}")
     joint, m = _joint(y, x), y.shape[-1]
-    centre, spread = np.zeros_like(joint[:, 0]), np.ones_like(joint[:, 0])
-    if standardise:
-        centre = _average(unchecked(mean)(joint), channel, agree)
-        squares = ((joint - centre[:, None, :]) ** 2).mean(axis=-2)
-        spread = np.sqrt(_average(squares, channel, agree))
+    centre = _average(unchecked(mean)(joint), channel, agree)
+    squares = ((joint - centre[:, None, :]) ** 2).mean(axis=-2)
+    spread = np.sqrt(_average(squares, channel, agree))
     joint = (joint - centre[:, None, :]) / spread[:, None, :]
     ones = np.concatenate([np.ones((*joint.shape[:-1], 1)), joint], axis=-1)
     solve, start = _proximal(ones.mT @ ones / joint.shape[-2], m)
-    run = admm(
-        solve, start, channel, rho=rho, tolerance=tolerance, iterations=iterations, check=check,
-        agree=agree,
-    )
+    run = admm(solve, start, channel, rho=rho, tolerance=tolerance, agree=agree)
     rows = np.zeros((len(joint), x.shape[-1], ones.shape[-1]))
     for k, (a, b) in enumerate(_parts(m, x.shape[-1])):
         rows[:, k, : b - a] = run.common[:, a:b]

@@ -14,7 +14,7 @@ eliminated; a few nonnegative ones are left for Newton's method, in all runs at 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -23,20 +23,24 @@ from scipy.special import ndtr
 
 from .. import ensembles
 from ..doors import Array, Bounds, Index, NonNegative, Record, door, unchecked
-from ..linalg import leading
+from ..linalg import SolverError, leading
 from .affine import Members, OwnMembers, OwnSeen, Seen, joined, refuse
-from .newton import SINGULAR, best_coefficients, invert
 
 __all__ = ["SeparableMap", "fit"]
 
 _ROOT = np.sqrt(2 * np.pi)
+_SINGULAR = 1e-12
+"""Eigenvalue, relative to the largest, below which a matrix counts as singular."""
+_LEAST_SLOPE = 0.1
+"""Least linear coefficient, per standard deviation; the best affine map has at least 1."""
+_ITERATIONS = 100
 
 
 def _increasing(slopes: tuple[Array, ...], name: str) -> None:
     for k, a in enumerate(slopes):
-        if (a < 0).any() or not (a > 0).any(axis=-1).all():
-            raise ValueError(f"{name}: needs nonnegative coefficients, one of them positive, so "
-                             f"that the map increases, got {a.min():.6g} in component {k}")
+        if (a < 0).any() or not (a[..., 0] > 0).all():
+            raise ValueError(f"{name}: needs nonnegative coefficients, the first positive, so that "
+                             f"the map increases, got {a.min():.6g} in component {k}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +63,7 @@ class SeparableMap(Record):
         Per component (..., 1 + L + L p): the constant, the L linear coefficients, the bumps'.
     slopes : tuple of ndarray
         Per component (..., 1 + q): the linear coefficient and those of the integrated bumps,
-        nonnegative, not all zero.
+        nonnegative, the first positive, which gives the map the whole line as its range.
 
     Examples
     --------
@@ -110,8 +114,6 @@ class SeparableMap(Record):
     def _inverted(self, aim: Array, k: int) -> Array:
         """Where the increasing part of component k has the values `aim`, (..., N)."""
         first, rest = self.slopes[k][..., :1], self.slopes[k][..., 1:]
-        if not (first > 1e-6).all():
-            return invert(lambda v: self._own(v, k), aim)
         # A line plus steps of known heights: its ends need no search.
         heights = _ROOT * self.steps[1][..., k, :] * rest
         low = (aim - heights.sum(axis=-1, keepdims=True)) / first
@@ -126,11 +128,7 @@ class SeparableMap(Record):
 
     @door
     def inverse(self, y: OwnSeen, z: OwnMembers) -> Array:
-        """Members x with S(y, x) = z, (..., N, d); `y` is (..., N, m), or (..., m) for all.
-
-        Raises ValueError for a z outside the map's range, which is bounded where the slope's
-        linear coefficient is zero.
-        """
+        """Members x with S(y, x) = z, (..., N, d); `y` is (..., N, m), or (..., m) for all."""
         joint, m = self._standard(y, z), self.observed
         for k in range(self.dim):
             joint[..., m + k] = self._inverted(z[..., k] - self._earlier(joint, k), k)
@@ -169,13 +167,14 @@ def _own_features(v: Array, steps: Array) -> tuple[Array, Array]:
 @door
 def fit(
     y: Seen, x: Members, *, order: Index | tuple[Index, Index], regularisation: NonNegative = 0.0,
-    uses: Sequence[Collection[Index]] | None = None, least_slope: NonNegative = 0.1,
+    uses: Sequence[Collection[Index]] | None = None,
 ) -> SeparableMap:
     r"""Fit the separable map to samples: the minimiser of (12), regularised.
 
     .. math:: \mathcal L^k + \tfrac\lambda2\Bigl(\sum_{l,j} c_{lj}^2 + \sum_j a_j^2\Bigr)
 
-    The penalty is on the bumps only, so a large one gives the affine map.
+    The penalty is on the bumps only, so a large one gives the affine map. The linear coefficient
+    :math:`a_0` is at least 0.1 per standard deviation; the best affine map has at least 1.
 
     Parameters
     ----------
@@ -191,9 +190,6 @@ def fit(
     uses : sequence of collections of int, optional
         For each of the d components, which earlier variables it may use: observations are 0 to
         m - 1, state components follow. All by default. A component that leaves some out is sparse.
-    least_slope : float
-        Lower bound of the linear coefficient :math:`a_0`, per standard deviation, at least 0. A
-        positive one gives the map the whole line as its range. The best affine map has at least 1.
 
     Raises
     ------
@@ -239,7 +235,7 @@ def fit(
     for k, used in enumerate(allowed):
         features = _earlier_features(joint[..., used], bumps[..., used, :])
         own = _own_features(joint[..., m + k], steps[..., k, :])
-        c, a = best_coefficients(features, *own, 1 + len(used), regularisation, least_slope)
+        c, a = _best_coefficients(features, *own, 1 + len(used), regularisation)
         weights.append(c)
         slopes.append(a)
     return SeparableMap.unchecked(
@@ -262,7 +258,7 @@ def _refuse_combinations(joint: Array, uses: list[list[int]], m: int) -> None:
 
     def singular(used: list[int]) -> bool:
         part = cov[..., used, :][..., used]
-        return bool(used and (np.linalg.eigvalsh(part)[..., 0] < SINGULAR).any())
+        return bool(used and (np.linalg.eigvalsh(part)[..., 0] < _SINGULAR).any())
 
     for k, used in enumerate(uses):
         if singular([*used, m + k]):
@@ -278,3 +274,111 @@ def _nodes(joint: Array, n: int, m: int) -> Array:
     widths = found[..., 2::2] - found[..., :-2:2]
     refuse(np.any(widths <= 0, axis=-1), m, "have quantiles that differ for the basis functions")
     return np.stack([found[..., 1::2], widths])
+
+
+def _best_coefficients(
+    features: Array, values: Array, rates: Array, linear: int, penalty: float
+) -> tuple[Array, Array]:
+    r"""Coefficients of one component: those of the earlier variables, then the nonnegative ones.
+
+    For the component :math:`\Psi\mathbf c + \Phi\mathbf a` the objective (12) is
+    :math:`\tfrac1{2N}|\Psi\mathbf c+\Phi\mathbf a|^2 - \tfrac1N\sum_i\log(\Phi'\mathbf a)_i`, to
+    be minimised over free c and nonnegative a. For given a, the best c solves a regression,
+    c = -W a, which leaves a quadratic form in a.
+    """
+    n = features.shape[-2]
+    on_c = penalty * (np.arange(features.shape[-1]) >= linear)
+    on_a = penalty * (np.arange(values.shape[-1]) >= 1)
+    normal = features.mT @ features / n + np.diag(on_c)
+    ends = np.linalg.eigvalsh(normal)
+    if (ends[..., 0] < _SINGULAR * ends[..., -1]).any():
+        raise ValueError("regularisation: needs a positive value, for the basis functions are not "
+                         f"independent on these samples, got {penalty:g}")
+    regression = np.linalg.solve(normal, features.mT @ values / n)
+    left = values - features @ regression
+    quadratic = left.mT @ left / n + regression.mT @ (on_c[:, None] * regression) + np.diag(on_a)
+    lower = np.where(np.arange(values.shape[-1]) == 0, _LEAST_SLOPE, 0.0)
+    a = _nonnegative(quadratic, rates, lower)
+    return -np.asarray((regression @ a[..., None])[..., 0]), a
+
+
+def _nonnegative(quadratic: Array, rates: Array, lower: Array) -> Array:
+    """Minimise a'Qa / 2 - mean(log(rates a)) over a >= lower by projected Newton steps."""
+    r, n = quadratic.shape[-1], rates.shape[-2]
+    a = np.broadcast_to(lower, quadratic.shape[:-1]).copy()
+    a[..., 0] = np.maximum(lower[0], 1 / np.sqrt(quadratic[..., 0, 0]))
+    for _ in range(_ITERATIONS):
+        ratio = rates / (rates @ a[..., None])
+        gradient = (quadratic @ a[..., None])[..., 0] - ratio.mean(axis=-2)
+        free = (a > lower) | (gradient < 0)
+        hessian = quadratic + ratio.mT @ ratio / n
+        # Held coefficients get a row of the identity, and so a step of zero.
+        system = np.where(free[..., :, None] & free[..., None, :], hessian, np.eye(r))
+        slope = np.where(free, gradient, 0.0)
+        step = -np.linalg.solve(system, slope[..., None])[..., 0]
+        a = _shortened(quadratic, rates, lower, a, step, gradient)
+        if (-(slope * step).sum(axis=-1) < 1e-13).all():
+            return a
+    raise SolverError(f"separable: no minimum of (12) after {_ITERATIONS} Newton steps")
+
+
+def _shortened(
+    quadratic: Array, rates: Array, lower: Array, a: Array, step: Array, gradient: Array
+) -> Array:
+    """Move along the projected step, halved in each run until the objective falls enough."""
+
+    def loss(c: Array) -> Array:
+        form = 0.5 * (c[..., None, :] @ quadratic @ c[..., None])[..., 0, 0]
+        return np.asarray(form - np.log((rates @ c[..., None])[..., 0]).mean(axis=-1))
+
+    before, t = loss(a), np.ones(a.shape[:-1])
+    for _ in range(40):
+        new = np.maximum(lower, a + t[..., None] * step)
+        wanted = 1e-4 * (gradient * (new - a)).sum(axis=-1)
+        # Near the minimum the fall is lost in rounding.
+        good = loss(new) <= before + wanted + 1e-14 * (1 + np.abs(before))
+        if good.all():
+            break
+        t = np.where(good, t, 0.5 * t)
+    return np.asarray(new)
+
+
+def invert(
+    function: Callable[[Array], tuple[Array, Array]], target: Array, low: Array, high: Array
+) -> Array:
+    """Solve ``function(v) = target`` by Newton's method inside a shrinking bracket.
+
+    The function gives values and slopes, element by element. A Newton step that would leave the
+    bracket is replaced by a bisection, so the iteration converges wherever the function increases.
+
+    Raises
+    ------
+    SolverError
+        If the iteration does not settle, as for a function with jumps.
+
+    Examples
+    --------
+    >>> ends = np.full(2, -4.0), np.full(2, 4.0)
+    >>> invert(lambda v: (np.sinh(v), np.cosh(v)), np.sinh([-2.0, 0.5]), *ends).round(9)
+    array([-2. ,  0.5])
+    """
+    v, moved = 0.5 * (low + high), high - low
+    for _ in range(2 * _ITERATIONS):
+        value, slope = function(v)
+        gap = value - target
+        low, high = np.where(gap <= 0, v, low), np.where(gap >= 0, v, high)
+        steep = slope > 0
+        newton = v - gap / np.where(steep, slope, 1.0)
+        step = np.abs(newton - v)
+        enough = 1e-13 * (1 + np.abs(v))
+        # A step that has settled may stand on an end of its bracket; any other has to be inside
+        # and half as long as the last, or Newton's method could go to and fro for ever.
+        good = (newton > low) & (newton < high) & (step <= 0.5 * moved)
+        new = np.where(steep & (good | (step <= enough)), newton, 0.5 * (low + high))
+        moved, v = np.abs(new - v), new
+        if (moved <= enough).all():
+            # Halving settles at a jump as well, where the value is not reached.
+            if ((step <= enough) | (np.abs(gap) <= 1e-9 * (1 + np.abs(target)))).all():
+                return np.asarray(v)
+            break
+    raise SolverError("separable: the map's inverse did not settle at all targets")

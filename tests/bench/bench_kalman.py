@@ -148,7 +148,7 @@ def filters() -> Iterator[Row]:
         yield from compared(case, {
             "distfilt": partial(kalman_filter, mean, cov, y, **matrices),
             name: partial(by_hand, mean, cov, y, **matrices),
-            "filterpy": partial(filterpy_kf, mean, cov, y, **matrices, likelihood=False),
+            "filterpy": partial(filterpy_kf, mean, cov, y, **matrices),
         }, 5)  # fmt: skip
     given, options = curved_case(rng)
     yield from compared("unscented", {

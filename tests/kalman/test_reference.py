@@ -23,13 +23,12 @@ FULL = np.array([[4.0, 1.2], [1.2, 1.0]])
 
 
 def one_agent(
-    mean: Any, cov: Any, y: Any, *, model: Model, sensors: Any, times: Any, t0: float = 0.0,
-    **options: Any,
+    mean: Any, cov: Any, y: Any, *, model: Model, sensors: Any, times: Any, **options: Any
 ) -> GaussianRun:
     """The Gaussian filter of one agent that holds all sensors."""
     y = np.asarray(y)
     f = GaussianFilter(model, [stack(sensors)], **options)
-    states = list(f.steps(f.start((mean, cov), runs=y.shape[1:-1], t=t0), times, [y]))
+    states = list(f.steps(f.start((mean, cov), runs=y.shape[1:-1]), times, [y]))
     means = np.array([s.means[..., 0, :] for s in states])
     covs = np.array([s.covariances[..., 0, :, :] for s in states])
     return GaussianRun(means, covs, np.zeros(means.shape[:-1]))
@@ -76,8 +75,8 @@ def test_linear_case_equals_the_kalman_filter(
     times, y = np.array([0.6, 0.7, 0.9]), rng.standard_normal((3, *runs, 4))
     y[1, ..., 2], y[2] = np.nan, np.nan
     args = (rng.standard_normal(6), spd(rng, 6), y)
-    run = filter_(*args, model=model, sensors=[both], times=times, t0=0.5)
-    steps = np.diff(times, prepend=0.5)
+    run = filter_(*args, model=model, sensors=[both], times=times)
+    steps = np.diff(times, prepend=0.0)
     exact = kalman_filter(
         *args, F=np.array([model.transition(dt) for dt in steps]), H=both.matrix(6), R=both.cov,
         Q=np.array([model.noise(0.0, dt) for dt in steps]),
@@ -158,17 +157,20 @@ def test_extended_steps_are_the_linearised_formulas(filter_: Callable[..., Any])
 
     model = Model(2, flow, lambda t, dt: (1 + t) * dt * FULL)
     sensor = Sensor(2, lambda x: np.stack([x[..., 0] ** 2, x.sum(-1)], -1), FULL)
-    options = {"model": model, "sensors": [sensor], "times": [2.5], "t0": 2.0}
-    slope = np.array([[np.cos(0.3), 0.0], [-0.35, 0.15]])
-    x, p = np.array([np.sin(0.3) + 2, -0.105]), slope @ FULL @ slope.T + 1.5 * FULL
-    ahead = filter_([0.3, -0.7], FULL, [[np.nan, np.nan]], **options)
-    np.testing.assert_allclose(ahead.means[0], x)
-    np.testing.assert_allclose(ahead.covariances[0], p, atol=1e-8)
-    run = filter_([0.3, -0.7], FULL, [[1.0, -1.0]], **options)
+    options = {"model": model, "sensors": [sensor], "times": [2.0, 2.5]}
+    x, p = np.array([0.3, -0.7]), FULL
+    for t, dt in ((0.0, 2.0), (2.0, 0.5)):
+        slope = np.array([[np.cos(x[0]), 0.0], [x[1] * dt, x[0] * dt]])
+        x, p = flow(x, t, dt), slope @ p @ slope.T + (1 + t) * dt * FULL
+    gone = [np.nan, np.nan]
+    ahead = filter_([0.3, -0.7], FULL, [gone, gone], **options)
+    np.testing.assert_allclose(ahead.means[1], x)
+    np.testing.assert_allclose(ahead.covariances[1], p, atol=1e-8)
+    run = filter_([0.3, -0.7], FULL, [gone, [1.0, -1.0]], **options)
     gap, h = [1.0 - x[0] ** 2, -1.0 - x.sum()], np.array([[2 * x[0], 0.0], [1.0, 1.0]])
     for ours, exact in zip((run.means, run.covariances), conditioned(x, p, gap, h, FULL),
                            strict=True):  # fmt: skip
-        np.testing.assert_allclose(ours[0], exact, atol=1e-7)
+        np.testing.assert_allclose(ours[1], exact, atol=1e-7)
 
 
 @pytest.mark.parametrize("filter_", [unscented, filterpy_ukf])

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distfilt.linalg import SolverError
 from distfilt.network import Channel, graphs
 from distfilt.network.consensus import average
 from distfilt.triangular import AffineMap, affine, compose
@@ -95,12 +94,6 @@ def test_admm_finds_the_map_of_all_samples(graph: graphs.Graph, raw: bool) -> No
         one = AffineMap(*(getattr(solved, n)[agent] for n in
                           ("observed_mean", "mean", "gain", "scale")))
         assert (np.abs(compose(one, *flat, y[0, 0]) - moved) / scale).max() < 1e-4
-
-
-def test_admm_needs_standardised_data() -> None:
-    y, x = _samples(5, 3, raw=True)
-    with pytest.raises(SolverError):
-        pool_by_admm(y, x, Channel(graphs.path(3)), standardise=False, iterations=3000)
 
 
 def test_a_rule_that_diverges_is_blamed_itself() -> None:
