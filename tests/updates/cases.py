@@ -69,6 +69,10 @@ CONSISTENT = [
 """Those whose moments tend to the Kalman filter's."""
 
 
+def rng(seed: int = 1) -> np.random.Generator:
+    return np.random.default_rng(seed)
+
+
 def enough(name: str) -> int:
     """Members for a comparison of moments; a coupling of thousands takes its time."""
     return 300 if "transform" in name else 4000

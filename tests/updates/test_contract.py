@@ -8,13 +8,9 @@ import pytest
 from distfilt.doors import unchecked
 from distfilt.updates.door import stackable
 
-from .cases import CONSISTENT, UPDATES, H, R, Y, enough, kalman, members, moments
+from .cases import CONSISTENT, UPDATES, H, R, Y, enough, kalman, members, moments, rng
 
 BOTH = pytest.mark.parametrize("name", UPDATES)
-
-
-def rng(seed: int = 1) -> np.random.Generator:
-    return np.random.default_rng(seed)
 
 
 @BOTH

@@ -30,14 +30,10 @@ from distfilt.updates import (
 from distfilt.updates.door import Update, stackable
 from distfilt.updates.wrappers import gaspari_cohn
 
-from .cases import UPDATES, H, R, Y, kalman, members, moments
+from .cases import UPDATES, H, R, Y, kalman, members, moments, rng
 
 ROOT = partial(square_root, rotation="none")
 """An update that draws nothing."""
-
-
-def rng(seed: int = 1) -> np.random.Generator:
-    return np.random.default_rng(seed)
 
 
 def test_inflation_multiplies_anomalies_only() -> None:
