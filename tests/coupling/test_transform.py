@@ -72,11 +72,6 @@ def test_copies_do_not_leave_the_choice_to_rounding() -> None:
         assert np.abs(ensemble_transform(nudged, logs) - reference).max() < 1e-9
 
 
-def test_equal_weights_move_nobody() -> None:
-    x, _, _ = _case(4)
-    assert np.abs(ensemble_transform(x, np.zeros(40)) - x).max() < 1e-13
-
-
 def test_weights_that_underflow_and_weights_of_zero() -> None:
     x, logs, _ = _case(5)
     assert np.allclose(ensemble_transform(x, logs - 1e4), ensemble_transform(x, logs), atol=1e-9)
@@ -87,19 +82,19 @@ def test_weights_that_underflow_and_weights_of_zero() -> None:
     assert np.isfinite(ensemble_transform(x, some)).all()
 
 
-def test_one_member_and_a_collapsed_ensemble() -> None:
+def test_equal_weights_one_member_and_a_collapsed_ensemble_move_nobody() -> None:
+    x, _, _ = _case(4)
+    assert np.abs(ensemble_transform(x, np.zeros(40)) - x).max() < 1e-13
     assert (ensemble_transform([[3.0, 4.0]], [-5.0]) == [[3.0, 4.0]]).all()
-    same = np.ones((6, 2))
-    assert (ensemble_transform(same, np.arange(6.0)) == 1).all()
+    assert (ensemble_transform(np.ones((6, 2)), np.arange(6.0)) == 1).all()
 
 
-def test_leading_axes_are_ensembles_of_their_own() -> None:
-    x = np.stack([[_case(s)[0] for s in (1, 2)], [_case(s)[0] for s in (3, 4)]])
-    logs = np.stack([[_case(s)[1] for s in (1, 2)], [_case(s)[1] for s in (3, 4)]])
-    for options in ({}, {"correct": True}):
-        moved = ensemble_transform(x, logs, **options)
-        alone = ensemble_transform(x[1, 0], logs[1, 0], **options)
-        assert np.allclose(moved[1, 0], alone, atol=1e-12)
+@pytest.mark.parametrize("correct", [False, True])
+def test_leading_axes_are_ensembles_of_their_own(correct: bool) -> None:
+    x, logs = (np.stack(part) for part in list(zip(*map(_case, range(4)), strict=True))[:2])
+    moved = ensemble_transform(x.reshape(2, 2, 40, 3), logs.reshape(2, 2, 40), correct=correct)
+    alone = ensemble_transform(x[2], logs[2], correct=correct)
+    assert np.allclose(moved[1, 0], alone, atol=1e-12)
 
 
 @example(8, 4, 6)  # fewer members than components

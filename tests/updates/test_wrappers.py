@@ -77,19 +77,16 @@ def test_serial_without_a_sensor_is_exact_for_linear_readings() -> None:
 
 def test_serial_predicts_again() -> None:
     """Two curved readings: the second is predicted from the members as the first left them."""
-    x = members(30)
-    both = lambda e: np.stack([e[:, 0] ** 2, np.exp(e[:, 0])], axis=1)  # noqa: E731
-    diagonal, y = np.diag([0.5, 0.9]), np.array([1.5, 3.0])
-    source = rng(4)
-    out = serial(exact_draws)(x, both(x), y, diagonal, rng=source, predict=both)
-    source = rng(4)
-    first = with_missing(exact_draws, x, both(x)[:, :1], y[:1], diagonal[:1, :1], rng=source)
-    second = with_missing(
-        exact_draws, first, both(first)[:, 1:], y[1:], diagonal[1:, 1:], rng=source
-    )
+    def both(e: np.ndarray) -> np.ndarray:
+        return np.stack([e[:, 0] ** 2, np.exp(e[:, 0])], axis=1)
+
+    x, y = members(30), np.array([1.5, 3.0])
+    four = x, both(x), y, np.diag([0.5, 0.9])
+    out = serial(ROOT)(*four, rng=rng(), predict=both)
+    first = ROOT(x, both(x)[:, :1], y[:1], [[0.5]], rng=rng())
+    second = ROOT(first, both(first)[:, 1:], y[1:], [[0.9]], rng=rng())
     assert np.allclose(out, second, atol=1e-13)
-    without = serial(exact_draws)(x, both(x), y, diagonal, rng=rng(4))
-    assert np.abs(without - out).max() > 1e-3
+    assert np.abs(serial(ROOT)(*four, rng=rng()) - out).max() > 1e-3
 
 
 def test_serial_serves_more_readings_than_members() -> None:
