@@ -11,9 +11,7 @@ import numpy as np
 from .doors import Array, Count, Rng, Semidefinite, door, unchecked
 from .linalg import EPS, cholesky, factor, leading, solve_upper, symmetrise
 
-__all__ = [  # fmt: skip
-    "Ensemble", "Members", "anomalies", "draw", "exact_noise", "mean", "sample_covariance",
-]
+__all__ = ["Members", "draw", "mean", "sample_covariance"]
 
 
 def _at_least(members: int, value: Array, name: str) -> None:

@@ -15,7 +15,7 @@ from scipy.linalg.lapack import dpotrf, dtrtrs
 
 from .doors import Array, NonNegative, Semidefinite, door, unchecked
 
-__all__ = ["SolverError", "factor", "van_loan"]
+__all__ = ["SolverError", "factor"]
 
 EPS = float(np.finfo(np.float64).eps)
 _STEP = 6e-6

@@ -25,7 +25,7 @@ WITHOUT = {
     r".*(Error|Collapse|Gain)": "an error or a warning, which a user catches",
     r"filters\.(\w*State|Summary|Filter)|network\.\w*(State|Run)|metrics\.Interval|coupling\.Plan":
         "made by the library, or derived from by a user",
-    r"ensembles\.(Ensemble|Members)|models\.Swarm|triangular\.ConditionalMap": "a type",
+    r"ensembles\.Members|models\.Swarm": "a type",
     r"updates\.(update|effective_size|with_missing)":
         "looks at what has no kind: a function's signature, logarithms with -inf, a step's own",
 }  # fmt: skip

@@ -16,8 +16,8 @@ from distfilt.gaussians import (
     intersection,
     intersection_weights,
     log_density,
-    recolour,
 )
+from distfilt.gaussians.single import recolour
 from tests.support import NAN, generator, spd, unit_gap
 
 SEEDS = st.integers(0, 10_000)

@@ -9,7 +9,6 @@ from scipy.integrate import quad
 
 from distfilt.metrics import (
     crps,
-    ensemble_nees,
     gaussian_crps,
     log_score,
     mean_interval,
@@ -18,6 +17,7 @@ from distfilt.metrics import (
     nis,
     squared_error,
 )
+from distfilt.metrics.scores import ensemble_nees
 from tests.support import generator, spd
 
 RNG = np.random.default_rng(0)

@@ -200,8 +200,8 @@ def code_lines(path: Path) -> int:
     return len(found)
 
 
-MODULE = 403
-LIMITS = {"lines": 9550, "files": 90, "rooms": 16, "names": 260, "unreached": 20, "private": 0}
+MODULE = 400
+LIMITS = {"lines": 9250, "files": 90, "rooms": 16, "names": 260, "unreached": 0, "private": 0}
 
 
 def private_imports() -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from distfilt.gaussians import unscented_points
+from distfilt.gaussians.single import unscented_points
 
 from .support import generator, spd
 

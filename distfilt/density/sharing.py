@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..doors import MISSING, Array, Count, Mask, NonNegative, Places, Positive, Record, unchecked
-from ..network import Channel, Graph, PIState, first_order, pi_step
+from ..network import Channel, Graph, PIState, pi_step
 from ..network import weights as weighting
 from ..network.channel import Lost
+from ..network.dynamic import first_order
 from ..network.graphs import disk
 from .grid import Grid
 from .kernel import kernel_density, kernel_information, kernels

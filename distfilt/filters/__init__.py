@@ -4,11 +4,11 @@ from .base import Filter
 from .density import DensityFilter, DensityState
 from .ensemble import EnsembleFilter, EnsembleState
 from .gaussian import GaussianFilter, GaussianState
-from .inputs import Late, Reading, members_of, mixture_of, moments_of
+from .inputs import Late, Reading, moments_of
 from .mixture import MixtureFilter, MixtureState
 from .news import NewsFilter, increment
-from .particle import ParticleCollapse, ParticleFilter, ParticleState
-from .record import Summary, final_state
+from .particle import ParticleCollapse, ParticleFilter
+from .record import Summary
 from .saving import SensorState, State
 from .step import FilterError, Step
 from .transport import TransportFilter
@@ -16,7 +16,6 @@ from .transport import TransportFilter
 __all__ = [  # fmt: skip
     "DensityFilter", "DensityState", "EnsembleFilter", "EnsembleState", "Filter", "FilterError",
     "GaussianFilter", "GaussianState", "Late", "MixtureFilter", "MixtureState", "NewsFilter",
-    "ParticleCollapse", "ParticleFilter", "ParticleState", "Reading", "SensorState", "State",
-    "Step", "Summary", "TransportFilter", "final_state", "increment", "members_of", "mixture_of",
-    "moments_of",
+    "ParticleCollapse", "ParticleFilter", "Reading", "SensorState", "State", "Step", "Summary",
+    "TransportFilter", "increment", "moments_of",
 ]

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from ..doors import Array, Bounds, Index, Positive, Record, Rng, door
 from ..models import Model
-from ..network import Channel, Faults, Ledger, as_graph, fused_kind
+from ..network import Channel, Faults, Ledger, fused_kind
+from ..network.graphs import as_graph
 from .inbox import Inbox
 from .inputs import Late, Team, belated, planned, said_by_all, team_of
 from .record import SCORES, Recorder, Score, Summary
@@ -371,8 +372,8 @@ class Filter(Record, ABC):
             ``total_squared_error`` add components up, whatever their units, and say so; ``nees``
             is d on average for a consistent filter. ``messages``, ``scalars``, ``bytes``, ``lost``
             and ``rounds`` are those of each step, the same names with ``_total`` their sums;
-            ``refused`` counts what the `gate` left out. :func:`final_state` gives the state at the
-            end.
+            ``refused`` counts what the `gate` left out;
+            :func:`distfilt.filters.record.final_state` gives the state at the end.
         """
         return self._recorded(state, times, observations, truth, scores, late, 0)
 
@@ -396,5 +397,3 @@ def described(model: Model) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Names and units of a model's components; their numbers where it has no names."""
     names = tuple(model.names) or tuple(str(k) for k in range(model.dim))
     return names, tuple(model.units) or ("",) * model.dim
-
-

@@ -22,7 +22,8 @@ from ..density import (
 from ..density.kernel import fine_enough
 from ..density.sharing import Seen, alone, present_graph
 from ..doors import Array, Count, NonNegative, Places, Positive, array, unchecked
-from ..network import Channel, Graph, as_graph
+from ..network import Channel, Graph
+from ..network.graphs import as_graph
 from .base import Filter
 from .inputs import one_each
 from .record import Summary

@@ -18,8 +18,9 @@ from ..doors import Array, Bounds, array, unchecked
 from ..models import Model
 from ..network import Graph, intersection
 from ..sensors import Sensor
-from ..updates import exact_draws, exact_forecast, known_noise, sampled_forecast, with_missing
+from ..updates import exact_draws, known_noise, sampled_forecast, with_missing
 from ..updates.door import stackable
+from ..updates.forecasts import exact_forecast
 from .base import Filter
 from .inbox import Heard
 from .inputs import members_of

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 
 from ..doors import Array, Count, NonNegative, Positive, unchecked
-from ..gaussians import conditioned, unscented_points
+from ..gaussians.single import conditioned, unscented_points
 from ..linalg import symmetrise
 from .base import Filter
 from .inbox import Heard

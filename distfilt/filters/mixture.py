@@ -11,14 +11,9 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from ..doors import Array, Bounds, Count, unchecked
-from ..mixtures import (
-    GaussianMixture,
-    conditioned,
-    moved,
-    split_stretched,
-    two_stage,
-    within_gate,
-)
+from ..mixtures import GaussianMixture, conditioned, moved, two_stage
+from ..mixtures.conditioning import within_gate
+from ..mixtures.splitting import split_stretched
 from ..models import Model
 from .base import Filter, described
 from .inputs import Said, mixture_of, priors_of

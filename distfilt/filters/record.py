@@ -10,7 +10,8 @@ import numpy as np
 
 from ..doors import Array, array, unchecked
 from ..ensembles import sample_covariance
-from ..metrics import crps, ensemble_nees, gaussian_crps, nees
+from ..metrics import crps, gaussian_crps, nees
+from ..metrics.scores import ensemble_nees
 from .saving import State
 
 if TYPE_CHECKING:

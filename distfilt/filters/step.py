@@ -172,7 +172,8 @@ class Step:
                     for (place, said), value in zip(outgoing[sender], values, strict=False):
                         has.append((sender, place, said._replace(value=value)))
                 has.sort(key=lambda item: item[0])
-        known: dict[int, list[list[tuple[Sensor, Array]]]] = defaultdict(lambda: [[] for _ in found])
+        known: dict[int, list[list[tuple[Sensor, Array]]]]
+        known = defaultdict(lambda: [[] for _ in found])
         for agent, has in enumerate(found):
             for _, place, said in has:
                 known[place][agent].append((said.sensor, said.value))

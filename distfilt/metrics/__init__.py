@@ -3,7 +3,6 @@
 from .intervals import Interval, mean_interval, median_interval, proportion_interval
 from .scores import (
     crps,
-    ensemble_nees,
     gaussian_crps,
     log_score,
     nees,
@@ -13,6 +12,6 @@ from .scores import (
 )
 
 __all__ = [  # fmt: skip
-    "Interval", "crps", "ensemble_nees", "gaussian_crps", "log_score", "mean_interval",
-    "median_interval", "nees", "nees_band", "nis", "proportion_interval", "squared_error",
+    "Interval", "crps", "gaussian_crps", "log_score", "mean_interval", "median_interval", "nees",
+    "nees_band", "nis", "proportion_interval", "squared_error",
 ]

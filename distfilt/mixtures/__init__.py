@@ -1,7 +1,7 @@
 """Gaussian mixtures: densities, fusion of a shared part of the state, reduction, divergences."""
 
 from .agreement import average, fuse, fuse_in_turn, fuse_moments, target_fusion
-from .conditioning import conditioned, moved, within_gate
+from .conditioning import conditioned, moved
 from .divergence import Divergence, jeffreys_by_sampling, jeffreys_of_many
 from .fusion import PartialFusion
 from .gaussian import GaussianMixture
@@ -14,12 +14,12 @@ from .reduction import (
     runnalls,
     two_stage,
 )
-from .splitting import arc, split, split_library, split_stretched, stretching
+from .splitting import arc, split, split_library, stretching
 
 __all__ = [  # fmt: skip
     "Divergence", "GaussianMixture", "PartialFusion", "Shapes", "arc", "average", "conditioned",
     "cross_relevance", "fuse", "fuse_in_turn", "fuse_moments", "jeffreys_by_sampling",
     "jeffreys_of_many", "kept_by_relevance", "merge_costs", "moved", "nonnegative_least_squares",
-    "pivoted_qr", "runnalls", "split", "split_library", "split_stretched", "stretching",
-    "target_fusion", "tikhonov", "two_stage", "within_gate",
+    "pivoted_qr", "runnalls", "split", "split_library", "stretching", "target_fusion", "tikhonov",
+    "two_stage",
 ]

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ..doors import MISSING, Array, Bounds, Cov, door, unchecked
-from ..gaussians import unscented_points
+from ..gaussians.single import unscented_points
 from .gaussian import GaussianMixture
 
 __all__ = ["PointRule", "conditioned", "moved", "within_gate"]

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..doors import Array, Count, Record, Share, door, summing_to_one, unchecked
-from ..gaussians import unscented_points
+from ..gaussians.single import unscented_points
 from ..linalg import SolverError
 from .gaussian import GaussianMixture, log_sum
 from .mixands import Shapes, conditional_shapes, literal_shapes, nonnegative_least_squares

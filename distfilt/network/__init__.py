@@ -16,7 +16,6 @@ from .consensus import (
 from .dynamic import (
     PIState,
     event_triggered,
-    first_order,
     flood,
     gossip,
     pi_start,
@@ -32,14 +31,14 @@ from .fusion import (
     naive_fusion,
     pull,
 )
-from .graphs import Graph, as_graph
+from .graphs import Graph
 from .ledger import Ledger
 from .weights import UnstableGain, Weights
 
 __all__ = [  # fmt: skip
     "AdmmRun", "Channel", "Disconnected", "Faults", "Graph", "Ledger", "PIState", "UnstableGain",
-    "Weights", "admm", "arithmetic_average", "as_graph", "average", "consensus_pull",
-    "covariance_intersection", "event_triggered", "finite_time", "first_order", "flood",
-    "fused_kind", "fuses", "gossip", "graphs", "intersection", "maximum", "naive_fusion",
-    "pi_start", "pi_step", "pull", "push_sum", "stable_substeps", "weights",
+    "Weights", "admm", "arithmetic_average", "average", "consensus_pull", "covariance_intersection",
+    "event_triggered", "finite_time", "flood", "fused_kind", "fuses", "gossip", "graphs",
+    "intersection", "maximum", "naive_fusion", "pi_start", "pi_step", "pull", "push_sum",
+    "stable_substeps", "weights",
 ]

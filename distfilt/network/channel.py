@@ -39,7 +39,7 @@ class Channel:
     ----------
     graph : Graph
         The links at this time; or a networkx graph, a matrix of links, or edges: see
-        :func:`distfilt.network.as_graph`.
+        :func:`distfilt.network.graphs.as_graph`.
     ledger : Ledger, optional
         What was sent before; empty by default. Its count of rounds numbers the losses.
     runs : tuple of int

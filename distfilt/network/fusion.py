@@ -13,7 +13,8 @@ import numpy as np
 
 from ..doors import Array, Bounds, Count, Mask, NonNegative, definite, door, unchecked
 from ..ensembles import mean, sample_covariance
-from ..gaussians import intersection_weights, recolour
+from ..gaussians import intersection_weights
+from ..gaussians.single import recolour
 from ..linalg import cholesky, solve_lower, symmetrise
 from ._links import Indices
 from .channel import Channel
@@ -56,8 +57,7 @@ def covariance_intersection(
     channel : Channel
         Mean and covariance go over each link, d + d(d+1)/2 scalars. What is lost is left out.
     rule : {"equal", "trace", "determinant", "min_trace", "min_determinant"}
-        How an agent weights what it has: see
-        :func:`distfilt.gaussians.intersection_weights`.
+        How an agent weights what it has: see :func:`distfilt.gaussians.intersection_weights`.
     rounds : int
         How many times.
 
@@ -213,8 +213,7 @@ def pull(
     ensembles : array_like, (*runs, A, N, d)
         One ensemble per agent.
     channel : Channel
-        The door between agents; only means pass through it, d scalars a link and round. A mean
-        that is lost does not pull.
+        Only means go over each link, d scalars a round. A mean that is lost does not pull.
     gain : float
         The gain γ, at least 0; 0 sends nothing and changes nothing.
     rounds : int

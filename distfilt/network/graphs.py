@@ -14,7 +14,7 @@ from ..doors import Array, Bounds, Count, Index, Positive, Record, door
 from . import _links
 from ._links import Indices
 
-__all__ = ["Graph", "as_graph", "complete", "disk", "grid", "path", "ring", "star"]
+__all__ = ["Graph", "complete", "disk", "grid", "path", "ring", "star"]
 
 
 @dataclass(frozen=True, eq=False)

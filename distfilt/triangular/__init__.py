@@ -1,11 +1,11 @@
 """Triangular transport maps: fit one to samples of (y, x), then condition on an observation."""
 
 from . import affine, separable
-from .affine import AffineMap, ConditionalMap, compose
+from .affine import AffineMap, compose
 from .pooling import pool_by_admm, pool_by_moments
 from .separable import SeparableMap
 
 __all__ = [  # fmt: skip
-    "AffineMap", "ConditionalMap", "SeparableMap", "affine", "compose", "pool_by_admm",
-    "pool_by_moments", "separable",
+    "AffineMap", "SeparableMap", "affine", "compose", "pool_by_admm", "pool_by_moments",
+    "separable",
 ]

@@ -24,9 +24,7 @@ from .. import ensembles
 from ..doors import Array, Record, door, needed, unchecked
 from ..linalg import SolverError, leading
 
-__all__ = [  # fmt: skip
-    "AffineMap", "ConditionalMap", "compose", "fit", "fit_convex", "gradient", "objective",
-]
+__all__ = ["AffineMap", "compose", "fit", "fit_convex", "gradient", "objective"]
 
 Seen = Annotated[Array, "... N M"]
 Members = Annotated[Array, "... N d"]

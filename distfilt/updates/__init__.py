@@ -1,7 +1,7 @@
 """Updates: what an ensemble makes of an observation, ``(ensemble, predicted, observed, noise)``."""
 
 from .door import update, with_missing
-from .forecasts import exact_forecast, sampled_forecast
+from .forecasts import sampled_forecast
 from .gaussian import exact_draws, known_noise, sampled_noise, square_root
 from .particles import effective_size, jitter, resampled
 from .transport import (
@@ -14,9 +14,8 @@ from .transport import (
 from .wrappers import augmented, gated, inflated, localised, projected, retracted, serial
 
 __all__ = [  # fmt: skip
-    "augmented", "effective_size", "ensemble_transform", "exact_draws", "exact_forecast",
-    "gated", "inflated", "jitter", "known_noise", "localised", "principal_components",
-    "principal_directions", "projected", "resampled", "retracted", "sampled_forecast",
-    "sampled_noise", "serial", "square_root", "transport", "transport_sample", "update",
-    "with_missing",
+    "augmented", "effective_size", "ensemble_transform", "exact_draws", "gated", "inflated",
+    "jitter", "known_noise", "localised", "principal_components", "principal_directions",
+    "projected", "resampled", "retracted", "sampled_forecast", "sampled_noise", "serial",
+    "square_root", "transport", "transport_sample", "update", "with_missing",
 ]

@@ -10,7 +10,8 @@ import numpy as np
 from .. import coupling
 from ..doors import Array, Bounds, Count, NonNegative, Rng, door, unchecked
 from ..ensembles import sample_covariance
-from ..triangular import ConditionalMap, affine, compose
+from ..triangular import affine, compose
+from ..triangular.affine import ConditionalMap
 from .door import perturbed, several, update
 from .particles import log_likelihood, warn_of_collapse
 

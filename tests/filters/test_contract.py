@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from distfilt.filters import FilterError, Late, final_state
+from distfilt.filters import FilterError, Late
+from distfilt.filters.record import final_state
 from distfilt.models import LinearModel, Model
 from distfilt.network import Faults, graphs
 from distfilt.sensors import Sensor, direct
@@ -354,11 +355,3 @@ def test_bad_run_is_named_and_others_go_on(family: str) -> None:
     assert np.isfinite(run["mean"].values[0]).all()
     recorded = [value.values for value in run.values() if "run" in value.dims]
     assert len(recorded) >= 6 and all(np.isnan(value[1:, 1]).all() for value in recorded)
-
-
-
-
-
-
-
-

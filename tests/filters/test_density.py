@@ -21,7 +21,8 @@ from distfilt.density import (
     zero_mean_prior,
 )
 from distfilt.density.sharing import Seen
-from distfilt.filters import DensityFilter, DensityState, final_state
+from distfilt.filters import DensityFilter, DensityState
+from distfilt.filters.record import final_state
 from distfilt.models import rotating_swarm
 from distfilt.network import Faults, Graph, graphs
 

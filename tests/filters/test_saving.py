@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from distfilt.filters import EnsembleState, ParticleState, State
+from distfilt.filters import EnsembleState, State
+from distfilt.filters.particle import ParticleState
 from distfilt.network import Ledger
 
 
@@ -130,5 +131,3 @@ def test_what_cannot_be_saved_says_so(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="objects"):
         state.save(tmp_path / "a.npz")
     assert not list(tmp_path.iterdir())
-
-

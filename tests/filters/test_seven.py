@@ -23,8 +23,8 @@ from distfilt.filters import (
     ParticleFilter,
     Reading,
     TransportFilter,
-    final_state,
 )
+from distfilt.filters.record import final_state
 from distfilt.kalman import kalman_filter
 from distfilt.mixtures import GaussianMixture, target_fusion
 from distfilt.models import LinearModel, lorenz63, rotating_swarm

@@ -14,10 +14,10 @@ from distfilt.mixtures import (
     moved,
     split,
     split_library,
-    split_stretched,
     stretching,
-    within_gate,
 )
+from distfilt.mixtures.conditioning import within_gate
+from distfilt.mixtures.splitting import split_stretched
 
 from .examples import affine, random_mixture, same, scales, shuffled
 

@@ -18,7 +18,6 @@ from distfilt.network import (
     average,
     event_triggered,
     finite_time,
-    first_order,
     flood,
     gossip,
     graphs,
@@ -29,6 +28,7 @@ from distfilt.network import (
     stable_substeps,
     weights,
 )
+from distfilt.network.dynamic import first_order
 from tests.network.helpers import GRID, REFERENCE, named, rng
 
 GAINS = {"alpha": 0.2, "a": 0.4, "b": 0.04}

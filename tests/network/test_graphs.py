@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from scipy import sparse
 from scipy.sparse.csgraph import shortest_path
 
-from distfilt.network import Graph, as_graph, graphs
+from distfilt.network import Graph, graphs
 from distfilt.network._links import diameter_bound
+from distfilt.network.graphs import as_graph
 from tests.network.helpers import DISK, STAR, random_graph, rng
 
 SHAPES = {

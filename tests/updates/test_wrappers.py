@@ -14,7 +14,6 @@ from distfilt.updates import (
     augmented,
     ensemble_transform,
     exact_draws,
-    exact_forecast,
     gated,
     inflated,
     known_noise,
@@ -28,6 +27,7 @@ from distfilt.updates import (
     with_missing,
 )
 from distfilt.updates.door import Update, stackable
+from distfilt.updates.forecasts import exact_forecast
 from distfilt.updates.wrappers import gaspari_cohn
 
 from .cases import UPDATES, H, R, Y, kalman, members, moments, rng
