@@ -8,9 +8,7 @@ from scipy.integrate import solve_ivp
 
 from distfilt.models import orbit
 from distfilt.models.orbit import (
-    J2,
     MU,
-    RADIUS,
     acceleration,
     occulted,
     orbits,
@@ -30,14 +28,6 @@ def test_acceleration_is_the_gradient_of_the_potential() -> None:
     h = 1e-2 * np.eye(3)
     slope = np.stack([(potential(r + e) - potential(r - e)) / 2e-2 for e in h], axis=-1)
     assert np.abs(slope - acceleration(r)).max() < 1e-7 * np.abs(slope).max()
-    # Without oblateness it is Newton's, and the printed (47) is not the gradient.
-    size = np.linalg.norm(r, axis=1, keepdims=True)
-    flat = acceleration(r) + MU * r / size**3
-    z = r[:, 2:]
-    printed = 0.5 * J2 * MU * RADIUS**2 * (
-        15 * r * z**2 / size**2 - 3 * r * z**2 / size**2 - 6 * z * [0, 0, 1]
-    )
-    assert np.abs(printed - flat).max() > 1e3 * np.abs(flat).max()
 
 
 @pytest.mark.parametrize("start", [MEO, GEO])
@@ -101,11 +91,6 @@ def test_frames_are_rotations_along_the_motion() -> None:
 def test_the_printed_sign_hides_the_agents_from_each_other() -> None:
     other = np.array([36581.86, -21120.55, 0.0])
     assert not occulted(GEO[:3], other)
-    turn = np.degrees(np.arccos(GEO[:3] @ other / np.linalg.norm(GEO[:3]) / np.linalg.norm(other)))
-    assert abs(turn - 30) < 0.01
-    printed = -GEO[:3]
-    assert abs(np.degrees(np.arccos(
-        printed @ other / np.linalg.norm(printed) / np.linalg.norm(other))) - 150) < 0.01
-    assert occulted(printed, MEO[:3]) and not occulted(GEO[:3], MEO[:3])
+    assert occulted(-GEO[:3], MEO[:3]) and not occulted(GEO[:3], MEO[:3])
     # A line that ends before the Earth is free.
     assert not occulted([42000.0, 0, 0], [8000.0, 0, 0])
