@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 import socket
 import subprocess
 import sys
@@ -142,10 +141,7 @@ def wait(what: Any, seconds: int = 240) -> Any:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not shutil.which("chromium"), reason="needs chromium and chromedriver")
 def test_in_jupyterlab_a_chapter_runs_and_is_saved_apart(tmp_path: Path) -> None:
-    from test_browser import FLAGS
-
     folder, stem = tmp_path / "copy", "01-bayes-and-kalman"
     lab.main([str(folder), "--no-open"])
     saved = folder / "book" / f"{stem}.ipynb"
@@ -160,7 +156,7 @@ def test_in_jupyterlab_a_chapter_runs_and_is_saved_apart(tmp_path: Path) -> None
     server = subprocess.Popen(command, env=lab.settings(folder), stderr=subprocess.DEVNULL)
     try:
         wait(lambda: urllib.request.urlopen(f"{address}/api"))
-        _run_all(address, stem, tmp_path, FLAGS)
+        _run_all(address, stem, tmp_path)
     finally:
         server.terminate()
         server.wait()
@@ -181,21 +177,14 @@ def _emptied(path: Path) -> None:
     nbformat.write(notebook, path)
 
 
-def _run_all(address: str, stem: str, scratch: Path, flags: tuple[str, ...]) -> None:
+def _run_all(address: str, stem: str, scratch: Path) -> None:
     """Open a chapter, run all its cells, move its sliders, save it."""
-    from selenium import webdriver
-    from selenium.webdriver.chrome.options import Options
-    from selenium.webdriver.chrome.service import Service
+    from test_browser import chromium
 
-    options = Options()
-    options.binary_location = str(shutil.which("chromium"))
-    for flag in (*flags, f"--user-data-dir={scratch / 'profile'}", "--window-size=1400,1000"):
-        options.add_argument(flag)
-    driver = webdriver.Chrome(options=options, service=Service(shutil.which("chromedriver")))
-    driver.set_script_timeout(600)
     command = ("const done = arguments[1]; jupyterapp.commands.execute(arguments[0])"
                ".then(() => done('done'), e => done(String(e)));")  # fmt: skip
-    try:
+    with chromium(scratch / "profile") as driver:
+        driver.set_script_timeout(600)
         driver.get(f"{address}/lab/tree/{stem}.ipynb")
         # Cells that are run before the kernel is there make JupyterLab ask for one.
         ready = ("return window.jupyterapp?.shell.currentWidget?.sessionContext?.session?.kernel"
@@ -210,5 +199,3 @@ def _run_all(address: str, stem: str, scratch: Path, flags: tuple[str, ...]) -> 
         )
         assert moved and all(moved)
         assert driver.execute_async_script(command, "docmanager:save") == "done"
-    finally:
-        driver.quit()

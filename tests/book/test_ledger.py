@@ -2,30 +2,15 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import pytest
 
 from bookkit.rows import read_rows
 from ledger import COLUMNS, ITEMS, LEDGER, VERDICTS, current, ledger, summaries, text_of
 
-ITEM = {
-    "paper": "grange",
-    "item": "Fig. 1",
-    "kind": "results",
-    "title": "Error",
-    "chapter": "04-satellite-network",
-}
+HOME = {"paper": "grange", "item": "Fig. 1", "chapter": "04-satellite-network"}
+ITEM = {**HOME, "kind": "results", "title": "Error"}
 TABLE = {**ITEM, "item": "Table I", "kind": "parameters"}
-VERDICT = {
-    "paper": "grange",
-    "item": "Fig. 1",
-    "chapter": "04-satellite-network",
-    "verdict": "differs",
-    "ours": "0.08",
-    "published": "unstable",
-    "why": "a, b",
-}
+VERDICT = {**HOME, "verdict": "differs", "ours": "0.08", "published": "unstable", "why": "a, b"}
 
 
 def test_ledger_is_what_the_chapters_give() -> None:
@@ -33,8 +18,6 @@ def test_ledger_is_what_the_chapters_give() -> None:
 
 
 def test_ledger_has_every_item_once() -> None:
-    papers = Counter(row["paper"] for row in read_rows(ITEMS))
-    assert papers == {"grange": 5, "das": 5, "semeraro": 9, "zheng": 2}
     items = [(row["paper"], row["item"]) for row in read_rows(ITEMS)]
     rows = read_rows(LEDGER)
     assert [(row["paper"], row["item"]) for row in rows] == items

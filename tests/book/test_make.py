@@ -48,20 +48,20 @@ def makes_it(folder: Path) -> bool:
     return "environment.py" in done.stdout
 
 
-def test_a_whole_environment_is_kept(clone: Path) -> None:
-    pretend(clone, str(clone))
-    assert not makes_it(clone)
-
-
-def test_a_changed_lock_updates_it(clone: Path) -> None:
-    pretend(clone, str(clone))
-    os.utime(clone / ".venv" / "stamp", (1, 1))
-    assert makes_it(clone)
-
-
-def test_no_environment_or_half_of_one_is_made_again(clone: Path) -> None:
+def test_only_a_whole_environment_is_kept(clone: Path) -> None:
+    """None, half of one, a whole one, a changed lock, and a Python that is gone."""
     assert makes_it(clone)
     pretend(clone, None)
+    assert makes_it(clone)
+    stamp, python = clone / ".venv" / "stamp", clone / ".venv" / "bin" / "python"
+    stamp.write_text(f"{clone}\n")
+    assert not makes_it(clone)
+    os.utime(stamp, (1, 1))
+    assert makes_it(clone)
+    os.utime(stamp)
+    assert not makes_it(clone)
+    python.unlink()
+    python.symlink_to("/nowhere/python")
     assert makes_it(clone)
 
 
@@ -71,13 +71,6 @@ def test_a_moved_or_copied_folder_makes_its_own(clone: Path, tmp_path: Path) -> 
     shutil.copytree(clone, copied, symlinks=True)
     assert makes_it(copied) and not makes_it(clone)
     assert makes_it(clone.rename(tmp_path / "moved"))
-
-
-def test_an_environment_whose_python_is_gone_is_made_again(clone: Path) -> None:
-    pretend(clone, str(clone))
-    (clone / ".venv" / "bin" / "python").unlink()
-    (clone / ".venv" / "bin" / "python").symlink_to("/nowhere/python")
-    assert makes_it(clone)
 
 
 def test_an_old_python_is_named_and_leaves_nothing(clone: Path) -> None:
