@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
@@ -314,11 +315,7 @@ def _by_receiver(graph: Graph, sent: Sequence[Any], links: Any) -> list[dict[int
 
 def _after_loss(graph: Graph, w: Weights, arrived: Mask, lost: str) -> tuple[Array, Array]:
     """Own and link weights of each run, (R, A) and (R, E), once some messages are missing."""
-    ends = graph.receivers
-
-    def sums(per_link: Array) -> Array:
-        return np.asarray((graph.incidence @ per_link.T).T)
-
+    ends, sums = graph.receivers, partial(graph._summed, axis=1)
     if lost in ("mutual", "metropolis"):
         arrived = arrived & arrived[:, graph.reverse]
     if lost == "metropolis":

@@ -234,16 +234,9 @@ def push_sum(values: PerAgent, channel: Channel, *, rounds: Count) -> Array:
         pushed = pushed + share * mass
         arrived = carry(pushed[..., graph.senders, :])
         latest = np.where(np.isnan(arrived), heard, arrived)
-        mass = share * mass + _summed(latest - heard, channel)
+        mass = share * mass + graph._summed(latest - heard)
         heard = latest
     return np.asarray(mass[..., :-1] / mass[..., -1:])
-
-
-def _summed(per_link: Array, channel: Channel) -> Array:
-    """Sum of what each agent received over its links, (*runs, A, k)."""
-    front = np.moveaxis(per_link, -2, 0)
-    out = channel.graph.incidence @ front.reshape(front.shape[0], -1)
-    return np.moveaxis(out.reshape(channel.graph.size, *front.shape[1:]), 0, -2)
 
 
 @fuses("vectors")

@@ -227,7 +227,8 @@ def gossip(values: PerAgent, channel: Channel, *, rounds: Count, rng: Rng) -> Ar
     >>> channel.ledger.messages.sum()
     np.int64(400)
     """
-    _pairwise(channel)
+    channel.graph._undirected()
+    _prompt(channel)
     graph, carry, out = channel.graph, unchecked(channel.carry), values.copy()
     awake = rng.integers(graph.size, size=rounds)
     chosen = (rng.random(rounds) * graph.degrees[awake]).astype(np.int64)
@@ -295,7 +296,8 @@ def event_triggered(
     (True, True)
     """
     _alone(channel)
-    _pairwise(channel)
+    channel.graph._undirected()
+    _prompt(channel)
     graph, carry, x = channel.graph, unchecked(channel.carry), values
     w = metropolis(graph)
     faulty = not channel.faults.none
@@ -360,11 +362,6 @@ def flood(values: PerAgent, channel: Channel, *, rounds: Count | None = None) ->
             news.append([new[owner] for owner in sorted(new)])
     average = np.array([np.mean([k[a][1:] for a in sorted(k)], axis=0) for k in known])
     return average, np.array([[a in k for a in range(size)] for k in known])
-
-
-def _pairwise(channel: Channel) -> None:
-    channel.graph._undirected()
-    _prompt(channel)
 
 
 def _prompt(channel: Channel) -> None:

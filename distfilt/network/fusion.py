@@ -124,10 +124,11 @@ def arithmetic_average(belief: Gaussians, channel: Channel, *, rounds: Count = 1
     def step(heard: _Heard) -> Pair:
         own, links = _by_rule(heard, "equal")
         gap = heard.gaps()
-        moved = heard.sums(links[..., None] * gap)
+        moved = heard.graph._summed(links[..., None] * gap, 1)
         # From the new mean: the own one lies -moved away, a heard one gap - moved.
         left = gap - moved[:, heard.graph.receivers]
-        spread = heard.sums(links[..., None, None] * left[..., :, None] * left[..., None, :])
+        spread = links[..., None, None] * left[..., :, None] * left[..., None, :]
+        spread = heard.graph._summed(spread, 1)
         spread += own[..., None, None] * moved[..., :, None] * moved[..., None, :]
         covs = heard.mixed(own, links, heard.covs, heard.sent_covs)
         return heard.means + moved, symmetrise(covs + spread)
@@ -300,17 +301,10 @@ class _Heard:
     sent_covs: Array
     arrived: Mask
 
-    def sums(self, per_link: Array) -> Array:
-        """What each agent's links carry, added: (R, E, ...) to (R, A, ...)."""
-        runs, edges, *rest = per_link.shape
-        flat = per_link.swapaxes(0, 1).reshape(edges, -1)
-        out = np.asarray(self.graph.incidence @ flat)
-        return out.reshape(self.graph.size, runs, *rest).swapaxes(0, 1)
-
     def mixed(self, own: Array, links: Array, mine: Array, sent: Array) -> Array:
         """Weighted sums of matrices (R, A, d, d), the own one and what each sender sent."""
         heard = links[..., None, None] * sent[:, self.graph.senders]
-        return own[..., None, None] * mine + self.sums(heard)
+        return own[..., None, None] * mine + self.graph._summed(heard, 1)
 
     def gaps(self) -> Array:
         """The heard mean less the own one, on each link, (R, E, d)."""
@@ -367,7 +361,7 @@ def _by_rule(heard: _Heard, rule: Rule) -> Pair:
         own = _size_weights(heard.covs, rule)
         sent = own if heard.sent_covs is heard.covs else _size_weights(heard.sent_covs, rule)
         links = sent[:, heard.graph.senders] * heard.arrived
-    total = own + heard.sums(links)
+    total = own + heard.graph._summed(links, 1)
     return own / total, links / total[:, heard.graph.receivers]
 
 
@@ -389,7 +383,8 @@ def _information_sum(heard: _Heard, own: Array, links: Array) -> Pair:
     total = _inverse(heard.mixed(own, links, mine, sent))
     # About the own mean, so that equal means stay and large ones lose no digits.
     turned = (sent[:, heard.graph.senders] @ heard.gaps()[..., None])[..., 0]
-    moved = (total @ heard.sums(links[..., None] * turned)[..., None])[..., 0]
+    pulled = heard.graph._summed(links[..., None] * turned, 1)
+    moved = (total @ pulled[..., None])[..., 0]
     return heard.means + moved, symmetrise(total)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any
@@ -129,6 +130,13 @@ class Graph(Record):
         edges = self.senders.size
         parts = np.ones(edges), np.arange(edges), self.links.indptr
         return sparse.csr_array(parts, (self.size, edges))
+
+    def _summed(self, per_link: Array, axis: int = -2) -> Array:
+        """What arrives over each agent's links, added: E entries along an axis become A."""
+        front = np.moveaxis(per_link, axis, 0)
+        shape = (self.size, *front.shape[1:])
+        out = self.incidence @ front.reshape(len(front), math.prod(shape[1:]))
+        return np.moveaxis(np.asarray(out).reshape(shape), 0, axis)
 
     @door
     def neighbours(self, agent: Index) -> tuple[int, ...]:
