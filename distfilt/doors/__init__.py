@@ -29,23 +29,14 @@ several axes. Any other word is free where it first occurs, and the same from th
 ``...`` allows any leading axes. Sizes in lower case are numbers of components, at least 1.
 """
 
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
 
 from .declared import Record, describe, door, unchecked
-from .kinds import (
-    MISSING,
-    Count,
-    Cov,
-    Index,
-    Mask,
-    NonNegative,
-    Places,
-    Positive,
-    Rng,
-    Semidefinite,
-    Share,
-    Times,
-    Weights,
-)
+from .kinds import MISSING
 from .values import (
     Array,
     Bounds,
@@ -61,6 +52,18 @@ from .values import (
 __all__ = [  # fmt: skip
     "Array", "Bounds", "Count", "Cov", "Index", "MISSING", "Mask", "NonNegative", "Places",
     "Positive", "Record", "Rng", "Semidefinite", "Share", "Times", "Weights", "array", "definite",
-    "describe", "distinct", "door", "increasing", "needed", "semidefinite", "summing_to_one",
-    "unchecked",
+    "describe", "door", "increasing", "needed", "semidefinite", "summing_to_one", "unchecked",
 ]
+
+Mask = NDArray[np.bool_]
+Rng = np.random.Generator
+Cov = Annotated[Array, "... d d", definite]
+Semidefinite = Annotated[Array, "... d d", semidefinite]
+Weights = Annotated[Array, "... N", summing_to_one]
+Times = Annotated[Array, "T", increasing]
+Positive = Annotated[float, Bounds(above=0)]
+NonNegative = Annotated[float, Bounds(at_least=0)]
+Share = Annotated[float, Bounds(at_least=0, at_most=1)]
+Count = Annotated[int, Bounds(at_least=1)]
+Index = Annotated[int, Bounds(at_least=0)]
+Places = Annotated[Sequence[Index], distinct]

@@ -180,9 +180,9 @@ class Record:
         """Build one from what the library made itself: nothing is checked or copied."""
         out, made = object.__new__(cls), cast(Any, cls)
         given = dict(zip(_names(made), args, strict=False)) | options
-        for name, default in _defaults(made):
+        for name, factory in _factories(made).items():
             if name not in given:
-                given[name] = default()
+                given[name] = factory()
         out.__dict__.update(given)
         return out
 
@@ -198,12 +198,10 @@ def _names(cls: Any) -> tuple[str, ...]:
 
 
 @cache
-def _defaults(cls: Any) -> list[tuple[str, Callable[[], Any]]]:
-    plain = [(f.name, f.default) for f in fields(cls) if f.default is not _NO_DEFAULT]
-    made = [(f.name, f.default_factory) for f in fields(cls)]
-    return [(name, lambda value=value: value) for name, value in plain] + [
-        (name, factory) for name, factory in made if factory is not _NO_DEFAULT
-    ]
+def _factories(cls: Any) -> dict[str, Callable[[], Any]]:
+    """What makes a default; a plain one is an attribute of the class."""
+    made = {f.name: f.default_factory for f in fields(cls)}
+    return {name: factory for name, factory in made.items() if factory is not _NO_DEFAULT}
 
 
 @cache

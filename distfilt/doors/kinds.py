@@ -9,42 +9,14 @@ from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .values import (
-    Array,
-    Bounds,
-    _fits,
-    _real,
-    _shape_text,
-    array,
-    definite,
-    distinct,
-    increasing,
-    semidefinite,
-    summing_to_one,
-)
+from .values import _fits, _real, _shape_text, array
 
-__all__ = [  # fmt: skip
-    "Count", "Cov", "Index", "Kind", "MISSING", "Mask", "NonNegative", "Places", "Positive", "Rng",
-    "Scope", "Semidefinite", "Share", "Times", "Weights", "kind_of",
-]
+__all__ = ["MISSING", "Kind", "Scope", "kind_of"]
 
 MISSING = "missing allowed"
 """Beside an array's shape: NaN may stand for what is missing; infinity may not."""
-
-Mask = NDArray[np.bool_]
-Rng = np.random.Generator
-Cov = Annotated[Array, "... d d", definite]
-Semidefinite = Annotated[Array, "... d d", semidefinite]
-Weights = Annotated[Array, "... N", summing_to_one]
-Times = Annotated[Array, "T", increasing]
-Positive = Annotated[float, Bounds(above=0)]
-NonNegative = Annotated[float, Bounds(at_least=0)]
-Share = Annotated[float, Bounds(at_least=0, at_most=1)]
-Count = Annotated[int, Bounds(at_least=1)]
-Index = Annotated[int, Bounds(at_least=0)]
-Places = Annotated[Sequence[Index], distinct]
 
 
 @dataclass(frozen=True)
@@ -188,7 +160,10 @@ _PLAIN = {
     str: Kind("a text", partial(_instance, str)),
     bool: Kind("a bool, True or False", partial(_instance, bool)),
     Callable: Kind("a function", _callable),
-    Rng: Kind("a numpy.random.Generator (np.random.default_rng(seed))", partial(_instance, Rng)),
+    np.random.Generator: Kind(
+        "a numpy.random.Generator (np.random.default_rng(seed))",
+        partial(_instance, np.random.Generator),
+    ),
 }
 _SEQUENCES = (Sequence, Collection, Iterable, tuple, list)
 
@@ -199,6 +174,7 @@ def kind_of(annotation: Any) -> Kind | None:
 
     Examples
     --------
+    >>> from distfilt.doors import Count
     >>> kind_of(Count).take(0, "members", Scope({}))
     Traceback (most recent call last):
     ValueError: members: needs an integer of at least 1, got 0

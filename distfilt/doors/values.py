@@ -24,9 +24,6 @@ Array = NDArray[np.float64]
 _ROUNDING = 1e-9
 """Largest asymmetry and negative eigenvalue, in units of the variances, that count as rounding."""
 
-_KINDS = {"b": "booleans", "c": "complex numbers", "M": "dates", "m": "time differences"}
-_KINDS |= {"S": "text", "U": "text", "V": "records"}
-"""What an array holds that is not real numbers, by the letter of its type."""
 _NOT_REAL = (bool, np.bool_, complex, np.complexfloating, str, bytes, np.datetime64, np.timedelta64,
              type(None), np.ma.MaskedArray)  # fmt: skip
 """What would turn into numbers inside a list or an array of objects."""
@@ -79,11 +76,9 @@ def _real(value: Any, name: str) -> Array:
         found = np.asarray(value)
         entries = found.ravel() if found.dtype.kind == "O" else ()
         odd = [v for v in (*parts, *entries) if isinstance(v, _NOT_REAL)]
-        kind = np.asarray(odd[0]).dtype.kind if odd else found.dtype.kind
-        if not odd and kind not in _KINDS:
+        if not odd and found.dtype.kind in "fiuO":
             return np.asarray(found, dtype=np.float64)
-        masked = odd and isinstance(odd[0], np.ma.MaskedArray)
-        got = "a masked array" if masked else _KINDS.get(kind, "None")
+        got = type(odd[0]).__name__ if odd else found.dtype.name
     except (TypeError, ValueError, OverflowError):
         pass
     raise ValueError(f"{name}: needs an array of real numbers, got {got}") from None
@@ -118,8 +113,7 @@ def definite(value: Array, name: str) -> None:
     ValueError: noise: needs a positive definite matrix, got smallest eigenvalue -1
     """
     _symmetric(value, name)
-    if not _has_factor(value):
-        _why_not_definite(value, name, "definite")
+    _need(value, name, "definite")
 
 
 def semidefinite(value: Array, name: str) -> None:
@@ -130,8 +124,7 @@ def semidefinite(value: Array, name: str) -> None:
     >>> semidefinite(np.zeros((2, 2)), "noise")
     """
     _symmetric(value, name)
-    if not _has_factor(value):
-        _why_not_definite(value, name, "semidefinite")
+    _need(value, name, "semidefinite")
 
 
 def _symmetric(value: Array, name: str) -> None:
@@ -158,23 +151,22 @@ def _units(cov: Array) -> Array:
     return np.asarray(std[..., :, None] * std[..., None, :])
 
 
-def _why_not_definite(cov: Array, name: str, word: str) -> None:
-    """Refuse a matrix, of those of which one has no Cholesky factor, that is not a covariance."""
-    needs = f"{name}: needs a positive {word} matrix, got"
-    variances = np.diagonal(cov, axis1=-2, axis2=-1)
-    if variances.min() < 0:
-        at = np.argwhere(variances == variances.min())[0, :-1].tolist()
-        raise ValueError(f"{needs} a variance of {variances.min():.6g}{f' at {at}' * bool(at)}")
-    scale = _units(cov)
-    scaled = np.divide(cov, scale, out=np.where(cov == 0, 0.0, np.inf), where=scale > 0)
-    if np.isinf(scaled).any():
-        raise ValueError(f"{needs} a covariance with a component of variance 0")
-    least = np.linalg.eigvalsh(scaled)[..., 0]
-    if word == "semidefinite" and least.min() >= -_ROUNDING:
+def _need(cov: Array, name: str, word: str) -> None:
+    """Refuse what has no Cholesky factor, unless only rounding keeps it from being semidefinite."""
+    if _has_factor(cov):
         return
-    at = np.argwhere(least == least.min())[0].tolist()
+    scale = _units(cov)
+    scaled = np.divide(cov, scale, out=np.where(cov == 0, 0.0, -np.inf), where=scale > 0)
+    # Not so where a variance is negative, or 0 beside a covariance that is not 0.
+    finite = np.asarray(np.isfinite(scaled).all(axis=(-2, -1)))
+    values = np.linalg.eigvalsh(np.where(finite[..., None, None], scaled, 0.0))[..., 0]
+    values = np.where(finite, values, -np.inf)
+    if word == "semidefinite" and values.min() >= -_ROUNDING:
+        return
+    at = np.argwhere(values == values.min())[0].tolist()
     smallest = float(np.linalg.eigvalsh(cov[tuple(at)])[0])
-    raise ValueError(f"{needs} smallest eigenvalue {smallest:.6g}{f' at {at}' * bool(at)}")
+    raise ValueError(f"{name}: needs a positive {word} matrix, got smallest eigenvalue "
+                     f"{smallest:.6g}{f' at {at}' * bool(at)}")
 
 
 def summing_to_one(value: Array, name: str) -> None:
