@@ -7,8 +7,9 @@ import inspect
 import re
 import types
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_args, get_origin
 
+import numpy as np
 from docutils import nodes
 from sphinx.pycode import ModuleAnalyzer
 
@@ -90,9 +91,11 @@ def modules() -> list[str]:
 def directive(module: Any, name: str) -> list[str]:
     """Return the lines that document one public name of the module that defines it."""
     value = getattr(module, name)
-    if isinstance(value, types.GenericAlias):
+    if get_origin(value) is not None:
         meaning = ModuleAnalyzer.for_module(module.__name__).find_attr_docs().get(("", name), [])
-        shown = str(value).replace("typing.", "").replace("numpy.", "np.")
+        base, *notes = get_args(value) if get_origin(value) is Annotated else (value,)
+        kind = "np.ndarray" if get_origin(base) is np.ndarray else getattr(base, "__name__", base)
+        shown = ", ".join(str(getattr(note, "__name__", note)) for note in (kind, *notes))
         text = [f"   {line}" for line in [*meaning, "", f"The type ``{shown}``."]]
         return [f".. py:data:: {name}", "", *text, ""]
     if inspect.isclass(value) and not value.__module__.startswith("distfilt"):
