@@ -10,7 +10,6 @@ import re
 import subprocess
 import sys
 import tokenize
-import tomllib
 import zipfile
 from pathlib import Path
 
@@ -114,29 +113,6 @@ def test_the_library_knows_nothing_of_the_book() -> None:
     for path in PATHS:
         text = path.read_text(encoding="utf-8")
         assert [name for name in BOOK if name in text] == []
-
-
-def test_no_circle_of_imports() -> None:
-    """No module reaches itself, imports for types and inside functions included."""
-    names = {dotted(path): path for path in PATHS}
-    graph: dict[str, set[str]] = {}
-    for name, path in names.items():
-        found = imports(path, ast.parse(path.read_text(encoding="utf-8")))
-        inside = {n.removeprefix("distfilt.") for n in found if n.startswith("distfilt.")}
-        # A name's module, or the longest part of it that is one; a face is not a module of its own.
-        graph[name] = {m for n in inside if (m := module_of(n, names)) and m != name}
-    while graph:
-        free = {name for name, needs in graph.items() if not needs & graph.keys()}
-        assert free, f"a circle among {sorted(graph)}"
-        graph = {name: needs for name, needs in graph.items() if name not in free}
-
-
-def module_of(name: str, known: dict[str, Path]) -> str | None:
-    """Return the module that an imported name lives in."""
-    parts = name.split(".")
-    while parts and ".".join(parts) not in known:
-        parts.pop()
-    return ".".join(parts) or None
 
 
 def test_heavy_packages_stay_at_home_and_load_late() -> None:
@@ -283,11 +259,6 @@ def test_import_loads_no_heavy_package() -> None:
     for names in (["distfilt"], modules):
         code = f"import sys, {', '.join(names)}; print([h for h in {heavy} if h in sys.modules])"
         assert run(code).strip() == "[]"
-
-
-def test_extras() -> None:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert {"book", "test", "peers", "dask", "mpi"} <= set(project["optional-dependencies"])
 
 
 def test_lock_names_no_registry() -> None:

@@ -143,21 +143,6 @@ def test_agents_that_go_are_left_out_and_their_filters_go_on() -> None:
     assert np.trace(state.filters.information[5]) < np.trace(state.filters.information[4])
 
 
-def test_a_network_that_falls_apart_is_told() -> None:
-    def graph(t: float, x: np.ndarray) -> Graph:
-        if t < 0.45:
-            return graphs.ring(SIZE)
-        half = SIZE // 2
-        block = np.ones((half, half)) - np.eye(half)
-        return Graph.from_adjacency(np.kron(np.eye(2), block))
-
-    f = make(graph, PIConsensus())
-    run = f.run(f.start(START), np.arange(1, 9) * 0.1, PATH.swapaxes(0, 1))
-    assert run["parts"].isel(agent=0).values.tolist() == [1] * 4 + [2] * 4
-    assert np.isfinite(run["mean"].values).all()
-    assert np.allclose(run["mass"].values, 1)
-
-
 def test_a_network_that_falls_apart_is_in_the_ledger() -> None:
     """Nobody hears anything any more: no messages, and each filter goes on with what it has."""
     def graph(t: float, x: np.ndarray) -> Graph:
@@ -346,9 +331,6 @@ def test_consensus_may_start_flat() -> None:
     assert np.abs(state.carried[0][:, :100] - state.estimates).max() < 1e-14
     assert np.array_equal(state.carried[2], make(0.5, PIConsensus()).start(START).carried[2])
     assert np.abs(GRID.integral(last(f).observed) - 1).max() < 1e-12
-
-
-_STATE = make(0.5, Flooding()).start(START)
 
 
 def test_seen_kernels_of_the_gone_are_zero() -> None:

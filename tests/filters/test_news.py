@@ -34,8 +34,6 @@ def network(agents: int, **options: object) -> NewsFilter:
     return NewsFilter([MODEL] * agents, [EYE] * agents, graphs.complete(agents), **full)
 
 
-
-
 def joint(agents: int, readings: np.ndarray, speed: np.ndarray) -> tuple:
     """The Kalman filter of [target; all egos] with all readings, (steps, agents) and (steps,)."""
     d = 2 + agents
@@ -162,16 +160,6 @@ def test_a_gated_reading_is_no_news() -> None:
     f = network(2, gate=0.99)
     after = f.step(f.start([PRIOR] * 2), 1.0, [[500.0, np.nan], None])
     assert after.ledger.scalars.sum() == 0
-
-
-def test_saved_and_resumed(tmp_path) -> None:
-    f = network(2)
-    half = f.step(f.start([PRIOR] * 2), 1.0, [[0.2, np.nan], [0.1, np.nan]])
-    half.save(tmp_path / "s.npz")
-    again = type(half).load(tmp_path / "s.npz")
-    a, b = (f.step(s, 2.0, [[0.3, 0.1], [0.5, 0.1]]) for s in (half, again))
-    for x, y in zip(a.mixtures, b.mixtures, strict=True):
-        assert np.array_equal(x.means, y.means) and np.array_equal(x.covs, y.covs)
 
 
 def test_everybody_hears_only_neighbours() -> None:

@@ -15,9 +15,7 @@ from distfilt.density import Flooding, FokkerPlanck, Grid
 from distfilt.filters import (
     DensityFilter,
     EnsembleFilter,
-    FilterError,
     GaussianFilter,
-    Late,
     MixtureFilter,
     NewsFilter,
     ParticleFilter,
@@ -28,7 +26,7 @@ from distfilt.filters.record import final_state
 from distfilt.kalman import kalman_filter
 from distfilt.mixtures import GaussianMixture, target_fusion
 from distfilt.models import LinearModel, lorenz63, rotating_swarm
-from distfilt.network import Graph, covariance_intersection, graphs, pull
+from distfilt.network import Graph, covariance_intersection, graphs
 from distfilt.sensors import Sensor, direct, stack
 
 from .families import NOISE, PRIOR, TIMES, Q, data, model
@@ -103,26 +101,8 @@ def test_events_of_any_order_are_the_series(family: str) -> None:
 
 
 @EACH
-def test_what_has_no_meaning_is_refused_by_name(family: str) -> None:
-    odd = {
-        "transport": {"every": 2.0}, "news": {"agreement": pull, "lag": 1, "share": True},
-        "mixture": {"share": True, "lag": 1, "failures": "keep", "agreement": pull},
-        "density": {"share": False, "lag": 1, "failures": "keep", "gate": 0.9},
-        "ensemble": {"agreement": covariance_intersection, "every": 1.0},
-        "gaussian": {"agreement": pull, "every": 1.0}, "particle": {"every": 1.0},
-    }  # fmt: skip
-    for name, value in odd[family].items():
-        told = "lag" if name == "every" and family != "transport" else name
-        with pytest.raises(ValueError, match=f"^{told}: "):
-            made(family, **{name: value})
+def test_a_run_begins_at_its_state_and_knows_its_agents(family: str) -> None:
     f, start, seen, _ = made(family)
-    if family in ("mixture", "news", "density"):
-        with pytest.raises(ValueError, match="^runs: needs"):
-            f.start(PRIOR, runs=(2,))
-        with pytest.raises(ValueError, match="^lag: "):
-            f.smooth(start, TIMES, seen)
-    with pytest.raises(ValueError, match="^late: "):
-        f.step(start, 1.0, [s[0] for s in seen], late=[Late(0, 0.5, [1.0], arrived=1.0)])
     with pytest.raises(ValueError, match="^times: "):
         f.run(start, TIMES - 1.0, seen)
     with pytest.raises(ValueError, match="^observations: "):
@@ -353,16 +333,6 @@ def test_a_prior_of_any_kind() -> None:
     m = MixtureFilter(model(), EYES, target_dim=2)
     begun = m.start([PRIOR, frozen, two]).mixtures
     assert [b.size for b in begun] == [1, 1, 2]
-
-
-def test_failures_name_who_and_when() -> None:
-    def broken(belief: Any, channel: Any) -> Any:
-        raise np.linalg.LinAlgError("collapsed")
-
-    for family in ("gaussian", "ensemble", "mixture"):
-        f, start, seen, _ = made(family, agreement=broken)
-        with pytest.raises(FilterError, match=r"t = 0.1 s: collapsed"):
-            f.run(start, TIMES, seen)
 
 
 def test_the_extended_filter_bears_its_own_rounding() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ from distfilt.updates import ensemble_transform as transform_update
 
 from .families import NOISE, PRIOR, TIMES, data, model, team
 
-_T = "distfilt.filters.transport.TransportFilter"
 FOUR: list[Sensor | None] = [
     direct([0], std=0.6), direct([1], std=0.5), Sensor(2, lambda x: x, NOISE), direct([0], std=0.8),
 ]
@@ -27,8 +25,6 @@ FOUR: list[Sensor | None] = [
 def _filter(**options: Any) -> TransportFilter:
     options = {"members": 30} | options
     return TransportFilter(model(), options.pop("sensors", FOUR), graphs.ring(4), **options)
-
-
 
 
 def _start(f: TransportFilter, runs: tuple[int, ...] = ()) -> EnsembleState:
@@ -117,17 +113,6 @@ def test_a_late_reading_weighs_all_times_with_one_coupling() -> None:
     w /= w.sum()
     assert np.allclose(after.ensembles[2], ensemble_transform(plain, logs), atol=1e-11)
     assert np.allclose(after.history[-1][1][1].mean(axis=0), w @ before, atol=1e-12)
-
-
-def test_saved_and_resumed_with_finite_time_agreement(tmp_path: Path) -> None:
-    f = _filter(rejuvenation=0.1)
-    _, seen = data(FOUR)
-    states = list(f.steps(_start(f), TIMES, seen))
-    states[3].save(tmp_path / "s.npz")
-    again = EnsembleState.load(tmp_path / "s.npz")
-    last = list(f.steps(again, TIMES[4:], [o[4:] for o in seen]))[-1]
-    assert (last.ensembles == states[-1].ensembles).all()
-    assert (last.ledger.scalars == states[-1].ledger.scalars).all()
 
 
 def test_a_step_reaches_as_far_as_the_rounds_of_the_agreement() -> None:

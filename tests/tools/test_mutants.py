@@ -73,16 +73,6 @@ def test_a_sample_stays_when_other_lines_change(repository: Path) -> None:
     assert len(found) > len(before) and kept == before
 
 
-def test_nearest_tests_come_first() -> None:
-    for module, test in (
-        ("network/channel", "network/test_channel"),
-        ("updates/transport", "updates/test_transport"),
-    ):  # fmt: skip
-        near = mutants.nearest(f"distfilt/{module}.py", mutants.ROOT)
-        assert near == [f"distfilt/{module}.py", f"tests/{test}.py", "tests/test_doors.py"]
-        assert all((mutants.ROOT / path).is_file() for path in near)
-
-
 def test_a_line_is_tested_by_what_runs_its_statement_or_function_or_module() -> None:
     text = "A = (\n    1\n)\n\ndef f(x,\n      y=2):\n    z = (x +\n         y)\n    return z\n"
     contexts = {1: [""], 5: [""], 7: ["t.py::a[1]|run", "t.py::a[2]|run", ""], 9: ["t.py::b|call"]}
