@@ -50,8 +50,8 @@ class EnsembleState(SensorState):
     --------
     >>> from distfilt.network import Ledger
     >>> state = EnsembleState(0.0, Ledger.empty(2), np.random.default_rng(0), np.zeros((2, 5, 3)))
-    >>> state.agents, state.members, state.dim
-    (2, 5, 3)
+    >>> state.members, state.runs
+    (5, ())
     """
 
     ensembles: Array
@@ -59,23 +59,43 @@ class EnsembleState(SensorState):
     _belief = "ensembles", (..., "A", "N", "d")
 
     @property
-    def agents(self) -> int:
-        """Number A of agents."""
-        return int(self.ensembles.shape[-3])
-
-    @property
     def members(self) -> int:
         """Number N of members of each agent."""
         return int(self.ensembles.shape[-2])
 
+
+@dataclass(frozen=True, eq=False)
+class MembersFilter(Filter):
+    """What all families have in common whose agents hold members."""
+
+    _: KW_ONLY
+    members: Several = 100
+
+    state: ClassVar[type[SensorState]] = EnsembleState
+    draws: ClassVar[bool] = True
+    changes: ClassVar[bool] = True
+    fuses: ClassVar[str] = "ensembles"
+
     @property
-    def dim(self) -> int:
-        """Size d of the state vector."""
-        return int(self.ensembles.shape[-1])
+    def sizes(self) -> tuple[int, ...]:
+        """Members, and their components."""
+        return self.members, self.model.dim
+
+    def drawn(self, prior: Any, leading: tuple[int, ...], rng: Any) -> Array:
+        """Members (*leading, N, d) of a prior."""
+        return members_of(prior, self.members, leading, self.model.dim, rng)
+
+    def summary(self, state: Any) -> Summary:
+        """Means and variances of the agents' ensembles, and the members for the scores."""
+        x = state.ensembles
+        mean = unchecked(moments.mean)(x)
+        variance = unchecked(moments.mean)((x - mean[..., None, :]) ** 2)
+        variance = variance * (self.members / (self.members - 1))
+        return Summary(state.shown(mean), state.shown(variance), members=x)
 
 
 @dataclass(frozen=True, eq=False)
-class EnsembleFilter(Filter):
+class EnsembleFilter(MembersFilter):
     """One ensemble per agent; agents share observations and agree with each other.
 
     In every step each agent moves its members with the model, sends its observation to those that
@@ -110,12 +130,6 @@ class EnsembleFilter(Filter):
     _: KW_ONLY
     update: Callable[..., Array] = known_noise
     forecast: Callable[..., Array] = sampled_forecast
-    members: Several = 100
-
-    state: ClassVar[type[EnsembleState]] = EnsembleState
-    draws: ClassVar[bool] = True
-    changes: ClassVar[bool] = True
-    fuses: ClassVar[str] = "ensembles"
 
     @classmethod
     def exact(
@@ -152,13 +166,7 @@ class EnsembleFilter(Filter):
 
     def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """Members drawn for each agent."""
-        lead = (*runs, self.count)
-        return {"ensembles": members_of(prior, self.members, lead, self.model.dim, rng)}
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Members, and their components."""
-        return self.members, self.model.dim
+        return {"ensembles": self.drawn(prior, (*runs, self.count), rng)}
 
     def advance(self, step: Step) -> Any:
         """Forecast, condition on what was heard, agree."""
@@ -171,10 +179,6 @@ class EnsembleFilter(Filter):
             step.settle(self._condition(stack, place, group, step), group.agents)
         (now,) = step.agreed(stack[-1])
         return step.end(ensembles=now, past=stack[:-1])
-
-    def summary(self, state: EnsembleState) -> Summary:
-        """Ensemble means and variances; the members for the scores."""
-        return ensemble_summary(state)
 
     def _condition(
         self, stack: list[Array], place: int, group: Heard, step: Step
@@ -228,12 +232,3 @@ class EnsembleFilter(Filter):
 def sample_moments(members: Array) -> tuple[Array, Array]:
     """Mean and covariance of predictions (..., N, M); NaN where some member cannot be seen."""
     return members.mean(axis=-2), unchecked(moments.sample_covariance)(members)
-
-
-def ensemble_summary(state: EnsembleState) -> Summary:
-    """Means and variances of the agents' ensembles, and the members for the scores."""
-    x = state.ensembles
-    mean = unchecked(moments.mean)(x)
-    variance = unchecked(moments.mean)((x - mean[..., None, :]) ** 2)
-    variance = variance * (state.members / (state.members - 1))
-    return Summary(state.shown(mean), state.shown(variance), members=x)

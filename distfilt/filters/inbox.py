@@ -30,11 +30,6 @@ class _Part:
     sensor: Sensor
     rows: Indices
     columns: Indices
-    everyone: bool  # all agents of the group, once each and in order
-
-    def of(self, states: Array) -> Array:
-        """Of a group's states (*runs, G, N, d) those of the agents with this reading."""
-        return states if self.everyone else states[..., self.rows, :, :]
 
 
 class _Plan:
@@ -58,8 +53,7 @@ class _Plan:
         for sensor, found in cells.items():
             rows, starts = (np.array(c, dtype=np.intp) for c in zip(*found, strict=True))
             columns = starts[:, None] + np.arange(sensor.dim)
-            everyone = rows.tolist() == list(range(len(agents)))
-            self.parts.append(_Part(sensor, rows, columns, everyone))
+            self.parts.append(_Part(sensor, rows, columns))
             across, down = columns[:, :, None], columns[:, None, :]
             noise[rows[:, None, None], across, down] = sensor.cov
         self.noise = noise[0] if (noise == noise[:1]).all() else noise
@@ -125,30 +119,24 @@ class Heard:
         """
         if self.plan.linear:
             out = states @ self.plan.matrix(states.shape[-1]).mT
-        elif len(self.plan.parts) == 1 and self.plan.parts[0].everyone:
-            out = np.ascontiguousarray(self._seen(self.plan.parts[0], states, previous))
         else:
-            out = self._stacked(states, previous)
+            out = np.empty((*states.shape[:-2], self.target.shape[-1], states.shape[-2]))
+            for part in self.plan.parts:
+                seen = self._seen(part, states, previous).swapaxes(-1, -2)
+                out[..., part.rows[:, None], part.columns, :] = seen
+            out = np.ascontiguousarray(out.swapaxes(-1, -2))
         if np.isinf(out).any():
             raise ValueError("predicted: needs finite numbers or NaN (missing), got infinity")
         return out
 
-    def _stacked(self, states: Array, previous: Array | None) -> Array:
-        """Readings of several sensors, (*runs, G, N, M)."""
-        out = np.empty((*states.shape[:-2], self.target.shape[-1], states.shape[-2]))
-        for part in self.plan.parts:
-            cells = part.rows[:, None], part.columns
-            out[..., *cells, :] = self._seen(part, states, previous).swapaxes(-1, -2)
-        return np.ascontiguousarray(out.swapaxes(-1, -2))
-
     def _seen(self, part: _Part, states: Array, previous: Array | None) -> Array:
         """Readings of one sensor, (*runs, K, N, m)."""
-        sensor, here = part.sensor, part.of(states)
+        sensor, here = part.sensor, states[..., part.rows, :, :]
         predict = unchecked(sensor.predict)
         if not sensor.uses_previous or previous is None:
             seen = predict(here)  # which says so where states of before are missing
         else:
-            seen = predict(here, part.of(previous))
+            seen = predict(here, previous[..., part.rows, :, :])
         if sensor.difference is None:
             return seen
         # On the branch of the observation: y* - wrap(y* - h).

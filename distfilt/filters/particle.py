@@ -24,10 +24,8 @@ from ..updates.particles import (
     taken,
     weighed,
 )
-from .base import Filter
-from .ensemble import Several
+from .ensemble import MembersFilter, Several
 from .inbox import Heard
-from .inputs import members_of
 from .record import Summary
 from .saving import SensorState
 from .step import Step, guarded
@@ -79,7 +77,7 @@ class ParticleState(SensorState):
 
 
 @dataclass(frozen=True, eq=False)
-class ParticleFilter(Filter):
+class ParticleFilter(MembersFilter):
     """One bootstrap particle filter per agent, for any model and sensors.
 
     Parameters
@@ -120,19 +118,11 @@ class ParticleFilter(Filter):
     jitter: Share | None = None
 
     state: ClassVar[type[ParticleState]] = ParticleState
-    draws: ClassVar[bool] = True
-    changes: ClassVar[bool] = True
-    fuses: ClassVar[str] = "ensembles"
 
     def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """Particles drawn for each agent, with equal weights."""
-        points = members_of(prior, self.members, (*runs, self.count), self.model.dim, rng)
+        points = self.drawn(prior, (*runs, self.count), rng)
         return {"points": points, "log_weights": np.full(points.shape[:-1], -np.log(self.members))}
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Members, and their components."""
-        return self.members, self.model.dim
 
     def advance(self, step: Step) -> Any:
         """Resample where it is due, forecast, weigh by what was heard, agree.

@@ -15,18 +15,15 @@ from ..coupling.transform import carried, normalised
 from ..doors import Array, NonNegative, unchecked
 from ..network import finite_time
 from ..updates.particles import log_likelihood
-from .base import Filter
-from .ensemble import EnsembleState, Several, ensemble_summary, sample_moments
-from .inputs import members_of
+from .ensemble import MembersFilter, sample_moments
 from .particle import warn_of_collapse
-from .record import Summary
 from .step import Step, guarded
 
 __all__ = ["TransportFilter"]
 
 
 @dataclass(frozen=True, eq=False)
-class TransportFilter(Filter):
+class TransportFilter(MembersFilter):
     r"""Agents that hold the same members, agree on their log-likelihoods, and transport alone.
 
     Readings of different agents are independent, so the log-likelihood of all of them is A times
@@ -71,13 +68,9 @@ class TransportFilter(Filter):
 
     _: KW_ONLY
     agreement: Callable[..., Any] | None = finite_time
-    members: Several = 100
     correct: bool = False
     rejuvenation: NonNegative = 0.0
 
-    state: ClassVar[type[EnsembleState]] = EnsembleState
-    draws: ClassVar[bool] = True
-    changes: ClassVar[bool] = True
     fuses: ClassVar[str] = "vectors"
     unused: ClassVar[dict[str, str]] = {
         "every": "a transport filter's agents have their members in common, so that they have to "
@@ -91,13 +84,7 @@ class TransportFilter(Filter):
 
     def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """One set of members, (N, d) or (*runs, 1, N, d), for all agents."""
-        drawn = members_of(prior, self.members, (*runs, 1), self.model.dim, rng)
-        return {"ensembles": np.repeat(drawn, self.count, axis=-3)}
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Members, and their components."""
-        return self.members, self.model.dim
+        return {"ensembles": np.repeat(self.drawn(prior, (*runs, 1), rng), self.count, axis=-3)}
 
     def advance(self, step: Step) -> Any:
         """Forecast, weigh by what was seen, agree on the weights, transport.
@@ -114,15 +101,11 @@ class TransportFilter(Filter):
         stack = step.stack(step.moved(now, state.ensembles, 2))
         (logs,) = step.agreed(self._log_likelihoods(stack, step))
         if step.agrees:
-            logs = state.agents * logs
+            logs = self.count * logs
         stack, errors = self._transported(stack, logs, step.rng)
-        step.settle(errors, range(state.agents))
+        step.settle(errors, range(self.count))
         self._warn(logs, step)
         return step.end(ensembles=stack[-1], past=stack[:-1])
-
-    def summary(self, state: EnsembleState) -> Summary:
-        """Ensemble means and variances; the members for the scores."""
-        return ensemble_summary(state)
 
     def _for_all(
         self, draw: Callable[..., Array], arrays: tuple[Array, ...], rng: np.random.Generator
