@@ -2,7 +2,7 @@
 
 from .base import Filter
 from .density import DensityFilter, DensityState
-from .ensemble import EnsembleFilter, EnsembleState
+from .ensemble import EnsembleFilter, EnsembleState, TransportFilter
 from .gaussian import GaussianFilter, GaussianState
 from .inputs import Late, Reading, moments_of
 from .mixture import MixtureFilter, MixtureState
@@ -11,7 +11,6 @@ from .particle import ParticleCollapse, ParticleFilter
 from .record import Summary
 from .saving import SensorState, State
 from .step import FilterError, Step
-from .transport import TransportFilter
 
 __all__ = [  # fmt: skip
     "DensityFilter", "DensityState", "EnsembleFilter", "EnsembleState", "Filter", "FilterError",

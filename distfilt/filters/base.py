@@ -26,7 +26,7 @@ from .step import RECOVERABLE, FilterError, Step, of_the_call
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["Filter", "described"]
+__all__ = ["Filter"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,12 +111,9 @@ class Filter(Record, ABC):
 
     def check_parts(self) -> None:
         """Refuse a model, sensors or a graph that this family cannot have."""
-        if not isinstance(self.model, Model):
-            raise ValueError(f"model: needs a Model, got {type(self.model).__name__}")
-        self.check_network()
-
-    def check_network(self) -> None:
-        """Refuse sensors and a graph that are none."""
+        for model in self.models:
+            if not isinstance(model, Model):
+                raise ValueError(f"model: needs a Model, got {type(model).__name__}")
         if not callable(self.sensors):
             team_of(self.sensors)
             object.__setattr__(self, "sensors", tuple(self.sensors))
@@ -127,6 +124,11 @@ class Filter(Record, ABC):
             raise ValueError(f"graph: needs a Graph of {self.count} agents, got None")
         if self.graph is not None and not callable(self.graph):
             object.__setattr__(self, "graph", as_graph(self.graph, self.count))
+
+    @property
+    def models(self) -> tuple[Model, ...]:
+        """The models of different agents."""
+        return (self.model,)
 
     @cached_property
     def inbox(self) -> Inbox:
@@ -148,8 +150,10 @@ class Filter(Record, ABC):
 
     @property
     def components(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Names and units of the state's components; numbers where the model has no names."""
-        return described(self.model)
+        """Names and units of the largest state's components; numbers where it has no names."""
+        model = max(self.models, key=lambda model: model.dim)
+        names = tuple(model.names) or tuple(str(k) for k in range(model.dim))
+        return names, tuple(model.units) or ("",) * model.dim
 
     @property
     def agents(self) -> tuple[str, ...]:
@@ -391,9 +395,3 @@ class Filter(Record, ABC):
             why = self.unused.get("lag", "needs at least 1 for smoothing, got 0")
             raise ValueError(f"lag: {why}")
         return self._recorded(state, times, observations, truth, scores, late, self.lag)
-
-
-def described(model: Model) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names and units of a model's components; their numbers where it has no names."""
-    names = tuple(model.names) or tuple(str(k) for k in range(model.dim))
-    return names, tuple(model.units) or ("",) * model.dim

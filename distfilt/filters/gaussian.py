@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
-from typing import Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 
@@ -46,20 +46,17 @@ class GaussianState(SensorState):
     ((2, 1), ())
     """
 
-    joint_means: Array
-    joint_covariances: Array
+    joint_means: Annotated[Array, "... A D"]
+    joint_covariances: Annotated[Array, "... A D D"]
     dim: Count
 
     _belief = "joint_means", (..., "A", "D")
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        m, size = self.joint_means.shape, self.dim * (1 + len(self.history))
-        if m[-1] != size:
-            raise ValueError(f"joint_means: needs {size} components, got {m[-1]}")
-        if self.joint_covariances.shape != (*m, size):
-            got = self.joint_covariances.shape
-            raise ValueError(f"joint_covariances: needs shape {(*m, size)}, got {got}")
+        size = self.dim * (1 + len(self.history))
+        if (got := self.joint_means.shape[-1]) != size:
+            raise ValueError(f"joint_means: needs {size} components, got {got}")
 
     @property
     def times(self) -> tuple[float, ...]:
@@ -146,7 +143,7 @@ class GaussianFilter(Filter):
     def advance(self, step: Step) -> Any:
         """Forecast, condition on what was heard, fuse."""
         means, covs = self._forecast(step)
-        means = step.moved(means, 0.0, 1)
+        means = step.moved(means, 0.0)
         covs = step.kept(covs, np.eye(means.shape[-1]))
         for place, group in step.heard():
             slot = len(step.times) - place
@@ -215,7 +212,7 @@ class GaussianFilter(Filter):
         noise = np.broadcast_to(group.noise + extra, (*big.shape[:-1], big.shape[-2]))
         (m, p), errors = guarded(
             lambda m, p, gap, big, noise, *_: unchecked(conditioned)(m, p, gap, big, noise),
-            (m, p, group.target - at, big, noise), (m, p), group.target.ndim - 1, shared=_NONE,
+            (m, p, group.target - at, big, noise), (m, p), group.target.ndim - 1,
         )
         means[..., rows, :], covs[..., rows, :, :] = m, p
         return errors
@@ -230,6 +227,3 @@ class GaussianFilter(Filter):
         gain = np.linalg.solve(now, covs[..., :d, :]).mT
         moved = means + (gain @ (m - old)[..., None])[..., 0]
         return moved, covs + gain @ (p - now) @ gain.mT
-
-
-_NONE = np.zeros((0, 0))

@@ -15,7 +15,7 @@ from ..mixtures import GaussianMixture, conditioned, moved, two_stage
 from ..mixtures.conditioning import within_gate
 from ..mixtures.splitting import split_stretched
 from ..models import Model
-from .base import Filter, described
+from .base import Filter
 from .inputs import Said, mixture_of, priors_of
 from .record import Summary
 from .saving import State
@@ -132,14 +132,12 @@ class MixtureFilter(Filter):
 
     def check_parts(self) -> None:
         """Refuse models that are none, or smaller than the target."""
+        super().check_parts()
         for model in self.models:
-            if not isinstance(model, Model):
-                raise ValueError(f"model: needs a Model, got {type(model).__name__}")
             if model.dim < self.target_dim:
                 raise ValueError(f"model: needs {self.target_dim} components, got {model.dim}")
             if self.scale is not None and self.scale.size != model.dim:
                 raise ValueError(f"scale: needs {model.dim} numbers, got {self.scale.size}")
-        self.check_network()
         if len(self.models) != self.count:
             raise ValueError(f"model: needs one for all or {self.count}, got {len(self.models)}")
         if self.agreement is not None and self.graph is None:
@@ -151,11 +149,6 @@ class MixtureFilter(Filter):
         """Each agent's model."""
         given = self.model
         return tuple(given) if isinstance(given, Sequence) else (given,) * self.count
-
-    @property
-    def components(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Names and units of the components, those of the largest state."""
-        return described(max(self.models, key=lambda m: m.dim))
 
     def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """A mixture for each agent."""

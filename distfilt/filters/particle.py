@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property, partial
 from typing import Any, ClassVar
@@ -24,7 +23,7 @@ from ..updates.particles import (
     taken,
     weighed,
 )
-from .ensemble import MembersFilter, Several
+from .ensemble import MembersFilter, Several, warn_of_collapse
 from .inbox import Heard
 from .record import Summary
 from .saving import SensorState
@@ -138,7 +137,7 @@ class ParticleFilter(MembersFilter):
         weights = self._resampled(stack, state, step)
         if step.dt:
             moved = unchecked(self.model.sample_step)(stack[-1], state.t, step.dt, rng=step.rng)
-            stack[-1] = step.moved(moved, stack[-1], 2)
+            stack[-1] = step.moved(moved, stack[-1])
         for place, group in step.heard():
             predicted = group.predict(
                 stack[place][..., group.rows, :, :], step.before(place, group.rows)
@@ -225,16 +224,6 @@ class ParticleFilter(MembersFilter):
         else:
             return
         warn_of_collapse(state.t, what, "jitter=")
-
-
-def warn_of_collapse(t: float, what: str, option: str) -> None:
-    """Tell whoever runs a filter that what it believes rests on few members."""
-    warnings.warn(
-        f"t = {t:g} s: {what}; more members, {option}, or more process noise keep its "
-        f"belief alive",
-        ParticleCollapse,
-        stacklevel=4,
-    )
 
 
 def weighted_moments(points: Array, w: Array) -> tuple[Array, Array]:

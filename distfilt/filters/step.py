@@ -118,15 +118,10 @@ class Step:
         except RECOVERABLE as error:
             raise FilterError((), agent, self.t, error) from error
 
-    def moved(self, values: Array, old: Any, axes: int) -> Array:
-        """A forecast (*runs, A, ...) with so many axes after the agents'; `old` in failed runs."""
-        if not np.isfinite(values).all():
-            good = np.isfinite(values).all(axis=tuple(range(-axes, 0)))
-            bad = (tuple(map(int, row)) for row in np.argwhere(~good))
-            self.settle(
-                {row: "the forecast is not finite" for row in bad},
-                range(values.shape[-axes - 1]),
-            )
+    def moved(self, values: Array, old: Any) -> Array:
+        """A forecast (*runs, A, ...); `old` in failed runs."""
+        bad = _not_finite(values, len(self.state.runs) + 1, "forecast")
+        self.settle(bad, range(self.filter.count))
         # Groups of agents are updated in place, which a state must not notice.
         apart = not np.may_share_memory(values, self.state.belief)
         return self.kept(values if apart else values.copy(), old)
@@ -261,11 +256,12 @@ class Step:
 
 
 _NOBODY = np.zeros((), dtype=bool)
+_NOTHING = np.zeros((0, 0))
 
 
 def guarded(
     compute: Compute, arrays: tuple[Array, ...], fallback: tuple[Array, ...], lead: int, *,
-    shared: Array, rng: np.random.Generator | None = None,
+    shared: Array = _NOTHING, rng: np.random.Generator | None = None,
 ) -> tuple[tuple[Array, ...], dict[Row, str]]:
     """A computation on a batch (*lead, …), and if it fails on each row alone.
 
@@ -304,11 +300,7 @@ def guarded(
         if wrong and len(errors) == np.prod(arrays[0].shape[:lead]):
             raise
     for got in out:
-        if not np.isfinite(got).all():
-            bad = ~np.isfinite(got).reshape(*got.shape[:lead], -1).all(axis=-1)
-            errors |= {
-                tuple(map(int, row)): "the result is not finite" for row in np.argwhere(bad)
-            }
+        errors |= _not_finite(got, lead, "result")
     if errors:
         out = tuple(o.copy() for o in out)
     for row in errors:
@@ -320,3 +312,12 @@ def guarded(
 def of_the_call(error: Exception) -> bool:
     """Whether an error tells of wrong arguments; numpy's LinAlgError is a ValueError too."""
     return isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError)
+
+
+def _not_finite(values: Array, lead: int, what: str) -> dict[Row, str]:
+    """Errors of the rows (*lead, ...) that are not finite."""
+    good = np.isfinite(values)
+    if good.all():
+        return {}
+    bad = ~good.reshape(*values.shape[:lead], -1).all(axis=-1)
+    return {tuple(map(int, row)): f"the {what} is not finite" for row in np.argwhere(bad)}

@@ -178,7 +178,7 @@ def in_orbit(target: np.ndarray, observer: np.ndarray, **options: object) -> tup
 def test_an_orbit_below_the_surface_is_refused() -> None:
     falls = np.array([7000.0, 0, 0, 0, 100.0, 0])
     f, state = in_orbit(falls, GEO)
-    with pytest.raises(FilterError, match="agent 0, t = 3000 s: .*orbits above"):
+    with pytest.raises(FilterError, match="agent 0, t = 3000 s: .*above"):
         f.step(state, 3000.0, [None])
 
 
