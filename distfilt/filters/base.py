@@ -377,7 +377,7 @@ class Filter(Record, ABC):
             is d on average for a consistent filter. ``messages``, ``scalars``, ``bytes``, ``lost``
             and ``rounds`` are those of each step, the same names with ``_total`` their sums;
             ``refused`` counts what the `gate` left out;
-            :func:`distfilt.filters.record.final_state` gives the state at the end.
+            :func:`distfilt.filters.final_state` gives the state at the end.
         """
         return self._recorded(state, times, observations, truth, scores, late, 0)
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from distfilt.filters import EnsembleState, State
+from distfilt.filters import State
+from distfilt.filters.ensemble import EnsembleState
 from distfilt.network import Ledger
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from distfilt.coupling import ensemble_transform
-from distfilt.filters import EnsembleFilter, EnsembleState, Late, TransportFilter
+from distfilt.filters import EnsembleFilter, Late, TransportFilter
+from distfilt.filters.ensemble import EnsembleState
 from distfilt.models import LinearModel
 from distfilt.network import Faults, average, graphs
 from distfilt.sensors import Sensor, direct, stack
