@@ -67,7 +67,7 @@ KINDS: list[tuple[Any, Sequence[Any], Sequence[Any]]] = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("annotation", "good", "bad"), KINDS, ids=lambda v: str(v)[:40])
+@pytest.mark.parametrize(("annotation", "good", "bad"), KINDS, ids=range(len(KINDS)))
 def test_a_kind_lets_through_and_refuses(annotation: Any, good: Any, bad: Any) -> None:
     kind = kind_of(annotation)
     assert kind is not None

@@ -13,8 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from bookkit.rows import read_rows
 from common import missing_pages, toc_pages
-from ledger import LEDGER, rows_of, summaries
+from ledger import LEDGER, summaries
 from pages import home_of, modules, parts
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -91,7 +92,7 @@ def test_api_page_opens_with_an_index_and_names_no_type_of_the_builder() -> None
 @pytest.mark.skipif(not (ROOT / "book/reproductions.md").is_file(), reason="no such page")
 def test_page_of_reproductions_shows_the_ledger() -> None:
     text = page("book/reproductions")
-    rows = rows_of(LEDGER)
+    rows = read_rows(LEDGER)
     tables = re.findall(r"<tbody>(.*?)</tbody>", text, flags=re.DOTALL)
     shown = [row for table in tables for row in re.findall(r"<tr.*?</tr>", table, flags=re.DOTALL)]
     assert len(shown) == len(rows) == 21
