@@ -89,7 +89,7 @@ class Grid(Record):
         return float(np.prod(self.spacing))
 
     @cached_property
-    def edges(self) -> tuple[Array, ...]:
+    def edges(self) -> tuple[NDArray[np.float64], ...]:
         """Edges of the cells along each axis, (n_k + 1,)."""
         low = np.asarray(self.low)
         ends = zip(low, low + self.width, self.shape, strict=True)

@@ -37,8 +37,7 @@ def batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Arr
     >>> one = SimpleNamespace(dim=2, flow=lambda x: np.array([x[1], x[0]]))
     >>> batched(one, "flow", [x])
     Traceback (most recent call last):
-    ValueError: flow: needs to take many states at once, (..., d), with the components last \
-(x[..., 0], not x[0]); for states (2, 2) it gives other values than for one
+    ValueError: flow: needs to take many states at once, ...
     """
     function, x = getattr(owner, name), states[0]
     out, wanted = _made(function, states, rest), (*x.shape[:-1], owner.dim)
