@@ -3,9 +3,5 @@
 from . import affine, separable
 from .affine import AffineMap, compose
 from .pooling import pool_by_admm, pool_by_moments
-from .separable import SeparableMap
 
-__all__ = [  # fmt: skip
-    "AffineMap", "SeparableMap", "affine", "compose", "pool_by_admm", "pool_by_moments",
-    "separable",
-]
+__all__ = ["AffineMap", "affine", "compose", "pool_by_admm", "pool_by_moments", "separable"]

@@ -24,7 +24,7 @@ from .. import ensembles
 from ..doors import Array, Record, door, needed, unchecked
 from ..linalg import SolverError, leading
 
-__all__ = ["AffineMap", "compose", "fit", "fit_convex", "gradient", "objective"]
+__all__ = ["AffineMap", "compose", "fit", "fit_convex", "objective"]
 
 Seen = Annotated[Array, "... N M"]
 Members = Annotated[Array, "... N d"]
@@ -211,8 +211,23 @@ def fit(y: Seen, x: Members) -> AffineMap:
 
 
 def from_moments(mean: Array, cov: Array, m: int) -> AffineMap:
-    """The affine map of a Gaussian (y, x), or of samples with these moments (divided by N)."""
-    lower = _cholesky(cov, mean, m)
+    """The affine map of a Gaussian (y, x), or of samples with these moments (divided by N).
+
+    An error says which of them has no factor.
+    """
+    needs = "are not constant and not combinations of others"
+    variance = np.diagonal(cov, axis1=-2, axis2=-1)
+    try:
+        lower = np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:
+        try:
+            np.linalg.cholesky(cov[..., :m, :m])
+        except np.linalg.LinAlgError:
+            raise ValueError(f"y: needs variables that {needs}") from None
+        raise ValueError(f"x: needs variables that {needs}") from None
+    # Rounding may leave a repeated variable a tiny variance of its own.
+    left = np.diagonal(lower, axis1=-2, axis2=-1) ** 2
+    refuse((left <= _ROUNDING * variance) | (variance <= (_ROUNDING * mean) ** 2), m, needs)
     # The factor of the joint covariance holds the map: its lower blocks are K L_yy and L.
     gain = np.linalg.solve(lower[..., :m, :m].mT, lower[..., m:, :m].mT)
     return AffineMap.unchecked(mean[..., :m], mean[..., m:], gain.mT, lower[..., m:, m:])
@@ -230,24 +245,6 @@ def from_rows(u: Array, observed_mean: Array) -> AffineMap:
     mean = (gain @ observed_mean[..., None])[..., 0] - solved[..., 0]
     scale = np.linalg.solve(upper, np.broadcast_to(np.eye(upper.shape[-1]), upper.shape))
     return AffineMap.unchecked(observed_mean, mean, gain, np.tril(scale))
-
-
-def _cholesky(cov: Array, mean: Array, m: int) -> Array:
-    """Factor of the joint covariance of (y, x); an error says which of them is to blame."""
-    needs = "are not constant and not combinations of others"
-    variance = np.diagonal(cov, axis1=-2, axis2=-1)
-    try:
-        lower = np.asarray(np.linalg.cholesky(cov))
-    except np.linalg.LinAlgError:
-        try:
-            np.linalg.cholesky(cov[..., :m, :m])
-        except np.linalg.LinAlgError:
-            raise ValueError(f"y: needs variables that {needs}") from None
-        raise ValueError(f"x: needs variables that {needs}") from None
-    # Rounding may leave a repeated variable a tiny variance of its own.
-    left = np.diagonal(lower, axis1=-2, axis2=-1) ** 2
-    refuse((left <= _ROUNDING * variance) | (variance <= (_ROUNDING * mean) ** 2), m, needs)
-    return lower
 
 
 @door
@@ -271,35 +268,6 @@ def objective(map_: ConditionalMap, y: Seen, x: Members) -> Array:
     """
     squares = 0.5 * (map_(y, x) ** 2).sum(axis=-1)
     return np.asarray((squares - map_.log_det(y, x)).mean(axis=-1))
-
-
-@door
-def gradient(coefficients: Annotated[Array, "K"], samples: Annotated[Array, "n k"]) -> Array:
-    r"""Gradient (k + 1,) of (12) for one affine component, the corrected equation (14).
-
-    .. math:: \frac{\partial\mathcal L^k}{\partial u_l}
-        = \frac1N\sum_i U^k(\mathbf z_i)\, z_{i,l} - \frac{\delta_{lk}}{u_k}
-
-    The paper prints :math:`u_l` where :math:`z_{i,l}` belongs.
-
-    Parameters
-    ----------
-    coefficients : array_like, (k + 1,)
-        :math:`u_0` and :math:`u_1,\dots,u_k`, with :math:`u_k > 0`.
-    samples : array_like, (N, k)
-        The first k variables.
-
-    Examples
-    --------
-    >>> gradient([0.0, 1.0], [[-1.0], [1.0]])
-    array([0., 0.])
-    """
-    u, ones = coefficients, np.column_stack([np.ones(len(samples)), samples])
-    if len(u) != ones.shape[1] or u[-1] <= 0:
-        raise ValueError(f"coefficients: needs {ones.shape[1]} of them, the last positive, got {u}")
-    out = np.asarray(ones.T @ (ones @ u) / len(ones))
-    out[-1] -= 1 / u[-1]
-    return out
 
 
 @door
@@ -331,10 +299,23 @@ def fit_convex(
     >>> bool(abs(exact.scale - solved.scale).max() < 1e-4)
     True
     """
-    joint, m = enough(y, x, len(x)), y.shape[-1]
+    joint, m, cp = enough(y, x, len(x)), y.shape[-1], needed("cvxpy", "maps")
     rows = np.zeros((x.shape[-1], 1 + joint.shape[-1]))
-    for k in range(len(rows)):
-        rows[k, : m + k + 2] = _solved(joint[:, : m + k + 1], solver)
+    ones = np.column_stack([np.ones(len(joint)), joint]) / np.sqrt(len(joint))
+    # What cvxpy would warn of, the status below tells, and it becomes an error.
+    with _SOLVING, warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        for k, n in enumerate(range(m + 2, m + 2 + len(rows))):
+            problem, root, u = _program(n)
+            root.value = np.linalg.qr(ones[:, :n], mode="r")
+            try:
+                problem.solve(solver=solver, warm_start=False)
+                status = problem.status
+            except cp.error.SolverError as error:
+                status = error
+            if status != cp.OPTIMAL:
+                raise SolverError(f"{solver}: component {n - 1} of the map stopped with {status!r}")
+            rows[k, :n] = u.value
     return from_rows(rows, unchecked(ensembles.mean)(y))
 
 
@@ -342,32 +323,13 @@ _SOLVING = Lock()
 """A compiled program holds its last data: one thread at a time."""
 
 
-def _solved(z: Array, solver: str) -> Array:
-    """Coefficients (u_0, u_1 … u_k) that minimise (12) for the last column of `z`."""
-    cp, (n, k) = needed("cvxpy", "maps"), z.shape
-    problem, root, u = _program(k)
-    # What cvxpy would warn of, the status below tells, and it becomes an error.
-    with _SOLVING, warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")
-        root.value = np.linalg.qr(np.column_stack([np.ones(n), z]) / np.sqrt(n), mode="r")
-        try:
-            problem.solve(solver=solver, warm_start=False)
-            status = problem.status
-        except cp.error.SolverError as error:
-            status = error
-        if status != cp.OPTIMAL:
-            raise SolverError(f"{solver}: component {k} of the map stopped with {status!r}")
-        return np.asarray(u.value, dtype=np.float64).copy()
-
-
 @lru_cache(maxsize=32)
-def _program(k: int) -> tuple[Any, Any, Any]:
-    """The program (12) of component k, compiled once, with the samples' triangular factor open.
+def _program(n: int) -> tuple[Any, Any, Any]:
+    """The program (12) of n coefficients, compiled once, with the samples' triangular factor open.
 
     The samples enter by |u_0 + Z u|² only, which their QR factor keeps.
     """
     cp = needed("cvxpy", "maps")
-
-    root, u = cp.Parameter((k + 1, k + 1)), cp.Variable(k + 1)
-    loss = cp.sum_squares(root @ u) / 2 - cp.log(u[k])
+    root, u = cp.Parameter((n, n)), cp.Variable(n)
+    loss = cp.sum_squares(root @ u) / 2 - cp.log(u[n - 1])
     return cp.Problem(cp.Minimize(loss)), root, u

@@ -56,7 +56,7 @@ def pool_by_moments(
     >>> bool(abs(pooled.scale - one.scale).max() < 1e-12)
     True
     """
-    joint = _joint(y, x)
+    joint = enough(y, x, x.shape[-3] * x.shape[-2])
     centre = _average(unchecked(mean)(joint), channel, agree)
     about = joint - centre[..., None, :]
     second = about.mT @ about / joint.shape[-2]
@@ -109,68 +109,53 @@ def pool_by_admm(
     """
     if channel.runs:
         raise ValueError(f"channel: needs a single run for ADMM, got runs {channel.runs}")
-    joint, m = _joint(y, x), y.shape[-1]
+    joint, m = enough(y, x, x.shape[-3] * x.shape[-2]), y.shape[-1]
     centre = _average(unchecked(mean)(joint), channel, agree)
     squares = ((joint - centre[:, None, :]) ** 2).mean(axis=-2)
     spread = np.sqrt(_average(squares, channel, agree))
+    refuse(spread <= 1e-13 * np.abs(centre), m, "are not constant")
     joint = (joint - centre[:, None, :]) / spread[:, None, :]
     ones = np.concatenate([np.ones((*joint.shape[:-1], 1)), joint], axis=-1)
-    solve, start = _proximal(ones.mT @ ones / joint.shape[-2], m)
+    solve, start, there = _proximal(ones.mT @ ones / joint.shape[-2], m)
     run = admm(solve, start, channel, rho=rho, tolerance=tolerance, agree=agree)
-    rows = np.zeros((len(joint), x.shape[-1], ones.shape[-1]))
-    for k, (a, b) in enumerate(_parts(m, x.shape[-1])):
-        rows[:, k, : b - a] = run.common[:, a:b]
-    one = from_rows(rows, np.zeros((len(joint), m)))
-    sy, sx = spread[:, :m], spread[:, m:]  # back from standardised variables
-    found = AffineMap.unchecked(
-        centre[:, :m], centre[:, m:] + sx * one.mean,
-        sx[:, :, None] * one.gain / sy[:, None, :], sx[:, :, None] * one.scale,
-    )
-    return found, run
-
-
-def _joint(y: Array, x: Array) -> Array:
-    """All agents' variables, refused where they cannot have a map."""
-    joint = enough(y, x, x.shape[-3] * x.shape[-2])
-    constant = np.ptp(joint, axis=(-3, -2)) <= 1e-13 * np.abs(joint).max(axis=(-3, -2))
-    refuse(constant, y.shape[-1], "are not constant")
-    return joint
+    rows = np.zeros((len(joint), *there.shape))
+    rows[:, there] = run.common
+    # Back from standardised variables.
+    rows[..., 1:] /= spread[:, None, :]
+    rows[..., 0] -= (rows[..., 1:] @ centre[..., None])[..., 0]
+    return from_rows(rows, centre[:, :m]), run
 
 
 def _average(values: Array, channel: Channel, agree: Agree) -> Array:
     """What the agents agree on, refused where it cannot be an average of the values."""
     out = array(agree(values, channel), "agree", values.shape)
-    low, high = values.min(axis=-2, keepdims=True), values.max(axis=-2, keepdims=True)
+    middle = values.mean(axis=-2, keepdims=True)
     # A rule that is only approximate may miss by as much as the values differ.
-    slack = (high - low) + 1e-9 * np.maximum(np.abs(low), np.abs(high))
-    wrong = out[(out < low - slack) | (out > high + slack)]
-    if wrong.size:
-        raise ValueError("agree: needs a rule that returns averages of the agents' values, got "
-                         f"{wrong[0]:.6g} of values up to {values.max():.6g}")
+    slack = np.ptp(values, axis=-2, keepdims=True) + 1e-9 * np.abs(middle)
+    if (np.abs(out - middle) > 2 * slack).any():
+        raise ValueError("agree: needs a rule that returns averages of the agents' values, got up "
+                         f"to {np.abs(out).max():.6g} of up to {np.abs(values).max():.6g}")
     return out
 
 
-def _parts(m: int, d: int) -> list[tuple[int, int]]:
-    """Where the coefficients of each component stand in a row of all."""
-    ends = np.cumsum([0, *(m + k + 2 for k in range(d))]).tolist()
-    return list(zip(ends[:-1], ends[1:], strict=True))
-
-
-def _proximal(moments: Array, m: int) -> tuple[Callable[[Array, float], Array], Array]:
-    """The proximal step of every agent, components one after the other, and where to start."""
-    parts = _parts(m, moments.shape[-1] - 1 - m)
-    start = np.zeros((len(moments), parts[-1][1]))
-    start[:, [b - 1 for _, b in parts]] = 1.0
+def _proximal(moments: Array, m: int) -> tuple[Callable[[Array, float], Array], Array, Array]:
+    """The proximal step of every agent, components one after the other; where to start; and which
+    coefficients (d, 1 + m + d) there are.
+    """
+    d = moments.shape[-1] - 1 - m
+    there = np.tri(d, 1 + m + d, m + 1, dtype=bool)
+    start = np.tile(np.eye(d, 1 + m + d, m + 1)[there], (len(moments), 1))
 
     def solve(target: Array, rho: float) -> Array:
-        out = np.empty_like(target)
-        for a, b in parts:
-            n = b - a
+        out = np.zeros((len(target), *there.shape))
+        out[:, there] = rho * target
+        for k in range(d):
+            n = m + k + 2
             regular = moments[:, :n, :n] + rho * np.eye(n)
-            right = np.stack([rho * target[:, a:b], np.tile(np.eye(n)[-1], (len(target), 1))], -1)
+            right = np.stack([out[:, k, :n], np.tile(np.eye(n)[-1], (len(target), 1))], -1)
             pulled, column = np.moveaxis(np.linalg.solve(regular, right), -1, 0)
             last = 0.5 * (pulled[:, -1] + np.sqrt(pulled[:, -1] ** 2 + 4 * column[:, -1]))
-            out[:, a:b] = pulled + column / last[:, None]
-        return out
+            out[:, k, :n] = pulled + column / last[:, None]
+        return np.asarray(out[:, there])
 
-    return solve, start
+    return solve, start, there

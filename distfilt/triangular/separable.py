@@ -16,13 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from functools import partial
 
 import numpy as np
 from scipy.special import ndtr
 
 from .. import ensembles
-from ..doors import Array, Bounds, Index, NonNegative, Record, door, unchecked
+from ..doors import Array, Index, NonNegative, door, unchecked
 from ..linalg import SolverError, leading
 from .affine import Members, OwnMembers, OwnSeen, Seen, joined, refuse
 
@@ -36,61 +36,52 @@ _LEAST_SLOPE = 0.1
 _ITERATIONS = 100
 
 
-def _increasing(slopes: tuple[Array, ...], name: str) -> None:
-    for k, a in enumerate(slopes):
-        if (a < 0).any() or not (a[..., 0] > 0).all():
-            raise ValueError(f"{name}: needs nonnegative coefficients, the first positive, so that "
-                             f"the map increases, got {a.min():.6g} in component {k}")
-
-
 @dataclass(frozen=True, eq=False)
-class SeparableMap(Record):
+class SeparableMap:
     """The map S(y, x) that takes x given y to the standard normal, component by component.
 
     Variables are numbered through: the m observations, then the d components of the state.
 
     Parameters
     ----------
+    observed : int
+        Number m of observations.
     centre, spread : ndarray, (..., m + d)
         What each variable is shifted and divided by.
     bumps : ndarray, (2, ..., m + d, p)
         Centres and widths of the bumps of each standardised variable.
     steps : ndarray, (2, ..., d, q)
         The same for the integrated bumps of each state component.
-    uses : tuple of tuple of int
+    uses : list of list of int
         Which earlier variables each of the d components uses.
-    weights : tuple of ndarray
+    weights : list of ndarray
         Per component (..., 1 + L + L p): the constant, the L linear coefficients, the bumps'.
-    slopes : tuple of ndarray
+    slopes : list of ndarray
         Per component (..., 1 + q): the linear coefficient and those of the integrated bumps,
         nonnegative, the first positive, which gives the map the whole line as its range.
 
     Examples
     --------
     >>> none = np.empty((2, 1, 0))
-    >>> double = SeparableMap(np.zeros(1), np.ones(1), none, none, ((),), (np.zeros(1),),
-    ...                       (np.array([2.0]),))
+    >>> double = SeparableMap(0, np.zeros(1), np.ones(1), none, none, [[]], [np.zeros(1)],
+    ...                       [np.array([2.0])])
     >>> double(np.empty((1, 0)), [[3.0]])
     array([[6.]])
     """
 
-    centre: Annotated[Array, "... D"]
-    spread: Annotated[Array, "... D", Bounds(above=0)]
-    bumps: Annotated[Array, "... D P"]
-    steps: Annotated[Array, "... d Q"]
-    uses: tuple[tuple[Index, ...], ...]
-    weights: tuple[Annotated[Array, "..."], ...]
-    slopes: Annotated[tuple[Annotated[Array, "... s"], ...], _increasing]
+    observed: int
+    centre: Array
+    spread: Array
+    bumps: Array
+    steps: Array
+    uses: list[list[int]]
+    weights: list[Array]
+    slopes: list[Array]
 
     @property
     def dim(self) -> int:
         """Number d of components."""
         return len(self.uses)
-
-    @property
-    def observed(self) -> int:
-        """Number m of observations."""
-        return int(self.centre.shape[-1]) - self.dim
 
     def _standard(self, y: Array, x: Array) -> Array:
         """Standardised (y, x), (..., N, m + d); one y for all members is repeated."""
@@ -101,7 +92,7 @@ class SeparableMap(Record):
 
     def _earlier(self, joint: Array, k: int) -> Array:
         """What component k makes of the variables before its own, (..., N)."""
-        used = list(self.uses[k])
+        used = self.uses[k]
         features = _earlier_features(joint[..., used], self.bumps[..., used, :])
         return np.asarray((features @ self.weights[k][..., None])[..., 0])
 
@@ -110,14 +101,6 @@ class SeparableMap(Record):
         values, rates = _own_features(v, self.steps[..., k, :])
         a = self.slopes[k][..., None]
         return np.asarray((values @ a)[..., 0]), np.asarray((rates @ a)[..., 0])
-
-    def _inverted(self, aim: Array, k: int) -> Array:
-        """Where the increasing part of component k has the values `aim`, (..., N)."""
-        first, rest = self.slopes[k][..., :1], self.slopes[k][..., 1:]
-        # A line plus steps of known heights: its ends need no search.
-        heights = _ROOT * self.steps[1][..., k, :] * rest
-        low = (aim - heights.sum(axis=-1, keepdims=True)) / first
-        return invert(lambda v: self._own(v, k), aim, low, aim / first)
 
     @door
     def __call__(self, y: OwnSeen, x: OwnMembers) -> Array:
@@ -131,7 +114,11 @@ class SeparableMap(Record):
         """Members x with S(y, x) = z, (..., N, d); `y` is (..., N, m), or (..., m) for all."""
         joint, m = self._standard(y, z), self.observed
         for k in range(self.dim):
-            joint[..., m + k] = self._inverted(z[..., k] - self._earlier(joint, k), k)
+            aim, line = z[..., k] - self._earlier(joint, k), self.slopes[k][..., :1]
+            # A line plus steps of known heights: its ends need no search.
+            heights = _ROOT * self.steps[1][..., k, :] * self.slopes[k][..., 1:]
+            low = (aim - heights.sum(axis=-1, keepdims=True)) / line
+            joint[..., m + k] = invert(partial(self._own, k=k), aim, low, aim / line)
         return joint[..., m:] * self.spread[..., None, m:] + self.centre[..., None, m:]
 
     @door
@@ -158,10 +145,8 @@ def _own_features(v: Array, steps: Array) -> tuple[Array, Array]:
     u = (v[..., None] - centres) / widths
     values = _ROOT * widths * ndtr(u)
     ones = np.ones((*v.shape, 1))
-    return (
-        np.concatenate([v[..., None], values], axis=-1),
-        np.concatenate([ones, np.exp(-0.5 * u**2)], axis=-1),
-    )
+    rates = np.concatenate([ones, np.exp(-0.5 * u**2)], axis=-1)
+    return np.concatenate([v[..., None], values], axis=-1), rates
 
 
 @door
@@ -217,7 +202,12 @@ def fit(
     """
     m, d = y.shape[-1], x.shape[-1]
     p, q = (order, order) if isinstance(order, int) else order
-    allowed = _allowed([range(m + k) for k in range(d)] if uses is None else uses, m, d)
+    uses = [range(m + k) for k in range(d)] if uses is None else uses
+    allowed = [sorted(set(used)) for used in uses]
+    if len(uses) != d or any(len(used) < len(given) or used[-1:] >= [m + k]
+                             for k, (used, given) in enumerate(zip(allowed, uses, strict=True))):
+        raise ValueError(f"uses: needs for each of {d} components different variables before its "
+                         f"own, the {m} observations first, got {uses}")
     most = max(map(len, allowed))
     needed = 2 + most if regularisation else 2 + q + most * (1 + p)
     if x.shape[-2] <= needed:
@@ -231,40 +221,24 @@ def fit(
     joint /= spread[..., None, :]
     _refuse_combinations(joint, allowed, m)
     bumps, steps = _nodes(joint, p, m), _nodes(joint[..., m:], q, 0)
-    weights, slopes = [], []
+    found = []
     for k, used in enumerate(allowed):
         features = _earlier_features(joint[..., used], bumps[..., used, :])
         own = _own_features(joint[..., m + k], steps[..., k, :])
-        c, a = _best_coefficients(features, *own, 1 + len(used), regularisation)
-        weights.append(c)
-        slopes.append(a)
-    return SeparableMap.unchecked(
-        centre, spread, bumps, steps, tuple(map(tuple, allowed)), tuple(weights), tuple(slopes))
-
-
-def _allowed(uses: Sequence[Collection[int]], m: int, d: int) -> list[list[int]]:
-    """Which earlier variables each component may use, in order."""
-    found = [sorted(set(used)) for used in uses]
-    if len(uses) != d or any(len(used) < len(given) or used[-1:] >= [m + k]
-                             for k, (used, given) in enumerate(zip(found, uses, strict=True))):
-        raise ValueError(f"uses: needs for each of {d} components different variables before its "
-                         f"own, the {m} observations first, got {uses}")
-    return found
+        found.append(_best_coefficients(features, *own, 1 + len(used), regularisation))
+    weights, slopes = map(list, zip(*found, strict=True))
+    return SeparableMap(m, centre, spread, bumps, steps, allowed, weights, slopes)
 
 
 def _refuse_combinations(joint: Array, uses: list[list[int]], m: int) -> None:
     """Refuse variables that are combinations of others that the same component uses."""
     cov = joint.mT @ joint / joint.shape[-2]
-
-    def singular(used: list[int]) -> bool:
-        part = cov[..., used, :][..., used]
-        return bool(used and (np.linalg.eigvalsh(part)[..., 0] < _SINGULAR).any())
-
     for k, used in enumerate(uses):
-        if singular([*used, m + k]):
-            name = "y" if singular([v for v in used if v < m]) else "x"
-            raise ValueError(f"{name}: needs variables that are not combinations of others, "
-                             f"got a singular correlation matrix in component {k}")
+        for name, some in (("y", [v for v in used if v < m]), ("x", [*used, m + k])):
+            least = np.linalg.eigvalsh(cov[..., some, :][..., some]).min(initial=1.0)
+            if least < _SINGULAR:
+                raise ValueError(f"{name}: needs variables that are not combinations of others, "
+                                 f"got a singular correlation matrix in component {k}")
 
 
 def _nodes(joint: Array, n: int, m: int) -> Array:
@@ -303,7 +277,15 @@ def _best_coefficients(
 
 
 def _nonnegative(quadratic: Array, rates: Array, lower: Array) -> Array:
-    """Minimise a'Qa / 2 - mean(log(rates a)) over a >= lower by projected Newton steps."""
+    """Minimise a'Qa / 2 - mean(log(rates a)) over a >= lower by projected Newton steps.
+
+    Each is halved, in each run, until the objective falls enough.
+    """
+
+    def loss(c: Array) -> Array:
+        form = 0.5 * (c[..., None, :] @ quadratic @ c[..., None])[..., 0, 0]
+        return np.asarray(form - np.log((rates @ c[..., None])[..., 0]).mean(axis=-1))
+
     r, n = quadratic.shape[-1], rates.shape[-2]
     a = np.broadcast_to(lower, quadratic.shape[:-1]).copy()
     a[..., 0] = np.maximum(lower[0], 1 / np.sqrt(quadratic[..., 0, 0]))
@@ -316,31 +298,18 @@ def _nonnegative(quadratic: Array, rates: Array, lower: Array) -> Array:
         system = np.where(free[..., :, None] & free[..., None, :], hessian, np.eye(r))
         slope = np.where(free, gradient, 0.0)
         step = -np.linalg.solve(system, slope[..., None])[..., 0]
-        a = _shortened(quadratic, rates, lower, a, step, gradient)
+        start, before, t = a, loss(a), np.ones(a.shape[:-1])
+        for _ in range(40):
+            a = np.maximum(lower, start + t[..., None] * step)
+            wanted = 1e-4 * (gradient * (a - start)).sum(axis=-1)
+            # Near the minimum the fall is lost in rounding.
+            good = loss(a) <= before + wanted + 1e-14 * (1 + np.abs(before))
+            if good.all():
+                break
+            t = np.where(good, t, 0.5 * t)
         if (-(slope * step).sum(axis=-1) < 1e-13).all():
             return a
     raise SolverError(f"separable: no minimum of (12) after {_ITERATIONS} Newton steps")
-
-
-def _shortened(
-    quadratic: Array, rates: Array, lower: Array, a: Array, step: Array, gradient: Array
-) -> Array:
-    """Move along the projected step, halved in each run until the objective falls enough."""
-
-    def loss(c: Array) -> Array:
-        form = 0.5 * (c[..., None, :] @ quadratic @ c[..., None])[..., 0, 0]
-        return np.asarray(form - np.log((rates @ c[..., None])[..., 0]).mean(axis=-1))
-
-    before, t = loss(a), np.ones(a.shape[:-1])
-    for _ in range(40):
-        new = np.maximum(lower, a + t[..., None] * step)
-        wanted = 1e-4 * (gradient * (new - a)).sum(axis=-1)
-        # Near the minimum the fall is lost in rounding.
-        good = loss(new) <= before + wanted + 1e-14 * (1 + np.abs(before))
-        if good.all():
-            break
-        t = np.where(good, t, 0.5 * t)
-    return np.asarray(new)
 
 
 def invert(
@@ -348,13 +317,13 @@ def invert(
 ) -> Array:
     """Solve ``function(v) = target`` by Newton's method inside a shrinking bracket.
 
-    The function gives values and slopes, element by element. A Newton step that would leave the
-    bracket is replaced by a bisection, so the iteration converges wherever the function increases.
+    The function gives values and positive slopes, element by element. A Newton step that would
+    leave the bracket is replaced by a bisection, so the iteration converges.
 
     Raises
     ------
     SolverError
-        If the iteration does not settle, as for a function with jumps.
+        If the iteration does not settle, as where a target is not a number.
 
     Examples
     --------
@@ -367,18 +336,14 @@ def invert(
         value, slope = function(v)
         gap = value - target
         low, high = np.where(gap <= 0, v, low), np.where(gap >= 0, v, high)
-        steep = slope > 0
-        newton = v - gap / np.where(steep, slope, 1.0)
+        newton = v - gap / slope
         step = np.abs(newton - v)
         enough = 1e-13 * (1 + np.abs(v))
         # A step that has settled may stand on an end of its bracket; any other has to be inside
         # and half as long as the last, or Newton's method could go to and fro for ever.
         good = (newton > low) & (newton < high) & (step <= 0.5 * moved)
-        new = np.where(steep & (good | (step <= enough)), newton, 0.5 * (low + high))
+        new = np.where(good | (step <= enough), newton, 0.5 * (low + high))
         moved, v = np.abs(new - v), new
         if (moved <= enough).all():
-            # Halving settles at a jump as well, where the value is not reached.
-            if ((step <= enough) | (np.abs(gap) <= 1e-9 * (1 + np.abs(target)))).all():
-                return np.asarray(v)
-            break
+            return np.asarray(v)
     raise SolverError("separable: the map's inverse did not settle at all targets")

@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from distfilt.network import Channel, graphs
-from distfilt.network.consensus import average
 from distfilt.triangular import AffineMap, affine, compose
-from distfilt.triangular.pooling import _proximal, pool_by_admm, pool_by_moments
+from distfilt.triangular.pooling import pool_by_admm, pool_by_moments
 
 
 def _samples(
@@ -52,32 +51,6 @@ def test_averaged_moments_are_batched_over_runs_and_cost_what_they_say() -> None
     # One round each on a complete graph: 12 + 78 scalars on every link.
     assert channel.ledger.rounds == 2
     assert (channel.ledger.scalars == 2 * 90).all()
-
-
-def test_gossip_comes_close() -> None:
-    y, x = _samples(3, 5)
-
-    def gossip(values: np.ndarray, channel: Channel) -> np.ndarray:
-        return average(values, channel, rounds=80)
-
-    pooled = pool_by_moments(y, x, Channel(graphs.star(5)), agree=gossip)
-    assert np.abs(pooled.gain - _centralised(y, x).gain).max() < 1e-6
-
-
-@given(st.integers(0, 10_000), st.floats(0.1, 10.0))
-def test_proximal_step_meets_its_conditions(seed: int, rho: float) -> None:
-    """(C + rho I) u - e_k / u_k = rho v, with u_k > 0."""
-    rng = np.random.default_rng(seed)
-    root = rng.standard_normal((3, 20, 4))
-    moments = np.swapaxes(root, -1, -2) @ root / 20
-    solve, start = _proximal(moments, 1)
-    v = rng.standard_normal(start.shape)
-    u = solve(v, rho)
-    for n, part in ((3, slice(0, 3)), (4, slice(3, 7))):
-        left = (moments[:, :n, :n] + rho * np.eye(n)) @ u[:, part, None]
-        left[:, -1, 0] -= 1 / u[:, part][:, -1]
-        assert np.abs(left[..., 0] - rho * v[:, part]).max() < 1e-12 * (1 + np.abs(left).max())
-        assert (u[:, part][:, -1] > 0).all()
 
 
 @pytest.mark.parametrize("graph", [graphs.path(3), graphs.star(5)])
