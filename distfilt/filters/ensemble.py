@@ -23,8 +23,8 @@ from ..models import Model
 from ..network import Graph, finite_time, intersection
 from ..sensors import Sensor
 from ..updates import exact_draws, known_noise, sampled_forecast, with_missing
-from ..updates.door import stackable
-from ..updates.forecasts import exact_forecast
+from ..updates.door import says
+from ..updates.gaussian import exact_forecast
 from ..updates.particles import ParticleCollapse, log_likelihood
 from .base import Filter
 from .inbox import Heard
@@ -221,7 +221,7 @@ class EnsembleFilter(MembersFilter):
         """One time's ensembles after the update; a plain function gets one agent's at a time."""
         if options or getattr(self.update, "repredicts", False):
             return unchecked(self.update)(x, h, y, noise, rng=rng, **options)
-        if stackable(self.update) or x.ndim == 2:
+        if says(self.update, "stacks") or x.ndim == 2:
             new = with_missing(self.update, x, h, y, noise, rng=rng)
             return array(new, "update", x.shape, finite=False)
         out = np.empty_like(x)

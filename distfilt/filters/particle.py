@@ -12,11 +12,9 @@ import numpy as np
 from ..doors import Array, Mask, Share, array, unchecked
 from ..updates.particles import (
     ParticleCollapse,
-    Resampling,
     copies,
     distinct_share,
     jittered,
-    levels_of,
     picked_by,
     silverman,
     size_of,
@@ -87,9 +85,8 @@ class ParticleFilter(MembersFilter):
     members : int
         Number N of particles of each agent.
     threshold : float
-        An agent resamples when its effective sample size falls below this share of N, in [0, 1].
-    rule : {"systematic", "stratified", "multinomial"}
-        How; see :func:`distfilt.updates.resampled`.
+        An agent resamples, by :func:`distfilt.updates.resampled`, when its effective sample size
+        falls below this share of N, in [0, 1].
     jitter : float, optional
         Bandwidth of the kernel that moves copies apart, in [0, 1], in units of the particles'
         weighted spread; 0 for none. Particles that were not copied stay. By default Silverman's
@@ -113,7 +110,6 @@ class ParticleFilter(MembersFilter):
     _: KW_ONLY
     members: Several = 1000
     threshold: Share = 0.5
-    rule: Resampling = "systematic"
     jitter: Share | None = None
 
     state: ClassVar[type[ParticleState]] = ParticleState
@@ -147,8 +143,8 @@ class ParticleFilter(MembersFilter):
             step.settle(_weigh(weights, predicted, group), group.agents)
         if step.agrees:
             # The particles have to be an ensemble, which the agreement can move.
-            levels = levels_of(weights.shape, step.rng, self.rule)
-            self._pick(stack, weights, np.exp(weights), np.ones(weights.shape[:-1], bool), levels)
+            offset = step.rng.random((*weights.shape[:-1], 1))
+            self._pick(stack, weights, np.exp(weights), np.ones(weights.shape[:-1], bool), offset)
         (now,) = step.agreed(stack[-1])
         after = step.end(points=now, log_weights=weights, past=stack[:-1])
         self._warn(after)
@@ -168,13 +164,13 @@ class ParticleFilter(MembersFilter):
         """Log-weights after agents with a poor effective size have resampled, in place."""
         weights, before = state.log_weights.copy(), stack[-1]
         # Everybody draws, needed or not: an agent's luck must not depend on another's weights.
-        levels = levels_of(weights.shape, step.rng, self.rule)
+        offset = step.rng.random((*weights.shape[:-1], 1))
         width = self._bandwidth(state.t, step.dt)
         noise = step.rng.standard_normal(before.shape) if width else None
         poor = state.effective_size < self.threshold * self.members
         if not poor.any():
             return weights
-        picked = self._pick(stack, weights, state.weights, poor, levels)
+        picked = self._pick(stack, weights, state.weights, poor, offset)
         if noise is not None:
             # Where one weight dominates, the spread of all particles: the weighted one is gone.
             lost = state.effective_size[poor][:, None] < 2
@@ -192,11 +188,11 @@ class ParticleFilter(MembersFilter):
         return silverman(self.members, self.model.dim) if still else 0.0
 
     def _pick(
-        self, stack: list[Array], log_weights: Array, weights: Array, poor: Mask, levels: Array
+        self, stack: list[Array], log_weights: Array, weights: Array, poor: Mask, offset: Array
     ) -> Any:
         """Resample some agents' paths in the stack; the weights are equal then."""
         rows = slice(None) if poor.all() else poor
-        picked = picked_by(weights[rows], levels[rows], self.rule)
+        picked = picked_by(weights[rows], offset[rows])
         for k, path in enumerate(stack):
             moved = taken(path[rows], picked)
             stack[k] = path.copy() if rows is poor else moved

@@ -9,32 +9,30 @@ and the covariance of its noise, (m, m) or (..., m, m). Loops go round the door 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial, wraps
 from inspect import signature
 from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..doors import Array, Cov, Rng, door, unchecked
-from ..linalg import cholesky
+from ..ensembles import Ensemble
+from ..linalg import cholesky, leading
 
-__all__ = ["Update", "around", "perturbed", "stackable", "update", "with_missing"]
+__all__ = ["Update", "around", "perturbed", "says", "update", "with_missing"]
 
 F = TypeVar("F", bound=Callable[..., Array])
+Indices = NDArray[np.intp]
 
 Update = Callable[..., Array]
 """``update(ensemble, predicted, observed, noise, *, rng) -> ensemble``"""
 
 
-def several(ensemble: Array, name: str) -> None:
-    """Refuse a single member: it has no spread."""
-    if ensemble.shape[-2] < 2:
-        raise ValueError(f"{name}: needs at least 2 members, got {ensemble.shape[-2]}")
-
-
 _KINDS = (
-    Annotated[Array, "... N d", several],
+    Ensemble,
     Annotated[Array, "... N m"],
     Annotated[Array, "... m"],
     Annotated[Cov, "... m m"],
@@ -95,33 +93,28 @@ def _related(four: dict[str, Array]) -> dict[str, Array]:
     if own[0] == own[1] == lead and own[2] in ((), lead):
         return {}
     for name, given in zip(list(four)[1:], own, strict=True):
-        fits = all(n in (1, k) for n, k in zip(given[::-1], lead[::-1], strict=False))
-        if len(given) > len(lead) or not fits:
+        if leading(lead, given, name) != lead:
             raise ValueError(f"{name}: needs leading axes {lead}, got {given}")
     tails = zip(list(four)[1:3], (2, 1), strict=True)
     return {n: np.broadcast_to(four[n], (*lead, *four[n].shape[-k:])) for n, k in tails}
 
 
 def says(update: Update, what: str) -> bool:
-    """What an update says of itself: that it ``stacks``, or takes missing readings ``whole``."""
-    return bool(getattr(update.func if isinstance(update, partial) else update, what, False))
+    """What an update says of itself: that it ``stacks``, or takes missing readings ``whole``.
 
+    One that stacks can update ensembles with a noise covariance of their own each in one call, as
+    every update of this package does; a plain function gets one agent's at a time.
 
-def stackable(update: Update) -> bool:
-    """Whether ensembles with a noise covariance of their own each can be updated in one call.
-
-    True for every update of this package; a plain function gets one agent's at a time.
-
-    >>> stackable(print)
+    >>> says(print, "stacks")
     False
     """
-    return says(update, "stacks")
+    return bool(getattr(update.func if isinstance(update, partial) else update, what, False))
 
 
 def around(inner: Update) -> Callable[[F], F]:
     """The door of a wrapper, which says of itself what the update says that it wraps.
 
-    >>> stackable(around(print)(lambda x, h, y, r, *, rng: x))
+    >>> says(around(print)(lambda x, h, y, r, *, rng: x), "stacks")
     False
     """
 
@@ -179,7 +172,7 @@ def with_missing(
     if gone.any():
         present = present & ~gone.any(axis=-2)
     if present.all() or says(update, "whole"):
-        stream = _stream(rng, [*base, m], lead, None)
+        stream = _stream(rng, [*base, m], lead, np.arange(math.prod(lead)))
         known = np.where(present, observed, np.nan)
         return inner(ensemble, predicted, known, noise, rng=stream)
     flat, aim = present.reshape(-1, m), observed.reshape(-1, m)
@@ -198,30 +191,27 @@ def with_missing(
     return np.asarray(out.reshape(ensemble.shape))
 
 
-def _stream(rng: Rng, seed: list[int], lead: tuple[int, ...], where: Any) -> Rng:
-    """A stream of draws for the rows `where` (all if None) of a batch."""
-    return rng.stream(seed, where) if isinstance(rng, Rows) else Rows(seed, lead, where)
+def _stream(rng: Rng, seed: list[int], lead: tuple[int, ...], where: Indices) -> Rng:
+    """A stream of draws for the rows `where` of a batch; of rows of rows their places stay."""
+    if isinstance(rng, Rows):
+        return Rows(seed, rng.lead, rng.where[where])
+    return Rows(seed, lead, where)
 
 
 class Rows(Rng):
     """Normal draws for all ensembles of a batch (*lead), of which those in `where` are asked for.
 
-    `where` counts them flat; None stands for all.
+    `where` counts them flat.
     """
 
-    def __init__(self, seed: list[int], lead: tuple[int, ...], where: Any) -> None:
+    def __init__(self, seed: list[int], lead: tuple[int, ...], where: Indices) -> None:
         super().__init__(np.random.PCG64(np.random.SeedSequence(seed)))
         self.lead, self.where = lead, where
 
-    def stream(self, seed: list[int], where: Any) -> Rows:
-        """Another stream for these ensembles, or for some of them: their places stay."""
-        if where is None:
-            return Rows(seed, self.lead, self.where)
-        return Rows(seed, self.lead, where if self.where is None else self.where[where])
-
     def standard_normal(self, size: Any = None, *args: Any, **options: Any) -> Any:
         """As numpy's, but of a batch's rows those that are asked for."""
-        if self.where is None or not np.iterable(size) or tuple(size)[:1] != self.where.shape:
+        some = np.iterable(size) and tuple(size)[:1] == self.where.shape
+        if not some or self.where.size == math.prod(self.lead):
             return super().standard_normal(size, *args, **options)
         rest = tuple(size)[1:]
         drawn = super().standard_normal((*self.lead, *rest), *args, **options)

@@ -1,4 +1,4 @@
-r"""Updates by the Kalman gain: four ways to treat the noise of the observation.
+r"""Updates by the Kalman gain, with four ways to treat the noise of the observation; forecasts.
 
 With the sample covariances :math:`\hat{\mathbf C}` of members and predictions, and one draw
 :math:`\zeta_i` of the noise for each member,
@@ -6,23 +6,29 @@ With the sample covariances :math:`\hat{\mathbf C}` of members and predictions, 
 .. math:: \mathbf x_i' = \mathbf x_i + \mathbf K(\mathbf y^* - \mathbf h(\mathbf x_i) - \zeta_i),
     \qquad \mathbf K = \hat{\mathbf C}_{xh}(\hat{\mathbf C}_{hh} + \mathbf R)^{-1}.
 
-What differs is what stands for R in the gain, and how the draws are made.
+What differs is what stands for R in the gain, and how the draws are made. In a forecast the members
+meet the model's noise, plainly drawn or exact to second order.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from scipy.fft import dct
 from scipy.linalg.lapack import dposv
 
-from ..doors import Array, Rng, unchecked
-from ..ensembles import mean
+from ..doors import Array, NonNegative, Rng, door, unchecked
+from ..ensembles import Ensemble, anomalies, exact_noise, mean
+from ..models import Model
 from .door import perturbed, update
-from .forecasts import exact
 
-__all__ = ["exact_draws", "known_noise", "sampled_noise", "square_root"]
+__all__ = [
+    "exact_draws", "exact_forecast", "known_noise", "sampled_forecast", "sampled_noise",
+    "square_root",
+]  # fmt: skip
+
+Members = Annotated[Ensemble, "... n model.dim"]
 
 
 def _centred(members: Array) -> tuple[Array, Array]:
@@ -217,3 +223,69 @@ def _turned(spread: Array, rng: Rng) -> Array:
     signs = np.copysign(1.0, rng.standard_normal((*rest.shape[:-1], 1)))
     out = np.concatenate([out[..., :1, :], signs * rest], axis=-2)
     return np.asarray(out - 2 * v[:, None] * (v @ out)[..., None, :])
+
+
+@door
+def sampled_forecast(
+    ensemble: Members, model: Model, t: float, dt: NonNegative, *, rng: Rng
+) -> Array:
+    """Move every member with the model and add an independent draw of the noise, (..., N, d).
+
+    Parameters
+    ----------
+    ensemble : array_like, (..., N, d)
+        Members at time `t`.
+    model : Model
+    t, dt : float
+        From when, and how far, in s.
+    rng : numpy.random.Generator
+
+    Examples
+    --------
+    >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+    >>> sampled_forecast([[1.0], [2.0]], still, 0.0, 0.1, rng=np.random.default_rng(0)).ravel()
+    array([1., 2.])
+    """
+    return unchecked(model.sample_step)(ensemble, t, dt, rng=rng)
+
+
+@door
+def exact_forecast(
+    ensemble: Members, model: Model, t: float, dt: NonNegative, *, rng: Rng
+) -> Array:
+    r"""Move the members and add noise that is exact to second order.
+
+    The draws are centred, orthogonal to the moved members' anomalies, and have the sample
+    covariance Q: for a linear model the sample covariance becomes
+    :math:`\boldsymbol\Phi\mathbf P\boldsymbol\Phi^\top+\mathbf Q` to rounding.
+
+    Parameters
+    ----------
+    ensemble, model, t, dt, rng
+        As for :func:`sampled_forecast`; more members than d + the rank of Q.
+
+    Examples
+    --------
+    >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
+    >>> x = np.array([[-1.0], [0.0], [0.5], [0.5]])
+    >>> moved = exact_forecast(x, walk, 0.0, 0.5, rng=np.random.default_rng(0))
+    >>> bool(abs(moved.mean()) < 1e-12), float(moved.var(ddof=1).round(12))
+    (True, 1.0)
+    """
+    moved = unchecked(model.step)(ensemble, t, dt)
+    q = model.noise(t, dt)
+    if not q.any():
+        return moved
+    bad = ~np.isfinite(moved).all(axis=(-2, -1), keepdims=True)
+    clean = np.where(bad, ensemble, moved)
+    noisy = clean + exact(unchecked(anomalies)(clean), q, rng)
+    # Members that the model lost stay lost, and do not take the others' noise with them.
+    return np.where(bad, np.nan, noisy)
+
+
+def exact(avoid: Array, cov: Array, rng: Rng) -> Array:
+    """Exact draws, (..., N, k), that say of an update's ensemble if it has too few members."""
+    try:
+        return unchecked(exact_noise)(avoid, cov, rng=rng)
+    except ValueError as error:
+        raise ValueError(str(error).replace("anomalies_to_avoid", "ensemble")) from None

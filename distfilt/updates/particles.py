@@ -1,9 +1,9 @@
-"""Weighted particles: weights from likelihoods, three ways to resample, jitter, and collapse."""
+"""Weighted particles: weights from likelihoods, systematic resampling, jitter, and collapse."""
 
 from __future__ import annotations
 
 import warnings
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,11 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from ..doors import Array, Bounds, Mask, Rng, Semidefinite, Weights, array, door, unchecked
 from ..linalg import cholesky, factor, solve_lower
 
-__all__ = ["ParticleCollapse", "Resampling", "effective_size", "jitter", "resampled"]
+__all__ = ["ParticleCollapse", "effective_size", "jitter", "resampled"]
 
 Indices = NDArray[np.intp]
-Resampling = Literal["systematic", "stratified", "multinomial"]
-"""The names of the rules by which :func:`resampled` draws."""
 Bandwidth = Annotated[float, Bounds(above=0, at_most=1)]
 
 
@@ -87,19 +85,16 @@ def _log_sum(logs: Array) -> Array:
 
 
 @door
-def resampled(
-    probabilities: Annotated[Weights, "... n"], *, rng: Rng, rule: Resampling = "systematic"
-) -> Indices:
-    """Draw N indices, each as often as its weight says on average.
+def resampled(probabilities: Annotated[Weights, "... n"], *, rng: Rng) -> Indices:
+    """Draw N indices, each as often as its weight says on average: systematic resampling.
+
+    One random number serves all, so that an index appears within one of N times its weight.
 
     Parameters
     ----------
     probabilities : array_like, (..., N)
         Weights that sum to one.
     rng : numpy.random.Generator
-    rule : {"systematic", "stratified", "multinomial"}
-        One random number for all, so that an index appears within one of N times its weight; one
-        in each of N equal strata; or N independent draws, which vary most.
 
     Returns
     -------
@@ -115,37 +110,15 @@ def resampled(
     >>> resampled([0.5, 0.0, 0.25, 0.25], rng=np.random.default_rng(0))
     array([0, 0, 2, 3])
     """
-    return picked_by(probabilities, levels_of(probabilities.shape, rng, rule), rule)
+    return picked_by(probabilities, rng.random((*probabilities.shape[:-1], 1)))
 
 
-def levels_of(shape: tuple[int, ...], rng: Rng, rule: str) -> Array:
-    """The random numbers that a rule needs; as many whatever the weights are."""
-    return rng.random((*shape[:-1], 1 if rule == "systematic" else shape[-1]))
-
-
-def picked_by(w: Array, drawn: Array, rule: str) -> Indices:
-    """The indices of weights (..., N) that the random numbers of :func:`levels_of` pick."""
+def picked_by(w: Array, offset: Array) -> Indices:
+    """Index of the weight (..., N) that holds each of the levels (k + offset) / N."""
     n = w.shape[-1]
-    if rule == "systematic":
-        return _systematic(w, drawn)
-    levels = (np.arange(n) + drawn) / n if rule == "stratified" else np.sort(drawn, axis=-1)
-    edges = _edges(w).reshape(-1, n)
-    # Rounding must not leave a level at the last edge: it would pick an index beyond the weights.
-    inside = np.minimum(levels, np.nextafter(1.0, 0.0)).reshape(-1, n)
-    rows = [np.searchsorted(e, u, side="right") for e, u in zip(edges, inside, strict=True)]
-    return np.array(rows, dtype=np.intp).reshape(w.shape)
-
-
-def _edges(w: Array) -> Array:
     edges = np.cumsum(w, axis=-1)
-    return np.asarray(edges / edges[..., -1:])
-
-
-def _systematic(w: Array, offset: Array) -> Indices:
-    """Index of the weight that holds each of the levels (k + offset) / n."""
-    n = w.shape[-1]
     # How many levels lie below each edge; the last edge has all of them.
-    levels = n * _edges(w)
+    levels = n * (edges / edges[..., -1:])
     levels -= offset
     below = np.ceil(levels, out=levels).clip(0, n, out=levels).astype(np.intp)
     below[..., -1] = n
@@ -157,30 +130,25 @@ def _systematic(w: Array, offset: Array) -> Indices:
 
 @door
 def jitter(
-    points: Annotated[Array, "... n d"], *, rng: Rng, bandwidth: Bandwidth | None = None,
-    cov: Semidefinite | None = None, copied: Annotated[Mask, "... n"] | None = None,
+    points: Annotated[Array, "... n d"], *, rng: Rng, bandwidth: Bandwidth,
+    cov: Semidefinite | None = None,
 ) -> Array:
     r"""Move equally weighted particles apart without moving their mean or covariance.
 
     .. math:: \mathbf x_i' = \bar{\mathbf x} + \sqrt{1-h^2}\,(\mathbf x_i-\bar{\mathbf x})
         + h\,\mathbf C^{1/2}\boldsymbol\xi_i
 
-    Copies of one particle separate, which a model without noise never does for them. Where it is
-    known which were `copied`, these alone move, by :math:`h\,\mathbf C^{1/2}\boldsymbol\xi_i`.
+    Copies of one particle separate, which a model without noise never does for them.
 
     Parameters
     ----------
     points : array_like, (..., N, d)
     rng : numpy.random.Generator
-    bandwidth : float, optional
-        The kernel's width h, in (0, 1]; by default Silverman's
-        :math:`(4/(N(d+2)))^{1/(d+4)}`, at most one.
+    bandwidth : float
+        The kernel's width h, in (0, 1].
     cov : array_like, (..., d, d), optional
         C; by default the particles' own. When one weight dominated before resampling the copies
         have none: pass the covariance of the unweighted particles.
-
-    copied : ndarray of bool, (..., N), optional
-        Which are copies, as :func:`copies` says: the others stay.
 
     Returns
     -------
@@ -189,8 +157,7 @@ def jitter(
 
     Notes
     -----
-    J. Liu, M. West, in: Sequential Monte Carlo Methods in Practice (2001) 197-223; C. Musso,
-    N. Oudjane, F. Le Gland, same book, 247-271, for copies alone.
+    J. Liu, M. West, in: Sequential Monte Carlo Methods in Practice (2001) 197-223.
 
     Examples
     --------
@@ -199,12 +166,10 @@ def jitter(
     >>> len(set(moved.ravel().tolist()))
     4
     """
-    n, d = points.shape[-2:]
-    h = silverman(n, d) if bandwidth is None else bandwidth
     if cov is None:
         around = points - points.mean(axis=-2, keepdims=True)
-        cov = np.swapaxes(around, -1, -2) @ around / n
-    return jittered(points, cov, h, rng.standard_normal(points.shape), copied)
+        cov = np.swapaxes(around, -1, -2) @ around / points.shape[-2]
+    return jittered(points, cov, bandwidth, rng.standard_normal(points.shape))
 
 
 def silverman(n: int, d: int) -> float:
@@ -222,7 +187,11 @@ def copies(picked: Indices) -> Mask:
 
 
 def jittered(x: Array, cov: Array, h: float, drawn: Array, copied: Mask | None = None) -> Array:
-    """As :func:`jitter`, with standard normal draws."""
+    """As :func:`jitter`, with standard normal draws.
+
+    Where it is known which were copied, these alone move: C. Musso, N. Oudjane, F. Le Gland, in the
+    same book, 247-271.
+    """
     moved = drawn @ np.swapaxes(unchecked(factor)(cov), -1, -2)
     if copied is not None:
         return np.asarray(np.where(copied[..., None], x + h * moved, x))

@@ -9,16 +9,13 @@ import numpy as np
 
 from .. import coupling
 from ..doors import Array, Bounds, Count, NonNegative, Rng, door, unchecked
-from ..ensembles import sample_covariance
+from ..ensembles import Ensemble, sample_covariance
 from ..triangular import affine, compose
 from ..triangular.affine import ConditionalMap
-from .door import perturbed, several, update
+from .door import perturbed, update
 from .particles import log_likelihood, warn_of_collapse
 
-__all__ = [
-    "ensemble_transform", "principal_components", "principal_directions", "transport",
-    "transport_sample",
-]  # fmt: skip
+__all__ = ["ensemble_transform", "principal_components", "principal_directions", "transport"]
 
 Factor = Annotated[float, Bounds(at_least=0, at_most=1e100)]
 Fit = Callable[[Array, Array], ConditionalMap]
@@ -63,39 +60,8 @@ def transport(
     return compose(fit(seen, ensemble), seen, ensemble, observed)
 
 
-@update
-def transport_sample(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
-    fit: Fit = affine.fit,
-) -> Array:
-    r"""Draw a new ensemble from the conditional by the inverse map alone, equation (9).
-
-    .. math:: \mathbf x_i' = \mathbf S(\mathbf y^*,\cdot)^{-1}(\mathbf z_i),\qquad
-        \mathbf z_i\sim N(\mathbf 0,\mathbf I)
-
-    The new members forget the old ones. Where the map fits badly, so do they: the composed map
-    (10) of :func:`transport` makes most of the map's error undo itself.
-
-    Parameters
-    ----------
-    ensemble, predicted, observed, noise, rng, fit
-        As in :func:`transport`; the reference samples are drawn too.
-
-    Examples
-    --------
-    >>> rng = np.random.default_rng(3)
-    >>> prior = rng.standard_normal((4000, 1))
-    >>> posterior = transport_sample(prior, prior, [1.0], [[1.0]], rng=rng)
-    >>> posterior.mean().round(1), posterior.var().round(1)
-    (np.float64(0.5), np.float64(0.5))
-    """
-    seen = perturbed(predicted, noise, rng)
-    reference = rng.standard_normal(ensemble.shape)
-    return fit(seen, ensemble).inverse(observed, reference)
-
-
 @door
-def principal_directions(ensemble: Annotated[Array, "... N d", several], n: Count) -> Array:
+def principal_directions(ensemble: Ensemble, n: Count) -> Array:
     """The `n` orthonormal directions of largest sample variance, as columns.
 
     Parameters

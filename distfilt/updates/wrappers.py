@@ -1,6 +1,6 @@
 """Wrappers: what can be put around any update, one round another.
 
-``inflated(gated(known_noise), factor=1.02)`` is an update like any other, and so is
+``inflated(serial(known_noise), factor=1.02)`` is an update like any other, and so is
 ``projected(augmented(ensemble_transform, g, std=0.1), g)``, Das and Bhattacharya's OTNLeqMA.
 """
 
@@ -10,24 +10,18 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse import csgraph
-from scipy.special import ndtri
 
 from .. import coupling
 from ..coupling import Constraint
-from ..doors import Array, Bounds, NonNegative, Positive, Rng, door, unchecked
-from .door import Update, around, with_missing
+from ..doors import Array, NonNegative, Positive, Rng, door, unchecked
+from .door import Indices, Update, around, with_missing
 
-__all__ = [
-    "augmented", "gated", "inflated", "localised", "projected", "retracted", "serial",
-]  # fmt: skip
+__all__ = ["augmented", "inflated", "localised", "projected", "retracted", "serial"]
 
-Indices = NDArray[np.intp]
 Motion = tuple[Sequence[int], Sequence[int]]
 """Indices of positions and of their velocities, in the same order."""
-_Open = Annotated[float, Bounds(above=0, below=1)]
 
 
 def _followed(update: Update, change: Callable[[Array], Array]) -> Update:
@@ -187,40 +181,6 @@ def augmented(update: Update, constraint: Constraint, *, std: Positive) -> Updat
 
 
 @door
-def gated(update: Update, *, probability: _Open = 0.999) -> Update:
-    r"""Leave out readings whose innovation is too large to believe; with none left, nothing moves.
-
-    A component passes where :math:`(y^*-\bar h)^2 \le q^2(\hat C_{hh}+R)`, each judged alone, with
-    q such that a consistent filter rejects a reading with probability one minus `probability`.
-
-    Parameters
-    ----------
-    update, probability
-        Any update; how likely a good reading passes, between 0 and 1.
-
-    Examples
-    --------
-    >>> from distfilt.updates import exact_draws
-    >>> x = np.array([[-1.0], [0.0], [0.5], [0.5]])
-    >>> careful = gated(exact_draws)
-    >>> bool((careful(x, x, [90.0], [[0.5]], rng=np.random.default_rng(0)) == x).all())
-    True
-    """
-    width = float(ndtri(0.5 + 0.5 * probability))
-
-    @around(update)
-    def gate(
-        ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
-    ) -> Array:
-        variance = predicted.var(axis=-2, ddof=1) + np.diagonal(noise, axis1=-2, axis2=-1)
-        passes = (observed - predicted.mean(axis=-2)) ** 2 <= width**2 * variance
-        kept = np.where(passes, observed, np.nan)
-        return with_missing(update, ensemble, predicted, kept, noise, rng=rng)
-
-    return gate
-
-
-@door
 def serial(update: Update) -> Update:
     """Take independent readings in one after the other.
 
@@ -303,8 +263,6 @@ def localised(
     >>> (after != x).any(axis=0)
     array([ True, False])
     """
-    if places.shape[1] != readings.shape[1]:
-        raise ValueError(f"readings: needs {places.shape[1]} coordinates, got {readings.shape[1]}")
     both = np.concatenate([places, readings])
     gap = np.abs(both[:, None] - readings)
     if period is not None:

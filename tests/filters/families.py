@@ -24,7 +24,7 @@ from distfilt.network import (
     pull,
 )
 from distfilt.sensors import Sensor, angle, direct
-from distfilt.updates import exact_draws, gated, inflated, serial, square_root, transport
+from distfilt.updates import exact_draws, inflated, serial, square_root, transport
 
 FAMILIES: dict[str, Callable[..., Any]] = {
     "ensemble": partial(EnsembleFilter, members=40),
@@ -32,13 +32,13 @@ FAMILIES: dict[str, Callable[..., Any]] = {
     "ensemble, exact draws": partial(EnsembleFilter, update=exact_draws, members=40),
     "ensemble, transport": partial(EnsembleFilter, update=transport, members=60),
     "ensemble, square root": partial(
-        EnsembleFilter, update=inflated(gated(square_root), factor=1.01), members=40
+        EnsembleFilter, update=inflated(square_root, factor=1.01), members=40
     ),
     "ensemble, serial": partial(EnsembleFilter, update=serial(exact_draws), members=40),
     "gaussian": GaussianFilter,
     "gaussian, unscented": partial(GaussianFilter, rule="unscented"),
     "particle": partial(ParticleFilter, members=500),
-    "particle, stratified": partial(ParticleFilter, members=500, rule="stratified", jitter=0.2),
+    "particle, jitter": partial(ParticleFilter, members=500, jitter=0.2),
     "ensemble, common": partial(TransportFilter, members=40, agreement=average, rejuvenation=0.1),
 }
 

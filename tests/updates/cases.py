@@ -11,7 +11,6 @@ from distfilt.updates import (
     augmented,
     ensemble_transform,
     exact_draws,
-    gated,
     inflated,
     known_noise,
     localised,
@@ -22,7 +21,6 @@ from distfilt.updates import (
     serial,
     square_root,
     transport,
-    transport_sample,
 )
 
 H = np.array([[1.0, 0.0, 0.5], [0.0, 2.0, -1.0]])
@@ -44,30 +42,19 @@ UPDATES = {
     "exact_draws": exact_draws,
     "square_root": square_root,
     "transport": transport,
-    "transport_sample": transport_sample,
     "principal_components": partial(principal_components, n_state=2, n_observed=2),
     "inflated": inflated(known_noise, factor=1.1),
-    "gated": gated(known_noise),
     "serial": serial(known_noise),
     "localised": localised(
         known_noise, places=np.zeros((3, 1)), readings=np.zeros((2, 1)), radius=9.0
     ),
-    "inflated gated serial": inflated(gated(serial(square_root)), factor=1.01),
+    "inflated serial": inflated(serial(square_root), factor=1.01),
     "ensemble_transform": FRESH,
     "ensemble_transform, corrected": partial(FRESH, correct=True),
     "augmented": augmented(known_noise, PLANE, std=0.5),
-    "augmented transform": augmented(FRESH, PLANE, std=0.5),
     "projected": projected(known_noise, PLANE),
-    "projected transform": projected(FRESH, PLANE, reading="particle"),
     "retracted": retracted(known_noise, PLANE),
-    "retracted transform": retracted(FRESH, PLANE),
 }
-CONSISTENT = [
-    "sampled_noise", "known_noise", "exact_draws", "square_root", "transport", "transport_sample",
-    "gated", "serial", "localised",
-]
-"""Those whose moments tend to the Kalman filter's."""
-
 
 def rng(seed: int = 1) -> np.random.Generator:
     return np.random.default_rng(seed)

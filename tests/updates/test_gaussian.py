@@ -23,6 +23,11 @@ def test_sampled_and_known_noise_by_their_formulas() -> None:
         assert np.allclose(out, x + (Y - seen) @ gain.T, atol=1e-12)
 
 
+def test_sampled_noise_needs_more_members_than_readings() -> None:
+    with pytest.raises(ValueError, match="ensemble: needs at least 3 members"):
+        sampled_noise(members(2), members(2)[:, :2], Y, R, rng=np.random.default_rng(3))
+
+
 @pytest.mark.parametrize("update", [exact_draws, square_root])
 def test_moments_after_a_curved_reading_are_exact(update: Update) -> None:
     """P+ = P - K S K' for the sample covariances, also where h is not linear."""

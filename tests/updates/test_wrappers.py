@@ -3,31 +3,30 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
 
 from distfilt.coupling import norm, project, retract
 from distfilt.doors import unchecked
-from distfilt.models import Model, rk4
+from distfilt.models import Model
 from distfilt.updates import (
     augmented,
     ensemble_transform,
     exact_draws,
-    gated,
     inflated,
     known_noise,
     localised,
     projected,
     retracted,
     sampled_forecast,
-    sampled_noise,
     serial,
     square_root,
     with_missing,
 )
-from distfilt.updates.door import Update, stackable
-from distfilt.updates.forecasts import exact_forecast
+from distfilt.updates.door import Update, says
+from distfilt.updates.gaussian import exact_forecast
 from distfilt.updates.wrappers import gaspari_cohn
 
 from .cases import UPDATES, H, R, Y, kalman, members, moments, rng
@@ -44,26 +43,15 @@ def test_inflation_multiplies_anomalies_only() -> None:
     assert np.allclose(wide, centre + 1.3 * (plain - centre), atol=1e-12)
 
 
-def test_wild_missing_and_unpredicted_readings_are_deleted_rows() -> None:
+def test_missing_and_unpredicted_readings_are_deleted_rows() -> None:
     x, noise = members(30), np.array([[0.5, 0.3, 0.1], [0.3, 0.9, 0.2], [0.1, 0.2, 0.4]])
     h, y, keep = np.column_stack([x @ H.T, x[:, 0]]), np.array([1.2, -0.7, 0.4]), [0, 2]
     wanted = ROOT(x, h[:, keep], y[keep], noise[np.ix_(keep, keep)], rng=rng())
-    blind, wild, gap = h.copy(), y.copy(), y.copy()
-    blind[3, 1], wild[1], gap[1] = np.nan, 500.0, np.nan
-    for out in (
-        gated(ROOT)(x, h, wild, noise, rng=rng()),
-        with_missing(ROOT, x, h, gap, noise, rng=rng()),
-        with_missing(ROOT, x, blind, y, noise, rng=rng()),
-    ):
+    blind, gap = h.copy(), y.copy()
+    blind[3, 1], gap[1] = np.nan, np.nan
+    for seen, told in ((h, gap), (blind, y)):
+        out = with_missing(ROOT, x, seen, told, noise, rng=rng())
         assert np.allclose(out, wanted, atol=1e-12)
-
-
-def test_gate_uses_the_sample_variance_of_few_members() -> None:
-    """Of -1 and 1 it is 2, so with noise 0.5 a reading passes within q times the root of 2.5."""
-    x, q = np.array([[-1.0], [1.0]]), 1.959963984540054
-    for y, passes in ((0.999 * q * np.sqrt(2.5), True), (1.001 * q * np.sqrt(2.5), False)):
-        out = gated(known_noise, probability=0.95)(x, x, [y], [[0.5]], rng=rng())
-        assert bool((out != x).any()) is passes
 
 
 def test_serial_without_a_sensor_is_exact_for_linear_readings() -> None:
@@ -89,16 +77,6 @@ def test_serial_predicts_again() -> None:
     assert np.abs(serial(ROOT)(*four, rng=rng()) - out).max() > 1e-3
 
 
-def test_serial_serves_more_readings_than_members() -> None:
-    """A hub that hears twenty readings with ten members, sampled noise and all."""
-    x = members(10)
-    h = np.repeat(x[:, :1], 20, axis=1)
-    with pytest.raises(ValueError, match="at least 21 members for 20 readings"):
-        sampled_noise(x, h, np.ones(20), np.eye(20), rng=rng())
-    out = serial(sampled_noise)(x, h, np.ones(20), np.eye(20), rng=rng())
-    assert out[:, 0].var() < 0.5 * x[:, 0].var()
-
-
 @pytest.mark.parametrize("name", UPDATES)
 def test_missing_readings_of_a_stack_with_noise_of_its_own(name: str) -> None:
     x = members(30, 3)
@@ -118,8 +96,8 @@ def test_partial_options_survive_the_open_door() -> None:
     x = members(20)
     given = (x, x @ H.T, Y, R)
     assert np.array_equal(unchecked(turned)(*given, rng=rng()), turned(*given, rng=rng()))
-    assert stackable(turned) and not stackable(partial(print, 3))
-    assert not stackable(inflated(lambda x, h, y, r, *, rng: x, factor=1.0))
+    assert says(turned, "stacks") and not says(partial(print, 3), "stacks")
+    assert not says(inflated(lambda x, h, y, r, *, rng: x, factor=1.0), "stacks")
     with pytest.raises(ValueError, match="rotation"):
         inflated(partial(square_root, rotation="left"), factor=1.0)
 
@@ -202,30 +180,17 @@ def test_one_reading_localised_is_the_update_with_a_tapered_gain() -> None:
     assert (out[:, 2] == x[:, 2]).all()
 
 
-def lorenz96(x: np.ndarray, _: float) -> np.ndarray:
-    near = np.roll(x, -1, axis=-1) - np.roll(x, 2, axis=-1)
-    return near * np.roll(x, 1, axis=-1) - x + 8.0
-
-
-def error96(update: Update, n: int, steps: int = 150) -> float:
-    """Root mean square error on Lorenz-96, 40 components all seen with variance 1, in 4 runs."""
-    source, inner, misses = rng(96), unchecked(update), []
-    truth = 8 + source.standard_normal((4, 40))
-    for _ in range(200):
-        truth = rk4(lorenz96, truth, 0.0, 0.05)
-    x = truth[:, None] + source.standard_normal((4, n, 40))
-    for _ in range(steps):
-        truth, x = rk4(lorenz96, truth, 0.0, 0.05), rk4(lorenz96, x, 0.0, 0.05)
-        seen = truth + source.standard_normal(truth.shape)
-        x = inner(x, x, seen, np.eye(40), rng=source)
-        misses.append(((x.mean(axis=1) - truth) ** 2).mean())
-    return float(np.sqrt(np.mean(misses[50:])))
-
-
-@pytest.mark.parametrize(("inner", "n"), [(ROOT, 10), (known_noise, 20)])
-def test_few_members_follow_lorenz_96_only_if_localised(inner: Update, n: int) -> None:
-    """Localised to less than a third of a reading's error; the truth is lost without."""
-    ring = 1.0 * np.arange(40)[:, None]
-    near = localised(inner, places=ring, readings=ring, radius=5.0, period=40.0)
-    assert error96(inflated(near, factor=1.03), n) < 0.3
-    assert error96(inflated(inner, factor=1.03), n) > 0.8
+@pytest.mark.parametrize("given", [{}, {"predict": lambda e: e[:, [0, 2]]}])
+def test_readings_on_a_ring_localised_one_after_the_other(given: dict[str, Any]) -> None:
+    """What the first reading moves, predictions or the members of which they are made, the second
+    meets; distances are the shorter way round.
+    """
+    x, y = members(20), np.array([1.0, -0.5])
+    near = partial(localised, ROOT, places=[[0.0], [1.5], [7.0]], radius=2.0, period=8.0)
+    out = near(readings=[[0.0], [7.0]])(x, x[:, [0, 2]], y, np.diag([0.5, 0.9]), rng=rng(), **given)
+    first = near(readings=[[0.0]])(x, x[:, :1], y[:1], [[0.5]], rng=rng())
+    second = near(readings=[[7.0]])(first, first[:, 2:], y[1:], [[0.9]], rng=rng())
+    assert np.allclose(out, second, atol=1e-12)
+    moved = near(readings=[[7.0]])(x, x[:, 2:], y[1:], [[0.9]], rng=rng()) - x
+    plain = ROOT(x, x[:, 2:], y[1:], [[0.9]], rng=rng()) - x
+    assert np.allclose(moved, plain * gaspari_cohn(np.array([0.5, 1.25, 0.0])), atol=1e-12)
