@@ -4,7 +4,7 @@ from .base import Filter
 from .density import DensityFilter, DensityState
 from .ensemble import EnsembleFilter, TransportFilter
 from .gaussian import GaussianFilter, GaussianState
-from .inputs import Late, Reading, moments_of
+from .inputs import Reading, moments_of
 from .mixture import MixtureFilter, MixtureState
 from .news import NewsFilter, increment
 from .particle import ParticleCollapse, ParticleFilter
@@ -14,7 +14,7 @@ from .step import FilterError, Step
 
 __all__ = [  # fmt: skip
     "DensityFilter", "DensityState", "EnsembleFilter", "Filter", "FilterError",
-    "GaussianFilter", "GaussianState", "Late", "MixtureFilter", "MixtureState", "NewsFilter",
+    "GaussianFilter", "GaussianState", "MixtureFilter", "MixtureState", "NewsFilter",
     "ParticleCollapse", "ParticleFilter", "Reading", "SensorState", "State", "Step", "Summary",
     "TransportFilter", "final_state", "increment", "moments_of",
 ]

@@ -11,15 +11,18 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, fields
 from functools import cached_property
+from operator import attrgetter
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+import numpy as np
 
 from ..doors import Array, Bounds, Index, Positive, Record, Rng, door
 from ..models import Model
 from ..network import Channel, Faults, Ledger, fused_kind
 from ..network.graphs import as_graph
-from .inbox import Inbox
-from .inputs import Late, Team, belated, planned, said_by_all, team_of
-from .record import SCORES, Recorder, Score, Summary
+from ..sensors import Sensor
+from .inputs import Reading, belated, planned, said_by_all
+from .record import SCORES, Score, Summary, recorded
 from .saving import State
 from .step import RECOVERABLE, FilterError, Step, of_the_call
 
@@ -37,11 +40,11 @@ class Filter(Record, ABC):
     ----------
     model : Model
         How the state moves; known to all agents.
-    sensors : sequence of length A, or callable t -> sequence
-        What each agent sees: a Sensor, several in a list, or None. Neighbours know each other's. A
-        function is asked at t = 0 how many agents there are.
+    sensors : sequence of length A
+        What each agent sees: a Sensor, several in a list, or None. Neighbours know each other's.
+        One that moves comes with each :class:`Reading`.
     graph : Graph, networkx graph, matrix or edges, or callable t -> one of them, optional
-        Who hears whom; a single agent needs none. At a time without any link nobody speaks.
+        Who hears whom; needed where anybody speaks. At a time without any link nobody does.
     agreement : callable, optional
         ``agreement(belief, channel) -> belief``: what agents do after the update to agree, if they
         do; the belief is the family's. A rule of this package that fuses something else is refused.
@@ -49,7 +52,7 @@ class Filter(Record, ABC):
         Whether agents send their readings to those that hear them, who use them too.
     faults : Faults, optional
         Messages lost and agents silenced; a lost observation is a missing one. A delay is not
-        accepted: an observation that comes late has its own time, pass it as :class:`Late`.
+        accepted: an observation that comes late has its own time, pass it as `late`.
     lag : int
         How many earlier times are kept, for late observations and for smoothing.
     names : sequence of str
@@ -60,9 +63,9 @@ class Filter(Record, ABC):
     gate : float, optional
         How likely a good reading passes, in (0, 1). Each sensor's reading is tested against what
         was predicted; those that fail are left out and counted as ``refused`` in the record.
-    every : float or callable t -> bool, optional
-        When agents exchange anything: every so many seconds, or at the steps where the function
-        is true. Readings wait for it and are told as late ones, so that a `lag` has to reach back.
+    every : float, optional
+        Agents exchange something every so many seconds only. Readings wait for it and are told as
+        late ones, so that a `lag` has to reach back.
 
     Notes
     -----
@@ -72,8 +75,8 @@ class Filter(Record, ABC):
     `fuses` what its agreements fuse, and `unused` why options that it cannot have are refused.
     """
 
-    model: Any
-    sensors: Any
+    model: Model
+    sensors: Sequence[Sensor | Sequence[Sensor] | None]
     graph: Any = None
     _: KW_ONLY
     agreement: Callable[..., Any] | None = None
@@ -83,13 +86,12 @@ class Filter(Record, ABC):
     names: Sequence[str] = ()
     failures: Literal["raise", "keep"] = "raise"
     gate: Annotated[float, Bounds(above=0, below=1)] | None = None
-    every: Positive | Callable[[float], bool] | None = None
+    every: Positive | None = None
 
     state: ClassVar[type[Any]] = State
     draws: ClassVar[bool] = False
     batched: ClassVar[bool] = True
     changes: ClassVar[bool] = False
-    alone: ClassVar[bool] = False
     fuses: ClassVar[str | None] = None
     unused: ClassVar[Mapping[str, str]] = {}
 
@@ -106,52 +108,34 @@ class Filter(Record, ABC):
         kind = None if self.agreement is None else fused_kind(self.agreement)
         if kind is not None and kind != self.fuses:
             raise ValueError(f"agreement: needs a rule that fuses {self.fuses}, got one of {kind}")
-        if self.every is not None and self.shares and self.graph is not None and not self.lag:
+        if self.every is not None and self.share and self.graph is not None and not self.lag:
             raise ValueError("lag: needs at least 1 for readings that wait for a contact, got 0")
 
     def check_parts(self) -> None:
-        """Refuse a model, sensors or a graph that this family cannot have."""
-        for model in self.models:
-            if not isinstance(model, Model):
-                raise ValueError(f"model: needs a Model, got {type(model).__name__}")
-        if not callable(self.sensors):
-            team_of(self.sensors)
-            object.__setattr__(self, "sensors", tuple(self.sensors))
-        for sensor in (s for own in self.team(0.0) for s in own):
-            if not self.changes and sensor.uses_previous:
-                raise ValueError("sensors: needs sensors of the present state, got a differential")
-        if self.graph is None and self.count > 1 and not self.alone:
+        """Refuse sensors or a graph that this family cannot have."""
+        if not self.changes and any(s.uses_previous for own in self.team for s in own):
+            raise ValueError("sensors: needs sensors of the present state, got a differential")
+        speak = self.share or self.agreement is not None
+        if self.graph is None and self.count > 1 and speak:
             raise ValueError(f"graph: needs a Graph of {self.count} agents, got None")
         if self.graph is not None and not callable(self.graph):
             object.__setattr__(self, "graph", as_graph(self.graph, self.count))
 
-    @property
-    def models(self) -> tuple[Model, ...]:
-        """The models of different agents."""
-        return (self.model,)
-
     @cached_property
-    def inbox(self) -> Inbox:
-        """Plans of who has which readings."""
-        return Inbox()
+    def team(self) -> tuple[tuple[Sensor, ...], ...]:
+        """Each agent's sensors."""
+        several = [() if own is None else own for own in self.sensors]
+        return tuple(own if isinstance(own, tuple) else (own,) for own in several)
 
     @cached_property
     def count(self) -> int:
         """Number A of agents."""
-        given = self.sensors(0.0) if callable(self.sensors) else self.sensors
-        if isinstance(given, Sequence):
-            return len(given)
-        raise ValueError(f"sensors: needs one for each agent, got {type(given).__name__}")
-
-    @property
-    def shares(self) -> bool:
-        """Whether readings are told to neighbours."""
-        return self.share
+        return len(self.sensors)
 
     @property
     def components(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Names and units of the largest state's components; numbers where it has no names."""
-        model = max(self.models, key=lambda model: model.dim)
+        """Names and units of the state's components; numbers where it has no names."""
+        model = self.model
         names = tuple(model.names) or tuple(str(k) for k in range(model.dim))
         return names, tuple(model.units) or ("",) * model.dim
 
@@ -159,14 +143,6 @@ class Filter(Record, ABC):
     def agents(self) -> tuple[str, ...]:
         """Names of the agents; their numbers by default."""
         return tuple(self.names) or tuple(str(k) for k in range(self.count))
-
-    def team(self, t: float) -> Team:
-        """Each agent's sensors at a time."""
-        return team_of(self.sensors(t)) if callable(self.sensors) else self._fixed
-
-    @cached_property
-    def _fixed(self) -> Team:
-        return team_of(self.sensors)
 
     def channel(self, state: State, t: float) -> Channel | None:
         """The door of this step; none where nobody can speak, or it is not yet time."""
@@ -180,8 +156,8 @@ class Filter(Record, ABC):
         )
 
     def _contact(self, before: float, t: float) -> bool:
-        if self.every is None or callable(self.every):
-            return self.every is None or bool(self.every(t))
+        if self.every is None:
+            return True
         # Whether one of the multiples lies after the step's start, and up to its end.
         return math.floor(t / self.every + 1e-9) > math.floor(before / self.every + 1e-9)
 
@@ -234,7 +210,7 @@ class Filter(Record, ABC):
 
     @door
     def step(
-        self, state: State, t: float, observations: Any, *, late: Sequence[Late] = ()
+        self, state: State, t: float, observations: Any, *, late: Sequence[Reading] = ()
     ) -> Any:
         """Move to time `t` and take in what was observed there.
 
@@ -247,8 +223,8 @@ class Filter(Record, ABC):
         observations : sequence of length A
             Per agent (*runs, m) or (m,), or None; or one :class:`Reading`, or a list of them. NaN
             marks a missing component, run by run.
-        late : sequence of Late
-            Observations of earlier times that arrive now; needs a `lag` that reaches back to them.
+        late : sequence of Reading
+            Those of earlier times that arrive now; needs a `lag` that reaches back to them.
 
         Raises
         ------
@@ -263,7 +239,7 @@ class Filter(Record, ABC):
         return self._advanced(state, t, observations, late, own=False)
 
     def _advanced(
-        self, state: Any, t: float, observations: Any, late: Sequence[Late], *, own: bool
+        self, state: Any, t: float, observations: Any, late: Sequence[Reading], *, own: bool
     ) -> Any:
         said = self.read(observations, state.runs, t)
         old = belated(self, late, state, t) if late else ()
@@ -296,15 +272,17 @@ class Filter(Record, ABC):
         return said_by_all(self, observations, runs, t)
 
     def _walk(
-        self, state: Any, grid: Array, entries: Iterable[Any], late: Sequence[Late], *, own: bool
+        self, state: Any, grid: Array, entries: Iterable[Any], late: Sequence[Reading], *, own: bool
     ) -> Iterator[Any]:
-        waiting = sorted(late, key=lambda item: item.arrived)
-        if waiting and (not grid.size or waiting[-1].arrived > grid[-1]):
-            end = f"{grid[-1]:g}" if grid.size else "no time at all"
-            raise ValueError(f"late: needs arrivals up to {end}, got {waiting[-1].arrived:g}")
+        last = grid[-1] if grid.size else -np.inf
+        for item in late:
+            if item.arrived is None or item.arrived > last:
+                raise ValueError(f"late: needs arrivals up to {last:g}, got {item.arrived}")
+        arrival = attrgetter("arrived")
+        waiting = sorted(late, key=arrival)
         mine = False
         for t, observed in zip(grid.tolist(), entries, strict=True):
-            due = [item for item in waiting if item.arrived <= t]
+            due = [item for item in waiting if arrival(item) <= t]
             waiting = waiting[len(due) :]
             state = self._advanced(state, t, observed, due, own=mine)
             mine = own
@@ -312,30 +290,29 @@ class Filter(Record, ABC):
 
     def _recorded(
         self, state: Any, times: Any, observations: Any, truth: Any, scores: Collection[Score],
-        late: Sequence[Late], lag: int,
+        late: Sequence[Reading], lag: int,
     ) -> xarray.Dataset:  # fmt: skip
         """A run's record, each time as it is believed when `lag` more have been observed."""
         self.fits(state)
         grid, entries = planned(self, state, times, observations)
-        recorder = Recorder(self, grid, state, truth, scores)
-        waiting: list[tuple[Any, Summary]] = []
-        last = state
-        for last in self._walk(state, grid, entries, late, own=True):
-            past = [s for t, s in self.past(last) if t > state.t] if lag else []
-            first = len(waiting) - len(past)
-            waiting[first:] = [
-                (then, summary) for (then, _), summary in zip(waiting[first:], past, strict=True)
-            ]
-            waiting.append((last, self.summary(last)))
+        walk = self._walk(state, grid, entries, late, own=True)
+        return recorded(self, grid, state, self._believed(walk, lag), truth, scores)
+
+    def _believed(self, walk: Iterable[Any], lag: int) -> Iterator[tuple[Any, Summary]]:
+        """Each state of a walk, and what is believed of it when `lag` more have followed."""
+        waiting: list[Any] = []
+        for last in walk:
+            waiting.append(last)
             if len(waiting) > lag:
-                recorder.add(*waiting.pop(0))
-        for then, summary in waiting:
-            recorder.add(then, summary)
-        return recorder.dataset(last)
+                summary = self.past(last)[-lag][1] if lag else self.summary(last)
+                yield waiting.pop(0), summary
+        if waiting:
+            past = [summary for _, summary in self.past(last)]
+            yield from zip(waiting, [*past, self.summary(last)][-len(waiting) :], strict=True)
 
     @door
     def steps(
-        self, state: State, times: Any, observations: Any, *, late: Sequence[Late] = ()
+        self, state: State, times: Any, observations: Any, *, late: Sequence[Reading] = ()
     ) -> Iterator[Any]:
         """The states at `times`, one after the other; arguments as in :meth:`run`."""
         self.fits(state)
@@ -345,7 +322,7 @@ class Filter(Record, ABC):
     @door
     def run(
         self, state: State, times: Any, observations: Any, *, truth: Any = None,
-        scores: Collection[Score] = SCORES, late: Sequence[Late] = (),
+        scores: Collection[Score] = SCORES, late: Sequence[Reading] = (),
     ) -> xarray.Dataset:  # fmt: skip
         """Step through a series, or through events, and record it.
 
@@ -364,8 +341,8 @@ class Filter(Record, ABC):
             some components only, by their names, (T, *runs) or (T, *runs, A) each.
         scores : collection of {"squared_error", "nees", "crps"}
             Which of them; CRPS costs about as much as an ensemble filter.
-        late : sequence of Late
-            Each is taken in at the first of `times` that is not before its arrival.
+        late : sequence of Reading
+            Each is taken in at the first of `times` that is not before it `arrived`.
 
         Returns
         -------
@@ -384,7 +361,7 @@ class Filter(Record, ABC):
     @door
     def smooth(
         self, state: State, times: Any, observations: Any, *, truth: Any = None,
-        scores: Collection[Score] = SCORES, late: Sequence[Late] = (),
+        scores: Collection[Score] = SCORES, late: Sequence[Reading] = (),
     ) -> xarray.Dataset:  # fmt: skip
         """Fixed-lag smoothing: of each time what is believed when `lag` more have been observed.
 

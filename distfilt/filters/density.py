@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -119,8 +119,6 @@ class DensityFilter(Filter):
         second weighs by the noise itself and is biased.
     floor : float
         Least density in R, positive.
-    number_known : bool
-        Whether agents know A; otherwise k̄ takes the number that their sharing tells.
     process : float, optional
         For a model that is not exact: Q is this times the prior's factor, per root second.
 
@@ -137,14 +135,15 @@ class DensityFilter(Filter):
     ((20, 225), 1)
     """
 
-    model: FokkerPlanck
-    sensors: Count
+    model: FokkerPlanck  # type: ignore[assignment]
+    sensors: Count  # type: ignore[assignment]
     graph: Positive | Graph | Callable[[float, Array], Graph]
     _: KW_ONLY
     agreement: Sharing  # type: ignore[assignment]
+    share: bool = False
     bandwidth: Positive
     local: Places | None = None
-    first: Literal["flat", "observed"] | ArrayLike = "flat"
+    first: Literal["flat", "observed"] | Annotated[Array, "model.grid.size"] = "flat"
     first_std: Positive | None = None
     rank: Count = 48
     prior_length: Positive | None = None
@@ -152,7 +151,6 @@ class DensityFilter(Filter):
     mass_std: NonNegative = 0.0
     noise: Literal["forecast", "observed"] = "forecast"
     floor: Positive | None = None
-    number_known: bool = True
     process: Positive | None = None
 
     state: ClassVar[type[DensityState]] = DensityState
@@ -170,11 +168,6 @@ class DensityFilter(Filter):
         fine_enough(self.model.grid, self.bandwidth)
         if self.local is not None and max(self.local) >= self.count:
             raise ValueError(f"local: needs agents below {self.count}, got {max(self.local)}")
-        if isinstance(self.first, str) and self.first not in ("flat", "observed"):
-            raise ValueError(f"first: needs flat, observed or a density, got {self.first!r}")
-        if not isinstance(self.first, str):
-            first = array(self.first, "first", (self.model.grid.size,)).copy()
-            object.__setattr__(self, "first", first)
 
     @cached_property
     def count(self) -> int:
@@ -224,7 +217,7 @@ class DensityFilter(Filter):
     def _base(self, seen: Seen) -> Array:
         """Prior means of all agents, (A, n)."""
         if not isinstance(self.first, str):
-            return np.tile(np.asarray(self.first, dtype=np.float64), (self.count, 1))
+            return np.tile(self.first, (self.count, 1))
         if self.first == "observed":
             return alone(self.agreement, seen)
         return seen.flat(self.first_std)
@@ -248,13 +241,12 @@ class DensityFilter(Filter):
         step.channel = channel = Channel(graph, ledger=state.ledger, faults=self.faults, t=t)
         carried, y, counted = self.agreement.learn(state.carried, seen, channel, dt)
         y = y[self.filtering]
-        agents = seen.present.sum() if self.number_known else counted
 
         move = self.model.solver(state.t, dt)
         q = None if self.process is None else self.process * self._basis
         moved = unchecked(low_rank_moved)(state.filters, move, process=q, dt=dt)
         level = moved.estimates if self.noise == "forecast" else y
-        noise = seen.noise(level, agents, self.floor)
+        noise = seen.noise(level, seen.present.sum(), self.floor)
         filters = unchecked(low_rank_step)(moved, y, noise, dt)
         parts = np.unique(graph.components[seen.present]).size
         return step.end(

@@ -221,17 +221,16 @@ class EnsembleFilter(MembersFilter):
         """One time's ensembles after the update; a plain function gets one agent's at a time."""
         if options or getattr(self.update, "repredicts", False):
             return unchecked(self.update)(x, h, y, noise, rng=rng, **options)
-        if says(self.update, "stacks") or x.ndim == 2:
-            new = with_missing(self.update, x, h, y, noise, rng=rng)
+
+        def one(x: Array, h: Array, y: Array, r: Array) -> Array:
+            new = with_missing(self.update, x, h, y, r, rng=rng)
             return array(new, "update", x.shape, finite=False)
-        out = np.empty_like(x)
-        for g in range(x.shape[-3]):
-            r = noise[g] if noise.ndim > 2 else noise
-            new = with_missing(
-                self.update, x[..., g, :, :], h[..., g, :, :], y[..., g, :], r, rng=rng
-            )
-            out[..., g, :, :] = array(new, "update", x[..., g, :, :].shape, finite=False)
-        return out
+
+        if says(self.update, "stacks") or x.ndim == 2:
+            return one(x, h, y, noise)
+        noises = noise if noise.ndim > 2 else [noise] * x.shape[-3]
+        agents = [(x[..., g, :, :], h[..., g, :, :], y[..., g, :], r) for g, r in enumerate(noises)]
+        return np.stack([one(*own) for own in agents], axis=-3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,12 +247,10 @@ class TransportFilter(MembersFilter):
     model, sensors, graph, faults, lag, names, failures, gate
         As for :class:`~distfilt.filters.Filter`. Members in common need an agreement in every step,
         so that `every` is refused.
-    agreement : callable, optional
+    agreement : callable
         ``agreement(log_likelihoods, channel) -> averages``, both (\*runs, A, N): exact finite-time
-        averaging by default, or ``partial(average, rounds=20)``. With None nobody agrees.
-    share : bool
-        Without an agreement: whether readings go to the neighbours, who use them too. An agreement
-        takes their place, and readings stay with their agents.
+        averaging by default, or ``partial(average, rounds=20)``. It takes the place of telling
+        readings, which stay with their agents.
     members : int
         Number N of members of the common set.
     correct : bool
@@ -279,20 +276,17 @@ class TransportFilter(MembersFilter):
     """
 
     _: KW_ONLY
-    agreement: Callable[..., Any] | None = finite_time
+    agreement: Callable[..., Any] = finite_time
+    share: bool = False
     correct: bool = False
     rejuvenation: NonNegative = 0.0
 
     fuses: ClassVar[str] = "vectors"
     unused: ClassVar[dict[str, str]] = {
+        "share": "agents agree on what their readings say, so that these stay with them",
         "every": "a transport filter's agents have their members in common, so that they have to "
         "agree in every step"
     }
-
-    @property
-    def shares(self) -> bool:
-        """Readings are told only where nobody agrees on what they say."""
-        return self.share and self.agreement is None
 
     def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """One set of members, (N, d) or (*runs, 1, N, d), for all agents."""

@@ -52,12 +52,6 @@ class GaussianState(SensorState):
 
     _belief = "joint_means", (..., "A", "D")
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        size = self.dim * (1 + len(self.history))
-        if (got := self.joint_means.shape[-1]) != size:
-            raise ValueError(f"joint_means: needs {size} components, got {got}")
-
     @property
     def times(self) -> tuple[float, ...]:
         """The earlier times that are kept, oldest first."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,18 +14,14 @@ from scipy.special import gammaincinv
 from ..doors import Array, unchecked
 from ..sensors import Sensor
 
-__all__ = ["Heard", "Inbox"]
+__all__ = ["Heard", "groups"]
 
 Indices = NDArray[np.intp]
 Known = Sequence[Sequence[tuple[Sensor, Array]]]
 """Of each agent the readings that it has: their sensors, and their values (*runs, m)."""
 
-_PATTERNS = 16
-"""So many patterns of who knows what are kept with their plans."""
 
-
-@dataclass(frozen=True, eq=False)
-class _Part:
+class _Part(NamedTuple):
     """One sensor: with which agents of a group its reading stands, `rows`, and in which columns."""
 
     sensor: Sensor
@@ -32,8 +29,21 @@ class _Part:
     columns: Indices
 
 
-class _Plan:
-    """A group of agents that have equally many numbers: whose they are, and with what noise."""
+class Heard:
+    """The readings that G agents have, equally many numbers each, M.
+
+    `agents` (G,) says who they are, and `rows` the same as an index, a slice where they are all.
+    `target` (*runs, G, M) is what they know of the observations, NaN where a component is missing;
+    `noise` is its covariance, (M, M) if it is the same for all, else (G, M, M).
+
+    >>> from distfilt.sensors import direct
+    >>> sensor = direct([0], std=0.5)
+    >>> (pair,) = groups([[(sensor, np.array([1.0]))]] * 2)
+    >>> pair.agents, pair.target.ravel(), pair.noise
+    (array([0, 1]), array([1., 1.]), array([[0.25]]))
+    """
+
+    target: Array
 
     def __init__(self, agents: list[int], sensors: Sequence[tuple[Sensor, ...]]) -> None:
         self.agents = np.array(agents, dtype=np.intp)
@@ -75,41 +85,11 @@ class _Plan:
         flat = rows[0] if len(rows) == 1 else np.concatenate(rows, axis=-1)
         return flat.reshape(*flat.shape[:-1], *self.owner.shape)
 
-
-@dataclass(frozen=True, eq=False)
-class Heard:
-    """The readings that G agents have, equally many numbers each, M.
-
-    `target` (*runs, G, M) is what they know of the observations, NaN where a component is missing.
-
-    >>> from distfilt.sensors import direct
-    >>> sensor = direct([0], std=0.5)
-    >>> (pair,) = Inbox().groups([[(sensor, np.array([1.0]))]] * 2)
-    >>> pair.agents, pair.target.ravel(), pair.noise
-    (array([0, 1]), array([1., 1.]), array([[0.25]]))
-    """
-
-    plan: _Plan
-    target: Array
-
-    @property
-    def agents(self) -> Indices:
-        """Who they are, (G,)."""
-        return self.plan.agents
-
-    @property
-    def rows(self) -> Any:
-        """The same as an index; a slice where they are all."""
-        return self.plan.rows
-
-    @property
-    def noise(self) -> Array:
-        """The noise's covariance, (M, M) if it is the same for all, else (G, M, M)."""
-        return self.plan.noise
-
     def aimed(self, target: Array) -> Heard:
-        """The same with other values."""
-        return Heard(self.plan, target)
+        """The same with these values."""
+        out = copy.copy(self)
+        out.target = target
+        return out
 
     def predict(self, states: Array, previous: Array | None = None) -> Array:
         """Readings of states (*runs, G, N, d) without noise, (*runs, G, N, M).
@@ -117,11 +97,11 @@ class Heard:
         A reading that wraps lies on the branch of the observation. `previous` holds the states at
         the observation time before, for sensors that see changes.
         """
-        if self.plan.linear:
-            out = states @ self.plan.matrix(states.shape[-1]).mT
+        if self.linear:
+            out = states @ self.matrix(states.shape[-1]).mT
         else:
             out = np.empty((*states.shape[:-2], self.target.shape[-1], states.shape[-2]))
-            for part in self.plan.parts:
+            for part in self.parts:
                 seen = self._seen(part, states, previous).swapaxes(-1, -2)
                 out[..., part.rows[:, None], part.columns, :] = seen
             out = np.ascontiguousarray(out.swapaxes(-1, -2))
@@ -147,10 +127,10 @@ class Heard:
     def jacobian(self, states: Array) -> Array:
         """Derivatives of the readings at states (*runs, G, d), (*runs, G, M, d)."""
         d = states.shape[-1]
-        if self.plan.linear:
-            return np.broadcast_to(self.plan.matrix(d), (*self.target.shape, d))
+        if self.linear:
+            return np.broadcast_to(self.matrix(d), (*self.target.shape, d))
         out = np.empty((*self.target.shape, d))
-        for part in self.plan.parts:
+        for part in self.parts:
             slope = unchecked(part.sensor.jacobian)(states[..., part.rows, :])
             out[..., part.rows[:, None], part.columns, :] = slope
         return out
@@ -163,8 +143,8 @@ class Heard:
         """
         gap, spread = self.target - mean, cov + self.noise
         refused, out = np.zeros(gap.shape[:-1]), self.target
-        for k in range(int(self.plan.owner.max()) + 1):
-            here = (self.plan.owner == k) & ~np.isnan(gap)
+        for k in range(int(self.owner.max()) + 1):
+            here = (self.owner == k) & ~np.isnan(gap)
             some = here.sum(axis=-1)
             inner = np.where(here[..., :, None] & here[..., None, :], spread, np.eye(gap.shape[-1]))
             part = np.where(here, gap, 0.0)
@@ -175,27 +155,21 @@ class Heard:
         return self.aimed(out), refused
 
 
-class Inbox:
-    """Plans of who has which readings, each made when it is first needed.
+@lru_cache(maxsize=32)
+def _planned(pattern: tuple[tuple[Sensor, ...], ...]) -> list[Heard]:
+    """A group for each number of readings that occurs; agents without any are left out."""
+    sizes: dict[int, list[int]] = {}
+    for agent, sensors in enumerate(pattern):
+        if sensors:
+            sizes.setdefault(sum(s.dim for s in sensors), []).append(agent)
+    return [Heard(agents, pattern) for _, agents in sorted(sizes.items())]
 
-    >>> Inbox().groups([[], []])
+
+def groups(known: Known) -> list[Heard]:
+    """Who knows what, in groups; the plan of a pattern is made when it is first needed.
+
+    >>> groups([[], []])
     []
     """
-
-    def __init__(self) -> None:
-        self.plans: dict[tuple[tuple[Sensor, ...], ...], list[_Plan]] = {}
-
-    def groups(self, known: Known) -> list[Heard]:
-        """One entry for each number of readings that occurs; agents without any are left out."""
-        pattern = tuple([tuple([sensor for sensor, _ in own]) for own in known])
-        plans = self.plans.get(pattern)
-        if plans is None:
-            if len(self.plans) >= _PATTERNS:
-                self.plans.clear()
-            sizes: dict[int, list[int]] = {}
-            for agent, sensors in enumerate(pattern):
-                if sensors:
-                    sizes.setdefault(sum(s.dim for s in sensors), []).append(agent)
-            plans = [_Plan(agents, pattern) for _, agents in sorted(sizes.items())]
-            self.plans[pattern] = plans
-        return [Heard(plan, plan.collected(known)) for plan in plans]
+    plans = _planned(tuple([tuple([sensor for sensor, _ in own]) for own in known]))
+    return [plan.aimed(plan.collected(known)) for plan in plans]

@@ -4,41 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass
 from itertools import pairwise
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 
-from ..doors import (
-    MISSING,
-    Array,
-    Bounds,
-    Index,
-    Record,
-    array,
-    definite,
-    increasing,
-    semidefinite,
-    unchecked,
-)
+from ..doors import MISSING, Array, Index, Record, array, increasing, semidefinite, unchecked
 from ..ensembles import draw, sample_covariance
 from ..mixtures import GaussianMixture
 from ..sensors import Sensor
 
 __all__ = [
-    "Late", "Reading", "Said", "Team", "belated", "members_of", "mixture_of", "moments_of",
-    "planned", "priors_of", "said_by_all", "sensor_of", "team_of",
+    "Reading", "belated", "members_of", "mixtures_of", "moments_of", "planned", "said_by_all",
+    "sensor_of",
 ]  # fmt: skip
-
-
-class Said(NamedTuple):
-    """A reading on its way: its value (*runs, m), and what tells others how it was made."""
-
-    sensor: Sensor
-    value: Array
-    place: Any = 0  # among the agent's sensors, or a sensor of its own
-    about: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +28,9 @@ class Reading(Record):
     Parameters
     ----------
     t : float
-        In s.
+        When it was made, in s.
     agent : int
+        Who observed.
     value : array_like, (*runs, m) or (m,)
         NaN marks a missing component.
     sensor : int or Sensor
@@ -57,6 +38,8 @@ class Reading(Record):
     about : sequence of float
         Numbers that a neighbour needs to know the sensor, such as that pose: they are sent with the
         reading and charged.
+    arrived : float, optional
+        When it became known, in s, if that was later: for the `late` of :meth:`Filter.run`.
 
     Examples
     --------
@@ -68,76 +51,23 @@ class Reading(Record):
     agent: Index
     value: Annotated[Array, "... m", MISSING]
     sensor: Index | Sensor = 0
-    about: tuple[float, ...] = field(default=(), kw_only=True)
+    _: KW_ONLY
+    about: tuple[float, ...] = ()
+    arrived: float | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class Late(Record):
-    """An observation that arrives after the time at which it was made.
-
-    Parameters
-    ----------
-    agent : int
-        Who observed, with its first sensor.
-    measured : float
-        When, in s: a time at which the filter was stepped before.
-    value : array_like, (*runs, m) or (m,)
-        What was observed; NaN marks a missing component.
-    arrived : float
-        When it became known, in s; used by :meth:`Filter.run`.
-
-    Examples
-    --------
-    >>> Late(0, 1.0, [2.0], arrived=3.0).measured
-    1.0
-    """
-
-    agent: Index
-    measured: float
-    value: Annotated[Array, "... m", MISSING]
-    arrived: float
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        Bounds(above=self.measured)(self.arrived, "arrived")
+def sensor_of(f: Any, reading: Reading) -> Sensor:
+    """The sensor that made a reading: its own, or one of the agent's."""
+    if isinstance(reading.sensor, Sensor):
+        return reading.sensor
+    own: tuple[Sensor, ...] = f.team[reading.agent]
+    if reading.sensor >= len(own):
+        raise ValueError(f"observations: needs one of the {len(own)} sensors of agent "
+                         f"{reading.agent}, got {reading.sensor}")
+    return own[reading.sensor]
 
 
-Team = tuple[tuple[Sensor, ...], ...]
-"""Each agent's sensors."""
-
-
-def team_of(sensors: Any) -> Team:
-    """Each agent's sensors, of a Sensor, several in a list, or None for each.
-
-    >>> team_of([None, None])
-    ((), ())
-    """
-    if isinstance(sensors, Sensor) or not isinstance(sensors, Sequence) or not len(sensors):
-        got = "none" if isinstance(sensors, Sequence) else type(sensors).__name__
-        raise ValueError(f"sensors: needs one Sensor or None for each agent, in a list, got {got}")
-    out = tuple(
-        () if own is None else tuple(own) if isinstance(own, list | tuple) else (own,)
-        for own in sensors
-    )
-    for sensor in (s for own in out for s in own):
-        if not isinstance(sensor, Sensor):
-            raise ValueError(f"sensors: needs Sensor or None, got {type(sensor).__name__}")
-    return out
-
-
-def sensor_of(f: Any, agent: int, place: int | Sensor, t: float) -> Sensor:
-    """One of an agent's sensors, by its place; a sensor is itself."""
-    if isinstance(place, Sensor):
-        return place
-    own: tuple[Sensor, ...] = f.team(t)[agent]
-    if place >= len(own):
-        raise ValueError(
-            f"observations: needs one of the {len(own)} sensors of agent {agent}, got {place}"
-        )
-    return own[place]
-
-
-def said_by_all(f: Any, observations: Any, runs: tuple[int, ...], t: float) -> list[list[Said]]:
+def said_by_all(f: Any, observations: Any, runs: tuple[int, ...], t: float) -> list[list[Reading]]:
     """What each agent of a filter observed at one time, checked.
 
     >>> from distfilt.filters import GaussianFilter
@@ -147,10 +77,11 @@ def said_by_all(f: Any, observations: Any, runs: tuple[int, ...], t: float) -> l
     >>> [[said.value for said in own] for own in said_by_all(f, [[1.5]], (), 0.0)]
     [[array([1.5])]]
     """
-    out: list[list[Said]] = []
+    out: list[list[Reading]] = []
     for agent, given in enumerate(one_each(observations, f.count)):
-        several = _is_readings(given) or (isinstance(given, list) and not given)
-        found = (_said(f, one, agent, runs, t) for one in (given if several else (given,)))
+        name = f"observations[{agent}]"
+        several = given if _are_readings(given) else () if given is None else (given,)
+        found = [_complete(f, _read(f, one, agent, t, name), runs, name) for one in several]
         out.append([said for said in found if said is not None])
     return out
 
@@ -163,38 +94,37 @@ def one_each(observations: Any, agents: int) -> Any:
     return observations
 
 
-def _said(f: Any, given: Any, agent: int, runs: tuple[int, ...], t: float) -> Said | None:
-    """One reading; None if nothing of it is there."""
-    name = f"observations[{agent}]"
-    place: int | Sensor = 0
-    about: tuple[float, ...] = ()
-    if given is None:
-        return None
+def _read(f: Any, given: Any, agent: int, t: float, name: str) -> Reading:
+    """A reading of this agent and time, or what its only sensor read."""
     if isinstance(given, Reading):
         if (given.agent, given.t) != (agent, t):
             got = f"one of agent {given.agent} at t = {given.t:g}"
             raise ValueError(f"{name}: needs a Reading of agent {agent} at t = {t:g}, got {got}")
-        value, place, about = given.value, given.sensor, given.about
-    elif len(own := f.team(t)[agent]) == 1:
-        value = array(given, name, (..., own[0].dim), finite=False)
-    else:
+        return given
+    own = f.team[agent]
+    if len(own) != 1:
         needs = "a Reading of each sensor" if own else "None for an agent without a sensor"
         raise ValueError(f"{name}: needs {needs}, got an array")
-    sensor = sensor_of(f, agent, place, t)
+    return Reading.unchecked(t, agent, array(given, name, (..., own[0].dim), finite=False))
+
+
+def _complete(f: Any, said: Reading, runs: tuple[int, ...], name: str) -> Reading | None:
+    """A reading with a value for each run; None if nothing of it is there."""
+    value, dim = said.value, sensor_of(f, said).dim
     if not np.isfinite(value).all():
         if np.isinf(value).any():
             raise ValueError(f"{name}: needs numbers or NaN, got infinity")
         if np.isnan(value).all():
             return None
-    if value.shape != (*runs, sensor.dim):
-        if value.shape != (sensor.dim,):
-            raise ValueError(f"{name}: needs shape {(*runs, sensor.dim)}, got {value.shape}")
-        value = np.broadcast_to(value, (*runs, sensor.dim))
-    return Said(sensor, value, place, about)
+    if value.shape == (*runs, dim):
+        return said
+    if value.shape != (dim,):
+        raise ValueError(f"{name}: needs shape {(*runs, dim)}, got {value.shape}")
+    return said.changed(value=np.broadcast_to(value, (*runs, dim)))
 
 
-def belated(f: Any, late: Sequence[Late], state: Any, t: float) -> list[tuple[int, int, Said]]:
-    """Where among the kept times each late observation belongs, who made it, and what it says.
+def belated(f: Any, late: Sequence[Reading], state: Any, t: float) -> list[Reading]:
+    """Late readings, each at that one of the kept times to which it belongs.
 
     A sum of steps may differ by rounding, but by far less than the shortest of them.
     """
@@ -202,61 +132,55 @@ def belated(f: Any, late: Sequence[Late], state: Any, t: float) -> list[tuple[in
     shortest = min((b - a for a, b in pairwise((*times, t))), default=0.0)
     out = []
     for item in late:
-        away = [abs(known - item.measured) for known in times]
-        slack = min(1e-9 * max(1.0, abs(item.measured)), 1e-3 * shortest)
-        if not away or min(away) > slack:
+        near = min(times, key=lambda known: abs(known - item.t), default=np.inf)
+        if abs(near - item.t) > min(1e-9 * max(1.0, abs(item.t)), 1e-3 * shortest):
             known = ", ".join(f"{t:g}" for t in times) or "none (lag = 0)"
             raise ValueError(
-                f"late: needs an earlier time that is kept ({known}), got {item.measured:g}"
+                f"late: needs an earlier time that is kept ({known}), got {item.t:g}"
             )
         if item.agent >= f.count:
             raise ValueError(f"late: needs an agent below {f.count}, got {item.agent}")
-        said = _said(f, item.value, item.agent, state.runs, item.measured)
-        if said is not None and said.sensor.uses_previous:
-            kind = said.sensor.kind
-            raise ValueError(f"late: a {kind} sensor cannot be late, it compares two times")
+        if (sensor := sensor_of(f, item)).uses_previous:
+            raise ValueError(f"late: a {sensor.kind} sensor cannot be late, it compares two times")
+        said = _complete(f, item, state.runs, "late")
         if said is not None:
-            out.append((away.index(min(away)), item.agent, said))
+            out.append(said.changed(t=near))
     return out
 
 
 def planned(f: Any, state: Any, times: Any, observations: Any) -> tuple[Array, Iterator[Any]]:
     """The times of a run's steps, and an iterator over what is observed at each of them."""
     grid = np.zeros(0) if times is None else array(times, "times", ("T",))
+    increasing(grid, "times")
     entries: Iterator[Any]
-    if _is_readings(observations) or (times is None and observations == []):
+    if _are_readings(observations) and (times is None or observations):
         at: dict[float, list[list[Reading]]] = {t: [[] for _ in range(f.count)] for t in grid}
         for event in observations:
             if event.agent >= f.count:
                 raise ValueError(f"observations: needs agents below {f.count}, got {event.agent}")
             at.setdefault(event.t, [[] for _ in range(f.count)])[event.agent].append(event)
-        increasing(grid, "times")
         grid = np.array(sorted(at))
         entries = iter([at[t] for t in grid])
     elif times is None:
         raise ValueError("times: needs them, unless all observations are Readings, got None")
     else:
-        size = grid.size
         for agent, series in enumerate(one_each(observations, f.count)):
-            if series is not None and (got := len(np.atleast_1d(series))) != size:
+            if series is not None and (got := len(np.atleast_1d(series))) != grid.size:
                 raise ValueError(
-                    f"observations: needs ({size}, ..., m) for agent {agent}, got {got}"
+                    f"observations: needs ({grid.size}, ..., m) for agent {agent}, got {got}"
                 )
-        entries = ([None if o is None else o[k] for o in observations] for k in range(size))
-    increasing(grid, "times")
+        entries = ([None if o is None else o[k] for o in observations] for k in range(grid.size))
     if grid.size and grid[0] < state.t:
         raise ValueError(f"times: needs times from the state's {state.t:g} on, got {grid[0]:g}")
     return grid, entries
 
 
-def _is_readings(given: Any) -> bool:
-    """Whether these are events: one or more Readings, and nothing else."""
-    if isinstance(given, Reading) or not isinstance(given, list | tuple):
-        return False
-    return all(isinstance(item, Reading) for item in given) and len(given) > 0
+def _are_readings(given: Any) -> bool:
+    """Whether these are events: Readings in a list, and nothing else."""
+    return isinstance(given, list | tuple) and all(isinstance(item, Reading) for item in given)
 
 
-def moments_of(prior: Any, dim: int, *, singular: bool = False) -> tuple[Array, Array]:
+def moments_of(prior: Any, dim: int) -> tuple[Array, Array]:
     """Mean (d,) and covariance (d, d) of a prior of any kind that has them.
 
     >>> from scipy.stats import multivariate_normal
@@ -266,7 +190,8 @@ def moments_of(prior: Any, dim: int, *, singular: bool = False) -> tuple[Array, 
     if isinstance(prior, GaussianMixture):
         mean, cov = prior.moments()
     elif hasattr(prior, "rvs"):
-        mean, cov = (v() if callable(v) else v for v in (prior.mean, _covariance(prior)))
+        spread: Any = getattr(prior, "cov", getattr(prior, "var", None))
+        mean, cov = (v() if callable(v) else v for v in (prior.mean, spread))
     elif isinstance(prior, tuple) and len(prior) == 2:
         mean, cov = prior
     elif callable(prior) or np.ndim(prior) != 2:
@@ -277,17 +202,8 @@ def moments_of(prior: Any, dim: int, *, singular: bool = False) -> tuple[Array, 
         mean, cov = members.mean(axis=0), sample_covariance(members)
     mean = array(np.atleast_1d(mean), "prior", (dim,))
     cov = array(np.atleast_2d(cov), "prior", (dim, dim))
-    (semidefinite if singular else definite)(cov, "prior")
+    semidefinite(cov, "prior")
     return mean, cov
-
-
-def _covariance(prior: Any) -> Any:
-    """A frozen distribution's covariance, under the name that it has there."""
-    for name in ("cov", "cov_object", "var"):
-        if hasattr(prior, name):
-            found = getattr(prior, name)
-            return getattr(found, "covariance", found)
-    raise ValueError(f"prior: needs a distribution with a covariance, got {type(prior).__name__}")
 
 
 def members_of(
@@ -300,12 +216,11 @@ def members_of(
     """
     shape = (*leading, members, dim)
     if isinstance(prior, tuple) and len(prior) == 2:
-        mean, cov = moments_of(prior, dim, singular=True)
+        mean, cov = moments_of(prior, dim)
         return unchecked(draw)(mean, cov, members, rng=rng, leading=leading)
-    if isinstance(prior, GaussianMixture):
-        return prior.rvs(math.prod(shape[:-1]), rng=rng).reshape(shape)
     if hasattr(prior, "rvs"):
-        found = prior.rvs(size=math.prod(shape[:-1]), random_state=rng)
+        word = "rng" if isinstance(prior, GaussianMixture) else "random_state"
+        found = prior.rvs(math.prod(shape[:-1]), **{word: rng})
         return np.asarray(found, dtype=np.float64).reshape(shape)
     found = prior(members, rng=rng, leading=leading) if callable(prior) else prior
     out = array(found, "prior", (..., members, dim))
@@ -314,36 +229,19 @@ def members_of(
     return np.broadcast_to(out, shape).copy()
 
 
-def mixture_of(prior: Any, dim: int) -> GaussianMixture:
-    """A prior of any kind that has moments, as a mixture.
+def mixtures_of(prior: Any, dim: int, count: int) -> tuple[GaussianMixture, ...]:
+    """A mixture for each agent, of one prior for all or of a list with one each.
 
-    >>> mixture_of(([0.0], [[1.0]]), 1).size
-    1
+    >>> [mixture.size for mixture in mixtures_of(([0.0], [[1.0]]), 1, 2)]
+    [1, 1]
     """
-    if not isinstance(prior, GaussianMixture):
-        return GaussianMixture.gaussian(*moments_of(prior, dim))
-    if prior.dim != dim:
-        raise ValueError(f"prior: needs dimension {dim}, got {prior.dim}")
-    return prior
-
-
-def priors_of(prior: Any, count: int) -> list[Any]:
-    """One prior for each agent, of one for all or a sequence.
-
-    >>> len(priors_of(([0.0], [[1.0]]), 3)), len(priors_of([([0.0], [[1.0]])] * 2, 2))
-    (3, 2)
-    """
-    pair = isinstance(prior, tuple) and len(prior) == 2
-    one = isinstance(prior, GaussianMixture | np.ndarray) or hasattr(prior, "rvs")
-    if one or (pair and _is_vector(prior[0])):
-        return [prior] * count
-    if not isinstance(prior, Sequence) or len(prior) != count:
-        got = len(prior) if isinstance(prior, Sequence) else type(prior).__name__
-        raise ValueError(f"prior: needs one for all or for each of {count} agents, got {got}")
-    return list(prior)
-
-
-def _is_vector(value: Any) -> bool:
-    if isinstance(value, tuple | GaussianMixture) or hasattr(value, "rvs"):
-        return False
-    return all(np.ndim(v) == 0 for v in value)
+    given = prior if isinstance(prior, list) else [prior] * count
+    if len(given) != count:
+        raise ValueError(f"prior: needs one for all or for each of {count}, got {len(given)}")
+    out = []
+    for one in given:
+        mixed = isinstance(one, GaussianMixture)
+        out.append(one if mixed else GaussianMixture.gaussian(*moments_of(one, dim)))
+        if out[-1].dim != dim:
+            raise ValueError(f"prior: needs dimension {dim}, got {out[-1].dim}")
+    return tuple(out)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field
-from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -14,9 +13,8 @@ from ..doors import Array, Bounds, Count, unchecked
 from ..mixtures import GaussianMixture, conditioned, moved, two_stage
 from ..mixtures.conditioning import within_gate
 from ..mixtures.splitting import split_stretched
-from ..models import Model
 from .base import Filter
-from .inputs import Said, mixture_of, priors_of
+from .inputs import Reading, mixtures_of, sensor_of
 from .record import Summary
 from .saving import State
 from .step import Step
@@ -54,14 +52,6 @@ class MixtureState(State):
     mixtures: tuple[GaussianMixture, ...] = ()
     untold: tuple[GaussianMixture | None, ...] = field(default=(), kw_only=True)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if len(self.mixtures) != self.ledger.messages.size:
-            raise ValueError(
-                f"mixtures: needs {self.ledger.messages.size} like the ledger, "
-                f"got {len(self.mixtures)}"
-            )
-
 
 @dataclass(frozen=True, eq=False)
 class MixtureFilter(Filter):
@@ -69,17 +59,17 @@ class MixtureFilter(Filter):
 
     In a step an agent splits the mixands that its model stretches most, forecasts all of them,
     conditions them on its reading, sends its target marginal, fuses what it hears, and merges down
-    to `size` mixands. Agents' states may differ in size. A mixand that the sensor cannot see (it
-    predicts NaN for one of its points) contradicts a reading and is left out; a reading that all
-    mixands contradict in this way is refused by an error.
+    to `size` mixands. A mixand that the sensor cannot see (it predicts NaN for one of its points)
+    contradicts a reading and is left out; a reading that all mixands contradict in this way is
+    refused by an error.
 
     Parameters
     ----------
-    model : Model or sequence of Model, length A
-        How each agent's [target; ego] moves; one for all where they are alike.
+    model : Model
+        How an agent's [target; ego] moves.
     sensors, graph, faults, names, gate, every
-        As for :class:`~distfilt.filters.Filter`; without a graph nobody speaks. Agents' states
-        differ, so that readings stay with their agents and one run is filtered at a time.
+        As for :class:`~distfilt.filters.Filter`. Agents' states differ, so that readings stay with
+        their agents and one run is filtered at a time.
     agreement : callable, optional
         ``agreement(beliefs, channel) -> beliefs`` of the agents' mixtures, such as
         ``partial(target_fusion, target_dim=6)`` of :mod:`distfilt.mixtures`.
@@ -100,6 +90,7 @@ class MixtureFilter(Filter):
     --------
     >>> from functools import partial
     >>> from distfilt.mixtures import target_fusion
+    >>> from distfilt.models import Model
     >>> from distfilt.network import graphs
     >>> from distfilt.sensors import direct
     >>> still = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
@@ -117,12 +108,11 @@ class MixtureFilter(Filter):
     size: Count = 12
     most: Count = 12
     stretch: Annotated[float, Bounds(above=0, at_most=1e150)] | None = None
-    scale: Annotated[Array, "d"] | None = None
+    scale: Annotated[Array, "model.dim"] | None = None
     rule: Literal["dd2", "unscented"] = "dd2"
 
     state: ClassVar[type[MixtureState]] = MixtureState
     batched: ClassVar[bool] = False
-    alone: ClassVar[bool] = True
     fuses: ClassVar[str | None] = "mixtures"
     unused: ClassVar[dict[str, str]] = {
         "share": "agents' own states differ, so that their readings stay with them",
@@ -131,30 +121,14 @@ class MixtureFilter(Filter):
     }
 
     def check_parts(self) -> None:
-        """Refuse models that are none, or smaller than the target."""
+        """Refuse a model that is smaller than the target."""
         super().check_parts()
-        for model in self.models:
-            if model.dim < self.target_dim:
-                raise ValueError(f"model: needs {self.target_dim} components, got {model.dim}")
-            if self.scale is not None and self.scale.size != model.dim:
-                raise ValueError(f"scale: needs {model.dim} numbers, got {self.scale.size}")
-        if len(self.models) != self.count:
-            raise ValueError(f"model: needs one for all or {self.count}, got {len(self.models)}")
-        if self.agreement is not None and self.graph is None:
-            raise ValueError("graph: needs a Graph for the agreement, got None")
+        Bounds(at_least=self.target_dim)(self.model.dim, "model")
         Bounds(at_least=self.size)(self.most, "most")
-
-    @cached_property
-    def models(self) -> tuple[Model, ...]:
-        """Each agent's model."""
-        given = self.model
-        return tuple(given) if isinstance(given, Sequence) else (given,) * self.count
 
     def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """A mixture for each agent."""
-        priors = priors_of(prior, self.count)
-        both = zip(priors, self.models, strict=True)
-        return {"mixtures": tuple(mixture_of(p, model.dim) for p, model in both)}
+        return {"mixtures": mixtures_of(prior, self.model.dim, self.count)}
 
     def advance(self, step: Step) -> Any:
         """Split and forecast, condition on the own readings, exchange, fuse, reduce."""
@@ -165,23 +139,16 @@ class MixtureFilter(Filter):
         return step.end(mixtures=tuple(plain[:size]), untold=tuple(plain[size:]))
 
     def summary(self, state: MixtureState) -> Summary:
-        """Means, variances and covariances of the whole mixtures, and their sizes.
-
-        NaN fills the rows of agents whose states are smaller.
-        """
-        d = max(model.dim for model in self.models)
-        mean = np.full((self.count, d), np.nan)
-        cov = np.full((self.count, d, d), np.nan)
-        for k, belief in enumerate(state.mixtures):
-            n = belief.dim
-            mean[k, :n], cov[k, :n, :n] = belief.moments()
+        """Means, variances and covariances of the whole mixtures, and their sizes."""
+        moments = [belief.moments() for belief in state.mixtures]
+        mean, cov = (np.array(part) for part in zip(*moments, strict=True))
         sizes = np.array([belief.size for belief in state.mixtures], dtype=np.float64)
         variance = np.diagonal(cov, axis1=-2, axis2=-1)
         return Summary(mean, variance, cov, numbers={"mixands": sizes})
 
     def _moved(self, belief: GaussianMixture, agent: int, step: Step) -> GaussianMixture:
         """Split where the model stretches, then forecast every mixand."""
-        t, dt, model = step.state.t, step.dt, self.models[agent]
+        t, dt, model = step.state.t, step.dt, self.model
         if dt == 0:
             return belief
         flow, derivative = unchecked(model.step), unchecked(model.jacobian)
@@ -203,11 +170,12 @@ class MixtureFilter(Filter):
         return unchecked(two_stage)(belief, self.size, heaviest=most).changed()
 
     def _read(
-        self, belief: GaussianMixture, agent: int, said: Sequence[Said], step: Step, *,
+        self, belief: GaussianMixture, agent: int, said: Sequence[Reading], step: Step, *,
         counted: bool = True,
     ) -> GaussianMixture:  # fmt: skip
         """An agent's belief after readings; one that fails the gate changes nothing."""
-        for sensor, y, *_ in said:
+        for reading in said:
+            sensor, y = sensor_of(self, reading), reading.value
             about: Any = unchecked(sensor.predict), sensor.cov
             known: Any = {"residual": unchecked(sensor.residual), "rule": self.rule}
             with step.of(agent):
@@ -227,7 +195,7 @@ class MixtureFilter(Filter):
         return (self._agreed(after, step) if step.agrees else after), ()
 
     def _agreed(self, beliefs: list[GaussianMixture], step: Step) -> list[GaussianMixture]:
-        """What the rule of agreement makes of the beliefs, each of its own dimension."""
+        """What the rule of agreement makes of the beliefs."""
         assert self.agreement is not None
         out = list(self.agreement(beliefs, step.channel))
         for k, (fused, belief) in enumerate(zip(out, beliefs, strict=True)):

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..doors import Array, Count, Index, door
 from ..mixtures import GaussianMixture, conditioned
-from .inputs import Said
+from .inputs import Reading
 from .mixture import MixtureFilter
 from .step import Step
 
@@ -115,7 +115,7 @@ class NewsFilter(MixtureFilter):
         super().check_parts()
         if self.graph is None:
             raise ValueError("graph: needs a Graph, got None")
-        least = min((s.dim for own in self.team(0.0) for s in own), default=0)
+        least = min((s.dim for own in self.team for s in own), default=0)
         if self.common and max(self.common) >= least:
             raise ValueError(f"common: needs components below {least}, got {max(self.common)}")
 
@@ -162,16 +162,16 @@ class NewsFilter(MixtureFilter):
                     after[k] = _learned(after[k], news)
                     untold[k] = None if before is None else _learned(before, news)
 
-    def _parted(self, said: Sequence[Said]) -> tuple[list[Said], list[Said]]:
+    def _parted(self, said: Sequence[Reading]) -> tuple[list[Reading], list[Reading]]:
         """Readings without and with nothing but the common components; none where none is left."""
-        own: list[Said] = []
-        alike: list[Said] = []
+        own: list[Reading] = []
+        alike: list[Reading] = []
         for reading in said:
             everybody = np.isin(np.arange(reading.value.size), self.common)
             for part, gone in ((own, everybody), (alike, ~everybody)):
                 left = np.where(gone, np.nan, reading.value)
                 if not np.isnan(left).all():
-                    part.append(reading._replace(value=left))
+                    part.append(reading.changed(value=left))
         return own, alike
 
 

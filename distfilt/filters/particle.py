@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..doors import Array, Mask, Share, array, unchecked
+from ..doors import Array, Mask, Share, unchecked
 from ..updates.particles import (
     ParticleCollapse,
     copies,
@@ -57,10 +57,6 @@ class ParticleState(SensorState):
     log_weights: Array
 
     _belief = "points", (..., "A", "N", "d")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        array(self.log_weights, "log_weights", self.points.shape[:-1], finite=False)
 
     @cached_property
     def weights(self) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,13 +17,14 @@ from .saving import State
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["SCORES", "Recorder", "Score", "Summary", "final_state"]
+__all__ = ["SCORES", "Score", "Summary", "final_state", "recorded"]
 
 Score = Literal["squared_error", "nees", "crps"]
 SCORES: tuple[Score, ...] = ("squared_error", "nees", "crps")
 """What can be recorded beside a known truth."""
 
-_SENT = ("messages", "scalars", "bytes", "lost")
+_SENT = ("messages", "scalars", "bytes", "lost", "rounds")
+_WHEN = ("in this step", "so far")
 
 _MEANING = {
     "mean": ("estimate of the state", "of the component"),
@@ -35,11 +36,6 @@ _MEANING = {
     "crps": ("continuous ranked probability score", "of the component"),
     "nees": ("normalised estimation error squared; its mean is d for a consistent filter", "1"),
     "refused": ("readings that the gate left out in this step", "1"),
-    "messages": ("messages sent in this step", "1"),
-    "scalars": ("numbers sent in this step", "1"),
-    "bytes": ("bytes sent in this step", "B"),
-    "lost": ("messages lost in this step, mean over runs", "1"),
-    "rounds": ("rounds of communication in this step", "1"),
 }
 
 
@@ -74,121 +70,106 @@ class Summary:
     numbers: Mapping[str, Array] = field(default_factory=dict)
 
 
-class Recorder:
-    """Collects summaries and ledgers of a run, and makes one Dataset of them.
+def recorded(
+    filter_: Any, times: Array, start: Any, said: Iterable[tuple[Any, Summary]], truth: Any,
+    scores: Collection[Score],
+) -> xarray.Dataset:
+    """One Dataset of states and what a filter says of each of them; `start` is the one before.
 
-    Names and units are the filter's; `start` is the state before the first step, `truth` what the
-    scores compare with, as :meth:`distfilt.filters.Filter.run` describes it.
+    Names and units are the filter's; the scores compare with the `truth`, as
+    :meth:`distfilt.filters.Filter.run` describes it.
     """
+    import xarray
 
-    def __init__(
-        self, filter_: Any, times: Array, start: Any, truth: Any, scores: Collection[Score]
-    ) -> None:
-        self.filter, self.times = filter_, times
-        self.runs: tuple[int, ...] = tuple(start.runs)
-        self.scores = scores
-        self.ledgers = [start.ledger]
-        self.columns: dict[str, list[Array]] = {}
-        self.chosen: Any = slice(None)
-        self.truth = None if truth is None else self._known(truth)
+    names, units = filter_.components
+    agents = list(filter_.agents)
+    known, chosen = _known(truth, names, (times.size, *start.runs), len(agents))
+    columns: dict[str, list[Array]] = {}
+    last, ledgers = start, [start.ledger]
+    for k, (last, summary) in enumerate(said):
+        ledgers.append(last.ledger)
+        scored = {} if known is None else _scored(summary, known[k], chosen, scores)
+        for name, value in (_told(last, summary) | scored).items():
+            columns.setdefault(name, []).append(np.asarray(value))
 
-    def _known(self, truth: Any) -> Array:
-        """The truth of the chosen components, (T, *runs, 1 or A, d)."""
-        names = self.filter.components[0]
-        shape, agents = (self.times.size, *self.runs), len(self.filter.agents)
-        if not isinstance(truth, Mapping):
-            x = array(truth, "truth", None, finite=False)
-            if x.shape == (*shape, len(names)):
-                return x[..., None, :]
-            return array(x, "truth", (*shape, agents, len(names)), finite=False)
-        unknown = [name for name in truth if name not in names]
-        if unknown or not truth:
-            raise ValueError(f"truth: needs components of {', '.join(names)}, got {unknown}")
-        self.chosen = [names.index(name) for name in truth]
-        parts = []
-        for name, given in truth.items():
-            x = array(given, f"truth[{name!r}]", None)
-            parts.append(x[..., None] if x.shape == shape else array(x, "truth", (*shape, agents)))
-        return np.stack(np.broadcast_arrays(*parts), axis=-1)
+    n = len(start.runs)
+    lead = ("time", *(("run",) if n == 1 else [f"run{i}" for i in range(n)]), "agent")
+    axes = {"covariance": (*lead, "component", "column")}
+    axes |= {k: (*lead, "component") for k in ("mean", "variance", "squared_error", "crps")}
+    data = {
+        name: (axes.get(name, lead), np.array(values), _attributes(name))
+        for name, values in columns.items()
+    }
+    for name in _SENT:
+        data |= _counted(name, [getattr(ledger, name) for ledger in ledgers])
+    coords = {
+        "time": ("time", times, {"units": "s"}), "agent": agents, "component": list(names),
+        "unit": ("component", list(units)),
+    }
+    out = xarray.Dataset(data, coords=coords)
+    # A selection or another run joined to this one inherits the entry: these tell them apart.
+    mean = np.array(data["mean"][1][-1]) if columns else None
+    out.encoding["final_state"] = last, agents, mean
+    return out
 
-    def add(self, state: Any, summary: Any) -> None:
-        """Record the next state."""
-        known = None if self.truth is None else self.truth[len(self.ledgers) - 1]
-        self.ledgers.append(state.ledger)
-        out = {"mean": summary.mean, "variance": summary.variance}
-        out["spread"] = np.sqrt(np.nansum(summary.variance, axis=-1))
-        out["spread"][np.isnan(summary.variance).all(axis=-1)] = np.nan
-        if summary.covariance is not None:
-            out["covariance"] = summary.covariance
-        if state.refused is not None:
-            out["refused"] = state.refused
-        out.update(summary.numbers)
-        if known is not None:
-            out.update(self._scored(summary, known))
-        for name, value in out.items():
-            self.columns.setdefault(name, []).append(np.asarray(value))
 
-    def _scored(self, summary: Any, known: Array) -> dict[str, Array]:
-        out: dict[str, Array] = {}
-        at = self.chosen
-        mean = summary.mean[..., at]
-        known = np.broadcast_to(known, mean.shape)
-        good = np.isfinite(mean).all(axis=-1) & np.isfinite(known).all(axis=-1)
-        some = None if summary.members is None else summary.members[..., at]
-        cov = None if summary.covariance is None else summary.covariance[..., at, :][..., at]
-        if "squared_error" in self.scores:
-            squared = (mean - known) ** 2
-            out["squared_error"] = self._spread_out(squared, summary.mean.shape)
-            out["total_squared_error"] = squared.sum(axis=-1)
-        if "crps" in self.scores:
-            if some is None:
-                found = unchecked(gaussian_crps)(mean, np.sqrt(summary.variance[..., at]), known)
-            else:
-                found = unchecked(crps)(some, known, weights=summary.weights)
-            found = np.where(good[..., None], found, np.nan)
-            out["crps"] = self._spread_out(found, summary.mean.shape)
-        if "nees" in self.scores and cov is not None:
-            out["nees"] = _where(good, _nees_or_infinite, mean, cov, known)
-        elif "nees" in self.scores and some is not None and some.shape[-2] > some.shape[-1]:
-            out["nees"] = _where(good, _ensemble_nees, some, known)
-        return out
+def _known(
+    truth: Any, names: Sequence[str], shape: tuple[int, ...], agents: int
+) -> tuple[Array | None, Any]:
+    """The truth, (T, *runs, 1 or A, d), and which components of it are known."""
+    if truth is None:
+        return None, slice(None)
+    if not isinstance(truth, Mapping):
+        x = array(truth, "truth", None, finite=False)
+        if x.shape == (*shape, len(names)):
+            return x[..., None, :], slice(None)
+        return array(x, "truth", (*shape, agents, len(names)), finite=False), slice(None)
+    unknown = [name for name in truth if name not in names]
+    if unknown or not truth:
+        raise ValueError(f"truth: needs components of {', '.join(names)}, got {unknown}")
+    whole = np.full((*shape, agents, len(names)), np.nan)
+    for name, given in truth.items():
+        x = array(given, f"truth[{name!r}]", None)
+        x = x[..., None] if x.shape == shape else array(x, "truth", (*shape, agents))
+        whole[..., names.index(name)] = x
+    return whole, [names.index(name) for name in truth]
 
-    def _spread_out(self, values: Array, shape: tuple[int, ...]) -> Array:
-        """Values of the chosen components among all, NaN for the others."""
-        out = np.full(shape, np.nan)
-        out[..., self.chosen] = values
-        return out
 
-    def dataset(self, final: Any) -> xarray.Dataset:
-        """Everything recorded."""
-        import xarray
+def _told(state: Any, summary: Summary) -> dict[str, Array]:
+    """What is recorded of a state without a truth."""
+    spread = np.sqrt(np.nansum(summary.variance, axis=-1))
+    spread[np.isnan(summary.variance).all(axis=-1)] = np.nan
+    out = {"mean": summary.mean, "variance": summary.variance, "spread": spread}
+    if summary.covariance is not None:
+        out["covariance"] = summary.covariance
+    if state.refused is not None:
+        out["refused"] = state.refused
+    return out | dict(summary.numbers)
 
-        n = len(self.runs)
-        runs = ("run",) if n == 1 else tuple(f"run{i}" for i in range(n))
-        lead = ("time", *runs, "agent")
-        axes = {"covariance": (*lead, "component", "column")}
-        axes |= {k: (*lead, "component") for k in ("mean", "variance", "squared_error", "crps")}
-        data = {
-            name: (axes.get(name, lead), np.array(values), _attributes(name))
-            for name, values in self.columns.items()
-        }
-        for name in _SENT:
-            data |= _counted(name, [getattr(ledger, name) for ledger in self.ledgers], "agent")
-        data |= _counted("rounds", [ledger.rounds for ledger in self.ledgers])
-        names, units = self.filter.components
-        out = xarray.Dataset(
-            data,
-            coords={
-                "time": ("time", self.times, {"units": "s"}),
-                "agent": list(self.filter.agents),
-                "component": list(names),
-                "unit": ("component", list(units)),
-            },
-        )
-        # A selection or another run joined to this one inherits the entry: these tell them apart.
-        last = np.array(data["mean"][1][-1]) if len(self.times) else None
-        out.encoding["final_state"] = final, list(self.filter.agents), last
-        return out
+
+def _scored(
+    summary: Summary, known: Array, at: Any, scores: Collection[Score]
+) -> dict[str, Array]:
+    out: dict[str, Array] = {}
+    mean, some = summary.mean, summary.members
+    known = np.broadcast_to(known, mean.shape)
+    good: Any = np.isfinite(mean[..., at]).all(axis=-1) & np.isfinite(known[..., at]).all(axis=-1)
+    if "squared_error" in scores:
+        squared = (mean - known) ** 2
+        out["squared_error"], out["total_squared_error"] = squared, squared[..., at].sum(axis=-1)
+    if "crps" in scores:
+        if some is None:
+            found = unchecked(gaussian_crps)(mean, np.sqrt(summary.variance), known)
+        else:
+            found = unchecked(crps)(some, known, weights=summary.weights)
+        out["crps"] = np.where(good[..., None] & ~np.isnan(known), found, np.nan)
+    mean, known = mean[..., at], known[..., at]
+    if "nees" in scores and summary.covariance is not None:
+        cov = summary.covariance[..., at, :][..., at]
+        out["nees"] = _where(good, _nees_or_infinite, mean, cov, known)
+    elif "nees" in scores and some is not None and some.shape[-2] > mean.shape[-1]:
+        out["nees"] = _where(good, _ensemble_nees, some[..., at], known)
+    return out
 
 
 def final_state(run: xarray.Dataset) -> State:
@@ -207,14 +188,10 @@ def final_state(run: xarray.Dataset) -> State:
     Traceback (most recent call last):
     ValueError: run: needs the Dataset that a filter's run returned, got one without a state
     """
-    kept = getattr(run, "encoding", {}).get("final_state")
-    if kept is not None:
-        state, agents, last = kept
-        same = "mean" in run and list(run["agent"].values) == agents and run["time"].size > 0
-        if (
-            same and np.array_equal(run["time"].values[-1], state.t)
-            and np.array_equal(run["mean"].values[-1], last, equal_nan=True)
-        ):
+    state, agents, last = getattr(run, "encoding", {}).get("final_state", (None, (), None))
+    if "mean" in run and run["time"].size and list(run["agent"].values) == agents:
+        ends = np.array_equal(run["time"].values[-1], state.t)
+        if ends and np.array_equal(run["mean"].values[-1], last, equal_nan=True):
             return state  # type: ignore[no-any-return]
     raise ValueError(
         "run: needs the Dataset that a filter's run returned, got one without a state"
@@ -226,15 +203,12 @@ def _attributes(name: str) -> dict[str, str]:
     return {"long_name": meaning, "units": unit}
 
 
-def _counted(name: str, values: list[Any], *axes: str) -> dict[str, Any]:
+def _counted(name: str, values: list[Any]) -> dict[str, Any]:
     """What was sent in each step, and in all until then."""
     total = np.array(values)
-    meaning, unit = _MEANING[name]
-    sums = {"long_name": meaning.replace("in this step", "so far"), "units": unit}
-    return {
-        name: (("time", *axes), np.diff(total, axis=0), _attributes(name)),
-        f"{name}_total": (("time", *axes), total[1:], sums),
-    }
+    axes, unit = ("time", "agent")[: total.ndim], "B" if name == "bytes" else "1"
+    now, sums = ({"long_name": f"{name} {when}", "units": unit} for when in _WHEN)
+    return {name: (axes, np.diff(total, axis=0), now), f"{name}_total": (axes, total[1:], sums)}
 
 
 def _where(good: Any, score: Any, *parts: Array) -> Array:

@@ -15,8 +15,8 @@ from ..doors import Array, array
 from ..linalg import SolverError
 from ..network import Channel
 from ..sensors import Sensor
-from .inbox import Heard
-from .inputs import Said, sensor_of
+from .inbox import Heard, groups
+from .inputs import Reading, sensor_of
 from .saving import SensorState
 
 __all__ = ["RECOVERABLE", "FilterError", "Step", "guarded", "of_the_call"]
@@ -64,7 +64,7 @@ class Step:
 
     `dt` is its length, `channel` its door (None where nobody speaks) and `rng` its own generator;
     `times` are the earlier times that will be kept, oldest first. `said` are the agents' readings
-    of now, `late` those of earlier times: pairs of a place among the times and what was said.
+    of now, `late` those of earlier times.
 
     Examples
     --------
@@ -82,8 +82,8 @@ class Step:
     """
 
     def __init__(
-        self, filter_: Any, state: Any, t: float, said: Any,
-        late: Sequence[tuple[int, int, Said]] = (), *, own: bool = False,
+        self, filter_: Any, state: Any, t: float, said: Any, late: Sequence[Reading] = (), *,
+        own: bool = False,
     ) -> None:
         self.filter, self.state, self.t, self.dt = filter_, state, t, t - state.t
         self.said, self.late = said, late
@@ -143,75 +143,65 @@ class Step:
 
         The last place is now. A target is NaN in failed runs, so that they are left alone.
         """
-        for place, known in sorted(self._known().items()):
-            for group in self.filter.inbox.groups(known):
+        known = self._known()
+        for place, t in enumerate((*self.times, self.t)):
+            for group in groups(known[t]) if t in known else ():
                 if self.failed.any():
                     group = group.aimed(self.kept(group.target, np.nan))
                 yield place, group
 
-    def _known(self) -> dict[int, list[list[tuple[Sensor, Array]]]]:
+    def _known(self) -> dict[float, list[list[tuple[Sensor, Array]]]]:
         """For each time the readings that each agent has, its own and what it heard, by sender."""
-        own = [[(len(self.times), said) for said in mine] for mine in self.said]
-        for place, agent, said in self.late:
-            own[agent].append((place, said))
-        outgoing = self._outgoing(own)
-        if outgoing is None:
-            found = [[(0, *reading) for reading in mine] for mine in own]
-        else:
-            assert self.channel is not None
-            inbox = self.channel.exchange([self._payload(items) for items in outgoing])
-            found = [[(a, *reading) for reading in mine] for a, mine in enumerate(own)]
-            for box, has in zip(inbox, found, strict=True):
+        own = [list(mine) for mine in self.said]
+        for late in self.late:
+            own[late.agent].append(late)
+        heard = [{agent: [(said, said.value) for said in mine]} for agent, mine in enumerate(own)]
+        told = self._told(own)
+        if self.channel is not None and told:
+            inbox = self.channel.exchange([self._payload(mine) for mine in told])
+            for has, box in zip(heard, inbox, strict=True):
                 for sender, payload in box.items():
                     values = payload if isinstance(payload, tuple) else (payload,)
-                    for (place, said), value in zip(outgoing[sender], values, strict=False):
-                        has.append((sender, place, said._replace(value=value)))
-                has.sort(key=lambda item: item[0])
-        known: dict[int, list[list[tuple[Sensor, Array]]]]
-        known = defaultdict(lambda: [[] for _ in found])
-        for agent, has in enumerate(found):
-            for _, place, said in has:
-                known[place][agent].append((said.sensor, said.value))
+                    has[sender] = list(zip(told[sender], values, strict=False))
+        known: dict[float, list[list[tuple[Sensor, Array]]]]
+        known = defaultdict(lambda: [[] for _ in own])
+        for agent, has in enumerate(heard):
+            for sender in sorted(has):
+                for said, value in has[sender]:
+                    known[said.t][agent].append((sensor_of(self.filter, said), value))
         return known
 
-    def _outgoing(self, own: list[list[tuple[int, Said]]]) -> list[list[tuple[int, Said]]] | None:
-        """What each agent tells now; None if nobody does. What is not told waits for a contact."""
-        f, before = self.filter, self.state.waiting
-        if not f.shares or f.graph is None:
-            return None
+    def _told(self, own: list[list[Reading]]) -> list[list[Reading]]:
+        """What each agent tells now; none if nobody does. What is not told waits for a contact."""
+        f = self.filter
+        if not f.share or f.graph is None:
+            return []
         if self.channel is None:
             if f.lag:
-                new = ((self._time(place), agent, said.place, said.value, said.about)
-                       for agent, mine in enumerate(own) for place, said in mine)
-                self.waiting = (*before, *new)
-            return None
-        out = [list(mine) for mine in own]
-        for t, agent, place, value, about in reversed(before):
-            if t not in self.times:
+                self.waiting = (*self.state.waiting, *(said for mine in own for said in mine))
+            return []
+        out: list[list[Reading]] = [[] for _ in own]
+        for said in self.state.waiting:
+            if said.t not in self.times:
                 raise ValueError(
-                    f"lag: needs to reach back to t = {t:g}, from when a reading waited for this "
-                    f"contact at t = {self.t:g}, got {f.lag}"
+                    f"lag: needs to reach back to t = {said.t:g}, from when a reading waited for "
+                    f"this contact at t = {self.t:g}, got {f.lag}"
                 )
-            sensor = sensor_of(f, agent, place, t)
-            out[agent].insert(0, (self.times.index(t), Said(sensor, value, place, about)))
-        return out
+            out[said.agent].append(said)
+        return [waited + mine for waited, mine in zip(out, own, strict=True)]
 
-    def _time(self, place: int) -> float:
-        return self.times[place] if place < len(self.times) else self.t
-
-    def _payload(self, items: list[tuple[int, Said]]) -> Any:
+    def _payload(self, told: list[Reading]) -> Any:
         """Values, and for others than an only reading of now when and of which sensor each is."""
-        if not items:
+        if not told:
             return None
-        place, said = items[0]
-        if len(items) == 1 and place == len(self.times) and not said.about:
-            return said.value
+        if len(told) == 1 and told[0].t == self.t and not told[0].about:
+            return told[0].value
         about: list[float] = []
-        for place, said in items:
-            which = said.place if isinstance(said.place, int) else -1
-            about += [self._time(place), which, *said.about]
+        for said in told:
+            which = said.sensor if isinstance(said.sensor, int) else -1
+            about += [said.t, which, *said.about]
         numbers = np.broadcast_to(np.array(about), (*self.state.runs, len(about)))
-        return (*(said.value for _, said in items), numbers)
+        return (*(said.value for said in told), numbers)
 
     def gated(self, group: Heard, predicted: Callable[[], tuple[Array, Array]]) -> Heard:
         """A group without the readings that the gate refuses.

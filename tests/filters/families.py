@@ -23,7 +23,7 @@ from distfilt.network import (
     naive_fusion,
     pull,
 )
-from distfilt.sensors import Sensor, angle, direct
+from distfilt.sensors import Sensor, direct
 from distfilt.updates import exact_draws, inflated, serial, square_root, transport
 
 FAMILIES: dict[str, Callable[..., Any]] = {
@@ -69,14 +69,6 @@ def rules(family: str) -> dict[str, Callable[..., Any]]:
     return LIKELIHOOD_RULES if family.endswith("common") else ENSEMBLE_RULES
 
 
-RULED = [(family, rule) for family in FAMILIES for rule in rules(family)]
-
-
-def rule_of(family: str, name: str) -> Any:
-    """An agreement that fits the family."""
-    return rules(family)[name]
-
-
 Q = np.array([[0.3, 0.1], [0.1, 0.2]])
 PRIOR = (np.array([1.0, -0.5]), np.array([[1.0, 0.3], [0.3, 0.8]]))
 NOISE = np.array([[0.5, 0.2], [0.2, 0.4]])
@@ -116,6 +108,8 @@ def data(
 
 def made(family: str, agents: int = 5, **options: Any) -> tuple[Any, Any]:
     """A filter of a family on a path of agents, and its state at the start."""
+    if family.endswith("common") and options.get("agreement", 0) is None:
+        del options["agreement"]  # one round of averaging, which is as far as readings go
     sensors = options.pop("sensors", team(agents))
     graph = options.pop("graph", graphs.path(len(sensors)))
     runs = options.pop("runs", ())
@@ -127,8 +121,3 @@ def values(state: Any) -> dict[str, np.ndarray]:
     """Every array that a state holds, by name."""
     names = ("ensembles", "points", "log_weights", "joint_means", "joint_covariances")
     return {n: getattr(state, n) for n in names if hasattr(state, n)}
-
-
-def sight() -> Sensor:
-    """A direction, which wraps at π."""
-    return angle([0, 1], std=0.05, full=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,15 +13,14 @@ from distfilt.filters import (
     FilterError,
     GaussianFilter,
     GaussianState,
-    Late,
     ParticleCollapse,
     ParticleFilter,
 )
 from distfilt.kalman import kalman_filter, rts_smoother
-from distfilt.models import Model, constant_velocity, lorenz63, simulate
+from distfilt.models import Model
 from distfilt.network import covariance_intersection, graphs
-from distfilt.sensors import Sensor, direct, distance, stack
-from distfilt.updates import known_noise, sampled_noise
+from distfilt.sensors import Sensor, direct
+from distfilt.updates import sampled_noise
 
 from .families import NOISE, PRIOR, TIMES, Q, data, made, model, team
 
@@ -70,27 +70,6 @@ def test_network_of_exact_ensembles_is_the_network_of_kalman_filters() -> None:
     assert np.allclose(a["variance"], b["variance"], atol=1e-8)
     for name in ("messages", "scalars", "lost", "rounds"):
         assert np.array_equal(a[name], b[name])
-
-
-def test_linear_network_of_exact_draws_errs_like_the_kalman_filter_of_all_readings() -> None:
-    """Three agents who hear each other, random priors: ratio of the errors, and honest NEES."""
-    sensors = [direct([0], std=1.0), direct([1], std=0.7), direct([0, 1], std=1.5)]
-    walker, times = constant_velocity(sigma=0.3), np.arange(1, 26) * 0.5
-    prior, rng = (np.zeros(4), np.diag([4.0, 4.0, 1.0, 1.0])), np.random.default_rng(7)
-    truth = simulate(walker, rng.multivariate_normal(*prior, size=500), times, rng=rng)
-    seen = [sensor.observe(truth, rng=rng) for sensor in sensors]
-    f = EnsembleFilter.exact(walker, sensors, graphs.complete(3), members=20)
-    run = f.run(f.start(prior, rng=rng, runs=(500,)), times, seen, truth=truth,
-                scores=("squared_error", "nees"))
-    everything = stack(sensors)
-    exact = kalman_filter(
-        *prior, np.concatenate(seen, axis=-1), F=walker.jacobian(np.zeros(4), 0.0, 0.5),
-        Q=walker.noise(0.0, 0.5), H=everything.matrix(4), R=everything.cov,
-    )
-    settled = slice(10, None)
-    best = ((exact.means - truth) ** 2).sum(axis=-1)[settled].mean()
-    assert abs(run["total_squared_error"].values[settled].mean() / best - 1.0) < 0.005
-    assert 0.97 < run["nees"].values[settled].mean() / 4 < 1.03
 
 
 @pytest.mark.parametrize("rule", ["extended", "unscented"])
@@ -151,25 +130,6 @@ def test_jitter_moves_copies_by_a_share_of_what_is_believed() -> None:
     assert abs(moves.std() / width - 1) < 0.05 and not (after - picked)[stayed].any()
 
 
-def test_default_filter_is_safe_at_ten_members() -> None:
-    """Chaotic model, ten members: sampling the noise's covariance loses the truth more often."""
-    chaos = lorenz63(sigma=0.3)
-    sensors = [direct([0, 1, 2], std=1.0)]
-    times = np.arange(1, 201) * 0.05
-    rng = np.random.default_rng(0)
-    begin = np.array([1.5, -1.5, 25.0])
-    truth = simulate(chaos, begin + rng.standard_normal((30, 3)), times, rng=rng)
-    seen = [sensors[0].observe(truth, rng=rng)]
-    worst = {}
-    for name, update in (("default", known_noise), ("sampled", sampled_noise)):
-        f = EnsembleFilter(chaos, sensors, members=10, update=update)
-        assert name != "default" or EnsembleFilter(chaos, sensors, members=10).update is update
-        run = f.run(f.start((begin, np.eye(3)), rng=np.random.default_rng(1), runs=(30,)),
-                    times, seen, truth=truth, scores=["squared_error"])
-        worst[name] = run["total_squared_error"].values[100:].mean()
-    assert worst["default"] < 0.7 * worst["sampled"] and worst["default"] < 3.0
-
-
 def test_particles_tend_to_the_kalman_filter_with_a_full_noise() -> None:
     _, (seen,) = data([BOTH])
     seen[3, 0] = np.nan
@@ -181,7 +141,7 @@ def test_particles_tend_to_the_kalman_filter_with_a_full_noise() -> None:
     assert (run["effective_size"].values > 1000).all() and (run["distinct"].values > 0.03).all()
 
 
-def test_collapse_warns_with_step_and_share_and_jitter_helps() -> None:
+def test_collapse_warns_with_step_and_share() -> None:
     """A model without noise: copies never part, although their weights look perfect."""
     still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
     sensors, readings = [direct([0], std=0.01)], [np.zeros((6, 1))]
@@ -190,10 +150,6 @@ def test_collapse_warns_with_step_and_share_and_jitter_helps() -> None:
     with pytest.warns(ParticleCollapse, match=r"t = \d s: 0\.\d+% of an agent's particles"):
         run = f.run(start, np.arange(1.0, 7.0), readings)
     assert run["distinct"].values[-1] < 0.01
-    g = ParticleFilter(still, sensors, members=800, jitter=0.3)
-    run = g.run(g.start(([0.0], [[4.0]]), rng=np.random.default_rng(0)), np.arange(1.0, 7.0),
-                readings)
-    assert run["distinct"].values[-1] > 0.5 and run["variance"].values[-1] > 1e-7
 
 
 def test_copies_are_regularised_by_default_where_the_model_never_parts_them() -> None:
@@ -227,22 +183,7 @@ def test_copies_of_one_particle_warn_at_any_number() -> None:
         f.step(start, 1.0, [None])
 
 
-def test_update_that_fails_in_one_run_is_named() -> None:
-    def fragile(x: np.ndarray, h: np.ndarray, y: np.ndarray, r: np.ndarray, *, rng: object):
-        if (y > 5).any():
-            raise np.linalg.LinAlgError("singular")
-        return x + 0.1 * (y[..., None, :] - h)
-
-    f = EnsembleFilter(model(), [direct([0], std=1.0)] * 2, graphs.path(2), update=fragile,
-                       share=False, members=5)
-    start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(3,))
-    seen = [np.zeros((3, 1)), np.array([[0.0], [9.0], [0.0]])]
-    with pytest.raises(FilterError, match="run 1, agent 1, t = 0.5 s: singular") as caught:
-        f.step(start, 0.5, seen)
-    assert (caught.value.run, caught.value.agent, caught.value.t) == ((1,), 1, 0.5)
-
-
-def test_an_update_that_fails_in_one_run_leaves_the_draws_of_the_others() -> None:
+def test_an_update_that_fails_in_one_run_is_named_and_leaves_the_draws_of_the_others() -> None:
     def fragile(x: np.ndarray, h: np.ndarray, y: np.ndarray, r: np.ndarray, *, rng: object):
         after = sampled_noise(x, h, y, r, rng=rng)
         return np.where(y[..., None, :] > 5, np.nan, after)
@@ -255,6 +196,10 @@ def test_an_update_that_fails_in_one_run_leaves_the_draws_of_the_others() -> Non
     assert some.failed.tolist() == [False, True, False]
     np.testing.assert_array_equal(some.ensembles[[0, 2]], good.ensembles[[0, 2]])
     assert np.isnan(f.summary(some).mean[1]).all()
+    strict = replace(f, failures="raise")
+    with pytest.raises(FilterError, match="run 1, agent 1, t = 0.5 s: .* not finite") as caught:
+        strict.step(start, 0.5, [np.zeros((3, 1)), np.array([[0.0], [9.0], [0.0]])])
+    assert (caught.value.run, caught.value.agent, caught.value.t) == ((1,), 1, 0.5)
 
 
 def test_groups_of_readings_give_each_agent_its_own_noise() -> None:
@@ -265,17 +210,3 @@ def test_groups_of_readings_give_each_agent_its_own_noise() -> None:
     variance = f.summary(state).variance[:, 0]
     p = PRIOR[1][0, 0]
     assert np.allclose(variance, [p * 0.01 / (p + 0.01), p * 4 / (p + 4)], rtol=0.1)
-
-
-def test_late_readings_of_a_distance_in_a_network() -> None:
-    """A curved sensor, late by two steps, helps its agent and who hears it, and is charged."""
-    far = distance([0, 1], std=0.05, origin=[3.0, 0.0])
-    for family in ("ensemble", "gaussian", "particle"):
-        f, start = made(family, sensors=[far, None], lag=2, runs=(30,))
-        for t in (0.1, 0.2):
-            start = f.step(start, t, [None, None])
-        before = f.step(start, 0.3, [None, None])
-        after = f.step(start, 0.3, [None, None], late=[Late(0, 0.1, [2.0], arrived=0.3)])
-        spread = [f.summary(s).variance.sum(axis=-1).mean(axis=0) for s in (before, after)]
-        assert (spread[1] < 0.8 * spread[0]).all()
-        assert after.ledger.messages.tolist() == [1, 0]

@@ -31,7 +31,7 @@ PRIOR = GaussianMixture.gaussian(
 
 def network(agents: int, **options: object) -> NewsFilter:
     full = {"target_dim": 2, "common": [1], **options}
-    return NewsFilter([MODEL] * agents, [EYE] * agents, graphs.complete(agents), **full)
+    return NewsFilter(MODEL, [EYE] * agents, graphs.complete(agents), **full)
 
 
 def joint(agents: int, readings: np.ndarray, speed: np.ndarray) -> tuple:
@@ -121,7 +121,7 @@ def test_a_large_gain_does_not_hide_a_small_one() -> None:
 def test_no_zero_is_sent(rank: int, numbers: int) -> None:
     still = Model(6, lambda x, t, dt: x, lambda t, dt: np.zeros((6, 6)))
     eye = direct(range(rank), std=1.0)
-    f = NewsFilter([still] * 2, [eye, None], graphs.path(2), target_dim=6)
+    f = NewsFilter(still, [eye, None], graphs.path(2), target_dim=6)
     prior = GaussianMixture.gaussian(np.zeros(6), np.eye(6) + 0.3)
     after = f.step(f.start([prior] * 2), 1.0, [np.ones(rank), None])
     assert after.ledger.scalars.tolist() == [numbers, 0]
@@ -132,7 +132,7 @@ def test_no_zero_is_sent(rank: int, numbers: int) -> None:
 def test_news_that_are_lost_leave_the_own_belief() -> None:
     seen = [[0.7, np.nan], [-0.4, np.nan]]
     deaf = network(2, faults=Faults(loss=1.0))
-    alone = MixtureFilter([MODEL] * 2, [EYE] * 2, target_dim=2, size=1, most=1)
+    alone = MixtureFilter(MODEL, [EYE] * 2, target_dim=2, size=1, most=1)
     a, b = (f.step(f.start([PRIOR] * 2), 1.0, seen) for f in (deaf, alone))
     assert all(
         np.allclose(x.covs, y.covs) and np.allclose(x.means, y.means)
@@ -144,7 +144,7 @@ def test_news_that_are_lost_leave_the_own_belief() -> None:
 def test_mixands_are_weighed_by_the_news() -> None:
     still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
     f = NewsFilter(
-        [still] * 2, [direct([0], std=1.0), None], graphs.path(2), target_dim=1, size=2, most=2
+        still, [direct([0], std=1.0), None], graphs.path(2), target_dim=1, size=2, most=2
     )
     prior = GaussianMixture([0.3, 0.7], [[-2.0], [1.0]], [[[1.0]], [[2.0]]])
     one = GaussianMixture.gaussian([0.0], [[3.0]])
@@ -163,7 +163,7 @@ def test_a_gated_reading_is_no_news() -> None:
 
 
 def test_everybody_hears_only_neighbours() -> None:
-    f = NewsFilter([MODEL] * 3, [EYE] * 3, graphs.path(3), target_dim=2, common=[1])
+    f = NewsFilter(MODEL, [EYE] * 3, graphs.path(3), target_dim=2, common=[1])
     step = partial(f.step, f.start([PRIOR] * 3), 1.0)
     a, b = (step([[0.1, np.nan], None, [y, np.nan]]) for y in (0.2, 9.0))
     assert np.array_equal(a.mixtures[0].means, b.mixtures[0].means)

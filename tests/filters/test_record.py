@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from distfilt.filters import ParticleFilter
-from distfilt.filters.record import _nees_or_infinite
 from distfilt.models import Model
 from distfilt.sensors import direct
 
@@ -26,9 +25,3 @@ def test_nees_of_a_collapsed_cloud_is_infinite() -> None:
     mean, cov = run["mean"].values[0, 1, 0], run["covariance"].values[0, 1, 0]
     gap = mean - truth[0, 1]
     assert abs(recorded[0, 1] - gap @ np.linalg.solve(cov, gap)) < 1e-9
-
-
-def test_a_covariance_that_is_certain_in_one_direction_claims_too_much() -> None:
-    covs = np.array([np.diag([1.0, 1e-14]), np.diag([4.0, 1.0]), [[1.0, 1.0], [1.0, 1.0]]])
-    assert _nees_or_infinite(np.zeros((3, 2)), covs, np.ones((3, 2))).tolist() == [
-        np.inf, 1.25, np.inf]

@@ -26,7 +26,7 @@ from distfilt.filters.record import final_state
 from distfilt.kalman import kalman_filter
 from distfilt.mixtures import GaussianMixture, target_fusion
 from distfilt.models import LinearModel, lorenz63, rotating_swarm
-from distfilt.network import Graph, covariance_intersection, graphs
+from distfilt.network import Faults, Graph, covariance_intersection, graphs
 from distfilt.sensors import Sensor, direct, stack
 
 from .families import NOISE, PRIOR, TIMES, Q, data, model
@@ -73,7 +73,10 @@ def joint(seen: Any, sensors: Any = EYES) -> Any:
 def test_a_run_is_its_steps_whether_saved_or_not(family: str, tmp_path: Path) -> None:
     """With as many times as agents, so that a series cannot be taken for its transpose."""
     times = TIMES[: 9 if family == "density" else 3]
-    f, start, seen, truth = made(family, times)
+    options: dict[str, Any] = {} if family == "transport" else {"faults": Faults(loss=0.4, seed=5)}
+    if family in ("ensemble", "gaussian", "particle"):
+        options["lag"] = 1
+    f, start, seen, truth = made(family, times, **options)
     run = f.run(start, times, seen, truth=truth)
     state = start
     for k, t in enumerate(times):
@@ -83,7 +86,10 @@ def test_a_run_is_its_steps_whether_saved_or_not(family: str, tmp_path: Path) ->
         again = f.summary(state)
         assert np.array_equal(run["mean"].values[k], again.mean, equal_nan=True)
         assert np.array_equal(run["variance"].values[k], again.variance, equal_nan=True)
-        assert np.array_equal(run["scalars_total"].values[k], state.ledger.scalars)
+        for name in ("rounds", "messages", "scalars", "bytes", "lost"):
+            total = run[f"{name}_total"].values
+            assert np.array_equal(total[k], getattr(state.ledger, name))
+            assert np.array_equal(total, np.cumsum(run[name].values, axis=0))
     assert (run["squared_error"].values == (run["mean"].values - truth[:, None]) ** 2).all()
     assert len(repr(state)) < 200 and f"t={times[-1]:g}" in repr(state)
 
@@ -187,16 +193,15 @@ def test_each_reading_is_judged_alone() -> None:
     assert run["refused"].values.tolist() == [[1, 1, 1]]
 
 
-@pytest.mark.parametrize("how", ["every", "called", "graph"])
+@pytest.mark.parametrize("how", ["every", "graph"])
 @pytest.mark.parametrize("family", ["gaussian", "news"])
 def test_nothing_is_lost_until_the_next_contact(family: str, how: str) -> None:
     """After it everybody knows what one filter with all readings knows; before, only its own."""
     quiet = LinearModel.from_transition(2, model().transition_matrix, lambda t, dt: 0 * Q)
     apart = Graph.from_edges(3, np.zeros((0, 2)))
     options: dict[str, Any] = {
-        "every": {"every": 0.5}, "called": {"every": lambda t: t > 0.95},
-        "graph": {"graph": lambda t: NET if t > 0.95 else apart},
-    }[how]  # fmt: skip
+        "every": {"every": 0.5}, "graph": {"graph": lambda t: NET if t > 0.95 else apart},
+    }[how]
     options = {"graph": NET} | options | ({"lag": 8} if family == "gaussian" else {})
     f = SIX[family](quiet, EYES, options.pop("graph"), **options)
     g = GaussianFilter(quiet, EYES, NET)
@@ -245,9 +250,6 @@ def test_several_sensors_an_agent_and_one_of_its_own_at_each_time() -> None:
     moved = f.step(start, 0.1, [posed, None])
     assert np.allclose(moved.means, one.means)
     assert moved.ledger.scalars.tolist() == [1 + 2 + 3, 0] and one.ledger.scalars.sum() == 1
-    turning = GaussianFilter(model(), lambda t: both if t < 1 else both[::-1], graphs.path(2))
-    after = turning.step(start, 2.0, [None, Reading(2.0, 1, [0.3], 1)])
-    assert np.allclose(after.means, f.step(start, 2.0, [Reading(2.0, 0, [0.3], 1), None]).means)
 
 
 @pytest.mark.parametrize("family", ["gaussian", "ensemble", "mixture", "news"])

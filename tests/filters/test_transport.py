@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 
 from distfilt.coupling import ensemble_transform
-from distfilt.filters import EnsembleFilter, Late, TransportFilter
+from distfilt.filters import Reading, TransportFilter
 from distfilt.filters.ensemble import EnsembleState
-from distfilt.models import LinearModel
 from distfilt.network import Faults, average, graphs
 from distfilt.sensors import Sensor, direct, stack
-from distfilt.updates import ensemble_transform as transform_update
 
-from .families import NOISE, PRIOR, TIMES, data, model, team
+from .families import NOISE, PRIOR, TIMES, data, model
 
 FOUR: list[Sensor | None] = [
     direct([0], std=0.6), direct([1], std=0.5), Sensor(2, lambda x: x, NOISE), direct([0], std=0.8),
@@ -69,8 +67,6 @@ def test_only_log_likelihoods_are_sent() -> None:
     _, seen = data(FOUR)
     ledger = f.step(_start(f), TIMES[0], [o[0] for o in seen]).ledger
     assert ledger.rounds == 2 and (ledger.scalars == 2 * 2 * 30).all()
-    with_readings = _filter(agreement=None).step(_start(f), TIMES[0], [o[0] for o in seen]).ledger
-    assert with_readings.scalars.tolist() == [2, 2, 4, 2]
 
 
 def test_sets_stay_in_common_with_noise_and_rejuvenation_over_runs() -> None:
@@ -83,24 +79,6 @@ def test_sets_stay_in_common_with_noise_and_rejuvenation_over_runs() -> None:
     assert np.abs(last[0] - last[1]).max() > 0.1
 
 
-def test_without_an_agreement_it_is_the_ensemble_filter_with_the_transform() -> None:
-    """Given no noise of the model; what is drawn of it differs between the two."""
-    still = LinearModel.from_transition(
-        2, lambda dt: 0.9 * np.eye(2), lambda t, dt: np.zeros((2, 2))
-    )
-    members = np.random.default_rng(4).standard_normal((30, 2))
-    seen = [None if s is None else np.full(s.dim, 0.3) for s in team(3)]
-    out = []
-    for f in (
-        TransportFilter(still, team(3), graphs.path(3), agreement=None, members=30),
-        EnsembleFilter(still, team(3), graphs.path(3), update=transform_update, members=30),
-    ):
-        state = f.start(members, rng=np.random.default_rng(0))
-        out.append(f.step(state, 0.5, seen))
-    assert np.abs(out[0].ensembles - out[1].ensembles).max() < 1e-12
-    assert (out[0].ledger.scalars == out[1].ledger.scalars).all()
-
-
 def test_a_late_reading_weighs_all_times_with_one_coupling() -> None:
     """Its likelihood multiplies today's, and every kept time gets the exact weighted mean."""
     f = _filter(sensors=FOUR, lag=2)
@@ -108,28 +86,12 @@ def test_a_late_reading_weighs_all_times_with_one_coupling() -> None:
     state = f.step(state, 0.5, [None] * 4)
     before = state.ensembles[0]
     plain = f.step(state, 1.0, [None] * 4).ensembles[0]
-    after = f.step(state, 1.0, [None, None, None, [0.4]], late=[Late(0, 0.5, [1.3], arrived=1.0)])
+    after = f.step(state, 1.0, [None, None, None, [0.4]], late=[Reading(0.5, 0, [1.3])])
     logs = -0.5 * ((1.3 - before[:, 0]) / 0.6) ** 2 - 0.5 * ((0.4 - plain[:, 0]) / 0.8) ** 2
     w = np.exp(logs - logs.max())
     w /= w.sum()
     assert np.allclose(after.ensembles[2], ensemble_transform(plain, logs), atol=1e-11)
     assert np.allclose(after.history[-1][1][1].mean(axis=0), w @ before, atol=1e-12)
-
-
-def test_a_step_reaches_as_far_as_the_rounds_of_the_agreement() -> None:
-    """On a path of five agent 4's set changes: after two rounds agents 0 and 1 know nothing."""
-    sensors: list[Sensor | None] = [direct([0], std=0.6)] * 5
-    f = TransportFilter(
-        model(), sensors, graphs.path(5), members=20, agreement=partial(average, rounds=2)
-    )
-    start = f.start(PRIOR, rng=np.random.default_rng(0))
-    members = start.ensembles.copy()
-    members[4] *= 1.5
-    fields = {k: getattr(start, k) for k in start.__dataclass_fields__} | {"ensembles": members}
-    plain = f.step(start, 0.5, [[0.3]] * 5).ensembles
-    other = f.step(EnsembleState(**fields), 0.5, [[0.3]] * 5).ensembles
-    changed = np.abs(plain - other).max(axis=(1, 2)) > 1e-12
-    assert changed.tolist() == [False, False, True, True, True]
 
 
 def test_finite_time_averaging_refuses_a_lossy_network() -> None:

@@ -279,7 +279,7 @@ ALLOWED: dict[tuple[str, str, str], str] = {
         "a user's function that overflows",
     (r"sensors\.Sensor.*", r".*", r"(tiny|zero|NaN): NaN"):
         "a direction to where the sensor is, or a reading that is missing",
-    (r"sensors\.wrap|filters\.(Late|Reading)", r".*", "NaN: NaN"): "a reading that is missing",
+    (r"sensors\.wrap|filters\.Reading", r".*", "NaN: NaN"): "a reading that is missing",
     (r"network\.admm", "check", "None: taken"): "no check, as its docstring says",
     (r"kalman\.filterpy_\w+|models\.pendulum_chart", r".*", r"huge: (unnamed|NaN)"):
         "an overflow, in another package's words or an angle of nothing",
