@@ -12,13 +12,12 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from _bench import Row, main, peak_mb, table, timed
+from _bench import Row, interleaved, main, peak_mb, table, timed
 
 from bookkit import studies
 from distfilt.mixtures import (
     GaussianMixture,
     PartialFusion,
-    kept_by_relevance,
     moved,
     runnalls,
     split,
@@ -86,27 +85,22 @@ def theirs_of(p: GaussianMixture) -> Any:
 
 
 def beside_peers() -> Iterator[Row]:
-    """Our reduction, plain numpy's, pyest's and Stone Soup's."""
+    """Our reduction, pyest's and Stone Soup's."""
     from pyest.gm import merge_runnalls
 
     for dim, size, needed in PEERS:
         p = mixture(size, dim)
-        for warm in (mixture(40, dim), p):
-            runnalls(warm, 30)
-        merge_runnalls(theirs_of(mixture(40, dim)), 30)
-        ours = timed(partial(runnalls, p, LEFT, engine="numba"), 5)
-        plain = timed(partial(runnalls, p, LEFT, engine="numpy"), 1)
-        peer = timed(partial(merge_runnalls, theirs_of(p), LEFT), 1)
-        soup, q = timed(stone_soup(p), 1), plain.result
-        apart = gap(ours.result, peer.result.w, peer.result.m, peer.result.P)
-        ratio = peer.cpu / ours.cpu
-        yield row("reduce", dim, size, ours.cpu)
-        yield row("reduce, numpy", dim, size, plain.cpu, ratio=f"{plain.cpu / ours.cpu:.1f}",
-                  gap=f"{gap(ours.result, q.weights, q.means, q.covs):.0e}")
-        yield row("reduce, pyest", dim, size, peer.cpu, ratio=f"{ratio:.1f}", needed=needed,
-                  gap=f"{apart:.0e}", missed=ratio < needed or apart > 1e-12)
-        yield row("merge in a gate, Stone Soup", dim, size, soup.cpu,
-                  ratio=f"{soup.cpu / ours.cpu:.1f}")
+        ours, there = partial(runnalls, p, LEFT, engine="numba"), theirs_of(p)
+        found = merge_runnalls(there, LEFT)
+        apart = gap(ours(), found.w, found.m, found.P)
+        times, ratios = interleaved({
+            "reduce": ours, "reduce, pyest": partial(merge_runnalls, there, LEFT),
+            "merge in a gate, Stone Soup": stone_soup(p),
+        }, 3)  # fmt: skip
+        for name, spent in times.items():
+            mine = {"needed": needed, "gap": f"{apart:.0e}"} if "pyest" in name else {}
+            missed = bool(mine) and (ratios[name] < needed or apart > 1e-12)
+            yield row(name, dim, size, spent, ratio=f"{ratios[name]:.1f}", missed=missed, **mine)
 
 
 def growth() -> Iterator[Row]:
@@ -131,15 +125,12 @@ def fusion() -> Iterator[Row]:
         few = {"marginal": mine, "received": [heard]}
         for name, rule, repeats, options in (
             ("all terms", "C2", 1, {"terms": "all"}),
-            ("all terms, literal", "C2", 1, {"terms": "all", "form": "literal"}),
             ("matched terms", "C2", 1, {"terms": "matched"}),
             ("marginals reduced to 6", "C2", 3, {"terms": "all", **few}),
             ("matched, heard reduced to 6, C3", "C3", 3, {"received": [heard]}),
         ):
             took = timed(lambda f=f, o=options, r=rule: f.weigh(f.shapes(**o), rule=r), repeats)
             yield row(f"fuse, {name}", 12, size, took.cpu)
-        took = timed(partial(kept_by_relevance, f.target, f.others[0], threshold=40.0), 3)
-        yield row("relevance", 6, size, took.cpu)
 
 
 def in_orbit() -> Iterator[Row]:
@@ -163,27 +154,28 @@ def splits_and_points() -> Iterator[Row]:
     p = mixture(1, 12)
     u = p.factors[:, :, 0]
     options = GaussSplitOptions(L=3, lam=1e-3)
-    ours = timed(lambda: [split(p, [0], u) for _ in range(200)], 3).cpu / 200
-    theirs = timed(lambda: [
-        split_gaussian(1.0, p.means[0], p.covs[0], options, direction=u[0]) for _ in range(200)
-    ], 3).cpu / 200
-    yield row("split", 12, 1, ours)
-    yield row("split, pyest", 12, 1, theirs, ratio=f"{theirs / ours:.1f}")
+    splits = {
+        "split": partial(split, p, [0], u),
+        "split, pyest": partial(
+            split_gaussian, 1.0, p.means[0], p.covs[0], options, direction=u[0]
+        ),
+    }
     p, noise = mixture(12, 12), 0.1 * np.eye(12)
     peer = GmukfPredict(
         lambda x, before, after: x + 0.1 * np.sin(x), noise,
         sigma_pt_opts=SigmaPointOptions(1.0, 0.0, 0.0),
     )
-    there, root = theirs_of(p), np.linalg.cholesky(noise)
-    mine = timed(lambda: [
-        moved(p, lambda x: x + 0.1 * np.sin(x), root, rule="unscented") for _ in range(50)
-    ], 3)
-    other = timed(lambda: [peer.predict((0.0, 1.0), there) for _ in range(50)], 3)
-    ahead, after = mine.result[0], other.result[0]
-    apart = float(max(np.abs(ahead.means - after.m).max(), np.abs(ahead.covs - after.P).max()))
-    yield row("unscented forecast", 12, 12, mine.cpu / 50)
-    yield row("unscented forecast, pyest", 12, 12, other.cpu / 50, missed=apart > 1e-10,
-              ratio=f"{other.cpu / mine.cpu:.1f}", gap=f"{apart:.0e}")
+    ours = partial(
+        moved, p, lambda x: x + 0.1 * np.sin(x), np.linalg.cholesky(noise), rule="unscented"
+    )
+    theirs = partial(peer.predict, (0.0, 1.0), theirs_of(p))
+    after = theirs()
+    apart = gap(ours(), after.w, after.m, after.P)
+    forecasts = {"unscented forecast": ours, "unscented forecast, pyest": theirs}
+    for calls, size, differ in (splits, 1, 0.0), (forecasts, 12, apart):
+        times, ratios = interleaved(calls)
+        for name, spent in times.items():
+            yield row(name, 12, size, spent, ratio=f"{ratios[name]:.1f}", missed=differ > 1e-10)
 
 
 @table("mixtures", "numpy", "numba", "pyest", "stonesoup")

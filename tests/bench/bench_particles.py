@@ -1,4 +1,4 @@
-"""The bootstrap particle filter against the `particles` package and against plain numpy.
+"""The bootstrap particle filter against the `particles` package.
 
 A random walk in three components, of which two are seen with a full noise; 1 000 and 10 000
 particles, 50 steps, resampled in every step by the systematic rule, and the weighted mean of each.
@@ -39,20 +39,6 @@ def by_distfilt(n: int, seen: np.ndarray) -> np.ndarray:
     return out
 
 
-def by_numpy(n: int, seen: np.ndarray) -> np.ndarray:
-    rng = np.random.default_rng(1)
-    move, white = np.linalg.cholesky(Q).T, np.linalg.inv(np.linalg.cholesky(R)).T
-    x, out = rng.standard_normal((n, 3)), np.empty((STEPS, 3))
-    for k in range(STEPS):
-        x = x + rng.standard_normal((n, 3)) @ move
-        logs = -0.5 * (((seen[k] - x @ H.T) @ white) ** 2).sum(axis=1)
-        w = np.exp(logs - logs.max())
-        w /= w.sum()
-        out[k] = w @ x
-        x = x[np.searchsorted(np.cumsum(w), (np.arange(n) + rng.random()) / n).clip(max=n - 1)]
-    return out
-
-
 def by_particles(package: Any, n: int, seen: np.ndarray) -> np.ndarray:
     spaces = peer("particles.state_space_models")
     laws, collectors = peer("particles.distributions"), peer("particles.collectors")
@@ -87,7 +73,6 @@ def filters() -> Iterator[Row]:
         calls: dict[str, Any] = {"distfilt": partial(by_distfilt, n, seen)}
         if package is not None:
             calls["particles"] = partial(by_particles, package, n, seen)
-        calls["plain numpy"] = partial(by_numpy, n, seen)
         times, ratios = interleaved(calls, 7)
         for name, call in calls.items():
             floor = FLOOR if name == "particles" else 0

@@ -1,11 +1,9 @@
-"""The studies of Figs. 1 and 2 and of Table III of Grange et al., and a step of Table III's filter.
+"""A step of the filter of Table III of Grange et al.
 
-Times one batch of each stored study and multiplies by the number of batches: processor time of the
-whole study, in one process. A step of the network of Table III (five agents, 13 components, 200
-members, known noise and covariance intersection, or exact draws and moments) is held against what
-it cannot do without: the normal numbers that it draws, the model's motion of the members, and the
-products for means, covariances and gains, by numpy. Misses above 3.7 times that floor for one run
-and 2.2 times for a batch of fifty.
+The network has five agents, 13 components and 200 members; known noise and covariance intersection,
+or exact draws and moments. A step is held against what it cannot do without: the normal numbers
+that it draws, the model's motion of the members, and the products for means, covariances and gains,
+by numpy. Misses above 3.7 times that floor for one run and 2.2 times for a batch of fifty.
 """
 
 from __future__ import annotations
@@ -15,23 +13,11 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from _bench import Row, interleaved, main, table, timed
+from _bench import Row, interleaved, main, table
 
 from bookkit import studies
 
 LIMITS = {1: 3.7, 50: 2.2}
-
-
-def studied() -> Iterator[Row]:
-    """Processor time of a batch of each study, and of all of them."""
-    for name in ("figure_1", "figure_2", "table_3"):
-        study = studies.script(name)
-        spent = timed(partial(study.trial, study.seeds[0]), 1)
-        yield {
-            "part": f"study {name}, {len(study.seeds)} batches of {study.BATCH} runs", "runs": "",
-            "ms": f"{1e3 * spent.cpu * len(study.seeds):.0f}", "floor_ms": "", "ratio": "",
-            "limit": "", "peak_mb": f"{spent.peak_mb:.0f}",
-        }
 
 
 def floor_of(setup: Any, states: np.ndarray, rng: np.random.Generator) -> Any:
@@ -82,9 +68,8 @@ def rows() -> Iterator[Row]:
             yield {
                 "part": f"a step of Table III, {kind}", "runs": runs,
                 "ms": f"{1e3 * times['ours']:.2f}", "floor_ms": f"{1e3 * times['floor']:.2f}",
-                "ratio": f"{ratio:.2f}", "limit": limit, "peak_mb": "", "missed": ratio > limit,
+                "ratio": f"{ratio:.2f}", "limit": limit, "missed": ratio > limit,
             }
-    yield from studied()
 
 
 if __name__ == "__main__":

@@ -3,9 +3,8 @@
 A trial sleeps for 10 ms and returns how long it really took. The overhead per trial is what the
 workers spent on anything else: workers * wall time / trials - mean time of a trial. It is measured
 on a pool whose processes run already, the median of several studies; starting the processes is
-timed apart. Beside it: `store`, which puts every trial on disk, loky itself with one call a trial,
-the standard library's pool with chunks, and joblib. Misses where `run` on two workers takes more
-than 0.15 ms a trial.
+timed apart. Beside it: `store`, which puts every trial on disk. Misses where `run` on two workers
+takes more than 0.15 ms a trial.
 """
 
 from __future__ import annotations
@@ -13,11 +12,10 @@ from __future__ import annotations
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from tempfile import mkdtemp
 
-from _bench import Row, main, peer, table
+from _bench import Row, main, table
 from loky import get_reusable_executor
 from numpy.random import SeedSequence
 
@@ -52,23 +50,6 @@ def by_store(workers: int) -> Call:
     return call
 
 
-def by_loky(workers: int) -> Call:
-    return lambda: list(get_reusable_executor(workers).map(trial, SEEDS))
-
-
-def by_pool(workers: int) -> Call:
-    """What a user of the standard library writes, with a chunk size found by trying."""
-    pool = ProcessPoolExecutor(workers)
-    return lambda: list(pool.map(trial, SEEDS, chunksize=20))
-
-
-def by_joblib(workers: int) -> Call | None:
-    joblib = peer("joblib")
-    if joblib is None:
-        return None
-    return lambda: joblib.Parallel(n_jobs=workers)(joblib.delayed(trial)(s) for s in SEEDS)
-
-
 def overheads(call: Call, workers: int) -> tuple[list[float], float]:
     """Overhead of each repeat, in ms a trial, and what the first call took longer, in s."""
     out, walls = [], []
@@ -80,25 +61,17 @@ def overheads(call: Call, workers: int) -> tuple[list[float], float]:
     return out[1:], walls[0] - statistics.median(walls[1:])
 
 
-CASES: tuple[tuple[int, str, Callable[[int], Call | None]], ...] = (
-    (1, "run", by_run), (2, "run", by_run), (2, "store", by_store),
-    (2, "loky, a call a trial", by_loky), (2, "ProcessPoolExecutor, chunks of 20", by_pool),
-    (2, "joblib", by_joblib),
-)  # fmt: skip
+CASES = (1, "run", by_run), (2, "run", by_run), (2, "store", by_store)
 
 
 @table("studies", "numpy", "loky", "cloudpickle", "threadpoolctl")
 def rows() -> Iterator[Row]:
     for workers, name, made in CASES:
-        call = made(workers)
-        if call is None:
-            continue
-        found, start = overheads(call, workers)
+        found, start = overheads(made(workers), workers)
         median = statistics.median(found)
         required = name == "run" and workers > 1
         yield {
             "case": name, "workers": workers, "trials": TRIALS, "overhead_ms": f"{median:.3f}",
-            "least_ms": f"{min(found):.3f}", "most_ms": f"{max(found):.3f}",
             "required_ms": f"{REQUIRED_MS:g}" if required else "", "start_s": f"{start:.2f}",
             "repeats": REPEATS, "missed": required and median > REQUIRED_MS,
         }

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from _bench import Row, interleaved, main, peer, table
 
-from distfilt.updates import exact_draws, known_noise, square_root
+from distfilt.updates import known_noise
 
 MEMBERS, DIMS, DRAWS = 100, (6, 13, 40), 300
 FLOORS = {"DAPPER, perturbed observations": 1.3, "six lines of numpy": 0.8}
@@ -64,9 +64,6 @@ def analyses() -> Iterator[Row]:
             "known_noise": partial(known_noise, x, h, y, r, rng=rng),
             "DAPPER, perturbed observations": dapper(x, h, y, r),
             "six lines of numpy": partial(six_lines, x, h, y, r, rng),
-            "known_noise, unchecked": partial(known_noise.unchecked, x, h, y, r, rng=rng),
-            "exact_draws": partial(exact_draws, x, h, y, r, rng=rng),
-            "square_root": partial(square_root, x, h, y, r, rng=rng),
         }
         calls = {name: call for name, call in calls.items() if call is not None}
         times, ratios = interleaved(calls, 31)
