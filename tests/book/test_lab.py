@@ -60,16 +60,12 @@ def test_no_role_is_left_and_no_label_is_lost(copied: Path) -> None:
 
 def test_numbers_are_those_of_the_built_book() -> None:
     pages = [ROOT / f"{page}.md" for page in toc_pages()]
-    known, seen = lab.names(pages), 0
+    known, numbers = lab.names(pages), {}
     for source in chapters():
         html = (BUILT / f"{source.stem}.html").read_text(encoding="utf-8")
-        numbers = dict(
-            re.findall(r'id="equation-([\w-]+)">\s*<span class="eqno">(\([\d.]+\))', html)
-        )
-        for label, number in numbers.items():
-            assert known.words[label] == number
-        seen += len(numbers)
-    assert seen >= len(known.equations) > 20
+        numbers |= re.findall(r'id="equation-([\w-]+)">\s*<span class="eqno">(\([\d.]+\))', html)
+    assert {label: known.words[label] for label in numbers} == numbers
+    assert len(numbers) >= len(known.equations) > 20
 
 
 def test_words_for_citations_and_places() -> None:
@@ -95,17 +91,14 @@ def test_words_for_citations_and_places() -> None:
     assert other == "[(4.1)](04-satellite-network.ipynb)"
 
 
-def test_no_save_writes_a_second_file(copied: Path) -> None:
+def test_outputs_are_trusted_hidden_code_is_folded_and_no_save_writes_a_second_file(
+    copied: Path,
+) -> None:
+    notary = NotebookNotary(data_dir=str(copied / ".jupyter" / "data"))
     for path in (copied / "book").glob("*.ipynb"):
         notebook = nbformat.read(path, as_version=4)
         nbformat.validate(notebook)
         assert "jupytext" not in notebook.metadata
-
-
-def test_stored_outputs_are_trusted_and_code_that_a_page_hides_is_folded(copied: Path) -> None:
-    notary = NotebookNotary(data_dir=str(copied / ".jupyter" / "data"))
-    for path in (copied / "book").glob("*.ipynb"):
-        notebook = nbformat.read(path, as_version=4)
         assert notary.check_signature(notebook)
         for cell in notebook.cells:
             if lab.HIDDEN & set(cell.metadata.get("tags", [])):

@@ -28,12 +28,9 @@ def test_ledger_has_every_item_once() -> None:
         assert row["verdict"] != "not yet" or not any(given)
 
 
-def test_an_item_without_a_verdict_is_not_yet() -> None:
+def test_a_verdict_fills_its_row() -> None:
     (row,) = ledger([ITEM], [])
     assert row["verdict"] == "not yet" and row["chapter"] == ITEM["chapter"]
-
-
-def test_a_verdict_fills_its_row() -> None:
     (row,) = ledger([ITEM], [VERDICT])
     assert row == {**VERDICT, "kind": "results"} and tuple(row) == COLUMNS
     assert text_of([row]).splitlines()[1].endswith('"a, b"')
