@@ -34,28 +34,15 @@ def test_digest_is_steady_at_round_numbers(value):
     assert len(texts) == 1
 
 
-@given(
-    st.lists(st.integers(-50, 50), min_size=2, max_size=60), st.data(), st.sampled_from([-20, 20])
-)
-def test_digest_sees_one_changed_entry(values, data, change):
-    curve = np.array(values, dtype=float)
-    moved = curve.copy()
-    moved[data.draw(st.integers(0, len(values) - 1))] += change
-    # The projection moves by 20/sqrt(4n), at least 1.2, and its last digit is worth at most 0.1.
-    assert digest(c=curve) != digest(c=moved)
-
-
 def test_digest_sees_order_sign_and_size():
     t = np.linspace(0, 6, 200)
     curve = np.sin(t)
     for other in (curve[::-1], -curve, 1.001 * curve, curve + 0.001, np.sin(t + 0.01), curve[:-1]):
         assert digest(c=curve) != digest(c=other)
-    swapped = curve.copy()
+    swapped, bumped = curve.copy(), curve.copy()
     swapped[[40, 60]] = swapped[[60, 40]]  # same range, mean and parity
-    assert digest(c=curve) != digest(c=swapped)
-    bumped = curve.copy()
     bumped[100] += 0.02
-    assert digest(c=curve) != digest(c=bumped)
+    assert len({digest(c=curve), digest(c=swapped), digest(c=bumped)}) == 3
 
 
 def test_digest_text():
@@ -63,10 +50,8 @@ def test_digest_text():
     assert digest(a=[np.nan, np.nan]) == "a: 2 values, 2 NaN"
     text = digest(a=[1.0, np.nan, np.inf, 2.0])
     assert text.endswith("1 NaN, 1 infinite") and text.startswith("a: 4 values, 1..2, mean 1.5,")
-    moved = digest(a=[np.nan, 1.0, np.inf, 2.0])
-    assert moved != text
-    turn = np.linspace(0, 2 * np.pi, 101)[:-1]
-    assert "mean 0," in digest(a=np.sin(turn))
+    assert digest(a=[np.nan, 1.0, np.inf, 2.0]) != text
+    assert "mean 0," in digest(a=np.sin(np.linspace(0, 2 * np.pi, 101)[:-1]))
     assert digest(a=np.array([123456, 234567])).startswith("a: 2 values, 1.235e+05..2.346e+05")
 
 
@@ -134,21 +119,6 @@ def test_drawing_and_style_do_not_change_the_text(tmp_path):
     assert of_axes(figure) == before
 
 
-@settings(derandomize=True, max_examples=15)  # as above: a number may lie close to a tie
-@given(st.integers(0, 2**32 - 1))
-def test_text_survives_the_last_bits_of_another_processor(seed):
-    def drawn(noise):
-        axes = Figure().subplots()
-        axes.plot(T, np.sin(T) * (1 + noise[0]))
-        axes.plot(T * (1 + noise[1]), np.exp(T) * (1 + noise[2]))
-        axes.fill_between(T, np.cos(T) * (1 + noise[3]))
-        axes.bar(T[:5], T[1:6] * (1 + noise[4, :5]))
-        return of_axes(axes)
-
-    noise = np.random.default_rng(seed).uniform(-1e-12, 1e-12, (5, 50))
-    assert drawn(noise) == drawn(0 * noise)
-
-
 def test_text_of_each_kind():
     axes = Figure().subplots()
     axes.plot([0.0, 1.0], [2.0, np.nan])
@@ -180,7 +150,7 @@ def test_figures_axes_and_arrays_of_axes_read_alike():
 
 
 def test_three_dimensions():
-    def drawn(z, surface, points):
+    def drawn(z=1.0, surface=1.0, points=1.0):
         axes = pyplot.figure().add_subplot(projection="3d")
         axes.plot(T, T, z * T)
         axes.plot_wireframe(*np.meshgrid(T[:3], T[:4]), surface * np.ones((4, 3)))
@@ -190,10 +160,9 @@ def test_three_dimensions():
         pyplot.close("all")
         return text
 
-    plain = drawn(1.0, 1.0, 1.0)
-    assert plain == drawn(1.0, 1.0, 1.0) and "line 1 z" in plain
-    for other in ((1.01, 1, 1), (1, 1.01, 1), (1, 1, 1.01)):
-        assert drawn(*other) != plain
+    plain = drawn()
+    assert plain == drawn() and "line 1 z" in plain
+    assert plain not in {drawn(z=1.01), drawn(surface=1.01), drawn(points=1.01)}
 
 
 def test_an_empty_figure_says_so():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import pickle
 from collections import Counter
 from pathlib import Path
@@ -32,12 +31,12 @@ S = scenario("grange", "table-2")
 CHANGED = S.replace(gain=0.1)
 ROWS = [{"name": a.name, "dims": a.dims, "kind": a.kind, "noise": a.noise,
          "neighbours": a.neighbours} for a in S.agents]  # fmt: skip
-UNSTABLE, STABLE, SMALL = CLAIMS = [
+CLAIMS = [
     Claim("without-pca-unstable", "share", True, "0.4 [0.3, 0.5]"),
     Claim("pca-stable", "share", True, "0 [0, 0.04]"),
     Claim("small-samples", "difference", True, "0.3 [0.2, 0.4]"),
 ]
-FAILED = STABLE._replace(holds=False)
+DENIED = [CLAIMS[0], CLAIMS[1]._replace(holds=False), CLAIMS[2]]
 
 
 # Files.
@@ -84,15 +83,13 @@ def test_a_row_that_does_not_fit_is_refused_by_name(tmp_path: Path, text: str) -
 def test_the_data_are_those_of_the_working_copy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    own = data_root()
-    (tmp_path / "data").mkdir()
-    deep = tmp_path / "book" / "deep"
-    deep.mkdir(parents=True)
+    own, deep = data_root(), tmp_path / "book" / "deep"
+    for folder in (tmp_path / "data" / "published", deep):
+        folder.mkdir(parents=True)
     monkeypatch.chdir(deep)
     assert data_root() == own  # another project's data is passed over
-    (tmp_path / "data" / "published").mkdir()
     (tmp_path / "data" / "published" / "items.csv").touch()
-    assert data_root() == tmp_path / "data" and os.getcwd() == str(deep)
+    assert data_root() == tmp_path / "data"
 
 
 # Scenarios.
@@ -100,14 +97,11 @@ def test_the_data_are_those_of_the_working_copy(
 GAIN = '[parameters.gain]\nvalue = 0.05\nunit = "1"\nsource = "assumed"\nreason = "a sweep"\n'
 
 
-def agent(name: str, neighbours: str, kind: str = "direct") -> str:
-    return (
-        f'[[agents]]\nname = "{name}"\nkind = "{kind}"\nunit = "m"\nsource = "given"\n'
-        f'where = "Table II"\nneighbours = {list(neighbours)}\n'
-    )
-
-
-GOOD = 'title = "A study"\n' + GAIN + agent("A", "AB") + agent("B", "AB")
+AGENT = (
+    '[[agents]]\nname = "{}"\nkind = "direct"\nunit = "m"\nsource = "given"\n'
+    "where = \"Table II\"\nneighbours = ['A', 'B']\n"
+)
+GOOD = 'title = "A study"\n' + GAIN + AGENT.format("A") + AGENT.format("B")
 
 
 @pytest.mark.parametrize(
@@ -116,12 +110,9 @@ GOOD = 'title = "A study"\n' + GAIN + agent("A", "AB") + agent("B", "AB")
         ("value = 0.05\n", "", r"\[parameters.gain\]: .*value"),
         ("value = 0.05", "value =", r"its form: .*line 3"),
         ("reason", "reson", r"\[parameters.gain\]: .*reson"),
-        ('reason = "a sweep"\n', "", r"\[parameters.gain\]: reason: needs a text"),
         ("assumed", "given", r"\[parameters.gain\]: where: needs a text"),
         ("assumed", "guessed", "source: needs one of given, inferred, assumed"),
-        ('title = "A study"\n', "", "title"),
         ("neighbours = ['A', 'B']", "neighbours = ['A']", "agents: needs mutual neighbours"),
-        ("neighbours = ['A', 'B']", "neighbours = ['A', 'Z']", "agents: needs mutual neighbours"),
         ('name = "B"', 'name = "A"', "agents: needs distinct names"),
         ('kind = "direct"', 'kind = "angle"', "unit: needs rad or deg for 'angle'"),
     ],
@@ -130,7 +121,8 @@ def test_a_fault_is_named_with_the_file(tmp_path: Path, old: str, new: str, word
     (tmp_path / "some").mkdir()
     path = tmp_path / "some" / "study.toml"
     path.write_text(GOOD)
-    assert read_scenario(path)["gain"] == 0.05
+    found = read_scenario(path)
+    assert found["gain"] == 0.05 and found.changes == ("some/study is no scenario of the book",)
     path.write_text(GOOD.replace(old, new, 1))
     with pytest.raises(ValueError, match=f"^some/study.toml: (?s:.*){words}"):
         read_scenario(path)
@@ -167,14 +159,6 @@ def test_a_change_is_noticed_and_named() -> None:
     assert not back.changed and back.digest == S.digest != other.digest
 
 
-def replaced(text: str, tmp_path: Path, old: str, new: str) -> Scenario:
-    path = tmp_path / "grange" / "table-2.toml"
-    path.parent.mkdir()
-    assert old in text
-    path.write_text(text.replace(old, new))
-    return read_scenario(path)
-
-
 @pytest.mark.parametrize(
     ("old", "new", "changes"),
     [
@@ -192,14 +176,11 @@ def test_a_changed_file_is_noticed_by_its_values(
     tmp_path: Path, old: str, new: str, changes: tuple[str, ...]
 ) -> None:
     text = (data_root() / "scenarios" / "grange" / "table-2.toml").read_text(encoding="utf-8")
-    other = replaced(text, tmp_path, old, new)
-    assert other.changes == changes and (other.digest == S.digest) == (not changes)
-
-
-def test_a_scenario_of_a_reader_s_own_is_a_change(tmp_path: Path) -> None:
-    path = tmp_path / "mine.toml"
-    path.write_text(GOOD)
-    assert read_scenario(path).changes == (f"{tmp_path.name}/mine is no scenario of the book",)
+    path = tmp_path / "grange" / "table-2.toml"
+    path.parent.mkdir()
+    path.write_text(text.replace(old, new))
+    other = read_scenario(path)
+    assert old in text and other.changes == changes and (other.digest == S.digest) == (not changes)
 
 
 def test_a_scenario_prints_every_parameter_and_its_reason() -> None:
@@ -212,12 +193,10 @@ def test_a_scenario_prints_every_parameter_and_its_reason() -> None:
 
 
 def test_tables_are_ruled_and_escaped() -> None:
-    head, *body, last = text_table(["a", "bb", "c", "d"], [["1", "2", "333", "4"]]).splitlines()
-    assert head == last == body[1] == "-" * (1 + 2 + 3 + 1 + 3 * 2)
-    assert body[0] == "a  bb  c    d" and body[2] == "1  2   333  4"
+    rule = "-" * (1 + 2 + 3 + 1 + 3 * 2)
+    text = text_table(["a", "bb", "c", "d"], [["1", "2", "333", "4"]])
+    assert text.split("\n") == [rule, "a  bb  c    d", rule, "1  2   333  4", rule]
     assert markdown_table(["a"], [["x | \\y"]]).endswith(r"| x \| \\y |")
-    assert "a &lt; b" in Verdict("grange", "Table I", "read", "a < b", "b")._repr_mimebundle_()[
-        "text/html"]  # fmt: skip
 
 
 # What was read.
@@ -251,24 +230,20 @@ def test_what_a_study_took_is_read_as_printed(item: str, name: str) -> None:
 
 def test_a_cell_that_no_study_took_is_not_read() -> None:
     study = S.reading()
-    found = judge_parameters("grange", "Table II", study)
-    why = "row A, dims: printed [0, 1], not read by the study"
-    assert (found.verdict, found.why) == ("differs", why)
     for a in study.agents:
         a.dims, a.noise, a.kind  # noqa: B018
     found = judge_parameters("grange", "Table II", study)
-    assert found.why == "row A, neighbours: printed [A,B,C], not read by the study"
+    why = "row A, neighbours: printed [A,B,C], not read by the study"
+    assert (found.verdict, found.why) == ("differs", why)
 
 
 @pytest.mark.parametrize(
     ("change", "why"),
     [
         ({"noise": 0.3}, "row B, noise: read 0.3, printed 0.2"),
-        ({"noise": "0.2"}, ""),
         ({"noise": np.float64(0.2)}, ""),
         ({"dims": (2, 1)}, "row B, dims: read [2,1], printed [1, 2]"),
         ({"dims": np.array([1, 2])}, ""),
-        ({"kind": "range"}, "row B, kind: read range, printed angle"),
         ({"neighbours": ["A"]}, "row B, neighbours: read [A], printed [A,B]"),
         ({"name": "Z"}, "row B is printed but was not read"),
     ],
@@ -294,15 +269,15 @@ def test_formulas_are_compared_without_spaces() -> None:
 
 
 def test_every_claim_has_to_hold() -> None:
-    match = judge_claims("grange", "Fig. 1", [SMALL, STABLE, UNSTABLE])
+    match = judge_claims("grange", "Fig. 1", CLAIMS[::-1])
     assert match.verdict == "match" and "pca-stable holds: share 0" in match.ours
     assert "unstable" in match.published and match.why == ""
-    differs = judge_claims("grange", "Fig. 1", [UNSTABLE, FAILED, SMALL], why="it is an EnKF")
+    differs = judge_claims("grange", "Fig. 1", DENIED, why="it is an EnKF")
     assert (differs.verdict, differs.why) == ("differs", "it is an EnKF")
     assert "pca-stable fails" in differs.ours
     with pytest.raises(ValueError, match="^why: needs a reason"):
-        judge_claims("grange", "Fig. 1", [UNSTABLE, FAILED, SMALL])
-    for claims in (CLAIMS[:2], [*CLAIMS, SMALL], [*CLAIMS[:2], SMALL._replace(id="other")]):
+        judge_claims("grange", "Fig. 1", DENIED)
+    for claims in (CLAIMS[:2], [*CLAIMS, CLAIMS[2]], [*CLAIMS[:2], CLAIMS[2]._replace(id="other")]):
         with pytest.raises(ValueError, match="^claims: needs those of grange Fig. 1"):
             judge_claims("grange", "Fig. 1", claims)
 
@@ -320,21 +295,15 @@ def test_an_open_criterion_cannot_be_judged(
 
 
 @pytest.mark.parametrize(
-    ("item", "word", "why", "good"),
+    ("item", "word", "why"),
     [
-        ("Table II", "read", "", True), ("Table II", "match", "", False),
-        ("Fig. 1", "match", "", True), ("Fig. 1", "read", "", False),
-        ("Fig. 1", "differs", "", False), ("Fig. 1", "differs", "so", True),
-        ("Fig. 1", "not comparable", " ", False), ("Fig. 1", "not comparable", "so", True),
-        ("Fig. 9", "match", "", False), ("Fig. 1", "not yet", "so", False),
+        ("Table II", "match", ""), ("Fig. 1", "read", ""), ("Fig. 1", "differs", ""),
+        ("Fig. 1", "not comparable", " "), ("Fig. 9", "match", ""), ("Fig. 1", "not yet", "so"),
     ],
 )  # fmt: skip
-def test_a_verdict_fits_its_item(item: str, word: str, why: str, good: bool) -> None:
-    if good:
-        assert Verdict("grange", item, word, "a", "b", why).verdict == word
-    else:
-        with pytest.raises(ValueError, match="^(item|verdict|why): needs"):
-            Verdict("grange", item, word, "a", "b", why)
+def test_a_verdict_that_does_not_fit_its_item_is_refused(item: str, word: str, why: str) -> None:
+    with pytest.raises(ValueError, match="^(item|verdict|why): needs"):
+        Verdict("grange", item, word, "a", "b", why)
 
 
 def test_a_verdict_travels_in_a_notebook() -> None:
@@ -351,7 +320,7 @@ def test_a_verdict_travels_in_a_notebook() -> None:
 def test_a_changed_scenario_is_not_compared() -> None:
     for found in (
         judge_claims("grange", "Fig. 1", CLAIMS, scenario=CHANGED),
-        judge_claims("grange", "Fig. 1", [UNSTABLE, FAILED, SMALL], why="x", scenario=CHANGED),
+        judge_claims("grange", "Fig. 1", DENIED, why="x", scenario=CHANGED),
         judge_parameters("grange", "Table II", ROWS, scenario=CHANGED),
         judge_parameters("grange", "Table II", used(CHANGED.reading())),
     ):
