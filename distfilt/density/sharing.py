@@ -13,7 +13,6 @@ from ..doors import MISSING, Array, Count, Mask, NonNegative, Places, Positive, 
 from ..network import Channel, Graph, PIState, pi_step
 from ..network import weights as weighting
 from ..network.channel import Lost
-from ..network.dynamic import first_order
 from ..network.graphs import disk
 from .grid import Grid
 from .kernel import kernel_density, kernel_information, kernels
@@ -249,7 +248,8 @@ class PIConsensus(Record, Sharing):
 class DynamicAverage(Record, Sharing):
     """First-order dynamic average consensus on cosine coefficients of the density.
 
-    Metropolis weights where all links go both ways, else weights that balance the graph.
+    Metropolis weights where all links go both ways, else weights that balance the graph (M. Zhu and
+    S. Martinez, Automatica 46 (2010) 322-329).
 
     Parameters
     ----------
@@ -275,7 +275,7 @@ class DynamicAverage(Record, Sharing):
         (x, before), graph = carried, channel.graph
         weights = weighting.balanced(graph) if graph.directed else weighting.metropolis(graph)
         lost: Lost = "keep" if graph.directed else "mutual"
-        x = first_order(x, u, before, channel, weights=weights, lost=lost)
+        x = unchecked(channel.combine)(x, weights, lost=lost) + (u - before)
         return (x, u), *_read(x, seen, self.modes)
 
 

@@ -1,27 +1,9 @@
 """Who hears whom, what a message costs, and how neighbours agree."""
 
 from . import graphs, weights
-from .channel import Channel
-from .consensus import (
-    AdmmRun,
-    Disconnected,
-    admm,
-    average,
-    finite_time,
-    fused_kind,
-    fuses,
-    maximum,
-    push_sum,
-)
-from .dynamic import (
-    PIState,
-    event_triggered,
-    flood,
-    gossip,
-    pi_start,
-    pi_step,
-    stable_substeps,
-)
+from .channel import Channel, fused_kind, fuses
+from .consensus import AdmmRun, Disconnected, admm, average, finite_time, maximum, push_sum
+from .dynamic import PIState, event_triggered, flood, gossip, pi_start, pi_step, stable_substeps
 from .faults import Faults
 from .fusion import (
     arithmetic_average,

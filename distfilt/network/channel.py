@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from .graphs import Graph, as_graph
 from .ledger import Ledger
 from .weights import Weights, _matching, stacked
 
-__all__ = ["Channel", "Lost", "PerAgent"]
+__all__ = ["Channel", "Lost", "PerAgent", "fused_kind", "fuses"]
 
 _PERFECT = Faults()
 _Own = Annotated[Array, "*self.runs self.graph.size k"]
@@ -28,13 +28,16 @@ PerAgent = Annotated[Array, "*channel.runs channel.graph.size k"]
 Lost = Literal["mutual", "metropolis", "keep", "renormalise", "zero"]
 """What :meth:`Channel.combine` can do about a lost message; the last three are biased."""
 
+Fused = Literal["vectors", "ensembles", "gaussians", "mixtures", "densities", "particles"]
+F = TypeVar("F", bound=Callable[..., Any])
+
 
 class Channel:
     """Deliver payloads along a graph's links, lose or delay some, and charge for all of them.
 
     Everything that an agent learns from another passes through :meth:`exchange` (any payload),
-    :meth:`combine` (weighted sums of stacked vectors, one sparse product), :meth:`broadcast` (one
-    vector of each agent) or :meth:`carry` (a vector of its own on each link).
+    :meth:`combine` (weighted sums of stacked vectors, one sparse product) or :meth:`carry` (a
+    vector of its own on each link).
 
     Parameters
     ----------
@@ -47,9 +50,9 @@ class Channel:
         Leading axes of every payload that are independent runs of the same network. They are
         charged once, and lose different messages.
     faults : Faults, optional
-        How the channel fails; not at all by default.
+        How the channel fails; not at all by default. A delay is for :meth:`combine` alone.
     t : float, optional
-        The time, in s; needed for faults whose windows are in seconds.
+        The time, in s, which the windows of faults count then; rounds without it.
 
     Examples
     --------
@@ -73,10 +76,10 @@ class Channel:
         self.t = t
         self._ledger = Ledger.empty(self.graph.size) if ledger is None else ledger
         self._owed: dict[int, int] = {}
-        self._late: dict[Any, deque[Any]] = {}
+        self._late: dict[tuple[int, ...], deque[Any]] = {}
         self._perfect = self.faults.none
         if not self._perfect:
-            self.faults.check(self.graph, t)
+            self.faults.check(self.graph)
 
     @classmethod
     def unchecked(cls, *args: Any, **options: Any) -> Channel:
@@ -122,16 +125,9 @@ class Channel:
             floats there.
         """
         graph = self.graph
-        late = self.faults.late > 0
-        sent, scalars, bytes_ = accounts.taken(payloads, graph.size, self.runs, copy=late)
+        sent, scalars, bytes_ = accounts.taken(payloads, graph.size, self.runs)
         speaks = np.array([p is not None for p in sent])[graph.senders]
         arrived = self._transmit(speaks, scalars, bytes_)
-        if self._perfect:
-            return _by_receiver(graph, sent, np.flatnonzero(speaks))
-        now = self._delayed("exchange", (sent, arrived))
-        if now is None:
-            return [{} for _ in range(graph.size)]
-        sent, arrived = now
         some = np.flatnonzero(arrived.any(axis=0))
         inbox = _by_receiver(graph, sent, some)
         for k in some[~arrived[:, some].all(axis=0)].tolist():
@@ -169,14 +165,8 @@ class Channel:
         if self._perfect:
             return self._combine_all(values, w, rounds)
         for _ in range(rounds):
-            values = self._combine_what_arrives(values, w, lost)[0]
+            values = self._combine_with_own(values, w, lost)[0]
         return values
-
-    def _combine_with_own(self, values: Array, weights: Weights, lost: Lost) -> tuple[Array, Array]:
-        """As :meth:`combine`, with the weight that each agent's own value got, (*runs, A)."""
-        if self._perfect:
-            return self._combine_all(values, weights, 1), weights.own
-        return self._combine_what_arrives(values, weights, lost)
 
     def _combine_all(self, v: Array, w: Weights, rounds: int) -> Array:
         """Rounds without faults, agents in front throughout."""
@@ -186,37 +176,6 @@ class Channel:
         for _ in range(rounds):
             flat = w.matrix @ flat
         return np.ascontiguousarray(np.moveaxis(flat.reshape(front.shape), 0, -2))
-
-    @door
-    def broadcast(self, values: _Own) -> tuple[Array, Mask]:
-        """Let every agent send one vector to all that hear it.
-
-        Parameters
-        ----------
-        values : array_like, (*runs, A, k)
-            One vector per agent.
-
-        Returns
-        -------
-        values : ndarray, (*runs, A, k)
-            By sender, what arrives in this round; read-only. Another array than what was sent only
-            where messages are late.
-        arrived : ndarray of bool, (*runs, E)
-            On which links it does, in the order of ``graph.receivers`` and ``graph.senders``. What
-            did not arrive at an agent it must not use.
-
-        Examples
-        --------
-        >>> from distfilt.network import graphs
-        >>> heard, arrived = Channel(graphs.path(2)).broadcast([[1.0], [3.0]])
-        >>> heard.ravel(), arrived
-        (array([1., 3.]), array([ True,  True]))
-        """
-        sizes = np.full(self.graph.size, values.shape[-1])
-        heard, arrived = self._sent("broadcast", values, sizes)
-        heard = heard.view()
-        heard.flags.writeable = False
-        return heard, arrived.reshape(*self.runs, self.graph.senders.size)
 
     @door
     def carry(
@@ -241,51 +200,53 @@ class Channel:
             The same, with NaN where nothing arrives.
         """
         edges = self.graph.senders.size
-        speaks = np.ones(edges, dtype=bool) if links is None else links
-        sizes = np.full(self.graph.size, values.shape[-1])
-        sent, arrived = self._sent("carry", values, sizes, speaks=speaks, acknowledged=acknowledged)
-        return np.where(arrived.reshape(*self.runs, edges)[..., None], sent, np.nan)
+        arrived = self._sent(values.shape[-1], links, acknowledged=acknowledged)
+        return np.where(arrived.reshape(*self.runs, edges)[..., None], values, np.nan)
 
-    def _combine_what_arrives(self, v: Array, w: Weights, lost: Lost) -> tuple[Array, Array]:
+    def _combine_with_own(self, v: Array, w: Weights, lost: Lost) -> tuple[Array, Array]:
+        """As :meth:`combine`, with the weight that each agent's own value got, (*runs, A)."""
+        if self._perfect:
+            return self._combine_all(v, w, 1), w.own
         k, size = v.shape[-1], self.graph.size
         both = lost in ("mutual", "metropolis")
         if both and self.graph.directed:
             raise ValueError(f"lost: {lost!r} needs links both ways, got one-way links")
         # Metropolis weights need the degree of what is left, one number more.
-        sizes = np.full(size, k + (lost == "metropolis"))
-        heard, arrived = self._sent("combine", v, sizes, acknowledged=both)
+        arrived = self._sent(k + (lost == "metropolis"), acknowledged=both, late=True)
+        flat, delay = v.reshape(-1, k), self.faults.late
+        heard, arrived = self._delayed(flat, arrived) if delay else (flat, arrived)
         own, links = _after_loss(self.graph, w, arrived, lost)
-        runs = own.shape[0]
-        delayed = self.faults.late > 0
-        matrix = stacked(self.graph, own, links, heard_at=runs * size if delayed else 0)
-        flat = v.reshape(-1, k)
-        out = matrix @ (np.concatenate([flat, heard.reshape(-1, k)]) if delayed else flat)
+        matrix = stacked(self.graph, own, links, heard_at=len(flat) if delay else 0)
+        out = matrix @ (np.concatenate([flat, heard]) if delay else flat)
         return out.reshape(v.shape), own.reshape(*self.runs, size)
 
-    def _sent(
-        self, kind: str, v: Array, sizes: Any, *, speaks: Mask | None = None,
-        acknowledged: bool = False,
-    ) -> tuple[Array, Mask]:
-        """Send vectors: those that arrive in this round, and on which links, (R, E)."""
-        used = np.ones(self.graph.senders.size, dtype=bool) if speaks is None else speaks
-        arrived = self._transmit(used, sizes, 8 * sizes, acknowledged=acknowledged)
-        if not self.faults.late:
-            return v, arrived
-        late = self._delayed((kind, v.shape), (v.copy(), arrived))
-        return (np.zeros_like(v), np.zeros_like(arrived)) if late is None else late
+    def _sent(self, numbers: int, links: Mask | None = None, **options: bool) -> Mask:
+        """Send so many numbers over some links, all by default; which messages arrive, (R, E)."""
+        used = np.ones(self.graph.senders.size, dtype=bool) if links is None else links
+        return self._transmit(used, numbers, 8 * numbers, **options)
+
+    def _delayed(self, values: Array, arrived: Mask) -> tuple[Array, Mask]:
+        """The values of some rounds ago, and on which links those arrive now."""
+        queue = self._late.setdefault(values.shape, deque())
+        queue.append((values.copy(), arrived))
+        if len(queue) > self.faults.late:
+            return queue.popleft()  # type: ignore[no-any-return]
+        return np.zeros_like(values), np.zeros_like(arrived)
 
     def _transmit(
-        self, speaks: Mask, sizes: Any, bytes_: Any, *, acknowledged: bool = False
+        self, speaks: Mask, sizes: Any, bytes_: Any, *, acknowledged: bool = False,
+        late: bool = False,
     ) -> Mask:
-        """Charge one round in which the links in `speaks` are used; which messages arrive."""
+        """Charge one round in which the links in `speaks` are used; which arrive, (R, E)."""
+        if self.faults.late and not late:
+            raise ValueError(f"channel: needs no delay here, got {self.faults.late} rounds")
         now = self.ledger
         size, runs = self.graph.size, int(np.prod(self.runs, dtype=np.int64))
         if self._perfect:
             arrived, lost = np.broadcast_to(speaks, (runs, speaks.size)), np.zeros(size)
         else:
-            speaking, losing = unchecked(self.faults.speaking), unchecked(self.faults.lost)
-            speaks = speaks & speaking(self.graph, now.rounds, self.t)
-            arrived = speaks & ~losing(self.graph, now.rounds, runs, self.t)
+            speaks = speaks & self.faults.speaking(self.graph, now.rounds, self.t)
+            arrived = speaks & ~self.faults.lost(self.graph, now.rounds, runs, self.t)
             missing = (speaks & ~arrived).sum(axis=0) / runs
             lost = np.bincount(self.graph.senders, weights=missing, minlength=size).astype(float)
         messages = np.bincount(self.graph.senders[speaks], minlength=size)
@@ -295,14 +256,6 @@ class Channel:
             after = self._charged(after, back, 0, 1, rounds=0)
         self._ledger = after
         return np.asarray(arrived)
-
-    def _delayed(self, key: Any, now: Any) -> Any:
-        """What arrives in this round of what was sent before under the same key; None at first."""
-        if not self.faults.late:
-            return now
-        queue = self._late.setdefault(key, deque())
-        queue.append(now)
-        return queue.popleft() if len(queue) > self.faults.late else None
 
 
 def _by_receiver(graph: Graph, sent: Sequence[Any], links: Any) -> list[dict[int, Any]]:
@@ -333,3 +286,40 @@ def _after_loss(graph: Graph, w: Weights, arrived: Mask, lost: str) -> tuple[Arr
             raise ValueError("lost: 'renormalise' needs weights left, got a row that sums to 0")
         own, links = own / total, links / total[:, ends]
     return np.asarray(own), links
+
+
+def fuses(kind: Fused) -> Callable[[F], F]:
+    """Say what a rule of agreement fuses, so that a filter can tell if the rule is for it.
+
+    Parameters
+    ----------
+    kind : {"vectors", "ensembles", "gaussians", "mixtures", "densities", "particles"}
+        What ``rule(belief, channel, *, …)`` takes and returns.
+
+    Examples
+    --------
+    >>> @fuses("vectors")
+    ... def stubborn(belief, channel):
+    ...     return belief
+    >>> stubborn.fuses
+    'vectors'
+    """
+
+    def named(rule: F) -> F:
+        for function in (rule, unchecked(rule)):
+            function.fuses = kind  # type: ignore[attr-defined]
+        return rule
+
+    return named
+
+
+def fused_kind(rule: Callable[..., Any]) -> str | None:
+    """What a rule says that it fuses, also with options given by a partial; None if nothing.
+
+    >>> from distfilt.network import average
+    >>> fused_kind(partial(average, rounds=3)), fused_kind(print)
+    ('vectors', None)
+    """
+    while isinstance(rule, partial):
+        rule = rule.func
+    return getattr(rule, "fuses", None)

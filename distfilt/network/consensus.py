@@ -5,65 +5,18 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated
 
 import numpy as np
 
 from ..doors import Array, Count, Positive, Record, array, door, unchecked
 from ..linalg import SolverError
-from ._links import diameter_bound
-from .channel import Channel, Lost, PerAgent
-from .weights import Weights, _keeping, _laplacian, _matching, _warn_if_unstable, metropolis
+from .channel import Channel, Lost, PerAgent, fuses
+from .weights import Weights, _keeping, _laplacian, _warn_if_unstable, metropolis
 
 __all__ = [  # fmt: skip
-    "AdmmRun", "Disconnected", "admm", "average", "finite_time", "fused_kind",
-    "fuses", "maximum", "push_sum",
+    "AdmmRun", "Disconnected", "admm", "average", "finite_time", "maximum", "push_sum",
 ]
-
-F = TypeVar("F", bound=Callable[..., Any])
-
-Fused = Literal["vectors", "ensembles", "gaussians", "mixtures", "densities", "particles"]
-
-_SMALL = 1000
-"""Up to this many agents :func:`maximum` looks for the diameter itself."""
-
-
-def fuses(kind: Fused) -> Callable[[F], F]:
-    """Say what a rule of agreement fuses, so that a filter can tell if the rule is for it.
-
-    Parameters
-    ----------
-    kind : {"vectors", "ensembles", "gaussians", "mixtures", "densities", "particles"}
-        What ``rule(belief, channel, *, …)`` takes and returns.
-
-    Examples
-    --------
-    >>> @fuses("vectors")
-    ... def stubborn(belief, channel):
-    ...     return belief
-    >>> stubborn.fuses
-    'vectors'
-    """
-
-    def named(rule: F) -> F:
-        for function in (rule, unchecked(rule)):
-            function.fuses = kind  # type: ignore[attr-defined]
-        return rule
-
-    return named
-
-
-def fused_kind(rule: Callable[..., Any]) -> str | None:
-    """What a rule says that it fuses, also with options given by a partial; None if nothing.
-
-    >>> fused_kind(partial(average, rounds=3)), fused_kind(print)
-    ('vectors', None)
-    """
-    while isinstance(rule, partial):
-        rule = rule.func
-    return getattr(rule, "fuses", None)
-
 
 class Disconnected(RuntimeWarning):
     """A graph in several parts, each of which agrees on an average of its own.
@@ -76,6 +29,11 @@ class Disconnected(RuntimeWarning):
 def _alone(channel: Channel) -> None:
     if channel.runs:
         raise ValueError(f"channel: needs a single run, got runs {channel.runs}")
+
+
+def _faultless(channel: Channel) -> None:
+    if not channel.faults.none:
+        raise ValueError("channel: needs no faults here, got a faulty channel")
 
 
 @fuses("vectors")
@@ -123,7 +81,7 @@ def average(
         weights = _laplacian(graph, gain)
     elif weights is None:
         weights = metropolis(graph)
-    _matching(graph, _keeping(weights))
+    _keeping(weights)
     if rounds > 1 and not graph.connected:
         parts = graph.components.max() + 1
         text = f"channel: the graph has {parts} parts, and each agrees on an average of its own"
@@ -162,8 +120,7 @@ def finite_time(values: PerAgent, channel: Channel) -> Array:
     2
     """
     channel.graph._joined()
-    if not channel.faults.none:
-        raise ValueError("channel: needs no faults for a finite-time rule, got a faulty channel")
+    _faultless(channel)
     combine, out = unchecked(channel.combine), values.copy()
     for eigenvalue in _leja(_distinct(channel.graph.spectrum[1:])):
         out = combine(out, _laplacian(channel.graph, 1 / eigenvalue))
@@ -176,19 +133,16 @@ def _distinct(values: Array) -> Array:
 
 
 def _leja(points: Array) -> list[float]:
-    """The points in an order in which partial products of their factors stay small.
+    """Ascending points in an order in which partial products of their factors stay small.
 
     Each next one is farthest, in the geometric mean, from all before it.
     """
-    score, order = np.abs(points), []
-    for k in range(points.size):
-        at = int(score.argmax())
-        order.append(at)
+    score, order = np.zeros(points.size), [float(p) for p in points[-1:]]
+    while len(order) < points.size:
         with np.errstate(divide="ignore"):
-            away = np.log(np.abs(points - points[at]))
-        score = away if k == 0 else score + away
-        score[order] = -np.inf
-    return [float(p) for p in points[order]]
+            score += np.log(np.abs(points - order[-1]))
+        order.append(float(points[score.argmax()]))
+    return order
 
 
 @fuses("vectors")
@@ -249,8 +203,7 @@ def maximum(values: PerAgent, channel: Channel, *, rounds: Count | None = None) 
     values, channel
         As for :func:`average`. Connected; a lost message only costs time.
     rounds : int, optional
-        By default the graph's diameter; with more than 1 000 agents, where that would take long to
-        find, a bound that is at most twice as much.
+        By default the graph's diameter.
 
     Examples
     --------
@@ -262,9 +215,7 @@ def maximum(values: PerAgent, channel: Channel, *, rounds: Count | None = None) 
     graph, carry, out = channel.graph, unchecked(channel.carry), values.copy()
     if graph.size == 1:
         return out
-    if rounds is None:
-        rounds = graph.diameter if graph.size <= _SMALL else diameter_bound(graph.links)
-    for _ in range(rounds):
+    for _ in range(rounds or graph.diameter):
         arrived = carry(out[..., graph.senders, :])
         out = np.fmax(out, np.fmax.reduceat(arrived, graph.links.indptr[:-1], axis=-2))
     return out
@@ -278,10 +229,6 @@ class AdmmRun(Record):
     ----------
     common : ndarray, (A, k)
         Each agent's copy of the common variable Z.
-    local : ndarray, (A, k)
-        Each agent's own variable.
-    multipliers : ndarray, (A, k)
-        Scaled multipliers; they sum to zero.
     iterations : int
         How many.
     primal, dual : float
@@ -290,13 +237,11 @@ class AdmmRun(Record):
 
     Examples
     --------
-    >>> AdmmRun(np.zeros((2, 1)), np.zeros((2, 1)), np.zeros((2, 1)), 3, 1e-9, 1e-9).iterations
+    >>> AdmmRun(np.zeros((2, 1)), 3, 1e-9, 1e-9).iterations
     3
     """
 
     common: Array
-    local: Array
-    multipliers: Array
     iterations: int
     primal: float
     dual: float
@@ -306,7 +251,7 @@ class AdmmRun(Record):
 def admm(
     local_solve: Callable[[Array, float], Array],
     start: Annotated[Array, "channel.graph.size k"], channel: Channel, *, rho: Positive = 1.0,
-    tolerance: Positive = 1e-6, iterations: Count = 1000, check: Count | None = 1,
+    tolerance: Positive = 1e-6, iterations: Count = 1000,
     agree: Callable[[Array, Channel], Array] = finite_time,
 ) -> AdmmRun:  # fmt: skip
     r"""Minimise :math:`\sum_l f_l(\mathbf Z)` when agent l knows only its own :math:`f_l`.
@@ -325,18 +270,15 @@ def admm(
     start : array_like, (A, k)
         Each agent's first Z.
     channel : Channel
-        The door between agents; a single run, connected.
+        The door between agents; a single run, connected, without faults. After every iteration the
+        agents agree on their largest residuals, so that all stop at once: :func:`maximum` of 2
+        scalars, as many rounds as the diameter, charged like everything else.
     rho : float
         Penalty, positive.
     tolerance : float
         Stop when both residuals, of every agent, are below it.
     iterations : int
         At most this many.
-    check : int or None
-        After every so many iterations the agents agree on their largest residuals, so that all stop
-        at once: :func:`maximum` of 2 scalars, as many rounds as the
-        diameter, charged like everything else. It needs a channel that loses nothing. None: no
-        agent looks, and all iterations are made.
     agree : callable
         ``agree(values, channel) -> values``: how the average is found. With a rule that is only
         approximate the agents' copies of Z differ.
@@ -344,8 +286,7 @@ def admm(
     Raises
     ------
     SolverError
-        If the residuals are not below `tolerance` after `iterations` although `check` is given; the
-        message has them.
+        If the residuals are not below `tolerance` after `iterations`; the message has them.
 
     Notes
     -----
@@ -364,10 +305,7 @@ def admm(
     array([3., 3., 3.])
     """
     _alone(channel)
-    if check is not None and not channel.faults.none:  # agents would stop apart
-        raise ValueError(
-            "check: needs a channel without faults, or None to make all iterations, got faults"
-        )
+    _faultless(channel)  # or agents would stop apart
     z, w = start, np.zeros_like(start)
     for n in range(1, iterations + 1):
         u = array(local_solve(z - w, rho), "local_solve", z.shape)
@@ -375,13 +313,10 @@ def admm(
         w = w + u - new
         gaps = np.stack([np.abs(u - new).max(axis=1), np.abs(new - z).max(axis=1)], axis=1)
         residuals, z = gaps * [1.0, rho], new
-        if check is not None and (n % check == 0 or n == iterations):
-            # After the maximum all agents hold the same two numbers; any row will do.
-            primal, dual = (float(r) for r in unchecked(maximum)(residuals, channel)[0])
-            if primal < tolerance and dual < tolerance:
-                return AdmmRun.unchecked(z, u, w, n, primal, dual)
-    if check is None:
-        return AdmmRun.unchecked(z, u, w, iterations, *residuals.max(axis=0).tolist())
+        # After the maximum all agents hold the same two numbers; any row will do.
+        primal, dual = unchecked(maximum)(residuals, channel)[0].tolist()
+        if primal < tolerance and dual < tolerance:
+            return AdmmRun.unchecked(z, n, primal, dual)
     raise SolverError(
         f"admm: residuals {primal:.3g} and {dual:.3g} after {iterations} iterations, "
         f"needs both below {tolerance:g}"

@@ -8,13 +8,12 @@ from typing import Annotated
 import numpy as np
 
 from ..doors import Array, Bounds, Count, Mask, NonNegative, Positive, Record, Rng, door, unchecked
-from .channel import Channel, Lost, PerAgent
-from .consensus import _alone, fuses
-from .weights import Weights, _keeping, _laplacian, _matching, metropolis
+from .channel import Channel, PerAgent, fuses
+from .consensus import _alone
+from .weights import _laplacian, metropolis
 
 __all__ = [  # fmt: skip
-    "PIState", "event_triggered", "first_order", "flood", "gossip", "pi_start", "pi_step",
-    "stable_substeps",
+    "PIState", "event_triggered", "flood", "gossip", "pi_start", "pi_step", "stable_substeps",
 ]
 
 _Gain = Annotated[float, Bounds(at_least=0, at_most=1e100)]
@@ -154,41 +153,6 @@ def pi_step(
     return PIState.unchecked(nu, eta)
 
 
-@door
-def first_order(
-    estimates: PerAgent, inputs: PerAgent, previous: PerAgent, channel: Channel, *,
-    weights: Weights | None = None, lost: Lost = "mutual",
-) -> Array:
-    r"""One round of first-order dynamic average consensus.
-
-    .. math:: \mathbf x \leftarrow \mathbf W\mathbf x + \mathbf u_{k+1} - \mathbf u_k
-
-    The average of the estimates equals the average of the inputs in every round if it did at the
-    start, as it does for estimates that start at the inputs.
-
-    Parameters
-    ----------
-    estimates, inputs, previous : array_like, (*runs, A, k)
-        One per agent: what they believe, measure now, and measured a round ago.
-    channel, weights, lost
-        As for :func:`distfilt.network.average`.
-
-    Notes
-    -----
-    M. Zhu and S. Martinez, Automatica 46 (2010) 322-329.
-
-    Examples
-    --------
-    >>> from distfilt.network import Channel, graphs
-    >>> channel = Channel(graphs.path(2))
-    >>> first_order([[0.0], [2.0]], [[1.0], [3.0]], [[0.0], [2.0]], channel).ravel()
-    array([2., 2.])
-    """
-    graph = channel.graph
-    w = metropolis(graph) if weights is None else _matching(graph, _keeping(weights))
-    return unchecked(channel.combine)(estimates, w, lost=lost) + (inputs - previous)
-
-
 @fuses("vectors")
 @door
 def gossip(values: PerAgent, channel: Channel, *, rounds: Count, rng: Rng) -> Array:
@@ -228,7 +192,6 @@ def gossip(values: PerAgent, channel: Channel, *, rounds: Count, rng: Rng) -> Ar
     np.int64(400)
     """
     channel.graph._undirected()
-    _prompt(channel)
     graph, carry, out = channel.graph, unchecked(channel.carry), values.copy()
     awake = rng.integers(graph.size, size=rounds)
     chosen = (rng.random(rounds) * graph.degrees[awake]).astype(np.int64)
@@ -297,7 +260,6 @@ def event_triggered(
     """
     _alone(channel)
     channel.graph._undirected()
-    _prompt(channel)
     graph, carry, x = channel.graph, unchecked(channel.carry), values
     w = metropolis(graph)
     faulty = not channel.faults.none
@@ -344,26 +306,17 @@ def flood(values: PerAgent, channel: Channel, *, rounds: Count | None = None) ->
     array([ 6, 12,  6])
     """
     _alone(channel)
-    _prompt(channel)
     size = channel.graph.size
+    table = np.concatenate([np.arange(size)[:, None], values], axis=1)
+    known = news = np.eye(size, dtype=bool)
     most = rounds or 2 * size
-    owners = np.arange(size, dtype=np.float64)[:, None]
-    table = np.concatenate([owners, values], axis=1)
-    known = [{a: table[a]} for a in range(size)]
-    news = [list(k.values()) for k in known]
-    while any(news) and most:
+    while news.any() and most:
         most -= 1
-        inbox = channel.exchange([np.array(n) if n else None for n in news])
-        news = []
-        for mine, box in zip(known, inbox, strict=True):
-            fresh = {int(row[0]): row for sent in box.values() for row in sent}
-            new = {owner: row for owner, row in fresh.items() if owner not in mine}
-            mine.update(new)
-            news.append([new[owner] for owner in sorted(new)])
-    average = np.array([np.mean([k[a][1:] for a in sorted(k)], axis=0) for k in known])
-    return average, np.array([[a in k for a in range(size)] for k in known])
-
-
-def _prompt(channel: Channel) -> None:
-    if channel.faults.late:
-        raise ValueError(f"channel: needs no delay, got {channel.faults.late} rounds")
+        inbox = channel.exchange([table[new] if new.any() else None for new in news])
+        told = np.zeros_like(known)
+        for mine, box in zip(told, inbox, strict=True):
+            for rows in box.values():
+                mine[rows[:, 0].astype(int)] = True
+        news = told & ~known
+        known = known | news
+    return np.array([values[whose].mean(axis=0) for whose in known]), known

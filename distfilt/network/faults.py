@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..doors import Array, Bounds, Index, Mask, Record, Share, array, door
+from ..doors import Array, Bounds, Index, Mask, Record, Share, array
 from .graphs import Graph
 
 __all__ = ["Faults"]
@@ -39,15 +39,14 @@ class Faults(Record):
         Mean number of rounds for which a link that fails keeps failing. Losses are independent by
         default, which is the shortest burst there is, 1 / (1 - loss) rounds.
     delay : int
-        Rounds that a message takes on top of its own, in a channel that lives as long.
+        Rounds that a message takes on top of its own, in a channel that lives as long; for
+        averages (:meth:`Channel.combine`) alone.
     silent : collection of int
         Agents whose radio is off: they neither send nor hear.
     during : sequence of (start, stop), optional
-        When losses happen and agents are silent: from `start` to before `stop`. Always by default;
-        `stop` may be infinite.
-    clock : {"rounds", "time"}
-        What `during` counts: the rounds of the channel's ledger, or the time `t` of the channel, in
-        s.
+        When losses happen and agents are silent: from `start` to before `stop`, in s where the
+        channel has a time `t`, as in filters, and in rounds of its ledger otherwise. Always by
+        default; `stop` may be infinite.
     also : tuple of Faults
         What fails besides; ``|`` fills it.
 
@@ -64,9 +63,9 @@ class Faults(Record):
     >>> Faults(loss=0.2, seed=7).lost(Graph.from_adjacency([[0, 1], [1, 0]]), 0, 5).shape
     (5, 2)
 
-    Agent 3 is off from 10 s to 20 s, and all links fail for 8 rounds at a time:
+    Agent 3 is off for a while, and all links fail for 8 rounds at a time:
 
-    >>> faults = Faults(loss=0.1, burst=8.0) | Faults(silent=[3], during=[(10, 20)], clock="time")
+    >>> faults = Faults(loss=0.1, burst=8.0) | Faults(silent=[3], during=[(10, 20)])
     >>> faults.none
     False
     """
@@ -77,13 +76,17 @@ class Faults(Record):
     delay: Index = 0
     silent: Collection[Index] = ()
     during: Sequence[tuple[Any, Any]] | None = None
-    clock: Literal["rounds", "time"] = "rounds"
     also: tuple[Faults, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.burst is not None:
-            _check_burst(self.burst, np.asarray(self.loss))
+        loss = np.asarray(self.loss)
+        shortest = 1 / (1 - loss[loss < 1].max(initial=0.0))
+        if self.burst is not None and self.burst < shortest * (1 - 1e-9):
+            raise ValueError(
+                f"burst: needs at least 1 / (1 - loss) = {shortest:g} rounds, which independent "
+                f"losses last, got {self.burst:g}"
+            )
         if self.during is not None:
             object.__setattr__(self, "during", _windows(self.during))
 
@@ -100,10 +103,8 @@ class Faults(Record):
     def _all(self) -> tuple[Faults, ...]:
         return (replace(self, also=()), *self.also) if self.also else (self,)
 
-    def check(self, graph: Graph, t: float | None) -> None:
-        """Refuse a graph whose agents do not fit, and a channel that needs to know its time."""
-        if t is None and any(f.during is not None and f.clock == "time" for f in self._all()):
-            raise ValueError("t: needs the time for faults with windows in seconds, got None")
+    def check(self, graph: Graph) -> None:
+        """Refuse a graph whose agents do not fit."""
         agents = graph.size
         for faults in self._all():
             got = np.shape(faults.loss)
@@ -123,8 +124,7 @@ class Faults(Record):
         """Rounds that a message takes on top of its own, all delays together."""
         return sum(f.delay for f in self._all())
 
-    @door
-    def speaking(self, graph: Graph, round_: Index = 0, t: float | None = None) -> Mask:
+    def speaking(self, graph: Graph, round_: int = 0, t: float | None = None) -> Mask:
         """Links whose both ends have their radio on in a round, (E,)."""
         off = np.zeros(graph.size, dtype=bool)
         for faults in self._all():
@@ -132,8 +132,7 @@ class Faults(Record):
                 off[list(faults.silent)] = True
         return ~(off[graph.receivers] | off[graph.senders])
 
-    @door
-    def lost(self, graph: Graph, round_: Index, runs: Index, t: float | None = None) -> Mask:
+    def lost(self, graph: Graph, round_: int, runs: int, t: float | None = None) -> Mask:
         """Which links lose the message of round `round_` in each of `runs` runs, (runs, E)."""
         out = np.zeros((runs, graph.senders.size), dtype=bool)
         for faults in self._all():
@@ -142,13 +141,8 @@ class Faults(Record):
         return out
 
     def _active(self, round_: int, t: float | None) -> bool:
-        if self.during is None:
-            return True
-        if self.clock == "time" and t is None:
-            raise ValueError("t: needs the channel's time for windows in seconds, got None")
-        now: Any = round_ if self.clock == "rounds" else t
-        windows: Any = self.during
-        return any(start <= now < stop for start, stop in windows)
+        now = round_ if t is None else t
+        return self.during is None or any(start <= now < stop for start, stop in self.during)
 
     def _losses(self, graph: Graph, round_: int, runs: int) -> Mask:
         i, j = graph.receivers, graph.senders
@@ -176,16 +170,6 @@ class Faults(Record):
     def _runs(self, round_: int, runs: int) -> Hashes:
         key = _mixed((self.seed + _GOLDEN * (round_ + 1)) % 2**64)
         return _mixed(key ^ (np.arange(runs, dtype=np.uint64) * np.uint64(_GOLDEN)))
-
-
-def _check_burst(burst: float, loss: Array) -> None:
-    rates = loss[(loss > 0) & (loss < 1)]
-    shortest = 1 / (1 - rates.max(initial=0.0))
-    if burst < shortest * (1 - 1e-9):
-        raise ValueError(
-            f"burst: needs at least 1 / (1 - loss) = {shortest:g} rounds, which independent losses "
-            f"last, got {burst:g}"
-        )
 
 
 def _windows(during: Any) -> tuple[tuple[float, float], ...]:

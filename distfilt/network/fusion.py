@@ -5,20 +5,18 @@ A filter takes one as its ``agreement=``, with :func:`functools.partial` for the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
 
-from ..doors import Array, Bounds, Count, Mask, NonNegative, definite, door, unchecked
+from ..doors import Array, Bounds, Count, Mask, NonNegative, Positive, definite, door, unchecked
 from ..ensembles import mean, sample_covariance
 from ..gaussians import intersection_weights
 from ..gaussians.single import recolour
 from ..linalg import cholesky, solve_lower, symmetrise
-from ._links import Indices
-from .channel import Channel
-from .consensus import fuses
+from .channel import Channel, fuses
 from .graphs import Graph
 from .weights import _laplacian, _warn_if_unstable
 
@@ -130,7 +128,7 @@ def arithmetic_average(belief: Gaussians, channel: Channel, *, rounds: Count = 1
         spread = links[..., None, None] * left[..., :, None] * left[..., None, :]
         spread = heard.graph._summed(spread, 1)
         spread += own[..., None, None] * moved[..., :, None] * moved[..., None, :]
-        covs = heard.mixed(own, links, heard.covs, heard.sent_covs)
+        covs = heard.mixed(own, links, heard.covs)
         return heard.means + moved, symmetrise(covs + spread)
 
     return _in_rounds(belief, channel, rounds, step)
@@ -139,15 +137,12 @@ def arithmetic_average(belief: Gaussians, channel: Channel, *, rounds: Count = 1
 @fuses("gaussians")
 @door
 def consensus_pull(
-    belief: Gaussians, channel: Channel, *, gain: NonNegative,
-    rule: Literal["scalar", "covariance"] = "scalar", rounds: Count = 1,
+    belief: Gaussians, channel: Channel, *, gain: Positive, rounds: Count = 1
 ) -> Pair:
     r"""Pull each mean towards the neighbours': the consensus Kalman filter's step.
 
     .. math:: \mathbf m_i\leftarrow\mathbf m_i
-        +\boldsymbol\Gamma_i\sum_j(\mathbf m_j-\mathbf m_i),\qquad
-        \boldsymbol\Gamma_i=\gamma\mathbf I\ \text{ or }\
-        \gamma\frac{\mathbf P_i}{1+\|\mathbf P_i\|_F}
+        +\gamma\sum_j(\mathbf m_j-\mathbf m_i)
 
     The covariances stay as they are: the pull is not in them, which is cheap, and wrong as soon as
     neighbours' errors are correlated.
@@ -159,9 +154,7 @@ def consensus_pull(
     channel : Channel
         Only means go over each link, d scalars. A mean that is lost does not pull.
     gain : float
-        The gain γ, at least 0; 0 sends nothing and changes nothing.
-    rule : {"scalar", "covariance"}
-        The same gain for all components, or more where an agent is less sure.
+        The gain γ, positive.
     rounds : int
         How many times.
 
@@ -172,7 +165,8 @@ def consensus_pull(
 
     Notes
     -----
-    R. Olfati-Saber, IEEE Conference on Decision and Control (2007) 5492-5498, algorithm 3.
+    R. Olfati-Saber, IEEE Conference on Decision and Control (2007) 5492-5498, algorithm 3, where
+    the gain is a multiple of the covariance.
 
     Examples
     --------
@@ -182,20 +176,9 @@ def consensus_pull(
     array([[1.],
            [3.]])
     """
-    m, p = belief
-    if gain == 0:
-        return m.copy(), p.copy()
-    trust, largest = np.broadcast_to(np.eye(m.shape[-1]), p.shape), 1.0
-    if rule == "covariance":
-        norm = np.sqrt((p**2).sum(axis=(-2, -1), keepdims=True))
-        trust = p / (1 + norm)
-        largest = float((norm / (1 + norm)).max())
-    _warn_if_unstable(channel.graph, gain * largest)
+    _warn_if_unstable(channel.graph, gain)
     weights, combine = _laplacian(channel.graph, gain), unchecked(channel.combine)
-    for _ in range(rounds):
-        change = combine(m, weights, lost="keep") - m
-        m = m + (trust @ change[..., None])[..., 0]
-    return m, p.copy()
+    return combine(belief[0], weights, lost="keep", rounds=rounds), belief[1].copy()
 
 
 @fuses("ensembles")
@@ -279,9 +262,6 @@ def intersection(
     array([[0.5, 2.5],
            [0.5, 2.5]])
     """
-    n, d = ensembles.shape[-2:]
-    if n <= d:
-        raise ValueError(f"ensembles: needs more members than its {d} components, got {n}")
     size = 1.0 if scale is None else scale
     x = ensembles / size
     belief = unchecked(mean)(x), unchecked(sample_covariance)(x)
@@ -292,40 +272,21 @@ def intersection(
 
 @dataclass(eq=False)
 class _Heard:
-    """One round's Gaussians, runs in one axis: own ones, those by sender, and who may use them."""
+    """One round's Gaussians, runs in one axis, and the links (R, E) over which they are heard."""
 
     graph: Graph
     means: Array
     covs: Array
-    sent_means: Array
-    sent_covs: Array
     arrived: Mask
 
-    def mixed(self, own: Array, links: Array, mine: Array, sent: Array) -> Array:
+    def mixed(self, own: Array, links: Array, matrices: Array) -> Array:
         """Weighted sums of matrices (R, A, d, d), the own one and what each sender sent."""
-        heard = links[..., None, None] * sent[:, self.graph.senders]
-        return own[..., None, None] * mine + self.graph._summed(heard, 1)
+        heard = links[..., None, None] * matrices[:, self.graph.senders]
+        return own[..., None, None] * matrices + self.graph._summed(heard, 1)
 
     def gaps(self) -> Array:
         """The heard mean less the own one, on each link, (R, E, d)."""
-        senders, receivers = self.graph.senders, self.graph.receivers
-        return self.sent_means[:, senders] - self.means[:, receivers]
-
-    def groups(self) -> Iterator[tuple[Indices, Indices, Array, Mask]]:
-        """Agents that hear equally many, (n,), and their links, (n, S - 1).
-
-        With the covariances that they have, the own first, (R, n, S, d, d), and which arrived.
-        """
-        starts, degrees = self.graph.links.indptr, np.diff(self.graph.links.indptr)
-        unit = np.eye(self.means.shape[-1])
-        for degree in np.unique(degrees):
-            agents = np.flatnonzero(degrees == degree)
-            links = starts[agents, None] + np.arange(degree)
-            got, who = self.arrived[:, links], self.graph.senders[links]
-            sent = np.where(got[..., None, None], self.sent_covs[:, who], unit)
-            covs = np.concatenate([self.covs[:, agents, None], sent], axis=2)
-            own = np.ones((*got.shape[:2], 1), dtype=bool)
-            yield agents, links, covs, np.concatenate([own, got], axis=2)
+        return self.means[:, self.graph.senders] - self.means[:, self.graph.receivers]
 
 
 def _in_rounds(
@@ -333,56 +294,50 @@ def _in_rounds(
 ) -> Pair:
     """Exchange means and upper triangles and take a step, some times."""
     means, covs = belief
-    graph, d, broadcast = channel.graph, means.shape[-1], unchecked(channel.broadcast)
-    row, column = np.triu_indices(d)
+    graph, d = channel.graph, means.shape[-1]
     m, p = means.reshape(-1, graph.size, d), covs.reshape(-1, graph.size, d, d)
     for _ in range(rounds):
-        packed = np.concatenate([m, p[..., row, column]], axis=-1)
-        heard, arrived = broadcast(packed.reshape(*channel.runs, graph.size, -1))
-        sent_m, sent_p = m, p
-        # Before the first late message is there, zeros stand in its place: no covariances.
-        if channel.faults.late and heard.any():
-            heard = heard.reshape(packed.shape)
-            sent_m, sent_p = heard[..., :d], np.empty_like(p)
-            sent_p[..., row, column] = sent_p[..., column, row] = heard[..., d:]
-        m, p = step(_Heard(graph, m, p, sent_m, sent_p, arrived.reshape(len(m), -1)))
+        m, p = step(_Heard(graph, m, p, channel._sent(d + d * (d + 1) // 2)))
     return m.reshape(means.shape), p.reshape(covs.shape)
 
 
 def _by_rule(heard: _Heard, rule: Rule) -> Pair:
     """Own weights (R, A) and those of links (R, E); each agent's sum to one."""
-    own, links = np.ones(heard.means.shape[:2]), heard.arrived.astype(np.float64)
     if rule.startswith("min"):
-        for agents, at, covs, here in heard.groups():
-            omega = unchecked(intersection_weights)(covs, rule=rule, here=here)
-            own[:, agents], links[:, at] = omega[..., 0], omega[..., 1:]
-        return own, links
+        return _least(heard, rule)
+    own, unit = np.ones(heard.means.shape[:2]), np.eye(heard.means.shape[-1])
     if rule != "equal":
-        own = _size_weights(heard.covs, rule)
-        sent = own if heard.sent_covs is heard.covs else _size_weights(heard.sent_covs, rule)
-        links = sent[:, heard.graph.senders] * heard.arrived
+        # The odds against a unit covariance: no agent's number depends on another's in any digit.
+        both = np.stack([heard.covs, np.broadcast_to(unit, heard.covs.shape)], axis=-3)
+        share = unchecked(intersection_weights)(both, rule=rule)
+        own = share[..., 0] / share[..., 1]
+    links = own[:, heard.graph.senders] * heard.arrived
     total = own + heard.graph._summed(links, 1)
     return own / total, links / total[:, heard.graph.receivers]
 
 
-def _size_weights(covs: Array, rule: Rule) -> Array:
-    """Weights in closed form up to a factor: a number of each source alone, (R, A).
-
-    The odds against a unit covariance: no agent's number depends on another's in any digit.
-    """
-    unit = np.broadcast_to(np.eye(covs.shape[-1]), covs.shape)
-    both = np.stack([covs, unit], axis=-3)
-    share = unchecked(intersection_weights)(both, rule=rule)
-    return np.asarray(share[..., 0] / share[..., 1])
+def _least(heard: _Heard, rule: Rule) -> Pair:
+    """The weights of least size, for all agents at once that hear equally many."""
+    graph, unit = heard.graph, np.eye(heard.means.shape[-1])
+    own, links = np.ones(heard.means.shape[:2]), np.zeros(heard.arrived.shape)
+    for degree in np.unique(graph.degrees):
+        agents = np.flatnonzero(graph.degrees == degree)
+        at = graph.links.indptr[agents, None] + np.arange(int(degree))
+        got = heard.arrived[:, at]
+        sent = np.where(got[..., None, None], heard.covs[:, graph.senders[at]], unit)
+        covs = np.concatenate([heard.covs[:, agents, None], sent], axis=2)
+        here = np.insert(got, 0, True, axis=2)
+        omega = unchecked(intersection_weights)(covs, rule=rule, here=here)
+        own[:, agents], links[:, at] = omega[..., 0], omega[..., 1:]
+    return own, links
 
 
 def _information_sum(heard: _Heard, own: Array, links: Array) -> Pair:
     """Weighted sum of information matrices and vectors, turned back into mean and covariance."""
-    mine = _inverse(heard.covs)
-    sent = mine if heard.sent_covs is heard.covs else _inverse(heard.sent_covs)
-    total = _inverse(heard.mixed(own, links, mine, sent))
+    information = _inverse(heard.covs)
+    total = _inverse(heard.mixed(own, links, information))
     # About the own mean, so that equal means stay and large ones lose no digits.
-    turned = (sent[:, heard.graph.senders] @ heard.gaps()[..., None])[..., 0]
+    turned = (information[:, heard.graph.senders] @ heard.gaps()[..., None])[..., 0]
     pulled = heard.graph._summed(links[..., None] * turned, 1)
     moved = (total @ pulled[..., None])[..., 0]
     return heard.means + moved, symmetrise(total)

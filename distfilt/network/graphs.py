@@ -17,6 +17,9 @@ from ._links import Indices
 
 __all__ = ["Graph", "complete", "disk", "grid", "path", "ring", "star"]
 
+_DENSE = 200
+"""Up to this many agents a dense eigenvalue solver is the faster one."""
+
 
 @dataclass(frozen=True, eq=False)
 class Graph(Record):
@@ -28,7 +31,7 @@ class Graph(Record):
     Parameters
     ----------
     links : scipy.sparse.csr_array, (A, A)
-        ``links[i, j] = 1`` when agent i hears agent j; indices ascending in each row.
+        ``links[i, j] = 1`` when agent i hears agent j.
 
     Examples
     --------
@@ -43,11 +46,8 @@ class Graph(Record):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        a = self.links
-        if a.ndim != 2 or a.shape[0] != a.shape[1] or a.shape[0] == 0:
-            raise ValueError(f"links: needs a square matrix, got shape {a.shape}")
-        if not a.has_canonical_format or (a.data != 1).any() or a.diagonal().any():
-            raise ValueError("links: needs ones off the diagonal, sorted and listed once")
+        links = _links.of_matrix(self.links, "links", directed=True)
+        object.__setattr__(self, "links", links)
 
     @classmethod
     @door
@@ -102,7 +102,9 @@ class Graph(Record):
         """
         if not _links.is_networkx(graph):
             raise ValueError(f"graph: needs a networkx graph, got {type(graph).__name__}")
-        return cls.unchecked(_links.of_networkx(graph, "graph"))
+        number_of = {node: k for k, node in enumerate(graph.nodes)}
+        edges = [(number_of[edge[1]], number_of[edge[0]]) for edge in graph.edges]
+        return cls.from_edges(len(number_of), edges, directed=bool(graph.is_directed()))
 
     @property
     def size(self) -> int:
@@ -121,8 +123,9 @@ class Graph(Record):
 
     @cached_property
     def reverse(self) -> Indices:
-        """For each link the number of the one that goes the other way, (E,); -1 for none."""
-        return _links.reverse(self.links, self.receivers, self.senders)
+        """For each link, of links both ways, the number of the one that goes back, (E,)."""
+        self._undirected()
+        return np.lexsort((self.receivers, self.senders))
 
     @cached_property
     def incidence(self) -> sparse.csr_array:
@@ -177,41 +180,41 @@ class Graph(Record):
         return np.asarray(np.linalg.eigvalsh(self.laplacian.toarray()), dtype=np.float64)
 
     @cached_property
-    def fiedler_value(self) -> float:
-        """The second smallest eigenvalue of the Laplacian; 0 where the graph is not connected."""
-        self._undirected()
-        if self.size == 1 or not self.connected:
-            return 0.0
-        if self.size <= _links.DENSE:
-            return float(self.spectrum[1])
-        return _links.fiedler_value(self.laplacian, self.degrees)
-
-    @cached_property
     def largest_gain(self) -> float:
         r"""The bound below which averaging agrees, :math:`2/\lambda_{\max}` with links both ways.
 
         With one-way links the eigenvalues are complex and it is the least
         :math:`2\operatorname{Re}\lambda/|\lambda|^2`, by a dense solver. Infinite without links.
         """
+        from scipy.sparse.linalg import eigsh
+
         if self.senders.size == 0:
             return float("inf")
         if self.directed:
             values = np.linalg.eigvals(self.laplacian.toarray())
             values = values[np.abs(values) > 1e-9 * np.abs(values).max()]
             return float((2 * values.real / np.abs(values) ** 2).min(initial=np.inf))
-        if self.size <= _links.DENSE:
+        if self.size <= _DENSE:
             return float(2 / self.spectrum[-1])
-        bound = _links.degree_bound(self.links, self.degrees)
-        return 2 / _links.largest_eigenvalue(self.laplacian, bound)
+        # A fixed start makes results repeatable; a random one is orthogonal to no eigenvector.
+        start = np.random.default_rng(0).standard_normal(self.size)
+        how = {"which": "LA", "v0": start, "tol": 1e-8, "return_eigenvectors": False}
+        return float(2 / eigsh(self.laplacian, 1, **how)[0])
 
     @cached_property
     def safe_gain(self) -> float:
-        """A gain from the degrees alone, at most :attr:`largest_gain`; agents can compute it."""
+        """A gain from the degrees alone, at most :attr:`largest_gain`; agents can compute it.
+
+        With links both ways by the largest sum of an agent's degree and its neighbours' mean degree
+        (R. Merris, Linear Algebra and its Applications 285 (1998) 33-35), exact for stars and even
+        rings; else by Gershgorin's discs.
+        """
         if self.senders.size == 0:
             return float("inf")
         if self.directed:
-            return float(1 / self.degrees.max())  # Gershgorin's discs
-        return 2 / _links.degree_bound(self.links, self.degrees)
+            return float(1 / self.degrees.max())
+        near = (self.links @ self.degrees) / np.maximum(self.degrees, 1)
+        return float(2 / (self.degrees + near).max())
 
     @cached_property
     def components(self) -> Indices:
@@ -232,13 +235,15 @@ class Graph(Record):
         >>> graphs.path(4).hops(1)
         array([1, 0, 1, 2])
         """
-        return _links.hops(sparse.csr_array(self.links.T), self._below(agent))
+        forward, start = sparse.csr_array(self.links.T), self._below(agent)
+        away = sparse.csgraph.dijkstra(forward, indices=start, unweighted=True)
+        return np.where(np.isinf(away), -1, away).astype(np.int64)
 
     @cached_property
     def diameter(self) -> int:
         """The largest number of hops between two agents of a connected graph."""
         self._joined()
-        return _links.diameter(self.links, symmetric=not self.directed)
+        return max(int(self.hops(agent).max()) for agent in range(self.size))
 
     def _below(self, agent: int) -> int:
         if agent < self.size:
@@ -280,10 +285,8 @@ def as_graph(value: Any, size: int | None = None) -> Graph:
     elif sparse.issparse(value) or isinstance(value, np.ndarray | list | tuple):
         graph = Graph.unchecked(_links.of_either(value, size, "graph"))
     else:
-        raise ValueError(
-            "graph: needs a Graph (see Graph.from_networkx, Graph.from_adjacency, Graph.from_edges "
-            f"and distfilt.network.graphs), got {type(value).__name__}"
-        )
+        needs = "a Graph, a networkx graph, a matrix of zeros and ones, or edges"
+        raise ValueError(f"graph: needs {needs}, got {type(value).__name__}")
     if size is not None and graph.size != size:
         raise ValueError(f"graph: needs a graph of {size} agents, got {graph.size}")
     return graph
@@ -291,7 +294,8 @@ def as_graph(value: Any, size: int | None = None) -> Graph:
 
 def _both_ways(size: int, first: Indices, second: Indices) -> Graph:
     one_way = np.stack([first.ravel(), second.ravel()], axis=1)
-    return Graph.unchecked(_links.linked(size, np.concatenate([one_way, one_way[:, ::-1]])))
+    both = np.concatenate([one_way, one_way[:, ::-1]])
+    return Graph.unchecked(_links.linked(size, both, "graph"))
 
 
 @door
@@ -350,7 +354,9 @@ def complete(agents: Count) -> Graph:
 
 
 @door
-def disk(positions: Annotated[Array, "A p"], radius: Positive) -> Graph:
+def disk(
+    positions: Annotated[Array, "A p", Bounds(at_least=-1e150, at_most=1e150)], radius: Positive
+) -> Graph:
     """Agents hear each other within a distance: the graph of radios of one range.
 
     Parameters
@@ -373,7 +379,5 @@ def disk(positions: Annotated[Array, "A p"], radius: Positive) -> Graph:
 
     if positions.size == 0:
         raise ValueError(f"positions: needs at least one agent, got shape {positions.shape}")
-    if np.abs(positions).max() > 1e150:
-        raise ValueError(f"positions: needs finite squares, got {np.abs(positions).max():g}")
     pairs = cKDTree(positions).query_pairs(radius, output_type="ndarray").astype(np.int64)
     return _both_ways(len(positions), pairs[:, 0], pairs[:, 1])

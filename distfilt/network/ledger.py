@@ -10,14 +10,13 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..doors import Array, Count, Index, Record, door
+from ..doors import Array, Count, Index, Mask, Record, door
 
 __all__ = ["Ledger"]
 
 Counts = NDArray[np.int64]
 Part = NDArray[Any]
 Payload = Part | tuple[Part, ...]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,12 +61,11 @@ class Ledger(Record):
 
 
 def taken(
-    payloads: Any, agents: int, runs: tuple[int, ...], *, copy: bool
+    payloads: Any, agents: int, runs: tuple[int, ...]
 ) -> tuple[list[Payload | None], Counts, Counts]:
     """Each agent's payload as read-only arrays, None where it is silent, its scalars and bytes.
 
-    What is NaN in all runs is not sent, and a payload that holds nothing else is silence too. With
-    `copy` the arrays are the channel's own, for messages that arrive later.
+    What is NaN in all runs is not sent, and a payload that holds nothing else is silence too.
     """
     if not isinstance(payloads, Sequence | np.ndarray) or len(payloads) != agents:
         got = len(payloads) if hasattr(payloads, "__len__") else type(payloads).__name__
@@ -79,7 +77,7 @@ def taken(
         if payload is None:
             continue
         several = type(payload) is tuple
-        parts = [_part(p, agent, runs, copy) for p in (payload if several else (payload,))]
+        parts = [_part(p, agent, runs) for p in (payload if several else (payload,))]
         if not parts:
             raise ValueError(f"payloads[{agent}]: needs arrays, or None to stay silent, got ()")
         silent = True
@@ -93,7 +91,7 @@ def taken(
     return sent, np.array(scalars), np.array(bytes_)
 
 
-def _part(part: Any, agent: int, runs: tuple[int, ...], copy: bool) -> Part:
+def _part(part: Any, agent: int, runs: tuple[int, ...]) -> Part:
     plain = isinstance(part, np.ndarray) and not isinstance(part, np.ma.MaskedArray)
     if not plain or part.dtype.kind not in "biuf":
         got = f"dtype {part.dtype}" if plain else type(part).__name__
@@ -101,7 +99,7 @@ def _part(part: Any, agent: int, runs: tuple[int, ...], copy: bool) -> Part:
         raise ValueError(f"payloads[{agent}]: needs {needs}, got {got}")
     if part.shape[: len(runs)] != runs:
         raise ValueError(f"payloads[{agent}]: needs leading axes {runs}, got shape {part.shape}")
-    out = np.array(part) if copy else part.view(np.ndarray)
+    out: Part = part.view(np.ndarray)
     out.flags.writeable = False
     return out
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import sparse
 
 from ..doors import Array, Record, door
-from ._links import Indices, left_null_vector
+from ._links import Indices
 from .graphs import Graph
 
 __all__ = [  # fmt: skip
@@ -68,28 +68,22 @@ def stacked(graph: Graph, own: Array, links: Array, *, heard_at: int) -> sparse.
     `own` is (R, A) and `links` (R, E). With `heard_at` = 0 both multiply the same stacked values;
     otherwise what is heard stands `heard_at` rows further on.
     """
-    runs, size, edges = own.shape[0], graph.size, graph.senders.size
-    starts = graph.links.indptr + np.arange(size + 1)
-    data = np.empty((runs, size + edges))
-    indices = np.empty((runs, size + edges), dtype=np.int64)
-    at_own = starts[:-1]
-    at_link = np.arange(edges) + graph.receivers + 1
-    offset = size * np.arange(runs)[:, None]
-    data[:, at_own], data[:, at_link] = own, links
-    indices[:, at_own] = np.arange(size) + offset
-    indices[:, at_link] = graph.senders + offset + heard_at
-    pointers = np.concatenate(
-        [(starts[:-1] + (size + edges) * np.arange(runs)[:, None]).ravel(), [data.size]]
-    )
+    (runs, size), at = own.shape, graph.links.indptr[:-1]
+    run = np.arange(runs)[:, None]
+    data = np.insert(links, at, own, axis=1)
+    heard = graph.senders + size * run + heard_at
+    columns = np.insert(heard, at, np.arange(size) + size * run, axis=1)
+    ends = graph.links.indptr[1:] + np.arange(1, size + 1) + data.shape[1] * run
+    pointers = np.concatenate([[0], ends.ravel()])
     shape = (runs * size, runs * size + heard_at)
-    return sparse.csr_array((data.ravel(), indices.ravel(), pointers), shape)
+    return sparse.csr_array((data.ravel(), columns.ravel(), pointers), shape)
 
 
 def _matching(graph: Graph, weights: Weights) -> Weights:
     """The weights themselves, or a ValueError if they are those of other links."""
     ours, theirs = graph.links, weights.graph.links
     same = np.array_equal(ours.indptr, theirs.indptr)
-    if not (ours is theirs or (same and np.array_equal(ours.indices, theirs.indices))):
+    if not (same and np.array_equal(ours.indices, theirs.indices)):
         raise ValueError("weights: needs weights of the channel's graph, got those of other links")
     return weights
 
@@ -166,7 +160,7 @@ def best_constant(graph: Graph) -> Weights:
     graph._joined()
     if graph.size == 1:
         return _laplacian(graph, 0.0)
-    return _laplacian(graph, 2 / (graph.fiedler_value + 2 / graph.largest_gain))
+    return _laplacian(graph, 2 / float(graph.spectrum[1] + graph.spectrum[-1]))
 
 
 @door
@@ -205,15 +199,11 @@ def fastest(graph: Graph) -> Weights:
     at = np.flatnonzero(graph.receivers < graph.senders)
     if at.size < 2:
         return start
-    best, slowest = start.links[at], _modulus(graph, at, start.links[at])
-    x = best
+    found = [start.links[at]]
     for mu in (1e-1, 1e-2, 1e-3, 1e-4):
-        options = {"maxiter": 200}
-        x = minimize(_smoothed, x, (graph, at, mu), "L-BFGS-B", jac=True, options=options).x
-        now = _modulus(graph, at, x)
-        if now < slowest:
-            best, slowest = x, now
-    return _from_pairs(graph, at, best)
+        how = {"method": "L-BFGS-B", "jac": True, "options": {"maxiter": 200}}
+        found.append(minimize(_smoothed, found[-1], (graph, at, mu), **how).x)
+    return _from_pairs(graph, at, min(found, key=lambda x: np.abs(_modes(graph, at, x)[0]).max()))
 
 
 def _from_pairs(graph: Graph, at: Indices, pairs: Array) -> Weights:
@@ -224,12 +214,7 @@ def _from_pairs(graph: Graph, at: Indices, pairs: Array) -> Weights:
 
 def _modes(graph: Graph, at: Indices, pairs: Array) -> tuple[Array, Array]:
     dense = _from_pairs(graph, at, pairs).matrix.toarray() - 1 / graph.size
-    values, vectors = np.linalg.eigh(dense)
-    return values, vectors
-
-
-def _modulus(graph: Graph, at: Indices, pairs: Array) -> float:
-    return float(np.abs(_modes(graph, at, pairs)[0]).max())
+    return np.linalg.eigh(dense)
 
 
 def _smoothed(pairs: Array, graph: Graph, at: Indices, mu: float) -> tuple[float, Array]:
@@ -290,9 +275,26 @@ def balanced(graph: Graph) -> Weights:
     array([1., 1., 1.])
     """
     graph._joined()
-    p = left_null_vector(graph.laplacian) if graph.directed else np.ones(graph.size)
+    p = _left_null_vector(graph.laplacian) if graph.directed else np.ones(graph.size)
     links = p[graph.receivers] / (2 * (p * graph.degrees).max())
     return _by_links(graph, links)
+
+
+def _left_null_vector(laplacian: sparse.csr_array) -> Array:
+    """Positive p with p' L = 0 of a strongly connected graph, largest entry 1."""
+    from scipy.sparse.linalg import splu
+
+    if laplacian.shape[0] == 1:
+        return np.ones(1)
+    # One entry is set; the rest solves an M-matrix, which needs no pivoting.
+    turned = laplacian.T.tocsc()
+    inner, right = turned[1:, 1:], -turned[1:, [0]].toarray().ravel()
+    factor = splu(inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+                  options={"SymmetricMode": True})
+    rest = factor.solve(right)
+    rest += factor.solve(right - inner @ rest)
+    p = np.abs(np.concatenate([[1.0], rest]))
+    return np.asarray(p / p.max())
 
 
 def _keeping(weights: Weights) -> Weights:

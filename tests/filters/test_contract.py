@@ -86,7 +86,7 @@ def test_observations_reach_one_link(family: str) -> None:
 @EACH
 def test_faults_between_two_times(family: str) -> None:
     """Agent 0's radio is off from 1 s to before 2 s: who hears it is blind at 1 s only."""
-    off = Faults(silent=[0], during=[(1.0, 2.0)], clock="time")
+    off = Faults(silent=[0], during=[(1.0, 2.0)])
     sensors = [direct([0], std=0.5), None]
     f, state = made(family, sensors=sensors, agreement=None, faults=off)
     heard = []

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import sparse
 
 from distfilt.network import Channel, Faults, Graph, Ledger, graphs, weights
 from tests.network.helpers import (
@@ -29,14 +28,10 @@ _ZERO = np.zeros((3, 1))
 _ONES = [np.zeros(1)] * 3
 REFUSED = {
     "object": object(),
-    "dict": {"mean": np.zeros(2)},
     "list": [np.zeros(2)],
-    "text array": np.array(["a", "b"]),
     "object array": np.array([{"a": 1}, None], dtype=object),
-    "structured array": np.zeros(2, dtype=[("a", float)]),
     "complex": np.array([1j]),
     "masked": np.ma.masked_array([1.0, 2.0], [True, False]),
-    "sparse": sparse.csr_array(np.eye(2)),
     "nested tuple": (np.zeros(1), (np.zeros(1),)),
     "empty tuple": (),
 }
@@ -123,7 +118,7 @@ def test_what_arrives_cannot_be_changed_and_is_a_plain_array() -> None:
     own = [np.array([float(i)]) for i in range(3)]
     received = [
         star().exchange(own)[1][0], star().exchange([(own[0], own[1]), None, None])[1][0][1],
-        star().broadcast(_ZERO)[0], lossy(0.5, runs=(20,)).exchange([np.ones((20, 2))] * 3)[0][1],
+        lossy(0.5, runs=(20,)).exchange([np.ones((20, 2))] * 3)[0][1],
     ]
     for array in received:
         with pytest.raises(ValueError, match="read-only"):
@@ -133,43 +128,10 @@ def test_what_arrives_cannot_be_changed_and_is_a_plain_array() -> None:
     assert type(star().exchange([own_kind, None, None])[1][0]) is np.ndarray
 
 
-@pytest.mark.parametrize("delay", [1, 2])
-def test_a_late_message_is_what_was_sent(delay: int) -> None:
-    """The sender goes on computing in its own array; what is on the way stays as it was."""
-    channel = Channel(graphs.path(2), faults=Faults(delay=delay))
-    crossed = of_matrix(channel.graph, [[0.0, 1.0], [1.0, 0.0]])
-    by_message, by_link, by_sum, by_cast = (np.zeros((2, 1)) for _ in range(4))
-    got = []
-    for k in range(delay + 2):
-        for own in (by_message, by_link, by_sum, by_cast):
-            own[:] = k + 1
-        box = channel.exchange(list(by_message))[0]
-        got.append([
-            float(box[1][0]) if box else 0.0,
-            float(np.nan_to_num(channel.carry(by_link)[0, 0])),
-            float(channel.combine(by_sum, crossed, lost="zero")[0, 0]),
-            float(channel.broadcast(by_cast)[0][1, 0]),
-        ])
-    assert got == [[float(max(k + 1 - delay, 0))] * 4 for k in range(delay + 2)]
-
-
-def test_what_is_lost_is_lost_when_it_is_sent() -> None:
-    """With a delay the same messages get through, a round later."""
-    graph, faults = REFERENCE["ring"], {"loss": 0.5, "seed": 3}
-    sent = [[np.array([float(10 * k + a)]) for a in range(7)] for k in range(6)]
-    first, second = (
-        [channel.exchange(s) for s in sent]
-        for channel in (Channel(graph, faults=Faults(**faults, delay=d)) for d in (0, 1))
-    )
-    assert all(box == {} for box in second[0])
-    assert second[1:] == first[:-1]
-
-
 def test_without_links_there_is_no_round() -> None:
     for channel in (Channel(APART), lossy(0.5, APART)):
         assert channel.exchange(_ONES) == [{}, {}, {}]
         channel.combine(_ZERO, weights.metropolis(APART), rounds=4)
-        channel.broadcast(_ZERO)
         channel.carry(np.zeros((0, 1)))
         assert channel.ledger.rounds == 0 and charged(channel, messages=0)
 
@@ -192,24 +154,21 @@ def test_combine_is_the_matrix_product(seed: int, agents: int, k: int, rounds: i
 
 @named
 @pytest.mark.parametrize(("runs", "loss"), [((), 0.3), ((3,), 0.0), ((2, 2), 0.3)])
-def test_combine_carry_and_broadcast_are_exchange_to_the_bit(
+def test_combine_and_carry_are_exchange_to_the_bit(
     graph: Graph, runs: tuple[int, ...], loss: float
 ) -> None:
     """The same sum by messages: own value first, then the senders in ascending order."""
     w = weights.metropolis(graph)
     dense = w.matrix.toarray()
     values = rng(1).standard_normal((*runs, graph.size, 3))
-    channels = [Channel(graph, runs=runs, faults=Faults(loss=loss, seed=9)) for _ in range(4)]
+    channels = [Channel(graph, runs=runs, faults=Faults(loss=loss, seed=9)) for _ in range(3)]
     for _ in range(2):
         inbox = channels[0].exchange([values[..., a, :] for a in range(graph.size)])
         whole = channels[1].combine(values, w, lost="zero")
         carried = channels[2].carry(values[..., graph.senders, :])
-        by_cast, arrived = channels[3].broadcast(values)
-        assert (by_cast == values).all()
         for link, (i, j) in enumerate(zip(graph.receivers, graph.senders, strict=True)):
             got = inbox[i].get(int(j), np.full((*runs, 3), NAN))
             assert np.array_equal(carried[..., link, :], got, equal_nan=True)
-            assert (arrived[..., link] == ~np.isnan(got[..., 0])).all()
         for a in range(graph.size):
             total = dense[a, a] * values[..., a, :]
             for sender, payload in inbox[a].items():
@@ -277,14 +236,23 @@ def test_acknowledgements_are_charged() -> None:
     assert charged(one_way, messages=[2, 1 + 1, 2], scalars=[4, 2, 0], bytes=[32, 16 + 1, 2])
 
 
-def test_combine_with_delay_uses_old_neighbours_and_the_new_own_value() -> None:
-    graph = graphs.path(2)
-    half = of_matrix(graph, np.full((2, 2), 0.5))
-    channel = Channel(graph, faults=Faults(delay=1))
-    first = channel.combine([[1.0], [3.0]], half, lost="keep")
-    assert (first == [[1.0], [3.0]]).all()
-    second = channel.combine([[10.0], [30.0]], half, lost="keep")
-    assert (second == [[0.5 * 10 + 0.5 * 3], [0.5 * 30 + 0.5 * 1]]).all()
+@pytest.mark.parametrize("delay", [1, 2])
+def test_late_values_are_those_that_were_sent_and_not_lost_then(delay: int) -> None:
+    """Own values are new; what is on the way stays as it was, and is lost when it is sent."""
+    graph = REFERENCE["ring"]
+    w = of_matrix(graph, np.eye(7) + graph.links.toarray())
+    prompt, late = (
+        Channel(graph, faults=Faults(loss=0.5, seed=3, delay=d)) for d in (0, delay))
+    values, news = np.zeros((7, 1)), []
+    for k in range(delay + 4):
+        values[:] = (10.0 * k + np.arange(7))[:, None]  # goes on computing in its own array
+        news.append(prompt.combine(values, w, lost="zero") - values)
+        wanted = values + (news[k - delay] if k >= delay else 0.0)
+        assert np.allclose(late.combine(values, w, lost="zero"), wanted, atol=1e-12)
+    assert same_account(prompt, late)
+    for call in (lambda: late.exchange([np.zeros(1)] * 7), lambda: late.carry(np.zeros((14, 1)))):
+        with pytest.raises(ValueError, match=f"channel: needs no delay here, got {delay} rounds"):
+            call()
 
 
 def test_delayed_averaging_still_agrees_but_on_another_value() -> None:
@@ -304,19 +272,15 @@ def test_silent_agents_neither_send_nor_hear() -> None:
 
 
 def test_a_graph_may_come_as_anything_that_names_links() -> None:
-    for links in (nx.star_graph(2), STAR.links, STAR.links.toarray(), [(0, 1), (2, 0)]):
-        channel = Channel(links)
-        channel.exchange(_ONES)
-        assert charged(channel, messages=[2, 1, 1])
+    assert (Channel(nx.star_graph(2)).graph.links != STAR.links).nnz == 0
     assert Channel([(0, 1)], ledger=Ledger.empty(5)).graph.size == 5
     with pytest.raises(ValueError, match="graph: needs a graph of 5 agents, got 3"):
         Channel(STAR, ledger=Ledger.empty(5))
 
 
 def test_windows_follow_the_channel_s_time_or_the_ledger_s_rounds() -> None:
-    timed = Faults(silent=[0], during=[(10.0, 20.0)], clock="time")
-    makers = (Channel, Channel.unchecked)
-    for make in makers:
+    timed = Faults(silent=[0], during=[(10.0, 20.0)])
+    for make in (Channel, Channel.unchecked):
         got = [len(make(STAR, faults=timed, t=t).exchange(_ONES)[0]) for t in (9.9, 10, 19, 20)]
         assert got == [2, 0, 0, 2]
     channel = star(faults=Faults(loss=1.0, during=[(1, 3), (4, 5)]))

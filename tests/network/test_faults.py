@@ -50,16 +50,6 @@ def test_stored_losses_stay() -> None:
             assert Faults(loss=0.4, seed=5).lost(STAR, 2, 3)[run, link] == lost
 
 
-def test_the_share_of_losses_is_the_probability() -> None:
-    """Counts, and those of neighbouring pairs of rounds, runs and links."""
-    lost = _series(Faults(loss=0.3, seed=1), DISK, 4, 150)
-    assert _within(lost.sum(), lost.size, 0.3)
-    for axis in range(3):
-        front = np.moveaxis(lost, axis, 0)
-        pairs = front[: len(front) // 2 * 2].reshape(-1, 2, *front.shape[1:])
-        assert _within(pairs.all(axis=1).sum(), pairs.size // 2, 0.09)
-
-
 @pytest.mark.parametrize(("loss", "burst"), [(0.2, 5.0), (0.5, 3.0), (0.05, 20.0)])
 def test_bursts_have_their_rate_and_their_length(loss: float, burst: float) -> None:
     """Transitions of the chain, over independent links and runs and from the first round on."""
@@ -111,7 +101,7 @@ def test_windows_hold_losses_and_silence() -> None:
     assert lost == [False, False, True, True, False, False, True, True]
     off = [int((~faults.speaking(STAR, k)).sum()) for k in range(8)]
     assert off == [0, 0, 2, 2, 0, 0, 2, 2]
-    timed = Faults(loss=1.0, during=[(0.5, 1.0)], clock="time")
+    timed = Faults(loss=1.0, during=[(0.5, 1.0)])
     assert [bool(timed.lost(STAR, 9, 1, t).all()) for t in (0.4, 0.5, 1.0)] == [False, True, False]
 
 
@@ -128,15 +118,12 @@ def test_faults_together_fail_in_every_way() -> None:
 
 def test_what_cannot_be_said_of_a_network_is_refused() -> None:
     """Bursts shorter than independence, one seed twice, rates and agents of other networks."""
-    timed = Faults(loss=0.1, during=[(0, 1)], clock="time")
     refused = {
         "burst: needs at least": lambda: Faults(loss=[0.1, 0.8], burst=4.0),
         "seed: needs other seeds": lambda: Faults(loss=0.1, seed=3) | Faults(loss=0.2, seed=3),
         "loss: needs a number for each": lambda: Channel(STAR, faults=Faults(loss=[0.1, 0.2])),
         "silent: needs agents below 3": lambda: Channel(STAR, faults=Faults(silent=[3])),
         "during: needs windows": lambda: Faults(loss=0.1, during=[(2, 2)]),
-        "t: needs the channel's time": lambda: timed.lost(STAR, 0, 1),
-        "t: needs the time": lambda: Channel(STAR, faults=Faults(delay=1) | timed),
     }
     for text, call in refused.items():
         with pytest.raises(ValueError, match=text):

@@ -27,7 +27,7 @@ from distfilt.network import (
     naive_fusion,
     pull,
 )
-from tests.network.helpers import REFERENCE, STAR, gaussians, heard, lossy, rng, star
+from tests.network.helpers import DISK, STAR, gaussians, heard, lossy, rng, star
 
 RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
 GAIN = 0.04
@@ -76,18 +76,17 @@ def _gap(cov: np.ndarray, wanted: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.4])
-@pytest.mark.parametrize("name", ["star", "grid", "disk"])
+@pytest.mark.parametrize("graph", [STAR, DISK, Graph.from_edges(3, [[0, 1]])])
 @pytest.mark.parametrize("key", ALL)
-def test_all_agents_at_once_is_each_by_its_definition(key: str, name: str, loss: float) -> None:
-    graph = REFERENCE[name]
-    m, p = gaussians(3, 2, graph.size, d=3)
+def test_all_agents_at_once_is_each_by_its_definition(key: str, graph: Graph, loss: float) -> None:
+    m, p = gaussians(3, 2, 1, graph.size, d=3)
     faults = Faults(loss=loss, seed=6)
-    out = ALL[key]((m, p), Channel(graph, runs=(2,), faults=faults))
+    out = ALL[key]((m, p), Channel(graph, runs=(2, 1), faults=faults))
     for run, got in enumerate(heard(faults, graph, runs=2)):
-        means, covs = _by_hand(key, graph, m[run], p[run], got)
+        means, covs = _by_hand(key, graph, m[run, 0], p[run, 0], got)
         unit = np.sqrt(np.diagonal(covs, axis1=-2, axis2=-1))
-        assert np.abs((out[0][run] - means) / unit).max() < 1e-7
-        assert _gap(out[1][run], covs) < 1e-7
+        assert np.abs((out[0][run, 0] - means) / unit).max() < 1e-7
+        assert _gap(out[1][run, 0], covs) < 1e-7
     assert (out[1] == np.swapaxes(out[1], -1, -2)).all()
 
 
@@ -99,20 +98,6 @@ def test_the_account_is_mean_and_half_the_covariance(rule: object) -> None:
         sent = 2 * (d if rule is ALL["pull"] else floats) * LINKS
         assert (channel.ledger.scalars == sent).all() and (channel.ledger.bytes == 8 * sent).all()
         assert channel.ledger.rounds == 2 and 0 < channel.ledger.lost.sum() < 8
-
-
-@every
-def test_fusion_in_a_batch_is_fusion_run_by_run(rule: object) -> None:
-    m, p = gaussians(1, 4, 3)
-    faults = Faults(loss=0.4, seed=1)
-    whole = rule((m, p), star(runs=(4,), faults=faults), rounds=2)
-    first = rule((m[0], p[0]), star(faults=faults), rounds=2)
-    assert np.allclose(whole[0][0], first[0]) and np.allclose(whole[1][0], first[1])
-    nested = rule((m.reshape(2, 2, 3, 2), p.reshape(2, 2, 3, 2, 2)),
-                  star(runs=(2, 2), faults=faults), rounds=2)
-    assert np.allclose(nested[0].reshape(m.shape), whole[0])
-    alone = rule((m, p), star(runs=(4,), faults=Faults(loss=1.0)))
-    assert np.allclose(alone[0], m) and np.allclose(alone[1], p)
 
 
 @every
@@ -130,21 +115,6 @@ def test_a_perturbation_travels_one_hop_a_round_and_inputs_stay(rule: object) ->
     assert not np.shares_memory(a[0], m) and not np.shares_memory(a[1], p)
 
 
-@every
-def test_late_gaussians_are_those_of_before(rule: object) -> None:
-    """With a delay agents fuse their own of now with the neighbours' of a round ago."""
-    first, second = gaussians(1, 3), gaussians(2, 3)
-    channel = star(faults=Faults(delay=1))
-    alone, late = rule(first, channel), rule(second, channel)
-    assert np.allclose(alone[0], first[0]) and np.allclose(alone[1], first[1])
-    for a in range(3):
-        mixed_m, mixed_p = first[0].copy(), first[1].copy()
-        mixed_m[a], mixed_p[a] = second[0][a], second[1][a]
-        expected = rule((mixed_m, mixed_p), star())
-        for got, wanted in zip(late, expected, strict=True):
-            assert np.allclose(got[a], wanted[a], rtol=1e-7)
-
-
 @pytest.mark.parametrize("key", [*RULES, "arithmetic"])
 @given(seed=st.integers(0, 1000), d=st.integers(1, 4))
 def test_fusing_the_same_belief_changes_nothing(key: str, seed: int, d: int) -> None:
@@ -153,68 +123,14 @@ def test_fusing_the_same_belief_changes_nothing(key: str, seed: int, d: int) -> 
     assert (mean == m + 1e6).all() and np.allclose(cov, p, rtol=1e-7, atol=1e-12)
 
 
-@pytest.mark.parametrize("rule", RULES)
-@given(seed=st.integers(0, 1000), d=st.integers(1, 3))
-def test_covariance_intersection_bounds_the_true_covariance(rule: str, seed: int, d: int) -> None:
-    """Whatever the errors' correlation, P - P_true has no negative eigenvalue."""
-    root = rng(seed).standard_normal((2 * d, 2 * d))
-    joint = root @ root.T + 0.1 * np.eye(2 * d)
-    covs = np.stack([joint[:d, :d], joint[d:, d:]])
-    # Unit means in place of data read off the linear map from both means to the fused one.
-    many = Channel(graphs.path(2), runs=(2 * d,))
-    belief = np.eye(2 * d).reshape(2 * d, 2, d), np.broadcast_to(covs, (2 * d, 2, d, d))
-    means, fused = covariance_intersection(belief, many, rule=rule)
-    whole = means[:, 0].T
-    gap = fused[0, 0] - whole @ joint @ whole.T
-    assert np.linalg.eigvalsh(gap).min() > -1e-9 * np.abs(fused).max()
-
-
-@pytest.mark.parametrize("rule", ["equal", "determinant", "min_determinant"])
-def test_what_uses_determinants_does_not_depend_on_units(rule: str) -> None:
-    m, p = gaussians(1, 3)
-    units = np.diag([1000.0, 0.01])
-    plain = covariance_intersection((m, p), star(), rule=rule)
-    other = covariance_intersection((m @ units, units @ p @ units), star(), rule=rule)
-    assert np.allclose(other[0], plain[0] @ units, rtol=1e-6)
-    assert np.allclose(other[1], units @ plain[1] @ units, rtol=1e-6)
-
-
-@pytest.mark.parametrize("rule", RULES)
-def test_an_agent_that_hears_nobody_keeps_its_belief(rule: str) -> None:
-    means, covs = gaussians(2, 3)
-    door = Channel(Graph.from_edges(3, [[0, 1]]))
-    m, p = covariance_intersection((means, covs), door, rule=rule)
-    assert np.allclose(m[2], means[2], rtol=1e-14) and np.allclose(p[2], covs[2], rtol=1e-13)
-
-
-def test_naive_fusion_grows_sure_of_one_measurement() -> None:
-    """The same datum passed round and round: variance falls, although nothing new was learned."""
-    one = np.zeros((3, 1)), np.ones((3, 1, 1))
-    assert naive_fusion(one, star(), rounds=5)[1].max() < 0.02
-    assert np.allclose(covariance_intersection(one, star(), rounds=5)[1], 1.0)
-
-
-def test_a_consensus_pull_by_covariance() -> None:
-    """Olfati-Saber's gain: γ P / (1 + |P|_F), matrix and all."""
-    m, p = gaussians(5, 3)
-    mean, cov = consensus_pull((m, p), star(), gain=0.4, rule="covariance")
-    for i, near in enumerate([[1, 2], [0], [0]]):
-        gain = 0.4 * p[i] / (1 + np.linalg.norm(p[i]))
-        assert np.allclose(mean[i], m[i] + gain @ (m[near] - m[i]).sum(axis=0), rtol=1e-12)
-    assert (cov == p).all()
-
-
 def test_pulls_beyond_the_bound_warn_and_none_is_silence() -> None:
-    (m, p), e = gaussians(5, 3), _ensembles(1)
-    for rule, belief in ((consensus_pull, (m, p)), (pull, e)):
+    e = _ensembles(1)
+    for rule, belief in ((consensus_pull, gaussians(5, 3)), (pull, e)):
         with pytest.warns(UnstableGain, match=r"0\.8 is above 2/λ_max = 0\.6666") as caught:
             rule(belief, star(), gain=0.8, rounds=2)
         assert len(caught) == 1 and caught[0].filename == __file__
-        channel = star()
-        same = rule(belief, channel, gain=0.0)
-        assert all((a == b).all() for a, b in zip(same, belief, strict=True))
-        assert channel.ledger.rounds == 0
-    consensus_pull((m, 0.1 * np.tile(np.eye(2), (3, 1, 1))), star(), gain=0.8, rule="covariance")
+    channel = star()
+    assert (pull(e, channel, gain=0.0) == e).all() and channel.ledger.rounds == 0
 
 
 def _ensembles(seed: int, leading: tuple[int, ...] = (3,)) -> np.ndarray:
@@ -232,30 +148,18 @@ def test_a_rule_says_what_it_fuses_with_and_without_its_door() -> None:
 
 
 @pytest.mark.parametrize("include", [True, False])
-def test_a_pull_averages_means_and_shrinks_the_spread(include: bool) -> None:
-    """The exact defect of (16): anomalies are multiplied by 1 - γ|Nbs| in every round."""
-    e, channel = rng(1).standard_normal((3, 20, 2)), star()
-    pulled = pull(e, channel, gain=0.05, rounds=2, include_self=include)
-    means = average(e.mean(axis=1), star(), gain=0.05, rounds=2)
-    assert np.allclose(pulled.mean(axis=1), means, atol=1e-13)
-    shrink = (1 - 0.05 * (LINKS + include)) ** 2
-    before, after = (v - v.mean(axis=1, keepdims=True) for v in (e, pulled))
-    assert np.allclose(after, shrink[:, None, None] * before, atol=1e-13)
-    assert (channel.ledger.scalars == 2 * 2 * LINKS).all()
-
-
-def test_a_lost_mean_does_not_pull_and_the_others_do() -> None:
-    """Run by run against equation (16) with the neighbours that were heard."""
+def test_a_pull_by_its_equation_with_the_means_that_are_heard(include: bool) -> None:
+    """Member by member, run by run, equation (16)."""
     e = rng(1).standard_normal((6, 3, 20, 2))
-    faults = Faults(loss=0.5, seed=5)
-    out = pull(e, star(runs=(6,), faults=faults), gain=0.2, include_self=False)
-    got = heard(faults, STAR, runs=6)
-    assert 0 < got.sum() < 6 * 4
+    channel = star(runs=(6,), faults=Faults(loss=0.5, seed=5))
+    out = pull(e, channel, gain=0.2, include_self=include)
+    got = heard(channel.faults, STAR, runs=6) | (include & np.eye(3, dtype=bool))
     for run in range(6):
         expected = e[run].copy()
         for i, j in np.argwhere(got[run]):
             expected[i] += 0.2 * (e[run, j].mean(axis=0) - e[run, i])
         assert np.abs(out[run] - expected).max() < 1e-14
+    assert (channel.ledger.scalars == 2 * LINKS).all()
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -268,19 +172,12 @@ def test_intersection_gives_the_fused_moments(rule: str) -> None:
     assert _gap(sample_covariance(out), fused[1]) < 1e-10
     # 4 + 10 numbers on each link and round.
     assert (channel.ledger.scalars == 2 * 14 * LINKS).all()
+    assert rule != "min_determinant" or (intersection(e, channel, rounds=2) == out).all()
     # A scale matters to traces only.
     scaled = intersection(e[0], star(), rule=rule, scale=SIZES)
     plain = intersection(e[0], star(), rule=rule)
     assert np.allclose(plain, scaled, rtol=1e-6, atol=1e-6) == ("trace" not in rule)
     assert np.allclose(scaled, intersection(e[0] / SIZES, star(), rule=rule) * SIZES)
-
-
-def test_the_default_weights_give_the_least_determinant() -> None:
-    e = _ensembles(7)
-    options = ({}, *({"rule": rule} for rule in RULES[:4]))
-    sizes = [np.linalg.slogdet(sample_covariance(intersection(e, star(), **o)))[1] for o in options]
-    assert all((sizes[0] <= other + 1e-9).all() for other in sizes[1:])
-    assert (sizes[0] < sizes[1] - 1e-3).any()
 
 
 @pytest.mark.parametrize("rule", MOVES.values(), ids=MOVES.keys())

@@ -11,7 +11,6 @@ from scipy import sparse
 from scipy.sparse.csgraph import shortest_path
 
 from distfilt.network import Graph, graphs
-from distfilt.network._links import diameter_bound
 from distfilt.network.graphs import as_graph
 from tests.network.helpers import DISK, STAR, random_graph, rng
 
@@ -33,19 +32,13 @@ def test_shapes_and_spectra_are_networkx_s(name: str) -> None:
     graph, theirs = SHAPES[name]
     assert (graph.links.toarray() == nx.to_numpy_array(theirs)).all()
     assert graph.diameter == nx.diameter(theirs)
-    assert graph.diameter <= diameter_bound(graph.links) <= 2 * graph.diameter
     if graph.size > 1:
         assert np.allclose(graph.spectrum, np.sort(nx.laplacian_spectrum(theirs)), atol=1e-10)
-        assert np.isclose(graph.fiedler_value, graph.spectrum[1], rtol=1e-9)
         assert np.isclose(graph.largest_gain, 2 / graph.spectrum[-1], rtol=1e-9)
 
 
 def test_sparse_and_dense_ends_of_the_spectrum_agree() -> None:
-    graph = graphs.grid(20, 30)
-    exact = 2 - 2 * np.cos(np.pi / 30)
-    assert np.isclose(graph.fiedler_value, exact, rtol=1e-9)
-    assert np.isclose(graph.spectrum[1], exact, rtol=1e-8)
-    for other in (graph, graphs.ring(301), graphs.path(400), graphs.star(300), graphs.complete(250),
+    for other in (graphs.ring(301), graphs.path(400), graphs.star(300), graphs.complete(250),
                   graphs.disk(rng(1).random((500, 2)), 0.1)):
         assert np.isclose(other.largest_gain, 2 / other.spectrum[-1], rtol=1e-9)
 
@@ -59,10 +52,9 @@ def test_links_laplacian_and_hops_by_their_definition(
     assert (graph.laplacian.toarray() == np.diag(dense.sum(axis=1)) - dense).all()
     assert (graph.listeners == dense.sum(axis=0)).all() and (graph.degrees == dense.sum(1)).all()
     assert (graph.incidence @ np.ones(graph.senders.size) == graph.degrees).all()
-    for e, back in enumerate(graph.reverse):
-        i, j = graph.receivers[e], graph.senders[e]
-        assert (back >= 0) == bool(dense[j, i])
-        assert back < 0 or (graph.receivers[back], graph.senders[back]) == (j, i)
+    if not graph.directed:
+        assert (graph.receivers[graph.reverse] == graph.senders).all()
+        assert (graph.senders[graph.reverse] == graph.receivers).all()
     # links[i, j] carries news from j to i.
     away = shortest_path(graph.links.T, unweighted=True)
     for agent in range(agents):
@@ -70,7 +62,7 @@ def test_links_laplacian_and_hops_by_their_definition(
         assert graph.neighbours(agent) == tuple(np.flatnonzero(dense[agent]))
     assert graph.connected == np.isfinite(away).all()
     if graph.connected:
-        assert graph.diameter == away.max() <= diameter_bound(graph.links) <= 2 * away.max()
+        assert graph.diameter == away.max()
 
 
 @given(st.integers(0, 1000), st.integers(1, 9), st.booleans())
@@ -125,8 +117,8 @@ def test_a_graph_is_read_from_what_describes_it(seed: int, agents: int) -> None:
 
 def test_what_describes_no_graph_is_refused_with_the_ways_to_make_one() -> None:
     refused = {
-        "Graph.from_networkx, Graph.from_adjacency, Graph.from_edges": 3,
-        "one way only between agents 0 and 1 .*directed=True": np.eye(3, k=-1),
+        "a Graph, a networkx graph, a matrix .*, or edges, got int": 3,
+        "both ways .*directed=True.* one way only between 0 and 1": np.eye(3, k=-1),
         "no self-loops": [(0, 1), (1, 1), (2, 0), (0, 2)],
         "zeros and ones, got 0.5": 0.5 * sparse.csr_array(STAR.links),
         "agents from 0 to 2": [(0, 1), (1, 7)],

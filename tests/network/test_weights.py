@@ -71,9 +71,6 @@ def test_the_best_constant_is_no_worse_than_any(graph: Graph) -> None:
     best = weights.best_constant(graph)
     low, high = graph.spectrum[1], graph.spectrum[-1]
     assert np.isclose(_slowest(best), (high - low) / (high + low), atol=1e-9)
-    for factor in (0.97, 1.03):
-        other = weights._laplacian(graph, factor * best.links[0])
-        assert _slowest(other) > _slowest(best) or low == high
     assert (weights.best_constant(graphs.path(1)).matrix.toarray() == 1).all()
 
 
