@@ -10,36 +10,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from distfilt import gaussians as pure
+from distfilt import network
 from distfilt.doors import unchecked
 from distfilt.ensembles import mean, sample_covariance
-from distfilt.network import (
-    Channel,
-    Faults,
-    Graph,
-    UnstableGain,
-    arithmetic_average,
-    average,
-    consensus_pull,
-    covariance_intersection,
-    fused_kind,
-    graphs,
-    intersection,
-    naive_fusion,
-    pull,
-)
+from distfilt.network import Channel, Faults, Graph, UnstableGain, graphs
 from tests.network.helpers import DISK, STAR, gaussians, heard, lossy, rng, star
+from tests.support import unit_gap
 
 RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
 GAIN = 0.04
 ALL = {
-    **{r: partial(covariance_intersection, rule=r) for r in RULES},
-    "naive": naive_fusion, "arithmetic": arithmetic_average,
-    "pull": partial(consensus_pull, gain=GAIN),
+    **{r: partial(network.covariance_intersection, rule=r) for r in RULES},
+    "naive": network.naive_fusion, "arithmetic": network.arithmetic_average,
+    "pull": partial(network.consensus_pull, gain=GAIN),
 }
 every = pytest.mark.parametrize("rule", ALL.values(), ids=ALL.keys())
 MOVES = {
-    "least": intersection, "equal": partial(intersection, rule="equal"),
-    "pull": partial(pull, gain=0.1),
+    "least": network.intersection, "equal": partial(network.intersection, rule="equal"),
+    "pull": partial(network.pull, gain=0.1),
 }
 SIZES = np.logspace(-1, 2, 4)
 LINKS = np.array([2, 1, 1])
@@ -54,9 +42,8 @@ def _by_hand(
     for i in range(graph.size):
         who = [i, *(j for j in graph.neighbours(i) if got[i, j])]
         if name == "naive":
-            info = np.linalg.inv(p[who])
-            out_p[i] = np.linalg.inv(info.sum(axis=0))
-            out_m[i] = out_p[i] @ (info @ m[who][..., None]).sum(axis=0)[:, 0]
+            equal = np.full(len(who), 1 / len(who))
+            out_m[i], out_p[i] = pure.intersection(m[who], p[who] / len(who), equal)
         elif name == "arithmetic":
             out_m[i] = m[who].mean(axis=0)
             gap = m[who] - out_m[i]
@@ -67,12 +54,6 @@ def _by_hand(
             omega = pure.intersection_weights(p[who], rule=name)
             out_m[i], out_p[i] = pure.intersection(m[who], p[who], omega)
     return out_m, out_p
-
-
-def _gap(cov: np.ndarray, wanted: np.ndarray) -> float:
-    """Largest difference in units of the standard deviations."""
-    unit = np.sqrt(np.diagonal(wanted, axis1=-2, axis2=-1))
-    return float(np.abs((cov - wanted) / (unit[..., :, None] * unit[..., None, :])).max())
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.4])
@@ -86,7 +67,7 @@ def test_all_agents_at_once_is_each_by_its_definition(key: str, graph: Graph, lo
         means, covs = _by_hand(key, graph, m[run, 0], p[run, 0], got)
         unit = np.sqrt(np.diagonal(covs, axis1=-2, axis2=-1))
         assert np.abs((out[0][run, 0] - means) / unit).max() < 1e-7
-        assert _gap(out[1][run, 0], covs) < 1e-7
+        assert unit_gap(out[1][run, 0], covs) < 1e-7
     assert (out[1] == np.swapaxes(out[1], -1, -2)).all()
 
 
@@ -125,12 +106,12 @@ def test_fusing_the_same_belief_changes_nothing(key: str, seed: int, d: int) -> 
 
 def test_pulls_beyond_the_bound_warn_and_none_is_silence() -> None:
     e = _ensembles(1)
-    for rule, belief in ((consensus_pull, gaussians(5, 3)), (pull, e)):
+    for rule, belief in ((network.consensus_pull, gaussians(5, 3)), (network.pull, e)):
         with pytest.warns(UnstableGain, match=r"0\.8 is above 2/λ_max = 0\.6666") as caught:
             rule(belief, star(), gain=0.8, rounds=2)
         assert len(caught) == 1 and caught[0].filename == __file__
     channel = star()
-    assert (pull(e, channel, gain=0.0) == e).all() and channel.ledger.rounds == 0
+    assert (network.pull(e, channel, gain=0.0) == e).all() and channel.ledger.rounds == 0
 
 
 def _ensembles(seed: int, leading: tuple[int, ...] = (3,)) -> np.ndarray:
@@ -142,9 +123,10 @@ def _ensembles(seed: int, leading: tuple[int, ...] = (3,)) -> np.ndarray:
 
 
 def test_a_rule_says_what_it_fuses_with_and_without_its_door() -> None:
-    assert fused_kind(partial(partial(pull, gain=0.1), rounds=2)) == "ensembles"
-    assert fused_kind(unchecked(naive_fusion)) == "gaussians"
-    assert fused_kind(average) == "vectors" and fused_kind(lambda belief, channel: belief) is None
+    assert network.fused_kind(partial(partial(network.pull, gain=0.1), rounds=2)) == "ensembles"
+    assert network.fused_kind(unchecked(network.naive_fusion)) == "gaussians"
+    assert network.fused_kind(network.average) == "vectors"
+    assert network.fused_kind(lambda belief, channel: belief) is None
 
 
 @pytest.mark.parametrize("include", [True, False])
@@ -152,7 +134,7 @@ def test_a_pull_by_its_equation_with_the_means_that_are_heard(include: bool) -> 
     """Member by member, run by run, equation (16)."""
     e = rng(1).standard_normal((6, 3, 20, 2))
     channel = star(runs=(6,), faults=Faults(loss=0.5, seed=5))
-    out = pull(e, channel, gain=0.2, include_self=include)
+    out = network.pull(e, channel, gain=0.2, include_self=include)
     got = heard(channel.faults, STAR, runs=6) | (include & np.eye(3, dtype=bool))
     for run in range(6):
         expected = e[run].copy()
@@ -166,18 +148,18 @@ def test_a_pull_by_its_equation_with_the_means_that_are_heard(include: bool) -> 
 def test_intersection_gives_the_fused_moments(rule: str) -> None:
     e = _ensembles(3, (5, 3))
     belief, channel = (mean(e), sample_covariance(e)), star(runs=(5,))
-    fused = covariance_intersection(belief, star(runs=(5,)), rule=rule, rounds=2)
-    out = intersection(e, channel, rule=rule, rounds=2)
+    fused = network.covariance_intersection(belief, star(runs=(5,)), rule=rule, rounds=2)
+    out = network.intersection(e, channel, rule=rule, rounds=2)
     assert np.abs((mean(out) - fused[0]) / e.std(axis=-2)).max() < 1e-10
-    assert _gap(sample_covariance(out), fused[1]) < 1e-10
+    assert unit_gap(sample_covariance(out), fused[1]) < 1e-10
     # 4 + 10 numbers on each link and round.
     assert (channel.ledger.scalars == 2 * 14 * LINKS).all()
-    assert rule != "min_determinant" or (intersection(e, channel, rounds=2) == out).all()
+    assert rule != "min_determinant" or (network.intersection(e, channel, rounds=2) == out).all()
     # A scale matters to traces only.
-    scaled = intersection(e[0], star(), rule=rule, scale=SIZES)
-    plain = intersection(e[0], star(), rule=rule)
+    scaled = network.intersection(e[0], star(), rule=rule, scale=SIZES)
+    plain = network.intersection(e[0], star(), rule=rule)
     assert np.allclose(plain, scaled, rtol=1e-6, atol=1e-6) == ("trace" not in rule)
-    assert np.allclose(scaled, intersection(e[0] / SIZES, star(), rule=rule) * SIZES)
+    assert np.allclose(scaled, network.intersection(e[0] / SIZES, star(), rule=rule) * SIZES)
 
 
 @pytest.mark.parametrize("rule", MOVES.values(), ids=MOVES.keys())
@@ -202,4 +184,4 @@ def test_flat_ensembles_are_refused() -> None:
     flat = (e[:, :4], np.zeros_like(e), e[..., [0, 0]], e[..., [0, 1]] @ [[1.0, 1, 2], [1, -1, 3]])
     for ensembles in flat:
         with pytest.raises(ValueError, match="ensemble"):
-            intersection(ensembles, star())
+            network.intersection(ensembles, star())
