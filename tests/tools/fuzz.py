@@ -1,20 +1,18 @@
 """Unusual input for every argument of everything that has a door: right, or refused by name.
 
-    python tests/tools/fuzz.py [--dry] [room …]
+    python -m tests.tools.fuzz [room …]
 
 Each argument of a valid call, which an example of the documentation makes, is exchanged for other
 values, the same ones each time. One that means the same (a list, Fortran order, read-only memory)
 has to give the same result. One that means nothing (dates, complex numbers, masked arrays, text)
 has to be refused by an error that names the argument. Any other is refused by an error that names
 an argument, or gives a result without NaN. No call may change its arguments. What is otherwise
-stands in ``ALLOWED`` with the reason. Writes ``data/bench/fuzz.csv``, a line a room with the
-counts, unless ``--dry``.
+stands in ``ALLOWED`` with the reason.
 """
 
 from __future__ import annotations
 
 import copy
-import csv
 import inspect
 import os
 import re
@@ -35,7 +33,6 @@ import numpy as np
 from tests.tools.calls import Call, callables, calls, public, rooms
 
 ROOT = Path(__file__).resolve().parents[2]
-TABLE = ROOT / "data" / "bench" / "fuzz.csv"
 REFUSALS = (ValueError, RuntimeError, LookupError, ImportError, FileNotFoundError)
 SECONDS = 10
 
@@ -147,17 +144,15 @@ def parts(value: Any, depth: int = 0, seen: frozenset[int] = frozenset()) -> Ite
     elif isinstance(value, list | tuple):
         for v in value:
             yield from parts(v, depth + 1, seen)
-    elif hasattr(value, "to_dict") and hasattr(value, "data_vars"):
-        for name in value.variables:
-            yield value[name].to_numpy()
+    elif hasattr(value, "data_vars"):
+        yield from (value[name].to_numpy() for name in value.variables)
     elif hasattr(value, "tocoo"):
         yield value.toarray()
     elif isinstance(value, np.random.Generator):
         yield str(value.bit_generator.state)
     elif is_dataclass(value) and not inspect.isclass(value):
         for field in fields(value):
-            if field.name != "seconds":  # of a study: it takes another time each time
-                yield from parts(getattr(value, field.name, None), depth + 1, seen)
+            yield from parts(getattr(value, field.name, None), depth + 1, seen)
 
 
 def same(a: Any, b: Any) -> bool:
@@ -178,12 +173,8 @@ def equal(x: Any, y: Any) -> bool:
 
 def exact(a: Any, b: Any) -> bool:
     """Whether two arguments are the same to the bit."""
-    for x, y in zip(parts(a), parts(b), strict=False):
-        if np.asarray(x).dtype.kind == "O":
-            continue
-        if np.asarray(x).tobytes() != np.asarray(y).tobytes():
-            return False
-    return True
+    pairs = ((np.asarray(x), np.asarray(y)) for x, y in zip(parts(a), parts(b), strict=False))
+    return all(x.dtype.kind == "O" or x.tobytes() == y.tobytes() for x, y in pairs)
 
 
 def nans(value: Any) -> int:
@@ -314,31 +305,15 @@ def run(chosen: list[str]) -> list[Finding]:
 
 def main(arguments: list[str]) -> int:
     """Print the faults and the counts; how many faults there are."""
-    chosen = [a for a in arguments if a != "--dry"] or rooms()
     began = time.perf_counter()
-    found = run(chosen)
+    found = run(arguments or rooms())
     faults = [f for f in found if judged(f) not in {*GOOD, "allowed"}]
     for f in faults:
         print(f"{f.result:9} {f.name}({f.argument}): {f.kind}: {f.text}", flush=True)
     named = len({f.name for f in found}), len({(f.name, f.argument) for f in found})
     print(f"{len(found)} calls, {named[0]} callables, {named[1]} arguments: "
           f"{dict(Counter(map(judged, found)))}, {time.perf_counter() - began:.0f} s")  # fmt: skip
-    if "--dry" not in arguments and chosen == rooms():
-        write(found)
     return len(faults)
-
-
-def write(found: list[Finding]) -> None:
-    """The counts, a line a room and result."""
-    results = [*sorted({*GOOD, *map(judged, found)} - {"allowed"}), "allowed"]
-    with TABLE.open("w", encoding="utf-8", newline="") as lines:
-        writer = csv.writer(lines, lineterminator="\n")
-        writer.writerow(["room", "callables", "arguments", "calls", *results])
-        for room in rooms():
-            mine = [f for f in found if f.name.partition(".")[0] == room]
-            counts = Counter(map(judged, mine))
-            names = len({f.name for f in mine}), len({(f.name, f.argument) for f in mine})
-            writer.writerow([room, *names, len(mine), *(counts[r] for r in results)])
 
 
 if __name__ == "__main__":

@@ -50,6 +50,7 @@ SECONDS = (120, 400)
 """What the tests of each stage may take; a mutant that takes longer hangs, and so is found."""
 EVERY = ("distfilt", "tests", *(f"--ignore=tests/{name}" for name in ("book", "tools")),
          "--ignore=tests/test_package.py")  # fmt: skip
+"""What the tests import from elsewhere is imported once for all mutants."""
 WARM = (
     "numpy", "scipy.linalg", "scipy.optimize", "scipy.sparse.csgraph", "scipy.sparse.linalg",
     "scipy.spatial", "scipy.special", "scipy.stats", "scipy.integrate", "networkx", "xarray",
@@ -64,7 +65,6 @@ class Mutant:
 
     module: str
     operator: str
-    arguments: tuple[tuple[str, Any], ...]
     occurrence: int
     line: int
     column: int
@@ -74,34 +74,25 @@ class Mutant:
         from cosmic_ray.mutating import mutate_code
         from cosmic_ray.plugins import get_operator
 
-        operator = get_operator(self.operator)(**dict(self.arguments))
-        return str(mutate_code(text, operator, self.occurrence))
-
-
-def operators() -> Iterator[tuple[str, tuple[tuple[str, Any], ...], Any]]:
-    """Name, arguments and instance of every operator of cosmic-ray that needs no set-up."""
-    from cosmic_ray.plugins import get_operator, operator_names
-
-    for name in sorted(operator_names()):
-        kind = get_operator(name)
-        if not kind.arguments() and "no-op" not in name.lower():
-            yield name, (), kind()
+        return str(mutate_code(text, get_operator(self.operator)(), self.occurrence))
 
 
 def mutants(root: Path, only: str) -> Iterator[Mutant]:
-    """Every change that can be made to the library's modules."""
+    """Every change that an operator without set-up can make to the library's modules."""
     from cosmic_ray.ast import ast_nodes, get_ast
+    from cosmic_ray.plugins import get_operator, operator_names
 
-    every = list(operators())
+    kinds = {name: get_operator(name) for name in sorted(operator_names())}
+    plain = {name: kind() for name, kind in kinds.items() if not kind.arguments()}
     for path in sorted((root / "distfilt").rglob("*.py")):
         module = path.relative_to(root).as_posix()
         if path.name == "__init__.py" or not module.startswith(f"distfilt/{only}"):
             continue
         nodes = list(ast_nodes(get_ast(path.read_text(encoding="utf-8"))))
-        for name, arguments, operator in every:
+        for name, operator in plain.items():
             places = (place for node in nodes for place in operator.mutation_positions(node))
             for occurrence, (start, _) in enumerate(places):
-                yield Mutant(module, name, arguments, occurrence, *start)
+                yield Mutant(module, name, occurrence, *start)
 
 
 def meaning(text: str) -> str:
@@ -195,14 +186,7 @@ def running(contexts: dict[int, list[str]], text: str, line: int) -> list[str]:
     return []
 
 
-def warm() -> None:
-    """Import what the tests import from elsewhere, once for all mutants."""
-    for name in WARM:
-        if importlib.util.find_spec(name.partition(".")[0]) is not None:
-            importlib.import_module(name)
-
-
-def tests_pass(tests: list[str], folder: Path) -> int:
+def pytest_in(folder: Path, tests: list[str]) -> int:
     """pytest's exit code, in this process, which has not imported the library."""
     os.setsid()
     nowhere = os.open(os.devnull, os.O_RDWR)
@@ -223,7 +207,7 @@ def passes(tests: list[str], folder: Path, seconds: float) -> bool:
     if not child:
         code = 1
         try:
-            code = tests_pass(tests, folder)
+            code = pytest_in(folder, tests)
         finally:
             os._exit(code)
     end = time.monotonic() + seconds
@@ -266,20 +250,16 @@ def tested(mutant: Mutant, folder: Path, stages: list[list[str]]) -> dict[str, A
     return found | {"seconds": f"{time.perf_counter() - began:.0f}"}
 
 
-def copied(root: Path, folder: Path) -> Path:
-    """A copy of what the tests need."""
-    left_out = shutil.ignore_patterns(".git", ".venv", "_build", "__pycache__", ".*_cache")
-    shutil.copytree(root, folder, ignore=left_out)
-    return folder
-
-
 def run(
     rows: list[tuple[Mutant, dict[str, Any]]], root: Path, options: argparse.Namespace
 ) -> Iterator[None]:
     """Complete the rows, a job each in a process of its own; yields after each one."""
     trace = traced(root, options.jobs) if rows and options.stages > 1 else None
     with tempfile.TemporaryDirectory(prefix="mutants-") as scratch:
-        free = [copied(root, Path(scratch) / str(k)) for k in range(options.jobs)]
+        left_out = shutil.ignore_patterns(".git", ".venv", "_build", "__pycache__", ".*_cache")
+        free = [Path(scratch) / str(k) for k in range(options.jobs)]
+        for folder in free:
+            shutil.copytree(root, folder, ignore=left_out)
         busy: dict[int, tuple[Path, Path, dict[str, Any]]] = {}
         end = time.monotonic() + 60 * options.minutes
         waiting = rows[::-1]
@@ -342,7 +322,6 @@ def main(arguments: list[str] | None = None, root: Path = ROOT, table: Path = TA
     parser.add_argument("--only", default="", help="a folder or module of the library")
     parser.add_argument("--stages", type=int, default=len(SECONDS), help="how far to go")
     parser.add_argument("--minutes", type=float, default=1e6, help="when to stop for now")
-    parser.add_argument("--again", action="store_true", help="run the survivors again")
     options = parser.parse_args(arguments)
     before = known(table)
     chosen = drawn(root, options.sample, options.seed, options.only)
@@ -351,13 +330,11 @@ def main(arguments: list[str] | None = None, root: Path = ROOT, table: Path = TA
         row = described(mutant, root)
         old = before.get((row["module"], row["was"], row["becomes"]), {})
         pairs.append((mutant, row | {n: old[n] for n in COLUMNS[4:] if n in old}))
-    again = {"survived"} if options.again else set()
-    waiting = [
-        (m, row) for m, row in pairs
-        if not finished(row, options.stages) or (row["result"] in again and not row["reason"])
-    ]  # fmt: skip
+    waiting = [(m, row) for m, row in pairs if not finished(row, options.stages)]
     rows = [row for _, row in pairs]
-    warm()
+    for name in WARM:
+        if importlib.util.find_spec(name.partition(".")[0]) is not None:
+            importlib.import_module(name)
     for _ in run(waiting, root, options):
         stored(rows, table)
     stored(rows, table)
