@@ -11,13 +11,11 @@ from distfilt.metrics import (
     crps,
     gaussian_crps,
     log_score,
-    mean_interval,
     nees,
     nees_band,
     nis,
     squared_error,
 )
-from distfilt.metrics.scores import ensemble_nees
 from tests.support import generator, spd
 
 RNG = np.random.default_rng(0)
@@ -33,11 +31,10 @@ def test_squared_error_is_a_sum_or_stays_apart():
 def test_leading_axes_broadcast():
     estimates = RNG.standard_normal((7, 3, 6, 2))  # runs, agents, members, components
     truth = RNG.standard_normal((7, 1, 2))
-    for score in (crps, ensemble_nees):
-        whole = score(estimates, truth)
-        for r in range(7):
-            for a in range(3):
-                assert np.allclose(whole[r, a], score(estimates[r, a], truth[r, 0]), rtol=1e-12)
+    whole = crps(estimates, truth)
+    for r in range(7):
+        for a in range(3):
+            assert np.allclose(whole[r, a], crps(estimates[r, a], truth[r, 0]), rtol=1e-12)
 
 
 # --- consistency ------------------------------------------------------------------------------
@@ -57,22 +54,6 @@ def test_nees_and_nis_are_their_definitions(leading):
     exact = (gap * np.linalg.solve(one, gap[..., None])[..., 0]).sum(-1)
     assert np.allclose(nees(estimate, one, truth), exact, rtol=1e-10)
 
-
-
-def test_ensemble_nees_equals_nees_with_the_sample_covariance():
-    x = RNG.standard_normal((4, 30, 5)) @ np.diag([1e-6, 1.0, 1e6, 3.0, 1.0])
-    cov = np.stack([np.cov(e, rowvar=False) for e in x])
-    expected = nees(x.mean(-2), cov, np.zeros(5))
-    assert np.allclose(ensemble_nees(x, np.zeros(5)), expected, rtol=1e-9)
-
-
-def test_honest_ensembles_average_as_documented():
-    n, d = 20, 3
-    x = np.random.default_rng(3).standard_normal((20000, n + 1, d))
-    values = ensemble_nees(x[:, 1:], x[:, 0])
-    interval = mean_interval(values, level=0.999)  # one false alarm in a thousand seeds
-    assert d * (1 + 1 / n) * (n - 1) / (n - d - 2) in interval
-    assert d not in interval
 
 
 @pytest.mark.parametrize("dim, runs, level", [(1, 1, 0.95), (6, 24, 0.95), (13, 100, 0.99)])

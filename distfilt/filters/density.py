@@ -21,7 +21,7 @@ from ..density import (
 )
 from ..density.kernel import fine_enough
 from ..density.sharing import Seen, alone, present_graph
-from ..doors import Array, Count, NonNegative, Places, Positive, array, unchecked
+from ..doors import Array, Bounds, Count, NonNegative, Places, Positive, array, unchecked
 from ..network import Channel, Graph
 from ..network.graphs import as_graph
 from .base import Filter
@@ -166,8 +166,7 @@ class DensityFilter(Filter):
     def check_parts(self) -> None:
         """Refuse places and densities that are not of the grid."""
         fine_enough(self.model.grid, self.bandwidth)
-        if self.local is not None and max(self.local) >= self.count:
-            raise ValueError(f"local: needs agents below {self.count}, got {max(self.local)}")
+        Bounds(below=self.count)(max(self.local or (0,)), "local")
 
     @cached_property
     def count(self) -> int:

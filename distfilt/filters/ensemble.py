@@ -55,18 +55,13 @@ class EnsembleState(SensorState):
     --------
     >>> from distfilt.network import Ledger
     >>> state = EnsembleState(0.0, Ledger.empty(2), np.random.default_rng(0), np.zeros((2, 5, 3)))
-    >>> state.members, state.runs
-    (5, ())
+    >>> state.runs
+    ()
     """
 
     ensembles: Array
 
     _belief = "ensembles", (..., "A", "N", "d")
-
-    @property
-    def members(self) -> int:
-        """Number N of members of each agent."""
-        return int(self.ensembles.shape[-2])
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..doors import Array, Count, Index, door
+from ..doors import Array, Bounds, Count, Index, door
 from ..mixtures import GaussianMixture, conditioned
 from .inputs import Reading
 from .mixture import MixtureFilter
@@ -116,8 +116,7 @@ class NewsFilter(MixtureFilter):
         if self.graph is None:
             raise ValueError("graph: needs a Graph, got None")
         least = min((s.dim for own in self.team for s in own), default=0)
-        if self.common and max(self.common) >= least:
-            raise ValueError(f"common: needs components below {least}, got {max(self.common)}")
+        Bounds(below=least)(max(self.common, default=-1), "common")
 
     def _told(
         self, beliefs: list[GaussianMixture], step: Step

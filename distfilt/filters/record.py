@@ -10,8 +10,8 @@ import numpy as np
 
 from ..doors import Array, array, unchecked
 from ..ensembles import sample_covariance
-from ..metrics import crps, gaussian_crps, nees
-from ..metrics.scores import ensemble_nees
+from ..linalg import cholesky, quadratic_form
+from ..metrics import crps, gaussian_crps
 from .saving import State
 
 if TYPE_CHECKING:
@@ -164,11 +164,12 @@ def _scored(
             found = unchecked(crps)(some, known, weights=summary.weights)
         out["crps"] = np.where(good[..., None] & ~np.isnan(known), found, np.nan)
     mean, known = mean[..., at], known[..., at]
-    if "nees" in scores and summary.covariance is not None:
-        cov = summary.covariance[..., at, :][..., at]
-        out["nees"] = _where(good, _nees_or_infinite, mean, cov, known)
-    elif "nees" in scores and some is not None and some.shape[-2] > mean.shape[-1]:
-        out["nees"] = _where(good, _ensemble_nees, some[..., at], known)
+    cov = None if summary.covariance is None else summary.covariance[..., at, :][..., at]
+    if "nees" in scores and cov is None and some is not None and some.shape[-2] > mean.shape[-1]:
+        cov = unchecked(sample_covariance)(some[..., at])
+    if "nees" in scores and cov is not None:
+        out["nees"] = np.full(good.shape, np.nan)
+        out["nees"][good] = _nees(mean[good], cov[good], known[good])
     return out
 
 
@@ -211,30 +212,11 @@ def _counted(name: str, values: list[Any]) -> dict[str, Any]:
     return {name: (axes, np.diff(total, axis=0), now), f"{name}_total": (axes, total[1:], sums)}
 
 
-def _where(good: Any, score: Any, *parts: Array) -> Array:
-    """A score where there is an estimate, NaN elsewhere."""
-    out = np.full(good.shape, np.nan)
-    if good.any():
-        out[good] = score(*(p[good] for p in parts))
-    return out
-
-
-def _nees_or_infinite(mean: Array, cov: Array, known: Array) -> Array:
-    """NEES; infinite where a cloud has collapsed, so that its covariance claims certainty."""
-    try:
-        return nees(mean, cov, known)
-    except ValueError:
-        values = np.linalg.eigvalsh(cov)
-        sure = values[..., 0] <= 1e-12 * np.abs(values[..., -1])
-        if not sure.any():
-            raise
-        some = np.where(sure[..., None, None], np.eye(cov.shape[-1]), cov)
-        return np.where(sure, np.inf, nees(mean, some, known))
-
-
-def _ensemble_nees(members: Array, known: Array) -> Array:
-    """The same of members."""
-    try:
-        return ensemble_nees(members, known)
-    except ValueError:
-        return _nees_or_infinite(members.mean(axis=-2), sample_covariance(members), known)
+def _nees(mean: Array, cov: Array, known: Array) -> Array:
+    """NEES, whatever the units; infinite where a cloud has collapsed, which claims certainty."""
+    scale = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    unit = np.where(scale > 0, scale, 1.0)
+    shape = cov / (unit[..., :, None] * unit[..., None, :])
+    sure = np.linalg.eigvalsh(shape)[..., 0] <= 1e-12
+    shape[sure] = np.eye(shape.shape[-1])
+    return np.where(sure, np.inf, quadratic_form(cholesky(shape), (mean - known) / unit))

@@ -51,11 +51,8 @@ class State(Record):
     refused: Annotated[Array, "..."] | None = field(default=None, kw_only=True)
 
     def __repr__(self) -> str:
-        """Time, agents, and the shapes of what is believed: the numbers themselves are many."""
-        own = ((f.name, getattr(self, f.name)) for f in fields(self)[4:])
-        shapes = [f"{name} {v.shape}" for name, v in own if isinstance(v, np.ndarray) and v.ndim]
-        parts = [f"t={self.t:g}", f"{self.ledger.messages.size} agents", *shapes]
-        return f"{type(self).__name__}({', '.join(parts)})"
+        """Time and agents: the numbers themselves are many."""
+        return f"{type(self).__name__}(t={self.t:g}, {self.ledger.messages.size} agents)"
 
     @property
     def runs(self) -> tuple[int, ...]:

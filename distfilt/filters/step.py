@@ -273,7 +273,6 @@ def guarded(
         out = compute(*arrays, shared, rng)
     except RECOVERABLE as error:
         out = tuple(f.copy() for f in fallback)
-        wrong = of_the_call(error)
         for row in np.ndindex(arrays[0].shape[:lead]):
             source = copy.deepcopy(rng)
             if source is not None:
@@ -283,11 +282,10 @@ def guarded(
                 results = compute(*(a[row] for a in arrays), part, source)
             except RECOVERABLE as own:
                 errors[row] = str(own)
-                wrong = wrong and isinstance(own, ValueError)
                 continue
             for target, result in zip(out, results, strict=True):
                 target[row] = result
-        if wrong and len(errors) == np.prod(arrays[0].shape[:lead]):
+        if of_the_call(error) and len(errors) == np.prod(arrays[0].shape[:lead]):
             raise
     for got in out:
         errors |= _not_finite(got, lead, "result")

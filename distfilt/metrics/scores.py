@@ -13,15 +13,12 @@ from typing import Annotated
 import numpy as np
 
 from ..doors import Array, Bounds, Count, Cov, Weights, door, unchecked
-from ..ensembles import Ensemble, Members, mean, sample_covariance
+from ..ensembles import Members
 from ..gaussians import log_density
-from ..linalg import EPS, cholesky, leading, quadratic_form
+from ..linalg import cholesky, leading, quadratic_form
 from .intervals import Interval, Level
 
-__all__ = [  # fmt: skip
-    "crps", "ensemble_nees", "gaussian_crps", "log_score", "nees", "nees_band", "nis",
-    "squared_error",
-]
+__all__ = ["crps", "gaussian_crps", "log_score", "nees", "nees_band", "nis", "squared_error"]
 
 Vector = Annotated[Array, "... d"]
 
@@ -98,50 +95,6 @@ def nis(innovation: Annotated[Array, "... m"], cov: Annotated[Cov, "... m m"]) -
     """
     leading(innovation.shape[:-1], cov.shape[:-2], "cov")
     return quadratic_form(cholesky(cov), innovation)
-
-
-@door
-def ensemble_nees(ensemble: Ensemble, truth: Vector) -> Array:
-    r"""NEES of an ensemble, (...): its mean against the truth, in units of its sample covariance.
-
-    Parameters
-    ----------
-    ensemble : array_like, (..., N, d)
-        Members; the covariance has N - 1 in the denominator.
-    truth : array_like, (..., d)
-
-    Raises
-    ------
-    ValueError
-        If N <= d, where the sample covariance is singular, or if the members lie in a subspace.
-
-    Notes
-    -----
-    When truth and members come from one Gaussian, :math:`\epsilon/(1+1/N)` is Hotelling's T², so
-    the average is :math:`d\,(1+1/N)(N-1)/(N-d-2)` for N > d + 2, a little above d: by 4% for d = 6
-    and N = 200.
-
-    Examples
-    --------
-    >>> float(ensemble_nees([[0.0], [1.0], [2.0]], [3.0]))
-    4.0
-    """
-    n, d = ensemble.shape[-2:]
-    if n <= d:
-        raise ValueError(f"ensemble: needs more members than components ({d}), got {n}")
-    leading(ensemble.shape[:-2], truth.shape[:-1], "truth")
-    middle, cov = unchecked(mean)(ensemble), unchecked(sample_covariance)(ensemble)
-    # NEES does not depend on units: scaled to unit variances, rounding does not either, and the
-    # test for a subspace compares pure numbers.
-    scale = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
-    if not np.isfinite(scale).all():
-        raise ValueError("ensemble: needs members of finite variance, got infinity")
-    if (scale <= n * EPS * np.abs(middle)).any():
-        raise ValueError("ensemble: needs members that differ in every component")
-    correlation = cov / (scale[..., :, None] * scale[..., None, :])
-    if np.linalg.eigvalsh(correlation).min(initial=1.0) <= 10 * n * EPS:
-        raise ValueError("ensemble: needs members that span all components, got a subspace")
-    return quadratic_form(cholesky(correlation), (middle - truth) / scale)
 
 
 @door

@@ -76,7 +76,7 @@ def test_a_twin_with_the_same_fields_is_another_kind(tmp_path: Path) -> None:
     for made, asked in ((Twin, EnsembleState), (EnsembleState, Twin)):
         made(0.0, Ledger.empty(1), np.random.default_rng(0), np.zeros((1, 2, 1))).save(
             tmp_path / "a.npz")
-        assert made.load(tmp_path / "a.npz").members == 2
+        assert made.load(tmp_path / "a.npz").ensembles.shape == (1, 2, 1)
         with pytest.raises(ValueError, match=f"needs a saved {asked.__name__}"):
             asked.load(tmp_path / "a.npz")
 
