@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from distfilt.filters import EnsembleFilter, GaussianFilter, ParticleFilter, TransportFilter
+from distfilt.kalman import kalman_filter
 from distfilt.models import LinearModel, simulate
 from distfilt.network import (
     arithmetic_average,
@@ -23,7 +24,7 @@ from distfilt.network import (
     naive_fusion,
     pull,
 )
-from distfilt.sensors import Sensor, direct
+from distfilt.sensors import Sensor, direct, stack
 from distfilt.updates import exact_draws, inflated, serial, square_root, transport
 
 FAMILIES: dict[str, Callable[..., Any]] = {
@@ -42,31 +43,18 @@ FAMILIES: dict[str, Callable[..., Any]] = {
     "ensemble, common": partial(TransportFilter, members=40, agreement=average, rejuvenation=0.1),
 }
 
-ENSEMBLE_RULES = {
-    "pull": partial(pull, gain=0.1),
-    "intersection": intersection,
-    "intersection, equal": partial(intersection, rule="equal"),
-    "intersection, trace": partial(intersection, rule="trace"),
-    "intersection, least trace": partial(intersection, rule="min_trace"),
-}
-GAUSSIAN_RULES = {
-    "intersection": covariance_intersection,
-    "intersection, least determinant": partial(covariance_intersection, rule="min_determinant"),
-    "naive": naive_fusion,
-    "arithmetic": arithmetic_average,
-    "pull": partial(consensus_pull, gain=0.1),
-}
-LIKELIHOOD_RULES = {
-    "average": average,
-    "average, gain": partial(average, gain=0.2),
+RULES = {
+    "ensemble": [partial(pull, gain=0.1), intersection, partial(intersection, rule="min_trace")],
+    "gaussian": [covariance_intersection, naive_fusion, arithmetic_average,
+                 partial(consensus_pull, gain=0.1)],
+    "common": [average, partial(average, gain=0.2)],
 }
 
 
-def rules(family: str) -> dict[str, Callable[..., Any]]:
+def rules(family: str) -> list[Callable[..., Any]]:
     """Agreements that fit the family: of Gaussians, of log-likelihoods or of ensembles."""
-    if family.startswith("gaussian"):
-        return GAUSSIAN_RULES
-    return LIKELIHOOD_RULES if family.endswith("common") else ENSEMBLE_RULES
+    words = [word for word in ("gaussian", "common", "ensemble") if word in family]
+    return RULES[words[0] if words else "ensemble"]
 
 
 Q = np.array([[0.3, 0.1], [0.1, 0.2]])
@@ -104,6 +92,17 @@ def data(
     start = PRIOR[0] + rng.standard_normal((*runs, 2)) @ np.linalg.cholesky(PRIOR[1]).T
     truth = simulate(model(), start, TIMES, rng=rng)
     return truth, [None if s is None else s.observe(truth, rng=rng) for s in sensors]
+
+
+def kalman(seen: Any, sensors: Any) -> tuple[Any, dict[str, Any]]:
+    """The Kalman filter of everybody's readings, with the matrices of its model."""
+    steps, every = np.diff(TIMES, prepend=0.0), stack(sensors)
+    moves = {
+        "F": np.array([model().transition(dt) for dt in steps]),
+        "Q": np.array([dt * Q for dt in steps]),
+    }
+    y = np.concatenate(seen, axis=-1)
+    return kalman_filter(*PRIOR, y, H=every.matrix(2), R=every.cov, **moves), moves
 
 
 def made(family: str, agents: int = 5, **options: Any) -> tuple[Any, Any]:

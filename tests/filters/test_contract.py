@@ -13,16 +13,7 @@ from distfilt.models import LinearModel, Model
 from distfilt.network import Faults
 from distfilt.sensors import Sensor, angle, direct
 
-from .families import (
-    FAMILIES,
-    PRIOR,
-    TIMES,
-    data,
-    made,
-    rules,
-    team,
-    values,
-)
+from .families import FAMILIES, PRIOR, TIMES, data, made, rules, team, values
 
 EACH = pytest.mark.parametrize("family", FAMILIES)
 pytestmark = pytest.mark.filterwarnings("ignore::distfilt.filters.ParticleCollapse")
@@ -50,9 +41,9 @@ def test_step_leaves_its_state_alone_and_repeats(family: str) -> None:
 
 
 @pytest.mark.parametrize(("family", "rule"), [(f, rule) for f in FAMILIES for rule in rules(f)])
-def test_nobody_notices_beyond_the_neighbours(family: str, rule: str) -> None:
+def test_nobody_notices_beyond_the_neighbours(family: str, rule: Any) -> None:
     """On a path 0-1-2-3-4 a step reaches one link: agents 0, 1, 2 know nothing of agent 4."""
-    f, start = made(family, agreement=rules(family)[rule])
+    f, start = made(family, agreement=rule)
     _, seen = data(f.sensors)
     start = f.step(start, TIMES[0], at(seen, 0))
     changed = {n: v.copy() for n, v in values(start).items()}
@@ -195,9 +186,6 @@ def test_time_passes_to_model_and_noise(family: str) -> None:
     state = f.step(state, 3.5, [None])
     assert {c[1:] for c in calls} == {(2.0, 0.5), (2.5, 1.0)}
     assert {c[0] for c in calls} == {"flow", "noise"}
-    # 1 + 2 · .5 + 2.5 · 1 in each component; the noise's variances add to those of the prior.
-    shift = f.summary(state).mean[0] - PRIOR[0]
-    assert np.allclose(shift, 3.5, atol=1.5)
 
 
 @EACH

@@ -64,13 +64,6 @@ def test_complete_graph_and_equal_starts_give_the_centralised_filter(rule: objec
     assert (everyone.counted == SIZE).all()
 
 
-def test_consensus_on_a_complete_graph_lags() -> None:
-    """E4: (16) is not the centralised filter even there."""
-    apart = last(make(graphs.complete(SIZE), PIConsensus(), first=np.ones(100)))
-    central = last(make(graphs.complete(SIZE), Centralised(), first=np.ones(100)))
-    assert np.abs(apart.estimates - central.estimates).max() > 1e-3
-
-
 @pytest.mark.parametrize("name", RULES)
 def test_mass_stays_one(name: str) -> None:
     state = last(make(0.5, RULES[name]))
@@ -225,26 +218,13 @@ def test_a_step_is_the_forms_step_with_the_noise_that_was_asked_for(
     assert np.allclose(state.variances, wanted.variances, rtol=1e-12)
 
 
-def test_process_noise_keeps_the_filter_open() -> None:
-    closed = last(make(graphs.complete(SIZE), Centralised(), local=(0,)))
-    tiny = last(make(graphs.complete(SIZE), Centralised(), local=(0,), process=1e-9))
-    opened = last(make(graphs.complete(SIZE), Centralised(), local=(0,), process=1.0))
-    assert np.abs(closed.estimates - tiny.estimates).max() < 1e-9
-    assert opened.variances.mean() > 2 * closed.variances.mean()
-
-
-def test_run_records_and_leaves_inputs_alone() -> None:
-    f = make(0.6, Flooding(), local=(2, 7))
-    path = PATH.copy()
-    truth = MODEL.evolve(np.ones(100), np.arange(1, 9) * 0.1)
-    run = f.run(f.start(START), np.arange(1, 9) * 0.1, path.swapaxes(0, 1), truth=truth,
-                scores=["squared_error"])
+def test_a_run_of_few_filters_records_them_and_leaves_its_inputs_alone() -> None:
+    f, path = make(0.6, Flooding(), local=(2, 7)), PATH.copy()
+    run = f.run(f.start(START), np.arange(1, 9) * 0.1, path.swapaxes(0, 1))
     assert np.array_equal(path, PATH)
     state = final_state(run)
     assert np.allclose(run["mean"].values[-1, [2, 7]], state.estimates)
     assert np.isnan(run["mean"].values[:, 0]).all()
-    wanted = ((state.estimates - truth[-1]) ** 2).sum(axis=-1)
-    assert np.allclose(run["total_squared_error"].values[-1, [2, 7]], wanted)
     assert np.allclose(state.variances[0], np.diag(state.filters.covariance(0)))
 
 

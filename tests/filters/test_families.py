@@ -16,23 +16,15 @@ from distfilt.filters import (
     ParticleCollapse,
     ParticleFilter,
 )
-from distfilt.kalman import kalman_filter, rts_smoother
+from distfilt.kalman import rts_smoother
 from distfilt.models import Model
 from distfilt.network import covariance_intersection, graphs
 from distfilt.sensors import Sensor, direct
 from distfilt.updates import sampled_noise
 
-from .families import NOISE, PRIOR, TIMES, Q, data, made, model, team
+from .families import NOISE, PRIOR, TIMES, data, kalman, made, model, team
 
 BOTH = Sensor(2, lambda x: x, NOISE, linear=lambda d: np.eye(d))
-
-
-def exact_kalman(seen: np.ndarray) -> object:
-    """The Kalman filter with the matrices written out, for readings (T, ..., 2)."""
-    steps = np.diff(TIMES, prepend=0.0)
-    f = np.array([model().transition(dt) for dt in steps])
-    q = np.array([dt * Q for dt in steps])
-    return kalman_filter(*PRIOR, seen, F=f, Q=q, H=np.eye(2), R=NOISE)
 
 
 def test_gaussian_filter_is_the_kalman_filter_with_full_noise_and_gaps() -> None:
@@ -41,7 +33,7 @@ def test_gaussian_filter_is_the_kalman_filter_with_full_noise_and_gaps() -> None
     seen[4] = np.nan
     run = made("gaussian", sensors=[BOTH], graph=None, runs=(5,))
     out = run[0].run(run[1], TIMES, [seen])
-    exact = exact_kalman(seen)
+    exact, _ = kalman([seen], [BOTH])
     assert np.allclose(out["mean"].values[..., 0, :], exact.means, atol=1e-12)
     assert np.allclose(
         out["covariance"].values[..., 0, :, :],
@@ -77,10 +69,8 @@ def test_gaussian_smoothing_is_the_smoother(rule: str) -> None:
     _, (seen,) = data([BOTH], (4,))
     f = GaussianFilter(model(), [BOTH], rule=rule, lag=len(TIMES))
     out = f.smooth(f.start(PRIOR, runs=(4,)), TIMES, [seen])
-    steps = np.diff(TIMES, prepend=0.0)
-    phi = np.array([model().transition(dt) for dt in steps])
-    q = np.array([dt * Q for dt in steps])
-    exact = rts_smoother(exact_kalman(seen), F=phi, Q=q)
+    filtered, moves = kalman([seen], [BOTH])
+    exact = rts_smoother(filtered, **moves)
     assert np.allclose(out["mean"].values[..., 0, :], exact.means, atol=1e-11)
     assert np.allclose(out["covariance"].values[..., 0, :, :], exact.covariances, atol=1e-11)
 
@@ -135,7 +125,7 @@ def test_particles_tend_to_the_kalman_filter_with_a_full_noise() -> None:
     seen[3, 0] = np.nan
     f = ParticleFilter(model(), [BOTH], members=40_000)
     run = f.run(f.start(PRIOR, rng=np.random.default_rng(0)), TIMES, [seen])
-    exact = exact_kalman(seen)
+    exact, _ = kalman([seen], [BOTH])
     assert np.allclose(run["mean"].values[:, 0], exact.means, atol=0.03)
     assert np.allclose(run["covariance"].values[:, 0], exact.covariances, atol=0.03)
     assert (run["effective_size"].values > 1000).all() and (run["distinct"].values > 0.03).all()
@@ -210,3 +200,20 @@ def test_groups_of_readings_give_each_agent_its_own_noise() -> None:
     variance = f.summary(state).variance[:, 0]
     p = PRIOR[1][0, 0]
     assert np.allclose(variance, [p * 0.01 / (p + 0.01), p * 4 / (p + 4)], rtol=0.1)
+
+
+@pytest.mark.filterwarnings("ignore::distfilt.filters.ParticleCollapse")
+def test_nees_of_a_collapsed_cloud_is_infinite() -> None:
+    # The first reading is 1e6 times sharper than the prior: one particle keeps all the weight.
+    walk = Model(2, lambda x, t, dt: x, lambda t, dt: dt * np.eye(2))
+    f = ParticleFilter(walk, [direct([0, 1], std=1e-6)], members=20)
+    state = f.start((np.zeros(2), np.eye(2)), rng=np.random.default_rng(0), runs=(3,))
+    truth = np.full((2, 3, 2), 0.3)
+    seen = truth.copy()
+    seen[:, 1] = np.nan  # a run without readings stays honest
+    run = f.run(state, [1.0, 2.0], [seen], truth=truth)
+    recorded = run["nees"].values[:, :, 0]
+    assert np.isinf(recorded[:, [0, 2]]).all()
+    mean, cov = run["mean"].values[0, 1, 0], run["covariance"].values[0, 1, 0]
+    gap = mean - truth[0, 1]
+    assert abs(recorded[0, 1] - gap @ np.linalg.solve(cov, gap)) < 1e-9

@@ -9,6 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from distfilt.filters import MixtureFilter, NewsFilter, increment
+from distfilt.kalman import kalman_filter
 from distfilt.mixtures import GaussianMixture
 from distfilt.models import Model
 from distfilt.network import Faults, graphs
@@ -47,14 +48,10 @@ def joint(agents: int, readings: np.ndarray, speed: np.ndarray) -> tuple:
     h[:agents, 0], h[agents, 1] = 1.0, 1.0
     h[:agents, 2:] = -np.eye(agents)
     r = np.diag(np.concatenate([np.full(agents, 0.3), [0.25]]))
-    for y, v in zip(readings, speed, strict=True):
-        m, p = f @ m, f @ p @ f.T + np.diag(np.concatenate([np.zeros(2), np.full(agents, 0.2)]))
-        here = ~np.isnan(np.append(y, v))
-        hh = h[here]
-        gain = p @ hh.T @ np.linalg.inv(hh @ p @ hh.T + r[np.ix_(here, here)])
-        m = m + gain @ (np.append(y, v)[here] - hh @ m)
-        p = p - gain @ hh @ p
-    return m, p
+    q = np.diag(np.concatenate([np.zeros(2), np.full(agents, 0.2)]))
+    seen = np.column_stack([readings, speed])
+    exact = kalman_filter(m, p, seen, F=f, Q=q, H=h, R=r)
+    return exact.means[-1], exact.covariances[-1]
 
 
 @pytest.mark.parametrize("agents", [2, 3, 5])

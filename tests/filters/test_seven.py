@@ -23,13 +23,12 @@ from distfilt.filters import (
     TransportFilter,
 )
 from distfilt.filters.record import final_state
-from distfilt.kalman import kalman_filter
 from distfilt.mixtures import GaussianMixture, target_fusion
 from distfilt.models import LinearModel, lorenz63, rotating_swarm
 from distfilt.network import Faults, Graph, covariance_intersection, graphs
-from distfilt.sensors import Sensor, direct, stack
+from distfilt.sensors import Sensor, direct
 
-from .families import NOISE, PRIOR, TIMES, Q, data, model
+from .families import NOISE, PRIOR, TIMES, Q, data, kalman, model
 
 EYES = [direct([0], std=0.6), Sensor(2, lambda x: x, NOISE, linear=np.eye), direct([1], std=0.5)]
 NET = graphs.complete(3)
@@ -59,14 +58,6 @@ def made(family: str, times: Any = TIMES, **options: Any) -> tuple[Any, Any, Any
     f = SIX[family](model(), given.pop("sensors"), given.pop("graph"), **given)
     seen = [None if s is None else s[: len(times)] for s in seen]
     return f, f.start(PRIOR, rng=np.random.default_rng(0)), seen, truth[: len(times)]
-
-
-def joint(seen: Any, sensors: Any = EYES) -> Any:
-    """The Kalman filter of everybody's readings."""
-    steps, every = np.diff(TIMES, prepend=0.0), stack(sensors)
-    f, q = np.array([model().transition(dt) for dt in steps]), np.array([dt * Q for dt in steps])
-    y = np.concatenate(seen, axis=-1)
-    return kalman_filter(*PRIOR, y, F=f, Q=q, H=every.matrix(2), R=every.cov)
 
 
 @EACH
@@ -127,7 +118,7 @@ def test_everybody_who_hears_all_is_the_joint_filter(family: str, bound: float) 
         x = np.linalg.solve(np.linalg.cholesky(np.cov(x.T)), (x - x.mean(axis=0)).T).T
         prior = PRIOR[0] + x @ np.linalg.cholesky(PRIOR[1]).T
         start, bound = f.start(prior, rng=np.random.default_rng(0)), 1e-10
-    exact = joint(seen)
+    exact, _ = kalman(seen, EYES)
     for k, state in enumerate(f.steps(start, TIMES, seen)):
         found = f.summary(state)
         cov = found.covariance

@@ -11,7 +11,7 @@ import pytest
 from distfilt.coupling import ensemble_transform
 from distfilt.filters import Reading, TransportFilter
 from distfilt.filters.ensemble import EnsembleState
-from distfilt.network import Faults, average, graphs
+from distfilt.network import average, graphs
 from distfilt.sensors import Sensor, direct, stack
 
 from .families import NOISE, PRIOR, TIMES, data, model
@@ -92,12 +92,6 @@ def test_a_late_reading_weighs_all_times_with_one_coupling() -> None:
     w /= w.sum()
     assert np.allclose(after.ensembles[2], ensemble_transform(plain, logs), atol=1e-11)
     assert np.allclose(after.history[-1][1][1].mean(axis=0), w @ before, atol=1e-12)
-
-
-def test_finite_time_averaging_refuses_a_lossy_network() -> None:
-    f = _filter(faults=Faults(loss=0.5, seed=1))
-    with pytest.raises(ValueError, match="channel"):
-        f.step(_start(f), 0.5, [[0.1], [0.2], [0.3, 0.1], [0.2]])
 
 
 def test_a_step_without_any_reading_moves_nothing() -> None:
