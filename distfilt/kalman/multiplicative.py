@@ -17,7 +17,7 @@ from ..doors import MISSING, Array, Count, Cov, Index, Record, Times, door, unch
 from ..gaussians.single import analysis, left_out
 from ..linalg import central
 from ..models import Model
-from ..models.rotations import left_directions, turn_between, turned
+from ..models.satellite import left_directions, turn_between, turned
 from ..sensors import Sensor, stack
 from .linear import GaussianRun, flattened, grid, log_likelihood, unflattened
 
@@ -77,7 +77,7 @@ def quaternion_chart(dim: Count, first: Index) -> Chart:
     """States with a quaternion among their components, and the rest as it is.
 
     The error's components are the state's, with the rotation vector of
-    :func:`distfilt.models.rotations.turned` in the quaternion's place: one fewer.
+    :func:`distfilt.models.satellite.turned` in the quaternion's place: one fewer.
 
     Parameters
     ----------

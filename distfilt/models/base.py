@@ -21,11 +21,6 @@ Strength = Annotated[float, Bounds(at_least=0, at_most=1e150)]
 """Of white noise, per root second: its square is finite."""
 
 
-def white(density: Array, t: float, dt: float) -> Array:
-    """The covariance that white noise of a spectral density gathers in a step."""
-    return np.asarray(density * dt)
-
-
 @dataclass(frozen=True, eq=False)
 class Model(Record):
     """A stochastic model of motion, x(t + dt) = f(x(t), t, dt) + w, w ~ N(0, Q(t, dt)).

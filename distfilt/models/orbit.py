@@ -14,7 +14,7 @@ import numpy as np
 
 from ..doors import Array, Bounds, Count, Positive, door, unchecked
 from .base import Model, Strength
-from .integrators import equal_steps, rk4
+from .motion import equal_steps, rk4
 
 __all__ = [  # fmt: skip
     "J2", "MU", "RADIUS", "acceleration", "occulted", "orbits", "potential", "propagate",
@@ -30,9 +30,6 @@ RADIUS = 6378.1363
 J2 = 1.08262668e-3
 """Coefficient of the Earth's oblateness."""
 
-_LARGEST = 1e75
-"""Positions and velocities up to this have products whose squares are finite."""
-
 
 def _outside(value: Array, name: str) -> None:
     least = float(np.linalg.norm(value, axis=-1).min(initial=np.inf))
@@ -40,7 +37,8 @@ def _outside(value: Array, name: str) -> None:
         raise ValueError(f"{name}: needs a distance above {RADIUS:g} km, got {least:g}")
 
 
-_BOUNDED = Bounds(at_least=-_LARGEST, at_most=_LARGEST)
+_BOUNDED = Bounds(at_least=-1e75, at_most=1e75)
+"""Positions and velocities up to this have products whose squares are finite."""
 Place = Annotated[Array, "... 3", _BOUNDED, _outside]
 Orbits = Annotated[Array, "... 6", _BOUNDED]
 
@@ -140,8 +138,6 @@ def propagate(
     True
     """
     _outside(x[..., :3], "x")
-    if dt == 0:
-        return x.copy()
     steps = equal_steps(abs(dt), longest)
     with np.errstate(all="ignore"):
         for _ in range(steps):

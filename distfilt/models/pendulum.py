@@ -7,13 +7,13 @@ pendulum hangs at :math:`(0, L)`; or, in the chart, the angle from there and its
 from __future__ import annotations
 
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from ..doors import Array, Bounds, NonNegative, Positive, door
 from .base import Model
-from .integrators import integrated
+from .motion import integrated
 
 __all__ = [  # fmt: skip
     "pendulum", "pendulum_angle", "pendulum_chart", "pendulum_energy", "pendulum_rate",
@@ -73,23 +73,6 @@ def _rate(s: Array, t: float, size: float, g: float, printed: bool) -> Array:
     return out
 
 
-def _slope(s: Array, t: float, size: float, g: float, printed: bool) -> Array:
-    """Derivative of the right-hand side, (..., 4, 4)."""
-    x, y, u, v = s[..., 0], s[..., 1], s[..., 2], s[..., 3]
-    k = -1.0 / (size * size)
-    pull = (u * u + v * v + g * y) * k
-    out = np.zeros((*s.shape, 4))
-    out[..., 0, 2] = out[..., 1, 3] = 1.0
-    out[..., 2, 0], out[..., 2, 1] = pull, k * g * x
-    out[..., 2, 2], out[..., 2, 3] = 2 * k * u * x, 2 * k * v * x
-    out[..., 3, 1] = pull + k * g * y
-    out[..., 3, 2], out[..., 3, 3] = 2 * k * u * y, 2 * k * v * y
-    if printed:
-        out[..., 3, 0] -= 2 * k * g * x
-        out[..., 3, 1] -= 2 * k * g * y
-    return out
-
-
 @door
 def pendulum(
     *, length: Length = 1.0, gravity: NonNegative = 9.8, form: Form = "printed",
@@ -113,10 +96,10 @@ def pendulum(
     >>> float(np.hypot(*swing[:2]).round(6))
     1.0
     """
-    given: dict[str, Any] = {"size": length, "g": gravity, "printed": form == "printed"}
     return integrated(
-        partial(_rate, **given), partial(_slope, **given), np.diag(np.repeat(sigma, 2) ** 2),
-        step=step, names=("x", "y", "vx", "vy"), units=("m", "m", "m/s", "m/s"),
+        partial(_rate, size=length, g=gravity, printed=form == "printed"),
+        np.diag(np.repeat(sigma, 2) ** 2), step=step, names=("x", "y", "vx", "vy"),
+        units=("m", "m", "m/s", "m/s"),
     )
 
 
@@ -141,10 +124,9 @@ def pendulum_angle(
     >>> pendulum_angle().step([0.0, 1.0], 0.0, 0.01).round(4)
     array([0.01  , 0.9995])
     """
-    pull = gravity / length
     return integrated(
-        partial(_swing, pull=pull), partial(_swing_slope, pull=pull),
-        np.diag(np.square(sigma)), step=step, names=("theta", "omega"), units=("rad", "rad/s"),
+        partial(_swing, pull=gravity / length), np.diag(np.square(sigma)), step=step,
+        names=("theta", "omega"), units=("rad", "rad/s"),
     )
 
 
@@ -152,13 +134,6 @@ def _swing(x: Array, t: float, pull: float) -> Array:
     out = np.empty_like(x)
     out[..., 0] = x[..., 1]
     out[..., 1] = -pull * np.sin(x[..., 0])
-    return out
-
-
-def _swing_slope(x: Array, t: float, pull: float) -> Array:
-    out = np.zeros((*x.shape, 2))
-    out[..., 0, 1] = 1.0
-    out[..., 1, 0] = -pull * np.cos(x[..., 0])
     return out
 
 

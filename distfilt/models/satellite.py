@@ -1,5 +1,7 @@
 r"""Motion of a satellite in the Hill frame of a chief on a circular orbit: place and attitude.
 
+Rotations are unit quaternions, scalar part first, with the *active* rotation matrix.
+
 The axes are radial (away from the Earth), along the track, and along the orbit's normal. The place
 is :math:`(x, y, z, \dot x, \dot y, \dot z)` in m and m/s, equation (18) of Grange et al. The
 attitude, (19)-(21), is :math:`(\boldsymbol\omega, \mathbf q)`: the angular velocity of the body
@@ -11,16 +13,19 @@ not for its transpose, :math:`\dot{\mathbf R} = -[\boldsymbol\omega]_\times\math
 from __future__ import annotations
 
 from functools import lru_cache, partial
+from typing import Annotated, Any
 
 import numpy as np
 
 from ..doors import Array, Positive, door, unchecked
 from ..linalg import van_loan
 from .base import LinearModel, Model, Strength
-from .integrators import rk4, rk4_jacobian
-from .rotations import cross_matrix, kinematics, left_directions, rotation_matrix
+from .motion import rk4
 
-__all__ = ["clohessy_wiltshire", "satellite_pose"]
+__all__ = [  # fmt: skip
+    "clohessy_wiltshire", "cross_matrix", "left_directions", "quaternion_rate", "rotation_matrix",
+    "satellite_pose", "turn_between", "turned",
+]
 
 
 def _drift(rate: float) -> Array:
@@ -54,14 +59,14 @@ def _transition(dt: float, rate: float) -> Array:
 
 
 @lru_cache(maxsize=64)
-def _noise(rate: float, sigma: float, dt: float) -> Array:
+def _exact_noise(rate: float, sigma: float, dt: float) -> Array:
     cov = unchecked(van_loan)(_drift(rate), sigma**2 * np.eye(6), dt)[1]
     cov.setflags(write=False)
     return cov
 
 
-def _place_noise(t: float, dt: float, rate: float, sigma: float) -> Array:
-    return _noise(rate, sigma, dt)
+def _noise(t: float, dt: float, rate: float, sigma: float) -> Array:
+    return _exact_noise(rate, sigma, dt)
 
 
 @door
@@ -83,7 +88,7 @@ def clohessy_wiltshire(*, rate: Positive, sigma: Strength) -> LinearModel:
     array([0.00401, 0.00401, 0.00401, 0.004  , 0.004  , 0.004  ])
     """
     return LinearModel.from_transition(
-        6, partial(_transition, rate=rate), partial(_place_noise, rate=rate, sigma=sigma),
+        6, partial(_transition, rate=rate), partial(_noise, rate=rate, sigma=sigma),
         names=("x", "y", "z", "vx", "vy", "vz"), units=("m", "m", "m", "m/s", "m/s", "m/s"),
     )
 
@@ -111,7 +116,6 @@ def satellite_pose(*, rate: Positive, sigma: Strength, step: Positive = 0.01) ->
     place = clohessy_wiltshire(rate=rate, sigma=sigma)
     return Model(
         13, partial(_flow, rate=rate, step=step), partial(_pose_noise, rate=rate, sigma=sigma),
-        derivative=partial(_derivative, rate=rate, step=step),
         names=(*place.names, "w1", "w2", "w3", "q1", "q2", "q3", "q4"),
         units=(*place.units, *["rad/s"] * 3, *["1"] * 4),
     )
@@ -119,7 +123,7 @@ def satellite_pose(*, rate: Positive, sigma: Strength, step: Positive = 0.01) ->
 
 def _pose_noise(t: float, dt: float, rate: float, sigma: float) -> Array:
     cov = np.zeros((13, 13))
-    cov[:6, :6] = _noise(rate, sigma, dt)
+    cov[:6, :6] = _noise(t, dt, rate, sigma)
     cov[6:9, 6:9] = sigma**2 * dt * np.eye(3)
     return cov
 
@@ -130,16 +134,6 @@ def _flow(x: Array, t: float, dt: float, rate: float, step: float) -> Array:
     rows = np.ascontiguousarray(np.moveaxis(x[..., 6:], -1, 0))
     body = unchecked(rk4)(partial(_rates, alpha=rate), rows, t, dt, longest=step)
     return np.concatenate([moved, np.moveaxis(body, 0, -1)], axis=-1)
-
-
-def _derivative(x: Array, t: float, dt: float, rate: float, step: float) -> Array:
-    def rates(body: Array, _: float) -> Array:
-        return np.moveaxis(_rates(np.moveaxis(body, -1, 0), 0.0, rate), 0, -1)
-
-    out = np.zeros((*x.shape, 13))
-    out[..., :6, :6] = _transition(dt, rate)
-    out[..., 6:, 6:] = rk4_jacobian(rates, partial(_slopes, alpha=rate), x[..., 6:], t, dt, step)
-    return out
 
 
 def _rates(rows: Array, t: float, alpha: float) -> Array:
@@ -166,22 +160,164 @@ def _angular_acceleration(q: Array, w: Array, alpha: float) -> list[Array]:
     return [w2 * v3 - w3 * v2, w3 * v1 - w1 * v3, w1 * v2 - w2 * v1]
 
 
-def _slopes(x: Array, t: float, alpha: float) -> Array:
-    r"""Derivative of (20) and (21), (..., 7, 7).
+def _far_from_zero(value: Array, name: str) -> None:
+    with np.errstate(over="ignore", under="ignore"):
+        squares = (value**2).sum(axis=-1)
+    if not (np.isfinite(squares) & (squares > 1e-280)).all():
+        got = np.abs(value).max()
+        raise ValueError(f"{name}: needs quaternions that are not zero or infinite, got {got:g}")
 
-    With v = R(q) (0, 0, α), the rate [ω]v has the slopes -[v] in ω and [ω] dv/dq in q.
+
+Quaternion = Annotated[Array, "... 4", _far_from_zero]
+Vector = Annotated[Array, "... 3"]
+
+
+@door
+def cross_matrix(vector: Vector) -> Array:
+    r"""The cross product :math:`[\boldsymbol\omega]_\times` as a matrix (..., 3, 3), equation (19).
+
+    Parameters
+    ----------
+    vector : array_like, (..., 3)
+
+    Examples
+    --------
+    >>> cross_matrix([0.0, 0.0, 1.0]) @ [1.0, 0.0, 0.0]
+    array([0., 1., 0.])
     """
-    w, q = x[..., :3], x[..., 3:]
-    a, b, c, d = (q[..., k] for k in range(4))
-    squared = (q**2).sum(axis=-1)[..., None, None]
-    third = unchecked(rotation_matrix)(q)[..., 2]
-    rows = [[c, d, a, b], [-b, -a, d, c], [a, -b, -c, d]]
-    bent = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-    turn = 2 * alpha * (bent - third[..., None] * q[..., None, :]) / squared
-    out = np.zeros((*x.shape, 7))
-    out[..., :3, :3] = -unchecked(cross_matrix)(alpha * third)
-    out[..., :3, 3:] = unchecked(cross_matrix)(w) @ turn
-    out[..., 3:, :3] = -unchecked(left_directions)(q)
-    out[..., 3, 4:], out[..., 4:, 3] = 0.5 * w, -0.5 * w
-    out[..., 4:, 4:] = -0.5 * unchecked(cross_matrix)(w)
-    return out
+    return np.cross(np.eye(3), vector[..., None, :])
+
+
+@door
+def rotation_matrix(quaternion: Quaternion) -> Array:
+    r"""The active rotation matrix R(q), (..., 3, 3), of a quaternion with its scalar part first.
+
+    Members of an ensemble need not have unit length, so the length is divided out.
+
+    Parameters
+    ----------
+    quaternion : array_like, (..., 4)
+        Not zero.
+
+    Examples
+    --------
+    A quarter turn about the third axis takes the first axis to the second:
+
+    >>> (rotation_matrix([1.0, 0.0, 0.0, 1.0]) @ [1.0, 0.0, 0.0]).round(12)
+    array([0., 1., 0.])
+    """
+    return _rotations(quaternion).as_matrix().reshape(*quaternion.shape[:-1], 3, 3)
+
+
+def _rotations(quaternion: Array) -> Any:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_quat(quaternion.reshape(-1, 4), scalar_first=True)
+
+
+@door
+def left_directions(quaternion: Quaternion) -> Array:
+    r"""How a quaternion changes as the body turns a little further about the frame's axes.
+
+    The derivative at zero of :func:`turned` in its angle. Equation (21) is
+    :math:`\dot{\mathbf q} = -\mathbf D(\mathbf q)\,\boldsymbol\omega`.
+
+    Parameters
+    ----------
+    quaternion : array_like, (..., 4)
+        Not zero.
+
+    Returns
+    -------
+    ndarray, (..., 4, 3)
+        Its columns are orthogonal to the quaternion and to each other, half as long as it.
+
+    Examples
+    --------
+    >>> left_directions([1.0, 0.0, 0.0, 0.0])[1:]
+    array([[0.5, 0. , 0. ],
+           [0. , 0.5, 0. ],
+           [0. , 0. , 0.5]])
+    """
+    q = quaternion
+    out = np.empty((*q.shape, 3))
+    out[..., 0, :] = -q[..., 1:]
+    out[..., 1:, :] = -unchecked(cross_matrix)(q[..., 1:])
+    out[..., 1:, :] += q[..., :1, None] * np.eye(3)
+    return 0.5 * out + 0.0
+
+
+@door
+def turned(quaternion: Quaternion, angle: Vector) -> Array:
+    r"""The attitude (..., 4) turned further, :math:`e^{\boldsymbol\theta/2}\mathbf q`.
+
+    Parameters
+    ----------
+    quaternion : array_like, (..., 4)
+        Not zero; its length is kept.
+    angle : array_like, (..., 3)
+        Rotation vector in the frame that R(q) leads to, in rad.
+
+    Examples
+    --------
+    >>> turned([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2]).round(4)
+    array([0.7071, 0.    , 0.    , 0.7071])
+    """
+    half = 0.5 * np.linalg.norm(angle, axis=-1)[..., None]
+    move = (unchecked(left_directions)(quaternion) @ angle[..., None])[..., 0]
+    return np.asarray(np.cos(half) * quaternion + np.sinc(half / np.pi) * move)
+
+
+@door
+def turn_between(quaternion: Quaternion, other: Quaternion) -> Array:
+    """The rotation vector that takes one attitude to another, the inverse of :func:`turned`.
+
+    Parameters
+    ----------
+    quaternion, other : array_like, (..., 4)
+        Not zero; their lengths and signs do not matter.
+
+    Returns
+    -------
+    ndarray, (..., 3)
+        In rad, at most π long.
+
+    Examples
+    --------
+    >>> turn_between([1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, -1.0]).round(4)
+    array([ 0.    ,  0.    , -1.5708])
+    """
+    before, after = np.broadcast_arrays(quaternion, other)
+    turn = _rotations(after) * _rotations(before).inv()
+    return turn.as_rotvec().reshape(*before.shape[:-1], 3)
+
+
+@door
+def quaternion_rate(quaternion: Quaternion, angular_velocity: Vector) -> Array:
+    """The quaternion's derivative in 1/s, (..., 4), equation (21); it keeps the length.
+
+    Parameters
+    ----------
+    quaternion : array_like, (..., 4)
+    angular_velocity : array_like, (..., 3)
+        Of the body relative to the Hill frame, in rad/s.
+
+    Examples
+    --------
+    >>> quaternion_rate([1.0, 0.0, 0.0, 0.0], [0.2, 0.0, 0.0]) + 0.0
+    array([ 0. , -0.1,  0. ,  0. ])
+    """
+    rows = kinematics(np.moveaxis(quaternion, -1, 0), np.moveaxis(angular_velocity, -1, 0))
+    return np.stack(rows, axis=-1)
+
+
+def kinematics(q: Array, w: Array) -> list[Array]:
+    """Equation (21), components first."""
+    a, b, c, d = q
+    w1, w2, w3 = w
+    return [
+        0.5 * (b * w1 + c * w2 + d * w3),
+        -0.5 * (a * w1 + d * w2 - c * w3),
+        -0.5 * (a * w2 + b * w3 - d * w1),
+        -0.5 * (c * w1 - b * w2 + a * w3),
+    ]

@@ -13,10 +13,7 @@ from ..doors import Array, Bounds, Count, NonNegative, Positive, Record, Rng, Ti
 from ..doors.values import array
 from .base import path
 
-__all__ = ["READINGS", "RotatingMixture", "Swarm", "rotating_swarm"]
-
-READINGS = ("literal", "gibbs", "slowgibbs")
-"""Readings of equation (23) of Zheng and Lin, see :func:`rotating_swarm`."""
+__all__ = ["RotatingMixture", "Swarm", "rotating_swarm"]
 
 Positions = Annotated[Array, "... self.dim"]
 
@@ -223,7 +220,7 @@ def rotating_swarm(
     strength: Annotated[float, Bounds(above=0, at_most=1e150)] = 0.03,
     mixture: RotatingMixture | None = None,
 ) -> Swarm:
-    """The swarm of Zheng and Lin's study, equation (23), in one of its `READINGS`.
+    """The swarm of Zheng and Lin's study, equation (23), in one of three readings.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ from distfilt.kalman import (
 )
 from distfilt.linalg import central
 from distfilt.models import Model, constant_velocity, satellite_pose, simulate
-from distfilt.models.rotations import turned
+from distfilt.models.satellite import turned
 from distfilt.sensors import direct, distance_and_angle, stack
 from distfilt.sensors.kinds import differential
 from tests.kalman.problems import spd

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import distfilt.models as att
 from distfilt.linalg import central
 from distfilt.models import satellite as sat
-from distfilt.models.rotations import left_directions, turn_between, turned
+from distfilt.models.satellite import left_directions, turn_between, turned
 
 START = np.array([0.3, 0.2, 0.1, 1.0, 0.0, 0.0, 0.0])
 
