@@ -14,7 +14,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import _satellites as satellites
 
-from distfilt.kalman import multiplicative_filter, quaternion_chart
+from distfilt.kalman import QuaternionChart, multiplicative_filter
 
 NAME, PAPER, BATCH = "table-3", "grange", 4
 SETUP = satellites.setup("table-3")
@@ -38,7 +38,7 @@ rtol = 1e-4
 
 def central(truth: np.ndarray, seen: list[np.ndarray]) -> dict[str, float]:
     """The multiplicative filter of all sensors: twelve errors, three of them of the attitude."""
-    chart, (mean, cov) = quaternion_chart(13, 9), SETUP.prior
+    chart, (mean, cov) = QuaternionChart(13, 9), SETUP.prior
     unit = np.concatenate([mean[:9], mean[9:] / np.linalg.norm(mean[9:])])
     found = multiplicative_filter(
         unit, chart.project(mean, cov), np.concatenate(seen, axis=-1), chart=chart,

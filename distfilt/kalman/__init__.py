@@ -5,10 +5,10 @@ Filterpy's stand beside them as the reference. Extended and unscented filters ar
 """
 
 from .linear import GaussianRun, kalman_filter, rts_smoother
-from .multiplicative import Chart, multiplicative_filter, quaternion_chart
+from .multiplicative import QuaternionChart, multiplicative_filter
 from .reference import filterpy_ekf, filterpy_kf, filterpy_ukf
 
 __all__ = [  # fmt: skip
-    "Chart", "GaussianRun", "filterpy_ekf", "filterpy_kf", "filterpy_ukf", "kalman_filter",
-    "multiplicative_filter", "quaternion_chart", "rts_smoother",
+    "GaussianRun", "QuaternionChart", "filterpy_ekf", "filterpy_kf", "filterpy_ukf",
+    "kalman_filter", "multiplicative_filter", "rts_smoother",
 ]

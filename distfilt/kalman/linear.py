@@ -16,6 +16,11 @@ from ..sensors import Sensor
 __all__ = ["GaussianRun", "kalman_filter", "rts_smoother"]
 
 Runs = tuple[int, ...]
+Mean = Annotated[Array, "... d"]
+Matrix = Annotated[Array, "... d d"]
+Seen = Annotated[Array, "... m d"]
+Noise = Annotated[Cov, "... m m"]
+Series = Annotated[Array, "... N m", MISSING]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +49,6 @@ class GaussianRun(Record):
     covariances: Annotated[Array, "... k k"]
     log_likelihood: Array
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        x, p = self.means.shape, self.covariances.shape
-        if len(p) != len(x) + 1 or p[0] != x[0]:
-            raise ValueError(f"covariances: needs one for each of the means {x}, got {p}")
-        leading(x[:-1], p[:-2], "covariances")
-
     @property
     def dim(self) -> int:
         """Number d of a state's components."""
@@ -59,14 +57,7 @@ class GaussianRun(Record):
 
 @door
 def kalman_filter(
-    mean: Annotated[Array, "... d"],
-    cov: Cov,
-    observations: Annotated[Array, "... N m", MISSING],
-    *,
-    F: Annotated[Array, "... d d"],
-    H: Annotated[Array, "... m d"],
-    Q: Semidefinite,
-    R: Annotated[Cov, "... m m"],
+    mean: Mean, cov: Cov, observations: Series, *, F: Matrix, H: Seen, Q: Semidefinite, R: Noise
 ) -> GaussianRun:
     r"""Filter T observations of a linear Gaussian model, for any number of runs at once.
 
@@ -126,15 +117,13 @@ def kalman_filter(
     if not np.isfinite(means).all():
         raise np.linalg.LinAlgError("kalman_filter: needs matrices without overflow, got infinity")
     density = log_likelihood(gaps, inner, missing)
-    return unflattened(means, covs, density, runs, (1,) * len(runs) if shared else runs)
+    return unflattened(means, covs, density, runs)
 
 
 @door
 def rts_smoother(
-    run: GaussianRun,
-    *,
-    F: Annotated[Array, "... run.dim run.dim"],
-    Q: Annotated[Semidefinite, "... run.dim run.dim"],
+    run: GaussianRun, *, F: Annotated[Array, "... run.dim run.dim"],
+    Q: Annotated[Semidefinite, "... run.dim run.dim"]
 ) -> GaussianRun:
     r"""States given all observations, backwards through a Kalman filter's run.
 
@@ -156,7 +145,7 @@ def rts_smoother(
     Raises
     ------
     numpy.linalg.LinAlgError
-        If a forecast covariance is not positive definite.
+        If a forecast covariance is singular.
 
     Notes
     -----
@@ -176,23 +165,13 @@ def rts_smoother(
     means, covs = run.means.copy(), run.covariances.copy()
     for k in reversed(range(len(f) - 1)):
         x, p = run.means[k], run.covariances[k]
-        gain = _gain(p, f[k + 1], q[k + 1])
+        forward = f[k + 1] @ p
+        gain = np.linalg.solve(symmetrise(forward @ f[k + 1].T + q[k + 1]), forward).mT
         gap = means[k + 1] - x @ f[k + 1].T
         means[k] = x + (gain @ gap[..., None])[..., 0]
         kept = np.eye(run.dim) - gain @ f[k + 1]
         covs[k] = symmetrise(kept @ p @ kept.mT + gain @ (covs[k + 1] + q[k + 1]) @ gain.mT)
     return run.changed(means=means, covariances=covs)
-
-
-def _gain(p: Array, f: Array, q: Array) -> Array:
-    """P F' (F P F' + Q)^-1, (..., d, d), by a Cholesky factor."""
-    forward = f @ p
-    try:
-        lower = np.linalg.cholesky(symmetrise(forward @ f.T + q))
-    except np.linalg.LinAlgError:
-        raise np.linalg.LinAlgError("a forecast covariance is not positive definite") from None
-    half = np.linalg.solve(lower, forward)
-    return np.linalg.solve(lower.mT, half).mT
 
 
 def flattened(mean: Array, cov: Array, observations: Array) -> tuple[Runs, Array, Array, Array]:
@@ -210,11 +189,10 @@ def flattened(mean: Array, cov: Array, observations: Array) -> tuple[Runs, Array
     return runs, y, x, p
 
 
-def unflattened(
-    means: Array, covs: Array, density: Array, runs: Runs, cov_runs: Runs | None = None
-) -> GaussianRun:
+def unflattened(means: Array, covs: Array, density: Array, runs: Runs) -> GaussianRun:
     """What a filter found of all runs, (T, R, ...), with their axes apart."""
-    steps, lead = len(means), runs if cov_runs is None else cov_runs
+    steps = len(means)
+    lead = runs if covs.shape[1] == means.shape[1] else (1,) * len(runs)
     return GaussianRun.unchecked(
         means.reshape(steps, *runs, *means.shape[2:]),
         covs.reshape(steps, *lead, *covs.shape[2:]),

@@ -1,80 +1,31 @@
-r"""An extended Kalman filter for states that do not fill their space, such as a unit quaternion.
+r"""The multiplicative extended Kalman filter, for states with a unit quaternion.
 
-The mean stays where states can be; its error lives in the tangent directions. For a quaternion
-that is the multiplicative extended Kalman filter: three numbers for the error of an attitude, and
-no spread along its length.
+The mean stays where states can be; its error lives in the tangent directions: three numbers for the
+error of an attitude, and no spread along its length.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 
-from ..doors import MISSING, Array, Count, Cov, Index, Record, Times, door, unchecked
+from ..doors import Array, Count, Cov, Index, Record, Times, door, unchecked
 from ..gaussians.single import analysis, left_out
 from ..linalg import central
 from ..models import Model
 from ..models.satellite import left_directions, turn_between, turned
 from ..sensors import Sensor, stack
-from .linear import GaussianRun, flattened, grid, log_likelihood, unflattened
+from .linear import GaussianRun, Series, flattened, grid, log_likelihood, unflattened
 
-__all__ = ["Chart", "multiplicative_filter", "quaternion_chart"]
+__all__ = ["QuaternionChart", "multiplicative_filter"]
 
 
 @dataclass(frozen=True, eq=False)
-class Chart(Record):
-    """How errors with k components move a state with d.
-
-    Parameters
-    ----------
-    dim, error_dim : int
-        Sizes d of the state and k of the error, k ≤ d.
-    retract : callable
-        ``retract(x, e) -> x`` moves states (..., d) by errors (..., k).
-    local : callable
-        ``local(x, other) -> e``, its inverse: the error that takes x to `other`.
-    directions : callable
-        ``directions(x)``, the derivative of `retract` at no error, (..., d, k), of full rank.
-
-    Examples
-    --------
-    >>> plain = Chart(2, 2, np.add, lambda x, other: other - x, lambda x: np.eye(2))
-    >>> plain.project([1.0, 2.0], np.eye(2))
-    array([[1., 0.],
-           [0., 1.]])
-    """
-
-    dim: Count
-    error_dim: Count
-    retract: Callable[[Array, Array], Array]
-    local: Callable[[Array, Array], Array]
-    directions: Callable[[Array], Array]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.error_dim > self.dim:
-            raise ValueError(f"error_dim: needs at most {self.dim}, got {self.error_dim}")
-
-    @door
-    def project(
-        self, x: Annotated[Array, "... self.dim"], cov: Annotated[Array, "... self.dim self.dim"]
-    ) -> Array:
-        """Covariance of the errors, (..., k, k), of states with covariance `cov`, (..., d, d)."""
-        inwards = self._inwards(x)
-        return inwards @ cov @ inwards.mT
-
-    def _inwards(self, x: Array) -> Array:
-        """The errors (..., k, d) of small moves of the state: the directions' pseudo-inverse."""
-        b = self.directions(x)
-        return np.asarray(np.linalg.solve(b.mT @ b, b.mT))
-
-
-@door
-def quaternion_chart(dim: Count, first: Index) -> Chart:
-    """States with a quaternion among their components, and the rest as it is.
+class QuaternionChart(Record):
+    """How errors move a state with a quaternion among its components, and the rest as it is.
 
     The error's components are the state's, with the rotation vector of
     :func:`distfilt.models.satellite.turned` in the quaternion's place: one fewer.
@@ -88,44 +39,68 @@ def quaternion_chart(dim: Count, first: Index) -> Chart:
 
     Examples
     --------
-    >>> chart = quaternion_chart(5, 1)
+    >>> chart = QuaternionChart(5, 1)
     >>> chart.retract(np.array([2.0, 1, 0, 0, 0]), np.array([0.5, np.pi, 0, 0])).round(3) + 0.0
     array([2.5, 0. , 1. , 0. , 0. ])
+    >>> chart.project([2.0, 1, 0, 0, 0], np.eye(5)).diagonal()
+    array([1., 4., 4., 4.])
     """
-    d, at = dim, first
-    if at + 4 > d:
-        raise ValueError(f"first: needs four components from there on, got {first} of {dim}")
 
-    def retract(x: Array, e: Array) -> Array:
+    dim: Count
+    first: Index
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.first + 4 > self.dim:
+            needs = f"four components from there on, got {self.first} of {self.dim}"
+            raise ValueError(f"first: needs {needs}")
+
+    @property
+    def error_dim(self) -> int:
+        """Size k of the error."""
+        return self.dim - 1
+
+    def retract(self, x: Array, e: Array) -> Array:
+        """Move states (..., d) by errors (..., k)."""
+        at = self.first
         turn = unchecked(turned)(x[..., at : at + 4], e[..., at : at + 3])
         before, behind = x[..., :at] + e[..., :at], x[..., at + 4 :] + e[..., at + 3 :]
         return np.concatenate([before, turn, behind], axis=-1)
 
-    def local(x: Array, other: Array) -> Array:
+    def local(self, x: Array, other: Array) -> Array:
+        """The error that takes x to `other`, the inverse of `retract`."""
+        at, gap = self.first, other - x
         turn = unchecked(turn_between)(x[..., at : at + 4], other[..., at : at + 4])
-        gap = other - x
         return np.concatenate([gap[..., :at], turn, gap[..., at + 4 :]], axis=-1)
 
-    def directions(x: Array) -> Array:
-        out = np.zeros((*x.shape, d - 1))
+    def directions(self, x: Array) -> Array:
+        """The derivative of `retract` at no error, (..., d, k)."""
+        at = self.first
+        out = np.zeros((*x.shape, self.error_dim))
         out[..., :at, :at] = np.eye(at)
         out[..., at : at + 4, at : at + 3] = unchecked(left_directions)(x[..., at : at + 4])
-        out[..., at + 4 :, at + 3 :] = np.eye(d - at - 4)
+        out[..., at + 4 :, at + 3 :] = np.eye(self.dim - at - 4)
         return out
 
-    return Chart(d, d - 1, retract, local, directions)
+    @door
+    def project(
+        self, x: Annotated[Array, "... self.dim"], cov: Annotated[Array, "... self.dim self.dim"]
+    ) -> Array:
+        """Covariance of the errors, (..., k, k), of states with covariance `cov`, (..., d, d)."""
+        inwards = self.inwards(x)
+        return inwards @ cov @ inwards.mT
+
+    def inwards(self, x: Array) -> Array:
+        """The errors (..., k, d) of small moves of the state: the directions' pseudo-inverse."""
+        b = self.directions(x)
+        return np.asarray(np.linalg.solve(b.mT @ b, b.mT))
 
 
 @door
 def multiplicative_filter(
     mean: Annotated[Array, "... model.dim"],
-    cov: Annotated[Cov, "... chart.error_dim chart.error_dim"],
-    observations: Annotated[Array, "... N m", MISSING],
-    *,
-    chart: Chart,
-    model: Model,
-    sensors: Sequence[Sensor],
-    times: Times,
+    cov: Annotated[Cov, "... chart.error_dim chart.error_dim"], observations: Series, *,
+    chart: QuaternionChart, model: Model, sensors: Sequence[Sensor], times: Times
 ) -> GaussianRun:
     r"""The extended Kalman filter on a chart's errors, over series of observations.
 
@@ -140,12 +115,12 @@ def multiplicative_filter(
     mean : array_like, (d,) or (..., d)
         Prior mean at time 0.
     cov : array_like, (k, k) or (..., k, k)
-        Prior covariance of the error; :meth:`Chart.project` makes it of the state's.
+        Prior covariance of the error; :meth:`QuaternionChart.project` makes it of the state's.
     observations : array_like, (T, ..., m)
         The observations of all sensors, one after the other; the middle axes are the runs. NaN
         marks a missing component.
-    chart : Chart
-        Such as :func:`quaternion_chart`.
+    chart : QuaternionChart
+        Which components are the quaternion.
     model : Model
         Linearised about each analysis mean.
     sensors : sequence of Sensor
@@ -171,7 +146,7 @@ def multiplicative_filter(
     >>> from distfilt.sensors import direct
     >>> x = np.r_[np.zeros(6), [0.3, 0.2, 0.1], [1.0, 0.0, 0.0, 0.0]]
     >>> run = multiplicative_filter(
-    ...     x, 0.01 * np.eye(12), np.zeros((1, 3)), chart=quaternion_chart(13, 9),
+    ...     x, 0.01 * np.eye(12), np.zeros((1, 3)), chart=QuaternionChart(13, 9),
     ...     model=satellite_pose(rate=0.1, sigma=0.2, step=0.1),
     ...     sensors=[direct([10, 11, 12], std=0.1)], times=[0.1])
     >>> float((run.means[0, 9:] ** 2).sum().round(9)), run.covariances.shape
@@ -194,11 +169,12 @@ def multiplicative_filter(
 
 
 def _step(
-    x: Array, p: Array, y: Array, chart: Chart, model: Model, sensor: Sensor, t: float, dt: float
+    x: Array, p: Array, y: Array, chart: QuaternionChart, model: Model, sensor: Sensor, t: float,
+    dt: float
 ) -> tuple[Array, Array, Array]:
     """Means (R, d), covariances (R, k, k) and log densities (R,) one reading later."""
     moved = _finite(unchecked(model.step)(x, t, dt))
-    inwards = chart._inwards(moved)
+    inwards = chart.inwards(moved)
     slope = inwards @ unchecked(model.jacobian)(x, t, dt) @ chart.directions(x)
     joint = slope @ p @ slope.mT + inwards @ model.noise(t, dt) @ inwards.mT
     previous = None
@@ -222,7 +198,7 @@ def _finite(x: Array) -> Array:
     return x
 
 
-def _errors_seen(x: Array, previous: Array | None, sensor: Sensor, chart: Chart) -> Array:
+def _errors_seen(x: Array, previous: Array | None, sensor: Sensor, chart: QuaternionChart) -> Array:
     """How a sensor sees the errors (R, m, k), of the previous state too if it uses it."""
     slope = unchecked(sensor.jacobian)(x, previous) @ chart.directions(x)
     if previous is None:

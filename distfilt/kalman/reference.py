@@ -11,29 +11,37 @@ update on the same sigma points can give a negative variance.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Annotated, Any
 
 import numpy as np
 
-from ..doors import MISSING, Array, Cov, Mask, Semidefinite, Times, door, needed
+from ..doors import Array, Cov, Mask, Semidefinite, Times, door, needed
 from ..models import Model
 from ..sensors import Sensor, stack
-from .linear import GaussianRun, flattened, grid, per_step, unflattened
+from .linear import (
+    GaussianRun,
+    Matrix,
+    Mean,
+    Noise,
+    Seen,
+    Series,
+    flattened,
+    grid,
+    per_step,
+    unflattened,
+)
 
 __all__ = ["filterpy_ekf", "filterpy_kf", "filterpy_ukf"]
+
+State = Annotated[Array, "... model.dim"]
+Spread = Annotated[Cov, "... model.dim model.dim"]
 
 
 @door
 def filterpy_kf(
-    mean: Annotated[Array, "... d"],
-    cov: Cov,
-    observations: Annotated[Array, "... N m", MISSING],
-    *,
-    F: Annotated[Array, "... d d"],
-    H: Annotated[Array, "... m d"],
-    Q: Semidefinite,
-    R: Annotated[Cov, "... m m"],
+    mean: Mean, cov: Cov, observations: Series, *, F: Matrix, H: Seen, Q: Semidefinite, R: Noise
 ) -> GaussianRun:
     """Filterpy's Kalman filter over a series: arguments and result of :func:`kalman_filter`.
 
@@ -48,35 +56,22 @@ def filterpy_kf(
     >>> run.means, run.covariances
     (array([[1.]]), array([[[0.5]]]))
     """
-    filterpy = needed("filterpy.kalman", "reference")
-
     f, h, q, r = per_step(len(observations), F=F, H=H, Q=Q, R=R)
     m, d = h.shape[1:]
 
-    def start(x: Array, p: Array) -> Any:
-        kf = filterpy.KalmanFilter(dim_x=d, dim_z=m)
-        kf.x, kf.P = x.copy(), p.copy()
-        return kf
-
     def step(kf: Any, k: int, z: Array, seen: Mask) -> None:
         kf.predict(F=f[k], Q=q[k])
-        if seen.all():
-            kf.update(z, H=h[k], R=r[k])
-        elif seen.any():
+        if seen.any():
             kf.update(z[seen], H=h[k][seen], R=r[k][np.ix_(seen, seen)])
 
-    return _over_runs(mean, cov, observations, start, step)
+    make = partial(needed("filterpy.kalman", "reference").KalmanFilter, dim_x=d, dim_z=m)
+    return _over_runs(mean, cov, observations, make, step)
 
 
 @door
 def filterpy_ekf(
-    mean: Annotated[Array, "... model.dim"],
-    cov: Annotated[Cov, "... model.dim model.dim"],
-    observations: Annotated[Array, "... N m", MISSING],
-    *,
-    model: Model,
-    sensors: Sequence[Sensor],
-    times: Times,
+    mean: State, cov: Spread, observations: Series, *, model: Model, sensors: Sequence[Sensor],
+    times: Times
 ) -> GaussianRun:
     r"""Filterpy's extended Kalman filter over a series: linearise the model and the sensors.
 
@@ -95,13 +90,7 @@ def filterpy_ekf(
     >>> run.means.round(6)
     array([[2.]])
     """
-    filterpy, sensor = needed("filterpy.kalman", "reference"), _present(sensors)
-    clock = grid(times, observations, sensor)
-
-    def start(x: Array, p: Array) -> Any:
-        kf = filterpy.ExtendedKalmanFilter(dim_x=model.dim, dim_z=sensor.dim)
-        kf.x, kf.P = x.copy(), p.copy()
-        return kf
+    sensor, clock = _present(sensors, times, observations)
 
     def step(kf: Any, k: int, z: Array, seen: Mask) -> None:
         t, dt = float(clock[k]), float(clock[k + 1] - clock[k])
@@ -110,36 +99,28 @@ def filterpy_ekf(
         kf.predict()
         kf.x = moved  # filterpy moves the mean with F; the model itself is the better step
         if seen.any():
-            kf.update(
-                z[seen],
-                HJacobian=lambda x: sensor.jacobian(x)[seen],
-                Hx=lambda x: sensor.predict(x)[seen],
-                R=sensor.cov[np.ix_(seen, seen)],
-                residual=_residual_of(sensor, seen),
-            )
+            # It gets residuals, which the sensor wraps, in place of readings.
+            gap, h = sensor.residual(z, sensor.predict(moved))[seen], sensor.jacobian(moved)[seen]
+            kf.update(gap, lambda x: h, lambda x: 0 * gap, sensor.cov[np.ix_(seen, seen)])
 
-    return _over_runs(mean, cov, observations, start, step)
+    make = needed("filterpy.kalman", "reference").ExtendedKalmanFilter
+    make = partial(make, dim_x=model.dim, dim_z=sensor.dim)
+    return _over_runs(mean, cov, observations, make, step)
 
 
 @door
 def filterpy_ukf(
-    mean: Annotated[Array, "... model.dim"],
-    cov: Annotated[Cov, "... model.dim model.dim"],
-    observations: Annotated[Array, "... N m", MISSING],
-    *,
-    model: Model,
-    sensors: Sequence[Sensor],
-    times: Times,
-    kappa: float = 1.0,
+    mean: State, cov: Spread, observations: Series, *, model: Model, sensors: Sequence[Sensor],
+    times: Times
 ) -> GaussianRun:
     r"""Filterpy's unscented Kalman filter over a series: 2d + 1 points instead of derivatives.
+
+    The points lie :math:`\sqrt{d+1}` standard deviations from the mean.
 
     Parameters
     ----------
     mean, cov, observations, model, sensors, times
         As for :func:`filterpy_ekf`.
-    kappa : float
-        The points lie :math:`\sqrt{d+\kappa}` standard deviations from the mean.
 
     Examples
     --------
@@ -150,16 +131,19 @@ def filterpy_ukf(
     >>> run.means.round(6)
     array([[2.]])
     """
-    sensor = _present(sensors)
-    clock = grid(times, observations, sensor)
-    if kappa <= -model.dim:
-        raise ValueError(f"kappa: needs more than -{model.dim}, got {kappa:g}")
-    start = _unscented(model, sensor.dim, kappa)
+    sensor, clock = _present(sensors, times, observations)
+    filterpy = needed("filterpy.kalman", "reference")
+
+    def make() -> Any:
+        points = filterpy.MerweScaledSigmaPoints(model.dim, 1.0, 0.0, 1.0)
+        return filterpy.UnscentedKalmanFilter(model.dim, sensor.dim, 0.0, None, None, points)
 
     def step(kf: Any, k: int, z: Array, seen: Mask) -> None:
         t, dt = float(clock[k]), float(clock[k + 1] - clock[k])
         kf.Q = model.noise(t, dt)
-        kf.predict(dt=dt, t=t)
+        # filterpy asks for one sigma point after the other; all of them are moved in one call.
+        moved = iter(model.step(kf.points_fn.sigma_points(kf.x, kf.P), t, dt))
+        kf.predict(dt, fx=lambda x, dt: next(moved))
         if seen.any():
             h = sensor.predict(kf.sigmas_f)
             # Readings that wrap are unwrapped: the points around the central one, the observation
@@ -167,43 +151,24 @@ def filterpy_ukf(
             h = h[0] + sensor.residual(h, np.broadcast_to(h[0], h.shape))
             middle = kf.Wm @ h
             near = middle + sensor.residual(z, middle)
-            rows: Iterator[Array] = iter(h[:, seen])
-            # filterpy calls hx once for each sigma point, in their order.
-            kf.update(near[seen], R=sensor.cov[np.ix_(seen, seen)], hx=lambda s: next(rows))
+            rows = iter(h[:, seen])
+            kf.update(near[seen], R=sensor.cov[np.ix_(seen, seen)], hx=lambda x: next(rows))
 
-    return _over_runs(mean, cov, observations, start, step)
+    return _over_runs(mean, cov, observations, make, step)
 
 
-def _present(sensors: Sequence[Sensor]) -> Sensor:
-    """The stacked sensor, if none of the sensors needs the previous state."""
+def _present(
+    sensors: Sequence[Sensor], times: Array, observations: Array
+) -> tuple[Sensor, Array]:
+    """The stacked sensor, if none of the sensors needs the previous state, and the clock."""
     sensor = stack(sensors)
     if sensor.uses_previous:
         raise ValueError("sensors: needs sensors of the present state, got a differential sensor")
-    return sensor
-
-
-def _unscented(model: Model, observed: int, kappa: float) -> Callable[[Array, Array], Any]:
-    """What starts filterpy's filter at a mean and a covariance."""
-    filterpy = needed("filterpy.kalman", "reference")
-
-    class Batched(filterpy.UnscentedKalmanFilter):  # type: ignore[misc, name-defined]
-        """Moves all sigma points in one call of the model."""
-
-        def compute_process_sigmas(self, dt: float, fx: Any = None, **fx_args: Any) -> None:
-            points = self.points_fn.sigma_points(self.x, self.P)
-            self.sigmas_f = model.step(points, fx_args["t"], dt)
-
-    def start(x: Array, p: Array) -> Any:
-        points = filterpy.MerweScaledSigmaPoints(model.dim, 1.0, 0.0, kappa)
-        kf = Batched(model.dim, observed, 0.0, None, None, points)
-        kf.x, kf.P = x.copy(), p.copy()
-        return kf
-
-    return start
+    return sensor, grid(times, observations, sensor)
 
 
 def _over_runs(
-    mean: Array, cov: Array, observations: Array, start: Callable[[Array, Array], Any],
+    mean: Array, cov: Array, observations: Array, make: Callable[[], Any],
     step: Callable[[Any, int, Array, Mask], None],
 ) -> GaussianRun:
     """Run one of filterpy's objects over every run and every step."""
@@ -211,7 +176,8 @@ def _over_runs(
     means, covs = np.empty((len(y), *x.shape)), np.empty((len(y), *p.shape))
     density = np.zeros(y.shape[:2])
     for run in range(len(x)):
-        kf = start(x[run], p[run])
+        kf = make()
+        kf.x, kf.P = x[run].copy(), p[run].copy()
         for k, z in enumerate(y[:, run]):
             seen = ~np.isnan(z)
             step(kf, k, z, seen)
@@ -221,14 +187,3 @@ def _over_runs(
     if not np.isfinite(means).all():
         raise np.linalg.LinAlgError("filterpy's filter ended in NaN")
     return unflattened(means, covs, density, runs)
-
-
-def _residual_of(sensor: Sensor, seen: Mask) -> Callable[[Array, Array], Array]:
-    """The sensor's residual on the observed components only."""
-
-    def residual(a: Array, b: Array) -> Array:
-        whole_a, whole_b = np.zeros(sensor.dim), np.zeros(sensor.dim)
-        whole_a[seen], whole_b[seen] = a, b
-        return np.asarray(sensor.residual(whole_a, whole_b)[seen])
-
-    return residual

@@ -1,4 +1,4 @@
-r"""Motion straight on, motion by rates of change, and Lorenz's convection, the smallest chaotic flow.
+r"""Motion straight on, by rates of change, and Lorenz's convection, the smallest chaotic flow.
 
 The states of straight motion are positions first, then velocities, in m and m/s. The noise is white
 noise on the acceleration: Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications

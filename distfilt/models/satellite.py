@@ -206,7 +206,7 @@ def rotation_matrix(quaternion: Quaternion) -> Array:
     >>> (rotation_matrix([1.0, 0.0, 0.0, 1.0]) @ [1.0, 0.0, 0.0]).round(12)
     array([0., 1., 0.])
     """
-    return _rotations(quaternion).as_matrix().reshape(*quaternion.shape[:-1], 3, 3)
+    return np.reshape(_rotations(quaternion).as_matrix(), (*quaternion.shape[:-1], 3, 3))
 
 
 def _rotations(quaternion: Array) -> Any:
@@ -289,7 +289,7 @@ def turn_between(quaternion: Quaternion, other: Quaternion) -> Array:
     """
     before, after = np.broadcast_arrays(quaternion, other)
     turn = _rotations(after) * _rotations(before).inv()
-    return turn.as_rotvec().reshape(*before.shape[:-1], 3)
+    return np.reshape(turn.as_rotvec(), (*before.shape[:-1], 3))
 
 
 @door

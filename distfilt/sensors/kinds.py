@@ -1,4 +1,4 @@
-"""The sensors that a table names: components, changes, distances, angles, and stacks of them."""
+"""The built-in sensors: components, changes, distances, angles, directions, and stacks of them."""
 
 from __future__ import annotations
 
@@ -7,22 +7,24 @@ from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from scipy.linalg import block_diag
 
-from ..doors import Array, Bounds, Places, door, unchecked
+from ..doors import Array, Bounds, Index, Places, door, unchecked
+from ..doors.values import distinct
 from .base import Sensor, wrap
 
-__all__ = ["angle", "direct", "distance", "distance_and_angle", "of_kind", "stack"]
+__all__ = [  # fmt: skip
+    "angle", "direct", "distance", "distance_and_angle", "ephemeris", "line_of_sight", "of_kind",
+    "stack",
+]
 
 Deviation = Annotated[float, Bounds(at_least=1e-150, at_most=1e150)]
 """A standard deviation whose square is a variance that is neither zero nor infinite."""
 
 
-def _two(value: Sequence[int], name: str) -> None:
-    if len(value) != 2:
-        raise ValueError(f"{name}: needs 2 components, got {len(value)}")
-
-
-Pair = Annotated[Places, _two]
+Turn = Annotated[float, Bounds(at_least=1e-150, at_most=np.pi)]
+"""A standard deviation of an angle, in rad: a wider Gaussian is none once it is wrapped."""
+Pair = Annotated[tuple[Index, Index], distinct]
 
 
 def diagonal(*stds: float) -> Array:
@@ -33,10 +35,6 @@ def diagonal(*stds: float) -> Array:
 
 
 def _pick(x: Array, indices: Sequence[int]) -> Array:
-    if max(indices) >= x.shape[-1]:
-        raise ValueError(
-            f"x: needs more than {max(indices)} components for this sensor, got {x.shape[-1]}"
-        )
     return x[..., list(indices)]
 
 
@@ -92,8 +90,7 @@ def _change_slope(x: Array, previous: Array, indices: Sequence[int]) -> Array:
 
 def _gap(x: Array, indices: Sequence[int], origin: Array | None) -> Array:
     """From the origin to the place that some components are."""
-    place = _pick(x, indices)
-    return place if origin is None else np.asarray(place - origin)
+    return _pick(x, indices) - (0.0 if origin is None else origin)
 
 
 @door
@@ -142,7 +139,7 @@ def _distance_slope(x: Array, indices: Sequence[int], origin: Array | None) -> A
 
 @door
 def angle(
-    indices: Pair, *, std: Deviation, full: bool = False,
+    indices: Pair, *, std: Turn, full: bool = False,
     origin: Annotated[Array, "2"] | None = None
 ) -> Sensor:
     """See the angle of two components (a, b), in rad.
@@ -152,7 +149,7 @@ def angle(
     indices : sequence of two int
         The components a and b.
     std : float
-        Standard deviation, in rad, positive.
+        Standard deviation, in rad, positive and at most π.
     full : bool
         False: ``arctan(b/a)``, the angle of a line, which repeats after π (Grange et al., Table I).
         True: ``arctan2(b, a)``, a direction, which repeats after 2π.
@@ -203,7 +200,7 @@ def _angle_slope(x: Array, indices: Sequence[int], origin: Array | None) -> Arra
 
 @door
 def distance_and_angle(
-    indices: Pair, *, std: tuple[Deviation, Deviation], origin: Annotated[Array, "2"] | None = None,
+    indices: Pair, *, std: tuple[Deviation, Turn], origin: Annotated[Array, "2"] | None = None,
     heading: float = 0.0
 ) -> Sensor:
     """See the distance and the direction of two components, as a radar or a robot does.
@@ -235,7 +232,7 @@ def distance_and_angle(
     place: dict[str, Any] = {"indices": indices, "origin": origin}
     return Sensor.unchecked(
         2, partial(_sighting, heading=heading, **place), diagonal(*std),
-        difference=_sighting_gap, kind="distance and angle",
+        difference=partial(_turned_at, k=1), kind="distance and angle",
         derivative=partial(_sighting_slope, **place)
     )
 
@@ -245,14 +242,82 @@ def _sighting(x: Array, heading: float, **place: Any) -> Array:
     return np.concatenate([_distance(x, **place), turned], axis=-1)
 
 
-def _sighting_gap(observed: Array, predicted: Array) -> Array:
+def _turned_at(observed: Array, predicted: Array, k: int) -> Array:
+    """Differences, wrapped in one component."""
     gap = np.asarray(observed - predicted)
-    gap[..., 1] = unchecked(wrap)(gap[..., 1])
+    gap[..., k] = unchecked(wrap)(gap[..., k])
     return gap
 
 
 def _sighting_slope(x: Array, **place: Any) -> Array:
     return np.concatenate([_distance_slope(x, **place), _angle_slope(x, **place)], axis=-2)
+
+
+@door
+def line_of_sight(
+    *, std: Turn, form: Literal["arctan2", "printed"] = "arctan2", observer: Index = 6,
+    hidden: Callable[[Array, Array], Array] | None = None
+) -> Sensor:
+    r"""The direction to a target, the state's first body, from another: two angles in rad.
+
+    Parameters
+    ----------
+    std : float
+        Standard deviation of each angle, in rad, at most π.
+    form : {"arctan2", "printed"}
+        Right ascension and declination, or (49) of Semeraro et al., which has arcsin of the unit
+        vector's y component where the right ascension is meant.
+    observer : int
+        Where the other body's position begins in the state.
+    hidden : callable, optional
+        ``hidden(target, observer) -> bool (...)`` of positions (..., 3), such as
+        :func:`distfilt.models.occulted`; a direction that it hides is NaN.
+
+    Examples
+    --------
+    >>> eye = line_of_sight(std=1e-4)
+    >>> x = np.zeros(12)
+    >>> x[:3] = -1.0, -1.0, 0.0
+    >>> eye.predict(x).round(4) + 0.0
+    array([-2.3562,  0.    ])
+    """
+    return Sensor.unchecked(
+        2, partial(_sight, form=form, observer=observer, hidden=hidden), diagonal(std, std),
+        difference=partial(_turned_at, k=0)
+    )
+
+
+def _sight(
+    x: Array, form: str, observer: int, hidden: Callable[[Array, Array], Array] | None
+) -> Array:
+    target, own = x[..., :3], x[..., observer : observer + 3]
+    way = target - own
+    unit = np.clip(way / np.linalg.norm(way, axis=-1, keepdims=True), -1, 1)
+    out: Array = np.arcsin(unit[..., 1:])
+    if form == "arctan2":
+        out[..., 0] = np.arctan2(unit[..., 1], unit[..., 0])
+    if hidden is not None:
+        out[np.asarray(hidden(target, own))] = np.nan
+    return out
+
+
+@door
+def ephemeris(*, position_std: Deviation, velocity_std: Deviation) -> Sensor:
+    """The first body's full state, read directly, in km and m/s.
+
+    Parameters
+    ----------
+    position_std, velocity_std : float
+        Above 0, in km and m/s.
+
+    Examples
+    --------
+    >>> ephemeris(position_std=1e-3, velocity_std=1e-5).dim
+    6
+    """
+    read = unchecked(direct)(tuple(range(6)), std=1.0)
+    cov = diagonal(*[position_std] * 3, *[velocity_std] * 3)
+    return read.changed(cov=cov)
 
 
 @door
@@ -275,10 +340,7 @@ def of_kind(
     'distance'
     """
     makers: dict[str, Callable[..., Sensor]] = {
-        "direct": direct,
-        "differential": differential,
-        "range": distance,
-        "angle": angle,
+        "direct": direct, "differential": differential, "range": distance, "angle": angle
     }
     return makers[kind](indices, std=std)
 
@@ -306,20 +368,14 @@ def stack(sensors: Annotated[Sequence[Sensor], _some]) -> Sensor:
     >>> both.predict([1.0, 1.0]).round(4), both.cov.diagonal().round(4)
     (array([1.    , 0.7854]), array([0.01, 0.04]))
     """
-    ends = np.cumsum([s.dim for s in sensors]).tolist()
-    cov = np.zeros((ends[-1], ends[-1]))
-    for s, end in zip(sensors, ends, strict=True):
-        cov[end - s.dim : end, end - s.dim : end] = s.cov
+    cov = block_diag(*[s.cov for s in sensors])
     cov.setflags(write=False)
-    differences = partial(_stacked_differences, parts=sensors, ends=ends[:-1])
+    wraps = any(s.difference is not None for s in sensors)
     linear = all(s.linear is not None for s in sensors)
     return Sensor.unchecked(
-        ends[-1],
-        partial(_stacked, parts=sensors),
-        cov,
-        difference=None if all(s.difference is None for s in sensors) else differences,
+        len(cov), partial(_stacked, parts=sensors), cov, kind="stacked",
+        difference=partial(_stacked_differences, parts=sensors) if wraps else None,
         uses_previous=any(s.uses_previous for s in sensors),
-        kind="stacked",
         linear=partial(_stacked_rows, parts=sensors) if linear else None,
         derivative=partial(_stacked_slopes, parts=sensors),
     )
@@ -329,9 +385,8 @@ def _stacked(x: Array, previous: Array | None = None, *, parts: Sequence[Sensor]
     return np.concatenate([unchecked(s.predict)(x, previous) for s in parts], axis=-1)
 
 
-def _stacked_differences(
-    observed: Array, predicted: Array, parts: Sequence[Sensor], ends: list[int]
-) -> Array:
+def _stacked_differences(observed: Array, predicted: Array, parts: Sequence[Sensor]) -> Array:
+    ends = np.cumsum([s.dim for s in parts])[:-1]
     pairs = [np.split(reading, ends, axis=-1) for reading in (observed, predicted)]
     gaps = [unchecked(s.residual)(y, p) for s, y, p in zip(parts, *pairs, strict=True)]
     return np.concatenate(gaps, axis=-1)

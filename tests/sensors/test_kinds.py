@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pickle
 import timeit
+from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -89,7 +91,7 @@ def test_each_kind_has_its_standard_deviation() -> None:
         angle([2, 0], std=0.1, full=True, origin=PLACE),
         distance_and_angle([2, 1], std=[0.1, 0.2], origin=PLACE),
         distance_and_angle([2, 1], std=[0.1, 0.2], origin=PLACE, heading=0.4),
-        line_of_sight(std=0.1, target=0, observer=2),
+        line_of_sight(std=0.1, observer=2),
         stack([distance([2, 0], std=0.1), direct([1], std=0.2), angle([0, 1], std=0.1)]),
     ],
     ids=lambda s: s.kind,
@@ -153,7 +155,7 @@ def test_a_robot_sees_from_its_own_pose() -> None:
 SHIPPED = [
     direct([2, 0], std=0.1), differential([0, 1], std=0.1), distance([2, 0], std=0.1, origin=PLACE),
     angle([1, 2], std=0.1), distance_and_angle([2, 1], std=[0.1, 0.2], origin=PLACE),
-    line_of_sight(std=0.1, target=0, observer=3, hidden=occulted),
+    line_of_sight(std=0.1, observer=3, hidden=occulted),
     ephemeris(position_std=0.1, velocity_std=0.2),
     stack([direct([1], std=0.2), angle([0, 1], std=0.1)]),
 ]
@@ -206,14 +208,25 @@ def test_right_ascension_wraps() -> None:
 
 
 def test_places_in_the_state_and_the_ephemeris() -> None:
-    x = np.arange(18.0)
-    eye = line_of_sight(std=1.0, target=6, observer=12)
-    y = np.zeros(12)
-    y[:3], y[6:9] = x[6:9], x[12:15]
+    x = np.arange(18.0) ** 2
+    eye, y = line_of_sight(std=1.0, observer=12), x[:12].copy()
+    y[6:9] = x[12:15]
     assert np.allclose(eye.predict(x), line_of_sight(std=1.0).predict(y))
-    fix = ephemeris(position_std=1e-3, velocity_std=1e-5, start=6)
-    assert fix.predict(x).tolist() == x[6:12].tolist()
+    fix = ephemeris(position_std=1e-3, velocity_std=1e-5)
+    assert fix.predict(x).tolist() == x[:6].tolist()
     assert np.allclose(np.sqrt(np.diag(fix.cov)), [1e-3] * 3 + [1e-5] * 3)
+
+
+@pytest.mark.parametrize("make", [
+    partial(angle, [0, 1]), partial(angle, [0, 1], full=True), line_of_sight,
+    lambda std: distance_and_angle([0, 1], std=(9.0, std)),
+    lambda std: sensors.of_kind("angle", [0, 1], std=std),
+])
+def test_an_angle_is_known_better_than_not_at_all(make: Callable[..., Sensor]) -> None:
+    """A Gaussian wider than half a turn is none once it is wrapped."""
+    make(std=3.1)
+    with pytest.raises(ValueError, match=r"^std.* at most 3.14159, got 5"):
+        make(std=5.0)
 
 
 def test_a_hidden_direction_is_nan() -> None:
