@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from distfilt.doors import describe
 from distfilt.doors.kinds import Scope
-from tests.tools.calls import Call, callables, calls, public, rooms
+from tests.tools.calls import Call, callables, calls, describe, public, rooms
 from tests.tools.fuzz import exact
 
 PUBLIC = {name: thing for room in rooms() for name, thing in public(room).items()}

@@ -29,7 +29,6 @@ from distfilt.doors import (
     Times,
     Weights,
     definite,
-    describe,
     door,
     semidefinite,
     unchecked,
@@ -105,12 +104,12 @@ class Line(Record):
 def test_shapes_are_bound_by_arguments_fields_and_paths() -> None:
     @door
     def both(x: Annotated[Array, "N d"], y: Annotated[Array, "N"], line: Line,
-             z: Annotated[Array, "line.dim+1 d"]) -> tuple[Any, ...]:  # fmt: skip
+             z: Annotated[Array, "line.dim d"]) -> tuple[Any, ...]:  # fmt: skip
         return x, y, z
 
-    fits = {"x": np.ones((3, 4)), "y": np.ones(3), "line": Line(2, np.eye(2)), "z": np.ones((3, 4))}
+    fits = {"x": np.ones((3, 4)), "y": np.ones(3), "line": Line(2, np.eye(2)), "z": np.ones((2, 4))}
     both(**fits)
-    for name, bad in (("y", np.ones(4)), ("z", np.ones((2, 4))), ("line", 3)):
+    for name, bad in (("y", np.ones(4)), ("z", np.ones((3, 4))), ("line", 3)):
         with pytest.raises(ValueError, match=f"^{name}: "):
             both(**(fits | {name: bad}))
 
@@ -124,7 +123,6 @@ def test_records_copy_and_freeze_and_a_way_round_does_neither() -> None:
     assert line.changed(dim=7).dim == 7 and pickle.loads(pickle.dumps(line)).dim == 2
     with pytest.raises(ValueError, match="^cov: "):
         Line(3, cov)
-    assert list(describe(Line)) == ["dim", "names", "cov"]
 
 
 def test_the_way_round_a_door() -> None:

@@ -35,7 +35,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from .declared import Record, describe, door, unchecked
+from .declared import Record, door, unchecked
 from .kinds import MISSING
 from .values import (
     Array,
@@ -52,7 +52,7 @@ from .values import (
 __all__ = [  # fmt: skip
     "Array", "Bounds", "Count", "Cov", "Index", "MISSING", "Mask", "NonNegative", "Places",
     "Positive", "Record", "Rng", "Semidefinite", "Share", "Times", "Weights", "array", "definite",
-    "describe", "door", "increasing", "needed", "semidefinite", "summing_to_one", "unchecked",
+    "door", "increasing", "needed", "semidefinite", "summing_to_one", "unchecked",
 ]
 
 Mask = NDArray[np.bool_]

@@ -16,21 +16,19 @@ import numpy as np
 
 from .kinds import Kind, Scope, kind_of
 
-__all__ = ["Record", "describe", "door", "unchecked"]
+__all__ = ["Record", "door", "unchecked"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
 def _declared(annotations: Mapping[str, Any], names: Mapping[str, Any]) -> dict[str, Kind]:
     """The kinds of named annotations, arrays last: their shapes may speak of the others."""
-    found: dict[str, Kind] = {}
+    found: dict[str, Kind | None] = {}
     for name, annotation in annotations.items():
         with suppress(NameError):  # a name that only the type checker imports
             meant = eval(annotation, dict(names)) if isinstance(annotation, str) else annotation
-            kind = kind_of(meant)
-            if kind is not None and name != "return":
-                found[name] = kind
-    return _arrays_last(found)
+            found[name] = None if name == "return" else kind_of(meant)
+    return _arrays_last({name: kind for name, kind in found.items() if kind is not None})
 
 
 def _arrays_last(kinds: dict[str, Kind]) -> dict[str, Kind]:
@@ -55,12 +53,6 @@ class _Plan:
         return tuple(p.name for p in known if p.kind <= Parameter.POSITIONAL_OR_KEYWORD)
 
     @cached_property
-    def places(self) -> list[tuple[str, int, Kind]]:
-        """Each kind with the argument's name, and its place where it may stand in a row."""
-        place = {name: k for k, name in enumerate(self.row)}
-        return [(name, place.get(name, sys.maxsize), kind) for name, kind in self.kinds.items()]
-
-    @cached_property
     def defaults(self) -> dict[str, Any]:
         """What stands for the arguments that are left out."""
         known = signature(self.function).parameters.values()
@@ -70,14 +62,13 @@ class _Plan:
         self, args: tuple[Any, ...], options: dict[str, Any]
     ) -> tuple[list[Any], dict[str, Any]]:
         """The arguments converted, or the error for the first that does not fit."""
-        row, given = list(args), dict(options)
-        scope = Scope({**self.defaults, **dict(zip(self.row, args, strict=False)), **options})
-        for name, place, kind in self.places:
-            if place < len(row):
-                row[place] = scope.values[name] = kind.take(row[place], name, scope)
-            elif name in given:
-                given[name] = scope.values[name] = kind.take(given[name], name, scope)
-        return row, given
+        given = dict(zip(self.row, args, strict=False)) | options
+        scope = Scope(self.defaults | given)
+        for name, kind in self.kinds.items():
+            if name in given:
+                scope.values[name] = kind.take(given[name], name, scope)
+        row = [scope.values[name] for name in self.row[: len(args)]]
+        return [*row, *args[len(row) :]], {name: scope.values[name] for name in options}
 
 
 def door(function: F) -> F:
@@ -128,26 +119,10 @@ def unchecked(function: F) -> F:
     True
     """
     if isinstance(function, partial):
-        inner = unchecked(function.func)
-        return cast(F, partial(inner, *function.args, **function.keywords))
+        return cast(F, partial(unchecked(function.func), *function.args, **function.keywords))
     if isinstance(function, MethodType):
         return cast(F, MethodType(unchecked(function.__func__), function.__self__))
     return cast(F, getattr(function, "unchecked", function))
-
-
-def describe(thing: Any) -> dict[str, Kind]:
-    """The kinds that a function with a door, or a class of records, declares by name.
-
-    Examples
-    --------
-    >>> [kind.needs for kind in describe(door).values()]
-    []
-    """
-    if isinstance(thing, type):
-        made: Any = thing
-        return _of_fields(made) if issubclass(thing, Record) else {}
-    plan = getattr(thing, "plan", None)
-    return {} if plan is None else dict(plan.kinds)
 
 
 class Record:
@@ -170,20 +145,19 @@ class Record:
 
     def __post_init__(self) -> None:
         cls: Any = type(self)
-        scope = Scope({name: getattr(self, name) for name in _names(cls)})
+        scope = Scope(dict(vars(self)))
         for name, kind in _of_fields(cls).items():
             scope.values[name] = _kept(kind.take(scope.values[name], name, scope))
-            object.__setattr__(self, name, scope.values[name])
+        vars(self).update(scope.values)
 
     @classmethod
     def unchecked(cls, *args: Any, **options: Any) -> Self:
         """Build one from what the library made itself: nothing is checked or copied."""
-        out, made = object.__new__(cls), cast(Any, cls)
-        given = dict(zip(_names(made), args, strict=False)) | options
-        for name, factory in _factories(made).items():
-            if name not in given:
-                given[name] = factory()
-        out.__dict__.update(given)
+        out, names = object.__new__(cls), _names(cast(Any, cls))
+        vars(out).update(zip(names, args, strict=False), **options)
+        for name, factory in names.items():
+            if factory and name not in vars(out):
+                vars(out)[name] = factory()
         return out
 
     def changed(self, **changes: Any) -> Self:
@@ -193,15 +167,10 @@ class Record:
 
 
 @cache
-def _names(cls: Any) -> tuple[str, ...]:
-    return tuple(f.name for f in fields(cls))
-
-
-@cache
-def _factories(cls: Any) -> dict[str, Callable[[], Any]]:
-    """What makes a default; a plain one is an attribute of the class."""
+def _names(cls: Any) -> dict[str, Any]:
+    """Each field with what makes its default; a plain default is an attribute of the class."""
     made = {f.name: f.default_factory for f in fields(cls)}
-    return {name: factory for name, factory in made.items() if factory is not _NO_DEFAULT}
+    return {name: None if factory is _NO_DEFAULT else factory for name, factory in made.items()}
 
 
 @cache

@@ -40,9 +40,6 @@ class Scope:
             return self.sizes[word]
         if word.isdigit():
             return int(word)
-        if "+" in word:
-            parts = [self._size(part) for part in word.split("+")]
-            return word if any(isinstance(part, str) for part in parts) else sum(parts)
         head, *path = word.lstrip("*").split(".")
         found = self.values.get(head)
         for part in path:
@@ -71,12 +68,10 @@ class Kind:
 
 
 def _number(value: Any, name: str, scope: Scope) -> float:
-    if type(value) not in (float, int):
-        try:
-            value = _real(value, name)[()]
-        except ValueError:
-            raise TypeError from None
-    out = float(value)  # a TypeError for an array
+    try:  # a TypeError for an array
+        out = float(value if type(value) in (float, int) else _real(value, name)[()])
+    except ValueError:
+        raise TypeError from None
     if not np.isfinite(out):
         raise TypeError
     return out
@@ -140,7 +135,11 @@ def _many(
     return tuple([kind.take(item, name, scope) if kind else item for kind, item in pairs])
 
 
-def _either(kinds: tuple[Kind, ...], value: Any, name: str, scope: Scope) -> Any:
+def _either(
+    kinds: tuple[Kind, ...], optional: bool, value: Any, name: str, scope: Scope
+) -> Any:
+    if value is None and optional:
+        return None
     for kind in kinds:
         try:
             return kind.take(value, name, scope)
@@ -148,10 +147,6 @@ def _either(kinds: tuple[Kind, ...], value: Any, name: str, scope: Scope) -> Any
             if len(kinds) == 1:
                 raise
     raise TypeError
-
-
-def _optional(kind: Kind, value: Any, name: str, scope: Scope) -> Any:
-    return None if value is None else kind.take(value, name, scope)
 
 
 _PLAIN = {
@@ -189,7 +184,7 @@ def kind_of(annotation: Any) -> Kind | None:
     if origin is Literal:
         return Kind(f"one of {', '.join(map(str, args))}", partial(_one_of, args))
     if origin is np.ndarray:
-        return _array_of(annotation, None, missing=False)
+        return _array_of(annotation)
     if origin is tuple and args[-1] is not ...:
         kinds = tuple(kind_of(a) for a in args)
         return Kind(_words(kinds, ", "), partial(_many, kinds, True))
@@ -209,26 +204,23 @@ def _words(kinds: tuple[Kind | None, ...], between: str) -> str:
 
 def _union(args: tuple[Any, ...]) -> Kind | None:
     """What fits one of several annotations, the first that does."""
-    found = tuple(kind_of(a) for a in args if a is not type(None))
-    kinds = tuple(kind for kind in found if kind is not None)
-    if len(kinds) < len(found):
+    kinds = tuple(kind_of(a) for a in args if a is not type(None))
+    if None in kinds:
         return None
-    one = Kind(_words(kinds, " or "), partial(_either, kinds))
-    return replace(one, convert=partial(_optional, one)) if type(None) in args else one
+    return Kind(_words(kinds, " or "), partial(_either, kinds, type(None) in args))
 
 
 def _noted(base: Any, notes: tuple[Any, ...]) -> Kind | None:
     """A type with a shape and rules beside it; the last shape counts, so that aliases can vary."""
-    rules = tuple(note for note in notes if callable(note))
-    if get_origin(base) is not np.ndarray:
-        kind = kind_of(base)
-        return None if kind is None else replace(kind, rules=kind.rules + rules)
     shapes = [note.split() for note in notes if isinstance(note, str) and note != MISSING]
-    kind = _array_of(base, shapes[-1] if shapes else None, missing=MISSING in notes)
-    return replace(kind, rules=rules)
+    if get_origin(base) is np.ndarray:
+        kind: Kind | None = _array_of(base, shapes[-1] if shapes else None, MISSING in notes)
+    else:
+        kind = kind_of(base)
+    return kind and replace(kind, rules=(*kind.rules, *filter(callable, notes)))
 
 
-def _array_of(base: Any, words: Sequence[str] | None, *, missing: bool) -> Kind:
+def _array_of(base: Any, words: Sequence[str] | None = None, missing: bool = False) -> Kind:
     dtype = get_args(get_args(base)[1])[0]
     what = {np.float64: "real numbers", np.bool_: "True and False"}.get(dtype, "integers")
     shape = "" if words is None else f" of shape ({', '.join(words)})"

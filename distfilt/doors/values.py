@@ -1,22 +1,21 @@
-"""What arrays and numbers must be: each rule refuses by an error that names the argument."""
+"""What arrays, numbers and a user's functions must be: what is not is refused by its name."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg.lapack import dpotrf
 
 __all__ = [  # fmt: skip
-    "Array", "Bounds", "array", "definite", "distinct", "increasing", "needed", "semidefinite",
-    "summing_to_one",
+    "Array", "Bounds", "array", "batched", "definite", "distinct", "increasing", "needed",
+    "semidefinite", "summing_to_one",
 ]
 
 Array = NDArray[np.float64]
@@ -103,7 +102,7 @@ def _shape_text(shape: tuple[Any, ...]) -> str:
     return f"({sizes},)" if len(shape) == 1 else f"({sizes})"
 
 
-def definite(value: Array, name: str) -> None:
+def definite(value: Array, name: str, word: str = "definite") -> None:
     """Refuse what is not a symmetric positive definite matrix, or a stack of them.
 
     Examples
@@ -112,8 +111,23 @@ def definite(value: Array, name: str) -> None:
     Traceback (most recent call last):
     ValueError: noise: needs a positive definite matrix, got smallest eigenvalue -1
     """
-    _symmetric(value, name)
-    _need(value, name, "definite")
+    if value.ndim < 2 or value.shape[-1] != value.shape[-2]:
+        raise ValueError(f"{name}: needs a square matrix, got shape {value.shape}")
+    gap = np.abs(value - value.mT)
+    if gap.any():
+        unit = _in_units(value)
+        worst = gap[np.abs(unit - unit.mT) > _ROUNDING].max(initial=0.0)
+        if worst > 0:
+            raise ValueError(f"{name}: needs a symmetric matrix, got an asymmetry of {worst:.3g}")
+    with contextlib.suppress(np.linalg.LinAlgError):
+        np.linalg.cholesky(value)
+        return
+    # Without a factor; rounding alone may be why, unless it has to be definite.
+    values = np.linalg.eigvalsh(_in_units(value))[..., 0]
+    if word == "definite" or values.min() < -_ROUNDING:
+        at = tuple(np.argwhere(values == values.min())[0].tolist())
+        least = f"{np.linalg.eigvalsh(value[at])[0]:.6g}{f' at {[*at]}' * bool(at)}"
+        raise ValueError(f"{name}: needs a positive {word} matrix, got smallest eigenvalue {least}")
 
 
 def semidefinite(value: Array, name: str) -> None:
@@ -123,50 +137,15 @@ def semidefinite(value: Array, name: str) -> None:
     --------
     >>> semidefinite(np.zeros((2, 2)), "noise")
     """
-    _symmetric(value, name)
-    _need(value, name, "semidefinite")
+    definite(value, name, "semidefinite")
 
 
-def _symmetric(value: Array, name: str) -> None:
-    if value.ndim < 2 or value.shape[-1] != value.shape[-2]:
-        raise ValueError(f"{name}: needs a square matrix, got shape {value.shape}")
-    gap = np.abs(value - value.mT)
-    if gap.any():
-        worst = np.where(gap > _ROUNDING * _units(value), gap, 0.0).max()
-        if worst > 0:
-            raise ValueError(f"{name}: needs a symmetric matrix, got an asymmetry of {worst:.3g}")
-
-
-def _has_factor(cov: Array) -> bool:
-    if cov.ndim == 2 and cov.size:
-        return bool(dpotrf(cov, lower=1, clean=0)[1] == 0)  # a fifth of numpy's time
-    with contextlib.suppress(np.linalg.LinAlgError):
-        return np.linalg.cholesky(cov) is not None
-    return False
-
-
-def _units(cov: Array) -> Array:
-    """Products of the components' standard deviations, the scale of each entry."""
-    std = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
-    return np.asarray(std[..., :, None] * std[..., None, :])
-
-
-def _need(cov: Array, name: str, word: str) -> None:
-    """Refuse what has no Cholesky factor, unless only rounding keeps it from being semidefinite."""
-    if _has_factor(cov):
-        return
-    scale = _units(cov)
-    scaled = np.divide(cov, scale, out=np.where(cov == 0, 0.0, -np.inf), where=scale > 0)
-    # Not so where a variance is negative, or 0 beside a covariance that is not 0.
-    finite = np.asarray(np.isfinite(scaled).all(axis=(-2, -1)))
-    values = np.linalg.eigvalsh(np.where(finite[..., None, None], scaled, 0.0))[..., 0]
-    values = np.where(finite, values, -np.inf)
-    if word == "semidefinite" and values.min() >= -_ROUNDING:
-        return
-    at = np.argwhere(values == values.min())[0].tolist()
-    smallest = float(np.linalg.eigvalsh(cov[tuple(at)])[0])
-    raise ValueError(f"{name}: needs a positive {word} matrix, got smallest eigenvalue "
-                     f"{smallest:.6g}{f' at {at}' * bool(at)}")
+def _in_units(cov: Array) -> Array:
+    """Covariances in units of the components' standard deviations, as far as that matters."""
+    std = np.sqrt(np.abs(np.diagonal(cov, axis1=-2, axis2=-1)))
+    unit = np.where(std > 0, std, 1.0)
+    with np.errstate(over="ignore"):
+        return np.clip(cov / unit[..., :, None] / unit[..., None, :], -2.0, 2.0)
 
 
 def summing_to_one(value: Array, name: str) -> None:
@@ -233,17 +212,18 @@ class Bounds:
 
     def __call__(self, value: Any, name: str) -> None:
         """Refuse what is out of bounds."""
-        for bound, word, holds in (
-            (self.above, "above", operator.gt),
-            (self.at_least, "at least", operator.ge),
-            (self.below, "below", operator.lt),
-            (self.at_most, "at most", operator.le),
-        ):
+        for side, holds in _HOLDS.items():
+            bound, word = getattr(self, side), side.replace("_", " ")
             if bound is None or np.all(holds(value, bound)):
                 continue
             needs = "an integer of" if isinstance(value, int) and word == "at least" else "a number"
             worst = value if np.ndim(value) == 0 else value[~holds(value, bound)].flat[0]
             raise ValueError(f"{name}: needs {needs} {word} {bound:g}, got {worst!r}")
+
+
+_HOLDS = {
+    "above": operator.gt, "at_least": operator.ge, "below": operator.lt, "at_most": operator.le
+}
 
 
 def needed(module: str, extra: str) -> ModuleType:
@@ -268,3 +248,76 @@ def needed(module: str, extra: str) -> ModuleType:
         raise ModuleNotFoundError(
             f"{module}: needs the extra {extra}: pip install 'distfilt[{extra}]'", name=module
         ) from None
+
+
+def batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Array:
+    """What a function makes of states (..., d), as (..., ``owner.dim``); it gets copies.
+
+    A function that was written for one state may return the right shape with wrong numbers. So the
+    first rows that differ are compared with one of them alone.
+
+    Parameters
+    ----------
+    owner, name
+        Where the user's function is, and as what.
+    states : sequence of ndarray, (..., d)
+        Its first arguments.
+    rest
+        Its other arguments.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> x = np.array([[1.0, 2.0], [3.0, 4.0]])
+    >>> batched(SimpleNamespace(dim=2, flow=lambda x: x[..., ::-1]), "flow", [x])
+    array([[2., 1.],
+           [4., 3.]])
+    >>> one = SimpleNamespace(dim=2, flow=lambda x: np.array([x[1], x[0]]))
+    >>> batched(one, "flow", [x])
+    Traceback (most recent call last):
+    ValueError: flow: needs to take many states at once, ...
+    """
+    function, x = getattr(owner, name), states[0]
+    out, wanted = _made(function, states, rest), (*x.shape[:-1], owner.dim)
+    fits = np.shape(out) == wanted
+    if x.ndim > 1 and x.size and not (fits and "_compared" in vars(owner)):
+        last = [s.reshape(-1, s.shape[-1])[-1] for s in states]
+        alone = _made(function, last, rest)
+        if fits:
+            wrong = _differs(out.reshape(-1, owner.dim)[-1], alone, last)
+        else:  # an error of its own comes from some states only, and not from one of them alone
+            copies = [np.broadcast_to(one, s.shape) for one, s in zip(last, states, strict=True)]
+            many = _made(function, copies, rest)
+            wrong = np.shape(alone) == wanted[-1:] and np.shape(many) != wanted
+        if wrong:
+            raise ValueError(
+                f"{name}: needs to take many states at once, (..., d), with the components last "
+                f"(x[..., 0], not x[0]), got one that is right for a single state only"
+            )
+        if fits and (x.reshape(-1, x.shape[-1])[0] != last[0]).any():
+            vars(owner)["_compared"] = True
+    if isinstance(out, IndexError):
+        raise ValueError(f"x: needs more components, got {x.shape}") from out
+    if isinstance(out, Exception):
+        raise out
+    if not fits:
+        raise ValueError(f"{name}: needs to return shape {wanted} for states {x.shape}, "
+                         f"got {out.shape}")
+    return np.asarray(out)
+
+
+def _made(function: Callable[..., Any], states: Sequence[Array], rest: tuple[float, ...]) -> Any:
+    """What a function returns, or the error that it raises."""
+    try:
+        return np.asarray(function(*[s.copy() for s in states], *rest), dtype=np.float64)
+    except (TypeError, ValueError, IndexError) as error:
+        return error
+
+
+def _differs(row: Array, alone: Any, states: Sequence[Array]) -> bool:
+    if np.shape(alone) != row.shape:
+        return False
+    # Rules of adaptive step differ a little; wrong rows differ as much as the states move.
+    moved = alone - states[0] if alone.shape == states[0].shape else alone
+    bound = 1e-2 * np.abs(moved).max() + 1e-9 * np.abs(alone).max()
+    return bool((np.isnan(row) != np.isnan(alone)).any() or (np.abs(row - alone) > bound).any())

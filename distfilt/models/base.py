@@ -10,8 +10,7 @@ from typing import Annotated
 import numpy as np
 
 from ..doors import Array, Bounds, Count, NonNegative, Record, Rng, Times, array, door, unchecked
-from ..doors.batched import batched
-from ..doors.values import semidefinite
+from ..doors.values import batched, semidefinite
 from ..linalg import central, factor
 
 __all__ = ["LinearModel", "Model", "simulate"]

@@ -16,7 +16,7 @@ from typing import Annotated
 import numpy as np
 
 from ..doors import MISSING, Array, Count, Cov, Positive, Record, Rng, array, door, unchecked
-from ..doors.batched import batched
+from ..doors.values import batched
 from ..linalg import central, factor, leading
 
 __all__ = ["Sensor", "wrap"]
