@@ -135,9 +135,7 @@ def _many(
     return tuple([kind.take(item, name, scope) if kind else item for kind, item in pairs])
 
 
-def _either(
-    kinds: tuple[Kind, ...], optional: bool, value: Any, name: str, scope: Scope
-) -> Any:
+def _either(kinds: tuple[Any, ...], optional: bool, value: Any, name: str, scope: Scope) -> Any:
     if value is None and optional:
         return None
     for kind in kinds:
@@ -217,7 +215,8 @@ def _noted(base: Any, notes: tuple[Any, ...]) -> Kind | None:
         kind: Kind | None = _array_of(base, shapes[-1] if shapes else None, MISSING in notes)
     else:
         kind = kind_of(base)
-    return kind and replace(kind, rules=(*kind.rules, *filter(callable, notes)))
+    rules: Any = filter(callable, notes)
+    return kind and replace(kind, rules=(*kind.rules, *rules))
 
 
 def _array_of(base: Any, words: Sequence[str] | None = None, missing: bool = False) -> Kind:

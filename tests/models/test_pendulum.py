@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.special import ellipk
 
 from distfilt.models import (
-    Model,
     pendulum,
     pendulum_angle,
     pendulum_chart,
     pendulum_energy,
     pendulum_rate,
     pendulum_states,
-    rk4,
 )
 
 FORMS = ("printed", "multiplier")
@@ -31,21 +27,6 @@ def _path(step: float, form: str = "printed", start: np.ndarray = START) -> np.n
     for k in range(200):
         out.append(model.step(out[-1], 0.05 * k, 0.05))
     return np.array(out)
-
-
-def _multiplier(form: str, theta: float = np.pi / 3) -> np.ndarray:
-    """Floquet multipliers of c'' = -k(t) c over half a period, c = r² - L² linearised."""
-
-    def rate(s: np.ndarray, _: float) -> np.ndarray:
-        c, slope, angle, omega = np.moveaxis(s, -1, 0)
-        k = 2 * omega**2 + (2 * G * np.cos(angle) if form == "multiplier" else 0.0)
-        return np.stack([slope, -k * c, omega, -G * np.sin(angle)], axis=-1)
-
-    half = 2 * np.sqrt(1 / G) * ellipk(np.sin(theta / 2) ** 2)
-    basis = np.array([[1.0, 0.0, theta, 0.0], [0.0, 1.0, theta, 0.0]])
-    ends = rk4(rate, basis, 0.0, half, longest=1e-3)[:, :2].T
-    assert abs(np.linalg.det(ends) - 1) < 1e-10
-    return np.asarray(np.linalg.eigvals(ends))
 
 
 def test_the_printed_equations() -> None:
@@ -83,23 +64,6 @@ def test_the_constraint_obeys_hill_s_equation_off_the_manifold(form: str, k: flo
     assert np.allclose(second, -(2 * speed + k * s[:, 1]) * c / 1.44, atol=1e-12)
 
 
-def test_floquet_multipliers() -> None:
-    printed, stable = _multiplier("printed"), _multiplier("multiplier")
-    assert abs(np.abs(printed).max() - 2.283) < 0.005
-    assert np.abs(np.abs(stable) - 1).max() < 1e-6
-    for degrees in (10, 20, 30, 45):
-        assert abs(np.abs(_multiplier("printed", np.deg2rad(degrees))).max() - 1) < 1e-6
-
-
-def test_a_length_error_grows_in_the_printed_form_only() -> None:
-    """Over ten seconds an error of 1e-6 m grows by the multiplier's power, or not at all."""
-    errors = {}
-    for form in FORMS:
-        end = _path(0.005, form, START * [1 + 1e-6, 1 + 1e-6, 1, 1])[-1]
-        errors[form] = abs(np.hypot(*end[:2]) - 1)
-    assert errors["printed"] > 2e-4 and errors["multiplier"] < 5e-6
-
-
 @pytest.mark.parametrize(("step", "bound"), [(0.05, 4e-2), (0.01, 1e-4), (0.0025, 4e-7)])
 def test_the_length_drifts_with_the_fourth_power_of_the_step(step: float, bound: float) -> None:
     drift = np.abs(np.hypot(*_path(step)[:, :2].T) - 1).max()
@@ -125,15 +89,6 @@ def test_the_chart_and_back() -> None:
     assert np.allclose(hang, [0.0, 1.0, 0.0, 0.0])
     away = pendulum_states([[1.0, 2.0]]) * 3.0
     assert np.allclose(pendulum_chart(away), [[1.0, 2.0]])
-
-
-@pytest.mark.parametrize("model", [pendulum(), pendulum(form="multiplier", length=1.4),
-                                   pendulum_angle(gravity=5.0)])
-def test_jacobians_by_differences(model: Model) -> None:
-    x = np.random.default_rng(3).uniform(-1, 1, (5, model.dim))
-    numeric = replace(model, derivative=None)
-    gap = model.jacobian(x, 0.0, 0.05) - numeric.jacobian(x, 0.0, 0.05)
-    assert np.abs(gap).max() < 1e-8
 
 
 def test_noise_and_names() -> None:

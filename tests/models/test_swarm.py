@@ -30,11 +30,6 @@ def test_reflection_is_even_and_periodic(a: float, b: float) -> None:
     assert np.abs(_reflected(inside, low, high) - inside).max() < 1e-14
 
 
-def test_reflection_turns_back_at_the_wall() -> None:
-    got = _reflected(np.array([[1.25, 0.4], [-1.5, 2.5], [3.25, 0.5]]), *map(np.array, CORNERS))
-    assert np.allclose(got, [[0.75, 0.6], [-0.5, 1.5], [-0.75, 0.5]], atol=1e-14)
-
-
 def test_score_is_the_gradient_of_the_logarithm() -> None:
     f = RotatingMixture(components=3, radius=0.2, phase=0.4)
     x = np.random.default_rng(1).random((7, 2))
@@ -131,15 +126,3 @@ def test_readings_are_the_published_numbers(
     swarm, x = rotating_swarm(reading, strength=0.2), np.array([[0.3, 0.9]])
     assert np.allclose(swarm.drift_at(x, 1.0), mobility * RotatingMixture().score(x, 1.0))
     assert np.allclose(swarm.diffusion_at(x, 1.0), diffusion)
-
-
-@pytest.mark.parametrize("unit", [1e-3, 1e5])
-def test_a_swarm_does_not_depend_on_units(unit: float) -> None:
-    def near(size: float) -> Swarm:
-        return Swarm(lambda x, t: 0.5 * (0.5 * size - x), 0.01 * size**2, high=(size, size))
-
-    x = np.random.default_rng(1).random((50, 2))
-    one, other = (
-        near(u).step(u * x, 0.0, 1.0, rng=np.random.default_rng(2)) / u for u in (1.0, unit)
-    )
-    assert np.allclose(one, other, rtol=1e-9)
