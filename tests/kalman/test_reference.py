@@ -122,6 +122,15 @@ def test_an_angle_may_wrap(filter_: Callable[..., Any]) -> None:
     np.testing.assert_allclose(turned.means, run.means, atol=1e-12)
 
 
+def test_what_the_sensor_cannot_see_is_missing() -> None:
+    """A mean at the sensor's place has no angle; its distance is used all the same."""
+    options = {"model": walk(2), "times": [1e-9],
+               "sensors": [distance_and_angle([0, 1], std=[0.3, 0.1])]}  # fmt: skip
+    here, blind = (extended([0.0, 0.0], FULL, [[0.5, z]], **options) for z in (0.1, np.nan))
+    np.testing.assert_allclose(here.means, blind.means, atol=1e-14)
+    np.testing.assert_allclose(here.covariances, blind.covariances, atol=1e-14)
+
+
 @pytest.mark.parametrize("filter_", [extended, filterpy_ekf])
 def test_extended_steps_are_the_linearised_formulas(filter_: Callable[..., Any]) -> None:
     def flow(x: np.ndarray, t: float, dt: float) -> np.ndarray:
