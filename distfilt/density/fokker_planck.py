@@ -12,7 +12,7 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
-from ..doors import Array, Count, NonNegative, Positive, Record, Times, door, unchecked
+from ..doors import Array, NonNegative, Positive, Record, Times, door, unchecked
 from ..models.swarm import Swarm
 from .grid import Grid
 
@@ -101,18 +101,14 @@ class FokkerPlanck(Record):
         a, b = np.concatenate(left), np.concatenate(right)
         return _Faces(0.5 * (grid.centres[a] + grid.centres[b]), a, b, axis, grid.spacing[axis])
 
-    @door
-    def rates(self, t: float) -> tuple[Array, Array]:
+    def _rates(self, t: float) -> tuple[Array, Array]:
         """Rates at which mass crosses each face, forwards and backwards, in 1/s."""
         f = self._faces
         pick = np.arange(f.axis.size), f.axis
         drift = self.swarm.drift_at(f.points, t)[pick]
         between = self.swarm.diffusion_at(f.points, t)[pick]
-        if callable(self.swarm.diffusion):
-            cells = self.swarm.diffusion_at(self.grid.centres, t)
-            at_left, at_right = cells[f.left, f.axis], cells[f.right, f.axis]
-        else:
-            at_left = at_right = between
+        cells = self.swarm.diffusion_at(self.grid.centres, t)
+        at_left, at_right = cells[f.left, f.axis], cells[f.right, f.axis]
         peclet = drift * f.width / between
         # B(-z) = z + B(z): one exponential serves both directions, without cancellation.
         small = unchecked(bernoulli)(np.abs(peclet))
@@ -122,7 +118,7 @@ class FokkerPlanck(Record):
 
     def _assembled(self, t: float, scale: float, identity: float) -> sparse.csc_array:
         """identity I + scale A(t)."""
-        forwards, backwards = unchecked(self.rates)(t)
+        forwards, backwards = self._rates(t)
         n, f = self.grid.size, self._faces
         leaving = np.bincount(f.left, forwards, n) + np.bincount(f.right, backwards, n)
         data = np.concatenate([identity - scale * leaving, scale * forwards, scale * backwards])
@@ -145,18 +141,14 @@ class FokkerPlanck(Record):
         """The step from `t` to `t` + `dt` as a function: one factorisation for any number."""
         if self.scheme == "split":
             return self._split(t, dt)
-        half = self.scheme == "crank_nicolson"
-        share = 0.5 * dt if half else dt
-        matrix = self._assembled(t + dt, -share, 1.0)
+        share = dt if self.scheme == "backward_euler" else 0.5 * dt
+        explicit, matrix = self._assembled(t, dt - share, 1.0), self._assembled(t + dt, -share, 1.0)
         # The pattern is symmetric and the columns are dominated by their diagonal: no pivoting.
         factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
                        options={"SymmetricMode": True})
-        explicit = self._assembled(t, share, 1.0) if half else None
 
         def move(p: Array) -> Array:
-            columns = p.reshape(-1, self.grid.size).T
-            if explicit is not None:
-                columns = explicit @ columns
+            columns = explicit @ p.reshape(-1, self.grid.size).T
             moved = factors.solve(np.asfortranarray(columns))
             return np.ascontiguousarray(moved.T).reshape(p.shape)
 
@@ -167,7 +159,7 @@ class FokkerPlanck(Record):
 
         The tridiagonal elimination has no subtraction, so it keeps signs to the last bit.
         """
-        grid, rates = self.grid, unchecked(self.rates)(t + dt)
+        grid, rates = self.grid, self._rates(t + dt)
         factors = [self._eliminated(*(dt * self._across(r, k) for r in rates))
                    for k in range(grid.dim)]
 
@@ -205,25 +197,19 @@ class FokkerPlanck(Record):
         return np.moveaxis(rate[self._faces.axis == k].reshape(shape), k, 0)
 
     @door
-    def evolve(
-        self, values: Annotated[Array, "... self.grid.size"], times: Times, *, substeps: Count = 1
-    ) -> Array:
-        """Densities at `times`, (T, ..., n), of one that is `values` at time 0.
+    def evolve(self, values: Annotated[Array, "... self.grid.size"], times: Times) -> Array:
+        """Densities at `times`, (T, ..., n), of one that is `values` at time 0, a step to each.
 
         Parameters
         ----------
         values : array_like, (..., n)
         times : array_like, (T,)
             Strictly increasing from 0, in s.
-        substeps : int
-            Steps between two times.
         """
         if times.size and times[0] <= 0:
             raise ValueError(f"times: needs times after 0, got {times[0]:g}")
         p, now, out = values, 0.0, np.empty((times.size, *values.shape))
         for k, t in enumerate(times):
-            h = (float(t) - now) / substeps
-            for j in range(substeps):
-                p = unchecked(self.solver)(now + j * h, h)(p)
+            p = unchecked(self.solver)(now, float(t) - now)(p)
             out[k], now = p, float(t)
         return out

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..doors import Array, Bounds, Count, Record, door
+from ..doors import Array, Bounds, Count, NonNegative, Positive, Record, door
 
-__all__ = ["Grid"]
+__all__ = ["Grid", "zero_mean_prior"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,14 +101,12 @@ class Grid(Record):
         axes = np.meshgrid(*(0.5 * (e[1:] + e[:-1]) for e in self.edges), indexing="ij")
         return np.stack([a.ravel() for a in axes], axis=-1)
 
-    def _inside(self, positions: Array, name: str = "positions") -> Array:
+    def _inside(self, positions: Array) -> Array:
         """Positions (..., d); those outside the box are refused."""
         outside = ((positions < self.low) | (positions > self.high)).any(axis=-1)
         if outside.any():
-            raise ValueError(
-                f"{name}: needs agents inside the grid's box, got {int(outside.sum())} outside, "
-                f"one at {positions[outside][0].tolist()}"
-            )
+            raise ValueError("positions: needs agents inside the grid's box, got "
+                             f"{outside.sum()} outside, one at {positions[outside][0].tolist()}")
         return positions
 
     @door
@@ -149,26 +147,20 @@ class Grid(Record):
         self, values: Annotated[Array, "self.size"], positions: Annotated[Array, "... self.dim"]
     ) -> Array:
         """Multilinear interpolation of cell values (n,) at positions (..., d); flat at walls."""
-        v = values.reshape(self.shape)
-        place = (self._inside(positions) - self.low) / self.spacing - 0.5
-        first = np.clip(np.floor(place), 0, np.array(self.shape) - 2).astype(np.int64)
-        share = np.clip(place - first, 0.0, 1.0)
-        out = np.zeros(positions.shape[:-1])
-        for corner in np.ndindex(*(2,) * self.dim):
-            step = np.array(corner)
-            weight = np.where(step, share, 1 - share).prod(axis=-1)
-            out += weight * v[tuple(np.moveaxis(first + step, -1, 0))]
-        return out
+        from scipy.ndimage import map_coordinates
+
+        flat = self._inside(positions).reshape(-1, self.dim)
+        place, v = ((flat - self.low) / self.spacing - 0.5).T, values.reshape(self.shape)
+        found = map_coordinates(v, place, order=1, mode="nearest")
+        return np.asarray(found.reshape(positions.shape[:-1]))
 
     @door
     def aggregated(self, values: Annotated[Array, "... self.size"], coarse: Grid) -> Array:
         """Means over the cells of a coarser grid of the same box, (..., n) to (..., m)."""
         pairs = list(zip(self.shape, coarse.shape, strict=False))
         if not self._same_box(coarse) or any(a % b for a, b in pairs):
-            raise ValueError(
-                f"coarse: needs a grid of the same box whose cells are whole numbers of cells of "
-                f"{self.shape}, got {coarse.shape!r}"
-            )
+            raise ValueError("coarse: needs a grid of the same box with whole numbers of the "
+                             f"cells of {self.shape}, got {coarse.shape!r}")
         lead = values.shape[:-1]
         cut = values.reshape(*lead, *(n for a, b in pairs for n in (b, a // b)))
         axes = tuple(len(lead) + 1 + 2 * k for k in range(self.dim))
@@ -178,8 +170,7 @@ class Grid(Record):
         """Whether another grid, or a swarm, fills the same box."""
         return np.array_equal(self.low, other.low) and np.array_equal(self.high, other.high)
 
-    @door
-    def wavenumbers(self, rank: Count) -> NDArray[np.int64]:
+    def wavenumbers(self, rank: int) -> NDArray[np.int64]:
         """The `rank` lowest cosine modes, (rank, d) half-waves along each axis, constant first.
 
         They are ordered by the frequency in the box, and ties by the number itself.
@@ -219,3 +210,52 @@ class Grid(Record):
     def _kept(self) -> dict[int, Array]:
         """Bases that were asked for before; consensus asks in every step."""
         return {}
+
+
+@door
+def zero_mean_prior(
+    grid: Grid, *, rank: Count, length: Positive | None = None, std: Positive | None = None,
+    mass_std: NonNegative = 0.0,
+) -> Array:
+    r"""A factor S of the prior covariance P = S Sᵀ of a density: smooth, and of zero mass.
+
+    Cosine modes without the constant one, with the spectrum of a squared exponential of length ℓ,
+    :math:`\lambda_k\propto\exp(-\pi^2\ell^2|k|^2/2)`, scaled so that all modes together have the
+    variance std² in the mean over the box. Every column integrates to zero, so no gain built from
+    S can change a density's mass, unless `mass_std` adds a column that lets it.
+
+    Parameters
+    ----------
+    grid : Grid
+    rank : int
+        Number r of modes that are kept, below the number of cells.
+    length : float, optional
+        Correlation length ℓ, in the box's unit; by default a tenth of the box's side.
+    std : float, optional
+        Standard deviation of the density in a cell, of all modes together; by default the mean
+        density of the box.
+    mass_std : float
+        Standard deviation of the total mass. Above 0, a constant column of that mass comes first.
+
+    Returns
+    -------
+    ndarray, (n, r), or (n, 1 + r) if the mass is not certain
+
+    Examples
+    --------
+    >>> S = zero_mean_prior(Grid((30, 30)), rank=50)
+    >>> S.shape, bool(abs(S.sum(axis=0)).max() < 1e-10)
+    ((900, 50), True)
+    """
+    if rank >= grid.size:
+        raise ValueError(f"rank: needs at most {grid.size - 1} modes besides the constant, "
+                         f"got {rank}")
+    ell = 0.1 * grid.side if length is None else min(length, 1e6 * grid.side)
+    squared = ((grid.wavenumbers(grid.size)[1:] / grid.width) ** 2).sum(axis=-1)
+    # About the lowest mode: a length beyond the box leaves that alone, and no zero in its place.
+    spectrum = np.exp(-0.5 * (np.pi * ell) ** 2 * (squared - squared[0]))
+    scale = np.sqrt(spectrum[:rank] / (spectrum.sum() / grid.box))
+    scale *= 1 / grid.box if std is None else std
+    basis = np.asarray(grid.cosines(rank + 1)[:, 1:] * scale)
+    even = np.full((grid.size, 1), mass_std / (grid.size * grid.volume))
+    return np.concatenate([even, basis], axis=1) if mass_std > 0 else basis

@@ -7,13 +7,10 @@ from typing import Annotated, Literal
 import numpy as np
 from scipy.special import erf
 
-from ..doors import Array, Bounds, Count, Positive, Share, door, unchecked
+from ..doors import Array, Bounds, Count, Positive, door, unchecked
 from .grid import Grid
 
-__all__ = [  # fmt: skip
-    "adaptive_bandwidths", "bandwidth", "kernel_covariance", "kernel_density", "kernel_information",
-    "kernels",
-]
+__all__ = ["bandwidth", "kernel_covariance", "kernel_density", "kernel_information", "kernels"]
 
 Widths = Positive | Annotated[Array, "n", Bounds(above=0)]
 
@@ -45,16 +42,21 @@ def fine_enough(grid: Grid, bandwidth: float | Array) -> None:
         raise ValueError(f"bandwidth: needs at most 20 widths of the box, got {bandwidth}")
     least, widest = float(np.min(bandwidth)), float(grid.spacing.max())
     if widest > 2 * least * (1 + 1e-12):
-        raise ValueError(
-            f"grid: needs cells no wider than two bandwidths ({2 * least:g}), got {widest:g}: "
-            f"too coarse for the kernel"
-        )
+        raise ValueError(f"grid: needs cells no wider than two bandwidths, {2 * least:g}, "
+                         f"got {widest:g}")
 
 
 def _factors(positions: Array, grid: Grid, bandwidth: float | Array) -> list[Array]:
     fine_enough(grid, bandwidth)
     x, h = grid._inside(positions), np.broadcast_to(bandwidth, positions.shape[:-1])
     return [_along(x[..., k], grid, k, h) for k in range(grid.dim)]
+
+
+def _products(out: Array, factors: list[Array]) -> Array:
+    """Each agent's products over the cells of one axis and of some more, (..., N, n)."""
+    for factor in factors:
+        out = (out[..., :, None] * factor[..., None, :]).reshape(*out.shape[:-1], -1)
+    return out
 
 
 @door
@@ -91,10 +93,8 @@ def kernels(
     >>> z.shape, bool(abs(grid.integral(z) - 1).max() < 1e-12)
     ((2, 400), True)
     """
-    out, *rest = _factors(positions, grid, bandwidth)
-    for factor in rest:
-        out = (out[..., :, None] * factor[..., None, :]).reshape(*out.shape[:-1], -1)
-    return out
+    first, *rest = _factors(positions, grid, bandwidth)
+    return _products(first, rest)
 
 
 @door
@@ -117,13 +117,8 @@ def kernel_density(
     >>> round(float(p.max() * 2 * np.pi * 0.1**2), 2)
     0.92
     """
-    factors = _factors(positions, grid, bandwidth)
-    if grid.dim == 2:
-        out = factors[0].mT @ factors[1]
-    elif grid.dim == 1:
-        out = factors[0].sum(axis=-2)
-    else:
-        out = np.einsum("...ni,...nj,...nk->...ijk", *factors, optimize=True)
+    first, *rest = _factors(positions, grid, bandwidth)
+    out = first.mT @ _products(np.ones((*first.shape[:-1], 1)), rest)
     return np.asarray(out.reshape(*positions.shape[:-2], grid.size) / positions.shape[-2])
 
 
@@ -235,43 +230,3 @@ def _least_squares(x: Array, grid: Grid, h: float) -> float:
     at = z[:, grid.cells(x)]  # kernel of agent i in the cell of agent j
     others = (at.sum() - np.trace(at)) / (n * (n - 1))
     return float((mean**2).sum() * grid.volume - 2 * others)
-
-
-@door
-def adaptive_bandwidths(
-    positions: Annotated[Array, "n grid.dim"], grid: Grid, *, bandwidth: Positive,
-    sensitivity: Share = 0.5,
-) -> Array:
-    r"""Abramson's bandwidths: narrow where agents are many, wide where they are few.
-
-    .. math:: h_i = h\,\bigl(\hat p(\mathbf X_i)/g\bigr)^{-s},\qquad
-              \log g=\tfrac1N\textstyle\sum_i\log\hat p(\mathbf X_i)
-
-    Parameters
-    ----------
-    positions : array_like, (N, d)
-    grid : Grid
-    bandwidth : float
-        h, of the pilot estimate and in the mean.
-    sensitivity : float
-        s in [0, 1]; 1/2 removes the leading bias.
-
-    Returns
-    -------
-    ndarray, (N,)
-        At least half a cell.
-
-    Notes
-    -----
-    I. S. Abramson, Annals of Statistics 10 (1982) 1217-1223.
-
-    Examples
-    --------
-    >>> x = [[0.5, 0.5], [0.5, 0.52], [0.1, 0.9]]
-    >>> h = adaptive_bandwidths(x, Grid((30, 30)), bandwidth=0.1)
-    >>> bool(h[2] > 0.1 > h[0])
-    True
-    """
-    pilot = kernel_density(positions, grid, bandwidth=bandwidth)[grid.cells(positions)]
-    local = bandwidth * (pilot / np.exp(np.log(pilot).mean())) ** -sensitivity
-    return np.asarray(np.maximum(local, 0.5 * float(grid.spacing.max())))

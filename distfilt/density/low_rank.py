@@ -9,86 +9,19 @@ are not, and the two forms below do the same step.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..doors import (
-    Array,
-    Bounds,
-    Count,
-    NonNegative,
-    Positive,
-    Record,
-    array,
-    door,
-    semidefinite,
-    unchecked,
-)
-from .grid import Grid
+from ..doors import Array, Positive, Record, array, door, semidefinite, unchecked
 
-__all__ = [  # fmt: skip
-    "Dense", "LowRank", "dense_step", "low_rank_moved", "low_rank_start", "low_rank_step",
-    "zero_mean_prior",
-]
+__all__ = ["Dense", "LowRank", "dense_step", "low_rank_moved", "low_rank_start", "low_rank_step"]
 
-Length = Annotated[float, Bounds(above=0, at_most=1e100)]
 Move = Callable[[Array], Array]
 Observed = Annotated[Array, "*state.base.shape"] | Annotated[Array, "state.size"]
-
-
-@door
-def zero_mean_prior(
-    grid: Grid, *, rank: Count, length: Length | None = None, std: Positive | None = None,
-    mass_std: NonNegative = 0.0,
-) -> Array:
-    r"""A factor S of the prior covariance P = S Sᵀ of a density: smooth, and of zero mass.
-
-    Cosine modes without the constant one, with the spectrum of a squared exponential of length ℓ,
-    :math:`\lambda_k\propto\exp(-\pi^2\ell^2|k|^2/2)`, scaled so that all modes together have the
-    variance std² in the mean over the box. Every column integrates to zero, so no gain built from
-    S can change a density's mass, unless `mass_std` adds a column that lets it.
-
-    Parameters
-    ----------
-    grid : Grid
-    rank : int
-        Number r of modes that are kept, below the number of cells.
-    length : float, optional
-        Correlation length ℓ, in the box's unit; by default a tenth of the box's side.
-    std : float, optional
-        Standard deviation of the density in a cell, of all modes together; by default the mean
-        density of the box.
-    mass_std : float
-        Standard deviation of the total mass. Above 0, a constant column of that mass comes first.
-
-    Returns
-    -------
-    ndarray, (n, r), or (n, 1 + r) if the mass is not certain
-
-    Examples
-    --------
-    >>> S = zero_mean_prior(Grid((30, 30)), rank=50)
-    >>> S.shape, bool(abs(S.sum(axis=0)).max() < 1e-10)
-    ((900, 50), True)
-    """
-    if rank >= grid.size:
-        raise ValueError(f"rank: needs at most {grid.size - 1} modes besides the constant, "
-                         f"got {rank}")
-    ell = 0.1 * grid.side if length is None else length
-    squared = ((grid.wavenumbers(grid.size)[1:] / grid.width) ** 2).sum(axis=-1)
-    # About the lowest mode: a length beyond the box leaves that alone, and no zero in its place.
-    spectrum = np.exp(-0.5 * (np.pi * ell) ** 2 * (squared - squared[0]))
-    scale = np.sqrt(spectrum[:rank] / (spectrum.sum() / grid.box))
-    scale *= 1 / grid.box if std is None else std
-    basis = np.asarray(grid.cosines(rank + 1)[:, 1:] * scale)
-    even = np.full((grid.size, 1), mass_std / (grid.size * grid.volume))
-    return np.concatenate([even, basis], axis=1) if mass_std > 0 else basis
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,12 +46,12 @@ class Dense(Record):
 @door
 def dense_step(
     state: Dense, move: Move, observed: Annotated[Array, "*state.mean.shape"], noise: ArrayLike,
-    dt: Positive, *, process: Annotated[Array, "state.mean.size q"] | None = None,
+    dt: Positive,
 ) -> Dense:
     r"""One step with the whole covariance: O(n³), the reference for the other.
 
     .. math::
-        \mathbf P^-=\boldsymbol\Phi\mathbf P\boldsymbol\Phi^\top+\mathbf Q\Delta,\quad
+        \mathbf P^-=\boldsymbol\Phi\mathbf P\boldsymbol\Phi^\top,\quad
         \mathbf K=\mathbf P^-(\mathbf P^-+\mathbf R/\Delta)^{-1},\quad
         \mathbf P=(\mathbf I-\mathbf K)\mathbf P^-
 
@@ -133,8 +66,6 @@ def dense_step(
         Strength R of its white noise: a variance times seconds, positive.
     dt : float
         The step Δ, in s.
-    process : array_like, (n, q), optional
-        A factor of Q, per root second.
 
     Examples
     --------
@@ -144,8 +75,6 @@ def dense_step(
     """
     variance, mean = _strength(noise, state.mean.shape) / dt, move(state.mean)
     p = move(move(state.covariance).T)
-    if process is not None:
-        p = p + dt * process @ process.T
     p = 0.5 * (p + p.T)
     gain = np.linalg.solve(p + np.diag(variance), p).T
     left = p - gain @ p
@@ -164,18 +93,6 @@ def _strength(noise: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 _MOST = 1e15
 """Ratio of informations, the greatest to the least, from which on rounding decides."""
-
-
-@contextmanager
-def _named() -> Iterator[None]:
-    """Say whose matrix it is that has no factor."""
-    try:
-        yield
-    except np.linalg.LinAlgError as error:
-        raise np.linalg.LinAlgError(
-            "density filter: a covariance has no factor to rounding, as the length of a step, the "
-            f"noise or the prior is out of scale: {error}"
-        ) from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,8 +138,7 @@ class LowRank(Record):
     @property
     def estimates(self) -> Array:
         """Every filter's density, (F, n)."""
-        with _named():
-            weights = np.linalg.solve(self.information, self.vector[..., None])[..., 0]
+        weights = np.linalg.solve(self.information, self.vector[..., None])[..., 0]
         return np.asarray(self.base + (self.basis @ weights[..., None])[..., 0])
 
     @property
@@ -233,10 +149,9 @@ class LowRank(Record):
     @property
     def factors(self) -> Array:
         """Every filter's factor L of the covariance L Lᵀ, (F, n, r)."""
-        with _named():
-            root = np.linalg.cholesky(self.information)
-            rows = np.broadcast_to(self.basis.mT, (len(root), *self.basis.mT.shape[-2:]))
-            return np.linalg.solve(root, rows).mT
+        root = np.linalg.cholesky(self.information)
+        rows = np.broadcast_to(self.basis.mT, (len(root), *self.basis.mT.shape[-2:]))
+        return np.linalg.solve(root, rows).mT
 
     @door
     def covariance(self, k: int) -> Array:
@@ -300,8 +215,7 @@ def low_rank_moved(
         raise ValueError("dt: needs the step's length where there is process noise, got None")
     added = np.broadcast_to(np.sqrt(dt) * process, (len(base), *process.shape))
     factor = np.concatenate([basis, added], axis=-1)
-    with _named():
-        _, vectors = np.linalg.eigh(factor.mT @ factor)
+    _, vectors = np.linalg.eigh(factor.mT @ factor)
     kept = factor @ vectors[..., -basis.shape[-1] :]
     return unchecked(low_rank_start)(kept, moved[-len(base) :])
 
@@ -339,10 +253,10 @@ def low_rank_step(state: LowRank, observed: Observed, noise: ArrayLike, dt: Posi
     seen = (gap[:, None, :] @ state.basis)[:, 0]
     information = state.information + _weighted_products(state.basis, precision)
     if not information.max() < _MOST:
-        with _named():
-            least, most = np.linalg.eigvalsh(information)[:, [0, -1]].T
-            if not (most < _MOST * least).all():
-                raise np.linalg.LinAlgError(f"information up to {most.max():.3g} priors")
+        least, most = np.linalg.eigvalsh(information)[:, [0, -1]].T
+        if not (most < _MOST * least).all():
+            raise np.linalg.LinAlgError("density filter: the step's length, the noise or the prior "
+                                        f"is out of scale, information {most.max():.3g}")
     return state.changed(information=information, vector=state.vector + seen)
 
 
@@ -351,23 +265,7 @@ def _weighted_products(s: Array, weights: Array) -> Array:
     if s.ndim == 3 or len(weights) < 16:
         return np.asarray((s.mT * weights[:, None, :]) @ s)
     r, turned = s.shape[1], np.ascontiguousarray(s.T)
-    half = np.empty((len(weights), r * (r + 1) // 2))
-    # Products of two columns, about a hundred at a time: they stay in the processor's cache.
-    block = np.empty((96 + r, s.shape[0]))
-    done = held = 0
+    out = np.empty((len(weights), r, r))
     for i in range(r):
-        np.multiply(turned[i], turned[i:], out=block[held : held + r - i])
-        held += r - i
-        if held >= 96 or i == r - 1:
-            half[:, done : done + held] = weights @ block[:held].T
-            done, held = done + held, 0
-    return np.asarray(np.take(half, _places(r), axis=1).reshape(len(weights), r, r))
-
-
-@lru_cache(maxsize=8)
-def _places(r: int) -> NDArray[np.int64]:
-    """Where each entry of a symmetric matrix is in the list of its upper triangle's rows."""
-    rows, columns = np.triu_indices(r)
-    place = np.empty((r, r), dtype=np.int64)
-    place[rows, columns] = place[columns, rows] = np.arange(rows.size)
-    return place.ravel()
+        out[:, i, i:] = out[:, i:, i] = weights @ (turned[i] * turned[i:]).T
+    return out

@@ -184,9 +184,8 @@ def alone(sharing: Sharing, seen: Seen) -> Array:
 def _coordinates(seen: Seen, modes: int | None, values: Array) -> Array:
     """Densities, whole or as cosine coefficients, and a 1 of the first agent that is here."""
     z = values if modes is None else values @ seen.grid.cosines(modes) * seen.grid.volume
-    leader = np.zeros((len(z), 1))
-    leader[int(np.argmax(seen.present)), 0] = 1.0
-    return np.concatenate([z, leader], axis=1)
+    leader = np.arange(len(z)) == np.argmax(seen.present)
+    return np.concatenate([z, leader[:, None]], axis=1)
 
 
 def _read(values: Array, seen: Seen, modes: int | None) -> tuple[Array, Array]:
