@@ -31,8 +31,6 @@ FLAGS = (
     "--disable-component-update",
     "--disable-sync",
     "--no-first-run",
-    "--no-default-browser-check",
-    "--window-size=1400,1000",
 )
 
 # Waits for the mathematics, opens what is folded, then reports what a reader would meet.

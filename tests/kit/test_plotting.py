@@ -38,12 +38,6 @@ def curve(rate, width=3.0):
     return ax
 
 
-def noise(seed):
-    ax = blank()
-    ax.imshow(np.random.default_rng(seed).random((400, 600)), aspect="auto")
-    return ax.figure
-
-
 PAIR = [[0, 1], [1, 0]]
 
 # --- figures ----------------------------------------------------------------------------------
@@ -191,6 +185,9 @@ def test_texts_of_a_slider_cannot_end_its_script():
 
 
 def test_a_page_s_sliders_stay_small_and_of_one_size():
+    def noise(seed):
+        return blank().imshow(np.random.default_rng(seed).random((400, 600)), aspect="auto").axes
+
     with pytest.raises(ValueError, match="^frames: needs at most 400000"):
         slider(noise, range(4), label="x", alt="y", colours=256)
     with pytest.raises(ValueError, match="^draw: needs figures of one size"):

@@ -259,9 +259,9 @@ def test_rows_of_what_ran_are_judged_to_the_first_difference(
 
 
 def test_formulas_are_compared_without_spaces() -> None:
-    rows = table("grange", "table-1")
+    first, *others = table("grange", "table-1")
     for function, verdict in (("h( x )=x", "read"), ("h(x) = 2x", "differs")):
-        changed = [{**rows[0], "function": function}, *rows[1:]]
+        changed = [{**first, "function": function}, *others]
         assert judge_parameters("grange", "Table I", changed).verdict == verdict
 
 
