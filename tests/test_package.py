@@ -23,24 +23,18 @@ PATHS = sorted(PACKAGE.rglob("*.py"))
 TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in PATHS}
 
 # Who may import whom: a module imports from floors below its own, or within its own folder.
-FLOORS = {
-    "doors": 0,
-    "linalg": 1,
-    "ensembles": 2,
-    "gaussians": 2,
-    "models": 2.5,
-    "network": 3,
-    "sensors": 3,
-    "metrics": 3,
-    "mixtures": 4,
-    "density": 4,
-    "kalman": 4,
-    "triangular": 4,
-    "coupling": 4,
-    "updates": 5,
-    "filters": 6,
-    "": 7,
-}
+LEVELS = (
+    ("doors",),
+    ("linalg",),
+    ("ensembles", "gaussians"),
+    ("models",),
+    ("network", "sensors", "metrics"),
+    ("mixtures", "density", "kalman", "triangular", "coupling"),
+    ("updates",),
+    ("filters",),
+    ("",),
+)
+FLOORS = {room: floor for floor, level in enumerate(LEVELS) for room in level}
 # A heavy package has a home.
 HOMES = {
     "cvxpy": {"triangular"},
