@@ -1,5 +1,6 @@
 """Filters: a model, sensors, an update and a network, put together on one contract."""
 
+from ..updates.particles import ParticleCollapse
 from .base import Filter
 from .density import DensityFilter, DensityState
 from .ensemble import EnsembleFilter, TransportFilter
@@ -7,7 +8,7 @@ from .gaussian import GaussianFilter, GaussianState
 from .inputs import Reading, moments_of
 from .mixture import MixtureFilter, MixtureState
 from .news import NewsFilter, increment
-from .particle import ParticleCollapse, ParticleFilter
+from .particle import ParticleFilter
 from .record import Summary, final_state
 from .saving import SensorState, State
 from .step import FilterError, Step

@@ -259,13 +259,9 @@ class Filter(Record, ABC):
         if state.ledger.messages.size != self.count:
             got = state.ledger.messages.size
             raise ValueError(f"state: needs {self.count} agents, got {got}")
-        if self.sizes is not None and state.sizes != self.sizes:
-            raise ValueError(f"state: needs sizes {self.sizes} an agent, got {state.sizes}")
-
-    @property
-    def sizes(self) -> tuple[int, ...] | None:
-        """Sizes of one agent's belief, if a state's need to be compared with them."""
-        return None
+        own = getattr(self, "sizes", None)
+        if own is not None and state.sizes != own:
+            raise ValueError(f"state: needs sizes {own} an agent, got {state.sizes}")
 
     def read(self, observations: Any, runs: tuple[int, ...], t: float) -> Any:
         """What is observed at one time, checked; as a rule each agent's readings."""

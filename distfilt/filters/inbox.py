@@ -5,10 +5,9 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
 from ..doors import Array, unchecked
@@ -16,17 +15,8 @@ from ..sensors import Sensor
 
 __all__ = ["Heard", "groups"]
 
-Indices = NDArray[np.intp]
 Known = Sequence[Sequence[tuple[Sensor, Array]]]
 """Of each agent the readings that it has: their sensors, and their values (*runs, m)."""
-
-
-class _Part(NamedTuple):
-    """One sensor: with which agents of a group its reading stands, `rows`, and in which columns."""
-
-    sensor: Sensor
-    rows: Indices
-    columns: Indices
 
 
 class Heard:
@@ -58,24 +48,26 @@ class Heard:
                 cells.setdefault(sensor, []).append((g, at))
                 self.owner[g, at : at + sensor.dim] = k
                 at += sensor.dim
-        # Agents with one and the same sensor are predicted together.
-        self.parts, noise = [], np.zeros((len(agents), size, size))
+        # Agents with one and the same sensor are predicted together: with which agents of the
+        # group a sensor's reading stands, and in which columns.
+        self.parts: list[tuple[Sensor, Any, Any]] = []
+        noise = np.zeros((len(agents), size, size))
         for sensor, found in cells.items():
             rows, starts = (np.array(c, dtype=np.intp) for c in zip(*found, strict=True))
             columns = starts[:, None] + np.arange(sensor.dim)
-            self.parts.append(_Part(sensor, rows, columns))
+            self.parts.append((sensor, rows, columns))
             across, down = columns[:, :, None], columns[:, None, :]
             noise[rows[:, None, None], across, down] = sensor.cov
         self.noise = noise[0] if (noise == noise[:1]).all() else noise
-        self.linear = all(part.sensor.linear is not None for part in self.parts)
+        self.linear = all(sensor.linear is not None for sensor, *_ in self.parts)
         self.matrices: dict[int, Array] = {}
 
     def matrix(self, dim: int) -> Array:
         """The matrices of linear sensors one below the other, (G, M, d), made once."""
         if dim not in self.matrices:
             h = np.zeros((*self.owner.shape, dim))
-            for part in self.parts:
-                h[part.rows[:, None], part.columns] = part.sensor.matrix(dim)
+            for sensor, rows, columns in self.parts:
+                h[rows[:, None], columns] = sensor.matrix(dim)
             self.matrices[dim] = h
         return self.matrices[dim]
 
@@ -101,28 +93,15 @@ class Heard:
             out = states @ self.matrix(states.shape[-1]).mT
         else:
             out = np.empty((*states.shape[:-2], self.target.shape[-1], states.shape[-2]))
-            for part in self.parts:
-                seen = self._seen(part, states, previous).swapaxes(-1, -2)
-                out[..., part.rows[:, None], part.columns, :] = seen
+            for sensor, rows, columns in self.parts:
+                before = None if previous is None else previous[..., rows, :, :]
+                aim = self.target[..., rows[:, None], columns][..., None, :]
+                seen = _seen(sensor, states[..., rows, :, :], before, aim)
+                out[..., rows[:, None], columns, :] = seen.swapaxes(-1, -2)
             out = np.ascontiguousarray(out.swapaxes(-1, -2))
         if np.isinf(out).any():
             raise ValueError("predicted: needs finite numbers or NaN (missing), got infinity")
         return out
-
-    def _seen(self, part: _Part, states: Array, previous: Array | None) -> Array:
-        """Readings of one sensor, (*runs, K, N, m)."""
-        sensor, here = part.sensor, states[..., part.rows, :, :]
-        predict = unchecked(sensor.predict)
-        if not sensor.uses_previous or previous is None:
-            seen = predict(here)  # which says so where states of before are missing
-        else:
-            seen = predict(here, previous[..., part.rows, :, :])
-        if sensor.difference is None:
-            return seen
-        # On the branch of the observation: y* - wrap(y* - h).
-        aim = self.target[..., part.rows[:, None], part.columns][..., None, :]
-        gap = unchecked(sensor.residual)(np.broadcast_to(aim, seen.shape), seen)
-        return np.where(np.isnan(gap), seen, aim - gap)
 
     def jacobian(self, states: Array) -> Array:
         """Derivatives of the readings at states (*runs, G, d), (*runs, G, M, d)."""
@@ -130,9 +109,9 @@ class Heard:
         if self.linear:
             return np.broadcast_to(self.matrix(d), (*self.target.shape, d))
         out = np.empty((*self.target.shape, d))
-        for part in self.parts:
-            slope = unchecked(part.sensor.jacobian)(states[..., part.rows, :])
-            out[..., part.rows[:, None], part.columns, :] = slope
+        for sensor, rows, columns in self.parts:
+            slope = unchecked(sensor.jacobian)(states[..., rows, :])
+            out[..., rows[:, None], columns, :] = slope
         return out
 
     def gated(self, mean: Array, cov: Array, share: float) -> tuple[Heard, Array]:
@@ -153,6 +132,20 @@ class Heard:
             out = np.where(here & bad[..., None], np.nan, out)
             refused += bad
         return self.aimed(out), refused
+
+
+def _seen(sensor: Sensor, states: Array, previous: Array | None, aim: Array) -> Array:
+    """Readings of one sensor, (*runs, K, N, m), on the branch of what was observed."""
+    predict = unchecked(sensor.predict)
+    if not sensor.uses_previous or previous is None:
+        seen = predict(states)  # which says so where states of before are missing
+    else:
+        seen = predict(states, previous)
+    if sensor.difference is None:
+        return seen
+    # y* - wrap(y* - h)
+    gap = unchecked(sensor.residual)(np.broadcast_to(aim, seen.shape), seen)
+    return np.where(np.isnan(gap), seen, aim - gap)
 
 
 @lru_cache(maxsize=32)

@@ -10,17 +10,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from ..doors import (
-    MISSING,
-    Array,
-    Bounds,
-    Index,
-    Record,
-    array,
-    increasing,
-    semidefinite,
-    unchecked,
-)
+from ..doors import MISSING, Array, Index, Record, array, increasing, semidefinite, unchecked
 from ..ensembles import draw, sample_covariance
 from ..mixtures import GaussianMixture
 from ..sensors import Sensor
@@ -148,7 +138,8 @@ def belated(f: Any, late: Sequence[Reading], state: Any, t: float) -> list[Readi
             raise ValueError(
                 f"late: needs an earlier time that is kept ({known}), got {item.t:g}"
             )
-        Bounds(below=f.count)(item.agent, "late")
+        if item.agent >= f.count:
+            raise ValueError(f"late: needs an agent below {f.count}, got {item.agent}")
         if (sensor := sensor_of(f, item)).uses_previous:
             raise ValueError(f"late: a {sensor.kind} sensor cannot be late, it compares two times")
         said = _complete(f, item, state.runs, "late")
@@ -165,7 +156,8 @@ def planned(f: Any, state: Any, times: Any, observations: Any) -> tuple[Array, I
     if _are_readings(observations) and (times is None or observations):
         at: dict[float, list[list[Reading]]] = {t: [[] for _ in range(f.count)] for t in grid}
         for event in observations:
-            Bounds(below=f.count)(event.agent, "observations")
+            if event.agent >= f.count:
+                raise ValueError(f"observations: needs agents below {f.count}, got {event.agent}")
             at.setdefault(event.t, [[] for _ in range(f.count)])[event.agent].append(event)
         grid = np.array(sorted(at))
         entries = iter([at[t] for t in grid])
@@ -178,8 +170,8 @@ def planned(f: Any, state: Any, times: Any, observations: Any) -> tuple[Array, I
                     f"observations: needs ({grid.size}, ..., m) for agent {agent}, got {got}"
                 )
         entries = ([None if o is None else o[k] for o in observations] for k in range(grid.size))
-    if grid.size:
-        Bounds(at_least=state.t)(float(grid[0]), "times")
+    if grid.size and grid[0] < state.t:
+        raise ValueError(f"times: needs times from the state's {state.t:g} on, got {grid[0]:g}")
     return grid, entries
 
 

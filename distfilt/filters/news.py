@@ -182,13 +182,10 @@ def _packed(news: Array) -> Array:
 
 def _unpacked(numbers: Array, n: int) -> Array:
     """The increment of n components, whose number of rows follows from its length."""
-    for r in range(1, n + 1):
-        filled = np.triu_indices(r, 0, n + 1)
-        if filled[0].size == numbers.size:
-            out = np.zeros((r, n + 1))
-            out[filled] = numbers
-            return out
-    raise ValueError(f"news: needs an increment of {n} components, got {numbers.size} numbers")
+    sizes = [np.triu_indices(r, 0, n + 1)[0].size for r in range(1, n + 1)]
+    out = np.zeros((sizes.index(numbers.size) + 1, n + 1))
+    out[np.triu_indices(len(out), 0, n + 1)] = numbers
+    return out
 
 
 def _learned(belief: GaussianMixture, news: Array) -> GaussianMixture:

@@ -10,24 +10,14 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..doors import Array, Mask, Share, unchecked
-from ..updates.particles import (
-    ParticleCollapse,
-    copies,
-    distinct_share,
-    jittered,
-    picked_by,
-    silverman,
-    size_of,
-    taken,
-    weighed,
-)
+from ..updates import particles
 from .ensemble import MembersFilter, Several, warn_of_collapse
 from .inbox import Heard
 from .record import Summary
 from .saving import SensorState
 from .step import Step, guarded
 
-__all__ = ["ParticleCollapse", "ParticleFilter", "ParticleState"]
+__all__ = ["ParticleFilter", "ParticleState"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -66,7 +56,7 @@ class ParticleState(SensorState):
     @cached_property
     def effective_size(self) -> Array:
         """Effective sample size of each agent's weights, (*runs, A)."""
-        return size_of(self.weights)
+        return particles.size_of(self.weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +141,7 @@ class ParticleFilter(MembersFilter):
         w = state.weights
         mean, cov = weighted_moments(state.points, w)
         cov = state.shown(cov)
-        sizes, distinct = state.effective_size, distinct_share(state.points)
+        sizes, distinct = state.effective_size, particles.distinct_share(state.points)
         numbers = {"effective_size": state.shown(sizes), "distinct": state.shown(distinct)}
         variance = np.diagonal(cov, axis1=-2, axis2=-1)
         return Summary(state.shown(mean), variance, cov, state.points, w, numbers)
@@ -172,8 +162,8 @@ class ParticleFilter(MembersFilter):
             lost = state.effective_size[poor][:, None] < 2
             shares = np.where(lost, 1 / self.members, state.weights[poor])
             cov = weighted_moments(before[poor], shares)[1]
-            copied = copies(picked).reshape(-1, self.members)
-            stack[-1][poor] = jittered(stack[-1][poor], cov, width, noise[poor], copied)
+            copied = particles.copies(picked).reshape(-1, self.members)
+            stack[-1][poor] = particles.jittered(stack[-1][poor], cov, width, noise[poor], copied)
         return weights
 
     def _bandwidth(self, t: float, dt: float) -> float:
@@ -181,16 +171,16 @@ class ParticleFilter(MembersFilter):
         if self.jitter is not None:
             return self.jitter
         still = not np.any(self.model.noise_cov(t, dt or 1.0))
-        return silverman(self.members, self.model.dim) if still else 0.0
+        return particles.silverman(self.members, self.model.dim) if still else 0.0
 
     def _pick(
         self, stack: list[Array], log_weights: Array, weights: Array, poor: Mask, offset: Array
     ) -> Any:
         """Resample some agents' paths in the stack; the weights are equal then."""
         rows = slice(None) if poor.all() else poor
-        picked = picked_by(weights[rows], offset[rows])
+        picked = particles.picked_by(weights[rows], offset[rows])
         for k, path in enumerate(stack):
-            moved = taken(path[rows], picked)
+            moved = particles.taken(path[rows], picked)
             stack[k] = path.copy() if rows is poor else moved
             stack[k][rows] = moved
         log_weights[rows] = -np.log(self.members)
@@ -206,9 +196,9 @@ class ParticleFilter(MembersFilter):
         least = max(0.01 * self.members, 2.0)
         # A few that differ are proof enough; all are looked at only where they do not.
         few = points[..., :: max(1, self.members // (4 * math.ceil(least))), :]
-        distinct = distinct_share(few).min() * few.shape[-2] / self.members
+        distinct = particles.distinct_share(few).min() * few.shape[-2] / self.members
         if distinct * self.members < least:
-            distinct = distinct_share(points).min()
+            distinct = particles.distinct_share(points).min()
         if distinct * self.members < least:
             what = f"{distinct:.2%} of an agent's particles are distinct"
         elif size.min() < 2:
@@ -230,7 +220,7 @@ def _weigh(weights: Array, predicted: Array, group: Heard) -> dict[tuple[int, ..
     """Multiply a group's weights by the likelihood, in place; the rows that failed."""
     old = weights[..., group.rows, :]
     (new,), errors = guarded(
-        lambda h, y, w, noise, _: (weighed(w, h, y, noise),),
+        lambda h, y, w, noise, _: (particles.weighed(w, h, y, noise),),
         (predicted, group.target, old), (old,), group.target.ndim - 1, shared=group.noise,
     )
     weights[..., group.rows, :] = new

@@ -20,11 +20,10 @@ from distfilt.density import (
     low_rank_step,
     zero_mean_prior,
 )
-from distfilt.density.sharing import Seen
 from distfilt.filters import DensityFilter, DensityState
 from distfilt.filters.record import final_state
 from distfilt.models import rotating_swarm
-from distfilt.network import Faults, Graph, graphs
+from distfilt.network import Graph, graphs
 
 SIZE, H = 12, 0.12
 GRID = Grid((10, 10))
@@ -88,12 +87,6 @@ def test_coefficients_are_the_whole_density_to_truncation() -> None:
     assert cut.ledger.scalars.sum() == whole.ledger.scalars.sum()
     fewer = last(make(0.5, PIConsensus(modes=30)))
     assert fewer.ledger.scalars.sum() * 101 == whole.ledger.scalars.sum() * 31
-
-
-def test_first_order_rule_keeps_the_average() -> None:
-    state = last(make(0.6, DynamicAverage(modes=None)))
-    y = kernel_density(PATH[-1], GRID, bandwidth=H)
-    assert np.abs(state.observed.mean(axis=0) - y).max() < 1e-12
 
 
 def test_flooding_knows_where_agents_were_as_many_steps_ago_as_hops() -> None:
@@ -193,13 +186,6 @@ def test_directed_graphs_flood_and_average() -> None:
         last(make(one_way, PIConsensus()))
 
 
-def test_losses_change_what_is_known_and_are_counted() -> None:
-    f = make(graphs.ring(SIZE), Flooding(), faults=Faults(loss=0.4, seed=1))
-    state = last(f)
-    assert state.ledger.lost.sum() > 0
-    assert not np.array_equal(state.observed, last(make(graphs.ring(SIZE), Flooding())).observed)
-
-
 @pytest.mark.parametrize("process", [None, 0.5])
 @pytest.mark.parametrize("noise", ["forecast", "observed"])
 def test_a_step_is_the_forms_step_with_the_noise_that_was_asked_for(
@@ -256,8 +242,3 @@ def test_consensus_may_start_flat() -> None:
     assert np.abs(state.carried[0][:, :100] - state.estimates).max() < 1e-14
     assert np.array_equal(state.carried[2], make(0.5, PIConsensus()).start(START).carried[2])
     assert np.abs(GRID.integral(last(f).observed) - 1).max() < 1e-12
-
-
-def test_seen_kernels_of_the_gone_are_zero() -> None:
-    seen = Seen(np.array([[0.5, 0.5], [np.nan, np.nan]]), GRID, H, 0.0)
-    assert seen.kernels[1].max() == 0 and GRID.integral(seen.kernels[0]) == pytest.approx(1)

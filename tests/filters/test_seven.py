@@ -297,16 +297,6 @@ def test_a_state_and_a_reading_of_another_are_refused() -> None:
             f.step(start, 0.1, [reading, None, None])
 
 
-def test_a_graph_in_any_form() -> None:
-    f, start, seen, _ = made("gaussian", graph=graphs.path(3))
-    wanted = f.run(start, TIMES, seen)
-    for given in ([(0, 1), (1, 2)], np.eye(3, k=1) + np.eye(3, k=-1), lambda t: [(0, 1), (1, 2)]):
-        found = made("gaussian", graph=given)[0].run(start, TIMES, seen)
-        xarray.testing.assert_equal(found, wanted)
-    with pytest.raises(ValueError, match="graph: needs"):
-        made("gaussian", graph=3)
-
-
 def test_a_prior_of_any_kind() -> None:
     f, _, _, _ = made("gaussian")
     frozen, mixture = multivariate_normal(*PRIOR), GaussianMixture.gaussian(*PRIOR)
