@@ -25,7 +25,8 @@ from common import ROOT, VERDICT, chapters
 
 ITEMS = ROOT / "data" / "published" / "items.csv"
 LEDGER = ROOT / "data" / "published" / "ledger.csv"
-COLUMNS = ("paper", "item", "kind", "chapter", "verdict", "ours", "published", "why")
+COLUMNS = ("paper", "item", "kind", "chapter", "verdict", "ours", "null", "range",
+           "published", "why")  # fmt: skip
 OPEN = "not yet"
 VERDICTS = {kind: (*found, OPEN) for kind, found in published.VERDICTS.items()}
 """What can stand in the ledger for each kind of item."""
@@ -66,9 +67,9 @@ def ledger(items: list[dict[str, str]], verdicts: list[dict[str, str]]) -> list[
         if verdict["verdict"] not in known:
             raise ValueError(f"{where}: verdict {verdict['verdict']!r}, needs one of {known}")
         given[key] = verdict
-    blank = {"verdict": OPEN, "ours": "", "published": "", "why": ""}
+    blank = dict.fromkeys(COLUMNS, "") | {"verdict": OPEN}
     return [
-        {name: ({**item, **blank, **given.get(key, {})})[name] for name in COLUMNS}
+        {name: (blank | item | given.get(key, {}))[name] for name in COLUMNS}
         for key, item in zip(keys, items, strict=True)
     ]
 

@@ -223,7 +223,9 @@ def reproductions_text() -> str:
         for row in (r for r in rows if r["paper"] == paper):
             cells = [row["item"].replace(" ", "\u00a0"), cell(titles[paper, row["item"]])]
             cells += [chapter_link(row["chapter"])]
-            cells += [cell(row[name]) for name in ("verdict", "ours", "published", "why")]
+            beside = {"ours": "", "null": "<br>*If false:* ", "range": "<br>*Range:* "}
+            ours = "".join(f"{word}{cell(row[n])}" for n, word in beside.items() if row[n])
+            cells += [row["verdict"], ours or cell(""), cell(row["published"]), cell(row["why"])]
             lines += ["| " + " | ".join(cells) + " |"]
         lines += [""]
     return "\n".join(lines)

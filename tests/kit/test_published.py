@@ -282,16 +282,18 @@ def test_every_claim_has_to_hold() -> None:
             judge_claims("grange", "Fig. 1", claims)
 
 
-def test_an_open_criterion_cannot_be_judged(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    folder = tmp_path / "data" / "published" / "grange"
-    folder.mkdir(parents=True)
-    (folder.parent / "items.csv").write_bytes((data_root() / "published/items.csv").read_bytes())
-    (folder / "figure-2.csv").write_text("id,claim,criterion\nagreement,similar,open: how much\n")
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=r"^claims: .*open for agreement"):
-        judge_claims("grange", "Fig. 2", [Claim("agreement", "ratio", True, "1.1")])
+def test_a_rule_that_its_null_passes_too_shows_nothing() -> None:
+    def below(limit: float) -> Claim:
+        return Claim.ruled("pca-stable", "share", lambda s: s < limit, 0.02, 0.3, "a coin")
+
+    verdicts = [judge_claims("grange", "Fig. 1", [UNSTABLE, below(x), SMALL], why="high")
+                for x in (0.1, 0.5, 0.01)]  # fmt: skip
+    assert [v.verdict for v in verdicts] == ["match", "not comparable", "differs"]
+    assert {v.null for v in verdicts} == {"pca-stable, a coin: 0.3"}
+    assert verdicts[1].why == "the rule of pca-stable holds for its null too"
+    swept = below(0.1)._replace(range="for gains from .1 on")
+    verdict = judge_claims("grange", "Fig. 1", [UNSTABLE, swept, SMALL])
+    assert verdict.range == "pca-stable for gains from .1 on"
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -99,6 +99,10 @@ class Verdict:
     why : str
         Needed if it differs or is not comparable: the reason, or the input that the paper does
         not give.
+    null : str
+        What the numbers would be if the claims were false; the rules fail on them.
+    range : str
+        For which values of parameters that the paper does not print the verdict holds.
 
     Examples
     --------
@@ -114,6 +118,8 @@ class Verdict:
     ours: str
     published: str
     why: str = ""
+    null: str = ""
+    range: str = ""
 
     def __post_init__(self) -> None:
         known = VERDICTS[_known(self.paper, self.item).kind]
@@ -123,8 +129,8 @@ class Verdict:
             raise ValueError(f"why: needs a reason for {self.verdict!r}")
 
     def _fields(self) -> list[tuple[str, str]]:
-        pairs = [("ours", self.ours), ("published", self.published), ("why", self.why)]
-        return [(name, text) for name, text in pairs if text]
+        names = ("ours", "null", "range", "published", "why")
+        return [(name, getattr(self, name)) for name in names if getattr(self, name)]
 
     def __str__(self) -> str:
         head = f"{self.paper} {self.item}: {self.verdict}"
@@ -134,19 +140,20 @@ class Verdict:
         return {
             "text/plain": str(self),
             "text/html": html_table((f"{self.paper} {self.item}", self.verdict), self._fields()),
-            _MIME: dict(vars(self)),
+            _MIME: {name: text for name, text in vars(self).items() if text or name == "why"},
         }
 
 
 def _judged(
-    item: Item, good: bool, ours: str, published: str, why: str, study: Scenario | None
+    item: Item, good: bool, ours: str, published: str, why: str, study: Scenario | None,
+    *, open_: str = "", **beside: str,
 ) -> Verdict:
     """What was found, unless the study was another one; the reason is needed for a difference."""
-    named, word = (item.paper, item.item), VERDICTS[item.kind][0]
     if study is not None and study.changed:
-        reason = "changed scenario: " + "; ".join(study.changes)
-        return Verdict(*named, "not comparable", ours, published, reason)
-    return Verdict(*named, word if good else "differs", ours, published, "" if good else why)
+        open_ = "changed scenario: " + "; ".join(study.changes)
+    word = "not comparable" if open_ else VERDICTS[item.kind][0] if good else "differs"
+    reason = open_ or ("" if good else why)
+    return Verdict(item.paper, item.item, word, ours, published, reason, **beside)
 
 
 class Claim(NamedTuple):
@@ -162,6 +169,12 @@ class Claim(NamedTuple):
         Whether its criterion is met.
     evidence : str
         The numbers, with their interval.
+    null : str
+        What the numbers would be if the claim were false, and how that was computed.
+    bites : bool
+        Whether the criterion fails on the null's numbers, as it must.
+    range : str
+        For which values of a parameter that the paper does not print the claim holds.
 
     Examples
     --------
@@ -173,6 +186,25 @@ class Claim(NamedTuple):
     text: str
     holds: bool
     evidence: str
+    null: str = ""
+    bites: bool = True
+    range: str = ""
+
+    @classmethod
+    def ruled(
+        cls, id: str, text: str, rule: Callable[[Any], bool], ours: Any, null: Any, against: str,
+        *, range: str = "", shown: Callable[[Any], str] = str,
+    ) -> Claim:
+        """A claim judged by one rule on our number and on its null, which `against` describes.
+
+        Examples
+        --------
+        >>> print(Claim.ruled("order", "ratio", lambda r: r < 1, 0.8, 1.1, "agents shuffled"))
+        order holds: ratio 0.8
+        """
+        beside = f"{against}: {shown(null)}"
+        holds, passes = bool(rule(ours)), bool(rule(null))
+        return cls(id, text, holds, shown(ours), beside, not passes, range)
 
     def __str__(self) -> str:
         return f"{self.id} {'holds' if self.holds else 'fails'}: {self.text} {self.evidence}"
@@ -187,14 +219,19 @@ def judge_claims(
     Parameters
     ----------
     paper, item : str
-        One of `items`; its claims are listed in ``published/PAPER/figure-N.csv``.
+        One of `items`; its claims are listed in ``published/PAPER/figure-N.csv``, or in
+        ``table-N-claims.csv``.
     claims : sequence of Claim
-        Every listed claim, once; none may have its criterion open.
+        Every listed claim, once.
     why : str
         Why it differs; needed and used only if a claim fails.
     scenario : Scenario, optional
         What the study ran; if it is not the paper's, the verdict is "not comparable" and names
         what was changed.
+
+    Notes
+    -----
+    Where all claims hold and a criterion passes on its null too, the verdict is "not comparable".
 
     Examples
     --------
@@ -207,17 +244,19 @@ def judge_claims(
     'differs'
     """
     known = _known(paper, item)
-    listed = {row["id"]: row for row in table(paper, known.file)}
+    file = known.file if known.file.startswith("figure") else f"{known.file}-claims"
+    listed = {row["id"]: row for row in table(paper, file)}
     given = [claim.id for claim in claims]
     if sorted(given) != sorted(listed):
         raise ValueError(f"claims: needs those of {paper} {item}, {', '.join(listed)}, each once, "
                          f"got {', '.join(given)}")  # fmt: skip
-    undecided = [i for i, row in listed.items() if row["criterion"].startswith("open:")]
-    if undecided:
-        raise ValueError(f"claims: needs a fixed criterion, open for {', '.join(undecided)}")
     ours = "; ".join(str(c) for c in claims)
     said = "; ".join(row["claim"] for row in listed.values())
-    return _judged(known, all(c.holds for c in claims), ours, said, why, scenario)
+    good, blunt = all(c.holds for c in claims), [c.id for c in claims if not c.bites]
+    open_ = f"the rule of {', '.join(blunt)} holds for its null too" if good and blunt else ""
+    null = "; ".join(f"{c.id}, {c.null}" for c in claims if c.null)
+    swept = "; ".join(f"{c.id} {c.range}" for c in claims if c.range)
+    return _judged(known, good, ours, said, why, scenario, open_=open_, null=null, range=swept)
 
 
 def judge_parameters(
