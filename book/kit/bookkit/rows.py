@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import csv
 import html
-import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 
-__all__ = ["html_table", "markdown_table", "read_rows", "text_table"]
+__all__ = ["html_table", "markdown_table", "read_rows"]
 
 Rows = Sequence[Sequence[str]]
 
@@ -52,22 +51,3 @@ def markdown_table(columns: Sequence[str], rows: Rows) -> str:
         "| " + " | ".join(t.replace("\\", "\\\\").replace("|", "\\|") for t in line) + " |"
         for line in lines
     )
-
-
-def text_table(columns: Sequence[str], rows: Rows, *, width: int = 60) -> str:
-    """Rows as aligned text with three rules; long cells are wrapped."""
-    blocks = [[textwrap.wrap(t, width) or [""] for t in row] for row in rows]
-    widths = [
-        max([len(name), *(len(line) for block in blocks for line in block[k])])
-        for k, name in enumerate(columns)
-    ]
-
-    def line(texts: Sequence[str]) -> str:
-        return "  ".join(t.ljust(w) for t, w in zip(texts, widths, strict=True)).rstrip()
-
-    rule = "-" * (sum(widths) + 2 * (len(widths) - 1))
-    out = [rule, line(columns), rule]
-    for block in blocks:
-        for k in range(max(len(cell) for cell in block)):
-            out.append(line([cell[k] if k < len(cell) else "" for cell in block]))
-    return "\n".join([*out, rule])

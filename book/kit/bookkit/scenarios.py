@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .folders import data_root, inside
-from .rows import html_table, markdown_table, read_rows, text_table
+from .rows import html_table, markdown_table, read_rows
 
 __all__ = ["Parameter", "Row", "Scenario", "read_scenario", "scenario"]
 
@@ -303,8 +303,7 @@ class Scenario:
         return out
 
     def __repr__(self) -> str:
-        head = f"{self.paper}/{self.name}: {self.title}"
-        return "\n".join([head, *(text_table(*t) for t in self._shown())])
+        return f"{self.paper}/{self.name}: {self.title}\n\n{self._repr_markdown_()}"
 
     def _repr_html_(self) -> str:
         return "\n".join(html_table(*t) for t in self._shown())
