@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from .doors import Array, Count, Rng, Semidefinite, door, unchecked
-from .linalg import EPS, cholesky, factor, leading, solve_upper, symmetrise
+from .linalg import EPS, cholesky, factor, leading, lower_root, solve_upper, symmetrise
 
 __all__ = ["Members", "draw", "mean", "sample_covariance"]
 
@@ -25,7 +25,7 @@ Ensemble = Annotated[Array, "... N d", partial(_at_least, 2)]
 """The kind of what has a sample covariance."""
 
 _CLOSE = 1e-6
-"""The share of a unit column beside others below which singular values say if it is one more."""
+"""The share of a unit column beside others up to which singular values say if it is one more."""
 
 
 @door
@@ -154,47 +154,35 @@ def _narrow(root: Array) -> Array:
     u, s, _ = np.linalg.svd(root / unit)
     kept = s**2 > 64 * s.shape[-1] * EPS * s.max(axis=-1, initial=0.0, keepdims=True) ** 2
     width = int(kept.sum(axis=-1).max(initial=0))
-    narrow = (u * (s * kept)[..., None, :])[..., :width]
-    # Triangular again, which leaves no signs or rotations to the machine.
-    upper: Array = np.asarray(np.linalg.qr(narrow.swapaxes(-1, -2), mode="r"))
-    sign = np.where(np.diagonal(upper, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
-    return (upper * sign[..., None]).swapaxes(-1, -2) * unit
+    return lower_root((u * (s * kept)[..., None, :])[..., :width]) * unit
 
 
 def _projected(drawn: Array, avoid: Array) -> Array:
-    """What is left of a draw without the constant and the anomalies."""
-    n = avoid.shape[-2]
-    centred = unchecked(anomalies)(avoid)
+    """What is left of a draw without its mean and the anomalies."""
+    (n, rank), centred = drawn.shape[-2:], unchecked(anomalies)(avoid)
     size = np.sqrt((centred**2).sum(axis=-2, keepdims=True))
-    unit = centred / np.where(size > 0, size, 1.0)
-    constant = np.full((*unit.shape[:-1], 1), n**-0.5)
-    rank = drawn.shape[-1]
-    frame, independent = _frame(np.concatenate([constant, unit], axis=-1))
-    independent -= 1
+    frame, independent = _frame(centred / np.where(size > 0, size, 1.0))
     if n <= independent + rank:
         raise ValueError(
             f"anomalies_to_avoid: needs more than {independent} + {rank} members, for "
             f"{independent} independent anomalies and noise of rank {rank}, got {n}"
         )
     for _ in range(2):
-        drawn = drawn - frame @ (frame.swapaxes(-1, -2) @ drawn)
+        drawn = unchecked(anomalies)(drawn - frame @ (frame.mT @ drawn))
     return drawn
 
 
 def _frame(columns: Array) -> tuple[Array, int]:
     """Orthonormal columns, or zeros, that span unit columns (..., n, p), and the largest rank."""
-    tiny = columns.shape[-2] * EPS
     q, r = np.linalg.qr(columns)
-    # Columns that repeat earlier ones, as linear predictions do, leave rows of zeros at the end.
-    good = np.abs(r).max(axis=-1) > tiny
-    pivots = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
+    good = np.abs(np.diagonal(r, axis1=-2, axis2=-1)) > _CLOSE
     # A small pivot may be rounding, magnified by columns that are close to one another: to avoid
     # its direction would cost a member, and would leave the draw to the last bit.
-    if (good != (pivots > tiny)).any() or ((pivots > tiny) & (pivots < _CLOSE)).any():
+    if not good.all():
         u, values, _ = np.linalg.svd(r, full_matrices=False)
-        good = values > tiny * values.max(axis=-1, initial=0.0, keepdims=True)
+        good = values > columns.shape[-2] * EPS * values.max(axis=-1, initial=0.0, keepdims=True)
         q = q @ u
-    return np.asarray(q * good[..., None, :]), int(good.sum(axis=-1).max(initial=1))
+    return np.asarray(q * good[..., None, :]), int(good.sum(axis=-1).max(initial=0))
 
 
 def _coloured(drawn: Array, root: Array) -> Array:

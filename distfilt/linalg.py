@@ -8,21 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Annotated
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
 
-from .doors import Array, NonNegative, Semidefinite, door, unchecked
+from .doors import Array, Semidefinite, door
 
 __all__ = ["SolverError", "factor"]
 
 EPS = float(np.finfo(np.float64).eps)
 _STEP = 6e-6
 """Of differences: about the cube root of EPS, where truncation and rounding balance."""
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)
-_POWERS = (0.5 * (_NODES + 1))[:, None] ** np.arange(21)
-"""Powers 0 to 20 of the Gauss-Legendre points of [0, 1]."""
 
 
 class SolverError(RuntimeError):
@@ -103,11 +99,19 @@ def _from_eigenvectors(cov: Array) -> Array:
     """The lower triangular factor of one matrix by orthogonal steps, which lose nothing."""
     values, vectors = np.linalg.eigh(cov)
     kept = values > 4 * len(cov) * EPS * values[-1]
-    root = vectors[:, kept] * np.sqrt(values[kept])
-    upper: Array = np.asarray(np.linalg.qr(root.T, mode="r"))
     lower = np.zeros_like(cov)
-    lower[:, : len(upper)] = (upper * np.where(np.diagonal(upper) < 0, -1.0, 1.0)[:, None]).T
+    lower[:, : kept.sum()] = lower_root(vectors[:, kept] * np.sqrt(values[kept]))
     return lower
+
+
+def lower_root(columns: Array) -> Array:
+    """Lower triangular L with L L' = A A' for A of these columns, and a nonnegative diagonal.
+
+    By QR, which leaves no signs or rotations to the machine and loses no definiteness.
+    """
+    upper: Array = np.asarray(np.linalg.qr(columns.mT, mode="r"))
+    sign = np.where(np.diagonal(upper, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
+    return np.asarray(upper.mT * sign[..., None, :])
 
 
 def leading(wanted: tuple[int, ...], got: tuple[int, ...], name: str) -> tuple[int, ...]:
@@ -197,83 +201,6 @@ def quadratic_form(lower: Array, vector: Array) -> Array:
 def log_det(lower: Array) -> Array:
     """Logarithm of a covariance's determinant, by its Cholesky factor."""
     return np.asarray(2.0 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1))
-
-
-@door
-def van_loan(
-    drift: Annotated[Array, "d d"], diffusion: Annotated[Semidefinite, "d d"], dt: NonNegative
-) -> tuple[Array, Array]:
-    r"""Exact discretisation of :math:`\dot{\mathbf x} = \mathbf A\mathbf x + \text{white noise}`.
-
-    Parameters
-    ----------
-    drift : array_like, (d, d)
-        The matrix A, in 1/s. Slow and fast modes may stand side by side.
-    diffusion : array_like, (d, d)
-        The noise's spectral density :math:`\mathbf Q_c`, in units of the state squared per s.
-    dt : float
-        The step, in s, at least 0.
-
-    Returns
-    -------
-    transition : ndarray, (d, d)
-        :math:`\mathbf\Phi = e^{\mathbf A\,dt}`.
-    noise : ndarray, (d, d)
-        :math:`\mathbf Q = \int_0^{dt} e^{\mathbf A s}\mathbf Q_c e^{\mathbf A^\top s}\,ds`,
-        symmetric positive semidefinite.
-
-    Raises
-    ------
-    ValueError
-        If the arguments do not fit, or the step is so long that the transition overflows.
-
-    Notes
-    -----
-    The pair that C. F. Van Loan, IEEE Transactions on Automatic Control 23 (1978) 395-404, reads
-    off one exponential of twice the size. That exponential holds :math:`e^{-\mathbf A\,dt}`, and is
-    useless for a fast decay. So the step is halved until :math:`\lVert\mathbf A\rVert_1h\le1`,
-    where a Taylor sum gives the exponential and ten Gauss-Legendre points the integral, and both
-    are doubled back:
-
-    .. math:: \mathbf Q_{2h}=\mathbf Q_h+\mathbf\Phi_h\mathbf Q_h\mathbf\Phi_h^\top,\qquad
-        \mathbf\Phi_{2h}=\mathbf\Phi_h^2.
-
-    Only positive semidefinite matrices are added up: nothing cancels.
-
-    Examples
-    --------
-    >>> phi, q = van_loan([[0.0, 1.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]], 2.0)
-    >>> phi.round(9)
-    array([[1., 2.],
-           [0., 1.]])
-    >>> q.round(6)
-    array([[2.666667, 2.      ],
-           [2.      , 2.      ]])
-    """
-    with np.errstate(over="ignore", invalid="ignore", under="ignore"):
-        size = np.abs(drift).sum(axis=0).max() * dt
-        halvings = max(0, int(np.ceil(np.log2(max(size, 1.0))))) if np.isfinite(size) else 0
-        h = dt * 0.5**halvings
-        phi, q = _short_step(drift * dt * 0.5**halvings, unchecked(factor)(diffusion), h)
-        for _ in range(halvings):
-            q = symmetrise(q + phi @ q @ phi.T)
-            phi = phi @ phi
-    if not (np.isfinite(phi).all() and np.isfinite(q).all()):
-        raise ValueError(f"dt: needs a step over which the transition is finite, got {dt:g}")
-    return phi, q
-
-
-def _short_step(a: Array, root: Array, h: float) -> tuple[Array, Array]:
-    """Transition and noise over a step h with a = A h of norm at most 1."""
-    terms = [np.eye(len(a))]
-    for k in range(1, _POWERS.shape[1]):  # the first one left out, 1/21!, is below rounding
-        terms.append(terms[-1] @ a / k)
-    taylor = np.array(terms)
-    # One factor of the noise beside the other, (d, 10 d): the integral is its product with itself.
-    wide = np.tensordot(_POWERS, taylor, axes=1) @ root
-    wide *= np.sqrt(0.5 * h * _WEIGHTS)[:, None, None]
-    flat = wide.transpose(1, 0, 2).reshape(len(a), -1)
-    return taylor.sum(axis=0), symmetrise(flat @ flat.T)
 
 
 def central(

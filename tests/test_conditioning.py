@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -60,20 +59,6 @@ def test_one_covariance_and_one_sensor_serve_any_number_of_means() -> None:
     full = conditioned(mean, np.broadcast_to(cov, (6, D, D)), gap[:, :M], h, r)
     np.testing.assert_allclose(x, full[0], rtol=0, atol=1e-13)
     np.testing.assert_allclose(np.broadcast_to(p, full[1].shape), full[1], rtol=0, atol=1e-13)
-
-
-@pytest.mark.parametrize("scale", [1e-6, 1e6])
-def test_units_change_nothing(scale: float) -> None:
-    """A state in units that differ by component, a reading in units of its own."""
-    mean, cov, gap, h, r = case(6)
-    state, seen = np.array([1.0, scale, 1.0, 1 / scale]), np.array([scale, 1.0, 3.0])
-    x, p = conditioned(mean, cov, gap, h, r)
-    other = conditioned(
-        state * mean, state[:, None] * cov * state, seen * gap, seen[:, None] * h / state,
-        seen[:, None] * r * seen,
-    )  # fmt: skip
-    np.testing.assert_allclose(other[0] / state, x, rtol=1e-9)
-    np.testing.assert_allclose(other[1] / state[:, None] / state, p, rtol=1e-9)
 
 
 def test_joseph_s_form_stays_positive_where_a_reading_is_nearly_exact() -> None:

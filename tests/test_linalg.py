@@ -1,4 +1,4 @@
-"""Factors, solves and exact discretisation against definitions, full matrices, stiff drifts."""
+"""Factors, solves and derivatives against definitions and full matrices."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.linalg import expm, solve_continuous_lyapunov
 
 from distfilt import linalg
 from distfilt.doors import unchecked
@@ -39,7 +38,6 @@ def test_inputs_are_not_changed() -> None:
     assert_unchanged(linalg.factor, cov.copy())
     assert_unchanged(_solved, cov.copy(), np.eye(3))
     assert_unchanged(_length, np.stack([cov] * 9), np.ones((9, 3)))
-    assert_unchanged(lambda a, q: linalg.van_loan(a, q, 2.0), np.ones((3, 3)), cov.copy())
 
 
 # --- factors ----------------------------------------------------------------------------------
@@ -173,83 +171,7 @@ def test_solves_agree_with_numpy(seed: int, d: int, leading: tuple[int, ...]) ->
     assert _log_det(cov).shape == leading
 
 
-# --- exact discretisation ---------------------------------------------------------------------
-
-STIFF = np.array([[-1.0, 1.0], [0.0, -50.0]])
-SLOW_AND_FAST = np.array([[-0.01, 2.0, 0.3], [-1.0, -0.02, 0.1], [0.0, 0.4, -500.0]])
-
-
-@pytest.mark.parametrize("dt", [1e-3, 0.1, 1.0, 2.0, 30.0])
-@pytest.mark.parametrize("drift", [STIFF, SLOW_AND_FAST], ids=["two", "three"])
-def test_van_loan_of_a_stiff_drift(drift: np.ndarray, dt: float) -> None:
-    """Against the stationary covariance X: Q = X − Φ X Φ', exact for stable drifts."""
-    density = np.array([[1.0, 0.3, 0.1], [0.3, 2.0, -0.4], [0.1, -0.4, 0.5]])
-    density = density[: len(drift), : len(drift)]
-    phi, q = linalg.van_loan(drift, density, dt)
-    whole = solve_continuous_lyapunov(drift, -density)
-    exact = expm(drift * dt)
-    assert np.allclose(phi, exact, rtol=1e-9, atol=1e-13)
-    lost = 1e-13 * np.abs(whole).max() / np.abs(q).max()  # digits lost in the reference
-    assert unit_gap(q, whole - exact @ whole @ exact.T) < 1e-12 + 10 * lost
-    assert (q == q.T).all() and np.linalg.eigvalsh(q)[0] > 0
-
-
-@given(SEEDS, SIZES, st.floats(1e-3, 30.0))
-def test_van_loan_meets_its_differential_equation(seed: int, d: int, dt: float) -> None:
-    """Halves compose to the whole, and a short step is the integrand: both together fix Q."""
-    rng = generator(seed)
-    drift = rng.standard_normal((d, d))
-    drift -= (1.5 * np.sqrt(d)) * np.eye(d)  # decays
-    density = singular(rng, d, max(1, d - 1))
-    phi, q = linalg.van_loan(drift, density, dt)
-    half, noise = linalg.van_loan(drift, density, dt / 2)
-    assert np.allclose(half @ half, phi, rtol=1e-9, atol=1e-12)
-    assert unit_gap(half @ noise @ half.T + noise, q) < 1e-10
-    tiny = 1e-6
-    short = linalg.van_loan(drift, density, tiny)[1]
-    first = density + tiny / 2 * (drift @ density + density @ drift.T)
-    assert np.allclose(short / tiny, first, rtol=0, atol=1e-10 * (1 + np.abs(density).max()) * d**2)
-    scaled = q / np.sqrt(np.outer(np.diag(q), np.diag(q)))
-    assert np.linalg.eigvalsh(scaled)[0] > -1e-13
-
-
-def test_van_loan_of_a_chain_keeps_the_digits_of_short_steps() -> None:
-    chain = np.diag([1.0, 1.0], 1)
-    for h in (1e-9, 1e-3, 1.0, 1e4):
-        phi, q = linalg.van_loan(chain, np.diag([0.0, 0.0, 3.0]), h)
-        exact = 3 * np.array([[h**5 / 20, h**4 / 8, h**3 / 6], [h**4 / 8, h**3 / 3, h**2 / 2],
-                              [h**3 / 6, h**2 / 2, h]])  # fmt: skip
-        assert np.allclose(q, exact, rtol=1e-14, atol=0)
-        assert np.allclose(phi, [[1, h, h * h / 2], [0, 1, h], [0, 0, 1]], rtol=1e-14, atol=0)
-
-
-def test_van_loan_of_a_rotation_and_of_growth() -> None:
-    phi, q = linalg.van_loan([[0.0, 7.0], [-7.0, 0.0]], 2 * np.eye(2), 3.0)
-    c, s = np.cos(21.0), np.sin(21.0)
-    assert np.allclose(phi, [[c, s], [-s, c]], atol=1e-13)
-    assert np.allclose(q, 6 * np.eye(2), atol=1e-12)
-    phi, q = linalg.van_loan([[2.0]], [[3.0]], 5.0)
-    assert np.allclose([phi, q], [[[np.exp(10)]], [[0.75 * (np.exp(20) - 1)]]], rtol=1e-13)
-
-
-def test_van_loan_without_time_noise_or_motion() -> None:
-    phi, q = linalg.van_loan(np.ones((3, 3)), np.eye(3), 0.0)
-    assert (phi == np.eye(3)).all() and (q == 0).all()
-    phi, q = linalg.van_loan(STIFF, np.zeros((2, 2)), 1.0)
-    assert (q == 0).all() and np.allclose(phi, expm(STIFF))
-
-
-def test_van_loan_forgets_completely_but_does_not_overflow() -> None:
-    phi, q = linalg.van_loan([[-1.0]], [[3.0]], 1e300)
-    assert phi == 0 and np.allclose(q, 1.5, rtol=1e-12)
-    with pytest.raises(ValueError, match="transition is finite, got 1000"):
-        linalg.van_loan(STIFF + 60 * np.eye(2), np.eye(2), 1000.0)
-
-
-def test_symmetrise_averages() -> None:
-    m = generator(1).standard_normal((2, 3, 3))
-    out = linalg.symmetrise(m)
-    assert (out == _turned(out)).all() and np.allclose(out, (m + _turned(m)) / 2)
+# --- derivatives ------------------------------------------------------------------------------
 
 
 def test_a_matrix_is_its_own_derivative() -> None:

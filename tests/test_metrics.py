@@ -7,25 +7,10 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
-from distfilt.metrics import (
-    crps,
-    gaussian_crps,
-    log_score,
-    nees,
-    nees_band,
-    nis,
-    squared_error,
-)
+from distfilt.metrics import crps, gaussian_crps, nees, nees_band, nis
 from tests.support import generator, spd
 
 RNG = np.random.default_rng(0)
-
-
-def test_squared_error_is_a_sum_or_stays_apart():
-    errors = RNG.standard_normal((5, 3, 2)) * [1.0, 1e3]
-    truth = RNG.standard_normal((3, 2))
-    square = (truth + errors - truth) ** 2
-    assert np.allclose(squared_error(truth + errors, truth), square.sum(-1), rtol=1e-14)
 
 
 def test_leading_axes_broadcast():
@@ -71,22 +56,6 @@ def test_nees_band_has_its_probability(dim, runs, level):
 # --- scores -----------------------------------------------------------------------------------
 
 
-def _crps_by_definition(x, y):
-    n = len(x)
-    pairs = np.abs(x[:, None] - x[None, :]).sum() / n**2
-    return np.abs(x - y).mean() - 0.5 * pairs
-
-
-@pytest.mark.parametrize("n", [2, 3, 50, 201])
-def test_crps_equals_its_definition(n):
-    x, y = RNG.standard_normal((3, n, 4)), RNG.standard_normal((3, 4))
-    out = crps(x, y)
-    expected = [
-        [_crps_by_definition(x[r, :, k], y[r, k]) for k in range(4)] for r in range(3)
-    ]
-    assert np.abs(out - expected).max() < 1e-12
-
-
 @pytest.mark.parametrize("mean, std, truth", [(0.0, 1.0, 0.0), (2.0, 0.3, 1.1), (-1.0, 5.0, 9.0)])
 def test_gaussian_crps_equals_its_integral(mean, std, truth):
     cdf = stats.norm(mean, std).cdf
@@ -95,8 +64,8 @@ def test_gaussian_crps_equals_its_integral(mean, std, truth):
     assert gaussian_crps(mean, std, truth) == pytest.approx(below + above, abs=1e-9)
 
 
-@pytest.mark.parametrize("n", [1, 2, 7])
-def test_weighted_crps_is_its_definition(n):
+@pytest.mark.parametrize("n", [1, 2, 50])
+def test_crps_is_its_definition(n):
     rng = generator(n)
     x, y, w = rng.standard_normal((3, n, 2)), rng.standard_normal((3, 2)), rng.dirichlet([1] * n, 3)
     found = crps(x, y, weights=w)
@@ -108,12 +77,3 @@ def test_weighted_crps_is_its_definition(n):
             assert found[r, k] == pytest.approx(exact, abs=1e-13)
     equal = np.full(n, 1 / n)
     assert np.allclose(crps(x, y, weights=[equal] * 3), crps(x, y), atol=1e-13)
-
-
-def test_log_score_is_minus_the_log_density():
-    rng = generator(8)
-    estimate, truth, cov = rng.standard_normal((5, 3)), rng.standard_normal(3), spd(rng, 3, (5,))
-    found = log_score(estimate, cov, truth)
-    for k in range(5):
-        exact = -stats.multivariate_normal(estimate[k], cov[k]).logpdf(truth)
-        assert found[k] == pytest.approx(exact, rel=1e-10)

@@ -11,7 +11,6 @@ import numpy as np
 from distfilt.mixtures import (
     GaussianMixture,
     PartialFusion,
-    arc,
     fuse_moments,
     jeffreys_by_sampling,
 )
@@ -28,6 +27,37 @@ BOUNDS = {
     "mixands": (3, 6), "distance": (6.0, 12.0), "turn": (0.5, 2.6), "angle_std": (0.2, 0.6),
     "range_std": (0.25, 0.5), "ego_std": (0.25, 0.5), "width": (0.2, 0.5),
 }
+
+
+def arc(
+    mixands: int, agent: np.ndarray, *, angle_std: float, range_std: float, ego_std: float,
+    width: float = 0.31, span: float = 1.46,
+) -> GaussianMixture:
+    r"""What knows a distance well and a bearing badly: a belief about [target; ego], bent.
+
+    Both are in the plane, four components in all. The agent aims at the origin from a distance R.
+    Mixand k lies at the angle :math:`\theta_k=\theta_0+\sigma_\theta s_k` with :math:`s_k` equally
+    spaced in ± `span`, weighs :math:`\propto e^{-s_k^2/2}`, and has the target at distance R, the
+    ego position moved half as far the other way. Within a mixand the errors are independent along
+    the line of sight (`range_std`) and across it (R, `width` and the spacing of the angles
+    multiplied); the ego position takes half of the error across, and has `ego_std` of its own in
+    both directions.
+    """
+    agent = np.asarray(agent)
+    r = float(np.hypot(*agent))
+    s = np.linspace(-1, 1, mixands) * span
+    theta = np.arctan2(-agent[1], -agent[0]) + angle_std * s
+    across = r * width * angle_std * (s[1] - s[0])
+    variances = np.array([range_std, across, ego_std, ego_std]) ** 2
+    u = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+    v = np.stack([-u[:, 1], u[:, 0]], axis=-1)
+    slope = np.zeros((mixands, 4, 4))
+    slope[:, :2, 0], slope[:, :2, 1] = u, v
+    slope[:, 2:, 1], slope[:, 2:, 2], slope[:, 2:, 3] = -0.5 * v, u, v
+    means = np.concatenate([agent + r * u, agent - 0.5 * r * (u + agent / r)], axis=-1)
+    w = np.exp(-0.5 * s**2)
+    covs = (slope * variances) @ slope.mT
+    return GaussianMixture(w / w.sum(), means, 0.5 * (covs + covs.mT))
 
 
 def belief(

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from scipy.special import gammaincinv
 
 from ..doors import Array, Bounds, Count, unchecked
-from ..mixtures import GaussianMixture, conditioned, moved, two_stage
-from ..mixtures.conditioning import within_gate
+from ..mixtures import GaussianMixture, runnalls
+from ..mixtures.conditioning import moved, updated, within_gate
 from ..mixtures.splitting import split_stretched
 from .base import Filter
 from .inputs import Reading, mixtures_of, sensor_of
@@ -83,8 +83,6 @@ class MixtureFilter(Filter):
         Split where a mixand's weight times its largest stretching is above this; never by default.
     scale : array_like, optional
         What each component is multiplied by before lengths are compared, the same for all agents.
-    rule : {"dd2", "unscented"}
-        How points stand for a mixand.
 
     Examples
     --------
@@ -109,7 +107,6 @@ class MixtureFilter(Filter):
     most: Count = 12
     stretch: Annotated[float, Bounds(above=0, at_most=1e150)] | None = None
     scale: Annotated[Array, "model.dim"] | None = None
-    rule: Literal["dd2", "unscented"] = "dd2"
 
     state: ClassVar[type[MixtureState]] = MixtureState
     batched: ClassVar[bool] = False
@@ -159,7 +156,7 @@ class MixtureFilter(Filter):
                     stretch=self.stretch, scale=self.scale,
                 )
             root = unchecked(model.root)(t, dt)
-            return unchecked(moved)(belief, lambda x: flow(x, t, dt), root, rule=self.rule)
+            return moved(belief, lambda x: flow(x, t, dt), root)
 
     def _reduced(self, belief: GaussianMixture) -> GaussianMixture:
         """So many mixands as are kept, without the square roots that they came with.
@@ -167,7 +164,7 @@ class MixtureFilter(Filter):
         A loaded state has none, and has to go on alike.
         """
         most = max(_EXACT, self.size)
-        return unchecked(two_stage)(belief, self.size, heaviest=most).changed()
+        return unchecked(runnalls)(belief, self.size, heaviest=most).changed()
 
     def _read(
         self, belief: GaussianMixture, agent: int, said: Sequence[Reading], step: Step, *,
@@ -177,12 +174,12 @@ class MixtureFilter(Filter):
         for reading in said:
             sensor, y = sensor_of(self, reading), reading.value
             about: Any = unchecked(sensor.predict), sensor.cov
-            known: Any = {"residual": unchecked(sensor.residual), "rule": self.rule}
+            residual = unchecked(sensor.residual)
             with step.of(agent):
                 if self.gate is not None:
                     width = float(np.sqrt(2 * gammaincinv((~np.isnan(y)).sum() / 2, self.gate)))
-                    y = unchecked(within_gate)(belief, y, *about, gate=width, **known)
-                belief = unchecked(conditioned)(belief, y, *about, **known)
+                    y = within_gate(belief, y, *about, gate=width, residual=residual)
+                belief = updated(belief, y, *about, residual=residual)
             if counted and step.refused is not None:
                 step.refused[agent] += np.isnan(y).all()
         return belief

@@ -9,7 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from ..doors import Array, Bounds, Count, Index, door
-from ..mixtures import GaussianMixture, conditioned
+from ..mixtures import GaussianMixture
+from ..mixtures.conditioning import updated
 from .inputs import Reading
 from .mixture import MixtureFilter
 from .step import Step
@@ -76,7 +77,7 @@ class NewsFilter(MixtureFilter):
 
     Parameters
     ----------
-    model, sensors, graph, target_dim, stretch, scale, rule, gate, every, faults, names
+    model, sensors, graph, target_dim, stretch, scale, gate, every, faults, names
         As of :class:`MixtureFilter`; a `graph` is needed and an `agreement` is not taken. What was
         learned while nobody could be told, for want of links or because it was not time (`every`),
         is told at the next contact; where the target's motion has noise, that is an approximation.
@@ -191,6 +192,6 @@ def _unpacked(numbers: Array, n: int) -> Array:
 def _learned(belief: GaussianMixture, news: Array) -> GaussianMixture:
     """A belief after news of its first components."""
     rows, values = news[:, :-1], news[:, -1]
-    return conditioned(
+    return updated(
         belief, values, lambda x: x[..., : rows.shape[1]] @ rows.T, np.eye(values.size)
     )

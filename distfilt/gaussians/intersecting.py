@@ -6,13 +6,12 @@ covariances (..., S, d, d), weights (..., S). NaN may stand at a source that did
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
 
 from ..doors import MISSING, Array, Mask, Weights, definite, door
-from ..linalg import cholesky, leading, log_det, solve_lower, symmetrise
+from ..linalg import cholesky, leading, log_det, lower_root, solve_lower, symmetrise
 
 __all__ = ["intersection", "intersection_weights"]
 
@@ -77,10 +76,8 @@ def intersection(
     leading(lead, covs.shape[:-3], "covs")
     d = means.shape[-1]
     here = weights > 0
-    m = means if here.all() else np.where(here[..., None], means, 0.0)
-    if np.isnan(m).any():
-        raise ValueError("means: needs finite numbers where a weight is positive, got NaN")
-    lower = _factors(covs, here)
+    m = _counted(means, here[..., None], 0.0, "means")
+    lower = cholesky(_counted(covs, here[..., None, None], np.eye(d), "covs"))
     first, centre = lower[..., 0, :, :], m[..., 0, :]
     own, others = weights[..., :1, None], np.sqrt(weights[..., 1:, None, None])
     gap = m[..., 1:, :, None] - centre[..., None, :, None]
@@ -96,12 +93,18 @@ def intersection(
     return centre + fused[..., d], symmetrise(fused[..., :d])
 
 
+def _counted(value: Array, here: Mask, other: Array | float, name: str) -> Array:
+    """What the sources that count hold, with `other` in the place of those that do not."""
+    out = value if here.all() else np.where(here, value, other)
+    if not np.isfinite(out).all():
+        raise ValueError(f"{name}: needs finite numbers where a source counts, got NaN or infinity")
+    return out
+
+
 def _beside(left: Array, right: Array) -> Array:
     """The columns of both; the left one's leading axes may be 1."""
-    columns = left.shape[-1]
-    out = np.empty((*right.shape[:-1], columns + right.shape[-1]))
-    out[..., :columns], out[..., columns:] = left, right
-    return out
+    left = np.broadcast_to(left, (*right.shape[:-1], left.shape[-1]))
+    return np.concatenate([left, right], axis=-1)
 
 
 @door
@@ -165,14 +168,17 @@ def intersection_weights(
         raise ValueError("here: needs at least one source that arrived, got none")
     lead = leading(there.shape[:-1], covs.shape[:-3], "covs")
     here = np.broadcast_to(there, (*lead, *covs.shape[-3:-2]))
-    covs = np.broadcast_to(covs, (*lead, *covs.shape[-3:]))
+    covs = _counted(
+        np.broadcast_to(covs, (*lead, *covs.shape[-3:])), here[..., None, None],
+        np.eye(covs.shape[-1]), "covs",
+    )  # fmt: skip
     if rule in ("min_trace", "min_determinant") and here.shape[-1] > 1:
         return _least(covs, here, rule == "min_determinant")
     logs = np.zeros(here.shape)
     if rule == "trace":
-        logs = np.log(np.where(here, np.trace(covs, axis1=-2, axis2=-1), 1.0))
+        logs = np.log(np.trace(covs, axis1=-2, axis2=-1))
     elif rule == "determinant":
-        logs = log_det(_factors(covs, here)) / covs.shape[-1]
+        logs = log_det(cholesky(covs)) / covs.shape[-1]
     logs = np.where(here, logs, np.inf)
     weights = np.exp(logs.min(axis=-1, keepdims=True) - logs)
     return np.asarray(weights / weights.sum(axis=-1, keepdims=True))
@@ -184,17 +190,17 @@ def _least(covs: Array, here: Mask, determinant: bool) -> Array:
     """Weights of least determinant or trace; :func:`.intersection_weights` says how and why."""
     leading, (s, d) = here.shape[:-1], covs.shape[-3:-1]
     there = here.reshape(-1, s).astype(np.float64)
-    lower = _factors(covs, here).reshape(-1, s, d, d)
+    lower = cholesky(covs).reshape(-1, s, d, d)
     # In the first one's coordinates, as in an intersection; traces are taken in the state's own.
     roots = solve_lower(lower, np.broadcast_to(lower[:, :1], lower.shape))
     roots *= there[..., None, None]
-    problem = _Problem(roots, _square(roots.swapaxes(-1, -2)), lower[:, 0], there, determinant)
+    information, first = _square(roots.mT), lower[:, 0]
     point = there / there.sum(axis=-1, keepdims=True)
     best, sure = point.copy(), point
     left, share = np.arange(len(point)), np.ones((len(point), 1))
     lowest = bound = np.full(len(point), np.inf)
     for _ in range(_STEPS):
-        value, slope, curvature = problem.derivatives(point)
+        value, slope, curvature = _derivatives(point, roots, information, first, determinant)
         mean = (point * slope).sum(axis=-1, keepdims=True)
         gap = slope.max(axis=-1) / mean[:, 0] - 1
         # What is settled stays: the others' need for more steps must not move it.
@@ -208,49 +214,39 @@ def _least(covs: Array, here: Mask, determinant: bool) -> Array:
         # sure step does, whatever the value there, and the next Newton step is cut.
         at = (value <= bound)[:, None]
         share = np.where(at, np.minimum(2 * share, 1.0), 0.25 * share)
-        newton = _newton(point, slope, mean, curvature, problem.there)
+        newton = _newton(point, slope, mean, curvature, there)
         newton = point + share * (newton - point)
-        scaled = _scaled(point, slope / mean, determinant)
+        scaled = point * (slope / mean if determinant else np.sqrt(slope / mean))
+        scaled /= scaled.sum(axis=-1, keepdims=True)
         gain = (slope * (newton - point)).sum(axis=-1)
         aim = np.where(gain > 0, value - 1e-3 * gain + 1e-13 * (1 + np.abs(value)), -np.inf)
         bound = np.where(at[:, 0], aim, np.inf)
         point, sure = np.where(at, newton, sure), np.where(at, scaled, sure)
         if 2 * np.count_nonzero(open_) <= len(open_):
-            problem = problem.part(open_)
+            roots, information = roots[open_], information[open_]
+            first, there = first[open_], there[open_]
             left, lowest, bound = left[open_], lowest[open_], bound[open_]
             point, sure, share = point[open_], sure[open_], share[open_]
     return np.asarray(best.reshape(*leading, s))
 
 
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """Sources of n intersections in coordinates in which the first has the unit covariance."""
-
-    roots: Array
-    information: Array
-    first: Array
-    there: Array
-    determinant: bool
-
-    def part(self, keep: Mask) -> _Problem:
-        parts = (self.roots[keep], self.information[keep], self.first[keep], self.there[keep])
-        return _Problem(*parts, self.determinant)
-
-    def derivatives(self, weights: Array) -> tuple[Array, Array, Array]:
-        """What is made least (n,), minus its gradient (n, S), its second derivatives (n, S, S)."""
-        n, s, d, _ = self.roots.shape
-        total = weights[:, None, :] @ self.information.reshape(n, s, d * d)
-        lower = _cholesky_or_qr(total.reshape(n, d, d), np.zeros((1, 1)), weights, self.roots)
-        half = solve_lower(lower, self.roots.reshape(n, s * d, d).swapaxes(-1, -2))
-        # Each source's information where that of the result is the identity, (n, S, d, d).
-        shares = _square(half.reshape(n, d, s, d).swapaxes(1, 2))
-        if self.determinant:
-            flat = shares.reshape(n, s, d * d)
-            return -log_det(lower), np.einsum("nsii->ns", shares), flat @ flat.swapaxes(-1, -2)
-        spread = solve_lower(lower, self.first.swapaxes(-1, -2))
-        flat = (shares @ spread[:, None]).reshape(n, s, d * d)
-        slope = (flat @ spread.reshape(n, d * d, 1))[..., 0]
-        return (spread**2).sum(axis=(-2, -1)), slope, 2 * flat @ flat.swapaxes(-1, -2)
+def _derivatives(
+    weights: Array, roots: Array, information: Array, first: Array, determinant: bool
+) -> tuple[Array, Array, Array]:
+    """What is made least (n,), minus its gradient (n, S), its second derivatives (n, S, S)."""
+    n, s, d, _ = roots.shape
+    total = weights[:, None, :] @ information.reshape(n, s, d * d)
+    lower = _cholesky_or_qr(total.reshape(n, d, d), np.zeros((1, 1)), weights, roots)
+    half = solve_lower(lower, roots.reshape(n, s * d, d).mT)
+    # Each source's information where that of the result is the identity, (n, S, d, d).
+    shares = _square(half.reshape(n, d, s, d).swapaxes(1, 2))
+    if determinant:
+        flat = shares.reshape(n, s, d * d)
+        return -log_det(lower), np.einsum("nsii->ns", shares), flat @ flat.mT
+    spread = solve_lower(lower, first.mT)
+    flat = (shares @ spread[:, None]).reshape(n, s, d * d)
+    slope = (flat @ spread.reshape(n, d * d, 1))[..., 0]
+    return (spread**2).sum(axis=(-2, -1)), slope, 2 * flat @ flat.mT
 
 
 def _square(root: Array) -> Array:
@@ -276,18 +272,6 @@ def _newton(weights: Array, slope: Array, mean: Array, curvature: Array, there: 
     return np.asarray(out / out.sum(axis=-1, keepdims=True))
 
 
-def _scaled(weights: Array, ratio: Array, determinant: bool) -> Array:
-    """The sure step: weights times their slopes over the mean one, or the root of that."""
-    out = weights * (ratio if determinant else np.sqrt(ratio))
-    return np.asarray(out / out.sum(axis=-1, keepdims=True))
-
-
-def _factors(covs: Array, here: Mask) -> Array:
-    """Cholesky factors (..., S, d, d) of the sources; the identity for one that is not here."""
-    full = covs if here.all() else np.where(here[..., None, None], covs, np.eye(covs.shape[-1]))
-    return cholesky(full)
-
-
 def _cholesky_or_qr(total: Array, own: Array, weights: Array, roots: Array) -> Array:
     """Cholesky factor of own I + sum of w G' G; from the G where rounding spoils their squares."""
     try:
@@ -297,6 +281,4 @@ def _cholesky_or_qr(total: Array, own: Array, weights: Array, roots: Array) -> A
         tall = np.sqrt(weights)[..., None, None] * roots
         tall = tall.reshape(*tall.shape[:-3], -1, d)
         first = np.broadcast_to(np.sqrt(own) * np.eye(d), (*tall.shape[:-2], d, d))
-        upper: Array = np.asarray(np.linalg.qr(np.concatenate([first, tall], axis=-2), mode="r"))
-        sign = np.where(np.diagonal(upper, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
-        return np.asarray((upper * sign[..., None]).swapaxes(-1, -2))
+        return lower_root(np.concatenate([first, tall], axis=-2).mT)

@@ -76,17 +76,23 @@ def recolour(
     >>> recolour([[0.0], [2.0]], [5.0], [[8.0]]).ravel()
     array([3., 7.])
     """
-    x = ensemble
-    n, d = x.shape[-2:]
+    n, d = ensemble.shape[-2:]
     if n <= d:
         raise ValueError(f"ensemble: needs more than {d} members for {d} components, got {n}")
+    lead = leading(ensemble.shape[:-2], mean.shape[:-1], "mean")
+    leading(lead, cov.shape[:-2], "cov")
     unit = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
-    scaled = x / unit[..., None, :]
+    scaled = ensemble / unit[..., None, :]
     average = np.full(n, 1 / n)
     centre = average @ scaled
     scaled -= centre[..., None, :]
     q, r = np.linalg.qr(scaled)
-    _refuse_flat(r, np.abs(centre))
+    length = np.sqrt((r**2).sum(axis=-2))
+    own = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
+    # What a component has that those before it have not, against the rounding of the members.
+    if (own <= 32 * d * EPS * (length + np.abs(centre))).any():
+        raise ValueError("ensemble: needs components that are not constant and not combinations "
+                         "of others, got a singular sample covariance")
     target = cholesky(cov / (unit[..., :, None] * unit[..., None, :])).mT
     u, _, vh = np.linalg.svd(target @ r.mT)
     turn = vh.mT @ (u.mT @ target)
@@ -94,18 +100,7 @@ def recolour(
     # Where the old spread is almost flat, Q is centred only to rounding over the flatness.
     out -= (average @ out)[..., None, :]
     out *= unit[..., None, :]
-    out += mean[..., None, :]
-    return np.asarray(out)
-
-
-def _refuse_flat(r: Array, centre: Array) -> None:
-    """Refuse anomalies, by their triangular factor, that are combinations of one another."""
-    length = np.sqrt((r**2).sum(axis=-2))
-    own = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
-    # What a component has that those before it have not, against the rounding of the members.
-    if (own <= 32 * r.shape[-1] * EPS * (length + centre)).any():
-        raise ValueError("ensemble: needs components that are not constant and not combinations "
-                         "of others, got a singular sample covariance")
+    return np.asarray(out + mean[..., None, :])
 
 
 @door

@@ -1,15 +1,7 @@
 """How good an estimate is: error, consistency and score, with intervals."""
 
 from .intervals import Interval, mean_interval, median_interval, proportion_interval
-from .scores import (
-    crps,
-    gaussian_crps,
-    log_score,
-    nees,
-    nees_band,
-    nis,
-    squared_error,
-)
+from .scores import crps, gaussian_crps, log_score, nees, nees_band, nis, squared_error
 
 __all__ = [  # fmt: skip
     "Interval", "crps", "gaussian_crps", "log_score", "mean_interval", "median_interval", "nees",

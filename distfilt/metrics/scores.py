@@ -172,19 +172,13 @@ def crps(
     leading(ensemble.shape[:-2], truth.shape[:-1], "truth")
     # Distances from the truth are as good as the members, and lose fewer digits far from zero.
     gap = ensemble - truth[..., None, :]
-    if weights is not None:
-        return _weighted_crps(gap, weights)
-    gap = np.sort(gap, axis=-2)
-    rank = 2.0 * np.arange(1, n + 1) - n - 1
-    pairs = (rank[:, None] * gap).sum(axis=-2) / (n * n)
-    return np.asarray(np.abs(gap).mean(axis=-2) - pairs)
-
-
-def _weighted_crps(gap: Array, weights: Array) -> Array:
-    leading(gap.shape[:-2], weights.shape[:-1], "weights")
-    order = np.argsort(gap, axis=-2)
-    gap = np.take_along_axis(gap, order, axis=-2)
-    share = np.take_along_axis(np.broadcast_to(weights[..., None], gap.shape), order, axis=-2)
+    if weights is None:
+        gap, share = np.sort(gap, axis=-2), np.full((n, 1), 1 / n)
+    else:
+        leading(gap.shape[:-2], weights.shape[:-1], "weights")
+        order = np.argsort(gap, axis=-2)
+        gap = np.take_along_axis(gap, order, axis=-2)
+        share = np.take_along_axis(np.broadcast_to(weights[..., None], gap.shape), order, axis=-2)
     above = 2 * np.cumsum(share, axis=-2) - share - 1
     return np.asarray((share * (np.abs(gap) - above * gap)).sum(axis=-2))
 

@@ -10,8 +10,7 @@ import numpy as np
 from ..doors import Count, Share, door, unchecked
 from ..network import Channel, fuses
 from .fusion import Exponents, Others, PartialFusion, Rule, Terms
-from .gaussian import GaussianMixture, log_sum
-from .mixands import joined, regression
+from .gaussian import GaussianMixture, joined, log_sum, regression
 from .reduction import runnalls
 
 __all__ = ["average", "fuse", "fuse_in_turn", "fuse_moments", "target_fusion"]

@@ -1,4 +1,4 @@
-"""How far two densities are apart: in closed form, by quadrature, by importance sampling."""
+"""How far two densities are apart: by quadrature, by importance sampling."""
 
 from __future__ import annotations
 
@@ -11,40 +11,9 @@ import numpy as np
 from ..doors import Array, Bounds, Record, Rng, array, door, unchecked
 from .gaussian import GaussianMixture
 
-__all__ = ["Divergence", "gaussian_divergences", "jeffreys_by_sampling", "jeffreys_of_many"]
+__all__ = ["Divergence", "jeffreys_by_sampling", "jeffreys_of_many"]
 
 Several = Annotated[int, Bounds(at_least=2)]
-
-
-def gaussian_divergences(means: Array, covs: Array, other_means: Array, other_covs: Array) -> Array:
-    r"""Kullback-Leibler divergences of each Gaussian from each of others, (L, L'), in nats.
-
-    .. math::
-        D_{KL}&=\tfrac12\bigl[\operatorname{tr}\mathbf P_r^{-1}\mathbf P_q-d
-        +\log|\mathbf P_r|-\log|\mathbf P_q|\\
-        &\qquad+(\mathbf m_q-\mathbf m_r)^\top\mathbf P_r^{-1}(\mathbf m_q-\mathbf m_r)\bigr]
-
-    never negative: what rounding leaves below zero is zero.
-
-    Parameters
-    ----------
-    means, covs : ndarray, (L, d), (L, d, d)
-    other_means, other_covs : ndarray, (L', d), (L', d, d)
-
-    Examples
-    --------
-    >>> gaussian_divergences(np.array([[0.0]]), np.ones((1, 1, 1)), np.array([[0.0], [3.0]]),
-    ...                      np.ones((2, 1, 1)))
-    array([[0. , 4.5]])
-    """
-    root, root2 = np.linalg.cholesky(covs), np.linalg.cholesky(other_covs)
-    d = means.shape[1]
-    white = np.linalg.solve(root2, np.broadcast_to(np.eye(d), other_covs.shape))
-    trace = ((white[None] @ root[:, None]) ** 2).sum(axis=(-2, -1))
-    gap = ((white[None] @ (means[:, None] - other_means)[..., None]) ** 2).sum(axis=(-2, -1))
-    half, half2 = (np.log(np.diagonal(r, axis1=-2, axis2=-1)).sum(axis=-1) for r in (root, root2))
-    out = 0.5 * (trace - d + gap) + half2[None] - half[:, None]
-    return np.asarray(np.maximum(out, 0.0))
 
 
 @dataclass(frozen=True)
@@ -57,18 +26,15 @@ class Divergence(Record):
         Half the sum of the two Kullback-Leibler divergences, in nats.
     error : float
         Its standard error; 0 for a quadrature.
-    share : float
-        Effective share of the sample, the smaller of the two densities'; 1 for a quadrature.
 
     Examples
     --------
-    >>> print(Divergence(0.5, 0.01, 0.9))
+    >>> print(Divergence(0.5, 0.01))
     0.5 ± 0.01
     """
 
     value: float
     error: float
-    share: float
 
     def __str__(self) -> str:
         return f"{self.value:.3g} ± {self.error:.1g}"
@@ -123,7 +89,7 @@ def jeffreys_of_many(
         tops = new
     ratios = sums[:, 1:] / sums[:, :1]
     gaps = 0.5 * (ratios[0, 1:] - np.diagonal(ratios)[1:])
-    return [Divergence(float(gap), 0.0, 1.0) for gap in gaps]
+    return [Divergence(float(gap), 0.0) for gap in gaps]
 
 
 def _tensor_grid(low: Array, high: Array, nodes: int) -> tuple[Array, Array]:
@@ -171,6 +137,5 @@ def jeffreys_by_sampling(
     weights = [w / w.mean() for w in weights]
     means = [float((w * ratio).mean()) for w in weights]
     influence = weights[0] * (ratio - means[0]) - weights[1] * (ratio - means[1])
-    share = min(float(1 / (w**2).mean()) for w in weights)
     error = 0.5 * influence.std(ddof=1) / np.sqrt(base.size)
-    return Divergence(0.5 * (means[0] - means[1]), float(error), share)
+    return Divergence(0.5 * (means[0] - means[1]), float(error))

@@ -18,22 +18,25 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import svdvals
+from scipy.optimize import nnls
 
-from ..doors import Array, Count, Record, Share, door, summing_to_one, unchecked
+from ..doors import Array, Bounds, Count, Mask, Record, Share, door, summing_to_one, unchecked
 from ..gaussians.single import unscented_points
-from ..linalg import SolverError
-from .gaussian import GaussianMixture, log_sum
-from .mixands import Shapes, conditional_shapes, literal_shapes, nonnegative_least_squares
+from ..linalg import SolverError, symmetrise
+from .gaussian import GaussianMixture, inverse, joined, log_sum, regression
+from .reduction import Shapes
 
-__all__ = ["Exponents", "Others", "PartialFusion", "Rule", "Terms"]
+__all__ = ["PartialFusion", "nonnegative_least_squares", "tikhonov"]
 
 Others = GaussianMixture | Sequence[GaussianMixture]
 Exponents = Share | Literal["equal"] | Annotated[Array, "K", summing_to_one]
 Terms = Literal["matched", "all"]
 Rule = Literal["C1", "C2", "C3", "points"]
+Condition = Annotated[float, Bounds(above=1, at_most=1e150)]
 
+# Relative density below which the rows of "points" stop gaining weight.
 _FLOOR = 1e-3
-"""Relative density below which the rows of "points" stop gaining weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,18 +106,8 @@ class PartialFusion(Record):
         """The own belief about the target."""
         return unchecked(self.own.marginal)(range(self.target_dim))
 
-    @door
-    def log_update(self, t: Annotated[Array, "... self.target_dim"]) -> Array:
-        """Logarithm of the update factor g(t) of (15), not normalised, (...).
-
-        Parameters
-        ----------
-        t : array_like, (..., n_t)
-        """
-        return self._with_update(np.zeros(t.shape[:-1]), t, "t")
-
     def _with_update(self, logs: Array, t: Array, name: str) -> Array:
-        """Logarithms of densities and that of the update factor, added."""
+        """Logarithms of densities and that of the update factor g(t) of (15), added."""
         w = self.exponents
         with np.errstate(invalid="ignore"):
             if w[0] != 1:
@@ -144,18 +137,18 @@ class PartialFusion(Record):
 
     @door
     def shapes(
-        self, *, terms: Terms = "matched", form: Literal["conditional", "literal"] = "conditional",
-        marginal: GaussianMixture | None = None, received: Sequence[GaussianMixture] | None = None,
+        self, *, terms: Terms = "matched", marginal: GaussianMixture | None = None,
+        received: Sequence[GaussianMixture] | None = None,
     ) -> Shapes:
         """Means and covariances of the fused mixands, (22)-(28), without weights.
+
+        By conditioning in the own mixand's whitened frame, which inverts nothing indefinite.
 
         Parameters
         ----------
         terms : {"matched", "all"}
             Terms in which own mixand and divided mixand are the same, L L' of them, all positive
             definite; or all L² L', of which some are not and are left out.
-        form : {"conditional", "literal"}
-            By conditioning, which inverts nothing indefinite; or (22)-(27) as printed.
         marginal : GaussianMixture, optional
             What to divide by in place of the own target marginal (a reduced one); with
             ``terms="all"``.
@@ -166,16 +159,16 @@ class PartialFusion(Record):
             raise ValueError("marginal: needs terms='all', since matched terms use the own mixands")
         divided = self.target if marginal is None else marginal
         sent = self.others if received is None else received
-        if len(sent) != len(self.others):
-            raise ValueError(f"received: needs {len(self.others)} mixtures, got {len(sent)}")
-        for name, mixture in (("marginal", divided), *(("received", other) for other in sent)):
-            if mixture.dim != self.target_dim:
-                raise ValueError(f"{name}: needs dimension {self.target_dim}, got {mixture.dim}")
+        n = self.target_dim
+        if divided.dim != n:
+            raise ValueError(f"marginal: needs dimension {n}, got {divided.dim}")
+        wanted, got = [n] * len(self.others), [other.dim for other in sent]
+        if got != wanted:
+            raise ValueError(f"received: needs mixtures of dimensions {wanted}, got {got}")
         pairs: NDArray[np.intp] = np.indices((self.own.size, divided.size)).reshape(2, -1)
         if terms == "matched":
             pairs = np.repeat(np.arange(self.own.size)[None], 2, axis=0)
-        make = conditional_shapes if form == "conditional" else literal_shapes
-        return make(self.own, divided, sent, self.exponents, pairs)
+        return _conditional(self.own, divided, sent, self.exponents, pairs)
 
     @door
     def weigh(self, shapes: Shapes, *, rule: Rule = "C3", at_most: Count = 500) -> GaussianMixture:
@@ -201,7 +194,8 @@ class PartialFusion(Record):
         if rule in ("C1", "C2"):
             return _weighed(mixture, logs)
         if shapes.size > at_most:
-            keep = np.sort(np.argsort(mixture.log_peaks - logs, kind="stable")[:at_most])
+            best = np.argsort(mixture.log_peaks - logs, kind="stable")[:at_most]
+            keep = np.isin(np.arange(shapes.size), best)
             shapes, logs = unchecked(shapes.select)(keep), logs[keep]
             mixture = shapes.equally_weighed()
         points = shapes.means
@@ -225,7 +219,7 @@ class PartialFusion(Record):
         own, q = self.own, shapes.source
         white = np.linalg.solve(own.factors[q], (shapes.means - own.means[q])[..., None])[..., 0]
         logs = (own.log_weights + own.log_peaks)[q] - 0.5 * (white**2).sum(axis=-1)
-        return np.asarray(logs + unchecked(self.log_update)(shapes.means[:, : self.target_dim]))
+        return self._with_update(logs, shapes.means[:, : self.target_dim], "shapes")
 
 
 def _weighed(mixture: GaussianMixture, logs: Array) -> GaussianMixture:
@@ -236,6 +230,138 @@ def _weighed(mixture: GaussianMixture, logs: Array) -> GaussianMixture:
         raise SolverError("no fused mixand has a weight: the exact density is zero at every point")
     w = np.exp(mass - total)
     keep = w > 0
-    return GaussianMixture.unchecked(
-        w[keep] / w[keep].sum(), mixture.means[keep], mixture.covs[keep]
-    )
+    w = w[keep] / w[keep].sum()
+    return GaussianMixture.unchecked(w, mixture.means[keep], mixture.covs[keep])
+
+
+def _told(sent: Sequence[GaussianMixture], w: Array, about: Array) -> tuple[Array, Array]:
+    """Information (Q, T, n, n) and vectors (Q, T, n) of the product of the others' powers.
+
+    One term for each choice of a mixand from each, with vectors relative to points (Q, n).
+    """
+    q, n = about.shape
+    information, pull = np.zeros((q, 1, n, n)), np.zeros((q, 1, n))
+    for weight, other in zip(w, sent, strict=True):
+        j = weight * inverse(other.factors)
+        eta = np.einsum("rij,srj->sri", j, other.means - about[:, None])
+        information = (information[:, :, None] + j).reshape(q, -1, n, n)
+        pull = (pull[:, :, None] + eta[:, None]).reshape(q, -1, n)
+    return information, pull
+
+
+def _conditional(
+    own: GaussianMixture, divided: GaussianMixture, sent: Sequence[GaussianMixture], w: Array,
+    pairs: NDArray[np.intp],
+) -> Shapes:  # fmt: skip
+    """Update the target part by Λ and η in the own mixand's whitened frame; e follows."""
+    n = divided.dim
+    q, p = pairs
+    # Everything about the own mixand's mean: far from the origin products would cancel.
+    information, pull = _told(sent, w[1:], own.means[q, :n])
+    if w[0] != 1:
+        j = (w[0] - 1) * inverse(divided.factors)[p]
+        gap = divided.means[p] - own.means[q, :n]
+        information = information + j[:, None]
+        pull = pull + (j @ gap[..., None])[:, None, :, 0]
+    root = np.linalg.cholesky(own.covs[q, :n, :n])[:, None]
+    lower, good = _factored(np.eye(n) + root.mT @ symmetrise(information) @ root)
+    half = np.linalg.solve(lower, np.broadcast_to(root.mT, lower.shape))
+    target = half.mT @ half
+    move = (target @ pull[..., None])[..., 0]
+    gain, rest = (part[q, None] for part in regression(own, n))
+    shift = np.concatenate([move, (gain @ move[..., None])[..., 0]], axis=-1)
+    covs = joined(target, gain, rest)
+    source = np.broadcast_to(q[:, None], good.shape)
+    means = own.means[q, None] + shift
+    return Shapes.unchecked(means[good], covs[good], source[good], int((~good).sum()))
+
+
+def _factored(matrices: Array) -> tuple[Array, Mask]:
+    """Cholesky factors of a stack, and which of them exist; the identity where none does."""
+    d = matrices.shape[-1]
+    lower = np.zeros_like(matrices)
+    good = np.ones(matrices.shape[:-2], dtype=bool)
+    for k in range(d):
+        column = matrices[..., k:, k] - (lower[..., k:, :k] @ lower[..., k, :k, None])[..., 0]
+        # A pivot that has lost ten digits to cancellation is rounding.
+        good &= column[..., 0] > 1e-10 * np.abs(matrices[..., k, k])
+        pivot = np.where(good, column[..., 0], 1.0)
+        lower[..., k:, k] = np.where(good[..., None], column, 0.0) / np.sqrt(pivot)[..., None]
+    lower[~good] = np.eye(d)
+    return lower, good
+
+
+@door
+def tikhonov(
+    largest: Annotated[float, Bounds(at_least=0, at_most=1e150)],
+    smallest: Annotated[float, Bounds(at_least=0, at_most=1e150)], *,
+    condition: Condition = 1e10,
+) -> float:
+    r"""The smallest factor that brings a matrix's condition number down to `condition`, (66).
+
+    .. math:: \alpha^2=\frac{\sigma_1^2-\kappa^2\sigma_n^2}{\kappa^2-1}
+
+    and 0 where the matrix is well conditioned already. The printed (66) has an index i where the
+    largest singular value is meant.
+
+    Parameters
+    ----------
+    largest, smallest : float
+        Singular values, at least 0.
+    condition : float
+        Above 1.
+
+    Examples
+    --------
+    >>> alpha = tikhonov(1.0, 0.0, condition=10.0)
+    >>> round(float(np.sqrt(1 + alpha**2) / alpha), 9)
+    10.0
+    >>> tikhonov(1.0, 0.5, condition=10.0)
+    0.0
+    """
+    gap = largest**2 - (condition * smallest) ** 2
+    return float(np.sqrt(max(gap, 0.0) / (condition**2 - 1)))
+
+
+@door
+def nonnegative_least_squares(
+    matrix: Annotated[Array, "n s", Bounds(at_least=-1e150, at_most=1e150)],
+    right: Annotated[Array, "n"], *,
+    condition: Condition = 1e10,
+) -> Array:
+    """Nonnegative weights that solve ``matrix @ w = right`` best, regularised by (60) and (66).
+
+    Parameters
+    ----------
+    matrix : array_like, (n, S)
+    right : array_like, (n,)
+    condition : float
+        The largest condition number allowed.
+
+    Returns
+    -------
+    ndarray, (S,)
+
+    Raises
+    ------
+    SolverError
+        If the iteration does not end.
+
+    Examples
+    --------
+    >>> nonnegative_least_squares([[1.0, 0.0], [0.0, 1.0]], [2.0, -1.0])
+    array([2., 0.])
+    """
+    rows, columns = matrix.shape
+    values = svdvals(matrix)
+    smallest = float(values[-1]) if rows >= columns else 0.0
+    alpha = unchecked(tikhonov)(float(values[0]), smallest, condition=condition)
+    if alpha > 0:
+        matrix = np.concatenate([matrix, alpha * np.eye(columns)])
+        right = np.concatenate([right, np.zeros(columns)])
+    try:
+        return np.asarray(nnls(matrix, right, maxiter=20 * columns)[0], dtype=np.float64)
+    except RuntimeError as error:
+        raise SolverError(
+            f"nonnegative least squares stopped: {error} ({columns} unknowns)"
+        ) from None

@@ -10,13 +10,13 @@ from typing import Annotated, Any, Self
 import numpy as np
 
 from ..doors import Array, Count, Cov, Places, Record, Rng, definite, door, summing_to_one
-from ..linalg import symmetrise
+from ..linalg import log_det, symmetrise
 
 __all__ = ["GaussianMixture"]
 
 _LOG_2PI = float(np.log(2 * np.pi))
+# Numbers that one block of an evaluation may hold: half a megabyte stays in the cache.
 _CHUNK = 60_000
-"""Numbers that one block of an evaluation may hold: half a megabyte stays in the cache."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -117,8 +117,7 @@ class GaussianMixture(Record):
     @cached_property
     def log_peaks(self) -> Array:
         """Logarithm of each mixand's largest density, -log sqrt|2 pi P|, (L,)."""
-        half = np.log(np.diagonal(self.factors, axis1=-2, axis2=-1)).sum(axis=-1)
-        return np.asarray(-half - 0.5 * self.dim * _LOG_2PI)
+        return np.asarray(-0.5 * (log_det(self.factors) + self.dim * _LOG_2PI))
 
     @door
     def component_log_densities(self, x: Annotated[Array, "... self.dim"]) -> Array:
@@ -271,3 +270,21 @@ def log_sum(logs: Array) -> Array:
     top = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide="ignore"):
         return np.asarray(np.log(np.exp(logs - top).sum(axis=-1)) + top[..., 0])
+
+
+def regression(own: GaussianMixture, n: int) -> tuple[Array, Array]:
+    """Gain of e on t and covariance of e given t, of each mixand."""
+    cross = own.covs[:, :n, n:]
+    gain = np.asarray(np.linalg.solve(own.covs[:, :n, :n], cross).mT, dtype=np.float64)
+    return gain, symmetrise(own.covs[:, n:, n:] - gain @ cross)
+
+
+def joined(target: Array, gain: Array, rest: Array) -> Array:
+    """Covariances of [t; e] from that of t, the gain of e on t, and the covariance of e given t."""
+    below = symmetrise(rest + gain @ target @ gain.mT)
+    n = target.shape[-1]
+    out = np.empty((*below.shape[:-2], n + below.shape[-1], n + below.shape[-1]))
+    out[..., :n, :n], out[..., n:, n:] = target, below
+    out[..., n:, :n] = gain @ target
+    out[..., :n, n:] = out[..., n:, :n].mT
+    return out

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from types import FunctionType
 from typing import Annotated, Any, Literal, cast
@@ -12,21 +13,75 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from ..doors import Array, Bounds, Count, Mask, NonNegative, door, needed, unchecked
+from ..doors import Array, Bounds, Count, Index, Mask, Record, definite, door, unchecked
 from ..linalg import symmetrise
-from .divergence import gaussian_divergences
 from .gaussian import GaussianMixture
-from .mixands import Shapes
 
 __all__ = [
-    "cross_relevance", "kept_by_relevance", "merge_costs", "pivoted_qr", "runnalls", "two_stage",
+    "Shapes", "cross_relevance", "kept_by_relevance", "merge_costs", "pivoted_qr", "runnalls",
 ]  # fmt: skip
 
-Engine = Literal["auto", "numba", "numpy"]
+# Divergence in nats up to which a mixand counts as near another's, whatever its weight.
+_GATE = 0.5
+# The least that the smallest relevance counts as, in nats.
+_FLOOR = 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes(Record):
+    """Mixands before they are weighed.
+
+    Parameters
+    ----------
+    means : array_like, (S, d)
+    covs : array_like, (S, d, d)
+        Positive definite.
+    source : array_like of int, (S,)
+        The own mixand that each came from.
+    dropped : int
+        How many others were left out because they had no positive definite covariance.
+
+    Examples
+    --------
+    >>> Shapes([[0.0]], [[[1.0]]], [0]).size
+    1
+    """
+
+    means: Annotated[Array, "s d"]
+    covs: Annotated[Array, "s d d", definite]
+    source: Annotated[NDArray[np.intp], "s", Bounds(at_least=0)]
+    dropped: Index = 0
+
+    @property
+    def size(self) -> int:
+        """Number of mixands, S."""
+        return int(self.means.shape[0])
+
+    @door
+    def select(self, keep: Annotated[Mask, "self.size"]) -> Shapes:
+        """Some of the mixands, by a mask.
+
+        Parameters
+        ----------
+        keep : array_like of bool, (S,)
+            True for those that stay.
+
+        Examples
+        --------
+        >>> Shapes([[0.0], [1.0]], [[[1.0]], [[2.0]]], [0, 0]).select([False, True]).means
+        array([[1.]])
+        """
+        return self.unchecked(self.means[keep], self.covs[keep], self.source[keep], self.dropped)
+
+    def equally_weighed(self) -> GaussianMixture:
+        """A mixture of these mixands with equal weights."""
+        return GaussianMixture.unchecked(np.full(self.size, 1 / self.size), self.means, self.covs)
 
 
 @door
-def runnalls(mixture: GaussianMixture, size: Count, *, engine: Engine = "auto") -> GaussianMixture:
+def runnalls(
+    mixture: GaussianMixture, size: Count, *, heaviest: Count | None = None
+) -> GaussianMixture:
     r"""Merge, pair by pair, the mixands whose merger may lose least, until `size` are left.
 
     Merging i and j keeps their weight, mean and covariance. The loss of information is at most
@@ -36,16 +91,17 @@ def runnalls(mixture: GaussianMixture, size: Count, *, engine: Engine = "auto") 
 
     A. Runnalls, IEEE Transactions on Aerospace and Electronic Systems 43 (2007) 989-999. Costs are
     kept between mergers, so that L mixands cost about L²/2 determinants, and the memory is 8 L²
-    bytes; use :func:`two_stage` beyond some thousands.
+    bytes: of thousands let the heaviest absorb the others first. Where numba is installed (the
+    extra `speed`) it computes: the same merges, some four times as fast.
 
     Parameters
     ----------
     mixture : GaussianMixture
     size : int
         How many to keep; a mixture that is no larger is returned as it is.
-    engine : {"auto", "numba", "numpy"}
-        What computes; "auto" takes numba where it is installed (the extra `speed`). Same merges,
-        other speed.
+    heaviest : int, optional
+        Of a larger mixture each mixand joins that of the so many heaviest with which its merger
+        costs least, all at once, before pairs are merged; at least `size`.
 
     Examples
     --------
@@ -54,10 +110,14 @@ def runnalls(mixture: GaussianMixture, size: Count, *, engine: Engine = "auto") 
     array([[0.1],
            [9. ]])
     """
+    if heaviest is not None and heaviest < size:
+        raise ValueError(f"heaviest: needs an integer of at least size, {size}, got {heaviest}")
+    if heaviest is not None and heaviest < mixture.size:
+        mixture = _absorbed(mixture, heaviest)
     if mixture.size <= size:
         return mixture
     w, m, p, root = _whitened(mixture)
-    alive = _merging(engine)(w, m, p, size)
+    alive = _merging()(w, m, p, size)
     means = mixture.mean + m[alive] @ root.T
     covs = symmetrise(root @ p[alive] @ root.T)
     return GaussianMixture.unchecked(w[alive] / w[alive].sum(), means, covs)
@@ -79,42 +139,6 @@ def merge_costs(mixture: GaussianMixture) -> Array:
 
 
 @door
-def two_stage(mixture: GaussianMixture, size: Count, *, heaviest: Count = 400) -> GaussianMixture:
-    """Runnalls' reduction for thousands of mixands: the heaviest absorb the others first.
-
-    Each other mixand joins the heavy one with which its merger costs least, all at once; then
-    :func:`runnalls` goes on. Mean and covariance of the whole mixture are kept.
-
-    Parameters
-    ----------
-    mixture : GaussianMixture
-    size : int
-        How many to keep.
-    heaviest : int
-        How many go into the second stage, at least `size`.
-
-    Examples
-    --------
-    >>> three = GaussianMixture([0.5, 0.4, 0.1], [[0.0], [9.0], [8.0]], [[[1.0]]] * 3)
-    >>> two_stage(three, 2, heaviest=2).means.round(2)
-    array([[0. ],
-           [8.8]])
-    """
-    if heaviest < size:
-        raise ValueError(f"heaviest: needs an integer of at least size, {size}, got {heaviest}")
-    if mixture.size <= heaviest:
-        return unchecked(runnalls)(mixture, size)
-    w, m, p, _ = _whitened(mixture)
-    order = np.argsort(-w, kind="stable")
-    heavy, rest = order[:heaviest], order[heaviest:]
-    dets = np.linalg.slogdet(p)[1]
-    labels = np.empty(w.size, dtype=np.intp)
-    labels[heavy] = np.arange(heaviest)
-    labels[rest] = [_costs(w, m, p, dets, i, heavy).argmin() for i in rest]
-    return unchecked(runnalls)(_grouped(mixture, labels), size)
-
-
-@door
 def cross_relevance(mixture: GaussianMixture, other: GaussianMixture) -> Array:
     r"""The matrix (38)-(39): :math:`w_q D_{KL}(\mathcal N_q\|\mathcal N_r)`, (L, L').
 
@@ -131,22 +155,21 @@ def cross_relevance(mixture: GaussianMixture, other: GaussianMixture) -> Array:
     >>> cross_relevance(one, GaussianMixture.gaussian([2.0], [[1.0]]))
     array([[2.]])
     """
-    return mixture.weights[:, None] * _divergences(mixture, other)
+    return mixture.weights[:, None] * gaussian_divergences(mixture, other)
 
 
 @door
 def kept_by_relevance(
     mixture: GaussianMixture, other: GaussianMixture, *,
-    threshold: Annotated[float, Bounds(above=1)], gate: NonNegative = 0.5,
-    floor: NonNegative = 1e-4,
+    threshold: Annotated[float, Bounds(above=1)],
 ) -> GaussianMixture:
     r"""Merge into one the mixands that overlap with none of another's: the KLD rule (40)-(41).
 
     With :math:`\delta_q=\min_r w_qD_{KL}(\mathcal N_q\|\mathcal N_r)` the mixands with
     :math:`\delta_q>\epsilon\,\delta_{\min}` are merged. As printed, a mixand that both agents
     share makes :math:`\delta_{\min}` zero, or negative by rounding, and the mixture collapses.
-    Three guards: :math:`\delta_{\min}` is at least `floor`; a mixand is only merged if its
-    unweighted divergence exceeds `gate`; and the most relevant mixand is never merged.
+    Three guards: :math:`\delta_{\min}` is at least 1e-4 nats; a mixand is only merged if its
+    unweighted divergence exceeds half a nat; and the most relevant mixand is never merged.
 
     Parameters
     ----------
@@ -154,8 +177,6 @@ def kept_by_relevance(
         Of the same dimension.
     threshold : float
         The factor :math:`\epsilon`, above 1.
-    gate, floor : float
-        At least 0, in nats.
 
     Examples
     --------
@@ -165,9 +186,9 @@ def kept_by_relevance(
     array([[0. ],
            [8.5]])
     """
-    nearest = _divergences(mixture, other).min(axis=1)
+    nearest = gaussian_divergences(mixture, other).min(axis=1)
     delta = mixture.weights * nearest
-    out = (delta > threshold * max(float(delta.min()), floor)) & (nearest > gate)
+    out = (delta > threshold * max(float(delta.min()), _FLOOR)) & (nearest > _GATE)
     out[np.argmin(delta)] = False
     labels = np.where(out, mixture.size, np.arange(mixture.size))
     return _grouped(mixture, np.unique(labels, return_inverse=True)[1])
@@ -175,67 +196,82 @@ def kept_by_relevance(
 
 @door
 def pivoted_qr(
-    shapes: Shapes, *, size: Count | None = None,
-    tolerance: Annotated[float, Bounds(above=0, below=1)] | None = None,
-    rest: Literal["merge", "drop"] = "merge",
+    shapes: Shapes, *, size: Count, rest: Literal["merge", "drop"] = "merge"
 ) -> Shapes:
     r"""Keep the mixands that a pivoted QR decomposition of (33) finds independent, (42)-(43).
 
     Parameters
     ----------
     shapes : Shapes
-    size : int, optional
-        How many to have in the end.
-    tolerance : float, optional
-        Or :math:`\delta` in (0, 1): those whose pivot is at least :math:`\delta|U_{11}|`.
+    size : int
+        How many to have in the end, those with the largest pivots.
     rest : {"merge", "drop"}
         Merge the others into one, with equal weights since they have none yet; or drop them.
 
     Examples
     --------
     >>> three = Shapes([[0.0], [1e-6], [9.0]], [[[1.0]]] * 3, [0, 0, 0])
-    >>> pivoted_qr(three, tolerance=0.1, rest="drop").means
+    >>> pivoted_qr(three, size=2, rest="drop").means
     array([[0.],
            [9.]])
     """
-    if (size is None) == (tolerance is None):
-        raise ValueError("size: needs either a size or a tolerance, got both or none")
+    if size >= shapes.size:
+        return shapes
     mixture = shapes.equally_weighed()
     logs = unchecked(mixture.component_log_densities)(shapes.means) - mixture.log_peaks
-    upper, order = qr(np.exp(logs), mode="r", pivoting=True)
-    pivots = np.abs(np.diagonal(upper))
-    kept = int((pivots >= (tolerance or 0.0) * pivots[0]).sum())
-    kept = kept if size is None else min(size, shapes.size)
-    if size is not None and rest == "merge" and 1 < kept < shapes.size:
-        kept -= 1
-    select = unchecked(shapes.select)
-    first = select(np.sort(order[:kept]))
-    if rest == "drop" or kept == shapes.size:
+    order = qr(np.exp(logs), mode="r", pivoting=True)[1]
+    kept = size - (rest == "merge")
+    keep = np.isin(np.arange(shapes.size), order[:kept])
+    first, lost = unchecked(shapes.select)(keep), unchecked(shapes.select)(~keep)
+    if rest == "drop":
         return first
-    lost = select(order[kept:])
     one = lost.equally_weighed()
     return Shapes.unchecked(
         np.concatenate([first.means, one.mean[None]]), np.concatenate([first.covs, one.cov[None]]),
-        np.append(first.source, lost.source[0]), shapes.dropped,
+        np.append(first.source, shapes.source[order[kept]]), shapes.dropped,
     )  # fmt: skip
 
 
-def _divergences(mixture: GaussianMixture, other: GaussianMixture) -> Array:
-    if other.dim != mixture.dim:
-        raise ValueError(f"other: needs dimension {mixture.dim}, got {other.dim}")
-    return gaussian_divergences(mixture.means, mixture.covs, other.means, other.covs)
+def gaussian_divergences(mixture: GaussianMixture, other: GaussianMixture) -> Array:
+    r"""Kullback-Leibler divergences of each mixand from each of another's, (L, L'), in nats.
+
+    .. math::
+        D_{KL}&=\tfrac12\bigl[\operatorname{tr}\mathbf P_r^{-1}\mathbf P_q-d
+        +\log|\mathbf P_r|-\log|\mathbf P_q|\\
+        &\qquad+(\mathbf m_q-\mathbf m_r)^\top\mathbf P_r^{-1}(\mathbf m_q-\mathbf m_r)\bigr]
+
+    never negative: what rounding leaves below zero is zero.
+    """
+    d = mixture.dim
+    if other.dim != d:
+        raise ValueError(f"other: needs dimension {d}, got {other.dim}")
+    white = np.linalg.solve(other.factors, np.broadcast_to(np.eye(d), other.covs.shape))
+    trace = ((white @ mixture.factors[:, None]) ** 2).sum(axis=(-2, -1))
+    gap = mixture.means[:, None] - other.means
+    length = ((white @ gap[..., None]) ** 2).sum(axis=(-2, -1))
+    out = 0.5 * (trace - d + length) + mixture.log_peaks[:, None] - other.log_peaks
+    return np.asarray(np.maximum(out, 0.0))
+
+
+def _absorbed(mixture: GaussianMixture, heaviest: int) -> GaussianMixture:
+    """The heaviest mixands after each other one has joined the cheapest of them."""
+    w, m, p, _ = _whitened(mixture)
+    order = np.argsort(-w, kind="stable")
+    heavy, rest = order[:heaviest], order[heaviest:]
+    dets = np.linalg.slogdet(p)[1]
+    labels = np.empty(w.size, dtype=np.intp)
+    labels[heavy] = np.arange(heaviest)
+    labels[rest] = [_costs(w, m, p, dets, i, heavy).argmin() for i in rest]
+    return _grouped(mixture, labels)
 
 
 def _whitened(mixture: GaussianMixture) -> tuple[Array, Array, Array, Array]:
     """Copies in the frame of the global moments, where the costs are the same and well scaled."""
     root = np.linalg.cholesky(mixture.cov)
     white = np.linalg.solve(root, np.eye(mixture.dim))
-    return (
-        mixture.weights.copy(),
-        np.ascontiguousarray((mixture.means - mixture.mean) @ white.T),
-        np.ascontiguousarray(symmetrise(white @ mixture.covs @ white.T)),
-        np.asarray(root),
-    )
+    means = (mixture.means - mixture.mean) @ white.T
+    covs = symmetrise(white @ mixture.covs @ white.T)
+    return mixture.weights.copy(), means, covs, np.asarray(root)
 
 
 def _costs(w: Array, m: Array, p: Array, dets: Array, i: Any, others: NDArray[np.intp]) -> Array:
@@ -250,11 +286,12 @@ def _costs(w: Array, m: Array, p: Array, dets: Array, i: Any, others: NDArray[np
 
 
 @cache
-def _merging(engine: Engine) -> Callable[..., Mask]:
-    """What merges; "auto" takes numba where it is installed."""
-    if engine == "numpy" or (engine == "auto" and importlib.util.find_spec("numba") is None):
+def _merging() -> Callable[..., Mask]:
+    """What merges, compiled where numba is installed."""
+    try:
+        compiled = importlib.import_module("numba").njit(cache=True)
+    except ModuleNotFoundError:
         return _merged
-    compiled = needed("numba", "speed").njit(cache=True)
     # The same function, with the other way to compute a row: numba keeps it between processes
     # only if that is a global name.
     names = globals() | {"_costs": compiled(_costs_in_loops)}
@@ -326,15 +363,11 @@ def _merged(w: Any, m: Any, p: Any, size: Any) -> Any:
 
 def _grouped(mixture: GaussianMixture, labels: NDArray[np.intp]) -> GaussianMixture:
     """Merge the mixands of equal label, keeping each group's weight, mean and covariance."""
-    groups = int(labels.max()) + 1
-    w = np.asarray(np.bincount(labels, weights=mixture.weights), dtype=np.float64)
-    sizes = np.bincount(labels)
-    total = w[labels]
-    share = np.divide(mixture.weights, total, out=1.0 / sizes[labels], where=total > 0)
-    means = np.zeros((groups, mixture.dim))
-    np.add.at(means, labels, share[:, None] * mixture.means)
+    member = labels == np.arange(labels.max() + 1)[:, None]
+    w = member @ mixture.weights
+    equal = member / member.sum(axis=1, keepdims=True)
+    share = np.divide(member * mixture.weights, w[:, None], out=equal, where=w[:, None] > 0)
+    means = share @ mixture.means
     gap = mixture.means - means[labels]
-    covs = np.zeros((groups, mixture.dim, mixture.dim))
-    spread = mixture.covs + gap[:, :, None] * gap[:, None, :]
-    np.add.at(covs, labels, share[:, None, None] * spread)
+    covs = np.tensordot(share, mixture.covs + gap[:, :, None] * gap[:, None, :], axes=1)
     return GaussianMixture.unchecked(w, means, symmetrise(covs))

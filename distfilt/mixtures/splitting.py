@@ -1,4 +1,4 @@
-"""More mixands where a density bends: along the direction that a map stretches, along an arc."""
+"""More mixands where a density bends: along the direction that a map stretches."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from ..doors import Array, Bounds, Count, Positive, door, unchecked
 from ..linalg import symmetrise
 from .gaussian import GaussianMixture
 
-__all__ = ["arc", "split", "split_library", "split_stretched", "stretching"]
+__all__ = ["split", "split_library", "split_stretched", "stretching"]
 
 Fraction = Annotated[float, Bounds(above=0, below=1)]
 
+# Mixands lighter than this are not split.
 _LIGHT = 1e-3
-"""Mixands lighter than this are not split."""
 
 
 @door
@@ -194,62 +194,3 @@ def split_stretched(
             break
         mixture = unchecked(split)(mixture, worst, directions[worst])
     return mixture
-
-
-@door
-def arc(
-    mixands: Annotated[int, Bounds(at_least=2)], agent: Annotated[Array, "2"], *,
-    angle_std: Positive, range_std: Positive, ego_std: Positive, width: Positive = 0.31,
-    span: Positive = 1.46,
-) -> GaussianMixture:
-    r"""What knows a distance well and a bearing badly: a belief about [target; ego], bent.
-
-    Both are in the plane, four components in all.
-
-    The agent aims at the origin from a distance R. Mixand k lies at the angle
-    :math:`\theta_k=\theta_0+\sigma_\theta s_k` with :math:`s_k` equally spaced in ± `span`,
-    weighs :math:`\propto e^{-s_k^2/2}`, and has the target at distance R, the ego position moved
-    half as far the other way. Within a mixand the errors are independent along the line of sight
-    (`range_std`) and across it (R, `width` and the spacing of the angles multiplied); the ego
-    position takes half of the error across, and has `ego_std` of its own in both directions.
-
-    Parameters
-    ----------
-    mixands : int
-        At least 2.
-    agent : array_like, (2,)
-        Where the agent stands, not at the origin.
-    angle_std : float
-        In rad, above 0.
-    range_std, ego_std : float
-        In the agent's units of length, above 0.
-    width, span : float
-        Without unit, above 0.
-
-    Returns
-    -------
-    GaussianMixture
-        Of dimension 4: target (2), ego (2).
-
-    Examples
-    --------
-    >>> bent = arc(5, [-10.0, 0.0], angle_std=0.6, range_std=0.4, ego_std=0.4)
-    >>> bent.means[2].round(6) + 0.0
-    array([  0.,   0., -10.,   0.])
-    """
-    r = float(np.hypot(*agent))
-    if r == 0:
-        raise ValueError("agent: needs a place apart from the origin, got the origin")
-    s = np.linspace(-1, 1, mixands) * span
-    theta = np.arctan2(-agent[1], -agent[0]) + angle_std * s
-    across = r * width * angle_std * (s[1] - s[0])
-    variances = np.array([range_std, across, ego_std, ego_std]) ** 2
-    u = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
-    v = np.stack([-u[:, 1], u[:, 0]], axis=-1)
-    slope = np.zeros((mixands, 4, 4))
-    slope[:, :2, 0], slope[:, :2, 1] = u, v
-    slope[:, 2:, 1], slope[:, 2:, 2], slope[:, 2:, 3] = -0.5 * v, u, v
-    means = np.concatenate([agent + r * u, agent - 0.5 * r * (u + agent / r)], axis=-1)
-    w = np.exp(-0.5 * s**2)
-    covs = symmetrise((slope * variances) @ slope.mT)
-    return GaussianMixture(w / w.sum(), means, covs)

@@ -16,9 +16,10 @@ from functools import lru_cache, partial
 from typing import Annotated, Any
 
 import numpy as np
+from scipy.linalg import expm
 
 from ..doors import Array, Positive, door, unchecked
-from ..linalg import van_loan
+from ..linalg import symmetrise
 from .base import LinearModel, Model, Strength
 from .motion import rk4
 
@@ -60,7 +61,10 @@ def _transition(dt: float, rate: float) -> Array:
 
 @lru_cache(maxsize=64)
 def _exact_noise(rate: float, sigma: float, dt: float) -> Array:
-    cov = unchecked(van_loan)(_drift(rate), sigma**2 * np.eye(6), dt)[1]
+    # C. F. Van Loan, IEEE Transactions on Automatic Control 23 (1978) 395-404.
+    a, density = _drift(rate), sigma**2 * np.eye(6)
+    both = expm(dt * np.block([[-a, density], [np.zeros((6, 6)), a.T]]))
+    cov = symmetrise(both[6:, 6:].T @ both[:6, 6:])
     cov.setflags(write=False)
     return cov
 

@@ -1,4 +1,4 @@
-"""Gaussian mixtures and divergences against scipy, quadrature and identities; beliefs on arcs."""
+"""Gaussian mixtures and divergences against scipy, quadrature and identities."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from distfilt.mixtures import GaussianMixture, arc, jeffreys_by_sampling, jeffreys_of_many
-from distfilt.mixtures.divergence import gaussian_divergences
+from distfilt.mixtures import GaussianMixture, jeffreys_by_sampling, jeffreys_of_many
+from distfilt.mixtures.reduction import gaussian_divergences as between
 
 from .examples import affine, random_mixture, scales, shuffled
 
@@ -95,19 +95,7 @@ def test_a_mixture_owns_its_arrays() -> None:
             mixture.covs[0] *= 4
 
 
-def test_a_collapsed_mixture_names_its_mixand() -> None:
-    flat = GaussianMixture.unchecked(
-        np.full(2, 0.5), np.zeros((2, 2)), np.array([np.eye(2), 1e-9 * np.ones((2, 2))])
-    )
-    with pytest.raises(np.linalg.LinAlgError, match="^mixand 1 of 2 .*not positive definite"):
-        flat.log_density([0.0, 0.0])
-
-
 # ----------------------------------------------------------------------------- divergences
-
-
-def between(p: GaussianMixture, q: GaussianMixture) -> np.ndarray:
-    return gaussian_divergences(p.means, p.covs, q.means, q.covs)
 
 
 def closed(p: GaussianMixture, q: GaussianMixture) -> float:
@@ -155,33 +143,3 @@ def test_sampling_meets_the_closed_form_within_its_standard_error() -> None:
     assert abs(np.mean([d.value for d in found]) - closed(P, Q)) < 4 * spread / 200**0.5
     # A standard deviation from 200 draws is known to 5%; 20% is four of its standard errors.
     assert np.isclose(np.mean([d.error for d in found]), spread, rtol=0.2)
-    assert all(0 < d.share <= 1 for d in found)
-
-
-def test_equal_densities_are_not_apart() -> None:
-    found = jeffreys_by_sampling(F, F, P, members=10, rng=np.random.default_rng(0))
-    assert found.value == 0 and found.error == 0 and np.isclose(found.share, 1)
-
-
-@pytest.mark.parametrize("turn", [0.0, 1.0, np.pi])
-def test_arcs_turn_with_the_agent(turn: float) -> None:
-    c, s = np.cos(turn), np.sin(turn)
-    plane = np.array([[c, -s], [s, c]])
-    whole = np.kron(np.eye(2), plane)
-    base = arc(5, [-10.0, 2.0], angle_std=0.6, range_std=0.4, ego_std=0.3, width=0.4)
-    moved = arc(5, plane @ [-10.0, 2.0], angle_std=0.6, range_std=0.4, ego_std=0.3, width=0.4)
-    assert np.allclose(moved.means, base.means @ whole.T)
-    assert np.allclose(moved.covs, whole @ base.covs @ whole.T)
-    assert np.allclose(base.means[2], [0, 0, -10, 2], atol=1e-12)
-    r = np.hypot(10, 2)
-    assert np.allclose(np.hypot(*(base.means[:, :2] - [-10, 2]).T), r)
-    # The own position moves half as far, the other way.
-    out, ego = base.means[:, :2] - base.means[2, :2], base.means[:, 2:] - base.means[2, 2:]
-    assert np.allclose(ego, -0.5 * out)
-    along, across = np.array([10, -2]) / r, np.array([2, 10]) / r
-    assert np.isclose(along @ base.covs[2, :2, :2] @ along, 0.4**2)
-    step = r * 0.4 * 0.6 * 1.46 / 2
-    assert np.isclose(across @ base.covs[2, :2, :2] @ across, step**2)
-    assert np.isclose(across @ base.covs[2, :2, 2:] @ across, -0.5 * step**2)
-    assert np.isclose(across @ base.covs[2, 2:, 2:] @ across, 0.25 * step**2 + 0.3**2)
-    assert np.allclose(np.diff(np.log(base.weights))[:2], 1.46**2 * np.array([3 / 8, 1 / 8]))

@@ -3,35 +3,36 @@
 from __future__ import annotations
 
 import importlib.util
-import sys
+from itertools import product
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distfilt.mixtures import (
-    GaussianMixture,
-    Shapes,
+from distfilt.mixtures import GaussianMixture, Shapes, reduction, runnalls
+from distfilt.mixtures.reduction import (
     cross_relevance,
+    gaussian_divergences,
     kept_by_relevance,
     pivoted_qr,
-    reduction,
-    runnalls,
-    two_stage,
 )
-from distfilt.mixtures.divergence import gaussian_divergences
 
 from .examples import affine, random_mixture, same, scales, shuffled
 
 ENGINES = ["numpy", "loops", *(["numba"] if importlib.util.find_spec("numba") else [])]
 
 
-def by(engine: str, p: GaussianMixture, left: int, patch: pytest.MonkeyPatch) -> GaussianMixture:
-    """As :func:`runnalls`; "loops" is numba's kernel uncompiled."""
-    if engine == "loops":
-        patch.setattr(reduction, "_costs", reduction._costs_in_loops)
-    return runnalls(p, left, engine=engine.replace("loops", "numpy"))
+@pytest.fixture(params=ENGINES)
+def engine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What merges: plain numpy, numba's kernel uncompiled, and compiled where there is numba."""
+    if request.param != "numba":
+        monkeypatch.setattr(reduction, "_merging", lambda: reduction._merged)
+    if request.param == "loops":
+        monkeypatch.setattr(reduction, "_costs", reduction._costs_in_loops)
+
+
+ENGINE = pytest.mark.usefixtures("engine")
 
 
 def brute(p: GaussianMixture, size: int) -> GaussianMixture:
@@ -60,15 +61,13 @@ def brute(p: GaussianMixture, size: int) -> GaussianMixture:
     return GaussianMixture(np.array(w), np.array(m), np.array(c))
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@ENGINE
 @pytest.mark.parametrize(
     ("size", "dim", "left"), [(7, 1, 2), (12, 3, 4), (9, 9, 1), (20, 4, 19), (30, 2, 5)]
 )
-def test_runnalls_is_the_algorithm(
-    engine: str, size: int, dim: int, left: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_runnalls_is_the_algorithm(size: int, dim: int, left: int) -> None:
     p = random_mixture(size, dim, size)
-    same(by(engine, p, left, monkeypatch), brute(p, left))
+    same(runnalls(p, left), brute(p, left))
 
 
 @given(st.integers(2, 30), st.integers(1, 5), st.integers(0, 1000))
@@ -82,51 +81,46 @@ def test_reduction_keeps_the_moments_in_any_coordinates(size: int, dim: int, see
     same(runnalls(shuffled(p), left), a)
 
 
-def test_without_numba_its_engine_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "numba", None)
-    reduction._merging.cache_clear()
-    with pytest.raises(ModuleNotFoundError, match=r"numba.*speed"):
-        runnalls(random_mixture(4, 2, 1), 2, engine="numba")
-
-
-@pytest.mark.parametrize("engine", ENGINES)
-def test_ties_do_not_depend_on_rounding(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@ENGINE
+def test_ties_do_not_depend_on_rounding() -> None:
     # Mirror images cost the same; the first pair goes, whatever the last bit says.
     m = np.array([[-3.0], [-2.0], [2.0], [3.0]])
     for shift in (0.0, 0.1, 1e-9):
         p = GaussianMixture(np.full(4, 0.25), m + shift, np.ones((4, 1, 1)))
-        left = by(engine, p, 3, monkeypatch).means.ravel()
+        left = runnalls(p, 3).means.ravel()
         assert np.allclose(left, [-2.5 + shift, 2 + shift, 3 + shift])
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_mixand_without_weight_goes_first(
-    engine: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@ENGINE
+def test_a_mixand_without_weight_goes_first() -> None:
     p = GaussianMixture([0.5, 0.0, 0.5], [[0.0], [5.0], [9.0]], np.ones((3, 1, 1)))
-    left = by(engine, p, 2, monkeypatch)
+    left = runnalls(p, 2)
     assert np.allclose(left.means.ravel(), [0.0, 9.0]) and np.allclose(left.weights, 0.5)
 
 
-def test_two_stage() -> None:
+def test_the_heaviest_absorb_the_others_first() -> None:
     p = random_mixture(300, 3, 12)
     for n in (1, 5):
-        q = two_stage(p, n, heaviest=40)
+        q = runnalls(p, n, heaviest=40)
         assert q.size == n and np.allclose(q.mean, p.mean) and np.allclose(q.cov, p.cov)
-    same(two_stage(p, 5, heaviest=300), runnalls(p, 5))
-    # A light mixand joins the heavy one that is near.
-    q = GaussianMixture([0.45, 0.45, 0.1], [[0.0], [9.0], [1.0]], np.ones((3, 1, 1)))
-    assert np.allclose(two_stage(q, 2, heaviest=2).weights, [0.55, 0.45])
+    same(runnalls(p, 5, heaviest=300), runnalls(p, 5))
+    # A light mixand joins the heavy one that is near; one without weight changes nothing.
+    means = [[0.0], [9.0], [1.0], [2.0]]
+    q = GaussianMixture([0.45, 0.45, 0.1, 0.0], means, np.ones((4, 1, 1)))
+    assert np.allclose(runnalls(q, 2, heaviest=2).weights, [0.55, 0.45])
+    with pytest.raises(ValueError, match="^heaviest: needs an integer of at least size, 3, got 2"):
+        runnalls(q, 3, heaviest=2)
 
 
-def test_the_relevance_rule_is_41_where_no_guard_is_needed() -> None:
+def test_the_relevance_rule_is_41_without_its_guards(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reduction, "_GATE", 0.0)
+    monkeypatch.setattr(reduction, "_FLOOR", 0.0)
     one, two = random_mixture(7, 2, 1), random_mixture(8, 2, 2)
-    apart = gaussian_divergences(one.means, one.covs, two.means, two.covs)
     relevance = cross_relevance(one, two)
-    assert np.allclose(relevance, one.weights[:, None] * apart)
+    assert np.allclose(relevance, one.weights[:, None] * gaussian_divergences(one, two))
     delta = relevance.min(axis=1)
     out = delta > 3.0 * delta.min()
-    kept = kept_by_relevance(one, two, threshold=3.0, gate=0.0, floor=0.0)
+    kept = kept_by_relevance(one, two, threshold=3.0)
     assert kept.size == 1 + (~out).sum()
     assert np.isclose(kept.weights[-1], one.weights[out].sum())
     inside = GaussianMixture(
@@ -135,7 +129,7 @@ def test_the_relevance_rule_is_41_where_no_guard_is_needed() -> None:
     assert np.allclose(kept.means[-1], inside.mean) and np.allclose(kept.covs[-1], inside.cov)
     assert np.allclose(kept.cov, one.cov)
     there = (affine(m, *scales(2)) for m in (one, two))
-    same(kept_by_relevance(*there, threshold=3.0, gate=0.0), affine(kept, *scales(2)))
+    same(kept_by_relevance(*there, threshold=3.0), affine(kept, *scales(2)))
 
 
 @given(st.integers(0, 500), st.integers(2, 8))
@@ -162,14 +156,20 @@ def test_a_light_mixand_far_away_does_not_set_the_scale() -> None:
 def test_pivoted_qr() -> None:
     means = np.array([[0.0, 0.0], [0.0, 1e-7], [5.0, 0.0], [5.0, 1e-7], [0.0, 9.0]])
     shapes = Shapes(means, np.stack([np.eye(2)] * 5), [0, 1, 2, 3, 4], 7)
-    dropped = pivoted_qr(shapes, tolerance=1e-3, rest="drop")
+    dropped = pivoted_qr(shapes, size=3, rest="drop")
     assert dropped.size == 3 and dropped.dropped == 7 and 4 in dropped.source
-    merged = pivoted_qr(shapes, tolerance=1e-3)
+    merged = pivoted_qr(shapes, size=4)
     # Two copies, one of each pair, with equal weights.
     assert merged.size == 4 and np.allclose(merged.means[-1], [2.5, 0.0], atol=1e-6)
     assert np.allclose(merged.covs[-1], [[1 + 6.25, 0], [0, 1]], atol=1e-5)
-    for n in (1, 2, 3, 5, 9):
-        assert pivoted_qr(shapes, size=n, rest="drop").size == min(n, 5)
-    assert pivoted_qr(shapes, size=4).size == 4 and pivoted_qr(shapes, size=5).size == 5
-    with pytest.raises(ValueError, match="^size: needs either"):
-        pivoted_qr(shapes, size=2, tolerance=0.1)
+    assert set(merged.source[:3]) == set(dropped.source) and merged.source[3] not in dropped.source
+    for n, rest in product((1, 2, 3, 5, 9), ("merge", "drop")):
+        assert pivoted_qr(shapes, size=n, rest=rest).size == min(n, 5)
+
+
+@pytest.mark.parametrize("keep", [[5], [0], [True], [True] * 4, [-1, 0, 1], "all"])
+def test_mixands_are_selected_by_a_mask_and_by_nothing_else(keep: object) -> None:
+    shapes = Shapes([[0.0], [1.0], [2.0]], np.ones((3, 1, 1)), [0, 0, 0])
+    assert shapes.select([True, False, True]).means.ravel().tolist() == [0.0, 2.0]
+    with pytest.raises(ValueError, match="^keep: needs (shape|an array of True and False)"):
+        shapes.select(keep)

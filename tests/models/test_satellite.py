@@ -38,6 +38,7 @@ def test_noise_is_exact_over_two_halves() -> None:
     model = sat.clohessy_wiltshire(rate=0.1, sigma=0.2)
     half, q = model.transition(0.05), model.noise(0.0, 0.05)
     assert np.allclose(half @ q @ half.T + q, model.noise(0.0, 0.1), rtol=1e-12)
+    assert np.allclose(model.noise(0.0, 1e-7), 0.2**2 * 1e-7 * np.eye(6), atol=1e-14)
 
 
 def _random(seed: int, n: int = 50) -> tuple[np.ndarray, np.ndarray]:
