@@ -24,8 +24,8 @@ Members = Annotated[Array, "... N d", partial(_at_least, 1)]
 Ensemble = Annotated[Array, "... N d", partial(_at_least, 2)]
 """The kind of what has a sample covariance."""
 
+# The share of a unit column beside others up to which singular values say if it is one more.
 _CLOSE = 1e-6
-"""The share of a unit column beside others up to which singular values say if it is one more."""
 
 
 @door

@@ -21,11 +21,11 @@ def _definite_or_missing(value: Array, name: str) -> None:
 
 
 Covs = Annotated[Array, "... S d d", MISSING, _definite_or_missing]
+# How far the derivatives may be from the conditions of the optimum, relative to their mean.
 _GAP = 1e-7
-"""How far the derivatives may be from the conditions of the optimum, relative to their mean."""
 _STEPS = 60
+# A weight that vanishes stays above it: zero could not grow again.
 _LEAST = 1e-30
-"""A weight that vanishes stays above it: zero could not grow again."""
 
 
 @door
@@ -168,10 +168,8 @@ def intersection_weights(
         raise ValueError("here: needs at least one source that arrived, got none")
     lead = leading(there.shape[:-1], covs.shape[:-3], "covs")
     here = np.broadcast_to(there, (*lead, *covs.shape[-3:-2]))
-    covs = _counted(
-        np.broadcast_to(covs, (*lead, *covs.shape[-3:])), here[..., None, None],
-        np.eye(covs.shape[-1]), "covs",
-    )  # fmt: skip
+    covs = np.broadcast_to(covs, (*lead, *covs.shape[-3:]))
+    covs = _counted(covs, here[..., None, None], np.eye(covs.shape[-1]), "covs")
     if rule in ("min_trace", "min_determinant") and here.shape[-1] > 1:
         return _least(covs, here, rule == "min_determinant")
     logs = np.zeros(here.shape)
@@ -194,13 +192,13 @@ def _least(covs: Array, here: Mask, determinant: bool) -> Array:
     # In the first one's coordinates, as in an intersection; traces are taken in the state's own.
     roots = solve_lower(lower, np.broadcast_to(lower[:, :1], lower.shape))
     roots *= there[..., None, None]
-    information, first = _square(roots.mT), lower[:, 0]
+    fixed = [roots, _square(roots.mT), lower[:, 0], there]
     point = there / there.sum(axis=-1, keepdims=True)
     best, sure = point.copy(), point
     left, share = np.arange(len(point)), np.ones((len(point), 1))
     lowest = bound = np.full(len(point), np.inf)
     for _ in range(_STEPS):
-        value, slope, curvature = _derivatives(point, roots, information, first, determinant)
+        value, slope, curvature = _derivatives(point, fixed, determinant)
         mean = (point * slope).sum(axis=-1, keepdims=True)
         gap = slope.max(axis=-1) / mean[:, 0] - 1
         # What is settled stays: the others' need for more steps must not move it.
@@ -214,29 +212,26 @@ def _least(covs: Array, here: Mask, determinant: bool) -> Array:
         # sure step does, whatever the value there, and the next Newton step is cut.
         at = (value <= bound)[:, None]
         share = np.where(at, np.minimum(2 * share, 1.0), 0.25 * share)
-        newton = _newton(point, slope, mean, curvature, there)
-        newton = point + share * (newton - point)
+        step = share * (_newton(point, slope, mean, curvature, fixed[3]) - point)
         scaled = point * (slope / mean if determinant else np.sqrt(slope / mean))
         scaled /= scaled.sum(axis=-1, keepdims=True)
-        gain = (slope * (newton - point)).sum(axis=-1)
+        gain = (slope * step).sum(axis=-1)
         aim = np.where(gain > 0, value - 1e-3 * gain + 1e-13 * (1 + np.abs(value)), -np.inf)
         bound = np.where(at[:, 0], aim, np.inf)
-        point, sure = np.where(at, newton, sure), np.where(at, scaled, sure)
+        point, sure = np.where(at, point + step, sure), np.where(at, scaled, sure)
         if 2 * np.count_nonzero(open_) <= len(open_):
-            roots, information = roots[open_], information[open_]
-            first, there = first[open_], there[open_]
+            fixed = [part[open_] for part in fixed]
             left, lowest, bound = left[open_], lowest[open_], bound[open_]
             point, sure, share = point[open_], sure[open_], share[open_]
     return np.asarray(best.reshape(*leading, s))
 
 
-def _derivatives(
-    weights: Array, roots: Array, information: Array, first: Array, determinant: bool
-) -> tuple[Array, Array, Array]:
+def _derivatives(w: Array, fixed: list[Array], determinant: bool) -> tuple[Array, Array, Array]:
     """What is made least (n,), minus its gradient (n, S), its second derivatives (n, S, S)."""
-    n, s, d, _ = roots.shape
-    total = weights[:, None, :] @ information.reshape(n, s, d * d)
-    lower = _cholesky_or_qr(total.reshape(n, d, d), np.zeros((1, 1)), weights, roots)
+    roots, information, first, _ = fixed
+    n, s, d = roots.shape[:3]
+    total = w[:, None, :] @ information.reshape(n, s, d * d)
+    lower = _cholesky_or_qr(total.reshape(n, d, d), np.zeros((1, 1)), w, roots)
     half = solve_lower(lower, roots.reshape(n, s * d, d).mT)
     # Each source's information where that of the result is the identity, (n, S, d, d).
     shares = _square(half.reshape(n, d, s, d).swapaxes(1, 2))
