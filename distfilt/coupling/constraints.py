@@ -12,18 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..doors import (
-    Array,
-    Bounds,
-    Count,
-    NonNegative,
-    Places,
-    Positive,
-    Record,
-    array,
-    door,
-    unchecked,
-)
+from ..doors import Array, Bounds, NonNegative, Places, Record, array, door, unchecked
 from ..linalg import SolverError, central
 
 __all__ = ["Constraint", "norm", "project", "retract"]
@@ -32,6 +21,9 @@ Reading = Literal["printed", "reversed", "particle", "shift"]
 """Four readings of (12): the gain times D_i - d̂, d̂ - D_i, d - D_i, or d - d̂."""
 Motion = tuple[Places, Places]
 """Indices of positions and of their velocities, in the same order."""
+
+_CLOSE, _STEPS = 1e-15, 50
+"""What :func:`retract` leaves of the residual, relative, and its Newton steps at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,19 +53,12 @@ class Constraint(Record):
     @door
     def residual(self, x: Annotated[Array, "... d"]) -> Array:
         """By how much states (..., d) miss, g(x) - d, (..., s)."""
-        out = self.missed(x)
-        if not np.isfinite(out).all():
-            at = np.argwhere(~np.isfinite(out))[0, :-1].tolist()
-            raise ValueError(f"function: needs finite values, got NaN or infinity at state {at}")
-        return out
+        return array(self.missed(x), "function")
 
     def missed(self, x: Array) -> Array:
         """The same without a door, for trial steps: NaN where the function has no value."""
-        try:
-            g = self.function(x.copy())
-        except IndexError as error:
-            raise ValueError(f"function: needs states of more components, got {x.shape}") from error
-        return array(g, "function", (*x.shape[:-1], self.value.size), finite=False) - self.value
+        g, shape = self.function(x.copy()), (*x.shape[:-1], self.value.size)
+        return array(g, "function", shape, finite=False) - self.value
 
     @door
     def jacobian(self, x: Annotated[Array, "... d"]) -> Array:
@@ -176,26 +161,26 @@ def project(
     out = x + aim @ gain
     if not guarded:
         return np.asarray(out)
-    bad = ~np.isfinite(out).all(axis=(-1, -2))
-    left = constraint.missed(np.where(bad[..., None, None], x, out))
+    left = constraint.missed(out)
     # The members' own misses may grow where only their mean is moved: g is curved.
     before, after = (mean, left.mean(axis=-2, keepdims=True)) if reading == "shift" else (gap, left)
     better = np.abs(after).sum(axis=(-1, -2)) <= np.abs(before).sum(axis=(-1, -2))
-    return np.asarray(np.where((better & ~bad)[..., None, None], out, x))
+    return np.asarray(np.where(better[..., None, None], out, x))
 
 
 @door
 def retract(
-    states: Annotated[Array, "... d"], constraint: Constraint, *, motion: Motion | None = None,
-    tolerance: Positive = 1e-15, iterations: Count = 50,
+    states: Annotated[Array, "... d"], constraint: Constraint, *, motion: Motion | None = None
 ) -> Array:
     r"""Move every state to the constraint by Newton steps along its normals.
 
     .. math:: \mathbf x\leftarrow\mathbf x-s\,\mathbf J^\top(\mathbf J\mathbf J^\top)^{-1}
         (\mathbf g(\mathbf x)-\mathbf d),
 
-    where s is halved until the residual falls. With `motion` the velocities then lose their part
-    along the normals, :math:`\mathbf J\dot{\mathbf q}=\mathbf 0`.
+    where s is halved until the residual falls, down to the rounding of :math:`d_i` or of a state,
+    :math:`|\nabla g_i|\,|\mathbf x|`, whichever is larger: the same for every unit of length.
+    With `motion` the velocities then lose their part along the normals,
+    :math:`\mathbf J\dot{\mathbf q}=\mathbf 0`.
 
     Parameters
     ----------
@@ -205,12 +190,6 @@ def retract(
         For a motion a function of the positions only.
     motion : (sequence of int, sequence of int), optional
         Indices of positions and of their velocities.
-    tolerance : float
-        Largest :math:`|g_i-d_i|` that is left, relative to :math:`|d_i|` or to what the rounding
-        of a state changes, :math:`|\nabla g_i|\,|\mathbf x|`, whichever is larger: the same for
-        every unit of length.
-    iterations : int
-        How many Newton steps at most.
 
     Returns
     -------
@@ -232,24 +211,21 @@ def retract(
     """
     x = states.reshape(-1, states.shape[-1]).copy()
     gap, left = unchecked(constraint.residual)(x), np.arange(len(x))
-    for _ in range(iterations):
+    for _ in range(_STEPS):
         slope, excess = _excess(constraint, x[left], gap[left])
-        left, slope = left[excess > tolerance], slope[excess > tolerance]
+        todo = excess > _CLOSE
+        left, slope, excess = left[todo], slope[todo], excess[todo]
         if not left.size:
             break
         step = _along_normals(slope, gap[left])
         x[left], gap[left], better = _shortened(constraint, x[left], gap[left], step)
-        stuck = left[~better]
         # Rounding ends the descent a little above the tolerance where g is large.
-        lost = stuck[_excess(constraint, x[stuck], gap[stuck])[1] > 1e3 * tolerance]
-        left = lost if lost.size else left[better]
-        if lost.size:
-            break
+        left = left[better | (excess > 1e3 * _CLOSE)]
     else:
-        left = left[_excess(constraint, x[left], gap[left])[1] > tolerance]
+        left = left[_excess(constraint, x[left], gap[left])[1] > _CLOSE]
     if left.size:
         raise SolverError(
-            f"retract: {left.size} of {len(x)} states did not reach the constraint in {iterations} "
+            f"retract: {left.size} of {len(x)} states did not reach the constraint in {_STEPS} "
             f"Newton steps, |g - d| up to {np.abs(gap[left]).max():.3g}"
         )
     if motion is not None:
@@ -285,18 +261,17 @@ def _shortened(
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     """The step halved in each state until its residual falls; whether it did."""
     before = np.linalg.norm(gap, axis=-1)
-    share, better = np.ones(len(x)), np.zeros(len(x), dtype=bool)
+    better = np.zeros(len(x), dtype=bool)
     place, left = x.copy(), gap.copy()
-    for _ in range(30):
+    for k in range(30):
         todo = np.flatnonzero(~better)
-        if not todo.size:
-            break
-        trial = x[todo] + share[todo, None] * step[todo]
+        trial = x[todo] + 0.5**k * step[todo]
         missed = constraint.missed(trial)
         falls = np.linalg.norm(missed, axis=-1) < before[todo]
         place[todo[falls]], left[todo[falls]] = trial[falls], missed[falls]
         better[todo[falls]] = True
-        share[todo] *= 0.5
+        if better.all():
+            break
     return place, left, better
 
 

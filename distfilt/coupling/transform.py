@@ -21,14 +21,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..doors import Array, NonNegative, Positive, Rng, array, door, unchecked
 from ..linalg import EPS, factor
-from .solvers import Solve, Solver, distances, scaled, solver_of
+from .solvers import SQUARED, Solve, Solver, distances, scaled, solver_of
 
 __all__ = [  # fmt: skip
     "ensemble_transform", "plans", "rejuvenated", "second_order", "transform_along",
     "transform_within",
 ]
 
-Members = Annotated[Array, "... n d"]
+Members = Annotated[Array, "... n d", SQUARED]
 AsMoved = Annotated[Array, "*moved.shape"]
 
 _TIE = 1e-7
@@ -90,13 +90,17 @@ def plans(ensemble: Members, log_weights: ArrayLike) -> Array:
 
 def _plans(x: Array, w: Array, solve: Solve) -> Array:
     """Couplings (..., N, N) of the weights to equal masses, for the squared distance."""
-    n, d = x.shape[-2:]
-    equal, ties = np.full(n, 1 / n), _ties(n)
-    out = np.empty((*x.shape[:-1], n))
-    rows = zip(x.reshape(-1, n, d), w.reshape(-1, n), out.reshape(-1, n, n), strict=True)
-    for points, masses, target in rows:
-        cost = scaled(unchecked(distances)(points))[0]
-        target[...], _ = solve(cost + ties, masses, equal)
+    points = x.reshape(-1, *x.shape[-2:])
+    costs = np.array([unchecked(distances)(p) for p in points])
+    return _coupled(costs.reshape(*w.shape, w.shape[-1]), w, solve)
+
+
+def _coupled(costs: Array, w: Array, solve: Solve) -> Array:
+    """Couplings for costs (..., N, N)."""
+    n = w.shape[-1]
+    equal, ties, out = np.full(n, 1 / n), _ties(n), np.empty_like(costs)
+    for row in np.ndindex(w.shape[:-1]):
+        out[row], _ = solve(scaled(costs[row])[0] + ties, w[row], equal)
     return out
 
 
@@ -203,11 +207,7 @@ def _second_order(y: Array, x: Array, w: Array) -> Array:
     n = x.shape[-2]
     centre = w[..., None, :] @ x
     around, spread = x - centre, y - y.mean(axis=-2, keepdims=True)
-    with np.errstate(over="ignore", invalid="ignore"):
-        target = around.mT @ (w[..., None] * around)
-    if not np.isfinite(target).all():
-        raise ValueError("ensemble: needs members with a finite covariance, got an overflow")
-    root = _graded(target)
+    root = _graded(around.mT @ (w[..., None] * around))
     # With P = K K' the anomalies times B are the nearest orthonormal columns to those times K,
     # times K': P comes out to rounding, however little C has left of it in some direction.
     turned = spread @ root
@@ -309,13 +309,12 @@ def transform_within(
     >>> bool((np.abs(y) >= 0.9).all())
     True
     """
-    x = ensemble
-    matrix = len(x) * unchecked(plans)(x, log_weights)
+    matrix = len(ensemble) * unchecked(plans)(ensemble, log_weights)
     names, index = np.unique(pieces, return_inverse=True)
     belongs = (index == np.arange(names.size)[:, None]).astype(np.float64)
     chosen = _chosen(belongs @ matrix, rng)
     kept = matrix * belongs[chosen].T
-    return np.asarray(kept.T @ x / kept.sum(axis=0)[:, None])
+    return np.asarray(kept.T @ ensemble / kept.sum(axis=0)[:, None])
 
 
 def _chosen(share: Array, rng: np.random.Generator) -> Array:
@@ -378,13 +377,9 @@ def transform_along(
            [-3.142]])
     """
     x, n = ensemble, ensemble.shape[-2]
-    w, solve = normalised(log_weights, x.shape[:-1]), solver_of("network")
-    equal = np.full(n, 1 / n)
+    w = normalised(log_weights, x.shape[:-1])
     there, here = np.broadcast_arrays(x[..., :, None, :], x[..., None, :, :])
     v = array(difference(there.copy(), here.copy()), "difference", (*x.shape[:-1], n, "k"))
-    costs = (v * v).sum(axis=-1)
-    steps = np.empty((*x.shape[:-1], v.shape[-1]))
-    for row in np.ndindex(x.shape[:-2]):
-        matrix, _ = solve(scaled(costs[row])[0] + _ties(n), w[row], equal)
-        steps[row] = n * np.einsum("ij,ijk->jk", matrix, v[row])
+    matrix = _coupled((v * v).sum(axis=-1), w, solver_of("network"))
+    steps = n * np.einsum("...ij,...ijk->...jk", matrix, v)
     return array(retract(x.copy(), steps), "retract", x.shape)

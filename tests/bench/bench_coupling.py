@@ -1,6 +1,6 @@
 """Couplings: the network simplex beside general solvers, alone up to N = 2000, and a whole study.
 
-Misses where scipy's linprog or cvxpy is less than thirty times slower, or the solvers disagree.
+Misses where cvxpy is less than thirty times slower, or the solvers disagree.
 cvxpy runs as equations (4) and (5) are written down, built anew for every reading as a filter
 would. No general solver gets more than 200 members: its matrices have 2 N^3 entries. The study is
 the one of book/studies/pendulum.py, the paper's five algorithms without retraction, 100 runs.
@@ -22,7 +22,7 @@ from distfilt.coupling import distances, plan, project
 SIZES = (50, 100, 200)
 RUNS, SECONDS = 100, 30
 GROWTH = (50, 100, 200, 500, 1000, 2000)
-NEEDED = {"linprog": 30, "cvxpy, built anew": 30}
+NEEDED = {"cvxpy, built anew": 30}
 PACKAGES = ("numpy", "scipy", "POT", "cvxpy", "highspy")
 BOUNDS = {"entropic, 0.01": np.inf}
 """Largest difference of the value from the network simplex's; 1e-11 for the others."""
@@ -93,7 +93,6 @@ def ratios() -> Iterator[Row]:
         cost, w = case(n)
         ms, best = simplex(n, max(3, 4000 // n))
         others = {
-            "linprog": partial(value, "linprog", cost, w),
             "cvxpy, built anew": partial(built_anew, cost, w),
             "entropic, 0.01": partial(value, "entropic", cost, w),
         }
