@@ -257,15 +257,15 @@ def _newton(
     return matrix, g, off
 
 
-def _rounded(matrix: Array, a: Array, b: Array) -> Array:
-    """The nearest-by matrix with the exact marginals: scale down what is over, spread the rest."""
-    t = matrix.copy()
+def _rounded(t: Array, a: Array, b: Array) -> Array:
+    """The nearest-by matrix with the exact marginals: scale down what is over (in place), spread the rest."""
     for masses, axis in ((a, 1), (b, 0)):
         total = t.sum(axis=axis)
         share = np.divide(masses, total, out=np.ones_like(total), where=total > masses)
         t *= np.expand_dims(share, axis)
     left, right = np.maximum(a - t.sum(axis=1), 0.0), np.maximum(b - t.sum(axis=0), 0.0)
-    return t + np.outer(left, right) / max(right.sum(), left.sum(), np.finfo(float).tiny)
+    most = max(right.sum(), left.sum(), np.finfo(float).tiny)
+    return np.asarray(t + np.outer(left, right) / most)
 
 
 @door
