@@ -258,7 +258,7 @@ def _newton(
 
 
 def _rounded(t: Array, a: Array, b: Array) -> Array:
-    """The nearest-by matrix with the exact marginals: scale down what is over (in place), spread the rest."""
+    """Exact marginals for a matrix, in place: scale down what is over, spread the rest."""
     for masses, axis in ((a, 1), (b, 0)):
         total = t.sum(axis=axis)
         share = np.divide(masses, total, out=np.ones_like(total), where=total > masses)
