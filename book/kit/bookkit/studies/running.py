@@ -383,7 +383,7 @@ class _Flight:
         self.executor, self.own, self.size = executor or _pool(workers or 1), executor is None, 1
         self.waiting, self.suspects = deque(items), deque[Item]()
         self.flying: dict[Landed, list[Item]] = {}
-        self.broken = False
+        self.broken, self.room, self.known_until = False, 1, 0.0
 
     def outcomes(self) -> Iterator[Outcome]:
         while self.waiting or self.suspects or self.flying:
@@ -392,6 +392,7 @@ class _Flight:
             wait(self.flying, timeout=1.0, return_when=FIRST_COMPLETED)
             for future in [f for f in self.flying if f.done()]:
                 yield from self._landed(future, self.flying.pop(future))
+                self._fill()  # at once: no slot waits for the others' outcomes
 
     def _landed(self, future: Landed, items: list[Item]) -> Iterable[Outcome]:
         """The outcomes of a chunk; of one whose worker died, none, or the trial's that did it."""
@@ -423,7 +424,9 @@ class _Flight:
             if not self.flying:
                 self._submit([self.suspects.popleft()])
             return
-        room = self.workers or slots(self.executor)
+        if time.monotonic() > self.known_until:  # a cluster grows and shrinks; asking it takes time
+            self.room, self.known_until = slots(self.executor), time.monotonic() + 1.0
+        room = self.workers or self.room
         window = room if self.one_by_one else 2 * room
         while self.waiting and len(self.flying) < window and not self.broken:
             fair = ceil(len(self.waiting) / (2 * room))  # towards the end nobody is left alone

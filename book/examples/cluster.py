@@ -1,0 +1,46 @@
+"""A study that runs on this machine's cores, on a Dask cluster or under MPI, to the same bits."""
+
+import sys
+
+import numpy as np
+
+from bookkit import studies
+from distfilt.filters import EnsembleFilter
+from distfilt.models import constant_velocity, simulate
+from distfilt.network import graphs
+from distfilt.sensors import distance
+
+model = constant_velocity(sigma=0.1)
+sensors = [distance([0, 1], std=0.3, origin=p) for p in [(0, 0), (9, 0), (0, 9), (9, 9)]]
+f = EnsembleFilter.exact(model, sensors, graphs.ring(4), members=60)
+
+
+def trial(seed):
+    """One truth, its readings and a run of the filter: squared error and what was claimed, m²."""
+    rng, times = np.random.default_rng(seed), np.arange(1, 11) * 0.5
+    truth = simulate(model, [4.0, 4.0, 0.1, 0.0], times, rng=rng)
+    seen = [sensor.observe(truth, rng=rng) for sensor in sensors]
+    state = f.start(([4, 4, 0, 0], np.diag([1, 1, 0.1, 0.1])), rng=rng)
+    run = f.run(state, times, seen, truth=truth)[["squared_error", "variance"]]
+    return [float(x[5:, :, :2].mean()) for x in run.values()]
+
+
+def executor(where):
+    """Where trials run: this machine's cores unless it says otherwise."""
+    if where == "dask":
+        from dask.distributed import Client
+
+        return Client(scheduler_file="cluster.json").get_executor()
+    if where == "mpi":
+        from mpi4py.futures import MPIPoolExecutor
+
+        return MPIPoolExecutor()
+
+
+if __name__ == "__main__":
+    where, *some = sys.argv[1:]
+    made = studies.store(
+        "errors.csv", trial, studies.spawn(2026, 40), columns=["error", "claim"], parameters={},
+        indices=range(*map(int, some)) if some else None, executor=executor(where),
+    )  # fmt: skip
+    print(made)

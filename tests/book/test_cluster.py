@@ -1,0 +1,151 @@
+"""Every command of the page about clusters, and what the page says of what dies."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from common import ROOT
+
+PAGE = (ROOT / "book" / "cluster.md").read_text(encoding="utf-8")
+LOCAL, SCHEDULER, WORKERS, DASK, MPI, PARTS = re.findall(r"^```sh\n(.*?)\n```$", PAGE, re.M | re.S)
+BESIDE = """
+import os, signal
+from pathlib import Path
+
+def begin(which):
+    with Path(LOG, str(which)).open("a") as log:
+        log.write("x")
+    if which == 20 and Path(LOG, "fatal").exists():
+        Path(LOG, "fatal").unlink()
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+BIN = os.path.dirname(sys.executable)
+ENVIRONMENT = {
+    **os.environ, "PATH": os.pathsep.join([BIN, os.environ["PATH"]]),
+    "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
+}  # fmt: skip
+Start = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture(scope="module")
+def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page's script and what it writes; its trial tells a module beside it that it begins."""
+    folder = tmp_path_factory.mktemp("page")
+    text = (ROOT / "book" / "examples" / "cluster.py").read_text(encoding="utf-8")
+    for place, more in [("import sys\n", "import beside\n"),
+                        ("    rng, times", "    beside.begin(seed.spawn_key[0])\n")]:  # fmt: skip
+        text = text.replace(place, more + place, 1)
+    (folder / "cluster.py").write_text(text, encoding="utf-8")
+    (folder / "beside.py").write_text("def begin(which): pass", encoding="utf-8")
+    subprocess.run(LOCAL, shell=True, cwd=folder, env=ENVIRONMENT, check=True)
+    return folder
+
+
+@pytest.fixture
+def folder(script: Path, tmp_path: Path) -> Path:
+    """A copy of the script that counts how often each trial begins."""
+    shutil.copy(script / "cluster.py", tmp_path)
+    (tmp_path / "beside.py").write_text(BESIDE.replace("LOG", repr(str(tmp_path / "log"))))
+    for name in ("log", "elsewhere"):
+        (tmp_path / name).mkdir()
+    return tmp_path
+
+
+@pytest.fixture
+def start(folder: Path) -> Iterator[Start]:
+    """Start a command of the page beside the script, or in another folder."""
+    processes = []
+
+    def started(command: str, cwd: Path = folder) -> subprocess.Popen[str]:
+        # Not through a shell that stays: a signal is for the command itself.
+        lines = command if "\n" in command else f"exec {command}"
+        processes.append(subprocess.Popen(
+            ["sh", "-ec", lines], cwd=cwd, env=ENVIRONMENT, text=True, start_new_session=True,
+            stdout=(cwd / "output").open("w"), stderr=subprocess.STDOUT,
+        ))  # fmt: skip
+        return processes[-1]
+
+    yield started
+    for process in processes:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def begun(folder: Path) -> list[int]:
+    return [len(path.read_text()) for path in (folder / "log").glob("[0-9]*")]
+
+
+def killed_at(n: int, folder: Path, client: subprocess.Popen[str], *victims: object) -> str:
+    """Kill processes once n trials began; what the client says at its end."""
+    while len(begun(folder)) < n and client.poll() is None:
+        time.sleep(0.01)
+    for victim in victims:
+        os.killpg(victim.pid, signal.SIGKILL)  # type: ignore[attr-defined]
+    assert client.wait(120) != 0 and not (folder / "errors.csv").exists()
+    return (folder / "output").read_text()
+
+
+def same(folder: Path, script: Path, twice: int) -> None:
+    """The file is the same, and at most so many trials ran twice."""
+    assert (folder / "errors.csv").read_bytes() == (script / "errors.csv").read_bytes()
+    assert not (folder / "errors.csv.part").exists()
+    assert len(begun(folder)) == 40 and sum(begun(folder)) <= 40 + twice
+
+
+def test_on_this_machine(folder: Path, script: Path, start: Start) -> None:
+    client = start(LOCAL)
+    killed_at(20, folder, client, client)
+    time.sleep(1.0)  # its workers see that it is gone
+    assert start(LOCAL).wait() == 0
+    same(folder, script, twice=os.cpu_count() or 1)
+
+
+def test_parts_of_two_machines_are_merged(folder: Path, script: Path, start: Start) -> None:
+    assert start(PARTS).wait() == 0
+    same(folder, script, twice=0)
+
+
+def test_dask(folder: Path, script: Path, start: Start) -> None:
+    pytest.importorskip("distributed", reason="distributed (Dask) is not installed")
+
+    def cluster() -> list[subprocess.Popen[str]]:
+        """A scheduler, and workers that do not see the folder of the script."""
+        (folder / "cluster.json").unlink(missing_ok=True)
+        scheduler = start(SCHEDULER, folder)
+        while not (folder / "cluster.json").exists():
+            assert scheduler.poll() is None
+            time.sleep(0.05)
+        shutil.copy(folder / "cluster.json", folder / "elsewhere")
+        return [scheduler, start(WORKERS, folder / "elsewhere")]
+
+    machines = cluster()
+    client = start(DASK)
+    killed_at(20, folder, client, client)
+    (folder / "log" / "fatal").touch()  # the worker of trial 20 dies, and nobody has to know
+    said = killed_at(28, folder, start(DASK), machines[0])
+    assert re.search(r"StudyError: .*trials that are done are in errors\.csv\.part", said)
+    assert not (folder / "log" / "fatal").exists()
+    cluster()
+    assert start(DASK).wait() == 0
+    same(folder, script, twice=2 + 1 + 2)
+
+
+def test_mpi(folder: Path, script: Path, start: Start) -> None:
+    pytest.importorskip("mpi4py", reason="mpi4py is not installed")
+    if subprocess.run("mpiexec -n 1 true", shell=True, env=ENVIRONMENT).returncode:
+        pytest.skip("mpiexec does not run here")
+    (folder / "log" / "fatal").touch()
+    killed_at(40, folder, start(MPI))
+    assert start(MPI).wait() == 0
+    same(folder, script, twice=2)
