@@ -114,7 +114,8 @@ lab: $(STAMP)
 
 lock: $(STAMP)
 	$(PY) -m uv pip compile --quiet --universal --python-version 3.11 --no-emit-index-url \
-		--no-emit-find-links --no-header --no-annotate --extra book --extra test --extra mutants \
+		--no-emit-find-links --no-header --no-annotate --generate-hashes \
+		--extra book --extra test --extra mutants --extra dask --extra mpi \
 		pyproject.toml requirements.in --output-file requirements.txt
 
 clean:

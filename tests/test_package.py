@@ -219,11 +219,11 @@ def test_import_loads_no_heavy_package() -> None:
         assert run(code).strip() == "[]"
 
 
-def test_lock_names_no_registry() -> None:
-    text = (ROOT / "requirements.txt").read_text(encoding="utf-8")
+def test_lock_names_no_registry_and_has_a_hash_for_every_file() -> None:
+    text = (ROOT / "requirements.txt").read_text(encoding="utf-8").replace("\\\n", "")
     assert "//" not in text and "--index" not in text
     pins = [line for line in text.splitlines() if line and not line.startswith("#")]
-    assert pins and all("==" in pin for pin in pins)
+    assert pins and all("==" in pin and "--hash=sha256:" in pin for pin in pins)
 
 
 @pytest.fixture(scope="module")

@@ -46,7 +46,7 @@ def main():
         shutil.rmtree(folder, ignore_errors=True)
         run(sys.executable, "-m", "venv", folder)
     pip = ("-m", "pip", "install", "--quiet", "--disable-pip-version-check")
-    run(python, *pip, "-r", "requirements.txt")
+    run(python, *pip, "--require-hashes", "-r", "requirements.txt")
     for package in (".", "book/kit"):
         run(python, *pip, "--no-deps", "--no-build-isolation", "--editable", package)
     run(python, "-W", "ignore", "-c", "import matplotlib.font_manager")

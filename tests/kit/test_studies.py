@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import errno
 import os
+import resource
 import signal
-import subprocess
-import sys
-import textwrap
-import time
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
@@ -154,12 +150,12 @@ class Cluster(Executor):
     """Calls that nobody runs until they are asked for, on as many slots as it says."""
 
     def __init__(self, slots: int, asked: Callable[[list[Any]], None]) -> None:
-        self.num_workers, self.asked, self.calls = slots, asked, []  # type: ignore[var-annotated]
+        self._max_workers, self.asked, self.calls = slots, asked, []  # type: ignore[var-annotated]
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
         self.calls.append((future, fn, args))
-        if len(self.calls) == self.num_workers:
+        if len(self.calls) == self._max_workers:
             self.asked(self.calls)
             for made, call, given in self.calls:
                 made.set_result(call(*given))
@@ -244,54 +240,6 @@ def test_the_book_s_own_studies_are_whole() -> None:
         studies.script("../studies/table-2")
 
 
-CLIENT = """
-    import os, sys
-    from pathlib import Path
-    import beside
-    from bookkit import studies
-
-    def trial(seed):
-        Path("log", str(seed.spawn_key[0])).open("a").write("x")
-        return beside.value(seed)
-
-    studies.store("a.csv", trial, studies.spawn(7, 30), columns=["mean", "norm"],
-                  parameters={}, workers=2, progress=False)
-"""
-BESIDE = """
-    import time
-    import numpy as np
-
-    def value(seed):
-        time.sleep(0.02)
-        x = np.random.default_rng(seed).standard_normal(9)
-        return x.mean(), np.sqrt(x @ x)
-"""
-
-
-def test_a_killed_client_goes_on_and_runs_again_what_was_in_flight(tmp_path: Path) -> None:
-    """Its trial calls a module beside the script, which no worker can import by name."""
-    path, log = tmp_path / "a.csv", tmp_path / "log"
-    log.mkdir()
-    (tmp_path / "client.py").write_text(textwrap.dedent(CLIENT))
-    (tmp_path / "beside.py").write_text(textwrap.dedent(BESIDE))
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
-    client = partial(subprocess.Popen, [sys.executable, "client.py"], cwd=tmp_path, env=env)
-    stopped = client()
-    while len(list(log.iterdir())) < 15:
-        time.sleep(0.01)
-    stopped.kill()
-    stopped.wait()
-    assert not path.exists() and (tmp_path / "a.csv.part").exists()
-    time.sleep(1.0)  # its workers see that it is gone
-    assert client().wait() == 0
-    beside: dict[str, Any] = {}
-    exec(textwrap.dedent(BESIDE), beside)
-    assert studies.load(path).metric("mean").tolist() == [beside["value"](s)[0] for s in SEEDS]
-    assert not (tmp_path / "a.csv.part").exists()
-    runs = [len(trial.read_text()) for trial in log.iterdir()]
-    assert len(runs) == 30 and sum(runs) <= 32  # two slots
-
-
 def test_a_row_that_was_cut_off_or_damaged_runs_again(whole: Path, tmp_path: Path) -> None:
     path, part = tmp_path / "a.csv", tmp_path / "a.csv.part"
     assert stored(path, indices=range(20)) == part
@@ -311,6 +259,9 @@ def test_parts_of_several_machines_merge(whole: Path, tmp_path: Path) -> None:
     stored(tmp_path / "b.csv", indices=[0], parameters={"size": 41})
     with pytest.raises(ValueError, match="other code, parameters or versions"):
         studies.merge(tmp_path / "c.csv", tmp_path / "0.csv.part", tmp_path / "b.csv.part")
+    (tmp_path / "b.csv.part").write_text("# version")
+    with pytest.raises(ValueError, match="b.csv.part is damaged"):
+        studies.merge(tmp_path / "c.csv", tmp_path / "b.csv.part")
 
 
 @pytest.mark.parametrize("other", [{"parameters": {}}, {"trial": partial(fails_at, ())},
@@ -321,22 +272,16 @@ def test_a_part_of_another_study_is_refused(tmp_path: Path, other: dict[str, Any
         stored(tmp_path / "a.csv", **other)
 
 
-def test_a_full_disk_is_named_and_loses_nothing(
-    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    left = [18]
-
-    def full(descriptor: int) -> None:
-        left[0] -= 1
-        if left[0] < 0:
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("bookkit.studies.files._SYNC_SECONDS", -1.0)
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "fsync", full)
-        with pytest.raises(OSError, match=r"No space left on device: .*a\.csv\.part"):
+def test_a_full_disk_is_named_and_loses_nothing(whole: Path, tmp_path: Path) -> None:
+    most = len(whole.read_bytes()) * 6 // 10
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (most, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"File too large: .*a\.csv\.part"):
             stored(tmp_path / "a.csv")
-    assert (tmp_path / "a.csv.part").read_text().count("\n") >= 18
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert (tmp_path / "a.csv.part").stat().st_size == most
     assert stored(tmp_path / "a.csv").read_bytes() == whole.read_bytes()
 
 

@@ -282,12 +282,13 @@ def merge(path: str | Path, *parts: str | Path) -> Path:
     *parts : path
         Parts of the same study, made with the same code, parameters and versions.
     """
-    texts = [Path(part).read_text(encoding="utf-8", errors="replace") for part in parts]
-    head = next(m[0] for m in [re.match(r"(#.*\n)*index,.*", texts[0])] if m)
-    own = _Part(Path(path), head)
+    first = Path(parts[0]).read_text(encoding="utf-8", errors="replace")
+    if (head := re.match(r"(#.*\n)*index,.*", first)) is None:
+        raise ValueError(f"{parts[0]} is damaged, or no part that store wrote")
+    own = _Part(Path(path), head[0])
     known = own.rows()
     for part in parts:
-        other = _Part(Path(path), head)
+        other = _Part(Path(path), head[0])
         other.path = Path(part)
         for i, made in other.rows().items():
             if known.setdefault(i, made) != made:

@@ -314,8 +314,7 @@ def slots(executor: Executor) -> int:
     """How many calls an executor runs at a time: those of its cluster, not this machine's cores."""
     if client := getattr(executor, "_client", None):  # dask's
         return max(1, int(sum(client.nthreads().values())))
-    known = getattr(executor, "num_workers", None) or getattr(executor, "_max_workers", None)
-    return int(known or os.cpu_count() or 1)
+    return int(getattr(executor, "_max_workers", None) or os.cpu_count() or 1)
 
 
 def sent_by_value(folder: Path) -> None:
@@ -354,8 +353,7 @@ def outcomes(
     With `one_by_one` a slot of the executor gets its next trial only after the outcome of its last
     one was taken here; else trials travel in chunks, two for each slot.
     """
-    if executor is None and workers is None:
-        workers = int(cpu_count())
+    workers = workers or (int(cpu_count()) if executor is None else None)
     job = (_pickled(trial), home(), versions())
     with _held():
         if executor is None and workers == 1:
@@ -420,15 +418,13 @@ class _Flight:
         if self.broken:
             self.executor, self.broken = _pool(self.workers or 1), False
         self.alone = bool(self.suspects)
-        if self.alone:
-            if not self.flying:
-                self._submit([self.suspects.popleft()])
-            return
+        if self.alone and not self.flying:
+            self._submit([self.suspects.popleft()])
         if time.monotonic() > self.known_until:  # a cluster grows and shrinks; asking it takes time
             self.room, self.known_until = slots(self.executor), time.monotonic() + 1.0
         room = self.workers or self.room
         window = room if self.one_by_one else 2 * room
-        while self.waiting and len(self.flying) < window and not self.broken:
+        while self.waiting and len(self.flying) < window and not (self.alone or self.broken):
             fair = ceil(len(self.waiting) / (2 * room))  # towards the end nobody is left alone
             size = 1 if self.one_by_one else min(self.size, fair)
             self._submit([self.waiting.popleft() for _ in range(size)])
