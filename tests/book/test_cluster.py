@@ -92,7 +92,7 @@ def killed_at(n: int, folder: Path, client: subprocess.Popen[str], *victims: obj
         time.sleep(0.01)
     for victim in victims:
         os.killpg(victim.pid, signal.SIGKILL)  # type: ignore[attr-defined]
-    assert client.wait(120) != 0 and not (folder / "errors.csv").exists()
+    assert client.wait(300) != 0 and not (folder / "errors.csv").exists()
     return (folder / "output").read_text()
 
 
