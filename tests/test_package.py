@@ -145,7 +145,7 @@ def code_lines(path: Path) -> int:
 
 
 MODULE = 400
-LIMITS = {"lines": 9250, "files": 90, "rooms": 16, "names": 260, "unreached": 0, "private": 0}
+LIMITS = {"lines": 8000, "files": 90, "rooms": 16, "names": 260, "unreached": 0, "private": 0}
 
 
 def private_imports() -> list[str]:

@@ -6,6 +6,7 @@ and angular rate are drawn, with the prior's deviation for the centre and about 
 starts on the circle. Both starts of a trial have one true swing and the same readings.
 """
 
+# ruff: noqa: SIM300
 from __future__ import annotations
 
 import warnings

@@ -18,7 +18,8 @@ import numpy as np
 
 from ..doors import Array, Bounds, Index, Positive, Record, Rng, door
 from ..models import Model
-from ..network import Channel, Faults, Ledger, fused_kind
+from ..network import Channel, Faults, Ledger
+from ..network.channel import fused_kind
 from ..network.graphs import as_graph
 from ..sensors import Sensor
 from .inputs import Reading, belated, planned, said_by_all

@@ -20,7 +20,8 @@ from distfilt.mixtures import (
     target_fusion,
     tikhonov,
 )
-from distfilt.network import Channel, Graph, fused_kind, graphs
+from distfilt.network import Channel, Graph, graphs
+from distfilt.network.channel import fused_kind
 
 from .examples import TARGET, affine, random_mixture, same, scales, shuffled
 

@@ -14,6 +14,7 @@ from distfilt import network
 from distfilt.doors import unchecked
 from distfilt.ensembles import mean, sample_covariance
 from distfilt.network import Channel, Faults, Graph, UnstableGain, graphs
+from distfilt.network.channel import fused_kind
 from tests.network.helpers import DISK, STAR, gaussians, heard, lossy, rng, star
 from tests.support import unit_gap
 
@@ -123,10 +124,10 @@ def _ensembles(seed: int, leading: tuple[int, ...] = (3,)) -> np.ndarray:
 
 
 def test_a_rule_says_what_it_fuses_with_and_without_its_door() -> None:
-    assert network.fused_kind(partial(partial(network.pull, gain=0.1), rounds=2)) == "ensembles"
-    assert network.fused_kind(unchecked(network.naive_fusion)) == "gaussians"
-    assert network.fused_kind(network.average) == "vectors"
-    assert network.fused_kind(lambda belief, channel: belief) is None
+    assert fused_kind(partial(partial(network.pull, gain=0.1), rounds=2)) == "ensembles"
+    assert fused_kind(unchecked(network.naive_fusion)) == "gaussians"
+    assert fused_kind(network.average) == "vectors"
+    assert fused_kind(lambda belief, channel: belief) is None
 
 
 @pytest.mark.parametrize("include", [True, False])
