@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
 import os
 from dataclasses import dataclass, field, fields, is_dataclass
@@ -17,7 +19,7 @@ from ..network import Ledger
 
 __all__ = ["SensorState", "State"]
 
-_FORMAT = 4
+_FORMAT = 5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -73,15 +75,17 @@ class State(Record):
     def save(self, path: str | PathLike[str]) -> None:
         """Write the state to one .npz file; :meth:`load` gives back the same bits.
 
-        The file appears whole or not at all: a full disk leaves an earlier one as it was.
+        The file appears whole or not at all: a full disk leaves an earlier one as it was. It ends
+        with the SHA-256 of all that stands before.
         """
         arrays: list[Any] = []
         header = {"format": _FORMAT, "kind": _name(type(self)), "state": _encoded(self, arrays)}
         parts = {f"a{k}": a for k, a in enumerate(arrays)}
+        np.savez(made := io.BytesIO(), header=np.array(json.dumps(header)), **parts)
         unfinished = Path(path).with_name(f".{Path(path).name}.part")
         try:
             with unfinished.open("wb") as file:
-                np.savez(file, header=np.array(json.dumps(header)), **parts)
+                file.write(made.getvalue() + hashlib.sha256(made.getvalue()).digest())
                 file.flush()
                 os.fsync(file.fileno())
             unfinished.replace(path)
@@ -100,7 +104,10 @@ class State(Record):
             If the file is no saved state of this kind, or is damaged.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            made = Path(path).read_bytes()
+            if hashlib.sha256(made[:-32]).digest() != made[-32:]:
+                raise ValueError("it is damaged, or no state that was saved")
+            with np.load(io.BytesIO(made[:-32]), allow_pickle=False) as file:
                 parts = {name: file[name] for name in file.files}
             header = json.loads(str(parts["header"]))
             if header["format"] != _FORMAT or header["kind"] != _name(cls):
