@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,7 +20,7 @@ from common import ROOT
 PAGE = (ROOT / "book" / "cluster.md").read_text(encoding="utf-8")
 LOCAL, SCHEDULER, WORKERS, DASK, MPI, PARTS = re.findall(r"^```sh\n(.*?)\n```$", PAGE, re.M | re.S)
 BESIDE = """
-import os, signal
+import os, signal, time
 from pathlib import Path
 
 def begin(which):
@@ -28,6 +29,8 @@ def begin(which):
     if which == 20 and Path(LOG, "fatal").exists():
         Path(LOG, "fatal").unlink()
         os.kill(os.getpid(), signal.SIGKILL)
+    while any(which >= int(hold.suffix[1:]) for hold in Path(LOG).glob("hold.*")):
+        time.sleep(0.01)
 """
 BIN = os.path.dirname(sys.executable)
 ENVIRONMENT = {
@@ -86,13 +89,17 @@ def begun(folder: Path) -> list[int]:
     return [len(path.read_text()) for path in (folder / "log").glob("[0-9]*")]
 
 
-def killed_at(n: int, folder: Path, client: subprocess.Popen[str], *victims: object) -> str:
-    """Kill processes once n trials began; what the client says at its end."""
-    while len(begun(folder)) < n and client.poll() is None:
+def killed(n: int, folder: Path, start: Start, command: str, *victims: Any) -> str:
+    """Kill processes, or the study's own, when n trials are done; what it says at its end."""
+    hold = folder / "log" / f"hold.{n}"
+    hold.touch()
+    client = start(command)
+    while len(begun(folder)) <= n and client.poll() is None:
         time.sleep(0.01)
-    for victim in victims:
-        os.killpg(victim.pid, signal.SIGKILL)  # type: ignore[attr-defined]
+    for victim in victims or [client]:
+        os.killpg(victim.pid, signal.SIGKILL)
     assert client.wait(300) != 0 and not (folder / "errors.csv").exists()
+    hold.unlink()
     return (folder / "output").read_text()
 
 
@@ -104,8 +111,7 @@ def same(folder: Path, script: Path, twice: int) -> None:
 
 
 def test_on_this_machine(folder: Path, script: Path, start: Start) -> None:
-    client = start(LOCAL)
-    killed_at(20, folder, client, client)
+    killed(20, folder, start, LOCAL)
     time.sleep(1.0)  # its workers see that it is gone
     assert start(LOCAL).wait() == 0
     same(folder, script, twice=os.cpu_count() or 1)
@@ -130,10 +136,9 @@ def test_dask(folder: Path, script: Path, start: Start) -> None:
         return [scheduler, start(WORKERS, folder / "elsewhere")]
 
     machines = cluster()
-    client = start(DASK)
-    killed_at(20, folder, client, client)
+    killed(20, folder, start, DASK)
     (folder / "log" / "fatal").touch()  # the worker of trial 20 dies, and nobody has to know
-    said = killed_at(28, folder, start(DASK), machines[0])
+    said = killed(28, folder, start, DASK, machines[0])
     assert re.search(r"StudyError: .*trials that are done are in errors\.csv\.part", said)
     assert not (folder / "log" / "fatal").exists()
     cluster()
@@ -146,6 +151,6 @@ def test_mpi(folder: Path, script: Path, start: Start) -> None:
     if subprocess.run("mpiexec -n 1 true", shell=True, env=ENVIRONMENT).returncode:
         pytest.skip("mpiexec does not run here")
     (folder / "log" / "fatal").touch()
-    killed_at(40, folder, start(MPI))
+    assert start(MPI).wait() != 0 and not (folder / "errors.csv").exists()
     assert start(MPI).wait() == 0
     same(folder, script, twice=2)
