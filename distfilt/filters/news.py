@@ -72,19 +72,29 @@ class NewsFilter(MixtureFilter):
 
     A reading is told once, by whom it belongs to, so that nothing is counted twice and nothing has
     to be discounted. For linear models and Gaussians that equals one filter with everybody's
-    readings, if everybody hears everybody and nothing is lost. It needs to know where readings come
-    from: what all receive alike has to be named in `common`, and is taken by each for itself.
+    readings, if everybody hears everybody, nothing is lost, and the agents' own states are
+    independent of each other given the target's *present* state. It needs to know where readings
+    come from: what all receive alike has to be named in `common`, and is taken by each for itself.
 
     Parameters
     ----------
     model, sensors, graph, target_dim, stretch, scale, gate, every, faults, names
         As of :class:`MixtureFilter`; a `graph` is needed and an `agreement` is not taken. What was
         learned while nobody could be told, for want of links or because it was not time (`every`),
-        is told at the next contact; where the target's motion has noise, that is an approximation.
+        is told at the next contact.
     size, most : int
         As there. With more than one mixand the moments' news are told, which is an approximation.
     common : sequence of int
         Components of the readings that all agents receive alike, with the same error.
+
+    Notes
+    -----
+    Own states stay independent given the target if nothing disturbs the target's motion, or if no
+    agent doubts its own state. Otherwise readings tie them together through the target's past,
+    which no belief about [target; own state] can hold, and beliefs become too sure of themselves.
+    Then let each agent filter [target; all agents] while neighbours tell their readings: a
+    :class:`GaussianFilter` with one sensor per agent. It sends m numbers a reading, and for linear
+    models it is exact for what an agent has heard, with any noise and whatever is lost.
 
     Examples
     --------

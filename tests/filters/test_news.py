@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from distfilt.filters import MixtureFilter, NewsFilter, increment
+from distfilt.filters import GaussianFilter, MixtureFilter, NewsFilter, increment
 from distfilt.kalman import kalman_filter
 from distfilt.mixtures import GaussianMixture
 from distfilt.models import Model
@@ -165,3 +165,34 @@ def test_everybody_hears_only_neighbours() -> None:
     a, b = (step([[0.1, np.nan], None, [y, np.nan]]) for y in (0.2, 9.0))
     assert np.array_equal(a.mixtures[0].means, b.mixtures[0].means)
     assert not np.array_equal(a.mixtures[1].means, b.mixtures[1].means)
+
+
+@pytest.mark.parametrize(
+    ("q", "claimed", "least"),
+    [(0.0, 0.4563, 0.4563), (0.1, 0.2965, 0.5289), (0.5, 0.191, 0.572)],
+)
+def test_a_target_that_moves_with_noise_needs_readings_in_place_of_news(
+    q: float, claimed: float, least: float
+) -> None:
+    """Two agents with fixed doubtful places, ten readings each, on a line."""
+    readings = np.random.default_rng(1).standard_normal((10, 2))
+    own = Model(2, lambda x, t, dt: x, lambda t, dt: np.diag([q, 0.0]))
+    alone = Sensor(1, lambda x: x[..., :1] - x[..., 1:], np.array([[0.3]]))
+    prior = GaussianMixture.gaussian([0.0, 0.0], np.diag([4.0, 1.0]))
+    news = NewsFilter(own, [alone] * 2, graphs.path(2), target_dim=1)
+    all_ = Model(3, lambda x, t, dt: x, lambda t, dt: np.diag([q, 0.0, 0.0]))
+    eyes = [Sensor(1, lambda x, a=a: x[..., :1] - x[..., a : a + 1], [[0.3]]) for a in (1, 2)]
+    told = GaussianFilter(all_, eyes, graphs.path(2))
+    one, both = news.start([prior] * 2), told.start((np.zeros(3), np.diag([4.0, 1.0, 1.0])))
+    for k, y in enumerate(readings):
+        one, both = news.step(one, k + 1.0, y[:, None]), told.step(both, k + 1.0, y[:, None])
+    exact = kalman_filter(
+        np.zeros(3), np.diag([4.0, 1.0, 1.0]), readings, F=np.eye(3), Q=np.diag([q, 0.0, 0.0]),
+        H=np.array([[1.0, -1.0, 0.0], [1.0, 0.0, -1.0]]), R=0.3 * np.eye(2),
+    )
+    assert np.allclose(both.means, exact.means[-1]) and both.ledger.scalars.sum() == 20
+    assert np.allclose(both.covariances, exact.covariances[-1])
+    variances = one.mixtures[0].covs[0, 0, 0], both.covariances[0, 0, 0]
+    assert np.allclose(variances, (claimed, least), atol=1e-3)
+    gap = one.mixtures[0].means[0, 0] - both.means[0, 0]
+    assert (abs(gap) < 1e-9) == (q == 0.0)
