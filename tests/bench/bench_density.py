@@ -1,15 +1,13 @@
-"""Density filters: one shared basis against a dense covariance, and growth with agents and grid.
+"""Density filters: one shared basis against a dense covariance.
 
-All local filters of a hundred agents on 30 by 30 cells, one filter on 100 by 100, and one step each
-of the Fokker-Planck equation, the kernel estimate and the consensus, for several sizes. Memory is
-the largest that one call allocates. Misses where a time or a ratio is not met.
+All local filters of a hundred agents on 30 by 30 cells, and one filter on 100 by 100. Memory is the
+largest that one call allocates. Misses where a time or a ratio is not met.
 """
 
 from __future__ import annotations
 
 import tracemalloc
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,7 +26,6 @@ from distfilt.density import (
     zero_mean_prior,
 )
 from distfilt.models import rotating_swarm
-from distfilt.network import Channel, graphs, pi_start, pi_step
 
 H, AGENTS, RANK, DT = 0.08, 100, 50, 0.1
 LIMITS = {"100 local filters, 30 x 30": 30.0, "one filter, 100 x 100": 100.0}
@@ -80,38 +77,14 @@ def dense(n: int) -> Callable[[], Any]:
     return lambda: dense_step(state, flow.solver(0.0, DT), y, k * np.maximum(y, 0.1), DT)
 
 
-def consensus(x: np.ndarray, u: np.ndarray, reach: float) -> Any:
-    door = Channel(graphs.disk(x, reach))
-    return pi_step(pi_start(u), u, door, dt=DT, alpha=0.2, a=0.4, b=0.04)
-
-
-def growth() -> Iterator[Row]:
-    """One step of each part, for several sizes."""
-    rng = np.random.default_rng(2)
-    for n in (30, 60, 120, 240):
-        flow = FokkerPlanck(SWARM, Grid((n, n)))
-        step = partial(flow.step, np.ones(n * n), 0.0, DT)
-        yield row("Fokker-Planck step, cells", n * n, step, 7)
-    for agents in (100, 1000, 10_000):
-        seen = partial(kernel_density, rng.random((agents, 2)), Grid((30, 30)), bandwidth=H)
-        yield row("kernel estimate, agents", agents, seen, 7)
-    for agents, cells in (100, 225), (100, 900), (100, 3600), (1000, 64), (10_000, 64):
-        # The range shrinks, so that everybody keeps as many neighbours.
-        x, u = rng.random((agents, 2)), rng.random((agents, cells))
-        talk = partial(consensus, x, u, 0.25 * np.sqrt(100 / agents))
-        yield row(f"consensus step of {agents} agents, cells", cells, talk, 5)
-
-
 @table("density")
 def rows() -> Iterator[Row]:
-    """The filters, and what each part grows like."""
     ours = row("100 local filters, 30 x 30", 900, filters(30, AGENTS), 9)
     dear = row("dense filter, 30 x 30", 900, dense(30), 3)
     yield from (ours, row("one filter, 100 x 100", 10_000, filters(100, 1), 5), dear)
     ratio = AGENTS * dear["cpu_ms"] / ours["cpu_ms"]
     yield {"what": "ratio: dense for each of 100 agents", "size": 900, "cpu_ms": round(ratio, 1),
            "peak_mb": "", "missed": ratio < RATIO}  # fmt: skip
-    yield from growth()
 
 
 if __name__ == "__main__":

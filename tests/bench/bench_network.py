@@ -1,13 +1,9 @@
-"""The channel against the bare sparse product, and filters on many agents.
+"""Filters on many agents, and operations on very many.
 
-A hundred lossless rounds through the channel are held against a hundred products of the same matrix
-with the same values, and miss above 1.3 times their time.
-
-A thousand agents with about
-six neighbours each and a dozen kinds of sensors, d = 6, with covariance intersection by every rule:
-at most 0.12 s a step. A hundred thousand agents: `combine`, `largest_gain` and `balanced` with
-links one way, at most 1 s each in a process of its own that never needs more than 500 MB, graph and
-packages included.
+A thousand agents with about six neighbours each and a dozen kinds of sensors, d = 6, with
+covariance intersection by every rule: at most 0.12 s a step. A hundred thousand agents: `combine`,
+`largest_gain` and `balanced` with links one way, at most 1 s each in a process of its own that
+never needs more than 500 MB, graph and packages included.
 """
 
 from __future__ import annotations
@@ -20,7 +16,7 @@ from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
-from _bench import Row, interleaved, main, table, timed
+from _bench import Row, main, table, timed
 from scipy.spatial import cKDTree
 
 from distfilt.filters import EnsembleFilter, GaussianFilter
@@ -36,8 +32,6 @@ from distfilt.network import (
 from distfilt.sensors import direct
 from distfilt.updates import known_noise
 
-LIMIT, ROUNDS = 1.3, 100
-SIZES = (100, 1000, 10_000)
 MODEL, PRIOR = clohessy_wiltshire(rate=0.1, sigma=0.2), (np.zeros(6), 25 * np.eye(6))
 MANY, RULES, STEP_S = 1000, ("equal", "trace", "determinant", "min_trace", "min_determinant"), 0.12
 VERY_MANY, SECONDS, MEGABYTES = 100_000, 1.0, 500.0
@@ -47,30 +41,6 @@ def spread(agents: int, neighbours: float = 10) -> tuple[np.ndarray, float]:
     """Places in the unit square, and a range that gives about so many neighbours."""
     places = np.random.default_rng(agents).random((agents, 2))
     return places, float(np.sqrt(neighbours / np.pi / agents))
-
-
-@table("channel")
-def channels() -> Iterator[Row]:
-    """The channel's combine against ``matrix @ values``."""
-    for agents, k in ((5, 100), (5, 10_000), *((n, 128) for n in SIZES)):
-        graph = graphs.star(5) if agents == 5 else graphs.disk(*spread(agents))
-        w = weights.metropolis(graph)
-        values = np.random.default_rng(1).standard_normal((agents, k))
-        rounds = ROUNDS if agents * k < 1e5 else 10
-
-        def products(m: Any = w.matrix, v: Any = values, n: int = rounds) -> Any:
-            for _ in range(n):
-                v = m @ v
-            return v
-
-        through = partial(Channel(graph).combine, values, w, rounds=rounds)
-        spent, ratios = interleaved({"bare": products, "channel": through})
-        ours, bare = (spent[name] / rounds * 1e6 for name in ("channel", "bare"))
-        yield {
-            "agents": agents, "values": k, "product_us": f"{bare:.1f}", "channel_us": f"{ours:.1f}",
-            "ratio": f"{ratios['channel']:.2f}", "limit": LIMIT,
-            "missed": ratios["channel"] > LIMIT,
-        }
 
 
 def scaled(what: str, agents: int, spent: Any, seconds: float, memory: float = np.inf) -> Row:

@@ -1,10 +1,9 @@
-"""Triangular maps: against the printed program, each other, and another toolbox; their growth.
+"""Triangular maps against the printed program, and against another toolbox.
 
 The closed-form affine map against the printed program (12), component by component in cvxpy: once
 with each component's program compiled before, as the library keeps it, and once compiled in every
 call, as a newcomer writes it; misses where a ratio, against the compiled program, or an agreement
-is missed. Separable maps against the affine one, and how the fit grows with members and with
-dimension; misses where one costs more than its limit times the affine one, or grows too fast.
+is missed.
 
 Separable maps against the Triangular-Transport-Toolbox (github.com/MaxRamgraber): the update of a
 bent three-dimensional ensemble with one reading, full maps on both sides. The toolbox is one file,
@@ -63,63 +62,6 @@ def programs() -> Iterator[Row]:
                 "composed_map_gap": f"{gap:.1e}",
                 "missed": gap >= 1e-8 or solved.cpu / each < wanted,
             }
-
-
-# --- against the affine map, and growth -------------------------------------------------------
-
-AXES = {
-    "members": [(n, 6) for n in (400, 800, 1600, 3200)],
-    "dimension": [(400, d) for d in (4, 8, 16, 32)],
-}
-RUNS = 8
-LIMITS = {"separable 1": 400, "separable 2": 800}
-"""How many times the affine update's time a separable one may take."""
-
-SLOPES = {"members": 1.3, "dimension": 3.2}
-"""Time over members is linear; over dimension the features of each component grow, and their count
-and the normal equations with them: between 2 and 3."""
-
-FITS: dict[str, Callable[..., Any]] = {
-    "affine": affine.fit,
-    "separable 1": partial(separable.fit, order=1, regularisation=0.01),
-    "separable 2": partial(separable.fit, order=2, regularisation=0.01),
-}
-
-
-def samples(members: int, dim: int) -> tuple[np.ndarray, np.ndarray]:
-    """Curved members, and noisy observations of half of their components."""
-    rng = np.random.default_rng(1000 * dim + members)
-    x = rng.standard_normal((RUNS, members, dim))
-    x[..., 1:] += 0.3 * x[..., :-1] ** 2
-    seen = x[..., : dim // 2]
-    return seen + 0.5 * rng.standard_normal(seen.shape), x
-
-
-def measured(fit: Callable[..., Any], members: int, dim: int) -> tuple[float, float]:
-    """Processor time in ms of a fit and of the whole update, all runs together."""
-    y, x = samples(members, dim)
-    alone = timed(lambda: fit(y, x), 3)
-    update = timed(lambda: compose(fit(y, x), y, x, y[:, 0]), 3)
-    return 1e3 * alone.cpu, 1e3 * update.cpu
-
-
-@table("maps")
-def growth() -> Iterator[Row]:
-    affine_time: dict[tuple[int, int], float] = {}
-    for name, fit in FITS.items():
-        for along, sizes in AXES.items():
-            found = {size: measured(fit, *size) for size in sizes}
-            times = [alone for alone, _ in found.values()]
-            slope = np.polyfit(np.log(np.prod(sizes, axis=1)), np.log(times), 1)[0]
-            for size, (alone, update) in found.items():
-                ratio = update / affine_time.setdefault(size, update)
-                yield {
-                    "map": name, "along": along, "members": size[0], "dimension": size[1],
-                    "fit_ms": f"{alone:.2f}", "update_ms": f"{update:.2f}",
-                    "update_ratio": f"{ratio:.1f}", "fit_slope": f"{slope:.2f}",
-                    "slope_limit": SLOPES[along],
-                    "missed": slope > SLOPES[along] or ratio > LIMITS.get(name, np.inf),
-                }
 
 
 # --- against the toolbox ----------------------------------------------------------------------

@@ -102,10 +102,10 @@ CHANGED = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("change", [*CHANGED, "swapped panels", "hidden curve", "missing points"])
-def test_one_changed_artist_changes_the_text(change):
-    assert of_axes(picture(change)) != of_axes(picture())
-    assert of_axes(picture(change)) == of_axes(picture(change))
+def test_one_changed_artist_changes_the_text():
+    changes = ["", *CHANGED, "swapped panels", "hidden curve", "missing points"]
+    texts = [of_axes(picture(change)) for change in changes]
+    assert len(set(texts)) == len(changes) and texts[0] == of_axes(picture())
 
 
 def test_drawing_and_style_do_not_change_the_text(tmp_path):

@@ -1,7 +1,7 @@
 """How many random faults in the library do its tests find?
 
     python tests/tools/mutants.py [--sample 300] [--seed 1] [--jobs 2] [--only network]
-        [--stages 2] [--minutes 30]
+        [--minutes 30]
 
 cosmic-ray lists the places where the library's code can be changed (an operator, a comparison, a
 number, a keyword) and makes the change; a seeded sample of places is drawn, and one change at each.
@@ -9,14 +9,13 @@ The draw looks at a place's own line, so that most of a sample stays when other 
 A mutant is tested in two stages: by the file that mirrors the module and the module's own examples,
 then by every test that runs the changed line, but for those of the book (the suite runs once with a
 tracer for that; a line that runs on import only is tested by what runs its function or module). It
-survives if all pass; ``--stages 1`` stops earlier, and the table's column says how far a survivor
-came. A change of a type or a text only is no fault and is not drawn.
+survives if all pass. A change of a type or a text only is no fault and is not drawn.
 
 Writes ``data/bench/mutants.csv``, a line a mutant. A survivor that is equivalent to the original
 gets a reason there by hand, which a later run of the same mutant keeps; the share of the others is
-the result. With ``--minutes`` the run ends after that time, and the next one goes on: a mutant that
-was killed, or has a reason, or survived as many stages, is not run again. Each job works in a copy
-of the repository, in processes forked from one that has numpy and the other packages in memory.
+the result. With ``--minutes`` the run ends after that time, and the next one goes on: a mutant in
+the table is not run again. Each job works in a copy of the repository, in processes forked from one
+that has numpy and the other packages in memory.
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ import contextlib
 import csv
 import importlib
 import importlib.util
-import json
 import os
 import random
 import shutil
@@ -38,8 +36,10 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from hashlib import sha256
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -232,9 +232,20 @@ def described(mutant: Mutant, root: Path) -> dict[str, Any]:
     return row | {"becomes": becomes, "result": "", "stage": "", "seconds": "", "reason": ""}
 
 
-def tested(mutant: Mutant, folder: Path, stages: list[list[str]]) -> dict[str, Any]:
-    """What became of one mutant in the copy in that folder."""
-    path = folder / mutant.module
+_COPY = Path()
+"""The job's own copy of the repository."""
+
+
+def copied(root: Path, scratch: str) -> None:
+    global _COPY
+    _COPY = Path(scratch) / str(os.getpid())
+    left_out = shutil.ignore_patterns(".git", ".venv", "_build", "__pycache__", ".*_cache")
+    shutil.copytree(root, _COPY, ignore=left_out)
+
+
+def tested(mutant: Mutant, stages: list[list[str]]) -> dict[str, Any]:
+    """What became of one mutant in the job's copy."""
+    path = _COPY / mutant.module
     text = path.read_text(encoding="utf-8")
     found: dict[str, Any] = {"result": "survived"}
     began = time.perf_counter()
@@ -242,7 +253,7 @@ def tested(mutant: Mutant, folder: Path, stages: list[list[str]]) -> dict[str, A
     try:
         for stage, names in enumerate(stages, start=1):
             found["stage"] = stage
-            if names and not passes(names, folder, SECONDS[stage - 1]):
+            if names and not passes(names, _COPY, SECONDS[stage - 1]):
                 found["result"] = "killed"
                 break
     finally:
@@ -250,42 +261,30 @@ def tested(mutant: Mutant, folder: Path, stages: list[list[str]]) -> dict[str, A
     return found | {"seconds": f"{time.perf_counter() - began:.0f}"}
 
 
-def run(
-    rows: list[tuple[Mutant, dict[str, Any]]], root: Path, options: argparse.Namespace
-) -> Iterator[None]:
+def stages(mutant: Mutant, root: Path, trace: Any) -> list[list[str]]:
+    """The tests of both stages."""
+    path = root / mutant.module
+    lines, text = trace.contexts_by_lineno(str(path)), path.read_text(encoding="utf-8")
+    return [nearest(mutant.module, root), running(lines, text, mutant.line)]
+
+
+def run(rows: list[tuple[Mutant, dict[str, Any]]], root: Path, jobs: int) -> Iterator[None]:
     """Complete the rows, a job each in a process of its own; yields after each one."""
-    trace = traced(root, options.jobs) if rows and options.stages > 1 else None
-    with tempfile.TemporaryDirectory(prefix="mutants-") as scratch:
-        left_out = shutil.ignore_patterns(".git", ".venv", "_build", "__pycache__", ".*_cache")
-        free = [Path(scratch) / str(k) for k in range(options.jobs)]
-        for folder in free:
-            shutil.copytree(root, folder, ignore=left_out)
-        busy: dict[int, tuple[Path, Path, dict[str, Any]]] = {}
-        end = time.monotonic() + 60 * options.minutes
-        waiting = rows[::-1]
-        while busy or (waiting and time.monotonic() < end):
-            if free and waiting and time.monotonic() < end:
-                folder, (mutant, row) = free.pop(), waiting.pop()
-                answer = Path(scratch) / f"{folder.name}.json"
-                tests = [nearest(mutant.module, root)]
-                if trace is not None:
-                    path = root / mutant.module
-                    lines = trace.contexts_by_lineno(str(path))
-                    text = path.read_text(encoding="utf-8")
-                    tests.append(running(lines, text, mutant.line))
-                child = os.fork()
-                if not child:
-                    try:
-                        answer.write_text(json.dumps(tested(mutant, folder, tests)))
-                    finally:
-                        os._exit(0)
-                busy[child] = folder, answer, row
-                continue
-            folder, answer, row = busy.pop(os.wait()[0])
-            row |= json.loads(answer.read_text())
-            free.append(folder)
-            print(f"{row['result']:8} {row['module']}:{row['line']}: {row['becomes']}", flush=True)
-            yield
+    trace = traced(root, jobs)
+    with (
+        tempfile.TemporaryDirectory(prefix="mutants-") as scratch,
+        ProcessPoolExecutor(jobs, get_context("fork"), copied, (root, scratch)) as pool,
+    ):
+        futures = {pool.submit(tested, m, stages(m, root, trace)): row for m, row in rows}
+        try:
+            for future in as_completed(futures):
+                row = futures[future]
+                row |= future.result()
+                place = f"{row['module']}:{row['line']}"
+                print(f"{row['result']:8} {place}: {row['becomes']}", flush=True)
+                yield
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def known(table: Path) -> dict[tuple[str, str, str], dict[str, Any]]:
@@ -294,13 +293,6 @@ def known(table: Path) -> dict[tuple[str, str, str], dict[str, Any]]:
         return {}
     with table.open(encoding="utf-8", newline="") as lines:
         return {(r["module"], r["was"], r["becomes"]): r for r in csv.DictReader(lines)}
-
-
-def finished(row: dict[str, Any], most: int) -> bool:
-    """Whether another run of the mutant would show nothing new."""
-    if row["result"] == "killed":
-        return True
-    return row["result"] == "survived" and int(row["stage"] or 0) >= most
 
 
 def stored(rows: list[dict[str, Any]], table: Path) -> None:
@@ -320,7 +312,6 @@ def main(arguments: list[str] | None = None, root: Path = ROOT, table: Path = TA
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", default="", help="a folder or module of the library")
-    parser.add_argument("--stages", type=int, default=len(SECONDS), help="how far to go")
     parser.add_argument("--minutes", type=float, default=1e6, help="when to stop for now")
     options = parser.parse_args(arguments)
     before = known(table)
@@ -330,14 +321,17 @@ def main(arguments: list[str] | None = None, root: Path = ROOT, table: Path = TA
         row = described(mutant, root)
         old = before.get((row["module"], row["was"], row["becomes"]), {})
         pairs.append((mutant, row | {n: old[n] for n in COLUMNS[4:] if n in old}))
-    waiting = [(m, row) for m, row in pairs if not finished(row, options.stages)]
+    waiting = [(m, row) for m, row in pairs if not row["result"]]
     rows = [row for _, row in pairs]
     for name in WARM:
         if importlib.util.find_spec(name.partition(".")[0]) is not None:
             importlib.import_module(name)
-    for _ in run(waiting, root, options):
-        stored(rows, table)
+    end = time.monotonic() + 60 * options.minutes
     stored(rows, table)
+    for _ in run(waiting, root, options.jobs) if waiting else ():
+        stored(rows, table)
+        if time.monotonic() > end:
+            break
     ran = [row for row in rows if row["result"]]
     killed = sum(row["result"] == "killed" for row in ran)
     equivalent = sum(row["result"] == "survived" and bool(row["reason"]) for row in ran)

@@ -28,6 +28,7 @@ __all__ = [  # fmt: skip
     "graph", "line_style", "slider", "use_style",
 ]
 
+# Okabe and Ito: distinct for every kind of colour vision.
 PALETTE = (
     "#0072B2",  # blue
     "#D55E00",  # vermilion
