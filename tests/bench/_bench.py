@@ -7,7 +7,6 @@ A script yields the rows of its tables; a row whose floor or limit is not met sa
 
 from __future__ import annotations
 
-import csv
 import importlib
 import os
 import platform
@@ -21,6 +20,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NoReturn
 
+import pandas
 from threadpoolctl import threadpool_limits
 
 Row = dict[str, Any]
@@ -146,20 +146,15 @@ def versions(packages: Sequence[str]) -> str:
 
 def write(name: str, rows: Sequence[Row], packages: Sequence[str]) -> None:
     """Print rows, and write them to data/bench/`name`.csv with versions, machine and its load."""
-    columns, busy = list(rows[0]), max(_BEFORE, load())
-    widths = [max(len(c), *(len(str(row[c])) for row in rows)) for c in columns]
-    for cells in (columns, *([row[c] for c in columns] for row in rows)):
-        print("  ".join(str(v).ljust(w) for v, w in zip(cells, widths, strict=True)).rstrip())
+    found, busy = pandas.DataFrame(rows), max(_BEFORE, load())
+    print(found.to_string(index=False))
     path = FOLDER / f"{name}.csv"
     if busy > BUSY and "--force" not in sys.argv:
         print(f"{name}.csv: not written under a load of {busy:.1f}; --force writes it")
         return
     FOLDER.mkdir(parents=True, exist_ok=True)
     where = {"versions": versions(packages), "machine": machine(busy)}
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [*columns, *where], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({**row, **where} for row in rows)
+    found.assign(**where).to_csv(path, index=False, lineterminator="\n")
 
 
 _TABLES: dict[str, tuple[Rows, Sequence[str]]] = {}

@@ -278,21 +278,6 @@ def test_every_slider_moves_and_plays(visits: dict[Path, Visit]) -> None:
         assert len(moved) == drawn and all(all(s.values()) for s in moved), (source.stem, moved)
 
 
-def test_what_chromium_asks_for_itself_is_not_the_book_s() -> None:
-    page, far = "file:///book/index.html", "http://example.invalid/a.js"
-    own, socket = "chrome-untrusted://new-tab-page/", "wss://example.invalid"
-    entries = [
-        {"message": {"method": "Network.requestWillBeSent", "params": {
-            "request": {"url": url}, "documentURL": document}}, "webview": tab}
-        for url, document, tab in [
-            (page, page, "ours"), (own, own, "ours"), (far, own, "another"), (far, page, "ours"),
-        ]
-    ]  # fmt: skip
-    opened = {"method": "Network.webSocketCreated", "params": {"url": socket}}
-    entries.append({"message": opened, "webview": "ours"})
-    assert asked(entries, "ours") == [page, far, socket]
-
-
 BAD = r"""<!doctype html><title>bad</title><body>
 <p>\(x\)</p><p class="math">x</p><img src="nowhere.png">
 <a href="nowhere.html">a</a><a href="#no">b</a>

@@ -42,7 +42,7 @@ def verdicts(notebook: Any) -> dict[str, tuple[str, str]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("changes", [LINKS, SENSOR, LINKS + SENSOR], ids=["links", "range", "both"])
+@pytest.mark.parametrize("changes", [LINKS, LINKS + SENSOR], ids=["links", "both"])
 def test_a_changed_scenario_runs_to_the_end_and_is_not_compared(
     changes: tuple[tuple[str, str], ...], tmp_path: Path
 ) -> None:

@@ -125,16 +125,9 @@ def test_an_interrupted_update_leaves_no_stamp(clone: Path, steps: list[str]) ->
     assert steps[0] == "venv" and not (clone / ".venv" / "half").exists()
 
 
-def test_line_ends_are_fixed_whatever_a_clone_s_settings_are(tmp_path: Path) -> None:
-    source, clone = tmp_path / "source", tmp_path / "clone"
-    source.mkdir()
-    names = ("a.csv", "a.ipynb", "a.md", "a.py")
-    for name in names:
-        (source / name).write_bytes(b"one\ntwo\n")
-    shutil.copy(ROOT / ".gitattributes", source)
-    git = ["git", "-c", "user.name=a", "-c", "user.email=a@b", "-c", "core.autocrlf=true"]
-    for arguments in (["init", "-q"], ["add", "-A"], ["commit", "-qm", "a"]):
-        subprocess.run([*git, *arguments], cwd=source, check=True, capture_output=True)
-    subprocess.run([*git, "clone", "-q", source, clone], check=True, capture_output=True)
-    for name in names:
-        assert (clone / name).read_bytes() == b"one\ntwo\n"
+def test_line_ends_are_fixed_whatever_a_clone_s_settings_are() -> None:
+    names = ["a.csv", "a.ipynb", "a.md", "a.py"]
+    found = subprocess.run(
+        ["git", "check-attr", "eol", *names], cwd=ROOT, check=True, capture_output=True, text=True
+    ).stdout
+    assert found.split("\n")[:-1] == [f"{name}: eol: lf" for name in names]

@@ -68,8 +68,6 @@ def test_make_studies_stores_and_checks(
     [
         ('"zheng"', '"chang"', "PAPER"),
         ('"spread", "zheng"', '"a/b", "zheng"', "NAME"),
-        ("def trial", "def try_it", "has to define trial"),
-        ('["mean", "spread"]', '["a b", "c"]', "columns"),
         ('["mean", "spread"]', '["a", "a"]', "columns"),
     ],
 )

@@ -14,8 +14,7 @@ survives if all pass. A change of a type or a text only is no fault and is not d
 Writes ``data/bench/mutants.csv``, a line a mutant. A survivor that is equivalent to the original
 gets a reason there by hand, which a later run of the same mutant keeps; the share of the others is
 the result. With ``--minutes`` the run ends after that time, and the next one goes on: a mutant in
-the table is not run again. Each job works in a copy of the repository, in processes forked from one
-that has numpy and the other packages in memory.
+the table is not run again. Each job works in a copy of the repository.
 """
 
 from __future__ import annotations
@@ -24,8 +23,6 @@ import argparse
 import ast
 import contextlib
 import csv
-import importlib
-import importlib.util
 import os
 import random
 import shutil
@@ -36,11 +33,11 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from hashlib import sha256
-from multiprocessing import get_context
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -50,13 +47,6 @@ SECONDS = (120, 400)
 """What the tests of each stage may take; a mutant that takes longer hangs, and so is found."""
 EVERY = ("distfilt", "tests", *(f"--ignore=tests/{name}" for name in ("book", "tools")),
          "--ignore=tests/test_package.py")  # fmt: skip
-"""What the tests import from elsewhere is imported once for all mutants."""
-WARM = (
-    "numpy", "scipy.linalg", "scipy.optimize", "scipy.sparse.csgraph", "scipy.sparse.linalg",
-    "scipy.spatial", "scipy.special", "scipy.stats", "scipy.integrate", "networkx", "xarray",
-    "pandas", "cvxpy", "ot", "filterpy.kalman", "matplotlib.figure", "pytest", "hypothesis",
-    "hypothesis.internal.conjecture.engine", "nbval.plugin", "nbval.kernel", "PIL.Image",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -186,41 +176,22 @@ def running(contexts: dict[int, list[str]], text: str, line: int) -> list[str]:
     return []
 
 
-def pytest_in(folder: Path, tests: list[str]) -> int:
-    """pytest's exit code, in this process, which has not imported the library."""
-    os.setsid()
-    nowhere = os.open(os.devnull, os.O_RDWR)
-    for stream in (0, 1, 2):
-        os.dup2(nowhere, stream)
-    os.chdir(folder)
-    os.environ |= {"PYTHONPATH": str(folder), "HYPOTHESIS_PROFILE": "gate"}
-    sys.path.insert(0, str(folder))
-    sys.dont_write_bytecode = True
-    import pytest
-
-    return int(pytest.main(["-q", "-x", "-p", "no:cacheprovider", *tests]))
-
-
 def passes(tests: list[str], folder: Path, seconds: float) -> bool:
     """Whether the tests pass in a copy, in time."""
-    child = os.fork()
-    if not child:
-        code = 1
-        try:
-            code = pytest_in(folder, tests)
-        finally:
-            os._exit(code)
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        done, status = os.waitpid(child, os.WNOHANG)
-        if done:
-            with contextlib.suppress(ProcessLookupError):  # workers that it left behind
-                os.killpg(child, signal.SIGKILL)
-            return os.waitstatus_to_exitcode(status) in (0, 5)  # 5: no test there
-        time.sleep(0.02)
-    os.killpg(child, signal.SIGKILL)
-    os.waitpid(child, 0)
-    return False
+    command = [sys.executable, "-B", "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
+    child = subprocess.Popen(
+        command, cwd=folder, start_new_session=True, stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        env=os.environ | {"PYTHONPATH": str(folder), "HYPOTHESIS_PROFILE": "gate"},
+    )  # fmt: skip
+    try:
+        return child.wait(seconds) in (0, 5)  # 5: no test there
+    except subprocess.TimeoutExpired:
+        return False
+    finally:
+        with contextlib.suppress(ProcessLookupError):  # and workers that it left behind
+            os.killpg(child.pid, signal.SIGKILL)
+        child.wait()
 
 
 def described(mutant: Mutant, root: Path) -> dict[str, Any]:
@@ -232,20 +203,10 @@ def described(mutant: Mutant, root: Path) -> dict[str, Any]:
     return row | {"becomes": becomes, "result": "", "stage": "", "seconds": "", "reason": ""}
 
 
-_COPY = Path()
-"""The job's own copy of the repository."""
-
-
-def copied(root: Path, scratch: str) -> None:
-    global _COPY
-    _COPY = Path(scratch) / str(os.getpid())
-    left_out = shutil.ignore_patterns(".git", ".venv", "_build", "__pycache__", ".*_cache")
-    shutil.copytree(root, _COPY, ignore=left_out)
-
-
-def tested(mutant: Mutant, stages: list[list[str]]) -> dict[str, Any]:
-    """What became of one mutant in the job's copy."""
-    path = _COPY / mutant.module
+def tested(mutant: Mutant, stages: list[list[str]], free: SimpleQueue[Path]) -> dict[str, Any]:
+    """What became of one mutant, in a copy that no other one is using."""
+    folder = free.get()
+    path = folder / mutant.module
     text = path.read_text(encoding="utf-8")
     found: dict[str, Any] = {"result": "survived"}
     began = time.perf_counter()
@@ -253,11 +214,12 @@ def tested(mutant: Mutant, stages: list[list[str]]) -> dict[str, Any]:
     try:
         for stage, names in enumerate(stages, start=1):
             found["stage"] = stage
-            if names and not passes(names, _COPY, SECONDS[stage - 1]):
+            if names and not passes(names, folder, SECONDS[stage - 1]):
                 found["result"] = "killed"
                 break
     finally:
         path.write_text(text, encoding="utf-8")
+        free.put(folder)
     return found | {"seconds": f"{time.perf_counter() - began:.0f}"}
 
 
@@ -269,16 +231,17 @@ def stages(mutant: Mutant, root: Path, trace: Any) -> list[list[str]]:
 
 
 def run(rows: list[tuple[Mutant, dict[str, Any]]], root: Path, jobs: int) -> Iterator[None]:
-    """Complete the rows, a job each in a process of its own; yields after each one."""
+    """Complete the rows, each job with a copy of the repository; yields after each one."""
     trace = traced(root, jobs)
-    with (
-        tempfile.TemporaryDirectory(prefix="mutants-") as scratch,
-        ProcessPoolExecutor(jobs, get_context("fork"), copied, (root, scratch)) as pool,
-    ):
-        futures = {pool.submit(tested, m, stages(m, root, trace)): row for m, row in rows}
+    left_out = shutil.ignore_patterns(".git", ".venv", "_build", "__pycache__", ".*_cache")
+    free: SimpleQueue[Path] = SimpleQueue()
+    with tempfile.TemporaryDirectory(prefix="mutants-") as own, ThreadPoolExecutor(jobs) as pool:
+        for k in range(jobs):
+            free.put(shutil.copytree(root, Path(own) / str(k), ignore=left_out))
+        waiting = {pool.submit(tested, m, stages(m, root, trace), free): row for m, row in rows}
         try:
-            for future in as_completed(futures):
-                row = futures[future]
+            for future in as_completed(waiting):
+                row = waiting[future]
                 row |= future.result()
                 place = f"{row['module']}:{row['line']}"
                 print(f"{row['result']:8} {place}: {row['becomes']}", flush=True)
@@ -323,9 +286,6 @@ def main(arguments: list[str] | None = None, root: Path = ROOT, table: Path = TA
         pairs.append((mutant, row | {n: old[n] for n in COLUMNS[4:] if n in old}))
     waiting = [(m, row) for m, row in pairs if not row["result"]]
     rows = [row for _, row in pairs]
-    for name in WARM:
-        if importlib.util.find_spec(name.partition(".")[0]) is not None:
-            importlib.import_module(name)
     end = time.monotonic() + 60 * options.minutes
     stored(rows, table)
     for _ in run(waiting, root, options.jobs) if waiting else ():
