@@ -22,7 +22,6 @@ from __future__ import annotations
 import argparse
 import ast
 import contextlib
-import csv
 import os
 import random
 import shutil
@@ -39,6 +38,8 @@ from hashlib import sha256
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
+
+import pandas
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = ROOT / "data" / "bench" / "mutants.csv"
@@ -254,18 +255,15 @@ def known(table: Path) -> dict[tuple[str, str, str], dict[str, Any]]:
     """The lines of an earlier run, by module and change."""
     if not table.is_file():
         return {}
-    with table.open(encoding="utf-8", newline="") as lines:
-        return {(r["module"], r["was"], r["becomes"]): r for r in csv.DictReader(lines)}
+    rows = pandas.read_csv(table, dtype=str, keep_default_na=False).to_dict("records")
+    return {(r["module"], r["was"], r["becomes"]): r for r in rows}
 
 
 def stored(rows: list[dict[str, Any]], table: Path) -> None:
-    """Write the table; one write, so that a run that is ended leaves a whole one."""
+    """Write the table; in one step, so that a run that is ended leaves a whole one."""
     table.parent.mkdir(parents=True, exist_ok=True)
     part = table.with_suffix(".part")
-    with part.open("w", encoding="utf-8", newline="") as lines:
-        writer = csv.DictWriter(lines, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    pandas.DataFrame(rows, columns=COLUMNS).to_csv(part, index=False, lineterminator="\n")
     part.replace(table)
 
 
