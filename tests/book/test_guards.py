@@ -1,6 +1,6 @@
 """What guards the book must itself be able to fail: a small chapter is broken in every way.
 
-The commands are those of ``make test``, on copies of the chapters in ``fixtures``: the comparison
+The commands are those of ``make test``, on copies of the chapter in ``fixtures``: the comparison
 of the pair, and nbval over the stored outputs. What breaks one cell stands in one notebook, a cell
 a fault, so that it runs once.
 """
@@ -29,7 +29,7 @@ from common import ROOT
 from pictures import difference, taken_out
 
 TOOLS = ROOT / "book" / "tools"
-FIXTURES = Path(__file__).parent / "fixtures"
+SMALL = Path(__file__).parent / "fixtures" / "small.md"
 
 
 def tool(name: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -51,9 +51,9 @@ executed_folder = pytest.fixture(scratch, scope="module")
 
 @pytest.fixture(scope="module")
 def executed(executed_folder: Path) -> Path:
-    """Return a folder with the small chapters, executed once."""
-    shutil.copytree(FIXTURES, executed_folder, dirs_exist_ok=True)
-    done = tool("execute.py", *sorted(executed_folder.glob("*.md")))
+    """Return a folder with the small chapter, executed once."""
+    shutil.copy(SMALL, executed_folder)
+    done = tool("execute.py", executed_folder / SMALL.name)
     assert done.returncode == 0, done.stderr
     return executed_folder
 
@@ -144,26 +144,23 @@ FAULTS: dict[str, tuple[int, Callable[[Any], object], str]] = {
 
 
 def test_one_changed_output_or_source_fails_and_no_other(executed: Path, folder: Path) -> None:
-    cells = code_cells(stored(executed / "small.md"))
+    whole = executed / "small.md"
+    cells = code_cells(stored(whole))
+    untouched = len(cells)
+    assert pairs.check(whole) == []
     for which, change, _ in FAULTS.values():
         cells.append(nbformat.from_dict(cells[which]))
         change(cells[-1])
     for k, cell in enumerate(cells):
         cell["id"] = f"cell-{k}"
     notebook = nbformat.v4.new_notebook(cells=cells, metadata={"kernelspec": execute.KERNELSPEC})
-    done = tool("regress.py", store(folder / "broken.md", notebook))
-    assert done.returncode == 1
+    done = tool("regress.py", store(folder / "broken.md", notebook), whole)
+    assert done.returncode == 1 and "small: as stored" in done.stdout
     parts = re.split(r"^_+ .*Cell (\d+) _+$", done.stderr, flags=re.M)
     told = dict(zip(map(int, parts[1::2]), parts[2::2], strict=True))
-    wanted = {k: text for k, (*_, text) in enumerate(FAULTS.values(), start=4) if text}
+    wanted = {k: text for k, (*_, text) in enumerate(FAULTS.values(), untouched) if text}
     assert set(told) == set(wanted)
     assert [k for k, text in wanted.items() if text not in told[k]] == []
-
-
-def test_untouched_chapters_pass(executed: Path) -> None:
-    chapters = [executed / "small.md", executed / "widget.md"]
-    assert [pairs.check(path) for path in chapters] == [[], []]
-    assert tool("regress.py", *chapters).returncode == 0
 
 
 def test_pixels_may_differ_if_few_or_little(executed: Path) -> None:
@@ -228,35 +225,32 @@ def test_new_sources_keep_the_outputs_and_are_checked(
 
 REFUSED = {
     "import warnings; warnings.warn('careful')": "wrote to stderr",
-    "raise ValueError('no')": "a cell failed",
     "import sys; print(sys.prefix)": "its output holds",
     "object()": "its output holds",
 }
 
 
 def test_execution_refuses(folder: Path) -> None:
-    head = (FIXTURES / "widget.md").read_text(encoding="utf-8").split("```")[0]
-    paths = [folder / f"chapter{k}.md" for k in range(len(REFUSED))]
-    for path, line in zip(paths, REFUSED, strict=True):
-        path.write_text(f"{head}```{{code-cell}} ipython3\n{line}\n```\n", encoding="utf-8")
-        path.with_suffix(".ipynb").write_text("as it was")
-    done = tool("execute.py", *paths)
-    told = re.split(r"^chapter\d: ", done.stderr, flags=re.M)[1:]
-    assert done.returncode == 1
-    for path, complaint, text in zip(paths, REFUSED.values(), told, strict=True):
-        assert complaint in text
-        assert path.with_suffix(".ipynb").read_text() == "as it was"
+    head = SMALL.read_text(encoding="utf-8").split("```")[0]
+    for name, lines in {"told": REFUSED, "failed": ["raise ValueError('no')"]}.items():
+        code = "".join(f"```{{code-cell}} ipython3\n{line}\n```\n\n" for line in lines)
+        (folder / f"{name}.md").write_text(head + code, encoding="utf-8")
+        (folder / f"{name}.ipynb").write_text("as it was")
+    done = tool("execute.py", folder / "told.md", folder / "failed.md")
+    assert done.returncode == 1 and "failed: a cell failed" in done.stderr
+    cells = re.split(r"^cell [\w-]+:\n", done.stderr, flags=re.M)[1:]
+    for cell, (line, complaint) in zip(cells, REFUSED.items(), strict=True):
+        assert cell.startswith(line) and complaint in cell
+    assert {path.read_text() for path in folder.glob("*.ipynb")} == {"as it was"}
 
 
 def test_executing_again_gives_the_same_bytes(executed: Path, chapter: Path) -> None:
     path = chapter.with_suffix(".ipynb")
     whole = path.read_text(encoding="utf-8")
     path.write_text(whole.replace("rate 2.0000", "rate 2.0001"), encoding="utf-8")
-    again = [executed / "small.md", executed / "widget.md", chapter]
-    done = tool("execute.py", "--bytes", *again)
+    done = tool("execute.py", "--bytes", executed / "small.md", chapter)
     assert done.returncode == 1 and done.stderr.count("does not give the stored bytes") == 1
-    assert sorted(re.findall(r"^\w+", done.stdout, re.M)) == ["small", "widget"]
-    assert "widget-state+json" in (executed / "widget.ipynb").read_text(encoding="utf-8")
+    assert re.findall(r"^\w+", done.stdout, re.M) == ["small"] and "widget-state+json" in whole
     assert "version" not in stored(chapter)["metadata"]["language_info"] and str(ROOT) not in whole
     notebook = nbformat.reads(whole, as_version=4)
     exchange_picture(code_cells(notebook)[FIGURE])
