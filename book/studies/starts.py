@@ -45,7 +45,7 @@ def scores(members: np.ndarray, truth: np.ndarray) -> tuple[float, ...]:
     gap = members.mean(axis=-2) - truth
     missed = np.hypot(*(gap + truth)[:, :2].T) - setting["length"]
     away = np.hypot(gap[:, 0], gap[:, 1])
-    late, judged = setting["score_from"] + 1e-9 < TIMES, TIMES > 1 + 1e-9
+    late, judged = TIMES > setting["score_from"] + 1e-9, TIMES > 1 + 1e-9
     farthest = away[judged].max() if np.isfinite(away).all() else np.inf
     return np.sqrt((missed**2).mean()), np.sqrt((away[late] ** 2).mean()), farthest
 

@@ -122,6 +122,7 @@ def test_parts_of_two_machines_are_merged(folder: Path, script: Path, start: Sta
     same(folder, script, twice=0)
 
 
+@pytest.mark.slow
 def test_dask(folder: Path, script: Path, start: Start) -> None:
     pytest.importorskip("distributed", reason="distributed (Dask) is not installed")
 
@@ -146,6 +147,7 @@ def test_dask(folder: Path, script: Path, start: Start) -> None:
     same(folder, script, twice=2 + 1 + 2)
 
 
+@pytest.mark.slow
 def test_mpi(folder: Path, script: Path, start: Start) -> None:
     pytest.importorskip("mpi4py", reason="mpi4py is not installed")
     if subprocess.run("mpiexec -n 1 true", shell=True, env=ENVIRONMENT).returncode:

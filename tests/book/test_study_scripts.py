@@ -53,7 +53,6 @@ def test_make_studies_stores_and_checks(
     capsys.readouterr()
     for old, new, word in [
         ("size=para", "loc=1e-12, size=para", "another run"),
-        ("2023, 12", "2023, 11", "other seeds"),
         ('"members": 20', '"rule": "mean", "members": 20', "other parameters"),
         ('"spread", "z', '"spreads", "z', "no script in book/studies makes it"),
     ]:
