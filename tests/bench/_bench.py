@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import pandas
+import psutil
 from threadpoolctl import threadpool_limits
 
 Row = dict[str, Any]
@@ -100,20 +101,8 @@ def peak_mb() -> float:
 
 
 def load(seconds: float = 1.0) -> float:
-    """How many cores others keep busy, while this process waits; NaN where nothing tells."""
-
-    def spent() -> tuple[int, int]:
-        line = Path("/proc/stat").read_text(encoding="utf-8").split("\n", 1)[0]
-        ticks = [int(v) for v in line.split()[1:9]]
-        return sum(ticks), ticks[3] + ticks[4]
-
-    try:
-        whole, idle = spent()
-        time.sleep(seconds)
-        now, rested = spent()
-    except (OSError, ValueError):
-        return float("nan")
-    return (os.cpu_count() or 1) * (1 - (rested - idle) / max(now - whole, 1))
+    """How many cores others keep busy, while this process waits."""
+    return (os.cpu_count() or 1) * psutil.cpu_percent(seconds) / 100
 
 
 _BEFORE = load()

@@ -62,20 +62,16 @@ def test_make_studies_stores_and_checks(
         assert word in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "word"),
-    [
+def test_a_script_s_name_and_columns_are_checked_before_it_runs(folder: Path) -> None:
+    for old, new, word in [
         ('"zheng"', '"chang"', "PAPER"),
         ('"spread", "zheng"', '"a/b", "zheng"', "NAME"),
         ('["mean", "spread"]', '["a", "a"]', "columns"),
-    ],
-)
-def test_make_studies_refuses_a_script(
-    old: str, new: str, word: str, folder: Path, tmp_path: Path
-) -> None:
-    (folder / "a.py").write_text(SCRIPT.replace(old, new, 1), encoding="utf-8")
-    with pytest.raises(ValueError, match=word):
-        tool.main([], tmp_path)
+    ]:
+        (folder / "a.py").write_text(SCRIPT.replace(old, new, 1), encoding="utf-8")
+        os.utime(folder / "a.py", (0, hash(word) % 2**30))
+        with pytest.raises(ValueError, match=word):
+            tool.main([], folder.parents[1])
 
 
 SHARED = """

@@ -149,8 +149,6 @@ def test_a_change_is_noticed_and_named() -> None:
         ('kind = "angle"\nnoise = 0.2\nunit = "rad"', 'kind = "range"\nnoise = 0.3\nunit = "m"',
          ("agents.B.kind: range, not angle", "agents.B.noise: 0.3, not 0.2",
           "agents.B.unit: m, not rad")),
-        ("[parameters.members]", "[parameters.pieces]",
-         ("pieces: 200, not absent", "members: absent, not 200")),
         ('where = "Section V.B, (18)"', 'where = "elsewhere"', ()),
         ("[parameters.orbital_rate]", "[notes.orbital_rate]",
          ("orbital_rate: absent, not 0.1 rad/s",)),
