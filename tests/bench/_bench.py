@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import os
 import platform
+import re
 import resource
 import statistics
 import sys
@@ -113,12 +114,10 @@ BUSY = 1.0
 
 def machine(busy: float) -> str:
     """Processor, core count, and how busy others kept it; `timed` holds BLAS to one thread."""
-    name = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        name = next(line.split(":", 1)[1].strip() for line in lines if "model name" in line)
-    except (OSError, StopIteration):
-        pass
+    name, told = platform.processor() or platform.machine(), Path("/proc/cpuinfo")
+    if told.is_file():
+        models = re.findall(r"model name\s*: (.*)", told.read_text(encoding="utf-8"))
+        name = models[0] if models else name
     return f"{name}; {os.cpu_count()} cores; one BLAS thread; load {busy:.1f}"
 
 

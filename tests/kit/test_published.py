@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ import pytest
 
 from bookkit.folders import data_root
 from bookkit.published import (
-    PAPERS,
     Claim,
     Scenario,
     Verdict,
@@ -40,12 +38,6 @@ DENIED = [CLAIMS[0], CLAIMS[1]._replace(holds=False), CLAIMS[2]]
 
 
 # Files.
-
-
-def test_items_are_complete() -> None:
-    found = items()
-    assert Counter(i.paper for i in found) == {"grange": 5, "das": 5, "semeraro": 9, "zheng": 2}
-    assert {i.paper for i in found} == set(PAPERS)
 
 
 def test_every_published_file_is_of_an_item_and_lists_its_claims() -> None:
