@@ -134,6 +134,7 @@ FAULTS: dict[str, tuple[int, Callable[[Any], object], str]] = {
     "curve that moves": (SLIDER, source("np.exp(-rate * t)", "1.01 * np.exp(-rate * t)"),
                          "data-frames"),
     "no picture": (FIGURE, lambda c: bundle(c).pop("image/png"), "0 pictures stored"),
+    "no picture beside the frames": (SLIDER, lambda c: bundle(c).pop("image/png"), "drawn"),
     "another picture": (FIGURE, exchange_picture, "pixels"),
     "exchanged frames": (SLIDER, exchange_frames, "pixels"),
     "another processor's shades": (FIGURE, shade, ""),

@@ -20,7 +20,7 @@ from numpy.random import SeedSequence
 
 from bookkit import studies
 from bookkit.folders import data_root
-from bookkit.studies import StudyError, running
+from bookkit.studies import StudyError
 
 COLUMNS = ["mean", "norm"]
 
@@ -89,8 +89,6 @@ def test_values_that_share_a_buffer_are_kept_apart() -> None:
 def test_metrics_are_taken_by_name_or_in_order() -> None:
     study = studies.run(lambda s: {"b": 2, "a": s.spawn_key[0]}, studies.spawn(1, 2), workers=1)
     assert study.metrics(["a"])["a"].tolist() == [0.0, 1.0]
-    with pytest.raises(ValueError, match="^columns: needs 2"):
-        studies.run(draw, [1], workers=1).metrics(["one"])
 
 
 def test_one_blas_thread_in_every_worker() -> None:
@@ -136,14 +134,6 @@ def test_a_broken_executor_leaves_what_was_done() -> None:
         with pytest.raises(StudyError, match="the executor broke") as caught:
             studies.run(partial(dies_at, 29), SEEDS, executor=pool)
         assert caught.value.study is not None and 0 < caught.value.study.done.sum() < 30
-    with pytest.raises(StudyError, match="takes no trial"):
-        studies.run(draw, [1], executor=pool)
-
-
-def test_a_worker_with_other_versions_is_refused() -> None:
-    job = (b"", "elsewhere", {**running.versions(), "numpy": "1.0"})
-    with pytest.raises(RuntimeError, match="1.0"):
-        running.chunk(job, [])
 
 
 class Cluster(Executor):
