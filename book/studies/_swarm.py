@@ -28,6 +28,7 @@ LOCAL, FLAT, MODES = int(SHARING["local"]), CHOICES["local_prior_std"], SHARING[
 GAINS = {"alpha": SWARM["pi_alpha"], "a": SWARM["pi_proportional"]}
 PAPERS = {**GAINS, "b": SWARM["pi_integral"]}
 FAST = {**GAINS, "b": 10 * SWARM["pi_integral"]}
+STIFF = {**PAPERS, "a": 10 * SWARM["pi_proportional"]}
 STEPS = {k: v / SWARM["dt"] for k, v in PAPERS.items()}
 PRINTED = {"noise": "observed", "mass_std": SHARING["mass_std"]}
 HALF = Faults(loss=0.5, seed=3)
@@ -39,6 +40,8 @@ SCHEMES: dict[str, tuple[Any, dict[str, Any]]] = {
     "paper_flat": (density.PIConsensus(modes=MODES, first_std=FLAT, **PAPERS), {}),
     "fast": (density.PIConsensus(modes=MODES, **FAST), {}),
     "fast_flat": (density.PIConsensus(modes=MODES, first_std=FLAT, **FAST), {}),
+    "stiff": (density.PIConsensus(modes=MODES, **STIFF), {}),
+    "stiff_flat": (density.PIConsensus(modes=MODES, first_std=FLAT, **STIFF), {}),
     "steps_flat": (density.PIConsensus(modes=MODES, first_std=FLAT, **STEPS), {}),
     "steps_printed": (density.PIConsensus(modes=MODES, first_std=FLAT, **STEPS), PRINTED),
     "average": (density.DynamicAverage(), {}),
