@@ -86,5 +86,7 @@ def test_a_prior_is_a_tenth_of_the_box_long_and_as_wide_as_the_mean_density() ->
 
 def test_a_prior_far_longer_than_the_box_is_its_lowest_modes() -> None:
     """exp(-π²ℓ²|k|²/2) underflows for all modes; what counts is their ratio."""
-    s = zero_mean_prior(Grid((9, 9)), rank=5, length=1e12, std=0.5)
-    assert np.allclose((s**2).mean(axis=0), [0.125, 0.125, 0, 0, 0])
+    for width, wanted in ((1.0, [0.125, 0.125, 0, 0, 0]), (2.0, [0.25, 0, 0, 0, 0])):
+        grid = Grid((9, 9), high=[width, 1.0])
+        s = zero_mean_prior(grid, rank=5, length=1e12, std=0.5)
+        assert np.allclose((s**2).mean(axis=0), wanted)

@@ -13,7 +13,7 @@ from distfilt.density import (
     kernel_information,
     kernels,
 )
-from distfilt.density.kernel import _least_squares
+from distfilt.density.kernel import _least_squares, fine_enough
 
 GRID = Grid((20, 30))
 SOME = np.random.default_rng(1).random((40, 2))
@@ -102,3 +102,9 @@ def test_cross_validation_has_the_least_score() -> None:
     least = _least_squares(x, GRID, h)
     assert all(least < _least_squares(x, GRID, c * h) for c in (0.8, 1.25, 2.0))
     assert h < 0.7 * bandwidth(x, GRID)
+
+
+def test_a_cell_is_at_most_two_bandwidths_wide() -> None:
+    fine_enough(Grid((10, 10)), 0.05)
+    with pytest.raises(ValueError, match="^grid: needs cells no wider than two bandwidths, 0.08"):
+        fine_enough(Grid((20, 10)), np.array([0.05, 0.04]))

@@ -169,13 +169,14 @@ def test_weights_are_the_printed_formulas(rule: str) -> None:
     assert np.allclose(f.weigh(shapes, rule=rule).weights, w[w > 0] / w.sum(), rtol=1e-6)
 
 
-def test_regularised_least_squares_have_the_condition_asked_for() -> None:
+@pytest.mark.parametrize("condition", [15.0, 1.5])
+def test_regularised_least_squares_have_the_condition_asked_for(condition: float) -> None:
     rng = np.random.default_rng(0)
     a = rng.uniform(size=(9, 4)) @ np.diag([1.0, 1.0, 1.0, 1e-6]) + 1.0
     s = np.linalg.svd(a, compute_uv=False)
-    padded = np.concatenate([a, tikhonov(s[0], s[-1], condition=15.0) * np.eye(4)])
+    padded = np.concatenate([a, tikhonov(s[0], s[-1], condition=condition) * np.eye(4)])
     b = np.r_[a @ [1.0, 2.0, 0.5, 1.0], np.zeros(4)]
-    w = nonnegative_least_squares(a, b[:9], condition=15.0)
+    w = nonnegative_least_squares(a, b[:9], condition=condition)
     slope = padded.T @ (padded @ w - b)
     # The conditions of Karush, Kuhn and Tucker.
     assert np.abs(slope[w > 0]).max() < 1e-9 and (slope[w == 0] > -1e-9).all()
