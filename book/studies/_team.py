@@ -168,3 +168,8 @@ def nees(truth: np.ndarray, belief: Belief) -> np.ndarray:
     """NEES per component of the target, (steps, runs, A)."""
     gap = (belief[0] - truth[:, :, None])[..., None]
     return (gap.mT @ np.linalg.solve(belief[1], gap))[..., 0, 0] / gap.shape[-2]
+
+
+def rare(share: float, n: int) -> float:
+    """The NEES per component that a right claim about n components exceeds so seldom."""
+    return float(chi2.isf(share, n)) / n
