@@ -1,9 +1,9 @@
 """Random pairs with many mixands: how often Table 2's orderings hold, for chapter 7's shares.
 
 Pairs are drawn as in the study of the rules for weights, with seven to nine mixands each, and
-reduced before or after the product to the sizes that the relevance rule leaves: for the factor of
-(41) behind our Table 2, and for one that merges less. All divergences of one trial are taken on
-points of the same seeds, by importance sampling.
+reduced before or after the product to the sizes that the relevance rule leaves: for a factor of
+(41) that merges much, and for the milder one of our Table 2. All divergences of one trial are
+taken on points of the same seeds, by importance sampling.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import arcs
 
-from bookkit.published import scenario
 from distfilt.mixtures import (
     GaussianMixture,
     PartialFusion,
@@ -28,21 +27,24 @@ from distfilt.mixtures import (
 )
 
 NAME, PAPER = "reductions", "semeraro"
-SCENARIO = scenario("semeraro", "table-2")
-THRESHOLDS = {"strong": float(SCENARIO["relevance_threshold"]), "mild": 10.0}
+OMEGA = 0.5
+THRESHOLDS = {"strong": 2.0, "mild": 10.0}
 MEMBERS, MIXANDS = 4000, (7, 9)
 RULES = ("relevance", "runnalls", "qr")
 columns = ["from_1", "from_2", *(
     f"{name}_{k}" for name in THRESHOLDS
     for k in ("to_1", "to_2", *(f"{r}_{k}" for r in RULES for k in (1, 2, "target"))))]
 parameters = {"members": MEMBERS, "mixands": MIXANDS, "bounds": arcs.BOUNDS,
-              "thresholds": THRESHOLDS}
+              "thresholds": THRESHOLDS, "omega": OMEGA}
 seeds = np.random.SeedSequence(20261).spawn(200)
-scenarios = (SCENARIO,)
 rtol, atol = 1e-3, 1e-9
 # Which of nearly equal shapes least squares keep hangs on the last bit, and so does a divergence
-# that a thin tail decides.
-rough = [name for name in columns if "_qr_" in name or name.endswith("target")]
+# that a thin tail decides: in one trial of eight some number with the mild factor, whose many
+# shapes are nearly equal, is another one with another order of the sums. Medians and shares stay.
+rough = [
+    name for name in columns
+    if "_qr_" in name or name.endswith("target") or name.startswith(("mild_rel", "mild_runn"))
+]
 
 
 def scores(exact: list[PartialFusion], pair: list[GaussianMixture], first: int) -> list[float]:
@@ -81,7 +83,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     turn = for_pair.uniform(*arcs.BOUNDS["turn"])
     own = [arcs.belief(b, for_pair, mixands=MIXANDS) for b in (np.pi, np.pi + turn)]
     said = [m.marginal([0, 1]) for m in own]
-    exact = [PartialFusion(own[k], said[1 - k], omega=SCENARIO["omega"]) for k in (0, 1)]
+    exact = [PartialFusion(own[k], said[1 - k], omega=OMEGA) for k in (0, 1)]
     first, out = int(for_points.integers(2**31)), {}
     for name, threshold in THRESHOLDS.items():
         for rule, shapes in reduced(exact, said, threshold).items():
