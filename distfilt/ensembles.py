@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from functools import partial
+from functools import lru_cache, partial
 from typing import Annotated
 
 import numpy as np
@@ -65,7 +65,12 @@ def mean(ensemble: Members) -> Array:
     array([2., 3.])
     """
     # A product with equal weights: ten times faster than a reduction over a short inner axis.
-    return np.asarray(np.full(ensemble.shape[-2], 1 / ensemble.shape[-2]) @ ensemble)
+    return np.asarray(_equal_weights(ensemble.shape[-2]) @ ensemble)
+
+
+@lru_cache(maxsize=16)
+def _equal_weights(members: int) -> Array:
+    return np.full(members, 1 / members)
 
 
 @door

@@ -16,7 +16,6 @@ from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
-from scipy.special import logsumexp
 
 from ..doors import Array, Bounds, Positive, Record, Weights, door, needed
 from ..linalg import SolverError
@@ -232,6 +231,8 @@ def _newton(
 
     The step is damped as by Levenberg and Marquardt.
     """
+
+    from scipy.special import logsumexp
 
     def at(g: Array) -> tuple[Array, float]:
         """The plan with these potentials, whose row sums are right, and the dual to be least."""

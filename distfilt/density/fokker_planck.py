@@ -9,8 +9,7 @@ from functools import cached_property
 from typing import Annotated, Literal
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse.linalg import splu
+import scipy
 
 from ..doors import Array, NonNegative, Positive, Record, Times, door, unchecked
 from ..models.swarm import Swarm
@@ -116,7 +115,7 @@ class FokkerPlanck(Record):
         backwards = small + np.maximum(-peclet, 0.0)
         return forwards * at_left / f.width**2, backwards * at_right / f.width**2
 
-    def _assembled(self, t: float, scale: float, identity: float) -> sparse.csc_array:
+    def _assembled(self, t: float, scale: float, identity: float) -> scipy.sparse.csc_array:
         """identity I + scale A(t)."""
         forwards, backwards = self._rates(t)
         n, f = self.grid.size, self._faces
@@ -124,10 +123,10 @@ class FokkerPlanck(Record):
         data = np.concatenate([identity - scale * leaving, scale * forwards, scale * backwards])
         rows = np.concatenate([np.arange(n), f.right, f.left])
         columns = np.concatenate([np.arange(n), f.left, f.right])
-        return sparse.csc_array((data, (rows, columns)), (n, n))
+        return scipy.sparse.csc_array((data, (rows, columns)), (n, n))
 
     @door
-    def generator(self, t: float) -> sparse.csc_array:
+    def generator(self, t: float) -> scipy.sparse.csc_array:
         """The matrix A(t) of dp/dt = A p, (n, n), sparse."""
         return self._assembled(t, 1.0, 0.0)
 
@@ -141,6 +140,8 @@ class FokkerPlanck(Record):
         """The step from `t` to `t` + `dt` as a function: one factorisation for any number."""
         if self.scheme == "split":
             return self._split(t, dt)
+        from scipy.sparse.linalg import splu
+
         share = dt if self.scheme == "backward_euler" else 0.5 * dt
         explicit, matrix = self._assembled(t, dt - share, 1.0), self._assembled(t + dt, -share, 1.0)
         # The pattern is symmetric and the columns are dominated by their diagonal: no pivoting.

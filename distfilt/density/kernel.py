@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from scipy.special import erf
 
 from ..doors import Array, Bounds, Count, Positive, door, unchecked
 from .grid import Grid
@@ -33,6 +32,8 @@ def _along(x: Array, grid: Grid, k: int, width: Array) -> Array:
 
 
 def _steps(x: Array, edges: Array, scale: Array) -> Array:
+    from scipy.special import erf
+
     return np.asarray(0.5 * np.diff(erf((edges - x[..., None]) / scale), axis=-1))
 
 

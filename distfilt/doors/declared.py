@@ -153,31 +153,33 @@ class Record:
     @classmethod
     def unchecked(cls, *args: Any, **options: Any) -> Self:
         """Build one from what the library made itself: nothing is checked or copied."""
-        out, names = object.__new__(cls), _names(cast(Any, cls))
+        out, (names, factories) = object.__new__(cls), _names(cast(Any, cls))
         vars(out).update(zip(names, args, strict=False), **options)
-        for name, factory in names.items():
-            if factory and name not in vars(out):
+        for name, factory in factories:
+            if name not in vars(out):
                 vars(out)[name] = factory()
         return out
 
     def changed(self, **changes: Any) -> Self:
         """The same with other values in some fields, unchecked."""
-        known = {name: getattr(self, name) for name in _names(cast(Any, type(self)))}
+        known = {name: getattr(self, name) for name in _names(cast(Any, type(self)))[0]}
         return self.unchecked(**known | changes)
 
 
 @cache
-def _names(cls: Any) -> dict[str, Any]:
-    """Each field with what makes its default; a plain default is an attribute of the class."""
+def _names(cls: Any) -> tuple[tuple[str, ...], tuple[tuple[str, Any], ...]]:
+    """The fields, and what makes defaults; a plain default is an attribute of the class."""
     made = {f.name: f.default_factory for f in fields(cls)}
-    return {name: None if factory is _NO_DEFAULT else factory for name, factory in made.items()}
+    factories = [(name, make) for name, make in made.items() if make is not _NO_DEFAULT]
+    return tuple(made), tuple(factories)
 
 
 @cache
 def _of_fields(cls: Any) -> dict[str, Kind]:
     found: dict[str, Kind] = {}
     for base in reversed(cls.__mro__):
-        own = {n: a for n, a in vars(base).get("__annotations__", {}).items() if n in _names(cls)}
+        own = vars(base).get("__annotations__", {}).items()
+        own = {name: a for name, a in own if name in _names(cls)[0]}
         found |= _declared(own, vars(sys.modules.get(base.__module__, sys)))
     return _arrays_last(found)
 

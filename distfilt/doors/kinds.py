@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
+from itertools import chain
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -19,7 +21,7 @@ MISSING = "missing allowed"
 """Beside an array's shape: NaN may stand for what is missing; infinity may not."""
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class Scope:
     """The arguments of one call by name, and the sizes that their shapes have bound."""
 
@@ -28,23 +30,26 @@ class Scope:
 
     def shape(self, words: Sequence[str]) -> tuple[Any, ...]:
         """A shape as far as it is known."""
-        out: list[Any] = []
-        for word in words:
-            known = ... if word == "..." else self._size(word)
-            out.extend(known if isinstance(known, tuple) else (known,))
-        return tuple(out)
+        known = [... if word == "..." else self._size(word) for word in words]
+        if tuple not in map(type, known):
+            return tuple(known)
+        return tuple(chain.from_iterable(n if type(n) is tuple else (n,) for n in known))
 
     def _size(self, word: str) -> Any:
         """What a word stands for: a size, sizes, or itself while it is free."""
         if word in self.sizes:
             return self.sizes[word]
-        if word.isdigit():
-            return int(word)
-        head, *path = word.lstrip("*").split(".")
-        found = self.values.get(head)
+        head, *path = _parts(word)
+        found = int(word) if word.isdigit() else self.values.get(head)
         for part in path:
             found = getattr(found, part, None)
-        return found if isinstance(found, int | np.integer | tuple) else word
+        return found if isinstance(found, (int, np.integer, tuple)) else word
+
+
+@cache
+def _parts(word: str) -> list[str]:
+    """The name of an argument, and the path to a size in it."""
+    return word.lstrip("*").split(".")
 
 
 @dataclass(frozen=True)
@@ -72,7 +77,7 @@ def _number(value: Any, name: str, scope: Scope) -> float:
         out = float(value if type(value) in (float, int) else _real(value, name)[()])
     except ValueError:
         raise TypeError from None
-    if not np.isfinite(out):
+    if not math.isfinite(out):
         raise TypeError
     return out
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg.lapack import dpotrf
 
 __all__ = [  # fmt: skip
     "Array", "Bounds", "array", "batched", "definite", "distinct", "increasing", "needed",
@@ -59,7 +60,7 @@ def array(
     """
     plain = type(value) is np.ndarray and value.dtype == np.float64
     out: Array = value if plain else _real(value, name)  # type: ignore[assignment]
-    if shape is not None and not _fits(out.shape, shape, {}):
+    if shape is not None and out.shape != shape and not _fits(out.shape, shape, {}):
         raise ValueError(f"{name}: needs shape {_shape_text(shape)}, got {out.shape}")
     if finite and not np.isfinite(out).all():
         bad = int((~np.isfinite(out)).sum())
@@ -120,7 +121,9 @@ def definite(value: Array, name: str, word: str = "definite") -> None:
         if worst > 0:
             raise ValueError(f"{name}: needs a symmetric matrix, got an asymmetry of {worst:.3g}")
     with contextlib.suppress(np.linalg.LinAlgError):
-        np.linalg.cholesky(value)
+        # The first takes a fifth of the other's time for one matrix.
+        if value.ndim > 2 or not value.size or dpotrf(value, lower=1)[1]:
+            np.linalg.cholesky(value)
         return
     # Without a factor; rounding alone may be why, unless it has to be definite.
     values = np.linalg.eigvalsh(_in_units(value))[..., 0]
@@ -213,9 +216,10 @@ class Bounds:
     def __call__(self, value: Any, name: str) -> None:
         """Refuse what is out of bounds."""
         for side, holds in _HOLDS.items():
-            bound, word = getattr(self, side), side.replace("_", " ")
-            if bound is None or np.all(holds(value, bound)):
+            bound = getattr(self, side)
+            if bound is None or (good := holds(value, bound)) is True or np.all(good):
                 continue
+            word = side.replace("_", " ")
             needs = "an integer of" if isinstance(value, int) and word == "at least" else "a number"
             worst = value if np.ndim(value) == 0 else value[~holds(value, bound)].flat[0]
             raise ValueError(f"{name}: needs {needs} {word} {bound:g}, got {worst!r}")

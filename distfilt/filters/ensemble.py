@@ -6,7 +6,6 @@ transport filters, whose agents have one set of members in common and agree on i
 
 from __future__ import annotations
 
-import copy
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
@@ -31,7 +30,7 @@ from .inbox import Heard
 from .inputs import members_of
 from .record import Summary
 from .saving import SensorState
-from .step import Step, guarded
+from .step import Step, copied, guarded
 
 __all__ = ["EnsembleFilter", "EnsembleState", "TransportFilter"]
 
@@ -198,7 +197,7 @@ class EnsembleFilter(MembersFilter):
                 options["predict"] = lambda x: group.predict(x, before)
             # Every time's members meet the same draw of the noise, so that all the separate
             # updates are one joint update; the last one advances the generator.
-            sources = [copy.deepcopy(source) for _ in ensembles[1:]] + [source]
+            sources = [copied(source) for _ in ensembles[1:]] + [source]
             both = zip(ensembles, sources, strict=True)
             return tuple([self._updated(x, h, y, noise, own, options) for x, own in both])
 
@@ -312,7 +311,7 @@ class TransportFilter(MembersFilter):
         self, draw: Callable[..., Array], arrays: tuple[Array, ...], rng: np.random.Generator
     ) -> Array:
         """Apply `draw` agent by agent, each with the same draws; the generator advances once."""
-        sources = [copy.deepcopy(rng) for _ in range(self.count - 1)] + [rng]
+        sources = [copied(rng) for _ in range(self.count - 1)] + [rng]
         parts = [
             draw(*(x[..., a, :, :] for x in arrays), rng=source) for a, source in enumerate(sources)
         ]
@@ -342,7 +341,7 @@ class TransportFilter(MembersFilter):
         if self.rejuvenation:
             draw = partial(unchecked(rejuvenated), bandwidth=self.rejuvenation)
             # Every time's members meet the same draws; the generator advances once.
-            sources = [copy.deepcopy(rng) for _ in out[1:]] + [rng]
+            sources = [copied(rng) for _ in out[1:]] + [rng]
             both = zip(out, stack, sources, strict=True)
             out = tuple(self._for_all(draw, (y, x), source) for y, x, source in both)
         # Where nothing was said of the members they stay as they were.

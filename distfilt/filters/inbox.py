@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from ..doors import Array, unchecked
 from ..sensors import Sensor
@@ -79,8 +77,8 @@ class Heard:
 
     def aimed(self, target: Array) -> Heard:
         """The same with these values."""
-        out = copy.copy(self)
-        out.target = target
+        out = object.__new__(Heard)
+        vars(out).update(vars(self), target=target)
         return out
 
     def predict(self, states: Array, previous: Array | None = None) -> Array:
@@ -120,6 +118,8 @@ class Heard:
         Each sensor's reading is judged alone, by what a good one's normalised innovation exceeds
         with probability 1 - `share`; `mean` and `cov` are of the predictions without noise.
         """
+        from scipy.special import gammaincinv
+
         gap, spread = self.target - mean, cov + self.noise
         refused, out = np.zeros(gap.shape[:-1]), self.target
         for k in range(int(self.owner.max()) + 1):

@@ -79,6 +79,12 @@ def said_by_all(f: Any, observations: Any, runs: tuple[int, ...], t: float) -> l
     """
     out: list[list[Reading]] = []
     for agent, given in enumerate(one_each(observations, f.count)):
+        own = f.team[agent]
+        if type(given) is np.ndarray and given.dtype == np.float64 and len(own) == 1:
+            whole = given.shape == (*runs, own[0].dim) and np.isfinite(given).all()
+            if whole:  # as nearly all are
+                out.append([Reading.unchecked(t, agent, given)])
+                continue
         name = f"observations[{agent}]"
         several = given if _are_readings(given) else () if given is None else (given,)
         found = [_complete(f, _read(f, one, agent, t, name), runs, name) for one in several]

@@ -7,7 +7,6 @@ from dataclasses import KW_ONLY, dataclass, field
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from ..doors import Array, Bounds, Count, unchecked
 from ..mixtures import GaussianMixture, runnalls
@@ -171,6 +170,8 @@ class MixtureFilter(Filter):
         counted: bool = True,
     ) -> GaussianMixture:  # fmt: skip
         """An agent's belief after readings; one that fails the gate changes nothing."""
+        from scipy.special import gammaincinv
+
         for reading in said:
             sensor, y = sensor_of(self, reading), reading.value
             about: Any = unchecked(sensor.predict), sensor.cov

@@ -92,6 +92,11 @@ def recorded(
         for name, value in (_told(last, summary) | scored).items():
             columns.setdefault(name, []).append(np.asarray(value))
 
+    if columns:
+        variance = np.array(columns["variance"])
+        spread = np.sqrt(np.nansum(variance, axis=-1))
+        columns["spread"] = [*np.where(np.isnan(variance).all(axis=-1), np.nan, spread)]
+
     n = len(start.runs)
     lead = ("time", *(("run",) if n == 1 else [f"run{i}" for i in range(n)]), "agent")
     axes = {"covariance": (*lead, "component", "column")}
@@ -137,9 +142,8 @@ def _known(
 
 def _told(state: Any, summary: Summary) -> dict[str, Array]:
     """What is recorded of a state without a truth."""
-    spread = np.sqrt(np.nansum(summary.variance, axis=-1))
-    spread[np.isnan(summary.variance).all(axis=-1)] = np.nan
-    out = {"mean": summary.mean, "variance": summary.variance, "spread": spread}
+    # The spread is made of all variances at the end.
+    out = {"mean": summary.mean, "variance": summary.variance, "spread": summary.variance}
     if summary.covariance is not None:
         out["covariance"] = summary.covariance
     if state.refused is not None:

@@ -19,7 +19,6 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import svdvals
-from scipy.optimize import nnls
 
 from ..doors import Array, Bounds, Count, Mask, Record, Share, door, summing_to_one, unchecked
 from ..gaussians.single import unscented_points
@@ -352,6 +351,8 @@ def nonnegative_least_squares(
     >>> nonnegative_least_squares([[1.0, 0.0], [0.0, 1.0]], [2.0, -1.0])
     array([2., 0.])
     """
+    from scipy.optimize import nnls
+
     rows, columns = matrix.shape
     values = svdvals(matrix)
     smallest = float(values[-1]) if rows >= columns else 0.0

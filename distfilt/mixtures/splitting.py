@@ -8,7 +8,6 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from ..doors import Array, Bounds, Count, Positive, door, unchecked
 from ..linalg import symmetrise
@@ -51,6 +50,8 @@ def split_library(*, std: Fraction = 0.7) -> tuple[Array, Array]:
 
 @lru_cache(maxsize=16)
 def _library(std: float) -> tuple[Array, Array]:
+    from scipy.optimize import minimize_scalar
+
     def parts(a: float) -> tuple[Array, Array]:
         m = np.sqrt((1 - std**2) / (2 * a))
         return np.array([a, 1 - 2 * a, a]), np.array([-m, 0.0, m])

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import sparse
 
 from ..doors import array
 
@@ -15,12 +15,12 @@ __all__: list[str] = []
 Indices = NDArray[np.int64]
 
 
-def of_matrix(value: Any, name: str, *, directed: bool) -> sparse.csr_array:
+def of_matrix(value: Any, name: str, *, directed: bool) -> scipy.sparse.csr_array:
     """The links that a matrix of zeros and ones marks, an array or sparse."""
-    if not sparse.issparse(value):
+    if not scipy.sparse.issparse(value):
         flags = isinstance(value, np.ndarray) and value.dtype == bool
         value = array(value * 1.0 if flags else value, name, ("A", "A"))
-    a = sparse.csr_array(value)
+    a = scipy.sparse.csr_array(value)
     if a.shape[0] != a.shape[1] or a.shape[0] == 0:
         raise ValueError(f"{name}: needs a square matrix, got shape {a.shape}")
     odd = (a.data != 0) & (a.data != 1)
@@ -34,7 +34,7 @@ def of_matrix(value: Any, name: str, *, directed: bool) -> sparse.csr_array:
     return links
 
 
-def of_edges(size: int, edges: Any, name: str, *, directed: bool) -> sparse.csr_array:
+def of_edges(size: int, edges: Any, name: str, *, directed: bool) -> scipy.sparse.csr_array:
     """The links of pairs (listener, speaker), both ways unless the graph is directed."""
     pairs = array(edges, name)
     pairs = pairs.reshape(-1, 2) if pairs.size == 0 else array(pairs, name, ("E", 2))
@@ -46,9 +46,9 @@ def of_edges(size: int, edges: Any, name: str, *, directed: bool) -> sparse.csr_
     return linked(size, both, name)
 
 
-def of_either(value: Any, size: int | None, name: str) -> sparse.csr_array:
+def of_either(value: Any, size: int | None, name: str) -> scipy.sparse.csr_array:
     """The links of a matrix or of a list of edges, both ways."""
-    if sparse.issparse(value) or getattr(value, "dtype", None) == np.dtype(bool):
+    if scipy.sparse.issparse(value) or getattr(value, "dtype", None) == np.dtype(bool):
         return of_matrix(value, name, directed=False)
     a = array(value, name)
     square = a.ndim == 2 and 0 < a.shape[0] == a.shape[1] and size in (None, a.shape[0])
@@ -64,12 +64,12 @@ def is_networkx(value: Any) -> bool:
     return all(hasattr(value, name) for name in ("nodes", "edges", "is_directed"))
 
 
-def linked(size: int, pairs: Indices, name: str) -> sparse.csr_array:
+def linked(size: int, pairs: Indices, name: str) -> scipy.sparse.csr_array:
     """The matrix of a graph's links from pairs (listener, speaker), which may repeat."""
     loops = pairs[pairs[:, 0] == pairs[:, 1], 0]
     if loops.size:
         raise ValueError(f"{name}: needs no self-loops, got one at agent {loops[0]}")
-    links = sparse.csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (size, size))
+    links = scipy.sparse.csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (size, size))
     links.sum_duplicates()
     links.data[:] = 1.0
     links.sort_indices()

@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
-from scipy import sparse
 
 from ..doors import Array, Bounds, Count, Index, Positive, Record, door
 from . import _links
@@ -42,7 +42,7 @@ class Graph(Record):
     array([0., 1., 3.])
     """
 
-    links: sparse.csr_array
+    links: scipy.sparse.csr_array
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -128,11 +128,11 @@ class Graph(Record):
         return np.lexsort((self.receivers, self.senders))
 
     @cached_property
-    def incidence(self) -> sparse.csr_array:
+    def incidence(self) -> scipy.sparse.csr_array:
         """Sums what arrives over an agent's links: ``incidence[i, e] = 1`` if link e ends at i."""
         edges = self.senders.size
         parts = np.ones(edges), np.arange(edges), self.links.indptr
-        return sparse.csr_array(parts, (self.size, edges))
+        return scipy.sparse.csr_array(parts, (self.size, edges))
 
     def _summed(self, per_link: Array, axis: int = -2) -> Array:
         """What arrives over each agent's links, added: E entries along an axis become A."""
@@ -166,9 +166,9 @@ class Graph(Record):
         return not same
 
     @cached_property
-    def laplacian(self) -> sparse.csr_array:
+    def laplacian(self) -> scipy.sparse.csr_array:
         """The Laplacian, sparse: degrees on the diagonal, -1 where an agent hears another."""
-        return (sparse.diags_array(self.degrees) - self.links).tocsr()
+        return (scipy.sparse.diags_array(self.degrees) - self.links).tocsr()
 
     @cached_property
     def spectrum(self) -> Array:
@@ -219,7 +219,7 @@ class Graph(Record):
     @cached_property
     def components(self) -> Indices:
         """For each agent the number of its (strongly) connected component, (A,)."""
-        _, labels = sparse.csgraph.connected_components(self.links, connection="strong")
+        _, labels = scipy.sparse.csgraph.connected_components(self.links, connection="strong")
         return np.asarray(labels, dtype=np.int64)
 
     @property
@@ -235,8 +235,8 @@ class Graph(Record):
         >>> graphs.path(4).hops(1)
         array([1, 0, 1, 2])
         """
-        forward, start = sparse.csr_array(self.links.T), self._below(agent)
-        away = sparse.csgraph.dijkstra(forward, indices=start, unweighted=True)
+        forward, start = scipy.sparse.csr_array(self.links.T), self._below(agent)
+        away = scipy.sparse.csgraph.dijkstra(forward, indices=start, unweighted=True)
         return np.where(np.isinf(away), -1, away).astype(np.int64)
 
     @cached_property
@@ -282,7 +282,7 @@ def as_graph(value: Any, size: int | None = None) -> Graph:
         graph = value
     elif _links.is_networkx(value):
         graph = Graph.from_networkx(value)
-    elif sparse.issparse(value) or isinstance(value, np.ndarray | list | tuple):
+    elif scipy.sparse.issparse(value) or isinstance(value, np.ndarray | list | tuple):
         graph = Graph.unchecked(_links.of_either(value, size, "graph"))
     else:
         needs = "a Graph, a networkx graph, a matrix of zeros and ones, or edges"

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Annotated
 
 import numpy as np
-from scipy import sparse
+import scipy
 
 from ..doors import Array, Record, door
 from ._links import Indices
@@ -57,12 +57,12 @@ class Weights(Record):
     links: Annotated[Array, "graph.senders.size"]
 
     @cached_property
-    def matrix(self) -> sparse.csr_array:
+    def matrix(self) -> scipy.sparse.csr_array:
         """The matrix W of x <- W x, (A, A), each row's own entry stored first."""
         return stacked(self.graph, self.own[None], self.links[None], heard_at=0)
 
 
-def stacked(graph: Graph, own: Array, links: Array, *, heard_at: int) -> sparse.csr_array:
+def stacked(graph: Graph, own: Array, links: Array, *, heard_at: int) -> scipy.sparse.csr_array:
     """Matrices of R runs as one block-diagonal matrix, each row's own entry first.
 
     `own` is (R, A) and `links` (R, E). With `heard_at` = 0 both multiply the same stacked values;
@@ -76,7 +76,7 @@ def stacked(graph: Graph, own: Array, links: Array, *, heard_at: int) -> sparse.
     ends = graph.links.indptr[1:] + np.arange(1, size + 1) + data.shape[1] * run
     pointers = np.concatenate([[0], ends.ravel()])
     shape = (runs * size, runs * size + heard_at)
-    return sparse.csr_array((data.ravel(), columns.ravel(), pointers), shape)
+    return scipy.sparse.csr_array((data.ravel(), columns.ravel(), pointers), shape)
 
 
 def _matching(graph: Graph, weights: Weights) -> Weights:
@@ -280,7 +280,7 @@ def balanced(graph: Graph) -> Weights:
     return _by_links(graph, links)
 
 
-def _left_null_vector(laplacian: sparse.csr_array) -> Array:
+def _left_null_vector(laplacian: scipy.sparse.csr_array) -> Array:
     """Positive p with p' L = 0 of a strongly connected graph, largest entry 1."""
     from scipy.sparse.linalg import splu
 

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy.special import ndtr
 
 from .. import ensembles
 from ..doors import Array, Index, NonNegative, door, unchecked
@@ -141,6 +140,8 @@ def _earlier_features(v: Array, bumps: Array) -> Array:
 
 def _own_features(v: Array, steps: Array) -> tuple[Array, Array]:
     """The variable and its integrated bumps, and their slopes, (..., N, 1 + q), of (..., N)."""
+    from scipy.special import ndtr
+
     centres, widths = steps[..., None, :]
     u = (v[..., None] - centres) / widths
     values = _ROOT * widths * ndtr(u)

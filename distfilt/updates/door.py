@@ -171,9 +171,9 @@ def with_missing(
     present, gone = ~np.isnan(observed), np.isnan(predicted)
     if gone.any():
         present = present & ~gone.any(axis=-2)
-    if present.all() or says(update, "whole"):
+    if (whole := bool(present.all())) or says(update, "whole"):
         stream = _stream(rng, [*base, m], lead, np.arange(math.prod(lead)))
-        known = np.where(present, observed, np.nan)
+        known = observed if whole else np.where(present, observed, np.nan)
         return inner(ensemble, predicted, known, noise, rng=stream)
     flat, aim = present.reshape(-1, m), observed.reshape(-1, m)
     rows, seen = (a.reshape(-1, *a.shape[-2:]) for a in (ensemble, predicted))

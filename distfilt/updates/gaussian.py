@@ -15,7 +15,6 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 import numpy as np
-from scipy.fft import dct
 from scipy.linalg.lapack import dposv
 
 from ..doors import Array, NonNegative, Rng, door, unchecked
@@ -40,10 +39,12 @@ def _centred(members: Array) -> tuple[Array, Array]:
 def _gain(inner: Array, a: Array, b: Array) -> Array:
     """The gain transposed, (..., m, d): one solve for all members."""
     cross = np.swapaxes(b, -1, -2) @ a / (a.shape[-2] - 1)
-    if inner.ndim == 2 and inner.size:
-        _, gain, failed = dposv(inner, cross, lower=1)  # a third of numpy's time for one ensemble
+    m, d = cross.shape[-2:]
+    if inner.size == m * m and cross.size == m * d > 0:
+        # A third of numpy's time for one ensemble.
+        _, gain, failed = dposv(inner.reshape(m, m), cross.reshape(m, d), lower=1)
         if not failed:
-            return np.asarray(gain)
+            return np.asarray(gain.reshape(cross.shape))
     return np.asarray(np.linalg.solve(inner, cross))
 
 
@@ -210,6 +211,8 @@ def _turned(spread: Array, rng: Rng) -> Array:
     Random signs and cosine transforms in turn, in the space of centred members: orthogonal to
     rounding, in N log N steps where a random matrix takes N cubed.
     """
+    from scipy.fft import dct
+
     n = spread.shape[-2]
     # A reflection takes the direction of ones to the first unit vector, and is its own inverse.
     v = np.full(n, -1 / np.sqrt(n))
@@ -246,7 +249,12 @@ def sampled_forecast(
     >>> sampled_forecast([[1.0], [2.0]], still, 0.0, 0.1, rng=np.random.default_rng(0)).ravel()
     array([1., 2.])
     """
-    return unchecked(model.sample_step)(ensemble, t, dt, rng=rng)
+    moved, root = unchecked(model.step)(ensemble, t, dt), unchecked(model.root)(t, dt)
+    if not root.any():
+        return moved
+    noise = rng.standard_normal(moved.shape) @ root.T
+    noise += moved
+    return noise
 
 
 @door

@@ -10,8 +10,6 @@ from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from scipy import sparse
-from scipy.sparse import csgraph
 
 from .. import coupling
 from ..coupling import Constraint
@@ -311,6 +309,8 @@ def _one_by_one(update: Update, taper: Array | None) -> Update:
 
 def _groups(noise: Array) -> list[Indices]:
     """Indices of readings that are correlated with each other, in the order of their first."""
+    from scipy.sparse import csgraph, csr_array
+
     linked = (noise != 0).reshape(-1, *noise.shape[-2:]).any(axis=0)
-    labels = csgraph.connected_components(sparse.csr_array(linked), directed=False)[1]
+    labels = csgraph.connected_components(csr_array(linked), directed=False)[1]
     return [np.flatnonzero(labels == k) for k in dict.fromkeys(labels.tolist())]
