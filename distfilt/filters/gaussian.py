@@ -10,7 +10,7 @@ import numpy as np
 
 from ..doors import Array, Count, NonNegative, Positive, unchecked
 from ..gaussians.single import conditioned, unscented_points
-from ..linalg import symmetrise
+from ..linalg import cholesky, symmetrise
 from .base import Filter
 from .inbox import Heard
 from .inputs import moments_of
@@ -164,15 +164,17 @@ class GaussianFilter(Filter):
             state.means, state.covariances,
         )
         old = state.joint_means[..., : kept * d]
-        shift = np.zeros((*moved.shape[:-1], (1 + kept) * d, state.joint_means.shape[-1]))
-        shift[..., :d, :d] = slope
-        shift[..., d:, : kept * d] = np.eye(kept * d)
+        shift = np.ascontiguousarray(slope)
+        if kept:
+            shift = np.zeros((*moved.shape[:-1], (1 + kept) * d, state.joint_means.shape[-1]))
+            shift[..., :d, :d] = slope
+            shift[..., d:, : kept * d] = np.eye(kept * d)
         covs = shift @ state.joint_covariances @ shift.mT
         covs[..., :d, :d] += unchecked(model.noise)(state.t, dt) + extra
         if self.inflation != 1.0:
             covs[..., :d, :] *= self.inflation
             covs[..., :, :d] *= self.inflation
-        return np.concatenate([moved, old], axis=-1), covs
+        return np.concatenate([moved, old], axis=-1) if kept else moved.copy(), covs
 
     def _linearised(
         self, function: Callable[[Array], Array], jacobian: Callable[[Array], Array], mean: Array,
@@ -181,7 +183,7 @@ class GaussianFilter(Filter):
         """Value, slope and extra covariance of a function of a Gaussian (..., d)."""
         if self.rule == "extended":
             return function(mean[..., None, :])[..., 0, :], jacobian(mean), 0.0
-        root = np.asarray(np.linalg.cholesky(cov))
+        root = cholesky(cov)
         points, w = unchecked(unscented_points)(mean, root, kappa=self.kappa)
         values = function(points)
         at = w @ values
@@ -201,8 +203,10 @@ class GaussianFilter(Filter):
             group.predict, group.jacobian, m[..., here], p[..., here, here]
         )
         group = step.gated(group, lambda: (at, slope @ p[..., here, here] @ slope.mT + extra))
-        big = np.zeros((*slope.shape[:-1], m.shape[-1]))
-        big[..., here] = slope
+        big = np.ascontiguousarray(slope)
+        if m.shape[-1] > d:
+            big = np.zeros((*slope.shape[:-1], m.shape[-1]))
+            big[..., here] = slope
         noise = np.broadcast_to(group.noise + extra, (*big.shape[:-1], big.shape[-2]))
         (m, p), errors = guarded(
             lambda m, p, gap, big, noise, *_: unchecked(conditioned)(m, p, gap, big, noise),

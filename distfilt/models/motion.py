@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Annotated
 
 import numpy as np
@@ -56,13 +56,26 @@ def constant_velocity(
     )
 
 
+@lru_cache(maxsize=64)
 def _straight(dt: float, axes: int) -> Array:
-    return np.asarray(np.kron([[1.0, dt], [0.0, 1.0]], np.eye(axes)), dtype=np.float64)
+    return _along_axes(np.array([[1.0, dt], [0.0, 1.0]]), axes)
 
 
 def _straight_noise(t: float, dt: float, sigma: float, axes: int) -> Array:
+    return _steady_noise(dt, sigma, axes)
+
+
+@lru_cache(maxsize=64)
+def _steady_noise(dt: float, sigma: float, axes: int) -> Array:
     block = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-    return np.asarray(np.kron(sigma**2 * block, np.eye(axes)), dtype=np.float64)
+    return _along_axes(sigma**2 * block, axes)
+
+
+def _along_axes(block: Array, axes: int) -> Array:
+    """A block for each axis, read-only, since the same few are asked for in every step."""
+    out = np.asarray(np.kron(block, np.eye(axes)), dtype=np.float64)
+    out.setflags(write=False)
+    return out
 
 
 @door
