@@ -159,20 +159,25 @@ class Step:
         own = [list(mine) for mine in self.said]
         for late in self.late:
             own[late.agent].append(late)
-        heard = [{agent: [(said, said.value) for said in mine]} for agent, mine in enumerate(own)]
+        heard = [
+            {agent: [(said.t, sensor_of(f, said), said.value) for said in mine]}
+            for agent, mine in enumerate(own)
+        ]
         told = self._told(own)
         if self.channel is not None and told:
             inbox = self.channel.exchange([self._payload(mine) for mine in told])
+            kinds = [[(said.t, sensor_of(f, said)) for said in mine] for mine in told]
             for has, box in zip(heard, inbox, strict=True):
                 for sender, payload in box.items():
                     values = payload if isinstance(payload, tuple) else (payload,)
-                    has[sender] = list(zip(told[sender], values, strict=False))
+                    both = zip(kinds[sender], values, strict=False)
+                    has[sender] = [(t, sensor, value) for (t, sensor), value in both]
         known: dict[float, list[list[tuple[Sensor, Array]]]]
         known = defaultdict(lambda: [[] for _ in own])
         for agent, has in enumerate(heard):
             for sender in sorted(has):
-                for said, value in has[sender]:
-                    known[said.t][agent].append((sensor_of(f, said), value))
+                for t, sensor, value in has[sender]:
+                    known[t][agent].append((sensor, value))
         return known
 
     def _told(self, own: list[list[Reading]]) -> list[list[Reading]]:
