@@ -92,17 +92,12 @@ def recorded(
         for name, value in (_told(last, summary) | scored).items():
             columns.setdefault(name, []).append(np.asarray(value))
 
-    if columns:
-        variance = np.array(columns["variance"])
-        spread = np.sqrt(np.nansum(variance, axis=-1))
-        columns["spread"] = [*np.where(np.isnan(variance).all(axis=-1), np.nan, spread)]
-
     n = len(start.runs)
     lead = ("time", *(("run",) if n == 1 else [f"run{i}" for i in range(n)]), "agent")
     axes = {"covariance": (*lead, "component", "column")}
     axes |= {k: (*lead, "component") for k in ("mean", "variance", "squared_error", "crps")}
     data = {
-        name: (axes.get(name, lead), np.array(values), _attributes(name))
+        name: (axes.get(name, lead), _series(name, np.array(values)), _attributes(name))
         for name, values in columns.items()
     }
     for name in _SENT:
@@ -142,13 +137,21 @@ def _known(
 
 def _told(state: Any, summary: Summary) -> dict[str, Array]:
     """What is recorded of a state without a truth."""
-    # The spread is made of all variances at the end.
+    # The spread is made of the variances of all times at once.
     out = {"mean": summary.mean, "variance": summary.variance, "spread": summary.variance}
     if summary.covariance is not None:
         out["covariance"] = summary.covariance
     if state.refused is not None:
         out["refused"] = state.refused
     return out | dict(summary.numbers)
+
+
+def _series(name: str, values: Array) -> Array:
+    """What is recorded of all times, (T, ...)."""
+    if name != "spread":
+        return values
+    spread = np.sqrt(np.nansum(values, axis=-1))
+    return np.where(np.isnan(values).all(axis=-1), np.nan, spread)
 
 
 def _scored(
