@@ -271,10 +271,10 @@ def guarded(
 
     >>> def root(x, shared, rng):
     ...     return (np.linalg.cholesky(x),)
-    >>> x = np.array([[[4.0]], [[-1.0]]])
+    >>> x = np.array([[[4.0]], [[-1.0]], [[9.0]]])
     >>> out, errors = guarded(root, (x,), (x,), 1, shared=np.eye(1))
     >>> out[0].ravel(), errors
-    (array([ 2., -1.]), {(1,): 'Matrix is not positive definite'})
+    (array([ 2., -1.,  3.]), {(1,): 'Matrix is not positive definite'})
     """
     at: Any = None if rng is None else rng.bit_generator.state
     errors: dict[Row, str] = {}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from distfilt import metrics
-from distfilt.filters import FilterError, Reading
+from distfilt.filters import FilterError, Reading, final_state
 from distfilt.models import LinearModel, Model
 from distfilt.network import Faults
 from distfilt.sensors import Sensor, angle, direct
@@ -206,6 +206,21 @@ def test_late_reading_is_in_time_after_all(family: str) -> None:
                    1.5, [[0.1]])
     gap = np.abs(a.mean.mean(axis=0) - b.mean.mean(axis=0)).max()
     assert gap < 0.12 < np.abs(g.summary(blind).mean.mean(axis=0) - b.mean.mean(axis=0)).max()
+
+
+@EACH
+def test_a_run_takes_each_late_reading_when_it_arrives(family: str) -> None:
+    f, start = made(family, sensors=[direct([0], std=0.4)], graph=None, lag=2)
+    times, seen = [0.5, 1.0, 1.5, 2.0], np.array([[np.nan], [0.3], [np.nan], [0.1]])
+    late = [Reading(1.5, 0, [1.1], arrived=2.0), Reading(0.5, 0, [1.9], arrived=1.2)]
+    run = f.run(start, times, [seen], late=late)
+    state = start
+    for t, y in zip(times, seen, strict=True):
+        due = [r for r in late if r.arrived is not None and t - 0.5 < r.arrived <= t]
+        state = f.step(state, t, [y], late=due)
+    assert same(final_state(run), state)
+    with pytest.raises(ValueError, match="late: needs arrivals up to 1.5, got 2.0"):
+        f.run(start, times[:3], [seen[:3]], late=late)
 
 
 @EACH

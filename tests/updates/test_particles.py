@@ -50,6 +50,9 @@ def test_weights_by_bayes_rule_with_a_missing_component() -> None:
     for seen, wanted in ((y, both), (np.array([y[0], np.nan]), one)):
         w = np.exp(wanted) / np.exp(wanted).sum()
         assert np.allclose(np.exp(weighed(before, h, seen, noise)), w)
+    # What one particle cannot predict says nothing of any.
+    h[3, 1] = np.nan
+    assert np.allclose(np.exp(weighed(before, h, y, noise)), w)
 
 
 def test_jitter_keeps_mean_and_covariance_on_average() -> None:
