@@ -1,4 +1,4 @@
-"""A study that runs on this machine's cores, on a Dask cluster or under MPI, to the same bits."""
+"""A study on this machine's cores, on a Dask cluster or under MPI."""
 
 import sys
 
@@ -11,18 +11,20 @@ from distfilt.network import graphs
 from distfilt.sensors import distance
 
 model = constant_velocity(sigma=0.1)
-sensors = [distance([0, 1], std=0.3, origin=p) for p in [(0, 0), (9, 0), (0, 9), (9, 9)]]
+corners = [(0, 0), (9, 0), (0, 9), (9, 9)]
+sensors = [distance([0, 1], std=0.3, origin=c) for c in corners]
 f = EnsembleFilter.exact(model, sensors, graphs.ring(4), members=60)
 
 
 def trial(seed):
-    """One truth, its readings and a run of the filter: squared error and what was claimed, m²."""
+    """One truth, its readings, a run: squared error and the claimed, m²."""
     rng, times = np.random.default_rng(seed), np.arange(1, 11) * 0.5
     truth = simulate(model, [4.0, 4.0, 0.1, 0.0], times, rng=rng)
     seen = [sensor.observe(truth, rng=rng) for sensor in sensors]
     state = f.start(([4, 4, 0, 0], np.diag([1, 1, 0.1, 0.1])), rng=rng)
-    run = f.run(state, times, seen, truth=truth)[["squared_error", "variance"]]
-    return [float(x[5:, :, :2].mean()) for x in run.values()]
+    run = f.run(state, times, seen, truth=truth)
+    both = run["squared_error"], run["variance"]
+    return [float(x[5:, :, :2].mean()) for x in both]
 
 
 def executor(where):
@@ -40,7 +42,9 @@ def executor(where):
 if __name__ == "__main__":
     where, *some = sys.argv[1:]
     made = studies.store(
-        "errors.csv", trial, studies.spawn(2026, 40), columns=["error", "claim"], parameters={},
-        indices=range(*map(int, some)) if some else None, executor=executor(where),
-    )  # fmt: skip
+        "errors.csv", trial, studies.spawn(2026, 40),
+        columns=["error", "claim"], parameters={},
+        indices=range(*map(int, some)) if some else None,
+        executor=executor(where),
+    )
     print(made)
