@@ -11,8 +11,8 @@ from distfilt.network import graphs
 from distfilt.sensors import distance
 
 model = constant_velocity(sigma=0.1)
-corners = [(0, 0), (9, 0), (0, 9), (9, 9)]
-sensors = [distance([0, 1], std=0.3, origin=c) for c in corners]
+sensors = [distance([0, 1], std=0.3, origin=(x, 9)) for x in (0, 3, 6, 9)]
+COLUMNS = ["squared_error", "variance"]
 f = EnsembleFilter.exact(model, sensors, graphs.ring(4), members=60)
 
 
@@ -23,8 +23,7 @@ def trial(seed):
     seen = [sensor.observe(truth, rng=rng) for sensor in sensors]
     state = f.start(([4, 4, 0, 0], np.diag([1, 1, 0.1, 0.1])), rng=rng)
     run = f.run(state, times, seen, truth=truth)
-    both = run["squared_error"], run["variance"]
-    return [float(x[5:, :, :2].mean()) for x in both]
+    return [float(run[name][5:, :, :2].mean()) for name in COLUMNS]
 
 
 def executor(where):
@@ -41,10 +40,8 @@ def executor(where):
 
 if __name__ == "__main__":
     where, *some = sys.argv[1:]
-    made = studies.store(
-        "errors.csv", trial, studies.spawn(2026, 40),
-        columns=["error", "claim"], parameters={},
+    print(studies.store(
+        "errors.csv", trial, studies.spawn(2026, 40), columns=COLUMNS,
+        parameters={}, executor=executor(where),
         indices=range(*map(int, some)) if some else None,
-        executor=executor(where),
-    )
-    print(made)
+    ))
