@@ -263,6 +263,8 @@ def test_a_rule_that_its_null_passes_too_shows_nothing() -> None:
     swept = below(0.1)._replace(range="for gains from .1 on")
     verdict = judge_claims("grange", "Fig. 1", [CLAIMS[0], swept, CLAIMS[2]])
     assert verdict.range == "pca-stable for gains from .1 on"
+    hangs = judge_claims("grange", "Fig. 1", [CLAIMS[0], swept, CLAIMS[2]], free="no gain printed")
+    assert (hangs.verdict, hangs.why) == ("not comparable", "no gain printed")
 
 
 def test_a_verdict_travels_in_a_notebook() -> None:

@@ -203,15 +203,14 @@ class Claim(NamedTuple):
         order holds: ratio 0.8
         """
         beside = f"{against}: {shown(null)}"
-        holds, passes = bool(rule(ours)), bool(rule(null))
-        return cls(id, text, holds, shown(ours), beside, not passes, range)
+        return cls(id, text, bool(rule(ours)), shown(ours), beside, not rule(null), range)
 
     def __str__(self) -> str:
         return f"{self.id} {'holds' if self.holds else 'fails'}: {self.text} {self.evidence}"
 
 
 def judge_claims(
-    paper: str, item: str, claims: Sequence[Claim], *, why: str = "",
+    paper: str, item: str, claims: Sequence[Claim], *, why: str = "", free: str = "",
     scenario: Scenario | None = None,
 ) -> Verdict:
     """The verdict on a figure: a match if every claim listed for it is judged and holds.
@@ -225,6 +224,9 @@ def judge_claims(
         Every listed claim, once.
     why : str
         Why it differs; needed and used only if a claim fails.
+    free : str
+        What the paper does not print and the verdict hangs on, so that it is "not comparable";
+        the claims' ranges say for which values they hold.
     scenario : Scenario, optional
         What the study ran; if it is not the paper's, the verdict is "not comparable" and names
         what was changed.
@@ -253,10 +255,11 @@ def judge_claims(
     ours = "; ".join(str(c) for c in claims)
     said = "; ".join(row["claim"] for row in listed.values())
     good, blunt = all(c.holds for c in claims), [c.id for c in claims if not c.bites]
-    open_ = f"the rule of {', '.join(blunt)} holds for its null too" if good and blunt else ""
+    if good and blunt and not free:
+        free = f"the rule of {', '.join(blunt)} holds for its null too"
     null = "; ".join(f"{c.id}, {c.null}" for c in claims if c.null)
     swept = "; ".join(f"{c.id} {c.range}" for c in claims if c.range)
-    return _judged(known, good, ours, said, why, scenario, open_=open_, null=null, range=swept)
+    return _judged(known, good, ours, said, why, scenario, open_=free, null=null, range=swept)
 
 
 def judge_parameters(
