@@ -17,9 +17,9 @@ import nbformat
 import numpy as np
 from PIL import Image
 
-# With a slider the PNG's own first bytes tell it from other text; a notebook escapes quotes.
+# With a slider a WebP's own first bytes tell it from other text; a notebook escapes quotes.
 _EMBEDDED = re.compile(
-    r'(?<=data:image/png;base64,)[A-Za-z0-9+/=\n]+|(?<=")iVBORw0KGgo[A-Za-z0-9+/=]+'
+    r'(?<=data:image/webp;base64,)[A-Za-z0-9+/=\n]+|(?<=")UklGR[A-Za-z0-9+/=]+'
 )
 SHADE = 0.25
 """A pixel differs if its shade does by more than this share of black to white."""
@@ -28,12 +28,12 @@ SHARE = 5e-4
 
 
 def taken_out(text: str) -> tuple[str, list[str]]:
-    """Return a text without the PNGs that are written in it, and these."""
+    """Return a text without the frames of sliders that are written in it, and these."""
     return _EMBEDDED.sub("…", text), _EMBEDDED.findall(text)
 
 
 def stored_pictures(output: Any) -> list[str]:
-    """Return the PNGs of an output, those that its HTML embeds included, as base64."""
+    """Return the pictures of an output, those that its HTML embeds included, as base64."""
     data = output.get("data", {})
     out = [data["image/png"]] if "image/png" in data else []
     return out + taken_out(_joined(data.get("text/html", "")))[1]
@@ -44,7 +44,7 @@ def _joined(text: Any) -> str:
 
 
 def without_pictures(outputs: list[Any]) -> list[Any]:
-    """Return outputs with every PNG replaced by its place."""
+    """Return outputs with every picture replaced by its place."""
     out = []
     for output in outputs:
         data = dict(output.get("data", {}))

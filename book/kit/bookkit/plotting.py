@@ -108,6 +108,8 @@ def _print_digests() -> None:
     if shell is not None:
         # The notebook's backend forgets printers when it starts, with the first figure: start it.
         pyplot.switch_backend(get_backend())
+        # Twice the pixels, at the same size on the page.
+        shell.run_line_magic("config", "InlineBackend.figure_format = 'retina'")
         text = shell.display_formatter.formatters["text/plain"]
         text.for_type(Figure, lambda figure, printer, cycle: printer.text(of_axes(figure)))
 

@@ -9,6 +9,8 @@ import io
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from string import Template
 from typing import Any
 
 from matplotlib import pyplot
@@ -21,65 +23,12 @@ __all__ = ["Slider", "slider"]
 LIMIT = 400_000
 """Characters of HTML at most: a page with three of them still opens at once.
 
-Fewer or smaller frames, fewer colours and less fine detail make it shorter.
+Fewer or smaller frames and less fine detail make it shorter.
 """
 
-_PAGE = """\
-<div class="frames" data-frames="{key}" role="group" aria-label="{label}">
-<img src="data:image/png;base64,{first}" alt="{alt}" width="{width}" height="{height}" \
-style="max-width:100%;height:auto">
-<div class="frames-controls" style="display:none;gap:.6em;align-items:center;max-width:{width}px">
-<button type="button" aria-label="Play" style="min-width:2.4em">&#9654;</button>
-<input type="range" min="0" max="{last}" step="1" value="{start}" aria-label="{label}" \
-style="flex:1;min-width:6em">
-<output style="min-width:7em">{said}</output>
-</div>
-<script type="application/json">{data}</script>
-<script>
-(() => {{
-  const set = (root) => {{
-    root.dataset.ready = "";
-    const data = JSON.parse(root.querySelector("script[type='application/json']").textContent);
-    const [image, input] = [root.querySelector("img"), root.querySelector("input")];
-    const [button, output] = [root.querySelector("button"), root.querySelector("output")];
-    root.querySelector(".frames-controls").style.display = "flex";
-    const show = () => {{
-      const frame = Number(input.value);
-      image.src = "data:image/png;base64," + data.frames[frame];
-      image.alt = data.alt + " " + data.said[frame] + ".";
-      output.textContent = data.said[frame];
-      input.setAttribute("aria-valuetext", data.said[frame]);
-    }};
-    let timer = null;
-    const stop = () => {{
-      clearInterval(timer);
-      timer = null;
-      button.textContent = "\\u25B6";
-      button.setAttribute("aria-label", "Play");
-    }};
-    const step = () => {{
-      if (!root.isConnected) return stop();
-      input.value = (Number(input.value) + 1) % data.frames.length;
-      show();
-    }};
-    input.addEventListener("input", () => {{ stop(); show(); }});
-    button.addEventListener("click", () => {{
-      if (timer !== null) return stop();
-      timer = setInterval(step, data.milliseconds);
-      button.textContent = "\\u275A\\u275A";
-      button.setAttribute("aria-label", "Pause");
-    }});
-    show();
-  }};
-  const find = (left) => {{
-    const roots = document.querySelectorAll("[data-frames='{key}']:not([data-ready])");
-    roots.forEach(set);
-    if (!roots.length && left > 0) requestAnimationFrame(() => find(left - 1));
-  }};
-  find(120);
-}})();
-</script>
-</div>"""
+_PAGE = Template((Path(__file__).parent / "slider.html").read_text(encoding="utf-8"))
+_SECONDS = 5.0
+"""How long all frames together play; a frame stays half a second at most."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -89,7 +38,9 @@ class Slider:
     Parameters
     ----------
     frames : tuple of bytes
-        One PNG a frame.
+        One lossless WebP a frame, of twice the pixels that it takes on a page.
+    size : tuple of int
+        Width and height on a page, in pixels.
     said : tuple of str
         What is shown beside each frame, such as ``gain 0.1``.
     digests : tuple of str
@@ -102,6 +53,7 @@ class Slider:
     """
 
     frames: tuple[bytes, ...]
+    size: tuple[int, int]
     said: tuple[str, ...]
     digests: tuple[str, ...]
     label: str
@@ -109,8 +61,6 @@ class Slider:
     start: int
 
     def __post_init__(self) -> None:
-        if len({frame[16:24] for frame in self.frames}) != 1:
-            raise ValueError("draw: needs figures of one size")
         if len(self.html) > LIMIT:
             raise ValueError(f"frames: needs at most {LIMIT} characters, got {len(self.html)}")
 
@@ -127,18 +77,17 @@ class Slider:
         data = {
             "alt": self.alt,
             "said": self.said,
-            "milliseconds": 500,
+            "milliseconds": round(1000 * min(0.5, _SECONDS / len(self.frames))),
             "frames": pictures,
         }
-        width, height = (int.from_bytes(self.frames[0][k : k + 4]) for k in (16, 20))
-        return _PAGE.format(
+        return _PAGE.substitute(
             # Of what the frames show, not of their bytes, which another machine may draw otherwise.
             key=hashlib.sha256(repr(self).encode()).hexdigest()[:16],
             label=html.escape(self.label),
             first=pictures[self.start],
             alt=html.escape(f"{self.alt} {self.said[self.start]}."),
-            width=width,
-            height=height,
+            width=self.size[0],
+            height=self.size[1],
             last=len(self.frames) - 1,
             start=self.start,
             said=html.escape(self.said[self.start]),
@@ -146,22 +95,24 @@ class Slider:
         )
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
+        still = io.BytesIO()
+        Image.open(io.BytesIO(self.frames[self.start])).save(still, format="png", optimize=True)
         return {
             "text/plain": repr(self),
             "text/html": self.html,
-            "image/png": base64.b64encode(self.frames[self.start]).decode(),
+            "image/png": base64.b64encode(still.getvalue()).decode(),
         }
 
 
 def slider(
     draw: Callable[[Any], Any], values: Sequence[Any], *, label: str, alt: str,
-    unit: str | None = None, form: str = "g", start: int = 0, colours: int = 32,
+    unit: str | None = None, form: str = "g", start: int = 0,
 ) -> Slider:
     """Draw a figure for each value, and go through them with a slider that needs no kernel.
 
     Every frame is drawn now. The HTML that comes out holds them all, with a slider, a button that
-    plays them and a text for readers who do not see them. It works on the book's pages, in
-    JupyterLab and in a file sent by mail; without scripts the first frame is left.
+    plays them from the beginning, and a text for readers who do not see them. It works on the
+    book's pages, in JupyterLab and in a file sent by mail; without scripts the first frame is left.
 
     Parameters
     ----------
@@ -169,7 +120,7 @@ def slider(
         ``draw(value)`` returns a matplotlib figure or axes; all figures of one size. Axes of one
         scale in all frames let a reader compare them: fix their limits.
     values : sequence
-        One a frame; ten to thirty are enough.
+        One a frame; with 24 or more what moves looks smooth.
     label : str
         What the slider sets, such as ``gain``.
     alt : str
@@ -181,8 +132,6 @@ def slider(
     start : int
         The frame that is shown first, counted from 0. Choose the one that says most: it is also
         the picture in print.
-    colours : int
-        Colours of a frame's palette, 2 to 256. Few make a small file.
 
     Examples
     --------
@@ -197,17 +146,19 @@ def slider(
     """
     ending = "" if unit is None else f" {unit}"
     said = tuple(f"{label} {format(value, form)}{ending}" for value in values)
-    frames, digests = zip(*(_frame(draw(value), colours) for value in values), strict=True)
-    return Slider(frames, said, digests, label, alt, start)
+    frames, sizes, digests = zip(*(_frame(draw(value)) for value in values), strict=True)
+    if len(set(sizes)) != 1:
+        raise ValueError("draw: needs figures of one size")
+    return Slider(frames, sizes[0], said, digests, label, alt, start)
 
 
-def _frame(drawn: Any, colours: int) -> tuple[bytes, str]:
-    """A figure as a small PNG, and its digest; the figure is closed, so that no cell shows it."""
+def _frame(drawn: Any) -> tuple[bytes, tuple[int, int], str]:
+    """A figure as a picture, its size and digest; it is closed, so that no cell shows it."""
     figure = getattr(drawn, "figure", drawn)
     whole, small = io.BytesIO(), io.BytesIO()
     text = of_axes(figure)
-    figure.savefig(whole, format="png", metadata={"Software": None}, bbox_inches=None)
+    figure.savefig(whole, format="png", dpi=2 * figure.dpi, bbox_inches=None)
     pyplot.close(figure)
     picture = Image.open(whole).convert("RGB")
-    picture.quantize(colours, dither=Image.Dither.NONE).save(small, format="png", optimize=True)
-    return small.getvalue(), text
+    picture.save(small, format="webp", lossless=True, quality=100, method=6)
+    return small.getvalue(), (picture.width // 2, picture.height // 2), text

@@ -1,0 +1,59 @@
+"""Results as tables that a page renders, and that a comparison of stored outputs reads as text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from html import escape
+
+import pandas as pd
+
+__all__ = ["table"]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class table:
+    """A frame as a table: numbers in a given form, the best of a column in bold.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        Its index is the table's first column. A cell that is a text is shown as it is.
+    form : mapping, optional
+        Format of a column's numbers, as of `format`.
+    best : mapping, optional
+        ``"min"`` or ``"max"`` for each column whose best number is shown in bold.
+    caption : str
+        What the table shows, with units.
+
+    Examples
+    --------
+    >>> rows = pd.DataFrame({"error, m": [0.5234, 0.4]}, index=["alone", "fused"])
+    >>> table(rows, form={"error, m": ".2f"}, best={"error, m": "min"})
+          error, m
+    alone     0.52
+    fused     0.40
+    """
+
+    frame: pd.DataFrame
+    form: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    best: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    caption: str = field(default="", kw_only=True)
+
+    def _shown(self, name: str) -> list[str]:
+        form = self.form.get(name, "")
+        return [v if isinstance(v, str) else format(v, form) for v in self.frame[name]]
+
+    def __repr__(self) -> str:
+        texts = self.frame.assign(**{name: self._shown(name) for name in self.form})
+        return "\n".join(filter(None, [self.caption, texts.to_string()]))
+
+    def _repr_html_(self) -> str:
+        cells = {}
+        for name in self.frame:
+            best = self.frame[name].agg(self.best[name]) if name in self.best else None
+            pairs = zip(self.frame[name], map(escape, self._shown(name)), strict=True)
+            cells[name] = [f"<b>{t}</b>" if value == best else t for value, t in pairs]
+        page = self.frame.assign(**cells).to_html(escape=False, border=0)
+        head = f"<caption>{escape(self.caption)}</caption>\n<thead>"
+        return str(page).replace("<thead>", head, 1)
