@@ -56,6 +56,8 @@ def test_intersection_is_the_weighted_sum_of_information(seed: int, s: int, d: i
     assert (found[1] == found[1].swapaxes(-1, -2)).all()
     one = intersection(m[2], p[2], w[2])
     assert np.allclose(one[0], found[0][2], atol=worst) and np.allclose(one[1], found[1][2])
+    several = intersection(m[2], np.stack([p[2], 2 * p[2]]), w[2])
+    assert np.allclose(several[0], one[0], atol=worst) and np.allclose(several[1][1], 2 * one[1])
 
 
 def test_intersection_of_the_same_or_one_source_changes_nothing() -> None:

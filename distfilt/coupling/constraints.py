@@ -57,7 +57,13 @@ class Constraint(Record):
 
     def missed(self, x: Array) -> Array:
         """The same without a door, for trial steps: NaN where the function has no value."""
-        g, shape = self.function(x.copy()), (*x.shape[:-1], self.value.size)
+        shape = (*x.shape[:-1], self.value.size)
+        try:
+            g = self.function(x.copy())
+        except IndexError as error:
+            raise ValueError(
+                f"constraint: needs states with more than {x.shape[-1]} components: {error}"
+            ) from error
         return array(g, "function", shape, finite=False) - self.value
 
     @door

@@ -29,7 +29,7 @@ __all__ = [  # fmt: skip
 ]
 
 Members = Annotated[Array, "... n d", SQUARED]
-AsMoved = Annotated[Array, "*moved.shape"]
+AsMoved = Annotated[Array, "*moved.shape", SQUARED]
 
 _TIE = 1e-7
 """In units of the largest cost. The weighted mean stays exact, the plan costs at most this more."""

@@ -73,9 +73,9 @@ def intersection(
     (array([1.]), array([[1.333333]]))
     """
     lead = leading(weights.shape[:-1], means.shape[:-2], "means")
-    leading(lead, covs.shape[:-3], "covs")
-    d = means.shape[-1]
-    here = weights > 0
+    lead = leading(lead, covs.shape[:-3], "covs")
+    size, d = means.shape[-2:]
+    means, here = np.broadcast_to(means, (*lead, size, d)), weights > 0
     m = _counted(means, here[..., None], 0.0, "means")
     lower = cholesky(_counted(covs, here[..., None, None], np.eye(d), "covs"))
     first, centre = lower[..., 0, :, :], m[..., 0, :]

@@ -176,3 +176,5 @@ def test_a_constraint_that_has_no_real_value_is_refused(value: complex) -> None:
     for call in (retract, project):
         with pytest.raises(ValueError, match="function: needs"):
             call(x, g)
+        with pytest.raises(ValueError, match="^constraint: needs states with more than 1"):
+            call(x[..., None], norm([0, 1]))

@@ -9,6 +9,7 @@ import re
 
 import matplotlib
 import numpy as np
+import pandas as pd
 import pytest
 from bs4 import BeautifulSoup
 from PIL import Image
@@ -19,6 +20,7 @@ from matplotlib.colors import to_rgb
 
 from bookkit import plotting
 from bookkit.plotting import PALETTE, SIZE, axes, colour, graph, line_style, slider, use_style
+from bookkit.tables import table
 
 
 @pytest.fixture(autouse=True)
@@ -152,3 +154,13 @@ def test_texts_of_a_slider_cannot_end_its_script():
     found = slider(curve, [1.0], label="rate", alt="</script><b>x</b>")
     find, data = found_in(found.html)
     assert data["alt"] == "</script><b>x</b>" and not find("b")
+
+
+def test_a_table_marks_the_best_number_in_the_form_that_is_asked_for():
+    frame = pd.DataFrame({"m": [0.523, np.nan, 0.404], "rule": ["a<b", "c", "d"]}, index=[*"xyz"])
+    found = table(frame, form={"m": ".2f"}, best={"m": "min"}, caption="Error")
+    page = BeautifulSoup(found._repr_html_(), "html.parser")
+    rows = [[c.text for c in row.find_all(["th", "td"])] for row in page.find_all("tr")]
+    assert rows == [["", "m", "rule"], ["x", "0.52", "a<b"], ["y", "nan", "c"], ["z", "0.40", "d"]]
+    assert [b.text for b in page.find_all("b")] == ["0.40"] and page.caption.text == "Error"
+    assert repr(found).split() == ["Error", *rows[0][1:], *rows[1], *rows[2], *rows[3]]
