@@ -20,8 +20,8 @@ from .digests import of_axes
 
 __all__ = ["Slider", "slider"]
 
-LIMIT = 400_000
-"""Characters of HTML at most: a page with three of them still opens at once.
+LIMIT = 800_000
+"""Characters of HTML at most: a page with two of them weighs less than two megabytes.
 
 Fewer or smaller frames and less fine detail make it shorter.
 """
@@ -160,5 +160,5 @@ def _frame(drawn: Any) -> tuple[bytes, tuple[int, int], str]:
     figure.savefig(whole, format="png", dpi=2 * figure.dpi, bbox_inches=None)
     pyplot.close(figure)
     picture = Image.open(whole).convert("RGB")
-    picture.save(small, format="webp", lossless=True, quality=100, method=6)
+    picture.save(small, format="webp", lossless=True, quality=80, method=4)
     return small.getvalue(), (picture.width // 2, picture.height // 2), text
