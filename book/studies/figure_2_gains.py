@@ -35,4 +35,13 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     return out
 
 
+def part(seed: np.random.SeedSequence) -> dict[str, float]:
+    """The largest gain at which the claim fails, as in the trial, for chapter 4 to run again."""
+    for_data, for_filters = seed.spawn(2)
+    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    for_filters.spawn(2)  # of the two gains before it
+    f = satellites.published(SETUP, pca=True, gain=GAINS["g03"])
+    return satellites.scored(SETUP, "g03", satellites.run(SETUP, f, for_filters, truth, seen))
+
+
 code = (satellites.data, satellites.published, satellites.scored)

@@ -47,4 +47,14 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     return out
 
 
+def part(seed: np.random.SeedSequence) -> dict[str, float]:
+    """A reading that does not run away, as in the trial, for chapter 4 to run again."""
+    for_data, for_filters = seed.spawn(2)
+    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,), noisy=False)
+    for_filters.spawn(3)  # of the three readings before it
+    f = satellites.published(SETUP, pca=True, noise_factor=FACTORS["hundredth"])
+    result = satellites.run(SETUP, f, for_filters, truth, seen, ("squared_error",))
+    return satellites.scored(SETUP, "printed_hundredth_pca", result, each_agent=False)
+
+
 code = (satellites.data, satellites.published, satellites.noise_free, satellites.scored)

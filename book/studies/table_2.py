@@ -105,4 +105,12 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     return out | central("iterated", iterated(first, readings), truth)
 
 
+def part(seed: np.random.SeedSequence) -> dict[str, float]:
+    """The filter with exact draws alone, as the trial runs it: what chapter 4 runs again."""
+    for_data, for_filters = seed.spawn(2)
+    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    f, source = satellites.repaired(SETUP, "exact"), for_filters.spawn(len(EXACT))[0]
+    return satellites.scored(SETUP, "exact", satellites.run(SETUP, f, source, truth, seen))
+
+
 code = (iterated, extended, central, satellites.data, satellites.published, satellites.repaired)
