@@ -118,11 +118,14 @@ def unchecked(function: F) -> F:
     >>> unchecked(print) is print
     True
     """
-    if isinstance(function, partial):
-        return cast(F, partial(unchecked(function.func), *function.args, **function.keywords))
-    if isinstance(function, MethodType):
-        return cast(F, MethodType(unchecked(function.__func__), function.__self__))
-    return cast(F, getattr(function, "unchecked", function))
+    given: Any = function
+    if isinstance(given, MethodType):
+        given = MethodType(unchecked(given.__func__), given.__self__)
+    elif isinstance(given, partial):
+        given = partial(unchecked(given.func), *given.args, **given.keywords)
+    else:
+        given = getattr(given, "unchecked", given)
+    return given  # type: ignore[no-any-return]
 
 
 class Record:
