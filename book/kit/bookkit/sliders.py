@@ -13,7 +13,9 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+import numpy as np
 from matplotlib import pyplot
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
 from .digests import of_axes
@@ -155,10 +157,11 @@ def slider(
 def _frame(drawn: Any) -> tuple[bytes, tuple[int, int], str]:
     """A figure as a picture, its size and digest; it is closed, so that no cell shows it."""
     figure = getattr(drawn, "figure", drawn)
-    whole, small = io.BytesIO(), io.BytesIO()
-    text = of_axes(figure)
-    figure.savefig(whole, format="png", dpi=2 * figure.dpi, bbox_inches=None)
+    small, text = io.BytesIO(), of_axes(figure)
     pyplot.close(figure)
-    picture = Image.open(whole).convert("RGB")
+    canvas: Any = FigureCanvasAgg(figure)
+    figure.set_dpi(2 * figure.dpi)
+    canvas.draw()
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     picture.save(small, format="webp", lossless=True, quality=80, method=4)
     return small.getvalue(), (picture.width // 2, picture.height // 2), text
