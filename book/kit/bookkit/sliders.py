@@ -163,5 +163,6 @@ def _frame(drawn: Any) -> tuple[bytes, tuple[int, int], str]:
     figure.set_dpi(2 * figure.dpi)
     canvas.draw()
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    figure.set_dpi(figure.dpi / 2)  # it may be drawn again for the next frame
     picture.save(small, format="webp", lossless=True, quality=80, method=4)
     return small.getvalue(), (picture.width // 2, picture.height // 2), text
