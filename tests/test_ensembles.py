@@ -128,6 +128,7 @@ def test_exact_noise_says_how_many_members_it_needs() -> None:
         exact_noise(x[:7], FULL, rng=generator())
     rank_one = np.ones((3, 3))
     assert exact_noise(x[:6], rank_one, rng=generator()).shape == (6, 3)
+    assert exact_noise(x[:6], rank_one[None, None], rng=generator()).shape == (1, 1, 6, 3)
     assert (exact_noise(x[:5], np.zeros((3, 3)), rng=generator()) == 0).all()
 
 

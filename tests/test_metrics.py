@@ -38,6 +38,8 @@ def test_nees_and_nis_are_their_definitions(leading):
     one = cov[(0,) * len(leading)]
     exact = (gap * np.linalg.solve(one, gap[..., None])[..., 0]).sum(-1)
     assert np.allclose(nees(estimate, one, truth), exact, rtol=1e-10)
+    with pytest.raises(ValueError, match="^truth: needs leading axes"):
+        nees(np.ones((2, 4)), one, np.ones((3, 4)))
 
 
 

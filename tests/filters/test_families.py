@@ -112,7 +112,7 @@ def test_jitter_moves_copies_by_a_share_of_what_is_believed() -> None:
     after = f.step(before, 2.0, [None]).points[0, :, 0]
     old = before.points[0, :, 0]
     stayed = np.isin(after, old)
-    assert 0.02 < stayed.mean() < 0.5
+    assert 0.02 < stayed.mean() < 0.5 and EnsembleFilter(still, f.sensors, members=2).members == 2
     plain = ParticleFilter(still, f.sensors, members=4000, threshold=1.0, jitter=0.0)
     picked = plain.step(before, 2.0, [None]).points[0, :, 0]
     moves = (after - picked)[~stayed]

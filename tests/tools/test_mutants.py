@@ -60,16 +60,6 @@ def test_a_sample_is_the_seed_s_and_has_one_change_a_place(repository: Path) -> 
     assert mutants.drawn(repository, 50, 3, "other") == []
 
 
-def test_a_sample_stays_when_other_lines_change(repository: Path) -> None:
-    module = repository / "distfilt" / "a.py"
-    before = [m.source(LIBRARY) for m in mutants.drawn(repository, 50, 3, "")]
-    module.write_text(LIBRARY.replace("def unused", "FIRST = 7\n\n\ndef unused"), encoding="utf-8")
-    found = mutants.drawn(repository, 50, 3, "")
-    kept = [m.source(module.read_text(encoding="utf-8")) for m in found]
-    kept = [t.replace("FIRST = 7\n\n\n", "") for t in kept if "FIRST = 7" in t]
-    assert len(found) > len(before) and kept == before
-
-
 def test_a_line_is_tested_by_what_runs_its_statement_or_function_or_module() -> None:
     text = "A = (\n    1\n)\n\ndef f(x,\n      y=2):\n    z = (x +\n         y)\n    return z\n"
     contexts = {1: [""], 5: [""], 7: ["t.py::a[1]|run", "t.py::a[2]|run", ""], 9: ["t.py::b|call"]}

@@ -58,6 +58,7 @@ def test_sparse_components_do_not_see_what_they_leave_out() -> None:
     y, x, _ = banana(7)
     s = fit(y, x, order=2, uses=[[], [0]])
     assert s.weights[0].shape == (1,) and s.weights[1].shape == (4,)
+    assert fit(y[:8], x[:8], order=2, uses=[[], [0]])(y, x).shape == x.shape
     assert (s(y + 1, x)[:, 0] == s(y, x)[:, 0]).all()
     full = fit(y, x, order=2)
     assert affine.objective(full, y, x) <= affine.objective(s, y, x)
