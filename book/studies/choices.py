@@ -21,7 +21,10 @@ PAPER = "das"
 STDS = (0.02, 0.05, 0.1, 0.2)
 """Deviations of the pretended reading of the squared length, in m²; columns have thousandths."""
 READINGS = ("shift", "particle")
-UPDATES = {f"OTMA_{round(1000 * std)}": augmented(ensemble_transform, pendulum.rod, std=std) for std in STDS}
+UPDATES = {
+    f"OTMA_{round(1000 * std)}": augmented(ensemble_transform, pendulum.rod, std=std)
+    for std in STDS
+}
 for _reading in READINGS:
     _how = {**pendulum.how, "reading": _reading}
     UPDATES[f"OTNLeq_{_reading}"] = projected(ensemble_transform, pendulum.rod, **_how)

@@ -93,6 +93,19 @@ def data(rng: np.random.Generator, noisy: bool, prior=PRIOR) -> tuple[np.ndarray
     return truth, seen, centre
 
 
+def many(seeds) -> tuple[np.ndarray, np.ndarray]:
+    """The noisy case of many runs at once: true chart states (T, R, 2) and readings (T, R, 2)."""
+    drawn = []
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        drawn.append([rng.standard_normal(shape) for shape in (2, (STEPS, 2), (STEPS, 2))])
+    first, kicks, errors = (np.stack(x) for x in zip(*drawn, strict=True))
+    state, truth = PRIOR[0] + PRIOR[1] * first, np.empty((STEPS, len(first), 2))
+    for k in range(STEPS):
+        state = truth[k] = chart.step(state, 0.0, DT) + KICK * kicks[:, k]
+    return truth, place(truth)[..., :2] + np.sqrt(NOISE[0, 0]) * errors.swapaxes(0, 1)
+
+
 def ensembles(updates, members, model, see, readings, noise, noisy, rng):
     """Analysis members of filters with one model, {name: (T, N, d)}."""
     inner = {name: unchecked(update) for name, update in updates.items()}
@@ -254,6 +267,12 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         "mirror": mirror(streams[2]),
     }  # fmt: skip
     return {f"{which}_{key}": v for which, found in cases.items() for key, v in found.items()}
+
+
+def noisy_part(seed: np.random.SeedSequence) -> dict[str, float]:
+    """The noisy case of a trial alone, which takes a fifth of its time."""
+    found = case(True, np.random.default_rng(seed.spawn(3)[1]))
+    return {f"noisy_{key}": value for key, value in found.items()}
 
 
 SCORES = ("constraint", "position", "velocity", "honest", "nees", "crps")
