@@ -228,6 +228,14 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     return out | satellites.scored(SETUP, "exact", result, each_agent=False)
 
 
+def part(seed: np.random.SeedSequence) -> dict[str, float]:
+    """The reference alone, as in the trial, for chapter 4 to run again."""
+    for_data, _ = seed.spawn(2)
+    rng = np.random.default_rng(seed.spawn(3)[0])
+    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    return scored("reference", truth, guided(seen, rng))
+
+
 code = (
     guided, chosen, sighted, cost, squared, damped, normal, scored, from_prior,
     satellites.data, satellites.repaired,
