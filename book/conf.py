@@ -26,17 +26,23 @@ from typing import Any
 from sphinx.application import Sphinx
 from sphinx.environment.collectors.toctree import TocTreeCollector
 from sphinx.errors import ExtensionError
+from sphinx.util.nodes import make_refnode
 
 sys.path.insert(0, str(Path(__file__).parent / "tools"))
 
-from common import BOOK, ROOT, missing_pages
+from common import BOOK, ROOT, chapters, missing_pages
 from pages import (
     chapter_number,
+    code_of,
     drop_widgets,
     escape_stars,
+    homes,
+    imported,
     keep_sliders,
+    lighter,
+    link_code,
     number_chapters,
-    plain_types,
+    signature,
     write_generated,
 )
 
@@ -56,6 +62,7 @@ extensions = [
     "sphinxcontrib.bibtex",
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
     "numpydoc",
 ]
 
@@ -103,7 +110,7 @@ bibtex_reference_style = "author_year"
 bibtex_default_style = "plain"
 
 autodoc_typehints = "signature"
-toc_object_entries = False
+toc_object_entries_show_parents = "hide"
 add_module_names = False
 autodoc_member_order = "bysource"
 autodoc_type_aliases = {"Array": "Array", "ArrayLike": "ArrayLike"}
@@ -111,6 +118,15 @@ autodoc_preserve_defaults = True
 python_maximum_signature_line_length = 72
 numpydoc_show_class_members = False
 numpydoc_class_members_toctree = False
+
+# A reference that leads nowhere stops the build; these names are others'.
+nitpicky = True
+OUTSIDE = (
+    r"(np|numpy|scipy|xr|xarray|collections|typing|types|functools|pathlib|os|random)\..*",
+    r"Any|Array(Like)?|NDArray|Callable|Generator|Hashable|I?ter\w+|Literal|Mapping|Path|Sequence",
+    r"Dataset|DataArray|Protocol|PathLike|cs[cr]_array|dtype|module|F|Self|.*\.F|-?\d.*",
+)
+nitpick_ignore_regex = [("py:.*", "|".join(OUTSIDE))]
 
 # Mathematics without a network: MathJax 3 is copied from a Python package at the end of a build.
 mathjax_path = "mathjax/tex-mml-chtml.js"
@@ -172,6 +188,44 @@ def copy_mathjax(app: Sphinx, error: Exception | None) -> None:
             shutil.copy(source / part, target / part)
 
 
+def find_name(app: Sphinx, env: Any, node: Any, shown: Any) -> Any:
+    """Resolve a name that is called by its room's path, or by itself, to its entry."""
+    if node.get("refdomain") != "py":
+        return None
+    entries, target = env.domains.python_domain.objects, node["reftarget"].removeprefix("~")
+    known = {**env.distfilt_homes, **{path: path for path in entries}}
+    room, here = f"distfilt.{target}", node.get("py:module") or ""
+    paths = [target, room, f"{here}.{target}", f"{here}.{node.get('py:class')}.{target}"]
+    found = [known[path] for path in paths if path in known]
+    owner, _, member = target.rpartition(".")
+    found += [f"{known[path]}.{member}" for path in (owner, f"distfilt.{owner}") if path in known]
+    found += sorted({known[path] for path in known if path.endswith(f".{target}")})
+    if not found or found[0] not in entries:
+        return None
+    entry = entries[found[0]]
+    return make_refnode(
+        app.builder, node["refdoc"], entry.docname, entry.node_id, shown, found[0]
+    )
+
+
+def link_names(app: Sphinx, page: str, template: str, context: dict[str, Any], tree: Any) -> None:
+    """Link the library's names in a chapter's code to their entries."""
+    source = ROOT / f"{page}.md"
+    if page.startswith("book/api"):
+        context["body"] = lighter(context["body"])
+    if source not in chapters():
+        return
+    objects = app.env.domains.python_domain.objects
+
+    def url(path: str) -> str | None:
+        entry = objects.get(app.env.distfilt_homes.get(path, path))
+        where = entry and app.builder.get_relative_uri(page, entry.docname)
+        return f"{where}#{entry.node_id}" if entry else None
+
+    names = imported(code_of(source), app.env.distfilt_homes)
+    context["body"] = link_code(context["body"], names, url)
+
+
 def setup(app: Sphinx) -> None:
     number_figures = TocTreeCollector.assign_figure_numbers
 
@@ -182,8 +236,11 @@ def setup(app: Sphinx) -> None:
     TocTreeCollector.assign_figure_numbers = with_chapter_numbers  # type: ignore[method-assign]
     app.connect("builder-inited", check_toc)
     app.connect("builder-inited", lambda app: write_generated(BOOK / "_generated"))
+    app.connect("builder-inited", lambda app: setattr(app.env, "distfilt_homes", homes()))
+    app.connect("missing-reference", find_name)
+    app.connect("html-page-context", link_names)
     app.connect("doctree-read", lambda app, tree: drop_widgets(tree))
     app.connect("doctree-read", lambda app, tree: keep_sliders(tree))
     app.connect("autodoc-process-docstring", lambda *event: escape_stars(event[-1]))
-    app.connect("autodoc-process-signature", lambda *event: tuple(map(plain_types, event[-2:])))
+    app.connect("autodoc-process-signature", lambda *event: signature(event[1], event[3]))
     app.connect("build-finished", copy_mathjax)

@@ -199,7 +199,7 @@ def copy(folder: Path) -> list[Path]:
             (book / source.name).write_text(bibliography(references), encoding="utf-8")
         elif source.stem == "api":
             (book / source.name).write_text(HELP, encoding="utf-8")
-        else:
+        elif source.parent == BOOK:
             text = plain(source.read_text(encoding="utf-8"), source.stem, known, references)
             (book / source.name).write_text(text, encoding="utf-8")
     left_out = shutil.ignore_patterns("__pycache__", ".*")

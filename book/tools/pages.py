@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import ast
+import functools
 import importlib
 import inspect
 import re
 import types
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin
+from typing import Annotated, Any, ForwardRef, Literal, Union, get_args, get_origin
 
 import numpy as np
 from docutils import nodes
+from numpy.typing import ArrayLike
 from sphinx.pycode import ModuleAnalyzer
 
 from bookkit.rows import read_rows
-from common import ROOT, SLIDER, toc_pages
+from common import BOOK, ROOT, SLIDER, chapters, toc_pages
+from distfilt.doors import MISSING
 from ledger import ITEMS, LEDGER, WORDS, summaries
 
 PAPERS = {
@@ -23,6 +28,12 @@ PAPERS = {
     "semeraro": "Partial-state fusion",
     "zheng": "Distributed density filter",
 }
+CODE = re.compile(
+    r"^(`{3,})\{code-cell\}[^\n]*\n(?:---\n.*?^---\n)?(?::\w+:[^\n]*\n)*(.*?)^\1$", re.M | re.S
+)
+"""A chapter's code cell; its text is the second group."""
+BLOCK = re.compile(r'<div class="highlight-ipython3[^>]*>.*?</pre>', re.S)
+"""The code of a cell on a built page."""
 
 
 def chapter_number(page: str) -> int | None:
@@ -91,21 +102,29 @@ def modules() -> list[str]:
 def directive(module: Any, name: str) -> list[str]:
     """Return the lines that document one public name of the module that defines it."""
     value = getattr(module, name)
-    if get_origin(value) is not None:
-        meaning = ModuleAnalyzer.for_module(module.__name__).find_attr_docs().get(("", name), [])
-        base, *notes = get_args(value) if get_origin(value) is Annotated else (value,)
-        kind = "np.ndarray" if get_origin(base) is np.ndarray else getattr(base, "__name__", base)
-        shown = ", ".join(str(getattr(note, "__name__", note)) for note in (kind, *notes))
-        text = [f"   {line}" for line in [*meaning, "", f"The type ``{shown}``."]]
-        return [f".. py:data:: {name}", "", *text, ""]
-    if inspect.isclass(value) and not value.__module__.startswith("distfilt"):
-        text = f"Short for ``{value.__module__}.{value.__qualname__}``."
-        return [f".. py:data:: {name}", "", f"   {text}", ""]
-    if inspect.isclass(value):
+    if inspect.isclass(value) and value.__module__.startswith("distfilt"):
         return [f".. autoclass:: {module.__name__}.{name}", "   :members:", ""]
     if inspect.isfunction(value):
         return [f".. autofunction:: {module.__name__}.{name}", ""]
-    return [f".. autodata:: {module.__name__}.{name}", "   :no-value:", ""]
+    meaning = ModuleAnalyzer.for_module(module.__name__).find_attr_docs().get(("", name), [])
+    if inspect.isclass(value):
+        meaning = [f"Short for ``{value.__module__}.{value.__qualname__}``."]
+    elif get_origin(value) is not None:
+        base, *notes = get_args(value) if get_origin(value) is Annotated else (value,)
+        kind = "np.ndarray" if get_origin(base) is np.ndarray else getattr(base, "__name__", base)
+        shown = ", ".join(word_of(note) for note in (kind, *notes))
+        meaning = [*meaning, "", f"The type ``{shown}``."]
+    elif not meaning:
+        meaning = [f"A constant, a ``{type(value).__name__}``."]
+    text = [f"   {line}" for line in meaning]
+    return [f".. py:data:: {name}", "", *text, ""]
+
+
+def word_of(note: Any) -> str:
+    """Return a note of a type in words: ``at_least(1)`` for a condition with its bound."""
+    if isinstance(note, functools.partial):
+        return f"{word_of(note.func)}({', '.join(map(str, note.args))})"
+    return str(getattr(note, "__name__", note)).lstrip("_")
 
 
 def home_of(module: Any, name: str) -> str:
@@ -124,9 +143,76 @@ def home_of(module: Any, name: str) -> str:
     return next(shown, module.__name__)
 
 
-def plain_types(signature: str | None) -> str | None:
-    """Return a signature without the builder's own word around the names of our types."""
-    return signature and re.sub(r"TypeAliasForwardRef\('([\w.]+)'\)", r"\1", signature)
+@functools.cache
+def named_types() -> list[tuple[Any, str]]:
+    """Return the types that have a name of their own, each with it."""
+    doors = importlib.import_module("distfilt.doors")
+    own = [(getattr(doors, name), name) for name in doors.__all__]
+    return [*((value, name) for value, name in own if get_origin(value)), (ArrayLike, "ArrayLike")]
+
+
+def written(kind: Any, names: Mapping[str, Any]) -> str:
+    """Return a type as a reader would write it: ``Array['... N d']``, ``Positive | None``."""
+    if isinstance(kind, ForwardRef):
+        kind = kind.__forward_arg__
+    if isinstance(kind, str):
+        try:
+            return written(eval(kind, dict(names)), names)
+        except (NameError, TypeError):
+            return kind
+    if kind is Ellipsis or kind is None or kind is type(None):
+        return "..." if kind is Ellipsis else "None"
+    if isinstance(kind, list):
+        return f"[{', '.join(written(part, names) for part in kind)}]"
+    if known := next((name for value, name in named_types() if value == kind), None):
+        return known
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        shapes = [note for note in inner[1:] if isinstance(note, str) and note != MISSING]
+        return written(inner[0], names) + (f"[{shapes[-1]!r}]" if shapes else "")
+    if origin in (Union, types.UnionType):
+        return " | ".join(written(part, names) for part in inner)
+    if origin is Literal:
+        return f"Literal[{', '.join(map(repr, inner))}]"
+    if origin is not None and origin is not np.ndarray:
+        name = getattr(origin, "__name__", str(origin))
+        return f"{name}[{', '.join(written(part, names) for part in inner)}]"
+    return "NDArray" if origin else getattr(kind, "__name__", str(kind))
+
+
+def default(value: Any) -> str:
+    """Return a default as code: a function's name, dots for what has no short form."""
+    shown = getattr(value, "__name__", None) or repr(value)
+    try:
+        ast.parse(shown)
+    except SyntaxError:
+        return "..."
+    return shown
+
+
+def signature(what: str, value: Any) -> tuple[str, str | None] | None:
+    """Return a signature with every type as `written`; None leaves it as it is."""
+    if what not in ("function", "method", "class"):
+        return None
+    try:
+        found = inspect.signature(value)
+    except (TypeError, ValueError):
+        return None
+    home = importlib.import_module(getattr(value, "__module__", "builtins"))
+    shown, kinds, last = [], inspect.Parameter, None
+    for k, part in enumerate(found.parameters.values()):
+        if k == 0 and part.name == "self":
+            continue
+        if part.kind is kinds.KEYWORD_ONLY and last not in (part.kind, kinds.VAR_POSITIONAL):
+            shown.append("*")
+        last = part.kind
+        text = {kinds.VAR_POSITIONAL: "*", kinds.VAR_KEYWORD: "**"}.get(last, "") + part.name
+        if part.annotation is not part.empty:
+            text += f": {written(part.annotation, vars(home))}"
+        shown.append(text if part.default is part.empty else f"{text} = {default(part.default)}")
+    given = found.return_annotation
+    returned = None if given is found.empty else written(given, vars(home))
+    return f"({', '.join(shown)})", None if what == "class" else returned
 
 
 def escape_stars(lines: list[str]) -> None:
@@ -148,7 +234,7 @@ FIRST = ("filters", "updates", "network", "sensors", "models", "metrics", "kalma
 """What a reader looks for first; the other parts follow in alphabetical order."""
 
 
-def parts() -> dict[str, list[str]]:
+def api_parts() -> dict[str, list[str]]:
     """Return the library's parts in the order of the page, each with its modules."""
     found: dict[str, list[str]] = {}
     for name in modules():
@@ -163,6 +249,111 @@ def anchor(name: str) -> str:
     return "api-" + name.replace(".", "-").replace("_", "-")
 
 
+def homes() -> dict[str, str]:
+    """Return where each public name is documented, by every path that a reader imports it from."""
+    out = {}
+    for path in modules():
+        module = importlib.import_module(path)
+        for name in module.__all__:
+            value = getattr(module, name)
+            if isinstance(value, types.ModuleType):
+                out[f"{path}.{name}"] = value.__name__
+            else:
+                out[f"{path}.{name}"] = f"{home_of(module, name)}.{name}"
+    return out
+
+
+def code_of(source: Path) -> str:
+    """Return all code of a chapter or of a script, without lines for the notebook alone."""
+    text = source.read_text(encoding="utf-8")
+    if source.suffix == ".md":
+        text = "\n".join(body for _, body in CODE.findall(text))
+    return re.sub(r"^[%!].*$", "", text, flags=re.MULTILINE)
+
+
+def imported(code: str, known: dict[str, str]) -> dict[str, str]:
+    """Return what a text calls the library's names, each with the path of its entry."""
+    out = {}
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("distfilt"):
+            for name in node.names:
+                path = f"{node.module}.{name.name}"
+                out[name.asname or name.name] = known.get(path, path)
+    return out
+
+
+def used(code: str, known: dict[str, str]) -> set[str]:
+    """Return the library's names that a text uses, those of a module or class too."""
+    names, out = imported(code, known), set()
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Name) and node.id in names:
+            out.add(names[node.id])
+        elif isinstance(node, ast.Attribute) and (owner := getattr(node.value, "id", "")) in names:
+            path = f"{names[owner]}.{node.attr}"
+            out.add(known.get(path, path))
+    return out
+
+
+def users() -> dict[str, list[str]]:
+    """Return, for each name of the library, links to the chapters and scripts that use it."""
+    known, out = homes(), {}
+    scripts = [*(BOOK / "examples").glob("*.py"), *(BOOK / "studies").glob("*.py")]
+    for source in [*chapters(), *sorted(scripts)]:
+        if source.suffix == ".md":
+            number = chapter_number(f"book/{source.stem}")
+            shown = f":doc:`{number or 'the first page'} </book/{source.stem}>`"
+        else:
+            shown = f"``{source.relative_to(ROOT).as_posix()}``"
+        for name in used(code_of(source), known):
+            out.setdefault(name, []).append(shown)
+    return out
+
+
+def used_in(name: str, by: dict[str, list[str]]) -> list[str]:
+    """Return the line that leads from a name to the chapters that use it, else to scripts."""
+    found = by.get(name, [])
+    pages = [shown for shown in found if shown.startswith(":doc:")]
+    word = "chapter " if pages and "first page" not in pages[0] else ""
+    return ["", f"   *Used in* {word}{', '.join(pages or found[:3])}.", ""] if found else [""]
+
+
+def link_code(body: str, names: dict[str, str], url: Callable[[str], str | None]) -> str:
+    """Return a page whose code cells link the names that its chapter imports to their entries.
+
+    A name is linked where it is used, not where it is an argument's name or another's attribute.
+    """
+
+    def link(found: re.Match[str]) -> str:
+        path = names[found["name"]] + (f".{found['part']}" if found["part"] else "")
+        target = url(path) or url(names[found["name"]])
+        return f'<a class="api" href="{target}">{found[0]}</a>' if target else found[0]
+
+    if not names:
+        return body
+    one = "|".join(map(re.escape, names))
+    name = re.compile(
+        rf'(?<!<span class="o">\.</span>)<span class="n">(?P<name>{one})</span>'
+        r'(?:<span class="o">\.</span><span class="n">(?P<part>\w+)</span>)?'
+        r'(?!<span class="o">=</span>)'
+    )
+    return BLOCK.sub(lambda block: name.sub(link, block[0]), body)
+
+
+def lighter(body: str) -> str:
+    """Return a page without the marks inside its signatures, which are half of its weight."""
+
+    def plain(found: re.Match[str]) -> str:
+        text = re.sub(r'<span class="(?:pre|[pwko])">([^<]*)</span>', r"\1", found[0])
+        return re.sub(r'<span class="(?:pre|[pwkon])">([^<]*)</span>', r"\1", text)
+
+    return re.sub(r'<dt class="sig .*?</dt>', plain, body, flags=re.DOTALL)
+
+
+def is_protocol(value: Any) -> bool:
+    """Say whether a public class tells what a reader's own one must offer."""
+    return bool(getattr(value, "_is_protocol", False)) and value.__name__[0] != "_"
+
+
 def links(module: Any) -> str:
     """Return links to what a part's face offers, in the order of its names."""
     out = []
@@ -175,24 +366,32 @@ def links(module: Any) -> str:
     return ", ".join(out)
 
 
-def api_text() -> str:
-    """Return the API reference: an index of one screen, then part by part what each module has."""
-    index, lines = ["| Part | What it is for | Names |", "|---|---|---|"], []
-    for part, names in parts().items():
+def api_index() -> str:
+    """Return the reference's index: each part, what it is for, and the names of its face."""
+    lines = ["| Part | What it is for | Names |", "|---|---|---|"]
+    for part in api_parts():
         face = importlib.import_module(f"distfilt.{part}")
-        head = f"distfilt.{part}"
-        index += [f"| [`{part}`](#{anchor(head)}) | {summary(face)} | {links(face)} |"]
-        lines += [f"({anchor(head)})=", f"## `{head}`", ""]
-        for name in names:
-            module = importlib.import_module(name)
-            own = [n for n in module.__all__ if home_of(module, n) == name]
-            if name != head:
-                lines += [f"({anchor(name)})=", f"### `{name}`", ""]
-            body = [f".. automodule:: {name}", "   :no-members:", ""]
-            for public in own:
-                body += directive(module, public)
-            lines += ["```{eval-rst}", *body, "```", ""]
-    return "\n".join([*index, "", *lines])
+        lines += [f"| [`{part}`](/book/api/{part}.md) | {summary(face)} | {links(face)} |"]
+    return "\n".join(lines)
+
+
+def api_part(part: str, by: dict[str, list[str]]) -> str:
+    """Return the reference of one part, module by module."""
+    lines, head = [], f"distfilt.{part}"
+    for name in api_parts()[part]:
+        module = importlib.import_module(name)
+        own = [n for n in module.__all__ if home_of(module, n) == name]
+        # What a reader writes a class for need not be imported, and yet is looked up.
+        own += [n for n, v in vars(module).items() if is_protocol(v) and v.__module__ == name]
+        title = f"# `{head}`" if name == head else f"## `{name[len(head) + 1 :]}`"
+        lines += [f"({anchor(name)})=", title, ""]
+        body = [f".. automodule:: {name}", "   :no-members:", ""]
+        for public in dict.fromkeys(own):
+            body += [*directive(module, public)[:-1], *used_in(f"{name}.{public}", by)]
+        lines += ["```{eval-rst}", *body, "```", ""]
+        if name == head and hasattr(module, "__path__"):
+            lines += [f"From here a reader imports {links(module)}.", ""]
+    return "\n".join(lines)
 
 
 def cell(text: str) -> str:
@@ -233,11 +432,13 @@ def reproductions_text() -> str:
 
 def write_generated(folder: Path) -> None:
     """Write the included parts of pages; an unchanged part keeps its date."""
-    folder.mkdir(exist_ok=True)
-    parts = {"api.md": api_text()}
+    by = users()
+    parts = {f"api/{part}.md": api_part(part, by) for part in api_parts()}
+    parts["api.md"] = api_index()
     if ITEMS.is_file() and LEDGER.is_file():
         parts["reproductions.md"] = reproductions_text()
     for name, text in parts.items():
         target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
         if not target.is_file() or target.read_text(encoding="utf-8") != text:
             target.write_text(text, encoding="utf-8")

@@ -252,10 +252,6 @@ class TransportFilter(MembersFilter):
     rejuvenation : float
         h of :func:`distfilt.coupling.rejuvenated`; 0 draws nothing.
 
-    See Also
-    --------
-    distfilt.updates.transform_by_agreement : the same step without a filter round it.
-
     Examples
     --------
     >>> from distfilt.models import Model

@@ -42,8 +42,7 @@ class Channel:
     Parameters
     ----------
     graph : Graph
-        The links at this time; or a networkx graph, a matrix of links, or edges: see
-        :func:`distfilt.network.graphs.as_graph`.
+        The links at this time; or a networkx graph, a matrix of links, or edges.
     ledger : Ledger, optional
         What was sent before; empty by default. Its count of rounds numbers the losses.
     runs : tuple of int
