@@ -30,7 +30,8 @@ def pinned_environment() -> dict[str, str]:
     """Return the environment in which every chapter runs, wherever it is run.
 
     One thread in each BLAS and a fixed hash seed keep the digits; the reader's own IPython profile
-    and kernels are not looked at; progress bars, whose text holds times, are off.
+    and kernels are not looked at; progress bars, whose text holds times, are off. A check that fails stops the
+    chapter.
     """
     home = ROOT / "_build" / "jupyter"
     (home / "ipython").mkdir(parents=True, exist_ok=True)
@@ -41,6 +42,7 @@ def pinned_environment() -> dict[str, str]:
         "MKL_NUM_THREADS": "1",
         "PYTHONHASHSEED": "0",
         "TQDM_DISABLE": "1",
+        "BOOK_STRICT": "1",
         "IPYTHONDIR": str(home / "ipython"),
         "JUPYTER_CONFIG_DIR": str(home / "config"),
         "JUPYTER_PREFER_ENV_PATH": "1",

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from distfilt.linalg import factor
 
+from .checks import tell
 from .digests import digest, of_axes
 from .sliders import Slider, slider
 
@@ -72,7 +73,8 @@ def use_style() -> None:
     Page size, resolution and fonts are fixed, so that a figure drawn twice is the same file. In a
     notebook the text form of a figure, which is stored beside its picture, becomes the digest of
     what its axes hold (`bookkit.digests.of_axes`): a curve that changes is noticed by whoever
-    compares stored outputs.
+    compares stored outputs. A check that fails after a reader's edit is told in words, and the
+    notebook runs on; it stops where the book is tested (`bookkit.checks`).
 
     >>> with matplotlib.rc_context():  # so that this example leaves no trace
     ...     use_style()
@@ -106,6 +108,7 @@ def _print_digests() -> None:
 
     shell = get_ipython()
     if shell is not None:
+        tell(shell)
         # The notebook's backend forgets printers when it starts, with the first figure: start it.
         pyplot.switch_backend(get_backend())
         # Twice the pixels, at the same size on the page.
