@@ -1,8 +1,8 @@
-"""Lorenz-63 with one component seen: transport beside Kalman and particle filters, and a bound.
+"""Lorenz-63 with one component seen: transport, Kalman and particle filters, and a reference.
 
 Every family runs with three strengths of its own remedy for a spread that is too small. The first
-`TUNING` trials choose the strength, the others are reported. The bound is a particle filter with
-`PARTICLES` members on the same data.
+`TUNING` trials choose the strength, the others are reported. The reference, ``bound`` in the names
+of the columns, is a particle filter with `PARTICLES` members on the same data.
 """
 
 from __future__ import annotations
