@@ -7,7 +7,6 @@ keeps [target; ego], except in joint bookkeeping, where it keeps [target; all eg
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -56,7 +55,7 @@ class Team:
         h[:, :e], h[:, n + agent * e : n + (agent + 1) * e] = np.eye(e), -np.eye(e)
         return h
 
-    @cached_property
+    @property
     def size(self) -> int:
         """How many agents."""
         return int(self.graph.size)

@@ -78,5 +78,5 @@ code = (
     paper.bound, paper.scored,
 )
 scenarios = paper.scenarios
-seeds = np.random.SeedSequence(480).spawn(208)
+seeds = np.random.SeedSequence(480).spawn(448)
 rtol = 1e-3
