@@ -126,10 +126,12 @@ def around(inner: Update) -> Callable[[F], F]:
     return made
 
 
-def perturbed(predicted: Array, noise: Array, rng: Rng) -> Array:
-    """Predictions with a draw of the noise each, (..., N, m)."""
-    root = cholesky(noise)
-    return predicted + rng.standard_normal(predicted.shape) @ np.swapaxes(root, -1, -2)
+def perturbed(predicted: Array, noise: Array, rng: Rng, *, centred: bool = False) -> Array:
+    """Predictions with a draw of the noise each, (..., N, m); centred draws keep its covariance."""
+    drawn, n = rng.standard_normal(predicted.shape), predicted.shape[-2]
+    if centred:
+        drawn = np.sqrt(n / (n - 1)) * (drawn - drawn.mean(axis=-2, keepdims=True))
+    return predicted + drawn @ np.swapaxes(cholesky(noise), -1, -2)
 
 
 def with_missing(

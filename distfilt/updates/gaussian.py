@@ -101,7 +101,8 @@ def sampled_noise(
 
 @update
 def known_noise(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
+    centred: bool = False,
 ) -> Array:
     r"""Update with R itself in the gain, where :func:`sampled_noise` has a sample covariance.
 
@@ -112,6 +113,9 @@ def known_noise(
     ----------
     ensemble, predicted, observed, noise, rng
         As in :func:`sampled_noise`; two members are enough.
+    centred : bool
+        Take the draws' mean off, so that they do not move the ensemble's: worth having with ten or
+        twenty members.
 
     Examples
     --------
@@ -121,7 +125,7 @@ def known_noise(
     >>> posterior.mean().round(1), posterior.var().round(1)
     (np.float64(0.5), np.float64(0.5))
     """
-    drawn = perturbed(predicted, noise, rng)
+    drawn = perturbed(predicted, noise, rng, centred=centred)
     b = _centred(predicted)[1]
     gain = _gain(_inner(b) + noise, _centred(ensemble)[1], b)
     return np.asarray(ensemble + (observed[..., None, :] - drawn) @ gain)
