@@ -1,4 +1,4 @@
-"""Density, intersection and its weights, recolouring: exact identities."""
+"""Density, intersection and its weights, recolouring, points, updates: exact identities."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from scipy.stats import multivariate_normal
 
 from distfilt.doors import unchecked
 from distfilt.ensembles import mean, sample_covariance
-from distfilt.gaussians import intersecting, intersection, intersection_weights, log_density
-from distfilt.gaussians.single import recolour
+from distfilt.gaussians import conditioned, intersecting, intersection, intersection_weights
+from distfilt.gaussians.single import log_density, recolour, unscented_points
 from tests.support import NAN, generator, spd, unit_gap
 
 SEEDS = st.integers(0, 10_000)
@@ -284,3 +284,85 @@ def test_flat_ensembles_are_refused_wherever_they_lie() -> None:
         for shift in (0.0, 1e6):
             with pytest.raises(ValueError, match="^ensemble: .* singular"):
                 recolour(np.stack([x, flat + shift]), np.zeros((2, 3)), np.stack([np.eye(3)] * 2))
+
+
+# --- unscented points -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kappa", [-1.0, 0.0, 0.5, 3.0])
+@pytest.mark.parametrize("d", [2, 5])
+def test_points_have_the_moments(d: int, kappa: float) -> None:
+    rng = generator(d)
+    mean, cov = rng.standard_normal((4, d)), spd(rng, d, (4,))
+    root = np.linalg.cholesky(cov) @ np.linalg.qr(rng.standard_normal((d, d)))[0]
+    points, w = unscented_points(mean, root, kappa=kappa)
+    assert points.shape == (4, 2 * d + 1, d) and np.isclose(w.sum(), 1)
+    assert np.allclose(w @ points, mean)
+    gap = points - mean[:, None]
+    assert np.allclose((gap * w[:, None]).mT @ gap, cov)
+    assert np.allclose(points[:, 0], mean) and np.allclose(points[:, 1:].mean(axis=1), mean)
+
+
+def test_fourth_moments_along_an_axis_are_a_gaussians() -> None:
+    points, w = unscented_points(np.zeros(4), np.eye(4), kappa=-1.0)
+    assert np.allclose(w @ points**4, 3.0) and np.allclose(w @ points**3, 0.0)
+
+
+# --- conditioning -----------------------------------------------------------------------------
+
+D, M = 4, 3
+
+
+def case(seed: int, lead: tuple[int, ...] = ()) -> tuple[np.ndarray, ...]:
+    rng = np.random.default_rng(seed)
+    mean, gap = rng.standard_normal((*lead, D)), rng.standard_normal((*lead, M))
+    return mean, spd(rng, D, lead), gap, rng.standard_normal((*lead, M, D)), spd(rng, M, lead)
+
+
+@given(seed=st.integers(0, 10**6))
+def test_in_information_form_an_update_is_a_sum(seed: int) -> None:
+    mean, cov, gap, h, r = case(seed)
+    x, p = conditioned(mean, cov, gap, h, r)
+    weight = h.T @ np.linalg.inv(r)
+    exact = np.linalg.inv(np.linalg.inv(cov) + weight @ h)
+    np.testing.assert_allclose(p, exact, rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(x, mean + exact @ weight @ gap, rtol=1e-8, atol=1e-8)
+    assert (p == p.T).all()
+
+
+def test_a_missing_component_is_a_row_left_out() -> None:
+    mean, cov, gap, h, r = case(1)
+    gap[1] = np.nan
+    kept = [0, 2]
+    ours = conditioned(mean, cov, gap, h, r)
+    theirs = conditioned(mean, cov, gap[kept], h[kept], r[np.ix_(kept, kept)])
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
+    blind = conditioned(mean, cov, np.full(M, np.nan), h, r)
+    assert (blind[0] == mean).all() and (blind[1] == cov).all()
+
+
+def test_a_batch_is_its_members_one_by_one() -> None:
+    mean, cov, gap, h, r = case(2, (5, 2))
+    gap[np.random.default_rng(3).random(gap.shape) < 0.3] = np.nan
+    x, p = conditioned(mean, cov, gap, h, r)
+    for k in np.ndindex(5, 2):
+        alone = conditioned(mean[k], cov[k], gap[k], h[k], r[k])
+        np.testing.assert_allclose(x[k], alone[0], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(p[k], alone[1], rtol=0, atol=1e-13)
+
+
+def test_one_covariance_and_one_sensor_serve_any_number_of_means() -> None:
+    mean, gap = np.random.default_rng(4).standard_normal((2, 6, D))
+    _, cov, _, h, r = case(5)
+    x, p = conditioned(mean, cov, gap[:, :M], h, r)
+    assert x.shape == (6, D) and p.shape == (D, D)
+    full = conditioned(mean, np.broadcast_to(cov, (6, D, D)), gap[:, :M], h, r)
+    np.testing.assert_allclose(x, full[0], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(np.broadcast_to(p, full[1].shape), full[1], rtol=0, atol=1e-13)
+
+
+def test_joseph_s_form_stays_positive_where_a_reading_is_nearly_exact() -> None:
+    mean, cov, gap, h, _ = case(7)
+    p = conditioned(mean, 1e8 * cov, gap, h, 1e-8 * np.eye(M))[1]
+    assert np.linalg.eigvalsh(p).min() > 0

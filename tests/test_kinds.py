@@ -121,14 +121,10 @@ def test_records_copy_and_freeze_and_a_way_round_does_neither() -> None:
     assert line.cov[0, 0] == 1.0 and line.names == ("a",) and not line.cov.flags.writeable
     assert Line.unchecked(2, cov).cov is cov and Line.unchecked(2, cov).names == ()
     assert line.changed(dim=7).dim == 7 and pickle.loads(pickle.dumps(line)).dim == 2
-    with pytest.raises(ValueError, match="^cov: "):
-        Line(3, cov)
 
 
 def test_the_way_round_a_door() -> None:
     line = Line(1, [[1.0]])
-    with pytest.raises(ValueError, match="^x: "):
-        line.moved([1.0, 2.0])
     assert unchecked(line.moved)(np.ones(2)).tolist() == [2.0, 2.0]
     assert unchecked(partial(line.moved, by=2.0))(np.ones(2)).tolist() == [3.0, 3.0]
     assert unchecked(len) is len

@@ -12,6 +12,7 @@ along a curved surface it samples sets.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Annotated
@@ -43,6 +44,9 @@ def normalised(log_weights: ArrayLike, shape: tuple[int, ...] | None = None) -> 
         raise ValueError("log_weights: needs a positive weight in every ensemble, got only zeros")
     if not np.isfinite(top).all():
         raise ValueError("log_weights: needs numbers below infinity, got NaN or infinity")
+    if w.shape[-1] > 2 and w.min() >= 0 and np.allclose(w.sum(axis=-1), 1):
+        text = "log_weights: needs logarithms, got numbers with a sum of 1"
+        warnings.warn(text, RuntimeWarning, stacklevel=4)
     w = np.exp(w - top)
     return np.asarray(w / w.sum(axis=-1, keepdims=True))
 

@@ -146,8 +146,10 @@ def _either(kinds: tuple[Any, ...], optional: bool, value: Any, name: str, scope
     for kind in kinds:
         try:
             return kind.take(value, name, scope)
-        except ValueError:
-            if len(kinds) == 1:
+        except ValueError as error:
+            # A number that is out of bounds is nothing else.
+            plain = type(value) in (int, float) and kind.convert in (_number, _integer)
+            if len(kinds) == 1 or (plain and kind.needs not in str(error)):
                 raise
     raise TypeError
 

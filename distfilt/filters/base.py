@@ -120,7 +120,7 @@ class Filter(Record, ABC):
         if self.graph is None and self.count > 1 and speak:
             raise ValueError(f"graph: needs a Graph of {self.count} agents, got None")
         if self.graph is not None and not callable(self.graph):
-            object.__setattr__(self, "graph", as_graph(self.graph, self.count))
+            object.__setattr__(self, "graph", as_graph(self.graph, self.count, self.names))
 
     @cached_property
     def team(self) -> tuple[tuple[Sensor, ...], ...]:
@@ -149,7 +149,8 @@ class Filter(Record, ABC):
         """The door of this step; none where nobody can speak, or it is not yet time."""
         if self.graph is None or not self._contact(state.t, t):
             return None
-        graph = as_graph(self.graph(t), self.count) if callable(self.graph) else self.graph
+        graph = self.graph(t) if callable(self.graph) else self.graph
+        graph = as_graph(graph, self.count, self.names)
         if not graph.senders.size:
             return None
         return Channel.unchecked(

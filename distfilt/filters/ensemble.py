@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
+from inspect import signature
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -129,6 +130,14 @@ class EnsembleFilter(MembersFilter):
     _: KW_ONLY
     update: Callable[..., Array] = known_noise
     forecast: Callable[..., Array] = sampled_forecast
+
+    def check_parts(self) -> None:
+        """Refuse what cannot be called as an update, such as a wrapper without one."""
+        super().check_parts()
+        try:
+            signature(self.update).bind(*range(4), rng=None)
+        except TypeError as error:
+            raise ValueError(f"update: needs four arrays and rng, got one with {error}") from None
 
     @classmethod
     def exact(

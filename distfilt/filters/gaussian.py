@@ -125,7 +125,7 @@ class GaussianFilter(Filter):
     def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """The prior's mean and covariance, the same for all agents and runs."""
         d = self.model.dim
-        both = moments_of(prior, d)
+        both = moments_of(prior, d, "semi" * (self.rule == "extended") + "definite")
         m, p = (np.broadcast_to(x, (*runs, self.count, *x.shape)).copy() for x in both)
         return {"joint_means": m, "joint_covariances": p, "dim": d}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass
 from itertools import pairwise
@@ -10,7 +11,7 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from ..doors import MISSING, Array, Index, Record, array, increasing, semidefinite, unchecked
+from ..doors import MISSING, Array, Index, Record, array, definite, increasing, unchecked
 from ..ensembles import draw, sample_covariance
 from ..mixtures import GaussianMixture
 from ..sensors import Sensor
@@ -94,6 +95,8 @@ def said_by_all(f: Any, observations: Any, runs: tuple[int, ...], t: float) -> l
 
 def one_each(observations: Any, agents: int) -> Any:
     """Observations in a list, one entry for each agent."""
+    if hasattr(observations, "__array__"):  # also xarray's
+        observations = np.asarray(observations)
     if not isinstance(observations, Sequence | np.ndarray) or len(observations) != agents:
         got = len(observations) if hasattr(observations, "__len__") else repr(observations)
         raise ValueError(f"observations: needs one for each of {agents} agents, got {got}")
@@ -170,15 +173,31 @@ def planned(f: Any, state: Any, times: Any, observations: Any) -> tuple[Array, I
     elif times is None:
         raise ValueError("times: needs them, unless all observations are Readings, got None")
     else:
-        for agent, series in enumerate(one_each(observations, f.count)):
-            if series is not None and (got := len(np.atleast_1d(series))) != grid.size:
+        # A table whose columns have names would give a column where a row is asked for.
+        each = [o if o is None or isinstance(o, list | tuple) else np.atleast_1d(o)
+                for o in one_each(observations, f.count)]
+        for agent, series in enumerate(each):
+            if series is not None and (got := len(series)) != grid.size:
                 raise ValueError(
                     f"observations: needs ({grid.size}, ..., m) for agent {agent}, got {got}"
                 )
-        entries = ([None if o is None else o[k] for o in observations] for k in range(grid.size))
+            if isinstance(series, np.ndarray) and not isinstance(f.sensors, int):
+                _warn_of_degrees(f.team[agent], series, agent)
+        entries = ([None if o is None else o[k] for o in each] for k in range(grid.size))
     if grid.size and grid[0] < state.t:
         raise ValueError(f"times: needs times from the state's {state.t:g} on, got {grid[0]:g}")
     return grid, entries
+
+
+def _warn_of_degrees(own: Sequence[Sensor], series: Array, agent: int) -> None:
+    """Warn of angles that are more than four turns from what they are wrapped to."""
+    wraps = len(own) == 1 and own[0].difference
+    if not wraps or series.shape[-1:] != (own[0].dim,):
+        return
+    y = np.nan_to_num(series.astype(np.float64))
+    if (most := np.abs(y - wraps(y, 0 * y)).max(initial=0.0)) > 8 * np.pi:
+        text = f"needs angles in rad, got some {most / (2 * np.pi):.0f} turns from what they mean"
+        warnings.warn(f"observations[{agent}]: {text}", RuntimeWarning, stacklevel=4)
 
 
 def _are_readings(given: Any) -> bool:
@@ -186,8 +205,14 @@ def _are_readings(given: Any) -> bool:
     return isinstance(given, list | tuple) and all(isinstance(item, Reading) for item in given)
 
 
-def moments_of(prior: Any, dim: int) -> tuple[Array, Array]:
-    """Mean (d,) and covariance (d, d) of a prior of any kind that has them.
+def _is_pair(prior: Any) -> bool:
+    """Whether this is (mean, cov), and no list of two members."""
+    pair = isinstance(prior, tuple | list) and len(prior) == 2
+    return pair and (isinstance(prior, tuple) or np.ndim(prior[0]) < np.ndim(prior[1]))
+
+
+def moments_of(prior: Any, dim: int, word: str = "semidefinite") -> tuple[Array, Array]:
+    """Mean (d,) and covariance (d, d), definite or semidefinite, of a prior that has them.
 
     >>> from scipy.stats import multivariate_normal
     >>> moments_of(multivariate_normal([1.0], [[4.0]]), 1)
@@ -198,7 +223,7 @@ def moments_of(prior: Any, dim: int) -> tuple[Array, Array]:
     elif hasattr(prior, "rvs"):
         spread: Any = getattr(prior, "cov", getattr(prior, "var", None))
         mean, cov = (v() if callable(v) else v for v in (prior.mean, spread))
-    elif isinstance(prior, tuple) and len(prior) == 2:
+    elif _is_pair(prior):
         mean, cov = prior
     elif callable(prior) or np.ndim(prior) != 2:
         got = "a function" if callable(prior) else type(prior).__name__
@@ -207,8 +232,11 @@ def moments_of(prior: Any, dim: int) -> tuple[Array, Array]:
         members = array(prior, "prior", ("N", dim))
         mean, cov = members.mean(axis=0), sample_covariance(members)
     mean = array(np.atleast_1d(mean), "prior", (dim,))
-    cov = array(np.atleast_2d(cov), "prior", (dim, dim))
-    semidefinite(cov, "prior")
+    cov = array(cov, "prior")
+    if cov.shape != (dim, dim) and not dim == cov.size == 1:
+        raise ValueError(f"prior: needs a covariance of shape {(dim, dim)}, got {cov.shape}")
+    cov = cov.reshape(dim, dim)
+    definite(cov, "prior", word)
     return mean, cov
 
 
@@ -221,7 +249,7 @@ def members_of(
     (2, 5, 1)
     """
     shape = (*leading, members, dim)
-    if isinstance(prior, tuple) and len(prior) == 2:
+    if _is_pair(prior):
         mean, cov = moments_of(prior, dim)
         return unchecked(draw)(mean, cov, members, rng=rng, leading=leading)
     if hasattr(prior, "rvs"):
@@ -247,7 +275,7 @@ def mixtures_of(prior: Any, dim: int, count: int) -> tuple[GaussianMixture, ...]
     out = []
     for one in given:
         mixed = isinstance(one, GaussianMixture)
-        out.append(one if mixed else GaussianMixture.gaussian(*moments_of(one, dim)))
+        out.append(one if mixed else GaussianMixture.gaussian(*moments_of(one, dim, "definite")))
         if out[-1].dim != dim:
             raise ValueError(f"prior: needs dimension {dim}, got {out[-1].dim}")
     return tuple(out)

@@ -123,7 +123,10 @@ def _known(
         x = array(truth, "truth", None, finite=False)
         if x.shape == (*shape, len(names)):
             return x[..., None, :], slice(None)
-        return array(x, "truth", (*shape, agents, len(names)), finite=False), slice(None)
+        if x.shape != (*shape, agents, len(names)):
+            needs = f"shape {(*shape, len(names))}, one for each of {agents} agents, or a dict of "
+            raise ValueError(f"truth: needs {needs}those components that are known, got {x.shape}")
+        return x, slice(None)
     unknown = [name for name in truth if name not in names]
     if unknown or not truth:
         raise ValueError(f"truth: needs components of {', '.join(names)}, got {unknown}")

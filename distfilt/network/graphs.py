@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, Any
@@ -85,14 +86,17 @@ class Graph(Record):
         return cls.unchecked(_links.of_edges(agents, edges, "edges", directed=directed))
 
     @classmethod
-    def from_networkx(cls, graph: Any) -> Graph:
-        """Build a graph from a networkx one, agents in the order of its nodes.
+    def from_networkx(cls, graph: Any, names: Sequence[str] = ()) -> Graph:
+        """Build a graph from a networkx one.
 
         Parameters
         ----------
         graph : networkx.Graph or networkx.DiGraph
             Of a digraph an edge runs from speaker to listener. Names, weights and parallel edges
             are left behind.
+        names : sequence of str
+            Of the agents. Nodes that are these, or 0 to A - 1, are agents by their labels; others
+            by the order in which the graph has them.
 
         Examples
         --------
@@ -102,7 +106,9 @@ class Graph(Record):
         """
         if not _links.is_networkx(graph):
             raise ValueError(f"graph: needs a networkx graph, got {type(graph).__name__}")
-        number_of = {node: k for k, node in enumerate(graph.nodes)}
+        labels = range(len(graph.nodes)), names, graph.nodes
+        order = next(some for some in labels if {*some} == {*graph.nodes})
+        number_of = {node: k for k, node in enumerate(order)}
         edges = [(number_of[edge[1]], number_of[edge[0]]) for edge in graph.edges]
         return cls.from_edges(len(number_of), edges, directed=bool(graph.is_directed()))
 
@@ -262,7 +268,7 @@ class Graph(Record):
             raise ValueError("graph: needs links both ways here, got one-way links")
 
 
-def as_graph(value: Any, size: int | None = None) -> Graph:
+def as_graph(value: Any, size: int | None = None, names: Sequence[str] = ()) -> Graph:
     """A graph from whatever describes one.
 
     Parameters
@@ -281,7 +287,7 @@ def as_graph(value: Any, size: int | None = None) -> Graph:
     if isinstance(value, Graph):
         graph = value
     elif _links.is_networkx(value):
-        graph = Graph.from_networkx(value)
+        graph = Graph.from_networkx(value, names)
     elif scipy.sparse.issparse(value) or isinstance(value, np.ndarray | list | tuple):
         graph = Graph.unchecked(_links.of_either(value, size, "graph"))
     else:

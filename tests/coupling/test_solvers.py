@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distfilt.coupling import distances, ensemble_transform, plan, solvers, sorted_plan
+from distfilt.coupling import distances, plan, solvers, sorted_plan
 from distfilt.linalg import SolverError
 
 
@@ -117,19 +115,3 @@ def test_the_entropic_plan_is_that_of_its_optimality_conditions(seed: int, eps: 
     ends[np.arange(i.size), i] = ends[np.arange(i.size), 6 + j] = 1.0
     sums = ends @ np.linalg.lstsq(ends, log[i, j])[0]
     assert np.abs(log[i, j] - sums).max() < 1e-3
-
-
-def test_without_its_package_the_default_solver_names_the_extra(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    class Absent:
-        def find_spec(self, name: str, *_: object) -> None:
-            if name == "ot":
-                raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-
-    for name in [n for n in sys.modules if n == "ot" or n.startswith("ot.")]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setattr(sys, "meta_path", [Absent(), *sys.meta_path])
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'distfilt\[maps\]'"):
-        ensemble_transform([[0.0], [1.0]], [0.0, 0.0])
-    assert abs(plan([[0.0, 1.0]], [1.0], solver="entropic").value - 0.5) < 1e-12

@@ -145,7 +145,10 @@ def test_entropy_shrinks_and_debiasing_restores() -> None:
     kept = [np.trace(_covariance(e)) for e in (biased, debiased, plain)]
     assert kept[0] < 0.7 * kept[2] and abs(kept[1] - kept[2]) < 0.5 * (kept[2] - kept[0])
     assert np.abs(debiased.mean(axis=0) - w @ x).max() < 1e-13
-    assert np.allclose(ensemble_transform(x, np.zeros(60), debias=True, **entropic), x)
+    free = biased + x - ensemble_transform(x, np.zeros(60), **entropic)
+    assert np.allclose(debiased, free + w @ x - free.mean(axis=0))
+    with pytest.warns(RuntimeWarning, match="needs logarithms, got numbers with a sum of 1"):
+        ensemble_transform(x, w)
 
 
 def test_rejuvenation_keeps_the_mean_and_adds_its_share() -> None:

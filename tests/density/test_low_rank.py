@@ -100,10 +100,6 @@ def test_filters_do_not_see_each_other_and_infinite_noise_measures_nothing() -> 
 
 
 def test_what_is_out_of_scale_is_named() -> None:
-    with pytest.raises(ValueError, match="covariance: .* semidefinite"):
-        Dense(np.ones(2), np.diag([1.0, -1.0]))
     start, ones = low_rank_start(np.eye(36)[:, :9], np.ones((1, 36))), np.ones(36)
     with pytest.raises(np.linalg.LinAlgError, match="density filter: .* out of scale"):
         low_rank_step(start, ones, np.where(np.arange(36) < 4, np.inf, 1.0), 1e20)
-    with pytest.raises(ValueError, match="dt: needs the step's length"):
-        low_rank_moved(start, np.asarray, process=np.eye(36))

@@ -170,6 +170,7 @@ def test_only_the_wanted_estimates_are_made() -> None:
     for rule in RULES.values():
         everyone, few = last(make(0.5, rule)), last(make(0.5, rule, local=(7, 2)))
         assert np.array_equal(everyone.ledger.scalars, few.ledger.scalars)
+        assert np.array_equal(everyone.counted, few.counted)
         assert np.abs(everyone.observed[[7, 2]] - few.observed).max() < 1e-13
         assert np.abs(everyone.estimates[[7, 2]] - few.estimates).max() < 1e-11
 

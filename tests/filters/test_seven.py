@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas
 import pytest
 import xarray
 from scipy.stats import chi2, multivariate_normal
@@ -26,8 +27,9 @@ from distfilt.filters import (
 from distfilt.filters.record import final_state
 from distfilt.mixtures import GaussianMixture, target_fusion
 from distfilt.models import LinearModel, lorenz63, rotating_swarm
-from distfilt.network import Faults, Graph, covariance_intersection, graphs
-from distfilt.sensors import Sensor, direct
+from distfilt.network import Faults, Graph, covariance_intersection, graphs, pull
+from distfilt.sensors import Sensor, angle, direct
+from distfilt.updates import inflated, square_root
 
 from .families import NOISE, PRIOR, TIMES, Q, data, kalman, model
 
@@ -93,26 +95,24 @@ def test_events_of_any_order_are_the_series(family: str) -> None:
     mixed = [events[k] for k in np.random.default_rng(0).permutation(len(events))]
     a, b = f.run(start, TIMES, seen), f.run(start, None, mixed)
     xarray.testing.assert_equal(a, b)
+    xarray.testing.assert_equal(a, f.run(start, TIMES, [pandas.DataFrame(s) for s in seen]))
+    gaps = [[None, *s[1:]] for s in seen]
+    some = [np.concatenate([s[:1] * np.nan, s[1:]]) for s in seen]
+    xarray.testing.assert_equal(f.run(start, TIMES, gaps), f.run(start, TIMES, some))
     more = f.run(start, [0.05, TIMES[-1] + 1], mixed)
     assert more["time"].size == len(TIMES) + 2
     assert more["mean"].isel(time=slice(1, 2)).shape == a["mean"].isel(time=slice(0, 1)).shape
 
 
-@EACH
-def test_a_run_begins_at_its_state_and_knows_its_agents(family: str) -> None:
-    f, start, seen, _ = made(family)
-    with pytest.raises(ValueError, match="^times: "):
-        f.run(start, TIMES - 1.0, seen)
-    with pytest.raises(ValueError, match="^observations: "):
-        f.run(start, TIMES, seen[:-1])
-
-
 @pytest.mark.parametrize(
-    ("family", "bound"), [("gaussian", 1e-12), ("ensemble", 0.4), ("particle", 0.3), ("news", 1e-9)]
+    ("family", "bound"), [("gaussian", 1e-12), ("ensemble", 0.4), ("particle", 0.3),
+                          ("particle, agreed", 0.3), ("news", 1e-9)]
 )
 def test_everybody_who_hears_all_is_the_joint_filter(family: str, bound: float) -> None:
     """Means and covariances; members are drawn, so that theirs differ by their number's share."""
-    f, start, seen, _ = made(family)
+    options = {"agreement": partial(pull, gain=0.0)} if "agreed" in family else {}
+    family = family.split(",")[0]
+    f, start, seen, _ = made(family, **options)
     if family == "ensemble":
         # Of a prior with exact moments the exact family is exact, forecast and update.
         x = np.random.default_rng(3).standard_normal((30, 2))
@@ -162,12 +162,12 @@ def test_the_order_of_agents_changes_nothing(family: str) -> None:
 @pytest.mark.parametrize("family", SIX)
 def test_the_gate_lets_pass_what_its_share_says(family: str) -> None:
     """Just inside the quantile a reading counts, just outside it is left out and counted."""
-    f, start, _, _ = made(family, sensors=[direct([0], std=0.6), None, None], gate=0.95)
+    f, start, _, _ = made(family, sensors=[direct([0, 1], std=0.6), None, None], gate=0.95)
     blind = f.step(start, 0.1, [None] * 3)
     mean, variance = (getattr(f.summary(blind), part)[0, 0] for part in ("mean", "variance"))
     edge = np.sqrt(chi2.ppf(0.95, 1) * (variance + 0.36))
     for factor, refused in ((0.97, 0), (1.03, 1)):
-        after = f.step(start, 0.1, [[mean + factor * edge], None, None])
+        after = f.step(start, 0.1, [[mean + factor * edge, np.nan], None, None])
         assert after.refused[0] == refused
         same = np.allclose(f.summary(after).mean[0], f.summary(blind).mean[0], atol=1e-12)
         assert same == bool(refused)
@@ -183,6 +183,12 @@ def test_each_reading_is_judged_alone() -> None:
     assert a.refused.tolist() == [1, 1, 1] and np.array_equal(a.means, b.means)
     run = f.run(start, [0.1], [[good], [wild], None])
     assert run["refused"].values.tolist() == [[1, 1, 1]]
+    still = LinearModel.from_transition(1, lambda h: np.eye(1), lambda t, h: np.zeros((1, 1)))
+    bowl = Sensor(1, np.square, [[0.5]])  # of N(0, 1): mean 1, variance 1 by the points, slope 0
+    f = GaussianFilter(still, [bowl], rule="unscented", gate=0.95)
+    edge, start = np.sqrt(1.5 * chi2.ppf(0.95, 1)), f.start((np.zeros(1), np.eye(1)))
+    refused = [f.step(start, 1.0, [[1 + k * edge]]).refused.tolist() for k in (0.97, 1.03)]
+    assert refused == [[0.0], [1.0]]
 
 
 @pytest.mark.parametrize("how", ["every", "graph"])
@@ -212,6 +218,30 @@ def test_nothing_is_lost_until_the_next_contact(family: str, how: str) -> None:
             found = f.summary(states[k])
             assert np.allclose(found.mean, wanted.means, atol=1e-9)
             assert np.allclose(found.covariance, wanted.covariances, atol=1e-9)
+
+
+def test_what_was_heard_is_not_told_as_one_s_own() -> None:
+    """Agent 0 hears agent 1 at first, and is heard by nobody; then all hear all."""
+    quiet = LinearModel.from_transition(2, model().transition_matrix, lambda t, dt: 0 * Q)
+    one_way, (_, seen) = Graph.from_edges(3, [(0, 1)], directed=True), data(EYES)
+    f = NewsFilter(quiet, EYES, lambda t: NET if t > 0.95 else one_way, target_dim=2)
+    found, wanted = (h.run(h.start(PRIOR), TIMES[:4], [s[:4] for s in seen])["covariance"][-1, :2]
+                     for h in (f, GaussianFilter(quiet, EYES, NET)))
+    assert np.allclose(found, wanted, atol=1e-9)
+
+
+def test_a_row_that_fails_leaves_the_others_their_own_noise() -> None:
+    def wary(*given: Any, rng: np.random.Generator) -> np.ndarray:
+        if given[2].max() > 9:
+            raise ArithmeticError("too far")
+        return square_root(*given, rng=rng, rotation="none")
+
+    eyes = [direct([0], std=0.6), direct([0], std=0.2)]
+    f = EnsembleFilter(model(), eyes, share=False, update=wary, members=9, failures="keep")
+    start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(2,))
+    good, part = (f.step(start, 0.1, [[0.3], [[0.4], [y]]]) for y in (0.4, 10.0))
+    assert part.failed.tolist() == [False, True]
+    assert np.allclose(part.ensembles[0], good.ensembles[0])
 
 
 def test_what_waits_survives_on_disk_and_a_lag_has_to_reach_it(tmp_path: Path) -> None:
@@ -266,8 +296,9 @@ def test_truth_of_each_agent_and_of_named_components(family: str) -> None:
     assert some["squared_error"].isel(component=0).isnull().all()
     if "nees" in some and "covariance" in some:
         assert np.allclose(some["nees"], one / some["variance"].sel(component=name))
-    with pytest.raises(ValueError, match="truth: needs components"):
-        f.run(start, TIMES, seen, truth={"speed": truth[:, 1]})
+    for wrong, text in (({"speed": truth[:, 1]}, "components"), (truth[:, :1], ".*or a dict of")):
+        with pytest.raises(ValueError, match=f"truth: needs {text}"):
+            f.run(start, TIMES, seen, truth=wrong)
 
 
 @EACH
@@ -302,12 +333,17 @@ def test_a_prior_of_any_kind() -> None:
     f, _, _, _ = made("gaussian")
     frozen, mixture = multivariate_normal(*PRIOR), GaussianMixture.gaussian(*PRIOR)
     members = frozen.rvs(size=50, random_state=np.random.default_rng(0))
-    for prior in (PRIOR, frozen, mixture):
+    for prior in (PRIOR, [*PRIOR], frozen, mixture):
         state = f.start(prior)
         assert np.allclose(state.means, PRIOR[0]) and np.allclose(state.covariances, PRIOR[1])
     assert np.allclose(f.start(members).covariances, np.cov(members.T))
-    with pytest.raises(ValueError, match="prior: needs .*, got a function"):
-        f.start(lambda n, rng, leading: None)
+    flat = (PRIOR[0], np.diag([1.0, 0.0]))
+    unscented = GaussianFilter(model(), EYES, NET, rule="unscented")
+    for g, wrong, text in ((f, lambda n, rng, leading: None, "got a function"),
+                           (f, ([0.0, 0.0], [1.0, 1.0]), r"a covariance of .*, got \(2,\)"),
+                           (unscented, flat, "definite"), (made("mixture")[0], flat, "definite")):
+        with pytest.raises(ValueError, match=f"prior: needs .*{text}"):
+            g.start(wrong)
     rng = np.random.default_rng(1)
     e = EnsembleFilter(model(), EYES, NET, members=4000)
     two = GaussianMixture([0.5, 0.5], [[-3.0, 0.0], [3.0, 0.0]], [np.eye(2)] * 2)
@@ -317,6 +353,14 @@ def test_a_prior_of_any_kind() -> None:
     m = MixtureFilter(model(), EYES, target_dim=2)
     begun = m.start([PRIOR, frozen, two]).mixtures
     assert [b.size for b in begun] == [1, 1, 2]
+
+
+def test_degrees_and_a_wrapper_without_an_update_are_told() -> None:
+    f = GaussianFilter(model(), [angle([0, 1], std=0.1), None, None], NET)
+    with pytest.warns(RuntimeWarning, match=r"^observations\[0\]: .* rad, got some 14 turns"):
+        f.run(f.start(PRIOR), [1.0], [np.array([[89.6]]), None, None])
+    with pytest.raises(ValueError, match="update: needs four arrays and rng"):
+        EnsembleFilter(model(), EYES, NET, update=partial(inflated, factor=1.1))
 
 
 def test_the_extended_filter_bears_its_own_rounding() -> None:
@@ -339,3 +383,12 @@ def test_inflation_widens_the_forecast_and_goes_with_fusion_and_the_past() -> No
     fused = GaussianFilter(model(), EYES, NET, inflation=1.3, agreement=covariance_intersection)
     c = fused.step(fused.start(PRIOR), 0.5, [None] * 3)
     assert np.allclose(c.covariances, a.covariances)
+    # What is agreed of now tells of the past as much as its regression on now says.
+    c, b = (f.step(f.start(PRIOR), 0.5, [[0.3], [0.2, 0.4], [0.9]]) for f in (
+        GaussianFilter(model(), EYES, NET, lag=1, share=False, agreement=rule)
+        for rule in (covariance_intersection, None)))
+    p, alone, gap = c.joint_covariances, b.joint_covariances, c.joint_means - b.joint_means
+    gain = alone[..., 2:, :2] @ np.linalg.inv(alone[..., :2, :2])
+    assert np.allclose(p[..., 2:, :2], gain @ p[..., :2, :2])
+    assert np.allclose((p - alone)[..., 2:, 2:], gain @ (p - alone)[..., :2, :2] @ gain.mT)
+    assert np.allclose(gap[..., 2:, None], gain @ gap[..., :2, None])

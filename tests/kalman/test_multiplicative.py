@@ -73,6 +73,19 @@ def test_a_run_that_is_lost_is_named() -> None:
             chart=_Flat(4, 0), model=burst, sensors=[direct([0], std=1e-6)], times=[1.0, 2.0])
 
 
+def test_errors_move_by_the_derivative_of_the_flow_in_the_chart() -> None:
+    rng, model = np.random.default_rng(4), satellite_pose(rate=0.3, sigma=0.0)
+    x, cov = rng.standard_normal(13), spd(rng, 12)
+    blind = multiplicative_filter(x, cov, [[np.nan]], chart=POSE, model=model, times=[0.8],
+                                  sensors=[direct([0], std=1.0)])
+
+    def after(e: np.ndarray) -> np.ndarray:
+        return model.step(POSE.retract(np.broadcast_to(x, (*e.shape[:-1], 13)), e), 0.0, 0.8)
+
+    slope = central(lambda e: POSE.local(after(0 * e), after(e)), np.zeros(12))
+    assert np.allclose(blind.covariances[0], slope @ cov @ slope.T, atol=1e-6)
+
+
 def test_changes_are_readings_of_two_states() -> None:
     """A differential sensor: equal to the Kalman filter of the doubled state (x, x before)."""
     rng = np.random.default_rng(5)

@@ -165,11 +165,3 @@ def test_pivoted_qr() -> None:
     assert set(merged.source[:3]) == set(dropped.source) and merged.source[3] not in dropped.source
     for n, rest in product((1, 2, 3, 5, 9), ("merge", "drop")):
         assert pivoted_qr(shapes, size=n, rest=rest).size == min(n, 5)
-
-
-@pytest.mark.parametrize("keep", [[5], [0], [True], [True] * 4, [-1, 0, 1], "all"])
-def test_mixands_are_selected_by_a_mask_and_by_nothing_else(keep: object) -> None:
-    shapes = Shapes([[0.0], [1.0], [2.0]], np.ones((3, 1, 1)), [0, 0, 0])
-    assert shapes.select([True, False, True]).means.ravel().tolist() == [0.0, 2.0]
-    with pytest.raises(ValueError, match="^keep: needs (shape|an array of True and False)"):
-        shapes.select(keep)

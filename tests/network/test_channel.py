@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import networkx as nx
 import numpy as np
 import pytest
 from hypothesis import given
@@ -269,13 +268,6 @@ def test_silent_agents_neither_send_nor_hear() -> None:
     channel = star(faults=Faults(silent=[1]))
     assert [sorted(box) for box in channel.exchange(_ONES)] == [[2], [], [0]]
     assert charged(channel, messages=[1, 0, 1], lost=0)
-
-
-def test_a_graph_may_come_as_anything_that_names_links() -> None:
-    assert (Channel(nx.star_graph(2)).graph.links != STAR.links).nnz == 0
-    assert Channel([(0, 1)], ledger=Ledger.empty(5)).graph.size == 5
-    with pytest.raises(ValueError, match="graph: needs a graph of 5 agents, got 3"):
-        Channel(STAR, ledger=Ledger.empty(5))
 
 
 def test_windows_follow_the_channel_s_time_or_the_ledger_s_rounds() -> None:

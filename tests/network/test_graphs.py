@@ -100,6 +100,8 @@ def test_edges_count_once_and_run_from_speaker_to_listener() -> None:
     named = Graph.from_networkx(nx.DiGraph([("camera", "screen"), ("screen", "log")]))
     assert named.directed and named.neighbours(1) == (0,) and named.neighbours(0) == ()
     assert Graph.from_networkx(nx.MultiGraph([(5, 7), (5, 7), (7, 9)])).senders.size == 4
+    for a, b, c in ((0, 1, 2), "abc"):
+        assert as_graph(nx.Graph([(c, a), (a, b)]), 3, "abc").neighbours(0) == (1, 2)
 
 
 @given(st.integers(0, 1000), st.integers(1, 8))

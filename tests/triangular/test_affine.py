@@ -128,9 +128,3 @@ def test_composed_affine_map_is_the_enkf(seed: int, m: int, d: int) -> None:
     condition = np.linalg.cond(np.cov(y, rowvar=False).reshape(m, -1))
     ours, theirs = compose(fit(y, x), y, x, observed), _enkf(y, x, observed)
     assert np.abs(ours - theirs).max() < 1e-12 * max(1, np.abs(theirs).max(), condition)
-
-
-def test_members_just_enough() -> None:
-    """One member more than variables is enough for a map, but not for a good one."""
-    y, x = samples(8, n=6, m=2, d=3)
-    assert np.isfinite(compose(fit(y, x), y, x, np.zeros(2))).all()
