@@ -30,8 +30,8 @@ def pinned_environment() -> dict[str, str]:
     """Return the environment in which every chapter runs, wherever it is run.
 
     One thread in each BLAS and a fixed hash seed keep the digits; the reader's own IPython profile
-    and kernels are not looked at; progress bars, whose text holds times, are off. A check that fails stops the
-    chapter.
+    and kernels are not looked at; progress bars, whose text holds times, are off. A check that
+    fails stops the chapter.
     """
     home = ROOT / "_build" / "jupyter"
     (home / "ipython").mkdir(parents=True, exist_ok=True)
