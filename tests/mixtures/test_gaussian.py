@@ -90,6 +90,7 @@ def test_a_mixture_owns_its_arrays() -> None:
     before = p.log_density([0.3, 0.4])
     w[:], m[:], c[:] = 0.5, 7.0, 4 * np.eye(2)
     assert p.log_density([0.3, 0.4]) == before == p.changed().log_density([0.3, 0.4])
+    assert np.allclose(p.changed(covs=4 * p.covs).factors, 2 * p.factors)
     for mixture in (p, p.marginal([0]), p.collapsed()):
         with pytest.raises(ValueError, match="read-only"):
             mixture.covs[0] *= 4

@@ -105,11 +105,12 @@ def test_partial_options_survive_the_open_door() -> None:
 def test_exact_forecast_adds_q_exactly() -> None:
     phi, q = np.array([[1.0, 0.3], [0.0, 0.9]]), np.array([[0.4, 0.1], [0.1, 0.2]])
     model = Model(2, lambda x, t, dt: x @ phi.T, lambda t, dt: dt * q)
+    bent = Model(2, lambda x, t, dt: x @ phi.T + 0.3 * x**2, lambda t, dt: dt * q)
     x = members(12, 3)[..., :2]
-    out = exact_forecast(x, model, 0.0, 0.5, rng=rng())
-    for e, m in zip(out, x, strict=True):
-        assert np.allclose(e.mean(axis=0), phi @ m.mean(axis=0), atol=1e-13)
-        assert np.allclose(np.cov(e.T), phi @ np.cov(m.T) @ phi.T + 0.5 * q, atol=1e-12)
+    out = exact_forecast(x, bent, 0.0, 0.5, rng=rng())
+    for e, m in zip(out, bent.step(x, 0.0, 0.5), strict=True):
+        assert np.allclose(e.mean(axis=0), m.mean(axis=0), atol=1e-13)
+        assert np.allclose(np.cov(e.T), np.cov(m.T) + 0.5 * q, atol=1e-12)
     plain = sampled_forecast(members(100_000)[:, :2], model, 0.0, 0.5, rng=rng())
     wanted = phi @ np.cov(members(100_000)[:, :2].T) @ phi.T + 0.5 * q
     assert np.allclose(np.cov(plain.T), wanted, atol=0.03)
