@@ -204,9 +204,7 @@ def run(code: str, path: Path | None = None) -> str:
     """Run code in a fresh interpreter, away from the repository; return what it prints."""
     env = {**os.environ, "PYTHONPATH": str(path or "")}
     command = [sys.executable, "-W", "error", "-c", code]
-    done = subprocess.run(
-        command, cwd=path or ROOT.parent, env=env, capture_output=True, text=True
-    )
+    done = subprocess.run(command, cwd=path or ROOT.parent, env=env, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

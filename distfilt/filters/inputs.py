@@ -144,9 +144,7 @@ def belated(f: Any, late: Sequence[Reading], state: Any, t: float) -> list[Readi
         near = min(times, key=lambda known: abs(known - item.t), default=np.inf)
         if abs(near - item.t) > min(1e-9 * max(1.0, abs(item.t)), 1e-3 * shortest):
             known = ", ".join(f"{t:g}" for t in times) or "none (lag = 0)"
-            raise ValueError(
-                f"late: needs an earlier time that is kept ({known}), got {item.t:g}"
-            )
+            raise ValueError(f"late: needs an earlier time that is kept ({known}), got {item.t:g}")
         if item.agent >= f.count:
             raise ValueError(f"late: needs an agent below {f.count}, got {item.agent}")
         if (sensor := sensor_of(f, item)).uses_previous:

@@ -202,6 +202,4 @@ def _unpacked(numbers: Array, n: int) -> Array:
 def _learned(belief: GaussianMixture, news: Array) -> GaussianMixture:
     """A belief after news of its first components."""
     rows, values = news[:, :-1], news[:, -1]
-    return updated(
-        belief, values, lambda x: x[..., : rows.shape[1]] @ rows.T, np.eye(values.size)
-    )
+    return updated(belief, values, lambda x: x[..., : rows.shape[1]] @ rows.T, np.eye(values.size))

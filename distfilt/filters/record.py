@@ -204,9 +204,7 @@ def final_state(run: xarray.Dataset) -> State:
         ends = np.array_equal(run["time"].values[-1], state.t)
         if ends and np.array_equal(run["mean"].values[-1], last, equal_nan=True):
             return state  # type: ignore[no-any-return]
-    raise ValueError(
-        "run: needs the Dataset that a filter's run returned, got one without a state"
-    )
+    raise ValueError("run: needs the Dataset that a filter's run returned, got one without a state")
 
 
 def _attributes(name: str) -> dict[str, str]:

@@ -66,9 +66,7 @@ def model() -> LinearModel:
     """A damped oscillator with a full process noise."""
 
     def transition(dt: float) -> np.ndarray:
-        return np.exp(-0.1 * dt) * np.array(
-            [[np.cos(dt), np.sin(dt)], [-np.sin(dt), np.cos(dt)]]
-        )
+        return np.exp(-0.1 * dt) * np.array([[np.cos(dt), np.sin(dt)], [-np.sin(dt), np.cos(dt)]])
 
     return LinearModel.from_transition(
         2, transition, lambda t, dt: dt * Q, names=("x", "v"), units=("m", "m/s")

@@ -227,9 +227,7 @@ def test_a_run_takes_each_late_reading_when_it_arrives(family: str) -> None:
 @pytest.mark.parametrize(("origin", "dt"), [(0.0, 1.0), (1.7e9, 1.0), (0.0, 1e-10)])
 def test_a_late_reading_belongs_to_its_own_time(family: str, origin: float, dt: float) -> None:
     """Whatever the clock's zero and its unit; between the times it belongs to none."""
-    walk = LinearModel.from_transition(
-        1, lambda h: np.eye(1), lambda t, h: h / dt * np.eye(1)
-    )
+    walk = LinearModel.from_transition(1, lambda h: np.eye(1), lambda t, h: h / dt * np.eye(1))
     f = FAMILIES[family](walk, [direct([0], std=0.1)], None, lag=3)
     prior = (np.zeros(1), np.eye(1))
     state = f.start(prior, rng=np.random.default_rng(0), runs=(20,), t=origin)
@@ -271,9 +269,7 @@ def test_bad_run_is_named_and_others_go_on(family: str) -> None:
             out[1, 0] = np.nan
         return out
 
-    broken = Model(
-        2, flow, lambda t, dt: dt * np.eye(2), derivative=lambda x, t, dt: np.eye(2)
-    )
+    broken = Model(2, flow, lambda t, dt: dt * np.eye(2), derivative=lambda x, t, dt: np.eye(2))
     sensors = [direct([0], std=0.5), direct([1], std=0.5)]
     f, start = made(family, sensors=sensors, model=broken, runs=(3,))
     start = f.step(start, 0.5, [[0.1], [0.2]])

@@ -176,8 +176,7 @@ def test_only_the_wanted_estimates_are_made() -> None:
 
 
 def test_directed_graphs_flood_and_average() -> None:
-    one_way = Graph.from_edges(
-        SIZE, [[i, (i - 1) % SIZE] for i in range(SIZE)], directed=True)
+    one_way = Graph.from_edges(SIZE, [[i, (i - 1) % SIZE] for i in range(SIZE)], directed=True)
     state = last(make(one_way, Flooding(), local=(3,)))
     assert (state.carried[0][3][:, 2] > 0).sum() == 9
     averaged = last(make(one_way, DynamicAverage(modes=None)))

@@ -240,8 +240,7 @@ def test_late_values_are_those_that_were_sent_and_not_lost_then(delay: int) -> N
     """Own values are new; what is on the way stays as it was, and is lost when it is sent."""
     graph = REFERENCE["ring"]
     w = of_matrix(graph, np.eye(7) + graph.links.toarray())
-    prompt, late = (
-        Channel(graph, faults=Faults(loss=0.5, seed=3, delay=d)) for d in (0, delay))
+    prompt, late = (Channel(graph, faults=Faults(loss=0.5, seed=3, delay=d)) for d in (0, delay))
     values, news = np.zeros((7, 1)), []
     for k in range(delay + 4):
         values[:] = (10.0 * k + np.arange(7))[:, None]  # goes on computing in its own array
