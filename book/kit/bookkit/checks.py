@@ -16,12 +16,12 @@ class Telling(ast.NodeTransformer):
     --------
     >>> edited = Telling().visit(ast.parse("assert 1 > 2, 'the order of one and two'"))
     >>> exec(compile(ast.fix_missing_locations(edited), "cell", "exec"))
-    a check no longer holds: the order of one and two
+    no longer holds: the order of one and two
     """
 
     def visit_Assert(self, node: ast.Assert) -> ast.If:
         """``if not test: print(...)``, with the test itself where the check has no words."""
-        words = [ast.Constant("a check no longer holds:"), node.msg or ast.Constant(ast.unparse(node.test))]
+        words = [ast.Constant("no longer holds:"), node.msg or ast.Constant(ast.unparse(node.test))]
         remark = ast.Expr(ast.Call(ast.Name("print", ast.Load()), words, []))
         told = ast.If(ast.UnaryOp(ast.Not(), node.test), [remark], [])
         return ast.copy_location(told, node)
