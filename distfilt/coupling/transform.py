@@ -45,8 +45,7 @@ def normalised(log_weights: ArrayLike, shape: tuple[int, ...] | None = None) -> 
     if not np.isfinite(top).all():
         raise ValueError("log_weights: needs numbers below infinity, got NaN or infinity")
     if w.shape[-1] > 2 and w.min() >= 0 and np.allclose(w.sum(axis=-1), 1):
-        text = "log_weights: needs logarithms, got numbers with a sum of 1"
-        warnings.warn(text, RuntimeWarning, stacklevel=4)
+        warnings.warn("log_weights: needs logarithms, got a sum of 1", RuntimeWarning, stacklevel=4)
     w = np.exp(w - top)
     return np.asarray(w / w.sum(axis=-1, keepdims=True))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
@@ -104,6 +105,11 @@ class Model(Record):
             raise ValueError(
                 f"derivative: needs to return shape {(*x.shape, self.dim)}, got {slope.shape}"
             )
+        if "_judged" not in vars(self):  # once: a transposed one has the right shape too
+            vars(self)["_judged"] = True
+            near = central(lambda state: unchecked(self.step)(state, t, dt), x)
+            if np.abs(slope - near).max(initial=0.0) > 1e-2 * np.abs(near).max(initial=0.0):
+                warnings.warn("derivative: needs that of flow, got another", RuntimeWarning, 4)
         return np.broadcast_to(slope, (*x.shape, self.dim))
 
 

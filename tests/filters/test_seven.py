@@ -27,7 +27,7 @@ from distfilt.filters import (
 from distfilt.filters.record import final_state
 from distfilt.mixtures import GaussianMixture, target_fusion
 from distfilt.models import LinearModel, lorenz63, rotating_swarm
-from distfilt.network import Faults, Graph, covariance_intersection, graphs, pull
+from distfilt.network import Channel, Faults, Graph, covariance_intersection, graphs, pull
 from distfilt.sensors import Sensor, angle, direct
 from distfilt.updates import inflated, square_root
 
@@ -380,15 +380,17 @@ def test_inflation_widens_the_forecast_and_goes_with_fusion_and_the_past() -> No
     assert np.allclose(a.covariances, 1.69 * b.covariances)
     assert np.allclose(a.joint_covariances[..., :2, 2:], 1.3 * b.joint_covariances[..., :2, 2:])
     assert np.allclose(a.joint_covariances[..., 2:, 2:], b.joint_covariances[..., 2:, 2:])
-    fused = GaussianFilter(model(), EYES, NET, inflation=1.3, agreement=covariance_intersection)
-    c = fused.step(fused.start(PRIOR), 0.5, [None] * 3)
+    f = GaussianFilter(model(), EYES, NET, inflation=1.3, agreement=covariance_intersection)
+    c = f.step(f.start(PRIOR), 0.5, [None] * 3)
     assert np.allclose(c.covariances, a.covariances)
     # What is agreed of now tells of the past as much as its regression on now says.
     c, b = (f.step(f.start(PRIOR), 0.5, [[0.3], [0.2, 0.4], [0.9]]) for f in (
         GaussianFilter(model(), EYES, NET, lag=1, share=False, agreement=rule)
         for rule in (covariance_intersection, None)))
     p, alone, gap = c.joint_covariances, b.joint_covariances, c.joint_means - b.joint_means
+    fused = covariance_intersection((b.means, b.covariances), Channel(NET))
     gain = alone[..., 2:, :2] @ np.linalg.inv(alone[..., :2, :2])
     assert np.allclose(p[..., 2:, :2], gain @ p[..., :2, :2])
     assert np.allclose((p - alone)[..., 2:, 2:], gain @ (p - alone)[..., :2, :2] @ gain.mT)
     assert np.allclose(gap[..., 2:, None], gain @ gap[..., :2, None])
+    assert np.allclose(c.means, fused[0]) and np.allclose(c.covariances, fused[1])

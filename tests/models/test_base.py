@@ -55,6 +55,14 @@ def test_drawn_noise_has_the_full_covariance(door: str) -> None:
     assert (np.abs(draws.T @ draws / n - truth) < 3.9 * error).all()
 
 
+def test_a_transposed_derivative_is_told_once() -> None:
+    wrong = Model(2, lambda x, t, dt: x + dt * x[..., ::-1] * [1, 0], lambda t, dt: np.eye(2),
+                  derivative=lambda x, t, dt: np.array([[1.0, 0.0], [dt, 1.0]]))
+    with pytest.warns(RuntimeWarning, match="^derivative: needs that of flow"):
+        wrong.jacobian(np.ones((3, 2)), 0.0, 0.5)
+    wrong.jacobian(np.ones((3, 2)), 0.0, 0.5)
+
+
 def test_simulation_passes_the_times_on() -> None:
     seen = []
 

@@ -73,12 +73,7 @@ def test_free_agents_spread_by_2_d_t_on_each_axis() -> None:
 
 def test_numbers_and_functions_of_place_mean_the_same() -> None:
     x = np.random.default_rng(5).random((2, 2))  # as many agents as coordinates
-    forms = [
-        0.02,
-        [0.02, 0.02],
-        lambda x, t: 0.02 + 0 * x[..., 0],
-        lambda x, t: 0.02 + 0 * x,
-    ]
+    forms = [0.02, [0.02, 0.02], lambda x, t: 0.02 + 0 * x[..., 0], lambda x, t: 0.02 + 0 * x]
     steps = [Swarm(_still, f).step(x, 0.0, 0.1, rng=np.random.default_rng(6)) for f in forms]
     for other in steps[1:]:
         assert np.abs(other - steps[0]).max() < 1e-15
