@@ -192,9 +192,9 @@ def _warn_of_degrees(own: Sequence[Sensor], series: Array, agent: int) -> None:
     if not wraps or series.shape[-1:] != (own[0].dim,):
         return
     y = np.nan_to_num(series.astype(np.float64))
-    if (most := np.abs(y - wraps(y, 0 * y)).max(initial=0.0)) > 8 * np.pi:
-        text = f"needs angles in rad, got some {most / (2 * np.pi):.0f} turns from what they mean"
-        warnings.warn(f"observations[{agent}]: {text}", RuntimeWarning, stacklevel=4)
+    if (most := np.abs(y - wraps(y, 0 * y)).max(initial=0.0) / (2 * np.pi)) > 4:
+        text = f"observations[{agent}]: needs angles in rad, got some {most:.0f} turns off"
+        warnings.warn(text, RuntimeWarning, stacklevel=4)
 
 
 def _are_readings(given: Any) -> bool:
@@ -227,13 +227,14 @@ def moments_of(prior: Any, dim: int, word: str = "semidefinite") -> tuple[Array,
         raise ValueError(f"prior: needs (mean, cov) or what has a mean and a covariance, got {got}")
     else:
         members = array(prior, "prior", ("N", dim))
+        if len(members) <= dim:
+            raise ValueError(f"prior: needs more than {dim} members, got {len(members)}")
         mean, cov = members.mean(axis=0), sample_covariance(members)
     mean = array(np.atleast_1d(mean), "prior", (dim,))
     cov = array(cov, "prior")
     if cov.shape != (dim, dim) and not dim == cov.size == 1:
         raise ValueError(f"prior: needs a covariance of shape {(dim, dim)}, got {cov.shape}")
-    cov = cov.reshape(dim, dim)
-    definite(cov, "prior", word)
+    definite(cov := cov.reshape(dim, dim), "prior", word)
     return mean, cov
 
 

@@ -341,6 +341,7 @@ def test_a_prior_of_any_kind() -> None:
     unscented = GaussianFilter(model(), EYES, NET, rule="unscented")
     for g, wrong, text in ((f, lambda n, rng, leading: None, "got a function"),
                            (f, ([0.0, 0.0], [1.0, 1.0]), r"a covariance of .*, got \(2,\)"),
+                           (f, [[0.0, 0.0], [1.0, 1.0]], "more than 2 members, got 2"),
                            (unscented, flat, "definite"), (made("mixture")[0], flat, "definite")):
         with pytest.raises(ValueError, match=f"prior: needs .*{text}"):
             g.start(wrong)
