@@ -157,7 +157,10 @@ html_theme_options = {
     "use_repository_button": False,
     "use_source_button": False,
     # Pages of wide tables and long lines take the room of the bar on the right.
-    "secondary_sidebar_items": {"**": ["page-toc"], "book/api": [], "book/reproductions": []},
+    "secondary_sidebar_items": {
+        "**": ["page-toc"],
+        **{f"book/{page}": [] for page in ("index", "api", "reproductions", "errata", "gallery")},
+    },
 }
 pygments_style = "tango"
 copybutton_exclude = ".linenos, .gp, .go"
@@ -222,8 +225,23 @@ def link_names(app: Sphinx, page: str, template: str, context: dict[str, Any], t
         where = entry and app.builder.get_relative_uri(page, entry.docname)
         return f"{where}#{entry.node_id}" if entry else None
 
+    offer = (
+        f'<p class="notebook"><a href="_notebooks/{source.stem}.ipynb" download>'
+        "Download this chapter as a notebook</a></p>"
+    )
+    if chapter_number(page):
+        context["body"] = context["body"].replace("</h1>", f"</h1>\n{offer}", 1)
     names = imported(code_of(source), app.env.distfilt_homes)
     context["body"] = link_code(context["body"], names, url)
+
+
+def copy_notebooks(app: Sphinx, error: Exception | None) -> None:
+    """Put the chapters beside their pages, to be taken away."""
+    target = Path(app.outdir) / "book" / "_notebooks"
+    if error is None and app.builder.name == "html":
+        target.mkdir(parents=True, exist_ok=True)
+        for source in chapters():
+            shutil.copy(source.with_suffix(".ipynb"), target)
 
 
 def setup(app: Sphinx) -> None:
@@ -244,3 +262,4 @@ def setup(app: Sphinx) -> None:
     app.connect("autodoc-process-docstring", lambda *event: escape_stars(event[-1]))
     app.connect("autodoc-process-signature", lambda *event: signature(event[1], event[3]))
     app.connect("build-finished", copy_mathjax)
+    app.connect("build-finished", copy_notebooks)

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import ast
+import base64
 import functools
 import importlib
 import inspect
+import io
+import json
 import re
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ForwardRef, Literal, Union, get_args, get_origin
 
 import numpy as np
+import yaml
 from docutils import nodes
 from numpy.typing import ArrayLike
+from PIL import Image
 from sphinx.pycode import ModuleAnalyzer
 
 from bookkit.rows import read_rows
@@ -198,7 +203,9 @@ def signature(what: str, value: Any) -> tuple[str, str | None] | None:
         found = inspect.signature(value)
     except (TypeError, ValueError):
         return None
-    home = importlib.import_module(getattr(value, "__module__", "builtins"))
+    names: dict[str, Any] = {}
+    for owner in reversed(inspect.getmro(value) if what == "class" else [value]):
+        names |= vars(importlib.import_module(owner.__module__))
     shown, kinds, last = [], inspect.Parameter, None
     for k, part in enumerate(found.parameters.values()):
         if k == 0 and part.name == "self":
@@ -208,10 +215,10 @@ def signature(what: str, value: Any) -> tuple[str, str | None] | None:
         last = part.kind
         text = {kinds.VAR_POSITIONAL: "*", kinds.VAR_KEYWORD: "**"}.get(last, "") + part.name
         if part.annotation is not part.empty:
-            text += f": {written(part.annotation, vars(home))}"
+            text += f": {written(part.annotation, names)}"
         shown.append(text if part.default is part.empty else f"{text} = {default(part.default)}")
     given = found.return_annotation
-    returned = None if given is found.empty else written(given, vars(home))
+    returned = None if given is found.empty else written(given, names)
     return f"({', '.join(shown)})", None if what == "class" else returned
 
 
@@ -430,11 +437,125 @@ def reproductions_text() -> str:
     return "\n".join(lines)
 
 
+NEEDS = {2: (1,), 3: (1,), 4: (2, 3), 5: (3,), 6: (1, 5), 7: (1, 2), 8: (1, 7), 9: (1,), 10: (2, 9)}
+"""The chapters that each chapter builds on, as its first paragraphs say."""
+
+
+def map_text() -> str:
+    """Return a drawing of what each chapter builds on, and the same as a list."""
+    pages = {n: page for page in toc_pages() if (n := chapter_number(page)) is not None}
+    titles = {n: chapter_title(page) for n, page in pages.items()}
+    rows: dict[int, int] = {}
+    for n in pages:
+        rows[n] = 1 + max((rows[k] for k in NEEDS.get(n, ())), default=-1)
+    place = {}
+    for n, row in rows.items():
+        beside = [k for k in rows if rows[k] == row]
+        place[n] = (530 + 262 * (beside.index(n) - (len(beside) - 1) / 2), 40 + 105 * row)
+    width, height = 1060, 80 + 105 * max(rows.values())
+    lines = [f'<svg class="map" viewBox="0 0 {width} {height}" role="img" '
+             'aria-label="Arrows from each chapter to those that build on it">']  # fmt: skip
+    for n, (x, y) in place.items():
+        # What another arrow implies is not drawn.
+        for k in (k for k in NEEDS.get(n, ()) if rows[k] == rows[n] - 1):
+            a, b = place[k]
+            lines += [f'<path d="M{a},{b + 26} C{a},{b + 66} {x},{y - 66} {x},{y - 27}"/>']
+    for n, (x, y) in place.items():
+        link = pages[n].removeprefix("book/")
+        lines += [f'<a href="{link}.html"><rect x="{x - 125}" y="{y - 26}" width="250" height="52" '
+                  f'rx="8"/><text x="{x}" y="{y + 6}">{n}. {titles[n]}</text></a>']  # fmt: skip
+    lines += ["</svg>"]
+    told = []
+    for n, page in pages.items():
+        needs = [f"[chapter {k}](/{pages[k]}.md)" for k in NEEDS.get(n, ())]
+        builds = " and ".join(needs) or "nothing of the book"
+        told += [f"- **{n}** [{titles[n]}](/{page}.md): {builds}"]
+    return "\n".join(["```{raw} html", *lines, "```", "", *told])
+
+
+def chapter_title(page: str) -> str:
+    """Return the title of a page."""
+    text = (ROOT / f"{page}.md").read_text(encoding="utf-8")
+    return re.search(r"^# +(.+)$", text, flags=re.MULTILINE)[1]  # type: ignore[index]
+
+
+def figures(source: Path) -> Iterator[tuple[str, str, str, bytes]]:
+    """Yield a chapter's numbered figures: label, caption, text for who does not see it, picture."""
+    for cell in json.loads(source.with_suffix(".ipynb").read_text(encoding="utf-8"))["cells"]:
+        options = cell["metadata"].get("mystnb", {})
+        name = options.get("figure", {}).get("name")
+        found = [output.get("data", {}) for output in cell.get("outputs", ())]
+        shown = [data["image/png"] for data in found if "image/png" in data]
+        if name and shown:
+            caption, alt = options["figure"].get("caption", ""), options.get("image", {}).get("alt")
+            yield name, caption, alt or caption, base64.b64decode("".join(shown[0]))
+
+
+def gallery_text(folder: Path) -> str:
+    """Return a card for each figure of the book, and write its small picture."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lines = []
+    for source in chapters():
+        if (number := chapter_number(f"book/{source.stem}")) is None:
+            continue
+        lines += [f"## {number}. {chapter_title(f'book/{source.stem}')}", ""]
+        lines += ["::::{grid} 2 2 3 4", ":gutter: 2", ""]
+        for name, caption, alt, picture in figures(source):
+            target = folder / f"{name}.png"
+            made = target.stat().st_mtime if target.is_file() else 0.0
+            if made < source.with_suffix(".ipynb").stat().st_mtime:
+                small = Image.open(io.BytesIO(picture)).convert("RGB")
+                small.thumbnail((480, 480), reducing_gap=2.0)
+                small.quantize(64).save(target)
+            words = re.sub(r"\{[\w:]+\}`([^`<]*)[^`]*`", r"\1", caption).split(". ")[0].rstrip(".")
+            alt = " ".join(alt.split())
+            lines += [":::{grid-item-card}", f":link: {name}", ":link-type: ref",
+                      f":img-top: /book/_generated/gallery/{name}.png", f":img-alt: {alt}",
+                      ":class-card: picture", "", words, ":::"]  # fmt: skip
+        lines += ["::::", ""]
+    return "\n".join(lines)
+
+
+def errata_text() -> str:
+    """Return the papers' errata, as each paper's page of printed values lists them."""
+    lines = []
+    for paper, title in PAPERS.items():
+        text = (ROOT / "data" / "published" / paper / "README.md").read_text(encoding="utf-8")
+        table = text.split("## Errata", 1)[1].split("\n## ", 1)[0]
+        rows = [line for line in table.splitlines() if line.startswith("|")]
+        lines += [f"### {title} (`{paper}`)", "", *map(with_links, rows), ""]
+    return "\n".join(lines)
+
+
+def with_links(row: str) -> str:
+    """Return a row of a table whose chapters are links."""
+    pages = {n: page for page in toc_pages() if (n := chapter_number(page)) is not None}
+
+    def link(found: re.Match[str]) -> str:
+        page = pages.get(int(found[2]))
+        return f"[{found[1]}{found[2]}](/{page}.md)" if page else found[0]
+
+    first = re.sub(r"(?<=chapter )()(\d+)", link, row)
+    return re.sub(r"(?<=chapters )()(\d+)", link, re.sub(r"(?<= and )()(\d+)(?= \|$)", link, first))
+
+
+def cite_text() -> str:
+    """Return how to cite the book, from the file that says it for machines."""
+    facts = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    who = " and ".join(author["name"] for author in facts["authors"])
+    fields = {"title": facts["title"], "author": "{" + who + "}",
+              "version": facts["version"], "year": str(facts["date-released"])[:4]}  # fmt: skip
+    body = ",\n".join(f"  {name:<8}= {{{value}}}" for name, value in fields.items())
+    return f"```bibtex\n@software{{distfilt,\n{body}\n}}\n```"
+
+
 def write_generated(folder: Path) -> None:
     """Write the included parts of pages; an unchanged part keeps its date."""
     by = users()
     parts = {f"api/{part}.md": api_part(part, by) for part in api_parts()}
     parts["api.md"] = api_index()
+    parts["map.md"], parts["errata.md"] = map_text(), errata_text()
+    parts["gallery.md"], parts["cite.md"] = gallery_text(folder / "gallery"), cite_text()
     if ITEMS.is_file() and LEDGER.is_file():
         parts["reproductions.md"] = reproductions_text()
     for name, text in parts.items():
