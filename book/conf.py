@@ -30,6 +30,7 @@ from sphinx.util.nodes import make_refnode
 
 sys.path.insert(0, str(Path(__file__).parent / "tools"))
 
+import distfilt
 from common import BOOK, ROOT, chapters, missing_pages
 from pages import (
     chapter_number,
@@ -50,6 +51,7 @@ project = "Distributed Nonlinear Filtering"
 author = "The distfilt authors"
 copyright = "2026, The distfilt authors"
 language = "en"
+version = release = distfilt.__version__
 
 extensions = [
     "myst_nb",

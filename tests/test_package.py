@@ -239,7 +239,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return target
 
 
-def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
+def test_wheel_holds_the_library_and_nothing_else_in_one_version(wheel: Path) -> None:
+    told = ("pyproject.toml", "book/kit/pyproject.toml", "CITATION.cff", "CHANGELOG.md")
+    assert all(distfilt.__version__ in (ROOT / name).read_text("utf-8") for name in told)
     assert sorted(p.name.partition("-")[0] for p in wheel.iterdir()) == ["distfilt", "distfilt"]
     files = (p for p in (wheel / "distfilt").rglob("*") if p.is_file())
     found = sorted(p.relative_to(wheel / "distfilt") for p in files)
