@@ -38,6 +38,7 @@ TITLE = re.compile(r"^# +(.+)$", re.M)
 ANCHOR = re.compile(r"^\(([\w-]+)\)=\s*\n+#+ +(.+)$", re.M)
 SOLUTION = re.compile(r"^(`{3,}|:{3,})\{solution-(start|end)\}[^\n]*\n.*?^\1$\n?", re.M | re.S)
 INCLUDE = re.compile(r"^```\{include\} _generated/reproductions\.md\n```$", re.M)
+MADE = re.compile(r"^```\{include\} _generated/\S+\n```$", re.M)
 HELP = """# API reference
 
 The reference is a page of the built book (`make book`). In a notebook `help(name)` or `name?` shows
@@ -148,6 +149,7 @@ def plain(text: str, page: str, known: Names, references: BibliographyData) -> s
     text = MATH.sub(equation, DOLLARS.sub(dollars, text))
     text = SOLUTION.sub(lambda m: "**Solution**\n" if m[2] == "start" else "", text)
     text = INCLUDE.sub(lambda m: reproductions_text(), text)
+    text = MADE.sub("*What the build makes of the chapters stands here on the book's page.*", text)
     text = re.sub(r"\]\((?:/book/)?(\d\d-[\w-]+)\.md", r"](\1.ipynb", text)
     return ROLE.sub(lambda m: written_out(m[1], m[2], page, known, references), text)
 

@@ -62,8 +62,7 @@ return {
     .filter(e => e.getBoundingClientRect().width < 1).length,
   broken: [...document.images].filter(i => !i.complete || i.naturalWidth === 0).map(name),
   mute: [...document.images].filter(i => !(i.getAttribute("alt") || "").trim()).map(name),
-  links: [...document.querySelectorAll("a[href]")]
-    .map(a => new URL(a.getAttribute("href"), document.baseURI).href),
+  links: [...document.links].map(a => a.href),
   ids: [...document.querySelectorAll("[id], a[name]")].map(e => e.id || e.name),
 };
 """
