@@ -111,6 +111,9 @@ bibtex_bibfiles = ["refs.bib"]
 bibtex_reference_style = "author_year"
 bibtex_default_style = "plain"
 
+# Every name is documented where it is defined; what another module imports is not its own.
+viewcode_follow_imported_members = False
+
 autodoc_typehints = "signature"
 toc_object_entries_show_parents = "hide"
 add_module_names = False

@@ -462,7 +462,7 @@ def map_text() -> str:
             lines += [f'<path d="M{a},{b + 26} C{a},{b + 66} {x},{y - 66} {x},{y - 27}"/>']
     for n, (x, y) in place.items():
         link = pages[n].removeprefix("book/")
-        lines += [f'<a href="{link}.html"><rect x="{x - 125}" y="{y - 26}" width="250" height="52" '
+        lines += [f'<a href="{link}.html"><rect x="{x - 129}" y="{y - 26}" width="258" height="52" '
                   f'rx="8"/><text x="{x}" y="{y + 6}">{n}. {titles[n]}</text></a>']  # fmt: skip
     lines += ["</svg>"]
     told = []

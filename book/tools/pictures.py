@@ -17,9 +17,9 @@ import nbformat
 import numpy as np
 from PIL import Image
 
-# With a slider a WebP's own first bytes tell it from other text; a notebook escapes quotes.
+# A picture is told from other text by its own first bytes; a notebook escapes quotes.
 _EMBEDDED = re.compile(
-    r'(?<=data:image/webp;base64,)[A-Za-z0-9+/=\n]+|(?<=")UklGR[A-Za-z0-9+/=]+'
+    r'(?<=data:image/webp;base64,)[A-Za-z0-9+/=\n]+|(?<=")(?:UklGR|iVBORw0KGgo)[A-Za-z0-9+/=]+'
 )
 SHADE = 0.25
 """A pixel differs if its shade does by more than this share of black to white."""
