@@ -24,10 +24,11 @@ export MPLCONFIGDIR := $(CURDIR)/$(VENV)/matplotlib
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .PHONY: help environment remake book test unit types style pairs regress slow outputs identical \
-	accept studies check-studies bench mutants portable lab lock clean
+	accept studies check-studies bench mutants portable lab lock pdf epub clean
 
 help:
 	@echo "make book       environment, library and HTML (warnings are errors); prints the page's path"
+	@echo "make pdf        the book, then all of it as one PDF; make epub the same as an EPUB (needs Chromium and its driver)"
 	@echo "make test       the book, then unit, property and doc tests, types, style, pairs, stored outputs, browser"
 	@echo "make slow       the tests that take minutes, and new examples for the property tests"
 	@echo "make outputs    execute every chapter, store its outputs, write the ledger of reproductions"
@@ -60,6 +61,9 @@ book: $(STAMP)
 	rm -rf $(HTML)
 	$(PY) -m sphinx -b html -W --keep-going -q -E -d _build/doctrees -c book . $(HTML)
 	@echo "The book: $(CURDIR)/$(HTML)/book/index.html"
+
+pdf epub: book
+	$(PY) book/tools/volume.py $@
 
 test: book unit types style pairs regress
 

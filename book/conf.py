@@ -32,6 +32,7 @@ sys.path.insert(0, str(Path(__file__).parent / "tools"))
 
 import distfilt
 from common import BOOK, ROOT, chapters, missing_pages
+from light import lighten
 from pages import (
     chapter_number,
     code_of,
@@ -147,10 +148,12 @@ html_static_path = ["_static"]
 html_css_files = ["book.css"]
 html_favicon = "_static/mark.svg"
 html_logo = "_static/mark.svg"
+html_search_scorer = str(Path(__file__).parent / "_static" / "search.js")
 html_copy_source = False
 html_show_sourcelink = False
 html_show_sphinx = False
 html_context = {"default_mode": "light"}
+WIDE = ("index", "which-filter", "api", "reproductions", "errata", "gallery")
 html_theme_options = {
     "logo": {"text": project, "alt_text": "Distributed Nonlinear Filtering, first page"},
     "home_page_in_toc": False,
@@ -164,7 +167,7 @@ html_theme_options = {
     # Pages of wide tables and long lines take the room of the bar on the right.
     "secondary_sidebar_items": {
         "**": ["page-toc"],
-        **{f"book/{page}": [] for page in ("index", "api", "reproductions", "errata", "gallery")},
+        **{f"book/{page}": [] for page in WIDE},
     },
 }
 pygments_style = "tango"
@@ -249,6 +252,12 @@ def copy_notebooks(app: Sphinx, error: Exception | None) -> None:
             shutil.copy(source.with_suffix(".ipynb"), target)
 
 
+def make_lighter(app: Sphinx, error: Exception | None) -> None:
+    """Make the pages light, once all are written."""
+    if error is None and app.builder.name == "html":
+        lighten(Path(app.outdir))
+
+
 def setup(app: Sphinx) -> None:
     number_figures = TocTreeCollector.assign_figure_numbers
 
@@ -268,3 +277,4 @@ def setup(app: Sphinx) -> None:
     app.connect("autodoc-process-signature", lambda *event: signature(event[1], event[3]))
     app.connect("build-finished", copy_mathjax)
     app.connect("build-finished", copy_notebooks)
+    app.connect("build-finished", make_lighter)

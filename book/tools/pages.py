@@ -437,17 +437,35 @@ def reproductions_text() -> str:
     return "\n".join(lines)
 
 
-NEEDS = {2: (1,), 3: (1,), 4: (2, 3), 5: (3,), 6: (1, 5), 7: (1, 2), 8: (1, 7), 9: (1,), 10: (2, 9)}
-"""The chapters that each chapter builds on, as its first paragraphs say."""
+def needs() -> dict[int, set[int]]:
+    """Return the chapters that each chapter builds on, as it says: *You should know ...*."""
+    out = {}
+    for page in toc_pages():
+        if (number := chapter_number(page)) is None:
+            continue
+        text = " ".join((ROOT / f"{page}.md").read_text(encoding="utf-8").split())
+        text = re.sub(r"\[([^]]*)\]\(\d[^)]*\)", r"\1", text)
+        said = re.search(r"You should know .*?\.(?= [A-Z`:|#]|$)", text)
+        found: set[int] = set()
+        lists = r"[Cc]hapters? ((?:\d+(?:, and |, | and | to )?)+)"
+        for few in re.findall(lists, said[0] if said else ""):
+            listed = [int(n) for n in re.findall(r"\d+", few)]
+            found |= set(range(listed[0], listed[-1] + 1) if " to " in few else listed)
+        out[number] = found - {number}
+    return out
 
 
 def map_text() -> str:
     """Return a drawing of what each chapter builds on, and the same as a list."""
     pages = {n: page for page in toc_pages() if (n := chapter_number(page)) is not None}
-    titles = {n: chapter_title(page) for n, page in pages.items()}
+    titles, needed = {n: chapter_title(page) for n, page in pages.items()}, needs()
     rows: dict[int, int] = {}
+
+    def before(n: int) -> set[int]:
+        return needed[n].union(*map(before, needed[n]))
+
     for n in pages:
-        rows[n] = 1 + max((rows[k] for k in NEEDS.get(n, ())), default=-1)
+        rows[n] = 1 + max((rows[k] for k in needed[n]), default=-1)
     place = {}
     for n, row in rows.items():
         beside = [k for k in rows if rows[k] == row]
@@ -457,7 +475,7 @@ def map_text() -> str:
              'aria-label="Arrows from each chapter to those that build on it">']  # fmt: skip
     for n, (x, y) in place.items():
         # What another arrow implies is not drawn.
-        for k in (k for k in NEEDS.get(n, ()) if rows[k] == rows[n] - 1):
+        for k in needed[n] - {i for j in needed[n] for i in before(j)}:
             a, b = place[k]
             lines += [f'<path d="M{a},{b + 26} C{a},{b + 66} {x},{y - 66} {x},{y - 27}"/>']
     for n, (x, y) in place.items():
@@ -467,9 +485,9 @@ def map_text() -> str:
     lines += ["</svg>"]
     told = []
     for n, page in pages.items():
-        needs = [f"[chapter {k}](/{pages[k]}.md)" for k in NEEDS.get(n, ())]
-        builds = " and ".join(needs) or "nothing of the book"
-        told += [f"- **{n}** [{titles[n]}](/{page}.md): {builds}"]
+        builds = [f"[chapter {k}](/{pages[k]}.md)" for k in sorted(needed[n])]
+        listed = " and ".join(", ".join(builds).rsplit(", ", 1)) or "nothing of the book"
+        told += [f"- **{n}** [{titles[n]}](/{page}.md): {listed}"]
     return "\n".join(["```{raw} html", *lines, "```", "", *told])
 
 

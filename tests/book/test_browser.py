@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +14,8 @@ from urllib.parse import unquote, urldefrag, urlparse
 
 import pytest
 
+import browser
+from browser import READY
 from common import ROOT, chapters
 
 BUILT = ROOT / "_build" / "html"
@@ -22,24 +23,7 @@ LOCAL = ("file://", "data:", "blob:", "about:")
 # Pages that a Chromium opens for itself, whatever its version: what they ask for is not the book's.
 OWN = ("chrome://", "chrome-untrusted://", "chrome-extension://", "devtools://", "about:")
 WIDTHS = (1440, 1200, 400)
-FLAGS = (
-    "--headless=new",
-    "--no-sandbox",
-    "--disable-gpu",
-    "--disable-dev-shm-usage",
-    "--disable-background-networking",
-    "--disable-component-update",
-    "--disable-sync",
-    "--no-first-run",
-)
-
-# Waits for the mathematics, opens what is folded, then reports what a reader would meet.
-READY = """
-const done = arguments[arguments.length - 1];
-const ready = window.MathJax && MathJax.startup ? MathJax.startup.promise : Promise.resolve();
-const pictures = [...document.images].map(i => i.decode().catch(() => null));
-ready.then(() => Promise.all(pictures)).then(() => done(true));
-"""
+# Opens what is folded, then reports what a reader would meet.
 REPORT = r"""
 document.querySelectorAll("details").forEach(d => { d.open = true; });
 const raw = [];
@@ -175,29 +159,11 @@ def asked(entries: list[dict[str, Any]], tab: str) -> list[str]:
 
 @contextmanager
 def chromium(profile: Path, **logs: str) -> Iterator[Any]:
-    """A headless Chromium with a fresh profile."""
-    names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-    browser = next(filter(None, map(shutil.which, names)), None)
-    helper = shutil.which("chromedriver")
-    if not browser or not helper:
-        message = "chromium or chromedriver is not installed: no page was opened in a browser"
-        if os.environ.get("CI") == "true":
-            pytest.fail(message)
-        pytest.skip(message)
-    from selenium import webdriver
-    from selenium.webdriver.chrome.options import Options
-    from selenium.webdriver.chrome.service import Service
-
-    options = Options()
-    options.binary_location = browser
-    for flag in (*FLAGS, f"--user-data-dir={profile}"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", logs)
-    driver = webdriver.Chrome(options=options, service=Service(helper))
-    try:
-        yield driver
-    finally:
-        driver.quit()
+    """A headless Chromium; where there is none the test is skipped, except in `CI`."""
+    if browser.installed() is None:
+        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(browser.MISSING)
+    with browser.chromium(profile, **logs) as found:
+        yield found
 
 
 @pytest.fixture(scope="module")

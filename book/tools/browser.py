@@ -1,0 +1,60 @@
+"""A headless Chromium, for what only a browser can show."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+FLAGS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-dev-shm-usage",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+)
+READY = """
+const done = arguments[arguments.length - 1];
+const ready = window.MathJax && MathJax.startup ? MathJax.startup.promise : Promise.resolve();
+const pictures = [...document.images].map(i => i.decode().catch(() => null));
+ready.then(() => Promise.all(pictures)).then(() => done(true));
+"""
+"""Waits for the mathematics and the pictures of a page."""
+
+MISSING = "chromium or chromedriver is not installed"
+
+
+def installed() -> tuple[str, str] | None:
+    """Return the paths of a browser and of what drives it, or nothing."""
+    names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+    browser, helper = (
+        next(filter(None, map(shutil.which, names)), None),
+        shutil.which("chromedriver"),
+    )
+    return (browser, helper) if browser and helper else None
+
+
+@contextmanager
+def chromium(profile: Path, **logs: str) -> Iterator[Any]:
+    """Yield a browser with a fresh profile, and with logs of what it does."""
+    if (found := installed()) is None:
+        raise FileNotFoundError(MISSING)
+    from selenium import webdriver
+    from selenium.webdriver.chrome.options import Options
+    from selenium.webdriver.chrome.service import Service
+
+    options = Options()
+    options.binary_location = found[0]
+    for flag in (*FLAGS, f"--user-data-dir={profile}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", logs)
+    driver = webdriver.Chrome(options=options, service=Service(found[1]))
+    try:
+        yield driver
+    finally:
+        driver.quit()

@@ -1,0 +1,289 @@
+"""Write the whole book as one PDF, or as one EPUB, from its built pages.
+
+    python book/tools/volume.py pdf
+    python book/tools/volume.py epub
+
+A headless Chromium sets the mathematics and the pages, so that nothing but a browser is needed. A
+slider is its still picture, code that the pages fold away is left out, and the solutions of all
+exercises stand at the end. The reference of the library and the gallery stay with the pages.
+A chapter that is missing, or anything wider than the paper, is an error.
+"""
+
+from __future__ import annotations
+
+import base64
+import datetime
+import html
+import posixpath
+import re
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import yaml
+from bs4 import BeautifulSoup, Tag
+
+import distfilt
+import epub
+from browser import READY, chromium
+from common import ROOT, toc_pages
+
+BUILT = ROOT / "_build" / "html"
+TARGET = BUILT / "book"
+NAME = "distributed-nonlinear-filtering"
+TITLE, AUTHOR = "Distributed Nonlinear Filtering", "The distfilt authors"
+STYLE = Path(__file__).with_name("volume.css")
+LEFT_OUT = "book/api", "book/gallery"
+"""Pages that stay with the site: long to print, and made to be searched."""
+GONE = (
+    "script, style, .headerlink, .notebook, .frames-controls, p:has(> a.sd-btn), "
+    "details.above-input, details > summary, .pst-copy, button, input"
+)
+"""What a page on a screen has and a book has not."""
+
+# Type that is too wide for the column becomes smaller, down to six tenths.
+FIT = r"""
+const shrink = (part, wide) => {
+  for (let k = 0, size = 1; k < 8 && size > 0.6; k++) {
+    const over = wide();
+    if (over <= 1.001) return;
+    size = Math.max(0.6, size / over - 0.004);
+    part.style.fontSize = `calc(${part.dataset.size} * ${size})`;
+  }
+};
+for (const part of document.querySelectorAll("pre, table, div.math")) {
+  part.dataset.size = getComputedStyle(part).fontSize;
+  if (part.matches("pre")) shrink(part, () => part.scrollWidth / part.clientWidth);
+  else if (part.matches("table"))
+    shrink(part, () => part.offsetWidth / part.parentElement.clientWidth);
+  else if (part.matches("div.math")) {
+    const held = part.querySelector("mjx-container"), inner = part.querySelector("mjx-math");
+    if (inner) shrink(part, () => inner.getBoundingClientRect().width / held.clientWidth);
+  }
+}
+"""
+# What is wider or higher than the paper, what is not set, what is not drawn.
+WRONG = r"""
+const body = document.body.getBoundingClientRect(), found = [];
+const name = (e) => `${e.tagName.toLowerCase()} in ${e.closest("section.part")?.id}: `
+  + (e.closest("div.math, pre, table") || e).textContent.trim().slice(0, 60);
+for (const e of document.querySelectorAll("section.part *")) {
+  const box = e.getBoundingClientRect();
+  if (!box.width || e.closest("svg, mjx-math, mjx-assistive-mml") && !e.matches("svg, mjx-math"))
+    continue;
+  if (box.right > body.right + 2 || box.left < body.left - 2) found.push("too wide: " + name(e));
+}
+for (const e of document.querySelectorAll("pre"))
+  if (e.scrollWidth > e.clientWidth + 1) found.push("cut: " + name(e));
+for (const e of document.querySelectorAll("img")) {
+  if (!e.naturalWidth) found.push("not drawn: " + name(e) + e.src);
+  if (e.getBoundingClientRect().height > 860) found.push("too high: " + name(e) + e.src);
+}
+for (const e of document.querySelectorAll(".math"))
+  if (!e.querySelector("mjx-container")) found.push("not set: " + name(e));
+for (const e of document.querySelectorAll("mjx-merror, [data-mml-node=merror]"))
+  found.push("no formula: " + name(e));
+return [...new Set(found)];
+"""
+
+# The contents tell the page of each place.
+NUMBER = """
+for (const line of document.querySelectorAll(".contents li:has(a)"))
+  line.querySelector("b").textContent = arguments[0][line.querySelector("a").hash.slice(1)];
+"""
+
+
+def key(page: str, name: str = "") -> str:
+    """Return what a name of one page is called in the whole book."""
+    stem = page.removeprefix("book/").replace("/", "-")
+    return f"p{stem}" + (f"--{re.sub(r'[^A-Za-z0-9_.-]', '-', name)}" if name else "")
+
+
+def shown() -> list[str]:
+    """Return the pages that the whole book holds, in reading order."""
+    return [page for page in toc_pages() if not page.startswith(LEFT_OUT)]
+
+
+def article(page: str, pages: list[str]) -> tuple[Tag, list[Tag]]:
+    """Return a page's text as it stands in the book, and the solutions that it held."""
+    path = BUILT / f"{page}.html"
+    if not path.is_file():
+        sys.exit(f"{path.relative_to(ROOT)} is not built: make book")
+    soup = BeautifulSoup(path.read_text(encoding="utf-8"), "html.parser")
+    text = soup.select_one("article.bd-article")
+    assert text is not None, page
+    for part in text.select(GONE):
+        part.decompose()
+    for part in text.select("details"):
+        part.unwrap()
+    for node in text.find_all(id=True):
+        node["id"] = key(page, str(node["id"]))
+    for link in text.find_all("a", href=True):
+        lead(link, page, pages)
+    for picture in text.find_all("img"):
+        picture["src"] = (path.parent / unquote(str(picture["src"]))).resolve().as_uri()
+        del picture["loading"]
+    for table in text.find_all("table"):
+        if len(table.find_all("tr")) > 14:
+            table["class"] = [*table.get("class", []), "long"]
+    text.name, text.attrs = "section", {"class": ["part"], "id": key(page)}
+    return text, [solution.extract() for solution in text.select(".solution")]
+
+
+def lead(link: Tag, page: str, pages: list[str]) -> None:
+    """Make a link lead to its place in the book; one to a page that stays away is its words."""
+    where, _, name = str(link["href"]).partition("#")
+    if re.match(r"\w+:", where):
+        return
+    beside = posixpath.normpath(posixpath.join(posixpath.dirname(page), where))
+    target = beside.removesuffix(".html") if where else page
+    if target in pages:
+        link["href"] = "#" + key(target, unquote(name))
+    else:
+        link.unwrap()
+
+
+def assembled() -> tuple[str, list[str]]:
+    """Return the whole book as one page, and its chapters' names."""
+    pages, parts, back = shown(), [], []
+    captions = {}
+    for group in yaml.safe_load((ROOT / "_toc.yml").read_text(encoding="utf-8"))["parts"]:
+        captions[group["chapters"][0]["file"]] = group["caption"]
+    listed = []
+    for page in pages:
+        text, solutions = article(page, pages)
+        parts.append(str(text))
+        if page in captions:
+            listed.append(f'<li class="group">{html.escape(captions[page])}</li>')
+        listed += entries(text)
+        if solutions:
+            title = text.find("h1").get_text()  # type: ignore[union-attr]
+            back += [
+                f'<h2 id="{key(page, "solutions")}">{html.escape(title)}</h2>',
+                *map(str, solutions),
+            ]
+    parts.append(
+        f'<section class="part" id="psolutions"><h1>Solutions</h1>{"".join(back)}</section>'
+    )
+    listed += entries(BeautifulSoup(parts[-1], "html.parser").section)
+    built = "".join((BUILT / f"{page}.html").read_text(encoding="utf-8") for page in pages)
+    config = re.search(r"<script>(window\.MathJax = .*?)</script>", built)
+    assert config is not None, "pages have no mathematics"
+    mathjax = (BUILT / "_static" / "mathjax" / "tex-mml-chtml.js").as_uri()
+    now = datetime.date.today().isoformat()
+    head = f"""<!doctype html><html lang="en" data-theme="light"><head>
+<meta charset="utf-8"><title>{TITLE}</title>
+<link rel="stylesheet" href="{(BUILT / "_static" / "pygments.css").as_uri()}">
+<style>{STYLE.read_text(encoding="utf-8")}</style>
+<script>{config[1]}; window.MathJax.options.menuOptions =
+  {{settings: {{assistiveMml: false}}}};</script>
+<script defer src="{mathjax}"></script></head><body class="tex2jax_ignore mathjax_ignore">"""
+    front = f"""<section class="front"><p class="title">{TITLE}</p><p>{AUTHOR}, edition
+{distfilt.__version__}, printed {now}.</p><p class="told">What moves on the pages is a still picture
+here. Code that the pages fold away, the reference of the library and the gallery of pictures are
+with the pages and the notebooks.</p></section>"""
+    contents = (
+        f'<section class="part contents"><h1>Contents</h1><ol>{"".join(listed)}</ol></section>'
+    )
+    return "\n".join([head, front, contents, *parts, "</body></html>"]), [*pages, "solutions"]
+
+
+def entries(text: Any) -> list[str]:
+    """Return the lines of the contents for one part: its title, and its sections."""
+    out = []
+    for head in text.find_all(["h1", "h2"]):
+        place = text["id"] if head.name == "h1" else (head.get("id") or head.parent.get("id"))
+        kind = "chapter" if head.name == "h1" else "below"
+        words = head.decode_contents().strip()
+        out.append(f'<li class="{kind}"><a href="#{place}">{words}</a><i></i><b></b></li>')
+    return out
+
+
+def pages_of(pdf: bytes) -> dict[str, int]:
+    """Return the page of each place that a link of a PDF by Chromium leads to."""
+    objects = dict(re.findall(rb"(?:^|\n)(\d+) 0 obj\n(.*?)\nendobj", pdf, flags=re.DOTALL))
+
+    def leaves(number: bytes) -> list[bytes]:
+        below = re.search(rb"/Kids\s*\[(.*?)\]", objects[number], flags=re.DOTALL)
+        kids = re.findall(rb"(\d+) 0 R", below[1]) if below else []
+        return [leaf for kid in kids for leaf in leaves(kid)] if below else [number]
+
+    root = next(n for n, text in objects.items() if b"/Type /Catalog" in text)
+    top = re.search(rb"/Pages (\d+) 0 R", objects[root])
+    assert top is not None, "a PDF without pages"
+    order = {number: k + 1 for k, number in enumerate(leaves(top[1]))}
+    places = re.findall(rb"/([^\s/\[\]<>()]+)\s*\[(\d+) 0 R\s*/XYZ", b"\n".join(objects.values()))
+    return {name.decode(): order[number] for name, number in places}
+
+
+def printed(driver: Any) -> bytes:
+    """Return the open page as a PDF."""
+    foot = ('<div style="font: 8px sans-serif; width: 100%; text-align: center">'
+            '<span class="pageNumber"></span></div>')  # fmt: skip
+    answer = driver.execute_cdp_cmd("Page.printToPDF", {
+        "preferCSSPageSize": True, "printBackground": True, "displayHeaderFooter": True,
+        "headerTemplate": "<span></span>", "footerTemplate": foot,
+        "generateDocumentOutline": True, "generateTaggedPDF": True,
+    })  # fmt: skip
+    return base64.b64decode(answer["data"])
+
+
+def opened(driver: Any, page: Path) -> None:
+    """Open the assembled page, set it, and refuse what does not fit."""
+    driver.command_executor.client_config.timeout = 1800
+    driver.set_script_timeout(1700)
+    driver.set_page_load_timeout(1700)
+    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    driver.set_window_size(900, 1000)
+    driver.get(page.as_uri())
+    driver.execute_async_script(READY)
+    driver.execute_script(FIT)
+    if wrong := driver.execute_script(WRONG):
+        sys.exit("\n".join(["the book does not fit its paper:", *wrong]))
+
+
+def pdf(driver: Any, parts: list[str]) -> bytes:
+    """Return the book as a PDF; the second printing has the numbers of the first one's pages."""
+    places = pages_of(printed(driver))
+    starts = [places[part] for part in parts if part in places]
+    if len(starts) != len(parts) or starts != sorted(set(starts)):
+        sys.exit(f"the PDF has not every chapter: {dict(zip(parts, starts, strict=False))}")
+    driver.execute_script(NUMBER, places)
+    return printed(driver)
+
+
+def main() -> int:
+    if len(sys.argv) != 2 or sys.argv[1] not in ("pdf", "epub"):
+        sys.exit(__doc__)
+    text, names = assembled()
+    target = TARGET / f"{NAME}.{sys.argv[1]}"
+    with tempfile.TemporaryDirectory() as folder, chromium(Path(folder) / "profile") as driver:
+        page = Path(folder) / "book.html"
+        page.write_text(text, encoding="utf-8")
+        opened(driver, page)
+        parts = [key(name) for name in names]
+        if sys.argv[1] == "pdf":
+            target.write_bytes(pdf(driver, parts))
+        else:
+            colours = (BUILT / "_static" / "pygments.css").read_text(encoding="utf-8")
+            light = re.findall(r'^html\[data-theme="light"\] .*', colours, flags=re.MULTILINE)
+            about = {"title": TITLE, "author": AUTHOR, "version": distfilt.__version__}
+            epub.write(driver, target, parts, about, "\n".join(light))
+    offer(target)
+    print(f"The book: {target}, {target.stat().st_size / 1e6:.1f} MB")
+    return 0
+
+
+def offer(target: Path) -> None:
+    """Let the first page lead to a file whose name it tells."""
+    first = TARGET / "index.html"
+    name = re.escape(target.name)
+    told = re.compile(rf'<code[^>]*><span class="pre">{name}</span></code>')
+    text = first.read_text(encoding="utf-8")
+    first.write_text(told.sub(f'<a href="{target.name}">{target.name}</a>', text), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
