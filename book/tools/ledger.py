@@ -12,8 +12,10 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 import sys
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +92,53 @@ def summaries(rows: list[dict[str, str]]) -> dict[str, tuple[int, dict[str, int]
         found = Counter(row["verdict"] for row in rows if row["kind"] == kind)
         out[kind] = found.total(), {verdict: found[verdict] for verdict in known}
     return out
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One claim of a row as the ledger tells it, for one of the starts that were judged."""
+
+    id: str
+    start: str
+    holds: bool
+    ours: str
+    null: str
+    range: str
+
+
+START = r"(?:(?P<start>(?:off|on) the circle): )?"
+
+
+def parts(text: str, head: str) -> list[tuple[str, re.Match[str], str]]:
+    """Split a cell of the ledger at its claims: the start, the head's match, the rest."""
+    hits = list(re.finditer(rf"(?:^|; ){START}{head}", text))
+    out, start = [], ""
+    ends = [h.start() for h in hits[1:]] + [len(text)] * bool(hits)
+    for hit, end in zip(hits, ends, strict=True):
+        start = hit["start"] or start
+        out.append((start, hit, text[hit.end():end]))
+    return out
+
+
+def claims_of(row: dict[str, str]) -> list[Judged]:
+    """Return the claims of a row of results, each with its null and its range."""
+    ours = parts(row["ours"], r"(?P<id>[a-z0-9-]+) (?P<word>holds|fails): ")
+    ids = "|".join(dict.fromkeys(hit["id"] for _, hit, _ in ours))
+    nulls = {(s, hit["id"]): rest for s, hit, rest in parts(row["null"], rf"(?P<id>{ids}), ")}
+    ranges = {(s, hit["id"]): rest for s, hit, rest in parts(row["range"], rf"(?P<id>{ids}) ")}
+    return [
+        Judged(hit["id"], s, hit["word"] == "holds", rest, nulls.get((s, hit["id"]), ""),
+               ranges.get((s, hit["id"]), ""))
+        for s, hit, rest in ours
+    ]  # fmt: skip
+
+
+def unmoved(row: dict[str, str]) -> list[str]:
+    """Return the claims of a row whose verdict is the same on the null's numbers, or lacks one.
+
+    A claim writes "holds too" behind its null when its rule, asked of the null, holds.
+    """
+    return [c.id for c in claims_of(row) if not c.null or "(holds too)" in c.null]
 
 
 def current() -> str:

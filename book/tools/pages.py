@@ -25,7 +25,7 @@ from sphinx.pycode import ModuleAnalyzer
 from bookkit.rows import read_rows
 from common import BOOK, ROOT, SLIDER, chapters, toc_pages
 from distfilt.doors import MISSING
-from ledger import ITEMS, LEDGER, WORDS, summaries
+from ledger import ITEMS, LEDGER, WORDS, claims_of, summaries
 
 PAPERS = {
     "grange": "Triangular transport maps",
@@ -423,18 +423,41 @@ def reproductions_text() -> str:
         shown = ", ".join(f"{n} *{verdict}*" for verdict, n in counts.items())
         lines += [f"Of {total} {WORDS[kind]}: {shown}.", ""]
     for paper in dict.fromkeys(row["paper"] for row in rows):
+        own = [row for row in rows if row["paper"] == paper]
         lines += [f"## {PAPERS.get(paper, paper)} (`{paper}`)", ""]
-        lines += ["| Item | Shows | Chapter | Verdict | Ours | Published | Why |"]
-        lines += ["|---|---|---|---|---|---|---|"]
-        for row in (r for r in rows if r["paper"] == paper):
+        lines += ["| Item | Shows | Chapter | Verdict |", "|---|---|---|---|"]
+        for row in own:
             cells = [row["item"].replace(" ", "\u00a0"), cell(titles[paper, row["item"]])]
-            cells += [chapter_link(row["chapter"])]
-            beside = {"ours": "", "null": "<br>*If false:* ", "range": "<br>*Range:* "}
-            ours = "".join(f"{word}{cell(row[n])}" for n, word in beside.items() if row[n])
-            cells += [row["verdict"], ours or cell(""), cell(row["published"]), cell(row["why"])]
+            cells += [chapter_link(row["chapter"]), row["verdict"]]
             lines += ["| " + " | ".join(cells) + " |"]
         lines += [""]
+        for row in (row for row in own if row["verdict"] != "read"):
+            lines += claims_text(row, titles[paper, row["item"]])
     return "\n".join(lines)
+
+
+def claims_text(row: dict[str, str], title: str) -> list[str]:
+    """Return what stands behind one verdict: each claim with our number, its null and its range."""
+    lines = [f"### {row['item']}: {title}", "", f"Verdict: **{row['verdict']}**."]
+    if row["why"]:
+        lines[-1] += f" Why: {row['why']}."
+    lines += [""]
+    found = claims_of(row)
+    if not found:
+        return [*lines, f"Ours: {row['ours'] or '–'}. Published: {row['published'] or '–'}.", ""]
+    folder, name = ROOT / "data" / "published" / row["paper"], row["item"].lower()
+    stem = name.replace("fig. ", "figure-").replace("table ", "table-")
+    path = folder / f"{stem}{'' if stem.startswith('figure') else '-claims'}.csv"
+    listed = {claim["id"]: claim for claim in read_rows(path)}
+    for k in dict.fromkeys(claim.id for claim in found):
+        lines += [f"{listed[k]['claim']}", f": *Rule:* {listed[k]['criterion']}"]
+        for claim in (c for c in found if c.id == k):
+            start = f", {claim.start}" if claim.start else ""
+            lines += ["", f": *Ours{start}* ({'holds' if claim.holds else 'fails'}): {claim.ours}"]
+            lines += ["", f": *If the claim were false{start}:* {claim.null}"]
+            lines += ["", f": *Range{start}:* {claim.range}"] if claim.range else []
+        lines += [""]
+    return lines
 
 
 def needs() -> dict[int, set[int]]:

@@ -258,7 +258,7 @@ def test_a_rule_that_its_null_passes_too_shows_nothing() -> None:
     verdicts = [judge_claims("grange", "Fig. 1", [CLAIMS[0], below(x), CLAIMS[2]], why="high")
                 for x in (0.1, 0.5, 0.01)]  # fmt: skip
     assert [v.verdict for v in verdicts] == ["match", "not comparable", "differs"]
-    assert {v.null for v in verdicts} == {"pca-stable, a coin: 0.3"}
+    assert ["holds too" in v.null for v in verdicts] == [False, True, False]
     assert verdicts[1].why == "the rule of pca-stable holds for its null too"
     swept = below(0.1)._replace(range="for gains from .1 on")
     verdict = judge_claims("grange", "Fig. 1", [CLAIMS[0], swept, CLAIMS[2]])

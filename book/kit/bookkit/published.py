@@ -202,7 +202,7 @@ class Claim(NamedTuple):
         >>> print(Claim.ruled("order", "ratio", lambda r: r < 1, 0.8, 1.1, "agents shuffled"))
         order holds: ratio 0.8
         """
-        beside = f"{against}: {shown(null)}"
+        beside = f"{against}: {shown(null)}{' (holds too)' if rule(null) else ''}"
         return cls(id, text, bool(rule(ours)), shown(ours), beside, not rule(null), range)
 
     def __str__(self) -> str:
