@@ -9,10 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from nbval.kernel import RunningKernel
-from nbval.plugin import IPyNbCell
-
-from pictures import differences, without_pictures
+import pytest
 
 
 def _execute_cell_input(kernel: Any, cell_input: str, allow_stdin: bool | None = None) -> Any:
@@ -21,18 +18,25 @@ def _execute_cell_input(kernel: Any, cell_input: str, allow_stdin: bool | None =
     )
 
 
-_compare_texts = IPyNbCell.compare_outputs
+def pytest_configure(config: pytest.Config) -> None:
+    """Nothing to change, or to import, where no notebook is run."""
+    if not config.getoption("nbval", False):
+        return
+    from nbval.kernel import RunningKernel
+    from nbval.plugin import IPyNbCell
 
+    from pictures import differences, without_pictures
 
-def _compare_outputs(cell: Any, test: Any, ref: Any, skip_compare: Any = None) -> bool:
-    """Texts to the letter, by nbval; pictures as a reader sees them."""
-    texts = (without_pictures(test), without_pictures(ref), skip_compare)
-    if not _compare_texts(cell, *texts):
-        return False
-    found = differences(ref, test)
-    cell.comparison_traceback += found
-    return not found
+    compare_texts = IPyNbCell.compare_outputs
 
+    def compare_outputs(cell: Any, test: Any, ref: Any, skip_compare: Any = None) -> bool:
+        """Texts to the letter, by nbval; pictures as a reader sees them."""
+        texts = (without_pictures(test), without_pictures(ref), skip_compare)
+        if not compare_texts(cell, *texts):
+            return False
+        found = differences(ref, test)
+        cell.comparison_traceback += found
+        return not found
 
-RunningKernel.execute_cell_input = _execute_cell_input
-IPyNbCell.compare_outputs = _compare_outputs
+    RunningKernel.execute_cell_input = _execute_cell_input
+    IPyNbCell.compare_outputs = compare_outputs

@@ -7,7 +7,7 @@ import os
 from hypothesis import HealthCheck, settings
 
 # No deadline: a busy machine is no error. Derandomised, a fresh clone passes or fails always.
-settings.register_profile("gate", derandomize=True, deadline=None)
+settings.register_profile("gate", derandomize=True, deadline=None, max_examples=40)
 settings.register_profile(
     "explore", max_examples=2000, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )

@@ -6,7 +6,6 @@ import copy
 import inspect
 import re
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from itertools import product
 from typing import Any
@@ -16,7 +15,7 @@ import pytest
 
 from distfilt.doors.kinds import Scope
 from tests.tools.calls import Call, callables, calls, describe, public, rooms
-from tests.tools.fuzz import exact
+from tests.tools.fuzz import exact, kinds
 
 PUBLIC = {name: thing for room in rooms() for name, thing in public(room).items()}
 WITHOUT = {
@@ -36,18 +35,6 @@ IN_A_ROW = {
     "strength", "bodies", "reading", "wanted", "mixtures", "sensor",
 }  # fmt: skip
 """Data that a call may leave out, such as a filter's graph; options are given by name."""
-
-
-def wrong(valid: Any) -> Iterator[Any]:
-    """Values of other kinds, and the valid one made worse; a kind refuses some of them."""
-    yield from (object(), "no such", 1.5, -1, 0, 2, True, np.nan, 1j, [], [1.0, "text"])
-    with suppress(TypeError, ValueError):
-        x = np.atleast_1d(np.asarray(valid, dtype=float))
-        yield from (-x, 0 * x - 1, x + 1j, x.astype(str), x[..., None, None], x[:0], 3 * x + 2)
-        if x.size:
-            flat = x.copy()
-            flat.flat[-1] = np.nan
-            yield from (flat, np.where(np.isnan(flat), np.inf, x), x.flat[0], x.ravel()[::-1])
 
 
 def refuses(value: Any, call: Call, name: str) -> bool:
@@ -79,7 +66,7 @@ def test_a_door_refuses_by_name(name: str) -> None:
         for call, (argument, kind) in product(found[:1], describe(function).items()):
             if argument not in call.given:
                 continue
-            bad = [v for v in wrong(call.given[argument]) if refuses(v, call, argument)]
+            bad = [v for _, v in kinds(call.given[argument]) if refuses(v, call, argument)]
             assert bad, f"{name}{method}({argument}): {kind.needs} refuses nothing"
             for value in bad:
                 before = copy.deepcopy(call.given)

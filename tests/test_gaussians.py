@@ -125,6 +125,8 @@ def test_closed_forms() -> None:
     assert np.allclose(intersection_weights(p, rule="determinant"), roots / roots.sum(), rtol=1e-14)
     for rule in RULES:
         assert intersection_weights(p[:1], rule=rule).tolist() == [1.0]
+    here = np.array([True, False, True])
+    assert intersection_weights(p, here=[here, ~here]).tolist() == [[0.5, 0, 0.5], [0, 1, 0]]
     huge = np.stack([1e-200 * np.eye(4), 1e200 * np.eye(4)])
     assert np.allclose(intersection_weights(huge, rule="determinant"), [1.0, 0.0])
 
@@ -206,17 +208,6 @@ def test_optimal_weights_are_numbers_for_any_sizes(seed: int, power: float) -> N
     for rule in RULES:
         w = intersection_weights(p, rule=rule)
         assert (w >= 0).all() and np.allclose(w.sum(-1), 1.0, rtol=1e-12)
-
-
-def test_batches_equal_one_by_one() -> None:
-    p = spd(generator(10), 3, (4, 7, 3))
-    for rule in RULES:
-        whole = intersection_weights(p, rule=rule)
-        assert whole.shape == (4, 7, 3)
-        for i, j in ((0, 0), (3, 6), (2, 1)):
-            assert np.allclose(whole[i, j], intersection_weights(p[i, j], rule=rule), atol=1e-9)
-    here = np.array([True, False, True])
-    assert intersection_weights(p[0, 0], here=[here, ~here]).tolist() == [[0.5, 0, 0.5], [0, 1, 0]]
 
 
 # --- recolouring ------------------------------------------------------------------------------

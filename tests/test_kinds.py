@@ -161,6 +161,7 @@ def test_each_matrix_is_judged_alone_and_each_component_in_its_units(rule: Any) 
         ([np.diag([1e12, 1e12]), INDEFINITE], r"at \[1\]"),
         ([[1e12 * np.eye(2), np.diag([1.0, -1e-9])]], r"at \[0, 1\]"),
         (hidden, "smallest eigenvalue -0.1"),
+        ([[1.0, 0.0]], r"a square matrix, got shape \(1, 2\)"),
         ([[1e12, 0, 0], [0, 1.0, 0.5], [0, 0.5 + 1e-8, 1.0]], "symmetric"),
     ):
         with pytest.raises(ValueError, match=f"^P: .*{words}"):

@@ -251,11 +251,3 @@ def test_wheel_holds_the_library_and_nothing_else_in_one_version(wheel: Path) ->
 def test_installed_library_runs_alone(wheel: Path) -> None:
     code = "import distfilt; from distfilt import filters; print(distfilt.__file__)"
     assert Path(run(code, wheel).strip()).is_relative_to(wheel)
-
-
-TIMED = "import time, numpy, scipy.linalg; start = time.perf_counter(); import distfilt; "
-
-
-def test_import_is_quick() -> None:
-    # The least of three: the first may read from a cold disk.
-    assert min(float(run(TIMED + "print(time.perf_counter() - start)")) for _ in range(3)) < 0.4

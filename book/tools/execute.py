@@ -14,6 +14,9 @@ outputs, for edits that change no output, such as a new name for an import.
 
 from __future__ import annotations
 
+import startup  # noqa: F401
+
+# isort: split
 import argparse
 import os
 import sys

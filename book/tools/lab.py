@@ -10,6 +10,9 @@ since JupyterLab knows only one page at a time. A copy that is there already is 
 
 from __future__ import annotations
 
+import startup  # noqa: F401
+
+# isort: split
 import argparse
 import json
 import os

@@ -10,6 +10,9 @@ byte.
 
 from __future__ import annotations
 
+import startup  # noqa: F401
+
+# isort: split
 import csv
 import io
 import re

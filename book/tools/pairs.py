@@ -8,6 +8,9 @@ notebook whose outputs and execution counts were both cleared.
 
 from __future__ import annotations
 
+import startup  # noqa: F401
+
+# isort: split
 import re
 import sys
 from pathlib import Path

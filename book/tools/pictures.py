@@ -7,6 +7,9 @@ few pixels may differ, and none by much more than a line's edge.
 
 from __future__ import annotations
 
+import startup  # noqa: F401
+
+# isort: split
 import base64
 import binascii
 import io

@@ -8,6 +8,9 @@ notebook goes through the very same command first and fails if the setting did n
 
 from __future__ import annotations
 
+import startup  # noqa: F401
+
+# isort: split
 import argparse
 import subprocess
 import sys
@@ -42,7 +45,8 @@ def compare(notebook: Path, extra: dict[str, str]) -> int:
     """Run one notebook against its stored outputs; return pytest's exit code."""
     started = time.perf_counter()
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", ""]
-    command += ["--nbval", "--nbval-current-env", "--nbval-cell-timeout=900", str(notebook)]
+    command += ["-p", "book.tools.startup", "-p", "nbval.plugin", "--nbval", "--nbval-current-env"]
+    command += ["--nbval-cell-timeout=900", str(notebook)]
     done = subprocess.run(
         command, cwd=ROOT, env=pinned_environment() | extra, capture_output=True, text=True
     )

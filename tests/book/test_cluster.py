@@ -42,25 +42,33 @@ Start = Callable[..., subprocess.Popen[str]]
 
 @pytest.fixture(scope="module")
 def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The page's script and what it writes; its trial tells a module beside it that it begins."""
+    """The page's script, run in two parts; its trial tells a module beside it that it begins."""
     folder = tmp_path_factory.mktemp("page")
     text = (ROOT / "book" / "examples" / "cluster.py").read_text(encoding="utf-8")
-    for place, more in [("import sys\n", "import beside\n"),
-                        ("    rng, times", "    beside.begin(seed.spawn_key[0])\n")]:  # fmt: skip
-        text = text.replace(place, more + place, 1)
+    for old, new in [("import sys\n", "import beside\nimport sys\n"), ("[5:,", "[:,"),
+                     ("    rng, times", "    beside.begin(seed.spawn_key[0])\n    rng, times"),
+                     ("np.arange(1, 11) * 0.5", "[0.5]")]:  # fmt: skip
+        assert text.count(old) == 1
+        text = text.replace(old, new)
     (folder / "cluster.py").write_text(text, encoding="utf-8")
-    (folder / "beside.py").write_text("def begin(which): pass", encoding="utf-8")
-    subprocess.run(LOCAL, shell=True, cwd=folder, env=ENVIRONMENT, check=True)
+    counted(folder)
+    one = ENVIRONMENT | {"LOKY_MAX_CPU_COUNT": "1"}
+    subprocess.run(["sh", "-ec", PARTS], cwd=folder, env=one, check=True)
     return folder
+
+
+def counted(folder: Path) -> None:
+    """Beside the script, what counts how often each trial begins."""
+    (folder / "beside.py").write_text(BESIDE.replace("LOG", repr(str(folder / "log"))))
+    for name in ("log", "elsewhere"):
+        (folder / name).mkdir()
 
 
 @pytest.fixture
 def folder(script: Path, tmp_path: Path) -> Path:
-    """A copy of the script that counts how often each trial begins."""
+    """A copy of the script, not run yet."""
     shutil.copy(script / "cluster.py", tmp_path)
-    (tmp_path / "beside.py").write_text(BESIDE.replace("LOG", repr(str(tmp_path / "log"))))
-    for name in ("log", "elsewhere"):
-        (tmp_path / name).mkdir()
+    counted(tmp_path)
     return tmp_path
 
 
@@ -110,16 +118,14 @@ def same(folder: Path, script: Path, twice: int) -> None:
     assert len(begun(folder)) == 40 and sum(begun(folder)) <= 40 + twice
 
 
-def test_on_this_machine(folder: Path, script: Path, start: Start) -> None:
+def test_on_this_machine_or_in_parts_that_are_merged(
+    folder: Path, script: Path, start: Start
+) -> None:
     killed(20, folder, start, LOCAL)
     time.sleep(1.0)  # its workers see that it is gone
     assert start(LOCAL).wait() == 0
     same(folder, script, twice=os.cpu_count() or 1)
-
-
-def test_parts_of_two_machines_are_merged(folder: Path, script: Path, start: Start) -> None:
-    assert start(PARTS).wait() == 0
-    same(folder, script, twice=0)
+    same(script, script, twice=0)
 
 
 @pytest.mark.slow

@@ -50,11 +50,20 @@ executed_folder = pytest.fixture(scratch, scope="module")
 
 
 @pytest.fixture(scope="module")
-def executed(executed_folder: Path) -> Path:
+def execution(executed_folder: Path) -> subprocess.CompletedProcess[str]:
+    """Execute the small chapter, and two that have to be refused, at once."""
+    text = SMALL.read_text(encoding="utf-8")
+    sources = [executed_folder / f"{name}.md" for name in ("small", "told", "failed")]
+    for path, lines in zip(sources, ([], REFUSED, ["raise ValueError('no')"]), strict=True):
+        code = "".join(f"```{{code-cell}} ipython3\n{line}\n```\n\n" for line in lines)
+        path.write_text(text.split("```")[0] + code if lines else text, encoding="utf-8")
+        path.with_suffix(".ipynb").write_text("as it was")
+    return tool("execute.py", *sources)
+
+
+@pytest.fixture(scope="module")
+def executed(execution: object, executed_folder: Path) -> Path:
     """Return a folder with the small chapter, executed once."""
-    shutil.copy(SMALL, executed_folder)
-    done = tool("execute.py", executed_folder / SMALL.name)
-    assert done.returncode == 0, done.stderr
     return executed_folder
 
 
@@ -144,18 +153,17 @@ FAULTS: dict[str, tuple[int, Callable[[Any], object], str]] = {
 
 
 def test_one_changed_output_or_source_fails_and_no_other(executed: Path, folder: Path) -> None:
-    whole = executed / "small.md"
-    cells = code_cells(stored(whole))
+    cells = code_cells(stored(executed / "small.md"))
     untouched = len(cells)
-    assert pairs.check(whole) == []
+    assert pairs.check(executed / "small.md") == []
     for which, change, _ in FAULTS.values():
         cells.append(nbformat.from_dict(cells[which]))
         change(cells[-1])
     for k, cell in enumerate(cells):
         cell["id"] = f"cell-{k}"
     notebook = nbformat.v4.new_notebook(cells=cells, metadata={"kernelspec": execute.KERNELSPEC})
-    done = tool("regress.py", store(folder / "broken.md", notebook), whole)
-    assert done.returncode == 1 and "small: as stored" in done.stdout
+    done = tool("regress.py", store(folder / "broken.md", notebook))
+    assert done.returncode == 1 and "broken: differs" in done.stdout
     parts = re.split(r"^_+ .*Cell (\d+) _+$", done.stderr, flags=re.M)
     told = dict(zip(map(int, parts[1::2]), parts[2::2], strict=True))
     wanted = {k: text for k, (*_, text) in enumerate(FAULTS.values(), untouched) if text}
@@ -230,28 +238,27 @@ REFUSED = {
 }
 
 
-def test_execution_refuses(folder: Path) -> None:
-    head = SMALL.read_text(encoding="utf-8").split("```")[0]
-    for name, lines in {"told": REFUSED, "failed": ["raise ValueError('no')"]}.items():
-        code = "".join(f"```{{code-cell}} ipython3\n{line}\n```\n\n" for line in lines)
-        (folder / f"{name}.md").write_text(head + code, encoding="utf-8")
-        (folder / f"{name}.ipynb").write_text("as it was")
-    done = tool("execute.py", folder / "told.md", folder / "failed.md")
-    assert done.returncode == 1 and "failed: a cell failed" in done.stderr
-    cells = re.split(r"^cell [\w-]+:\n", done.stderr, flags=re.M)[1:]
+def test_execution_refuses(execution: Any, executed: Path) -> None:
+    assert execution.returncode == 1 and "failed: a cell failed" in execution.stderr
+    cells = re.split(r"^cell [\w-]+:\n", execution.stderr, flags=re.M)[1:]
     for cell, (line, complaint) in zip(cells, REFUSED.items(), strict=True):
         assert cell.startswith(line) and complaint in cell
-    assert {path.read_text() for path in folder.glob("*.ipynb")} == {"as it was"}
+    kept = {path.stem for path in executed.glob("*.ipynb") if path.read_text() == "as it was"}
+    assert kept == {"told", "failed"} and re.findall(r"^\w+", execution.stdout, re.M) == ["small"]
 
 
-def test_executing_again_gives_the_same_bytes(executed: Path, chapter: Path) -> None:
+def test_executing_again_gives_the_same_bytes(
+    executed: Path, chapter: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = chapter.with_suffix(".ipynb")
     whole = path.read_text(encoding="utf-8")
-    path.write_text(whole.replace("rate 2.0000", "rate 2.0001"), encoding="utf-8")
-    done = tool("execute.py", "--bytes", executed / "small.md", chapter)
-    assert done.returncode == 1 and done.stderr.count("does not give the stored bytes") == 1
-    assert re.findall(r"^\w+", done.stdout, re.M) == ["small"] and "widget-state+json" in whole
+    done = tool("execute.py", "--bytes", executed / "small.md")
+    assert done.returncode == 0 and done.stderr == "" and "widget-state+json" in whole
     assert "version" not in stored(chapter)["metadata"]["language_info"] and str(ROOT) not in whole
+    path.write_text(whole.replace("rate 2.0000", "rate 2.0001"), encoding="utf-8")
+    monkeypatch.setattr(execute, "run", lambda new, _: new.update(stored(executed / "small.md")))
+    monkeypatch.setattr(execute.os, "environ", dict(execute.os.environ))
+    assert "does not give the stored bytes" in execute.execute(chapter, True, True)
     notebook = nbformat.reads(whole, as_version=4)
     exchange_picture(code_cells(notebook)[FIGURE])
     assert "pixels" in execute.unlike(whole, execute.dump(notebook), False)

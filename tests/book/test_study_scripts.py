@@ -43,7 +43,7 @@ def test_make_studies_stores_and_checks(
     script.write_text(SCRIPT, encoding="utf-8")
     assert tool.main(["--check"], tmp_path) == 1
     assert "not stored yet" in capsys.readouterr().err
-    assert tool.main(["--workers", "2"], tmp_path) == 0
+    assert tool.main(["--workers", "1"], tmp_path) == 0
     path = tmp_path / "data" / "studies" / "zheng" / "spread.csv"
     stored = studies.load(path)
     assert len(stored) == 12 and stored.parameters == {"members": 20}
@@ -98,7 +98,7 @@ def test_scripts_share_a_module_and_store_what_their_scenario_was(
     (folder / "_common.py").write_text(SHARED, encoding="utf-8")
     (folder / "two.py").write_text(USES, encoding="utf-8")
     monkeypatch.setattr(sys, "path", [*sys.path])
-    assert tool.main(["--workers", "2"], tmp_path) == 0
+    assert tool.main(["--workers", "1"], tmp_path) == 0
     stored = studies.load(tmp_path / "data" / "studies" / "grange" / "table-2.csv")
     assert stored.metric("a").tolist() == [0.0, 1.0, 2.0, 3.0]
     digest = scenario("grange", "table-2").digest

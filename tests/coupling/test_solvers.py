@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -95,6 +97,13 @@ def test_a_solver_that_stops_early_says_so(
     monkeypatch.setattr(solvers, limit, value)
     with pytest.raises(SolverError, match=message):
         plan(*_case(8), solver=solver, regularisation=1e-3)
+
+
+def test_where_rounding_hides_the_dual_its_gradient_leads_on(monkeypatch: Any) -> None:
+    solve, steps = np.linalg.solve, []
+    monkeypatch.setattr(np.linalg, "solve", lambda a, b: steps.append(a) or solve(a, b))
+    plan(*_case(8, 15, 3, 2), solver="entropic", regularisation=1e-7)
+    assert len(steps) < 100
 
 
 @given(st.integers(0, 10_000), st.sampled_from([1e-2, 1e-3, 1e-4]))

@@ -29,17 +29,6 @@ def at(observations: list[Any], k: int) -> list[Any]:
     return [None if o is None else o[k] for o in observations]
 
 
-@EACH
-def test_step_leaves_its_state_alone_and_repeats(family: str) -> None:
-    f, start = made(family, runs=(2,))
-    _, seen = data(f.sensors, (2,))
-    before = {n: v.copy() for n, v in values(start).items()}
-    once, twice = (f.step(start, TIMES[0], at(seen, 0)) for _ in range(2))
-    assert same(once, twice) and once.t == TIMES[0]
-    assert all((values(start)[n] == before[n]).all() for n in before)
-    assert any((values(once)[n] != before[n]).any() for n in before)
-
-
 @pytest.mark.parametrize(("family", "rule"), [(f, rule) for f in FAMILIES for rule in rules(f)])
 def test_nobody_notices_beyond_the_neighbours(family: str, rule: Any) -> None:
     """On a path 0-1-2-3-4 a step reaches one link: agents 0, 1, 2 know nothing of agent 4."""

@@ -27,20 +27,6 @@ from .families import NOISE, PRIOR, TIMES, data, kalman, made, model, team
 BOTH = Sensor(2, lambda x: x, NOISE, linear=lambda d: np.eye(d))
 
 
-def test_gaussian_filter_is_the_kalman_filter_with_full_noise_and_gaps() -> None:
-    _, (seen,) = data([BOTH], (5,))
-    seen[2, 1, 0] = np.nan
-    seen[4] = np.nan
-    run = made("gaussian", sensors=[BOTH], graph=None, runs=(5,))
-    out = run[0].run(run[1], TIMES, [seen])
-    exact, _ = kalman([seen], [BOTH])
-    assert np.allclose(out["mean"].values[..., 0, :], exact.means, atol=1e-12)
-    assert np.allclose(
-        out["covariance"].values[..., 0, :, :],
-        np.broadcast_to(exact.covariances, (8, 5, 2, 2)), atol=1e-12,
-    )
-
-
 def test_network_of_exact_ensembles_is_the_network_of_kalman_filters() -> None:
     """With the same rule of intersection, agent by agent, with loss and a full noise matrix."""
     from distfilt.network import Faults

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from distfilt.coupling import ensemble_transform
+from distfilt.coupling.transform import plans
 from distfilt.filters import Reading, TransportFilter
 from distfilt.filters.ensemble import EnsembleState
+from distfilt.linalg import SolverError
 from distfilt.network import average, graphs
 from distfilt.sensors import Sensor, direct, stack
 
@@ -92,6 +94,18 @@ def test_a_late_reading_weighs_all_times_with_one_coupling() -> None:
     w /= w.sum()
     assert np.allclose(after.ensembles[2], ensemble_transform(plain, logs), atol=1e-11)
     assert np.allclose(after.history[-1][1][1].mean(axis=0), w @ before, atol=1e-12)
+
+
+def test_weights_of_a_run_that_failed_are_no_collapse(monkeypatch: pytest.MonkeyPatch) -> None:
+    def wary(x: np.ndarray, logs: np.ndarray) -> np.ndarray:
+        if np.ptp(logs, axis=-1).max() > 1e4:
+            raise SolverError("too far")
+        return plans(x, logs)
+
+    monkeypatch.setattr("distfilt.filters.ensemble.plans", wary)
+    f = TransportFilter(model(), [direct([0], std=0.6)], None, members=30, failures="keep")
+    start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(2,))
+    assert f.step(start, 0.5, [[[0.3], [3e4]]]).failed.tolist() == [False, True]
 
 
 def test_a_step_without_any_reading_moves_nothing() -> None:

@@ -181,7 +181,7 @@ def test_a_file_gives_back_every_bit(whole: Path) -> None:
     assert kept.heads["code"] == {"draw": studies.fingerprint(draw)}
 
 
-@settings(max_examples=20)
+@settings(max_examples=25)
 @given(st.lists(st.floats(), min_size=1, max_size=4), st.integers(0, 2**128),
        st.lists(st.integers(0, 2**31), max_size=3))  # fmt: skip
 def test_any_number_and_seed_comes_back(

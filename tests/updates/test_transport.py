@@ -86,8 +86,10 @@ def test_a_spread_that_is_lost_warns() -> None:
     x = MEAN + 1e-3 * (members(40) - MEAN)
     near = x.mean(axis=0) @ H.T
     ensemble_transform(x, x @ H.T, near + 3 * np.sqrt(np.diagonal(R)), R, rng=_rng())
-    with pytest.warns(ParticleCollapse, match="squared distance"):
-        ensemble_transform(x, x @ H.T, near + 6 * np.sqrt(np.diagonal(R)), R, rng=_rng())
+    far = 6 * np.sqrt(np.diagonal(R))
+    wanted = rf"squared distance .* is {far @ np.linalg.solve(R, far):.0f}, not 2;"
+    with pytest.warns(ParticleCollapse, match=wanted):  # of two ensembles that of the second
+        ensemble_transform([x, x], [x @ H.T] * 2, [near, near + far], R, rng=_rng())
 
 
 def test_nothing_is_drawn_without_rejuvenation() -> None:
