@@ -11,6 +11,7 @@ VENV := .venv
 PY := $(VENV)/bin/python
 STAMP := $(VENV)/stamp
 HTML := _build/html
+BUILT := _build/book.stamp
 LAB := _build/lab
 JOBS := 2
 SAMPLE := 300
@@ -58,10 +59,14 @@ $(STAMP): requirements.txt pyproject.toml book/kit/pyproject.toml
 
 remake:
 
-# Built afresh each time: a page that is not read again would not repeat its warnings.
-book: $(STAMP)
-	rm -rf $(HTML)
+# Built whole or not at all: a page that is not read again would not repeat its warnings.
+$(BUILT): $(STAMP) _toc.yml CITATION.cff \
+		$(shell find book distfilt data -type f ! -path "*/__pycache__/*" ! -path "*/_generated/*" ! -path "*/.*")
+	rm -rf $(HTML) $@
 	$(PY) -m sphinx -b html -W --keep-going -q -E -d _build/doctrees -c book . $(HTML)
+	@touch $@
+
+book: $(BUILT)
 	@echo "The book: $(CURDIR)/$(HTML)/book/index.html"
 
 pdf epub: book

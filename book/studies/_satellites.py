@@ -62,7 +62,7 @@ class Setup:
     @property
     def changed(self) -> bool:
         """Whether it is another study than the paper's, as the book reads it."""
-        return self.scenario.changed
+        return bool(self.scenario.changes)
 
 
 def setup(name: str, **changes: Any) -> Setup:

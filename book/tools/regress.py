@@ -73,6 +73,8 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2, help="chapters at a time")
     options = parser.parse_args()
     notebooks = [source.with_suffix(".ipynb") for source in chosen(options.chapters)]
+    # The largest first, so that no core waits at the end for the other's last chapter.
+    notebooks.sort(key=lambda notebook: -notebook.stat().st_size)
     if not notebooks:
         print("the table of contents has no chapter", file=sys.stderr)
         return 1

@@ -149,7 +149,7 @@ def _judged(
     *, open_: str = "", **beside: str,
 ) -> Verdict:
     """What was found, unless the study was another one; the reason is needed for a difference."""
-    if study is not None and study.changed:
+    if study is not None and study.changes:
         open_ = "changed scenario: " + "; ".join(study.changes)
     word = "not comparable" if open_ else VERDICTS[item.kind][0] if good else "differs"
     reason = open_ or ("" if good else why)

@@ -283,11 +283,6 @@ class Scenario:
             if found.get(name) != known.get(name)
         )
 
-    @property
-    def changed(self) -> bool:
-        """Whether it differs from the paper's study as the book accepts it."""
-        return bool(self.changes)
-
     def _shown(self) -> list[tuple[list[str], list[list[str]]]]:
         heads = ["unit", "source", "where or why"]
         out = []
@@ -342,13 +337,12 @@ def read_scenario(path: Path) -> Scenario:
     tables, such as one ``[[agents]]`` for each agent (see `Row`). The folder's name becomes the
     paper, the file's the name.
     """
-    entry = "its form"
+    folder, entry = path.parent, "its form"
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
         title = data.pop("title")
-        groups: dict[str, dict[str, Parameter]] = {}
-        for group in ("parameters", "notes"):
-            groups[group] = {}
+        groups: dict[str, dict[str, Parameter]] = {"parameters": {}, "notes": {}}
+        for group in groups:
             for name, cells in data.pop(group, {}).items():
                 entry = f"[{group}.{name}]"
                 groups[group][name] = Parameter(name, **cells)
@@ -357,9 +351,8 @@ def read_scenario(path: Path) -> Scenario:
             tables[entry] = tuple(Row(cells) for cells in rows)
             _check_links({row["name"]: row for row in tables[entry]}, len(rows))
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise ValueError(f"{path.parent.name}/{path.name}: {entry}: {error}") from error
-    named = path.parent.name, path.stem, title
-    return Scenario(*named, groups["parameters"], groups["notes"], tables)
+        raise ValueError(f"{folder.name}/{path.name}: {entry}: {error}") from error
+    return Scenario(folder.name, path.stem, title, groups["parameters"], groups["notes"], tables)
 
 
 def _check_links(rows: Mapping[str, Row], count: int) -> None:

@@ -146,22 +146,30 @@ def slider(
     >>> len(found.frames), found.said
     (3, ('rate 0', 'rate 0.5', 'rate 1'))
     """
-    ending = "" if unit is None else f" {unit}"
-    said = tuple(f"{label} {format(value, form)}{ending}" for value in values)
-    frames, sizes, digests = zip(*(_frame(draw(value)) for value in values), strict=True)
+    said = tuple(f"{label} {format(value, form)} {unit or ''}".rstrip() for value in values)
+    places: list[Any] = []
+    frames, sizes, digests = zip(*(_frame(draw(v), places) for v in values), strict=True)
     if len(set(sizes)) != 1:
         raise ValueError("draw: needs figures of one size")
     return Slider(frames, sizes[0], said, digests, label, alt, start)
 
 
-def _frame(drawn: Any) -> tuple[bytes, tuple[int, int], str]:
-    """A figure as a picture, its size and digest; it is closed, so that no cell shows it."""
+def _frame(drawn: Any, places: list[Any]) -> tuple[bytes, tuple[int, int], str]:
+    """A figure as a picture, its size and digest; it is closed, so that no cell shows it.
+
+    The first frame's panels find their `places`, the others take them, so that no panel jumps.
+    """
     figure = getattr(drawn, "figure", drawn)
+    if places:
+        figure.set_layout_engine("none")
+    for ax, place in zip(figure.axes, places, strict=False):
+        ax.set_position(place)
     small, text = io.BytesIO(), of_axes(figure)
     pyplot.close(figure)
     canvas: Any = FigureCanvasAgg(figure)
     figure.set_dpi(2 * figure.dpi)
     canvas.draw()
+    places[:] = places or [ax.get_position(original=True) for ax in figure.axes]
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
     figure.set_dpi(figure.dpi / 2)  # it may be drawn again for the next frame
     picture.save(small, format="webp", lossless=True, quality=80, method=4)

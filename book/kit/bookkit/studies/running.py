@@ -381,7 +381,7 @@ class _Flight:
         self.executor, self.own, self.size = executor or _pool(workers or 1), executor is None, 1
         self.waiting, self.suspects = deque(items), deque[Item]()
         self.flying: dict[Landed, list[Item]] = {}
-        self.broken, self.room, self.known_until = False, 1, 0.0
+        self.alone, self.broken, self.room, self.known_until = False, False, 1, 0.0
 
     def outcomes(self) -> Iterator[Outcome]:
         while self.waiting or self.suspects or self.flying:
@@ -417,7 +417,7 @@ class _Flight:
             return
         if self.broken:
             self.executor, self.broken = _pool(self.workers or 1), False
-        self.alone = bool(self.suspects)
+        self.alone = bool(self.suspects) or (self.alone and bool(self.flying))
         if self.alone and not self.flying:
             self._submit([self.suspects.popleft()])
         if time.monotonic() > self.known_until:  # a cluster grows and shrinks; asking it takes time
