@@ -40,6 +40,7 @@ from .kinds import MISSING
 from .values import (
     Array,
     Bounds,
+    all_finite,
     array,
     definite,
     distinct,
@@ -51,8 +52,8 @@ from .values import (
 
 __all__ = [  # fmt: skip
     "Array", "Bounds", "Count", "Cov", "Index", "MISSING", "Mask", "NonNegative", "Places",
-    "Positive", "Record", "Rng", "Semidefinite", "Share", "Times", "Weights", "array", "definite",
-    "door", "increasing", "needed", "semidefinite", "summing_to_one", "unchecked",
+    "Positive", "Record", "Rng", "Semidefinite", "Share", "Times", "Weights", "all_finite", "array",
+    "definite", "door", "increasing", "needed", "semidefinite", "summing_to_one", "unchecked",
 ]
 
 Mask = NDArray[np.bool_]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import math
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf
 
 __all__ = [  # fmt: skip
-    "Array", "Bounds", "array", "batched", "definite", "distinct", "increasing", "needed",
-    "semidefinite", "summing_to_one",
+    "Array", "Bounds", "all_finite", "array", "batched", "definite", "distinct", "increasing",
+    "needed", "semidefinite", "summing_to_one",
 ]
 
 Array = NDArray[np.float64]
@@ -62,10 +63,20 @@ def array(
     out: Array = value if plain else _real(value, name)  # type: ignore[assignment]
     if shape is not None and out.shape != shape and not _fits(out.shape, shape, {}):
         raise ValueError(f"{name}: needs shape {_shape_text(shape)}, got {out.shape}")
-    if finite and not np.isfinite(out).all():
+    if finite and not all_finite(out):
         bad = int((~np.isfinite(out)).sum())
         raise ValueError(f"{name}: needs finite numbers, got {bad} NaN or infinite of {out.size}")
     return out
+
+
+def all_finite(value: Array) -> bool:
+    """Whether no number is NaN or infinite.
+
+    >>> all_finite(np.array([1.0, -np.inf])), all_finite(np.array([1e200]))
+    (False, True)
+    """
+    # A sum of squares says so in a fifth of the time, unless it overflows.
+    return math.isfinite(np.vdot(value, value)) or bool(np.isfinite(value).all())
 
 
 def _real(value: Any, name: str) -> Array:

@@ -87,10 +87,9 @@ class MembersFilter(Filter):
 
     def summary(self, state: Any) -> Summary:
         """Means and variances of the agents' ensembles, and the members for the scores."""
-        x = state.ensembles
-        mean = unchecked(moments.mean)(x)
-        variance = unchecked(moments.mean)((x - mean[..., None, :]) ** 2)
-        variance = variance * (self.members / (self.members - 1))
+        x, average = state.ensembles, unchecked(moments.mean)
+        mean = average(x)
+        variance = average((x - mean[..., None, :]) ** 2) * (self.members / (self.members - 1))
         return Summary(state.shown(mean), state.shown(variance), members=x)
 
 

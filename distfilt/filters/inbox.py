@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..doors import Array, unchecked
+from ..doors import Array, all_finite, unchecked
 from ..sensors import Sensor
 
 __all__ = ["Heard", "groups"]
@@ -71,7 +71,7 @@ class Heard:
 
     def collected(self, known: Known) -> Array:
         """The readings of each agent of the group side by side, (*runs, G, M)."""
-        rows = [value for agent in self.agents for _, value in known[agent]]
+        rows = [value for agent in self.agents.tolist() for _, value in known[agent]]
         flat = rows[0] if len(rows) == 1 else np.concatenate(rows, axis=-1)
         return flat.reshape(*flat.shape[:-1], *self.owner.shape)
 
@@ -88,16 +88,15 @@ class Heard:
         the observation time before, for sensors that see changes.
         """
         if self.linear:
-            out = states @ self.matrix(states.shape[-1]).mT
-        else:
-            out = np.empty((*states.shape[:-2], self.target.shape[-1], states.shape[-2]))
-            for sensor, rows, columns in self.parts:
-                before = None if previous is None else previous[..., rows, :, :]
-                aim = self.target[..., rows[:, None], columns][..., None, :]
-                seen = _seen(sensor, states[..., rows, :, :], before, aim)
-                out[..., rows[:, None], columns, :] = seen.swapaxes(-1, -2)
-            out = np.ascontiguousarray(out.swapaxes(-1, -2))
-        if np.isinf(out).any():
+            return np.asarray(states @ self.matrix(states.shape[-1]).mT)
+        out = np.empty((*states.shape[:-2], self.target.shape[-1], states.shape[-2]))
+        for sensor, rows, columns in self.parts:
+            before = None if previous is None else previous[..., rows, :, :]
+            aim = self.target[..., rows[:, None], columns][..., None, :]
+            seen = _seen(sensor, states[..., rows, :, :], before, aim)
+            out[..., rows[:, None], columns, :] = seen.swapaxes(-1, -2)
+        out = np.ascontiguousarray(out.swapaxes(-1, -2))
+        if not all_finite(out) and np.isinf(out).any():
             raise ValueError("predicted: needs finite numbers or NaN (missing), got infinity")
         return out
 

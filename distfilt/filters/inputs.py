@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from ..doors import MISSING, Array, Index, Record, array, definite, increasing, unchecked
+from ..doors.values import all_finite
 from ..ensembles import draw, sample_covariance
 from ..mixtures import GaussianMixture
 from ..sensors import Sensor
@@ -82,7 +83,7 @@ def said_by_all(f: Any, observations: Any, runs: tuple[int, ...], t: float) -> l
     for agent, given in enumerate(one_each(observations, f.count)):
         own = f.team[agent]
         if type(given) is np.ndarray and given.dtype == np.float64 and len(own) == 1:
-            whole = given.shape == (*runs, own[0].dim) and np.isfinite(given).all()
+            whole = given.shape == (*runs, own[0].dim) and all_finite(given)
             if whole:  # as nearly all are
                 out.append([Reading.unchecked(t, agent, given)])
                 continue

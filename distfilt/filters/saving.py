@@ -187,7 +187,7 @@ class SensorState(State):
 
     def shown(self, values: Array) -> Array:
         """Values (*runs, ...) for the record: NaN in runs that have failed."""
-        if not self.failed.any():
+        if not np.count_nonzero(self.failed):
             return values
         out = np.array(values)
         out[self.failed] = np.nan

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..doors import Array, array
+from ..doors import Array, all_finite, array
 from ..linalg import SolverError
 from ..network import Channel
 from ..sensors import Sensor
@@ -92,7 +92,7 @@ class Step:
         # A run's own generator need not be copied: nobody else draws from it.
         self.rng: Any = state.rng if own else copied(state.rng)
         self.failed = getattr(state, "failed", _NOBODY)
-        self.lost = bool(self.failed.any())
+        self.lost = bool(np.count_nonzero(self.failed))
         self.waiting: tuple[Any, ...] = ()
         self.refused: Array | None = None
         if filter_.gate is not None:
@@ -323,8 +323,7 @@ def of_the_call(error: Exception) -> bool:
 
 def _not_finite(values: Array, lead: int, what: str) -> dict[Row, str]:
     """Errors of the rows (*lead, ...) that are not finite."""
-    good = np.isfinite(values)
-    if good.all():
+    if all_finite(values):
         return {}
-    bad = ~good.reshape(*values.shape[:lead], -1).all(axis=-1)
+    bad = ~np.isfinite(values).reshape(*values.shape[:lead], -1).all(axis=-1)
     return {tuple(map(int, row)): f"the {what} is not finite" for row in np.argwhere(bad)}

@@ -18,7 +18,7 @@ from typing import Annotated, Any, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from ..doors import Array, Cov, Rng, door, unchecked
+from ..doors import Array, Cov, Rng, all_finite, door, unchecked
 from ..ensembles import Ensemble
 from ..linalg import cholesky, leading
 
@@ -165,17 +165,16 @@ def with_missing(
     0.5
     """
     inner = unchecked(update)
-    m = observed.shape[-1]
-    lead = observed.shape[:-1]
+    lead, m = observed.shape[:-1], observed.shape[-1]
     # What is drawn for an ensemble depends on its place and on how many readings it has, not on
     # what others miss: each number of readings has a stream, which is drawn from for all places.
-    base = rng.integers(2**63, size=2)
-    present, gone = ~np.isnan(observed), np.isnan(predicted)
-    if gone.any():
-        present = present & ~gone.any(axis=-2)
-    if (whole := bool(present.all())) or says(update, "whole"):
-        stream = _stream(rng, base, m, lead, np.arange(math.prod(lead)))
-        known = observed if whole else np.where(present, observed, np.nan)
+    # As words of 32 bits, which seeds are made of: 63 bits each, as `integers` would draw them.
+    base = (rng.bit_generator.random_raw(2) >> 1).astype("<u8").view("<u4")
+    if all_finite(observed) and all_finite(predicted):
+        return inner(ensemble, predicted, observed, noise, rng=_stream(rng, base, m, lead))
+    present = ~np.isnan(observed) & ~np.isnan(predicted).any(axis=-2)
+    if says(update, "whole"):
+        known, stream = np.where(present, observed, np.nan), _stream(rng, base, m, lead)
         return inner(ensemble, predicted, known, noise, rng=stream)
     flat, aim = present.reshape(-1, m), observed.reshape(-1, m)
     rows, seen = (a.reshape(-1, *a.shape[-2:]) for a in (ensemble, predicted))
@@ -193,23 +192,22 @@ def with_missing(
     return np.asarray(out.reshape(ensemble.shape))
 
 
-def _stream(rng: Rng, base: Indices, m: int, lead: tuple[int, ...], where: Indices) -> Rng:
-    """A stream of draws for the rows `where` of a batch; of rows of rows their places stay."""
+def _stream(rng: Rng, base: Any, m: int, lead: tuple[int, ...], where: Any = ...) -> Rng:
+    """A stream of draws for a batch, or its rows `where`; of rows of rows their places stay."""
+    bits = np.random.PCG64(np.random.SeedSequence(np.array([*base.tolist(), m], dtype="<u4")))
     if isinstance(rng, Rows):
-        lead, where = rng.lead, rng.where[where]
-    # Words of 32 bits: what a seed of Python's integers becomes, in half the time.
-    words = np.append(base.astype("<i8").view("<u4"), np.uint32(m))
-    return Rows(words, lead, where)
+        return Rows(bits, rng.lead, rng.where[where])
+    return Rng(bits) if where is ... else Rows(bits, lead, where)
 
 
 class Rows(Rng):
     """Normal draws for all ensembles of a batch (*lead), of which those in `where` are asked for.
 
-    `where` counts them flat; `words` seed them.
+    `where` counts them flat.
     """
 
-    def __init__(self, words: Any, lead: tuple[int, ...], where: Indices) -> None:
-        super().__init__(np.random.PCG64(np.random.SeedSequence(words)))
+    def __init__(self, bits: Any, lead: tuple[int, ...], where: Indices) -> None:
+        super().__init__(bits)
         self.lead, self.where = lead, where
         self.some = where.size != math.prod(lead)
 

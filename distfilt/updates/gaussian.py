@@ -254,7 +254,7 @@ def sampled_forecast(
     array([1., 2.])
     """
     moved, root = unchecked(model.step)(ensemble, t, dt), unchecked(model.root)(t, dt)
-    if not root.any():
+    if not np.count_nonzero(root):
         return moved
     noise = rng.standard_normal(moved.shape) @ root.T
     noise += moved
