@@ -35,8 +35,7 @@ class Heard:
 
     def __init__(self, agents: list[int], sensors: Sequence[tuple[Sensor, ...]]) -> None:
         self.agents = np.array(agents, dtype=np.intp)
-        everybody = agents == list(range(len(sensors)))
-        self.rows: Any = slice(None) if everybody else self.agents
+        self.rows: Any = slice(None) if agents == [*range(len(sensors))] else self.agents
         cells: dict[Sensor, list[tuple[int, int]]] = {}
         size = sum(s.dim for s in sensors[agents[0]])
         self.owner = np.zeros((len(agents), size), dtype=np.intp)
@@ -135,11 +134,7 @@ class Heard:
 
 def _seen(sensor: Sensor, states: Array, previous: Array | None, aim: Array) -> Array:
     """Readings of one sensor, (*runs, K, N, m), on the branch of what was observed."""
-    predict = unchecked(sensor.predict)
-    if not sensor.uses_previous or previous is None:
-        seen = predict(states)  # which says so where states of before are missing
-    else:
-        seen = predict(states, previous)
+    seen = unchecked(sensor.predict)(states, previous)
     if sensor.difference is None:
         return seen
     # y* - wrap(y* - h)

@@ -89,6 +89,8 @@ class State(Record):
                 file.flush()
                 os.fsync(file.fileno())
             unfinished.replace(path)
+        except OSError as error:  # a write does not tell which file
+            raise OSError(error.errno, error.strerror or str(error), str(path)) from error
         finally:
             unfinished.unlink(missing_ok=True)
 

@@ -190,9 +190,11 @@ class Graph(Record):
         r"""The bound below which averaging agrees, :math:`2/\lambda_{\max}` with links both ways.
 
         With one-way links the eigenvalues are complex and it is the least
-        :math:`2\operatorname{Re}\lambda/|\lambda|^2`, by a dense solver. Infinite without links.
+        :math:`2\operatorname{Re}\lambda/|\lambda|^2`, by a dense solver. Infinite without links;
+        :attr:`safe_gain` where too many eigenvalues crowd at the end to tell them apart, as on a
+        ring of very many agents.
         """
-        from scipy.sparse.linalg import eigsh
+        from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
         if self.senders.size == 0:
             return float("inf")
@@ -204,8 +206,11 @@ class Graph(Record):
             return float(2 / self.spectrum[-1])
         # A fixed start makes results repeatable; a random one is orthogonal to no eigenvector.
         start = np.random.default_rng(0).standard_normal(self.size)
-        how = {"which": "LA", "v0": start, "tol": 1e-8, "return_eigenvectors": False}
-        return float(2 / eigsh(self.laplacian, 1, **how)[0])
+        how = {"v0": start, "tol": 1e-8, "maxiter": 100, "return_eigenvectors": False}
+        try:
+            return float(2 / eigsh(self.laplacian, 1, which="LA", **how)[0])
+        except ArpackNoConvergence:
+            return self.safe_gain
 
     @cached_property
     def safe_gain(self) -> float:
