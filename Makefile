@@ -86,6 +86,7 @@ style: $(STAMP)
 
 pairs: $(STAMP)
 	$(PY) book/tools/pairs.py
+	$(PY) book/tools/numerals.py
 	$(PY) book/tools/scenarios.py
 	$(PY) book/tools/ledger.py --check
 
