@@ -237,8 +237,8 @@ def test_a_late_reading_belongs_to_its_own_time(family: str, origin: float, dt: 
 
 @EACH
 def test_smoothing_knows_more(family: str) -> None:
-    f, start = made(family, agents=2, lag=4, runs=(60,))
-    truth, seen = data(f.sensors, (60,), seed=4)
+    f, start = made(family, agents=2, lag=4, runs=(30,))
+    truth, seen = data(f.sensors, (30,), seed=4)
     run = f.run(start, TIMES, seen, truth=truth)
     smooth = f.smooth(start, TIMES, seen, truth=truth)
     early = slice(0, 4)
