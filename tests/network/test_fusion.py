@@ -11,7 +11,7 @@ from distfilt import gaussians as pure
 from distfilt import network
 from distfilt.doors import unchecked
 from distfilt.ensembles import mean, sample_covariance
-from distfilt.network import Channel, Faults, Graph, UnstableGain
+from distfilt.network import Channel, Faults, Graph, UnstableGain, graphs
 from distfilt.network.channel import fused_kind
 from tests.network.helpers import DISK, STAR, gaussians, heard, lossy, rng, star
 from tests.support import unit_gap
@@ -80,6 +80,14 @@ def test_the_account_is_mean_and_half_the_covariance(rule: object) -> None:
         assert channel.ledger.rounds == 2 and 0 < channel.ledger.lost.sum() < 8
 
 
+@every
+def test_two_rounds_are_one_after_the_other(rule: object) -> None:
+    belief, channel = gaussians(2, 6), Channel(graphs.path(6))
+    for whole, part in zip(rule(belief, channel, rounds=2), rule(rule(belief, channel), channel),
+                           strict=True):  # fmt: skip
+        assert np.allclose(whole, part, rtol=1e-12)
+
+
 def test_pulls_beyond_the_bound_warn_and_none_is_silence() -> None:
     e = _ensembles(1)
     for rule, belief in ((network.consensus_pull, gaussians(5, 3)), (network.pull, e)):
@@ -139,8 +147,10 @@ def test_intersection_gives_the_fused_moments(rule: str) -> None:
 
 
 @pytest.mark.parametrize("rule", MOVES.values(), ids=MOVES.keys())
-def test_ensembles_in_any_units_and_equal_ones(rule: object) -> None:
-    e = _ensembles(2, (6,))
+def test_ensembles_of_two_rounds_in_any_units_and_equal_ones(rule: object) -> None:
+    e, channel = _ensembles(2, (6,)), Channel(graphs.path(6))
+    whole, parts = rule(e, channel, rounds=2), rule(rule(e, channel), channel)
+    assert np.allclose(mean(whole), mean(parts), rtol=1e-9)
     for factor in (1e-8, 1e8):
         scaled = rule(factor * e[:3], star()) / factor
         assert np.allclose(scaled, rule(e[:3], star()), rtol=1e-8, atol=1e-8)
