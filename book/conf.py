@@ -31,6 +31,7 @@ from sphinx.util.nodes import make_refnode
 sys.path.insert(0, str(Path(__file__).parent / "tools"))
 
 import distfilt
+from access import mend
 from common import BOOK, ROOT, chapters, missing_pages
 from light import lighten
 from pages import (
@@ -252,10 +253,12 @@ def copy_notebooks(app: Sphinx, error: Exception | None) -> None:
             shutil.copy(source.with_suffix(".ipynb"), target)
 
 
-def make_lighter(app: Sphinx, error: Exception | None) -> None:
-    """Make the pages light, once all are written."""
+def finish(app: Sphinx, error: Exception | None) -> None:
+    """Make the pages light and usable by everybody, once all are written."""
     if error is None and app.builder.name == "html":
         lighten(Path(app.outdir))
+        for page in Path(app.outdir).rglob("*.html"):
+            mend(page)
 
 
 def setup(app: Sphinx) -> None:
@@ -277,4 +280,4 @@ def setup(app: Sphinx) -> None:
     app.connect("autodoc-process-signature", lambda *event: signature(event[1], event[3]))
     app.connect("build-finished", copy_mathjax)
     app.connect("build-finished", copy_notebooks)
-    app.connect("build-finished", make_lighter)
+    app.connect("build-finished", finish)

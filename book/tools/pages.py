@@ -351,7 +351,10 @@ def lighter(body: str) -> str:
 
     def plain(found: re.Match[str]) -> str:
         text = re.sub(r'<span class="(?:pre|[pwko])">([^<]*)</span>', r"\1", found[0])
-        return re.sub(r'<span class="(?:pre|[pwkon])">([^<]*)</span>', r"\1", text)
+        text = re.sub(r'<span class="(?:pre|[pwkon])">([^<]*)</span>', r"\1", text)
+        # Lines of a long signature are no list of words and meanings.
+        text = re.sub(r"<(/?)dl>", r"<\1div>", text).replace("</dd>", "</div>")
+        return text.replace("<dd>", '<div class="sig-line">')
 
     return re.sub(r'<dt class="sig .*?</dt>', plain, body, flags=re.DOTALL)
 
@@ -494,7 +497,7 @@ def map_text() -> str:
         beside = [k for k in rows if rows[k] == row]
         place[n] = (530 + 262 * (beside.index(n) - (len(beside) - 1) / 2), 40 + 105 * row)
     width, height = 1060, 80 + 105 * max(rows.values())
-    lines = [f'<svg class="map" viewBox="0 0 {width} {height}" role="img" '
+    lines = [f'<svg class="map" viewBox="0 0 {width} {height}" role="group" '
              'aria-label="Arrows from each chapter to those that build on it">']  # fmt: skip
     for n, (x, y) in place.items():
         # What another arrow implies is not drawn.
@@ -504,7 +507,8 @@ def map_text() -> str:
     for n, (x, y) in place.items():
         link = pages[n].removeprefix("book/")
         lines += [f'<a href="{link}.html"><rect x="{x - 129}" y="{y - 26}" width="258" height="52" '
-                  f'rx="8"/><text x="{x}" y="{y + 6}">{n}. {titles[n]}</text></a>']  # fmt: skip
+                  f'rx="8"/><text x="{x}" y="{y + 6}">{n}. {titles[n]}</text>'
+                  f'<title>{titles[n]}</title></a>']  # fmt: skip
     lines += ["</svg>"]
     told = []
     for n, page in pages.items():

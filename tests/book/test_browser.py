@@ -16,6 +16,7 @@ from urllib.parse import unquote, urldefrag, urlparse
 import pytest
 
 import browser
+from access import RULES
 from browser import READY
 from common import ROOT, chapters
 
@@ -24,6 +25,7 @@ LOCAL = ("file://", "data:", "blob:", "about:")
 # Pages that a Chromium opens for itself, whatever its version: what they ask for is not the book's.
 OWN = ("chrome://", "chrome-untrusted://", "chrome-extension://", "devtools://", "about:")
 WIDTHS = (1440, 1200, 400)
+THEMES = ("dark", "light")
 # Opens what is folded, then reports what a reader would meet.
 REPORT = r"""
 document.querySelectorAll("details").forEach(d => { d.open = true; });
@@ -115,6 +117,7 @@ class Visit:
     console: list[str]
     fit: dict[int, dict[str, Any]]
     sliders: list[dict[str, bool]]
+    rules: dict[str, list[str]]
 
 
 def visit(driver: Any, page: Path) -> Visit:
@@ -129,12 +132,13 @@ def visit(driver: Any, page: Path) -> Visit:
             driver.get(page.as_uri())
             driver.execute_async_script(READY)
             report = driver.execute_script(REPORT)
+            rules = {theme: driver.execute_script(RULES, theme) for theme in THEMES}
         fit[width] = driver.execute_script(FIT)
     sliders = driver.execute_async_script(MOVE)
     entries = [json.loads(entry["message"]) for entry in driver.get_log("performance")]
     requests = asked(entries, driver.current_window_handle)
     console = [e["message"] for e in driver.get_log("browser") if e["level"] == "SEVERE"]
-    return Visit(report, requests, console, fit, sliders)
+    return Visit(report, requests, console, fit, sliders, rules)
 
 
 def asked(entries: list[dict[str, Any]], tab: str) -> list[str]:
@@ -171,6 +175,7 @@ def driver(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     profile = tmp_path_factory.mktemp("profile")
     with chromium(profile, performance="ALL", browser="ALL") as found:
         found.set_script_timeout(60)
+        found.execute_cdp_cmd("Emulation.setFocusEmulationEnabled", {"enabled": True})
         yield found
 
 
@@ -243,6 +248,11 @@ def test_every_page_fits_and_on_a_desk_scrolls_in_no_box(visits: dict[Path, Visi
             assert width < 1200 or fit["scrolls"] == [], f"{page.name} at {width}"
 
 
+@pytest.mark.parametrize("theme", THEMES)
+def test_everybody_can_use_every_page(visits: dict[Path, Visit], theme: str) -> None:
+    assert {p.name: v.rules[theme] for p, v in visits.items() if v.rules[theme]} == {}
+
+
 def test_every_slider_moves_and_plays(visits: dict[Path, Visit]) -> None:
     for source in chapters():
         drawn = source.read_text(encoding="utf-8").count("plotting.slider(")
@@ -259,7 +269,7 @@ BAD = r"""<!doctype html><title>bad</title><body>
 <pre style="overflow-x: auto; width: 300px">x<span style="padding: 400px">x</span></pre></article>
 <div data-frames="a"><img alt="a"><button></button><input type="range" max="3">
 <output>a</output></div>
-<script>throw new Error("broken")</script></body>"""
+<table><th></th></table><script>throw new Error("broken")</script></body>"""
 
 
 def test_a_bad_page_is_found_out(driver: Any, tmp_path: Path) -> None:
@@ -273,3 +283,4 @@ def test_a_bad_page_is_found_out(driver: Any, tmp_path: Path) -> None:
     assert len(seen.fit[1200]["cut"]) == 1 and len(seen.fit[1200]["scrolls"]) == 1
     assert seen.sliders and not any(seen.sliders[0].values())
     assert seen.fit[400]["over"] > 0
+    assert {told.split(":")[0] for told in seen.rules["dark"]} >= {"no language", "empty header"}

@@ -1,0 +1,39 @@
+"""The whole book as one file: every chapter is in it, and nothing is cut at the paper's edge."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import pytest
+from test_browser import chromium
+
+import volume
+from common import chapters
+
+BAD = """<body style="width: 174mm; margin: 0"><section class="part" id="p1"><pre>{}</pre>
+<div style="width: 300mm">x</div><img src="nowhere.png" alt=""><p class="math">x</p></section>"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["pdf", "epub"])
+def test_the_whole_book_is_written(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["volume.py", kind])
+    assert volume.main() == 0
+    target = volume.TARGET / f"{volume.NAME}.{kind}"
+    if kind == "epub":
+        held = {Path(name).stem for name in zipfile.ZipFile(target).namelist()}
+    else:
+        held = set(volume.pages_of(target.read_bytes()))
+    assert held >= {volume.key(f"book/{source.stem}") for source in chapters()}
+    assert target.name in (volume.TARGET / "index.html").read_text(encoding="utf-8")
+
+
+def test_what_does_not_fit_the_paper_is_refused(tmp_path: Path) -> None:
+    page = tmp_path / "bad.html"
+    page.write_text(BAD.format("x" * 300), encoding="utf-8")
+    with chromium(tmp_path / "profile") as driver, pytest.raises(SystemExit) as told:
+        volume.opened(driver, page)
+    assert all(
+        f"\n{what}: " in str(told.value) for what in ("too wide", "cut", "not drawn", "not set")
+    )
