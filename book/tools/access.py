@@ -8,12 +8,13 @@ from pathlib import Path
 MENDS = (
     # The corner of a table heads nothing.
     ("<th></th>", "<td></td>"),
+    ('<th class="head"><p></p></th>', "<td></td>"),
     # A control is called what it shows, and one that shows an arrow alone has a name.
     ('<summary aria-label="Toggle hidden content">', "<summary>"),
     (' title="Search" aria-label="Search" data-bs-placement', " data-bs-placement"),
     ("<summary><span", '<summary aria-label="Pages below"><span'),
     # Columns of the index are no table.
-    ('class="indextable genindextable"', 'class="indextable genindextable" role="presentation"'),
+    ('class="indextable', 'role="presentation" class="indextable'),
     # An exercise's text has the same id as the next one's.
     (' id="exercise-content"', ""),
     (' id="solution-content"', ""),

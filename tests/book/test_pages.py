@@ -6,6 +6,7 @@ import html
 import importlib
 import re
 import runpy
+from pathlib import Path
 from unittest.mock import Mock, call
 
 import pytest
@@ -36,6 +37,13 @@ def plain(text: str) -> str:
 def test_page_of_the_contents_is_built(name: str) -> None:
     assert not missing_pages()
     assert "<h1>" in page(name)
+
+
+@pytest.mark.parametrize("source", chapters(), ids=lambda source: source.stem)
+def test_a_chapter_with_its_pictures_is_light(source: Path) -> None:
+    text = page(f"book/{source.stem}")
+    pictures = set(re.findall(r"_images/[\w.-]+\.(?:png|webp|svg)", text))
+    assert len(text) + sum((BUILT / name).stat().st_size for name in pictures) <= 3_000_000
 
 
 def test_chapters_import_nothing_of_the_folder_they_lie_in() -> None:
