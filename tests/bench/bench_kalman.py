@@ -106,10 +106,9 @@ def compared(case: str, calls: dict[str, Any], rounds: int) -> Iterator[Row]:
     results = {name: call() for name, call in calls.items()}
     times, ratios = interleaved(calls, rounds)
     first, mine = moments(results["distfilt"])
-    scale = np.abs(first).max()
     for name, other in results.items():
         means, covs = moments(other)
-        gap = np.abs(means - first).max() / scale
+        gap = np.abs(means - first).max() / np.abs(first).max()
         covs = covs.reshape(len(covs), -1, *covs.shape[-2:])
         own = mine.reshape(len(covs), -1, *covs.shape[-2:])
         gap = max(gap, np.abs(covs - own).max() / np.abs(own).max())
