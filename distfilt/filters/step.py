@@ -160,7 +160,7 @@ class Step:
         for late in self.late:
             own[late.agent].append(late)
         heard = [
-            {agent: [(said.t, sensor_of(f, said), said.value) for said in mine]}
+            {agent: [((said.t, sensor_of(f, said)), said.value) for said in mine]}
             for agent, mine in enumerate(own)
         ]
         told = self._told(own)
@@ -170,13 +170,12 @@ class Step:
             for has, box in zip(heard, inbox, strict=True):
                 for sender, payload in box.items():
                     values = payload if isinstance(payload, tuple) else (payload,)
-                    both = zip(kinds[sender], values, strict=False)
-                    has[sender] = [(t, sensor, value) for (t, sensor), value in both]
+                    has[sender] = list(zip(kinds[sender], values, strict=False))
         known: dict[float, list[list[tuple[Sensor, Array]]]]
         known = defaultdict(lambda: [[] for _ in own])
         for agent, has in enumerate(heard):
             for sender in sorted(has):
-                for t, sensor, value in has[sender]:
+                for (t, sensor), value in has[sender]:
                     known[t][agent].append((sensor, value))
         return known
 
