@@ -23,6 +23,7 @@ for (const item of MathJax.startup.document.math) {
   item.typesetRoot.replaceWith(document.importNode(tree, true));
 }
 document.querySelectorAll("body [style]").forEach((e) => e.removeAttribute("style"));
+document.querySelectorAll("svg[role]").forEach((e) => e.removeAttribute("role"));
 document.querySelectorAll("[data-size]").forEach((e) => e.removeAttribute("data-size"));
 """
 # One part as XHTML, with its title and the titles below it, each with its place.
