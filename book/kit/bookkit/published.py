@@ -18,8 +18,8 @@ __all__ = [  # fmt: skip
     "judge_parameters", "read_scenario", "scenario", "table",
 ]
 
-PAPERS = ("grange", "das", "semeraro", "zheng")
-"""Keys of the papers: triangular maps, constrained transport, mixture fusion, density."""
+PAPERS = ("grange", "das", "semeraro", "zheng", "together")
+"""Keys: triangular maps, constrained transport, mixture fusion, density; all of them together."""
 
 VERDICTS = {
     "parameters": ("read", "differs", "not comparable"),

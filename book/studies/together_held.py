@@ -1,0 +1,31 @@
+"""Chapter 11's held-out problems, on which its decision tree is tried: every filter, 40 runs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+import _together as together
+
+NAME, PAPER, BATCHES = "held", "together", 2
+CELLS = {p: ("reference", *together.cells_of(p)) for p in together.THREE}
+columns = together.columns_of([f"{p}_{c}" for p, cells in CELLS.items() for c in cells])
+parameters = {"batch": together.BATCH, "cells": CELLS}
+seeds = np.random.SeedSequence(together.STUDY["seed"] + 2).spawn(BATCHES)
+scenarios = (together.HELD, together.STUDY, together.TUNED)
+code = together.code
+rtol, rough = 1e-4, columns
+
+
+def trial(seed: np.random.SeedSequence) -> dict[str, float]:
+    """References and cells of the three problems."""
+    out: dict[str, float] = {}
+    for name in together.THREE:
+        p = together.problem(name)
+        found = together.referred(p, seed, together.drawn(p, seed))
+        found |= together.compared(name, seed, together.cells_of(name))
+        out |= {f"{name}_{k}": v for k, v in found.items() if not k.startswith("half")}
+    return out

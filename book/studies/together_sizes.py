@@ -1,0 +1,64 @@
+"""Chapter 11's sweeps: 10 to 300 members on the curved problems, 4 to 64 agents on two of them."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+import _together as together
+
+NAME, PAPER = "sizes", "together"
+MEMBERS = (10, 30, 100, 300)
+SIZED = ("known_flood", "root_flood", "exact_ci", "pf_flood", "pf_agreed", "ot_young")
+# Transport has a linear programme to solve of three hundred times three hundred unknowns.
+LARGEST = {"ot_young": 100}
+AGENTS = (4, 8, 16, 32, 64)
+GROWN = {"linear": ("ekf_near", "ekf_ci", "ekf_meas", "ekf_flood", "known_flood"),
+         "range": ("ekf_ci", "known_flood", "exact_ci", "pf_agreed")}  # fmt: skip
+# Where everybody filters everybody's readings, work grows with the square of the agents.
+MOST = {"known_flood": 16, "exact_ci": 32}
+FEWEST = {"exact_ci": 30}
+BY_MEMBERS = [(p, c, n) for p in ("range", "lorenz") for c in SIZED for n in MEMBERS
+              if FEWEST.get(c, 0) <= n <= LARGEST.get(c, 300)]  # fmt: skip
+BY_AGENTS = [(p, c, a) for p, cells in GROWN.items() for c in cells for a in AGENTS
+             if a <= MOST.get(c, 64)]  # fmt: skip
+COLUMNS = [*(f"{p}_members_{n}_{c}" for p, c, n in BY_MEMBERS),
+           *(f"{p}_agents_{a}_{c}" for p, c, a in BY_AGENTS),
+           *(f"{p}_agents_{a}_reference" for p in GROWN for a in AGENTS),
+           *(f"{p}_members_reference" for p in ("range", "lorenz"))]  # fmt: skip
+columns = together.columns_of(COLUMNS)
+parameters = {"batch": together.BATCH, "members": MEMBERS, "agents": AGENTS}
+seeds = np.random.SeedSequence(together.STUDY["seed"] + 1).spawn(2)
+scenarios = (*(together.problem(p).scenario for p in ("linear", "range", "lorenz")),
+             together.STUDY, together.TUNED)  # fmt: skip
+code = together.code
+rtol, rough = 1e-4, columns
+
+
+def trial(seed: np.random.SeedSequence) -> dict[str, float]:
+    """One trial of everything."""
+    out: dict[str, float] = {}
+    for name in ("range", "lorenz"):
+        p = together.problem(name)
+        data = together.drawn(p, seed)
+        out |= only(together.referred(p, seed, data), f"{name}_members_")
+        for _, cell, n in (row for row in BY_MEMBERS if row[0] == name):
+            f = together.CELLS[cell].make(p, together.tuned(name, cell), n)
+            out |= together.measured(p, cell, f, data, seed, f"{name}_members_{n}_")
+    for name, cells in GROWN.items():
+        for agents in AGENTS:
+            p = together.problem(name).resized(agents)
+            data = together.drawn(p, seed)
+            out |= only(together.referred(p, seed, data), f"{name}_agents_{agents}_")
+            for cell in (c for c in cells if (name, c, agents) in BY_AGENTS):
+                f = together.CELLS[cell].make(p, together.tuned(name, cell))
+                out |= together.measured(p, cell, f, data, seed, f"{name}_agents_{agents}_")
+    return out
+
+
+def only(found: dict[str, float], prefix: str) -> dict[str, float]:
+    """The reference's columns, not those of the half of it."""
+    return {f"{prefix}{k}": v for k, v in found.items() if k.startswith("reference")}

@@ -1,0 +1,47 @@
+"""The one tuning budget of chapter 11: three values of one number, ten runs each, for every filter.
+
+The runs are not reported. What is compared is the mean CRPS, which rewards small errors and claims
+that fit. The best values stand in data/scenarios/together/tuned.toml.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+import _together as together
+
+NAME, PAPER = "tuned", "together"
+RUNS = together.STUDY["tuning_runs"]
+TRIED = {p: [c for c, cell in together.CELLS.items() if cell.grid and not cell.why_empty(p)]
+         for p in together.FOUR}  # fmt: skip
+columns = [f"{p}_{c}_{k}" for p, cells in TRIED.items() for c in cells for k in range(3)]
+parameters = {"runs": RUNS, "grids": {c: v.grid for c, v in together.CELLS.items() if v.grid}}
+seeds = np.random.SeedSequence(together.STUDY["tuning_seed"]).spawn(1)
+scenarios = (*(together.problem(p).scenario for p in together.FOUR), together.STUDY)
+code = together.code
+rtol, rough = 1e-3, [c for c in columns if "_pf_" in c or "_ot_" in c or "_maps_" in c]
+
+
+def trial(seed: np.random.SeedSequence) -> dict[str, float]:
+    """Every value of every filter on every problem; infinity where a run fails."""
+    out = {}
+    for name, cells in TRIED.items():
+        p = together.problem(name)
+        data = p.data(RUNS, together.stream(seed, name))
+        for cell in cells:
+            made = together.CELLS[cell]
+            for k, value in enumerate(made.grid):
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")
+                    found = together.scored(
+                        p, made.make(p, value), data, together.stream(seed, f"{name}{cell}"),
+                        alone=made.alone, scores=("crps",),
+                    )  # fmt: skip
+                mean = float(found["crps"].mean())
+                out[f"{name}_{cell}_{k}"] = float(f"{mean:.6g}") if np.isfinite(mean) else 1e9
+    return out
