@@ -523,7 +523,10 @@ class GridFilter(filters.Filter):
         mean = w @ x
         second = np.stack([w @ (x[:, i] * x[:, j]) for i in (0, 1) for j in (0, 1)], axis=-1)
         cov = second.reshape(*mean.shape, 2) - mean[..., :, None] * mean[..., None, :]
-        cov = cov + (2 * self.half / self.cells) ** 2 / 12 * np.eye(2)
+        # A belief is no narrower than a cell.
+        least = (2 * self.half / self.cells) ** 2 / 12
+        i = np.arange(2)
+        cov[..., i, i] = np.maximum(cov[..., i, i], least)
         return filters.Summary(mean, np.diagonal(cov, axis1=-2, axis2=-1), cov)
 
 

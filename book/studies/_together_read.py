@@ -152,12 +152,18 @@ def operations(p: Any, cell: str, members: int | None = None) -> float:
 
 # ----------------------------------------------------------------------------------------- a tree
 
-QUESTIONS = ("curved", "several", "chaotic", "doubted", *BUDGETS)
-"""What a user knows of a problem, and whether an agent may send more than so much."""
+QUESTIONS = ("plane", "doubted", "chaotic", "several", "curved", *BUDGETS)
+"""What a user knows of a problem, and whether an agent may send more than so much.
+
+Where two questions divide the four problems alike the first stands: what there is room for comes
+before what bends.
+"""
 
 
 def says(question: Any, name: str, budget: float) -> bool:
     """The answer for a problem and a budget."""
+    if question == "plane":
+        return bool(together.problem(name).model.dim <= 2)
     if isinstance(question, str):
         return question in together.problem(name).traits
     return budget > question

@@ -9,6 +9,7 @@ import importlib
 import inspect
 import io
 import json
+import math
 import re
 import types
 from collections.abc import Callable, Iterator, Mapping
@@ -594,12 +595,34 @@ def cite_text() -> str:
     return f"```bibtex\n@software{{distfilt,\n{body}\n}}\n```"
 
 
+def measured_text() -> str:
+    """Return what chapter 11's stored study found best: a row a problem, a column a budget."""
+    from bookkit import studies
+
+    read = studies.script("_together_read")
+    lines = ["| Problem | Silent | At most 3 numbers | At most 32 numbers | Any |",
+             "|---|---|---|---|---|"]  # fmt: skip
+    for name in read.FOUR:
+        cells = [f"*{name}*: {read.together.problem(name).scenario.title}"]
+        for budget in (0, 3, 32, math.inf):
+            if not read.allowed(name, budget):
+                cells += ["nothing whose claim fits"]
+                continue
+            best = read.best(name, budget)
+            error = read.ratio(best, read.results(name)["reference"]).estimate
+            what = read.together.CELLS[best.cell]
+            cells += [f"{error:.2f}: {what.family}; {what.talk}"]
+        lines += ["| " + " | ".join(cells) + " |"]
+    return "\n".join(lines)
+
+
 def write_generated(folder: Path) -> None:
     """Write the included parts of pages; an unchanged part keeps its date."""
     by = users()
     parts = {f"api/{part}.md": api_part(part, by) for part in api_parts()}
     parts["api.md"] = api_index()
     parts["map.md"], parts["errata.md"] = map_text(), errata_text()
+    parts["measured.md"] = measured_text()
     parts["gallery.md"], parts["cite.md"] = gallery_text(folder / "gallery"), cite_text()
     if ITEMS.is_file() and LEDGER.is_file():
         parts["reproductions.md"] = reproductions_text()
