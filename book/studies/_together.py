@@ -37,7 +37,7 @@ LINEAR, RANGE = scenario("together", "linear"), scenario("together", "range")
 LORENZ, PLACES = scenario("together", "lorenz"), scenario("together", "places")
 STUDY, TUNED = scenario("together", "study"), scenario("together", "tuned")
 HELD = scenario("together", "held")
-BATCH = STUDY["batch"]
+BATCH, TUNING = STUDY["batch"], (STUDY["tuning_seed"], STUDY["tuning_runs"])
 
 
 # ------------------------------------------------------------------------------------- problems
@@ -228,9 +228,10 @@ def problem(name: str) -> Problem:
 
 
 class PassedOn:
-    """Before it filters, every agent passes on what it hears until all have all readings.
+    """Before it filters, every agent passes on what it hears.
 
-    A reading goes over a link once in each direction at most, with the number of whose it is.
+    A reading goes over a link once in each direction at most, with
+    the number of whose it is, until all have all readings.
     """
 
     def advance(self, step: Any) -> Any:
@@ -296,7 +297,8 @@ class MeasurementConsensus(GaussianFilter):
             H, at = heard.jacobian(m[..., a, :]), m[..., a, :, None]
             gap = heard.target - heard.predict(m[..., a, None, :])[..., 0, :]
             W = H.mT @ np.linalg.inv(heard.noise)
-            said[..., a, :, :] = W @ np.concatenate([H, gap[..., None] + H @ at], axis=-1)
+            z = gap[..., None] + H @ at
+            said[..., a, :, :] = W @ np.concatenate([H, z], axis=-1)
         rows, columns = np.triu_indices(d, 0, d + 1)
         flat = np.ascontiguousarray(said[..., rows, columns])
         flat = self.count * self.agree(flat, step.channel)

@@ -16,12 +16,12 @@ sys.path.insert(0, str(Path(__file__).parent))
 import _together as together
 
 NAME, PAPER = "tuned", "together"
-RUNS = together.STUDY["tuning_runs"]
+SEED, RUNS = together.TUNING
 TRIED = {p: [c for c, cell in together.CELLS.items() if cell.grid and not cell.why_empty(p)]
          for p in together.FOUR}  # fmt: skip
 columns = [f"{p}_{c}_{k}" for p, cells in TRIED.items() for c in cells for k in range(3)]
 parameters = {"runs": RUNS, "grids": {c: v.grid for c, v in together.CELLS.items() if v.grid}}
-seeds = np.random.SeedSequence(together.STUDY["tuning_seed"]).spawn(1)
+seeds = np.random.SeedSequence(SEED).spawn(1)
 scenarios = (*(together.problem(p).scenario for p in together.FOUR), together.STUDY)
 code = together.code
 rtol, rough = 1e-3, [c for c in columns if "_pf_" in c or "_ot_" in c or "_maps_" in c]
