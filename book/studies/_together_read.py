@@ -109,8 +109,14 @@ def worse(best: Result, others: Iterable[Result]) -> set[str]:
     """The cells whose error differs from the best's on the same runs, by Holm."""
     from scipy.stats import ttest_rel
 
-    return holm({o.cell: 0.0 if o.failed else float(ttest_rel(o.error, best.error).pvalue)
-                 for o in others if o.cell != best.cell})  # fmt: skip
+    def p_value(other: Result) -> float:
+        if other.failed:
+            return 0.0
+        if np.allclose(other.error, best.error, rtol=1e-4):
+            return 1.0
+        return float(ttest_rel(other.error, best.error).pvalue)
+
+    return holm({o.cell: p_value(o) for o in others if o.cell != best.cell})
 
 
 # ------------------------------------------------------------------------------------ operations
@@ -185,8 +191,10 @@ def allowed(name: str, budget: float = np.inf) -> list[Result]:
 
 
 def best(name: str, budget: float = np.inf) -> Result:
-    """The honest cell of least error that a budget allows."""
-    return min(allowed(name, budget), key=lambda r: r.error.mean())
+    """The honest cell of least error that a budget allows; the cheapest of those that are alike."""
+    found = allowed(name, budget)
+    least = min(r.error.mean() for r in found)
+    return min((r for r in found if r.error.mean() < least * (1 + 1e-4)), key=lambda r: r.floats)
 
 
 def leaf(rows: Sequence[tuple[str, float]]) -> tuple[float, str]:
