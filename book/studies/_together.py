@@ -800,7 +800,8 @@ def scored(
         state = f.start(prior, rng=rng if f.draws else None, runs=() if alone else (runs,))
         run = f.run(state, p.times, [y[:, part] for y in seen],
                     truth={k: v[:, part] for k, v in known.items()}, scores=scores)  # fmt: skip
-        here = run.isel(late).mean(("time", "agent"))
+        # A run that failed once, at one agent, has no mean.
+        here = run.isel(late).mean(("time", "agent"), skipna=False)
         some = here.sel(component=list(p.scored))
         if "squared_error" in here:
             out["error"].append(some["squared_error"].sum("component").values)
