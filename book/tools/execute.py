@@ -31,7 +31,7 @@ from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 
 from common import ROOT, chosen, foreign_text, pinned_environment
-from pictures import differences, taken_out
+from pictures import differences, lighten, taken_out
 
 KERNELSPEC = {"display_name": "Python 3", "language": "python", "name": "python3"}
 LANGUAGE = {
@@ -91,6 +91,8 @@ def run(notebook: Any, folder: Path) -> None:
     )
     client.execute(env=pinned_environment())
     notebook.metadata["language_info"] = nbformat.from_dict(LANGUAGE)
+    for cell in notebook.cells:
+        lighten(cell.get("outputs", []))
 
 
 def complaints(notebook: Any) -> list[str]:
@@ -173,6 +175,7 @@ def copy_sources(source: Path) -> str:
     for new, old in zip(fresh.cells, stored.cells, strict=True):
         if new.cell_type == "code":
             new.outputs, new.execution_count = old.outputs, old.execution_count
+            lighten(new.outputs)
     if "widgets" in stored.metadata:
         fresh.metadata["widgets"] = stored.metadata["widgets"]
     target.write_text(dump(fresh), encoding="utf-8", newline="\n")

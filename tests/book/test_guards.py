@@ -26,7 +26,7 @@ from PIL import Image
 import execute
 import pairs
 from common import ROOT
-from pictures import difference, taken_out
+from pictures import difference, lighter, taken_out
 
 TOOLS = ROOT / "book" / "tools"
 SMALL = Path(__file__).parent / "fixtures" / "small.md"
@@ -102,6 +102,10 @@ def shaded(png: str, share: float, by: int) -> str:
     pixels = np.asarray(image).astype(int)
     chosen = np.random.default_rng(1).random(pixels.shape[:2]) < share
     pixels[chosen] += np.where(pixels[chosen] > 127, -by, by)
+    return as_png(pixels)
+
+
+def as_png(pixels: np.ndarray) -> str:
     out = io.BytesIO()
     Image.fromarray(pixels.astype(np.uint8)).save(out, format="png")
     return base64.b64encode(out.getvalue()).decode()
@@ -176,6 +180,13 @@ def test_pixels_may_differ_if_few_or_little(executed: Path) -> None:
     assert difference(shaded(png, 0.002, 120), png).startswith("differs in 0.2")
     assert difference(shaded(png, 0.0001, 120), png) == ""
     assert difference(png, "a") == "is no picture"
+
+
+def test_a_lighter_picture_shows_the_same() -> None:
+    noise = np.random.default_rng(1).integers(0, 256, (200, 200, 3))
+    few, many = as_png(noise // 64 * 80), as_png(noise)
+    assert len(lighter(few)) < 0.9 * len(few) and difference(lighter(few), few) == ""
+    assert lighter(many) == many and lighter(lighter(few)) == lighter(few)
 
 
 def clear(cell: Any) -> None:
