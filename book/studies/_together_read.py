@@ -61,11 +61,8 @@ def result(stored: Any, name: str, cell: str = "") -> Result:
 @cache
 def results(name: str) -> dict[str, Result]:
     """All cells of a problem, the reference first."""
-    if name in THREE:
-        held = studies.stored("together", "held")
-        return {c: result(held, f"{name}_{c}", c) for c in cells_in(held, f"{name}_")}
-    main = studies.stored("together", name)
-    return {c: result(main, c) for c in cells_in(main, "")}
+    stored = studies.stored("together", "held" if name in THREE else "every")
+    return {c: result(stored, f"{name}_{c}", c) for c in cells_in(stored, f"{name}_")}
 
 
 def cells_in(stored: Any, prefix: str) -> list[str]:
