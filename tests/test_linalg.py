@@ -174,13 +174,6 @@ def test_solves_agree_with_numpy(seed: int, d: int, leading: tuple[int, ...]) ->
 # --- derivatives ------------------------------------------------------------------------------
 
 
-def test_a_matrix_is_its_own_derivative() -> None:
-    a = np.random.default_rng(0).standard_normal((2, 3))
-    x = np.random.default_rng(1).standard_normal((4, 5, 3))
-    slope = linalg.central(lambda v: v @ a.T, x)
-    assert slope.shape == (4, 5, 2, 3) and np.abs(slope - a).max() < 1e-9
-
-
 def test_values_that_wrap_and_large_components() -> None:
     slope = linalg.central(wrap, np.array([np.pi, 3.0]), lambda a, b: wrap(a - b))
     assert np.abs(slope - np.eye(2)).max() < 1e-9

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..doors import Array, Bounds, NonNegative, Places, Record, array, door, unchecked
-from ..linalg import SolverError, central
+from ..linalg import SolverError, as_derivative, central
 
 __all__ = ["Constraint", "norm", "project", "retract"]
 
@@ -37,7 +38,8 @@ class Constraint(Record):
     value : array_like, (s,)
         The right-hand side d.
     derivative : callable, optional
-        ``derivative(x)``, the Jacobian of `function`, (..., s, d); differences stand in for it.
+        ``derivative(x)``, the Jacobian of `function`, (..., s, d); differences stand in for it. A
+        first time they are compared, and a warning tells of another function's.
 
     Examples
     --------
@@ -69,10 +71,12 @@ class Constraint(Record):
     @door
     def jacobian(self, x: Annotated[Array, "... d"]) -> Array:
         """Derivative of g at states (..., d), (..., s, d)."""
+        near = partial(central, self.missed, x)
         if self.derivative is None:
-            return central(self.missed, x)
+            return near()
         shape = (*x.shape[:-1], self.value.size, x.shape[-1])
-        return array(self.derivative(x.copy()), "derivative", shape)
+        slope = array(self.derivative(x.copy()), "derivative", shape)
+        return as_derivative(slope, shape, self, near)
 
 
 @door

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..doors import Array, Bounds, Count, NonNegative, Positive, Record, door
+from ..models.swarm import inside
 
 __all__ = ["Grid", "zero_mean_prior"]
 
@@ -103,11 +104,7 @@ class Grid(Record):
 
     def _inside(self, positions: Array) -> Array:
         """Positions (..., d); those outside the box are refused."""
-        outside = ((positions < self.low) | (positions > self.high)).any(axis=-1)
-        if outside.any():
-            raise ValueError("positions: needs agents inside the grid's box, got "
-                             f"{outside.sum()} outside, one at {positions[outside][0].tolist()}")
-        return positions
+        return inside(positions, np.asarray(self.low), np.asarray(self.high))
 
     @door
     def integral(self, values: Annotated[Array, "... self.size"]) -> Array:

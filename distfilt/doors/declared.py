@@ -151,7 +151,8 @@ class Record:
         scope = Scope(dict(vars(self)))
         for name, kind in _of_fields(cls).items():
             scope.values[name] = _kept(kind.take(scope.values[name], name, scope))
-        vars(self).update(scope.values)
+        # What its functions say of each other is compared when they first speak.
+        vars(self).update(scope.values, _doubted=True)
 
     @classmethod
     def unchecked(cls, *args: Any, **options: Any) -> Self:

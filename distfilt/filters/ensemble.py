@@ -6,7 +6,6 @@ transport filters, whose agents have one set of members in common and agree on i
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
@@ -25,7 +24,7 @@ from ..sensors import Sensor
 from ..updates import exact_draws, known_noise, sampled_forecast, with_missing
 from ..updates.door import says
 from ..updates.gaussian import exact_forecast
-from ..updates.particles import ParticleCollapse, log_likelihood
+from ..updates.particles import log_likelihood, warn_of_collapse
 from .base import Filter
 from .inbox import Heard
 from .inputs import members_of
@@ -296,7 +295,7 @@ class TransportFilter(MembersFilter):
         Warns
         -----
         ParticleCollapse
-            If the weights that are carried over have an effective size below two.
+            If one member has nearly all the weight that is carried over.
         """
         state, now = step.state, step.state.ensembles
         if step.dt:
@@ -353,26 +352,16 @@ class TransportFilter(MembersFilter):
         return [np.where(told, y, x) for y, x in zip(out, stack, strict=True)], errors
 
     def _warn(self, logs: Array, step: Step) -> None:
-        """A coupling that carries all to one or two members leaves nothing to go on from."""
+        """A coupling that carries all to one member leaves nothing to go on from."""
         if step.failed.all():
             return
         w = normalised(logs[~step.failed] if step.failed.any() else logs)
         size = float((1 / (w * w).sum(axis=-1)).min())
         if size < 1.1:
             what = f"an agent's weights have an effective size of {size:.1f}"
-            warn_of_collapse(step.t, what, "rejuvenation=")
+            warn_of_collapse(f"t = {step.t:g} s: {what}", "rejuvenation=")
 
 
 def sample_moments(members: Array) -> tuple[Array, Array]:
     """Mean and covariance of predictions (..., N, M); NaN where some member cannot be seen."""
     return members.mean(axis=-2), unchecked(moments.sample_covariance)(members)
-
-
-def warn_of_collapse(t: float, what: str, option: str) -> None:
-    """Tell whoever runs a filter that what it believes rests on few members."""
-    warnings.warn(
-        f"t = {t:g} s: {what}; more members, {option}, or more process noise keep its "
-        f"belief alive",
-        ParticleCollapse,
-        stacklevel=4,
-    )

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..doors import Array, Mask, Share, unchecked
 from ..updates import particles
-from .ensemble import MembersFilter, Several, warn_of_collapse
+from .ensemble import MembersFilter, Several
 from .inbox import Heard
 from .record import Summary
 from .saving import SensorState
@@ -205,7 +205,7 @@ class ParticleFilter(MembersFilter):
             what = f"an agent's weights have an effective size of {size.min():.1f}"
         else:
             return
-        warn_of_collapse(state.t, what, "jitter=")
+        particles.warn_of_collapse(f"t = {state.t:g} s: {what}", "jitter=")
 
 
 def weighted_moments(points: Array, w: Array) -> tuple[Array, Array]:

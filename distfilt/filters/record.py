@@ -10,7 +10,7 @@ import numpy as np
 
 from ..doors import Array, array, unchecked
 from ..ensembles import sample_covariance
-from ..linalg import cholesky, quadratic_form
+from ..linalg import cholesky, in_units, quadratic_form
 from ..metrics import crps, gaussian_crps
 from .saving import State
 
@@ -222,9 +222,7 @@ def _counted(name: str, values: list[Any]) -> dict[str, Any]:
 
 def _nees(mean: Array, cov: Array, known: Array) -> Array:
     """NEES, whatever the units; infinite where a cloud has collapsed, which claims certainty."""
-    scale = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
-    unit = np.where(scale > 0, scale, 1.0)
-    shape = cov / (unit[..., :, None] * unit[..., None, :])
+    shape, unit = in_units(cov)
     sure = np.linalg.eigvalsh(shape)[..., 0] <= 1e-12
     shape[sure] = np.eye(shape.shape[-1])
     return np.where(sure, np.inf, quadratic_form(cholesky(shape), (mean - known) / unit))

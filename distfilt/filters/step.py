@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
@@ -261,7 +261,7 @@ def guarded(
     compute: Compute, arrays: tuple[Array, ...], fallback: tuple[Array, ...], lead: int, *,
     shared: Array = _NOTHING, rng: np.random.Generator | None = None,
 ) -> tuple[tuple[Array, ...], dict[Row, str]]:
-    """A computation on a batch (*lead, …), and if it fails on each row alone.
+    """A computation on a batch (*lead, …), whose rows may fail without the others' notice.
 
     `compute` gets the arrays, `shared`, (m, m) for all rows or (G, m, m) for each entry of the last
     leading axis, and `rng`; `lead` axes count rows, and a row that fails keeps its `fallback`. The
@@ -280,20 +280,24 @@ def guarded(
     try:
         out = compute(*arrays, shared, rng)
     except RECOVERABLE as error:
-        out = tuple(f.copy() for f in fallback)
-        for row in np.ndindex(arrays[0].shape[:lead]):
-            source = copy.deepcopy(rng)
-            if source is not None:
-                source.bit_generator.state = at
+        out, rows = tuple(f.copy() for f in fallback), list(np.ndindex(arrays[0].shape[:lead]))
+        for row in rows:
             part = shared[row[-1]] if shared.ndim > 2 else shared
             try:
-                results = compute(*(a[row] for a in arrays), part, source)
+                results = compute(*(a[row] for a in arrays), part, rng)
             except RECOVERABLE as own:
                 errors[row] = str(own)
                 continue
             for target, result in zip(out, results, strict=True):
                 target[row] = result
-        if of_the_call(error) and len(errors) == np.prod(arrays[0].shape[:lead]):
+        if 0 < len(errors) < len(rows) and rng is not None:
+            # No row may draw otherwise because another fails: a good one stands in for that.
+            good = next(row for row in rows if row not in errors)
+            where: Any = tuple(np.transpose([good if row in errors else row for row in rows]))
+            rng.bit_generator.state = at
+            with suppress(*RECOVERABLE):
+                out = compute(*(a[where].reshape(a.shape) for a in arrays), shared, rng)
+        if of_the_call(error) and len(errors) == len(rows):
             raise
     for got in out:
         errors |= _not_finite(got, lead, "result")

@@ -8,9 +8,10 @@ from typing import Literal
 import numpy as np
 
 from ..doors import Count, Share, door, unchecked
+from ..linalg import log_sum
 from ..network import Channel, fuses
 from .fusion import Exponents, Others, PartialFusion, Rule, Terms
-from .gaussian import GaussianMixture, joined, log_sum, regression
+from .gaussian import GaussianMixture, joined, regression
 from .reduction import runnalls
 
 __all__ = ["average", "fuse", "fuse_in_turn", "fuse_moments", "target_fusion"]
@@ -130,7 +131,7 @@ def average(own: GaussianMixture, heard: GaussianMixture, *, omega: Share = 0.5)
     """
     target, n = PartialFusion(own, heard).target, heard.dim
     logs = target.log_weights + unchecked(target.component_log_densities)(heard.means)
-    share = np.exp(logs - log_sum(logs)[:, None])
+    share = np.exp(logs - log_sum(logs))
     gain, rest = regression(own, n)
     gap = heard.means[:, None] - own.means[:, :n]
     ego = own.means[:, n:] + (gain @ gap[..., None])[..., 0]

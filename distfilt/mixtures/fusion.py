@@ -22,8 +22,8 @@ from scipy.linalg import svdvals
 
 from ..doors import Array, Bounds, Count, Mask, Record, Share, door, summing_to_one, unchecked
 from ..gaussians.single import unscented_points
-from ..linalg import SolverError, symmetrise
-from .gaussian import GaussianMixture, inverse, joined, log_sum, regression
+from ..linalg import SolverError, log_sum, symmetrise
+from .gaussian import GaussianMixture, inverse, joined, regression
 from .reduction import Shapes
 
 __all__ = ["PartialFusion", "nonnegative_least_squares", "tikhonov"]
@@ -225,7 +225,7 @@ def _weighed(mixture: GaussianMixture, logs: Array) -> GaussianMixture:
     """Weights from the logarithms of EQ coefficients, by (18); what vanishes is left out."""
     mass = logs - mixture.log_peaks
     total = log_sum(mass)
-    if not np.isfinite(total):
+    if not np.isfinite(total).all():
         raise SolverError("no fused mixand has a weight: the exact density is zero at every point")
     w = np.exp(mass - total)
     keep = w > 0

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 
 from ..doors import Array, Count, Cov, Places, Record, Rng, definite, door, summing_to_one
-from ..linalg import log_det, symmetrise
+from ..linalg import in_units, log_det, log_sum, symmetrise
 
 __all__ = ["GaussianMixture"]
 
@@ -143,7 +143,7 @@ class GaussianMixture(Record):
         >>> one.log_density([[0.0], [60.0]]).round(2).tolist()
         [-0.92, -1800.92]
         """
-        return self._in_blocks(x, (), lambda logs: log_sum(self.log_weights + logs))
+        return self._in_blocks(x, (), lambda logs: log_sum(self.log_weights + logs)[..., 0])
 
     def _in_blocks(self, x: Array, shape: tuple[int, ...], of: Callable[[Array], Array]) -> Array:
         """What is made of the mixands' log densities (n, L) at points, some points at a time."""
@@ -247,9 +247,7 @@ class GaussianMixture(Record):
 
 def _collapsed(covs: Array) -> str:
     """Which mixand has no square root, and what that comes from."""
-    std = np.sqrt(np.abs(np.diagonal(covs, axis1=-2, axis2=-1)))
-    unit = np.where(std > 0, std, 1.0)
-    least = np.linalg.eigvalsh(covs / (unit[:, :, None] * unit[:, None, :]))
+    least = np.linalg.eigvalsh(in_units(covs)[0])
     worst = int(least[:, 0].argmin())
     return (
         f"mixand {worst} of {len(covs)} has a covariance that is not positive definite (smallest "
@@ -262,14 +260,6 @@ def inverse(factors: Array) -> Array:
     """The inverse of L L', symmetric, for Cholesky factors (..., d, d)."""
     white = np.linalg.solve(factors, np.broadcast_to(np.eye(factors.shape[-1]), factors.shape))
     return np.asarray(white.mT @ white)
-
-
-def log_sum(logs: Array) -> Array:
-    """Logarithm of the sum of exponentials along the last axis; -inf where all are."""
-    top = logs.max(axis=-1, keepdims=True)
-    top = np.where(np.isfinite(top), top, 0.0)
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.log(np.exp(logs - top).sum(axis=-1)) + top[..., 0])
 
 
 def regression(own: GaussianMixture, n: int) -> tuple[Array, Array]:

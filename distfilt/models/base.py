@@ -12,7 +12,7 @@ import numpy as np
 
 from ..doors import Array, Bounds, Count, NonNegative, Record, Rng, Times, array, door, unchecked
 from ..doors.values import batched, semidefinite
-from ..linalg import central, factor
+from ..linalg import as_derivative, central, factor
 
 __all__ = ["LinearModel", "Model", "simulate"]
 
@@ -37,7 +37,7 @@ class Model(Record):
         ``noise_cov(t, dt) -> Q``, (d, d), positive semidefinite.
     derivative : callable, optional
         ``derivative(x, t, dt)``, the Jacobian of `flow`, (..., d, d). Central differences stand in
-        for it.
+        for it; a first time they are compared, and a warning tells of another function's.
     names : tuple of str, optional
         Name of each component, for labels.
     units : tuple of str, optional
@@ -98,19 +98,11 @@ class Model(Record):
 
         `derivative` where the model has it, central differences of `flow` otherwise.
         """
+        near = partial(central, lambda state: unchecked(self.step)(state, t, dt), x)
         if self.derivative is None:
-            return central(lambda state: unchecked(self.step)(state, t, dt), x)
-        slope = np.asarray(self.derivative(x.copy(), t, dt))
-        if slope.shape not in ((*x.shape, self.dim), (self.dim, self.dim)):
-            raise ValueError(
-                f"derivative: needs to return shape {(*x.shape, self.dim)}, got {slope.shape}"
-            )
-        if "_judged" not in vars(self):  # once: a transposed one has the right shape too
-            vars(self)["_judged"] = True
-            near = central(lambda state: unchecked(self.step)(state, t, dt), x)
-            if np.abs(slope - near).max(initial=0.0) > 1e-2 * np.abs(near).max(initial=0.0):
-                warnings.warn("derivative: needs that of flow, got another", RuntimeWarning, 4)
-        return np.broadcast_to(slope, (*x.shape, self.dim))
+            return near()
+        slope, full = self.derivative(x.copy(), t, dt), (*x.shape, self.dim)
+        return as_derivative(slope, full, self, near, np.eye(self.dim))
 
 
 @lru_cache(maxsize=64)
@@ -131,7 +123,8 @@ class LinearModel(Model):
     ----------
     transition_matrix : callable
         ``transition_matrix(dt) -> Φ``, (d, d). `flow` has to be the product with it; build the
-        model with :meth:`from_transition`, which sees to that.
+        model with :meth:`from_transition`, which sees to that. A warning tells if it is the
+        transpose that fits `noise_cov`.
 
     Examples
     --------
@@ -154,6 +147,18 @@ class LinearModel(Model):
         return cls(
             dim, flow, noise_cov, names=names, units=units, transition_matrix=transition_matrix
         )
+
+    def _noise(self, t: float, dt: float) -> tuple[Array, Array]:
+        whole, half = super()._noise(t, dt), dt / 2
+        if dt and vars(self).pop("_doubted", False):
+            # Noise of two half steps is that of a whole one, if each is what white noise becomes.
+            phi, first = unchecked(self.transition)(half), self.noise_cov(t, half)
+            last = self.noise_cov(t + half, half) - whole[0]
+            own, other = (np.abs(p @ first @ p.T + last).max() for p in (phi, phi.T))
+            if other < 1e-11 * np.abs(whole[0]).max() < 1e-2 * own:
+                text = "transition_matrix: needs that of noise_cov, got its transpose"
+                warnings.warn(text, RuntimeWarning, stacklevel=4)
+        return whole
 
     @door
     def transition(self, dt: NonNegative) -> Array:

@@ -26,6 +26,15 @@ def _reflected(x: Array, low: Array, high: Array) -> Array:
     return np.clip(low + fold, low, high)
 
 
+def inside(positions: Array, low: Array, high: Array) -> Array:
+    """Positions (..., d); those outside the box are refused."""
+    outside = ((positions < low) | (positions > high)).any(axis=-1)
+    if outside.any():
+        raise ValueError("positions: needs agents inside the box, got "
+                         f"{outside.sum()} outside, one at {positions[outside][0].tolist()}")
+    return positions
+
+
 def _diagonal(value: Any, points: tuple[int, ...], dim: int) -> Array:
     """A diffusion, isotropic or per axis, as (*points, d), positive."""
     d = array(value, "diffusion")
@@ -100,15 +109,6 @@ class Swarm(Record):
         points = x.shape[:-1] if callable(self.diffusion) else ()
         return np.broadcast_to(_diagonal(value, points, self.dim), x.shape)
 
-    def _inside(self, x: Array) -> Array:
-        outside = ((x < self.low) | (x > self.high)).any(axis=-1)
-        if outside.any():
-            raise ValueError(
-                f"positions: needs agents inside the box, got {int(outside.sum())} outside, one at "
-                f"{x[outside][0].tolist()}"
-            )
-        return x
-
     @door
     def step(
         self, positions: Positions, t: float, dt: Positive, *, rng: Rng, substeps: Count = 10
@@ -131,7 +131,7 @@ class Swarm(Record):
         -------
         ndarray, (..., d)
         """
-        return self._step(self._inside(positions), t, dt, rng, substeps)
+        return self._step(inside(positions, self.low, self.high), t, dt, rng, substeps)
 
     def _step(self, x: Array, t: float, dt: float, rng: np.random.Generator, n: int) -> Array:
         h = dt / n
@@ -151,7 +151,7 @@ class Swarm(Record):
         Parameters are those of :meth:`step`; `times` increase strictly from `t0`.
         """
         move = partial(self._step, rng=rng, n=substeps)
-        return path(move, self._inside(positions), times, t0)
+        return path(move, inside(positions, self.low, self.high), times, t0)
 
 
 @dataclass(frozen=True, eq=False)

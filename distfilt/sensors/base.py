@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Annotated
 
 import numpy as np
 
 from ..doors import MISSING, Array, Count, Cov, Positive, Record, Rng, array, door, unchecked
 from ..doors.values import batched
-from ..linalg import central, factor, leading
+from ..linalg import as_derivative, central, factor, leading
 
 __all__ = ["Sensor", "wrap"]
 
@@ -69,7 +69,8 @@ class Sensor(Record):
         ``linear(d) -> H``, (m, d), if h is linear.
     derivative : callable, optional
         ``derivative(x)``, the Jacobian of `function` in the present state, (..., m, d), called
-        like it. Central differences stand in for it.
+        like it. Central differences stand in for it; a first time they are compared, and a
+        warning tells of another function's.
 
     Examples
     --------
@@ -161,11 +162,9 @@ class Sensor(Record):
         full = (*states[0].shape[:-1], self.dim, d)
         if self.linear is not None:
             return np.broadcast_to(unchecked(self.matrix)(d), full)
+        before = [b[..., None, :] for b in states[1:]]
+        predict, residual = unchecked(self.predict), unchecked(self.residual)
+        near = partial(central, lambda moved: predict(moved, *before), states[0], residual)
         if self.derivative is None:
-            before = [b[..., None, :] for b in states[1:]]
-            predict, residual = unchecked(self.predict), unchecked(self.residual)
-            return central(lambda moved: predict(moved, *before), states[0], residual)
-        slope = np.asarray(self.derivative(*[s.copy() for s in states]))
-        if slope.shape not in (full, full[-2:]):
-            raise ValueError(f"derivative: needs to return shape {full}, got {slope.shape}")
-        return np.broadcast_to(slope, full)
+            return near()
+        return as_derivative(self.derivative(*[s.copy() for s in states]), full, self, near)

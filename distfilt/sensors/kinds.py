@@ -173,7 +173,7 @@ def angle(
     place: dict[str, Any] = {"indices": indices, "origin": origin}
     return Sensor.unchecked(
         1, partial(_angle, period=period, **place), diagonal(std), kind="angle",
-        difference=partial(_shorter_way, period=period), derivative=partial(_angle_slope, **place)
+        derivative=partial(_angle_slope, **place), difference=partial(_turned_at, period=period)
     )
 
 
@@ -183,10 +183,6 @@ def _angle(
     a, b = np.moveaxis(_gap(x, indices, origin), -1, 0)
     direction = np.where((a == 0) & (b == 0), np.nan, np.arctan2(b, a)) - heading
     return unchecked(wrap)(direction, period=period)[..., None]
-
-
-def _shorter_way(observed: Array, predicted: Array, period: float) -> Array:
-    return unchecked(wrap)(observed - predicted, period=period)
 
 
 def _angle_slope(x: Array, indices: Sequence[int], origin: Array | None) -> Array:
@@ -242,10 +238,10 @@ def _sighting(x: Array, heading: float, **place: Any) -> Array:
     return np.concatenate([_distance(x, **place), turned], axis=-1)
 
 
-def _turned_at(observed: Array, predicted: Array, k: int) -> Array:
+def _turned_at(observed: Array, predicted: Array, k: int = 0, period: float = 2 * np.pi) -> Array:
     """Differences, wrapped in one component."""
     gap = np.asarray(observed - predicted)
-    gap[..., k] = unchecked(wrap)(gap[..., k])
+    gap[..., k] = unchecked(wrap)(gap[..., k], period=period)
     return gap
 
 
@@ -283,7 +279,7 @@ def line_of_sight(
     """
     return Sensor.unchecked(
         2, partial(_sight, form=form, observer=observer, hidden=hidden), diagonal(std, std),
-        difference=partial(_turned_at, k=0)
+        difference=_turned_at
     )
 
 

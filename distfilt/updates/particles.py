@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..doors import Array, Bounds, Mask, Rng, Semidefinite, Weights, array, door, unchecked
-from ..linalg import cholesky, factor, solve_lower
+from ..linalg import cholesky, factor, log_sum, solve_lower
 
 __all__ = ["ParticleCollapse", "effective_size", "jitter", "resampled"]
 
@@ -39,7 +39,7 @@ def effective_size(log_weights: ArrayLike) -> Array:
     w = array(log_weights, "log_weights", (..., "n"), finite=False)
     if not (w < np.inf).all() or np.isneginf(w.max(axis=-1)).any():
         raise ValueError("log_weights: needs numbers below infinity, and a positive weight a set")
-    return size_of(np.exp(w - _log_sum(w)))
+    return size_of(np.exp(w - log_sum(w)))
 
 
 def size_of(w: Array) -> Array:
@@ -47,25 +47,27 @@ def size_of(w: Array) -> Array:
     return np.asarray(1 / (w * w).sum(axis=-1))
 
 
-def warn_of_collapse(log_weights: Array, predicted: Array, observed: Array, noise: Array) -> None:
+def warn_of_collapse(what: str, option: str) -> None:
+    """Tell whoever called a filter, or an update, that what it believes rests on few members."""
+    text = f"{what}; more members, {option}, or more process noise keep its belief alive"
+    warnings.warn(text, ParticleCollapse, stacklevel=4)
+
+
+def warn_of_weights(log_weights: Array, predicted: Array, observed: Array, noise: Array) -> None:
     """Warn where one member has all the weight, or the reading is beyond what members believe."""
     m = observed.shape[-1]
     gap = observed - predicted.mean(axis=-2)
     around = predicted - predicted.mean(axis=-2, keepdims=True)
     cov = np.swapaxes(around, -1, -2) @ around / predicted.shape[-2] + noise
     miss = (gap * np.linalg.solve(cov, gap[..., None])[..., 0]).sum(axis=-1).max(initial=0.0)
-    least = size_of(np.exp(log_weights - _log_sum(log_weights))).min(initial=np.inf)
+    least = size_of(np.exp(log_weights - log_sum(log_weights))).min(initial=np.inf)
     if least < 1.1:
         what = f"an ensemble's weights have an effective size of {least:.1f}"
     elif miss > m + 10 * np.sqrt(2 * m):
         what = f"a reading's squared distance from an ensemble's belief is {miss:.0f}, not {m}"
     else:
         return
-    warnings.warn(
-        f"{what}; more members, rejuvenation=, or more process noise keep its belief alive",
-        ParticleCollapse,
-        stacklevel=3,
-    )
+    warn_of_collapse(what, "rejuvenation=")
 
 
 def taken(points: Array, picked: Indices) -> Array:
@@ -74,14 +76,6 @@ def taken(points: Array, picked: Indices) -> Array:
     first = n * np.arange(picked.size // n)[:, None]
     rows = (picked.reshape(-1, n) + first).ravel()
     return np.asarray(points.reshape(-1, d)[rows].reshape(points.shape))
-
-
-def _log_sum(logs: Array) -> Array:
-    """Logarithm of the sum of exponentials (..., 1), a tenth of scipy's time for short vectors."""
-    most = logs.max(axis=-1, keepdims=True)
-    most = np.where(np.isfinite(most), most, 0.0)
-    with np.errstate(divide="ignore"):
-        return np.asarray(most + np.log(np.exp(logs - most).sum(axis=-1, keepdims=True)))
 
 
 @door
@@ -202,7 +196,7 @@ def jittered(x: Array, cov: Array, h: float, drawn: Array, copied: Mask | None =
 def weighed(log_weights: Array, predicted: Array, observed: Array, noise: Array) -> Array:
     """Log-weights (..., N), normalised, after a reading; refused where it rules out every point."""
     joint = log_weights + log_likelihood(predicted, observed, noise)
-    total = _log_sum(joint)
+    total = log_sum(joint)
     if not np.isfinite(total).all():
         raise ArithmeticError("every particle has a likelihood of zero")
     # A weight of zero is minus infinity; kept finite, so that it can be told from failure.

@@ -13,7 +13,7 @@ from ..ensembles import Ensemble, sample_covariance
 from ..triangular import affine, compose
 from ..triangular.affine import ConditionalMap
 from .door import perturbed, update
-from .particles import log_likelihood, warn_of_collapse
+from .particles import log_likelihood, warn_of_weights
 
 __all__ = ["ensemble_transform", "principal_components", "principal_directions", "transport"]
 
@@ -186,7 +186,7 @@ def ensemble_transform(
     (np.float64(0.5), np.float64(0.5))
     """
     logs = log_likelihood(predicted, observed, noise)
-    warn_of_collapse(logs, predicted, observed, noise)
+    warn_of_weights(logs, predicted, observed, noise)
     out = unchecked(coupling.ensemble_transform)(ensemble, logs, correct=correct)
     if not rejuvenation:
         return out

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -159,13 +160,16 @@ def test_copies_of_one_particle_warn_at_any_number() -> None:
         f.step(start, 1.0, [None])
 
 
-def test_an_update_that_fails_in_one_run_is_named_and_leaves_the_draws_of_the_others() -> None:
-    def fragile(x: np.ndarray, h: np.ndarray, y: np.ndarray, r: np.ndarray, *, rng: object):
+@pytest.mark.parametrize("raises", [False, True])
+def test_a_run_whose_update_fails_is_named_and_leaves_the_others_their_draws(raises: bool) -> None:
+    def fragile(x: np.ndarray, h: np.ndarray, y: np.ndarray, r: np.ndarray, *, rng: Any):
+        if raises and (y > 5).any():
+            raise ArithmeticError("it is not finite")
         after = sampled_noise(x, h, y, r, rng=rng)
         return np.where(y[..., None, :] > 5, np.nan, after)
 
-    f = EnsembleFilter(model(), [direct([0], std=1.0)] * 2, graphs.path(2), update=fragile,
-                       share=False, members=5, failures="keep")
+    f = EnsembleFilter(model(), [direct([0], std=s) for s in (1.0, 0.2)], graphs.path(2),
+                       update=fragile, share=False, members=5, failures="keep")
     start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(3,))
     good = f.step(start, 0.5, [np.zeros((3, 1))] * 2)
     some = f.step(start, 0.5, [np.zeros((3, 1)), np.array([[0.0], [9.0], [0.0]])])

@@ -27,7 +27,6 @@ from .examples import TARGET, affine, random_mixture, same, scales, shuffled
 
 OWN = random_mixture(3, 4, 1)
 OTHER = random_mixture(2, 2, 2)
-EXACT = PartialFusion(OWN, OTHER)
 ROWS = pytest.mark.parametrize("rule", ["C1", "C2", "C3", "points"])
 
 

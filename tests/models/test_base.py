@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import warnings
 from functools import partial
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from distfilt import models
-from distfilt.models import Model, simulate
+from distfilt.models import LinearModel, Model, constant_velocity, simulate
 from distfilt.models.satellite import clohessy_wiltshire
 from tests.support import generator
 
@@ -55,12 +56,19 @@ def test_drawn_noise_has_the_full_covariance(door: str) -> None:
     assert (np.abs(draws.T @ draws / n - truth) < 3.9 * error).all()
 
 
-def test_a_transposed_derivative_is_told_once() -> None:
-    wrong = Model(2, lambda x, t, dt: x + dt * x[..., ::-1] * [1, 0], lambda t, dt: np.eye(2),
-                  derivative=lambda x, t, dt: np.array([[1.0, 0.0], [dt, 1.0]]))
-    with pytest.warns(RuntimeWarning, match="^derivative: needs that of flow"):
-        wrong.jacobian(np.ones((3, 2)), 0.0, 0.5)
-    wrong.jacobian(np.ones((3, 2)), 0.0, 0.5)
+@pytest.mark.parametrize("dt", [0.5, 1e-4])
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_transposed_derivative_or_transition_is_told_once(turned: bool, dt: float) -> None:
+    straight = constant_velocity(sigma=0.3, axes=1)
+    phi = (lambda dt: straight.transition(dt).T) if turned else straight.transition
+    model = Model(2, straight.flow, straight.noise_cov, derivative=lambda x, t, dt: phi(dt))
+    linear = LinearModel.from_transition(2, phi, straight.noise_cov)
+    with warnings.catch_warnings(record=True, action="always") as told:
+        for _ in range(2):
+            model.jacobian(np.ones((3, 2)), 0.0, dt)
+            linear.sample_step(np.ones(2), 0.0, dt, rng=generator())
+    words = [str(one.message).split(":")[0] for one in told]
+    assert words == ["derivative", "transition_matrix"] * turned
 
 
 def test_simulation_passes_the_times_on() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 
 import numpy as np
@@ -98,6 +99,17 @@ def test_jacobian_without_a_formula() -> None:
     )
     x = np.array([[np.pi, 0.0], [1.0, 2.0]])
     assert np.abs(sensor.jacobian(x) - 1.0).max() < 1e-9
+
+
+def test_a_transposed_derivative_is_told_once_and_a_rough_one_is_not() -> None:
+    """Nor one that differences cannot see, so near to a bend."""
+    turn = np.array([[0.8, 0.6], [-0.6, 0.8]])
+    for x, slope, told in ((1.0, 1.05 * turn, 0), (1.0, turn.T, 1), (1e-9, turn, 0)):
+        sensor = Sensor(2, lambda x: np.abs(x) @ turn.T, np.eye(2), derivative=lambda x, s=slope: s)
+        with warnings.catch_warnings(record=True, action="always") as caught:
+            for _ in range(2):
+                sensor.jacobian(np.full((3, 2), x))
+        assert [str(one.message)[:10] for one in caught] == told * ["derivative"]
 
 
 def test_jacobian_of_changes_is_in_the_present_state() -> None:
