@@ -25,7 +25,10 @@ unexport PYTHONDONTWRITEBYTECODE
 export MPLCONFIGDIR := $(CURDIR)/$(VENV)/matplotlib
 
 .DEFAULT_GOAL := help
+# One thing after the other, but for the checks of `make test`, which share the cores.
+ifndef CHECKING
 .NOTPARALLEL:
+endif
 .PHONY: help environment remake book test unit types style pairs regress slow outputs identical \
 	accept studies check-studies bench mutants portable lab lock pdf epub clean
 
@@ -72,7 +75,9 @@ book: $(BUILT)
 pdf epub: book
 	$(PY) book/tools/volume.py $@
 
-test: book unit types style pairs regress
+# Chapters on one half of the cores, all other checks on the other: neither waits for the other's end.
+test: book
+	@$(MAKE) --no-print-directory -k -j2 CHECKING=1 JOBS=$$((($(JOBS) + 1) / 2)) regress unit types style pairs
 
 # In the order of their folders: the files with few but long tests then come first.
 unit: $(STAMP)
