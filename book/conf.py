@@ -35,6 +35,7 @@ from access import mend
 from common import BOOK, ROOT, chapters, missing_pages
 from light import lighten
 from pages import (
+    chapter_label,
     chapter_number,
     code_of,
     drop_widgets,
@@ -102,7 +103,8 @@ myst_enable_extensions = [
 myst_heading_anchors = 3
 myst_dmath_double_inline = True
 
-# Numbers: (4.1) and Fig. 4.1 start with the chapter's number, which its file name gives.
+# Numbers: (4.1) and Fig. 4.1 start with the chapter's number, which its file name gives. They go on
+# through both pages of a chapter that has two; the second one's title is numbered 1b.
 numfig = True
 numfig_secnum_depth = 1
 numfig_format = {"figure": "Fig. %s", "table": "Table %s", "code-block": "Listing %s"}
@@ -236,7 +238,7 @@ def link_names(app: Sphinx, page: str, template: str, context: dict[str, Any], t
 
     offer = (
         f'<p class="notebook"><a href="_notebooks/{source.stem}.ipynb" download>'
-        "Download this chapter as a notebook</a></p>"
+        "Download this page as a notebook</a></p>"
     )
     if chapter_number(page):
         context["body"] = context["body"].replace("</h1>", f"</h1>\n{offer}", 1)
@@ -266,7 +268,9 @@ def setup(app: Sphinx) -> None:
 
     def with_chapter_numbers(self: Any, env: Any) -> list[str]:
         number_chapters(env, chapter_number)
-        return number_figures(self, env)
+        renumbered = number_figures(self, env)
+        number_chapters(env, chapter_label)
+        return renumbered
 
     TocTreeCollector.assign_figure_numbers = with_chapter_numbers  # type: ignore[method-assign]
     app.connect("builder-inited", check_toc)

@@ -31,7 +31,7 @@ from pybtex.database import BibliographyData, parse_file
 from pybtex.plugin import find_plugin
 
 from common import BOOK, ROOT, is_chapter, toc_pages
-from pages import chapter_number, reproductions_text
+from pages import chapter_label, chapter_number, reproductions_text
 
 ROLE = re.compile(r"\{(cite:p|cite:t|cite|eq|numref|ref|doc|prf:ref)\}`([^`]+)`")
 MATH = re.compile(r"^(?P<fence>`{3,})\{math\}\n(?P<body>.*?)^(?P=fence)$", re.M | re.S)
@@ -85,14 +85,16 @@ def texts_of(source: Path) -> list[tuple[str, Any]]:
 
 def names(sources: list[Path]) -> Names:
     """Return what all labels of the book are called."""
-    out = Names()
+    out, last = Names(), None
     for source in sources:
-        number = chapter_number(f"book/{source.stem}")
+        number, page = chapter_number(f"book/{source.stem}"), chapter_label(f"book/{source.stem}")
         head = "" if number is None else f"{number}."
-        equations = figures = 0
+        if number is None or number != last:  # a chapter's second page counts on
+            equations = figures = 0
+        last = number
         for text, figure in texts_of(source):
             if title := TITLE.search(text):
-                chapter = title[1] if number is None else f"Chapter {number}, {title[1]}"
+                chapter = title[1] if number is None else f"Chapter {page}, {title[1]}"
                 out.add(source.stem, chapter, source.stem)
             for label in labels_of(text):
                 equations += 1
@@ -153,7 +155,7 @@ def plain(text: str, page: str, known: Names, references: BibliographyData) -> s
     text = SOLUTION.sub(lambda m: "**Solution**\n" if m[2] == "start" else "", text)
     text = INCLUDE.sub(lambda m: reproductions_text(), text)
     text = MADE.sub("*What the build makes of the chapters stands here on the book's page.*", text)
-    text = re.sub(r"\]\((?:/book/)?(\d\d-[\w-]+)\.md", r"](\1.ipynb", text)
+    text = re.sub(r"\]\((?:/book/)?(\d\d[a-z]?-[\w-]+)\.md", r"](\1.ipynb", text)
     return ROLE.sub(lambda m: written_out(m[1], m[2], page, known, references), text)
 
 

@@ -42,10 +42,21 @@ BLOCK = re.compile(r'<div class="highlight-ipython3[^>]*>.*?</pre>', re.S)
 """The code of a cell on a built page."""
 
 
+def chapter_label(page: str) -> str | None:
+    """Return what its file name calls a page of a chapter: "1", and "1b" for the second page."""
+    found = re.match(r"book/0*(\d+[a-z]?)-", page)
+    return found.group(1) if found else None
+
+
 def chapter_number(page: str) -> int | None:
-    """Return the number that a chapter's file name starts with."""
-    found = re.match(r"book/(\d+)-", page)
+    """Return the number of a page's chapter."""
+    found = re.match(r"book/(\d+)[a-z]?-", page)
     return int(found.group(1)) if found else None
+
+
+def chapter_pages() -> dict[str, str]:
+    """Return the pages of all chapters by their labels."""
+    return {label: page for page in toc_pages() if (label := chapter_label(page))}
 
 
 def drop_widgets(tree: nodes.document) -> None:
@@ -82,18 +93,17 @@ def number_chapters(env: Any, number_of: Any) -> None:
     """Give each chapter the number of its file name, whichever chapters exist.
 
     Sphinx counts the chapters that it finds; then equation (4.1) would be renumbered when
-    chapters 2 and 3 appear.
+    chapters 2 and 3 appear. It gives none to a chapter's second page, which lies one level deeper.
     """
-    for page, sections in env.toc_secnumbers.items():
+    for page, title in env.titles.items():
         number = number_of(page)
         if number is None:
             continue
-        for anchor, old in sections.items():
-            sections[anchor] = (number, *old[1:]) if old else old
-        marked = [env.titles[page], *env.tocs[page].findall(nodes.reference)]
-        for node in marked:
-            if old := node.get("secnumber"):
-                node["secnumber"] = [number, *old[1:]]
+        entries = list(env.tocs[page].findall(nodes.reference))
+        sections = dict.fromkeys([entry["anchorname"] for entry in entries])
+        env.toc_secnumbers[page] = {**sections, "": (number,)}
+        for node in (title, entries[0]):
+            node["secnumber"] = [number]
 
 
 def modules() -> list[str]:
@@ -308,8 +318,8 @@ def users() -> dict[str, list[str]]:
     scripts = [*(BOOK / "examples").glob("*.py"), *(BOOK / "studies").glob("*.py")]
     for source in [*chapters(), *sorted(scripts)]:
         if source.suffix == ".md":
-            number = chapter_number(f"book/{source.stem}")
-            shown = f":doc:`{number or 'the first page'} </book/{source.stem}>`"
+            label = chapter_label(f"book/{source.stem}")
+            shown = f":doc:`{label or 'the first page'} </book/{source.stem}>`"
         else:
             shown = f"``{source.relative_to(ROOT).as_posix()}``"
         for name in used(code_of(source), known):
@@ -413,8 +423,7 @@ def cell(text: str) -> str:
 def chapter_link(chapter: str) -> str:
     """Return a link to a chapter that exists, or its number."""
     page = f"book/{chapter}"
-    number = chapter_number(page)
-    label = chapter if number is None else str(number)
+    label = chapter_label(page) or chapter
     return f"[{label}](/{page})" if page in toc_pages() else label
 
 
@@ -465,57 +474,63 @@ def claims_text(row: dict[str, str], title: str) -> list[str]:
 
 
 def needs() -> dict[int, set[int]]:
-    """Return the chapters that each chapter builds on, as it says: *You should know ...*."""
-    out = {}
-    for page in toc_pages():
-        if (number := chapter_number(page)) is None:
-            continue
+    """Return the chapters that each chapter builds on, as its pages say: *You should know ...*."""
+    out: dict[int, set[int]] = {}
+    for page in chapter_pages().values():
         text = " ".join((ROOT / f"{page}.md").read_text(encoding="utf-8").split())
         text = re.sub(r"\[([^]]*)\]\(\d[^)]*\)", r"\1", text)
         said = re.search(r"You should know .*?\.(?= [A-Z`:|#]|$)", text)
-        found: set[int] = set()
+        number = chapter_number(page) or 0
+        found = out.setdefault(number, set())
         lists = r"[Cc]hapters? ((?:\d+(?:, and |, | and | to )?)+)"
         for few in re.findall(lists, said[0] if said else ""):
             listed = [int(n) for n in re.findall(r"\d+", few)]
             found |= set(range(listed[0], listed[-1] + 1) if " to " in few else listed)
-        out[number] = found - {number}
+        found -= {number}
     return out
 
 
 def map_text() -> str:
     """Return a drawing of what each chapter builds on, and the same as a list."""
-    pages = {n: page for page in toc_pages() if (n := chapter_number(page)) is not None}
-    titles, needed = {n: chapter_title(page) for n, page in pages.items()}, needs()
-    rows: dict[int, int] = {}
+    needed, pages, rows = needs(), chapter_pages(), {}
+    stacks: dict[int, list[str]] = {n: [] for n in needed}
+    for label, page in pages.items():
+        stacks[chapter_number(page) or 0].append(label)
+    titles = {label: chapter_title(page) for label, page in pages.items()}
 
     def before(n: int) -> set[int]:
         return needed[n].union(*map(before, needed[n]))
 
-    for n in pages:
+    for n in needed:
         rows[n] = 1 + max((rows[k] for k in needed[n]), default=-1)
-    place = {}
-    for n, row in rows.items():
+    place, top = {}, 40
+    for row in range(max(rows.values()) + 1):
         beside = [k for k in rows if rows[k] == row]
-        place[n] = (530 + 262 * (beside.index(n) - (len(beside) - 1) / 2), 40 + 105 * row)
-    width, height = 1060, 80 + 105 * max(rows.values())
+        for n in beside:
+            place[n] = (530 + 262 * (beside.index(n) - (len(beside) - 1) / 2), top)
+        top += 53 + 52 * max(len(stacks[n]) for n in beside)
+    width, height = 1060, top - 65
     lines = [f'<svg class="map" viewBox="0 0 {width} {height}" role="group" '
              'aria-label="Arrows from each chapter to those that build on it">']  # fmt: skip
     for n, (x, y) in place.items():
         # What another arrow implies is not drawn.
         for k in needed[n] - {i for j in needed[n] for i in before(j)}:
             a, b = place[k]
+            b += 52 * (len(stacks[k]) - 1)
             lines += [f'<path d="M{a},{b + 26} C{a},{b + 66} {x},{y - 66} {x},{y - 27}"/>']
     for n, (x, y) in place.items():
-        link = pages[n].removeprefix("book/")
-        lines += [f'<a href="{link}.html"><rect x="{x - 129}" y="{y - 26}" width="258" height="52" '
-                  f'rx="8"/><text x="{x}" y="{y + 6}">{n}. {titles[n]}</text>'
-                  f'<title>{titles[n]}</title></a>']  # fmt: skip
+        for k, label in enumerate(stacks[n]):
+            link, at = pages[label].removeprefix("book/"), y + 52 * k
+            lines += [f'<a href="{link}.html"><rect x="{x - 129}" y="{at - 26}" width="258" '
+                      f'height="52" rx="8"/><text x="{x}" y="{at + 6}">{label}. {titles[label]}'
+                      f'</text><title>{titles[label]}</title></a>']  # fmt: skip
     lines += ["</svg>"]
     told = []
-    for n, page in pages.items():
-        builds = [f"[chapter {k}](/{pages[k]}.md)" for k in sorted(needed[n])]
+    for n, labels in stacks.items():
+        builds = [f"[chapter {k}](/{pages[str(k)]}.md)" for k in sorted(needed[n])]
         listed = " and ".join(", ".join(builds).rsplit(", ", 1)) or "nothing of the book"
-        told += [f"- **{n}** [{titles[n]}](/{page}.md): {listed}"]
+        links = (f"**{label}** [{titles[label]}](/{pages[label]}.md)" for label in labels)
+        told += [f"- {' with '.join(links)}: {listed}"]
     return "\n".join(["```{raw} html", *lines, "```", "", *told])
 
 
@@ -542,9 +557,9 @@ def gallery_text(folder: Path) -> str:
     folder.mkdir(parents=True, exist_ok=True)
     lines = []
     for source in chapters():
-        if (number := chapter_number(f"book/{source.stem}")) is None:
+        if (label := chapter_label(f"book/{source.stem}")) is None:
             continue
-        lines += [f"## {number}. {chapter_title(f'book/{source.stem}')}", ""]
+        lines += [f"## {label}. {chapter_title(f'book/{source.stem}')}", ""]
         lines += ["::::{grid} 2 2 3 4", ":gutter: 2", ""]
         for name, caption, alt, picture in figures(source):
             target = folder / f"{name}.png"
@@ -575,10 +590,10 @@ def errata_text() -> str:
 
 def with_links(row: str) -> str:
     """Return a row of a table whose chapters are links."""
-    pages = {n: page for page in toc_pages() if (n := chapter_number(page)) is not None}
+    pages = chapter_pages()
 
     def link(found: re.Match[str]) -> str:
-        page = pages.get(int(found[2]))
+        page = pages.get(found[2])
         return f"[{found[1]}{found[2]}](/{page}.md)" if page else found[0]
 
     first = re.sub(r"(?<=chapter )()(\d+)", link, row)
