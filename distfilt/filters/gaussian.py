@@ -137,11 +137,12 @@ class GaussianFilter(Filter):
     def advance(self, step: Step) -> Any:
         """Forecast, condition on what was heard, fuse."""
         means, covs = self._forecast(step)
-        means = step.moved(means, 0.0)
-        covs = step.kept(covs, np.eye(means.shape[-1]))
+        means, one = step.moved(means, 0.0), np.eye(means.shape[-1])
+        covs = step.moved(covs, one)
         for place, group in step.heard():
             slot = len(step.times) - place
             step.settle(self._condition(means, covs, slot, group, step), group.agents)
+        covs = step.kept(covs, one)  # what failed here has to have a root in what follows
         if step.agrees:
             means, covs = self._agreed(means, covs, step)
         covs, past = symmetrise(covs), step.times[::-1]

@@ -160,6 +160,15 @@ def test_copies_of_one_particle_warn_at_any_number() -> None:
         f.step(start, 1.0, [None])
 
 
+def test_a_run_whose_covariance_overflows_leaves_the_others_to_agree() -> None:
+    wild = Model(1, lambda x, t, dt: (x.T * [1.0, 1e200]).T, lambda t, dt: np.eye(1))
+    f = GaussianFilter(wild, [None] * 2, graphs.path(2), agreement=covariance_intersection,
+                       failures="keep")
+    with np.errstate(over="ignore", invalid="ignore"):
+        state = f.step(f.start(([0.0], [[1.0]]), runs=(2,)), 1.0, [None, None])
+    assert state.failed.tolist() == [False, True] and np.allclose(state.covariances[0], 2.0)
+
+
 @pytest.mark.parametrize("raises", [False, True])
 def test_a_run_whose_update_fails_is_named_and_leaves_the_others_their_draws(raises: bool) -> None:
     def fragile(x: np.ndarray, h: np.ndarray, y: np.ndarray, r: np.ndarray, *, rng: Any):

@@ -68,8 +68,7 @@ def test_substeps_are_half_as_long_as_the_bound(
 
 @named
 def test_gossip_keeps_the_average_and_two_change_at_a_time(graph: Graph) -> None:
-    values = rng(1).standard_normal((graph.size, 2))
-    draw = rng(3)
+    values, draw = rng(1).standard_normal((graph.size, 2)), rng(3)
     for _ in range(30):
         channel = Channel(graph)
         new = network.gossip(values, channel, rounds=1, rng=draw)
