@@ -258,8 +258,7 @@ class Filter(Record, ABC):
         if not isinstance(state, self.state):
             needs = self.state.__name__
             raise ValueError(f"state: needs a {needs}, got a {type(state).__name__}")
-        if state.ledger.messages.size != self.count:
-            got = state.ledger.messages.size
+        if (got := state.ledger.messages.size) != self.count:
             raise ValueError(f"state: needs {self.count} agents, got {got}")
         own = getattr(self, "sizes", None)
         if own is not None and state.sizes != own:

@@ -106,8 +106,7 @@ class Heard:
             return np.broadcast_to(self.matrix(d), (*self.target.shape, d))
         out = np.empty((*self.target.shape, d))
         for sensor, rows, columns in self.parts:
-            slope = unchecked(sensor.jacobian)(states[..., rows, :])
-            out[..., rows[:, None], columns, :] = slope
+            out[..., rows[:, None], columns, :] = unchecked(sensor.jacobian)(states[..., rows, :])
         return out
 
     def gated(self, mean: Array, cov: Array, share: float) -> tuple[Heard, Array]:

@@ -312,8 +312,7 @@ def ephemeris(*, position_std: Deviation, velocity_std: Deviation) -> Sensor:
     6
     """
     read = unchecked(direct)(tuple(range(6)), std=1.0)
-    cov = diagonal(*[position_std] * 3, *[velocity_std] * 3)
-    return read.changed(cov=cov)
+    return read.changed(cov=diagonal(*[position_std] * 3, *[velocity_std] * 3))
 
 
 @door
