@@ -794,7 +794,7 @@ def read(source: Path) -> tuple[list[Numeral], list[Fact]]:
     for name in sorted(set(re.findall(r"\b([a-z]\w+)\(", whole))):
         facts += defaults().get(name, ())
     if source.stem == "index":
-        for other in chosen(["04"]):
+        for other in chosen(["04", "04b"]):
             facts += [replace(f, section=-1) for f in read(other)[1]]
     paper = PAPERS_OF.get(source.stem[:2])
     if paper:
