@@ -596,8 +596,10 @@ def with_links(row: str) -> str:
         page = pages.get(found[2])
         return f"[{found[1]}{found[2]}](/{page}.md)" if page else found[0]
 
-    first = re.sub(r"(?<=chapter )()(\d+)", link, row)
-    return re.sub(r"(?<=chapters )()(\d+)", link, re.sub(r"(?<= and )()(\d+)(?= \|$)", link, first))
+    for place in (r"(?<=chapter )()(\d+\w?)", r"(?<= and )()(\d+\w?)(?= \|$)",
+                  r"(?<=chapters )()(\d+\w?)"):  # fmt: skip
+        row = re.sub(place, link, row)
+    return row
 
 
 def cite_text() -> str:
