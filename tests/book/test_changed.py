@@ -32,13 +32,9 @@ def copied(target: Path, changes: tuple[tuple[str, str], ...]) -> Path:
 
 def verdicts(notebook: Any) -> dict[str, tuple[str, str]]:
     """Verdict and reason of each item, from what the cells show."""
-    out = {}
-    for cell in notebook.cells:
-        for output in cell.get("outputs", []):
-            found = output.get("data", {}).get(VERDICT)
-            if found:
-                out[found["item"]] = (found["verdict"], found["why"])
-    return out
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    shown = [output.get("data", {}).get(VERDICT) for output in outputs]
+    return {found["item"]: (found["verdict"], found["why"]) for found in shown if found}
 
 
 @pytest.mark.slow
