@@ -44,4 +44,13 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     return out
 
 
+def part(seed: np.random.SeedSequence) -> dict[str, float]:
+    """The paper's filter with the pull, as in the trial, for chapter 4 to run again."""
+    for_data, for_filters = seed.spawn(2)
+    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    f = satellites.published(SETUP, pca=True, gain=GAINS["pca"])
+    result = satellites.run(SETUP, f, for_filters, truth, seen)
+    return satellites.scored(SETUP, "pca", result) | satellites.of_every_step(SETUP, "pca", result)
+
+
 code = (satellites.data, satellites.published, satellites.scored)
