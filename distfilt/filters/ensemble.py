@@ -194,7 +194,7 @@ class EnsembleFilter(MembersFilter):
         members = tuple([e[..., rows, :, :] for e in stack])
         before = step.before(place, rows)
         predicted = group.predict(members[place], before)
-        group = step.gated(group, partial(sample_moments, predicted))
+        group = step.gated(group, sample_moments, predicted)
         again = getattr(self.update, "repredicts", False)
 
         def compute(h: Array, y: Array, *rest: Any) -> tuple[Array, ...]:
@@ -326,7 +326,7 @@ class TransportFilter(MembersFilter):
         for place, group in step.heard():
             rows = group.rows
             predicted = group.predict(stack[place][..., rows, :, :], step.before(place, rows))
-            group = step.gated(group, partial(sample_moments, predicted))
+            group = step.gated(group, sample_moments, predicted)
             logs[..., rows, :] += log_likelihood(predicted, group.target, group.noise)
         return logs
 

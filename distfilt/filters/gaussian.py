@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -159,10 +160,9 @@ class GaussianFilter(Filter):
         if not dt:
             return state.joint_means.copy(), state.joint_covariances.copy()
         d, kept = state.dim, len(step.times)
-        flow, derivative = unchecked(model.step), unchecked(model.jacobian)
         moved, slope, extra = self._linearised(
-            lambda x: flow(x, state.t, dt), lambda x: derivative(x, state.t, dt),
-            state.means, state.covariances,
+            partial(unchecked(model.step), t=state.t, dt=dt),
+            partial(unchecked(model.jacobian), t=state.t, dt=dt), state.means, state.covariances,
         )
         old = state.joint_means[..., : kept * d]
         shift = np.ascontiguousarray(slope)
@@ -200,10 +200,15 @@ class GaussianFilter(Filter):
         d, rows = self.model.dim, group.rows
         here = slice(slot * d, (slot + 1) * d)
         m, p = means[..., rows, :], covs[..., rows, :, :]
-        at, slope, extra = self._linearised(
-            group.predict, group.jacobian, m[..., here], p[..., here, here]
-        )
-        group = step.gated(group, lambda: (at, slope @ p[..., here, here] @ slope.mT + extra))
+        x, own = m[..., here], p[..., here, here]
+        predict, jacobian = group.predict, group.jacobian
+        at, slope, extra = self._linearised(predict, jacobian, x, own)
+
+        def alike(_: Array) -> tuple[Array, Array]:
+            mean, h, rest = self._linearised(partial(predict, alike=True), jacobian, x, own)
+            return mean, h @ own @ h.mT + rest
+
+        group = step.gated(group, alike, at[..., None, :])
         big = np.ascontiguousarray(slope)
         if m.shape[-1] > d:
             big = np.zeros((*slope.shape[:-1], m.shape[-1]))

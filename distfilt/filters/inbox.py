@@ -80,24 +80,37 @@ class Heard:
         vars(out).update(vars(self), target=target)
         return out
 
-    def predict(self, states: Array, previous: Array | None = None) -> Array:
+    def predict(self, states: Array, previous: Array | None = None, alike: bool = False) -> Array:
         """Readings of states (*runs, G, N, d) without noise, (*runs, G, N, M).
 
-        A reading that wraps lies on the branch of the observation. `previous` holds the states at
-        the observation time before, for sensors that see changes.
+        A reading that wraps lies on the branch of the observation; if they are to be `alike`, the
+        first one does, and the others lie on its branch. `previous` holds the states at the
+        observation time before, for sensors that see changes.
         """
         if self.linear:
             return np.asarray(states @ self.matrix(states.shape[-1]).mT)
         out = np.empty((*states.shape[:-2], self.target.shape[-1], states.shape[-2]))
         for sensor, rows, columns in self.parts:
             before = None if previous is None else previous[..., rows, :, :]
-            aim = self.target[..., rows[:, None], columns][..., None, :]
-            seen = _seen(sensor, states[..., rows, :, :], before, aim)
+            seen = unchecked(sensor.predict)(states[..., rows, :, :], before)
             out[..., rows[:, None], columns, :] = seen.swapaxes(-1, -2)
         out = np.ascontiguousarray(out.swapaxes(-1, -2))
         if not all_finite(out) and np.isinf(out).any():
             raise ValueError("predicted: needs finite numbers or NaN (missing), got infinity")
-        return out
+        out = self.near(out, self.target[..., None, :])
+        return self.near(out, out[..., :1, :]) if alike else out
+
+    def near(self, seen: Array, aim: Array) -> Array:
+        """Predictions (*runs, G, N, M), now on the branch of an aim (*runs, G, 1, M); in place."""
+        out, goal = seen.swapaxes(-1, -2), np.broadcast_to(aim, seen.shape).swapaxes(-1, -2)
+        for sensor, rows, columns in self.parts:
+            if sensor.difference is not None:
+                at = (..., rows[:, None], columns, slice(None))
+                here, there = (x[at].swapaxes(-1, -2) for x in (out, goal))
+                # y* - wrap(y* - h)
+                gap = unchecked(sensor.residual)(there, here)
+                out[at] = np.where(np.isnan(gap), here, there - gap).swapaxes(-1, -2)
+        return seen
 
     def jacobian(self, states: Array) -> Array:
         """Derivatives of the readings at states (*runs, G, d), (*runs, G, M, d)."""
@@ -129,16 +142,6 @@ class Heard:
             out = np.where(here & bad[..., None], np.nan, out)
             refused += bad
         return self.aimed(out), refused
-
-
-def _seen(sensor: Sensor, states: Array, previous: Array | None, aim: Array) -> Array:
-    """Readings of one sensor, (*runs, K, N, m), on the branch of what was observed."""
-    seen = unchecked(sensor.predict)(states, previous)
-    if sensor.difference is None:
-        return seen
-    # y* - wrap(y* - h)
-    gap = unchecked(sensor.residual)(np.broadcast_to(aim, seen.shape), seen)
-    return np.where(np.isnan(gap), seen, aim - gap)
 
 
 @lru_cache(maxsize=32)

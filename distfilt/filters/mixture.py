@@ -162,8 +162,7 @@ class MixtureFilter(Filter):
 
         A loaded state has none, and has to go on alike.
         """
-        most = max(_EXACT, self.size)
-        return unchecked(runnalls)(belief, self.size, heaviest=most).changed()
+        return unchecked(runnalls)(belief, self.size, heaviest=max(_EXACT, self.size)).changed()
 
     def _read(
         self, belief: GaussianMixture, agent: int, said: Sequence[Reading], step: Step, *,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import KW_ONLY, dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -121,11 +121,9 @@ class ParticleFilter(MembersFilter):
             moved = unchecked(self.model.sample_step)(stack[-1], state.t, step.dt, rng=step.rng)
             stack[-1] = step.moved(moved, stack[-1])
         for place, group in step.heard():
-            predicted = group.predict(
-                stack[place][..., group.rows, :, :], step.before(place, group.rows)
-            )
-            w = np.exp(weights[..., group.rows, :])
-            group = step.gated(group, partial(weighted_moments, predicted, w))
+            rows = group.rows
+            predicted = group.predict(stack[place][..., rows, :, :], step.before(place, rows))
+            group = step.gated(group, weighted_moments, predicted, np.exp(weights[..., rows, :]))
             step.settle(_weigh(weights, predicted, group), group.agents)
         if step.agrees:
             # The particles have to be an ensemble, which the agreement can move.

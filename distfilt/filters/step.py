@@ -211,14 +211,17 @@ class Step:
         numbers = np.broadcast_to(np.array(about), (*self.state.runs, len(about)))
         return (*(said.value for said in told), numbers)
 
-    def gated(self, group: Heard, predicted: Callable[[], tuple[Array, Array]]) -> Heard:
+    def gated(self, group: Heard, moments: Any, seen: Array, *rest: Array) -> Heard:
         """A group without the readings that the gate refuses.
 
-        `predicted` gives their predictions' mean (*runs, G, M) and covariance without the noise.
+        `moments` gives mean (*runs, G, M) and covariance of predictions (*runs, G, N, M) and what
+        belongs to them, without the noise.
         """
         if self.refused is None:
             return group
-        group, refused = group.gated(*predicted(), self.filter.gate)
+        # Opposite to a wild angle the branch of the observation would tear them apart.
+        mean, cov = moments(group.near(seen.copy(), seen[..., :1, :]), *rest)
+        group, refused = group.gated(mean, cov, self.filter.gate)
         self.refused[..., group.agents] += refused
         return group
 

@@ -256,9 +256,7 @@ def sampled_forecast(
     moved, root = unchecked(model.step)(ensemble, t, dt), unchecked(model.root)(t, dt)
     if not np.count_nonzero(root):
         return moved
-    noise = rng.standard_normal(moved.shape) @ root.T
-    noise += moved
-    return noise
+    return moved + rng.standard_normal(moved.shape) @ root.T
 
 
 @door

@@ -171,6 +171,11 @@ def test_the_gate_lets_pass_what_its_share_says(family: str) -> None:
         assert after.refused[0] == refused
         same = np.allclose(f.summary(after).mean[0], f.summary(blind).mean[0], atol=1e-12)
         assert same == bool(refused)
+    # Straight behind a direction predictions lie on both sides of where its residuals jump.
+    given = {"sensors": [angle([0, 1], std=0.05, full=True), None, None], "gate": 0.99}
+    f = made(family, **given | ({"rule": "unscented"} if family == "gaussian" else {}))[0]
+    start = f.start((np.array([9.0, 0.0]), 0.2 * np.eye(2)), rng=np.random.default_rng(0))
+    assert f.step(start, 0.01, [[np.pi], None, None]).refused[0] == 1
 
 
 def test_each_reading_is_judged_alone() -> None:

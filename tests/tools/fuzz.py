@@ -264,14 +264,12 @@ ALLOWED: dict[tuple[str, str, str], str] = {
         "an iteration that diverges, with a warning before; as many substeps as are stable",
     (r".*", r"rounds|iterations|members|substeps", "huge: too long"):
         "as many rounds as were asked for",
-    (r"density\.DynamicAverage|triangular\.pool_by_admm", "modes|check", "None: taken"):
-        "all cells in place of coefficients; no agreement on when to stop",
+    (r"density\.DynamicAverage", "modes", "None: taken"): "all cells in place of coefficients",
     (r"models\.(Model\..*|rk4.*|RotatingMixture.*)", r".*", r".*: NaN"):
         "a user's function that overflows",
     (r"sensors\.Sensor.*", r".*", r"(tiny|zero|NaN): NaN"):
         "a direction to where the sensor is, or a reading that is missing",
     (r"sensors\.wrap|filters\.Reading", r".*", "NaN: NaN"): "a reading that is missing",
-    (r"network\.admm", "check", "None: taken"): "no check, as its docstring says",
     (r"kalman\.filterpy_\w+|models\.pendulum_chart", r".*", r"huge: (unnamed|NaN)"):
         "an overflow, in another package's words or an angle of nothing",
 }  # fmt: skip

@@ -97,8 +97,6 @@ def meaning(text: str) -> str:
         first = body[0] if isinstance(body, list) and body else None
         if isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant):
             first.value = ast.Constant("")
-        if isinstance(node, ast.AnnAssign):
-            node.annotation = ast.Constant(None)
     return ast.dump(tree)
 
 
