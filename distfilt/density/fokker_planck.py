@@ -12,6 +12,7 @@ import numpy as np
 import scipy
 
 from ..doors import Array, NonNegative, Positive, Record, Times, door, unchecked
+from ..models.base import path
 from ..models.swarm import Swarm
 from .grid import Grid
 
@@ -207,10 +208,4 @@ class FokkerPlanck(Record):
         times : array_like, (T,)
             Strictly increasing from 0, in s.
         """
-        if times.size and times[0] <= 0:
-            raise ValueError(f"times: needs times after 0, got {times[0]:g}")
-        p, now, out = values, 0.0, np.empty((times.size, *values.shape))
-        for k, t in enumerate(times):
-            p = unchecked(self.solver)(now, float(t) - now)(p)
-            out[k], now = p, float(t)
-        return out
+        return path(unchecked(self.step), values, times, 0.0)

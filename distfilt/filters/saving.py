@@ -100,13 +100,13 @@ class State(Record):
 
         Raises
         ------
-        FileNotFoundError
-            If there is no such file.
+        OSError
+            If there is no such file, or it cannot be read.
         ValueError
             If the file is no saved state of this kind, or is damaged.
         """
+        made = Path(path).read_bytes()
         try:
-            made = Path(path).read_bytes()
             if hashlib.sha256(made[:-32]).digest() != made[-32:]:
                 raise ValueError("it is damaged, or no state that was saved")
             with np.load(io.BytesIO(made[:-32]), allow_pickle=False) as file:
@@ -115,8 +115,6 @@ class State(Record):
             if header["format"] != _FORMAT or header["kind"] != _name(cls):
                 raise ValueError(f"format {header['format']}, a {header['kind']}")
             return cls(**_decoded({"dict": header["state"]["dict"]}, parts))
-        except FileNotFoundError:
-            raise
         except Exception as error:  # zip, JSON and numpy each have their own for what is damaged
             raise ValueError(f"path: needs a saved {cls.__name__}, got {path}: {error}") from None
 

@@ -60,7 +60,8 @@ class Sensor(Record):
     cov : array_like, (m, m)
         The covariance R, positive definite.
     difference : callable, optional
-        ``difference(observed, predicted)``, for readings that wrap; subtraction by default.
+        ``difference(observed, predicted)``, for readings that wrap; subtraction by default. One
+        that falls where the reading grows is refused.
     uses_previous : bool
         Whether the sensor sees the change from the previous observation time.
     kind : str
@@ -87,6 +88,13 @@ class Sensor(Record):
     kind: str = field(default="sensor", kw_only=True)
     linear: Callable[[int], Array] | None = field(default=None, kw_only=True)
     derivative: Callable[..., Array] | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.difference is not None:
+            ahead = self.difference(np.full(self.dim, 1 + 1e-6), np.ones(self.dim))
+            if (np.asarray(ahead) < -5e-7).any():
+                raise ValueError("difference: needs observed less predicted, got the opposite")
 
     @cached_property
     def root(self) -> Array:

@@ -340,13 +340,8 @@ def of_kind(
     return makers[kind](indices, std=std)
 
 
-def _some(value: Sequence[Sensor], name: str) -> None:
-    if not value:
-        raise ValueError(f"{name}: needs at least one Sensor, got none")
-
-
 @door
-def stack(sensors: Annotated[Sequence[Sensor], _some]) -> Sensor:
+def stack(sensors: Sequence[Sensor]) -> Sensor:
     """One sensor whose observation is the observations of `sensors`, one after the other.
 
     It wraps the components that the given sensors wrap, is linear if all of them are, and needs
@@ -363,6 +358,8 @@ def stack(sensors: Annotated[Sequence[Sensor], _some]) -> Sensor:
     >>> both.predict([1.0, 1.0]).round(4), both.cov.diagonal().round(4)
     (array([1.    , 0.7854]), array([0.01, 0.04]))
     """
+    if not sensors:
+        raise ValueError("sensors: needs at least one Sensor, got none")
     cov = block_diag(*[s.cov for s in sensors])
     cov.setflags(write=False)
     wraps = any(s.difference is not None for s in sensors)

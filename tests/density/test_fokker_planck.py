@@ -76,5 +76,5 @@ def test_diffusion_that_varies_is_meant_in_the_sense_of_ito() -> None:
     swarm = Swarm(lambda x, t: 0 * x, lambda x, t: 0.1 * (1 + x[..., 0]), low=[0.0], high=[1.0])
     p = FokkerPlanck(swarm, grid).evolve(np.ones(200), [50.0, 1000.0])[-1]
     assert np.abs(p * (1 + grid.centres[:, 0]) * np.log(2) - 1).max() < 1e-5
-    with pytest.raises(ValueError, match="^times: needs times after 0"):
+    with pytest.raises(ValueError, match="^times: needs times after t0 = 0"):
         FokkerPlanck(swarm, grid).evolve(np.ones(200), [0.0, 50.0])

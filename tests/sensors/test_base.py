@@ -99,6 +99,8 @@ def test_jacobian_without_a_formula() -> None:
     )
     x = np.array([[np.pi, 0.0], [1.0, 2.0]])
     assert np.abs(sensor.jacobian(x) - 1.0).max() < 1e-9
+    with pytest.raises(ValueError, match="^difference: needs observed less predicted"):
+        Sensor(1, sensor.function, np.eye(1), difference=lambda y, p: wrap(p - y))
 
 
 def test_a_transposed_derivative_is_told_once_and_a_rough_one_is_not() -> None:
