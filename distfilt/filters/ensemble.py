@@ -192,7 +192,7 @@ class EnsembleFilter(MembersFilter):
         """Condition every time's ensembles of a group's agents, in place; the rows that failed."""
         rows = group.rows
         members = tuple([e[..., rows, :, :] for e in stack])
-        before = step.before(place, rows)
+        before = step.before(place, rows, step.state.ensembles)
         predicted = group.predict(members[place], before)
         group = step.gated(group, sample_moments, predicted)
         again = getattr(self.update, "repredicts", False)
@@ -325,7 +325,8 @@ class TransportFilter(MembersFilter):
         logs = np.zeros(stack[-1].shape[:-1])
         for place, group in step.heard():
             rows = group.rows
-            predicted = group.predict(stack[place][..., rows, :, :], step.before(place, rows))
+            before = step.before(place, rows, step.state.ensembles)
+            predicted = group.predict(stack[place][..., rows, :, :], before)
             group = step.gated(group, sample_moments, predicted)
             logs[..., rows, :] += log_likelihood(predicted, group.target, group.noise)
         return logs

@@ -117,20 +117,21 @@ class ParticleFilter(MembersFilter):
         state = step.state
         stack = step.stack(state.points)
         weights = self._resampled(stack, state, step)
+        old = stack[-1]  # where each particle comes from, which is not where it was in the state
         if step.dt:
             moved = unchecked(self.model.sample_step)(stack[-1], state.t, step.dt, rng=step.rng)
             stack[-1] = step.moved(moved, stack[-1])
         for place, group in step.heard():
             rows = group.rows
-            predicted = group.predict(stack[place][..., rows, :, :], step.before(place, rows))
+            before = step.before(place, rows, old)
+            predicted = group.predict(stack[place][..., rows, :, :], before)
             group = step.gated(group, weighted_moments, predicted, np.exp(weights[..., rows, :]))
             step.settle(_weigh(weights, predicted, group), group.agents)
         if step.agrees:
             # The particles have to be an ensemble, which the agreement can move.
             offset = step.rng.random((*weights.shape[:-1], 1))
             self._pick(stack, weights, np.exp(weights), np.ones(weights.shape[:-1], bool), offset)
-        (now,) = step.agreed(stack[-1])
-        after = step.end(points=now, log_weights=weights, past=stack[:-1])
+        after = step.end(points=step.agreed(stack[-1])[0], log_weights=weights, past=stack[:-1])
         self._warn(after)
         return after
 

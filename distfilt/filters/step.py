@@ -225,9 +225,9 @@ class Step:
         self.refused[..., group.agents] += refused
         return group
 
-    def before(self, place: int, rows: Any) -> Array | None:
+    def before(self, place: int, rows: Any, members: Array) -> Array | None:
         """The agents' members at the time before now, for sensors that see changes."""
-        return self.state.belief[..., rows, :, :] if place == len(self.times) else None
+        return members[..., rows, :, :] if place == len(self.times) else None
 
     @property
     def agrees(self) -> bool:

@@ -20,11 +20,12 @@ from distfilt.filters import (
 from distfilt.kalman import rts_smoother
 from distfilt.models import Model
 from distfilt.network import covariance_intersection, graphs
-from distfilt.sensors import Sensor, direct
+from distfilt.sensors import Sensor, direct, of_kind, stack
 from distfilt.updates import sampled_noise
 
 from .families import NOISE, PRIOR, TIMES, data, kalman, made, model, team
 
+STILL = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
 BOTH = Sensor(2, lambda x: x, NOISE, linear=lambda d: np.eye(d))
 
 
@@ -93,18 +94,26 @@ def test_unscented_points_see_a_curve() -> None:
 
 
 def test_jitter_moves_copies_by_a_share_of_what_is_believed() -> None:
-    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-    f = ParticleFilter(still, [direct([0], std=0.5)], members=4000, threshold=1.0, jitter=0.3)
+    f = ParticleFilter(STILL, [direct([0], std=0.5)], members=4000, threshold=1.0, jitter=0.3)
     before = f.step(f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0)), 1.0, [[1.0]])
     after = f.step(before, 2.0, [None]).points[0, :, 0]
     old = before.points[0, :, 0]
     stayed = np.isin(after, old)
-    assert 0.02 < stayed.mean() < 0.5 and EnsembleFilter(still, f.sensors, members=2).members == 2
-    plain = ParticleFilter(still, f.sensors, members=4000, threshold=1.0, jitter=0.0)
+    assert 0.02 < stayed.mean() < 0.5
+    plain = ParticleFilter(STILL, f.sensors, members=4000, threshold=1.0, jitter=0.0)
     picked = plain.step(before, 2.0, [None]).points[0, :, 0]
     moves = (after - picked)[~stayed]
     width = 0.3 * np.sqrt(f.summary(before).variance[0, 0])
     assert abs(moves.std() / width - 1) < 0.05 and not (after - picked)[stayed].any()
+
+
+def test_a_particle_that_was_picked_sees_changes_from_where_it_comes() -> None:
+    """Nothing moves, and a reading says so: that tells no particle from another."""
+    eye = stack([direct([0], std=0.5), of_kind("differential", [0], std=0.1)])
+    f = ParticleFilter(STILL, [eye], members=50, threshold=1.0, jitter=0.0)
+    state = f.step(f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [[0.5, np.nan]])
+    assert np.ptp(state.weights) > 0.01
+    assert np.ptp(f.step(state, 2.0, [[np.nan, 0.0]]).weights) < 1e-15
 
 
 def test_particles_tend_to_the_kalman_filter_with_a_full_noise() -> None:
@@ -120,19 +129,16 @@ def test_particles_tend_to_the_kalman_filter_with_a_full_noise() -> None:
 
 def test_collapse_warns_with_step_and_share() -> None:
     """A model without noise: copies never part, although their weights look perfect."""
-    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-    sensors, readings = [direct([0], std=0.01)], [np.zeros((6, 1))]
-    f = ParticleFilter(still, sensors, members=800, jitter=0.0)
+    f = ParticleFilter(STILL, [direct([0], std=0.01)], members=800, jitter=0.0)
     start = f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0))
     with pytest.warns(ParticleCollapse, match=r"t = \d s: 0\.\d+% of an agent's particles"):
-        run = f.run(start, np.arange(1.0, 7.0), readings)
+        run = f.run(start, np.arange(1.0, 7.0), [np.zeros((6, 1))])
     assert run["distinct"].values[-1] < 0.01
 
 
 def test_copies_are_regularised_by_default_where_the_model_never_parts_them() -> None:
     """Of a constant the posterior is known; the kernel widens it by less than a tenth or so."""
-    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-    f = ParticleFilter(still, [direct([0], std=0.5)], members=4000)
+    f = ParticleFilter(STILL, [direct([0], std=0.5)], members=4000)
     seen = [np.full((6, 1), 0.8)]
     run = f.run(f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0)), np.arange(1.0, 7.0), seen)
     variance = 1 / (1 / 4 + np.arange(1, 7) / 0.25)
@@ -144,8 +150,7 @@ def test_copies_are_regularised_by_default_where_the_model_never_parts_them() ->
 
 @pytest.mark.parametrize("jitter", [0.0, 0.3])
 def test_one_weight_for_all_warns_although_the_particles_are_distinct(jitter: float) -> None:
-    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-    f = ParticleFilter(still, [direct([0], std=1e-4)], members=800, jitter=jitter)
+    f = ParticleFilter(STILL, [direct([0], std=1e-4)], members=800, jitter=jitter)
     start = f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0))
     with pytest.warns(ParticleCollapse, match=r"t = 1 s: an agent's weights .* size of 1\.\d;"):
         summary = f.summary(f.step(start, 1.0, [[0.5]]))
@@ -153,8 +158,7 @@ def test_one_weight_for_all_warns_although_the_particles_are_distinct(jitter: fl
 
 
 def test_copies_of_one_particle_warn_at_any_number() -> None:
-    still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-    f = ParticleFilter(still, [None], members=50, jitter=0.0)
+    f = ParticleFilter(STILL, [None], members=50, jitter=0.0)
     start = f.start(([0.0], [[0.0]]), rng=np.random.default_rng(0))
     with pytest.warns(ParticleCollapse, match="2.00% of an agent's particles are distinct"):
         f.step(start, 1.0, [None])
