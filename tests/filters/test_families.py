@@ -16,11 +16,12 @@ from distfilt.filters import (
     GaussianState,
     ParticleCollapse,
     ParticleFilter,
+    Reading,
 )
 from distfilt.kalman import rts_smoother
 from distfilt.models import Model
 from distfilt.network import covariance_intersection, graphs
-from distfilt.sensors import Sensor, direct, of_kind, stack
+from distfilt.sensors import Sensor, direct, of_kind
 from distfilt.updates import sampled_noise
 
 from .families import NOISE, PRIOR, TIMES, data, kalman, made, model, team
@@ -107,13 +108,17 @@ def test_jitter_moves_copies_by_a_share_of_what_is_believed() -> None:
     assert abs(moves.std() / width - 1) < 0.05 and not (after - picked)[stayed].any()
 
 
-def test_a_particle_that_was_picked_sees_changes_from_where_it_comes() -> None:
+def test_a_member_that_was_picked_or_moved_sees_changes_from_where_it_comes() -> None:
     """Nothing moves, and a reading says so: that tells no particle from another."""
-    eye = stack([direct([0], std=0.5), of_kind("differential", [0], std=0.1)])
-    f = ParticleFilter(STILL, [eye], members=50, threshold=1.0, jitter=0.0)
-    state = f.step(f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [[0.5, np.nan]])
-    assert np.ptp(state.weights) > 0.01
-    assert np.ptp(f.step(state, 2.0, [[np.nan, 0.0]]).weights) < 1e-15
+    eyes = [[direct([0], std=0.5), of_kind("differential", [0], std=0.1)]]
+    f = ParticleFilter(STILL, eyes, members=50, threshold=1.0, jitter=0.0)
+    first, still = Reading(1.0, 0, [0.5]), [Reading(2.0, 0, [0.0], 1)]
+    state = f.step(f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [first])
+    assert np.ptp(state.weights) > 0.01 and np.ptp(f.step(state, 2.0, [still]).weights) < 1e-15
+    g = EnsembleFilter(STILL, eyes, members=50, lag=1)
+    state = g.step(g.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [None])
+    told, not_told = (g.step(state, 2.0, [y], late=[first]).ensembles for y in (still, None))
+    assert np.allclose(told, not_told)
 
 
 def test_particles_tend_to_the_kalman_filter_with_a_full_noise() -> None:

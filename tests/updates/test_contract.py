@@ -38,9 +38,3 @@ def test_noise_of_its_own_for_each_ensemble(name: str) -> None:
         assert np.allclose(both[k].mean(axis=0), alone.mean(axis=0), atol=0.12)
         assert np.allclose(np.cov(both[k].T), np.cov(alone.T), atol=0.12)
     assert np.abs(both[0].mean(axis=0) - both[1].mean(axis=0)).max() > 0.2
-
-
-@pytest.mark.parametrize("name", ["known_noise", "square_root"])
-def test_two_members_are_enough(name: str) -> None:
-    x = members(2)
-    assert np.isfinite(UPDATES[name](x, x @ H.T, Y, R, rng=rng())).all()
