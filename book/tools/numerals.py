@@ -44,17 +44,19 @@ from __future__ import annotations
 
 import argparse
 import ast
+import contextlib
 import csv
 import html
 import io
 import json
 import math
+import operator
 import re
 import sys
 import tokenize
 import tomllib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -382,6 +384,12 @@ def one(
 # --- what the run has ----------------------------------------------------------------------------
 
 
+ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul,
+    ast.Div: operator.truediv, ast.Pow: operator.pow,
+}  # fmt: skip
+
+
 def constant(node: ast.AST) -> float | None:
     """The number that an expression of constants is, or None."""
     if isinstance(node, ast.Constant) and type(node.value) in (int, float):
@@ -392,18 +400,8 @@ def constant(node: ast.AST) -> float | None:
     if isinstance(node, ast.BinOp):
         a, b = constant(node.left), constant(node.right)
         if a is not None and b is not None:
-            try:
-                return float(
-                    {
-                        ast.Add: a.__add__,
-                        ast.Sub: a.__sub__,
-                        ast.Mult: a.__mul__,
-                        ast.Div: a.__truediv__,
-                        ast.Pow: a.__pow__,
-                    }[type(node.op)](b)
-                )
-            except (KeyError, ArithmeticError, TypeError):
-                return None
+            with contextlib.suppress(KeyError, ArithmeticError, TypeError):
+                return float(ARITHMETIC[type(node.op)](a, b))
     return None
 
 
@@ -422,14 +420,10 @@ def compared(node: ast.AST) -> Iterator[float]:
     elif isinstance(node, ast.BinOp):
         yield from compared(node.left)
         yield from compared(node.right)
-    elif (
-        isinstance(node, ast.Call)
-        and getattr(node.func, "id", "") == "abs"
-        or isinstance(node, ast.Call)
-        and node.args
-        and (getattr(node.func, "attr", "") in ("abs", "array", "log", "sqrt", "log10", "deg2rad"))
-    ):
-        yield from compared(node.args[0])
+    elif isinstance(node, ast.Call) and node.args:
+        name = getattr(node.func, "attr", getattr(node.func, "id", ""))
+        if name in ("abs", "array", "log", "sqrt", "log10", "deg2rad"):
+            yield from compared(node.args[0])
 
 
 def checks(node: ast.Assert, section: int, where: str) -> Iterator[Fact]:
@@ -545,10 +539,8 @@ def printed(cell: Any, section: int, where: str) -> Iterator[Fact]:
         if SLIDER in page or any(mime.startswith("image/") for mime in data):
             continue
         verdict = [(str(v), "") for v in data.get(VERDICT, {}).values()]
-        text = (
-            "".join(output.get("text", "")) or "" if page else "".join(data.get("text/plain", ""))
-        )
-        lines = [(line, "") for line in ("".join(output.get("text", "")) + text).splitlines()]
+        plainly = "" if page else "".join(data.get("text/plain", ""))
+        lines = [(line, "") for line in ("".join(output.get("text", "")) + plainly).splitlines()]
         for row, head in (*rows_of(page), *verdict, *lines):
             words = stems(f"{row} {head}")
             for found in NUMBER.finditer(f"{row}\n{head}"):
