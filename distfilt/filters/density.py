@@ -85,7 +85,7 @@ class DensityState(State):
 class DensityFilter(Filter):
     r"""Local filters of a swarm's density, equations (14) to (16) of Zheng and Lin.
 
-    In each step every agent sees its own position, learns by `sharing` an estimate y_i of the
+    In each step every agent sees its own position, learns by the `agreement` an estimate y_i of the
     kernel estimate of all, and takes it into a Kalman filter of the density whose model is the
     Fokker-Planck equation. Where the network falls apart, agents go on with what they hear, and
     the record says into how many parts.

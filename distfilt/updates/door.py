@@ -48,7 +48,8 @@ def update(function: F) -> F:
     function : callable
         ``function(ensemble, predicted, observed, noise, *, rng, …)`` for float64 arrays that fit,
         with a noise covariance for each ensemble or one for all. The annotations of its options
-        are checked too, as :mod:`distfilt.doors` says.
+        are checked too, as :mod:`distfilt.doors` says. In a filter whose runs miss different
+        readings normal draws are each run's own where they are asked for all members at once.
 
     Returns
     -------
@@ -203,13 +204,25 @@ def _stream(rng: Rng, base: Any, m: int, lead: tuple[int, ...], where: Any = ...
 class Rows(Rng):
     """Normal draws for all ensembles of a batch (*lead), of which those in `where` are asked for.
 
-    `where` counts them flat.
+    `where` counts them flat. So two ensembles that miss different readings draw apart:
+
+    >>> def own(x, h, y, r, *, rng):
+    ...     return x + rng.normal(size=x.shape)
+    >>> gaps = np.array([[1.0, np.nan], [np.nan, 1.0]])
+    >>> a, b = with_missing(own, np.zeros((2, 3, 1)), np.zeros((2, 3, 2)), gaps, np.eye(2),
+    ...                     rng=np.random.default_rng(0))
+    >>> bool((a != b).all())
+    True
     """
 
     def __init__(self, bits: Any, lead: tuple[int, ...], where: Indices) -> None:
         super().__init__(bits)
         self.lead, self.where = lead, where
         self.some = where.size != math.prod(lead)
+
+    def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
+        """As numpy's, by standard normal draws."""
+        return loc + scale * self.standard_normal(size)
 
     def standard_normal(self, size: Any = None, *args: Any, **options: Any) -> Any:
         """As numpy's, but of a batch's rows those that are asked for."""

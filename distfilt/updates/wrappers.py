@@ -6,20 +6,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from .. import coupling
-from ..coupling import Constraint
+from ..coupling.constraints import Constraint, Motion
 from ..doors import Array, NonNegative, Positive, Rng, door, unchecked
 from .door import Indices, Update, around, with_missing
 
 __all__ = ["augmented", "inflated", "localised", "projected", "retracted", "serial"]
-
-Motion = tuple[Sequence[int], Sequence[int]]
-"""Indices of positions and of their velocities, in the same order."""
 
 
 def _followed(update: Update, change: Callable[[Array], Array]) -> Update:
