@@ -172,6 +172,7 @@ def says(question: Any, name: str, budget: float) -> bool:
     return budget > question
 
 
+@cache
 def regret(name: str, budget: float, cell: str) -> float:
     """Logarithm of a cell's error over the best honest one's that the budget allows."""
     found = results(name)
@@ -187,6 +188,7 @@ def allowed(name: str, budget: float = np.inf) -> list[Result]:
             if c not in ("reference", "half") and r.honest and r.floats <= budget]  # fmt: skip
 
 
+@cache
 def best(name: str, budget: float = np.inf) -> Result:
     """The honest cell of least error that a budget allows; the cheapest of those that are alike."""
     found = allowed(name, budget)
