@@ -1,9 +1,10 @@
 """A step of the filter of Table III of Grange et al.
 
 The network has five agents, 13 components and 200 members; known noise and covariance intersection,
-or exact draws and moments. A step is held against what it cannot do without: the normal numbers
-that it draws, the model's motion of the members, and the products for means, covariances and gains,
-by numpy. Misses above 3.7 times that floor for one run and 2.2 times for a batch of fifty.
+or exact draws and moments. A step is held against the same by numpy, with nothing checked and no
+message charged: the model's motion, the draws, the gains, and the fusion of moments by weights that
+are given. Exact draws are projected there too; the search for the weights of least determinant,
+which the second filter makes besides, is not in its floor. Misses above the limits.
 """
 
 from __future__ import annotations
@@ -17,33 +18,52 @@ from _bench import Row, interleaved, main, table
 
 from bookkit import studies
 
-LIMITS = {1: 3.7, 50: 2.2}
+LIMITS = {("known_fused", 1): 3.0, ("known_fused", 50): 2.0, ("exact", 1): 4.5, ("exact", 50): 2.5}
 
 
-def floor_of(setup: Any, states: np.ndarray, rng: np.random.Generator) -> Any:
-    """The draws, the motion and the products of one step, states (runs, A, N, d)."""
-    n, d = states.shape[-2:]
-    dt = float(setup.times[1] - setup.times[0])
-    root = np.linalg.cholesky(setup.model.noise(0.0, dt) + 1e-12 * np.eye(d))
-    senders, receivers = setup.graph.senders, setup.graph.receivers
-    heard = [
-        sum(setup.sensors[j].dim for j in (k, *senders[receivers == k]))
-        for k in range(len(setup.sensors))
-    ]
+def centred(x: np.ndarray) -> np.ndarray:
+    return x - x.mean(axis=-2, keepdims=True)
+
+
+def exact(z: np.ndarray, avoid: np.ndarray) -> np.ndarray:
+    """Normal draws (..., N, k) made uncorrelated with anomalies and of unit sample covariance."""
+    z = centred(z)
+    z = z - avoid @ np.linalg.solve(avoid.mT @ avoid, avoid.mT @ z)
+    own = np.linalg.cholesky(z.mT @ z / (z.shape[-2] - 1))
+    return z @ np.linalg.inv(own).mT
+
+
+def floor_of(setup: Any, states: np.ndarray, rng: np.random.Generator, kind: str) -> Any:
+    """One step for states (runs, A, N, d)."""
+    n, dt = states.shape[-2] - 1, float(setup.times[1] - setup.times[0])
+    values, vectors = np.linalg.eigh(setup.model.noise(0.0, dt))
+    kept = values > 1e-14 * values.max()
+    root = vectors[:, kept] * np.sqrt(values[kept])
+    hears = np.eye(len(setup.sensors)) + (setup.graph.laplacian.toarray() < 0)
+    read = [sum(s.dim for s, told in zip(setup.sensors, row, strict=True) if told) for row in hears]
+
+    def drawn(avoid: np.ndarray, k: int) -> np.ndarray:
+        z = rng.standard_normal((*avoid.shape[:-1], k))
+        return exact(z, avoid) if kind == "exact" else z
 
     def call() -> np.ndarray:
         x = setup.model.step(states, 0.0, dt)
-        x = x + rng.standard_normal(states.shape) @ root.T
-        for k, m in enumerate(heard):
-            h = x[:, k, :, :1] + rng.standard_normal((len(x), n, m))
-            b, a = h - h.mean(axis=1, keepdims=True), x[:, k] - x[:, k].mean(axis=1, keepdims=True)
-            inner = np.swapaxes(b, 1, 2) @ b / n + np.eye(m)
-            gain = np.linalg.solve(inner, np.swapaxes(b, 1, 2) @ a / n)
-            x[:, k] += h @ gain
-        a = x - x.mean(axis=2, keepdims=True)
-        cov = np.swapaxes(a, 2, 3) @ a / n + np.eye(d)
-        turn = np.linalg.cholesky(cov)
-        return a @ np.swapaxes(turn, 2, 3)
+        x = x + drawn(centred(x), root.shape[1]) @ root.T
+        for k, m in enumerate(read):
+            h = x[:, k, :, :1] + rng.standard_normal((len(x), n + 1, m))
+            a, b = centred(x[:, k]), centred(h)
+            gain = np.linalg.solve(b.mT @ b / n + np.eye(m), b.mT @ a / n)
+            x[:, k] -= (h + drawn(np.concatenate([a, b], axis=-1), m)) @ gain
+        a = centred(x)
+        covs = a.mT @ a / n
+        precise = np.linalg.inv(covs)
+        weights = hears / np.trace(covs, axis1=-2, axis2=-1)[:, None]
+        weights /= weights.sum(axis=-1, keepdims=True)
+        fused = np.linalg.inv(np.einsum("rkj,rjde->rkde", weights, precise))
+        told = (precise @ x.mean(axis=-2)[..., None])[..., 0]
+        mean = (fused @ (weights @ told)[..., None])[..., 0]
+        turn = np.linalg.cholesky(fused) @ np.linalg.inv(np.linalg.cholesky(covs))
+        return mean[..., None, :] + a @ turn.mT
 
     return call
 
@@ -53,23 +73,21 @@ def rows() -> Iterator[Row]:
     satellites = studies.script("_satellites")
     setup = satellites.setup("table-3")
     t = float(setup.times[0])
-    for kind in ("known_fused", "exact"):
-        for runs, limit in LIMITS.items():
-            f = satellites.repaired(setup, kind)
-            rng = np.random.default_rng(1)
-            _, seen = satellites.data(setup, rng, (runs,))
-            state = f.start(setup.prior, rng=rng, runs=(runs,))
-            calls = {
-                "ours": partial(f.step, state, t, [y[0] for y in seen]),
-                "floor": floor_of(setup, state.ensembles, rng),
-            }
-            times, ratios = interleaved(calls, 9, 0.05)
-            ratio = 1 / ratios["floor"]
-            yield {
-                "part": f"a step of Table III, {kind}", "runs": runs,
-                "ms": f"{1e3 * times['ours']:.2f}", "floor_ms": f"{1e3 * times['floor']:.2f}",
-                "ratio": f"{ratio:.2f}", "limit": limit, "missed": ratio > limit,
-            }
+    for (kind, runs), limit in LIMITS.items():
+        f, rng = satellites.repaired(setup, kind), np.random.default_rng(1)
+        _, seen = satellites.data(setup, rng, (runs,))
+        state = f.start(setup.prior, rng=rng, runs=(runs,))
+        calls = {
+            "ours": partial(f.step, state, t, [y[0] for y in seen]),
+            "floor": floor_of(setup, state.ensembles, rng, kind),
+        }
+        times, ratios = interleaved(calls, 9, 0.05)
+        ratio = 1 / ratios["floor"]
+        yield {
+            "part": f"a step of Table III, {kind}", "runs": runs,
+            "ms": f"{1e3 * times['ours']:.2f}", "floor_ms": f"{1e3 * times['floor']:.2f}",
+            "ratio": f"{ratio:.2f}", "limit": limit, "missed": ratio > limit,
+        }
 
 
 if __name__ == "__main__":

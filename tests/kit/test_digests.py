@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 matplotlib.use("Agg")
 
-from matplotlib import pyplot
 from matplotlib.figure import Figure
 
 from bookkit.digests import digest, of_axes
@@ -135,34 +134,6 @@ def test_text_of_each_kind():
     assert lines[6].startswith("image 1 value: 4 values, 1..3,") and "1 NaN" in lines[6]
     assert lines[7].startswith("image 1 extent: 4 values, -0.5..1.5,")
     assert len(lines) == 8
-
-
-def test_figures_axes_and_arrays_of_axes_read_alike():
-    figure = Figure()
-    panels = figure.subplots(2, 2)
-    for k, axes in enumerate(panels.ravel()):
-        axes.plot(T, T**k)
-    assert of_axes(panels) == of_axes(figure) == of_axes(list(panels.ravel()))
-    alone = of_axes(panels[0, 1]).splitlines()[1:]
-    whole = of_axes(figure).splitlines()
-    at = whole.index("axes 2: 1 line")
-    assert whole[at + 1 : at + 3] == alone and len(alone) == 2
-
-
-def test_three_dimensions():
-    def drawn(z=1.0, surface=1.0, points=1.0):
-        axes = pyplot.figure().add_subplot(projection="3d")
-        axes.plot(T, T, z * T)
-        axes.plot_wireframe(*np.meshgrid(T[:3], T[:4]), surface * np.ones((4, 3)))
-        axes.plot_surface(*np.meshgrid(T[:3], T[:4]), surface * np.ones((4, 3)))
-        axes.scatter(T, T, points * T)
-        text = of_axes(axes)
-        pyplot.close("all")
-        return text
-
-    plain = drawn()
-    assert plain == drawn() and "line 1 z" in plain
-    assert plain not in {drawn(z=1.01), drawn(surface=1.01), drawn(points=1.01)}
 
 
 def test_an_empty_figure_says_so():

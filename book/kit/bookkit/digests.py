@@ -151,8 +151,7 @@ def _panels(drawn: Any) -> Iterator[Any]:
 def _entries(axes: Any) -> Iterator[_Entry]:
     """What is visible in one axes; neighbours of one kind of patch, such as bars, are one entry."""
     for line in _visible(axes.lines):
-        deep = hasattr(line, "get_data_3d")
-        yield "line", 1, _named(*(line.get_data_3d() if deep else np.transpose(line.get_xydata())))
+        yield "line", 1, _named(*np.transpose(line.get_xydata()))
     for _, group in groupby(_visible(axes.patches), key=type):
         patches = list(group)
         outlines = [p.get_patch_transform().transform(p.get_path().vertices) for p in patches]
@@ -171,12 +170,7 @@ def _visible(artists: Iterable[Any]) -> list[Any]:
 def _collection(artist: Any, data: Any) -> dict[str, Array]:
     """Where its points are or, where all is drawn at one place, what its outlines are."""
     offsets = np.ma.filled(artist.get_offsets(), np.nan)
-    solid = getattr(artist, "_faces", getattr(artist, "_segments3d", None))
-    if hasattr(artist, "_offsets3d"):
-        found = _named(*artist._offsets3d)
-    elif solid is not None:
-        found = _named(*np.concatenate([np.reshape(_plain(part), (-1, 3)) for part in solid]).T)
-    elif len(offsets) > 1 or artist.get_offset_transform() == data:
+    if len(offsets) > 1 or artist.get_offset_transform() == data:
         found = _named(*offsets.T)
     else:
         outlines = [path.vertices for path in artist.get_paths()]
@@ -188,7 +182,7 @@ def _collection(artist: Any, data: Any) -> dict[str, Array]:
 
 
 def _named(*coordinates: Any) -> dict[str, Array]:
-    return {name: _plain(values) for name, values in zip("xyz", coordinates, strict=False)}
+    return {name: _plain(values) for name, values in zip("xy", coordinates, strict=True)}
 
 
 def _plain(values: Any) -> Array:

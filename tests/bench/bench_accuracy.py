@@ -1,0 +1,78 @@
+"""Errors on DAPPER's own Lorenz-63 problem, beside those of its own filters, tuned as it says.
+
+Truths and readings are DAPPER's (Sakov et al. 2012: three components seen every 25 steps of 0.01),
+and both get the same. Ours are parts as they are shipped, with the same members and inflation. The
+error is the root mean square over components, its mean over the times after the burn-in, and over
+independent runs. Misses where the ratio is above its limit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+from _bench import Row, main, peer, table
+
+from distfilt.filters import EnsembleFilter, ParticleFilter
+from distfilt.models import lorenz63
+from distfilt.sensors import direct
+from distfilt.updates import exact_draws, inflated, known_noise, square_root
+
+RUNS, END = 24, 216.0
+
+
+def pairs(da: Any) -> Iterator[tuple[str, Any, Any, float]]:
+    """Each filter of ours, DAPPER's with the options that it recommends, the limit of the ratio."""
+    given = lorenz63(step=0.01), [direct([0, 1, 2], std=np.sqrt(2.0))]
+    perturbed = partial(da.EnKF, "PertObs", N=10, infl=1.04)
+    rotated = partial(da.EnKF, "Sqrt", N=10, infl=1.02, rot=True)
+    for name, update, factor, other, limit in (
+        ("centred draws", partial(known_noise, centred=True), 1.04, perturbed, 1.05),
+        ("square root", square_root, 1.02, rotated, 1.0),
+        ("exact draws", exact_draws, 1.02, rotated, 1.0),
+    ):
+        own = EnsembleFilter(*given, members=10, update=inflated(update, factor=factor))
+        yield name, own, other, limit
+    particles = partial(da.PartFilt, N=800, reg=0.9, NER=0.2)
+    yield "particles", ParticleFilter(*given, members=800), particles, 1.03
+
+
+@table("accuracy", "numpy", "scipy", "dapper")
+def errors() -> Iterator[Row]:
+    parts = "", ".da_methods", ".mods.Lorenz63.sakov2012"
+    dapper, da, problem = (peer(f"dapper{part}") for part in parts)
+    if problem is None:
+        return
+    hmm = problem.HMM.copy()
+    hmm.tseq.T = END
+    times = hmm.tseq.tto
+    dapper.set_seed(3000)
+    drawn = [hmm.simulate() for _ in range(RUNS)]
+    truth = np.stack([x[hmm.tseq.kko] for x, _ in drawn], axis=1)
+    seen = np.stack([np.array([*y]) for _, y in drawn], axis=1)
+
+    def error(means: Any) -> Any:
+        gap = (np.asarray(means) - truth)[times > hmm.tseq.BurnIn]
+        return np.sqrt((gap**2).mean(axis=-1)).mean(axis=0)
+
+    for name, f, make, limit in pairs(da):
+        state = f.start((problem.x0, 2 * np.eye(3)), rng=np.random.default_rng(5), runs=(RUNS,))
+        own = error(f.run(state, times, [seen])["mean"][:, :, 0])
+        dapper.set_seed(9000)
+        means = []
+        for x, y in drawn:
+            (other := make()).assimilate(hmm, x, y, liveplots=False)
+            means.append(other.stats.mu.a)
+        its = error(np.stack(means, axis=1))
+        ratio, scatter = own.mean() / its.mean(), (own - its).std(ddof=1) / its.mean()
+        yield {
+            "ours": name, "error": f"{own.mean():.4f}", "its_error": f"{its.mean():.4f}",
+            "ratio": f"{ratio:.3f}", "se": f"{scatter / RUNS**0.5:.3f}", "limit": limit,
+            "missed": ratio > limit,
+        }  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
