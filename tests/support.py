@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from distfilt.models import Model, constant_velocity
@@ -39,16 +37,6 @@ def unit_gap(found: np.ndarray, wanted: np.ndarray) -> float:
     std = np.sqrt(np.diagonal(wanted, axis1=-2, axis2=-1))
     unit = np.where(std > 0, std, 1.0)
     return float((np.abs(found - wanted) / (unit[..., :, None] * unit[..., None, :])).max())
-
-
-def assert_unchanged(call: Callable[..., object], *arrays: np.ndarray) -> None:
-    """Call with arrays that may not be written, and compare them before and after."""
-    before = [a.copy() for a in arrays]
-    for a in arrays:
-        a.flags.writeable = False
-    call(*arrays)
-    for a, b in zip(arrays, before, strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def turning(*, sigma: float, turn_sigma: float) -> Model:
