@@ -37,7 +37,7 @@ COLUMNS = [*(f"{p}_members_{n}_{c}" for p, c, n in BY_MEMBERS),
            *(f"{p}_members_reference" for p in ("range", "lorenz"))]  # fmt: skip
 columns = together.columns_of(COLUMNS)
 parameters = {"batch": together.BATCH, "members": MEMBERS, "agents": AGENTS}
-seeds = np.random.SeedSequence(together.STUDY["seed"] + 1).spawn(5)
+seeds = np.random.SeedSequence(together.STUDY["seed"] + 1).spawn(len(together.seeds_of()))
 scenarios = (*(together.problem(p).scenario for p in ("linear", "range", "lorenz")),
              together.STUDY, together.TUNED)  # fmt: skip
 code = together.code
