@@ -14,6 +14,7 @@ HTML := _build/html
 BUILT := _build/book.stamp
 LAB := _build/lab
 JOBS := 2
+PAGES := regress-index $(shell sed -n 's|.*book/\([0-9][0-9]b\{0,1\}\)-.*|regress-\1|p' _toc.yml)
 SAMPLE := 300
 
 # One thread in each BLAS, so that two runs give the same digits; book/tools pins the same for kernels.
@@ -30,7 +31,7 @@ ifndef CHECKING
 .NOTPARALLEL:
 endif
 .PHONY: help environment remake book test unit types style pairs regress slow outputs identical \
-	accept studies check-studies bench mutants portable lab lock pdf epub clean
+	accept studies check-studies bench mutants portable lab lock pdf epub clean $(PAGES)
 
 help:
 	@echo "make book       environment, library and HTML (warnings are errors); prints the page's path"
@@ -75,9 +76,9 @@ book: $(BUILT)
 pdf epub: book
 	$(PY) book/tools/volume.py $@
 
-# Chapters on one half of the cores, all other checks on the other: neither waits for the other's end.
+# As many checks at a time as there are jobs, each page of the book one of them.
 test: book
-	@$(MAKE) --no-print-directory -k -j2 CHECKING=1 JOBS=$$((($(JOBS) + 1) / 2)) regress unit types style pairs
+	@$(MAKE) --no-print-directory -k -j$(JOBS) CHECKING=1 JOBS=1 unit types style pairs $(PAGES)
 
 # In the order of their folders: the files with few but long tests then come first.
 unit: $(STAMP)
@@ -97,6 +98,9 @@ pairs: $(STAMP)
 
 regress: $(STAMP)
 	$(PY) book/tools/regress.py --jobs $(JOBS)
+
+$(PAGES): regress-%: $(STAMP)
+	@$(PY) book/tools/regress.py $*
 
 slow: $(STAMP)
 	HYPOTHESIS_PROFILE=explore $(PY) -m pytest -q -m "slow or hypothesis"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import environment
-from common import ROOT
+from common import ROOT, chapters, chosen
 
 
 @pytest.fixture
@@ -129,3 +130,8 @@ def test_line_ends_are_fixed_whatever_a_clone_s_settings_are() -> None:
         ["git", "check-attr", "eol", *names], cwd=ROOT, check=True, capture_output=True, text=True
     ).stdout
     assert found.split("\n")[:-1] == [f"{name}: eol: lf" for name in names]
+
+
+def test_every_page_with_code_is_compared() -> None:
+    named = re.findall(r"regress\.py (\S+)", make(ROOT, "-n", "test").stdout)
+    assert sorted(chosen(named)) == sorted(chapters())
