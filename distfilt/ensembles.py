@@ -73,15 +73,15 @@ def _equal_weights(members: int) -> Array:
     return np.full(members, 1 / members)
 
 
-@door
-def anomalies(ensemble: Members) -> Array:
-    """Members minus their mean, (..., N, d).
+def about_mean(members: Array) -> tuple[Array, Array]:
+    """Mean (..., 1, d) and anomalies (..., N, d), members minus their mean.
 
-    >>> anomalies([[1.0], [3.0]])
-    array([[-1.],
-           [ 1.]])
+    >>> about_mean(np.array([[1.0], [3.0]]))
+    (array([[2.]]), array([[-1.],
+           [ 1.]]))
     """
-    return np.asarray(ensemble - unchecked(mean)(ensemble)[..., None, :])
+    centre = (_equal_weights(members.shape[-2]) @ members)[..., None, :]
+    return centre, members - centre
 
 
 @door
@@ -92,7 +92,7 @@ def sample_covariance(ensemble: Ensemble) -> Array:
     array([[2., 4.],
            [4., 8.]])
     """
-    a = unchecked(anomalies)(ensemble)
+    a = about_mean(ensemble)[1]
     return symmetrise(a.swapaxes(-1, -2) @ a / (a.shape[-2] - 1))
 
 
@@ -138,7 +138,7 @@ def exact_noise(
     >>> sample_covariance(noise).round(12)
     array([[2., 1.],
            [1., 3.]])
-    >>> bool((abs(anomalies(x).T @ noise) < 1e-11).all())
+    >>> bool((abs(about_mean(x)[1].T @ noise) < 1e-11).all())
     True
     """
     leading(anomalies_to_avoid.shape[:-2], cov.shape[:-2], "cov")
@@ -164,16 +164,16 @@ def _narrow(root: Array) -> Array:
 
 def _projected(drawn: Array, avoid: Array) -> Array:
     """What is left of a draw without its mean and the anomalies."""
-    (n, rank), centred = drawn.shape[-2:], unchecked(anomalies)(avoid)
-    size = np.sqrt((centred**2).sum(axis=-2, keepdims=True))
-    frame, independent = _frame(centred / np.where(size > 0, size, 1.0))
+    (n, rank), around = drawn.shape[-2:], about_mean(avoid)[1]
+    size = np.sqrt((around**2).sum(axis=-2, keepdims=True))
+    frame, independent = _frame(around / np.where(size > 0, size, 1.0))
     if n <= independent + rank:
         raise ValueError(
             f"anomalies_to_avoid: needs more than {independent} + {rank} members, for "
             f"{independent} independent anomalies and noise of rank {rank}, got {n}"
         )
     for _ in range(2):
-        drawn = unchecked(anomalies)(drawn - frame @ (frame.mT @ drawn))
+        drawn = about_mean(drawn - frame @ (frame.mT @ drawn))[1]
     return drawn
 
 

@@ -254,7 +254,7 @@ def central(
     # What was moved by, after rounding, is the difference of the two states.
     moved = np.diagonal(ahead - behind, axis1=-2, axis2=-1)
     slope = difference(function(ahead), function(behind)) / moved[..., None]
-    return np.asarray(np.swapaxes(slope, -1, -2))
+    return np.asarray(slope.mT)
 
 
 def as_derivative(

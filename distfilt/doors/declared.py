@@ -157,7 +157,7 @@ class Record:
     @classmethod
     def unchecked(cls, *args: Any, **options: Any) -> Self:
         """Build one from what the library made itself: nothing is checked or copied."""
-        out, (names, factories) = object.__new__(cls), _names(cast(Any, cls))
+        out, (names, factories) = object.__new__(cls), _names(cls)  # type: ignore[arg-type]
         vars(out).update(zip(names, args, strict=False), **options)
         for name, factory in factories:
             if name not in vars(out):

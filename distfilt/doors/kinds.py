@@ -74,7 +74,7 @@ class Kind:
 
 def _number(value: Any, name: str, scope: Scope) -> float:
     try:  # a TypeError for an array
-        out = float(value if type(value) in (float, int) else _real(value, name)[()])
+        out = float(value if type(value) in (float, int, np.float64) else _real(value, name)[()])
     except ValueError:
         raise TypeError from None
     if not math.isfinite(out):

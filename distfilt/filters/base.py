@@ -237,7 +237,8 @@ class Filter(Record, ABC):
         FilterError
             If an agent's computation fails; see `failures`.
         """
-        Bounds(at_least=state.t)(t, "t")
+        if t < state.t:
+            Bounds(at_least=state.t)(t, "t")
         self.fits(state)
         return self._advanced(state, t, observations, late, own=False)
 

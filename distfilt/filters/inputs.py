@@ -97,7 +97,7 @@ def said_by_all(f: Any, observations: Any, runs: tuple[int, ...], t: float) -> l
 def one_each(observations: Any, agents: int) -> Any:
     """Observations in a list, one entry for each agent."""
     observations = observations.to_numpy() if hasattr(observations, "to_numpy") else observations
-    if not isinstance(observations, Sequence | np.ndarray) or len(observations) != agents:
+    if not isinstance(observations, list | Sequence | np.ndarray) or len(observations) != agents:
         got = len(observations) if hasattr(observations, "__len__") else repr(observations)
         raise ValueError(f"observations: needs one for each of {agents} agents, got {got}")
     return observations

@@ -211,8 +211,8 @@ def weighted_moments(points: Array, w: Array) -> tuple[Array, Array]:
     """Mean (..., d) and covariance (..., d, d) of points (..., N, d) with weights (..., N)."""
     mean = (w[..., None, :] @ points)[..., 0, :]
     # Components first: weights then multiply along all particles.
-    around = np.subtract(np.swapaxes(points, -1, -2), mean[..., None], order="C")
-    return mean, (w[..., None, :] * around) @ np.swapaxes(around, -1, -2)
+    around = np.subtract(points.mT, mean[..., None], order="C")
+    return mean, (w[..., None, :] * around) @ around.mT
 
 
 def _weigh(weights: Array, predicted: Array, group: Heard) -> dict[tuple[int, ...], str]:

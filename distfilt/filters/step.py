@@ -121,7 +121,7 @@ class Step:
 
     def moved(self, values: Array, old: Any) -> Array:
         """A forecast (*runs, A, ...); `old` in failed runs."""
-        bad = _not_finite(values, len(self.state.runs) + 1, "forecast")
+        bad = _not_finite(values, self.failed.ndim + 1, "forecast")
         self.settle(bad, range(self.filter.count))
         # Groups of agents are updated in place, which a state must not notice.
         apart = not np.may_share_memory(values, self.state.belief)
@@ -312,13 +312,18 @@ def guarded(
     return out, errors
 
 
+class _Unseeded(np.random.bit_generator.ISeedSequence):  # whose state comes from another
+    def generate_state(self, n_words: int, dtype: Any = np.uint32) -> Any:
+        return np.zeros(n_words, dtype)
+
+
 def copied(rng: Any) -> Any:
-    """A generator at the same place, in a fifth of the time that a deep copy takes."""
+    """A generator at the same place, in a seventh of the time that a deep copy takes."""
     if type(rng) is not np.random.Generator:
         return copy.deepcopy(rng)
     old: Any = rng.bit_generator
-    bits = type(old)(copy.copy(old.seed_seq))
-    bits.state = old.state
+    bits = type(old)(_Unseeded())
+    bits.__setstate__((old.state, copy.copy(old.seed_seq)))
     return np.random.Generator(bits)
 
 

@@ -80,7 +80,7 @@ class Model(Record):
         return self._noise(t, dt)[1]
 
     def _noise(self, t: float, dt: float) -> tuple[Array, Array]:
-        q = array(self.noise_cov(t, dt), "noise_cov", (self.dim, self.dim))
+        q = array(self.noise_cov(t, dt), "noise_cov", (self.dim, self.dim), finite=False)
         return _with_factor(q.tobytes(), self.dim)
 
     @door
@@ -109,7 +109,7 @@ class Model(Record):
 @lru_cache(maxsize=64)
 def _with_factor(data: bytes, dim: int) -> tuple[Array, Array]:
     """A covariance and its factor; the same few come in every step of a run."""
-    cov = np.frombuffer(data).reshape(dim, dim)
+    cov = array(np.frombuffer(data).reshape(dim, dim), "noise_cov")
     semidefinite(cov, "noise_cov")
     root = unchecked(factor)(cov)
     root.setflags(write=False)

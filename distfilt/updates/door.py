@@ -132,7 +132,7 @@ def perturbed(predicted: Array, noise: Array, rng: Rng, *, centred: bool = False
     drawn, n = rng.standard_normal(predicted.shape), predicted.shape[-2]
     if centred:
         drawn = np.sqrt(n / (n - 1)) * (drawn - drawn.mean(axis=-2, keepdims=True))
-    return predicted + drawn @ np.swapaxes(cholesky(noise), -1, -2)
+    return predicted + drawn @ cholesky(noise).mT
 
 
 def with_missing(
@@ -170,7 +170,7 @@ def with_missing(
     # What is drawn for an ensemble depends on its place and on how many readings it has, not on
     # what others miss: each number of readings has a stream, which is drawn from for all places.
     # As words of 32 bits, which seeds are made of: 63 bits each, as `integers` would draw them.
-    base = (rng.bit_generator.random_raw(2) >> 1).astype("<u8").view("<u4")
+    base = [w for r in rng.bit_generator.random_raw(2).tolist() for w in (r // 2 % 2**32, r >> 33)]
     if all_finite(observed) and all_finite(predicted):
         return inner(ensemble, predicted, observed, noise, rng=_stream(rng, base, m, lead))
     present = ~np.isnan(observed) & ~np.isnan(predicted).any(axis=-2)
@@ -193,9 +193,9 @@ def with_missing(
     return np.asarray(out.reshape(ensemble.shape))
 
 
-def _stream(rng: Rng, base: Any, m: int, lead: tuple[int, ...], where: Any = ...) -> Rng:
+def _stream(rng: Rng, base: list[int], m: int, lead: tuple[int, ...], where: Any = ...) -> Rng:
     """A stream of draws for a batch, or its rows `where`; of rows of rows their places stay."""
-    bits = np.random.PCG64(np.random.SeedSequence(np.array([*base.tolist(), m], dtype="<u4")))
+    bits = np.random.PCG64(np.random.SeedSequence(np.array([*base, m], dtype=np.uint32)))
     if isinstance(rng, Rows):
         return Rows(bits, rng.lead, rng.where[where])
     return Rng(bits) if where is ... else Rows(bits, lead, where)

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.linalg.lapack import dposv
 
 from ..doors import Array, NonNegative, Rng, door, unchecked
-from ..ensembles import Ensemble, anomalies, exact_noise, mean
+from ..ensembles import Ensemble, about_mean, exact_noise
 from ..models import Model
 from .door import perturbed, update
 
@@ -30,15 +30,10 @@ __all__ = [
 Members = Annotated[Ensemble, "... n model.dim"]
 
 
-def _centred(members: Array) -> tuple[Array, Array]:
-    """Mean (..., 1, d) and anomalies of members (..., N, d)."""
-    centre = unchecked(mean)(members)[..., None, :]
-    return centre, members - centre
-
-
-def _gain(inner: Array, a: Array, b: Array) -> Array:
-    """The gain transposed, (..., m, d): one solve for all members."""
-    cross = np.swapaxes(b, -1, -2) @ a / (a.shape[-2] - 1)
+def _gain(a: Array, b: Array, noise: Array | float = 0.0) -> Array:
+    """The gain transposed, (..., m, d), of anomalies: one solve for all members."""
+    n = a.shape[-2] - 1
+    cross, inner = b.mT @ a / n, b.mT @ b / n + noise
     m, d = cross.shape[-2:]
     if inner.size == m * m and cross.size == m * d > 0:
         # A third of numpy's time for one ensemble.
@@ -46,10 +41,6 @@ def _gain(inner: Array, a: Array, b: Array) -> Array:
         if not failed:
             return np.asarray(gain.reshape(cross.shape))
     return np.asarray(np.linalg.solve(inner, cross))
-
-
-def _inner(b: Array) -> Array:
-    return np.asarray(np.swapaxes(b, -1, -2) @ b / (b.shape[-2] - 1))
 
 
 @update
@@ -94,8 +85,8 @@ def sampled_noise(
         raise ValueError(f"ensemble: needs at least {m + 1} members for {m} readings, "
                          f"got {members}")
     drawn = perturbed(predicted, noise, rng)
-    b = _centred(drawn)[1]
-    gain = _gain(_inner(b), _centred(ensemble)[1], b)
+    b = about_mean(drawn)[1]
+    gain = _gain(about_mean(ensemble)[1], b)
     return np.asarray(ensemble + (observed[..., None, :] - drawn) @ gain)
 
 
@@ -126,8 +117,8 @@ def known_noise(
     (np.float64(0.5), np.float64(0.5))
     """
     drawn = perturbed(predicted, noise, rng, centred=centred)
-    b = _centred(predicted)[1]
-    gain = _gain(_inner(b) + noise, _centred(ensemble)[1], b)
+    b = about_mean(predicted)[1]
+    gain = _gain(about_mean(ensemble)[1], b, noise)
     return np.asarray(ensemble + (observed[..., None, :] - drawn) @ gain)
 
 
@@ -157,9 +148,9 @@ def exact_draws(
     >>> float(after.mean().round(12)), float(after.var(ddof=1).round(12))
     (0.5, 0.25)
     """
-    a, b = _centred(ensemble)[1], _centred(predicted)[1]
+    a, b = about_mean(ensemble)[1], about_mean(predicted)[1]
     draws = exact(np.concatenate([a, b], axis=-1), noise, rng)
-    gain = _gain(_inner(b) + noise, a, b)
+    gain = _gain(a, b, noise)
     return np.asarray(ensemble + (observed[..., None, :] - predicted - draws) @ gain)
 
 
@@ -197,13 +188,13 @@ def square_root(
     (1.0, 1.0)
     """
     n = ensemble.shape[-2]
-    (centre, a), (seen, b) = _centred(ensemble), _centred(predicted)
-    gain = _gain(_inner(b) + noise, a, b)
+    (centre, a), (seen, b) = about_mean(ensemble), about_mean(predicted)
+    gain = _gain(a, b, noise)
     root = np.linalg.cholesky(noise)
-    white = np.swapaxes(np.linalg.solve(root, np.swapaxes(b, -1, -2)), -1, -2) / np.sqrt(n - 1)
+    white = np.linalg.solve(root, b.mT).mT / np.sqrt(n - 1)
     left, sizes, _ = np.linalg.svd(white, full_matrices=False)
     shrink = 1 / np.sqrt(1 + sizes**2) - 1
-    spread = a + (left * shrink[..., None, :]) @ (np.swapaxes(left, -1, -2) @ a)
+    spread = a + (left * shrink[..., None, :]) @ (left.mT @ a)
     if rotation == "random" and n > 2:
         spread = _turned(spread, rng)
     return np.asarray(centre + (observed[..., None, :] - seen) @ gain + spread)
@@ -288,7 +279,7 @@ def exact_forecast(
         return moved
     bad = ~np.isfinite(moved).all(axis=(-2, -1), keepdims=True)
     clean = np.where(bad, ensemble, moved)
-    noisy = clean + exact(unchecked(anomalies)(clean), q, rng)
+    noisy = clean + exact(about_mean(clean)[1], q, rng)
     # Members that the model lost stay lost, and do not take the others' noise with them.
     return np.where(bad, np.nan, noisy)
 

@@ -58,7 +58,7 @@ def warn_of_weights(log_weights: Array, predicted: Array, observed: Array, noise
     m = observed.shape[-1]
     gap = observed - predicted.mean(axis=-2)
     around = predicted - predicted.mean(axis=-2, keepdims=True)
-    cov = np.swapaxes(around, -1, -2) @ around / predicted.shape[-2] + noise
+    cov = around.mT @ around / predicted.shape[-2] + noise
     miss = (gap * np.linalg.solve(cov, gap[..., None])[..., 0]).sum(axis=-1).max(initial=0.0)
     least = size_of(np.exp(log_weights - log_sum(log_weights))).min(initial=np.inf)
     if least < 1.1:
@@ -162,7 +162,7 @@ def jitter(
     """
     if cov is None:
         around = points - points.mean(axis=-2, keepdims=True)
-        cov = np.swapaxes(around, -1, -2) @ around / points.shape[-2]
+        cov = around.mT @ around / points.shape[-2]
     return jittered(points, cov, bandwidth, rng.standard_normal(points.shape))
 
 
@@ -186,7 +186,7 @@ def jittered(x: Array, cov: Array, h: float, drawn: Array, copied: Mask | None =
     Where it is known which were copied, these alone move: C. Musso, N. Oudjane, F. Le Gland, in the
     same book, 247-271.
     """
-    moved = drawn @ np.swapaxes(unchecked(factor)(cov), -1, -2)
+    moved = drawn @ unchecked(factor)(cov).mT
     if copied is not None:
         return np.asarray(np.where(copied[..., None], x + h * moved, x))
     centre = x.mean(axis=-2, keepdims=True)
@@ -206,7 +206,7 @@ def weighed(log_weights: Array, predicted: Array, observed: Array, noise: Array)
 def log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
     """Log-likelihood of each particle's prediction (..., N, m) but for a constant, (..., N)."""
     # Components first: sums over a few of them then run along all particles.
-    seen = np.ascontiguousarray(np.swapaxes(predicted, -1, -2))
+    seen = np.ascontiguousarray(predicted.mT)
     gap, cov = observed[..., None] - seen, noise
     missing = np.isnan(observed)
     if np.isnan(seen).any():

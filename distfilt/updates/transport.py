@@ -128,7 +128,7 @@ def principal_components(
     latent, reduced = ensemble @ w, seen @ v
     aim = (observed[..., None, :] @ v)[..., 0, :]
     moved = compose(fit(reduced, latent), reduced, latent, aim)
-    back = np.swapaxes(w, -1, -2)
+    back = w.mT
     if complement == "literal":
         return np.asarray(moved @ back)
     return np.asarray(ensemble + (moved - latent) @ back)
