@@ -154,9 +154,8 @@ def test_empty_systems(leading: tuple[int, ...], d: int, k: int) -> None:
 def test_solves_agree_with_numpy(seed: int, d: int, leading: tuple[int, ...]) -> None:
     rng = generator(seed)
     cov = spd(rng, d, leading)
-    v, b = rng.standard_normal((*leading, d)), rng.standard_normal((*leading, d, 2))
+    v = rng.standard_normal((*leading, d))
     worst = 1e-13 * np.linalg.cond(cov).max()
-    assert np.allclose(cov @ _solved(cov, b), b, rtol=worst, atol=worst)
     plain = np.linalg.solve(cov, v[..., None])[..., 0]
     assert np.allclose(_length(cov, v), (v * plain).sum(-1), rtol=worst)
     logs = np.linalg.slogdet(cov)[1]

@@ -172,8 +172,7 @@ class Grid(Record):
 
         They are ordered by the frequency in the box, and ties by the number itself.
         """
-        if rank > self.size:
-            raise ValueError(f"rank: needs at most the number of cells {self.size}, got {rank}")
+        Bounds(at_most=self.size)(rank, "rank")
         k = np.stack([a.ravel() for a in np.indices(self.shape)], axis=-1)
         squared = ((k / (self.width / self.width.max())) ** 2).sum(axis=-1)
         # Nine digits of each, whatever its size: rounding splits ties, and symmetric modes are to
@@ -244,9 +243,7 @@ def zero_mean_prior(
     >>> S.shape, bool(abs(S.sum(axis=0)).max() < 1e-10)
     ((900, 50), True)
     """
-    if rank >= grid.size:
-        raise ValueError(f"rank: needs at most {grid.size - 1} modes besides the constant, "
-                         f"got {rank}")
+    Bounds(below=grid.size)(rank, "rank")
     ell = 0.1 * grid.side if length is None else min(length, 1e6 * grid.side)
     squared = ((grid.wavenumbers(grid.size)[1:] / grid.width) ** 2).sum(axis=-1)
     # About the lowest mode: a length beyond the box leaves that alone, and no zero in its place.

@@ -105,8 +105,8 @@ class Filter(Record, ABC):
         self.check_parts()
         if self.faults is not None and self.faults.late:
             raise ValueError(f"faults: needs Faults without a delay, got {self.faults!r}")
-        if len(self.names) not in (0, self.count):
-            raise ValueError(f"names: needs {self.count} names, got {len(self.names)}")
+        if self.names and not len(self.names) == len({*self.names}) == self.count:
+            raise ValueError(f"names: needs {self.count} different names, got {[*self.names]}")
         kind = None if self.agreement is None else fused_kind(self.agreement)
         if kind is not None and kind != self.fuses:
             raise ValueError(f"agreement: needs a rule that fuses {self.fuses}, got one of {kind}")

@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from ..doors import Array, Count, NonNegative, Positive, unchecked
+from ..doors import Array, Bounds, Count, NonNegative, unchecked
 from ..gaussians.single import conditioned, unscented_points
 from ..linalg import cholesky, symmetrise
 from .base import Filter
@@ -101,7 +101,7 @@ class GaussianFilter(Filter):
         The unscented points lie :math:`\\sqrt{d+\\kappa}` standard deviations from the mean, at
         least 0, so that no weight is negative.
     inflation : float
-        What the forecast's standard deviations are multiplied by.
+        What the forecast's standard deviations are multiplied by; at least 0.5, for 5% is 1.05.
 
     Examples
     --------
@@ -118,7 +118,7 @@ class GaussianFilter(Filter):
     _: KW_ONLY
     rule: Literal["extended", "unscented"] = "extended"
     kappa: NonNegative = 1.0
-    inflation: Positive = 1.0
+    inflation: Annotated[float, Bounds(at_least=0.5)] = 1.0
 
     state: ClassVar[type[GaussianState]] = GaussianState
     fuses: ClassVar[str] = "gaussians"

@@ -98,8 +98,9 @@ def one_each(observations: Any, agents: int) -> Any:
     """Observations in a list, one entry for each agent."""
     observations = observations.to_numpy() if hasattr(observations, "to_numpy") else observations
     if not isinstance(observations, list | Sequence | np.ndarray) or len(observations) != agents:
-        got = len(observations) if hasattr(observations, "__len__") else repr(observations)
-        raise ValueError(f"observations: needs one for each of {agents} agents, got {got}")
+        listed = isinstance(observations, Sequence | np.ndarray)
+        got = len(observations) if listed else type(observations).__name__
+        raise ValueError(f"observations: needs a list, one for each of {agents} agents, got {got}")
     return observations
 
 
@@ -254,7 +255,7 @@ def members_of(
     if hasattr(prior, "rvs"):
         word = "rng" if isinstance(prior, GaussianMixture) else "random_state"
         found = prior.rvs(math.prod(shape[:-1]), **{word: rng})
-        return np.asarray(found, dtype=np.float64).reshape(shape)
+        return array(found.reshape(*shape[:-1], -1), "prior", shape)
     found = prior(members, rng=rng, leading=leading) if callable(prior) else prior
     out = array(found, "prior", (..., members, dim))
     if out.shape != shape and out.shape != shape[-2:]:

@@ -119,6 +119,8 @@ def _known(
     """The truth, (T, *runs, 1 or A, d), and which components of it are known."""
     if truth is None:
         return None, slice(None)
+    if hasattr(truth, "columns") and {*truth.columns} <= {*names}:
+        truth = dict(truth)  # a table says itself which component is which
     if not isinstance(truth, Mapping):
         x = array(truth, "truth", None, finite=False)
         if x.shape == (*shape, len(names)):

@@ -186,7 +186,8 @@ class Step:
             return []
         if self.channel is None:
             if f.lag:
-                self.waiting = (*self.state.waiting, *(said for mine in own for said in mine))
+                kept = [said.changed(value=said.value.copy()) for mine in own for said in mine]
+                self.waiting = (*self.state.waiting, *kept)
             return []
         out: list[list[Reading]] = [[] for _ in own]
         for said in self.state.waiting:

@@ -138,6 +138,8 @@ def propagate(
     True
     """
     _outside(x[..., :3], "x")
+    # The Earth holds nothing that is farther away, and orbits in metres are.
+    Bounds(at_most=1.5e6)(np.abs(x[..., :3]), "x, in km")
     steps = equal_steps(abs(dt), longest)
     with np.errstate(all="ignore"):
         for _ in range(steps):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Any
@@ -75,7 +75,7 @@ class Faults(Record):
     burst: Annotated[float, Bounds(at_least=1)] | None = None
     delay: Index = 0
     silent: Collection[Index] = ()
-    during: Sequence[tuple[Any, Any]] | None = None
+    during: Any = None
     also: tuple[Faults, ...] = ()
 
     def __post_init__(self) -> None:
@@ -110,9 +110,7 @@ class Faults(Record):
             got = np.shape(faults.loss)
             if got != (agents,) * len(got):
                 raise ValueError(f"loss: needs a number for each of {agents} agents, got {got}")
-            most = max(faults.silent, default=-1)
-            if most >= agents:
-                raise ValueError(f"silent: needs agents below {agents}, got {most}")
+            Bounds(below=agents)(max(faults.silent, default=-1), "silent")
 
     @cached_property
     def none(self) -> bool:

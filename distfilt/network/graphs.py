@@ -96,7 +96,7 @@ class Graph(Record):
             are left behind.
         names : sequence of str
             Of the agents. Nodes that are these, or 0 to A - 1, are agents by their labels; others
-            by the order in which the graph has them.
+            by the order in which the graph has them. If only some of them are these, it is refused.
 
         Examples
         --------
@@ -108,6 +108,8 @@ class Graph(Record):
             raise ValueError(f"graph: needs a networkx graph, got {type(graph).__name__}")
         labels = range(len(graph.nodes)), names, graph.nodes
         order = next(some for some in labels if {*some} == {*graph.nodes})
+        if order is labels[2] and {*names} & {*order}:
+            raise ValueError(f"graph: needs the nodes {[*names]}, got {[*order]}")
         number_of = {node: k for k, node in enumerate(order)}
         edges = [(number_of[edge[1]], number_of[edge[0]]) for edge in graph.edges]
         return cls.from_edges(len(number_of), edges, directed=bool(graph.is_directed()))
@@ -150,8 +152,8 @@ class Graph(Record):
     @door
     def neighbours(self, agent: Index) -> tuple[int, ...]:
         """The agents that `agent` hears, ascending, without itself."""
-        i = self._below(agent)
-        row = self.links.indices[self.links.indptr[i] : self.links.indptr[i + 1]]
+        Bounds(below=self.size)(agent, "agent")
+        row = self.links.indices[self.links.indptr[agent] : self.links.indptr[agent + 1]]
         return tuple(row.tolist())
 
     @cached_property
@@ -246,8 +248,9 @@ class Graph(Record):
         >>> graphs.path(4).hops(1)
         array([1, 0, 1, 2])
         """
-        forward, start = scipy.sparse.csr_array(self.links.T), self._below(agent)
-        away = scipy.sparse.csgraph.dijkstra(forward, indices=start, unweighted=True)
+        Bounds(below=self.size)(agent, "agent")
+        forward = scipy.sparse.csr_array(self.links.T)
+        away = scipy.sparse.csgraph.dijkstra(forward, indices=agent, unweighted=True)
         return np.where(np.isinf(away), -1, away).astype(np.int64)
 
     @cached_property
@@ -255,11 +258,6 @@ class Graph(Record):
         """The largest number of hops between two agents of a connected graph."""
         self._joined()
         return max(int(self.hops(agent).max()) for agent in range(self.size))
-
-    def _below(self, agent: int) -> int:
-        if agent < self.size:
-            return agent
-        raise ValueError(f"agent: needs an agent below {self.size}, got {agent}")
 
     def _joined(self) -> None:
         """Refuse a graph in parts."""

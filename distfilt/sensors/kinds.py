@@ -88,9 +88,14 @@ def _change_slope(x: Array, previous: Array, indices: Sequence[int]) -> Array:
     return _rows(x.shape[-1], indices)
 
 
-def _gap(x: Array, indices: Sequence[int], origin: Array | None) -> Array:
+def _place(indices: Sequence[int], origin: Array | None) -> dict[str, Any]:
+    """Of which components a place is made, and where it is seen from: a copy, for it may move."""
+    return {"indices": indices, "origin": np.array(0.0 if origin is None else origin)}
+
+
+def _gap(x: Array, indices: Sequence[int], origin: Array) -> Array:
     """From the origin to the place that some components are."""
-    return _pick(x, indices) - (0.0 if origin is None else origin)
+    return _pick(x, indices) - origin
 
 
 @door
@@ -119,18 +124,18 @@ def distance(
     """
     if origin is not None and len(origin) != len(indices):
         raise ValueError(f"origin: needs shape ({len(indices)},), got {origin.shape}")
-    place: dict[str, Any] = {"indices": indices, "origin": origin}
+    place = _place(indices, origin)
     return Sensor.unchecked(
         1, partial(_distance, **place), diagonal(std), kind="distance",
         derivative=partial(_distance_slope, **place)
     )
 
 
-def _distance(x: Array, indices: Sequence[int], origin: Array | None) -> Array:
+def _distance(x: Array, indices: Sequence[int], origin: Array) -> Array:
     return np.asarray(np.linalg.norm(_gap(x, indices, origin), axis=-1, keepdims=True))
 
 
-def _distance_slope(x: Array, indices: Sequence[int], origin: Array | None) -> Array:
+def _distance_slope(x: Array, indices: Sequence[int], origin: Array) -> Array:
     gap = _gap(x, indices, origin)
     length = np.linalg.norm(gap, axis=-1, keepdims=True)
     slope = gap / np.where(length > 0, length, 1.0)
@@ -170,7 +175,7 @@ def angle(
     array([-0.1416])
     """
     period = (2 if full else 1) * np.pi
-    place: dict[str, Any] = {"indices": indices, "origin": origin}
+    place = _place(indices, origin)
     return Sensor.unchecked(
         1, partial(_angle, period=period, **place), diagonal(std), kind="angle",
         derivative=partial(_angle_slope, **place), difference=partial(_turned_at, period=period)
@@ -178,14 +183,14 @@ def angle(
 
 
 def _angle(
-    x: Array, period: float, indices: Sequence[int], origin: Array | None, heading: float = 0.0
+    x: Array, period: float, indices: Sequence[int], origin: Array, heading: float = 0.0
 ) -> Array:
     a, b = np.moveaxis(_gap(x, indices, origin), -1, 0)
     direction = np.where((a == 0) & (b == 0), np.nan, np.arctan2(b, a)) - heading
     return unchecked(wrap)(direction, period=period)[..., None]
 
 
-def _angle_slope(x: Array, indices: Sequence[int], origin: Array | None) -> Array:
+def _angle_slope(x: Array, indices: Sequence[int], origin: Array) -> Array:
     gap = _gap(x, indices, origin)
     length = np.linalg.norm(gap, axis=-1, keepdims=True)
     length = np.where(length > 0, length, np.nan)
@@ -225,7 +230,7 @@ def distance_and_angle(
     >>> radar.predict([1.0, 2.0]).round(4)
     array([2.    , 1.5708])
     """
-    place: dict[str, Any] = {"indices": indices, "origin": origin}
+    place = _place(indices, origin)
     return Sensor.unchecked(
         2, partial(_sighting, heading=heading, **place), diagonal(*std),
         difference=partial(_turned_at, k=1), kind="distance and angle",

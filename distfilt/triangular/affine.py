@@ -28,7 +28,6 @@ __all__ = ["AffineMap", "compose", "fit", "fit_convex", "objective"]
 
 Seen = Annotated[Array, "... N M"]
 Members = Annotated[Array, "... N d"]
-Observed = Annotated[Array, "... M"]
 OwnSeen = Annotated[Array, "... self.observed"]
 OwnMembers = Annotated[Array, "... N self.dim"]
 
@@ -63,7 +62,10 @@ class ConditionalMap(Protocol):
 
 
 @door
-def compose(map_: ConditionalMap, y: Seen, x: Members, observed: Observed) -> Array:
+def compose(
+    map_: ConditionalMap, y: Annotated[Array, "... N map_.observed"],
+    x: Annotated[Array, "... N map_.dim"], observed: Annotated[Array, "... map_.observed"],
+) -> Array:
     r"""The composed map (10) of Grange et al.: from joint samples to samples given the observation.
 
     .. math:: \mathbf T(\mathbf y,\mathbf x)

@@ -8,7 +8,8 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..doors import Array, Bounds, Mask, Rng, Semidefinite, Weights, array, door, unchecked
+from ..coupling.transform import normalised
+from ..doors import Array, Bounds, Mask, Rng, Semidefinite, Weights, door, unchecked
 from ..linalg import cholesky, factor, log_sum, solve_lower
 
 __all__ = ["ParticleCollapse", "effective_size", "jitter", "resampled"]
@@ -36,10 +37,7 @@ def effective_size(log_weights: ArrayLike) -> Array:
     >>> float(effective_size(np.log([0.5, 0.25, 0.25])).round(4))
     2.6667
     """
-    w = array(log_weights, "log_weights", (..., "n"), finite=False)
-    if not (w < np.inf).all() or np.isneginf(w.max(axis=-1)).any():
-        raise ValueError("log_weights: needs numbers below infinity, and a positive weight a set")
-    return size_of(np.exp(w - log_sum(w)))
+    return size_of(normalised(log_weights))
 
 
 def size_of(w: Array) -> Array:

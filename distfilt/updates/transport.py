@@ -79,8 +79,7 @@ def principal_directions(ensemble: Ensemble, n: Count) -> Array:
     cov = unchecked(sample_covariance)(ensemble)
     if not np.isfinite(cov).all():
         raise ValueError("ensemble: needs members of finite variance, got infinity")
-    if n > cov.shape[-1]:
-        raise ValueError(f"n: needs at most {cov.shape[-1]} directions, got {n}")
+    Bounds(at_most=cov.shape[-1])(n, "n")
     _, vectors = np.linalg.eigh(cov)
     chosen = vectors[..., ::-1][..., :n]
     largest = np.take_along_axis(chosen, np.abs(chosen).argmax(axis=-2)[..., None, :], axis=-2)
@@ -121,8 +120,7 @@ def principal_components(
     """
     seen = _noisy(predicted, noise, noise_factor, rng)
     m, d = seen.shape[-1], ensemble.shape[-1]
-    if n_state > d:
-        raise ValueError(f"n_state: needs at most {d} directions, got {n_state}")
+    Bounds(at_most=d)(n_state, "n_state")
     v = unchecked(principal_directions)(seen, min(n_observed, m))
     w = unchecked(principal_directions)(ensemble, n_state)
     latent, reduced = ensemble @ w, seen @ v

@@ -13,7 +13,7 @@ import numpy as np
 
 from .. import coupling
 from ..coupling.constraints import Constraint, Motion
-from ..doors import Array, NonNegative, Positive, Rng, door, unchecked
+from ..doors import Array, Bounds, NonNegative, Positive, Rng, door, unchecked
 from .door import Indices, Update, around, with_missing
 
 __all__ = ["augmented", "inflated", "localised", "projected", "retracted", "serial"]
@@ -33,13 +33,13 @@ def _followed(update: Update, change: Callable[[Array], Array]) -> Update:
 
 
 @door
-def inflated(update: Update, *, factor: Positive) -> Update:
+def inflated(update: Update, *, factor: Annotated[float, Bounds(at_least=0.5)]) -> Update:
     """Multiply the analysis anomalies by a factor: the remedy for a spread that is too small.
 
     Parameters
     ----------
     update, factor
-        Any update; by what its standard deviations grow each time, positive.
+        Any update; by what its standard deviations are multiplied each time, at least 0.5.
 
     Notes
     -----

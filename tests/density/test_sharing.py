@@ -41,9 +41,10 @@ def test_the_change_of_the_inputs_is_added() -> None:
     wanted = w @ before.kernels + now.kernels - before.kernels
     assert np.abs(y - wanted).max() < 1e-12
     assert np.abs(y.mean(axis=0) - kernel_density(X[1], GRID, bandwidth=H)).max() < 1e-12
-    pi = PIConsensus(alpha=0.0, a=1e-12, b=0.0, rate=True)
-    _, y, _ = pi.learn(pi.begin(before), now, Channel(graph), 0.1)
-    assert np.abs(y - now.kernels).max() < 1e-9
+    for rate, wanted in ((True, now), (False, before)):
+        pi = PIConsensus(alpha=0.5, a=1e-12, b=0.0, rate=rate)
+        _, y, _ = pi.learn(pi.begin(before), now, Channel(graph), 0.1)
+        assert np.abs(y - wanted.kernels).max() < 1e-9
 
 
 def test_agents_that_have_gone_do_not_count_in_the_noise() -> None:

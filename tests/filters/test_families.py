@@ -111,13 +111,16 @@ def test_jitter_moves_copies_by_a_share_of_what_is_believed() -> None:
 def test_a_member_that_was_picked_or_moved_sees_changes_from_where_it_comes() -> None:
     """Nothing moves, and a reading says so: that tells no particle from another."""
     eyes = [[direct([0], std=0.5), of_kind("differential", [0], std=0.1)]]
-    f = ParticleFilter(STILL, eyes, members=50, threshold=1.0, jitter=0.0)
-    first, still = Reading(1.0, 0, [0.5]), [Reading(2.0, 0, [0.0], 1)]
-    state = f.step(f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [first])
-    assert np.ptp(state.weights) > 0.01 and np.ptp(f.step(state, 2.0, [still]).weights) < 1e-15
+    f = ParticleFilter(STILL, eyes * 2, members=50, threshold=1.0, jitter=0.0, share=False)
+    first, still = Reading(1.0, 0, [0.5]), Reading(2.0, 0, [0.0], 1)
+    start = f.start(np.linspace(-1, 1, 50)[:, None], rng=np.random.default_rng(0))
+    state = f.step(start, 1.0, [first, Reading(1.0, 1, [0.5])])
+    after = f.step(state, 2.0, [still, None])
+    assert np.ptp(state.weights[0]) > 0.01 and np.ptp(after.weights) < 1e-15
+    assert (state.points[0] == state.points[1]).all() and (after.points[0] != after.points[1]).any()
     g = EnsembleFilter(STILL, eyes, members=50, lag=1)
     state = g.step(g.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [None])
-    told, not_told = (g.step(state, 2.0, [y], late=[first]).ensembles for y in (still, None))
+    told, not_told = (g.step(state, 2.0, [y], late=[first]).ensembles for y in ([still], None))
     assert np.allclose(told, not_told)
 
 
@@ -203,11 +206,12 @@ def test_a_run_whose_update_fails_is_named_and_leaves_the_others_their_draws(rai
 def test_groups_of_readings_give_each_agent_its_own_noise() -> None:
     """Agents with one reading each but different noise: the quieter one is the surer."""
     sensors = [direct([0], std=0.1), direct([0], std=2.0)]
-    f = EnsembleFilter(model(), sensors, graphs.path(2), share=False, members=4000)
-    state = f.step(f.start(PRIOR, rng=np.random.default_rng(0)), 1e-6, [[1.0], [1.0]])
-    variance = f.summary(state).variance[:, 0]
     p = PRIOR[1][0, 0]
-    assert np.allclose(variance, [p * 0.01 / (p + 0.01), p * 4 / (p + 4)], rtol=0.1)
+    for update in (sampled_noise, lambda *four, rng: sampled_noise(*four, rng=rng)):
+        f = EnsembleFilter(model(), sensors, share=False, members=4000, update=update)
+        state = f.step(f.start(PRIOR, rng=np.random.default_rng(0)), 1e-6, [[1.0], [1.0]])
+        variance = f.summary(state).variance[:, 0]
+        assert np.allclose(variance, [p * 0.01 / (p + 0.01), p * 4 / (p + 4)], rtol=0.1)
 
 
 @pytest.mark.filterwarnings("ignore::distfilt.filters.ParticleCollapse")

@@ -43,11 +43,11 @@ def test_splitting_improves_a_bent_forecast() -> None:
     x = prior.rvs(4000, rng=np.random.default_rng(1))
     moved = BENT.sample_step(x, 0.0, 1.0, rng=np.random.default_rng(2))
     scores = []
-    for stretch in (None, 0.05):
-        f = MixtureFilter(BENT, [None], target_dim=1, stretch=stretch, size=15, most=15)
+    for options in ({}, {"stretch": 0.05}, {"stretch": 0.05, "scale": [1e-9, 1e-9]}):
+        f = MixtureFilter(BENT, [None], target_dim=1, size=15, most=15, **options)
         belief = f.step(f.start([prior]), 1.0, [None]).mixtures[0]
         scores.append(belief.log_density(moved).mean())
-    assert scores[1] > scores[0] + 0.05
+    assert scores[1] > scores[0] + 0.05 and scores[2] == scores[0]
 
 
 def test_only_the_target_marginal_is_heard() -> None:

@@ -54,13 +54,13 @@ def joint(agents: int, readings: np.ndarray, speed: np.ndarray) -> tuple:
     return exact.means[-1], exact.covariances[-1]
 
 
-@pytest.mark.parametrize("agents", [2, 3, 5])
-def test_news_are_one_filter_with_everybodys_readings(agents: int) -> None:
+@pytest.mark.parametrize(("agents", "every"), [(2, None), (3, 2.0), (5, None)])
+def test_news_are_one_filter_with_everybodys_readings(agents: int, every: float | None) -> None:
     rng = np.random.default_rng(agents)
     readings = rng.standard_normal((4, agents))
     readings[1, 0] = np.nan
-    speed = np.array([np.nan, 0.3, np.nan, -0.2])
-    f = network(agents)
+    speed = np.array([0.1, 0.3, np.nan, -0.2])
+    f = network(agents, every=every)
     state = f.start([PRIOR] * agents)
     for k, (y, v) in enumerate(zip(readings, speed, strict=True)):
         state = f.step(state, k + 1.0, [[one, v] for one in y])

@@ -76,14 +76,20 @@ def test_a_run_that_is_lost_is_named() -> None:
 def test_errors_move_by_the_derivative_of_the_flow_in_the_chart() -> None:
     rng, model = np.random.default_rng(4), satellite_pose(rate=0.3, sigma=0.0)
     x, cov = rng.standard_normal(13), spd(rng, 12)
-    blind = multiplicative_filter(x, cov, [[np.nan]], chart=POSE, model=model, times=[0.8],
-                                  sensors=[direct([0], std=1.0)])
+    seen = multiplicative_filter(x, cov, [[0.1, 0.2]], chart=POSE, model=model, times=[0.8],
+                                 sensors=[differential([9, 11], std=0.3)])
+
+    def before(e: np.ndarray) -> np.ndarray:
+        return POSE.retract(np.broadcast_to(x, (*e.shape[:-1], 13)), e)
 
     def after(e: np.ndarray) -> np.ndarray:
-        return model.step(POSE.retract(np.broadcast_to(x, (*e.shape[:-1], 13)), e), 0.0, 0.8)
+        return model.step(before(e), 0.0, 0.8)
 
     slope = central(lambda e: POSE.local(after(0 * e), after(e)), np.zeros(12))
-    assert np.allclose(blind.covariances[0], slope @ cov @ slope.T, atol=1e-6)
+    change = central(lambda e: (after(e) - before(e))[..., [9, 11]], np.zeros(12))
+    gain = np.linalg.solve(change @ cov @ change.T + 0.09 * np.eye(2), change @ cov @ slope.T).T
+    wanted = (slope - gain @ change) @ cov @ slope.T
+    assert np.allclose(seen.covariances[0], wanted, atol=1e-6)
 
 
 def test_changes_are_readings_of_two_states() -> None:

@@ -215,6 +215,10 @@ def test_average_keeps_the_conditional_and_averages_the_target() -> None:
     assert np.allclose(mixed.log_density(x) - target, given_t, rtol=1e-9)
     several = random_mixture(3, 4, 42)
     mixed, (matrix, shift) = average(several, other), scales(4, target_dim=2)
+    # Own mixands take the heard ones by what each says of the heard mean, weight and density.
+    near = several.weights * np.exp(several.marginal(TARGET).component_log_densities(other.means))
+    near *= 0.5 * (other.weights / near.sum(axis=1))[:, None]
+    assert np.allclose(mixed.weights, [*(0.5 * several.weights), *near.ravel()])
     there = average(affine(several, matrix, shift), affine(other, matrix[:2, :2], shift[:2]))
     same(there, affine(mixed, matrix, shift), 1e-7)
 

@@ -39,6 +39,8 @@ def test_time_can_run_back_and_batches_are_rows() -> None:
     assert np.abs(propagate(there, -7200.0) - both).max() < 1e-6
     assert np.abs(propagate(propagate(GEO, 60.0, rule="rk4"), -60.0, rule="rk4") - GEO).max() < 1e-6
     assert (propagate(both, 0.0) == both).all()
+    with pytest.raises(ValueError, match=r"x, in km: needs a number at most 1\.5e\+06"):
+        propagate(1e3 * GEO, 60.0)
 
 
 def test_the_model_is_block_by_block() -> None:

@@ -102,6 +102,8 @@ def test_edges_count_once_and_run_from_speaker_to_listener() -> None:
     assert Graph.from_networkx(nx.MultiGraph([(5, 7), (5, 7), (7, 9)])).senders.size == 4
     for a, b, c in ((0, 1, 2), "abc"):
         assert as_graph(nx.Graph([(c, a), (a, b)]), 3, "abc").neighbours(0) == (1, 2)
+    with pytest.raises(ValueError, match=r"graph: needs the nodes \['a', 'b', 'c'\], got"):
+        as_graph(nx.path_graph(["a", "b", "d"]), 3, "abc")
 
 
 @given(st.integers(0, 1000), st.integers(1, 8))

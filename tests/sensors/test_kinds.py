@@ -54,7 +54,9 @@ def test_what_the_sensors_see() -> None:
     assert np.allclose(far[:, 0], np.hypot(*gap.T), rtol=1e-15)
     turned = angle([2, 0], std=0.1, full=True, origin=PLACE).predict(x)
     assert np.allclose(turned[:, 0], np.arctan2(gap[:, 1], gap[:, 0]), rtol=1e-15)
-    both = distance_and_angle([2, 0], std=[0.3, 0.1], origin=PLACE)
+    place = np.array(PLACE)
+    both = distance_and_angle([2, 0], std=[0.3, 0.1], origin=place)
+    place += 9.0  # an array that goes on takes no sensor along
     assert np.array_equal(both.predict(x), np.concatenate([far, turned], axis=-1))
     assert np.allclose(both.cov, np.diag([0.09, 0.01]))
     for kind, ours in (("direct", plain), ("differential", change),

@@ -67,6 +67,7 @@ def test_admm_finds_the_map_of_all_samples(graph: graphs.Graph, raw: bool) -> No
         one = AffineMap(*(getattr(solved, n)[agent] for n in
                           ("observed_mean", "mean", "gain", "scale")))
         assert (np.abs(compose(one, *flat, y[0, 0]) - moved) / scale).max() < 1e-4
+        assert np.abs(one(*flat) - central(*flat)).max() < 1e-4
 
 
 def test_a_rule_that_diverges_is_blamed_itself() -> None:

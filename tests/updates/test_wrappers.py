@@ -187,11 +187,14 @@ def test_readings_on_a_ring_localised_one_after_the_other(given: dict[str, Any])
     meets; distances are the shorter way round.
     """
     x, y = members(20), np.array([1.0, -0.5])
-    near = partial(localised, ROOT, places=[[0.0], [1.5], [7.0]], radius=2.0, period=8.0)
+    places = [[0.0], [1.5], [7.0]]
+    near = partial(localised, ROOT, places=places, radius=2.0, period=8.0)
     out = near(readings=[[0.0], [7.0]])(x, x[:, [0, 2]], y, np.diag([0.5, 0.9]), rng=rng(), **given)
     first = near(readings=[[0.0]])(x, x[:, :1], y[:1], [[0.5]], rng=rng())
     second = near(readings=[[7.0]])(first, first[:, 2:], y[1:], [[0.9]], rng=rng())
     assert np.allclose(out, second, atol=1e-12)
-    moved = near(readings=[[7.0]])(x, x[:, 2:], y[1:], [[0.9]], rng=rng()) - x
-    plain = ROOT(x, x[:, 2:], y[1:], [[0.9]], rng=rng()) - x
-    assert np.allclose(moved, plain * gaspari_cohn(np.array([0.5, 1.25, 0.0])), atol=1e-12)
+    for k, noise, r in (([2], [[0.9]], [0.5, 1.25, 0.0]), ([0, 2], R, [0.0, 0.75, 0.0])):
+        four = x, x[:, k], y[-len(k) :], noise  # two whose errors go together move as one
+        local = near(readings=[places[i] for i in k])(*four, rng=rng())
+        share = gaspari_cohn(np.array(r))
+        assert np.allclose(local - x, share * (ROOT(*four, rng=rng()) - x), atol=1e-12)
