@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dtrtrs
@@ -258,26 +259,29 @@ def central(
 
 
 def as_derivative(
-    slope: Array, full: tuple[int, ...], owner: object, near: Callable[..., Array],
+    owner: Any, given: tuple[Any, ...], full: tuple[int, ...], near: Callable[..., Array],
     still: Array | float = 0.0
 ) -> Array:
-    """What a user's `derivative` returned, (m, d) or (..., m, d), as the latter.
+    """What an owner's `derivative` returns, (m, d) or (..., m, d), as the latter; differences
+    where it has none.
 
     The first time it is compared with differences: a transposed one may have the right shape too.
     Rows may be a tenth of their largest entry off, and lack what hardly matters beside others.
 
     Parameters
     ----------
-    slope, full : ndarray, tuple of int
-        The derivative, and the shape that it needs.
     owner : Record
         Whose derivative it is; what the library made itself is trusted.
+    given, full : tuple
+        What it gets, arrays as copies, and the shape that it needs.
     near : callable
         ``near(step=step)`` by :func:`central`. Rows that depend on the step say nothing.
     still : ndarray, optional
         The derivative of a state that stays, which is no merit of a model's.
     """
-    slope = np.asarray(slope)
+    if owner.derivative is None:
+        return near()
+    slope = np.asarray(owner.derivative(*[np.copy(x) if np.ndim(x) else x for x in given]))
     if slope.shape not in (full, full[-2:]):
         raise ValueError(f"derivative: needs to return shape {full}, got {slope.shape}")
     if vars(owner).pop("_doubted", False):

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..doors import Array, Bounds, NonNegative, Places, Record, array, door, unchecked
+from ..ensembles import Ensemble
 from ..linalg import SolverError, as_derivative, central
 
 __all__ = ["Constraint", "norm", "project", "retract"]
@@ -72,11 +73,7 @@ class Constraint(Record):
     def jacobian(self, x: Annotated[Array, "... d"]) -> Array:
         """Derivative of g at states (..., d), (..., s, d)."""
         near = partial(central, self.missed, x)
-        if self.derivative is None:
-            return near()
-        shape = (*x.shape[:-1], self.value.size, x.shape[-1])
-        slope = array(self.derivative(x.copy()), "derivative", shape)
-        return as_derivative(slope, shape, self, near)
+        return as_derivative(self, (x,), (*x.shape[:-1], self.value.size, x.shape[-1]), near)
 
 
 @door
@@ -112,7 +109,7 @@ def norm(
 
 @door
 def project(
-    ensemble: Annotated[Array, "... N d"], constraint: Constraint, *, reading: Reading = "shift",
+    ensemble: Ensemble, constraint: Constraint, *, reading: Reading = "shift",
     regularisation: NonNegative = 1e-6, guarded: bool = True,
 ) -> Array:
     r"""Regress the members on the constraint and correct them, equations (6)-(12).
@@ -159,8 +156,6 @@ def project(
     True
     """
     x, n = ensemble, ensemble.shape[-2]
-    if n < 2:
-        raise ValueError(f"ensemble: needs at least 2 members, got {n}")
     gap = unchecked(constraint.residual)(x)
     mean = gap.mean(axis=-2, keepdims=True)
     anomalies = gap - mean

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..doors import Array, NonNegative, Positive, Rng, array, door, unchecked
+from ..ensembles import Ensemble
 from ..linalg import EPS, factor
 from .solvers import SQUARED, Solve, Solver, distances, scaled, solver_of
 
@@ -237,7 +238,7 @@ def _graded(cov: Array) -> Array:
 
 @door
 def rejuvenated(
-    moved: Members, ensemble: AsMoved, *, bandwidth: NonNegative, rng: Rng
+    moved: Annotated[Ensemble, SQUARED], ensemble: AsMoved, *, bandwidth: NonNegative, rng: Rng
 ) -> Array:
     r"""Add combinations of the forecast's anomalies: new places, and the same mean.
 
@@ -267,8 +268,6 @@ def rejuvenated(
     (True, 3)
     """
     x, n = ensemble, ensemble.shape[-2]
-    if n < 2:
-        raise ValueError(f"ensemble: needs at least 2 members, got {n}")
     drawn = rng.standard_normal((*x.shape[:-1], n))
     # Centring costs one part in N of the variance.
     drawn = (drawn - drawn.mean(axis=-2, keepdims=True)) * np.sqrt(n / (n - 1))

@@ -39,7 +39,7 @@ class Scope:
         """What a word stands for: a size, sizes, or itself while it is free."""
         if word in self.sizes:
             return self.sizes[word]
-        head, *path = _parts(word)
+        head, *path = word.lstrip("*").split(".")
         found = int(word) if word.isdigit() else self.values.get(head)
         for part in path:
             found = getattr(found, part, None)
@@ -47,11 +47,6 @@ class Scope:
 
 
 @cache
-def _parts(word: str) -> list[str]:
-    """The name of an argument, and the path to a size in it."""
-    return word.lstrip("*").split(".")
-
-
 @dataclass(frozen=True)
 class Kind:
     """What an argument may be: what it needs in words, its conversion, and rules for the result."""

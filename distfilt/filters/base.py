@@ -60,8 +60,8 @@ class Filter(Record, ABC):
         Names of the agents; their numbers by default.
     failures : {"raise", "keep"}
         What happens when one run of a batch fails: a :class:`FilterError` that names it, or the
-        other runs go on and the failed one is recorded as NaN. An error of the `agreement` ends
-        all runs, since it may have spoken for all of them.
+        other runs go on and the failed one is recorded as NaN. Where an `agreement` raises, each
+        run is asked alone.
     gate : float, optional
         How likely a good reading passes, in (0, 1). Each sensor's reading is tested against what
         was predicted; those that fail are left out and counted as ``refused`` in the record.

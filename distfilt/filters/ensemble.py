@@ -193,7 +193,7 @@ class EnsembleFilter(MembersFilter):
         rows = group.rows
         members = tuple([e[..., rows, :, :] for e in stack])
         # What a late reading tells of the time before is in the stack.
-        before = step.before(place, rows, stack[-2] if len(stack) > 1 else step.state.ensembles)
+        before = step.before(place, rows, stack[:-1])
         predicted = group.predict(members[place], before)
         group = step.gated(group, sample_moments, predicted)
         again = getattr(self.update, "repredicts", False)
@@ -326,7 +326,7 @@ class TransportFilter(MembersFilter):
         logs = np.zeros(stack[-1].shape[:-1])
         for place, group in step.heard():
             rows = group.rows
-            before = step.before(place, rows, stack[-2] if len(stack) > 1 else step.state.ensembles)
+            before = step.before(place, rows, stack[:-1])
             predicted = group.predict(stack[place][..., rows, :, :], before)
             group = step.gated(group, sample_moments, predicted)
             logs[..., rows, :] += log_likelihood(predicted, group.target, group.noise)

@@ -163,7 +163,9 @@ class NewsFilter(MixtureFilter):
             if before is not None and listeners:
                 with step.of(k):
                     news = increment(before.marginal(part), after[k].marginal(part))
-                said[k], untold[k] = (_packed(news) if news.size else None), None
+                # Numbers that are not zero by construction, 13 for two rows of six.
+                packed = news[np.triu_indices(len(news), 0, news.shape[1])]
+                said[k], untold[k] = packed if news.size else None, None
         for k, heard in enumerate(channel.exchange(said)):
             for payload in heard.values():
                 news = _unpacked(payload, self.target_dim)
@@ -183,12 +185,6 @@ class NewsFilter(MixtureFilter):
                 if not np.isnan(left).all():
                     part.append(reading.changed(value=left))
         return own, alike
-
-
-def _packed(news: Array) -> Array:
-    """The numbers of an increment that are not zero by construction, 13 for two rows of six."""
-    r, k = news.shape
-    return news[np.triu_indices(r, 0, k)]
 
 
 def _unpacked(numbers: Array, n: int) -> Array:

@@ -9,11 +9,9 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..doors import Array, all_finite, array
 from ..linalg import SolverError
-from ..network import Channel
 from ..sensors import Sensor
 from .inbox import Heard, groups
 from .inputs import Reading, sensor_of
@@ -88,7 +86,7 @@ class Step:
         self.filter, self.state, self.t, self.dt = filter_, state, t, t - state.t
         self.said, self.late = said, late
         self.times = state.kept(filter_.lag, t)
-        self.channel: Channel | None = filter_.channel(state, t)
+        self.channel: Any = filter_.channel(state, t)
         # A run's own generator need not be copied: nobody else draws from it.
         self.rng: Any = state.rng if own else copied(state.rng)
         self.failed = getattr(state, "failed", _NOBODY)
@@ -98,18 +96,20 @@ class Step:
         if filter_.gate is not None:
             self.refused = np.zeros((*state.runs, filter_.count))
 
-    def settle(
-        self, errors: dict[Row, str], agents: Sequence[int] | NDArray[np.intp]
-    ) -> None:
-        """Take the runs of these errors as failed, or raise the error that names the first."""
+    def settle(self, errors: dict[Row, str], agents: Any = None) -> None:
+        """Take the runs of these errors as failed, or raise the error that names the first.
+
+        Their keys are runs, and where there are `agents` a place among these.
+        """
         if not errors:
             return
-        row, why = next(iter(errors.items()))
+        size, (row, why) = len(self.state.runs), next(iter(errors.items()))
         if self.filter.failures == "raise" or not self.failed.shape:
-            raise FilterError(row[:-1], int(agents[row[-1]]), self.t, why)
+            agent = None if agents is None else int(agents[row[-1]])
+            raise FilterError(row[:size], agent, self.t, why)
         self.failed = self.failed.copy()
         for row in errors:
-            self.failed[row[:-1]] = self.lost = True
+            self.failed[row[:size]] = self.lost = True
 
     @contextmanager
     def of(self, agent: int) -> Iterator[None]:
@@ -226,9 +226,14 @@ class Step:
         self.refused[..., group.agents] += refused
         return group
 
-    def before(self, place: int, rows: Any, members: Array) -> Array | None:
-        """The agents' members at the time before now, for sensors that see changes."""
-        return members[..., rows, :, :] if place == len(self.times) else None
+    def before(self, place: int, rows: Any, past: list[Array]) -> Array | None:
+        """A group's members at the time before now, for sensors that see changes.
+
+        They are the last of the `past`, or those with which the step begins, if it has a length.
+        """
+        if place < len(self.times) or not (past or self.dt):
+            return None
+        return (past or [self.state.belief])[-1][..., rows, :, :]
 
     @property
     def agrees(self) -> bool:
@@ -236,15 +241,27 @@ class Step:
         return self.filter.agreement is not None and self.channel is not None
 
     def agreed(self, *values: Array) -> tuple[Array, ...]:
-        """Values (*runs, A, ...) after the agreement, if there is one."""
-        if not self.agrees:
+        """Values (*runs, A, ...) after the agreement, if any; as they were in failed runs."""
+        if not self.agrees or self.failed.all():
             return values
-        belief: Any = values[0] if len(values) == 1 else values
-        out = self.filter.agreement(belief, self.channel)
-        out = (out,) if len(values) == 1 else tuple(out)
-        if len(out) != len(values):
-            raise ValueError(f"agreement: needs to return {len(values)} arrays, got {len(out)}")
-        return tuple(array(x, "agreement", v.shape) for x, v in zip(out, values, strict=True))
+        good, door = tuple(np.argwhere(~self.failed)[0]), self.channel
+        # What a run failed with may fail again: a good one stands in.
+        given = tuple([self.kept(v, v[good]) for v in values])
+        whole = np.arange(int(np.prod(self.state.runs))).reshape(self.state.runs)
+        ledger = door.ledger
+
+        def compute(*arrays: Any) -> tuple[Array, ...]:
+            *belief, run, _, _ = arrays
+            self.channel = channel = door.of(run, ledger)
+            out = self.filter.agreement(belief[0] if len(belief) == 1 else tuple(belief), channel)
+            out = (out,) if len(belief) == 1 else tuple(out)
+            if len(out) != len(belief):
+                raise ValueError(f"agreement: needs to return {len(belief)} arrays, got {len(out)}")
+            return tuple(array(x, "agreement", v.shape) for x, v in zip(out, belief, strict=True))
+
+        out, errors = guarded(compute, (*given, whole), values, whole.ndim)
+        self.settle(errors)
+        return tuple([self.kept(x, v) for x, v in zip(out, values, strict=True)])
 
     def end(self, *, past: Iterable[Array] = (), **belief: Any) -> Any:
         """The state after the step; `past` has one entry for each of the earlier times."""
@@ -294,11 +311,12 @@ def guarded(
                 continue
             for target, result in zip(out, results, strict=True):
                 target[row] = result
-        if 0 < len(errors) < len(rows) and rng is not None:
+        if 0 < len(errors) < len(rows):
             # No row may draw otherwise because another fails: a good one stands in for that.
             good = next(row for row in rows if row not in errors)
             where: Any = tuple(np.transpose([good if row in errors else row for row in rows]))
-            rng.bit_generator.state = at
+            if rng is not None:
+                rng.bit_generator.state = at
             with suppress(*RECOVERABLE):
                 out = compute(*(a[where].reshape(a.shape) for a in arrays), shared, rng)
         if of_the_call(error) and len(errors) == len(rows):

@@ -100,10 +100,7 @@ class Model(Record):
         `derivative` where the model has it, central differences of `flow` otherwise.
         """
         near = partial(central, lambda state: unchecked(self.step)(state, t, dt), x)
-        if self.derivative is None:
-            return near()
-        slope, full = self.derivative(x.copy(), t, dt), (*x.shape, self.dim)
-        return as_derivative(slope, full, self, near, np.eye(self.dim))
+        return as_derivative(self, (x, t, dt), (*x.shape, self.dim), near, np.eye(self.dim))
 
 
 @lru_cache(maxsize=64)

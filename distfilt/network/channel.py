@@ -71,6 +71,7 @@ class Channel:
     ) -> None:
         self.graph: Graph = as_graph(graph, None if ledger is None else ledger.messages.size)
         self.runs = runs
+        self._among = int(np.prod(runs, dtype=np.int64)), slice(None)
         self.faults = _PERFECT if faults is None else faults
         self.t = t
         self._ledger = Ledger.empty(self.graph.size) if ledger is None else ledger
@@ -85,6 +86,14 @@ class Channel:
         """The same for a caller that made the graph and the ledger itself, as filters do."""
         channel = cls.__new__(cls)
         unchecked(channel.__init__)(*args, **options)  # type: ignore[misc]
+        return channel
+
+    def of(self, run: Any, ledger: Ledger) -> Channel:
+        """The same with another account; of the numbers of all runs, or as one loses messages."""
+        channel = Channel.unchecked(
+            self.graph, ledger=ledger, runs=run.shape, faults=self.faults, t=self.t
+        )
+        channel._among = self._among[0], slice(None) if run.ndim else slice(run, run + 1)
         return channel
 
     @property
@@ -240,13 +249,13 @@ class Channel:
         if self.faults.late and not late:
             raise ValueError(f"channel: needs no delay here, got {self.faults.late} rounds")
         now = self.ledger
-        size, runs = self.graph.size, int(np.prod(self.runs, dtype=np.int64))
+        size, (runs, here) = self.graph.size, self._among
         if self._perfect:
-            arrived, lost = np.broadcast_to(speaks, (runs, speaks.size)), np.zeros(size)
+            arrived, lost = np.broadcast_to(speaks, (runs, speaks.size))[here], np.zeros(size)
         else:
             speaks = speaks & self.faults.speaking(self.graph, now.rounds, self.t)
-            arrived = speaks & ~self.faults.lost(self.graph, now.rounds, runs, self.t)
-            missing = (speaks & ~arrived).sum(axis=0) / runs
+            arrived = speaks & ~self.faults.lost(self.graph, now.rounds, runs, self.t)[here]
+            missing = (speaks & ~arrived).mean(axis=0)
             lost = np.bincount(self.graph.senders, weights=missing, minlength=size).astype(float)
         messages = np.bincount(self.graph.senders[speaks], minlength=size)
         after = self._charged(now, messages, sizes, bytes_, lost=lost)

@@ -284,8 +284,6 @@ def _left_null_vector(laplacian: scipy.sparse.csr_array) -> Array:
     """Positive p with p' L = 0 of a strongly connected graph, largest entry 1."""
     from scipy.sparse.linalg import splu
 
-    if laplacian.shape[0] == 1:
-        return np.ones(1)
     # One entry is set; the rest solves an M-matrix, which needs no pivoting.
     turned = laplacian.T.tocsc()
     inner, right = turned[1:, 1:], -turned[1:, [0]].toarray().ravel()

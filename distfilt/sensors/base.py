@@ -117,7 +117,8 @@ class Sensor(Record):
         if not self.uses_previous:
             return (x,)
         if previous is None:
-            raise ValueError(f"previous: a {self.kind} sensor needs the previous states, got None")
+            raise ValueError(f"previous: a {self.kind} sensor needs the states before, which at a "
+                             "state's own time a filter's lag keeps, got None")
         if x.shape != previous.shape:
             leading(x.shape[:-1], previous.shape[:-1], "previous")
             x, previous = np.broadcast_arrays(x, previous)
@@ -173,6 +174,4 @@ class Sensor(Record):
         before = [b[..., None, :] for b in states[1:]]
         predict, residual = unchecked(self.predict), unchecked(self.residual)
         near = partial(central, lambda moved: predict(moved, *before), states[0], residual)
-        if self.derivative is None:
-            return near()
-        return as_derivative(self.derivative(*[s.copy() for s in states]), full, self, near)
+        return as_derivative(self, states, full, near)

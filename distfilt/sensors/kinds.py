@@ -373,13 +373,15 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
         len(cov), partial(_stacked, parts=sensors), cov, kind="stacked",
         difference=partial(_stacked_differences, parts=sensors) if wraps else None,
         uses_previous=any(s.uses_previous for s in sensors),
-        linear=partial(_stacked_rows, parts=sensors) if linear else None,
-        derivative=partial(_stacked_slopes, parts=sensors),
+        linear=partial(_stacked, parts=sensors, what="matrix", axis=0) if linear else None,
+        derivative=partial(_stacked, parts=sensors, what="jacobian", axis=-2),
     )
 
 
-def _stacked(x: Array, previous: Array | None = None, *, parts: Sequence[Sensor]) -> Array:
-    return np.concatenate([unchecked(s.predict)(x, previous) for s in parts], axis=-1)
+def _stacked(
+    *states: Any, parts: Sequence[Sensor], what: str = "predict", axis: int = -1
+) -> Array:
+    return np.concatenate([unchecked(getattr(s, what))(*states) for s in parts], axis=axis)
 
 
 def _stacked_differences(observed: Array, predicted: Array, parts: Sequence[Sensor]) -> Array:
@@ -387,11 +389,3 @@ def _stacked_differences(observed: Array, predicted: Array, parts: Sequence[Sens
     pairs = [np.split(reading, ends, axis=-1) for reading in (observed, predicted)]
     gaps = [unchecked(s.residual)(y, p) for s, y, p in zip(parts, *pairs, strict=True)]
     return np.concatenate(gaps, axis=-1)
-
-
-def _stacked_rows(dim: int, parts: Sequence[Sensor]) -> Array:
-    return np.concatenate([unchecked(s.matrix)(dim) for s in parts])
-
-
-def _stacked_slopes(x: Array, previous: Array | None = None, *, parts: Sequence[Sensor]) -> Array:
-    return np.concatenate([unchecked(s.jacobian)(x, previous) for s in parts], axis=-2)

@@ -20,9 +20,9 @@ from distfilt.filters import (
 )
 from distfilt.kalman import rts_smoother
 from distfilt.models import Model
-from distfilt.network import covariance_intersection, graphs
+from distfilt.network import Faults, covariance_intersection, graphs, pull
 from distfilt.sensors import Sensor, direct, of_kind
-from distfilt.updates import sampled_noise
+from distfilt.updates import exact_draws, sampled_noise
 
 from .families import NOISE, PRIOR, TIMES, data, kalman, made, model, team
 
@@ -32,8 +32,6 @@ BOTH = Sensor(2, lambda x: x, NOISE, linear=lambda d: np.eye(d))
 
 def test_network_of_exact_ensembles_is_the_network_of_kalman_filters() -> None:
     """With the same rule of intersection, agent by agent, with loss and a full noise matrix."""
-    from distfilt.network import Faults
-
     sensors = team(4)
     _, seen = data(sensors, (3,))
     options = {"graph": graphs.ring(4), "runs": (3,), "sensors": sensors}
@@ -124,6 +122,17 @@ def test_a_member_that_was_picked_or_moved_sees_changes_from_where_it_comes() ->
     assert np.allclose(told, not_told)
 
 
+@pytest.mark.parametrize("family", ["ensemble", "particle", "ensemble, common"])
+def test_a_change_that_is_read_after_its_step_is_one_from_the_step_s_begin(family: str) -> None:
+    """A reading moves members as in one step with it; of what is not kept it is refused."""
+    f, start = made(family, sensors=[of_kind("differential", [0], std=0.5)], graph=None, lag=1)
+    at_once = f.step(start, 1.0, [[0.4]])
+    later = f.step(f.step(start, 1.0, [None]), 1.0, [[0.4]])
+    assert np.allclose(f.summary(later).mean, f.summary(at_once).mean, atol=1e-9)
+    with pytest.raises(ValueError, match="needs the states before, which at a state's own time"):
+        replace(f, lag=0).step(start, start.t, [[0.4]])
+
+
 def test_particles_tend_to_the_kalman_filter_with_a_full_noise() -> None:
     _, (seen,) = data([BOTH])
     seen[3, 0] = np.nan
@@ -181,6 +190,28 @@ def test_a_run_whose_covariance_overflows_leaves_the_others_to_agree() -> None:
     assert state.failed.tolist() == [False, True] and np.allclose(state.covariances[0], 2.0)
 
 
+def test_a_run_whose_agreement_fails_leaves_the_others_as_they_are() -> None:
+    """With losses of their own, and charged as if all had gone well."""
+
+    def fragile(ensembles: np.ndarray, channel: Any) -> np.ndarray:
+        out = pull(ensembles, channel, gain=0.3)
+        if (out > 50).any():
+            raise np.linalg.LinAlgError("it is far off")
+        return out
+
+    f = EnsembleFilter(model(), team(4), graphs.ring(4), agreement=fragile, members=5,
+                       failures="keep", faults=Faults(loss=0.5, seed=3))  # fmt: skip
+    start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(3,))
+    wild = start.changed(ensembles=start.ensembles + 99 * np.eye(3)[1][:, None, None, None])
+    with pytest.raises(FilterError, match=r"run 1, t = 0.1 s: it is far off"):
+        replace(f, failures="raise").step(wild, 0.1, [None] * 4)
+    for t in (0.1, 0.2):
+        start, wild = (f.step(s, t, [None] * 4) for s in (start, wild))
+        assert wild.failed.tolist() == [False, True, False]
+        np.testing.assert_array_equal(wild.ensembles[[0, 2]], start.ensembles[[0, 2]])
+        assert (wild.ledger.lost == start.ledger.lost).all() and start.ledger.lost.any()
+
+
 @pytest.mark.parametrize("raises", [False, True])
 def test_a_run_whose_update_fails_is_named_and_leaves_the_others_their_draws(raises: bool) -> None:
     def fragile(x: np.ndarray, h: np.ndarray, y: np.ndarray, r: np.ndarray, *, rng: Any):
@@ -205,13 +236,12 @@ def test_a_run_whose_update_fails_is_named_and_leaves_the_others_their_draws(rai
 
 def test_groups_of_readings_give_each_agent_its_own_noise() -> None:
     """Agents with one reading each but different noise: the quieter one is the surer."""
-    sensors = [direct([0], std=0.1), direct([0], std=2.0)]
-    p = PRIOR[1][0, 0]
-    for update in (sampled_noise, lambda *four, rng: sampled_noise(*four, rng=rng)):
-        f = EnsembleFilter(model(), sensors, share=False, members=4000, update=update)
-        state = f.step(f.start(PRIOR, rng=np.random.default_rng(0)), 1e-6, [[1.0], [1.0]])
-        variance = f.summary(state).variance[:, 0]
-        assert np.allclose(variance, [p * 0.01 / (p + 0.01), p * 4 / (p + 4)], rtol=0.1)
+    eyes, r = [direct([0], std=s) for s in (0.1, 2.0)], np.array([0.01, 4.0])
+    for update in (exact_draws, lambda *four, rng: exact_draws(*four, rng=rng)):
+        f = EnsembleFilter(model(), eyes, share=False, members=10, update=update)
+        start = f.start(PRIOR, rng=np.random.default_rng(0))
+        p, q = (f.summary(s).variance[:, 0] for s in (start, f.step(start, 0.0, [[1.0], [1.0]])))
+        assert np.allclose(q, p * r / (p + r), rtol=1e-9)
 
 
 @pytest.mark.filterwarnings("ignore::distfilt.filters.ParticleCollapse")

@@ -138,7 +138,6 @@ def test_intersection_gives_the_fused_moments(rule: str) -> None:
     assert unit_gap(sample_covariance(out), fused[1]) < 1e-10
     # 4 + 10 numbers on each link and round.
     assert (channel.ledger.scalars == 2 * 14 * LINKS).all()
-    assert rule != "min_determinant" or (network.intersection(e, channel, rounds=2) == out).all()
     # A scale matters to traces only.
     scaled = network.intersection(e[0], star(), rule=rule, scale=SIZES)
     plain = network.intersection(e[0], star(), rule=rule)
@@ -156,11 +155,3 @@ def test_ensembles_of_two_rounds_in_any_units_and_equal_ones(rule: object) -> No
         assert np.allclose(scaled, rule(e[:3], star()), rtol=1e-8, atol=1e-8)
     same = np.stack([e[0]] * 3)
     assert np.allclose(mean(rule(same, star())), mean(same), rtol=1e-8, atol=1e-8)
-
-
-def test_flat_ensembles_are_refused() -> None:
-    e = _ensembles(0)
-    flat = (e[:, :4], np.zeros_like(e), e[..., [0, 0]], e[..., [0, 1]] @ [[1.0, 1, 2], [1, -1, 3]])
-    for ensembles in flat:
-        with pytest.raises(ValueError, match="ensemble"):
-            network.intersection(ensembles, star())

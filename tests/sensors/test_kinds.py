@@ -62,8 +62,7 @@ def test_what_the_sensors_see() -> None:
     for kind, ours in (("direct", plain), ("differential", change),
                        ("range", distance([2, 0], std=0.3)), ("angle", angle([2, 0], std=0.3))):
         made = sensors.of_kind(kind, [2, 0], std=0.3)
-        assert made.kind == ours.kind and np.array_equal(made.cov, ours.cov)
-        assert np.allclose(made.cov, 0.09 * np.eye(made.dim), rtol=1e-15)
+        assert made.kind == ours.kind and np.allclose(made.cov, 0.09 * np.eye(ours.dim), rtol=1e-15)
 
 
 SHIPPED = [
@@ -111,10 +110,6 @@ def test_a_stacked_sensor_is_its_parts() -> None:
     assert both.linear is None
     assert np.abs(both.jacobian(x) - np.concatenate([s.jacobian(x) for s in parts], -2)).max() == 0
     assert (stack([direct([0], std=0.5), own]).matrix(3) == np.eye(3)).all()
-    changes = stack([direct([0], std=0.5), differential([1], std=0.5)])
-    assert changes.uses_previous
-    assert np.allclose(changes.predict([1.0, 5.0], [0.0, 2.0]), [1.0, 3.0])
-    assert np.allclose(changes.jacobian([1.0, 5.0], [0.0, 2.0]), np.eye(2))
 
 
 def test_a_robot_sees_from_its_own_pose() -> None:

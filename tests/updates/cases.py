@@ -60,11 +60,6 @@ def rng(seed: int = 1) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def enough(name: str) -> int:
-    """Members for a comparison of moments; a coupling of thousands takes its time."""
-    return 300 if "transform" in name else 4000
-
-
 def members(n: int, *leading: int, seed: int = 0) -> np.ndarray:
     """Members (*leading, n, 3) of the case's prior."""
     rng = np.random.default_rng(seed)
