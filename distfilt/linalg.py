@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.linalg.lapack import dpotrf, dtrtrs
+from scipy.linalg.lapack import dposv, dpotrf, dtrtrs
 
 from .doors import Array, Semidefinite, door
 
@@ -131,15 +131,26 @@ def solve_lower(lower: Array, right: Array) -> Array:
     return _triangular(lower, right, 0)
 
 
+def solve_definite(matrix: Array, right: Array) -> Array:
+    """Solve with symmetric positive definite matrices, (..., m, m) and (..., m, k)."""
+    m, k = right.shape[-2:]
+    if matrix.size == m * m and right.size == m * k > 0:
+        # A third of numpy's time for one system.
+        _, out, failed = dposv(matrix.reshape(m, m), right.reshape(m, k), lower=1)
+        if not failed:
+            return np.asarray(out.reshape(right.shape))
+    return np.asarray(np.linalg.solve(matrix, right))
+
+
 def solve_upper(lower: Array, right: Array) -> Array:
     r"""Solve Lᵀ out = right with the *lower* triangular factor."""
     return _triangular(lower, right, 1)
 
 
 def _triangular(lower: Array, right: Array, transposed: int) -> Array:
-    if lower.ndim == 2:
-        return _one_triangular(lower, right, transposed)
     d, k = right.shape[-2:]
+    if lower.size == d * d and lower.ndim <= right.ndim:
+        return _one_triangular(lower.reshape(d, d), right, transposed)
     leading = lower.shape[:-2]
     if leading != right.shape[:-2]:
         leading = np.broadcast_shapes(leading, right.shape[:-2])

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..doors import Array, Bounds, Count, NonNegative, unchecked
 from ..gaussians.single import conditioned, unscented_points
-from ..linalg import cholesky, symmetrise
+from ..linalg import cholesky, solve_upper, symmetrise
 from .base import Filter
 from .inbox import Heard
 from .inputs import moments_of
@@ -184,14 +184,15 @@ class GaussianFilter(Filter):
         """Value, slope and extra covariance of a function of a Gaussian (..., d)."""
         if self.rule == "extended":
             return function(mean[..., None, :])[..., 0, :], jacobian(mean), 0.0
-        root = cholesky(cov)
+        root, d = cholesky(cov), mean.shape[-1]
         points, w = unchecked(unscented_points)(mean, root, kappa=self.kappa)
         values = function(points)
         at = w @ values
         gap = values - at[..., None, :]
-        weighed = (w[:, None] * gap).mT
-        slope = np.asarray(np.linalg.solve(cov, (weighed @ (points - mean[..., None, :])).mT)).mT
-        return at, slope, weighed @ gap - slope @ cov @ slope.mT
+        # By opposite points: the slope times each column of the root, and what is beyond them.
+        half = (values[..., 1 : d + 1, :] - values[..., d + 1 :, :]) / (2 * np.sqrt(d + self.kappa))
+        slope = solve_upper(root, half).mT
+        return at, slope, (w[:, None] * gap).mT @ gap - half.mT @ half
 
     def _condition(
         self, means: Array, covs: Array, slot: int, group: Heard, step: Step
@@ -213,7 +214,7 @@ class GaussianFilter(Filter):
         if m.shape[-1] > d:
             big = np.zeros((*slope.shape[:-1], m.shape[-1]))
             big[..., here] = slope
-        noise = np.broadcast_to(group.noise + extra, (*big.shape[:-1], big.shape[-2]))
+        noise = np.zeros((*big.shape[:-1], big.shape[-2])) + group.noise + extra
         (m, p), errors = guarded(
             lambda m, p, gap, big, noise, *_: unchecked(conditioned)(m, p, gap, big, noise),
             (m, p, group.target - at, big, noise), (m, p), group.target.ndim - 1,

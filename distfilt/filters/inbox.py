@@ -102,7 +102,7 @@ class Heard:
 
     def near(self, seen: Array, aim: Array) -> Array:
         """Predictions (*runs, G, N, M), now on the branch of an aim (*runs, G, 1, M); in place."""
-        out, goal = seen.swapaxes(-1, -2), np.broadcast_to(aim, seen.shape).swapaxes(-1, -2)
+        out, goal = seen.swapaxes(-1, -2), (aim + 0 * seen).swapaxes(-1, -2)
         for sensor, rows, columns in self.parts:
             if sensor.difference is not None:
                 at = (..., rows[:, None], columns, slice(None))

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 
 from ..doors import MISSING, Array, Cov, Mask, Semidefinite, door
-from ..linalg import EPS, cholesky, leading, log_det, quadratic_form
+from ..linalg import EPS, cholesky, leading, log_det, quadratic_form, solve_definite
 
 __all__ = ["conditioned", "log_density", "recolour", "unscented_points"]
 
@@ -161,7 +161,7 @@ def analysis(cov: Array, H: Array, R: Array) -> tuple[Array, Array, Array]:
     """Gain, analysis covariance in Joseph's form, and innovation covariance."""
     cross = cov @ H.mT
     inner = H @ cross + R
-    gain = np.linalg.solve(inner, cross.mT).mT
+    gain = solve_definite(inner, cross.mT).mT
     rest = np.eye(cov.shape[-1]) - gain @ H
     after = rest @ cov @ rest.mT + gain @ R @ gain.mT
     return np.asarray(gain), np.asarray(0.5 * (after + after.mT)), inner
@@ -202,7 +202,7 @@ def unscented_points(
     if d + kappa <= 0:
         raise ValueError(f"kappa: needs a number above {-d}, got {kappa:g}")
     moves = np.sqrt(d + kappa) * root.mT
-    moves = np.concatenate([np.zeros_like(moves[..., :1, :]), moves, -moves], axis=-2)
+    moves = np.concatenate([0 * moves[..., :1, :], moves, -moves], axis=-2)
     weights = np.full(2 * d + 1, 0.5 / (d + kappa))
     weights[0] = kappa / (d + kappa)
     return mean[..., None, :] + moves, weights

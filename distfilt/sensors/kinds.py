@@ -132,12 +132,15 @@ def distance(
 
 
 def _distance(x: Array, indices: Sequence[int], origin: Array) -> Array:
-    return np.asarray(np.linalg.norm(_gap(x, indices, origin), axis=-1, keepdims=True))
+    return _length(_gap(x, indices, origin))
+
+
+def _length(gap: Array) -> Array:
+    return np.asarray(np.sqrt((gap * gap).sum(axis=-1, keepdims=True)))
 
 
 def _distance_slope(x: Array, indices: Sequence[int], origin: Array) -> Array:
-    gap = _gap(x, indices, origin)
-    length = np.linalg.norm(gap, axis=-1, keepdims=True)
+    length = _length(gap := _gap(x, indices, origin))
     slope = gap / np.where(length > 0, length, 1.0)
     return _spread(slope[..., None, :], indices, x.shape[-1])
 
@@ -182,17 +185,17 @@ def angle(
     )
 
 
-def _angle(
-    x: Array, period: float, indices: Sequence[int], origin: Array, heading: float = 0.0
-) -> Array:
-    a, b = np.moveaxis(_gap(x, indices, origin), -1, 0)
-    direction = np.where((a == 0) & (b == 0), np.nan, np.arctan2(b, a)) - heading
-    return unchecked(wrap)(direction, period=period)[..., None]
+def _angle(x: Array, period: float, **place: Any) -> Array:
+    return _direction(_gap(x, **place), period)
+
+
+def _direction(gap: Array, period: float, heading: float = 0.0) -> Array:
+    turned = np.where(gap.any(axis=-1), np.arctan2(gap[..., 1], gap[..., 0]), np.nan) - heading
+    return unchecked(wrap)(turned, period=period)[..., None]
 
 
 def _angle_slope(x: Array, indices: Sequence[int], origin: Array) -> Array:
-    gap = _gap(x, indices, origin)
-    length = np.linalg.norm(gap, axis=-1, keepdims=True)
+    length = _length(gap := _gap(x, indices, origin))
     length = np.where(length > 0, length, np.nan)
     unit = gap / length
     slope = np.stack([-unit[..., 1], unit[..., 0]], axis=-1) / length
@@ -239,8 +242,8 @@ def distance_and_angle(
 
 
 def _sighting(x: Array, heading: float, **place: Any) -> Array:
-    turned = _angle(x, 2 * np.pi, **place, heading=heading)
-    return np.concatenate([_distance(x, **place), turned], axis=-1)
+    gap = _gap(x, **place)
+    return np.concatenate([_length(gap), _direction(gap, 2 * np.pi, heading)], axis=-1)
 
 
 def _turned_at(observed: Array, predicted: Array, k: int = 0, period: float = 2 * np.pi) -> Array:
