@@ -142,7 +142,11 @@ def exact_noise(
     True
     """
     leading(anomalies_to_avoid.shape[:-2], cov.shape[:-2], "cov")
-    avoid, root = anomalies_to_avoid, unchecked(factor)(cov)
+    return drawn_apart(anomalies_to_avoid, unchecked(factor)(cov), rng)
+
+
+def drawn_apart(avoid: Array, root: Array, rng: Rng) -> Array:
+    """As :func:`exact_noise`, with a factor of the covariance."""
     n = avoid.shape[-2]
     if n <= avoid.shape[-1] + root.shape[-1]:
         root = _narrow(root)

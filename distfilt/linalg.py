@@ -118,6 +118,8 @@ def lower_root(columns: Array) -> Array:
 
 def leading(wanted: tuple[int, ...], got: tuple[int, ...], name: str) -> tuple[int, ...]:
     """What leading axes broadcast to, or an error that names the argument that does not fit."""
+    if wanted == got:
+        return wanted
     try:
         return np.broadcast_shapes(wanted, got)
     except ValueError:

@@ -164,7 +164,6 @@ class GaussianFilter(Filter):
             partial(unchecked(model.step), t=state.t, dt=dt),
             partial(unchecked(model.jacobian), t=state.t, dt=dt), state.means, state.covariances,
         )
-        old = state.joint_means[..., : kept * d]
         shift = np.ascontiguousarray(slope)
         if kept:
             shift = np.zeros((*moved.shape[:-1], (1 + kept) * d, state.joint_means.shape[-1]))
@@ -175,7 +174,7 @@ class GaussianFilter(Filter):
         if self.inflation != 1.0:
             covs[..., :d, :] *= self.inflation
             covs[..., :, :d] *= self.inflation
-        return np.concatenate([moved, old], axis=-1) if kept else moved.copy(), covs
+        return np.concatenate([moved, state.joint_means[..., : kept * d]], axis=-1), covs
 
     def _linearised(
         self, function: Callable[[Array], Array], jacobian: Callable[[Array], Array], mean: Array,
@@ -210,10 +209,8 @@ class GaussianFilter(Filter):
             return mean, h @ own @ h.mT + rest
 
         group = step.gated(group, alike, at[..., None, :])
-        big = np.ascontiguousarray(slope)
-        if m.shape[-1] > d:
-            big = np.zeros((*slope.shape[:-1], m.shape[-1]))
-            big[..., here] = slope
+        big = np.zeros((*slope.shape[:-1], m.shape[-1]))
+        big[..., here] = slope
         noise = np.zeros((*big.shape[:-1], big.shape[-2])) + group.noise + extra
         (m, p), errors = guarded(
             lambda m, p, gap, big, noise, *_: unchecked(conditioned)(m, p, gap, big, noise),

@@ -36,25 +36,27 @@ class Heard:
     def __init__(self, agents: list[int], sensors: Sequence[tuple[Sensor, ...]]) -> None:
         self.agents = np.array(agents, dtype=np.intp)
         self.rows: Any = slice(None) if agents == [*range(len(sensors))] else self.agents
-        cells: dict[Sensor, list[tuple[int, int]]] = {}
+        places: dict[Sensor, list[tuple[int, int]]] = {}
         size = sum(s.dim for s in sensors[agents[0]])
         self.owner = np.zeros((len(agents), size), dtype=np.intp)
         for g, agent in enumerate(agents):
             at = 0
             for k, sensor in enumerate(sensors[agent]):
-                cells.setdefault(sensor, []).append((g, at))
+                places.setdefault(sensor, []).append((g, at))
                 self.owner[g, at : at + sensor.dim] = k
                 at += sensor.dim
         # Agents with one and the same sensor are predicted together: with which agents of the
-        # group a sensor's reading stands, and in which columns.
+        # group a sensor's reading stands, and in which cells.
         self.parts: list[tuple[Sensor, Any, Any]] = []
         noise = np.zeros((len(agents), size, size))
-        for sensor, found in cells.items():
+        for sensor, found in places.items():
             rows, starts = (np.array(c, dtype=np.intp) for c in zip(*found, strict=True))
             columns = starts[:, None] + np.arange(sensor.dim)
-            self.parts.append((sensor, rows, columns))
             across, down = columns[:, :, None], columns[:, None, :]
             noise[rows[:, None, None], across, down] = sensor.cov
+            whole = columns.shape == self.owner.shape  # the only sensor: views will do
+            cells: Any = (slice(None), slice(None)) if whole else (rows[:, None], columns)
+            self.parts.append((sensor, slice(None) if whole else rows, cells))
         self.noise = noise[0] if (noise == noise[:1]).all() else noise
         self.linear = all(sensor.linear is not None for sensor, *_ in self.parts)
         self.matrices: dict[int, Array] = {}
@@ -63,8 +65,8 @@ class Heard:
         """The matrices of linear sensors one below the other, (G, M, d), made once."""
         if dim not in self.matrices:
             h = np.zeros((*self.owner.shape, dim))
-            for sensor, rows, columns in self.parts:
-                h[rows[:, None], columns] = sensor.matrix(dim)
+            for sensor, _, cells in self.parts:
+                h[cells] = sensor.matrix(dim)
             self.matrices[dim] = h
         return self.matrices[dim]
 
@@ -90,10 +92,10 @@ class Heard:
         if self.linear:
             return np.asarray(states @ self.matrix(states.shape[-1]).mT)
         out = np.empty((*states.shape[:-2], self.target.shape[-1], states.shape[-2]))
-        for sensor, rows, columns in self.parts:
+        for sensor, rows, cells in self.parts:
             before = None if previous is None else previous[..., rows, :, :]
             seen = unchecked(sensor.predict)(states[..., rows, :, :], before)
-            out[..., rows[:, None], columns, :] = seen.swapaxes(-1, -2)
+            out[(..., *cells, slice(None))] = seen.swapaxes(-1, -2)
         out = np.ascontiguousarray(out.swapaxes(-1, -2))
         if not all_finite(out) and np.isinf(out).any():
             raise ValueError("predicted: needs finite numbers or NaN (missing), got infinity")
@@ -103,9 +105,9 @@ class Heard:
     def near(self, seen: Array, aim: Array) -> Array:
         """Predictions (*runs, G, N, M), now on the branch of an aim (*runs, G, 1, M); in place."""
         out, goal = seen.swapaxes(-1, -2), (aim + 0 * seen).swapaxes(-1, -2)
-        for sensor, rows, columns in self.parts:
+        for sensor, _, cells in self.parts:
             if sensor.difference is not None:
-                at = (..., rows[:, None], columns, slice(None))
+                at = (..., *cells, slice(None))
                 here, there = (x[at].swapaxes(-1, -2) for x in (out, goal))
                 # y* - wrap(y* - h)
                 gap = unchecked(sensor.residual)(there, here)
@@ -118,8 +120,8 @@ class Heard:
         if self.linear:
             return np.broadcast_to(self.matrix(d), (*self.target.shape, d))
         out = np.empty((*self.target.shape, d))
-        for sensor, rows, columns in self.parts:
-            out[..., rows[:, None], columns, :] = unchecked(sensor.jacobian)(states[..., rows, :])
+        for sensor, rows, cells in self.parts:
+            out[(..., *cells, slice(None))] = unchecked(sensor.jacobian)(states[..., rows, :])
         return out
 
     def gated(self, mean: Array, cov: Array, share: float) -> tuple[Heard, Array]:

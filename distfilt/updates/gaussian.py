@@ -17,8 +17,8 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ..doors import Array, NonNegative, Rng, door, unchecked
-from ..ensembles import Ensemble, about_mean, exact_noise
-from ..linalg import solve_definite
+from ..ensembles import Ensemble, about_mean, drawn_apart
+from ..linalg import cholesky, solve_definite
 from ..models import Model
 from .door import perturbed, update
 
@@ -142,7 +142,7 @@ def exact_draws(
     (0.5, 0.25)
     """
     a, b = about_mean(ensemble)[1], about_mean(predicted)[1]
-    draws = exact(np.concatenate([a, b], axis=-1), noise, rng)
+    draws = exact(np.concatenate([a, b], axis=-1), cholesky(noise), rng)
     gain = _gain(a, b, noise)
     return np.asarray(ensemble + (observed[..., None, :] - predicted - draws) @ gain)
 
@@ -266,20 +266,19 @@ def exact_forecast(
     >>> bool(abs(moved.mean()) < 1e-12), float(moved.var(ddof=1).round(12))
     (True, 1.0)
     """
-    moved = unchecked(model.step)(ensemble, t, dt)
-    q = model.noise(t, dt)
-    if not q.any():
+    moved, root = unchecked(model.step)(ensemble, t, dt), unchecked(model.root)(t, dt)
+    if not root.any():
         return moved
     bad = ~np.isfinite(moved).all(axis=(-2, -1), keepdims=True)
     clean = np.where(bad, ensemble, moved)
-    noisy = clean + exact(about_mean(clean)[1], q, rng)
+    noisy = clean + exact(about_mean(clean)[1], root, rng)
     # Members that the model lost stay lost, and do not take the others' noise with them.
     return np.where(bad, np.nan, noisy)
 
 
-def exact(avoid: Array, cov: Array, rng: Rng) -> Array:
+def exact(avoid: Array, root: Array, rng: Rng) -> Array:
     """Exact draws, (..., N, k), that say of an update's ensemble if it has too few members."""
     try:
-        return unchecked(exact_noise)(avoid, cov, rng=rng)
+        return drawn_apart(avoid, root, rng)
     except ValueError as error:
         raise ValueError(str(error).replace("anomalies_to_avoid", "ensemble")) from None
