@@ -169,7 +169,7 @@ class ParticleFilter(MembersFilter):
         """How far copies are moved apart: by default where the model never does it."""
         if self.jitter is not None:
             return self.jitter
-        still = not np.any(self.model.noise_cov(t, dt or 1.0))
+        still = not np.count_nonzero(self.model.noise_cov(t, dt or 1.0))
         return particles.silverman(self.members, self.model.dim) if still else 0.0
 
     def _pick(

@@ -159,23 +159,20 @@ class Step:
         own = [list(mine) for mine in self.said]
         for late in self.late:
             own[late.agent].append(late)
-        heard = [
-            {agent: [((said.t, sensor_of(f, said)), said.value) for said in mine]}
-            for agent, mine in enumerate(own)
-        ]
-        told = self._told(own)
+        told, inbox = self._told(own), [dict[int, Any]() for _ in own]
         if self.channel is not None and told:
             inbox = self.channel.exchange([self._payload(mine) for mine in told])
-            kinds = [[(said.t, sensor_of(f, said)) for said in mine] for mine in told]
-            for has, box in zip(heard, inbox, strict=True):
-                for sender, payload in box.items():
-                    values = payload if isinstance(payload, tuple) else (payload,)
-                    has[sender] = list(zip(kinds[sender], values, strict=False))
+        kinds = [[(said.t, sensor_of(f, said)) for said in mine] for mine in told]
         known: dict[float, list[list[tuple[Sensor, Array]]]]
         known = defaultdict(lambda: [[] for _ in own])
-        for agent, has in enumerate(heard):
-            for sender in sorted(has):
-                for (t, sensor), value in has[sender]:
+        for agent, (mine, box) in enumerate(zip(own, inbox, strict=True)):
+            for sender in sorted((agent, *box)):
+                if sender == agent:
+                    for said in mine:
+                        known[said.t][agent].append((sensor_of(f, said), said.value))
+                    continue
+                values = box[sender] if isinstance(box[sender], tuple) else (box[sender],)
+                for (t, sensor), value in zip(kinds[sender], values, strict=False):
                     known[t][agent].append((sensor, value))
         return known
 

@@ -39,10 +39,13 @@ def wrap(angles: Annotated[Array, "...", MISSING], *, period: Positive = 2 * np.
     -1.570796
     """
     half = 0.5 * period
+    inside = (angles >= -half) & (angles < half)
+    if inside.all():
+        return np.array(angles)
     moved = (angles + half) % period - half
     # Rounding can put an angle just below -half at +half, which stands for the same direction.
     moved = np.where(moved >= half, -half, moved)
-    return np.asarray(np.where((angles >= -half) & (angles < half), angles, moved))
+    return np.asarray(np.where(inside, angles, moved))
 
 
 @dataclass(frozen=True, eq=False)
