@@ -58,17 +58,16 @@ class _Plan:
         known = signature(self.function).parameters.values()
         return {p.name: p.default for p in known if p.default is not Parameter.empty}
 
-    def taken(
-        self, args: tuple[Any, ...], options: dict[str, Any]
-    ) -> tuple[list[Any], dict[str, Any]]:
-        """The arguments converted, or the error for the first that does not fit."""
+    def taken(self, args: tuple[Any, ...], options: dict[str, Any]) -> dict[str, Any]:
+        """The arguments by name, converted, or the error for the first that does not fit."""
         given = dict(zip(self.row, args, strict=False)) | options
+        if len(given) < len(args) + len(options):  # too many, or one of them twice
+            signature(self.function).bind(*args, **options)
         scope = Scope(self.defaults | given)
         for name, kind in self.kinds.items():
             if name in given:
-                scope.values[name] = kind.take(given[name], name, scope)
-        row = [scope.values[name] for name in self.row[: len(args)]]
-        return [*row, *args[len(row) :]], {name: scope.values[name] for name in options}
+                given[name] = scope.values[name] = kind.take(given[name], name, scope)
+        return given
 
 
 def door(function: F) -> F:
@@ -102,8 +101,7 @@ def door(function: F) -> F:
 
     @wraps(function)
     def checked(*args: Any, **options: Any) -> Any:
-        row, given = plan.taken(args, options)
-        return function(*row, **given)
+        return function(**plan.taken(args, options))
 
     checked.unchecked = function  # type: ignore[attr-defined]
     checked.plan = plan  # type: ignore[attr-defined]

@@ -96,7 +96,7 @@ def _callable(value: Any, name: str, scope: Scope) -> Any:
     if plan is None:
         return value
     # Loops call it without its door, so the options that a partial holds are looked at here.
-    return partial(value.func, *value.args, **plan.taken((), value.keywords)[1])
+    return partial(value.func, *value.args, **plan.taken((), value.keywords))
 
 
 def _one_of(options: tuple[Any, ...], value: Any, name: str, scope: Scope) -> Any:

@@ -79,8 +79,7 @@ def update(function: F) -> F:
 
     @wraps(function)
     def checked(*args: Any, **options: Any) -> Array:
-        placed, named = plan.taken(args, options)
-        given = dict(zip(plan.row, placed, strict=False)) | named
+        given = plan.taken(args, options)
         return function(**given | _related({name: given[name] for name in names}))
 
     made: Any = checked
