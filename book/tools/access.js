@@ -31,30 +31,39 @@ heads.forEach((h, k) => { if (h > (k ? heads[k - 1] : 0) + 1) found.push("headin
 if (all("main, [role=main]").filter(seen).length !== 1) found.push("not one main part");
 const marks = "main, nav, header, footer, aside, dialog, [role=main], [role=navigation], "
   + "[role=banner], [role=search], [role=complementary], [role=contentinfo], .skip-link, button";
-const texts = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT), colours = {};
+const once = (make) => { const known = new Map();
+  return (e) => { if (!known.has(e)) known.set(e, make(e)); return known.get(e); }; };
+const within = (query) => {
+  const is = once((e) => e !== null && (e.matches(query) || is(e.parentElement)));
+  return is;
+};
+const [unseen, part, exempt] = ["script, style, noscript, template, mjx-assistive-mml", marks,
+  "svg, [disabled], .MathJax_Preview"].map(within);
 const paint = document.createElement("canvas").getContext("2d", {willReadFrequently: true});
-const rgb = (colour) => colours[colour] || (colours[colour] = (() => {
+const rgb = once((colour) => {
   paint.clearRect(0, 0, 1, 1); paint.fillStyle = colour; paint.fillRect(0, 0, 1, 1);
   return [...paint.getImageData(0, 0, 1, 1).data];
-})());
+});
 const over = (top, low) => low.map((v, k) => k < 3 ? (top[k] * top[3] + v * (255 - top[3])) / 255 : 255);
+const back = once((e) => e ? over(rgb(getComputedStyle(e).backgroundColor), back(e.parentElement))
+  : [255, 255, 255, 255]);
 const light = (c) => c.slice(0, 3).map(v => v / 255)
   .map(v => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
   .reduce((s, v, k) => s + v * [0.2126, 0.7152, 0.0722][k], 0);
-const outside = new Set();
-while (texts.nextNode()) {
-  const e = texts.currentNode.parentElement;
-  if (!texts.currentNode.data.trim() || e.closest("script, style, noscript, template") || !seen(e)) continue;
-  const top = [...document.body.children].find(c => c.contains(e));
-  if (!e.closest(marks) && !outside.has(top)) { outside.add(top); told("outside of all parts", e); }
-  if (e.closest("svg, mjx-assistive-mml, [disabled], .MathJax_Preview")) continue;
-  const layers = [];
-  for (let a = e; a; a = a.parentElement) layers.push(rgb(getComputedStyle(a).backgroundColor));
-  const back = layers.reverse().reduce((low, top) => over(top, low), [255, 255, 255, 255]);
+const texts = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+const holders = new Set(), outside = new Set();
+while (texts.nextNode()) if (texts.currentNode.data.trim()) holders.add(texts.currentNode.parentElement);
+for (const e of holders) {
+  if (unseen(e) || !seen(e)) continue;
+  if (!part(e)) {
+    const top = [...document.body.children].find(c => c.contains(e));
+    if (!outside.has(top)) { outside.add(top); told("outside of all parts", e); }
+  }
+  if (exempt(e)) continue;
   const style = getComputedStyle(e), size = parseFloat(style.fontSize);
-  const [x, y] = [light(over(rgb(style.color), back)), light(back)].sort((p, q) => q - p);
+  const [x, y] = [light(over(rgb(style.color), back(e))), light(back(e))].sort((p, q) => q - p);
   const large = size >= 24 || size >= 18.66 && +style.fontWeight >= 700;
-  if ((x + 0.05) / (y + 0.05) < (large ? 3 : 4.5)) told("faint " + style.color + " on " + back, e);
+  if ((x + 0.05) / (y + 0.05) < (large ? 3 : 4.5)) told("faint " + style.color + " on " + back(e), e);
 }
 const kinds = new Map();
 for (const e of all("a[href], button, input, summary")) if (seen(e) && !kinds.has(e.tagName + e.className))

@@ -62,6 +62,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from common import BOOK, ROOT, SLIDER, VERDICT, chosen
 
 KNOWN = Path(__file__).with_suffix(".csv")
@@ -673,6 +675,25 @@ def factors(unit: str) -> tuple[float, ...]:
     return (1.0, *(UNITS[unit] if unit else ()))
 
 
+def nearby(facts: list[Fact]) -> Callable[[Numeral], list[Fact]]:
+    """What finds the facts that a numeral may mean, a few of thousands, for `trace` to judge."""
+    low, high = np.array([(f.low, f.high) for f in facts], dtype=float).reshape(-1, 2).T
+
+    def near(n: Numeral) -> list[Fact]:
+        scale = np.array(factors(n.unit))
+        values, half = n.value * scale, 0.501 * n.step * scale
+        with np.errstate(divide="ignore"):
+            targets = np.concatenate([values, 1 / values, 1 + values, 1 - values])[:, None]
+        printed = np.pad(half, (0, 3 * len(half)))[:, None]
+        reach = 1e-9 + 1e-6 * abs(targets) + printed
+        narrow = high - low <= 0.41 * abs(values).max()
+        inside = (low - reach <= targets) & (targets <= high + reach) & narrow
+        meets = inside | (abs(abs(low) - abs(targets)) <= reach)
+        return [facts[k] for k in np.flatnonzero(meets.any(axis=0))]
+
+    return near
+
+
 def trace(n: Numeral, facts: list[Fact]) -> str:
     """Where a numeral comes from, or ''; the strongest trace first."""
     best: dict[str, str] = {}
@@ -810,16 +831,16 @@ def main() -> int:
         numerals, facts = read(source)
         text = " ".join(source.read_text(encoding="utf-8").split())
         own = [row for row in known if row["chapter"] == source.stem]
-        counts, lucky, tries = Counter[str](), 0, 0
+        counts, lucky, tries, near = Counter[str](), 0, 0, nearby(facts)
         for n in numerals:
             if n.kind:
                 n.source = n.kind
             else:
-                n.source = trace(n, facts)
+                n.source = trace(n, near(n))
                 if n.source and not n.source.startswith("beside"):
                     changed = list(others(n))
                     tries += len(changed)
-                    found = [trace(other, facts) for other in changed]
+                    found = [trace(other, near(other)) for other in changed]
                     lucky += sum(bool(f) and f[:6] != "beside" for f in found)
                 elif not n.source:
                     listed = (r for r in own if r["phrase"] in n.sentence and n.text in r["phrase"])

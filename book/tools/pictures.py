@@ -14,11 +14,11 @@ import base64
 import binascii
 import io
 import re
+from functools import reduce
 from typing import Any
 
 import nbformat
-import numpy as np
-from PIL import Image
+from PIL import Image, ImageChops
 
 # A picture is told from other text by its own first bytes; a notebook escapes quotes.
 _EMBEDDED = re.compile(
@@ -70,7 +70,7 @@ def lighter(picture: str) -> str:
     if image.mode == "P" or (image.mode == "RGBA" and image.getextrema()[3][0] < 255):
         return picture
     palette = image.convert("RGB").quantize(256, kmeans=1, dither=Image.Dither.NONE)
-    if (_moved(_shades(image), _shades(palette)) > TINT).mean() > TINTED:
+    if _moved(image, palette, TINT) > TINTED:
         return picture
     out = io.BytesIO()
     palette.save(out, "png", optimize=True, dpi=image.info.get("dpi", (72, 72)))
@@ -84,12 +84,11 @@ def lighten(outputs: list[Any]) -> None:
             output["data"]["image/png"] = lighter(output["data"]["image/png"])
 
 
-def _shades(image: Image.Image) -> np.ndarray:
-    return np.asarray(image.convert("RGB"), dtype=np.int16)
-
-
-def _moved(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    return np.asarray(np.abs(one - other).max(axis=-1))
+def _moved(one: Image.Image, other: Image.Image, by: float) -> float:
+    """The share of pixels of which a colour differs by more than `by` of 255."""
+    bands = ImageChops.difference(one.convert("RGB"), other.convert("RGB")).split()
+    counts = reduce(ImageChops.lighter, bands).histogram()
+    return sum(counts[int(by) + 1 :]) / sum(counts)
 
 
 def difference(one: str, other: str) -> str:
@@ -97,12 +96,12 @@ def difference(one: str, other: str) -> str:
     if one.strip() == other.strip():
         return ""
     try:
-        a, b = (_shades(Image.open(io.BytesIO(base64.b64decode(p)))) for p in (one, other))
+        a, b = (Image.open(io.BytesIO(base64.b64decode(p))) for p in (one, other))
+        share = _moved(a, b, 255 * SHADE) if a.size == b.size else 1.0
     except (OSError, ValueError, binascii.Error):
         return "is no picture"
-    if a.shape != b.shape:
-        return f"has {a.shape[1]} x {a.shape[0]} pixels, not {b.shape[1]} x {b.shape[0]}"
-    share = float((_moved(a, b) > 255 * SHADE).mean())
+    if a.size != b.size:
+        return f"has {a.width} x {a.height} pixels, not {b.width} x {b.height}"
     return f"differs in {share:.2%} of its pixels" if share > SHARE else ""
 
 

@@ -98,7 +98,7 @@ class Slider:
 
     def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
         still = io.BytesIO()
-        Image.open(io.BytesIO(self.frames[self.start])).save(still, "png", optimize=True)
+        Image.open(io.BytesIO(self.frames[self.start])).save(still, "png", compress_level=1)
         return {
             "text/plain": repr(self),
             "text/html": self.html,
