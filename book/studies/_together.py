@@ -7,6 +7,9 @@ Cells draw from generators of their own, so that any of them can be run again al
 
 from __future__ import annotations
 
+import ast
+import hashlib
+import inspect
 import sys
 import warnings
 import zlib
@@ -15,6 +18,7 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cache, partial
 from typing import Any
 
+import _together_mixtures
 import numpy as np
 from _together_mixtures import Mixtures
 
@@ -472,8 +476,9 @@ class GridState(filters.SensorState):
 class GridFilter(filters.Filter):
     """Beliefs on the cells of a square, which is exact but for the cells' size; for `ranges`.
 
-    An agreement is one of vectors: of the agents' log-beliefs, whose average is the geometric mean,
-    or with `likelihoods` of what their readings say, which is then multiplied by A.
+    Readings have errors that are independent of each other. An agreement is one of vectors: of the
+    agents' log-beliefs, whose average is the geometric mean, or with `likelihoods` of what their
+    readings say, which is then multiplied by A.
     """
 
     _: KW_ONLY
@@ -510,7 +515,11 @@ class GridFilter(filters.Filter):
             a = heard.agents
             seen = heard.predict(np.broadcast_to(self.centres, (*said[..., a, :].shape, 2)))
             gap = np.nan_to_num(heard.target[..., None, :] - seen) ** 2
-            said[..., a, :] = -0.5 * (gap / heard.noise[0, 0]).sum(axis=-1)
+            # (M,), or (G, M) of agents whose readings have errors of their own.
+            variance = np.diagonal(heard.noise, axis1=-2, axis2=-1)
+            if np.count_nonzero(heard.noise) > np.count_nonzero(variance):
+                raise ValueError("sensors: needs independent errors for a grid, got correlated")
+            said[..., a, :] = -0.5 * (gap / variance[..., None, :]).sum(axis=-1)
         if self.likelihoods:
             (said,) = step.agreed(said)
             return step.end(logs=logs + self.count * said)
@@ -943,4 +952,23 @@ def loose(names: Iterable[str]) -> list[str]:
     return [c for c in columns_of(names) if c.startswith(apart)]
 
 
-code = (scored, measured, flooded, referred, compared)
+@cache
+def program() -> str:
+    """A digest of all that stands here and beside, but for comments and docstrings.
+
+    The studies store it: a filter, a cell's options or a problem that is another one is noticed.
+    """
+    text = ""
+    for module in (sys.modules[__name__], _together_mixtures):
+        tree = ast.parse(inspect.getsource(module))
+        for node in ast.walk(tree):
+            parts = vars(node).get("body", [])
+            if isinstance(parts, list):
+                node.body = [part for part in parts if not is_text(part)]
+        text += ast.unparse(tree)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def is_text(node: ast.AST) -> bool:
+    """Whether this is a string that stands alone."""
+    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)

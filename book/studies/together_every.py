@@ -17,10 +17,9 @@ NAME, PAPER = "every", "together"
 CELLS = {p: (*together.references(together.problem(p)), *together.cells_of(p))
          for p in together.FOUR}  # fmt: skip
 columns = together.columns_of(f"{p}_{c}" for p, cells in CELLS.items() for c in cells)
-parameters = {"batch": together.BATCH, "cells": CELLS}
+parameters = {"batch": together.BATCH, "program": together.program(), "cells": CELLS}
 seeds = together.seeds_of()
 scenarios = (*(together.problem(p).scenario for p in CELLS), together.STUDY, together.TUNED)
-code = together.code
 rtol = 1e-4
 rough = [f"{p}_{k}" for p, cells in CELLS.items() for k in together.loose(cells)]
 

@@ -13,10 +13,9 @@ import _together as together
 NAME, PAPER = "held", "together"
 CELLS = {p: ("reference", *together.cells_of(p)) for p in together.THREE}
 columns = together.columns_of([f"{p}_{c}" for p, cells in CELLS.items() for c in cells])
-parameters = {"batch": together.BATCH, "cells": CELLS}
+parameters = {"batch": together.BATCH, "program": together.program(), "cells": CELLS}
 seeds = np.random.SeedSequence(together.STUDY["seed"] + 2).spawn(len(together.seeds_of()))
 scenarios = (together.HELD, together.STUDY, together.TUNED)
-code = together.code
 rtol, rough = 1e-4, columns
 
 

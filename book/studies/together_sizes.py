@@ -36,11 +36,11 @@ COLUMNS = [*(f"{p}_members_{n}_{c}" for p, c, n in BY_MEMBERS),
            *(f"{p}_agents_{a}_reference" for p in GROWN for a in RINGS[p]),
            *(f"{p}_members_reference" for p in ("range", "lorenz"))]  # fmt: skip
 columns = together.columns_of(COLUMNS)
-parameters = {"batch": together.BATCH, "members": MEMBERS, "agents": AGENTS}
+parameters = {"batch": together.BATCH, "members": MEMBERS, "agents": AGENTS,
+              "program": together.program()}  # fmt: skip
 seeds = np.random.SeedSequence(together.STUDY["seed"] + 1).spawn(len(together.seeds_of()))
 scenarios = (*(together.problem(p).scenario for p in ("linear", "range", "lorenz")),
              together.STUDY, together.TUNED)  # fmt: skip
-code = together.code
 rtol, rough = 1e-4, columns
 
 

@@ -22,10 +22,10 @@ VALUES = range(5)
 TRIED = {p: [c for c, cell in together.CELLS.items() if cell.grid and not cell.why_empty(p)]
          for p in together.FOUR}  # fmt: skip
 columns = [f"{p}_{c}_{k}" for p, cells in TRIED.items() for c in cells for k in VALUES]
-parameters = {"runs": RUNS, "grids": {c: v.grid for c, v in together.CELLS.items() if v.grid}}
+parameters = {"runs": RUNS, "grids": {c: v.grid for c, v in together.CELLS.items() if v.grid},
+              "program": together.program()}  # fmt: skip
 seeds = np.random.SeedSequence(SEED).spawn(1)
 scenarios = (*(together.problem(p).scenario for p in together.FOUR), together.STUDY)
-code = (together.log_scores, together.flooded)
 rtol, rough = 1e-3, [c for c in columns if any(k in c for k in ("_pf_", "_ot_", "_maps_", "_gm_"))]
 
 
