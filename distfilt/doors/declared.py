@@ -118,7 +118,7 @@ def unchecked(function: F) -> F:
     """
     given: Any = function
     if isinstance(given, MethodType):
-        given = MethodType(unchecked(given.__func__), given.__self__)
+        given = MethodType(getattr(given, "unchecked", given.__func__), given.__self__)
     elif isinstance(given, partial):
         given = partial(unchecked(given.func), *given.args, **given.keywords)
     else:

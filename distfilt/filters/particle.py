@@ -187,11 +187,11 @@ class ParticleFilter(MembersFilter):
 
     def _warn(self, state: ParticleState) -> None:
         """Distinct particles may have no weight, and particles of equal weight may be copies."""
-        if state.failed.all():
-            return
         points, size = state.points, state.effective_size
-        if state.failed.any():
+        if np.count_nonzero(state.failed):
             points, size = points[~state.failed], size[~state.failed]
+        if not size.size:
+            return
         least = max(0.01 * self.members, 2.0)
         # A few that differ are proof enough; all are looked at only where they do not.
         few = points[..., :: max(1, self.members // (4 * math.ceil(least))), :]

@@ -203,5 +203,6 @@ def unscented_points(
         raise ValueError(f"kappa: needs a number above {-d}, got {kappa:g}")
     moves = np.sqrt(d + kappa) * root.mT
     moves = np.concatenate([0 * moves[..., :1, :], moves, -moves], axis=-2)
-    weights = np.array([kappa, *[0.5] * (2 * d)]) / (d + kappa)
+    weights = np.full(2 * d + 1, 0.5 / (d + kappa))
+    weights[0] = kappa / (d + kappa)
     return mean[..., None, :] + moves, weights

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..coupling.transform import normalised
-from ..doors import Array, Bounds, Mask, Rng, Semidefinite, Weights, door, unchecked
+from ..doors import Array, Bounds, Mask, Rng, Semidefinite, Weights, all_finite, door, unchecked
 from ..linalg import cholesky, factor, log_sum, solve_lower
 
 __all__ = ["ParticleCollapse", "effective_size", "jitter", "resampled"]
@@ -195,7 +195,7 @@ def weighed(log_weights: Array, predicted: Array, observed: Array, noise: Array)
     """Log-weights (..., N), normalised, after a reading; refused where it rules out every point."""
     joint = log_weights + log_likelihood(predicted, observed, noise)
     total = log_sum(joint)
-    if not np.isfinite(total).all():
+    if not all_finite(total):
         raise ArithmeticError("every particle has a likelihood of zero")
     # A weight of zero is minus infinity; kept finite, so that it can be told from failure.
     return np.asarray(np.maximum(joint - total, -1e300))
@@ -207,7 +207,7 @@ def log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
     seen = np.ascontiguousarray(predicted.mT)
     gap, cov = observed[..., None] - seen, noise
     missing = np.isnan(observed)
-    if np.isnan(seen).any():
+    if not all_finite(seen):
         missing = missing | np.isnan(seen).any(axis=-1)
     if missing.any():
         # A missing component gets a zero residual and a unit of its own in R.
