@@ -4,7 +4,9 @@ The network has five agents, 13 components and 200 members; known noise and cova
 or exact draws and moments. A step is held against the same by numpy, with nothing checked and no
 message charged: the model's motion, the draws, the gains, and the fusion of moments by weights that
 are given. Exact draws are projected there too; the search for the weights of least determinant,
-which the second filter makes besides, is not in its floor. Misses above the limits.
+which the second filter makes besides, is not in its floor. Nor are the sensors, for which a
+component stands, nor the transport that moves members least: Cholesky factors move them there.
+Misses above the limits.
 """
 
 from __future__ import annotations
