@@ -21,7 +21,7 @@ from ..density import (
 )
 from ..density.kernel import fine_enough
 from ..density.sharing import Seen, alone, present_graph
-from ..doors import Array, Bounds, Count, NonNegative, Places, Positive, array, unchecked
+from ..doors import MISSING, Array, Bounds, Count, NonNegative, Places, Positive, array, unchecked
 from ..network import Channel, Graph
 from ..network.graphs import as_graph
 from .base import Filter
@@ -63,7 +63,7 @@ class DensityState(State):
     (1, 4)
     """
 
-    positions: Array
+    positions: Annotated[Array, "A d", MISSING]
     carried: tuple[Array, ...]
     observed: Array
     counted: Array

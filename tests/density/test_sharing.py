@@ -70,7 +70,7 @@ def test_the_whole_chain_does_not_depend_on_units(unit: float, rule: object) -> 
     """Swarm, grid, modes, prior, kernels, sharing and filters; defaults go with the box."""
     inside = rotating_swarm("gibbs")
 
-    def made(u: float) -> tuple[np.ndarray, np.ndarray]:
+    def made(u: float) -> tuple[np.ndarray, ...]:
         swarm = Swarm(lambda x, t: u * inside.drift_at(x / u, t), u**2 * 0.03, low=[0.0, 0.0],
                       high=[u, u])
         grid = Grid((10, 10), high=[u, u])
@@ -79,7 +79,8 @@ def test_the_whole_chain_does_not_depend_on_units(unit: float, rule: object) -> 
         state = f.start(u * X[0])
         for k in range(4):
             state = f.step(state, 0.1 * (k + 1), u * X[k % 2])
-        return u**2 * state.estimates, u**4 * state.variances
+        mass = f.summary(state).numbers["mass"]
+        return u**2 * state.estimates, u**4 * state.variances, mass
 
     for got, wanted in zip(made(unit), made(1.0), strict=True):
         assert np.abs(got - wanted).max() < 1e-9 * np.abs(wanted).max()

@@ -23,7 +23,7 @@ from distfilt.density import (
 from distfilt.filters import DensityFilter, DensityState
 from distfilt.filters.record import final_state
 from distfilt.models import rotating_swarm
-from distfilt.network import Graph, graphs
+from distfilt.network import Faults, Graph, graphs
 
 SIZE, H = 12, 0.12
 GRID = Grid((10, 10))
@@ -121,6 +121,9 @@ def test_agents_that_go_are_left_out_and_their_filters_go_on() -> None:
         ) < 1e-13
     assert np.isnan(state.positions[5]).all() and np.isfinite(state.estimates).all()
     assert np.trace(state.filters.information[5]) < np.trace(state.filters.information[4])
+    gone = np.where(np.arange(SIZE)[:, None] == 0, np.nan, START)
+    state = last(make(graphs.complete(SIZE), DynamicAverage(modes=30)), gone[None], gone)
+    assert np.allclose(state.counted[1:], SIZE - 1)
 
 
 def test_a_network_that_falls_apart_is_in_the_ledger() -> None:
@@ -175,7 +178,9 @@ def test_directed_graphs_flood_and_average() -> None:
     assert (state.carried[0][3][:, 2] > 0).sum() == 9
     averaged = last(make(one_way, DynamicAverage(modes=None)))
     y = kernel_density(PATH[-1], GRID, bandwidth=H)
-    assert np.abs(averaged.observed.mean(axis=0) - y).max() < 1e-12
+    lossy = make(graphs.ring(SIZE), DynamicAverage(modes=None), faults=Faults(loss=0.3))
+    for rule in (averaged, last(lossy)):
+        assert np.abs(rule.observed.mean(axis=0) - y).max() < 1e-12
     with pytest.raises(ValueError, match="both ways"):
         last(make(one_way, PIConsensus()))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -62,17 +63,6 @@ def test_gaussian_smoothing_is_the_smoother(rule: str) -> None:
     assert np.allclose(out["covariance"].values[..., 0, :, :], exact.covariances, atol=1e-11)
 
 
-@pytest.mark.parametrize("rule", ["extended", "unscented"])
-def test_agreement_moves_the_past_along(rule: str) -> None:
-    """After fusion with an agent who knows the present exactly, the past is known better too."""
-    sensors = [direct([0, 1], std=1e-4), None]
-    f = GaussianFilter(model(), sensors, graphs.path(2), share=False, lag=1, rule=rule,
-                       agreement=partial(covariance_intersection, rule="min_determinant"))
-    state = f.step(f.start(PRIOR), 0.1, [[0.3, 0.2], None])
-    ((_, past),) = f.past(state)
-    assert past.variance[1].max() < 0.5 * PRIOR[1].diagonal().min()
-
-
 def test_unscented_points_see_a_curve() -> None:
     """E[x²] of N(m, P) is m² + P: exact with points, not with the derivative at the mean.
 
@@ -116,6 +106,8 @@ def test_a_member_that_was_picked_or_moved_sees_changes_from_where_it_comes() ->
     after = f.step(state, 2.0, [still, None])
     assert np.ptp(state.weights[0]) > 0.01 and np.ptp(after.weights) < 1e-15
     assert (state.points[0] == state.points[1]).all() and (after.points[0] != after.points[1]).any()
+    kept = replace(f, threshold=0.2).step(state, 2.0, [None] * 2)
+    assert (kept.points == state.points).all() and (kept.weights == state.weights).all()
     g = EnsembleFilter(STILL, eyes, members=50, lag=1)
     state = g.step(g.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [None])
     told, not_told = (g.step(state, 2.0, [y], late=[first]).ensembles for y in ([still], None))
@@ -144,15 +136,6 @@ def test_particles_tend_to_the_kalman_filter_with_a_full_noise() -> None:
     assert (run["effective_size"].values > 1000).all() and (run["distinct"].values > 0.03).all()
 
 
-def test_collapse_warns_with_step_and_share() -> None:
-    """A model without noise: copies never part, although their weights look perfect."""
-    f = ParticleFilter(STILL, [direct([0], std=0.01)], members=800, jitter=0.0)
-    start = f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0))
-    with pytest.warns(ParticleCollapse, match=r"t = \d s: 0\.\d+% of an agent's particles"):
-        run = f.run(start, np.arange(1.0, 7.0), [np.zeros((6, 1))])
-    assert run["distinct"].values[-1] < 0.01
-
-
 def test_copies_are_regularised_by_default_where_the_model_never_parts_them() -> None:
     """Of a constant the posterior is known; the kernel widens it by less than a tenth or so."""
     f = ParticleFilter(STILL, [direct([0], std=0.5)], members=4000)
@@ -167,11 +150,17 @@ def test_copies_are_regularised_by_default_where_the_model_never_parts_them() ->
 
 @pytest.mark.parametrize("jitter", [0.0, 0.3])
 def test_one_weight_for_all_warns_although_the_particles_are_distinct(jitter: float) -> None:
+    """Its copies are moved apart by a share of what the cloud was, or nothing parts them."""
     f = ParticleFilter(STILL, [direct([0], std=1e-4)], members=800, jitter=jitter)
     start = f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0))
     with pytest.warns(ParticleCollapse, match=r"t = 1 s: an agent's weights .* size of 1\.\d;"):
-        summary = f.summary(f.step(start, 1.0, [[0.5]]))
+        state = f.step(start, 1.0, [[0.5]])
+    summary = f.summary(state)
     assert summary.numbers["distinct"] == 1.0 and summary.numbers["effective_size"] < 2
+    told = pytest.warns(ParticleCollapse, match=r"t = 2 s: 0\.\d+% of an agent's particles")
+    with nullcontext() if jitter else told:
+        after = f.step(state, 2.0, [None])
+    assert np.allclose(after.points.std(), jitter * state.points.std(), rtol=0.1, atol=1e-4)
 
 
 def test_copies_of_one_particle_warn_at_any_number() -> None:

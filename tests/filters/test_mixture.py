@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -28,11 +29,13 @@ TWO = MixtureFilter(SMALL, [direct([0], std=0.5), None], graphs.path(2), target_
 
 
 def test_one_agent_is_a_kalman_filter_with_gaps() -> None:
-    f = MixtureFilter(LINEAR, [SEE], target_dim=1)
+    growing, steps = replace(LINEAR, noise_cov=lambda t, dt: (1 + t) * Q), np.arange(1.0, 5.0)
+    f = MixtureFilter(growing, [SEE], target_dim=1)
     y = np.random.default_rng(0).standard_normal((4, 2))
     y[1, 0] = y[3, 1] = np.nan
-    *_, last = f.steps(f.start([PRIOR]), np.arange(1.0, 5.0), [y])
-    exact = kalman_filter(*PRIOR.moments(), y, F=PUSH, Q=Q, H=SEE.matrix(3), R=SEE.cov)
+    *_, last = f.steps(f.start([PRIOR]), steps, [y])
+    q = steps[:, None, None] * Q
+    exact = kalman_filter(*PRIOR.moments(), y, F=PUSH, Q=q, H=SEE.matrix(3), R=SEE.cov)
     mean, cov = last.mixtures[0].moments()
     assert np.allclose(mean, exact.means[-1], atol=1e-6)
     assert np.allclose(cov, exact.covariances[-1], atol=1e-6)
@@ -62,13 +65,6 @@ def test_only_the_target_marginal_is_heard() -> None:
     a, b = (three.step(three.start([OTHER, OTHER, m]), 1.0, [None] * 3) for m in (OTHER, far))
     assert np.array_equal(a.mixtures[0].means, b.mixtures[0].means)
     assert not np.array_equal(a.mixtures[1].means, b.mixtures[1].means)
-
-
-def test_a_wild_reading_does_not_empty_the_mixture() -> None:
-    free = MixtureFilter(SMALL, [direct([0], std=0.1)], target_dim=1)
-    wild = free.step(free.start([OTHER]), 1.0, [[1e6]])
-    assert np.isfinite(wild.mixtures[0].means).all()
-    assert np.isclose(wild.mixtures[0].weights.sum(), 1)
 
 
 MEO = np.array([26491.58, 2980.266, -357.1760, -173.028, 2191.596, 3178.45])
@@ -105,18 +101,6 @@ def test_a_reading_of_an_occulted_target_is_refused_and_a_missing_one_is_not() -
     fix[2:] = -MEO
     after = f.step(state, 0.0, [fix]).mixtures[0]
     assert np.sqrt(after.covs[0, 0, 0]) < 2e-3
-
-
-def test_a_mixand_that_cannot_see_the_target_contradicts_a_reading() -> None:
-    f, state = in_orbit(MEO, GEO)
-    one = state.mixtures[0]
-    away = np.concatenate([-MEO, GEO])
-    two = GaussianMixture([0.1, 0.9], np.stack([one.means[0], away]), np.repeat(one.covs, 2, 0))
-    y = np.full(8, np.nan)
-    y[:2] = line_of_sight(std=1e-4).predict(one.means[0])
-    after = f.step(f.start([two]), 0.0, [y]).mixtures[0]
-    alone = f.step(state, 0.0, [y]).mixtures[0]
-    assert after.size == 1 and np.array_equal(after.means, alone.means)
 
 
 def test_an_agreement_that_loses_definiteness_is_refused() -> None:

@@ -77,6 +77,9 @@ def test_a_run_is_its_steps_whether_saved_or_not(family: str, tmp_path: Path) ->
         state = f.step(state, t, [s[k] for s in seen])
         state.save(tmp_path / "state.npz")
         state = type(state).load(tmp_path / "state.npz")
+        if k == 0:
+            rest = f.run(state, times[1:], [s[1:] for s in seen])
+            assert np.array_equal(rest["scalars"], run["scalars"][1:])
         again = f.summary(state)
         assert np.array_equal(run["mean"].values[k], again.mean, equal_nan=True)
         assert np.array_equal(run["variance"].values[k], again.variance, equal_nan=True)
@@ -188,6 +191,9 @@ def test_each_reading_is_judged_alone() -> None:
     assert a.refused.tolist() == [1, 1, 1] and np.array_equal(a.means, b.means)
     run = f.run(start, [0.1], [[good], [wild], None])
     assert run["refused"].values.tolist() == [[1, 1, 1]]
+    f, start, _, _ = made("gaussian", gate=0.999, lag=1)
+    blind, late = f.step(start, 0.1, [None] * 3), Reading(0.1, 0, [40.0])
+    assert f.step(blind, 0.4, [None, wild, None], late=[late]).refused.tolist() == [2, 2, 2]
     still = LinearModel.from_transition(1, lambda h: np.eye(1), lambda t, h: np.zeros((1, 1)))
     bowl = Sensor(1, np.square, [[0.5]])  # of N(0, 1): mean 1, variance 1 by the points, slope 0
     f = GaussianFilter(still, [bowl], rule="unscented", gate=0.95)

@@ -73,8 +73,9 @@ def test_run_axes_broadcast() -> None:
     one = kalman_filter(means[2], covs[1, 0], y[:, 1, 2], **p)
     np.testing.assert_allclose(run.means[:, 1, 2], one.means, rtol=0, atol=1e-12)
     np.testing.assert_allclose(run.covariances[:, 1, 2], one.covariances, rtol=0, atol=1e-12)
-    series = kalman_filter(means, spd(rng, D), y[:, 0, 0], **p)  # many priors, one series
-    assert series.means.shape == (STEPS, 3, D)
+    many = np.stack([means, -means, 2 * means])  # nine priors, three series
+    series = kalman_filter(many, covs[1, 0], y[:, 1], **p).means
+    np.testing.assert_allclose(series[:, 0, 2], one.means, rtol=0, atol=1e-12)
 
 
 def test_no_steps_and_no_runs() -> None:

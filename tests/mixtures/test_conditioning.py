@@ -174,5 +174,3 @@ def test_the_most_stretched_are_split_while_there_is_room() -> None:
     assert split_stretched(two, slope, most=50, stretch=0.6).size == 6
     assert split_stretched(two, slope, most=3, stretch=0.6) is two
     assert split_stretched(two, slope, most=50, stretch=2.5) is two
-    with pytest.raises(ValueError, match="^most: needs"):
-        split_stretched(two, slope, most=0, stretch=0.6)

@@ -108,6 +108,9 @@ def test_the_heaviest_absorb_the_others_first() -> None:
     means = [[0.0], [9.0], [1.0], [2.0]]
     q = GaussianMixture([0.45, 0.45, 0.1, 0.0], means, np.ones((4, 1, 1)))
     assert np.allclose(runnalls(q, 2, heaviest=2).weights, [0.55, 0.45])
+    # Near is what costs little: a wide one takes in what a narrow one stands closer to.
+    q = GaussianMixture([0.45, 0.45, 0.1], [[0.0], [4.0], [1.5]], [[[0.01]], [[9.0]], [[1.0]]])
+    assert np.allclose(runnalls(q, 2, heaviest=2).weights, [0.45, 0.55])
     with pytest.raises(ValueError, match="^heaviest: needs an integer of at least size, 3, got 2"):
         runnalls(q, 3, heaviest=2)
 

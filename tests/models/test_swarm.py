@@ -50,6 +50,8 @@ def test_score_far_away_is_finite() -> None:
 def test_mixture_goes_round() -> None:
     f = RotatingMixture()
     assert np.allclose(f.means(np.pi / 2 / 0.04), [[0.5, 0.8], [0.5, 0.2]])
+    three = RotatingMixture(components=3).means(1.0)
+    assert np.allclose(np.linalg.norm(three - three[[1, 2, 0]], axis=1), 0.3 * np.sqrt(3))
     shifted = RotatingMixture(phase=0.3)
     assert np.allclose(shifted.means(1.0), f.means(1.0 + 0.3 / 0.04))
     # Its integral over the plane is one.

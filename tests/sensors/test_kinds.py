@@ -50,6 +50,7 @@ def test_what_the_sensors_see() -> None:
     assert np.array_equal(plain.matrix(3), np.eye(3)[[2, 0]])
     assert np.array_equal(change.predict(x, before), (x - before)[:, [2, 0]])
     assert (change.jacobian(x, before) == np.eye(3)[[2, 0]]).all()
+    assert change.jacobian(x[0], before).shape == (2, 2, 3)
     gap, far = x[:, [2, 0]] - PLACE, distance([2, 0], std=0.1, origin=PLACE).predict(x)
     assert np.allclose(far[:, 0], np.hypot(*gap.T), rtol=1e-15)
     turned = angle([2, 0], std=0.1, full=True, origin=PLACE).predict(x)
@@ -63,6 +64,8 @@ def test_what_the_sensors_see() -> None:
                        ("range", distance([2, 0], std=0.3)), ("angle", angle([2, 0], std=0.3))):
         made = sensors.of_kind(kind, [2, 0], std=0.3)
         assert made.kind == ours.kind and np.allclose(made.cov, 0.09 * np.eye(ours.dim), rtol=1e-15)
+        far = np.full(made.dim, 2.0)
+        assert np.array_equal(made.residual(far, -far), ours.residual(far, -far))
 
 
 SHIPPED = [
