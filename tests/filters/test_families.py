@@ -41,10 +41,8 @@ def test_network_of_exact_ensembles_is_the_network_of_kalman_filters() -> None:
     rule = partial(covariance_intersection, rule="min_determinant")
     g, begin = made("gaussian", agreement=rule, faults=faults, **options)
     e = start.ensembles
-    state = GaussianState(
-        0.0, begin.ledger, None, e.mean(axis=-2),
-        np.array([[np.cov(m.T) for m in agents] for agents in e]), 2,
-    )
+    cov = np.array([[np.cov(m.T) for m in agents] for agents in e])
+    state = GaussianState(0.0, begin.ledger, None, e.mean(axis=-2), cov, 2)
     a, b = f.run(start, TIMES, seen), g.run(state, TIMES, seen)
     assert np.allclose(a["mean"], b["mean"], atol=1e-8)
     assert np.allclose(a["variance"], b["variance"], atol=1e-8)
@@ -117,10 +115,12 @@ def test_a_member_that_was_picked_or_moved_sees_changes_from_where_it_comes() ->
 @pytest.mark.parametrize("family", ["ensemble", "particle", "ensemble, common"])
 def test_a_change_that_is_read_after_its_step_is_one_from_the_step_s_begin(family: str) -> None:
     """A reading moves members as in one step with it; of what is not kept it is refused."""
-    f, start = made(family, sensors=[of_kind("differential", [0], std=0.5)], graph=None, lag=1)
-    at_once = f.step(start, 1.0, [[0.4]])
-    later = f.step(f.step(start, 1.0, [None]), 1.0, [[0.4]])
-    assert np.allclose(f.summary(later).mean, f.summary(at_once).mean, atol=1e-9)
+    f, start = made(family, sensors=[of_kind("differential", [0], std=0.5)], graph=None, lag=2)
+    moved = f.step(start, 0.5, [None])
+    at_once = [replace(f, lag=k).step(moved, 1.0, [[0.4]]) for k in range(3)]
+    later = f.step(f.step(moved, 1.0, [None]), 1.0, [[0.4]])
+    for state in (later, *at_once[1:]):
+        assert np.allclose(f.summary(state).mean, f.summary(at_once[0]).mean, atol=1e-9)
     with pytest.raises(ValueError, match="needs the states before, which at a state's own time"):
         replace(f, lag=0).step(start, start.t, [[0.4]])
 

@@ -73,10 +73,8 @@ GEO = np.array([42241.10, 0.0, 0.0, 0.0, 3071.859, 0.0])
 
 def in_orbit(target: np.ndarray, observer: np.ndarray, **options: object) -> tuple:
     """A filter with an eye that the Earth blinds and a fix, and its belief."""
-    see = stack([
-        line_of_sight(std=1e-4, hidden=occulted),
-        ephemeris(position_std=1e-3, velocity_std=1e-5),
-    ])
+    fix = ephemeris(position_std=1e-3, velocity_std=1e-5)
+    see = stack([line_of_sight(std=1e-4, hidden=occulted), fix])
     f = MixtureFilter(orbits(2), [see], target_dim=6, **options)  # type: ignore[arg-type]
     cov = np.diag(np.tile([1.0, 1, 1, 0.1, 0.1, 0.1], 2))
     return f, f.start([GaussianMixture.gaussian(np.concatenate([target, observer]), cov)])

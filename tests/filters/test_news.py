@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 from scipy.stats import norm
 
 from distfilt.filters import GaussianFilter, MixtureFilter, NewsFilter, increment
@@ -17,7 +18,7 @@ from distfilt.sensors import Sensor, direct, stack
 
 T = np.array([[1.0, 0.3], [0.0, 1.0]])
 E = np.array([[0.9]])
-MOVE = np.block([[T, np.zeros((2, 1))], [np.zeros((1, 2)), E]])
+MOVE = block_diag(T, E)
 NOISE = np.diag([0.0, 0.0, 0.2])
 MODEL = Model(3, lambda x, t, dt: x @ MOVE.T, lambda t, dt: NOISE)
 # How far the target is from the agent, and a reading of the target's speed that all receive.
@@ -25,9 +26,7 @@ SEEN = Sensor(1, lambda x: x[..., :1] - x[..., 2:], np.array([[0.3]]))
 EYE = stack([SEEN, direct([1], std=0.5)])
 TARGET_COV = np.array([[2.0, 0.4], [0.4, 1.0]])
 EGO_COV = 0.7
-PRIOR = GaussianMixture.gaussian(
-    [1.0, -0.5, 0.2], np.block([[TARGET_COV, np.zeros((2, 1))], [np.zeros((1, 2)), EGO_COV]])
-)
+PRIOR = GaussianMixture.gaussian([1.0, -0.5, 0.2], block_diag(TARGET_COV, EGO_COV))
 
 
 def network(agents: int, **options: object) -> NewsFilter:
@@ -39,11 +38,8 @@ def joint(agents: int, readings: np.ndarray, speed: np.ndarray) -> tuple:
     """The Kalman filter of [target; all egos] with all readings, (steps, agents) and (steps,)."""
     d = 2 + agents
     m = np.concatenate([PRIOR.means[0, :2], np.full(agents, PRIOR.means[0, 2])])
-    p = np.diag(np.concatenate([np.zeros(2), np.full(agents, EGO_COV)]))
-    p[:2, :2] = TARGET_COV
-    f = np.eye(d)
-    f[:2, :2] = T
-    f[2:, 2:] *= E
+    p = block_diag(TARGET_COV, *[EGO_COV] * agents)
+    f = block_diag(T, *[E] * agents)
     h = np.zeros((agents + 1, d))
     h[:agents, 0], h[agents, 1] = 1.0, 1.0
     h[:agents, 2:] = -np.eye(agents)
@@ -94,9 +90,8 @@ def test_an_increment_is_the_readings_that_taught_it(rank: int) -> None:
     h, z = rng.standard_normal((rank, 4)), rng.standard_normal(rank)
     p = before.covs[0]
     gain = p @ h.T @ np.linalg.inv(h @ p @ h.T + np.eye(rank))
-    after = GaussianMixture.gaussian(
-        before.means[0] + gain @ (z - h @ before.means[0]), p - gain @ h @ p
-    )
+    moved = before.means[0] + gain @ (z - h @ before.means[0])
+    after = GaussianMixture.gaussian(moved, p - gain @ h @ p)
     news = increment(before, after)
     assert news.shape == (rank, 5)
     assert np.allclose(news[:, :-1].T @ news[:, :-1], h.T @ h, atol=1e-9)
@@ -140,9 +135,8 @@ def test_news_that_are_lost_leave_the_own_belief() -> None:
 
 def test_mixands_are_weighed_by_the_news() -> None:
     still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-    f = NewsFilter(
-        still, [direct([0], std=1.0), None], graphs.path(2), target_dim=1, size=2, most=2
-    )
+    f = NewsFilter(still, [direct([0], std=1.0), None], graphs.path(2), target_dim=1, size=2,
+                   most=2)
     prior = GaussianMixture([0.3, 0.7], [[-2.0], [1.0]], [[[1.0]], [[2.0]]])
     one = GaussianMixture.gaussian([0.0], [[3.0]])
     after = f.step(f.start([one, prior]), 1.0, [[0.5], None]).mixtures[1]

@@ -11,7 +11,7 @@ import numpy as np
 import pandas
 import pytest
 import xarray
-from scipy.stats import chi2, multivariate_normal
+from scipy.stats import chi2, multivariate_normal, norm
 
 from distfilt.density import Flooding, FokkerPlanck, Grid
 from distfilt.filters import (
@@ -166,14 +166,17 @@ def test_the_order_of_agents_changes_nothing(family: str) -> None:
 def test_the_gate_lets_pass_what_its_share_says(family: str) -> None:
     """Just inside the quantile a reading counts, just outside it is left out and counted."""
     f, start, _, _ = made(family, sensors=[direct([0, 1], std=0.6), None, None], gate=0.95)
-    blind = f.step(start, 0.1, [None] * 3)
-    mean, variance = (getattr(f.summary(blind), part)[0, 0] for part in ("mean", "variance"))
-    edge = np.sqrt(chi2.ppf(0.95, 1) * (variance + 0.36))
-    for factor, refused in ((0.999, 0), (1.001, 1)):
-        after = f.step(start, 0.1, [[mean + factor * edge, np.nan], None, None])
-        assert after.refused[0] == refused
-        same = np.allclose(f.summary(after).mean[0], f.summary(blind).mean[0], atol=1e-12)
-        assert same == bool(refused)
+    start = f.step(start, 0.0, [[0.4, np.nan], None, None])  # particles differ in weight since
+    blind = f.summary(f.step(start, 0.1, [None] * 3))
+    cov = np.cov(blind.members[0].T) if blind.covariance is None else blind.covariance[0]
+    s, way = cov + 0.36 * np.eye(2), np.array([1.0, -1.0])
+    two = np.sqrt(chi2.ppf(0.95, 2) / (way @ np.linalg.solve(s, way))) * way
+    for edge in (np.array([np.sqrt(chi2.ppf(0.95, 1) * s[0, 0]), np.nan]), two):
+        for factor, refused in ((0.999, 0), (1.001, 1)):
+            after = f.step(start, 0.1, [blind.mean[0] + factor * edge, None, None])
+            assert after.refused[0] == refused
+            same = np.allclose(f.summary(after).mean[0], blind.mean[0], atol=1e-12)
+            assert same == bool(refused)
     # Straight behind a direction predictions lie on both sides of where its residuals jump.
     given = {"sensors": [angle([0, 1], std=0.05, full=True), None, None], "gate": 0.99}
     f = made(family, **given | ({"rule": "unscented"} if family == "gaussian" else {}))[0]
@@ -198,6 +201,7 @@ def test_each_reading_is_judged_alone() -> None:
     bowl = Sensor(1, np.square, [[0.5]])  # of N(0, 1): mean 1, variance 1 by the points, slope 0
     f = GaussianFilter(still, [bowl], rule="unscented", gate=0.95)
     edge, start = np.sqrt(1.5 * chi2.ppf(0.95, 1)), f.start((np.zeros(1), np.eye(1)))
+    assert f.start(norm(1.0, 3.0)).covariances[0, 0, 0] == 9.0
     refused = [f.step(start, 1.0, [[1 + k * edge]]).refused.tolist() for k in (0.97, 1.03)]
     assert refused == [[0.0], [1.0]]
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from distfilt.kalman import QuaternionChart, filterpy_ekf, kalman_filter, multiplicative_filter
 from distfilt.linalg import central
@@ -74,8 +77,9 @@ def test_a_run_that_is_lost_is_named() -> None:
 
 
 def test_errors_move_by_the_derivative_of_the_flow_in_the_chart() -> None:
-    rng, model = np.random.default_rng(4), satellite_pose(rate=0.3, sigma=0.0)
-    x, cov = rng.standard_normal(13), spd(rng, 12)
+    rng = np.random.default_rng(4)
+    x, cov, q = rng.standard_normal(13), spd(rng, 12), spd(rng, 13)
+    model = replace(satellite_pose(rate=0.3, sigma=0.0), noise_cov=lambda t, dt: q)
     seen = multiplicative_filter(x, cov, [[0.1, 0.2]], chart=POSE, model=model, times=[0.8],
                                  sensors=[differential([9, 11], std=0.3)])
 
@@ -87,8 +91,11 @@ def test_errors_move_by_the_derivative_of_the_flow_in_the_chart() -> None:
 
     slope = central(lambda e: POSE.local(after(0 * e), after(e)), np.zeros(12))
     change = central(lambda e: (after(e) - before(e))[..., [9, 11]], np.zeros(12))
-    gain = np.linalg.solve(change @ cov @ change.T + 0.09 * np.eye(2), change @ cov @ slope.T).T
-    wanted = (slope - gain @ change) @ cov @ slope.T
+    there, both = after(np.zeros(12)), block_diag(cov, POSE.project(after(np.zeros(12)), q))
+    slope = np.hstack([slope, np.eye(12)])
+    change = np.hstack([change, POSE.directions(there)[[9, 11]]])
+    gain = np.linalg.solve(change @ both @ change.T + 0.09 * np.eye(2), change @ both @ slope.T).T
+    wanted = (slope - gain @ change) @ both @ slope.T
     assert np.allclose(seen.covariances[0], wanted, atol=1e-6)
 
 

@@ -108,10 +108,8 @@ def test_three_mixtures_by_information(terms: str) -> None:
     third = random_mixture(3, 2, 9)
     f = PartialFusion(OWN, [OTHER, third], omega=[0.5, 0.2, 0.3])
     x = np.random.default_rng(0).standard_normal((5, 4))
-    wanted = (
-        OWN.log_density(x) - 0.5 * OWN.marginal(TARGET).log_density(x[:, :2])
-        + 0.2 * OTHER.log_density(x[:, :2]) + 0.3 * third.log_density(x[:, :2])
-    )
+    wanted = (OWN.log_density(x) - 0.5 * OWN.marginal(TARGET).log_density(x[:, :2])
+              + 0.2 * OTHER.log_density(x[:, :2]) + 0.3 * third.log_density(x[:, :2]))
     assert np.allclose(f.log_value(x), wanted, rtol=1e-12)
     shapes = f.shapes(terms=terms)
     wanted = []
@@ -206,9 +204,8 @@ def test_average_keeps_the_conditional_and_averages_the_target() -> None:
     mixed = average(own, other, omega=0.3)
     x = np.random.default_rng(0).standard_normal((20, 4)) * 2
     t = x[:, :2]
-    wanted = np.logaddexp(
-        np.log(0.3) + own.marginal(TARGET).log_density(t), np.log(0.7) + other.log_density(t)
-    )
+    wanted = np.logaddexp(np.log(0.3) + own.marginal(TARGET).log_density(t),
+                          np.log(0.7) + other.log_density(t))
     target = mixed.marginal(TARGET).log_density(t)
     assert np.allclose(target, wanted, rtol=1e-10)
     given_t = own.log_density(x) - own.marginal(TARGET).log_density(t)

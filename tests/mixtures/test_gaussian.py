@@ -21,10 +21,8 @@ BOTH = GaussianMixture([0.5, 0.5], np.r_[P.means, Q.means], np.r_[P.covs, Q.covs
 def test_log_density_is_scipys(size: int, dim: int) -> None:
     p = random_mixture(size, dim, 10 * size + dim)
     x = np.random.default_rng(0).standard_normal((4, 7, dim)) * 3
-    wanted = sum(
-        w * multivariate_normal(m, c).pdf(x)
-        for w, m, c in zip(p.weights, p.means, p.covs, strict=True)
-    )
+    each = zip(p.weights, p.means, p.covs, strict=True)
+    wanted = sum(w * multivariate_normal(m, c).pdf(x) for w, m, c in each)
     assert p.log_density(x).shape == (4, 7)
     assert np.allclose(p.log_density(x), np.log(wanted), rtol=1e-11)
     parts = p.component_log_densities(x)
@@ -134,12 +132,8 @@ def test_quadrature_meets_the_closed_form(dim: int) -> None:
 
 
 def test_sampling_meets_the_closed_form_within_its_standard_error() -> None:
-    found = [
-        jeffreys_by_sampling(
-            lambda x: F(x) - 3, Q.log_density, BOTH, members=800, rng=np.random.default_rng(seed)
-        )
-        for seed in range(200)
-    ]
+    found = [jeffreys_by_sampling(lambda x: F(x) - 3, Q.log_density, BOTH, members=800,
+                                  rng=np.random.default_rng(seed)) for seed in range(200)]
     spread = np.std([d.value for d in found], ddof=1)
     assert abs(np.mean([d.value for d in found]) - closed(P, Q)) < 4 * spread / 200**0.5
     # A standard deviation from 200 draws is known to 5%; 20% is four of its standard errors.

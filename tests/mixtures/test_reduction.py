@@ -47,10 +47,8 @@ def brute(p: GaussianMixture, size: int) -> GaussianMixture:
 
     def loss(i: int, j: int) -> float:
         total, _, cov = merged(i, j)
-        return 0.5 * float(
-            total * np.linalg.slogdet(cov)[1]
-            - w[i] * np.linalg.slogdet(c[i])[1] - w[j] * np.linalg.slogdet(c[j])[1]
-        )
+        own = w[i] * np.linalg.slogdet(c[i])[1] + w[j] * np.linalg.slogdet(c[j])[1]
+        return 0.5 * float(total * np.linalg.slogdet(cov)[1] - own)
 
     while len(w) > size:
         i, j = min(
@@ -126,9 +124,8 @@ def test_the_relevance_rule_is_41_without_its_guards(monkeypatch: pytest.MonkeyP
     kept = kept_by_relevance(one, two, threshold=3.0)
     assert kept.size == 1 + (~out).sum()
     assert np.isclose(kept.weights[-1], one.weights[out].sum())
-    inside = GaussianMixture(
-        one.weights[out] / one.weights[out].sum(), one.means[out], one.covs[out]
-    )
+    share = one.weights[out] / one.weights[out].sum()
+    inside = GaussianMixture(share, one.means[out], one.covs[out])
     assert np.allclose(kept.means[-1], inside.mean) and np.allclose(kept.covs[-1], inside.cov)
     assert np.allclose(kept.cov, one.cov)
     there = (affine(m, *scales(2)) for m in (one, two))

@@ -24,9 +24,8 @@ def test_acceleration_is_the_gradient_of_the_potential() -> None:
 
 @pytest.mark.parametrize("start", [MEO, GEO])
 def test_a_day_against_scipys_integrator(start: np.ndarray) -> None:
-    exact = solve_ivp(
-        lambda t, y: orbit._rate(y), (0, 86400), start, method="DOP853", rtol=1e-13, atol=1e-9
-    ).y[:, -1]
+    exact = solve_ivp(lambda t, y: orbit._rate(y), (0, 86400), start, method="DOP853", rtol=1e-13,
+                      atol=1e-9).y[:, -1]
     for rule, longest, allowed in (("rk4", 40.0, 2e-5), ("dop853", 900.0, 1e-6)):
         found = propagate(start, 86400.0, rule=rule, longest=longest)
         assert np.abs(found - exact)[:3].max() < allowed  # km

@@ -62,8 +62,8 @@ def test_mixture_goes_round() -> None:
 
 def test_a_path_begins_with_a_step() -> None:
     swarm, x = rotating_swarm(), np.random.default_rng(2).random((5, 2))
-    moved = swarm.step(x, 0.0, 0.1, rng=np.random.default_rng(3))
-    path = swarm.simulate(x, [0.1, 0.3], rng=np.random.default_rng(3))
+    moved = swarm.step(x, 2.0, 0.25, rng=np.random.default_rng(3))
+    path = swarm.simulate(x, [2.25, 2.5], rng=np.random.default_rng(3), t0=2.0)
     assert np.array_equal(path[0], moved) and path.shape == (2, 5, 2)
 
 

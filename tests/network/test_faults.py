@@ -106,12 +106,12 @@ def test_windows_hold_losses_and_silence() -> None:
 
 
 def test_faults_together_fail_in_every_way() -> None:
-    a, b = Faults(loss=0.3, seed=1), Faults(loss=0.4, seed=2, during=[(0, 5)])
+    a, b = Faults(loss=0.3, seed=1), Faults(loss=0.4, seed=2, during=[(0, 5)], delay=1)
     c = Faults(silent=[2], delay=2)
     for whole in (a | b | c, a | (b | c)):
         assert (whole.lost(STAR, 3, 9) == (a.lost(STAR, 3, 9) | b.lost(STAR, 3, 9))).all()
         assert (whole.lost(STAR, 6, 9) == a.lost(STAR, 6, 9)).all()
-        assert (whole.speaking(STAR) == c.speaking(STAR)).all() and whole.late == 2
+        assert (whole.speaking(STAR) == c.speaking(STAR)).all() and whole.late == 3
         assert not whole.none
     assert (Faults() | Faults()).none and not c.none and not Faults(delay=1).none
 

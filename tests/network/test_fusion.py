@@ -24,10 +24,8 @@ ALL = {
     "pull": partial(network.consensus_pull, gain=GAIN),
 }
 every = pytest.mark.parametrize("rule", ALL.values(), ids=ALL.keys())
-MOVES = {
-    "least": network.intersection, "equal": partial(network.intersection, rule="equal"),
-    "pull": partial(network.pull, gain=0.1),
-}
+MOVES = {"least": network.intersection, "equal": partial(network.intersection, rule="equal"),
+         "pull": partial(network.pull, gain=0.1)}
 SIZES = np.logspace(-1, 2, 4)
 LINKS = np.array([2, 1, 1])
 """How many hear each agent of the star."""

@@ -93,10 +93,8 @@ def test_residual_keeps_what_is_missing_on_either_side() -> None:
 
 def test_jacobian_without_a_formula() -> None:
     """Differences, through the sensor's own residual where readings wrap."""
-    sensor = Sensor(
-        1, lambda x: wrap(x.sum(axis=-1, keepdims=True)), np.eye(1),
-        difference=lambda y, p: wrap(y - p),
-    )
+    sensor = Sensor(1, lambda x: wrap(x.sum(axis=-1, keepdims=True)), np.eye(1),
+                    difference=lambda y, p: wrap(y - p))
     x = np.array([[np.pi, 0.0], [1.0, 2.0]])
     assert np.abs(sensor.jacobian(x) - 1.0).max() < 1e-9
     with pytest.raises(ValueError, match="^difference: needs observed less predicted"):

@@ -167,6 +167,7 @@ def test_an_angle_is_known_better_than_not_at_all(make: Callable[..., Sensor]) -
 def test_a_hidden_direction_is_nan() -> None:
     x = np.zeros((2, 12))
     x[:, 0], x[0, 6], x[1, 7] = 26000.0, -42000.0, 42000.0
-    seen = line_of_sight(std=1e-4, hidden=occulted).predict(x)
-    assert np.isnan(seen).tolist() == [[True, True], [False, False]]
-    assert np.array_equal(seen[1], line_of_sight(std=1e-4).predict(x)[1])
+    for hidden in (occulted, lambda target, observer: observer[..., 0] < 0):
+        seen = line_of_sight(std=1e-4, hidden=hidden).predict(x)
+        assert np.isnan(seen).tolist() == [[True, True], [False, False]]
+        assert np.array_equal(seen[1], line_of_sight(std=1e-4).predict(x)[1])

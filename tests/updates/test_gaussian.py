@@ -59,8 +59,9 @@ def test_rotation_keeps_ones_and_lengths_and_differs() -> None:
 
 
 def test_rotation_prefers_no_direction() -> None:
-    """On average nothing is left of the anomalies, and every entry is equally large."""
-    n, draws = 5, 20_000
+    """On average nothing is left of the anomalies, and no two members go together."""
+    n, draws = 6, 20_000
     turn = _turned(np.broadcast_to(np.eye(n), (draws, n, n)), np.random.default_rng(1))
     assert np.allclose(turn.mean(axis=0), 1 / n, atol=5 * 0.5 / np.sqrt(draws))
-    assert np.allclose((turn - 1 / n).var(axis=0), (n - 1) / n**2, atol=0.03)
+    cov = np.einsum("rij,rkj->jik", turn - 1 / n, turn - 1 / n) / draws
+    assert np.allclose(cov, (np.eye(n) - 1 / n) / n, atol=0.012)

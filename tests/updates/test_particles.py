@@ -36,8 +36,9 @@ def test_weights_by_bayes_rule_with_a_missing_component() -> None:
     h, before = rng(1).standard_normal((6, 2)), np.log(rng(2).dirichlet(np.ones(6)))
     noise, y = np.array([[0.5, 0.3], [0.3, 0.9]]), np.array([0.4, -0.2])
     both = before - 0.5 * np.einsum("ni,ij,nj->n", y - h, np.linalg.inv(noise), y - h)
-    one = before - 0.5 * (y[0] - h[:, 0]) ** 2 / 0.5
-    for seen, wanted in ((y, both), (np.array([y[0], np.nan]), one)):
+    one, other = (before - 0.5 * (y[k] - h[:, k]) ** 2 / noise[k, k] for k in range(2))
+    gaps = np.array([y, [np.nan, y[1]], [y[0], np.nan]])
+    for seen, wanted in zip(gaps, (both, other, one), strict=True):
         w = np.exp(wanted) / np.exp(wanted).sum()
         assert np.allclose(np.exp(weighed(before, h, seen, noise)), w)
     # What one particle cannot predict says nothing of any.

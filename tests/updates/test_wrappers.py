@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -55,12 +56,13 @@ def test_missing_and_unpredicted_readings_are_deleted_rows() -> None:
 
 
 def test_serial_without_a_sensor_is_exact_for_linear_readings() -> None:
-    x = members(20)
-    diagonal = np.diag([0.5, 0.9])
-    mean, cov = kalman(*moments(x), H, diagonal, Y)
-    out = serial(exact_draws)(x, x @ H.T, Y, diagonal, rng=rng())
-    assert np.allclose(out.mean(axis=0), mean, atol=1e-12)
-    assert np.allclose(np.cov(out.T), cov, atol=1e-12)
+    x = members(20, 2)  # of two agents, whose readings' errors may go together for one
+    for noise in (np.diag([0.5, 0.9]) * [[[1.0]], [[2.0]]], np.stack([np.diag([0.5, 0.9]), R])):
+        out = serial(exact_draws)(x, x @ H.T, [Y, Y], noise, rng=rng())
+        for own, r, after in zip(x, noise, out, strict=True):
+            mean, cov = kalman(*moments(own), H, r, Y)
+            assert np.allclose(after.mean(axis=0), mean, atol=1e-12)
+            assert np.allclose(np.cov(after.T), cov, atol=1e-12)
 
 
 def test_serial_predicts_again() -> None:
@@ -105,12 +107,15 @@ def test_partial_options_survive_the_open_door() -> None:
 def test_exact_forecast_adds_q_exactly() -> None:
     phi, q = np.array([[1.0, 0.3], [0.0, 0.9]]), np.array([[0.4, 0.1], [0.1, 0.2]])
     model = Model(2, lambda x, t, dt: x @ phi.T, lambda t, dt: dt * q)
-    bent = Model(2, lambda x, t, dt: x @ phi.T + 0.3 * x**2, lambda t, dt: dt * q)
+    bent = replace(model, flow=lambda x, t, dt: np.where(x < 50, x @ phi.T + 0.3 * x**2, np.inf))
     x = members(12, 3)[..., :2]
     out = exact_forecast(x, bent, 0.0, 0.5, rng=rng())
     for e, m in zip(out, bent.step(x, 0.0, 0.5), strict=True):
         assert np.allclose(e.mean(axis=0), m.mean(axis=0), atol=1e-13)
         assert np.allclose(np.cov(e.T), np.cov(m.T) + 0.5 * q, atol=1e-12)
+    x[1, 0] = 99.0  # an ensemble that is lost takes no bit of the others' noise with it
+    lost = exact_forecast(x, bent, 0.0, 0.5, rng=rng())
+    assert np.array_equal(lost[::2], out[::2]) and np.isnan(lost[1]).all()
     plain = sampled_forecast(members(100_000)[:, :2], model, 0.0, 0.5, rng=rng())
     wanted = phi @ np.cov(members(100_000)[:, :2].T) @ phi.T + 0.5 * q
     assert np.allclose(np.cov(plain.T), wanted, atol=0.03)
