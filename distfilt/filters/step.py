@@ -245,18 +245,22 @@ class Step:
         # What a run failed with may fail again: a good one stands in.
         given = tuple([self.kept(v, v[good]) for v in values])
         whole = np.arange(int(np.prod(self.state.runs))).reshape(self.state.runs)
-        ledger = door.ledger
+        ledger, alone = door.ledger, list[Array]()
 
         def compute(*arrays: Any) -> tuple[Array, ...]:
             *belief, run, _, _ = arrays
-            self.channel = channel = door.of(run, ledger)
+            channel = door.of(run, ledger)
             out = self.filter.agreement(belief[0] if len(belief) == 1 else tuple(belief), channel)
             out = (out,) if len(belief) == 1 else tuple(out)
             if len(out) != len(belief):
                 raise ValueError(f"agreement: needs to return {len(belief)} arrays, got {len(out)}")
+            self.channel = channel
+            alone.append(channel.ledger.lost)
             return tuple(array(x, "agreement", v.shape) for x, v in zip(out, belief, strict=True))
 
         out, errors = guarded(compute, (*given, whole), values, whole.ndim)
+        if self.channel.runs != whole.shape:  # asked alone, each lost messages of its own
+            self.channel = door.of(whole, self.channel.ledger.changed(lost=np.mean(alone, axis=0)))
         self.settle(errors)
         return tuple([self.kept(x, v) for x, v in zip(out, values, strict=True)])
 

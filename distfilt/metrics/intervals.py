@@ -143,7 +143,6 @@ def proportion_interval(
     low = 0.0 if k == 0 else float(beta.ppf(tail, k, n - k + 1))
     high = 1.0 if k == n else float(beta.ppf(1 - tail, k + 1, n - k))
     share = k / n
+    error = float(np.sqrt(share * (1 - share) / n))
     # A level near 0 gives ends that pass each other around the share.
-    return Interval(
-        share, min(low, share), max(high, share), float(np.sqrt(share * (1 - share) / n))
-    )
+    return Interval(share, min(low, share), max(high, share), error)

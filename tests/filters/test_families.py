@@ -179,6 +179,22 @@ def test_a_run_whose_covariance_overflows_leaves_the_others_to_agree() -> None:
     assert state.failed.tolist() == [False, True] and np.allclose(state.covariances[0], 2.0)
 
 
+def test_an_agreement_for_one_run_is_asked_for_each() -> None:
+    """With the losses of the same rule for all; what they lose on average is in the account."""
+
+    def one(ensembles: np.ndarray, channel: Any) -> np.ndarray:
+        if channel.runs:
+            raise ValueError("channel: needs a single run")
+        return pull(ensembles, channel, gain=0.3)
+
+    f, start = made("ensemble", agreement=partial(pull, gain=0.3), runs=(2, 3), share=False,
+                    faults=Faults(loss=0.5, seed=3))  # fmt: skip
+    all_, each = (g.step(start, 0.1, [None] * 5) for g in (f, replace(f, agreement=one)))
+    np.testing.assert_array_equal(each.ensembles, all_.ensembles)
+    for name in ("rounds", "messages", "scalars", "bytes", "lost"):
+        assert np.allclose(getattr(each.ledger, name), getattr(all_.ledger, name))
+
+
 def test_a_run_whose_agreement_fails_leaves_the_others_as_they_are() -> None:
     """With losses of their own, and charged as if all had gone well."""
 

@@ -71,10 +71,8 @@ def test_news_are_one_filter_with_everybodys_readings(agents: int, every: float 
 def test_what_all_receive_counts_twice_if_it_is_told() -> None:
     readings, speed = np.full((1, 2), np.nan), np.array([0.4])
     _, p = joint(2, readings, speed)
-    once, twice = (
-        network(2, common=c).step(network(2).start([PRIOR] * 2), 1.0, [[np.nan, 0.4]] * 2)
-        for c in ([1], [])
-    )
+    start = network(2).start([PRIOR] * 2)
+    once, twice = (network(2, common=c).step(start, 1.0, [[np.nan, 0.4]] * 2) for c in ([1], []))
     assert np.allclose(once.mixtures[0].covs[0, :2, :2], p[:2, :2], atol=1e-10)
     assert once.ledger.scalars.sum() == 0
     told = np.linalg.inv(twice.mixtures[0].covs[0, :2, :2])
@@ -126,10 +124,8 @@ def test_news_that_are_lost_leave_the_own_belief() -> None:
     deaf = network(2, faults=Faults(loss=1.0))
     alone = MixtureFilter(MODEL, [EYE] * 2, target_dim=2, size=1, most=1)
     a, b = (f.step(f.start([PRIOR] * 2), 1.0, seen) for f in (deaf, alone))
-    assert all(
-        np.allclose(x.covs, y.covs) and np.allclose(x.means, y.means)
-        for x, y in zip(a.mixtures, b.mixtures, strict=True)
-    )
+    for x, y in zip(a.mixtures, b.mixtures, strict=True):
+        assert np.allclose(x.covs, y.covs) and np.allclose(x.means, y.means)
     assert a.ledger.lost.sum() == 2
 
 
