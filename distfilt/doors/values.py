@@ -86,6 +86,7 @@ def _real(value: Any, name: str) -> Array:
         parts = value if isinstance(value, list | tuple) else (value,)
         found = np.asarray(value)
         entries = found.ravel() if found.dtype.kind == "O" else ()
+        got = next((type(v).__name__ for v in entries), got)
         odd = [v for v in (*parts, *entries) if isinstance(v, _NOT_REAL)]
         if not odd and found.dtype.kind in "fiuO":
             return np.asarray(found, dtype=np.float64)
@@ -236,9 +237,8 @@ class Bounds:
             raise ValueError(f"{name}: needs {needs} {word} {bound:g}, got {worst!r}")
 
 
-_HOLDS = {
-    "above": operator.gt, "at_least": operator.ge, "below": operator.lt, "at_most": operator.le
-}
+_HOLDS = {"above": operator.gt, "at_least": operator.ge, "below": operator.lt,
+          "at_most": operator.le}
 
 
 def needed(module: str, extra: str) -> ModuleType:

@@ -208,10 +208,8 @@ class DensityFilter(Filter):
     @cached_property
     def _basis(self) -> Array:
         """A factor of the prior covariance, (n, r)."""
-        return zero_mean_prior(
-            self.model.grid, rank=self.rank, length=self.prior_length, std=self.prior_std,
-            mass_std=self.mass_std,
-        )
+        return zero_mean_prior(self.model.grid, rank=self.rank, length=self.prior_length,
+                               std=self.prior_std, mass_std=self.mass_std)
 
     def _base(self, seen: Seen) -> Array:
         """Prior means of all agents, (A, n)."""

@@ -206,6 +206,8 @@ def _are_readings(given: Any) -> bool:
 
 def _is_pair(prior: Any) -> bool:
     """Whether this is (mean, cov), and no list of two members."""
+    if type(prior) is list and any(type(p) is tuple and np.ndim(p[-1]) > 1 for p in prior):
+        raise ValueError("prior: needs one for all agents, got a list of (mean, cov)")
     pair = isinstance(prior, tuple | list) and len(prior) == 2
     return pair and (isinstance(prior, tuple) or np.ndim(prior[0]) < np.ndim(prior[1]))
 

@@ -119,7 +119,7 @@ class MixtureFilter(Filter):
     def check_parts(self) -> None:
         """Refuse a model that is smaller than the target."""
         super().check_parts()
-        Bounds(at_least=self.target_dim)(self.model.dim, "model")
+        Bounds(at_most=self.model.dim)(self.target_dim, "target_dim")
         Bounds(at_least=self.size)(self.most, "most")
 
     def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:

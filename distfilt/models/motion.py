@@ -143,10 +143,8 @@ def integrated(
     rate: Rate, density: Array, *, step: float, names: tuple[str, ...], units: tuple[str, ...]
 ) -> Model:
     """The model that :func:`rk4` makes of a rate, with white noise of a spectral density (d, d)."""
-    return Model(
-        len(density), partial(_flow, rate=rate, longest=step), partial(_white, density),
-        names=names, units=units,
-    )
+    return Model(len(density), partial(_flow, rate=rate, longest=step), partial(_white, density),
+                 names=names, units=units)
 
 
 def _flow(x: Array, t: float, dt: float, rate: Rate, longest: float) -> Array:

@@ -47,6 +47,7 @@ def _spread(slope: Array, indices: Sequence[int], dim: int) -> Array:
 
 def _rows(dim: int, indices: Sequence[int]) -> Array:
     """The rows of the identity that pick components."""
+    Bounds(below=dim)(max(indices), "indices")
     return _pick(np.eye(dim), indices).T
 
 

@@ -80,7 +80,8 @@ def update(function: F) -> F:
     @wraps(function)
     def checked(*args: Any, **options: Any) -> Array:
         given = plan.taken(args, options)
-        return function(**given | _related({name: given[name] for name in names}))
+        four = {name: given[name] for name in names if name in given}
+        return function(**given | (_related(four) if len(four) == len(names) else {}))
 
     made: Any = checked
     made.unchecked, made.plan, made.stacks = function, plan, True

@@ -176,10 +176,9 @@ def test_a_target_that_moves_with_noise_needs_readings_in_place_of_news(
     one, both = news.start([prior] * 2), told.start((np.zeros(3), np.diag([4.0, 1.0, 1.0])))
     for k, y in enumerate(readings):
         one, both = news.step(one, k + 1.0, y[:, None]), told.step(both, k + 1.0, y[:, None])
-    exact = kalman_filter(
-        np.zeros(3), np.diag([4.0, 1.0, 1.0]), readings, F=np.eye(3), Q=np.diag([q, 0.0, 0.0]),
-        H=np.array([[1.0, -1.0, 0.0], [1.0, 0.0, -1.0]]), R=0.3 * np.eye(2),
-    )
+    h = np.array([[1.0, -1.0, 0.0], [1.0, 0.0, -1.0]])
+    exact = kalman_filter(np.zeros(3), np.diag([4.0, 1.0, 1.0]), readings, F=np.eye(3), H=h,
+                          Q=np.diag([q, 0.0, 0.0]), R=0.3 * np.eye(2))
     assert np.allclose(both.means, exact.means[-1]) and both.ledger.scalars.sum() == 20
     assert np.allclose(both.covariances, exact.covariances[-1])
     variances = one.mixtures[0].covs[0, 0, 0], both.covariances[0, 0, 0]

@@ -219,12 +219,10 @@ def test_nothing_is_lost_until_the_next_contact(family: str, how: str) -> None:
     f = SIX[family](quiet, EYES, options.pop("graph"), **options)
     g = GaussianFilter(quiet, EYES, NET)
     own = GaussianFilter(quiet, EYES, NET, share=False)
-    _, seen = data(EYES)
+    seen = [s[:4] for s in data(EYES)[1]]
     times = [0.1, 0.15, 0.5, 0.6]  # multiples of .2 lie in the third step and, rounded, in the last
     told = [2, 3] if how == "every" else [3]
-    states, everything, alone = (
-        list(h.steps(h.start(PRIOR), times, [s[:4] for s in seen])) for h in (f, g, own)
-    )
+    states, everything, alone = (list(h.steps(h.start(PRIOR), times, seen)) for h in (f, g, own))
     for k in range(4):
         spoke = states[k].ledger.rounds - (states[k - 1].ledger.rounds if k else 0)
         assert spoke == (k in told)
@@ -347,6 +345,7 @@ def test_a_prior_of_any_kind() -> None:
     for g, wrong, text in ((f, lambda n, rng, leading: None, "got a function"),
                            (f, ([0.0, 0.0], [1.0, 1.0]), r"a covariance of .*, got \(2,\)"),
                            (f, [[0.0, 0.0], [1.0, 1.0]], "more than 2 members, got 2"),
+                           (f, [PRIOR] * 3, "one for all agents"),
                            (unscented, flat, "definite"), (made("mixture")[0], flat, "definite")):
         with pytest.raises(ValueError, match=f"prior: needs .*{text}"):
             g.start(wrong)

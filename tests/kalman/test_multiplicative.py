@@ -118,9 +118,8 @@ def test_changes_are_readings_of_two_states() -> None:
     exact = kalman_filter(np.r_[mean, mean], wide, y, F=double, Q=noise, H=h,
                           R=np.diag([0.04, 0.04, 0.09]))
     np.testing.assert_allclose(run.means, exact.means[..., :d], rtol=0, atol=1e-8)
-    np.testing.assert_allclose(
-        run.covariances, np.broadcast_to(exact.covariances[..., :d, :d], run.covariances.shape),
-        rtol=0, atol=1e-8)
+    wanted = np.broadcast_to(exact.covariances[..., :d, :d], run.covariances.shape)
+    np.testing.assert_allclose(run.covariances, wanted, rtol=0, atol=1e-8)
     np.testing.assert_allclose(run.log_likelihood, exact.log_likelihood, rtol=0, atol=1e-7)
 
 

@@ -229,9 +229,8 @@ def test_agents_fuse_the_marginals_of_whom_they_hear() -> None:
     channel = Channel(graphs.path(3))
     after = target_fusion(BELIEFS, channel, target_dim=2)
     said = [m.marginal(TARGET) for m in BELIEFS]
-    wanted = [
-        fuse(BELIEFS[0], said[1]), fuse(BELIEFS[1], [said[0], said[2]]), fuse(BELIEFS[2], said[1])
-    ]
+    heard = said[1], [said[0], said[2]], said[1]
+    wanted = [fuse(own, others) for own, others in zip(BELIEFS, heard, strict=True)]
     for a, b in zip(after, wanted, strict=True):
         assert np.array_equal(a.means, b.means) and np.array_equal(a.weights, b.weights)
     # A mixand is a weight, two means and three entries of a covariance; 1 has two listeners.

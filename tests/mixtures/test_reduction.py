@@ -51,9 +51,8 @@ def brute(p: GaussianMixture, size: int) -> GaussianMixture:
         return 0.5 * float(total * np.linalg.slogdet(cov)[1] - own)
 
     while len(w) > size:
-        i, j = min(
-            ((i, j) for i in range(len(w)) for j in range(i + 1, len(w))), key=lambda ij: loss(*ij)
-        )
+        pairs = ((i, j) for i in range(len(w)) for j in range(i + 1, len(w)))
+        i, j = min(pairs, key=lambda ij: loss(*ij))
         w[i], m[i], c[i] = merged(i, j)
         del w[j], m[j], c[j]
     return GaussianMixture(np.array(w), np.array(m), np.array(c))

@@ -60,6 +60,8 @@ def test_a_function_that_takes_one_state_only_is_refused(
 def test_a_function_s_own_error_is_not_hidden() -> None:
     with pytest.raises(ValueError, match="x: needs more components"):
         direct([3], std=1.0).predict(np.ones((4, 2)))
+    with pytest.raises(ValueError, match="indices: needs a number below 2, got 3"):
+        direct([3], std=1.0).matrix(2)
 
 
 def test_a_function_that_works_in_place_leaves_the_caller_s_states() -> None:

@@ -37,10 +37,8 @@ def test_pca_complement() -> None:
     """Outside the leading directions: kept, or lost with the mean."""
     w = principal_directions(_FOUR[0], 2)
     outside = np.eye(3) - w @ w.T
-    keep, literal = (
-        principal_components(*_FOUR, rng=_rng(3), n_state=2, n_observed=2, complement=c)
-        for c in ("keep", "literal")
-    )
+    keep, literal = (principal_components(*_FOUR, rng=_rng(3), n_state=2, n_observed=2,
+                                          complement=c) for c in ("keep", "literal"))
     assert np.allclose(keep @ outside, _FOUR[0] @ outside, atol=1e-9)
     assert np.allclose(literal @ outside, 0, atol=1e-9)
     assert np.allclose(keep @ w, literal @ w, atol=1e-8)
