@@ -1,8 +1,7 @@
 // What is wrong on an open page: names, headings, landmarks, tables, contrast, focus.
 document.documentElement.dataset.theme = document.documentElement.dataset.mode = arguments[0];
-const still = document.createElement("style");
+const still = document.head.appendChild(document.createElement("style"));
 still.textContent = "* { transition: none !important; animation: none !important; }";
-document.head.append(still);
 const found = [], told = (rule, e) => found.push(rule + ": " + e.outerHTML.slice(0, 90));
 const all = (query) => [...document.querySelectorAll(query)];
 const seen = (e) => e.getClientRects().length > 0 && getComputedStyle(e).visibility !== "hidden";
@@ -76,5 +75,4 @@ for (const e of [...kinds.values()].slice(0, 60)) {
   if (document.activeElement === e && look() === before) told("focus is not seen", e);
   e.blur();
 }
-still.remove();
 return [...new Set(found)];

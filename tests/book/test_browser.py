@@ -24,8 +24,9 @@ BUILT = ROOT / "_build" / "html"
 LOCAL = ("file://", "data:", "blob:", "about:")
 # Pages that a Chromium opens for itself, whatever its version: what they ask for is not the book's.
 OWN = ("chrome://", "chrome-untrusted://", "chrome-extension://", "devtools://", "about:")
+ASKS = ("Network.requestWillBeSent", "Network.webSocketCreated")
 WIDTHS = (1440, 1200, 400)
-THEMES = ("dark", "light")
+THEMES = ("light", "dark")
 # Opens what is folded, then reports what a reader would meet.
 REPORT = r"""
 document.querySelectorAll("details").forEach(d => { d.open = true; });
@@ -122,6 +123,7 @@ class Visit:
 
 def visit(driver: Any, page: Path) -> Visit:
     """Open a page, make it narrower, and collect what happened."""
+    driver.get("about:blank")  # the last page need not be laid out again
     for kind in ("performance", "browser"):
         driver.get_log(kind)
     fit: dict[int, dict[str, Any]] = {}
@@ -147,17 +149,10 @@ def asked(entries: list[dict[str, Any]], tab: str) -> list[str]:
     The log has every tab's events, and Chromium opens tabs of its own; and a new tab shows a page
     of Chromium's own before it shows ours.
     """
-    out = []
-    for entry in entries:
-        message = entry["message"]
-        params = message.get("params", {})
-        if entry.get("webview", tab) != tab:
-            continue
-        if message["method"] == "Network.requestWillBeSent":
-            out.append(params["request"]["url"])
-        elif message["method"] == "Network.webSocketCreated":
-            out.append(params["url"])
-    return [url for url in out if not url.startswith(OWN)]
+    sent = [entry["message"] for entry in entries if entry.get("webview", tab) == tab]
+    told = [message["params"] for message in sent if message["method"] in ASKS]
+    urls = [params.get("request", params)["url"] for params in told]
+    return [url for url in urls if not url.startswith(OWN)]
 
 
 @contextmanager

@@ -117,6 +117,8 @@ def _print_digests() -> None:
         shell.run_line_magic("config", f"InlineBackend.print_figure_kwargs = {packed}")
         text = shell.display_formatter.formatters["text/plain"]
         text.for_type(Figure, lambda figure, printer, cycle: printer.text(of_axes(figure)))
+        # The backend shows a cell's figures; pyplot's own hook would draw each once more, unseen.
+        pyplot.uninstall_repl_displayhook()
 
 
 def axes(
