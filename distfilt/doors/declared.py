@@ -117,12 +117,11 @@ def unchecked(function: F) -> F:
     True
     """
     given: Any = function
-    if isinstance(given, MethodType):
-        given = MethodType(getattr(given, "unchecked", given.__func__), given.__self__)
+    inner = getattr(given, "unchecked", None)  # a method has what its function has
+    if inner is not None:
+        given = MethodType(inner, given.__self__) if type(given) is MethodType else inner
     elif isinstance(given, partial):
         given = partial(unchecked(given.func), *given.args, **given.keywords)
-    else:
-        given = getattr(given, "unchecked", given)
     return given  # type: ignore[no-any-return]
 
 
@@ -156,10 +155,10 @@ class Record:
     def unchecked(cls, *args: Any, **options: Any) -> Self:
         """Build one from what the library made itself: nothing is checked or copied."""
         out, (names, factories) = object.__new__(cls), _names(cls)  # type: ignore[arg-type]
-        vars(out).update(zip(names, args, strict=False), **options)
+        (own := vars(out)).update(zip(names, args, strict=False), **options)
         for name, factory in factories:
-            if name not in vars(out):
-                vars(out)[name] = factory()
+            if name not in own:
+                own[name] = factory()
         return out
 
     def changed(self, **changes: Any) -> Self:

@@ -294,7 +294,7 @@ def batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Arr
     """
     function, x = getattr(owner, name), states[0]
     out, wanted = _made(function, states, rest), (*x.shape[:-1], owner.dim)
-    fits = np.shape(out) == wanted
+    fits = getattr(out, "shape", None) == wanted  # an error has none
     if x.ndim > 1 and x.size and not (fits and "_compared" in vars(owner)):
         last = [s.reshape(-1, s.shape[-1])[-1] for s in states]
         alone = _made(function, last, rest)

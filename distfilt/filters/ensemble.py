@@ -86,10 +86,10 @@ class MembersFilter(Filter):
 
     def summary(self, state: Any) -> Summary:
         """Means and variances of the agents' ensembles, and the members for the scores."""
-        x, average = state.ensembles, unchecked(moments.mean)
-        mean = average(x)
-        variance = average((x - mean[..., None, :]) ** 2) * (self.members / (self.members - 1))
-        return Summary(state.shown(mean), state.shown(variance), members=x)
+        centre, a = moments.about_mean(x := state.ensembles)
+        a *= a
+        variance = unchecked(moments.mean)(a) * (self.members / (self.members - 1))
+        return Summary(state.shown(centre[..., 0, :]), state.shown(variance), members=x)
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,21 +193,19 @@ class EnsembleFilter(MembersFilter):
         rows = group.rows
         members = tuple([e[..., rows, :, :] for e in stack])
         # What a late reading tells of the time before is in the stack.
-        before = step.before(place, rows, stack[:-1])
+        before = step.before(place, group, stack[:-1])
         predicted = group.predict(members[place], before)
         group = step.gated(group, sample_moments, predicted)
-        again = getattr(self.update, "repredicts", False)
 
         def compute(h: Array, y: Array, *rest: Any) -> tuple[Array, ...]:
             *ensembles, noise, source = rest
-            options: dict[str, Any] = {}
-            if again and len(stack) == 1 and h.shape == predicted.shape:
-                options["predict"] = lambda x: group.predict(x, before)
+            whole = len(stack) == 1 and h.shape == predicted.shape
+            predict = partial(group.predict, previous=before) if whole else None
             # Every time's members meet the same draw of the noise, so that all the separate
             # updates are one joint update; the last one advances the generator.
             sources = [copied(source) for _ in ensembles[1:]] + [source]
             both = zip(ensembles, sources, strict=True)
-            return tuple([self._updated(x, h, y, noise, own, options) for x, own in both])
+            return tuple([self._updated(x, h, y, noise, own, predict) for x, own in both])
 
         result, errors = guarded(
             compute, (predicted, group.target, *members), members, group.target.ndim - 1,
@@ -218,11 +216,11 @@ class EnsembleFilter(MembersFilter):
         return errors
 
     def _updated(
-        self, x: Array, h: Array, y: Array, noise: Array, rng: Any, options: dict[str, Any]
+        self, x: Array, h: Array, y: Array, noise: Array, rng: Any, predict: Any
     ) -> Array:
         """One time's ensembles after the update; a plain function gets one agent's at a time."""
-        if options or getattr(self.update, "repredicts", False):
-            return unchecked(self.update)(x, h, y, noise, rng=rng, **options)
+        if getattr(self.update, "repredicts", False):
+            return unchecked(self.update)(x, h, y, noise, rng=rng, predict=predict)
 
         def one(x: Array, h: Array, y: Array, r: Array) -> Array:
             new = with_missing(self.update, x, h, y, r, rng=rng)
@@ -326,7 +324,7 @@ class TransportFilter(MembersFilter):
         logs = np.zeros(stack[-1].shape[:-1])
         for place, group in step.heard():
             rows = group.rows
-            before = step.before(place, rows, stack[:-1])
+            before = step.before(place, group, stack[:-1])
             predicted = group.predict(stack[place][..., rows, :, :], before)
             group = step.gated(group, sample_moments, predicted)
             logs[..., rows, :] += log_likelihood(predicted, group.target, group.noise)

@@ -58,7 +58,8 @@ class Heard:
             cells: Any = (slice(None), slice(None)) if whole else (rows[:, None], columns)
             self.parts.append((sensor, slice(None) if whole else rows, cells))
         self.noise = noise[0] if (noise == noise[:1]).all() else noise
-        self.linear = all(sensor.linear is not None for sensor, *_ in self.parts)
+        self.linear = all(sensor.linear is not None for sensor in places)
+        self.changes = any(sensor.uses_previous for sensor in places)
         self.matrices: dict[int, Array] = {}
 
     def matrix(self, dim: int) -> Array:

@@ -22,6 +22,8 @@ __all__ = [
     "sensor_of",
 ]  # fmt: skip
 
+_LISTED = list, Sequence, np.ndarray
+
 
 @dataclass(frozen=True, eq=False)
 class Reading(Record):
@@ -82,11 +84,10 @@ def said_by_all(f: Any, observations: Any, runs: tuple[int, ...], t: float) -> l
     out: list[list[Reading]] = []
     for agent, given in enumerate(one_each(observations, f.count)):
         own = f.team[agent]
-        if type(given) is np.ndarray and given.dtype == np.float64 and len(own) == 1:
-            whole = given.shape == (*runs, own[0].dim) and all_finite(given)
-            if whole:  # as nearly all are
-                out.append([Reading.unchecked(t, agent, given)])
-                continue
+        plain = type(given) is np.ndarray and given.dtype == np.float64 and len(own) == 1
+        if plain and given.shape == (*runs, own[0].dim) and all_finite(given):  # as nearly all are
+            out.append([Reading.unchecked(t, agent, given)])
+            continue
         name = f"observations[{agent}]"
         several = given if _are_readings(given) else () if given is None else (given,)
         found = [_complete(f, _read(f, one, agent, t, name), runs, name) for one in several]
@@ -97,8 +98,8 @@ def said_by_all(f: Any, observations: Any, runs: tuple[int, ...], t: float) -> l
 def one_each(observations: Any, agents: int) -> Any:
     """Observations in a list, one entry for each agent."""
     observations = observations.to_numpy() if hasattr(observations, "to_numpy") else observations
-    if not isinstance(observations, list | Sequence | np.ndarray) or len(observations) != agents:
-        listed = isinstance(observations, Sequence | np.ndarray)
+    listed = isinstance(observations, _LISTED)
+    if not listed or len(observations) != agents:
         got = len(observations) if listed else type(observations).__name__
         raise ValueError(f"observations: needs a list, one for each of {agents} agents, got {got}")
     return observations

@@ -123,7 +123,7 @@ class ParticleFilter(MembersFilter):
             stack[-1] = step.moved(moved, stack[-1])
         for place, group in step.heard():
             rows = group.rows
-            before = step.before(place, rows, [old] if step.dt else stack[:-1])
+            before = step.before(place, group, [old] if step.dt else stack[:-1])
             predicted = group.predict(stack[place][..., rows, :, :], before)
             group = step.gated(group, weighted_moments, predicted, np.exp(weights[..., rows, :]))
             step.settle(_weigh(weights, predicted, group), group.agents)

@@ -84,22 +84,21 @@ def recorded(
     names, units = filter_.components
     agents = list(filter_.agents)
     known, chosen = _known(truth, names, (times.size, *start.runs), len(agents))
-    columns: dict[str, list[Array]] = {}
+    rows: list[dict[str, Array]] = []
     last, ledgers = start, [start.ledger]
     for k, (last, summary) in enumerate(said):
         ledgers.append(last.ledger)
         scored = {} if known is None else _scored(summary, known[k], chosen, scores)
-        for name, value in (_told(last, summary) | scored).items():
-            columns.setdefault(name, []).append(np.asarray(value))
+        rows.append(_told(last, summary) | scored)
 
     n = len(start.runs)
     lead = ("time", *(("run",) if n == 1 else [f"run{i}" for i in range(n)]), "agent")
     axes = {"covariance": (*lead, "component", "column")}
     axes |= {k: (*lead, "component") for k in ("mean", "variance", "squared_error", "crps")}
-    data = {
-        name: (axes.get(name, lead), _series(name, np.array(values)), _attributes(name))
-        for name, values in columns.items()
-    }
+    data = {}
+    for name in rows[0] if rows else ():
+        values = _series(name, np.array([row[name] for row in rows]))
+        data[name] = axes.get(name, lead), values, _attributes(name)
     for name in _SENT:
         data |= _counted(name, [getattr(ledger, name) for ledger in ledgers])
     coords = {
@@ -108,7 +107,7 @@ def recorded(
     }
     out = xarray.Dataset(data, coords=coords)
     # A selection or another run joined to this one inherits the entry: these tell them apart.
-    mean = np.array(data["mean"][1][-1]) if columns else None
+    mean = np.array(data["mean"][1][-1]) if rows else None
     out.encoding["final_state"] = last, agents, mean
     return out
 

@@ -162,12 +162,12 @@ class SensorState(State):
     @property
     def belief(self) -> Array:
         """What the agents believe, under the family's own name for it."""
-        return np.asarray(getattr(self, self._belief[0]))
+        return getattr(self, self._belief[0])  # type: ignore[no-any-return]
 
     @property
     def runs(self) -> tuple[int, ...]:
         """Leading axes: independent runs of the network."""
-        return tuple(self.belief.shape[: 1 - len(self._belief[1])])
+        return self.belief.shape[: 1 - len(self._belief[1])]
 
     @property
     def sizes(self) -> tuple[int, ...]:

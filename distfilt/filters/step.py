@@ -92,9 +92,8 @@ class Step:
         self.failed = getattr(state, "failed", _NOBODY)
         self.lost = bool(np.count_nonzero(self.failed))
         self.waiting: tuple[Any, ...] = ()
-        self.refused: Array | None = None
-        if filter_.gate is not None:
-            self.refused = np.zeros((*state.runs, filter_.count))
+        gated = filter_.gate is not None
+        self.refused: Any = np.zeros((*state.runs, filter_.count)) if gated else None
 
     def settle(self, errors: dict[Row, str], agents: Any = None) -> None:
         """Take the runs of these errors as failed, or raise the error that names the first.
@@ -121,8 +120,8 @@ class Step:
 
     def moved(self, values: Array, old: Any) -> Array:
         """A forecast (*runs, A, ...); `old` in failed runs."""
-        bad = _not_finite(values, self.failed.ndim + 1, "forecast")
-        self.settle(bad, range(self.filter.count))
+        if bad := _not_finite(values, self.failed.ndim + 1, "forecast"):
+            self.settle(bad, range(self.filter.count))
         # Groups of agents are updated in place, which a state must not notice.
         apart = not np.may_share_memory(values, self.state.belief)
         return self.kept(values if apart else values.copy(), old)
@@ -136,6 +135,8 @@ class Step:
 
     def stack(self, now: Array) -> list[Array]:
         """Copies of what is believed of the earlier times, then what is believed of now."""
+        if not self.times:
+            return [now]
         before = [x for _, x in self.state.history] + [self.state.belief] * (self.dt > 0)
         return [x.copy() for x in before[len(before) - len(self.times) :]] + [now]
 
@@ -223,14 +224,14 @@ class Step:
         self.refused[..., group.agents] += refused
         return group
 
-    def before(self, place: int, rows: Any, past: list[Array]) -> Array | None:
-        """A group's members at the time before now, for sensors that see changes.
+    def before(self, place: int, group: Heard, past: list[Array]) -> Array | None:
+        """A group's members at the time before now, where a sensor sees changes.
 
         They are the last of the `past`, or those with which the step begins, if it has a length.
         """
-        if place < len(self.times) or not (past or self.dt):
+        if not group.changes or place < len(self.times) or not (past or self.dt):
             return None
-        return (past or [self.state.belief])[-1][..., rows, :, :]
+        return (past or [self.state.belief])[-1][..., group.rows, :, :]
 
     @property
     def agrees(self) -> bool:
@@ -337,12 +338,15 @@ class _Unseeded(np.random.bit_generator.ISeedSequence):  # whose state comes fro
         return np.zeros(n_words, dtype)
 
 
+_UNSEEDED = _Unseeded()
+
+
 def copied(rng: Any) -> Any:
     """A generator at the same place, in a seventh of the time that a deep copy takes."""
     if type(rng) is not np.random.Generator:
         return copy.deepcopy(rng)
     old: Any = rng.bit_generator
-    bits = type(old)(_Unseeded())
+    bits = type(old)(_UNSEEDED)
     bits.__setstate__((old.state, copy.copy(old.seed_seq)))
     return np.random.Generator(bits)
 

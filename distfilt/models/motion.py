@@ -114,13 +114,13 @@ def rk4(
         # The rate may work in place: it gets arrays of its own, and what it returns is used before
         # it is called again.
         slope = array(rate(state.copy("K"), s), "rate", x.shape, finite=False)
-        total = slope.copy("K")
+        total = 0.5 * slope
         slope = rate(state + 0.5 * h * slope, s + 0.5 * h)
-        total += 2 * slope
+        total += slope
         slope = rate(state + 0.5 * h * slope, s + 0.5 * h)
-        total += 2 * slope
-        total += rate(state + h * slope, s + h)
-        total *= h / 6
+        total += slope
+        total += 0.5 * rate(state + h * slope, s + h)
+        total *= h / 3
         total += state
         state = total
     return np.asarray(state)

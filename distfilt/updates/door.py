@@ -132,7 +132,8 @@ def perturbed(predicted: Array, noise: Array, rng: Rng, *, centred: bool = False
     drawn, n = rng.standard_normal(predicted.shape), predicted.shape[-2]
     if centred:
         drawn = np.sqrt(n / (n - 1)) * (drawn - drawn.mean(axis=-2, keepdims=True))
-    return predicted + drawn @ cholesky(noise).mT
+    out = drawn @ cholesky(noise).mT
+    return np.asarray(np.add(out, predicted, out=out))
 
 
 def with_missing(
@@ -170,7 +171,8 @@ def with_missing(
     # What is drawn for an ensemble depends on its place and on how many readings it has, not on
     # what others miss: each number of readings has a stream, which is drawn from for all places.
     # As words of 32 bits, which seeds are made of: 63 bits each, as `integers` would draw them.
-    base = [w for r in rng.bit_generator.random_raw(2).tolist() for w in (r // 2 % 2**32, r >> 33)]
+    a, b = rng.bit_generator.random_raw(2).tolist()
+    base = [a // 2 % 2**32, a >> 33, b // 2 % 2**32, b >> 33]
     if all_finite(observed) and all_finite(predicted):
         return inner(ensemble, predicted, observed, noise, rng=_stream(rng, base, m, lead))
     present = ~np.isnan(observed) & ~np.isnan(predicted).any(axis=-2)

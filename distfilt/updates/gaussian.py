@@ -112,7 +112,8 @@ def known_noise(
     drawn = perturbed(predicted, noise, rng, centred=centred)
     b = about_mean(predicted)[1]
     gain = _gain(about_mean(ensemble)[1], b, noise)
-    return np.asarray(ensemble + (observed[..., None, :] - drawn) @ gain)
+    out = np.subtract(observed[..., None, :], drawn, out=drawn) @ gain
+    return np.asarray(np.add(out, ensemble, out=out))
 
 
 @update
