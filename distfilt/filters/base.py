@@ -261,8 +261,7 @@ class Filter(Record, ABC):
             raise ValueError(f"state: needs a {needs}, got a {type(state).__name__}")
         if (got := state.ledger.messages.size) != self.count:
             raise ValueError(f"state: needs {self.count} agents, got {got}")
-        own = getattr(self, "sizes", None)
-        if own is not None and state.sizes != own:
+        if (own := getattr(self, "sizes", None)) is not None and state.sizes != own:
             raise ValueError(f"state: needs sizes {own} an agent, got {state.sizes}")
 
     def read(self, observations: Any, runs: tuple[int, ...], t: float) -> Any:

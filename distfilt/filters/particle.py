@@ -179,9 +179,10 @@ class ParticleFilter(MembersFilter):
         rows = slice(None) if poor.all() else poor
         picked = particles.picked_by(weights[rows], offset[rows])
         for k, path in enumerate(stack):
-            moved = particles.taken(path[rows], picked)
-            stack[k] = path.copy() if rows is poor else moved
-            stack[k][rows] = moved
+            stack[k] = moved = particles.taken(path[rows], picked)
+            if rows is poor:
+                stack[k] = path.copy()
+                stack[k][rows] = moved
         log_weights[rows] = -np.log(self.members)
         return picked
 

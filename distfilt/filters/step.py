@@ -135,8 +135,6 @@ class Step:
 
     def stack(self, now: Array) -> list[Array]:
         """Copies of what is believed of the earlier times, then what is believed of now."""
-        if not self.times:
-            return [now]
         before = [x for _, x in self.state.history] + [self.state.belief] * (self.dt > 0)
         return [x.copy() for x in before[len(before) - len(self.times) :]] + [now]
 

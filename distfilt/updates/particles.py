@@ -72,8 +72,8 @@ def taken(points: Array, picked: Indices) -> Array:
     """Rows of points (..., N, d) by their indices (..., N)."""
     n, d = points.shape[-2:]
     first = n * np.arange(picked.size // n)[:, None]
-    rows = (picked.reshape(-1, n) + first).ravel()
-    return np.asarray(points.reshape(-1, d)[rows].reshape(points.shape))
+    rows = picked.reshape(-1, n) + first
+    return np.asarray(points.reshape(-1, d).take(rows, axis=0).reshape(points.shape))
 
 
 @door
@@ -108,14 +108,14 @@ def resampled(probabilities: Annotated[Weights, "... n"], *, rng: Rng) -> Indice
 def picked_by(w: Array, offset: Array) -> Indices:
     """Index of the weight (..., N) that holds each of the levels (k + offset) / N."""
     n = w.shape[-1]
-    edges = np.cumsum(w, axis=-1)
     # How many levels lie below each edge; the last edge has all of them.
-    levels = n * (edges / edges[..., -1:])
+    levels = w.cumsum(axis=-1)
+    levels /= levels[..., -1:].copy()
+    levels *= n
     levels -= offset
-    below = np.ceil(levels, out=levels).clip(0, n, out=levels).astype(np.intp)
-    below[..., -1] = n
-    copies = below.copy()
-    copies[..., 1:] -= below[..., :-1]
+    copies = np.minimum(np.ceil(levels, out=levels), n, out=levels).astype(np.intp)
+    copies[..., -1] = n
+    copies[..., 1:] -= copies[..., :-1]
     each = np.arange(n) if copies.size == n else np.tile(np.arange(n), copies.size // n)
     return np.repeat(each, copies.reshape(-1)).reshape(copies.shape)
 
