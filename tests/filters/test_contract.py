@@ -107,11 +107,9 @@ def test_recorded_scores_by_their_definitions(family: str) -> None:
         assert np.allclose(mean, np.average(x, axis=0, weights=w), atol=1e-12)
         cov = np.cov(x.T, aweights=w, ddof=1 if w is None else 0)
         crps = metrics.crps(x, true, weights=w)
-    wanted = {
-        "squared_error": (mean - true) ** 2, "total_squared_error": ((mean - true) ** 2).sum(),
-        "crps": crps, "variance": np.diag(cov), "spread": np.sqrt(np.trace(cov)),
-        "nees": metrics.nees(mean, cov, true),
-    }
+    wanted = {"squared_error": (mean - true) ** 2, "nees": metrics.nees(mean, cov, true),
+              "total_squared_error": ((mean - true) ** 2).sum(), "crps": crps,
+              "variance": np.diag(cov), "spread": np.sqrt(np.trace(cov))}
     for name, value in wanted.items():
         assert np.allclose(got[name].values, value, rtol=1e-9, atol=1e-12), name
 

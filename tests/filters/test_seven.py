@@ -385,6 +385,8 @@ def test_the_extended_filter_bears_its_own_rounding() -> None:
 def test_inflation_widens_the_forecast_and_goes_with_fusion_and_the_past() -> None:
     wide = GaussianFilter(model(), EYES, NET, inflation=1.3, lag=2)
     plain = GaussianFilter(model(), EYES, NET, lag=2)
+    with pytest.raises(ValueError, match="^inflation: needs a number at least 0.5, got 0.05"):
+        GaussianFilter(model(), EYES, NET, inflation=0.05)
     a, b = (f.step(f.start(PRIOR), 0.5, [None] * 3) for f in (wide, plain))
     assert np.allclose(a.covariances, 1.69 * b.covariances)
     assert np.allclose(a.joint_covariances[..., :2, 2:], 1.3 * b.joint_covariances[..., :2, 2:])

@@ -101,9 +101,8 @@ def test_nonlinear_filters_agree_with_filterpy(
     y = stack(sensors).observe(path, rng=rng)
     y[1, 0], y[2, 1, 0], y[3, 2, 1] = np.nan, np.nan, np.nan
     cov = 0.01 * spd(rng, d)
-    run, other = (
-        f(start, cov, y, model=model, sensors=sensors, times=times) for f in (ours, theirs)
-    )
+    both = ours, theirs
+    run, other = (f(start, cov, y, model=model, sensors=sensors, times=times) for f in both)
     np.testing.assert_allclose(run.means, other.means, rtol=0, atol=1e-12)
     np.testing.assert_allclose(run.covariances, other.covariances, rtol=0, atol=1e-12)
 

@@ -199,13 +199,10 @@ def test_rules_for_losses_by_their_definition(lost: str) -> None:
     degree = both.sum(axis=1)
     expected = np.empty_like(values)
     for i in range(GRID.size):
-        share = {
-            "mutual": dense[i] * both[i],
-            "metropolis": both[i] / (1 + np.maximum(degree[i], degree)),
-            "keep": dense[i] * got[i],
-            "zero": dense[i] * got[i],
-            "renormalise": dense[i] * got[i] / (dense[i, i] + (dense[i] * got[i]).sum()),
-        }[lost]
+        came = dense[i] * got[i]
+        share = {"mutual": dense[i] * both[i], "keep": came, "zero": came,
+                 "metropolis": both[i] / (1 + np.maximum(degree[i], degree)),
+                 "renormalise": came / (dense[i, i] + came.sum())}[lost]
         own = dense[i, i] if lost == "zero" else 1 - share.sum()
         expected[i] = own * values[i] + share @ values
     out = Channel(GRID, faults=faults).combine(values, w, lost=lost)

@@ -18,11 +18,9 @@ from tests.support import unit_gap
 
 RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
 GAIN = 0.04
-ALL = {
-    **{r: partial(network.covariance_intersection, rule=r) for r in RULES},
-    "naive": network.naive_fusion, "arithmetic": network.arithmetic_average,
-    "pull": partial(network.consensus_pull, gain=GAIN),
-}
+ALL = {**{r: partial(network.covariance_intersection, rule=r) for r in RULES},
+       "naive": network.naive_fusion, "arithmetic": network.arithmetic_average,
+       "pull": partial(network.consensus_pull, gain=GAIN)}
 every = pytest.mark.parametrize("rule", ALL.values(), ids=ALL.keys())
 MOVES = {"least": network.intersection, "equal": partial(network.intersection, rule="equal"),
          "pull": partial(network.pull, gain=0.1)}

@@ -102,6 +102,8 @@ def test_partial_options_survive_the_open_door() -> None:
     assert not says(inflated(lambda x, h, y, r, *, rng: x, factor=1.0), "stacks")
     with pytest.raises(ValueError, match="rotation"):
         inflated(partial(square_root, rotation="left"), factor=1.0)
+    with pytest.raises(ValueError, match="^factor: needs a number at least 0.5, got 0.05"):
+        inflated(square_root, factor=0.05)
     with pytest.raises(TypeError, match="exact_draws.* missing 4 required"):
         exact_draws()
 
