@@ -106,6 +106,10 @@ def test_a_member_that_was_picked_or_moved_sees_changes_from_where_it_comes() ->
     assert (state.points[0] == state.points[1]).all() and (after.points[0] != after.points[1]).any()
     kept = replace(f, threshold=0.2).step(state, 2.0, [None] * 2)
     assert (kept.points == state.points).all() and (kept.weights == state.weights).all()
+    some, few = f.step(start, 1.0, [first, None]), replace(f, threshold=0.9)
+    again = [few.step(some, 2.0, [None] * 2).points for _ in range(2)]  # a state stays as it was
+    assert (again[0] == again[1]).all()
+    assert (again[0] != start.points).any(axis=(1, 2)).tolist() == [True, False]
     g = EnsembleFilter(STILL, eyes, members=50, lag=1)
     state = g.step(g.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [None])
     told, not_told = (g.step(state, 2.0, [y], late=[first]).ensembles for y in ([still], None))
@@ -115,14 +119,16 @@ def test_a_member_that_was_picked_or_moved_sees_changes_from_where_it_comes() ->
 @pytest.mark.parametrize("family", ["ensemble", "particle", "ensemble, common"])
 def test_a_change_that_is_read_after_its_step_is_one_from_the_step_s_begin(family: str) -> None:
     """A reading moves members as in one step with it; of what is not kept it is refused."""
-    f, start = made(family, sensors=[of_kind("differential", [0], std=0.5)], graph=None, lag=2)
+    eyes = [[of_kind("differential", [0], std=0.5), direct([1], std=0.8)]]
+    f, start = made(family, sensors=eyes, graph=None, lag=2)
+    now = [[Reading(1.0, 0, [0.4]), Reading(1.0, 0, [-0.7], 1)]]
     moved = f.step(start, 0.5, [None])
-    at_once = [replace(f, lag=k).step(moved, 1.0, [[0.4]]) for k in range(3)]
-    later = f.step(f.step(moved, 1.0, [None]), 1.0, [[0.4]])
+    at_once = [replace(f, lag=k).step(moved, 1.0, now) for k in range(3)]
+    later = f.step(f.step(moved, 1.0, [None]), 1.0, now)
     for state in (later, *at_once[1:]):
         assert np.allclose(f.summary(state).mean, f.summary(at_once[0]).mean, atol=1e-9)
     with pytest.raises(ValueError, match="needs the states before, which at a state's own time"):
-        replace(f, lag=0).step(start, start.t, [[0.4]])
+        replace(f, lag=0).step(start, 0.0, [Reading(0.0, 0, [0.4])])
 
 
 def test_particles_tend_to_the_kalman_filter_with_a_full_noise() -> None:
