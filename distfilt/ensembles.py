@@ -65,12 +65,12 @@ def mean(ensemble: Members) -> Array:
     array([2., 3.])
     """
     # A product with equal weights: ten times faster than a reduction over a short inner axis.
-    return np.asarray(_equal_weights(ensemble.shape[-2]) @ ensemble)
+    return np.asarray((_equal_weights(ensemble.shape[-2]) @ ensemble)[..., 0, :])
 
 
 @lru_cache(maxsize=16)
 def _equal_weights(members: int) -> Array:
-    return np.full(members, 1 / members)
+    return np.full((1, members), 1 / members)
 
 
 def about_mean(members: Array) -> tuple[Array, Array]:
@@ -80,7 +80,7 @@ def about_mean(members: Array) -> tuple[Array, Array]:
     (array([[2.]]), array([[-1.],
            [ 1.]]))
     """
-    centre = (_equal_weights(members.shape[-2]) @ members)[..., None, :]
+    centre = _equal_weights(members.shape[-2]) @ members
     return centre, members - centre
 
 

@@ -279,7 +279,7 @@ class Filter(Record, ABC):
         waiting = sorted(late, key=arrival)
         mine = False
         for t, observed in zip(grid.tolist(), entries, strict=True):
-            due = [item for item in waiting if arrival(item) <= t]
+            due = [item for item in waiting if arrival(item) <= t] if waiting else waiting
             waiting = waiting[len(due) :]
             state = self._advanced(state, t, observed, due, own=mine)
             mine = own

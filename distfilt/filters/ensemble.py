@@ -198,14 +198,13 @@ class EnsembleFilter(MembersFilter):
         group = step.gated(group, sample_moments, predicted)
 
         def compute(h: Array, y: Array, *rest: Any) -> tuple[Array, ...]:
-            *ensembles, noise, source = rest
-            whole = len(stack) == 1 and h.shape == predicted.shape
-            predict = partial(group.predict, previous=before) if whole else None
+            *earlier, last, noise, source = rest
             # Every time's members meet the same draw of the noise, so that all the separate
             # updates are one joint update; the last one advances the generator.
-            sources = [copied(source) for _ in ensembles[1:]] + [source]
-            both = zip(ensembles, sources, strict=True)
-            return tuple([self._updated(x, h, y, noise, own, predict) for x, own in both])
+            past = [self._updated(x, h, y, noise, copied(source), None) for x in earlier]
+            whole = not earlier and h.shape == predicted.shape
+            predict = partial(group.predict, previous=before) if whole else None
+            return (*past, self._updated(last, h, y, noise, source, predict))
 
         result, errors = guarded(
             compute, (predicted, group.target, *members), members, group.target.ndim - 1,

@@ -169,10 +169,12 @@ class Step:
                 if sender == agent:
                     for said in mine:
                         known[said.t][agent].append((sensor_of(f, said), said.value))
-                    continue
-                values = box[sender] if isinstance(box[sender], tuple) else (box[sender],)
-                for (t, sensor), value in zip(kinds[sender], values, strict=False):
-                    known[t][agent].append((sensor, value))
+                elif type(got := box[sender]) is tuple:
+                    for (t, sensor), value in zip(kinds[sender], got, strict=False):
+                        known[t][agent].append((sensor, value))
+                else:
+                    t, sensor = kinds[sender][0]
+                    known[t][agent].append((sensor, got))
         return known
 
     def _told(self, own: list[list[Reading]]) -> list[list[Reading]]:

@@ -135,9 +135,9 @@ def _pose_noise(t: float, dt: float, rate: float, sigma: float) -> Array:
 def _flow(x: Array, t: float, dt: float, rate: float, step: float) -> Array:
     moved = x[..., :6] @ _transition(dt, rate).T
     # Components first: each operation then runs over contiguous memory.
-    rows = np.ascontiguousarray(np.moveaxis(x[..., 6:], -1, 0))
+    rows = np.ascontiguousarray(x.reshape(-1, 13)[:, 6:].T)
     body = unchecked(rk4)(partial(_rates, alpha=rate), rows, t, dt, longest=step)
-    return np.concatenate([moved, np.moveaxis(body, 0, -1)], axis=-1)
+    return np.concatenate([moved, body.T.reshape(*x.shape[:-1], 7)], axis=-1)
 
 
 def _rates(rows: Array, t: float, alpha: float) -> Array:

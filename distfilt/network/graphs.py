@@ -144,10 +144,10 @@ class Graph(Record):
 
     def _summed(self, per_link: Array, axis: int = -2) -> Array:
         """What arrives over each agent's links, added: E entries along an axis become A."""
-        front = np.moveaxis(per_link, axis, 0)
+        front = per_link.swapaxes(axis, 0)
         shape = (self.size, *front.shape[1:])
         out = self.incidence @ front.reshape(len(front), math.prod(shape[1:]))
-        return np.moveaxis(np.asarray(out).reshape(shape), 0, axis)
+        return np.asarray(out).reshape(shape).swapaxes(0, axis)
 
     @door
     def neighbours(self, agent: Index) -> tuple[int, ...]:
