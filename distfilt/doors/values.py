@@ -311,14 +311,14 @@ def batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Arr
             )
         if fits and (x.reshape(-1, x.shape[-1])[0] != last[0]).any():
             vars(owner)["_compared"] = True
+    if fits:
+        return np.asarray(out)
     if isinstance(out, IndexError):
         raise ValueError(f"x: needs more components, got {x.shape}") from out
     if isinstance(out, Exception):
         raise out
-    if not fits:
-        raise ValueError(f"{name}: needs to return shape {wanted} for states {x.shape}, "
-                         f"got {out.shape}")
-    return np.asarray(out)
+    raise ValueError(f"{name}: needs to return shape {wanted} for states {x.shape}, "
+                     f"got {out.shape}")
 
 
 def _made(function: Callable[..., Any], states: Sequence[Array], rest: tuple[float, ...]) -> Any:

@@ -110,8 +110,7 @@ def known_noise(
     (np.float64(0.5), np.float64(0.5))
     """
     drawn = perturbed(predicted, noise, rng, centred=centred)
-    b = about_mean(predicted)[1]
-    gain = _gain(about_mean(ensemble)[1], b, noise)
+    gain = _gain(about_mean(ensemble)[1], about_mean(predicted)[1], noise)
     out = np.subtract(observed[..., None, :], drawn, out=drawn) @ gain
     return np.asarray(np.add(out, ensemble, out=out))
 
