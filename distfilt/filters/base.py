@@ -154,8 +154,8 @@ class Filter(Record, ABC):
         graph = as_graph(graph, self.count, self.names)
         if not graph.senders.size:
             return None
-        options: dict[str, Any] = {"runs": state.runs, "faults": self.faults, "t": t}
-        return Channel.unchecked(graph, ledger=state.ledger, **options)
+        return Channel.unchecked(graph, ledger=state.ledger, runs=state.runs,
+                                 faults=self.faults, t=t)
 
     def _contact(self, before: float, t: float) -> bool:
         if self.every is None:

@@ -90,8 +90,8 @@ class Channel:
 
     def of(self, run: Any, ledger: Ledger) -> Channel:
         """The same with another account; of the numbers of all runs, or as one loses messages."""
-        options: dict[str, Any] = {"runs": run.shape, "faults": self.faults, "t": self.t}
-        channel = Channel.unchecked(self.graph, ledger=ledger, **options)
+        channel = Channel.unchecked(self.graph, ledger=ledger, runs=run.shape,
+                                    faults=self.faults, t=self.t)
         channel._among = self._among[0], slice(None) if run.ndim else slice(run, run + 1)
         return channel
 
