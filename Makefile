@@ -137,7 +137,7 @@ lab: $(STAMP)
 	$(PY) book/tools/lab.py "$(LAB)"
 
 lock: $(STAMP)
-	$(PY) -m uv pip compile --quiet --universal --python-version 3.11 --no-emit-index-url \
+	$(PY) -m uv pip compile --quiet --universal --fork-strategy fewest --python-version 3.11 --no-emit-index-url \
 		--no-emit-find-links --no-header --no-annotate --generate-hashes \
 		--extra book --extra test --extra mutants --extra dask --extra mpi \
 		pyproject.toml requirements.in --output-file requirements.txt

@@ -11,9 +11,8 @@ from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..doors import Array, Bounds, NonNegative, Places, Record, array, door, unchecked
+from ..doors import Array, Bounds, Mask, NonNegative, Places, Record, array, door, unchecked
 from ..ensembles import Ensemble
 from ..linalg import SolverError, as_derivative, central
 
@@ -263,7 +262,7 @@ def _along_normals(slope: Array, gap: Array) -> Array:
 
 def _shortened(
     constraint: Constraint, x: Array, gap: Array, step: Array
-) -> tuple[Array, Array, NDArray[np.bool_]]:
+) -> tuple[Array, Array, Mask]:
     """The step halved in each state until its residual falls; whether it did."""
     before = np.linalg.norm(gap, axis=-1)
     better = np.zeros(len(x), dtype=bool)

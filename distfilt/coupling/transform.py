@@ -18,9 +18,9 @@ from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..doors import Array, NonNegative, Positive, Rng, array, door, unchecked
+from ..doors import Array, Indices, NonNegative, Positive, Rng, array, door, unchecked
 from ..ensembles import Ensemble
 from ..linalg import EPS, factor
 from .solvers import SQUARED, Solve, Solver, distances, scaled, solver_of
@@ -278,7 +278,7 @@ def rejuvenated(
 @door
 def transform_within(
     ensemble: Annotated[Array, "n d"], log_weights: ArrayLike,
-    pieces: Annotated[NDArray[np.intp], "n"], *, rng: Rng,
+    pieces: Annotated[Indices, "n"], *, rng: Rng,
 ) -> Array:
     r"""The transform on a set cut into pieces: no average crosses from one piece to another.
 

@@ -7,9 +7,8 @@ from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..doors import Array, Bounds, Count, NonNegative, Positive, Record, door
+from ..doors import Array, Bounds, Count, Indices, NonNegative, Positive, Record, door
 from ..models.swarm import inside
 
 __all__ = ["Grid", "zero_mean_prior"]
@@ -90,7 +89,7 @@ class Grid(Record):
         return float(np.prod(self.spacing))
 
     @cached_property
-    def edges(self) -> tuple[NDArray[np.float64], ...]:
+    def edges(self) -> tuple[Array, ...]:
         """Edges of the cells along each axis, (n_k + 1,)."""
         low = np.asarray(self.low)
         ends = zip(low, low + self.width, self.shape, strict=True)
@@ -125,7 +124,7 @@ class Grid(Record):
         return np.asarray(values / total[..., None])
 
     @door
-    def cells(self, positions: Annotated[Array, "... self.dim"]) -> NDArray[np.int64]:
+    def cells(self, positions: Annotated[Array, "... self.dim"]) -> Indices:
         """Number of the cell in which each of the positions (..., d) lies, (...)."""
         at = ((self._inside(positions) - self.low) / self.spacing).astype(np.int64)
         at = np.minimum(at, np.array(self.shape) - 1)
@@ -167,7 +166,7 @@ class Grid(Record):
         """Whether another grid, or a swarm, fills the same box."""
         return np.array_equal(self.low, other.low) and np.array_equal(self.high, other.high)
 
-    def wavenumbers(self, rank: int) -> NDArray[np.int64]:
+    def wavenumbers(self, rank: int) -> Indices:
         """The `rank` lowest cosine modes, (rank, d) half-waves along each axis, constant first.
 
         They are ordered by the frequency in the box, and ties by the number itself.

@@ -11,7 +11,7 @@ Annotation                              What may come, and what the function get
 ``Annotated[Array, "... N d"]``         finite real numbers of this shape, as float64
 ``Annotated[Array, "m", MISSING]``      the same, where NaN stands for what is missing
 ``Annotated[Array, "d d", definite]``   the same, if ``definite(value, name)`` lets it pass
-``Annotated[Mask, "A"]``                booleans; ``NDArray[np.intp]`` for integers
+``Annotated[Mask, "A"]``                booleans; ``Indices`` for integers
 ``float``, ``int``, ``bool``, ``str``   one finite number, one integer, one flag, a text not blank
 ``Positive``, ``Count``, ``Share``      numbers in bounds; others by ``Annotated[float, Bounds(…)]``
 ``Literal["a", "b"]``                   one of these words
@@ -51,12 +51,14 @@ from .values import (
 )
 
 __all__ = [  # fmt: skip
-    "Array", "Bounds", "Count", "Cov", "Index", "MISSING", "Mask", "NonNegative", "Places",
-    "Positive", "Record", "Rng", "Semidefinite", "Share", "Times", "Weights", "all_finite", "array",
-    "definite", "door", "increasing", "needed", "semidefinite", "summing_to_one", "unchecked",
+    "Array", "Bounds", "Count", "Cov", "Index", "Indices", "MISSING", "Mask", "NonNegative",
+    "Places", "Positive", "Record", "Rng", "Semidefinite", "Share", "Times", "Weights",
+    "all_finite", "array", "definite", "door", "increasing", "needed", "semidefinite",
+    "summing_to_one", "unchecked",
 ]
 
 Mask = NDArray[np.bool_]
+Indices = NDArray[np.intp]
 Rng = np.random.Generator
 Cov = Annotated[Array, "... d d", definite]
 Semidefinite = Annotated[Array, "... d d", semidefinite]

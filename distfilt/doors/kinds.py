@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .values import _fits, _real, _shape_text, array
+from .values import _fits, _shape_text, array
 
 __all__ = ["MISSING", "Kind", "Scope", "kind_of"]
 
@@ -69,7 +69,7 @@ class Kind:
 
 def _number(value: Any, name: str, scope: Scope) -> float:
     try:  # a TypeError for an array
-        out = float(value if type(value) in (float, int, np.float64) else _real(value, name)[()])
+        out = float(value if type(value) in (float, int, np.float64) else array(value, name, ()))
     except ValueError:
         raise TypeError from None
     if not math.isfinite(out):
@@ -174,9 +174,10 @@ def kind_of(annotation: Any) -> Kind | None:
     Traceback (most recent call last):
     ValueError: members: needs an integer of at least 1, got 0
     """
-    origin, args = get_origin(annotation), get_args(annotation)
     if annotation is Any or annotation == ArrayLike:
         return None
+    annotation = _meant(annotation)
+    origin, args = get_origin(annotation), get_args(annotation)
     if origin is Annotated:
         return _noted(args[0], args[1:])
     if origin in (Union, UnionType):
@@ -210,9 +211,17 @@ def _union(args: tuple[Any, ...]) -> Kind | None:
     return Kind(_words(kinds, " or "), partial(_either, kinds, type(None) in args))
 
 
+def _meant(annotation: Any) -> Any:
+    """What a ``type`` alias stands for, as numpy's NDArray is one since 2.5; others as they are."""
+    args = get_args(annotation)
+    value = getattr(get_origin(annotation) or annotation, "__value__", None)
+    return annotation if value is None else _meant(value[args] if args else value)
+
+
 def _noted(base: Any, notes: tuple[Any, ...]) -> Kind | None:
     """A type with a shape and rules beside it; the last shape counts, so that aliases can vary."""
     shapes = [note.split() for note in notes if isinstance(note, str) and note != MISSING]
+    base = _meant(base)
     if get_origin(base) is np.ndarray:
         kind: Kind | None = _array_of(base, shapes[-1] if shapes else None, MISSING in notes)
     else:

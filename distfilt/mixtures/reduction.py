@@ -10,10 +10,9 @@ from types import FunctionType
 from typing import Annotated, Any, Literal, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import qr
 
-from ..doors import Array, Bounds, Count, Index, Mask, Record, definite, door, unchecked
+from ..doors import Array, Bounds, Count, Index, Indices, Mask, Record, definite, door, unchecked
 from ..linalg import symmetrise
 from .gaussian import GaussianMixture
 
@@ -49,7 +48,7 @@ class Shapes(Record):
 
     means: Annotated[Array, "s d"]
     covs: Annotated[Array, "s d d", definite]
-    source: Annotated[NDArray[np.intp], "s", Bounds(at_least=0)]
+    source: Annotated[Indices, "s", Bounds(at_least=0)]
     dropped: Index = 0
 
     @property
@@ -274,7 +273,7 @@ def _whitened(mixture: GaussianMixture) -> tuple[Array, Array, Array, Array]:
     return mixture.weights.copy(), means, covs, np.asarray(root)
 
 
-def _costs(w: Array, m: Array, p: Array, dets: Array, i: Any, others: NDArray[np.intp]) -> Array:
+def _costs(w: Array, m: Array, p: Array, dets: Array, i: Any, others: Indices) -> Array:
     """Runnalls' bound of mixand i with others; a pair without weight costs nothing."""
     total = w[i] + w[others]
     a = np.divide(w[i], total, out=np.full(total.shape, 0.5), where=total > 0)
@@ -361,7 +360,7 @@ def _merged(w: Any, m: Any, p: Any, size: Any) -> Any:
     return alive
 
 
-def _grouped(mixture: GaussianMixture, labels: NDArray[np.intp]) -> GaussianMixture:
+def _grouped(mixture: GaussianMixture, labels: Indices) -> GaussianMixture:
     """Merge the mixands of equal label, keeping each group's weight, mean and covariance."""
     member = labels == np.arange(labels.max() + 1)[:, None]
     w = member @ mixture.weights

@@ -7,9 +7,8 @@ from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..doors import Array, Bounds, Count, Positive, door, unchecked
+from ..doors import Array, Bounds, Count, Indices, Positive, door, unchecked
 from ..linalg import symmetrise
 from .gaussian import GaussianMixture
 
@@ -113,7 +112,7 @@ def stretching(
 
 @door
 def split(
-    mixture: GaussianMixture, which: Annotated[NDArray[np.intp], "K", Bounds(at_least=0)],
+    mixture: GaussianMixture, which: Annotated[Indices, "K", Bounds(at_least=0)],
     directions: Annotated[Array, "K mixture.dim"], *, std: Fraction = 0.7,
 ) -> GaussianMixture:
     r"""Replace some mixands by three along a direction, keeping their mean and covariance.

@@ -6,13 +6,11 @@ from typing import Any
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
-from ..doors import array
+from ..doors import Indices, array
 
 __all__: list[str] = []
 
-Indices = NDArray[np.int64]
 
 
 def of_matrix(value: Any, name: str, *, directed: bool) -> scipy.sparse.csr_array:

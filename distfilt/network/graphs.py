@@ -12,9 +12,8 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from ..doors import Array, Bounds, Count, Index, Positive, Record, door
+from ..doors import Array, Bounds, Count, Index, Indices, Positive, Record, door
 from . import _links
-from ._links import Indices
 
 __all__ = ["Graph", "complete", "disk", "grid", "path", "ring", "star"]
 

@@ -10,8 +10,7 @@ from typing import Annotated
 import numpy as np
 import scipy
 
-from ..doors import Array, Record, door
-from ._links import Indices
+from ..doors import Array, Indices, Record, door
 from .graphs import Graph
 
 __all__ = [  # fmt: skip

@@ -18,10 +18,9 @@ from threading import Lock
 from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import ensembles
-from ..doors import Array, Record, door, needed, unchecked
+from ..doors import Array, Mask, Record, door, needed, unchecked
 from ..linalg import SolverError, leading
 
 __all__ = ["AffineMap", "compose", "fit", "fit_convex", "objective"]
@@ -178,7 +177,7 @@ def enough(y: Array, x: Array, members: int) -> Array:
     return joint
 
 
-def refuse(wrong: NDArray[np.bool_], m: int, needs: str) -> None:
+def refuse(wrong: Mask, m: int, needs: str) -> None:
     """An error if a variable of (..., m + d) is not what a fit needs, y blamed before x."""
     columns = np.flatnonzero(wrong.reshape(-1, wrong.shape[-1]).any(axis=0))
     if columns.size:

@@ -16,16 +16,14 @@ from inspect import signature
 from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..doors import Array, Cov, Rng, all_finite, door, unchecked
+from ..doors import Array, Cov, Indices, Rng, all_finite, door, unchecked
 from ..ensembles import Ensemble
 from ..linalg import cholesky, leading
 
 __all__ = ["Update", "around", "perturbed", "says", "update", "with_missing"]
 
 F = TypeVar("F", bound=Callable[..., Array])
-Indices = NDArray[np.intp]
 
 Update = Callable[..., Array]
 """``update(ensemble, predicted, observed, noise, *, rng) -> ensemble``"""

@@ -13,8 +13,8 @@ import numpy as np
 
 from .. import coupling
 from ..coupling.constraints import Constraint, Motion
-from ..doors import Array, Bounds, NonNegative, Positive, Rng, door, unchecked
-from .door import Indices, Update, around, with_missing
+from ..doors import Array, Bounds, Indices, NonNegative, Positive, Rng, door, unchecked
+from .door import Update, around, with_missing
 
 __all__ = ["augmented", "inflated", "localised", "projected", "retracted", "serial"]
 
