@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..doors import Array, Bounds, Count, Indices, NonNegative, Positive, Record, door
 from ..models.swarm import inside
@@ -89,7 +90,7 @@ class Grid(Record):
         return float(np.prod(self.spacing))
 
     @cached_property
-    def edges(self) -> tuple[Array, ...]:
+    def edges(self) -> tuple[NDArray[np.float64], ...]:
         """Edges of the cells along each axis, (n_k + 1,)."""
         low = np.asarray(self.low)
         ends = zip(low, low + self.width, self.shape, strict=True)
