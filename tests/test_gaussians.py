@@ -89,6 +89,10 @@ def test_extreme_precision_does_not_spoil_the_rest() -> None:
         m = np.stack([np.ones(3), np.zeros(3)])[order]
         mean_, cov = intersection(m, np.stack([sharp, wide])[order], [0.5, 0.5])
         assert np.allclose(mean_, 1.0) and unit_gap(cov, 2 * sharp) < 1e-9
+    # Components alike to the last bit: along their sum both count, and rounding hides the rest.
+    alike = (1 + np.eye(2) * 2.0**-52) / 16
+    cov = intersection(np.zeros((2, 2)), [np.eye(2), alike], [0.75, 0.25])[1]
+    assert np.isclose(cov.sum(), 2 / (0.75 + 0.25 / 0.125))
 
 
 # --- weights ----------------------------------------------------------------------------------

@@ -198,15 +198,15 @@ class Step:
         return [waited + mine for waited, mine in zip(out, own, strict=True)]
 
     def _payload(self, told: list[Reading]) -> Any:
-        """Values, and for others than an only reading of now when and of which sensor each is."""
+        """Values, and when and of which sensor each is, but for an only one: now, of the first."""
         if not told:
             return None
-        if len(told) == 1 and told[0].t == self.t and not told[0].about:
-            return told[0].value
         about: list[float] = []
         for said in told:
             which = said.sensor if isinstance(said.sensor, int) else -1
             about += [said.t, which, *said.about]
+        if about in ([self.t, 0], [self.t, -1]):
+            return told[0].value
         numbers = np.broadcast_to(np.array(about), (*self.state.runs, len(about)))
         return (*(said.value for said in told), numbers)
 

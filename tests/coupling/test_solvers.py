@@ -64,6 +64,7 @@ def test_neither_scale_nor_offset_of_the_cost_matters(scale: float) -> None:
     other = plan(np.asfortranarray(scale * cost + 7 * scale), a, b)
     assert np.abs(other.matrix - reference.matrix).max() < 1e-9
     assert abs(other.value / scale - 7 - reference.value) < 1e-9
+    assert abs(reference.gap) < 1e-12 and b.min() == 0
 
 
 def test_a_constant_cost_and_single_masses() -> None:

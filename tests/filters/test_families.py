@@ -152,6 +152,10 @@ def test_copies_are_regularised_by_default_where_the_model_never_parts_them() ->
     assert run["distinct"].values.min() > 0.5
     assert np.abs(run["mean"].values[:, 0, 0] - mean).max() < 0.02
     assert np.allclose(run["variance"].values[:, 0, 0], variance, rtol=0.15)
+    half = Model(2, lambda x, t, dt: x, lambda t, dt: np.diag([dt, 0.0]))
+    f = ParticleFilter(half, [direct([0], std=0.5)], members=60, threshold=1.0)
+    first = f.step(f.start(PRIOR, rng=np.random.default_rng(0)), 1.0, [[0.8]])
+    assert np.isin(f.step(first, 2.0, [None]).points[..., 1], first.points[..., 1]).all()
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.3])

@@ -13,7 +13,7 @@ from distfilt.coupling.transform import plans
 from distfilt.filters import Reading, TransportFilter
 from distfilt.filters.ensemble import EnsembleState
 from distfilt.linalg import SolverError
-from distfilt.network import average, graphs
+from distfilt.network import Graph, average, graphs
 from distfilt.sensors import Sensor, direct, stack
 
 from .families import NOISE, PRIOR, TIMES, data, model
@@ -25,7 +25,8 @@ FOUR: list[Sensor | None] = [
 
 def _filter(**options: Any) -> TransportFilter:
     options = {"members": 30} | options
-    return TransportFilter(model(), options.pop("sensors", FOUR), graphs.ring(4), **options)
+    sensors, graph = options.pop("sensors", FOUR), options.pop("graph", graphs.ring(4))
+    return TransportFilter(model(), sensors, graph, **options)
 
 
 def _start(f: TransportFilter, runs: tuple[int, ...] = ()) -> EnsembleState:
@@ -69,6 +70,15 @@ def test_only_log_likelihoods_are_sent() -> None:
     _, seen = data(FOUR)
     ledger = f.step(_start(f), TIMES[0], [o[0] for o in seen]).ledger
     assert ledger.rounds == 2 and (ledger.scalars == 2 * 2 * 30).all()
+
+
+def test_an_agent_whom_nobody_hears_counts_its_own_reading_once() -> None:
+    f, y = _filter(graph=Graph.from_edges(4, [])), [[0.3], [1.0], [0.5, 0.2], [-0.4]]
+    apart = f.step(_start(f), 0.5, y).ensembles
+    for k in range(4):
+        one = _filter(sensors=FOUR[k : k + 1], graph=None)
+        alone = one.step(_start(one), 0.5, [y[k]]).ensembles[0]
+        assert np.allclose(alone, apart[k], atol=1e-13)
 
 
 def test_sets_stay_in_common_with_noise_and_rejuvenation_over_runs() -> None:

@@ -55,7 +55,6 @@ def test_runs_are_smoothed_as_if_alone(gaps: bool) -> None:
     run = kalman_filter(np.zeros(D), np.eye(D), y, **p)
     smooth = rts_smoother(run, F=p["F"], Q=p["Q"])
     assert smooth.covariances.shape == run.covariances.shape
-    assert np.array_equal(smooth.log_likelihood, run.log_likelihood)
     for k in range(RUNS):
         alone = kalman_filter(np.zeros(D), np.eye(D), y[:, k], **p)
         alone = rts_smoother(alone, F=p["F"], Q=p["Q"])

@@ -79,7 +79,7 @@ def test_a_run_that_is_lost_is_named() -> None:
 def test_errors_move_by_the_derivative_of_the_flow_in_the_chart() -> None:
     rng = np.random.default_rng(4)
     x, cov, q = rng.standard_normal(13), spd(rng, 12), spd(rng, 13)
-    model = replace(satellite_pose(rate=0.3, sigma=0.0), noise_cov=lambda t, dt: q)
+    model = replace(satellite_pose(rate=0.3, sigma=0.0), noise_cov=lambda t, dt: (1 + t) * q)
     seen = multiplicative_filter(x, cov, [[0.1, 0.2]], chart=POSE, model=model, times=[0.8],
                                  sensors=[differential([9, 11], std=0.3)])
 

@@ -12,7 +12,7 @@ import pytest
 from distfilt.filters import GaussianFilter
 from distfilt.gaussians import conditioned
 from distfilt.kalman import GaussianRun, filterpy_ekf, filterpy_kf, filterpy_ukf, kalman_filter
-from distfilt.models import Model, clohessy_wiltshire
+from distfilt.models import Model
 from distfilt.sensors import Sensor, angle, direct, distance, distance_and_angle, stack
 from tests.kalman.problems import D, M, problem, walk
 from tests.support import spd, turning
@@ -55,28 +55,6 @@ def test_equal_to_filterpy(varying: bool, pattern: str, priors: tuple[int, ...])
     shared = pattern in ("whole", "common") and not priors
     assert ours.covariances.shape == (30, 1 if shared else runs, D, D)
     assert (full == full.mT).all() and np.linalg.eigvalsh(full).min() > 0
-
-
-@pytest.mark.parametrize("filter_", FILTERS)
-@pytest.mark.parametrize("runs", [(), (2, 3)])
-def test_linear_case_equals_the_kalman_filter(
-    filter_: Callable[..., Any], runs: tuple[int, ...]
-) -> None:
-    rng = np.random.default_rng(7)
-    model = clohessy_wiltshire(rate=0.1, sigma=0.2)
-    both = stack([direct([0, 1], std=0.2), direct([1, 2], std=0.2)])
-    times, y = np.array([0.6, 0.7, 0.9]), rng.standard_normal((3, *runs, 4))
-    y[1, ..., 2], y[2] = np.nan, np.nan
-    args = (rng.standard_normal(6), spd(rng, 6), y)
-    run = filter_(*args, model=model, sensors=[both], times=times)
-    steps = np.diff(times, prepend=0.0)
-    exact = kalman_filter(
-        *args, F=np.array([model.transition(dt) for dt in steps]), H=both.matrix(6), R=both.cov,
-        Q=np.array([model.noise(0.0, dt) for dt in steps]),
-    )  # fmt: skip
-    np.testing.assert_allclose(run.means, exact.means, rtol=0, atol=1e-10)
-    full = np.broadcast_to(exact.covariances, run.covariances.shape)
-    np.testing.assert_allclose(run.covariances, full, rtol=0, atol=1e-10)
 
 
 BENT = (

@@ -177,6 +177,8 @@ def test_regularised_least_squares_have_the_condition_asked_for(condition: float
     slope = padded.T @ (padded @ w - b)
     # The conditions of Karush, Kuhn and Tucker.
     assert np.abs(slope[w > 0]).max() < 1e-9 and (slope[w == 0] > -1e-9).all()
+    # Of the many solutions of fewer equations than unknowns the shortest.
+    assert np.allclose(nonnegative_least_squares([[1.0, 2.0]], [5.0]), [1.0, 2.0])
 
 
 def test_least_squares_have_a_limit() -> None:

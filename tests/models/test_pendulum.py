@@ -15,8 +15,6 @@ from distfilt.models import (
     pendulum_states,
 )
 
-FORMS = ("printed", "multiplier")
-
 G = 9.8
 START = np.array([np.sin(np.pi / 3), np.cos(np.pi / 3), 0.0, 0.0])
 
@@ -40,7 +38,7 @@ def test_the_printed_equations() -> None:
     assert np.allclose(pendulum_rate(s, length=size, form="multiplier"), expected, atol=1e-13)
 
 
-@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("form", ["printed", "multiplier"])
 def test_both_forms_are_the_pendulum_on_the_manifold(form: str) -> None:
     q = np.random.default_rng(0).uniform(-3, 3, (50, 2))
     one = pendulum(length=1.3, form=form, step=0.001)

@@ -54,9 +54,9 @@ def test_a_step_of_substeps_by_its_equations(with_rate: bool) -> None:
 
 @pytest.mark.parametrize(("graph", "dt", "gains", "limit"), [
     (graphs.complete(100), 9.9, (0.2, 0.4, 0.04), 2 / (0.2 + 0.4 * 198)),
-    (graphs.path(2), 5.0, (0.3, 0.1, 3.0), (0.3 + 0.1 * 2) / (3.0 * 2) ** 2),
-    (graphs.path(2), 5.0, (0.3, 0.1, 0.9), (0.3 + 0.1 * 2) / (0.9 * 2) ** 2),
-    (graphs.path(2), 1e-6, (0.3, 0.1, 0.9), 1.0),
+    (graphs.path(2), 5.0, (0.3, 0.1, 0.14), 2 / (0.3 + 0.1 * 2)),
+    (graphs.path(2), 5.0, (0.3, 0.1, 0.2), (0.3 + 0.1 * 2) / (0.2 * 2) ** 2),
+    (graphs.path(2), 1e-6, (0.3, 0.1, 0.2), 1.0),
 ])
 def test_substeps_are_half_as_long_as_the_bound(
     graph: Graph, dt: float, gains: tuple[float, float, float], limit: float

@@ -141,8 +141,9 @@ def test_projection_and_retraction_follow_the_update(inner: Update) -> None:
     x, y = swings(3), np.tile(SEEN, (3, 1))
     four = x, x[..., :2], y, NOISE
     plain = inner(*four, rng=rng())
-    out = projected(inner, CIRCLE, reading="particle")(*four, rng=rng())
-    assert np.allclose(out, project(plain, CIRCLE, reading="particle"), atol=1e-14)
+    how: Any = {"reading": "particle", "regularisation": 0.01}
+    out = projected(inner, CIRCLE, **how)(*four, rng=rng())
+    assert np.allclose(out, project(plain, CIRCLE, **how), atol=1e-14)
     assert np.abs(out - plain).max() > 1e-3
     out = retracted(inner, CIRCLE, motion=MOTION)(*four, rng=rng())
     assert np.allclose(out, retract(plain, CIRCLE, motion=MOTION), atol=1e-14)
