@@ -18,6 +18,7 @@ JOBS := 2
 PAGES := $(shell ls -S $$(sed -n 's|.* \(book/[0-9].*\)|\1.ipynb|p' _toc.yml) book/index.ipynb \
 	| sed 's|book/\([0-9a-z]*\).*|regress-\1|')
 SAMPLE := 300
+VERSIONS := lowest-direct highest
 
 # One thread in each BLAS, so that two runs give the same digits; book/tools pins the same for kernels.
 export OPENBLAS_NUM_THREADS := 1
@@ -33,7 +34,7 @@ ifndef CHECKING
 .NOTPARALLEL:
 endif
 .PHONY: help environment remake book test unit types style pairs regress slow outputs identical \
-	accept studies check-studies bench mutants portable lab lock pdf epub clean $(PAGES)
+	accept studies check-studies bench mutants portable versions lab lock pdf epub clean $(PAGES)
 
 help:
 	@echo "make book       environment, library and HTML (warnings are errors); prints the page's path"
@@ -46,6 +47,7 @@ help:
 	@echo "make studies    run the studies that take too long for a chapter, store them in data/studies"
 	@echo "make check-studies  run every stored study again and compare"
 	@echo "make portable   stored outputs on another BLAS kernel and without numpy's newer SIMD"
+	@echo "make versions   the library's tests with the oldest and the newest packages that it admits"
 	@echo "make bench      side-by-side measurements, written to data/bench if the machine is idle"
 	@echo "make mutants    how many of SAMPLE=300 random faults the tests find, written to data/bench"
 	@echo "make lab        JupyterLab on a working copy of the chapters (LAB=folder for another one)"
@@ -119,6 +121,15 @@ accept: $(STAMP)
 
 portable: $(STAMP)
 	$(PY) book/tools/regress.py --portable
+
+versions: $(STAMP)
+	@for which in $(VERSIONS); do \
+		$(PY) -m uv venv --quiet --clear --python "$(PYTHON)" _build/$$which \
+		&& $(PY) -m uv pip install --quiet --python _build/$$which --resolution $$which \
+			--requirements pyproject.toml --extra book --extra test --requirements requirements.in \
+		&& HYPOTHESIS_PROFILE=gate _build/$$which/bin/python -m pytest -q -n $(JOBS) \
+			-p no:cacheprovider --ignore tests/book --ignore tests/tools || exit 1; \
+	done
 
 studies: $(STAMP)
 	$(PY) book/tools/studies.py
