@@ -28,11 +28,16 @@ class Scope:
     values: dict[str, Any]
     sizes: dict[str, int] = field(default_factory=dict)
 
-    def shape(self, words: Sequence[str]) -> tuple[Any, ...]:
+    def fits(self, got: tuple[int, ...], words: tuple[Any, ...], heads: frozenset[str]) -> bool:
+        """Whether a shape is what its words say; if so it binds those that were free."""
+        wanted = words if heads.isdisjoint(self.values) else self.shape(words)
+        if fits := _fits(got, wanted, sizes := self.sizes.copy()):
+            self.sizes = sizes
+        return fits
+
+    def shape(self, words: Sequence[Any]) -> tuple[Any, ...]:
         """A shape as far as it is known."""
-        known = [... if word == "..." else self._size(word) for word in words]
-        if tuple not in map(type, known):
-            return tuple(known)
+        known = [self._size(word) if isinstance(word, str) else word for word in words]
         return tuple(chain.from_iterable(n if type(n) is tuple else (n,) for n in known))
 
     def _size(self, word: str) -> Any:
@@ -40,7 +45,7 @@ class Scope:
         if word in self.sizes:
             return self.sizes[word]
         head, *path = word.lstrip("*").split(".")
-        found = int(word) if word.isdigit() else self.values.get(head)
+        found = self.values.get(head)
         for part in path:
             found = getattr(found, part, None)
         return found if isinstance(found, (int, np.integer, tuple)) else word
@@ -106,7 +111,8 @@ def _one_of(options: tuple[Any, ...], value: Any, name: str, scope: Scope) -> An
 
 
 def _numbers(
-    dtype: type, words: Sequence[str] | None, missing: bool, value: Any, name: str, scope: Scope
+    dtype: type, words: tuple[Any, ...] | None, heads: frozenset[str], missing: bool, value: Any,
+    name: str, scope: Scope,
 ) -> Any:
     if dtype is np.float64:
         out: Any = array(value, name, finite=not missing)
@@ -117,8 +123,8 @@ def _numbers(
         kinds = "b" if dtype is np.bool_ else "iu"
         if out.dtype.kind not in kinds or isinstance(value, np.ma.MaskedArray):
             raise TypeError
-    if words is not None and not _fits(out.shape, wanted := scope.shape(words), scope.sizes):
-        raise ValueError(f"{name}: needs shape {_shape_text(wanted)}, got {out.shape}")
+    if words is not None and not scope.fits(out.shape, words, heads):
+        raise ValueError(f"{name}: needs shape {_shape_text(scope.shape(words))}, got {out.shape}")
     return out
 
 
@@ -234,4 +240,7 @@ def _array_of(base: Any, words: Sequence[str] | None = None, missing: bool = Fal
     dtype = get_args(get_args(base)[1])[0]
     what = {np.float64: "real numbers", np.bool_: "True and False"}.get(dtype, "integers")
     shape = "" if words is None else f" of shape ({', '.join(words)})"
-    return Kind(f"an array of {what}{shape}", partial(_numbers, dtype, words, missing))
+    known: Any = words and tuple([int(w) if w.isdigit() else {"...": ...}.get(w, w) for w in words])
+    # What a word may stand for: an argument, or what one has.
+    heads = frozenset(word.lstrip("*").split(".")[0] for word in words or ())
+    return Kind(f"an array of {what}{shape}", partial(_numbers, dtype, known, heads, missing))

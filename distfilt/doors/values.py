@@ -126,9 +126,9 @@ def definite(value: Array, name: str, word: str = "definite") -> None:
     """
     if value.ndim < 2 or value.shape[-1] != value.shape[-2]:
         raise ValueError(f"{name}: needs a square matrix, got shape {value.shape}")
-    gap = np.abs(value - value.mT)
-    if gap.any():
-        unit = _in_units(value)
+    # As a rule the same bytes, which takes a fifth of a difference's time.
+    if value.tobytes() != value.mT.tobytes():
+        unit, gap = _in_units(value), np.abs(value - value.mT)
         worst = gap[np.abs(unit - unit.mT) > _ROUNDING].max(initial=0.0)
         if worst > 0:
             raise ValueError(f"{name}: needs a symmetric matrix, got an asymmetry of {worst:.3g}")

@@ -65,11 +65,9 @@ def _rate(s: Array, t: float, size: float, g: float, printed: bool) -> Array:
     out = np.empty_like(s)
     out[..., 0], out[..., 1] = u, v
     np.multiply(pull, x, out=out[..., 2])
-    if printed:
-        # g x² / L² = g - g y² / L² + g (x² + y² - L²) / L²: off the circle another force.
-        out[..., 3] = pull * y + g * (x * x + y * y) / (size * size)
-    else:
-        out[..., 3] = pull * y + g
+    # g x² / L² = g - g y² / L² + g (x² + y² - L²) / L²: off the circle another force.
+    weight = g * (x * x + y * y) / (size * size) if printed else g
+    out[..., 3] = pull * y + weight
     return out
 
 

@@ -88,7 +88,8 @@ def update(function: F) -> F:
 
 def _related(four: dict[str, Array]) -> dict[str, Array]:
     """What the arguments become whose leading axes have to fit the ensemble's."""
-    (lead, *own) = (v.shape[:-k] for v, k in zip(four.values(), (2, 2, 1, 2), strict=True))
+    x, h, y, r = four.values()
+    lead, own = x.shape[:-2], (h.shape[:-2], y.shape[:-1], r.shape[:-2])
     if own[0] == own[1] == lead and own[2] in ((), lead):
         return {}
     for name, given in zip(list(four)[1:], own, strict=True):
