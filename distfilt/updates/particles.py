@@ -206,10 +206,8 @@ def log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
     # Components first: sums over a few of them then run along all particles.
     seen = np.ascontiguousarray(predicted.mT)
     gap, cov = observed[..., None] - seen, noise
-    missing = np.isnan(observed)
-    if not all_finite(seen):
-        missing = missing | np.isnan(seen).any(axis=-1)
-    if missing.any():
+    if not all_finite(gap):
+        missing = np.isnan(observed) | np.isnan(seen).any(axis=-1)
         # A missing component gets a zero residual and a unit of its own in R.
         here = ~missing[..., :, None] & ~missing[..., None, :]
         cov = np.where(here, noise, np.eye(noise.shape[-1]))
