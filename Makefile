@@ -124,9 +124,9 @@ portable: $(STAMP)
 
 versions: $(STAMP)
 	@for which in $(VERSIONS); do \
-		$(PY) -m uv venv --quiet --clear --python "$(PYTHON)" _build/$$which \
+		$(PY) -m uv venv --quiet --clear --seed --python "$(PYTHON)" _build/$$which \
 		&& $(PY) -m uv pip install --quiet --python _build/$$which --resolution $$which \
-			--requirements pyproject.toml --extra book --extra test --requirements requirements.in \
+			--editable ".[book,test]" --requirements requirements.in \
 		&& HYPOTHESIS_PROFILE=gate _build/$$which/bin/python -m pytest -q -n $(JOBS) \
 			-p no:cacheprovider --ignore tests/book --ignore tests/tools || exit 1; \
 	done

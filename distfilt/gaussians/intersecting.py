@@ -200,9 +200,7 @@ def _least(covs: Array, here: Mask, determinant: bool) -> Array:
     left, share = np.arange(len(point)), np.ones((len(point), 1))
     lowest = bound = np.full(len(point), np.inf)
     for _ in range(_STEPS):
-        blocks = [slice(k, k + _BLOCK) for k in range(0, len(point), _BLOCK)]
-        found = [_derivatives(point[b], [part[b] for part in fixed], determinant) for b in blocks]
-        value, slope, curvature = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        value, slope, curvature = _derivatives(point, fixed, determinant)
         mean = (point * slope).sum(axis=-1, keepdims=True)
         gap = slope.max(axis=-1) / mean[:, 0] - 1
         # What is settled stays: the others' need for more steps must not move it.
@@ -230,8 +228,14 @@ def _least(covs: Array, here: Mask, determinant: bool) -> Array:
     return np.asarray(best.reshape(*leading, s))
 
 
-def _derivatives(w: Array, fixed: list[Array], determinant: bool) -> tuple[Array, Array, Array]:
+def _derivatives(w: Array, fixed: list[Array], determinant: bool) -> tuple[Array, ...]:
     """What is made least (n,), minus its gradient (n, S), its second derivatives (n, S, S)."""
+    blocks = [slice(k, k + _BLOCK) for k in range(0, len(w), _BLOCK)]
+    found = [_derived(w[b], [part[b] for part in fixed], determinant) for b in blocks]
+    return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))
+
+
+def _derived(w: Array, fixed: list[Array], determinant: bool) -> tuple[Array, Array, Array]:
     roots, information, first, _ = fixed
     n, s, d = roots.shape[:3]
     total = w[:, None, :] @ information.reshape(n, s, d * d)
