@@ -1,0 +1,40 @@
+"""Does an agent that floods know a swarm better than the observer who sees everybody?
+
+Slow reading of (23), peaked start, 15 s, 36 swarms: the observer from the kernel estimate and
+from the flat Gaussian, and local filters by flooding. Errors are L2, averaged from 10 s on.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+import _swarm as swarm
+
+from bookkit.studies import spawn
+
+NAME, PAPER = "hearing", "zheng"
+CHOICES, FROM = swarm.CHOICES, 10.0
+CASE = swarm.Case(start="peaked", end=15.0)
+columns = ["central", "central_flat", "flooding"]
+parameters = {"seed": CHOICES["seed"], "end": CASE.end, "local": swarm.LOCAL}
+seeds = spawn(CHOICES["seed"] + 4, 36)
+scenarios = swarm.scenarios
+rtol = 1e-4
+
+
+def trial(seed: np.random.SeedSequence) -> dict[str, float]:
+    """One swarm."""
+    filters = {
+        "central": swarm.network("central", CASE),
+        "central_flat": swarm.network("central", CASE, first="flat"),
+        "flooding": swarm.network("flooding", CASE),
+    }
+    run, _ = swarm.compared(CASE, np.random.default_rng(seed), filters)
+    return {s: float(swarm.average(run[f"{s}_error"], CASE, FROM).mean()) for s in columns}
+
+
+code = swarm.code
