@@ -26,8 +26,6 @@ _GAP = 1e-7
 _STEPS = 60
 # A weight that vanishes stays above it: zero could not grow again.
 _LEAST = 1e-30
-# So many problems at a time stay in a processor's cache: that halves the time of thousands.
-_BLOCK = 256
 
 
 @door
@@ -228,14 +226,8 @@ def _least(covs: Array, here: Mask, determinant: bool) -> Array:
     return np.asarray(best.reshape(*leading, s))
 
 
-def _derivatives(w: Array, fixed: list[Array], determinant: bool) -> tuple[Array, ...]:
+def _derivatives(w: Array, fixed: list[Array], determinant: bool) -> tuple[Array, Array, Array]:
     """What is made least (n,), minus its gradient (n, S), its second derivatives (n, S, S)."""
-    blocks = [slice(k, k + _BLOCK) for k in range(0, len(w), _BLOCK)]
-    found = [_derived(w[b], [part[b] for part in fixed], determinant) for b in blocks]
-    return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))
-
-
-def _derived(w: Array, fixed: list[Array], determinant: bool) -> tuple[Array, Array, Array]:
     roots, information, first, _ = fixed
     n, s, d = roots.shape[:3]
     total = w[:, None, :] @ information.reshape(n, s, d * d)
