@@ -203,8 +203,10 @@ def low_rank_moved(
     >>> low_rank_moved(state, lambda p: p / 2).estimates
     array([[0.5, 0.5]])
     """
-    rows = (state.basis if process is None else state.factors).mT
-    base = state.base if process is None else state.estimates
+    if process is None:
+        rows, base = state.basis.mT, state.base
+    else:
+        rows, base = state.factors.mT, state.estimates
     moved = move(np.concatenate([rows.reshape(-1, state.size), base]))
     basis = np.ascontiguousarray(moved[: -len(base)].reshape(rows.shape).mT)
     if process is None:

@@ -140,11 +140,14 @@ def propagate(
     _outside(x[..., :3], "x")
     # The Earth holds nothing that is farther away, and orbits in metres are.
     Bounds(at_most=1.5e6)(np.abs(x[..., :3]), "x, in km")
-    h = dt / (steps := equal_steps(abs(dt), longest))
+    steps = equal_steps(abs(dt), longest)
     with np.errstate(all="ignore"):
         for _ in range(steps):
             # A body that dives through the Earth and comes out again is found on its way.
-            x = unchecked(rk4)(_rate, x, 0.0, h) if rule == "rk4" else _dop853(x, h)
+            if rule == "rk4":
+                x = unchecked(rk4)(_rate, x, 0.0, dt / steps)
+            else:
+                x = _dop853(x, dt / steps)
             _outside(x[..., :3], "x")
     return x
 
