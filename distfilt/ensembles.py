@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from .doors import Array, Count, Rng, Semidefinite, door, unchecked
-from .linalg import EPS, cholesky, factor, leading, lower_root, solve_upper, symmetrise
+from .linalg import EPS, cholesky, factor, lower_root, solve_upper, symmetrise
 
 __all__ = ["Members", "draw", "mean", "sample_covariance"]
 
@@ -96,32 +96,28 @@ def sample_covariance(ensemble: Ensemble) -> Array:
     return symmetrise(a.swapaxes(-1, -2) @ a / (a.shape[-2] - 1))
 
 
-@door
-def exact_noise(
-    anomalies_to_avoid: Annotated[Array, "... N P", partial(_at_least, 2)], cov: Semidefinite, *,
-    rng: Rng
-) -> Array:
+def exact_noise(avoid: Array, root: Array, rng: Rng) -> Array:
     r"""Draw noise (..., N, k) whose sample moments are exact: second-order exact draws.
 
     Over the members the draws average to zero, are uncorrelated with the given anomalies, and have
-    exactly the sample covariance `cov`. An ensemble with such noise added has the sum of both
+    exactly the sample covariance asked for. An ensemble with such noise added has the sum of both
     covariances, without the sampling error of a plain draw; otherwise they are as random as can be.
 
     Parameters
     ----------
-    anomalies_to_avoid : array_like, (..., N, p)
+    avoid : ndarray, (..., N, p)
         What the noise has to be uncorrelated with, by member: the ensemble, its predictions, other
         noise. Only differences from their mean matter, so ensembles serve as well. p may be 0.
-    cov : array_like, (..., k, k)
-        Covariance of the noise, positive semidefinite. Leading axes broadcast.
+    root : ndarray, (..., k, r)
+        A factor of the noise's covariance. Leading axes broadcast.
     rng : numpy.random.Generator
         Source of the draw.
 
     Raises
     ------
     ValueError
-        If shapes do not fit, `cov` is not a covariance, or there are too few members: N has to
-        exceed the number of independent anomalies plus the rank of `cov`.
+        If there are too few members: N has to exceed the number of independent anomalies plus the
+        rank of the covariance.
 
     Notes
     -----
@@ -134,19 +130,13 @@ def exact_noise(
     --------
     >>> rng = np.random.default_rng(0)
     >>> x = rng.standard_normal((20, 3))
-    >>> noise = exact_noise(x, [[2.0, 1.0], [1.0, 3.0]], rng=rng)
+    >>> noise = exact_noise(x, np.array([[2.0, 0.0], [0.5, 1.0]]), rng)
     >>> sample_covariance(noise).round(12)
-    array([[2., 1.],
-           [1., 3.]])
+    array([[4.  , 1.  ],
+           [1.  , 1.25]])
     >>> bool((abs(about_mean(x)[1].T @ noise) < 1e-11).all())
     True
     """
-    leading(anomalies_to_avoid.shape[:-2], cov.shape[:-2], "cov")
-    return drawn_apart(anomalies_to_avoid, unchecked(factor)(cov), rng)
-
-
-def drawn_apart(avoid: Array, root: Array, rng: Rng) -> Array:
-    """As :func:`exact_noise`, with a factor of the covariance."""
     n = avoid.shape[-2]
     if n <= avoid.shape[-1] + root.shape[-1]:
         root = _narrow(root)
@@ -173,7 +163,7 @@ def _projected(drawn: Array, avoid: Array) -> Array:
     frame, independent = _frame(around / np.where(size > 0, size, 1.0))
     if n <= independent + rank:
         raise ValueError(
-            f"anomalies_to_avoid: needs more than {independent} + {rank} members, for "
+            f"ensemble: needs more than {independent} + {rank} members, for "
             f"{independent} independent anomalies and noise of rank {rank}, got {n}"
         )
     for _ in range(2):

@@ -18,6 +18,7 @@ from .. import ensembles as moments
 from ..coupling import plans, rejuvenated
 from ..coupling.transform import carried, normalised
 from ..doors import Array, Bounds, NonNegative, array, unchecked
+from ..linalg import in_units
 from ..models import Model
 from ..network import Graph, finite_time, intersection
 from ..sensors import Sensor
@@ -145,7 +146,9 @@ class EnsembleFilter(MembersFilter):
         """Second-order exact draws and covariance intersection of least determinant.
 
         For a linear model and linear sensors every agent's sample moments are those of the Kalman
-        filters that fuse by the same rule; the book's chapter 4 measures it on others.
+        filters that fuse by the same rule; the book's chapter 4 measures it on others. With process
+        noise, members and their past are tied by chance too: smoothing and late readings are then
+        exact to sampling errors only.
 
         Parameters
         ----------
@@ -184,7 +187,7 @@ class EnsembleFilter(MembersFilter):
         for place, group in step.heard():
             step.settle(self._condition(stack, place, group, step), group.agents)
         (now,) = step.agreed(stack[-1])
-        return step.end(ensembles=now, past=stack[:-1])
+        return step.end(ensembles=now, past=recalled(stack, now))
 
     def _condition(
         self, stack: list[Array], place: int, group: Heard, step: Step
@@ -245,7 +248,7 @@ class TransportFilter(MembersFilter):
     ----------
     model, sensors, graph, faults, lag, names, failures, gate
         As for :class:`~distfilt.filters.Filter`. Members in common need an agreement in every step,
-        so that `every` is refused.
+        so that `every` is refused, and so are readings at a time when a moving graph has no link.
     agreement : callable
         ``agreement(log_likelihoods, channel) -> averages``, both (\*runs, A, N): exact finite-time
         averaging by default, or ``partial(average, rounds=20)``. It takes the place of telling
@@ -296,6 +299,9 @@ class TransportFilter(MembersFilter):
             If one member has nearly all the weight that is carried over.
         """
         state, now = step.state, step.state.ensembles
+        apart = self.count > 1 and callable(self.graph) and step.channel is None
+        if apart and any((*step.said, step.late)):
+            raise ValueError(f"graph: needs links for the readings of t = {step.t:g}, got none")
         if step.dt:
             draw = partial(unchecked(self.model.sample_step), t=state.t, dt=step.dt)
             now = self._for_all(draw, (now,), step.rng)
@@ -359,6 +365,20 @@ class TransportFilter(MembersFilter):
         if size < 1.1:
             what = f"an agent's weights have an effective size of {size:.1f}"
             warn_of_collapse(f"t = {step.t:g} s: {what}", "rejuvenation=")
+
+
+def recalled(stack: list[Array], now: Array) -> list[Array]:
+    """Members of the earlier times of a stack whose last have become those of `now` by agreement.
+
+    What agents agree on tells of the past too: by its regression on the members as they were.
+    """
+    *past, old = stack
+    if now is old or not past:
+        return past
+    shape, unit = in_units(unchecked(moments.sample_covariance)(old))
+    inverse = np.linalg.pinv(shape, rcond=1e-10, hermitian=True) / (old.shape[-2] - 1)
+    around, moved = (x / unit[..., None, :] for x in (moments.about_mean(old)[1], now - old))
+    return [x + moved @ (inverse @ (around.mT @ x)) for x in past]
 
 
 def sample_moments(members: Array) -> tuple[Array, Array]:

@@ -122,11 +122,10 @@ def _read(f: Any, given: Any, agent: int, t: float, name: str) -> Reading:
 def _complete(f: Any, said: Reading, runs: tuple[int, ...], name: str) -> Reading | None:
     """A reading with a value for each run; None if nothing of it is there."""
     value, dim = said.value, sensor_of(f, said).dim
-    if not np.isfinite(value).all():
-        if np.isinf(value).any():
-            raise ValueError(f"{name}: needs numbers or NaN, got infinity")
-        if np.isnan(value).all():
-            return None
+    if np.isinf(value).any():
+        raise ValueError(f"{name}: needs numbers or NaN, got infinity")
+    if np.isnan(value).all():
+        return None
     if value.shape == (*runs, dim):
         return said
     if value.shape != (dim,):

@@ -165,10 +165,9 @@ class MixtureFilter(Filter):
         return unchecked(runnalls)(belief, self.size, heaviest=max(_EXACT, self.size)).changed()
 
     def _read(
-        self, belief: GaussianMixture, agent: int, said: Sequence[Reading], step: Step, *,
-        counted: bool = True,
-    ) -> GaussianMixture:  # fmt: skip
-        """An agent's belief after readings; one that fails the gate changes nothing."""
+        self, belief: Any, agent: int, said: Sequence[Reading], step: Step, beside: Any = None
+    ) -> tuple[Any, Any]:
+        """An agent's belief after readings, without those that fail its gate, and one beside it."""
         from scipy.special import gammaincinv
 
         for reading in said:
@@ -180,15 +179,18 @@ class MixtureFilter(Filter):
                     width = float(np.sqrt(2 * gammaincinv((~np.isnan(y)).sum() / 2, self.gate)))
                     y = within_gate(belief, y, *about, gate=width, residual=residual)
                 belief = updated(belief, y, *about, residual=residual)
-            if counted and step.refused is not None:
+                # What passes the gate counts for both, or one would hold it to be news.
+                if beside is not None:
+                    beside = updated(beside, y, *about, residual=residual)
+            if step.refused is not None:
                 step.refused[agent] += np.isnan(y).all()
-        return belief
+        return belief, beside
 
     def _told(
         self, beliefs: list[GaussianMixture], step: Step
     ) -> tuple[Sequence[GaussianMixture], Sequence[GaussianMixture | None]]:
         """The beliefs after the agents' readings and their exchange, and what stays untold."""
-        after = [self._read(b, k, step.said[k], step) for k, b in enumerate(beliefs)]
+        after = [self._read(b, k, step.said[k], step)[0] for k, b in enumerate(beliefs)]
         return (self._agreed(after, step) if step.agrees else after), ()
 
     def _agreed(self, beliefs: list[GaussianMixture], step: Step) -> list[GaussianMixture]:

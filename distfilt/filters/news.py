@@ -11,7 +11,7 @@ import numpy as np
 from ..doors import Array, Bounds, Count, Index, door
 from ..mixtures import GaussianMixture
 from ..mixtures.conditioning import updated
-from .inputs import Reading
+from .inputs import Reading, sensor_of
 from .mixture import MixtureFilter
 from .step import Step
 
@@ -85,7 +85,8 @@ class NewsFilter(MixtureFilter):
     size, most : int
         As there. With more than one mixand the moments' news are told, which is an approximation.
     common : sequence of int
-        Components of the readings that all agents receive alike, with the same error.
+        Components of the readings that all agents receive alike, with the same error, which has to
+        be independent of the other components'.
 
     Notes
     -----
@@ -134,7 +135,7 @@ class NewsFilter(MixtureFilter):
     ) -> tuple[Sequence[GaussianMixture], Sequence[GaussianMixture | None]]:
         """Own readings, then others' news, then what all received alike."""
         own, alike = zip(*(self._parted(said) for said in step.said), strict=True)
-        after = [self._read(b, k, own[k], step) for k, b in enumerate(beliefs)]
+        after = [self._read(b, k, own[k], step)[0] for k, b in enumerate(beliefs)]
         # What an agent would believe without what it has not told: from before the readings of now,
         # or from before those that wait.
         waiting = step.state.untold or (None,) * len(beliefs)
@@ -145,10 +146,7 @@ class NewsFilter(MixtureFilter):
         if step.channel is not None:
             self._exchanged(after, untold, step)
         for k, said in enumerate(alike):
-            after[k] = self._read(after[k], k, said, step)
-            before = untold[k]
-            if before is not None:
-                untold[k] = self._read(before, k, said, step, counted=False)
+            after[k], untold[k] = self._read(after[k], k, said, step, untold[k])
         return after, untold if any(before is not None for before in untold) else ()
 
     def _exchanged(
@@ -180,6 +178,8 @@ class NewsFilter(MixtureFilter):
         alike: list[Reading] = []
         for reading in said:
             everybody = np.isin(np.arange(reading.value.size), self.common)
+            if sensor_of(self, reading).cov[np.ix_(everybody, ~everybody)].any():
+                raise ValueError("common: needs noise of its own, got some that others share")
             for part, gone in ((own, everybody), (alike, ~everybody)):
                 left = np.where(gone, np.nan, reading.value)
                 if not np.isnan(left).all():

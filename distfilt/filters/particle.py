@@ -11,7 +11,7 @@ import numpy as np
 
 from ..doors import Array, Mask, Share, unchecked
 from ..updates import particles
-from .ensemble import MembersFilter, Several
+from .ensemble import MembersFilter, Several, recalled
 from .inbox import Heard
 from .record import Summary
 from .saving import SensorState
@@ -131,7 +131,8 @@ class ParticleFilter(MembersFilter):
             # The particles have to be an ensemble, which the agreement can move.
             offset = step.rng.random((*weights.shape[:-1], 1))
             self._pick(stack, weights, np.exp(weights), np.ones(weights.shape[:-1], bool), offset)
-        after = step.end(points=step.agreed(stack[-1])[0], log_weights=weights, past=stack[:-1])
+        (now,) = step.agreed(stack[-1])
+        after = step.end(points=now, log_weights=weights, past=recalled(stack, now))
         self._warn(after)
         return after
 

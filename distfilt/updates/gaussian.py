@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ..doors import Array, NonNegative, Rng, door, unchecked
-from ..ensembles import Ensemble, about_mean, drawn_apart
+from ..ensembles import Ensemble, about_mean, exact_noise
 from ..linalg import cholesky, solve_definite
 from ..models import Model
 from .door import perturbed, update
@@ -142,7 +142,7 @@ def exact_draws(
     (0.5, 0.25)
     """
     a, b = about_mean(ensemble)[1], about_mean(predicted)[1]
-    draws = exact(np.concatenate([a, b], axis=-1), cholesky(noise), rng)
+    draws = exact_noise(np.concatenate([a, b], axis=-1), cholesky(noise), rng)
     gain = _gain(a, b, noise)
     return np.asarray(ensemble + (observed[..., None, :] - predicted - draws) @ gain)
 
@@ -271,14 +271,6 @@ def exact_forecast(
         return moved
     bad = ~np.isfinite(moved).all(axis=(-2, -1), keepdims=True)
     clean = np.where(bad, ensemble, moved)
-    noisy = clean + exact(about_mean(clean)[1], root, rng)
+    noisy = clean + exact_noise(about_mean(clean)[1], root, rng)
     # Members that the model lost stay lost, and do not take the others' noise with them.
     return np.where(bad, np.nan, noisy)
-
-
-def exact(avoid: Array, root: Array, rng: Rng) -> Array:
-    """Exact draws, (..., N, k), that say of an update's ensemble if it has too few members."""
-    try:
-        return drawn_apart(avoid, root, rng)
-    except ValueError as error:
-        raise ValueError(str(error).replace("anomalies_to_avoid", "ensemble")) from None

@@ -76,15 +76,6 @@ def test_faults_between_two_times(family: str) -> None:
     assert heard == [True, False, True]
 
 
-@pytest.mark.parametrize("family", [f for f in FAMILIES if not f.endswith("common")])
-def test_share_false_sends_nothing(family: str) -> None:
-    f, start = made(family, share=False, sensors=[direct([0], std=0.5), None], agreement=None)
-    out = f.step(start, 0.5, [[0.3], None])
-    assert out.ledger.rounds == 0 and not out.ledger.messages.any()
-    summary = f.summary(out)
-    assert summary.variance[0, 0] < summary.variance[1, 0]
-
-
 @EACH
 def test_recorded_scores_by_their_definitions(family: str) -> None:
     f, start = made(family, runs=(3,), agents=3, names=("A", "B", "C"))

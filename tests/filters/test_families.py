@@ -25,17 +25,22 @@ from distfilt.network import Faults, covariance_intersection, graphs, pull
 from distfilt.sensors import Sensor, direct, of_kind
 from distfilt.updates import exact_draws, sampled_noise
 
-from .families import NOISE, PRIOR, TIMES, data, kalman, made, model, team
+from .families import NOISE, PRIOR, TIMES, Q, data, kalman, made, model, team
 
 STILL = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
 BOTH = Sensor(2, lambda x: x, NOISE, linear=lambda d: np.eye(d))
 
 
-def test_network_of_exact_ensembles_is_the_network_of_kalman_filters() -> None:
-    """With the same rule of intersection, agent by agent, with loss and a full noise matrix."""
+@pytest.mark.parametrize("lag", [0, 3])
+def test_network_of_exact_ensembles_is_the_network_of_kalman_filters(lag: int) -> None:
+    """With the same rule of intersection, agent by agent, with loss and a full noise matrix.
+
+    What they agree on tells of the past too; of that moments are exact for a model without noise.
+    """
     sensors = team(4)
     _, seen = data(sensors, (3,))
-    options = {"graph": graphs.ring(4), "runs": (3,), "sensors": sensors}
+    options = {"graph": graphs.ring(4), "runs": (3,), "sensors": sensors, "lag": lag}
+    options |= {"model": replace(model(), noise_cov=lambda t, dt: 0 * Q)} if lag else {}
     faults = Faults(loss=0.3, seed=1)
     f, start = made("ensemble, exact", faults=faults, **options)
     rule = partial(covariance_intersection, rule="min_determinant")
@@ -43,11 +48,14 @@ def test_network_of_exact_ensembles_is_the_network_of_kalman_filters() -> None:
     e = start.ensembles
     cov = np.array([[np.cov(m.T) for m in agents] for agents in e])
     state = GaussianState(0.0, begin.ledger, None, e.mean(axis=-2), cov, 2)
-    a, b = f.run(start, TIMES, seen), g.run(state, TIMES, seen)
-    assert np.allclose(a["mean"], b["mean"], atol=1e-8)
-    assert np.allclose(a["variance"], b["variance"], atol=1e-8)
-    for name in ("messages", "scalars", "lost", "rounds"):
-        assert np.array_equal(a[name], b[name])
+    late = [Reading(TIMES[k], 2, np.ones((3, 1)), sensors[0], arrived=TIMES[k + 2])
+            for k in range(6 * (lag > 0))]
+    for how in ("run", "smooth")[: 1 + lag]:
+        a, b = (getattr(h, how)(s, TIMES, seen, late=late) for h, s in ((f, start), (g, state)))
+        assert np.allclose(a["mean"], b["mean"], atol=1e-8)
+        assert np.allclose(a["variance"], b["variance"], atol=1e-8)
+        for name in ("messages", "scalars", "lost", "rounds"):
+            assert np.array_equal(a[name], b[name])
 
 
 @pytest.mark.parametrize("rule", ["extended", "unscented"])

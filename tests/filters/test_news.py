@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -147,6 +148,15 @@ def test_a_gated_reading_is_no_news() -> None:
     f = network(2, gate=0.99)
     after = f.step(f.start([PRIOR] * 2), 1.0, [[500.0, np.nan], None])
     assert after.ledger.scalars.sum() == 0
+    # Of a sum that both receive only who has read the first component expects so much.
+    still, sums = Model(2, lambda x, t, dt: x, lambda t, dt: 0 * TARGET_COV), np.tri(2)
+    eye = Sensor(2, lambda x: x @ sums.T, np.diag([0.09, 0.2]))
+    f = NewsFilter(still, [eye] * 2, graphs.path(2), target_dim=2, common=[1], gate=0.95)
+    start, y = f.start((np.zeros(2), np.eye(2))), [[1.2, 3.0]] * 2
+    a, b = (g.step(g.step(start, 1.0, y), 2.0, [None] * 2) for g in (f, replace(f, every=2.0)))
+    assert np.allclose(a.mixtures[0].covs, b.mixtures[0].covs, atol=1e-12)
+    with pytest.raises(ValueError, match="common: needs noise of its own"):
+        replace(f, sensors=[eye.changed(cov=TARGET_COV)] * 2).step(start, 1.0, y)
 
 
 def test_everybody_hears_only_neighbours() -> None:

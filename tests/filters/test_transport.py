@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -79,6 +80,10 @@ def test_an_agent_whom_nobody_hears_counts_its_own_reading_once() -> None:
         one = _filter(sensors=FOUR[k : k + 1], graph=None)
         alone = one.step(_start(one), 0.5, [y[k]]).ensembles[0]
         assert np.allclose(alone, apart[k], atol=1e-13)
+    f = _filter(graph=lambda t: graphs.ring(4) if t > 0.7 else Graph.from_edges(4, []))
+    for now, late in ((y, []), ([None] * 4, [Reading(0.5, 0, [0.3])])):
+        with pytest.raises(ValueError, match="graph: needs links for the readings of t = 0.6"):
+            replace(f, lag=1).step(_start(f).changed(t=0.5), 0.6, now, late=late)
 
 
 def test_sets_stay_in_common_with_noise_and_rejuvenation_over_runs() -> None:
