@@ -160,8 +160,9 @@ class Filter(Record, ABC):
     def _contact(self, before: float, t: float) -> bool:
         if self.every is None:
             return True
-        # Whether one of the multiples lies after the step's start, and up to its end.
-        return math.floor(t / self.every + 1e-9) > math.floor(before / self.every + 1e-9)
+        # Whether one of the multiples lies after the step's start, and up to its end, to rounding.
+        near = 1e-9 + 1e-15 * abs(t / self.every)
+        return math.floor(t / self.every + near) > math.floor(before / self.every + near)
 
     @abstractmethod
     def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:

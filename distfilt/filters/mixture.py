@@ -180,8 +180,7 @@ class MixtureFilter(Filter):
                     y = within_gate(belief, y, *about, gate=width, residual=residual)
                 belief = updated(belief, y, *about, residual=residual)
                 # What passes the gate counts for both, or one would hold it to be news.
-                if beside is not None:
-                    beside = updated(beside, y, *about, residual=residual)
+                beside = None if beside is None else updated(beside, y, *about, residual=residual)
             if step.refused is not None:
                 step.refused[agent] += np.isnan(y).all()
         return belief, beside

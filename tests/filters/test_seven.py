@@ -206,23 +206,24 @@ def test_each_reading_is_judged_alone() -> None:
     assert refused == [[0.0], [1.0]]
 
 
-@pytest.mark.parametrize("how", ["every", "graph"])
+@pytest.mark.parametrize(("how", "t0"), [("every", 0.0), ("every", 1.7e9), ("graph", 0.0)])
 @pytest.mark.parametrize("family", ["gaussian", "news"])
-def test_nothing_is_lost_until_the_next_contact(family: str, how: str) -> None:
+def test_nothing_is_lost_until_the_next_contact(family: str, how: str, t0: float) -> None:
     """After it everybody knows what one filter with all readings knows; before, only its own."""
     quiet = LinearModel.from_transition(2, model().transition_matrix, lambda t, dt: 0 * Q)
     apart = Graph.from_edges(3, np.zeros((0, 2)))
-    options: dict[str, Any] = {
-        "every": {"every": 0.2}, "graph": {"graph": lambda t: NET if t > 0.55 else apart},
-    }[how]
+    moving = {"graph": lambda t: NET if t > 0.55 else apart}
+    options: dict[str, Any] = {"every": 0.2} if how == "every" else moving
     options = {"graph": NET} | options | ({"lag": 8} if family == "gaussian" else {})
     f = SIX[family](quiet, EYES, options.pop("graph"), **options)
     g = GaussianFilter(quiet, EYES, NET)
     own = GaussianFilter(quiet, EYES, NET, share=False)
     seen = [s[:4] for s in data(EYES)[1]]
-    times = [0.1, 0.15, 0.5, 0.6]  # multiples of .2 lie in the third step and, rounded, in the last
+    # Multiples of .2 lie in the third step and, rounded, in the last.
+    times = t0 + np.array([0.1, 0.15, 0.5, 0.6])
     told = [2, 3] if how == "every" else [3]
-    states, everything, alone = (list(h.steps(h.start(PRIOR), times, seen)) for h in (f, g, own))
+    walks = (h.steps(h.start(PRIOR, t=t0), times, seen) for h in (f, g, own))
+    states, everything, alone = map(list, walks)
     for k in range(4):
         spoke = states[k].ledger.rounds - (states[k - 1].ledger.rounds if k else 0)
         assert spoke == (k in told)
