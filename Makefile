@@ -46,7 +46,7 @@ help:
 	@echo "make accept     take the scenarios as they are for the book's own"
 	@echo "make studies    run the studies that take too long for a chapter, store them in data/studies"
 	@echo "make check-studies  run every stored study again and compare"
-	@echo "make portable   stored outputs on another BLAS kernel and without numpy's newer SIMD"
+	@echo "make portable   stored outputs and the library's tests on another BLAS kernel and without numpy's newer SIMD"
 	@echo "make versions   the library's tests with the oldest and the newest packages that it admits"
 	@echo "make bench      side-by-side measurements, written to data/bench if the machine is idle"
 	@echo "make mutants    how many of SAMPLE=300 random faults the tests find, written to data/bench"
@@ -120,6 +120,8 @@ accept: $(STAMP)
 	$(PY) book/tools/scenarios.py --accept
 
 portable: $(STAMP)
+	OPENBLAS_CORETYPE=Nehalem NPY_DISABLE_CPU_FEATURES="X86_V4 X86_V3 AVX512_ICL AVX512_SPR" \
+		HYPOTHESIS_PROFILE=gate $(PY) -m pytest -q -n $(JOBS) --ignore tests/book --ignore tests/tools
 	$(PY) book/tools/regress.py --portable
 
 versions: $(STAMP)

@@ -178,16 +178,3 @@ def test_rounding_is_no_asymmetry_and_no_negative_eigenvalue() -> None:
         semidefinite(cov, "P")
     with pytest.raises(ValueError, match="smallest eigenvalue"):
         semidefinite(np.array([[1.0, 1.0 + 1e-8], [1.0 + 1e-8, 1.0]]), "P")
-
-
-def test_a_missing_package_names_its_extra_and_an_installed_one_s_errors_pass(
-    tmp_path: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with pytest.raises(ModuleNotFoundError, match=r"pip install 'distfilt\[maps\]'$") as caught:
-        doors.needed("no_such.package", "maps")
-    assert caught.value.name == "no_such.package"
-    (tmp_path / "half_there.py").write_text("import not_there_at_all")
-    monkeypatch.syspath_prepend(str(tmp_path))
-    with pytest.raises(ModuleNotFoundError) as caught:
-        doors.needed("half_there", "maps")
-    assert caught.value.name == "not_there_at_all" and "extra" not in str(caught.value)

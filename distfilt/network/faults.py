@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated, Any
@@ -147,7 +147,7 @@ class Faults(Record):
         link = _mixed((i * graph.size + j).astype(np.uint64) + np.uint64(_GOLDEN))
         loss = np.asarray(self.loss)
         rate = loss[(i, j)[: loss.ndim]]
-        drawn = _uniform(self._runs(round_, runs)[:, None] ^ link)
+        drawn = _uniform(self._runs([round_], runs).T ^ link)
         if self.burst is None:
             return np.asarray(drawn < rate)
         rate = np.broadcast_to(rate, link.shape)
@@ -156,18 +156,19 @@ class Faults(Record):
         enter = rate * (1 - stay)
         out = drawn < enter
         run, at = np.nonzero(~out & (drawn < enter + stay))
-        while run.size:
-            round_ -= 1
-            drawn = _uniform(self._runs(round_, runs)[run] ^ link[at])
+        while run.size:  # sixteen rounds back at a time
+            before, round_ = range(round_ - 1, round_ - 17, -1), round_ - 16
+            drawn = _uniform(self._runs(before, runs)[:, run] ^ link[at])
             hit = drawn < enter[at]
-            out[run[hit], at[hit]] = True
-            open_ = ~hit & (drawn < (enter + stay)[at])
-            run, at = run[open_], at[open_]
+            known = hit | (drawn >= (enter + stay)[at])
+            out[run, at] = hit[known.argmax(axis=0), np.arange(run.size)]
+            run, at = (x[~known.any(axis=0)] for x in (run, at))
         return np.asarray(out)
 
-    def _runs(self, round_: int, runs: int) -> Hashes:
-        key = _mixed((self.seed + _GOLDEN * (round_ + 1)) % 2**64)
-        return _mixed(key ^ (np.arange(runs, dtype=np.uint64) * np.uint64(_GOLDEN)))
+    def _runs(self, rounds: Sequence[int], runs: int) -> Hashes:
+        """Bits for each round and run."""
+        keys = _mixed([(self.seed + _GOLDEN * (k + 1)) % 2**64 for k in rounds])
+        return _mixed(keys[:, None] ^ (np.arange(runs, dtype=np.uint64) * np.uint64(_GOLDEN)))
 
 
 def _windows(during: Any) -> tuple[tuple[float, float], ...]:
@@ -183,10 +184,9 @@ def _uniform(bits: Hashes) -> Array:
     return (_mixed(bits) >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
 
-def _mixed(bits: Hashes | int) -> Hashes:
+def _mixed(bits: Hashes | list[int]) -> Hashes:
     """The finaliser of splitmix64: every output bit depends on every input bit."""
-    # Arrays, not scalars: their products wrap around silently, as they should here.
-    z = np.atleast_1d(np.asarray(bits, dtype=np.uint64))
+    z = np.asarray(bits, dtype=np.uint64)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return np.asarray(z ^ (z >> np.uint64(31)))

@@ -38,8 +38,8 @@ def test_the_readings_by_their_formulas_in_a_batch(eps: float) -> None:
 
 def test_a_projection_that_makes_it_worse_is_refused() -> None:
     far = np.random.default_rng(4).standard_normal((40, 2)) * [3.0, 0.01]
-    both = project(np.stack([far, 0.1 * far + 0.7]), norm([0, 1]), reading="printed")
-    assert (both[0] == far).all()
+    both = project(np.stack([far, 0.1 * far + 0.7]), norm([0, 1]), reading="particle")
+    assert (both[0] == far).all() and (both[1] != 0.1 * far + 0.7).all()
 
 
 def test_the_guard_judges_what_the_reading_moves() -> None:

@@ -53,17 +53,6 @@ def test_nobody_notices_beyond_the_neighbours(family: str, rule: Any) -> None:
 
 
 @EACH
-def test_observations_reach_one_link(family: str) -> None:
-    sensors = [direct([0], std=0.5) for _ in range(5)]
-    f, start = made(family, sensors=sensors, agreement=None)
-    near = f.step(start, 0.5, [[0.3]] * 5)
-    far = f.step(start, 0.5, [[0.3]] * 4 + [[2.0]])
-    both = [(v, values(far)[name]) for name, v in values(near).items()]
-    assert all((v[:3] == w[:3]).all() for v, w in both)
-    assert all(any((v[k] != w[k]).any() for v, w in both) for k in (3, 4))
-
-
-@EACH
 def test_faults_between_two_times(family: str) -> None:
     """Agent 0's radio is off from 1 s to before 2 s: who hears it is blind at 1 s only."""
     off = Faults(silent=[0], during=[(1.0, 2.0)])
@@ -169,7 +158,7 @@ def test_time_passes_to_model_and_noise(family: str) -> None:
 
 @EACH
 def test_late_reading_is_in_time_after_all(family: str) -> None:
-    """For who heard of it too. Exact for Gaussians; others come as near as their size allows."""
+    """For who heard of it too, as near as the members' number allows."""
     two: dict[str, Any] = {"sensors": [direct([0], std=0.4), None], "agreement": None}
     f, start = made(family, **two, lag=2, runs=(40,))
     for t in (0.5, 1.0):
@@ -179,9 +168,6 @@ def test_late_reading_is_in_time_after_all(family: str) -> None:
     begin = g.step(begin, 0.5, [[1.9], None])
     begin = g.step(g.step(begin, 1.0, [None] * 2), 1.5, [[0.1], None])
     a, b = f.summary(late), g.summary(begin)
-    if family.startswith("gaussian"):
-        assert np.allclose(a.mean, b.mean, atol=1e-12)
-        assert np.allclose(a.covariance, b.covariance, atol=1e-12)
     blind = g.start(PRIOR, rng=np.random.default_rng(3), runs=(40,))
     blind = g.step(g.step(blind, 1.0, [None] * 2), 1.5, [[0.1], None])
     gap = np.abs(a.mean.mean(axis=0) - b.mean.mean(axis=0)).max()

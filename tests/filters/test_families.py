@@ -188,6 +188,15 @@ def test_copies_of_one_particle_warn_at_any_number() -> None:
         f.step(start, 1.0, [None])
 
 
+def test_what_an_agreement_moves_was_there_before_too() -> None:
+    """Where nothing moves and nothing is jittered, the past is the present, agreed of or not."""
+    f = ParticleFilter(STILL, [direct([0], std=0.5), None], graphs.path(2), members=30, lag=1,
+                       jitter=0.0, share=False, agreement=partial(pull, gain=0.3))  # fmt: skip
+    start = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0))
+    after = f.step(f.step(start, 1.0, [[0.5], None]), 2.0, [[0.7], None])
+    assert np.allclose(after.history[0][1], after.points) and (after.points != start.points).any()
+
+
 def test_a_run_whose_covariance_overflows_leaves_the_others_to_agree() -> None:
     wild = Model(1, lambda x, t, dt: (x.T * [1.0, 1e200]).T, lambda t, dt: np.eye(1))
     f = GaussianFilter(wild, [None] * 2, graphs.path(2), agreement=covariance_intersection,

@@ -1,4 +1,4 @@
-"""The mixture filter on the contract: against Kalman, through the channel only, at its edges."""
+"""The mixture filter on the contract: split, through the channel only, at its edges."""
 
 from __future__ import annotations
 
@@ -9,36 +9,17 @@ import numpy as np
 import pytest
 
 from distfilt.filters import FilterError, MixtureFilter
-from distfilt.kalman import kalman_filter
 from distfilt.mixtures import GaussianMixture, target_fusion
 from distfilt.models import Model, occulted, orbits
 from distfilt.network import graphs
 from distfilt.sensors import direct, ephemeris, line_of_sight, stack
 
-PUSH = np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 0.9]])
-Q = np.array([[0.2, 0.05, 0.0], [0.05, 0.1, 0.0], [0.0, 0.0, 0.3]])
-LINEAR = Model(3, lambda x, t, dt: x @ PUSH.T, lambda t, dt: Q)
 SMALL = Model(2, lambda x, t, dt: x, lambda t, dt: 0.1 * np.eye(2))
 BENT = Model(2, lambda x, t, dt: x + 0.3 * x**2, lambda t, dt: 0.01 * np.eye(2))
-PRIOR = GaussianMixture.gaussian([1.0, -1.0, 0.5], [[2, 0.5, 0.3], [0.5, 1, 0.2], [0.3, 0.2, 1]])
 OTHER = GaussianMixture.gaussian([1.2, 0.4], [[1.0, 0.4], [0.4, 1.0]])
-SEE = direct([0, 2], std=0.5)
 AGREE = partial(target_fusion, target_dim=1)
 TWO = MixtureFilter(SMALL, [direct([0], std=0.5), None], graphs.path(2), target_dim=1,
                     agreement=AGREE)
-
-
-def test_one_agent_is_a_kalman_filter_with_gaps() -> None:
-    growing, steps = replace(LINEAR, noise_cov=lambda t, dt: (1 + t) * Q), np.arange(1.0, 5.0)
-    f = MixtureFilter(growing, [SEE], target_dim=1)
-    y = np.random.default_rng(0).standard_normal((4, 2))
-    y[1, 0] = y[3, 1] = np.nan
-    *_, last = f.steps(f.start([PRIOR]), steps, [y])
-    q = steps[:, None, None] * Q
-    exact = kalman_filter(*PRIOR.moments(), y, F=PUSH, Q=q, H=SEE.matrix(3), R=SEE.cov)
-    mean, cov = last.mixtures[0].moments()
-    assert np.allclose(mean, exact.means[-1], atol=1e-6)
-    assert np.allclose(cov, exact.covariances[-1], atol=1e-6)
 
 
 def test_splitting_improves_a_bent_forecast() -> None:

@@ -29,7 +29,6 @@ from distfilt.mixtures import GaussianMixture, target_fusion
 from distfilt.models import LinearModel, lorenz63, rotating_swarm
 from distfilt.network import Channel, Faults, Graph, covariance_intersection, graphs, pull
 from distfilt.sensors import Sensor, angle, direct
-from distfilt.updates import inflated
 
 from .families import NOISE, PRIOR, TIMES, Q, data, kalman, model
 
@@ -107,29 +106,15 @@ def test_events_of_any_order_are_the_series(family: str) -> None:
     assert more["mean"].isel(time=slice(1, 2)).shape == a["mean"].isel(time=slice(0, 1)).shape
 
 
-@pytest.mark.parametrize(
-    ("family", "bound"), [("gaussian", 1e-12), ("ensemble", 0.4), ("particle", 0.3),
-                          ("particle, agreed", 0.3), ("news", 1e-9)]
-)
-def test_everybody_who_hears_all_is_the_joint_filter(family: str, bound: float) -> None:
-    """Means and covariances; members are drawn, so that theirs differ by their number's share."""
-    options = {"agreement": partial(pull, gain=0.0)} if "agreed" in family else {}
-    family = family.split(",")[0]
-    f, start, seen, _ = made(family, **options)
-    if family == "ensemble":
-        # Of a prior with exact moments the exact family is exact, forecast and update.
-        x = np.random.default_rng(3).standard_normal((30, 2))
-        x = np.linalg.solve(np.linalg.cholesky(np.cov(x.T)), (x - x.mean(axis=0)).T).T
-        prior = PRIOR[0] + x @ np.linalg.cholesky(PRIOR[1]).T
-        start, bound = f.start(prior, rng=np.random.default_rng(0)), 1e-10
+@pytest.mark.parametrize("options", [{}, {"agreement": partial(pull, gain=0.0)}])
+def test_particles_that_hear_all_are_the_joint_filter(options: Any) -> None:
+    """Up to what their number leaves to chance; agreed of or not."""
+    f, start, seen, _ = made("particle", **options)
     exact, _ = kalman(seen, EYES)
     for k, state in enumerate(f.steps(start, TIMES, seen)):
         found = f.summary(state)
-        cov = found.covariance
-        if cov is None:
-            cov = np.array([np.cov(x.T) for x in state.ensembles])
-        assert np.abs(found.mean - exact.means[k]).max() < bound
-        assert np.abs(cov - exact.covariances[k]).max() < bound
+        assert np.abs(found.mean - exact.means[k]).max() < 0.3
+        assert np.abs(found.covariance - exact.covariances[k]).max() < 0.3
 
 
 @OF_SIX
@@ -206,25 +191,22 @@ def test_each_reading_is_judged_alone() -> None:
     assert refused == [[0.0], [1.0]]
 
 
-@pytest.mark.parametrize(("how", "t0"), [("every", 0.0), ("every", 1.7e9), ("graph", 0.0)])
+@pytest.mark.parametrize("t0", [0.0, 1.7e9])
 @pytest.mark.parametrize("family", ["gaussian", "news"])
-def test_nothing_is_lost_until_the_next_contact(family: str, how: str, t0: float) -> None:
+def test_nothing_is_lost_until_the_next_contact(family: str, t0: float) -> None:
     """After it everybody knows what one filter with all readings knows; before, only its own."""
     quiet = LinearModel.from_transition(2, model().transition_matrix, lambda t, dt: 0 * Q)
-    apart = Graph.from_edges(3, np.zeros((0, 2)))
-    moving = {"graph": lambda t: NET if t > 0.55 else apart}
-    options: dict[str, Any] = {"every": 0.2} if how == "every" else moving
-    options = {"graph": NET} | options | ({"lag": 8} if family == "gaussian" else {})
-    f = SIX[family](quiet, EYES, options.pop("graph"), **options)
+    lag = {"lag": 8} if family == "gaussian" else {}
+    f = SIX[family](quiet, EYES, NET, every=0.2, **lag)
     g = GaussianFilter(quiet, EYES, NET)
     own = GaussianFilter(quiet, EYES, NET, share=False)
-    seen = [s[:4] for s in data(EYES)[1]]
-    # Multiples of .2 lie in the third step and, rounded, in the last.
-    times = t0 + np.array([0.1, 0.15, 0.5, 0.6])
-    told = [2, 3] if how == "every" else [3]
+    seen = [s[:5] for s in data(EYES)[1]]
+    # Multiples of .2 lie in the third step and, rounded, in the fourth, which is once.
+    times = t0 + np.array([0.1, 0.15, 0.5, 0.6, 0.65])
+    told = [2, 3]
     walks = (h.steps(h.start(PRIOR, t=t0), times, seen) for h in (f, g, own))
     states, everything, alone = map(list, walks)
-    for k in range(4):
+    for k in range(5):
         spoke = states[k].ledger.rounds - (states[k - 1].ledger.rounds if k else 0)
         assert spoke == (k in told)
         wanted = everything[k] if k in told else alone[k] if k < told[0] else None
@@ -258,34 +240,6 @@ def test_what_waits_survives_on_disk_and_a_lag_has_to_reach_it(tmp_path: Path) -
     short, start, seen, _ = made("gaussian", every=1.0, lag=1)
     with pytest.raises(ValueError, match="lag: needs to reach back to t = 0"):
         short.run(start, TIMES, seen)
-
-
-def test_several_sensors_an_agent_and_one_of_its_own_at_each_time() -> None:
-    """Only the named one is read; what describes another is sent and charged."""
-    both = [[EYES[0], EYES[2]], None]
-    f = GaussianFilter(model(), both, graphs.path(2), lag=1)
-    start = f.start(PRIOR)
-    one = f.step(start, 0.1, [Reading(0.1, 0, [0.3], 1), None])
-    two = f.step(start, 0.1, [[Reading(0.1, 0, [0.9]), Reading(0.1, 0, [0.3], 1)], None])
-    g = GaussianFilter(model(), [EYES[0], EYES[2]], graphs.path(2))
-    assert np.allclose(one.means, g.step(start, 0.1, [None, [0.3]]).means)
-    assert np.allclose(two.means, g.step(start, 0.1, [[0.9], [0.3]]).means)
-    posed = Reading(0.1, 0, [0.3], direct([1], std=0.5), about=(1.0, 2.0, 3.0))
-    moved = f.step(start, 0.1, [posed, None])
-    assert np.allclose(moved.means, one.means)
-    first = f.step(start, 0.1, [Reading(0.1, 0, [0.3]), None])
-    late = f.step(start, 0.1, [None, None], late=[Reading(0.0, 0, [0.3])])
-    sent = [state.ledger.scalars[0] for state in (first, one, late, moved, two)]
-    assert sent == [1, 1 + 2, 1 + 2, 1 + 2 + 3, 2 + 2 * 2]
-
-
-@pytest.mark.parametrize("family", ["gaussian", "ensemble", "mixture", "news"])
-def test_two_readings_at_one_time_are_taken_one_after_the_other(family: str) -> None:
-    f, start, _, _ = made(family, agreement=None)
-    now = f.step(f.step(start, 0.1, [[0.9], None, None]), 0.1, [None, None, [0.3]])
-    both = f.step(start, 0.1, [[0.9], None, [0.3]])
-    assert np.allclose(f.summary(now).mean, f.summary(both).mean, atol=1e-9)
-    assert np.allclose(f.summary(now).variance, f.summary(both).variance, atol=1e-9)
 
 
 @EACH
@@ -348,8 +302,6 @@ def test_a_prior_of_any_kind() -> None:
     unscented = GaussianFilter(model(), EYES, NET, rule="unscented")
     for g, wrong, text in ((f, lambda n, rng, leading: None, "got a function"),
                            (f, ([0.0, 0.0], [1.0, 1.0]), r"a covariance of .*, got \(2,\)"),
-                           (f, [[0.0, 0.0], [1.0, 1.0]], "more than 2 members, got 2"),
-                           (f, [PRIOR] * 3, "one for all agents"),
                            (unscented, flat, "definite"), (made("mixture")[0], flat, "definite")):
         with pytest.raises(ValueError, match=f"prior: needs .*{text}"):
             g.start(wrong)
@@ -366,14 +318,10 @@ def test_a_prior_of_any_kind() -> None:
     assert [b.size for b in begun] == [1, 1, 2]
 
 
-def test_degrees_and_a_wrapper_without_an_update_are_told() -> None:
+def test_degrees_are_told() -> None:
     f = GaussianFilter(model(), [angle([0, 1], std=0.1), None, None], NET)
     with pytest.warns(RuntimeWarning, match=r"^observations\[0\]: .* rad, got some 14 turns"):
         f.run(f.start(PRIOR), [1.0], [np.array([[89.6]]), None, None])
-    with pytest.raises(ValueError, match="names: needs 3 different names, got"):
-        GaussianFilter(model(), EYES, NET, names=["a", "a", "b"])
-    with pytest.raises(ValueError, match="update: needs four arrays and rng"):
-        EnsembleFilter(model(), EYES, NET, update=partial(inflated, factor=1.1))
 
 
 def test_the_extended_filter_bears_its_own_rounding() -> None:

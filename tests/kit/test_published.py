@@ -23,7 +23,6 @@ from bookkit.published import (
     table,
 )
 from bookkit.rows import markdown_table
-from bookkit.scenarios import UnknownKey
 
 S = scenario("grange", "table-2")
 CHANGED = S.replace(gain=0.1)
@@ -57,9 +56,6 @@ def test_a_table_is_kept_cell_by_cell() -> None:
     rows = table("grange", "table-2")
     assert rows[1] == {"name": "B", "dims": "[1, 2]", "kind": "angle", "noise": "0.2",
                        "neighbours": "[A,B]"}  # fmt: skip
-    for paper, name in (("grange", "../das/figure-1"), ("..", "items"), ("grange", "table-9")):
-        with pytest.raises(ValueError, match="^(paper|name): needs one of"):
-            table(paper, name)
 
 
 def test_the_data_are_those_of_the_working_copy(
@@ -92,8 +88,6 @@ GOOD = 'title = "A study"\n' + GAIN + AGENT.format("A") + AGENT.format("B")
         ("value = 0.05", "value =", r"its form: .*line 3"),
         ("assumed", "given", r"\[parameters.gain\]: where: needs a text"),
         ("neighbours = ['A', 'B']", "neighbours = ['A']", "agents: needs mutual neighbours"),
-        ('name = "B"', 'name = "A"', "agents: needs distinct names"),
-        ('kind = "direct"', 'kind = "angle"', "unit: needs rad or deg for 'angle'"),
     ],
 )
 def test_a_fault_is_named_with_the_file(tmp_path: Path, old: str, new: str, words: str) -> None:
@@ -114,14 +108,6 @@ def test_values_are_the_file_s_and_cannot_be_changed() -> None:
         S["initial_state"][0] = 0.0
     assert S.agents[1].dims == (1, 2) and S.agents[1]["noise"] == 0.2
     assert S.adjacency.tolist() == [[0, 1, 1], [1, 0, 0], [1, 0, 0]]
-
-
-def test_an_unknown_key_is_both_errors_and_names_the_nearest() -> None:
-    with pytest.raises(KeyError, match="table-2 lacks 'members_'; nearest: members") as caught:
-        S["members_"]
-    assert isinstance(caught.value, UnknownKey) and isinstance(caught.value, ValueError)
-    with pytest.raises(UnknownKey, match="row 'A' has no column 'noice'; nearest: noise"):
-        S.agents[0]["noice"]
 
 
 def test_a_change_is_noticed_and_named() -> None:

@@ -145,17 +145,6 @@ def test_a_flow_of_many_states_is_asked_once() -> None:
     assert (given.step(np.zeros((3, 2)), 0.0, 0.1) == moves).all()
 
 
-def test_an_error_of_one_state_is_not_taken_for_another() -> None:
-    def flow(x: np.ndarray, t: float, dt: float) -> np.ndarray:
-        if (x[..., 0] < 0).any():
-            raise ValueError("x: below the ground")
-        return x
-
-    model = Model(1, flow, lambda t, dt: np.zeros((1, 1)))
-    with pytest.raises(ValueError, match="below the ground"):
-        model.step([[-1.0], [1.0]], 0.0, 0.1)
-
-
 SHIPPED = {
     "constant_velocity": {"sigma": 0.1}, "clohessy_wiltshire": {"rate": 0.1, "sigma": 0.2},
     "satellite_pose": {"rate": 0.1, "sigma": 0.2}, "lorenz63": {"sigma": 0.1}, "pendulum": {},

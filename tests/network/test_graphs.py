@@ -124,9 +124,7 @@ def test_what_describes_no_graph_is_refused_with_the_ways_to_make_one() -> None:
         "a Graph, a networkx graph, a matrix .*, or edges, got int": 3,
         "both ways .*directed=True.* one way only between 0 and 1": np.eye(3, k=-1),
         "both ways .* got one way only": sparse.csr_array(np.eye(3, k=1)),
-        "no self-loops": [(0, 1), (1, 1), (2, 0), (0, 2)],
         "zeros and ones, got 0.5": 0.5 * sparse.csr_array(STAR.links),
-        "agents from 0 to 2": [(0, 1), (1, 7)],
         "a graph of 3 agents, got 4": graphs.path(4),
     }
     for text, value in refused.items():

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distfilt.sensors import Sensor, angle, direct, wrap
+from distfilt.sensors import Sensor, angle, wrap
 from tests.support import NAN, generator
 
 # Full, of several components, and with no symmetry that a transposed factor could hide behind.
@@ -55,13 +55,6 @@ def test_a_function_that_takes_one_state_only_is_refused(
     x = 2.0 + np.arange(np.prod(shape)).reshape(shape)
     with pytest.raises(ValueError, match=r"function: needs to take many states at once"):
         sensor.predict(x)
-
-
-def test_a_function_s_own_error_is_not_hidden() -> None:
-    with pytest.raises(ValueError, match="x: needs more components"):
-        direct([3], std=1.0).predict(np.ones((4, 2)))
-    with pytest.raises(ValueError, match="indices: needs a number below 2, got 3"):
-        direct([3], std=1.0).matrix(2)
 
 
 def test_a_function_that_works_in_place_leaves_the_caller_s_states() -> None:
