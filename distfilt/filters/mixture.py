@@ -69,6 +69,8 @@ class MixtureFilter(Filter):
     sensors, graph, faults, names, gate, every
         As for :class:`~distfilt.filters.Filter`. Agents' states differ, so that readings stay with
         their agents and one run is filtered at a time.
+        Several readings of one time are taken one after the other, and the gate tests each against
+        what is believed after those before it.
     agreement : callable, optional
         ``agreement(beliefs, channel) -> beliefs`` of the agents' mixtures, such as
         ``partial(target_fusion, target_dim=6)`` of :mod:`distfilt.mixtures`.
