@@ -244,6 +244,19 @@ def test_a_run_whose_agreement_fails_leaves_the_others_as_they_are() -> None:
         assert (wild.ledger.lost == start.ledger.lost).all() and start.ledger.lost.any()
 
 
+@pytest.mark.filterwarnings("ignore:overflow")
+def test_a_reading_that_no_particle_explains_ends_its_run_alone() -> None:
+    f = ParticleFilter(model(), [direct([0], std=0.5)] * 2, graphs.path(2), members=30,
+                       share=False, failures="keep")  # fmt: skip
+    start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(3,))
+    good, wild = np.zeros((3, 1)), np.array([[0.0], [0.0], [1e200]])
+    a, b = (f.step(start, 0.5, [good, y]) for y in (good, wild))
+    assert b.failed.tolist() == [False, False, True]
+    assert (a.weights[:2] == b.weights[:2]).all()
+    with pytest.raises(FilterError, match="run 2, agent 1, t = 0.5 s"):
+        replace(f, failures="raise").step(start, 0.5, [good, wild])
+
+
 @pytest.mark.parametrize("raises", [False, True])
 def test_a_run_whose_update_fails_is_named_and_leaves_the_others_their_draws(raises: bool) -> None:
     def fragile(x: np.ndarray, h: np.ndarray, y: np.ndarray, r: np.ndarray, *, rng: Any):

@@ -63,13 +63,6 @@ def in_orbit(target: np.ndarray, observer: np.ndarray, **options: object) -> tup
     return f, f.start([GaussianMixture.gaussian(np.concatenate([target, observer]), cov)])
 
 
-def test_an_orbit_below_the_surface_is_refused() -> None:
-    falls = np.array([7000.0, 0, 0, 0, 100.0, 0])
-    f, state = in_orbit(falls, GEO)
-    with pytest.raises(FilterError, match="agent 0, t = 3000 s: .*above"):
-        f.step(state, 3000.0, [None])
-
-
 def test_a_reading_of_an_occulted_target_is_refused_and_a_missing_one_is_not() -> None:
     f, state = in_orbit(-MEO, GEO)
     nothing = np.full(8, np.nan)

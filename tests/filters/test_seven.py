@@ -238,6 +238,8 @@ def test_what_waits_survives_on_disk_and_a_lag_has_to_reach_it(tmp_path: Path) -
             again = f.step(again, TIMES[k], [s[k] for s in seen])
         assert np.array_equal(again.joint_means, states[3].joint_means)
     short, start, seen, _ = made("gaussian", every=1.0, lag=1)
+    with pytest.raises(ValueError, match="lag: needs at least 1 for readings that wait"):
+        made("gaussian", every=1.0)
     with pytest.raises(ValueError, match="lag: needs to reach back to t = 0"):
         short.run(start, TIMES, seen)
 
