@@ -89,9 +89,9 @@ def runnalls(
         -w_i\log|\mathbf P_i|-w_j\log|\mathbf P_j|\bigr],
 
     A. Runnalls, IEEE Transactions on Aerospace and Electronic Systems 43 (2007) 989-999. Costs are
-    kept between mergers, so that L mixands cost about L²/2 determinants, and the memory is 8 L²
-    bytes: of thousands let the heaviest absorb the others first. Where numba is installed (the
-    extra `speed`) it computes: the same merges, some four times as fast.
+    kept between mergers, so that L mixands that become K cost about L² − K²/2 determinants, and the
+    memory is 8 L² bytes: of thousands let the heaviest absorb the others first. Where numba is
+    installed (the extra `speed`) it computes: the same merges, some four times as fast.
 
     Parameters
     ----------
