@@ -63,16 +63,14 @@ def mean_interval(values: Values, *, level: Level = 0.95) -> Interval:
     >>> print(mean_interval([1.0, 2.0, 3.0, 4.0]))
     2.5 [0.446, 4.55]
     """
-    from scipy.stats import t
+    from scipy.special import stdtrit
 
     if values.size < 2:
         raise ValueError(f"values: needs at least 2 values, got {values.size}")
     middle = float(values.mean())
     error = float(values.std(ddof=1)) / float(np.sqrt(values.size))
-    if error == 0:  # all alike, which a distribution of scale 0 is not made for
-        return Interval(middle, middle, middle, 0.0)
-    low, high = t.interval(level, values.size - 1, loc=middle, scale=error)
-    return Interval(middle, float(low), float(high), error)
+    half = float(stdtrit(values.size - 1, 0.5 + level / 2)) * error
+    return Interval(middle, middle - half, middle + half, error)
 
 
 @door
@@ -95,12 +93,12 @@ def median_interval(values: Values, *, level: Level = 0.95) -> Interval:
     >>> print(median_interval([5.0, 1.0, 4.0, 2.0, 9.0, 3.0, 8.0]))
     4 [1, 9]
     """
-    from scipy.special import ndtri
-    from scipy.stats import binom
+    from scipy.special import betainc, ndtri
 
     v, n = np.sort(values), values.size
     # P(B <= k - 1) for k = 1, 2, ...: the chance that the k-th smallest lies above the median.
-    missed = 2 * binom.cdf(np.arange((n + 1) // 2), n, 0.5)
+    ranks = np.arange(1, (n + 1) // 2 + 1)
+    missed = 2 * betainc(n - ranks + 1, ranks, 0.5)
     k = int((missed <= 1 - level).sum())
     if k == 0:
         raise ValueError(f"values: needs more values for level {level:g}, got {n}")
@@ -135,13 +133,13 @@ def proportion_interval(
     >>> print(proportion_interval(0, 100))
     0 [0, 0.0362]
     """
-    from scipy.stats import beta
+    from scipy.special import betaincinv
 
     k, n, tail = successes, trials, (1 - level) / 2
     if k > n:
         raise ValueError(f"successes: needs at most as many as trials ({n}), got {k}")
-    low = 0.0 if k == 0 else float(beta.ppf(tail, k, n - k + 1))
-    high = 1.0 if k == n else float(beta.ppf(1 - tail, k + 1, n - k))
+    low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
+    high = 1.0 if k == n else float(betaincinv(k + 1, n - k, 1 - tail))
     share = k / n
     error = float(np.sqrt(share * (1 - share) / n))
     # A level near 0 gives ends that pass each other around the share.

@@ -130,11 +130,11 @@ def nees_band(
     >>> print(nees_band(6, 100, normalised=True))
     1 [0.89, 1.12]
     """
-    from scipy.stats import chi2
+    from scipy.special import gammaincinv
 
     tail, total = (1 - level) / 2, count * dim
     unit = total if normalised else count
-    low, high = (float(chi2.ppf(p, total)) / unit for p in (tail, 1 - tail))
+    low, high = (2 * float(gammaincinv(total / 2, p)) / unit for p in (tail, 1 - tail))
     # At tiny levels the band lies below the mean, because the chi-square's median does.
     middle = float(min(max(total / unit, low), high))
     return Interval(middle, low, high, float(np.sqrt(2 * total)) / unit)
