@@ -297,8 +297,8 @@ class Flooding(Record, Sharing):
     forget: Positive | None = field(default=None, kw_only=True)
 
     def begin(self, seen: Seen) -> Carried:
-        """Tables (A, A, d + 1) of positions and times, with the own entry only."""
-        return (_noted(seen),)
+        """Tables (A, A, d + 1) of positions and times, without any entry."""
+        return (_empty(seen),)
 
     def learn(self, carried: Carried, seen: Seen, channel: Channel, dt: float) -> Learnt:
         """Note the own position, send the table, keep the newest of each entry."""
@@ -312,11 +312,14 @@ class Flooding(Record, Sharing):
         return (new,), *_mean_kernels(new, oldest, seen)
 
 
-def _noted(seen: Seen, table: Array | None = None) -> Array:
-    """Each agent's table of all agents' positions and times, with the own entry of now."""
+def _empty(seen: Seen) -> Array:
     size, d = seen.positions.shape
-    out = np.full((size, size, d + 1), [0.0] * d + [_NEVER]) if table is None else table.copy()
-    here = np.flatnonzero(seen.present)
+    return np.full((size, size, d + 1), [0.0] * d + [_NEVER])
+
+
+def _noted(seen: Seen, table: Array) -> Array:
+    """Each agent's table of all agents' positions and times, with the own entry of now."""
+    out, here = table.copy(), np.flatnonzero(seen.present)
     out[here, here, :-1], out[here, here, -1] = seen.positions[here], seen.t
     return out
 
@@ -354,7 +357,7 @@ class Neighbours(Record, Sharing):
 
     def learn(self, carried: Carried, seen: Seen, channel: Channel, dt: float) -> Learnt:
         """Send the own position; the mean of the kernels at all positions that arrive."""
-        table = _noted(seen)
+        table = _noted(seen, _empty(seen))
         for i, box in enumerate(channel.exchange(seen.only_here(seen.positions))):
             for j, x in box.items():
                 table[i, j] = *x, seen.t

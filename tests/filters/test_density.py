@@ -47,10 +47,10 @@ RULES = {
 }
 
 
-def last(f: DensityFilter, path: np.ndarray = PATH, start: np.ndarray = START) -> DensityState:
-    state = f.start(start)
+def last(f: DensityFilter, path=PATH, start: np.ndarray = START, t: float = 0.0) -> DensityState:
+    state = f.start(start, t=t)
     for k, x in enumerate(path):
-        state = f.step(state, 0.1 * (k + 1), x)
+        state = f.step(state, t + 0.1 * (k + 1), x)
     return state
 
 
@@ -97,10 +97,10 @@ def test_flooding_knows_where_agents_were_as_many_steps_ago_as_hops() -> None:
 
 def test_flooding_forgets() -> None:
     path = PATH.copy()
-    path[2:, 3] = np.nan
+    path[2:, 3] = path[:, 4] = np.nan
     kept = last(make(graphs.complete(SIZE), Flooding(), local=(0,)), path)
-    gone = last(make(graphs.complete(SIZE), Flooding(forget=0.35), local=(0,)), path)
-    assert kept.counted[0] == SIZE and gone.counted[0] == SIZE - 1
+    gone = last(make(graphs.complete(SIZE), Flooding(forget=0.35), local=(0,)), path, t=-9.0)
+    assert kept.counted[0] == SIZE - 1 and gone.counted[0] == SIZE - 2 and gone.counted[4] == 0
 
 
 def test_ledger_charges_what_each_rule_sends() -> None:
