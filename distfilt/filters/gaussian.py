@@ -164,13 +164,13 @@ class GaussianFilter(Filter):
             partial(unchecked(model.step), t=state.t, dt=dt),
             partial(unchecked(model.jacobian), t=state.t, dt=dt), state.means, state.covariances,
         )
-        shift = np.ascontiguousarray(slope)
-        if kept:
-            shift = np.zeros((*moved.shape[:-1], (1 + kept) * d, state.joint_means.shape[-1]))
-            shift[..., :d, :d] = slope
-            shift[..., d:, : kept * d] = np.eye(kept * d)
-        covs = shift @ state.joint_covariances @ shift.mT
-        covs[..., :d, :d] += unchecked(model.noise)(state.t, dt) + extra
+        shift, before = np.ascontiguousarray(slope), state.joint_covariances
+        covs = shift @ before[..., :d, :d] @ shift.mT
+        covs += unchecked(model.noise)(state.t, dt) + extra
+        if kept:  # the past stays as it is, and only its products with the present move
+            past, across = before[..., : kept * d, : kept * d], shift @ before[..., :d, : kept * d]
+            upper = np.concatenate([covs, across], axis=-1)
+            covs = np.concatenate([upper, np.concatenate([across.mT, past], axis=-1)], axis=-2)
         if self.inflation != 1.0:
             covs[..., :d, :] *= self.inflation
             covs[..., :, :d] *= self.inflation
