@@ -164,13 +164,11 @@ class GaussianFilter(Filter):
             partial(unchecked(model.step), t=state.t, dt=dt),
             partial(unchecked(model.jacobian), t=state.t, dt=dt), state.means, state.covariances,
         )
-        shift, before = np.ascontiguousarray(slope), state.joint_covariances
-        covs = shift @ before[..., :d, :d] @ shift.mT
-        covs += unchecked(model.noise)(state.t, dt) + extra
+        shift, old = np.ascontiguousarray(slope), state.joint_covariances
+        covs = shift @ old[..., :d, :d] @ shift.mT + (unchecked(model.noise)(state.t, dt) + extra)
         if kept:  # the past stays as it is, and only its products with the present move
-            past, across = before[..., : kept * d, : kept * d], shift @ before[..., :d, : kept * d]
-            upper = np.concatenate([covs, across], axis=-1)
-            covs = np.concatenate([upper, np.concatenate([across.mT, past], axis=-1)], axis=-2)
+            across = shift @ old[..., :d, : kept * d]
+            covs = np.block([[covs, across], [across.mT, old[..., : kept * d, : kept * d]]])
         if self.inflation != 1.0:
             covs[..., :d, :] *= self.inflation
             covs[..., :, :d] *= self.inflation

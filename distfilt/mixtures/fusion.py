@@ -12,6 +12,7 @@ equations (14)-(15) of Semeraro, LeGrand and Kulik for one other agent.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from typing import Annotated, Literal
@@ -351,18 +352,21 @@ def nonnegative_least_squares(
     >>> nonnegative_least_squares([[1.0, 0.0], [0.0, 1.0]], [2.0, -1.0])
     array([2., 0.])
     """
-    from scipy.optimize import nnls
+    from scipy.optimize import lsq_linear, nnls
 
     rows, columns = matrix.shape
     values = svdvals(matrix)
-    smallest = float(values[-1]) if rows >= columns else 0.0
-    alpha = unchecked(tikhonov)(float(values[0]), smallest, condition=condition)
+    alpha = unchecked(tikhonov)(values[0], values[-1] * (rows >= columns), condition=condition)
     if alpha > 0:
         matrix = np.concatenate([matrix, alpha * np.eye(columns)])
         right = np.concatenate([right, np.zeros(columns)])
-    try:
-        return np.asarray(nnls(matrix, right, maxiter=20 * columns)[0], dtype=np.float64)
-    except RuntimeError as error:
-        raise SolverError(
-            f"nonnegative least squares stopped: {error} ({columns} unknowns)"
-        ) from None
+    with suppress(RuntimeError):
+        out = np.asarray(nnls(matrix, right, maxiter=20 * columns)[0], dtype=np.float64)
+        slope, limit = matrix.T @ (matrix @ out - right), 1e-9 * values[0] * np.linalg.norm(right)
+        # It may stop short where columns are almost the same; which is told by the optimum's slope.
+        if slope.min() >= -limit and slope[out > 0].max(initial=0.0) <= limit:
+            return out
+    found = lsq_linear(matrix, right, (0, np.inf), method="bvls", max_iter=20 * columns)
+    if not found.success:
+        raise SolverError(f"nonnegative least squares: {found.message} ({columns} unknowns)")
+    return np.asarray(found.x, dtype=np.float64)
