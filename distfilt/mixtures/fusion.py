@@ -12,7 +12,6 @@ equations (14)-(15) of Semeraro, LeGrand and Kulik for one other agent.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from typing import Annotated, Literal
@@ -360,13 +359,13 @@ def nonnegative_least_squares(
     if alpha > 0:
         matrix = np.concatenate([matrix, alpha * np.eye(columns)])
         right = np.concatenate([right, np.zeros(columns)])
-    with suppress(RuntimeError):
+    try:
         out = np.asarray(nnls(matrix, right, maxiter=20 * columns)[0], dtype=np.float64)
-        slope, limit = matrix.T @ (matrix @ out - right), 1e-9 * values[0] * np.linalg.norm(right)
-        # It may stop short where columns are almost the same; which is told by the optimum's slope.
-        if slope.min() >= -limit and slope[out > 0].max(initial=0.0) <= limit:
-            return out
-    found = lsq_linear(matrix, right, (0, np.inf), method="bvls", max_iter=20 * columns)
-    if not found.success:
-        raise SolverError(f"nonnegative least squares: {found.message} ({columns} unknowns)")
-    return np.asarray(found.x, dtype=np.float64)
+    except RuntimeError as error:
+        raise SolverError(f"nonnegative least squares: {error} ({columns} unknowns)") from None
+    slope, limit = matrix.T @ (matrix @ out - right), 1e-6 * values[0] * np.linalg.norm(right)
+    if slope.min() >= -limit and slope[out > 0].max(initial=0.0) <= limit:
+        return out
+    # It stops short at times where columns are almost the same; the optimum's slope tells.
+    other = lsq_linear(matrix, right, (0, np.inf), method="bvls").x.clip(0)
+    return min(out, other, key=lambda w: float(np.linalg.norm(matrix @ w - right)))
