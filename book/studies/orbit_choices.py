@@ -101,6 +101,8 @@ code = (
 scenarios = paper.scenarios
 seeds = paper.seeds
 rtol = 1e-3
+# Which of 24 nearly equal mixands are kept hangs on the last bit, and the later hours on them.
+odd = 2
 
 
 def again(seed: np.random.SeedSequence) -> dict[str, float]:

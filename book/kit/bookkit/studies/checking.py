@@ -46,6 +46,8 @@ def script(name: str, *, folder: Path | None = None) -> ModuleType:
     if str(path.parent) not in sys.path:
         sys.path.insert(0, str(path.parent))
     spec.loader.exec_module(module)
+    # Last, as an import leaves it: a ufunc is sent by the name of the first module that has it.
+    sys.modules[spec.name] = sys.modules.pop(spec.name)
     sent_by_value(path.parent)
     return module
 
