@@ -10,10 +10,11 @@ from distfilt.models import constant_velocity, simulate
 from distfilt.network import graphs
 from distfilt.sensors import distance
 
-model = constant_velocity(sigma=0.1)
-sensors = [distance([0, 1], std=0.3, origin=(x, 9)) for x in (0, 3, 6, 9)]
+S = {"sigma": 0.1, "std": 0.3, "members": 60}
 COLUMNS = ["squared_error", "variance"]
-f = EnsembleFilter.exact(model, sensors, graphs.ring(4), members=60)
+model = constant_velocity(sigma=S["sigma"])
+sensors = [distance([0, 1], std=S["std"], origin=(x, 9)) for x in (0, 3, 6, 9)]
+f = EnsembleFilter.exact(model, sensors, graphs.ring(4), members=S["members"])
 
 
 def trial(seed):
@@ -42,6 +43,6 @@ if __name__ == "__main__":
     where, *some = sys.argv[1:]
     print(studies.store(
         "errors.csv", trial, studies.spawn(2026, 40), columns=COLUMNS,
-        parameters={}, executor=executor(where),
+        parameters=S, executor=executor(where),
         indices=range(*map(int, some)) if some else None,
     ))

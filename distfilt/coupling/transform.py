@@ -127,8 +127,8 @@ def ensemble_transform(
         As for :func:`~distfilt.coupling.plan`.
     debias : bool
         Take off the displacement that the solver's plan gives members whose weights are equal
-        already. An entropic plan shrinks the ensemble; this undoes most of it, and does nothing to
-        an optimal plan.
+        already. An entropic plan shrinks the ensemble; this undoes most of it. An optimal plan
+        needs none: it only swaps what lies within the tie-breaker of :func:`plans`.
     correct : bool
         Give the new members the weighted covariance too, by :func:`second_order`.
 
@@ -295,8 +295,8 @@ def transform_within(
     pieces : array_like of int, (N,)
         The number of each member's piece.
     rng : numpy.random.Generator
-        Chooses the pieces, systematically: each gets its share of the members to within one or
-        two.
+        Chooses the pieces, systematically: each gets its share of the members on average, and
+        hardly more or less of them (by four or five where many pieces are interleaved).
 
     Returns
     -------

@@ -29,8 +29,8 @@ def bernoulli(z: Annotated[Array, "..."]) -> Array:
     array([1.581977, 1.      , 0.581977])
     """
     small = np.abs(z) < 1e-4
-    safe = np.where(small, 1.0, np.clip(z, -700.0, 700.0))
-    return np.where(small, 1 - z / 2 + z**2 / 12, safe / np.expm1(safe))
+    safe = np.where(small, 1.0, z)
+    return np.where(small, 1 - z / 2 + z**2 / 12, safe / np.expm1(np.clip(safe, -700.0, 700.0)))
 
 
 _Faces = namedtuple("_Faces", "points left right axis width")
@@ -87,7 +87,8 @@ class FokkerPlanck(Record):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.grid._same_box(self.swarm):
+        boxes = [np.array([part.low, part.high]) for part in (self.grid, self.swarm)]
+        if not np.array_equal(boxes[0], boxes[1]):
             raise ValueError("grid: needs a grid of the swarm's box, got "
                              f"{self.grid.shape!r} of another")
 

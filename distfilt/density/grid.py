@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,22 +150,6 @@ class Grid(Record):
         place, v = ((flat - self.low) / self.spacing - 0.5).T, values.reshape(self.shape)
         found = map_coordinates(v, place, order=1, mode="nearest")
         return np.asarray(found.reshape(positions.shape[:-1]))
-
-    @door
-    def aggregated(self, values: Annotated[Array, "... self.size"], coarse: Grid) -> Array:
-        """Means over the cells of a coarser grid of the same box, (..., n) to (..., m)."""
-        pairs = list(zip(self.shape, coarse.shape, strict=False))
-        if not self._same_box(coarse) or any(a % b for a, b in pairs):
-            raise ValueError("coarse: needs a grid of the same box with whole numbers of the "
-                             f"cells of {self.shape}, got {coarse.shape!r}")
-        lead = values.shape[:-1]
-        cut = values.reshape(*lead, *(n for a, b in pairs for n in (b, a // b)))
-        axes = tuple(len(lead) + 1 + 2 * k for k in range(self.dim))
-        return np.asarray(cut.mean(axis=axes).reshape(*lead, coarse.size))
-
-    def _same_box(self, other: Any) -> bool:
-        """Whether another grid, or a swarm, fills the same box."""
-        return np.array_equal(self.low, other.low) and np.array_equal(self.high, other.high)
 
     def wavenumbers(self, rank: int) -> Indices:
         """The `rank` lowest cosine modes, (rank, d) half-waves along each axis, constant first.

@@ -43,7 +43,7 @@ class Filter(Record, ABC):
         How the state moves; known to all agents.
     sensors : sequence of length A
         What each agent sees: a Sensor, several in a list, or None. Neighbours know each other's.
-        One that moves comes with each :class:`Reading`.
+        One that moves comes with each :class:`Reading`, and of several each reading is one.
     graph : Graph, networkx graph, matrix or edges, or callable t -> one of them, optional
         Who hears whom; needed where anybody speaks. At a time without any link nobody does.
     agreement : callable, optional
@@ -330,7 +330,7 @@ class Filter(Record, ABC):
             Where to begin.
         times : array_like, (T,), or None
             Strictly increasing, in s, from the state's on; steps may differ in length. With events
-            there is a step at each of theirs too, and None is enough.
+            there is a step at each of theirs too, and None is enough if none is late.
         observations : sequence of length A, or of Reading
             Per agent (T, *runs, m) or (T, m), or None; NaN marks what is missing. Or events of any
             order, several of which may have one time.
@@ -340,7 +340,8 @@ class Filter(Record, ABC):
         scores : collection of {"squared_error", "nees", "crps"}
             Which of them; CRPS costs about as much as an ensemble filter.
         late : sequence of Reading
-            Each is taken in at the first of `times` that is not before it `arrived`.
+            Each is taken in at the first of `times` that is not before it `arrived`, and has to be
+            of one of them: with events let `times` hold those of the late ones.
 
         Returns
         -------

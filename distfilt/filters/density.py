@@ -88,7 +88,8 @@ class DensityFilter(Filter):
     In each step every agent sees its own position, learns by the `agreement` an estimate y_i of the
     kernel estimate of all, and takes it into a Kalman filter of the density whose model is the
     Fokker-Planck equation. Where the network falls apart, agents go on with what they hear, and
-    the record says into how many parts.
+    the record says into how many parts. How sure a step's estimate is follows from the true number
+    of those present, which is taken as known: who has heard of few is then too sure.
 
     Parameters
     ----------
@@ -216,7 +217,8 @@ class DensityFilter(Filter):
         if not isinstance(self.first, str):
             return np.tile(self.first, (self.count, 1))
         if self.first == "observed":
-            return alone(self.agreement, seen)
+            own, here = alone(self.agreement, seen), seen.present[:, None]
+            return np.where(here, own, seen.flat(self.first_std))
         return seen.flat(self.first_std)
 
     def _seen(self, positions: ArrayLike, name: str, t: float) -> Seen:

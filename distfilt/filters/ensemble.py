@@ -221,7 +221,7 @@ class EnsembleFilter(MembersFilter):
         self, x: Array, h: Array, y: Array, noise: Array, rng: Any, predict: Any
     ) -> Array:
         """One time's ensembles after the update; a plain function gets one agent's at a time."""
-        if getattr(self.update, "repredicts", False):
+        if says(self.update, "repredicts"):
             return unchecked(self.update)(x, h, y, noise, rng=rng, predict=predict)
 
         def one(x: Array, h: Array, y: Array, r: Array) -> Array:

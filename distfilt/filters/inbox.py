@@ -105,10 +105,10 @@ class Heard:
 
     def near(self, seen: Array, aim: Array) -> Array:
         """Predictions (*runs, G, N, M), now on the branch of an aim (*runs, G, 1, M); in place."""
-        out, goal = seen.swapaxes(-1, -2), (aim + 0 * seen).swapaxes(-1, -2)
+        out = seen.swapaxes(-1, -2)
         for sensor, _, cells in self.parts:
             if sensor.difference is not None:
-                at = (..., *cells, slice(None))
+                at, goal = (..., *cells, slice(None)), (aim + 0 * seen).swapaxes(-1, -2)
                 here, there = (x[at].swapaxes(-1, -2) for x in (out, goal))
                 # y* - wrap(y* - h)
                 gap = unchecked(sensor.residual)(there, here)

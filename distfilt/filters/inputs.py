@@ -111,6 +111,8 @@ def _read(f: Any, given: Any, agent: int, t: float, name: str) -> Reading:
         if (given.agent, given.t) != (agent, t):
             got = f"one of agent {given.agent} at t = {given.t:g}"
             raise ValueError(f"{name}: needs a Reading of agent {agent} at t = {t:g}, got {got}")
+        if given.arrived is not None and given.arrived > t:
+            raise ValueError(f"{name}: needs what has arrived, got a Reading of {given.arrived:g}")
         return given
     own = f.team[agent]
     if len(own) != 1:

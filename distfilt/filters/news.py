@@ -72,9 +72,11 @@ class NewsFilter(MixtureFilter):
 
     A reading is told once, by whom it belongs to, so that nothing is counted twice and nothing has
     to be discounted. For linear models and Gaussians that equals one filter with everybody's
-    readings, if everybody hears everybody, nothing is lost, and the agents' own states are
-    independent of each other given the target's *present* state. It needs to know where readings
-    come from: what all receive alike has to be named in `common`, and is taken by each for itself.
+    readings, if everybody hears everybody, nothing is lost, the agents' own states are independent
+    of each other given the target's *present* state, and what is learned is told at once or nothing
+    disturbs the target: what waits (`every`) is counted as if it were. It needs to know where
+    readings come from: what all receive alike has to be named in `common`, and is taken by each for
+    itself.
 
     Parameters
     ----------
@@ -86,7 +88,7 @@ class NewsFilter(MixtureFilter):
         As there. With more than one mixand the moments' news are told, which is an approximation.
     common : sequence of int
         Components of the readings that all agents receive alike, with the same error, which has to
-        be independent of the other components'.
+        be independent of the other components'; the gate judges and counts them for themselves.
 
     Notes
     -----
@@ -156,14 +158,17 @@ class NewsFilter(MixtureFilter):
         channel, part = step.channel, range(self.target_dim)
         assert channel is not None
         said: list[Array | None] = [None] * len(after)
-        for k, listeners in enumerate(channel.graph.listeners):
+        # Whose radio is off tells later, and so does one whom nobody could hear.
+        on = channel.faults.speaking(channel.graph, channel.ledger.rounds, channel.t)
+        for k, listeners in enumerate(np.bincount(channel.graph.senders[on], minlength=len(said))):
             before = untold[k]
             if before is not None and listeners:
                 with step.of(k):
                     news = increment(before.marginal(part), after[k].marginal(part))
                 # Numbers that are not zero by construction, 13 for two rows of six.
-                packed = news[np.triu_indices(len(news), 0, news.shape[1])]
-                said[k], untold[k] = packed if news.size else None, None
+                if news.size:  # too little is told with what is learned next
+                    said[k] = news[np.triu_indices(len(news), 0, news.shape[1])]
+                    untold[k] = None
         for k, heard in enumerate(channel.exchange(said)):
             for payload in heard.values():
                 news = _unpacked(payload, self.target_dim)

@@ -75,9 +75,9 @@ def intersection(
     lead = leading(weights.shape[:-1], means.shape[:-2], "means")
     lead = leading(lead, covs.shape[:-3], "covs")
     size, d = means.shape[-2:]
-    means, here = np.broadcast_to(means, (*lead, size, d)), weights > 0
-    m = _counted(means, here[..., None], 0.0, "means")
-    lower = cholesky(_counted(covs, here[..., None, None], np.eye(d), "covs"))
+    means = np.broadcast_to(means, (*lead, size, d))
+    here = np.broadcast_to(weights > 0, (*lead, size))
+    m, lower = _counted(means, here, 1, "means"), cholesky(_counted(covs, here, 2, "covs"))
     first, centre = lower[..., 0, :, :], m[..., 0, :]
     own, others = weights[..., :1, None], np.sqrt(weights[..., 1:, None, None])
     gap = m[..., 1:, :, None] - centre[..., None, :, None]
@@ -93,12 +93,16 @@ def intersection(
     return centre + fused[..., d], symmetrise(fused[..., :d])
 
 
-def _counted(value: Array, here: Mask, other: Array | float, name: str) -> Array:
-    """What the sources that count hold, with `other` in the place of those that do not."""
-    out = value if here.all() else np.where(here, value, other)
-    if not np.isfinite(out).all():
+def _counted(value: Array, here: Mask, axes: int, name: str) -> Array:
+    """What the sources that count hold; the first of them stands in for those that do not."""
+    if not here.all():
+        value = np.broadcast_to(value, (*here.shape, *value.shape[value.ndim - axes :]))
+        wide = here.reshape(*here.shape, *(1,) * axes)
+        first = wide.argmax(axis=here.ndim - 1, keepdims=True)
+        value = np.where(wide, value, np.take_along_axis(value, first, axis=here.ndim - 1))
+    if not np.isfinite(value).all():
         raise ValueError(f"{name}: needs finite numbers where a source counts, got NaN or infinity")
-    return out
+    return value
 
 
 def _beside(left: Array, right: Array) -> Array:
@@ -169,7 +173,7 @@ def intersection_weights(
     lead = leading(there.shape[:-1], covs.shape[:-3], "covs")
     here = np.broadcast_to(there, (*lead, *covs.shape[-3:-2]))
     covs = np.broadcast_to(covs, (*lead, *covs.shape[-3:]))
-    covs = _counted(covs, here[..., None, None], np.eye(covs.shape[-1]), "covs")
+    covs = _counted(covs, here, 2, "covs")
     if rule in ("min_trace", "min_determinant") and here.shape[-1] > 1:
         return _least(covs, here, rule == "min_determinant")
     logs = np.zeros(here.shape)

@@ -105,11 +105,8 @@ def recolour(
 
 @door
 def conditioned(
-    mean: Annotated[Array, "... d"],
-    cov: Semidefinite,
-    gap: Annotated[Array, "... m", MISSING],
-    H: Annotated[Array, "... m d"],
-    R: Annotated[Cov, "... m m"],
+    mean: Annotated[Array, "... d"], cov: Semidefinite, gap: Annotated[Array, "... m", MISSING],
+    H: Annotated[Array, "... m d"], R: Annotated[Cov, "... m m"],
 ) -> tuple[Array, Array]:
     r"""Condition Gaussians on readings :math:`\mathbf y=\mathbf H\mathbf x+\text{noise}`.
 

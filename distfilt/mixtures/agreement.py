@@ -42,9 +42,9 @@ def fuse(
     [[[2.0, 1.0], [1.0, 1.0]]]
     """
     exact = PartialFusion(own, heard, omega=omega)
-    if exact.exponents[0] == 1:
-        return own
-    fused = unchecked(exact.weigh)(unchecked(exact.shapes)(terms=terms), rule=rule)
+    fused = own
+    if exact.exponents[0] != 1:
+        fused = unchecked(exact.weigh)(unchecked(exact.shapes)(terms=terms), rule=rule)
     return fused if size is None else unchecked(runnalls)(fused, size)
 
 

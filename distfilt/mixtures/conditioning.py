@@ -121,7 +121,7 @@ def within_gate(
     [array([nan]), array([9.5])]
     """
     surprise, *columns = _innovations(mixture, observed, function, noise, residual)
-    far = quadratic_form(_root(*columns), surprise)
+    far = np.where(mixture.weights > 0, quadratic_form(_root(*columns), surprise), np.nan)
     # A mixand that cannot see the target expects nothing.
     refused = np.isfinite(far).any() and np.nanmin(far) > gate**2
     return np.full_like(observed, np.nan) if refused else observed

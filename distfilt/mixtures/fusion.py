@@ -263,7 +263,9 @@ def _conditional(
         information = information + j[:, None]
         pull = pull + (j @ gap[..., None])[:, None, :, 0]
     root = np.linalg.cholesky(own.covs[q, :n, :n])[:, None]
-    lower, good = _factored(np.eye(n) + root.mT @ symmetrise(information) @ root)
+    # Where the own mixand is the divided one there is a factor; else it may be rounding's.
+    least = np.where((q == p) & (len(divided.means) == own.size), 1e-13, 1e-10)[:, None]
+    lower, good = _factored(np.eye(n) + root.mT @ symmetrise(information) @ root, least)
     half = np.linalg.solve(lower, np.broadcast_to(root.mT, lower.shape))
     target = half.mT @ half
     move = (target @ pull[..., None])[..., 0]
@@ -275,15 +277,15 @@ def _conditional(
     return Shapes.unchecked(means[good], covs[good], source[good], int((~good).sum()))
 
 
-def _factored(matrices: Array) -> tuple[Array, Mask]:
+def _factored(matrices: Array, least: Array) -> tuple[Array, Mask]:
     """Cholesky factors of a stack, and which of them exist; the identity where none does."""
     d = matrices.shape[-1]
     lower = np.zeros_like(matrices)
     good = np.ones(matrices.shape[:-2], dtype=bool)
     for k in range(d):
         column = matrices[..., k:, k] - (lower[..., k:, :k] @ lower[..., k, :k, None])[..., 0]
-        # A pivot that has lost ten digits to cancellation is rounding.
-        good &= column[..., 0] > 1e-10 * np.abs(matrices[..., k, k])
+        # A pivot that has lost so many digits to cancellation is rounding.
+        good &= column[..., 0] > least * np.abs(matrices[..., k, k])
         pivot = np.where(good, column[..., 0], 1.0)
         lower[..., k:, k] = np.where(good[..., None], column, 0.0) / np.sqrt(pivot)[..., None]
     lower[~good] = np.eye(d)
@@ -293,8 +295,7 @@ def _factored(matrices: Array) -> tuple[Array, Mask]:
 @door
 def tikhonov(
     largest: Annotated[float, Bounds(at_least=0, at_most=1e150)],
-    smallest: Annotated[float, Bounds(at_least=0, at_most=1e150)], *,
-    condition: Condition = 1e10,
+    smallest: Annotated[float, Bounds(at_least=0, at_most=1e150)], *, condition: Condition = 1e10,
 ) -> float:
     r"""The smallest factor that brings a matrix's condition number down to `condition`, (66).
 
@@ -325,8 +326,7 @@ def tikhonov(
 @door
 def nonnegative_least_squares(
     matrix: Annotated[Array, "n s", Bounds(at_least=-1e150, at_most=1e150)],
-    right: Annotated[Array, "n"], *,
-    condition: Condition = 1e10,
+    right: Annotated[Array, "n"], *, condition: Condition = 1e10,
 ) -> Array:
     """Nonnegative weights that solve ``matrix @ w = right`` best, regularised by (60) and (66).
 

@@ -242,7 +242,7 @@ class GaussianMixture(Record):
         rows, columns = np.triu_indices(d)
         covs = np.empty((len(means), d, d))
         covs[:, rows, columns] = covs[:, columns, rows] = triangles
-        return cls.unchecked(weights, means, covs)
+        return cls.unchecked(weights.copy(), means.copy(), covs)
 
 
 def _collapsed(covs: Array) -> str:

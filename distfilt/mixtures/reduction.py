@@ -186,8 +186,8 @@ def kept_by_relevance(
            [8.5]])
     """
     nearest = gaussian_divergences(mixture, other).min(axis=1)
-    delta = mixture.weights * nearest
-    out = (delta > threshold * max(float(delta.min()), _FLOOR)) & (nearest > _GATE)
+    delta = np.where(mixture.weights > 0, mixture.weights * nearest, np.inf)
+    out = np.isfinite(delta) & (delta > threshold * max(delta.min(), _FLOOR)) & (nearest > _GATE)
     out[np.argmin(delta)] = False
     labels = np.where(out, mixture.size, np.arange(mixture.size))
     return _grouped(mixture, np.unique(labels, return_inverse=True)[1])

@@ -170,7 +170,8 @@ def split_stretched(
     most : int
         How many mixands there may be.
     stretch : float
-        A mixand is split if its weight times its largest stretching is above this.
+        A mixand is split if its weight times its largest stretching is above this, and its weight
+        above a thousandth.
     scale : array_like, (m,), optional
         As of :func:`stretching`.
 

@@ -64,11 +64,6 @@ def _straight(dt: float, axes: int) -> Array:
 
 
 def _straight_noise(t: float, dt: float, sigma: float, axes: int) -> Array:
-    return _steady_noise(dt, sigma, axes)
-
-
-@lru_cache(maxsize=64)
-def _steady_noise(dt: float, sigma: float, axes: int) -> Array:
     block = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
     return _along_axes(sigma**2 * block, axes)
 

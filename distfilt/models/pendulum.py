@@ -16,7 +16,7 @@ from .base import Model
 from .motion import integrated
 
 __all__ = [  # fmt: skip
-    "pendulum", "pendulum_angle", "pendulum_chart", "pendulum_energy", "pendulum_rate",
+    "pendulum", "pendulum_angle", "pendulum_chart", "pendulum_rate",
     "pendulum_states",
 ]
 
@@ -174,21 +174,3 @@ def pendulum_chart(states: States) -> Array:
     if (square == 0).any():
         raise ValueError("states: needs positions away from the pivot, got one at it")
     return np.stack([np.arctan2(x, y), (u * y - x * v) / square], axis=-1)
-
-
-@door
-def pendulum_energy(states: States, *, gravity: NonNegative = 9.8) -> Array:
-    r"""Energy per mass, :math:`\frac12|\mathbf v|^2-gy`, in m²/s², (...).
-
-    Parameters
-    ----------
-    states : array_like, (..., 4)
-    gravity : float
-        g, in m/s², at least 0.
-
-    Examples
-    --------
-    >>> float(pendulum_energy([0.0, 1.0, 2.0, 0.0]).round(12))
-    -7.8
-    """
-    return np.asarray(0.5 * (states[..., 2] ** 2 + states[..., 3] ** 2) - gravity * states[..., 1])

@@ -143,8 +143,7 @@ class Swarm(Record):
 
     @door
     def simulate(
-        self, positions: Positions, times: Times, *, rng: Rng, t0: float = 0.0,
-        substeps: Count = 10,
+        self, positions: Positions, times: Times, *, rng: Rng, t0: float = 0.0, substeps: Count = 10
     ) -> Array:
         """Positions at `times`, (T, ..., d), of agents that are at `positions` at `t0`.
 

@@ -187,8 +187,7 @@ class Channel:
     @door
     def carry(
         self, values: Annotated[Array, "*self.runs self.graph.senders.size k"], *,
-        links: Annotated[Mask, "self.graph.senders.size"] | None = None,
-        acknowledged: bool = False,
+        links: Annotated[Mask, "self.graph.senders.size"] | None = None, acknowledged: bool = False,
     ) -> Array:
         """Send a payload of its own along each link.
 

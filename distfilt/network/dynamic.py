@@ -70,7 +70,7 @@ def stable_substeps(
     Returns
     -------
     int
-        The smallest number for which h = `dt` / number is half of the bound of stability or less:
+        A number for which h = `dt` / number is half of a bound of stability or less:
         at the bound a mode swings for ever, with half of it the fastest mode does not swing at all.
 
     Examples
@@ -80,8 +80,8 @@ def stable_substeps(
     8
     """
     bound = 2 * float(channel.graph.degrees.max())
-    rate = alpha + a * bound
-    if rate == 0:
+    rate = max(alpha + a * bound, 1e-300)  # without links nothing may move at all
+    if alpha + a == 0:
         raise ValueError("alpha: needs some damping, alpha or a above 0, got both 0")
     # Real eigenvalues lie within [-rate, 0]; complex ones, where 2 b λ exceeds α + a λ, have the
     # modulus b λ and the real part -(α + a λ)/2, and the largest λ is the worst.

@@ -63,7 +63,7 @@ class Ledger(Record):
 def taken(
     payloads: Any, agents: int, runs: tuple[int, ...]
 ) -> tuple[list[Payload | None], Counts, Counts]:
-    """Each agent's payload as read-only arrays, None where it is silent, its scalars and bytes.
+    """Each agent's payload as read-only copies, None where it is silent, its scalars and bytes.
 
     What is NaN in all runs is not sent, and a payload that holds nothing else is silence too.
     """
@@ -99,7 +99,7 @@ def _part(part: Any, agent: int, runs: tuple[int, ...]) -> Part:
         raise ValueError(f"payloads[{agent}]: needs {needs}, got {got}")
     if part.shape[: len(runs)] != runs:
         raise ValueError(f"payloads[{agent}]: needs leading axes {runs}, got shape {part.shape}")
-    out: Part = part.view(np.ndarray)
+    out: Part = np.array(part)  # what was sent does not change any more
     out.flags.writeable = False
     return out
 

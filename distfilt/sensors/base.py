@@ -158,7 +158,11 @@ class Sensor(Record):
         """The matrix H, (m, `dim`), of a linear sensor."""
         if self.linear is None:
             raise ValueError(f"sensor: needs a linear sensor, got a {self.kind} sensor")
-        return array(self.linear(dim), "linear", (self.dim, dim))
+        h = array(self.linear(dim), "linear", (self.dim, dim))
+        seen = unchecked(self.predict)(np.eye(dim)) if vars(self).pop("_doubted", False) else h.T
+        if not np.allclose(seen, h.T, atol=1e-9):
+            raise ValueError("linear: needs the matrix of its function, got another")
+        return h
 
     @door
     def jacobian(

@@ -148,8 +148,7 @@ def _distance_slope(x: Array, indices: Sequence[int], origin: Array) -> Array:
 
 @door
 def angle(
-    indices: Pair, *, std: Turn, full: bool = False,
-    origin: Annotated[Array, "2"] | None = None
+    indices: Pair, *, std: Turn, full: bool = False, origin: Annotated[Array, "2"] | None = None
 ) -> Sensor:
     """See the angle of two components (a, b), in rad.
 

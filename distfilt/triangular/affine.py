@@ -89,7 +89,7 @@ def compose(
     >>> compose(affine.fit(y, x), y, x, [2.0]).mean().round(1)
     np.float64(1.0)
     """
-    return unchecked(map_.inverse)(observed, unchecked(map_.__call__)(y, x))
+    return unchecked(map_.inverse)(observed[..., None, :], unchecked(map_.__call__)(y, x))
 
 
 def _lower_triangular(value: Array, name: str) -> None:
@@ -138,8 +138,7 @@ class AffineMap(Record):
 
     def _predicted(self, y: Array, members: Array) -> Array:
         """The regression of x on y, (..., N, d), which broadcasts with these members."""
-        seen = y[..., None, :] if y.ndim == self.observed_mean.ndim else y
-        centred = seen - self.observed_mean[..., None, :]
+        centred = y - self.observed_mean[..., None, :]
         out = self.mean[..., None, :] + centred @ self.gain.mT
         leading(members.shape[:-1], out.shape[:-1], "y")
         return np.asarray(out)
@@ -152,7 +151,8 @@ class AffineMap(Record):
     @door
     def inverse(self, y: OwnSeen, z: OwnMembers) -> Array:
         """Members x with S(y, x) = z, (..., N, d); `y` is (..., N, m), or (..., m) for all."""
-        return self._predicted(y, z) + z @ self.scale.mT
+        seen = y[..., None, :] if y.ndim == self.observed_mean.ndim else y
+        return self._predicted(seen, z) + z @ self.scale.mT
 
     @door
     def log_det(self, y: OwnSeen, x: OwnMembers) -> Array:
@@ -302,7 +302,10 @@ def fit_convex(
     """
     joint, m, cp = enough(y, x, len(x)), y.shape[-1], needed("cvxpy", "maps")
     rows = np.zeros((x.shape[-1], 1 + joint.shape[-1]))
-    ones = np.column_stack([np.ones(len(joint)), joint]) / np.sqrt(len(joint))
+    # Of size one: a solver's tolerances are absolute.
+    centre, size = joint.mean(axis=0), joint.std(axis=0)
+    size += size == 0
+    ones = np.column_stack([np.ones(len(joint)), (joint - centre) / size]) / np.sqrt(len(joint))
     # What cvxpy would warn of, the status below tells, and it becomes an error.
     with _SOLVING, warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
@@ -317,6 +320,8 @@ def fit_convex(
             if status != cp.OPTIMAL:
                 raise SolverError(f"{solver}: component {n - 1} of the map stopped with {status!r}")
             rows[k, :n] = u.value
+    rows[:, 1:] /= size
+    rows[:, 0] -= rows[:, 1:] @ centre
     return from_rows(rows, unchecked(ensembles.mean)(y))
 
 

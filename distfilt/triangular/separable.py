@@ -84,9 +84,8 @@ class SeparableMap:
 
     def _standard(self, y: Array, x: Array) -> Array:
         """Standardised (y, x), (..., N, m + d); one y for all members is repeated."""
-        seen = y[..., None, :] if y.ndim == self.centre.ndim else y
-        lead = leading(x.shape[:-1], seen.shape[:-1], "y")
-        joint = np.concatenate([np.broadcast_to(v, (*lead, v.shape[-1])) for v in (seen, x)], -1)
+        lead = leading(x.shape[:-1], y.shape[:-1], "y")
+        joint = np.concatenate([np.broadcast_to(v, (*lead, v.shape[-1])) for v in (y, x)], -1)
         return np.asarray((joint - self.centre[..., None, :]) / self.spread[..., None, :])
 
     def _earlier(self, joint: Array, k: int) -> Array:
@@ -111,7 +110,8 @@ class SeparableMap:
     @door
     def inverse(self, y: OwnSeen, z: OwnMembers) -> Array:
         """Members x with S(y, x) = z, (..., N, d); `y` is (..., N, m), or (..., m) for all."""
-        joint, m = self._standard(y, z), self.observed
+        seen = y[..., None, :] if y.ndim == self.centre.ndim else y
+        joint, m = self._standard(seen, z), self.observed
         for k in range(self.dim):
             aim, line = z[..., k] - self._earlier(joint, k), self.slopes[k][..., :1]
             # A line plus steps of known heights: its ends need no search.

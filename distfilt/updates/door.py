@@ -100,7 +100,7 @@ def _related(four: dict[str, Array]) -> dict[str, Array]:
 
 
 def says(update: Update, what: str) -> bool:
-    """What an update says of itself: that it ``stacks``, or takes missing readings ``whole``.
+    """What an update says of itself: that it ``stacks``, ``repredicts``, takes gaps ``whole``.
 
     One that stacks can update ensembles with a noise covariance of their own each in one call, as
     every update of this package does; a plain function gets one agent's at a time.
@@ -127,10 +127,11 @@ def around(inner: Update) -> Callable[[F], F]:
 
 
 def perturbed(predicted: Array, noise: Array, rng: Rng, *, centred: bool = False) -> Array:
-    """Predictions with a draw of the noise each, (..., N, m); centred draws keep its covariance."""
-    drawn, n = rng.standard_normal(predicted.shape), predicted.shape[-2]
+    """Predictions with a draw of the noise each, (..., N, m); with N - 1 in the denominator its
+    sample covariance is the noise's on average, centred or not."""
+    drawn = rng.standard_normal(predicted.shape)
     if centred:
-        drawn = np.sqrt(n / (n - 1)) * (drawn - drawn.mean(axis=-2, keepdims=True))
+        drawn -= drawn.mean(axis=-2, keepdims=True)
     out = drawn @ cholesky(noise).mT
     return np.asarray(np.add(out, predicted, out=out))
 

@@ -218,6 +218,10 @@ def log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
 
 
 def distinct_share(points: Array) -> Array:
-    """Share of particles that differ from all before them, (...)."""
-    first = np.sort(points[..., 0], axis=-1)
-    return np.asarray((1 + (first[..., 1:] > first[..., :-1]).sum(axis=-1)) / points.shape[-2])
+    """Share of particles that differ from all before them in the component that tells most, (...).
+
+    Mostly that is the first, but it may be known exactly.
+    """
+    changes = (points[..., 1:, :] != points[..., :-1, :]).reshape(-1, points.shape[-1]).sum(axis=0)
+    x = np.sort(points[..., changes.argmax()], axis=-1)
+    return np.asarray((1 + (x[..., 1:] > x[..., :-1]).sum(axis=-1)) / points.shape[-2])

@@ -88,9 +88,8 @@ def principal_directions(ensemble: Ensemble, n: Count) -> Array:
 
 @update
 def principal_components(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
-    n_state: Count, n_observed: Count, complement: Literal["keep", "literal"] = "keep",
-    noise_factor: Factor = 1.0,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng, n_state: Count,
+    n_observed: Count, complement: Literal["keep", "literal"] = "keep", noise_factor: Factor = 1.0,
     fit: Fit = affine.fit,
 ) -> Array:
     r"""Condition in the leading principal directions only, Algorithm 2 of Grange et al.

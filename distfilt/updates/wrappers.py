@@ -14,7 +14,7 @@ import numpy as np
 from .. import coupling
 from ..coupling.constraints import Constraint, Motion
 from ..doors import Array, Bounds, Indices, NonNegative, Positive, Rng, door, unchecked
-from .door import Update, around, with_missing
+from .door import Update, around, says, with_missing
 
 __all__ = ["augmented", "inflated", "localised", "projected", "retracted", "serial"]
 
@@ -25,10 +25,13 @@ def _followed(update: Update, change: Callable[[Array], Array]) -> Update:
 
     @around(update)
     def both(
-        ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
+        ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
+        predict: Callable[[Array], Array] | None = None,
     ) -> Array:
-        return change(inner(ensemble, predicted, observed, noise, rng=rng))
+        more = {} if predict is None else {"predict": predict}
+        return change(inner(ensemble, predicted, observed, noise, rng=rng, **more))
 
+    vars(both)["repredicts"] = says(update, "repredicts")
     return both
 
 
@@ -181,8 +184,9 @@ def serial(update: Update) -> Update:
 
     Readings are independent where the noise covariance has a zero between them; correlated ones
     stay together. Inside a filter each group meets predictions that are made again from the members
-    as they are by then; called alone, the update moves the later predictions along with the
-    members, as further components of the state.
+    as they are by then, also where the members are changed once more (:func:`inflated`,
+    :func:`projected`, :func:`retracted`); called alone, the update moves the later predictions
+    along with the members, as further components of the state.
 
     Parameters
     ----------
@@ -210,12 +214,8 @@ def serial(update: Update) -> Update:
 
 @door
 def localised(
-    update: Update,
-    *,
-    places: Annotated[Array, "d k"],
-    readings: Annotated[Array, "m k"],
-    radius: Positive,
-    period: Positive | None = None,
+    update: Update, *, places: Annotated[Array, "d k"], readings: Annotated[Array, "m k"],
+    radius: Positive, period: Positive | None = None,
 ) -> Update:
     r"""Let each reading move only components near it: the remedy for few members in a large space.
 
@@ -234,8 +234,9 @@ def localised(
     places : array_like, (d, k)
         Where each component of the state is.
     readings : array_like, (m, k)
-        Where each reading is, in the same coordinates; the update always gets all m, of which some
-        may be missing.
+        Where each reading is, in the same coordinates: of all that an agent hears in a step, by
+        agent. So it is for an agent alone, or for agents who all hear each other; some numbers may
+        be NaN, but no reading may fail to come.
     radius : float
         In the units of the coordinates.
     period : float, optional

@@ -21,14 +21,7 @@ from scipy.spatial import cKDTree
 
 from distfilt.filters import EnsembleFilter, GaussianFilter
 from distfilt.models import clohessy_wiltshire
-from distfilt.network import (
-    Channel,
-    Graph,
-    covariance_intersection,
-    graphs,
-    intersection,
-    weights,
-)
+from distfilt.network import Channel, Graph, covariance_intersection, graphs, intersection, weights
 from distfilt.sensors import direct
 from distfilt.updates import known_noise
 

@@ -26,14 +26,6 @@ def test_histogram_counts_batches() -> None:
     assert np.allclose(h[1], other.ravel())
 
 
-def test_aggregation_keeps_integrals_of_each_block() -> None:
-    fine, coarse = Grid((6, 8)), Grid((3, 2))
-    v = np.random.default_rng(3).random((2, 48))
-    got = fine.aggregated(v, coarse)
-    assert np.allclose(got[1, 0], v[1].reshape(6, 8)[:2, :4].mean())
-    assert np.allclose(fine.integral(v), coarse.integral(got))
-
-
 @pytest.mark.parametrize("grid", [Grid((9,)), BOX, Grid((3, 4, 5), high=[1.0, 2.0, 3.0])])
 def test_cosines_are_orthonormal_and_complete(grid: Grid) -> None:
     c = grid.cosines(grid.size)

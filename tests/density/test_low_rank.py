@@ -5,27 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from distfilt.density import (
-    Dense,
-    FokkerPlanck,
-    Grid,
-    LowRank,
-    dense_step,
-    kernel_density,
-    kernel_information,
-    low_rank_moved,
-    low_rank_start,
-    low_rank_step,
-    zero_mean_prior,
-)
+from distfilt import density
 from distfilt.models import rotating_swarm
 
 RNG = np.random.default_rng(1)
 
 
-def _stepped(state: LowRank, move: object, y: np.ndarray, r: np.ndarray, dt: float,
-             process: np.ndarray | None = None) -> LowRank:
-    return low_rank_step(low_rank_moved(state, move, process=process, dt=dt), y, r, dt)
+def _stepped(state: density.LowRank, move: object, y: np.ndarray, r: np.ndarray, dt: float,
+             process: np.ndarray | None = None) -> density.LowRank:
+    moved = density.low_rank_moved(state, move, process=process, dt=dt)
+    return density.low_rank_step(moved, y, r, dt)
 
 
 @pytest.mark.parametrize("filters", [1, 3, 20])
@@ -35,7 +24,7 @@ def test_two_steps_are_the_textbook_kalman_filter(filters: int) -> None:
     phi, q = RNG.random((n, n)) / 2, RNG.standard_normal((n, 2))
     root = np.hstack([RNG.standard_normal((n, n)), np.zeros((n, 2))])
     base, r = RNG.standard_normal((filters, n)), RNG.random((filters, n)) + 0.5
-    low = low_rank_start(root, base)
+    low = density.low_rank_start(root, base)
     wanted = [(m, root @ root.T) for m in base]
     for y in RNG.standard_normal((2, filters, n)):
         for i, (m, p) in enumerate(wanted):
@@ -49,8 +38,8 @@ def test_two_steps_are_the_textbook_kalman_filter(filters: int) -> None:
 
 
 def test_compression_keeps_the_largest_part() -> None:
-    state = low_rank_start(np.diag([3.0, 1.0])[:, :1], np.zeros((2, 2)))
-    moved = low_rank_moved(state, np.asarray, process=np.eye(2), dt=1.0)
+    state = density.low_rank_start(np.diag([3.0, 1.0])[:, :1], np.zeros((2, 2)))
+    moved = density.low_rank_moved(state, np.asarray, process=np.eye(2), dt=1.0)
     assert np.allclose(moved.covariance(0), np.diag([10.0, 0.0]))
 
 
@@ -61,18 +50,19 @@ def test_low_rank_equals_dense_with_the_same_prior_and_both_keep_the_mass(
     reading: str, rank: int, steps: int
 ) -> None:
     """Criterion 8: with the same prior and measurements to 1e-10; mass over hundreds of steps."""
-    grid, swarm = Grid((12, 12)), rotating_swarm(reading)
-    flow, rng = FokkerPlanck(swarm, grid), np.random.default_rng(2)
+    grid, swarm = density.Grid((12, 12)), rotating_swarm(reading)
+    flow, rng = density.FokkerPlanck(swarm, grid), np.random.default_rng(2)
     x = rng.random((100, 2))
-    y, prior = kernel_density(x, grid, bandwidth=0.08), zero_mean_prior(grid, rank=rank)
-    dense, low = Dense(y, prior @ prior.T), low_rank_start(prior, y[None])
-    k = kernel_information(grid, bandwidth=0.08, agents=100)
+    y = density.kernel_density(x, grid, bandwidth=0.08)
+    prior = density.zero_mean_prior(grid, rank=rank)
+    dense, low = density.Dense(y, prior @ prior.T), density.low_rank_start(prior, y[None])
+    k = density.kernel_information(grid, bandwidth=0.08, agents=100)
     for j in range(steps):
         move = flow.solver(0.1 * j, 0.1)
         x = swarm.step(x, 0.1 * j, 0.1, rng=rng, substeps=2)
-        y = kernel_density(x, grid, bandwidth=0.08)
+        y = density.kernel_density(x, grid, bandwidth=0.08)
         noise = k * np.maximum(move(dense.mean), 0.1)
-        dense = dense_step(dense, move, y, noise, 0.1)
+        dense = density.dense_step(dense, move, y, noise, 0.1)
         low = _stepped(low, move, y, noise, 0.1)
     assert np.abs(low.estimates[0] - dense.mean).max() < 1e-10 * np.abs(dense.mean).max()
     assert np.abs(low.covariance(0) - dense.covariance).max() < 1e-10
@@ -82,24 +72,24 @@ def test_low_rank_equals_dense_with_the_same_prior_and_both_keep_the_mass(
 
 
 def test_filters_do_not_see_each_other_and_infinite_noise_measures_nothing() -> None:
-    grid = Grid((10, 10))
-    move = FokkerPlanck(rotating_swarm(), grid).solver(0.0, 0.1)
-    s, base = zero_mean_prior(grid, rank=40), RNG.random((20, 100))
+    grid = density.Grid((10, 10))
+    move = density.FokkerPlanck(rotating_swarm(), grid).solver(0.0, 0.1)
+    s, base = density.zero_mean_prior(grid, rank=40), RNG.random((20, 100))
     y, r = RNG.random((20, 100)), 0.1 + RNG.random((20, 100))
     r[3], r[4, 50:] = np.inf, np.inf
     for q in (None, s):
-        start = low_rank_moved(low_rank_start(s, base), move, process=q, dt=0.1)
-        many = low_rank_step(start, y, r, 0.1)
-        huge = low_rank_step(start, y, np.minimum(r, 1e15), 0.1)
+        start = density.low_rank_moved(density.low_rank_start(s, base), move, process=q, dt=0.1)
+        many = density.low_rank_step(start, y, r, 0.1)
+        huge = density.low_rank_step(start, y, np.minimum(r, 1e15), 0.1)
         assert np.abs(many.estimates - huge.estimates).max() < 1e-12
         assert np.array_equal(many.estimates[3], start.estimates[3])
         for i in (0, 4, 19):
-            one = _stepped(low_rank_start(s, base[i : i + 1]), move, y[i], r[i], 0.1, q)
+            one = _stepped(density.low_rank_start(s, base[i : i + 1]), move, y[i], r[i], 0.1, q)
             assert np.abs(one.estimates[0] - many.estimates[i]).max() < 1e-12
             assert np.abs(one.variances[0] - many.variances[i]).max() < 1e-12
 
 
 def test_what_is_out_of_scale_is_named() -> None:
-    start, ones = low_rank_start(np.eye(36)[:, :9], np.ones((1, 36))), np.ones(36)
+    start, ones = density.low_rank_start(np.eye(36)[:, :9], np.ones((1, 36))), np.ones(36)
     with pytest.raises(np.linalg.LinAlgError, match="density filter: .* out of scale"):
-        low_rank_step(start, ones, np.where(np.arange(36) < 4, np.inf, 1.0), 1e20)
+        density.low_rank_step(start, ones, np.where(np.arange(36) < 4, np.inf, 1.0), 1e20)

@@ -11,19 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from distfilt import network
 from distfilt.filters import EnsembleFilter, GaussianFilter, ParticleFilter, TransportFilter
 from distfilt.kalman import kalman_filter
 from distfilt.models import LinearModel, simulate
-from distfilt.network import (
-    arithmetic_average,
-    average,
-    consensus_pull,
-    covariance_intersection,
-    graphs,
-    intersection,
-    naive_fusion,
-    pull,
-)
 from distfilt.sensors import Sensor, direct, stack
 from distfilt.updates import exact_draws, inflated, serial, square_root, transport
 
@@ -40,14 +31,16 @@ FAMILIES: dict[str, Callable[..., Any]] = {
     "gaussian, unscented": partial(GaussianFilter, rule="unscented"),
     "particle": partial(ParticleFilter, members=500),
     "particle, jitter": partial(ParticleFilter, members=500, jitter=0.2),
-    "ensemble, common": partial(TransportFilter, members=40, agreement=average, rejuvenation=0.1),
+    "ensemble, common": partial(TransportFilter, members=40, agreement=network.average,
+                                rejuvenation=0.1),
 }
 
 RULES = {
-    "ensemble": [partial(pull, gain=0.1), intersection, partial(intersection, rule="min_trace")],
-    "gaussian": [covariance_intersection, naive_fusion, arithmetic_average,
-                 partial(consensus_pull, gain=0.1)],
-    "common": [average, partial(average, gain=0.2)],
+    "ensemble": [partial(network.pull, gain=0.1), network.intersection,
+                 partial(network.intersection, rule="min_trace")],
+    "gaussian": [network.covariance_intersection, network.naive_fusion, network.arithmetic_average,
+                 partial(network.consensus_pull, gain=0.1)],
+    "common": [network.average, partial(network.average, gain=0.2)],
 }
 
 
@@ -108,7 +101,7 @@ def made(family: str, agents: int = 5, **options: Any) -> tuple[Any, Any]:
     if family.endswith("common") and options.get("agreement", 0) is None:
         del options["agreement"]  # one round of averaging, which is as far as readings go
     sensors = options.pop("sensors", team(agents))
-    graph = options.pop("graph", graphs.path(len(sensors)))
+    graph = options.pop("graph", network.graphs.path(len(sensors)))
     runs = options.pop("runs", ())
     f = FAMILIES[family](options.pop("model", model()), sensors, graph, **options)
     return f, f.start(PRIOR, rng=np.random.default_rng(3), runs=runs)

@@ -5,30 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from distfilt.density import (
-    Centralised,
-    DynamicAverage,
-    Flooding,
-    FokkerPlanck,
-    Grid,
-    Neighbours,
-    PIConsensus,
-    kernel_density,
-    kernel_information,
-    kernels,
-    low_rank_moved,
-    low_rank_step,
-    zero_mean_prior,
-)
+from distfilt import density
 from distfilt.filters import DensityFilter, DensityState
 from distfilt.filters.record import final_state
 from distfilt.models import rotating_swarm
 from distfilt.network import Faults, Graph, graphs
 
 SIZE, H = 12, 0.12
-GRID = Grid((10, 10))
+GRID = density.Grid((10, 10))
 SWARM = rotating_swarm("gibbs")
-MODEL = FokkerPlanck(SWARM, GRID)
+MODEL = density.FokkerPlanck(SWARM, GRID)
 START = np.random.default_rng(1).random((SIZE, 2))
 PATH = SWARM.simulate(START, np.arange(1, 9) * 0.1, rng=np.random.default_rng(2), substeps=2)
 
@@ -38,12 +24,12 @@ def make(graph: object, rule: object, **options: object) -> DensityFilter:
 
 
 RULES = {
-    "pi": PIConsensus(),
-    "pi, coefficients": PIConsensus(modes=30),
-    "pi, rate": PIConsensus(rate=True),
-    "average": DynamicAverage(modes=30),
-    "flooding": Flooding(),
-    "neighbours": Neighbours(),
+    "pi": density.PIConsensus(),
+    "pi, coefficients": density.PIConsensus(modes=30),
+    "pi, rate": density.PIConsensus(rate=True),
+    "average": density.DynamicAverage(modes=30),
+    "flooding": density.Flooding(),
+    "neighbours": density.Neighbours(),
 }
 
 
@@ -54,11 +40,11 @@ def last(f: DensityFilter, path=PATH, start: np.ndarray = START, t: float = 0.0)
     return state
 
 
-@pytest.mark.parametrize("rule", [Flooding(), Neighbours()])
+@pytest.mark.parametrize("rule", [density.Flooding(), density.Neighbours()])
 def test_complete_graph_and_equal_starts_give_the_centralised_filter(rule: object) -> None:
     """Criterion 7."""
     everyone = last(make(graphs.complete(SIZE), rule, first=np.ones(100)))
-    central = last(make(graphs.complete(SIZE), Centralised(), first=np.ones(100)))
+    central = last(make(graphs.complete(SIZE), density.Centralised(), first=np.ones(100)))
     assert np.abs(everyone.estimates - central.estimates).max() < 1e-12
     assert (everyone.counted == SIZE).all()
 
@@ -75,16 +61,16 @@ def test_nobody_reads_beyond_its_links(name: str) -> None:
 
 
 def test_coefficients_are_the_whole_density_to_truncation() -> None:
-    whole = last(make(0.5, PIConsensus()))
-    cut = last(make(0.5, PIConsensus(modes=100)))
+    whole = last(make(0.5, density.PIConsensus()))
+    cut = last(make(0.5, density.PIConsensus(modes=100)))
     assert np.abs(whole.observed - cut.observed).max() < 1e-10
     assert cut.ledger.scalars.sum() == whole.ledger.scalars.sum()
-    fewer = last(make(0.5, PIConsensus(modes=30)))
+    fewer = last(make(0.5, density.PIConsensus(modes=30)))
     assert fewer.ledger.scalars.sum() * 101 == whole.ledger.scalars.sum() * 31
 
 
 def test_flooding_knows_where_agents_were_as_many_steps_ago_as_hops() -> None:
-    state = last(make(graphs.path(SIZE), Flooding(), local=(0,)))
+    state = last(make(graphs.path(SIZE), density.Flooding(), local=(0,)))
     table = state.carried[0][0]
     # Agent 8 is eight hops from agent 0; eight steps were taken, the first with positions of then.
     for j in range(8):
@@ -92,14 +78,15 @@ def test_flooding_knows_where_agents_were_as_many_steps_ago_as_hops() -> None:
         assert np.array_equal(table[j, :2], PATH[7 - max(j - 1, 0)][j])
     assert (table[9:, 2] < 0).all() and state.counted[0] == 9
     x = np.stack([PATH[7 - max(j - 1, 0)][j] for j in range(9)])
-    assert np.abs(state.observed[0] - kernel_density(x, GRID, bandwidth=H)).max() < 1e-12
+    assert np.abs(state.observed[0] - density.kernel_density(x, GRID, bandwidth=H)).max() < 1e-12
 
 
 def test_flooding_forgets() -> None:
     path = PATH.copy()
     path[2:, 3] = path[:, 4] = np.nan
-    kept = last(make(graphs.complete(SIZE), Flooding(), local=(0,)), path)
-    gone = last(make(graphs.complete(SIZE), Flooding(forget=0.35), local=(0,)), path, t=-9.0)
+    all_ = graphs.complete(SIZE)
+    kept = last(make(all_, density.Flooding(), local=(0,)), path)
+    gone = last(make(all_, density.Flooding(forget=0.35), local=(0,)), path, t=-9.0)
     assert kept.counted[0] == SIZE - 1 and gone.counted[0] == SIZE - 2 and gone.counted[4] == 0
 
 
@@ -109,20 +96,20 @@ def test_ledger_charges_what_each_rule_sends() -> None:
     for name, numbers in wanted.items():
         ledger = last(make(graph, RULES[name])).ledger
         assert (ledger.scalars == 8 * 2 * numbers).all(), name
-    assert last(make(graph, Centralised())).ledger.scalars.sum() == 0
+    assert last(make(graph, density.Centralised())).ledger.scalars.sum() == 0
 
 
 def test_agents_that_go_are_left_out_and_their_filters_go_on() -> None:
     path = PATH.copy()
     path[4:, 5] = np.nan
-    state = last(make(graphs.complete(SIZE), Centralised(), first=np.ones(100)), path)
+    state = last(make(graphs.complete(SIZE), density.Centralised(), first=np.ones(100)), path)
     here = [i for i in range(SIZE) if i != 5]
-    assert np.abs(state.observed[0] - kernel_density(path[-1][here], GRID, bandwidth=H)).max(
-        ) < 1e-13
+    want = density.kernel_density(path[-1][here], GRID, bandwidth=H)
+    assert np.abs(state.observed[0] - want).max() < 1e-13
     assert state.parts == 1 and np.isfinite(state.estimates).all()
     assert np.trace(state.filters.information[5]) < np.trace(state.filters.information[4])
     gone = np.where(np.arange(SIZE)[:, None] == 0, np.nan, START)
-    state = last(make(graphs.complete(SIZE), DynamicAverage(modes=30)), gone[None], gone)
+    state = last(make(graphs.complete(SIZE), density.DynamicAverage(modes=30)), gone[None], gone)
     assert np.allclose(state.counted[1:], SIZE - 1)
 
 
@@ -131,7 +118,7 @@ def test_a_network_that_falls_apart_is_in_the_ledger() -> None:
     def graph(t: float, x: np.ndarray) -> Graph:
         return graphs.ring(SIZE) if t < 0.45 else Graph.from_edges(SIZE, np.zeros((0, 2)))
 
-    for rule in (Flooding(), PIConsensus(), DynamicAverage(modes=30)):
+    for rule in (density.Flooding(), density.PIConsensus(), density.DynamicAverage(modes=30)):
         f = make(graph, rule)
         run = f.run(f.start(START), np.arange(1, 9) * 0.1, PATH.swapaxes(0, 1))
         sent = run["messages"].sum("agent").values
@@ -144,13 +131,13 @@ def test_the_sum_forgets_agents_that_drop_out() -> None:
     """Equation (26) and Remark 3: after a dropout Σ(y_i - z_i) over those left decays by
     1 - α h in each step, whatever the integrators of the others held.
     """
-    f = make(graphs.ring(SIZE), PIConsensus(b=0.4), first=np.ones(100))
+    f = make(graphs.ring(SIZE), density.PIConsensus(b=0.4), first=np.ones(100))
     state, x = f.start(START), START.copy()
     for k in range(10):
         state = f.step(state, 0.1 * (k + 1), x)
     x[[2, 7]] = np.nan
     left = ~np.isnan(x).any(axis=-1)
-    z = kernels(x[left], GRID, bandwidth=H)
+    z = density.kernels(x[left], GRID, bandwidth=H)
     before = (state.carried[0][left, :100] - z).sum(axis=0)
     for k in range(10, 20):
         state = f.step(state, 0.1 * (k + 1), x)
@@ -174,15 +161,15 @@ def test_only_the_wanted_estimates_are_made() -> None:
 
 def test_directed_graphs_flood_and_average() -> None:
     one_way = Graph.from_edges(SIZE, [[i, (i - 1) % SIZE] for i in range(SIZE)], directed=True)
-    state = last(make(one_way, Flooding(), local=(3,)))
+    state = last(make(one_way, density.Flooding(), local=(3,)))
     assert (state.carried[0][3][:, 2] > 0).sum() == 9
-    averaged = last(make(one_way, DynamicAverage(modes=None)))
-    y = kernel_density(PATH[-1], GRID, bandwidth=H)
-    lossy = make(graphs.ring(SIZE), DynamicAverage(modes=None), faults=Faults(loss=0.3))
+    averaged = last(make(one_way, density.DynamicAverage(modes=None)))
+    y = density.kernel_density(PATH[-1], GRID, bandwidth=H)
+    lossy = make(graphs.ring(SIZE), density.DynamicAverage(modes=None), faults=Faults(loss=0.3))
     for rule in (averaged, last(lossy)):
         assert np.abs(rule.observed.mean(axis=0) - y).max() < 1e-12
     with pytest.raises(ValueError, match="both ways"):
-        last(make(one_way, PIConsensus()))
+        last(make(one_way, density.PIConsensus()))
 
 
 @pytest.mark.parametrize("process", [None, 0.5])
@@ -190,21 +177,22 @@ def test_directed_graphs_flood_and_average() -> None:
 def test_a_step_is_the_forms_step_with_the_noise_that_was_asked_for(
     process: float | None, noise: str
 ) -> None:
-    f = make(graphs.path(SIZE), Flooding(), local=(7, 2), noise=noise, floor=0.7, process=process)
+    options = {"noise": noise, "floor": 0.7, "process": process}
+    f = make(graphs.path(SIZE), density.Flooding(), local=(7, 2), **options)
     start = f.start(START)
     state = f.step(start, 0.1, PATH[0])
 
-    q = None if process is None else process * zero_mean_prior(GRID, rank=20)
-    moved = low_rank_moved(start.filters, MODEL.solver(0.0, 0.1), process=q, dt=0.1)
+    q = None if process is None else process * density.zero_mean_prior(GRID, rank=20)
+    moved = density.low_rank_moved(start.filters, MODEL.solver(0.0, 0.1), process=q, dt=0.1)
     level = moved.estimates if noise == "forecast" else state.observed
-    unit = kernel_information(GRID, bandwidth=H, agents=SIZE)
-    wanted = low_rank_step(moved, state.observed, unit * level.clip(0.7), 0.1)
+    unit = density.kernel_information(GRID, bandwidth=H, agents=SIZE)
+    wanted = density.low_rank_step(moved, state.observed, unit * level.clip(0.7), 0.1)
     assert np.allclose(state.estimates, wanted.estimates, rtol=1e-12)
     assert np.allclose(state.variances, wanted.variances, rtol=1e-12)
 
 
 def test_a_run_of_few_filters_records_them() -> None:
-    f = make(0.6, Flooding(), local=(2, 7))
+    f = make(0.6, density.Flooding(), local=(2, 7))
     run = f.run(f.start(START), np.arange(1, 9) * 0.1, PATH.swapaxes(0, 1))
     state = final_state(run)
     assert np.allclose(run["mean"].values[-1, [2, 7]], state.estimates)
@@ -213,30 +201,31 @@ def test_a_run_of_few_filters_records_them() -> None:
 
 
 def test_first_estimates() -> None:
-    flat = make(0.5, Flooding(), first_std=0.3).start(START)
+    flat = make(0.5, density.Flooding(), first_std=0.3).start(START)
     gap = ((GRID.centres - START[4]) ** 2).sum(axis=-1)
     assert np.allclose(flat.estimates[4], GRID.normalised(np.exp(-0.5 * gap / 0.09)))
-    own = make(0.5, Flooding(), first="observed").start(START)
-    assert np.allclose(own.estimates, kernels(START, GRID, bandwidth=H))
-    central = make(0.5, Centralised(), first="observed").start(START)
-    assert np.allclose(central.estimates[3], kernel_density(START, GRID, bandwidth=H))
+    own = make(0.5, density.Flooding(), first="observed").start(START)
+    assert np.allclose(own.estimates, density.kernels(START, GRID, bandwidth=H))
+    central = make(0.5, density.Centralised(), first="observed").start(START)
+    assert np.allclose(central.estimates[3], density.kernel_density(START, GRID, bandwidth=H))
 
 
 def test_mass_can_change_where_the_prior_says_so() -> None:
     """The constant wave's variance is mass_std squared, and R from what is seen leaks mass."""
-    f = make(0.5, Flooding(), mass_std=0.2, noise="observed")
+    f = make(0.5, density.Flooding(), mass_std=0.2, noise="observed")
     state = f.start(START)
     P = state.filters.covariance(0) * GRID.volume**2
     assert P.sum() == pytest.approx(0.04, rel=1e-9)
     assert np.abs(GRID.integral(last(f).estimates) - 1).max() > 1e-4
-    kept = last(make(0.5, Flooding(), noise="observed"))
+    kept = last(make(0.5, density.Flooding(), noise="observed"))
     assert np.abs(GRID.integral(kept.estimates) - 1).max() < 1e-12
 
 
 def test_consensus_may_start_flat() -> None:
     """(14) and Section VI at once: consensus and filter start at one flat Gaussian."""
-    f = make(0.5, PIConsensus(first_std=0.3), first_std=0.3)
+    f = make(0.5, density.PIConsensus(first_std=0.3), first_std=0.3)
     state = f.start(START)
     assert np.abs(state.carried[0][:, :100] - state.estimates).max() < 1e-14
-    assert np.array_equal(state.carried[2], make(0.5, PIConsensus()).start(START).carried[2])
+    other = make(0.5, density.PIConsensus()).start(START)
+    assert np.array_equal(state.carried[2], other.carried[2])
     assert np.abs(GRID.integral(last(f).observed) - 1).max() < 1e-12

@@ -13,17 +13,8 @@ import pytest
 import xarray
 from scipy.stats import chi2, multivariate_normal, norm
 
+from distfilt import filters
 from distfilt.density import Flooding, FokkerPlanck, Grid
-from distfilt.filters import (
-    DensityFilter,
-    EnsembleFilter,
-    GaussianFilter,
-    MixtureFilter,
-    NewsFilter,
-    ParticleFilter,
-    Reading,
-    TransportFilter,
-)
 from distfilt.filters.record import final_state
 from distfilt.mixtures import GaussianMixture, target_fusion
 from distfilt.models import LinearModel, lorenz63, rotating_swarm
@@ -37,12 +28,13 @@ NET = graphs.complete(3)
 SWARM, PLACES = rotating_swarm("gibbs"), np.random.default_rng(1).random((9, 2))
 LAW = FokkerPlanck(SWARM, Grid((9, 9)))
 SIX = {
-    "ensemble": partial(EnsembleFilter.exact, members=30, agreement=None),
-    "gaussian": GaussianFilter,
-    "particle": partial(ParticleFilter, members=300),
-    "transport": partial(TransportFilter, members=30),
-    "mixture": partial(MixtureFilter, target_dim=2, agreement=partial(target_fusion, target_dim=2)),
-    "news": partial(NewsFilter, target_dim=2),
+    "ensemble": partial(filters.EnsembleFilter.exact, members=30, agreement=None),
+    "gaussian": filters.GaussianFilter,
+    "particle": partial(filters.ParticleFilter, members=300),
+    "transport": partial(filters.TransportFilter, members=30),
+    "mixture": partial(filters.MixtureFilter, target_dim=2,
+                       agreement=partial(target_fusion, target_dim=2)),
+    "news": partial(filters.NewsFilter, target_dim=2),
 }
 EACH = pytest.mark.parametrize("family", [*SIX, "density"])
 OF_SIX = pytest.mark.parametrize("family", SIX)
@@ -53,7 +45,7 @@ def made(family: str, times: Any = TIMES, **options: Any) -> tuple[Any, Any, Any
     if family == "density":
         path = SWARM.simulate(PLACES, times, rng=np.random.default_rng(2), substeps=2)
         given = {"agreement": Flooding(), "bandwidth": 0.15, "rank": 20} | options
-        f: Any = DensityFilter(LAW, 9, given.pop("graph", 0.5), **given)
+        f: Any = filters.DensityFilter(LAW, 9, given.pop("graph", 0.5), **given)
         return f, f.start(PLACES), path.swapaxes(0, 1), LAW.evolve(np.ones(81), times)
     truth, seen = data(options.get("sensors", EYES))
     given = {"graph": NET, "sensors": EYES} | options
@@ -93,7 +85,8 @@ def test_a_run_is_its_steps_whether_saved_or_not(family: str, tmp_path: Path) ->
 @OF_SIX
 def test_events_of_any_order_are_the_series(family: str) -> None:
     f, start, seen, _ = made(family)
-    events = [Reading(t, a, y) for a, s in enumerate(seen) for t, y in zip(TIMES, s, strict=True)]
+    pairs = [(a, *pair) for a, s in enumerate(seen) for pair in zip(TIMES, s, strict=True)]
+    events = [filters.Reading(t, a, y) for a, t, y in pairs]
     mixed = [events[k] for k in np.random.default_rng(0).permutation(len(events))]
     a, b = f.run(start, TIMES, seen), f.run(start, None, mixed)
     xarray.testing.assert_equal(a, b)
@@ -180,11 +173,11 @@ def test_each_reading_is_judged_alone() -> None:
     run = f.run(start, [0.1], [[good], [wild], None])
     assert run["refused"].values.tolist() == [[1, 1, 1]]
     f, start, _, _ = made("gaussian", gate=0.999, lag=1)
-    blind, late = f.step(start, 0.1, [None] * 3), Reading(0.1, 0, [40.0])
+    blind, late = f.step(start, 0.1, [None] * 3), filters.Reading(0.1, 0, [40.0])
     assert f.step(blind, 0.4, [None, wild, None], late=[late]).refused.tolist() == [2, 2, 2]
     still = LinearModel.from_transition(1, lambda h: np.eye(1), lambda t, h: np.zeros((1, 1)))
     bowl = Sensor(1, np.square, [[0.5]])  # of N(0, 1): mean 1, variance 1 by the points, slope 0
-    f = GaussianFilter(still, [bowl], rule="unscented", gate=0.95)
+    f = filters.GaussianFilter(still, [bowl], rule="unscented", gate=0.95)
     edge, start = np.sqrt(1.5 * chi2.ppf(0.95, 1)), f.start((np.zeros(1), np.eye(1)))
     assert f.start(norm(1.0, 3.0)).covariances[0, 0, 0] == 9.0
     refused = [f.step(start, 1.0, [[1 + k * edge]]).refused.tolist() for k in (0.97, 1.03)]
@@ -198,8 +191,8 @@ def test_nothing_is_lost_until_the_next_contact(family: str, t0: float) -> None:
     quiet = LinearModel.from_transition(2, model().transition_matrix, lambda t, dt: 0 * Q)
     lag = {"lag": 8} if family == "gaussian" else {}
     f = SIX[family](quiet, EYES, NET, every=0.2, **lag)
-    g = GaussianFilter(quiet, EYES, NET)
-    own = GaussianFilter(quiet, EYES, NET, share=False)
+    g = filters.GaussianFilter(quiet, EYES, NET)
+    own = filters.GaussianFilter(quiet, EYES, NET, share=False)
     seen = [s[:5] for s in data(EYES)[1]]
     # Multiples of .2 lie in the third step and, rounded, in the fourth, which is once.
     times = t0 + np.array([0.1, 0.15, 0.5, 0.6, 0.65])
@@ -220,9 +213,9 @@ def test_what_was_heard_is_not_told_as_one_s_own() -> None:
     """Agent 0 hears agent 1 at first, and is heard by nobody; then all hear all."""
     quiet = LinearModel.from_transition(2, model().transition_matrix, lambda t, dt: 0 * Q)
     one_way, (_, seen) = Graph.from_edges(3, [(0, 1)], directed=True), data(EYES)
-    f = NewsFilter(quiet, EYES, lambda t: NET if t > 0.95 else one_way, target_dim=2)
+    f = filters.NewsFilter(quiet, EYES, lambda t: NET if t > 0.95 else one_way, target_dim=2)
     found, wanted = (h.run(h.start(PRIOR), TIMES[:4], [s[:4] for s in seen])["covariance"][-1, :2]
-                     for h in (f, GaussianFilter(quiet, EYES, NET)))
+                     for h in (f, filters.GaussianFilter(quiet, EYES, NET)))
     assert np.allclose(found, wanted, atol=1e-9)
 
 
@@ -285,9 +278,9 @@ def test_a_state_and_a_reading_of_another_are_refused() -> None:
         f.step(made("particle")[1], 0.1, seen)
     g, other, _, _ = made("ensemble")
     with pytest.raises(ValueError, match="state: needs sizes"):
-        g.step(EnsembleFilter(model(), EYES, NET, members=7).start(
+        g.step(filters.EnsembleFilter(model(), EYES, NET, members=7).start(
             PRIOR, rng=np.random.default_rng(0)), 0.1, [None] * 3)  # fmt: skip
-    for reading in (Reading(0.1, 1, [0.3]), Reading(0.2, 0, [0.3])):
+    for reading in (filters.Reading(0.1, 1, [0.3]), filters.Reading(0.2, 0, [0.3])):
         with pytest.raises(ValueError, match=r"observations\[0\]: needs a Reading of agent 0 at"):
             f.step(start, 0.1, [reading, None, None])
 
@@ -301,34 +294,34 @@ def test_a_prior_of_any_kind() -> None:
         assert np.allclose(state.means, PRIOR[0]) and np.allclose(state.covariances, PRIOR[1])
     assert np.allclose(f.start(members).covariances, np.cov(members.T))
     flat = (PRIOR[0], np.diag([1.0, 0.0]))
-    unscented = GaussianFilter(model(), EYES, NET, rule="unscented")
+    unscented = filters.GaussianFilter(model(), EYES, NET, rule="unscented")
     for g, wrong, text in ((f, lambda n, rng, leading: None, "got a function"),
                            (f, ([0.0, 0.0], [1.0, 1.0]), r"a covariance of .*, got \(2,\)"),
                            (unscented, flat, "definite"), (made("mixture")[0], flat, "definite")):
         with pytest.raises(ValueError, match=f"prior: needs .*{text}"):
             g.start(wrong)
     rng = np.random.default_rng(1)
-    e = EnsembleFilter(model(), EYES, NET, members=4000)
+    e = filters.EnsembleFilter(model(), EYES, NET, members=4000)
     with pytest.raises(ValueError, match=r"prior: needs shape \(3, 4000, 2\), got \(3, 4000, 3\)"):
         e.start(multivariate_normal(np.zeros(3)), rng=rng)
     two = GaussianMixture([0.5, 0.5], [[-3.0, 0.0], [3.0, 0.0]], [np.eye(2)] * 2)
     for prior, cov in ((PRIOR, PRIOR[1]), (frozen, PRIOR[1]), (two, two.cov)):
         x = e.start(prior, rng=rng, runs=(2,)).ensembles
         assert x.shape == (2, 3, 4000, 2) and np.allclose(np.cov(x[1, 2].T), cov, atol=0.5)
-    m = MixtureFilter(model(), EYES, target_dim=2)
+    m = filters.MixtureFilter(model(), EYES, target_dim=2)
     begun = m.start([PRIOR, frozen, two]).mixtures
     assert [b.size for b in begun] == [1, 1, 2]
 
 
 def test_degrees_are_told() -> None:
-    f = GaussianFilter(model(), [angle([0, 1], std=0.1), None, None], NET)
+    f = filters.GaussianFilter(model(), [angle([0, 1], std=0.1), None, None], NET)
     with pytest.warns(RuntimeWarning, match=r"^observations\[0\]: .* rad, got some 14 turns"):
         f.run(f.start(PRIOR), [1.0], [np.array([[89.6]]), None, None])
 
 
 def test_the_extended_filter_bears_its_own_rounding() -> None:
     chaos = lorenz63()
-    f = GaussianFilter(chaos, [direct([0, 1, 2], std=1.0)])
+    f = filters.GaussianFilter(chaos, [direct([0, 1, 2], std=1.0)])
     times = np.arange(1, 401) * 0.01
     start = [1.0, 1.0, 20.0]
     truth = np.array(list(accumulate(times, lambda x, _: chaos.step(x, 0.0, 0.01), initial=start)))
@@ -337,20 +330,20 @@ def test_the_extended_filter_bears_its_own_rounding() -> None:
 
 
 def test_inflation_widens_the_forecast_and_goes_with_fusion_and_the_past() -> None:
-    wide = GaussianFilter(model(), EYES, NET, inflation=1.3, lag=2)
-    plain = GaussianFilter(model(), EYES, NET, lag=2)
+    wide = filters.GaussianFilter(model(), EYES, NET, inflation=1.3, lag=2)
+    plain = filters.GaussianFilter(model(), EYES, NET, lag=2)
     with pytest.raises(ValueError, match="^inflation: needs a number at least 0.5, got 0.05"):
-        GaussianFilter(model(), EYES, NET, inflation=0.05)
+        filters.GaussianFilter(model(), EYES, NET, inflation=0.05)
     a, b = (f.step(f.start(PRIOR), 0.5, [None] * 3) for f in (wide, plain))
     assert np.allclose(a.covariances, 1.69 * b.covariances)
     assert np.allclose(a.joint_covariances[..., :2, 2:], 1.3 * b.joint_covariances[..., :2, 2:])
     assert np.allclose(a.joint_covariances[..., 2:, 2:], b.joint_covariances[..., 2:, 2:])
-    f = GaussianFilter(model(), EYES, NET, inflation=1.3, agreement=covariance_intersection)
+    f = filters.GaussianFilter(model(), EYES, NET, inflation=1.3, agreement=covariance_intersection)
     c = f.step(f.start(PRIOR), 0.5, [None] * 3)
     assert np.allclose(c.covariances, a.covariances)
     # What is agreed of now tells of the past as much as its regression on now says.
     c, b = (f.step(f.start(PRIOR), 0.5, [[0.3], [0.2, 0.4], [0.9]]) for f in (
-        GaussianFilter(model(), EYES, NET, lag=1, share=False, agreement=rule)
+        filters.GaussianFilter(model(), EYES, NET, lag=1, share=False, agreement=rule)
         for rule in (covariance_intersection, None)))
     p, alone, gap = c.joint_covariances, b.joint_covariances, c.joint_means - b.joint_means
     fused = covariance_intersection((b.means, b.covariances), Channel(NET))

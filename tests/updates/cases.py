@@ -6,22 +6,8 @@ from functools import partial
 
 import numpy as np
 
+from distfilt import updates
 from distfilt.coupling import Constraint
-from distfilt.updates import (
-    augmented,
-    ensemble_transform,
-    exact_draws,
-    inflated,
-    known_noise,
-    localised,
-    principal_components,
-    projected,
-    retracted,
-    sampled_noise,
-    serial,
-    square_root,
-    transport,
-)
 
 H = np.array([[1.0, 0.0, 0.5], [0.0, 2.0, -1.0]])
 R = np.array([[0.5, 0.3], [0.3, 0.9]])
@@ -34,26 +20,26 @@ PLANE = Constraint(
     derivative=lambda x: np.full((*x.shape[:-1], 1, x.shape[-1]), 0.5),
 )  # fmt: skip
 """A plane near the prior's mean, for any number of components."""
-FRESH = partial(ensemble_transform, rejuvenation=0.1)
+FRESH = partial(updates.ensemble_transform, rejuvenation=0.1)
 
 UPDATES = {
-    "sampled_noise": sampled_noise,
-    "known_noise": known_noise,
-    "exact_draws": exact_draws,
-    "square_root": square_root,
-    "transport": transport,
-    "principal_components": partial(principal_components, n_state=2, n_observed=2),
-    "inflated": inflated(known_noise, factor=1.1),
-    "serial": serial(known_noise),
-    "localised": localised(
-        known_noise, places=np.zeros((3, 1)), readings=np.zeros((2, 1)), radius=9.0
+    "sampled_noise": updates.sampled_noise,
+    "known_noise": updates.known_noise,
+    "exact_draws": updates.exact_draws,
+    "square_root": updates.square_root,
+    "transport": updates.transport,
+    "principal_components": partial(updates.principal_components, n_state=2, n_observed=2),
+    "inflated": updates.inflated(updates.known_noise, factor=1.1),
+    "serial": updates.serial(updates.known_noise),
+    "localised": updates.localised(
+        updates.known_noise, places=np.zeros((3, 1)), readings=np.zeros((2, 1)), radius=9.0
     ),
-    "inflated serial": inflated(serial(square_root), factor=1.01),
+    "inflated serial": updates.inflated(updates.serial(updates.square_root), factor=1.01),
     "ensemble_transform": FRESH,
     "ensemble_transform, corrected": partial(FRESH, correct=True),
-    "augmented": augmented(known_noise, PLANE, std=0.5),
-    "projected": projected(known_noise, PLANE),
-    "retracted": retracted(known_noise, PLANE),
+    "augmented": updates.augmented(updates.known_noise, PLANE, std=0.5),
+    "projected": updates.projected(updates.known_noise, PLANE),
+    "retracted": updates.retracted(updates.known_noise, PLANE),
 }
 
 def rng(seed: int = 1) -> np.random.Generator:

@@ -21,7 +21,7 @@ def test_sampled_and_known_noise_by_their_formulas() -> None:
         gain = joint[:3, 3:] @ np.linalg.inv(joint[3:, 3:] + noise)
         out = update(x, x @ H.T, Y, R, rng=np.random.default_rng(3))
         assert np.allclose(out, x + (Y - seen) @ gain.T, atol=1e-12)
-    zeta = np.sqrt(40 / 39) * (zeta - zeta.mean(axis=0))
+    zeta -= zeta.mean(axis=0)
     centred = known_noise(x, x @ H.T, Y, R, rng=np.random.default_rng(3), centred=True)
     assert np.allclose(centred, x + (Y - x @ H.T - zeta) @ gain.T, atol=1e-12)
 

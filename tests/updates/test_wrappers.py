@@ -9,37 +9,24 @@ from typing import Any
 import numpy as np
 import pytest
 
+from distfilt import updates
 from distfilt.coupling import norm, project, retract
 from distfilt.doors import unchecked
 from distfilt.models import Model
-from distfilt.updates import (
-    augmented,
-    ensemble_transform,
-    exact_draws,
-    inflated,
-    known_noise,
-    localised,
-    projected,
-    retracted,
-    sampled_forecast,
-    serial,
-    square_root,
-    with_missing,
-)
 from distfilt.updates.door import Update, says
 from distfilt.updates.gaussian import exact_forecast
 from distfilt.updates.wrappers import gaspari_cohn
 
 from .cases import UPDATES, H, R, Y, kalman, members, moments, rng
 
-ROOT = partial(square_root, rotation="none")
+ROOT = partial(updates.square_root, rotation="none")
 """An update that draws nothing."""
 
 
 def test_inflation_multiplies_anomalies_only() -> None:
     x = members(30)
-    plain = known_noise(x, x @ H.T, Y, R, rng=rng())
-    wide = inflated(known_noise, factor=1.3)(x, x @ H.T, Y, R, rng=rng())
+    plain = updates.known_noise(x, x @ H.T, Y, R, rng=rng())
+    wide = updates.inflated(updates.known_noise, factor=1.3)(x, x @ H.T, Y, R, rng=rng())
     centre = plain.mean(axis=0)
     assert np.allclose(wide, centre + 1.3 * (plain - centre), atol=1e-12)
 
@@ -51,14 +38,14 @@ def test_missing_and_unpredicted_readings_are_deleted_rows() -> None:
     blind, gap = h.copy(), y.copy()
     blind[3, 1], gap[1] = np.nan, np.nan
     for seen, told in ((h, gap), (blind, y)):
-        out = with_missing(ROOT, x, seen, told, noise, rng=rng())
+        out = updates.with_missing(ROOT, x, seen, told, noise, rng=rng())
         assert np.allclose(out, wanted, atol=1e-12)
 
 
 def test_serial_without_a_sensor_is_exact_for_linear_readings() -> None:
     x = members(20, 2)  # of two agents, whose readings' errors may go together for one
     for noise in (np.diag([0.5, 0.9]) * [[[1.0]], [[2.0]]], np.stack([np.diag([0.5, 0.9]), R])):
-        out = serial(exact_draws)(x, x @ H.T, [Y, Y], noise, rng=rng())
+        out = updates.serial(updates.exact_draws)(x, x @ H.T, [Y, Y], noise, rng=rng())
         for own, r, after in zip(x, noise, out, strict=True):
             mean, cov = kalman(*moments(own), H, r, Y)
             assert np.allclose(after.mean(axis=0), mean, atol=1e-12)
@@ -72,11 +59,11 @@ def test_serial_predicts_again() -> None:
 
     x, y = members(30), np.array([1.5, 3.0])
     four = x, both(x), y, np.diag([0.5, 0.9])
-    out = serial(ROOT)(*four, rng=rng(), predict=both)
+    out = updates.serial(ROOT)(*four, rng=rng(), predict=both)
     first = ROOT(x, both(x)[:, :1], y[:1], [[0.5]], rng=rng())
     second = ROOT(first, both(first)[:, 1:], y[1:], [[0.9]], rng=rng())
     assert np.allclose(out, second, atol=1e-13)
-    assert np.abs(serial(ROOT)(*four, rng=rng()) - out).max() > 1e-3
+    assert np.abs(updates.serial(ROOT)(*four, rng=rng()) - out).max() > 1e-3
 
 
 @pytest.mark.parametrize("name", UPDATES)
@@ -84,28 +71,28 @@ def test_missing_readings_of_a_stack_with_noise_of_its_own(name: str) -> None:
     x = members(30, 3)
     noise = np.stack([R, 2 * R, 3 * R])
     y = np.stack([Y, [Y[0], np.nan], [np.nan, np.nan]])
-    out = with_missing(UPDATES[name], x, x @ H.T, y, noise, rng=rng())
-    full = with_missing(UPDATES[name], x, x @ H.T, np.stack([Y] * 3), noise, rng=rng())
+    out = updates.with_missing(UPDATES[name], x, x @ H.T, y, noise, rng=rng())
+    full = updates.with_missing(UPDATES[name], x, x @ H.T, np.stack([Y] * 3), noise, rng=rng())
     assert (out[2] == x[2]).all() and (out[1] != x[1]).any()
     # What the others miss is no business of the first one's draws.
     assert np.allclose(out[0], full[0], rtol=0, atol=1e-12)
-    turned = with_missing(UPDATES[name], x, x @ H.T, y[[1, 0, 2]], noise, rng=rng())
+    turned = updates.with_missing(UPDATES[name], x, x @ H.T, y[[1, 0, 2]], noise, rng=rng())
     assert np.allclose(turned[1], full[1], rtol=0, atol=1e-12)
 
 
 def test_partial_options_survive_the_open_door() -> None:
-    turned = partial(square_root, rotation="none")
+    turned = partial(updates.square_root, rotation="none")
     x = members(20)
     given = (x, x @ H.T, Y, R)
     assert np.array_equal(unchecked(turned)(*given, rng=rng()), turned(*given, rng=rng()))
     assert says(turned, "stacks") and not says(partial(print, 3), "stacks")
-    assert not says(inflated(lambda x, h, y, r, *, rng: x, factor=1.0), "stacks")
+    assert not says(updates.inflated(lambda x, h, y, r, *, rng: x, factor=1.0), "stacks")
     with pytest.raises(ValueError, match="rotation"):
-        inflated(partial(square_root, rotation="left"), factor=1.0)
+        updates.inflated(partial(updates.square_root, rotation="left"), factor=1.0)
     with pytest.raises(ValueError, match="^factor: needs a number at least 0.5, got 0.05"):
-        inflated(square_root, factor=0.05)
+        updates.inflated(updates.square_root, factor=0.05)
     with pytest.raises(TypeError, match="exact_draws.* missing 4 required"):
-        exact_draws()
+        updates.exact_draws()
 
 
 def test_exact_forecast_adds_q_exactly() -> None:
@@ -120,7 +107,7 @@ def test_exact_forecast_adds_q_exactly() -> None:
     x[1, 0] = 99.0  # an ensemble that is lost takes no bit of the others' noise with it
     lost = exact_forecast(x, bent, 0.0, 0.5, rng=rng())
     assert np.array_equal(lost[::2], out[::2]) and np.isnan(lost[1]).all()
-    plain = sampled_forecast(members(100_000)[:, :2], model, 0.0, 0.5, rng=rng())
+    plain = updates.sampled_forecast(members(100_000)[:, :2], model, 0.0, 0.5, rng=rng())
     wanted = phi @ np.cov(members(100_000)[:, :2].T) @ phi.T + 0.5 * q
     assert np.allclose(np.cov(plain.T), wanted, atol=0.03)
 
@@ -128,7 +115,8 @@ CIRCLE = norm([0, 1], length=1.2)
 NOISE = np.array([[0.02, 0.005], [0.005, 0.03]])
 SEEN = np.array([0.9, 0.7])
 MOTION = ([0, 1], [2, 3])
-INNER = pytest.mark.parametrize("inner", [ensemble_transform, known_noise, square_root])
+INNERS = [updates.ensemble_transform, updates.known_noise, updates.square_root]
+INNER = pytest.mark.parametrize("inner", INNERS)
 
 
 def swings(*leading: int) -> np.ndarray:
@@ -142,10 +130,10 @@ def test_projection_and_retraction_follow_the_update(inner: Update) -> None:
     four = x, x[..., :2], y, NOISE
     plain = inner(*four, rng=rng())
     how: Any = {"reading": "particle", "regularisation": 0.01}
-    out = projected(inner, CIRCLE, **how)(*four, rng=rng())
+    out = updates.projected(inner, CIRCLE, **how)(*four, rng=rng())
     assert np.allclose(out, project(plain, CIRCLE, **how), atol=1e-14)
     assert np.abs(out - plain).max() > 1e-3
-    out = retracted(inner, CIRCLE, motion=MOTION)(*four, rng=rng())
+    out = updates.retracted(inner, CIRCLE, motion=MOTION)(*four, rng=rng())
     assert np.allclose(out, retract(plain, CIRCLE, motion=MOTION), atol=1e-14)
     assert np.abs(np.hypot(out[..., 0], out[..., 1]) - 1.2).max() <= 1e-14
 
@@ -157,7 +145,7 @@ def test_augmentation_is_one_more_reading(inner: Update) -> None:
     noise = np.zeros((3, 3))
     noise[:2, :2], noise[2, 2] = NOISE, 0.2**2
     expected = inner(x, both, [*SEEN, 1.44], noise, rng=rng())
-    out = augmented(inner, CIRCLE, std=0.2)(x, x[:, :2], SEEN, NOISE, rng=rng())
+    out = updates.augmented(inner, CIRCLE, std=0.2)(x, x[:, :2], SEEN, NOISE, rng=rng())
     assert np.allclose(out, expected, atol=1e-12)
 
 
@@ -183,9 +171,9 @@ def test_one_reading_localised_is_the_update_with_a_tapered_gain() -> None:
     gain = np.cov(x.T)[:, 0] / (np.cov(x.T)[0, 0] + 0.5) * share
 
     def seeded(*four: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        return known_noise(*four, rng=np.random.default_rng(3))
+        return updates.known_noise(*four, rng=np.random.default_rng(3))
 
-    near = localised(seeded, places=places, readings=at, radius=2.0)
+    near = updates.localised(seeded, places=places, readings=at, radius=2.0)
     out = near(x, x[:, :1], [1.0], [[0.5]], rng=rng())
     assert np.allclose(out, x + (1.0 - x[:, :1] - zeta) * gain, atol=1e-12)
     assert (out[:, 2] == x[:, 2]).all()
@@ -198,7 +186,7 @@ def test_readings_on_a_ring_localised_one_after_the_other(given: dict[str, Any])
     """
     x, y = members(20), np.array([1.0, -0.5])
     places = [[0.0], [1.5], [7.0]]
-    near = partial(localised, ROOT, places=places, radius=2.0, period=8.0)
+    near = partial(updates.localised, ROOT, places=places, radius=2.0, period=8.0)
     out = near(readings=[[0.0], [7.0]])(x, x[:, [0, 2]], y, np.diag([0.5, 0.9]), rng=rng(), **given)
     first = near(readings=[[0.0]])(x, x[:, :1], y[:1], [[0.5]], rng=rng())
     second = near(readings=[[7.0]])(first, first[:, 2:], y[1:], [[0.9]], rng=rng())
