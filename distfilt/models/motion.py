@@ -58,17 +58,17 @@ def constant_velocity(
     )
 
 
-@lru_cache(maxsize=64)
 def _straight(dt: float, axes: int) -> Array:
-    return _along_axes(np.array([[1.0, dt], [0.0, 1.0]]), axes)
+    return _along_axes(((1.0, dt), (0.0, 1.0)), axes)
 
 
 def _straight_noise(t: float, dt: float, sigma: float, axes: int) -> Array:
-    block = np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-    return _along_axes(sigma**2 * block, axes)
+    both, q = dt**2 / 2, sigma**2
+    return _along_axes(((q * (dt**3 / 3), q * both), (q * both, q * dt)), axes)
 
 
-def _along_axes(block: Array, axes: int) -> Array:
+@lru_cache(maxsize=64)
+def _along_axes(block: tuple[tuple[float, float], ...], axes: int) -> Array:
     """A block for each axis, read-only, since the same few are asked for in every step."""
     out = np.asarray(np.kron(block, np.eye(axes)), dtype=np.float64)
     out.setflags(write=False)
