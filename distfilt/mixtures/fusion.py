@@ -147,7 +147,8 @@ class PartialFusion(Record):
         ----------
         terms : {"matched", "all"}
             Terms in which own mixand and divided mixand are the same, L L' of them, all positive
-            definite; or all L² L', of which some are not and are left out.
+            definite (in floating point while what is heard is less than a million times as sharp);
+            or all L² L', of which some are not. Those are left out, and `dropped` counts them.
         marginal : GaussianMixture, optional
             What to divide by in place of the own target marginal (a reduced one); with
             ``terms="all"``.

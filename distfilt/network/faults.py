@@ -101,7 +101,7 @@ class Faults(Record):
         return replace(self, also=(*self.also, *other._all()))
 
     def _all(self) -> tuple[Faults, ...]:
-        return (self.changed(also=()) if self.also else self, *(x for f in self.also for x in f._all()))
+        return (self.changed(also=()), *(x for f in self.also for x in f._all()))
 
     def check(self, graph: Graph) -> None:
         """Refuse a graph whose agents do not fit."""
