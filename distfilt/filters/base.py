@@ -11,7 +11,6 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, fields
 from functools import cached_property
-from operator import attrgetter
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -74,7 +73,8 @@ class Filter(Record, ABC):
     A family of one's own is a dataclass that derives from this, names the kind of its `state`, and
     has three methods: `begin` gives the fields of the first state, `advance` makes the next one of
     a :class:`Step`, `summary` tells what is believed. `draws` says that steps need a generator,
-    `fuses` what its agreements fuse, and `unused` why options that it cannot have are refused.
+    `joins` that several states can be told as one with an axis more, `fuses` what its agreements
+    fuse, and `unused` why options that it cannot have are refused.
     """
 
     model: Model
@@ -93,6 +93,7 @@ class Filter(Record, ABC):
     state: ClassVar[type[Any]] = State
     draws: ClassVar[bool] = False
     batched: ClassVar[bool] = True
+    joins: ClassVar[bool] = False
     changes: ClassVar[bool] = False
     fuses: ClassVar[str | None] = None
     unused: ClassVar[Mapping[str, str]] = {}
@@ -175,10 +176,6 @@ class Filter(Record, ABC):
     @abstractmethod
     def summary(self, state: Any) -> Summary:
         """Estimates and spreads of a state."""
-
-    def past(self, state: Any) -> tuple[tuple[float, Summary], ...]:
-        """Earlier times that the state keeps, oldest first, and what is believed of them by now."""
-        return tuple((then.t, self.summary(then)) for then in getattr(state, "earlier", ()))
 
     @door
     def start(
@@ -276,14 +273,12 @@ class Filter(Record, ABC):
         for item in late:
             if item.arrived is None or item.arrived > last:
                 raise ValueError(f"late: needs arrivals up to {last:g}, got {item.arrived}")
-        arrival = attrgetter("arrived")
-        waiting = sorted(late, key=arrival)
-        mine = False
-        for t, observed in zip(grid.tolist(), entries, strict=True):
-            due = [item for item in waiting if arrival(item) <= t] if waiting else waiting
+        waiting: list[Any] = sorted(late, key=lambda item: item.arrived or 0.0)
+        for k, (t, observed) in enumerate(zip(grid.tolist(), entries, strict=True)):
+            due = [item for item in waiting if item.arrived <= t] if waiting else waiting
             waiting = waiting[len(due) :]
-            state = self._advanced(state, t, observed, due, own=mine)
-            mine = own
+            # The first state is the caller's.
+            state = self._advanced(state, t, observed, due, own=own and k > 0)
             yield state
 
     def _recorded(
@@ -296,17 +291,15 @@ class Filter(Record, ABC):
         walk = self._walk(state, grid, entries, late, own=True)
         return recorded(self, grid, state, self._believed(walk, lag), truth, scores)
 
-    def _believed(self, walk: Iterable[Any], lag: int) -> Iterator[tuple[Any, Summary]]:
-        """Each state of a walk, and what is believed of it when `lag` more have followed."""
+    def _believed(self, walk: Iterable[Any], lag: int) -> Iterator[tuple[Any, Any]]:
+        """Each state of a walk, and as what it is believed when `lag` more have followed."""
         waiting: list[Any] = []
         for last in walk:
             waiting.append(last)
             if len(waiting) > lag:
-                summary = self.past(last)[-lag][1] if lag else self.summary(last)
-                yield waiting.pop(0), summary
+                yield waiting.pop(0), last.earlier[-lag] if lag else last
         if waiting:
-            past = [summary for _, summary in self.past(last)]
-            yield from zip(waiting, [*past, self.summary(last)][-len(waiting) :], strict=True)
+            yield from zip(waiting, [*last.earlier, last][-len(waiting) :], strict=True)
 
     @door
     def steps(

@@ -73,6 +73,7 @@ class MembersFilter(Filter):
 
     state: ClassVar[type[SensorState]] = EnsembleState
     draws: ClassVar[bool] = True
+    joins: ClassVar[bool] = True
     changes: ClassVar[bool] = True
     fuses: ClassVar[str] = "ensembles"
 
@@ -217,9 +218,7 @@ class EnsembleFilter(MembersFilter):
             e[..., rows, :, :] = new
         return errors
 
-    def _updated(
-        self, x: Array, h: Array, y: Array, noise: Array, rng: Any, predict: Any
-    ) -> Array:
+    def _updated(self, x: Array, h: Array, y: Array, noise: Array, rng: Any, predict: Any) -> Array:
         """One time's ensembles after the update; a plain function gets one agent's at a time."""
         if says(self.update, "repredicts"):
             return unchecked(self.update)(x, h, y, noise, rng=rng, predict=predict)

@@ -121,6 +121,7 @@ class GaussianFilter(Filter):
     inflation: Annotated[float, Bounds(at_least=0.5)] = 1.0
 
     state: ClassVar[type[GaussianState]] = GaussianState
+    joins: ClassVar[bool] = True
     fuses: ClassVar[str] = "gaussians"
 
     def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:

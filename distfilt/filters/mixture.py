@@ -132,9 +132,11 @@ class MixtureFilter(Filter):
         """Split and forecast, condition on the own readings, exchange, fuse, reduce."""
         beliefs = [self._moved(b, k, step) for k, b in enumerate(step.state.mixtures)]
         after, untold = self._told(beliefs, step)
-        plain = [None if b is None else self._reduced(b) for b in (*after, *untold)]
-        size = len(after)
-        return step.end(mixtures=tuple(plain[:size]), untold=tuple(plain[size:]))
+        # Without the square roots that they came with: a loaded state has none.
+        size, exact, agents = self.size, max(_EXACT, self.size), len(after)
+        plain = [None if b is None else unchecked(runnalls)(b, size, heaviest=exact).changed()
+                 for b in (*after, *untold)]  # fmt: skip
+        return step.end(mixtures=tuple(plain[:agents]), untold=tuple(plain[agents:]))
 
     def summary(self, state: MixtureState) -> Summary:
         """Means, variances and covariances of the whole mixtures, and their sizes."""
@@ -158,13 +160,6 @@ class MixtureFilter(Filter):
                 )
             root = unchecked(model.root)(t, dt)
             return moved(belief, lambda x: flow(x, t, dt), root)
-
-    def _reduced(self, belief: GaussianMixture) -> GaussianMixture:
-        """So many mixands as are kept, without the square roots that they came with.
-
-        A loaded state has none, and has to go on alike.
-        """
-        return unchecked(runnalls)(belief, self.size, heaviest=max(_EXACT, self.size)).changed()
 
     def _read(
         self, belief: Any, agent: int, said: Sequence[Reading], step: Step, beside: Any = None
@@ -196,8 +191,7 @@ class MixtureFilter(Filter):
 
     def _agreed(self, beliefs: list[GaussianMixture], step: Step) -> list[GaussianMixture]:
         """What the rule of agreement makes of the beliefs."""
-        assert self.agreement is not None
-        out = list(self.agreement(beliefs, step.channel))
+        out = list(step.filter.agreement(beliefs, step.channel))
         for k, (fused, belief) in enumerate(zip(out, beliefs, strict=True)):
             if not isinstance(fused, GaussianMixture) or fused.dim != belief.dim:
                 got = fused.dim if isinstance(fused, GaussianMixture) else type(fused).__name__

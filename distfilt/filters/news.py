@@ -156,7 +156,6 @@ class NewsFilter(MixtureFilter):
     ) -> None:
         """Tell what was learned to those who listen, and learn from them, in place."""
         channel, part = step.channel, range(self.target_dim)
-        assert channel is not None
         said: list[Array | None] = [None] * len(after)
         # Whose radio is off tells later, and so does one whom nobody could hear.
         on = channel.faults.speaking(channel.graph, channel.ledger.rounds, channel.t)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+import math
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby, islice
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -12,7 +14,7 @@ from ..doors import Array, array, unchecked
 from ..ensembles import sample_covariance
 from ..linalg import cholesky, in_units, quadratic_form
 from ..metrics import crps, gaussian_crps
-from .saving import State
+from .saving import State, joined
 
 if TYPE_CHECKING:
     import xarray
@@ -22,6 +24,9 @@ __all__ = ["SCORES", "Score", "Summary", "final_state", "recorded"]
 Score = Literal["squared_error", "nees", "crps"]
 SCORES: tuple[Score, ...] = ("squared_error", "nees", "crps")
 """What can be recorded beside a known truth."""
+
+_BLOCK = 4096
+"""Up to how many numbers the states have whose summaries are made together."""
 
 _SENT = ("messages", "scalars", "bytes", "lost", "rounds")
 _WHEN = ("in this step", "so far")
@@ -71,10 +76,10 @@ class Summary:
 
 
 def recorded(
-    filter_: Any, times: Array, start: Any, said: Iterable[tuple[Any, Summary]], truth: Any,
+    filter_: Any, times: Array, start: Any, said: Iterable[tuple[Any, Any]], truth: Any,
     scores: Collection[Score],
 ) -> xarray.Dataset:
-    """One Dataset of states and what a filter says of each of them; `start` is the one before.
+    """One Dataset of states, each with what it is believed as; `start` is the one before.
 
     Names and units are the filter's; the scores compare with the `truth`, as
     :meth:`distfilt.filters.Filter.run` describes it.
@@ -84,21 +89,15 @@ def recorded(
     names, units = filter_.components
     agents = list(filter_.agents)
     known, chosen = _known(truth, names, (times.size, *start.runs), len(agents))
-    rows: list[dict[str, Array]] = []
-    last, ledgers = start, [start.ledger]
-    for k, (last, summary) in enumerate(said):
-        ledgers.append(last.ledger)
-        scored = {} if known is None else _scored(summary, known[k], chosen, scores)
-        rows.append(_told(last, summary) | scored)
-
+    series, ledgers, last = _followed(filter_, start, said, known, chosen, scores)
     n = len(start.runs)
     lead = ("time", *(("run",) if n == 1 else [f"run{i}" for i in range(n)]), "agent")
     axes = {"covariance": (*lead, "component", "column")}
     axes |= {k: (*lead, "component") for k in ("mean", "variance", "squared_error", "crps")}
     data = {}
-    for name in rows[0] if rows else ():
-        values = _series(name, np.array([row[name] for row in rows]))
-        data[name] = axes.get(name, lead), values, _attributes(name)
+    for name, values in series.items():
+        meaning, unit = _MEANING.get(name, (name.replace("_", " "), "1"))
+        data[name] = axes.get(name, lead), values, {"long_name": meaning, "units": unit}
     for name in _SENT:
         data |= _counted(name, [getattr(ledger, name) for ledger in ledgers])
     coords = {
@@ -107,9 +106,44 @@ def recorded(
     }
     out = xarray.Dataset(data, coords=coords)
     # A selection or another run joined to this one inherits the entry: these tell them apart.
-    mean = np.array(data["mean"][1][-1]) if rows else None
+    mean = np.array(series["mean"][-1]) if series else None
     out.encoding["final_state"] = last, agents, mean
     return out
+
+
+def _followed(
+    filter_: Any, last: Any, said: Iterable[tuple[Any, Any]], known: Array | None, at: Any,
+    scores: Collection[Score],
+) -> tuple[dict[str, Array], list[Any], Any]:
+    """What is recorded of all states, along a first axis, their ledgers, and the last one."""
+    rows: list[dict[str, Array]] = []
+    ledgers = [last.ledger]
+    for block in _blocks(said, filter_.joins):
+        states, believed = zip(*block, strict=True)
+        done, several, last = len(ledgers) - 1, len(block) > 1, states[-1]
+        ledgers += [state.ledger for state in states]
+        summary = filter_.summary(joined(believed) if several else believed[0])
+        row = {"mean": summary.mean, "variance": summary.variance, **summary.numbers}
+        if summary.covariance is not None:
+            row["covariance"] = summary.covariance
+        if last.refused is not None:
+            row["refused"] = np.array([s.refused for s in states]) if several else last.refused
+        if known is not None:
+            true = known[done : len(ledgers) - 1] if several else known[done]
+            row |= _scored(summary, true, at, scores)
+        rows.append(row if several else {name: value[None] for name, value in row.items()})
+    series = {name: np.concatenate([row[name] for row in rows]) for name in (rows or [{}])[0]}
+    if series:
+        spread = np.sqrt(np.nansum(variance := series["variance"], axis=-1))
+        series["spread"] = np.where(np.isnan(variance).all(axis=-1), np.nan, spread)
+    return series, ledgers, last
+
+
+def _blocks(said: Iterable[tuple[Any, Any]], joins: bool) -> Iterator[list[tuple[Any, Any]]]:
+    """Small states of one shape together: what is recorded of them takes one call."""
+    for shape, alike in groupby(said, lambda pair: pair[1].belief.shape if joins else (_BLOCK,)):
+        while block := [*islice(alike, max(1, _BLOCK // math.prod(shape)))]:
+            yield block
 
 
 def _known(
@@ -139,28 +173,7 @@ def _known(
     return whole, [names.index(name) for name in truth]
 
 
-def _told(state: Any, summary: Summary) -> dict[str, Array]:
-    """What is recorded of a state without a truth."""
-    # The spread is made of the variances of all times at once.
-    out = {"mean": summary.mean, "variance": summary.variance, "spread": summary.variance}
-    if summary.covariance is not None:
-        out["covariance"] = summary.covariance
-    if state.refused is not None:
-        out["refused"] = state.refused
-    return out | dict(summary.numbers)
-
-
-def _series(name: str, values: Array) -> Array:
-    """What is recorded of all times, (T, ...)."""
-    if name != "spread":
-        return values
-    spread = np.sqrt(np.nansum(values, axis=-1))
-    return np.where(np.isnan(values).all(axis=-1), np.nan, spread)
-
-
-def _scored(
-    summary: Summary, known: Array, at: Any, scores: Collection[Score]
-) -> dict[str, Array]:
+def _scored(summary: Summary, known: Array, at: Any, scores: Collection[Score]) -> dict[str, Array]:
     out: dict[str, Array] = {}
     mean, some = summary.mean, summary.members
     known = np.broadcast_to(known, mean.shape)
@@ -206,11 +219,6 @@ def final_state(run: xarray.Dataset) -> State:
         if ends and np.array_equal(run["mean"].values[-1], last, equal_nan=True):
             return state  # type: ignore[no-any-return]
     raise ValueError("run: needs the Dataset that a filter's run returned, got one without a state")
-
-
-def _attributes(name: str) -> dict[str, str]:
-    meaning, unit = _MEANING.get(name, (name.replace("_", " "), "1"))
-    return {"long_name": meaning, "units": unit}
 
 
 def _counted(name: str, values: list[Any]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import hashlib
 import io
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from importlib import import_module
 from os import PathLike
@@ -17,7 +18,7 @@ import numpy as np
 from ..doors import Array, Mask, Record, array
 from ..network import Ledger
 
-__all__ = ["SensorState", "State"]
+__all__ = ["SensorState", "State", "joined"]
 
 _FORMAT = 5
 
@@ -192,6 +193,12 @@ class SensorState(State):
         out = np.array(values)
         out[self.failed] = np.nan
         return out
+
+
+def joined(states: Sequence[Any]) -> Any:
+    """Several states of one shape as one, along a first axis of runs."""
+    own = [name for name, value in vars(states[0]).items() if type(value) is np.ndarray]
+    return states[0].changed(**{k: np.array([getattr(s, k) for s in states]) for k in own})
 
 
 def _name(kind: type) -> str:

@@ -92,8 +92,7 @@ class Step:
         self.failed = getattr(state, "failed", _NOBODY)
         self.lost = bool(np.count_nonzero(self.failed))
         self.waiting: tuple[Any, ...] = ()
-        gated = filter_.gate is not None
-        self.refused: Any = np.zeros((*state.runs, filter_.count)) if gated else None
+        self.refused: Any = None if filter_.gate is None else np.zeros((*state.runs, filter_.count))
 
     def settle(self, errors: dict[Row, str], agents: Any = None) -> None:
         """Take the runs of these errors as failed, or raise the error that names the first.

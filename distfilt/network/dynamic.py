@@ -50,9 +50,7 @@ def pi_start(estimate: Annotated[Array, "... A k"]) -> PIState:
 
 
 @door
-def stable_substeps(
-    channel: Channel, dt: Positive, *, alpha: _Gain, a: _Gain, b: _Gain
-) -> int:
+def stable_substeps(channel: Channel, dt: Positive, *, alpha: _Gain, a: _Gain, b: _Gain) -> int:
     r"""How many explicit steps make up `dt` so that the estimator is stable.
 
     An eigenvalue λ of the Laplacian contributes the matrix

@@ -32,8 +32,7 @@ Members = Annotated[Ensemble, "... n model.dim"]
 
 def _gain(a: Array, b: Array, noise: Array | float = 0.0) -> Array:
     """The gain transposed, (..., m, d), of anomalies: one solve for all members."""
-    n = a.shape[-2] - 1
-    return solve_definite(b.mT @ b / n + noise, b.mT @ a / n)
+    return solve_definite(b.mT @ b + (a.shape[-2] - 1) * noise, b.mT @ a)
 
 
 @update

@@ -102,9 +102,7 @@ def projected(
 
 
 @door
-def retracted(
-    update: Update, constraint: Constraint, *, motion: Motion | None = None
-) -> Update:
+def retracted(update: Update, constraint: Constraint, *, motion: Motion | None = None) -> Update:
     """Put every analysis member on the constraint by itself.
 
     Parameters

@@ -115,7 +115,7 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
                     owed[a] += price(waiting[a], t)
                 waiting[a] = []
         assert family == "news" or np.array_equal(state.ledger.scalars, owed)
-        views = [(t, f.summary(state)), *f.past(state)]
+        views = [(then.t, f.summary(then)) for then in (state, *getattr(state, "earlier", ()))]
         assert len(views) == 1 + min(lag * several, k)
         for a, *run in np.ndindex(agents, *runs):
             means, covs = batch(known[a], times[: k + 1], q, tuple(run))

@@ -199,14 +199,14 @@ def test_a_late_reading_belongs_to_its_own_time(family: str, origin: float, dt: 
     state = f.start(prior, rng=np.random.default_rng(0), runs=(20,), t=origin)
     for k in (1, 2, 3):
         state = f.step(state, origin + k * dt, [None])
-    times = [t for t, _ in f.past(state)] + [state.t]
+    times = [then.t for then in state.earlier] + [state.t]
 
     def late(measured: float) -> list[Reading]:
         return [Reading(measured, 0, [0.0], arrived=origin + 4 * dt)]
 
     for k in (1, 2):
         after = f.step(state, origin + 4 * dt, [None], late=late(np.nextafter(times[k + 1], -1)))
-        spread = [summary.variance.mean() for _, summary in f.past(after)]
+        spread = [f.summary(then).variance.mean() for then in after.earlier]
         assert np.argmin(spread) == k
     with pytest.raises(ValueError, match="late: needs an earlier time that is kept"):
         f.step(state, origin + 4 * dt, [None], late=late(origin + 2.4 * dt))
