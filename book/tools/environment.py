@@ -46,8 +46,8 @@ def main():
         shutil.rmtree(folder, ignore_errors=True)
         run(sys.executable, "-m", "venv", folder)
     pip = ("-m", "pip", "install", "--quiet", "--disable-pip-version-check")
-    # The list is whole. Older versions of pip, asked to resolve `name[extra]`, take the newest release
-    # instead of the listed one, and refuse it for want of a hash.
+    # The list is whole. Older versions of pip, asked to resolve `name[extra]`, take the newest
+    # release instead of the listed one, and refuse it for want of a hash.
     run(python, *pip, "--no-deps", "--require-hashes", "-r", "requirements.txt")
     for package in (".", "book/kit"):
         run(python, *pip, "--no-deps", "--no-build-isolation", "--editable", package)

@@ -51,7 +51,7 @@ class GaussianState(SensorState):
     joint_covariances: Annotated[Array, "... A D D"]
     dim: Count
 
-    _belief = "joint_means", (..., "A", "D")
+    _belief = "joint_covariances", (..., "A", "D", "D")
 
     @property
     def times(self) -> tuple[float, ...]:

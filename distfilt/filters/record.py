@@ -25,7 +25,7 @@ Score = Literal["squared_error", "nees", "crps"]
 SCORES: tuple[Score, ...] = ("squared_error", "nees", "crps")
 """What can be recorded beside a known truth."""
 
-_BLOCK = 4096
+_BLOCK = 32768
 """Up to how many numbers the states have whose summaries are made together."""
 
 _SENT = ("messages", "scalars", "bytes", "lost", "rounds")

@@ -138,14 +138,17 @@ def finite_time(values: PerAgent, channel: Channel) -> Array:
 @lru_cache(maxsize=32)
 def _factors(graph: Graph) -> list[float]:
     """The eigenvalues in their order, refused where their product is not what it is on paper."""
-    values, left = graph.spectrum[1:], np.eye(graph.size) - 1 / graph.size
-    apart = np.diff(values, prepend=-np.inf) > 1e-9 * max(1.0, float(values.max(initial=0)))
-    found = _leja(values[apart])
+    found, left = _leja(_distinct(graph.spectrum[1:])), np.eye(graph.size) - 1 / graph.size
     for eigenvalue in found:
         left -= graph.laplacian @ left / eigenvalue
     if (lost := np.abs(left).max()) > 1e-9:
         raise ValueError(f"channel: needs a graph that rounding spares, got an error of {lost:.0e}")
     return found
+
+
+def _distinct(values: Array) -> Array:
+    gaps = np.diff(values, prepend=-np.inf) > 1e-9 * max(1.0, float(values.max(initial=0)))
+    return values[gaps]
 
 
 def _leja(points: Array) -> list[float]:

@@ -135,3 +135,9 @@ def test_line_ends_are_fixed_whatever_a_clone_s_settings_are() -> None:
 def test_every_page_with_code_is_compared() -> None:
     named = re.findall(r"regress\.py (\S+)", make(ROOT, "-n", "test").stdout)
     assert sorted(chosen(named)) == sorted(chapters())
+
+
+def test_the_list_of_packages_is_whole() -> None:
+    """It is installed as it stands, without a look at what packages ask for."""
+    done = subprocess.run([sys.executable, "-m", "pip", "check"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
