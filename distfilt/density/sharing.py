@@ -114,6 +114,11 @@ class Seen(Record):
         """A Gaussian about each agent, cut off at the walls; in the middle for the gone, (A, n).
 
         Its standard deviation is .3 of the box's side, unless it is given.
+
+        >>> box = Grid((3, 3), high=3.0)
+        >>> seen = Seen(np.array([[2.9, 2.9], [np.nan, np.nan]]), box, 1.0, 0.0)
+        >>> seen.flat().argmax(axis=1)
+        array([8, 4])
         """
         width = 0.3 * self.grid.side if std is None else std
         centre = self._or(self.grid.low + 0.5 * self.grid.width)

@@ -55,9 +55,9 @@ def array(
     --------
     >>> array([[1, 2], [3, 4]], "ensemble", (..., "N", 2)).shape
     (2, 2)
-    >>> array([1.0, np.nan], "mean", (2,))
+    >>> array([1.0, np.nan, 2.0], "mean", (3,))
     Traceback (most recent call last):
-    ValueError: mean: needs finite numbers, got 1 NaN or infinite of 2
+    ValueError: mean: needs finite numbers, got 1 NaN or infinite of 3
     """
     plain = type(value) is np.ndarray and value.dtype == np.float64
     out: Array = value if plain else _real(value, name)  # type: ignore[assignment]

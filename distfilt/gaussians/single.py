@@ -138,27 +138,26 @@ def conditioned(
     (array([1.]), array([[0.5]]))
     """
     missing = np.isnan(gap)
-    if missing.any():
-        H, R = left_out(missing, H, R)
-        gap = np.where(missing, 0.0, gap)
-    gain, after, _ = analysis(cov, H, R)
+    if missing.any():  # a row of H may be missing too
+        H, gap = np.where(missing[..., None], 0.0, H), np.where(missing, 0.0, gap)
+    gain, after, _ = analysis(cov, H, R, missing)
     return mean + (gain @ gap[..., None])[..., 0], after
 
 
-def left_out(missing: Mask, H: Array, R: Array) -> tuple[Array, Array]:
-    """H and R where components (..., m) are missing: a zero row, a one on the diagonal.
+def analysis(cov: Array, H: Array, R: Array, missing: Mask) -> tuple[Array, Array, Array]:
+    """Gain, analysis covariance in Joseph's form, and innovation covariance.
 
-    That takes them out of every sum exactly.
+    Components (..., m) that are missing have no gain, and a one on the innovations' diagonal: that
+    takes them out of every sum exactly.
     """
-    here = ~missing[..., :, None] & ~missing[..., None, :]
-    return np.where(missing[..., None], 0.0, H), np.where(here, R, np.eye(R.shape[-1]))
-
-
-def analysis(cov: Array, H: Array, R: Array) -> tuple[Array, Array, Array]:
-    """Gain, analysis covariance in Joseph's form, and innovation covariance."""
-    cross = cov @ H.mT
-    inner = H @ cross + R
-    gain = solve_definite(inner, cross.mT).mT
+    cross = H @ cov
+    inner = cross @ H.mT + R
+    if missing.any():
+        here = ~missing
+        cross = np.where(here[..., None], cross, 0.0)
+        both = here[..., :, None] & here[..., None, :]
+        inner = np.where(both, inner, np.eye(R.shape[-1]))
+    gain = solve_definite(inner, cross).mT
     rest = np.eye(cov.shape[-1]) - gain @ H
     after = rest @ cov @ rest.mT + gain @ R @ gain.mT
     return np.asarray(gain), np.asarray(0.5 * (after + after.mT)), inner

@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 
 from ..doors import MISSING, Array, Cov, Mask, Record, Semidefinite, door
-from ..gaussians.single import analysis, left_out
+from ..gaussians.single import analysis
 from ..linalg import cholesky, leading, log_det, quadratic_form, symmetrise
 from ..sensors import Sensor
 
@@ -107,11 +107,8 @@ def kalman_filter(
     for k in range(len(y)):
         x, p = x @ f[k].T, f[k] @ p @ f[k].T + q[k]
         gaps[k] = y[k] - x @ h[k].T
-        seen, noise = h[k], r[k]
-        if missing[k].any():
-            seen, noise = left_out(missing[k, : len(p)], seen, noise)
-            gaps[k][missing[k]] = 0.0
-        gain, p, inner[k] = analysis(p, seen, noise)
+        gaps[k][missing[k]] = 0.0
+        gain, p, inner[k] = analysis(p, h[k], r[k], missing[k, : len(p)])
         x = x + (gaps[k] @ gain[0].T if shared else (gain @ gaps[k, ..., None])[..., 0])
         means[k], covs[k] = x, p
     if not np.isfinite(means).all():

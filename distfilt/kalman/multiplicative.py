@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 
 from ..doors import Array, Count, Cov, Index, Record, Times, door, unchecked
-from ..gaussians.single import analysis, left_out
+from ..gaussians.single import analysis
 from ..linalg import central
 from ..models import Model
 from ..models.satellite import left_directions, turn_between, turned
@@ -183,9 +183,9 @@ def _step(
         joint = np.block([[joint, across], [across.mT, p]])
     gap = unchecked(sensor.residual)(y, unchecked(sensor.predict)(moved, previous))
     missing = np.isnan(gap)
-    h, r = left_out(missing, _errors_seen(moved, previous, sensor, chart), sensor.cov)
-    gap = np.where(missing, 0.0, gap)
-    gain, joint, inner = analysis(joint, h, r)
+    h = _errors_seen(moved, previous, sensor, chart)
+    h, gap = np.where(missing[..., None], 0.0, h), np.where(missing, 0.0, gap)
+    gain, joint, inner = analysis(joint, h, sensor.cov, missing)
     error, k = (gain @ gap[..., None])[..., 0], chart.error_dim
     density = log_likelihood(gap, inner, missing)
     return _finite(chart.retract(moved, error[:, :k])), joint[:, :k, :k], density

@@ -167,6 +167,9 @@ def crps(
     --------
     >>> crps([[0.0], [2.0]], [1.0])
     array([0.5])
+    >>> crps(np.zeros((2, 4, 1)), [1.0], weights=np.full((3, 4), 0.25))
+    Traceback (most recent call last):
+    ValueError: weights: needs leading axes that broadcast with (2,), got (3,)
     """
     n = ensemble.shape[-2]
     leading(ensemble.shape[:-2], truth.shape[:-1], "truth")

@@ -33,7 +33,12 @@ def of_matrix(value: Any, name: str, *, directed: bool) -> scipy.sparse.csr_arra
 
 
 def of_edges(size: int, edges: Any, name: str, *, directed: bool) -> scipy.sparse.csr_array:
-    """The links of pairs (listener, speaker), both ways unless the graph is directed."""
+    """The links of pairs (listener, speaker), both ways unless the graph is directed.
+
+    >>> of_edges(3, [(0, -1)], "edges", directed=False)
+    Traceback (most recent call last):
+    ValueError: edges: needs agents from 0 to 2, got [[0.0, -1.0]]
+    """
     pairs = array(edges, name)
     pairs = pairs.reshape(-1, 2) if pairs.size == 0 else array(pairs, name, ("E", 2))
     listed = pairs.astype(np.int64)
@@ -63,7 +68,12 @@ def is_networkx(value: Any) -> bool:
 
 
 def linked(size: int, pairs: Indices, name: str) -> scipy.sparse.csr_array:
-    """The matrix of a graph's links from pairs (listener, speaker), which may repeat."""
+    """The matrix of a graph's links from pairs (listener, speaker), which may repeat.
+
+    >>> linked(3, np.array([[1, 1], [2, 2]]), "edges")
+    Traceback (most recent call last):
+    ValueError: edges: needs no self-loops, got one at agent 1
+    """
     loops = pairs[pairs[:, 0] == pairs[:, 1], 0]
     if loops.size:
         raise ValueError(f"{name}: needs no self-loops, got one at agent {loops[0]}")

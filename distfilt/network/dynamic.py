@@ -188,6 +188,14 @@ def gossip(values: PerAgent, channel: Channel, *, rounds: Count, rng: Rng) -> Ar
     array([3., 3., 3., 3.])
     >>> channel.ledger.messages.sum()
     np.int64(400)
+
+    An agent without a neighbour wakes in vain:
+
+    >>> channel = Channel(graphs.Graph.from_edges(3, [(1, 2)]))
+    >>> gossip([[0.0], [2.0], [4.0]], channel, rounds=9, rng=np.random.default_rng(1)).ravel()
+    array([0., 3., 3.])
+    >>> channel.ledger.messages
+    array([0, 6, 6])
     """
     channel.graph._undirected()
     graph, carry, out = channel.graph, unchecked(channel.carry), values.copy()

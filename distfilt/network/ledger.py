@@ -50,7 +50,12 @@ class Ledger(Record):
     @classmethod
     @door
     def empty(cls, agents: Count) -> Ledger:
-        """A ledger of `agents` agents that have not spoken."""
+        """A ledger of `agents` agents that have not spoken.
+
+        >>> Ledger.empty(0)
+        Traceback (most recent call last):
+        ValueError: agents: needs an integer of at least 1, got 0
+        """
         zero = np.zeros(agents, dtype=np.int64)
         return cls.unchecked(0, zero, zero, zero, np.zeros(agents))
 

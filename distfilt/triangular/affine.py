@@ -119,6 +119,8 @@ class AffineMap(Record):
     array([[1.]])
     >>> s.inverse([0.0], [[1.0]])
     array([[2.]])
+    >>> s.observed, s.dim
+    (1, 1)
     """
 
     observed_mean: Annotated[Array, "... M"]

@@ -71,6 +71,9 @@ def sampled_noise(
     >>> after = sampled_noise(prior, prior, [2.0], [[1.0]], rng=rng)
     >>> after.mean().round(1), after.var().round(1)
     (np.float64(1.0), np.float64(0.5))
+    >>> sampled_noise(np.eye(2), np.eye(2), [0.0, 0.0], np.eye(2), rng=rng)
+    Traceback (most recent call last):
+    ValueError: ensemble: needs at least 3 members for 2 readings, got 2
     """
     members, m = predicted.shape[-2:]
     if members <= m:

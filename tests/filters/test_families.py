@@ -174,11 +174,12 @@ def test_one_weight_for_all_warns_although_the_particles_are_distinct(jitter: fl
     assert np.allclose(after.points.std(), jitter * state.points.std(), rtol=0.1, atol=1e-4)
 
 
-def test_copies_of_one_particle_warn_at_any_number() -> None:
+def test_copies_of_one_particle_warn_at_any_number_and_two_do_not() -> None:
     f = filters.ParticleFilter(STILL, [None], members=50, jitter=0.0)
     start = f.start(([0.0], [[0.0]]), rng=np.random.default_rng(0))
     with pytest.warns(filters.ParticleCollapse, match="2.00% of an agent's particles are distinct"):
         f.step(start, 1.0, [None])
+    f.step(f.start(np.arange(50.0)[:, None] // 25, rng=np.random.default_rng(0)), 1.0, [None])
 
 
 def test_what_an_agreement_moves_was_there_before_too() -> None:
