@@ -96,7 +96,12 @@ def said_by_all(f: Any, observations: Any, runs: tuple[int, ...], t: float) -> l
 
 
 def one_each(observations: Any, agents: int) -> Any:
-    """Observations in a list, one entry for each agent."""
+    """Observations in a list, one entry for each agent.
+
+    >>> one_each([1.0, 2.0], 3)
+    Traceback (most recent call last):
+    ValueError: observations: needs a list, one for each of 3 agents, got 2
+    """
     observations = observations.to_numpy() if hasattr(observations, "to_numpy") else observations
     listed = isinstance(observations, _LISTED)
     if not listed or len(observations) != agents:

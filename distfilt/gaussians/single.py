@@ -151,12 +151,11 @@ def analysis(cov: Array, H: Array, R: Array, missing: Mask) -> tuple[Array, Arra
     takes them out of every sum exactly.
     """
     cross = H @ cov
-    inner = cross @ H.mT + R
+    inner = cross @ np.ascontiguousarray(H.mT) + R
     if missing.any():
-        here = ~missing
-        cross = np.where(here[..., None], cross, 0.0)
-        both = here[..., :, None] & here[..., None, :]
-        inner = np.where(both, inner, np.eye(R.shape[-1]))
+        gone = np.nonzero(np.broadcast_to(missing, cross.shape[:-1]))
+        cross[gone] = inner[gone] = inner.mT[gone] = 0.0
+        inner[(*gone, gone[-1])] = 1.0
     gain = solve_definite(inner, cross).mT
     rest = np.eye(cov.shape[-1]) - gain @ H
     after = rest @ cov @ rest.mT + gain @ R @ gain.mT
