@@ -119,8 +119,8 @@ def pendulum_angle(
 
     Examples
     --------
-    >>> pendulum_angle().step([0.0, 1.0], 0.0, 0.01).round(4)
-    array([0.01  , 0.9995])
+    >>> pendulum_angle().step([0.0, 1.0], 0.0, 1.0).round(4)
+    array([ 0.01  , -0.9995])
     """
     return integrated(
         partial(_swing, pull=gravity / length), np.diag(np.square(sigma)), step=step,
