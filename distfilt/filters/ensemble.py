@@ -200,13 +200,14 @@ class EnsembleFilter(MembersFilter):
         before = step.before(place, group, stack[:-1])
         predicted = group.predict(members[place], before)
         group = step.gated(group, sample_moments, predicted)
+        redone = says(self.update, "repredicts")
 
         def compute(h: Array, y: Array, *rest: Any) -> tuple[Array, ...]:
             *earlier, last, noise, source = rest
             # Every time's members meet the same draw of the noise, so that all the separate
             # updates are one joint update; the last one advances the generator.
             past = [self._updated(x, h, y, noise, copied(source), None) for x in earlier]
-            whole = not earlier and h.shape == predicted.shape
+            whole = redone and not earlier and h.shape == predicted.shape
             predict = partial(group.predict, previous=before) if whole else None
             return (*past, self._updated(last, h, y, noise, source, predict))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -297,7 +298,8 @@ def guarded(
     >>> out[0].ravel(), errors
     (array([ 2., -1.,  3.]), {(1,): 'Matrix is not positive definite'})
     """
-    at: Any = None if rng is None else rng.bit_generator.state
+    several = math.prod(arrays[0].shape[:lead]) > 1
+    at: Any = rng.bit_generator.state if rng is not None and several else None
     errors: dict[Row, str] = {}
     try:
         out = compute(*arrays, shared, rng)
