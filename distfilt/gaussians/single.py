@@ -153,7 +153,8 @@ def analysis(cov: Array, H: Array, R: Array, missing: Mask) -> tuple[Array, Arra
     cross = H @ cov
     inner = cross @ np.ascontiguousarray(H.mT) + R
     if missing.any():
-        gone = np.nonzero(np.broadcast_to(missing, cross.shape[:-1]))
+        gone = np.nonzero(np.broadcast_to(missing, inner.shape[:-1]))
+        cross = np.broadcast_to(cross, (*inner.shape[:-1], cross.shape[-1])).copy()
         cross[gone] = inner[gone] = inner.mT[gone] = 0.0
         inner[(*gone, gone[-1])] = 1.0
     gain = solve_definite(inner, cross).mT
