@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -133,6 +134,11 @@ def solve_lower(lower: Array, right: Array) -> Array:
     return _triangular(lower, right, 0)
 
 
+def solve_upper(lower: Array, right: Array) -> Array:
+    r"""Solve Lᵀ out = right with the *lower* triangular factor."""
+    return _triangular(lower, right, 1)
+
+
 def solve_definite(matrix: Array, right: Array) -> Array:
     """Solve with symmetric positive definite matrices, (..., m, m) and (..., m, k)."""
     m, k = right.shape[-2:]
@@ -141,12 +147,10 @@ def solve_definite(matrix: Array, right: Array) -> Array:
         _, out, failed = dposv(matrix.reshape(m, m), right.reshape(m, k), lower=1)
         if not failed:
             return np.asarray(out.reshape(right.shape))
+    elif m <= 12 and right.size > 600 * m and matrix.shape[:-2] == right.shape[:-2]:
+        with suppress(np.linalg.LinAlgError):  # by rounding one may be indefinite
+            return solve_upper(lower := cholesky(matrix), solve_lower(lower, right))
     return np.asarray(np.linalg.solve(matrix, right))
-
-
-def solve_upper(lower: Array, right: Array) -> Array:
-    r"""Solve Lᵀ out = right with the *lower* triangular factor."""
-    return _triangular(lower, right, 1)
 
 
 def _triangular(lower: Array, right: Array, transposed: int) -> Array:
@@ -159,14 +163,12 @@ def _triangular(lower: Array, right: Array, transposed: int) -> Array:
         lower = np.broadcast_to(lower, (*leading, d, d))
         right = np.broadcast_to(right, (*leading, d, k))
     n = math.prod(leading)
-    factors, columns = lower.reshape(n, d, d), right.reshape(n, d, k)
-    if len(factors) > 2 * d:
-        # Many small systems: row after row of all of them at once beats a call for each.
-        out = _substitute(factors, columns, transposed)
+    factors, sides = lower.reshape(n, d, d), right.reshape(n, d, k)
+    if n > 2 * d:
+        # Row after row of all of them at once beats a call for each.
+        out = _blocks(factors, sides, transposed)
     else:
-        out = np.empty((len(factors), d, k))
-        for i, (one, b) in enumerate(zip(factors, columns, strict=True)):
-            out[i] = _one_triangular(one, b, transposed)
+        out = np.array([_one_triangular(*x, transposed) for x in zip(factors, sides, strict=True)])
     return out.reshape(*leading, d, k)
 
 
@@ -177,24 +179,34 @@ def _one_triangular(lower: Array, right: Array, transposed: int) -> Array:
         return np.array(right)
     alone = right.size == d * k
     flat = right.reshape(d, k) if alone else np.moveaxis(right, -2, 0).reshape(d, -1)
-    out, failed = dtrtrs(lower, flat, lower=1, trans=transposed)
-    if failed:
-        raise np.linalg.LinAlgError("Singular matrix")
+    if d <= 12 and flat.size > 200 * d * d:  # so many columns that LAPACK's own order costs more
+        out = _substituted(lower[..., None], np.array(flat[:, None], order="C"), transposed)
+    else:
+        out, failed = dtrtrs(lower, flat, lower=1, trans=transposed)
+        if failed:
+            raise np.linalg.LinAlgError("Singular matrix")
     if alone:
         return np.asarray(out).reshape(right.shape)
     return np.moveaxis(out.reshape(d, *right.shape[:-2], right.shape[-1]), 0, -2)
 
 
-def _substitute(lower: Array, right: Array, transposed: int) -> Array:
-    if transposed:
-        turned = lower.swapaxes(-1, -2)[:, ::-1, ::-1]
-        return _substitute(turned, right[:, ::-1], 0)[:, ::-1]
-    out = np.array(right)
-    for i in range(out.shape[-2]):
-        if i:
-            out[:, i] -= (lower[:, i : i + 1, :i] @ out[:, :i])[:, 0]
-        out[:, i] /= lower[:, i, i, None]
+def _blocks(lower: Array, right: Array, transposed: int) -> Array:
+    """Many small systems, as many at once as a cache holds."""
+    out, size = np.empty(right.shape), max(1, 2**16 // (1 + lower[0].size + right[0].size))
+    for here in [slice(n, n + size) for n in range(0, len(out), size)]:
+        factors = np.ascontiguousarray(lower[here].transpose(1, 2, 0))
+        x = np.array(right[here].transpose(1, 2, 0), order="C")
+        out[here] = _substituted(factors, x, transposed).transpose(2, 0, 1)
     return out
+
+
+def _substituted(lower: Array, x: Array, transposed: int) -> Array:
+    """Solve in place, row after row of (d, k, n), with factors (d, d, n) or (d, d, 1)."""
+    for i in reversed(range(len(x))) if transposed else range(len(x)):
+        rest = slice(0, i) if transposed else slice(i + 1, None)
+        x[i] /= lower[i, i]
+        x[rest] -= (lower[i, rest] if transposed else lower[rest, i])[:, None] * x[i]
+    return x
 
 
 def whiten(lower: Array, vectors: Array) -> Array:
@@ -224,8 +236,7 @@ def log_sum(logs: Array) -> Array:
     >>> log_sum(np.zeros(2)).round(4)
     array([0.6931])
     """
-    top = logs.max(axis=-1, keepdims=True)
-    top = np.where(np.isfinite(top), top, 0.0)
+    top = np.maximum(logs.max(axis=-1, keepdims=True), -1e300)
     with np.errstate(divide="ignore"):
         return np.asarray(top + np.log(np.exp(logs - top).sum(axis=-1, keepdims=True)))
 

@@ -91,7 +91,7 @@ class Heard:
         observation time before, for sensors that see changes.
         """
         if self.linear:
-            return np.asarray(states @ self.matrix(states.shape[-1]).mT)
+            return np.asarray(states @ np.ascontiguousarray(self.matrix(states.shape[-1]).mT))
         out = np.empty((*states.shape[:-2], self.target.shape[-1], states.shape[-2]))
         for sensor, rows, cells in self.parts:
             before = None if previous is None else previous[..., rows, :, :]

@@ -125,7 +125,8 @@ class ParticleFilter(MembersFilter):
             rows = group.rows
             before = step.before(place, group, [old] if step.dt else stack[:-1])
             predicted = group.predict(stack[place][..., rows, :, :], before)
-            group = step.gated(group, weighted_moments, predicted, np.exp(weights[..., rows, :]))
+            logs = weights[..., rows, :]
+            group = step.gated(group, lambda x, w: weighted_moments(x, np.exp(w)), predicted, logs)
             step.settle(_weigh(weights, predicted, group), group.agents)
         if step.agrees:
             # The particles have to be an ensemble, which the agreement can move.

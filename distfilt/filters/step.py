@@ -89,7 +89,7 @@ class Step:
         self.times = state.kept(filter_.lag, t)
         self.channel: Any = filter_.channel(state, t)
         # A run's own generator need not be copied: nobody else draws from it.
-        self.rng: Any = state.rng if own else copied(state.rng)
+        self.rng: Any = state.rng if own or state.rng is None else copied(state.rng)
         self.failed = getattr(state, "failed", _NOBODY)
         self.lost = bool(np.count_nonzero(self.failed))
         self.waiting: tuple[Any, ...] = ()
@@ -161,20 +161,20 @@ class Step:
         told, inbox = self._told(own), [dict[int, Any]() for _ in own]
         if self.channel is not None and told:
             inbox = self.channel.exchange([self._payload(mine) for mine in told])
-        kinds = [[(said.t, sensor_of(f, said)) for said in mine] for mine in told]
-        known: dict[float, list[list[tuple[Sensor, Array]]]]
-        known = defaultdict(lambda: [[] for _ in own])
+        known: dict[float, list[list[Any]]] = defaultdict(lambda: [[] for _ in own])
+        now, last = known[self.t], dict[int, Any]()
         for agent, (mine, box) in enumerate(zip(own, inbox, strict=True)):
             for sender in sorted((agent, *box)):
                 if sender == agent:
                     for said in mine:
                         known[said.t][agent].append((sensor_of(f, said), said.value))
                 elif type(got := box[sender]) is tuple:
-                    for (t, sensor), value in zip(kinds[sender], got, strict=False):
-                        known[t][agent].append((sensor, value))
-                else:
-                    t, sensor = kinds[sender][0]
-                    known[t][agent].append((sensor, got))
+                    for said, value in zip(told[sender], got, strict=False):
+                        known[said.t][agent].append((sensor_of(f, said), value))
+                else:  # one of now, which is the same for all who hear it whole
+                    if sender not in last or last[sender][1] is not got:
+                        last[sender] = sensor_of(f, told[sender][0]), got
+                    now[agent].append(last[sender])
         return known
 
     def _told(self, own: list[list[Reading]]) -> list[list[Reading]]:
@@ -187,6 +187,8 @@ class Step:
                 kept = [said.changed(value=said.value.copy()) for mine in own for said in mine]
                 self.waiting = (*self.state.waiting, *kept)
             return []
+        if not self.state.waiting:
+            return own
         out: list[list[Reading]] = [[] for _ in own]
         for said in self.state.waiting:
             if said.t not in self.times:
@@ -201,12 +203,11 @@ class Step:
         """Values, and when and of which sensor each is, but for an only one: now, of the first."""
         if not told:
             return None
-        about: list[float] = []
-        for said in told:
-            which = said.sensor if isinstance(said.sensor, int) else -1
-            about += [said.t, which, *said.about]
-        if about in ([self.t, 0], [self.t, -1]):
+        which = [said.sensor if isinstance(said.sensor, int) else -1 for said in told]
+        if len(told) == 1 and told[0].t == self.t and which[0] < 1 and not told[0].about:
             return told[0].value
+        pairs = zip(told, which, strict=True)
+        about = [x for said, sensor in pairs for x in (said.t, sensor, *said.about)]
         numbers = np.broadcast_to(np.array(about), (*self.state.runs, len(about)))
         return (*(said.value for said in told), numbers)
 

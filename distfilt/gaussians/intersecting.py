@@ -223,7 +223,7 @@ def _least(covs: Array, here: Mask, determinant: bool) -> Array:
         aim = np.where(gain > 0, value - 1e-3 * gain + 1e-13 * (1 + np.abs(value)), -np.inf)
         bound = np.where(at[:, 0], aim, np.inf)
         point, sure = np.where(at, point + step, sure), np.where(at, scaled, sure)
-        if 2 * np.count_nonzero(open_) <= len(open_):
+        if 10 * np.count_nonzero(open_) <= 9 * len(open_):
             fixed = [part[open_] for part in fixed]
             left, lowest, bound = left[open_], lowest[open_], bound[open_]
             point, sure, share = point[open_], sure[open_], share[open_]

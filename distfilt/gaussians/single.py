@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated
 
 import numpy as np
@@ -13,9 +14,7 @@ __all__ = ["conditioned", "log_density", "recolour", "unscented_points"]
 
 
 @door
-def log_density(
-    x: Annotated[Array, "... d"], mean: Annotated[Array, "... d"], cov: Cov
-) -> Array:
+def log_density(x: Annotated[Array, "... d"], mean: Annotated[Array, "... d"], cov: Cov) -> Array:
     r"""Logarithm of the Gaussian density, (...), relative to the volume in the state's units.
 
     .. math:: \log N(\mathbf x;\mathbf m,\mathbf P)=-\tfrac12\bigl(
@@ -140,12 +139,13 @@ def conditioned(
     missing = np.isnan(gap)
     if missing.any():  # a row of H may be missing too
         H, gap = np.where(missing[..., None], 0.0, H), np.where(missing, 0.0, gap)
-    gain, after, _ = analysis(cov, H, R, missing)
-    return mean + (gain @ gap[..., None])[..., 0], after
+    cross, inner = innovation(cov, H, R, missing)
+    gain = solve_definite(inner, cross).mT
+    return mean + (gain @ gap[..., None])[..., 0], joseph(cov, gain, H, R)
 
 
-def analysis(cov: Array, H: Array, R: Array, missing: Mask) -> tuple[Array, Array, Array]:
-    """Gain, analysis covariance in Joseph's form, and innovation covariance.
+def innovation(cov: Array, H: Array, R: Array, missing: Mask) -> tuple[Array, Array]:
+    """Covariance of a reading's prediction with the state, (..., m, d), and of the innovation.
 
     Components (..., m) that are missing have no gain, and a one on the innovations' diagonal: that
     takes them out of every sum exactly.
@@ -157,10 +157,14 @@ def analysis(cov: Array, H: Array, R: Array, missing: Mask) -> tuple[Array, Arra
         cross = np.broadcast_to(cross, (*inner.shape[:-1], cross.shape[-1])).copy()
         cross[gone] = inner[gone] = inner.mT[gone] = 0.0
         inner[(*gone, gone[-1])] = 1.0
-    gain = solve_definite(inner, cross).mT
+    return cross, inner
+
+
+def joseph(cov: Array, gain: Array, H: Array, R: Array) -> Array:
+    """The covariance after an update with any gain, as a sum of squares: Joseph's form."""
     rest = np.eye(cov.shape[-1]) - gain @ H
-    after = rest @ cov @ rest.mT + gain @ R @ gain.mT
-    return np.asarray(gain), np.asarray(0.5 * (after + after.mT)), inner
+    after = rest @ cov @ np.ascontiguousarray(rest.mT) + gain @ R @ gain.mT
+    return np.asarray(0.5 * (after + after.mT))
 
 
 @door
@@ -197,8 +201,8 @@ def unscented_points(
     d = mean.shape[-1]
     if d + kappa <= 0:
         raise ValueError(f"kappa: needs a number above {-d}, got {kappa:g}")
-    moves = np.sqrt(d + kappa) * root.mT
+    moves = math.sqrt(d + kappa) * root.mT
     moves = np.concatenate([0 * moves[..., :1, :], moves, -moves], axis=-2)
-    weights = np.full(2 * d + 1, 0.5 / (d + kappa))
-    weights[0] = kappa / (d + kappa)
+    weights = np.empty(2 * d + 1)
+    weights[:], weights[0] = 0.5 / (d + kappa), kappa / (d + kappa)
     return mean[..., None, :] + moves, weights

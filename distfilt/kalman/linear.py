@@ -9,8 +9,8 @@ from typing import Annotated
 import numpy as np
 
 from ..doors import MISSING, Array, Cov, Mask, Record, Semidefinite, door
-from ..gaussians.single import analysis
-from ..linalg import cholesky, leading, log_det, quadratic_form, symmetrise
+from ..gaussians.single import innovation, joseph
+from ..linalg import cholesky, leading, log_det, solve_lower, solve_upper, symmetrise
 from ..sensors import Sensor
 
 __all__ = ["GaussianRun", "kalman_filter", "rts_smoother"]
@@ -99,22 +99,37 @@ def kalman_filter(
     """
     runs, y, x, p = flattened(mean, cov, observations)
     f, h, q, r = per_step(len(y), F=F, H=H, Q=Q, R=R)
-    missing = np.isnan(y)
+    turned, missing = np.ascontiguousarray(f.mT), np.isnan(y)
     shared = cov.ndim == 2 and bool((missing == missing[:, :1]).all())
-    p = cov[None] if shared else p
+    # Runs that share a covariance stand side by side, as the columns of one mean.
+    p, x, y = (cov[None], x.T[None], y.mT[:, None]) if shared else (p, x[..., None], y[..., None])
     means, covs = np.empty((len(y), *x.shape)), np.empty((len(y), *p.shape))
-    gaps, inner = np.empty_like(y), np.empty((len(y), len(p), *r.shape[1:]))
+    density, missing = np.empty((len(y), len(x), x.shape[-1])), np.asarray(np.isnan(y).any(axis=-1))
     for k in range(len(y)):
-        x, p = x @ f[k].T, f[k] @ p @ f[k].T + q[k]
-        gaps[k] = y[k] - x @ h[k].T
-        gaps[k][missing[k]] = 0.0
-        gain, p, inner[k] = analysis(p, h[k], r[k], missing[k, : len(p)])
-        x = x + (gaps[k] @ gain[0].T if shared else (gain @ gaps[k, ..., None])[..., 0])
+        x, p = f[k] @ x, f[k] @ p @ turned[k] + q[k]
+        gap = y[k] - h[k] @ x
+        gap[missing[k]] = 0.0
+        move, p, density[k] = assimilated(p, gap, h[k], r[k], missing[k])
+        x = x + move
         means[k], covs[k] = x, p
     if not np.isfinite(means).all():
         raise np.linalg.LinAlgError("kalman_filter: needs matrices without overflow, got infinity")
-    density = log_likelihood(gaps, inner, missing)
-    return unflattened(means, covs, density, runs)
+    return unflattened(means.mT, covs, density, runs)
+
+
+def assimilated(
+    cov: Array, gap: Array, H: Array, R: Array, missing: Mask
+) -> tuple[Array, Array, Array]:
+    """How innovations (..., m, k) move the mean, the covariance after it, and their log densities.
+
+    An innovation is 0 where it is missing.
+    """
+    (cross, inner), d = innovation(cov, H, R, missing), cov.shape[-1]
+    lower = cholesky(inner)
+    solved = solve_upper(lower, solve_lower(lower, np.concatenate([cross, gap], axis=-1)))
+    gain, length = solved[..., :d].mT, (gap * solved[..., d:]).sum(axis=-2)
+    constant = np.log(2 * np.pi) * (~missing).sum(axis=-1) + log_det(lower)
+    return gain @ gap, joseph(cov, gain, H, R), -0.5 * (length + constant[..., None])
 
 
 @door
@@ -189,9 +204,9 @@ def flattened(mean: Array, cov: Array, observations: Array) -> tuple[Runs, Array
 def unflattened(means: Array, covs: Array, density: Array, runs: Runs) -> GaussianRun:
     """What a filter found of all runs, (T, R, ...), with their axes apart."""
     steps = len(means)
-    lead = runs if covs.shape[1] == means.shape[1] else (1,) * len(runs)
+    lead = runs if covs.shape[1] == math.prod(runs) else (1,) * len(runs)
     return GaussianRun.unchecked(
-        means.reshape(steps, *runs, *means.shape[2:]),
+        means.reshape(steps, *runs, means.shape[-1]),
         covs.reshape(steps, *lead, *covs.shape[2:]),
         density.reshape(steps, *runs),
     )
@@ -215,14 +230,3 @@ def grid(times: Array, observations: Array, sensor: Sensor) -> Array:
     if times.min(initial=np.inf) <= 0:
         raise ValueError(f"times: needs times after 0, got {times[0]:g}")
     return np.concatenate([[0.0], times])
-
-
-def log_likelihood(gaps: Array, inner: Array, missing: Mask) -> Array:
-    """Log densities of innovations (..., R, m), which are 0 with variance 1 where missing."""
-    try:
-        lower = cholesky(inner)
-    except np.linalg.LinAlgError:
-        needs = "the innovation covariance is not positive definite"
-        raise np.linalg.LinAlgError(needs) from None
-    constant = np.log(2 * np.pi) * (~missing).sum(axis=-1)
-    return np.asarray(-0.5 * (quadratic_form(lower, gaps) + log_det(lower) + constant))

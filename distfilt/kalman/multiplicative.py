@@ -13,12 +13,11 @@ from typing import Annotated
 import numpy as np
 
 from ..doors import Array, Count, Cov, Index, Record, Times, door, unchecked
-from ..gaussians.single import analysis
 from ..linalg import central
 from ..models import Model
 from ..models.satellite import left_directions, turn_between, turned
 from ..sensors import Sensor, stack
-from .linear import GaussianRun, Series, flattened, grid, log_likelihood, unflattened
+from .linear import GaussianRun, Series, assimilated, flattened, grid, unflattened
 
 __all__ = ["QuaternionChart", "multiplicative_filter"]
 
@@ -185,10 +184,9 @@ def _step(
     missing = np.isnan(gap)
     h = _errors_seen(moved, previous, sensor, chart)
     h, gap = np.where(missing[..., None], 0.0, h), np.where(missing, 0.0, gap)
-    gain, joint, inner = analysis(joint, h, sensor.cov, missing)
-    error, k = (gain @ gap[..., None])[..., 0], chart.error_dim
-    density = log_likelihood(gap, inner, missing)
-    return _finite(chart.retract(moved, error[:, :k])), joint[:, :k, :k], density
+    error, joint, density = assimilated(joint, gap[..., None], h, sensor.cov, missing)
+    k = chart.error_dim
+    return _finite(chart.retract(moved, error[:, :k, 0])), joint[:, :k, :k], density[:, 0]
 
 
 def _finite(x: Array) -> Array:

@@ -157,9 +157,7 @@ def filterpy_ukf(
     return _over_runs(mean, cov, observations, make, step)
 
 
-def _present(
-    sensors: Sequence[Sensor], times: Array, observations: Array
-) -> tuple[Sensor, Array]:
+def _present(sensors: Sequence[Sensor], times: Array, observations: Array) -> tuple[Sensor, Array]:
     """The stacked sensor, if none of the sensors needs the previous state, and the clock."""
     sensor = stack(sensors)
     if sensor.uses_previous:

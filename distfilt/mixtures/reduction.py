@@ -194,9 +194,7 @@ def kept_by_relevance(
 
 
 @door
-def pivoted_qr(
-    shapes: Shapes, *, size: Count, rest: Literal["merge", "drop"] = "merge"
-) -> Shapes:
+def pivoted_qr(shapes: Shapes, *, size: Count, rest: Literal["merge", "drop"] = "merge") -> Shapes:
     r"""Keep the mixands that a pivoted QR decomposition of (33) finds independent, (42)-(43).
 
     Parameters

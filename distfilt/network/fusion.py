@@ -289,9 +289,7 @@ class _Heard:
         return self.means[:, self.graph.senders] - self.means[:, self.graph.receivers]
 
 
-def _in_rounds(
-    belief: Pair, channel: Channel, rounds: int, step: Callable[[_Heard], Pair]
-) -> Pair:
+def _in_rounds(belief: Pair, channel: Channel, rounds: int, step: Callable[[_Heard], Pair]) -> Pair:
     """Exchange means and upper triangles and take a step, some times."""
     means, covs = belief
     graph, d = channel.graph, means.shape[-1]

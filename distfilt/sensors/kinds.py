@@ -381,9 +381,7 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
     )
 
 
-def _stacked(
-    *states: Any, parts: Sequence[Sensor], what: str = "predict", axis: int = -1
-) -> Array:
+def _stacked(*states: Any, parts: Sequence[Sensor], what: str = "predict", axis: int = -1) -> Array:
     return np.concatenate([unchecked(getattr(s, what))(*states) for s in parts], axis=axis)
 
 

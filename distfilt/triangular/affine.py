@@ -141,7 +141,7 @@ class AffineMap(Record):
     def _predicted(self, y: Array, members: Array) -> Array:
         """The regression of x on y, (..., N, d), which broadcasts with these members."""
         centred = y - self.observed_mean[..., None, :]
-        out = self.mean[..., None, :] + centred @ self.gain.mT
+        out = self.mean[..., None, :] + centred @ np.ascontiguousarray(self.gain.mT)
         leading(members.shape[:-1], out.shape[:-1], "y")
         return np.asarray(out)
 
@@ -154,7 +154,7 @@ class AffineMap(Record):
     def inverse(self, y: OwnSeen, z: OwnMembers) -> Array:
         """Members x with S(y, x) = z, (..., N, d); `y` is (..., N, m), or (..., m) for all."""
         seen = y[..., None, :] if y.ndim == self.observed_mean.ndim else y
-        return self._predicted(seen, z) + z @ self.scale.mT
+        return self._predicted(seen, z) + z @ np.ascontiguousarray(self.scale.mT)
 
     @door
     def log_det(self, y: OwnSeen, x: OwnMembers) -> Array:

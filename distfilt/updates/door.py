@@ -132,7 +132,7 @@ def perturbed(predicted: Array, noise: Array, rng: Rng, *, centred: bool = False
     drawn = rng.standard_normal(predicted.shape)
     if centred:
         drawn -= drawn.mean(axis=-2, keepdims=True)
-    out = drawn @ cholesky(noise).mT
+    out = drawn @ np.ascontiguousarray(cholesky(noise).mT)
     return np.asarray(np.add(out, predicted, out=out))
 
 

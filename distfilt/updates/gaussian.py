@@ -242,7 +242,7 @@ def sampled_forecast(
     moved, root = unchecked(model.step)(ensemble, t, dt), unchecked(model.root)(t, dt)
     if not np.count_nonzero(root):
         return moved
-    return moved + rng.standard_normal(moved.shape) @ root.T
+    return moved + rng.standard_normal(moved.shape) @ np.ascontiguousarray(root.T)
 
 
 @door

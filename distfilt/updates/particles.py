@@ -204,10 +204,9 @@ def weighed(log_weights: Array, predicted: Array, observed: Array, noise: Array)
 def log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
     """Log-likelihood of each particle's prediction (..., N, m) but for a constant, (..., N)."""
     # Components first: sums over a few of them then run along all particles.
-    seen = np.ascontiguousarray(predicted.mT)
-    gap, cov = observed[..., None] - seen, noise
+    gap, cov = np.subtract(observed[..., None], predicted.mT, order="C"), noise
     if not all_finite(gap):
-        missing = np.isnan(observed) | np.isnan(seen).any(axis=-1)
+        missing = np.asarray(np.isnan(gap).any(axis=-1))
         # A missing component gets a zero residual and a unit of its own in R.
         here = ~missing[..., :, None] & ~missing[..., None, :]
         cov = np.where(here, noise, np.eye(noise.shape[-1]))
