@@ -228,10 +228,8 @@ def retract(
     else:
         left = left[_excess(constraint, x[left], gap[left])[1] > _CLOSE]
     if left.size:
-        raise SolverError(
-            f"retract: {left.size} of {len(x)} states did not reach the constraint in {_STEPS} "
-            f"Newton steps, |g - d| up to {np.abs(gap[left]).max():.3g}"
-        )
+        raise SolverError(f"retract: {left.size} of {len(x)} states did not reach the constraint "
+                          f"in {_STEPS} Newton steps, |g - d| up to {np.abs(gap[left]).max():.3g}")
     if motion is not None:
         _make_tangent(x, constraint, motion)
     return np.asarray(x.reshape(states.shape))
@@ -252,10 +250,8 @@ def _along_normals(slope: Array, gap: Array) -> Array:
     least = np.linalg.eigvalsh(np.nan_to_num(rows @ rows.mT))[..., 0]
     lost = ~(least > 1e-14)
     if lost.any():
-        raise ValueError(
-            "constraint: needs a Jacobian of full rank, got one that loses rank at state "
-            f"{lost.argmax()} ({lost.sum()} of {lost.size})"
-        )
+        raise ValueError("constraint: needs a Jacobian of full rank, got one that loses rank at "
+                         f"state {lost.argmax()} ({lost.sum()} of {lost.size})")
     dual = np.linalg.solve(slope @ slope.mT, gap[..., None])
     return np.asarray(-(slope.mT @ dual)[..., 0])
 

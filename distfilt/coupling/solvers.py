@@ -215,10 +215,8 @@ def _entropic(cost: Array, a: Array, b: Array, strength: float) -> tuple[Array, 
         matrix, g, off = _newton(part / eps, a[i], b[j], g / eps, 1e-3 if k else 1e-10)
         g = eps * g
     if not off < 1e-8:
-        raise SolverError(
-            f"entropic: marginals off by {off:.3g} after {_NEWTON} Newton steps: "
-            f"regularisation {strength:g} needs to be larger, or another solver"
-        )
+        raise SolverError(f"entropic: marginals off by {off:.3g} after {_NEWTON} Newton steps: "
+                          f"regularisation {strength:g} needs to be larger, or another solver")
     whole, potential = np.zeros(cost.shape), np.zeros(cost.shape[1])
     whole[np.ix_(i, j)], potential[j] = matrix, g
     return _rounded(whole, a, b), potential

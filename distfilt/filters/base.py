@@ -73,8 +73,8 @@ class Filter(Record, ABC):
     A family of one's own is a dataclass that derives from this, names the kind of its `state`, and
     has three methods: `begin` gives the fields of the first state, `advance` makes the next one of
     a :class:`Step`, `summary` tells what is believed. `draws` says that steps need a generator,
-    `joins` that several states can be told as one with an axis more, `fuses` what its agreements
-    fuse, and `unused` why options that it cannot have are refused.
+    `joins`, beside a `summary`, that this takes several states as one with an axis more in front,
+    `fuses` what its agreements fuse, and `unused` why options that it cannot have are refused.
     """
 
     model: Model
@@ -97,6 +97,12 @@ class Filter(Record, ABC):
     changes: ClassVar[bool] = False
     fuses: ClassVar[str | None] = None
     unused: ClassVar[Mapping[str, str]] = {}
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        # A summary of one's own may be right for single states only.
+        if "summary" in vars(cls) and "joins" not in vars(cls):
+            cls.joins = False
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -99,6 +99,7 @@ class ParticleFilter(MembersFilter):
     jitter: Share | None = None
 
     state: ClassVar[type[ParticleState]] = ParticleState
+    joins: ClassVar[bool] = True
 
     def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """Particles drawn for each agent, with equal weights."""

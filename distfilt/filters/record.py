@@ -63,8 +63,21 @@ class Summary:
 
     Examples
     --------
-    >>> Summary(np.zeros((2, 3)), np.ones((2, 3))).numbers
-    {}
+    One that tells for all what the agent believes who knows most:
+
+    >>> from distfilt.filters import GaussianFilter
+    >>> from distfilt.models import Model
+    >>> from distfilt.sensors import direct
+    >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: dt * np.eye(1))
+    >>> class Best(GaussianFilter):
+    ...     def summary(self, state):
+    ...         best = [state.covariances[:, 0, 0].argmin()] * self.count
+    ...         return Summary(state.means[best], state.covariances[best, 0])
+    >>> best = Best(walk, [None, direct([0], std=1.0)], share=False)
+    >>> run = best.run(best.start(([0.0], [[4.0]])), [1.0, 2.0], [None, [[2.0], [2.0]]])
+    >>> run["mean"].values[..., 0].round(3)
+    array([[1.667, 1.667],
+           [1.882, 1.882]])
     """
 
     mean: Array

@@ -249,8 +249,8 @@ def _derivatives(w: Array, fixed: list[Array], determinant: bool) -> tuple[Array
 
 
 def _square(root: Array) -> Array:
-    """A A' of small matrices; a copy of A' is five times as fast as its view."""
-    return np.asarray(np.ascontiguousarray(root) @ np.ascontiguousarray(root.swapaxes(-1, -2)))
+    """A A' of small matrices; with a copy of A' in half the time of its view."""
+    return np.asarray(root @ np.ascontiguousarray(root.swapaxes(-1, -2)))
 
 
 def _newton(weights: Array, slope: Array, mean: Array, curvature: Array, there: Array) -> Array:

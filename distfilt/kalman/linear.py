@@ -126,8 +126,8 @@ def assimilated(
     """
     (cross, inner), d = innovation(cov, H, R, missing), cov.shape[-1]
     lower = cholesky(inner)
-    solved = solve_upper(lower, solve_lower(lower, np.concatenate([cross, gap], axis=-1)))
-    gain, length = solved[..., :d].mT, (gap * solved[..., d:]).sum(axis=-2)
+    white = solve_lower(lower, np.concatenate([cross, gap], axis=-1))
+    gain, length = solve_upper(lower, white[..., :d]).mT, (white[..., d:] ** 2).sum(axis=-2)
     constant = np.log(2 * np.pi) * (~missing).sum(axis=-1) + log_det(lower)
     return gain @ gap, joseph(cov, gain, H, R), -0.5 * (length + constant[..., None])
 

@@ -31,12 +31,8 @@ MODEL = LinearModel.from_transition(3, lambda dt: np.eye(3), lambda t, dt: dt * 
 def by_distfilt(n: int, seen: np.ndarray) -> np.ndarray:
     sensor = Sensor(2, lambda x: x @ H.T, R, linear=lambda d: H)
     f = ParticleFilter(MODEL, [sensor], members=n, threshold=1.0)
-    state = f.start((np.zeros(3), np.eye(3)), rng=np.random.default_rng(1))
-    out = np.empty((STEPS, 3))
-    for k in range(STEPS):
-        state = f.step(state, TIMES[k], [seen[k]])
-        out[k] = state.weights[0] @ state.points[0]
-    return out
+    states = f.steps(f.start((np.zeros(3), np.eye(3)), rng=np.random.default_rng(1)), TIMES, [seen])
+    return np.array([state.weights[0] @ state.points[0] for state in states])
 
 
 def by_particles(package: Any, n: int, seen: np.ndarray) -> np.ndarray:
