@@ -102,16 +102,17 @@ def test_factor_of_nothing_and_of_a_mixed_stack() -> None:
 
 # --- solves -----------------------------------------------------------------------------------
 
-LEADING = [(), (1,), (3,), (40,), (2, 3), (5, 8)]
-"""One system, a call for each, and substitution in all of them at once."""
+LEADING = [(), (1,), (3,), (40,), (2, 3), (5, 8), (5000,)]
+"""One system, a call for each, and substitution in all of them at once, or in several blocks."""
 
 
 @pytest.mark.parametrize("leading", LEADING)
 @pytest.mark.parametrize("d", [1, 2, 5])
 def test_triangular_solves_of_every_number_of_systems(leading: tuple[int, ...], d: int) -> None:
     rng = generator(d)
-    lower = np.linalg.cholesky(spd(rng, d, leading))
+    lower = np.linalg.cholesky(cov := spd(rng, d, leading))
     right = rng.standard_normal((*leading, d, 3))
+    assert all(np.allclose(s * cov @ linalg.solve_definite(s * cov, right), right) for s in (1, -1))
     lower.flags.writeable = right.flags.writeable = False
     for solve, matrix in ((linalg.solve_lower, lower), (linalg.solve_upper, _turned(lower))):
         out = solve(lower, right)
