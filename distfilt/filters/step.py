@@ -78,6 +78,20 @@ class Step:
     >>> f.step(f.start((np.zeros(4), np.eye(4))), 0.5, [[1.0]]).t
     0.5 [[0]]
     0.5
+
+    What one agent hears in every run another may miss in some:
+
+    >>> from distfilt.network import Faults, Graph
+    >>> heard = Graph.from_edges(3, [(0, 1), (0, 2)])
+    >>> loss = np.zeros((3, 3))
+    >>> loss[2, 0] = 0.5
+    >>> f = GaussianFilter(constant_velocity(sigma=0.1), [direct([0], std=1.0), None, None], heard,
+    ...                    faults=Faults(loss=loss))
+    >>> state = f.step(f.start((np.zeros(4), np.eye(4)), runs=(4,)), 0.0, [[1.0], None, None])
+    >>> state.means[..., 0].T
+    array([[0.5, 0.5, 0.5, 0.5],
+           [0.5, 0.5, 0.5, 0.5],
+           [0. , 0. , 0. , 0.5]])
     """
 
     def __init__(
@@ -155,10 +169,10 @@ class Step:
         f = self.filter
         if not self.late and (f.graph is None or not f.share):
             return {self.t: [[(sensor_of(f, s), s.value) for s in mine] for mine in self.said]}
-        own = [list(mine) for mine in self.said]
+        own = [list(mine) for mine in self.said] if self.late else self.said
         for late in self.late:
             own[late.agent].append(late)
-        told, inbox = self._told(own), [dict[int, Any]() for _ in own]
+        told, inbox = self._told(own), [dict[int, Any]()] * len(own)
         if self.channel is not None and told:
             inbox = self.channel.exchange([self._payload(mine) for mine in told])
         known: dict[float, list[list[Any]]] = defaultdict(lambda: [[] for _ in own])
