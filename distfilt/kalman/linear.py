@@ -117,15 +117,16 @@ def kalman_filter(
     return unflattened(means.mT, covs, density, runs)
 
 
-def assimilated(
-    cov: Array, gap: Array, H: Array, R: Array, missing: Mask
-) -> tuple[Array, Array, Array]:
+def assimilated(cov: Array, gap: Array, H: Array, R: Array, missing: Mask) -> tuple[Array, ...]:
     """How innovations (..., m, k) move the mean, the covariance after it, and their log densities.
 
     An innovation is 0 where it is missing.
     """
     (cross, inner), d = innovation(cov, H, R, missing), cov.shape[-1]
-    lower = cholesky(inner)
+    try:
+        lower = cholesky(inner)
+    except np.linalg.LinAlgError:
+        raise np.linalg.LinAlgError("the innovation covariance is not positive definite") from None
     white = solve_lower(lower, np.concatenate([cross, gap], axis=-1))
     gain, length = solve_upper(lower, white[..., :d]).mT, (white[..., d:] ** 2).sum(axis=-2)
     constant = np.log(2 * np.pi) * (~missing).sum(axis=-1) + log_det(lower)
