@@ -175,20 +175,19 @@ class Step:
         told, inbox = self._told(own), [dict[int, Any]()] * len(own)
         if self.channel is not None and told:
             inbox = self.channel.exchange([self._payload(mine) for mine in told])
+        kinds = [[(said.t, sensor_of(f, said)) for said in mine] for mine in told]
         known: dict[float, list[list[Any]]] = defaultdict(lambda: [[] for _ in own])
-        now, last = known[self.t], dict[int, Any]()
         for agent, (mine, box) in enumerate(zip(own, inbox, strict=True)):
             for sender in sorted((agent, *box)):
                 if sender == agent:
                     for said in mine:
                         known[said.t][agent].append((sensor_of(f, said), said.value))
                 elif type(got := box[sender]) is tuple:
-                    for said, value in zip(told[sender], got, strict=False):
-                        known[said.t][agent].append((sensor_of(f, said), value))
-                else:  # one of now, which is the same for all who hear it whole
-                    if sender not in last or last[sender][1] is not got:
-                        last[sender] = sensor_of(f, told[sender][0]), got
-                    now[agent].append(last[sender])
+                    for (t, sensor), value in zip(kinds[sender], got, strict=False):
+                        known[t][agent].append((sensor, value))
+                else:
+                    t, sensor = kinds[sender][0]
+                    known[t][agent].append((sensor, got))
         return known
 
     def _told(self, own: list[list[Reading]]) -> list[list[Reading]]:
