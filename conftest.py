@@ -1,4 +1,4 @@
-"""Makes nbval run a cell as Jupyter does, and compare its pictures.
+"""Makes nbval run a cell as Jupyter does, compare its pictures, and open no port.
 
 nbval sends ``store_history=False``; IPython then shows the value of a last line that ends in ``;``,
 and the cell fails against an output that Jupyter stored without it. And it compares no picture: one
@@ -22,10 +22,11 @@ def pytest_configure(config: pytest.Config) -> None:
     """Nothing to change, or to import, where no notebook is run."""
     if not config.getoption("nbval", False):
         return
-    from nbval.kernel import RunningKernel
+    import nbval.kernel
     from nbval.plugin import IPyNbCell
 
     from pictures import differences, without_pictures
+    from sockets import Manager
 
     compare_texts = IPyNbCell.compare_outputs
 
@@ -38,5 +39,6 @@ def pytest_configure(config: pytest.Config) -> None:
         cell.comparison_traceback += found
         return not found
 
-    RunningKernel.execute_cell_input = _execute_cell_input
+    nbval.kernel.KernelManager = Manager
+    nbval.kernel.RunningKernel.execute_cell_input = _execute_cell_input
     IPyNbCell.compare_outputs = compare_outputs

@@ -32,6 +32,7 @@ from nbclient.exceptions import CellExecutionError
 
 from common import ROOT, chosen, foreign_text, pinned_environment
 from pictures import differences, lighten, taken_out
+from sockets import AsyncManager
 
 KERNELSPEC = {"display_name": "Python 3", "language": "python", "name": "python3"}
 LANGUAGE = {
@@ -84,6 +85,7 @@ def run(notebook: Any, folder: Path) -> None:
         notebook,
         timeout=900,
         kernel_name="python3",
+        kernel_manager_class=AsyncManager,
         record_timing=False,
         coalesce_streams=True,
         extra_arguments=["--log-level=40"],
