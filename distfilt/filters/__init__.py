@@ -1,5 +1,8 @@
 """Filters: a model, sensors, an update and a network, put together on one contract."""
 
+# First, where few calls are nested: from deep within, Python takes and returns memory all the time.
+import scipy.linalg  # noqa: F401
+
 from ..updates.particles import ParticleCollapse
 from .base import Filter
 from .density import DensityFilter, DensityState
