@@ -203,8 +203,10 @@ def _blocks(lower: Array, right: Array, transposed: int) -> Array:
 def _substituted(lower: Array, x: Array, transposed: int) -> Array:
     """Solve in place, row after row of (d, k, n), with factors (d, d, n) or (d, d, 1)."""
     for i in reversed(range(len(x))) if transposed else range(len(x)):
-        rest = slice(0, i) if transposed else slice(i + 1, None)
         x[i] /= lower[i, i]
+        if i == (0 if transposed else len(x) - 1):
+            break
+        rest = slice(0, i) if transposed else slice(i + 1, None)
         x[rest] -= (lower[i, rest] if transposed else lower[rest, i])[:, None] * x[i]
     return x
 

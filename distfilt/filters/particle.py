@@ -158,13 +158,13 @@ class ParticleFilter(MembersFilter):
         poor = state.effective_size < self.threshold * self.members
         if not poor.any():
             return weights
-        picked = self._pick(stack, weights, state.weights, poor, offset)
+        counts = self._pick(stack, weights, state.weights, poor, offset)
         if noise is not None:
             # Where one weight dominates, the spread of all particles: the weighted one is gone.
             lost = state.effective_size[poor][:, None] < 2
             shares = np.where(lost, 1 / self.members, state.weights[poor])
             cov = weighted_moments(before[poor], shares)[1]
-            copied = particles.copies(picked).reshape(-1, self.members)
+            copied = particles.taken((counts > 1)[..., None], counts).reshape(-1, self.members)
             stack[-1][poor] = particles.jittered(stack[-1][poor], cov, width, noise[poor], copied)
         return weights
 
@@ -180,14 +180,14 @@ class ParticleFilter(MembersFilter):
     ) -> Any:
         """Resample some agents' paths in the stack; the weights are equal then."""
         rows = slice(None) if poor.all() else poor
-        picked = particles.picked_by(weights[rows], offset[rows])
+        counts = particles.counted(weights[rows], offset[rows])
         for k, path in enumerate(stack):
-            stack[k] = moved = particles.taken(path[rows], picked)
+            stack[k] = moved = particles.taken(path[rows], counts)
             if rows is poor:
                 stack[k] = path.copy()
                 stack[k][rows] = moved
         log_weights[rows] = -np.log(self.members)
-        return picked
+        return counts
 
     def _warn(self, state: ParticleState) -> None:
         """Distinct particles may have no weight, and particles of equal weight may be copies."""
@@ -197,9 +197,9 @@ class ParticleFilter(MembersFilter):
         if not size.size:
             return
         least = max(0.01 * self.members, 2.0)
-        # A few that differ are proof enough; all are looked at only where they do not.
-        few = points[..., :: max(1, self.members // (4 * math.ceil(least))), :]
-        distinct = particles.distinct_share(few).min() * few.shape[-2] / self.members
+        # A few whose first components differ are proof enough; all are looked at where they do not.
+        few = np.sort(points[..., :: max(1, self.members // (4 * math.ceil(least))), 0])
+        distinct = (few[..., 1:] > few[..., :-1]).sum(axis=-1).min() / self.members
         if distinct * self.members < least:
             distinct = particles.distinct_share(points).min()
         if distinct * self.members < least:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -68,12 +68,10 @@ def warn_of_weights(log_weights: Array, predicted: Array, observed: Array, noise
     warn_of_collapse(what, "rejuvenation=")
 
 
-def taken(points: Array, picked: Indices) -> Array:
-    """Rows of points (..., N, d) by their indices (..., N)."""
-    n, d = points.shape[-2:]
-    first = n * np.arange(picked.size // n)[:, None]
-    rows = picked.reshape(-1, n) + first
-    return np.asarray(points.reshape(-1, d).take(rows, axis=0).reshape(points.shape))
+def taken(points: Any, counts: Indices) -> Any:
+    """Rows of points (..., N, d), each as often as its count (..., N), N in all."""
+    rows = points.reshape(-1, points.shape[-1])
+    return np.repeat(rows, counts.reshape(-1), axis=0).reshape(points.shape)
 
 
 @door
@@ -102,22 +100,23 @@ def resampled(probabilities: Annotated[Weights, "... n"], *, rng: Rng) -> Indice
     >>> resampled([0.5, 0.0, 0.25, 0.25], rng=np.random.default_rng(0))
     array([0, 0, 2, 3])
     """
-    return picked_by(probabilities, rng.random((*probabilities.shape[:-1], 1)))
+    counts = counted(probabilities, rng.random((*probabilities.shape[:-1], 1)))
+    each = np.broadcast_to(np.arange(counts.shape[-1])[:, None], (*counts.shape, 1))
+    return np.asarray(taken(each, counts)[..., 0])
 
 
-def picked_by(w: Array, offset: Array) -> Indices:
-    """Index of the weight (..., N) that holds each of the levels (k + offset) / N."""
+def counted(w: Array, offset: Array) -> Indices:
+    """How many of the levels (k + offset) / N each weight (..., N) holds."""
     n = w.shape[-1]
     # How many levels lie below each edge; the last edge has all of them.
     levels = w.cumsum(axis=-1)
     levels /= levels[..., -1:].copy()
     levels *= n
     levels -= offset
-    copies = np.minimum(np.ceil(levels, out=levels), n, out=levels).astype(np.intp)
-    copies[..., -1] = n
-    copies[..., 1:] -= copies[..., :-1]
-    each = np.arange(n) if copies.size == n else np.tile(np.arange(n), copies.size // n)
-    return np.repeat(each, copies.reshape(-1)).reshape(copies.shape)
+    counts: Indices = np.ceil(levels, out=levels).astype(np.intp)
+    counts[..., -1] = n
+    counts[..., 1:] -= counts[..., :-1]
+    return counts
 
 
 @door
@@ -167,15 +166,6 @@ def jitter(
 def silverman(n: int, d: int) -> float:
     """The bandwidth for n particles of d components, at most one."""
     return float(min(1.0, (4 / (n * (d + 2))) ** (1 / (d + 4))))
-
-
-def copies(picked: Indices) -> Mask:
-    """Which of the sorted indices (..., N) stand there more than once."""
-    out = np.zeros(picked.shape, dtype=bool)
-    same = picked[..., 1:] == picked[..., :-1]
-    out[..., 1:] |= same
-    out[..., :-1] |= same
-    return out
 
 
 def jittered(x: Array, cov: Array, h: float, drawn: Array, copied: Mask | None = None) -> Array:

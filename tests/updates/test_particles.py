@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from distfilt.updates import effective_size, jitter, resampled
-from distfilt.updates.particles import copies, distinct_share, jittered, silverman, weighed
+from distfilt.updates.particles import distinct_share, jittered, silverman, taken, weighed
 
 from .cases import rng
 
@@ -16,11 +16,10 @@ from .cases import rng
 @given(st.integers(0, 10**6), st.integers(1, 60))
 def test_systematic_is_the_inverse_of_the_distribution_function(seed: int, n: int) -> None:
     w = rng(seed).dirichlet(np.full(n, 0.2), size=4)
-    picked = resampled(w, rng=rng(6))
     levels = (np.arange(n) + rng(6).random((4, 1))) / n
     wanted = [np.searchsorted(np.cumsum(v) / v.sum(), u, side="right")
               for v, u in zip(w, levels, strict=True)]
-    assert np.array_equal(picked, wanted)
+    assert np.array_equal(resampled(w, rng=rng(6)), wanted)
 
 
 def test_effective_size_between_one_and_n() -> None:
@@ -66,10 +65,11 @@ def test_jitter_keeps_mean_and_covariance_on_average() -> None:
 
 
 def test_jitter_of_copies_moves_them_only_and_from_the_covariance_given() -> None:
-    picked = np.tile([0, 0, 1, 2, 2, 2, 3], (4000, 1))
-    assert np.array_equal(copies(picked)[0], [1, 1, 0, 1, 1, 1, 0])
-    x, cov = picked[..., None] * np.array([1.0, -2.0]), np.array([[2.0, 0.6], [0.6, 0.5]])
-    out = jittered(x, cov, 0.5, rng().standard_normal(x.shape), copies(picked))
+    counts, each = np.tile([2, 1, 3, 1, 0, 0, 0], (4000, 1)), np.tile(np.arange(7.0), (4000, 1))
+    x, copied = taken(each[..., None] * [1.0, -2.0], counts), taken(counts[..., None] > 1, counts)
+    assert np.array_equal(x[5, :, 0], [0, 0, 1, 2, 2, 2, 3])
+    cov, drawn = np.array([[2.0, 0.6], [0.6, 0.5]]), rng().standard_normal(x.shape)
+    out = jittered(x, cov, 0.5, drawn, copied[..., 0])
     assert (out[:, [2, 6]] == x[:, [2, 6]]).all() and (distinct_share(out) == 1).all()
     moved = (out - x)[:, [0, 1, 3, 4, 5]].reshape(-1, 2)
     assert np.abs(moved.mean(axis=0)).max() < 4 * 0.5 * np.sqrt(2 / len(moved))
