@@ -13,8 +13,8 @@ from ..sensors import Sensor
 
 __all__ = ["Heard", "groups"]
 
-Known = Sequence[Sequence[tuple[Sensor, Array]]]
-"""Of each agent the readings that it has: their sensors, and their values (*runs, m)."""
+Of = Sequence[Sequence[Any]]
+"""Of each agent something about every reading that it has."""
 
 
 class Heard:
@@ -26,7 +26,7 @@ class Heard:
 
     >>> from distfilt.sensors import direct
     >>> sensor = direct([0], std=0.5)
-    >>> (pair,) = groups([[(sensor, np.array([1.0]))]] * 2)
+    >>> (pair,) = groups([[sensor]] * 2, [[np.array([1.0])]] * 2)
     >>> pair.agents, pair.target.ravel(), pair.noise
     (array([0, 1]), array([1., 1.]), array([[0.25]]))
     """
@@ -71,9 +71,9 @@ class Heard:
             self.matrices[dim] = h
         return self.matrices[dim]
 
-    def collected(self, known: Known) -> Array:
+    def collected(self, values: Of) -> Array:
         """The readings of each agent of the group side by side, (*runs, G, M)."""
-        rows = [value for agent in self.agents.tolist() for _, value in known[agent]]
+        rows = [value for agent in self.agents.tolist() for value in values[agent]]
         flat = rows[0] if len(rows) == 1 else np.concatenate(rows, axis=-1)
         return flat.reshape(*flat.shape[:-1], *self.owner.shape)
 
@@ -157,11 +157,11 @@ def _planned(pattern: tuple[tuple[Sensor, ...], ...]) -> list[Heard]:
     return [Heard(agents, pattern) for _, agents in sorted(sizes.items())]
 
 
-def groups(known: Known) -> list[Heard]:
+def groups(sensors: Of, values: Of) -> list[Heard]:
     """Who knows what, in groups; the plan of a pattern is made when it is first needed.
 
-    >>> groups([[], []])
+    >>> groups([[], []], [[], []])
     []
     """
-    plans = _planned(tuple([tuple([sensor for sensor, _ in own]) for own in known]))
-    return [plan.aimed(plan.collected(known)) for plan in plans]
+    plans = _planned(tuple([tuple(own) for own in sensors]))
+    return [plan.aimed(plan.collected(values)) for plan in plans]

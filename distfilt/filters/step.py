@@ -159,16 +159,17 @@ class Step:
         """
         known = self._known()
         for place, t in enumerate((*self.times, self.t)):
-            for group in groups(known[t]) if t in known else ():
+            for group in groups(*known[t]) if t in known else ():
                 if self.lost:
                     group = group.aimed(self.kept(group.target, np.nan))
                 yield place, group
 
-    def _known(self) -> dict[float, list[list[tuple[Sensor, Array]]]]:
+    def _known(self) -> dict[float, tuple[list[list[Sensor]], list[list[Array]]]]:
         """For each time the readings that each agent has, its own and what it heard, by sender."""
         f = self.filter
         if not self.late and (f.graph is None or not f.share):
-            return {self.t: [[(sensor_of(f, s), s.value) for s in mine] for mine in self.said]}
+            sensors = [[sensor_of(f, said) for said in mine] for mine in self.said]
+            return {self.t: (sensors, [[said.value for said in mine] for mine in self.said])}
         own = [list(mine) for mine in self.said] if self.late else self.said
         for late in self.late:
             own[late.agent].append(late)
@@ -176,18 +177,21 @@ class Step:
         if self.channel is not None and told:
             inbox = self.channel.exchange([self._payload(mine) for mine in told])
         kinds = [[(said.t, sensor_of(f, said)) for said in mine] for mine in told]
-        known: dict[float, list[list[Any]]] = defaultdict(lambda: [[] for _ in own])
+        known: dict[float, Any] = defaultdict(lambda: ([[] for _ in own], [[] for _ in own]))
         for agent, (mine, box) in enumerate(zip(own, inbox, strict=True)):
             for sender in sorted((agent, *box)):
                 if sender == agent:
                     for said in mine:
-                        known[said.t][agent].append((sensor_of(f, said), said.value))
+                        known[said.t][0][agent].append(sensor_of(f, said))
+                        known[said.t][1][agent].append(said.value)
                 elif type(got := box[sender]) is tuple:
                     for (t, sensor), value in zip(kinds[sender], got, strict=False):
-                        known[t][agent].append((sensor, value))
+                        known[t][0][agent].append(sensor)
+                        known[t][1][agent].append(value)
                 else:
                     t, sensor = kinds[sender][0]
-                    known[t][agent].append((sensor, got))
+                    known[t][0][agent].append(sensor)
+                    known[t][1][agent].append(got)
         return known
 
     def _told(self, own: list[list[Reading]]) -> list[list[Reading]]:
