@@ -269,7 +269,7 @@ def batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Arr
     """What a function makes of states (..., d), as (..., ``owner.dim``); it gets copies.
 
     A function that was written for one state may return the right shape with wrong numbers. So the
-    first rows that differ are compared with one of them alone.
+    first numbers that differ are compared with what it makes of one state alone.
 
     Parameters
     ----------
@@ -309,7 +309,7 @@ def batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Arr
                 f"{name}: needs to take many states at once, (..., d), with the components last "
                 f"(x[..., 0], not x[0]), got one that is right for a single state only"
             )
-        if fits and (x.reshape(-1, x.shape[-1])[0] != last[0]).any():
+        if fits and (x != last[0][-1]).any():
             vars(owner)["_compared"] = True
     if fits:
         return np.asarray(out)

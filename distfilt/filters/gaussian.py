@@ -12,6 +12,7 @@ import numpy as np
 from ..doors import Array, Bounds, Count, NonNegative, unchecked
 from ..gaussians.single import conditioned, unscented_points
 from ..linalg import cholesky, solve_upper, symmetrise
+from ..models import LinearModel
 from .base import Filter
 from .inbox import Heard
 from .inputs import moments_of
@@ -164,23 +165,25 @@ class GaussianFilter(Filter):
         moved, slope, extra = self._linearised(
             partial(unchecked(model.step), t=state.t, dt=dt),
             partial(unchecked(model.jacobian), t=state.t, dt=dt), state.means, state.covariances,
+            isinstance(model, LinearModel),
         )
         shift, old = np.ascontiguousarray(slope), state.joint_covariances
         covs = shift @ old[..., :d, :d] @ shift.mT + (unchecked(model.noise)(state.t, dt) + extra)
         if kept:  # the past stays as it is, and only its products with the present move
+            moved = np.concatenate([moved, state.joint_means[..., : kept * d]], axis=-1)
             across = shift @ old[..., :d, : kept * d]
             covs = np.block([[covs, across], [across.mT, old[..., : kept * d, : kept * d]]])
         if self.inflation != 1.0:
             covs[..., :d, :] *= self.inflation
             covs[..., :, :d] *= self.inflation
-        return np.concatenate([moved, state.joint_means[..., : kept * d]], axis=-1), covs
+        return moved, covs
 
     def _linearised(
         self, function: Callable[[Array], Array], jacobian: Callable[[Array], Array], mean: Array,
-        cov: Array,
+        cov: Array, linear: bool,
     ) -> tuple[Array, Array, Array | float]:
         """Value, slope and extra covariance of a function of a Gaussian (..., d)."""
-        if self.rule == "extended":
+        if linear or self.rule == "extended":  # points would find the same of what is linear
             return function(mean[..., None, :])[..., 0, :], jacobian(mean), 0.0
         root, d = cholesky(cov), mean.shape[-1]
         points, w = unchecked(unscented_points)(mean, root, kappa=self.kappa)
@@ -192,28 +195,28 @@ class GaussianFilter(Filter):
         slope = solve_upper(root, half).mT
         return at, slope, (w[:, None] * gap).mT @ gap - half.mT @ half
 
-    def _condition(
-        self, means: Array, covs: Array, slot: int, group: Heard, step: Step
-    ) -> dict[tuple[int, ...], str]:
+    def _condition(self, means: Array, covs: Array, slot: int, group: Heard, step: Step) -> Any:
         """Condition a group's joint Gaussians in place; the rows that failed."""
         d, rows = self.model.dim, group.rows
         here = slice(slot * d, (slot + 1) * d)
         m, p = means[..., rows, :], covs[..., rows, :, :]
         x, own = m[..., here], p[..., here, here]
         predict, jacobian = group.predict, group.jacobian
-        at, slope, extra = self._linearised(predict, jacobian, x, own)
+        at, slope, extra = self._linearised(predict, jacobian, x, own, group.linear)
 
         def alike(_: Array) -> tuple[Array, Array]:
-            mean, h, rest = self._linearised(partial(predict, alike=True), jacobian, x, own)
+            near = partial(predict, alike=True)
+            mean, h, rest = self._linearised(near, jacobian, x, own, group.linear)
             return mean, h @ own @ h.mT + rest
 
         group = step.gated(group, alike, at[..., None, :])
-        big = np.zeros((*slope.shape[:-1], m.shape[-1]))
-        big[..., here] = slope
-        noise = np.zeros((*big.shape[:-1], big.shape[-2])) + group.noise + extra
+        noise = np.full((*slope.shape[:-1], slope.shape[-2]), group.noise) + extra
+        if m.shape[-1] > d:
+            part, slope = slope, np.zeros((*slope.shape[:-1], m.shape[-1]))
+            slope[..., here] = part
         (m, p), errors = guarded(
-            lambda m, p, gap, big, noise, *_: unchecked(conditioned)(m, p, gap, big, noise),
-            (m, p, group.target - at, big, noise), (m, p), group.target.ndim - 1,
+            lambda m, p, gap, h, noise, *_: unchecked(conditioned)(m, p, gap, h, noise),
+            (m, p, group.target - at, slope, noise), (m, p), group.target.ndim - 1,
         )
         means[..., rows, :], covs[..., rows, :, :] = m, p
         return errors

@@ -13,9 +13,6 @@ from ..sensors import Sensor
 
 __all__ = ["Heard", "groups"]
 
-Of = Sequence[Sequence[Any]]
-"""Of each agent something about every reading that it has."""
-
 
 class Heard:
     """The readings that G agents have, equally many numbers each, M.
@@ -71,7 +68,7 @@ class Heard:
             self.matrices[dim] = h
         return self.matrices[dim]
 
-    def collected(self, values: Of) -> Array:
+    def collected(self, values: Sequence[Sequence[Array]]) -> Array:
         """The readings of each agent of the group side by side, (*runs, G, M)."""
         rows = [value for agent in self.agents.tolist() for value in values[agent]]
         flat = rows[0] if len(rows) == 1 else np.concatenate(rows, axis=-1)
@@ -119,7 +116,7 @@ class Heard:
         """Derivatives of the readings at states (*runs, G, d), (*runs, G, M, d)."""
         d = states.shape[-1]
         if self.linear:
-            return np.broadcast_to(self.matrix(d), (*self.target.shape, d))
+            return np.full((*self.target.shape, d), self.matrix(d))
         out = np.empty((*self.target.shape, d))
         for sensor, rows, cells in self.parts:
             out[(..., *cells, slice(None))] = unchecked(sensor.jacobian)(states[..., rows, :])
@@ -157,8 +154,10 @@ def _planned(pattern: tuple[tuple[Sensor, ...], ...]) -> list[Heard]:
     return [Heard(agents, pattern) for _, agents in sorted(sizes.items())]
 
 
-def groups(sensors: Of, values: Of) -> list[Heard]:
-    """Who knows what, in groups; the plan of a pattern is made when it is first needed.
+def groups(sensors: Sequence[Any], values: Sequence[Sequence[Array]]) -> list[Heard]:
+    """Agents in groups, from each one's sensors and values (*runs, m) in a list of its own.
+
+    The plan of a pattern is made when it is first needed.
 
     >>> groups([[], []], [[], []])
     []

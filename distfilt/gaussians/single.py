@@ -7,7 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import MISSING, Array, Cov, Mask, Semidefinite, door
+from ..doors import MISSING, Array, Cov, Mask, Semidefinite, all_finite, door
 from ..linalg import EPS, cholesky, leading, log_det, quadratic_form, solve_definite
 
 __all__ = ["conditioned", "log_density", "recolour", "unscented_points"]
@@ -136,15 +136,15 @@ def conditioned(
     >>> x, p
     (array([1.]), array([[0.5]]))
     """
-    missing = np.isnan(gap)
-    if missing.any():  # a row of H may be missing too
+    missing = None if all_finite(gap) else np.isnan(gap)
+    if missing is not None:  # a row of H may be missing too
         H, gap = np.where(missing[..., None], 0.0, H), np.where(missing, 0.0, gap)
     cross, inner = innovation(cov, H, R, missing)
     gain = solve_definite(inner, cross).mT
     return mean + (gain @ gap[..., None])[..., 0], joseph(cov, gain, H, R)
 
 
-def innovation(cov: Array, H: Array, R: Array, missing: Mask) -> tuple[Array, Array]:
+def innovation(cov: Array, H: Array, R: Array, missing: Mask | None) -> tuple[Array, Array]:
     """Covariance of a reading's prediction with the state, (..., m, d), and of the innovation.
 
     Components (..., m) that are missing have no gain, and a one on the innovations' diagonal: that
@@ -152,7 +152,7 @@ def innovation(cov: Array, H: Array, R: Array, missing: Mask) -> tuple[Array, Ar
     """
     cross = H @ cov
     inner = cross @ np.ascontiguousarray(H.mT) + R
-    if missing.any():
+    if missing is not None and missing.any():
         gone = np.nonzero(np.broadcast_to(missing, inner.shape[:-1]))
         cross = np.broadcast_to(cross, (*inner.shape[:-1], cross.shape[-1])).copy()
         cross[gone] = inner[gone] = inner.mT[gone] = 0.0

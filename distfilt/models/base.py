@@ -166,7 +166,7 @@ class LinearModel(Model):
     @door
     def jacobian(self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegative) -> Array:
         """Derivative of a step, the same matrix for all states, as (..., d, d)."""
-        return np.broadcast_to(unchecked(self.transition)(dt), (*x.shape, self.dim))
+        return np.full((*x.shape, self.dim), unchecked(self.transition)(dt))
 
 
 def _product(
