@@ -269,7 +269,7 @@ def batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Arr
     """What a function makes of states (..., d), as (..., ``owner.dim``); it gets copies.
 
     A function that was written for one state may return the right shape with wrong numbers. So the
-    first numbers that differ are compared with what it makes of one state alone.
+    first rows that differ are compared with one of them alone, and so is the first only row.
 
     Parameters
     ----------
@@ -291,11 +291,18 @@ def batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Arr
     >>> batched(one, "flow", [x])
     Traceback (most recent call last):
     ValueError: flow: needs to take many states at once, ...
+    >>> unit = SimpleNamespace(dim=2, flow=lambda x: x / np.linalg.norm(x))
+    >>> batched(unit, "flow", [x[1:]])
+    array([[0.6, 0.8]])
+    >>> batched(unit, "flow", [x])
+    Traceback (most recent call last):
+    ValueError: flow: needs to take many states at once, ...
     """
     function, x = getattr(owner, name), states[0]
     out, wanted = _made(function, states, rest), (*x.shape[:-1], owner.dim)
     fits = getattr(out, "shape", None) == wanted  # an error has none
-    if x.ndim > 1 and x.size and not (fits and "_compared" in vars(owner)):
+    done = "_compared" if x.size > x.shape[-1] else "_compared_alone"
+    if x.ndim > 1 and x.size and not (fits and done in vars(owner)):
         last = [s.reshape(-1, s.shape[-1])[-1] for s in states]
         alone = _made(function, last, rest)
         if fits:
@@ -305,12 +312,11 @@ def batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Arr
             many = _made(function, copies, rest)
             wrong = np.shape(alone) == wanted[-1:] and np.shape(many) != wanted
         if wrong:
-            raise ValueError(
-                f"{name}: needs to take many states at once, (..., d), with the components last "
-                f"(x[..., 0], not x[0]), got one that is right for a single state only"
-            )
-        if fits and (x != last[0][-1]).any():
-            vars(owner)["_compared"] = True
+            raise ValueError(f"{name}: needs to take many states at once, (..., d), with components "
+                             "last (x[..., 0], not x[0]), got one that is right for a single one only")
+        first = x.reshape(-1, x.shape[-1])[0]
+        if fits and (first != (last[0] if done == "_compared" else first[-1])).any():
+            vars(owner)[done] = True
     if fits:
         return np.asarray(out)
     if isinstance(out, IndexError):
