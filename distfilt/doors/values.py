@@ -312,8 +312,8 @@ def batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Arr
             many = _made(function, copies, rest)
             wrong = np.shape(alone) == wanted[-1:] and np.shape(many) != wanted
         if wrong:
-            raise ValueError(f"{name}: needs to take many states at once, (..., d), with components "
-                             "last (x[..., 0], not x[0]), got one that is right for a single one only")
+            raise ValueError(f"{name}: needs to take many states at once, (..., d), components "
+                             "last (x[..., 0], not x[0]), got one for a single state only")
         first = x.reshape(-1, x.shape[-1])[0]
         if fits and (first != (last[0] if done == "_compared" else first[-1])).any():
             vars(owner)[done] = True
