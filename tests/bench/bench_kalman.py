@@ -43,9 +43,7 @@ def linear_case(rng: np.random.Generator) -> tuple[tuple[np.ndarray, ...], dict[
     """Prior mean and covariance and observations; the matrices; model, sensors and times."""
     model = clohessy_wiltshire(rate=0.1, sigma=0.2)
     x0 = np.array([100.0, 0.0, 0.0, 10.0, 0.1, 0.0])
-    sensor = stack(
-        [direct([0, 1], std=0.2), direct([1, 2], std=0.2), direct([3, 4, 5], std=0.1)]
-    )
+    sensor = stack([direct([0, 1], std=0.2), direct([1, 2], std=0.2), direct([3, 4, 5], std=0.1)])
     times = DT * np.arange(1, STEPS + 1)
     truth = simulate(model, np.tile(x0, (RUNS, 1)), times, rng=rng)
     matrices = {
@@ -136,8 +134,7 @@ def filters() -> Iterator[Row]:
     for case, y in ("common pattern", whole), ("gaps that differ by run", gaps):
         yield from compared(case, calls, 5, mean, cov, y, **matrices)
     calls, one = {"distfilt": unscented, "filterpy": filterpy_ukf}, slice(None, 1)
-    satellite = "unscented satellite, one run"
-    yield from compared(satellite, calls, 7, mean, cov, whole[:, one], **parts)
+    yield from compared("unscented satellite, one run", calls, 7, mean, cov, whole[:, one], **parts)
     (mean, cov, seen), options = curved_case(rng)
     yield from compared("unscented turn", calls, 3, mean, cov, seen, **options)
     yield from compared("unscented turn, one run", calls, 7, mean, cov, seen[:, one], **options)

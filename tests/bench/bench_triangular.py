@@ -102,9 +102,7 @@ class Toolbox:
             [[], *([v] for v in range(k)), *([v] * o + ["HF"] for v in range(k) for o in bent)]
             for k in (1, 2, 3)
         ]
-        monotone = [
-            [f"LET {k}", *[f"iRBF {k}"] * (order - 1), f"RET {k}"] for k in (1, 2, 3)
-        ]
+        monotone = [[f"LET {k}", *[f"iRBF {k}"] * (order - 1), f"RET {k}"] for k in (1, 2, 3)]
         self.map = module.transport_map(
             X=np.random.default_rng(0).standard_normal((BENT, 4)), monotone=monotone,
             nonmonotone=nonmonotone, polynomial_type="hermite function",
