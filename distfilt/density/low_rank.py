@@ -37,6 +37,9 @@ class Dense(Record):
     --------
     >>> Dense(np.ones(4), np.eye(4)).mean.sum()
     np.float64(4.0)
+    >>> Dense(np.ones(2), [[1.0, 2.0], [2.0, 1.0]])
+    Traceback (most recent call last):
+    ValueError: covariance: needs a positive semidefinite matrix, got smallest eigenvalue -1
     """
 
     mean: Annotated[Array, "n"]

@@ -75,6 +75,23 @@ class Filter(Record, ABC):
     a :class:`Step`, `summary` tells what is believed. `draws` says that steps need a generator,
     `joins`, beside a `summary`, that this takes several states as one with an axis more in front,
     `fuses` what its agreements fuse, and `unused` why options that it cannot have are refused.
+
+    Examples
+    --------
+    >>> import networkx as nx
+    >>> from distfilt.filters import GaussianFilter
+    >>> from distfilt.models import constant_velocity
+    >>> from distfilt.network import intersection
+    >>> from distfilt.sensors import direct
+    >>> walk, two = constant_velocity(sigma=1.0), [direct([0], std=1.0), None]
+    >>> for graph in (nx.path_graph(2), lambda t: [(0, 1)]):
+    ...     f = GaussianFilter(walk, two, graph)
+    ...     print(f.step(f.start((np.zeros(4), np.eye(4))), 0.0, [[1.0], None]).means[:, 0])
+    [0.5 0.5]
+    [0.5 0.5]
+    >>> GaussianFilter(walk, two, graph, agreement=intersection)
+    Traceback (most recent call last):
+    ValueError: agreement: needs a rule that fuses gaussians, got one of ensembles
     """
 
     model: Model

@@ -226,7 +226,20 @@ class DensityFilter(Filter):
         return Seen(x, self.model.grid, self.bandwidth, t, self.local)
 
     def advance(self, step: Step) -> Any:
-        """Share what the agents see of themselves, and take it into their filters."""
+        """Share what the agents see of themselves, and take it into their filters.
+
+        >>> from distfilt.density import Flooding, Grid
+        >>> from distfilt.models import rotating_swarm
+        >>> from distfilt.network import Faults
+        >>> given = FokkerPlanck(rotating_swarm(), Grid((9, 9))), 4, 2.0
+        >>> more = {"agreement": Flooding(), "bandwidth": 0.2, "rank": 9}
+        >>> x = np.random.default_rng(1).random((4, 2))
+        >>> for option in ({"faults": Faults(silent=[0])}, {"every": 1.0}):
+        ...     f = DensityFilter(*given, **more, **option)
+        ...     print(f.step(f.start(x), 0.5, x).ledger.messages)
+        [0 2 2 2]
+        [0 0 0 0]
+        """
         state, seen, t, dt = step.state, step.said, step.t, step.dt
         if not dt:
             raise ValueError(f"t: needs a number above {state.t:g}, got {t:g}")

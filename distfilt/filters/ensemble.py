@@ -25,7 +25,7 @@ from ..sensors import Sensor
 from ..updates import exact_draws, known_noise, sampled_forecast, with_missing
 from ..updates.door import says
 from ..updates.gaussian import exact_forecast
-from ..updates.particles import log_likelihood, warn_of_collapse
+from ..updates.particles import log_likelihood, size_of, warn_of_collapse, warn_of_weights
 from .base import Filter
 from .inbox import Heard
 from .inputs import members_of
@@ -296,7 +296,8 @@ class TransportFilter(MembersFilter):
         Warns
         -----
         ParticleCollapse
-            If one member has nearly all the weight that is carried over.
+            If one member has nearly all the weight that is carried over, or a reading is beyond
+            what the members believe.
         """
         state, now = step.state, step.state.ensembles
         apart = self.count > 1 and callable(self.graph) and step.channel is None
@@ -307,8 +308,7 @@ class TransportFilter(MembersFilter):
             now = self._for_all(draw, (now,), step.rng)
         stack = step.stack(step.moved(now, state.ensembles))
         (logs,) = step.agreed(self._log_likelihoods(stack, step))
-        if step.agrees:
-            logs = self.count * logs
+        logs = self.count * logs if step.agrees else logs
         stack, errors = self._transported(stack, logs, step.rng)
         step.settle(errors, range(self.count))
         self._warn(logs, step)
@@ -332,7 +332,9 @@ class TransportFilter(MembersFilter):
             before = step.before(place, group, stack[:-1])
             predicted = group.predict(stack[place][..., rows, :, :], before)
             group = step.gated(group, sample_moments, predicted)
-            logs[..., rows, :] += log_likelihood(predicted, group.target, group.noise)
+            told = log_likelihood(predicted, group.target, group.noise)
+            warn_of_weights(told, predicted, group.target, group.noise)
+            logs[..., rows, :] += told
         return logs
 
     def _transported(
@@ -358,13 +360,10 @@ class TransportFilter(MembersFilter):
 
     def _warn(self, logs: Array, step: Step) -> None:
         """A coupling that carries all to one member leaves nothing to go on from."""
-        if step.failed.all():
-            return
-        w = normalised(logs[~step.failed] if step.failed.any() else logs)
-        size = float((1 / (w * w).sum(axis=-1)).min())
+        size = size_of(normalised(logs[~step.failed])).min(initial=np.inf)
+        what = f"t = {step.t:g} s: an agent's weights have an effective size of {size:.1f}"
         if size < 1.1:
-            what = f"an agent's weights have an effective size of {size:.1f}"
-            warn_of_collapse(f"t = {step.t:g} s: {what}", "rejuvenation=")
+            warn_of_collapse(what, "rejuvenation=")
 
 
 def recalled(stack: list[Array], now: Array) -> list[Array]:

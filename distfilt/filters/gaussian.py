@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
@@ -11,7 +12,7 @@ import numpy as np
 
 from ..doors import Array, Bounds, Count, NonNegative, unchecked
 from ..gaussians.single import conditioned, unscented_points
-from ..linalg import cholesky, solve_upper, symmetrise
+from ..linalg import EPS, cholesky, solve_upper, symmetrise
 from ..models import LinearModel
 from .base import Filter
 from .inbox import Heard
@@ -138,7 +139,24 @@ class GaussianFilter(Filter):
         return (self.model.dim,)
 
     def advance(self, step: Step) -> Any:
-        """Forecast, condition on what was heard, fuse."""
+        """Forecast, condition on what was heard, fuse.
+
+        Warns
+        -----
+        RuntimeWarning
+            If a deviation after the agreement is below the rounding of its mean.
+
+        Examples
+        --------
+        >>> from distfilt.models import constant_velocity
+        >>> from distfilt.network import graphs, naive_fusion
+        >>> f = GaussianFilter(constant_velocity(sigma=1e-30), [None] * 9, graphs.complete(9),
+        ...                    agreement=naive_fusion)
+        >>> with warnings.catch_warnings(action="error"):
+        ...     f.run(f.start((np.ones(4), np.eye(4))), np.arange(50), [None] * 9)
+        Traceback (most recent call last):
+        RuntimeWarning: agreement: counts what is known again and again, at t = ...
+        """
         means, covs = self._forecast(step)
         means, one = step.moved(means, 0.0), np.eye(means.shape[-1])
         covs = step.moved(covs, one)
@@ -162,11 +180,10 @@ class GaussianFilter(Filter):
         if not dt:
             return state.joint_means.copy(), state.joint_covariances.copy()
         d, kept = state.dim, len(step.times)
-        moved, slope, extra = self._linearised(
-            partial(unchecked(model.step), t=state.t, dt=dt),
-            partial(unchecked(model.jacobian), t=state.t, dt=dt), state.means, state.covariances,
-            isinstance(model, LinearModel),
-        )
+        flow = partial(unchecked(model.step), t=state.t, dt=dt)
+        jacobian = partial(unchecked(model.jacobian), t=state.t, dt=dt)
+        now, linear = (state.means, state.covariances), isinstance(model, LinearModel)
+        moved, slope, extra = self._linearised(flow, jacobian, *now, linear)
         shift, old = np.ascontiguousarray(slope), state.joint_covariances
         covs = shift @ old[..., :d, :d] @ shift.mT + (unchecked(model.noise)(state.t, dt) + extra)
         if kept:  # the past stays as it is, and only its products with the present move
@@ -226,6 +243,10 @@ class GaussianFilter(Filter):
         d = self.model.dim
         old, now = means[..., :d], symmetrise(covs[..., :d, :d])
         m, p = step.agreed(old, now)
+        variance = np.diagonal(p, axis1=-2, axis2=-1)
+        if ((variance > 0) & (variance < (EPS * m) ** 2)).any():
+            text = f"agreement: counts what is known again and again, at t = {step.t:g} s"
+            warnings.warn(text, RuntimeWarning, stacklevel=4)
         if means.shape[-1] == d:
             return m, p
         gain = np.linalg.solve(now, covs[..., :d, :]).mT

@@ -164,7 +164,17 @@ def belated(f: Any, late: Sequence[Reading], state: Any, t: float) -> list[Readi
 
 
 def planned(f: Any, state: Any, times: Any, observations: Any) -> tuple[Array, Iterator[Any]]:
-    """The times of a run's steps, and an iterator over what is observed at each of them."""
+    """The times of a run's steps, and an iterator over what is observed at each of them.
+
+    >>> from distfilt.filters import GaussianFilter
+    >>> from distfilt.models import constant_velocity
+    >>> from distfilt.sensors import direct
+    >>> f = GaussianFilter(constant_velocity(sigma=1.0), [[direct([0], std=1.0)] * 2])
+    >>> seen = [Reading(1.0, 0, [2.0], 1), Reading(0.5, 0, [3.0]), Reading(1.0, 0, [1.0])]
+    >>> times, entries = planned(f, f.start((np.zeros(4), np.eye(4))), None, seen)
+    >>> times, [[float(said.value[0]) for said in own] for own, in entries]
+    (array([0.5, 1. ]), [[3.0], [2.0, 1.0]])
+    """
     grid = np.zeros(0) if times is None else array(times, "times", ("T",))
     increasing(grid, "times")
     entries: Iterator[Any]

@@ -99,6 +99,15 @@ class MixtureFilter(Filter):
     >>> after = f.step(f.start([prior, prior]), 1.0, [[2.0], None])
     >>> after.mixtures[1].means.round(4), after.ledger.scalars
     (array([[0.6667, 0.3333]]), array([3, 3]))
+
+    Agents differ in size from run to run, so that one run is all that a filter takes:
+
+    >>> f.start(prior, runs=(3,))
+    Traceback (most recent call last):
+    ValueError: runs: needs (), one run at a time, got (3,)
+    >>> MixtureFilter(still, [None], target_dim=1, failures="keep")
+    Traceback (most recent call last):
+    ValueError: failures: one run at a time: mixtures of several runs differ in size
     """
 
     _: KW_ONLY
@@ -147,7 +156,14 @@ class MixtureFilter(Filter):
         return Summary(mean, variance, cov, numbers={"mixands": sizes})
 
     def _moved(self, belief: GaussianMixture, agent: int, step: Step) -> GaussianMixture:
-        """Split where the model stretches, then forecast every mixand."""
+        """Split where the model stretches, then forecast every mixand.
+
+        >>> from distfilt.models import Model
+        >>> later = Model(1, lambda x, t, dt: x + t * dt, lambda t, dt: np.zeros((1, 1)))
+        >>> f = MixtureFilter(later, [None], target_dim=1)
+        >>> f.step(f.start(([0.0], [[1.0]]), t=2.0), 3.0, [None]).mixtures[0].means
+        array([[2.]])
+        """
         t, dt, model = step.state.t, step.dt, self.model
         if dt == 0:
             return belief
@@ -164,7 +180,18 @@ class MixtureFilter(Filter):
     def _read(
         self, belief: Any, agent: int, said: Sequence[Reading], step: Step, beside: Any = None
     ) -> tuple[Any, Any]:
-        """An agent's belief after readings, without those that fail its gate, and one beside it."""
+        """An agent's belief after readings, without those that fail its gate, and one beside it.
+
+        >>> from distfilt.models import Model
+        >>> from distfilt.sensors import direct
+        >>> still = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
+        >>> eyes = [direct([k], std=1.0) for k in range(2)]
+        >>> f = MixtureFilter(still, [eyes], target_dim=2, gate=0.99)
+        >>> state = f.start((np.zeros(2), np.eye(2)))
+        >>> state = f.step(state, 0.0, [[Reading(0.0, 0, [9.0]), Reading(0.0, 0, [1.0], 1)]])
+        >>> state.mixtures[0].means, state.refused
+        (array([[0. , 0.5]]), array([1.]))
+        """
         from scipy.special import gammaincinv
 
         for reading in said:
@@ -185,7 +212,19 @@ class MixtureFilter(Filter):
     def _told(
         self, beliefs: list[GaussianMixture], step: Step
     ) -> tuple[Sequence[GaussianMixture], Sequence[GaussianMixture | None]]:
-        """The beliefs after the agents' readings and their exchange, and what stays untold."""
+        """The beliefs after the agents' readings and their exchange, and what stays untold.
+
+        >>> from functools import partial
+        >>> from distfilt.mixtures import target_fusion
+        >>> from distfilt.models import Model
+        >>> from distfilt.network import Faults, graphs
+        >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+        >>> f = MixtureFilter(still, [None] * 3, graphs.path(3), target_dim=1,
+        ...                   agreement=partial(target_fusion, target_dim=1),
+        ...                   faults=Faults(silent=[0]))
+        >>> f.step(f.start(([0.0], [[1.0]])), 1.0, [None] * 3).ledger.messages
+        array([0, 1, 1])
+        """
         after = [self._read(b, k, step.said[k], step)[0] for k, b in enumerate(beliefs)]
         return (self._agreed(after, step) if step.agrees else after), ()
 

@@ -194,17 +194,16 @@ class ParticleFilter(MembersFilter):
         points, size = state.points, state.effective_size
         if np.count_nonzero(state.failed):
             points, size = points[~state.failed], size[~state.failed]
-        if not size.size:
-            return
         least = max(0.01 * self.members, 2.0)
         # A few whose first components differ are proof enough; all are looked at where they do not.
         few = np.sort(points[..., :: max(1, self.members // (4 * math.ceil(least))), 0])
-        distinct = (few[..., 1:] > few[..., :-1]).sum(axis=-1).min() / self.members
+        apart = (few[..., 1:] > few[..., :-1]).sum(axis=-1)
+        distinct = apart.min(initial=self.members) / self.members
         if distinct * self.members < least:
             distinct = particles.distinct_share(points).min()
         if distinct * self.members < least:
             what = f"{distinct:.2%} of an agent's particles are distinct"
-        elif size.min() < 2:
+        elif size.min(initial=np.inf) < 2:
             what = f"an agent's weights have an effective size of {size.min():.1f}"
         else:
             return

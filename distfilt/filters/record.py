@@ -222,6 +222,15 @@ def final_state(run: xarray.Dataset) -> State:
     Examples
     --------
     >>> import xarray
+    >>> from distfilt.filters import GaussianFilter
+    >>> from distfilt.models import constant_velocity
+    >>> f = GaussianFilter(constant_velocity(sigma=1.0), [None])
+    >>> run = f.run(f.start((np.zeros(4), np.eye(4))), [1.0, 2.0], [None])
+    >>> final_state(run).t
+    2.0
+    >>> final_state(run.isel(time=[0]))
+    Traceback (most recent call last):
+    ValueError: run: needs the Dataset that a filter's run returned, got one without a state
     >>> final_state(xarray.Dataset())
     Traceback (most recent call last):
     ValueError: run: needs the Dataset that a filter's run returned, got one without a state

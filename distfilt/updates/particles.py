@@ -57,12 +57,12 @@ def warn_of_weights(log_weights: Array, predicted: Array, observed: Array, noise
     gap = observed - predicted.mean(axis=-2)
     around = predicted - predicted.mean(axis=-2, keepdims=True)
     cov = around.mT @ around / predicted.shape[-2] + noise
-    miss = (gap * np.linalg.solve(cov, gap[..., None])[..., 0]).sum(axis=-1).max(initial=0.0)
+    miss = (gap * np.linalg.solve(cov, gap[..., None])[..., 0]).sum(axis=-1)
     least = size_of(np.exp(log_weights - log_sum(log_weights))).min(initial=np.inf)
     if least < 1.1:
         what = f"an ensemble's weights have an effective size of {least:.1f}"
-    elif miss > m + 10 * np.sqrt(2 * m):
-        what = f"a reading's squared distance from an ensemble's belief is {miss:.0f}, not {m}"
+    elif (most := np.nanmax(miss, initial=0.0)) > m + 10 * np.sqrt(2 * m):
+        what = f"a reading's squared distance from an ensemble's belief is {most:.0f}, not {m}"
     else:
         return
     warn_of_collapse(what, "rejuvenation=")
