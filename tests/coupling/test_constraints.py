@@ -113,9 +113,7 @@ def test_a_rank_that_is_lost_at_one_state_is_named() -> None:
         retract(x, norm([0, 1]))
 
 
-def test_a_constraint_without_a_solution_does_not_converge(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_constraint_without_a_solution_does_not_converge(monkeypatch: pytest.MonkeyPatch) -> None:
     impossible = Constraint(lambda x: (x**2).sum(axis=-1, keepdims=True) + 1, [0.5])
     with pytest.raises((SolverError, ValueError), match=r"did not reach|loses rank"):
         retract([[0.7, 0.4]], impossible)

@@ -11,7 +11,7 @@ import pytest
 
 from distfilt.coupling import ensemble_transform
 from distfilt.coupling.transform import plans
-from distfilt.filters import Reading, TransportFilter
+from distfilt.filters import ParticleCollapse, Reading, TransportFilter
 from distfilt.filters.ensemble import EnsembleState
 from distfilt.linalg import SolverError
 from distfilt.network import Graph, average, graphs
@@ -120,7 +120,8 @@ def test_weights_of_a_run_that_failed_are_no_collapse(monkeypatch: pytest.Monkey
     monkeypatch.setattr("distfilt.filters.ensemble.plans", wary)
     f = TransportFilter(model(), [direct([0], std=0.6)], None, members=30, failures="keep")
     start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(2,))
-    assert f.step(start, 0.5, [[[0.3], [3e4]]]).failed.tolist() == [False, True]
+    with pytest.warns(ParticleCollapse, match="squared distance from an ensemble's belief"):
+        assert f.step(start, 0.5, [[[0.3], [3e4]]]).failed.tolist() == [False, True]
 
 
 def test_a_step_without_any_reading_moves_nothing() -> None:
