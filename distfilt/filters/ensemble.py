@@ -193,7 +193,21 @@ class EnsembleFilter(MembersFilter):
     def _condition(
         self, stack: list[Array], place: int, group: Heard, step: Step
     ) -> dict[tuple[int, ...], str]:
-        """Condition every time's ensembles of a group's agents, in place; the rows that failed."""
+        """Condition every time's ensembles of a group's agents, in place; the rows that failed.
+
+        What stands still is believed the same now as before, also of curved readings in turn:
+
+        >>> from distfilt.models import Model
+        >>> from distfilt.sensors import Sensor
+        >>> from distfilt.updates import serial
+        >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+        >>> cubes = Sensor(2, lambda x: np.concatenate([x, x**3], axis=-1), np.eye(2))
+        >>> f = EnsembleFilter(still, [cubes], members=9, lag=1, update=serial(known_noise))
+        >>> state = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0))
+        >>> state = f.step(state, 1.0, [[1.0, 2.0]])
+        >>> bool(np.allclose(state.history[0][1], state.ensembles))
+        True
+        """
         rows = group.rows
         members = tuple([e[..., rows, :, :] for e in stack])
         # What a late reading tells of the time before is in the stack.
@@ -340,7 +354,18 @@ class TransportFilter(MembersFilter):
     def _transported(
         self, stack: list[Array], logs: Array, rng: np.random.Generator
     ) -> tuple[list[Array], dict[tuple[int, ...], str]]:
-        """All times' members, carried by the coupling of the last time's; the rows that failed."""
+        """All times' members, carried by the coupling of the last time's; the rows that failed.
+
+        Draws of rejuvenation keep what ties the times together:
+
+        >>> from distfilt.models import Model
+        >>> from distfilt.sensors import direct
+        >>> tenth = Model(1, lambda x, t, dt: x / 10, lambda t, dt: np.zeros((1, 1)))
+        >>> f = TransportFilter(tenth, [direct([0], std=0.1)], members=5, lag=1, rejuvenation=0.5)
+        >>> state = f.step(f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [[0.1]])
+        >>> bool(np.allclose(state.history[0][1], 10 * state.ensembles))
+        True
+        """
 
         def compute(here: Array, *rest: Any) -> tuple[Array, ...]:
             times, w = rest[:-2], normalised(here)
@@ -359,7 +384,18 @@ class TransportFilter(MembersFilter):
         return [np.where(told, y, x) for y, x in zip(out, stack, strict=True)], errors
 
     def _warn(self, logs: Array, step: Step) -> None:
-        """A coupling that carries all to one member leaves nothing to go on from."""
+        """A coupling that carries all to one member leaves nothing to go on from.
+
+        >>> import warnings
+        >>> from types import SimpleNamespace
+        >>> step = SimpleNamespace(t=1.0, failed=np.array([False, False, True]))
+        >>> logs = np.array([[[0.0, 0.0]], [[0.0, 0.0]], [[0.0, -99.0]]])  # runs, agents, members
+        >>> TransportFilter._warn(None, logs, step)
+        >>> with warnings.catch_warnings(action="error"):
+        ...     TransportFilter._warn(None, logs[::-1], step)
+        Traceback (most recent call last):
+        distfilt.updates.particles.ParticleCollapse: t = 1 s: an agent's weights have an ...
+        """
         size = size_of(normalised(logs[~step.failed])).min(initial=np.inf)
         what = f"t = {step.t:g} s: an agent's weights have an effective size of {size:.1f}"
         if size < 1.1:

@@ -26,6 +26,10 @@ class Heard:
     >>> (pair,) = groups([[sensor]] * 2, [[np.array([1.0])]] * 2)
     >>> pair.agents, pair.target.ravel(), pair.noise
     (array([0, 1]), array([1., 1.]), array([[0.25]]))
+    >>> quiet, loud = direct([1], std=1.0), direct([1], std=2.0)
+    >>> (pair,) = groups([[sensor, quiet], [sensor, loud]], [[np.ones(1)] * 2] * 2)
+    >>> pair.noise[:, 1, 1]
+    array([1., 4.])
     """
 
     target: Array

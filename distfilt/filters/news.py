@@ -135,7 +135,20 @@ class NewsFilter(MixtureFilter):
     def _told(
         self, beliefs: list[GaussianMixture], step: Step
     ) -> tuple[Sequence[GaussianMixture], Sequence[GaussianMixture | None]]:
-        """Own readings, then others' news, then what all received alike."""
+        """Own readings, then others' news, then what all received alike.
+
+        What all receive and the gate refuses is no news either, though it comes while news wait:
+
+        >>> from distfilt.models import Model
+        >>> from distfilt.network import graphs
+        >>> from distfilt.sensors import direct, stack
+        >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+        >>> f = NewsFilter(still, [stack([direct([0], std=1.0)] * 2)] * 2, graphs.path(2),
+        ...                target_dim=1, common=[1], gate=0.99, every=2.0)
+        >>> state = f.step(f.start(([0.0], [[1.0]])), 1.0, [[1.0, 99.0], [np.nan, 99.0]])
+        >>> [m.means[0] for m in f.step(state, 2.0, [None, None]).mixtures]
+        [array([0.5]), array([0.5])]
+        """
         own, alike = zip(*(self._parted(said) for said in step.said), strict=True)
         after = [self._read(b, k, own[k], step)[0] for k, b in enumerate(beliefs)]
         # What an agent would believe without what it has not told: from before the readings of now,

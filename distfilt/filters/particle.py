@@ -149,7 +149,18 @@ class ParticleFilter(MembersFilter):
         return Summary(state.shown(mean), variance, cov, state.points, w, numbers)
 
     def _resampled(self, stack: list[Array], state: ParticleState, step: Step) -> Array:
-        """Log-weights after agents with a poor effective size have resampled, in place."""
+        """Log-weights after agents with a poor effective size have resampled, in place.
+
+        >>> from distfilt.models import constant_velocity
+        >>> f = ParticleFilter(constant_velocity(sigma=1.0), [None] * 2, share=False, members=4,
+        ...                    threshold=0.9, jitter=0.5)
+        >>> state = f.start((np.zeros(4), np.eye(4)), rng=np.random.default_rng(0))
+        >>> fine, poor = state.log_weights[0], np.log([0.7, 0.1, 0.1, 0.1])
+        >>> moved = [f.step(state.changed(log_weights=np.array([w, poor])), 0.0, [None] * 2)
+        ...          for w in (fine, poor)]
+        >>> (moved[0].points == moved[1].points).all(axis=(1, 2))
+        array([False,  True])
+        """
         weights, before = state.log_weights.copy(), stack[-1]
         # Everybody draws, needed or not: an agent's luck must not depend on another's weights.
         offset = step.rng.random((*weights.shape[:-1], 1))
@@ -190,7 +201,23 @@ class ParticleFilter(MembersFilter):
         return counts
 
     def _warn(self, state: ParticleState) -> None:
-        """Distinct particles may have no weight, and particles of equal weight may be copies."""
+        """Distinct particles may have no weight, and particles of equal weight may be copies.
+
+        >>> import warnings
+        >>> from distfilt.models import constant_velocity
+        >>> from distfilt.network import Ledger
+        >>> f = ParticleFilter(constant_velocity(sigma=1.0), [None] * 2, share=False, members=200)
+        >>> apart = np.random.default_rng(0).standard_normal((2, 200, 4))
+        >>> for moved in ([1.0, 0.0], [1.0, 1.0]):  # the first components are known
+        ...     points = apart * np.array(moved)[:, None, None] * [0, 1, 1, 1]
+        ...     with warnings.catch_warnings(record=True) as caught:
+        ...         warnings.simplefilter("always")
+        ...         f._warn(ParticleState(1.0, Ledger.empty(2), None, points,
+        ...                               np.full((2, 200), -np.log(200))))
+        ...     [str(w.message)[:47] for w in caught]
+        ["t = 1 s: 0.50% of an agent's particles are dist"]
+        []
+        """
         points, size = state.points, state.effective_size
         if np.count_nonzero(state.failed):
             points, size = points[~state.failed], size[~state.failed]

@@ -108,6 +108,10 @@ def runnalls(
     >>> runnalls(three, 2).means.round(2)
     array([[0.1],
            [9. ]])
+    >>> four = GaussianMixture([0.4, 0.4, 0.1, 0.1], [[0.0], [9.0], [1.0], [8.0]], [[[1.0]]] * 4)
+    >>> runnalls(four, 2, heaviest=2).means.round(2)
+    array([[0.2],
+           [8.8]])
     """
     if heaviest is not None and heaviest < size:
         raise ValueError(f"heaviest: needs an integer of at least size, {size}, got {heaviest}")
@@ -184,6 +188,9 @@ def kept_by_relevance(
     >>> kept_by_relevance(mine, theirs, threshold=3.0).means
     array([[0. ],
            [8.5]])
+    >>> shared = GaussianMixture([0.9, 1e-5, 0.1 - 1e-5], [[0.0], [2.0], [9.0]], [[[1.0]]] * 3)
+    >>> kept_by_relevance(shared, GaussianMixture.gaussian([0.0], [[1.0]]), threshold=3.0).size
+    3
     """
     nearest = gaussian_divergences(mixture, other).min(axis=1)
     delta = np.where(mixture.weights > 0, mixture.weights * nearest, np.inf)

@@ -52,7 +52,18 @@ def warn_of_collapse(what: str, option: str) -> None:
 
 
 def warn_of_weights(log_weights: Array, predicted: Array, observed: Array, noise: Array) -> None:
-    """Warn where one member has all the weight, or the reading is beyond what members believe."""
+    """Warn where one member has all the weight, or the reading is beyond what members believe.
+
+    >>> two = np.array([[0.0, -99.0], [0.0, 0.0]]), np.array([[[0.0], [1.0]]] * 2)
+    >>> with warnings.catch_warnings(action="error"):
+    ...     warn_of_weights(*two, np.zeros((2, 1)), np.eye(1))
+    Traceback (most recent call last):
+    distfilt.updates.particles.ParticleCollapse: an ensemble's weights have an effective size of ...
+    >>> with warnings.catch_warnings(action="error"):
+    ...     warn_of_weights(0 * two[0], two[1], np.array([[np.nan], [9.0]]), np.eye(1))
+    Traceback (most recent call last):
+    distfilt.updates.particles.ParticleCollapse: a reading's squared distance from an ensemble's ...
+    """
     m = observed.shape[-1]
     gap = observed - predicted.mean(axis=-2)
     around = predicted - predicted.mean(axis=-2, keepdims=True)

@@ -256,6 +256,16 @@ def localised(
     >>> after = near(x, x[:, :1], [1.0], [[2.0]], rng=np.random.default_rng(0))
     >>> (after != x).any(axis=0)
     array([ True, False])
+
+    On a ring of length 10 the second is near, from wherever it is counted.
+
+    >>> for place in (9.0, -1.0, 11.0):
+    ...     ring = localised(known_noise, places=[[0.0], [place]], readings=[[0.0]], radius=1.0,
+    ...                      period=10.0)
+    ...     print(ring(x, x[:, :1], [1.0], [[2.0]], rng=np.random.default_rng(0))[0].round(3))
+    [-0.049 -0.902]
+    [-0.049 -0.902]
+    [-0.049 -0.902]
     """
     both = np.concatenate([places, readings])
     gap = np.abs(both[:, None] - readings)
