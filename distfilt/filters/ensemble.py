@@ -193,21 +193,7 @@ class EnsembleFilter(MembersFilter):
     def _condition(
         self, stack: list[Array], place: int, group: Heard, step: Step
     ) -> dict[tuple[int, ...], str]:
-        """Condition every time's ensembles of a group's agents, in place; the rows that failed.
-
-        What stands still is believed the same now as before, also of curved readings in turn:
-
-        >>> from distfilt.models import Model
-        >>> from distfilt.sensors import Sensor
-        >>> from distfilt.updates import serial
-        >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-        >>> cubes = Sensor(2, lambda x: np.concatenate([x, x**3], axis=-1), np.eye(2))
-        >>> f = EnsembleFilter(still, [cubes], members=9, lag=1, update=serial(known_noise))
-        >>> state = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0))
-        >>> state = f.step(state, 1.0, [[1.0, 2.0]])
-        >>> bool(np.allclose(state.history[0][1], state.ensembles))
-        True
-        """
+        """Condition every time's ensembles of a group's agents, in place; the rows that failed."""
         rows = group.rows
         members = tuple([e[..., rows, :, :] for e in stack])
         # What a late reading tells of the time before is in the stack.
@@ -354,18 +340,7 @@ class TransportFilter(MembersFilter):
     def _transported(
         self, stack: list[Array], logs: Array, rng: np.random.Generator
     ) -> tuple[list[Array], dict[tuple[int, ...], str]]:
-        """All times' members, carried by the coupling of the last time's; the rows that failed.
-
-        Draws of rejuvenation keep what ties the times together:
-
-        >>> from distfilt.models import Model
-        >>> from distfilt.sensors import direct
-        >>> tenth = Model(1, lambda x, t, dt: x / 10, lambda t, dt: np.zeros((1, 1)))
-        >>> f = TransportFilter(tenth, [direct([0], std=0.1)], members=5, lag=1, rejuvenation=0.5)
-        >>> state = f.step(f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [[0.1]])
-        >>> bool(np.allclose(state.history[0][1], 10 * state.ensembles))
-        True
-        """
+        """All times' members, carried by the coupling of the last time's; the rows that failed."""
 
         def compute(here: Array, *rest: Any) -> tuple[Array, ...]:
             times, w = rest[:-2], normalised(here)

@@ -145,17 +145,6 @@ class GaussianFilter(Filter):
         -----
         RuntimeWarning
             If a deviation after the agreement is below the rounding of its mean.
-
-        Examples
-        --------
-        >>> from distfilt.models import constant_velocity
-        >>> from distfilt.network import graphs, naive_fusion
-        >>> f = GaussianFilter(constant_velocity(sigma=1e-30), [None] * 9, graphs.complete(9),
-        ...                    agreement=naive_fusion)
-        >>> with warnings.catch_warnings(action="error"):
-        ...     f.run(f.start((np.ones(4), np.eye(4))), np.arange(50), [None] * 9)
-        Traceback (most recent call last):
-        RuntimeWarning: agreement: counts what is known again and again, at t = ...
         """
         means, covs = self._forecast(step)
         means, one = step.moved(means, 0.0), np.eye(means.shape[-1])
@@ -239,7 +228,17 @@ class GaussianFilter(Filter):
         return errors
 
     def _agreed(self, means: Array, covs: Array, step: Step) -> tuple[Array, Array]:
-        """Fuse the present states; what is believed of the past follows by its regression."""
+        """Fuse the present states; what is believed of the past follows by its regression.
+
+        >>> from types import SimpleNamespace
+        >>> from distfilt.models import constant_velocity
+        >>> f = GaussianFilter(constant_velocity(sigma=1.0), [None])
+        >>> sure = SimpleNamespace(t=1.0, agreed=lambda m, p: (m, 1e-40 * p))
+        >>> with warnings.catch_warnings(action="error"):
+        ...     f._agreed(np.ones((1, 4)), np.eye(4)[None], sure)
+        Traceback (most recent call last):
+        RuntimeWarning: agreement: counts what is known again and again, at t = 1 s
+        """
         d = self.model.dim
         old, now = means[..., :d], symmetrise(covs[..., :d, :d])
         m, p = step.agreed(old, now)

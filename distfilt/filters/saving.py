@@ -182,7 +182,25 @@ class SensorState(State):
 
     @property
     def earlier(self) -> tuple[Self, ...]:
-        """A state for each of these times, as what is believed of it by now."""
+        """A state for each of these times, as what is believed of it by now.
+
+        What ties the times together is kept, by draws too:
+
+        >>> from distfilt.filters import EnsembleFilter, TransportFilter
+        >>> from distfilt.models import Model
+        >>> from distfilt.sensors import Sensor, direct
+        >>> from distfilt.updates import known_noise, serial
+        >>> tenth = Model(1, lambda x, t, dt: x / 10, lambda t, dt: np.zeros((1, 1)))
+        >>> cubes = Sensor(2, lambda x: np.concatenate([10 * x, x**3], axis=-1), np.eye(2))
+        >>> for f in (TransportFilter(tenth, [direct([0], std=0.1)], lag=1, members=9,
+        ...                           rejuvenation=0.5),
+        ...           EnsembleFilter(tenth, [cubes], lag=1, members=9, update=serial(known_noise))):
+        ...     state = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0))
+        ...     state = f.step(state, 1.0, [[0.1, 0.0][: f.sensors[0].dim]])
+        ...     print(np.allclose(state.earlier[0].ensembles, 10 * state.ensembles))
+        True
+        True
+        """
         name = self._belief[0]
         return tuple(self.changed(t=t, history=(), **{name: x}) for t, x in self.history)
 

@@ -329,7 +329,15 @@ def _costs_in_loops(w: Any, m: Any, p: Any, dets: Any, i: Any, others: Any) -> A
 
 
 def _merged(w: Any, m: Any, p: Any, size: Any) -> Any:
-    """Merge the cheapest pair until `size` mixands are left, in place; which are left."""
+    """Merge the cheapest pair until `size` mixands are left, in place; which are left.
+
+    A merger can bring a mixand nearer to a third one than its nearest was:
+
+    >>> w, spread = np.array([8, 9, 3, 5, 7, 6]) / 38, np.array([0.1, 3.0, 1.0, 0.3, 1.0, 0.3])
+    >>> means = [[29.0], [-7.0], [24.0], [24.0], [37.0], [-38.0]]
+    >>> (38 * runnalls(GaussianMixture(w, means, spread[:, None, None] ** 2), 2).weights).round(6)
+    array([23., 15.])
+    """
     n = w.size
     every, alive = np.arange(n), np.full(n, True)
     dets = np.array([np.linalg.slogdet(p[i])[1] for i in range(n)])
