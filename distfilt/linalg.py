@@ -204,9 +204,8 @@ def _substituted(lower: Array, x: Array, transposed: int) -> Array:
     """Solve in place, row after row of (d, k, n), with factors (d, d, n) or (d, d, 1)."""
     for i in reversed(range(len(x))) if transposed else range(len(x)):
         x[i] /= lower[i, i]
-        rest = slice(0, i) if transposed else slice(i + 1, len(x))
-        if rest.start < rest.stop:
-            x[rest] -= (lower[i, rest] if transposed else lower[rest, i])[:, None] * x[i]
+        rest = slice(0, i) if transposed else slice(i + 1, None)
+        x[rest] -= (lower[i, rest] if transposed else lower[rest, i])[:, None] * x[i]
     return x
 
 

@@ -313,7 +313,7 @@ def batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Arr
             wrong = np.shape(alone) == wanted[-1:] and np.shape(many) != wanted
         if wrong:
             raise ValueError(f"{name}: needs to take many states at once, (..., d), components "
-                             "last (x[..., 0], not x[0]), got one for a single state only")
+                             "last (x[..., 0], not x[0] or x[:, 0]), got one for other axes")
         first = x.reshape(-1, x.shape[-1])[0]
         if fits and (first != (last[0] if done == "_compared" else first[-1])).any():
             vars(owner)[done] = True
@@ -337,7 +337,7 @@ def _made(function: Callable[..., Any], states: Sequence[Array], rest: tuple[flo
 
 def _differs(row: Array, alone: Any, states: Sequence[Array]) -> bool:
     if np.shape(alone) != row.shape:
-        return False
+        return isinstance(alone, IndexError)  # it wants two axes, and may get three
     # Rules of adaptive step differ a little; wrong rows differ as much as the states move.
     moved = alone - states[0] if alone.shape == states[0].shape else alone
     bound = 1e-2 * np.abs(moved).max() + 1e-9 * np.abs(alone).max()

@@ -237,15 +237,20 @@ class GaussianFilter(Filter):
         >>> with warnings.catch_warnings(action="error"):
         ...     f._agreed(np.ones((1, 4)), np.eye(4)[None], sure)
         Traceback (most recent call last):
-        RuntimeWarning: agreement: counts what is known again and again, at t = 1 s
+        RuntimeWarning: agreement: counts twice, at t = 1 s
+        >>> wrong = SimpleNamespace(t=1.0, agreed=lambda m, p: (m, p - 2 * np.eye(4)))
+        >>> f._agreed(np.ones((1, 4)), np.eye(4)[None], wrong)
+        Traceback (most recent call last):
+        ValueError: agreement: needs a covariance, got a variance of -1
         """
         d = self.model.dim
         old, now = means[..., :d], symmetrise(covs[..., :d, :d])
         m, p = step.agreed(old, now)
         variance = np.diagonal(p, axis1=-2, axis2=-1)
+        if (variance < 0).any():
+            raise ValueError(f"agreement: needs a covariance, got a variance of {variance.min():g}")
         if ((variance > 0) & (variance < (EPS * m) ** 2)).any():
-            text = f"agreement: counts what is known again and again, at t = {step.t:g} s"
-            warnings.warn(text, RuntimeWarning, stacklevel=4)
+            warnings.warn(f"agreement: counts twice, at t = {step.t:g} s", RuntimeWarning, 4)
         if means.shape[-1] == d:
             return m, p
         gain = np.linalg.solve(now, covs[..., :d, :]).mT

@@ -69,9 +69,9 @@ class State(Record):
 
     def kept(self, lag: int, t: float) -> tuple[float, ...]:
         """The earlier times that a step to `t` keeps, oldest first."""
-        if not lag or t == self.t:
+        if t == self.t:
             return self.times
-        return (*self.times, self.t)[-lag:]
+        return (*self.times, self.t)[-lag:] if lag else ()
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the state to one .npz file; :meth:`load` gives back the same bits.

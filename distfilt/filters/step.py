@@ -262,7 +262,7 @@ class Step:
             return values
         good, door = tuple(np.argwhere(~self.failed)[0]), self.channel
         # What a run failed with may fail again: a good one stands in.
-        given = tuple([self.kept(v, v[good]) for v in values])
+        given = tuple([self.kept(v, v[good]).copy() for v in values])
         whole = np.arange(int(np.prod(self.state.runs))).reshape(self.state.runs)
         ledger, alone = door.ledger, list[Array]()
 

@@ -148,7 +148,7 @@ class Sensor(Record):
         if self.difference is None:
             return np.asarray(observed - predicted)
         wanted = leading(observed.shape, predicted.shape, "predicted")
-        gap = np.asarray(self.difference(observed, predicted))
+        gap = np.asarray(self.difference(observed.copy(), predicted.copy()))
         if gap.shape != wanted:
             raise ValueError(f"difference: needs to return shape {wanted}, got {gap.shape}")
         return gap

@@ -221,7 +221,11 @@ def distinct_share(points: Array) -> Array:
     """Share of particles that differ from all before them in the component that tells most, (...).
 
     Mostly that is the first, but it may be known exactly.
+
+    >>> one, other = np.array([[0.0, 1.0], [0.0, 2.0]]), np.array([[1.0, 0.0], [2.0, 0.0]])
+    >>> distinct_share(np.stack([one, other]))
+    array([1., 1.])
     """
-    changes = (points[..., 1:, :] != points[..., :-1, :]).reshape(-1, points.shape[-1]).sum(axis=0)
-    x = np.sort(points[..., changes.argmax()], axis=-1)
+    changes = (points[..., 1:, :] != points[..., :-1, :]).sum(axis=-2, keepdims=True)
+    x = np.sort(np.take_along_axis(points, changes.argmax(axis=-1, keepdims=True), axis=-1)[..., 0])
     return np.asarray((1 + (x[..., 1:] > x[..., :-1]).sum(axis=-1)) / points.shape[-2])
