@@ -223,12 +223,15 @@ class EnsembleFilter(MembersFilter):
         """One time's ensembles after the update; a plain function gets one agent's at a time."""
         if says(self.update, "repredicts"):
             return unchecked(self.update)(x, h, y, noise, rng=rng, predict=predict)
+        stacks = says(self.update, "stacks")
 
-        def one(x: Array, h: Array, y: Array, r: Array) -> Array:
-            new = with_missing(self.update, x, h, y, r, rng=rng)
-            return array(new, "update", x.shape, finite=False)
+        def one(*given: Array) -> Array:
+            # A function of one's own may work in place.
+            own = given if stacks else [x.copy() for x in given]
+            new = with_missing(self.update, *own, rng=rng)
+            return array(new, "update", given[0].shape, finite=False)
 
-        if says(self.update, "stacks") or x.ndim == 2:
+        if stacks or x.ndim == 2:
             return one(x, h, y, noise)
         noises = noise if noise.ndim > 2 else [noise] * x.shape[-3]
         agents = [(x[..., g, :, :], h[..., g, :, :], y[..., g, :], r) for g, r in enumerate(noises)]
@@ -332,9 +335,8 @@ class TransportFilter(MembersFilter):
             before = step.before(place, group, stack[:-1])
             predicted = group.predict(stack[place][..., rows, :, :], before)
             group = step.gated(group, sample_moments, predicted)
-            told = log_likelihood(predicted, group.target, group.noise)
-            warn_of_weights(0 * told, predicted, group.target, group.noise)
-            logs[..., rows, :] += told
+            logs[..., rows, :] += log_likelihood(predicted, group.target, group.noise)
+            warn_of_weights(0 * predicted[..., 0], predicted, group.target, group.noise)
         return logs
 
     def _transported(
@@ -371,9 +373,8 @@ class TransportFilter(MembersFilter):
         Traceback (most recent call last):
         distfilt.updates.particles.ParticleCollapse: t = 1 s: an agent's weights have an ...
         """
-        size = size_of(normalised(logs[~step.failed])).min(initial=np.inf)
-        what = f"t = {step.t:g} s: an agent's weights have an effective size of {size:.1f}"
-        if size < 1.1:
+        if (size := size_of(normalised(logs[~step.failed])).min(initial=np.inf)) < 1.1:
+            what = f"t = {step.t:g} s: an agent's weights have an effective size of {size:.1f}"
             warn_of_collapse(what, "rejuvenation=")
 
 
