@@ -291,6 +291,10 @@ def batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Arr
     >>> batched(one, "flow", [x])
     Traceback (most recent call last):
     ValueError: flow: needs to take many states at once, ...
+    >>> two = SimpleNamespace(dim=2, flow=lambda x: x + x[:, :1])
+    >>> batched(two, "flow", [x])
+    Traceback (most recent call last):
+    ValueError: flow: needs to take many states at once, ...
     >>> unit = SimpleNamespace(dim=2, flow=lambda x: x / np.linalg.norm(x))
     >>> batched(unit, "flow", [x[1:]])
     array([[0.6, 0.8]])

@@ -68,7 +68,15 @@ class State(Record):
         return ()
 
     def kept(self, lag: int, t: float) -> tuple[float, ...]:
-        """The earlier times that a step to `t` keeps, oldest first."""
+        """The earlier times that a step to `t` keeps, oldest first.
+
+        >>> from distfilt.filters import GaussianFilter
+        >>> from distfilt.models import constant_velocity
+        >>> f = GaussianFilter(constant_velocity(sigma=1.0), [None], lag=1)
+        >>> state = f.step(f.start((np.zeros(4), np.eye(4))), 1.0, [None])
+        >>> state.times, [state.kept(lag, t) for t in (1.0, 2.0) for lag in (0, 1, 2)]
+        ((0.0,), [(0.0,), (0.0,), (0.0,), (), (1.0,), (0.0, 1.0)])
+        """
         if t == self.t:
             return self.times
         return (*self.times, self.t)[-lag:] if lag else ()

@@ -257,7 +257,18 @@ class Step:
         return self.filter.agreement is not None and self.channel is not None
 
     def agreed(self, *values: Array) -> tuple[Array, ...]:
-        """Values (*runs, A, ...) after the agreement, if any; as they were in failed runs."""
+        """Values (*runs, A, ...) after the agreement, if any; as they were in failed runs.
+
+        >>> from distfilt.filters import EnsembleFilter
+        >>> from distfilt.models import Model
+        >>> from distfilt.network import graphs
+        >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
+        >>> f = EnsembleFilter(still, [None] * 2, graphs.path(2), members=4, lag=1,
+        ...                    agreement=lambda x, channel: np.multiply(x, 2.0, out=x))
+        >>> state = f.step(f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [None] * 2)
+        >>> bool(np.allclose(state.history[0][1], state.ensembles))
+        True
+        """
         if not self.agrees or self.failed.all():
             return values
         good, door = tuple(np.argwhere(~self.failed)[0]), self.channel

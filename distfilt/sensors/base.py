@@ -144,6 +144,11 @@ class Sensor(Record):
         """How far observations are from predictions, (..., m), wrapped where the sensor wraps.
 
         NaN, a missing component or one that the sensor cannot see, stays NaN.
+
+        >>> seen, near = np.array([3.0]), np.array([1.0])
+        >>> eye = Sensor(1, lambda x: x, [[1.0]], difference=lambda a, b: np.subtract(a, b, out=a))
+        >>> eye.residual(seen, near), seen
+        (array([2.]), array([3.]))
         """
         if self.difference is None:
             return np.asarray(observed - predicted)
