@@ -100,7 +100,7 @@ class MixtureFilter(Filter):
     >>> after.mixtures[1].means.round(4), after.ledger.scalars
     (array([[0.6667, 0.3333]]), array([3, 3]))
 
-    Agents differ in size from run to run, so that one run is all that a filter takes:
+    Mixtures differ in size from run to run, so that one run is all that a filter takes:
 
     >>> f.start(prior, runs=(3,))
     Traceback (most recent call last):
