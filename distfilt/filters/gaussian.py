@@ -247,7 +247,7 @@ class GaussianFilter(Filter):
         old, now = means[..., :d], symmetrise(covs[..., :d, :d])
         m, p = step.agreed(old, now)
         variance = np.diagonal(p, axis1=-2, axis2=-1)
-        if (variance < 0).any():
+        if (variance < -1e-9 * np.abs(variance).max()).any():  # not by rounding
             raise ValueError(f"agreement: needs a covariance, got a variance of {variance.min():g}")
         if ((variance > 0) & (variance < (EPS * m) ** 2)).any():
             warnings.warn(f"agreement: counts twice, at t = {step.t:g} s", RuntimeWarning, 4)
