@@ -17,7 +17,7 @@ from types import ModuleType
 __version__ = "0.2.0"
 
 _ROOMS = (  # fmt: skip
-    "coupling", "density", "doors", "ensembles", "filters", "gaussians", "kalman", "linalg",
+    "coupling", "density", "validation", "ensembles", "filters", "gaussians", "kalman", "linalg",
     "metrics", "mixtures", "models", "network", "sensors", "triangular", "updates",
 )
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from .doors import Array, Count, Rng, Semidefinite, door, unchecked
+from .validation import Array, PositiveInt, Rng, PositiveSemidefinite, validated, unchecked
 from .linalg import EPS, cholesky, factor, lower_root, solve_upper, symmetrise
 
 __all__ = ["Members", "draw", "mean", "sample_covariance"]
@@ -28,10 +28,10 @@ Ensemble = Annotated[Array, "... N d", partial(_at_least, 2)]
 _CLOSE = 1e-6
 
 
-@door
+@validated
 def draw(
-    mean: Annotated[Array, "d"], cov: Annotated[Semidefinite, "d d"], members: Count, *, rng: Rng,
-    leading: tuple[Count, ...] = ()
+    mean: Annotated[Array, "d"], cov: Annotated[PositiveSemidefinite, "d d"], members: PositiveInt, *, rng: Rng,
+    leading: tuple[PositiveInt, ...] = ()
 ) -> Array:
     """Draw ensembles (*leading, N, d) from a Gaussian.
 
@@ -57,7 +57,7 @@ def draw(
     return mean + rng.standard_normal((*leading, members, mean.size)) @ root.T
 
 
-@door
+@validated
 def mean(ensemble: Members) -> Array:
     """Mean over the members, (..., d).
 
@@ -73,10 +73,10 @@ def _equal_weights(members: int) -> Array:
     return np.full((1, members), 1 / members)
 
 
-def about_mean(members: Array) -> tuple[Array, Array]:
+def center_ensemble(members: Array) -> tuple[Array, Array]:
     """Mean (..., 1, d) and anomalies (..., N, d), members minus their mean.
 
-    >>> about_mean(np.array([[1.0], [3.0]]))
+    >>> center_ensemble(np.array([[1.0], [3.0]]))
     (array([[2.]]), array([[-1.],
            [ 1.]]))
     """
@@ -84,7 +84,7 @@ def about_mean(members: Array) -> tuple[Array, Array]:
     return centre, members - centre
 
 
-@door
+@validated
 def sample_covariance(ensemble: Ensemble) -> Array:
     """Sample covariance with N - 1 in the denominator, (..., d, d).
 
@@ -92,7 +92,7 @@ def sample_covariance(ensemble: Ensemble) -> Array:
     array([[2., 4.],
            [4., 8.]])
     """
-    a = about_mean(ensemble)[1]
+    a = center_ensemble(ensemble)[1]
     return symmetrise(a.swapaxes(-1, -2) @ a / (a.shape[-2] - 1))
 
 
@@ -134,7 +134,7 @@ def exact_noise(avoid: Array, root: Array, rng: Rng) -> Array:
     >>> sample_covariance(noise).round(12)
     array([[4.  , 1.  ],
            [1.  , 1.25]])
-    >>> bool((abs(about_mean(x)[1].T @ noise) < 1e-11).all())
+    >>> bool((abs(center_ensemble(x)[1].T @ noise) < 1e-11).all())
     True
     """
     n = avoid.shape[-2]
@@ -158,7 +158,7 @@ def _narrow(root: Array) -> Array:
 
 def _projected(drawn: Array, avoid: Array) -> Array:
     """What is left of a draw without its mean and the anomalies."""
-    (n, rank), around = drawn.shape[-2:], about_mean(avoid)[1]
+    (n, rank), around = drawn.shape[-2:], center_ensemble(avoid)[1]
     size = np.sqrt((around**2).sum(axis=-2, keepdims=True))
     frame, independent = _frame(around / np.where(size > 0, size, 1.0))
     if n <= independent + rank:
@@ -167,7 +167,7 @@ def _projected(drawn: Array, avoid: Array) -> Array:
             f"{independent} independent anomalies and noise of rank {rank}, got {n}"
         )
     for _ in range(2):
-        drawn = about_mean(drawn - frame @ (frame.mT @ drawn))[1]
+        drawn = center_ensemble(drawn - frame @ (frame.mT @ drawn))[1]
     return drawn
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg.lapack import dposv, dpotrf, dtrtrs
 
-from .doors import Array, Semidefinite, door
+from .validation import Array, PositiveSemidefinite, validated
 
 __all__ = ["SolverError", "factor"]
 
@@ -33,8 +33,8 @@ def symmetrise(m: Array) -> Array:
     return np.asarray(0.5 * (m + m.swapaxes(-1, -2)))
 
 
-@door
-def factor(cov: Semidefinite) -> Array:
+@validated
+def factor(cov: PositiveSemidefinite) -> Array:
     r"""A matrix :math:`\mathbf L` with :math:`\mathbf L\mathbf L^\top` = `cov`, singular or not.
 
     Parameters
@@ -302,7 +302,7 @@ def as_derivative(
 
     Parameters
     ----------
-    owner : Record
+    owner : FrozenModel
         Whose derivative it is; what the library made itself is trusted.
     given, full : tuple
         What it gets, arrays as copies, and the shape that it needs.

@@ -65,7 +65,7 @@ def turning(*, sigma: float, turn_sigma: float) -> Model:
 
     def noise(t: float, dt: float) -> np.ndarray:
         cov = np.zeros((5, 5))
-        cov[:4, :4], cov[4, 4] = straight.noise(t, dt), turn_sigma**2 * dt
+        cov[:4, :4], cov[4, 4] = straight.Q(t, dt), turn_sigma**2 * dt
         return cov
 
     return Model(5, flow, noise, derivative=derivative)

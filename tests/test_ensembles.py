@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.stats import chi2, kstest
 
 from distfilt import ensembles
-from distfilt.ensembles import about_mean, draw, exact_noise, mean, sample_covariance
+from distfilt.ensembles import center_ensemble, draw, exact_noise, mean, sample_covariance
 from distfilt.linalg import factor
 from tests.support import generator, singular, spd, unit_gap
 
@@ -22,11 +22,11 @@ def test_moments_are_their_definitions() -> None:
     x = generator(1).standard_normal((2, 7, 3)) @ FULL + 5.0
     for k in range(2):
         assert np.allclose(mean(x)[k], x[k].mean(axis=0), rtol=1e-14)
-        assert np.allclose(about_mean(x)[1][k], x[k] - x[k].mean(axis=0), atol=1e-14)
+        assert np.allclose(center_ensemble(x)[1][k], x[k] - x[k].mean(axis=0), atol=1e-14)
         both = np.cov(x[k], rowvar=False)
         assert np.allclose(sample_covariance(x)[k], both, rtol=1e-12, atol=1e-13)
     assert (sample_covariance(x) == sample_covariance(x).swapaxes(-1, -2)).all()
-    assert mean(x[:, :1]).shape == (2, 3) and (about_mean(x[:, :1])[1] == 0).all()
+    assert mean(x[:, :1]).shape == (2, 3) and (center_ensemble(x[:, :1])[1] == 0).all()
 
 
 # --- draws ------------------------------------------------------------------------------------
@@ -63,7 +63,7 @@ def _exact(avoid: np.ndarray, cov: np.ndarray, noise: np.ndarray) -> None:
     if avoid.shape[-1]:
         length = avoid.std(axis=-2, ddof=1)
         length = np.where(length > 0, length, 1.0)
-        gap = about_mean(avoid)[1].mT @ noise / (avoid.shape[-2] - 1)
+        gap = center_ensemble(avoid)[1].mT @ noise / (avoid.shape[-2] - 1)
         gap /= length[..., :, None] * std[..., None, :]
         assert np.abs(gap).max() < 1e-12
 

@@ -12,7 +12,7 @@ import pytest
 from distfilt.filters import GaussianFilter
 from distfilt.models import Model
 from distfilt.network import graphs
-from distfilt.sensors import direct
+from distfilt.sensors import component
 
 FOLDER = Path(__file__).parents[1] / "book" / "examples"
 
@@ -39,7 +39,7 @@ def test_the_spill_is_found() -> None:
 def test_own_filter_is_the_kalman_filter_on_its_grid(tmp_path: Path) -> None:
     names = run("own_filter")
     walk = Model(1, lambda x, t, dt: x, lambda t, dt: 0.3 * dt * np.eye(1))
-    sensors, line = [direct([0], std=0.5), None], graphs.path(2)
+    sensors, line = [component([0], std=0.5), None], graphs.path(2)
     own, exact = names["GridFilter"](walk, sensors, line), GaussianFilter(walk, sensors, line)
     times, seen = [0.5, 1.0, 2.0], [np.array([[0.4], [1.0], [0.2]]), None]
     prior = ([0.0], [[1.0]])

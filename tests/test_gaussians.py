@@ -8,10 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from distfilt.doors import unchecked
+from distfilt.validation import unchecked
 from distfilt.ensembles import mean, sample_covariance
-from distfilt.gaussians import conditioned, intersecting, intersection, intersection_weights
-from distfilt.gaussians.single import log_density, recolour, unscented_points
+from distfilt.gaussians import condition, intersecting, intersect_gaussians, intersection_weights
+from distfilt.gaussians.single import log_density, match_moments, unscented_points
 from tests.support import NAN, generator, spd, unit_gap
 
 SEEDS = st.integers(0, 10_000)
@@ -49,25 +49,25 @@ def test_intersection_is_the_weighted_sum_of_information(seed: int, s: int, d: i
     rng = generator(seed)
     m, p = rng.standard_normal((6, s, d)), spd(rng, d, (6, s))
     w = rng.dirichlet(np.ones(s), 6)
-    found, exact = intersection(m, p, w), _by_inverses(m, p, w)
+    found, exact = intersect_gaussians(m, p, w), _by_inverses(m, p, w)
     worst = 1e-13 * np.linalg.cond(p).max()
     assert np.abs(found[0] - exact[0]).max() < 10 * worst
     assert unit_gap(found[1], exact[1]) < worst
     assert (found[1] == found[1].swapaxes(-1, -2)).all()
-    one = intersection(m[2], p[2], w[2])
+    one = intersect_gaussians(m[2], p[2], w[2])
     assert np.allclose(one[0], found[0][2], atol=worst) and np.allclose(one[1], found[1][2])
-    several = intersection(m[2], np.stack([p[2], 2 * p[2]]), w[2])
+    several = intersect_gaussians(m[2], np.stack([p[2], 2 * p[2]]), w[2])
     assert np.allclose(several[0], one[0], atol=worst) and np.allclose(several[1][1], 2 * one[1])
 
 
 def test_intersection_of_the_same_or_one_source_changes_nothing() -> None:
     rng = generator(1)
     m, p = 1e6 + rng.standard_normal(3), spd(rng, 3)
-    mean_, cov = intersection([m] * 4, [p] * 4, [0.1, 0.2, 0.3, 0.4])
+    mean_, cov = intersect_gaussians([m] * 4, [p] * 4, [0.1, 0.2, 0.3, 0.4])
     assert np.allclose(mean_, m, rtol=1e-15, atol=0) and unit_gap(cov, p) < 1e-14
-    mean_, cov = intersection([m, 0 * m], [p, np.eye(3)], [1.0, 0.0])
+    mean_, cov = intersect_gaussians([m, 0 * m], [p, np.eye(3)], [1.0, 0.0])
     assert (mean_ == m).all() and unit_gap(cov, p) < 1e-14
-    mean_, cov = intersection([0 * m, m], [np.eye(3), p], [0.0, 1.0])
+    mean_, cov = intersect_gaussians([0 * m, m], [np.eye(3), p], [0.0, 1.0])
     assert np.allclose(mean_, m, rtol=1e-14) and unit_gap(cov, p) < 1e-13
 
 
@@ -75,10 +75,10 @@ def test_intersection_does_not_depend_on_units_or_order() -> None:
     rng = generator(2)
     m, p, w = rng.standard_normal((3, 4)), spd(rng, 4, (3,)), np.array([0.2, 0.5, 0.3])
     size = np.array([1e-9, 1.0, 1e9, 1e3])
-    plain, scaled = intersection(m, p, w), intersection(m * size, p * np.outer(size, size), w)
+    plain, scaled = intersect_gaussians(m, p, w), intersect_gaussians(m * size, p * np.outer(size, size), w)
     assert np.allclose(scaled[0], plain[0] * size, rtol=1e-11)
     assert unit_gap(scaled[1], plain[1] * np.outer(size, size)) < 1e-12
-    turned = intersection(m[::-1], p[::-1], w[::-1])
+    turned = intersect_gaussians(m[::-1], p[::-1], w[::-1])
     assert np.allclose(turned[0], plain[0]) and unit_gap(turned[1], plain[1]) < 1e-12
 
 
@@ -87,11 +87,11 @@ def test_extreme_precision_does_not_spoil_the_rest() -> None:
     sharp, wide = 1e-20 * spd(rng, 3), spd(rng, 3)
     for order in (slice(None), slice(None, None, -1)):
         m = np.stack([np.ones(3), np.zeros(3)])[order]
-        mean_, cov = intersection(m, np.stack([sharp, wide])[order], [0.5, 0.5])
+        mean_, cov = intersect_gaussians(m, np.stack([sharp, wide])[order], [0.5, 0.5])
         assert np.allclose(mean_, 1.0) and unit_gap(cov, 2 * sharp) < 1e-9
     # Components alike to the last bit: along their sum both count, and rounding hides the rest.
     alike = (1 + np.eye(2) * 2.0**-52) / 16
-    cov = intersection(np.zeros((2, 2)), [np.eye(2), alike], [0.75, 0.25])[1]
+    cov = intersect_gaussians(np.zeros((2, 2)), [np.eye(2), alike], [0.75, 0.25])[1]
     assert np.isclose(cov.sum(), 2 / (0.75 + 0.25 / 0.125))
 
 
@@ -111,11 +111,11 @@ def test_what_did_not_arrive_weighs_nothing_whatever_it_holds(rule: str) -> None
         w = unchecked(intersection_weights)(covs, rule=rule, here=here)
         assert (w[~here] == 0).all() and np.allclose(w.sum(-1), 1.0, rtol=1e-14)
         assert w[0, 2] == 1.0 and (w >= 0).all()
-        fused = unchecked(intersection)(means, covs, w)
+        fused = unchecked(intersect_gaussians)(means, covs, w)
         for i in range(4):
             alone = intersection_weights(p[i][here[i]], rule=rule)
             assert np.allclose(w[i][here[i]], alone, atol=1e-6)
-            one = intersection(m[i][here[i]], p[i][here[i]], w[i][here[i]])
+            one = intersect_gaussians(m[i][here[i]], p[i][here[i]], w[i][here[i]])
             assert np.allclose(fused[0][i], one[0], atol=1e-11)
             assert unit_gap(fused[1][i], one[1]) < 1e-11
 
@@ -195,10 +195,10 @@ def test_covariances_that_are_no_numbers_are_refused_where_they_count(bad: float
         for rule in RULES:
             with pytest.raises(ValueError, match="^covs: needs finite numbers"):
                 call(p, rule=rule)
-    for fuse in (intersection, unchecked(intersection)):
+    for fuse in (intersect_gaussians, unchecked(intersect_gaussians)):
         with pytest.raises(ValueError, match="^covs: needs finite numbers"):
             fuse(np.zeros((3, 2)), p, THIRDS)
-    left = unchecked(intersection)(np.zeros((3, 2)), p, np.array([0.5, 0.0, 0.5]))[1]
+    left = unchecked(intersect_gaussians)(np.zeros((3, 2)), p, np.array([0.5, 0.0, 0.5]))[1]
     assert np.isfinite(left).all()
 
 
@@ -230,7 +230,7 @@ def test_recoloured_moments_are_exact(seed: int, d: int, more: int) -> None:
     e, other = _ensembles(seed, d + more, d, (2,)), _ensembles(seed + 1, d + 5, d, (2,))
     centre, cov = mean(other), sample_covariance(other)
     try:
-        out = recolour(e, centre, cov)
+        out = match_moments(e, centre, cov)
     except ValueError as error:  # members or target flat to rounding
         assert "singular" in str(error) or "definite" in str(error)
         return
@@ -247,7 +247,7 @@ def test_the_draw_that_lost_nine_digits() -> None:
         flat = np.diag(np.logspace(0, -7, d)) @ np.linalg.qr(rng.standard_normal((d, d)))[0]
         e = rng.standard_normal((60, d)) @ flat
         target = spd(rng, d, least=1e-10)
-        out = recolour(e, np.zeros(d), target)
+        out = match_moments(e, np.zeros(d), target)
         assert unit_gap(sample_covariance(out), target) < 1e-13
 
 
@@ -256,7 +256,7 @@ def test_recolouring_is_symmetric_and_so_moves_the_members_least() -> None:
     e, other = _ensembles(1, 40, 4), _ensembles(2, 40, 4)
     cov = sample_covariance(other)
     unit = np.sqrt(cov.diagonal())
-    a = np.linalg.lstsq(e - mean(e), recolour(e, mean(e), cov) - mean(e), rcond=None)[0].T
+    a = np.linalg.lstsq(e - mean(e), match_moments(e, mean(e), cov) - mean(e), rcond=None)[0].T
     a *= unit / unit[:, None]
     assert np.abs(a - a.T).max() < 1e-9 * np.abs(a).max()
     assert (np.linalg.eigvalsh(0.5 * (a + a.T)) > 0).all()
@@ -264,12 +264,12 @@ def test_recolouring_is_symmetric_and_so_moves_the_members_least() -> None:
 
 def test_leading_axes_of_a_target_broadcast_or_are_refused_by_name() -> None:
     e, cov = _ensembles(4, 9, 2, (3,)), np.stack([np.eye(2)] * 3)
-    many = recolour(e[0], np.arange(6.0).reshape(3, 2), np.eye(2))
+    many = match_moments(e[0], np.arange(6.0).reshape(3, 2), np.eye(2))
     assert many.shape == (3, 9, 2) and np.allclose(mean(many), [[0, 1], [2, 3], [4, 5]])
     with pytest.raises(ValueError, match="^mean: needs leading axes that broadcast"):
-        recolour(e, np.zeros((4, 2)), cov)
+        match_moments(e, np.zeros((4, 2)), cov)
     with pytest.raises(ValueError, match="^cov: needs leading axes that broadcast"):
-        recolour(e, np.zeros(2), cov[:2])
+        match_moments(e, np.zeros(2), cov[:2])
 
 
 def test_flat_ensembles_are_refused_wherever_they_lie() -> None:
@@ -278,7 +278,7 @@ def test_flat_ensembles_are_refused_wherever_they_lie() -> None:
     for flat in (x @ [[1, 0, 1], [0, 1, 1], [0, 0, 0]], x * [1, 0, 1], 1e9 + x * [1, 1e-9, 1]):
         for shift in (0.0, 1e6):
             with pytest.raises(ValueError, match="^ensemble: .* singular"):
-                recolour(np.stack([x, flat + shift]), np.zeros((2, 3)), np.stack([np.eye(3)] * 2))
+                match_moments(np.stack([x, flat + shift]), np.zeros((2, 3)), np.stack([np.eye(3)] * 2))
 
 
 # --- unscented points -------------------------------------------------------------------------
@@ -317,7 +317,7 @@ def case(seed: int, lead: tuple[int, ...] = ()) -> tuple[np.ndarray, ...]:
 @given(seed=st.integers(0, 10**6))
 def test_in_information_form_an_update_is_a_sum(seed: int) -> None:
     mean, cov, gap, h, r = case(seed)
-    x, p = conditioned(mean, cov, gap, h, r)
+    x, p = condition(mean, cov, gap, h, r)
     weight = h.T @ np.linalg.inv(r)
     exact = np.linalg.inv(np.linalg.inv(cov) + weight @ h)
     np.testing.assert_allclose(p, exact, rtol=1e-8, atol=1e-9)
@@ -329,20 +329,20 @@ def test_a_missing_component_is_a_row_left_out() -> None:
     mean, cov, whole, h, r = case(1)
     for lost, kept in ((1, [0, 2]), (0, [1, 2])):
         gap = np.where(np.arange(M) == lost, np.nan, whole)
-        ours = [both[0] for both in conditioned(mean, cov, gap, h, np.stack([r, 2 * r]))]
-        theirs = conditioned(mean, cov, gap[kept], h[kept], r[np.ix_(kept, kept)])
+        ours = [both[0] for both in condition(mean, cov, gap, h, np.stack([r, 2 * r]))]
+        theirs = condition(mean, cov, gap[kept], h[kept], r[np.ix_(kept, kept)])
         for a, b in zip(ours, theirs, strict=True):
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-13)
-    blind = conditioned(mean, cov, np.full(M, np.nan), h, r)
+    blind = condition(mean, cov, np.full(M, np.nan), h, r)
     assert (blind[0] == mean).all() and (blind[1] == cov).all()
 
 
 def test_a_batch_is_its_members_one_by_one() -> None:
     mean, cov, gap, h, r = case(2, (5, 2))
     gap[np.random.default_rng(3).random(gap.shape) < 0.3] = np.nan
-    x, p = conditioned(mean, cov, gap, h, r)
+    x, p = condition(mean, cov, gap, h, r)
     for k in np.ndindex(5, 2):
-        alone = conditioned(mean[k], cov[k], gap[k], h[k], r[k])
+        alone = condition(mean[k], cov[k], gap[k], h[k], r[k])
         np.testing.assert_allclose(x[k], alone[0], rtol=0, atol=1e-13)
         np.testing.assert_allclose(p[k], alone[1], rtol=0, atol=1e-13)
 
@@ -350,14 +350,14 @@ def test_a_batch_is_its_members_one_by_one() -> None:
 def test_one_covariance_and_one_sensor_serve_any_number_of_means() -> None:
     mean, gap = np.random.default_rng(4).standard_normal((2, 6, D))
     _, cov, _, h, r = case(5)
-    x, p = conditioned(mean, cov, gap[:, :M], h, r)
+    x, p = condition(mean, cov, gap[:, :M], h, r)
     assert x.shape == (6, D) and p.shape == (D, D)
-    full = conditioned(mean, np.broadcast_to(cov, (6, D, D)), gap[:, :M], h, r)
+    full = condition(mean, np.broadcast_to(cov, (6, D, D)), gap[:, :M], h, r)
     np.testing.assert_allclose(x, full[0], rtol=0, atol=1e-13)
     np.testing.assert_allclose(np.broadcast_to(p, full[1].shape), full[1], rtol=0, atol=1e-13)
 
 
 def test_joseph_s_form_keeps_what_a_nearly_exact_reading_leaves() -> None:
     mean, cov, gap, _, _ = case(7)
-    p = conditioned(mean, 1e8 * cov, gap, np.eye(D)[:M], 1e-8 * np.eye(M))[1]
+    p = condition(mean, 1e8 * cov, gap, np.eye(D)[:M], 1e-8 * np.eye(M))[1]
     np.testing.assert_allclose(p[:M, :M], 1e-8 * np.eye(M), rtol=1e-6, atol=1e-13)

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from distfilt import linalg
-from distfilt.doors import unchecked
+from distfilt.validation import unchecked
 from distfilt.sensors import wrap
 from tests.support import generator, singular, spd, unit_gap
 

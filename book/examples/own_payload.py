@@ -28,6 +28,6 @@ class Track:
 
 tracks = [Track(7 + a, np.full(3, float(a)), np.eye(3) + 0.5) for a in range(3)]
 channel = Channel(graphs.path(3))
-inbox = channel.exchange([track.pack() for track in tracks])
+inbox = channel.broadcast([track.pack() for track in tracks])
 heard = {sender: Track.unpack(payload) for sender, payload in inbox[1].items()}
 print({sender: track.name for sender, track in heard.items()}, channel.ledger)

@@ -5,13 +5,13 @@ import numpy as np
 from distfilt.filters import EnsembleFilter
 from distfilt.models import Model
 from distfilt.network import graphs
-from distfilt.sensors import direct
+from distfilt.sensors import component
 
 
 def median_of_means(ensembles, channel):
     """Move every ensemble (A, N, d) to the median of its own mean and its neighbours'."""
     means = list(ensembles.mean(axis=-2))
-    inbox = channel.exchange(means)
+    inbox = channel.broadcast(means)
     out = ensembles.copy()
     for agent, heard in enumerate(inbox):
         middle = np.median([means[agent], *heard.values()], axis=0)
@@ -20,9 +20,9 @@ def median_of_means(ensembles, channel):
 
 
 walk = Model(1, lambda x, t, dt: x, lambda t, dt: 0.1 * dt * np.eye(1), units=("m",))
-sensors = [direct([0], std=0.5) for _ in range(5)]
+sensors = [component([0], std=0.5) for _ in range(5)]
 f = EnsembleFilter(
-    walk, sensors, graphs.complete(5), agreement=median_of_means, share=False, members=100
+    walk, sensors, graphs.complete(5), fusion=median_of_means, share_observations=False, members=100
 )
 state = f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0))
 readings = [np.full((20, 1), 1.0)] * 4 + [np.full((20, 1), 30.0)]  # the last sensor is broken

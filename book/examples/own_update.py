@@ -4,7 +4,7 @@ import numpy as np
 
 from distfilt.filters import EnsembleFilter
 from distfilt.models import Model
-from distfilt.sensors import direct
+from distfilt.sensors import component
 
 
 def cautious(ensemble, predicted, observed, noise, *, rng):
@@ -20,7 +20,7 @@ def cautious(ensemble, predicted, observed, noise, *, rng):
 
 
 walk = Model(1, lambda x, t, dt: x, lambda t, dt: 0.1 * dt * np.eye(1), units=("m",))
-f = EnsembleFilter(walk, [direct([0], std=0.5)], update=cautious, members=200)
+f = EnsembleFilter(walk, [component([0], std=0.5)], update=cautious, members=200)
 state = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0))
 readings = np.where(np.arange(30) == 20, 50.0, 0.3)[:, None]  # one of them is wild
 run = f.run(state, np.arange(1.0, 31.0), [readings])

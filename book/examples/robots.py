@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from distfilt import filters
-from distfilt.doors import unchecked
+from distfilt.validation import unchecked
 from distfilt.mixtures import target_fusion
 from distfilt.models import constant_velocity
 from distfilt.network import graphs
-from distfilt.sensors import distance_and_angle
+from distfilt.sensors import range_bearing
 
 STD, RATE, END, ROBOTS = (0.3, 0.04), 0.4, 120.0, 5
 
@@ -37,7 +37,7 @@ def simulate(path, rng):
             speed, turn = 0.4, 0.05 * np.sin(t / 10 + robot)
             pose, t = rolled(pose, speed, turn, dt), t + dt
             drive = rng.normal([speed, turn], [0.005, 0.0005])
-            eye = distance_and_angle([0, 1], std=STD, origin=pose[:2], heading=pose[2])
+            eye = range_bearing([0, 1], std=STD, origin=pose[:2], heading=pose[2])
             sight = eye.observe(target(t), rng=rng) + 8.0 * (rng.random() < 0.05)
             rows.append([t, robot, dt, *drive, *sight])
     np.savetxt(path, sorted(rows), delimiter=",")
@@ -48,21 +48,21 @@ def events(path):
     poses = {robot: (8.0 * robot - 16, -5.0, 0.3 * robot) for robot in range(ROBOTS)}
     for t, robot, dt, speed, turn, *sight in np.loadtxt(path, delimiter=",").tolist():
         pose = poses[robot] = rolled(poses[robot], speed, turn, dt)
-        eye = unchecked(distance_and_angle)([0, 1], std=STD, origin=pose[:2], heading=pose[2])
-        yield filters.Reading(t, int(robot), sight, eye, about=pose)
+        eye = unchecked(range_bearing)([0, 1], std=STD, origin=pose[:2], heading=pose[2])
+        yield filters.Observation(t, int(robot), sight, eye, metadata=pose)
 
 
 log = Path(tempfile.mkdtemp()) / "log.csv"
 simulate(log, np.random.default_rng(0))
 seen, model = list(events(log)), constant_velocity(sigma=0.03)
 now = np.unique([event.t for event in seen])
-team, options = ([None] * ROBOTS, graphs.ring(ROBOTS)), {"gate": 0.999, "every": 10.0}
+team, options = ([None] * ROBOTS, graphs.ring(ROBOTS)), {"gate_probability": 0.999, "exchange_interval": 10.0}
 fuse = partial(target_fusion, target_dim=4)
 families = {
-    "mixture": filters.MixtureFilter(model, *team, agreement=fuse, target_dim=4, **options),
+    "mixture": filters.MixtureFilter(model, *team, fusion=fuse, target_dim=4, **options),
     "gaussian": filters.GaussianFilter(model, *team, lag=40, **options),
     "ensemble": filters.EnsembleFilter(model, *team, lag=40, members=100, **options),
-    "news": filters.NewsFilter(model, *team, target_dim=4, **options),
+    "news": filters.InformationIncrementFilter(model, *team, target_dim=4, **options),
 }
 print("filter    error/m  NEES/d  refused  floats")
 for name, f in families.items():
@@ -70,5 +70,5 @@ for name, f in families.items():
     run = f.run(begin, None, seen, truth=dict(zip(model.names, target(now).T, strict=True)))
     late = run.sel(time=slice(20, None))
     error = np.sqrt(late["squared_error"][..., :2].sum("component").mean())
-    refused, floats = (int(run[key].sum()) for key in ("refused", "scalars"))
+    refused, floats = (int(run[key].sum()) for key in ("rejected", "scalars"))
     print(f"{name:9s} {error:7.2f} {late['nees'].mean() / 4:7.2f} {refused:8d} {floats:7d}")

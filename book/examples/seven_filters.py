@@ -9,10 +9,10 @@ from distfilt.density import Flooding, FokkerPlanck, Grid
 from distfilt.mixtures import target_fusion
 from distfilt.models import constant_velocity, rotating_swarm, simulate
 from distfilt.network import covariance_intersection, graphs
-from distfilt.sensors import direct
+from distfilt.sensors import component
 
 walk, rng, times = constant_velocity(sigma=0.1), np.random.default_rng(0), np.arange(1, 31) * 0.5
-eyes, net = [direct([k % 2], std=0.5) for k in range(4)], graphs.ring(4)
+eyes, net = [component([k % 2], std=0.5) for k in range(4)], graphs.ring(4)
 prior = (np.zeros(4), np.diag([4.0, 4.0, 0.2, 0.2]))
 truth = simulate(walk, rng.multivariate_normal(*prior), times, rng=rng)
 walkers = prior, truth, [eye.observe(truth, rng=rng) for eye in eyes]
@@ -23,12 +23,12 @@ fuse, intersect = partial(target_fusion, target_dim=4), covariance_intersection
 
 problems = {
     "ensemble": (filters.EnsembleFilter(walk, eyes, net), walkers),
-    "gaussian": (filters.GaussianFilter(walk, eyes, net, agreement=intersect), walkers),
+    "gaussian": (filters.GaussianFilter(walk, eyes, net, fusion=intersect), walkers),
     "particle": (filters.ParticleFilter(walk, eyes, net, members=2000), walkers),
     "transport": (filters.TransportFilter(walk, eyes, net, rejuvenation=0.2), walkers),
-    "mixture": (filters.MixtureFilter(walk, eyes, net, agreement=fuse, target_dim=4), walkers),
-    "news": (filters.NewsFilter(walk, eyes, net, target_dim=4), walkers),
-    "density": (filters.DensityFilter(law, 40, 0.4, agreement=Flooding(), bandwidth=0.12), crowd),
+    "mixture": (filters.MixtureFilter(walk, eyes, net, fusion=fuse, target_dim=4), walkers),
+    "news": (filters.InformationIncrementFilter(walk, eyes, net, target_dim=4), walkers),
+    "density": (filters.DensityFilter(law, 40, 0.4, fusion=Flooding(), bandwidth=0.12), crowd),
 }
 print("filter      error   NEES/d  floats")
 for name, (f, (begin, true, seen)) in problems.items():

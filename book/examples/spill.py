@@ -6,7 +6,7 @@ import numpy as np
 
 from distfilt.filters import EnsembleFilter
 from distfilt.models import Model, simulate
-from distfilt.network import Graph, pull
+from distfilt.network import Graph, mean_pull
 from distfilt.sensors import Sensor
 
 rng = np.random.default_rng(0)
@@ -21,7 +21,7 @@ ring = Graph.from_adjacency([[0, 1, 0, 1], [1, 0, 1, 0], [0, 1, 0, 1], [1, 0, 1,
 times = np.arange(1, 61) * 0.05
 truth = simulate(model, [1.0, 0.0], times, rng=rng)
 seen = [sensor.observe(truth, rng=rng) for sensor in sensors]
-spill = EnsembleFilter(model, sensors, ring, agreement=partial(pull, gain=0.02), members=300)
+spill = EnsembleFilter(model, sensors, ring, fusion=partial(mean_pull, gain=0.02), members=300)
 state = spill.start(([0.5, 0.5], np.eye(2)), rng=rng)
 run = spill.run(state, times, seen, truth=truth)
 print(run["total_squared_error"].sel(time=slice(2, 3)).mean("time").values.round(3), "km²")

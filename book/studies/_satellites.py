@@ -18,14 +18,14 @@ from bookkit import studies
 from bookkit.published import Scenario, scenario
 from distfilt.filters import EnsembleFilter
 from distfilt.models import Model, clohessy_wiltshire, satellite_pose, simulate
-from distfilt.network import Graph, intersection, pull
-from distfilt.sensors import Sensor, of_kind
+from distfilt.network import Graph, intersect_ensembles, mean_pull
+from distfilt.sensors import Sensor, from_name
 from distfilt.updates import (
-    known_noise,
+    enkf,
     principal_components,
     principal_directions,
-    sampled_noise,
-    transport,
+    enkf_sampled_covariance,
+    transport_map_update,
     update,
 )
 
@@ -86,7 +86,7 @@ def setup(name: str, **changes: Any) -> Setup:
         s,
         make(sigma=s["process_noise"]),
         make(sigma=0.0),
-        tuple(of_kind(a.kind, a.dims, std=a.noise) for a in s.agents),
+        tuple(from_name(a.kind, a.dims, std=a.noise) for a in s.agents),
         Graph.from_adjacency(s.adjacency),
         tuple(a.name for a in s.agents),
         start,
@@ -121,7 +121,7 @@ def data(
 def published(s: Setup, *, pca: bool, noise_factor: float = 1.0, **changes: Any) -> EnsembleFilter:
     """Algorithm 1 of the paper, in principal components (Algorithm 2) or without.
 
-    Without them the update is `sampled_noise`, which is the affine map in closed form.
+    Without them the update is `enkf_sampled_covariance`, which is the affine map in closed form.
     """
     options = s.pca if pca else {}
     if noise_factor == 0:
@@ -130,8 +130,8 @@ def published(s: Setup, *, pca: bool, noise_factor: float = 1.0, **changes: Any)
         rule = partial(principal_components, noise_factor=noise_factor, **options)
     else:
         full = noise_factor == 1
-        rule = sampled_noise if full else partial(transport, noise_factor=noise_factor)
-    return _filter(s, rule, partial(pull, **(s.pull | changes)))
+        rule = enkf_sampled_covariance if full else partial(transport_map_update, noise_factor=noise_factor)
+    return _filter(s, rule, partial(mean_pull, **(s.pull | changes)))
 
 
 @update
@@ -163,24 +163,24 @@ def noise_free(
 
 def repaired(s: Setup, kind: str) -> EnsembleFilter:
     """One of the filters of the section "Better": what the update knows, how agents agree."""
-    fuse = partial(intersection, rule="trace", scale=np.sqrt(np.diag(s.prior[1])))
+    fuse = partial(intersect_ensembles, rule="trace", scale=np.sqrt(np.diag(s.prior[1])))
     if kind == "exact":
         return EnsembleFilter.exact(
-            s.model, s.sensors, s.graph, members=s.members, names=s.names, failures="keep"
+            s.model, s.sensors, s.graph, members=s.members, names=s.names, on_error="keep"
         )
     rule, agreement = {
-        "sampled_fused": (sampled_noise, fuse),
-        "known_pulled": (known_noise, partial(pull, **s.pull)),
-        "known_fused": (known_noise, fuse),
-        "known_best": (known_noise, partial(intersection, rule="min_determinant")),
+        "sampled_fused": (enkf_sampled_covariance, fuse),
+        "known_pulled": (enkf, partial(mean_pull, **s.pull)),
+        "known_fused": (enkf, fuse),
+        "known_best": (enkf, partial(intersect_ensembles, rule="min_determinant")),
     }[kind]
     return _filter(s, rule, agreement)
 
 
 def _filter(s: Setup, rule: Any, agreement: Any) -> EnsembleFilter:
     return EnsembleFilter(
-        s.model, s.sensors, s.graph, update=rule, agreement=agreement, members=s.members,
-        names=s.names, failures="keep",
+        s.model, s.sensors, s.graph, update=rule, fusion=agreement, members=s.members,
+        names=s.names, on_error="keep",
     )  # fmt: skip
 
 

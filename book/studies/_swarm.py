@@ -37,13 +37,13 @@ SCHEMES: dict[str, tuple[Any, dict[str, Any]]] = {
     "central_printed": (density.Centralised(), {"first": "observed", **PRINTED}),
     "paper": (density.PIConsensus(modes=MODES, **PAPERS), {}),
     "paper_printed": (density.PIConsensus(modes=MODES, **PAPERS), PRINTED),
-    "paper_flat": (density.PIConsensus(modes=MODES, first_std=FLAT, **PAPERS), {}),
+    "paper_flat": (density.PIConsensus(modes=MODES, initial_std=FLAT, **PAPERS), {}),
     "fast": (density.PIConsensus(modes=MODES, **FAST), {}),
-    "fast_flat": (density.PIConsensus(modes=MODES, first_std=FLAT, **FAST), {}),
+    "fast_flat": (density.PIConsensus(modes=MODES, initial_std=FLAT, **FAST), {}),
     "stiff": (density.PIConsensus(modes=MODES, **STIFF), {}),
-    "stiff_flat": (density.PIConsensus(modes=MODES, first_std=FLAT, **STIFF), {}),
-    "steps_flat": (density.PIConsensus(modes=MODES, first_std=FLAT, **STEPS), {}),
-    "steps_printed": (density.PIConsensus(modes=MODES, first_std=FLAT, **STEPS), PRINTED),
+    "stiff_flat": (density.PIConsensus(modes=MODES, initial_std=FLAT, **STIFF), {}),
+    "steps_flat": (density.PIConsensus(modes=MODES, initial_std=FLAT, **STEPS), {}),
+    "steps_printed": (density.PIConsensus(modes=MODES, initial_std=FLAT, **STEPS), PRINTED),
     "average": (density.DynamicAverage(), {}),
     "flooding": (density.Flooding(), {}),
     "flooding_forgets": (density.Flooding(forget=SHARING["forget"]), {}),
@@ -93,10 +93,10 @@ def network(
     model = density.FokkerPlanck(densities.swarm(case.reading, case.phase), case.grid)
     who = tuple(range(local)) if isinstance(local, int) else tuple(local)
     return DensityFilter(
-        model, case.agents, case.radio_range, agreement=sharing, bandwidth=case.bandwidth,
+        model, case.agents, case.radio_range, fusion=sharing, bandwidth=case.bandwidth,
         local=who[:1] if scheme.startswith("central") else who,
         prior_length=CHOICES["prior_length"], prior_std=CHOICES["prior_std"],
-        first_std=FLAT, floor=CHOICES["floor"],
+        initial_std=FLAT, floor=CHOICES["floor"],
         **{"rank": CHOICES["rank"], **own, **options},
     )
 
@@ -105,7 +105,7 @@ def drawn(case: Case, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]
     """Agents (N, 2) and the density that they are drawn from, on the case's grid."""
     x = densities.first_agents(case.start, case.agents, rng)
     first = densities.first_density(case.start)
-    return x, case.grid.normalised(first[densities.grid().cells(case.grid.centres)])
+    return x, case.grid.normalize(first[densities.grid().cell_index(case.grid.centres)])
 
 
 def compared(

@@ -58,7 +58,7 @@ class Team:
     @property
     def size(self) -> int:
         """How many agents."""
-        return int(self.graph.size)
+        return int(self.graph.n_agents)
 
     def data(self, steps: int, runs: int, rng: np.random.Generator) -> tuple:
         """Targets (steps, runs, n) and readings (steps, runs, A, e)."""
@@ -108,7 +108,7 @@ class Team:
             h = self.sees(agent, self.size)
             eyes.append(Sensor(len(h), lambda x, h=h: x @ h.T, self.reading_cov,
                                linear=lambda d, h=h: h))  # fmt: skip
-        return GaussianFilter(model, eyes, self.graph, faults=self.faults, gate=self.gate)
+        return GaussianFilter(model, eyes, self.graph, faults=self.faults, gate_probability=self.gate)
 
     def _joint(self, seen: np.ndarray) -> Belief:
         f, (n, _), first = self.joint(), self.dims, self.state(self.size)[2]

@@ -25,17 +25,17 @@ from _together_mixtures import Mixtures
 from bookkit.published import scenario
 from distfilt import filters, metrics, models, network, sensors
 from distfilt.ensembles import sample_covariance
-from distfilt.filters import EnsembleFilter, GaussianFilter, ParticleFilter, Reading
+from distfilt.filters import EnsembleFilter, GaussianFilter, ParticleFilter, Observation
 from distfilt.network import covariance_intersection, graphs
 from distfilt.triangular import separable
 from distfilt.updates import (
-    exact_draws,
-    inflated,
-    known_noise,
-    resampled,
-    sampled_noise,
-    square_root,
-    transport,
+    enkf_exact,
+    with_inflation,
+    enkf,
+    resample,
+    enkf_sampled_covariance,
+    etkf,
+    transport_map_update,
 )
 
 Array = np.ndarray
@@ -105,7 +105,7 @@ def linear(s: Any = LINEAR, agents: int | None = None) -> Problem:
     """Eight agents on a ring see one coordinate each of a walker."""
     agents = agents or s["agents"]
     model = replace(models.constant_velocity(sigma=s["sigma"]), names=("x", "y", "u", "v"))
-    eyes = [sensors.direct([k % 2], std=s["reading_std"]) for k in range(agents)]
+    eyes = [sensors.component([k % 2], std=s["reading_std"]) for k in range(agents)]
     prior = np.zeros(4), np.diag(np.square(s["prior_std"]))
     return Problem("linear", model, eyes, graphs.ring(agents), prior, clock(s), s["burn"],
                    ("x", "y", "u", "v"), scenario=s)  # fmt: skip
@@ -138,7 +138,7 @@ def lorenz(s: Any = LORENZ, agents: int | None = None) -> Problem:
     """Lorenz's convection on a path of three agents that see a component each."""
     agents = agents or s["agents"]
     model = models.lorenz63(sigma=s["sigma"], step=s["longest_step"])
-    eyes = [sensors.direct([k % 3], std=s["reading_std"]) for k in range(agents)]
+    eyes = [sensors.component([k % 3], std=s["reading_std"]) for k in range(agents)]
     prior = s["first"], s["prior_std"] ** 2 * np.eye(3)
     return Problem("lorenz", model, eyes, graphs.path(agents), prior, clock(s), s["burn"],
                    ("x", "y", "z"), scenario=s, traits=("chaotic",))  # fmt: skip
@@ -162,12 +162,12 @@ def egos_and_target(s: Any, agents: int) -> tuple[Any, Array]:
 
     def move(dt: float) -> Array:
         out = np.eye(n)
-        out[:4, :4] = walk.transition(dt)
+        out[:4, :4] = walk.F(dt)
         return out
 
     def noise(t: float, dt: float) -> Array:
         out = np.zeros((n, n))
-        out[:4, :4] = walk.noise(t, dt)
+        out[:4, :4] = walk.Q(t, dt)
         return out
 
     names = ("x", "y", "u", "v", *(f"{c}{k}" for k in range(agents) for c in "xy"))
@@ -190,7 +190,7 @@ def star(s: Any = HELD, agents: int | None = None) -> Problem:
     model = models.LinearModel.from_transition(
         3, lambda dt: np.eye(3), lambda t, dt: q * dt * np.eye(3), names=("x", "y", "z")
     )
-    eyes = [sensors.direct([k % 3], std=s["reading_std"]) for k in range(agents)]
+    eyes = [sensors.component([k % 3], std=s["reading_std"]) for k in range(agents)]
     return Problem("star", model, eyes, graphs.star(agents), (np.zeros(3), 4 * np.eye(3)),
                    clock(s), s["burn"], ("x", "y", "z"), scenario=s)  # fmt: skip
 
@@ -200,7 +200,7 @@ def angles(s: Any = HELD, agents: int | None = None) -> Problem:
     agents = agents or s["road_agents"]
     model = replace(models.constant_velocity(sigma=s["road_sigma"]), names=("x", "y", "u", "v"))
     at = np.stack([np.linspace(-6, 6, agents), np.full(agents, -8.0)], axis=-1)
-    eyes = [sensors.angle((0, 1), std=s["angle_std"], full=True, origin=o) for o in at]
+    eyes = [sensors.line_angle((0, 1), std=s["angle_std"], full=True, origin=o) for o in at]
     prior = np.zeros(4), np.diag([4.0, 4.0, 0.25, 0.25])
     return Problem("angles", model, eyes, graphs.complete(agents), prior, clock(s), s["burn"],
                    ("x", "y", "u", "v"), scenario=s, traits=("curved",))  # fmt: skip
@@ -240,14 +240,14 @@ class PassedOn:
     the number of whose it is, until all have all readings.
     """
 
-    def advance(self, step: Any) -> Any:
+    def next_state(self, step: Any) -> Any:
         """Flood, then go on as the family does."""
         if step.channel is not None:
             step.said = flooded(step.said, step.channel, step.t)
         return super().advance(step)  # type: ignore[misc]
 
 
-def flooded(said: list[list[Reading]], channel: Any, t: float) -> list[list[Reading]]:
+def flooded(said: list[list[Observation]], channel: Any, t: float) -> list[list[Observation]]:
     """Everybody's reading for everybody, of agents that have one reading at most."""
     known = [{r.agent: r for r in own} for own in said]
     news = [dict(own) for own in known]
@@ -258,13 +258,13 @@ def flooded(said: list[list[Reading]], channel: Any, t: float) -> list[list[Read
             whose = [np.full((*v.shape[:-1], 1), k) for k, v in zip(some, values, strict=True)]
             told.append(tuple(values + whose) if some else None)
         news = [{} for _ in known]
-        for agent, box in enumerate(channel.exchange(told)):
+        for agent, box in enumerate(channel.broadcast(told)):
             for payload in box.values():
                 half = len(payload) // 2
                 for value, name in zip(payload[:half], payload[half:], strict=True):
                     whose = int(name.flat[0])
                     if whose not in known[agent]:
-                        news[agent][whose] = Reading.unchecked(t, whose, value)
+                        news[agent][whose] = Observation.construct(t, whose, value)
         for own, new in zip(known, news, strict=True):
             own.update(new)
     return [[own[k] for k in sorted(own)] for own in known]
@@ -287,15 +287,15 @@ class MeasurementConsensus(GaussianFilter):
     """Agents agree on the average of what their readings say, HᵀR⁻¹H and HᵀR⁻¹z, times A."""
 
     _: KW_ONLY
-    agree: Callable[..., Array] = network.finite_time
+    agree: Callable[..., Array] = network.finite_time_consensus
     share: bool = False
 
-    def advance(self, step: Any) -> Any:
+    def next_state(self, step: Any) -> Any:
         """Forecast, linearise the own reading, agree, add the information."""
         t, dt, d = step.state.t, step.dt, self.model.dim
         slope = self.model.jacobian(step.state.means, t, dt)
         m = self.model.step(step.state.means, t, dt)
-        P = slope @ step.state.covariances @ slope.mT + self.model.noise(t, dt)
+        P = slope @ step.state.covariances @ slope.mT + self.model.Q(t, dt)
         P = self.inflation**2 * P
         said = np.zeros((*m.shape[:-1], d, d + 1))
         for _, heard in step.heard():
@@ -307,7 +307,7 @@ class MeasurementConsensus(GaussianFilter):
             said[..., a, :, :] = W @ np.concatenate([H, z], axis=-1)
         rows, columns = np.triu_indices(d, 0, d + 1)
         flat = np.ascontiguousarray(said[..., rows, columns])
-        flat = self.count * self.agree(flat, step.channel)
+        flat = self.n_agents * self.agree(flat, step.channel)
         said[..., rows, columns] = flat
         J = np.triu(said[..., :d]) + np.triu(said[..., :d], 1).mT
         P = P @ np.linalg.inv(np.eye(d) + J @ P)
@@ -330,7 +330,7 @@ class OnePlan(filters.TransportFilter):
                                       correct=self.correct,
                                       rejuvenation=self.rejuvenation)  # fmt: skip
         moved, errors = one._transported(first, logs[..., :1, :], rng)
-        return [np.repeat(x, self.count, axis=-3) for x in moved], errors
+        return [np.repeat(x, self.n_agents, axis=-3) for x in moved], errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -339,7 +339,7 @@ class OwnState(GaussianFilter):
 
     With `news` it tells what its reading taught, as two readings of unit noise; without, its whole
     belief of the target, and all it has and hears is fused with equal weights. The same as a
-    `NewsFilter`, and as a `MixtureFilter` of one mixand, for many runs at once.
+    `InformationIncrementFilter`, and as a `MixtureFilter` of one mixand, for many runs at once.
     """
 
     _: KW_ONLY
@@ -347,12 +347,12 @@ class OwnState(GaussianFilter):
     news: bool = True
     share: bool = False
 
-    def advance(self, step: Any) -> Any:
+    def next_state(self, step: Any) -> Any:
         """Forecast, take the own reading, tell, learn."""
         t, dt, n, d = step.state.t, step.dt, self.size, self.model.dim
         F = self.model.jacobian(step.state.means, t, dt)
         m = self.model.step(step.state.means, t, dt)
-        P = self.inflation**2 * (F @ step.state.covariances @ F.mT + self.model.noise(t, dt))
+        P = self.inflation**2 * (F @ step.state.covariances @ F.mT + self.model.Q(t, dt))
         before = information(m, P, n)
         for _, heard in step.heard():
             H = heard.jacobian(m)
@@ -361,7 +361,7 @@ class OwnState(GaussianFilter):
             m, P = m + (gain @ gap[..., None])[..., 0], P - gain @ H @ P
         after = information(m, P, n)
         told = packed_news(before, after) if self.news else upper(after)
-        inbox = step.channel.exchange([told[..., k, :] for k in range(self.count)])
+        inbox = step.channel.broadcast([told[..., k, :] for k in range(self.n_agents)])
         J = np.zeros((*m.shape[:-1], d, d))
         v = np.zeros_like(m)
         for k, box in enumerate(inbox):
@@ -421,27 +421,27 @@ class LikelihoodConsensus(ParticleFilter):
     """
 
     _: KW_ONLY
-    agree: Callable[..., Array] = network.finite_time
+    agree: Callable[..., Array] = network.finite_time_consensus
     degree: int = 2
     places: tuple[int, ...] = (0, 1)
     share: bool = False
 
-    def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """The same particles for all."""
-        points = np.repeat(self.drawn(prior, (*runs, 1), rng), self.count, axis=-3)
+        points = np.repeat(self.draw_prior(prior, (*runs, 1), rng), self.n_agents, axis=-3)
         return {"points": points, "log_weights": np.full(points.shape[:-1], -np.log(self.members))}
 
-    def advance(self, step: Any) -> Any:
+    def next_state(self, step: Any) -> Any:
         """Resample and move alike, agree on likelihoods, weigh."""
         from distfilt.updates.particles import log_likelihood
 
         x, w = step.state.points[..., 0, :, :], step.state.weights.mean(axis=-2)
-        x = np.take_along_axis(x, resampled(w, rng=step.rng)[..., None], axis=-2)
+        x = np.take_along_axis(x, resample(w, rng=step.rng)[..., None], axis=-2)
         if self.jitter:
             spread = x.std(axis=-2, keepdims=True)
             x = x + self.jitter * spread * step.rng.standard_normal(x.shape)
         x = self.model.sample_step(x, step.state.t, step.dt, rng=step.rng)
-        points = np.repeat(x[..., None, :, :], self.count, axis=-3)
+        points = np.repeat(x[..., None, :, :], self.n_agents, axis=-3)
         logs = np.zeros(points.shape[:-1])
         for _, heard in step.heard():
             a = heard.agents
@@ -449,7 +449,7 @@ class LikelihoodConsensus(ParticleFilter):
             logs[..., a, :] = log_likelihood(seen, heard.target, heard.noise)
         basis = polynomials(x[..., list(self.places)], self.degree)
         found = (logs[..., None, :] @ basis[..., None, :, :])[..., 0, :]
-        found = self.count * self.agree(found, step.channel)
+        found = self.n_agents * self.agree(found, step.channel)
         logs = (basis[..., None, :, :] @ found[..., None])[..., 0]
         logs = logs - logs.max(axis=-1, keepdims=True)
         logs = np.maximum(logs - np.log(np.exp(logs).sum(axis=-1, keepdims=True)), -1e300)
@@ -469,7 +469,7 @@ class GridState(filters.SensorState):
     """Logarithms of the chances of cells."""
 
     logs: Array
-    _belief = "logs", (..., "A", "cells")
+    belief_field = "logs", (..., "A", "cells")
 
 
 @dataclass(frozen=True, eq=False)
@@ -495,14 +495,14 @@ class GridFilter(filters.Filter):
         """Where the cells are, (n, 2)."""
         return centres_of(self.cells, self.half)
 
-    def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """The prior's logarithm at the cells."""
         mean, cov = prior
         gap = self.centres - mean
         logs = -0.5 * (gap * np.linalg.solve(cov, gap.T).T).sum(axis=-1)
-        return {"logs": np.broadcast_to(logs, (*runs, self.count, logs.size))}
+        return {"logs": np.broadcast_to(logs, (*runs, self.n_agents, logs.size))}
 
-    def advance(self, step: Any) -> Any:
+    def next_state(self, step: Any) -> Any:
         """Spread the chances, weigh them by what was heard, agree."""
         old = step.state.logs
         chances = np.exp(old - old.max(axis=-1, keepdims=True))
@@ -522,13 +522,13 @@ class GridFilter(filters.Filter):
             said[..., a, :] = -0.5 * (gap / variance[..., None, :]).sum(axis=-1)
         if self.likelihoods:
             (said,) = step.agreed(said)
-            return step.end(logs=logs + self.count * said)
+            return step.end(logs=logs + self.n_agents * said)
         logs = logs + said
         logs = logs - logs.max(axis=-1, keepdims=True)
         (logs,) = step.agreed(np.maximum(logs, -700.0))
         return step.end(logs=logs)
 
-    def summary(self, state: Any) -> Any:
+    def summarize(self, state: Any) -> Any:
         """Means and covariances of the cells' chances."""
         w = np.exp(state.logs - state.logs.max(axis=-1, keepdims=True))
         w = w / w.sum(axis=-1, keepdims=True)
@@ -553,7 +553,7 @@ def spread_of(cells: int, half: float, model: Any, dt: float) -> Any:
     from scipy.sparse import csr_array
     from scipy.spatial import KDTree
 
-    x, std = centres_of(cells, half), float(np.sqrt(model.noise(0.0, dt)[0, 0]))
+    x, std = centres_of(cells, half), float(np.sqrt(model.Q(0.0, dt)[0, 0]))
     near = KDTree(x).sparse_distance_matrix(
         KDTree(x @ model.transition(dt).T), 5 * std, output_type="coo_matrix"
     )
@@ -593,7 +593,7 @@ TRACE = partial(covariance_intersection, rule="trace")
 # Below one is for those that claim too little, such as intersection.
 WIDER = ("inflation", (0.9, 1.0, 1.05, 1.15, 1.3))
 JITTER = ("jitter", (0.0, 0.05, 0.1, 0.2, 0.4))
-SEPARABLE = partial(transport, fit=partial(separable.fit, order=1, regularisation=0.05))
+SEPARABLE = partial(transport_map_update, fit=partial(separable.fit, order=1, regularisation=0.05))
 
 
 def gaussian(kind: Any = GaussianFilter, *, rule: str = "extended", **options: Any) -> Any:
@@ -610,7 +610,7 @@ def ensemble(update: Any, kind: Any = EnsembleFilter, **options: Any) -> Any:
     """A maker of ensemble filters."""
 
     def make(p: Problem, value: float, members: int = STUDY["members"]) -> Any:
-        wider = inflated(update, factor=value)
+        wider = with_inflation(update, factor=value)
         return kind(p.model, p.sensors, p.graph, update=wider, members=members, failures="keep",
                     **options)  # fmt: skip
 
@@ -619,16 +619,16 @@ def ensemble(update: Any, kind: Any = EnsembleFilter, **options: Any) -> Any:
 
 def exact(p: Problem, value: float, members: int = STUDY["members"]) -> Any:
     """Exact draws and the intersection of least determinant."""
-    update = inflated(exact_draws, factor=value)
+    update = with_inflation(enkf_exact, factor=value)
     return EnsembleFilter.exact(p.model, p.sensors, p.graph, update=update, members=members,
-                                failures="keep")  # fmt: skip
+                                on_error="keep")  # fmt: skip
 
 
 def pulled(p: Problem, value: float, members: int = STUDY["members"]) -> Any:
     """Means that pull each other."""
-    rule = partial(network.pull, gain=value, include_self=False)
-    return EnsembleFilter(p.model, p.sensors, p.graph, agreement=rule, members=members,
-                          failures="keep")  # fmt: skip
+    rule = partial(network.mean_pull, gain=value, include_self=False)
+    return EnsembleFilter(p.model, p.sensors, p.graph, fusion=rule, members=members,
+                          on_error="keep")  # fmt: skip
 
 
 def particles(kind: Any = ParticleFilter, **options: Any) -> Any:
@@ -644,7 +644,7 @@ def particles(kind: Any = ParticleFilter, **options: Any) -> Any:
 def intersected(ensembles: Array, channel: Any) -> Array:
     """Intersection of clouds, which resampling may have left without any width."""
     least = 0.01 * np.random.default_rng(0).standard_normal(ensembles.shape[-2:])
-    return network.intersection(ensembles + least, channel)
+    return network.intersect_ensembles(ensembles + least, channel)
 
 
 def agreed_particles(p: Problem, value: float, members: int = STUDY["particles"]) -> Any:
@@ -682,7 +682,7 @@ def of_target(news: bool) -> Any:
 
     def make(p: Problem, value: float) -> Any:
         return OwnState(p.own.model, p.own.sensors, p.graph, news=news, inflation=value,
-                        failures="keep")  # fmt: skip
+                        on_error="keep")  # fmt: skip
 
     return make
 
@@ -718,7 +718,7 @@ CELLS = {
                      gaussian(share=False, agreement=partial(covariance_intersection, rounds=4)),
                      *WIDER),
     "ekf_two": Cell("Kalman, extended", "information, two rounds",
-                    gaussian(MeasurementConsensus, agree=partial(network.average, rounds=2)),
+                    gaussian(MeasurementConsensus, agree=partial(network.average_consensus, rounds=2)),
                     *WIDER),
     "ekf_meas": Cell("Kalman, extended", "information, exact average",
                      gaussian(MeasurementConsensus), *WIDER),
@@ -732,17 +732,17 @@ CELLS = {
                  empty=AS_READING),
     "own_ci": Cell("Kalman of target and own place", "beliefs of the target, equal CI",
                    of_target(news=False), *WIDER, own=True, empty=NO_PLACE),
-    "enkf_near": Cell("ensemble, perturbed", "readings, one hop", ensemble(sampled_noise), *WIDER),
-    "known_near": Cell("ensemble, known noise", "readings, one hop", ensemble(known_noise), *WIDER),
+    "enkf_near": Cell("ensemble, perturbed", "readings, one hop", ensemble(enkf_sampled_covariance), *WIDER),
+    "known_near": Cell("ensemble, known noise", "readings, one hop", ensemble(enkf), *WIDER),
     "known_pull": Cell("ensemble, known noise", "readings, mean pull", pulled, "gain",
                        (0.025, 0.05, 0.1, 0.2, 0.4)),
     "known_flood": Cell("ensemble, known noise", "readings, passed on",
-                        ensemble(known_noise, FloodedEnsemble, share=False), *WIDER),
+                        ensemble(enkf, FloodedEnsemble, share=False), *WIDER),
     "exact_ci": Cell("ensemble, exact draws", "readings, CI by determinant", exact, *WIDER),
     "root_ci": Cell("ensemble, square root", "readings, CI by determinant",
-                    ensemble(square_root, agreement=network.intersection), *WIDER),
+                    ensemble(etkf, agreement=network.intersect_ensembles), *WIDER),
     "root_flood": Cell("ensemble, square root", "readings, passed on",
-                       ensemble(square_root, FloodedEnsemble, share=False), *WIDER),
+                       ensemble(etkf, FloodedEnsemble, share=False), *WIDER),
     "maps_near": Cell("ensemble, separable maps", "readings, one hop", ensemble(SEPARABLE), *WIDER,
                       empty=MAPS),
     "maps_flood": Cell("ensemble, separable maps", "readings, passed on",
@@ -767,7 +767,7 @@ CELLS = {
     "gm_c3": Cell("mixture, C3", "beliefs, partial fusion", mixture("C3"), *WIDER, own=True),
     "grid_near": Cell("density on a grid", "readings, one hop", gridded(), empty=PLANE),
     "grid_mean": Cell("density on a grid", "beliefs, geometric mean",
-                      gridded(share=False, agreement=network.average), empty=PLANE),
+                      gridded(share=False, agreement=network.average_consensus), empty=PLANE),
     "grid_flood": Cell("density on a grid", "readings, passed on",
                        gridded(FloodedGrid, share=False), empty=PLANE),
 }  # fmt: skip
@@ -831,7 +831,7 @@ def log_scores(p: Problem, f: Any, data: Any, rng: Any, *, own: bool = False) ->
     for k, now in enumerate(f.steps(state, p.times, seen)):
         if k < p.burn:
             continue
-        said = f.summary(now)
+        said = f.summarize(now)
         cov = said.covariance
         if cov is None:
             cov = sample_covariance(said.members)

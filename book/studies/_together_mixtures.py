@@ -30,7 +30,7 @@ class MixturesState(filters.SensorState):
     means: Array
     weights: Array
     covs: Array
-    _belief = "means", (..., "A", "L", "d")
+    belief_field = "means", (..., "A", "L", "d")
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,22 +52,22 @@ class Mixtures(filters.Filter):
     state = MixturesState
     unused = {"lag": "a mixture filter keeps no past"}
 
-    def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """One mixand, and places for more."""
         mean, cov = prior
-        lead, d = (*runs, self.count, self.mixands), len(mean)
+        lead, d = (*runs, self.n_agents, self.mixands), len(mean)
         weights = np.broadcast_to(np.eye(self.mixands)[0], lead)
         covs = np.broadcast_to(cov, (*lead, d, d))
         return {"means": np.broadcast_to(mean, (*lead, d)), "weights": weights, "covs": covs}
 
-    def advance(self, step: Any) -> Any:
+    def next_state(self, step: Any) -> Any:
         """Split, forecast, read, tell, fuse, widen."""
         belief = step.state.weights, step.state.means, step.state.covs
         t, dt = step.state.t, step.dt
         if self.stretch is not None:
             jacobian = self.model.jacobian(belief[1], t, dt)
             belief = split(belief, jacobian, self.stretch)
-        w, m, P = moved(belief, lambda x: self.model.step(x, t, dt), self.model.noise(t, dt))
+        w, m, P = moved(belief, lambda x: self.model.step(x, t, dt), self.model.Q(t, dt))
         for agent, said in enumerate(step.said):
             for reading in (r for r in said if not np.isnan(r.value).all()):
                 part = w[..., agent, :], m[..., agent, :, :], P[..., agent, :, :, :]
@@ -85,7 +85,7 @@ class Mixtures(filters.Filter):
             [w, m[..., :n].reshape(flat), P[..., rows, columns].reshape(flat)], -1
         )
         inbox = [list(box.values()) for box in
-                 channel.exchange([said[..., k, :] for k in range(self.count)])]  # fmt: skip
+                 channel.broadcast([said[..., k, :] for k in range(self.n_agents)])]  # fmt: skip
         for turn in range(max(map(len, inbox))):
             here = [k for k, box in enumerate(inbox) if len(box) > turn]
             x = np.stack([inbox[k][turn] for k in here], axis=-2)
@@ -99,7 +99,7 @@ class Mixtures(filters.Filter):
             w[..., here, :], m[..., here, :, :], P[..., here, :, :, :] = fused
         return w, m, P
 
-    def summary(self, state: Any) -> Any:
+    def summarize(self, state: Any) -> Any:
         """Means and covariances of whole mixtures."""
         w, m = state.weights, state.means
         mean = (w[..., None] * m).sum(axis=-2)
@@ -167,7 +167,7 @@ def updated(belief: Any, y: Array, sensor: Any) -> Any:
     about = sensor.residual(seen, np.broadcast_to(centre[..., None, :], seen.shape))
     mean, first, second = differences(about)
     gap = sensor.residual(np.broadcast_to(y[..., None, :], centre.shape), centre) - mean
-    S = first @ first.mT + second @ second.mT + sensor.cov
+    S = first @ first.mT + second @ second.mT + sensor.noise_cov
     gain = root @ first.mT @ np.linalg.inv(S)
     far = (gap[..., None, :] @ np.linalg.solve(S, gap[..., None]))[..., 0, 0]
     logs = logarithm(w) - 0.5 * (far + np.linalg.slogdet(2 * np.pi * S)[1])

@@ -122,7 +122,7 @@ def worse(best: Result, others: Iterable[Result]) -> set[str]:
 def operations(p: Any, cell: str, members: int | None = None) -> float:
     """Leading terms of an agent's floating-point operations in a step."""
     d, agents, m = p.model.dim, p.agents, p.sensors[0].dim
-    near = float(p.graph.degrees.mean())
+    near = float(p.graph.in_degree.mean())
     talk = cell.split("_")[-1]
     used = {"near": 1 + near, "ci": 1 + near, "trace": 1 + near, "pull": 1 + near,
             "flood": agents}.get(talk, 1)  # fmt: skip

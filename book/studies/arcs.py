@@ -91,10 +91,10 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     two = belief(np.pi + for_pair.uniform(*BOUNDS["turn"]), for_pair)
     exact = [PartialFusion(one, two.marginal([0, 1])), PartialFusion(two, one.marginal([0, 1]))]
     fused = {
-        name: [f.weigh(f.shapes(terms=terms), rule=rule) for f in exact]
+        name: [f.assign_weights(f.component_shapes(terms=terms), rule=rule) for f in exact]
         for name, (terms, rule) in RULES.items()
     }
-    fused["moments"] = [fuse_moments(f.own, f.heard) for f in exact]
+    fused["moments"] = [fuse_moments(f.own, f.received) for f in exact]
     first = int(for_points.integers(2**31))
     out = {}
     for name, pair in fused.items():

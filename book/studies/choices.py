@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from bookkit import studies
-from distfilt.updates import augmented, ensemble_transform, projected
+from distfilt.updates import with_augmentation, etpf, with_projection
 
 starts = studies.script("starts")
 pendulum, setting = starts.pendulum, starts.setting
@@ -22,13 +22,13 @@ STDS = (0.02, 0.05, 0.1, 0.2)
 """Deviations of the pretended reading of the squared length, in m²; columns have thousandths."""
 READINGS = ("shift", "particle")
 UPDATES = {
-    f"OTMA_{round(1000 * std)}": augmented(ensemble_transform, pendulum.rod, std=std)
+    f"OTMA_{round(1000 * std)}": with_augmentation(etpf, pendulum.rod, std=std)
     for std in STDS
 }
 for _reading in READINGS:
     _how = {**pendulum.how, "reading": _reading}
-    UPDATES[f"OTNLeq_{_reading}"] = projected(ensemble_transform, pendulum.rod, **_how)
-    UPDATES[f"OTNLeqMA_{_reading}"] = projected(pendulum.seen_too, pendulum.rod, **_how)
+    UPDATES[f"OTNLeq_{_reading}"] = with_projection(etpf, pendulum.rod, **_how)
+    UPDATES[f"OTNLeqMA_{_reading}"] = with_projection(pendulum.seen_too, pendulum.rod, **_how)
 SCORES = (*starts.SCORES, "normal")
 
 

@@ -57,7 +57,7 @@ def first_density(start: str) -> np.ndarray:
         return np.ones(cells.size)
     gap = ((cells.centres - CHOICES["peak_centre"]) ** 2).sum(axis=-1)
     peak = np.exp(-0.5 * gap / CHOICES["peak_variance"])
-    return cells.normalised(peak + CHOICES["peak_floor"])
+    return cells.normalize(peak + CHOICES["peak_floor"])
 
 
 def first_agents(start: str, agents: int, rng: np.random.Generator) -> np.ndarray:
@@ -94,14 +94,14 @@ def case(
     end = dict(zip(READINGS, CHOICES["end_times"], strict=True))[reading] if end is None else end
     true, believed = swarm(reading), swarm(reading, phase)
     truth, model = (density.FokkerPlanck(s, cells) for s in (true, believed))
-    k = density.kernel_information(cells, bandwidth=h, agents=n)
+    k = density.kernel_constant(cells, bandwidth=h, agents=n)
     basis = density.zero_mean_prior(
         cells, rank=CHOICES["rank"], length=CHOICES["prior_length"], std=CHOICES["prior_std"])
     x, p = first_agents(start, n, rng), first_density(start)
     y = density.kernel_density(x, cells, bandwidth=h)
     flat = np.exp(-0.5 * ((cells.centres - x[0]) ** 2).sum(axis=-1)
                   / CHOICES["local_prior_std"] ** 2)
-    filters = beginning(basis, np.stack([y, y, y, cells.normalised(flat)]), x)
+    filters = beginning(basis, np.stack([y, y, y, cells.normalize(flat)]), x)
     few = basis[:, : CHOICES["low_rank"]]
     low = density.low_rank_start(few, y[None])
     scale = dict(zip(READINGS, CHOICES["process_scale"], strict=True))[reading]
@@ -113,12 +113,12 @@ def case(
         x = true.step(x, t, dt, rng=rng, substeps=CHOICES["substeps"])
         p = truth.step(p, t, dt)
         y = density.kernel_density(x, cells, bandwidth=h)
-        filters = density.low_rank_moved(filters, move)
+        filters = density.low_rank_predict(filters, move)
         noise[0] = k * np.maximum(filters.estimates[0], floor)
         noise[1] = k * np.maximum(y, floor)
         filters = density.low_rank_step(filters, y, noise, dt)
         if phase:
-            low = density.low_rank_moved(low, move, process=scale * few, dt=dt)
+            low = density.low_rank_predict(low, move, process=scale * few, dt=dt)
             low = density.low_rank_step(low, y, k * np.maximum(low.estimates, floor), dt)
         found = np.stack([y, *filters.estimates, *low.estimates])
         rows.append(np.concatenate([cells.norm(found - p), scored(filters, p, j)]))

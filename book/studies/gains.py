@@ -51,7 +51,7 @@ def network(scheme: str) -> DensityFilter:
         return replace(f, bandwidth=KERNELS[last])
     if last == "wide":
         f = swarm.network("paper_flat", CASE)
-        return replace(f, first_std=WIDE, agreement=replace(f.agreement, first_std=WIDE))
+        return replace(f, initial_std=WIDE, fusion=replace(f.fusion, initial_std=WIDE))
     return swarm.network(scheme, CASE)
 
 

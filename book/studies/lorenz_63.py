@@ -12,7 +12,7 @@ import numpy as np
 
 from distfilt.models import lorenz63, simulate
 from distfilt.triangular import affine, separable
-from distfilt.updates import transport
+from distfilt.updates import transport_map_update
 
 NAME = "lorenz-63"
 PAPER = "grange"
@@ -53,7 +53,7 @@ def scores(name, fit, members, truth, seen, rng):
     noise = VARIANCE * np.eye(3)
     for k, y in enumerate(seen):
         members = model.step(members, 0.0, DT)
-        members = transport(members, members, y, noise, rng=rng, fit=fit)
+        members = transport_map_update(members, members, y, noise, rng=rng, fit=fit)
         if k >= BURN:
             gap = members.mean(axis=0) - truth[k]
             errors.append(np.sqrt((gap**2).mean()))

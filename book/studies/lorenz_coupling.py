@@ -12,17 +12,17 @@ from functools import partial
 
 import numpy as np
 
-from distfilt.doors import unchecked
+from distfilt.validation import unchecked
 from distfilt.filters import ParticleCollapse
 from distfilt.metrics import crps
 from distfilt.models import lorenz63, simulate
 from distfilt.updates import (
-    ensemble_transform,
-    inflated,
+    etpf,
+    with_inflation,
     jitter,
-    known_noise,
-    resampled,
-    square_root,
+    enkf,
+    resample,
+    etkf,
 )
 
 # Strengths that are too weak are part of the study.
@@ -40,16 +40,16 @@ def particles(x, h, y, r, *, rng, bandwidth):
     """Weigh, resample, jitter: a particle filter as an update of members."""
     logs = -0.5 * ((y - h) ** 2).sum(axis=-1) / r[0, 0]
     w = np.exp(logs - logs.max())
-    picked = x[resampled(w / w.sum(), rng=rng)]
+    picked = x[resample(w / w.sum(), rng=rng)]
     return jitter(picked, rng=rng, bandwidth=bandwidth, cov=np.cov(x.T, bias=True))
 
 
 FAMILIES = {
-    "enkf": [inflated(known_noise, factor=f) for f in (1.02, 1.05, 1.1)],
-    "root": [inflated(square_root, factor=f) for f in (1.02, 1.05, 1.1)],
-    "transport": [partial(ensemble_transform, rejuvenation=h) for h in (0.1, 0.2, 0.3)],
+    "enkf": [with_inflation(enkf, factor=f) for f in (1.02, 1.05, 1.1)],
+    "root": [with_inflation(etkf, factor=f) for f in (1.02, 1.05, 1.1)],
+    "transport": [partial(etpf, rejuvenation=h) for h in (0.1, 0.2, 0.3)],
     "second": [
-        partial(ensemble_transform, rejuvenation=h, correct=True) for h in (0.1, 0.2, 0.3)
+        partial(etpf, rejuvenation=h, correct=True) for h in (0.1, 0.2, 0.3)
     ],
     "particles": [partial(particles, bandwidth=h) for h in (0.2, 0.3, 0.4)],
 }
@@ -71,7 +71,7 @@ def scores(update, members, truth, seen, rng):
     inner, rows = unchecked(update), []
     noise = VARIANCE * np.eye(1)
     for k, y in enumerate(seen):
-        members = model.flow(members, 0.0, DT)
+        members = model.transition(members, 0.0, DT)
         members = inner(members, members[:, :1], y, noise, rng=rng)
         if k >= BURN:
             gap = members.mean(axis=0) - truth[k]

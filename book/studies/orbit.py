@@ -15,20 +15,20 @@ import numpy as np
 
 from bookkit.published import scenario
 from bookkit.studies import Stored, check, stored
-from distfilt.filters import MixtureFilter, MixtureState, NewsFilter
+from distfilt.filters import MixtureFilter, MixtureState, InformationIncrementFilter
 from distfilt.mixtures import (
     GaussianMixture,
     PartialFusion,
-    average,
-    fuse,
-    fuse_in_turn,
+    average_mixtures,
+    fuse_mixtures,
+    fuse_sequentially,
     fuse_moments,
     runnalls,
     target_fusion,
 )
 from distfilt.models import occulted, orbits, rsw_frame
 from distfilt.network import graphs
-from distfilt.sensors import ephemeris, line_of_sight, stack
+from distfilt.sensors import ephemeris, angles_only, stack
 
 NAME, PAPER = "orbit", "semeraro"
 TABLE = scenario("semeraro", "table-3").reading()
@@ -71,12 +71,12 @@ SCENES = {
 def lean(own: GaussianMixture, heard: list[GaussianMixture]) -> GaussianMixture:
     """Matched terms with C2, what is heard being reduced to six mixands for the shapes."""
     exact = PartialFusion(own, heard)
-    return exact.weigh(exact.shapes(received=[runnalls(m, 6) for m in heard]), rule="C2")
+    return exact.assign_weights(exact.component_shapes(received=[runnalls(m, 6) for m in heard]), rule="C2")
 
 
 def mean_of(own: GaussianMixture, heard: list[GaussianMixture]) -> GaussianMixture:
     """The arithmetic average with the one agent that is heard."""
-    return average(own, heard[0])
+    return average_mixtures(own, heard[0])
 
 
 SCALE = [1.0, 1.0, 1.0, 6.8, 6.8, 6.8]
@@ -86,29 +86,29 @@ MANY = {
 }
 MORE = {**MANY, "size": TABLE["late_mixands"], "most": TABLE["late_mixands"]}
 ONE = {"size": 1, "most": 1}
-IN_TURN = partial(fuse_in_turn, pair=partial(fuse, size=TABLE["mixands"]))
+IN_TURN = partial(fuse_sequentially, pair=partial(fuse_mixtures, n_components=TABLE["mixands"]))
 SINGLE = {
     "one_none": ONE, "one_ci": {**ONE, "agreement": partial(fuse_moments, omega="equal")},
     "news": {"news": True},
 }
 CROWDED = {
     "none": MANY, "turn": {**MANY, "agreement": IN_TURN}, **SINGLE,
-    "half": {**ONE, "agreement": partial(fuse_in_turn, pair=fuse_moments, omega=0.5)},
+    "half": {**ONE, "agreement": partial(fuse_sequentially, pair=fuse_moments, omega=0.5)},
 }
 ROWS = {
     "": {
-        "none": MANY, "c2": {**MANY, "agreement": partial(fuse, rule="C2")},
-        "c3": {**MANY, "agreement": fuse},
-        "all": {**MANY, "agreement": partial(fuse, terms="all")},
+        "none": MANY, "c2": {**MANY, "agreement": partial(fuse_mixtures, rule="C2")},
+        "c3": {**MANY, "agreement": fuse_mixtures},
+        "all": {**MANY, "agreement": partial(fuse_mixtures, terms="all")},
         "moments": {**MANY, "agreement": fuse_moments},
         "average": {**MANY, "agreement": mean_of}, **SINGLE, "twice": {"news": True, "common": ()},
     },
     "late": {
-        "none": MORE, "c2": {**MORE, "agreement": lean}, "c3": {**MORE, "agreement": fuse},
+        "none": MORE, "c2": {**MORE, "agreement": lean}, "c3": {**MORE, "agreement": fuse_mixtures},
         "moments": {**MORE, "agreement": fuse_moments}, **SINGLE,
         "many_news": {**MORE, "news": True},
     },
-    "three": {**CROWDED, "pass": {**MANY, "agreement": partial(fuse, omega="equal")}},
+    "three": {**CROWDED, "pass": {**MANY, "agreement": partial(fuse_mixtures, omega="equal")}},
     "five": CROWDED,
     **{name: SINGLE for name in ("arctan", "sign", "fixes")},
 }
@@ -118,7 +118,7 @@ ROWS = {
 def sensor(s: dict) -> object:
     """An agent's: two angles of the target, then the target's full state."""
     fix = ephemeris(position_std=s["fix_std"][0], velocity_std=s["fix_std"][1])
-    return stack([line_of_sight(std=s["angle_std"] * ARCSECOND, form=s["form"]), fix])
+    return stack([angles_only(std=s["angle_std"] * ARCSECOND, form=s["form"]), fix])
 
 
 def data(s: dict, rng: np.random.Generator) -> tuple:
@@ -144,7 +144,7 @@ def readings(s: dict, truth: np.ndarray, rng: np.random.Generator) -> np.ndarray
     """What the agents see, (8, A, 8): no angles before the first or through the Earth."""
     agents = len(s["agents"])
     seen = np.full((len(HOURS), agents, 8), np.nan)
-    eye = line_of_sight(std=s["angle_std"] * ARCSECOND, form=s["form"])
+    eye = angles_only(std=s["angle_std"] * ARCSECOND, form=s["form"])
     for k, hour in enumerate(HOURS):
         noise = rng.standard_normal((agents, 6)) * np.repeat(s["fix_std"], 3)
         for a in range(agents):
@@ -185,7 +185,7 @@ def network(s: dict, options: dict) -> MixtureFilter:
     n, chosen = len(s["agents"]), dict(options)
     kind = MixtureFilter
     if chosen.pop("news", False):
-        kind, chosen = NewsFilter, {"common": range(2, 8) if s["one_fix"] else (), **chosen}
+        kind, chosen = InformationIncrementFilter, {"common": range(2, 8) if s["one_fix"] else (), **chosen}
     if "agreement" in chosen:
         chosen["agreement"] = partial(target_fusion, target_dim=6, fuse=chosen["agreement"])
     return kind(
@@ -214,7 +214,7 @@ def bound(
     eye = {"std": s["angle_std"] * ARCSECOND, "form": s["form"]}
     fix = ephemeris(position_std=s["fix_std"][0], velocity_std=s["fix_std"][1])
     fixes = 1 if s["one_fix"] else n
-    every = stack([line_of_sight(observer=6 * a, **eye) for a in range(1, n + 1)] + [fix] * fixes)
+    every = stack([angles_only(observer=6 * a, **eye) for a in range(1, n + 1)] + [fix] * fixes)
     f = MixtureFilter(moving(s, n + 1), [every], target_dim=6, **options)
     state, out = f.start([GaussianMixture.gaussian(first, block(covs))]), []
     for k, hour in enumerate(HOURS):

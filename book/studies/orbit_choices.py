@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import orbit as paper
 
 from bookkit.studies import Stored, check, stored
-from distfilt.mixtures import GaussianMixture, fuse
+from distfilt.mixtures import GaussianMixture, fuse_mixtures
 
 NAME, PAPER = "orbit-choices", "semeraro"
 EARLY_HOURS = tuple(paper.HOURS[k] for k in paper.EARLY)
@@ -34,14 +34,14 @@ def sized(mixands: int) -> dict[str, Any]:
 
 CHOICES: dict[str, tuple[dict, dict, dict[str, Any]]] = {
     "weights": (paper.SETTING, paper.MANY, {
-        "c1": partial(fuse, rule="C1"), "c2": partial(fuse, rule="C2"),
-        "all": partial(fuse, terms="all"),
+        "c1": partial(fuse_mixtures, rule="C1"), "c2": partial(fuse_mixtures, rule="C2"),
+        "all": partial(fuse_mixtures, terms="all"),
     }),
-    "mixands_6": (paper.SETTING, sized(6), {"c3": fuse}),
-    "mixands_24": (paper.SETTING, sized(24), {"c3": fuse}),
-    "split_2": (paper.SETTING, {**paper.MANY, "stretch": 2.5}, {"c3": fuse}),
-    "split_10": (paper.SETTING, {**paper.MANY, "stretch": 10.0}, {"c3": fuse}),
-    "fixes": (FIXES, paper.MANY, {"c3": fuse}),
+    "mixands_6": (paper.SETTING, sized(6), {"c3": fuse_mixtures}),
+    "mixands_24": (paper.SETTING, sized(24), {"c3": fuse_mixtures}),
+    "split_2": (paper.SETTING, {**paper.MANY, "stretch": 2.5}, {"c3": fuse_mixtures}),
+    "split_10": (paper.SETTING, {**paper.MANY, "stretch": 10.0}, {"c3": fuse_mixtures}),
+    "fixes": (FIXES, paper.MANY, {"c3": fuse_mixtures}),
 }
 """A setting, what its filters are made of, and the rules of fusion that are tried with them."""
 

@@ -77,8 +77,8 @@ def fusions(y: np.ndarray) -> list[PartialFusion]:
 
 def weighed(fusion: PartialFusion) -> list[GaussianMixture]:
     """The mixtures of the three rules."""
-    shapes = fusion.shapes(terms="all")
-    return [fusion.weigh(shapes, rule=rule) for rule in RULES]
+    shapes = fusion.component_shapes(terms="all")
+    return [fusion.assign_weights(shapes, rule=rule) for rule in RULES]
 
 
 def cubes(rng: np.random.Generator, n: int) -> Cubes:
@@ -89,7 +89,7 @@ def cubes(rng: np.random.Generator, n: int) -> Cubes:
 def points(mixture: GaussianMixture, u: np.ndarray) -> np.ndarray:
     """A mixture's points at places of the cube: which mixand, then where."""
     ends = np.cumsum(mixture.weights) / mixture.weights.sum()
-    which = np.searchsorted(ends, u[:, 0]).clip(max=mixture.size - 1)
+    which = np.searchsorted(ends, u[:, 0]).clip(max=mixture.n_components - 1)
     noise = (mixture.factors[which] @ ndtri(u[:, 1:])[..., None])[..., 0]
     return np.asarray(mixture.means[which] + noise)
 
@@ -227,7 +227,7 @@ def checked() -> Stored:
         y = np.array([whole.columns[f"y_{k}"][row] for k in range(12)])
         return again(y, seed.spawn(4)[3])
 
-    part = type(whole)(whole.path, whole.heads, whole.seeds, whole.failures,
+    part = type(whole)(whole.path, whole.metadata, whole.seeds, whole.failures,
                        {name: whole.columns[name] for name in ("fresh", "many")})
     check(part, scored, indices=[0, len(whole) - 1], rtol=rtol)
     return whole

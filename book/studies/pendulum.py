@@ -14,11 +14,11 @@ from functools import partial
 import numpy as np
 
 from bookkit.published import scenario
-from distfilt.coupling import norm, project, retract
-from distfilt.doors import unchecked
+from distfilt.coupling import norm_constraint, project, retract
+from distfilt.validation import unchecked
 from distfilt.filters import ParticleCollapse
 from distfilt.models import pendulum, pendulum_states
-from distfilt.updates import augmented, ensemble_transform, projected, retracted
+from distfilt.updates import with_augmentation, etpf, with_projection, with_retraction
 
 # The study counts the runs that lose the truth.
 warnings.filterwarnings("ignore", category=ParticleCollapse)
@@ -37,22 +37,22 @@ TRACED = tuple(range(STEPS // 20))
 REJUVENATION = 0.2
 """Bandwidth of rejuvenation; the paper's algorithms draw nothing."""
 
-rod = norm([0, 1], length=setting["length"])
+rod = norm_constraint([0, 1], length=setting["length"])
 swing = pendulum(
     length=setting["length"], gravity=setting["gravity"], step=setting["integration_step"]
 )
-seen_too = augmented(ensemble_transform, rod, std=setting["constraint_std"])
+seen_too = with_augmentation(etpf, rod, std=setting["constraint_std"])
 how = {"reading": setting["reading"], "regularisation": setting["regularisation"]}
 UPDATES = {
-    "OTF": ensemble_transform,
+    "OTF": etpf,
     "OTMA": seen_too,
-    "OTNLeq": projected(ensemble_transform, rod, **how),
-    "OTNLeqMA": projected(seen_too, rod, **how),
-    "retraction": retracted(ensemble_transform, rod, motion=MOTION),
-    "rejuvenated": retracted(
-        partial(ensemble_transform, rejuvenation=REJUVENATION), rod, motion=MOTION
+    "OTNLeq": with_projection(etpf, rod, **how),
+    "OTNLeqMA": with_projection(seen_too, rod, **how),
+    "retraction": with_retraction(etpf, rod, motion=MOTION),
+    "rejuvenated": with_retraction(
+        partial(etpf, rejuvenation=REJUVENATION), rod, motion=MOTION
     ),
-    "corrected": retracted(partial(ensemble_transform, correct=True), rod, motion=MOTION),
+    "corrected": with_retraction(partial(etpf, correct=True), rod, motion=MOTION),
 }
 ON_CIRCLE = ("retraction", "rejuvenated", "corrected")
 ALGORITHMS = ("OTF", "OTProj", "OTMA", "OTNLeq", "OTNLeqMA", *ON_CIRCLE)
@@ -88,7 +88,7 @@ def run(
     alive = np.ones(len(inner), dtype=bool)
     with np.errstate(all="ignore"):
         for k, y in enumerate(readings):
-            x = model.flow(x, 0.0, DT)
+            x = model.transition(x, 0.0, DT)
             for f in np.flatnonzero(alive):
                 try:
                     x[f] = inner[f](x[f], x[f, :, :2], y, NOISE, rng=rng)

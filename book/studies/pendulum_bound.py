@@ -16,19 +16,19 @@ from functools import partial
 import numpy as np
 
 from bookkit.published import scenario
-from distfilt.coupling import norm, retract
-from distfilt.doors import unchecked
+from distfilt.coupling import norm_constraint, retract
+from distfilt.validation import unchecked
 from distfilt.filters import ParticleCollapse
 from distfilt.metrics import crps
 from distfilt.models import pendulum, pendulum_angle, pendulum_chart, pendulum_states
 from distfilt.updates import (
-    augmented,
-    ensemble_transform,
-    known_noise,
-    projected,
-    resampled,
-    retracted,
-    square_root,
+    with_augmentation,
+    etpf,
+    enkf,
+    with_projection,
+    resample,
+    with_retraction,
+    etkf,
 )
 
 # The study counts the runs that lose the truth.
@@ -50,29 +50,29 @@ KICK = np.array([setting["noise_position"], setting["noise_velocity"]])
 PRIOR = (START, setting["prior_std"])
 MIRROR = (np.array([0.0, 0.0]), np.array([0.8, 0.5]))
 
-rod, motion = norm([0, 1], length=LENGTH), ([0, 1], [2, 3])
+rod, motion = norm_constraint([0, 1], length=LENGTH), ([0, 1], [2, 3])
 options = {"length": LENGTH, "gravity": setting["gravity"], "step": setting["integration_step"]}
 cartesian, chart = pendulum(**options), pendulum_angle(**options)
-seen_too = augmented(ensemble_transform, rod, std=setting["constraint_std"])
+seen_too = with_augmentation(etpf, rod, std=setting["constraint_std"])
 how = {"reading": setting["reading"], "regularisation": setting["regularisation"]}
 CARTESIAN = {
-    "OTF": ensemble_transform,
+    "OTF": etpf,
     "OTMA": seen_too,
-    "OTNLeq": projected(ensemble_transform, rod, **how),
-    "OTNLeqMA": projected(seen_too, rod, **how),
-    "OT_retracted": retracted(ensemble_transform, rod, motion=motion),
-    "EnKF_retracted": retracted(known_noise, rod, motion=motion),
-    "EnKF": known_noise,
+    "OTNLeq": with_projection(etpf, rod, **how),
+    "OTNLeqMA": with_projection(seen_too, rod, **how),
+    "OT_retracted": with_retraction(etpf, rod, motion=motion),
+    "EnKF_retracted": with_retraction(enkf, rod, motion=motion),
+    "EnKF": enkf,
 }
 CHART = {
-    "root_chart": square_root,
-    "EnKF_chart": known_noise,
-    "OT_chart": ensemble_transform,
-    "OT2_chart": partial(ensemble_transform, correct=True),
+    "root_chart": etkf,
+    "EnKF_chart": enkf,
+    "OT_chart": etpf,
+    "OT2_chart": partial(etpf, correct=True),
 }
 MIRRORED = {
-    "EnKF_chart": known_noise,
-    "OT_chart": partial(ensemble_transform, rejuvenation=0.1),
+    "EnKF_chart": enkf,
+    "OT_chart": partial(etpf, rejuvenation=0.1),
 }
 FILTERS = (*CARTESIAN, *CHART, "EKF_chart", "bound")
 
@@ -114,7 +114,7 @@ def ensembles(updates, members, model, see, readings, noise, noisy, rng):
     kick = np.repeat(KICK, x.shape[-1] // 2)
     with np.errstate(all="ignore"):
         for k, y in enumerate(readings):
-            x = model.flow(x, 0.0, DT)
+            x = model.transition(x, 0.0, DT)
             if noisy:
                 x = x + kick * rng.standard_normal(x.shape[1:])
             for f, update in enumerate(inner.values()):
@@ -157,7 +157,7 @@ def paths() -> tuple[np.ndarray, np.ndarray]:
     grid = START + np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
     x, out = grid, np.empty((STEPS, len(grid), 2), dtype=np.float32)
     for k in range(STEPS):
-        x = out[k] = chart.flow(x.copy(), 0.0, DT)
+        x = out[k] = chart.transition(x.copy(), 0.0, DT)
     KEPT[CELLS] = grid, out
     return grid, out
 
@@ -183,10 +183,10 @@ def particle_bound(readings, members, see, noise, rng):
     """A bootstrap filter with many particles in the chart, (T, P, 2)."""
     x, out = members, []
     for y in readings:
-        x = chart.flow(x, 0.0, DT) + KICK * rng.standard_normal(x.shape)
+        x = chart.transition(x, 0.0, DT) + KICK * rng.standard_normal(x.shape)
         logs = -0.5 * ((see(x) - y) ** 2).sum(axis=1) / noise[0, 0]
         w = np.exp(logs - logs.max())
-        x = x[resampled(w / w.sum(), rng=rng)]
+        x = x[resample(w / w.sum(), rng=rng)]
         out.append(x)
     return np.array(out)
 

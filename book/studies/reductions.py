@@ -19,9 +19,9 @@ import arcs
 from distfilt.mixtures import (
     GaussianMixture,
     PartialFusion,
-    Shapes,
+    ComponentShapes,
     jeffreys_by_sampling,
-    kept_by_relevance,
+    merge_irrelevant,
     pivoted_qr,
     runnalls,
 )
@@ -62,16 +62,16 @@ def scores(exact: list[PartialFusion], pair: list[GaussianMixture], first: int) 
 
 def reduced(
     exact: list[PartialFusion], said: list[GaussianMixture], threshold: float
-) -> dict[str, list[Shapes]]:
+) -> dict[str, list[ComponentShapes]]:
     """Both agents' shapes by each rule, of the sizes that the relevance rule leaves."""
-    kept = [kept_by_relevance(said[k], said[1 - k], threshold=threshold) for k in (0, 1)]
-    merged = [runnalls(m, k.size) for m, k in zip(said, kept, strict=True)]
+    kept = [merge_irrelevant(said[k], said[1 - k], threshold=threshold) for k in (0, 1)]
+    merged = [runnalls(m, k.n_components) for m, k in zip(said, kept, strict=True)]
     shapes = {
-        name: [exact[k].shapes(terms="all", marginal=r[k], received=[r[1 - k]]) for k in (0, 1)]
+        name: [exact[k].component_shapes(terms="all", marginal=r[k], received=[r[1 - k]]) for k in (0, 1)]
         for name, r in (("relevance", kept), ("runnalls", merged))
     }
     shapes["qr"] = [
-        pivoted_qr(f.shapes(terms="all"), size=s.size)
+        pivoted_qr(f.component_shapes(terms="all"), n_components=s.n_components)
         for f, s in zip(exact, shapes["relevance"], strict=True)
     ]
     return shapes
@@ -87,12 +87,12 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     first, out = int(for_points.integers(2**31)), {}
     for name, threshold in THRESHOLDS.items():
         for rule, shapes in reduced(exact, said, threshold).items():
-            fused = [f.weigh(s) for f, s in zip(exact, shapes, strict=True)]
+            fused = [f.assign_weights(s) for f, s in zip(exact, shapes, strict=True)]
             for k, value in zip((1, 2, "target"), scores(exact, fused, first), strict=True):
                 out[f"{name}_{rule}_{k}"] = value
         for k in (0, 1):
-            left = kept_by_relevance(said[k], said[1 - k], threshold=threshold).size
-            out |= {f"{name}_to_{k + 1}": float(left), f"from_{k + 1}": float(said[k].size)}
+            left = merge_irrelevant(said[k], said[1 - k], threshold=threshold).n_components
+            out |= {f"{name}_to_{k + 1}": float(left), f"from_{k + 1}": float(said[k].n_components)}
     return out
 
 

@@ -23,12 +23,12 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import _satellites as satellites
 
-from distfilt.gaussians import conditioned
+from distfilt.gaussians import condition
 from distfilt.linalg import factor
 from distfilt.metrics import nees
 from distfilt.models import simulate
 from distfilt.sensors import stack
-from distfilt.updates import resampled
+from distfilt.updates import resample
 
 NAME, PAPER, BATCH = "reference", "grange", 5
 SETUP = satellites.setup("table-2")
@@ -55,8 +55,8 @@ def guided(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Means (T, 2, R, 6) of two filters, covariances (T, R, 6, 6) of both, effective shares."""
     n, lead = parameters["particles"] // 2, (2, seen[0].shape[1])
-    dt, stds = float(SETUP.times[0]), [s.cov[0, 0] for s in SETUP.sensors]
-    f, q = SETUP.model.transition(dt), SETUP.model.noise(0.0, dt)
+    dt, stds = float(SETUP.times[0]), [s.noise_cov[0, 0] for s in SETUP.sensors]
+    f, q = SETUP.model.transition(dt), SETUP.model.Q(0.0, dt)
     flat, up = np.ix_(PLANE, PLANE), np.ix_(NORMAL, NORMAL)
     in_plane = np.concatenate([seen[0], seen[2][..., :2]], axis=-1)
     noise = np.diag([stds[0]] * 2 + [stds[2]] * 2)
@@ -102,7 +102,7 @@ def chosen(
     w, n = normal(log), log.shape[-1]
     poor = (w**2).sum(axis=-1) > 2 / n
     if poor.any():
-        index = resampled(w[poor].reshape(-1, n), rng=rng)
+        index = resample(w[poor].reshape(-1, n), rng=rng)
         m, z, log = m.copy(), z.copy(), log.copy()
         m[poor] = np.take_along_axis(m[poor], index[..., None], axis=-2)
         z[poor], log[poor] = np.take_along_axis(z[poor], index[..., None], axis=-2), 0.0
@@ -146,19 +146,19 @@ def damped(means: np.ndarray, readings: np.ndarray) -> list[np.ndarray]:
     errors, covs, t0 = [], [], 0.0
     for t, y in zip(s.times, readings, strict=True):
         slope = s.model.jacobian(means, t0, t - t0)
-        cov = slope @ cov @ slope.mT + s.model.noise(t0, t - t0)
+        cov = slope @ cov @ slope.mT + s.model.Q(t0, t - t0)
         means = x = s.model.step(means, t0, t - t0)
         t0 = t
 
         def value(x: np.ndarray, y: np.ndarray = y, means=means, cov=cov) -> np.ndarray:
-            return cost(x - means, cov, sensor.residual(y, sensor.predict(x)), sensor.cov)
+            return cost(x - means, cov, sensor.residual(y, sensor.predict(x)), sensor.noise_cov)
 
         least = value(x)
         for _ in range(STEPS):
             h = sensor.jacobian(x)
             expected = np.einsum("...ij,...j->...i", h, means - x)
             gap = sensor.residual(y, sensor.predict(x)) - expected
-            whole = conditioned(means, cov, gap, h, sensor.cov)[0] - x
+            whole = condition(means, cov, gap, h, sensor.noise_cov)[0] - x
             for _ in range(HALVINGS):
                 after = value(x + whole)
                 if not (worse := after > least).any():
@@ -169,7 +169,7 @@ def damped(means: np.ndarray, readings: np.ndarray) -> list[np.ndarray]:
             if gained.max() < ENOUGH:
                 break
         h = sensor.jacobian(x)
-        cov = conditioned(means, cov, np.zeros_like(y), h, sensor.cov)[1]
+        cov = condition(means, cov, np.zeros_like(y), h, sensor.noise_cov)[1]
         means = x
         errors.append(means)
         covs.append(cov)

@@ -19,7 +19,7 @@ import _team as team
 from distfilt.filters import GaussianFilter
 from distfilt.models import LinearModel, constant_velocity
 from distfilt.network import Faults, graphs
-from distfilt.sensors import Sensor, distance_and_angle
+from distfilt.sensors import Sensor, range_bearing
 
 NAME, PAPER = "ring", "semeraro"
 AGENTS, STEPS, RUNS = 8, 60, 10
@@ -37,7 +37,7 @@ def group(seed: int) -> team.Team:
     """The agents, with losses of their own."""
     moves = constant_velocity(sigma=SIGMA)
     return team.Team(
-        graphs.ring(AGENTS), moves.transition(1.0), moves.noise(0.0, 1.0),
+        graphs.ring(AGENTS), moves.F(1.0), moves.Q(0.0, 1.0),
         np.diag(np.square(TARGET_STD)), EGO_STD**2 * np.eye(2), READING_STD**2 * np.eye(2),
         Faults(loss=LOSS, seed=seed),
     )
@@ -53,7 +53,7 @@ def sights(rng: np.random.Generator, radius: float) -> tuple[np.ndarray, np.ndar
     """Targets (steps, runs, 4), and distances and directions (steps, runs, A, 2)."""
     exact = replace(group(0), reading_cov=np.zeros((2, 2)))
     truth, gaps = exact.data(STEPS, RUNS, rng)
-    eye = distance_and_angle([0, 1], std=SIGHT_STD)
+    eye = range_bearing([0, 1], std=SIGHT_STD)
     return truth, eye.observe(gaps - places(radius), rng=rng)
 
 
@@ -68,7 +68,7 @@ def measured(truth: np.ndarray, belief: team.Belief, name: str) -> dict[str, flo
 
 def looking(radius: float, agent: int | None = None) -> Sensor:
     """Distance and direction of the target in [target; ego], or in [target; all egos]."""
-    eye, at = distance_and_angle([0, 1], std=SIGHT_STD), 4 + 2 * (agent or 0)
+    eye, at = range_bearing([0, 1], std=SIGHT_STD), 4 + 2 * (agent or 0)
 
     def gap(x: np.ndarray) -> np.ndarray:
         return x[..., :2] - x[..., at : at + 2]
@@ -78,7 +78,7 @@ def looking(radius: float, agent: int | None = None) -> Sensor:
         out[..., :2], out[..., at : at + 2] = part, -part
         return out
 
-    return Sensor(2, lambda x: eye.predict(gap(x)), eye.cov, difference=eye.difference,
+    return Sensor(2, lambda x: eye.predict(gap(x)), eye.noise_cov, residual_function=eye.residual_function,
                   derivative=slope)
 
 
@@ -140,7 +140,7 @@ def single(case: team.Team, seen: np.ndarray, radius: float, tells: bool) -> tea
     for k, y in enumerate(seen):
         before = mean @ move.T, move @ cov @ move.T + noise
         gap = eye.residual(y, eye.predict(before[0]))
-        mean, cov = conditioned(*before, gap, eye.jacobian(before[0]), eye.cov)
+        mean, cov = conditioned(*before, gap, eye.jacobian(before[0]), eye.noise_cov)
         if tells:
             mean, cov = team._news(before, (mean, cov), case.arrived(k, RUNS), 4)
             cov = 0.5 * (cov + cov.mT)

@@ -40,8 +40,8 @@ def unscented(
     """What unscented filters of one Gaussian believe, one an epoch and agent."""
     n, start = len(s["agents"]), [b.moments() for b in paper.beliefs(first, covs)]
     f = GaussianFilter(
-        paper.moving(s, 2), [paper.sensor(s)] * n, graphs.complete(n), share=False,
-        rule="unscented", kappa=1.0, agreement=targets if fuses else None,
+        paper.moving(s, 2), [paper.sensor(s)] * n, graphs.complete(n), share_observations=False,
+        linearization="unscented", kappa=1.0, fusion=targets if fuses else None,
     )
     state, out = f.start(start[0]), []
     means, both = np.array([m for m, _ in start]), np.array([p for _, p in start])

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import _satellites as satellites
 
 from distfilt.filters import GaussianFilter
-from distfilt.gaussians import conditioned
+from distfilt.gaussians import condition
 from distfilt.metrics import nees
 from distfilt.sensors import stack
 
@@ -50,14 +50,14 @@ def iterated(means: np.ndarray, readings: np.ndarray, steps: int = 10) -> list[n
     errors, covs, t0 = [], [], 0.0
     for t, y in zip(s.times, readings, strict=True):
         slope = s.model.jacobian(means, t0, t - t0)
-        cov = slope @ cov @ slope.mT + s.model.noise(t0, t - t0)
+        cov = slope @ cov @ slope.mT + s.model.Q(t0, t - t0)
         means = x = s.model.step(means, t0, t - t0)
         t0 = t
         for _ in range(steps):
             h = sensor.jacobian(x)
             expected = np.einsum("...ij,...j->...i", h, means - x)
             gap = sensor.residual(y, sensor.predict(x)) - expected
-            x, after = conditioned(means, cov, gap, h, sensor.cov)
+            x, after = condition(means, cov, gap, h, sensor.noise_cov)
         means, cov = x, after
         errors.append(means)
         covs.append(cov)

@@ -14,7 +14,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import _satellites as satellites
 
-from distfilt.kalman import QuaternionChart, multiplicative_filter
+from distfilt.kalman import QuaternionChart, mekf
 
 NAME, PAPER, BATCH = "table-3", "grange", 4
 SETUP = satellites.setup("table-3")
@@ -40,7 +40,7 @@ def central(truth: np.ndarray, seen: list[np.ndarray]) -> dict[str, float]:
     """The multiplicative filter of all sensors: twelve errors, three of them of the attitude."""
     chart, (mean, cov) = QuaternionChart(13, 9), SETUP.prior
     unit = np.concatenate([mean[:9], mean[9:] / np.linalg.norm(mean[9:])])
-    found = multiplicative_filter(
+    found = mekf(
         unit, chart.project(mean, cov), np.concatenate(seen, axis=-1), chart=chart,
         model=SETUP.model, sensors=SETUP.sensors, times=SETUP.times,
     )  # fmt: skip

@@ -76,14 +76,14 @@ def errors(case: swarm.Case, rng: np.random.Generator) -> dict[str, np.ndarray]:
     x, p = swarm.drawn(case, rng)
     waves = cells.cosines(swarm.MODES)
     gap = ((cells.centres - x[:, None]) ** 2).sum(axis=-1)
-    flat = cells.normalised(np.exp(-0.5 * gap / swarm.FLAT**2))  # cut off at the walls
+    flat = cells.normalize(np.exp(-0.5 * gap / swarm.FLAT**2))  # cut off at the walls
     wide = flat @ waves * cells.volume
     z = density.kernels(x, cells, bandwidth=h) @ waves * cells.volume
     talk = {s: (wide, np.zeros_like(wide)) for s in (*GAINS, "silent")}
     first = density.kernel_density(x, cells, bandwidth=h)
     state = density.low_rank_start(basis, np.concatenate(
         [first[None] if s == "central" else flat[who] for s, who in ROWS.items()]))
-    k = density.kernel_information(cells, bandwidth=h, agents=case.agents)
+    k = density.kernel_constant(cells, bandwidth=h, agents=case.agents)
     cuts = np.cumsum([len(who) for who in ROWS.values()])
     out: dict[str, list[np.ndarray]] = {s: [] for s in (*ROWS, *NULLS, "kde")}
     for j in range(round(case.end / dt)):
@@ -95,7 +95,7 @@ def errors(case: swarm.Case, rng: np.random.Generator) -> dict[str, np.ndarray]:
         heard = [talk[s][0][who] @ waves.T if s in talk else np.tile(y, (len(who), 1))
                  for s, who in ROWS.items()]
         move = model.solver(j * dt, dt)
-        p, state = move(p), density.low_rank_moved(state, move)
+        p, state = move(p), density.low_rank_predict(state, move)
         noise = k * np.maximum(state.estimates, CHOICES["floor"])
         state = density.low_rank_step(state, np.concatenate(heard), noise, dt)
         gaps = np.split(cells.norm(state.estimates - p), cuts[:-1])

@@ -1,7 +1,7 @@
 """News against readings told: what agents may add where a target moves with noise.
 
 The stored trial is the orbit of chapter 8 with five agents, noise on all velocities and no
-ephemeris. News is `NewsFilter`; in joint bookkeeping each agent filters [target; all agents] and
+ephemeris. News is `InformationIncrementFilter`; in joint bookkeeping each agent filters [target; all agents] and
 hears readings; intersection fuses beliefs about the target.
 """
 
@@ -19,7 +19,7 @@ import orbit as paper
 from distfilt.filters import GaussianFilter
 from distfilt.mixtures import GaussianMixture
 from distfilt.network import graphs
-from distfilt.sensors import line_of_sight
+from distfilt.sensors import angles_only
 
 NAME, PAPER = "told", "semeraro"
 SETTING = {
@@ -36,9 +36,9 @@ def joint(
 ) -> tuple[list[list[GaussianMixture]], float]:
     """What each agent believes of [target; itself] if angles are told, and numbers sent."""
     n = len(s["agents"])
-    eye = partial(line_of_sight, std=s["angle_std"] * paper.ARCSECOND, form=s["form"])
+    eye = partial(angles_only, std=s["angle_std"] * paper.ARCSECOND, form=s["form"])
     eyes = [eye(observer=6 * a) for a in range(1, n + 1)]
-    f = GaussianFilter(paper.moving(s, n + 1), eyes, graphs.complete(n), rule="unscented")
+    f = GaussianFilter(paper.moving(s, n + 1), eyes, graphs.complete(n), linearization="unscented")
     state, out = f.start((first, paper.block(covs))), []
     for k, hour in enumerate(paper.HOURS):
         state = f.step(state, 3600.0 * hour, list(seen[k, :, :2]))

@@ -38,7 +38,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     y = density.kernel_density(x, cells, bandwidth=h)
     dense = density.Dense(y, full @ full.T)
     cut = {r: density.low_rank_start(full[:, :r], y[None]) for r in RANKS}
-    k = density.kernel_information(cells, bandwidth=h, agents=agents)
+    k = density.kernel_constant(cells, bandwidth=h, agents=agents)
     out: dict[str, float] = {}
     for j in range(round(TIMES[-1] / DT)):
         move = flow.solver(j * DT, DT)
@@ -46,7 +46,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         y = density.kernel_density(x, cells, bandwidth=h)
         noise = k * np.maximum(move(dense.mean), CHOICES["floor"])
         dense = density.dense_step(dense, move, y, noise, DT)
-        cut = {r: density.low_rank_step(density.low_rank_moved(s, move), y, noise, DT)
+        cut = {r: density.low_rank_step(density.low_rank_predict(s, move), y, noise, DT)
                for r, s in cut.items()}
         t = round((j + 1) * DT, 6)
         if t in TIMES:

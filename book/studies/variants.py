@@ -97,7 +97,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
                 continue
             out[f"{key}_{s}_error"] = late[f"{s}_error"].mean()
             out[f"{key}_{s}_consensus"] = late[f"{s}_consensus"].mean()
-            out[f"{key}_{s}_counted"] = float(np.median(ends[s].counted[:3]))
+            out[f"{key}_{s}_counted"] = float(np.median(ends[s].positions_sent[:3]))
             out |= {f"{key}_{s}_{k}": v for k, v in scored(ends[s], last[0]).items()}
     out |= wrong_model(wrong)
     return {name: float(out[name]) for name in columns}

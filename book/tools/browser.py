@@ -26,7 +26,7 @@ ready.then(() => Promise.all(pictures)).then(() => done(true));
 """
 """Waits for the mathematics and the pictures of a page."""
 
-MISSING = "chromium or chromedriver is not installed"
+ALLOW_NAN = "chromium or chromedriver is not installed"
 
 
 def installed() -> tuple[str, str] | None:
@@ -43,7 +43,7 @@ def installed() -> tuple[str, str] | None:
 def chromium(profile: Path, **logs: str) -> Iterator[Any]:
     """Yield a browser with a fresh profile, and with logs of what it does."""
     if (found := installed()) is None:
-        raise FileNotFoundError(MISSING)
+        raise FileNotFoundError(ALLOW_NAN)
     from selenium import webdriver
     from selenium.webdriver.chrome.options import Options
     from selenium.webdriver.chrome.service import Service

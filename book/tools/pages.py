@@ -25,7 +25,7 @@ from sphinx.pycode import ModuleAnalyzer
 
 from bookkit.rows import read_rows
 from common import BOOK, ROOT, SLIDER, chapters, toc_pages
-from distfilt.doors import MISSING
+from distfilt.validation import ALLOW_NAN
 from ledger import ITEMS, LEDGER, WORDS, claims_of, summaries
 
 PAPERS = {
@@ -162,8 +162,8 @@ def home_of(module: Any, name: str) -> str:
 @functools.cache
 def named_types() -> list[tuple[Any, str]]:
     """Return the types that have a name of their own, each with it."""
-    doors = importlib.import_module("distfilt.doors")
-    own = [(getattr(doors, name), name) for name in doors.__all__]
+    kinds = importlib.import_module("distfilt.validation")
+    own = [(getattr(validation, name), name) for name in doors.__all__]
     return [*((value, name) for value, name in own if get_origin(value)), (ArrayLike, "ArrayLike")]
 
 
@@ -184,7 +184,7 @@ def written(kind: Any, names: Mapping[str, Any]) -> str:
         return known
     origin, inner = get_origin(kind), get_args(kind)
     if origin is Annotated:
-        shapes = [note for note in inner[1:] if isinstance(note, str) and note != MISSING]
+        shapes = [note for note in inner[1:] if isinstance(note, str) and note != ALLOW_NAN]
         return written(inner[0], names) + (f"[{shapes[-1]!r}]" if shapes else "")
     if origin in (Union, types.UnionType):
         return " | ".join(written(part, names) for part in inner)

@@ -1,17 +1,17 @@
 """Couplings: plans that turn weights into equally weighted members, and members that obey rules."""
 
-from .constraints import Constraint, norm, project, retract
-from .solvers import Plan, distances, plan, sorted_plan
+from .constraints import Constraint, norm_constraint, project, retract
+from .solvers import TransportPlan, squared_distances, transport_plan, sorted_plan
 from .transform import (
-    ensemble_transform,
-    plans,
-    rejuvenated,
+    transform_ensemble,
+    transport_plans,
+    rejuvenate,
     second_order,
     transform_along,
     transform_within,
 )
 
 __all__ = [  # fmt: skip
-    "Constraint", "Plan", "distances", "ensemble_transform", "norm", "plan", "plans", "project",
-    "rejuvenated", "retract", "second_order", "sorted_plan", "transform_along", "transform_within",
+    "Constraint", "TransportPlan", "squared_distances", "transform_ensemble", "norm_constraint", "transport_plan", "transport_plans", "project",
+    "rejuvenate", "retract", "second_order", "sorted_plan", "transform_along", "transform_within",
 ]

@@ -12,15 +12,15 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..doors import Array, Bounds, Mask, NonNegative, Places, Record, array, door, unchecked
+from ..validation import Array, Bounds, Mask, NonNegativeFloat, DistinctIndices, FrozenModel, check_array, validated, unchecked
 from ..ensembles import Ensemble
 from ..linalg import SolverError, as_derivative, central
 
-__all__ = ["Constraint", "norm", "project", "retract"]
+__all__ = ["Constraint", "norm_constraint", "project", "retract"]
 
 Reading = Literal["printed", "reversed", "particle", "shift"]
 """Four readings of (12): the gain times D_i - d̂, d̂ - D_i, d - D_i, or d - d̂."""
-Motion = tuple[Places, Places]
+Motion = tuple[DistinctIndices, DistinctIndices]
 """Indices of positions and of their velocities, in the same order."""
 
 _CLOSE, _STEPS = 1e-15, 50
@@ -28,7 +28,7 @@ _CLOSE, _STEPS = 1e-15, 50
 
 
 @dataclass(frozen=True, eq=False)
-class Constraint(Record):
+class Constraint(FrozenModel):
     """What every state obeys, g(x) = d.
 
     Parameters
@@ -52,12 +52,12 @@ class Constraint(Record):
     value: Annotated[Array, "s"]
     derivative: Callable[[Array], Array] | None = field(default=None, kw_only=True)
 
-    @door
+    @validated
     def residual(self, x: Annotated[Array, "... d"]) -> Array:
         """By how much states (..., d) miss, g(x) - d, (..., s)."""
-        return array(self.missed(x), "function")
+        return check_array(self.violation(x), "function")
 
-    def missed(self, x: Array) -> Array:
+    def violation(self, x: Array) -> Array:
         """The same without a door, for trial steps: NaN where the function has no value."""
         shape = (*x.shape[:-1], self.value.size)
         try:
@@ -66,18 +66,18 @@ class Constraint(Record):
             raise ValueError(
                 f"constraint: needs states with more than {x.shape[-1]} components: {error}"
             ) from error
-        return array(g, "function", shape, finite=False) - self.value
+        return check_array(g, "function", shape, finite=False) - self.value
 
-    @door
+    @validated
     def jacobian(self, x: Annotated[Array, "... d"]) -> Array:
         """Derivative of g at states (..., d), (..., s, d)."""
-        near = partial(central, self.missed, x)
+        near = partial(central, self.violation, x)
         return as_derivative(self, (x,), (*x.shape[:-1], self.value.size, x.shape[-1]), near)
 
 
-@door
-def norm(
-    indices: Places, *, length: Annotated[float, Bounds(above=0, at_most=1e150)] = 1.0
+@validated
+def norm_constraint(
+    indices: DistinctIndices, *, length: Annotated[float, Bounds(above=0, at_most=1e150)] = 1.0
 ) -> Constraint:
     r"""Some components form a vector of given length, :math:`|\mathbf x_I|^2=L^2`.
 
@@ -90,7 +90,7 @@ def norm(
 
     Examples
     --------
-    >>> norm([0, 1]).residual([0.6, 0.8, 5.0]).round(15) + 0.0
+    >>> norm_constraint([0, 1]).residual([0.6, 0.8, 5.0]).round(15) + 0.0
     array([0.])
     """
     rows = list(indices)
@@ -106,10 +106,10 @@ def norm(
     return Constraint(squares, np.array([length**2]), derivative=slope)
 
 
-@door
+@validated
 def project(
     ensemble: Ensemble, constraint: Constraint, *, reading: Reading = "shift",
-    regularisation: NonNegative = 1e-6, guarded: bool = True,
+    regularisation: NonNegativeFloat = 1e-6, guarded: bool = True,
 ) -> Array:
     r"""Regress the members on the constraint and correct them, equations (6)-(12).
 
@@ -165,14 +165,14 @@ def project(
     out = x + aim @ gain
     if not guarded:
         return np.asarray(out)
-    left = constraint.missed(out)
+    left = constraint.violation(out)
     # The members' own misses may grow where only their mean is moved: g is curved.
     before, after = (mean, left.mean(axis=-2, keepdims=True)) if reading == "shift" else (gap, left)
     better = np.abs(after).sum(axis=(-1, -2)) <= np.abs(before).sum(axis=(-1, -2))
     return np.asarray(np.where(better[..., None, None], out, x))
 
 
-@door
+@validated
 def retract(
     states: Annotated[Array, "... d"], constraint: Constraint, *, motion: Motion | None = None
 ) -> Array:
@@ -210,7 +210,7 @@ def retract(
 
     Examples
     --------
-    >>> retract([3.0, 4.0, 1.0, 0.0], norm([0, 1]), motion=([0, 1], [2, 3])).round(12)
+    >>> retract([3.0, 4.0, 1.0, 0.0], norm_constraint([0, 1]), motion=([0, 1], [2, 3])).round(12)
     array([ 0.6 ,  0.8 ,  0.64, -0.48])
     """
     x = states.reshape(-1, states.shape[-1]).copy()
@@ -266,7 +266,7 @@ def _shortened(
     for k in range(30):
         todo = np.flatnonzero(~better)
         trial = x[todo] + 0.5**k * step[todo]
-        missed = constraint.missed(trial)
+        missed = constraint.violation(trial)
         falls = np.linalg.norm(missed, axis=-1) < before[todo]
         place[todo[falls]], left[todo[falls]] = trial[falls], missed[falls]
         better[todo[falls]] = True

@@ -17,10 +17,10 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..doors import Array, Bounds, Positive, Record, Weights, door, needed
+from ..validation import Array, Bounds, PositiveFloat, FrozenModel, Probabilities, validated, import_optional
 from ..linalg import SolverError
 
-__all__ = ["Plan", "distances", "plan", "sorted_plan"]
+__all__ = ["TransportPlan", "squared_distances", "transport_plan", "sorted_plan"]
 
 Solver = Literal["network", "entropic"]
 """POT's network simplex; Newton's method on the entropic problem."""
@@ -34,7 +34,7 @@ _NEWTON = 1000
 
 
 @dataclass(frozen=True, eq=False)
-class Plan(Record):
+class TransportPlan(FrozenModel):
     r"""A coupling, its cost and the dual solution that bounds the cost from below.
 
     Parameters
@@ -50,7 +50,7 @@ class Plan(Record):
 
     Examples
     --------
-    >>> swap = plan([[1.0, 0.0], [0.0, 1.0]], [0.5, 0.5])
+    >>> swap = transport_plan([[1.0, 0.0], [0.0, 1.0]], [0.5, 0.5])
     >>> swap.matrix
     array([[0. , 0.5],
            [0.5, 0. ]])
@@ -69,8 +69,8 @@ class Plan(Record):
         return self.value - self.bound
 
 
-@door
-def distances(
+@validated
+def squared_distances(
     source: Annotated[Array, "n d"], target: Annotated[Array, "m d"] | None = None
 ) -> Array:
     r"""Costs :math:`c_{ij}=|\mathbf x_i-\mathbf y_j|^2` of moving mass between two sets of points.
@@ -88,7 +88,7 @@ def distances(
 
     Examples
     --------
-    >>> distances([[0.0], [3.0]])
+    >>> squared_distances([[0.0], [3.0]])
     array([[0., 9.],
            [9., 0.]])
     """
@@ -101,12 +101,12 @@ def distances(
     return squares
 
 
-@door
-def plan(
-    cost: Annotated[Array, "n m"], rows: Annotated[Weights, "n"],
-    columns: Annotated[Weights, "m"] | None = None, *, solver: Solver = "network",
-    regularisation: Positive = 0.01,
-) -> Plan:
+@validated
+def transport_plan(
+    cost: Annotated[Array, "n m"], rows: Annotated[Probabilities, "n"],
+    columns: Annotated[Probabilities, "m"] | None = None, *, solver: Solver = "network",
+    regularisation: PositiveFloat = 0.01,
+) -> TransportPlan:
     """The cheapest coupling of two sets of masses.
 
     Parameters
@@ -147,7 +147,7 @@ def plan(
 
     Examples
     --------
-    >>> moved = plan(distances([[0.0], [1.0], [3.0]]), [0.5, 0.5, 0.0])
+    >>> moved = transport_plan(squared_distances([[0.0], [1.0], [3.0]]), [0.5, 0.5, 0.0])
     >>> (3 * moved.matrix).round(3)
     array([[1. , 0.5, 0. ],
            [0. , 0.5, 1. ],
@@ -156,7 +156,7 @@ def plan(
     (1.5, True)
     """
     a, b = _masses(rows, columns, cost.shape[1])
-    unit, low, scale = scaled(cost)
+    unit, low, scale = scale_cost(cost)
     matrix, g = solver_of(solver, regularisation)(unit, a, b)
     return _certified(cost, a, b, matrix, low + scale * g)
 
@@ -167,19 +167,19 @@ def _masses(rows: Array, columns: Array | None, size: int) -> tuple[Array, Array
     return rows / rows.sum(), b
 
 
-def scaled(cost: Array) -> tuple[Array, float, float]:
+def scale_cost(cost: Array) -> tuple[Array, float, float]:
     """The cost between zero and one, its minimum and its range."""
     low = float(cost.min())
     scale = float(cost.max()) - low
     return (cost - low) / (scale if scale > 0 else 1.0), low, scale
 
 
-def _certified(cost: Array, a: Array, b: Array, matrix: Array, g: Array) -> Plan:
+def _certified(cost: Array, a: Array, b: Array, matrix: Array, g: Array) -> TransportPlan:
     """The plan with potentials that are feasible whatever the solver says of them."""
     # A solver leaves out columns without mass, and what it says of them is nothing.
     f = (cost - np.where(b > 0, g, -np.inf)).min(axis=1)
     g = (cost - f[:, None]).min(axis=0)
-    return Plan.unchecked(matrix, float((matrix * cost).sum()), (f, g), float(f @ a + g @ b))
+    return TransportPlan.construct(matrix, float((matrix * cost).sum()), (f, g), float(f @ a + g @ b))
 
 
 Solve = Callable[[Array, Array, Array], tuple[Array, Array]]
@@ -195,7 +195,7 @@ def solver_of(name: Solver, regularisation: float = 0.01) -> Solve:
 
 def _network(cost: Array, a: Array, b: Array) -> tuple[Array, Array]:
     """POT's network simplex; `ot.emd` round it would cost 0.2 ms more, half as much at N = 50."""
-    emd = needed("ot.lp.emd_wrap", "maps")
+    emd = import_optional("ot.lp.emd_wrap", "maps")
     matrix, _, _, g, status = emd.emd_c(a, b, np.ascontiguousarray(cost), _PIVOTS, 1)
     if status != 1:
         raise SolverError(f"network simplex: stopped with status {status}")
@@ -267,11 +267,11 @@ def _rounded(t: Array, a: Array, b: Array) -> Array:
     return np.asarray(t + np.outer(left, right) / most)
 
 
-@door
+@validated
 def sorted_plan(
     source: Annotated[Array, "n", SQUARED], target: Annotated[Array, "m", SQUARED],
-    rows: Annotated[Weights, "n"], columns: Annotated[Weights, "m"] | None = None,
-) -> Plan:
+    rows: Annotated[Probabilities, "n"], columns: Annotated[Probabilities, "m"] | None = None,
+) -> TransportPlan:
     """The cheapest coupling on a line, for squared distances: smallest with smallest, in order.
 
     Parameters

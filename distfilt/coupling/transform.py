@@ -20,13 +20,13 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..doors import Array, Indices, NonNegative, Positive, Rng, array, door, unchecked
+from ..validation import Array, Indices, NonNegativeFloat, PositiveFloat, Rng, check_array, validated, unchecked
 from ..ensembles import Ensemble
 from ..linalg import EPS, factor
-from .solvers import SQUARED, Solve, Solver, distances, scaled, solver_of
+from .solvers import SQUARED, Solve, Solver, squared_distances, scale_cost, solver_of
 
 __all__ = [  # fmt: skip
-    "ensemble_transform", "plans", "rejuvenated", "second_order", "transform_along",
+    "transform_ensemble", "transport_plans", "rejuvenate", "second_order", "transform_along",
     "transform_within",
 ]
 
@@ -37,9 +37,9 @@ _TIE = 1e-7
 """In units of the largest cost. The weighted mean stays exact, the plan costs at most this more."""
 
 
-def normalised(log_weights: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
+def normalize_weights(log_weights: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
     """Weights (..., N) that sum to one, from logarithms of any size; -inf is a weight of zero."""
-    w = array(log_weights, "log_weights", shape, finite=False)
+    w = check_array(log_weights, "log_weights", shape, finite=False)
     top = w.max(axis=-1, keepdims=True)
     if np.isneginf(top).any():
         raise ValueError("log_weights: needs a positive weight in every ensemble, got only zeros")
@@ -64,8 +64,8 @@ def _ties(n: int) -> Array:
     return fixed
 
 
-@door
-def plans(ensemble: Members, log_weights: ArrayLike) -> Array:
+@validated
+def transport_plans(ensemble: Members, log_weights: ArrayLike) -> Array:
     """Optimal couplings of weighted members to the same members with equal weights.
 
     Parameters
@@ -84,18 +84,18 @@ def plans(ensemble: Members, log_weights: ArrayLike) -> Array:
 
     Examples
     --------
-    >>> plans([[0.0], [1.0]], np.log([0.75, 0.25]))
+    >>> transport_plans([[0.0], [1.0]], np.log([0.75, 0.25]))
     array([[0.5 , 0.25],
            [0.  , 0.25]])
     """
-    w = normalised(log_weights, ensemble.shape[:-1])
+    w = normalize_weights(log_weights, ensemble.shape[:-1])
     return _plans(ensemble, w, solver_of("network"))
 
 
 def _plans(x: Array, w: Array, solve: Solve) -> Array:
     """Couplings (..., N, N) of the weights to equal masses, for the squared distance."""
     points = x.reshape(-1, *x.shape[-2:])
-    costs = np.array([unchecked(distances)(p) for p in points])
+    costs = np.array([unchecked(squared_distances)(p) for p in points])
     return _coupled(costs.reshape(*w.shape, w.shape[-1]), w, solve)
 
 
@@ -104,14 +104,14 @@ def _coupled(costs: Array, w: Array, solve: Solve) -> Array:
     n = w.shape[-1]
     equal, ties, out = np.full(n, 1 / n), _ties(n), np.empty_like(costs)
     for row in np.ndindex(w.shape[:-1]):
-        out[row], _ = solve(scaled(costs[row])[0] + ties, w[row], equal)
+        out[row], _ = solve(scale_cost(costs[row])[0] + ties, w[row], equal)
     return out
 
 
-@door
-def ensemble_transform(
+@validated
+def transform_ensemble(
     ensemble: Members, log_weights: ArrayLike, *, solver: Solver = "network",
-    regularisation: Positive = 0.01, debias: bool = False, correct: bool = False,
+    regularisation: PositiveFloat = 0.01, debias: bool = False, correct: bool = False,
 ) -> Array:
     r"""Replace weighted members by as many with equal weights.
 
@@ -143,30 +143,30 @@ def ensemble_transform(
 
     Examples
     --------
-    >>> ensemble_transform([[0.0], [1.0]], np.log([0.75, 0.25]))
+    >>> transform_ensemble([[0.0], [1.0]], np.log([0.75, 0.25]))
     array([[0. ],
            [0.5]])
-    >>> bool(ensemble_transform([[0.0], [1.0]], [-1e4, -2e4])[1, 0] == 0.0)
+    >>> bool(transform_ensemble([[0.0], [1.0]], [-1e4, -2e4])[1, 0] == 0.0)
     True
     """
-    x, w = ensemble, normalised(log_weights, ensemble.shape[:-1])
+    x, w = ensemble, normalize_weights(log_weights, ensemble.shape[:-1])
     solve = solver_of(solver, regularisation)
-    out = carried(x, w, _plans(x, w, solve))
+    out = apply_plan(x, w, _plans(x, w, solve))
     if debias:
         equal = np.full(w.shape, 1 / x.shape[-2])
-        out += x - carried(x, equal, _plans(x, equal, solve))
+        out += x - apply_plan(x, equal, _plans(x, equal, solve))
         out += w[..., None, :] @ x - out.mean(axis=-2, keepdims=True)
     return _second_order(out, x, w) if correct else out
 
 
-def carried(x: Array, w: Array, matrix: Array, *, correct: bool = False) -> Array:
+def apply_plan(x: Array, w: Array, matrix: Array, *, correct: bool = False) -> Array:
     """Members with weights w after a coupling `matrix` of w to equal masses, (3)."""
     centre = w[..., None, :] @ x
     out = np.asarray(centre + x.shape[-2] * (matrix.mT @ (x - centre)))
     return _second_order(out, x, w) if correct else out
 
 
-@door
+@validated
 def second_order(moved: Members, ensemble: AsMoved, log_weights: ArrayLike) -> Array:
     r"""Give transformed members the mean and covariance of the weighted ones, exactly.
 
@@ -201,10 +201,10 @@ def second_order(moved: Members, ensemble: AsMoved, log_weights: ArrayLike) -> A
     Examples
     --------
     >>> x, logs = [[0.0], [1.0]], np.log([0.75, 0.25])
-    >>> float(second_order(ensemble_transform(x, logs), x, logs).var().round(12))
+    >>> float(second_order(transform_ensemble(x, logs), x, logs).var().round(12))
     0.1875
     """
-    return _second_order(moved, ensemble, normalised(log_weights, ensemble.shape[:-1]))
+    return _second_order(moved, ensemble, normalize_weights(log_weights, ensemble.shape[:-1]))
 
 
 def _second_order(y: Array, x: Array, w: Array) -> Array:
@@ -236,9 +236,9 @@ def _graded(cov: Array) -> Array:
     return np.take_along_axis(lower, np.argsort(order, axis=-1)[..., :, None], axis=-2)
 
 
-@door
-def rejuvenated(
-    moved: Annotated[Ensemble, SQUARED], ensemble: AsMoved, *, bandwidth: NonNegative, rng: Rng
+@validated
+def rejuvenate(
+    moved: Annotated[Ensemble, SQUARED], ensemble: AsMoved, *, bandwidth: NonNegativeFloat, rng: Rng
 ) -> Array:
     r"""Add combinations of the forecast's anomalies: new places, and the same mean.
 
@@ -263,7 +263,7 @@ def rejuvenated(
     Examples
     --------
     >>> x = np.array([[0.0], [1.0], [4.0]])
-    >>> after = rejuvenated(np.zeros((3, 1)), x, bandwidth=0.1, rng=np.random.default_rng(0))
+    >>> after = rejuvenate(np.zeros((3, 1)), x, bandwidth=0.1, rng=np.random.default_rng(0))
     >>> bool(abs(after.mean()) < 1e-15), len(set(after.ravel()))
     (True, 3)
     """
@@ -275,7 +275,7 @@ def rejuvenated(
     return np.asarray(moved + bandwidth / np.sqrt(n - 1) * (drawn @ around))
 
 
-@door
+@validated
 def transform_within(
     ensemble: Annotated[Array, "n d"], log_weights: ArrayLike,
     pieces: Annotated[Indices, "n"], *, rng: Rng,
@@ -311,7 +311,7 @@ def transform_within(
     >>> bool((np.abs(y) >= 0.9).all())
     True
     """
-    matrix = len(ensemble) * unchecked(plans)(ensemble, log_weights)
+    matrix = len(ensemble) * unchecked(transport_plans)(ensemble, log_weights)
     names, index = np.unique(pieces, return_inverse=True)
     belongs = (index == np.arange(names.size)[:, None]).astype(np.float64)
     chosen = _chosen(belongs @ matrix, rng)
@@ -338,7 +338,7 @@ def _chosen(share: Array, rng: np.random.Generator) -> Array:
     return np.asarray(np.where(bare, share.argmax(axis=0), order))
 
 
-@door
+@validated
 def transform_along(
     ensemble: Members, log_weights: ArrayLike, *, difference: Callable[[Array, Array], Array],
     retract: Callable[[Array, Array], Array],
@@ -379,9 +379,9 @@ def transform_along(
            [-3.142]])
     """
     x, n = ensemble, ensemble.shape[-2]
-    w = normalised(log_weights, x.shape[:-1])
+    w = normalize_weights(log_weights, x.shape[:-1])
     there, here = np.broadcast_arrays(x[..., :, None, :], x[..., None, :, :])
-    v = array(difference(there.copy(), here.copy()), "difference", (*x.shape[:-1], n, "k"))
+    v = check_array(difference(there.copy(), here.copy()), "difference", (*x.shape[:-1], n, "k"))
     matrix = _coupled((v * v).sum(axis=-1), w, solver_of("network"))
     steps = n * np.einsum("...ij,...ijk->...jk", matrix, v)
-    return array(retract(x.copy(), steps), "retract", x.shape)
+    return check_array(retract(x.copy(), steps), "retract", x.shape)

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 import scipy
 
-from ..doors import Array, NonNegative, Positive, Record, Times, door, unchecked
+from ..validation import Array, NonNegativeFloat, PositiveFloat, FrozenModel, Times, validated, unchecked
 from ..models.base import path
 from ..models.swarm import Swarm
 from .grid import Grid
@@ -19,7 +19,7 @@ from .grid import Grid
 __all__ = ["FokkerPlanck", "bernoulli"]
 
 
-@door
+@validated
 def bernoulli(z: Annotated[Array, "..."]) -> Array:
     """The function z / (exp(z) - 1), 1 at 0: the weight of Scharfetter and Gummel's flux.
 
@@ -38,7 +38,7 @@ _Faces = namedtuple("_Faces", "points left right axis width")
 
 
 @dataclass(frozen=True, eq=False)
-class FokkerPlanck(Record):
+class FokkerPlanck(FrozenModel):
     r"""The density of a swarm's agents, as finite volumes with walls that nothing passes.
 
     Through the face between two cells goes Scharfetter and Gummel's flux, exact where drift and
@@ -127,18 +127,18 @@ class FokkerPlanck(Record):
         columns = np.concatenate([np.arange(n), f.left, f.right])
         return scipy.sparse.csc_array((data, (rows, columns)), (n, n))
 
-    @door
+    @validated
     def generator(self, t: float) -> scipy.sparse.csc_array:
         """The matrix A(t) of dp/dt = A p, (n, n), sparse."""
         return self._assembled(t, 1.0, 0.0)
 
-    @door
-    def step(self, values: Annotated[Array, "... self.grid.size"], t: float, dt: Positive) -> Array:
+    @validated
+    def step(self, values: Annotated[Array, "... self.grid.size"], t: float, dt: PositiveFloat) -> Array:
         """Densities (..., n), or any cell values, moved from `t` to `t` + `dt`."""
         return unchecked(self.solver)(t, dt)(values)
 
-    @door
-    def solver(self, t: float, dt: NonNegative) -> Callable[[Array], Array]:
+    @validated
+    def solver(self, t: float, dt: NonNegativeFloat) -> Callable[[Array], Array]:
         """The step from `t` to `t` + `dt` as a function: one factorisation for any number."""
         if self.scheme == "split":
             return self._split(t, dt)
@@ -199,7 +199,7 @@ class FokkerPlanck(Record):
         shape[k] -= 1
         return np.moveaxis(rate[self._faces.axis == k].reshape(shape), k, 0)
 
-    @door
+    @validated
     def evolve(self, values: Annotated[Array, "... self.grid.size"], times: Times) -> Array:
         """Densities at `times`, (T, ..., n), of one that is `values` at time 0, a step to each.
 

@@ -9,14 +9,14 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from ..doors import Array, Bounds, Count, Indices, NonNegative, Positive, Record, door
+from ..validation import Array, Bounds, PositiveInt, Indices, NonNegativeFloat, PositiveFloat, FrozenModel, validated
 from ..models.swarm import inside
 
 __all__ = ["Grid", "zero_mean_prior"]
 
 
 @dataclass(frozen=True, eq=False)
-class Grid(Record):
+class Grid(FrozenModel):
     """A box in one to three dimensions, cut into equal cells.
 
     A density is a vector (..., n) of its means over the n cells, the last axis fastest; so a sum
@@ -106,41 +106,41 @@ class Grid(Record):
         """Positions (..., d); those outside the box are refused."""
         return inside(positions, np.asarray(self.low), np.asarray(self.high))
 
-    @door
+    @validated
     def integral(self, values: Annotated[Array, "... self.size"]) -> Array:
         """Integral over the box of cell values (..., n)."""
         return np.asarray(values.sum(axis=-1) * self.volume)
 
-    @door
+    @validated
     def norm(self, values: Annotated[Array, "... self.size"]) -> Array:
         """L2 norm over the box of cell values (..., n)."""
         return np.asarray(np.sqrt((values**2).sum(axis=-1) * self.volume))
 
-    @door
-    def normalised(self, values: Annotated[Array, "... self.size"]) -> Array:
+    @validated
+    def normalize(self, values: Annotated[Array, "... self.size"]) -> Array:
         """Cell values (..., n) divided by their integral, which has to be positive."""
         total = values.sum(axis=-1) * self.volume
         if not (total > 0).all():
             raise ValueError(f"values: needs a positive integral, got {float(total.min()):g}")
         return np.asarray(values / total[..., None])
 
-    @door
-    def cells(self, positions: Annotated[Array, "... self.dim"]) -> Indices:
+    @validated
+    def cell_index(self, positions: Annotated[Array, "... self.dim"]) -> Indices:
         """Number of the cell in which each of the positions (..., d) lies, (...)."""
         at = ((self._inside(positions) - self.low) / self.spacing).astype(np.int64)
         at = np.minimum(at, np.array(self.shape) - 1)
         return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(at, -1, 0)), self.shape))
 
-    @door
+    @validated
     def histogram(self, positions: Annotated[Array, "... n self.dim"]) -> Array:
         """Histogram of agents (..., N, d), one or more, as a density (..., n)."""
         lead, n = positions.shape[:-2], positions.shape[-2]
-        cells = self.cells(positions).reshape(-1, n)
+        cells = self.cell_index(positions).reshape(-1, n)
         rows = [np.bincount(row, minlength=self.size) for row in cells]
         return np.asarray(np.reshape(rows, (*lead, self.size)) / (n * self.volume))
 
-    @door
-    def at(
+    @validated
+    def interpolate(
         self, values: Annotated[Array, "self.size"], positions: Annotated[Array, "... self.dim"]
     ) -> Array:
         """Multilinear interpolation of cell values (n,) at positions (..., d); flat at walls."""
@@ -165,8 +165,8 @@ class Grid(Record):
         order = np.lexsort((*k.T[::-1], np.ldexp(mantissa.round(9), exponent)))
         return np.asarray(k[order[:rank]], dtype=np.int64)
 
-    @door
-    def cosines(self, rank: Count) -> Array:
+    @validated
+    def cosines(self, rank: PositiveInt) -> Array:
         r"""The `rank` lowest cosine modes at the centres, (n, rank), orthonormal over the box.
 
         :math:`c_k(x)\propto\prod_j\cos(\pi k_j (x_j-\text{low}_j)/w_j)`: the modes of reflecting
@@ -192,10 +192,10 @@ class Grid(Record):
         return {}
 
 
-@door
+@validated
 def zero_mean_prior(
-    grid: Grid, *, rank: Count, length: Positive | None = None, std: Positive | None = None,
-    mass_std: NonNegative = 0.0,
+    grid: Grid, *, rank: PositiveInt, length: PositiveFloat | None = None, std: PositiveFloat | None = None,
+    mass_std: NonNegativeFloat = 0.0,
 ) -> Array:
     r"""A factor S of the prior covariance P = S Sᵀ of a density: smooth, and of zero mass.
 

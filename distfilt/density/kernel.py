@@ -6,12 +6,12 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..doors import Array, Bounds, Count, Positive, door, unchecked
+from ..validation import Array, Bounds, PositiveInt, PositiveFloat, validated, unchecked
 from .grid import Grid
 
-__all__ = ["bandwidth", "kernel_covariance", "kernel_density", "kernel_information", "kernels"]
+__all__ = ["bandwidth", "kernel_covariance", "kernel_density", "kernel_constant", "kernels"]
 
-Widths = Positive | Annotated[Array, "n", Bounds(above=0)]
+Widths = PositiveFloat | Annotated[Array, "n", Bounds(above=0)]
 
 
 def _along(x: Array, grid: Grid, k: int, width: Array) -> Array:
@@ -60,7 +60,7 @@ def _products(out: Array, factors: list[Array]) -> Array:
     return out
 
 
-@door
+@validated
 def kernels(
     positions: Annotated[Array, "... n grid.dim"], grid: Grid, *, bandwidth: Widths
 ) -> Array:
@@ -98,7 +98,7 @@ def kernels(
     return _products(first, rest)
 
 
-@door
+@validated
 def kernel_density(
     positions: Annotated[Array, "... n grid.dim"], grid: Grid, *, bandwidth: Widths
 ) -> Array:
@@ -123,8 +123,8 @@ def kernel_density(
     return np.asarray(out.reshape(*positions.shape[:-2], grid.size) / positions.shape[-2])
 
 
-@door
-def kernel_information(grid: Grid, *, bandwidth: Positive, agents: Count) -> float:
+@validated
+def kernel_constant(grid: Grid, *, bandwidth: PositiveFloat, agents: PositiveInt) -> float:
     r"""The constant k̄ of Zheng and Lin: ∫K²/(N hᵈ), for which Var p_KDE ≈ k̄ p.
 
     For a Gaussian, :math:`\bar k = 1/\bigl(N(2\sqrt\pi h)^d\bigr)`. It is the variance of one cell.
@@ -132,16 +132,16 @@ def kernel_information(grid: Grid, *, bandwidth: Positive, agents: Count) -> flo
 
     Examples
     --------
-    >>> round(kernel_information(Grid((30, 30)), bandwidth=0.08, agents=100), 4)
+    >>> round(kernel_constant(Grid((30, 30)), bandwidth=0.08, agents=100), 4)
     0.1243
     """
     return float(1 / (agents * (2 * np.sqrt(np.pi) * bandwidth) ** grid.dim))
 
 
-@door
+@validated
 def kernel_covariance(
     density: Annotated[Array, "grid.size", Bounds(at_least=0)], grid: Grid, *,
-    bandwidth: Positive, agents: Count,
+    bandwidth: PositiveFloat, agents: PositiveInt,
 ) -> tuple[Array, Array]:
     r"""Mean and covariance of the kernel estimate of N independent agents, without approximation.
 
@@ -182,7 +182,7 @@ def kernel_covariance(
     return mean, ((g * density) @ g.T / grid.volume - np.outer(mean, mean)) / agents
 
 
-@door
+@validated
 def bandwidth(
     positions: Annotated[Array, "n grid.dim"], grid: Grid, *,
     rule: Literal["silverman", "least_squares"] = "silverman",
@@ -228,6 +228,6 @@ def _least_squares(x: Array, grid: Grid, h: float) -> float:
     n = len(x)
     z = unchecked(kernels)(x, grid, bandwidth=h)
     mean = z.mean(axis=0)
-    at = z[:, grid.cells(x)]  # kernel of agent i in the cell of agent j
+    at = z[:, grid.cell_index(x)]  # kernel of agent i in the cell of agent j
     others = (at.sum() - np.trace(at)) / (n * (n - 1))
     return float((mean**2).sum() * grid.volume - 2 * others)

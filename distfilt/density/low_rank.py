@@ -16,16 +16,16 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..doors import Array, Positive, Record, array, door, semidefinite, unchecked
+from ..validation import Array, PositiveFloat, FrozenModel, check_array, validated, check_positive_semidefinite, unchecked
 
-__all__ = ["Dense", "LowRank", "dense_step", "low_rank_moved", "low_rank_start", "low_rank_step"]
+__all__ = ["Dense", "LowRank", "dense_step", "low_rank_predict", "low_rank_start", "low_rank_step"]
 
 Move = Callable[[Array], Array]
 Observed = Annotated[Array, "*state.base.shape"] | Annotated[Array, "state.size"]
 
 
 @dataclass(frozen=True, eq=False)
-class Dense(Record):
+class Dense(FrozenModel):
     """A density and its whole covariance matrix: the reference.
 
     Parameters
@@ -43,13 +43,13 @@ class Dense(Record):
     """
 
     mean: Annotated[Array, "n"]
-    covariance: Annotated[Array, "n n", semidefinite]
+    covariance: Annotated[Array, "n n", check_positive_semidefinite]
 
 
-@door
+@validated
 def dense_step(
     state: Dense, move: Move, observed: Annotated[Array, "*state.mean.shape"], noise: ArrayLike,
-    dt: Positive,
+    dt: PositiveFloat,
 ) -> Dense:
     r"""One step with the whole covariance: O(n³), the reference for the other.
 
@@ -81,12 +81,12 @@ def dense_step(
     p = 0.5 * (p + p.T)
     gain = np.linalg.solve(p + np.diag(variance), p).T
     left = p - gain @ p
-    return Dense.unchecked(mean + gain @ (observed - mean), 0.5 * (left + left.T))
+    return Dense.construct(mean + gain @ (observed - mean), 0.5 * (left + left.T))
 
 
 def _strength(noise: ArrayLike, shape: tuple[int, ...]) -> Array:
     """The strength R of each filter's noise, infinite where a filter measures nothing."""
-    r = array(noise, "noise", (..., shape[-1]), finite=False)
+    r = check_array(noise, "noise", (..., shape[-1]), finite=False)
     if not r.min() > 0:
         raise ValueError(f"noise: needs variances above 0, got {r.min():g}")
     if r.shape not in (shape, shape[-1:]):
@@ -99,7 +99,7 @@ _MOST = 1e15
 
 
 @dataclass(frozen=True, eq=False)
-class LowRank(Record):
+class LowRank(FrozenModel):
     r"""Any number F of filters of one density, with covariances of low rank.
 
     Filter i holds an r × r information matrix and a vector in a basis S:
@@ -156,14 +156,14 @@ class LowRank(Record):
         rows = np.broadcast_to(self.basis.mT, (len(root), *self.basis.mT.shape[-2:]))
         return np.linalg.solve(root, rows).mT
 
-    @door
+    @validated
     def covariance(self, k: int) -> Array:
         """Covariance of filter `k`, (n, n)."""
         factor = self.factors[k]
         return np.asarray(factor @ factor.T)
 
 
-@door
+@validated
 def low_rank_start(
     basis: Annotated[Array, "n r"] | Annotated[Array, "f n r"], base: Annotated[Array, "f n"]
 ) -> LowRank:
@@ -176,13 +176,13 @@ def low_rank_start(
     """
     filters, rank = len(base), basis.shape[-1]
     nothing = np.tile(np.eye(rank), (filters, 1, 1)), np.zeros((filters, rank))
-    return LowRank.unchecked(basis.copy(), base.copy(), *nothing)
+    return LowRank.construct(basis.copy(), base.copy(), *nothing)
 
 
-@door
-def low_rank_moved(
+@validated
+def low_rank_predict(
     state: LowRank, move: Move, *, process: Annotated[Array, "state.size q"] | None = None,
-    dt: Positive | None = None,
+    dt: PositiveFloat | None = None,
 ) -> LowRank:
     r"""The filters after the model's step and before the measurement.
 
@@ -203,7 +203,7 @@ def low_rank_moved(
     Examples
     --------
     >>> state = low_rank_start(np.eye(2), np.ones((1, 2)))
-    >>> low_rank_moved(state, lambda p: p / 2).estimates
+    >>> low_rank_predict(state, lambda p: p / 2).estimates
     array([[0.5, 0.5]])
     """
     if process is None:
@@ -213,7 +213,7 @@ def low_rank_moved(
     moved = move(np.concatenate([rows.reshape(-1, state.size), base]))
     basis = np.ascontiguousarray(moved[: -len(base)].reshape(rows.shape).mT)
     if process is None:
-        return state.changed(basis=basis, base=moved[-len(base) :])
+        return state.replace(basis=basis, base=moved[-len(base) :])
     if dt is None:
         raise ValueError("dt: needs the step's length where there is process noise, got None")
     added = np.broadcast_to(np.sqrt(dt) * process, (len(base), *process.shape))
@@ -223,8 +223,8 @@ def low_rank_moved(
     return unchecked(low_rank_start)(kept, moved[-len(base) :])
 
 
-@door
-def low_rank_step(state: LowRank, observed: Observed, noise: ArrayLike, dt: Positive) -> LowRank:
+@validated
+def low_rank_step(state: LowRank, observed: Observed, noise: ArrayLike, dt: PositiveFloat) -> LowRank:
     r"""All filters take in a measurement each: one matrix product.
 
     .. math::
@@ -238,7 +238,7 @@ def low_rank_step(state: LowRank, observed: Observed, noise: ArrayLike, dt: Posi
     Parameters
     ----------
     state : LowRank
-        As :func:`low_rank_moved` left it.
+        As :func:`low_rank_predict` left it.
     observed : array_like, (F, n) or (n,)
     noise : array_like, (F, n) or (n,)
         Strength R of the noise, positive; infinite where a filter measures nothing.
@@ -260,7 +260,7 @@ def low_rank_step(state: LowRank, observed: Observed, noise: ArrayLike, dt: Posi
         if not (most < _MOST * least).all():
             raise np.linalg.LinAlgError("density filter: the step's length, the noise or the prior "
                                         f"is out of scale, information {most.max():.3g}")
-    return state.changed(information=information, vector=state.vector + seen)
+    return state.replace(information=information, vector=state.vector + seen)
 
 
 def _weighted_products(s: Array, weights: Array) -> Array:

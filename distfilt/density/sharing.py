@@ -9,16 +9,16 @@ from typing import Annotated, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..doors import MISSING, Array, Count, Mask, NonNegative, Places, Positive, Record, unchecked
+from ..validation import ALLOW_NAN, Array, PositiveInt, Mask, NonNegativeFloat, DistinctIndices, PositiveFloat, FrozenModel, unchecked
 from ..network import Channel, Graph, PIState, pi_step
 from ..network import weights as weighting
 from ..network.channel import Lost
 from ..network.graphs import disk
 from .grid import Grid
-from .kernel import kernel_density, kernel_information, kernels
+from .kernel import kernel_density, kernel_constant, kernels
 
 __all__ = [  # fmt: skip
-    "Centralised", "DynamicAverage", "Flooding", "Neighbours", "PIConsensus", "Seen", "Sharing",
+    "Centralised", "DynamicAverage", "Flooding", "Neighbours", "PIConsensus", "SwarmSnapshot", "ConsensusProtocol",
     "alone", "present_graph",
 ]
 
@@ -30,7 +30,7 @@ _NEVER = -1e30
 
 
 @dataclass(frozen=True, eq=False)
-class Seen(Record):
+class SwarmSnapshot(FrozenModel):
     """What the agents themselves see at one time, and on which grid they think.
 
     Parameters
@@ -47,16 +47,16 @@ class Seen(Record):
 
     Examples
     --------
-    >>> seen = Seen([[0.5, 0.5], [np.nan, np.nan]], Grid((9, 9)), 0.1, 0.0)
+    >>> seen = SwarmSnapshot([[0.5, 0.5], [np.nan, np.nan]], Grid((9, 9)), 0.1, 0.0)
     >>> seen.present, seen.kernels.shape
     (array([ True, False]), (2, 81))
     """
 
-    positions: Annotated[Array, "A grid.dim", MISSING]
+    positions: Annotated[Array, "A grid.dim", ALLOW_NAN]
     grid: Grid
-    bandwidth: Positive
+    bandwidth: PositiveFloat
     t: float
-    wanted: Places | None = None
+    wanted: DistinctIndices | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -106,7 +106,7 @@ class Seen(Record):
         least = 0.1 / self.grid.box if floor is None else floor
         heard = np.where(self.present, np.maximum(agents, 1.0), 0.0)
         chosen = heard if self.wanted is None else heard[list(self.wanted)]
-        unit = unchecked(kernel_information)(self.grid, bandwidth=self.bandwidth, agents=1)
+        unit = unchecked(kernel_constant)(self.grid, bandwidth=self.bandwidth, agents=1)
         k = np.divide(unit, chosen, out=np.full(chosen.shape, np.inf), where=chosen > 0)
         return np.asarray(k[:, None] * np.maximum(density, least))
 
@@ -116,14 +116,14 @@ class Seen(Record):
         Its standard deviation is .3 of the box's side, unless it is given.
 
         >>> box = Grid((3, 3), high=3.0)
-        >>> seen = Seen(np.array([[2.9, 2.9], [np.nan, np.nan]]), box, 1.0, 0.0)
+        >>> seen = SwarmSnapshot(np.array([[2.9, 2.9], [np.nan, np.nan]]), box, 1.0, 0.0)
         >>> seen.flat().argmax(axis=1)
         array([8, 4])
         """
         width = 0.3 * self.grid.side if std is None else std
         centre = self._or(self.grid.low + 0.5 * self.grid.width)
         gap = ((self.grid.centres - centre[:, None, :]) ** 2).sum(axis=-1)
-        return self.grid.normalised(np.exp(-0.5 * gap / width**2))
+        return self.grid.normalize(np.exp(-0.5 * gap / width**2))
 
 
 def present_graph(graph: Graph, present: Mask) -> Graph:
@@ -132,18 +132,18 @@ def present_graph(graph: Graph, present: Mask) -> Graph:
     Examples
     --------
     >>> from distfilt.network import graphs
-    >>> present_graph(graphs.path(3), np.array([True, True, False])).degrees
+    >>> present_graph(graphs.path(3), np.array([True, True, False])).in_degree
     array([1., 1., 0.])
     """
     if present.all():
         return graph
     keep = present[graph.receivers] & present[graph.senders]
     pairs = np.stack([graph.receivers[keep], graph.senders[keep]], axis=1)
-    return Graph.from_edges(graph.size, pairs, directed=True)
+    return Graph.from_edges(graph.n_agents, pairs, directed=True)
 
 
 @runtime_checkable
-class Sharing(Protocol):
+class ConsensusProtocol(Protocol):
     """A rule by which agents learn the swarm's kernel estimate: what a density filter agrees by.
 
     `begin` gives what the agents remember before their first step. `learn` takes what they see
@@ -152,48 +152,48 @@ class Sharing(Protocol):
 
     Examples
     --------
-    >>> Centralised().reference, Flooding().fuses
+    >>> Centralised().reference, Flooding().belief_kind
     (True, 'densities')
     """
 
-    fuses: str = "densities"
+    belief_kind: str = "densities"
     reference: bool = False
     """Whether this is no network's rule, but what it is compared with."""
 
-    def begin(self, seen: Seen) -> Carried:
+    def initial_state(self, seen: SwarmSnapshot) -> Carried:
         """What the agents remember before the first step: nothing, unless a rule says."""
         return ()
 
-    def learn(self, carried: Carried, seen: Seen, channel: Channel, dt: float) -> Learnt:
+    def update(self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float) -> Learnt:
         """One step of talking."""
         ...
 
 
-def alone(sharing: Sharing, seen: Seen) -> Array:
+def alone(sharing: ConsensusProtocol, seen: SwarmSnapshot) -> Array:
     """What each agent believes of the swarm before anybody has spoken, (A, n).
 
     Its own kernel, whatever it will say; only a reference knows of all without a word.
 
     Examples
     --------
-    >>> seen = Seen(np.full((2, 2), 0.5), Grid((9, 9)), 0.1, 0.0)
+    >>> seen = SwarmSnapshot(np.full((2, 2), 0.5), Grid((9, 9)), 0.1, 0.0)
     >>> np.array_equal(alone(Flooding(), seen), seen.kernels)
     True
     """
     if not sharing.reference:
         return seen.kernels
     silent = Channel(Graph.from_edges(len(seen.positions), np.zeros((0, 2))))
-    return sharing.learn(sharing.begin(seen), seen, silent, 1.0)[1]
+    return sharing.update(sharing.initial_state(seen), seen, silent, 1.0)[1]
 
 
-def _coordinates(seen: Seen, modes: int | None, values: Array) -> Array:
+def _coordinates(seen: SwarmSnapshot, modes: int | None, values: Array) -> Array:
     """Densities, whole or as cosine coefficients, and a 1 of the first agent that is here."""
     z = values if modes is None else values @ seen.grid.cosines(modes) * seen.grid.volume
     leader = np.arange(len(z)) == np.argmax(seen.present)
     return np.concatenate([z, leader[:, None]], axis=1)
 
 
-def _read(values: Array, seen: Seen, modes: int | None) -> tuple[Array, Array]:
+def _read(values: Array, seen: SwarmSnapshot, modes: int | None) -> tuple[Array, Array]:
     """Densities and numbers of agents that the coordinates stand for."""
     y = values[:, :-1]
     if modes is not None:
@@ -203,7 +203,7 @@ def _read(values: Array, seen: Seen, modes: int | None) -> tuple[Array, Array]:
 
 
 @dataclass(frozen=True)
-class PIConsensus(Record, Sharing):
+class PIConsensus(FrozenModel, ConsensusProtocol):
     """The proportional-integral estimator of equation (16) of Zheng and Lin.
 
     Parameters
@@ -214,7 +214,7 @@ class PIConsensus(Record, Sharing):
         Agree on so many cosine coefficients of the density instead of on all cells.
     rate : bool
         Add the inputs' derivative, which (16) lacks, so that the average is followed without a lag.
-    first_std : float, optional
+    initial_std : float, optional
         Start at a Gaussian of this width about the agent instead of at the own kernel.
 
     Examples
@@ -223,21 +223,21 @@ class PIConsensus(Record, Sharing):
     64
     """
 
-    alpha: NonNegative = field(default=0.2, kw_only=True)
-    a: NonNegative = field(default=0.4, kw_only=True)
-    b: NonNegative = field(default=0.04, kw_only=True)
-    modes: Count | None = field(default=None, kw_only=True)
+    alpha: NonNegativeFloat = field(default=0.2, kw_only=True)
+    a: NonNegativeFloat = field(default=0.4, kw_only=True)
+    b: NonNegativeFloat = field(default=0.04, kw_only=True)
+    modes: PositiveInt | None = field(default=None, kw_only=True)
     rate: bool = field(default=False, kw_only=True)
-    first_std: Positive | None = field(default=None, kw_only=True)
+    initial_std: PositiveFloat | None = field(default=None, kw_only=True)
 
-    def begin(self, seen: Seen) -> Carried:
+    def initial_state(self, seen: SwarmSnapshot) -> Carried:
         """First estimates, no integral, and the inputs of now."""
         u = _coordinates(seen, self.modes, seen.kernels)
-        if self.first_std is None:
+        if self.initial_std is None:
             return u, np.zeros_like(u), u
-        return _coordinates(seen, self.modes, seen.flat(self.first_std)), np.zeros_like(u), u
+        return _coordinates(seen, self.modes, seen.flat(self.initial_std)), np.zeros_like(u), u
 
-    def learn(self, carried: Carried, seen: Seen, channel: Channel, dt: float) -> Learnt:
+    def update(self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float) -> Learnt:
         """One step of (16), in as many substeps as stability asks for."""
         u = _coordinates(seen, self.modes, seen.kernels)
         estimate, integral, before = carried
@@ -249,7 +249,7 @@ class PIConsensus(Record, Sharing):
 
 
 @dataclass(frozen=True)
-class DynamicAverage(Record, Sharing):
+class DynamicAverage(FrozenModel, ConsensusProtocol):
     """First-order dynamic average consensus on cosine coefficients of the density.
 
     Metropolis weights where all links go both ways, else weights that balance the graph (M. Zhu and
@@ -266,25 +266,25 @@ class DynamicAverage(Record, Sharing):
     100
     """
 
-    modes: Count | None = field(default=100, kw_only=True)
+    modes: PositiveInt | None = field(default=100, kw_only=True)
 
-    def begin(self, seen: Seen) -> Carried:
+    def initial_state(self, seen: SwarmSnapshot) -> Carried:
         """Estimates that are the own kernels, which the rule needs for an exact average."""
         u = _coordinates(seen, self.modes, seen.kernels)
         return u, u
 
-    def learn(self, carried: Carried, seen: Seen, channel: Channel, dt: float) -> Learnt:
+    def update(self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float) -> Learnt:
         """Average, and add what the own input has changed by."""
         u = _coordinates(seen, self.modes, seen.kernels)
         (x, before), graph = carried, channel.graph
-        weights = weighting.balanced(graph) if graph.directed else weighting.metropolis(graph)
+        weights = weighting.doubly_stochastic(graph) if graph.directed else weighting.metropolis(graph)
         lost: Lost = "keep" if graph.directed else "mutual"
-        x = unchecked(channel.combine)(x, weights, lost=lost) + (u - before)
+        x = unchecked(channel.mix)(x, weights, lost=lost) + (u - before)
         return (x, u), *_read(x, seen, self.modes)
 
 
 @dataclass(frozen=True)
-class Flooding(Record, Sharing):
+class Flooding(FrozenModel, ConsensusProtocol):
     """Every agent passes on where it last knew each agent, with the time, and keeps the newest.
 
     Parameters
@@ -299,16 +299,16 @@ class Flooding(Record, Sharing):
     5.0
     """
 
-    forget: Positive | None = field(default=None, kw_only=True)
+    forget: PositiveFloat | None = field(default=None, kw_only=True)
 
-    def begin(self, seen: Seen) -> Carried:
+    def initial_state(self, seen: SwarmSnapshot) -> Carried:
         """Tables (A, A, d + 1) of positions and times, without any entry."""
         return (_empty(seen),)
 
-    def learn(self, carried: Carried, seen: Seen, channel: Channel, dt: float) -> Learnt:
+    def update(self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float) -> Learnt:
         """Note the own position, send the table, keep the newest of each entry."""
         table = _noted(seen, carried[0])
-        heard = channel.exchange(seen.only_here(table))
+        heard = channel.broadcast(seen.only_here(table))
         new, owners = table.copy(), np.arange(len(table))
         for i in np.flatnonzero(seen.present):
             rows = np.stack([table[i], *heard[i].values()])
@@ -317,19 +317,19 @@ class Flooding(Record, Sharing):
         return (new,), *_mean_kernels(new, oldest, seen)
 
 
-def _empty(seen: Seen) -> Array:
+def _empty(seen: SwarmSnapshot) -> Array:
     size, d = seen.positions.shape
     return np.full((size, size, d + 1), [0.0] * d + [_NEVER])
 
 
-def _noted(seen: Seen, table: Array) -> Array:
+def _noted(seen: SwarmSnapshot, table: Array) -> Array:
     """Each agent's table of all agents' positions and times, with the own entry of now."""
     out, here = table.copy(), np.flatnonzero(seen.present)
     out[here, here, :-1], out[here, here, -1] = seen.positions[here], seen.t
     return out
 
 
-def _mean_kernels(table: Array, oldest: float, seen: Seen) -> tuple[Array, Array]:
+def _mean_kernels(table: Array, oldest: float, seen: SwarmSnapshot) -> tuple[Array, Array]:
     """Kernel estimates of each table's newer entries, and their numbers.
 
     Equal entries are computed once.
@@ -349,7 +349,7 @@ def _mean_kernels(table: Array, oldest: float, seen: Seen) -> tuple[Array, Array
 
 
 @dataclass(frozen=True)
-class Neighbours(Record, Sharing):
+class Neighbours(FrozenModel, ConsensusProtocol):
     """Remark 4 of Zheng and Lin as it stands: positions go to neighbours, and that is all.
 
     Each agent's estimate is the kernel estimate of itself and of those that it hears.
@@ -360,17 +360,17 @@ class Neighbours(Record, Sharing):
     False
     """
 
-    def learn(self, carried: Carried, seen: Seen, channel: Channel, dt: float) -> Learnt:
+    def update(self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float) -> Learnt:
         """Send the own position; the mean of the kernels at all positions that arrive."""
         table = _noted(seen, _empty(seen))
-        for i, box in enumerate(channel.exchange(seen.only_here(seen.positions))):
+        for i, box in enumerate(channel.broadcast(seen.only_here(seen.positions))):
             for j, x in box.items():
                 table[i, j] = *x, seen.t
         return (), *_mean_kernels(table, _NEVER / 2, seen)
 
 
 @dataclass(frozen=True)
-class Centralised(Record, Sharing):
+class Centralised(FrozenModel, ConsensusProtocol):
     """All positions known to all at no cost: the reference that no network is.
 
     Examples
@@ -381,7 +381,7 @@ class Centralised(Record, Sharing):
 
     reference = True
 
-    def learn(self, carried: Carried, seen: Seen, channel: Channel, dt: float) -> Learnt:
+    def update(self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float) -> Learnt:
         """The kernel estimate of all that are here."""
         x, size = seen.positions[seen.present], len(seen.positions)
         y = unchecked(kernel_density)(x, seen.grid, bandwidth=seen.bandwidth)

@@ -8,9 +8,9 @@ from .base import Filter
 from .density import DensityFilter, DensityState
 from .ensemble import EnsembleFilter, TransportFilter
 from .gaussian import GaussianFilter, GaussianState
-from .inputs import Reading, moments_of
+from .inputs import Observation, prior_moments
 from .mixture import MixtureFilter, MixtureState
-from .news import NewsFilter, increment
+from .news import InformationIncrementFilter, information_increment
 from .particle import ParticleFilter
 from .record import Summary, final_state
 from .saving import SensorState, State
@@ -18,7 +18,7 @@ from .step import FilterError, Step
 
 __all__ = [  # fmt: skip
     "DensityFilter", "DensityState", "EnsembleFilter", "Filter", "FilterError",
-    "GaussianFilter", "GaussianState", "MixtureFilter", "MixtureState", "NewsFilter",
-    "ParticleCollapse", "ParticleFilter", "Reading", "SensorState", "State", "Step", "Summary",
-    "TransportFilter", "final_state", "increment", "moments_of",
+    "GaussianFilter", "GaussianState", "MixtureFilter", "MixtureState", "InformationIncrementFilter",
+    "ParticleCollapse", "ParticleFilter", "Observation", "SensorState", "State", "Step", "Summary",
+    "TransportFilter", "final_state", "information_increment", "prior_moments",
 ]

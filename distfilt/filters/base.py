@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from ..doors import Array, Bounds, Index, Positive, Record, Rng, door
+from ..validation import Array, Bounds, NonNegativeInt, PositiveFloat, FrozenModel, Rng, validated
 from ..models import Model
 from ..network import Channel, Faults, Ledger
-from ..network.channel import fused_kind
+from ..network.channel import kind_of_rule
 from ..network.graphs import as_graph
 from ..sensors import Sensor
-from .inputs import Reading, belated, planned, said_by_all
-from .record import SCORES, Score, Summary, recorded
+from .inputs import Observation, match_delayed, plan_steps, read_observations
+from .record import SCORES, Score, Summary, record_run
 from .saving import State
-from .step import RECOVERABLE, FilterError, Step, of_the_call
+from .step import RECOVERABLE, FilterError, Step, is_argument_error
 
 if TYPE_CHECKING:
     import xarray
@@ -33,7 +33,7 @@ __all__ = ["Filter"]
 
 
 @dataclass(frozen=True, eq=False)
-class Filter(Record, ABC):
+class Filter(FrozenModel, ABC):
     """What every family of filters is made of.
 
     Parameters
@@ -45,26 +45,26 @@ class Filter(Record, ABC):
         One that moves comes with each :class:`Reading`, and of several each reading is one.
     graph : Graph, networkx graph, matrix or edges, or callable t -> one of them, optional
         Who hears whom; needed where anybody speaks. At a time without any link nobody does.
-    agreement : callable, optional
+    fusion : callable, optional
         ``agreement(belief, channel) -> belief``: what agents do after the update to agree, if they
         do; the belief is the family's. A rule of this package that fuses something else is refused.
-    share : bool
+    share_observations : bool
         Whether agents send their readings to those that hear them, who use them too.
     faults : Faults, optional
         Messages lost and agents silenced; a lost observation is a missing one. A delay is not
-        accepted: an observation that comes late has its own time, pass it as `late`.
+        accepted: an observation that comes late has its own time, pass it as `delayed`.
     lag : int
         How many earlier times are kept, for late observations and for smoothing.
     names : sequence of str
         Names of the agents; their numbers by default.
-    failures : {"raise", "keep"}
+    on_error : {"raise", "keep"}
         What happens when one run of a batch fails: a :class:`FilterError` that names it, or the
-        other runs go on and the failed one is recorded as NaN. Where an `agreement` raises, each
+        other runs go on and the failed one is recorded as NaN. Where an `fusion` raises, each
         run is asked alone.
-    gate : float, optional
+    gate_probability : float, optional
         How likely a good reading passes, in (0, 1). Each sensor's reading is tested against what
-        was predicted; those that fail are left out and counted as ``refused`` in the record.
-    every : float, optional
+        was predicted; those that fail are left out and counted as ``rejected`` in the record.
+    exchange_interval : float, optional
         Agents exchange something every so many seconds only. Readings wait for it and are told as
         late ones, so that a `lag` has to reach back.
 
@@ -81,80 +81,80 @@ class Filter(Record, ABC):
     >>> import networkx as nx
     >>> from distfilt.filters import GaussianFilter
     >>> from distfilt.models import constant_velocity
-    >>> from distfilt.network import intersection
-    >>> from distfilt.sensors import direct
-    >>> walk, two = constant_velocity(sigma=1.0), [direct([0], std=1.0), None]
+    >>> from distfilt.network import intersect_ensembles
+    >>> from distfilt.sensors import component
+    >>> walk, two = constant_velocity(sigma=1.0), [component([0], std=1.0), None]
     >>> for graph in (nx.path_graph(2), lambda t: [(0, 1)]):
     ...     f = GaussianFilter(walk, two, graph)
     ...     print(f.step(f.start((np.zeros(4), np.eye(4))), 0.0, [[1.0], None]).means[:, 0])
     [0.5 0.5]
     [0.5 0.5]
-    >>> GaussianFilter(walk, two, graph, agreement=intersection)
+    >>> GaussianFilter(walk, two, graph, fusion=intersect_ensembles)
     Traceback (most recent call last):
-    ValueError: agreement: needs a rule that fuses gaussians, got one of ensembles
+    ValueError: fusion: needs a rule that fuses gaussians, got one of ensembles
     """
 
     model: Model
     sensors: Sequence[Sensor | Sequence[Sensor] | None]
     graph: Any = None
     _: KW_ONLY
-    agreement: Callable[..., Any] | None = None
-    share: bool = True
+    fusion: Callable[..., Any] | None = None
+    share_observations: bool = True
     faults: Faults | None = None
-    lag: Index = 0
+    lag: NonNegativeInt = 0
     names: Sequence[str] = ()
-    failures: Literal["raise", "keep"] = "raise"
-    gate: Annotated[float, Bounds(above=0, below=1)] | None = None
-    every: Positive | None = None
+    on_error: Literal["raise", "keep"] = "raise"
+    gate_probability: Annotated[float, Bounds(above=0, below=1)] | None = None
+    exchange_interval: PositiveFloat | None = None
 
-    state: ClassVar[type[Any]] = State
-    draws: ClassVar[bool] = False
-    batched: ClassVar[bool] = True
-    joins: ClassVar[bool] = False
-    changes: ClassVar[bool] = False
-    fuses: ClassVar[str | None] = None
-    unused: ClassVar[Mapping[str, str]] = {}
+    state_class: ClassVar[type[Any]] = State
+    requires_rng: ClassVar[bool] = False
+    supports_runs: ClassVar[bool] = True
+    batched_summary: ClassVar[bool] = False
+    supports_increments: ClassVar[bool] = False
+    belief_kind: ClassVar[str | None] = None
+    unsupported: ClassVar[Mapping[str, str]] = {}
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
         # A summary of one's own may be right for single states only.
-        if "summary" in vars(cls) and "joins" not in vars(cls):
-            cls.joins = False
+        if "summarize" in vars(cls) and "batched_summary" not in vars(cls):
+            cls.batched_summary = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
         for option in fields(self):
-            if option.name in self.unused and getattr(self, option.name) != option.default:
-                raise ValueError(f"{option.name}: {self.unused[option.name]}")
+            if option.name in self.unsupported and getattr(self, option.name) != option.default:
+                raise ValueError(f"{option.name}: {self.unsupported[option.name]}")
         self.check_parts()
-        if self.faults is not None and self.faults.late:
+        if self.faults is not None and self.faults.has_delay:
             raise ValueError(f"faults: needs Faults without a delay, got {self.faults!r}")
-        if self.names and not len(self.names) == len({*self.names}) == self.count:
-            raise ValueError(f"names: needs {self.count} different names, got {[*self.names]}")
-        kind = None if self.agreement is None else fused_kind(self.agreement)
-        if kind is not None and kind != self.fuses:
-            raise ValueError(f"agreement: needs a rule that fuses {self.fuses}, got one of {kind}")
-        if self.every is not None and self.share and self.graph is not None and not self.lag:
+        if self.names and not len(self.names) == len({*self.names}) == self.n_agents:
+            raise ValueError(f"names: needs {self.n_agents} different names, got {[*self.names]}")
+        kind = None if self.fusion is None else kind_of_rule(self.fusion)
+        if kind is not None and kind != self.belief_kind:
+            raise ValueError(f"fusion: needs a rule that fuses {self.belief_kind}, got one of {kind}")
+        if self.exchange_interval is not None and self.share_observations and self.graph is not None and not self.lag:
             raise ValueError("lag: needs at least 1 for readings that wait for a contact, got 0")
 
     def check_parts(self) -> None:
         """Refuse sensors or a graph that this family cannot have."""
-        if not self.changes and any(s.uses_previous for own in self.team for s in own):
+        if not self.supports_increments and any(s.uses_previous for own in self.agent_sensors for s in own):
             raise ValueError("sensors: needs sensors of the present state, got a differential")
-        speak = self.share or self.agreement is not None
-        if self.graph is None and self.count > 1 and speak:
-            raise ValueError(f"graph: needs a Graph of {self.count} agents, got None")
+        speak = self.share_observations or self.fusion is not None
+        if self.graph is None and self.n_agents > 1 and speak:
+            raise ValueError(f"graph: needs a Graph of {self.n_agents} agents, got None")
         if self.graph is not None and not callable(self.graph):
-            object.__setattr__(self, "graph", as_graph(self.graph, self.count, self.names))
+            object.__setattr__(self, "graph", as_graph(self.graph, self.n_agents, self.names))
 
     @cached_property
-    def team(self) -> tuple[tuple[Sensor, ...], ...]:
+    def agent_sensors(self) -> tuple[tuple[Sensor, ...], ...]:
         """Each agent's sensors."""
         several = [() if own is None else own for own in self.sensors]
         return tuple(own if isinstance(own, tuple) else (own,) for own in several)
 
     @cached_property
-    def count(self) -> int:
+    def n_agents(self) -> int:
         """Number A of agents."""
         return len(self.sensors)
 
@@ -168,39 +168,39 @@ class Filter(Record, ABC):
     @property
     def agents(self) -> tuple[str, ...]:
         """Names of the agents; their numbers by default."""
-        return tuple(self.names) or tuple(str(k) for k in range(self.count))
+        return tuple(self.names) or tuple(str(k) for k in range(self.n_agents))
 
     def channel(self, state: State, t: float) -> Channel | None:
         """The door of this step; none where nobody can speak, or it is not yet time."""
         if self.graph is None or not self._contact(state.t, t):
             return None
         graph = self.graph(t) if callable(self.graph) else self.graph
-        graph = as_graph(graph, self.count, self.names)
+        graph = as_graph(graph, self.n_agents, self.names)
         if not graph.senders.size:
             return None
-        return Channel.unchecked(graph, ledger=state.ledger, runs=state.runs,
+        return Channel.construct(graph, ledger=state.ledger, runs=state.runs,
                                  faults=self.faults, t=t)
 
     def _contact(self, before: float, t: float) -> bool:
-        if self.every is None:
+        if self.exchange_interval is None:
             return True
         # Whether one of the multiples lies after the step's start, and up to its end, to rounding.
-        near = 1e-9 + 1e-15 * abs(t / self.every)
-        return math.floor(t / self.every + near) > math.floor(before / self.every + near)
+        near = 1e-9 + 1e-15 * abs(t / self.exchange_interval)
+        return math.floor(t / self.exchange_interval + near) > math.floor(before / self.exchange_interval + near)
 
     @abstractmethod
-    def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """The fields of the first state that are the family's own."""
 
     @abstractmethod
-    def advance(self, step: Step) -> Any:
+    def next_state(self, step: Step) -> Any:
         """The state at the end of a step."""
 
     @abstractmethod
-    def summary(self, state: Any) -> Summary:
+    def summarize(self, state: Any) -> Summary:
         """Estimates and spreads of a state."""
 
-    @door
+    @validated
     def start(
         self, prior: Any, *, rng: Rng | None = None, runs: tuple[int, ...] = (), t: float = 0.0
     ) -> Any:
@@ -222,18 +222,18 @@ class Filter(Record, ABC):
         t : float
             The time of the prior, in s.
         """
-        if self.draws and rng is None:
+        if self.requires_rng and rng is None:
             raise ValueError("rng: needs a numpy.random.Generator, got None")
-        if runs and (not self.batched or min(runs) < 1):
-            needs = "sizes of at least 1" if self.batched else "(), one run at a time"
+        if runs and (not self.supports_runs or min(runs) < 1):
+            needs = "sizes of at least 1" if self.supports_runs else "(), one run at a time"
             raise ValueError(f"runs: needs {needs}, got {runs!r}")
-        own = self.begin(prior, runs, rng)
-        child = rng.spawn(1)[0] if self.draws and rng is not None else None
-        return self.state(t, Ledger.empty(self.count), child, **own)
+        own = self.initial_state(prior, runs, rng)
+        child = rng.spawn(1)[0] if self.requires_rng and rng is not None else None
+        return self.state_class(t, Ledger.empty(self.n_agents), child, **own)
 
-    @door
+    @validated
     def step(
-        self, state: State, t: float, observations: Any, *, late: Sequence[Reading] = ()
+        self, state: State, t: float, observations: Any, *, delayed: Sequence[Observation] = ()
     ) -> Any:
         """Move to time `t` and take in what was observed there.
 
@@ -255,50 +255,50 @@ class Filter(Record, ABC):
             If `t` is earlier, or an observation does not fit its sensor or no earlier state is
             kept for a late one.
         FilterError
-            If an agent's computation fails; see `failures`.
+            If an agent's computation fails; see `on_error`.
         """
         if t < state.t:
             Bounds(at_least=state.t)(t, "t")
-        self.fits(state)
-        return self._advanced(state, t, observations, late, own=False)
+        self.check_state(state)
+        return self._advanced(state, t, observations, delayed, own=False)
 
     def _advanced(
-        self, state: Any, t: float, observations: Any, late: Sequence[Reading], *, own: bool
+        self, state: Any, t: float, observations: Any, delayed: Sequence[Observation], *, own: bool
     ) -> Any:
-        said = self.read(observations, state.runs, t)
-        old = belated(self, late, state, t) if late else ()
+        said = self.read_observations(observations, state.runs, t)
+        old = match_delayed(self, delayed, state, t) if delayed else ()
         step = Step(self, state, t, said, old, own=own)
         try:
-            return self.advance(step)
+            return self.next_state(step)
         except RECOVERABLE as error:
-            if of_the_call(error):
+            if is_argument_error(error):
                 raise
             raise FilterError((), None, t, error) from error
 
-    def fits(self, state: Any) -> None:
+    def check_state(self, state: Any) -> None:
         """Refuse a state that is not this filter's."""
-        if not isinstance(state, self.state):
-            needs = self.state.__name__
+        if not isinstance(state, self.state_class):
+            needs = self.state_class.__name__
             raise ValueError(f"state: needs a {needs}, got a {type(state).__name__}")
-        if (got := state.ledger.messages.size) != self.count:
-            raise ValueError(f"state: needs {self.count} agents, got {got}")
+        if (got := state.ledger.messages.size) != self.n_agents:
+            raise ValueError(f"state: needs {self.n_agents} agents, got {got}")
         if (own := getattr(self, "sizes", None)) is not None and state.sizes != own:
             raise ValueError(f"state: needs sizes {own} an agent, got {state.sizes}")
 
-    def read(self, observations: Any, runs: tuple[int, ...], t: float) -> Any:
+    def read_observations(self, observations: Any, runs: tuple[int, ...], t: float) -> Any:
         """What is observed at one time, checked; as a rule each agent's readings."""
-        return said_by_all(self, observations, runs, t)
+        return read_observations(self, observations, runs, t)
 
     def _walk(
-        self, state: Any, grid: Array, entries: Iterable[Any], late: Sequence[Reading], *, own: bool
+        self, state: Any, grid: Array, entries: Iterable[Any], delayed: Sequence[Observation], *, own: bool
     ) -> Iterator[Any]:
         last = grid[-1] if grid.size else -np.inf
-        for item in late:
-            if item.arrived is None or item.arrived > last:
-                raise ValueError(f"late: needs arrivals up to {last:g}, got {item.arrived}")
-        waiting: list[Any] = sorted(late, key=lambda item: item.arrived or 0.0)
+        for item in delayed:
+            if item.arrival_time is None or item.arrival_time > last:
+                raise ValueError(f"delayed: needs arrivals up to {last:g}, got {item.arrival_time}")
+        waiting: list[Any] = sorted(delayed, key=lambda item: item.arrival_time or 0.0)
         for k, (t, observed) in enumerate(zip(grid.tolist(), entries, strict=True)):
-            due = [item for item in waiting if item.arrived <= t] if waiting else waiting
+            due = [item for item in waiting if item.arrival_time <= t] if waiting else waiting
             waiting = waiting[len(due) :]
             # The first state is the caller's.
             state = self._advanced(state, t, observed, due, own=own and k > 0)
@@ -306,13 +306,13 @@ class Filter(Record, ABC):
 
     def _recorded(
         self, state: Any, times: Any, observations: Any, truth: Any, scores: Collection[Score],
-        late: Sequence[Reading], lag: int,
+        delayed: Sequence[Observation], lag: int,
     ) -> xarray.Dataset:  # fmt: skip
         """A run's record, each time as it is believed when `lag` more have been observed."""
-        self.fits(state)
-        grid, entries = planned(self, state, times, observations)
-        walk = self._walk(state, grid, entries, late, own=True)
-        return recorded(self, grid, state, self._believed(walk, lag), truth, scores)
+        self.check_state(state)
+        grid, entries = plan_steps(self, state, times, observations)
+        walk = self._walk(state, grid, entries, delayed, own=True)
+        return record_run(self, grid, state, self._believed(walk, lag), truth, scores)
 
     def _believed(self, walk: Iterable[Any], lag: int) -> Iterator[tuple[Any, Any]]:
         """Each state of a walk, and as what it is believed when `lag` more have followed."""
@@ -320,23 +320,23 @@ class Filter(Record, ABC):
         for last in walk:
             waiting.append(last)
             if len(waiting) > lag:
-                yield waiting.pop(0), last.earlier[-lag] if lag else last
+                yield waiting.pop(0), last.lagged_states[-lag] if lag else last
         if waiting:
-            yield from zip(waiting, [*last.earlier, last][-len(waiting) :], strict=True)
+            yield from zip(waiting, [*last.lagged_states, last][-len(waiting) :], strict=True)
 
-    @door
+    @validated
     def steps(
-        self, state: State, times: Any, observations: Any, *, late: Sequence[Reading] = ()
+        self, state: State, times: Any, observations: Any, *, delayed: Sequence[Observation] = ()
     ) -> Iterator[Any]:
         """The states at `times`, one after the other; arguments as in :meth:`run`."""
-        self.fits(state)
-        grid, entries = planned(self, state, times, observations)
-        return self._walk(state, grid, entries, late, own=False)
+        self.check_state(state)
+        grid, entries = plan_steps(self, state, times, observations)
+        return self._walk(state, grid, entries, delayed, own=False)
 
-    @door
+    @validated
     def run(
         self, state: State, times: Any, observations: Any, *, truth: Any = None,
-        scores: Collection[Score] = SCORES, late: Sequence[Reading] = (),
+        scores: Collection[Score] = SCORES, delayed: Sequence[Observation] = (),
     ) -> xarray.Dataset:  # fmt: skip
         """Step through a series, or through events, and record it.
 
@@ -368,15 +368,15 @@ class Filter(Record, ABC):
             ``total_squared_error`` add components up, whatever their units, and say so; ``nees``
             is d on average for a consistent filter. ``messages``, ``scalars``, ``bytes``, ``lost``
             and ``rounds`` are those of each step, the same names with ``_total`` their sums;
-            ``refused`` counts what the `gate` left out;
+            ``rejected`` counts what the `gate_probability` left out;
             :func:`distfilt.filters.final_state` gives the state at the end.
         """
-        return self._recorded(state, times, observations, truth, scores, late, 0)
+        return self._recorded(state, times, observations, truth, scores, delayed, 0)
 
-    @door
+    @validated
     def smooth(
         self, state: State, times: Any, observations: Any, *, truth: Any = None,
-        scores: Collection[Score] = SCORES, late: Sequence[Reading] = (),
+        scores: Collection[Score] = SCORES, delayed: Sequence[Observation] = (),
     ) -> xarray.Dataset:  # fmt: skip
         """Fixed-lag smoothing: of each time what is believed when `lag` more have been observed.
 
@@ -384,6 +384,6 @@ class Filter(Record, ABC):
         fewer times follow, and the last estimate is the filter's.
         """
         if not self.lag:
-            why = self.unused.get("lag", "needs at least 1 for smoothing, got 0")
+            why = self.unsupported.get("lag", "needs at least 1 for smoothing, got 0")
             raise ValueError(f"lag: {why}")
-        return self._recorded(state, times, observations, truth, scores, late, self.lag)
+        return self._recorded(state, times, observations, truth, scores, delayed, self.lag)

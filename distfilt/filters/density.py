@@ -13,15 +13,15 @@ from numpy.typing import ArrayLike, NDArray
 from ..density import (
     FokkerPlanck,
     LowRank,
-    Sharing,
-    low_rank_moved,
+    ConsensusProtocol,
+    low_rank_predict,
     low_rank_start,
     low_rank_step,
     zero_mean_prior,
 )
 from ..density.kernel import fine_enough
-from ..density.sharing import Seen, alone, present_graph
-from ..doors import MISSING, Array, Bounds, Count, NonNegative, Places, Positive, array, unchecked
+from ..density.sharing import SwarmSnapshot, alone, present_graph
+from ..validation import ALLOW_NAN, Array, Bounds, PositiveInt, NonNegativeFloat, DistinctIndices, PositiveFloat, check_array, unchecked
 from ..network import Channel, Graph
 from ..network.graphs import as_graph
 from .base import Filter
@@ -47,7 +47,7 @@ class DensityState(State):
         What the rule of sharing remembers.
     observed : ndarray, (F, n)
         What the agents with filters believe the swarm's kernel estimate to be.
-    counted : ndarray, (A,)
+    positions_sent : ndarray, (A,)
         How many agents each believes there are.
     parts : int
         Into how many parts the network of the present agents fell in the last step.
@@ -63,10 +63,10 @@ class DensityState(State):
     (1, 4)
     """
 
-    positions: Annotated[Array, "A d", MISSING]
+    positions: Annotated[Array, "A d", ALLOW_NAN]
     carried: tuple[Array, ...]
     observed: Array
-    counted: Array
+    positions_sent: Array
     parts: int
     filters: LowRank
 
@@ -85,7 +85,7 @@ class DensityState(State):
 class DensityFilter(Filter):
     r"""Local filters of a swarm's density, equations (14) to (16) of Zheng and Lin.
 
-    In each step every agent sees its own position, learns by the `agreement` an estimate y_i of the
+    In each step every agent sees its own position, learns by the `fusion` an estimate y_i of the
     kernel estimate of all, and takes it into a Kalman filter of the density whose model is the
     Fokker-Planck equation. Where the network falls apart, agents go on with what they hear, and
     the record says into how many parts. How sure a step's estimate is follows from the true number
@@ -99,7 +99,7 @@ class DensityFilter(Filter):
         Number A of agents that there may be: each sees its own position.
     graph : float, Graph or callable
         A radio's range; a graph that does not move; or ``graph(t, positions) -> Graph``.
-    agreement : Sharing
+    fusion : Sharing
         The rule by which agents learn of the others, such as
         :class:`~distfilt.density.PIConsensus` or :class:`~distfilt.density.Flooding`.
     faults, names, every
@@ -110,7 +110,7 @@ class DensityFilter(Filter):
         The agents that run a filter; all by default. All agents share.
     first : {"flat", "observed"} or array_like (n,)
         Prior mean: a flat Gaussian about the agent, its own kernel, or a density for all.
-    first_std : float
+    initial_std : float
         Width of the flat Gaussian.
     rank, prior_length, prior_std, mass_std
         Of :func:`~distfilt.density.zero_mean_prior`. With a `mass_std` of 0, the default, no
@@ -129,7 +129,7 @@ class DensityFilter(Filter):
     >>> from distfilt.models import rotating_swarm
     >>> swarm, rng = rotating_swarm(), np.random.default_rng(1)
     >>> f = DensityFilter(FokkerPlanck(swarm, Grid((15, 15))), 20, 0.4,
-    ...                   agreement=Flooding(), bandwidth=0.12, rank=40)
+    ...                   fusion=Flooding(), bandwidth=0.12, rank=40)
     >>> x = rng.random((20, 2))
     >>> state = f.step(f.start(x), 0.1, swarm.step(x, 0.0, 0.1, rng=rng))
     >>> state.estimates.shape, state.ledger.rounds
@@ -137,40 +137,40 @@ class DensityFilter(Filter):
     """
 
     model: FokkerPlanck  # type: ignore[assignment]
-    sensors: Count  # type: ignore[assignment]
-    graph: Positive | Graph | Callable[[float, Array], Graph]
+    sensors: PositiveInt  # type: ignore[assignment]
+    graph: PositiveFloat | Graph | Callable[[float, Array], Graph]
     _: KW_ONLY
-    agreement: Sharing  # type: ignore[assignment]
-    share: bool = False
-    bandwidth: Positive
-    local: Places | None = None
-    first: Literal["flat", "observed"] | Annotated[Array, "model.grid.size"] = "flat"
-    first_std: Positive | None = None
-    rank: Count = 48
-    prior_length: Positive | None = None
-    prior_std: Positive | None = None
-    mass_std: NonNegative = 0.0
+    fusion: ConsensusProtocol  # type: ignore[assignment]
+    share_observations: bool = False
+    bandwidth: PositiveFloat
+    local: DistinctIndices | None = None
+    initial_density: Literal["flat", "observed"] | Annotated[Array, "model.grid.size"] = "flat"
+    initial_std: PositiveFloat | None = None
+    rank: PositiveInt = 48
+    prior_length: PositiveFloat | None = None
+    prior_std: PositiveFloat | None = None
+    mass_std: NonNegativeFloat = 0.0
     noise: Literal["forecast", "observed"] = "forecast"
-    floor: Positive | None = None
-    process: Positive | None = None
+    floor: PositiveFloat | None = None
+    process: PositiveFloat | None = None
 
-    state: ClassVar[type[DensityState]] = DensityState
-    batched: ClassVar[bool] = False
-    fuses: ClassVar[str] = "densities"
-    unused: ClassVar[dict[str, str]] = {
-        "share": "what agents tell of their positions is the agreement's",
+    state_class: ClassVar[type[DensityState]] = DensityState
+    supports_runs: ClassVar[bool] = False
+    belief_kind: ClassVar[str] = "densities"
+    unsupported: ClassVar[dict[str, str]] = {
+        "share_observations": "what agents tell of their positions is the agreement's",
         "lag": "a density filter keeps no past",
-        "failures": "one run at a time: the graph moves with the run",
-        "gate": "a position is the agent's own, and nothing predicts it",
+        "on_error": "one run at a time: the graph moves with the run",
+        "gate_probability": "a position is the agent's own, and nothing predicts it",
     }
 
     def check_parts(self) -> None:
         """Refuse places and densities that are not of the grid."""
         fine_enough(self.model.grid, self.bandwidth)
-        Bounds(below=self.count)(max(self.local or (0,)), "local")
+        Bounds(below=self.n_agents)(max(self.local or (0,)), "local")
 
     @cached_property
-    def count(self) -> int:
+    def n_agents(self) -> int:
         """Number A of agents."""
         return int(self.sensors)
 
@@ -184,25 +184,25 @@ class DensityFilter(Filter):
     @property
     def filtering(self) -> NDArray[np.int64]:
         """Numbers of the agents that run a filter, (F,)."""
-        return np.array(range(self.count) if self.local is None else self.local)
+        return np.array(range(self.n_agents) if self.local is None else self.local)
 
-    def read(self, observations: Any, runs: tuple[int, ...], t: float) -> Any:
+    def read_observations(self, observations: Any, runs: tuple[int, ...], t: float) -> Any:
         """The agents' positions (A, d); None and NaN are agents that have gone."""
         gone = np.full(self.model.grid.dim, np.nan)
-        given = one_each(observations, self.count)
+        given = one_each(observations, self.n_agents)
         return self._seen([gone if x is None else x for x in given], "observations", t)
 
     def channel(self, state: State, t: float) -> None:
         """None yet: who hears whom depends on where the agents are."""
 
-    def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """What is believed at the agents' first positions (A, d), NaN for those not here."""
         seen = self._seen(prior, "prior", 0.0)
         here = self.filtering
         filters = unchecked(low_rank_start)(self._basis, self._base(seen)[here])
         return {
-            "positions": seen.positions, "carried": self.agreement.begin(seen),
-            "observed": seen.kernels[here], "counted": np.full(self.count, float(self.count)),
+            "positions": seen.positions, "carried": self.fusion.initial_state(seen),
+            "observed": seen.kernels[here], "positions_sent": np.full(self.n_agents, float(self.n_agents)),
             "parts": 1, "filters": filters,
         }  # fmt: skip
 
@@ -212,71 +212,71 @@ class DensityFilter(Filter):
         return zero_mean_prior(self.model.grid, rank=self.rank, length=self.prior_length,
                                std=self.prior_std, mass_std=self.mass_std)
 
-    def _base(self, seen: Seen) -> Array:
+    def _base(self, seen: SwarmSnapshot) -> Array:
         """Prior means of all agents, (A, n)."""
-        if not isinstance(self.first, str):
-            return np.tile(self.first, (self.count, 1))
-        if self.first == "observed":
-            own, here = alone(self.agreement, seen), seen.present[:, None]
-            return np.where(here, own, seen.flat(self.first_std))
-        return seen.flat(self.first_std)
+        if not isinstance(self.initial_density, str):
+            return np.tile(self.initial_density, (self.n_agents, 1))
+        if self.initial_density == "observed":
+            own, here = alone(self.fusion, seen), seen.present[:, None]
+            return np.where(here, own, seen.flat(self.initial_std))
+        return seen.flat(self.initial_std)
 
-    def _seen(self, positions: ArrayLike, name: str, t: float) -> Seen:
-        x = array(positions, name, (self.count, self.model.grid.dim), finite=False)
-        return Seen(x, self.model.grid, self.bandwidth, t, self.local)
+    def _seen(self, positions: ArrayLike, name: str, t: float) -> SwarmSnapshot:
+        x = check_array(positions, name, (self.n_agents, self.model.grid.dim), finite=False)
+        return SwarmSnapshot(x, self.model.grid, self.bandwidth, t, self.local)
 
-    def advance(self, step: Step) -> Any:
+    def next_state(self, step: Step) -> Any:
         """Share what the agents see of themselves, and take it into their filters.
 
         >>> from distfilt.density import Flooding, Grid
         >>> from distfilt.models import rotating_swarm
         >>> from distfilt.network import Faults
         >>> given = FokkerPlanck(rotating_swarm(), Grid((9, 9))), 4, 2.0
-        >>> more = {"agreement": Flooding(), "bandwidth": 0.2, "rank": 9}
+        >>> more = {"fusion": Flooding(), "bandwidth": 0.2, "rank": 9}
         >>> x = np.random.default_rng(1).random((4, 2))
-        >>> for option in ({"faults": Faults(silent=[0])}, {"every": 1.0}):
+        >>> for option in ({"faults": Faults(silent=[0])}, {"exchange_interval": 1.0}):
         ...     f = DensityFilter(*given, **more, **option)
         ...     print(f.step(f.start(x), 0.5, x).ledger.messages)
         [0 2 2 2]
         [0 0 0 0]
         """
-        state, seen, t, dt = step.state, step.said, step.t, step.dt
+        state, seen, t, dt = step.state, step.observations, step.t, step.dt
         if not dt:
             raise ValueError(f"t: needs a number above {state.t:g}, got {t:g}")
         if isinstance(self.graph, float):
             graph = seen.near(self.graph)
         else:
             here = self.graph(t, seen.positions) if callable(self.graph) else self.graph
-            graph = present_graph(as_graph(here, self.count), seen.present)
+            graph = present_graph(as_graph(here, self.n_agents), seen.present)
         if not self._contact(state.t, t):
-            graph = Graph.from_edges(self.count, np.zeros((0, 2)))
+            graph = Graph.from_edges(self.n_agents, np.zeros((0, 2)))
         step.channel = channel = Channel(graph, ledger=state.ledger, faults=self.faults, t=t)
-        carried, y, counted = self.agreement.learn(state.carried, seen, channel, dt)
+        carried, y, counted = self.fusion.update(state.carried, seen, channel, dt)
         y = y[self.filtering]
 
         move = self.model.solver(state.t, dt)
         q = None if self.process is None else self.process * self._basis
-        moved = unchecked(low_rank_moved)(state.filters, move, process=q, dt=dt)
+        moved = unchecked(low_rank_predict)(state.filters, move, process=q, dt=dt)
         level = moved.estimates if self.noise == "forecast" else y
         noise = seen.noise(level, seen.present.sum(), self.floor)
         filters = unchecked(low_rank_step)(moved, y, noise, dt)
         parts = np.unique(graph.components[seen.present]).size
         return step.end(
-            positions=seen.positions, carried=carried, observed=y, counted=counted,
+            positions=seen.positions, carried=carried, observed=y, positions_sent=counted,
             parts=int(parts), filters=filters,
         )
 
-    def summary(self, state: DensityState) -> Summary:
+    def summarize(self, state: DensityState) -> Summary:
         """Densities and their variances of all agents, NaN for those without a filter.
 
-        ``parts`` is the number of parts of the network, ``counted`` how many agents each believes
+        ``parts`` is the number of parts of the network, ``positions_sent`` how many agents each believes
         in, ``mass`` the estimate's integral.
         """
         n, here = self.model.grid.size, self.filtering
-        mean, variance = (np.full((self.count, n), np.nan) for _ in range(2))
+        mean, variance = (np.full((self.n_agents, n), np.nan) for _ in range(2))
         mean[here], variance[here] = state.estimates, state.variances
         return Summary(mean, variance, numbers={
-            "parts": np.full(self.count, float(state.parts)),
-            "counted": state.counted,
+            "parts": np.full(self.n_agents, float(state.parts)),
+            "positions_sent": state.positions_sent,
             "mass": mean.sum(axis=-1) * self.model.grid.volume,
         })

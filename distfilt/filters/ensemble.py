@@ -15,23 +15,23 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 
 from .. import ensembles as moments
-from ..coupling import plans, rejuvenated
-from ..coupling.transform import carried, normalised
-from ..doors import Array, Bounds, NonNegative, array, unchecked
+from ..coupling import transport_plans, rejuvenate
+from ..coupling.transform import apply_plan, normalize_weights
+from ..validation import Array, Bounds, NonNegativeFloat, check_array, unchecked
 from ..linalg import in_units
 from ..models import Model
-from ..network import Graph, finite_time, intersection
+from ..network import Graph, finite_time_consensus, intersect_ensembles
 from ..sensors import Sensor
-from ..updates import exact_draws, known_noise, sampled_forecast, with_missing
-from ..updates.door import says
+from ..updates import enkf_exact, enkf, stochastic_forecast, with_missing
+from ..updates.decorator import has_tag
 from ..updates.gaussian import exact_forecast
 from ..updates.particles import log_likelihood, size_of, warn_of_collapse, warn_of_weights
 from .base import Filter
-from .inbox import Heard
-from .inputs import members_of
+from .inbox import Received
+from .inputs import draw_members
 from .record import Summary
 from .saving import SensorState
-from .step import Step, copied, guarded
+from .step import Step, copy_rng, run_isolated
 
 __all__ = ["EnsembleFilter", "EnsembleState", "TransportFilter"]
 
@@ -44,7 +44,7 @@ class EnsembleState(SensorState):
 
     Parameters
     ----------
-    t, ledger, rng, refused, failed, waiting
+    t, ledger, rng, rejected, failed, pending
         As for :class:`~distfilt.filters.SensorState`.
     ensembles : ndarray, (*runs, A, N, d)
         Every agent's members.
@@ -61,7 +61,7 @@ class EnsembleState(SensorState):
 
     ensembles: Array
 
-    _belief = "ensembles", (..., "A", "N", "d")
+    belief_field = "ensembles", (..., "A", "N", "d")
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,27 +71,27 @@ class MembersFilter(Filter):
     _: KW_ONLY
     members: Several = 100
 
-    state: ClassVar[type[SensorState]] = EnsembleState
-    draws: ClassVar[bool] = True
-    joins: ClassVar[bool] = True
-    changes: ClassVar[bool] = True
-    fuses: ClassVar[str] = "ensembles"
+    state_class: ClassVar[type[SensorState]] = EnsembleState
+    requires_rng: ClassVar[bool] = True
+    batched_summary: ClassVar[bool] = True
+    supports_increments: ClassVar[bool] = True
+    belief_kind: ClassVar[str] = "ensembles"
 
     @property
     def sizes(self) -> tuple[int, ...]:
         """Members, and their components."""
         return self.members, self.model.dim
 
-    def drawn(self, prior: Any, leading: tuple[int, ...], rng: Any) -> Array:
+    def draw_prior(self, prior: Any, leading: tuple[int, ...], rng: Any) -> Array:
         """Members (*leading, N, d) of a prior."""
-        return members_of(prior, self.members, leading, self.model.dim, rng)
+        return draw_members(prior, self.members, leading, self.model.dim, rng)
 
-    def summary(self, state: Any) -> Summary:
+    def summarize(self, state: Any) -> Summary:
         """Means and variances of the agents' ensembles, and the members for the scores."""
-        centre, a = moments.about_mean(x := state.ensembles)
+        centre, a = moments.center_ensemble(x := state.ensembles)
         a *= a
         variance = unchecked(moments.mean)(a) * (self.members / (self.members - 1))
-        return Summary(state.shown(centre[..., 0, :]), state.shown(variance), members=x)
+        return Summary(state.mask_failed(centre[..., 0, :]), state.mask_failed(variance), members=x)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +104,8 @@ class EnsembleFilter(MembersFilter):
 
     Parameters
     ----------
-    model, sensors, graph, agreement, share, faults, lag, names, failures, gate, every
+    model, sensors, graph, fusion, share_observations, faults, lag, names, on_error, gate_probability,
+        exchange_interval
         As for :class:`~distfilt.filters.Filter`. The agreement is a function
         ``agreement(ensembles, channel) -> ensembles``, such as ``partial(pull, gain=0.05)``.
     update : callable
@@ -118,9 +119,9 @@ class EnsembleFilter(MembersFilter):
     Examples
     --------
     >>> from distfilt.network import graphs
-    >>> from distfilt.sensors import direct
+    >>> from distfilt.sensors import component
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
-    >>> f = EnsembleFilter(walk, [direct([0], std=0.5), None], graphs.path(2), members=500)
+    >>> f = EnsembleFilter(walk, [component([0], std=0.5), None], graphs.path(2), members=500)
     >>> state = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0))
     >>> state = f.step(state, 1.0, [[0.8], None])
     >>> state.ensembles.mean(axis=1).round(1).ravel()
@@ -128,8 +129,8 @@ class EnsembleFilter(MembersFilter):
     """
 
     _: KW_ONLY
-    update: Callable[..., Array] = known_noise
-    forecast: Callable[..., Array] = sampled_forecast
+    update: Callable[..., Array] = enkf
+    forecast: Callable[..., Array] = stochastic_forecast
 
     def check_parts(self) -> None:
         """Refuse what cannot be called as an update, such as a wrapper without one."""
@@ -160,38 +161,38 @@ class EnsembleFilter(MembersFilter):
 
         Examples
         --------
-        >>> from distfilt.sensors import direct
+        >>> from distfilt.sensors import component
         >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
-        >>> f = EnsembleFilter.exact(walk, [direct([0], std=1.0)], members=10)
+        >>> f = EnsembleFilter.exact(walk, [component([0], std=1.0)], members=10)
         >>> prior = np.linspace(-1, 1, 10)[:, None]
         >>> state = f.step(f.start(prior, rng=np.random.default_rng(0)), 1.0, [[0.8]])
         >>> p = prior.var(ddof=1) + 1.0
         >>> bool(abs(state.ensembles.var(ddof=1) - p / (p + 1.0)) < 1e-12)
         True
         """
-        own: dict[str, Any] = {"update": exact_draws, "forecast": exact_forecast}
+        own: dict[str, Any] = {"update": enkf_exact, "forecast": exact_forecast}
         if graph is not None:
-            own["agreement"] = partial(intersection, rule="min_determinant")
+            own["fusion"] = partial(intersect_ensembles, rule="min_determinant")
         return cls(model, sensors, graph, **(own | options))
 
-    def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """Members drawn for each agent."""
-        return {"ensembles": self.drawn(prior, (*runs, self.count), rng)}
+        return {"ensembles": self.draw_prior(prior, (*runs, self.n_agents), rng)}
 
-    def advance(self, step: Step) -> Any:
+    def next_state(self, step: Step) -> Any:
         """Forecast, condition on what was heard, agree."""
         state, now = step.state, step.state.ensembles
         if step.dt:
             now = unchecked(self.forecast)(now, self.model, state.t, step.dt, rng=step.rng)
-            now = array(now, "forecast", state.ensembles.shape, finite=False)
-        stack = step.stack(step.moved(now, state.ensembles))
-        for place, group in step.heard():
-            step.settle(self._condition(stack, place, group, step), group.agents)
-        (now,) = step.agreed(stack[-1])
-        return step.end(ensembles=now, past=recalled(stack, now))
+            now = check_array(now, "forecast", state.ensembles.shape, finite=False)
+        stack = step.stack(step.check_forecast(now, state.ensembles))
+        for place, group in step.received():
+            step.record_failures(self._condition(stack, place, group, step), group.agents)
+        (now,) = step.fuse(stack[-1])
+        return step.end(ensembles=now, past=regress_past(stack, now))
 
     def _condition(
-        self, stack: list[Array], place: int, group: Heard, step: Step
+        self, stack: list[Array], place: int, group: Received, step: Step
     ) -> dict[tuple[int, ...], str]:
         """Condition every time's ensembles of a group's agents, in place; the rows that failed."""
         rows = group.rows
@@ -199,19 +200,19 @@ class EnsembleFilter(MembersFilter):
         # What a late reading tells of the time before is in the stack.
         before = step.before(place, group, stack[:-1])
         predicted = group.predict(members[place], before)
-        group = step.gated(group, sample_moments, predicted)
-        redone = says(self.update, "repredicts")
+        group = step.gate(group, sample_moments, predicted)
+        redone = has_tag(self.update, "repredicts")
 
         def compute(h: Array, y: Array, *rest: Any) -> tuple[Array, ...]:
             *earlier, last, noise, source = rest
             # Every time's members meet the same draw of the noise, so that all the separate
             # updates are one joint update; the last one advances the generator.
-            past = [self._updated(x, h, y, noise, copied(source), None) for x in earlier]
+            past = [self._updated(x, h, y, noise, copy_rng(source), None) for x in earlier]
             whole = redone and not earlier and h.shape == predicted.shape
             predict = partial(group.predict, previous=before) if whole else None
             return (*past, self._updated(last, h, y, noise, source, predict))
 
-        result, errors = guarded(
+        result, errors = run_isolated(
             compute, (predicted, group.target, *members), members, group.target.ndim - 1,
             shared=group.noise, rng=step.rng,
         )
@@ -221,15 +222,15 @@ class EnsembleFilter(MembersFilter):
 
     def _updated(self, x: Array, h: Array, y: Array, noise: Array, rng: Any, predict: Any) -> Array:
         """One time's ensembles after the update; a plain function gets one agent's at a time."""
-        if says(self.update, "repredicts"):
+        if has_tag(self.update, "repredicts"):
             return unchecked(self.update)(x, h, y, noise, rng=rng, predict=predict)
-        stacks = says(self.update, "stacks")
+        stacks = has_tag(self.update, "stacks")
 
         def one(*given: Array) -> Array:
             # A function of one's own may work in place.
             own = given if stacks else [x.copy() for x in given]
             new = with_missing(self.update, *own, rng=rng)
-            return array(new, "update", given[0].shape, finite=False)
+            return check_array(new, "update", given[0].shape, finite=False)
 
         if stacks or x.ndim == 2:
             return one(x, h, y, noise)
@@ -251,8 +252,8 @@ class TransportFilter(MembersFilter):
     ----------
     model, sensors, graph, faults, lag, names, failures, gate
         As for :class:`~distfilt.filters.Filter`. Members in common need an agreement in every step,
-        so that `every` is refused, and so are readings at a time when a moving graph has no link.
-    agreement : callable
+        so that `exchange_interval` is refused, and so are readings at a time when a moving graph has no link.
+    fusion : callable
         ``agreement(log_likelihoods, channel) -> averages``, both (\*runs, A, N): exact finite-time
         averaging by default, or ``partial(average, rounds=20)``. It takes the place of telling
         readings, which stay with their agents.
@@ -267,9 +268,9 @@ class TransportFilter(MembersFilter):
     --------
     >>> from distfilt.models import Model
     >>> from distfilt.network import graphs
-    >>> from distfilt.sensors import direct
+    >>> from distfilt.sensors import component
     >>> walk = Model(2, lambda x, t, dt: x, lambda t, dt: 0.1 * dt * np.eye(2))
-    >>> f = TransportFilter(walk, [direct([0], std=0.5), direct([1], std=0.5)], graphs.path(2))
+    >>> f = TransportFilter(walk, [component([0], std=0.5), component([1], std=0.5)], graphs.path(2))
     >>> state = f.start((np.zeros(2), np.eye(2)), rng=np.random.default_rng(0))
     >>> state = f.step(state, 1.0, [[0.8], [-0.8]])
     >>> bool(np.allclose(*state.ensembles)), state.ledger.scalars
@@ -277,23 +278,23 @@ class TransportFilter(MembersFilter):
     """
 
     _: KW_ONLY
-    agreement: Callable[..., Any] = finite_time
-    share: bool = False
+    fusion: Callable[..., Any] = finite_time_consensus
+    share_observations: bool = False
     correct: bool = False
-    rejuvenation: NonNegative = 0.0
+    rejuvenation: NonNegativeFloat = 0.0
 
-    fuses: ClassVar[str] = "vectors"
-    unused: ClassVar[dict[str, str]] = {
-        "share": "agents agree on what their readings say, so that these stay with them",
-        "every": "a transport filter's agents have their members in common, so that they have to "
+    belief_kind: ClassVar[str] = "vectors"
+    unsupported: ClassVar[dict[str, str]] = {
+        "share_observations": "agents agree on what their readings say, so that these stay with them",
+        "exchange_interval": "a transport filter's agents have their members in common, so that they have to "
         "agree in every step"
     }
 
-    def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """One set of members, (N, d) or (*runs, 1, N, d), for all agents."""
-        return {"ensembles": np.repeat(self.drawn(prior, (*runs, 1), rng), self.count, axis=-3)}
+        return {"ensembles": np.repeat(self.draw_prior(prior, (*runs, 1), rng), self.n_agents, axis=-3)}
 
-    def advance(self, step: Step) -> Any:
+    def next_state(self, step: Step) -> Any:
         """Forecast, weigh by what was seen, agree on the weights, transport.
 
         Warns
@@ -303,17 +304,17 @@ class TransportFilter(MembersFilter):
             what the members believe.
         """
         state, now = step.state, step.state.ensembles
-        apart = self.count > 1 and callable(self.graph) and step.channel is None
-        if apart and any((*step.said, step.late)):
+        apart = self.n_agents > 1 and callable(self.graph) and step.channel is None
+        if apart and any((*step.observations, step.delayed)):
             raise ValueError(f"graph: needs links for the readings of t = {step.t:g}, got none")
         if step.dt:
             draw = partial(unchecked(self.model.sample_step), t=state.t, dt=step.dt)
             now = self._for_all(draw, (now,), step.rng)
-        stack = step.stack(step.moved(now, state.ensembles))
-        (logs,) = step.agreed(self._log_likelihoods(stack, step))
-        logs = self.count * logs if step.agrees else logs
+        stack = step.stack(step.check_forecast(now, state.ensembles))
+        (logs,) = step.fuse(self._log_likelihoods(stack, step))
+        logs = self.n_agents * logs if step.has_fusion else logs
         stack, errors = self._transported(stack, logs, step.rng)
-        step.settle(errors, range(self.count))
+        step.record_failures(errors, range(self.n_agents))
         self._warn(logs, step)
         return step.end(ensembles=stack[-1], past=stack[:-1])
 
@@ -321,7 +322,7 @@ class TransportFilter(MembersFilter):
         self, draw: Callable[..., Array], arrays: tuple[Array, ...], rng: np.random.Generator
     ) -> Array:
         """Apply `draw` agent by agent, each with the same draws; the generator advances once."""
-        sources = [copied(rng) for _ in range(self.count - 1)] + [rng]
+        sources = [copy_rng(rng) for _ in range(self.n_agents - 1)] + [rng]
         parts = [
             draw(*(x[..., a, :, :] for x in arrays), rng=source) for a, source in enumerate(sources)
         ]
@@ -330,11 +331,11 @@ class TransportFilter(MembersFilter):
     def _log_likelihoods(self, stack: list[Array], step: Step) -> Array:
         """What each agent makes of the readings it has, (*runs, A, N)."""
         logs = np.zeros(stack[-1].shape[:-1])
-        for place, group in step.heard():
+        for place, group in step.received():
             rows = group.rows
             before = step.before(place, group, stack[:-1])
             predicted = group.predict(stack[place][..., rows, :, :], before)
-            group = step.gated(group, sample_moments, predicted)
+            group = step.gate(group, sample_moments, predicted)
             logs[..., rows, :] += log_likelihood(predicted, group.target, group.noise)
             warn_of_weights(0 * predicted[..., 0], predicted, group.target, group.noise)
         return logs
@@ -345,15 +346,15 @@ class TransportFilter(MembersFilter):
         """All times' members, carried by the coupling of the last time's; the rows that failed."""
 
         def compute(here: Array, *rest: Any) -> tuple[Array, ...]:
-            times, w = rest[:-2], normalised(here)
-            matrix = unchecked(plans)(times[-1], here)
-            return tuple(carried(x, w, matrix, correct=self.correct) for x in times)
+            times, w = rest[:-2], normalize_weights(here)
+            matrix = unchecked(transport_plans)(times[-1], here)
+            return tuple(apply_plan(x, w, matrix, correct=self.correct) for x in times)
 
-        out, errors = guarded(compute, (logs, *stack), tuple(stack), logs.ndim - 1)
+        out, errors = run_isolated(compute, (logs, *stack), tuple(stack), logs.ndim - 1)
         if self.rejuvenation:
-            draw = partial(unchecked(rejuvenated), bandwidth=self.rejuvenation)
+            draw = partial(unchecked(rejuvenate), bandwidth=self.rejuvenation)
             # Every time's members meet the same draws; the generator advances once.
-            sources = [copied(rng) for _ in out[1:]] + [rng]
+            sources = [copy_rng(rng) for _ in out[1:]] + [rng]
             both = zip(out, stack, sources, strict=True)
             out = tuple(self._for_all(draw, (y, x), source) for y, x, source in both)
         # Where nothing was said of the members they stay as they were.
@@ -373,12 +374,12 @@ class TransportFilter(MembersFilter):
         Traceback (most recent call last):
         distfilt.updates.particles.ParticleCollapse: t = 1 s: an agent's weights have an ...
         """
-        if (size := size_of(normalised(logs[~step.failed])).min(initial=np.inf)) < 1.1:
+        if (size := size_of(normalize_weights(logs[~step.failed])).min(initial=np.inf)) < 1.1:
             what = f"t = {step.t:g} s: an agent's weights have an effective size of {size:.1f}"
             warn_of_collapse(what, "rejuvenation=")
 
 
-def recalled(stack: list[Array], now: Array) -> list[Array]:
+def regress_past(stack: list[Array], now: Array) -> list[Array]:
     """Members of the earlier times of a stack whose last have become those of `now` by agreement.
 
     What agents agree on tells of the past too: by its regression on the members as they were.
@@ -388,7 +389,7 @@ def recalled(stack: list[Array], now: Array) -> list[Array]:
         return past
     shape, unit = in_units(unchecked(moments.sample_covariance)(old))
     inverse = np.linalg.pinv(shape, rcond=1e-10, hermitian=True) / (old.shape[-2] - 1)
-    around, moved = (x / unit[..., None, :] for x in (moments.about_mean(old)[1], now - old))
+    around, moved = (x / unit[..., None, :] for x in (moments.center_ensemble(old)[1], now - old))
     return [x + moved @ (inverse @ (around.mT @ x)) for x in past]
 
 

@@ -10,16 +10,16 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from ..doors import Array, Bounds, Count, NonNegative, unchecked
-from ..gaussians.single import conditioned, unscented_points
+from ..validation import Array, Bounds, PositiveInt, NonNegativeFloat, unchecked
+from ..gaussians.single import condition, unscented_points
 from ..linalg import EPS, cholesky, solve_upper, symmetrise
 from ..models import LinearModel
 from .base import Filter
-from .inbox import Heard
-from .inputs import moments_of
+from .inbox import Received
+from .inputs import prior_moments
 from .record import Summary
 from .saving import SensorState
-from .step import Step, guarded
+from .step import Step, run_isolated
 
 __all__ = ["GaussianFilter", "GaussianState"]
 
@@ -30,7 +30,7 @@ class GaussianState(SensorState):
 
     Parameters
     ----------
-    t, ledger, rng, refused, failed, waiting
+    t, ledger, rng, rejected, failed, pending
         As for :class:`~distfilt.filters.SensorState`; `rng` is None, as nothing is drawn.
     joint_means : ndarray, (*runs, A, D)
         Means of the present state and of the kept earlier ones, latest first: D = d (1 + kept).
@@ -51,9 +51,9 @@ class GaussianState(SensorState):
 
     joint_means: Annotated[Array, "... A D"]
     joint_covariances: Annotated[Array, "... A D D"]
-    dim: Count
+    dim: PositiveInt
 
-    _belief = "joint_covariances", (..., "A", "D", "D")
+    belief_field = "joint_covariances", (..., "A", "D", "D")
 
     @property
     def times(self) -> tuple[float, ...]:
@@ -61,12 +61,12 @@ class GaussianState(SensorState):
         return self.history[::-1]
 
     @property
-    def earlier(self) -> tuple[Self, ...]:
+    def lagged_states(self) -> tuple[Self, ...]:
         """A state for each of these times, as what is believed of it by now."""
         m, p, d = self.joint_means, self.joint_covariances, self.dim
         own = [slice(k * d, (k + 1) * d) for k in range(len(self.history), 0, -1)]
         return tuple(
-            self.changed(t=t, history=(), joint_means=m[..., k], joint_covariances=p[..., k, k])
+            self.replace(t=t, history=(), joint_means=m[..., k], joint_covariances=p[..., k, k])
             for t, k in zip(self.times, own, strict=True)
         )
 
@@ -92,7 +92,8 @@ class GaussianFilter(Filter):
 
     Parameters
     ----------
-    model, sensors, graph, agreement, share, faults, lag, names, failures, gate, every
+    model, sensors, graph, fusion, share_observations, faults, lag, names, on_error, gate_probability,
+        exchange_interval
         As for :class:`~distfilt.filters.Filter`. The agreement is a function
         ``agreement((means, covs), channel) -> (means, covs)``, such as
         :func:`distfilt.network.covariance_intersection`.
@@ -109,28 +110,28 @@ class GaussianFilter(Filter):
     --------
     >>> from distfilt.models import Model
     >>> from distfilt.network import covariance_intersection, graphs
-    >>> from distfilt.sensors import direct
+    >>> from distfilt.sensors import component
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: dt * np.eye(1))
-    >>> f = GaussianFilter(walk, [direct([0], std=1.0), None], graphs.path(2), share=False,
-    ...                    agreement=covariance_intersection)
+    >>> f = GaussianFilter(walk, [component([0], std=1.0), None], graphs.path(2), share_observations=False,
+    ...                    fusion=covariance_intersection)
     >>> f.step(f.start(([0.0], [[4.0]])), 1.0, [[2.0], None]).means.ravel().round(3)
     array([1.429, 1.429])
     """
 
     _: KW_ONLY
-    rule: Literal["extended", "unscented"] = "extended"
-    kappa: NonNegative = 1.0
+    linearization: Literal["extended", "unscented"] = "extended"
+    kappa: NonNegativeFloat = 1.0
     inflation: Annotated[float, Bounds(at_least=0.5)] = 1.0
 
-    state: ClassVar[type[GaussianState]] = GaussianState
-    joins: ClassVar[bool] = True
-    fuses: ClassVar[str] = "gaussians"
+    state_class: ClassVar[type[GaussianState]] = GaussianState
+    batched_summary: ClassVar[bool] = True
+    belief_kind: ClassVar[str] = "gaussians"
 
-    def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """The prior's mean and covariance, the same for all agents and runs."""
         d = self.model.dim
-        both = moments_of(prior, d, "semi" * (self.rule == "extended") + "definite")
-        m, p = (np.broadcast_to(x, (*runs, self.count, *x.shape)).copy() for x in both)
+        both = prior_moments(prior, d, "semi" * (self.linearization == "extended") + "definite")
+        m, p = (np.broadcast_to(x, (*runs, self.n_agents, *x.shape)).copy() for x in both)
         return {"joint_means": m, "joint_covariances": p, "dim": d}
 
     @property
@@ -138,7 +139,7 @@ class GaussianFilter(Filter):
         """The state's components."""
         return (self.model.dim,)
 
-    def advance(self, step: Step) -> Any:
+    def next_state(self, step: Step) -> Any:
         """Forecast, condition on what was heard, fuse.
 
         Warns
@@ -147,21 +148,21 @@ class GaussianFilter(Filter):
             If a deviation after the agreement is below the rounding of its mean.
         """
         means, covs = self._forecast(step)
-        means, one = step.moved(means, 0.0), np.eye(means.shape[-1])
-        covs = step.moved(covs, one)
-        for place, group in step.heard():
+        means, one = step.check_forecast(means, 0.0), np.eye(means.shape[-1])
+        covs = step.check_forecast(covs, one)
+        for place, group in step.received():
             slot = len(step.times) - place
-            step.settle(self._condition(means, covs, slot, group, step), group.agents)
-        covs = step.kept(covs, one)  # what failed here has to have a root in what follows
-        if step.agrees:
+            step.record_failures(self._condition(means, covs, slot, group, step), group.agents)
+        covs = step.keep_failed(covs, one)  # what failed here has to have a root in what follows
+        if step.has_fusion:
             means, covs = self._agreed(means, covs, step)
         covs, past = symmetrise(covs), step.times[::-1]
         return step.end(joint_means=means, joint_covariances=covs, dim=step.state.dim, history=past)
 
-    def summary(self, state: GaussianState) -> Summary:
+    def summarize(self, state: GaussianState) -> Summary:
         """Means and covariances of the present state."""
-        cov = state.shown(state.covariances)
-        return Summary(state.shown(state.means), np.diagonal(cov, axis1=-2, axis2=-1), cov)
+        cov = state.mask_failed(state.covariances)
+        return Summary(state.mask_failed(state.means), np.diagonal(cov, axis1=-2, axis2=-1), cov)
 
     def _forecast(self, step: Step) -> tuple[Array, Array]:
         """Joint mean and covariance of the moved state and of the earlier ones that are kept."""
@@ -174,7 +175,7 @@ class GaussianFilter(Filter):
         now, linear = (state.means, state.covariances), isinstance(model, LinearModel)
         moved, slope, extra = self._linearised(flow, jacobian, *now, linear)
         shift, old = np.ascontiguousarray(slope), state.joint_covariances
-        covs = shift @ old[..., :d, :d] @ shift.mT + (unchecked(model.noise)(state.t, dt) + extra)
+        covs = shift @ old[..., :d, :d] @ shift.mT + (unchecked(model.Q)(state.t, dt) + extra)
         if kept:  # the past stays as it is, and only its products with the present move
             moved = np.concatenate([moved, state.joint_means[..., : kept * d]], axis=-1)
             across = shift @ old[..., :d, : kept * d]
@@ -189,7 +190,7 @@ class GaussianFilter(Filter):
         cov: Array, linear: bool,
     ) -> tuple[Array, Array, Array | float]:
         """Value, slope and extra covariance of a function of a Gaussian (..., d)."""
-        if linear or self.rule == "extended":  # points would find the same of what is linear
+        if linear or self.linearization == "extended":  # points would find the same of what is linear
             return function(mean[..., None, :])[..., 0, :], jacobian(mean), 0.0
         root, d = cholesky(cov), mean.shape[-1]
         points, w = unchecked(unscented_points)(mean, root, kappa=self.kappa)
@@ -201,7 +202,7 @@ class GaussianFilter(Filter):
         slope = solve_upper(root, half).mT
         return at, slope, (w[:, None] * gap).mT @ gap - half.mT @ half
 
-    def _condition(self, means: Array, covs: Array, slot: int, group: Heard, step: Step) -> Any:
+    def _condition(self, means: Array, covs: Array, slot: int, group: Received, step: Step) -> Any:
         """Condition a group's joint Gaussians in place; the rows that failed."""
         d, rows = self.model.dim, group.rows
         here = slice(slot * d, (slot + 1) * d)
@@ -215,13 +216,13 @@ class GaussianFilter(Filter):
             mean, h, rest = self._linearised(near, jacobian, x, own, group.linear)
             return mean, h @ own @ h.mT + rest
 
-        group = step.gated(group, alike, at[..., None, :])
+        group = step.gate(group, alike, at[..., None, :])
         noise = np.full((*slope.shape[:-1], slope.shape[-2]), group.noise) + extra
         if m.shape[-1] > d:
             part, slope = slope, np.zeros((*slope.shape[:-1], m.shape[-1]))
             slope[..., here] = part
-        (m, p), errors = guarded(
-            lambda m, p, gap, h, noise, *_: unchecked(conditioned)(m, p, gap, h, noise),
+        (m, p), errors = run_isolated(
+            lambda m, p, gap, h, noise, *_: unchecked(condition)(m, p, gap, h, noise),
             (m, p, group.target - at, slope, noise), (m, p), group.target.ndim - 1,
         )
         means[..., rows, :], covs[..., rows, :, :] = m, p
@@ -233,24 +234,24 @@ class GaussianFilter(Filter):
         >>> from types import SimpleNamespace
         >>> from distfilt.models import constant_velocity
         >>> f = GaussianFilter(constant_velocity(sigma=1.0), [None])
-        >>> sure = SimpleNamespace(t=1.0, agreed=lambda m, p: (m, 1e-40 * p))
+        >>> sure = SimpleNamespace(t=1.0, fuse=lambda m, p: (m, 1e-40 * p))
         >>> with warnings.catch_warnings(action="error"):
         ...     f._agreed(np.ones((1, 4)), np.eye(4)[None], sure)
         Traceback (most recent call last):
-        RuntimeWarning: agreement: counts twice, at t = 1 s
-        >>> wrong = SimpleNamespace(t=1.0, agreed=lambda m, p: (m, p - 2 * np.eye(4)))
+        RuntimeWarning: fusion: counts twice, at t = 1 s
+        >>> wrong = SimpleNamespace(t=1.0, fuse=lambda m, p: (m, p - 2 * np.eye(4)))
         >>> f._agreed(np.ones((1, 4)), np.eye(4)[None], wrong)
         Traceback (most recent call last):
-        ValueError: agreement: needs a covariance, got a variance of -1
+        ValueError: fusion: needs a covariance, got a variance of -1
         """
         d = self.model.dim
         old, now = means[..., :d], symmetrise(covs[..., :d, :d])
-        m, p = step.agreed(old, now)
+        m, p = step.fuse(old, now)
         variance = np.diagonal(p, axis1=-2, axis2=-1)
         if (variance < -1e-9 * np.abs(variance).max()).any():  # not by rounding
-            raise ValueError(f"agreement: needs a covariance, got a variance of {variance.min():g}")
+            raise ValueError(f"fusion: needs a covariance, got a variance of {variance.min():g}")
         if ((variance > 0) & (variance < (EPS * m) ** 2)).any():
-            warnings.warn(f"agreement: counts twice, at t = {step.t:g} s", RuntimeWarning, 4)
+            warnings.warn(f"fusion: counts twice, at t = {step.t:g} s", RuntimeWarning, 4)
         if means.shape[-1] == d:
             return m, p
         gain = np.linalg.solve(now, covs[..., :d, :]).mT

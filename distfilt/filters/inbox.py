@@ -8,26 +8,26 @@ from typing import Any
 
 import numpy as np
 
-from ..doors import Array, all_finite, unchecked
+from ..validation import Array, all_finite, unchecked
 from ..sensors import Sensor
 
-__all__ = ["Heard", "groups"]
+__all__ = ["Received", "group_agents"]
 
 
-class Heard:
+class Received:
     """The readings that G agents have, equally many numbers each, M.
 
     `agents` (G,) says who they are, and `rows` the same as an index, a slice where they are all.
     `target` (*runs, G, M) is what they know of the observations, NaN where a component is missing;
     `noise` is its covariance, (M, M) if it is the same for all, else (G, M, M).
 
-    >>> from distfilt.sensors import direct
-    >>> sensor = direct([0], std=0.5)
-    >>> (pair,) = groups([[sensor]] * 2, [[np.array([1.0])]] * 2)
+    >>> from distfilt.sensors import component
+    >>> sensor = component([0], std=0.5)
+    >>> (pair,) = group_agents([[sensor]] * 2, [[np.array([1.0])]] * 2)
     >>> pair.agents, pair.target.ravel(), pair.noise
     (array([0, 1]), array([1., 1.]), array([[0.25]]))
-    >>> quiet, loud = direct([1], std=1.0), direct([1], std=2.0)
-    >>> (pair,) = groups([[sensor, quiet], [sensor, loud]], [[np.ones(1)] * 2] * 2)
+    >>> quiet, loud = component([1], std=1.0), component([1], std=2.0)
+    >>> (pair,) = group_agents([[sensor, quiet], [sensor, loud]], [[np.ones(1)] * 2] * 2)
     >>> pair.noise[:, 1, 1]
     array([1., 4.])
     """
@@ -54,7 +54,7 @@ class Heard:
             rows, starts = (np.array(c, dtype=np.intp) for c in zip(*found, strict=True))
             columns = starts[:, None] + np.arange(sensor.dim)
             across, down = columns[:, :, None], columns[:, None, :]
-            noise[rows[:, None, None], across, down] = sensor.cov
+            noise[rows[:, None, None], across, down] = sensor.noise_cov
             whole = columns.shape == self.owner.shape  # the only sensor: views will do
             cells: Any = (slice(None), slice(None)) if whole else (rows[:, None], columns)
             self.parts.append((sensor, slice(None) if whole else rows, cells))
@@ -63,24 +63,24 @@ class Heard:
         self.changes = any(sensor.uses_previous for sensor in places)
         self.matrices: dict[int, Array] = {}
 
-    def matrix(self, dim: int) -> Array:
+    def H(self, dim: int) -> Array:
         """The matrices of linear sensors one below the other, (G, M, d), made once."""
         if dim not in self.matrices:
             h = np.zeros((*self.owner.shape, dim))
             for sensor, _, cells in self.parts:
-                h[cells] = sensor.matrix(dim)
+                h[cells] = sensor.H(dim)
             self.matrices[dim] = h
         return self.matrices[dim]
 
-    def collected(self, values: Sequence[Sequence[Array]]) -> Array:
+    def collect(self, values: Sequence[Sequence[Array]]) -> Array:
         """The readings of each agent of the group side by side, (*runs, G, M)."""
         rows = [value for agent in self.agents.tolist() for value in values[agent]]
         flat = rows[0] if len(rows) == 1 else np.concatenate(rows, axis=-1)
         return flat.reshape(*flat.shape[:-1], *self.owner.shape)
 
-    def aimed(self, target: Array) -> Heard:
+    def with_target(self, target: Array) -> Received:
         """The same with these values."""
-        out = object.__new__(Heard)
+        out = object.__new__(Received)
         vars(out).update(vars(self), target=target)
         return out
 
@@ -92,7 +92,7 @@ class Heard:
         observation time before, for sensors that see changes.
         """
         if self.linear:
-            return np.asarray(states @ np.ascontiguousarray(self.matrix(states.shape[-1]).mT))
+            return np.asarray(states @ np.ascontiguousarray(self.H(states.shape[-1]).mT))
         out = np.empty((*states.shape[:-2], self.target.shape[-1], states.shape[-2]))
         for sensor, rows, cells in self.parts:
             before = None if previous is None else previous[..., rows, :, :]
@@ -101,14 +101,14 @@ class Heard:
         out = np.ascontiguousarray(out.swapaxes(-1, -2))
         if not all_finite(out) and np.isinf(out).any():
             raise ValueError("predicted: needs finite numbers or NaN (missing), got infinity")
-        out = self.near(out, self.target[..., None, :])
-        return self.near(out, out[..., :1, :]) if alike else out
+        out = self.wrap_near(out, self.target[..., None, :])
+        return self.wrap_near(out, out[..., :1, :]) if alike else out
 
-    def near(self, seen: Array, aim: Array) -> Array:
+    def wrap_near(self, seen: Array, aim: Array) -> Array:
         """Predictions (*runs, G, N, M), now on the branch of an aim (*runs, G, 1, M); in place."""
         out = seen.swapaxes(-1, -2)
         for sensor, _, cells in self.parts:
-            if sensor.difference is not None:
+            if sensor.residual_function is not None:
                 at, goal = (..., *cells, slice(None)), (aim + 0 * seen).swapaxes(-1, -2)
                 here, there = (x[at].swapaxes(-1, -2) for x in (out, goal))
                 # y* - wrap(y* - h)
@@ -120,17 +120,17 @@ class Heard:
         """Derivatives of the readings at states (*runs, G, d), (*runs, G, M, d)."""
         d = states.shape[-1]
         if self.linear:
-            return np.full((*self.target.shape, d), self.matrix(d))
+            return np.full((*self.target.shape, d), self.H(d))
         out = np.empty((*self.target.shape, d))
         for sensor, rows, cells in self.parts:
             out[(..., *cells, slice(None))] = unchecked(sensor.jacobian)(states[..., rows, :])
         return out
 
-    def gated(self, mean: Array, cov: Array, share: float) -> tuple[Heard, Array]:
+    def gate(self, mean: Array, cov: Array, share: float) -> tuple[Received, Array]:
         """The readings that their predictions can explain, and how many they cannot, (*runs, G).
 
         Each sensor's reading is judged alone, by what a good one's normalised innovation exceeds
-        with probability 1 - `share`; `mean` and `cov` are of the predictions without noise.
+        with probability 1 - `share_observations`; `mean` and `cov` are of the predictions without noise.
         """
         from scipy.special import gammaincinv
 
@@ -145,26 +145,26 @@ class Heard:
             bad = (some > 0) & (length > 2 * gammaincinv(np.maximum(some, 1) / 2, share))
             out = np.where(here & bad[..., None], np.nan, out)
             refused += bad
-        return self.aimed(out), refused
+        return self.with_target(out), refused
 
 
 @lru_cache(maxsize=32)
-def _planned(pattern: tuple[tuple[Sensor, ...], ...]) -> list[Heard]:
+def _planned(pattern: tuple[tuple[Sensor, ...], ...]) -> list[Received]:
     """A group for each number of readings that occurs; agents without any are left out."""
     sizes: dict[int, list[int]] = {}
     for agent, sensors in enumerate(pattern):
         if sensors:
             sizes.setdefault(sum(s.dim for s in sensors), []).append(agent)
-    return [Heard(agents, pattern) for _, agents in sorted(sizes.items())]
+    return [Received(agents, pattern) for _, agents in sorted(sizes.items())]
 
 
-def groups(sensors: Sequence[Any], values: Sequence[Sequence[Array]]) -> list[Heard]:
+def group_agents(sensors: Sequence[Any], values: Sequence[Sequence[Array]]) -> list[Received]:
     """Agents in groups, from each one's sensors and values (*runs, m) in a list of its own.
 
     The plan of a pattern is made when it is first needed.
 
-    >>> groups([[], []], [[], []])
+    >>> group_agents([[], []], [[], []])
     []
     """
     plans = _planned(tuple([tuple(own) for own in sensors]))
-    return [plan.aimed(plan.collected(values)) for plan in plans]
+    return [plan.with_target(plan.collect(values)) for plan in plans]

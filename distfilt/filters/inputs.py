@@ -11,14 +11,14 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from ..doors import MISSING, Array, Index, Record, array, definite, increasing, unchecked
-from ..doors.values import all_finite
+from ..validation import ALLOW_NAN, Array, NonNegativeInt, FrozenModel, check_array, check_positive_definite, check_increasing, unchecked
+from ..validation.checks import all_finite
 from ..ensembles import draw, sample_covariance
 from ..mixtures import GaussianMixture
 from ..sensors import Sensor
 
 __all__ = [
-    "Reading", "belated", "members_of", "mixtures_of", "moments_of", "planned", "said_by_all",
+    "Observation", "match_delayed", "draw_members", "prior_mixtures", "prior_moments", "plan_steps", "read_observations",
     "sensor_of",
 ]  # fmt: skip
 
@@ -26,7 +26,7 @@ _LISTED = list, Sequence, np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
-class Reading(Record):
+class Observation(FrozenModel):
     """What one sensor of one agent read at one time.
 
     Parameters
@@ -43,50 +43,50 @@ class Reading(Record):
         Numbers that a neighbour needs to know the sensor, such as that pose: they are sent with the
         reading and charged.
     arrived : float, optional
-        When it became known, in s, if that was later: for the `late` of :meth:`Filter.run`.
+        When it became known, in s, if that was later: for the `delayed` of :meth:`Filter.run`.
 
     Examples
     --------
-    >>> Reading(2.0, 0, [1.5]).sensor
+    >>> Observation(2.0, 0, [1.5]).sensor
     0
     """
 
     t: float
-    agent: Index
-    value: Annotated[Array, "... m", MISSING]
-    sensor: Index | Sensor = 0
+    agent: NonNegativeInt
+    value: Annotated[Array, "... m", ALLOW_NAN]
+    sensor: NonNegativeInt | Sensor = 0
     _: KW_ONLY
-    about: tuple[float, ...] = ()
-    arrived: float | None = None
+    metadata: tuple[float, ...] = ()
+    arrival_time: float | None = None
 
 
-def sensor_of(f: Any, reading: Reading) -> Sensor:
+def sensor_of(f: Any, reading: Observation) -> Sensor:
     """The sensor that made a reading: its own, or one of the agent's."""
     if isinstance(reading.sensor, Sensor):
         return reading.sensor
-    own: tuple[Sensor, ...] = f.team[reading.agent]
+    own: tuple[Sensor, ...] = f.agent_sensors[reading.agent]
     if reading.sensor >= len(own):
         raise ValueError(f"observations: needs one of the {len(own)} sensors of agent "
                          f"{reading.agent}, got {reading.sensor}")
     return own[reading.sensor]
 
 
-def said_by_all(f: Any, observations: Any, runs: tuple[int, ...], t: float) -> list[list[Reading]]:
+def read_observations(f: Any, observations: Any, runs: tuple[int, ...], t: float) -> list[list[Observation]]:
     """What each agent of a filter observed at one time, checked.
 
     >>> from distfilt.filters import GaussianFilter
     >>> from distfilt.models import constant_velocity
-    >>> from distfilt.sensors import direct
-    >>> f = GaussianFilter(constant_velocity(sigma=0.1), [direct([0], std=1.0)])
-    >>> [[said.value for said in own] for own in said_by_all(f, [[1.5]], (), 0.0)]
+    >>> from distfilt.sensors import component
+    >>> f = GaussianFilter(constant_velocity(sigma=0.1), [component([0], std=1.0)])
+    >>> [[said.value for said in own] for own in read_observations(f, [[1.5]], (), 0.0)]
     [[array([1.5])]]
     """
-    out: list[list[Reading]] = []
-    for agent, given in enumerate(one_each(observations, f.count)):
-        own = f.team[agent]
+    out: list[list[Observation]] = []
+    for agent, given in enumerate(one_each(observations, f.n_agents)):
+        own = f.agent_sensors[agent]
         plain = type(given) is np.ndarray and given.dtype == np.float64 and len(own) == 1
         if plain and given.shape == (*runs, own[0].dim) and all_finite(given):  # as nearly all are
-            out.append([Reading.unchecked(t, agent, given)])
+            out.append([Observation.construct(t, agent, given)])
             continue
         name = f"observations[{agent}]"
         several = given if _are_readings(given) else () if given is None else (given,)
@@ -110,23 +110,23 @@ def one_each(observations: Any, agents: int) -> Any:
     return observations
 
 
-def _read(f: Any, given: Any, agent: int, t: float, name: str) -> Reading:
+def _read(f: Any, given: Any, agent: int, t: float, name: str) -> Observation:
     """A reading of this agent and time, or what its only sensor read."""
-    if isinstance(given, Reading):
+    if isinstance(given, Observation):
         if (given.agent, given.t) != (agent, t):
             got = f"one of agent {given.agent} at t = {given.t:g}"
             raise ValueError(f"{name}: needs a Reading of agent {agent} at t = {t:g}, got {got}")
-        if given.arrived is not None and given.arrived > t:
-            raise ValueError(f"{name}: needs what has arrived, got a Reading of {given.arrived:g}")
+        if given.arrival_time is not None and given.arrival_time > t:
+            raise ValueError(f"{name}: needs what has arrived, got a Reading of {given.arrival_time:g}")
         return given
-    own = f.team[agent]
+    own = f.agent_sensors[agent]
     if len(own) != 1:
         needs = "a Reading of each sensor" if own else "None for an agent without a sensor"
         raise ValueError(f"{name}: needs {needs}, got an array")
-    return Reading.unchecked(t, agent, array(given, name, (..., own[0].dim), finite=False))
+    return Observation.construct(t, agent, check_array(given, name, (..., own[0].dim), finite=False))
 
 
-def _complete(f: Any, said: Reading, runs: tuple[int, ...], name: str) -> Reading | None:
+def _complete(f: Any, said: Observation, runs: tuple[int, ...], name: str) -> Observation | None:
     """A reading with a value for each run; None if nothing of it is there."""
     value, dim = said.value, sensor_of(f, said).dim
     if np.isinf(value).any():
@@ -137,53 +137,53 @@ def _complete(f: Any, said: Reading, runs: tuple[int, ...], name: str) -> Readin
         return said
     if value.shape != (dim,):
         raise ValueError(f"{name}: needs shape {(*runs, dim)}, got {value.shape}")
-    return said.changed(value=np.broadcast_to(value, (*runs, dim)))
+    return said.replace(value=np.broadcast_to(value, (*runs, dim)))
 
 
-def belated(f: Any, late: Sequence[Reading], state: Any, t: float) -> list[Reading]:
+def match_delayed(f: Any, late: Sequence[Observation], state: Any, t: float) -> list[Observation]:
     """Late readings, each at that one of the kept times to which it belongs.
 
     A sum of steps may differ by rounding, but by far less than the shortest of them.
     """
-    times = state.kept(f.lag, t)
+    times = state.lagged_times(f.lag, t)
     shortest = min((b - a for a, b in pairwise((*times, t))), default=0.0)
     out = []
     for item in late:
         near = min(times, key=lambda known: abs(known - item.t), default=np.inf)
         if abs(near - item.t) > min(1e-9 * max(1.0, abs(item.t)), 1e-3 * shortest):
             known = ", ".join(f"{t:g}" for t in times) or "none (lag = 0)"
-            raise ValueError(f"late: needs an earlier time that is kept ({known}), got {item.t:g}")
-        if item.agent >= f.count:
-            raise ValueError(f"late: needs an agent below {f.count}, got {item.agent}")
+            raise ValueError(f"delayed: needs an earlier time that is kept ({known}), got {item.t:g}")
+        if item.agent >= f.n_agents:
+            raise ValueError(f"delayed: needs an agent below {f.n_agents}, got {item.agent}")
         if (sensor := sensor_of(f, item)).uses_previous:
-            raise ValueError(f"late: a {sensor.kind} sensor cannot be late, it compares two times")
-        said = _complete(f, item, state.runs, "late")
+            raise ValueError(f"delayed: a {sensor.kind} sensor cannot be late, it compares two times")
+        said = _complete(f, item, state.runs, "delayed")
         if said is not None:
-            out.append(said.changed(t=near))
+            out.append(said.replace(t=near))
     return out
 
 
-def planned(f: Any, state: Any, times: Any, observations: Any) -> tuple[Array, Iterator[Any]]:
+def plan_steps(f: Any, state: Any, times: Any, observations: Any) -> tuple[Array, Iterator[Any]]:
     """The times of a run's steps, and an iterator over what is observed at each of them.
 
     >>> from distfilt.filters import GaussianFilter
     >>> from distfilt.models import constant_velocity
-    >>> from distfilt.sensors import direct
-    >>> f = GaussianFilter(constant_velocity(sigma=1.0), [[direct([0], std=1.0)] * 2])
-    >>> seen = [Reading(1.0, 0, [2.0], 1), Reading(0.5, 0, [3.0]), Reading(1.0, 0, [1.0])]
-    >>> times, entries = planned(f, f.start((np.zeros(4), np.eye(4))), None, seen)
+    >>> from distfilt.sensors import component
+    >>> f = GaussianFilter(constant_velocity(sigma=1.0), [[component([0], std=1.0)] * 2])
+    >>> seen = [Observation(1.0, 0, [2.0], 1), Observation(0.5, 0, [3.0]), Observation(1.0, 0, [1.0])]
+    >>> times, entries = plan_steps(f, f.start((np.zeros(4), np.eye(4))), None, seen)
     >>> times, [[float(said.value[0]) for said in own] for own, in entries]
     (array([0.5, 1. ]), [[3.0], [2.0, 1.0]])
     """
-    grid = np.zeros(0) if times is None else array(times, "times", ("T",))
-    increasing(grid, "times")
+    grid = np.zeros(0) if times is None else check_array(times, "times", ("T",))
+    check_increasing(grid, "times")
     entries: Iterator[Any]
     if _are_readings(observations) and (times is None or observations):
-        at: dict[float, list[list[Reading]]] = {t: [[] for _ in range(f.count)] for t in grid}
+        at: dict[float, list[list[Observation]]] = {t: [[] for _ in range(f.n_agents)] for t in grid}
         for event in observations:
-            if event.agent >= f.count:
-                raise ValueError(f"observations: needs agents below {f.count}, got {event.agent}")
-            at.setdefault(event.t, [[] for _ in range(f.count)])[event.agent].append(event)
+            if event.agent >= f.n_agents:
+                raise ValueError(f"observations: needs agents below {f.n_agents}, got {event.agent}")
+            at.setdefault(event.t, [[] for _ in range(f.n_agents)])[event.agent].append(event)
         grid = np.array(sorted(at))
         entries = iter([at[t] for t in grid])
     elif times is None:
@@ -191,14 +191,14 @@ def planned(f: Any, state: Any, times: Any, observations: Any) -> tuple[Array, I
     else:
         # A table whose columns have names would give a column where a row is asked for.
         each = [o if o is None or isinstance(o, list | tuple) else np.atleast_1d(o)
-                for o in one_each(observations, f.count)]
+                for o in one_each(observations, f.n_agents)]
         for agent, series in enumerate(each):
             if series is not None and (got := len(series)) != grid.size:
                 raise ValueError(
                     f"observations: needs ({grid.size}, ..., m) for agent {agent}, got {got}"
                 )
             if isinstance(series, np.ndarray) and not isinstance(f.sensors, int):
-                _warn_of_degrees(f.team[agent], series, agent)
+                _warn_of_degrees(f.agent_sensors[agent], series, agent)
         entries = ([None if o is None else o[k] for o in each] for k in range(grid.size))
     if grid.size and grid[0] < state.t:
         raise ValueError(f"times: needs times from the state's {state.t:g} on, got {grid[0]:g}")
@@ -207,7 +207,7 @@ def planned(f: Any, state: Any, times: Any, observations: Any) -> tuple[Array, I
 
 def _warn_of_degrees(own: Sequence[Sensor], series: Array, agent: int) -> None:
     """Warn of angles that are more than four turns from what they are wrapped to."""
-    wraps = len(own) == 1 and own[0].difference
+    wraps = len(own) == 1 and own[0].residual_function
     if not wraps or series.shape[-1:] != (own[0].dim,):
         return
     y = np.nan_to_num(series.astype(np.float64))
@@ -218,7 +218,7 @@ def _warn_of_degrees(own: Sequence[Sensor], series: Array, agent: int) -> None:
 
 def _are_readings(given: Any) -> bool:
     """Whether these are events: Readings in a list, and nothing else."""
-    return isinstance(given, list | tuple) and all(isinstance(item, Reading) for item in given)
+    return isinstance(given, list | tuple) and all(isinstance(item, Observation) for item in given)
 
 
 def _is_pair(prior: Any) -> bool:
@@ -229,11 +229,11 @@ def _is_pair(prior: Any) -> bool:
     return pair and (isinstance(prior, tuple) or np.ndim(prior[0]) < np.ndim(prior[1]))
 
 
-def moments_of(prior: Any, dim: int, word: str = "semidefinite") -> tuple[Array, Array]:
+def prior_moments(prior: Any, dim: int, word: str = "semidefinite") -> tuple[Array, Array]:
     """Mean (d,) and covariance (d, d), definite or semidefinite, of a prior that has them.
 
     >>> from scipy.stats import multivariate_normal
-    >>> moments_of(multivariate_normal([1.0], [[4.0]]), 1)
+    >>> prior_moments(multivariate_normal([1.0], [[4.0]]), 1)
     (array([1.]), array([[4.]]))
     """
     if isinstance(prior, GaussianMixture):
@@ -247,45 +247,45 @@ def moments_of(prior: Any, dim: int, word: str = "semidefinite") -> tuple[Array,
         got = "a function" if callable(prior) else type(prior).__name__
         raise ValueError(f"prior: needs (mean, cov) or what has a mean and a covariance, got {got}")
     else:
-        members = array(prior, "prior", ("N", dim))
+        members = check_array(prior, "prior", ("N", dim))
         if len(members) <= dim:
             raise ValueError(f"prior: needs more than {dim} members, got {len(members)}")
         mean, cov = members.mean(axis=0), sample_covariance(members)
-    mean = array(np.atleast_1d(mean), "prior", (dim,))
-    cov = array(cov, "prior")
+    mean = check_array(np.atleast_1d(mean), "prior", (dim,))
+    cov = check_array(cov, "prior")
     if cov.shape != (dim, dim) and not dim == cov.size == 1:
         raise ValueError(f"prior: needs a covariance of shape {(dim, dim)}, got {cov.shape}")
-    definite(cov := cov.reshape(dim, dim), "prior", word)
+    check_positive_definite(cov := cov.reshape(dim, dim), "prior", word)
     return mean, cov
 
 
-def members_of(
+def draw_members(
     prior: Any, members: int, leading: tuple[int, ...], dim: int, rng: np.random.Generator
 ) -> Array:
     """Members (*leading, N, d) of a prior of any kind that :meth:`Filter.start` lists.
 
-    >>> members_of(([0.0], [[1.0]]), 5, (2,), 1, np.random.default_rng(0)).shape
+    >>> draw_members(([0.0], [[1.0]]), 5, (2,), 1, np.random.default_rng(0)).shape
     (2, 5, 1)
     """
     shape = (*leading, members, dim)
     if _is_pair(prior):
-        mean, cov = moments_of(prior, dim)
+        mean, cov = prior_moments(prior, dim)
         return unchecked(draw)(mean, cov, members, rng=rng, leading=leading)
     if hasattr(prior, "rvs"):
         word = "rng" if isinstance(prior, GaussianMixture) else "random_state"
         found = prior.rvs(math.prod(shape[:-1]), **{word: rng})
-        return array(found.reshape(*shape[:-1], -1), "prior", shape)
+        return check_array(found.reshape(*shape[:-1], -1), "prior", shape)
     found = prior(members, rng=rng, leading=leading) if callable(prior) else prior
-    out = array(found, "prior", (..., members, dim))
+    out = check_array(found, "prior", (..., members, dim))
     if out.shape != shape and out.shape != shape[-2:]:
         raise ValueError(f"prior: needs shape {shape} or {shape[-2:]}, got {out.shape}")
     return np.broadcast_to(out, shape).copy()
 
 
-def mixtures_of(prior: Any, dim: int, count: int) -> tuple[GaussianMixture, ...]:
+def prior_mixtures(prior: Any, dim: int, count: int) -> tuple[GaussianMixture, ...]:
     """A mixture for each agent, of one prior for all or of a list with one each.
 
-    >>> [mixture.size for mixture in mixtures_of(([0.0], [[1.0]]), 1, 2)]
+    >>> [mixture.n_components for mixture in prior_mixtures(([0.0], [[1.0]]), 1, 2)]
     [1, 1]
     """
     given = prior if isinstance(prior, list) else [prior] * count
@@ -294,7 +294,7 @@ def mixtures_of(prior: Any, dim: int, count: int) -> tuple[GaussianMixture, ...]
     out = []
     for one in given:
         mixed = isinstance(one, GaussianMixture)
-        out.append(one if mixed else GaussianMixture.gaussian(*moments_of(one, dim, "definite")))
+        out.append(one if mixed else GaussianMixture.gaussian(*prior_moments(one, dim, "definite")))
         if out[-1].dim != dim:
             raise ValueError(f"prior: needs dimension {dim}, got {out[-1].dim}")
     return tuple(out)

@@ -8,21 +8,21 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..doors import Array, Bounds, Count, Index, door
+from ..validation import Array, Bounds, PositiveInt, NonNegativeInt, validated
 from ..mixtures import GaussianMixture
-from ..mixtures.conditioning import updated
-from .inputs import Reading, sensor_of
+from ..mixtures.conditioning import update_mixture
+from .inputs import Observation, sensor_of
 from .mixture import MixtureFilter
 from .step import Step
 
-__all__ = ["NewsFilter", "increment"]
+__all__ = ["InformationIncrementFilter", "information_increment"]
 
 _NOTHING = 1e-6
 """A gain in information, as a share of what was there before, below which nothing was learned."""
 
 
-@door
-def increment(before: GaussianMixture, after: GaussianMixture) -> Array:
+@validated
+def information_increment(before: GaussianMixture, after: GaussianMixture) -> Array:
     r"""What a belief has gained, as readings of unit noise that would have taught the same.
 
     For Gaussians the gain in information :math:`\mathbf P_+^{-1}-\mathbf P_-^{-1}` is
@@ -46,10 +46,10 @@ def increment(before: GaussianMixture, after: GaussianMixture) -> Array:
     --------
     >>> old = GaussianMixture.gaussian([0.0, 0.0], [[1.0, 0.0], [0.0, 1.0]])
     >>> new = GaussianMixture.gaussian([1.0, 0.0], [[0.5, 0.0], [0.0, 1.0]])
-    >>> np.abs(increment(old, new))
+    >>> np.abs(information_increment(old, new))
     array([[1., 0., 2.]])
     """
-    one, two = before.collapsed(), after.collapsed()
+    one, two = before.moment_match(), after.moment_match()
     if one.dim != two.dim:
         raise ValueError(f"after: needs dimension {one.dim}, got {two.dim}")
     # In the frame in which the old covariance is the identity.
@@ -67,22 +67,22 @@ def increment(before: GaussianMixture, after: GaussianMixture) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class NewsFilter(MixtureFilter):
+class InformationIncrementFilter(MixtureFilter):
     """Every agent tells the others what its own reading taught it of the target, and no more.
 
     A reading is told once, by whom it belongs to, so that nothing is counted twice and nothing has
     to be discounted. For linear models and Gaussians that equals one filter with everybody's
     readings, if everybody hears everybody, nothing is lost, the agents' own states are independent
     of each other given the target's *present* state, and what is learned is told at once or nothing
-    disturbs the target: what waits (`every`) is counted as if it were. It needs to know where
+    disturbs the target: what waits (`exchange_interval`) is counted as if it were. It needs to know where
     readings come from: what all receive alike has to be named in `common`, and is taken by each for
     itself.
 
     Parameters
     ----------
     model, sensors, graph, target_dim, stretch, scale, gate, every, faults, names
-        As of :class:`MixtureFilter`; a `graph` is needed and an `agreement` is not taken. What was
-        learned while nobody could be told, for want of links or because it was not time (`every`),
+        As of :class:`MixtureFilter`; a `graph` is needed and an `fusion` is not taken. What was
+        learned while nobody could be told, for want of links or because it was not time (`exchange_interval`),
         is told at the next contact.
     size, most : int
         As there. With more than one mixand the moments' news are told, which is an approximation.
@@ -105,9 +105,9 @@ class NewsFilter(MixtureFilter):
 
     >>> from distfilt.models import Model
     >>> from distfilt.network import graphs
-    >>> from distfilt.sensors import direct
+    >>> from distfilt.sensors import component
     >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-    >>> f = NewsFilter(still, [direct([0], std=1.0)] * 2, graphs.path(2), target_dim=1)
+    >>> f = InformationIncrementFilter(still, [component([0], std=1.0)] * 2, graphs.path(2), target_dim=1)
     >>> prior = GaussianMixture.gaussian([0.0], [[1.0]])
     >>> after = f.step(f.start([prior, prior]), 1.0, [[3.0], [0.0]])
     >>> [float(m.means[0, 0].round(9)) for m in after.mixtures], after.ledger.scalars
@@ -115,13 +115,13 @@ class NewsFilter(MixtureFilter):
     """
 
     _: KW_ONLY
-    size: Count = 1
-    most: Count = 1
-    common: Sequence[Index] = ()
+    n_components: PositiveInt = 1
+    max_components: PositiveInt = 1
+    shared_components: Sequence[NonNegativeInt] = ()
 
-    fuses: ClassVar[None] = None
-    unused: ClassVar[dict[str, str]] = {
-        **MixtureFilter.unused, "agreement": "news are added, so that there is nothing to agree on"
+    belief_kind: ClassVar[None] = None
+    unsupported: ClassVar[dict[str, str]] = {
+        **MixtureFilter.unsupported, "fusion": "news are added, so that there is nothing to agree on"
     }
 
     def check_parts(self) -> None:
@@ -129,8 +129,8 @@ class NewsFilter(MixtureFilter):
         super().check_parts()
         if self.graph is None:
             raise ValueError("graph: needs a Graph, got None")
-        least = min((s.dim for own in self.team for s in own), default=0)
-        Bounds(below=least)(max(self.common, default=-1), "common")
+        least = min((s.dim for own in self.agent_sensors for s in own), default=0)
+        Bounds(below=least)(max(self.shared_components, default=-1), "shared_components")
 
     def _told(
         self, beliefs: list[GaussianMixture], step: Step
@@ -141,19 +141,19 @@ class NewsFilter(MixtureFilter):
 
         >>> from distfilt.models import Model
         >>> from distfilt.network import graphs
-        >>> from distfilt.sensors import direct, stack
+        >>> from distfilt.sensors import component, stack
         >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-        >>> f = NewsFilter(still, [stack([direct([0], std=1.0)] * 2)] * 2, graphs.path(2),
-        ...                target_dim=1, common=[1], gate=0.99, every=2.0)
+        >>> f = InformationIncrementFilter(still, [stack([component([0], std=1.0)] * 2)] * 2, graphs.path(2),
+        ...                target_dim=1, shared_components=[1], gate_probability=0.99, exchange_interval=2.0)
         >>> state = f.step(f.start(([0.0], [[1.0]])), 1.0, [[1.0, 99.0], [np.nan, 99.0]])
         >>> [m.means[0] for m in f.step(state, 2.0, [None, None]).mixtures]
         [array([0.5]), array([0.5])]
         """
-        own, alike = zip(*(self._parted(said) for said in step.said), strict=True)
+        own, alike = zip(*(self._parted(said) for said in step.observations), strict=True)
         after = [self._read(b, k, own[k], step)[0] for k, b in enumerate(beliefs)]
         # What an agent would believe without what it has not told: from before the readings of now,
         # or from before those that wait.
-        waiting = step.state.untold or (None,) * len(beliefs)
+        waiting = step.state.unsent or (None,) * len(beliefs)
         untold = [
             (old if new is not old else None) if kept is None else self._moved(kept, k, step)
             for k, (old, new, kept) in enumerate(zip(beliefs, after, waiting, strict=True))
@@ -175,32 +175,32 @@ class NewsFilter(MixtureFilter):
         for k, listeners in enumerate(np.bincount(channel.graph.senders[on], minlength=len(said))):
             before = untold[k]
             if before is not None and listeners:
-                with step.of(k):
-                    news = increment(before.marginal(part), after[k].marginal(part))
+                with step.failing_as(k):
+                    news = information_increment(before.marginal(part), after[k].marginal(part))
                 # Numbers that are not zero by construction, 13 for two rows of six.
                 if news.size:  # too little is told with what is learned next
                     said[k] = news[np.triu_indices(len(news), 0, news.shape[1])]
                     untold[k] = None
-        for k, heard in enumerate(channel.exchange(said)):
+        for k, heard in enumerate(channel.broadcast(said)):
             for payload in heard.values():
                 news = _unpacked(payload, self.target_dim)
                 before = untold[k]
-                with step.of(k):
+                with step.failing_as(k):
                     after[k] = _learned(after[k], news)
                     untold[k] = None if before is None else _learned(before, news)
 
-    def _parted(self, said: Sequence[Reading]) -> tuple[list[Reading], list[Reading]]:
+    def _parted(self, said: Sequence[Observation]) -> tuple[list[Observation], list[Observation]]:
         """Readings without and with nothing but the common components; none where none is left."""
-        own: list[Reading] = []
-        alike: list[Reading] = []
+        own: list[Observation] = []
+        alike: list[Observation] = []
         for reading in said:
-            everybody = np.isin(np.arange(reading.value.size), self.common)
-            if sensor_of(self, reading).cov[np.ix_(everybody, ~everybody)].any():
+            everybody = np.isin(np.arange(reading.value.size), self.shared_components)
+            if sensor_of(self, reading).noise_cov[np.ix_(everybody, ~everybody)].any():
                 raise ValueError("common: needs noise of its own, got some that others share")
             for part, gone in ((own, everybody), (alike, ~everybody)):
                 left = np.where(gone, np.nan, reading.value)
                 if not np.isnan(left).all():
-                    part.append(reading.changed(value=left))
+                    part.append(reading.replace(value=left))
         return own, alike
 
 
@@ -215,4 +215,4 @@ def _unpacked(numbers: Array, n: int) -> Array:
 def _learned(belief: GaussianMixture, news: Array) -> GaussianMixture:
     """A belief after news of its first components."""
     rows, values = news[:, :-1], news[:, -1]
-    return updated(belief, values, lambda x: x[..., : rows.shape[1]] @ rows.T, np.eye(values.size))
+    return update_mixture(belief, values, lambda x: x[..., : rows.shape[1]] @ rows.T, np.eye(values.size))

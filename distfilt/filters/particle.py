@@ -9,13 +9,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..doors import Array, Mask, Share, unchecked
+from ..validation import Array, Mask, UnitInterval, unchecked
 from ..updates import particles
-from .ensemble import MembersFilter, Several, recalled
-from .inbox import Heard
+from .ensemble import MembersFilter, Several, regress_past
+from .inbox import Received
 from .record import Summary
 from .saving import SensorState
-from .step import Step, guarded
+from .step import Step, run_isolated
 
 __all__ = ["ParticleFilter", "ParticleState"]
 
@@ -26,9 +26,9 @@ class ParticleState(SensorState):
 
     Parameters
     ----------
-    t, ledger, rng, refused, failed, waiting
+    t, ledger, rng, rejected, failed, pending
         As for :class:`~distfilt.filters.SensorState`.
-    points : ndarray, (*runs, A, N, d)
+    particles : ndarray, (*runs, A, N, d)
     log_weights : ndarray, (*runs, A, N)
         Normalised. They are those after the last observation: a step resamples first.
     history : tuple of (float, ndarray)
@@ -43,10 +43,10 @@ class ParticleState(SensorState):
     ()
     """
 
-    points: Array
+    particles: Array
     log_weights: Array
 
-    _belief = "points", (..., "A", "N", "d")
+    belief_field = "particles", (..., "A", "N", "d")
 
     @cached_property
     def weights(self) -> Array:
@@ -65,7 +65,8 @@ class ParticleFilter(MembersFilter):
 
     Parameters
     ----------
-    model, sensors, graph, agreement, share, faults, lag, names, failures, gate, every
+    model, sensors, graph, fusion, share_observations, faults, lag, names, on_error, gate_probability,
+        exchange_interval
         As for :class:`~distfilt.filters.Filter`. The agreement is one of ensembles; agents
         resample before it.
     members : int
@@ -85,28 +86,28 @@ class ParticleFilter(MembersFilter):
     Examples
     --------
     >>> from distfilt.models import Model
-    >>> from distfilt.sensors import direct
+    >>> from distfilt.sensors import component
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
-    >>> f = ParticleFilter(walk, [direct([0], std=1.0)], members=500)
+    >>> f = ParticleFilter(walk, [component([0], std=1.0)], members=500)
     >>> state = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(1))
-    >>> f.summary(f.step(state, 1.0, [[3.0]])).mean.round(1)
+    >>> f.summarize(f.step(state, 1.0, [[3.0]])).mean.round(1)
     array([[1.9]])
     """
 
     _: KW_ONLY
     members: Several = 1000
-    threshold: Share = 0.5
-    jitter: Share | None = None
+    ess_threshold: UnitInterval = 0.5
+    jitter: UnitInterval | None = None
 
-    state: ClassVar[type[ParticleState]] = ParticleState
-    joins: ClassVar[bool] = True
+    state_class: ClassVar[type[ParticleState]] = ParticleState
+    batched_summary: ClassVar[bool] = True
 
-    def begin(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
         """Particles drawn for each agent, with equal weights."""
-        points = self.drawn(prior, (*runs, self.count), rng)
-        return {"points": points, "log_weights": np.full(points.shape[:-1], -np.log(self.members))}
+        points = self.draw_prior(prior, (*runs, self.n_agents), rng)
+        return {"particles": points, "log_weights": np.full(points.shape[:-1], -np.log(self.members))}
 
-    def advance(self, step: Step) -> Any:
+    def next_state(self, step: Step) -> Any:
         """Resample where it is due, forecast, weigh by what was heard, agree.
 
         Warns
@@ -116,49 +117,49 @@ class ParticleFilter(MembersFilter):
             or if the effective size of its weights is below two.
         """
         state = step.state
-        stack = step.stack(state.points)
+        stack = step.stack(state.particles)
         weights = self._resampled(stack, state, step)
         old = stack[-1]  # where each particle comes from, which is not where it was in the state
         if step.dt:
             moved = unchecked(self.model.sample_step)(stack[-1], state.t, step.dt, rng=step.rng)
-            stack[-1] = step.moved(moved, stack[-1])
-        for place, group in step.heard():
+            stack[-1] = step.check_forecast(moved, stack[-1])
+        for place, group in step.received():
             rows = group.rows
             before = step.before(place, group, [old] if step.dt else stack[:-1])
             predicted = group.predict(stack[place][..., rows, :, :], before)
             logs = weights[..., rows, :]
-            group = step.gated(group, lambda x, w: weighted_moments(x, np.exp(w)), predicted, logs)
-            step.settle(_weigh(weights, predicted, group), group.agents)
-        if step.agrees:
+            group = step.gate(group, lambda x, w: weighted_moments(x, np.exp(w)), predicted, logs)
+            step.record_failures(_weigh(weights, predicted, group), group.agents)
+        if step.has_fusion:
             # The particles have to be an ensemble, which the agreement can move.
             offset = step.rng.random((*weights.shape[:-1], 1))
             self._pick(stack, weights, np.exp(weights), np.ones(weights.shape[:-1], bool), offset)
-        (now,) = step.agreed(stack[-1])
-        after = step.end(points=now, log_weights=weights, past=recalled(stack, now))
+        (now,) = step.fuse(stack[-1])
+        after = step.end(particles=now, log_weights=weights, past=regress_past(stack, now))
         self._warn(after)
         return after
 
-    def summary(self, state: ParticleState) -> Summary:
+    def summarize(self, state: ParticleState) -> Summary:
         """Weighted means and covariances, effective sizes and the share of distinct particles."""
         w = state.weights
-        mean, cov = weighted_moments(state.points, w)
-        cov = state.shown(cov)
-        sizes, distinct = state.effective_size, particles.distinct_share(state.points)
-        numbers = {"effective_size": state.shown(sizes), "distinct": state.shown(distinct)}
+        mean, cov = weighted_moments(state.particles, w)
+        cov = state.mask_failed(cov)
+        sizes, distinct = state.effective_size, particles.distinct_fraction(state.particles)
+        numbers = {"effective_size": state.mask_failed(sizes), "distinct": state.mask_failed(distinct)}
         variance = np.diagonal(cov, axis1=-2, axis2=-1)
-        return Summary(state.shown(mean), variance, cov, state.points, w, numbers)
+        return Summary(state.mask_failed(mean), variance, cov, state.particles, w, numbers)
 
     def _resampled(self, stack: list[Array], state: ParticleState, step: Step) -> Array:
         """Log-weights after agents with a poor effective size have resampled, in place.
 
         >>> from distfilt.models import constant_velocity
-        >>> f = ParticleFilter(constant_velocity(sigma=1.0), [None] * 2, share=False, members=4,
-        ...                    threshold=0.9, jitter=0.5)
+        >>> f = ParticleFilter(constant_velocity(sigma=1.0), [None] * 2, share_observations=False, members=4,
+        ...                    ess_threshold=0.9, jitter=0.5)
         >>> state = f.start((np.zeros(4), np.eye(4)), rng=np.random.default_rng(0))
         >>> fine, poor = state.log_weights[0], np.log([0.7, 0.1, 0.1, 0.1])
-        >>> moved = [f.step(state.changed(log_weights=np.array([w, poor])), 0.0, [None] * 2)
+        >>> moved = [f.step(state.replace(log_weights=np.array([w, poor])), 0.0, [None] * 2)
         ...          for w in (fine, poor)]
-        >>> (moved[0].points == moved[1].points).all(axis=(1, 2))
+        >>> (moved[0].particles == moved[1].particles).all(axis=(1, 2))
         array([False,  True])
         """
         weights, before = state.log_weights.copy(), stack[-1]
@@ -166,7 +167,7 @@ class ParticleFilter(MembersFilter):
         offset = step.rng.random((*weights.shape[:-1], 1))
         width = self._bandwidth(state.t, step.dt)
         noise = step.rng.standard_normal(before.shape) if width else None
-        poor = state.effective_size < self.threshold * self.members
+        poor = state.effective_size < self.ess_threshold * self.members
         if not poor.any():
             return weights
         counts = self._pick(stack, weights, state.weights, poor, offset)
@@ -175,8 +176,8 @@ class ParticleFilter(MembersFilter):
             lost = state.effective_size[poor][:, None] < 2
             shares = np.where(lost, 1 / self.members, state.weights[poor])
             cov = weighted_moments(before[poor], shares)[1]
-            copied = particles.taken((counts > 1)[..., None], counts).reshape(-1, self.members)
-            stack[-1][poor] = particles.jittered(stack[-1][poor], cov, width, noise[poor], copied)
+            copied = particles.repeat_by_count((counts > 1)[..., None], counts).reshape(-1, self.members)
+            stack[-1][poor] = particles.add_jitter(stack[-1][poor], cov, width, noise[poor], copied)
         return weights
 
     def _bandwidth(self, t: float, dt: float) -> float:
@@ -191,9 +192,9 @@ class ParticleFilter(MembersFilter):
     ) -> Any:
         """Resample some agents' paths in the stack; the weights are equal then."""
         rows = slice(None) if poor.all() else poor
-        counts = particles.counted(weights[rows], offset[rows])
+        counts = particles.systematic_counts(weights[rows], offset[rows])
         for k, path in enumerate(stack):
-            stack[k] = moved = particles.taken(path[rows], counts)
+            stack[k] = moved = particles.repeat_by_count(path[rows], counts)
             if rows is poor:
                 stack[k] = path.copy()
                 stack[k][rows] = moved
@@ -206,7 +207,7 @@ class ParticleFilter(MembersFilter):
         >>> import warnings
         >>> from distfilt.models import constant_velocity
         >>> from distfilt.network import Ledger
-        >>> f = ParticleFilter(constant_velocity(sigma=1.0), [None] * 2, share=False, members=200)
+        >>> f = ParticleFilter(constant_velocity(sigma=1.0), [None] * 2, share_observations=False, members=200)
         >>> apart = np.random.default_rng(0).standard_normal((2, 200, 4))
         >>> for moved in ([1.0, 0.0], [1.0, 1.0]):  # the first components are known
         ...     points = apart * np.array(moved)[:, None, None] * [0, 1, 1, 1]
@@ -218,7 +219,7 @@ class ParticleFilter(MembersFilter):
         ["t = 1 s: 0.50% of an agent's particles are dist"]
         []
         """
-        points, size = state.points, state.effective_size
+        points, size = state.particles, state.effective_size
         if np.count_nonzero(state.failed):
             points, size = points[~state.failed], size[~state.failed]
         least = max(0.01 * self.members, 2.0)
@@ -227,7 +228,7 @@ class ParticleFilter(MembersFilter):
         apart = (few[..., 1:] > few[..., :-1]).sum(axis=-1)
         distinct = apart.min(initial=self.members) / self.members
         if distinct * self.members < least:
-            distinct = particles.distinct_share(points).min()
+            distinct = particles.distinct_fraction(points).min()
         if distinct * self.members < least:
             what = f"{distinct:.2%} of an agent's particles are distinct"
         elif size.min(initial=np.inf) < 2:
@@ -245,11 +246,11 @@ def weighted_moments(points: Array, w: Array) -> tuple[Array, Array]:
     return mean, (w[..., None, :] * around) @ around.mT
 
 
-def _weigh(weights: Array, predicted: Array, group: Heard) -> dict[tuple[int, ...], str]:
+def _weigh(weights: Array, predicted: Array, group: Received) -> dict[tuple[int, ...], str]:
     """Multiply a group's weights by the likelihood, in place; the rows that failed."""
     old = weights[..., group.rows, :]
-    (new,), errors = guarded(
-        lambda h, y, w, noise, _: (particles.weighed(w, h, y, noise),),
+    (new,), errors = run_isolated(
+        lambda h, y, w, noise, _: (particles.reweight(w, h, y, noise),),
         (predicted, group.target, old), (old,), group.target.ndim - 1, shared=group.noise,
     )
     weights[..., group.rows, :] = new

@@ -10,16 +10,16 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ..doors import Array, array, unchecked
+from ..validation import Array, check_array, unchecked
 from ..ensembles import sample_covariance
 from ..linalg import cholesky, in_units, quadratic_form
 from ..metrics import crps, gaussian_crps
-from .saving import State, joined
+from .saving import State, stack_states
 
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["SCORES", "Score", "Summary", "final_state", "recorded"]
+__all__ = ["SCORES", "Score", "Summary", "final_state", "record_run"]
 
 Score = Literal["squared_error", "nees", "crps"]
 SCORES: tuple[Score, ...] = ("squared_error", "nees", "crps")
@@ -40,7 +40,7 @@ _MEANING = {
     "total_squared_error": ("squared errors added over components, whatever their units", "mixed"),
     "crps": ("continuous ranked probability score", "of the component"),
     "nees": ("normalised estimation error squared; its mean is d for a consistent filter", "1"),
-    "refused": ("readings that the gate left out in this step", "1"),
+    "rejected": ("readings that the gate left out in this step", "1"),
 }
 
 
@@ -67,13 +67,13 @@ class Summary:
 
     >>> from distfilt.filters import GaussianFilter
     >>> from distfilt.models import Model
-    >>> from distfilt.sensors import direct
+    >>> from distfilt.sensors import component
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: dt * np.eye(1))
     >>> class Best(GaussianFilter):
-    ...     def summary(self, state):
-    ...         best = [state.covariances[:, 0, 0].argmin()] * self.count
+    ...     def summarize(self, state):
+    ...         best = [state.covariances[:, 0, 0].argmin()] * self.n_agents
     ...         return Summary(state.means[best], state.covariances[best, 0])
-    >>> best = Best(walk, [None, direct([0], std=1.0)], share=False)
+    >>> best = Best(walk, [None, component([0], std=1.0)], share_observations=False)
     >>> run = best.run(best.start(([0.0], [[4.0]])), [1.0, 2.0], [None, [[2.0], [2.0]]])
     >>> run["mean"].values[..., 0].round(3)
     array([[1.667, 1.667],
@@ -88,7 +88,7 @@ class Summary:
     numbers: Mapping[str, Array] = field(default_factory=dict)
 
 
-def recorded(
+def record_run(
     filter_: Any, times: Array, start: Any, said: Iterable[tuple[Any, Any]], truth: Any,
     scores: Collection[Score],
 ) -> xarray.Dataset:
@@ -131,16 +131,16 @@ def _followed(
     """What is recorded of all states, along a first axis, their ledgers, and the last one."""
     rows: list[dict[str, Array]] = []
     ledgers = [last.ledger]
-    for block in _blocks(said, filter_.joins):
+    for block in _blocks(said, filter_.batched_summary):
         states, believed = zip(*block, strict=True)
         done, several, last = len(ledgers) - 1, len(block) > 1, states[-1]
         ledgers += [state.ledger for state in states]
-        summary = filter_.summary(joined(believed) if several else believed[0])
+        summary = filter_.summarize(stack_states(believed) if several else believed[0])
         row = {"mean": summary.mean, "variance": summary.variance, **summary.numbers}
         if summary.covariance is not None:
             row["covariance"] = summary.covariance
-        if last.refused is not None:
-            row["refused"] = np.array([s.refused for s in states]) if several else last.refused
+        if last.rejected is not None:
+            row["rejected"] = np.array([s.rejected for s in states]) if several else last.rejected
         if known is not None:
             true = known[done : len(ledgers) - 1] if several else known[done]
             row |= _scored(summary, true, at, scores)
@@ -168,7 +168,7 @@ def _known(
     if hasattr(truth, "columns") and {*truth.columns} <= {*names}:
         truth = dict(truth)  # a table says itself which component is which
     if not isinstance(truth, Mapping):
-        x = array(truth, "truth", None, finite=False)
+        x = check_array(truth, "truth", None, finite=False)
         if x.shape == (*shape, len(names)):
             return x[..., None, :], slice(None)
         if x.shape != (*shape, agents, len(names)):
@@ -180,8 +180,8 @@ def _known(
         raise ValueError(f"truth: needs components of {', '.join(names)}, got {unknown}")
     whole = np.full((*shape, agents, len(names)), np.nan)
     for name, given in truth.items():
-        x = array(given, f"truth[{name!r}]", None)
-        x = x[..., None] if x.shape == shape else array(x, "truth", (*shape, agents))
+        x = check_array(given, f"truth[{name!r}]", None)
+        x = x[..., None] if x.shape == shape else check_array(x, "truth", (*shape, agents))
         whole[..., names.index(name)] = x
     return whole, [names.index(name) for name in truth]
 

@@ -15,16 +15,16 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 
-from ..doors import Array, Mask, Record, array
+from ..validation import Array, Mask, FrozenModel, check_array
 from ..network import Ledger
 
-__all__ = ["SensorState", "State", "joined"]
+__all__ = ["SensorState", "State", "stack_states"]
 
 _FORMAT = 5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class State(Record):
+class State(FrozenModel):
     """All that a filter needs to go on: nothing is hidden elsewhere.
 
     A family of filters adds its own fields. They may be arrays, numbers, texts, None, tuples of
@@ -51,7 +51,7 @@ class State(Record):
     t: float
     ledger: Ledger
     rng: np.random.Generator | None
-    refused: Annotated[Array, "..."] | None = field(default=None, kw_only=True)
+    rejected: Annotated[Array, "..."] | None = field(default=None, kw_only=True)
 
     def __repr__(self) -> str:
         """Time and agents: the numbers themselves are many."""
@@ -67,14 +67,14 @@ class State(Record):
         """Earlier times that are kept; none, unless a family says otherwise."""
         return ()
 
-    def kept(self, lag: int, t: float) -> tuple[float, ...]:
+    def lagged_times(self, lag: int, t: float) -> tuple[float, ...]:
         """The earlier times that a step to `t` keeps, oldest first.
 
         >>> from distfilt.filters import GaussianFilter
         >>> from distfilt.models import constant_velocity
         >>> f = GaussianFilter(constant_velocity(sigma=1.0), [None], lag=1)
         >>> state = f.step(f.start((np.zeros(4), np.eye(4))), 1.0, [None])
-        >>> state.times, [state.kept(lag, t) for t in (1.0, 2.0) for lag in (0, 1, 2)]
+        >>> state.times, [state.lagged_times(lag, t) for t in (1.0, 2.0) for lag in (0, 1, 2)]
         ((0.0,), [(0.0,), (0.0,), (0.0,), (), (1.0,), (0.0, 1.0)])
         """
         if t == self.t:
@@ -151,32 +151,32 @@ class SensorState(State):
     >>> @dataclass(frozen=True, eq=False, repr=False)
     ... class Levels(SensorState):
     ...     levels: Array
-    ...     _belief = "levels", (..., "A")
+    ...     belief_field = "levels", (..., "A")
     >>> Levels(0.0, Ledger.empty(2), None, np.zeros((3, 2))).runs
     (3,)
     """
 
     history: tuple[Any, ...] = field(default=(), kw_only=True)
     failed: Mask = field(default_factory=lambda: np.zeros((), dtype=bool), kw_only=True)
-    waiting: tuple[Any, ...] = field(default=(), kw_only=True)
+    pending: tuple[Any, ...] = field(default=(), kw_only=True)
 
-    _belief = "belief", tuple[Any, ...]()
+    belief_field = "belief", tuple[Any, ...]()
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        name, axes = self._belief
-        array(self.belief, name, axes)
+        name, axes = self.belief_field
+        check_array(self.belief, name, axes)
         object.__setattr__(self, "failed", np.broadcast_to(self.failed, self.runs))
 
     @property
     def belief(self) -> Array:
         """What the agents believe, under the family's own name for it."""
-        return getattr(self, self._belief[0])  # type: ignore[no-any-return]
+        return getattr(self, self.belief_field[0])  # type: ignore[no-any-return]
 
     @property
     def runs(self) -> tuple[int, ...]:
         """Leading axes: independent runs of the network."""
-        return self.belief.shape[: 1 - len(self._belief[1])]
+        return self.belief.shape[: 1 - len(self.belief_field[1])]
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -189,30 +189,30 @@ class SensorState(State):
         return tuple([t for t, _ in self.history])
 
     @property
-    def earlier(self) -> tuple[Self, ...]:
+    def lagged_states(self) -> tuple[Self, ...]:
         """A state for each of these times, as what is believed of it by now.
 
         What ties the times together is kept, by draws too:
 
         >>> from distfilt.filters import EnsembleFilter, TransportFilter
         >>> from distfilt.models import Model
-        >>> from distfilt.sensors import Sensor, direct
-        >>> from distfilt.updates import known_noise, serial
+        >>> from distfilt.sensors import Sensor, component
+        >>> from distfilt.updates import enkf, serially
         >>> tenth = Model(1, lambda x, t, dt: x / 10, lambda t, dt: np.zeros((1, 1)))
         >>> cubes = Sensor(2, lambda x: np.concatenate([10 * x, x**3], axis=-1), np.eye(2))
-        >>> for f in (TransportFilter(tenth, [direct([0], std=0.1)], lag=1, members=9,
+        >>> for f in (TransportFilter(tenth, [component([0], std=0.1)], lag=1, members=9,
         ...                           rejuvenation=0.5),
-        ...           EnsembleFilter(tenth, [cubes], lag=1, members=9, update=serial(known_noise))):
+        ...           EnsembleFilter(tenth, [cubes], lag=1, members=9, update=serially(enkf))):
         ...     state = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0))
         ...     state = f.step(state, 1.0, [[0.1, 0.0][: f.sensors[0].dim]])
-        ...     print(np.allclose(state.earlier[0].ensembles, 10 * state.ensembles))
+        ...     print(np.allclose(state.lagged_states[0].ensembles, 10 * state.ensembles))
         True
         True
         """
-        name = self._belief[0]
-        return tuple(self.changed(t=t, history=(), **{name: x}) for t, x in self.history)
+        name = self.belief_field[0]
+        return tuple(self.replace(t=t, history=(), **{name: x}) for t, x in self.history)
 
-    def shown(self, values: Array) -> Array:
+    def mask_failed(self, values: Array) -> Array:
         """Values (*runs, ...) for the record: NaN in runs that have failed."""
         if not np.count_nonzero(self.failed):
             return values
@@ -221,10 +221,10 @@ class SensorState(State):
         return out
 
 
-def joined(states: Sequence[Any]) -> Any:
+def stack_states(states: Sequence[Any]) -> Any:
     """Several states of one shape as one, along a first axis of runs."""
     own = [name for name, value in vars(states[0]).items() if type(value) is np.ndarray]
-    return states[0].changed(**{k: np.array([getattr(s, k) for s in states]) for k in own})
+    return states[0].replace(**{k: np.array([getattr(s, k) for s in states]) for k in own})
 
 
 def _name(kind: type) -> str:

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from ..doors import Array, all_finite, array
+from ..validation import Array, all_finite, check_array
 from ..linalg import SolverError
 from ..sensors import Sensor
-from .inbox import Heard, groups
-from .inputs import Reading, sensor_of
+from .inbox import Received, group_agents
+from .inputs import Observation, sensor_of
 from .saving import SensorState
 
-__all__ = ["RECOVERABLE", "FilterError", "Step", "copied", "guarded", "of_the_call"]
+__all__ = ["RECOVERABLE", "FilterError", "Step", "copy_rng", "run_isolated", "is_argument_error"]
 
 RECOVERABLE = (np.linalg.LinAlgError, ArithmeticError, SolverError, ValueError)
 """What one row of a batch, or one agent, may fail with while the filter is right."""
@@ -63,18 +63,18 @@ class Step:
 
     `dt` is its length, `channel` its door (None where nobody speaks) and `rng` its own generator;
     `times` are the earlier times that will be kept, oldest first. `said` are the agents' readings
-    of now, `late` those of earlier times.
+    of now, `delayed` those of earlier times.
 
     Examples
     --------
     >>> from distfilt.filters import Filter, GaussianFilter
     >>> from distfilt.models import constant_velocity
-    >>> from distfilt.sensors import direct
+    >>> from distfilt.sensors import component
     >>> class Telling(GaussianFilter):
-    ...     def advance(self, step):
-    ...         print(step.dt, [group.agents.tolist() for _, group in step.heard()])
-    ...         return super().advance(step)
-    >>> f = Telling(constant_velocity(sigma=0.1), [direct([0], std=1.0)])
+    ...     def next_state(self, step):
+    ...         print(step.dt, [group.agents.tolist() for _, group in step.received()])
+    ...         return super().next_state(step)
+    >>> f = Telling(constant_velocity(sigma=0.1), [component([0], std=1.0)])
     >>> f.step(f.start((np.zeros(4), np.eye(4))), 0.5, [[1.0]]).t
     0.5 [[0]]
     0.5
@@ -85,7 +85,7 @@ class Step:
     >>> heard = Graph.from_edges(3, [(0, 1), (0, 2)])
     >>> loss = np.zeros((3, 3))
     >>> loss[2, 0] = 0.5
-    >>> f = GaussianFilter(constant_velocity(sigma=0.1), [direct([0], std=1.0), None, None], heard,
+    >>> f = GaussianFilter(constant_velocity(sigma=0.1), [component([0], std=1.0), None, None], heard,
     ...                    faults=Faults(loss=loss))
     >>> state = f.step(f.start((np.zeros(4), np.eye(4)), runs=(4,)), 0.0, [[1.0], None, None])
     >>> state.means[..., 0].T
@@ -95,21 +95,21 @@ class Step:
     """
 
     def __init__(
-        self, filter_: Any, state: Any, t: float, said: Any, late: Sequence[Reading] = (), *,
+        self, filter_: Any, state: Any, t: float, said: Any, late: Sequence[Observation] = (), *,
         own: bool = False,
     ) -> None:
         self.filter, self.state, self.t, self.dt = filter_, state, t, t - state.t
-        self.said, self.late = said, late
-        self.times = state.kept(filter_.lag, t)
+        self.observations, self.delayed = said, late
+        self.times = state.lagged_times(filter_.lag, t)
         self.channel: Any = filter_.channel(state, t)
         # A run's own generator need not be copied: nobody else draws from it.
-        self.rng: Any = state.rng if own or state.rng is None else copied(state.rng)
+        self.rng: Any = state.rng if own or state.rng is None else copy_rng(state.rng)
         self.failed = getattr(state, "failed", _NOBODY)
         self.lost = bool(np.count_nonzero(self.failed))
-        self.waiting: tuple[Any, ...] = ()
-        self.refused: Any = None if filter_.gate is None else np.zeros((*state.runs, filter_.count))
+        self.pending: tuple[Any, ...] = ()
+        self.rejected: Any = None if filter_.gate_probability is None else np.zeros((*state.runs, filter_.n_agents))
 
-    def settle(self, errors: dict[Row, str], agents: Any = None) -> None:
+    def record_failures(self, errors: dict[Row, str], agents: Any = None) -> None:
         """Take the runs of these errors as failed, or raise the error that names the first.
 
         Their keys are runs, and where there are `agents` a place among these.
@@ -117,7 +117,7 @@ class Step:
         if not errors:
             return
         size, (row, why) = len(self.state.runs), next(iter(errors.items()))
-        if self.filter.failures == "raise" or not self.failed.shape:
+        if self.filter.on_error == "raise" or not self.failed.shape:
             agent = None if agents is None else int(agents[row[-1]])
             raise FilterError(row[:size], agent, self.t, why)
         self.failed = self.failed.copy()
@@ -125,22 +125,22 @@ class Step:
             self.failed[row[:size]] = self.lost = True
 
     @contextmanager
-    def of(self, agent: int) -> Iterator[None]:
+    def failing_as(self, agent: int) -> Iterator[None]:
         """What fails here is this agent's failure."""
         try:
             yield
         except RECOVERABLE as error:
             raise FilterError((), agent, self.t, error) from error
 
-    def moved(self, values: Array, old: Any) -> Array:
+    def check_forecast(self, values: Array, old: Any) -> Array:
         """A forecast (*runs, A, ...); `old` in failed runs."""
         if bad := _not_finite(values, self.failed.ndim + 1, "forecast"):
-            self.settle(bad, range(self.filter.count))
+            self.record_failures(bad, range(self.filter.n_agents))
         # Groups of agents are updated in place, which a state must not notice.
         apart = not np.may_share_memory(values, self.state.belief)
-        return self.kept(values if apart else values.copy(), old)
+        return self.keep_failed(values if apart else values.copy(), old)
 
-    def kept(self, values: Array, old: Any) -> Array:
+    def keep_failed(self, values: Array, old: Any) -> Array:
         """The values, but `old` in failed runs."""
         if not self.lost:
             return values
@@ -152,30 +152,30 @@ class Step:
         before = [x for _, x in self.state.history] + [self.state.belief] * (self.dt > 0)
         return [x.copy() for x in before[len(before) - len(self.times) :]] + [now]
 
-    def heard(self) -> Iterator[tuple[int, Heard]]:
+    def received(self) -> Iterator[tuple[int, Received]]:
         """Who heard what: a place among the times, and a group of agents with their readings.
 
         The last place is now. A target is NaN in failed runs, so that they are left alone.
         """
         known = self._known()
         for place, t in enumerate((*self.times, self.t)):
-            for group in groups(*known[t]) if t in known else ():
+            for group in group_agents(*known[t]) if t in known else ():
                 if self.lost:
-                    group = group.aimed(self.kept(group.target, np.nan))
+                    group = group.with_target(self.keep_failed(group.target, np.nan))
                 yield place, group
 
     def _known(self) -> dict[float, tuple[list[list[Sensor]], list[list[Array]]]]:
         """For each time the readings that each agent has, its own and what it heard, by sender."""
         f = self.filter
-        if not self.late and (f.graph is None or not f.share):
-            sensors = [[sensor_of(f, said) for said in mine] for mine in self.said]
-            return {self.t: (sensors, [[said.value for said in mine] for mine in self.said])}
-        own = [list(mine) for mine in self.said] if self.late else self.said
-        for late in self.late:
+        if not self.delayed and (f.graph is None or not f.share_observations):
+            sensors = [[sensor_of(f, said) for said in mine] for mine in self.observations]
+            return {self.t: (sensors, [[said.value for said in mine] for mine in self.observations])}
+        own = [list(mine) for mine in self.observations] if self.delayed else self.observations
+        for late in self.delayed:
             own[late.agent].append(late)
         told, inbox = self._told(own), [dict[int, Any]()] * len(own)
         if self.channel is not None and told:
-            inbox = self.channel.exchange([self._payload(mine) for mine in told])
+            inbox = self.channel.broadcast([self._payload(mine) for mine in told])
         kinds = [[(said.t, sensor_of(f, said)) for said in mine] for mine in told]
         known: dict[float, Any] = defaultdict(lambda: ([[] for _ in own], [[] for _ in own]))
         for agent, (mine, box) in enumerate(zip(own, inbox, strict=True)):
@@ -194,20 +194,20 @@ class Step:
                     known[t][1][agent].append(got)
         return known
 
-    def _told(self, own: list[list[Reading]]) -> list[list[Reading]]:
+    def _told(self, own: list[list[Observation]]) -> list[list[Observation]]:
         """What each agent tells now; none if nobody does. What is not told waits for a contact."""
         f = self.filter
-        if not f.share or f.graph is None:
+        if not f.share_observations or f.graph is None:
             return []
         if self.channel is None:
             if f.lag:
-                kept = [said.changed(value=said.value.copy()) for mine in own for said in mine]
-                self.waiting = (*self.state.waiting, *kept)
+                kept = [said.replace(value=said.value.copy()) for mine in own for said in mine]
+                self.pending = (*self.state.pending, *kept)
             return []
-        if not self.state.waiting:
+        if not self.state.pending:
             return own
-        out: list[list[Reading]] = [[] for _ in own]
-        for said in self.state.waiting:
+        out: list[list[Observation]] = [[] for _ in own]
+        for said in self.state.pending:
             if said.t not in self.times:
                 raise ValueError(
                     f"lag: needs to reach back to t = {said.t:g}, from when a reading waited for "
@@ -216,33 +216,33 @@ class Step:
             out[said.agent].append(said)
         return [waited + mine for waited, mine in zip(out, own, strict=True)]
 
-    def _payload(self, told: list[Reading]) -> Any:
+    def _payload(self, told: list[Observation]) -> Any:
         """Values, and when and of which sensor each is, but for an only one: now, of the first."""
         if not told:
             return None
         which = [said.sensor if isinstance(said.sensor, int) else -1 for said in told]
-        if len(told) == 1 and told[0].t == self.t and which[0] < 1 and not told[0].about:
+        if len(told) == 1 and told[0].t == self.t and which[0] < 1 and not told[0].metadata:
             return told[0].value
         pairs = zip(told, which, strict=True)
-        about = [x for said, sensor in pairs for x in (said.t, sensor, *said.about)]
+        about = [x for said, sensor in pairs for x in (said.t, sensor, *said.metadata)]
         numbers = np.broadcast_to(np.array(about), (*self.state.runs, len(about)))
         return (*(said.value for said in told), numbers)
 
-    def gated(self, group: Heard, moments: Any, seen: Array, *rest: Array) -> Heard:
+    def gate(self, group: Received, moments: Any, seen: Array, *rest: Array) -> Received:
         """A group without the readings that the gate refuses.
 
         `moments` gives mean (*runs, G, M) and covariance of predictions (*runs, G, N, M) and what
         belongs to them, without the noise.
         """
-        if self.refused is None:
+        if self.rejected is None:
             return group
         # Opposite to a wild angle the branch of the observation would tear them apart.
-        mean, cov = moments(group.near(seen.copy(), seen[..., :1, :]), *rest)
-        group, refused = group.gated(mean, cov, self.filter.gate)
-        self.refused[..., group.agents] += refused
+        mean, cov = moments(group.wrap_near(seen.copy(), seen[..., :1, :]), *rest)
+        group, refused = group.gate(mean, cov, self.filter.gate_probability)
+        self.rejected[..., group.agents] += refused
         return group
 
-    def before(self, place: int, group: Heard, past: list[Array]) -> Array | None:
+    def before(self, place: int, group: Received, past: list[Array]) -> Array | None:
         """A group's members at the time before now, where a sensor sees changes.
 
         They are the last of the `past`, or those with which the step begins, if it has a length.
@@ -252,11 +252,11 @@ class Step:
         return (past or [self.state.belief])[-1][..., group.rows, :, :]
 
     @property
-    def agrees(self) -> bool:
+    def has_fusion(self) -> bool:
         """Whether there is an agreement, and somebody to agree with."""
-        return self.filter.agreement is not None and self.channel is not None
+        return self.filter.fusion is not None and self.channel is not None
 
-    def agreed(self, *values: Array) -> tuple[Array, ...]:
+    def fuse(self, *values: Array) -> tuple[Array, ...]:
         """Values (*runs, A, ...) after the agreement, if any; as they were in failed runs.
 
         >>> from distfilt.filters import EnsembleFilter
@@ -264,35 +264,35 @@ class Step:
         >>> from distfilt.network import graphs
         >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
         >>> f = EnsembleFilter(still, [None] * 2, graphs.path(2), members=4, lag=1,
-        ...                    agreement=lambda x, channel: np.multiply(x, 2.0, out=x))
+        ...                    fusion=lambda x, channel: np.multiply(x, 2.0, out=x))
         >>> state = f.step(f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [None] * 2)
         >>> bool(np.allclose(state.history[0][1], state.ensembles))
         True
         """
-        if not self.agrees or self.failed.all():
+        if not self.has_fusion or self.failed.all():
             return values
         good, door = tuple(np.argwhere(~self.failed)[0]), self.channel
         # What a run failed with may fail again: a good one stands in.
-        given = tuple([self.kept(v, v[good]).copy() for v in values])
+        given = tuple([self.keep_failed(v, v[good]).copy() for v in values])
         whole = np.arange(int(np.prod(self.state.runs))).reshape(self.state.runs)
         ledger, alone = door.ledger, list[Array]()
 
         def compute(*arrays: Any) -> tuple[Array, ...]:
             *belief, run, _, _ = arrays
-            channel = door.of(run, ledger)
-            out = self.filter.agreement(belief[0] if len(belief) == 1 else tuple(belief), channel)
+            channel = door.for_run(run, ledger)
+            out = self.filter.fusion(belief[0] if len(belief) == 1 else tuple(belief), channel)
             out = (out,) if len(belief) == 1 else tuple(out)
             if len(out) != len(belief):
-                raise ValueError(f"agreement: needs to return {len(belief)} arrays, got {len(out)}")
+                raise ValueError(f"fusion: needs to return {len(belief)} arrays, got {len(out)}")
             self.channel = channel
             alone.append(channel.ledger.lost)
-            return tuple(array(x, "agreement", v.shape) for x, v in zip(out, belief, strict=True))
+            return tuple(check_array(x, "fusion", v.shape) for x, v in zip(out, belief, strict=True))
 
-        out, errors = guarded(compute, (*given, whole), values, whole.ndim)
+        out, errors = run_isolated(compute, (*given, whole), values, whole.ndim)
         if self.channel.runs != whole.shape:  # asked alone, each lost messages of its own
-            self.channel = door.of(whole, self.channel.ledger.changed(lost=np.mean(alone, axis=0)))
-        self.settle(errors)
-        return tuple([self.kept(x, v) for x, v in zip(out, values, strict=True)])
+            self.channel = door.for_run(whole, self.channel.ledger.replace(lost=np.mean(alone, axis=0)))
+        self.record_failures(errors)
+        return tuple([self.keep_failed(x, v) for x, v in zip(out, values, strict=True)])
 
     def end(self, *, past: Iterable[Array] = (), **belief: Any) -> Any:
         """The state after the step; `past` has one entry for each of the earlier times."""
@@ -300,16 +300,16 @@ class Step:
         if isinstance(state, SensorState):
             if "history" not in belief:
                 belief["history"] = tuple(zip(self.times, past, strict=True))
-            belief |= {"failed": self.failed, "waiting": self.waiting}
+            belief |= {"failed": self.failed, "pending": self.pending}
         ledger = state.ledger if self.channel is None else self.channel.ledger
-        return type(state).unchecked(self.t, ledger, self.rng, refused=self.refused, **belief)
+        return type(state).construct(self.t, ledger, self.rng, rejected=self.rejected, **belief)
 
 
 _NOBODY = np.zeros((), dtype=bool)
 _NOTHING = np.zeros((0, 0))
 
 
-def guarded(
+def run_isolated(
     compute: Compute, arrays: tuple[Array, ...], fallback: tuple[Array, ...], lead: int, *,
     shared: Array = _NOTHING, rng: np.random.Generator | None = None,
 ) -> tuple[tuple[Array, ...], dict[Row, str]]:
@@ -323,7 +323,7 @@ def guarded(
     >>> def root(x, shared, rng):
     ...     return (np.linalg.cholesky(x),)
     >>> x = np.array([[[4.0]], [[-1.0]], [[9.0]]])
-    >>> out, errors = guarded(root, (x,), (x,), 1, shared=np.eye(1))
+    >>> out, errors = run_isolated(root, (x,), (x,), 1, shared=np.eye(1))
     >>> out[0].ravel(), errors
     (array([ 2., -1.,  3.]), {(1,): 'Matrix is not positive definite'})
     """
@@ -351,7 +351,7 @@ def guarded(
                 rng.bit_generator.state = at
             with suppress(*RECOVERABLE):
                 out = compute(*(a[where].reshape(a.shape) for a in arrays), shared, rng)
-        if of_the_call(error) and len(errors) == len(rows):
+        if is_argument_error(error) and len(errors) == len(rows):
             raise
     for got in out:
         errors |= _not_finite(got, lead, "result")
@@ -371,7 +371,7 @@ class _Unseeded(np.random.bit_generator.ISeedSequence):  # whose state comes fro
 _UNSEEDED = _Unseeded()
 
 
-def copied(rng: Any) -> Any:
+def copy_rng(rng: Any) -> Any:
     """A generator at the same place, in a seventh of the time that a deep copy takes."""
     if type(rng) is not np.random.Generator:
         return copy.deepcopy(rng)
@@ -381,7 +381,7 @@ def copied(rng: Any) -> Any:
     return np.random.Generator(bits)
 
 
-def of_the_call(error: Exception) -> bool:
+def is_argument_error(error: Exception) -> bool:
     """Whether an error tells of wrong arguments; numpy's LinAlgError is a ValueError too."""
     return isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError)
 

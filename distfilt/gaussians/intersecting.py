@@ -10,17 +10,17 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..doors import MISSING, Array, Mask, Weights, definite, door
+from ..validation import ALLOW_NAN, Array, Mask, Probabilities, check_positive_definite, validated
 from ..linalg import cholesky, leading, log_det, lower_root, solve_lower, symmetrise
 
-__all__ = ["intersection", "intersection_weights"]
+__all__ = ["intersect_gaussians", "intersection_weights"]
 
 
 def _definite_or_missing(value: Array, name: str) -> None:
-    definite(value[~np.isnan(value).any(axis=(-2, -1))], name)
+    check_positive_definite(value[~np.isnan(value).any(axis=(-2, -1))], name)
 
 
-Covs = Annotated[Array, "... S d d", MISSING, _definite_or_missing]
+Covs = Annotated[Array, "... S d d", ALLOW_NAN, _definite_or_missing]
 # How far the derivatives may be from the conditions of the optimum, relative to their mean.
 _GAP = 1e-7
 _STEPS = 60
@@ -28,9 +28,9 @@ _STEPS = 60
 _LEAST = 1e-30
 
 
-@door
-def intersection(
-    means: Annotated[Array, "... S d", MISSING], covs: Covs, weights: Annotated[Weights, "... S"]
+@validated
+def intersect_gaussians(
+    means: Annotated[Array, "... S d", ALLOW_NAN], covs: Covs, weights: Annotated[Probabilities, "... S"]
 ) -> tuple[Array, Array]:
     r"""Covariance intersection: the normalised weighted geometric mean of Gaussians.
 
@@ -68,7 +68,7 @@ def intersection(
 
     Examples
     --------
-    >>> mean, cov = intersection([[0.0], [3.0]], [[[1.0]], [[2.0]]], [0.5, 0.5])
+    >>> mean, cov = intersect_gaussians([[0.0], [3.0]], [[[1.0]], [[2.0]]], [0.5, 0.5])
     >>> mean.round(6), cov.round(6)
     (array([1.]), array([[1.333333]]))
     """
@@ -111,7 +111,7 @@ def _beside(left: Array, right: Array) -> Array:
     return np.concatenate([left, right], axis=-1)
 
 
-@door
+@validated
 def intersection_weights(
     covs: Covs, *,
     rule: Literal["equal", "trace", "determinant", "min_trace", "min_determinant"] = "equal",

@@ -7,14 +7,14 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import MISSING, Array, Cov, Mask, Semidefinite, all_finite, door
+from ..validation import ALLOW_NAN, Array, PositiveDefinite, Mask, PositiveSemidefinite, all_finite, validated
 from ..linalg import EPS, cholesky, leading, log_det, quadratic_form, solve_definite
 
-__all__ = ["conditioned", "log_density", "recolour", "unscented_points"]
+__all__ = ["condition", "log_density", "match_moments", "unscented_points"]
 
 
-@door
-def log_density(x: Annotated[Array, "... d"], mean: Annotated[Array, "... d"], cov: Cov) -> Array:
+@validated
+def log_density(x: Annotated[Array, "... d"], mean: Annotated[Array, "... d"], cov: PositiveDefinite) -> Array:
     r"""Logarithm of the Gaussian density, (...), relative to the volume in the state's units.
 
     .. math:: \log N(\mathbf x;\mathbf m,\mathbf P)=-\tfrac12\bigl(
@@ -39,9 +39,9 @@ def log_density(x: Annotated[Array, "... d"], mean: Annotated[Array, "... d"], c
     return np.asarray(-0.5 * (quadratic_form(lower, x - mean) + log_det(lower) + constant))
 
 
-@door
-def recolour(
-    ensemble: Annotated[Array, "... N d"], mean: Annotated[Array, "... d"], cov: Cov
+@validated
+def match_moments(
+    ensemble: Annotated[Array, "... N d"], mean: Annotated[Array, "... d"], cov: PositiveDefinite
 ) -> Array:
     r"""Move an ensemble affinely so that its sample mean and covariance are the given ones.
 
@@ -72,7 +72,7 @@ def recolour(
 
     Examples
     --------
-    >>> recolour([[0.0], [2.0]], [5.0], [[8.0]]).ravel()
+    >>> match_moments([[0.0], [2.0]], [5.0], [[8.0]]).ravel()
     array([3., 7.])
     """
     n, d = ensemble.shape[-2:]
@@ -102,10 +102,10 @@ def recolour(
     return np.asarray(out + mean[..., None, :])
 
 
-@door
-def conditioned(
-    mean: Annotated[Array, "... d"], cov: Semidefinite, gap: Annotated[Array, "... m", MISSING],
-    H: Annotated[Array, "... m d"], R: Annotated[Cov, "... m m"],
+@validated
+def condition(
+    mean: Annotated[Array, "... d"], cov: PositiveSemidefinite, gap: Annotated[Array, "... m", ALLOW_NAN],
+    H: Annotated[Array, "... m d"], R: Annotated[PositiveDefinite, "... m m"],
 ) -> tuple[Array, Array]:
     r"""Condition Gaussians on readings :math:`\mathbf y=\mathbf H\mathbf x+\text{noise}`.
 
@@ -132,7 +132,7 @@ def conditioned(
 
     Examples
     --------
-    >>> x, p = conditioned([0.0], [[1.0]], [2.0], [[1.0]], [[1.0]])
+    >>> x, p = condition([0.0], [[1.0]], [2.0], [[1.0]], [[1.0]])
     >>> x, p
     (array([1.]), array([[0.5]]))
     """
@@ -167,7 +167,7 @@ def joseph(cov: Array, gain: Array, H: Array, R: Array) -> Array:
     return np.asarray(0.5 * (after + after.mT))
 
 
-@door
+@validated
 def unscented_points(
     mean: Annotated[Array, "... d"], root: Annotated[Array, "... d d"], *, kappa: float = 0.0
 ) -> tuple[Array, Array]:

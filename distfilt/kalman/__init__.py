@@ -4,11 +4,11 @@ Filterpy's stand beside them as the reference. Extended and unscented filters ar
 :class:`distfilt.filters.GaussianFilter`, of one agent or of many.
 """
 
-from .linear import GaussianRun, kalman_filter, rts_smoother
-from .multiplicative import QuaternionChart, multiplicative_filter
+from .linear import FilterResult, kalman_filter, rts_smoother
+from .multiplicative import QuaternionChart, mekf
 from .reference import filterpy_ekf, filterpy_kf, filterpy_ukf
 
 __all__ = [  # fmt: skip
-    "GaussianRun", "QuaternionChart", "filterpy_ekf", "filterpy_kf", "filterpy_ukf",
-    "kalman_filter", "multiplicative_filter", "rts_smoother",
+    "FilterResult", "QuaternionChart", "filterpy_ekf", "filterpy_kf", "filterpy_ukf",
+    "kalman_filter", "mekf", "rts_smoother",
 ]

@@ -8,23 +8,23 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import MISSING, Array, Cov, Mask, Record, Semidefinite, door
+from ..validation import ALLOW_NAN, Array, PositiveDefinite, Mask, FrozenModel, PositiveSemidefinite, validated
 from ..gaussians.single import innovation, joseph
 from ..linalg import cholesky, leading, log_det, solve_lower, solve_upper, symmetrise
 from ..sensors import Sensor
 
-__all__ = ["GaussianRun", "kalman_filter", "rts_smoother"]
+__all__ = ["FilterResult", "kalman_filter", "rts_smoother"]
 
 Runs = tuple[int, ...]
 Mean = Annotated[Array, "... d"]
 Matrix = Annotated[Array, "... d d"]
 Seen = Annotated[Array, "... m d"]
-Noise = Annotated[Cov, "... m m"]
-Series = Annotated[Array, "... N m", MISSING]
+Noise = Annotated[PositiveDefinite, "... m m"]
+Series = Annotated[Array, "... N m", ALLOW_NAN]
 
 
 @dataclass(frozen=True, eq=False)
-class GaussianRun(Record):
+class FilterResult(FrozenModel):
     """What a filter with Gaussian output leaves behind.
 
     Parameters
@@ -55,10 +55,10 @@ class GaussianRun(Record):
         return int(self.means.shape[-1])
 
 
-@door
+@validated
 def kalman_filter(
-    mean: Mean, cov: Cov, observations: Series, *, F: Matrix, H: Seen, Q: Semidefinite, R: Noise
-) -> GaussianRun:
+    mean: Mean, cov: PositiveDefinite, observations: Series, *, F: Matrix, H: Seen, Q: PositiveSemidefinite, R: Noise
+) -> FilterResult:
     r"""Filter T observations of a linear Gaussian model, for any number of runs at once.
 
     The model is :math:`\mathbf x_k = \mathbf F_k\mathbf x_{k-1} + \text{noise}(\mathbf Q_k)`,
@@ -97,7 +97,7 @@ def kalman_filter(
     >>> run.means.ravel().round(4)
     array([0.7143, 0.7143, 1.5263])
     """
-    runs, y, x, p = flattened(mean, cov, observations)
+    runs, y, x, p = flatten_runs(mean, cov, observations)
     f, h, q, r = per_step(len(y), F=F, H=H, Q=Q, R=R)
     turned, missing = np.ascontiguousarray(f.mT), np.isnan(y)
     shared = cov.ndim == 2 and bool((missing == missing[:, :1]).all())
@@ -109,15 +109,15 @@ def kalman_filter(
         x, p = f[k] @ x, f[k] @ p @ turned[k] + q[k]
         gap = y[k] - h[k] @ x
         gap[missing[k]] = 0.0
-        move, p, density[k] = assimilated(p, gap, h[k], r[k], missing[k])
+        move, p, density[k] = assimilate(p, gap, h[k], r[k], missing[k])
         x = x + move
         means[k], covs[k] = x, p
     if not np.isfinite(means).all():
         raise np.linalg.LinAlgError("kalman_filter: needs matrices without overflow, got infinity")
-    return unflattened(means.mT, covs, density, runs)
+    return unflatten_runs(means.mT, covs, density, runs)
 
 
-def assimilated(cov: Array, gap: Array, H: Array, R: Array, missing: Mask) -> tuple[Array, ...]:
+def assimilate(cov: Array, gap: Array, H: Array, R: Array, missing: Mask) -> tuple[Array, ...]:
     """How innovations (..., m, k) move the mean, the covariance after it, and their log densities.
 
     An innovation is 0 where it is missing.
@@ -133,11 +133,11 @@ def assimilated(cov: Array, gap: Array, H: Array, R: Array, missing: Mask) -> tu
     return gain @ gap, joseph(cov, gain, H, R), -0.5 * (length + constant[..., None])
 
 
-@door
+@validated
 def rts_smoother(
-    run: GaussianRun, *, F: Annotated[Array, "... run.dim run.dim"],
-    Q: Annotated[Semidefinite, "... run.dim run.dim"]
-) -> GaussianRun:
+    run: FilterResult, *, F: Annotated[Array, "... run.dim run.dim"],
+    Q: Annotated[PositiveSemidefinite, "... run.dim run.dim"]
+) -> FilterResult:
     r"""States given all observations, backwards through a Kalman filter's run.
 
     With the forecast :math:`\mathbf P^-_{k+1} = \mathbf F\mathbf P_k\mathbf F^\top+\mathbf Q` and
@@ -149,7 +149,7 @@ def rts_smoother(
 
     Parameters
     ----------
-    run : GaussianRun
+    run : FilterResult
         What :func:`kalman_filter` left, with any number of runs and gaps. The result has its
         shapes and its log-likelihoods.
     F, Q : array_like, (d, d) or (T, d, d)
@@ -184,10 +184,10 @@ def rts_smoother(
         means[k] = x + (gain @ gap[..., None])[..., 0]
         kept = np.eye(run.dim) - gain @ f[k + 1]
         covs[k] = symmetrise(kept @ p @ kept.mT + gain @ (covs[k + 1] + q[k + 1]) @ gain.mT)
-    return run.changed(means=means, covariances=covs)
+    return run.replace(means=means, covariances=covs)
 
 
-def flattened(mean: Array, cov: Array, observations: Array) -> tuple[Runs, Array, Array, Array]:
+def flatten_runs(mean: Array, cov: Array, observations: Array) -> tuple[Runs, Array, Array, Array]:
     """The axes of all runs, with observations (T, R, m), means and covariances on one such axis.
 
     New run axes of observations come in front.
@@ -202,11 +202,11 @@ def flattened(mean: Array, cov: Array, observations: Array) -> tuple[Runs, Array
     return runs, y, x, p
 
 
-def unflattened(means: Array, covs: Array, density: Array, runs: Runs) -> GaussianRun:
+def unflatten_runs(means: Array, covs: Array, density: Array, runs: Runs) -> FilterResult:
     """What a filter found of all runs, (T, R, ...), with their axes apart."""
     steps = len(means)
     lead = runs if covs.shape[1] == math.prod(runs) else (1,) * len(runs)
-    return GaussianRun.unchecked(
+    return FilterResult.construct(
         means.reshape(steps, *runs, means.shape[-1]),
         covs.reshape(steps, *lead, *covs.shape[2:]),
         density.reshape(steps, *runs),

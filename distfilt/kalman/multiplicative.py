@@ -12,18 +12,18 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import Array, Count, Cov, Index, Record, Times, door, unchecked
+from ..validation import Array, PositiveInt, PositiveDefinite, NonNegativeInt, FrozenModel, Times, validated, unchecked
 from ..linalg import central
 from ..models import Model
-from ..models.satellite import left_directions, turn_between, turned
+from ..models.satellite import left_directions, rotation_vector_between, rotate
 from ..sensors import Sensor, stack
-from .linear import GaussianRun, Series, assimilated, flattened, grid, unflattened
+from .linear import FilterResult, Series, assimilate, flatten_runs, grid, unflatten_runs
 
-__all__ = ["QuaternionChart", "multiplicative_filter"]
+__all__ = ["QuaternionChart", "mekf"]
 
 
 @dataclass(frozen=True, eq=False)
-class QuaternionChart(Record):
+class QuaternionChart(FrozenModel):
     """How errors move a state with a quaternion among its components, and the rest as it is.
 
     The error's components are the state's, with the rotation vector of
@@ -45,8 +45,8 @@ class QuaternionChart(Record):
     array([1., 4., 4., 4.])
     """
 
-    dim: Count
-    first: Index
+    dim: PositiveInt
+    first: NonNegativeInt
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,17 +62,17 @@ class QuaternionChart(Record):
     def retract(self, x: Array, e: Array) -> Array:
         """Move states (..., d) by errors (..., k)."""
         at = self.first
-        turn = unchecked(turned)(x[..., at : at + 4], e[..., at : at + 3])
+        turn = unchecked(rotate)(x[..., at : at + 4], e[..., at : at + 3])
         before, behind = x[..., :at] + e[..., :at], x[..., at + 4 :] + e[..., at + 3 :]
         return np.concatenate([before, turn, behind], axis=-1)
 
     def local(self, x: Array, other: Array) -> Array:
         """The error that takes x to `other`, the inverse of `retract`."""
         at, gap = self.first, other - x
-        turn = unchecked(turn_between)(x[..., at : at + 4], other[..., at : at + 4])
+        turn = unchecked(rotation_vector_between)(x[..., at : at + 4], other[..., at : at + 4])
         return np.concatenate([gap[..., :at], turn, gap[..., at + 4 :]], axis=-1)
 
-    def directions(self, x: Array) -> Array:
+    def tangent_basis(self, x: Array) -> Array:
         """The derivative of `retract` at no error, (..., d, k)."""
         at = self.first
         out = np.zeros((*x.shape, self.error_dim))
@@ -81,26 +81,26 @@ class QuaternionChart(Record):
         out[..., at + 4 :, at + 3 :] = np.eye(self.dim - at - 4)
         return out
 
-    @door
+    @validated
     def project(
         self, x: Annotated[Array, "... self.dim"], cov: Annotated[Array, "... self.dim self.dim"]
     ) -> Array:
         """Covariance of the errors, (..., k, k), of states with covariance `cov`, (..., d, d)."""
-        inwards = self.inwards(x)
+        inwards = self.tangent_projection(x)
         return inwards @ cov @ inwards.mT
 
-    def inwards(self, x: Array) -> Array:
+    def tangent_projection(self, x: Array) -> Array:
         """The errors (..., k, d) of small moves of the state: the directions' pseudo-inverse."""
-        b = self.directions(x)
+        b = self.tangent_basis(x)
         return np.asarray(np.linalg.solve(b.mT @ b, b.mT))
 
 
-@door
-def multiplicative_filter(
+@validated
+def mekf(
     mean: Annotated[Array, "... model.dim"],
-    cov: Annotated[Cov, "... chart.error_dim chart.error_dim"], observations: Series, *,
+    cov: Annotated[PositiveDefinite, "... chart.error_dim chart.error_dim"], observations: Series, *,
     chart: QuaternionChart, model: Model, sensors: Sequence[Sensor], times: Times
-) -> GaussianRun:
+) -> FilterResult:
     r"""The extended Kalman filter on a chart's errors, over series of observations.
 
     With the directions B of the chart and their pseudo-inverse, the errors' transition is
@@ -142,12 +142,12 @@ def multiplicative_filter(
     Examples
     --------
     >>> from distfilt.models import satellite_pose
-    >>> from distfilt.sensors import direct
+    >>> from distfilt.sensors import component
     >>> x = np.r_[np.zeros(6), [0.3, 0.2, 0.1], [1.0, 0.0, 0.0, 0.0]]
-    >>> run = multiplicative_filter(
+    >>> run = mekf(
     ...     x, 0.01 * np.eye(12), np.zeros((1, 3)), chart=QuaternionChart(13, 9),
     ...     model=satellite_pose(rate=0.1, sigma=0.2, step=0.1),
-    ...     sensors=[direct([10, 11, 12], std=0.1)], times=[0.1])
+    ...     sensors=[component([10, 11, 12], std=0.1)], times=[0.1])
     >>> float((run.means[0, 9:] ** 2).sum().round(9)), run.covariances.shape
     (1.0, (1, 12, 12))
     """
@@ -155,7 +155,7 @@ def multiplicative_filter(
     if chart.dim != model.dim:
         raise ValueError(f"chart: needs {model.dim} components like the model, got {chart.dim}")
     clock = grid(times, observations, sensor)
-    runs, y, x, p = flattened(mean, cov, observations)
+    runs, y, x, p = flatten_runs(mean, cov, observations)
     means, covs = np.empty((len(y), *x.shape)), np.empty((len(y), *p.shape))
     density = np.empty(y.shape[:2])
     for n, t in enumerate(times):
@@ -164,7 +164,7 @@ def multiplicative_filter(
         except np.linalg.LinAlgError as error:
             raise np.linalg.LinAlgError(f"at t = {t:g}: {error}") from None
         means[n], covs[n] = x, p
-    return unflattened(means, covs, density, runs)
+    return unflatten_runs(means, covs, density, runs)
 
 
 def _step(
@@ -173,9 +173,9 @@ def _step(
 ) -> tuple[Array, Array, Array]:
     """Means (R, d), covariances (R, k, k) and log densities (R,) one reading later."""
     moved = _finite(unchecked(model.step)(x, t, dt))
-    inwards = chart.inwards(moved)
-    slope = inwards @ unchecked(model.jacobian)(x, t, dt) @ chart.directions(x)
-    joint = slope @ p @ slope.mT + inwards @ model.noise(t, dt) @ inwards.mT
+    inwards = chart.tangent_projection(moved)
+    slope = inwards @ unchecked(model.jacobian)(x, t, dt) @ chart.tangent_basis(x)
+    joint = slope @ p @ slope.mT + inwards @ model.Q(t, dt) @ inwards.mT
     previous = None
     if sensor.uses_previous:
         across, previous = slope @ p, x
@@ -184,7 +184,7 @@ def _step(
     missing = np.isnan(gap)
     h = _errors_seen(moved, previous, sensor, chart)
     h, gap = np.where(missing[..., None], 0.0, h), np.where(missing, 0.0, gap)
-    error, joint, density = assimilated(joint, gap[..., None], h, sensor.cov, missing)
+    error, joint, density = assimilate(joint, gap[..., None], h, sensor.noise_cov, missing)
     k = chart.error_dim
     return _finite(chart.retract(moved, error[:, :k, 0])), joint[:, :k, :k], density[:, 0]
 
@@ -198,7 +198,7 @@ def _finite(x: Array) -> Array:
 
 def _errors_seen(x: Array, previous: Array | None, sensor: Sensor, chart: QuaternionChart) -> Array:
     """How a sensor sees the errors (R, m, k), of the previous state too if it uses it."""
-    slope = unchecked(sensor.jacobian)(x, previous) @ chart.directions(x)
+    slope = unchecked(sensor.jacobian)(x, previous) @ chart.tangent_basis(x)
     if previous is None:
         return np.asarray(slope)
 
@@ -206,4 +206,4 @@ def _errors_seen(x: Array, previous: Array | None, sensor: Sensor, chart: Quater
         return unchecked(sensor.predict)(np.broadcast_to(x[:, None], v.shape), v)
 
     back = central(of_previous, previous, difference=unchecked(sensor.residual))
-    return np.concatenate([slope, back @ chart.directions(previous)], axis=-1)
+    return np.concatenate([slope, back @ chart.tangent_basis(previous)], axis=-1)

@@ -17,32 +17,32 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from ..doors import Array, Cov, Mask, Semidefinite, Times, door, needed
+from ..validation import Array, PositiveDefinite, Mask, PositiveSemidefinite, Times, validated, import_optional
 from ..models import Model
 from ..sensors import Sensor, stack
 from .linear import (
-    GaussianRun,
+    FilterResult,
     Matrix,
     Mean,
     Noise,
     Seen,
     Series,
-    flattened,
+    flatten_runs,
     grid,
     per_step,
-    unflattened,
+    unflatten_runs,
 )
 
 __all__ = ["filterpy_ekf", "filterpy_kf", "filterpy_ukf"]
 
 State = Annotated[Array, "... model.dim"]
-Spread = Annotated[Cov, "... model.dim model.dim"]
+Spread = Annotated[PositiveDefinite, "... model.dim model.dim"]
 
 
-@door
+@validated
 def filterpy_kf(
-    mean: Mean, cov: Cov, observations: Series, *, F: Matrix, H: Seen, Q: Semidefinite, R: Noise
-) -> GaussianRun:
+    mean: Mean, cov: PositiveDefinite, observations: Series, *, F: Matrix, H: Seen, Q: PositiveSemidefinite, R: Noise
+) -> FilterResult:
     """Filterpy's Kalman filter over a series: arguments and result of :func:`kalman_filter`.
 
     Parameters
@@ -64,29 +64,29 @@ def filterpy_kf(
         if seen.any():
             kf.update(z[seen], H=h[k][seen], R=r[k][np.ix_(seen, seen)])
 
-    make = partial(needed("filterpy.kalman", "reference").KalmanFilter, dim_x=d, dim_z=m)
+    make = partial(import_optional("filterpy.kalman", "reference").KalmanFilter, dim_x=d, dim_z=m)
     return _over_runs(mean, cov, observations, make, step)
 
 
-@door
+@validated
 def filterpy_ekf(
     mean: State, cov: Spread, observations: Series, *, model: Model, sensors: Sequence[Sensor],
     times: Times
-) -> GaussianRun:
+) -> FilterResult:
     r"""Filterpy's extended Kalman filter over a series: linearise the model and the sensors.
 
     Parameters
     ----------
     mean, cov, observations, model, sensors, times
-        As for :func:`~distfilt.kalman.multiplicative_filter`, with the state's covariance, and
+        As for :func:`~distfilt.kalman.mekf`, with the state's covariance, and
         sensors of the present state.
 
     Examples
     --------
-    >>> from distfilt.sensors import direct
+    >>> from distfilt.sensors import component
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
     >>> run = filterpy_ekf([0.0], [[1.0]], [[3.0]], model=walk,
-    ...                    sensors=[direct([0], std=1.0)], times=[1.0])
+    ...                    sensors=[component([0], std=1.0)], times=[1.0])
     >>> run.means.round(6)
     array([[2.]])
     """
@@ -94,25 +94,25 @@ def filterpy_ekf(
 
     def step(kf: Any, k: int, z: Array, seen: Mask) -> None:
         t, dt = float(clock[k]), float(clock[k + 1] - clock[k])
-        kf.F, kf.Q = model.jacobian(kf.x, t, dt), model.noise(t, dt)
+        kf.F, kf.Q = model.jacobian(kf.x, t, dt), model.Q(t, dt)
         moved = model.step(kf.x, t, dt)
         kf.predict()
         kf.x = moved  # filterpy moves the mean with F; the model itself is the better step
         if seen.any():
             # It gets residuals, which the sensor wraps, in place of readings.
             gap, h = sensor.residual(z, sensor.predict(moved))[seen], sensor.jacobian(moved)[seen]
-            kf.update(gap, lambda x: h, lambda x: 0 * gap, sensor.cov[np.ix_(seen, seen)])
+            kf.update(gap, lambda x: h, lambda x: 0 * gap, sensor.noise_cov[np.ix_(seen, seen)])
 
-    make = needed("filterpy.kalman", "reference").ExtendedKalmanFilter
+    make = import_optional("filterpy.kalman", "reference").ExtendedKalmanFilter
     make = partial(make, dim_x=model.dim, dim_z=sensor.dim)
     return _over_runs(mean, cov, observations, make, step)
 
 
-@door
+@validated
 def filterpy_ukf(
     mean: State, cov: Spread, observations: Series, *, model: Model, sensors: Sequence[Sensor],
     times: Times
-) -> GaussianRun:
+) -> FilterResult:
     r"""Filterpy's unscented Kalman filter over a series: 2d + 1 points instead of derivatives.
 
     The points lie :math:`\sqrt{d+1}` standard deviations from the mean.
@@ -124,15 +124,15 @@ def filterpy_ukf(
 
     Examples
     --------
-    >>> from distfilt.sensors import direct
+    >>> from distfilt.sensors import component
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
     >>> run = filterpy_ukf([0.0], [[1.0]], [[3.0]], model=walk,
-    ...                    sensors=[direct([0], std=1.0)], times=[1.0])
+    ...                    sensors=[component([0], std=1.0)], times=[1.0])
     >>> run.means.round(6)
     array([[2.]])
     """
     sensor, clock = _present(sensors, times, observations)
-    filterpy = needed("filterpy.kalman", "reference")
+    filterpy = import_optional("filterpy.kalman", "reference")
 
     def make() -> Any:
         points = filterpy.MerweScaledSigmaPoints(model.dim, 1.0, 0.0, 1.0)
@@ -140,7 +140,7 @@ def filterpy_ukf(
 
     def step(kf: Any, k: int, z: Array, seen: Mask) -> None:
         t, dt = float(clock[k]), float(clock[k + 1] - clock[k])
-        kf.Q = model.noise(t, dt)
+        kf.Q = model.Q(t, dt)
         # filterpy asks for one sigma point after the other; all of them are moved in one call.
         moved = iter(model.step(kf.points_fn.sigma_points(kf.x, kf.P), t, dt))
         kf.predict(dt, fx=lambda x, dt: next(moved))
@@ -152,7 +152,7 @@ def filterpy_ukf(
             middle = kf.Wm @ h
             near = middle + sensor.residual(z, middle)
             rows = iter(h[:, seen])
-            kf.update(near[seen], R=sensor.cov[np.ix_(seen, seen)], hx=lambda x: next(rows))
+            kf.update(near[seen], R=sensor.noise_cov[np.ix_(seen, seen)], hx=lambda x: next(rows))
 
     return _over_runs(mean, cov, observations, make, step)
 
@@ -168,9 +168,9 @@ def _present(sensors: Sequence[Sensor], times: Array, observations: Array) -> tu
 def _over_runs(
     mean: Array, cov: Array, observations: Array, make: Callable[[], Any],
     step: Callable[[Any, int, Array, Mask], None],
-) -> GaussianRun:
+) -> FilterResult:
     """Run one of filterpy's objects over every run and every step."""
-    runs, y, x, p = flattened(mean, cov, observations)
+    runs, y, x, p = flatten_runs(mean, cov, observations)
     means, covs = np.empty((len(y), *x.shape)), np.empty((len(y), *p.shape))
     density = np.zeros(y.shape[:2])
     for run in range(len(x)):
@@ -184,4 +184,4 @@ def _over_runs(
                 density[k, run] = kf.log_likelihood
     if not np.isfinite(means).all():
         raise np.linalg.LinAlgError("filterpy's filter ended in NaN")
-    return unflattened(means, covs, density, runs)
+    return unflatten_runs(means, covs, density, runs)

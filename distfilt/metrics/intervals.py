@@ -7,7 +7,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import Array, Bounds, Count, door
+from ..validation import Array, Bounds, PositiveInt, validated
 
 __all__ = ["Interval", "mean_interval", "median_interval", "proportion_interval"]
 
@@ -47,7 +47,7 @@ class Interval:
         return f"{self.estimate:.3g} [{self.low:.3g}, {self.high:.3g}]"
 
 
-@door
+@validated
 def mean_interval(values: Values, *, level: Level = 0.95) -> Interval:
     """Student's t interval for the mean of independent values, with the standard error s/√n.
 
@@ -73,7 +73,7 @@ def mean_interval(values: Values, *, level: Level = 0.95) -> Interval:
     return Interval(middle, middle - half, middle + half, error)
 
 
-@door
+@validated
 def median_interval(values: Values, *, level: Level = 0.95) -> Interval:
     """Interval for the median that assumes nothing about the distribution.
 
@@ -107,9 +107,9 @@ def median_interval(values: Values, *, level: Level = 0.95) -> Interval:
     return Interval(float(np.median(v)), low, high, error)
 
 
-@door
+@validated
 def proportion_interval(
-    successes: Annotated[int, Bounds(at_least=0)], trials: Count, *, level: Level = 0.95
+    successes: Annotated[int, Bounds(at_least=0)], trials: PositiveInt, *, level: Level = 0.95
 ) -> Interval:
     """Clopper-Pearson interval for a probability: it covers with at least `level`, for every n.
 

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import Array, Bounds, Count, Cov, Weights, door, unchecked
+from ..validation import Array, Bounds, PositiveInt, PositiveDefinite, Probabilities, validated, unchecked
 from ..ensembles import Members
 from ..gaussians import log_density
 from ..linalg import cholesky, leading, quadratic_form
@@ -23,7 +23,7 @@ __all__ = ["crps", "gaussian_crps", "log_score", "nees", "nees_band", "nis", "sq
 Vector = Annotated[Array, "... d"]
 
 
-@door
+@validated
 def squared_error(estimate: Vector, truth: Vector) -> Array:
     r"""Squared length of the error, :math:`\lVert\hat{\mathbf x}-\mathbf x\rVert^2`.
 
@@ -43,8 +43,8 @@ def squared_error(estimate: Vector, truth: Vector) -> Array:
     return np.asarray(((estimate - truth) ** 2).sum(axis=-1))
 
 
-@door
-def nees(estimate: Vector, cov: Cov, truth: Vector) -> Array:
+@validated
+def nees(estimate: Vector, cov: PositiveDefinite, truth: Vector) -> Array:
     r"""Normalised estimation error squared, (...).
 
     :math:`\epsilon = (\hat{\mathbf x}-\mathbf x)^\top\mathbf P^{-1}(\hat{\mathbf x}-\mathbf x)`. If
@@ -72,8 +72,8 @@ def nees(estimate: Vector, cov: Cov, truth: Vector) -> Array:
     return unchecked(nis)(estimate - truth, cov)
 
 
-@door
-def nis(innovation: Annotated[Array, "... m"], cov: Annotated[Cov, "... m m"]) -> Array:
+@validated
+def nis(innovation: Annotated[Array, "... m"], cov: Annotated[PositiveDefinite, "... m m"]) -> Array:
     r"""Normalised innovation squared, (...): how far a reading is from its prediction.
 
     :math:`\mathbf d^\top\mathbf S^{-1}\mathbf d`. Of an honest filter it is chi-square with m
@@ -97,9 +97,9 @@ def nis(innovation: Annotated[Array, "... m"], cov: Annotated[Cov, "... m m"]) -
     return quadratic_form(cholesky(cov), innovation)
 
 
-@door
+@validated
 def nees_band(
-    dim: Count, count: Count, *, level: Level = 0.95, normalised: bool = False
+    dim: PositiveInt, count: PositiveInt, *, level: Level = 0.95, normalised: bool = False
 ) -> Interval:
     r"""Where the average of independent NEES values of an honest filter falls.
 
@@ -140,9 +140,9 @@ def nees_band(
     return Interval(middle, low, high, float(np.sqrt(2 * total)) / unit)
 
 
-@door
+@validated
 def crps(
-    ensemble: Members, truth: Vector, *, weights: Annotated[Weights, "... N"] | None = None
+    ensemble: Members, truth: Vector, *, weights: Annotated[Probabilities, "... N"] | None = None
 ) -> Array:
     r"""Continuous ranked probability score (..., d) of an ensemble by component; smaller is better.
 
@@ -186,7 +186,7 @@ def crps(
     return np.asarray((share * (np.abs(gap) - above * gap)).sum(axis=-2))
 
 
-@door
+@validated
 def gaussian_crps(
     mean: Annotated[Array, "..."], std: Annotated[Array, "...", Bounds(above=0)],
     truth: Annotated[Array, "..."],
@@ -219,8 +219,8 @@ def gaussian_crps(
     return np.asarray(std * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi)))
 
 
-@door
-def log_score(estimate: Vector, cov: Cov, truth: Vector) -> Array:
+@validated
+def log_score(estimate: Vector, cov: PositiveDefinite, truth: Vector) -> Array:
     r"""Minus the log-density of a Gaussian estimate at the truth, (...); smaller is better.
 
     It rewards a small error and a covariance that fits, of all components together. The score of

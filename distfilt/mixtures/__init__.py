@@ -1,15 +1,15 @@
 """Gaussian mixtures: densities, fusion of a shared part of the state, reduction, divergences."""
 
-from .agreement import average, fuse, fuse_in_turn, fuse_moments, target_fusion
+from .agreement import average_mixtures, fuse_mixtures, fuse_sequentially, fuse_moments, target_fusion
 from .divergence import Divergence, jeffreys_by_sampling, jeffreys_of_many
 from .fusion import PartialFusion, nonnegative_least_squares, tikhonov
 from .gaussian import GaussianMixture
-from .reduction import Shapes, cross_relevance, kept_by_relevance, merge_costs, pivoted_qr, runnalls
-from .splitting import split, split_library, stretching
+from .reduction import ComponentShapes, cross_relevance, merge_irrelevant, merge_costs, pivoted_qr, runnalls
+from .splitting import split_components, split_library, nonlinearity
 
 __all__ = [  # fmt: skip
-    "Divergence", "GaussianMixture", "PartialFusion", "Shapes", "average", "cross_relevance",
-    "fuse", "fuse_in_turn", "fuse_moments", "jeffreys_by_sampling", "jeffreys_of_many",
-    "kept_by_relevance", "merge_costs", "nonnegative_least_squares", "pivoted_qr", "runnalls",
-    "split", "split_library", "stretching", "target_fusion", "tikhonov",
+    "Divergence", "GaussianMixture", "PartialFusion", "ComponentShapes", "average_mixtures", "cross_relevance",
+    "fuse_mixtures", "fuse_sequentially", "fuse_moments", "jeffreys_by_sampling", "jeffreys_of_many",
+    "merge_irrelevant", "merge_costs", "nonnegative_least_squares", "pivoted_qr", "runnalls",
+    "split_components", "split_library", "nonlinearity", "target_fusion", "tikhonov",
 ]

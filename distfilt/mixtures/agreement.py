@@ -7,20 +7,20 @@ from typing import Literal
 
 import numpy as np
 
-from ..doors import Count, Share, door, unchecked
+from ..validation import PositiveInt, UnitInterval, validated, unchecked
 from ..linalg import log_sum
-from ..network import Channel, fuses
+from ..network import Channel, fusion_rule
 from .fusion import Exponents, Others, PartialFusion, Rule, Terms
-from .gaussian import GaussianMixture, joined, regression
+from .gaussian import GaussianMixture, assemble_joint, regression
 from .reduction import runnalls
 
-__all__ = ["average", "fuse", "fuse_in_turn", "fuse_moments", "target_fusion"]
+__all__ = ["average_mixtures", "fuse_mixtures", "fuse_sequentially", "fuse_moments", "target_fusion"]
 
 
-@door
-def fuse(
-    own: GaussianMixture, heard: Others, *, omega: Exponents = "equal", terms: Terms = "matched",
-    rule: Rule = "C3", size: Count | None = None,
+@validated
+def fuse_mixtures(
+    own: GaussianMixture, received: Others, *, omega: Exponents = "equal", terms: Terms = "matched",
+    rule: Rule = "C3", n_components: PositiveInt | None = None,
 ) -> GaussianMixture:
     """Fuse a belief about [target; ego] with others' beliefs about the target.
 
@@ -38,19 +38,19 @@ def fuse(
     Examples
     --------
     >>> own = GaussianMixture.gaussian([0.0, 0.0], [[2.0, 1.0], [1.0, 1.0]])
-    >>> fuse(own, own.marginal([0])).covs.round(6).tolist()
+    >>> fuse_mixtures(own, own.marginal([0])).covs.round(6).tolist()
     [[[2.0, 1.0], [1.0, 1.0]]]
     """
-    exact = PartialFusion(own, heard, omega=omega)
+    exact = PartialFusion(own, received, omega=omega)
     fused = own
     if exact.exponents[0] != 1:
-        fused = unchecked(exact.weigh)(unchecked(exact.shapes)(terms=terms), rule=rule)
-    return fused if size is None else unchecked(runnalls)(fused, size)
+        fused = unchecked(exact.assign_weights)(unchecked(exact.component_shapes)(terms=terms), rule=rule)
+    return fused if n_components is None else unchecked(runnalls)(fused, n_components)
 
 
-@door
+@validated
 def fuse_moments(
-    own: GaussianMixture, heard: Others, *, omega: Exponents = "equal"
+    own: GaussianMixture, received: Others, *, omega: Exponents = "equal"
 ) -> GaussianMixture:
     """Factorised covariance intersection: fuse the Gaussians that have the mixtures' moments.
 
@@ -70,15 +70,15 @@ def fuse_moments(
     >>> fuse_moments(own, GaussianMixture.gaussian([3.0], [[1.0]])).means.round(6)
     array([[2.]])
     """
-    others = PartialFusion(own, heard, omega=omega).others
-    alone = PartialFusion(own.collapsed(), [m.collapsed() for m in others], omega=omega)
-    return unchecked(alone.shapes)().equally_weighed()
+    others = PartialFusion(own, received, omega=omega).others
+    alone = PartialFusion(own.moment_match(), [m.moment_match() for m in others], omega=omega)
+    return unchecked(alone.component_shapes)().with_equal_weights()
 
 
-@door
-def fuse_in_turn(
-    own: GaussianMixture, heard: Others, *, omega: Share | Literal["equal"] = "equal",
-    pair: Callable[..., GaussianMixture] = fuse,
+@validated
+def fuse_sequentially(
+    own: GaussianMixture, received: Others, *, omega: UnitInterval | Literal["equal"] = "equal",
+    pair: Callable[..., GaussianMixture] = fuse_mixtures,
 ) -> GaussianMixture:
     """Fuse what is heard one belief after another: fewer mixands at a time than in one pass.
 
@@ -98,18 +98,18 @@ def fuse_in_turn(
     --------
     >>> ends = [GaussianMixture.gaussian([m], [[1.0]]) for m in (3.0, 6.0)]
     >>> own = GaussianMixture.gaussian([0.0], [[1.0]])
-    >>> fuse_in_turn(own, ends).means.round(9)
+    >>> fuse_sequentially(own, ends).means.round(9)
     array([[3.]])
-    >>> fuse_in_turn(own, ends, omega=0.5).means.round(9)
+    >>> fuse_sequentially(own, ends, omega=0.5).means.round(9)
     array([[3.75]])
     """
-    for m, other in enumerate(PartialFusion(own, heard).others, start=1):
+    for m, other in enumerate(PartialFusion(own, received).others, start=1):
         own = pair(own, other, omega=m / (m + 1) if isinstance(omega, str) else omega)
     return own
 
 
-@door
-def average(own: GaussianMixture, heard: GaussianMixture, *, omega: Share = 0.5) -> GaussianMixture:
+@validated
+def average_mixtures(own: GaussianMixture, received: GaussianMixture, *, omega: UnitInterval = 0.5) -> GaussianMixture:
     r"""Arithmetic average of the target beliefs, with the own conditional belief about the rest.
 
     :math:`p(\mathbf e|\mathbf t)\,[\omega\,p(\mathbf t)+(1-\omega)\,p_b(\mathbf t)]`. The weights
@@ -126,32 +126,32 @@ def average(own: GaussianMixture, heard: GaussianMixture, *, omega: Share = 0.5)
     Examples
     --------
     >>> own = GaussianMixture.gaussian([0.0, 0.0], [[1.0, 0.5], [0.5, 1.0]])
-    >>> average(own, GaussianMixture.gaussian([2.0], [[1.0]])).mean
+    >>> average_mixtures(own, GaussianMixture.gaussian([2.0], [[1.0]])).mean
     array([1. , 0.5])
     """
-    target, n = PartialFusion(own, heard).target, heard.dim
-    logs = target.log_weights + unchecked(target.component_log_densities)(heard.means)
+    target, n = PartialFusion(own, received).target, received.dim
+    logs = target.log_weights + unchecked(target.component_log_densities)(received.means)
     share = np.exp(logs - log_sum(logs))
     gain, rest = regression(own, n)
-    gap = heard.means[:, None] - own.means[:, :n]
+    gap = received.means[:, None] - own.means[:, :n]
     ego = own.means[:, n:] + (gain @ gap[..., None])[..., 0]
-    told = np.broadcast_to(heard.means[:, None], gap.shape)
+    told = np.broadcast_to(received.means[:, None], gap.shape)
     means = np.concatenate([told, ego], axis=-1)
-    covs = joined(heard.covs[:, None], gain, rest)
-    new = (heard.weights[:, None] * share).ravel() * (1 - omega)
+    covs = assemble_joint(received.covs[:, None], gain, rest)
+    new = (received.weights[:, None] * share).ravel() * (1 - omega)
     d, keep = own.dim, new > 0
-    return GaussianMixture.unchecked(
+    return GaussianMixture.construct(
         np.concatenate([omega * own.weights, new[keep]]),
         np.concatenate([own.means, means.reshape(-1, d)[keep]]),
         np.concatenate([own.covs, covs.reshape(-1, d, d)[keep]]),
     )
 
 
-@fuses("mixtures")
-@door
+@fusion_rule("mixtures")
+@validated
 def target_fusion(
-    beliefs: Sequence[GaussianMixture], channel: Channel, *, target_dim: Count,
-    fuse: Callable[..., GaussianMixture] = fuse,
+    beliefs: Sequence[GaussianMixture], channel: Channel, *, target_dim: PositiveInt,
+    fuse: Callable[..., GaussianMixture] = fuse_mixtures,
 ) -> tuple[GaussianMixture, ...]:
     """Every agent sends what it believes of the target, and fuses its belief with what arrives.
 
@@ -168,7 +168,7 @@ def target_fusion(
         How many components, n, the first of every state, are the target's.
     fuse : callable
         ``fuse(own, heard) -> mixture``, such as :func:`fuse`, :func:`fuse_moments` and
-        :func:`fuse_in_turn`.
+        :func:`fuse_sequentially`.
 
     Returns
     -------
@@ -189,7 +189,7 @@ def target_fusion(
     """
     said = [belief.marginal(range(target_dim)).pack() for belief in beliefs]
     unpack, out = unchecked(GaussianMixture.unpack), list(beliefs)
-    for agent, told in enumerate(channel.exchange(said)):
+    for agent, told in enumerate(channel.broadcast(said)):
         try:
             if told:
                 out[agent] = fuse(out[agent], [unpack(part) for part in told.values()])

@@ -11,12 +11,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..doors import Array, unchecked
+from ..validation import Array, unchecked
 from ..gaussians.single import unscented_points
 from ..linalg import cholesky, log_det, lower_root, quadratic_form
 from .gaussian import GaussianMixture
 
-__all__ = ["moved", "updated", "within_gate"]
+__all__ = ["propagate_mixture", "update_mixture", "within_gate"]
 
 _LOG_2PI = float(np.log(2 * np.pi))
 # Square of the step, in units of the variance.
@@ -25,7 +25,7 @@ _STEP = 3.0
 _NOTHING = 1e-9
 
 
-def moved(
+def propagate_mixture(
     mixture: GaussianMixture, function: Callable[[Array], Array], noise_factor: Array
 ) -> GaussianMixture:
     """The mixture after a function and added noise, mixand by mixand.
@@ -41,7 +41,7 @@ def moved(
     Examples
     --------
     >>> one = GaussianMixture.gaussian([1.0], [[0.25]])
-    >>> after = moved(one, lambda x: x**2, np.zeros((1, 1)))
+    >>> after = propagate_mixture(one, lambda x: x**2, np.zeros((1, 1)))
     >>> after.means, after.covs.round(6)  # E x² = 1.25, and its variance 4 m² P + 2 P²
     (array([[1.25]]), array([[[1.125]]]))
     """
@@ -51,7 +51,7 @@ def moved(
     return _of_roots(mixture.weights, means, _root(first, second, noise_factor))
 
 
-def updated(
+def update_mixture(
     mixture: GaussianMixture, observed: Array, function: Callable[[Array], Array], noise: Array, *,
     residual: Callable[[Array, Array], Array] = np.subtract,
 ) -> GaussianMixture:
@@ -79,7 +79,7 @@ def updated(
     Examples
     --------
     >>> two = GaussianMixture([0.5, 0.5], [[-2.0], [2.0]], [[[1.0]], [[1.0]]])
-    >>> after = updated(two, np.ones(1), lambda x: x, np.eye(1))
+    >>> after = update_mixture(two, np.ones(1), lambda x: x, np.eye(1))
     >>> after.means.ravel().round(6), after.weights.round(3)
     (array([-0.5,  1.5]), array([0.119, 0.881]))
     """
@@ -167,4 +167,4 @@ def _root(first: Array, second: Array, noise: Array) -> Array:
 
 def _of_roots(weights: Array, means: Array, factors: Array) -> GaussianMixture:
     """A mixture that keeps the square roots it came with."""
-    return GaussianMixture.unchecked(weights, means, factors @ factors.mT, factors=factors)
+    return GaussianMixture.construct(weights, means, factors @ factors.mT, factors=factors)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import Array, Bounds, Record, Rng, array, door, unchecked
+from ..validation import Array, Bounds, FrozenModel, Rng, check_array, validated, unchecked
 from .gaussian import GaussianMixture
 
 __all__ = ["Divergence", "jeffreys_by_sampling", "jeffreys_of_many"]
@@ -17,7 +17,7 @@ Several = Annotated[int, Bounds(at_least=2)]
 
 
 @dataclass(frozen=True)
-class Divergence(Record):
+class Divergence(FrozenModel):
     """An estimate of Jeffreys' divergence (44) with what it rests on.
 
     Parameters
@@ -40,7 +40,7 @@ class Divergence(Record):
         return f"{self.value:.3g} ± {self.error:.1g}"
 
 
-@door
+@validated
 def jeffreys_of_many(
     log_p: Callable[[Array], Array], log_qs: Sequence[Callable[[Array], Array]],
     lower: Annotated[Array, "d"], upper: Annotated[Array, "d"], *, nodes: Several = 50,
@@ -80,7 +80,7 @@ def jeffreys_of_many(
     # One slice of the first axis at a time; each density is rescaled when a larger value comes.
     for x, part in zip(front[:, 0], front_parts, strict=True):
         at = np.concatenate([np.full((points.shape[0], 1), x), points], axis=1)
-        logs = np.stack([array(f(at), "log_p, log_qs", at.shape[:1]) for f in functions])
+        logs = np.stack([check_array(f(at), "log_p, log_qs", at.shape[:1]) for f in functions])
         new = np.maximum(tops, logs.max(axis=1))
         mass = part * parts * np.exp(logs - new[:, None])
         sums *= np.exp(tops - new)[:, None]
@@ -100,7 +100,7 @@ def _tensor_grid(low: Array, high: Array, nodes: int) -> tuple[Array, Array]:
     return low + step * index, np.prod(np.where(ends, 0.5 * step, step), axis=1)
 
 
-@door
+@validated
 def jeffreys_by_sampling(
     log_p: Callable[[Array], Array], log_q: Callable[[Array], Array], proposal: GaussianMixture, *,
     members: Several, rng: Rng,
@@ -131,7 +131,7 @@ def jeffreys_by_sampling(
     """
     x = proposal.rvs(members, rng=rng)
     base = unchecked(proposal.log_density)(x)
-    logs = [array(f(x), name, base.shape) for f, name in ((log_p, "log_p"), (log_q, "log_q"))]
+    logs = [check_array(f(x), name, base.shape) for f, name in ((log_p, "log_p"), (log_q, "log_q"))]
     ratio = logs[0] - logs[1]
     weights = [np.exp(v - base - (v - base).max()) for v in logs]
     weights = [w / w.mean() for w in weights]

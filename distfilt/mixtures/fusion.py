@@ -20,16 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import svdvals
 
-from ..doors import Array, Bounds, Count, Mask, Record, Share, door, summing_to_one, unchecked
+from ..validation import Array, Bounds, PositiveInt, Mask, FrozenModel, UnitInterval, validated, check_probabilities, unchecked
 from ..gaussians.single import unscented_points
 from ..linalg import SolverError, log_sum, symmetrise
-from .gaussian import GaussianMixture, inverse, joined, regression
-from .reduction import Shapes
+from .gaussian import GaussianMixture, inverse, assemble_joint, regression
+from .reduction import ComponentShapes
 
 __all__ = ["PartialFusion", "nonnegative_least_squares", "tikhonov"]
 
 Others = GaussianMixture | Sequence[GaussianMixture]
-Exponents = Share | Literal["equal"] | Annotated[Array, "K", summing_to_one]
+Exponents = UnitInterval | Literal["equal"] | Annotated[Array, "K", check_probabilities]
 Terms = Literal["matched", "all"]
 Rule = Literal["C1", "C2", "C3", "points"]
 Condition = Annotated[float, Bounds(above=1, at_most=1e150)]
@@ -39,7 +39,7 @@ _FLOOR = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class PartialFusion(Record):
+class PartialFusion(FrozenModel):
     r"""The exact fused density, which can be evaluated but is no mixture, and its approximations.
 
     Parameters
@@ -57,13 +57,13 @@ class PartialFusion(Record):
     >>> own = GaussianMixture.gaussian([0.0, 0.0], [[2.0, 1.0], [1.0, 1.0]])
     >>> other = GaussianMixture.gaussian([3.0], [[1.0]])
     >>> exact = PartialFusion(own, other)
-    >>> fused = exact.weigh(exact.shapes())
+    >>> fused = exact.assign_weights(exact.component_shapes())
     >>> fused.means.round(4), fused.covs[0, 0, 0].round(4)
     (array([[2., 1.]]), np.float64(1.3333))
     """
 
     own: GaussianMixture
-    heard: Others
+    received: Others
     _: KW_ONLY
     omega: Exponents = "equal"
 
@@ -83,7 +83,7 @@ class PartialFusion(Record):
     @property
     def others(self) -> tuple[GaussianMixture, ...]:
         """What is heard, one or several."""
-        return (self.heard,) if isinstance(self.heard, GaussianMixture) else tuple(self.heard)
+        return (self.received,) if isinstance(self.received, GaussianMixture) else tuple(self.received)
 
     @cached_property
     def exponents(self) -> Array:
@@ -118,7 +118,7 @@ class PartialFusion(Record):
             raise ValueError(f"{name}: needs points whose density is a number, got one too far out")
         return logs
 
-    @door
+    @validated
     def log_value(self, x: Annotated[Array, "... self.own.dim"]) -> Array:
         """Logarithm of the fused density (14), not normalised, (...).
 
@@ -129,16 +129,16 @@ class PartialFusion(Record):
         logs = unchecked(self.own.log_density)(x)
         return self._with_update(logs, x[..., : self.target_dim], "x")
 
-    @door
+    @validated
     def log_target(self, t: Annotated[Array, "... self.target_dim"]) -> Array:
         """Logarithm of the fused target marginal, not normalised; it needs no ego state."""
         return self._with_update(unchecked(self.target.log_density)(t), t, "t")
 
-    @door
-    def shapes(
+    @validated
+    def component_shapes(
         self, *, terms: Terms = "matched", marginal: GaussianMixture | None = None,
         received: Sequence[GaussianMixture] | None = None,
-    ) -> Shapes:
+    ) -> ComponentShapes:
         """Means and covariances of the fused mixands, (22)-(28), without weights.
 
         By conditioning in the own mixand's whitened frame, which inverts nothing indefinite.
@@ -165,13 +165,13 @@ class PartialFusion(Record):
         wanted, got = [n] * len(self.others), [other.dim for other in sent]
         if got != wanted:
             raise ValueError(f"received: needs mixtures of dimensions {wanted}, got {got}")
-        pairs: NDArray[np.intp] = np.indices((self.own.size, divided.size)).reshape(2, -1)
+        pairs: NDArray[np.intp] = np.indices((self.own.n_components, divided.n_components)).reshape(2, -1)
         if terms == "matched":
-            pairs = np.repeat(np.arange(self.own.size)[None], 2, axis=0)
+            pairs = np.repeat(np.arange(self.own.n_components)[None], 2, axis=0)
         return _conditional(self.own, divided, sent, self.exponents, pairs)
 
-    @door
-    def weigh(self, shapes: Shapes, *, rule: Rule = "C3", at_most: Count = 500) -> GaussianMixture:
+    @validated
+    def assign_weights(self, shapes: ComponentShapes, *, rule: Rule = "C3", at_most: PositiveInt = 500) -> GaussianMixture:
         """The mixture of these shapes, with weights from the exact density at collocation points.
 
         Mixands whose weight is zero are left out.
@@ -189,15 +189,15 @@ class PartialFusion(Record):
         SolverError
             If no mixand has a weight, or least squares do not end.
         """
-        mixture = shapes.equally_weighed()
+        mixture = shapes.with_equal_weights()
         logs = self._at_means(shapes, alone=rule == "C1")
         if rule in ("C1", "C2"):
             return _weighed(mixture, logs)
-        if shapes.size > at_most:
+        if shapes.n_components > at_most:
             best = np.argsort(mixture.log_peaks - logs, kind="stable")[:at_most]
-            keep = np.isin(np.arange(shapes.size), best)
+            keep = np.isin(np.arange(shapes.n_components), best)
             shapes, logs = unchecked(shapes.select)(keep), logs[keep]
-            mixture = shapes.equally_weighed()
+            mixture = shapes.with_equal_weights()
         points = shapes.means
         if rule == "points":
             points = unchecked(unscented_points)(mixture.means, mixture.factors)[0]
@@ -212,7 +212,7 @@ class PartialFusion(Record):
         with np.errstate(divide="ignore"):
             return _weighed(mixture, np.log(found))
 
-    def _at_means(self, shapes: Shapes, *, alone: bool) -> Array:
+    def _at_means(self, shapes: ComponentShapes, *, alone: bool) -> Array:
         """Log density at the shapes' means, exact or with the mixand alone that each came from."""
         if not alone:
             return unchecked(self.log_value)(shapes.means)
@@ -231,7 +231,7 @@ def _weighed(mixture: GaussianMixture, logs: Array) -> GaussianMixture:
     w = np.exp(mass - total)
     keep = w > 0
     w = w[keep] / w[keep].sum()
-    return GaussianMixture.unchecked(w, mixture.means[keep], mixture.covs[keep])
+    return GaussianMixture.construct(w, mixture.means[keep], mixture.covs[keep])
 
 
 def _told(sent: Sequence[GaussianMixture], w: Array, about: Array) -> tuple[Array, Array]:
@@ -252,7 +252,7 @@ def _told(sent: Sequence[GaussianMixture], w: Array, about: Array) -> tuple[Arra
 def _conditional(
     own: GaussianMixture, divided: GaussianMixture, sent: Sequence[GaussianMixture], w: Array,
     pairs: NDArray[np.intp],
-) -> Shapes:  # fmt: skip
+) -> ComponentShapes:  # fmt: skip
     """Update the target part by Λ and η in the own mixand's whitened frame; e follows."""
     n = divided.dim
     q, p = pairs
@@ -265,17 +265,17 @@ def _conditional(
         pull = pull + (j @ gap[..., None])[:, None, :, 0]
     root = np.linalg.cholesky(own.covs[q, :n, :n])[:, None]
     # Where the own mixand is the divided one there is a factor; else it may be rounding's.
-    least = np.where((q == p) & (len(divided.means) == own.size), 1e-13, 1e-10)[:, None]
+    least = np.where((q == p) & (len(divided.means) == own.n_components), 1e-13, 1e-10)[:, None]
     lower, good = _factored(np.eye(n) + root.mT @ symmetrise(information) @ root, least)
     half = np.linalg.solve(lower, np.broadcast_to(root.mT, lower.shape))
     target = half.mT @ half
     move = (target @ pull[..., None])[..., 0]
     gain, rest = (part[q, None] for part in regression(own, n))
     shift = np.concatenate([move, (gain @ move[..., None])[..., 0]], axis=-1)
-    covs = joined(target, gain, rest)
+    covs = assemble_joint(target, gain, rest)
     source = np.broadcast_to(q[:, None], good.shape)
     means = own.means[q, None] + shift
-    return Shapes.unchecked(means[good], covs[good], source[good], int((~good).sum()))
+    return ComponentShapes.construct(means[good], covs[good], source[good], int((~good).sum()))
 
 
 def _factored(matrices: Array, least: Array) -> tuple[Array, Mask]:
@@ -293,7 +293,7 @@ def _factored(matrices: Array, least: Array) -> tuple[Array, Mask]:
     return lower, good
 
 
-@door
+@validated
 def tikhonov(
     largest: Annotated[float, Bounds(at_least=0, at_most=1e150)],
     smallest: Annotated[float, Bounds(at_least=0, at_most=1e150)], *, condition: Condition = 1e10,
@@ -324,7 +324,7 @@ def tikhonov(
     return float(np.sqrt(max(gap, 0.0) / (condition**2 - 1)))
 
 
-@door
+@validated
 def nonnegative_least_squares(
     matrix: Annotated[Array, "n s", Bounds(at_least=-1e150, at_most=1e150)],
     right: Annotated[Array, "n"], *, condition: Condition = 1e10,

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 
-from ..doors import Array, Count, Cov, Places, Record, Rng, definite, door, summing_to_one
+from ..validation import Array, PositiveInt, PositiveDefinite, DistinctIndices, FrozenModel, Rng, check_positive_definite, validated, check_probabilities
 from ..linalg import in_units, log_det, log_sum, symmetrise
 
 __all__ = ["GaussianMixture"]
@@ -20,7 +20,7 @@ _CHUNK = 60_000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class GaussianMixture(Record):
+class GaussianMixture(FrozenModel):
     r"""A weighted sum of Gaussian densities.
 
     .. math:: p(\mathbf x)=\sum_{\ell=1}^L w_\ell\,
@@ -52,13 +52,13 @@ class GaussianMixture(Record):
     array([[2.]])
     """
 
-    weights: Annotated[Array, "L", summing_to_one]
+    weights: Annotated[Array, "L", check_probabilities]
     means: Annotated[Array, "L d"]
-    covs: Annotated[Array, "L d d", definite]
+    covs: Annotated[Array, "L d d", check_positive_definite]
 
     @classmethod
-    @door
-    def gaussian(cls, mean: Annotated[Array, "d"], cov: Annotated[Cov, "d d"]) -> GaussianMixture:
+    @validated
+    def gaussian(cls, mean: Annotated[Array, "d"], cov: Annotated[PositiveDefinite, "d d"]) -> GaussianMixture:
         """A single Gaussian as a mixture of one mixand.
 
         Parameters
@@ -74,18 +74,18 @@ class GaussianMixture(Record):
         return cls(np.ones(1), mean[None], cov[None])
 
     @classmethod
-    def unchecked(cls, *args: Any, **options: Any) -> Self:
+    def construct(cls, *args: Any, **options: Any) -> Self:
         """Build one from what the library made itself, and freeze its arrays."""
-        out = super().unchecked(*args, **options)
+        out = super().construct(*args, **options)
         for part in (out.weights, out.means, out.covs):
             part.setflags(write=False)  # what is cached of them stays right
         return out
 
     def __repr__(self) -> str:
-        return f"GaussianMixture(size={self.size}, dim={self.dim})"
+        return f"GaussianMixture(size={self.n_components}, dim={self.dim})"
 
     @property
-    def size(self) -> int:
+    def n_components(self) -> int:
         """Number of mixands, L."""
         return int(self.weights.size)
 
@@ -119,7 +119,7 @@ class GaussianMixture(Record):
         """Logarithm of each mixand's largest density, -log sqrt|2 pi P|, (L,)."""
         return np.asarray(-0.5 * (log_det(self.factors) + self.dim * _LOG_2PI))
 
-    @door
+    @validated
     def component_log_densities(self, x: Annotated[Array, "... self.dim"]) -> Array:
         """Logarithm of each mixand's density, without its weight, (..., L).
 
@@ -127,9 +127,9 @@ class GaussianMixture(Record):
         ----------
         x : array_like, (..., d)
         """
-        return self._in_blocks(x, (self.size,), lambda logs: logs)
+        return self._in_blocks(x, (self.n_components,), lambda logs: logs)
 
-    @door
+    @validated
     def log_density(self, x: Annotated[Array, "... self.dim"]) -> Array:
         """Logarithm of the density, (...).
 
@@ -164,8 +164,8 @@ class GaussianMixture(Record):
         at = (white @ (self.means - centre)[..., None])[..., 0]
         return centre, np.array(white.reshape(-1, self.dim).T), at
 
-    @door
-    def marginal(self, indices: Places) -> GaussianMixture:
+    @validated
+    def marginal(self, indices: DistinctIndices) -> GaussianMixture:
         """The density of some components.
 
         Parameters
@@ -181,7 +181,7 @@ class GaussianMixture(Record):
         at = np.array(indices)
         if at.max() >= self.dim:
             raise ValueError(f"indices: needs integers below {self.dim}, got {at.max()}")
-        return self.unchecked(self.weights, self.means[:, at], self.covs[:, at[:, None], at])
+        return self.construct(self.weights, self.means[:, at], self.covs[:, at[:, None], at])
 
     @property
     def mean(self) -> Array:
@@ -199,12 +199,12 @@ class GaussianMixture(Record):
         """Mean (d,) and covariance (d, d) of the whole mixture."""
         return self.mean, self.cov
 
-    def collapsed(self) -> GaussianMixture:
+    def moment_match(self) -> GaussianMixture:
         """The one Gaussian that has the mixture's mean and covariance, as a mixture."""
-        return self.unchecked(np.ones(1), self.mean[None], self.cov[None])
+        return self.construct(np.ones(1), self.mean[None], self.cov[None])
 
-    @door
-    def rvs(self, size: Count, *, rng: Rng) -> Array:
+    @validated
+    def rvs(self, size: PositiveInt, *, rng: Rng) -> Array:
         """Draw `size` points, (size, d).
 
         Parameters
@@ -212,7 +212,7 @@ class GaussianMixture(Record):
         size : int
         rng : numpy.random.Generator
         """
-        which = rng.choice(self.size, size=size, p=self.weights / self.weights.sum())
+        which = rng.choice(self.n_components, size=size, p=self.weights / self.weights.sum())
         noise = rng.standard_normal((size, self.dim))
         return np.asarray(self.means[which] + (self.factors[which] @ noise[..., None])[..., 0])
 
@@ -222,7 +222,7 @@ class GaussianMixture(Record):
         return self.weights, self.means, self.covs[:, upper[0], upper[1]]
 
     @classmethod
-    @door
+    @validated
     def unpack(
         cls,
         payload: tuple[Annotated[Array, "L"], Annotated[Array, "L d"], Annotated[Array, "L m"]],
@@ -242,7 +242,7 @@ class GaussianMixture(Record):
         rows, columns = np.triu_indices(d)
         covs = np.empty((len(means), d, d))
         covs[:, rows, columns] = covs[:, columns, rows] = triangles
-        return cls.unchecked(weights.copy(), means.copy(), covs)
+        return cls.construct(weights.copy(), means.copy(), covs)
 
 
 def _collapsed(covs: Array) -> str:
@@ -269,7 +269,7 @@ def regression(own: GaussianMixture, n: int) -> tuple[Array, Array]:
     return gain, symmetrise(own.covs[:, n:, n:] - gain @ cross)
 
 
-def joined(target: Array, gain: Array, rest: Array) -> Array:
+def assemble_joint(target: Array, gain: Array, rest: Array) -> Array:
     """Covariances of [t; e] from that of t, the gain of e on t, and the covariance of e given t."""
     below = symmetrise(rest + gain @ target @ gain.mT)
     n = target.shape[-1]

@@ -12,12 +12,12 @@ from typing import Annotated, Any, Literal, cast
 import numpy as np
 from scipy.linalg import qr
 
-from ..doors import Array, Bounds, Count, Index, Indices, Mask, Record, definite, door, unchecked
+from ..validation import Array, Bounds, PositiveInt, NonNegativeInt, Indices, Mask, FrozenModel, check_positive_definite, validated, unchecked
 from ..linalg import symmetrise
 from .gaussian import GaussianMixture
 
 __all__ = [
-    "Shapes", "cross_relevance", "kept_by_relevance", "merge_costs", "pivoted_qr", "runnalls",
+    "ComponentShapes", "cross_relevance", "merge_irrelevant", "merge_costs", "pivoted_qr", "runnalls",
 ]  # fmt: skip
 
 # Divergence in nats up to which a mixand counts as near another's, whatever its weight.
@@ -27,7 +27,7 @@ _FLOOR = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class Shapes(Record):
+class ComponentShapes(FrozenModel):
     """Mixands before they are weighed.
 
     Parameters
@@ -42,22 +42,22 @@ class Shapes(Record):
 
     Examples
     --------
-    >>> Shapes([[0.0]], [[[1.0]]], [0]).size
+    >>> ComponentShapes([[0.0]], [[[1.0]]], [0]).n_components
     1
     """
 
     means: Annotated[Array, "s d"]
-    covs: Annotated[Array, "s d d", definite]
+    covs: Annotated[Array, "s d d", check_positive_definite]
     source: Annotated[Indices, "s", Bounds(at_least=0)]
-    dropped: Index = 0
+    dropped: NonNegativeInt = 0
 
     @property
-    def size(self) -> int:
+    def n_components(self) -> int:
         """Number of mixands, S."""
         return int(self.means.shape[0])
 
-    @door
-    def select(self, keep: Annotated[Mask, "self.size"]) -> Shapes:
+    @validated
+    def select(self, keep: Annotated[Mask, "self.size"]) -> ComponentShapes:
         """Some of the mixands, by a mask.
 
         Parameters
@@ -67,19 +67,19 @@ class Shapes(Record):
 
         Examples
         --------
-        >>> Shapes([[0.0], [1.0]], [[[1.0]], [[2.0]]], [0, 0]).select([False, True]).means
+        >>> ComponentShapes([[0.0], [1.0]], [[[1.0]], [[2.0]]], [0, 0]).select([False, True]).means
         array([[1.]])
         """
-        return self.unchecked(self.means[keep], self.covs[keep], self.source[keep], self.dropped)
+        return self.construct(self.means[keep], self.covs[keep], self.source[keep], self.dropped)
 
-    def equally_weighed(self) -> GaussianMixture:
+    def with_equal_weights(self) -> GaussianMixture:
         """A mixture of these mixands with equal weights."""
-        return GaussianMixture.unchecked(np.full(self.size, 1 / self.size), self.means, self.covs)
+        return GaussianMixture.construct(np.full(self.n_components, 1 / self.n_components), self.means, self.covs)
 
 
-@door
+@validated
 def runnalls(
-    mixture: GaussianMixture, size: Count, *, heaviest: Count | None = None
+    mixture: GaussianMixture, n_components: PositiveInt, *, heaviest: PositiveInt | None = None
 ) -> GaussianMixture:
     r"""Merge, pair by pair, the mixands whose merger may lose least, until `size` are left.
 
@@ -113,20 +113,20 @@ def runnalls(
     array([[0.2],
            [8.8]])
     """
-    if heaviest is not None and heaviest < size:
-        raise ValueError(f"heaviest: needs an integer of at least size, {size}, got {heaviest}")
-    if heaviest is not None and heaviest < mixture.size:
+    if heaviest is not None and heaviest < n_components:
+        raise ValueError(f"heaviest: needs an integer of at least size, {n_components}, got {heaviest}")
+    if heaviest is not None and heaviest < mixture.n_components:
         mixture = _absorbed(mixture, heaviest)
-    if mixture.size <= size:
+    if mixture.n_components <= n_components:
         return mixture
     w, m, p, root = _whitened(mixture)
-    alive = _merging()(w, m, p, size)
+    alive = _merging()(w, m, p, n_components)
     means = mixture.mean + m[alive] @ root.T
     covs = symmetrise(root @ p[alive] @ root.T)
-    return GaussianMixture.unchecked(w[alive] / w[alive].sum(), means, covs)
+    return GaussianMixture.construct(w[alive] / w[alive].sum(), means, covs)
 
 
-@door
+@validated
 def merge_costs(mixture: GaussianMixture) -> Array:
     """Runnalls' bound for each pair of mixands, (L, L); zero on the diagonal.
 
@@ -137,11 +137,11 @@ def merge_costs(mixture: GaussianMixture) -> Array:
     np.True_
     """
     w, m, p, _ = _whitened(mixture)
-    dets, every = np.linalg.slogdet(p)[1], np.arange(mixture.size)
-    return np.stack([_costs(w, m, p, dets, i, every) for i in range(mixture.size)])
+    dets, every = np.linalg.slogdet(p)[1], np.arange(mixture.n_components)
+    return np.stack([_costs(w, m, p, dets, i, every) for i in range(mixture.n_components)])
 
 
-@door
+@validated
 def cross_relevance(mixture: GaussianMixture, other: GaussianMixture) -> Array:
     r"""The matrix (38)-(39): :math:`w_q D_{KL}(\mathcal N_q\|\mathcal N_r)`, (L, L').
 
@@ -161,8 +161,8 @@ def cross_relevance(mixture: GaussianMixture, other: GaussianMixture) -> Array:
     return mixture.weights[:, None] * gaussian_divergences(mixture, other)
 
 
-@door
-def kept_by_relevance(
+@validated
+def merge_irrelevant(
     mixture: GaussianMixture, other: GaussianMixture, *,
     threshold: Annotated[float, Bounds(above=1)],
 ) -> GaussianMixture:
@@ -185,23 +185,23 @@ def kept_by_relevance(
     --------
     >>> mine = GaussianMixture([0.4, 0.3, 0.3], [[0.0], [8.0], [9.0]], [[[1.0]]] * 3)
     >>> theirs = GaussianMixture.gaussian([0.5], [[1.0]])
-    >>> kept_by_relevance(mine, theirs, threshold=3.0).means
+    >>> merge_irrelevant(mine, theirs, threshold=3.0).means
     array([[0. ],
            [8.5]])
     >>> shared = GaussianMixture([0.9, 1e-5, 0.1 - 1e-5], [[0.0], [2.0], [9.0]], [[[1.0]]] * 3)
-    >>> kept_by_relevance(shared, GaussianMixture.gaussian([0.0], [[1.0]]), threshold=3.0).size
+    >>> merge_irrelevant(shared, GaussianMixture.gaussian([0.0], [[1.0]]), threshold=3.0).n_components
     3
     """
     nearest = gaussian_divergences(mixture, other).min(axis=1)
     delta = np.where(mixture.weights > 0, mixture.weights * nearest, np.inf)
     out = np.isfinite(delta) & (delta > threshold * max(delta.min(), _FLOOR)) & (nearest > _GATE)
     out[np.argmin(delta)] = False
-    labels = np.where(out, mixture.size, np.arange(mixture.size))
+    labels = np.where(out, mixture.n_components, np.arange(mixture.n_components))
     return _grouped(mixture, np.unique(labels, return_inverse=True)[1])
 
 
-@door
-def pivoted_qr(shapes: Shapes, *, size: Count, rest: Literal["merge", "drop"] = "merge") -> Shapes:
+@validated
+def pivoted_qr(shapes: ComponentShapes, *, n_components: PositiveInt, rest: Literal["merge", "drop"] = "merge") -> ComponentShapes:
     r"""Keep the mixands that a pivoted QR decomposition of (33) finds independent, (42)-(43).
 
     Parameters
@@ -214,23 +214,23 @@ def pivoted_qr(shapes: Shapes, *, size: Count, rest: Literal["merge", "drop"] = 
 
     Examples
     --------
-    >>> three = Shapes([[0.0], [1e-6], [9.0]], [[[1.0]]] * 3, [0, 0, 0])
-    >>> pivoted_qr(three, size=2, rest="drop").means
+    >>> three = ComponentShapes([[0.0], [1e-6], [9.0]], [[[1.0]]] * 3, [0, 0, 0])
+    >>> pivoted_qr(three, n_components=2, rest="drop").means
     array([[0.],
            [9.]])
     """
-    if size >= shapes.size:
+    if n_components >= shapes.n_components:
         return shapes
-    mixture = shapes.equally_weighed()
+    mixture = shapes.with_equal_weights()
     logs = unchecked(mixture.component_log_densities)(shapes.means) - mixture.log_peaks
     order = qr(np.exp(logs), mode="r", pivoting=True)[1]
-    kept = size - (rest == "merge")
-    keep = np.isin(np.arange(shapes.size), order[:kept])
+    kept = n_components - (rest == "merge")
+    keep = np.isin(np.arange(shapes.n_components), order[:kept])
     first, lost = unchecked(shapes.select)(keep), unchecked(shapes.select)(~keep)
     if rest == "drop":
         return first
-    one = lost.equally_weighed()
-    return Shapes.unchecked(
+    one = lost.with_equal_weights()
+    return ComponentShapes.construct(
         np.concatenate([first.means, one.mean[None]]), np.concatenate([first.covs, one.cov[None]]),
         np.append(first.source, shapes.source[order[kept]]), shapes.dropped,
     )  # fmt: skip
@@ -382,4 +382,4 @@ def _grouped(mixture: GaussianMixture, labels: Indices) -> GaussianMixture:
     means = share @ mixture.means
     gap = mixture.means - means[labels]
     covs = np.tensordot(share, mixture.covs + gap[:, :, None] * gap[:, None, :], axes=1)
-    return GaussianMixture.unchecked(w, means, symmetrise(covs))
+    return GaussianMixture.construct(w, means, symmetrise(covs))

@@ -8,11 +8,11 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import Array, Bounds, Count, Indices, Positive, door, unchecked
+from ..validation import Array, Bounds, PositiveInt, Indices, PositiveFloat, validated, unchecked
 from ..linalg import symmetrise
 from .gaussian import GaussianMixture
 
-__all__ = ["split", "split_library", "split_stretched", "stretching"]
+__all__ = ["split_components", "split_library", "split_nonlinear", "nonlinearity"]
 
 Fraction = Annotated[float, Bounds(above=0, below=1)]
 
@@ -20,7 +20,7 @@ Fraction = Annotated[float, Bounds(above=0, below=1)]
 _LIGHT = 1e-3
 
 
-@door
+@validated
 def split_library(*, std: Fraction = 0.7) -> tuple[Array, Array]:
     r"""Weights and means of three Gaussians of deviation `std` that stand for the standard normal.
 
@@ -67,8 +67,8 @@ def _library(std: float) -> tuple[Array, Array]:
     return parts(float(found.x))
 
 
-@door
-def stretching(
+@validated
+def nonlinearity(
     factors: Annotated[Array, "L d d"], jacobians: Annotated[Array, "L m d"], *,
     scale: Annotated[Array, "m"] | None = None,
 ) -> tuple[Array, Array]:
@@ -97,7 +97,7 @@ def stretching(
 
     Examples
     --------
-    >>> direction, length = stretching([np.diag([3.0, 1.0])], [np.diag([1.0, 2.0])])
+    >>> direction, length = nonlinearity([np.diag([3.0, 1.0])], [np.diag([1.0, 2.0])])
     >>> np.abs(direction), length
     (array([[3., 0.]]), array([3.]))
     """
@@ -110,8 +110,8 @@ def stretching(
     return (factors @ (sign[:, None] * first)[..., None])[..., 0], values[:, 0]
 
 
-@door
-def split(
+@validated
+def split_components(
     mixture: GaussianMixture, which: Annotated[Indices, "K", Bounds(at_least=0)],
     directions: Annotated[Array, "K mixture.dim"], *, std: Fraction = 0.7,
 ) -> GaussianMixture:
@@ -133,13 +133,13 @@ def split(
     Examples
     --------
     >>> one = GaussianMixture.gaussian([0.0, 0.0], np.eye(2))
-    >>> three = split(one, [0], [[1.0, 0.0]])
-    >>> three.size, three.moments()[1].round(12).tolist()
+    >>> three = split_components(one, [0], [[1.0, 0.0]])
+    >>> three.n_components, three.moments()[1].round(12).tolist()
     (3, [[1.0, 0.0], [0.0, 1.0]])
     """
-    if (which >= mixture.size).any() or np.unique(which).size != which.size:
+    if (which >= mixture.n_components).any() or np.unique(which).size != which.size:
         raise ValueError(
-            f"which: needs distinct indices below {mixture.size}, got {which.tolist()}"
+            f"which: needs distinct indices below {mixture.n_components}, got {which.tolist()}"
         )
     white = np.linalg.solve(mixture.factors[which], directions[..., None])[..., 0]
     if np.abs((white**2).sum(axis=1) - 1).max(initial=0.0) > 1e-6:
@@ -147,17 +147,17 @@ def split(
     w, m = _library(std)
     means = mixture.means[which][:, None] + m[:, None] * directions[:, None]
     less = mixture.covs[which] - (1 - std**2) * directions[:, :, None] * directions[:, None, :]
-    stay = np.setdiff1d(np.arange(mixture.size), which)
-    return GaussianMixture.unchecked(
+    stay = np.setdiff1d(np.arange(mixture.n_components), which)
+    return GaussianMixture.construct(
         np.concatenate([mixture.weights[stay], (mixture.weights[which][:, None] * w).ravel()]),
         np.concatenate([mixture.means[stay], means.reshape(-1, mixture.dim)]),
         np.concatenate([mixture.covs[stay], np.repeat(symmetrise(less), 3, axis=0)]),
     )
 
 
-@door
-def split_stretched(
-    mixture: GaussianMixture, jacobian: Callable[[Array], Array], *, most: Count, stretch: Positive,
+@validated
+def split_nonlinear(
+    mixture: GaussianMixture, jacobian: Callable[[Array], Array], *, max_components: PositiveInt, split_threshold: PositiveFloat,
     scale: Annotated[Array, "m"] | None = None,
 ) -> GaussianMixture:
     """Split the mixands that a map stretches most in three, up to three times over.
@@ -178,20 +178,20 @@ def split_stretched(
     Examples
     --------
     >>> one = GaussianMixture.gaussian([0.0], [[1.0]])
-    >>> split_stretched(one, lambda x: 2 * np.ones((1, 1)), most=4, stretch=1.0).size
+    >>> split_nonlinear(one, lambda x: 2 * np.ones((1, 1)), max_components=4, split_threshold=1.0).n_components
     3
     """
     for _ in range(3):
-        room = (most - mixture.size) // 2
+        room = (max_components - mixture.n_components) // 2
         if room < 1:
             break
         slope = jacobian(mixture.means)
-        slope = np.broadcast_to(slope, (mixture.size, *np.shape(slope)[-2:]))
-        directions, lengths = unchecked(stretching)(mixture.factors, slope, scale=scale)
+        slope = np.broadcast_to(slope, (mixture.n_components, *np.shape(slope)[-2:]))
+        directions, lengths = unchecked(nonlinearity)(mixture.factors, slope, scale=scale)
         cost = np.where(mixture.weights > _LIGHT, mixture.weights * lengths, 0.0)
         worst = np.argsort(-cost, kind="stable")[:room]
-        worst = worst[cost[worst] > stretch]
+        worst = worst[cost[worst] > split_threshold]
         if not worst.size:
             break
-        mixture = unchecked(split)(mixture, worst, directions[worst])
+        mixture = unchecked(split_components)(mixture, worst, directions[worst])
     return mixture

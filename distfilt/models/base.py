@@ -11,8 +11,8 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import Array, Bounds, Count, NonNegative, Record, Rng, Times, array, door, unchecked
-from ..doors.values import batched, semidefinite
+from ..validation import Array, Bounds, PositiveInt, NonNegativeFloat, FrozenModel, Rng, Times, check_array, validated, unchecked
+from ..validation.checks import call_batched, check_positive_semidefinite
 from ..linalg import as_derivative, central, factor
 
 __all__ = ["LinearModel", "Model", "simulate"]
@@ -23,7 +23,7 @@ Strength = Annotated[float, Bounds(at_least=0, at_most=1e150)]
 
 
 @dataclass(frozen=True, eq=False)
-class Model(Record):
+class Model(FrozenModel):
     """A stochastic model of motion, x(t + dt) = f(x(t), t, dt) + w, w ~ N(0, Q(t, dt)).
 
     Parameters
@@ -47,12 +47,12 @@ class Model(Record):
     Examples
     --------
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
-    >>> walk.noise(0.0, 0.5)
+    >>> walk.Q(0.0, 0.5)
     array([[0.5]])
     """
 
-    dim: Count
-    flow: Callable[[Array, float, float], Array]
+    dim: PositiveInt
+    transition: Callable[[Array, float, float], Array]
     noise_cov: Callable[[float, float], Array]
     derivative: Callable[[Array, float, float], Array] | None = field(default=None, kw_only=True)
     names: tuple[str, ...] = field(default=(), kw_only=True)
@@ -64,28 +64,28 @@ class Model(Record):
             if labels and len(labels) != self.dim:
                 raise ValueError(f"{name}: needs {self.dim} entries, got {len(labels)}")
 
-    @door
-    def step(self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegative) -> Array:
+    @validated
+    def step(self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat) -> Array:
         """Move states (..., d) from `t` to `t` + `dt`, without noise."""
-        return batched(self, "flow", (x,), t, dt)
+        return call_batched(self, "transition", (x,), t, dt)
 
-    @door
-    def noise(self, t: float, dt: NonNegative) -> Array:
+    @validated
+    def Q(self, t: float, dt: NonNegativeFloat) -> Array:
         """Covariance of the noise that a step from `t` to `t` + `dt` adds, (d, d), read-only."""
         return self._noise(t, dt)[0]
 
-    @door
-    def root(self, t: float, dt: NonNegative) -> Array:
+    @validated
+    def noise_sqrt(self, t: float, dt: NonNegativeFloat) -> Array:
         """A factor of the noise's covariance, (d, d), read-only."""
         return self._noise(t, dt)[1]
 
     def _noise(self, t: float, dt: float) -> tuple[Array, Array]:
-        q = array(self.noise_cov(t, dt), "noise_cov", (self.dim, self.dim), finite=False)
+        q = check_array(self.noise_cov(t, dt), "noise_cov", (self.dim, self.dim), finite=False)
         return _with_factor(q.tobytes(), self.dim)
 
-    @door
+    @validated
     def sample_step(
-        self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegative, *, rng: Rng
+        self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat, *, rng: Rng
     ) -> Array:
         """Move states (..., d) from `t` to `t` + `dt` and add a draw of the noise to each."""
         moved = unchecked(self.step)(x, t, dt)
@@ -93,8 +93,8 @@ class Model(Record):
         noise += moved
         return noise
 
-    @door
-    def jacobian(self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegative) -> Array:
+    @validated
+    def jacobian(self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat) -> Array:
         """Derivative of a step from states (..., d), as (..., d, d).
 
         `derivative` where the model has it, central differences of `flow` otherwise.
@@ -106,8 +106,8 @@ class Model(Record):
 @lru_cache(maxsize=64)
 def _with_factor(data: bytes, dim: int) -> tuple[Array, Array]:
     """A covariance and its factor; the same few come in every step of a run."""
-    cov = array(np.frombuffer(data).reshape(dim, dim), "noise_cov")
-    semidefinite(cov, "noise_cov")
+    cov = check_array(np.frombuffer(data).reshape(dim, dim), "noise_cov")
+    check_positive_semidefinite(cov, "noise_cov")
     root = unchecked(factor)(cov)
     root.setflags(write=False)
     return cov, root
@@ -151,33 +151,33 @@ class LinearModel(Model):
         if dt and vars(self).pop("_doubted", False):
             # Two half steps add the noise of a whole one. A user's table may have no halves.
             with suppress(AssertionError, LookupError, RuntimeError, TypeError, ValueError):
-                phi, first = self.transition(half), self.noise_cov(t, half)
+                phi, first = self.F(half), self.noise_cov(t, half)
                 last = self.noise_cov(t + half, half) - whole[0]
                 own, other = (np.abs(p @ first @ p.T + last).max() for p in (phi, phi.T))
                 if other < 1e-11 * np.abs(whole[0]).max() < 1e-2 * own:
                     warnings.warn("transition_matrix: transposed for noise_cov", RuntimeWarning, 4)
         return whole
 
-    @door
-    def transition(self, dt: NonNegative) -> Array:
+    @validated
+    def F(self, dt: NonNegativeFloat) -> Array:
         """The matrix Φ of a step of `dt` seconds, (d, d)."""
-        return array(self.transition_matrix(dt), "transition_matrix", (self.dim, self.dim))
+        return check_array(self.transition_matrix(dt), "transition_matrix", (self.dim, self.dim))
 
-    @door
-    def jacobian(self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegative) -> Array:
+    @validated
+    def jacobian(self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat) -> Array:
         """Derivative of a step, the same matrix for all states, as (..., d, d)."""
-        return np.full((*x.shape, self.dim), unchecked(self.transition)(dt))
+        return np.full((*x.shape, self.dim), unchecked(self.F)(dt))
 
 
 def _product(
     transition_matrix: Callable[[float], Array], dim: int, x: Array, t: float, dt: float
 ) -> Array:
     """The flow of a linear model; with a copy of the transpose in half the time of its view."""
-    matrix = array(transition_matrix(dt), "transition_matrix", (dim, dim))
+    matrix = check_array(transition_matrix(dt), "transition_matrix", (dim, dim))
     return np.asarray(x @ np.ascontiguousarray(matrix.T))
 
 
-@door
+@validated
 def simulate(
     model: Model, x0: Annotated[Array, "... model.dim"], times: Times, *, rng: Rng, t0: float = 0.0
 ) -> Array:

@@ -14,10 +14,10 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import Array, Bounds, NonNegative, Positive, array, door, unchecked
+from ..validation import Array, Bounds, NonNegativeFloat, PositiveFloat, check_array, validated, unchecked
 from .base import LinearModel, Model, Strength
 
-__all__ = ["constant_velocity", "integrated", "lorenz63", "rk4"]
+__all__ = ["constant_velocity", "integrate", "lorenz63", "rk4"]
 
 Rate = Callable[[Array, float], Array]
 _MOST = 10_000_000
@@ -27,7 +27,7 @@ _AXES = ("x", "y", "z")
 _PRANDTL, _RAYLEIGH, _SHAPE = np.array(10.0), np.array(28.0), np.array(8 / 3)
 
 
-@door
+@validated
 def constant_velocity(
     *, sigma: Strength, axes: Annotated[int, Bounds(at_least=1, at_most=3)] = 2
 ) -> LinearModel:
@@ -75,9 +75,9 @@ def _along_axes(block: tuple[tuple[float, float], ...], axes: int) -> Array:
     return out
 
 
-@door
+@validated
 def rk4(
-    rate: Rate, x: Array, t: float, dt: NonNegative, *, longest: Positive | None = None
+    rate: Rate, x: Array, t: float, dt: NonNegativeFloat, *, longest: PositiveFloat | None = None
 ) -> Array:
     r"""Advance :math:`\dot{\mathbf x} = \mathbf f(\mathbf x, t)` by the classical Runge-Kutta rule.
 
@@ -110,7 +110,7 @@ def rk4(
         s = t + k * h
         # The rate may work in place: it gets arrays of its own, and what it returns is used before
         # it is called again.
-        slope = array(rate(state.copy("K"), s), "rate", x.shape, finite=False)
+        slope = check_array(rate(state.copy("K"), s), "rate", x.shape, finite=False)
         total = 0.5 * slope
         slope = rate(state + 0.5 * h * slope, s + 0.5 * h)
         total += slope
@@ -136,7 +136,7 @@ def equal_steps(dt: float, longest: float | None) -> int:
     return max(1, math.ceil(needed))
 
 
-def integrated(
+def integrate(
     rate: Rate, density: Array, *, step: float, names: tuple[str, ...], units: tuple[str, ...]
 ) -> Model:
     """The model that :func:`rk4` makes of a rate, with white noise of a spectral density (d, d)."""
@@ -153,8 +153,8 @@ def _white(density: Array, t: float, dt: float) -> Array:
     return density * dt
 
 
-@door
-def lorenz63(*, sigma: Strength = 0.0, step: Positive = 0.01) -> Model:
+@validated
+def lorenz63(*, sigma: Strength = 0.0, step: PositiveFloat = 0.01) -> Model:
     r"""Lorenz's model of 1963, integrated by Runge-Kutta of order 4 with a fixed step.
 
     .. math:: \dot x = 10\,(y-x),\quad \dot y = x(28-z)-y,\quad \dot z = xy-\tfrac83z
@@ -176,7 +176,7 @@ def lorenz63(*, sigma: Strength = 0.0, step: Positive = 0.01) -> Model:
     >>> lorenz63().step([1.0, 1.0, 20.0], 0.0, 0.1).shape
     (3,)
     """
-    return integrated(_rate, sigma**2 * np.eye(3), step=step, names=_AXES, units=("1",) * 3)
+    return integrate(_rate, sigma**2 * np.eye(3), step=step, names=_AXES, units=("1",) * 3)
 
 
 def _rate(state: Array, t: float) -> Array:

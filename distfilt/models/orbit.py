@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..doors import Array, Bounds, Count, Positive, door, unchecked
+from ..validation import Array, Bounds, PositiveInt, PositiveFloat, validated, unchecked
 from .base import Model, Strength
 from .motion import equal_steps, rk4
 
@@ -43,7 +43,7 @@ Place = Annotated[Array, "... 3", _BOUNDED, _outside]
 Orbits = Annotated[Array, "... 6", _BOUNDED]
 
 
-@door
+@validated
 def potential(position: Place) -> Array:
     r"""Potential whose gradient is the acceleration, in km²/s².
 
@@ -65,7 +65,7 @@ def potential(position: Place) -> Array:
     return np.asarray(MU / size * (1 - 0.5 * J2 * (RADIUS / size) ** 2 * shape))
 
 
-@door
+@validated
 def acceleration(position: Place) -> Array:
     r"""Acceleration of a satellite, in km/s²: the mended (47).
 
@@ -101,10 +101,10 @@ def _rate(x: Array, t: float = 0.0) -> Array:
     return out
 
 
-@door
+@validated
 def propagate(
     x: Annotated[Array, "... 6"], dt: float, *, rule: Literal["dop853", "rk4"] = "dop853",
-    longest: Positive = 900.0
+    longest: PositiveFloat = 900.0
 ) -> Array:
     """Move satellites by a fixed number of equal steps.
 
@@ -165,9 +165,9 @@ def _dop853(x: Array, h: float) -> Array:
     return np.asarray(x + (b @ flat).reshape(x.shape))
 
 
-@door
+@validated
 def orbits(
-    bodies: Count = 1, *, position_std: Strength = 0.0, velocity_std: Strength = 0.0,
+    bodies: PositiveInt = 1, *, position_std: Strength = 0.0, velocity_std: Strength = 0.0,
 ) -> Model:
     """Several satellites as one model; the state is theirs one after the other.
 
@@ -217,7 +217,7 @@ def _slope(x: Array, t: float, dt: float, bodies: int) -> Array:
     return out
 
 
-@door
+@validated
 def rsw_frame(x: Orbits) -> Array:
     """Axes along the radius, across it along the motion, and along the orbit's normal, (58).
 
@@ -247,7 +247,7 @@ def rsw_frame(x: Orbits) -> Array:
     return np.stack([radial, np.cross(normal, radial), normal], axis=-1)
 
 
-@door
+@validated
 def occulted(a: Place, b: Place) -> Array:
     """Whether the Earth's equatorial sphere hides two positions from each other, (...).
 

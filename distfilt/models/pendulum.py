@@ -11,9 +11,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..doors import Array, Bounds, NonNegative, Positive, door
+from ..validation import Array, Bounds, NonNegativeFloat, PositiveFloat, validated
 from .base import Model
-from .motion import integrated
+from .motion import integrate
 
 __all__ = [  # fmt: skip
     "pendulum", "pendulum_angle", "pendulum_chart", "pendulum_rate",
@@ -26,9 +26,9 @@ Form = Literal["printed", "multiplier"]
 States = Annotated[Array, "... 4"]
 
 
-@door
+@validated
 def pendulum_rate(
-    states: States, *, length: Length = 1.0, gravity: NonNegative = 9.8, form: Form = "printed"
+    states: States, *, length: Length = 1.0, gravity: NonNegativeFloat = 9.8, form: Form = "printed"
 ) -> Array:
     r"""Right-hand side (..., 4) of the pendulum's equations, (14)-(15) of Das and Bhattacharya.
 
@@ -71,10 +71,10 @@ def _rate(s: Array, t: float, size: float, g: float, printed: bool) -> Array:
     return out
 
 
-@door
+@validated
 def pendulum(
-    *, length: Length = 1.0, gravity: NonNegative = 9.8, form: Form = "printed",
-    sigma: tuple[NonNegative, NonNegative] = (0.0, 0.0), step: Positive = 0.01,
+    *, length: Length = 1.0, gravity: NonNegativeFloat = 9.8, form: Form = "printed",
+    sigma: tuple[NonNegativeFloat, NonNegativeFloat] = (0.0, 0.0), step: PositiveFloat = 0.01,
 ) -> Model:
     """The pendulum in Cartesian coordinates x, y, vx, vy, by Runge-Kutta of order 4.
 
@@ -94,17 +94,17 @@ def pendulum(
     >>> float(np.hypot(*swing[:2]).round(6))
     1.0
     """
-    return integrated(
+    return integrate(
         partial(_rate, size=length, g=gravity, printed=form == "printed"),
         np.diag(np.repeat(sigma, 2) ** 2), step=step, names=("x", "y", "vx", "vy"),
         units=("m", "m", "m/s", "m/s"),
     )
 
 
-@door
+@validated
 def pendulum_angle(
-    *, length: Length = 1.0, gravity: NonNegative = 9.8,
-    sigma: tuple[NonNegative, NonNegative] = (0.0, 0.0), step: Positive = 0.01,
+    *, length: Length = 1.0, gravity: NonNegativeFloat = 9.8,
+    sigma: tuple[NonNegativeFloat, NonNegativeFloat] = (0.0, 0.0), step: PositiveFloat = 0.01,
 ) -> Model:
     r"""The pendulum in its chart: the angle θ from the vertical, not wrapped, and its rate.
 
@@ -122,7 +122,7 @@ def pendulum_angle(
     >>> pendulum_angle().step([0.0, 1.0], 0.0, 1.0).round(4)
     array([ 0.01  , -0.9995])
     """
-    return integrated(
+    return integrate(
         partial(_swing, pull=gravity / length), np.diag(np.square(sigma)), step=step,
         names=("theta", "omega"), units=("rad", "rad/s"),
     )
@@ -135,7 +135,7 @@ def _swing(x: Array, t: float, pull: float) -> Array:
     return out
 
 
-@door
+@validated
 def pendulum_states(chart: Annotated[Array, "... 2"], *, length: Length = 1.0) -> Array:
     r"""Cartesian states (..., 4), position and velocity, of chart coordinates.
 
@@ -155,7 +155,7 @@ def pendulum_states(chart: Annotated[Array, "... 2"], *, length: Length = 1.0) -
     return length * np.stack([sine, cosine, rate * cosine, -rate * sine], axis=-1)
 
 
-@door
+@validated
 def pendulum_chart(states: States) -> Array:
     r"""Angle in (-π, π] and rate :math:`(\dot xy-x\dot y)/r^2` of Cartesian states, (..., 2).
 

@@ -18,14 +18,14 @@ from typing import Annotated, Any
 import numpy as np
 from scipy.linalg import expm
 
-from ..doors import Array, Positive, door, unchecked
+from ..validation import Array, PositiveFloat, validated, unchecked
 from ..linalg import symmetrise
 from .base import LinearModel, Model, Strength
 from .motion import rk4
 
 __all__ = [  # fmt: skip
     "clohessy_wiltshire", "cross_matrix", "left_directions", "quaternion_rate", "rotation_matrix",
-    "satellite_pose", "turn_between", "turned",
+    "satellite_pose", "rotation_vector_between", "rotate",
 ]
 
 
@@ -73,8 +73,8 @@ def _noise(t: float, dt: float, rate: float, sigma: float) -> Array:
     return _exact_noise(rate, sigma, dt)
 
 
-@door
-def clohessy_wiltshire(*, rate: Positive, sigma: Strength) -> LinearModel:
+@validated
+def clohessy_wiltshire(*, rate: PositiveFloat, sigma: Strength) -> LinearModel:
     r"""The Clohessy-Wiltshire model, equation (18) of Grange et al., with noise on all six rows.
 
     Parameters
@@ -88,7 +88,7 @@ def clohessy_wiltshire(*, rate: Positive, sigma: Strength) -> LinearModel:
     Examples
     --------
     >>> model = clohessy_wiltshire(rate=0.1, sigma=0.2)
-    >>> model.noise(0.0, 0.1).diagonal().round(5)
+    >>> model.Q(0.0, 0.1).diagonal().round(5)
     array([0.00401, 0.00401, 0.00401, 0.004  , 0.004  , 0.004  ])
     """
     return LinearModel.from_transition(
@@ -97,8 +97,8 @@ def clohessy_wiltshire(*, rate: Positive, sigma: Strength) -> LinearModel:
     )
 
 
-@door
-def satellite_pose(*, rate: Positive, sigma: Strength, step: Positive = 0.01) -> Model:
+@validated
+def satellite_pose(*, rate: PositiveFloat, sigma: Strength, step: PositiveFloat = 0.01) -> Model:
     r"""Translation and attitude together: the 13-component model of Table III of Grange et al.
 
     Translation (18) moves by its exact transition and exact noise, attitude (20)-(21) by
@@ -176,7 +176,7 @@ Quaternion = Annotated[Array, "... 4", _far_from_zero]
 Vector = Annotated[Array, "... 3"]
 
 
-@door
+@validated
 def cross_matrix(vector: Vector) -> Array:
     r"""The cross product :math:`[\boldsymbol\omega]_\times` as a matrix (..., 3, 3), equation (19).
 
@@ -192,7 +192,7 @@ def cross_matrix(vector: Vector) -> Array:
     return np.cross(np.eye(3), vector[..., None, :])
 
 
-@door
+@validated
 def rotation_matrix(quaternion: Quaternion) -> Array:
     r"""The active rotation matrix R(q), (..., 3, 3), of a quaternion with its scalar part first.
 
@@ -219,7 +219,7 @@ def _rotations(quaternion: Array) -> Any:
     return Rotation.from_quat(quaternion.reshape(-1, 4), scalar_first=True)
 
 
-@door
+@validated
 def left_directions(quaternion: Quaternion) -> Array:
     r"""How a quaternion changes as the body turns a little further about the frame's axes.
 
@@ -251,8 +251,8 @@ def left_directions(quaternion: Quaternion) -> Array:
     return 0.5 * out + 0.0
 
 
-@door
-def turned(quaternion: Quaternion, angle: Vector) -> Array:
+@validated
+def rotate(quaternion: Quaternion, angle: Vector) -> Array:
     r"""The attitude (..., 4) turned further, :math:`e^{\boldsymbol\theta/2}\mathbf q`.
 
     Parameters
@@ -264,7 +264,7 @@ def turned(quaternion: Quaternion, angle: Vector) -> Array:
 
     Examples
     --------
-    >>> turned([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2]).round(4)
+    >>> rotate([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, np.pi / 2]).round(4)
     array([0.7071, 0.    , 0.    , 0.7071])
     """
     half = 0.5 * np.linalg.norm(angle, axis=-1)[..., None]
@@ -272,8 +272,8 @@ def turned(quaternion: Quaternion, angle: Vector) -> Array:
     return np.asarray(np.cos(half) * quaternion + np.sinc(half / np.pi) * move)
 
 
-@door
-def turn_between(quaternion: Quaternion, other: Quaternion) -> Array:
+@validated
+def rotation_vector_between(quaternion: Quaternion, other: Quaternion) -> Array:
     """The rotation vector that takes one attitude to another, the inverse of :func:`turned`.
 
     Parameters
@@ -288,7 +288,7 @@ def turn_between(quaternion: Quaternion, other: Quaternion) -> Array:
 
     Examples
     --------
-    >>> turn_between([1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, -1.0]).round(4)
+    >>> rotation_vector_between([1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, -1.0]).round(4)
     array([ 0.    ,  0.    , -1.5708])
     """
     before, after = np.broadcast_arrays(quaternion, other)
@@ -296,7 +296,7 @@ def turn_between(quaternion: Quaternion, other: Quaternion) -> Array:
     return np.reshape(turn.as_rotvec(), (*before.shape[:-1], 3))
 
 
-@door
+@validated
 def quaternion_rate(quaternion: Quaternion, angular_velocity: Vector) -> Array:
     """The quaternion's derivative in 1/s, (..., 4), equation (21); it keeps the length.
 

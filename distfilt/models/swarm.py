@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from ..doors import Array, Bounds, Count, NonNegative, Positive, Record, Rng, Times, door, unchecked
-from ..doors.values import array
+from ..validation import Array, Bounds, PositiveInt, NonNegativeFloat, PositiveFloat, FrozenModel, Rng, Times, validated, unchecked
+from ..validation.checks import check_array
 from .base import path
 
 __all__ = ["RotatingMixture", "Swarm", "rotating_swarm"]
@@ -37,7 +37,7 @@ def inside(positions: Array, low: Array, high: Array) -> Array:
 
 def _diagonal(value: Any, points: tuple[int, ...], dim: int) -> Array:
     """A diffusion, isotropic or per axis, as (*points, d), positive."""
-    d = array(value, "diffusion")
+    d = check_array(value, "diffusion")
     if d.shape in ((), points):
         d = d[..., None]
     elif d.shape not in ((dim,), (*points, dim)):
@@ -51,7 +51,7 @@ def _diagonal(value: Any, points: tuple[int, ...], dim: int) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class Swarm(Record):
+class Swarm(FrozenModel):
     r"""Independent agents of one law in a box with reflecting walls.
 
     .. math:: d\mathbf X = \mathbf v(\mathbf X, t)\,dt + \sqrt{2\mathbf D(\mathbf X,t)}\,d\mathbf B
@@ -101,7 +101,7 @@ class Swarm(Record):
 
     def drift_at(self, x: Array, t: float) -> Array:
         """The drift at positions (..., d), checked for its shape."""
-        return array(self.drift(x, t), "drift", x.shape)
+        return check_array(self.drift(x, t), "drift", x.shape)
 
     def diffusion_at(self, x: Array, t: float) -> Array:
         """The diffusion along each axis at positions (..., d), as (..., d)."""
@@ -109,9 +109,9 @@ class Swarm(Record):
         points = x.shape[:-1] if callable(self.diffusion) else ()
         return np.broadcast_to(_diagonal(value, points, self.dim), x.shape)
 
-    @door
+    @validated
     def step(
-        self, positions: Positions, t: float, dt: Positive, *, rng: Rng, substeps: Count = 10
+        self, positions: Positions, t: float, dt: PositiveFloat, *, rng: Rng, substeps: PositiveInt = 10
     ) -> Array:
         """Move agents from `t` to `t` + `dt` by Euler and Maruyama's scheme.
 
@@ -141,9 +141,9 @@ class Swarm(Record):
             x = _reflected(x + h * self.drift_at(x, now) + kick, self.low, self.high)
         return x
 
-    @door
+    @validated
     def simulate(
-        self, positions: Positions, times: Times, *, rng: Rng, t0: float = 0.0, substeps: Count = 10
+        self, positions: Positions, times: Times, *, rng: Rng, t0: float = 0.0, substeps: PositiveInt = 10
     ) -> Array:
         """Positions at `times`, (T, ..., d), of agents that are at `positions` at `t0`.
 
@@ -154,7 +154,7 @@ class Swarm(Record):
 
 
 @dataclass(frozen=True, eq=False)
-class RotatingMixture(Record):
+class RotatingMixture(FrozenModel):
     """Gaussians of equal weight and variance that go round a circle: f(x, t) of Zheng and Lin.
 
     Parameters
@@ -178,13 +178,13 @@ class RotatingMixture(Record):
     """
 
     centre: Annotated[Array, "2"] = field(default_factory=partial(np.full, 2, 0.5), kw_only=True)
-    radius: NonNegative = field(default=0.3, kw_only=True)
+    radius: NonNegativeFloat = field(default=0.3, kw_only=True)
     rate: float = field(default=0.04, kw_only=True)
-    variance: Positive = field(default=0.02, kw_only=True)
-    components: Count = field(default=2, kw_only=True)
+    variance: PositiveFloat = field(default=0.02, kw_only=True)
+    components: PositiveInt = field(default=2, kw_only=True)
     phase: float = field(default=0.0, kw_only=True)
 
-    @door
+    @validated
     def means(self, t: float) -> Array:
         """Where the components are at time `t`, (K, 2)."""
         k = np.arange(self.components)
@@ -197,14 +197,14 @@ class RotatingMixture(Record):
         gap = x[..., None, :] - means
         return -0.5 * (gap**2).sum(axis=-1) / self.variance, means
 
-    @door
+    @validated
     def density(self, x: Annotated[Array, "... 2"], t: float) -> Array:
         """f at positions (..., 2), normalised over the plane."""
         logs, _ = self._logs(x, t)
         out = np.exp(logs).mean(axis=-1) / (2 * np.pi * self.variance)
         return np.asarray(out)
 
-    @door
+    @validated
     def score(self, x: Annotated[Array, "... 2"], t: float) -> Array:
         """∇f/f at positions (..., 2); finite wherever f itself would underflow."""
         logs, means = self._logs(x, t)
@@ -213,7 +213,7 @@ class RotatingMixture(Record):
         return np.asarray((w @ means - x) / self.variance)
 
 
-@door
+@validated
 def rotating_swarm(
     reading: Literal["literal", "gibbs", "slowgibbs"] = "slowgibbs", *,
     strength: Annotated[float, Bounds(above=0, at_most=1e150)] = 0.03,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from ..doors import Indices, array
+from ..validation import Indices, check_array
 
 __all__: list[str] = []
 
@@ -17,7 +17,7 @@ def of_matrix(value: Any, name: str, *, directed: bool) -> scipy.sparse.csr_arra
     """The links that a matrix of zeros and ones marks, an array or sparse."""
     if not scipy.sparse.issparse(value):
         flags = isinstance(value, np.ndarray) and value.dtype == bool
-        value = array(value * 1.0 if flags else value, name, ("A", "A"))
+        value = check_array(value * 1.0 if flags else value, name, ("A", "A"))
     a = scipy.sparse.csr_array(value)
     if a.shape[0] != a.shape[1] or a.shape[0] == 0:
         raise ValueError(f"{name}: needs a square matrix, got shape {a.shape}")
@@ -39,8 +39,8 @@ def of_edges(size: int, edges: Any, name: str, *, directed: bool) -> scipy.spars
     Traceback (most recent call last):
     ValueError: edges: needs agents from 0 to 2, got [[0.0, -1.0]]
     """
-    pairs = array(edges, name)
-    pairs = pairs.reshape(-1, 2) if pairs.size == 0 else array(pairs, name, ("E", 2))
+    pairs = check_array(edges, name)
+    pairs = pairs.reshape(-1, 2) if pairs.size == 0 else check_array(pairs, name, ("E", 2))
     listed = pairs.astype(np.int64)
     inside = not listed.size or 0 <= listed.min() <= listed.max() < size
     if (listed != pairs).any() or not inside:
@@ -53,7 +53,7 @@ def of_either(value: Any, size: int | None, name: str) -> scipy.sparse.csr_array
     """The links of a matrix or of a list of edges, both ways."""
     if scipy.sparse.issparse(value) or getattr(value, "dtype", None) == np.dtype(bool):
         return of_matrix(value, name, directed=False)
-    a = array(value, name)
+    a = check_array(value, name)
     square = a.ndim == 2 and 0 < a.shape[0] == a.shape[1] and size in (None, a.shape[0])
     # Two edges look like a matrix of two agents.
     if square and not (a.shape[0] == 2 and (a.diagonal().any() or (a > 1).any())):

@@ -10,19 +10,19 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 
-from ..doors import Array, Count, Mask, door, unchecked
+from ..validation import Array, PositiveInt, Mask, validated, unchecked
 from . import ledger as accounts
 from .faults import Faults
 from .graphs import Graph, as_graph
 from .ledger import Ledger
-from .weights import Weights, _matching, stacked
+from .weights import ConsensusWeights, _matching, stack_weights
 
-__all__ = ["Channel", "Lost", "PerAgent", "fused_kind", "fuses"]
+__all__ = ["Channel", "Lost", "PerAgent", "kind_of_rule", "fusion_rule"]
 
 _PERFECT = Faults()
-_Own = Annotated[Array, "*self.runs self.graph.size k"]
+_Own = Annotated[Array, "*self.runs self.graph.n_agents k"]
 
-PerAgent = Annotated[Array, "*channel.runs channel.graph.size k"]
+PerAgent = Annotated[Array, "*channel.runs channel.graph.n_agents k"]
 """One vector for each agent of an argument named `channel`."""
 
 Lost = Literal["mutual", "metropolis", "keep", "renormalise", "zero"]
@@ -57,16 +57,16 @@ class Channel:
     --------
     >>> star = Graph.from_adjacency([[0, 1, 1], [1, 0, 0], [1, 0, 0]])
     >>> channel = Channel(star)
-    >>> inbox = channel.exchange([np.array([1.0]), np.array([2.0]), np.array([3.0])])
+    >>> inbox = channel.broadcast([np.array([1.0]), np.array([2.0]), np.array([3.0])])
     >>> sorted(inbox[0]), sorted(inbox[1])
     ([1, 2], [0])
     >>> channel.ledger
     Ledger(rounds=1, messages=4, scalars=4, bytes=32, lost=0)
     """
 
-    @door
+    @validated
     def __init__(
-        self, graph: Any, *, ledger: Ledger | None = None, runs: tuple[Count, ...] = (),
+        self, graph: Any, *, ledger: Ledger | None = None, runs: tuple[PositiveInt, ...] = (),
         faults: Faults | None = None, t: float | None = None,
     ) -> None:
         self.graph: Graph = as_graph(graph, None if ledger is None else ledger.messages.size)
@@ -74,7 +74,7 @@ class Channel:
         self._among = int(np.prod(runs, dtype=np.int64)), slice(None)
         self.faults = _PERFECT if faults is None else faults
         self.t = t
-        self._ledger = Ledger.empty(self.graph.size) if ledger is None else ledger
+        self._ledger = Ledger.empty(self.graph.n_agents) if ledger is None else ledger
         self._owed: dict[int, int] = {}
         self._late: dict[tuple[int, ...], deque[Any]] = {}
         self._perfect = self.faults.none
@@ -82,15 +82,15 @@ class Channel:
             self.faults.check(self.graph)
 
     @classmethod
-    def unchecked(cls, *args: Any, **options: Any) -> Channel:
+    def construct(cls, *args: Any, **options: Any) -> Channel:
         """The same for a caller that made the graph and the ledger itself, as filters do."""
         channel = cls.__new__(cls)
         unchecked(channel.__init__)(*args, **options)  # type: ignore[misc]
         return channel
 
-    def of(self, run: Any, ledger: Ledger) -> Channel:
+    def for_run(self, run: Any, ledger: Ledger) -> Channel:
         """The same with another account; of the numbers of all runs, or as one loses messages."""
-        channel = Channel.unchecked(self.graph, ledger=ledger, runs=run.shape,
+        channel = Channel.construct(self.graph, ledger=ledger, runs=run.shape,
                                     faults=self.faults, t=self.t)
         channel._among = self._among[0], slice(None) if run.ndim else slice(run, run + 1)
         return channel
@@ -99,7 +99,7 @@ class Channel:
     def ledger(self) -> Ledger:
         """The account so far."""
         for size, rounds in self._owed.items():
-            messages = rounds * self.graph.listeners.astype(np.int64)
+            messages = rounds * self.graph.out_degree.astype(np.int64)
             self._ledger = self._charged(self._ledger, messages, size, 8 * size, rounds=rounds)
         self._owed = {}
         return self._ledger
@@ -108,13 +108,13 @@ class Channel:
                  rounds: int = 1, lost: Any = 0.0) -> Ledger:  # fmt: skip
         """The account after more rounds, in which agents sent so many messages of these sizes."""
         spoke = self.graph.senders.size > 0
-        return ledger.changed(
+        return ledger.replace(
             rounds=ledger.rounds + rounds * spoke, messages=ledger.messages + messages,
             scalars=ledger.scalars + messages * scalars, bytes=ledger.bytes + messages * bytes_,
             lost=ledger.lost + lost,
         )
 
-    def exchange(self, payloads: Sequence[Any]) -> list[dict[int, Any]]:
+    def broadcast(self, payloads: Sequence[Any]) -> list[dict[int, Any]]:
         """Let every agent send its payload to all that hear it.
 
         Parameters
@@ -132,7 +132,7 @@ class Channel:
             floats there.
         """
         graph = self.graph
-        sent, scalars, bytes_ = accounts.taken(payloads, graph.size, self.runs)
+        sent, scalars, bytes_ = accounts.count_payload(payloads, graph.n_agents, self.runs)
         speaks = np.array([p is not None for p in sent])[graph.senders]
         arrived = self._transmit(speaks, scalars, bytes_)
         some = np.flatnonzero(arrived.any(axis=0))
@@ -140,12 +140,12 @@ class Channel:
         for k in some[~arrived[:, some].all(axis=0)].tolist():
             receiver, sender = int(graph.receivers[k]), int(graph.senders[k])
             here = arrived[:, k].reshape(self.runs)
-            inbox[receiver][sender] = accounts.thinned(sent[sender], here)
+            inbox[receiver][sender] = accounts.drop_lost(sent[sender], here)
         return inbox
 
-    @door
-    def combine(
-        self, values: _Own, weights: Weights, *, lost: Lost = "mutual", rounds: Count = 1
+    @validated
+    def mix(
+        self, values: _Own, weights: ConsensusWeights, *, lost: Lost = "mutual", rounds: PositiveInt = 1
     ) -> Array:
         """Let every agent replace its value by a weighted sum of its own and what it hears.
 
@@ -175,17 +175,17 @@ class Channel:
             values = self._combine_with_own(values, w, lost)[0]
         return values
 
-    def _combine_all(self, v: Array, w: Weights, rounds: int) -> Array:
+    def _combine_all(self, v: Array, w: ConsensusWeights, rounds: int) -> Array:
         """Rounds without faults, agents in front throughout."""
         self._owed[v.shape[-1]] = self._owed.get(v.shape[-1], 0) + rounds
         front = np.moveaxis(v, -2, 0)
-        flat = front.reshape(self.graph.size, -1)
+        flat = front.reshape(self.graph.n_agents, -1)
         for _ in range(rounds):
             flat = w.matrix @ flat
         return np.ascontiguousarray(np.moveaxis(flat.reshape(front.shape), 0, -2))
 
-    @door
-    def carry(
+    @validated
+    def send_on_links(
         self, values: Annotated[Array, "*self.runs self.graph.senders.size k"], *,
         links: Annotated[Mask, "self.graph.senders.size"] | None = None, acknowledged: bool = False,
     ) -> Array:
@@ -209,20 +209,20 @@ class Channel:
         arrived = self._sent(values.shape[-1], links, acknowledged=acknowledged)
         return np.where(arrived.reshape(*self.runs, edges)[..., None], values, np.nan)
 
-    def _combine_with_own(self, v: Array, w: Weights, lost: Lost) -> tuple[Array, Array]:
+    def _combine_with_own(self, v: Array, w: ConsensusWeights, lost: Lost) -> tuple[Array, Array]:
         """As :meth:`combine`, with the weight that each agent's own value got, (*runs, A)."""
         if self._perfect:
             return self._combine_all(v, w, 1), w.own
-        k, size = v.shape[-1], self.graph.size
+        k, size = v.shape[-1], self.graph.n_agents
         both = lost in ("mutual", "metropolis")
         if both and self.graph.directed:
             raise ValueError(f"lost: {lost!r} needs links both ways, got one-way links")
         # Metropolis weights need the degree of what is left, one number more.
         arrived = self._sent(k + (lost == "metropolis"), acknowledged=both, late=True)
-        flat, delay = v.reshape(-1, k), self.faults.late
+        flat, delay = v.reshape(-1, k), self.faults.has_delay
         heard, arrived = self._delayed(flat, arrived) if delay else (flat, arrived)
         own, links = _after_loss(self.graph, w, arrived, lost)
-        matrix = stacked(self.graph, own, links, heard_at=len(flat) if delay else 0)
+        matrix = stack_weights(self.graph, own, links, heard_at=len(flat) if delay else 0)
         out = matrix @ (np.concatenate([flat, heard]) if delay else flat)
         return out.reshape(v.shape), own.reshape(*self.runs, size)
 
@@ -235,7 +235,7 @@ class Channel:
         """The values of some rounds ago, and on which links those arrive now."""
         queue = self._late.setdefault(values.shape, deque())
         queue.append((values.copy(), arrived))
-        if len(queue) > self.faults.late:
+        if len(queue) > self.faults.has_delay:
             return queue.popleft()  # type: ignore[no-any-return]
         return np.zeros_like(values), np.zeros_like(arrived)
 
@@ -244,10 +244,10 @@ class Channel:
         late: bool = False,
     ) -> Mask:
         """Charge one round in which the links in `speaks` are used; which arrive, (R, E)."""
-        if self.faults.late and not late:
-            raise ValueError(f"channel: needs no delay here, got {self.faults.late} rounds")
+        if self.faults.has_delay and not late:
+            raise ValueError(f"channel: needs no delay here, got {self.faults.has_delay} rounds")
         now = self.ledger
-        size, (runs, here) = self.graph.size, self._among
+        size, (runs, here) = self.graph.n_agents, self._among
         if self._perfect:
             arrived, lost = np.broadcast_to(speaks, (runs, speaks.size))[here], np.zeros(size)
         else:
@@ -268,11 +268,11 @@ def _by_receiver(graph: Graph, sent: Sequence[Any], links: Any) -> list[dict[int
     """What arrives on some links, given by their ascending numbers, for each agent by sender."""
     senders = graph.senders[links].tolist()
     messages = [sent[j] for j in senders]
-    ends = np.searchsorted(graph.receivers[links], np.arange(graph.size + 1)).tolist()
+    ends = np.searchsorted(graph.receivers[links], np.arange(graph.n_agents + 1)).tolist()
     return [dict(zip(senders[i:j], messages[i:j], strict=True)) for i, j in pairwise(ends)]
 
 
-def _after_loss(graph: Graph, w: Weights, arrived: Mask, lost: str) -> tuple[Array, Array]:
+def _after_loss(graph: Graph, w: ConsensusWeights, arrived: Mask, lost: str) -> tuple[Array, Array]:
     """Own and link weights of each run, (R, A) and (R, E), once some messages are missing."""
     ends, sums = graph.receivers, partial(graph._summed, axis=1)
     if lost in ("mutual", "metropolis"):
@@ -283,7 +283,7 @@ def _after_loss(graph: Graph, w: Weights, arrived: Mask, lost: str) -> tuple[Arr
         links = arrived / (1 + pair)
         return 1 - sums(links), links
     links = w.links * arrived
-    own = np.broadcast_to(w.own, (arrived.shape[0], graph.size))
+    own = np.broadcast_to(w.own, (arrived.shape[0], graph.n_agents))
     if lost in ("mutual", "keep"):
         own = own + sums(w.links * ~arrived)
     elif lost == "renormalise":
@@ -294,7 +294,7 @@ def _after_loss(graph: Graph, w: Weights, arrived: Mask, lost: str) -> tuple[Arr
     return np.asarray(own), links
 
 
-def fuses(kind: Fused) -> Callable[[F], F]:
+def fusion_rule(kind: Fused) -> Callable[[F], F]:
     """Say what a rule of agreement fuses, so that a filter can tell if the rule is for it.
 
     Parameters
@@ -304,28 +304,28 @@ def fuses(kind: Fused) -> Callable[[F], F]:
 
     Examples
     --------
-    >>> @fuses("vectors")
+    >>> @fusion_rule("vectors")
     ... def stubborn(belief, channel):
     ...     return belief
-    >>> stubborn.fuses
+    >>> stubborn.belief_kind
     'vectors'
     """
 
     def named(rule: F) -> F:
         for function in (rule, unchecked(rule)):
-            function.fuses = kind  # type: ignore[attr-defined]
+            function.belief_kind = kind  # type: ignore[attr-defined]
         return rule
 
     return named
 
 
-def fused_kind(rule: Callable[..., Any]) -> str | None:
+def kind_of_rule(rule: Callable[..., Any]) -> str | None:
     """What a rule says that it fuses, also with options given by a partial; None if nothing.
 
-    >>> from distfilt.network import average
-    >>> fused_kind(partial(average, rounds=3)), fused_kind(print)
+    >>> from distfilt.network import average_consensus
+    >>> kind_of_rule(partial(average_consensus, rounds=3)), kind_of_rule(print)
     ('vectors', None)
     """
     while isinstance(rule, partial):
         rule = rule.func
-    return getattr(rule, "fuses", None)
+    return getattr(rule, "belief_kind", None)

@@ -10,14 +10,14 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import Array, Count, Positive, Record, array, door, unchecked
+from ..validation import Array, PositiveInt, PositiveFloat, FrozenModel, check_array, validated, unchecked
 from ..linalg import SolverError
-from .channel import Channel, Lost, PerAgent, fuses
+from .channel import Channel, Lost, PerAgent, fusion_rule
 from .graphs import Graph
-from .weights import Weights, _keeping, _laplacian, _warn_if_unstable, metropolis
+from .weights import ConsensusWeights, _keeping, _laplacian, _warn_if_unstable, metropolis
 
 __all__ = [  # fmt: skip
-    "AdmmRun", "Disconnected", "admm", "average", "finite_time", "maximum", "push_sum",
+    "AdmmResult", "Disconnected", "admm", "average_consensus", "finite_time_consensus", "max_consensus", "push_sum",
 ]
 
 class Disconnected(RuntimeWarning):
@@ -38,11 +38,11 @@ def _faultless(channel: Channel) -> None:
         raise ValueError("channel: needs no faults here, got a faulty channel")
 
 
-@fuses("vectors")
-@door
-def average(
-    values: PerAgent, channel: Channel, *, rounds: Count = 1, gain: Positive | None = None,
-    weights: Weights | None = None, lost: Lost = "mutual",
+@fusion_rule("vectors")
+@validated
+def average_consensus(
+    values: PerAgent, channel: Channel, *, rounds: PositiveInt = 1, gain: PositiveFloat | None = None,
+    weights: ConsensusWeights | None = None, lost: Lost = "mutual",
 ) -> Array:
     r"""Move every agent's value towards its neighbours', the averaging behind equation (16).
 
@@ -70,7 +70,7 @@ def average(
     Examples
     --------
     >>> from distfilt.network import Channel, graphs
-    >>> average([[0.0], [3.0], [-1.5]], Channel(graphs.star(3)), gain=0.5, rounds=40).round(4)
+    >>> average_consensus([[0.0], [3.0], [-1.5]], Channel(graphs.star(3)), gain=0.5, rounds=40).round(4)
     array([[0.5],
            [0.5],
            [0.5]])
@@ -88,12 +88,12 @@ def average(
         parts = graph.components.max() + 1
         text = f"channel: the graph has {parts} parts, and each agrees on an average of its own"
         warnings.warn(text, Disconnected, stacklevel=3)
-    return unchecked(channel.combine)(values, weights, lost=lost, rounds=rounds)
+    return unchecked(channel.mix)(values, weights, lost=lost, rounds=rounds)
 
 
-@fuses("vectors")
-@door
-def finite_time(values: PerAgent, channel: Channel) -> Array:
+@fusion_rule("vectors")
+@validated
+def finite_time_consensus(values: PerAgent, channel: Channel) -> Array:
     r"""The exact average in as many rounds as the Laplacian has distinct nonzero eigenvalues.
 
     .. math:: \prod_{k}\Bigl(\mathbf I-\tfrac1{\lambda_k}\mathbf L\Bigr)\mathbf x
@@ -122,14 +122,14 @@ def finite_time(values: PerAgent, channel: Channel) -> Array:
     --------
     >>> from distfilt.network import Channel, graphs
     >>> channel = Channel(graphs.star(5))
-    >>> finite_time(np.arange(5.0)[:, None], channel).ravel().round(12)
+    >>> finite_time_consensus(np.arange(5.0)[:, None], channel).ravel().round(12)
     array([2., 2., 2., 2., 2.])
     >>> channel.ledger.rounds
     2
     """
     channel.graph._joined()
     _faultless(channel)
-    combine, out = unchecked(channel.combine), values.copy()
+    combine, out = unchecked(channel.mix), values.copy()
     for eigenvalue in _factors(channel.graph):
         out = combine(out, _laplacian(channel.graph, 1 / eigenvalue))
     return out
@@ -138,7 +138,7 @@ def finite_time(values: PerAgent, channel: Channel) -> Array:
 @lru_cache(maxsize=32)
 def _factors(graph: Graph) -> list[float]:
     """The eigenvalues in their order, refused where their product is not what it is on paper."""
-    found, left = _leja(_distinct(graph.spectrum[1:])), np.eye(graph.size) - 1 / graph.size
+    found, left = _leja(_distinct(graph.laplacian_spectrum[1:])), np.eye(graph.n_agents) - 1 / graph.n_agents
     for eigenvalue in found:
         left -= graph.laplacian @ left / eigenvalue
     if (lost := np.abs(left).max()) > 1e-9:
@@ -164,9 +164,9 @@ def _leja(points: Array) -> list[float]:
     return order
 
 
-@fuses("vectors")
-@door
-def push_sum(values: PerAgent, channel: Channel, *, rounds: Count) -> Array:
+@fusion_rule("vectors")
+@validated
+def push_sum(values: PerAgent, channel: Channel, *, rounds: PositiveInt) -> Array:
     r"""Averages on any strongly connected digraph, also when messages are lost, without answers.
 
     Each agent pushes shares of its value and of a weight that began at one, and the ratio tends to
@@ -198,9 +198,9 @@ def push_sum(values: PerAgent, channel: Channel, *, rounds: Count) -> Array:
     array([3., 3., 3.])
     """
     channel.graph._joined()
-    graph, carry = channel.graph, unchecked(channel.carry)
+    graph, carry = channel.graph, unchecked(channel.send_on_links)
     mass = np.concatenate([values, np.ones((*values.shape[:-1], 1))], axis=-1)
-    share = 1 / (1 + graph.listeners)[:, None]
+    share = 1 / (1 + graph.out_degree)[:, None]
     pushed = np.zeros_like(mass)
     heard = np.zeros((*channel.runs, graph.senders.size, mass.shape[-1]))
     for _ in range(rounds):
@@ -212,9 +212,9 @@ def push_sum(values: PerAgent, channel: Channel, *, rounds: Count) -> Array:
     return np.asarray(mass[..., :-1] / mass[..., -1:])
 
 
-@fuses("vectors")
-@door
-def maximum(values: PerAgent, channel: Channel, *, rounds: Count | None = None) -> Array:
+@fusion_rule("vectors")
+@validated
+def max_consensus(values: PerAgent, channel: Channel, *, rounds: PositiveInt | None = None) -> Array:
     """The largest value, component by component; exact after as many rounds as the diameter.
 
     Parameters
@@ -227,12 +227,12 @@ def maximum(values: PerAgent, channel: Channel, *, rounds: Count | None = None) 
     Examples
     --------
     >>> from distfilt.network import Channel, graphs
-    >>> maximum([[1.0], [5.0], [2.0]], Channel(graphs.path(3))).ravel()
+    >>> max_consensus([[1.0], [5.0], [2.0]], Channel(graphs.path(3))).ravel()
     array([5., 5., 5.])
     """
     channel.graph._joined()
-    graph, carry, out = channel.graph, unchecked(channel.carry), values.copy()
-    if graph.size == 1:
+    graph, carry, out = channel.graph, unchecked(channel.send_on_links), values.copy()
+    if graph.n_agents == 1:
         return out
     for _ in range(rounds or graph.diameter):
         arrived = carry(out[..., graph.senders, :])
@@ -241,7 +241,7 @@ def maximum(values: PerAgent, channel: Channel, *, rounds: Count | None = None) 
 
 
 @dataclass(frozen=True, eq=False)
-class AdmmRun(Record):
+class AdmmResult(FrozenModel):
     """What consensus ADMM found.
 
     Parameters
@@ -256,7 +256,7 @@ class AdmmRun(Record):
 
     Examples
     --------
-    >>> AdmmRun(np.zeros((2, 1)), 3, 1e-9, 1e-9).iterations
+    >>> AdmmResult(np.zeros((2, 1)), 3, 1e-9, 1e-9).iterations
     3
     """
 
@@ -266,12 +266,12 @@ class AdmmRun(Record):
     dual: float
 
 
-@door
+@validated
 def admm(
-    local_solve: Callable[[Array, float], Array], start: Annotated[Array, "channel.graph.size k"],
-    channel: Channel, *, rho: Positive = 1.0, tolerance: Positive = 1e-6, iterations: Count = 1000,
-    agree: Callable[[Array, Channel], Array] = finite_time,
-) -> AdmmRun:  # fmt: skip
+    local_solve: Callable[[Array, float], Array], start: Annotated[Array, "channel.graph.n_agents k"],
+    channel: Channel, *, rho: PositiveFloat = 1.0, tolerance: PositiveFloat = 1e-6, iterations: PositiveInt = 1000,
+    average: Callable[[Array, Channel], Array] = finite_time_consensus,
+) -> AdmmResult:  # fmt: skip
     r"""Minimise :math:`\sum_l f_l(\mathbf Z)` when agent l knows only its own :math:`f_l`.
 
     .. math::
@@ -326,15 +326,15 @@ def admm(
     _faultless(channel)  # or agents would stop apart
     z, w = start, np.zeros_like(start)
     for n in range(1, iterations + 1):
-        u = array(local_solve(z - w, rho), "local_solve", z.shape)
-        new = array(agree(u + w, channel), "agree", z.shape)
+        u = check_array(local_solve(z - w, rho), "local_solve", z.shape)
+        new = check_array(average(u + w, channel), "agree", z.shape)
         w = w + u - new
         gaps = np.stack([np.abs(u - new).max(axis=1), np.abs(new - z).max(axis=1)], axis=1)
         residuals, z = gaps * [1.0, rho], new
         # After the maximum all agents hold the same two numbers; any row will do.
-        primal, dual = unchecked(maximum)(residuals, channel)[0].tolist()
+        primal, dual = unchecked(max_consensus)(residuals, channel)[0].tolist()
         if primal < tolerance and dual < tolerance:
-            return AdmmRun.unchecked(z, n, primal, dual)
+            return AdmmResult.construct(z, n, primal, dual)
     raise SolverError(
         f"admm: residuals {primal:.3g} and {dual:.3g} after {iterations} iterations, "
         f"needs both below {tolerance:g}"

@@ -7,20 +7,20 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import Array, Bounds, Count, Mask, NonNegative, Positive, Record, Rng, door, unchecked
-from .channel import Channel, PerAgent, fuses
+from ..validation import Array, Bounds, PositiveInt, Mask, NonNegativeFloat, PositiveFloat, FrozenModel, Rng, validated, unchecked
+from .channel import Channel, PerAgent, fusion_rule
 from .consensus import _alone
 from .weights import _laplacian, metropolis
 
 __all__ = [  # fmt: skip
-    "PIState", "event_triggered", "flood", "gossip", "pi_start", "pi_step", "stable_substeps",
+    "PIState", "event_triggered", "flooding", "gossip_consensus", "pi_start", "pi_step", "stable_substeps",
 ]
 
 _Gain = Annotated[float, Bounds(at_least=0, at_most=1e100)]
 
 
 @dataclass(frozen=True, eq=False)
-class PIState(Record):
+class PIState(FrozenModel):
     """What the agents of a proportional-integral estimator remember.
 
     Parameters
@@ -39,18 +39,18 @@ class PIState(Record):
     integral: Annotated[Array, "... A k"]
 
 
-@door
+@validated
 def pi_start(estimate: Annotated[Array, "... A k"]) -> PIState:
     """The state before the first step: any first estimates, (*runs, A, k), no integral.
 
     >>> pi_start([[1.0], [3.0]]).estimate.shape
     (2, 1)
     """
-    return PIState.unchecked(estimate.copy(), np.zeros_like(estimate))
+    return PIState.construct(estimate.copy(), np.zeros_like(estimate))
 
 
-@door
-def stable_substeps(channel: Channel, dt: Positive, *, alpha: _Gain, a: _Gain, b: _Gain) -> int:
+@validated
+def stable_substeps(channel: Channel, dt: PositiveFloat, *, alpha: _Gain, a: _Gain, b: _Gain) -> int:
     r"""How many explicit steps make up `dt` so that the estimator is stable.
 
     An eigenvalue λ of the Laplacian contributes the matrix
@@ -77,7 +77,7 @@ def stable_substeps(channel: Channel, dt: Positive, *, alpha: _Gain, a: _Gain, b
     >>> stable_substeps(Channel(graphs.complete(100)), 0.1, alpha=0.2, a=0.4, b=0.04)
     8
     """
-    bound = 2 * float(channel.graph.degrees.max())
+    bound = 2 * float(channel.graph.in_degree.max())
     rate = max(alpha + a * bound, 1e-300)  # without links nothing may move at all
     if alpha + a == 0:
         raise ValueError("alpha: needs some damping, alpha or a above 0, got both 0")
@@ -88,10 +88,10 @@ def stable_substeps(channel: Channel, dt: Positive, *, alpha: _Gain, a: _Gain, b
     return max(1, int(np.ceil(2 * dt / limit)))
 
 
-@door
+@validated
 def pi_step(
-    state: PIState, inputs: PerAgent, channel: Channel, *, dt: Positive, alpha: _Gain, a: _Gain,
-    b: _Gain, rate: PerAgent | None = None, substeps: Count | None = None,
+    state: PIState, inputs: PerAgent, channel: Channel, *, dt: PositiveFloat, alpha: _Gain, a: _Gain,
+    b: _Gain, rate: PerAgent | None = None, substeps: PositiveInt | None = None,
 ) -> PIState:
     r"""One step of the proportional-integral estimator, equation (25) of Zheng et al.
 
@@ -140,7 +140,7 @@ def pi_step(
     n = substeps or unchecked(stable_substeps)(channel, dt, alpha=alpha, a=a, b=b)
     h, k = dt / n, u.shape[-1]
     # One combination gives -h L of both: the weights I - h L less the values themselves.
-    weights, combine = _laplacian(channel.graph, h), unchecked(channel.combine)
+    weights, combine = _laplacian(channel.graph, h), unchecked(channel.mix)
     for j in range(n):
         both = np.concatenate([nu, eta], axis=-1)
         change = combine(both, weights) - both
@@ -148,12 +148,12 @@ def pi_step(
         now = u + j * h * slope
         moved = nu + h * (alpha * (now - nu) + slope) + a * pull - b * spring
         nu, eta = moved, eta + b * pull
-    return PIState.unchecked(nu, eta)
+    return PIState.construct(nu, eta)
 
 
-@fuses("vectors")
-@door
-def gossip(values: PerAgent, channel: Channel, *, rounds: Count, rng: Rng) -> Array:
+@fusion_rule("vectors")
+@validated
+def gossip_consensus(values: PerAgent, channel: Channel, *, rounds: PositiveInt, rng: Rng) -> Array:
     r"""Average in pairs: in each round one agent wakes and meets one neighbour, both drawn evenly.
 
     .. math:: \mathbf x_i,\mathbf x_j\leftarrow\tfrac12(\mathbf x_i+\mathbf x_j)
@@ -183,7 +183,7 @@ def gossip(values: PerAgent, channel: Channel, *, rounds: Count, rng: Rng) -> Ar
     --------
     >>> from distfilt.network import Channel, graphs
     >>> channel = Channel(graphs.ring(4))
-    >>> gossip([[0.0], [2.0], [4.0], [6.0]], channel, rounds=200,
+    >>> gossip_consensus([[0.0], [2.0], [4.0], [6.0]], channel, rounds=200,
     ...        rng=np.random.default_rng(1)).round(6).ravel()
     array([3., 3., 3., 3.])
     >>> channel.ledger.messages.sum()
@@ -192,20 +192,20 @@ def gossip(values: PerAgent, channel: Channel, *, rounds: Count, rng: Rng) -> Ar
     An agent without a neighbour wakes in vain:
 
     >>> channel = Channel(graphs.Graph.from_edges(3, [(1, 2)]))
-    >>> gossip([[0.0], [2.0], [4.0]], channel, rounds=9, rng=np.random.default_rng(1)).ravel()
+    >>> gossip_consensus([[0.0], [2.0], [4.0]], channel, rounds=9, rng=np.random.default_rng(1)).ravel()
     array([0., 3., 3.])
     >>> channel.ledger.messages
     array([0, 6, 6])
     """
     channel.graph._undirected()
-    graph, carry, out = channel.graph, unchecked(channel.carry), values.copy()
-    awake = rng.integers(graph.size, size=rounds)
-    chosen = (rng.random(rounds) * graph.degrees[awake]).astype(np.int64)
+    graph, carry, out = channel.graph, unchecked(channel.send_on_links), values.copy()
+    awake = rng.integers(graph.n_agents, size=rounds)
+    chosen = (rng.random(rounds) * graph.in_degree[awake]).astype(np.int64)
     faulty = not channel.faults.none
     packet = np.zeros((*channel.runs, graph.senders.size, out.shape[-1]))
     links = np.zeros(graph.senders.size, dtype=bool)
     for i, nth in zip(awake.tolist(), chosen.tolist(), strict=True):
-        if graph.degrees[i] == 0:
+        if graph.in_degree[i] == 0:
             continue
         link = int(graph.links.indptr[i]) + nth
         pair = [link, int(graph.reverse[link])]
@@ -219,10 +219,10 @@ def gossip(values: PerAgent, channel: Channel, *, rounds: Count, rng: Rng) -> Ar
     return out
 
 
-@fuses("vectors")
-@door
+@fusion_rule("vectors")
+@validated
 def event_triggered(
-    values: PerAgent, channel: Channel, *, rounds: Count, threshold: NonNegative,
+    values: PerAgent, channel: Channel, *, rounds: PositiveInt, threshold: NonNegativeFloat,
     decay: Annotated[float, Bounds(above=0, at_most=1)] = 1.0,
 ) -> Array:
     r"""Average, but send only what has moved by more than a threshold since it was sent last.
@@ -266,7 +266,7 @@ def event_triggered(
     """
     _alone(channel)
     channel.graph._undirected()
-    graph, carry, x = channel.graph, unchecked(channel.carry), values
+    graph, carry, x = channel.graph, unchecked(channel.send_on_links), values
     w = metropolis(graph)
     faulty = not channel.faults.none
     # What link e delivered last; its sender knows by the acknowledgement.
@@ -282,8 +282,8 @@ def event_triggered(
     return x
 
 
-@door
-def flood(values: PerAgent, channel: Channel, *, rounds: Count | None = None) -> tuple[Array, Mask]:
+@validated
+def flooding(values: PerAgent, channel: Channel, *, rounds: PositiveInt | None = None) -> tuple[Array, Mask]:
     """Every agent passes on each value when it first hears of it: the rival of all averaging.
 
     Parameters
@@ -306,19 +306,19 @@ def flood(values: PerAgent, channel: Channel, *, rounds: Count | None = None) ->
     --------
     >>> from distfilt.network import Channel, graphs
     >>> channel = Channel(graphs.path(3))
-    >>> flood([[0.0], [3.0], [6.0]], channel)[0].ravel()
+    >>> flooding([[0.0], [3.0], [6.0]], channel)[0].ravel()
     array([3., 3., 3.])
     >>> channel.ledger.scalars
     array([ 6, 12,  6])
     """
     _alone(channel)
-    size = channel.graph.size
+    size = channel.graph.n_agents
     table = np.concatenate([np.arange(size)[:, None], values], axis=1)
     known = news = np.eye(size, dtype=bool)
     most = rounds or 2 * size
     while news.any() and most:
         most -= 1
-        inbox = channel.exchange([table[new] if new.any() else None for new in news])
+        inbox = channel.broadcast([table[new] if new.any() else None for new in news])
         told = np.zeros_like(known)
         for mine, box in zip(told, inbox, strict=True):
             for rows in box.values():

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..doors import Array, Bounds, Index, Mask, Record, Share, array
+from ..validation import Array, Bounds, NonNegativeInt, Mask, FrozenModel, UnitInterval, check_array
 from .graphs import Graph
 
 __all__ = ["Faults"]
@@ -23,7 +23,7 @@ _BETWEEN = Bounds(at_least=0, at_most=1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Faults(Record):
+class Faults(FrozenModel):
     r"""How a channel fails. ``faults | other`` fails in both ways.
 
     Parameters
@@ -70,11 +70,11 @@ class Faults(Record):
     False
     """
 
-    loss: Share | Annotated[Array, "A", _BETWEEN] | Annotated[Array, "A A", _BETWEEN] = 0.0
-    seed: Index = 0
+    loss: UnitInterval | Annotated[Array, "A", _BETWEEN] | Annotated[Array, "A A", _BETWEEN] = 0.0
+    seed: NonNegativeInt = 0
     burst: Annotated[float, Bounds(at_least=1)] | None = None
-    delay: Index = 0
-    silent: Collection[Index] = ()
+    delay: NonNegativeInt = 0
+    silent: Collection[NonNegativeInt] = ()
     during: Any = None
     also: tuple[Faults, ...] = ()
 
@@ -101,11 +101,11 @@ class Faults(Record):
         return replace(self, also=(*self.also, *other._all()))
 
     def _all(self) -> tuple[Faults, ...]:
-        return (self.changed(also=()), *(x for f in self.also for x in f._all()))
+        return (self.replace(also=()), *(x for f in self.also for x in f._all()))
 
     def check(self, graph: Graph) -> None:
         """Refuse a graph whose agents do not fit."""
-        agents = graph.size
+        agents = graph.n_agents
         for faults in self._all():
             got = np.shape(faults.loss)
             if got != (agents,) * len(got):
@@ -118,13 +118,13 @@ class Faults(Record):
         return not any(np.any(f.loss) or f.delay or f.silent for f in self._all())
 
     @cached_property
-    def late(self) -> int:
+    def has_delay(self) -> int:
         """Rounds that a message takes on top of its own, all delays together."""
         return sum(f.delay for f in self._all())
 
     def speaking(self, graph: Graph, round_: int = 0, t: float | None = None) -> Mask:
         """Links whose both ends have their radio on in a round, (E,)."""
-        off = np.zeros(graph.size, dtype=bool)
+        off = np.zeros(graph.n_agents, dtype=bool)
         for faults in self._all():
             if faults.silent and faults._active(round_, t):
                 off[list(faults.silent)] = True
@@ -144,7 +144,7 @@ class Faults(Record):
 
     def _losses(self, graph: Graph, round_: int, runs: int) -> Mask:
         i, j = graph.receivers, graph.senders
-        link = _mixed((i * graph.size + j).astype(np.uint64) + np.uint64(_GOLDEN))
+        link = _mixed((i * graph.n_agents + j).astype(np.uint64) + np.uint64(_GOLDEN))
         loss = np.asarray(self.loss)
         rate = loss[(i, j)[: loss.ndim]]
         drawn = _uniform(self._runs([round_], runs).T ^ link)
@@ -172,7 +172,7 @@ class Faults(Record):
 
 
 def _windows(during: Any) -> tuple[tuple[float, float], ...]:
-    ends = array(during, "during", finite=False)
+    ends = check_array(during, "during", finite=False)
     if ends.ndim != 2 or ends.shape[1] != 2 or not (ends[:, 0] < ends[:, 1]).all():
         raise ValueError(
             f"during: needs windows (start, stop) with start before stop, got {during!r}"

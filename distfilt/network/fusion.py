@@ -11,33 +11,33 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..doors import Array, Bounds, Count, Mask, NonNegative, Positive, definite, door, unchecked
+from ..validation import Array, Bounds, PositiveInt, Mask, NonNegativeFloat, PositiveFloat, check_positive_definite, validated, unchecked
 from ..ensembles import mean, sample_covariance
 from ..gaussians import intersection_weights
-from ..gaussians.single import recolour
+from ..gaussians.single import match_moments
 from ..linalg import cholesky, solve_lower, symmetrise
-from .channel import Channel, fuses
+from .channel import Channel, fusion_rule
 from .graphs import Graph
 from .weights import _laplacian, _warn_if_unstable
 
 __all__ = [  # fmt: skip
-    "arithmetic_average", "consensus_pull", "covariance_intersection", "intersection",
-    "naive_fusion", "pull",
+    "arithmetic_average", "consensus_pull", "covariance_intersection", "intersect_ensembles",
+    "naive_fusion", "mean_pull",
 ]
 
 Gaussians = tuple[
-    Annotated[Array, "*channel.runs channel.graph.size d"],
-    Annotated[Array, "*channel.runs channel.graph.size d d", definite],
+    Annotated[Array, "*channel.runs channel.graph.n_agents d"],
+    Annotated[Array, "*channel.runs channel.graph.n_agents d d", check_positive_definite],
 ]
-Ensembles = Annotated[Array, "*channel.runs channel.graph.size N d"]
+Ensembles = Annotated[Array, "*channel.runs channel.graph.n_agents N d"]
 Pair = tuple[Array, Array]
 Rule = Literal["equal", "trace", "determinant", "min_trace", "min_determinant"]
 
 
-@fuses("gaussians")
-@door
+@fusion_rule("gaussians")
+@validated
 def covariance_intersection(
-    belief: Gaussians, channel: Channel, *, rule: Rule = "equal", rounds: Count = 1
+    belief: Gaussians, channel: Channel, *, rule: Rule = "equal", rounds: PositiveInt = 1
 ) -> Pair:
     r"""Each agent fuses its Gaussian with its neighbours', safely whatever they share.
 
@@ -79,9 +79,9 @@ def covariance_intersection(
     return _in_rounds(belief, channel, rounds, step)
 
 
-@fuses("gaussians")
-@door
-def naive_fusion(belief: Gaussians, channel: Channel, *, rounds: Count = 1) -> Pair:
+@fusion_rule("gaussians")
+@validated
+def naive_fusion(belief: Gaussians, channel: Channel, *, rounds: PositiveInt = 1) -> Pair:
     """Multiply the densities as if their errors were independent: counts shared data twice.
 
     Right for a single fusion of independent estimates, wrong as soon as agents exchange what they
@@ -101,9 +101,9 @@ def naive_fusion(belief: Gaussians, channel: Channel, *, rounds: Count = 1) -> P
     return _in_rounds(belief, channel, rounds, step)
 
 
-@fuses("gaussians")
-@door
-def arithmetic_average(belief: Gaussians, channel: Channel, *, rounds: Count = 1) -> Pair:
+@fusion_rule("gaussians")
+@validated
+def arithmetic_average(belief: Gaussians, channel: Channel, *, rounds: PositiveInt = 1) -> Pair:
     r"""Each agent takes mean and covariance of the mixture of its own and the heard densities.
 
     .. math:: \mathbf m=\sum_j\omega_j\mathbf m_j,\qquad
@@ -134,10 +134,10 @@ def arithmetic_average(belief: Gaussians, channel: Channel, *, rounds: Count = 1
     return _in_rounds(belief, channel, rounds, step)
 
 
-@fuses("gaussians")
-@door
+@fusion_rule("gaussians")
+@validated
 def consensus_pull(
-    belief: Gaussians, channel: Channel, *, gain: Positive, rounds: Count = 1
+    belief: Gaussians, channel: Channel, *, gain: PositiveFloat, rounds: PositiveInt = 1
 ) -> Pair:
     r"""Pull each mean towards the neighbours': the consensus Kalman filter's step.
 
@@ -177,14 +177,14 @@ def consensus_pull(
            [3.]])
     """
     _warn_if_unstable(channel.graph, gain)
-    weights, combine = _laplacian(channel.graph, gain), unchecked(channel.combine)
+    weights, combine = _laplacian(channel.graph, gain), unchecked(channel.mix)
     return combine(belief[0], weights, lost="keep", rounds=rounds), belief[1].copy()
 
 
-@fuses("ensembles")
-@door
-def pull(
-    ensembles: Ensembles, channel: Channel, *, gain: NonNegative, rounds: Count = 1,
+@fusion_rule("ensembles")
+@validated
+def mean_pull(
+    ensembles: Ensembles, channel: Channel, *, gain: NonNegativeFloat, rounds: PositiveInt = 1,
     include_self: bool = True,
 ) -> Array:
     r"""Pull every member towards the neighbours' ensemble means, equation (16) of Grange et al.
@@ -215,7 +215,7 @@ def pull(
     --------
     >>> from distfilt.network import Channel, graphs
     >>> two = [[[0.0], [2.0]], [[4.0], [6.0]]]
-    >>> pull(two, Channel(graphs.path(2)), gain=0.25, include_self=False)[0].ravel()
+    >>> mean_pull(two, Channel(graphs.path(2)), gain=0.25, include_self=False)[0].ravel()
     array([1.25, 2.75])
     """
     out = ensembles.copy()
@@ -231,11 +231,11 @@ def pull(
     return out
 
 
-@fuses("ensembles")
-@door
-def intersection(
+@fusion_rule("ensembles")
+@validated
+def intersect_ensembles(
     ensembles: Ensembles, channel: Channel, *, rule: Rule = "min_determinant",
-    scale: Annotated[Array, "d", Bounds(above=0)] | None = None, rounds: Count = 1,
+    scale: Annotated[Array, "d", Bounds(above=0)] | None = None, rounds: PositiveInt = 1,
 ) -> Array:
     """Fuse sample means and covariances by intersection, and move each ensemble to have those.
 
@@ -258,16 +258,16 @@ def intersection(
     --------
     >>> from distfilt.network import Channel, graphs
     >>> two = [[[-1.0], [1.0]], [[2.0], [4.0]]]
-    >>> intersection(two, Channel(graphs.path(2)), rule="equal")[..., 0]
+    >>> intersect_ensembles(two, Channel(graphs.path(2)), rule="equal")[..., 0]
     array([[0.5, 2.5],
            [0.5, 2.5]])
     """
     size = 1.0 if scale is None else scale
     x = ensembles / size
     belief = unchecked(mean)(x), unchecked(sample_covariance)(x)
-    definite(belief[1], "ensembles")
+    check_positive_definite(belief[1], "ensembles")
     fused = unchecked(covariance_intersection)(belief, channel, rule=rule, rounds=rounds)
-    return unchecked(recolour)(x, *fused) * size
+    return unchecked(match_moments)(x, *fused) * size
 
 
 @dataclass(eq=False)
@@ -293,7 +293,7 @@ def _in_rounds(belief: Pair, channel: Channel, rounds: int, step: Callable[[_Hea
     """Exchange means and upper triangles and take a step, some times."""
     means, covs = belief
     graph, d = channel.graph, means.shape[-1]
-    m, p = means.reshape(-1, graph.size, d), covs.reshape(-1, graph.size, d, d)
+    m, p = means.reshape(-1, graph.n_agents, d), covs.reshape(-1, graph.n_agents, d, d)
     for _ in range(rounds):
         m, p = step(_Heard(graph, m, p, channel._sent(d + d * (d + 1) // 2)))
     return m.reshape(means.shape), p.reshape(covs.shape)
@@ -318,8 +318,8 @@ def _least(heard: _Heard, rule: Rule) -> Pair:
     """The weights of least size, for all agents at once that hear equally many."""
     graph, unit = heard.graph, np.eye(heard.means.shape[-1])
     own, links = np.ones(heard.means.shape[:2]), np.zeros(heard.arrived.shape)
-    for degree in np.unique(graph.degrees):
-        agents = np.flatnonzero(graph.degrees == degree)
+    for degree in np.unique(graph.in_degree):
+        agents = np.flatnonzero(graph.in_degree == degree)
         at = graph.links.indptr[agents, None] + np.arange(int(degree))
         got = heard.arrived[:, at]
         sent = np.where(got[..., None, None], heard.covs[:, graph.senders[at]], unit)

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from ..doors import Array, Bounds, Count, Index, Indices, Positive, Record, door
+from ..validation import Array, Bounds, PositiveInt, NonNegativeInt, Indices, PositiveFloat, FrozenModel, validated
 from . import _links
 
 __all__ = ["Graph", "complete", "disk", "grid", "path", "ring", "star"]
@@ -22,7 +22,7 @@ _DENSE = 200
 
 
 @dataclass(frozen=True, eq=False)
-class Graph(Record):
+class Graph(FrozenModel):
     """Links between agents, without self-loops: an agent always knows what it knows itself.
 
     Build it with :meth:`from_adjacency`, :meth:`from_edges`, :meth:`from_networkx` or a function of
@@ -38,7 +38,7 @@ class Graph(Record):
     >>> graph = Graph.from_adjacency([[0, 1, 1], [1, 0, 0], [1, 0, 0]])
     >>> graph.neighbours(0)
     (1, 2)
-    >>> graph.spectrum.round(6) + 0.0
+    >>> graph.laplacian_spectrum.round(6) + 0.0
     array([0., 1., 3.])
     """
 
@@ -50,7 +50,7 @@ class Graph(Record):
         object.__setattr__(self, "links", links)
 
     @classmethod
-    @door
+    @validated
     def from_adjacency(cls, adjacency: Any, *, directed: bool = False) -> Graph:
         """Build a graph from a matrix of zeros and ones, an array or sparse.
 
@@ -61,11 +61,11 @@ class Graph(Record):
         directed : bool
             Accept links that go one way only.
         """
-        return cls.unchecked(_links.of_matrix(adjacency, "adjacency", directed=directed))
+        return cls.construct(_links.of_matrix(adjacency, "adjacency", directed=directed))
 
     @classmethod
-    @door
-    def from_edges(cls, agents: Count, edges: ArrayLike, *, directed: bool = False) -> Graph:
+    @validated
+    def from_edges(cls, agents: PositiveInt, edges: ArrayLike, *, directed: bool = False) -> Graph:
         """Build a graph from its links, listed as pairs (listener, speaker).
 
         Parameters
@@ -82,7 +82,7 @@ class Graph(Record):
         >>> Graph.from_edges(3, [(0, 1), (1, 2)]).neighbours(1)
         (0, 2)
         """
-        return cls.unchecked(_links.of_edges(agents, edges, "edges", directed=directed))
+        return cls.construct(_links.of_edges(agents, edges, "edges", directed=directed))
 
     @classmethod
     def from_networkx(cls, graph: Any, names: Sequence[str] = ()) -> Graph:
@@ -114,14 +114,14 @@ class Graph(Record):
         return cls.from_edges(len(number_of), edges, directed=bool(graph.is_directed()))
 
     @property
-    def size(self) -> int:
+    def n_agents(self) -> int:
         """Number A of agents."""
         return int(self.links.shape[0])
 
     @cached_property
     def receivers(self) -> Indices:
         """The listener of each link, (E,), ascending."""
-        return np.repeat(np.arange(self.size), np.diff(self.links.indptr))
+        return np.repeat(np.arange(self.n_agents), np.diff(self.links.indptr))
 
     @cached_property
     def senders(self) -> Indices:
@@ -139,31 +139,31 @@ class Graph(Record):
         """Sums what arrives over an agent's links: ``incidence[i, e] = 1`` if link e ends at i."""
         edges = self.senders.size
         parts = np.ones(edges), np.arange(edges), self.links.indptr
-        return scipy.sparse.csr_array(parts, (self.size, edges))
+        return scipy.sparse.csr_array(parts, (self.n_agents, edges))
 
     def _summed(self, per_link: Array, axis: int = -2) -> Array:
         """What arrives over each agent's links, added: E entries along an axis become A."""
         front = per_link.swapaxes(axis, 0)
-        shape = (self.size, *front.shape[1:])
+        shape = (self.n_agents, *front.shape[1:])
         out = self.incidence @ front.reshape(len(front), math.prod(shape[1:]))
         return np.asarray(out).reshape(shape).swapaxes(0, axis)
 
-    @door
-    def neighbours(self, agent: Index) -> tuple[int, ...]:
+    @validated
+    def neighbours(self, agent: NonNegativeInt) -> tuple[int, ...]:
         """The agents that `agent` hears, ascending, without itself."""
-        Bounds(below=self.size)(agent, "agent")
+        Bounds(below=self.n_agents)(agent, "agent")
         row = self.links.indices[self.links.indptr[agent] : self.links.indptr[agent + 1]]
         return tuple(row.tolist())
 
     @cached_property
-    def degrees(self) -> Array:
+    def in_degree(self) -> Array:
         """How many agents each agent hears, (A,)."""
         return np.asarray(np.diff(self.links.indptr), dtype=np.float64)
 
     @cached_property
-    def listeners(self) -> Array:
+    def out_degree(self) -> Array:
         """How many agents hear each agent, (A,)."""
-        return np.bincount(self.senders, minlength=self.size).astype(np.float64)
+        return np.bincount(self.senders, minlength=self.n_agents).astype(np.float64)
 
     @cached_property
     def directed(self) -> bool:
@@ -175,24 +175,24 @@ class Graph(Record):
     @cached_property
     def laplacian(self) -> scipy.sparse.csr_array:
         """The Laplacian, sparse: degrees on the diagonal, -1 where an agent hears another."""
-        return (scipy.sparse.diags_array(self.degrees) - self.links).tocsr()
+        return (scipy.sparse.diags_array(self.in_degree) - self.links).tocsr()
 
     @cached_property
-    def spectrum(self) -> Array:
+    def laplacian_spectrum(self) -> Array:
         """Eigenvalues of the Laplacian of an undirected graph, ascending, (A,).
 
-        All, by a dense solver, in seconds at 2 000 agents; :attr:`largest_gain` needs only an end.
+        All, by a dense solver, in seconds at 2 000 agents; :attr:`max_stable_gain` needs only an end.
         """
         self._undirected()
         return np.asarray(np.linalg.eigvalsh(self.laplacian.toarray()), dtype=np.float64)
 
     @cached_property
-    def largest_gain(self) -> float:
+    def max_stable_gain(self) -> float:
         r"""The bound below which averaging agrees, :math:`2/\lambda_{\max}` with links both ways.
 
         With one-way links the eigenvalues are complex and it is the least
         :math:`2\operatorname{Re}\lambda/|\lambda|^2`, by a dense solver. Infinite without links;
-        :attr:`safe_gain` where too many eigenvalues crowd at the end to tell them apart, as on a
+        :attr:`degree_bound_gain` where too many eigenvalues crowd at the end to tell them apart, as on a
         ring of very many agents.
         """
         from scipy.sparse.linalg import ArpackNoConvergence, eigsh
@@ -203,19 +203,19 @@ class Graph(Record):
             values = np.linalg.eigvals(self.laplacian.toarray())
             values = values[np.abs(values) > 1e-9 * np.abs(values).max()]
             return float((2 * values.real / np.abs(values) ** 2).min(initial=np.inf))
-        if self.size <= _DENSE:
-            return float(2 / self.spectrum[-1])
+        if self.n_agents <= _DENSE:
+            return float(2 / self.laplacian_spectrum[-1])
         # A fixed start makes results repeatable; a random one is orthogonal to no eigenvector.
-        start = np.random.default_rng(0).standard_normal(self.size)
+        start = np.random.default_rng(0).standard_normal(self.n_agents)
         how = {"v0": start, "tol": 1e-8, "maxiter": 100, "return_eigenvectors": False}
         try:
             return float(2 / eigsh(self.laplacian, 1, which="LA", **how)[0])
         except ArpackNoConvergence:
-            return self.safe_gain
+            return self.degree_bound_gain
 
     @cached_property
-    def safe_gain(self) -> float:
-        """A gain from the degrees alone, at most :attr:`largest_gain`; agents can compute it.
+    def degree_bound_gain(self) -> float:
+        """A gain from the degrees alone, at most :attr:`max_stable_gain`; agents can compute it.
 
         With links both ways by the largest sum of an agent's degree and its neighbours' mean degree
         (R. Merris, Linear Algebra and its Applications 285 (1998) 33-35), exact for stars and even
@@ -224,9 +224,9 @@ class Graph(Record):
         if self.senders.size == 0:
             return float("inf")
         if self.directed:
-            return float(1 / self.degrees.max())
-        near = (self.links @ self.degrees) / np.maximum(self.degrees, 1)
-        return float(2 / (self.degrees + near).max())
+            return float(1 / self.in_degree.max())
+        near = (self.links @ self.in_degree) / np.maximum(self.in_degree, 1)
+        return float(2 / (self.in_degree + near).max())
 
     @cached_property
     def components(self) -> Indices:
@@ -239,15 +239,15 @@ class Graph(Record):
         """Whether every agent can reach every other along the links."""
         return int(self.components.max()) == 0
 
-    @door
-    def hops(self, agent: Index) -> Indices:
+    @validated
+    def hops(self, agent: NonNegativeInt) -> Indices:
         """How many rounds news of an agent takes to reach each, (A,); -1 where it never does.
 
         >>> from distfilt.network import graphs
         >>> graphs.path(4).hops(1)
         array([1, 0, 1, 2])
         """
-        Bounds(below=self.size)(agent, "agent")
+        Bounds(below=self.n_agents)(agent, "agent")
         forward = scipy.sparse.csr_array(self.links.T)
         away = scipy.sparse.csgraph.dijkstra(forward, indices=agent, unweighted=True)
         return np.where(np.isinf(away), -1, away).astype(np.int64)
@@ -256,7 +256,7 @@ class Graph(Record):
     def diameter(self) -> int:
         """The largest number of hops between two agents of a connected graph."""
         self._joined()
-        return max(int(self.hops(agent).max()) for agent in range(self.size))
+        return max(int(self.hops(agent).max()) for agent in range(self.n_agents))
 
     def _joined(self) -> None:
         """Refuse a graph in parts."""
@@ -283,7 +283,7 @@ def as_graph(value: Any, size: int | None = None, names: Sequence[str] = ()) -> 
 
     Examples
     --------
-    >>> as_graph([(0, 1), (1, 2)]).degrees
+    >>> as_graph([(0, 1), (1, 2)]).in_degree
     array([1., 2., 1.])
     """
     if isinstance(value, Graph):
@@ -291,23 +291,23 @@ def as_graph(value: Any, size: int | None = None, names: Sequence[str] = ()) -> 
     elif _links.is_networkx(value):
         graph = Graph.from_networkx(value, names)
     elif scipy.sparse.issparse(value) or isinstance(value, np.ndarray | list | tuple):
-        graph = Graph.unchecked(_links.of_either(value, size, "graph"))
+        graph = Graph.construct(_links.of_either(value, size, "graph"))
     else:
         needs = "a Graph, a networkx graph, a matrix of zeros and ones, or edges"
         raise ValueError(f"graph: needs {needs}, got {type(value).__name__}")
-    if size is not None and graph.size != size:
-        raise ValueError(f"graph: needs a graph of {size} agents, got {graph.size}")
+    if size is not None and graph.n_agents != size:
+        raise ValueError(f"graph: needs a graph of {size} agents, got {graph.n_agents}")
     return graph
 
 
 def _both_ways(size: int, first: Indices, second: Indices) -> Graph:
     one_way = np.stack([first.ravel(), second.ravel()], axis=1)
     both = np.concatenate([one_way, one_way[:, ::-1]])
-    return Graph.unchecked(_links.linked(size, both, "graph"))
+    return Graph.construct(_links.linked(size, both, "graph"))
 
 
-@door
-def path(agents: Count) -> Graph:
+@validated
+def path(agents: PositiveInt) -> Graph:
     """Agents in a row.
 
     >>> path(3).neighbours(1)
@@ -317,7 +317,7 @@ def path(agents: Count) -> Graph:
     return _both_ways(agents, number_of[:-1], number_of[1:])
 
 
-@door
+@validated
 def ring(agents: Annotated[int, Bounds(at_least=3)]) -> Graph:
     """Agents in a circle, at least three.
 
@@ -328,19 +328,19 @@ def ring(agents: Annotated[int, Bounds(at_least=3)]) -> Graph:
     return _both_ways(agents, number_of, np.roll(number_of, -1))
 
 
-@door
-def star(agents: Count) -> Graph:
+@validated
+def star(agents: PositiveInt) -> Graph:
     """Agent 0 hears all the others and they hear only it; Tables II and III of Grange et al.
 
-    >>> star(5).spectrum.round(6) + 0.0
+    >>> star(5).laplacian_spectrum.round(6) + 0.0
     array([0., 1., 1., 1., 5.])
     """
     others = np.arange(1, agents)
     return _both_ways(agents, np.zeros_like(others), others)
 
 
-@door
-def grid(rows: Count, columns: Count) -> Graph:
+@validated
+def grid(rows: PositiveInt, columns: PositiveInt) -> Graph:
     """Agents on a rectangular grid, numbered row by row.
 
     >>> grid(2, 3).neighbours(4)
@@ -351,19 +351,19 @@ def grid(rows: Count, columns: Count) -> Graph:
     return _both_ways(at.size, first, np.concatenate([at[:, 1:].ravel(), at[1:].ravel()]))
 
 
-@door
-def complete(agents: Count) -> Graph:
+@validated
+def complete(agents: PositiveInt) -> Graph:
     """Everybody hears everybody.
 
-    >>> complete(4).degrees
+    >>> complete(4).in_degree
     array([3., 3., 3., 3.])
     """
     return _both_ways(agents, *np.triu_indices(agents, 1))
 
 
-@door
+@validated
 def disk(
-    positions: Annotated[Array, "A p", Bounds(at_least=-1e150, at_most=1e150)], radius: Positive
+    positions: Annotated[Array, "A p", Bounds(at_least=-1e150, at_most=1e150)], radius: PositiveFloat
 ) -> Graph:
     """Agents hear each other within a distance: the graph of radios of one range.
 
@@ -380,7 +380,7 @@ def disk(
 
     Examples
     --------
-    >>> disk([[0.0, 0.0], [1.0, 0.0], [5.0, 0.0]], 2.0).degrees
+    >>> disk([[0.0, 0.0], [1.0, 0.0], [5.0, 0.0]], 2.0).in_degree
     array([1., 1., 0.])
     """
     from scipy.spatial import cKDTree

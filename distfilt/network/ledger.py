@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..doors import Array, Count, Index, Mask, Record, door
+from ..validation import Array, PositiveInt, NonNegativeInt, Mask, FrozenModel, validated
 
 __all__ = ["Ledger"]
 
@@ -20,7 +20,7 @@ Payload = Part | tuple[Part, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Ledger(Record):
+class Ledger(FrozenModel):
     """What the agents sent: the cost of a distributed method.
 
     A message is one payload on one link, also when it is lost. A batch of independent runs counts
@@ -41,15 +41,15 @@ class Ledger(Record):
     Ledger(rounds=0, messages=0, scalars=0, bytes=0, lost=0)
     """
 
-    rounds: Index
+    rounds: NonNegativeInt
     messages: Annotated[Counts, "A"]
     scalars: Annotated[Counts, "A"]
     bytes: Annotated[Counts, "A"]
     lost: Annotated[Array, "A"]
 
     @classmethod
-    @door
-    def empty(cls, agents: Count) -> Ledger:
+    @validated
+    def empty(cls, agents: PositiveInt) -> Ledger:
         """A ledger of `agents` agents that have not spoken.
 
         >>> Ledger.empty(0)
@@ -57,7 +57,7 @@ class Ledger(Record):
         ValueError: agents: needs an integer of at least 1, got 0
         """
         zero = np.zeros(agents, dtype=np.int64)
-        return cls.unchecked(0, zero, zero, zero, np.zeros(agents))
+        return cls.construct(0, zero, zero, zero, np.zeros(agents))
 
     def __repr__(self) -> str:
         names = ("messages", "scalars", "bytes", "lost")
@@ -65,7 +65,7 @@ class Ledger(Record):
         return f"Ledger(rounds={self.rounds}, {totals})"
 
 
-def taken(
+def count_payload(
     payloads: Any, agents: int, runs: tuple[int, ...]
 ) -> tuple[list[Payload | None], Counts, Counts]:
     """Each agent's payload as read-only copies, None where it is silent, its scalars and bytes.
@@ -117,10 +117,10 @@ def _present(part: Part, copies: int) -> int:
     return int((~np.isnan(part)).reshape(copies, -1).any(axis=0).sum())
 
 
-def thinned(payload: Any, arrived: Mask) -> Any:
+def drop_lost(payload: Any, arrived: Mask) -> Any:
     """Read-only copies with NaN in the runs that lost the message."""
     if isinstance(payload, tuple):
-        return tuple([thinned(part, arrived) for part in payload])
+        return tuple([drop_lost(part, arrived) for part in payload])
     gone = ~arrived.reshape(arrived.shape + (1,) * (payload.ndim - arrived.ndim))
     out = np.where(gone, np.nan, payload)
     out.flags.writeable = False

@@ -10,12 +10,12 @@ from typing import Annotated
 import numpy as np
 import scipy
 
-from ..doors import Array, Indices, Record, door
+from ..validation import Array, Indices, FrozenModel, validated
 from .graphs import Graph
 
 __all__ = [  # fmt: skip
-    "UnstableGain", "Weights", "balanced", "best_constant", "fastest", "gossip", "metropolis",
-    "push",
+    "UnstableGain", "ConsensusWeights", "doubly_stochastic", "best_constant_edge", "fastest_mixing", "expected_gossip", "metropolis",
+    "column_stochastic",
 ]
 
 
@@ -30,7 +30,7 @@ class UnstableGain(RuntimeWarning):
 
 
 @dataclass(frozen=True, eq=False)
-class Weights(Record):
+class ConsensusWeights(FrozenModel):
     """One weight for each agent's own value, and one for each link.
 
     Parameters
@@ -52,16 +52,16 @@ class Weights(Record):
     """
 
     graph: Graph
-    own: Annotated[Array, "graph.size"]
+    own: Annotated[Array, "graph.n_agents"]
     links: Annotated[Array, "graph.senders.size"]
 
     @cached_property
     def matrix(self) -> scipy.sparse.csr_array:
         """The matrix W of x <- W x, (A, A), each row's own entry stored first."""
-        return stacked(self.graph, self.own[None], self.links[None], heard_at=0)
+        return stack_weights(self.graph, self.own[None], self.links[None], heard_at=0)
 
 
-def stacked(graph: Graph, own: Array, links: Array, *, heard_at: int) -> scipy.sparse.csr_array:
+def stack_weights(graph: Graph, own: Array, links: Array, *, heard_at: int) -> scipy.sparse.csr_array:
     """Matrices of R runs as one block-diagonal matrix, each row's own entry first.
 
     `own` is (R, A) and `links` (R, E). With `heard_at` = 0 both multiply the same stacked values;
@@ -78,7 +78,7 @@ def stacked(graph: Graph, own: Array, links: Array, *, heard_at: int) -> scipy.s
     return scipy.sparse.csr_array((data.ravel(), columns.ravel(), pointers), shape)
 
 
-def _matching(graph: Graph, weights: Weights) -> Weights:
+def _matching(graph: Graph, weights: ConsensusWeights) -> ConsensusWeights:
     """The weights themselves, or a ValueError if they are those of other links."""
     ours, theirs = graph.links, weights.graph.links
     same = np.array_equal(ours.indptr, theirs.indptr)
@@ -87,13 +87,13 @@ def _matching(graph: Graph, weights: Weights) -> Weights:
     return weights
 
 
-def _by_links(graph: Graph, links: Array) -> Weights:
+def _by_links(graph: Graph, links: Array) -> ConsensusWeights:
     """Weights of links, and what is left of one for the own value."""
-    return Weights.unchecked(graph, 1 - np.asarray(graph.incidence @ links), links)
+    return ConsensusWeights.construct(graph, 1 - np.asarray(graph.incidence @ links), links)
 
 
-@door
-def metropolis(graph: Graph) -> Weights:
+@validated
+def metropolis(graph: Graph) -> ConsensusWeights:
     r"""Metropolis weights :math:`w_{ij}=1/(1+\max(d_i,d_j))`: symmetric, rows sum to one.
 
     Each agent needs only its neighbours' degrees. An agent without neighbours keeps its value.
@@ -109,15 +109,15 @@ def metropolis(graph: Graph) -> Weights:
     array([0.333, 0.667, 0.667])
     """
     graph._undirected()
-    d = graph.degrees
+    d = graph.in_degree
     links = 1 / (1 + np.maximum(d[graph.receivers], d[graph.senders]))
     return _by_links(graph, links)
 
 
-def _laplacian(graph: Graph, gain: float) -> Weights:
+def _laplacian(graph: Graph, gain: float) -> ConsensusWeights:
     """The weights of one averaging step, I - gain L."""
-    own = 1 - gain * graph.degrees
-    return Weights.unchecked(graph, own, np.full(graph.senders.size, gain))
+    own = 1 - gain * graph.in_degree
+    return ConsensusWeights.construct(graph, own, np.full(graph.senders.size, gain))
 
 
 def _warn_if_unstable(graph: Graph, gain: float) -> None:
@@ -126,9 +126,9 @@ def _warn_if_unstable(graph: Graph, gain: float) -> None:
     A bound from the degrees clears most gains; eigenvalues are computed, once for a graph, only
     beyond it.
     """
-    if gain <= graph.safe_gain:
+    if gain <= graph.degree_bound_gain:
         return
-    limit = graph.largest_gain
+    limit = graph.max_stable_gain
     if gain > limit * (1 + 1e-9):
         warnings.warn(
             f"gain: {gain:.6g} is above 2/λ_max = {limit:.6g} of this graph, so the agents drift "
@@ -138,8 +138,8 @@ def _warn_if_unstable(graph: Graph, gain: float) -> None:
         )
 
 
-@door
-def best_constant(graph: Graph) -> Weights:
+@validated
+def best_constant_edge(graph: Graph) -> ConsensusWeights:
     r"""The best weights that are equal on all links, :math:`2/(\lambda_2+\lambda_{\max})`.
 
     The slowest and the fastest mode then shrink by the same factor,
@@ -153,17 +153,17 @@ def best_constant(graph: Graph) -> Weights:
     Examples
     --------
     >>> from distfilt.network import graphs
-    >>> float(best_constant(graphs.star(3)).links[0])
+    >>> float(best_constant_edge(graphs.star(3)).links[0])
     0.5
     """
     graph._joined()
-    if graph.size == 1:
+    if graph.n_agents == 1:
         return _laplacian(graph, 0.0)
-    return _laplacian(graph, 2 / float(graph.spectrum[1] + graph.spectrum[-1]))
+    return _laplacian(graph, 2 / float(graph.laplacian_spectrum[1] + graph.laplacian_spectrum[-1]))
 
 
-@door
-def fastest(graph: Graph) -> Weights:
+@validated
+def fastest_mixing(graph: Graph) -> ConsensusWeights:
     r"""Symmetric weights with the (nearly) smallest second largest modulus of an eigenvalue.
 
     Fastest linear averaging on the graph: a convex problem, here smoothed by
@@ -188,13 +188,13 @@ def fastest(graph: Graph) -> Weights:
     >>> from distfilt.network import Graph
     >>> edges = [(0, 1), (0, 2), (1, 2), (2, 3), (3, 4), (3, 5), (4, 5)]
     >>> pair = Graph.from_edges(6, edges)
-    >>> w = fastest(pair).matrix.toarray()
+    >>> w = fastest_mixing(pair).matrix.toarray()
     >>> bool(w[2, 3] > 1.4 * w[0, 2])
     True
     """
     from scipy.optimize import minimize
 
-    start = best_constant(graph)
+    start = best_constant_edge(graph)
     at = np.flatnonzero(graph.receivers < graph.senders)
     if at.size < 2:
         return start
@@ -205,14 +205,14 @@ def fastest(graph: Graph) -> Weights:
     return _from_pairs(graph, at, min(found, key=lambda x: np.abs(_modes(graph, at, x)[0]).max()))
 
 
-def _from_pairs(graph: Graph, at: Indices, pairs: Array) -> Weights:
+def _from_pairs(graph: Graph, at: Indices, pairs: Array) -> ConsensusWeights:
     links = np.empty(graph.senders.size)
     links[at] = links[graph.reverse[at]] = pairs
     return _by_links(graph, links)
 
 
 def _modes(graph: Graph, at: Indices, pairs: Array) -> tuple[Array, Array]:
-    dense = _from_pairs(graph, at, pairs).matrix.toarray() - 1 / graph.size
+    dense = _from_pairs(graph, at, pairs).matrix.toarray() - 1 / graph.n_agents
     return np.linalg.eigh(dense)
 
 
@@ -227,40 +227,40 @@ def _smoothed(pairs: Array, graph: Graph, at: Indices, mu: float) -> tuple[float
     return float(top + mu * np.log(total)), 2 * mean[i, j] - mean[i, i] - mean[j, j]
 
 
-@door
-def gossip(graph: Graph) -> Weights:
+@validated
+def expected_gossip(graph: Graph) -> ConsensusWeights:
     """The mean of one meeting's averaging matrix in :func:`distfilt.network.gossip`.
 
     An agent wakes with probability 1 / A and meets one of its neighbours. The second largest
     eigenvalue bounds the factor by which the mean squared disagreement shrinks in each meeting.
 
     >>> from distfilt.network import graphs
-    >>> gossip(graphs.path(2)).own
+    >>> expected_gossip(graphs.path(2)).own
     array([0.5, 0.5])
     """
     graph._undirected()
-    d = np.maximum(graph.degrees, 1)
-    links = (1 / d[graph.receivers] + 1 / d[graph.senders]) / (2 * graph.size)
+    d = np.maximum(graph.in_degree, 1)
+    links = (1 / d[graph.receivers] + 1 / d[graph.senders]) / (2 * graph.n_agents)
     return _by_links(graph, links)
 
 
-@door
-def push(graph: Graph) -> Weights:
+@validated
+def column_stochastic(graph: Graph) -> ConsensusWeights:
     """Each agent splits its value evenly between itself and its listeners: columns sum to one.
 
     An agent needs to know only how many hear it.
 
     >>> from distfilt.network import Graph
     >>> circle = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1)], directed=True)
-    >>> push(circle).own
+    >>> column_stochastic(circle).own
     array([0.5, 0.5, 0.5])
     """
-    share = 1 / (1 + graph.listeners)
-    return Weights.unchecked(graph, share, share[graph.senders])
+    share = 1 / (1 + graph.out_degree)
+    return ConsensusWeights.construct(graph, share, share[graph.senders])
 
 
-@door
-def balanced(graph: Graph) -> Weights:
+@validated
+def doubly_stochastic(graph: Graph) -> ConsensusWeights:
     r"""Weights of a strongly connected digraph whose rows and columns sum to one.
 
     Scaling agent i's links by the left null vector p of the Laplacian makes what it hears as heavy
@@ -270,12 +270,12 @@ def balanced(graph: Graph) -> Weights:
 
     >>> from distfilt.network import Graph
     >>> circle = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1)], directed=True)
-    >>> balanced(circle).matrix.toarray().sum(axis=0)
+    >>> doubly_stochastic(circle).matrix.toarray().sum(axis=0)
     array([1., 1., 1.])
     """
     graph._joined()
-    p = _left_null_vector(graph.laplacian) if graph.directed else np.ones(graph.size)
-    links = p[graph.receivers] / (2 * (p * graph.degrees).max())
+    p = _left_null_vector(graph.laplacian) if graph.directed else np.ones(graph.n_agents)
+    links = p[graph.receivers] / (2 * (p * graph.in_degree).max())
     return _by_links(graph, links)
 
 
@@ -294,13 +294,13 @@ def _left_null_vector(laplacian: scipy.sparse.csr_array) -> Array:
     return np.asarray(p / p.max())
 
 
-def _keeping(weights: Weights) -> Weights:
+def _keeping(weights: ConsensusWeights) -> ConsensusWeights:
     """The weights themselves, or a ValueError if their columns do not sum to one."""
     graph, own, links = weights.graph, weights.own, weights.links
     # Not by the matrix: scipy's sums sort its entries in place, which changes how sums round.
-    columns = own + np.bincount(graph.senders, links, graph.size)
+    columns = own + np.bincount(graph.senders, links, graph.n_agents)
     # Rounding grows with the weights that cancel in a sum.
-    size = np.abs(own) + np.bincount(graph.senders, np.abs(links), graph.size)
+    size = np.abs(own) + np.bincount(graph.senders, np.abs(links), graph.n_agents)
     off = np.abs(columns - 1) / np.maximum(1.0, size)
     worst = int(off.argmax())
     if off[worst] <= 1e-9:

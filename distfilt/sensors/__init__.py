@@ -2,17 +2,17 @@
 
 from .base import Sensor, wrap
 from .kinds import (
-    angle,
-    direct,
+    line_angle,
+    component,
     distance,
-    distance_and_angle,
+    range_bearing,
     ephemeris,
-    line_of_sight,
-    of_kind,
+    angles_only,
+    from_name,
     stack,
 )
 
 __all__ = [  # fmt: skip
-    "Sensor", "angle", "direct", "distance", "distance_and_angle", "ephemeris",
-    "line_of_sight", "of_kind", "stack", "wrap",
+    "Sensor", "line_angle", "component", "distance", "range_bearing", "ephemeris",
+    "angles_only", "from_name", "stack", "wrap",
 ]

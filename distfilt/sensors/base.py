@@ -15,15 +15,15 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import MISSING, Array, Count, Cov, Positive, Record, Rng, array, door, unchecked
-from ..doors.values import batched
+from ..validation import ALLOW_NAN, Array, PositiveInt, PositiveDefinite, PositiveFloat, FrozenModel, Rng, check_array, validated, unchecked
+from ..validation.checks import call_batched
 from ..linalg import as_derivative, central, factor, leading
 
 __all__ = ["Sensor", "wrap"]
 
 
-@door
-def wrap(angles: Annotated[Array, "...", MISSING], *, period: Positive = 2 * np.pi) -> Array:
+@validated
+def wrap(angles: Annotated[Array, "...", ALLOW_NAN], *, period: PositiveFloat = 2 * np.pi) -> Array:
     """Bring angles into [-period/2, period/2).
 
     Parameters
@@ -49,7 +49,7 @@ def wrap(angles: Annotated[Array, "...", MISSING], *, period: Positive = 2 * np.
 
 
 @dataclass(frozen=True, eq=False)
-class Sensor(Record):
+class Sensor(FrozenModel):
     """A sensor y = h(x) + ζ, ζ ~ N(0, R), possibly of two successive states.
 
     Parameters
@@ -83,10 +83,10 @@ class Sensor(Record):
     array([3.])
     """
 
-    dim: Count
-    function: Callable[..., Array]
-    cov: Annotated[Cov, "dim dim"]
-    difference: Callable[[Array, Array], Array] | None = field(default=None, kw_only=True)
+    dim: PositiveInt
+    h: Callable[..., Array]
+    noise_cov: Annotated[PositiveDefinite, "dim dim"]
+    residual_function: Callable[[Array, Array], Array] | None = field(default=None, kw_only=True)
     uses_previous: bool = field(default=False, kw_only=True)
     kind: str = field(default="sensor", kw_only=True)
     linear: Callable[[int], Array] | None = field(default=None, kw_only=True)
@@ -94,17 +94,17 @@ class Sensor(Record):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.difference is not None:
-            ahead = self.difference(np.full(self.dim, 1 + 1e-6), np.ones(self.dim))
+        if self.residual_function is not None:
+            ahead = self.residual_function(np.full(self.dim, 1 + 1e-6), np.ones(self.dim))
             if (np.asarray(ahead) < -5e-7).any():
                 raise ValueError("difference: needs observed less predicted, got the opposite")
 
     @cached_property
-    def root(self) -> Array:
+    def noise_sqrt(self) -> Array:
         """A factor of R, (m, m)."""
-        return unchecked(factor)(self.cov)
+        return unchecked(factor)(self.noise_cov)
 
-    @door
+    @validated
     def predict(
         self, x: Annotated[Array, "... d"], previous: Annotated[Array, "... d"] | None = None
     ) -> Array:
@@ -113,7 +113,7 @@ class Sensor(Record):
         `previous` holds the states at the previous observation time; only a sensor that sees
         changes needs it.
         """
-        return batched(self, "function", self._states(x, previous))
+        return call_batched(self, "h", self._states(x, previous))
 
     def _states(self, x: Array, previous: Array | None) -> tuple[Array, ...]:
         """What the function gets."""
@@ -127,49 +127,49 @@ class Sensor(Record):
             x, previous = np.broadcast_arrays(x, previous)
         return x, previous
 
-    @door
+    @validated
     def observe(
         self, x: Annotated[Array, "... d"], *, rng: Rng,
         previous: Annotated[Array, "... d"] | None = None
     ) -> Array:
         """A noisy observation of each of the states (..., d), as (..., m)."""
         seen = unchecked(self.predict)(x, previous)
-        return seen + rng.standard_normal(seen.shape) @ self.root.T
+        return seen + rng.standard_normal(seen.shape) @ self.noise_sqrt.T
 
-    @door
+    @validated
     def residual(
-        self, observed: Annotated[Array, "... self.dim", MISSING],
-        predicted: Annotated[Array, "... self.dim", MISSING]
+        self, observed: Annotated[Array, "... self.dim", ALLOW_NAN],
+        predicted: Annotated[Array, "... self.dim", ALLOW_NAN]
     ) -> Array:
         """How far observations are from predictions, (..., m), wrapped where the sensor wraps.
 
         NaN, a missing component or one that the sensor cannot see, stays NaN.
 
         >>> seen, near = np.array([3.0]), np.array([1.0])
-        >>> eye = Sensor(1, lambda x: x, [[1.0]], difference=lambda a, b: np.subtract(a, b, out=a))
+        >>> eye = Sensor(1, lambda x: x, [[1.0]], residual_function=lambda a, b: np.subtract(a, b, out=a))
         >>> eye.residual(seen, near), seen
         (array([2.]), array([3.]))
         """
-        if self.difference is None:
+        if self.residual_function is None:
             return np.asarray(observed - predicted)
         wanted = leading(observed.shape, predicted.shape, "predicted")
-        gap = np.asarray(self.difference(observed.copy(), predicted.copy()))
+        gap = np.asarray(self.residual_function(observed.copy(), predicted.copy()))
         if gap.shape != wanted:
             raise ValueError(f"difference: needs to return shape {wanted}, got {gap.shape}")
         return gap
 
-    @door
-    def matrix(self, dim: Count) -> Array:
+    @validated
+    def H(self, dim: PositiveInt) -> Array:
         """The matrix H, (m, `dim`), of a linear sensor."""
         if self.linear is None:
             raise ValueError(f"sensor: needs a linear sensor, got a {self.kind} sensor")
-        h = array(self.linear(dim), "linear", (self.dim, dim))
+        h = check_array(self.linear(dim), "linear", (self.dim, dim))
         seen = unchecked(self.predict)(np.eye(dim)) if vars(self).pop("_doubted", False) else h.T
         if not np.allclose(seen, h.T, atol=1e-9):
             raise ValueError("linear: needs the matrix of its function, got another")
         return h
 
-    @door
+    @validated
     def jacobian(
         self, x: Annotated[Array, "... d"], previous: Annotated[Array, "... d"] | None = None
     ) -> Array:
@@ -182,7 +182,7 @@ class Sensor(Record):
         d = x.shape[-1]
         full = (*states[0].shape[:-1], self.dim, d)
         if self.linear is not None:
-            return np.broadcast_to(unchecked(self.matrix)(d), full)
+            return np.broadcast_to(unchecked(self.H)(d), full)
         before = [b[..., None, :] for b in states[1:]]
         predict, residual = unchecked(self.predict), unchecked(self.residual)
         near = partial(central, lambda moved: predict(moved, *before), states[0], residual)

@@ -9,12 +9,12 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from scipy.linalg import block_diag
 
-from ..doors import Array, Bounds, Index, Places, door, unchecked
-from ..doors.values import distinct
+from ..validation import Array, Bounds, NonNegativeInt, DistinctIndices, validated, unchecked
+from ..validation.checks import check_distinct
 from .base import Sensor, wrap
 
 __all__ = [  # fmt: skip
-    "angle", "direct", "distance", "distance_and_angle", "ephemeris", "line_of_sight", "of_kind",
+    "line_angle", "component", "distance", "range_bearing", "ephemeris", "angles_only", "from_name",
     "stack",
 ]
 
@@ -24,7 +24,7 @@ Deviation = Annotated[float, Bounds(at_least=1e-150, at_most=1e150)]
 
 Turn = Annotated[float, Bounds(at_least=1e-150, at_most=np.pi)]
 """A standard deviation of an angle, in rad: a wider Gaussian is none once it is wrapped."""
-Pair = Annotated[tuple[Index, Index], distinct]
+Pair = Annotated[tuple[NonNegativeInt, NonNegativeInt], check_distinct]
 
 
 def diagonal(*stds: float) -> Array:
@@ -51,31 +51,31 @@ def _rows(dim: int, indices: Sequence[int]) -> Array:
     return _pick(np.eye(dim), indices).T
 
 
-@door
-def direct(indices: Places, *, std: Deviation) -> Sensor:
+@validated
+def component(indices: DistinctIndices, *, std: Deviation) -> Sensor:
     """See some components as they are, ``h(x) = x[indices]``, with a standard deviation `std` each.
 
     Examples
     --------
-    >>> direct([0, 2], std=0.1).predict([1.0, 2.0, 3.0])
+    >>> component([0, 2], std=0.1).predict([1.0, 2.0, 3.0])
     array([1., 3.])
     """
-    return Sensor.unchecked(
+    return Sensor.construct(
         len(indices), partial(_pick, indices=indices), diagonal(*[std] * len(indices)),
         kind="direct", linear=partial(_rows, indices=indices)
     )
 
 
-@door
-def differential(indices: Places, *, std: Deviation) -> Sensor:
+@validated
+def increment(indices: DistinctIndices, *, std: Deviation) -> Sensor:
     """See how much some components changed since the previous observation time, to `std` each.
 
     Examples
     --------
-    >>> differential([1], std=0.1).predict([1.0, 5.0], previous=[0.0, 3.0])
+    >>> increment([1], std=0.1).predict([1.0, 5.0], previous=[0.0, 3.0])
     array([2.])
     """
-    return Sensor.unchecked(
+    return Sensor.construct(
         len(indices), partial(_change, indices=indices), diagonal(*[std] * len(indices)),
         uses_previous=True, kind="differential", derivative=partial(_change_slope, indices=indices)
     )
@@ -99,9 +99,9 @@ def _gap(x: Array, indices: Sequence[int], origin: Array) -> Array:
     return _pick(x, indices) - origin
 
 
-@door
+@validated
 def distance(
-    indices: Places, *, std: Deviation, origin: Annotated[Array, "n"] | None = None
+    indices: DistinctIndices, *, std: Deviation, origin: Annotated[Array, "n"] | None = None
 ) -> Sensor:
     """See the distance from a place in some components, ``h(x) = |x[indices] - origin|``.
 
@@ -126,7 +126,7 @@ def distance(
     if origin is not None and len(origin) != len(indices):
         raise ValueError(f"origin: needs shape ({len(indices)},), got {origin.shape}")
     place = _place(indices, origin)
-    return Sensor.unchecked(
+    return Sensor.construct(
         1, partial(_distance, **place), diagonal(std), kind="distance",
         derivative=partial(_distance_slope, **place)
     )
@@ -146,8 +146,8 @@ def _distance_slope(x: Array, indices: Sequence[int], origin: Array) -> Array:
     return _spread(slope[..., None, :], indices, x.shape[-1])
 
 
-@door
-def angle(
+@validated
+def line_angle(
     indices: Pair, *, std: Turn, full: bool = False, origin: Annotated[Array, "2"] | None = None
 ) -> Sensor:
     """See the angle of two components (a, b), in rad.
@@ -171,7 +171,7 @@ def angle(
 
     Examples
     --------
-    >>> sight = angle([0, 1], std=0.2)
+    >>> sight = line_angle([0, 1], std=0.2)
     >>> sight.predict([1.0, 1.0]).round(4)
     array([0.7854])
     >>> sight.residual([1.5], [-1.5]).round(4)
@@ -179,9 +179,9 @@ def angle(
     """
     period = (2 if full else 1) * np.pi
     place = _place(indices, origin)
-    return Sensor.unchecked(
+    return Sensor.construct(
         1, partial(_angle, period=period, **place), diagonal(std), kind="angle",
-        derivative=partial(_angle_slope, **place), difference=partial(_turned_at, period=period)
+        derivative=partial(_angle_slope, **place), residual_function=partial(_turned_at, period=period)
     )
 
 
@@ -202,8 +202,8 @@ def _angle_slope(x: Array, indices: Sequence[int], origin: Array) -> Array:
     return _spread(slope[..., None, :], indices, x.shape[-1])
 
 
-@door
-def distance_and_angle(
+@validated
+def range_bearing(
     indices: Pair, *, std: tuple[Deviation, Turn], origin: Annotated[Array, "2"] | None = None,
     heading: float = 0.0
 ) -> Sensor:
@@ -225,18 +225,18 @@ def distance_and_angle(
     -----
     At the origin itself there is no angle: it and its derivative are NaN. A sensor
     with another pose at each reading is best made without checks,
-    ``unchecked(distance_and_angle)(...)``: it takes some 10 µs.
+    ``unchecked(range_bearing)(...)``: it takes some 10 µs.
 
     Examples
     --------
-    >>> radar = distance_and_angle([0, 1], std=[0.5, 0.01], origin=[1.0, 0.0])
+    >>> radar = range_bearing([0, 1], std=[0.5, 0.01], origin=[1.0, 0.0])
     >>> radar.predict([1.0, 2.0]).round(4)
     array([2.    , 1.5708])
     """
     place = _place(indices, origin)
-    return Sensor.unchecked(
+    return Sensor.construct(
         2, partial(_sighting, heading=heading, **place), diagonal(*std),
-        difference=partial(_turned_at, k=1), kind="distance and angle",
+        residual_function=partial(_turned_at, k=1), kind="distance and angle",
         derivative=partial(_sighting_slope, **place)
     )
 
@@ -257,9 +257,9 @@ def _sighting_slope(x: Array, **place: Any) -> Array:
     return np.concatenate([_distance_slope(x, **place), _angle_slope(x, **place)], axis=-2)
 
 
-@door
-def line_of_sight(
-    *, std: Turn, form: Literal["arctan2", "printed"] = "arctan2", observer: Index = 6,
+@validated
+def angles_only(
+    *, std: Turn, form: Literal["arctan2", "printed"] = "arctan2", observer: NonNegativeInt = 6,
     hidden: Callable[[Array, Array], Array] | None = None
 ) -> Sensor:
     r"""The direction to a target, the state's first body, from another: two angles in rad.
@@ -279,15 +279,15 @@ def line_of_sight(
 
     Examples
     --------
-    >>> eye = line_of_sight(std=1e-4)
+    >>> eye = angles_only(std=1e-4)
     >>> x = np.zeros(12)
     >>> x[:3] = -1.0, -1.0, 0.0
     >>> eye.predict(x).round(4) + 0.0
     array([-2.3562,  0.    ])
     """
-    return Sensor.unchecked(
+    return Sensor.construct(
         2, partial(_sight, form=form, observer=observer, hidden=hidden), diagonal(std, std),
-        difference=_turned_at
+        residual_function=_turned_at
     )
 
 
@@ -305,7 +305,7 @@ def _sight(
     return out
 
 
-@door
+@validated
 def ephemeris(*, position_std: Deviation, velocity_std: Deviation) -> Sensor:
     """The first body's full state, read directly, in km and m/s.
 
@@ -319,13 +319,13 @@ def ephemeris(*, position_std: Deviation, velocity_std: Deviation) -> Sensor:
     >>> ephemeris(position_std=1e-3, velocity_std=1e-5).dim
     6
     """
-    read = unchecked(direct)(tuple(range(6)), std=1.0)
-    return read.changed(cov=diagonal(*[position_std] * 3, *[velocity_std] * 3))
+    read = unchecked(component)(tuple(range(6)), std=1.0)
+    return read.replace(noise_cov=diagonal(*[position_std] * 3, *[velocity_std] * 3))
 
 
-@door
-def of_kind(
-    kind: Literal["direct", "differential", "range", "angle"], indices: Places, *, std: Deviation
+@validated
+def from_name(
+    kind: Literal["direct", "differential", "range", "angle"], indices: DistinctIndices, *, std: Deviation
 ) -> Sensor:
     """The sensor that a table names.
 
@@ -339,16 +339,16 @@ def of_kind(
 
     Examples
     --------
-    >>> of_kind("range", [0, 1], std=0.1).kind
+    >>> from_name("range", [0, 1], std=0.1).kind
     'distance'
     """
     makers: dict[str, Callable[..., Sensor]] = {
-        "direct": direct, "differential": differential, "range": distance, "angle": angle
+        "direct": component, "differential": increment, "range": distance, "angle": line_angle
     }
     return makers[kind](indices, std=std)
 
 
-@door
+@validated
 def stack(sensors: Sequence[Sensor]) -> Sensor:
     """One sensor whose observation is the observations of `sensors`, one after the other.
 
@@ -362,21 +362,21 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
 
     Examples
     --------
-    >>> both = stack([direct([0], std=0.1), angle([0, 1], std=0.2)])
-    >>> both.predict([1.0, 1.0]).round(4), both.cov.diagonal().round(4)
+    >>> both = stack([component([0], std=0.1), line_angle([0, 1], std=0.2)])
+    >>> both.predict([1.0, 1.0]).round(4), both.noise_cov.diagonal().round(4)
     (array([1.    , 0.7854]), array([0.01, 0.04]))
     """
     if not sensors:
         raise ValueError("sensors: needs at least one Sensor, got none")
-    cov = block_diag(*[s.cov for s in sensors])
+    cov = block_diag(*[s.noise_cov for s in sensors])
     cov.setflags(write=False)
-    wraps = any(s.difference is not None for s in sensors)
+    wraps = any(s.residual_function is not None for s in sensors)
     linear = all(s.linear is not None for s in sensors)
-    return Sensor.unchecked(
+    return Sensor.construct(
         len(cov), partial(_stacked, parts=sensors), cov, kind="stacked",
-        difference=partial(_stacked_differences, parts=sensors) if wraps else None,
+        residual_function=partial(_stacked_differences, parts=sensors) if wraps else None,
         uses_previous=any(s.uses_previous for s in sensors),
-        linear=partial(_stacked, parts=sensors, what="matrix", axis=0) if linear else None,
+        linear=partial(_stacked, parts=sensors, what="H", axis=0) if linear else None,
         derivative=partial(_stacked, parts=sensors, what="jacobian", axis=-2),
     )
 

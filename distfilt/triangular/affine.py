@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 import numpy as np
 
 from .. import ensembles
-from ..doors import Array, Mask, Record, door, needed, unchecked
+from ..validation import Array, Mask, FrozenModel, validated, import_optional, unchecked
 from ..linalg import SolverError, leading
 
 __all__ = ["AffineMap", "compose", "fit", "fit_convex", "objective"]
@@ -60,7 +60,7 @@ class ConditionalMap(Protocol):
         """Log-determinant at each member."""
 
 
-@door
+@validated
 def compose(
     map_: ConditionalMap, y: Annotated[Array, "... N map_.observed"],
     x: Annotated[Array, "... N map_.dim"], observed: Annotated[Array, "... map_.observed"],
@@ -98,7 +98,7 @@ def _lower_triangular(value: Array, name: str) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class AffineMap(Record):
+class AffineMap(FrozenModel):
     """The affine map S(y, x) that takes x given y to the standard normal.
 
     Parameters
@@ -145,25 +145,25 @@ class AffineMap(Record):
         leading(members.shape[:-1], out.shape[:-1], "y")
         return np.asarray(out)
 
-    @door
+    @validated
     def __call__(self, y: OwnSeen, x: OwnMembers) -> Array:
         """Reference samples S(y, x), (..., N, d), of members y (..., N, m) and x (..., N, d)."""
         return np.asarray(np.linalg.solve(self.scale, (x - self._predicted(y, x)).mT).mT)
 
-    @door
+    @validated
     def inverse(self, y: OwnSeen, z: OwnMembers) -> Array:
         """Members x with S(y, x) = z, (..., N, d); `y` is (..., N, m), or (..., m) for all."""
         seen = y[..., None, :] if y.ndim == self.observed_mean.ndim else y
         return self._predicted(seen, z) + z @ np.ascontiguousarray(self.scale.mT)
 
-    @door
+    @validated
     def log_det(self, y: OwnSeen, x: OwnMembers) -> Array:
         """Logarithm of the determinant of the map's derivative in x at each member, (..., N)."""
         total = -np.log(np.diagonal(self.scale, axis1=-2, axis2=-1)).sum(axis=-1)
         return np.broadcast_to(total[..., None], x.shape[:-1]).copy()
 
 
-def joined(y: Array, x: Array) -> Array:
+def joint_samples(y: Array, x: Array) -> Array:
     """The variables (y, x) of each member, (..., N, m + d)."""
     if y.shape[:-1] != x.shape[:-1]:
         raise ValueError(f"y: needs members {x.shape[:-1]} as x has them, got {y.shape[:-1]}")
@@ -172,7 +172,7 @@ def joined(y: Array, x: Array) -> Array:
 
 def enough(y: Array, x: Array, members: int) -> Array:
     """The variables joined, refused unless there are more members than variables."""
-    joint = joined(y, x)
+    joint = joint_samples(y, x)
     if members <= joint.shape[-1]:
         raise ValueError(f"x: needs more than {joint.shape[-1]} members for {joint.shape[-1]} "
                          f"variables, got {members}")
@@ -188,7 +188,7 @@ def refuse(wrong: Mask, m: int, needs: str) -> None:
         raise ValueError(f"{name}: needs variables that {needs}, got one in column {column}")
 
 
-@door
+@validated
 def fit(y: Seen, x: Members) -> AffineMap:
     """Fit the affine map to samples in closed form: the minimiser of (12).
 
@@ -233,7 +233,7 @@ def from_moments(mean: Array, cov: Array, m: int) -> AffineMap:
     refuse((left <= _ROUNDING * variance) | (variance <= (_ROUNDING * mean) ** 2), m, needs)
     # The factor of the joint covariance holds the map: its lower blocks are K L_yy and L.
     gain = np.linalg.solve(lower[..., :m, :m].mT, lower[..., m:, :m].mT)
-    return AffineMap.unchecked(mean[..., :m], mean[..., m:], gain.mT, lower[..., m:, m:])
+    return AffineMap.construct(mean[..., :m], mean[..., m:], gain.mT, lower[..., m:, m:])
 
 
 def from_rows(u: Array, observed_mean: Array) -> AffineMap:
@@ -247,10 +247,10 @@ def from_rows(u: Array, observed_mean: Array) -> AffineMap:
     gain = -solved[..., 1:]
     mean = (gain @ observed_mean[..., None])[..., 0] - solved[..., 0]
     scale = np.linalg.solve(upper, np.broadcast_to(np.eye(upper.shape[-1]), upper.shape))
-    return AffineMap.unchecked(observed_mean, mean, gain, np.tril(scale))
+    return AffineMap.construct(observed_mean, mean, gain, np.tril(scale))
 
 
-@door
+@validated
 def objective(map_: ConditionalMap, y: Seen, x: Members) -> Array:
     """The objective (12) of the x-block, summed over its components, (...).
 
@@ -273,7 +273,7 @@ def objective(map_: ConditionalMap, y: Seen, x: Members) -> Array:
     return np.asarray((squares - map_.log_det(y, x)).mean(axis=-1))
 
 
-@door
+@validated
 def fit_convex(
     y: Annotated[Array, "N M"], x: Annotated[Array, "N d"], *,
     solver: Literal["ECOS", "CLARABEL"] = "ECOS",
@@ -302,7 +302,7 @@ def fit_convex(
     >>> bool(abs(exact.scale - solved.scale).max() < 1e-4)
     True
     """
-    joint, m, cp = enough(y, x, len(x)), y.shape[-1], needed("cvxpy", "maps")
+    joint, m, cp = enough(y, x, len(x)), y.shape[-1], import_optional("cvxpy", "maps")
     rows = np.zeros((x.shape[-1], 1 + joint.shape[-1]))
     # Of size one: a solver's tolerances are absolute.
     centre, size = joint.mean(axis=0), joint.std(axis=0)
@@ -337,7 +337,7 @@ def _program(n: int) -> tuple[Any, Any, Any]:
 
     The samples enter by |u_0 + Z u|² only, which their QR factor keeps.
     """
-    cp = needed("cvxpy", "maps")
+    cp = import_optional("cvxpy", "maps")
     root, u = cp.Parameter((n, n)), cp.Variable(n)
     loss = cp.sum_squares(root @ u) / 2 - cp.log(u[n - 1])
     return cp.Problem(cp.Minimize(loss)), root, u

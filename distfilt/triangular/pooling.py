@@ -13,21 +13,21 @@ from typing import Annotated
 
 import numpy as np
 
-from ..doors import Array, Positive, array, door, unchecked
+from ..validation import Array, PositiveFloat, check_array, validated, unchecked
 from ..ensembles import mean
-from ..network import AdmmRun, Channel, admm, finite_time
+from ..network import AdmmResult, Channel, admm, finite_time_consensus
 from .affine import AffineMap, enough, from_moments, from_rows, refuse
 
 __all__ = ["pool_by_admm", "pool_by_moments"]
 
 Agree = Callable[[Array, Channel], Array]
-Seen = Annotated[Array, "*channel.runs channel.graph.size N M"]
-Members = Annotated[Array, "*channel.runs channel.graph.size N d"]
+Seen = Annotated[Array, "*channel.runs channel.graph.n_agents N M"]
+Members = Annotated[Array, "*channel.runs channel.graph.n_agents N d"]
 
 
-@door
+@validated
 def pool_by_moments(
-    y: Seen, x: Members, channel: Channel, *, agree: Agree = finite_time
+    y: Seen, x: Members, channel: Channel, *, average: Agree = finite_time_consensus
 ) -> AffineMap:
     """The affine map of all agents' samples together, from averaged moments: each agent's copy.
 
@@ -57,20 +57,20 @@ def pool_by_moments(
     True
     """
     joint = enough(y, x, x.shape[-3] * x.shape[-2])
-    centre = _average(unchecked(mean)(joint), channel, agree)
+    centre = _average(unchecked(mean)(joint), channel, average)
     about = joint - centre[..., None, :]
     second = about.mT @ about / joint.shape[-2]
     rows, columns = np.triu_indices(joint.shape[-1])
-    packed = _average(np.ascontiguousarray(second[..., rows, columns]), channel, agree)
+    packed = _average(np.ascontiguousarray(second[..., rows, columns]), channel, average)
     second[..., rows, columns] = second[..., columns, rows] = packed
     return from_moments(centre, second, y.shape[-1])
 
 
-@door
+@validated
 def pool_by_admm(
-    y: Seen, x: Members, channel: Channel, *, rho: Positive = 1.0, tolerance: Positive = 1e-6,
-    agree: Agree = finite_time,
-) -> tuple[AffineMap, AdmmRun]:
+    y: Seen, x: Members, channel: Channel, *, rho: PositiveFloat = 1.0, tolerance: PositiveFloat = 1e-6,
+    average: Agree = finite_time_consensus,
+) -> tuple[AffineMap, AdmmResult]:
     r"""The same map by consensus ADMM on the components' coefficients, the paper's proposal.
 
     Agents agree on each variable's mean and variance first, 2 D scalars more, and work on
@@ -95,7 +95,7 @@ def pool_by_admm(
     map : AffineMap
         With a leading axis (A,): each agent's copy. It is as exact as `tolerance`, and the number
         of iterations grows with the condition number of the variables' correlation matrix.
-    run : AdmmRun
+    run : AdmmResult
         How ADMM ended; its ``common`` holds the coefficients.
 
     Examples
@@ -110,14 +110,14 @@ def pool_by_admm(
     if channel.runs:
         raise ValueError(f"channel: needs a single run for ADMM, got runs {channel.runs}")
     joint, m = enough(y, x, x.shape[-3] * x.shape[-2]), y.shape[-1]
-    centre = _average(unchecked(mean)(joint), channel, agree)
+    centre = _average(unchecked(mean)(joint), channel, average)
     squares = ((joint - centre[:, None, :]) ** 2).mean(axis=-2)
-    spread = np.sqrt(_average(squares, channel, agree))
+    spread = np.sqrt(_average(squares, channel, average))
     refuse(spread <= 1e-13 * np.abs(centre), m, "are not constant")
     joint = (joint - centre[:, None, :]) / spread[:, None, :]
     ones = np.concatenate([np.ones((*joint.shape[:-1], 1)), joint], axis=-1)
     solve, start, there = _proximal(ones.mT @ ones / joint.shape[-2], m)
-    run = admm(solve, start, channel, rho=rho, tolerance=tolerance, agree=agree)
+    run = admm(solve, start, channel, rho=rho, tolerance=tolerance, average=average)
     rows = np.zeros((len(joint), *there.shape))
     rows[:, there] = run.common
     # Back from standardised variables.
@@ -128,7 +128,7 @@ def pool_by_admm(
 
 def _average(values: Array, channel: Channel, agree: Agree) -> Array:
     """What the agents agree on, refused where it cannot be an average of the values."""
-    out = array(agree(values, channel), "agree", values.shape)
+    out = check_array(agree(values, channel), "agree", values.shape)
     middle = values.mean(axis=-2, keepdims=True)
     # A rule that is only approximate may miss by as much as the values differ.
     slack = np.ptp(values, axis=-2, keepdims=True) + 1e-9 * np.abs(middle)

@@ -21,9 +21,9 @@ from functools import partial
 import numpy as np
 
 from .. import ensembles
-from ..doors import Array, Index, NonNegative, door, unchecked
+from ..validation import Array, NonNegativeInt, NonNegativeFloat, validated, unchecked
 from ..linalg import SolverError, leading
-from .affine import Members, OwnMembers, OwnSeen, Seen, joined, refuse
+from .affine import Members, OwnMembers, OwnSeen, Seen, joint_samples, refuse
 
 __all__ = ["SeparableMap", "fit"]
 
@@ -100,14 +100,14 @@ class SeparableMap:
         a = self.slopes[k][..., None]
         return np.asarray((values @ a)[..., 0]), np.asarray((rates @ a)[..., 0])
 
-    @door
+    @validated
     def __call__(self, y: OwnSeen, x: OwnMembers) -> Array:
         """Reference samples S(y, x), (..., N, d), of members y (..., N, m) and x (..., N, d)."""
         joint, m = self._standard(y, x), self.observed
         own = [self._own(joint[..., m + k], k)[0] for k in range(self.dim)]
         return np.stack([self._earlier(joint, k) + v for k, v in enumerate(own)], axis=-1)
 
-    @door
+    @validated
     def inverse(self, y: OwnSeen, z: OwnMembers) -> Array:
         """Members x with S(y, x) = z, (..., N, d); `y` is (..., N, m), or (..., m) for all."""
         seen = y[..., None, :] if y.ndim == self.centre.ndim else y
@@ -120,7 +120,7 @@ class SeparableMap:
             joint[..., m + k] = invert(partial(self._own, k=k), aim, low, aim / line)
         return joint[..., m:] * self.spread[..., None, m:] + self.centre[..., None, m:]
 
-    @door
+    @validated
     def log_det(self, y: OwnSeen, x: OwnMembers) -> Array:
         """Logarithm of the determinant of the map's derivative in x at each member, (..., N)."""
         joint, m = self._standard(y, x), self.observed
@@ -150,10 +150,10 @@ def _own_features(v: Array, steps: Array) -> tuple[Array, Array]:
     return np.concatenate([v[..., None], values], axis=-1), rates
 
 
-@door
+@validated
 def fit(
-    y: Seen, x: Members, *, order: Index | tuple[Index, Index], regularisation: NonNegative = 0.0,
-    uses: Sequence[Collection[Index]] | None = None,
+    y: Seen, x: Members, *, order: NonNegativeInt | tuple[NonNegativeInt, NonNegativeInt], regularisation: NonNegativeFloat = 0.0,
+    uses: Sequence[Collection[NonNegativeInt]] | None = None,
 ) -> SeparableMap:
     r"""Fit the separable map to samples: the minimiser of (12), regularised.
 
@@ -214,7 +214,7 @@ def fit(
     if x.shape[-2] <= needed:
         raise ValueError(f"x: needs more than {needed} members for as many coefficients, "
                          f"got {x.shape[-2]}")
-    joint = joined(y, x)
+    joint = joint_samples(y, x)
     centre = unchecked(ensembles.mean)(joint)
     joint -= centre[..., None, :]
     spread = np.sqrt((joint**2).mean(axis=-2))

@@ -1,14 +1,14 @@
 """Updates: what an ensemble makes of an observation, ``(ensemble, predicted, observed, noise)``."""
 
-from .door import update, with_missing
-from .gaussian import exact_draws, known_noise, sampled_forecast, sampled_noise, square_root
-from .particles import effective_size, jitter, resampled
-from .transport import ensemble_transform, principal_components, principal_directions, transport
-from .wrappers import augmented, inflated, localised, projected, retracted, serial
+from .decorator import update, with_missing
+from .gaussian import enkf_exact, enkf, stochastic_forecast, enkf_sampled_covariance, etkf
+from .particles import effective_size, jitter, resample
+from .transport import etpf, principal_components, principal_directions, transport_map_update
+from .wrappers import with_augmentation, with_inflation, with_localization, with_projection, with_retraction, serially
 
 __all__ = [  # fmt: skip
-    "augmented", "effective_size", "ensemble_transform", "exact_draws", "inflated", "jitter",
-    "known_noise", "localised", "principal_components", "principal_directions", "projected",
-    "resampled", "retracted", "sampled_forecast", "sampled_noise", "serial", "square_root",
-    "transport", "update", "with_missing",
+    "with_augmentation", "effective_size", "etpf", "enkf_exact", "with_inflation", "jitter",
+    "enkf", "with_localization", "principal_components", "principal_directions", "with_projection",
+    "resample", "with_retraction", "stochastic_forecast", "enkf_sampled_covariance", "serially", "etkf",
+    "transport_map_update", "update", "with_missing",
 ]

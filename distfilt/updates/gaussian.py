@@ -16,15 +16,15 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..doors import Array, NonNegative, Rng, door, unchecked
-from ..ensembles import Ensemble, about_mean, exact_noise
+from ..validation import Array, NonNegativeFloat, Rng, validated, unchecked
+from ..ensembles import Ensemble, center_ensemble, exact_noise
 from ..linalg import cholesky, solve_definite
 from ..models import Model
-from .door import perturbed, update
+from .decorator import perturb_observations, update
 
 __all__ = [
-    "exact_draws", "exact_forecast", "known_noise", "sampled_forecast", "sampled_noise",
-    "square_root",
+    "enkf_exact", "exact_forecast", "enkf", "stochastic_forecast", "enkf_sampled_covariance",
+    "etkf",
 ]  # fmt: skip
 
 Members = Annotated[Ensemble, "... n model.dim"]
@@ -36,7 +36,7 @@ def _gain(a: Array, b: Array, noise: Array | float = 0.0) -> Array:
 
 
 @update
-def sampled_noise(
+def enkf_sampled_covariance(
     ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
 ) -> Array:
     r"""The ensemble Kalman filter's update with both covariances sampled, perturbations included.
@@ -44,7 +44,7 @@ def sampled_noise(
     The gain is :math:`\hat{\mathbf\Sigma}_{xy}\hat{\mathbf\Sigma}_{yy}^{-1}` of the perturbed
     predictions :math:`\mathbf y_i = \mathbf h(\mathbf x_i)+\zeta_i`: the composed affine map of
     Grange et al. computes the same. Chance correlations of members and draws enter the gain, so a
-    small ensemble loses its spread; :func:`known_noise` does not.
+    small ensemble loses its spread; :func:`enkf` does not.
 
     Parameters
     ----------
@@ -68,10 +68,10 @@ def sampled_noise(
     --------
     >>> rng = np.random.default_rng(1)
     >>> prior = rng.standard_normal((2000, 1))
-    >>> after = sampled_noise(prior, prior, [2.0], [[1.0]], rng=rng)
+    >>> after = enkf_sampled_covariance(prior, prior, [2.0], [[1.0]], rng=rng)
     >>> after.mean().round(1), after.var().round(1)
     (np.float64(1.0), np.float64(0.5))
-    >>> sampled_noise(np.eye(2), np.eye(2), [0.0, 0.0], np.eye(2), rng=rng)
+    >>> enkf_sampled_covariance(np.eye(2), np.eye(2), [0.0, 0.0], np.eye(2), rng=rng)
     Traceback (most recent call last):
     ValueError: ensemble: needs at least 3 members for 2 readings, got 2
     """
@@ -79,18 +79,18 @@ def sampled_noise(
     if members <= m:
         raise ValueError(f"ensemble: needs at least {m + 1} members for {m} readings, "
                          f"got {members}")
-    drawn = perturbed(predicted, noise, rng)
-    b = about_mean(drawn)[1]
-    gain = _gain(about_mean(ensemble)[1], b)
+    drawn = perturb_observations(predicted, noise, rng)
+    b = center_ensemble(drawn)[1]
+    gain = _gain(center_ensemble(ensemble)[1], b)
     return np.asarray(ensemble + (observed[..., None, :] - drawn) @ gain)
 
 
 @update
-def known_noise(
+def enkf(
     ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
     centred: bool = False,
 ) -> Array:
-    r"""Update with R itself in the gain, where :func:`sampled_noise` has a sample covariance.
+    r"""Update with R itself in the gain, where :func:`enkf_sampled_covariance` has a sample covariance.
 
     The chance correlations of the members with the drawn noise stay out of the gain, and
     :math:`\hat{\mathbf C}_{hh}+\mathbf R` can be inverted for any number of members.
@@ -98,7 +98,7 @@ def known_noise(
     Parameters
     ----------
     ensemble, predicted, observed, noise, rng
-        As in :func:`sampled_noise`; two members are enough.
+        As in :func:`enkf_sampled_covariance`; two members are enough.
     centred : bool
         Take the draws' mean off, so that they do not move the ensemble's: worth having with ten or
         twenty members.
@@ -107,31 +107,31 @@ def known_noise(
     --------
     >>> rng = np.random.default_rng(3)
     >>> prior = rng.standard_normal((1000, 1))
-    >>> posterior = known_noise(prior, prior, [1.0], [[1.0]], rng=rng)
+    >>> posterior = enkf(prior, prior, [1.0], [[1.0]], rng=rng)
     >>> posterior.mean().round(1), posterior.var().round(1)
     (np.float64(0.5), np.float64(0.5))
     """
-    drawn = perturbed(predicted, noise, rng, centred=centred)
-    gain = _gain(about_mean(ensemble)[1], about_mean(predicted)[1], noise)
+    drawn = perturb_observations(predicted, noise, rng, centred=centred)
+    gain = _gain(center_ensemble(ensemble)[1], center_ensemble(predicted)[1], noise)
     out = np.subtract(observed[..., None, :], drawn, out=drawn) @ gain
     return np.asarray(np.add(out, ensemble, out=out))
 
 
 @update
-def exact_draws(
+def enkf_exact(
     ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
 ) -> Array:
     r"""Update with perturbations that are exact to second order.
 
     The draws are centred over the members, orthogonal to the members' and the predictions'
     anomalies, and have the sample covariance R. The sampled gain then *is* the gain of
-    :func:`known_noise`, and :math:`\mathbf P^+=(\mathbf I-\mathbf K\mathbf H)\mathbf P` holds for
+    :func:`enkf`, and :math:`\mathbf P^+=(\mathbf I-\mathbf K\mathbf H)\mathbf P` holds for
     the sample covariances themselves: what is known is not sampled.
 
     Parameters
     ----------
     ensemble, predicted, observed, noise, rng
-        As in :func:`sampled_noise`; more than d + 2m members (d + m where the predictions are
+        As in :func:`enkf_sampled_covariance`; more than d + 2m members (d + m where the predictions are
         linear in the members).
 
     Examples
@@ -139,18 +139,18 @@ def exact_draws(
     Halfway between prior and observation, with half the variance, whatever was drawn:
 
     >>> prior = np.array([[-1.0], [0.0], [0.5], [0.5]])
-    >>> after = exact_draws(prior, prior, [1.0], [[0.5]], rng=np.random.default_rng(0))
+    >>> after = enkf_exact(prior, prior, [1.0], [[0.5]], rng=np.random.default_rng(0))
     >>> float(after.mean().round(12)), float(after.var(ddof=1).round(12))
     (0.5, 0.25)
     """
-    a, b = about_mean(ensemble)[1], about_mean(predicted)[1]
+    a, b = center_ensemble(ensemble)[1], center_ensemble(predicted)[1]
     draws = exact_noise(np.concatenate([a, b], axis=-1), cholesky(noise), rng)
     gain = _gain(a, b, noise)
     return np.asarray(ensemble + (observed[..., None, :] - predicted - draws) @ gain)
 
 
 @update
-def square_root(
+def etkf(
     ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
     rotation: Literal["random", "none"] = "random",
 ) -> Array:
@@ -166,7 +166,7 @@ def square_root(
     Parameters
     ----------
     ensemble, predicted, observed, noise, rng
-        As in :func:`sampled_noise`; two members are enough.
+        As in :func:`enkf_sampled_covariance`; two members are enough.
     rotation : {"random", "none"}
         Whether the anomalies are turned.
 
@@ -178,12 +178,12 @@ def square_root(
     Examples
     --------
     >>> prior = np.array([[-1.0], [1.0]])
-    >>> after = square_root(prior, prior, [2.0], [[2.0]], rng=np.random.default_rng(0))
+    >>> after = etkf(prior, prior, [2.0], [[2.0]], rng=np.random.default_rng(0))
     >>> float(after.mean().round(12)), float(after.var(ddof=1).round(12))
     (1.0, 1.0)
     """
     n = ensemble.shape[-2]
-    (centre, a), (seen, b) = about_mean(ensemble), about_mean(predicted)
+    (centre, a), (seen, b) = center_ensemble(ensemble), center_ensemble(predicted)
     gain = _gain(a, b, noise)
     root = np.linalg.cholesky(noise)
     white = np.linalg.solve(root, b.mT).mT / np.sqrt(n - 1)
@@ -218,9 +218,9 @@ def _turned(spread: Array, rng: Rng) -> Array:
     return np.asarray(out - 2 * v[:, None] * (v @ out)[..., None, :])
 
 
-@door
-def sampled_forecast(
-    ensemble: Members, model: Model, t: float, dt: NonNegative, *, rng: Rng
+@validated
+def stochastic_forecast(
+    ensemble: Members, model: Model, t: float, dt: NonNegativeFloat, *, rng: Rng
 ) -> Array:
     """Move every member with the model and add an independent draw of the noise, (..., N, d).
 
@@ -236,18 +236,18 @@ def sampled_forecast(
     Examples
     --------
     >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-    >>> sampled_forecast([[1.0], [2.0]], still, 0.0, 0.1, rng=np.random.default_rng(0)).ravel()
+    >>> stochastic_forecast([[1.0], [2.0]], still, 0.0, 0.1, rng=np.random.default_rng(0)).ravel()
     array([1., 2.])
     """
-    moved, root = unchecked(model.step)(ensemble, t, dt), unchecked(model.root)(t, dt)
+    moved, root = unchecked(model.step)(ensemble, t, dt), unchecked(model.noise_sqrt)(t, dt)
     if not np.count_nonzero(root):
         return moved
     return moved + rng.standard_normal(moved.shape) @ np.ascontiguousarray(root.T)
 
 
-@door
+@validated
 def exact_forecast(
-    ensemble: Members, model: Model, t: float, dt: NonNegative, *, rng: Rng
+    ensemble: Members, model: Model, t: float, dt: NonNegativeFloat, *, rng: Rng
 ) -> Array:
     r"""Move the members and add noise that is exact to second order.
 
@@ -258,7 +258,7 @@ def exact_forecast(
     Parameters
     ----------
     ensemble, model, t, dt, rng
-        As for :func:`sampled_forecast`; more members than d + the rank of Q.
+        As for :func:`stochastic_forecast`; more members than d + the rank of Q.
 
     Examples
     --------
@@ -268,11 +268,11 @@ def exact_forecast(
     >>> bool(abs(moved.mean()) < 1e-12), float(moved.var(ddof=1).round(12))
     (True, 1.0)
     """
-    moved, root = unchecked(model.step)(ensemble, t, dt), unchecked(model.root)(t, dt)
+    moved, root = unchecked(model.step)(ensemble, t, dt), unchecked(model.noise_sqrt)(t, dt)
     if not root.any():
         return moved
     bad = ~np.isfinite(moved).all(axis=(-2, -1), keepdims=True)
     clean = np.where(bad, ensemble, moved)
-    noisy = clean + exact_noise(about_mean(clean)[1], root, rng)
+    noisy = clean + exact_noise(center_ensemble(clean)[1], root, rng)
     # Members that the model lost stay lost, and do not take the others' noise with them.
     return np.where(bad, np.nan, noisy)

@@ -8,11 +8,11 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..coupling.transform import normalised
-from ..doors import Array, Bounds, Mask, Rng, Semidefinite, Weights, all_finite, door, unchecked
+from ..coupling.transform import normalize_weights
+from ..validation import Array, Bounds, Mask, Rng, PositiveSemidefinite, Probabilities, all_finite, validated, unchecked
 from ..linalg import cholesky, factor, log_sum, solve_lower
 
-__all__ = ["ParticleCollapse", "effective_size", "jitter", "resampled"]
+__all__ = ["ParticleCollapse", "effective_size", "jitter", "resample"]
 
 Indices = NDArray[np.intp]
 Bandwidth = Annotated[float, Bounds(above=0, at_most=1)]
@@ -37,7 +37,7 @@ def effective_size(log_weights: ArrayLike) -> Array:
     >>> float(effective_size(np.log([0.5, 0.25, 0.25])).round(4))
     2.6667
     """
-    return size_of(normalised(log_weights))
+    return size_of(normalize_weights(log_weights))
 
 
 def size_of(w: Array) -> Array:
@@ -79,14 +79,14 @@ def warn_of_weights(log_weights: Array, predicted: Array, observed: Array, noise
     warn_of_collapse(what, "rejuvenation=")
 
 
-def taken(points: Any, counts: Indices) -> Any:
+def repeat_by_count(points: Any, counts: Indices) -> Any:
     """Rows of points (..., N, d), each as often as its count (..., N), N in all."""
     rows = points.reshape(-1, points.shape[-1])
     return np.repeat(rows, counts.reshape(-1), axis=0).reshape(points.shape)
 
 
-@door
-def resampled(probabilities: Annotated[Weights, "... n"], *, rng: Rng) -> Indices:
+@validated
+def resample(probabilities: Annotated[Probabilities, "... n"], *, rng: Rng) -> Indices:
     """Draw N indices, each as often as its weight says on average: systematic resampling.
 
     One random number serves all, so that an index appears within one of N times its weight.
@@ -108,15 +108,15 @@ def resampled(probabilities: Annotated[Weights, "... n"], *, rng: Rng) -> Indice
 
     Examples
     --------
-    >>> resampled([0.5, 0.0, 0.25, 0.25], rng=np.random.default_rng(0))
+    >>> resample([0.5, 0.0, 0.25, 0.25], rng=np.random.default_rng(0))
     array([0, 0, 2, 3])
     """
-    counts = counted(probabilities, rng.random((*probabilities.shape[:-1], 1)))
+    counts = systematic_counts(probabilities, rng.random((*probabilities.shape[:-1], 1)))
     each = np.broadcast_to(np.arange(counts.shape[-1])[:, None], (*counts.shape, 1))
-    return np.asarray(taken(each, counts)[..., 0])
+    return np.asarray(repeat_by_count(each, counts)[..., 0])
 
 
-def counted(w: Array, offset: Array) -> Indices:
+def systematic_counts(w: Array, offset: Array) -> Indices:
     """How many of the levels (k + offset) / N each weight (..., N) holds."""
     n = w.shape[-1]
     # How many levels lie below each edge; the last edge has all of them.
@@ -130,10 +130,10 @@ def counted(w: Array, offset: Array) -> Indices:
     return counts
 
 
-@door
+@validated
 def jitter(
     points: Annotated[Array, "... n d"], *, rng: Rng, bandwidth: Bandwidth,
-    cov: Semidefinite | None = None,
+    cov: PositiveSemidefinite | None = None,
 ) -> Array:
     r"""Move equally weighted particles apart without moving their mean or covariance.
 
@@ -171,7 +171,7 @@ def jitter(
     if cov is None:
         around = points - points.mean(axis=-2, keepdims=True)
         cov = around.mT @ around / points.shape[-2]
-    return jittered(points, cov, bandwidth, rng.standard_normal(points.shape))
+    return add_jitter(points, cov, bandwidth, rng.standard_normal(points.shape))
 
 
 def silverman(n: int, d: int) -> float:
@@ -179,7 +179,7 @@ def silverman(n: int, d: int) -> float:
     return float(min(1.0, (4 / (n * (d + 2))) ** (1 / (d + 4))))
 
 
-def jittered(x: Array, cov: Array, h: float, drawn: Array, copied: Mask | None = None) -> Array:
+def add_jitter(x: Array, cov: Array, h: float, drawn: Array, copied: Mask | None = None) -> Array:
     """As :func:`jitter`, with standard normal draws.
 
     Where it is known which were copied, these alone move: C. Musso, N. Oudjane, F. Le Gland, in the
@@ -192,7 +192,7 @@ def jittered(x: Array, cov: Array, h: float, drawn: Array, copied: Mask | None =
     return np.asarray(centre + np.sqrt(1 - h * h) * (x - centre) + h * moved)
 
 
-def weighed(log_weights: Array, predicted: Array, observed: Array, noise: Array) -> Array:
+def reweight(log_weights: Array, predicted: Array, observed: Array, noise: Array) -> Array:
     """Log-weights (..., N), normalised, after a reading; refused where it rules out every point."""
     joint = log_weights + log_likelihood(predicted, observed, noise)
     total = log_sum(joint)
@@ -217,13 +217,13 @@ def log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
     return np.asarray(-0.5 * (half * half).sum(axis=-2))
 
 
-def distinct_share(points: Array) -> Array:
+def distinct_fraction(points: Array) -> Array:
     """Share of particles that differ from all before them in the component that tells most, (...).
 
     Mostly that is the first, but it may be known exactly.
 
     >>> one, other = np.array([[0.0, 1.0], [0.0, 2.0]]), np.array([[1.0, 0.0], [2.0, 0.0]])
-    >>> distinct_share(np.stack([one, other]))
+    >>> distinct_fraction(np.stack([one, other]))
     array([1., 1.])
     """
     changes = (points[..., 1:, :] != points[..., :-1, :]).sum(axis=-2, keepdims=True)

@@ -8,14 +8,14 @@ from typing import Annotated, Literal
 import numpy as np
 
 from .. import coupling
-from ..doors import Array, Bounds, Count, NonNegative, Rng, door, unchecked
+from ..validation import Array, Bounds, PositiveInt, NonNegativeFloat, Rng, validated, unchecked
 from ..ensembles import Ensemble, sample_covariance
 from ..triangular import affine, compose
 from ..triangular.affine import ConditionalMap
-from .door import perturbed, update
+from .decorator import perturb_observations, update
 from .particles import log_likelihood, warn_of_weights
 
-__all__ = ["ensemble_transform", "principal_components", "principal_directions", "transport"]
+__all__ = ["etpf", "principal_components", "principal_directions", "transport_map_update"]
 
 Factor = Annotated[float, Bounds(at_least=0, at_most=1e100)]
 Fit = Callable[[Array, Array], ConditionalMap]
@@ -23,23 +23,23 @@ Fit = Callable[[Array, Array], ConditionalMap]
 
 
 def _noisy(seen: Array, noise: Array, factor: float, rng: Rng) -> Array:
-    return perturbed(seen, factor**2 * noise, rng) if factor else seen
+    return perturb_observations(seen, factor**2 * noise, rng) if factor else seen
 
 
 @update
-def transport(
+def transport_map_update(
     ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
     fit: Fit = affine.fit, noise_factor: Factor = 1.0,
 ) -> Array:
     """Condition an ensemble with a composed map, equations (10)-(13) of Grange et al.
 
     With the affine map, the default, this is exactly the stochastic ensemble Kalman filter with
-    sample covariances, :func:`~distfilt.updates.sampled_noise`.
+    sample covariances, :func:`~distfilt.updates.enkf_sampled_covariance`.
 
     Parameters
     ----------
     ensemble, predicted, observed, noise, rng
-        As in :func:`~distfilt.updates.sampled_noise`; a draw of the noise is added to each
+        As in :func:`~distfilt.updates.enkf_sampled_covariance`; a draw of the noise is added to each
         prediction.
     fit : callable
         ``fit(y, x) -> map``: an estimator of the map, such as
@@ -52,7 +52,7 @@ def transport(
     --------
     >>> rng = np.random.default_rng(3)
     >>> prior = rng.standard_normal((1000, 1))
-    >>> posterior = transport(prior, prior, [1.0], [[1.0]], rng=rng)
+    >>> posterior = transport_map_update(prior, prior, [1.0], [[1.0]], rng=rng)
     >>> posterior.mean().round(1), posterior.var().round(1)
     (np.float64(0.5), np.float64(0.5))
     """
@@ -60,8 +60,8 @@ def transport(
     return compose(fit(seen, ensemble), seen, ensemble, observed)
 
 
-@door
-def principal_directions(ensemble: Ensemble, n: Count) -> Array:
+@validated
+def principal_directions(ensemble: Ensemble, n: PositiveInt) -> Array:
     """The `n` orthonormal directions of largest sample variance, as columns.
 
     Parameters
@@ -88,8 +88,8 @@ def principal_directions(ensemble: Ensemble, n: Count) -> Array:
 
 @update
 def principal_components(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng, n_state: Count,
-    n_observed: Count, complement: Literal["keep", "literal"] = "keep", noise_factor: Factor = 1.0,
+    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng, n_state: PositiveInt,
+    n_observed: PositiveInt, complement: Literal["keep", "literal"] = "keep", noise_factor: Factor = 1.0,
     fit: Fit = affine.fit,
 ) -> Array:
     r"""Condition in the leading principal directions only, Algorithm 2 of Grange et al.
@@ -132,9 +132,9 @@ def principal_components(
 
 
 @update
-def ensemble_transform(
+def etpf(
     ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
-    correct: bool = False, rejuvenation: NonNegative = 0.0,
+    correct: bool = False, rejuvenation: NonNegativeFloat = 0.0,
 ) -> Array:
     r"""Weigh the members by their likelihoods and transport the weights to equal ones, (3)-(5).
 
@@ -178,13 +178,13 @@ def ensemble_transform(
     --------
     >>> rng = np.random.default_rng(3)
     >>> prior = rng.standard_normal((400, 1))
-    >>> posterior = ensemble_transform(prior, prior, [1.0], [[1.0]], rng=rng)
+    >>> posterior = etpf(prior, prior, [1.0], [[1.0]], rng=rng)
     >>> posterior.mean().round(1), posterior.var().round(1)
     (np.float64(0.5), np.float64(0.5))
     """
     logs = log_likelihood(predicted, observed, noise)
     warn_of_weights(logs, predicted, observed, noise)
-    out = unchecked(coupling.ensemble_transform)(ensemble, logs, correct=correct)
+    out = unchecked(coupling.transform_ensemble)(ensemble, logs, correct=correct)
     if not rejuvenation:
         return out
-    return unchecked(coupling.rejuvenated)(out, ensemble, bandwidth=rejuvenation, rng=rng)
+    return unchecked(coupling.rejuvenate)(out, ensemble, bandwidth=rejuvenation, rng=rng)

@@ -1,6 +1,6 @@
 """Wrappers: what can be put around any update, one round another.
 
-``inflated(serial(known_noise), factor=1.02)`` is an update like any other, and so is
+``inflated(serial(enkf), factor=1.02)`` is an update like any other, and so is
 ``projected(augmented(ensemble_transform, g, std=0.1), g)``, Das and Bhattacharya's OTNLeqMA.
 """
 
@@ -13,10 +13,10 @@ import numpy as np
 
 from .. import coupling
 from ..coupling.constraints import Constraint, Motion
-from ..doors import Array, Bounds, Indices, NonNegative, Positive, Rng, door, unchecked
-from .door import Update, around, says, with_missing
+from ..validation import Array, Bounds, Indices, NonNegativeFloat, PositiveFloat, Rng, validated, unchecked
+from .decorator import Update, around, has_tag, with_missing
 
-__all__ = ["augmented", "inflated", "localised", "projected", "retracted", "serial"]
+__all__ = ["with_augmentation", "with_inflation", "with_localization", "with_projection", "with_retraction", "serially"]
 
 
 def _followed(update: Update, change: Callable[[Array], Array]) -> Update:
@@ -31,12 +31,12 @@ def _followed(update: Update, change: Callable[[Array], Array]) -> Update:
         more = {} if predict is None else {"predict": predict}
         return change(inner(ensemble, predicted, observed, noise, rng=rng, **more))
 
-    vars(both)["repredicts"] = says(update, "repredicts")
+    vars(both)["repredicts"] = has_tag(update, "repredicts")
     return both
 
 
-@door
-def inflated(update: Update, *, factor: Annotated[float, Bounds(at_least=0.5)]) -> Update:
+@validated
+def with_inflation(update: Update, *, factor: Annotated[float, Bounds(at_least=0.5)]) -> Update:
     """Multiply the analysis anomalies by a factor: the remedy for a spread that is too small.
 
     Parameters
@@ -50,9 +50,9 @@ def inflated(update: Update, *, factor: Annotated[float, Bounds(at_least=0.5)]) 
 
     Examples
     --------
-    >>> from distfilt.updates import exact_draws
+    >>> from distfilt.updates import enkf_exact
     >>> x = np.array([[-1.0], [0.0], [0.5], [0.5]])
-    >>> wider = inflated(exact_draws, factor=2.0)
+    >>> wider = with_inflation(enkf_exact, factor=2.0)
     >>> float(wider(x, x, [1.0], [[0.5]], rng=np.random.default_rng(0)).var(ddof=1).round(12))
     1.0
     """
@@ -64,11 +64,11 @@ def inflated(update: Update, *, factor: Annotated[float, Bounds(at_least=0.5)]) 
     return _followed(update, inflate)
 
 
-@door
-def projected(
+@validated
+def with_projection(
     update: Update, constraint: Constraint, *,
     reading: Literal["printed", "reversed", "particle", "shift"] = "shift",
-    regularisation: NonNegative = 1e-6,
+    regularisation: NonNegativeFloat = 1e-6,
 ) -> Update:
     """Project the analysis members by regression, equations (6)-(12), and go on from them.
 
@@ -87,10 +87,10 @@ def projected(
 
     Examples
     --------
-    >>> from distfilt.coupling import norm
-    >>> from distfilt.updates import square_root
+    >>> from distfilt.coupling import norm_constraint
+    >>> from distfilt.updates import etkf
     >>> x = 1.3 * np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
-    >>> on = projected(square_root, norm([0, 1]))
+    >>> on = with_projection(etkf, norm_constraint([0, 1]))
     >>> after = on(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
     >>> bool(abs((after**2).sum(axis=1).mean() - 1) < abs((x**2).sum(axis=1).mean() - 1) / 3)
     True
@@ -101,8 +101,8 @@ def projected(
     )
 
 
-@door
-def retracted(update: Update, constraint: Constraint, *, motion: Motion | None = None) -> Update:
+@validated
+def with_retraction(update: Update, constraint: Constraint, *, motion: Motion | None = None) -> Update:
     """Put every analysis member on the constraint by itself.
 
     Parameters
@@ -120,10 +120,10 @@ def retracted(update: Update, constraint: Constraint, *, motion: Motion | None =
 
     Examples
     --------
-    >>> from distfilt.coupling import norm
-    >>> from distfilt.updates import square_root
+    >>> from distfilt.coupling import norm_constraint
+    >>> from distfilt.updates import etkf
     >>> x = 1.3 * np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
-    >>> on = retracted(square_root, norm([0, 1]))
+    >>> on = with_retraction(etkf, norm_constraint([0, 1]))
     >>> after = on(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
     >>> bool(abs((after**2).sum(axis=1) - 1).max() < 1e-14)
     True
@@ -132,8 +132,8 @@ def retracted(update: Update, constraint: Constraint, *, motion: Motion | None =
     return _followed(update, lambda x: retract(x, constraint, motion=motion))
 
 
-@door
-def augmented(update: Update, constraint: Constraint, *, std: Positive) -> Update:
+@validated
+def with_augmentation(update: Update, constraint: Constraint, *, std: PositiveFloat) -> Update:
     r"""Observe the constraint too, as a reading that is nearly perfect, equation (13).
 
     Parameters
@@ -152,10 +152,10 @@ def augmented(update: Update, constraint: Constraint, *, std: Positive) -> Updat
 
     Examples
     --------
-    >>> from distfilt.coupling import norm
-    >>> from distfilt.updates import square_root
+    >>> from distfilt.coupling import norm_constraint
+    >>> from distfilt.updates import etkf
     >>> x = 1.3 * np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
-    >>> knows = augmented(square_root, norm([0, 1]), std=0.01)
+    >>> knows = with_augmentation(etkf, norm_constraint([0, 1]), std=0.01)
     >>> after = knows(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
     >>> bool(abs((after**2).sum(axis=1) - 1).mean() < abs((x**2).sum(axis=1) - 1).mean() / 5)
     True
@@ -176,8 +176,8 @@ def augmented(update: Update, constraint: Constraint, *, std: Positive) -> Updat
     return augment
 
 
-@door
-def serial(update: Update) -> Update:
+@validated
+def serially(update: Update) -> Update:
     """Take independent readings in one after the other.
 
     Readings are independent where the noise covariance has a zero between them; correlated ones
@@ -190,7 +190,7 @@ def serial(update: Update) -> Update:
     ----------
     update : callable
         Any update; it never sees more readings at once than the largest group, so an agent that
-        hears more than it has members can still use :func:`~distfilt.updates.sampled_noise`.
+        hears more than it has members can still use :func:`~distfilt.updates.enkf_sampled_covariance`.
 
     Returns
     -------
@@ -199,9 +199,9 @@ def serial(update: Update) -> Update:
 
     Examples
     --------
-    >>> from distfilt.updates import exact_draws
+    >>> from distfilt.updates import enkf_exact
     >>> x = np.array([[-1.0], [0.0], [0.5], [0.5]])
-    >>> twice = serial(exact_draws)
+    >>> twice = serially(enkf_exact)
     >>> seen = np.concatenate([x, x], axis=1)
     >>> after = twice(x, seen, [1.0, 1.0], np.eye(2), rng=np.random.default_rng(0))
     >>> float(after.mean().round(12)), float(after.var(ddof=1).round(12))
@@ -210,10 +210,10 @@ def serial(update: Update) -> Update:
     return _one_by_one(update, None)
 
 
-@door
-def localised(
-    update: Update, *, places: Annotated[Array, "d k"], readings: Annotated[Array, "m k"],
-    radius: Positive, period: Positive | None = None,
+@validated
+def with_localization(
+    update: Update, *, places: Annotated[Array, "d k"], observation_places: Annotated[Array, "m k"],
+    radius: PositiveFloat, period: PositiveFloat | None = None,
 ) -> Update:
     r"""Let each reading move only components near it: the remedy for few members in a large space.
 
@@ -226,7 +226,7 @@ def localised(
     Parameters
     ----------
     update : callable
-        An update whose draws stay with the readings: :func:`~distfilt.updates.known_noise`, or
+        An update whose draws stay with the readings: :func:`~distfilt.updates.enkf`, or
         ``partial(square_root, rotation="none")``; not a random rotation, which mixes the members of
         near components and not of far ones.
     places : array_like, (d, k)
@@ -250,8 +250,8 @@ def localised(
     --------
     Two components, of which the first is seen; the second is too far to be moved.
 
-    >>> from distfilt.updates import known_noise
-    >>> near = localised(known_noise, places=[[0.0], [9.0]], readings=[[0.0]], radius=1.0)
+    >>> from distfilt.updates import enkf
+    >>> near = with_localization(enkf, places=[[0.0], [9.0]], observation_places=[[0.0]], radius=1.0)
     >>> x = np.array([[-1.0, -1.1], [1.0, 0.9]])
     >>> after = near(x, x[:, :1], [1.0], [[2.0]], rng=np.random.default_rng(0))
     >>> (after != x).any(axis=0)
@@ -260,15 +260,15 @@ def localised(
     On a ring of length 10 the second is near, from wherever it is counted.
 
     >>> for place in (9.0, -1.0, 11.0):
-    ...     ring = localised(known_noise, places=[[0.0], [place]], readings=[[0.0]], radius=1.0,
+    ...     ring = with_localization(enkf, places=[[0.0], [place]], observation_places=[[0.0]], radius=1.0,
     ...                      period=10.0)
     ...     print(ring(x, x[:, :1], [1.0], [[2.0]], rng=np.random.default_rng(0))[0].round(3))
     [-0.049 -0.902]
     [-0.049 -0.902]
     [-0.049 -0.902]
     """
-    both = np.concatenate([places, readings])
-    gap = np.abs(both[:, None] - readings)
+    both = np.concatenate([places, observation_places])
+    gap = np.abs(both[:, None] - observation_places)
     if period is not None:
         gap = np.minimum(gap % period, -gap % period)
     return _one_by_one(update, gaspari_cohn(np.linalg.norm(gap, axis=-1) / radius))

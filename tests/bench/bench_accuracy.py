@@ -20,23 +20,23 @@ from _bench import Row, main, peer, table
 
 from distfilt.filters import EnsembleFilter, ParticleFilter
 from distfilt.models import lorenz63
-from distfilt.sensors import direct
-from distfilt.updates import exact_draws, inflated, known_noise, square_root
+from distfilt.sensors import component
+from distfilt.updates import enkf_exact, with_inflation, enkf, etkf
 
 RUNS, END, STD = 72, 216.0, 2**0.5
 
 
 def pairs(da: Any) -> Iterator[tuple[str, Any, Any, float]]:
     """Each filter of ours, DAPPER's with the options that it recommends, the limit of the ratio."""
-    given = lorenz63(step=0.01), [direct([0, 1, 2], std=STD)]
-    ours, wider = partial(EnsembleFilter, *given, members=10), partial(inflated, factor=1.02)
-    centred = inflated(partial(known_noise, centred=True), factor=1.04)
+    given = lorenz63(step=0.01), [component([0, 1, 2], std=STD)]
+    ours, wider = partial(EnsembleFilter, *given, members=10), partial(with_inflation, factor=1.02)
+    centred = with_inflation(partial(enkf, centred=True), factor=1.04)
     rotated = partial(da.EnKF, "Sqrt", N=10, infl=1.02, rot=True)
     yield "centred draws", ours(update=centred), partial(da.EnKF, "PertObs", N=10, infl=1.04), 1.05
-    yield "square root", ours(update=wider(square_root)), rotated, 1.0
-    yield "exact draws", ours(update=wider(exact_draws)), rotated, 1.0
+    yield "square root", ours(update=wider(etkf)), rotated, 1.0
+    yield "exact draws", ours(update=wider(enkf_exact)), rotated, 1.0
     particles = partial(da.PartFilt, N=800, reg=0.9, NER=0.2)
-    yield "particles", ParticleFilter(*given, members=800, threshold=0.2), particles, 1.03
+    yield "particles", ParticleFilter(*given, members=800, ess_threshold=0.2), particles, 1.03
 
 
 @table("accuracy", "numpy", "scipy", "dapper")

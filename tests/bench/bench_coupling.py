@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 from _bench import Row, interleaved, main, table
 
-from distfilt.coupling import distances, plan
+from distfilt.coupling import squared_distances, transport_plan
 
 SIZES, MOST, NEEDED = (50, 100, 200, 500, 1000, 2000), 200, 30
 
@@ -23,7 +23,7 @@ def case(n: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(n)
     x = rng.standard_normal((n, 4))
     w = np.exp(-1.5 * x[:, 0] ** 2)
-    return distances(x), w / w.sum()
+    return squared_distances(x), w / w.sum()
 
 
 def built_anew(cost: np.ndarray, w: np.ndarray) -> float:
@@ -45,10 +45,10 @@ def rows() -> Iterator[Row]:
     spent: dict[int, float] = {}
     for n in SIZES:
         cost, w = case(n)
-        calls = {"network simplex": lambda c=cost, w=w: plan(c, w).value}
+        calls = {"network simplex": lambda c=cost, w=w: transport_plan(c, w).value}
         if n <= MOST:
             calls["cvxpy, built anew"] = partial(built_anew, cost, w)
-            calls["entropic, 0.01"] = lambda c=cost, w=w: plan(c, w, solver="entropic").value
+            calls["entropic, 0.01"] = lambda c=cost, w=w: transport_plan(c, w, solver="entropic").value
         times, ratios = interleaved(calls, 5)
         best, spent[n] = calls["network simplex"](), times["network simplex"]
         slope = np.diff(np.log(list(spent.items())[-2:]), axis=0)

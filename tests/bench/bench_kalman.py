@@ -25,7 +25,7 @@ from filterpy import kalman as filterpy
 from distfilt.filters import GaussianFilter
 from distfilt.kalman import filterpy_kf, filterpy_ukf, kalman_filter
 from distfilt.models import clohessy_wiltshire, simulate
-from distfilt.sensors import direct, distance_and_angle, stack
+from distfilt.sensors import component, range_bearing, stack
 from tests.support import turning
 
 RUNS, STEPS, DT = 200, 100, 0.1
@@ -43,11 +43,11 @@ def linear_case(rng: np.random.Generator) -> tuple[tuple[np.ndarray, ...], dict[
     """Prior mean and covariance and observations; the matrices; model, sensors and times."""
     model = clohessy_wiltshire(rate=0.1, sigma=0.2)
     x0 = np.array([100.0, 0.0, 0.0, 10.0, 0.1, 0.0])
-    sensor = stack([direct([0, 1], std=0.2), direct([1, 2], std=0.2), direct([3, 4, 5], std=0.1)])
+    sensor = stack([component([0, 1], std=0.2), component([1, 2], std=0.2), component([3, 4, 5], std=0.1)])
     times = DT * np.arange(1, STEPS + 1)
     truth = simulate(model, np.tile(x0, (RUNS, 1)), times, rng=rng)
     matrices = {
-        "F": model.transition(DT), "H": sensor.matrix(6), "Q": model.noise(0.0, DT), "R": sensor.cov
+        "F": model.F(DT), "H": sensor.H(6), "Q": model.Q(0.0, DT), "R": sensor.noise_cov
     }
     parts = {"model": model, "sensors": (sensor,), "times": times}
     return (x0 + 3.0, 25.0 * np.eye(6), sensor.observe(truth, rng=rng)), matrices, parts
@@ -84,7 +84,7 @@ def plain_numpy(mean: Any, cov: Any, y: Any, *, F: Any, H: Any, Q: Any, R: Any) 
 
 def curved_case(rng: np.random.Generator) -> tuple[tuple[np.ndarray, ...], dict[str, Any]]:
     model = turning(sigma=0.1, turn_sigma=0.02)
-    sensors = (distance_and_angle([0, 1], std=(0.3, 0.02), origin=[-9.0, -7.0]),)
+    sensors = (range_bearing([0, 1], std=(0.3, 0.02), origin=[-9.0, -7.0]),)
     x0 = np.array([0.0, 0.0, 1.0, 0.5, 0.1])
     times = 0.5 * np.arange(1, CURVED_STEPS + 1)
     truth = simulate(model, np.tile(x0, (CURVED_RUNS, 1)), times, rng=rng)
@@ -94,7 +94,7 @@ def curved_case(rng: np.random.Generator) -> tuple[tuple[np.ndarray, ...], dict[
 
 
 def unscented(mean: Any, cov: Any, y: Any, *, model: Any, sensors: Any, times: Any) -> Any:
-    f = GaussianFilter(model, sensors, rule="unscented")
+    f = GaussianFilter(model, sensors, linearization="unscented")
     states = list(f.steps(f.start((mean, cov), runs=y.shape[1:-1]), times, [y]))
     means = np.array([s.means[:, 0] for s in states])
     return means, np.array([s.covariances[:, 0] for s in states])

@@ -2,7 +2,7 @@
 
 A thousand agents with about six neighbours each and a dozen kinds of sensors, d = 6, with
 covariance intersection by every rule: at most 0.12 s a step; ten thousand, by the dearest rule: at
-most 1 s. A hundred thousand agents: `combine`, `largest_gain` and `balanced` with links one way, at
+most 1 s. A hundred thousand agents: `combine`, `max_stable_gain` and `balanced` with links one way, at
 most 1 s each in a process of its own that never needs more than 500 MB, graph and packages
 included. Importing the filters takes at most 1.3 times as long as importing scipy.linalg.
 """
@@ -25,9 +25,9 @@ from scipy.spatial import cKDTree
 
 from distfilt.filters import EnsembleFilter, GaussianFilter
 from distfilt.models import clohessy_wiltshire
-from distfilt.network import Channel, Graph, covariance_intersection, graphs, intersection, weights
-from distfilt.sensors import direct
-from distfilt.updates import known_noise
+from distfilt.network import Channel, Graph, covariance_intersection, graphs, intersect_ensembles, weights
+from distfilt.sensors import component
+from distfilt.updates import enkf
 
 MODEL, PRIOR = clohessy_wiltshire(rate=0.1, sigma=0.2), (np.zeros(6), 25 * np.eye(6))
 MANY, RULES, STEP_S = 1000, ("equal", "trace", "determinant", "min_trace", "min_determinant"), 0.12
@@ -52,21 +52,21 @@ def scaled(what: str, agents: int, spent: Any, seconds: float, memory: float = n
 @table("scale")
 def many() -> Iterator[Row]:
     """A step of a thousand agents, and operations on very many."""
-    kinds = [direct([k], std=0.2) for k in range(6)]
-    kinds += [direct([k, (k + 1) % 6], std=0.2) for k in range(6)]
+    kinds = [component([k], std=0.2) for k in range(6)]
+    kinds += [component([k, (k + 1) % 6], std=0.2) for k in range(6)]
     for agents, rule in [*((MANY, rule) for rule in RULES), (10 * MANY, "min_determinant")]:
         sensors, graph = [kinds[k % 12] for k in range(agents)], graphs.disk(*spread(agents, 6))
         seen, limit = [np.zeros(s.dim) for s in sensors], STEP_S if agents == MANY else SECONDS
         ours = partial(covariance_intersection, rule=rule)
-        own = {"update": known_noise, "members": 50, "agreement": partial(intersection, rule=rule)}
+        own = {"update": enkf, "members": 50, "agreement": partial(intersect_ensembles, rule=rule)}
         for name, f in (
-            ("Gaussian", GaussianFilter(MODEL, sensors, graph, agreement=ours)),
+            ("Gaussian", GaussianFilter(MODEL, sensors, graph, fusion=ours)),
             ("ensemble, 50 members", EnsembleFilter(MODEL, sensors, graph, **own)),
         ):
             state = f.step(f.start(PRIOR, rng=np.random.default_rng(2)), 0.1, seen)
             spent = timed(partial(f.step, state, 0.2, seen), 5)
             yield scaled(f"a step, {name}, {rule}", agents, spent, limit)
-    for what in ("combine", "largest_gain", "balanced"):
+    for what in ("combine", "max_stable_gain", "balanced"):
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             agents, spent = pool.submit(large, what).result()
         yield scaled(what, agents, spent, SECONDS, MEGABYTES)
@@ -102,14 +102,14 @@ def one_way() -> Graph:
 def large(what: str) -> tuple[int, Any]:
     """Agents, and what one operation on very many of them takes."""
     graph = one_way() if what == "balanced" else graphs.disk(*spread(VERY_MANY))
-    averaging = weights.push(graph) if graph.directed else weights.metropolis(graph)
+    averaging = weights.column_stochastic(graph) if graph.directed else weights.metropolis(graph)
     values = np.random.default_rng(4).standard_normal((VERY_MANY, 6))
     calls = {
-        "combine": lambda: Channel(graph).combine(values, averaging),
-        "largest_gain": lambda: graph.largest_gain,
-        "balanced": lambda: weights.balanced(graph),
+        "combine": lambda: Channel(graph).mix(values, averaging),
+        "max_stable_gain": lambda: graph.max_stable_gain,
+        "balanced": lambda: weights.doubly_stochastic(graph),
     }
-    return graph.size, replace(timed(calls[what], 1), result=None)
+    return graph.n_agents, replace(timed(calls[what], 1), result=None)
 
 
 if __name__ == "__main__":

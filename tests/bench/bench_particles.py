@@ -30,7 +30,7 @@ MODEL = LinearModel.from_transition(3, lambda dt: np.eye(3), lambda t, dt: dt * 
 
 def by_distfilt(n: int, seen: np.ndarray) -> np.ndarray:
     sensor = Sensor(2, lambda x: x @ H.T, R, linear=lambda d: H)
-    f = ParticleFilter(MODEL, [sensor], members=n, threshold=1.0)
+    f = ParticleFilter(MODEL, [sensor], members=n, ess_threshold=1.0)
     states = f.steps(f.start((np.zeros(3), np.eye(3)), rng=np.random.default_rng(1)), TIMES, [seen])
     return np.array([state.weights[0] @ state.points[0] for state in states])
 

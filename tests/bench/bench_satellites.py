@@ -18,7 +18,7 @@ import numpy as np
 from _bench import Row, interleaved, main, table
 
 from bookkit import studies
-from distfilt.doors import unchecked
+from distfilt.validation import unchecked
 from distfilt.gaussians import intersection_weights
 
 LIMITS = {("known_fused", 1): 2.0, ("known_fused", 50): 2.0, ("exact", 1): 2.0, ("exact", 50): 2.0}
@@ -41,7 +41,7 @@ def exact(z: np.ndarray, avoid: np.ndarray) -> np.ndarray:
 def floor_of(setup: Any, states: np.ndarray, rng: np.random.Generator, kind: str) -> Any:
     """One step for states (runs, A, N, d)."""
     n, dt = states.shape[-2] - 1, float(setup.times[1] - setup.times[0])
-    values, vectors = np.linalg.eigh(setup.model.noise(0.0, dt))
+    values, vectors = np.linalg.eigh(setup.model.Q(0.0, dt))
     kept = values > 1e-14 * values.max()
     root = vectors[:, kept] * np.sqrt(values[kept])
     hears = np.eye(len(setup.sensors)) + (setup.graph.laplacian.toarray() < 0)

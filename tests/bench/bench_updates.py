@@ -18,8 +18,8 @@ from _bench import Row, interleaved, main, peer, table
 
 from distfilt.filters import EnsembleFilter
 from distfilt.models import Model, lorenz63, rk4, simulate
-from distfilt.sensors import direct
-from distfilt.updates import known_noise
+from distfilt.sensors import component
+from distfilt.updates import enkf
 
 MEMBERS, DIMS, CYCLES, DT = 100, (6, 13, 40), 1000, 0.05
 PROBLEMS = {"Lorenz63.sakov2012": (3, 2.0), "Lorenz96.sakov2008": (40, 1.0)}
@@ -89,14 +89,14 @@ def analyses_and_cycles() -> Iterator[Row]:
     for d in DIMS:
         given, rng = case(d), np.random.default_rng(0)
         yield from compared(d, {
-            "known_noise": partial(known_noise, *given, rng=rng),
+            "enkf": partial(enkf, *given, rng=rng),
             "DAPPER, analysis": dapper(*given),
             "six lines of numpy": partial(six_lines, *given, rng),
         }, 31)  # fmt: skip
     other = Model(40, partial(rk4, ring, longest=DT), lambda t, dt: np.zeros((40, 40)))
     for problem, (d, variance) in PROBLEMS.items():
         model = lorenz63(step=DT) if d == 3 else other
-        sensor, rng = direct(range(d), std=variance**0.5), np.random.default_rng(d)
+        sensor, rng = component(range(d), std=variance**0.5), np.random.default_rng(d)
         times, x0 = DT * np.arange(1, CYCLES + 1), model.step(rng.standard_normal(d), 0.0, 100.0)
         y = sensor.observe(simulate(model, x0, times, rng=rng), rng=rng)
         f = EnsembleFilter(model, [sensor], members=MEMBERS)

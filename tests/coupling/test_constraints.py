@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distfilt.coupling import Constraint, constraints, norm, project, retract
+from distfilt.coupling import Constraint, constraints, norm_constraint, project, retract
 from distfilt.linalg import SolverError
 
 
@@ -38,13 +38,13 @@ def test_the_readings_by_their_formulas_in_a_batch(eps: float) -> None:
 
 def test_a_projection_that_makes_it_worse_is_refused() -> None:
     far = np.random.default_rng(4).standard_normal((40, 2)) * [3.0, 0.01]
-    both = project(np.stack([far, 0.1 * far + 0.7]), norm([0, 1]), reading="particle")
+    both = project(np.stack([far, 0.1 * far + 0.7]), norm_constraint([0, 1]), reading="particle")
     assert (both[0] == far).all() and (both[1] != 0.1 * far + 0.7).all()
 
 
 def test_the_guard_judges_what_the_reading_moves() -> None:
     """The shift takes the mean of g to d; where g is curved the members' own misses may grow."""
-    g = norm([0, 1])
+    g = norm_constraint([0, 1])
     rng = np.random.default_rng(16)
     miss, own = [], []
     for _ in range(40):
@@ -74,7 +74,7 @@ def test_a_shift_too_far_or_out_of_the_domain_is_refused(
 @given(st.integers(0, 10_000), st.floats(0.2, 5.0))
 def test_a_length_is_retracted_to_the_closest_point(seed: int, length: float) -> None:
     x = 0.3 + np.random.default_rng(seed).uniform(0, 3, (2, 20, 3))
-    out = retract(x, norm([0, 1, 2], length=length))
+    out = retract(x, norm_constraint([0, 1, 2], length=length))
     r = np.linalg.norm(x, axis=-1, keepdims=True)
     assert np.abs(out - length * x / r).max() < 1e-12 * length
     assert np.abs(np.linalg.norm(out, axis=-1) - length).max() <= 1e-14 * max(1.0, length)
@@ -94,7 +94,7 @@ def test_two_constraints_and_numerical_derivatives() -> None:
 def test_velocities_become_tangent_and_keep_their_tangent_part() -> None:
     rng = np.random.default_rng(6)
     x = rng.standard_normal((40, 6))
-    out = retract(x, norm([3, 0]), motion=([0, 3], [1, 5]))
+    out = retract(x, norm_constraint([3, 0]), motion=([0, 3], [1, 5]))
     radial = out[:, 0] * out[:, 1] + out[:, 3] * out[:, 5]
     assert np.abs(radial).max() < 1e-14
     before = x[:, 0] * x[:, 5] - x[:, 3] * x[:, 1]
@@ -110,7 +110,7 @@ def test_a_rank_that_is_lost_at_one_state_is_named() -> None:
     x = np.ones((5, 2))
     x[3] = 0.0
     with pytest.raises(ValueError, match=r"rank at state 3 \(1 of 5\)"):
-        retract(x, norm([0, 1]))
+        retract(x, norm_constraint([0, 1]))
 
 
 def test_a_constraint_without_a_solution_does_not_converge(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -119,7 +119,7 @@ def test_a_constraint_without_a_solution_does_not_converge(monkeypatch: pytest.M
         retract([[0.7, 0.4]], impossible)
     monkeypatch.setattr(constraints, "_STEPS", 2)
     with pytest.raises(SolverError, match="1 of 2 states"):
-        retract([[100.0, 3.0], [0.6, 0.8]], norm([0, 1]))
+        retract([[100.0, 3.0], [0.6, 0.8]], norm_constraint([0, 1]))
 
 
 def test_steps_are_shortened_where_newton_overshoots_or_leaves_the_domain() -> None:
@@ -141,7 +141,7 @@ def test_inputs_stay_as_they_were() -> None:
 
 
 def test_a_jacobian_is_each_member_s_by_formula_and_by_differences() -> None:
-    x, g = np.random.default_rng(3).standard_normal((2, 5, 4)), norm([0, 2])
+    x, g = np.random.default_rng(3).standard_normal((2, 5, 4)), norm_constraint([0, 2])
     slope = g.jacobian(x)
     assert np.array_equal(slope[..., 0, [0, 2]], 2 * x[..., [0, 2]])
     assert slope.shape == (2, 5, 1, 4) and not slope[..., 0, [1, 3]].any()
@@ -152,8 +152,8 @@ def test_a_jacobian_is_each_member_s_by_formula_and_by_differences() -> None:
 def test_retraction_in_any_unit_of_length(unit: float) -> None:
     """A tolerance of 1e-15 is relative: a circle of a ten-millionth is met as closely as one."""
     x = 1 + np.random.default_rng(17).random((30, 2))
-    plain = retract(x, norm([0, 1]))
-    other = retract(unit * x, norm([0, 1], length=unit))
+    plain = retract(x, norm_constraint([0, 1]))
+    other = retract(unit * x, norm_constraint([0, 1], length=unit))
     assert np.abs(other / unit - plain).max() < 4e-15
     tilted = Constraint(lambda v: v[..., :1] - 3 * v[..., 1:], [0.0])
     assert np.abs(tilted.residual(retract(unit * x, tilted))).max() < 1e-14 * unit
@@ -172,4 +172,4 @@ def test_a_constraint_that_has_no_real_value_is_refused(value: complex) -> None:
         with pytest.raises(ValueError, match="function: needs"):
             call(x, g)
         with pytest.raises(ValueError, match="^constraint: needs states with more than 1"):
-            call(x[..., None], norm([0, 1]))
+            call(x[..., None], norm_constraint([0, 1]))

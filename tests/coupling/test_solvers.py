@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distfilt.coupling import distances, plan, solvers, sorted_plan
+from distfilt.coupling import squared_distances, transport_plan, solvers, sorted_plan
 from distfilt.linalg import SolverError
 
 
@@ -19,15 +19,15 @@ def _case(seed: int, n: int = 24, m: int = 24, d: int = 3) -> tuple[np.ndarray, 
     x, y = rng.standard_normal((n, d)), rng.standard_normal((m, d)) + 0.3
     a, b = rng.random(n) ** 6, rng.random(m)
     a[: n // 6], b[-1] = 0.0, 0.0
-    return distances(x, y), a / a.sum(), b / b.sum()
+    return squared_distances(x, y), a / a.sum(), b / b.sum()
 
 
 @given(st.integers(0, 10_000), st.integers(1, 12), st.integers(1, 12))
 def test_the_network_simplex_is_certified_by_its_dual(seed: int, n: int, m: int) -> None:
     rng = np.random.default_rng(seed)
-    cost = distances(rng.standard_normal((n, 2)), rng.standard_normal((m, 2)))
+    cost = squared_distances(rng.standard_normal((n, 2)), rng.standard_normal((m, 2)))
     a, b = rng.dirichlet(np.full(n, 0.3)), rng.dirichlet(np.ones(m))
-    found = plan(cost, a, b)
+    found = transport_plan(cost, a, b)
     f, g = found.potentials
     assert (f[:, None] + g <= cost + 1e-9).all()
     assert abs(found.bound - (f @ a + g @ b)) < 1e-12
@@ -43,7 +43,7 @@ def test_the_sorted_plan_is_the_cheapest(seed: int, n: int, m: int) -> None:
     x, y = rng.standard_normal(n), rng.standard_normal(m)
     a, b = rng.dirichlet(np.full(n, 0.5)), rng.dirichlet(np.ones(m))
     found = sorted_plan(x, y, a, b)
-    best = plan(distances(x[:, None], y[:, None]), a, b)
+    best = transport_plan(squared_distances(x[:, None], y[:, None]), a, b)
     assert abs(found.value - best.value) < 1e-11
     assert -1e-12 < found.gap < 1e-11
     assert np.abs(found.matrix.sum(axis=1) - a).max() <= 1e-14
@@ -60,20 +60,20 @@ def test_the_sorted_plan_with_ties_and_empty_masses() -> None:
 @pytest.mark.parametrize("scale", [1e-9, 1e-4, 1e6])
 def test_neither_scale_nor_offset_of_the_cost_matters(scale: float) -> None:
     cost, a, b = _case(4)
-    reference = plan(cost, a, b)
-    other = plan(np.asfortranarray(scale * cost + 7 * scale), a, b)
+    reference = transport_plan(cost, a, b)
+    other = transport_plan(np.asfortranarray(scale * cost + 7 * scale), a, b)
     assert np.abs(other.matrix - reference.matrix).max() < 1e-9
     assert abs(other.value / scale - 7 - reference.value) < 1e-9
     assert abs(reference.gap) < 1e-12 and b.min() == 0
 
 
 def test_a_constant_cost_and_single_masses() -> None:
-    flat = plan(np.full((3, 4), 2.0), [0.2, 0.3, 0.5])
+    flat = transport_plan(np.full((3, 4), 2.0), [0.2, 0.3, 0.5])
     assert abs(flat.value - 2) < 1e-14
     for solver in ("network", "entropic"):
-        one = plan([[3.0]], [1.0], solver=solver)
+        one = transport_plan([[3.0]], [1.0], solver=solver)
         assert abs(one.matrix[0, 0] - 1) < 1e-14
-        column = plan([[1.0], [2.0]], [0.25, 0.75], solver=solver)
+        column = transport_plan([[1.0], [2.0]], [0.25, 0.75], solver=solver)
         assert np.abs(column.matrix.ravel() - [0.25, 0.75]).max() < 1e-14
 
 
@@ -83,7 +83,7 @@ def test_tiny_masses_do_not_make_a_problem_infeasible() -> None:
     x = rng.standard_normal((60, 2))
     w = np.exp(-40 * x[:, 0] ** 2)
     w /= w.sum()
-    found = plan(distances(x), w)
+    found = transport_plan(squared_distances(x), w)
     assert np.abs(found.matrix.sum(axis=1) - w).max() <= 1e-14
     assert found.gap < 1e-6
 
@@ -97,13 +97,13 @@ def test_a_solver_that_stops_early_says_so(
 ) -> None:
     monkeypatch.setattr(solvers, limit, value)
     with pytest.raises(SolverError, match=message):
-        plan(*_case(8), solver=solver, regularisation=1e-3)
+        transport_plan(*_case(8), solver=solver, regularisation=1e-3)
 
 
 def test_where_rounding_hides_the_dual_its_gradient_leads_on(monkeypatch: Any) -> None:
     solve, steps = np.linalg.solve, []
     monkeypatch.setattr(np.linalg, "solve", lambda a, b: steps.append(a) or solve(a, b))
-    plan(*_case(8, 15, 3, 2), solver="entropic", regularisation=1e-7)
+    transport_plan(*_case(8, 15, 3, 2), solver="entropic", regularisation=1e-7)
     assert len(steps) < 100
 
 
@@ -111,10 +111,10 @@ def test_where_rounding_hides_the_dual_its_gradient_leads_on(monkeypatch: Any) -
 def test_the_entropic_plan_is_that_of_its_optimality_conditions(seed: int, eps: float) -> None:
     """Also where Sinkhorn's iteration would take more than 100 000 turns."""
     cost, a, b = _case(seed, 6, 7, 2)
-    found = plan(cost, a, b, solver="entropic", regularisation=eps)
+    found = transport_plan(cost, a, b, solver="entropic", regularisation=eps)
     assert np.abs(found.matrix.sum(axis=0) - b).max() <= 1e-14
     assert np.abs(found.matrix.sum(axis=1) - a).max() <= 1e-14 and found.matrix.min() >= 0
-    best = plan(cost, a, b).value
+    best = transport_plan(cost, a, b).value
     # The entropy of a plan is at most that of a product of its marginals.
     most = eps * np.ptp(cost) * np.log(6 * 7)
     assert -1e-9 < found.value - best < most

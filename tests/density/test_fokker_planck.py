@@ -66,7 +66,7 @@ def test_ornstein_and_uhlenbeck(n: int, bound: float) -> None:
     flow = FokkerPlanck(Swarm(lambda x, t: k * (0.5 - x), d), grid, scheme="backward_euler")
     line = [quad(lambda s: np.exp(-k * (s - 0.5) ** 2 / (2 * d)), a, b)[0] / (b - a)
             for a, b in zip(grid.edges[0][:-1], grid.edges[0][1:], strict=True)]
-    exact = grid.normalised(np.outer(line, line).ravel())
+    exact = grid.normalize(np.outer(line, line).ravel())
     p = flow.evolve(np.ones(grid.size), [50.0, 200.0, 1e4])[-1]
     assert grid.norm(p - exact) / grid.norm(exact) < bound
 

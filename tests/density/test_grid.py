@@ -13,8 +13,8 @@ BOX = Grid((4, 6), low=[-1.0, 2.0], high=[1.0, 5.0])
 def test_order_is_that_of_the_last_axis_and_walls_belong_to_the_outer_cells() -> None:
     assert np.allclose(BOX.centres[1] - BOX.centres[0], [0.0, 0.5])
     assert np.allclose(BOX.centres[6] - BOX.centres[0], [0.5, 0.0])
-    assert np.array_equal(BOX.cells(BOX.centres), np.arange(24))
-    assert np.array_equal(BOX.cells([[1.0, 5.0], [-1.0, 2.0]]), [23, 0])
+    assert np.array_equal(BOX.cell_index(BOX.centres), np.arange(24))
+    assert np.array_equal(BOX.cell_index([[1.0, 5.0], [-1.0, 2.0]]), [23, 0])
 
 
 def test_histogram_counts_batches() -> None:
@@ -53,8 +53,8 @@ def test_interpolation_is_exact_for_products_of_lines(shape: tuple[int, ...]) ->
     grid = Grid(shape)
     v = (1 + grid.centres).prod(axis=-1)
     x = 0.2 + 0.6 * np.random.default_rng(2).random((20, grid.dim))
-    assert np.allclose(grid.at(v, x), (1 + x).prod(axis=-1), atol=1e-13)
-    assert grid.at(v, np.zeros(grid.dim)) == pytest.approx(v[0])
+    assert np.allclose(grid.interpolate(v, x), (1 + x).prod(axis=-1), atol=1e-13)
+    assert grid.interpolate(v, np.zeros(grid.dim)) == pytest.approx(v[0])
 
 
 def test_prior_has_the_variance_the_length_and_the_mass_that_it_says() -> None:

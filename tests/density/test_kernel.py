@@ -53,14 +53,14 @@ def test_the_constant_is_the_integral_of_the_kernel_squared() -> None:
         middle = np.full((1, grid.dim), 0.5)
         z = density.kernels(middle, grid, bandwidth=0.05)[0]
         wanted = float((z**2).sum() * grid.volume) / 100
-        got = density.kernel_information(grid, bandwidth=0.05, agents=100)
+        got = density.kernel_constant(grid, bandwidth=0.05, agents=100)
         assert got == pytest.approx(wanted, rel=5e-3)
 
 
 def test_covariance_is_that_of_one_agent_over_their_number() -> None:
     """An agent is in cell j with probability p_j Δ, and its kernel is then that cell's."""
     grid = density.Grid((10, 10))
-    p = grid.normalised(1 + grid.centres[:, 0] + 2 * grid.centres[:, 1] ** 2)
+    p = grid.normalize(1 + grid.centres[:, 0] + 2 * grid.centres[:, 1] ** 2)
     z = density.kernels(grid.centres, grid, bandwidth=0.12)
     mean, cov = density.kernel_covariance(p, grid, bandwidth=0.12, agents=20)
     assert np.allclose(mean, np.average(z, axis=0, weights=p))
@@ -81,7 +81,7 @@ def test_the_score_of_cross_validation_leaves_each_agent_out(apart: float) -> No
     """∫p² - 2/N Σ p₋ᵢ(Xᵢ), the estimate without i made anew for each i."""
     x = np.array([[0.2, 0.2], [0.2 + apart, 0.2], [0.25, 0.25]])
     p = density.kernel_density(x, GRID, bandwidth=0.04)
-    left = [density.kernel_density(np.delete(x, i, axis=0), GRID, bandwidth=0.04)[GRID.cells(x[i])]
+    left = [density.kernel_density(np.delete(x, i, axis=0), GRID, bandwidth=0.04)[GRID.cell_index(x[i])]
             for i in range(3)]
     wanted = (p**2).sum() * GRID.volume - 2 * np.mean(left)
     assert _least_squares(x, GRID, 0.04) == pytest.approx(wanted)

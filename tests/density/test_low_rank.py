@@ -13,7 +13,7 @@ RNG = np.random.default_rng(1)
 
 def _stepped(state: density.LowRank, move: object, y: np.ndarray, r: np.ndarray, dt: float,
              process: np.ndarray | None = None) -> density.LowRank:
-    moved = density.low_rank_moved(state, move, process=process, dt=dt)
+    moved = density.low_rank_predict(state, move, process=process, dt=dt)
     return density.low_rank_step(moved, y, r, dt)
 
 
@@ -39,7 +39,7 @@ def test_two_steps_are_the_textbook_kalman_filter(filters: int) -> None:
 
 def test_compression_keeps_the_largest_part() -> None:
     state = density.low_rank_start(np.diag([3.0, 1.0])[:, :1], np.zeros((2, 2)))
-    moved = density.low_rank_moved(state, np.asarray, process=np.eye(2), dt=1.0)
+    moved = density.low_rank_predict(state, np.asarray, process=np.eye(2), dt=1.0)
     assert np.allclose(moved.covariance(0), np.diag([10.0, 0.0]))
 
 
@@ -56,7 +56,7 @@ def test_low_rank_equals_dense_with_the_same_prior_and_both_keep_the_mass(
     y = density.kernel_density(x, grid, bandwidth=0.08)
     prior = density.zero_mean_prior(grid, rank=rank)
     dense, low = density.Dense(y, prior @ prior.T), density.low_rank_start(prior, y[None])
-    k = density.kernel_information(grid, bandwidth=0.08, agents=100)
+    k = density.kernel_constant(grid, bandwidth=0.08, agents=100)
     for j in range(steps):
         move = flow.solver(0.1 * j, 0.1)
         x = swarm.step(x, 0.1 * j, 0.1, rng=rng, substeps=2)
@@ -78,7 +78,7 @@ def test_filters_do_not_see_each_other_and_infinite_noise_measures_nothing() -> 
     y, r = RNG.random((20, 100)), 0.1 + RNG.random((20, 100))
     r[3], r[4, 50:] = np.inf, np.inf
     for q in (None, s):
-        start = density.low_rank_moved(density.low_rank_start(s, base), move, process=q, dt=0.1)
+        start = density.low_rank_predict(density.low_rank_start(s, base), move, process=q, dt=0.1)
         many = density.low_rank_step(start, y, r, 0.1)
         huge = density.low_rank_step(start, y, np.minimum(r, 1e15), 0.1)
         assert np.abs(many.estimates - huge.estimates).max() < 1e-12

@@ -15,32 +15,32 @@ from distfilt import network
 from distfilt.filters import EnsembleFilter, GaussianFilter, ParticleFilter, TransportFilter
 from distfilt.kalman import kalman_filter
 from distfilt.models import LinearModel, simulate
-from distfilt.sensors import Sensor, direct, stack
-from distfilt.updates import exact_draws, inflated, serial, square_root, transport
+from distfilt.sensors import Sensor, component, stack
+from distfilt.updates import enkf_exact, with_inflation, serially, etkf, transport_map_update
 
 FAMILIES: dict[str, Callable[..., Any]] = {
     "ensemble": partial(EnsembleFilter, members=40),
     "ensemble, exact": partial(EnsembleFilter.exact, members=40),
-    "ensemble, exact draws": partial(EnsembleFilter, update=exact_draws, members=40),
-    "ensemble, transport": partial(EnsembleFilter, update=transport, members=60),
+    "ensemble, exact draws": partial(EnsembleFilter, update=enkf_exact, members=40),
+    "ensemble, transport": partial(EnsembleFilter, update=transport_map_update, members=60),
     "ensemble, square root": partial(
-        EnsembleFilter, update=inflated(square_root, factor=1.01), members=40
+        EnsembleFilter, update=with_inflation(etkf, factor=1.01), members=40
     ),
-    "ensemble, serial": partial(EnsembleFilter, update=serial(exact_draws), members=40),
+    "ensemble, serial": partial(EnsembleFilter, update=serially(enkf_exact), members=40),
     "gaussian": GaussianFilter,
-    "gaussian, unscented": partial(GaussianFilter, rule="unscented"),
+    "gaussian, unscented": partial(GaussianFilter, linearization="unscented"),
     "particle": partial(ParticleFilter, members=500),
     "particle, jitter": partial(ParticleFilter, members=500, jitter=0.2),
-    "ensemble, common": partial(TransportFilter, members=40, agreement=network.average,
+    "ensemble, common": partial(TransportFilter, members=40, fusion=network.average_consensus,
                                 rejuvenation=0.1),
 }
 
 RULES = {
-    "ensemble": [partial(network.pull, gain=0.1), network.intersection,
-                 partial(network.intersection, rule="min_trace")],
+    "ensemble": [partial(network.mean_pull, gain=0.1), network.intersect_ensembles,
+                 partial(network.intersect_ensembles, rule="min_trace")],
     "gaussian": [network.covariance_intersection, network.naive_fusion, network.arithmetic_average,
                  partial(network.consensus_pull, gain=0.1)],
-    "common": [network.average, partial(network.average, gain=0.2)],
+    "common": [network.average_consensus, partial(network.average_consensus, gain=0.2)],
 }
 
 
@@ -69,7 +69,7 @@ def model() -> LinearModel:
 def team(agents: int = 5) -> list[Sensor | None]:
     """Sensors of one, two (correlated) and no readings in turn."""
     both = Sensor(2, lambda x: x, NOISE, linear=lambda d: np.eye(d))
-    return [[direct([0], std=0.6), both, None][k % 3] for k in range(agents)]
+    return [[component([0], std=0.6), both, None][k % 3] for k in range(agents)]
 
 
 TIMES = np.cumsum([0.1, 0.3, 0.2, 0.4, 0.1, 0.2, 0.3, 0.2])
@@ -89,17 +89,17 @@ def kalman(seen: Any, sensors: Any) -> tuple[Any, dict[str, Any]]:
     """The Kalman filter of everybody's readings, with the matrices of its model."""
     steps, every = np.diff(TIMES, prepend=0.0), stack(sensors)
     moves = {
-        "F": np.array([model().transition(dt) for dt in steps]),
+        "F": np.array([model().F(dt) for dt in steps]),
         "Q": np.array([dt * Q for dt in steps]),
     }
     y = np.concatenate(seen, axis=-1)
-    return kalman_filter(*PRIOR, y, H=every.matrix(2), R=every.cov, **moves), moves
+    return kalman_filter(*PRIOR, y, H=every.H(2), R=every.noise_cov, **moves), moves
 
 
 def made(family: str, agents: int = 5, **options: Any) -> tuple[Any, Any]:
     """A filter of a family on a path of agents, and its state at the start."""
-    if family.endswith("common") and options.get("agreement", 0) is None:
-        del options["agreement"]  # one round of averaging, which is as far as readings go
+    if family.endswith("common") and options.get("fusion", 0) is None:
+        del options["fusion"]  # one round of averaging, which is as far as readings go
     sensors = options.pop("sensors", team(agents))
     graph = options.pop("graph", network.graphs.path(len(sensors)))
     runs = options.pop("runs", ())
@@ -109,5 +109,5 @@ def made(family: str, agents: int = 5, **options: Any) -> tuple[Any, Any]:
 
 def values(state: Any) -> dict[str, np.ndarray]:
     """Every array that a state holds, by name."""
-    names = ("ensembles", "points", "log_weights", "joint_means", "joint_covariances")
+    names = ("ensembles", "particles", "log_weights", "joint_means", "joint_covariances")
     return {n: getattr(state, n) for n in names if hasattr(state, n)}

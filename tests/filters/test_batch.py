@@ -9,23 +9,23 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from distfilt.filters import EnsembleFilter, GaussianFilter, MixtureFilter, NewsFilter, Reading
-from distfilt.gaussians.single import recolour
+from distfilt.filters import EnsembleFilter, GaussianFilter, MixtureFilter, InformationIncrementFilter, Observation
+from distfilt.gaussians.single import match_moments
 from distfilt.models import LinearModel
 from distfilt.network import Graph
-from distfilt.sensors import Sensor, direct
+from distfilt.sensors import Sensor, component
 
 from .families import NOISE, PRIOR, Q, model
 
 SLANT = np.array([[1.0, 0.5], [0.0, 2.0]])
-KINDS = [direct([0], std=0.6), direct([1], std=0.5),
+KINDS = [component([0], std=0.6), component([1], std=0.5),
          Sensor(2, lambda x: x @ SLANT.T, NOISE, linear=lambda d: SLANT)]  # fmt: skip
 FAMILIES: dict[str, Any] = {
     "gaussian": GaussianFilter,
-    "unscented": partial(GaussianFilter, rule="unscented", kappa=0.5),
-    "ensemble": partial(EnsembleFilter.exact, members=120, agreement=None),
+    "unscented": partial(GaussianFilter, linearization="unscented", kappa=0.5),
+    "ensemble": partial(EnsembleFilter.exact, members=120, fusion=None),
     "mixture": partial(MixtureFilter, target_dim=2),
-    "news": partial(NewsFilter, target_dim=2),
+    "news": partial(InformationIncrementFilter, target_dim=2),
 }
 
 
@@ -33,7 +33,7 @@ def batch(known: list[Any], times: Any, q: Any, run: Any) -> tuple[Any, Any]:
     """Means (K, 2) and covariances (K, 2, 2) at all times, given what is known in one run."""
     lift, steps = np.eye(2 * len(times)), np.diff(times)
     for k, dt in enumerate(steps, 1):
-        lift[2 * k : 2 * k + 2] += model().transition(dt) @ lift[2 * k - 2 : 2 * k]
+        lift[2 * k : 2 * k + 2] += model().F(dt) @ lift[2 * k - 2 : 2 * k]
     mean = lift[:, :2] @ PRIOR[0]
     noises = [dt * (1 + t) * q for t, dt in zip(times, steps, strict=False)]
     cov = lift @ block_diag(PRIOR[1], *noises) @ lift.T
@@ -41,8 +41,8 @@ def batch(known: list[Any], times: Any, q: Any, run: Any) -> tuple[Any, Any]:
     for sensor, said in known:
         value = said.value[run] if said.value.ndim > 1 else said.value
         here, at = ~np.isnan(value), np.eye(len(times))[times.tolist().index(said.t)]
-        h = np.concatenate([h, np.kron(at, sensor.matrix(2))[here]])
-        r = block_diag(r, sensor.cov[np.ix_(here, here)])
+        h = np.concatenate([h, np.kron(at, sensor.H(2))[here]])
+        r = block_diag(r, sensor.noise_cov[np.ix_(here, here)])
         y = np.concatenate([y, value[here]])
     gain = np.linalg.solve(h @ cov @ h.T + r, h @ cov).T
     mean, cov = mean + gain @ (y - h @ mean), cov - gain @ h @ cov
@@ -54,9 +54,9 @@ def price(told: list[Any], now: float) -> Any:
     there = [~np.isnan(said.value.reshape(-1, sensor.dim)).all(axis=0) for sensor, said in told]
     numbers = sum(map(np.sum, there))
     (sensor, said), *more = told
-    if not more and said.t == now and not said.about and said.sensor in (0, sensor):
+    if not more and said.t == now and not said.metadata and said.sensor in (0, sensor):
         return numbers
-    return numbers + sum(2 + len(said.about) for _, said in told)
+    return numbers + sum(2 + len(said.metadata) for _, said in told)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -81,11 +81,11 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
     q = Q if gaussian or family == "mixture" else 0 * Q
     walk = LinearModel.from_transition(2, model().transition_matrix, lambda t, dt: dt * (1 + t) * q)
     nets = {t: Graph.from_adjacency(a, directed=True) for t, a in zip(times, links, strict=True)}
-    options: Any = {"lag": lag, "share": share} if several else {}
-    f = FAMILIES[family](walk, team, nets.get, every=every or None, **options)
+    options: Any = {"lag": lag, "share_observations": share} if several else {}
+    f = FAMILIES[family](walk, team, nets.get, exchange_interval=every or None, **options)
     prior: Any = PRIOR  # or members of these moments, which exact updates keep
     if family == "ensemble":
-        prior = recolour(rng.standard_normal((120, 2)), *PRIOR)
+        prior = match_moments(rng.standard_normal((120, 2)), *PRIOR)
     events = []
     for j, a in np.ndindex(steps + 1, agents):
         for s, sensor in enumerate(team[a]):
@@ -95,7 +95,7 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
             which = sensor if (own := rng.random() < 0.2) else s
             about = tuple(rng.random(own * rng.integers(3)))
             if 0 < k <= steps and not np.isnan(value).all():  # in the first step to k, or a second
-                said = Reading(times[j], a, value, which, about=about)
+                said = Observation(times[j], a, value, which, metadata=about)
                 events.append((k + rng.integers(2) / 2, sensor, said))
     known, waiting = [[] for _ in team], [[] for _ in team]
     owed, state = np.zeros(agents), f.start(prior, rng=rng, runs=runs, t=times[0])
@@ -105,7 +105,7 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
                for a in range(agents)]  # fmt: skip
         late = [said for own in now for _, said in own if said.t < t]
         seen = [[said for _, said in own if said.t == t] for own in now]
-        state = f.step(state, t, seen, **({"late": late} if several else {}))
+        state = f.step(state, t, seen, **({"delayed": late} if several else {}))
         for a, own in enumerate(now):
             known[a] += own
             waiting[a] += own
@@ -115,7 +115,7 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
                     owed[a] += price(waiting[a], t)
                 waiting[a] = []
         assert family == "news" or np.array_equal(state.ledger.scalars, owed)
-        views = [(then.t, f.summary(then)) for then in (state, *getattr(state, "earlier", ()))]
+        views = [(then.t, f.summarize(then)) for then in (state, *getattr(state, "lagged_states", ()))]
         assert len(views) == 1 + min(lag * several, k)
         for a, *run in np.ndindex(agents, *runs):
             means, covs = batch(known[a], times[: k + 1], q, tuple(run))

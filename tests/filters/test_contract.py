@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from distfilt import metrics
-from distfilt.filters import FilterError, Reading, final_state
+from distfilt.filters import FilterError, Observation, final_state
 from distfilt.models import LinearModel, Model
 from distfilt.network import Faults
-from distfilt.sensors import Sensor, angle, direct
+from distfilt.sensors import Sensor, line_angle, component
 
 from .families import FAMILIES, PRIOR, TIMES, data, made, rules, team, values
 
@@ -32,7 +32,7 @@ def at(observations: list[Any], k: int) -> list[Any]:
 @pytest.mark.parametrize(("family", "rule"), [(f, rule) for f in FAMILIES for rule in rules(f)])
 def test_nobody_notices_beyond_the_neighbours(family: str, rule: Any) -> None:
     """On a path 0-1-2-3-4 a step reaches one link: agents 0, 1, 2 know nothing of agent 4."""
-    f, start = made(family, agreement=rule)
+    f, start = made(family, fusion=rule)
     _, seen = data(f.sensors)
     start = f.step(start, TIMES[0], at(seen, 0))
     changed = {n: v.copy() for n, v in values(start).items()}
@@ -56,8 +56,8 @@ def test_nobody_notices_beyond_the_neighbours(family: str, rule: Any) -> None:
 def test_faults_between_two_times(family: str) -> None:
     """Agent 0's radio is off from 1 s to before 2 s: who hears it is blind at 1 s only."""
     off = Faults(silent=[0], during=[(1.0, 2.0)])
-    sensors = [direct([0], std=0.5), None]
-    f, state = made(family, sensors=sensors, agreement=None, faults=off)
+    sensors = [component([0], std=0.5), None]
+    f, state = made(family, sensors=sensors, fusion=None, faults=off)
     heard = []
     for t in (0.5, 1.0, 2.0):
         before, state = state, f.step(state, t, [[0.3], None])
@@ -83,7 +83,7 @@ def test_recorded_scores_by_their_definitions(family: str) -> None:
         crps = metrics.gaussian_crps(mean, np.sqrt(np.diag(cov)), true)
     else:
         w = np.exp(states[k].log_weights[r, a]) if family.startswith("particle") else None
-        x = (states[k].ensembles if w is None else states[k].points)[r, a]
+        x = (states[k].ensembles if w is None else states[k].particles)[r, a]
         assert np.allclose(mean, np.average(x, axis=0, weights=w), atol=1e-12)
         cov = np.cov(x.T, aweights=w, ddof=1 if w is None else 0)
         crps = metrics.crps(x, true, weights=w)
@@ -99,10 +99,10 @@ def test_missing_component_is_a_sensor_without_it(family: str) -> None:
     sensors = [team(2)[1]]
     f, start = made(family, sensors=sensors, graph=None)
     y = np.array([0.4, np.nan])
-    less = made(family, sensors=[direct([0], std=np.sqrt(0.5))], graph=None)[0]
+    less = made(family, sensors=[component([0], std=np.sqrt(0.5))], graph=None)[0]
     a, b = f.step(start, 0.5, [y]), less.step(start, 0.5, [[0.4]])
-    assert np.allclose(f.summary(a).mean, less.summary(b).mean, atol=1e-12)
-    assert np.allclose(f.summary(a).variance, less.summary(b).variance, atol=1e-12)
+    assert np.allclose(f.summarize(a).mean, less.summarize(b).mean, atol=1e-12)
+    assert np.allclose(f.summarize(a).variance, less.summarize(b).variance, atol=1e-12)
 
 
 @EACH
@@ -110,8 +110,8 @@ def test_components_missing_in_some_runs_only(family: str) -> None:
     sensors = [team(2)[1]]
     f, start = made(family, sensors=sensors, graph=None, runs=(3,))
     y = np.array([[0.4, 0.1], [np.nan, 0.1], [np.nan, np.nan]])
-    out = f.summary(f.step(start, 0.5, [y]))
-    blind = f.summary(f.step(start, 0.5, [None]))
+    out = f.summarize(f.step(start, 0.5, [y]))
+    blind = f.summarize(f.step(start, 0.5, [None]))
     assert np.allclose(out.mean[2], blind.mean[2], atol=1e-12)
     assert np.allclose(out.variance[2], blind.variance[2], atol=1e-12)
     assert (np.abs(out.mean[:2] - blind.mean[:2]).max(axis=(1, 2)) > 1e-3).all()
@@ -121,7 +121,7 @@ def test_components_missing_in_some_runs_only(family: str) -> None:
 def test_direction_across_pi(family: str) -> None:
     """A truth near the negative x-axis, whose direction jumps between π and −π."""
     still = Model(2, lambda x, t, dt: x, lambda t, dt: 1e-4 * dt * np.eye(2))
-    sensors: list[Sensor | None] = [angle([0, 1], std=0.05, full=True), direct([0], std=0.1)]
+    sensors: list[Sensor | None] = [line_angle([0, 1], std=0.05, full=True), component([0], std=0.1)]
     f = made(family, sensors=sensors, model=still)[0]
     prior = (np.array([-2.0, 0.0]), 0.04 * np.eye(2))
     start = f.start(prior, rng=np.random.default_rng(0), runs=(20,))
@@ -130,7 +130,7 @@ def test_direction_across_pi(family: str) -> None:
     for k in range(10):
         seen = [s.observe(truth, rng=rng) for s in sensors if s is not None]
         start = f.step(start, k + 1.0, seen)
-    summary = f.summary(start)
+    summary = f.summarize(start)
     error = summary.mean - truth[:, None]
     assert np.sqrt((error**2).mean(axis=(0, 1))).max() < 0.09
     assert np.sqrt(summary.variance).max() < 0.12
@@ -141,7 +141,7 @@ def test_time_passes_to_model_and_noise(family: str) -> None:
     calls: list[tuple[str, float, float]] = []
 
     def flow(x: np.ndarray, t: float, dt: float) -> np.ndarray:
-        calls.append(("flow", t, dt))
+        calls.append(("transition", t, dt))
         return x + t * dt
 
     def noise(t: float, dt: float) -> np.ndarray:
@@ -153,40 +153,40 @@ def test_time_passes_to_model_and_noise(family: str) -> None:
     state = f.step(state, 2.5, [None])
     state = f.step(state, 3.5, [None])
     assert {c[1:] for c in calls} == {(2.0, 0.5), (2.5, 1.0)}
-    assert {c[0] for c in calls} == {"flow", "noise"}
+    assert {c[0] for c in calls} == {"transition", "noise"}
 
 
 @EACH
 def test_late_reading_is_in_time_after_all(family: str) -> None:
     """For who heard of it too, as near as the members' number allows."""
-    two: dict[str, Any] = {"sensors": [direct([0], std=0.4), None], "agreement": None}
+    two: dict[str, Any] = {"sensors": [component([0], std=0.4), None], "fusion": None}
     f, start = made(family, **two, lag=2, runs=(40,))
     for t in (0.5, 1.0):
         start = f.step(start, t, [None] * 2)
-    late = f.step(start, 1.5, [[0.1], None], late=[Reading(0.5, 0, [1.9], arrived=1.5)])
+    late = f.step(start, 1.5, [[0.1], None], delayed=[Observation(0.5, 0, [1.9], arrival_time=1.5)])
     g, begin = made(family, **two, runs=(40,))
     begin = g.step(begin, 0.5, [[1.9], None])
     begin = g.step(g.step(begin, 1.0, [None] * 2), 1.5, [[0.1], None])
-    a, b = f.summary(late), g.summary(begin)
+    a, b = f.summarize(late), g.summarize(begin)
     blind = g.start(PRIOR, rng=np.random.default_rng(3), runs=(40,))
     blind = g.step(g.step(blind, 1.0, [None] * 2), 1.5, [[0.1], None])
     gap = np.abs(a.mean.mean(axis=0) - b.mean.mean(axis=0)).max()
-    assert gap < 0.12 < np.abs(g.summary(blind).mean.mean(axis=0) - b.mean.mean(axis=0)).max()
+    assert gap < 0.12 < np.abs(g.summarize(blind).mean.mean(axis=0) - b.mean.mean(axis=0)).max()
 
 
 @EACH
 def test_a_run_takes_each_late_reading_when_it_arrives(family: str) -> None:
-    f, start = made(family, sensors=[direct([0], std=0.4)], graph=None, lag=2)
+    f, start = made(family, sensors=[component([0], std=0.4)], graph=None, lag=2)
     times, seen = [0.5, 1.0, 1.5, 2.0], np.array([[np.nan], [0.3], [np.nan], [0.1]])
-    late = [Reading(1.5, 0, [1.1], arrived=2.0), Reading(0.5, 0, [1.9], arrived=1.2)]
-    run = f.run(start, times, [seen], late=late)
+    late = [Observation(1.5, 0, [1.1], arrival_time=2.0), Observation(0.5, 0, [1.9], arrival_time=1.2)]
+    run = f.run(start, times, [seen], delayed=late)
     state = start
     for t, y in zip(times, seen, strict=True):
-        due = [r for r in late if r.arrived is not None and t - 0.5 < r.arrived <= t]
-        state = f.step(state, t, [y], late=due)
+        due = [r for r in late if r.arrival_time is not None and t - 0.5 < r.arrival_time <= t]
+        state = f.step(state, t, [y], delayed=due)
     assert same(final_state(run), state)
-    with pytest.raises(ValueError, match="late: needs arrivals up to 1.5, got 2.0"):
-        f.run(start, times[:3], [seen[:3]], late=late)
+    with pytest.raises(ValueError, match="delayed: needs arrivals up to 1.5, got 2.0"):
+        f.run(start, times[:3], [seen[:3]], delayed=late)
 
 
 @EACH
@@ -194,22 +194,22 @@ def test_a_run_takes_each_late_reading_when_it_arrives(family: str) -> None:
 def test_a_late_reading_belongs_to_its_own_time(family: str, origin: float, dt: float) -> None:
     """Whatever the clock's zero and its unit; between the times it belongs to none."""
     walk = LinearModel.from_transition(1, lambda h: np.eye(1), lambda t, h: h / dt * np.eye(1))
-    f = FAMILIES[family](walk, [direct([0], std=0.1)], None, lag=3)
+    f = FAMILIES[family](walk, [component([0], std=0.1)], None, lag=3)
     prior = (np.zeros(1), np.eye(1))
     state = f.start(prior, rng=np.random.default_rng(0), runs=(20,), t=origin)
     for k in (1, 2, 3):
         state = f.step(state, origin + k * dt, [None])
-    times = [then.t for then in state.earlier] + [state.t]
+    times = [then.t for then in state.lagged_states] + [state.t]
 
-    def late(measured: float) -> list[Reading]:
-        return [Reading(measured, 0, [0.0], arrived=origin + 4 * dt)]
+    def late(measured: float) -> list[Observation]:
+        return [Observation(measured, 0, [0.0], arrival_time=origin + 4 * dt)]
 
     for k in (1, 2):
-        after = f.step(state, origin + 4 * dt, [None], late=late(np.nextafter(times[k + 1], -1)))
-        spread = [f.summary(then).variance.mean() for then in after.earlier]
+        after = f.step(state, origin + 4 * dt, [None], delayed=late(np.nextafter(times[k + 1], -1)))
+        spread = [f.summarize(then).variance.mean() for then in after.lagged_states]
         assert np.argmin(spread) == k
-    with pytest.raises(ValueError, match="late: needs an earlier time that is kept"):
-        f.step(state, origin + 4 * dt, [None], late=late(origin + 2.4 * dt))
+    with pytest.raises(ValueError, match="delayed: needs an earlier time that is kept"):
+        f.step(state, origin + 4 * dt, [None], delayed=late(origin + 2.4 * dt))
 
 
 @EACH
@@ -236,12 +236,12 @@ def test_bad_run_is_named_and_others_go_on(family: str) -> None:
         return out
 
     broken = Model(2, flow, lambda t, dt: dt * np.eye(2), derivative=lambda x, t, dt: np.eye(2))
-    sensors = [direct([0], std=0.5), direct([1], std=0.5)]
+    sensors = [component([0], std=0.5), component([1], std=0.5)]
     f, start = made(family, sensors=sensors, model=broken, runs=(3,))
     start = f.step(start, 0.5, [[0.1], [0.2]])
     with pytest.raises(FilterError, match=r"run 1, agent 0, t = 1 s: the forecast is not finite"):
         f.step(start, 1.0, [[0.1], [0.2]])
-    g, state = made(family, sensors=sensors, model=broken, runs=(3,), failures="keep")
+    g, state = made(family, sensors=sensors, model=broken, runs=(3,), on_error="keep")
     run = g.run(state, [0.5, 1.0, 1.5], [np.full((3, 1), 0.1), np.full((3, 1), 0.2)],
                 truth=np.zeros((3, 3, 2)))
     assert np.isfinite(run["mean"].values[:, [0, 2]]).all()

@@ -20,7 +20,7 @@ PATH = SWARM.simulate(START, np.arange(1, 9) * 0.1, rng=np.random.default_rng(2)
 
 
 def make(graph: object, rule: object, **options: object) -> DensityFilter:
-    return DensityFilter(MODEL, SIZE, graph, agreement=rule, bandwidth=H, **{"rank": 20, **options})
+    return DensityFilter(MODEL, SIZE, graph, fusion=rule, bandwidth=H, **{"rank": 20, **options})
 
 
 RULES = {
@@ -43,10 +43,10 @@ def last(f: DensityFilter, path=PATH, start: np.ndarray = START, t: float = 0.0)
 @pytest.mark.parametrize("rule", [density.Flooding(), density.Neighbours()])
 def test_complete_graph_and_equal_starts_give_the_centralised_filter(rule: object) -> None:
     """Criterion 7."""
-    everyone = last(make(graphs.complete(SIZE), rule, first=np.ones(100)))
-    central = last(make(graphs.complete(SIZE), density.Centralised(), first=np.ones(100)))
+    everyone = last(make(graphs.complete(SIZE), rule, initial_density=np.ones(100)))
+    central = last(make(graphs.complete(SIZE), density.Centralised(), initial_density=np.ones(100)))
     assert np.abs(everyone.estimates - central.estimates).max() < 1e-12
-    assert (everyone.counted == SIZE).all()
+    assert (everyone.positions_sent == SIZE).all()
 
 
 @pytest.mark.parametrize("name", RULES)
@@ -76,7 +76,7 @@ def test_flooding_knows_where_agents_were_as_many_steps_ago_as_hops() -> None:
     for j in range(8):
         assert table[j, 2] == pytest.approx(0.8 - 0.1 * max(j - 1, 0))
         assert np.array_equal(table[j, :2], PATH[7 - max(j - 1, 0)][j])
-    assert (table[9:, 2] < 0).all() and state.counted[0] == 9
+    assert (table[9:, 2] < 0).all() and state.positions_sent[0] == 9
     x = np.stack([PATH[7 - max(j - 1, 0)][j] for j in range(9)])
     assert np.abs(state.observed[0] - density.kernel_density(x, GRID, bandwidth=H)).max() < 1e-12
 
@@ -87,7 +87,7 @@ def test_flooding_forgets() -> None:
     all_ = graphs.complete(SIZE)
     kept = last(make(all_, density.Flooding(), local=(0,)), path)
     gone = last(make(all_, density.Flooding(forget=0.35), local=(0,)), path, t=-9.0)
-    assert kept.counted[0] == SIZE - 1 and gone.counted[0] == SIZE - 2 and gone.counted[4] == 0
+    assert kept.positions_sent[0] == SIZE - 1 and gone.positions_sent[0] == SIZE - 2 and gone.positions_sent[4] == 0
 
 
 def test_ledger_charges_what_each_rule_sends() -> None:
@@ -102,7 +102,7 @@ def test_ledger_charges_what_each_rule_sends() -> None:
 def test_agents_that_go_are_left_out_and_their_filters_go_on() -> None:
     path = PATH.copy()
     path[4:, 5] = np.nan
-    state = last(make(graphs.complete(SIZE), density.Centralised(), first=np.ones(100)), path)
+    state = last(make(graphs.complete(SIZE), density.Centralised(), initial_density=np.ones(100)), path)
     here = [i for i in range(SIZE) if i != 5]
     want = density.kernel_density(path[-1][here], GRID, bandwidth=H)
     assert np.abs(state.observed[0] - want).max() < 1e-13
@@ -110,7 +110,7 @@ def test_agents_that_go_are_left_out_and_their_filters_go_on() -> None:
     assert np.trace(state.filters.information[5]) < np.trace(state.filters.information[4])
     gone = np.where(np.arange(SIZE)[:, None] == 0, np.nan, START)
     state = last(make(graphs.complete(SIZE), density.DynamicAverage(modes=30)), gone[None], gone)
-    assert np.allclose(state.counted[1:], SIZE - 1)
+    assert np.allclose(state.positions_sent[1:], SIZE - 1)
 
 
 def test_a_network_that_falls_apart_is_in_the_ledger() -> None:
@@ -131,7 +131,7 @@ def test_the_sum_forgets_agents_that_drop_out() -> None:
     """Equation (26) and Remark 3: after a dropout Σ(y_i - z_i) over those left decays by
     1 - α h in each step, whatever the integrators of the others held.
     """
-    f = make(graphs.ring(SIZE), density.PIConsensus(b=0.4), first=np.ones(100))
+    f = make(graphs.ring(SIZE), density.PIConsensus(b=0.4), initial_density=np.ones(100))
     state, x = f.start(START), START.copy()
     for k in range(10):
         state = f.step(state, 0.1 * (k + 1), x)
@@ -154,7 +154,7 @@ def test_only_the_wanted_estimates_are_made() -> None:
     for rule in RULES.values():
         everyone, few = last(make(0.5, rule)), last(make(0.5, rule, local=(7, 2)))
         assert np.array_equal(everyone.ledger.scalars, few.ledger.scalars)
-        assert np.array_equal(everyone.counted, few.counted)
+        assert np.array_equal(everyone.positions_sent, few.positions_sent)
         assert np.abs(everyone.observed[[7, 2]] - few.observed).max() < 1e-13
         assert np.abs(everyone.estimates[[7, 2]] - few.estimates).max() < 1e-11
 
@@ -183,9 +183,9 @@ def test_a_step_is_the_forms_step_with_the_noise_that_was_asked_for(
     state = f.step(start, 0.1, PATH[0])
 
     q = None if process is None else process * density.zero_mean_prior(GRID, rank=20)
-    moved = density.low_rank_moved(start.filters, MODEL.solver(0.0, 0.1), process=q, dt=0.1)
+    moved = density.low_rank_predict(start.filters, MODEL.solver(0.0, 0.1), process=q, dt=0.1)
     level = moved.estimates if noise == "forecast" else state.observed
-    unit = density.kernel_information(GRID, bandwidth=H, agents=SIZE)
+    unit = density.kernel_constant(GRID, bandwidth=H, agents=SIZE)
     wanted = density.low_rank_step(moved, state.observed, unit * level.clip(0.7), 0.1)
     assert np.allclose(state.estimates, wanted.estimates, rtol=1e-12)
     assert np.allclose(state.variances, wanted.variances, rtol=1e-12)
@@ -201,12 +201,12 @@ def test_a_run_of_few_filters_records_them() -> None:
 
 
 def test_first_estimates() -> None:
-    flat = make(0.5, density.Flooding(), first_std=0.3).start(START)
+    flat = make(0.5, density.Flooding(), initial_std=0.3).start(START)
     gap = ((GRID.centres - START[4]) ** 2).sum(axis=-1)
-    assert np.allclose(flat.estimates[4], GRID.normalised(np.exp(-0.5 * gap / 0.09)))
-    own = make(0.5, density.Flooding(), first="observed").start(START)
+    assert np.allclose(flat.estimates[4], GRID.normalize(np.exp(-0.5 * gap / 0.09)))
+    own = make(0.5, density.Flooding(), initial_density="observed").start(START)
     assert np.allclose(own.estimates, density.kernels(START, GRID, bandwidth=H))
-    central = make(0.5, density.Centralised(), first="observed").start(START)
+    central = make(0.5, density.Centralised(), initial_density="observed").start(START)
     assert np.allclose(central.estimates[3], density.kernel_density(START, GRID, bandwidth=H))
 
 
@@ -223,7 +223,7 @@ def test_mass_can_change_where_the_prior_says_so() -> None:
 
 def test_consensus_may_start_flat() -> None:
     """(14) and Section VI at once: consensus and filter start at one flat Gaussian."""
-    f = make(0.5, density.PIConsensus(first_std=0.3), first_std=0.3)
+    f = make(0.5, density.PIConsensus(initial_std=0.3), initial_std=0.3)
     state = f.start(START)
     assert np.abs(state.carried[0][:, :100] - state.estimates).max() < 1e-14
     other = make(0.5, density.PIConsensus()).start(START)

@@ -13,9 +13,9 @@ import pytest
 from distfilt import filters
 from distfilt.kalman import rts_smoother
 from distfilt.models import Model
-from distfilt.network import Faults, covariance_intersection, graphs, pull
-from distfilt.sensors import Sensor, direct, of_kind
-from distfilt.updates import exact_draws, sampled_noise
+from distfilt.network import Faults, covariance_intersection, graphs, mean_pull
+from distfilt.sensors import Sensor, component, from_name
+from distfilt.updates import enkf_exact, enkf_sampled_covariance
 
 from .families import NOISE, PRIOR, TIMES, Q, data, kalman, made, model, team
 
@@ -36,14 +36,14 @@ def test_network_of_exact_ensembles_is_the_network_of_kalman_filters(lag: int) -
     faults = Faults(loss=0.3, seed=1)
     f, start = made("ensemble, exact", faults=faults, **options)
     rule = partial(covariance_intersection, rule="min_determinant")
-    g, begin = made("gaussian", agreement=rule, faults=faults, **options)
+    g, begin = made("gaussian", fusion=rule, faults=faults, **options)
     e = start.ensembles
     cov = np.array([[np.cov(m.T) for m in agents] for agents in e])
     state = filters.GaussianState(0.0, begin.ledger, None, e.mean(axis=-2), cov, 2)
-    late = [filters.Reading(TIMES[k], 2, np.ones((3, 1)), sensors[0], arrived=TIMES[k + 2])
+    late = [filters.Observation(TIMES[k], 2, np.ones((3, 1)), sensors[0], arrival_time=TIMES[k + 2])
             for k in range(6 * (lag > 0))]
     for how in ("run", "smooth")[: 1 + lag]:
-        a, b = (getattr(h, how)(s, TIMES, seen, late=late) for h, s in ((f, start), (g, state)))
+        a, b = (getattr(h, how)(s, TIMES, seen, delayed=late) for h, s in ((f, start), (g, state)))
         assert np.allclose(a["mean"], b["mean"], atol=1e-8)
         assert np.allclose(a["variance"], b["variance"], atol=1e-8)
         for name in ("messages", "scalars", "lost", "rounds"):
@@ -53,7 +53,7 @@ def test_network_of_exact_ensembles_is_the_network_of_kalman_filters(lag: int) -
 @pytest.mark.parametrize("rule", ["extended", "unscented"])
 def test_gaussian_smoothing_is_the_smoother(rule: str) -> None:
     _, (seen,) = data([BOTH], (4,))
-    f = filters.GaussianFilter(model(), [BOTH], rule=rule, lag=len(TIMES))
+    f = filters.GaussianFilter(model(), [BOTH], linearization=rule, lag=len(TIMES))
     out = f.smooth(f.start(PRIOR, runs=(4,)), TIMES, [seen])
     filtered, moves = kalman([seen], [BOTH])
     exact = rts_smoother(filtered, **moves)
@@ -69,11 +69,11 @@ def test_unscented_points_see_a_curve() -> None:
     square = Model(1, lambda x, t, dt: x**2, lambda t, dt: np.zeros((1, 1)))
     eye = Sensor(1, lambda x: x**2, [[0.5]])
     for rule, mean, cov in (("unscented", 1.25, 1.0625), ("extended", 1.0, 1.0)):
-        f = filters.GaussianFilter(square, [None], rule=rule)
+        f = filters.GaussianFilter(square, [None], linearization=rule)
         state = f.step(f.start(([1.0], [[0.25]])), 1.0, [None])
         assert abs(state.means[0, 0] - mean) < 1e-9
         assert abs(state.covariances[0, 0, 0] - cov) < 1e-9
-        g = filters.GaussianFilter(Model(1, lambda x, t, dt: x, square.noise_cov), [eye], rule=rule)
+        g = filters.GaussianFilter(Model(1, lambda x, t, dt: x, square.noise_cov), [eye], linearization=rule)
         after = g.step(g.start(([1.0], [[0.25]])), 1.0, [[2.0]])
         gain = 0.5 / (cov + 0.5)  # the covariance of x and x² is 2mP
         assert abs(after.means[0, 0] - (1.0 + gain * (2.0 - mean))) < 1e-9
@@ -81,55 +81,55 @@ def test_unscented_points_see_a_curve() -> None:
 
 
 def test_jitter_moves_copies_by_a_share_of_what_is_believed() -> None:
-    eye = direct([0], std=0.5)
-    f = filters.ParticleFilter(STILL, [eye], members=4000, threshold=1.0, jitter=0.3)
+    eye = component([0], std=0.5)
+    f = filters.ParticleFilter(STILL, [eye], members=4000, ess_threshold=1.0, jitter=0.3)
     before = f.step(f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0)), 1.0, [[1.0]])
-    after = f.step(before, 2.0, [None]).points[0, :, 0]
-    old = before.points[0, :, 0]
+    after = f.step(before, 2.0, [None]).particles[0, :, 0]
+    old = before.particles[0, :, 0]
     stayed = np.isin(after, old)
     assert 0.02 < stayed.mean() < 0.5
-    plain = filters.ParticleFilter(STILL, f.sensors, members=4000, threshold=1.0, jitter=0.0)
-    picked = plain.step(before, 2.0, [None]).points[0, :, 0]
+    plain = filters.ParticleFilter(STILL, f.sensors, members=4000, ess_threshold=1.0, jitter=0.0)
+    picked = plain.step(before, 2.0, [None]).particles[0, :, 0]
     moves = (after - picked)[~stayed]
-    width = 0.3 * np.sqrt(f.summary(before).variance[0, 0])
+    width = 0.3 * np.sqrt(f.summarize(before).variance[0, 0])
     assert abs(moves.std() / width - 1) < 0.05 and not (after - picked)[stayed].any()
 
 
 def test_a_member_that_was_picked_or_moved_sees_changes_from_where_it_comes() -> None:
     """Nothing moves, and a reading says so: that tells no particle from another."""
-    eyes = [[direct([0], std=0.5), of_kind("differential", [0], std=0.1)]]
-    f = filters.ParticleFilter(STILL, eyes * 2, members=50, threshold=1.0, jitter=0.0, share=False)
-    first, still = filters.Reading(1.0, 0, [0.5]), filters.Reading(2.0, 0, [0.0], 1)
+    eyes = [[component([0], std=0.5), from_name("differential", [0], std=0.1)]]
+    f = filters.ParticleFilter(STILL, eyes * 2, members=50, ess_threshold=1.0, jitter=0.0, share_observations=False)
+    first, still = filters.Observation(1.0, 0, [0.5]), filters.Observation(2.0, 0, [0.0], 1)
     start = f.start(np.linspace(-1, 1, 50)[:, None], rng=np.random.default_rng(0))
-    state = f.step(start, 1.0, [first, filters.Reading(1.0, 1, [0.5])])
+    state = f.step(start, 1.0, [first, filters.Observation(1.0, 1, [0.5])])
     after = f.step(state, 2.0, [still, None])
     assert np.ptp(state.weights[0]) > 0.01 and np.ptp(after.weights) < 1e-15
-    assert (state.points[0] == state.points[1]).all() and (after.points[0] != after.points[1]).any()
-    kept = replace(f, threshold=0.2).step(state, 2.0, [None] * 2)
-    assert (kept.points == state.points).all() and (kept.weights == state.weights).all()
+    assert (state.particles[0] == state.particles[1]).all() and (after.particles[0] != after.particles[1]).any()
+    kept = replace(f, ess_threshold=0.2).step(state, 2.0, [None] * 2)
+    assert (kept.particles == state.particles).all() and (kept.weights == state.weights).all()
     some, few = f.step(start, 1.0, [first, None]), replace(f, threshold=0.9)
-    again = [few.step(some, 2.0, [None] * 2).points for _ in range(2)]  # a state stays as it was
+    again = [few.step(some, 2.0, [None] * 2).particles for _ in range(2)]  # a state stays as it was
     assert (again[0] == again[1]).all()
-    assert (again[0] != start.points).any(axis=(1, 2)).tolist() == [True, False]
+    assert (again[0] != start.particles).any(axis=(1, 2)).tolist() == [True, False]
     g = filters.EnsembleFilter(STILL, eyes, members=50, lag=1)
     state = g.step(g.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [None])
-    told, not_told = (g.step(state, 2.0, [y], late=[first]).ensembles for y in ([still], None))
+    told, not_told = (g.step(state, 2.0, [y], delayed=[first]).ensembles for y in ([still], None))
     assert np.allclose(told, not_told)
 
 
 @pytest.mark.parametrize("family", ["ensemble", "particle", "ensemble, common"])
 def test_a_change_that_is_read_after_its_step_is_one_from_the_step_s_begin(family: str) -> None:
     """A reading moves members as in one step with it; of what is not kept it is refused."""
-    eyes = [[of_kind("differential", [0], std=0.5), direct([1], std=0.8)]]
+    eyes = [[from_name("differential", [0], std=0.5), component([1], std=0.8)]]
     f, start = made(family, sensors=eyes, graph=None, lag=2)
-    now = [[filters.Reading(1.0, 0, [0.4]), filters.Reading(1.0, 0, [-0.7], 1)]]
+    now = [[filters.Observation(1.0, 0, [0.4]), filters.Observation(1.0, 0, [-0.7], 1)]]
     moved = f.step(start, 0.5, [None])
     at_once = [replace(f, lag=k).step(moved, 1.0, now) for k in range(3)]
     later = f.step(f.step(moved, 1.0, [None]), 1.0, now)
     for state in (later, *at_once[1:]):
-        assert np.allclose(f.summary(state).mean, f.summary(at_once[0]).mean, atol=1e-9)
+        assert np.allclose(f.summarize(state).mean, f.summarize(at_once[0]).mean, atol=1e-9)
     with pytest.raises(ValueError, match="needs the states before, which at a state's own time"):
-        replace(f, lag=0).step(start, 0.0, [filters.Reading(0.0, 0, [0.4])])
+        replace(f, lag=0).step(start, 0.0, [filters.Observation(0.0, 0, [0.4])])
 
 
 def test_particles_tend_to_the_kalman_filter_with_a_full_noise() -> None:
@@ -145,7 +145,7 @@ def test_particles_tend_to_the_kalman_filter_with_a_full_noise() -> None:
 
 def test_copies_are_regularised_by_default_where_the_model_never_parts_them() -> None:
     """Of a constant the posterior is known; the kernel widens it by less than a tenth or so."""
-    f = filters.ParticleFilter(STILL, [direct([0], std=0.5)], members=4000)
+    f = filters.ParticleFilter(STILL, [component([0], std=0.5)], members=4000)
     seen = [np.full((6, 1), 0.8)]
     run = f.run(f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0)), np.arange(1.0, 7.0), seen)
     variance = 1 / (1 / 4 + np.arange(1, 7) / 0.25)
@@ -154,24 +154,24 @@ def test_copies_are_regularised_by_default_where_the_model_never_parts_them() ->
     assert np.abs(run["mean"].values[:, 0, 0] - mean).max() < 0.02
     assert np.allclose(run["variance"].values[:, 0, 0], variance, rtol=0.15)
     half = Model(2, lambda x, t, dt: x, lambda t, dt: np.diag([dt, 0.0]))
-    f = filters.ParticleFilter(half, [direct([0], std=0.5)], members=60, threshold=1.0)
+    f = filters.ParticleFilter(half, [component([0], std=0.5)], members=60, ess_threshold=1.0)
     first = f.step(f.start(PRIOR, rng=np.random.default_rng(0)), 1.0, [[0.8]])
-    assert np.isin(f.step(first, 2.0, [None]).points[..., 1], first.points[..., 1]).all()
+    assert np.isin(f.step(first, 2.0, [None]).particles[..., 1], first.particles[..., 1]).all()
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.3])
 def test_one_weight_for_all_warns_although_the_particles_are_distinct(jitter: float) -> None:
     """Its copies are moved apart by a share of what the cloud was, or nothing parts them."""
-    f = filters.ParticleFilter(STILL, [direct([0], std=1e-4)], members=800, jitter=jitter)
+    f = filters.ParticleFilter(STILL, [component([0], std=1e-4)], members=800, jitter=jitter)
     start = f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0))
     with pytest.warns(filters.ParticleCollapse, match=r"t = 1 s: an agent's .* size of 1\.\d;"):
         state = f.step(start, 1.0, [[0.5]])
-    summary = f.summary(state)
+    summary = f.summarize(state)
     assert summary.numbers["distinct"] == 1.0 and summary.numbers["effective_size"] < 2
     told = pytest.warns(filters.ParticleCollapse, match=r"t = 2 s: 0\.\d+% of an agent's particles")
     with nullcontext() if jitter else told:
         after = f.step(state, 2.0, [None])
-    assert np.allclose(after.points.std(), jitter * state.points.std(), rtol=0.1, atol=1e-4)
+    assert np.allclose(after.particles.std(), jitter * state.particles.std(), rtol=0.1, atol=1e-4)
 
 
 def test_copies_of_one_particle_warn_at_any_number_and_two_do_not() -> None:
@@ -185,17 +185,17 @@ def test_copies_of_one_particle_warn_at_any_number_and_two_do_not() -> None:
 def test_what_an_agreement_moves_was_there_before_too() -> None:
     """Where nothing moves and nothing is jittered, the past is the present, agreed of or not."""
     f = filters.ParticleFilter(
-        STILL, [direct([0], std=0.5), None], graphs.path(2), members=30, lag=1, jitter=0.0,
-        share=False, agreement=partial(pull, gain=0.3))  # fmt: skip
+        STILL, [component([0], std=0.5), None], graphs.path(2), members=30, lag=1, jitter=0.0,
+        share_observations=False, fusion=partial(mean_pull, gain=0.3))  # fmt: skip
     start = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0))
     after = f.step(f.step(start, 1.0, [[0.5], None]), 2.0, [[0.7], None])
-    assert np.allclose(after.history[0][1], after.points) and (after.points != start.points).any()
+    assert np.allclose(after.history[0][1], after.particles) and (after.particles != start.particles).any()
 
 
 def test_a_run_whose_covariance_overflows_leaves_the_others_to_agree() -> None:
     wild = Model(1, lambda x, t, dt: (x.T * [1.0, 1e200]).T, lambda t, dt: np.eye(1))
-    f = filters.GaussianFilter(wild, [None] * 2, graphs.path(2), agreement=covariance_intersection,
-                       failures="keep")
+    f = filters.GaussianFilter(wild, [None] * 2, graphs.path(2), fusion=covariance_intersection,
+                       on_error="keep")
     with np.errstate(over="ignore", invalid="ignore"):
         state = f.step(f.start(([0.0], [[1.0]]), runs=(2,)), 1.0, [None, None])
     assert state.failed.tolist() == [False, True] and np.allclose(state.covariances[0], 2.0)
@@ -207,11 +207,11 @@ def test_an_agreement_for_one_run_is_asked_for_each() -> None:
     def one(ensembles: np.ndarray, channel: Any) -> np.ndarray:
         if channel.runs:
             raise ValueError("channel: needs a single run")
-        return pull(ensembles, channel, gain=0.3)
+        return mean_pull(ensembles, channel, gain=0.3)
 
-    f, start = made("ensemble", agreement=partial(pull, gain=0.3), runs=(2, 3), share=False,
+    f, start = made("ensemble", fusion=partial(mean_pull, gain=0.3), runs=(2, 3), share_observations=False,
                     faults=Faults(loss=0.5, seed=3))  # fmt: skip
-    all_, each = (g.step(start, 0.1, [None] * 5) for g in (f, replace(f, agreement=one)))
+    all_, each = (g.step(start, 0.1, [None] * 5) for g in (f, replace(f, fusion=one)))
     np.testing.assert_array_equal(each.ensembles, all_.ensembles)
     for name in ("rounds", "messages", "scalars", "bytes", "lost"):
         assert np.allclose(getattr(each.ledger, name), getattr(all_.ledger, name))
@@ -221,17 +221,17 @@ def test_a_run_whose_agreement_fails_leaves_the_others_as_they_are() -> None:
     """With losses of their own, and charged as if all had gone well."""
 
     def fragile(ensembles: np.ndarray, channel: Any) -> np.ndarray:
-        out = pull(ensembles, channel, gain=0.3)
+        out = mean_pull(ensembles, channel, gain=0.3)
         if (out > 50).any():
             raise np.linalg.LinAlgError("it is far off")
         return out
 
-    f = filters.EnsembleFilter(model(), team(4), graphs.ring(4), agreement=fragile, members=5,
-                       failures="keep", faults=Faults(loss=0.5, seed=3))  # fmt: skip
+    f = filters.EnsembleFilter(model(), team(4), graphs.ring(4), fusion=fragile, members=5,
+                       on_error="keep", faults=Faults(loss=0.5, seed=3))  # fmt: skip
     start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(3,))
-    wild = start.changed(ensembles=start.ensembles + 99 * np.eye(3)[1][:, None, None, None])
+    wild = start.replace(ensembles=start.ensembles + 99 * np.eye(3)[1][:, None, None, None])
     with pytest.raises(filters.FilterError, match=r"run 1, t = 0.1 s: it is far off"):
-        replace(f, failures="raise").step(wild, 0.1, [None] * 4)
+        replace(f, on_error="raise").step(wild, 0.1, [None] * 4)
     for t in (0.1, 0.2):
         start, wild = (f.step(s, t, [None] * 4) for s in (start, wild))
         assert wild.failed.tolist() == [False, True, False]
@@ -241,15 +241,15 @@ def test_a_run_whose_agreement_fails_leaves_the_others_as_they_are() -> None:
 
 @pytest.mark.filterwarnings("ignore:overflow")
 def test_a_reading_that_no_particle_explains_ends_its_run_alone() -> None:
-    f = filters.ParticleFilter(model(), [direct([0], std=0.5)] * 2, graphs.path(2), members=30,
-                       share=False, failures="keep")  # fmt: skip
+    f = filters.ParticleFilter(model(), [component([0], std=0.5)] * 2, graphs.path(2), members=30,
+                       share_observations=False, on_error="keep")  # fmt: skip
     start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(3,))
     good, wild = np.zeros((3, 1)), np.array([[0.0], [0.0], [1e200]])
     a, b = (f.step(start, 0.5, [good, y]) for y in (good, wild))
     assert b.failed.tolist() == [False, False, True]
     assert (a.weights[:2] == b.weights[:2]).all()
     with pytest.raises(filters.FilterError, match="run 2, agent 1, t = 0.5 s"):
-        replace(f, failures="raise").step(start, 0.5, [good, wild])
+        replace(f, on_error="raise").step(start, 0.5, [good, wild])
 
 
 @pytest.mark.parametrize("raises", [False, True])
@@ -257,18 +257,18 @@ def test_a_run_whose_update_fails_is_named_and_leaves_the_others_their_draws(rai
     def fragile(x: np.ndarray, h: np.ndarray, y: np.ndarray, r: np.ndarray, *, rng: Any):
         if raises and (y > 5).any():
             raise ArithmeticError("it is not finite")
-        after = sampled_noise(x, h, y, r, rng=rng)
+        after = enkf_sampled_covariance(x, h, y, r, rng=rng)
         return np.where(y[..., None, :] > 5, np.nan, after)
 
-    f = filters.EnsembleFilter(model(), [direct([0], std=s) for s in (1.0, 0.2)], graphs.path(2),
-                       update=fragile, share=False, members=5, failures="keep")
+    f = filters.EnsembleFilter(model(), [component([0], std=s) for s in (1.0, 0.2)], graphs.path(2),
+                       update=fragile, share_observations=False, members=5, on_error="keep")
     start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(3,))
     good = f.step(start, 0.5, [np.zeros((3, 1))] * 2)
     some = f.step(start, 0.5, [np.zeros((3, 1)), np.array([[0.0], [9.0], [0.0]])])
     assert some.failed.tolist() == [False, True, False]
     np.testing.assert_array_equal(some.ensembles[[0, 2]], good.ensembles[[0, 2]])
-    assert np.isnan(f.summary(some).mean[1]).all()
-    strict = replace(f, failures="raise")
+    assert np.isnan(f.summarize(some).mean[1]).all()
+    strict = replace(f, on_error="raise")
     with pytest.raises(filters.FilterError, match="run 1, agent 1, t = 0.5 s: .*ite") as caught:
         strict.step(start, 0.5, [np.zeros((3, 1)), np.array([[0.0], [9.0], [0.0]])])
     assert (caught.value.run, caught.value.agent, caught.value.t) == ((1,), 1, 0.5)
@@ -276,11 +276,11 @@ def test_a_run_whose_update_fails_is_named_and_leaves_the_others_their_draws(rai
 
 def test_groups_of_readings_give_each_agent_its_own_noise() -> None:
     """Agents with one reading each but different noise: the quieter one is the surer."""
-    eyes, r = [direct([0], std=s) for s in (0.1, 2.0)], np.array([0.01, 4.0])
-    for update in (exact_draws, lambda *four, rng: exact_draws(*four, rng=rng)):
-        f = filters.EnsembleFilter(model(), eyes, share=False, members=10, update=update)
+    eyes, r = [component([0], std=s) for s in (0.1, 2.0)], np.array([0.01, 4.0])
+    for update in (enkf_exact, lambda *four, rng: enkf_exact(*four, rng=rng)):
+        f = filters.EnsembleFilter(model(), eyes, share_observations=False, members=10, update=update)
         start = f.start(PRIOR, rng=np.random.default_rng(0))
-        p, q = (f.summary(s).variance[:, 0] for s in (start, f.step(start, 0.0, [[1.0], [1.0]])))
+        p, q = (f.summarize(s).variance[:, 0] for s in (start, f.step(start, 0.0, [[1.0], [1.0]])))
         assert np.allclose(q, p * r / (p + r), rtol=1e-9)
 
 
@@ -288,7 +288,7 @@ def test_groups_of_readings_give_each_agent_its_own_noise() -> None:
 def test_nees_of_a_collapsed_cloud_is_infinite() -> None:
     # The first reading is 1e6 times sharper than the prior: one particle keeps all the weight.
     walk = Model(2, lambda x, t, dt: x, lambda t, dt: dt * np.eye(2))
-    f = filters.ParticleFilter(walk, [direct([0, 1], std=1e-6)], members=20)
+    f = filters.ParticleFilter(walk, [component([0, 1], std=1e-6)], members=20)
     state = f.start((np.zeros(2), np.eye(2)), rng=np.random.default_rng(0), runs=(3,))
     truth = np.full((2, 3, 2), 0.3)
     seen = truth.copy()

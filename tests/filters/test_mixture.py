@@ -11,14 +11,14 @@ from distfilt.filters import FilterError, MixtureFilter
 from distfilt.mixtures import GaussianMixture, target_fusion
 from distfilt.models import Model, occulted, orbits
 from distfilt.network import graphs
-from distfilt.sensors import direct, ephemeris, line_of_sight, stack
+from distfilt.sensors import component, ephemeris, angles_only, stack
 
 SMALL = Model(2, lambda x, t, dt: x, lambda t, dt: 0.1 * np.eye(2))
 BENT = Model(2, lambda x, t, dt: x + 0.3 * x**2, lambda t, dt: 0.01 * np.eye(2))
 OTHER = GaussianMixture.gaussian([1.2, 0.4], [[1.0, 0.4], [0.4, 1.0]])
 AGREE = partial(target_fusion, target_dim=1)
-TWO = MixtureFilter(SMALL, [direct([0], std=0.5), None], graphs.path(2), target_dim=1,
-                    agreement=AGREE)
+TWO = MixtureFilter(SMALL, [component([0], std=0.5), None], graphs.path(2), target_dim=1,
+                    fusion=AGREE)
 
 
 def test_splitting_improves_a_bent_forecast() -> None:
@@ -26,8 +26,8 @@ def test_splitting_improves_a_bent_forecast() -> None:
     x = prior.rvs(4000, rng=np.random.default_rng(1))
     moved = BENT.sample_step(x, 0.0, 1.0, rng=np.random.default_rng(2))
     scores = []
-    for options in ({}, {"stretch": 0.05}, {"stretch": 0.05, "scale": [1e-9, 1e-9]}):
-        f = MixtureFilter(BENT, [None], target_dim=1, size=15, most=15, **options)
+    for options in ({}, {"split_threshold": 0.05}, {"split_threshold": 0.05, "split_scale": [1e-9, 1e-9]}):
+        f = MixtureFilter(BENT, [None], target_dim=1, n_components=15, max_components=15, **options)
         belief = f.step(f.start([prior]), 1.0, [None]).mixtures[0]
         scores.append(belief.log_density(moved).mean())
     assert scores[1] > scores[0] + 0.05 and scores[2] == scores[0]
@@ -40,7 +40,7 @@ def test_only_the_target_marginal_is_heard() -> None:
     assert a.ledger.scalars.tolist() == [3, 3]
     assert np.array_equal(a.mixtures[0].means, b.mixtures[0].means)
     # Nobody hears beyond its neighbours.
-    three = MixtureFilter(SMALL, [None] * 3, graphs.path(3), target_dim=1, agreement=AGREE)
+    three = MixtureFilter(SMALL, [None] * 3, graphs.path(3), target_dim=1, fusion=AGREE)
     far = GaussianMixture.gaussian([9.0, 0.0], np.eye(2))
     a, b = (three.step(three.start([OTHER, OTHER, m]), 1.0, [None] * 3) for m in (OTHER, far))
     assert np.array_equal(a.mixtures[0].means, b.mixtures[0].means)
@@ -54,7 +54,7 @@ GEO = np.array([42241.10, 0.0, 0.0, 0.0, 3071.859, 0.0])
 def in_orbit(target: np.ndarray, observer: np.ndarray, **options: object) -> tuple:
     """A filter with an eye that the Earth blinds and a fix, and its belief."""
     fix = ephemeris(position_std=1e-3, velocity_std=1e-5)
-    see = stack([line_of_sight(std=1e-4, hidden=occulted), fix])
+    see = stack([angles_only(std=1e-4, hidden=occulted), fix])
     f = MixtureFilter(orbits(2), [see], target_dim=6, **options)  # type: ignore[arg-type]
     cov = np.diag(np.tile([1.0, 1, 1, 0.1, 0.1, 0.1], 2))
     return f, f.start([GaussianMixture.gaussian(np.concatenate([target, observer]), cov)])
@@ -77,8 +77,8 @@ def test_a_reading_of_an_occulted_target_is_refused_and_a_missing_one_is_not() -
 def test_an_agreement_that_loses_definiteness_is_refused() -> None:
     def broken(beliefs: list, channel: object) -> list:
         down = 10 * np.eye(2)
-        return [GaussianMixture.unchecked(b.weights, b.means, b.covs - down) for b in beliefs]
+        return [GaussianMixture.construct(b.weights, b.means, b.covs - down) for b in beliefs]
 
-    f = MixtureFilter(SMALL, [None] * 2, graphs.path(2), target_dim=1, agreement=broken)
+    f = MixtureFilter(SMALL, [None] * 2, graphs.path(2), target_dim=1, fusion=broken)
     with pytest.raises(FilterError, match="agent 0, t = 1 s: .*mixand 0 of 1 "):
         f.step(f.start([OTHER, OTHER]), 1.0, [None, None])

@@ -10,12 +10,12 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.stats import norm
 
-from distfilt.filters import GaussianFilter, MixtureFilter, NewsFilter, increment
+from distfilt.filters import GaussianFilter, MixtureFilter, InformationIncrementFilter, information_increment
 from distfilt.kalman import kalman_filter
 from distfilt.mixtures import GaussianMixture
 from distfilt.models import Model
 from distfilt.network import Faults, graphs
-from distfilt.sensors import Sensor, direct, stack
+from distfilt.sensors import Sensor, component, stack
 
 T = np.array([[1.0, 0.3], [0.0, 1.0]])
 E = np.array([[0.9]])
@@ -24,15 +24,15 @@ NOISE = np.diag([0.0, 0.0, 0.2])
 MODEL = Model(3, lambda x, t, dt: x @ MOVE.T, lambda t, dt: NOISE)
 # How far the target is from the agent, and a reading of the target's speed that all receive.
 SEEN = Sensor(1, lambda x: x[..., :1] - x[..., 2:], np.array([[0.3]]))
-EYE = stack([SEEN, direct([1], std=0.5)])
+EYE = stack([SEEN, component([1], std=0.5)])
 TARGET_COV = np.array([[2.0, 0.4], [0.4, 1.0]])
 EGO_COV = 0.7
 PRIOR = GaussianMixture.gaussian([1.0, -0.5, 0.2], block_diag(TARGET_COV, EGO_COV))
 
 
-def network(agents: int, **options: object) -> NewsFilter:
-    full = {"target_dim": 2, "common": [1], **options}
-    return NewsFilter(MODEL, [EYE] * agents, graphs.complete(agents), **full)
+def network(agents: int, **options: object) -> InformationIncrementFilter:
+    full = {"target_dim": 2, "shared_components": [1], **options}
+    return InformationIncrementFilter(MODEL, [EYE] * agents, graphs.complete(agents), **full)
 
 
 def joint(agents: int, readings: np.ndarray, speed: np.ndarray) -> tuple:
@@ -51,13 +51,13 @@ def joint(agents: int, readings: np.ndarray, speed: np.ndarray) -> tuple:
     return exact.means[-1], exact.covariances[-1]
 
 
-@pytest.mark.parametrize(("agents", "every"), [(2, None), (3, 2.0), (5, None)])
+@pytest.mark.parametrize(("agents", "exchange_interval"), [(2, None), (3, 2.0), (5, None)])
 def test_news_are_one_filter_with_everybodys_readings(agents: int, every: float | None) -> None:
     rng = np.random.default_rng(agents)
     readings = rng.standard_normal((4, agents))
     readings[1, 0] = np.nan
     speed = np.array([0.1, 0.3, np.nan, -0.2])
-    f = network(agents, every=every)
+    f = network(agents, exchange_interval=every)
     state = f.start([PRIOR] * agents)
     for k, (y, v) in enumerate(zip(readings, speed, strict=True)):
         state = f.step(state, k + 1.0, [[one, v] for one in y])
@@ -91,18 +91,18 @@ def test_an_increment_is_the_readings_that_taught_it(rank: int) -> None:
     gain = p @ h.T @ np.linalg.inv(h @ p @ h.T + np.eye(rank))
     moved = before.means[0] + gain @ (z - h @ before.means[0])
     after = GaussianMixture.gaussian(moved, p - gain @ h @ p)
-    news = increment(before, after)
+    news = information_increment(before, after)
     assert news.shape == (rank, 5)
     assert np.allclose(news[:, :-1].T @ news[:, :-1], h.T @ h, atol=1e-9)
     assert np.allclose(news[:, :-1].T @ news[:, -1], h.T @ z, atol=1e-9)
     assert np.array_equal(news[:, :-1], np.triu(news[:, :-1]))
-    assert increment(before, before).shape == (0, 5)
+    assert information_increment(before, before).shape == (0, 5)
 
 
 def test_a_large_gain_does_not_hide_a_small_one() -> None:
     before = GaussianMixture.gaussian([0.0, 0.0, 0.0], np.eye(3))
     after = GaussianMixture.gaussian([2.0, -1.0, 0.0], np.diag([1e-10, 0.5, 1.0]))
-    news = increment(before, after)
+    news = information_increment(before, after)
     assert news.shape == (2, 4)
     assert np.allclose(news[:, :-1].T @ news[:, :-1], np.diag([1e10, 1.0, 0.0]), rtol=1e-6)
     assert np.allclose(news[:, :-1].T @ news[:, -1], [2e10, -2.0, 0.0], rtol=1e-6)
@@ -111,8 +111,8 @@ def test_a_large_gain_does_not_hide_a_small_one() -> None:
 @pytest.mark.parametrize(("rank", "numbers"), [(1, 7), (2, 13), (3, 18), (6, 27)])
 def test_no_zero_is_sent(rank: int, numbers: int) -> None:
     still = Model(6, lambda x, t, dt: x, lambda t, dt: np.zeros((6, 6)))
-    eye = direct(range(rank), std=1.0)
-    f = NewsFilter(still, [eye, None], graphs.path(2), target_dim=6)
+    eye = component(range(rank), std=1.0)
+    f = InformationIncrementFilter(still, [eye, None], graphs.path(2), target_dim=6)
     prior = GaussianMixture.gaussian(np.zeros(6), np.eye(6) + 0.3)
     after = f.step(f.start([prior] * 2), 1.0, [np.ones(rank), None])
     assert after.ledger.scalars.tolist() == [numbers, 0]
@@ -123,7 +123,7 @@ def test_no_zero_is_sent(rank: int, numbers: int) -> None:
 def test_news_that_are_lost_leave_the_own_belief() -> None:
     seen = [[0.7, np.nan], [-0.4, np.nan]]
     deaf = network(2, faults=Faults(loss=1.0))
-    alone = MixtureFilter(MODEL, [EYE] * 2, target_dim=2, size=1, most=1)
+    alone = MixtureFilter(MODEL, [EYE] * 2, target_dim=2, n_components=1, max_components=1)
     a, b = (f.step(f.start([PRIOR] * 2), 1.0, seen) for f in (deaf, alone))
     for x, y in zip(a.mixtures, b.mixtures, strict=True):
         assert np.allclose(x.covs, y.covs) and np.allclose(x.means, y.means)
@@ -132,8 +132,8 @@ def test_news_that_are_lost_leave_the_own_belief() -> None:
 
 def test_mixands_are_weighed_by_the_news() -> None:
     still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-    f = NewsFilter(still, [direct([0], std=1.0), None], graphs.path(2), target_dim=1, size=2,
-                   most=2)
+    f = InformationIncrementFilter(still, [component([0], std=1.0), None], graphs.path(2), target_dim=1, n_components=2,
+                   max_components=2)
     prior = GaussianMixture([0.3, 0.7], [[-2.0], [1.0]], [[[1.0]], [[2.0]]])
     one = GaussianMixture.gaussian([0.0], [[3.0]])
     after = f.step(f.start([one, prior]), 1.0, [[0.5], None]).mixtures[1]
@@ -145,22 +145,22 @@ def test_mixands_are_weighed_by_the_news() -> None:
 
 
 def test_a_gated_reading_is_no_news() -> None:
-    f = network(2, gate=0.99)
+    f = network(2, gate_probability=0.99)
     after = f.step(f.start([PRIOR] * 2), 1.0, [[500.0, np.nan], None])
     assert after.ledger.scalars.sum() == 0
     # Of a sum that both receive only who has read the first component expects so much.
     still, sums = Model(2, lambda x, t, dt: x, lambda t, dt: 0 * TARGET_COV), np.tri(2)
     eye = Sensor(2, lambda x: x @ sums.T, np.diag([0.09, 0.2]))
-    f = NewsFilter(still, [eye] * 2, graphs.path(2), target_dim=2, common=[1], gate=0.95)
+    f = InformationIncrementFilter(still, [eye] * 2, graphs.path(2), target_dim=2, shared_components=[1], gate_probability=0.95)
     start, y = f.start((np.zeros(2), np.eye(2))), [[1.2, 3.0]] * 2
-    a, b = (g.step(g.step(start, 1.0, y), 2.0, [None] * 2) for g in (f, replace(f, every=2.0)))
+    a, b = (g.step(g.step(start, 1.0, y), 2.0, [None] * 2) for g in (f, replace(f, exchange_interval=2.0)))
     assert np.allclose(a.mixtures[0].covs, b.mixtures[0].covs, atol=1e-12)
     with pytest.raises(ValueError, match="common: needs noise of its own"):
-        replace(f, sensors=[eye.changed(cov=TARGET_COV)] * 2).step(start, 1.0, y)
+        replace(f, sensors=[eye.replace(noise_cov=TARGET_COV)] * 2).step(start, 1.0, y)
 
 
 def test_everybody_hears_only_neighbours() -> None:
-    f = NewsFilter(MODEL, [EYE] * 3, graphs.path(3), target_dim=2, common=[1])
+    f = InformationIncrementFilter(MODEL, [EYE] * 3, graphs.path(3), target_dim=2, shared_components=[1])
     step = partial(f.step, f.start([PRIOR] * 3), 1.0)
     a, b = (step([[0.1, np.nan], None, [y, np.nan]]) for y in (0.2, 9.0))
     assert np.array_equal(a.mixtures[0].means, b.mixtures[0].means)
@@ -179,7 +179,7 @@ def test_a_target_that_moves_with_noise_needs_readings_in_place_of_news(
     own = Model(2, lambda x, t, dt: x, lambda t, dt: np.diag([q, 0.0]))
     alone = Sensor(1, lambda x: x[..., :1] - x[..., 1:], np.array([[0.3]]))
     prior = GaussianMixture.gaussian([0.0, 0.0], np.diag([4.0, 1.0]))
-    news = NewsFilter(own, [alone] * 2, graphs.path(2), target_dim=1)
+    news = InformationIncrementFilter(own, [alone] * 2, graphs.path(2), target_dim=1)
     all_ = Model(3, lambda x, t, dt: x, lambda t, dt: np.diag([q, 0.0, 0.0]))
     eyes = [Sensor(1, lambda x, a=a: x[..., :1] - x[..., a : a + 1], [[0.3]]) for a in (1, 2)]
     told = GaussianFilter(all_, eyes, graphs.path(2))

@@ -18,23 +18,23 @@ from distfilt.density import Flooding, FokkerPlanck, Grid
 from distfilt.filters.record import final_state
 from distfilt.mixtures import GaussianMixture, target_fusion
 from distfilt.models import LinearModel, lorenz63, rotating_swarm
-from distfilt.network import Channel, Faults, Graph, covariance_intersection, graphs, pull
-from distfilt.sensors import Sensor, angle, direct
+from distfilt.network import Channel, Faults, Graph, covariance_intersection, graphs, mean_pull
+from distfilt.sensors import Sensor, line_angle, component
 
 from .families import NOISE, PRIOR, TIMES, Q, data, kalman, model
 
-EYES = [direct([0], std=0.6), Sensor(2, lambda x: x, NOISE, linear=np.eye), direct([1], std=0.5)]
+EYES = [component([0], std=0.6), Sensor(2, lambda x: x, NOISE, linear=np.eye), component([1], std=0.5)]
 NET = graphs.complete(3)
 SWARM, PLACES = rotating_swarm("gibbs"), np.random.default_rng(1).random((9, 2))
 LAW = FokkerPlanck(SWARM, Grid((9, 9)))
 SIX = {
-    "ensemble": partial(filters.EnsembleFilter.exact, members=30, agreement=None),
+    "ensemble": partial(filters.EnsembleFilter.exact, members=30, fusion=None),
     "gaussian": filters.GaussianFilter,
     "particle": partial(filters.ParticleFilter, members=300),
     "transport": partial(filters.TransportFilter, members=30),
     "mixture": partial(filters.MixtureFilter, target_dim=2,
-                       agreement=partial(target_fusion, target_dim=2)),
-    "news": partial(filters.NewsFilter, target_dim=2),
+                       fusion=partial(target_fusion, target_dim=2)),
+    "news": partial(filters.InformationIncrementFilter, target_dim=2),
 }
 EACH = pytest.mark.parametrize("family", [*SIX, "density"])
 OF_SIX = pytest.mark.parametrize("family", SIX)
@@ -44,7 +44,7 @@ def made(family: str, times: Any = TIMES, **options: Any) -> tuple[Any, Any, Any
     """A filter, its first state, the readings agent by agent, and the truth."""
     if family == "density":
         path = SWARM.simulate(PLACES, times, rng=np.random.default_rng(2), substeps=2)
-        given = {"agreement": Flooding(), "bandwidth": 0.15, "rank": 20} | options
+        given = {"fusion": Flooding(), "bandwidth": 0.15, "rank": 20} | options
         f: Any = filters.DensityFilter(LAW, 9, given.pop("graph", 0.5), **given)
         return f, f.start(PLACES), path.swapaxes(0, 1), LAW.evolve(np.ones(81), times)
     truth, seen = data(options.get("sensors", EYES))
@@ -72,7 +72,7 @@ def test_a_run_is_its_steps_whether_saved_or_not(family: str, tmp_path: Path) ->
             rest = f.run(state, times[k + 1 :], [s[k + 1 :] for s in seen], truth=truth[k + 1 :])
             xarray.testing.assert_allclose(rest, run.isel(time=slice(k + 1, None)), 1e-9, 1e-12)
             xarray.testing.assert_equal(rest["mean"], run["mean"][k + 1 :])
-        again = f.summary(state)
+        again = f.summarize(state)
         assert np.array_equal(run["mean"].values[k], again.mean, equal_nan=True)
         assert np.array_equal(run["variance"].values[k], again.variance, equal_nan=True)
         for name in ("rounds", "messages", "scalars", "bytes", "lost"):
@@ -87,7 +87,7 @@ def test_a_run_is_its_steps_whether_saved_or_not(family: str, tmp_path: Path) ->
 def test_events_of_any_order_are_the_series(family: str) -> None:
     f, start, seen, _ = made(family)
     pairs = [(a, *pair) for a, s in enumerate(seen) for pair in zip(TIMES, s, strict=True)]
-    events = [filters.Reading(t, a, y) for a, t, y in pairs]
+    events = [filters.Observation(t, a, y) for a, t, y in pairs]
     mixed = [events[k] for k in np.random.default_rng(0).permutation(len(events))]
     a, b = f.run(start, TIMES, seen), f.run(start, None, mixed)
     xarray.testing.assert_equal(a, b)
@@ -100,13 +100,13 @@ def test_events_of_any_order_are_the_series(family: str) -> None:
     assert more["mean"].isel(time=slice(1, 2)).shape == a["mean"].isel(time=slice(0, 1)).shape
 
 
-@pytest.mark.parametrize("options", [{}, {"agreement": partial(pull, gain=0.0)}])
+@pytest.mark.parametrize("options", [{}, {"fusion": partial(mean_pull, gain=0.0)}])
 def test_particles_that_hear_all_are_the_joint_filter(options: Any) -> None:
     """Up to what their number leaves to chance; agreed of or not."""
     f, start, seen, _ = made("particle", **options)
     exact, _ = kalman(seen, EYES)
     for k, state in enumerate(f.steps(start, TIMES, seen)):
-        found = f.summary(state)
+        found = f.summarize(state)
         assert np.abs(found.mean - exact.means[k]).max() < 0.3
         assert np.abs(found.covariance - exact.covariances[k]).max() < 0.3
 
@@ -116,9 +116,9 @@ def test_units_change_nothing(family: str) -> None:
     """A state in millimetres in place of metres, to the rounding of a long product."""
     big = 1e3
     wide = LinearModel.from_transition(2, model().transition_matrix, lambda t, dt: big**2 * dt * Q)
-    eyes = [direct([0], std=0.6 * big), direct([1], std=0.5 * big), direct([0], std=0.3 * big)]
-    f, start, seen, _ = made(family, sensors=[direct([0], std=0.6), direct([1], std=0.5),
-                                              direct([0], std=0.3)])  # fmt: skip
+    eyes = [component([0], std=0.6 * big), component([1], std=0.5 * big), component([0], std=0.3 * big)]
+    f, start, seen, _ = made(family, sensors=[component([0], std=0.6), component([1], std=0.5),
+                                              component([0], std=0.3)])  # fmt: skip
     g = SIX[family](wide, eyes, NET)
     first = (big * PRIOR[0], big**2 * PRIOR[1])
     a = f.run(start, TIMES, seen)
@@ -144,44 +144,44 @@ def test_the_order_of_agents_changes_nothing(family: str) -> None:
 @pytest.mark.parametrize("family", SIX)
 def test_the_gate_lets_pass_what_its_share_says(family: str) -> None:
     """Just inside the quantile a reading counts, just outside it is left out and counted."""
-    f, start, _, _ = made(family, sensors=[direct([0, 1], std=0.6), None, None], gate=0.95)
+    f, start, _, _ = made(family, sensors=[component([0, 1], std=0.6), None, None], gate_probability=0.95)
     start = f.step(start, 0.0, [[0.4, np.nan], None, None])  # particles differ in weight since
-    blind = f.summary(f.step(start, 0.1, [None] * 3))
+    blind = f.summarize(f.step(start, 0.1, [None] * 3))
     cov = np.cov(blind.members[0].T) if blind.covariance is None else blind.covariance[0]
     s, way = cov + 0.36 * np.eye(2), np.array([1.0, -1.0])
     two = np.sqrt(chi2.ppf(0.95, 2) / (way @ np.linalg.solve(s, way))) * way
     for edge in (np.array([np.sqrt(chi2.ppf(0.95, 1) * s[0, 0]), np.nan]), two):
         for factor, refused in ((0.999, 0), (1.001, 1)):
             after = f.step(start, 0.1, [blind.mean[0] + factor * edge, None, None])
-            assert after.refused[0] == refused
-            same = np.allclose(f.summary(after).mean[0], blind.mean[0], atol=1e-12)
+            assert after.rejected[0] == refused
+            same = np.allclose(f.summarize(after).mean[0], blind.mean[0], atol=1e-12)
             assert same == bool(refused)
     # Straight behind a direction predictions lie on both sides of where its residuals jump.
-    given = {"sensors": [angle([0, 1], std=0.05, full=True), None, None], "gate": 0.99}
-    f = made(family, **given | ({"rule": "unscented"} if family == "gaussian" else {}))[0]
+    given = {"sensors": [line_angle([0, 1], std=0.05, full=True), None, None], "gate_probability": 0.99}
+    f = made(family, **given | ({"linearization": "unscented"} if family == "gaussian" else {}))[0]
     start = f.start((np.array([9.0, 0.0]), 0.2 * np.eye(2)), rng=np.random.default_rng(0))
-    assert f.step(start, 0.01, [[np.pi], None, None]).refused[0] == 1
+    assert f.step(start, 0.01, [[np.pi], None, None]).rejected[0] == 1
 
 
 def test_each_reading_is_judged_alone() -> None:
     """Of two readings that an agent has, its own and a neighbour's, only the wild one goes."""
-    f, start, _, _ = made("gaussian", gate=0.999)
+    f, start, _, _ = made("gaussian", gate_probability=0.999)
     plain = made("gaussian")[0]
     good, wild = [0.9], [0.8, 40.0]
     a = f.step(start, 0.1, [good, wild, None])
     b = plain.step(start, 0.1, [good, None, None])
-    assert a.refused.tolist() == [1, 1, 1] and np.array_equal(a.means, b.means)
+    assert a.rejected.tolist() == [1, 1, 1] and np.array_equal(a.means, b.means)
     run = f.run(start, [0.1], [[good], [wild], None])
-    assert run["refused"].values.tolist() == [[1, 1, 1]]
-    f, start, _, _ = made("gaussian", gate=0.999, lag=1)
-    blind, late = f.step(start, 0.1, [None] * 3), filters.Reading(0.1, 0, [40.0])
-    assert f.step(blind, 0.4, [None, wild, None], late=[late]).refused.tolist() == [2, 2, 2]
+    assert run["rejected"].values.tolist() == [[1, 1, 1]]
+    f, start, _, _ = made("gaussian", gate_probability=0.999, lag=1)
+    blind, late = f.step(start, 0.1, [None] * 3), filters.Observation(0.1, 0, [40.0])
+    assert f.step(blind, 0.4, [None, wild, None], delayed=[late]).rejected.tolist() == [2, 2, 2]
     still = LinearModel.from_transition(1, lambda h: np.eye(1), lambda t, h: np.zeros((1, 1)))
     bowl = Sensor(1, np.square, [[0.5]])  # of N(0, 1): mean 1, variance 1 by the points, slope 0
-    f = filters.GaussianFilter(still, [bowl], rule="unscented", gate=0.95)
+    f = filters.GaussianFilter(still, [bowl], linearization="unscented", gate_probability=0.95)
     edge, start = np.sqrt(1.5 * chi2.ppf(0.95, 1)), f.start((np.zeros(1), np.eye(1)))
     assert f.start(norm(1.0, 3.0)).covariances[0, 0, 0] == 9.0
-    refused = [f.step(start, 1.0, [[1 + k * edge]]).refused.tolist() for k in (0.97, 1.03)]
+    refused = [f.step(start, 1.0, [[1 + k * edge]]).rejected.tolist() for k in (0.97, 1.03)]
     assert refused == [[0.0], [1.0]]
 
 
@@ -191,9 +191,9 @@ def test_nothing_is_lost_until_the_next_contact(family: str, t0: float) -> None:
     """After it everybody knows what one filter with all readings knows; before, only its own."""
     quiet = LinearModel.from_transition(2, model().transition_matrix, lambda t, dt: 0 * Q)
     lag = {"lag": 8} if family == "gaussian" else {}
-    f = SIX[family](quiet, EYES, NET, every=0.2, **lag)
+    f = SIX[family](quiet, EYES, NET, exchange_interval=0.2, **lag)
     g = filters.GaussianFilter(quiet, EYES, NET)
-    own = filters.GaussianFilter(quiet, EYES, NET, share=False)
+    own = filters.GaussianFilter(quiet, EYES, NET, share_observations=False)
     seen = [s[:5] for s in data(EYES)[1]]
     # Multiples of .2 lie in the third step and, rounded, in the fourth, which is once.
     times = t0 + np.array([0.1, 0.15, 0.5, 0.6, 0.65])
@@ -205,7 +205,7 @@ def test_nothing_is_lost_until_the_next_contact(family: str, t0: float) -> None:
         assert spoke == (k in told)
         wanted = everything[k] if k in told else alone[k] if k < told[0] else None
         if wanted is not None:
-            found = f.summary(states[k])
+            found = f.summarize(states[k])
             assert np.allclose(found.mean, wanted.means, atol=1e-9)
             assert np.allclose(found.covariance, wanted.covariances, atol=1e-9)
 
@@ -214,16 +214,16 @@ def test_what_was_heard_is_not_told_as_one_s_own() -> None:
     """Agent 0 hears agent 1 at first, and is heard by nobody; then all hear all."""
     quiet = LinearModel.from_transition(2, model().transition_matrix, lambda t, dt: 0 * Q)
     one_way, (_, seen) = Graph.from_edges(3, [(0, 1)], directed=True), data(EYES)
-    f = filters.NewsFilter(quiet, EYES, lambda t: NET if t > 0.95 else one_way, target_dim=2)
+    f = filters.InformationIncrementFilter(quiet, EYES, lambda t: NET if t > 0.95 else one_way, target_dim=2)
     found, wanted = (h.run(h.start(PRIOR), TIMES[:4], [s[:4] for s in seen])["covariance"][-1, :2]
                      for h in (f, filters.GaussianFilter(quiet, EYES, NET)))
     assert np.allclose(found, wanted, atol=1e-9)
 
 
 def test_what_waits_survives_on_disk_and_a_lag_has_to_reach_it(tmp_path: Path) -> None:
-    f, start, seen, _ = made("gaussian", every=1.0, lag=8)
+    f, start, seen, _ = made("gaussian", exchange_interval=1.0, lag=8)
     states = list(f.steps(start, TIMES, seen))
-    assert states[0].waiting and not states[3].waiting
+    assert states[0].pending and not states[3].pending
     states[1].save(tmp_path / "s.npz")
     for s in seen:
         s[:2] = 9.0  # a buffer that is filled again is not what waits
@@ -231,9 +231,9 @@ def test_what_waits_survives_on_disk_and_a_lag_has_to_reach_it(tmp_path: Path) -
         for k in (2, 3):
             again = f.step(again, TIMES[k], [s[k] for s in seen])
         assert np.array_equal(again.joint_means, states[3].joint_means)
-    short, start, seen, _ = made("gaussian", every=1.0, lag=1)
+    short, start, seen, _ = made("gaussian", exchange_interval=1.0, lag=1)
     with pytest.raises(ValueError, match="lag: needs at least 1 for readings that wait"):
-        made("gaussian", every=1.0)
+        made("gaussian", exchange_interval=1.0)
     with pytest.raises(ValueError, match="lag: needs to reach back to t = 0"):
         short.run(start, TIMES, seen)
 
@@ -265,7 +265,7 @@ def test_a_selection_has_no_wrong_state(family: str) -> None:
     last = final_state(run)
     assert last.t == TIMES[-1]
     assert final_state(run.copy()) is last and final_state(run.assign(x=1)) is last
-    assert np.array_equal(f.summary(final_state(run.copy(deep=True))).mean, f.summary(last).mean)
+    assert np.array_equal(f.summarize(final_state(run.copy(deep=True))).mean, f.summarize(last).mean)
     assert final_state(run.isel(time=slice(3, None))) is last
     for part in (run.isel(time=slice(2)), run.isel(agent=[0]), run[["variance"]],
                  run.isel(agent=[1, 0, *range(2, len(seen))])):  # fmt: skip
@@ -281,7 +281,7 @@ def test_a_state_and_a_reading_of_another_are_refused() -> None:
     with pytest.raises(ValueError, match="state: needs sizes"):
         g.step(filters.EnsembleFilter(model(), EYES, NET, members=7).start(
             PRIOR, rng=np.random.default_rng(0)), 0.1, [None] * 3)  # fmt: skip
-    for reading in (filters.Reading(0.1, 1, [0.3]), filters.Reading(0.2, 0, [0.3])):
+    for reading in (filters.Observation(0.1, 1, [0.3]), filters.Observation(0.2, 0, [0.3])):
         with pytest.raises(ValueError, match=r"observations\[0\]: needs a Reading of agent 0 at"):
             f.step(start, 0.1, [reading, None, None])
 
@@ -295,7 +295,7 @@ def test_a_prior_of_any_kind() -> None:
         assert np.allclose(state.means, PRIOR[0]) and np.allclose(state.covariances, PRIOR[1])
     assert np.allclose(f.start(members).covariances, np.cov(members.T))
     flat = (PRIOR[0], np.diag([1.0, 0.0]))
-    unscented = filters.GaussianFilter(model(), EYES, NET, rule="unscented")
+    unscented = filters.GaussianFilter(model(), EYES, NET, linearization="unscented")
     for g, wrong, text in ((f, lambda n, rng, leading: None, "got a function"),
                            (f, ([0.0, 0.0], [1.0, 1.0]), r"a covariance of .*, got \(2,\)"),
                            (unscented, flat, "definite"), (made("mixture")[0], flat, "definite")):
@@ -311,18 +311,18 @@ def test_a_prior_of_any_kind() -> None:
         assert x.shape == (2, 3, 4000, 2) and np.allclose(np.cov(x[1, 2].T), cov, atol=0.5)
     m = filters.MixtureFilter(model(), EYES, target_dim=2)
     begun = m.start([PRIOR, frozen, two]).mixtures
-    assert [b.size for b in begun] == [1, 1, 2]
+    assert [b.n_components for b in begun] == [1, 1, 2]
 
 
 def test_degrees_are_told() -> None:
-    f = filters.GaussianFilter(model(), [angle([0, 1], std=0.1), None, None], NET)
+    f = filters.GaussianFilter(model(), [line_angle([0, 1], std=0.1), None, None], NET)
     with pytest.warns(RuntimeWarning, match=r"^observations\[0\]: .* rad, got some 14 turns"):
         f.run(f.start(PRIOR), [1.0], [np.array([[89.6]]), None, None])
 
 
 def test_the_extended_filter_bears_its_own_rounding() -> None:
     chaos = lorenz63()
-    f = filters.GaussianFilter(chaos, [direct([0, 1, 2], std=1.0)])
+    f = filters.GaussianFilter(chaos, [component([0, 1, 2], std=1.0)])
     times = np.arange(1, 401) * 0.01
     start = [1.0, 1.0, 20.0]
     truth = np.array(list(accumulate(times, lambda x, _: chaos.step(x, 0.0, 0.01), initial=start)))
@@ -339,12 +339,12 @@ def test_inflation_widens_the_forecast_and_goes_with_fusion_and_the_past() -> No
     assert np.allclose(a.covariances, 1.69 * b.covariances)
     assert np.allclose(a.joint_covariances[..., :2, 2:], 1.3 * b.joint_covariances[..., :2, 2:])
     assert np.allclose(a.joint_covariances[..., 2:, 2:], b.joint_covariances[..., 2:, 2:])
-    f = filters.GaussianFilter(model(), EYES, NET, inflation=1.3, agreement=covariance_intersection)
+    f = filters.GaussianFilter(model(), EYES, NET, inflation=1.3, fusion=covariance_intersection)
     c = f.step(f.start(PRIOR), 0.5, [None] * 3)
     assert np.allclose(c.covariances, a.covariances)
     # What is agreed of now tells of the past as much as its regression on now says.
     c, b = (f.step(f.start(PRIOR), 0.5, [[0.3], [0.2, 0.4], [0.9]]) for f in (
-        filters.GaussianFilter(model(), EYES, NET, lag=1, share=False, agreement=rule)
+        filters.GaussianFilter(model(), EYES, NET, lag=1, share_observations=False, fusion=rule)
         for rule in (covariance_intersection, None)))
     p, alone, gap = c.joint_covariances, b.joint_covariances, c.joint_means - b.joint_means
     fused = covariance_intersection((b.means, b.covariances), Channel(NET))

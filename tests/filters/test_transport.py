@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from distfilt.coupling import ensemble_transform
-from distfilt.coupling.transform import plans
-from distfilt.filters import ParticleCollapse, Reading, TransportFilter
+from distfilt.coupling import transform_ensemble
+from distfilt.coupling.transform import transport_plans
+from distfilt.filters import ParticleCollapse, Observation, TransportFilter
 from distfilt.filters.ensemble import EnsembleState
 from distfilt.linalg import SolverError
-from distfilt.network import Graph, average, graphs
-from distfilt.sensors import Sensor, direct, stack
+from distfilt.network import Graph, average_consensus, graphs
+from distfilt.sensors import Sensor, component, stack
 
 from .families import NOISE, PRIOR, TIMES, data, model
 
 FOUR: list[Sensor | None] = [
-    direct([0], std=0.6), direct([1], std=0.5), Sensor(2, lambda x: x, NOISE), direct([0], std=0.8),
+    component([0], std=0.6), component([1], std=0.5), Sensor(2, lambda x: x, NOISE), component([0], std=0.8),
 ]
 
 
@@ -39,12 +39,12 @@ def _central(state: EnsembleState, seen: list[Any], steps: int) -> np.ndarray:
     x, rng, t = state.ensembles[0], state.rng, state.t
     assert rng is not None
     whole = stack([s for s in FOUR if s is not None])
-    weight = np.linalg.inv(whole.cov)
+    weight = np.linalg.inv(whole.noise_cov)
     for k in range(steps):
         x = model().sample_step(x, t, TIMES[k] - t, rng=rng)
         t = TIMES[k]
         gap = np.concatenate([o[k] for o in seen]) - whole.predict(x, None)
-        x = ensemble_transform(x, -0.5 * np.einsum("ni,ij,nj->n", gap, weight, gap))
+        x = transform_ensemble(x, -0.5 * np.einsum("ni,ij,nj->n", gap, weight, gap))
     return x
 
 
@@ -52,8 +52,8 @@ def _central(state: EnsembleState, seen: list[Any], steps: int) -> np.ndarray:
     ("options", "bound"),
     [
         ({}, 1e-12),
-        ({"agreement": partial(average, rounds=20)}, 1e-7),
-        ({"agreement": partial(average, rounds=30)}, 1e-11),
+        ({"fusion": partial(average_consensus, rounds=20)}, 1e-7),
+        ({"fusion": partial(average_consensus, rounds=30)}, 1e-11),
     ],
 )
 def test_agents_with_different_sensors_are_one_central_filter(
@@ -81,9 +81,9 @@ def test_an_agent_whom_nobody_hears_counts_its_own_reading_once() -> None:
         alone = one.step(_start(one), 0.5, [y[k]]).ensembles[0]
         assert np.allclose(alone, apart[k], atol=1e-13)
     f = _filter(graph=lambda t: graphs.ring(4) if t > 0.7 else Graph.from_edges(4, []))
-    for now, late in ((y, []), ([None] * 4, [Reading(0.5, 0, [0.3])])):
+    for now, late in ((y, []), ([None] * 4, [Observation(0.5, 0, [0.3])])):
         with pytest.raises(ValueError, match="graph: needs links for the readings of t = 0.6"):
-            replace(f, lag=1).step(_start(f).changed(t=0.5), 0.6, now, late=late)
+            replace(f, lag=1).step(_start(f).replace(t=0.5), 0.6, now, delayed=late)
 
 
 def test_sets_stay_in_common_with_noise_and_rejuvenation_over_runs() -> None:
@@ -103,11 +103,11 @@ def test_a_late_reading_weighs_all_times_with_one_coupling() -> None:
     state = f.step(state, 0.5, [None] * 4)
     before = state.ensembles[0]
     plain = f.step(state, 1.0, [None] * 4).ensembles[0]
-    after = f.step(state, 1.0, [None, None, None, [0.4]], late=[Reading(0.5, 0, [1.3])])
+    after = f.step(state, 1.0, [None, None, None, [0.4]], delayed=[Observation(0.5, 0, [1.3])])
     logs = -0.5 * ((1.3 - before[:, 0]) / 0.6) ** 2 - 0.5 * ((0.4 - plain[:, 0]) / 0.8) ** 2
     w = np.exp(logs - logs.max())
     w /= w.sum()
-    assert np.allclose(after.ensembles[2], ensemble_transform(plain, logs), atol=1e-11)
+    assert np.allclose(after.ensembles[2], transform_ensemble(plain, logs), atol=1e-11)
     assert np.allclose(after.history[-1][1][1].mean(axis=0), w @ before, atol=1e-12)
 
 
@@ -115,10 +115,10 @@ def test_weights_of_a_run_that_failed_are_no_collapse(monkeypatch: pytest.Monkey
     def wary(x: np.ndarray, logs: np.ndarray) -> np.ndarray:
         if np.ptp(logs, axis=-1).max() > 1e4:
             raise SolverError("too far")
-        return plans(x, logs)
+        return transport_plans(x, logs)
 
-    monkeypatch.setattr("distfilt.filters.ensemble.plans", wary)
-    f = TransportFilter(model(), [direct([0], std=0.6)], None, members=30, failures="keep")
+    monkeypatch.setattr("distfilt.filters.ensemble.transport_plans", wary)
+    f = TransportFilter(model(), [component([0], std=0.6)], None, members=30, on_error="keep")
     start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(2,))
     with pytest.warns(ParticleCollapse, match="squared distance from an ensemble's belief"):
         assert f.step(start, 0.5, [[[0.3], [3e4]]]).failed.tolist() == [False, True]

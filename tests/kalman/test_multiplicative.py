@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from distfilt.kalman import QuaternionChart, filterpy_ekf, kalman_filter, multiplicative_filter
+from distfilt.kalman import QuaternionChart, filterpy_ekf, kalman_filter, mekf
 from distfilt.linalg import central
 from distfilt.models import Model, constant_velocity, satellite_pose, simulate
-from distfilt.models.satellite import turned
-from distfilt.sensors import direct, distance_and_angle, stack
-from distfilt.sensors.kinds import differential
+from distfilt.models.satellite import rotate
+from distfilt.sensors import component, range_bearing, stack
+from distfilt.sensors.kinds import increment
 from tests.support import spd, turning
 
 POSE = QuaternionChart(13, 9)
@@ -27,7 +27,7 @@ class _Flat(QuaternionChart):
     def retract(self, x: np.ndarray, e: np.ndarray) -> np.ndarray:
         return x + e
 
-    def directions(self, x: np.ndarray) -> np.ndarray:
+    def tangent_basis(self, x: np.ndarray) -> np.ndarray:
         return np.eye(self.dim)
 
 
@@ -40,15 +40,15 @@ def test_a_quaternion_s_chart(dim: int, first: int) -> None:
     q = slice(first, first + 4)
     assert np.abs(np.linalg.norm(moved[:, q], axis=1) - np.linalg.norm(x[:, q], axis=1)).max() < (
         1e-13)
-    assert np.allclose(moved[:, q], turned(x[:, q], e[:, first : first + 3]), atol=1e-15)
+    assert np.allclose(moved[:, q], rotate(x[:, q], e[:, first : first + 3]), atol=1e-15)
     others = np.delete(x, range(first, first + 4), 1) + np.delete(e, range(first, first + 3), 1)
     assert np.allclose(np.delete(moved, range(first, first + 4), 1), others, atol=1e-15)
     for k in range(5):
         numeric = central(lambda v, k=k: chart.retract(np.broadcast_to(x[k], (*v.shape[:-1], dim)),
                                                        v), np.zeros(dim - 1))
-        assert np.abs(chart.directions(x[k]) - numeric).max() < 1e-9
+        assert np.abs(chart.tangent_basis(x[k]) - numeric).max() < 1e-9
     # Moves along the directions are errors, and a quaternion's length is none.
-    b, cov, along = chart.directions(x), spd(rng, dim - 1), np.zeros_like(x)
+    b, cov, along = chart.tangent_basis(x), spd(rng, dim - 1), np.zeros_like(x)
     assert np.allclose(chart.project(x, b @ cov @ b.mT), cov)
     along[:, q] = x[:, q]
     assert np.abs(chart.project(x, along[..., None] * along[:, None])).max() < 1e-13
@@ -58,11 +58,11 @@ def test_a_flat_chart_is_the_extended_filter() -> None:
     rng = np.random.default_rng(2)
     model = turning(sigma=0.1, turn_sigma=0.05)
     start, cov = np.array([0.0, 0.0, 1.0, 0.0, 0.2]), 0.1 * spd(rng, 5)
-    sensors = [distance_and_angle([0, 1], std=[0.1, 0.05], origin=[3.0, 0.1])]
+    sensors = [range_bearing([0, 1], std=[0.1, 0.05], origin=[3.0, 0.1])]
     y = stack(sensors).observe(start + 0.1 * rng.standard_normal((3, 4, 5)), rng=rng)
     y[1, 2, 0] = np.nan
     options = {"model": model, "sensors": sensors, "times": [0.3, 0.8, 1.8]}
-    ours = multiplicative_filter(start, cov, y, chart=_Flat(5, 0), **options)
+    ours = mekf(start, cov, y, chart=_Flat(5, 0), **options)
     plain = filterpy_ekf(start, cov, y, **options)
     for name, most in (("means", 1e-13), ("covariances", 1e-13), ("log_likelihood", 1e-10)):
         np.testing.assert_allclose(getattr(ours, name), getattr(plain, name), rtol=0, atol=most)
@@ -71,17 +71,17 @@ def test_a_flat_chart_is_the_extended_filter() -> None:
 def test_a_run_that_is_lost_is_named() -> None:
     burst = Model(4, lambda x, t, dt: np.where(x > 5, np.nan, x), lambda t, dt: np.eye(4) * 1e-6)
     with pytest.raises(np.linalg.LinAlgError, match=r"at t = 2: run 1"):
-        multiplicative_filter(
+        mekf(
             [[0.0] * 4, [4.0] * 4], 1e-6 * np.eye(4), np.full((2, 2, 1), [[0.0], [9.0]]),
-            chart=_Flat(4, 0), model=burst, sensors=[direct([0], std=1e-6)], times=[1.0, 2.0])
+            chart=_Flat(4, 0), model=burst, sensors=[component([0], std=1e-6)], times=[1.0, 2.0])
 
 
 def test_errors_move_by_the_derivative_of_the_flow_in_the_chart() -> None:
     rng = np.random.default_rng(4)
     x, cov, q = rng.standard_normal(13), spd(rng, 12), spd(rng, 13)
     model = replace(satellite_pose(rate=0.3, sigma=0.0), noise_cov=lambda t, dt: (1 + t) * q)
-    seen = multiplicative_filter(x, cov, [[0.1, 0.2]], chart=POSE, model=model, times=[0.8],
-                                 sensors=[differential([9, 11], std=0.3)])
+    seen = mekf(x, cov, [[0.1, 0.2]], chart=POSE, model=model, times=[0.8],
+                                 sensors=[increment([9, 11], std=0.3)])
 
     def before(e: np.ndarray) -> np.ndarray:
         return POSE.retract(np.broadcast_to(x, (*e.shape[:-1], 13)), e)
@@ -93,7 +93,7 @@ def test_errors_move_by_the_derivative_of_the_flow_in_the_chart() -> None:
     change = central(lambda e: (after(e) - before(e))[..., [9, 11]], np.zeros(12))
     there, both = after(np.zeros(12)), block_diag(cov, POSE.project(after(np.zeros(12)), q))
     slope = np.hstack([slope, np.eye(12)])
-    change = np.hstack([change, POSE.directions(there)[[9, 11]]])
+    change = np.hstack([change, POSE.tangent_basis(there)[[9, 11]]])
     gain = np.linalg.solve(change @ both @ change.T + 0.09 * np.eye(2), change @ both @ slope.T).T
     wanted = (slope - gain @ change) @ both @ slope.T
     assert np.allclose(seen.covariances[0], wanted, atol=1e-6)
@@ -103,12 +103,12 @@ def test_changes_are_readings_of_two_states() -> None:
     """A differential sensor: equal to the Kalman filter of the doubled state (x, x before)."""
     rng = np.random.default_rng(5)
     model, d = constant_velocity(sigma=0.3), 4
-    sensors = [differential([0, 3], std=0.2), direct([1], std=0.3)]
+    sensors = [increment([0, 3], std=0.2), component([1], std=0.3)]
     mean, cov, y = rng.standard_normal(d), spd(rng, d), rng.standard_normal((4, 3, 3))
     y[1, 0, 0] = y[2, 1] = np.nan
-    run = multiplicative_filter(mean, cov, y, chart=_Flat(d, 0), model=model, sensors=sensors,
+    run = mekf(mean, cov, y, chart=_Flat(d, 0), model=model, sensors=sensors,
                                 times=[0.5, 1.0, 1.5, 2.0])
-    phi, q = model.transition(0.5), model.noise(0.0, 0.5)
+    phi, q = model.F(0.5), model.Q(0.0, 0.5)
     double, noise = np.zeros((2 * d, 2 * d)), np.zeros((2 * d, 2 * d))
     double[:d, :d], double[d:, :d], noise[:d, :d] = phi, np.eye(d), q
     h = np.zeros((3, 2 * d))
@@ -134,9 +134,9 @@ def test_an_attitude_s_uncertainty_is_honest_and_its_length_kept() -> None:
     truth = POSE.retract(np.broadcast_to(x0, (runs, 13)), 0.1 * rng.standard_normal((runs, 12)))
     times = 0.1 * np.arange(1, 21)
     path = simulate(model, truth, times, rng=rng)
-    sensors = [direct([0, 1, 2], std=0.2), direct([9, 10, 11, 12], std=0.1)]
+    sensors = [component([0, 1, 2], std=0.2), component([9, 10, 11, 12], std=0.1)]
     y = stack(sensors).observe(path, rng=rng)
-    run = multiplicative_filter(x0, cov, y, chart=POSE, model=model, sensors=sensors, times=times)
+    run = mekf(x0, cov, y, chart=POSE, model=model, sensors=sensors, times=times)
     error = POSE.local(run.means[-1], path[-1])
     nees = np.einsum("ri,ri->r", error,
                      np.linalg.solve(run.covariances[-1], error[..., None])[..., 0])

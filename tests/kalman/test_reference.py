@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from distfilt.filters import GaussianFilter
-from distfilt.gaussians import conditioned
-from distfilt.kalman import GaussianRun, filterpy_ekf, filterpy_kf, filterpy_ukf, kalman_filter
+from distfilt.gaussians import condition
+from distfilt.kalman import FilterResult, filterpy_ekf, filterpy_kf, filterpy_ukf, kalman_filter
 from distfilt.models import Model
-from distfilt.sensors import Sensor, angle, direct, distance, distance_and_angle, stack
+from distfilt.sensors import Sensor, line_angle, component, distance, range_bearing, stack
 from tests.kalman.problems import D, M, problem, walk
 from tests.support import spd, turning
 
@@ -22,17 +22,17 @@ FULL = np.array([[4.0, 1.2], [1.2, 1.0]])
 
 def one_agent(
     mean: Any, cov: Any, y: Any, *, model: Model, sensors: Any, times: Any, **options: Any
-) -> GaussianRun:
+) -> FilterResult:
     """The Gaussian filter of one agent that holds all sensors."""
     y = np.asarray(y)
     f = GaussianFilter(model, [stack(sensors)], **options)
     states = list(f.steps(f.start((mean, cov), runs=y.shape[1:-1]), times, [y]))
     means = np.array([s.means[..., 0, :] for s in states])
     covs = np.array([s.covariances[..., 0, :, :] for s in states])
-    return GaussianRun(means, covs, np.zeros(means.shape[:-1]))
+    return FilterResult(means, covs, np.zeros(means.shape[:-1]))
 
 
-extended, unscented = one_agent, partial(one_agent, rule="unscented")
+extended, unscented = one_agent, partial(one_agent, linearization="unscented")
 FILTERS = (filterpy_ekf, filterpy_ukf, extended, unscented)
 
 
@@ -59,9 +59,9 @@ def test_equal_to_filterpy(varying: bool, pattern: str, priors: tuple[int, ...])
 
 BENT = (
     ([0.0, 0.0, 1.0, 0.0, 0.2], turning(sigma=0.1, turn_sigma=0.05),
-     [distance_and_angle([0, 1], std=[0.1, 0.05], origin=[3.0, 0.1])]),
+     [range_bearing([0, 1], std=[0.1, 0.05], origin=[3.0, 0.1])]),
     ([1.0, 2.0, 0.3], walk(3),
-     [direct([0, 1], std=0.2), angle([1, 2], std=0.2), distance([0, 1, 2], std=0.3)]),
+     [component([0, 1], std=0.2), line_angle([1, 2], std=0.2), distance([0, 1, 2], std=0.3)]),
 )  # fmt: skip
 
 
@@ -88,7 +88,7 @@ def test_nonlinear_filters_agree_with_filterpy(
 @pytest.mark.parametrize("filter_", FILTERS)
 def test_an_angle_may_wrap(filter_: Callable[..., Any]) -> None:
     """Bearings on either side of the cut: turned by half a turn, nothing but the signs changes."""
-    options = {"model": walk(2), "sensors": [angle([0, 1], std=0.01, full=True)], "times": [1e-9]}
+    options = {"model": walk(2), "sensors": [line_angle([0, 1], std=0.01, full=True)], "times": [1e-9]}
     mean, cov = np.array([-1.0, 0.02]), 0.01 * FULL / 4
     run = filter_(mean, cov, [[-np.pi + 0.02]], **options)
     assert run.means[0, 1] < -0.01
@@ -102,7 +102,7 @@ def test_an_angle_may_wrap(filter_: Callable[..., Any]) -> None:
 def test_what_the_sensor_cannot_see_is_missing() -> None:
     """A mean at the sensor's place has no angle; its distance is used all the same."""
     options = {"model": walk(2), "times": [1e-9],
-               "sensors": [distance_and_angle([0, 1], std=[0.3, 0.1])]}  # fmt: skip
+               "sensors": [range_bearing([0, 1], std=[0.3, 0.1])]}  # fmt: skip
     here, blind = (extended([0.0, 0.0], FULL, [[0.5, z]], **options) for z in (0.1, np.nan))
     np.testing.assert_allclose(here.means, blind.means, atol=1e-14)
     np.testing.assert_allclose(here.covariances, blind.covariances, atol=1e-14)
@@ -126,6 +126,6 @@ def test_extended_steps_are_the_linearised_formulas(filter_: Callable[..., Any])
     np.testing.assert_allclose(ahead.covariances[1], p, atol=1e-8)
     run = filter_([0.3, -0.7], FULL, [gone, [1.0, -1.0]], **options)
     gap, h = [1.0 - x[0] ** 2, -1.0 - x.sum()], np.array([[2 * x[0], 0.0], [1.0, 1.0]])
-    for ours, exact in zip((run.means, run.covariances), conditioned(x, p, gap, h, FULL),
+    for ours, exact in zip((run.means, run.covariances), condition(x, p, gap, h, FULL),
                            strict=True):  # fmt: skip
         np.testing.assert_allclose(ours[1], exact, atol=1e-7)

@@ -20,7 +20,7 @@ from matplotlib.colors import to_rgb
 
 from bookkit import plotting
 from bookkit.plotting import PALETTE, SIZE, axes, colour, graph, line_style, slider, use_style
-from bookkit.tables import table
+from bookkit.tables import ResultTable
 
 
 @pytest.fixture(autouse=True)
@@ -119,7 +119,7 @@ def test_a_slider_holds_its_frames_and_nothing_else():
     assert matplotlib.rcParams["axes.prop_cycle"].by_key()["color"] == list(PALETTE)
     rates = [0.0, 0.5, 1.0, 2.0]
     found = slider(curve, rates, label="rate", unit="1/s", alt="A curve <falls>.", start=2)
-    assert found.said == ("rate 0 1/s", "rate 0.5 1/s", "rate 1 1/s", "rate 2 1/s")
+    assert found.labels == ("rate 0 1/s", "rate 0.5 1/s", "rate 1 1/s", "rate 2 1/s")
     assert len(set(found.frames)) == 4 and not pyplot.get_fignums()
     find, data = found_in(found.html)
     (image,), (knob,) = find("img"), find("input")
@@ -132,7 +132,7 @@ def test_a_slider_holds_its_frames_and_nothing_else():
     assert (knob["type"], knob["min"], knob["max"], knob["value"]) == ("range", "0", "3", "2")
     assert knob["aria-label"] == "rate" and len(find("button")) == 1
     assert [base64.b64decode(f) for f in data["frames"]] == list(found.frames)
-    assert data["said"] == list(found.said) and data["milliseconds"] == 500
+    assert data["said"] == list(found.labels) and data["milliseconds"] == 500
     assert "http" not in found.html and not any("src" in s.attrs for s in find("script"))
     assert len(found.html) < 100_000
     bundle = found._repr_mimebundle_()
@@ -158,7 +158,7 @@ def test_texts_of_a_slider_cannot_end_its_script():
 
 def test_a_table_marks_the_best_number_in_the_form_that_is_asked_for():
     frame = pd.DataFrame({"m": [0.523, np.nan, 0.404], "rule": ["a<b", "c", "d"]}, index=[*"xyz"])
-    found = table(frame, form={"m": ".2f"}, best={"m": "min"}, caption="Error")
+    found = ResultTable(frame, form={"m": ".2f"}, best={"m": "min"}, caption="Error")
     page = BeautifulSoup(found._repr_html_(), "html.parser")
     rows = [[c.text for c in row.find_all(["th", "td"])] for row in page.find_all("tr")]
     assert rows == [["", "m", "rule"], ["x", "0.52", "a<b"], ["y", "nan", "c"], ["z", "0.40", "d"]]

@@ -239,7 +239,7 @@ def test_every_claim_has_to_hold() -> None:
 
 def test_a_rule_that_its_null_passes_too_shows_nothing() -> None:
     def below(limit: float) -> Claim:
-        return Claim.ruled("pca-stable", "share", lambda s: s < limit, 0.02, 0.3, "a coin")
+        return Claim.from_rule("pca-stable", "share", lambda s: s < limit, 0.02, 0.3, "a coin")
 
     verdicts = [judge_claims("grange", "Fig. 1", [CLAIMS[0], below(x), CLAIMS[2]], why="high")
                 for x in (0.1, 0.5, 0.01)]  # fmt: skip

@@ -179,7 +179,7 @@ def test_a_file_gives_back_every_bit(whole: Path) -> None:
     kept = studies.load(whole)
     assert np.stack([kept.columns[c] for c in COLUMNS], axis=1).tobytes() == REFERENCE
     assert kept.parameters == {"size": 40} and len(kept) == 30
-    assert kept.heads["code"] == {"draw": studies.fingerprint(draw)}
+    assert kept.metadata["code"] == {"draw": studies.fingerprint(draw)}
 
 
 @settings(max_examples=25)
@@ -297,7 +297,7 @@ def test_another_run_is_compared(
 
 def test_a_few_trials_may_go_another_way(whole: Path) -> None:
     other = partial(fails_at, (4,))
-    studies.check(whole, other, indices=[0, 4, 29], odd=1)
+    studies.check(whole, other, indices=[0, 4, 29], max_outliers=1)
     with pytest.raises(AssertionError, match="trial 4: stored a value, now ArithmeticError"):
         studies.check(whole, other, indices=[0, 4, 29])
 

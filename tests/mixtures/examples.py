@@ -20,22 +20,22 @@ def random_mixture(size: int, dim: int, seed: int, spread: float = 3.0) -> Gauss
 
 def affine(p: GaussianMixture, matrix: np.ndarray, shift: np.ndarray) -> GaussianMixture:
     """The same density in other coordinates."""
-    return GaussianMixture.unchecked(
+    return GaussianMixture.construct(
         p.weights.copy(), p.means @ matrix.T + shift, matrix @ p.covs @ matrix.T
     )
 
 
 def shuffled(p: GaussianMixture, seed: int = 0) -> GaussianMixture:
     """The same density with its mixands in another order."""
-    order = np.random.default_rng(seed).permutation(p.size)
+    order = np.random.default_rng(seed).permutation(p.n_components)
     return GaussianMixture(p.weights[order], p.means[order], p.covs[order])
 
 
 def same(a: GaussianMixture, b: GaussianMixture, tolerance: float = 1e-9) -> None:
     """Both have the same mixands, in whatever order."""
-    assert a.size == b.size
+    assert a.n_components == b.n_components
     first, second = (
-        np.array(sorted(np.c_[p.means, p.weights, p.covs.reshape(p.size, -1)].round(12).tolist()))
+        np.array(sorted(np.c_[p.means, p.weights, p.covs.reshape(p.n_components, -1)].round(12).tolist()))
         for p in (a, b)
     )
     np.testing.assert_allclose(first, second, rtol=tolerance, atol=tolerance * np.abs(second).max())

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from distfilt.mixtures import GaussianMixture, split, split_library, stretching
-from distfilt.mixtures.conditioning import moved, updated, within_gate
-from distfilt.mixtures.splitting import split_stretched
+from distfilt.mixtures import GaussianMixture, split_components, split_library, nonlinearity
+from distfilt.mixtures.conditioning import propagate_mixture, update_mixture, within_gate
+from distfilt.mixtures.splitting import split_nonlinear
 
 from .examples import affine, random_mixture, same, scales, shuffled
 
@@ -25,11 +25,11 @@ def test_linear_problems_are_the_kalman_filter(seed: int, d: int) -> None:
     rng = np.random.default_rng(seed)
     p, f, h = random_mixture(3, d, seed), rng.standard_normal((d, d)), rng.standard_normal((2, d))
     q, r = random_mixture(1, d, seed + 1).factors[0], random_mixture(1, 2, seed + 2).covs[0]
-    ahead = moved(p, lambda x: x @ f.T, q)
+    ahead = propagate_mixture(p, lambda x: x @ f.T, q)
     assert np.allclose(ahead.means, p.means @ f.T)
     assert np.allclose(ahead.covs, f @ p.covs @ f.T + q @ q.T)
     y = 3 * rng.standard_normal(2)
-    after = updated(ahead, y, lambda x: x @ h.T, r)
+    after = update_mixture(ahead, y, lambda x: x @ h.T, r)
     inner = h @ ahead.covs @ h.T + r
     gain = np.linalg.solve(inner, h @ ahead.covs).mT
     means = ahead.means + (gain @ (y - ahead.means @ h.T)[..., None])[..., 0]
@@ -46,9 +46,9 @@ def test_what_bends_adds_to_the_spread() -> None:
     m, p, r, y = 1.5, 0.8, 0.3, 4.0
     prior = GaussianMixture.gaussian([m], [[p]])
     spread = 4 * m**2 * p + 2 * p**2
-    ahead = moved(prior, lambda x: x**2, np.full((1, 1), np.sqrt(r)))
+    ahead = propagate_mixture(prior, lambda x: x**2, np.full((1, 1), np.sqrt(r)))
     assert np.allclose(ahead.covs, spread + r)
-    after = updated(prior, np.array([y]), lambda x: x**2, np.full((1, 1), r))
+    after = update_mixture(prior, np.array([y]), lambda x: x**2, np.full((1, 1), r))
     gain = 2 * m * p / (spread + r)
     assert np.allclose(after.means, m + gain * (y - m**2 - p))
     assert np.allclose(after.covs, p - gain**2 * (spread + r))
@@ -66,21 +66,21 @@ def test_steps_in_other_coordinates_and_in_another_order() -> None:
 
     # The unscented points depend on the square root, so both start from matching ones.
     p = affine(P, matrix, shift)
-    p = GaussianMixture.unchecked(p.weights, p.means, p.covs, factors=matrix @ P.factors)
-    after = moved(p, lambda x: bent(there(x)) @ matrix.T + shift, 0.1 * matrix)
-    same(affine(after, back, -back @ shift), moved(P, bent, 0.1 * np.eye(3)), 1e-8)
+    p = GaussianMixture.construct(p.weights, p.means, p.covs, factors=matrix @ P.factors)
+    after = propagate_mixture(p, lambda x: bent(there(x)) @ matrix.T + shift, 0.1 * matrix)
+    same(affine(after, back, -back @ shift), propagate_mixture(P, bent, 0.1 * np.eye(3)), 1e-8)
     y = np.array([0.5, 1.0])
-    after = updated(p, y, lambda x: bent(there(x)) @ H.T, R)
-    home = updated(P, y, lambda x: bent(x) @ H.T, R)
+    after = update_mixture(p, y, lambda x: bent(there(x)) @ H.T, R)
+    home = update_mixture(P, y, lambda x: bent(x) @ H.T, R)
     same(affine(after, back, -back @ shift), home, 1e-7)
-    same(updated(shuffled(P), y, lambda x: bent(x) @ H.T, R), home)
+    same(update_mixture(shuffled(P), y, lambda x: bent(x) @ H.T, R), home)
 
 
 def test_a_missing_component_keeps_its_noise_to_itself() -> None:
     noise = np.array([[1.0, 0.9], [0.9, 2.0]])
-    part = updated(P, np.array([np.nan, 1.0]), lambda x: x @ H.T, noise)
-    same(part, updated(P, np.ones(1), lambda x: x @ H[1:].T, noise[1:, 1:]))
-    assert updated(P, np.full(2, np.nan), lambda x: x @ H.T, noise) is P
+    part = update_mixture(P, np.array([np.nan, 1.0]), lambda x: x @ H.T, noise)
+    same(part, update_mixture(P, np.ones(1), lambda x: x @ H[1:].T, noise[1:, 1:]))
+    assert update_mixture(P, np.full(2, np.nan), lambda x: x @ H.T, noise) is P
 
 
 def test_a_mixand_that_cannot_see_is_left_out() -> None:
@@ -88,10 +88,10 @@ def test_a_mixand_that_cannot_see_is_left_out() -> None:
         return np.where(x > 0, x, np.nan)
 
     two = GaussianMixture([0.5, 0.5], [[-9.0], [9.0]], np.ones((2, 1, 1)))
-    after = updated(two, np.full(1, 8.0), half_blind, np.eye(1))
-    assert after.size == 1 and np.allclose(after.means, 8.5)
+    after = update_mixture(two, np.full(1, 8.0), half_blind, np.eye(1))
+    assert after.n_components == 1 and np.allclose(after.means, 8.5)
     with pytest.raises(ValueError, match="^observed: needs a target that can be seen"):
-        updated(two, np.full(1, 8.0), lambda x: np.nan * x, np.eye(1))
+        update_mixture(two, np.full(1, 8.0), lambda x: np.nan * x, np.eye(1))
 
 
 def test_angles_that_wrap_between_points() -> None:
@@ -103,8 +103,8 @@ def test_angles_that_wrap_between_points() -> None:
 
     at, turn = np.array([-5.0, 0.01]), np.array([[0.0, -1.0], [1.0, 0.0]])
     one, two = (GaussianMixture.gaussian(m, 0.09 * np.eye(2)) for m in (at, turn @ at))
-    one = updated(one, np.array([-np.pi + 0.05]), bearing, 0.01 * np.eye(1), residual=wrap)
-    two = updated(two, np.array([-np.pi / 2 + 0.05]), bearing, 0.01 * np.eye(1), residual=wrap)
+    one = update_mixture(one, np.array([-np.pi + 0.05]), bearing, 0.01 * np.eye(1), residual=wrap)
+    two = update_mixture(two, np.array([-np.pi / 2 + 0.05]), bearing, 0.01 * np.eye(1), residual=wrap)
     assert np.allclose(one.means @ turn.T, two.means)
     assert np.allclose(turn @ one.covs @ turn.T, two.covs)
 
@@ -141,20 +141,20 @@ def test_the_library_keeps_moments_and_is_near_the_normal() -> None:
 
 
 def test_splits_keep_the_moments() -> None:
-    after = split(P, [1, 3], U, std=0.6)
-    assert after.size == 8 and np.linalg.eigvalsh(after.covs).min() > 0
+    after = split_components(P, [1, 3], U, std=0.6)
+    assert after.n_components == 8 and np.linalg.eigvalsh(after.covs).min() > 0
     assert np.allclose(after.mean, P.mean) and np.allclose(after.cov, P.cov, rtol=1e-12)
     assert np.allclose(after.weights[:2], P.weights[[0, 2]])
     assert np.isclose(after.weights[2:5].sum(), P.weights[1])
     matrix, shift = scales(3)
-    there = split(affine(P, matrix, shift), [1, 3], U @ matrix.T, std=0.6)
+    there = split_components(affine(P, matrix, shift), [1, 3], U @ matrix.T, std=0.6)
     same(there, affine(after, matrix, shift))
 
 
 def test_stretching_is_the_largest_image() -> None:
     rng = np.random.default_rng(2)
     g, scale = rng.standard_normal((4, 2, 3)), np.array([1.0, 3.0])
-    u, length = stretching(P.factors, g, scale=scale)
+    u, length = nonlinearity(P.factors, g, scale=scale)
     for k in range(4):
         assert np.isclose(u[k] @ np.linalg.solve(P.covs[k], u[k]), 1)
         assert np.isclose(np.linalg.norm(scale * (g[k] @ u[k])), length[k])
@@ -168,9 +168,9 @@ def test_the_most_stretched_are_split_while_there_is_room() -> None:
         return np.where(x > 0, 4.0, 1.0)[..., None]
 
     two = GaussianMixture([0.5, 0.5], [[-5.0], [5.0]], np.ones((2, 1, 1)))
-    once = split_stretched(two, slope, most=4, stretch=0.6)
-    assert once.size == 4 and (once.means > 0).sum() == 3
+    once = split_nonlinear(two, slope, max_components=4, split_threshold=0.6)
+    assert once.n_components == 4 and (once.means > 0).sum() == 3
     # .5 · 4 is above the limit, and so is its middle piece, of deviation .7; thrice at most.
-    assert split_stretched(two, slope, most=50, stretch=0.6).size == 6
-    assert split_stretched(two, slope, most=3, stretch=0.6) is two
-    assert split_stretched(two, slope, most=50, stretch=2.5) is two
+    assert split_nonlinear(two, slope, max_components=50, split_threshold=0.6).n_components == 6
+    assert split_nonlinear(two, slope, max_components=3, split_threshold=0.6) is two
+    assert split_nonlinear(two, slope, max_components=50, split_threshold=2.5) is two

@@ -12,16 +12,16 @@ from hypothesis import strategies as st
 from distfilt.mixtures import (
     GaussianMixture,
     PartialFusion,
-    average,
-    fuse,
-    fuse_in_turn,
+    average_mixtures,
+    fuse_mixtures,
+    fuse_sequentially,
     fuse_moments,
     nonnegative_least_squares,
     target_fusion,
     tikhonov,
 )
 from distfilt.network import Channel, Graph, graphs
-from distfilt.network.channel import fused_kind
+from distfilt.network.channel import kind_of_rule
 
 from .examples import TARGET, affine, random_mixture, same, scales, shuffled
 
@@ -48,7 +48,7 @@ def by_information(
 def test_gaussians_are_fused_exactly(seed: int, omega: float, n: int, e: int) -> None:
     own, other = random_mixture(1, n + e, seed), random_mixture(1, n, seed + 1)
     mean, cov = by_information(own, 0, 0, [(other, 0)], [omega, 1 - omega])
-    for fused in (fuse(own, other, omega=omega), fuse_moments(own, other, omega=omega)):
+    for fused in (fuse_mixtures(own, other, omega=omega), fuse_moments(own, other, omega=omega)):
         assert np.allclose(fused.means[0], mean, rtol=1e-8, atol=1e-8)
         assert np.allclose(fused.covs[0], cov, rtol=1e-8, atol=1e-8)
 
@@ -57,8 +57,8 @@ def test_matched_terms_are_always_definite_and_others_may_fail() -> None:
     dropped = 0
     for seed in range(40):
         f = PartialFusion(random_mixture(3, 4, seed, 1.0), random_mixture(3, 2, 500 + seed, 1.0))
-        matched, every = f.shapes(), f.shapes(terms="all")
-        assert matched.dropped == 0 and matched.size == 9 and every.size + every.dropped == 27
+        matched, every = f.component_shapes(), f.component_shapes(terms="all")
+        assert matched.dropped == 0 and matched.n_components == 9 and every.n_components + every.dropped == 27
         assert min(np.linalg.eigvalsh(s.covs).min() for s in (matched, every)) > 0
         dropped += every.dropped
     assert dropped > 0
@@ -74,9 +74,9 @@ def test_the_target_marginal_of_the_exact_density_by_quadrature() -> None:
 
 
 def test_omega_at_its_ends() -> None:
-    assert fuse(OWN, OTHER, omega=1.0) is OWN
+    assert fuse_mixtures(OWN, OTHER, omega=1.0) is OWN
     other = random_mixture(1, 2, 8)
-    same(fuse(random_mixture(1, 4, 4), other, omega=0.0).marginal(TARGET), other)
+    same(fuse_mixtures(random_mixture(1, 4, 4), other, omega=0.0).marginal(TARGET), other)
     assert np.isfinite(PartialFusion(OWN, OTHER, omega=1.0).log_value(np.zeros((1, 4)))).all()
 
 
@@ -94,13 +94,13 @@ def test_exponents_are_equal_by_default() -> None:
 def test_many_agents_in_one_pass_and_one_after_the_other() -> None:
     own = random_mixture(1, 5, 30)
     others = [random_mixture(1, 2, 31 + k) for k in range(3)]
-    once = fuse(own, others)
+    once = fuse_mixtures(own, others)
     for order in (others, others[::-1]):
-        same(fuse_in_turn(own, order), once)
-    halves = fuse_in_turn(own, others, omega=0.5, pair=fuse_moments)
-    same(halves, fuse(own, others, omega=[1 / 8, 1 / 8, 1 / 4, 1 / 2]))
+        same(fuse_sequentially(own, order), once)
+    halves = fuse_sequentially(own, others, omega=0.5, pair=fuse_moments)
+    same(halves, fuse_mixtures(own, others, omega=[1 / 8, 1 / 8, 1 / 4, 1 / 2]))
     # With halves the order matters.
-    assert not np.allclose(halves.means, fuse_in_turn(own, others[::-1], omega=0.5).means)
+    assert not np.allclose(halves.means, fuse_sequentially(own, others[::-1], omega=0.5).means)
 
 
 @pytest.mark.parametrize("terms", ["matched", "all"])
@@ -111,14 +111,14 @@ def test_three_mixtures_by_information(terms: str) -> None:
     wanted = (OWN.log_density(x) - 0.5 * OWN.marginal(TARGET).log_density(x[:, :2])
               + 0.2 * OTHER.log_density(x[:, :2]) + 0.3 * third.log_density(x[:, :2]))
     assert np.allclose(f.log_value(x), wanted, rtol=1e-12)
-    shapes = f.shapes(terms=terms)
+    shapes = f.component_shapes(terms=terms)
     wanted = []
     for q, p, r, s in np.ndindex(3, 3, 2, 3):
         mean, cov = by_information(OWN, q, p, [(OTHER, r), (third, s)], [0.5, 0.2, 0.3])
         if (terms == "all" or p == q) and np.linalg.eigvalsh(cov)[0] > 0:
             wanted.append((q, mean, cov))
     source, means, covs = (np.array(part) for part in zip(*wanted, strict=True))
-    assert shapes.size + shapes.dropped == 3 * 2 * 3 * (3 if terms == "all" else 1)
+    assert shapes.n_components + shapes.dropped == 3 * 2 * 3 * (3 if terms == "all" else 1)
     assert np.array_equal(shapes.source, source)
     assert np.allclose(shapes.means, means, rtol=1e-9, atol=1e-9)
     assert np.allclose(shapes.covs, covs, rtol=1e-9, atol=1e-9)
@@ -128,14 +128,14 @@ def test_three_mixtures_by_information(terms: str) -> None:
 @pytest.mark.parametrize("terms", ["matched", "all"])
 def test_fusion_in_other_coordinates_and_in_another_order(rule: str, terms: str) -> None:
     others = [random_mixture(1, 2, 51), random_mixture(2, 2, 52)]
-    fused = fuse(OWN, others, rule=rule, terms=terms)
-    same(fuse(OWN, others[::-1], rule=rule, terms=terms), fused, 1e-6)
-    same(fuse(shuffled(OWN), [shuffled(m) for m in others], rule=rule, terms=terms), fused, 1e-6)
+    fused = fuse_mixtures(OWN, others, rule=rule, terms=terms)
+    same(fuse_mixtures(OWN, others[::-1], rule=rule, terms=terms), fused, 1e-6)
+    same(fuse_mixtures(shuffled(OWN), [shuffled(m) for m in others], rule=rule, terms=terms), fused, 1e-6)
     # Sigma points hang on the square root, which other coordinates turn unless they are scaled.
     matrix, shift = scales(4, target_dim=2)
     if rule == "points":
         matrix = np.diag(np.geomspace(1e-3, 1e5, 4))
-    there = fuse(
+    there = fuse_mixtures(
         affine(OWN, matrix, shift), [affine(m, matrix[:2, :2], shift[:2]) for m in others],
         rule=rule, terms=terms,
     )  # fmt: skip
@@ -147,11 +147,11 @@ def test_fusion_in_other_coordinates_and_in_another_order(rule: str, terms: str)
 def test_weights_are_the_printed_formulas(rule: str) -> None:
     """C1 and C2 at the means; least squares meet the density at means or sigma points."""
     f = PartialFusion(OWN, OTHER, omega=0.6)
-    shapes = f.shapes()
+    shapes = f.component_shapes()
     size = np.sqrt(np.linalg.det(2 * np.pi * shapes.covs))
     if rule in ("C1", "C2"):
         parts = np.exp(OWN.component_log_densities(shapes.means)) * OWN.weights
-        own = parts[np.arange(shapes.size), shapes.source] if rule == "C1" else parts.sum(axis=1)
+        own = parts[np.arange(shapes.n_components), shapes.source] if rule == "C1" else parts.sum(axis=1)
         update = f.log_value(shapes.means) - OWN.log_density(shapes.means)
         w = own * np.exp(update) * size
     else:
@@ -163,7 +163,7 @@ def test_weights_are_the_printed_formulas(rule: str) -> None:
         square = (gap * np.linalg.solve(shapes.covs, gap[..., None])[..., 0]).sum(axis=-1)
         scale = np.ones(p.size) if rule == "C3" else 1 / np.sqrt(p + 1e-3)
         w = nonnegative_least_squares(np.exp(-0.5 * square) * scale[:, None], p * scale) * size
-    assert np.allclose(f.weigh(shapes, rule=rule).weights, w[w > 0] / w.sum(), rtol=1e-6)
+    assert np.allclose(f.assign_weights(shapes, rule=rule).weights, w[w > 0] / w.sum(), rtol=1e-6)
 
 
 @pytest.mark.parametrize("condition", [15.0, 1.5])
@@ -185,8 +185,8 @@ def test_condition_of_least_squares(condition: float, monkeypatch: pytest.Monkey
 
 def test_least_squares_have_a_limit() -> None:
     f = PartialFusion(random_mixture(5, 3, 1, 1.0), random_mixture(5, 2, 2, 1.0))
-    shapes, c2 = f.shapes(), f.weigh(f.shapes(), rule="C2")
-    few, best = f.weigh(shapes, at_most=6).means, c2.means[np.argsort(-c2.weights)[:6]]
+    shapes, c2 = f.component_shapes(), f.assign_weights(f.component_shapes(), rule="C2")
+    few, best = f.assign_weights(shapes, at_most=6).means, c2.means[np.argsort(-c2.weights)[:6]]
     assert {tuple(m) for m in few} <= {tuple(m) for m in best}
 
 
@@ -195,7 +195,7 @@ def test_least_squares_have_a_limit() -> None:
 def test_mixands_far_apart_leave_no_nan(rule: str, terms: str) -> None:
     own = GaussianMixture([0.5, 0.5], [[0.0, 0.0], [1e3, 0.0]], [np.eye(2), np.eye(2)])
     other = GaussianMixture([0.5, 0.5], [[0.0], [-1e3]], [[[1.0]], [[0.5]]])
-    fused = fuse(own, other, rule=rule, terms=terms)
+    fused = fuse_mixtures(own, other, rule=rule, terms=terms)
     assert np.isfinite(fused.weights).all() and np.isclose(fused.weights.sum(), 1)
     assert np.isfinite(fused.log_density([0.0, 0.0]))
     assert fused.weights[np.abs(fused.means[:, 0]) < 1].sum() > 0.99
@@ -203,7 +203,7 @@ def test_mixands_far_apart_leave_no_nan(rule: str, terms: str) -> None:
 
 def test_average_keeps_the_conditional_and_averages_the_target() -> None:
     own, other = random_mixture(1, 4, 40), random_mixture(3, 2, 41)
-    mixed = average(own, other, omega=0.3)
+    mixed = average_mixtures(own, other, omega=0.3)
     x = np.random.default_rng(0).standard_normal((20, 4)) * 2
     t = x[:, :2]
     wanted = np.logaddexp(np.log(0.3) + own.marginal(TARGET).log_density(t),
@@ -213,12 +213,12 @@ def test_average_keeps_the_conditional_and_averages_the_target() -> None:
     given_t = own.log_density(x) - own.marginal(TARGET).log_density(t)
     assert np.allclose(mixed.log_density(x) - target, given_t, rtol=1e-9)
     several = random_mixture(3, 4, 42)
-    mixed, (matrix, shift) = average(several, other), scales(4, target_dim=2)
+    mixed, (matrix, shift) = average_mixtures(several, other), scales(4, target_dim=2)
     # Own mixands take the heard ones by what each says of the heard mean, weight and density.
     near = several.weights * np.exp(several.marginal(TARGET).component_log_densities(other.means))
     near *= 0.5 * (other.weights / near.sum(axis=1))[:, None]
     assert np.allclose(mixed.weights, [*(0.5 * several.weights), *near.ravel()])
-    there = average(affine(several, matrix, shift), affine(other, matrix[:2, :2], shift[:2]))
+    there = average_mixtures(affine(several, matrix, shift), affine(other, matrix[:2, :2], shift[:2]))
     same(there, affine(mixed, matrix, shift), 1e-7)
 
 
@@ -232,7 +232,7 @@ def test_agents_fuse_the_marginals_of_whom_they_hear() -> None:
     after = target_fusion(BELIEFS, channel, target_dim=2)
     said = [m.marginal(TARGET) for m in BELIEFS]
     heard = said[1], [said[0], said[2]], said[1]
-    wanted = [fuse(own, others) for own, others in zip(BELIEFS, heard, strict=True)]
+    wanted = [fuse_mixtures(own, others) for own, others in zip(BELIEFS, heard, strict=True)]
     for a, b in zip(after, wanted, strict=True):
         assert np.array_equal(a.means, b.means) and np.array_equal(a.weights, b.weights)
     # A mixand is a weight, two means and three entries of a covariance; 1 has two listeners.
@@ -240,8 +240,8 @@ def test_agents_fuse_the_marginals_of_whom_they_hear() -> None:
 
 
 def test_what_is_fused_and_how_can_be_chosen() -> None:
-    rule = partial(target_fusion, target_dim=2, fuse=partial(fuse_in_turn, pair=fuse_moments))
-    assert fused_kind(rule) == "mixtures"
+    rule = partial(target_fusion, target_dim=2, fuse=partial(fuse_sequentially, pair=fuse_moments))
+    assert kind_of_rule(rule) == "mixtures"
     after = rule(BELIEFS, Channel(graphs.complete(3)))
     # Equal exponents in whatever order: everybody has the same Gaussian target.
     for m in after[1:]:
@@ -258,7 +258,7 @@ def test_a_collapse_names_the_agent_the_mixand_and_the_cause() -> None:
     def naive(own: GaussianMixture, heard: list[GaussianMixture]) -> GaussianMixture:
         covs = own.covs.copy()
         covs[1] -= 2 * np.linalg.eigvalsh(covs[1])[0] * np.eye(own.dim)
-        return GaussianMixture.unchecked(own.weights, own.means, covs)
+        return GaussianMixture.construct(own.weights, own.means, covs)
 
     with pytest.raises(np.linalg.LinAlgError, match="^agent 0: mixand 1 of 2 .*independent"):
         target_fusion(BELIEFS, Channel(graphs.path(3)), target_dim=2, fuse=naive)

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distfilt.mixtures import GaussianMixture, Shapes, reduction, runnalls
+from distfilt.mixtures import GaussianMixture, ComponentShapes, reduction, runnalls
 from distfilt.mixtures.reduction import (
     cross_relevance,
     gaussian_divergences,
-    kept_by_relevance,
+    merge_irrelevant,
     pivoted_qr,
 )
 
@@ -71,7 +71,7 @@ def test_runnalls_is_the_algorithm(size: int, dim: int, left: int) -> None:
 def test_reduction_keeps_the_moments_in_any_coordinates(size: int, dim: int, seed: int) -> None:
     p, left = random_mixture(size, dim, seed), 1 + seed % size
     a = runnalls(p, left)
-    assert a.size == min(left, size)
+    assert a.n_components == min(left, size)
     assert np.allclose(a.mean, p.mean) and np.allclose(a.cov, p.cov)
     matrix, shift = scales(dim)
     same(runnalls(affine(p, matrix, shift), left), affine(a, matrix, shift), 1e-7)
@@ -99,7 +99,7 @@ def test_the_heaviest_absorb_the_others_first() -> None:
     p = random_mixture(300, 3, 12)
     for n in (1, 5):
         q = runnalls(p, n, heaviest=40)
-        assert q.size == n and np.allclose(q.mean, p.mean) and np.allclose(q.cov, p.cov)
+        assert q.n_components == n and np.allclose(q.mean, p.mean) and np.allclose(q.cov, p.cov)
     same(runnalls(p, 5, heaviest=300), runnalls(p, 5))
     # A light mixand joins the heavy one that is near; one without weight changes nothing.
     means = [[0.0], [9.0], [1.0], [2.0]]
@@ -118,15 +118,15 @@ def test_the_relevance_rule_is_41_without_its_guards(monkeypatch: pytest.MonkeyP
     assert np.allclose(relevance, one.weights[:, None] * gaussian_divergences(one, two))
     delta = relevance.min(axis=1)
     out = delta > 3.0 * delta.min()
-    kept = kept_by_relevance(one, two, threshold=3.0)
-    assert kept.size == 1 + (~out).sum()
+    kept = merge_irrelevant(one, two, threshold=3.0)
+    assert kept.n_components == 1 + (~out).sum()
     assert np.isclose(kept.weights[-1], one.weights[out].sum())
     share = one.weights[out] / one.weights[out].sum()
     inside = GaussianMixture(share, one.means[out], one.covs[out])
     assert np.allclose(kept.means[-1], inside.mean) and np.allclose(kept.covs[-1], inside.cov)
     assert np.allclose(kept.cov, one.cov)
     there = (affine(m, *scales(2)) for m in (one, two))
-    same(kept_by_relevance(*there, threshold=3.0), affine(kept, *scales(2)))
+    same(merge_irrelevant(*there, threshold=3.0), affine(kept, *scales(2)))
 
 
 @given(st.integers(0, 500), st.integers(2, 8))
@@ -137,28 +137,28 @@ def test_a_shared_mixand_does_not_collapse_the_mixture(seed: int, size: int) -> 
     moved[0] = p.means[0]
     q = GaussianMixture(p.weights, moved, p.covs)
     # All lie within the gate of a mixand of the other.
-    assert kept_by_relevance(p, q, threshold=1.5).size == size
+    assert merge_irrelevant(p, q, threshold=1.5).n_components == size
     far = random_mixture(size, 2, seed, spread=30.0)
     shared = GaussianMixture.gaussian(far.means[0], far.covs[0])
-    left = kept_by_relevance(far, shared, threshold=1.5)
-    assert left.size >= 2 and np.abs(left.means - far.means[0]).sum(axis=1).min() < 1e-12
+    left = merge_irrelevant(far, shared, threshold=1.5)
+    assert left.n_components >= 2 and np.abs(left.means - far.means[0]).sum(axis=1).min() < 1e-12
 
 
 def test_a_light_mixand_far_away_does_not_set_the_scale() -> None:
     one = GaussianMixture([0.5, 0.5 - 1e-9, 1e-9], [[0.0], [1.0], [40.0]], np.ones((3, 1, 1)))
     two = GaussianMixture([0.5, 0.5], [[0.2], [1.3]], np.ones((2, 1, 1)))
-    assert kept_by_relevance(one, two, threshold=1.5).size == 3
+    assert merge_irrelevant(one, two, threshold=1.5).n_components == 3
 
 
 def test_pivoted_qr() -> None:
     means = np.array([[0.0, 0.0], [0.0, 1e-7], [5.0, 0.0], [5.0, 1e-7], [0.0, 9.0]])
-    shapes = Shapes(means, np.stack([np.eye(2)] * 5), [0, 1, 2, 3, 4], 7)
-    dropped = pivoted_qr(shapes, size=3, rest="drop")
-    assert dropped.size == 3 and dropped.dropped == 7 and 4 in dropped.source
-    merged = pivoted_qr(shapes, size=4)
+    shapes = ComponentShapes(means, np.stack([np.eye(2)] * 5), [0, 1, 2, 3, 4], 7)
+    dropped = pivoted_qr(shapes, n_components=3, rest="drop")
+    assert dropped.n_components == 3 and dropped.dropped == 7 and 4 in dropped.source
+    merged = pivoted_qr(shapes, n_components=4)
     # Two copies, one of each pair, with equal weights.
-    assert merged.size == 4 and np.allclose(merged.means[-1], [2.5, 0.0], atol=1e-6)
+    assert merged.n_components == 4 and np.allclose(merged.means[-1], [2.5, 0.0], atol=1e-6)
     assert np.allclose(merged.covs[-1], [[1 + 6.25, 0], [0, 1]], atol=1e-5)
     assert set(merged.source[:3]) == set(dropped.source) and merged.source[3] not in dropped.source
     for n, rest in product((1, 2, 3, 5, 9), ("merge", "drop")):
-        assert pivoted_qr(shapes, size=n, rest=rest).size == min(n, 5)
+        assert pivoted_qr(shapes, n_components=n, rest=rest).n_components == min(n, 5)

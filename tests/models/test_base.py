@@ -37,7 +37,7 @@ def test_a_flow_that_works_in_place_leaves_the_caller_s_states() -> None:
 def test_noise_cannot_be_changed_through_what_it_returns_and_its_root_is_a_factor() -> None:
     q = FULL.copy()
     model = Model(3, lambda x, t, dt: x, lambda t, dt: q)
-    found, root = model.noise(0.0, 1.0), model.root(0.0, 1.0)
+    found, root = model.Q(0.0, 1.0), model.noise_sqrt(0.0, 1.0)
     assert not found.flags.writeable and not np.shares_memory(found, q)
     assert np.allclose(root @ root.T, FULL, rtol=1e-14)
 
@@ -59,8 +59,8 @@ def test_drawn_noise_has_the_full_covariance(door: str) -> None:
 @pytest.mark.parametrize(("turned", "dt"), [(False, 1e-4), (True, 0.5), (True, 1e-4)])
 def test_a_transposed_derivative_or_transition_is_told_once(turned: bool, dt: float) -> None:
     straight = constant_velocity(sigma=0.3, axes=1)
-    phi = (lambda dt: straight.transition(dt).T) if turned else straight.transition
-    model = Model(2, straight.flow, straight.noise_cov, derivative=lambda x, t, dt: phi(dt))
+    phi = (lambda dt: straight.F(dt).T) if turned else straight.F
+    model = Model(2, straight.transition, straight.noise_cov, derivative=lambda x, t, dt: phi(dt))
     linear = LinearModel.from_transition(2, phi, straight.noise_cov)
     with warnings.catch_warnings(record=True, action="always") as told:
         for _ in range(2):
@@ -68,7 +68,7 @@ def test_a_transposed_derivative_or_transition_is_told_once(turned: bool, dt: fl
             linear.sample_step(np.ones(2), 0.0, dt, rng=generator())
     words = [str(one.message).split(":")[0] for one in told]
     assert words == ["derivative", "transition_matrix"] * turned
-    LinearModel.from_transition(2, phi, lambda t, dt: {1.0: np.eye(2)}[dt]).noise(0.0, 1.0)
+    LinearModel.from_transition(2, phi, lambda t, dt: {1.0: np.eye(2)}[dt]).Q(0.0, 1.0)
 
 
 def test_simulation_passes_the_times_on() -> None:
@@ -102,7 +102,7 @@ def test_jacobian_by_differences_given_and_of_a_matrix() -> None:
     orbit = clohessy_wiltshire(rate=0.1, sigma=0.2)
     for state in (np.ones(6), np.ones((2, 6))):
         slope = orbit.jacobian(state, 0.0, 0.7)
-        assert slope.shape == (*state.shape, 6) and (slope == orbit.transition(0.7)).all()
+        assert slope.shape == (*state.shape, 6) and (slope == orbit.F(0.7)).all()
 
 
 def _column_in_place(x: np.ndarray, t: float, dt: float) -> np.ndarray:
@@ -122,7 +122,7 @@ def test_a_flow_for_one_state_is_refused(flow: Any, shape: tuple[int, ...]) -> N
     assert model.step(np.arange(4.0), 0.0, 0.1).shape == (4,)
     x = generator().standard_normal(shape)
     for step in (model.step, partial(model.sample_step, rng=generator())) * 2:
-        with pytest.raises(ValueError, match="flow: needs to take many states at once"):
+        with pytest.raises(ValueError, match="transition: needs to take many states at once"):
             step(x, 0.0, 0.1)
 
 
@@ -160,4 +160,4 @@ def test_shipped_models_can_be_pickled(name: str) -> None:
     x = high if name == "orbits" else generator().random(model.dim)
     assert (again.step(x, 0.0, 0.2) == model.step(x, 0.0, 0.2)).all()
     assert (again.jacobian(x, 0.0, 0.2) == model.jacobian(x, 0.0, 0.2)).all()
-    assert (again.noise(0.0, 0.2) == model.noise(0.0, 0.2)).all()
+    assert (again.Q(0.0, 0.2) == model.Q(0.0, 0.2)).all()

@@ -61,7 +61,7 @@ def test_straight_motion(axes: int) -> None:
     assert np.allclose(model.step([*p, *v], 0.0, 2.0), [*(p + 2 * v), *v])
     # The integral of the noise's response, by components: 0.09 (8/3, 4/2; 4/2, 2).
     exact = np.kron([[8 / 3, 2.0], [2.0, 2.0]], 0.09 * np.eye(axes))
-    assert np.allclose(model.noise(0.0, 2.0), exact)
+    assert np.allclose(model.Q(0.0, 2.0), exact)
     assert model.names == (*"xyz"[:axes], *(f"v{k}" for k in "xyz"[:axes]))
     assert model.units == ("m",) * axes + ("m/s",) * axes
 
@@ -81,5 +81,5 @@ def test_lorenz_agrees_with_an_adaptive_rule() -> None:
     error = [np.sqrt((gap**2).mean()) for gap in gaps]
     assert error[-1] < 1e-7
     assert abs(np.polyfit(np.log(steps), np.log(error), 1)[0] - 4) < 0.3
-    assert np.allclose(lorenz63(sigma=0.5).noise(0.0, 0.1), 0.025 * np.eye(3))
-    assert not lorenz63().noise(0.0, 0.1).any()
+    assert np.allclose(lorenz63(sigma=0.5).Q(0.0, 0.1), 0.025 * np.eye(3))
+    assert not lorenz63().Q(0.0, 0.1).any()

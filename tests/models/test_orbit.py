@@ -51,7 +51,7 @@ def test_the_model_is_block_by_block() -> None:
     move = np.array([0.1, -0.2, 0.3, 0.5, 0.2, -0.1])
     gap = propagate(MEO + 1e-2 * move, 3600.0) - propagate(MEO - 1e-2 * move, 3600.0)
     assert np.allclose(slope[:6, :6] @ move, gap / 2e-2, rtol=1e-5, atol=1e-6)
-    assert np.allclose(np.sqrt(np.diag(model.noise(0, 10.0)))[[0, 3, 11]], [1e-11, 1e-6, 1e-6])
+    assert np.allclose(np.sqrt(np.diag(model.Q(0, 10.0)))[[0, 3, 11]], [1e-11, 1e-6, 1e-6])
 
 
 def test_frames_are_rotations_along_the_motion() -> None:

@@ -69,8 +69,8 @@ def test_the_chart_and_back() -> None:
 
 def test_noise_and_names() -> None:
     model = pendulum(sigma=(0.1, 0.2))
-    assert np.allclose(model.noise(0.0, 0.5), np.diag([0.005, 0.005, 0.02, 0.02]))
+    assert np.allclose(model.Q(0.0, 0.5), np.diag([0.005, 0.005, 0.02, 0.02]))
     chart = pendulum_angle(sigma=(0.1, 0.2))
-    assert np.allclose(chart.noise(0.0, 0.5), np.diag([0.005, 0.02]))
+    assert np.allclose(chart.Q(0.0, 0.5), np.diag([0.005, 0.02]))
     assert model.names == ("x", "y", "vx", "vy") and chart.units == ("rad", "rad/s")
-    assert (pendulum().noise(0.0, 0.1) == 0).all()
+    assert (pendulum().Q(0.0, 0.1) == 0).all()

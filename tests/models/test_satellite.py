@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import distfilt.models as att
 from distfilt.linalg import central
 from distfilt.models import satellite as sat
-from distfilt.models.satellite import left_directions, turn_between, turned
+from distfilt.models.satellite import left_directions, rotation_vector_between, rotate
 
 START = np.array([0.3, 0.2, 0.1, 1.0, 0.0, 0.0, 0.0])
 
@@ -36,9 +36,9 @@ def test_drift_of_a_geostationary_orbit_keeps_its_digits() -> None:
 
 def test_noise_is_exact_over_two_halves() -> None:
     model = sat.clohessy_wiltshire(rate=0.1, sigma=0.2)
-    half, q = model.transition(0.05), model.noise(0.0, 0.05)
-    assert np.allclose(half @ q @ half.T + q, model.noise(0.0, 0.1), rtol=1e-12)
-    assert np.allclose(model.noise(0.0, 1e-7), 0.2**2 * 1e-7 * np.eye(6), atol=1e-14)
+    half, q = model.F(0.05), model.Q(0.0, 0.05)
+    assert np.allclose(half @ q @ half.T + q, model.Q(0.0, 0.1), rtol=1e-12)
+    assert np.allclose(model.Q(0.0, 1e-7), 0.2**2 * 1e-7 * np.eye(6), atol=1e-14)
 
 
 def _random(seed: int, n: int = 50) -> tuple[np.ndarray, np.ndarray]:
@@ -59,8 +59,8 @@ def test_rotation_matrix_is_the_active_one(seed: int) -> None:
 def test_turned_rotates_the_active_matrix_from_the_left(seed: int) -> None:
     q, angle = _random(seed)
     rotated = Rotation.from_rotvec(angle).as_matrix() @ att.rotation_matrix(q)
-    assert np.abs(att.rotation_matrix(turned(3 * q, angle)) - rotated).max() < 1e-13
-    lengths = np.linalg.norm(turned(3 * q, angle), axis=1)
+    assert np.abs(att.rotation_matrix(rotate(3 * q, angle)) - rotated).max() < 1e-13
+    lengths = np.linalg.norm(rotate(3 * q, angle), axis=1)
     assert np.abs(lengths - 3).max() < 1e-13
 
 
@@ -68,17 +68,17 @@ def test_turned_rotates_the_active_matrix_from_the_left(seed: int) -> None:
 def test_turn_between_undoes_turned(seed: int) -> None:
     q, angle = _random(seed)
     angle *= np.minimum(1, 3 / np.linalg.norm(angle, axis=1, keepdims=True))
-    there = turned(q, angle)
-    assert np.abs(turn_between(2 * q, there) - angle).max() < 1e-12
-    assert np.abs(turn_between(q, -there) - angle).max() < 1e-12
-    assert np.abs(turn_between(q, q)).max() < 1e-15
+    there = rotate(q, angle)
+    assert np.abs(rotation_vector_between(2 * q, there) - angle).max() < 1e-12
+    assert np.abs(rotation_vector_between(q, -there) - angle).max() < 1e-12
+    assert np.abs(rotation_vector_between(q, q)).max() < 1e-15
 
 
 def test_left_directions_are_the_derivative_of_turned_and_of_equation_21() -> None:
     """So (21) keeps the length and turns the active matrix by -[w]R, as `turned` does."""
     q, w = _random(3, 5)
     for one in q:
-        numeric = central(lambda e, one=one: turned(one, e), np.zeros(3))
+        numeric = central(lambda e, one=one: rotate(one, e), np.zeros(3))
         assert np.abs(left_directions(one) - numeric).max() < 1e-9
     rate = -(left_directions(q) @ w[..., None])[..., 0]
     assert np.abs(att.quaternion_rate(q, w) - rate).max() < 1e-15
@@ -115,6 +115,6 @@ def test_pose_is_translation_and_attitude() -> None:
     moved = pose.step(x, 0.0, 0.1)
     assert np.allclose(moved[..., :6], orbit.step(x[..., :6], 0.0, 0.1), atol=1e-14)
     assert np.allclose(moved[2, 1, 6:], _body(0.01, x[2, 1, 6:], 0.1), atol=1e-14)
-    q = pose.noise(0.0, 0.1)
-    assert np.allclose(q[:6, :6], orbit.noise(0.0, 0.1)) and not q[:6, 6:].any()
+    q = pose.Q(0.0, 0.1)
+    assert np.allclose(q[:6, :6], orbit.Q(0.0, 0.1)) and not q[:6, 6:].any()
     assert np.allclose(q[6:, 6:], np.diag([0.004] * 3 + [0.0] * 4))

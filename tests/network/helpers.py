@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from distfilt.network import Channel, Faults, Graph, Weights, graphs
+from distfilt.network import Channel, Faults, Graph, ConsensusWeights, graphs
 
 NAN = float("nan")
 STAR = graphs.star(3)
@@ -35,10 +35,10 @@ def lossy(loss: float = 0.3, graph: Graph = STAR, **options: object) -> Channel:
     return Channel(graph, faults=Faults(loss=loss, seed=5), **options)
 
 
-def of_matrix(graph: Graph, matrix: object) -> Weights:
+def of_matrix(graph: Graph, matrix: object) -> ConsensusWeights:
     """The weights that stand in a matrix at the graph's links and on its diagonal."""
     dense = np.asarray(matrix, dtype=float)
-    return Weights(graph, dense.diagonal(), dense[graph.receivers, graph.senders])
+    return ConsensusWeights(graph, dense.diagonal(), dense[graph.receivers, graph.senders])
 
 
 def random_graph(seed: int, agents: int, *, directed: bool = False) -> Graph:
@@ -50,7 +50,7 @@ def random_graph(seed: int, agents: int, *, directed: bool = False) -> Graph:
 
 def heard(faults: Faults, graph: Graph, round_: int = 0, runs: int = 1) -> np.ndarray:
     """Whose message arrives at whom, (runs, A, A)."""
-    out = np.zeros((runs, graph.size, graph.size), dtype=bool)
+    out = np.zeros((runs, graph.n_agents, graph.n_agents), dtype=bool)
     out[:, graph.receivers, graph.senders] = ~faults.lost(graph, round_, runs)
     return out
 

@@ -51,17 +51,17 @@ def test_what_is_no_array_is_refused_by_name_and_costs_nothing() -> None:
     channel = star()
     for payload in REFUSED.values():
         with pytest.raises(ValueError, match=r"payloads\[2\]: needs"):
-            channel.exchange([np.zeros(1), None, payload])
+            channel.broadcast([np.zeros(1), None, payload])
     with pytest.raises(ValueError, match=r"payloads\[0\]: needs leading axes \(4,\)"):
-        star(runs=(4,)).exchange([(np.zeros((4, 3)), np.zeros(3))] * 3)
+        star(runs=(4,)).broadcast([(np.zeros((4, 3)), np.zeros(3))] * 3)
     assert channel.ledger.rounds == 0 and charged(channel, messages=0)
 
 
 def test_a_ledger_is_replaced_never_changed() -> None:
     before = Ledger.empty(3)
     channel = star(ledger=before)
-    channel.exchange(_ONES)
-    channel.combine(_ZERO, weights.metropolis(STAR))
+    channel.broadcast(_ONES)
+    channel.mix(_ZERO, weights.metropolis(STAR))
     assert before.rounds == 0 and (before.messages == 0).all()
     assert repr(channel.ledger) == "Ledger(rounds=2, messages=8, scalars=8, bytes=64, lost=0)"
 
@@ -101,7 +101,7 @@ ACCOUNTS = {
 def test_every_number_is_charged_and_what_is_missing_is_not_sent(name: str) -> None:
     runs, sent, messages, scalars, bytes_ = ACCOUNTS[name]
     channel = star(runs=runs)
-    inbox = channel.exchange(sent)
+    inbox = channel.broadcast(sent)
     assert charged(channel, messages=messages, scalars=scalars, bytes=bytes_, lost=0)
     assert channel.ledger.rounds == 1
     for i, box in enumerate(inbox):
@@ -116,22 +116,22 @@ def test_every_number_is_charged_and_what_is_missing_is_not_sent(name: str) -> N
 def test_what_arrives_cannot_be_changed_and_is_a_plain_array() -> None:
     own = [np.array([float(i)]) for i in range(3)]
     received = [
-        star().exchange(own)[1][0], star().exchange([(own[0], own[1]), None, None])[1][0][1],
-        lossy(0.5, runs=(20,)).exchange([np.ones((20, 2))] * 3)[0][1],
+        star().broadcast(own)[1][0], star().broadcast([(own[0], own[1]), None, None])[1][0][1],
+        lossy(0.5, runs=(20,)).broadcast([np.ones((20, 2))] * 3)[0][1],
     ]
     for array in received:
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 9.0
     assert own[0][0] == 0.0 and own[0].flags.writeable
     own_kind = np.eye(2).view(type("OwnKind", (np.ndarray,), {}))
-    assert type(star().exchange([own_kind, None, None])[1][0]) is np.ndarray
+    assert type(star().broadcast([own_kind, None, None])[1][0]) is np.ndarray
 
 
 def test_without_links_there_is_no_round() -> None:
     for channel in (Channel(APART), lossy(0.5, APART)):
-        assert channel.exchange(_ONES) == [{}, {}, {}]
-        channel.combine(_ZERO, weights.metropolis(APART), rounds=4)
-        channel.carry(np.zeros((0, 1)))
+        assert channel.broadcast(_ONES) == [{}, {}, {}]
+        channel.mix(_ZERO, weights.metropolis(APART), rounds=4)
+        channel.send_on_links(np.zeros((0, 1)))
         assert channel.ledger.rounds == 0 and charged(channel, messages=0)
 
 
@@ -142,11 +142,11 @@ def test_combine_is_the_matrix_product(seed: int, agents: int, k: int, rounds: i
     w = draw.standard_normal((agents, agents)) * (graph.links.toarray() + np.eye(agents))
     values = draw.standard_normal((2, agents, k))
     channel = Channel(graph, runs=(2,))
-    out = channel.combine(values, of_matrix(graph, w), rounds=rounds)
+    out = channel.mix(values, of_matrix(graph, w), rounds=rounds)
     exact = np.linalg.matrix_power(w, rounds) @ values
     assert np.allclose(out, exact, rtol=1e-12, atol=1e-10)
     assert channel.ledger.rounds == rounds * (graph.senders.size > 0)
-    sent = rounds * graph.listeners
+    sent = rounds * graph.out_degree
     assert charged(channel, messages=sent, scalars=k * sent, bytes=8 * k * sent)
 
 
@@ -158,16 +158,16 @@ def test_combine_and_carry_are_exchange_to_the_bit(
     """The same sum by messages: own value first, then the senders in ascending order."""
     w = weights.metropolis(graph)
     dense = w.matrix.toarray()
-    values = rng(1).standard_normal((*runs, graph.size, 3))
+    values = rng(1).standard_normal((*runs, graph.n_agents, 3))
     channels = [Channel(graph, runs=runs, faults=Faults(loss=loss, seed=9)) for _ in range(3)]
     for _ in range(2):
-        inbox = channels[0].exchange([values[..., a, :] for a in range(graph.size)])
-        whole = channels[1].combine(values, w, lost="zero")
-        carried = channels[2].carry(values[..., graph.senders, :])
+        inbox = channels[0].broadcast([values[..., a, :] for a in range(graph.n_agents)])
+        whole = channels[1].mix(values, w, lost="zero")
+        carried = channels[2].send_on_links(values[..., graph.senders, :])
         for link, (i, j) in enumerate(zip(graph.receivers, graph.senders, strict=True)):
             got = inbox[i].get(int(j), np.full((*runs, 3), NAN))
             assert np.array_equal(carried[..., link, :], got, equal_nan=True)
-        for a in range(graph.size):
+        for a in range(graph.n_agents):
             total = dense[a, a] * values[..., a, :]
             for sender, payload in inbox[a].items():
                 weighted = dense[a, sender] * payload
@@ -181,7 +181,7 @@ def test_combine_and_carry_are_exchange_to_the_bit(
 def test_only_the_links_in_use_are_charged() -> None:
     channel = star()
     used = np.array([True, False, False, True])
-    got = channel.carry(np.arange(4.0)[:, None], links=used)
+    got = channel.send_on_links(np.arange(4.0)[:, None], links=used)
     assert np.array_equal(got.ravel(), [0.0, NAN, NAN, 3.0], equal_nan=True)
     assert charged(channel, messages=np.bincount(STAR.senders[used], minlength=3))
     assert channel.ledger.rounds == 1
@@ -191,27 +191,27 @@ def test_only_the_links_in_use_are_charged() -> None:
 def test_rules_for_losses_by_their_definition(lost: str) -> None:
     """Values after one round from the links that arrived, written out agent by agent."""
     faults = Faults(loss=0.4, seed=2)
-    values = rng(1).standard_normal((GRID.size, 2))
+    values = rng(1).standard_normal((GRID.n_agents, 2))
     w = weights.metropolis(GRID)
     dense = w.matrix.toarray()
     got = heard(faults, GRID)[0]
     both = got & got.T
     degree = both.sum(axis=1)
     expected = np.empty_like(values)
-    for i in range(GRID.size):
+    for i in range(GRID.n_agents):
         came = dense[i] * got[i]
         share = {"mutual": dense[i] * both[i], "keep": came, "zero": came,
                  "metropolis": both[i] / (1 + np.maximum(degree[i], degree)),
                  "renormalise": came / (dense[i, i] + came.sum())}[lost]
         own = dense[i, i] if lost == "zero" else 1 - share.sum()
         expected[i] = own * values[i] + share @ values
-    out = Channel(GRID, faults=faults).combine(values, w, lost=lost)
+    out = Channel(GRID, faults=faults).mix(values, w, lost=lost)
     assert np.abs(out - expected).max() < 1e-14
 
 
 def test_losses_in_a_batch_are_counted_on_average() -> None:
     channel = lossy(0.5, runs=(8,))
-    inbox = channel.exchange([np.ones((8, 1))] * 3)
+    inbox = channel.broadcast([np.ones((8, 1))] * 3)
     missed = [np.isnan(inbox[0].get(j, np.full((8, 1), NAN))).mean() for j in (1, 2)]
     assert (channel.ledger.lost[1:] == missed).all() and 0 < channel.ledger.lost.sum() < 4
 
@@ -220,14 +220,14 @@ def test_acknowledgements_are_charged() -> None:
     """A byte for each, to the receiver of the message, who need not have a link of its own."""
     plain, told, degrees = lossy(), lossy(), lossy()
     for channel, lost in ((plain, "keep"), (told, "mutual"), (degrees, "metropolis")):
-        channel.combine(np.zeros((3, 4)), weights.metropolis(STAR), lost=lost)
+        channel.mix(np.zeros((3, 4)), weights.metropolis(STAR), lost=lost)
     sent = plain.ledger.messages
     assert charged(plain, scalars=4 * sent, bytes=32 * sent)
     assert charged(told, messages=2 * sent, scalars=4 * sent, bytes=33 * sent)
     assert charged(degrees, messages=2 * sent, scalars=5 * sent, bytes=41 * sent)
     graph = Graph.from_edges(3, [(1, 0), (2, 0), (2, 1)], directed=True)  # 2 is heard by nobody
     one_way = Channel(graph)
-    one_way.carry(np.zeros((3, 2)), acknowledged=True)
+    one_way.send_on_links(np.zeros((3, 2)), acknowledged=True)
     assert charged(one_way, messages=[2, 1 + 1, 2], scalars=[4, 2, 0], bytes=[32, 16 + 1, 2])
 
 
@@ -240,11 +240,11 @@ def test_late_values_are_those_that_were_sent_and_not_lost_then(delay: int) -> N
     values, news = np.zeros((7, 1)), []
     for k in range(delay + 4):
         values[:] = (10.0 * k + np.arange(7))[:, None]  # goes on computing in its own array
-        news.append(prompt.combine(values, w, lost="zero") - values)
+        news.append(prompt.mix(values, w, lost="zero") - values)
         wanted = values + (news[k - delay] if k >= delay else 0.0)
-        assert np.allclose(late.combine(values, w, lost="zero"), wanted, atol=1e-12)
+        assert np.allclose(late.mix(values, w, lost="zero"), wanted, atol=1e-12)
     assert same_account(prompt, late)
-    for call in (lambda: late.exchange([np.zeros(1)] * 7), lambda: late.carry(np.zeros((14, 1)))):
+    for call in (lambda: late.broadcast([np.zeros(1)] * 7), lambda: late.send_on_links(np.zeros((14, 1)))):
         with pytest.raises(ValueError, match=f"channel: needs no delay here, got {delay} rounds"):
             call()
 
@@ -252,7 +252,7 @@ def test_late_values_are_those_that_were_sent_and_not_lost_then(delay: int) -> N
 def test_delayed_averaging_still_agrees_but_on_another_value() -> None:
     values, w = rng(3).standard_normal((6, 1)), weights.metropolis(graphs.star(6))
     channel = Channel(w.graph, faults=Faults(delay=1))
-    out = channel.combine(values, w, lost="keep", rounds=400)
+    out = channel.mix(values, w, lost="keep", rounds=400)
     count = 1 + (1 - w.own)
     assert np.ptp(out) < 1e-9
     assert abs(out[0, 0] - count @ values[:, 0] / count.sum()) < 1e-9
@@ -261,16 +261,16 @@ def test_delayed_averaging_still_agrees_but_on_another_value() -> None:
 
 def test_silent_agents_neither_send_nor_hear() -> None:
     channel = star(faults=Faults(silent=[1]))
-    assert [sorted(box) for box in channel.exchange(_ONES)] == [[2], [], [0]]
+    assert [sorted(box) for box in channel.broadcast(_ONES)] == [[2], [], [0]]
     assert charged(channel, messages=[1, 0, 1], lost=0)
 
 
 def test_windows_follow_the_channel_s_time_or_the_ledger_s_rounds() -> None:
     timed = Faults(silent=[0], during=[(10.0, 20.0)])
-    for make in (Channel, Channel.unchecked):
-        got = [len(make(STAR, faults=timed, t=t).exchange(_ONES)[0]) for t in (9.9, 10, 19, 20)]
+    for make in (Channel, Channel.construct):
+        got = [len(make(STAR, faults=timed, t=t).broadcast(_ONES)[0]) for t in (9.9, 10, 19, 20)]
         assert got == [2, 0, 0, 2]
     channel = star(faults=Faults(loss=1.0, during=[(1, 3), (4, 5)]))
-    assert [len(channel.exchange(_ONES)[0]) for _ in range(6)] == [2, 0, 0, 2, 0, 2]
+    assert [len(channel.broadcast(_ONES)[0]) for _ in range(6)] == [2, 0, 0, 2, 0, 2]
     later = star(faults=Faults(loss=1.0, during=[(1, 3)]), ledger=channel.ledger)
-    assert len(later.exchange(_ONES)[0]) == 2
+    assert len(later.broadcast(_ONES)[0]) == 2

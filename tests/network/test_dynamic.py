@@ -33,7 +33,7 @@ def test_a_step_of_substeps_by_its_equations(with_rate: bool) -> None:
     """Euler steps of (25) with the inputs moving on inside the step, or standing still."""
     n, dt = 7, 0.3
     draw = rng(2)
-    u, nu, eta = draw.standard_normal((3, GRID.size, 2))
+    u, nu, eta = draw.standard_normal((3, GRID.n_agents, 2))
     slope = draw.standard_normal(u.shape) if with_rate else np.zeros_like(u)
     laplacian, h = GRID.laplacian.toarray(), dt / n
     wanted_nu, wanted_eta = nu, eta
@@ -49,7 +49,7 @@ def test_a_step_of_substeps_by_its_equations(with_rate: bool) -> None:
     state = network.pi_step(state, u, channel, dt=dt, rate=rate, substeps=n, **GAINS)
     assert np.abs(state.estimate - wanted_nu).max() < 1e-13
     assert np.abs(state.integral - wanted_eta).max() < 1e-13
-    assert channel.ledger.rounds == n and (channel.ledger.scalars == 4 * n * GRID.listeners).all()
+    assert channel.ledger.rounds == n and (channel.ledger.scalars == 4 * n * GRID.out_degree).all()
 
 
 @pytest.mark.parametrize(("graph", "dt", "gains", "limit"), [
@@ -68,16 +68,16 @@ def test_substeps_are_half_as_long_as_the_bound(
 
 @named
 def test_gossip_keeps_the_average_and_two_change_at_a_time(graph: Graph) -> None:
-    values, draw = rng(1).standard_normal((graph.size, 2)), rng(3)
+    values, draw = rng(1).standard_normal((graph.n_agents, 2)), rng(3)
     for _ in range(30):
         channel = Channel(graph)
-        new = network.gossip(values, channel, rounds=1, rng=draw)
+        new = network.gossip_consensus(values, channel, rounds=1, rng=draw)
         moved = np.flatnonzero((new != values).any(axis=1))
         assert moved.size == 2 and moved[1] in graph.neighbours(int(moved[0]))
         assert (new[moved] == values[moved].mean(axis=0)).all()
         assert (channel.ledger.messages[moved] == 1).all() and channel.ledger.messages.sum() == 2
         assert channel.ledger.scalars.sum() == 4 and channel.ledger.rounds == 1
-    whole = network.gossip(values, Channel(graph), rounds=4000, rng=rng(5))
+    whole = network.gossip_consensus(values, Channel(graph), rounds=4000, rng=rng(5))
     assert np.abs(whole - values.mean(axis=0)).max() < 1e-6
     assert np.abs(whole.mean(axis=0) - values.mean(axis=0)).max() < 1e-13
 
@@ -87,21 +87,21 @@ def test_meetings_are_drawn_evenly() -> None:
     graph, meetings = graphs.path(4), 2000
     values, counts, draw = np.arange(4.0)[:, None] ** 2, np.zeros(3), rng(8)
     for _ in range(meetings):
-        moved = network.gossip(values, Channel(graph), rounds=1, rng=draw) != values
+        moved = network.gossip_consensus(values, Channel(graph), rounds=1, rng=draw) != values
         counts[np.flatnonzero(moved)[0]] += 1
     expected = meetings * np.array([1 + 0.5, 0.5 + 0.5, 0.5 + 1]) / 4
     assert chisquare(counts, expected).pvalue > 1e-3
 
 
 def test_gossip_through_losses_keeps_the_average() -> None:
-    values = rng(1).standard_normal((6, GRID.size, 1))
+    values = rng(1).standard_normal((6, GRID.n_agents, 1))
     channel = Channel(GRID, runs=(6,), faults=Faults(loss=0.4, seed=2))
-    out = network.gossip(values, channel, rounds=1500, rng=rng(3))
+    out = network.gossip_consensus(values, channel, rounds=1500, rng=rng(3))
     assert np.abs(out.mean(axis=1) - values.mean(axis=1)).max() < 1e-13
     assert np.ptp(out, axis=1).max() < 1e-3
     assert (np.ptp(out[:, :, 0], axis=1) > 0).all() and channel.ledger.messages.sum() == 4 * 1500
     silent = Channel(GRID, runs=(6,), faults=Faults(loss=1.0))
-    assert (network.gossip(values, silent, rounds=50, rng=rng(3)) == values).all()
+    assert (network.gossip_consensus(values, silent, rounds=50, rng=rng(3)) == values).all()
 
 
 @named
@@ -109,7 +109,7 @@ def test_gossip_through_losses_keeps_the_average() -> None:
 def test_events_keep_the_average_and_agree_as_the_threshold_falls(
     graph: Graph, loss: float
 ) -> None:
-    values = 10 * rng(1).standard_normal((graph.size, 2))
+    values = 10 * rng(1).standard_normal((graph.n_agents, 2))
     channel = Channel(graph, faults=Faults(loss=loss, seed=4))
     out = network.event_triggered(values, channel, rounds=600, threshold=1.0, decay=0.98)
     assert np.abs(out.mean(axis=0) - values.mean(axis=0)).max() < 1e-12
@@ -118,10 +118,10 @@ def test_events_keep_the_average_and_agree_as_the_threshold_falls(
 
 
 def test_without_a_threshold_events_are_plain_averaging() -> None:
-    values = rng(1).standard_normal((GRID.size, 2))
+    values = rng(1).standard_normal((GRID.n_agents, 2))
     channel, plain = Channel(GRID), Channel(GRID)
     out = network.event_triggered(values, channel, rounds=25, threshold=0.0)
-    exact = plain.combine(values, weights.metropolis(GRID), rounds=25)
+    exact = plain.mix(values, weights.metropolis(GRID), rounds=25)
     assert np.abs(out - exact).max() < 1e-13
     assert (channel.ledger.scalars == plain.ledger.scalars).all()
 
@@ -148,33 +148,33 @@ def test_an_event_that_was_lost_is_sent_again() -> None:
 
 @named
 def test_flooding_tells_everybody_everything(graph: Graph) -> None:
-    values = rng(1).standard_normal((graph.size, 2))
+    values = rng(1).standard_normal((graph.n_agents, 2))
     channel = Channel(graph)
-    mean, known = network.flood(values, channel)
+    mean, known = network.flooding(values, channel)
     assert known.all() and np.abs(mean - values.mean(axis=0)).max() < 1e-14
     # Each agent says each thing once to each of its listeners.
-    assert (channel.ledger.scalars == 3 * graph.size * graph.listeners).all()
+    assert (channel.ledger.scalars == 3 * graph.n_agents * graph.out_degree).all()
     assert channel.ledger.rounds == graph.diameter + 1
-    some, known = network.flood(values, Channel(graph), rounds=1)
-    near = graph.links.toarray().astype(bool) | np.eye(graph.size, dtype=bool)
+    some, known = network.flooding(values, Channel(graph), rounds=1)
+    near = graph.links.toarray().astype(bool) | np.eye(graph.n_agents, dtype=bool)
     assert (known == near).all()
     assert np.allclose(some, np.stack([values[row].mean(axis=0) for row in near]))
 
 
 RULES = {
-    "average": partial(network.average, rounds=3),
+    "average": partial(network.average_consensus, rounds=3),
     "push-sum": partial(network.push_sum, rounds=3),
-    "maximum": partial(network.maximum, rounds=2),
+    "maximum": partial(network.max_consensus, rounds=2),
     "events": partial(network.event_triggered, rounds=4, threshold=0.5),
-    "flooding": lambda values, channel: network.flood(values, channel, rounds=2)[0],
-    "finite time": network.finite_time,
+    "flooding": lambda values, channel: network.flooding(values, channel, rounds=2)[0],
+    "finite time": network.finite_time_consensus,
 }
 
 
 @pytest.mark.parametrize("name", RULES)
 def test_the_agents_order_and_units_do_not_matter(name: str) -> None:
     """Numbered otherwise, the same agents reach the same values and send as much."""
-    values, order = rng(1).standard_normal((GRID.size, 2)), rng(2).permutation(GRID.size)
+    values, order = rng(1).standard_normal((GRID.n_agents, 2)), rng(2).permutation(GRID.n_agents)
     dense = GRID.links.toarray()[np.ix_(order, order)]
     channels = Channel(GRID), Channel(Graph.from_adjacency(dense))
     plain, other = RULES[name](values, channels[0]), RULES[name](values[order], channels[1])

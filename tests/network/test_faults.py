@@ -91,7 +91,7 @@ def test_loss_by_receiver_and_by_link() -> None:
     by_link = np.zeros((3, 3))
     by_link[0, 2] = by_link[1, 0] = 1.0
     for loss, arrive in (([1.0, 0.0, 0.0], [[], [0], [0]]), (by_link, [[1], [], [0]])):
-        inbox = Channel(STAR, faults=Faults(loss=loss, seed=1)).exchange([np.zeros(1)] * 3)
+        inbox = Channel(STAR, faults=Faults(loss=loss, seed=1)).broadcast([np.zeros(1)] * 3)
         assert [sorted(box) for box in inbox] == arrive
 
 
@@ -111,7 +111,7 @@ def test_faults_together_fail_in_every_way() -> None:
     for whole in (a | b | c, a | (b | c)):
         assert (whole.lost(STAR, 3, 9) == (a.lost(STAR, 3, 9) | b.lost(STAR, 3, 9))).all()
         assert (whole.lost(STAR, 6, 9) == a.lost(STAR, 6, 9)).all()
-        assert (whole.speaking(STAR) == c.speaking(STAR)).all() and whole.late == 3
+        assert (whole.speaking(STAR) == c.speaking(STAR)).all() and whole.has_delay == 3
         assert not whole.none
     assert (Faults() | Faults()).none and not c.none and not Faults(delay=1).none
 

@@ -9,10 +9,10 @@ import pytest
 
 from distfilt import gaussians as pure
 from distfilt import network
-from distfilt.doors import unchecked
+from distfilt.validation import unchecked
 from distfilt.ensembles import mean, sample_covariance
 from distfilt.network import Channel, Faults, Graph, UnstableGain, graphs
-from distfilt.network.channel import fused_kind
+from distfilt.network.channel import kind_of_rule
 from tests.network.helpers import DISK, STAR, gaussians, heard, lossy, rng, star
 from tests.support import unit_gap
 
@@ -22,8 +22,8 @@ ALL = {**{r: partial(network.covariance_intersection, rule=r) for r in RULES},
        "naive": network.naive_fusion, "arithmetic": network.arithmetic_average,
        "pull": partial(network.consensus_pull, gain=GAIN)}
 every = pytest.mark.parametrize("rule", ALL.values(), ids=ALL.keys())
-MOVES = {"least": network.intersection, "equal": partial(network.intersection, rule="equal"),
-         "pull": partial(network.pull, gain=0.1)}
+MOVES = {"least": network.intersect_ensembles, "equal": partial(network.intersect_ensembles, rule="equal"),
+         "pull": partial(network.mean_pull, gain=0.1)}
 SIZES = np.logspace(-1, 2, 4)
 LINKS = np.array([2, 1, 1])
 """How many hear each agent of the star."""
@@ -34,11 +34,11 @@ def _by_hand(
 ) -> tuple[np.ndarray, np.ndarray]:
     """One round, agent by agent, from those whose messages arrived, `got` (A, A)."""
     out_m, out_p = np.empty_like(m), np.empty_like(p)
-    for i in range(graph.size):
+    for i in range(graph.n_agents):
         who = [i, *(j for j in graph.neighbours(i) if got[i, j])]
         if name == "naive":
             equal = np.full(len(who), 1 / len(who))
-            out_m[i], out_p[i] = pure.intersection(m[who], p[who] / len(who), equal)
+            out_m[i], out_p[i] = pure.intersect_gaussians(m[who], p[who] / len(who), equal)
         elif name == "arithmetic":
             out_m[i] = m[who].mean(axis=0)
             gap = m[who] - out_m[i]
@@ -47,7 +47,7 @@ def _by_hand(
             out_m[i], out_p[i] = m[i] + GAIN * (m[who] - m[i]).sum(axis=0), p[i]
         else:
             omega = pure.intersection_weights(p[who], rule=name)
-            out_m[i], out_p[i] = pure.intersection(m[who], p[who], omega)
+            out_m[i], out_p[i] = pure.intersect_gaussians(m[who], p[who], omega)
     return out_m, out_p
 
 
@@ -55,7 +55,7 @@ def _by_hand(
 @pytest.mark.parametrize("graph", [STAR, DISK, Graph.from_edges(3, [[0, 1]])])
 @pytest.mark.parametrize("key", ALL)
 def test_all_agents_at_once_is_each_by_its_definition(key: str, graph: Graph, loss: float) -> None:
-    m, p = gaussians(3, 2, 1, graph.size, d=3)
+    m, p = gaussians(3, 2, 1, graph.n_agents, d=3)
     faults = Faults(loss=loss, seed=6)
     out = ALL[key]((m, p), Channel(graph, runs=(2, 1), faults=faults))
     for run, got in enumerate(heard(faults, graph, runs=2)):
@@ -86,12 +86,12 @@ def test_two_rounds_are_one_after_the_other(rule: object) -> None:
 
 def test_pulls_beyond_the_bound_warn_and_none_is_silence() -> None:
     e = _ensembles(1)
-    for rule, belief in ((network.consensus_pull, gaussians(5, 3)), (network.pull, e)):
+    for rule, belief in ((network.consensus_pull, gaussians(5, 3)), (network.mean_pull, e)):
         with pytest.warns(UnstableGain, match=r"0\.8 is above 2/λ_max = 0\.6666") as caught:
             rule(belief, star(), gain=0.8, rounds=2)
         assert len(caught) == 1 and caught[0].filename == __file__
     channel = star()
-    assert (network.pull(e, channel, gain=0.0) == e).all() and channel.ledger.rounds == 0
+    assert (network.mean_pull(e, channel, gain=0.0) == e).all() and channel.ledger.rounds == 0
 
 
 def _ensembles(seed: int, leading: tuple[int, ...] = (3,)) -> np.ndarray:
@@ -103,10 +103,10 @@ def _ensembles(seed: int, leading: tuple[int, ...] = (3,)) -> np.ndarray:
 
 
 def test_a_rule_says_what_it_fuses_with_and_without_its_door() -> None:
-    assert fused_kind(partial(partial(network.pull, gain=0.1), rounds=2)) == "ensembles"
-    assert fused_kind(unchecked(network.naive_fusion)) == "gaussians"
-    assert fused_kind(network.average) == "vectors"
-    assert fused_kind(lambda belief, channel: belief) is None
+    assert kind_of_rule(partial(partial(network.mean_pull, gain=0.1), rounds=2)) == "ensembles"
+    assert kind_of_rule(unchecked(network.naive_fusion)) == "gaussians"
+    assert kind_of_rule(network.average_consensus) == "vectors"
+    assert kind_of_rule(lambda belief, channel: belief) is None
 
 
 @pytest.mark.parametrize("include", [True, False])
@@ -114,7 +114,7 @@ def test_a_pull_by_its_equation_with_the_means_that_are_heard(include: bool) -> 
     """Member by member, run by run, equation (16)."""
     e = rng(1).standard_normal((6, 3, 20, 2))
     channel = star(runs=(6,), faults=Faults(loss=0.5, seed=5))
-    out = network.pull(e, channel, gain=0.2, include_self=include)
+    out = network.mean_pull(e, channel, gain=0.2, include_self=include)
     got = heard(channel.faults, STAR, runs=6) | (include & np.eye(3, dtype=bool))
     for run in range(6):
         expected = e[run].copy()
@@ -129,16 +129,16 @@ def test_intersection_gives_the_fused_moments(rule: str) -> None:
     e = _ensembles(3, (5, 3))
     belief, channel = (mean(e), sample_covariance(e)), star(runs=(5,))
     fused = network.covariance_intersection(belief, star(runs=(5,)), rule=rule, rounds=2)
-    out = network.intersection(e, channel, rule=rule, rounds=2)
+    out = network.intersect_ensembles(e, channel, rule=rule, rounds=2)
     assert np.abs((mean(out) - fused[0]) / e.std(axis=-2)).max() < 1e-10
     assert unit_gap(sample_covariance(out), fused[1]) < 1e-10
     # 4 + 10 numbers on each link and round.
     assert (channel.ledger.scalars == 2 * 14 * LINKS).all()
     # A scale matters to traces only.
-    scaled = network.intersection(e[0], star(), rule=rule, scale=SIZES)
-    plain = network.intersection(e[0], star(), rule=rule)
+    scaled = network.intersect_ensembles(e[0], star(), rule=rule, scale=SIZES)
+    plain = network.intersect_ensembles(e[0], star(), rule=rule)
     assert np.allclose(plain, scaled, rtol=1e-6, atol=1e-6) == ("trace" not in rule)
-    assert np.allclose(scaled, network.intersection(e[0] / SIZES, star(), rule=rule) * SIZES)
+    assert np.allclose(scaled, network.intersect_ensembles(e[0] / SIZES, star(), rule=rule) * SIZES)
 
 
 @pytest.mark.parametrize("rule", MOVES.values(), ids=MOVES.keys())

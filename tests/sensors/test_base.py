@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distfilt.sensors import Sensor, angle, wrap
+from distfilt.sensors import Sensor, line_angle, wrap
 from tests.support import NAN, generator
 
 # Full, of several components, and with no symmetry that a transposed factor could hide behind.
@@ -53,7 +53,7 @@ def test_a_function_that_takes_one_state_only_is_refused(
     sensor = Sensor(2, function, np.eye(2))
     assert sensor.predict([1.0, 2.0, 3.0]).shape == (2,)
     x = 2.0 + np.arange(np.prod(shape)).reshape(shape)
-    with pytest.raises(ValueError, match=r"function: needs to take many states at once"):
+    with pytest.raises(ValueError, match=r"h: needs to take many states at once"):
         sensor.predict(x)
 
 
@@ -82,18 +82,18 @@ def test_residual_keeps_what_is_missing_on_either_side() -> None:
     sensor = Sensor(3, lambda x: x, np.eye(3))
     gap = sensor.residual([NAN, 2.0, 3.0], [[1.0, NAN, 1.0]])
     assert np.isnan(gap[0, :2]).all() and gap[0, 2] == 2.0
-    turned = angle([0, 1], std=0.1, full=True)
+    turned = line_angle([0, 1], std=0.1, full=True)
     assert np.isnan(turned.residual([[NAN], [1.0]], [[1.0], [NAN]])).all()
 
 
 def test_jacobian_without_a_formula() -> None:
     """Differences, through the sensor's own residual where readings wrap."""
     sensor = Sensor(1, lambda x: wrap(x.sum(axis=-1, keepdims=True)), np.eye(1),
-                    difference=lambda y, p: wrap(y - p))
+                    residual_function=lambda y, p: wrap(y - p))
     x = np.array([[np.pi, 0.0], [1.0, 2.0]])
     assert np.abs(sensor.jacobian(x) - 1.0).max() < 1e-9
     with pytest.raises(ValueError, match="^difference: needs observed less predicted"):
-        Sensor(1, sensor.function, np.eye(1), difference=lambda y, p: wrap(p - y))
+        Sensor(1, sensor.h, np.eye(1), residual_function=lambda y, p: wrap(p - y))
 
 
 def test_a_transposed_derivative_is_told_and_a_rough_one_is_not() -> None:

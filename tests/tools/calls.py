@@ -16,7 +16,7 @@ from types import ModuleType
 from typing import Any
 
 import distfilt
-from distfilt.doors import Record, declared
+from distfilt.validation import FrozenModel, decorators
 
 MOST = 4
 """Recorded calls of one function."""
@@ -25,7 +25,7 @@ MOST = 4
 def describe(thing: Any) -> dict[str, Any]:
     """The kinds that a function with a door, or a class of records, declares by name."""
     if inspect.isclass(thing):
-        return declared._of_fields(thing) if issubclass(thing, Record) else {}
+        return decorators._of_fields(thing) if issubclass(thing, FrozenModel) else {}
     return dict(thing.plan.kinds) if hasattr(thing, "plan") else {}
 
 
@@ -61,7 +61,7 @@ class Recorder:
     @contextmanager
     def listening(self) -> Iterator[None]:
         """While it lasts, what passes a door is kept."""
-        taken, made = declared._Plan.taken, Record.__post_init__
+        taken, made = decorators._Plan.taken, FrozenModel.__post_init__
 
         def at_door(plan: Any, args: Any, options: Any) -> Any:
             out = taken(plan, args, options)
@@ -75,12 +75,12 @@ class Recorder:
             made(record)
             self.keep(type(record), (), given)
 
-        declared._Plan.taken, Record.__post_init__ = at_door, at_record
+        decorators._Plan.taken, FrozenModel.__post_init__ = at_door, at_record
         try:
             with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
                 yield
         finally:
-            declared._Plan.taken, Record.__post_init__ = taken, made
+            decorators._Plan.taken, FrozenModel.__post_init__ = taken, made
 
 
 RECORDER = Recorder()
@@ -88,8 +88,8 @@ _RUN: set[str] = set()
 
 
 def rooms() -> list[str]:
-    """The rooms that the library shows; doors are tested by their kinds."""
-    return sorted(set(distfilt.__all__) - {"__version__", "doors"})
+    """The rooms that the library shows; validation are tested by their kinds."""
+    return sorted(set(distfilt.__all__) - {"__version__", "validation"})
 
 
 def public(room: str) -> dict[str, Any]:

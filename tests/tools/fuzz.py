@@ -222,9 +222,9 @@ def tried(call: Call, where: tuple[str, str, str], value: Any, reference: Any) -
     except TooLong:
         return Finding(*where, "too long")
     except MemoryError:
-        return Finding(*where, "refused", "memory")
+        return Finding(*where, "rejected", "memory")
     except Exception as error:
-        result = "refused" if refused(error, call, argument, kind) else "unnamed"
+        result = "rejected" if refused(error, call, argument, kind) else "unnamed"
         result = "misread" if kind in SAME else result
         result = result if isinstance(error, REFUSALS) else "raw"
         return Finding(*where, result, f"{type(error).__name__}: {error}"[:200])
@@ -258,7 +258,7 @@ def of(name: str, several: list[Call]) -> Iterator[Finding]:
                     yield tried(call, (name, argument, kind), value, reference)
 
 
-GOOD = {"refused", "same", "finite"}
+GOOD = {"rejected", "same", "finite"}
 ALLOWED: dict[tuple[str, str, str], str] = {
     (r"network\.(average|pi_step)", "gain|dt", "huge: (NaN|too long)"):
         "an iteration that diverges, with a warning before; as many substeps as are stable",

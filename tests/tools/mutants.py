@@ -137,7 +137,7 @@ def nearest(module: str, root: Path) -> list[str]:
     parts = Path(module).with_suffix("").parts[1:]
     name = f"test_{parts[-1].lstrip('_')}.py"
     mirrors = [root.joinpath("tests", *parts[:-1], name), root / "tests" / f"test_{parts[0]}.py"]
-    options = [p for p in (root / "tests" / "test_doors.py",) if p.is_file()]
+    options = [p for p in (root / "tests" / "test_validation.py",) if p.is_file()]
     near = [*[p for p in mirrors if p.is_file()][:1], *options]
     return [module, *(p.relative_to(root).as_posix() for p in near)]
 

@@ -34,7 +34,7 @@ _Y, _X = _samples(0)
 
 @given(st.integers(0, 10_000), st.sampled_from([graphs.path(3), graphs.star(5), graphs.ring(4)]))
 def test_averaged_moments_give_the_map_of_all_samples(seed: int, graph: graphs.Graph) -> None:
-    y, x = _samples(seed, graph.size)
+    y, x = _samples(seed, graph.n_agents)
     pooled, central = pool_by_moments(y, x, Channel(graph)), _centralised(y, x)
     for name in ("observed_mean", "mean", "gain", "scale"):
         gap = getattr(pooled, name) - getattr(central, name)
@@ -56,14 +56,14 @@ def test_averaged_moments_are_batched_over_runs_and_cost_what_they_say() -> None
 @pytest.mark.parametrize("graph", [graphs.path(3), graphs.star(5)])
 @pytest.mark.parametrize("raw", [False, True])
 def test_admm_finds_the_map_of_all_samples(graph: graphs.Graph, raw: bool) -> None:
-    y, x = _samples(4, graph.size, 60, 3, 4, raw=raw)
+    y, x = _samples(4, graph.n_agents, 60, 3, 4, raw=raw)
     solved, run = pool_by_admm(y, x, Channel(graph))
     central = _centralised(y, x)
     assert run.iterations <= 250
     scale = x.reshape(-1, 4).std(axis=0)
     flat = y.reshape(-1, 3), x.reshape(-1, 4)
     moved = compose(central, *flat, y[0, 0])
-    for agent in range(graph.size):
+    for agent in range(graph.n_agents):
         one = AffineMap(*(getattr(solved, n)[agent] for n in
                           ("observed_mean", "mean", "gain", "scale")))
         assert (np.abs(compose(one, *flat, y[0, 0]) - moved) / scale).max() < 1e-4
@@ -79,7 +79,7 @@ def test_a_rule_that_diverges_is_blamed_itself() -> None:
 
         for pool in (pool_by_moments, pool_by_admm):
             with pytest.raises(ValueError, match="agree: needs a rule that returns averages"):
-                pool(_Y, _X, Channel(graphs.path(3)), agree=rule)
+                pool(_Y, _X, Channel(graphs.path(3)), average=rule)
 
 
 def test_a_variable_that_only_differs_between_agents_is_not_constant() -> None:

@@ -20,26 +20,26 @@ PLANE = Constraint(
     derivative=lambda x: np.full((*x.shape[:-1], 1, x.shape[-1]), 0.5),
 )  # fmt: skip
 """A plane near the prior's mean, for any number of components."""
-FRESH = partial(updates.ensemble_transform, rejuvenation=0.1)
+FRESH = partial(updates.etpf, rejuvenation=0.1)
 
 UPDATES = {
-    "sampled_noise": updates.sampled_noise,
-    "known_noise": updates.known_noise,
-    "exact_draws": updates.exact_draws,
-    "square_root": updates.square_root,
-    "transport": updates.transport,
+    "enkf_sampled_covariance": updates.enkf_sampled_covariance,
+    "enkf": updates.enkf,
+    "enkf_exact": updates.enkf_exact,
+    "square_root": updates.etkf,
+    "transport": updates.transport_map_update,
     "principal_components": partial(updates.principal_components, n_state=2, n_observed=2),
-    "inflated": updates.inflated(updates.known_noise, factor=1.1),
-    "serial": updates.serial(updates.known_noise),
-    "localised": updates.localised(
-        updates.known_noise, places=np.zeros((3, 1)), readings=np.zeros((2, 1)), radius=9.0
+    "inflated": updates.with_inflation(updates.enkf, factor=1.1),
+    "serial": updates.serially(updates.enkf),
+    "localised": updates.with_localization(
+        updates.enkf, places=np.zeros((3, 1)), observation_places=np.zeros((2, 1)), radius=9.0
     ),
-    "inflated serial": updates.inflated(updates.serial(updates.square_root), factor=1.01),
+    "inflated serial": updates.with_inflation(updates.serially(updates.etkf), factor=1.01),
     "ensemble_transform": FRESH,
     "ensemble_transform, corrected": partial(FRESH, correct=True),
-    "augmented": updates.augmented(updates.known_noise, PLANE, std=0.5),
-    "projected": updates.projected(updates.known_noise, PLANE),
-    "retracted": updates.retracted(updates.known_noise, PLANE),
+    "augmented": updates.with_augmentation(updates.enkf, PLANE, std=0.5),
+    "projected": updates.with_projection(updates.enkf, PLANE),
+    "retracted": updates.with_retraction(updates.enkf, PLANE),
 }
 
 def rng(seed: int = 1) -> np.random.Generator:

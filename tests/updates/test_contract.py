@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from distfilt.doors import unchecked
+from distfilt.validation import unchecked
 
 from .cases import UPDATES, H, R, Y, members, rng
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from distfilt.updates import exact_draws, known_noise, sampled_noise, square_root
-from distfilt.updates.door import Update
+from distfilt.updates import enkf_exact, enkf, enkf_sampled_covariance, etkf
+from distfilt.updates.decorator import Update
 from distfilt.updates.gaussian import _turned
 
 from .cases import H, R, Y, members
@@ -16,17 +16,17 @@ def test_sampled_and_known_noise_by_their_formulas() -> None:
     x = members(40)
     zeta = np.random.default_rng(3).standard_normal((40, 2)) @ np.linalg.cholesky(R).T
     seen = x @ H.T + zeta
-    for update, told, noise in ((sampled_noise, seen, 0 * R), (known_noise, x @ H.T, R)):
+    for update, told, noise in ((enkf_sampled_covariance, seen, 0 * R), (enkf, x @ H.T, R)):
         joint = np.cov(np.hstack([x, told]).T)
         gain = joint[:3, 3:] @ np.linalg.inv(joint[3:, 3:] + noise)
         out = update(x, x @ H.T, Y, R, rng=np.random.default_rng(3))
         assert np.allclose(out, x + (Y - seen) @ gain.T, atol=1e-12)
     zeta -= zeta.mean(axis=0)
-    centred = known_noise(x, x @ H.T, Y, R, rng=np.random.default_rng(3), centred=True)
+    centred = enkf(x, x @ H.T, Y, R, rng=np.random.default_rng(3), centred=True)
     assert np.allclose(centred, x + (Y - x @ H.T - zeta) @ gain.T, atol=1e-12)
 
 
-@pytest.mark.parametrize("update", [exact_draws, square_root])
+@pytest.mark.parametrize("update", [enkf_exact, etkf])
 def test_moments_after_a_curved_reading_are_exact(update: Update) -> None:
     """P+ = P - K S K' for the sample covariances, also where h is not linear."""
     x = members(20)
@@ -46,7 +46,7 @@ def test_square_root_without_rotation_is_symmetric() -> None:
     white = np.linalg.solve(np.linalg.cholesky(R), (a @ H.T).T).T / np.sqrt(8)
     values, vectors = np.linalg.eigh(np.eye(9) + white @ white.T)
     root = vectors @ np.diag(values**-0.5) @ vectors.T
-    out = square_root(x, x @ H.T, Y, R, rng=np.random.default_rng(0), rotation="none")
+    out = etkf(x, x @ H.T, Y, R, rng=np.random.default_rng(0), rotation="none")
     assert np.allclose(out - out.mean(axis=0), root @ a, atol=1e-12)
 
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distfilt.updates import effective_size, jitter, resampled
-from distfilt.updates.particles import distinct_share, jittered, silverman, taken, weighed
+from distfilt.updates import effective_size, jitter, resample
+from distfilt.updates.particles import distinct_fraction, add_jitter, silverman, repeat_by_count, reweight
 
 from .cases import rng
 
@@ -19,7 +19,7 @@ def test_systematic_is_the_inverse_of_the_distribution_function(seed: int, n: in
     levels = (np.arange(n) + rng(6).random((4, 1))) / n
     wanted = [np.searchsorted(np.cumsum(v) / v.sum(), u, side="right")
               for v, u in zip(w, levels, strict=True)]
-    assert np.array_equal(resampled(w, rng=rng(6)), wanted)
+    assert np.array_equal(resample(w, rng=rng(6)), wanted)
 
 
 def test_effective_size_between_one_and_n() -> None:
@@ -39,10 +39,10 @@ def test_weights_by_bayes_rule_with_a_missing_component() -> None:
     gaps = np.array([y, [np.nan, y[1]], [y[0], np.nan]])
     for seen, wanted in zip(gaps, (both, other, one), strict=True):
         w = np.exp(wanted) / np.exp(wanted).sum()
-        assert np.allclose(np.exp(weighed(before, h, seen, noise)), w)
+        assert np.allclose(np.exp(reweight(before, h, seen, noise)), w)
     # What one particle cannot predict says nothing of any.
     h[3, 1] = np.nan
-    assert np.allclose(np.exp(weighed(before, h, y, noise)), w)
+    assert np.allclose(np.exp(reweight(before, h, y, noise)), w)
 
 
 def test_jitter_keeps_mean_and_covariance_on_average() -> None:
@@ -64,11 +64,11 @@ def test_jitter_keeps_mean_and_covariance_on_average() -> None:
 
 def test_jitter_of_copies_moves_them_only_and_from_the_covariance_given() -> None:
     counts, each = np.tile([2, 1, 3, 1, 0, 0, 0], (4000, 1)), np.tile(np.arange(7.0), (4000, 1))
-    x, copied = taken(each[..., None] * [1.0, -2.0], counts), taken(counts[..., None] > 1, counts)
+    x, copied = repeat_by_count(each[..., None] * [1.0, -2.0], counts), repeat_by_count(counts[..., None] > 1, counts)
     assert np.array_equal(x[5, :, 0], [0, 0, 1, 2, 2, 2, 3])
     cov, drawn = np.array([[2.0, 0.6], [0.6, 0.5]]), rng().standard_normal(x.shape)
-    out = jittered(x, cov, 0.5, drawn, copied[..., 0])
-    assert (out[:, [2, 6]] == x[:, [2, 6]]).all() and (distinct_share(out) == 1).all()
+    out = add_jitter(x, cov, 0.5, drawn, copied[..., 0])
+    assert (out[:, [2, 6]] == x[:, [2, 6]]).all() and (distinct_fraction(out) == 1).all()
     moved = (out - x)[:, [0, 1, 3, 4, 5]].reshape(-1, 2)
     assert np.abs(moved.mean(axis=0)).max() < 4 * 0.5 * np.sqrt(2 / len(moved))
     assert np.allclose(np.cov(moved.T), 0.25 * cov, atol=4 * 0.25 * 2 * np.sqrt(2 / len(moved)))

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from distfilt import coupling
 from distfilt.triangular import affine
 from distfilt.updates import (
-    ensemble_transform,
+    etpf,
     principal_components,
     principal_directions,
-    transport,
+    transport_map_update,
 )
 from distfilt.updates.particles import ParticleCollapse
 from tests.triangular.samples import rng_of as _rng
@@ -51,7 +51,7 @@ def test_noise_factor_scales_the_draw_and_nothing_else(factor: float) -> None:
     seen = y + factor * _rng(3).standard_normal(y.shape) @ np.linalg.cholesky(noise).T
     map_ = affine.fit(seen, x)
     wanted = map_.inverse(target, map_(seen, x))
-    out = transport(*_FOUR, rng=_rng(3), noise_factor=factor)
+    out = transport_map_update(*_FOUR, rng=_rng(3), noise_factor=factor)
     assert np.allclose(out, wanted, atol=1e-10)
     for complement in ("keep", "literal"):
         pca = principal_components(*_FOUR, rng=_rng(3), noise_factor=factor, n_state=3,
@@ -65,17 +65,17 @@ def test_the_ensemble_transform_by_its_formula() -> None:
     gap = Y - x @ H.T
     w = np.exp(-0.5 * np.einsum("ni,ij,nj->n", gap, np.linalg.inv(R), gap))
     w /= w.sum()
-    out = ensemble_transform(x, x @ H.T, Y, R, rng=_rng())
-    assert np.allclose(out, coupling.ensemble_transform(x, np.log(w)), atol=1e-10)
+    out = etpf(x, x @ H.T, Y, R, rng=_rng())
+    assert np.allclose(out, coupling.transform_ensemble(x, np.log(w)), atol=1e-10)
     assert np.abs(out.mean(axis=0) - w @ x).max() < 1e-13
-    both = ensemble_transform(x, x @ H.T, Y, R, rng=_rng(), correct=True)
+    both = etpf(x, x @ H.T, Y, R, rng=_rng(), correct=True)
     assert np.allclose(np.cov(both.T, bias=True), np.cov(x.T, aweights=w, bias=True), atol=1e-12)
 
 
 def test_a_reading_far_away_underflows_nothing_and_warns() -> None:
     x = members(40)
     with pytest.warns(ParticleCollapse, match="effective size of 1"):
-        out = ensemble_transform(x, x @ H.T, Y + 1e4, R, rng=_rng())
+        out = etpf(x, x @ H.T, Y + 1e4, R, rng=_rng())
     assert np.isfinite(out).all()
 
 
@@ -83,17 +83,17 @@ def test_a_spread_that_is_lost_warns() -> None:
     """Weights of members that have run together are equal: the reading tells."""
     x = MEAN + 1e-3 * (members(40) - MEAN)
     near = x.mean(axis=0) @ H.T
-    ensemble_transform(x, x @ H.T, near + 3 * np.sqrt(np.diagonal(R)), R, rng=_rng())
+    etpf(x, x @ H.T, near + 3 * np.sqrt(np.diagonal(R)), R, rng=_rng())
     far = 6 * np.sqrt(np.diagonal(R))
     wanted = rf"squared distance .* is {far @ np.linalg.solve(R, far):.0f}, not 2;"
     with pytest.warns(ParticleCollapse, match=wanted):  # of two ensembles that of the second
-        ensemble_transform([x, x], [x @ H.T] * 2, [near, near + far], R, rng=_rng())
+        etpf([x, x], [x @ H.T] * 2, [near, near + far], R, rng=_rng())
 
 
 def test_nothing_is_drawn_without_rejuvenation() -> None:
     x = members(30)
-    a, b = (ensemble_transform(x, x @ H.T, Y, R, rng=_rng(s)) for s in (1, 2))
+    a, b = (etpf(x, x @ H.T, Y, R, rng=_rng(s)) for s in (1, 2))
     assert (a == b).all()
-    c, d = (ensemble_transform(x, x @ H.T, Y, R, rng=_rng(s), rejuvenation=0.2) for s in (1, 2))
+    c, d = (etpf(x, x @ H.T, Y, R, rng=_rng(s), rejuvenation=0.2) for s in (1, 2))
     assert (c != d).any()
-    assert np.array_equal(c, coupling.rejuvenated(a, x, bandwidth=0.2, rng=_rng(1)))
+    assert np.array_equal(c, coupling.rejuvenate(a, x, bandwidth=0.2, rng=_rng(1)))

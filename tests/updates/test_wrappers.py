@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 
 from distfilt import updates
-from distfilt.coupling import norm, project, retract
-from distfilt.doors import unchecked
+from distfilt.coupling import norm_constraint, project, retract
+from distfilt.validation import unchecked
 from distfilt.models import Model
-from distfilt.updates.door import Update, says
+from distfilt.updates.decorator import Update, has_tag
 from distfilt.updates.gaussian import exact_forecast
 from distfilt.updates.wrappers import gaspari_cohn
 
 from .cases import UPDATES, H, R, Y, kalman, members, moments, rng
 
-ROOT = partial(updates.square_root, rotation="none")
+ROOT = partial(updates.etkf, rotation="none")
 """An update that draws nothing."""
 
 
 def test_inflation_multiplies_anomalies_only() -> None:
     x = members(30)
-    plain = updates.known_noise(x, x @ H.T, Y, R, rng=rng())
-    wide = updates.inflated(updates.known_noise, factor=1.3)(x, x @ H.T, Y, R, rng=rng())
+    plain = updates.enkf(x, x @ H.T, Y, R, rng=rng())
+    wide = updates.with_inflation(updates.enkf, factor=1.3)(x, x @ H.T, Y, R, rng=rng())
     centre = plain.mean(axis=0)
     assert np.allclose(wide, centre + 1.3 * (plain - centre), atol=1e-12)
 
@@ -45,7 +45,7 @@ def test_missing_and_unpredicted_readings_are_deleted_rows() -> None:
 def test_serial_without_a_sensor_is_exact_for_linear_readings() -> None:
     x = members(20, 2)  # of two agents, whose readings' errors may go together for one
     for noise in (np.diag([0.5, 0.9]) * [[[1.0]], [[2.0]]], np.stack([np.diag([0.5, 0.9]), R])):
-        out = updates.serial(updates.exact_draws)(x, x @ H.T, [Y, Y], noise, rng=rng())
+        out = updates.serially(updates.enkf_exact)(x, x @ H.T, [Y, Y], noise, rng=rng())
         for own, r, after in zip(x, noise, out, strict=True):
             mean, cov = kalman(*moments(own), H, r, Y)
             assert np.allclose(after.mean(axis=0), mean, atol=1e-12)
@@ -59,11 +59,11 @@ def test_serial_predicts_again() -> None:
 
     x, y = members(30), np.array([1.5, 3.0])
     four = x, both(x), y, np.diag([0.5, 0.9])
-    out = updates.serial(ROOT)(*four, rng=rng(), predict=both)
+    out = updates.serially(ROOT)(*four, rng=rng(), predict=both)
     first = ROOT(x, both(x)[:, :1], y[:1], [[0.5]], rng=rng())
     second = ROOT(first, both(first)[:, 1:], y[1:], [[0.9]], rng=rng())
     assert np.allclose(out, second, atol=1e-13)
-    assert np.abs(updates.serial(ROOT)(*four, rng=rng()) - out).max() > 1e-3
+    assert np.abs(updates.serially(ROOT)(*four, rng=rng()) - out).max() > 1e-3
 
 
 @pytest.mark.parametrize("name", UPDATES)
@@ -81,20 +81,20 @@ def test_missing_readings_of_a_stack_with_noise_of_its_own(name: str) -> None:
 
 
 def test_partial_options_survive_the_open_door() -> None:
-    turned = partial(updates.square_root, rotation="none")
+    turned = partial(updates.etkf, rotation="none")
     x = members(20)
     given = (x, x @ H.T, Y, R)
     assert np.array_equal(unchecked(turned)(*given, rng=rng()), turned(*given, rng=rng()))
-    assert says(turned, "stacks") and not says(partial(print, 3), "stacks")
-    assert not says(updates.inflated(lambda x, h, y, r, *, rng: x, factor=1.0), "stacks")
+    assert has_tag(turned, "stacks") and not has_tag(partial(print, 3), "stacks")
+    assert not has_tag(updates.with_inflation(lambda x, h, y, r, *, rng: x, factor=1.0), "stacks")
     with pytest.raises(ValueError, match="rotation"):
-        updates.inflated(partial(updates.square_root, rotation="left"), factor=1.0)
+        updates.with_inflation(partial(updates.etkf, rotation="left"), factor=1.0)
 
 
 def test_exact_forecast_adds_q_exactly() -> None:
     phi, q = np.array([[1.0, 0.3], [0.0, 0.9]]), np.array([[0.4, 0.1], [0.1, 0.2]])
     model = Model(2, lambda x, t, dt: x @ phi.T, lambda t, dt: dt * q)
-    bent = replace(model, flow=lambda x, t, dt: np.where(x < 50, x @ phi.T + 0.3 * x**2, np.inf))
+    bent = replace(model, transition=lambda x, t, dt: np.where(x < 50, x @ phi.T + 0.3 * x**2, np.inf))
     x = members(12, 3)[..., :2]
     out = exact_forecast(x, bent, 0.0, 0.5, rng=rng())
     for e, m in zip(out, bent.step(x, 0.0, 0.5), strict=True):
@@ -103,15 +103,15 @@ def test_exact_forecast_adds_q_exactly() -> None:
     x[1, 0] = 99.0  # an ensemble that is lost takes no bit of the others' noise with it
     lost = exact_forecast(x, bent, 0.0, 0.5, rng=rng())
     assert np.array_equal(lost[::2], out[::2]) and np.isnan(lost[1]).all()
-    plain = updates.sampled_forecast(members(100_000)[:, :2], model, 0.0, 0.5, rng=rng())
+    plain = updates.stochastic_forecast(members(100_000)[:, :2], model, 0.0, 0.5, rng=rng())
     wanted = phi @ np.cov(members(100_000)[:, :2].T) @ phi.T + 0.5 * q
     assert np.allclose(np.cov(plain.T), wanted, atol=0.03)
 
-CIRCLE = norm([0, 1], length=1.2)
+CIRCLE = norm_constraint([0, 1], length=1.2)
 NOISE = np.array([[0.02, 0.005], [0.005, 0.03]])
 SEEN = np.array([0.9, 0.7])
 MOTION = ([0, 1], [2, 3])
-INNERS = [updates.ensemble_transform, updates.known_noise, updates.square_root]
+INNERS = [updates.etpf, updates.enkf, updates.etkf]
 INNER = pytest.mark.parametrize("inner", INNERS)
 
 
@@ -126,10 +126,10 @@ def test_projection_and_retraction_follow_the_update(inner: Update) -> None:
     four = x, x[..., :2], y, NOISE
     plain = inner(*four, rng=rng())
     how: Any = {"reading": "particle", "regularisation": 0.01}
-    out = updates.projected(inner, CIRCLE, **how)(*four, rng=rng())
+    out = updates.with_projection(inner, CIRCLE, **how)(*four, rng=rng())
     assert np.allclose(out, project(plain, CIRCLE, **how), atol=1e-14)
     assert np.abs(out - plain).max() > 1e-3
-    out = updates.retracted(inner, CIRCLE, motion=MOTION)(*four, rng=rng())
+    out = updates.with_retraction(inner, CIRCLE, motion=MOTION)(*four, rng=rng())
     assert np.allclose(out, retract(plain, CIRCLE, motion=MOTION), atol=1e-14)
     assert np.abs(np.hypot(out[..., 0], out[..., 1]) - 1.2).max() <= 1e-14
 
@@ -141,7 +141,7 @@ def test_augmentation_is_one_more_reading(inner: Update) -> None:
     noise = np.zeros((3, 3))
     noise[:2, :2], noise[2, 2] = NOISE, 0.2**2
     expected = inner(x, both, [*SEEN, 1.44], noise, rng=rng())
-    out = updates.augmented(inner, CIRCLE, std=0.2)(x, x[:, :2], SEEN, NOISE, rng=rng())
+    out = updates.with_augmentation(inner, CIRCLE, std=0.2)(x, x[:, :2], SEEN, NOISE, rng=rng())
     assert np.allclose(out, expected, atol=1e-12)
 
 
@@ -167,9 +167,9 @@ def test_one_reading_localised_is_the_update_with_a_tapered_gain() -> None:
     gain = np.cov(x.T)[:, 0] / (np.cov(x.T)[0, 0] + 0.5) * share
 
     def seeded(*four: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        return updates.known_noise(*four, rng=np.random.default_rng(3))
+        return updates.enkf(*four, rng=np.random.default_rng(3))
 
-    near = updates.localised(seeded, places=places, readings=at, radius=2.0)
+    near = updates.with_localization(seeded, places=places, observation_places=at, radius=2.0)
     out = near(x, x[:, :1], [1.0], [[0.5]], rng=rng())
     assert np.allclose(out, x + (1.0 - x[:, :1] - zeta) * gain, atol=1e-12)
     assert (out[:, 2] == x[:, 2]).all()
@@ -182,13 +182,13 @@ def test_readings_on_a_ring_localised_one_after_the_other(given: dict[str, Any])
     """
     x, y = members(20), np.array([1.0, -0.5])
     places = [[0.0], [1.5], [7.0]]
-    near = partial(updates.localised, ROOT, places=places, radius=2.0, period=8.0)
-    out = near(readings=[[0.0], [7.0]])(x, x[:, [0, 2]], y, np.diag([0.5, 0.9]), rng=rng(), **given)
-    first = near(readings=[[0.0]])(x, x[:, :1], y[:1], [[0.5]], rng=rng())
-    second = near(readings=[[7.0]])(first, first[:, 2:], y[1:], [[0.9]], rng=rng())
+    near = partial(updates.with_localization, ROOT, places=places, radius=2.0, period=8.0)
+    out = near(observation_places=[[0.0], [7.0]])(x, x[:, [0, 2]], y, np.diag([0.5, 0.9]), rng=rng(), **given)
+    first = near(observation_places=[[0.0]])(x, x[:, :1], y[:1], [[0.5]], rng=rng())
+    second = near(observation_places=[[7.0]])(first, first[:, 2:], y[1:], [[0.9]], rng=rng())
     assert np.allclose(out, second, atol=1e-12)
     for k, noise, r in (([2], [[0.9]], [0.5, 1.25, 0.0]), ([0, 2], R, [0.0, 0.75, 0.0])):
         four = x, x[:, k], y[-len(k) :], noise  # two whose errors go together move as one
-        local = near(readings=[places[i] for i in k])(*four, rng=rng())
+        local = near(observation_places=[places[i] for i in k])(*four, rng=rng())
         share = gaspari_cohn(np.array(r))
         assert np.allclose(local - x, share * (ROOT(*four, rng=rng()) - x), atol=1e-12)

@@ -6,15 +6,15 @@ import ast
 import os
 from typing import Any
 
-__all__ = ["Telling", "tell"]
+__all__ = ["SoftAssert", "use_soft_assert"]
 
 
-class Telling(ast.NodeTransformer):
+class SoftAssert(ast.NodeTransformer):
     """Turn each ``assert`` into a remark, so that an edited notebook runs on and says what changed.
 
     Examples
     --------
-    >>> edited = Telling().visit(ast.parse("assert 1 > 2, 'the order of one and two'"))
+    >>> edited = SoftAssert().visit(ast.parse("assert 1 > 2, 'the order of one and two'"))
     >>> exec(compile(ast.fix_missing_locations(edited), "cell", "exec"))
     no longer holds: the order of one and two
     """
@@ -27,8 +27,8 @@ class Telling(ast.NodeTransformer):
         return ast.copy_location(told, node)
 
 
-def tell(shell: Any) -> None:
+def use_soft_assert(shell: Any) -> None:
     """Let the cells of an IPython shell tell, unless ``BOOK_STRICT`` is set, as in the tests."""
     known = [type(transformer) for transformer in shell.ast_transformers]
-    if "BOOK_STRICT" not in os.environ and Telling not in known:
-        shell.ast_transformers.append(Telling())
+    if "BOOK_STRICT" not in os.environ and SoftAssert not in known:
+        shell.ast_transformers.append(SoftAssert())

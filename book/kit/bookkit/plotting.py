@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from distfilt.linalg import factor
 
-from .checks import tell
+from .checks import use_soft_assert
 from .digests import digest, of_axes
 from .sliders import Slider, slider
 
@@ -108,7 +108,7 @@ def _print_digests() -> None:
 
     shell = get_ipython()
     if shell is not None:
-        tell(shell)
+        use_soft_assert(shell)
         # The notebook's backend forgets printers when it starts, with the first figure: start it.
         pyplot.switch_backend(get_backend())
         # Twice the pixels, at the same size on the page; packed fast, for who stores packs anew.

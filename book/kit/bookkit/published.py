@@ -187,11 +187,11 @@ class Claim(NamedTuple):
     holds: bool
     evidence: str
     null: str = ""
-    bites: bool = True
+    has_power: bool = True
     range: str = ""
 
     @classmethod
-    def ruled(
+    def from_rule(
         cls, id: str, text: str, rule: Callable[[Any], bool], ours: Any, null: Any, against: str,
         *, range: str = "", shown: Callable[[Any], str] = str,
     ) -> Claim:
@@ -199,7 +199,7 @@ class Claim(NamedTuple):
 
         Examples
         --------
-        >>> print(Claim.ruled("order", "ratio", lambda r: r < 1, 0.8, 1.1, "agents shuffled"))
+        >>> print(Claim.from_rule("order", "ratio", lambda r: r < 1, 0.8, 1.1, "agents shuffled"))
         order holds: ratio 0.8
         """
         beside = f"{against}: {shown(null)}{' (holds too)' if rule(null) else ''}"
@@ -254,7 +254,7 @@ def judge_claims(
                          f"got {', '.join(given)}")  # fmt: skip
     ours = "; ".join(str(c) for c in claims)
     said = "; ".join(row["claim"] for row in listed.values())
-    good, blunt = all(c.holds for c in claims), [c.id for c in claims if not c.bites]
+    good, blunt = all(c.holds for c in claims), [c.id for c in claims if not c.has_power]
     if good and blunt and not free:
         free = f"the rule of {', '.join(blunt)} holds for its null too"
     null = "; ".join(f"{c.id}, {c.null}" for c in claims if c.null)

@@ -56,7 +56,7 @@ class Slider:
 
     frames: tuple[bytes, ...]
     size: tuple[int, int]
-    said: tuple[str, ...]
+    labels: tuple[str, ...]
     digests: tuple[str, ...]
     label: str
     alt: str
@@ -67,8 +67,8 @@ class Slider:
             raise ValueError(f"frames: needs at most {LIMIT} characters, got {len(self.html)}")
 
     def __repr__(self) -> str:
-        lines = [f"slider of {len(self.frames)} frames, first {self.said[self.start]}"]
-        for said, text in zip(self.said, self.digests, strict=True):
+        lines = [f"slider of {len(self.frames)} frames, first {self.labels[self.start]}"]
+        for said, text in zip(self.labels, self.digests, strict=True):
             lines += [said, *(f"  {line}" for line in text.splitlines())]
         return "\n".join(lines)
 
@@ -78,7 +78,7 @@ class Slider:
         pictures = [base64.b64encode(frame).decode() for frame in self.frames]
         data = {
             "alt": self.alt,
-            "said": self.said,
+            "said": self.labels,
             "milliseconds": round(1000 * min(0.5, _SECONDS / len(self.frames))),
             "frames": pictures,
         }
@@ -87,12 +87,12 @@ class Slider:
             key=hashlib.sha256(repr(self).encode()).hexdigest()[:16],
             label=html.escape(self.label),
             first=pictures[self.start],
-            alt=html.escape(f"{self.alt} {self.said[self.start]}."),
+            alt=html.escape(f"{self.alt} {self.labels[self.start]}."),
             width=self.size[0],
             height=self.size[1],
             last=len(self.frames) - 1,
             start=self.start,
-            said=html.escape(self.said[self.start]),
+            said=html.escape(self.labels[self.start]),
             data=json.dumps(data, separators=(",", ":")).replace("</", "<\\/"),
         )
 
@@ -143,7 +143,7 @@ def slider(
     ...     ax.plot([0, 1, 2], [1, 1 - rate, (1 - rate) ** 2])
     ...     return ax
     >>> found = slider(draw, [0.0, 0.5, 1.0], label="rate", alt="A curve that falls.", start=1)
-    >>> len(found.frames), found.said
+    >>> len(found.frames), found.labels
     (3, ('rate 0', 'rate 0.5', 'rate 1'))
     """
     said = tuple(f"{label} {format(value, form)} {unit or ''}".rstrip() for value in values)

@@ -8,11 +8,11 @@ from html import escape
 
 import pandas as pd
 
-__all__ = ["table"]
+__all__ = ["ResultTable"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class table:
+class ResultTable:
     """A frame as a table: numbers in a given form, the best of a column in bold.
 
     Parameters
@@ -29,7 +29,7 @@ class table:
     Examples
     --------
     >>> rows = pd.DataFrame({"error, m": [0.5234, 0.4]}, index=["alone", "fused"])
-    >>> table(rows, form={"error, m": ".2f"}, best={"error, m": "min"})
+    >>> ResultTable(rows, form={"error, m": ".2f"}, best={"error, m": "min"})
           error, m
     alone     0.52
     fused     0.40

@@ -54,7 +54,7 @@ def script(name: str, *, folder: Path | None = None) -> ModuleType:
 
 def check(
     path: str | Path | Stored, trial: Trial, *, indices: Iterable[int] | None = None,
-    rtol: float = 0.0, atol: float = 0.0, rough: Collection[str] = (), odd: int = 0,
+    rtol: float = 0.0, atol: float = 0.0, ill_conditioned: Collection[str] = (), max_outliers: int = 0,
     workers: int | None = 1, executor: Executor | None = None,
 ) -> Stored:
     """Run stored trials again and compare what they give now with what is stored.
@@ -91,10 +91,10 @@ def check(
     """
     stored = path if isinstance(path, Stored) else load(path)
     chosen = list(range(len(stored)) if indices is None else indices)
-    if odd >= len(chosen):
-        raise ValueError(f"odd: needs fewer than the {len(chosen)} trials that run, got {odd}")
+    if max_outliers >= len(chosen):
+        raise ValueError(f"odd: needs fewer than the {len(chosen)} trials that run, got {max_outliers}")
     allowed = dict.fromkeys(stored.columns, atol)
-    for name in rough:
+    for name in ill_conditioned:
         finite = stored.columns[name][np.isfinite(stored.columns[name])]
         allowed[name] = max(atol, float(np.ptp(finite)) if finite.size else 0.0)
     study = run(trial, [stored.seed(i) for i in chosen], errors="collect", workers=workers,
@@ -104,7 +104,7 @@ def check(
         found for k, i in enumerate(chosen)
         if (found := _differences(stored, i, study, k, kinds.get(k, ""), rtol, allowed))
     ]  # fmt: skip
-    if len(wrong) > odd:
+    if len(wrong) > max_outliers:
         raise AssertionError(_report(stored, trial, [text for each in wrong for text in each]))
     return stored
 
@@ -134,9 +134,9 @@ def _same(was: float, now: float, rtol: float, atol: float) -> bool:
 
 def _report(stored: Stored, trial: Trial, wrong: list[str]) -> str:
     kept = [*wrong[:5], *([f"and {len(wrong) - 5} more"] if len(wrong) > 5 else [])]
-    was = stored.heads["code"].get(plain(trial).__qualname__)
+    was = stored.metadata["code"].get(plain(trial).__qualname__)
     if was and was != (now := fingerprint(trial)):
         kept.append(f"the source of the trial is another one: stored {was}, now {now}")
-    elif stored.heads["version"] != versions():
-        kept.append(f"the versions are others: stored {dict(stored.heads['version'])}")
+    elif stored.metadata["version"] != versions():
+        kept.append(f"the versions are others: stored {dict(stored.metadata['version'])}")
     return f"{stored.path.name}: another run does not give what is stored\n" + "\n".join(kept)

@@ -57,7 +57,7 @@ class Stored:
     """
 
     path: Path
-    heads: Mapping[str, Mapping[str, Any]]
+    metadata: Mapping[str, Mapping[str, Any]]
     seeds: tuple[str, ...]
     failures: tuple[str, ...]
     columns: Mapping[str, NDArray[np.float64]]
@@ -68,7 +68,7 @@ class Stored:
     @property
     def parameters(self) -> Mapping[str, Any]:
         """The study's parameters."""
-        return self.heads["parameter"]
+        return self.metadata["parameter"]
 
     def metric(self, column: str) -> NDArray[np.float64]:
         """A metric of the trials that are done, (done,)."""

@@ -13,11 +13,11 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .values import _fits, _shape_text, array
+from .checks import _fits, _shape_text, check_array
 
-__all__ = ["MISSING", "Kind", "Scope", "kind_of"]
+__all__ = ["ALLOW_NAN", "Kind", "Scope", "kind_of"]
 
-MISSING = "missing allowed"
+ALLOW_NAN = "missing allowed"
 """Beside an array's shape: NaN may stand for what is missing; infinity may not."""
 
 
@@ -74,7 +74,7 @@ class Kind:
 
 def _number(value: Any, name: str, scope: Scope) -> float:
     try:  # a TypeError for an array
-        out = float(value if type(value) in (float, int, np.float64) else array(value, name, ()))
+        out = float(value if type(value) in (float, int, np.float64) else check_array(value, name, ()))
     except ValueError:
         raise TypeError from None
     if not math.isfinite(out):
@@ -115,7 +115,7 @@ def _numbers(
     name: str, scope: Scope,
 ) -> Any:
     if dtype is np.float64:
-        out: Any = array(value, name, finite=not missing)
+        out: Any = check_array(value, name, finite=not missing)
         if missing and np.isinf(out).any():
             raise ValueError(f"{name}: needs finite numbers or NaN (missing), got infinity")
     else:
@@ -175,8 +175,8 @@ def kind_of(annotation: Any) -> Kind | None:
 
     Examples
     --------
-    >>> from distfilt.doors import Count
-    >>> kind_of(Count).take(0, "members", Scope({}))
+    >>> from distfilt.validation import PositiveInt
+    >>> kind_of(PositiveInt).take(0, "members", Scope({}))
     Traceback (most recent call last):
     ValueError: members: needs an integer of at least 1, got 0
     """
@@ -226,10 +226,10 @@ def _meant(annotation: Any) -> Any:
 
 def _noted(base: Any, notes: tuple[Any, ...]) -> Kind | None:
     """A type with a shape and rules beside it; the last shape counts, so that aliases can vary."""
-    shapes = [note.split() for note in notes if isinstance(note, str) and note != MISSING]
+    shapes = [note.split() for note in notes if isinstance(note, str) and note != ALLOW_NAN]
     base = _meant(base)
     if get_origin(base) is np.ndarray:
-        kind: Kind | None = _array_of(base, shapes[-1] if shapes else None, MISSING in notes)
+        kind: Kind | None = _array_of(base, shapes[-1] if shapes else None, ALLOW_NAN in notes)
     else:
         kind = kind_of(base)
     rules: Any = filter(callable, notes)

@@ -1,6 +1,6 @@
 r"""Doors: what a function's arguments must be, declared once, by its annotations.
 
-A public function stands behind :func:`door`. Each argument whose annotation is a kind of this
+A public function stands behind :func:`validated`. Each argument whose annotation is a kind of this
 module, or a plain type, is checked and converted before the function runs; what does not fit is
 refused by an error that names the argument, what it needs and what it got. Nothing is repaired.
 :func:`unchecked` gives the function without its door, for loops.
@@ -9,7 +9,7 @@ refused by an error that names the argument, what it needs and what it got. Noth
 Annotation                              What may come, and what the function gets
 ======================================  ==========================================================
 ``Annotated[Array, "... N d"]``         finite real numbers of this shape, as float64
-``Annotated[Array, "m", MISSING]``      the same, where NaN stands for what is missing
+``Annotated[Array, "m", ALLOW_NAN]``      the same, where NaN stands for what is missing
 ``Annotated[Array, "d d", definite]``   the same, if ``definite(value, name)`` lets it pass
 ``Annotated[Mask, "A"]``                booleans; ``Indices`` for integers
 ``float``, ``int``, ``bool``, ``str``   one finite number, one integer, one flag, a text not blank
@@ -35,38 +35,38 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from .declared import Record, door, unchecked
-from .kinds import MISSING
-from .values import (
+from .decorators import FrozenModel, unchecked, validated
+from .annotations import ALLOW_NAN
+from .checks import (
     Array,
     Bounds,
     all_finite,
-    array,
-    definite,
-    distinct,
-    increasing,
-    needed,
-    semidefinite,
-    summing_to_one,
+    check_array,
+    check_positive_definite,
+    check_distinct,
+    check_increasing,
+    import_optional,
+    check_positive_semidefinite,
+    check_probabilities,
 )
 
 __all__ = [  # fmt: skip
-    "Array", "Bounds", "Count", "Cov", "Index", "Indices", "MISSING", "Mask", "NonNegative",
-    "Places", "Positive", "Record", "Rng", "Semidefinite", "Share", "Times", "Weights",
-    "all_finite", "array", "definite", "door", "increasing", "needed", "semidefinite",
-    "summing_to_one", "unchecked",
+    "Array", "Bounds", "PositiveInt", "PositiveDefinite", "NonNegativeInt", "Indices", "ALLOW_NAN", "Mask", "NonNegativeFloat",
+    "DistinctIndices", "PositiveFloat", "FrozenModel", "Rng", "PositiveSemidefinite", "UnitInterval", "Times", "Probabilities",
+    "all_finite", "check_array", "check_positive_definite", "validated", "check_increasing", "import_optional", "check_positive_semidefinite",
+    "check_probabilities", "unchecked",
 ]
 
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 Rng = np.random.Generator
-Cov = Annotated[Array, "... d d", definite]
-Semidefinite = Annotated[Array, "... d d", semidefinite]
-Weights = Annotated[Array, "... N", summing_to_one]
-Times = Annotated[Array, "T", increasing]
-Positive = Annotated[float, Bounds(above=0)]
-NonNegative = Annotated[float, Bounds(at_least=0)]
-Share = Annotated[float, Bounds(at_least=0, at_most=1)]
-Count = Annotated[int, Bounds(at_least=1)]
-Index = Annotated[int, Bounds(at_least=0)]
-Places = Annotated[Sequence[Index], distinct]
+PositiveDefinite = Annotated[Array, "... d d", check_positive_definite]
+PositiveSemidefinite = Annotated[Array, "... d d", check_positive_semidefinite]
+Probabilities = Annotated[Array, "... N", check_probabilities]
+Times = Annotated[Array, "T", check_increasing]
+PositiveFloat = Annotated[float, Bounds(above=0)]
+NonNegativeFloat = Annotated[float, Bounds(at_least=0)]
+UnitInterval = Annotated[float, Bounds(at_least=0, at_most=1)]
+PositiveInt = Annotated[int, Bounds(at_least=1)]
+NonNegativeInt = Annotated[int, Bounds(at_least=0)]
+DistinctIndices = Annotated[Sequence[NonNegativeInt], check_distinct]

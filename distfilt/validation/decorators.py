@@ -14,9 +14,9 @@ from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 
-from .kinds import Kind, Scope, kind_of
+from .annotations import Kind, Scope, kind_of
 
-__all__ = ["Record", "door", "unchecked"]
+__all__ = ["FrozenModel", "validated", "unchecked"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -70,13 +70,13 @@ class _Plan:
         return given
 
 
-def door(function: F) -> F:
+def validated(function: F) -> F:
     """Let a function's annotations check what it is given.
 
     Parameters
     ----------
     function : callable
-        Its annotations are kinds as in the table of :mod:`distfilt.doors`. Defaults are not
+        Its annotations are kinds as in the table of :mod:`distfilt.validation`. Defaults are not
         checked.
 
     Returns
@@ -87,9 +87,9 @@ def door(function: F) -> F:
     Examples
     --------
     >>> from typing import Annotated
-    >>> from distfilt.doors import Array, Positive
-    >>> @door
-    ... def scaled(x: Annotated[Array, "... d"], factor: Positive = 2.0) -> Array:
+    >>> from distfilt.validation import Array, PositiveFloat
+    >>> @validated
+    ... def scaled(x: Annotated[Array, "... d"], factor: PositiveFloat = 2.0) -> Array:
     ...     return factor * x
     >>> scaled([1.0, 2.0])
     array([2., 4.])
@@ -125,7 +125,7 @@ def unchecked(function: F) -> F:
     return given  # type: ignore[no-any-return]
 
 
-class Record:
+class FrozenModel:
     """A base of frozen dataclasses: their fields' annotations are the door of the constructor.
 
     Arrays are copied and kept read-only. A subclass with relations between its fields extends
@@ -135,7 +135,7 @@ class Record:
     --------
     >>> from dataclasses import dataclass
     >>> @dataclass(frozen=True, eq=False)
-    ... class Label(Record):
+    ... class Label(FrozenModel):
     ...     text: str
     ...     size: int
     >>> Label("a", 1.5)
@@ -152,7 +152,7 @@ class Record:
         vars(self).update(scope.values, _doubted=True)
 
     @classmethod
-    def unchecked(cls, *args: Any, **options: Any) -> Self:
+    def construct(cls, *args: Any, **options: Any) -> Self:
         """Build one from what the library made itself: nothing is checked or copied."""
         out, (names, factories) = object.__new__(cls), _names(cls)  # type: ignore[arg-type]
         (own := vars(out)).update(zip(names, args, strict=False), **options)
@@ -161,10 +161,10 @@ class Record:
                 own[name] = factory()
         return out
 
-    def changed(self, **changes: Any) -> Self:
+    def replace(self, **changes: Any) -> Self:
         """The same with other values in some fields, unchecked."""
         known = {name: getattr(self, name) for name in _names(cast(Any, type(self)))[0]}
-        return self.unchecked(**known | changes)
+        return self.construct(**known | changes)
 
 
 @cache

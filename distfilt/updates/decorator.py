@@ -4,7 +4,7 @@ Every update has the signature ``(ensemble, predicted, observed, noise, *, rng, 
 and is told four things: the forecast members (..., N, d); what each of them would observe without
 noise (..., N, m), on the branch of the observation where a reading wraps; the observation (..., m);
 and the covariance of its noise, (m, m) or (..., m, m). Loops go round the door by
-:func:`distfilt.doors.unchecked`.
+:func:`distfilt.validation.unchecked`.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
 
-from ..doors import Array, Cov, Indices, Rng, all_finite, door, unchecked
+from ..validation import Array, PositiveDefinite, Indices, Rng, all_finite, validated, unchecked
 from ..ensembles import Ensemble
 from ..linalg import cholesky, leading
 
-__all__ = ["Update", "around", "perturbed", "says", "update", "with_missing"]
+__all__ = ["Update", "around", "perturb_observations", "has_tag", "update", "with_missing"]
 
 F = TypeVar("F", bound=Callable[..., Array])
 
@@ -33,7 +33,7 @@ _KINDS = (
     Ensemble,
     Annotated[Array, "... N m"],
     Annotated[Array, "... m"],
-    Annotated[Cov, "... m m"],
+    Annotated[PositiveDefinite, "... m m"],
 )
 """Of an update's first four arguments, whatever their own annotations say."""
 
@@ -46,13 +46,13 @@ def update(function: F) -> F:
     function : callable
         ``function(ensemble, predicted, observed, noise, *, rng, …)`` for float64 arrays that fit,
         with a noise covariance for each ensemble or one for all. The annotations of its options
-        are checked too, as :mod:`distfilt.doors` says. In a filter whose runs miss different
+        are checked too, as :mod:`distfilt.validation` says. In a filter whose runs miss different
         readings normal draws are each run's own where they are asked for all members at once.
 
     Returns
     -------
     callable
-        The same with checks; :func:`distfilt.doors.unchecked` gives the function back.
+        The same with checks; :func:`distfilt.validation.unchecked` gives the function back.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def update(function: F) -> F:
         raise ValueError(f"function: needs a function, got {type(function).__name__}")
     names = list(signature(function).parameters)[:4]
     function.__annotations__ |= dict(zip(names, _KINDS, strict=True)) | {"rng": Rng}
-    plan: Any = cast(Any, door(function)).plan
+    plan: Any = cast(Any, validated(function)).plan
 
     @wraps(function)
     def checked(*args: Any, **options: Any) -> Array:
@@ -99,13 +99,13 @@ def _related(four: dict[str, Array]) -> dict[str, Array]:
     return {n: np.broadcast_to(four[n], (*lead, *four[n].shape[-k:])) for n, k in tails}
 
 
-def says(update: Update, what: str) -> bool:
+def has_tag(update: Update, what: str) -> bool:
     """What an update says of itself: that it ``stacks``, ``repredicts``, takes gaps ``whole``.
 
     One that stacks can update ensembles with a noise covariance of their own each in one call, as
     every update of this package does; a plain function gets one agent's at a time.
 
-    >>> says(print, "stacks")
+    >>> has_tag(print, "stacks")
     False
     """
     return bool(getattr(update.func if isinstance(update, partial) else update, what, False))
@@ -114,19 +114,19 @@ def says(update: Update, what: str) -> bool:
 def around(inner: Update) -> Callable[[F], F]:
     """The door of a wrapper, which says of itself what the update says that it wraps.
 
-    >>> says(around(print)(lambda x, h, y, r, *, rng: x), "stacks")
+    >>> has_tag(around(print)(lambda x, h, y, r, *, rng: x), "stacks")
     False
     """
 
     def made(wrapper: F) -> F:
         out: Any = update(wrapper)
-        out.stacks, out.whole = says(inner, "stacks"), says(inner, "whole")
+        out.stacks, out.whole = has_tag(inner, "stacks"), has_tag(inner, "whole")
         return cast(F, out)
 
     return made
 
 
-def perturbed(predicted: Array, noise: Array, rng: Rng, *, centred: bool = False) -> Array:
+def perturb_observations(predicted: Array, noise: Array, rng: Rng, *, centred: bool = False) -> Array:
     """Predictions with a draw of the noise each, (..., N, m); with N - 1 in the denominator its
     sample covariance is the noise's on average, centred or not."""
     drawn = rng.standard_normal(predicted.shape)
@@ -158,10 +158,10 @@ def with_missing(
 
     Examples
     --------
-    >>> from distfilt.updates import exact_draws
+    >>> from distfilt.updates import enkf_exact
     >>> x = np.array([[-1.0], [0.0], [0.5], [0.5]])
     >>> seen = np.concatenate([x, x], axis=1)
-    >>> after = with_missing(exact_draws, x, seen, np.array([1.0, np.nan]), 0.5 * np.eye(2),
+    >>> after = with_missing(enkf_exact, x, seen, np.array([1.0, np.nan]), 0.5 * np.eye(2),
     ...                      rng=np.random.default_rng(0))
     >>> float(after.mean().round(12))
     0.5
@@ -176,7 +176,7 @@ def with_missing(
     if all_finite(observed) and all_finite(predicted):
         return inner(ensemble, predicted, observed, noise, rng=_stream(rng, base, m, lead))
     present = ~np.isnan(observed) & ~np.isnan(predicted).any(axis=-2)
-    if says(update, "whole"):
+    if has_tag(update, "whole"):
         known, stream = np.where(present, observed, np.nan), _stream(rng, base, m, lead)
         return inner(ensemble, predicted, known, noise, rng=stream)
     flat, aim = present.reshape(-1, m), observed.reshape(-1, m)

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf
 
 __all__ = [  # fmt: skip
-    "Array", "Bounds", "all_finite", "array", "batched", "definite", "distinct", "increasing",
-    "needed", "semidefinite", "summing_to_one",
+    "Array", "Bounds", "all_finite", "check_array", "call_batched", "check_positive_definite", "check_distinct", "check_increasing",
+    "import_optional", "check_positive_semidefinite", "check_probabilities",
 ]
 
 Array = NDArray[np.float64]
@@ -30,7 +30,7 @@ _NOT_REAL = (bool, np.bool_, complex, np.complexfloating, str, bytes, np.datetim
 """What would turn into numbers inside a list or an array of objects."""
 
 
-def array(
+def check_array(
     value: ArrayLike, name: str, shape: tuple[Any, ...] | None = None, *, finite: bool = True
 ) -> Array:
     """Return `value` as a float64 array of the wanted shape: for what a user's function returned.
@@ -53,9 +53,9 @@ def array(
 
     Examples
     --------
-    >>> array([[1, 2], [3, 4]], "ensemble", (..., "N", 2)).shape
+    >>> check_array([[1, 2], [3, 4]], "ensemble", (..., "N", 2)).shape
     (2, 2)
-    >>> array([1.0, np.nan, 2.0], "mean", (3,))
+    >>> check_array([1.0, np.nan, 2.0], "mean", (3,))
     Traceback (most recent call last):
     ValueError: mean: needs finite numbers, got 1 NaN or infinite of 3
     """
@@ -115,12 +115,12 @@ def _shape_text(shape: tuple[Any, ...]) -> str:
     return f"({sizes},)" if len(shape) == 1 else f"({sizes})"
 
 
-def definite(value: Array, name: str, word: str = "definite") -> None:
+def check_positive_definite(value: Array, name: str, word: str = "definite") -> None:
     """Refuse what is not a symmetric positive definite matrix, or a stack of them.
 
     Examples
     --------
-    >>> definite(np.array([[1.0, 2.0], [2.0, 1.0]]), "noise")
+    >>> check_positive_definite(np.array([[1.0, 2.0], [2.0, 1.0]]), "noise")
     Traceback (most recent call last):
     ValueError: noise: needs a positive definite matrix, got smallest eigenvalue -1
     """
@@ -145,14 +145,14 @@ def definite(value: Array, name: str, word: str = "definite") -> None:
         raise ValueError(f"{name}: needs a positive {word} matrix, got smallest eigenvalue {least}")
 
 
-def semidefinite(value: Array, name: str) -> None:
+def check_positive_semidefinite(value: Array, name: str) -> None:
     """Refuse what is not a symmetric matrix without negative eigenvalues, or a stack of them.
 
     Examples
     --------
-    >>> semidefinite(np.zeros((2, 2)), "noise")
+    >>> check_positive_semidefinite(np.zeros((2, 2)), "noise")
     """
-    definite(value, name, "semidefinite")
+    check_positive_definite(value, name, "semidefinite")
 
 
 def _in_units(cov: Array) -> Array:
@@ -163,12 +163,12 @@ def _in_units(cov: Array) -> Array:
         return np.clip(cov / unit[..., :, None] / unit[..., None, :], -2.0, 2.0)
 
 
-def summing_to_one(value: Array, name: str) -> None:
+def check_probabilities(value: Array, name: str) -> None:
     """Refuse what is not nonnegative weights that sum to one along the last axis.
 
     Examples
     --------
-    >>> summing_to_one(np.array([0.5, 0.6]), "weights")
+    >>> check_probabilities(np.array([0.5, 0.6]), "weights")
     Traceback (most recent call last):
     ValueError: weights: needs a sum of 1, got 1.1
     """
@@ -180,12 +180,12 @@ def summing_to_one(value: Array, name: str) -> None:
         raise ValueError(f"{name}: needs a sum of 1, got {total[off.argmax()]:.9g}")
 
 
-def increasing(value: Array, name: str) -> None:
+def check_increasing(value: Array, name: str) -> None:
     """Refuse what does not strictly increase.
 
     Examples
     --------
-    >>> increasing(np.array([0.0, 0.2, 0.2]), "times")
+    >>> check_increasing(np.array([0.0, 0.2, 0.2]), "times")
     Traceback (most recent call last):
     ValueError: times: needs strictly increasing values, got 0.2 after 0.2
     """
@@ -196,12 +196,12 @@ def increasing(value: Array, name: str) -> None:
         raise ValueError(f"{name}: needs strictly increasing values, got {got}")
 
 
-def distinct(value: Sequence[int], name: str) -> None:
+def check_distinct(value: Sequence[int], name: str) -> None:
     """Refuse an empty list of places, and one that names a place twice.
 
     Examples
     --------
-    >>> distinct((2, 2), "local")
+    >>> check_distinct((2, 2), "local")
     Traceback (most recent call last):
     ValueError: local: needs distinct integers, one or more, got [2, 2]
     """
@@ -241,7 +241,7 @@ _HOLDS = {"above": operator.gt, "at_least": operator.ge, "below": operator.lt,
           "at_most": operator.le}
 
 
-def needed(module: str, extra: str) -> ModuleType:
+def import_optional(module: str, extra: str) -> ModuleType:
     """Import an optional package, or say which extra brings it.
 
     Raises
@@ -251,7 +251,7 @@ def needed(module: str, extra: str) -> ModuleType:
 
     Examples
     --------
-    >>> needed("no_such_package", "maps")
+    >>> import_optional("no_such_package", "maps")
     Traceback (most recent call last):
     ModuleNotFoundError: no_such_package: needs the extra maps: pip install 'distfilt[maps]'
     """
@@ -265,7 +265,7 @@ def needed(module: str, extra: str) -> ModuleType:
         ) from None
 
 
-def batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Array:
+def call_batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Array:
     """What a function makes of states (..., d), as (..., ``owner.dim``); it gets copies.
 
     A function that was written for one state may return the right shape with wrong numbers. So the
@@ -284,21 +284,21 @@ def batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Arr
     --------
     >>> from types import SimpleNamespace
     >>> x = np.array([[1.0, 2.0], [3.0, 4.0]])
-    >>> batched(SimpleNamespace(dim=2, flow=lambda x: x[..., ::-1]), "flow", [x])
+    >>> call_batched(SimpleNamespace(dim=2, flow=lambda x: x[..., ::-1]), "flow", [x])
     array([[2., 1.],
            [4., 3.]])
     >>> one = SimpleNamespace(dim=2, flow=lambda x: np.array([x[1], x[0]]))
-    >>> batched(one, "flow", [x])
+    >>> call_batched(one, "flow", [x])
     Traceback (most recent call last):
     ValueError: flow: needs to take many states at once, ...
     >>> two = SimpleNamespace(dim=2, flow=lambda x: x + x[:, :1])
-    >>> batched(two, "flow", [x])
+    >>> call_batched(two, "flow", [x])
     Traceback (most recent call last):
     ValueError: flow: needs to take many states at once, ...
     >>> unit = SimpleNamespace(dim=2, flow=lambda x: x / np.linalg.norm(x))
-    >>> batched(unit, "flow", [x[1:]])
+    >>> call_batched(unit, "flow", [x[1:]])
     array([[0.6, 0.8]])
-    >>> batched(unit, "flow", [x])
+    >>> call_batched(unit, "flow", [x])
     Traceback (most recent call last):
     ValueError: flow: needs to take many states at once, ...
     """

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from distfilt.doors.kinds import Scope
+from distfilt.validation.annotations import Scope
 from tests.tools.calls import Call, callables, calls, describe, public, rooms
 from tests.tools.fuzz import exact, kinds
 
@@ -21,11 +21,11 @@ PUBLIC = {name: thing for room in rooms() for name, thing in public(room).items(
 WITHOUT = {
     r"linalg\..*": "for loops, which have checked before",
     r".*(Error|Collapse|Gain|Disconnected)": "an error or a warning, which a user catches",
-    r"filters\.(\w*State|Summary|Filter)|network\.\w*(State|Run)|metrics\.Interval|coupling\.Plan":
+    r"filters\.(\w*State|Summary|Filter)|network\.\w*(State|Result)|metrics\.Interval|coupling\.TransportPlan":
         "made by the library, or derived from by a user",
     r"ensembles\.Members|models\.Swarm": "a type",
-    r"density\.(Centralised|Neighbours|Sharing)": "a protocol, and two that have no arguments",
-    r"filters\.(Step|final_state|moments_of)|network\.fuses": "for who writes a filter or a rule",
+    r"density\.(Centralised|Neighbours|ConsensusProtocol)": "a protocol, and two that have no arguments",
+    r"filters\.(Step|final_state|prior_moments)|network\.fusion_rule": "for who writes a filter or a rule",
     r"updates\.(update|effective_size|with_missing)":
         "looks at what has no kind: a function's signature, logarithms with -inf, a step's own",
 }  # fmt: skip
