@@ -12,7 +12,9 @@ from typing import Any
 import pytest
 
 
-def _execute_cell_input(kernel: Any, cell_input: str, allow_stdin: bool | None = None) -> Any:
+def _execute_cell_input(
+    kernel: Any, cell_input: str, allow_stdin: bool | None = None
+) -> Any:
     return kernel.kc.execute(
         cell_input, store_history=True, allow_stdin=allow_stdin, stop_on_error=False
     )
@@ -30,7 +32,9 @@ def pytest_configure(config: pytest.Config) -> None:
 
     compare_texts = IPyNbCell.compare_outputs
 
-    def compare_outputs(cell: Any, test: Any, ref: Any, skip_compare: Any = None) -> bool:
+    def compare_outputs(
+        cell: Any, test: Any, ref: Any, skip_compare: Any = None
+    ) -> bool:
         """Texts to the letter, by nbval; pictures as a reader sees them."""
         texts = (without_pictures(test), without_pictures(ref), skip_compare)
         if not compare_texts(cell, *texts):

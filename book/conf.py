@@ -88,7 +88,9 @@ nb_execution_mode = "off"
 nb_merge_streams = True
 nb_number_source_lines = False
 nb_ipywidgets_js: dict[str, Any] = {}
-nb_mime_priority_overrides = [("html", "application/vnd.jupyter.widget-view+json", None)]
+nb_mime_priority_overrides = [
+    ("html", "application/vnd.jupyter.widget-view+json", None)
+]
 # A verdict is shown as text or HTML; its third form is for the ledger.
 suppress_warnings = ["mystnb.unknown_mime_type"]
 myst_enable_extensions = [
@@ -158,7 +160,10 @@ html_show_sphinx = False
 html_context = {"default_mode": "light"}
 WIDE = ("index", "which-filter", "api", "reproductions", "errata", "gallery")
 html_theme_options = {
-    "logo": {"text": project, "alt_text": "Distributed Nonlinear Filtering, first page"},
+    "logo": {
+        "text": project,
+        "alt_text": "Distributed Nonlinear Filtering, first page",
+    },
     "home_page_in_toc": False,
     "show_navbar_depth": 1,
     "show_toc_level": 2,
@@ -182,7 +187,9 @@ togglebutton_hint_hide = "Hide"
 def check_toc(app: Sphinx) -> None:
     """Stop the build when a page of the table of contents has no file."""
     if missing := missing_pages():
-        raise ExtensionError(f"_toc.yml names pages that do not exist: {', '.join(missing)}")
+        raise ExtensionError(
+            f"_toc.yml names pages that do not exist: {', '.join(missing)}"
+        )
 
 
 def copy_mathjax(app: Sphinx, error: Exception | None) -> None:
@@ -194,7 +201,13 @@ def copy_mathjax(app: Sphinx, error: Exception | None) -> None:
         raise ExtensionError("sphinx-mathjax-offline is not installed: no mathematics")
     source = Path(spec.origin).parent / "static" / "mathjax"
     target = Path(app.outdir) / "_static" / "mathjax"
-    for part in ("tex-mml-chtml.js", "output/chtml/fonts", "input/tex/extensions", "a11y", "sre"):
+    for part in (
+        "tex-mml-chtml.js",
+        "output/chtml/fonts",
+        "input/tex/extensions",
+        "a11y",
+        "sre",
+    ):
         if (source / part).is_dir():
             shutil.copytree(source / part, target / part, dirs_exist_ok=True)
         else:
@@ -206,13 +219,24 @@ def find_name(app: Sphinx, env: Any, node: Any, shown: Any) -> Any:
     """Resolve a name that is called by its room's path, or by itself, to its entry."""
     if node.get("refdomain") != "py":
         return None
-    entries, target = env.domains.python_domain.objects, node["reftarget"].removeprefix("~")
+    entries = env.domains.python_domain.objects
+    target = node["reftarget"].removeprefix("~")
     known = {**env.distfilt_homes, **{path: path for path in entries}}
-    room, here = f"distfilt.{target}", node.get("py:module") or ""
-    paths = [target, room, f"{here}.{target}", f"{here}.{node.get('py:class')}.{target}"]
+    room = f"distfilt.{target}"
+    here = node.get("py:module") or ""
+    paths = [
+        target,
+        room,
+        f"{here}.{target}",
+        f"{here}.{node.get('py:class')}.{target}",
+    ]
     found = [known[path] for path in paths if path in known]
     owner, _, member = target.rpartition(".")
-    found += [f"{known[path]}.{member}" for path in (owner, f"distfilt.{owner}") if path in known]
+    found += [
+        f"{known[path]}.{member}"
+        for path in (owner, f"distfilt.{owner}")
+        if path in known
+    ]
     found += sorted({known[path] for path in known if path.endswith(f".{target}")})
     if not found or found[0] not in entries:
         return None
@@ -222,7 +246,9 @@ def find_name(app: Sphinx, env: Any, node: Any, shown: Any) -> Any:
     )
 
 
-def link_names(app: Sphinx, page: str, template: str, context: dict[str, Any], tree: Any) -> None:
+def link_names(
+    app: Sphinx, page: str, template: str, context: dict[str, Any], tree: Any
+) -> None:
     """Link the library's names in a chapter's code to their entries."""
     source = ROOT / f"{page}.md"
     if page.startswith("book/api"):
@@ -275,13 +301,17 @@ def setup(app: Sphinx) -> None:
     TocTreeCollector.assign_figure_numbers = with_chapter_numbers  # type: ignore[method-assign]
     app.connect("builder-inited", check_toc)
     app.connect("builder-inited", lambda app: write_generated(BOOK / "_generated"))
-    app.connect("builder-inited", lambda app: setattr(app.env, "distfilt_homes", homes()))
+    app.connect(
+        "builder-inited", lambda app: setattr(app.env, "distfilt_homes", homes())
+    )
     app.connect("missing-reference", find_name)
     app.connect("html-page-context", link_names)
     app.connect("doctree-read", lambda app, tree: drop_widgets(tree))
     app.connect("doctree-read", lambda app, tree: keep_sliders(tree))
     app.connect("autodoc-process-docstring", lambda *event: escape_stars(event[-1]))
-    app.connect("autodoc-process-signature", lambda *event: signature(event[1], event[3]))
+    app.connect(
+        "autodoc-process-signature", lambda *event: signature(event[1], event[3])
+    )
     app.connect("build-finished", copy_mathjax)
     app.connect("build-finished", copy_notebooks)
     app.connect("build-finished", finish)

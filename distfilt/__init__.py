@@ -16,9 +16,22 @@ from types import ModuleType
 
 __version__ = "0.2.0"
 
-_ROOMS = (  # fmt: skip
-    "coupling", "density", "validation", "ensembles", "filters", "gaussians", "kalman", "linalg",
-    "metrics", "mixtures", "models", "network", "sensors", "triangular", "updates",
+_ROOMS = (
+    "coupling",
+    "density",
+    "validation",
+    "ensembles",
+    "filters",
+    "gaussians",
+    "kalman",
+    "linalg",
+    "metrics",
+    "mixtures",
+    "models",
+    "network",
+    "sensors",
+    "triangular",
+    "updates",
 )
 
 __all__ = ["__version__", *_ROOMS]

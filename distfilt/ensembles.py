@@ -8,15 +8,24 @@ from typing import Annotated
 
 import numpy as np
 
-from .validation import Array, PositiveInt, Rng, PositiveSemidefinite, validated, unchecked
 from .linalg import EPS, cholesky, factor, lower_root, solve_upper, symmetrise
+from .validation import (
+    Array,
+    PositiveInt,
+    PositiveSemidefinite,
+    Rng,
+    unchecked,
+    validated,
+)
 
 __all__ = ["Members", "draw", "mean", "sample_covariance"]
 
 
 def _at_least(members: int, value: Array, name: str) -> None:
     if value.shape[-2] < members:
-        raise ValueError(f"{name}: needs at least {members} members, got {value.shape[-2]}")
+        raise ValueError(
+            f"{name}: needs at least {members} members, got {value.shape[-2]}"
+        )
 
 
 Members = Annotated[Array, "... N d", partial(_at_least, 1)]
@@ -30,8 +39,12 @@ _CLOSE = 1e-6
 
 @validated
 def draw(
-    mean: Annotated[Array, "d"], cov: Annotated[PositiveSemidefinite, "d d"], members: PositiveInt, *, rng: Rng,
-    leading: tuple[PositiveInt, ...] = ()
+    mean: Annotated[Array, "d"],
+    cov: Annotated[PositiveSemidefinite, "d d"],
+    members: PositiveInt,
+    *,
+    rng: Rng,
+    leading: tuple[PositiveInt, ...] = (),
 ) -> Array:
     """Draw ensembles (*leading, N, d) from a Gaussian.
 
@@ -151,14 +164,17 @@ def _narrow(root: Array) -> Array:
     std = np.sqrt((root**2).sum(axis=-1))
     unit = np.where(std > 0, std, 1.0)[..., None]
     u, s, _ = np.linalg.svd(root / unit)
-    kept = s**2 > 64 * s.shape[-1] * EPS * s.max(axis=-1, initial=0.0, keepdims=True) ** 2
+    kept = (
+        s**2 > 64 * s.shape[-1] * EPS * s.max(axis=-1, initial=0.0, keepdims=True) ** 2
+    )
     width = int(kept.sum(axis=-1).max(initial=0))
     return lower_root((u * (s * kept)[..., None, :])[..., :width]) * unit
 
 
 def _projected(drawn: Array, avoid: Array) -> Array:
     """What is left of a draw without its mean and the anomalies."""
-    (n, rank), around = drawn.shape[-2:], center_ensemble(avoid)[1]
+    (n, rank) = drawn.shape[-2:]
+    around = center_ensemble(avoid)[1]
     size = np.sqrt((around**2).sum(axis=-2, keepdims=True))
     frame, independent = _frame(around / np.where(size > 0, size, 1.0))
     if n <= independent + rank:
@@ -179,7 +195,9 @@ def _frame(columns: Array) -> tuple[Array, int]:
     # its direction would cost a member, and would leave the draw to the last bit.
     if not good.all():
         u, values, _ = np.linalg.svd(r, full_matrices=False)
-        good = values > columns.shape[-2] * EPS * values.max(axis=-1, initial=0.0, keepdims=True)
+        good = values > columns.shape[-2] * EPS * values.max(
+            axis=-1, initial=0.0, keepdims=True
+        )
         q = q @ u
     return np.asarray(q * good[..., None, :]), int(good.sum(axis=-1).max(initial=0))
 

@@ -92,7 +92,9 @@ def _semidefinite_cholesky(cov: Array) -> Array:
         pivot = column[..., 0]
         root = np.sqrt(np.where(pivot > 16 * d * EPS, pivot, np.inf))
         lower[..., j:, j] = column / root[..., None]
-    gap = np.abs(lower @ lower.swapaxes(-1, -2) - scaled).max(axis=(-2, -1), initial=0.0)
+    gap = np.abs(lower @ lower.swapaxes(-1, -2) - scaled).max(
+        axis=(-2, -1), initial=0.0
+    )
     for k in np.argwhere(gap > 32 * d * EPS):
         lower[tuple(k)] = _from_eigenvectors(scaled[tuple(k)])
     return np.asarray(lower * unit[..., :, None])
@@ -117,7 +119,9 @@ def lower_root(columns: Array) -> Array:
     return np.asarray(upper.mT * sign[..., None, :])
 
 
-def leading(wanted: tuple[int, ...], got: tuple[int, ...], name: str) -> tuple[int, ...]:
+def leading(
+    wanted: tuple[int, ...], got: tuple[int, ...], name: str
+) -> tuple[int, ...]:
     """What leading axes broadcast to, or an error that names the argument that does not fit."""
     if wanted == got:
         return wanted
@@ -163,12 +167,15 @@ def _triangular(lower: Array, right: Array, transposed: int) -> Array:
         lower = np.broadcast_to(lower, (*leading, d, d))
         right = np.broadcast_to(right, (*leading, d, k))
     n = math.prod(leading)
-    factors, sides = lower.reshape(n, d, d), right.reshape(n, d, k)
+    factors = lower.reshape(n, d, d)
+    sides = right.reshape(n, d, k)
     if n > 2 * d:
         # Row after row of all of them at once beats a call for each.
         out = _blocks(factors, sides, transposed)
     else:
-        out = np.array([_one_triangular(*x, transposed) for x in zip(factors, sides, strict=True)])
+        out = np.array(
+            [_one_triangular(*x, transposed) for x in zip(factors, sides, strict=True)]
+        )
     return out.reshape(*leading, d, k)
 
 
@@ -179,8 +186,12 @@ def _one_triangular(lower: Array, right: Array, transposed: int) -> Array:
         return np.array(right)
     alone = right.size == d * k
     flat = right.reshape(d, k) if alone else np.moveaxis(right, -2, 0).reshape(d, -1)
-    if d <= 12 and flat.size > 200 * d * d:  # so many columns that LAPACK's own order costs more
-        out = _substituted(lower[..., None], np.array(flat[:, None], order="C"), transposed)
+    if (
+        d <= 12 and flat.size > 200 * d * d
+    ):  # so many columns that LAPACK's own order costs more
+        out = _substituted(
+            lower[..., None], np.array(flat[:, None], order="C"), transposed
+        )
     else:
         out, failed = dtrtrs(lower, flat, lower=1, trans=transposed)
         if failed:
@@ -192,7 +203,8 @@ def _one_triangular(lower: Array, right: Array, transposed: int) -> Array:
 
 def _blocks(lower: Array, right: Array, transposed: int) -> Array:
     """Many small systems, as many at once as a cache holds."""
-    out, size = np.empty(right.shape), max(1, 2**16 // (1 + lower[0].size + right[0].size))
+    out = np.empty(right.shape)
+    size = max(1, 2**16 // (1 + lower[0].size + right[0].size))
     for here in [slice(n, n + size) for n in range(0, len(out), size)]:
         factors = np.ascontiguousarray(lower[here].transpose(1, 2, 0))
         x = np.array(right[here].transpose(1, 2, 0), order="C")
@@ -212,11 +224,15 @@ def _substituted(lower: Array, x: Array, transposed: int) -> Array:
 def whiten(lower: Array, vectors: Array) -> Array:
     """Solve L out = v for vectors (..., d); leading axes broadcast."""
     if lower.ndim == 2:
-        flat = vectors.reshape(math.prod(vectors.shape[:-1]), -1 if vectors.size else len(lower))
+        flat = vectors.reshape(
+            math.prod(vectors.shape[:-1]), -1 if vectors.size else len(lower)
+        )
         return _one_triangular(lower, flat.T, 0).T.reshape(vectors.shape)
     if lower.shape[-3] == 1 and vectors.ndim > 1:
         # One factor for all vectors along the last leading axis: they are its columns.
-        return _triangular(lower[..., 0, :, :], vectors.swapaxes(-1, -2), 0).swapaxes(-1, -2)
+        return _triangular(lower[..., 0, :, :], vectors.swapaxes(-1, -2), 0).swapaxes(
+            -1, -2
+        )
     return np.asarray(_triangular(lower, vectors[..., None], 0)[..., 0])
 
 
@@ -249,8 +265,11 @@ def in_units(cov: Array) -> tuple[Array, Array]:
 
 
 def central(
-    function: Callable[[Array], Array], x: Array,
-    difference: Callable[[Array, Array], Array] = np.subtract, *, step: float = _STEP
+    function: Callable[[Array], Array],
+    x: Array,
+    difference: Callable[[Array, Array], Array] = np.subtract,
+    *,
+    step: float = _STEP,
 ) -> Array:
     """Derivative (..., m, d) by central differences, all 2 d moves in two calls.
 
@@ -279,7 +298,9 @@ def central(
     behind = x[..., None, :] - h[..., None] * np.eye(x.shape[-1])
     # What was moved by, after rounding, is the difference of the two states.
     moved = np.diagonal(ahead - behind, axis1=-2, axis2=-1)
-    front, back, here = function(ahead), function(behind), function(x[..., None, :])
+    front = function(ahead)
+    back = function(behind)
+    here = function(x[..., None, :])
     slope = difference(front, back)
     bend = np.abs(difference(front, here) + difference(back, here)).max(axis=-1)
     curved = bend > 1e-2 * np.abs(slope).max(axis=-1) + 1e-9 * np.abs(here).max(axis=-1)
@@ -291,8 +312,11 @@ def central(
 
 
 def as_derivative(
-    owner: Any, given: tuple[Any, ...], full: tuple[int, ...], near: Callable[..., Array],
-    still: Array | float = 0.0
+    owner: Any,
+    given: tuple[Any, ...],
+    full: tuple[int, ...],
+    near: Callable[..., Array],
+    still: Array | float = 0.0,
 ) -> Array:
     """What an owner's `derivative` returns, (m, d) or (..., m, d), as the latter; differences
     where it has none.
@@ -313,14 +337,19 @@ def as_derivative(
     """
     if owner.derivative is None:
         return near()
-    slope = np.asarray(owner.derivative(*[np.copy(x) if np.ndim(x) else x for x in given]))
+    slope = np.asarray(
+        owner.derivative(*[np.copy(x) if np.ndim(x) else x for x in given])
+    )
     if slope.shape not in (full, full[-2:]):
         raise ValueError(f"derivative: needs to return shape {full}, got {slope.shape}")
     if vars(owner).pop("_doubted", False):
-        found, wide = near(step=_STEP), near(step=4 * _STEP)
+        found = near(step=_STEP)
+        wide = near(step=4 * _STEP)
         row = np.abs(found - still).max(axis=-1, keepdims=True)
         sure = np.abs(found - wide).max(axis=-1, keepdims=True) <= 1e-2 * row
         bound = 0.1 * row + 1e-4 * row.max(axis=-2, keepdims=True)
         if (sure & (np.abs(slope - found) > bound)).any():
-            warnings.warn("derivative: needs that of its function, got another", RuntimeWarning, 4)
+            warnings.warn(
+                "derivative: needs that of its function, got another", RuntimeWarning, 4
+            )
     return np.broadcast_to(slope, full)

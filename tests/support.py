@@ -16,7 +16,11 @@ def generator(seed: int = 0) -> np.random.Generator:
 
 
 def spd(
-    rng: np.random.Generator, d: int, leading: tuple[int, ...] = (), *, least: float = 0.1
+    rng: np.random.Generator,
+    d: int,
+    leading: tuple[int, ...] = (),
+    *,
+    least: float = 0.1,
 ) -> np.ndarray:
     """Random full covariances with eigenvalues above `least`."""
     a = rng.standard_normal((*leading, d, d))
@@ -36,7 +40,9 @@ def unit_gap(found: np.ndarray, wanted: np.ndarray) -> float:
     """Largest difference of two covariances in units of the wanted standard deviations."""
     std = np.sqrt(np.diagonal(wanted, axis1=-2, axis2=-1))
     unit = np.where(std > 0, std, 1.0)
-    return float((np.abs(found - wanted) / (unit[..., :, None] * unit[..., None, :])).max())
+    return float(
+        (np.abs(found - wanted) / (unit[..., :, None] * unit[..., None, :])).max()
+    )
 
 
 def turning(*, sigma: float, turn_sigma: float) -> Model:
@@ -44,18 +50,29 @@ def turning(*, sigma: float, turn_sigma: float) -> Model:
     straight = constant_velocity(sigma=sigma)
 
     def flow(x: np.ndarray, t: float, dt: float) -> np.ndarray:
-        p, v, tau = x[..., :2], x[..., 2:4], x[..., 4:] * dt
+        p = x[..., :2]
+        v = x[..., 2:4]
+        tau = x[..., 4:] * dt
         left = np.stack([-v[..., 1], v[..., 0]], axis=-1)
-        along, aside = np.sinc(tau / np.pi), 0.5 * tau * np.sinc(0.5 * tau / np.pi) ** 2
+        along = np.sinc(tau / np.pi)
+        aside = 0.5 * tau * np.sinc(0.5 * tau / np.pi) ** 2
         moved = p + dt * (along * v + aside * left)
-        return np.concatenate([moved, np.cos(tau) * v + np.sin(tau) * left, x[..., 4:]], axis=-1)
+        return np.concatenate(
+            [moved, np.cos(tau) * v + np.sin(tau) * left, x[..., 4:]], axis=-1
+        )
 
     def derivative(x: np.ndarray, t: float, dt: float) -> np.ndarray:
-        tau, v = x[..., 4, None, None] * dt, x[..., 2:4, None]  # turns that are not tiny
-        one, left = np.eye(2), np.array([[0.0, -1.0], [1.0, 0.0]])
-        sine, cosine = np.sin(tau) / tau, (1 - np.cos(tau)) / tau
+        tau, v = (
+            x[..., 4, None, None] * dt,
+            x[..., 2:4, None],
+        )  # turns that are not tiny
+        one = np.eye(2)
+        left = np.array([[0.0, -1.0], [1.0, 0.0]])
+        sine = np.sin(tau) / tau
+        cosine = (1 - np.cos(tau)) / tau
         out = np.zeros((*x.shape, 5))
-        out[..., :2, :2], out[..., 4, 4] = one, 1.0
+        out[..., :2, :2] = one
+        out[..., 4, 4] = 1.0
         out[..., :2, 2:4] = dt * (sine * one + cosine * left)
         out[..., 2:4, 2:4] = np.cos(tau) * one + np.sin(tau) * left
         bent = (np.cos(tau) - sine) * one + (np.sin(tau) - cosine) * left
@@ -65,7 +82,8 @@ def turning(*, sigma: float, turn_sigma: float) -> Model:
 
     def noise(t: float, dt: float) -> np.ndarray:
         cov = np.zeros((5, 5))
-        cov[:4, :4], cov[4, 4] = straight.Q(t, dt), turn_sigma**2 * dt
+        cov[:4, :4] = straight.Q(t, dt)
+        cov[4, 4] = turn_sigma**2 * dt
         return cov
 
     return Model(5, flow, noise, derivative=derivative)

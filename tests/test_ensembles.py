@@ -9,7 +9,13 @@ from hypothesis import strategies as st
 from scipy.stats import chi2, kstest
 
 from distfilt import ensembles
-from distfilt.ensembles import center_ensemble, draw, exact_noise, mean, sample_covariance
+from distfilt.ensembles import (
+    center_ensemble,
+    draw,
+    exact_noise,
+    mean,
+    sample_covariance,
+)
 from distfilt.linalg import factor
 from tests.support import generator, singular, spd, unit_gap
 
@@ -22,7 +28,9 @@ def test_moments_are_their_definitions() -> None:
     x = generator(1).standard_normal((2, 7, 3)) @ FULL + 5.0
     for k in range(2):
         assert np.allclose(mean(x)[k], x[k].mean(axis=0), rtol=1e-14)
-        assert np.allclose(center_ensemble(x)[1][k], x[k] - x[k].mean(axis=0), atol=1e-14)
+        assert np.allclose(
+            center_ensemble(x)[1][k], x[k] - x[k].mean(axis=0), atol=1e-14
+        )
         both = np.cov(x[k], rowvar=False)
         assert np.allclose(sample_covariance(x)[k], both, rtol=1e-12, atol=1e-13)
     assert (sample_covariance(x) == sample_covariance(x).swapaxes(-1, -2)).all()
@@ -35,17 +43,26 @@ def test_moments_are_their_definitions() -> None:
 def test_draws_have_the_mean_and_the_full_covariance() -> None:
     """Each entry of the sample moments within 5 standard errors; a transposed factor is 50 off."""
     n = 20_000  # along all axes
-    x = draw([1.0, -2.0, 3.0], FULL, 100, rng=generator(3), leading=(20, 10)).reshape(n, 3)
+    x = draw([1.0, -2.0, 3.0], FULL, 100, rng=generator(3), leading=(20, 10)).reshape(
+        n, 3
+    )
     error = np.sqrt((FULL**2 + np.outer(FULL.diagonal(), FULL.diagonal())) / n)
     assert (np.abs(sample_covariance(x) - FULL) < 5 * error).all()
     assert (np.abs(mean(x) - [1.0, -2.0, 3.0]) < 5 * np.sqrt(FULL.diagonal() / n)).all()
     # The squared length is chi-square: the shape is Gaussian too.
-    length = ((x - [1.0, -2.0, 3.0]) * np.linalg.solve(FULL, (x - [1.0, -2.0, 3.0]).T).T).sum(-1)
+    length = (
+        (x - [1.0, -2.0, 3.0]) * np.linalg.solve(FULL, (x - [1.0, -2.0, 3.0]).T).T
+    ).sum(-1)
     assert kstest(length, chi2(3).cdf).pvalue > 1e-4
 
 
 def test_draws_of_a_singular_covariance_stay_in_its_range() -> None:
-    x = draw([0.0, 5.0, 0.0], np.outer([1.0, 0.0, 2.0], [1.0, 0.0, 2.0]), 50, rng=generator(5))
+    x = draw(
+        [0.0, 5.0, 0.0],
+        np.outer([1.0, 0.0, 2.0], [1.0, 0.0, 2.0]),
+        50,
+        rng=generator(5),
+    )
     assert (x[:, 1] == 5.0).all() and np.allclose(x[:, 2], 2 * x[:, 0], rtol=1e-12)
     assert (draw([1.0], [[0.0]], 3, rng=generator()) == 1.0).all()
 
@@ -77,7 +94,9 @@ def test_exact_noise_is_exact_down_to_the_last_member(
     rank = data.draw(st.integers(0, k))
     cov = spd(rng, k, (2,)) if rank == k else singular(rng, k, rank, (2,))
     n = max(2, p + rank + more)
-    avoid = rng.standard_normal((2, n, p)) @ np.diag(10.0 ** rng.uniform(-6, 6, p)) + 1.0
+    avoid = (
+        rng.standard_normal((2, n, p)) @ np.diag(10.0 ** rng.uniform(-6, 6, p)) + 1.0
+    )
     noise = exact_noise(avoid, factor(cov), rng)
     assert noise.shape == (2, n, k)
     _exact(avoid, cov, noise)
@@ -92,7 +111,9 @@ def test_exact_noise_beside_anomalies_that_depend_on_each_other(n: int) -> None:
         h = x @ rng.standard_normal((4, 8)) + slight * rng.standard_normal((3, n, 8))
         both = np.concatenate([x, h], axis=-1)
         if n == 12 and slight:
-            with pytest.raises(ValueError, match=r"needs more than 1[12] \+ 3 members.* got 12$"):
+            with pytest.raises(
+                ValueError, match=r"needs more than 1[12] \+ 3 members.* got 12$"
+            ):
                 exact_noise(both, factor(FULL), rng)
         else:
             _exact(both, FULL, exact_noise(both, factor(FULL), rng))
@@ -138,7 +159,9 @@ def test_exact_noise_is_as_random_as_can_be() -> None:
     """Uniform over the directions left: each member's mean 0, variance that of the projection."""
     rng = generator(12)
     x = rng.standard_normal((8, 2))
-    noise = exact_noise(np.broadcast_to(x, (20_000, 8, 2)), factor([[4.0]]), rng)[..., 0]
+    noise = exact_noise(np.broadcast_to(x, (20_000, 8, 2)), factor([[4.0]]), rng)[
+        ..., 0
+    ]
     basis = np.linalg.qr(np.column_stack([np.ones(8), x]))[0]
     left = np.eye(8) - basis @ basis.T
     found = noise.T @ noise / 20_000

@@ -23,8 +23,12 @@ def run(name: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda p: p.stem)
 def test_an_example_is_short(path: Path) -> None:
-    code = [line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    assert len(code) <= {"robots": 60, "seven_filters": 45, "cluster": 36}.get(path.stem, 30)
+    code = [
+        line for line in path.read_text(encoding="utf-8").splitlines() if line.strip()
+    ]
+    assert len(code) <= {"robots": 60, "seven_filters": 45, "cluster": 36}.get(
+        path.stem, 30
+    )
 
 
 def test_the_spill_is_found() -> None:
@@ -39,9 +43,12 @@ def test_the_spill_is_found() -> None:
 def test_own_filter_is_the_kalman_filter_on_its_grid(tmp_path: Path) -> None:
     names = run("own_filter")
     walk = Model(1, lambda x, t, dt: x, lambda t, dt: 0.3 * dt * np.eye(1))
-    sensors, line = [component([0], std=0.5), None], graphs.path(2)
-    own, exact = names["GridFilter"](walk, sensors, line), GaussianFilter(walk, sensors, line)
-    times, seen = [0.5, 1.0, 2.0], [np.array([[0.4], [1.0], [0.2]]), None]
+    sensors = [component([0], std=0.5), None]
+    line = graphs.path(2)
+    own = names["GridFilter"](walk, sensors, line)
+    exact = GaussianFilter(walk, sensors, line)
+    times = [0.5, 1.0, 2.0]
+    seen = [np.array([[0.4], [1.0], [0.2]]), None]
     prior = ([0.0], [[1.0]])
     a = own.run(own.start(prior), times, seen, truth=np.zeros((3, 1)))
     b = exact.run(exact.start(prior), times, seen, truth=np.zeros((3, 1)))
@@ -52,7 +59,9 @@ def test_own_filter_is_the_kalman_filter_on_its_grid(tmp_path: Path) -> None:
     assert np.array_equal(many["mean"].values[:, 1], a["mean"].values)
     state = own.start(prior)
     state.save(tmp_path / "grid.npz")
-    assert np.array_equal(names["GridState"].load(tmp_path / "grid.npz").chances, state.chances)
+    assert np.array_equal(
+        names["GridState"].load(tmp_path / "grid.npz").chances, state.chances
+    )
 
 
 def test_own_update_is_not_pulled_far() -> None:
@@ -73,7 +82,9 @@ def test_own_payload_arrives_and_is_charged() -> None:
         assert track.name == sent.name and np.array_equal(track.cov, sent.cov)
     ledger = names["channel"].ledger
     # One name, three means, six entries of the covariance; four messages on a path of three.
-    assert ledger.scalars.sum() == 4 * 10 and ledger.bytes.sum() == 4 * (8 + 3 * 8 + 6 * 4)
+    assert ledger.scalars.sum() == 4 * 10 and ledger.bytes.sum() == 4 * (
+        8 + 3 * 8 + 6 * 4
+    )
 
 
 def table(text: str) -> dict[str, list[float]]:
@@ -88,14 +99,21 @@ def test_seven_filters_in_one_loop(capsys: pytest.CaptureFixture[str]) -> None:
     for name, (error, nees, floats) in rows.items():
         assert error < 0.3 and floats > 0, name
         assert name == "density" or nees < 4, name
-    assert rows["ensemble"][2] == 240  # a reading to two neighbours each, for thirty steps
+    assert (
+        rows["ensemble"][2] == 240
+    )  # a reading to two neighbours each, for thirty steps
 
 
-def test_robots_are_tracked_from_a_log_of_events(capsys: pytest.CaptureFixture[str]) -> None:
+def test_robots_are_tracked_from_a_log_of_events(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     run("robots")
     rows = table(capsys.readouterr().out)
     assert set(rows) == {"mixture", "gaussian", "ensemble", "news"}
     for name, (error, nees, refused, floats) in rows.items():
         assert error < 1.0 and nees < 4 and refused > 3 and floats > 0, name
     # What waits for a contact is not lost: as good as readings that are all told.
-    assert rows["news"][0] < 1.25 * rows["gaussian"][0] and rows["news"][3] < rows["gaussian"][3]
+    assert (
+        rows["news"][0] < 1.25 * rows["gaussian"][0]
+        and rows["news"][3] < rows["gaussian"][3]
+    )

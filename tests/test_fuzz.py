@@ -38,10 +38,15 @@ def test_a_door_left_open_is_found() -> None:
         return 0.0
 
     def order(x: np.ndarray) -> np.ndarray:
-        return np.frombuffer(x.tobytes("A")) if isinstance(x, np.ndarray) else np.ravel(x)
+        return (
+            np.frombuffer(x.tobytes("A")) if isinstance(x, np.ndarray) else np.ravel(x)
+        )
 
     def careful(x: object) -> float:
-        if type(x) not in (list, np.ndarray) or np.asarray(x, dtype=object).ravel()[:1].size == 0:
+        if (
+            type(x) not in (list, np.ndarray)
+            or np.asarray(x, dtype=object).ravel()[:1].size == 0
+        ):
             raise ValueError("x: needs numbers")
         if not all(isinstance(v, float) for v in np.asarray(x, dtype=object).ravel()):
             raise ValueError("x: needs numbers")
@@ -52,7 +57,9 @@ def test_a_door_left_open_is_found() -> None:
     a = np.array([[1.0, 2.0], [3.0, 4.5]])
     found = of(careless, a)
     assert found["complex"] == found["booleans"] == found["masked"] == "taken"
-    assert found["NaN"] == "NaN" and found["list"] == "same" and found["object"] == "raw"
+    assert (
+        found["NaN"] == "NaN" and found["list"] == "same" and found["object"] == "raw"
+    )
     assert of(writes, a)["zero"] == "finite" and of(writes, a)["huge"] == "changed"
     assert of(writes, a)["read-only"] == "misread"
     assert of(order, a)["fortran"] == "different" and of(order, a)["strided"] == "same"

@@ -8,10 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from distfilt.validation import unchecked
 from distfilt.ensembles import mean, sample_covariance
-from distfilt.gaussians import condition, intersecting, intersect_gaussians, intersection_weights
+from distfilt.gaussians import (
+    condition,
+    intersect_gaussians,
+    intersecting,
+    intersection_weights,
+)
 from distfilt.gaussians.single import log_density, match_moments, unscented_points
+from distfilt.validation import unchecked
 from tests.support import NAN, generator, spd, unit_gap
 
 SEEDS = st.integers(0, 10_000)
@@ -25,7 +30,9 @@ THIRDS = np.full(3, 1 / 3)
 @given(SEEDS, st.integers(1, 6))
 def test_log_density_is_the_definition(seed: int, d: int) -> None:
     rng = generator(seed)
-    x, centre, cov = rng.standard_normal((4, 3, d)), rng.standard_normal((3, d)), spd(rng, d, (3,))
+    x = rng.standard_normal((4, 3, d))
+    centre = rng.standard_normal((3, d))
+    cov = spd(rng, d, (3,))
     found = log_density(x, centre, cov)
     assert found.shape == (4, 3)
     for i in range(3):
@@ -37,7 +44,9 @@ def test_log_density_is_the_definition(seed: int, d: int) -> None:
 # --- intersection -----------------------------------------------------------------------------
 
 
-def _by_inverses(m: np.ndarray, p: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _by_inverses(
+    m: np.ndarray, p: np.ndarray, w: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     information = np.linalg.inv(p)
     cov = np.linalg.inv((w[..., None, None] * information).sum(axis=-3))
     vector = (w[..., None] * (information @ m[..., None])[..., 0]).sum(axis=-2)
@@ -45,24 +54,33 @@ def _by_inverses(m: np.ndarray, p: np.ndarray, w: np.ndarray) -> tuple[np.ndarra
 
 
 @given(SEEDS, st.integers(1, 5), st.integers(1, 5))
-def test_intersection_is_the_weighted_sum_of_information(seed: int, s: int, d: int) -> None:
+def test_intersection_is_the_weighted_sum_of_information(
+    seed: int, s: int, d: int
+) -> None:
     rng = generator(seed)
-    m, p = rng.standard_normal((6, s, d)), spd(rng, d, (6, s))
+    m = rng.standard_normal((6, s, d))
+    p = spd(rng, d, (6, s))
     w = rng.dirichlet(np.ones(s), 6)
-    found, exact = intersect_gaussians(m, p, w), _by_inverses(m, p, w)
+    found = intersect_gaussians(m, p, w)
+    exact = _by_inverses(m, p, w)
     worst = 1e-13 * np.linalg.cond(p).max()
     assert np.abs(found[0] - exact[0]).max() < 10 * worst
     assert unit_gap(found[1], exact[1]) < worst
     assert (found[1] == found[1].swapaxes(-1, -2)).all()
     one = intersect_gaussians(m[2], p[2], w[2])
-    assert np.allclose(one[0], found[0][2], atol=worst) and np.allclose(one[1], found[1][2])
+    assert np.allclose(one[0], found[0][2], atol=worst) and np.allclose(
+        one[1], found[1][2]
+    )
     several = intersect_gaussians(m[2], np.stack([p[2], 2 * p[2]]), w[2])
-    assert np.allclose(several[0], one[0], atol=worst) and np.allclose(several[1][1], 2 * one[1])
+    assert np.allclose(several[0], one[0], atol=worst) and np.allclose(
+        several[1][1], 2 * one[1]
+    )
 
 
 def test_intersection_of_the_same_or_one_source_changes_nothing() -> None:
     rng = generator(1)
-    m, p = 1e6 + rng.standard_normal(3), spd(rng, 3)
+    m = 1e6 + rng.standard_normal(3)
+    p = spd(rng, 3)
     mean_, cov = intersect_gaussians([m] * 4, [p] * 4, [0.1, 0.2, 0.3, 0.4])
     assert np.allclose(mean_, m, rtol=1e-15, atol=0) and unit_gap(cov, p) < 1e-14
     mean_, cov = intersect_gaussians([m, 0 * m], [p, np.eye(3)], [1.0, 0.0])
@@ -73,9 +91,12 @@ def test_intersection_of_the_same_or_one_source_changes_nothing() -> None:
 
 def test_intersection_does_not_depend_on_units_or_order() -> None:
     rng = generator(2)
-    m, p, w = rng.standard_normal((3, 4)), spd(rng, 4, (3,)), np.array([0.2, 0.5, 0.3])
+    m = rng.standard_normal((3, 4))
+    p = spd(rng, 4, (3,))
+    w = np.array([0.2, 0.5, 0.3])
     size = np.array([1e-9, 1.0, 1e9, 1e3])
-    plain, scaled = intersect_gaussians(m, p, w), intersect_gaussians(m * size, p * np.outer(size, size), w)
+    plain = intersect_gaussians(m, p, w)
+    scaled = intersect_gaussians(m * size, p * np.outer(size, size), w)
     assert np.allclose(scaled[0], plain[0] * size, rtol=1e-11)
     assert unit_gap(scaled[1], plain[1] * np.outer(size, size)) < 1e-12
     turned = intersect_gaussians(m[::-1], p[::-1], w[::-1])
@@ -84,7 +105,8 @@ def test_intersection_does_not_depend_on_units_or_order() -> None:
 
 def test_extreme_precision_does_not_spoil_the_rest() -> None:
     rng = generator(4)
-    sharp, wide = 1e-20 * spd(rng, 3), spd(rng, 3)
+    sharp = 1e-20 * spd(rng, 3)
+    wide = spd(rng, 3)
     for order in (slice(None), slice(None, None, -1)):
         m = np.stack([np.ones(3), np.zeros(3)])[order]
         mean_, cov = intersect_gaussians(m, np.stack([sharp, wide])[order], [0.5, 0.5])
@@ -101,13 +123,16 @@ def test_extreme_precision_does_not_spoil_the_rest() -> None:
 @pytest.mark.parametrize("rule", RULES)
 def test_what_did_not_arrive_weighs_nothing_whatever_it_holds(rule: str) -> None:
     rng = generator(5)
-    p, m = spd(rng, 3, (4, 5)), rng.standard_normal((4, 5, 3))
+    p = spd(rng, 3, (4, 5))
+    m = rng.standard_normal((4, 5, 3))
     here = rng.random((4, 5)) < 0.6
     here[:, 2] = True
     here[0] = [False, False, True, False, False]
-    here[1, 0], here[2, 0] = False, True
+    here[1, 0] = False
+    here[2, 0] = True
     for junk in (NAN, 0.0, -3.0):
-        covs, means = np.where(here[..., None, None], p, junk), np.where(here[..., None], m, junk)
+        covs = np.where(here[..., None, None], p, junk)
+        means = np.where(here[..., None], m, junk)
         w = unchecked(intersection_weights)(covs, rule=rule, here=here)
         assert (w[~here] == 0).all() and np.allclose(w.sum(-1), 1.0, rtol=1e-14)
         assert w[0, 2] == 1.0 and (w >= 0).all()
@@ -124,13 +149,20 @@ def test_closed_forms() -> None:
     p = np.stack([np.diag([1.0, 4.0]), np.diag([9.0, 1.0]), [[2.0, 1.0], [1.0, 2.0]]])
     assert np.allclose(intersection_weights(p), THIRDS, rtol=1e-15)
     traces = np.array([1 / 5, 1 / 10, 1 / 4])
-    assert np.allclose(intersection_weights(p, rule="trace"), traces / traces.sum(), rtol=1e-14)
+    assert np.allclose(
+        intersection_weights(p, rule="trace"), traces / traces.sum(), rtol=1e-14
+    )
     roots = np.array([1 / 2, 1 / 3, 1 / np.sqrt(3)])
-    assert np.allclose(intersection_weights(p, rule="determinant"), roots / roots.sum(), rtol=1e-14)
+    assert np.allclose(
+        intersection_weights(p, rule="determinant"), roots / roots.sum(), rtol=1e-14
+    )
     for rule in RULES:
         assert intersection_weights(p[:1], rule=rule).tolist() == [1.0]
     here = np.array([True, False, True])
-    assert intersection_weights(p, here=[here, ~here]).tolist() == [[0.5, 0, 0.5], [0, 1, 0]]
+    assert intersection_weights(p, here=[here, ~here]).tolist() == [
+        [0.5, 0, 0.5],
+        [0, 1, 0],
+    ]
     huge = np.stack([1e-200 * np.eye(4), 1e200 * np.eye(4)])
     assert np.allclose(intersection_weights(huge, rule="determinant"), [1.0, 0.0])
 
@@ -144,7 +176,12 @@ def _slopes(w: np.ndarray, p: np.ndarray, rule: str) -> np.ndarray:
 
 
 @pytest.mark.parametrize("rule", ["min_trace", "min_determinant"])
-@given(seed=SEEDS, s=st.integers(2, 5), d=st.integers(1, 5), spread=st.sampled_from([0.1, 1, 3]))
+@given(
+    seed=SEEDS,
+    s=st.integers(2, 5),
+    d=st.integers(1, 5),
+    spread=st.sampled_from([0.1, 1, 3]),
+)
 def test_optimal_weights_meet_the_conditions_of_the_optimum(
     rule: str, seed: int, s: int, d: int, spread: float
 ) -> None:
@@ -175,20 +212,26 @@ def test_sure_steps_alone_reach_the_optimum(monkeypatch: pytest.MonkeyPatch) -> 
         for i in range(4):
             best = _slopes(w[i], p[i], rule)
             assert best.max() <= 1.001 * float(w[i] @ best)
-    assert np.allclose(intersection_weights(p, rule="min_determinant"), exact, atol=0.02)
+    assert np.allclose(
+        intersection_weights(p, rule="min_determinant"), exact, atol=0.02
+    )
 
 
 def test_optimal_weights_of_crossed_repeated_and_dominated_sources() -> None:
     crossed = [np.diag([1.0, 4.0]), np.diag([4.0, 1.0])]
     for rule in ("min_trace", "min_determinant"):
-        better = intersection_weights([np.eye(2), 1.01 * np.eye(2), 9 * np.eye(2)], rule=rule)
+        better = intersection_weights(
+            [np.eye(2), 1.01 * np.eye(2), 9 * np.eye(2)], rule=rule
+        )
         assert better[0] > 1 - 1e-4
         twice = intersection_weights([crossed[0], crossed[0], crossed[1]], rule=rule)
         assert np.allclose([twice[:2].sum(), twice[2]], 0.5, atol=1e-6)
 
 
 @pytest.mark.parametrize("bad", [NAN, np.inf])
-def test_covariances_that_are_no_numbers_are_refused_where_they_count(bad: float) -> None:
+def test_covariances_that_are_no_numbers_are_refused_where_they_count(
+    bad: float,
+) -> None:
     p = spd(generator(7), 2, (3,))
     p[1, 0, 0] = bad
     for call in (intersection_weights, unchecked(intersection_weights)):
@@ -198,7 +241,9 @@ def test_covariances_that_are_no_numbers_are_refused_where_they_count(bad: float
     for fuse in (intersect_gaussians, unchecked(intersect_gaussians)):
         with pytest.raises(ValueError, match="^covs: needs finite numbers"):
             fuse(np.zeros((3, 2)), p, THIRDS)
-    left = unchecked(intersect_gaussians)(np.zeros((3, 2)), p, np.array([0.5, 0.0, 0.5]))[1]
+    left = unchecked(intersect_gaussians)(
+        np.zeros((3, 2)), p, np.array([0.5, 0.0, 0.5])
+    )[1]
     assert np.isfinite(left).all()
 
 
@@ -221,14 +266,18 @@ def _ensembles(seed: int, n: int, d: int, leading: tuple[int, ...] = ()) -> np.n
     rng = generator(seed)
     mixing = rng.standard_normal((*leading, d, d))
     shift = 10 * rng.standard_normal((*leading, 1, d))
-    return (rng.standard_normal((*leading, n, d)) @ mixing + shift) * np.logspace(-3, 3, d)
+    return (rng.standard_normal((*leading, n, d)) @ mixing + shift) * np.logspace(
+        -3, 3, d
+    )
 
 
 @given(SEEDS, st.integers(1, 13), st.integers(1, 30))
 def test_recoloured_moments_are_exact(seed: int, d: int, more: int) -> None:
     """Whatever the condition of the old and the new covariance, down to d + 1 members."""
-    e, other = _ensembles(seed, d + more, d, (2,)), _ensembles(seed + 1, d + 5, d, (2,))
-    centre, cov = mean(other), sample_covariance(other)
+    e = _ensembles(seed, d + more, d, (2,))
+    other = _ensembles(seed + 1, d + 5, d, (2,))
+    centre = mean(other)
+    cov = sample_covariance(other)
     try:
         out = match_moments(e, centre, cov)
     except ValueError as error:  # members or target flat to rounding
@@ -244,7 +293,10 @@ def test_the_draw_that_lost_nine_digits() -> None:
     """Ill-conditioned old and new covariances at once."""
     rng = generator(31)
     for d in (3, 12):
-        flat = np.diag(np.logspace(0, -7, d)) @ np.linalg.qr(rng.standard_normal((d, d)))[0]
+        flat = (
+            np.diag(np.logspace(0, -7, d))
+            @ np.linalg.qr(rng.standard_normal((d, d)))[0]
+        )
         e = rng.standard_normal((60, d)) @ flat
         target = spd(rng, d, least=1e-10)
         out = match_moments(e, np.zeros(d), target)
@@ -253,17 +305,21 @@ def test_the_draw_that_lost_nine_digits() -> None:
 
 def test_recolouring_is_symmetric_and_so_moves_the_members_least() -> None:
     """A C A = P has one symmetric positive solution in units of the new standard deviations."""
-    e, other = _ensembles(1, 40, 4), _ensembles(2, 40, 4)
+    e = _ensembles(1, 40, 4)
+    other = _ensembles(2, 40, 4)
     cov = sample_covariance(other)
     unit = np.sqrt(cov.diagonal())
-    a = np.linalg.lstsq(e - mean(e), match_moments(e, mean(e), cov) - mean(e), rcond=None)[0].T
+    a = np.linalg.lstsq(
+        e - mean(e), match_moments(e, mean(e), cov) - mean(e), rcond=None
+    )[0].T
     a *= unit / unit[:, None]
     assert np.abs(a - a.T).max() < 1e-9 * np.abs(a).max()
     assert (np.linalg.eigvalsh(0.5 * (a + a.T)) > 0).all()
 
 
 def test_leading_axes_of_a_target_broadcast_or_are_refused_by_name() -> None:
-    e, cov = _ensembles(4, 9, 2, (3,)), np.stack([np.eye(2)] * 3)
+    e = _ensembles(4, 9, 2, (3,))
+    cov = np.stack([np.eye(2)] * 3)
     many = match_moments(e[0], np.arange(6.0).reshape(3, 2), np.eye(2))
     assert many.shape == (3, 9, 2) and np.allclose(mean(many), [[0, 1], [2, 3], [4, 5]])
     with pytest.raises(ValueError, match="^mean: needs leading axes that broadcast"):
@@ -275,10 +331,18 @@ def test_leading_axes_of_a_target_broadcast_or_are_refused_by_name() -> None:
 def test_flat_ensembles_are_refused_wherever_they_lie() -> None:
     rng = generator(12)
     x = rng.standard_normal((20, 3))
-    for flat in (x @ [[1, 0, 1], [0, 1, 1], [0, 0, 0]], x * [1, 0, 1], 1e9 + x * [1, 1e-9, 1]):
+    for flat in (
+        x @ [[1, 0, 1], [0, 1, 1], [0, 0, 0]],
+        x * [1, 0, 1],
+        1e9 + x * [1, 1e-9, 1],
+    ):
         for shift in (0.0, 1e6):
             with pytest.raises(ValueError, match="^ensemble: .* singular"):
-                match_moments(np.stack([x, flat + shift]), np.zeros((2, 3)), np.stack([np.eye(3)] * 2))
+                match_moments(
+                    np.stack([x, flat + shift]),
+                    np.zeros((2, 3)),
+                    np.stack([np.eye(3)] * 2),
+                )
 
 
 # --- unscented points -------------------------------------------------------------------------
@@ -288,14 +352,17 @@ def test_flat_ensembles_are_refused_wherever_they_lie() -> None:
 @pytest.mark.parametrize("d", [2, 5])
 def test_points_have_the_moments(d: int, kappa: float) -> None:
     rng = generator(d)
-    mean, cov = rng.standard_normal((4, d)), spd(rng, d, (4,))
+    mean = rng.standard_normal((4, d))
+    cov = spd(rng, d, (4,))
     root = np.linalg.cholesky(cov) @ np.linalg.qr(rng.standard_normal((d, d)))[0]
     points, w = unscented_points(mean, root, kappa=kappa)
     assert points.shape == (4, 2 * d + 1, d) and np.isclose(w.sum(), 1)
     assert np.allclose(w @ points, mean)
     gap = points - mean[:, None]
     assert np.allclose((gap * w[:, None]).mT @ gap, cov)
-    assert np.allclose(points[:, 0], mean) and np.allclose(points[:, 1:].mean(axis=1), mean)
+    assert np.allclose(points[:, 0], mean) and np.allclose(
+        points[:, 1:].mean(axis=1), mean
+    )
 
 
 def test_fourth_moments_along_an_axis_are_a_gaussians() -> None:
@@ -305,13 +372,21 @@ def test_fourth_moments_along_an_axis_are_a_gaussians() -> None:
 
 # --- conditioning -----------------------------------------------------------------------------
 
-D, M = 4, 3
+D = 4
+M = 3
 
 
 def case(seed: int, lead: tuple[int, ...] = ()) -> tuple[np.ndarray, ...]:
     rng = np.random.default_rng(seed)
-    mean, gap = rng.standard_normal((*lead, D)), rng.standard_normal((*lead, M))
-    return mean, spd(rng, D, lead), gap, rng.standard_normal((*lead, M, D)), spd(rng, M, lead)
+    mean = rng.standard_normal((*lead, D))
+    gap = rng.standard_normal((*lead, M))
+    return (
+        mean,
+        spd(rng, D, lead),
+        gap,
+        rng.standard_normal((*lead, M, D)),
+        spd(rng, M, lead),
+    )
 
 
 @given(seed=st.integers(0, 10**6))
@@ -354,7 +429,9 @@ def test_one_covariance_and_one_sensor_serve_any_number_of_means() -> None:
     assert x.shape == (6, D) and p.shape == (D, D)
     full = condition(mean, np.broadcast_to(cov, (6, D, D)), gap[:, :M], h, r)
     np.testing.assert_allclose(x, full[0], rtol=0, atol=1e-13)
-    np.testing.assert_allclose(np.broadcast_to(p, full[1].shape), full[1], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(
+        np.broadcast_to(p, full[1].shape), full[1], rtol=0, atol=1e-13
+    )
 
 
 def test_joseph_s_form_keeps_what_a_nearly_exact_reading_leaves() -> None:

@@ -8,11 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from distfilt import linalg
-from distfilt.validation import unchecked
 from distfilt.sensors import wrap
+from distfilt.validation import unchecked
 from tests.support import generator, singular, spd, unit_gap
 
-SEEDS, SIZES = st.integers(0, 10_000), st.integers(1, 7)
+SEEDS = st.integers(0, 10_000)
+SIZES = st.integers(1, 7)
 EPS = linalg.EPS
 
 
@@ -41,7 +42,9 @@ def test_factor_reproduces_its_matrix(seed: int, d: int) -> None:
     cov = spd(generator(seed), d, (2, 3))
     lower = linalg.factor(cov)
     assert unit_gap(lower @ _turned(lower), cov) < 10 * d * EPS
-    assert (np.triu(lower, 1) == 0).all() and (np.diagonal(lower, axis1=-2, axis2=-1) > 0).all()
+    assert (np.triu(lower, 1) == 0).all() and (
+        np.diagonal(lower, axis1=-2, axis2=-1) > 0
+    ).all()
     assert np.allclose(linalg.factor(cov[1, 2]), lower[1, 2], rtol=1e-10, atol=1e-12)
 
 
@@ -69,7 +72,9 @@ def test_factor_where_a_tiny_pivot_decides(nearly: float) -> None:
     """
     third = np.array([0.0, nearly, 1.0])
     for k in range(20):
-        first = generator(k).uniform(0.5, 2.0) * np.array([1.0, generator(k).uniform(0.5, 2), 0.3])
+        first = generator(k).uniform(0.5, 2.0) * np.array(
+            [1.0, generator(k).uniform(0.5, 2), 0.3]
+        )
         cov = np.outer(first, first) + np.outer(third, third)
         lower = linalg.factor(cov)
         assert unit_gap(lower @ lower.T, cov) < 150 * EPS
@@ -108,21 +113,35 @@ LEADING = [(), (1,), (3,), (40,), (2, 3), (5, 8), (5000,)]
 
 @pytest.mark.parametrize("leading", LEADING)
 @pytest.mark.parametrize("d", [1, 2, 5])
-def test_triangular_solves_of_every_number_of_systems(leading: tuple[int, ...], d: int) -> None:
+def test_triangular_solves_of_every_number_of_systems(
+    leading: tuple[int, ...], d: int
+) -> None:
     rng = generator(d)
     lower = np.linalg.cholesky(cov := spd(rng, d, leading))
     right = rng.standard_normal((*leading, d, 3))
-    assert all(np.allclose(s * cov @ linalg.solve_definite(s * cov, right), right) for s in (1, -1))
+    assert all(
+        np.allclose(s * cov @ linalg.solve_definite(s * cov, right), right)
+        for s in (1, -1)
+    )
     lower.flags.writeable = right.flags.writeable = False
-    for solve, matrix in ((linalg.solve_lower, lower), (linalg.solve_upper, _turned(lower))):
+    for solve, matrix in (
+        (linalg.solve_lower, lower),
+        (linalg.solve_upper, _turned(lower)),
+    ):
         out = solve(lower, right)
         assert out.shape == right.shape
         assert np.allclose(matrix @ out, right, rtol=1e-11, atol=1e-11)
         shared = solve(lower, right[(0,) * len(leading)])
-        assert np.allclose(matrix @ shared, right[(0,) * len(leading)], rtol=1e-11, atol=1e-11)
+        assert np.allclose(
+            matrix @ shared, right[(0,) * len(leading)], rtol=1e-11, atol=1e-11
+        )
     one = lower[(0,) * len(leading)]
-    assert np.allclose(one @ linalg.solve_lower(one, right), right, rtol=1e-11, atol=1e-11)
-    assert np.allclose(one.T @ linalg.solve_upper(one, right), right, rtol=1e-11, atol=1e-11)
+    assert np.allclose(
+        one @ linalg.solve_lower(one, right), right, rtol=1e-11, atol=1e-11
+    )
+    assert np.allclose(
+        one.T @ linalg.solve_upper(one, right), right, rtol=1e-11, atol=1e-11
+    )
 
 
 @pytest.mark.parametrize("leading", LEADING)
@@ -132,7 +151,9 @@ def test_whitening_broadcasts_in_every_way(leading: tuple[int, ...]) -> None:
     for shape in ((*leading, 4), (4,)):
         v = rng.standard_normal(shape)
         out = linalg.whiten(lower, v)
-        assert np.allclose((lower @ out[..., None])[..., 0], np.broadcast_to(v, out.shape))
+        assert np.allclose(
+            (lower @ out[..., None])[..., 0], np.broadcast_to(v, out.shape)
+        )
     many = rng.standard_normal((*leading, 7, 4))
     out = linalg.whiten(lower[..., None, :, :], many)
     assert out.shape == many.shape
@@ -144,11 +165,15 @@ def test_whitening_broadcasts_in_every_way(leading: tuple[int, ...]) -> None:
 @pytest.mark.parametrize("leading", [(), (0,), (3,), (0, 2)])
 @pytest.mark.parametrize(("d", "k"), [(0, 0), (0, 2), (2, 0), (2, 1)])
 def test_empty_systems(leading: tuple[int, ...], d: int, k: int) -> None:
-    cov, right = np.broadcast_to(np.eye(d), (*leading, d, d)), np.ones((*leading, d, k))
+    cov = np.broadcast_to(np.eye(d), (*leading, d, d))
+    right = np.ones((*leading, d, k))
     assert _solved(cov, right).shape == right.shape
     assert _length(cov, np.ones((*leading, d))).shape == leading
     assert _length(np.eye(d), np.ones((*leading, d))).shape == leading
-    assert unchecked(linalg.factor)(cov).shape == cov.shape and _log_det(cov).shape == leading
+    assert (
+        unchecked(linalg.factor)(cov).shape == cov.shape
+        and _log_det(cov).shape == leading
+    )
 
 
 @given(SEEDS, SIZES, st.sampled_from(LEADING))

@@ -7,7 +7,14 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
-from distfilt.metrics import crps, gaussian_crps, mean_interval, median_interval, nees, nees_band
+from distfilt.metrics import (
+    crps,
+    gaussian_crps,
+    mean_interval,
+    median_interval,
+    nees,
+    nees_band,
+)
 from distfilt.metrics.intervals import Interval, proportion_interval
 from distfilt.metrics.scores import nis
 from tests.support import generator, spd
@@ -21,7 +28,9 @@ def test_leading_axes_broadcast():
     whole = crps(estimates, truth)
     for r in range(7):
         for a in range(3):
-            assert np.allclose(whole[r, a], crps(estimates[r, a], truth[r, 0]), rtol=1e-12)
+            assert np.allclose(
+                whole[r, a], crps(estimates[r, a], truth[r, 0]), rtol=1e-12
+            )
 
 
 # --- consistency ------------------------------------------------------------------------------
@@ -44,15 +53,21 @@ def test_nees_and_nis_are_their_definitions(leading):
         nees(np.ones((2, 4)), one, np.ones((3, 4)))
 
 
-
-@pytest.mark.parametrize("dim, runs, level", [(1, 1, 0.95), (6, 24, 0.95), (13, 100, 0.99)])
+@pytest.mark.parametrize(
+    "dim, runs, level", [(1, 1, 0.95), (6, 24, 0.95), (13, 100, 0.99)]
+)
 def test_nees_band_has_its_probability(dim, runs, level):
     band = nees_band(dim, runs, level=level)
     law = stats.chi2(dim * runs)
-    assert law.cdf(band.high * runs) - law.cdf(band.low * runs) == pytest.approx(level, abs=1e-10)
+    assert law.cdf(band.high * runs) - law.cdf(band.low * runs) == pytest.approx(
+        level, abs=1e-10
+    )
     unit = nees_band(dim, runs, level=level, normalised=True)
-    assert np.allclose([unit.low, unit.high, unit.error],
-                       np.array([band.low, band.high, band.error]) / dim, rtol=1e-12)  # fmt: skip
+    assert np.allclose(
+        [unit.low, unit.high, unit.error],
+        np.array([band.low, band.high, band.error]) / dim,
+        rtol=1e-12,
+    )
     assert dim in band and 1 in unit
     assert band.error == pytest.approx(np.sqrt(2 * dim / runs), rel=1e-12)
 
@@ -60,7 +75,9 @@ def test_nees_band_has_its_probability(dim, runs, level):
 # --- scores -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("mean, std, truth", [(0.0, 1.0, 0.0), (2.0, 0.3, 1.1), (-1.0, 5.0, 9.0)])
+@pytest.mark.parametrize(
+    "mean, std, truth", [(0.0, 1.0, 0.0), (2.0, 0.3, 1.1), (-1.0, 5.0, 9.0)]
+)
 def test_gaussian_crps_equals_its_integral(mean, std, truth):
     cdf = stats.norm(mean, std).cdf
     below, _ = quad(lambda u: cdf(u) ** 2, mean - 12 * std, truth, epsabs=1e-12)
@@ -71,7 +88,9 @@ def test_gaussian_crps_equals_its_integral(mean, std, truth):
 @pytest.mark.parametrize("n", [1, 2, 50])
 def test_crps_is_its_definition(n):
     rng = generator(n)
-    x, y, w = rng.standard_normal((3, n, 2)), rng.standard_normal((3, 2)), rng.dirichlet([1] * n, 3)
+    x = rng.standard_normal((3, n, 2))
+    y = rng.standard_normal((3, 2))
+    w = rng.dirichlet([1] * n, 3)
     found = crps(x, y, weights=w)
     for r in range(3):
         for k in range(2):

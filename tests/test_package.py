@@ -76,11 +76,17 @@ def imports(path: Path) -> set[str]:
 def test_modules_import_only_from_floors_below() -> None:
     for path in PATHS:
         here = part(dotted(path))
-        names = [n.removeprefix("distfilt.") for n in imports(path) if n.startswith("distfilt.")]
+        names = [
+            n.removeprefix("distfilt.")
+            for n in imports(path)
+            if n.startswith("distfilt.")
+        ]
         wanted = {part(name) for name in names} - {"__version__"}
         assert here in FLOORS, f"{here} has no floor: add it to FLOORS"
         for other in wanted - {here}:
-            assert FLOORS[other] < FLOORS[here], f"{here} imports {other}, which is not below it"
+            assert FLOORS[other] < FLOORS[here], (
+                f"{here} imports {other}, which is not below it"
+            )
 
 
 def test_the_library_knows_nothing_of_the_book() -> None:
@@ -94,7 +100,9 @@ def test_heavy_packages_stay_at_home() -> None:
         here = part(dotted(path))
         for package in {part(name) for name in imports(path)} & set(HOMES):
             home = HOMES[package]
-            assert here in home, f"{here} imports {package}, whose home is {sorted(home)}"
+            assert here in home, (
+                f"{here} imports {package}, whose home is {sorted(home)}"
+            )
 
 
 def test_modules_are_short_and_say_what_is_public() -> None:
@@ -106,7 +114,9 @@ def test_modules_are_short_and_say_what_is_public() -> None:
         assert module.__doc__, f"{name}: a module starts with what it is for"
         for shown in module.__all__:
             value = getattr(module, shown)
-            if callable(value) and getattr(value, "__module__", "").startswith("distfilt"):
+            if callable(value) and getattr(value, "__module__", "").startswith(
+                "distfilt"
+            ):
                 assert value.__doc__, f"{shown} has no docstring"
 
 
@@ -124,11 +134,19 @@ def test_functions_fit_a_screen() -> None:
         for node in ast.walk(TREES[path]):
             if isinstance(node, ast.FunctionDef):
                 told = len(spanned(node.body[0])) if ast.get_docstring(node) else 0
-                assert len(spanned(node)) - told <= 40, f"{path.name}: {node.name} is too long"
+                assert len(spanned(node)) - told <= 40, (
+                    f"{path.name}: {node.name} is too long"
+                )
 
 
-IDLE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT,
-        tokenize.ENDMARKER}  # fmt: skip
+IDLE = {
+    tokenize.COMMENT,
+    tokenize.NL,
+    tokenize.NEWLINE,
+    tokenize.INDENT,
+    tokenize.DEDENT,
+    tokenize.ENDMARKER,
+}
 
 
 def code_lines(path: Path) -> int:
@@ -145,7 +163,14 @@ def code_lines(path: Path) -> int:
 
 
 MODULE = 400
-LIMITS = {"lines": 8000, "files": 90, "rooms": 16, "names": 260, "unreached": 0, "private": 0}
+LIMITS = {
+    "lines": 8000,
+    "files": 90,
+    "rooms": 16,
+    "names": 260,
+    "unreached": 0,
+    "private": 0,
+}
 
 
 def private_imports() -> list[str]:
@@ -169,11 +194,18 @@ def unreached() -> list[str]:
     code = [found[0] for found in block.finditer(pages)]
     code += re.findall(r"`[^`]+`", block.sub("", pages))
     for folder in ("studies", "examples"):
-        code += [path.read_text(encoding="utf-8") for path in (book / folder).glob("*.py")]
+        code += [
+            path.read_text(encoding="utf-8") for path in (book / folder).glob("*.py")
+        ]
     for path in PATHS:
         code += re.findall(r"-> .*?:\n", path.read_text(encoding="utf-8"), re.S)
     known = set(re.findall(r"\w+", " ".join(code)))
-    names = {name for room in rooms() for name, thing in public(room).items() if callable(thing)}
+    names = {
+        name
+        for room in rooms()
+        for name, thing in public(room).items()
+        if callable(thing)
+    }
     return sorted(name for name in names if name.rpartition(".")[2] not in known)
 
 
@@ -204,7 +236,9 @@ def run(code: str, path: Path | None = None) -> str:
     """Run code in a fresh interpreter, away from the repository; return what it prints."""
     env = {**os.environ, "PYTHONPATH": str(path or "")}
     command = [sys.executable, "-W", "error", "-c", code]
-    done = subprocess.run(command, cwd=path or ROOT.parent, env=env, capture_output=True, text=True)
+    done = subprocess.run(
+        command, cwd=path or ROOT.parent, env=env, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -228,7 +262,15 @@ def test_lock_names_no_registry_and_has_a_hash_for_every_file() -> None:
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build the wheel without a network and unpack it; return the folder."""
     folder = tmp_path_factory.mktemp("wheel")
-    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-index", "--no-deps"]
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-index",
+        "--no-deps",
+    ]
     command += ["--no-build-isolation", "--wheel-dir", str(folder), str(ROOT)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -241,11 +283,18 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_wheel_holds_the_library_and_nothing_else_in_one_version(wheel: Path) -> None:
     told = ("pyproject.toml", "book/kit/pyproject.toml", "CITATION.cff", "CHANGELOG.md")
-    assert all(distfilt.__version__ in (ROOT / name).read_text("utf-8") for name in told)
-    assert sorted(p.name.partition("-")[0] for p in wheel.iterdir()) == ["distfilt", "distfilt"]
+    assert all(
+        distfilt.__version__ in (ROOT / name).read_text("utf-8") for name in told
+    )
+    assert sorted(p.name.partition("-")[0] for p in wheel.iterdir()) == [
+        "distfilt",
+        "distfilt",
+    ]
     files = (p for p in (wheel / "distfilt").rglob("*") if p.is_file())
     found = sorted(p.relative_to(wheel / "distfilt") for p in files)
-    assert found == sorted(p.relative_to(PACKAGE) for p in [*PATHS, PACKAGE / "py.typed"])
+    assert found == sorted(
+        p.relative_to(PACKAGE) for p in [*PATHS, PACKAGE / "py.typed"]
+    )
 
 
 def test_installed_library_runs_alone(wheel: Path) -> None:

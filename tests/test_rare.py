@@ -21,7 +21,8 @@ from distfilt.updates.particles import distinct_fraction
 U, V = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2)
 SHARP = 1e4 * np.outer(U, U) + 1e-8 * np.outer(V, V)
 STILL, PLANE = (
-    models.Model(d, lambda x, t, dt: x, lambda t, dt, d=d: np.zeros((d, d))) for d in (1, 2)
+    models.Model(d, lambda x, t, dt: x, lambda t, dt, d=d: np.zeros((d, d)))
+    for d in (1, 2)
 )
 
 
@@ -29,34 +30,54 @@ def test_what_is_heard_may_be_a_million_times_sharper() -> None:
     own = GaussianMixture([0.99, 0.01], np.zeros((2, 2)), [1e4 * np.eye(2), np.eye(2)])
     heard = GaussianMixture.gaussian([0.0, 0.0], SHARP)
     assert PartialFusion(own, heard).component_shapes().dropped == 0
-    alone = fuse_mixtures(GaussianMixture.gaussian([0.0, 0.0], 1e4 * np.eye(2)), heard).cov
+    alone = fuse_mixtures(
+        GaussianMixture.gaussian([0.0, 0.0], 1e4 * np.eye(2)), heard
+    ).cov
     assert np.allclose([U @ alone @ U, V @ alone @ V], [1e4, 2e-8], rtol=1e-3)
 
 
 def test_a_first_source_without_weight_is_no_matter() -> None:
-    far, wide = np.full(2, 7e6), SHARP + 3e-8 * np.outer(V, V)
-    means, covs = [far, far + 10 * U, far - 10 * U], [np.full((2, 2), np.nan), SHARP, wide]
+    far = np.full(2, 7e6)
+    wide = SHARP + 3e-8 * np.outer(V, V)
+    means = [far, far + 10 * U, far - 10 * U]
+    covs = [np.full((2, 2), np.nan), SHARP, wide]
     mean, cov = intersect_gaussians(means, covs, [0.0, 0.5, 0.5])
     other = intersect_gaussians(means[::-1], covs[::-1], [0.5, 0.5, 0.0])
     assert np.abs(mean - far).max() < 1e-3 and np.allclose(cov, other[1], rtol=1e-6)
 
 
 def test_mixands_and_weights_at_their_limits() -> None:
-    ghost = GaussianMixture([0.5, 0.3, 0.2, 0.0], [[0.0], [8.0], [9.0], [100.0]], [[[1.0]]] * 4)
-    kept = merge_irrelevant(ghost, GaussianMixture.gaussian([1.2], [[1.0]]), threshold=3.0)
+    ghost = GaussianMixture(
+        [0.5, 0.3, 0.2, 0.0], [[0.0], [8.0], [9.0], [100.0]], [[[1.0]]] * 4
+    )
+    kept = merge_irrelevant(
+        ghost, GaussianMixture.gaussian([1.2], [[1.0]]), threshold=3.0
+    )
     assert np.allclose(sorted(kept.means[kept.weights > 0][:, 0]), [0.0, 8.4])
     gated = partial(within_gate, function=lambda x: x, noise=np.eye(1), gate=3.0)
     assert np.isnan(gated(ghost, np.array([100.0])))
-    assert fuse_mixtures(ghost, ghost.marginal([0]), omega=1.0, n_components=2).n_components == 2
+    assert (
+        fuse_mixtures(
+            ghost, ghost.marginal([0]), omega=1.0, n_components=2
+        ).n_components
+        == 2
+    )
     with pytest.raises(ValueError, match=r"needs a sum of 1, got 1\.00000"):
-        GaussianMixture(np.full(7, 1 / 7, np.float32), np.zeros((7, 1)), np.ones((7, 1, 1)))
+        GaussianMixture(
+            np.full(7, 1 / 7, np.float32), np.zeros((7, 1)), np.ones((7, 1, 1))
+        )
     parts = np.ones(1), np.zeros((1, 1)), np.ones((1, 1))
-    assert GaussianMixture.unpack(parts).weights is not parts[0] and parts[1].flags.writeable
+    assert (
+        GaussianMixture.unpack(parts).weights is not parts[0]
+        and parts[1].flags.writeable
+    )
 
 
 def test_news_wait_while_the_radio_is_off_or_there_is_too_little_to_say() -> None:
     off = Faults(silent=[0], during=[(0.5, 1.5)])
-    make = partial(InformationIncrementFilter, STILL, graph=graphs.path(2), target_dim=1)
+    make = partial(
+        InformationIncrementFilter, STILL, graph=graphs.path(2), target_dim=1
+    )
     f = make([component([0], std=1.0)] * 2, faults=off)
     state = f.start(([0.0], [[1.0]]))
     for t in (1.0, 2.0):
@@ -71,7 +92,9 @@ def test_news_wait_while_the_radio_is_off_or_there_is_too_little_to_say() -> Non
 
 def test_maps_of_many_ensembles_tell_members_from_observations() -> None:
     y, x = np.random.default_rng(0).standard_normal((2, 4, 50, 1))
-    s, one, aim = affine.fit(y, x), affine.fit(y[0], x[0]), np.arange(4.0)[:, None]
+    s = affine.fit(y, x)
+    one = affine.fit(y[0], x[0])
+    aim = np.arange(4.0)[:, None]
     each = np.stack([affine.fit(y[k], x[k])(y[0, :4], x[0, :4]) for k in range(4)])
     assert np.allclose(s(y[0, :4], x[0, :4]), each, atol=1e-12)
     got = compose(one, y[:, :4], x[:, :4], aim)
@@ -83,7 +106,9 @@ def test_maps_of_many_ensembles_tell_members_from_observations() -> None:
 def test_derivatives_far_from_the_origin_and_of_small_things() -> None:
     for size, far in ((1.0, [4e6, 3e6]), (1e-6, [0.0, 0.0])):
         at = np.array(far) + size * np.array([6.0, 8.0])
-        see = Sensor(1, lambda x, p=far: np.linalg.norm(x - p, axis=-1, keepdims=True), [[1.0]])
+        see = Sensor(
+            1, lambda x, p=far: np.linalg.norm(x - p, axis=-1, keepdims=True), [[1.0]]
+        )
         want = distance([0, 1], std=1.0, origin=far).jacobian(at)
         assert np.abs(see.jacobian(at) - want).max() < 1e-4
     wrong = Sensor(1, lambda x: x[..., :1], [[1.0]], linear=lambda d: np.eye(d)[1:2])
@@ -94,7 +119,9 @@ def test_derivatives_far_from_the_origin_and_of_small_things() -> None:
 def test_networks_that_are_uneven_silent_or_without_a_link() -> None:
     hub = [(0, i) for i in range(1, 21)] + [(i, i + 1) for i in range(1, 20)]
     with pytest.raises(ValueError, match="rounding"):
-        network.finite_time_consensus(np.zeros((21, 1)), Channel(Graph.from_edges(21, hub)))
+        network.finite_time_consensus(
+            np.zeros((21, 1)), Channel(Graph.from_edges(21, hub))
+        )
     x = np.array([[0.0], [3.0], [6.0]])
     box = Channel(graphs.path(3)).broadcast(list(x))
     x += 1
@@ -107,10 +134,18 @@ def test_networks_that_are_uneven_silent_or_without_a_link() -> None:
 
 def test_swarms_and_particles_that_begin_oddly() -> None:
     x = np.random.default_rng(0).random((4, 2))
-    start, box = np.where(np.arange(4)[:, None] == 2, np.nan, x), density.Grid((9, 9))
+    start = np.where(np.arange(4)[:, None] == 2, np.nan, x)
+    box = density.Grid((9, 9))
     flow = density.FokkerPlanck(models.rotating_swarm(), box)
-    f = filters.DensityFilter(flow, 4, 2.0, fusion=density.Flooding(), bandwidth=0.15, rank=9,
-                              initial_density="observed")
+    f = filters.DensityFilter(
+        flow,
+        4,
+        2.0,
+        fusion=density.Flooding(),
+        bandwidth=0.15,
+        rank=9,
+        initial_density="observed",
+    )
     assert np.allclose(box.integral(f.start(start).estimates), 1.0)
     assert np.allclose(density.bernoulli([-1000.0, -5000.0]), [1000.0, 5000.0])
     assert distinct_fraction(np.stack([np.zeros(9), np.arange(9)], axis=-1)) == 1.0
@@ -118,7 +153,10 @@ def test_swarms_and_particles_that_begin_oddly() -> None:
 
 def test_readings_in_turn_meet_new_predictions_within_a_wrapper() -> None:
     serial = updates.serially(partial(updates.etkf, rotation="none"))
-    eyes = [distance([0, 1], std=0.1, origin=o) for o in ([0.0, 0.0], [3.0, 0.0], [0.0, 3.0])]
+    eyes = [
+        distance([0, 1], std=0.1, origin=o)
+        for o in ([0.0, 0.0], [3.0, 0.0], [0.0, 3.0])
+    ]
     after = []
     for update in (serial, updates.with_inflation(serial, factor=1.0), partial(serial)):
         f = filters.EnsembleFilter(PLANE, [stack(eyes)], update=update, members=50)

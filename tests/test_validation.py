@@ -21,19 +21,30 @@ PUBLIC = {name: thing for room in rooms() for name, thing in public(room).items(
 WITHOUT = {
     r"linalg\..*": "for loops, which have checked before",
     r".*(Error|Collapse|Gain|Disconnected)": "an error or a warning, which a user catches",
-    r"filters\.(\w*State|Summary|Filter)|network\.\w*(State|Result)|metrics\.Interval|coupling\.TransportPlan":
-        "made by the library, or derived from by a user",
+    r"filters\.(\w*State|Summary|Filter)|network\.\w*(State|Result)|metrics\.Interval|coupling\.TransportPlan": "made by the library, or derived from by a user",
     r"ensembles\.Members|models\.Swarm": "a type",
     r"density\.(Centralised|Neighbours|ConsensusProtocol)": "a protocol, and two that have no arguments",
     r"filters\.(Step|final_state|prior_moments)|network\.fusion_rule": "for who writes a filter or a rule",
-    r"updates\.(update|effective_size|with_missing)":
-        "looks at what has no kind: a function's signature, logarithms with -inf, a step's own",
-}  # fmt: skip
+    r"updates\.(update|effective_size|with_missing)": "looks at what has no kind: a function's signature, logarithms with -inf, a step's own",
+}
 """Public names without a door, as patterns, and why."""
 IN_A_ROW = {
-    "graph", "covariance", "members", "weights", "numbers", "columns", "target", "lost", "dropped",
-    "strength", "bodies", "reading", "wanted", "mixtures", "sensor",
-}  # fmt: skip
+    "graph",
+    "covariance",
+    "members",
+    "weights",
+    "numbers",
+    "columns",
+    "target",
+    "lost",
+    "dropped",
+    "strength",
+    "bodies",
+    "reading",
+    "wanted",
+    "mixtures",
+    "sensor",
+}
 """Data that a call may leave out, such as a filter's graph; options are given by name."""
 
 
@@ -54,7 +65,11 @@ def refuses(value: Any, call: Call, name: str) -> bool:
 
 def is_doorless(thing: Any) -> bool:
     """Whether a public name takes arguments and declares nothing about them."""
-    return callable(thing) and not callables(thing) and not isinstance(thing, type(Iterator[int]))
+    return (
+        callable(thing)
+        and not callables(thing)
+        and not isinstance(thing, type(Iterator[int]))
+    )
 
 
 @pytest.mark.parametrize("name", sorted(PUBLIC))
@@ -66,13 +81,17 @@ def test_a_door_refuses_by_name(name: str) -> None:
         for call, (argument, kind) in product(found[:1], describe(function).items()):
             if argument not in call.given:
                 continue
-            bad = [v for _, v in kinds(call.given[argument]) if refuses(v, call, argument)]
+            bad = [
+                v for _, v in kinds(call.given[argument]) if refuses(v, call, argument)
+            ]
             assert bad, f"{name}{method}({argument}): {kind.needs} refuses nothing"
             for value in bad:
                 before = copy.deepcopy(call.given)
                 with pytest.raises(ValueError) as caught:
                     call.run(**{argument: value})
-                assert str(caught.value).startswith(argument), f"{name}{method}: {caught.value}"
+                assert str(caught.value).startswith(argument), (
+                    f"{name}{method}: {caught.value}"
+                )
                 assert exact(before, call.given)
 
 
@@ -82,7 +101,11 @@ def test_a_valid_call_changes_none_of_its_arguments(name: str) -> None:
     for function in callables(PUBLIC[name]).values():
         for call in calls(PUBLIC[name], function)[:1]:
             after = call.run()[1]
-            kept = {k: v for k, v in call.given.items() if not isinstance(v, np.random.Generator)}
+            kept = {
+                k: v
+                for k, v in call.given.items()
+                if not isinstance(v, np.random.Generator)
+            }
             assert exact(kept, {k: after[k] for k in kept}), function
 
 
@@ -96,8 +119,12 @@ def test_options_are_given_by_name() -> None:
     for name, thing in PUBLIC.items():
         if function := callables(thing).get(""):
             parameters = inspect.signature(function).parameters.values()
-            row = {p.name for p in parameters if p.kind < 2 and p.default is not p.empty}
-            assert row <= IN_A_ROW, f"{name}: {sorted(row - IN_A_ROW)} can stand in a row"
+            row = {
+                p.name for p in parameters if p.kind < 2 and p.default is not p.empty
+            }
+            assert row <= IN_A_ROW, (
+                f"{name}: {sorted(row - IN_A_ROW)} can stand in a row"
+            )
 
 
 def test_structures_are_frozen_and_arrays_make_no_equality() -> None:
@@ -106,5 +133,7 @@ def test_structures_are_frozen_and_arrays_make_no_equality() -> None:
         if inspect.isclass(made) and is_dataclass(made):
             options: Any = made.__dataclass_params__  # type: ignore[attr-defined]
             assert options.frozen or name == "filters.Step", f"{name} can be changed"
-            types = " ".join(re.sub(r"Callable\[.*\]", "", str(f.type)) for f in fields(made))
+            types = " ".join(
+                re.sub(r"Callable\[.*\]", "", str(f.type)) for f in fields(made)
+            )
             assert not (options.eq and "Array" in types), f"{name} compares arrays"

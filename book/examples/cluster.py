@@ -19,7 +19,8 @@ f = EnsembleFilter.exact(model, sensors, graphs.ring(4), members=S["members"])
 
 def trial(seed):
     """One truth, its readings, a run: squared error and the claimed, m²."""
-    rng, times = np.random.default_rng(seed), np.arange(1, 11) * 0.5
+    rng = np.random.default_rng(seed)
+    times = np.arange(1, 11) * 0.5
     truth = simulate(model, [4.0, 4.0, 0.1, 0.0], times, rng=rng)
     seen = [sensor.observe(truth, rng=rng) for sensor in sensors]
     state = f.start(([4, 4, 0, 0], np.diag([1, 1, 0.1, 0.1])), rng=rng)
@@ -41,8 +42,14 @@ def executor(where):
 
 if __name__ == "__main__":
     where, *some = sys.argv[1:]
-    print(studies.store(
-        "errors.csv", trial, studies.spawn(2026, 40), columns=COLUMNS,
-        parameters=S, executor=executor(where),
-        indices=range(*map(int, some)) if some else None,
-    ))
+    print(
+        studies.store(
+            "errors.csv",
+            trial,
+            studies.spawn(2026, 40),
+            columns=COLUMNS,
+            parameters=S,
+            executor=executor(where),
+            indices=range(*map(int, some)) if some else None,
+        )
+    )

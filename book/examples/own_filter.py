@@ -22,15 +22,23 @@ class GridFilter(Filter):
     def initial_state(self, prior, runs, rng):
         mean, cov = prior_moments(prior, 1)
         belief = np.exp(-((X.T - mean) ** 2) / (2 * cov))
-        return {"chances": np.broadcast_to(belief / belief.sum(), (*runs, self.n_agents, len(X)))}
+        return {
+            "chances": np.broadcast_to(
+                belief / belief.sum(), (*runs, self.n_agents, len(X))
+            )
+        }
 
     def next_state(self, step):
         gap = X.T - self.model.step(X, step.state.t, step.dt)
         kernel = np.exp(-(gap**2) / (2 * self.model.Q(step.state.t, step.dt)))
         belief = step.state.chances @ (kernel / kernel.sum(axis=1, keepdims=True))
         for _, heard in step.received():
-            seen = heard.predict(np.broadcast_to(X, (*belief[..., heard.agents, :].shape, 1)))
-            gap = np.nan_to_num(heard.target[..., None, :] - seen)  # what is missing says nothing
+            seen = heard.predict(
+                np.broadcast_to(X, (*belief[..., heard.agents, :].shape, 1))
+            )
+            gap = np.nan_to_num(
+                heard.target[..., None, :] - seen
+            )  # what is missing says nothing
             noise = np.diagonal(heard.noise, axis1=-2, axis2=-1)[..., None, :]
             belief[..., heard.agents, :] *= np.exp(-(gap**2 / noise).sum(-1) / 2)
         return step.end(chances=belief / belief.sum(axis=-1, keepdims=True))

@@ -22,9 +22,21 @@ def median_of_means(ensembles, channel):
 walk = Model(1, lambda x, t, dt: x, lambda t, dt: 0.1 * dt * np.eye(1), units=("m",))
 sensors = [component([0], std=0.5) for _ in range(5)]
 f = EnsembleFilter(
-    walk, sensors, graphs.complete(5), fusion=median_of_means, share_observations=False, members=100
+    walk,
+    sensors,
+    graphs.complete(5),
+    fusion=median_of_means,
+    share_observations=False,
+    members=100,
 )
 state = f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0))
-readings = [np.full((20, 1), 1.0)] * 4 + [np.full((20, 1), 30.0)]  # the last sensor is broken
+readings = [np.full((20, 1), 1.0)] * 4 + [
+    np.full((20, 1), 30.0)
+]  # the last sensor is broken
 run = f.run(state, np.arange(1.0, 21.0), readings)
-print(run["mean"].values[-1, :, 0].round(1), "m;", run["scalars"].values[-1].sum(), "numbers")
+print(
+    run["mean"].values[-1, :, 0].round(1),
+    "m;",
+    run["scalars"].values[-1].sum(),
+    "numbers",
+)

@@ -11,24 +11,40 @@ from distfilt.models import constant_velocity, rotating_swarm, simulate
 from distfilt.network import covariance_intersection, graphs
 from distfilt.sensors import component
 
-walk, rng, times = constant_velocity(sigma=0.1), np.random.default_rng(0), np.arange(1, 31) * 0.5
-eyes, net = [component([k % 2], std=0.5) for k in range(4)], graphs.ring(4)
+walk = constant_velocity(sigma=0.1)
+rng = np.random.default_rng(0)
+times = np.arange(1, 31) * 0.5
+eyes = [component([k % 2], std=0.5) for k in range(4)]
+net = graphs.ring(4)
 prior = (np.zeros(4), np.diag([4.0, 4.0, 0.2, 0.2]))
 truth = simulate(walk, rng.multivariate_normal(*prior), times, rng=rng)
 walkers = prior, truth, [eye.observe(truth, rng=rng) for eye in eyes]
-swarm, grid, first = rotating_swarm("gibbs"), Grid((12, 12)), rng.random((40, 2))
-law, path = FokkerPlanck(swarm, grid), swarm.simulate(first, times, rng=rng, substeps=5)
+swarm = rotating_swarm("gibbs")
+grid = Grid((12, 12))
+first = rng.random((40, 2))
+law = FokkerPlanck(swarm, grid)
+path = swarm.simulate(first, times, rng=rng, substeps=5)
 crowd = first, law.evolve(np.ones(144), times), path.swapaxes(0, 1)
-fuse, intersect = partial(target_fusion, target_dim=4), covariance_intersection
+fuse = partial(target_fusion, target_dim=4)
+intersect = covariance_intersection
 
 problems = {
     "ensemble": (filters.EnsembleFilter(walk, eyes, net), walkers),
     "gaussian": (filters.GaussianFilter(walk, eyes, net, fusion=intersect), walkers),
     "particle": (filters.ParticleFilter(walk, eyes, net, members=2000), walkers),
     "transport": (filters.TransportFilter(walk, eyes, net, rejuvenation=0.2), walkers),
-    "mixture": (filters.MixtureFilter(walk, eyes, net, fusion=fuse, target_dim=4), walkers),
-    "news": (filters.InformationIncrementFilter(walk, eyes, net, target_dim=4), walkers),
-    "density": (filters.DensityFilter(law, 40, 0.4, fusion=Flooding(), bandwidth=0.12), crowd),
+    "mixture": (
+        filters.MixtureFilter(walk, eyes, net, fusion=fuse, target_dim=4),
+        walkers,
+    ),
+    "news": (
+        filters.InformationIncrementFilter(walk, eyes, net, target_dim=4),
+        walkers,
+    ),
+    "density": (
+        filters.DensityFilter(law, 40, 0.4, fusion=Flooding(), bandwidth=0.12),
+        crowd,
+    ),
 }
 print("filter      error   NEES/d  floats")
 for name, (f, (begin, true, seen)) in problems.items():

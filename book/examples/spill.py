@@ -11,7 +11,8 @@ from distfilt.sensors import Sensor
 
 rng = np.random.default_rng(0)
 turn = lambda x, t, dt: x + dt * np.stack([-x[..., 1], x[..., 0]], axis=-1)  # noqa: E731
-names, units = ("x", "y"), ("km", "km")
+names = ("x", "y")
+units = ("km", "km")
 model = Model(2, turn, lambda t, dt: 0.01 * dt * np.eye(2), names=names, units=units)
 buoys = np.array([[2.0, 0.0], [0.0, 2.0], [-2.0, 0.0], [0.0, -2.0]])
 reach = lambda place, x: np.exp(-((x - place) ** 2).sum(-1, keepdims=True) / 8)  # noqa: E731
@@ -21,7 +22,11 @@ ring = Graph.from_adjacency([[0, 1, 0, 1], [1, 0, 1, 0], [0, 1, 0, 1], [1, 0, 1,
 times = np.arange(1, 61) * 0.05
 truth = simulate(model, [1.0, 0.0], times, rng=rng)
 seen = [sensor.observe(truth, rng=rng) for sensor in sensors]
-spill = EnsembleFilter(model, sensors, ring, fusion=partial(mean_pull, gain=0.02), members=300)
+spill = EnsembleFilter(
+    model, sensors, ring, fusion=partial(mean_pull, gain=0.02), members=300
+)
 state = spill.start(([0.5, 0.5], np.eye(2)), rng=rng)
 run = spill.run(state, times, seen, truth=truth)
-print(run["total_squared_error"].sel(time=slice(2, 3)).mean("time").values.round(3), "km²")
+print(
+    run["total_squared_error"].sel(time=slice(2, 3)).mean("time").values.round(3), "km²"
+)

@@ -22,9 +22,9 @@ from distfilt.network import Graph, intersect_ensembles, mean_pull
 from distfilt.sensors import Sensor, from_name
 from distfilt.updates import (
     enkf,
+    enkf_sampled_covariance,
     principal_components,
     principal_directions,
-    enkf_sampled_covariance,
     transport_map_update,
     update,
 )
@@ -68,16 +68,24 @@ class Setup:
 def setup(name: str, **changes: Any) -> Setup:
     """The set-up of ``table-2`` or ``table-3``, with other values of some parameters."""
     s = scenario(PAPER, name).replace(**changes).reading()
-    start, dt = np.array(s["initial_state"]), s["dt_observe"]
+    start = np.array(s["initial_state"])
+    dt = s["dt_observe"]
     if name == "table-2":
         make = partial(clohessy_wiltshire, rate=s["orbital_rate"])
-        offset, variance = s["prior_offset"] * np.ones(6), s["prior_variance"] * np.ones(6)
+        offset = s["prior_offset"] * np.ones(6)
+        variance = s["prior_variance"] * np.ones(6)
     elif name == "table-3":
-        make = partial(satellite_pose, rate=s["orbital_rate"], step=s["integration_step"])
+        make = partial(
+            satellite_pose, rate=s["orbital_rate"], step=s["integration_step"]
+        )
         if make(sigma=0.0).names != tuple(s["state_order"]):
-            raise ValueError(f"state_order: needs that of satellite_pose, got {s['state_order']}")
-        moved, wide = s["prior_offset_translation"], s["prior_variance_translation"]
-        turned, loose = s["prior_offset_attitude"], s["prior_variance_attitude"]
+            raise ValueError(
+                f"state_order: needs that of satellite_pose, got {s['state_order']}"
+            )
+        moved = s["prior_offset_translation"]
+        wide = s["prior_variance_translation"]
+        turned = s["prior_offset_attitude"]
+        loose = s["prior_variance_attitude"]
         offset = np.repeat([moved, turned], [6, 7])
         variance = np.repeat([wide, loose], [6, 7])
     n = round((s["end_time"] - s["first_observation"]) / dt) + 1
@@ -113,12 +121,15 @@ def data(
     truth = simulate(s.model if noisy else s.still, start, s.times, rng=rng)
     before = np.concatenate([start[None], truth[:-1]])
     seen = [
-        q.observe(truth, rng=rng, previous=before if q.uses_previous else None) for q in s.sensors
+        q.observe(truth, rng=rng, previous=before if q.uses_previous else None)
+        for q in s.sensors
     ]
     return truth, seen
 
 
-def published(s: Setup, *, pca: bool, noise_factor: float = 1.0, **changes: Any) -> EnsembleFilter:
+def published(
+    s: Setup, *, pca: bool, noise_factor: float = 1.0, **changes: Any
+) -> EnsembleFilter:
     """Algorithm 1 of the paper, in principal components (Algorithm 2) or without.
 
     Without them the update is `enkf_sampled_covariance`, which is the affine map in closed form.
@@ -130,7 +141,11 @@ def published(s: Setup, *, pca: bool, noise_factor: float = 1.0, **changes: Any)
         rule = partial(principal_components, noise_factor=noise_factor, **options)
     else:
         full = noise_factor == 1
-        rule = enkf_sampled_covariance if full else partial(transport_map_update, noise_factor=noise_factor)
+        rule = (
+            enkf_sampled_covariance
+            if full
+            else partial(transport_map_update, noise_factor=noise_factor)
+        )
     return _filter(s, rule, partial(mean_pull, **(s.pull | changes)))
 
 
@@ -150,11 +165,14 @@ def noise_free(
     The members then determine the predictions, and where these are singular a map does not exist;
     a pseudo-inverse gives the gain that is nearest to it.
     """
-    d, m = ensemble.shape[-1], predicted.shape[-1]
+    d = ensemble.shape[-1]
+    m = predicted.shape[-1]
     w = principal_directions(ensemble, n_state or d)
     v = principal_directions(predicted, min(n_observed or m, m))
-    x, h = ensemble @ w, predicted @ v
-    dx, dh = x - x.mean(axis=-2, keepdims=True), h - h.mean(axis=-2, keepdims=True)
+    x = ensemble @ w
+    h = predicted @ v
+    dx = x - x.mean(axis=-2, keepdims=True)
+    dh = h - h.mean(axis=-2, keepdims=True)
     across = np.swapaxes(dh, -1, -2)
     gain = np.linalg.pinv(across @ dh, hermitian=True, rtol=1e-12) @ (across @ dx)
     step = (observed[..., None, :] @ v - h) @ gain
@@ -163,10 +181,17 @@ def noise_free(
 
 def repaired(s: Setup, kind: str) -> EnsembleFilter:
     """One of the filters of the section "Better": what the update knows, how agents agree."""
-    fuse = partial(intersect_ensembles, rule="trace", scale=np.sqrt(np.diag(s.prior[1])))
+    fuse = partial(
+        intersect_ensembles, rule="trace", scale=np.sqrt(np.diag(s.prior[1]))
+    )
     if kind == "exact":
         return EnsembleFilter.exact(
-            s.model, s.sensors, s.graph, members=s.members, names=s.names, on_error="keep"
+            s.model,
+            s.sensors,
+            s.graph,
+            members=s.members,
+            names=s.names,
+            on_error="keep",
         )
     rule, agreement = {
         "sampled_fused": (enkf_sampled_covariance, fuse),
@@ -179,9 +204,15 @@ def repaired(s: Setup, kind: str) -> EnsembleFilter:
 
 def _filter(s: Setup, rule: Any, agreement: Any) -> EnsembleFilter:
     return EnsembleFilter(
-        s.model, s.sensors, s.graph, update=rule, fusion=agreement, members=s.members,
-        names=s.names, on_error="keep",
-    )  # fmt: skip
+        s.model,
+        s.sensors,
+        s.graph,
+        update=rule,
+        fusion=agreement,
+        members=s.members,
+        names=s.names,
+        on_error="keep",
+    )
 
 
 def run(
@@ -202,17 +233,25 @@ def short(value: Any) -> float:
     return float(f"{float(value):.6g}")
 
 
-def scored(s: Setup, name: str, result: Any, *, each_agent: bool = True) -> dict[str, float]:
+def scored(
+    s: Setup, name: str, result: Any, *, each_agent: bool = True
+) -> dict[str, float]:
     """What is stored of each run: settled error (of each agent), NEES/d, distance of the means."""
     late = result.isel(time=s.settled)
     error = late["total_squared_error"].mean("time").values
     gap = late["mean"] - late["mean"].mean("agent")
     apart = (gap**2).sum("component").mean(("time", "agent")).values
-    nees = late["nees"].mean(("time", "agent")).values / s.model.dim if "nees" in late else None
+    nees = (
+        late["nees"].mean(("time", "agent")).values / s.model.dim
+        if "nees" in late
+        else None
+    )
     out: dict[str, float] = {}
     for r in range(error.shape[0]):
         if each_agent:
-            out |= {f"{name}_mse_{a}_{r}": float(error[r, k]) for k, a in enumerate(s.names)}
+            out |= {
+                f"{name}_mse_{a}_{r}": float(error[r, k]) for k, a in enumerate(s.names)
+            }
             out[f"{name}_apart_{r}"] = float(apart[r])
         else:
             out[f"{name}_mse_{r}"] = float(error[r].mean())
@@ -221,7 +260,9 @@ def scored(s: Setup, name: str, result: Any, *, each_agent: bool = True) -> dict
     return out
 
 
-def score_columns(s: Setup, name: str, batch: int, *, each_agent: bool = True) -> list[str]:
+def score_columns(
+    s: Setup, name: str, batch: int, *, each_agent: bool = True
+) -> list[str]:
     """The names of what `scored` gives with NEES."""
     out = []
     for r in range(batch):
@@ -271,7 +312,8 @@ class Kept:
     """What a study stored, or what a changed scenario gives now, run by run and over time."""
 
     def __init__(self, columns: Any, batch: int) -> None:
-        self.columns, self.batch = columns, batch
+        self.columns = columns
+        self.batch = batch
 
     @property
     def runs(self) -> int:
@@ -307,7 +349,9 @@ def repeat(*scripts: ModuleType) -> None:
     from loky import ProcessPoolExecutor, cpu_count
 
     # A worker whose memory has grown is replaced, at no cost; the warning is not for a reader.
-    warnings.filterwarnings("ignore", message="A worker (stopped|was restarted) while some")
+    warnings.filterwarnings(
+        "ignore", message="A worker (stopped|was restarted) while some"
+    )
     pool = ProcessPoolExecutor(cpu_count())
     for script in scripts:
         if not script.SETUP.changed:
@@ -323,9 +367,16 @@ def _again(name: str) -> str:
     found = studies.stored(script.PAPER, script.NAME)
     if hasattr(script, "part"):
         now = script.part(found.seed(0))
-        wrong = [c for c, value in now.items()
-                 if not np.isclose(value, found.columns[c][0], script.rtol, 0)]  # fmt: skip
-        return f"{name}: another run does not give what is stored: {wrong}" if wrong else ""
+        wrong = [
+            c
+            for c, value in now.items()
+            if not np.isclose(value, found.columns[c][0], script.rtol, 0)
+        ]
+        return (
+            f"{name}: another run does not give what is stored: {wrong}"
+            if wrong
+            else ""
+        )
     options = {k: getattr(script, k) for k in ("rtol", "rough") if hasattr(script, k)}
     try:
         studies.check(found, script.trial, indices=[0], **options)

@@ -22,9 +22,12 @@ from distfilt.network import Faults
 sys.path.insert(0, str(Path(__file__).parent))
 import densities
 
-SWARM, CHOICES = densities.SWARM, densities.CHOICES
+SWARM = densities.SWARM
+CHOICES = densities.CHOICES
 SHARING = scenario("zheng", "locals")
-LOCAL, FLAT, MODES = int(SHARING["local"]), CHOICES["local_prior_std"], SHARING["modes"]
+LOCAL = int(SHARING["local"])
+FLAT = CHOICES["local_prior_std"]
+MODES = SHARING["modes"]
 GAINS = {"alpha": SWARM["pi_alpha"], "a": SWARM["pi_proportional"]}
 PAPERS = {**GAINS, "b": SWARM["pi_integral"]}
 FAST = {**GAINS, "b": 10 * SWARM["pi_integral"]}
@@ -43,7 +46,10 @@ SCHEMES: dict[str, tuple[Any, dict[str, Any]]] = {
     "stiff": (density.PIConsensus(modes=MODES, **STIFF), {}),
     "stiff_flat": (density.PIConsensus(modes=MODES, initial_std=FLAT, **STIFF), {}),
     "steps_flat": (density.PIConsensus(modes=MODES, initial_std=FLAT, **STEPS), {}),
-    "steps_printed": (density.PIConsensus(modes=MODES, initial_std=FLAT, **STEPS), PRINTED),
+    "steps_printed": (
+        density.PIConsensus(modes=MODES, initial_std=FLAT, **STEPS),
+        PRINTED,
+    ),
     "average": (density.DynamicAverage(), {}),
     "flooding": (density.Flooding(), {}),
     "flooding_forgets": (density.Flooding(forget=SHARING["forget"]), {}),
@@ -93,10 +99,16 @@ def network(
     model = density.FokkerPlanck(densities.swarm(case.reading, case.phase), case.grid)
     who = tuple(range(local)) if isinstance(local, int) else tuple(local)
     return DensityFilter(
-        model, case.agents, case.radio_range, fusion=sharing, bandwidth=case.bandwidth,
+        model,
+        case.agents,
+        case.radio_range,
+        fusion=sharing,
+        bandwidth=case.bandwidth,
         local=who[:1] if scheme.startswith("central") else who,
-        prior_length=CHOICES["prior_length"], prior_std=CHOICES["prior_std"],
-        initial_std=FLAT, floor=CHOICES["floor"],
+        prior_length=CHOICES["prior_length"],
+        prior_std=CHOICES["prior_std"],
+        initial_std=FLAT,
+        floor=CHOICES["floor"],
         **{"rank": CHOICES["rank"], **own, **options},
     )
 
@@ -109,26 +121,35 @@ def drawn(case: Case, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]
 
 
 def compared(
-    case: Case, rng: np.random.Generator, filters: dict[str, DensityFilter],
-    watch: Callable[..., None] | None = None, every: int = 1,
+    case: Case,
+    rng: np.random.Generator,
+    filters: dict[str, DensityFilter],
+    watch: Callable[..., None] | None = None,
+    every: int = 1,
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Errors over time, (T, filters) or (T,), and the last states, by scheme.
 
     The errors are noted every so many steps.
     """
-    cells, dt = case.grid, SWARM["dt"]
+    cells = case.grid
+    dt = SWARM["dt"]
     swarm = densities.swarm(case.reading)
     x, p = drawn(case, rng)
     states = {s: f.start(x) for s, f in filters.items()}
     model = density.FokkerPlanck(swarm, cells)
     believed = density.FokkerPlanck(densities.swarm(case.reading, case.phase), cells)
-    opened = np.stack([density.kernel_density(x, cells, bandwidth=case.bandwidth),
-                       density.kernels(x[:1], cells, bandwidth=FLAT)[0]])
+    opened = np.stack(
+        [
+            density.kernel_density(x, cells, bandwidth=case.bandwidth),
+            density.kernels(x[:1], cells, bandwidth=FLAT)[0],
+        ]
+    )
     out: dict[str, list[Any]] = {}
     gone = np.arange(case.agents) >= round((1 - case.gone) * case.agents)
     for j in range(round(case.end / dt)):
         x = swarm.step(x, j * dt, dt, rng=rng, substeps=CHOICES["substeps"])
-        p, opened = model.step(p, j * dt, dt), believed.step(opened, j * dt, dt)
+        p = model.step(p, j * dt, dt)
+        opened = believed.step(opened, j * dt, dt)
         late = (j + 1) * dt > case.gone_at
         seen = np.where((gone & late)[:, None], np.nan, x)
         for s, f in filters.items():
@@ -138,8 +159,11 @@ def compared(
         if (j + 1) % every:
             continue
         y = density.kernel_density(x[~(gone & late)], cells, bandwidth=case.bandwidth)
-        noted = {"kde": cells.norm(y - p), "open": cells.norm(opened[0] - p),
-                 "open_flat": cells.norm(opened[1] - p)}
+        noted = {
+            "kde": cells.norm(y - p),
+            "open": cells.norm(opened[0] - p),
+            "open_flat": cells.norm(opened[1] - p),
+        }
         for s, state in states.items():
             noted[f"{s}_error"] = cells.norm(state.estimates - p)
             noted[f"{s}_consensus"] = cells.norm(state.observed - y)
@@ -148,10 +172,14 @@ def compared(
     return {name: np.array(values) for name, values in out.items()}, states
 
 
-def average(values: np.ndarray, case: Case, start: float, end: float | None = None) -> np.ndarray:
+def average(
+    values: np.ndarray, case: Case, start: float, end: float | None = None
+) -> np.ndarray:
     """Mean over the times from `start` to `end`."""
     k = len(values) / case.end
-    return values[round(start * k): None if end is None else round(end * k)].mean(axis=0)
+    return values[round(start * k) : None if end is None else round(end * k)].mean(
+        axis=0
+    )
 
 
 code = (compared, network, drawn, average)

@@ -40,19 +40,26 @@ class Team:
 
     def state(self, egos: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Transition, noise and first covariance of [target; egos]."""
-        (n, e), own = self.dims, np.eye(egos)
-        blocks = (self.move, np.kron(own, np.eye(e))), (self.noise, np.kron(own, np.zeros((e, e))))
+        (n, e) = self.dims
+        own = np.eye(egos)
+        blocks = (
+            (self.move, np.kron(own, np.eye(e))),
+            (self.noise, np.kron(own, np.zeros((e, e)))),
+        )
         full = [np.zeros((n + egos * e, n + egos * e)) for _ in range(3)]
-        for out, (a, b) in zip(full, (*blocks, (self.target_cov, np.kron(own, self.ego_cov))),
-                               strict=True):  # fmt: skip
-            out[:n, :n], out[n:, n:] = a, b
+        for out, (a, b) in zip(
+            full, (*blocks, (self.target_cov, np.kron(own, self.ego_cov))), strict=True
+        ):
+            out[:n, :n] = a
+            out[n:, n:] = b
         return full[0], full[1], full[2]
 
     def sees(self, agent: int, egos: int) -> np.ndarray:
         """The matrix H of an agent's reading of [target; egos]."""
         n, e = self.dims
         h = np.zeros((e, n + egos * e))
-        h[:, :e], h[:, n + agent * e : n + (agent + 1) * e] = np.eye(e), -np.eye(e)
+        h[:, :e] = np.eye(e)
+        h[:, n + agent * e : n + (agent + 1) * e] = -np.eye(e)
         return h
 
     @property
@@ -62,13 +69,19 @@ class Team:
 
     def data(self, steps: int, runs: int, rng: np.random.Generator) -> tuple:
         """Targets (steps, runs, n) and readings (steps, runs, A, e)."""
-        (n, e), (move, noise, first) = self.dims, self.state(self.size)
+        (n, e) = self.dims
+        (move, noise, first) = self.state(self.size)
         x = rng.multivariate_normal(np.zeros(len(first)), first, size=runs)
         h = np.array([self.sees(a, self.size) for a in range(self.size)])
-        truth, seen = [], []
+        truth = []
+        seen = []
         for _ in range(steps):
-            x = x @ move.T + rng.multivariate_normal(np.zeros(len(x.T)), noise, size=runs)
-            errors = rng.multivariate_normal(np.zeros(e), self.reading_cov, size=(runs, self.size))
+            x = x @ move.T + rng.multivariate_normal(
+                np.zeros(len(x.T)), noise, size=runs
+            )
+            errors = rng.multivariate_normal(
+                np.zeros(e), self.reading_cov, size=(runs, self.size)
+            )
             truth.append(x[:, :n])
             seen.append((h @ x[:, None, :, None])[..., 0] + errors)
         return np.array(truth), np.array(seen)
@@ -84,14 +97,17 @@ class Team:
         """Beliefs about the target after each step, (steps, runs, A, n) and (steps, ..., n, n)."""
         if way == "joint":
             return self._joint(seen)
-        (n, _), (move, noise, first) = self.dims, self.state(1)
+        (n, _) = self.dims
+        (move, noise, first) = self.state(1)
         steps, runs = seen.shape[:2]
         mean = np.zeros((runs, self.size, len(first)))
         cov = np.broadcast_to(first, (runs, self.size, *first.shape))
         out = []
         for k in range(steps):
             before = mean @ move.T, move @ cov @ move.T + noise
-            after = known(*before, self.sees(0, 1), self.reading_cov, seen[k], self.gate)
+            after = known(
+                *before, self.sees(0, 1), self.reading_cov, seen[k], self.gate
+            )
             mean, cov = after
             if way != "alone":
                 exchange = {"news": _news, "intersection": _intersected}[way]
@@ -102,17 +118,30 @@ class Team:
     def joint(self) -> GaussianFilter:
         """The filter of [target; all egos] that every agent runs, readings being told."""
         move, noise, _ = self.state(self.size)
-        model = LinearModel.from_transition(len(move), lambda dt: move, lambda t, dt: noise)
+        model = LinearModel.from_transition(
+            len(move), lambda dt: move, lambda t, dt: noise
+        )
         eyes = []
         for agent in range(self.size):
             h = self.sees(agent, self.size)
-            eyes.append(Sensor(len(h), lambda x, h=h: x @ h.T, self.reading_cov,
-                               linear=lambda d, h=h: h))  # fmt: skip
-        return GaussianFilter(model, eyes, self.graph, faults=self.faults, gate_probability=self.gate)
+            eyes.append(
+                Sensor(
+                    len(h),
+                    lambda x, h=h: x @ h.T,
+                    self.reading_cov,
+                    linear=lambda d, h=h: h,
+                )
+            )
+        return GaussianFilter(
+            model, eyes, self.graph, faults=self.faults, gate_probability=self.gate
+        )
 
     def _joint(self, seen: np.ndarray) -> Belief:
-        f, (n, _), first = self.joint(), self.dims, self.state(self.size)[2]
-        state, out = f.start((np.zeros(len(first)), first), runs=seen.shape[1:2]), []
+        f = self.joint()
+        (n, _) = self.dims
+        first = self.state(self.size)[2]
+        state = f.start((np.zeros(len(first)), first), runs=seen.shape[1:2])
+        out = []
         for k, y in enumerate(seen):
             state = f.step(state, k + 1.0, list(np.moveaxis(y, 1, 0)))
             out.append((state.means[..., :n], state.covariances[..., :n, :n]))
@@ -120,11 +149,16 @@ class Team:
 
 
 def known(
-    mean: np.ndarray, cov: np.ndarray, h: np.ndarray, r: np.ndarray, y: np.ndarray,
+    mean: np.ndarray,
+    cov: np.ndarray,
+    h: np.ndarray,
+    r: np.ndarray,
+    y: np.ndarray,
     gate: float | None = None,
 ) -> Belief:
     """Gaussians after readings y of h; one that fails the gate changes nothing."""
-    gap, spread = (y - mean @ h.T)[..., None], h @ cov @ h.T + r
+    gap = (y - mean @ h.T)[..., None]
+    spread = h @ cov @ h.T + r
     gain = np.linalg.solve(spread, h @ cov).mT
     if gate is not None:
         far = (gap.mT @ np.linalg.solve(spread, gap))[..., 0, 0]

@@ -25,25 +25,29 @@ from _together_mixtures import Mixtures
 from bookkit.published import scenario
 from distfilt import filters, metrics, models, network, sensors
 from distfilt.ensembles import sample_covariance
-from distfilt.filters import EnsembleFilter, GaussianFilter, ParticleFilter, Observation
+from distfilt.filters import EnsembleFilter, GaussianFilter, Observation, ParticleFilter
 from distfilt.network import covariance_intersection, graphs
 from distfilt.triangular import separable
 from distfilt.updates import (
-    enkf_exact,
-    with_inflation,
     enkf,
-    resample,
+    enkf_exact,
     enkf_sampled_covariance,
     etkf,
+    resample,
     transport_map_update,
+    with_inflation,
 )
 
 Array = np.ndarray
-LINEAR, RANGE = scenario("together", "linear"), scenario("together", "range")
-LORENZ, PLACES = scenario("together", "lorenz"), scenario("together", "places")
-STUDY, TUNED = scenario("together", "study"), scenario("together", "tuned")
+LINEAR = scenario("together", "linear")
+RANGE = scenario("together", "range")
+LORENZ = scenario("together", "lorenz")
+PLACES = scenario("together", "places")
+STUDY = scenario("together", "study")
+TUNED = scenario("together", "tuned")
 HELD = scenario("together", "held")
-BATCH, TUNING = STUDY["batch"], (STUDY["tuning_seed"], STUDY["tuning_runs"])
+BATCH = STUDY["batch"]
+TUNING = (STUDY["tuning_seed"], STUDY["tuning_runs"])
 
 
 # ------------------------------------------------------------------------------------- problems
@@ -104,11 +108,22 @@ def clock(s: Any) -> Array:
 def linear(s: Any = LINEAR, agents: int | None = None) -> Problem:
     """Eight agents on a ring see one coordinate each of a walker."""
     agents = agents or s["agents"]
-    model = replace(models.constant_velocity(sigma=s["sigma"]), names=("x", "y", "u", "v"))
+    model = replace(
+        models.constant_velocity(sigma=s["sigma"]), names=("x", "y", "u", "v")
+    )
     eyes = [sensors.component([k % 2], std=s["reading_std"]) for k in range(agents)]
     prior = np.zeros(4), np.diag(np.square(s["prior_std"]))
-    return Problem("linear", model, eyes, graphs.ring(agents), prior, clock(s), s["burn"],
-                   ("x", "y", "u", "v"), scenario=s)  # fmt: skip
+    return Problem(
+        "linear",
+        model,
+        eyes,
+        graphs.ring(agents),
+        prior,
+        clock(s),
+        s["burn"],
+        ("x", "y", "u", "v"),
+        scenario=s,
+    )
 
 
 def turn(angle: float) -> Array:
@@ -118,20 +133,38 @@ def turn(angle: float) -> Array:
 
 def ranges(s: Any = RANGE, agents: int | None = None) -> Problem:
     """A turning target, seen in range by a ring; at times all are silent but one diameter."""
-    agents, rate, q = agents or s["agents"], s["turn_rate"], s["process_std"] ** 2
+    agents = agents or s["agents"]
+    rate = s["turn_rate"]
+    q = s["process_std"] ** 2
     model = models.LinearModel.from_transition(
-        2, lambda dt: turn(rate * dt), lambda t, dt: q * dt * np.eye(2), names=("x", "y")
+        2,
+        lambda dt: turn(rate * dt),
+        lambda t, dt: q * dt * np.eye(2),
+        names=("x", "y"),
     )
     angles = 2 * np.pi * np.arange(agents) / agents
     at = s["radius"] * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    eyes = [sensors.distance([0, 1], std=s["reading_std"], origin=place) for place in at]
+    eyes = [
+        sensors.distance([0, 1], std=s["reading_std"], origin=place) for place in at
+    ]
     silent = np.zeros((s["steps"], agents), dtype=bool)
     for (begin, end), quarter in zip(s["silences"], s["speakers"], strict=True):
         speak = (np.array([0, agents // 2]) + quarter * (agents // 4)) % agents
         silent[begin:end] = ~np.isin(np.arange(agents), speak)
     prior = np.zeros(2), s["prior_std"] ** 2 * np.eye(2)
-    return Problem("range", model, eyes, graphs.ring(agents), prior, clock(s), s["burn"],
-                   ("x", "y"), silent, scenario=s, traits=("curved", "several"))  # fmt: skip
+    return Problem(
+        "range",
+        model,
+        eyes,
+        graphs.ring(agents),
+        prior,
+        clock(s),
+        s["burn"],
+        ("x", "y"),
+        silent,
+        scenario=s,
+        traits=("curved", "several"),
+    )
 
 
 def lorenz(s: Any = LORENZ, agents: int | None = None) -> Problem:
@@ -140,8 +173,18 @@ def lorenz(s: Any = LORENZ, agents: int | None = None) -> Problem:
     model = models.lorenz63(sigma=s["sigma"], step=s["longest_step"])
     eyes = [sensors.component([k % 3], std=s["reading_std"]) for k in range(agents)]
     prior = s["first"], s["prior_std"] ** 2 * np.eye(3)
-    return Problem("lorenz", model, eyes, graphs.path(agents), prior, clock(s), s["burn"],
-                   ("x", "y", "z"), scenario=s, traits=("chaotic",))  # fmt: skip
+    return Problem(
+        "lorenz",
+        model,
+        eyes,
+        graphs.path(agents),
+        prior,
+        clock(s),
+        s["burn"],
+        ("x", "y", "z"),
+        scenario=s,
+        traits=("chaotic",),
+    )
 
 
 def places(s: Any = PLACES, agents: int | None = None) -> Problem:
@@ -149,16 +192,35 @@ def places(s: Any = PLACES, agents: int | None = None) -> Problem:
     agents = agents or s["agents"]
     model, whole = (egos_and_target(s, n) for n in (1, agents))
     eyes = [from_there(s, agent, agents) for agent in range(agents)]
-    own = Problem("places", model[0], [from_there(s, 0, 1)] * agents, graphs.ring(agents),
-                  (np.zeros(6), model[1]), clock(s), s["burn"], ("x", "y", "u", "v"))  # fmt: skip
-    return Problem("places", whole[0], eyes, graphs.ring(agents),
-                   (np.zeros(len(whole[1])), whole[1]), clock(s), s["burn"],
-                   ("x", "y", "u", "v"), own=own, scenario=s, traits=("doubted",))  # fmt: skip
+    own = Problem(
+        "places",
+        model[0],
+        [from_there(s, 0, 1)] * agents,
+        graphs.ring(agents),
+        (np.zeros(6), model[1]),
+        clock(s),
+        s["burn"],
+        ("x", "y", "u", "v"),
+    )
+    return Problem(
+        "places",
+        whole[0],
+        eyes,
+        graphs.ring(agents),
+        (np.zeros(len(whole[1])), whole[1]),
+        clock(s),
+        s["burn"],
+        ("x", "y", "u", "v"),
+        own=own,
+        scenario=s,
+        traits=("doubted",),
+    )
 
 
 def egos_and_target(s: Any, agents: int) -> tuple[Any, Array]:
     """Model and first covariance of [target; egos]; egos stand still."""
-    walk, n = models.constant_velocity(sigma=s["sigma"]), 4 + 2 * agents
+    walk = models.constant_velocity(sigma=s["sigma"])
+    n = 4 + 2 * agents
 
     def move(dt: float) -> Array:
         out = np.eye(n)
@@ -179,49 +241,93 @@ def egos_and_target(s: Any, agents: int) -> tuple[Any, Array]:
 def from_there(s: Any, agent: int, agents: int) -> Any:
     """A sensor of the target's place as seen from an agent's own."""
     h = np.zeros((2, 4 + 2 * agents))
-    h[:, :2], h[:, 4 + 2 * agent : 6 + 2 * agent] = np.eye(2), -np.eye(2)
-    return sensors.Sensor(2, lambda x: x @ h.T, s["reading_std"] ** 2 * np.eye(2),
-                          linear=lambda d: h)  # fmt: skip
+    h[:, :2] = np.eye(2)
+    h[:, 4 + 2 * agent : 6 + 2 * agent] = -np.eye(2)
+    return sensors.Sensor(
+        2, lambda x: x @ h.T, s["reading_std"] ** 2 * np.eye(2), linear=lambda d: h
+    )
 
 
 def star(s: Any = HELD, agents: int | None = None) -> Problem:
     """Held out: a walk of three components, one of which each agent on a star sees."""
-    agents, q = agents or s["star_agents"], s["star_step_std"] ** 2
+    agents = agents or s["star_agents"]
+    q = s["star_step_std"] ** 2
     model = models.LinearModel.from_transition(
         3, lambda dt: np.eye(3), lambda t, dt: q * dt * np.eye(3), names=("x", "y", "z")
     )
     eyes = [sensors.component([k % 3], std=s["reading_std"]) for k in range(agents)]
-    return Problem("star", model, eyes, graphs.star(agents), (np.zeros(3), 4 * np.eye(3)),
-                   clock(s), s["burn"], ("x", "y", "z"), scenario=s)  # fmt: skip
+    return Problem(
+        "star",
+        model,
+        eyes,
+        graphs.star(agents),
+        (np.zeros(3), 4 * np.eye(3)),
+        clock(s),
+        s["burn"],
+        ("x", "y", "z"),
+        scenario=s,
+    )
 
 
 def angles(s: Any = HELD, agents: int | None = None) -> Problem:
     """Held out: a walker that agents along a road see in directions; all can talk to all."""
     agents = agents or s["road_agents"]
-    model = replace(models.constant_velocity(sigma=s["road_sigma"]), names=("x", "y", "u", "v"))
+    model = replace(
+        models.constant_velocity(sigma=s["road_sigma"]), names=("x", "y", "u", "v")
+    )
     at = np.stack([np.linspace(-6, 6, agents), np.full(agents, -8.0)], axis=-1)
-    eyes = [sensors.line_angle((0, 1), std=s["angle_std"], full=True, origin=o) for o in at]
+    eyes = [
+        sensors.line_angle((0, 1), std=s["angle_std"], full=True, origin=o) for o in at
+    ]
     prior = np.zeros(4), np.diag([4.0, 4.0, 0.25, 0.25])
-    return Problem("angles", model, eyes, graphs.complete(agents), prior, clock(s), s["burn"],
-                   ("x", "y", "u", "v"), scenario=s, traits=("curved",))  # fmt: skip
+    return Problem(
+        "angles",
+        model,
+        eyes,
+        graphs.complete(agents),
+        prior,
+        clock(s),
+        s["burn"],
+        ("x", "y", "u", "v"),
+        scenario=s,
+        traits=("curved",),
+    )
 
 
 def mirror(s: Any = HELD, agents: int | None = None) -> Problem:
     """Held out: ranges from a line, on one side of which the target is likelier to be."""
-    agents, q = agents or s["line_agents"], s["line_step_std"] ** 2
+    agents = agents or s["line_agents"]
+    q = s["line_step_std"] ** 2
     model = models.LinearModel.from_transition(
         2, lambda dt: np.eye(2), lambda t, dt: q * dt * np.eye(2), names=("x", "y")
     )
     at = np.stack([np.linspace(-5, 5, agents), np.zeros(agents)], axis=-1)
     eyes = [sensors.distance([0, 1], std=s["range_std"], origin=o) for o in at]
-    return Problem("mirror", model, eyes, graphs.path(agents), (np.array([0.0, 1.0]),
-                   4 * np.eye(2)), clock(s), s["burn"], ("x", "y"), scenario=s,
-                   traits=("curved", "several"))  # fmt: skip
+    return Problem(
+        "mirror",
+        model,
+        eyes,
+        graphs.path(agents),
+        (np.array([0.0, 1.0]), 4 * np.eye(2)),
+        clock(s),
+        s["burn"],
+        ("x", "y"),
+        scenario=s,
+        traits=("curved", "several"),
+    )
 
 
-MAKERS = {"linear": linear, "range": ranges, "lorenz": lorenz, "places": places,
-          "star": star, "angles": angles, "mirror": mirror}  # fmt: skip
-FOUR, THREE = tuple(MAKERS)[:4], tuple(MAKERS)[4:]
+MAKERS = {
+    "linear": linear,
+    "range": ranges,
+    "lorenz": lorenz,
+    "places": places,
+    "star": star,
+    "angles": angles,
+    "mirror": mirror,
+}
+FOUR = tuple(MAKERS)[:4]
+THREE = tuple(MAKERS)[4:]
 
 
 @cache
@@ -247,7 +353,9 @@ class PassedOn:
         return super().advance(step)  # type: ignore[misc]
 
 
-def flooded(said: list[list[Observation]], channel: Any, t: float) -> list[list[Observation]]:
+def flooded(
+    said: list[list[Observation]], channel: Any, t: float
+) -> list[list[Observation]]:
     """Everybody's reading for everybody, of agents that have one reading at most."""
     known = [{r.agent: r for r in own} for own in said]
     news = [dict(own) for own in known]
@@ -255,7 +363,10 @@ def flooded(said: list[list[Observation]], channel: Any, t: float) -> list[list[
         told = []
         for some in news:
             values = [r.value for r in some.values()]
-            whose = [np.full((*v.shape[:-1], 1), k) for k, v in zip(some, values, strict=True)]
+            whose = [
+                np.full((*v.shape[:-1], 1), k)
+                for k, v in zip(some, values, strict=True)
+            ]
             told.append(tuple(values + whose) if some else None)
         news = [{} for _ in known]
         for agent, box in enumerate(channel.broadcast(told)):
@@ -292,7 +403,9 @@ class MeasurementConsensus(GaussianFilter):
 
     def next_state(self, step: Any) -> Any:
         """Forecast, linearise the own reading, agree, add the information."""
-        t, dt, d = step.state.t, step.dt, self.model.dim
+        t = step.state.t
+        dt = step.dt
+        d = self.model.dim
         slope = self.model.jacobian(step.state.means, t, dt)
         m = self.model.step(step.state.means, t, dt)
         P = slope @ step.state.covariances @ slope.mT + self.model.Q(t, dt)
@@ -300,7 +413,8 @@ class MeasurementConsensus(GaussianFilter):
         said = np.zeros((*m.shape[:-1], d, d + 1))
         for _, heard in step.heard():
             a = heard.agents
-            H, at = heard.jacobian(m[..., a, :]), m[..., a, :, None]
+            H = heard.jacobian(m[..., a, :])
+            at = m[..., a, :, None]
             gap = heard.target - heard.predict(m[..., a, None, :])[..., 0, :]
             W = H.mT @ np.linalg.inv(heard.noise)
             z = gap[..., None] + H @ at
@@ -322,13 +436,19 @@ class OnePlan(filters.TransportFilter):
     def _transported(self, stack: Any, logs: Array, rng: Any) -> Any:
         """The coupling of the first agent, for all."""
         first = [x[..., :1, :, :] for x in stack]
-        same = all(np.array_equal(x, np.broadcast_to(y, x.shape))
-                   for x, y in zip(stack, first, strict=True))  # fmt: skip
+        same = all(
+            np.array_equal(x, np.broadcast_to(y, x.shape))
+            for x, y in zip(stack, first, strict=True)
+        )
         if not same or not np.allclose(logs, logs[..., :1, :], rtol=1e-9, atol=1e-9):
             return super()._transported(stack, logs, rng)
-        one = filters.TransportFilter(self.model, self.sensors[:1], members=self.members,
-                                      correct=self.correct,
-                                      rejuvenation=self.rejuvenation)  # fmt: skip
+        one = filters.TransportFilter(
+            self.model,
+            self.sensors[:1],
+            members=self.members,
+            correct=self.correct,
+            rejuvenation=self.rejuvenation,
+        )
         moved, errors = one._transported(first, logs[..., :1, :], rng)
         return [np.repeat(x, self.n_agents, axis=-3) for x in moved], errors
 
@@ -349,16 +469,22 @@ class OwnState(GaussianFilter):
 
     def next_state(self, step: Any) -> Any:
         """Forecast, take the own reading, tell, learn."""
-        t, dt, n, d = step.state.t, step.dt, self.size, self.model.dim
+        t = step.state.t
+        dt = step.dt
+        n = self.size
+        d = self.model.dim
         F = self.model.jacobian(step.state.means, t, dt)
         m = self.model.step(step.state.means, t, dt)
-        P = self.inflation**2 * (F @ step.state.covariances @ F.mT + self.model.Q(t, dt))
+        P = self.inflation**2 * (
+            F @ step.state.covariances @ F.mT + self.model.Q(t, dt)
+        )
         before = information(m, P, n)
         for _, heard in step.heard():
             H = heard.jacobian(m)
             gain = P @ H.mT @ np.linalg.inv(H @ P @ H.mT + heard.noise)
             gap = heard.target - heard.predict(m[..., None, :])[..., 0, :]
-            m, P = m + (gain @ gap[..., None])[..., 0], P - gain @ H @ P
+            m = m + (gain @ gap[..., None])[..., 0]
+            P = P - gain @ H @ P
         after = information(m, P, n)
         told = packed_news(before, after) if self.news else upper(after)
         inbox = step.channel.broadcast([told[..., k, :] for k in range(self.n_agents)])
@@ -391,7 +517,9 @@ def upper(belief: tuple[Array, Array]) -> Array:
     return np.concatenate([belief[0][..., rows, columns], belief[1]], axis=-1)
 
 
-def packed_news(before: tuple[Array, Array], after: tuple[Array, Array], rank: int = 2) -> Array:
+def packed_news(
+    before: tuple[Array, Array], after: tuple[Array, Array], rank: int = 2
+) -> Array:
     """A gain in information as `rank` readings of unit noise, zero below the diagonal."""
     sizes, axes = np.linalg.eigh(after[0] - before[0])
     H = np.sqrt(sizes[..., -rank:, None]) * axes[..., -rank:].mT
@@ -401,7 +529,9 @@ def packed_news(before: tuple[Array, Array], after: tuple[Array, Array], rank: i
     return np.concatenate([H[..., rows, columns], (turn.mT @ z)[..., 0]], axis=-1)
 
 
-def unpacked(numbers: Array, n: int, *, news: bool, rank: int = 2) -> tuple[Array, Array]:
+def unpacked(
+    numbers: Array, n: int, *, news: bool, rank: int = 2
+) -> tuple[Array, Array]:
     """Information matrix and vector of what was sent."""
     rows = np.triu_indices(rank if news else n, 0, n)
     H = np.zeros((*numbers.shape[:-1], rank if news else n, n))
@@ -426,16 +556,24 @@ class LikelihoodConsensus(ParticleFilter):
     places: tuple[int, ...] = (0, 1)
     share: bool = False
 
-    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(
+        self, prior: Any, runs: tuple[int, ...], rng: Any
+    ) -> dict[str, Any]:
         """The same particles for all."""
-        points = np.repeat(self.draw_prior(prior, (*runs, 1), rng), self.n_agents, axis=-3)
-        return {"points": points, "log_weights": np.full(points.shape[:-1], -np.log(self.members))}
+        points = np.repeat(
+            self.draw_prior(prior, (*runs, 1), rng), self.n_agents, axis=-3
+        )
+        return {
+            "points": points,
+            "log_weights": np.full(points.shape[:-1], -np.log(self.members)),
+        }
 
     def next_state(self, step: Any) -> Any:
         """Resample and move alike, agree on likelihoods, weigh."""
         from distfilt.updates.particles import log_likelihood
 
-        x, w = step.state.points[..., 0, :, :], step.state.weights.mean(axis=-2)
+        x = step.state.points[..., 0, :, :]
+        w = step.state.weights.mean(axis=-2)
         x = np.take_along_axis(x, resample(w, rng=step.rng)[..., None], axis=-2)
         if self.jitter:
             spread = x.std(axis=-2, keepdims=True)
@@ -452,7 +590,9 @@ class LikelihoodConsensus(ParticleFilter):
         found = self.n_agents * self.agree(found, step.channel)
         logs = (basis[..., None, :, :] @ found[..., None])[..., 0]
         logs = logs - logs.max(axis=-1, keepdims=True)
-        logs = np.maximum(logs - np.log(np.exp(logs).sum(axis=-1, keepdims=True)), -1e300)
+        logs = np.maximum(
+            logs - np.log(np.exp(logs).sum(axis=-1, keepdims=True)), -1e300
+        )
         return step.end(points=points, log_weights=logs, past=())
 
 
@@ -460,7 +600,9 @@ def polynomials(x: Array, degree: int) -> Array:
     """Polynomials up to a degree, orthonormal on points (..., N, k), but for the constant."""
     u = (x - x.mean(axis=-2, keepdims=True)) / x.std(axis=-2, keepdims=True)
     powers = [p for p in np.ndindex(*[degree + 1] * x.shape[-1]) if sum(p) <= degree]
-    columns = [np.prod([u[..., k] ** e for k, e in enumerate(p)], axis=0) for p in powers]
+    columns = [
+        np.prod([u[..., k] ** e for k, e in enumerate(p)], axis=0) for p in powers
+    ]
     return np.linalg.qr(np.stack(columns, axis=-1))[0][..., 1:]
 
 
@@ -486,16 +628,18 @@ class GridFilter(filters.Filter):
     half: float = 9.0
     likelihoods: bool = False
 
-    state = GridState
-    fuses = "vectors"
-    unused = {"lag": "a grid keeps no past"}
+    state_class = GridState
+    belief_kind = "vectors"
+    unsupported = {"lag": "a grid keeps no past"}
 
     @property
     def centres(self) -> Array:
         """Where the cells are, (n, 2)."""
         return centres_of(self.cells, self.half)
 
-    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(
+        self, prior: Any, runs: tuple[int, ...], rng: Any
+    ) -> dict[str, Any]:
         """The prior's logarithm at the cells."""
         mean, cov = prior
         gap = self.centres - mean
@@ -506,19 +650,25 @@ class GridFilter(filters.Filter):
         """Spread the chances, weigh them by what was heard, agree."""
         old = step.state.logs
         chances = np.exp(old - old.max(axis=-1, keepdims=True))
-        moved = spread_of(self.cells, self.half, self.model, step.dt) @ chances.reshape(
-            -1, old.shape[-1]).T  # fmt: skip
+        moved = (
+            spread_of(self.cells, self.half, self.model, step.dt)
+            @ chances.reshape(-1, old.shape[-1]).T
+        )
         with np.errstate(divide="ignore"):
             logs = np.maximum(np.log(moved.T.reshape(old.shape)), -700.0)
         said = np.zeros_like(logs)
         for _, heard in step.heard():
             a = heard.agents
-            seen = heard.predict(np.broadcast_to(self.centres, (*said[..., a, :].shape, 2)))
+            seen = heard.predict(
+                np.broadcast_to(self.centres, (*said[..., a, :].shape, 2))
+            )
             gap = np.nan_to_num(heard.target[..., None, :] - seen) ** 2
             # (M,), or (G, M) of agents whose readings have errors of their own.
             variance = np.diagonal(heard.noise, axis1=-2, axis2=-1)
             if np.count_nonzero(heard.noise) > np.count_nonzero(variance):
-                raise ValueError("sensors: needs independent errors for a grid, got correlated")
+                raise ValueError(
+                    "sensors: needs independent errors for a grid, got correlated"
+                )
             said[..., a, :] = -0.5 * (gap / variance[..., None, :]).sum(axis=-1)
         if self.likelihoods:
             (said,) = step.agreed(said)
@@ -534,7 +684,9 @@ class GridFilter(filters.Filter):
         w = w / w.sum(axis=-1, keepdims=True)
         x = self.centres
         mean = w @ x
-        second = np.stack([w @ (x[:, i] * x[:, j]) for i in (0, 1) for j in (0, 1)], axis=-1)
+        second = np.stack(
+            [w @ (x[:, i] * x[:, j]) for i in (0, 1) for j in (0, 1)], axis=-1
+        )
         cov = second.reshape(*mean.shape, 2) - mean[..., :, None] * mean[..., None, :]
         # A belief is no narrower than a cell.
         least = (2 * self.half / self.cells) ** 2 / 12
@@ -553,11 +705,14 @@ def spread_of(cells: int, half: float, model: Any, dt: float) -> Any:
     from scipy.sparse import csr_array
     from scipy.spatial import KDTree
 
-    x, std = centres_of(cells, half), float(np.sqrt(model.Q(0.0, dt)[0, 0]))
+    x = centres_of(cells, half)
+    std = float(np.sqrt(model.Q(0.0, dt)[0, 0]))
     near = KDTree(x).sparse_distance_matrix(
         KDTree(x @ model.transition(dt).T), 5 * std, output_type="coo_matrix"
     )
-    kernel = csr_array((np.exp(-0.5 * (near.data / std) ** 2), (near.row, near.col)), near.shape)
+    kernel = csr_array(
+        (np.exp(-0.5 * (near.data / std) ** 2), (near.row, near.col)), near.shape
+    )
     total = np.asarray(kernel.sum(axis=0))
     return csr_array(kernel / np.where(total > 0, total, 1.0))
 
@@ -593,15 +748,26 @@ TRACE = partial(covariance_intersection, rule="trace")
 # Below one is for those that claim too little, such as intersection.
 WIDER = ("inflation", (0.9, 1.0, 1.05, 1.15, 1.3))
 JITTER = ("jitter", (0.0, 0.05, 0.1, 0.2, 0.4))
-SEPARABLE = partial(transport_map_update, fit=partial(separable.fit, order=1, regularisation=0.05))
+SEPARABLE = partial(
+    transport_map_update, fit=partial(separable.fit, order=1, regularisation=0.05)
+)
 
 
-def gaussian(kind: Any = GaussianFilter, *, rule: str = "extended", **options: Any) -> Any:
+def gaussian(
+    kind: Any = GaussianFilter, *, rule: str = "extended", **options: Any
+) -> Any:
     """A maker of Kalman filters."""
 
     def make(p: Problem, value: float) -> Any:
-        return kind(p.model, p.sensors, p.graph, rule=rule, inflation=value, failures="keep",
-                    **options)  # fmt: skip
+        return kind(
+            p.model,
+            p.sensors,
+            p.graph,
+            rule=rule,
+            inflation=value,
+            on_error="keep",
+            **options,
+        )
 
     return make
 
@@ -611,8 +777,15 @@ def ensemble(update: Any, kind: Any = EnsembleFilter, **options: Any) -> Any:
 
     def make(p: Problem, value: float, members: int = STUDY["members"]) -> Any:
         wider = with_inflation(update, factor=value)
-        return kind(p.model, p.sensors, p.graph, update=wider, members=members, failures="keep",
-                    **options)  # fmt: skip
+        return kind(
+            p.model,
+            p.sensors,
+            p.graph,
+            update=wider,
+            members=members,
+            on_error="keep",
+            **options,
+        )
 
     return make
 
@@ -620,23 +793,32 @@ def ensemble(update: Any, kind: Any = EnsembleFilter, **options: Any) -> Any:
 def exact(p: Problem, value: float, members: int = STUDY["members"]) -> Any:
     """Exact draws and the intersection of least determinant."""
     update = with_inflation(enkf_exact, factor=value)
-    return EnsembleFilter.exact(p.model, p.sensors, p.graph, update=update, members=members,
-                                on_error="keep")  # fmt: skip
+    return EnsembleFilter.exact(
+        p.model, p.sensors, p.graph, update=update, members=members, on_error="keep"
+    )
 
 
 def pulled(p: Problem, value: float, members: int = STUDY["members"]) -> Any:
     """Means that pull each other."""
     rule = partial(network.mean_pull, gain=value, include_self=False)
-    return EnsembleFilter(p.model, p.sensors, p.graph, fusion=rule, members=members,
-                          on_error="keep")  # fmt: skip
+    return EnsembleFilter(
+        p.model, p.sensors, p.graph, fusion=rule, members=members, on_error="keep"
+    )
 
 
 def particles(kind: Any = ParticleFilter, **options: Any) -> Any:
     """A maker of particle filters."""
 
     def make(p: Problem, value: float, members: int = STUDY["particles"]) -> Any:
-        return kind(p.model, p.sensors, p.graph, jitter=value, members=members, failures="keep",
-                    **options)  # fmt: skip
+        return kind(
+            p.model,
+            p.sensors,
+            p.graph,
+            jitter=value,
+            members=members,
+            on_error="keep",
+            **options,
+        )
 
     return make
 
@@ -647,12 +829,21 @@ def intersected(ensembles: Array, channel: Any) -> Array:
     return network.intersect_ensembles(ensembles + least, channel)
 
 
-def agreed_particles(p: Problem, value: float, members: int = STUDY["particles"]) -> Any:
+def agreed_particles(
+    p: Problem, value: float, members: int = STUDY["particles"]
+) -> Any:
     """Particles in common and likelihoods agreed on."""
     degree = 4 if "curved" in p.traits else 2
     seen = tuple(range(2 if len(p.scored) == 4 else len(p.scored)))
-    return LikelihoodConsensus(p.model, p.sensors, p.graph, jitter=value, members=members,
-                               degree=degree, places=seen)  # fmt: skip
+    return LikelihoodConsensus(
+        p.model,
+        p.sensors,
+        p.graph,
+        jitter=value,
+        members=members,
+        degree=degree,
+        places=seen,
+    )
 
 
 def moved(**options: Any) -> Any:
@@ -660,7 +851,9 @@ def moved(**options: Any) -> Any:
 
     def make(p: Problem, value: float, members: int = STUDY["transported"]) -> Any:
         own = options | ({"rejuvenation": value} if value else {})
-        return OnePlan(p.model, p.sensors, p.graph, members=members, failures="keep", **own)
+        return OnePlan(
+            p.model, p.sensors, p.graph, members=members, on_error="keep", **own
+        )
 
     return make
 
@@ -670,9 +863,16 @@ def mixture(rule: str) -> Any:
 
     def make(p: Problem, value: float) -> Any:
         own = p.own or p
-        return Mixtures(own.model, own.sensors, p.graph, size=len(p.scored), rule=rule,
-                        mixands=STUDY["mixands"], stretch=STUDY["stretch"],
-                        inflation=value)  # fmt: skip
+        return Mixtures(
+            own.model,
+            own.sensors,
+            p.graph,
+            size=len(p.scored),
+            rule=rule,
+            mixands=STUDY["mixands"],
+            stretch=STUDY["stretch"],
+            inflation=value,
+        )
 
     return make
 
@@ -681,8 +881,14 @@ def of_target(news: bool) -> Any:
     """A maker of filters of [target; own place]."""
 
     def make(p: Problem, value: float) -> Any:
-        return OwnState(p.own.model, p.own.sensors, p.graph, news=news, inflation=value,
-                        on_error="keep")  # fmt: skip
+        return OwnState(
+            p.own.model,
+            p.own.sensors,
+            p.graph,
+            news=news,
+            inflation=value,
+            on_error="keep",
+        )
 
     return make
 
@@ -693,14 +899,18 @@ def gridded(kind: Any = GridFilter, **options: Any) -> Any:
 
 
 WIDE = "16 components: "
-JOINT = (("places", WIDE + "polynomials of degree 2 have 152 terms, and a cloud collapses"),)
+JOINT = (
+    ("places", WIDE + "polynomials of degree 2 have 152 terms, and a cloud collapses"),
+)
 CLOUD = (("places", WIDE + "the weights of a cloud collapse"),)
 AFFINE = "the best map is affine: an ensemble with perturbed readings"
 MANY = WIDE + "a map has more coefficients than members"
 MAPS = (("linear", AFFINE), ("star", AFFINE), ("places", MANY))
 SAME = "the gain of a reading is the reading: readings, one hop"
-NO_PLACE = tuple((name, "no agent doubts its place") for name in
-                 ("linear", "range", "lorenz", *THREE))  # fmt: skip
+NO_PLACE = tuple(
+    (name, "no agent doubts its place")
+    for name in ("linear", "range", "lorenz", *THREE)
+)
 AS_READING = tuple((name, SAME) for name in ("linear", "range", "lorenz", *THREE))
 CELLS_OF = "{} components need 40 to the power of {} cells"
 SIZES = {"linear": 4, "lorenz": 3, "places": 16, "star": 3, "angles": 4}
@@ -708,69 +918,189 @@ PLANE = tuple((name, CELLS_OF.format(d, d)) for name, d in SIZES.items())
 CELLS = {
     "ekf_alone": Cell("Kalman, extended", "nothing", gaussian(share=False), *WIDER),
     "ekf_near": Cell("Kalman, extended", "readings, one hop", gaussian(), *WIDER),
-    "ekf_naive": Cell("Kalman, extended", "beliefs, multiplied",
-                      gaussian(share=False, agreement=network.naive_fusion), *WIDER),
-    "ekf_trace": Cell("Kalman, extended", "readings, CI by trace",
-                      gaussian(agreement=TRACE), *WIDER),
-    "ekf_ci": Cell("Kalman, extended", "readings, CI by determinant",
-                   gaussian(agreement=CI), *WIDER),
-    "ekf_info": Cell("Kalman, extended", "beliefs, four rounds of equal CI",
-                     gaussian(share=False, agreement=partial(covariance_intersection, rounds=4)),
-                     *WIDER),
-    "ekf_two": Cell("Kalman, extended", "information, two rounds",
-                    gaussian(MeasurementConsensus, agree=partial(network.average_consensus, rounds=2)),
-                    *WIDER),
-    "ekf_meas": Cell("Kalman, extended", "information, exact average",
-                     gaussian(MeasurementConsensus), *WIDER),
-    "ekf_flood": Cell("Kalman, extended", "readings, passed on",
-                      gaussian(FloodedGaussian, share=False), *WIDER),
-    "ukf_ci": Cell("Kalman, unscented", "readings, CI by determinant",
-                   gaussian(rule="unscented", agreement=CI), *WIDER),
-    "ukf_flood": Cell("Kalman, unscented", "readings, passed on",
-                      gaussian(FloodedGaussian, rule="unscented", share=False), *WIDER),
-    "news": Cell("news", "gain in information, one hop", of_target(news=True), *WIDER, own=True,
-                 empty=AS_READING),
-    "own_ci": Cell("Kalman of target and own place", "beliefs of the target, equal CI",
-                   of_target(news=False), *WIDER, own=True, empty=NO_PLACE),
-    "enkf_near": Cell("ensemble, perturbed", "readings, one hop", ensemble(enkf_sampled_covariance), *WIDER),
-    "known_near": Cell("ensemble, known noise", "readings, one hop", ensemble(enkf), *WIDER),
-    "known_pull": Cell("ensemble, known noise", "readings, mean pull", pulled, "gain",
-                       (0.025, 0.05, 0.1, 0.2, 0.4)),
-    "known_flood": Cell("ensemble, known noise", "readings, passed on",
-                        ensemble(enkf, FloodedEnsemble, share=False), *WIDER),
-    "exact_ci": Cell("ensemble, exact draws", "readings, CI by determinant", exact, *WIDER),
-    "root_ci": Cell("ensemble, square root", "readings, CI by determinant",
-                    ensemble(etkf, agreement=network.intersect_ensembles), *WIDER),
-    "root_flood": Cell("ensemble, square root", "readings, passed on",
-                       ensemble(etkf, FloodedEnsemble, share=False), *WIDER),
-    "maps_near": Cell("ensemble, separable maps", "readings, one hop", ensemble(SEPARABLE), *WIDER,
-                      empty=MAPS),
-    "maps_flood": Cell("ensemble, separable maps", "readings, passed on",
-                       ensemble(SEPARABLE, FloodedEnsemble, share=False), *WIDER,
-                       empty=MAPS),
-    "pf_alone": Cell("particles", "nothing", particles(share=False), *JITTER,
-                     empty=CLOUD),
-    "pf_near": Cell("particles", "readings, one hop", particles(), *JITTER, empty=CLOUD),
-    "pf_ci": Cell("particles", "readings, CI by determinant",
-                  particles(agreement=intersected), *JITTER, empty=CLOUD),
-    "pf_agreed": Cell("particles", "likelihood consensus", agreed_particles, *JITTER,
-                      empty=JOINT),
-    "pf_flood": Cell("particles", "readings, passed on",
-                     particles(FloodedParticles, share=False), *JITTER, empty=CLOUD),
-    "ot_plain": Cell("transport, plain", "log-likelihoods, exact average", moved(), empty=CLOUD),
-    "ot_right": Cell("transport, corrected", "log-likelihoods, exact average",
-                     moved(correct=True), empty=CLOUD),
-    "ot_young": Cell("transport, rejuvenated", "log-likelihoods, exact average", moved(),
-                     "rejuvenation", (0.05, 0.1, 0.2, 0.4, 0.8), empty=CLOUD),
-    "gm_c1": Cell("mixture, C1", "beliefs, partial fusion", mixture("C1"), *WIDER, own=True),
-    "gm_c2": Cell("mixture, C2", "beliefs, partial fusion", mixture("C2"), *WIDER, own=True),
-    "gm_c3": Cell("mixture, C3", "beliefs, partial fusion", mixture("C3"), *WIDER, own=True),
+    "ekf_naive": Cell(
+        "Kalman, extended",
+        "beliefs, multiplied",
+        gaussian(share=False, agreement=network.naive_fusion),
+        *WIDER,
+    ),
+    "ekf_trace": Cell(
+        "Kalman, extended", "readings, CI by trace", gaussian(agreement=TRACE), *WIDER
+    ),
+    "ekf_ci": Cell(
+        "Kalman, extended",
+        "readings, CI by determinant",
+        gaussian(agreement=CI),
+        *WIDER,
+    ),
+    "ekf_info": Cell(
+        "Kalman, extended",
+        "beliefs, four rounds of equal CI",
+        gaussian(share=False, agreement=partial(covariance_intersection, rounds=4)),
+        *WIDER,
+    ),
+    "ekf_two": Cell(
+        "Kalman, extended",
+        "information, two rounds",
+        gaussian(
+            MeasurementConsensus, agree=partial(network.average_consensus, rounds=2)
+        ),
+        *WIDER,
+    ),
+    "ekf_meas": Cell(
+        "Kalman, extended",
+        "information, exact average",
+        gaussian(MeasurementConsensus),
+        *WIDER,
+    ),
+    "ekf_flood": Cell(
+        "Kalman, extended",
+        "readings, passed on",
+        gaussian(FloodedGaussian, share=False),
+        *WIDER,
+    ),
+    "ukf_ci": Cell(
+        "Kalman, unscented",
+        "readings, CI by determinant",
+        gaussian(rule="unscented", agreement=CI),
+        *WIDER,
+    ),
+    "ukf_flood": Cell(
+        "Kalman, unscented",
+        "readings, passed on",
+        gaussian(FloodedGaussian, rule="unscented", share=False),
+        *WIDER,
+    ),
+    "news": Cell(
+        "news",
+        "gain in information, one hop",
+        of_target(news=True),
+        *WIDER,
+        own=True,
+        empty=AS_READING,
+    ),
+    "own_ci": Cell(
+        "Kalman of target and own place",
+        "beliefs of the target, equal CI",
+        of_target(news=False),
+        *WIDER,
+        own=True,
+        empty=NO_PLACE,
+    ),
+    "enkf_near": Cell(
+        "ensemble, perturbed",
+        "readings, one hop",
+        ensemble(enkf_sampled_covariance),
+        *WIDER,
+    ),
+    "known_near": Cell(
+        "ensemble, known noise", "readings, one hop", ensemble(enkf), *WIDER
+    ),
+    "known_pull": Cell(
+        "ensemble, known noise",
+        "readings, mean pull",
+        pulled,
+        "gain",
+        (0.025, 0.05, 0.1, 0.2, 0.4),
+    ),
+    "known_flood": Cell(
+        "ensemble, known noise",
+        "readings, passed on",
+        ensemble(enkf, FloodedEnsemble, share=False),
+        *WIDER,
+    ),
+    "exact_ci": Cell(
+        "ensemble, exact draws", "readings, CI by determinant", exact, *WIDER
+    ),
+    "root_ci": Cell(
+        "ensemble, square root",
+        "readings, CI by determinant",
+        ensemble(etkf, agreement=network.intersect_ensembles),
+        *WIDER,
+    ),
+    "root_flood": Cell(
+        "ensemble, square root",
+        "readings, passed on",
+        ensemble(etkf, FloodedEnsemble, share=False),
+        *WIDER,
+    ),
+    "maps_near": Cell(
+        "ensemble, separable maps",
+        "readings, one hop",
+        ensemble(SEPARABLE),
+        *WIDER,
+        empty=MAPS,
+    ),
+    "maps_flood": Cell(
+        "ensemble, separable maps",
+        "readings, passed on",
+        ensemble(SEPARABLE, FloodedEnsemble, share=False),
+        *WIDER,
+        empty=MAPS,
+    ),
+    "pf_alone": Cell(
+        "particles", "nothing", particles(share=False), *JITTER, empty=CLOUD
+    ),
+    "pf_near": Cell(
+        "particles", "readings, one hop", particles(), *JITTER, empty=CLOUD
+    ),
+    "pf_ci": Cell(
+        "particles",
+        "readings, CI by determinant",
+        particles(agreement=intersected),
+        *JITTER,
+        empty=CLOUD,
+    ),
+    "pf_agreed": Cell(
+        "particles", "likelihood consensus", agreed_particles, *JITTER, empty=JOINT
+    ),
+    "pf_flood": Cell(
+        "particles",
+        "readings, passed on",
+        particles(FloodedParticles, share=False),
+        *JITTER,
+        empty=CLOUD,
+    ),
+    "ot_plain": Cell(
+        "transport, plain", "log-likelihoods, exact average", moved(), empty=CLOUD
+    ),
+    "ot_right": Cell(
+        "transport, corrected",
+        "log-likelihoods, exact average",
+        moved(correct=True),
+        empty=CLOUD,
+    ),
+    "ot_young": Cell(
+        "transport, rejuvenated",
+        "log-likelihoods, exact average",
+        moved(),
+        "rejuvenation",
+        (0.05, 0.1, 0.2, 0.4, 0.8),
+        empty=CLOUD,
+    ),
+    "gm_c1": Cell(
+        "mixture, C1", "beliefs, partial fusion", mixture("C1"), *WIDER, own=True
+    ),
+    "gm_c2": Cell(
+        "mixture, C2", "beliefs, partial fusion", mixture("C2"), *WIDER, own=True
+    ),
+    "gm_c3": Cell(
+        "mixture, C3", "beliefs, partial fusion", mixture("C3"), *WIDER, own=True
+    ),
     "grid_near": Cell("density on a grid", "readings, one hop", gridded(), empty=PLANE),
-    "grid_mean": Cell("density on a grid", "beliefs, geometric mean",
-                      gridded(share=False, agreement=network.average_consensus), empty=PLANE),
-    "grid_flood": Cell("density on a grid", "readings, passed on",
-                       gridded(FloodedGrid, share=False), empty=PLANE),
-}  # fmt: skip
+    "grid_mean": Cell(
+        "density on a grid",
+        "beliefs, geometric mean",
+        gridded(share=False, agreement=network.average_consensus),
+        empty=PLANE,
+    ),
+    "grid_flood": Cell(
+        "density on a grid",
+        "readings, passed on",
+        gridded(FloodedGrid, share=False),
+        empty=PLANE,
+    ),
+}
 
 
 # --------------------------------------------------------------------------------------- the loop
@@ -783,9 +1113,15 @@ def stream(seed: np.random.SeedSequence, name: str) -> np.random.Generator:
 
 
 def scored(
-    p: Problem, f: Any, data: Any, rng: Any, *, alone: bool = False, own: bool = False,
+    p: Problem,
+    f: Any,
+    data: Any,
+    rng: Any,
+    *,
+    alone: bool = False,
+    own: bool = False,
     scores: tuple[str, ...] = ("squared_error", "nees"),
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """The one loop: a filter runs on the data; each run's scores, and what an agent sent a step.
 
     ``error`` is the mean squared error of the components that count, ``nees`` that per component,
@@ -799,9 +1135,16 @@ def scored(
     out: dict[str, list[Array]] = {name: [] for name in ("error", "nees", "crps")}
     batches: Iterable[Any] = range(runs) if alone else [slice(None)]
     for part in batches:
-        state = f.start(prior, rng=rng if f.draws else None, runs=() if alone else (runs,))
-        run = f.run(state, p.times, [y[:, part] for y in seen],
-                    truth={k: v[:, part] for k, v in known.items()}, scores=scores)  # fmt: skip
+        state = f.start(
+            prior, rng=rng if f.draws else None, runs=() if alone else (runs,)
+        )
+        run = f.run(
+            state,
+            p.times,
+            [y[:, part] for y in seen],
+            truth={k: v[:, part] for k, v in known.items()},
+            scores=scores,
+        )
         # A run that failed once, at one agent, has no mean.
         here = run.isel(late).mean(("time", "agent"), skipna=False)
         some = here.sel(component=list(p.scored))
@@ -823,8 +1166,11 @@ def log_scores(p: Problem, f: Any, data: Any, rng: Any, *, own: bool = False) ->
     where a filter fails or a cloud has no width.
     """
     truth, seen = data
-    state = f.start(p.own.prior if own and p.own else p.prior, runs=truth.shape[1:2],
-                    rng=rng if f.draws else None)  # fmt: skip
+    state = f.start(
+        p.own.prior if own and p.own else p.prior,
+        runs=truth.shape[1:2],
+        rng=rng if f.draws else None,
+    )
     at = [list(f.model.names).index(name) for name in p.scored]
     known = np.stack(list(p.known(truth).values()), axis=-1)
     out = []
@@ -835,10 +1181,13 @@ def log_scores(p: Problem, f: Any, data: Any, rng: Any, *, own: bool = False) ->
         cov = said.covariance
         if cov is None:
             cov = sample_covariance(said.members)
-        mean, cov = said.mean[..., at], cov[..., at, :][..., at]
+        mean = said.mean[..., at]
+        cov = cov[..., at, :][..., at]
         there = np.broadcast_to(known[k][:, None], mean.shape)
         good = np.isfinite(mean).all(axis=-1) & np.isfinite(cov).all(axis=(-2, -1))
-        std = np.sqrt(np.where(good[..., None], np.diagonal(cov, axis1=-2, axis2=-1), 1.0))
+        std = np.sqrt(
+            np.where(good[..., None], np.diagonal(cov, axis1=-2, axis2=-1), 1.0)
+        )
         good &= (std > 0).all(axis=-1)
         shape = cov[good] / (std[good][:, :, None] * std[good][:, None, :])
         good[good] = np.linalg.eigvalsh(shape)[:, 0] > 1e-12
@@ -853,14 +1202,21 @@ def tuned(name: str, cell: str) -> float:
     """A cell's tuned number for a problem; for one held out the upper median of the four's."""
     found = {row["name"]: row["value"] for row in TUNED.tables.get("tuned", ())}
     if name in THREE:
-        known = [tuned(other, cell) for other in FOUR if not CELLS[cell].why_empty(other)]
+        known = [
+            tuned(other, cell) for other in FOUR if not CELLS[cell].why_empty(other)
+        ]
         return sorted(known)[len(known) // 2] if known else 0.0
-    return float(found.get(f"{name}_{cell}", 1.0 if CELLS[cell].option == "inflation" else 0.0))
+    return float(
+        found.get(f"{name}_{cell}", 1.0 if CELLS[cell].option == "inflation" else 0.0)
+    )
 
 
-def measured(p: Problem, cell: str, f: Any, data: Any, seed: Any, prefix: str = "") -> dict:
+def measured(
+    p: Problem, cell: str, f: Any, data: Any, seed: Any, prefix: str = ""
+) -> dict:
     """A filter's errors and NEES run by run, and its floats, as columns; NaN where it fails."""
-    name, own = prefix + cell, cell in CELLS and CELLS[cell].own
+    name = prefix + cell
+    own = cell in CELLS and CELLS[cell].own
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
@@ -893,11 +1249,15 @@ def references(p: Problem) -> dict[str, Any]:
     if not {"curved", "chaotic"} & set(p.traits):
         return {"reference": GaussianFilter(*all_of)}
     if p.model.dim == 2:
-        return {"reference": GridFilter(*all_of, cells=STUDY["reference_cells"]),
-                "half": GridFilter(*all_of)}  # fmt: skip
+        return {
+            "reference": GridFilter(*all_of, cells=STUDY["reference_cells"]),
+            "half": GridFilter(*all_of),
+        }
     many = STUDY["reference"]
-    return {"reference": ParticleFilter(*all_of, members=many),
-            "half": ParticleFilter(*all_of, members=many // 2)}  # fmt: skip
+    return {
+        "reference": ParticleFilter(*all_of, members=many),
+        "half": ParticleFilter(*all_of, members=many // 2),
+    }
 
 
 def drawn(p: Problem, seed: np.random.SeedSequence, runs: int = BATCH) -> Any:
@@ -905,7 +1265,9 @@ def drawn(p: Problem, seed: np.random.SeedSequence, runs: int = BATCH) -> Any:
     return p.data(runs, stream(seed, "data"))
 
 
-def referred(p: Problem, seed: np.random.SeedSequence, data: Any, *, half: bool = True) -> dict:
+def referred(
+    p: Problem, seed: np.random.SeedSequence, data: Any, *, half: bool = True
+) -> dict:
     """The references' columns, if wanted with those of one of half the effort."""
     one = replace(p, sensors=[p.together], graph=None, own=None)
     joint = data[0], [np.concatenate(data[1], axis=-1)]
@@ -915,7 +1277,9 @@ def referred(p: Problem, seed: np.random.SeedSequence, data: Any, *, half: bool 
         out |= measured(one, name, f, joint, seed)
     if "half" in some and p.model.dim == 2:
         # All agents with all readings and one grid are that grid with all readings.
-        out |= {k.replace("half", "grid_flood"): v for k, v in out.items() if "half" in k}
+        out |= {
+            k.replace("half", "grid_flood"): v for k, v in out.items() if "half" in k
+        }
         out["grid_flood_floats"] = np.nan
     return out
 
@@ -923,7 +1287,8 @@ def referred(p: Problem, seed: np.random.SeedSequence, data: Any, *, half: bool 
 def compared(name: str, seed: np.random.SeedSequence, cells: Iterable[str]) -> dict:
     """The columns of some cells of a problem, each with its tuned number, on one trial's data."""
     p = problem(name)
-    data, out = drawn(p, seed), {}
+    data = drawn(p, seed)
+    out = {}
     for cell in (c for c in cells if c != "grid_flood"):
         out |= measured(p, cell, CELLS[cell].make(p, tuned(name, cell)), data, seed)
     if "ekf_flood_floats" in out and p.model.dim == 2:

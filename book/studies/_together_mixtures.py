@@ -52,22 +52,32 @@ class Mixtures(filters.Filter):
     state = MixturesState
     unused = {"lag": "a mixture filter keeps no past"}
 
-    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(
+        self, prior: Any, runs: tuple[int, ...], rng: Any
+    ) -> dict[str, Any]:
         """One mixand, and places for more."""
         mean, cov = prior
-        lead, d = (*runs, self.n_agents, self.mixands), len(mean)
+        lead = (*runs, self.n_agents, self.mixands)
+        d = len(mean)
         weights = np.broadcast_to(np.eye(self.mixands)[0], lead)
         covs = np.broadcast_to(cov, (*lead, d, d))
-        return {"means": np.broadcast_to(mean, (*lead, d)), "weights": weights, "covs": covs}
+        return {
+            "means": np.broadcast_to(mean, (*lead, d)),
+            "weights": weights,
+            "covs": covs,
+        }
 
     def next_state(self, step: Any) -> Any:
         """Split, forecast, read, tell, fuse, widen."""
         belief = step.state.weights, step.state.means, step.state.covs
-        t, dt = step.state.t, step.dt
+        t = step.state.t
+        dt = step.dt
         if self.stretch is not None:
             jacobian = self.model.jacobian(belief[1], t, dt)
             belief = split(belief, jacobian, self.stretch)
-        w, m, P = moved(belief, lambda x: self.model.step(x, t, dt), self.model.Q(t, dt))
+        w, m, P = moved(
+            belief, lambda x: self.model.step(x, t, dt), self.model.Q(t, dt)
+        )
         for agent, said in enumerate(step.said):
             for reading in (r for r in said if not np.isnan(r.value).all()):
                 part = w[..., agent, :], m[..., agent, :, :], P[..., agent, :, :, :]
@@ -78,14 +88,20 @@ class Mixtures(filters.Filter):
 
     def told(self, belief: Any, channel: Any) -> Any:
         """Every agent fuses what it hears, one belief after another."""
-        n, few, (w, m, P) = self.size, self.mixands, belief
+        n = self.size
+        few = self.mixands
+        (w, m, P) = belief
         rows, columns = np.triu_indices(n)
         flat = (*w.shape[:-1], -1)
         said = np.concatenate(
             [w, m[..., :n].reshape(flat), P[..., rows, columns].reshape(flat)], -1
         )
-        inbox = [list(box.values()) for box in
-                 channel.broadcast([said[..., k, :] for k in range(self.n_agents)])]  # fmt: skip
+        inbox = [
+            list(box.values())
+            for box in channel.broadcast(
+                [said[..., k, :] for k in range(self.n_agents)]
+            )
+        ]
         for turn in range(max(map(len, inbox))):
             here = [k for k, box in enumerate(inbox) if len(box) > turn]
             x = np.stack([inbox[k][turn] for k in here], axis=-2)
@@ -95,13 +111,16 @@ class Mixtures(filters.Filter):
             other_P = np.zeros((*other_m.shape, n))
             other_P[..., rows, columns] = other_P[..., columns, rows] = entries
             own = w[..., here, :], m[..., here, :, :], P[..., here, :, :, :]
-            fused = fuse(own, (other_w, other_m, other_P), (turn + 1) / (turn + 2), self.rule)
+            fused = fuse(
+                own, (other_w, other_m, other_P), (turn + 1) / (turn + 2), self.rule
+            )
             w[..., here, :], m[..., here, :, :], P[..., here, :, :, :] = fused
         return w, m, P
 
     def summarize(self, state: Any) -> Any:
         """Means and covariances of whole mixtures."""
-        w, m = state.weights, state.means
+        w = state.weights
+        m = state.means
         mean = (w[..., None] * m).sum(axis=-2)
         gap = m - mean[..., None, :]
         each = state.covs + gap[..., :, None] * gap[..., None, :]
@@ -124,23 +143,31 @@ def split(belief: Any, jacobian: Array, stretch: float) -> Any:
     u = (root @ right[:, 0, :, None])[..., 0][far]
     # A singular vector's sign is arbitrary.
     top = right[far, 0]
-    u = u * np.sign(np.take_along_axis(top, np.abs(top).argmax(axis=-1)[:, None], axis=-1))
+    u = u * np.sign(
+        np.take_along_axis(top, np.abs(top).argmax(axis=-1)[:, None], axis=-1)
+    )
     weights, places = split_library()
-    new_w, new_m, new_P = w[some], m[some], P[some]
+    new_w = w[some]
+    new_m = m[some]
+    new_P = P[some]
     rows = np.flatnonzero(far)[:, None]
     new_w[far] = 0.0
     new_w[rows, np.arange(3)] = weights
     new_m[rows, np.arange(3)] = mean[far][:, None] + places[:, None] * u[:, None]
     less = cov[far] - (1 - 0.7**2) * u[:, :, None] * u[:, None, :]
     new_P[far] = less[:, None]
-    w[some], m[some], P[some] = new_w, new_m, new_P
+    w[some] = new_w
+    m[some] = new_m
+    P[some] = new_P
     return w, m, P
 
 
 def differences(values: Array) -> tuple[Array, Array, Array]:
     """Mean, and first and second differences as columns, of a function's values at points."""
     d = values.shape[-2] // 2
-    centre, plus, minus = values[..., :1, :], values[..., 1 : d + 1, :], values[..., d + 1 :, :]
+    centre = values[..., :1, :]
+    plus = values[..., 1 : d + 1, :]
+    minus = values[..., d + 1 :, :]
     even = plus + minus - 2 * centre
     mean = centre[..., 0, :] + even.sum(axis=-2) / 6
     return mean, (plus - minus).mT / (2 * STEP), even.mT * np.sqrt(2.0) / 6
@@ -172,7 +199,11 @@ def updated(belief: Any, y: Array, sensor: Any) -> Any:
     far = (gap[..., None, :] @ np.linalg.solve(S, gap[..., None]))[..., 0, 0]
     logs = logarithm(w) - 0.5 * (far + np.linalg.slogdet(2 * np.pi * S)[1])
     P = P - gain @ S @ gain.mT
-    return weights_of(logs, LEAST), m + (gain @ gap[..., None])[..., 0], 0.5 * (P + P.mT)
+    return (
+        weights_of(logs, LEAST),
+        m + (gain @ gap[..., None])[..., 0],
+        0.5 * (P + P.mT),
+    )
 
 
 def logarithm(w: Array) -> Array:
@@ -208,8 +239,10 @@ def log_density(x: Array, w: Array, m: Array, P: Array) -> Array:
 
 def fuse(own: Any, other: Any, omega: float, rule: str) -> Any:
     """An own belief about [t; e] and another's about t, with exponents omega and its rest."""
-    (w, m, P), (w_b, m_b, P_b) = own, other
-    n, d = m_b.shape[-1], m.shape[-1]
+    (w, m, P) = own
+    (w_b, m_b, P_b) = other
+    n = m_b.shape[-1]
+    d = m.shape[-1]
     A, A_b = (np.linalg.inv(x) for x in (P[..., :n, :n], P_b))
     # Every pair of mixands, the own ones first.
     J = omega * A[..., :, None, :, :] + (1 - omega) * A_b[..., None, :, :, :]
@@ -220,15 +253,19 @@ def fuse(own: Any, other: Any, omega: float, rule: str) -> Any:
     rest = (P[..., n:, n:] - P[..., n:, :n] @ A @ P[..., :n, n:])[..., :, None, :, :]
     means = np.concatenate([move, gain @ move], axis=-2)[..., 0] + m[..., :, None, :]
     covs = np.empty((*J.shape[:-2], d, d))
-    covs[..., :n, :n], covs[..., n:, :n] = target, gain @ target
+    covs[..., :n, :n] = target
+    covs[..., n:, :n] = gain @ target
     covs[..., :n, n:] = covs[..., n:, :n].mT
     covs[..., n:, n:] = rest + gain @ target @ gain.mT
     covs = 0.5 * (covs + covs.mT)
     alive = (w[..., :, None] > 0) & (w_b[..., None, :] > 0)
-    few, few_b = w.shape[-1], w_b.shape[-1]
+    few = w.shape[-1]
+    few_b = w_b.shape[-1]
     pairs = (*w.shape[:-1], few * few_b)
-    means, covs = means.reshape(*pairs, d), covs.reshape(*pairs, d, d)
-    alive, source = alive.reshape(pairs), np.repeat(np.arange(few), few_b)
+    means = means.reshape(*pairs, d)
+    covs = covs.reshape(*pairs, d, d)
+    alive = alive.reshape(pairs)
+    source = np.repeat(np.arange(few), few_b)
     x = means[..., :n]
     logs = (omega - 1) * log_density(x, w, m[..., :n], P[..., :n, :n])
     logs = logs + (1 - omega) * log_density(x, w_b, m_b, P_b)
@@ -258,22 +295,31 @@ def costs(w: Array, m: Array, P: Array, dets: Array, i: Any, j: Any) -> Array:
     total = w[at, i] + w[at, j]
     a = np.divide(w[at, i], total, out=np.full(total.shape, 0.5), where=total > 0)
     both = joined(a, m[at, i], m[at, j], P[at, i], P[at, j])
-    return 0.5 * (total * np.linalg.slogdet(both)[1] - w[at, i] * dets[at, i]
-                  - w[at, j] * dets[at, j])  # fmt: skip
+    return 0.5 * (
+        total * np.linalg.slogdet(both)[1]
+        - w[at, i] * dets[at, i]
+        - w[at, j] * dets[at, j]
+    )
 
 
 def joined(a: Array, m_i: Array, m_j: Array, P_i: Array, P_j: Array) -> Array:
     """The covariance of two mixands that are merged, the first of which has the share a."""
-    gap, a = m_j - m_i, a[..., None, None]
+    gap = m_j - m_i
+    a = a[..., None, None]
     return a * P_i + (1 - a) * P_j + a * (1 - a) * gap[..., :, None] * gap[..., None, :]
 
 
 def merged(w: Array, m: Array, P: Array, size: int) -> Any:
     """Merge the pair that costs least until so many mixands are left."""
-    lead, (n, d) = w.shape[:-1], m.shape[-2:]
-    w, m, P = w.reshape(-1, n).copy(), m.reshape(-1, n, d).copy(), P.reshape(-1, n, d, d).copy()
+    lead = w.shape[:-1]
+    (n, d) = m.shape[-2:]
+    w = w.reshape(-1, n).copy()
+    m = m.reshape(-1, n, d).copy()
+    P = P.reshape(-1, n, d, d).copy()
     dets = np.linalg.slogdet(P)[1]
-    rows, columns = (np.broadcast_to(x, (len(w), x.size)) for x in np.triu_indices(n, 1))
+    rows, columns = (
+        np.broadcast_to(x, (len(w), x.size)) for x in np.triu_indices(n, 1)
+    )
     table = np.full((len(w), n, n), np.inf)
     at = np.arange(len(w))[:, None]
     table[at, rows, columns] = costs(w, m, P, dets, rows, columns)
@@ -283,12 +329,15 @@ def merged(w: Array, m: Array, P: Array, size: int) -> Any:
         part = table[more].reshape(more.size, -1)
         least = part.min(axis=-1, keepdims=True)
         # The first of the pairs that cost the same, so that rounding does not choose.
-        i, j = np.divmod((part <= least + 1e-12 + 1e-9 * np.abs(least)).argmax(axis=-1), n)
+        i, j = np.divmod(
+            (part <= least + 1e-12 + 1e-9 * np.abs(least)).argmax(axis=-1), n
+        )
         total = w[more, i] + w[more, j]
         a = w[more, i] / total
         P[more, i] = joined(a, m[more, i], m[more, j], P[more, i], P[more, j])
         m[more, i] += (1 - a)[:, None] * (m[more, j] - m[more, i])
-        w[more, i], w[more, j] = total, 0.0
+        w[more, i] = total
+        w[more, j] = 0.0
         dets[more, i] = np.linalg.slogdet(P[more, i])[1]
         others = np.broadcast_to(np.arange(n), (more.size, n))
         row = costs(w[more], m[more], P[more], dets[more], i[:, None], others)
@@ -299,6 +348,11 @@ def merged(w: Array, m: Array, P: Array, size: int) -> Any:
         up = table[more, :, i]
         table[more, :, i] = np.where(below, row, up)
     order = np.argsort(w == 0, axis=-1, kind="stable")[:, :size]
-    w, m, P = w[at, order], m[at, order], P[at, order]
-    return (w / w.sum(axis=-1, keepdims=True)).reshape(*lead, size), m.reshape(
-        *lead, size, d), P.reshape(*lead, size, d, d)  # fmt: skip
+    w = w[at, order]
+    m = m[at, order]
+    P = P[at, order]
+    return (
+        (w / w.sum(axis=-1, keepdims=True)).reshape(*lead, size),
+        m.reshape(*lead, size, d),
+        P.reshape(*lead, size, d, d),
+    )

@@ -13,7 +13,8 @@ import numpy as np
 from bookkit import studies
 from distfilt.metrics import Interval, mean_interval
 
-FOUR, THREE = together.FOUR, together.THREE
+FOUR = together.FOUR
+THREE = together.THREE
 HONEST = (0.8, 1.25)
 """NEES per component of a filter that is called honest; 0.95 to 1.05 is asked for where said."""
 BUDGETS = (3, 12, 32, 64, 400)
@@ -54,8 +55,12 @@ def columns(stored: Any, name: str, what: str) -> np.ndarray:
 def result(stored: Any, name: str, cell: str = "") -> Result:
     """A cell's result; `name` is its column's."""
     floats = float(stored.metric(f"{name}_floats").mean())
-    return Result(cell or name, columns(stored, name, "error"), columns(stored, name, "nees"),
-                  floats)  # fmt: skip
+    return Result(
+        cell or name,
+        columns(stored, name, "error"),
+        columns(stored, name, "nees"),
+        floats,
+    )
 
 
 @cache
@@ -79,8 +84,12 @@ def ratio(one: Result, other: Result) -> Interval:
     middle = float(np.sqrt(one.error.mean() / other.error.mean()))
     spread = one.error / one.error.mean() - other.error / other.error.mean()
     error = mean_interval(spread).error / 2
-    return Interval(middle, middle * np.exp(-1.96 * error), middle * np.exp(1.96 * error),
-                    middle * error)  # fmt: skip
+    return Interval(
+        middle,
+        middle * np.exp(-1.96 * error),
+        middle * np.exp(1.96 * error),
+        middle * error,
+    )
 
 
 def front(points: Mapping[str, tuple[float, float]]) -> list[str]:
@@ -121,14 +130,23 @@ def worse(best: Result, others: Iterable[Result]) -> set[str]:
 
 def operations(p: Any, cell: str, members: int | None = None) -> float:
     """Leading terms of an agent's floating-point operations in a step."""
-    d, agents, m = p.model.dim, p.agents, p.sensors[0].dim
+    d = p.model.dim
+    agents = p.agents
+    m = p.sensors[0].dim
     near = float(p.graph.in_degree.mean())
     talk = cell.split("_")[-1]
-    used = {"near": 1 + near, "ci": 1 + near, "trace": 1 + near, "pull": 1 + near,
-            "flood": agents}.get(talk, 1)  # fmt: skip
+    used = {
+        "near": 1 + near,
+        "ci": 1 + near,
+        "trace": 1 + near,
+        "pull": 1 + near,
+        "flood": agents,
+    }.get(talk, 1)
     M = used * m
     flow = 400 if "chaotic" in p.traits else 2 * d * d
-    fusing = {"ci": 25, "trace": 2, "naive": 2, "info": 8}.get(talk, 0) * (1 + near) * d**3
+    fusing = (
+        {"ci": 25, "trace": 2, "naive": 2, "info": 8}.get(talk, 0) * (1 + near) * d**3
+    )
     averaged = {"two": 2, "meas": agents / 2}.get(talk, 0) * near * d * d
     size = {"pf": "particles", "ot": "transported"}.get(cell.split("_")[0], "members")
     N = members or together.STUDY[size]
@@ -184,8 +202,11 @@ def regret(name: str, budget: float, cell: str) -> float:
 
 def allowed(name: str, budget: float = np.inf) -> list[Result]:
     """The honest cells that a budget allows."""
-    return [r for c, r in results(name).items()
-            if c not in ("reference", "half") and r.honest and r.floats <= budget]  # fmt: skip
+    return [
+        r
+        for c, r in results(name).items()
+        if c not in ("reference", "half") and r.honest and r.floats <= budget
+    ]
 
 
 @cache
@@ -193,7 +214,10 @@ def best(name: str, budget: float = np.inf) -> Result:
     """The honest cell of least error that a budget allows; the cheapest of those that are alike."""
     found = allowed(name, budget)
     least = min(r.error.mean() for r in found)
-    return min((r for r in found if r.error.mean() < least * (1 + 1e-4)), key=lambda r: r.floats)
+    return min(
+        (r for r in found if r.error.mean() < least * (1 + 1e-4)),
+        key=lambda r: r.floats,
+    )
 
 
 def leaf(rows: Sequence[tuple[str, float]]) -> tuple[float, str]:
@@ -212,7 +236,8 @@ def tree(rows: Sequence[tuple[str, float]], depth: int) -> tuple[float, Any]:
         yes = tuple(row for row in rows if says(question, *row))
         no = tuple(row for row in rows if not says(question, *row))
         if yes and no:
-            (a, one), (b, two) = grown(yes, depth - 1), grown(no, depth - 1)
+            (a, one) = grown(yes, depth - 1)
+            (b, two) = grown(no, depth - 1)
             # A question has to be worth a hundredth.
             if a + b < found[0] - 0.01:
                 found = a + b, (question, one, two)

@@ -20,18 +20,32 @@ PAPER = "semeraro"
 
 MEMBERS = 4000
 RULES = {
-    "c1": ("all", "C1"), "c2": ("all", "C2"), "c3": ("all", "C3"),
-    "matched": ("matched", "C3"), "points": ("matched", "points"),
+    "c1": ("all", "C1"),
+    "c2": ("all", "C2"),
+    "c3": ("all", "C3"),
+    "matched": ("matched", "C3"),
+    "points": ("matched", "points"),
 }
 BOUNDS = {
-    "mixands": (3, 6), "distance": (6.0, 12.0), "turn": (0.5, 2.6), "angle_std": (0.2, 0.6),
-    "range_std": (0.25, 0.5), "ego_std": (0.25, 0.5), "width": (0.2, 0.5),
+    "mixands": (3, 6),
+    "distance": (6.0, 12.0),
+    "turn": (0.5, 2.6),
+    "angle_std": (0.2, 0.6),
+    "range_std": (0.25, 0.5),
+    "ego_std": (0.25, 0.5),
+    "width": (0.2, 0.5),
 }
 
 
 def arc(
-    mixands: int, agent: np.ndarray, *, angle_std: float, range_std: float, ego_std: float,
-    width: float = 0.31, span: float = 1.46,
+    mixands: int,
+    agent: np.ndarray,
+    *,
+    angle_std: float,
+    range_std: float,
+    ego_std: float,
+    width: float = 0.31,
+    span: float = 1.46,
 ) -> GaussianMixture:
     r"""What knows a distance well and a bearing badly: a belief about [target; ego], bent.
 
@@ -52,8 +66,11 @@ def arc(
     u = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
     v = np.stack([-u[:, 1], u[:, 0]], axis=-1)
     slope = np.zeros((mixands, 4, 4))
-    slope[:, :2, 0], slope[:, :2, 1] = u, v
-    slope[:, 2:, 1], slope[:, 2:, 2], slope[:, 2:, 3] = -0.5 * v, u, v
+    slope[:, :2, 0] = u
+    slope[:, :2, 1] = v
+    slope[:, 2:, 1] = -0.5 * v
+    slope[:, 2:, 2] = u
+    slope[:, 2:, 3] = v
     means = np.concatenate([agent + r * u, agent - 0.5 * r * (u + agent / r)], axis=-1)
     w = np.exp(-0.5 * s**2)
     covs = (slope * variances) @ slope.mT
@@ -61,7 +78,10 @@ def arc(
 
 
 def belief(
-    bearing: float, rng: np.random.Generator, *, mixands: tuple[int, int] = BOUNDS["mixands"]
+    bearing: float,
+    rng: np.random.Generator,
+    *,
+    mixands: tuple[int, int] = BOUNDS["mixands"],
 ) -> GaussianMixture:
     """One agent's belief, drawn within the bounds; its arc misses the origin a little."""
     draws = {
@@ -89,9 +109,14 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     for_pair, for_points = (np.random.default_rng(s) for s in seed.spawn(2))
     one = belief(np.pi, for_pair)
     two = belief(np.pi + for_pair.uniform(*BOUNDS["turn"]), for_pair)
-    exact = [PartialFusion(one, two.marginal([0, 1])), PartialFusion(two, one.marginal([0, 1]))]
+    exact = [
+        PartialFusion(one, two.marginal([0, 1])),
+        PartialFusion(two, one.marginal([0, 1])),
+    ]
     fused = {
-        name: [f.assign_weights(f.component_shapes(terms=terms), rule=rule) for f in exact]
+        name: [
+            f.assign_weights(f.component_shapes(terms=terms), rule=rule) for f in exact
+        ]
         for name, (terms, rule) in RULES.items()
     }
     fused["moments"] = [fuse_moments(f.own, f.received) for f in exact]
@@ -100,13 +125,19 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     for name, pair in fused.items():
         for k, (f, m) in enumerate(zip(exact, pair, strict=True)):
             found = jeffreys_by_sampling(
-                m.log_density, f.log_value, both(fused["points"][k], f.own, 0.8),
-                members=MEMBERS, rng=np.random.default_rng(first + k),
+                m.log_density,
+                f.log_value,
+                both(fused["points"][k], f.own, 0.8),
+                members=MEMBERS,
+                rng=np.random.default_rng(first + k),
             )
             out[f"{name}_{k + 1}"] = found.value
         a, b = (m.marginal([0, 1]) for m in pair)
         found = jeffreys_by_sampling(
-            a.log_density, b.log_density, both(a, b, 0.5), members=MEMBERS,
+            a.log_density,
+            b.log_density,
+            both(a, b, 0.5),
+            members=MEMBERS,
             rng=np.random.default_rng(first + 2),
         )
         out[f"{name}_target"] = found.value

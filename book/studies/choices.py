@@ -10,10 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from bookkit import studies
-from distfilt.updates import with_augmentation, etpf, with_projection
+from distfilt.updates import etpf, with_augmentation, with_projection
 
 starts = studies.script("starts")
-pendulum, setting = starts.pendulum, starts.setting
+pendulum = starts.pendulum
+setting = starts.setting
 
 NAME = "choices"
 PAPER = "das"
@@ -28,7 +29,9 @@ UPDATES = {
 for _reading in READINGS:
     _how = {**pendulum.how, "reading": _reading}
     UPDATES[f"OTNLeq_{_reading}"] = with_projection(etpf, pendulum.rod, **_how)
-    UPDATES[f"OTNLeqMA_{_reading}"] = with_projection(pendulum.seen_too, pendulum.rod, **_how)
+    UPDATES[f"OTNLeqMA_{_reading}"] = with_projection(
+        pendulum.seen_too, pendulum.rod, **_how
+    )
 SCORES = (*starts.SCORES, "normal")
 
 
@@ -54,9 +57,14 @@ def side(start: str, seed: np.random.SeedSequence) -> dict[str, float]:
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """Both starts, and OTF released from 30°."""
-    truth, readings, members = pendulum.data(np.random.default_rng(seed.spawn(2)[0]), 30.0)
+    truth, readings, members = pendulum.data(
+        np.random.default_rng(seed.spawn(2)[0]), 30.0
+    )
     low = pendulum.run(readings, members, ("OTF",))[:, 0]
-    out = {f"low_OTF_{key}": float(v) for key, v in zip(SCORES, scores(low, truth), strict=True)}
+    out = {
+        f"low_OTF_{key}": float(v)
+        for key, v in zip(SCORES, scores(low, truth), strict=True)
+    }
     for start in ("off", "on"):
         fresh = np.random.SeedSequence(seed.entropy, spawn_key=seed.spawn_key)
         out |= side(start, fresh)
@@ -67,7 +75,12 @@ parameters = {name: np.asarray(setting[name]).tolist() for name in setting}
 parameters |= {"stds": list(STDS), "readings": list(READINGS)}
 columns = (
     *(f"low_OTF_{key}" for key in SCORES),
-    *(f"{start}_{name}_{key}" for start in ("off", "on") for name in UPDATES for key in SCORES),
+    *(
+        f"{start}_{name}_{key}"
+        for start in ("off", "on")
+        for name in UPDATES
+        for key in SCORES
+    ),
 )
 code = (side, scores, starts.scores, starts.on_circle, pendulum.data, pendulum.run)
 seeds = starts.seeds[:60]

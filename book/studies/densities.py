@@ -17,8 +17,10 @@ from bookkit.studies import spawn
 from distfilt import density
 from distfilt.models import RotatingMixture, rotating_swarm
 
-NAME, PAPER = "densities", "zheng"
-SWARM, CHOICES = scenario("zheng", "swarm"), scenario("zheng", "figure-1")
+NAME = "densities"
+PAPER = "zheng"
+SWARM = scenario("zheng", "swarm")
+CHOICES = scenario("zheng", "figure-1")
 parameters = {k: s.parameter(k).value for s in (SWARM, CHOICES) for k in s}
 seeds = spawn(CHOICES["seed"], CHOICES["runs"])
 rtol = 1e-4
@@ -28,8 +30,12 @@ EXACT = ("kde", "filter", "observed_r", "open", "open_flat", "bound")
 WRONG = ("kde", "filter", "process", "open")
 columns = [
     *(f"{r}_{s}_{e}" for r, s, e in product(READINGS, STARTS, EXACT)),
-    *(f"{r}_{s}_{e}" for r, s, e in product(
-        READINGS, STARTS, ("filter_nees", "bound_nees", "filter_crps", "bound_crps"))),
+    *(
+        f"{r}_{s}_{e}"
+        for r, s, e in product(
+            READINGS, STARTS, ("filter_nees", "bound_nees", "filter_crps", "bound_crps")
+        )
+    ),
     *(f"{r}_wrong_{e}" for r, e in product(READINGS, WRONG)),
 ]
 
@@ -43,9 +49,12 @@ def swarm(reading: str, phase: float = 0.0) -> Any:
     """The swarm of (23) in one reading, its f turned by `phase`."""
     phases = SWARM["target_phases"]
     mixture = RotatingMixture(
-        centre=SWARM["target_centre"], radius=SWARM["target_radius"],
-        rate=SWARM["target_rate"], variance=SWARM["target_variance"],
-        components=len(phases), phase=phases[0] + phase,
+        centre=SWARM["target_centre"],
+        radius=SWARM["target_radius"],
+        rate=SWARM["target_rate"],
+        variance=SWARM["target_variance"],
+        components=len(phases),
+        phase=phases[0] + phase,
     )
     return rotating_swarm(reading, strength=SWARM["diffusion"], mixture=mixture)
 
@@ -74,7 +83,8 @@ def informed(basis: np.ndarray, positions: np.ndarray) -> Any:
     A histogram of N independent agents has the variance p / (N cell). Once with p = 1, then with
     what that gave.
     """
-    cells, level = grid(), np.ones(grid().size)
+    cells = grid()
+    level = np.ones(grid().size)
     for _ in range(2):
         state = density.low_rank_start(basis, np.ones((1, cells.size)))
         noise = np.maximum(level, CHOICES["floor"]) / (len(positions) * cells.volume)
@@ -84,28 +94,48 @@ def informed(basis: np.ndarray, positions: np.ndarray) -> Any:
 
 
 def case(
-    reading: str, start: str, rng: np.random.Generator, *, phase: float = 0.0,
-    agents: int | None = None, end: float | None = None,
+    reading: str,
+    start: str,
+    rng: np.random.Generator,
+    *,
+    phase: float = 0.0,
+    agents: int | None = None,
+    end: float | None = None,
 ) -> dict[str, np.ndarray]:
     """L2 errors over time by method, (T,), and NEES and CRPS per cell of two of them."""
-    cells, dt = grid(), SWARM["dt"]
+    cells = grid()
+    dt = SWARM["dt"]
     n = int(SWARM["agents"]) if agents is None else agents
     h = CHOICES["bandwidth"]
-    end = dict(zip(READINGS, CHOICES["end_times"], strict=True))[reading] if end is None else end
-    true, believed = swarm(reading), swarm(reading, phase)
+    end = (
+        dict(zip(READINGS, CHOICES["end_times"], strict=True))[reading]
+        if end is None
+        else end
+    )
+    true = swarm(reading)
+    believed = swarm(reading, phase)
     truth, model = (density.FokkerPlanck(s, cells) for s in (true, believed))
     k = density.kernel_constant(cells, bandwidth=h, agents=n)
     basis = density.zero_mean_prior(
-        cells, rank=CHOICES["rank"], length=CHOICES["prior_length"], std=CHOICES["prior_std"])
-    x, p = first_agents(start, n, rng), first_density(start)
+        cells,
+        rank=CHOICES["rank"],
+        length=CHOICES["prior_length"],
+        std=CHOICES["prior_std"],
+    )
+    x = first_agents(start, n, rng)
+    p = first_density(start)
     y = density.kernel_density(x, cells, bandwidth=h)
-    flat = np.exp(-0.5 * ((cells.centres - x[0]) ** 2).sum(axis=-1)
-                  / CHOICES["local_prior_std"] ** 2)
+    flat = np.exp(
+        -0.5
+        * ((cells.centres - x[0]) ** 2).sum(axis=-1)
+        / CHOICES["local_prior_std"] ** 2
+    )
     filters = beginning(basis, np.stack([y, y, y, cells.normalize(flat)]), x)
     few = basis[:, : CHOICES["low_rank"]]
     low = density.low_rank_start(few, y[None])
     scale = dict(zip(READINGS, CHOICES["process_scale"], strict=True))[reading]
-    floor, rows = CHOICES["floor"], []
+    floor = CHOICES["floor"]
+    rows = []
     noise = np.full(filters.base.shape, np.inf)
     for j in range(round(end / dt)):
         t = j * dt
@@ -119,18 +149,29 @@ def case(
         filters = density.low_rank_step(filters, y, noise, dt)
         if phase:
             low = density.low_rank_predict(low, move, process=scale * few, dt=dt)
-            low = density.low_rank_step(low, y, k * np.maximum(low.estimates, floor), dt)
+            low = density.low_rank_step(
+                low, y, k * np.maximum(low.estimates, floor), dt
+            )
         found = np.stack([y, *filters.estimates, *low.estimates])
         rows.append(np.concatenate([cells.norm(found - p), scored(filters, p, j)]))
-    names = (*EXACT, "process", "filter_nees", "bound_nees", "filter_crps", "bound_crps")
+    names = (
+        *EXACT,
+        "process",
+        "filter_nees",
+        "bound_nees",
+        "filter_crps",
+        "bound_crps",
+    )
     return dict(zip(names, np.array(rows).T, strict=True))
 
 
 def beginning(basis: np.ndarray, base: np.ndarray, positions: np.ndarray) -> Any:
     """Filters that start from the rows of `base`, and the bound's, informed once, as the last."""
-    known, state = informed(basis, positions), density.low_rank_start(basis, base)
+    known = informed(basis, positions)
+    state = density.low_rank_start(basis, base)
     return density.LowRank(
-        basis, np.concatenate([base, known.base]),
+        basis,
+        np.concatenate([base, known.base]),
         np.concatenate([state.information, known.information]),
         np.concatenate([state.vector, known.vector]),
     )
@@ -151,7 +192,7 @@ def scored(filters: Any, p: np.ndarray, step: int) -> np.ndarray:
 
 def late(values: np.ndarray) -> float:
     """Mean from the scenario's time on."""
-    return float(np.nanmean(values[round(CHOICES["average_from"] / SWARM["dt"]):]))
+    return float(np.nanmean(values[round(CHOICES["average_from"] / SWARM["dt"]) :]))
 
 
 def trial(seed: np.random.SeedSequence) -> list[float]:
@@ -161,7 +202,9 @@ def trial(seed: np.random.SeedSequence) -> list[float]:
     for (reading, start), part in zip(cases, seed.spawn(len(cases)), strict=True):
         wrong = start == "wrong"
         result = case(
-            reading, "peaked" if wrong else start, np.random.default_rng(part),
+            reading,
+            "peaked" if wrong else start,
+            np.random.default_rng(part),
             phase=CHOICES["wrong_phase"] if wrong else 0.0,
             end=CHOICES["wrong_end"] if wrong else None,
         )
@@ -169,4 +212,12 @@ def trial(seed: np.random.SeedSequence) -> list[float]:
     return [found[c] for c in columns]
 
 
-code: tuple[Any, ...] = (case, beginning, informed, scored, first_agents, first_density, late)
+code: tuple[Any, ...] = (
+    case,
+    beginning,
+    informed,
+    scored,
+    first_agents,
+    first_density,
+    late,
+)

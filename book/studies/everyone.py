@@ -16,8 +16,10 @@ import locals as figure
 
 from bookkit.studies import spawn
 
-NAME, PAPER = "everyone", "zheng"
-CHOICES, CASE = swarm.CHOICES, figure.CASE
+NAME = "everyone"
+PAPER = "zheng"
+CHOICES = swarm.CHOICES
+CASE = figure.CASE
 RULES = ("paper", "flooding")
 columns = ["kde", "central", *(f"{s}_{i}" for s in RULES for i in range(CASE.agents))]
 parameters = {"seed": CHOICES["seed"], "end": CASE.end}

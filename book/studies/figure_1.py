@@ -15,7 +15,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import _satellites as satellites
 
-NAME, PAPER, BATCH, FEW = "figure-1", "grange", 5, 13
+NAME = "figure-1"
+PAPER = "grange"
+BATCH = 5
+FEW = 13
 SETUP = satellites.setup("table-2")
 NAMES = {"bare": False, "pca": True}
 columns = [
@@ -48,7 +51,9 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         nees = result["nees"].mean("agent").values / SETUP.model.dim
         out |= satellites.over_time(name, error, nees)
         small = satellites.published(replace(SETUP, members=FEW), pca=pca)
-        result = satellites.run(SETUP, small, for_filters, truth, seen, ("squared_error",))
+        result = satellites.run(
+            SETUP, small, for_filters, truth, seen, ("squared_error",)
+        )
         out |= satellites.scored(SETUP, f"{name}_few", result, each_agent=False)
     return out
 

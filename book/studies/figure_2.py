@@ -13,7 +13,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import _satellites as satellites
 
-NAME, PAPER, BATCH = "figure-2", "grange", 4
+NAME = "figure-2"
+PAPER = "grange"
+BATCH = 4
 SETUP = satellites.setup("table-3")
 GAINS = {"pca": SETUP.pull["gain"], "alone": 0.0}
 columns = [
@@ -50,7 +52,9 @@ def part(seed: np.random.SeedSequence) -> dict[str, float]:
     truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
     f = satellites.published(SETUP, pca=True, gain=GAINS["pca"])
     result = satellites.run(SETUP, f, for_filters, truth, seen)
-    return satellites.scored(SETUP, "pca", result) | satellites.of_every_step(SETUP, "pca", result)
+    return satellites.scored(SETUP, "pca", result) | satellites.of_every_step(
+        SETUP, "pca", result
+    )
 
 
 code = (satellites.data, satellites.published, satellites.scored)

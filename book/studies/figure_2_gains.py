@@ -14,7 +14,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import _satellites as satellites
 
-NAME, PAPER, BATCH = "figure-2-gains", "grange", 4
+NAME = "figure-2-gains"
+PAPER = "grange"
+BATCH = 4
 SETUP = satellites.setup("table-3")
 GAINS = {"g01": 0.01, "g02": 0.02, "g03": 0.03, "g10": 0.1}
 columns = [c for name in GAINS for c in satellites.score_columns(SETUP, name, BATCH)]
@@ -31,7 +33,9 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     out: dict[str, float] = {}
     for name, gain in GAINS.items():
         f = satellites.published(SETUP, pca=True, gain=gain)
-        out |= satellites.scored(SETUP, name, satellites.run(SETUP, f, for_filters, truth, seen))
+        out |= satellites.scored(
+            SETUP, name, satellites.run(SETUP, f, for_filters, truth, seen)
+        )
     return out
 
 
@@ -41,7 +45,9 @@ def part(seed: np.random.SeedSequence) -> dict[str, float]:
     truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
     for_filters.spawn(2)  # of the two gains before it
     f = satellites.published(SETUP, pca=True, gain=GAINS["g03"])
-    return satellites.scored(SETUP, "g03", satellites.run(SETUP, f, for_filters, truth, seen))
+    return satellites.scored(
+        SETUP, "g03", satellites.run(SETUP, f, for_filters, truth, seen)
+    )
 
 
 code = (satellites.data, satellites.published, satellites.scored)

@@ -21,17 +21,38 @@ from bookkit.studies import spawn
 from distfilt.filters import DensityFilter
 from distfilt.metrics import mean_interval
 
-NAME, PAPER = "gains", "zheng"
-CHOICES, CASE = swarm.CHOICES, figure.CASE
-WIDE, KERNELS = 1.0, {"narrow": 0.05, "broad": 0.12}
-READINGS = ("paper", "paper_flat", "fast", "fast_flat", "steps_flat",
-            "steps_printed", "paper_wide", "paper_narrow", "paper_broad")
+NAME = "gains"
+PAPER = "zheng"
+CHOICES = swarm.CHOICES
+CASE = figure.CASE
+WIDE = 1.0
+KERNELS = {"narrow": 0.05, "broad": 0.12}
+READINGS = (
+    "paper",
+    "paper_flat",
+    "fast",
+    "fast_flat",
+    "steps_flat",
+    "steps_printed",
+    "paper_wide",
+    "paper_narrow",
+    "paper_broad",
+)
 CENTRALS = ("central", "central_printed", *(f"central_{k}" for k in KERNELS))
 KINDS = ("error", "ratio", "ratio_high", "falls_high", "below")
-columns = ["kde", *CENTRALS, *(f"{s}_below" for s in CENTRALS),
-           *(f"{r}_{k}" for r in READINGS for k in KINDS)]
-parameters = {"seed": CHOICES["seed"], "end": CASE.end, "local": swarm.LOCAL, "wide": WIDE,
-              "kernels": KERNELS}
+columns = [
+    "kde",
+    *CENTRALS,
+    *(f"{s}_below" for s in CENTRALS),
+    *(f"{r}_{k}" for r in READINGS for k in KINDS),
+]
+parameters = {
+    "seed": CHOICES["seed"],
+    "end": CASE.end,
+    "local": swarm.LOCAL,
+    "wide": WIDE,
+    "kernels": KERNELS,
+}
 seeds = spawn(CHOICES["seed"] + 1, 2)
 scenarios = swarm.scenarios
 rtol = 1e-4
@@ -59,7 +80,9 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One run: per reading the claims of the caption, each from eight local filters."""
     filters = {s: network(s) for s in (*CENTRALS, *READINGS)}
     run, _ = swarm.compared(CASE, np.random.default_rng(seed), filters)
-    half, k, level = CASE.end / 2, len(run["kde"]) // 12, float(run["kde"].mean())
+    half = CASE.end / 2
+    k = len(run["kde"]) // 12
+    level = float(run["kde"].mean())
     out = {"kde": swarm.average(run["kde"], CASE, half)}
     for s in CENTRALS:
         out[s] = swarm.average(run[f"{s}_error"], CASE, half)[0]
@@ -70,7 +93,8 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         falls = mean_interval(error[-k:].mean(axis=0) / error[:k].mean(axis=0))
         out |= {
             f"{r}_error": swarm.average(error, CASE, half).mean(),
-            f"{r}_ratio": ratio.estimate, f"{r}_ratio_high": ratio.high,
+            f"{r}_ratio": ratio.estimate,
+            f"{r}_ratio_high": ratio.high,
             f"{r}_falls_high": falls.high,
             f"{r}_below": figure.below(error.mean(axis=1), level),
         }

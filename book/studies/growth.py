@@ -17,16 +17,30 @@ import _swarm as swarm
 
 from bookkit.studies import spawn
 
-NAME, PAPER = "growth", "zheng"
+NAME = "growth"
+PAPER = "zheng"
 CHOICES = swarm.CHOICES
-SIZES, GRIDS = (50, 100, 300, 1000, 3000, 10_000), (15, 30, 60)
-END, FROM, SIXTEEN, TABLES = 6.0, 4.0, 16, 3000
+SIZES = (50, 100, 300, 1000, 3000, 10_000)
+GRIDS = (15, 30, 60)
+END = 6.0
+FROM = 4.0
+SIXTEEN = 16
+TABLES = 3000
 RULES = ("central", "paper", "average", "flooding")
 TOLD = ("consensus", "numbers")
 columns = [
-    *(f"{kind}_{n}_{k}" for kind, sizes in (("agents", SIZES), ("cells", GRIDS)) for n in sizes
-      for k in ("kde", "open", *RULES, *(f"{r}_{k}" for r in RULES[1:] for k in TOLD),
-                "connected")),
+    *(
+        f"{kind}_{n}_{k}"
+        for kind, sizes in (("agents", SIZES), ("cells", GRIDS))
+        for n in sizes
+        for k in (
+            "kde",
+            "open",
+            *RULES,
+            *(f"{r}_{k}" for r in RULES[1:] for k in TOLD),
+            "connected",
+        )
+    ),
 ]
 parameters = {"seed": CHOICES["seed"], "end": END, "local": SIXTEEN}
 seeds = spawn(CHOICES["seed"] + 3, 3)
@@ -40,7 +54,9 @@ def one(case: swarm.Case, rng: np.random.Generator) -> dict[str, float]:
     filters = {s: swarm.network(s, case, min(SIXTEEN, case.agents)) for s in names}
     parts: list[bool] = []
 
-    def watch(t: float, x: np.ndarray, p: np.ndarray, states: dict[str, object]) -> None:
+    def watch(
+        t: float, x: np.ndarray, p: np.ndarray, states: dict[str, object]
+    ) -> None:
         parts.append(states["paper"].parts == 1)
 
     run, ends = swarm.compared(case, rng, filters, watch, every=10)
@@ -50,7 +66,10 @@ def one(case: swarm.Case, rng: np.random.Generator) -> dict[str, float]:
     steps = case.agents * END / swarm.SWARM["dt"]
     for s in RULES[1:]:
         sent = ends[s].ledger.scalars.sum() / steps if s in ends else np.nan
-        out |= {f"{s}_consensus": late.get(f"{s}_consensus", np.nan), f"{s}_numbers": float(sent)}
+        out |= {
+            f"{s}_consensus": late.get(f"{s}_consensus", np.nan),
+            f"{s}_numbers": float(sent),
+        }
     return out
 
 

@@ -16,8 +16,10 @@ import _swarm as swarm
 
 from bookkit.studies import spawn
 
-NAME, PAPER = "hearing", "zheng"
-CHOICES, FROM = swarm.CHOICES, 10.0
+NAME = "hearing"
+PAPER = "zheng"
+CHOICES = swarm.CHOICES
+FROM = 10.0
 CASE = swarm.Case(start="peaked", end=15.0)
 columns = ["central", "central_flat", "flooding"]
 parameters = {"seed": CHOICES["seed"], "end": CASE.end, "local": swarm.LOCAL}
@@ -34,7 +36,9 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         "flooding": swarm.network("flooding", CASE),
     }
     run, _ = swarm.compared(CASE, np.random.default_rng(seed), filters)
-    return {s: float(swarm.average(run[f"{s}_error"], CASE, FROM).mean()) for s in columns}
+    return {
+        s: float(swarm.average(run[f"{s}_error"], CASE, FROM).mean()) for s in columns
+    }
 
 
 code = swarm.code

@@ -16,16 +16,30 @@ import _swarm as swarm
 
 from bookkit.studies import spawn
 
-NAME, PAPER = "locals", "zheng"
+NAME = "locals"
+PAPER = "zheng"
 CHOICES = swarm.CHOICES
-CASE = swarm.Case(end=float(CHOICES["end_times"][CHOICES["readings"].index("slowgibbs")]))
+CASE = swarm.Case(
+    end=float(CHOICES["end_times"][CHOICES["readings"].index("slowgibbs")])
+)
 NAMES = ("central", "paper", "flooding")
 MARKS = tuple(range(2, round(CASE.end) + 1, 2))
-LINES = ("kde", "open", "open_flat", "central",
-         *(f"{s}_{i}" for s in NAMES[1:] for i in range(swarm.LOCAL)))
+LINES = (
+    "kde",
+    "open",
+    "open_flat",
+    "central",
+    *(f"{s}_{i}" for s in NAMES[1:] for i in range(swarm.LOCAL)),
+)
 columns = [
-    *LINES, "central_20_40", "flooding_20_40", "central_half",
-    "paper_consensus", "flooding_consensus", "central_below", "paper_below",
+    *LINES,
+    "central_20_40",
+    "flooding_20_40",
+    "central_half",
+    "paper_consensus",
+    "flooding_consensus",
+    "central_below",
+    "paper_below",
     *(f"paper_{k}_{i}" for k in ("half", "falls") for i in range(swarm.LOCAL)),
     *(f"{line}_at_{t}" for line in LINES for t in MARKS),
 ]
@@ -46,16 +60,25 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     filters = {s: swarm.network(s, CASE) for s in NAMES}
     run, _ = swarm.compared(CASE, np.random.default_rng(seed), filters)
     lines = {n: run[n] for n in LINES[:3]} | {"central": run["central_error"][:, 0]}
-    lines |= {f"{s}_{i}": run[f"{s}_error"][:, i] for s in NAMES[1:] for i in range(swarm.LOCAL)}
-    late, half = CHOICES["average_from"], CASE.end / 2
+    lines |= {
+        f"{s}_{i}": run[f"{s}_error"][:, i]
+        for s in NAMES[1:]
+        for i in range(swarm.LOCAL)
+    }
+    late = CHOICES["average_from"]
+    half = CASE.end / 2
     out = {n: swarm.average(e, CASE, late) for n, e in lines.items()}
-    out |= {f"{n}_at_{t}": e[round(t / swarm.SWARM["dt"]) - 1]
-            for n, e in lines.items() for t in MARKS}
+    out |= {
+        f"{n}_at_{t}": e[round(t / swarm.SWARM["dt"]) - 1]
+        for n, e in lines.items()
+        for t in MARKS
+    }
     for s in NAMES[:1] + NAMES[2:]:
         out[f"{s}_20_40"] = swarm.average(run[f"{s}_error"], CASE, 20.0, 40.0).mean()
     for s in NAMES[1:]:
         out[f"{s}_consensus"] = swarm.average(run[f"{s}_consensus"], CASE, late).mean()
-    local, level = run["paper_error"], float(run["kde"].mean())
+    local = run["paper_error"]
+    level = float(run["kde"].mean())
     k = round(5.0 / swarm.SWARM["dt"])
     falls = local[-k:].mean(axis=0) / local[:k].mean(axis=0)
     out |= {
@@ -64,7 +87,9 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         "paper_below": below(local.mean(axis=1), level),
     }
     out |= {f"paper_falls_{i}": v for i, v in enumerate(falls)}
-    out |= {f"paper_half_{i}": v for i, v in enumerate(swarm.average(local, CASE, half))}
+    out |= {
+        f"paper_half_{i}": v for i, v in enumerate(swarm.average(local, CASE, half))
+    }
     return {name: float(out[name]) for name in columns}
 
 

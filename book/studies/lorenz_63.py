@@ -18,7 +18,10 @@ NAME = "lorenz-63"
 PAPER = "grange"
 
 MEMBERS = (100, 400, 1000)
-DT, STEPS, BURN, VARIANCE = 0.1, 150, 30, 4.0
+DT = 0.1
+STEPS = 150
+BURN = 30
+VARIANCE = 4.0
 PENALTY = 0.01
 MAPS = {
     "affine": affine.fit,
@@ -34,7 +37,8 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     start = rng.standard_normal(3) + [1.5, -1.5, 25.5]
     times = DT * np.arange(1, 101 + STEPS)
     path = simulate(model, start, times, rng=rng)
-    first, truth = path[99], path[100:]
+    first = path[99]
+    truth = path[100:]
     seen = truth + np.sqrt(VARIANCE) * rng.standard_normal(truth.shape)
     cloud = first + np.sqrt(VARIANCE) * rng.standard_normal((MEMBERS[-1], 3))
     draws = source.spawn(len(MEMBERS))
@@ -49,7 +53,9 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
 
 def scores(name, fit, members, truth, seen, rng):
     """One filter: mean over time of its error and of its spread."""
-    model, errors, spreads = lorenz63(step=0.02), [], []
+    model = lorenz63(step=0.02)
+    errors = []
+    spreads = []
     noise = VARIANCE * np.eye(3)
     for k, y in enumerate(seen):
         members = model.step(members, 0.0, DT)
@@ -62,10 +68,17 @@ def scores(name, fit, members, truth, seen, rng):
 
 
 parameters = {
-    "members": list(MEMBERS), "dt": DT, "steps": STEPS, "burn": BURN,
-    "variance": VARIANCE, "penalty": PENALTY, "maps": list(MAPS),
+    "members": list(MEMBERS),
+    "dt": DT,
+    "steps": STEPS,
+    "burn": BURN,
+    "variance": VARIANCE,
+    "penalty": PENALTY,
+    "maps": list(MAPS),
 }
-columns = tuple(f"{m}_{n}_{what}" for n in MEMBERS for m in MAPS for what in ("rmse", "spread"))
+columns = tuple(
+    f"{m}_{n}_{what}" for n in MEMBERS for m in MAPS for what in ("rmse", "spread")
+)
 code = (scores,)
 seeds = np.random.SeedSequence(363).spawn(60)
 rtol = 1e-6

@@ -12,18 +12,18 @@ from functools import partial
 
 import numpy as np
 
-from distfilt.validation import unchecked
 from distfilt.filters import ParticleCollapse
 from distfilt.metrics import crps
 from distfilt.models import lorenz63, simulate
 from distfilt.updates import (
-    etpf,
-    with_inflation,
-    jitter,
     enkf,
-    resample,
     etkf,
+    etpf,
+    jitter,
+    resample,
+    with_inflation,
 )
+from distfilt.validation import unchecked
 
 # Strengths that are too weak are part of the study.
 warnings.filterwarnings("ignore", category=ParticleCollapse)
@@ -32,8 +32,13 @@ NAME = "lorenz-coupling"
 PAPER = "das"
 
 MEMBERS = (20, 100)
-DT, STEPS, BURN, VARIANCE = 0.12, 120, 30, 8.0
-PARTICLES, TUNING, TRIALS = 2000, 5, 20
+DT = 0.12
+STEPS = 120
+BURN = 30
+VARIANCE = 8.0
+PARTICLES = 2000
+TUNING = 5
+TRIALS = 20
 
 
 def particles(x, h, y, r, *, rng, bandwidth):
@@ -48,9 +53,7 @@ FAMILIES = {
     "enkf": [with_inflation(enkf, factor=f) for f in (1.02, 1.05, 1.1)],
     "root": [with_inflation(etkf, factor=f) for f in (1.02, 1.05, 1.1)],
     "transport": [partial(etpf, rejuvenation=h) for h in (0.1, 0.2, 0.3)],
-    "second": [
-        partial(etpf, rejuvenation=h, correct=True) for h in (0.1, 0.2, 0.3)
-    ],
+    "second": [partial(etpf, rejuvenation=h, correct=True) for h in (0.1, 0.2, 0.3)],
     "particles": [partial(particles, bandwidth=h) for h in (0.2, 0.3, 0.4)],
 }
 bound = partial(particles, bandwidth=0.1)
@@ -68,7 +71,8 @@ def data(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def scores(update, members, truth, seen, rng):
     """Error, spread and CRPS of one filter: means over time after the burn-in."""
-    inner, rows = unchecked(update), []
+    inner = unchecked(update)
+    rows = []
     noise = VARIANCE * np.eye(1)
     for k, y in enumerate(seen):
         members = model.transition(members, 0.0, DT)
@@ -93,27 +97,44 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     }
     cases["bound"] = (bound, PARTICLES)
     out = {}
-    for (case, (update, n)), stream in zip(cases.items(), source.spawn(len(cases)), strict=True):
+    for (case, (update, n)), stream in zip(
+        cases.items(), source.spawn(len(cases)), strict=True
+    ):
         found = scores(update, cloud[:n], truth, seen, stream)
-        out |= {f"{case}_{what}": float(v) for what, v in zip(SCORES, found, strict=True)}
+        out |= {
+            f"{case}_{what}": float(v) for what, v in zip(SCORES, found, strict=True)
+        }
     return out
 
 
 SCORES = ("rmse", "spread", "crps")
 parameters = {
-    "members": list(MEMBERS), "dt": DT, "steps": STEPS, "burn": BURN, "variance": VARIANCE,
-    "particles": PARTICLES, "tuning": TUNING, "families": list(FAMILIES),
-}  # fmt: skip
+    "members": list(MEMBERS),
+    "dt": DT,
+    "steps": STEPS,
+    "burn": BURN,
+    "variance": VARIANCE,
+    "particles": PARTICLES,
+    "tuning": TUNING,
+    "families": list(FAMILIES),
+}
 columns = (
-    *(f"{name}_{n}_{k}_{what}" for n in MEMBERS for name in FAMILIES for k in range(3)
-      for what in SCORES),
+    *(
+        f"{name}_{n}_{k}_{what}"
+        for n in MEMBERS
+        for name in FAMILIES
+        for k in range(3)
+        for what in SCORES
+    ),
     *(f"bound_{what}" for what in SCORES),
-)  # fmt: skip
+)
 code = (particles, data, scores)
 seeds = np.random.SeedSequence(512).spawn(TRIALS)
 rtol = 1e-3
 # In these filters a difference of the last bit grows with the model's chaos, tenfold in ten steps:
 # another processor's members part from the stored ones before the end.
-rough = [name for name in columns if name.startswith(("transport", "second", "particles"))]
+rough = [
+    name for name in columns if name.startswith(("transport", "second", "particles"))
+]
 # With twenty members it may also lose the path, farther than it did in any stored trial.
 odd = 5

@@ -12,7 +12,8 @@ import orbit as paper
 
 from distfilt.network import Faults
 
-NAME, PAPER = "losses", "semeraro"
+NAME = "losses"
+PAPER = "semeraro"
 METRICS = ("error_tp", "nees")
 ROWS = ("one_ci", "news")
 LOSSES = {"none": 0.0, "some": 0.3}
@@ -22,20 +23,30 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """Means over agents and the epochs from 2 to 20 h."""
     rng = np.random.default_rng(seed)
     truth, *rest = paper.data(paper.SETTING, rng)
-    which, out = int(rng.integers(2**31)), {}
+    which = int(rng.integers(2**31))
+    out = {}
     for row in ROWS:
         for lost, share in LOSSES.items():
             options = {**paper.SINGLE[row], "faults": Faults(loss=share, seed=which)}
             states = paper.run(paper.SETTING, options, *rest)
             found = [paper.scored(states[k].mixtures, truth[k]) for k in paper.EARLY]
-            out |= {f"{row}_{lost}_{m}": float(np.mean([f[m].mean() for f in found]))
-                    for m in METRICS}
+            out |= {
+                f"{row}_{lost}_{m}": float(np.mean([f[m].mean() for f in found]))
+                for m in METRICS
+            }
     return {name: float(paper.SIX.format(v)) for name, v in out.items()}
 
 
 columns = [f"{row}_{lost}_{m}" for row in ROWS for lost in LOSSES for m in METRICS]
 parameters = {"setting": paper.SETTING, "losses": LOSSES}
-code = (paper.data, paper.readings, paper.beliefs, paper.network, paper.run, paper.scored)
+code = (
+    paper.data,
+    paper.readings,
+    paper.beliefs,
+    paper.network,
+    paper.run,
+    paper.scored,
+)
 scenarios = paper.scenarios
 seeds = np.random.SeedSequence(900).spawn(96)
 rtol = 1e-3

@@ -15,7 +15,9 @@ from distfilt.models import pendulum as motion
 from distfilt.models import pendulum_chart, pendulum_states
 
 starts = studies.script("starts")
-pendulum, setting, TIMES = starts.pendulum, starts.setting, starts.TIMES
+pendulum = starts.pendulum
+setting = starts.setting
+TIMES = starts.TIMES
 
 NAME = "onset"
 PAPER = "das"
@@ -25,9 +27,11 @@ LIMITS = (0.2, 0.3, 0.5)
 WIDER = (2, 3, 5)
 """Factors of the prior's standard deviation."""
 steady = motion(
-    length=setting["length"], gravity=setting["gravity"], step=setting["integration_step"],
+    length=setting["length"],
+    gravity=setting["gravity"],
+    step=setting["integration_step"],
     form="multiplier",
-)  # fmt: skip
+)
 
 
 def stretched(members: np.ndarray, factor: float) -> np.ndarray:
@@ -52,12 +56,16 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """Both starts, both forms of the equations, and wider priors."""
     rng, again = (np.random.default_rng(s) for s in seed.spawn(2))
     truth, readings, off = pendulum.data(rng)
-    on, out = starts.on_circle(again), {}
+    on = starts.on_circle(again)
+    out = {}
     cases = {
         f"{start}_{form}": (members, ("OTF",), model)
         for start, members in (("off", off), ("on", on))
         for form, model in (("printed", pendulum.swing), ("multiplier", steady))
-    } | {f"wide{k}": (stretched(on, k), ("OTF", "OTNLeqMA"), pendulum.swing) for k in WIDER}
+    } | {
+        f"wide{k}": (stretched(on, k), ("OTF", "OTNLeqMA"), pendulum.swing)
+        for k in WIDER
+    }
     for case, (members, names, model) in cases.items():
         found = pendulum.run(readings, members, names, model=model)
         for k, name in enumerate(names):
@@ -69,14 +77,24 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
 parameters = {name: np.asarray(setting[name]).tolist() for name in setting}
 parameters |= {"limits": list(LIMITS), "wider": list(WIDER)}
 SCORES = (
-    "constraint", "growth", "ratio_yx", *(f"onset_{round(100 * limit)}cm" for limit in LIMITS),
-)  # fmt: skip
+    "constraint",
+    "growth",
+    "ratio_yx",
+    *(f"onset_{round(100 * limit)}cm" for limit in LIMITS),
+)
 CASES = (
     *(f"{s}_{f}_OTF" for s in ("off", "on") for f in ("printed", "multiplier")),
     *(f"wide{k}_{name}" for k in WIDER for name in ("OTF", "OTNLeqMA")),
 )
 columns = tuple(f"{case}_{key}" for case in CASES for key in SCORES)
-code = (stretched, departures, starts.on_circle, pendulum.data, pendulum.run, pendulum.scores)
+code = (
+    stretched,
+    departures,
+    starts.on_circle,
+    pendulum.data,
+    pendulum.run,
+    pendulum.scores,
+)
 seeds = starts.seeds[:40]
 rtol = 1e-4
 # A run that has lost the swing multiplies the last bit until it decides.

@@ -22,7 +22,8 @@ import orbit as paper
 from bookkit.studies import Stored, check, stored
 from distfilt.mixtures import GaussianMixture, fuse_mixtures
 
-NAME, PAPER = "orbit-choices", "semeraro"
+NAME = "orbit-choices"
+PAPER = "semeraro"
 EARLY_HOURS = tuple(paper.HOURS[k] for k in paper.EARLY)
 FIXES = {**paper.SETTING, "one_fix": False}
 
@@ -33,10 +34,15 @@ def sized(mixands: int) -> dict[str, Any]:
 
 
 CHOICES: dict[str, tuple[dict, dict, dict[str, Any]]] = {
-    "weights": (paper.SETTING, paper.MANY, {
-        "c1": partial(fuse_mixtures, rule="C1"), "c2": partial(fuse_mixtures, rule="C2"),
-        "all": partial(fuse_mixtures, terms="all"),
-    }),
+    "weights": (
+        paper.SETTING,
+        paper.MANY,
+        {
+            "c1": partial(fuse_mixtures, rule="C1"),
+            "c2": partial(fuse_mixtures, rule="C2"),
+            "all": partial(fuse_mixtures, terms="all"),
+        },
+    ),
     "mixands_6": (paper.SETTING, sized(6), {"c3": fuse_mixtures}),
     "mixands_24": (paper.SETTING, sized(24), {"c3": fuse_mixtures}),
     "split_2": (paper.SETTING, {**paper.MANY, "stretch": 2.5}, {"c3": fuse_mixtures}),
@@ -48,7 +54,8 @@ CHOICES: dict[str, tuple[dict, dict, dict[str, Any]]] = {
 
 def added(own: GaussianMixture, heard: list[GaussianMixture]) -> GaussianMixture:
     """Fusion without a discount: the beliefs multiplied."""
-    (m, P), (mean, cov) = own.moments(), heard[0].moments()
+    (m, P) = own.moments()
+    (mean, cov) = heard[0].moments()
     J = np.linalg.inv(cov)
     gain = P[:, :6] @ np.linalg.inv(np.eye(6) + J @ P[:6, :6])
     P = P - gain @ J @ P[:6]
@@ -58,9 +65,13 @@ def added(own: GaussianMixture, heard: list[GaussianMixture]) -> GaussianMixture
 def row(s: dict, options: dict, truth: np.ndarray, rest: tuple) -> dict[str, float]:
     """A filter's means over agents and the epochs from 2 to 20 h, and each agent's errors."""
     states = paper.run(s, options, *rest)
-    found = [paper.scored(x.mixtures, true) for x, true in zip(states, truth, strict=True)]
+    found = [
+        paper.scored(x.mixtures, true) for x, true in zip(states, truth, strict=True)
+    ]
     early = [found[k] for k in paper.EARLY]
-    out = {m: float(np.mean([f[m].mean() for f in early])) for m in (*paper.ERRORS, "nees")}
+    out = {
+        m: float(np.mean([f[m].mean() for f in early])) for m in (*paper.ERRORS, "nees")
+    }
     claims = [found[paper.HOURS.index(h)]["claim_tp"].mean() for h in (20, 22)]
     out["claim"] = float(np.sqrt(claims[1] / claims[0]))
     for hour, values in zip(EARLY_HOURS, early, strict=True):
@@ -70,13 +81,16 @@ def row(s: dict, options: dict, truth: np.ndarray, rest: tuple) -> dict[str, flo
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """All choices on one set of data."""
-    child, out = seed.spawn(1)[0], {}
+    child = seed.spawn(1)[0]
+    out = {}
     for name, (s, options, rules) in CHOICES.items():
         truth, *rest = paper.data(s, np.random.default_rng(child))
         found = {"none": row(s, options, truth, tuple(rest))}
         for rule, fusion in rules.items():
             found[rule] = row(s, {**options, "agreement": fusion}, truth, tuple(rest))
-        out |= {f"{name}_{rule}_{m}": v for rule, r in found.items() for m, v in r.items()}
+        out |= {
+            f"{name}_{rule}_{m}": v for rule, r in found.items() for m, v in r.items()
+        }
     truth, *rest = paper.data(paper.SETTING, np.random.default_rng(child))
     null = row(paper.SETTING, {**paper.ONE, "agreement": added}, truth, tuple(rest))
     out["added_nees"] = null["nees"]
@@ -84,10 +98,15 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
 
 
 METRICS = (
-    *paper.ERRORS, "nees", "claim", *(f"target{a}_{h}" for h in EARLY_HOURS for a in (1, 2)),
+    *paper.ERRORS,
+    "nees",
+    "claim",
+    *(f"target{a}_{h}" for h in EARLY_HOURS for a in (1, 2)),
 )
 columns = [
-    f"{name}_{rule}_{m}" for name, (_, _, rules) in CHOICES.items() for rule in ("none", *rules)
+    f"{name}_{rule}_{m}"
+    for name, (_, _, rules) in CHOICES.items()
+    for rule in ("none", *rules)
     for m in METRICS
 ] + ["added_nees"]
 parameters = {
@@ -95,7 +114,14 @@ parameters = {
     "choices": {name: ["none", *rules] for name, (_, _, rules) in CHOICES.items()},
 }
 code = (
-    sized, added, row, paper.data, paper.readings, paper.beliefs, paper.network, paper.run,
+    sized,
+    added,
+    row,
+    paper.data,
+    paper.readings,
+    paper.beliefs,
+    paper.network,
+    paper.run,
     paper.scored,
 )
 scenarios = paper.scenarios
@@ -112,7 +138,11 @@ def again(seed: np.random.SeedSequence) -> dict[str, float]:
     fused = {**options, "agreement": rules["c3"]}
     found = {"none": options, "c3": fused, "added": {**paper.ONE, "agreement": added}}
     rows = {name: row(s, chosen, truth, tuple(rest)) for name, chosen in found.items()}
-    out = {f"mixands_6_{name}_{m}": rows[name][m] for name in ("none", "c3") for m in METRICS}
+    out = {
+        f"mixands_6_{name}_{m}": rows[name][m]
+        for name in ("none", "c3")
+        for m in METRICS
+    }
     out["added_nees"] = rows["added"]["nees"]
     return {name: float(paper.SIX.format(v)) for name, v in out.items()}
 
@@ -120,6 +150,8 @@ def again(seed: np.random.SeedSequence) -> dict[str, float]:
 def checked() -> Stored:
     """The stored study, once that part of two of its seeds has run again and agrees."""
     whole = stored(PAPER, NAME)
-    quick = {m: v for m, v in whole.columns.items() if m.startswith(("mixands_6_", "added_"))}
+    quick = {
+        m: v for m, v in whole.columns.items() if m.startswith(("mixands_6_", "added_"))
+    }
     check(replace(whole, columns=quick), again, indices=[0, 1], rtol=rtol)
     return whole

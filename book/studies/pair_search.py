@@ -24,26 +24,41 @@ from distfilt.mixtures import GaussianMixture, PartialFusion, jeffreys_of_many
 
 arcs = studies.script("arcs")
 
-NAME, PAPER = "pair-search", "semeraro"
+NAME = "pair-search"
+PAPER = "semeraro"
 STUDY = scenario("semeraro", "table-1").reading()
 OMEGA = float(STUDY["omega"])
-PRINTED = np.array([
-    [float(r[c]) for c in ("d1", "d2", "target")] for r in table("semeraro", "table-1")
-])
+PRINTED = np.array(
+    [
+        [float(r[c]) for c in ("d1", "d2", "target")]
+        for r in table("semeraro", "table-1")
+    ]
+)
 SHAPES = ("angle_std", "range_std", "ego_std", "width", "span")
 RULES = ("C1", "C2", "C3")
 DISTANCE = 9.0
 """Of agent 1 from the target: lengths have no unit."""
 BOUNDS = {
-    "angle_std": (0.1, 0.8), "range_std": (0.25, 0.5), "ego_std": (0.25, 0.6), "width": (0.2, 0.5),
-    "span": (1.2, 2.4), "distance": (2.5, 10.0), "turn": (0.5, 2.6),
+    "angle_std": (0.1, 0.8),
+    "range_std": (0.25, 0.5),
+    "ego_std": (0.25, 0.6),
+    "width": (0.2, 0.5),
+    "span": (1.2, 2.4),
+    "distance": (2.5, 10.0),
+    "turn": (0.5, 2.6),
 }
-FAR, NEAR = 3, 5
-DRAWN, AWAY = 24, 0.1
+FAR = 3
+NEAR = 5
+DRAWN = 24
+AWAY = 0.1
 """How many far starts are drawn, the best of which is taken; and how far a near one is moved."""
 STEPS = {"far": 360, "near": 120}
 SPREAD = {"far": 0.25, "near": 0.05}
-POINTS, MANY, NODES, EACH, OFFSPRING = 1024, 8192, 18, 3, 12
+POINTS = 1024
+MANY = 8192
+NODES = 18
+EACH = 3
+OFFSPRING = 12
 SHARES = np.array([0.3, 0.2, 0.4, 0.1])
 """Of C1, C2, C3 and the own belief in the proposal."""
 
@@ -98,7 +113,8 @@ def mixed(parts: Sequence[GaussianMixture], shares: np.ndarray) -> GaussianMixtu
     """A mixture of mixtures."""
     return GaussianMixture(
         np.concatenate([m.weights * s for m, s in zip(parts, shares, strict=True)]),
-        np.concatenate([m.means for m in parts]), np.concatenate([m.covs for m in parts]),
+        np.concatenate([m.means for m in parts]),
+        np.concatenate([m.covs for m in parts]),
     )
 
 
@@ -111,7 +127,8 @@ def jeffreys(p: np.ndarray, q: np.ndarray, base: np.ndarray) -> float:
 
 def sampled(y: np.ndarray, u: Cubes) -> np.ndarray:
     """Logarithms of our nine divergences over the printed ones, on places of the cube."""
-    out, targets = [], []
+    out = []
+    targets = []
     for fusion, places in zip(fusions(y), u[:2], strict=True):
         parts = [*weighed(fusion), fusion.own]
         x = points(mixed(parts, SHARES), places)
@@ -134,14 +151,29 @@ def exactly(y: np.ndarray) -> np.ndarray:
     for parts, fusion in zip(fused, both, strict=True):
         mean, cov = mixed(parts, np.full(3, 1 / 3)).moments()
         half = 4.2 * np.sqrt(np.diag(cov))
-        out.append([v.value for v in jeffreys_of_many(
-            fusion.log_value, [m.log_density for m in parts], mean - half, mean + half,
-            nodes=NODES)])
+        out.append(
+            [
+                v.value
+                for v in jeffreys_of_many(
+                    fusion.log_value,
+                    [m.log_density for m in parts],
+                    mean - half,
+                    mean + half,
+                    nodes=NODES,
+                )
+            ]
+        )
     pairs = [[m.marginal([0, 1]) for m in pair] for pair in zip(*fused, strict=True)]
     mean, cov = mixed([m for pair in pairs for m in pair], np.full(6, 1 / 6)).moments()
     half = 4.2 * np.sqrt(np.diag(cov))
-    out.append([jeffreys_of_many(a.log_density, [b.log_density], mean - half, mean + half,
-                                 nodes=80)[0].value for a, b in pairs])
+    out.append(
+        [
+            jeffreys_of_many(
+                a.log_density, [b.log_density], mean - half, mean + half, nodes=80
+            )[0].value
+            for a, b in pairs
+        ]
+    )
     return np.log(np.array(out).T / PRINTED)
 
 
@@ -154,17 +186,22 @@ def evolved(
     y: np.ndarray, u: Cubes, steps: int, spread: float, rng: np.random.Generator
 ) -> np.ndarray:
     """Evolution with covariance adaptation (Hansen's rules) from a start; the best pair met."""
-    n, mu = y.size, OFFSPRING // 2
+    n = y.size
+    mu = OFFSPRING // 2
     w = np.log(mu + 0.5) - np.log(np.arange(1, mu + 1))
     w /= w.sum()
     mass = 1 / (w**2).sum()
-    c_s, c_c = (mass + 2) / (n + mass + 5), (4 + mass / n) / (n + 4 + 2 * mass / n)
+    c_s = (mass + 2) / (n + mass + 5)
+    c_c = (4 + mass / n) / (n + 4 + 2 * mass / n)
     damping = 1 + c_s + 2 * max(0.0, np.sqrt((mass - 1) / (n + 1)) - 1)
     c_1 = 2 / ((n + 1.3) ** 2 + mass)
     c_mu = min(1 - c_1, 2 * (mass - 2 + 1 / mass) / ((n + 2) ** 2 + mass))
     usual = np.sqrt(n) * (1 - 1 / (4 * n) + 1 / (21 * n**2))
-    cov, path_s, path_c = np.eye(n), np.zeros(n), np.zeros(n)
-    best, least = y, factor(sampled(y, u))
+    cov = np.eye(n)
+    path_s = np.zeros(n)
+    path_c = np.zeros(n)
+    best = y
+    least = factor(sampled(y, u))
     for k in range(steps // OFFSPRING):
         values, axes = np.linalg.eigh(cov)
         lengths = np.sqrt(np.maximum(values, 1e-12))
@@ -174,18 +211,23 @@ def evolved(
             logs = sampled(y + spread * move, u)
             costs[i] = (logs**4).sum()
             if factor(logs) < least:
-                best, least = y + spread * move, factor(logs)
+                best = y + spread * move
+                least = factor(logs)
         order = np.argsort(costs)[:mu]
         move = w @ moves[order]
         y = y + spread * move
         path_s = (1 - c_s) * path_s + np.sqrt(c_s * (2 - c_s) * mass) * (
-            axes @ (axes.T @ move / lengths))
+            axes @ (axes.T @ move / lengths)
+        )
         size = np.linalg.norm(path_s) / np.sqrt(1 - (1 - c_s) ** (2 * (k + 1)))
         path_c = (1 - c_c) * path_c
         if size < (1.4 + 2 / (n + 1)) * usual:
             path_c += np.sqrt(c_c * (2 - c_c) * mass) * move
-        cov = ((1 - c_1 - c_mu) * cov + c_1 * np.outer(path_c, path_c)
-               + c_mu * (moves[order].T * w) @ moves[order])
+        cov = (
+            (1 - c_1 - c_mu) * cov
+            + c_1 * np.outer(path_c, path_c)
+            + c_mu * (moves[order].T * w) @ moves[order]
+        )
         spread *= float(np.exp(c_s / damping * (np.linalg.norm(path_s) / usual - 1)))
     return best
 
@@ -194,7 +236,8 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One search: the largest factor off Table 1 at its start and at its end, and the pair."""
     for_start, for_points, for_moves, for_scores = seed.spawn(4)
     kind = "far" if seed.spawn_key[0] < FAR else "near"
-    rng, u = np.random.default_rng(for_start), cubes(np.random.default_rng(for_points), POINTS)
+    rng = np.random.default_rng(for_start)
+    u = cubes(np.random.default_rng(for_points), POINTS)
     if kind == "far":
         names = (*SHAPES, *SHAPES, "distance", "turn")
         low, high = np.log([BOUNDS[name] for name in names]).T
@@ -206,8 +249,12 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     y = evolved(y, u, STEPS[kind], SPREAD[kind], np.random.default_rng(for_moves))
     own = factor(sampled(y, u))
     return {
-        "far": float(kind == "far"), "start": began, "own": own, **again(y, for_scores),
-        "exact": factor(exactly(y)), **{f"y_{k}": float(v) for k, v in enumerate(y)},
+        "far": float(kind == "far"),
+        "start": began,
+        "own": own,
+        **again(y, for_scores),
+        "exact": factor(exactly(y)),
+        **{f"y_{k}": float(v) for k, v in enumerate(y)},
     }
 
 
@@ -215,7 +262,10 @@ def again(y: np.ndarray, seed: np.random.SeedSequence) -> dict[str, float]:
     """Scores of a pair on fresh places: the mean of a few, and on many."""
     rng = np.random.default_rng(seed)
     fresh = [factor(sampled(y, cubes(rng, POINTS))) for _ in range(EACH)]
-    return {"fresh": float(np.mean(fresh)), "many": factor(sampled(y, cubes(rng, MANY)))}
+    return {
+        "fresh": float(np.mean(fresh)),
+        "many": factor(sampled(y, cubes(rng, MANY))),
+    }
 
 
 def checked() -> Stored:
@@ -227,16 +277,38 @@ def checked() -> Stored:
         y = np.array([whole.columns[f"y_{k}"][row] for k in range(12)])
         return again(y, seed.spawn(4)[3])
 
-    part = type(whole)(whole.path, whole.metadata, whole.seeds, whole.failures,
-                       {name: whole.columns[name] for name in ("fresh", "many")})
+    part = type(whole)(
+        whole.path,
+        whole.metadata,
+        whole.seeds,
+        whole.failures,
+        {name: whole.columns[name] for name in ("fresh", "many")},
+    )
     check(part, scored, indices=[0, len(whole) - 1], rtol=rtol)
     return whole
 
 
-columns = ("far", "start", "own", "fresh", "many", "exact", *(f"y_{k}" for k in range(12)))
+columns = (
+    "far",
+    "start",
+    "own",
+    "fresh",
+    "many",
+    "exact",
+    *(f"y_{k}" for k in range(12)),
+)
 parameters = {
-    "bounds": BOUNDS, "far": FAR, "near": NEAR, "drawn": DRAWN, "away": AWAY, "steps": STEPS,
-    "spread": SPREAD, "points": POINTS, "many": MANY, "nodes": NODES, "offspring": OFFSPRING,
+    "bounds": BOUNDS,
+    "far": FAR,
+    "near": NEAR,
+    "drawn": DRAWN,
+    "away": AWAY,
+    "steps": STEPS,
+    "spread": SPREAD,
+    "points": POINTS,
+    "many": MANY,
+    "nodes": NODES,
+    "offspring": OFFSPRING,
     "shares": SHARES.tolist(),
 }
 code = (sampled, exactly, evolved, again, fusions, points, arcs.arc)

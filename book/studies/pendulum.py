@@ -15,10 +15,10 @@ import numpy as np
 
 from bookkit.published import scenario
 from distfilt.coupling import norm_constraint, project, retract
-from distfilt.validation import unchecked
 from distfilt.filters import ParticleCollapse
 from distfilt.models import pendulum, pendulum_states
-from distfilt.updates import with_augmentation, etpf, with_projection, with_retraction
+from distfilt.updates import etpf, with_augmentation, with_projection, with_retraction
+from distfilt.validation import unchecked
 
 # The study counts the runs that lose the truth.
 warnings.filterwarnings("ignore", category=ParticleCollapse)
@@ -39,7 +39,9 @@ REJUVENATION = 0.2
 
 rod = norm_constraint([0, 1], length=setting["length"])
 swing = pendulum(
-    length=setting["length"], gravity=setting["gravity"], step=setting["integration_step"]
+    length=setting["length"],
+    gravity=setting["gravity"],
+    step=setting["integration_step"],
 )
 seen_too = with_augmentation(etpf, rod, std=setting["constraint_std"])
 how = {"reading": setting["reading"], "regularisation": setting["regularisation"]}
@@ -70,11 +72,19 @@ def data(
     truth = np.empty((STEPS, 4))
     for k in range(STEPS):
         state = truth[k] = swing.step(state, 0.0, DT)
-    return truth, truth[:, :2] + np.sqrt(NOISE[0, 0]) * rng.standard_normal((STEPS, 2)), members
+    return (
+        truth,
+        truth[:, :2] + np.sqrt(NOISE[0, 0]) * rng.standard_normal((STEPS, 2)),
+        members,
+    )
 
 
 def run(
-    readings: np.ndarray, members: np.ndarray, names=tuple(UPDATES), updates=UPDATES, draws=0,
+    readings: np.ndarray,
+    members: np.ndarray,
+    names=tuple(UPDATES),
+    updates=UPDATES,
+    draws=0,
     model=swing,
 ):
     """Analysis members of several filters side by side, (T, F, N, 4); NaN after a failure.
@@ -118,7 +128,9 @@ def scores(name: str, members: np.ndarray, truth: np.ndarray) -> dict[str, float
     late = TIMES > setting["score_from"] + 1e-9
     spread = np.sqrt(members[late].var(axis=1, ddof=1).mean(axis=0))
     away = (np.hypot(gap[:, 0], gap[:, 1]) > 0.3) & (TIMES > 1 + 1e-9)
-    around = members[late][:, :, :2] - members[late][:, :, :2].mean(axis=1, keepdims=True)
+    around = members[late][:, :, :2] - members[late][:, :, :2].mean(
+        axis=1, keepdims=True
+    )
     cov = np.swapaxes(around, 1, 2) @ around / (members.shape[1] - 1)
     nees = np.nan
     if np.isfinite(cov).all() and np.linalg.det(cov).min() > 1e-30:
@@ -153,14 +165,27 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         whole = np.isfinite(found["OTF"]).all(axis=(1, 2))
         found["OTProj"] = found["OTF"].copy()
         found["OTProj"][whole] = project(found["OTF"][whole], rod, **how)
-        return {k: v for name in ALGORITHMS for k, v in scores(name, found[name], truth).items()}
+        return {
+            k: v
+            for name in ALGORITHMS
+            for k, v in scores(name, found[name], truth).items()
+        }
 
 
 parameters = {name: np.asarray(setting[name]).tolist() for name in setting}
 parameters["rejuvenation"] = REJUVENATION
 SCORES = (
-    "constraint", "growth", "position", "velocity", "spread", "spread_velocity", "nees", "ratio_yx",
-    "diverged", "onset", "finite",
+    "constraint",
+    "growth",
+    "position",
+    "velocity",
+    "spread",
+    "spread_velocity",
+    "nees",
+    "ratio_yx",
+    "diverged",
+    "onset",
+    "finite",
 )
 columns = tuple(
     f"{name}_{key}"

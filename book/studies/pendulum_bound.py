@@ -17,19 +17,19 @@ import numpy as np
 
 from bookkit.published import scenario
 from distfilt.coupling import norm_constraint, retract
-from distfilt.validation import unchecked
 from distfilt.filters import ParticleCollapse
 from distfilt.metrics import crps
 from distfilt.models import pendulum, pendulum_angle, pendulum_chart, pendulum_states
 from distfilt.updates import (
-    with_augmentation,
-    etpf,
     enkf,
-    with_projection,
-    resample,
-    with_retraction,
     etkf,
+    etpf,
+    resample,
+    with_augmentation,
+    with_projection,
+    with_retraction,
 )
+from distfilt.validation import unchecked
 
 # The study counts the runs that lose the truth.
 warnings.filterwarnings("ignore", category=ParticleCollapse)
@@ -38,21 +38,31 @@ NAME = "pendulum-bound"
 PAPER = "das"
 
 setting = scenario("das", "pendulum")
-RUNS, PARTICLES, CELLS, REACH = 48, 4000, 161, 0.45
+RUNS = 48
+PARTICLES = 4000
+CELLS = 161
+REACH = 0.45
 DT = setting["dt_observe"]
 STEPS = round(setting["end_time"] / DT)
 TIMES = DT * np.arange(1, STEPS + 1)
 LATE = np.flatnonzero(TIMES > setting["score_from"] + 1e-9)
-LENGTH, N = setting["length"], setting["members"]
+LENGTH = setting["length"]
+N = setting["members"]
 START = np.array([np.deg2rad(setting["start_angle"]), setting["start_rate"]])
 NOISE = setting["noise_variance"] * np.eye(2)
 KICK = np.array([setting["noise_position"], setting["noise_velocity"]])
 PRIOR = (START, setting["prior_std"])
 MIRROR = (np.array([0.0, 0.0]), np.array([0.8, 0.5]))
 
-rod, motion = norm_constraint([0, 1], length=LENGTH), ([0, 1], [2, 3])
-options = {"length": LENGTH, "gravity": setting["gravity"], "step": setting["integration_step"]}
-cartesian, chart = pendulum(**options), pendulum_angle(**options)
+rod = norm_constraint([0, 1], length=LENGTH)
+motion = ([0, 1], [2, 3])
+options = {
+    "length": LENGTH,
+    "gravity": setting["gravity"],
+    "step": setting["integration_step"],
+}
+cartesian = pendulum(**options)
+chart = pendulum_angle(**options)
 seen_too = with_augmentation(etpf, rod, std=setting["constraint_std"])
 how = {"reading": setting["reading"], "regularisation": setting["regularisation"]}
 CARTESIAN = {
@@ -85,7 +95,8 @@ def place(q: np.ndarray) -> np.ndarray:
 def data(rng: np.random.Generator, noisy: bool, prior=PRIOR) -> tuple[np.ndarray, ...]:
     """True chart states (T, 2) from a draw of the prior, readings (T, 2), the prior's centre."""
     centre, std = prior
-    state, truth = centre + std * rng.standard_normal(2), np.empty((STEPS, 2))
+    state = centre + std * rng.standard_normal(2)
+    truth = np.empty((STEPS, 2))
     for k in range(STEPS):
         state = chart.step(state, 0.0, DT) + noisy * KICK * rng.standard_normal(2)
         truth[k] = state
@@ -98,9 +109,12 @@ def many(seeds) -> tuple[np.ndarray, np.ndarray]:
     drawn = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
-        drawn.append([rng.standard_normal(shape) for shape in (2, (STEPS, 2), (STEPS, 2))])
+        drawn.append(
+            [rng.standard_normal(shape) for shape in (2, (STEPS, 2), (STEPS, 2))]
+        )
     first, kicks, errors = (np.stack(x) for x in zip(*drawn, strict=True))
-    state, truth = PRIOR[0] + PRIOR[1] * first, np.empty((STEPS, len(first), 2))
+    state = PRIOR[0] + PRIOR[1] * first
+    truth = np.empty((STEPS, len(first), 2))
     for k in range(STEPS):
         state = truth[k] = chart.step(state, 0.0, DT) + KICK * kicks[:, k]
     return truth, place(truth)[..., :2] + np.sqrt(NOISE[0, 0]) * errors.swapaxes(0, 1)
@@ -129,9 +143,13 @@ def ensembles(updates, members, model, see, readings, noise, noisy, rng):
 
 def extended(readings, centre, noisy, rng):
     """The extended Kalman filter in the chart; draws of its Gaussian stand for members."""
-    m, p, out = centre, setting["prior_std"] ** 2 * np.eye(2), []
+    m = centre
+    p = setting["prior_std"] ** 2 * np.eye(2)
+    out = []
     draws = rng.standard_normal((N, 2))
-    draws = (draws - draws.mean(axis=0)) @ np.linalg.inv(np.linalg.cholesky(np.cov(draws.T))).T
+    draws = (draws - draws.mean(axis=0)) @ np.linalg.inv(
+        np.linalg.cholesky(np.cov(draws.T))
+    ).T
     for y in readings:
         f = chart.jacobian(m, 0.0, DT)
         m = chart.step(m, 0.0, DT)
@@ -154,8 +172,11 @@ def paths() -> tuple[np.ndarray, np.ndarray]:
     if CELLS in KEPT:
         return KEPT[CELLS]
     side = REACH * np.linspace(-1, 1, CELLS)
-    grid = START + np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(-1, 2)
-    x, out = grid, np.empty((STEPS, len(grid), 2), dtype=np.float32)
+    grid = START + np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(
+        -1, 2
+    )
+    x = grid
+    out = np.empty((STEPS, len(grid), 2), dtype=np.float32)
     for k in range(STEPS):
         x = out[k] = chart.transition(x.copy(), 0.0, DT)
     KEPT[CELLS] = grid, out
@@ -167,7 +188,8 @@ def grid_bound(readings, centre, rng):
     grid, path = paths()
     logs = -0.5 * ((grid - centre) ** 2).sum(axis=1) / setting["prior_std"] ** 2
     kept = np.flatnonzero(logs > -18)
-    logs, out = logs[kept], []
+    logs = logs[kept]
+    out = []
     for k, y in enumerate(readings):
         here = path[k, kept].astype(np.float64)
         gap = LENGTH * np.column_stack([np.sin(here[:, 0]), np.cos(here[:, 0])]) - y
@@ -181,7 +203,8 @@ def grid_bound(readings, centre, rng):
 
 def particle_bound(readings, members, see, noise, rng):
     """A bootstrap filter with many particles in the chart, (T, P, 2)."""
-    x, out = members, []
+    x = members
+    out = []
     for y in readings:
         x = chart.transition(x, 0.0, DT) + KICK * rng.standard_normal(x.shape)
         logs = -0.5 * ((see(x) - y) ** 2).sum(axis=1) / noise[0, 0]
@@ -200,7 +223,8 @@ def score(members: np.ndarray, truth: np.ndarray) -> float:
 def scores(name, members, truth) -> dict[str, float]:
     """Of one filter's members, in the chart (T, N, 2) or Cartesian (T, N, 4)."""
     aim = place(truth)[LATE]
-    own, flat = members[LATE], members.shape[-1] == 2
+    own = members[LATE]
+    flat = members.shape[-1] == 2
     states = place(own) if flat else own
     mean = states.mean(axis=1)
     if not np.isfinite(mean).all():
@@ -231,13 +255,22 @@ def case(noisy: bool, rng: np.random.Generator) -> dict[str, float]:
     truth, seen, centre = data(rng, noisy)
     first = centre + setting["prior_std"] * rng.standard_normal((PARTICLES, 2))
     found = ensembles(
-        CARTESIAN, place(first[:N]), cartesian, lambda x: x[:, :2], seen, NOISE, noisy, rng
+        CARTESIAN,
+        place(first[:N]),
+        cartesian,
+        lambda x: x[:, :2],
+        seen,
+        NOISE,
+        noisy,
+        rng,
     )
     see = lambda q: place(q)[:, :2]  # noqa: E731
     found |= ensembles(CHART, first[:N], chart, see, seen, NOISE, noisy, rng)
     found["EKF_chart"] = extended(seen, centre, noisy, rng)
     found["bound"] = (
-        particle_bound(seen, first, see, NOISE, rng) if noisy else grid_bound(seen, centre, rng)
+        particle_bound(seen, first, see, NOISE, rng)
+        if noisy
+        else grid_bound(seen, centre, rng)
     )
     out: dict[str, float] = {}
     for name in FILTERS:
@@ -248,7 +281,8 @@ def case(noisy: bool, rng: np.random.Generator) -> dict[str, float]:
 def mirror(rng: np.random.Generator) -> dict[str, float]:
     """CRPS of x when only its absolute value is seen, from a prior around the vertical."""
     truth, seen, _ = data(rng, True, MIRROR)
-    readings, noise = np.abs(seen[:, :1]), NOISE[:1, :1]
+    readings = np.abs(seen[:, :1])
+    noise = NOISE[:1, :1]
     first = MIRROR[0] + MIRROR[1] * rng.standard_normal((PARTICLES, 2))
     see = lambda q: np.abs(place(q)[:, :1])  # noqa: E731
     found = ensembles(MIRRORED, first[:N], chart, see, readings, noise, True, rng)
@@ -263,10 +297,15 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One run of every case."""
     streams = [np.random.default_rng(s) for s in seed.spawn(3)]
     cases = {
-        "still": case(False, streams[0]), "noisy": case(True, streams[1]),
+        "still": case(False, streams[0]),
+        "noisy": case(True, streams[1]),
         "mirror": mirror(streams[2]),
-    }  # fmt: skip
-    return {f"{which}_{key}": v for which, found in cases.items() for key, v in found.items()}
+    }
+    return {
+        f"{which}_{key}": v
+        for which, found in cases.items()
+        for key, v in found.items()
+    }
 
 
 def noisy_part(seed: np.random.SeedSequence) -> dict[str, float]:
@@ -278,14 +317,28 @@ def noisy_part(seed: np.random.SeedSequence) -> dict[str, float]:
 SCORES = ("constraint", "position", "velocity", "honest", "nees", "crps")
 parameters = {
     **{name: np.asarray(setting[name]).tolist() for name in setting},
-    "bound_runs": RUNS, "particles": PARTICLES, "cells": CELLS, "reach": REACH,
+    "bound_runs": RUNS,
+    "particles": PARTICLES,
+    "cells": CELLS,
+    "reach": REACH,
     "mirror_prior": [v.tolist() for v in MIRROR],
-}  # fmt: skip
+}
 columns = (
     *(f"{c}_{f}_{s}" for c in ("still", "noisy") for f in FILTERS for s in SCORES),
     *(f"mirror_{f}_crps" for f in (*MIRRORED, "bound")),
 )
-code = (data, ensembles, extended, paths, grid_bound, particle_bound, score, scores, case, mirror)
+code = (
+    data,
+    ensembles,
+    extended,
+    paths,
+    grid_bound,
+    particle_bound,
+    score,
+    scores,
+    case,
+    mirror,
+)
 seeds = np.random.SeedSequence(4096).spawn(RUNS)
 rtol = 1e-3
 # Folded readings leave two swings, and which of them small ensembles keep hangs on the last bit.

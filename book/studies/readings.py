@@ -15,13 +15,17 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import _satellites as satellites
 
-NAME, PAPER, BATCH = "readings", "grange", 5
+NAME = "readings"
+PAPER = "grange"
+BATCH = 5
 ORBIT = float(np.sqrt(3.986004418e14 / 8.413e6**3))
 SETUP = satellites.setup("table-2")
 SETUPS = {"printed": SETUP, "orbit": satellites.setup("table-2", orbital_rate=ORBIT)}
 FACTORS = {"none": 0.0, "hundredth": 0.01}
 VERSIONS = {"bare": False, "pca": True}
-NAMES = [f"{rate}_{noise}_{v}" for rate in SETUPS for noise in FACTORS for v in VERSIONS]
+NAMES = [
+    f"{rate}_{noise}_{v}" for rate in SETUPS for noise in FACTORS for v in VERSIONS
+]
 columns = [f"{name}_mse_{r}" for name in NAMES for r in range(BATCH)]
 parameters = {"batch": BATCH, "seed": 2024, "orbit": ORBIT, "factors": FACTORS}
 seeds = np.random.SeedSequence(satellites.SEED).spawn(SETUP.runs // BATCH)
@@ -37,11 +41,15 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     for_data, for_filters = seed.spawn(2)
     out: dict[str, float] = {}
     for rate, s in SETUPS.items():
-        truth, seen = satellites.data(s, np.random.default_rng(for_data), (BATCH,), noisy=False)
+        truth, seen = satellites.data(
+            s, np.random.default_rng(for_data), (BATCH,), noisy=False
+        )
         for noise, factor in FACTORS.items():
             for v, pca in VERSIONS.items():
                 f = satellites.published(s, pca=pca, noise_factor=factor)
-                result = satellites.run(s, f, for_filters, truth, seen, ("squared_error",))
+                result = satellites.run(
+                    s, f, for_filters, truth, seen, ("squared_error",)
+                )
                 name = f"{rate}_{noise}_{v}"
                 out |= satellites.scored(s, name, result, each_agent=False)
     return out
@@ -50,7 +58,9 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
 def part(seed: np.random.SeedSequence) -> dict[str, float]:
     """A reading that does not run away, as in the trial, for chapter 4 to run again."""
     for_data, for_filters = seed.spawn(2)
-    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,), noisy=False)
+    truth, seen = satellites.data(
+        SETUP, np.random.default_rng(for_data), (BATCH,), noisy=False
+    )
     for_filters.spawn(3)  # of the three readings before it
     f = satellites.published(SETUP, pca=True, noise_factor=FACTORS["hundredth"])
     result = satellites.run(SETUP, f, for_filters, truth, seen, ("squared_error",))

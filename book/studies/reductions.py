@@ -17,46 +17,79 @@ sys.path.insert(0, str(Path(__file__).parent))
 import arcs
 
 from distfilt.mixtures import (
+    ComponentShapes,
     GaussianMixture,
     PartialFusion,
-    ComponentShapes,
     jeffreys_by_sampling,
     merge_irrelevant,
     pivoted_qr,
     runnalls,
 )
 
-NAME, PAPER = "reductions", "semeraro"
+NAME = "reductions"
+PAPER = "semeraro"
 OMEGA = 0.5
 THRESHOLDS = {"strong": 2.0, "mild": 10.0}
-MEMBERS, MIXANDS = 4000, (7, 9)
+MEMBERS = 4000
+MIXANDS = (7, 9)
 RULES = ("relevance", "runnalls", "qr")
-columns = ["from_1", "from_2", *(
-    f"{name}_{k}" for name in THRESHOLDS
-    for k in ("to_1", "to_2", *(f"{r}_{k}" for r in RULES for k in (1, 2, "target"))))]
-parameters = {"members": MEMBERS, "mixands": MIXANDS, "bounds": arcs.BOUNDS,
-              "thresholds": THRESHOLDS, "omega": OMEGA}
+columns = [
+    "from_1",
+    "from_2",
+    *(
+        f"{name}_{k}"
+        for name in THRESHOLDS
+        for k in (
+            "to_1",
+            "to_2",
+            *(f"{r}_{k}" for r in RULES for k in (1, 2, "target")),
+        )
+    ),
+]
+parameters = {
+    "members": MEMBERS,
+    "mixands": MIXANDS,
+    "bounds": arcs.BOUNDS,
+    "thresholds": THRESHOLDS,
+    "omega": OMEGA,
+}
 seeds = np.random.SeedSequence(20261).spawn(200)
-rtol, atol = 1e-3, 1e-9
+rtol = 1e-3
+atol = 1e-9
 # Which of nearly equal shapes least squares keep hangs on the last bit, and so does a divergence
 # that a thin tail decides: in one trial of eight some number with the mild factor, whose many
 # shapes are nearly equal, is another one with another order of the sums. Medians and shares stay.
 rough = [
-    name for name in columns
-    if "_qr_" in name or name.endswith("target") or name.startswith(("mild_rel", "mild_runn"))
+    name
+    for name in columns
+    if "_qr_" in name
+    or name.endswith("target")
+    or name.startswith(("mild_rel", "mild_runn"))
 ]
 
 
-def scores(exact: list[PartialFusion], pair: list[GaussianMixture], first: int) -> list[float]:
+def scores(
+    exact: list[PartialFusion], pair: list[GaussianMixture], first: int
+) -> list[float]:
     """Both agents' divergences from the exact density, and that of their targets."""
     out = [
-        jeffreys_by_sampling(m.log_density, f.log_value, arcs.both(m, f.own, 0.8),
-                             members=MEMBERS, rng=np.random.default_rng(first + k)).value
+        jeffreys_by_sampling(
+            m.log_density,
+            f.log_value,
+            arcs.both(m, f.own, 0.8),
+            members=MEMBERS,
+            rng=np.random.default_rng(first + k),
+        ).value
         for k, (f, m) in enumerate(zip(exact, pair, strict=True))
     ]
     a, b = (m.marginal([0, 1]) for m in pair)
-    apart = jeffreys_by_sampling(a.log_density, b.log_density, arcs.both(a, b, 0.5),
-                                 members=MEMBERS, rng=np.random.default_rng(first + 2))
+    apart = jeffreys_by_sampling(
+        a.log_density,
+        b.log_density,
+        arcs.both(a, b, 0.5),
+        members=MEMBERS,
+        rng=np.random.default_rng(first + 2),
+    )
     return [*out, apart.value]
 
 
@@ -67,7 +100,10 @@ def reduced(
     kept = [merge_irrelevant(said[k], said[1 - k], threshold=threshold) for k in (0, 1)]
     merged = [runnalls(m, k.n_components) for m, k in zip(said, kept, strict=True)]
     shapes = {
-        name: [exact[k].component_shapes(terms="all", marginal=r[k], received=[r[1 - k]]) for k in (0, 1)]
+        name: [
+            exact[k].component_shapes(terms="all", marginal=r[k], received=[r[1 - k]])
+            for k in (0, 1)
+        ]
         for name, r in (("relevance", kept), ("runnalls", merged))
     }
     shapes["qr"] = [
@@ -84,15 +120,23 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     own = [arcs.belief(b, for_pair, mixands=MIXANDS) for b in (np.pi, np.pi + turn)]
     said = [m.marginal([0, 1]) for m in own]
     exact = [PartialFusion(own[k], said[1 - k], omega=OMEGA) for k in (0, 1)]
-    first, out = int(for_points.integers(2**31)), {}
+    first = int(for_points.integers(2**31))
+    out = {}
     for name, threshold in THRESHOLDS.items():
         for rule, shapes in reduced(exact, said, threshold).items():
             fused = [f.assign_weights(s) for f, s in zip(exact, shapes, strict=True)]
-            for k, value in zip((1, 2, "target"), scores(exact, fused, first), strict=True):
+            for k, value in zip(
+                (1, 2, "target"), scores(exact, fused, first), strict=True
+            ):
                 out[f"{name}_{rule}_{k}"] = value
         for k in (0, 1):
-            left = merge_irrelevant(said[k], said[1 - k], threshold=threshold).n_components
-            out |= {f"{name}_to_{k + 1}": float(left), f"from_{k + 1}": float(said[k].n_components)}
+            left = merge_irrelevant(
+                said[k], said[1 - k], threshold=threshold
+            ).n_components
+            out |= {
+                f"{name}_to_{k + 1}": float(left),
+                f"from_{k + 1}": float(said[k].n_components),
+            }
     return out
 
 

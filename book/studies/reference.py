@@ -30,20 +30,31 @@ from distfilt.models import simulate
 from distfilt.sensors import stack
 from distfilt.updates import resample
 
-NAME, PAPER, BATCH = "reference", "grange", 5
+NAME = "reference"
+PAPER = "grange"
+BATCH = 5
 SETUP = satellites.setup("table-2")
-PLANE, NORMAL = [0, 1, 3, 4], [2, 5]
-STEPS, HALVINGS, ENOUGH = 20, 12, 1e-6
+PLANE = [0, 1, 3, 4]
+NORMAL = [2, 5]
+STEPS = 20
+HALVINGS = 12
+ENOUGH = 1e-6
 APPLIES = [(a.kind, list(a.dims)) for a in SETUP.scenario.agents] == [
-    ("direct", [0, 1]), ("angle", [1, 2]), ("direct", [3, 4, 5])
-]  # fmt: skip
+    ("direct", [0, 1]),
+    ("angle", [1, 2]),
+    ("direct", [3, 4, 5]),
+]
 columns = [
-    *(f"{name}_{what}_{r}" for name in ("reference", "bound")
-      for what in ("mse", "nees", "chance", "share") for r in range(BATCH)),
+    *(
+        f"{name}_{what}_{r}"
+        for name in ("reference", "bound")
+        for what in ("mse", "nees", "chance", "share")
+        for r in range(BATCH)
+    ),
     *(f"damped_{what}_{r}" for what in ("mse", "nees") for r in range(BATCH)),
     *satellites.score_columns(SETUP, "exact", BATCH, each_agent=False),
     *satellites.time_columns(SETUP, "reference"),
-]  # fmt: skip
+]
 parameters = {"batch": BATCH, "seed": 2024, "particles": 2400, "nodes": 7}
 seeds = np.random.SeedSequence(satellites.SEED).spawn(SETUP.runs // BATCH)
 scenarios = (SETUP.scenario,)
@@ -54,10 +65,14 @@ def guided(
     seen: list[np.ndarray], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Means (T, 2, R, 6) of two filters, covariances (T, R, 6, 6) of both, effective shares."""
-    n, lead = parameters["particles"] // 2, (2, seen[0].shape[1])
-    dt, stds = float(SETUP.times[0]), [s.noise_cov[0, 0] for s in SETUP.sensors]
-    f, q = SETUP.model.transition(dt), SETUP.model.Q(0.0, dt)
-    flat, up = np.ix_(PLANE, PLANE), np.ix_(NORMAL, NORMAL)
+    n = parameters["particles"] // 2
+    lead = (2, seen[0].shape[1])
+    dt = float(SETUP.times[0])
+    stds = [s.noise_cov[0, 0] for s in SETUP.sensors]
+    f = SETUP.model.transition(dt)
+    q = SETUP.model.Q(0.0, dt)
+    flat = np.ix_(PLANE, PLANE)
+    up = np.ix_(NORMAL, NORMAL)
     in_plane = np.concatenate([seen[0], seen[2][..., :2]], axis=-1)
     noise = np.diag([stds[0]] * 2 + [stds[2]] * 2)
     m = np.broadcast_to(SETUP.prior[0][PLANE], (*lead, n, 4))
@@ -65,17 +80,23 @@ def guided(
     z = np.broadcast_to(SETUP.prior[0][NORMAL], (*lead, n, 2))
     wide = f[up] @ SETUP.prior[1][up] @ f[up].T
     log = np.zeros((*lead, n))
-    means, covs, shares = [], [], []
+    means = []
+    covs = []
+    shares = []
     for k in range(SETUP.times.size):
         # The plane: a Kalman step with the gain that all particles share.
-        m, p = m @ f[flat].T, f[flat] @ p @ f[flat].T + q[flat]
-        gap, s = in_plane[k][:, None] - m, p + noise
+        m = m @ f[flat].T
+        p = f[flat] @ p @ f[flat].T + q[flat]
+        gap = in_plane[k][:, None] - m
+        s = p + noise
         log = log - 0.5 * (gap * np.linalg.solve(s, gap.mT).mT).sum(axis=-1)
         gain = np.linalg.solve(s, p).mT
-        m, p = m + gap @ gain.mT, p - gain @ p
+        m = m + gap @ gain.mT
+        p = p - gain @ p
         # Along the normal: drawn given the velocity; at first the prior is part of the noise.
         spread = q[up] + (wide if k == 0 else 0.0)
-        z, s = z @ f[up].T, spread[1, 1] + stds[2]
+        z = z @ f[up].T
+        s = spread[1, 1] + stds[2]
         gap = seen[2][k, :, 2, None] - z[..., 1]
         log = log - 0.5 * gap**2 / s
         z = z + gap[..., None] * spread[:, 1] / s
@@ -92,25 +113,38 @@ def guided(
         covs.append(cov)
         shares.append(1 / (w**2).sum(axis=-1).max(axis=0) / n)
     back = np.argsort(PLANE + NORMAL)
-    return np.array(means)[..., back], np.array(covs)[..., back, :][..., back], np.array(shares)
+    return (
+        np.array(means)[..., back],
+        np.array(covs)[..., back, :][..., back],
+        np.array(shares),
+    )
 
 
 def chosen(
     m: np.ndarray, z: np.ndarray, log: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Resample where fewer than half of the particles count."""
-    w, n = normal(log), log.shape[-1]
+    w = normal(log)
+    n = log.shape[-1]
     poor = (w**2).sum(axis=-1) > 2 / n
     if poor.any():
         index = resample(w[poor].reshape(-1, n), rng=rng)
-        m, z, log = m.copy(), z.copy(), log.copy()
+        m = m.copy()
+        z = z.copy()
+        log = log.copy()
         m[poor] = np.take_along_axis(m[poor], index[..., None], axis=-2)
-        z[poor], log[poor] = np.take_along_axis(z[poor], index[..., None], axis=-2), 0.0
+        z[poor] = np.take_along_axis(z[poor], index[..., None], axis=-2)
+        log[poor] = 0.0
     return m, z, log
 
 
 def sighted(
-    m: np.ndarray, p: np.ndarray, z: np.ndarray, log: np.ndarray, angle: np.ndarray, noise: float
+    m: np.ndarray,
+    p: np.ndarray,
+    z: np.ndarray,
+    log: np.ndarray,
+    angle: np.ndarray,
+    noise: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The angle arctan(z/y): a weight, and the mean and variance that it leaves of y."""
     nodes, shares = np.polynomial.hermite_e.hermegauss(parameters["nodes"])
@@ -129,9 +163,13 @@ def sighted(
     return m + shift[..., None] * slope[..., None, :], p, log
 
 
-def cost(gap: np.ndarray, prior: np.ndarray, residual: np.ndarray, noise: np.ndarray) -> np.ndarray:
+def cost(
+    gap: np.ndarray, prior: np.ndarray, residual: np.ndarray, noise: np.ndarray
+) -> np.ndarray:
     """What a maximum of the posterior makes least, (R,): misfit to forecast and to readings."""
-    return squared(gap, prior) + squared(residual, np.broadcast_to(noise, (len(gap), *noise.shape)))
+    return squared(gap, prior) + squared(
+        residual, np.broadcast_to(noise, (len(gap), *noise.shape))
+    )
 
 
 def squared(gap: np.ndarray, cov: np.ndarray) -> np.ndarray:
@@ -141,9 +179,12 @@ def squared(gap: np.ndarray, cov: np.ndarray) -> np.ndarray:
 
 def damped(means: np.ndarray, readings: np.ndarray) -> list[np.ndarray]:
     """The iterated extended filter of all sensors: a step that does not lower `cost` is halved."""
-    sensor, s = stack(SETUP.sensors), SETUP
+    sensor = stack(SETUP.sensors)
+    s = SETUP
     cov = np.broadcast_to(s.prior[1], (*means.shape, means.shape[-1]))
-    errors, covs, t0 = [], [], 0.0
+    errors = []
+    covs = []
+    t0 = 0.0
     for t, y in zip(s.times, readings, strict=True):
         slope = s.model.jacobian(means, t0, t - t0)
         cov = slope @ cov @ slope.mT + s.model.Q(t0, t - t0)
@@ -151,7 +192,9 @@ def damped(means: np.ndarray, readings: np.ndarray) -> list[np.ndarray]:
         t0 = t
 
         def value(x: np.ndarray, y: np.ndarray = y, means=means, cov=cov) -> np.ndarray:
-            return cost(x - means, cov, sensor.residual(y, sensor.predict(x)), sensor.noise_cov)
+            return cost(
+                x - means, cov, sensor.residual(y, sensor.predict(x)), sensor.noise_cov
+            )
 
         least = value(x)
         for _ in range(STEPS):
@@ -164,8 +207,11 @@ def damped(means: np.ndarray, readings: np.ndarray) -> list[np.ndarray]:
                 if not (worse := after > least).any():
                     break
                 whole[worse] /= 2
-            whole[worse], after[worse] = 0.0, least[worse]
-            x, gained, least = x + whole, least - after, after
+            whole[worse] = 0.0
+            after[worse] = least[worse]
+            x = x + whole
+            gained = least - after
+            least = after
             if gained.max() < ENOUGH:
                 break
         h = sensor.jacobian(x)
@@ -187,7 +233,8 @@ def scored(
 ) -> dict[str, float]:
     """What is stored: error, NEES/d, the error's share by chance, effective share; over time."""
     means, covs, shares = found
-    late, gap = SETUP.settled, means.mean(axis=1) - truth
+    late = SETUP.settled
+    gap = means.mean(axis=1) - truth
     error = (gap**2).sum(axis=-1)
     score = nees(means.mean(axis=1), covs, truth) / gap.shape[-1]
     chance = ((means[:, 0] - means[:, 1]) ** 2).sum(axis=-1) / 4
@@ -217,14 +264,19 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
     out = scored("reference", truth, guided(seen, rng))
     first = np.broadcast_to(SETUP.prior[0], truth.shape[1:])
-    found, late = damped(first, np.concatenate(seen, axis=-1)), SETUP.settled
+    found = damped(first, np.concatenate(seen, axis=-1))
+    late = SETUP.settled
     for r in range(BATCH):
-        out[f"damped_mse_{r}"] = float(((found[0] - truth) ** 2).sum(axis=-1)[late, r].mean())
+        out[f"damped_mse_{r}"] = float(
+            ((found[0] - truth) ** 2).sum(axis=-1)[late, r].mean()
+        )
         score = nees(found[0][:, r], found[1][:, r], truth[:, r])[late].mean()
         out[f"damped_nees_{r}"] = float(score) / truth.shape[-1]
     truth, seen = from_prior(np.random.default_rng(drawn))
     out |= scored("bound", truth, guided(seen, rng))
-    result = satellites.run(SETUP, satellites.repaired(SETUP, "exact"), for_filters, truth, seen)
+    result = satellites.run(
+        SETUP, satellites.repaired(SETUP, "exact"), for_filters, truth, seen
+    )
     return out | satellites.scored(SETUP, "exact", result, each_agent=False)
 
 
@@ -237,6 +289,15 @@ def part(seed: np.random.SeedSequence) -> dict[str, float]:
 
 
 code = (
-    guided, chosen, sighted, cost, squared, damped, normal, scored, from_prior,
-    satellites.data, satellites.repaired,
-)  # fmt: skip
+    guided,
+    chosen,
+    sighted,
+    cost,
+    squared,
+    damped,
+    normal,
+    scored,
+    from_prior,
+    satellites.data,
+    satellites.repaired,
+)

@@ -21,10 +21,17 @@ from distfilt.models import LinearModel, constant_velocity
 from distfilt.network import Faults, graphs
 from distfilt.sensors import Sensor, range_bearing
 
-NAME, PAPER = "ring", "semeraro"
-AGENTS, STEPS, RUNS = 8, 60, 10
-LOSS, SIGMA, RARE = 0.3, 1.0, 1e-6
-TARGET_STD, EGO_STD, READING_STD = (5.0, 5.0, 0.5, 0.5), 5.0, 0.3
+NAME = "ring"
+PAPER = "semeraro"
+AGENTS = 8
+STEPS = 60
+RUNS = 10
+LOSS = 0.3
+SIGMA = 1.0
+RARE = 1e-6
+TARGET_STD = (5.0, 5.0, 0.5, 0.5)
+EGO_STD = 5.0
+READING_STD = 0.3
 SIGHT_STD = (0.3, 0.01)
 RADII = (20.0, 100.0)
 LATE = 20
@@ -37,8 +44,12 @@ def group(seed: int) -> team.Team:
     """The agents, with losses of their own."""
     moves = constant_velocity(sigma=SIGMA)
     return team.Team(
-        graphs.ring(AGENTS), moves.F(1.0), moves.Q(0.0, 1.0),
-        np.diag(np.square(TARGET_STD)), EGO_STD**2 * np.eye(2), READING_STD**2 * np.eye(2),
+        graphs.ring(AGENTS),
+        moves.F(1.0),
+        moves.Q(0.0, 1.0),
+        np.diag(np.square(TARGET_STD)),
+        EGO_STD**2 * np.eye(2),
+        READING_STD**2 * np.eye(2),
         Faults(loss=LOSS, seed=seed),
     )
 
@@ -62,24 +73,36 @@ def measured(truth: np.ndarray, belief: team.Belief, name: str) -> dict[str, flo
     gap = ((belief[0] - truth[:, :, None])[..., :2] ** 2).sum(axis=-1)
     score = team.nees(truth, belief)
     lost = (score[-LATE:] > team.rare(RARE, 4)).any(axis=(0, 2))
-    return {f"{name}_error": float(gap.mean()), f"{name}_median": float(np.median(gap)),
-            f"{name}_nees": float(score.mean()), f"{name}_lost": float(lost.sum())}
+    return {
+        f"{name}_error": float(gap.mean()),
+        f"{name}_median": float(np.median(gap)),
+        f"{name}_nees": float(score.mean()),
+        f"{name}_lost": float(lost.sum()),
+    }
 
 
 def looking(radius: float, agent: int | None = None) -> Sensor:
     """Distance and direction of the target in [target; ego], or in [target; all egos]."""
-    eye, at = range_bearing([0, 1], std=SIGHT_STD), 4 + 2 * (agent or 0)
+    eye = range_bearing([0, 1], std=SIGHT_STD)
+    at = 4 + 2 * (agent or 0)
 
     def gap(x: np.ndarray) -> np.ndarray:
         return x[..., :2] - x[..., at : at + 2]
 
     def slope(x: np.ndarray) -> np.ndarray:
-        out, part = np.zeros((*x.shape[:-1], 2, x.shape[-1])), eye.jacobian(gap(x))
-        out[..., :2], out[..., at : at + 2] = part, -part
+        out = np.zeros((*x.shape[:-1], 2, x.shape[-1]))
+        part = eye.jacobian(gap(x))
+        out[..., :2] = part
+        out[..., at : at + 2] = -part
         return out
 
-    return Sensor(2, lambda x: eye.predict(gap(x)), eye.noise_cov, residual_function=eye.residual_function,
-                  derivative=slope)
+    return Sensor(
+        2,
+        lambda x: eye.predict(gap(x)),
+        eye.noise_cov,
+        residual_function=eye.residual_function,
+        derivative=slope,
+    )
 
 
 def joint(case: team.Team, seen: np.ndarray, radius: float) -> team.Belief:
@@ -89,7 +112,8 @@ def joint(case: team.Team, seen: np.ndarray, radius: float) -> team.Belief:
     eyes = [looking(radius, a) for a in range(AGENTS)]
     f = GaussianFilter(model, eyes, case.graph, faults=case.faults)
     mean = np.concatenate([np.zeros(4), places(radius).ravel()])
-    state, out = f.start((mean, first), runs=(RUNS,)), []
+    state = f.start((mean, first), runs=(RUNS,))
+    out = []
     for k, y in enumerate(seen):
         state = f.step(state, k + 1.0, list(np.moveaxis(y, 1, 0)))
         out.append((state.means[..., :4], state.covariances[..., :4, :4]))
@@ -111,13 +135,18 @@ def turned(case: team.Team, seen: np.ndarray, radius: float) -> team.Belief:
     Each keeps its error along and across the sight, with the distance that was read.
     """
     move, noise, first = case.state(AGENTS)
-    mean = np.tile(np.concatenate([np.zeros(4), places(radius).ravel()]), (RUNS, AGENTS, 1))
-    cov, out = np.broadcast_to(first, (RUNS, AGENTS, *first.shape)), []
+    mean = np.tile(
+        np.concatenate([np.zeros(4), places(radius).ravel()]), (RUNS, AGENTS, 1)
+    )
+    cov = np.broadcast_to(first, (RUNS, AGENTS, *first.shape))
+    out = []
     for k, y in enumerate(seen):
-        mean, cov = mean @ move.T, move @ cov @ move.T + noise
+        mean = mean @ move.T
+        cov = move @ cov @ move.T + noise
         heard = case.arrived(k, RUNS) | np.eye(AGENTS, dtype=bool)
         for j in range(AGENTS):
-            far, along = y[:, j, 0], np.stack([np.cos(y[:, j, 1]), np.sin(y[:, j, 1])], axis=-1)
+            far = y[:, j, 0]
+            along = np.stack([np.cos(y[:, j, 1]), np.sin(y[:, j, 1])], axis=-1)
             across = np.stack([-along[:, 1], along[:, 0]], axis=-1) * far[:, None]
             error = np.stack([along * SIGHT_STD[0], across * SIGHT_STD[1]], axis=-1)
             h = case.sees(j, AGENTS)
@@ -130,13 +159,16 @@ def turned(case: team.Team, seen: np.ndarray, radius: float) -> team.Belief:
     return np.array([m for m, _ in out]), np.array([p for _, p in out])
 
 
-def single(case: team.Team, seen: np.ndarray, radius: float, tells: bool) -> team.Belief:
+def single(
+    case: team.Team, seen: np.ndarray, radius: float, tells: bool
+) -> team.Belief:
     """Extended Kalman filters of [target; ego], alone or adding each other's news."""
     move, noise, first = case.state(1)
     eye = looking(radius)
     mean = np.zeros((RUNS, AGENTS, 6))
     mean[..., 4:] = places(radius)
-    cov, out = np.broadcast_to(first, (RUNS, AGENTS, 6, 6)), []
+    cov = np.broadcast_to(first, (RUNS, AGENTS, 6, 6))
+    out = []
     for k, y in enumerate(seen):
         before = mean @ move.T, move @ cov @ move.T + noise
         gap = eye.residual(y, eye.predict(before[0]))
@@ -159,8 +191,10 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     for radius in RADII:
         truth, seen = sights(rng, radius)
         beliefs = (
-            single(case, seen, radius, False), single(case, seen, radius, True),
-            joint(case, seen, radius), turned(case, seen, radius),
+            single(case, seen, radius, False),
+            single(case, seen, radius, True),
+            joint(case, seen, radius),
+            turned(case, seen, radius),
         )
         for way, belief in zip(SIGHTED, beliefs, strict=True):
             out |= measured(truth, belief, f"sight_{radius:.0f}_{way}")
@@ -170,13 +204,34 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
 NAMES = (*WAYS, *(f"sight_{radius:.0f}_{way}" for radius in RADII for way in SIGHTED))
 columns = [f"{name}_{m}" for name in NAMES for m in ("error", "median", "nees", "lost")]
 parameters = {
-    "agents": AGENTS, "steps": STEPS, "runs": RUNS, "loss": LOSS, "sigma": SIGMA, "rare": RARE,
-    "target_std": TARGET_STD, "ego_std": EGO_STD, "reading_std": READING_STD,
-    "sight_std": SIGHT_STD, "radii": RADII, "late": LATE,
+    "agents": AGENTS,
+    "steps": STEPS,
+    "runs": RUNS,
+    "loss": LOSS,
+    "sigma": SIGMA,
+    "rare": RARE,
+    "target_std": TARGET_STD,
+    "ego_std": EGO_STD,
+    "reading_std": READING_STD,
+    "sight_std": SIGHT_STD,
+    "radii": RADII,
+    "late": LATE,
 }
 code = (
-    group, places, sights, measured, looking, joint, conditioned, turned, single, team.Team,
-    team.known, team.nees, team._news, team._intersected,
+    group,
+    places,
+    sights,
+    measured,
+    looking,
+    joint,
+    conditioned,
+    turned,
+    single,
+    team.Team,
+    team.known,
+    team.nees,
+    team._news,
+    team._intersected,
 )
 seeds = np.random.SeedSequence(808).spawn(20)
 rtol = 1e-3

@@ -19,7 +19,8 @@ from distfilt.filters import GaussianFilter
 from distfilt.mixtures import GaussianMixture, fuse_moments, target_fusion
 from distfilt.network import Channel, graphs
 
-NAME, PAPER = "singles", "semeraro"
+NAME = "singles"
+PAPER = "semeraro"
 METRICS = ("error_tp", "error_ep", "nees_t", "nees_e", "nees")
 ROWS = {"one_none": None, "one_ci": None, "unscented_none": False, "unscented_ci": True}
 
@@ -38,14 +39,22 @@ def unscented(
     s: dict, fuses: bool, seen: np.ndarray, first: np.ndarray, covs: list
 ) -> list[list[GaussianMixture]]:
     """What unscented filters of one Gaussian believe, one an epoch and agent."""
-    n, start = len(s["agents"]), [b.moments() for b in paper.beliefs(first, covs)]
+    n = len(s["agents"])
+    start = [b.moments() for b in paper.beliefs(first, covs)]
     f = GaussianFilter(
-        paper.moving(s, 2), [paper.sensor(s)] * n, graphs.complete(n), share_observations=False,
-        linearization="unscented", kappa=1.0, fusion=targets if fuses else None,
+        paper.moving(s, 2),
+        [paper.sensor(s)] * n,
+        graphs.complete(n),
+        share_observations=False,
+        linearization="unscented",
+        kappa=1.0,
+        fusion=targets if fuses else None,
     )
-    state, out = f.start(start[0]), []
-    means, both = np.array([m for m, _ in start]), np.array([p for _, p in start])
-    state = state.changed(joint_means=means, joint_covariances=both)
+    state = f.start(start[0])
+    out = []
+    means = np.array([m for m, _ in start])
+    both = np.array([p for _, p in start])
+    state = state.replace(joint_means=means, joint_covariances=both)
     for k, hour in enumerate(paper.HOURS):
         state = f.step(state, 3600.0 * hour, list(seen[k]))
         pairs = zip(state.means, state.covariances, strict=True)
@@ -67,15 +76,24 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     out: dict[str, float] = {}
     for row, found in beliefs.items():
         scores = [paper.scored(found[k], truth[k]) for k in paper.EARLY]
-        out |= {f"{row}_{m}": float(np.mean([f[m].mean() for f in scores])) for m in METRICS}
+        out |= {
+            f"{row}_{m}": float(np.mean([f[m].mean() for f in scores])) for m in METRICS
+        }
     return {name: float(paper.SIX.format(v)) for name, v in out.items()}
 
 
 columns = [f"{row}_{m}" for row in ("bound", *ROWS) for m in METRICS]
 parameters = {"setting": paper.SETTING, "rows": sorted(ROWS)}
 code = (
-    targets, unscented, paper.data, paper.readings, paper.beliefs, paper.network, paper.run,
-    paper.bound, paper.scored,
+    targets,
+    unscented,
+    paper.data,
+    paper.readings,
+    paper.beliefs,
+    paper.network,
+    paper.run,
+    paper.bound,
+    paper.scored,
 )
 scenarios = paper.scenarios
 seeds = np.random.SeedSequence(480).spawn(448)

@@ -19,7 +19,9 @@ from distfilt.filters import ParticleCollapse
 from distfilt.models import pendulum_states
 
 pendulum = studies.script("pendulum")
-setting, STEPS, TIMES = pendulum.setting, pendulum.STEPS, pendulum.TIMES
+setting = pendulum.setting
+STEPS = pendulum.STEPS
+TIMES = pendulum.TIMES
 
 warnings.filterwarnings("ignore", category=ParticleCollapse)
 
@@ -45,7 +47,8 @@ def scores(members: np.ndarray, truth: np.ndarray) -> tuple[float, ...]:
     gap = members.mean(axis=-2) - truth
     missed = np.hypot(*(gap + truth)[:, :2].T) - setting["length"]
     away = np.hypot(gap[:, 0], gap[:, 1])
-    late, judged = TIMES > setting["score_from"] + 1e-9, TIMES > 1 + 1e-9
+    late = TIMES > setting["score_from"] + 1e-9
+    judged = TIMES > 1 + 1e-9
     farthest = away[judged].max() if np.isfinite(away).all() else np.inf
     return np.sqrt((missed**2).mean()), np.sqrt((away[late] ** 2).mean()), farthest
 
@@ -57,13 +60,19 @@ def side(start: str, seed: np.random.SeedSequence) -> dict[str, float]:
     if start == "on":
         members = on_circle(again)
     found = dict(
-        zip(FILTERS, np.moveaxis(pendulum.run(readings, members, FILTERS), 1, 0), strict=True)
+        zip(
+            FILTERS,
+            np.moveaxis(pendulum.run(readings, members, FILTERS), 1, 0),
+            strict=True,
+        )
     )
     out = {}
     with np.errstate(all="ignore"):
         whole = np.isfinite(found["OTF"]).all(axis=(1, 2))
         found["OTProj"] = found["OTF"].copy()
-        found["OTProj"][whole] = project(found["OTF"][whole], pendulum.rod, **pendulum.how)
+        found["OTProj"][whole] = project(
+            found["OTF"][whole], pendulum.rod, **pendulum.how
+        )
         for name in ALGORITHMS:
             values = zip(SCORES, scores(found[name], truth), strict=True)
             out |= {f"{start}_{name}_{key}": float(value) for key, value in values}
@@ -77,7 +86,9 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
 
 
 parameters = {name: np.asarray(setting[name]).tolist() for name in setting}
-columns = tuple(f"{s}_{a}_{k}" for s in ("off", "on") for a in ALGORITHMS for k in SCORES)
+columns = tuple(
+    f"{s}_{a}_{k}" for s in ("off", "on") for a in ALGORITHMS for k in SCORES
+)
 code = (on_circle, scores, pendulum.data, pendulum.run)
 seeds = np.random.SeedSequence(3024).spawn(400)
 rtol = 1e-4

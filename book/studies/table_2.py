@@ -19,7 +19,9 @@ from distfilt.gaussians import condition
 from distfilt.metrics import nees
 from distfilt.sensors import stack
 
-NAME, PAPER, BATCH = "table-2", "grange", 5
+NAME = "table-2"
+PAPER = "grange"
+BATCH = 5
 SETUP = satellites.setup("table-2")
 TUNED = {"pca": False, "include_self": False, "gain": 0.1}
 REPAIRED = ("sampled_fused", "known_pulled", "known_fused")
@@ -31,7 +33,12 @@ columns = [
         for name in ("tuned", *REPAIRED, *EXACT)
         for c in satellites.score_columns(SETUP, name, BATCH)
     ),
-    *(f"{n}_{what}_{r}" for n in CENTRAL for what in ("mse", "nees") for r in range(BATCH)),
+    *(
+        f"{n}_{what}_{r}"
+        for n in CENTRAL
+        for what in ("mse", "nees")
+        for r in range(BATCH)
+    ),
     *satellites.time_columns(SETUP, "exact"),
 ]
 parameters = {"batch": BATCH, "seed": 2024, "tuned": TUNED}
@@ -43,11 +50,16 @@ rtol = 1e-4
 rough = [name for name in columns if name.startswith("iterated")]
 
 
-def iterated(means: np.ndarray, readings: np.ndarray, steps: int = 10) -> list[np.ndarray]:
+def iterated(
+    means: np.ndarray, readings: np.ndarray, steps: int = 10
+) -> list[np.ndarray]:
     """The iterated extended filter: linearise again where the update has led, `steps` times."""
-    sensor, s = stack(SETUP.sensors), SETUP
+    sensor = stack(SETUP.sensors)
+    s = SETUP
     cov = np.broadcast_to(s.prior[1], (*means.shape, means.shape[-1]))
-    errors, covs, t0 = [], [], 0.0
+    errors = []
+    covs = []
+    t0 = 0.0
     for t, y in zip(s.times, readings, strict=True):
         slope = s.model.jacobian(means, t0, t - t0)
         cov = slope @ cov @ slope.mT + s.model.Q(t0, t - t0)
@@ -58,7 +70,8 @@ def iterated(means: np.ndarray, readings: np.ndarray, steps: int = 10) -> list[n
             expected = np.einsum("...ij,...j->...i", h, means - x)
             gap = sensor.residual(y, sensor.predict(x)) - expected
             x, after = condition(means, cov, gap, h, sensor.noise_cov)
-        means, cov = x, after
+        means = x
+        cov = after
         errors.append(means)
         covs.append(cov)
     return [np.array(errors), np.array(covs)]
@@ -69,8 +82,10 @@ def extended(readings: np.ndarray) -> list[np.ndarray]:
     f = GaussianFilter(SETUP.model, [stack(SETUP.sensors)])
     start = f.start(SETUP.prior, runs=readings.shape[1:-1])
     states = list(f.steps(start, SETUP.times, [readings]))
-    return [np.array([s.means[..., 0, :] for s in states]),
-            np.array([s.covariances[..., 0, :, :] for s in states])]  # fmt: skip
+    return [
+        np.array([s.means[..., 0, :] for s in states]),
+        np.array([s.covariances[..., 0, :, :] for s in states]),
+    ]
 
 
 def central(name: str, found: list[np.ndarray], truth: np.ndarray) -> dict[str, float]:
@@ -109,8 +124,18 @@ def part(seed: np.random.SeedSequence) -> dict[str, float]:
     """The filter with exact draws alone, as the trial runs it: what chapter 4 runs again."""
     for_data, for_filters = seed.spawn(2)
     truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
-    f, source = satellites.repaired(SETUP, "exact"), for_filters.spawn(len(EXACT))[0]
-    return satellites.scored(SETUP, "exact", satellites.run(SETUP, f, source, truth, seen))
+    f = satellites.repaired(SETUP, "exact")
+    source = for_filters.spawn(len(EXACT))[0]
+    return satellites.scored(
+        SETUP, "exact", satellites.run(SETUP, f, source, truth, seen)
+    )
 
 
-code = (iterated, extended, central, satellites.data, satellites.published, satellites.repaired)
+code = (
+    iterated,
+    extended,
+    central,
+    satellites.data,
+    satellites.published,
+    satellites.repaired,
+)

@@ -16,7 +16,9 @@ import _satellites as satellites
 
 from distfilt.kalman import QuaternionChart, mekf
 
-NAME, PAPER, BATCH = "table-3", "grange", 4
+NAME = "table-3"
+PAPER = "grange"
+BATCH = 4
 SETUP = satellites.setup("table-3")
 TUNED = {"pca": False, "include_self": False, "gain": 0.1}
 REPAIRED = ("known_pulled", "known_fused", "exact")
@@ -38,15 +40,23 @@ rtol = 1e-4
 
 def central(truth: np.ndarray, seen: list[np.ndarray]) -> dict[str, float]:
     """The multiplicative filter of all sensors: twelve errors, three of them of the attitude."""
-    chart, (mean, cov) = QuaternionChart(13, 9), SETUP.prior
+    chart = QuaternionChart(13, 9)
+    (mean, cov) = SETUP.prior
     unit = np.concatenate([mean[:9], mean[9:] / np.linalg.norm(mean[9:])])
     found = mekf(
-        unit, chart.project(mean, cov), np.concatenate(seen, axis=-1), chart=chart,
-        model=SETUP.model, sensors=SETUP.sensors, times=SETUP.times,
-    )  # fmt: skip
+        unit,
+        chart.project(mean, cov),
+        np.concatenate(seen, axis=-1),
+        chart=chart,
+        model=SETUP.model,
+        sensors=SETUP.sensors,
+        times=SETUP.times,
+    )
     error = ((found.means - truth) ** 2).sum(axis=-1)
     local = chart.local(found.means, truth)
-    score = (local * np.linalg.solve(found.covariances, local[..., None])[..., 0]).sum(axis=-1)
+    score = (local * np.linalg.solve(found.covariances, local[..., None])[..., 0]).sum(
+        axis=-1
+    )
     score = score / chart.error_dim
     late = SETUP.settled
     out = satellites.over_time("central", error, score)

@@ -23,13 +23,24 @@ import locals as figure
 from distfilt import density
 from distfilt.network import Channel, Graph, graphs, stable_substeps
 
-NAME, PAPER = "tenfold", "zheng"
+NAME = "tenfold"
+PAPER = "zheng"
 CHOICES = swarm.CHOICES
 CASES = {"uniform": figure.CASE, "peaked": replace(figure.CASE, start="peaked")}
-TENFOLD = {"paper_flat": swarm.PAPERS, "stiff_flat": swarm.STIFF, "fast_flat": swarm.FAST}
+TENFOLD = {
+    "paper_flat": swarm.PAPERS,
+    "stiff_flat": swarm.STIFF,
+    "fast_flat": swarm.FAST,
+}
 GAINS = tuple(TENFOLD)
-EIGHT, TWO = np.arange(swarm.LOCAL), np.arange(2)
-ROWS = {"central": TWO[:1], "central_flat": TWO, **dict.fromkeys(GAINS, EIGHT), "silent": TWO}
+EIGHT = np.arange(swarm.LOCAL)
+TWO = np.arange(2)
+ROWS = {
+    "central": TWO[:1],
+    "central_flat": TWO,
+    **dict.fromkeys(GAINS, EIGHT),
+    "silent": TWO,
+}
 """By name: the agents whose filters are in it."""
 NULLS = ("zero", "open")
 KINDS = ("error", "ratio", "falls", "last", "below")
@@ -37,7 +48,11 @@ columns = [
     *(f"{key}_kde" for key in CASES),
     *(f"{key}_{s}_{k}" for key in CASES for s in (*ROWS, *NULLS) for k in KINDS),
 ]
-parameters = {"seed": CHOICES["seed"], "local": swarm.LOCAL, "rank": CHOICES["low_rank"]}
+parameters = {
+    "seed": CHOICES["seed"],
+    "local": swarm.LOCAL,
+    "rank": CHOICES["low_rank"],
+}
 seeds = figure.seeds
 scenarios = swarm.scenarios
 rtol = 1e-4
@@ -50,15 +65,18 @@ def consensus(
 
     The library's `pi_step` in plain numpy: its ledger would take most of the time here.
     """
-    gains, dt = TENFOLD.get(scheme, swarm.PAPERS), swarm.SWARM["dt"]
+    gains = TENFOLD.get(scheme, swarm.PAPERS)
+    dt = swarm.SWARM["dt"]
     if graph is None:
         return nu + dt * gains["alpha"] * (z - nu), eta
     pull = graph.laplacian.toarray()
     steps = stable_substeps(Channel(graph), dt, **gains)
     for _ in range(steps):
-        apart, spring = pull @ nu, pull @ eta
+        apart = pull @ nu
+        spring = pull @ eta
         nu = nu + dt / steps * (
-            gains["alpha"] * (z - nu) - gains["a"] * apart + gains["b"] * spring)
+            gains["alpha"] * (z - nu) - gains["a"] * apart + gains["b"] * spring
+        )
         eta = eta - dt / steps * gains["b"] * apart
     return nu, eta
 
@@ -68,11 +86,17 @@ def errors(case: swarm.Case, rng: np.random.Generator) -> dict[str, np.ndarray]:
 
     A filter of zero gain is its prior mean, moved.
     """
-    cells, dt, h = case.grid, swarm.SWARM["dt"], case.bandwidth
+    cells = case.grid
+    dt = swarm.SWARM["dt"]
+    h = case.bandwidth
     law = swarm.densities.swarm(case.reading)
     model = density.FokkerPlanck(law, cells)
-    basis = density.zero_mean_prior(cells, rank=int(CHOICES["low_rank"]),
-                                    length=CHOICES["prior_length"], std=CHOICES["prior_std"])
+    basis = density.zero_mean_prior(
+        cells,
+        rank=int(CHOICES["low_rank"]),
+        length=CHOICES["prior_length"],
+        std=CHOICES["prior_std"],
+    )
     x, p = swarm.drawn(case, rng)
     waves = cells.cosines(swarm.MODES)
     gap = ((cells.centres - x[:, None]) ** 2).sum(axis=-1)
@@ -81,27 +105,36 @@ def errors(case: swarm.Case, rng: np.random.Generator) -> dict[str, np.ndarray]:
     z = density.kernels(x, cells, bandwidth=h) @ waves * cells.volume
     talk = {s: (wide, np.zeros_like(wide)) for s in (*GAINS, "silent")}
     first = density.kernel_density(x, cells, bandwidth=h)
-    state = density.low_rank_start(basis, np.concatenate(
-        [first[None] if s == "central" else flat[who] for s, who in ROWS.items()]))
+    state = density.low_rank_start(
+        basis,
+        np.concatenate(
+            [first[None] if s == "central" else flat[who] for s, who in ROWS.items()]
+        ),
+    )
     k = density.kernel_constant(cells, bandwidth=h, agents=case.agents)
     cuts = np.cumsum([len(who) for who in ROWS.values()])
     out: dict[str, list[np.ndarray]] = {s: [] for s in (*ROWS, *NULLS, "kde")}
     for j in range(round(case.end / dt)):
         x = law.step(x, j * dt, dt, rng=rng, substeps=CHOICES["substeps"])
         graph = graphs.disk(x, case.radio_range)
-        talk = {s: consensus(*talk[s], z, None if s == "silent" else graph, s) for s in talk}
+        talk = {
+            s: consensus(*talk[s], z, None if s == "silent" else graph, s) for s in talk
+        }
         z = density.kernels(x, cells, bandwidth=h) @ waves * cells.volume
         y = density.kernel_density(x, cells, bandwidth=h)
-        heard = [talk[s][0][who] @ waves.T if s in talk else np.tile(y, (len(who), 1))
-                 for s, who in ROWS.items()]
+        heard = [
+            talk[s][0][who] @ waves.T if s in talk else np.tile(y, (len(who), 1))
+            for s, who in ROWS.items()
+        ]
         move = model.solver(j * dt, dt)
-        p, state = move(p), density.low_rank_predict(state, move)
+        p = move(p)
+        state = density.low_rank_predict(state, move)
         noise = k * np.maximum(state.estimates, CHOICES["floor"])
         state = density.low_rank_step(state, np.concatenate(heard), noise, dt)
         gaps = np.split(cells.norm(state.estimates - p), cuts[:-1])
         for s, gap in zip(ROWS, gaps, strict=True):
             out[s].append(gap)
-        out["zero"].append(cells.norm(state.base[cuts[1]:cuts[2]] - p))
+        out["zero"].append(cells.norm(state.base[cuts[1] : cuts[2]] - p))
         out["open"].append(cells.norm(state.base[:1] - p))
         out["kde"].append(cells.norm(y - p))
     return {s: np.array(e) for s, e in out.items()}
@@ -112,15 +145,20 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     out: dict[str, float] = {}
     for key, case in CASES.items():
         found = errors(case, np.random.default_rng(seed))
-        kde, k = found.pop("kde"), round(5.0 / swarm.SWARM["dt"])
+        kde = found.pop("kde")
+        k = round(5.0 / swarm.SWARM["dt"])
         half = {s: swarm.average(e, case, case.end / 2) for s, e in found.items()}
         out[f"{key}_kde"] = swarm.average(kde, case, case.end / 2)
         for s, e in found.items():
-            first, last = e[:k].mean(axis=0), e[-k:].mean(axis=0)
+            first = e[:k].mean(axis=0)
+            last = e[-k:].mean(axis=0)
             above = np.flatnonzero(e.mean(axis=1) > kde.mean())
             below = (above[-1] + 1) * swarm.SWARM["dt"] if above.size else 0.0
             values = half[s], half[s] / half["central"], last / first, last, below
-            out |= {f"{key}_{s}_{kind}": np.mean(v) for kind, v in zip(KINDS, values, strict=True)}
+            out |= {
+                f"{key}_{s}_{kind}": np.mean(v)
+                for kind, v in zip(KINDS, values, strict=True)
+            }
     return {name: float(out[name]) for name in columns}
 
 

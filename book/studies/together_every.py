@@ -13,13 +13,20 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import _together as together
 
-NAME, PAPER = "every", "together"
-CELLS = {p: (*together.references(together.problem(p)), *together.cells_of(p))
-         for p in together.FOUR}  # fmt: skip
+NAME = "every"
+PAPER = "together"
+CELLS = {
+    p: (*together.references(together.problem(p)), *together.cells_of(p))
+    for p in together.FOUR
+}
 columns = together.columns_of(f"{p}_{c}" for p, cells in CELLS.items() for c in cells)
 parameters = {"batch": together.BATCH, "program": together.program(), "cells": CELLS}
 seeds = together.seeds_of()
-scenarios = (*(together.problem(p).scenario for p in CELLS), together.STUDY, together.TUNED)
+scenarios = (
+    *(together.problem(p).scenario for p in CELLS),
+    together.STUDY,
+    together.TUNED,
+)
 rtol = 1e-4
 rough = [f"{p}_{k}" for p, cells in CELLS.items() for k in together.loose(cells)]
 

@@ -10,13 +10,17 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import _together as together
 
-NAME, PAPER = "held", "together"
+NAME = "held"
+PAPER = "together"
 CELLS = {p: ("reference", *together.cells_of(p)) for p in together.THREE}
 columns = together.columns_of([f"{p}_{c}" for p, cells in CELLS.items() for c in cells])
 parameters = {"batch": together.BATCH, "program": together.program(), "cells": CELLS}
-seeds = np.random.SeedSequence(together.STUDY["seed"] + 2).spawn(len(together.seeds_of()))
+seeds = np.random.SeedSequence(together.STUDY["seed"] + 2).spawn(
+    len(together.seeds_of())
+)
 scenarios = (together.HELD, together.STUDY, together.TUNED)
-rtol, rough = 1e-4, columns
+rtol = 1e-4
+rough = columns
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:

@@ -13,35 +13,60 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import _together as together
 
-NAME, PAPER = "sizes", "together"
+NAME = "sizes"
+PAPER = "together"
 MEMBERS = (10, 30, 100, 300)
 SIZED = ("known_flood", "root_flood", "exact_ci", "pf_flood", "pf_agreed", "ot_young")
 PARTICLES = (together.STUDY["particles"], 2 * together.STUDY["particles"])
 # Transport has a linear programme to solve of three hundred times three hundred unknowns.
 LARGEST = {"ot_young": 100, "pf_flood": PARTICLES[1], "pf_agreed": PARTICLES[1]}
 AGENTS = (4, 8, 16, 32, 64)
-GROWN = {"linear": ("ekf_near", "ekf_ci", "ekf_meas", "ekf_flood", "known_flood"),
-         "range": ("ekf_ci", "known_flood", "exact_ci", "pf_agreed")}  # fmt: skip
+GROWN = {
+    "linear": ("ekf_near", "ekf_ci", "ekf_meas", "ekf_flood", "known_flood"),
+    "range": ("ekf_ci", "known_flood", "exact_ci", "pf_agreed"),
+}
 # What 64 ranges leave to doubt is narrower than the cells of the reference.
 RINGS = {"linear": AGENTS, "range": AGENTS[:-1]}
 # Where everybody filters everybody's readings, work grows with the square of the agents.
 MOST = {"known_flood": 16}
 FEWEST = {"exact_ci": 30}
-BY_MEMBERS = [(p, c, n) for p in ("range", "lorenz") for c in SIZED for n in MEMBERS + PARTICLES
-              if FEWEST.get(c, 0) <= n <= LARGEST.get(c, 300)]  # fmt: skip
-BY_AGENTS = [(p, c, a) for p, cells in GROWN.items() for c in cells for a in RINGS[p]
-             if a <= MOST.get(c, 64)]  # fmt: skip
-COLUMNS = [*(f"{p}_members_{n}_{c}" for p, c, n in BY_MEMBERS),
-           *(f"{p}_agents_{a}_{c}" for p, c, a in BY_AGENTS),
-           *(f"{p}_agents_{a}_reference" for p in GROWN for a in RINGS[p]),
-           *(f"{p}_members_reference" for p in ("range", "lorenz"))]  # fmt: skip
+BY_MEMBERS = [
+    (p, c, n)
+    for p in ("range", "lorenz")
+    for c in SIZED
+    for n in MEMBERS + PARTICLES
+    if FEWEST.get(c, 0) <= n <= LARGEST.get(c, 300)
+]
+BY_AGENTS = [
+    (p, c, a)
+    for p, cells in GROWN.items()
+    for c in cells
+    for a in RINGS[p]
+    if a <= MOST.get(c, 64)
+]
+COLUMNS = [
+    *(f"{p}_members_{n}_{c}" for p, c, n in BY_MEMBERS),
+    *(f"{p}_agents_{a}_{c}" for p, c, a in BY_AGENTS),
+    *(f"{p}_agents_{a}_reference" for p in GROWN for a in RINGS[p]),
+    *(f"{p}_members_reference" for p in ("range", "lorenz")),
+]
 columns = together.columns_of(COLUMNS)
-parameters = {"batch": together.BATCH, "members": MEMBERS, "agents": AGENTS,
-              "program": together.program()}  # fmt: skip
-seeds = np.random.SeedSequence(together.STUDY["seed"] + 1).spawn(len(together.seeds_of()))
-scenarios = (*(together.problem(p).scenario for p in ("linear", "range", "lorenz")),
-             together.STUDY, together.TUNED)  # fmt: skip
-rtol, rough = 1e-4, columns
+parameters = {
+    "batch": together.BATCH,
+    "members": MEMBERS,
+    "agents": AGENTS,
+    "program": together.program(),
+}
+seeds = np.random.SeedSequence(together.STUDY["seed"] + 1).spawn(
+    len(together.seeds_of())
+)
+scenarios = (
+    *(together.problem(p).scenario for p in ("linear", "range", "lorenz")),
+    together.STUDY,
+    together.TUNED,
+)
+rtol = 1e-4
+rough = columns
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
@@ -62,7 +87,9 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
             out |= headed(found, f"{name}_agents_{agents}_")
             for cell in (c for c in cells if (name, c, agents) in BY_AGENTS):
                 f = together.CELLS[cell].make(p, together.tuned(name, cell))
-                out |= together.measured(p, cell, f, data, seed, f"{name}_agents_{agents}_")
+                out |= together.measured(
+                    p, cell, f, data, seed, f"{name}_agents_{agents}_"
+                )
     return out
 
 

@@ -16,17 +16,24 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 import _together as together
 
-NAME, PAPER = "tuned", "together"
+NAME = "tuned"
+PAPER = "together"
 SEED, RUNS = together.TUNING
 VALUES = range(5)
-TRIED = {p: [c for c, cell in together.CELLS.items() if cell.grid and not cell.why_empty(p)]
-         for p in together.FOUR}  # fmt: skip
+TRIED = {
+    p: [c for c, cell in together.CELLS.items() if cell.grid and not cell.why_empty(p)]
+    for p in together.FOUR
+}
 columns = [f"{p}_{c}_{k}" for p, cells in TRIED.items() for c in cells for k in VALUES]
-parameters = {"runs": RUNS, "grids": {c: v.grid for c, v in together.CELLS.items() if v.grid},
-              "program": together.program()}  # fmt: skip
+parameters = {
+    "runs": RUNS,
+    "grids": {c: v.grid for c, v in together.CELLS.items() if v.grid},
+    "program": together.program(),
+}
 seeds = np.random.SeedSequence(SEED).spawn(1)
 scenarios = (*(together.problem(p).scenario for p in together.FOUR), together.STUDY)
-rtol, rough = 1e-3, [c for c in columns if any(k in c for k in ("_pf_", "_ot_", "_maps_", "_gm_"))]
+rtol = 1e-3
+rough = [c for c in columns if any(k in c for k in ("_pf_", "_ot_", "_maps_", "_gm_"))]
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
@@ -42,11 +49,16 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
                     warnings.simplefilter("ignore")
                     try:
                         mean = together.log_scores(
-                            p, made.make(p, value), data, together.stream(seed, f"{name}{cell}"),
+                            p,
+                            made.make(p, value),
+                            data,
+                            together.stream(seed, f"{name}{cell}"),
                             own=made.own,
-                        ).mean()  # fmt: skip
+                        ).mean()
                     except (ValueError, ArithmeticError, RuntimeError) as error:
                         print(f"{name}, {cell}, {value}: {error}", file=sys.stderr)
                         mean = np.inf
-                out[f"{name}_{cell}_{k}"] = float(f"{mean:.6g}") if np.isfinite(mean) else 1e9
+                out[f"{name}_{cell}_{k}"] = (
+                    float(f"{mean:.6g}") if np.isfinite(mean) else 1e9
+                )
     return out

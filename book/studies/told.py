@@ -21,9 +21,12 @@ from distfilt.mixtures import GaussianMixture
 from distfilt.network import graphs
 from distfilt.sensors import angles_only
 
-NAME, PAPER = "told", "semeraro"
+NAME = "told"
+PAPER = "semeraro"
 SETTING = {
-    **paper.SETTING, "agents": paper.CROWD, "fix_at": 0,
+    **paper.SETTING,
+    "agents": paper.CROWD,
+    "fix_at": 0,
     "noise_std": [paper.SETTING["noise_std"][0], 0.5],
 }
 """Every two hours add half a metre per second to each component of each velocity."""
@@ -38,15 +41,20 @@ def joint(
     n = len(s["agents"])
     eye = partial(angles_only, std=s["angle_std"] * paper.ARCSECOND, form=s["form"])
     eyes = [eye(observer=6 * a) for a in range(1, n + 1)]
-    f = GaussianFilter(paper.moving(s, n + 1), eyes, graphs.complete(n), linearization="unscented")
-    state, out = f.start((first, paper.block(covs))), []
+    f = GaussianFilter(
+        paper.moving(s, n + 1), eyes, graphs.complete(n), linearization="unscented"
+    )
+    state = f.start((first, paper.block(covs)))
+    out = []
     for k, hour in enumerate(paper.HOURS):
         state = f.step(state, 3600.0 * hour, list(seen[k, :, :2]))
         own = [[*range(6), *range(6 * a, 6 * a + 6)] for a in range(1, n + 1)]
-        out.append([
-            GaussianMixture.gaussian(m[o], p[np.ix_(o, o)])
-            for m, p, o in zip(state.means, state.covariances, own, strict=True)
-        ])
+        out.append(
+            [
+                GaussianMixture.gaussian(m[o], p[np.ix_(o, o)])
+                for m, p, o in zip(state.means, state.covariances, own, strict=True)
+            ]
+        )
     return out, float(state.ledger.scalars.sum())
 
 
@@ -62,14 +70,24 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
             beliefs = [state.mixtures for state in states]
             sent = float(states[-1].ledger.scalars.sum())
         found = [paper.scored(beliefs[k], truth[k]) for k in paper.EARLY]
-        out |= {f"{row}_{m}": float(np.mean([f[m].mean() for f in found])) for m in METRICS}
+        out |= {
+            f"{row}_{m}": float(np.mean([f[m].mean() for f in found])) for m in METRICS
+        }
         out[f"{row}_floats"] = sent
     return {name: float(paper.SIX.format(v)) for name, v in out.items()}
 
 
 columns = [f"{row}_{m}" for row in ROWS for m in (*METRICS, "floats")]
 parameters = {"setting": SETTING}
-code = (joint, paper.data, paper.readings, paper.beliefs, paper.network, paper.run, paper.scored)
+code = (
+    joint,
+    paper.data,
+    paper.readings,
+    paper.beliefs,
+    paper.network,
+    paper.run,
+    paper.scored,
+)
 scenarios = paper.scenarios
 seeds = np.random.SeedSequence(1920).spawn(104)
 rtol = 1e-3

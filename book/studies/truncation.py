@@ -17,10 +17,15 @@ import densities
 from bookkit.studies import spawn
 from distfilt import density
 
-NAME, PAPER = "truncation", "zheng"
-CHOICES, DT = densities.CHOICES, densities.SWARM["dt"]
-RANKS, TIMES = (20, 40, 60, 100, 200), (1, 3, 10, 30)
-columns = [f"rank_{r}_{t}" for r in RANKS for t in TIMES] + [f"error_{t}" for t in TIMES]
+NAME = "truncation"
+PAPER = "zheng"
+CHOICES = densities.CHOICES
+DT = densities.SWARM["dt"]
+RANKS = (20, 40, 60, 100, 200)
+TIMES = (1, 3, 10, 30)
+columns = [f"rank_{r}_{t}" for r in RANKS for t in TIMES] + [
+    f"error_{t}" for t in TIMES
+]
 parameters = {"seed": CHOICES["seed"], "ranks": RANKS, "times": TIMES}
 seeds = spawn(CHOICES["seed"] + 4, 1)
 scenarios = (densities.SWARM, CHOICES)
@@ -29,12 +34,20 @@ rtol = 1e-3
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One run: relative distances from the dense filter, and its own relative error."""
-    cells, rng = densities.grid(), np.random.default_rng(seed)
-    swarm, h = densities.swarm("slowgibbs"), CHOICES["bandwidth"]
-    flow, agents = density.FokkerPlanck(swarm, cells), int(densities.SWARM["agents"])
-    full = density.zero_mean_prior(cells, rank=cells.size - 1, length=CHOICES["prior_length"],
-                                   std=CHOICES["prior_std"])
-    x, p = rng.random((agents, 2)), np.ones(cells.size)
+    cells = densities.grid()
+    rng = np.random.default_rng(seed)
+    swarm = densities.swarm("slowgibbs")
+    h = CHOICES["bandwidth"]
+    flow = density.FokkerPlanck(swarm, cells)
+    agents = int(densities.SWARM["agents"])
+    full = density.zero_mean_prior(
+        cells,
+        rank=cells.size - 1,
+        length=CHOICES["prior_length"],
+        std=CHOICES["prior_std"],
+    )
+    x = rng.random((agents, 2))
+    p = np.ones(cells.size)
     y = density.kernel_density(x, cells, bandwidth=h)
     dense = density.Dense(y, full @ full.T)
     cut = {r: density.low_rank_start(full[:, :r], y[None]) for r in RANKS}
@@ -42,17 +55,22 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     out: dict[str, float] = {}
     for j in range(round(TIMES[-1] / DT)):
         move = flow.solver(j * DT, DT)
-        x, p = swarm.step(x, j * DT, DT, rng=rng, substeps=CHOICES["substeps"]), move(p)
+        x = swarm.step(x, j * DT, DT, rng=rng, substeps=CHOICES["substeps"])
+        p = move(p)
         y = density.kernel_density(x, cells, bandwidth=h)
         noise = k * np.maximum(move(dense.mean), CHOICES["floor"])
         dense = density.dense_step(dense, move, y, noise, DT)
-        cut = {r: density.low_rank_step(density.low_rank_predict(s, move), y, noise, DT)
-               for r, s in cut.items()}
+        cut = {
+            r: density.low_rank_step(density.low_rank_predict(s, move), y, noise, DT)
+            for r, s in cut.items()
+        }
         t = round((j + 1) * DT, 6)
         if t in TIMES:
             size = np.linalg.norm(dense.mean)
-            out |= {f"rank_{r}_{t:.0f}": np.linalg.norm(s.estimates[0] - dense.mean) / size
-                    for r, s in cut.items()}
+            out |= {
+                f"rank_{r}_{t:.0f}": np.linalg.norm(s.estimates[0] - dense.mean) / size
+                for r, s in cut.items()
+            }
             out[f"error_{t:.0f}"] = np.linalg.norm(dense.mean - p) / size
     return {name: float(out[name]) for name in columns}
 

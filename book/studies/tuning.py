@@ -18,7 +18,9 @@ import _satellites as satellites
 
 from distfilt.network import mean_pull
 
-NAME, PAPER, BATCH = "tuning", "grange", 1
+NAME = "tuning"
+PAPER = "grange"
+BATCH = 1
 GAINS = (0.0, 0.02, 0.05, 0.1, 0.15)
 SETUPS = {"II": satellites.setup("table-2"), "III": satellites.setup("table-3")}
 SETUP = SETUPS["II"]
@@ -40,10 +42,14 @@ scenarios = tuple(s.scenario for s in SETUPS.values())
 rtol = 1e-4
 
 
-def every_gain(ensembles: np.ndarray, channel: Any, *, include_self: bool) -> np.ndarray:
+def every_gain(
+    ensembles: np.ndarray, channel: Any, *, include_self: bool
+) -> np.ndarray:
     """Pull (G, A, N, d) ensembles, each of the G with its own gain: (16) is linear in γ."""
     unit = 0.05
-    moved = mean_pull(ensembles, channel, gain=unit, include_self=include_self) - ensembles
+    moved = (
+        mean_pull(ensembles, channel, gain=unit, include_self=include_self) - ensembles
+    )
     gains = np.array(GAINS)[:, None, None, None]
     return np.asarray(ensembles + gains / unit * moved)
 

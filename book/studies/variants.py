@@ -16,20 +16,33 @@ import _swarm as swarm
 
 from bookkit.studies import spawn
 
-NAME, PAPER = "variants", "zheng"
+NAME = "variants"
+PAPER = "zheng"
 CHOICES = swarm.CHOICES
-RULES = ("central", "paper", "paper_half", "fast", "average", "flooding", "flooding_half",
-         "neighbours")
+RULES = (
+    "central",
+    "paper",
+    "paper_half",
+    "fast",
+    "average",
+    "flooding",
+    "flooding_half",
+    "neighbours",
+)
 TABLE = swarm.Case(start="peaked", end=15.0)
 QUICK = swarm.Case(reading="gibbs", start="peaked", end=15.0)
-WRONG = swarm.Case(reading="gibbs", start="peaked", end=15.0, phase=CHOICES["wrong_phase"])
+WRONG = swarm.Case(
+    reading="gibbs", start="peaked", end=15.0, phase=CHOICES["wrong_phase"]
+)
 DROP = swarm.Case(start="peaked", end=15.0, gone=swarm.SHARING["gone"])
 DROPS = ("central", "paper", "flooding", "flooding_forgets")
 BASES = ("central", "paper", "flooding")
 OPEN = ("kde", "open", "open_flat")
 MARKS = tuple(range(1, 16))
-CURVES = {"table": (*OPEN, *BASES), "wrong": (*OPEN, *(f"{s}_{q}" for s in BASES
-                                                       for q in ("exact", "process")))}
+CURVES = {
+    "table": (*OPEN, *BASES),
+    "wrong": (*OPEN, *(f"{s}_{q}" for s in BASES for q in ("exact", "process"))),
+}
 columns = [
     *(f"table_{s}_{k}" for s in RULES for k in ("error", "consensus", "nees", "crps")),
     *(f"table_{n}" for n in OPEN),
@@ -38,7 +51,12 @@ columns = [
     *(f"drop_{n}" for n in OPEN),
     *(f"wrong_{s}_{q}" for s in BASES for q in ("exact", "process")),
     *(f"wrong_{n}" for n in OPEN),
-    *(f"{case}_{line}_at_{t}" for case, lines in CURVES.items() for line in lines for t in MARKS),
+    *(
+        f"{case}_{line}_at_{t}"
+        for case, lines in CURVES.items()
+        for line in lines
+        for t in MARKS
+    ),
 ]
 parameters = {"seed": CHOICES["seed"], "local": 3, "rules": RULES}
 seeds = spawn(CHOICES["seed"] + 2, 2)
@@ -50,26 +68,44 @@ def scored(state: object, p: np.ndarray) -> dict[str, float]:
     """NEES and CRPS per cell at the end."""
     from distfilt.metrics import gaussian_crps
 
-    gap, variance = state.estimates - p, np.maximum(state.variances, 1e-12)
-    return {"nees": (gap**2 / variance).mean(),
-            "crps": gaussian_crps(0 * gap, np.sqrt(variance), gap).mean()}
+    gap = state.estimates - p
+    variance = np.maximum(state.variances, 1e-12)
+    return {
+        "nees": (gap**2 / variance).mean(),
+        "crps": gaussian_crps(0 * gap, np.sqrt(variance), gap).mean(),
+    }
 
 
 def curves(key: str, run: dict[str, np.ndarray]) -> dict[str, float]:
     """Errors at the marks by rule, the mean over the local filters."""
     dt = swarm.SWARM["dt"]
-    lines = {n: run[n] if n in OPEN else run[f"{n}_error"].mean(axis=1) for n in CURVES[key]}
-    return {f"{key}_{n}_at_{t}": e[round(t / dt) - 1] for n, e in lines.items() for t in MARKS}
+    lines = {
+        n: run[n] if n in OPEN else run[f"{n}_error"].mean(axis=1) for n in CURVES[key]
+    }
+    return {
+        f"{key}_{n}_at_{t}": e[round(t / dt) - 1]
+        for n, e in lines.items()
+        for t in MARKS
+    }
 
 
 def wrong_model(rng: np.random.Generator) -> dict[str, float]:
     """Local filters whose f is out of phase, with Q = 0 and with Q > 0."""
-    scale = dict(zip(CHOICES["readings"], CHOICES["process_scale"], strict=True))["gibbs"]
+    scale = dict(zip(CHOICES["readings"], CHOICES["process_scale"], strict=True))[
+        "gibbs"
+    ]
     filters = {f"{s}_exact": swarm.network(s, WRONG, 3) for s in BASES}
-    filters |= {f"{s}_process": swarm.network(s, WRONG, 3, process=scale,
-                                              rank=CHOICES["low_rank"]) for s in BASES}
+    filters |= {
+        f"{s}_process": swarm.network(
+            s, WRONG, 3, process=scale, rank=CHOICES["low_rank"]
+        )
+        for s in BASES
+    }
     run, _ = swarm.compared(WRONG, rng, filters)
-    out = {f"wrong_{s}": swarm.average(run[f"{s}_error"], WRONG, 10.0).mean() for s in filters}
+    out = {
+        f"wrong_{s}": swarm.average(run[f"{s}_error"], WRONG, 10.0).mean()
+        for s in filters
+    }
     out |= {f"wrong_{n}": swarm.average(run[n], WRONG, 10.0) for n in OPEN}
     return out | curves("wrong", run)
 
@@ -83,8 +119,11 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         last[0] = p
 
     out: dict[str, float] = {}
-    for case, rng, names, key in ((TABLE, table, RULES, "table"), (QUICK, quick, BASES, "gibbs"),
-                                  (DROP, drop, DROPS, "drop")):
+    for case, rng, names, key in (
+        (TABLE, table, RULES, "table"),
+        (QUICK, quick, BASES, "gibbs"),
+        (DROP, drop, DROPS, "drop"),
+    ):
         filters = {s: swarm.network(s, case, 3) for s in names}
         run, ends = swarm.compared(case, rng, filters, keep)
         late = {k: swarm.average(v, case, 10.0) for k, v in run.items()}

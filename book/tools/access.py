@@ -19,7 +19,7 @@ MENDS = (
     (' id="exercise-content"', ""),
     (' id="solution-content"', ""),
     (' valign="top"', ""),
-)  # fmt: skip
+)
 BRAND = re.compile(r'<div class="[^"]*">(?=\s*<a class="navbar-brand logo")')
 """Around the book's name in the bar on the left, which no landmark holds."""
 

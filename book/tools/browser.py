@@ -32,10 +32,8 @@ ALLOW_NAN = "chromium or chromedriver is not installed"
 def installed() -> tuple[str, str] | None:
     """Return the paths of a browser and of what drives it, or nothing."""
     names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-    browser, helper = (
-        next(filter(None, map(shutil.which, names)), None),
-        shutil.which("chromedriver"),
-    )
+    browser = next(filter(None, map(shutil.which, names)), None)
+    helper = shutil.which("chromedriver")
     return (browser, helper) if browser and helper else None
 
 

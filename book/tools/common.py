@@ -93,10 +93,14 @@ def chosen(names: list[str]) -> list[Path]:
         return chapters()
     out = []
     for name in names:
-        known = [c for c in chapters() if c.stem == name or c.stem.startswith(f"{name}-")]
+        known = [
+            c for c in chapters() if c.stem == name or c.stem.startswith(f"{name}-")
+        ]
         path = known[0] if known else Path(name).with_suffix(".md").resolve()
         if not path.is_file():
-            sys.exit(f"{name}: no such chapter; _toc.yml has {[c.stem for c in chapters()]}")
+            sys.exit(
+                f"{name}: no such chapter; _toc.yml has {[c.stem for c in chapters()]}"
+            )
         out.append(path)
     return out
 

@@ -35,11 +35,17 @@ def made_here(folder, here):
 
 
 def main():
-    folder, here = sys.argv[1], os.getcwd()
+    folder = sys.argv[1]
+    here = os.getcwd()
     if sys.version_info < OLDEST:
         found = ".".join(map(str, sys.version_info[:3])) + " (" + sys.executable + ")"
-        sys.exit("Python 3.11 or newer is needed, got " + found + ": make PYTHON=/path/to/python")
-    stamp, python = os.path.join(folder, "stamp"), os.path.join(folder, "bin", "python")
+        sys.exit(
+            "Python 3.11 or newer is needed, got "
+            + found
+            + ": make PYTHON=/path/to/python"
+        )
+    stamp = os.path.join(folder, "stamp")
+    python = os.path.join(folder, "bin", "python")
     if made_here(folder, here):
         os.remove(stamp)  # until the update is whole too
     else:

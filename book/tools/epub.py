@@ -65,13 +65,20 @@ figcaption { font-size: 0.9em; }
 XHTML = 'media-type="application/xhtml+xml"'
 
 
-def write(driver: Any, target: Path, parts: list[str], about: dict[str, str], style: str) -> None:
+def write(
+    driver: Any, target: Path, parts: list[str], about: dict[str, str], style: str
+) -> None:
     """Write an EPUB of the parts of the open page, which their ids name, in that order."""
     driver.execute_script(MATHML)
-    texts, heads = {}, {}
+    texts = {}
+    heads = {}
     for part in parts:
         texts[part], heads[part] = driver.execute_script(PART, part)
-    home = {i: part for part, text in texts.items() for i in re.findall(r' id="([^"]+)"', text)}
+    home = {
+        i: part
+        for part, text in texts.items()
+        for i in re.findall(r' id="([^"]+)"', text)
+    }
     pictures: dict[str, str] = {}
 
     def place(found: re.Match[str]) -> str:
@@ -104,7 +111,8 @@ def navigation(heads: dict[str, list[tuple[str, str]]]) -> str:
     lines = []
     for part, listed in heads.items():
         head, *below = (
-            f'<a href="{part}.xhtml#{place}">{html.escape(words)}</a>' for place, words in listed
+            f'<a href="{part}.xhtml#{place}">{html.escape(words)}</a>'
+            for place, words in listed
         )
         inner = "".join(f"<li>{link}</li>" for link in below)
         lines += [f"<li>{head}{f'<ol>{inner}</ol>' if inner else ''}</li>"]
@@ -114,10 +122,14 @@ def navigation(heads: dict[str, list[tuple[str, str]]]) -> str:
 
 def package(texts: dict[str, str], pictures: list[str], about: dict[str, str]) -> str:
     """Return the list of what the EPUB holds, in reading order."""
-    items = [f'<item id="nav" href="nav.xhtml" {XHTML} properties="nav"/>',
-             '<item id="style" href="style.css" media-type="text/css"/>']  # fmt: skip
+    items = [
+        f'<item id="nav" href="nav.xhtml" {XHTML} properties="nav"/>',
+        '<item id="style" href="style.css" media-type="text/css"/>',
+    ]
     for part, text in texts.items():
-        has = [word for word, tag in (("mathml", "<math"), ("svg", "<svg")) if tag in text]
+        has = [
+            word for word, tag in (("mathml", "<math"), ("svg", "<svg")) if tag in text
+        ]
         told = f' properties="{" ".join(has)}"' if has else ""
         items += [f'<item id="{part}" href="{part}.xhtml" {XHTML}{told}/>']
     for k, name in enumerate(pictures):

@@ -50,7 +50,9 @@ def read(source: Path) -> Any:
     """Return the Markdown source as a notebook with numbered cells and no version in its header."""
     notebook = jupytext.read(source)
     header = notebook.metadata.get("jupytext", {})
-    wanted = {k: v for k, v in header.items() if k in ("formats", "notebook_metadata_filter")}
+    wanted = {
+        k: v for k, v in header.items() if k in ("formats", "notebook_metadata_filter")
+    }
     layout = header.get("text_representation", {})
     wanted["text_representation"] = {
         k: v for k, v in layout.items() if k in ("extension", "format_name")
@@ -60,7 +62,8 @@ def read(source: Path) -> Any:
     )
     for k, cell in enumerate(notebook.cells):
         cell["id"] = f"{source.stem}-{k:03d}"
-    notebook.nbformat, notebook.nbformat_minor = 4, 5
+    notebook.nbformat = 4
+    notebook.nbformat_minor = 5
     return notebook
 
 
@@ -106,13 +109,17 @@ def complaints(notebook: Any) -> list[str]:
             if output.get("name") == "stderr":
                 out.append(f"{where}wrote to stderr (fix the cause):\n{output['text']}")
             elif foreign := foreign_text(output):
-                out.append(f"{where}its output holds {foreign!r}, which another run would not")
+                out.append(
+                    f"{where}its output holds {foreign!r}, which another run would not"
+                )
     return out
 
 
 def dump(notebook: Any) -> str:
     """Return the notebook as text: sorted keys, and widget models numbered in order of creation."""
-    text: str = nbformat.writes(notebook, sort_keys=True, indent=1, ensure_ascii=False) + "\n"
+    text: str = (
+        nbformat.writes(notebook, sort_keys=True, indent=1, ensure_ascii=False) + "\n"
+    )
     state = notebook.metadata.get("widgets", {}).get(WIDGET_STATE, {}).get("state", {})
     for k, model in enumerate(state):
         text = text.replace(model, f"{k:032d}")
@@ -122,7 +129,10 @@ def dump(notebook: Any) -> str:
 
 def _sorted(text: str) -> str:
     notebook = nbformat.reads(text, as_version=4)
-    return str(nbformat.writes(notebook, sort_keys=True, indent=1, ensure_ascii=False)) + "\n"
+    return (
+        str(nbformat.writes(notebook, sort_keys=True, indent=1, ensure_ascii=False))
+        + "\n"
+    )
 
 
 def unlike(stored: str, fresh: str, whole: bool) -> str:
@@ -133,7 +143,9 @@ def unlike(stored: str, fresh: str, whole: bool) -> str:
         return "another execution does not give the stored bytes"
     pairs = zip(cells_of(stored), cells_of(fresh), strict=True)
     found = [
-        f"{a['id']}: {text}" for a, b in pairs for text in differences(a["outputs"], b["outputs"])
+        f"{a['id']}: {text}"
+        for a, b in pairs
+        for text in differences(a["outputs"], b["outputs"])
     ]
     return "\n".join(found)
 
@@ -156,7 +168,8 @@ def execute(source: Path, check: bool = False, whole: bool = False) -> str:
     problems = complaints(notebook)
     if problems:
         return "\n".join([f"{source.stem}: outputs that cannot be stored", *problems])
-    text, target = dump(notebook), source.with_suffix(".ipynb")
+    text = dump(notebook)
+    target = source.with_suffix(".ipynb")
     if check:
         if not target.is_file():
             return f"{target.name}: not stored yet: make outputs"
@@ -171,12 +184,14 @@ def execute(source: Path, check: bool = False, whole: bool = False) -> str:
 def copy_sources(source: Path) -> str:
     """Give the stored notebook the Markdown's cells, outputs kept; return what is wrong, or ''."""
     target = source.with_suffix(".ipynb")
-    fresh, stored = read(source), nbformat.read(target, as_version=4)
+    fresh = read(source)
+    stored = nbformat.read(target, as_version=4)
     if [c.cell_type for c in fresh.cells] != [c.cell_type for c in stored.cells]:
         return f"{target.name}: has other cells than the Markdown: make outputs"
     for new, old in zip(fresh.cells, stored.cells, strict=True):
         if new.cell_type == "code":
-            new.outputs, new.execution_count = old.outputs, old.execution_count
+            new.outputs = old.outputs
+            new.execution_count = old.execution_count
             lighten(new.outputs)
     if "widgets" in stored.metadata:
         fresh.metadata["widgets"] = stored.metadata["widgets"]
@@ -185,11 +200,17 @@ def copy_sources(source: Path) -> str:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Execute chapters and store their outputs.")
+    parser = argparse.ArgumentParser(
+        description="Execute chapters and store their outputs."
+    )
     parser.add_argument("chapters", nargs="*", help="names or numbers; all without one")
     parser.add_argument("--check", action="store_true", help="compare, write nothing")
-    parser.add_argument("--bytes", action="store_true", help="compare the bytes of pictures too")
-    parser.add_argument("--sources", action="store_true", help="run nothing, keep the outputs")
+    parser.add_argument(
+        "--bytes", action="store_true", help="compare the bytes of pictures too"
+    )
+    parser.add_argument(
+        "--sources", action="store_true", help="run nothing, keep the outputs"
+    )
     parser.add_argument("--jobs", type=int, default=2, help="chapters at a time")
     options = parser.parse_args()
     sources = chosen(options.chapters)
@@ -199,7 +220,11 @@ def main() -> int:
         with ProcessPoolExecutor(max_workers=options.jobs) as pool:
             many = len(sources)
             whole = [options.bytes] * many
-            found = list(pool.map(execute, sources, [options.check or options.bytes] * many, whole))
+            found = list(
+                pool.map(
+                    execute, sources, [options.check or options.bytes] * many, whole
+                )
+            )
     for problem in filter(None, found):
         print(problem, file=sys.stderr)
     if not sources:

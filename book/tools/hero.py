@@ -33,15 +33,25 @@ def pages() -> Iterator[str]:
 
 def main() -> int:
     found = next(page for page in pages() if SLIDER in page)
-    data = re.search(r'<script type="application/json">(.*?)</script>', found, re.DOTALL)
+    data = re.search(
+        r'<script type="application/json">(.*?)</script>', found, re.DOTALL
+    )
     if data is None:
         sys.exit("book/index.ipynb: its slider has no frames; run make outputs")
     shown = json.loads(data[1])
-    frames = [Image.open(io.BytesIO(base64.b64decode(frame))) for frame in shown["frames"]]
-    small = [frame.convert("RGB").resize((720, 720 * frame.height // frame.width))
-             .quantize(64, dither=Image.Dither.NONE) for frame in frames]  # fmt: skip
+    frames = [
+        Image.open(io.BytesIO(base64.b64decode(frame))) for frame in shown["frames"]
+    ]
+    small = [
+        frame.convert("RGB")
+        .resize((720, 720 * frame.height // frame.width))
+        .quantize(64, dither=Image.Dither.NONE)
+        for frame in frames
+    ]
     times = [shown["milliseconds"]] * (len(small) - 1) + [1500]
-    small[0].save(TARGET, save_all=True, append_images=small[1:], duration=times, loop=0)
+    small[0].save(
+        TARGET, save_all=True, append_images=small[1:], duration=times, loop=0
+    )
     if TARGET.stat().st_size > LIMIT:
         sys.exit(f"{TARGET}: {TARGET.stat().st_size} bytes, at most {LIMIT}")
     print(f"{TARGET.relative_to(BOOK.parent)}: {TARGET.stat().st_size} bytes")

@@ -39,7 +39,9 @@ DOLLARS = re.compile(r"\$\$(?P<body>[^$]+?)\$\$ *\((?P<label>[\w-]+)\)", re.S)
 OPTION = re.compile(r"^:(\w+): *(.*)\n", re.M)
 TITLE = re.compile(r"^# +(.+)$", re.M)
 ANCHOR = re.compile(r"^\(([\w-]+)\)=\s*\n+#+ +(.+)$", re.M)
-SOLUTION = re.compile(r"^(`{3,}|:{3,})\{solution-(start|end)\}[^\n]*\n.*?^\1$\n?", re.M | re.S)
+SOLUTION = re.compile(
+    r"^(`{3,}|:{3,})\{solution-(start|end)\}[^\n]*\n.*?^\1$\n?", re.M | re.S
+)
 INCLUDE = re.compile(r"^```\{include\} _generated/reproductions\.md\n```$", re.M)
 MADE = re.compile(r"^```\{include\} _generated/\S+\n```$", re.M)
 HELP = """# API reference
@@ -61,12 +63,16 @@ class Names:
     figures: dict[str, str] = field(default_factory=dict)
 
     def add(self, label: str, words: str, home: str) -> None:
-        self.words[label], self.homes[label] = words, home
+        self.words[label] = words
+        self.homes[label] = home
 
 
 def labels_of(text: str) -> Iterator[str]:
     """Yield the labels of a text's equations, in order."""
-    found = [(m.start(), dict(OPTION.findall(m["body"])).get("label")) for m in MATH.finditer(text)]
+    found = [
+        (m.start(), dict(OPTION.findall(m["body"])).get("label"))
+        for m in MATH.finditer(text)
+    ]
     found += [(m.start(), m["label"]) for m in DOLLARS.finditer(text)]
     return (label for _, label in sorted(found) if label)
 
@@ -77,17 +83,21 @@ def texts_of(source: Path) -> list[tuple[str, Any]]:
         return [(source.read_text(encoding="utf-8"), None)]
     cells = nbformat.read(source.with_suffix(".ipynb"), as_version=4).cells
     return [
-        (cell.source if cell.cell_type == "markdown" else "",
-         cell.metadata.get("mystnb", {}).get("figure"))
+        (
+            cell.source if cell.cell_type == "markdown" else "",
+            cell.metadata.get("mystnb", {}).get("figure"),
+        )
         for cell in cells
-    ]  # fmt: skip
+    ]
 
 
 def names(sources: list[Path]) -> Names:
     """Return what all labels of the book are called."""
-    out, last = Names(), None
+    out = Names()
+    last = None
     for source in sources:
-        number, page = chapter_number(f"book/{source.stem}"), chapter_label(f"book/{source.stem}")
+        number = chapter_number(f"book/{source.stem}")
+        page = chapter_label(f"book/{source.stem}")
         head = "" if number is None else f"{number}."
         if number is None or number != last:  # a chapter's second page counts on
             equations = figures = 0
@@ -119,13 +129,21 @@ def cited(key: str, references: BibliographyData) -> tuple[str, str]:
     return shown, str(entry.fields.get("year", "n.d."))
 
 
-def written_out(role: str, target: str, page: str, known: Names, refs: BibliographyData) -> str:
+def written_out(
+    role: str, target: str, page: str, known: Names, refs: BibliographyData
+) -> str:
     """Return the words that a role stands for."""
     if role.startswith("cite"):
         entries = [cited(key.strip(), refs) for key in target.split(",")]
         if role == "cite:t":
-            return "; ".join(f"[{who} ({year})](bibliography.md)" for who, year in entries)
-        return "([" + "; ".join(f"{who}, {year}" for who, year in entries) + "](bibliography.md))"
+            return "; ".join(
+                f"[{who} ({year})](bibliography.md)" for who, year in entries
+            )
+        return (
+            "(["
+            + "; ".join(f"{who}, {year}" for who, year in entries)
+            + "](bibliography.md))"
+        )
     shown, _, inner = target.rpartition("<")
     label = inner.rstrip(">").strip() if shown else target
     label = label.removeprefix("/").removeprefix("book/").removesuffix(".md")
@@ -154,7 +172,9 @@ def plain(text: str, page: str, known: Names, references: BibliographyData) -> s
     text = MATH.sub(equation, DOLLARS.sub(dollars, text))
     text = SOLUTION.sub(lambda m: "**Solution**\n" if m[2] == "start" else "", text)
     text = INCLUDE.sub(lambda m: reproductions_text(), text)
-    text = MADE.sub("*What the build makes of the chapters stands here on the book's page.*", text)
+    text = MADE.sub(
+        "*What the build makes of the chapters stands here on the book's page.*", text
+    )
     text = re.sub(r"\]\((?:/book/)?(\d\d[a-z]?-[\w-]+)\.md", r"](\1.ipynb", text)
     return ROLE.sub(lambda m: written_out(m[1], m[2], page, known, references), text)
 
@@ -163,7 +183,8 @@ def notebook(source: Path, known: Names, references: BibliographyData) -> Any:
     """Return a chapter as a notebook of its own, which no save writes to a second file."""
     stored = nbformat.read(source.with_suffix(".ipynb"), as_version=4)
     stored.metadata.pop("jupytext", None)
-    cells, figures = [], 0
+    cells = []
+    figures = 0
     for cell in stored.cells:
         cells.append(cell)
         if cell.cell_type == "markdown":
@@ -175,8 +196,12 @@ def notebook(source: Path, known: Names, references: BibliographyData) -> Any:
         if figure:
             figures += 1
             name = known.figures[str(figure.get("name", f"{source.stem}-{figures}"))]
-            caption = plain(str(figure.get("caption", "")), source.stem, known, references)
-            below = nbformat.v4.new_markdown_cell(f"**{name}** {caption}", id=f"{cell.id}-caption")
+            caption = plain(
+                str(figure.get("caption", "")), source.stem, known, references
+            )
+            below = nbformat.v4.new_markdown_cell(
+                f"**{name}** {caption}", id=f"{cell.id}-caption"
+            )
             cells.append(below)
     stored.cells = cells
     return stored
@@ -186,16 +211,22 @@ def bibliography(references: BibliographyData) -> str:
     """Return the list of references as Markdown."""
     style = find_plugin("pybtex.style.formatting", "plain")()
     backend = find_plugin("pybtex.backends", "markdown")()
-    entries = sorted(references.entries.values(), key=lambda e: cited(e.key, references))
+    entries = sorted(
+        references.entries.values(), key=lambda e: cited(e.key, references)
+    )
     lines = [entry.text.render(backend) for entry in style.format_entries(entries)]
     return "# Bibliography\n\n" + "\n".join(f"- {line}" for line in lines) + "\n"
 
 
 def copy(folder: Path) -> list[Path]:
     """Write the working copy; return its notebooks."""
-    pages = [ROOT / f"{page}.md" for page in toc_pages() if (ROOT / f"{page}.md").is_file()]
+    pages = [
+        ROOT / f"{page}.md" for page in toc_pages() if (ROOT / f"{page}.md").is_file()
+    ]
     references = parse_file(str(BOOK / "refs.bib"), bib_format="bibtex")
-    known, book, out = names(pages), folder / "book", []
+    known = names(pages)
+    book = folder / "book"
+    out = []
     book.mkdir(parents=True)
     for source in pages:
         if is_chapter(source):
@@ -207,7 +238,9 @@ def copy(folder: Path) -> list[Path]:
         elif source.stem == "api":
             (book / source.name).write_text(HELP, encoding="utf-8")
         elif source.parent == BOOK:
-            text = plain(source.read_text(encoding="utf-8"), source.stem, known, references)
+            text = plain(
+                source.read_text(encoding="utf-8"), source.stem, known, references
+            )
             (book / source.name).write_text(text, encoding="utf-8")
     left_out = shutil.ignore_patterns("__pycache__", ".*")
     for name in ("examples", "studies"):
@@ -222,7 +255,9 @@ def settings(folder: Path) -> dict[str, str]:
     viewers = home / "lab" / "user-settings" / "@jupyterlab" / "docmanager-extension"
     viewers.mkdir(parents=True, exist_ok=True)
     chosen = {"defaultViewers": {"markdown": "Markdown Preview"}}
-    (viewers / "plugin.jupyterlab-settings").write_text(json.dumps(chosen), encoding="utf-8")
+    (viewers / "plugin.jupyterlab-settings").write_text(
+        json.dumps(chosen), encoding="utf-8"
+    )
     return {
         **os.environ,
         "JUPYTER_CONFIG_DIR": str(home / "config"),
@@ -243,7 +278,9 @@ def trust(notebooks: list[Path], environment: dict[str, str]) -> None:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description="JupyterLab on a working copy of the book.")
+    parser = argparse.ArgumentParser(
+        description="JupyterLab on a working copy of the book."
+    )
     parser.add_argument("folder", type=Path, help="where the copy is, or is made")
     parser.add_argument("--no-open", action="store_true", help="make the copy only")
     options = parser.parse_args(arguments)
@@ -252,7 +289,9 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"{options.folder}: would be written over the repository")
     environment = settings(folder) if (folder / "book").is_dir() else {}
     if environment:
-        print(f"The working copy of before: {folder}\nFor a fresh one: make lab LAB=another/folder")
+        print(
+            f"The working copy of before: {folder}\nFor a fresh one: make lab LAB=another/folder"
+        )
     elif folder.is_dir() and any(folder.iterdir()):
         parser.error(f"{options.folder}: is not empty and holds no working copy")
     else:

@@ -30,12 +30,25 @@ from common import ROOT, VERDICT, chapters
 
 ITEMS = ROOT / "data" / "published" / "items.csv"
 LEDGER = ROOT / "data" / "published" / "ledger.csv"
-COLUMNS = ("paper", "item", "kind", "chapter", "verdict", "ours", "null", "range",
-           "published", "why")  # fmt: skip
+COLUMNS = (
+    "paper",
+    "item",
+    "kind",
+    "chapter",
+    "verdict",
+    "ours",
+    "null",
+    "range",
+    "published",
+    "why",
+)
 OPEN = "not yet"
 VERDICTS = {kind: (*found, OPEN) for kind, found in published.VERDICTS.items()}
 """What can stand in the ledger for each kind of item."""
-WORDS = {"parameters": "tables of parameters", "results": "tables and figures of results"}
+WORDS = {
+    "parameters": "tables of parameters",
+    "results": "tables and figures of results",
+}
 
 
 def verdicts_of(notebook: Path) -> list[dict[str, str]]:
@@ -50,7 +63,9 @@ def verdicts_of(notebook: Path) -> list[dict[str, str]]:
     return [{**verdict, "chapter": notebook.stem} for verdict in found]
 
 
-def ledger(items: list[dict[str, str]], verdicts: list[dict[str, str]]) -> list[dict[str, str]]:
+def ledger(
+    items: list[dict[str, str]], verdicts: list[dict[str, str]]
+) -> list[dict[str, str]]:
     """Return one row for each item, with the verdict that a chapter computed or "not yet".
 
     Raises
@@ -67,10 +82,14 @@ def ledger(items: list[dict[str, str]], verdicts: list[dict[str, str]]) -> list[
         if key not in keys:
             raise ValueError(f"{where}: not an item of {ITEMS.name}")
         if key in given:
-            raise ValueError(f"{where}: has a verdict already, in {given[key]['chapter']}")
+            raise ValueError(
+                f"{where}: has a verdict already, in {given[key]['chapter']}"
+            )
         known = VERDICTS[kinds[key]]
         if verdict["verdict"] not in known:
-            raise ValueError(f"{where}: verdict {verdict['verdict']!r}, needs one of {known}")
+            raise ValueError(
+                f"{where}: verdict {verdict['verdict']!r}, needs one of {known}"
+            )
         given[key] = verdict
     blank = dict.fromkeys(COLUMNS, "") | {"verdict": OPEN}
     return [
@@ -115,11 +134,12 @@ START = r"(?:(?P<start>(?:off|on) the circle): )?"
 def parts(text: str, head: str) -> list[tuple[str, re.Match[str], str]]:
     """Split a cell of the ledger at its claims: the start, the head's match, the rest."""
     hits = list(re.finditer(rf"(?:^|; ){START}{head}", text))
-    out, start = [], ""
+    out = []
+    start = ""
     ends = [h.start() for h in hits[1:]] + [len(text)] * bool(hits)
     for hit, end in zip(hits, ends, strict=True):
         start = hit["start"] or start
-        out.append((start, hit, text[hit.end():end]))
+        out.append((start, hit, text[hit.end() : end]))
     return out
 
 
@@ -127,13 +147,23 @@ def claims_of(row: dict[str, str]) -> list[Judged]:
     """Return the claims of a row of results, each with its null and its range."""
     ours = parts(row["ours"], r"(?P<id>[a-z0-9-]+) (?P<word>holds|fails): ")
     ids = "|".join(dict.fromkeys(hit["id"] for _, hit, _ in ours))
-    nulls = {(s, hit["id"]): rest for s, hit, rest in parts(row["null"], rf"(?P<id>{ids}), ")}
-    ranges = {(s, hit["id"]): rest for s, hit, rest in parts(row["range"], rf"(?P<id>{ids}) ")}
+    nulls = {
+        (s, hit["id"]): rest for s, hit, rest in parts(row["null"], rf"(?P<id>{ids}), ")
+    }
+    ranges = {
+        (s, hit["id"]): rest for s, hit, rest in parts(row["range"], rf"(?P<id>{ids}) ")
+    }
     return [
-        Judged(hit["id"], s, hit["word"] == "holds", rest, nulls.get((s, hit["id"]), ""),
-               ranges.get((s, hit["id"]), ""))
+        Judged(
+            hit["id"],
+            s,
+            hit["word"] == "holds",
+            rest,
+            nulls.get((s, hit["id"]), ""),
+            ranges.get((s, hit["id"]), ""),
+        )
         for s, hit, rest in ours
-    ]  # fmt: skip
+    ]
 
 
 def unmoved(row: dict[str, str]) -> list[str]:
@@ -161,7 +191,10 @@ def main() -> int:
     elif not LEDGER.is_file() or LEDGER.read_text(encoding="utf-8") != text:
         sys.exit(f"{LEDGER.name} is not what the stored chapters give: make outputs")
     for kind, (total, counts) in summaries(read_rows(LEDGER)).items():
-        print(f"{total} {WORDS[kind]}: " + ", ".join(f"{n} {v}" for v, n in counts.items()))
+        print(
+            f"{total} {WORDS[kind]}: "
+            + ", ".join(f"{n} {v}" for v, n in counts.items())
+        )
     return 0
 
 

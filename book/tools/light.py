@@ -15,7 +15,8 @@ from PIL import Image
 from common import SLIDER
 
 FRAMES = re.compile(
-    rf'<div {SLIDER}.*?<script type="application/json">(?P<data>.*?)</script>.*?</script>', re.S
+    rf'<div {SLIDER}.*?<script type="application/json">(?P<data>.*?)</script>.*?</script>',
+    re.S,
 )
 """A picture that moves, on a built page."""
 INLINE = "data:image/webp;base64,"
@@ -30,13 +31,17 @@ def lighten(folder: Path) -> None:
     """Make the pages of a built book lighter; what they show stays the same to the last pixel."""
     images = folder / "_images"
     with ThreadPoolExecutor() as pool:
-        small = [name for name in pool.map(as_webp, sorted(images.glob("*.png"))) if name]
+        small = [
+            name for name in pool.map(as_webp, sorted(images.glob("*.png"))) if name
+        ]
     named = re.compile(rf"(_images/)({'|'.join(map(re.escape, small))})\.png")
     for page in sorted(folder.rglob("*.html")):
         before = page.read_text(encoding="utf-8")
         text = named.sub(r"\1\2.webp", before) if small else before
         where = os.path.relpath(images, page.parent)
-        text = FRAMES.sub(lambda found, where=where: outside(found, images, where), text)
+        text = FRAMES.sub(
+            lambda found, where=where: outside(found, images, where), text
+        )
         if text != before:
             page.write_text(text, encoding="utf-8")
 
@@ -55,14 +60,19 @@ def as_webp(picture: Path) -> str | None:
 
 def outside(found: re.Match[str], images: Path, where: str) -> str:
     """Return a slider whose frames are files, and write them."""
-    data, names = json.loads(found["data"]), []
+    data = json.loads(found["data"])
+    names = []
     for frame in data["frames"]:
         content = base64.b64decode(frame)
         names += [f"{hashlib.sha256(content).hexdigest()[:24]}.webp"]
         (images / names[-1]).write_bytes(content)
-    links = dict(zip((f"{INLINE}{frame}" for frame in data["frames"]), names, strict=True))
+    links = dict(
+        zip((f"{INLINE}{frame}" for frame in data["frames"]), names, strict=True)
+    )
     data["frames"] = [f"{where}/{name}" for name in names]
     told = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
     text = found[0].replace(found["data"], told).replace(f'"{INLINE}" + ', "")
-    text = re.sub(rf'src="({INLINE}[^"]*)"', lambda src: f'src="{where}/{links[src[1]]}"', text)
+    text = re.sub(
+        rf'src="({INLINE}[^"]*)"', lambda src: f'src="{where}/{links[src[1]]}"', text
+    )
     return text.replace('root.dataset.ready = "";', AHEAD)

@@ -68,18 +68,51 @@ from common import BOOK, ROOT, SLIDER, VERDICT, chosen
 
 KNOWN = Path(__file__).with_suffix(".csv")
 _UPWARDS = (
-    "zero", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven",
-    "twelve", "thirteen", "fourteen", "fifteen", "sixteen", "seventeen", "eighteen", "nineteen",
-)  # fmt: skip
+    "zero",
+    "one",
+    "two",
+    "three",
+    "four",
+    "five",
+    "six",
+    "seven",
+    "eight",
+    "nine",
+    "ten",
+    "eleven",
+    "twelve",
+    "thirteen",
+    "fourteen",
+    "fifteen",
+    "sixteen",
+    "seventeen",
+    "eighteen",
+    "nineteen",
+)
 _TENS = ("twenty", "thirty", "forty", "fifty", "sixty", "seventy", "eighty", "ninety")
 ONES = {word: k for k, word in enumerate(_UPWARDS)}
 TENS = {word: 20 + 10 * k for k, word in enumerate(_TENS)}
 LARGE = {"hundred": 100, "thousand": 1000, "million": 10**6, "billion": 10**9}
 PARTS = {
-    "half": 2, "third": 3, "quarter": 4, "fifth": 5, "sixth": 6, "seventh": 7, "eighth": 8,
-    "ninth": 9, "tenth": 10, "twelfth": 12, "sixteenth": 16, "twentieth": 20, "fortieth": 40,
-    "fiftieth": 50, "ninetieth": 90, "hundredth": 100, "thousandth": 1000, "millionth": 10**6,
-}  # fmt: skip
+    "half": 2,
+    "third": 3,
+    "quarter": 4,
+    "fifth": 5,
+    "sixth": 6,
+    "seventh": 7,
+    "eighth": 8,
+    "ninth": 9,
+    "tenth": 10,
+    "twelfth": 12,
+    "sixteenth": 16,
+    "twentieth": 20,
+    "fortieth": 40,
+    "fiftieth": 50,
+    "ninetieth": 90,
+    "hundredth": 100,
+    "thousandth": 1000,
+    "millionth": 10**6,
+}
 ORDINAL = ("third", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth", "twelfth")
 COUNT = "|".join((*ONES, *TENS, *LARGE))
 WORDS = re.compile(
@@ -121,15 +154,80 @@ LABELS = (
     r"|degree|tables|level|satellites?|robots?|state|appendix"
 )
 COMMON = {
-    "that", "this", "with", "from", "which", "than", "what", "have", "more", "most",
-    "less", "least", "each", "every", "both", "other", "such", "they", "their", "there",
-    "then", "when", "where", "here", "only", "into", "over", "under", "about", "after",
-    "before", "same", "some", "many", "very", "does", "would", "could", "should", "between",
-    "because", "number", "numbers", "times", "value", "values", "first", "second", "last", "name",
-    "label", "title", "size", "shape", "axis", "default", "float", "array", "numpy", "list",
-    "dict", "range", "print", "text", "kwargs", "index", "color", "alpha", "marker",
-    "style", "figure", "table", "caption",
-}  # fmt: skip
+    "that",
+    "this",
+    "with",
+    "from",
+    "which",
+    "than",
+    "what",
+    "have",
+    "more",
+    "most",
+    "less",
+    "least",
+    "each",
+    "every",
+    "both",
+    "other",
+    "such",
+    "they",
+    "their",
+    "there",
+    "then",
+    "when",
+    "where",
+    "here",
+    "only",
+    "into",
+    "over",
+    "under",
+    "about",
+    "after",
+    "before",
+    "same",
+    "some",
+    "many",
+    "very",
+    "does",
+    "would",
+    "could",
+    "should",
+    "between",
+    "because",
+    "number",
+    "numbers",
+    "times",
+    "value",
+    "values",
+    "first",
+    "second",
+    "last",
+    "name",
+    "label",
+    "title",
+    "size",
+    "shape",
+    "axis",
+    "default",
+    "float",
+    "array",
+    "numpy",
+    "list",
+    "dict",
+    "range",
+    "print",
+    "text",
+    "kwargs",
+    "index",
+    "color",
+    "alpha",
+    "marker",
+    "style",
+    "figure",
+    "table",
+    "caption",
+}
 
 
 @dataclass
@@ -168,9 +266,13 @@ class Fact:
 
 def stems(text: str) -> frozenset[str]:
     """Beginnings of the words that mean something."""
-    words = re.findall(r"[a-zA-Zε-ω]{3,}", re.sub(r"([a-z])([A-Z])|_", r"\1 \2", text).lower())
+    words = re.findall(
+        r"[a-zA-Zε-ω]{3,}", re.sub(r"([a-z])([A-Z])|_", r"\1 \2", text).lower()
+    )
     found = [*words, *re.findall(r"[a-z]+_[a-z_]+", text)]
-    return frozenset(w if "_" in w else w[:5] for w in found if w not in COMMON and w not in ONES)
+    return frozenset(
+        w if "_" in w else w[:5] for w in found if w not in COMMON and w not in ONES
+    )
 
 
 def number(text: str) -> float:
@@ -180,16 +282,21 @@ def number(text: str) -> float:
         return float(re.sub(r"[   \u2009]", "", text.replace("−", "-")))
     if low == "twice":
         return 2.0
-    if found := re.fullmatch(r"(?:an? )?(\w+)-(hundred|thousand|million)ths?", text.lower()):
+    if found := re.fullmatch(
+        r"(?:an? )?(\w+)-(hundred|thousand|million)ths?", text.lower()
+    ):
         return 1 / (number(found[1]) * LARGE[found[2]])
-    total, part, share = 0.0, 0.0, 1.0
+    total = 0.0
+    part = 0.0
+    share = 1.0
     for word in low.split():
         single = word.removesuffix("s") if word != "halves" else "half"
         if word in ONES or word in TENS:
             part += {**ONES, **TENS}[word]
         elif word in LARGE:
             part = max(part, 1.0) * LARGE[word] if part != 0.5 else 0.5 * LARGE[word]
-            total, part = total + (part if word != "hundred" else 0), part * (word == "hundred")
+            total = total + (part if word != "hundred" else 0)
+            part = part * (word == "hundred")
         elif single in PARTS:
             if word == "half" and low.endswith("and a half"):
                 return total + part + 0.5
@@ -224,13 +331,17 @@ CELL = re.compile(
 
 def pieces(text: str) -> Iterator[tuple[int, str, str]]:
     """Yield line, kind ("prose" or "code") and text of the parts of a chapter, in order."""
-    text = re.sub(r"\A---\n.*?^---\n", lambda m: "\n" * m[0].count("\n"), text, flags=re.M | re.S)
+    text = re.sub(
+        r"\A---\n.*?^---\n", lambda m: "\n" * m[0].count("\n"), text, flags=re.M | re.S
+    )
     at = 0
     for cell in CELL.finditer(text):
         yield text.count("\n", 0, at) + 1, "prose", text[at : cell.start()]
         line = text.count("\n", 0, cell.start()) + 1
         header = cell["yaml"] or ""
-        for found in re.finditer(r"^ *(caption|alt): >-\n((?: {6,}.*\n)+)", header, re.M):
+        for found in re.finditer(
+            r"^ *(caption|alt): >-\n((?: {6,}.*\n)+)", header, re.M
+        ):
             yield line, "prose", f"\n\n{found[2]}\n\n"
         yield line, "code", cell["code"]
         at = cell.end()
@@ -245,9 +356,15 @@ def evaluated(text: str) -> float | None:
     text = re.sub(r"\\[td]?frac(\d)(\d)", r"(\1/\2)", text)
     text = re.sub(r"\\[td]?frac\{([^{}]*)\}\{([^{}]*)\}", r"((\1)/(\2))", text)
     text = re.sub(r"\\(sqrt|log)\s*\{?(\d+)\}?", r"\1(\2)", text)
-    text = re.sub(r"\|([^|]+)\|", r"abs(\1)", text).replace("\\pi", "(pi)").replace("e^", "exp^")
     text = (
-        re.sub(r"\\cdot|\\times", "*", text).replace("^", "**").replace("exp**", "(2.718281828)**")
+        re.sub(r"\|([^|]+)\|", r"abs(\1)", text)
+        .replace("\\pi", "(pi)")
+        .replace("e^", "exp^")
+    )
+    text = (
+        re.sub(r"\\cdot|\\times", "*", text)
+        .replace("^", "**")
+        .replace("exp**", "(2.718281828)**")
     )
     text = re.sub(r"\\[,; ]|[\s{}]", "", text)
     text = re.sub(r"(?<=[\d)])(?=[a-z(])", "*", text)
@@ -267,7 +384,8 @@ def of_formula(found: re.Match[str]) -> str:
     inside = found[1].replace("{,}", "").replace("\\,", " ").replace("\\%", "%").strip()
     parts = re.split(r"(=|\\approx)", inside)
     if len(parts) > 2 and re.fullmatch(r" ?-?\d+(?:\.\d+)? ?", parts[-1]):
-        given, exact = float(parts[-1]), evaluated(parts[-3])
+        given = float(parts[-1])
+        exact = evaluated(parts[-3])
         loose = 0.02 * abs(given) if "approx" in parts[-2] else 0.0
         if exact is not None and abs(exact - given) <= max(
             loose, 0.5001 * step_of(parts[-1].strip(), given)
@@ -279,7 +397,8 @@ def of_formula(found: re.Match[str]) -> str:
     if re.fullmatch(r"\\?(?:pm)?[-\d. %]+", inside):
         return f" {inside.removeprefix(chr(92) + 'pm')} "
     last = re.search(
-        r"(?:=|\\approx|<|>|\\leq?|\\geq?|\\pm) ?(-?\d+(?:\.\d+)?)(?:\\?[ ,;]*)$", inside
+        r"(?:=|\\approx|<|>|\\leq?|\\geq?|\\pm) ?(-?\d+(?:\.\d+)?)(?:\\?[ ,;]*)$",
+        inside,
     )
     return f" ({last[1]}) = " if last and float(last[1]) not in (0, 1) else " "
 
@@ -287,7 +406,9 @@ def of_formula(found: re.Match[str]) -> str:
 def plain(text: str) -> str:
     """Prose without code, roles, addresses, comments and what defines something; lines kept."""
     keep = lambda m: "\n" * m[0].count("\n")  # noqa: E731
-    text = re.sub(r"^(`{3,})\{(?:math|include|eval-rst)\}.*?^\1$", keep, text, flags=re.M | re.S)
+    text = re.sub(
+        r"^(`{3,})\{(?:math|include|eval-rst)\}.*?^\1$", keep, text, flags=re.M | re.S
+    )
     text = re.sub(r"^(`{3,}|:{3,}).*$|^:\w+:.*$|^%.*$|^\(.*\)=$", "", text, flags=re.M)
     text = re.sub(r"\$\$.*?\$\$", keep, text, flags=re.S)
     text = re.sub(r"\{cite:\w\}`[^`]*`", " ⸢cited⸣ ", text)
@@ -305,7 +426,9 @@ def structure(sentence: str) -> str:
     blank = lambda m: re.sub(r"\S", "_", m[0])  # noqa: E731
     number_list = r"\d+[a-z]?(?:(?:, | and | to | or |-|–|/)\d+[a-z]?)*\b(?!\.\d| ?%)"
     roman = r"[IVX]+\b(?:(?:, | and | to )[IVX]+\b)*"
-    out = re.sub(rf"\b(?:{LABELS})\s+(?:{number_list}|{roman})", blank, sentence, flags=re.I)
+    out = re.sub(
+        rf"\b(?:{LABELS})\s+(?:{number_list}|{roman})", blank, sentence, flags=re.I
+    )
     out = re.sub(r"\((?!\d+\) =)\d{1,2}[a-z]?\)(?:-\(\d+\))?", blank, out)
     out = re.sub(r"\b[A-Za-z]+\d[\w.]*|\b\d+-D\b|\b\d+[a-zA-Z]\w*-", blank, out)
     out = re.sub(r"\b\d+, (?:19|20)\d\d\)", blank, out)
@@ -322,7 +445,8 @@ def numerals_of(piece: str, chapter: str, line: int, section: int) -> Iterator[N
         start = line + piece_line(plain(piece), block.start())
         text = block[0]
         for found in re.finditer(
-            r"(?s).+?(?:(?<!Fig)(?<!Figs)(?<!Eq)(?<!Prop)(?<!cf)[.!?:](?=\s)|\|\n|$)", text
+            r"(?s).+?(?:(?<!Fig)(?<!Figs)(?<!Eq)(?<!Prop)(?<!cf)[.!?:](?=\s)|\|\n|$)",
+            text,
         ):
             sentence = " ".join(found[0].split())
             clean = structure(sentence)
@@ -350,20 +474,27 @@ def one(
     hit: re.Match[str], clean: str, sentence: str, chapter: str, line: int, section: int
 ) -> Iterator[Numeral]:
     """The numeral of one hit, with its unit and whether it is a small one."""
-    text, after = hit[0].strip(), clean[hit.end() :].lstrip(" -)")
+    text = hit[0].strip()
+    after = clean[hit.end() :].lstrip(" -)")
     value = number(text)
     unit = next((u for u in UNITS if re.match(u, after)), "")
     if text.lower() in ("third", "quarter", "a second") and not unit:
         return
     whole = value == int(value)
     tiny = (whole and abs(value) <= 12) or value == 0.5
-    ordinal = text.lower().removeprefix("a ") in ORDINAL and not re.match(r"of\b", after)
+    ordinal = text.lower().removeprefix("a ") in ORDINAL and not re.match(
+        r"of\b", after
+    )
     if re.fullmatch(r"(?:an?|one)", text, re.I):
         return
     if after.startswith("≗"):
-        yield Numeral(chapter, line, section, text, value, 0.0, "", sentence, "arithmetic")
+        yield Numeral(
+            chapter, line, section, text, value, 0.0, "", sentence, "arithmetic"
+        )
         return
-    spread = re.match(rf"(?:to|and|or|–) (?:{DIGITS.pattern}|{COUNT}) ?({'|'.join(UNITS)})", after)
+    spread = re.match(
+        rf"(?:to|and|or|–) (?:{DIGITS.pattern}|{COUNT}) ?({'|'.join(UNITS)})", after
+    )
     if spread and not unit:
         unit = next(u for u in UNITS if re.match(u, spread[1]))
     kind = "small" if (tiny and not unit) or ordinal else ""
@@ -387,9 +518,12 @@ def one(
 
 
 ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
-    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul,
-    ast.Div: operator.truediv, ast.Pow: operator.pow,
-}  # fmt: skip
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+}
 
 
 def constant(node: ast.AST) -> float | None:
@@ -400,7 +534,8 @@ def constant(node: ast.AST) -> float | None:
         inner = constant(node.operand)
         return None if inner is None else -inner
     if isinstance(node, ast.BinOp):
-        a, b = constant(node.left), constant(node.right)
+        a = constant(node.left)
+        b = constant(node.right)
         if a is not None and b is not None:
             with contextlib.suppress(KeyError, ArithmeticError, TypeError):
                 return float(ARITHMETIC[type(node.op)](a, b))
@@ -450,10 +585,14 @@ def checks(node: ast.Assert, section: int, where: str) -> Iterator[Fact]:
         yield Fact("check", value, value, where, section, words)
     message = node.msg.value if isinstance(node.msg, ast.Constant) else ""
     for said in numerals_of(str(message) + "\n", "", 0, 0):
-        yield Fact("check", said.value, said.value, where, section, words, said.unit or "said")
+        yield Fact(
+            "check", said.value, said.value, where, section, words, said.unit or "said"
+        )
 
 
-def parameters(code: str, where: str, section: int = -1, kind: str = "parameter") -> Iterator[Fact]:
+def parameters(
+    code: str, where: str, section: int = -1, kind: str = "parameter"
+) -> Iterator[Fact]:
     """The numbers of some code with the names that they are bound to and comments beside them."""
     comments: dict[int, str] = {}
     for token in tokenize.generate_tokens(io.StringIO(code).readline):
@@ -467,7 +606,14 @@ def parameters(code: str, where: str, section: int = -1, kind: str = "parameter"
         value = constant(node) if isinstance(node, ast.expr) else None
         if value is not None:
             said = " ".join((*names[-3:], comments.get(node.lineno, "")))
-            yield Fact(kind, value, value, f"{where}: {'.'.join(names[-2:])}", section, stems(said))
+            yield Fact(
+                kind,
+                value,
+                value,
+                f"{where}: {'.'.join(names[-2:])}",
+                section,
+                stems(said),
+            )
             if not isinstance(node, ast.BinOp):
                 return
         if isinstance(node, ast.Assign | ast.AnnAssign):
@@ -528,7 +674,11 @@ def rows_of(page: str) -> Iterator[tuple[str, str]]:
     page = re.sub(r"<style.*?</style>", "", page, flags=re.S)
     for block in re.split(r"(?=<table)", page):
         rows = re.split(r"(?=<tr)", block)
-        head = bare(" ".join(re.findall(r"<caption.*?</caption>|<thead.*?</thead>", block, re.S)))
+        head = bare(
+            " ".join(
+                re.findall(r"<caption.*?</caption>|<thead.*?</thead>", block, re.S)
+            )
+        )
         for row in rows:
             yield bare(row), head
 
@@ -542,7 +692,10 @@ def printed(cell: Any, section: int, where: str) -> Iterator[Fact]:
             continue
         verdict = [(str(v), "") for v in data.get(VERDICT, {}).values()]
         plainly = "" if page else "".join(data.get("text/plain", ""))
-        lines = [(line, "") for line in ("".join(output.get("text", "")) + plainly).splitlines()]
+        lines = [
+            (line, "")
+            for line in ("".join(output.get("text", "")) + plainly).splitlines()
+        ]
         for row, head in (*rows_of(page), *verdict, *lines):
             words = stems(f"{row} {head}")
             for found in NUMBER.finditer(f"{row}\n{head}"):
@@ -576,15 +729,24 @@ def scenario_facts(path: Path) -> tuple[Fact, ...]:
     entries = [*data.get("parameters", {}).items(), *data.get("notes", {}).items()]
     for name, entry in entries:
         kind = "published" if entry.get("source") == "given" else "parameter"
-        said = " ".join(str(entry.get(k, "")) for k in ("unit", "where", "reason", "note"))
-        words, where = stems(f"{name} {data.get('title', '')}"), f"{path.stem}.toml: {name}"
+        said = " ".join(
+            str(entry.get(k, "")) for k in ("unit", "where", "reason", "note")
+        )
+        words = stems(f"{name} {data.get('title', '')}")
+        where = f"{path.stem}.toml: {name}"
         for value in flat(entry["value"]):
             for k in {kind, "parameter"}:
-                out.append(Fact(k, value, value, where, words=words, unit=str(entry["unit"])))
+                out.append(
+                    Fact(k, value, value, where, words=words, unit=str(entry["unit"]))
+                )
         for found in NUMBER.finditer(said):
             if digits(found[0]) > 1:
                 value = number(found[0])
-                out.append(Fact("parameter", value, value, where, words=stems(f"{name} {said}")))
+                out.append(
+                    Fact(
+                        "parameter", value, value, where, words=stems(f"{name} {said}")
+                    )
+                )
     for key, rows in data.items():
         if isinstance(rows, list):
             for row in rows:
@@ -610,11 +772,17 @@ def study_facts(name: str) -> tuple[Fact, ...]:
         return ()
     code = path.read_text(encoding="utf-8")
     out = list(parameters(code, path.name))
-    for other in re.findall(r"^(?:import|from) (\w+)|script\(\"([\w-]+)\"\)", code, re.M):
+    for other in re.findall(
+        r"^(?:import|from) (\w+)|script\(\"([\w-]+)\"\)", code, re.M
+    ):
         out += study_facts(other[0] or other[1])
     label = re.search(r'^NAME.*?"([\w-]+)"', code, re.M)
-    for stored in (ROOT / "data" / "studies").glob(f"*/{label[1] if label else name}.csv"):
-        rows = [r for r in stored.read_text(encoding="utf-8").splitlines() if r[:1] != "#"]
+    for stored in (ROOT / "data" / "studies").glob(
+        f"*/{label[1] if label else name}.csv"
+    ):
+        rows = [
+            r for r in stored.read_text(encoding="utf-8").splitlines() if r[:1] != "#"
+        ]
         out.append(
             Fact(
                 "parameter",
@@ -631,7 +799,10 @@ def study_facts(name: str) -> tuple[Fact, ...]:
 def defaults() -> dict[str, tuple[Fact, ...]]:
     """The numbers that the library's functions take if they are not told, by function."""
     out: dict[str, tuple[Fact, ...]] = {}
-    files = [*(ROOT / "distfilt").rglob("*.py"), *(BOOK / "kit" / "bookkit").rglob("*.py")]
+    files = [
+        *(ROOT / "distfilt").rglob("*.py"),
+        *(BOOK / "kit" / "bookkit").rglob("*.py"),
+    ]
     for path in sorted(files):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.FunctionDef):
@@ -648,7 +819,9 @@ def published_facts(paper: str) -> tuple[Fact, ...]:
     for path in sorted((ROOT / "data" / "published" / paper).iterdir()):
         for found in NUMBER.finditer(path.read_text(encoding="utf-8")):
             value = number(found[0])
-            out.append(Fact("published", value, value, f"published/{paper}/{path.name}"))
+            out.append(
+                Fact("published", value, value, f"published/{paper}/{path.name}")
+            )
     return tuple(out)
 
 
@@ -681,9 +854,12 @@ def nearby(facts: list[Fact]) -> Callable[[Numeral], list[Fact]]:
 
     def near(n: Numeral) -> list[Fact]:
         scale = np.array(factors(n.unit))
-        values, half = n.value * scale, 0.501 * n.step * scale
+        values = n.value * scale
+        half = 0.501 * n.step * scale
         with np.errstate(divide="ignore"):
-            targets = np.concatenate([values, 1 / values, 1 + values, 1 - values])[:, None]
+            targets = np.concatenate([values, 1 / values, 1 + values, 1 - values])[
+                :, None
+            ]
         printed = np.pad(half, (0, 3 * len(half)))[:, None]
         reach = 1e-9 + 1e-6 * abs(targets) + printed
         narrow = high - low <= 0.41 * abs(values).max()
@@ -712,7 +888,9 @@ def trace(n: Numeral, facts: list[Fact]) -> str:
                 hit = hit and (here or shared)
             elif f.kind == "check":
                 targets = (
-                    [value] if n.value >= 1 or re.search(r"\d", n.text) else [value, 1 / value]
+                    [value]
+                    if n.value >= 1 or re.search(r"\d", n.text)
+                    else [value, 1 / value]
                 )
                 if n.unit.startswith("%") and factor < 1:
                     targets += [1 + value, 1 - value]
@@ -727,10 +905,14 @@ def trace(n: Numeral, facts: list[Fact]) -> str:
                 hit = abs(abs(value) - abs(f.low)) <= half and f.half <= half
                 hit = hit and (long or (here and (shared or not small)))
             elif f.kind == "published":
-                hit = abs(abs(value) - abs(f.low)) <= slack and bool(SPEAKS.search(n.sentence))
+                hit = abs(abs(value) - abs(f.low)) <= slack and bool(
+                    SPEAKS.search(n.sentence)
+                )
                 hit = hit and (shared or not f.words) and not (small and not f.words)
             else:
-                same = bool(f.unit and n.unit and re.search(rf"(?:^|[ ,])(?:{n.unit})", f.unit))
+                same = bool(
+                    f.unit and n.unit and re.search(rf"(?:^|[ ,])(?:{n.unit})", f.unit)
+                )
                 fits = same or not (n.unit and f.unit)
                 hit = abs(abs(value) - abs(f.low)) <= slack and (
                     same or (shared and fits) or (here and not small)
@@ -743,7 +925,11 @@ def trace(n: Numeral, facts: list[Fact]) -> str:
             return f"{kind}: {best[kind]}"
     if "⸢cited⸣" in n.sentence:
         return "cited: by the sentence"
-    near = (f for f in facts if f.section == n.section and f.low == f.high and f.kind != "output")
+    near = (
+        f
+        for f in facts
+        if f.section == n.section and f.low == f.high and f.kind != "output"
+    )
     for f in near:
         if small and any(abs(f.low) == n.value * k for k in factors(n.unit)):
             return f"beside: {f.where}"
@@ -753,13 +939,18 @@ def trace(n: Numeral, facts: list[Fact]) -> str:
 def others(n: Numeral) -> Iterator[Numeral]:
     """The same sentence with another number of the same length."""
     if re.search(r"\d", n.text) or n.value == int(n.value):
-        count = max(digits(n.text), 1) if re.search(r"\d", n.text) else len(str(int(n.value)))
+        count = (
+            max(digits(n.text), 1)
+            if re.search(r"\d", n.text)
+            else len(str(int(n.value)))
+        )
         unit = (
             n.step
             if re.search(r"\d", n.text)
             else 10.0 ** (len(str(int(n.value)).rstrip("0")) < count)
         )
-        low, high = 10 ** (count - 1), 10**count
+        low = 10 ** (count - 1)
+        high = 10**count
         for k in range(16):
             whole = low + (7919 * (k + 1) + int(abs(n.value))) % (high - low)
             value = whole * (n.step if re.search(r"\d", n.text) else 1.0)
@@ -776,12 +967,16 @@ def read(source: Path) -> tuple[list[Numeral], list[Fact]]:
     text = source.read_text(encoding="utf-8")
     cells = [
         c
-        for c in json.loads(source.with_suffix(".ipynb").read_text(encoding="utf-8"))["cells"]
+        for c in json.loads(source.with_suffix(".ipynb").read_text(encoding="utf-8"))[
+            "cells"
+        ]
         if c["cell_type"] == "code"
     ]
     numerals: list[Numeral] = []
     facts: list[Fact] = []
-    section, count, whole = 0, 0, ""
+    section = 0
+    count = 0
+    whole = ""
     for line, kind, piece in pieces(text):
         if kind == "prose":
             at = line
@@ -798,11 +993,15 @@ def read(source: Path) -> tuple[list[Numeral], list[Fact]]:
                 facts += checks(node, section, where)
             if isinstance(node, ast.keyword) and node.arg == "alt":
                 said = ast.unparse(node.value)
-                numerals += numerals_of(said.strip("'\"") + "\n", source.stem, line, section)
+                numerals += numerals_of(
+                    said.strip("'\"") + "\n", source.stem, line, section
+                )
         facts += parameters(piece, where, section)
         facts += printed(cells[count], section, where)
         count += 1
-    for name in sorted(set(re.findall(r"(?:script\(|stored\(\s*\"\w+\",\s*)\"([\w-]+)\"", whole))):
+    for name in sorted(
+        set(re.findall(r"(?:script\(|stored\(\s*\"\w+\",\s*)\"([\w-]+)\"", whole))
+    ):
         facts += study_facts(name)
     for name in sorted(set(re.findall(r"\b([a-z]\w+)\(", whole))):
         facts += defaults().get(name, ())
@@ -831,7 +1030,10 @@ def main() -> int:
         numerals, facts = read(source)
         text = " ".join(source.read_text(encoding="utf-8").split())
         own = [row for row in known if row["chapter"] == source.stem]
-        counts, lucky, tries, near = Counter[str](), 0, 0, nearby(facts)
+        counts = Counter[str]()
+        lucky = 0
+        tries = 0
+        near = nearby(facts)
         for n in numerals:
             if n.kind:
                 n.source = n.kind
@@ -843,15 +1045,23 @@ def main() -> int:
                     found = [trace(other, near(other)) for other in changed]
                     lucky += sum(bool(f) and f[:6] != "beside" for f in found)
                 elif not n.source:
-                    listed = (r for r in own if r["phrase"] in n.sentence and n.text in r["phrase"])
+                    listed = (
+                        r
+                        for r in own
+                        if r["phrase"] in n.sentence and n.text in r["phrase"]
+                    )
                     n.source = next((f"known: {r['reason']}" for r in listed), "")
             counts[n.source.split(":")[0] or "untraced"] += 1
             if options.all or not n.source:
-                print(f"{n.chapter}:{n.line}: {n.text!r}: {n.source or 'UNTRACED'} | {n.sentence}")
+                print(
+                    f"{n.chapter}:{n.line}: {n.text!r}: {n.source or 'UNTRACED'} | {n.sentence}"
+                )
         problems += counts["untraced"]
         for row in own:
             if " ".join(row["phrase"].split()) not in plain_text(text):
-                print(f"{source.stem}: numerals.csv lists a phrase that is gone: {row['phrase']}")
+                print(
+                    f"{source.stem}: numerals.csv lists a phrase that is gone: {row['phrase']}"
+                )
                 problems += 1
         shown = ", ".join(f"{v} {k}" for k, v in counts.most_common())
         print(

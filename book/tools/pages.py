@@ -35,7 +35,8 @@ PAPERS = {
     "zheng": "Distributed density filter",
 }
 CODE = re.compile(
-    r"^(`{3,})\{code-cell\}[^\n]*\n(?:---\n.*?^---\n)?(?::\w+:[^\n]*\n)*(.*?)^\1$", re.M | re.S
+    r"^(`{3,})\{code-cell\}[^\n]*\n(?:---\n.*?^---\n)?(?::\w+:[^\n]*\n)*(.*?)^\1$",
+    re.M | re.S,
 )
 """A chapter's code cell; its text is the second group."""
 BLOCK = re.compile(r'<div class="highlight-ipython3[^>]*>.*?</pre>', re.S)
@@ -79,7 +80,8 @@ def keep_sliders(tree: nodes.document) -> None:
     ]
     for bundle in bundles:
         parts = {part.get("mime_type"): part for part in bundle.children}
-        page, picture = parts.get("text/html"), parts.get("image/png")
+        page = parts.get("text/html")
+        picture = parts.get("image/png")
         if page is None or picture is None:
             continue
         raw = next((n for n in page.findall(nodes.raw) if SLIDER in n.astext()), None)
@@ -111,7 +113,9 @@ def modules() -> list[str]:
     root = ROOT / "distfilt"
     shown = (p for p in root.rglob("*.py") if p.stem == "__init__" or p.stem[0] != "_")
     paths = sorted(shown)
-    names = [p.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".") for p in paths]
+    names = [
+        p.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".") for p in paths
+    ]
     return sorted(name.removesuffix(".__init__") for name in names)
 
 
@@ -122,12 +126,18 @@ def directive(module: Any, name: str) -> list[str]:
         return [f".. autoclass:: {module.__name__}.{name}", "   :members:", ""]
     if inspect.isfunction(value):
         return [f".. autofunction:: {module.__name__}.{name}", ""]
-    meaning = ModuleAnalyzer.for_module(module.__name__).find_attr_docs().get(("", name), [])
+    meaning = (
+        ModuleAnalyzer.for_module(module.__name__).find_attr_docs().get(("", name), [])
+    )
     if inspect.isclass(value):
         meaning = [f"Short for ``{value.__module__}.{value.__qualname__}``."]
     elif get_origin(value) is not None:
         base, *notes = get_args(value) if get_origin(value) is Annotated else (value,)
-        kind = "np.ndarray" if get_origin(base) is np.ndarray else getattr(base, "__name__", base)
+        kind = (
+            "np.ndarray"
+            if get_origin(base) is np.ndarray
+            else getattr(base, "__name__", base)
+        )
         shown = ", ".join(word_of(note) for note in (kind, *notes))
         meaning = [*meaning, "", f"The type ``{shown}``."]
     elif not meaning:
@@ -163,8 +173,11 @@ def home_of(module: Any, name: str) -> str:
 def named_types() -> list[tuple[Any, str]]:
     """Return the types that have a name of their own, each with it."""
     kinds = importlib.import_module("distfilt.validation")
-    own = [(getattr(validation, name), name) for name in doors.__all__]
-    return [*((value, name) for value, name in own if get_origin(value)), (ArrayLike, "ArrayLike")]
+    own = [(getattr(kinds, name), name) for name in kinds.__all__]
+    return [
+        *((value, name) for value, name in own if get_origin(value)),
+        (ArrayLike, "ArrayLike"),
+    ]
 
 
 def written(kind: Any, names: Mapping[str, Any]) -> str:
@@ -182,9 +195,12 @@ def written(kind: Any, names: Mapping[str, Any]) -> str:
         return f"[{', '.join(written(part, names) for part in kind)}]"
     if known := next((name for value, name in named_types() if value == kind), None):
         return known
-    origin, inner = get_origin(kind), get_args(kind)
+    origin = get_origin(kind)
+    inner = get_args(kind)
     if origin is Annotated:
-        shapes = [note for note in inner[1:] if isinstance(note, str) and note != ALLOW_NAN]
+        shapes = [
+            note for note in inner[1:] if isinstance(note, str) and note != ALLOW_NAN
+        ]
         return written(inner[0], names) + (f"[{shapes[-1]!r}]" if shapes else "")
     if origin in (Union, types.UnionType):
         return " | ".join(written(part, names) for part in inner)
@@ -217,17 +233,26 @@ def signature(what: str, value: Any) -> tuple[str, str | None] | None:
     names: dict[str, Any] = {}
     for owner in reversed(inspect.getmro(value) if what == "class" else [value]):
         names |= vars(importlib.import_module(owner.__module__))
-    shown, kinds, last = [], inspect.Parameter, None
+    shown = []
+    kinds = inspect.Parameter
+    last = None
     for k, part in enumerate(found.parameters.values()):
         if k == 0 and part.name == "self":
             continue
-        if part.kind is kinds.KEYWORD_ONLY and last not in (part.kind, kinds.VAR_POSITIONAL):
+        if part.kind is kinds.KEYWORD_ONLY and last not in (
+            part.kind,
+            kinds.VAR_POSITIONAL,
+        ):
             shown.append("*")
         last = part.kind
-        text = {kinds.VAR_POSITIONAL: "*", kinds.VAR_KEYWORD: "**"}.get(last, "") + part.name
+        text = {kinds.VAR_POSITIONAL: "*", kinds.VAR_KEYWORD: "**"}.get(
+            last, ""
+        ) + part.name
         if part.annotation is not part.empty:
             text += f": {written(part.annotation, names)}"
-        shown.append(text if part.default is part.empty else f"{text} = {default(part.default)}")
+        shown.append(
+            text if part.default is part.empty else f"{text} = {default(part.default)}"
+        )
     given = found.return_annotation
     returned = None if given is found.empty else written(given, names)
     return f"({', '.join(shown)})", None if what == "class" else returned
@@ -238,7 +263,9 @@ def escape_stars(lines: list[str]) -> None:
     for k, line in enumerate(lines):
         if not line.lstrip().startswith((">>>", "...")):
             parts = line.split("``")
-            parts[::2] = [re.sub(r"(?<=[(\s])\*(?=\w+[,)])", r"\\*", part) for part in parts[::2]]
+            parts[::2] = [
+                re.sub(r"(?<=[(\s])\*(?=\w+[,)])", r"\\*", part) for part in parts[::2]
+            ]
             lines[k] = "``".join(parts)
 
 
@@ -248,7 +275,16 @@ def summary(module: Any) -> str:
     return cell(first)
 
 
-FIRST = ("filters", "updates", "network", "sensors", "models", "metrics", "kalman", "triangular")
+FIRST = (
+    "filters",
+    "updates",
+    "network",
+    "sensors",
+    "models",
+    "metrics",
+    "kalman",
+    "triangular",
+)
 """What a reader looks for first; the other parts follow in alphabetical order."""
 
 
@@ -258,7 +294,10 @@ def api_parts() -> dict[str, list[str]]:
     for name in modules():
         if name != "distfilt":
             found.setdefault(name.split(".")[1], []).append(name)
-    order = [*(p for p in FIRST if p in found), *sorted(p for p in found if p not in FIRST)]
+    order = [
+        *(p for p in FIRST if p in found),
+        *sorted(p for p in found if p not in FIRST),
+    ]
     return {part: found[part] for part in order}
 
 
@@ -293,7 +332,9 @@ def imported(code: str, known: dict[str, str]) -> dict[str, str]:
     """Return what a text calls the library's names, each with the path of its entry."""
     out = {}
     for node in ast.walk(ast.parse(code)):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("distfilt"):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
+            "distfilt"
+        ):
             for name in node.names:
                 path = f"{node.module}.{name.name}"
                 out[name.asname or name.name] = known.get(path, path)
@@ -302,11 +343,15 @@ def imported(code: str, known: dict[str, str]) -> dict[str, str]:
 
 def used(code: str, known: dict[str, str]) -> set[str]:
     """Return the library's names that a text uses, those of a module or class too."""
-    names, out = imported(code, known), set()
+    names = imported(code, known)
+    out = set()
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Name) and node.id in names:
             out.add(names[node.id])
-        elif isinstance(node, ast.Attribute) and (owner := getattr(node.value, "id", "")) in names:
+        elif (
+            isinstance(node, ast.Attribute)
+            and (owner := getattr(node.value, "id", "")) in names
+        ):
             path = f"{names[owner]}.{node.attr}"
             out.add(known.get(path, path))
     return out
@@ -314,7 +359,8 @@ def used(code: str, known: dict[str, str]) -> set[str]:
 
 def users() -> dict[str, list[str]]:
     """Return, for each name of the library, links to the chapters and scripts that use it."""
-    known, out = homes(), {}
+    known = homes()
+    out = {}
     scripts = [*(BOOK / "examples").glob("*.py"), *(BOOK / "studies").glob("*.py")]
     for source in [*chapters(), *sorted(scripts)]:
         if source.suffix == ".md":
@@ -332,10 +378,16 @@ def used_in(name: str, by: dict[str, list[str]]) -> list[str]:
     found = by.get(name, [])
     pages = [shown for shown in found if shown.startswith(":doc:")]
     word = "chapter " if pages and "first page" not in pages[0] else ""
-    return ["", f"   *Used in* {word}{', '.join(pages or found[:3])}.", ""] if found else [""]
+    return (
+        ["", f"   *Used in* {word}{', '.join(pages or found[:3])}.", ""]
+        if found
+        else [""]
+    )
 
 
-def link_code(body: str, names: dict[str, str], url: Callable[[str], str | None]) -> str:
+def link_code(
+    body: str, names: dict[str, str], url: Callable[[str], str | None]
+) -> str:
     """Return a page whose code cells link the names that its chapter imports to their entries.
 
     A name is linked where it is used, not where it is an argument's name or another's attribute.
@@ -379,7 +431,8 @@ def links(module: Any) -> str:
     """Return links to what a part's face offers, in the order of its names."""
     out = []
     for name in module.__all__:
-        home, value = home_of(module, name), getattr(module, name)
+        home = home_of(module, name)
+        value = getattr(module, name)
         if isinstance(value, types.ModuleType):
             out.append(f"[`{name}`](#{anchor(home)})")
         else:
@@ -392,18 +445,25 @@ def api_index() -> str:
     lines = ["| Part | What it is for | Names |", "|---|---|---|"]
     for part in api_parts():
         face = importlib.import_module(f"distfilt.{part}")
-        lines += [f"| [`{part}`](/book/api/{part}.md) | {summary(face)} | {links(face)} |"]
+        lines += [
+            f"| [`{part}`](/book/api/{part}.md) | {summary(face)} | {links(face)} |"
+        ]
     return "\n".join(lines)
 
 
 def api_part(part: str, by: dict[str, list[str]]) -> str:
     """Return the reference of one part, module by module."""
-    lines, head = [], f"distfilt.{part}"
+    lines = []
+    head = f"distfilt.{part}"
     for name in api_parts()[part]:
         module = importlib.import_module(name)
         own = [n for n in module.__all__ if home_of(module, n) == name]
         # What a reader writes a class for need not be imported, and yet is looked up.
-        own += [n for n, v in vars(module).items() if is_protocol(v) and v.__module__ == name]
+        own += [
+            n
+            for n, v in vars(module).items()
+            if is_protocol(v) and v.__module__ == name
+        ]
         title = f"# `{head}`" if name == head else f"## `{name[len(head) + 1 :]}`"
         lines += [f"({anchor(name)})=", title, ""]
         body = [f".. automodule:: {name}", "   :no-members:", ""]
@@ -440,7 +500,10 @@ def reproductions_text() -> str:
         lines += [f"## {PAPERS.get(paper, paper)} (`{paper}`)", ""]
         lines += ["| Item | Shows | Chapter | Verdict |", "|---|---|---|---|"]
         for row in own:
-            cells = [row["item"].replace(" ", "\u00a0"), cell(titles[paper, row["item"]])]
+            cells = [
+                row["item"].replace(" ", "\u00a0"),
+                cell(titles[paper, row["item"]]),
+            ]
             cells += [chapter_link(row["chapter"]), row["verdict"]]
             lines += ["| " + " | ".join(cells) + " |"]
         lines += [""]
@@ -457,8 +520,13 @@ def claims_text(row: dict[str, str], title: str) -> list[str]:
     lines += [""]
     found = claims_of(row)
     if not found:
-        return [*lines, f"Ours: {row['ours'] or '–'}. Published: {row['published'] or '–'}.", ""]
-    folder, name = ROOT / "data" / "published" / row["paper"], row["item"].lower()
+        return [
+            *lines,
+            f"Ours: {row['ours'] or '–'}. Published: {row['published'] or '–'}.",
+            "",
+        ]
+    folder = ROOT / "data" / "published" / row["paper"]
+    name = row["item"].lower()
     stem = name.replace("fig. ", "figure-").replace("table ", "table-")
     path = folder / f"{stem}{'' if stem.startswith('figure') else '-claims'}.csv"
     listed = {claim["id"]: claim for claim in read_rows(path)}
@@ -466,7 +534,10 @@ def claims_text(row: dict[str, str], title: str) -> list[str]:
         lines += [f"{listed[k]['claim']}", f": *Rule:* {listed[k]['criterion']}"]
         for claim in (c for c in found if c.id == k):
             start = f", {claim.start}" if claim.start else ""
-            lines += ["", f": *Ours{start}* ({'holds' if claim.holds else 'fails'}): {claim.ours}"]
+            lines += [
+                "",
+                f": *Ours{start}* ({'holds' if claim.holds else 'fails'}): {claim.ours}",
+            ]
             lines += ["", f": *If the claim were false{start}:* {claim.null}"]
             lines += ["", f": *Range{start}:* {claim.range}"] if claim.range else []
         lines += [""]
@@ -492,7 +563,9 @@ def needs() -> dict[int, set[int]]:
 
 def map_text() -> str:
     """Return a drawing of what each chapter builds on, and the same as a list."""
-    needed, pages, rows = needs(), chapter_pages(), {}
+    needed = needs()
+    pages = chapter_pages()
+    rows = {}
     stacks: dict[int, list[str]] = {n: [] for n in needed}
     for label, page in pages.items():
         stacks[chapter_number(page) or 0].append(label)
@@ -503,33 +576,46 @@ def map_text() -> str:
 
     for n in needed:
         rows[n] = 1 + max((rows[k] for k in needed[n]), default=-1)
-    place, top = {}, 40
+    place = {}
+    top = 40
     for row in range(max(rows.values()) + 1):
         beside = [k for k in rows if rows[k] == row]
         for n in beside:
             place[n] = (530 + 262 * (beside.index(n) - (len(beside) - 1) / 2), top)
         top += 53 + 52 * max(len(stacks[n]) for n in beside)
-    width, height = 1060, top - 65
-    lines = [f'<svg class="map" viewBox="0 0 {width} {height}" role="group" '
-             'aria-label="Arrows from each chapter to those that build on it">']  # fmt: skip
+    width = 1060
+    height = top - 65
+    lines = [
+        f'<svg class="map" viewBox="0 0 {width} {height}" role="group" '
+        'aria-label="Arrows from each chapter to those that build on it">'
+    ]
     for n, (x, y) in place.items():
         # What another arrow implies is not drawn.
         for k in needed[n] - {i for j in needed[n] for i in before(j)}:
             a, b = place[k]
             b += 52 * (len(stacks[k]) - 1)
-            lines += [f'<path d="M{a},{b + 26} C{a},{b + 66} {x},{y - 66} {x},{y - 27}"/>']
+            lines += [
+                f'<path d="M{a},{b + 26} C{a},{b + 66} {x},{y - 66} {x},{y - 27}"/>'
+            ]
     for n, (x, y) in place.items():
         for k, label in enumerate(stacks[n]):
-            link, at = pages[label].removeprefix("book/"), y + 52 * k
-            lines += [f'<a href="{link}.html"><rect x="{x - 129}" y="{at - 26}" width="258" '
-                      f'height="52" rx="8"/><text x="{x}" y="{at + 6}">{label}. {titles[label]}'
-                      f'</text><title>{titles[label]}</title></a>']  # fmt: skip
+            link = pages[label].removeprefix("book/")
+            at = y + 52 * k
+            lines += [
+                f'<a href="{link}.html"><rect x="{x - 129}" y="{at - 26}" width="258" '
+                f'height="52" rx="8"/><text x="{x}" y="{at + 6}">{label}. {titles[label]}'
+                f"</text><title>{titles[label]}</title></a>"
+            ]
     lines += ["</svg>"]
     told = []
     for n, labels in stacks.items():
         builds = [f"[chapter {k}](/{pages[str(k)]}.md)" for k in sorted(needed[n])]
-        listed = " and ".join(", ".join(builds).rsplit(", ", 1)) or "nothing of the book"
-        links = (f"**{label}** [{titles[label]}](/{pages[label]}.md)" for label in labels)
+        listed = (
+            " and ".join(", ".join(builds).rsplit(", ", 1)) or "nothing of the book"
+        )
+        links = (
+            f"**{label}** [{titles[label]}](/{pages[label]}.md)" for label in labels
+        )
         told += [f"- {' with '.join(links)}: {listed}"]
     return "\n".join(["```{raw} html", *lines, "```", "", *told])
 
@@ -542,13 +628,16 @@ def chapter_title(page: str) -> str:
 
 def figures(source: Path) -> Iterator[tuple[str, str, str, bytes]]:
     """Yield a chapter's numbered figures: label, caption, text for who does not see it, picture."""
-    for cell in json.loads(source.with_suffix(".ipynb").read_text(encoding="utf-8"))["cells"]:
+    for cell in json.loads(source.with_suffix(".ipynb").read_text(encoding="utf-8"))[
+        "cells"
+    ]:
         options = cell["metadata"].get("mystnb", {})
         name = options.get("figure", {}).get("name")
         found = [output.get("data", {}) for output in cell.get("outputs", ())]
         shown = [data["image/png"] for data in found if "image/png" in data]
         if name and shown:
-            caption, alt = options["figure"].get("caption", ""), options.get("image", {}).get("alt")
+            caption = options["figure"].get("caption", "")
+            alt = options.get("image", {}).get("alt")
             yield name, caption, alt or caption, base64.b64decode("".join(shown[0]))
 
 
@@ -568,11 +657,23 @@ def gallery_text(folder: Path) -> str:
                 small = Image.open(io.BytesIO(picture)).convert("RGB")
                 small.thumbnail((480, 480), reducing_gap=2.0)
                 small.quantize(64).save(target)
-            words = re.sub(r"\{[\w:]+\}`([^`<]*)[^`]*`", r"\1", caption).split(". ")[0].rstrip(".")
+            words = (
+                re.sub(r"\{[\w:]+\}`([^`<]*)[^`]*`", r"\1", caption)
+                .split(". ")[0]
+                .rstrip(".")
+            )
             alt = " ".join(alt.split())
-            lines += [":::{grid-item-card}", f":link: {name}", ":link-type: ref",
-                      f":img-top: /book/_generated/gallery/{name}.png", f":img-alt: {alt}",
-                      ":class-card: picture", "", words, ":::"]  # fmt: skip
+            lines += [
+                ":::{grid-item-card}",
+                f":link: {name}",
+                ":link-type: ref",
+                f":img-top: /book/_generated/gallery/{name}.png",
+                f":img-alt: {alt}",
+                ":class-card: picture",
+                "",
+                words,
+                ":::",
+            ]
         lines += ["::::", ""]
     return "\n".join(lines)
 
@@ -581,7 +682,9 @@ def errata_text() -> str:
     """Return the papers' errata, as each paper's page of printed values lists them."""
     lines = []
     for paper, title in PAPERS.items():
-        text = (ROOT / "data" / "published" / paper / "README.md").read_text(encoding="utf-8")
+        text = (ROOT / "data" / "published" / paper / "README.md").read_text(
+            encoding="utf-8"
+        )
         table = text.split("## Errata", 1)[1].split("\n## ", 1)[0]
         rows = [line for line in table.splitlines() if line.startswith("|")]
         lines += [f"### {title} (`{paper}`)", "", *map(with_links, rows), ""]
@@ -596,8 +699,11 @@ def with_links(row: str) -> str:
         page = pages.get(found[2])
         return f"[{found[1]}{found[2]}](/{page}.md)" if page else found[0]
 
-    for place in (r"(?<=chapter )()(\d+\w?)", r"(?<= and )()(\d+\w?)(?= \|$)",
-                  r"(?<=chapters )()(\d+\w?)"):  # fmt: skip
+    for place in (
+        r"(?<=chapter )()(\d+\w?)",
+        r"(?<= and )()(\d+\w?)(?= \|$)",
+        r"(?<=chapters )()(\d+\w?)",
+    ):
         row = re.sub(place, link, row)
     return row
 
@@ -606,8 +712,12 @@ def cite_text() -> str:
     """Return how to cite the book, from the file that says it for machines."""
     facts = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     who = " and ".join(author["name"] for author in facts["authors"])
-    fields = {"title": facts["title"], "author": "{" + who + "}",
-              "version": facts["version"], "year": str(facts["date-released"])[:4]}  # fmt: skip
+    fields = {
+        "title": facts["title"],
+        "author": "{" + who + "}",
+        "version": facts["version"],
+        "year": str(facts["date-released"])[:4],
+    }
     body = ",\n".join(f"  {name:<8}= {{{value}}}" for name, value in fields.items())
     return f"```bibtex\n@software{{distfilt,\n{body}\n}}\n```"
 
@@ -617,8 +727,10 @@ def measured_text() -> str:
     from bookkit import studies
 
     read = studies.script("_together_read")
-    lines = ["| Problem | Silent | At most 3 numbers | At most 32 numbers | Any |",
-             "|---|---|---|---|---|"]  # fmt: skip
+    lines = [
+        "| Problem | Silent | At most 3 numbers | At most 32 numbers | Any |",
+        "|---|---|---|---|---|",
+    ]
     for name in read.FOUR:
         cells = [f"*{name}*: {read.together.problem(name).scenario.title}"]
         for budget in (0, 3, 32, math.inf):
@@ -638,9 +750,11 @@ def write_generated(folder: Path) -> None:
     by = users()
     parts = {f"api/{part}.md": api_part(part, by) for part in api_parts()}
     parts["api.md"] = api_index()
-    parts["map.md"], parts["errata.md"] = map_text(), errata_text()
+    parts["map.md"] = map_text()
+    parts["errata.md"] = errata_text()
     parts["measured.md"] = measured_text()
-    parts["gallery.md"], parts["cite.md"] = gallery_text(folder / "gallery"), cite_text()
+    parts["gallery.md"] = gallery_text(folder / "gallery")
+    parts["cite.md"] = cite_text()
     if ITEMS.is_file() and LEDGER.is_file():
         parts["reproductions.md"] = reproductions_text()
     for name, text in parts.items():

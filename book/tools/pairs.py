@@ -18,7 +18,16 @@ from typing import Any
 
 import nbformat
 
-from common import BOOK, ROOT, SLIDER, chosen, foreign_text, is_chapter, missing_pages, toc_pages
+from common import (
+    BOOK,
+    ROOT,
+    SLIDER,
+    chosen,
+    foreign_text,
+    is_chapter,
+    missing_pages,
+    toc_pages,
+)
 from execute import read
 
 WIDTH = 79
@@ -30,11 +39,15 @@ def differences(source: Path, stored: Any) -> list[str]:
     fresh = read(source)
     out = []
     if len(fresh.cells) != len(stored.cells):
-        out.append(f"{len(fresh.cells)} cells in the Markdown, {len(stored.cells)} stored")
+        out.append(
+            f"{len(fresh.cells)} cells in the Markdown, {len(stored.cells)} stored"
+        )
     for ours, theirs in zip(fresh.cells, stored.cells, strict=False):
         for key in ("id", "cell_type", "source", "metadata"):
             if ours.get(key) != theirs.get(key):
-                out.append(f"{ours['id']}: {key} differs between the Markdown and the notebook")
+                out.append(
+                    f"{ours['id']}: {key} differs between the Markdown and the notebook"
+                )
     if fresh.metadata != {k: v for k, v in stored.metadata.items() if k != "widgets"}:
         out.append("the headers of the Markdown and of the notebook differ")
     return out
@@ -46,10 +59,14 @@ def code_faults(cell: Any, count: int) -> list[str]:
     if not cell.source.strip():
         return ["an empty code cell"]
     if cell.execution_count != count:
-        out.append(f"execution count {cell.execution_count}, needs {count}: make outputs")
+        out.append(
+            f"execution count {cell.execution_count}, needs {count}: make outputs"
+        )
     for line in cell.source.splitlines():
         if len(line) > WIDTH:
-            out.append(f"a line of {len(line)} characters, at most {WIDTH}: {line.strip()[:40]}…")
+            out.append(
+                f"a line of {len(line)} characters, at most {WIDTH}: {line.strip()[:40]}…"
+            )
     for output in cell.outputs:
         if output.output_type == "error":
             out.append(f"a stored error: {output.ename}")
@@ -57,7 +74,9 @@ def code_faults(cell: Any, count: int) -> list[str]:
             out.append("stored stderr")
         for line in shown(output).splitlines():
             if len(line) > WIDTH:
-                out.append(f"a line of {len(line)} characters printed, at most {WIDTH}: {line}")
+                out.append(
+                    f"a line of {len(line)} characters printed, at most {WIDTH}: {line}"
+                )
         if foreign := foreign_text(output):
             out.append(f"an output holds {foreign!r}, which belongs to one machine")
     return out + figure_faults(cell)

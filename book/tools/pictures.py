@@ -28,7 +28,8 @@ SHADE = 0.25
 """A pixel differs if its shade does by more than this share of black to white."""
 SHARE = 5e-4
 """How many of a picture's pixels may differ."""
-TINT, TINTED = 12, 1e-3
+TINT = 12
+TINTED = 1e-3
 """A palette of 256 colours moves no more than this share of pixels by more than this of 255."""
 
 

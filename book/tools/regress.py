@@ -37,7 +37,10 @@ assert features["X86_V3"] is False, "X86_V3 is still on"
 """
 SETTINGS = {
     "blas": ({"OPENBLAS_CORETYPE": "Nehalem"}, PROBE_BLAS),
-    "simd": ({"NPY_DISABLE_CPU_FEATURES": "X86_V4 X86_V3 AVX512_ICL AVX512_SPR"}, PROBE_SIMD),
+    "simd": (
+        {"NPY_DISABLE_CPU_FEATURES": "X86_V4 X86_V3 AVX512_ICL AVX512_SPR"},
+        PROBE_SIMD,
+    ),
 }
 
 
@@ -45,15 +48,28 @@ def compare(notebook: Path, extra: dict[str, str]) -> int:
     """Run one notebook against its stored outputs; return pytest's exit code."""
     started = time.perf_counter()
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", ""]
-    command += ["-p", "book.tools.startup", "-p", "nbval.plugin", "--nbval", "--nbval-current-env"]
+    command += [
+        "-p",
+        "book.tools.startup",
+        "-p",
+        "nbval.plugin",
+        "--nbval",
+        "--nbval-current-env",
+    ]
     command += ["--nbval-cell-timeout=900", str(notebook)]
     done = subprocess.run(
-        command, cwd=ROOT, env=pinned_environment() | extra, capture_output=True, text=True
+        command,
+        cwd=ROOT,
+        env=pinned_environment() | extra,
+        capture_output=True,
+        text=True,
     )
     if done.returncode:
         print(done.stdout, done.stderr, sep="\n", file=sys.stderr)
     state = "differs" if done.returncode else "as stored"
-    print(f"{notebook.stem}: {state}, {time.perf_counter() - started:.1f} s", flush=True)
+    print(
+        f"{notebook.stem}: {state}, {time.perf_counter() - started:.1f} s", flush=True
+    )
     return done.returncode
 
 
@@ -67,9 +83,13 @@ def probe(name: str, code: str) -> Path:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description="Compare chapters with their stored outputs.")
+    parser = argparse.ArgumentParser(
+        description="Compare chapters with their stored outputs."
+    )
     parser.add_argument("chapters", nargs="*", help="names or numbers; all without one")
-    parser.add_argument("--portable", action="store_true", help="other BLAS kernel, less SIMD")
+    parser.add_argument(
+        "--portable", action="store_true", help="other BLAS kernel, less SIMD"
+    )
     parser.add_argument("--jobs", type=int, default=2, help="chapters at a time")
     options = parser.parse_args()
     notebooks = [source.with_suffix(".ipynb") for source in chosen(options.chapters)]
@@ -79,7 +99,9 @@ def main() -> int:
         print("the table of contents has no chapter", file=sys.stderr)
         return 1
     codes = []
-    for name, (extra, code) in SETTINGS.items() if options.portable else [("", ({}, ""))]:
+    for name, (extra, code) in (
+        SETTINGS.items() if options.portable else [("", ({}, ""))]
+    ):
         if name:
             print(f"under {extra}", flush=True)
             codes.append(compare(probe(name, code), extra))

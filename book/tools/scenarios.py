@@ -28,17 +28,22 @@ def text_of(folder: Path) -> str:
     for paper in PAPERS:
         for path in sorted((folder / paper).glob("*.toml")):
             s = read_scenario(path)
-            writer.writerows([paper, s.name, key, value] for key, value in s.entries().items())
+            writer.writerows(
+                [paper, s.name, key, value] for key, value in s.entries().items()
+            )
     return out.getvalue()
 
 
 def main(arguments: list[str] | None = None, root: Path = ROOT) -> int:
     folder = root / "data" / "scenarios"
-    target, text = folder / "accepted.csv", text_of(folder)
+    target = folder / "accepted.csv"
+    text = text_of(folder)
     if "--accept" in (sys.argv[1:] if arguments is None else arguments):
         target.write_text(text, encoding="utf-8", newline="\n")
     elif not target.is_file() or target.read_text(encoding="utf-8") != text:
-        print("the scenarios are not those of accepted.csv: make accept", file=sys.stderr)
+        print(
+            "the scenarios are not those of accepted.csv: make accept", file=sys.stderr
+        )
         return 1
     print(f"{len(text.splitlines()) - 1} values of scenarios, as accepted")
     return 0

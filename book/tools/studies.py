@@ -48,9 +48,15 @@ def load_script(path: Path) -> ModuleType:
     if lacking:
         raise ValueError(f"{path.name}: has to define {', '.join(lacking)}")
     if script.PAPER not in PAPERS:
-        raise ValueError(f"{path.name}: PAPER needs one of {PAPERS}, got {script.PAPER!r}")
-    if not isinstance(script.NAME, str) or not re.fullmatch(r"[a-z0-9][a-z0-9-]*", script.NAME):
-        raise ValueError(f"{path.name}: NAME needs small letters, digits, -, got {script.NAME!r}")
+        raise ValueError(
+            f"{path.name}: PAPER needs one of {PAPERS}, got {script.PAPER!r}"
+        )
+    if not isinstance(script.NAME, str) or not re.fullmatch(
+        r"[a-z0-9][a-z0-9-]*", script.NAME
+    ):
+        raise ValueError(
+            f"{path.name}: NAME needs small letters, digits, -, got {script.NAME!r}"
+        )
     return script
 
 
@@ -66,7 +72,11 @@ def parameters_of(script: ModuleType) -> dict[str, Any]:
 def changed(script: ModuleType) -> str:
     """Return what differs in a study's scenarios from the book's own, or ''."""
     found = [c for s in getattr(script, "scenarios", ()) for c in s.changes]
-    return f"{script.NAME}: changed scenario: {'; '.join(found)}: make accept" if found else ""
+    return (
+        f"{script.NAME}: changed scenario: {'; '.join(found)}: make accept"
+        if found
+        else ""
+    )
 
 
 def target(script: ModuleType, root: Path) -> Path:
@@ -104,15 +114,19 @@ def run(script: ModuleType, root: Path, workers: int | None) -> None:
         code=getattr(script, "code", ()),
         workers=workers,
     )
-    stored, seconds = studies.load(path), time.perf_counter() - began
+    stored = studies.load(path)
+    seconds = time.perf_counter() - began
     failed = [f"trial {k}: {kind}" for k, kind in enumerate(stored.failures) if kind]
     print(*failed, sep="\n", end="\n" * bool(failed), file=sys.stderr)
-    print(f"{path.relative_to(root)}: {len(stored)} trials, {seconds:.0f} s", flush=True)
+    print(
+        f"{path.relative_to(root)}: {len(stored)} trials, {seconds:.0f} s", flush=True
+    )
 
 
 def check(script: ModuleType, root: Path, workers: int | None) -> str:
     """Run one study's stored trials again; return what is wrong, or ''."""
-    path, began = target(script, root), time.perf_counter()
+    path = target(script, root)
+    began = time.perf_counter()
     shown = path.relative_to(root)
     if not path.is_file():
         return f"{shown}: not stored yet: make studies"
@@ -123,7 +137,10 @@ def check(script: ModuleType, root: Path, workers: int | None) -> str:
         return str(error)
     if tuple(map(seed_text, script.seeds)) != stored.seeds:
         return f"{shown}: the script has other seeds: make studies"
-    written = {name: json.loads(text) for name, text in plain_json(parameters_of(script)).items()}
+    written = {
+        name: json.loads(text)
+        for name, text in plain_json(parameters_of(script)).items()
+    }
     if written != stored.parameters or tuple(script.columns) != tuple(stored.columns):
         return f"{shown}: the script has other parameters: make studies"
     seconds = time.perf_counter() - began
@@ -135,16 +152,23 @@ def main(arguments: list[str] | None = None, root: Path = ROOT) -> int:
     parser = argparse.ArgumentParser(description="Run and store the long studies.")
     parser.add_argument("names", nargs="*", help="NAMEs of studies; all without one")
     parser.add_argument("--check", action="store_true", help="run again and compare")
-    parser.add_argument("--workers", type=int, default=None, help="one for each core without it")
+    parser.add_argument(
+        "--workers", type=int, default=None, help="one for each core without it"
+    )
     options = parser.parse_args(arguments)
     known = scripts(root)
     unknown = sorted(set(options.names) - {script.NAME for script in known})
     if unknown:
-        print(f"{', '.join(unknown)}: no such study; there are "
-              f"{', '.join(script.NAME for script in known) or 'none'}", file=sys.stderr)
+        print(
+            f"{', '.join(unknown)}: no such study; there are "
+            f"{', '.join(script.NAME for script in known) or 'none'}",
+            file=sys.stderr,
+        )
         return 1
     chosen = [s for s in known if not options.names or s.NAME in options.names]
-    problems = [f"{path}: no script in book/studies makes it" for path in orphans(root, known)]
+    problems = [
+        f"{path}: no script in book/studies makes it" for path in orphans(root, known)
+    ]
     if not known:
         print("book/studies holds no script: there is no long study to run")
     for script in chosen:

@@ -33,7 +33,8 @@ from common import ROOT, toc_pages
 BUILT = ROOT / "_build" / "html"
 TARGET = BUILT / "book"
 NAME = "distributed-nonlinear-filtering"
-TITLE, AUTHOR = "Distributed Nonlinear Filtering", "The distfilt authors"
+TITLE = "Distributed Nonlinear Filtering"
+AUTHOR = "The distfilt authors"
 STYLE = Path(__file__).with_name("volume.css")
 LEFT_OUT = "book/api", "book/gallery"
 """Pages that stay with the site: long to print, and made to be searched."""
@@ -128,7 +129,8 @@ def article(page: str, pages: list[str]) -> tuple[Tag, list[Tag]]:
     for table in text.find_all("table"):
         if len(table.find_all("tr")) > 14:
             table["class"] = [*table.get("class", []), "long"]
-    text.name, text.attrs = "section", {"class": ["part"], "id": key(page)}
+    text.name = "section"
+    text.attrs = {"class": ["part"], "id": key(page)}
     return text, [solution.extract() for solution in text.select(".solution")]
 
 
@@ -147,9 +149,13 @@ def lead(link: Tag, page: str, pages: list[str]) -> None:
 
 def assembled() -> tuple[str, list[str]]:
     """Return the whole book as one page, and its chapters' names."""
-    pages, parts, back = shown(), [], []
+    pages = shown()
+    parts = []
+    back = []
     captions = {}
-    for group in yaml.safe_load((ROOT / "_toc.yml").read_text(encoding="utf-8"))["parts"]:
+    for group in yaml.safe_load((ROOT / "_toc.yml").read_text(encoding="utf-8"))[
+        "parts"
+    ]:
         captions[group["chapters"][0]["file"]] = group["caption"]
     listed = []
     for page in pages:
@@ -168,7 +174,9 @@ def assembled() -> tuple[str, list[str]]:
         f'<section class="part" id="psolutions"><h1>Solutions</h1>{"".join(back)}</section>'
     )
     listed += entries(BeautifulSoup(parts[-1], "html.parser").section)
-    built = "".join((BUILT / f"{page}.html").read_text(encoding="utf-8") for page in pages)
+    built = "".join(
+        (BUILT / f"{page}.html").read_text(encoding="utf-8") for page in pages
+    )
     config = re.search(r"<script>(window\.MathJax = .*?)</script>", built)
     assert config is not None, "pages have no mathematics"
     mathjax = (BUILT / "_static" / "mathjax" / "tex-mml-chtml.js").as_uri()
@@ -184,26 +192,35 @@ def assembled() -> tuple[str, list[str]]:
 {distfilt.__version__}, printed {now}.</p><p class="told">What moves on the pages is a still picture
 here. Code that the pages fold away, the reference of the library and the gallery of pictures are
 with the pages and the notebooks.</p></section>"""
-    contents = (
-        f'<section class="part contents"><h1>Contents</h1><ol>{"".join(listed)}</ol></section>'
-    )
-    return "\n".join([head, front, contents, *parts, "</body></html>"]), [*pages, "solutions"]
+    contents = f'<section class="part contents"><h1>Contents</h1><ol>{"".join(listed)}</ol></section>'
+    return "\n".join([head, front, contents, *parts, "</body></html>"]), [
+        *pages,
+        "solutions",
+    ]
 
 
 def entries(text: Any) -> list[str]:
     """Return the lines of the contents for one part: its title, and its sections."""
     out = []
     for head in text.find_all(["h1", "h2"]):
-        place = text["id"] if head.name == "h1" else (head.get("id") or head.parent.get("id"))
+        place = (
+            text["id"]
+            if head.name == "h1"
+            else (head.get("id") or head.parent.get("id"))
+        )
         kind = "chapter" if head.name == "h1" else "below"
         words = head.decode_contents().strip()
-        out.append(f'<li class="{kind}"><a href="#{place}">{words}</a><i></i><b></b></li>')
+        out.append(
+            f'<li class="{kind}"><a href="#{place}">{words}</a><i></i><b></b></li>'
+        )
     return out
 
 
 def pages_of(pdf: bytes) -> dict[str, int]:
     """Return the page of each place that a link of a PDF by Chromium leads to."""
-    objects = dict(re.findall(rb"(?:^|\n)(\d+) 0 obj\n(.*?)\nendobj", pdf, flags=re.DOTALL))
+    objects = dict(
+        re.findall(rb"(?:^|\n)(\d+) 0 obj\n(.*?)\nendobj", pdf, flags=re.DOTALL)
+    )
 
     def leaves(number: bytes) -> list[bytes]:
         below = re.search(rb"/Kids\s*\[(.*?)\]", objects[number], flags=re.DOTALL)
@@ -214,19 +231,30 @@ def pages_of(pdf: bytes) -> dict[str, int]:
     top = re.search(rb"/Pages (\d+) 0 R", objects[root])
     assert top is not None, "a PDF without pages"
     order = {number: k + 1 for k, number in enumerate(leaves(top[1]))}
-    places = re.findall(rb"/([^\s/\[\]<>()]+)\s*\[(\d+) 0 R\s*/XYZ", b"\n".join(objects.values()))
+    places = re.findall(
+        rb"/([^\s/\[\]<>()]+)\s*\[(\d+) 0 R\s*/XYZ", b"\n".join(objects.values())
+    )
     return {name.decode(): order[number] for name, number in places}
 
 
 def printed(driver: Any) -> bytes:
     """Return the open page as a PDF."""
-    foot = ('<div style="font: 8px sans-serif; width: 100%; text-align: center">'
-            '<span class="pageNumber"></span></div>')  # fmt: skip
-    answer = driver.execute_cdp_cmd("Page.printToPDF", {
-        "preferCSSPageSize": True, "printBackground": True, "displayHeaderFooter": True,
-        "headerTemplate": "<span></span>", "footerTemplate": foot,
-        "generateDocumentOutline": True, "generateTaggedPDF": True,
-    })  # fmt: skip
+    foot = (
+        '<div style="font: 8px sans-serif; width: 100%; text-align: center">'
+        '<span class="pageNumber"></span></div>'
+    )
+    answer = driver.execute_cdp_cmd(
+        "Page.printToPDF",
+        {
+            "preferCSSPageSize": True,
+            "printBackground": True,
+            "displayHeaderFooter": True,
+            "headerTemplate": "<span></span>",
+            "footerTemplate": foot,
+            "generateDocumentOutline": True,
+            "generateTaggedPDF": True,
+        },
+    )
     return base64.b64decode(answer["data"])
 
 
@@ -249,7 +277,9 @@ def pdf(driver: Any, parts: list[str]) -> bytes:
     places = pages_of(printed(driver))
     starts = [places[part] for part in parts if part in places]
     if len(starts) != len(parts) or starts != sorted(set(starts)):
-        sys.exit(f"the PDF has not every chapter: {dict(zip(parts, starts, strict=False))}")
+        sys.exit(
+            f"the PDF has not every chapter: {dict(zip(parts, starts, strict=False))}"
+        )
     driver.execute_script(NUMBER, places)
     return printed(driver)
 
@@ -259,7 +289,10 @@ def main() -> int:
         sys.exit(__doc__)
     text, names = assembled()
     target = TARGET / f"{NAME}.{sys.argv[1]}"
-    with tempfile.TemporaryDirectory() as folder, chromium(Path(folder) / "profile") as driver:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        chromium(Path(folder) / "profile") as driver,
+    ):
         page = Path(folder) / "book.html"
         page.write_text(text, encoding="utf-8")
         opened(driver, page)
@@ -268,7 +301,9 @@ def main() -> int:
             target.write_bytes(pdf(driver, parts))
         else:
             colours = (BUILT / "_static" / "pygments.css").read_text(encoding="utf-8")
-            light = re.findall(r'^html\[data-theme="light"\] .*', colours, flags=re.MULTILINE)
+            light = re.findall(
+                r'^html\[data-theme="light"\] .*', colours, flags=re.MULTILINE
+            )
             about = {"title": TITLE, "author": AUTHOR, "version": distfilt.__version__}
             epub.write(driver, target, parts, about, "\n".join(light))
     offer(target)
@@ -282,7 +317,9 @@ def offer(target: Path) -> None:
     name = re.escape(target.name)
     told = re.compile(rf'<code[^>]*><span class="pre">{name}</span></code>')
     text = first.read_text(encoding="utf-8")
-    first.write_text(told.sub(f'<a href="{target.name}">{target.name}</a>', text), encoding="utf-8")
+    first.write_text(
+        told.sub(f'<a href="{target.name}">{target.name}</a>', text), encoding="utf-8"
+    )
 
 
 if __name__ == "__main__":

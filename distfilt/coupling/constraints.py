@@ -12,9 +12,19 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..validation import Array, Bounds, Mask, NonNegativeFloat, DistinctIndices, FrozenModel, check_array, validated, unchecked
 from ..ensembles import Ensemble
 from ..linalg import SolverError, as_derivative, central
+from ..validation import (
+    Array,
+    Bounds,
+    DistinctIndices,
+    FrozenModel,
+    Mask,
+    NonNegativeFloat,
+    check_array,
+    unchecked,
+    validated,
+)
 
 __all__ = ["Constraint", "norm_constraint", "project", "retract"]
 
@@ -23,7 +33,8 @@ Reading = Literal["printed", "reversed", "particle", "shift"]
 Motion = tuple[DistinctIndices, DistinctIndices]
 """Indices of positions and of their velocities, in the same order."""
 
-_CLOSE, _STEPS = 1e-15, 50
+_CLOSE = 1e-15
+_STEPS = 50
 """What :func:`retract` leaves of the residual, relative, and its Newton steps at most."""
 
 
@@ -72,12 +83,16 @@ class Constraint(FrozenModel):
     def jacobian(self, x: Annotated[Array, "... d"]) -> Array:
         """Derivative of g at states (..., d), (..., s, d)."""
         near = partial(central, self.violation, x)
-        return as_derivative(self, (x,), (*x.shape[:-1], self.value.size, x.shape[-1]), near)
+        return as_derivative(
+            self, (x,), (*x.shape[:-1], self.value.size, x.shape[-1]), near
+        )
 
 
 @validated
 def norm_constraint(
-    indices: DistinctIndices, *, length: Annotated[float, Bounds(above=0, at_most=1e150)] = 1.0
+    indices: DistinctIndices,
+    *,
+    length: Annotated[float, Bounds(above=0, at_most=1e150)] = 1.0,
 ) -> Constraint:
     r"""Some components form a vector of given length, :math:`|\mathbf x_I|^2=L^2`.
 
@@ -108,8 +123,12 @@ def norm_constraint(
 
 @validated
 def project(
-    ensemble: Ensemble, constraint: Constraint, *, reading: Reading = "shift",
-    regularisation: NonNegativeFloat = 1e-6, guarded: bool = True,
+    ensemble: Ensemble,
+    constraint: Constraint,
+    *,
+    reading: Reading = "shift",
+    regularisation: NonNegativeFloat = 1e-6,
+    guarded: bool = True,
 ) -> Array:
     r"""Regress the members on the constraint and correct them, equations (6)-(12).
 
@@ -154,27 +173,38 @@ def project(
     >>> bool(abs(line.residual(y)).max() < 1e-14)
     True
     """
-    x, n = ensemble, ensemble.shape[-2]
+    x = ensemble
+    n = ensemble.shape[-2]
     gap = unchecked(constraint.residual)(x)
     mean = gap.mean(axis=-2, keepdims=True)
     anomalies = gap - mean
     around = x - x.mean(axis=-2, keepdims=True)
     spread = anomalies.mT @ anomalies / n + regularisation * np.eye(gap.shape[-1])
     gain = np.linalg.solve(spread, anomalies.mT @ around / n)
-    aim = {"printed": anomalies, "reversed": -anomalies, "particle": -gap, "shift": -mean}[reading]
+    aim = {
+        "printed": anomalies,
+        "reversed": -anomalies,
+        "particle": -gap,
+        "shift": -mean,
+    }[reading]
     out = x + aim @ gain
     if not guarded:
         return np.asarray(out)
     left = constraint.violation(out)
     # The members' own misses may grow where only their mean is moved: g is curved.
-    before, after = (mean, left.mean(axis=-2, keepdims=True)) if reading == "shift" else (gap, left)
+    before, after = (
+        (mean, left.mean(axis=-2, keepdims=True)) if reading == "shift" else (gap, left)
+    )
     better = np.abs(after).sum(axis=(-1, -2)) <= np.abs(before).sum(axis=(-1, -2))
     return np.asarray(np.where(better[..., None, None], out, x))
 
 
 @validated
 def retract(
-    states: Annotated[Array, "... d"], constraint: Constraint, *, motion: Motion | None = None
+    states: Annotated[Array, "... d"],
+    constraint: Constraint,
+    *,
+    motion: Motion | None = None,
 ) -> Array:
     r"""Move every state to the constraint by Newton steps along its normals.
 
@@ -210,15 +240,20 @@ def retract(
 
     Examples
     --------
-    >>> retract([3.0, 4.0, 1.0, 0.0], norm_constraint([0, 1]), motion=([0, 1], [2, 3])).round(12)
+    >>> retract(
+    ...     [3.0, 4.0, 1.0, 0.0], norm_constraint([0, 1]), motion=([0, 1], [2, 3])
+    ... ).round(12)
     array([ 0.6 ,  0.8 ,  0.64, -0.48])
     """
     x = states.reshape(-1, states.shape[-1]).copy()
-    gap, left = unchecked(constraint.residual)(x), np.arange(len(x))
+    gap = unchecked(constraint.residual)(x)
+    left = np.arange(len(x))
     for _ in range(_STEPS):
         slope, excess = _excess(constraint, x[left], gap[left])
         todo = excess > _CLOSE
-        left, slope, excess = left[todo], slope[todo], excess[todo]
+        left = left[todo]
+        slope = slope[todo]
+        excess = excess[todo]
         if not left.size:
             break
         step = _along_normals(slope, gap[left])
@@ -228,8 +263,10 @@ def retract(
     else:
         left = left[_excess(constraint, x[left], gap[left])[1] > _CLOSE]
     if left.size:
-        raise SolverError(f"retract: {left.size} of {len(x)} states did not reach the constraint "
-                          f"in {_STEPS} Newton steps, |g - d| up to {np.abs(gap[left]).max():.3g}")
+        raise SolverError(
+            f"retract: {left.size} of {len(x)} states did not reach the constraint "
+            f"in {_STEPS} Newton steps, |g - d| up to {np.abs(gap[left]).max():.3g}"
+        )
     if motion is not None:
         _make_tangent(x, constraint, motion)
     return np.asarray(x.reshape(states.shape))
@@ -250,8 +287,10 @@ def _along_normals(slope: Array, gap: Array) -> Array:
     least = np.linalg.eigvalsh(np.nan_to_num(rows @ rows.mT))[..., 0]
     lost = ~(least > 1e-14)
     if lost.any():
-        raise ValueError("constraint: needs a Jacobian of full rank, got one that loses rank at "
-                         f"state {lost.argmax()} ({lost.sum()} of {lost.size})")
+        raise ValueError(
+            "constraint: needs a Jacobian of full rank, got one that loses rank at "
+            f"state {lost.argmax()} ({lost.sum()} of {lost.size})"
+        )
     dual = np.linalg.solve(slope @ slope.mT, gap[..., None])
     return np.asarray(-(slope.mT @ dual)[..., 0])
 
@@ -262,13 +301,15 @@ def _shortened(
     """The step halved in each state until its residual falls; whether it did."""
     before = np.linalg.norm(gap, axis=-1)
     better = np.zeros(len(x), dtype=bool)
-    place, left = x.copy(), gap.copy()
+    place = x.copy()
+    left = gap.copy()
     for k in range(30):
         todo = np.flatnonzero(~better)
         trial = x[todo] + 0.5**k * step[todo]
         missed = constraint.violation(trial)
         falls = np.linalg.norm(missed, axis=-1) < before[todo]
-        place[todo[falls]], left[todo[falls]] = trial[falls], missed[falls]
+        place[todo[falls]] = trial[falls]
+        left[todo[falls]] = missed[falls]
         better[todo[falls]] = True
         if better.all():
             break
@@ -278,8 +319,14 @@ def _shortened(
 def _make_tangent(x: Array, constraint: Constraint, motion: Motion) -> None:
     """Take from the velocities in states (n, d) their part along the normals, in place."""
     places, rates = (list(part) for part in motion)
-    if len(places) != len(rates) or {*places} & {*rates} or max(places + rates) >= x.shape[-1]:
-        needs = f"as many other indices below {x.shape[-1]} for velocities as for positions"
+    if (
+        len(places) != len(rates)
+        or {*places} & {*rates}
+        or max(places + rates) >= x.shape[-1]
+    ):
+        needs = (
+            f"as many other indices below {x.shape[-1]} for velocities as for positions"
+        )
         raise ValueError(f"motion: needs {needs}, got {motion}")
     slope = unchecked(constraint.jacobian)(x)[..., places]
     along = (slope @ x[:, rates, None])[..., 0]

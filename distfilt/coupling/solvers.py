@@ -17,8 +17,16 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveFloat, FrozenModel, Probabilities, validated, import_optional
 from ..linalg import SolverError
+from ..validation import (
+    Array,
+    Bounds,
+    FrozenModel,
+    PositiveFloat,
+    Probabilities,
+    import_optional,
+    validated,
+)
 
 __all__ = ["TransportPlan", "squared_distances", "transport_plan", "sorted_plan"]
 
@@ -103,8 +111,11 @@ def squared_distances(
 
 @validated
 def transport_plan(
-    cost: Annotated[Array, "n m"], rows: Annotated[Probabilities, "n"],
-    columns: Annotated[Probabilities, "m"] | None = None, *, solver: Solver = "network",
+    cost: Annotated[Array, "n m"],
+    rows: Annotated[Probabilities, "n"],
+    columns: Annotated[Probabilities, "m"] | None = None,
+    *,
+    solver: Solver = "network",
     regularisation: PositiveFloat = 0.01,
 ) -> TransportPlan:
     """The cheapest coupling of two sets of masses.
@@ -147,7 +158,9 @@ def transport_plan(
 
     Examples
     --------
-    >>> moved = transport_plan(squared_distances([[0.0], [1.0], [3.0]]), [0.5, 0.5, 0.0])
+    >>> moved = transport_plan(
+    ...     squared_distances([[0.0], [1.0], [3.0]]), [0.5, 0.5, 0.0]
+    ... )
     >>> (3 * moved.matrix).round(3)
     array([[1. , 0.5, 0. ],
            [0. , 0.5, 1. ],
@@ -174,12 +187,16 @@ def scale_cost(cost: Array) -> tuple[Array, float, float]:
     return (cost - low) / (scale if scale > 0 else 1.0), low, scale
 
 
-def _certified(cost: Array, a: Array, b: Array, matrix: Array, g: Array) -> TransportPlan:
+def _certified(
+    cost: Array, a: Array, b: Array, matrix: Array, g: Array
+) -> TransportPlan:
     """The plan with potentials that are feasible whatever the solver says of them."""
     # A solver leaves out columns without mass, and what it says of them is nothing.
     f = (cost - np.where(b > 0, g, -np.inf)).min(axis=1)
     g = (cost - f[:, None]).min(axis=0)
-    return TransportPlan.construct(matrix, float((matrix * cost).sum()), (f, g), float(f @ a + g @ b))
+    return TransportPlan.construct(
+        matrix, float((matrix * cost).sum()), (f, g), float(f @ a + g @ b)
+    )
 
 
 Solve = Callable[[Array, Array, Array], tuple[Array, Array]]
@@ -208,17 +225,23 @@ def _entropic(cost: Array, a: Array, b: Array, strength: float) -> tuple[Array, 
     Sinkhorn's iteration creeps along plateaus where the entropy is small. Masses of zero take no
     part.
     """
-    i, j = np.flatnonzero(a), np.flatnonzero(b)
-    part, g = cost[np.ix_(i, j)], np.zeros(len(j))
+    i = np.flatnonzero(a)
+    j = np.flatnonzero(b)
+    part = cost[np.ix_(i, j)]
+    g = np.zeros(len(j))
     for k in range(max(0, math.ceil(math.log2(0.1 / strength))), -1, -1):
         eps = strength * 2.0**k
         matrix, g, off = _newton(part / eps, a[i], b[j], g / eps, 1e-3 if k else 1e-10)
         g = eps * g
     if not off < 1e-8:
-        raise SolverError(f"entropic: marginals off by {off:.3g} after {_NEWTON} Newton steps: "
-                          f"regularisation {strength:g} needs to be larger, or another solver")
-    whole, potential = np.zeros(cost.shape), np.zeros(cost.shape[1])
-    whole[np.ix_(i, j)], potential[j] = matrix, g
+        raise SolverError(
+            f"entropic: marginals off by {off:.3g} after {_NEWTON} Newton steps: "
+            f"regularisation {strength:g} needs to be larger, or another solver"
+        )
+    whole = np.zeros(cost.shape)
+    potential = np.zeros(cost.shape[1])
+    whole[np.ix_(i, j)] = matrix
+    potential[j] = g
     return _rounded(whole, a, b), potential
 
 
@@ -236,9 +259,12 @@ def _newton(
         """The plan with these potentials, whose row sums are right, and the dual to be least."""
         exponents = g - cost
         total = logsumexp(exponents, axis=1)
-        return rows[:, None] * np.exp(exponents - total[:, None]), float(rows @ total - columns @ g)
+        return rows[:, None] * np.exp(exponents - total[:, None]), float(
+            rows @ total - columns @ g
+        )
 
-    damping, (matrix, value) = 1e-2, at(g)
+    damping = 1e-2
+    (matrix, value) = at(g)
     for _ in range(_NEWTON):
         sums = matrix.sum(axis=0)
         off = float(np.abs(sums - columns).sum())
@@ -249,8 +275,13 @@ def _newton(
         moved, after = at(trial)
         # Near the solution the dual falls by less than rounding; its gradient still shrinks.
         flat = abs(after - value) < 1e-9 * abs(value)
-        if after < value or (flat and np.abs(moved.sum(axis=0) - columns).sum() < 0.5 * off):
-            g, matrix, value, damping = trial - trial.mean(), moved, after, max(damping / 10, 1e-14)
+        if after < value or (
+            flat and np.abs(moved.sum(axis=0) - columns).sum() < 0.5 * off
+        ):
+            g = trial - trial.mean()
+            matrix = moved
+            value = after
+            damping = max(damping / 10, 1e-14)
         else:
             damping *= 10
     return matrix, g, off
@@ -262,15 +293,18 @@ def _rounded(t: Array, a: Array, b: Array) -> Array:
         total = t.sum(axis=axis)
         share = np.divide(masses, total, out=np.ones_like(total), where=total > masses)
         t *= np.expand_dims(share, axis)
-    left, right = np.maximum(a - t.sum(axis=1), 0.0), np.maximum(b - t.sum(axis=0), 0.0)
+    left = np.maximum(a - t.sum(axis=1), 0.0)
+    right = np.maximum(b - t.sum(axis=0), 0.0)
     most = max(right.sum(), left.sum(), np.finfo(float).tiny)
     return np.asarray(t + np.outer(left, right) / most)
 
 
 @validated
 def sorted_plan(
-    source: Annotated[Array, "n", SQUARED], target: Annotated[Array, "m", SQUARED],
-    rows: Annotated[Probabilities, "n"], columns: Annotated[Probabilities, "m"] | None = None,
+    source: Annotated[Array, "n", SQUARED],
+    target: Annotated[Array, "m", SQUARED],
+    rows: Annotated[Probabilities, "n"],
+    columns: Annotated[Probabilities, "m"] | None = None,
 ) -> TransportPlan:
     """The cheapest coupling on a line, for squared distances: smallest with smallest, in order.
 
@@ -293,10 +327,13 @@ def sorted_plan(
     array([[0.25, 0.5 ],
            [0.25, 0.  ]])
     """
-    x, y = source, target
+    x = source
+    y = target
     a, b = _masses(rows, columns, y.size)
-    i, j = np.argsort(x, kind="stable"), np.argsort(y, kind="stable")
-    matrix, g = np.zeros((x.size, y.size)), np.zeros(y.size)
+    i = np.argsort(x, kind="stable")
+    j = np.argsort(y, kind="stable")
+    matrix = np.zeros((x.size, y.size))
+    g = np.zeros(y.size)
     cost = (x[:, None] - y) ** 2
     rank_i, rank_j, mass = _staircase(a[i], b[j])
     np.add.at(matrix, (i[rank_i], j[rank_j]), mass)

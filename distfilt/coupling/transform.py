@@ -20,13 +20,26 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..validation import Array, Indices, NonNegativeFloat, PositiveFloat, Rng, check_array, validated, unchecked
 from ..ensembles import Ensemble
 from ..linalg import EPS, factor
-from .solvers import SQUARED, Solve, Solver, squared_distances, scale_cost, solver_of
+from ..validation import (
+    Array,
+    Indices,
+    NonNegativeFloat,
+    PositiveFloat,
+    Rng,
+    check_array,
+    unchecked,
+    validated,
+)
+from .solvers import SQUARED, Solve, Solver, scale_cost, solver_of, squared_distances
 
-__all__ = [  # fmt: skip
-    "transform_ensemble", "transport_plans", "rejuvenate", "second_order", "transform_along",
+__all__ = [
+    "transform_ensemble",
+    "transport_plans",
+    "rejuvenate",
+    "second_order",
+    "transform_along",
     "transform_within",
 ]
 
@@ -37,16 +50,26 @@ _TIE = 1e-7
 """In units of the largest cost. The weighted mean stays exact, the plan costs at most this more."""
 
 
-def normalize_weights(log_weights: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
+def normalize_weights(
+    log_weights: ArrayLike, shape: tuple[int, ...] | None = None
+) -> Array:
     """Weights (..., N) that sum to one, from logarithms of any size; -inf is a weight of zero."""
     w = check_array(log_weights, "log_weights", shape, finite=False)
     top = w.max(axis=-1, keepdims=True)
     if np.isneginf(top).any():
-        raise ValueError("log_weights: needs a positive weight in every ensemble, got only zeros")
+        raise ValueError(
+            "log_weights: needs a positive weight in every ensemble, got only zeros"
+        )
     if not np.isfinite(top).all():
-        raise ValueError("log_weights: needs numbers below infinity, got NaN or infinity")
+        raise ValueError(
+            "log_weights: needs numbers below infinity, got NaN or infinity"
+        )
     if w.shape[-1] > 2 and w.min() >= 0 and np.allclose(w.sum(axis=-1), 1):
-        warnings.warn("log_weights: needs logarithms, got a sum of 1", RuntimeWarning, stacklevel=4)
+        warnings.warn(
+            "log_weights: needs logarithms, got a sum of 1",
+            RuntimeWarning,
+            stacklevel=4,
+        )
     w = np.exp(w - top)
     return np.asarray(w / w.sum(axis=-1, keepdims=True))
 
@@ -102,7 +125,9 @@ def _plans(x: Array, w: Array, solve: Solve) -> Array:
 def _coupled(costs: Array, w: Array, solve: Solve) -> Array:
     """Couplings for costs (..., N, N)."""
     n = w.shape[-1]
-    equal, ties, out = np.full(n, 1 / n), _ties(n), np.empty_like(costs)
+    equal = np.full(n, 1 / n)
+    ties = _ties(n)
+    out = np.empty_like(costs)
     for row in np.ndindex(w.shape[:-1]):
         out[row], _ = solve(scale_cost(costs[row])[0] + ties, w[row], equal)
     return out
@@ -110,8 +135,13 @@ def _coupled(costs: Array, w: Array, solve: Solve) -> Array:
 
 @validated
 def transform_ensemble(
-    ensemble: Members, log_weights: ArrayLike, *, solver: Solver = "network",
-    regularisation: PositiveFloat = 0.01, debias: bool = False, correct: bool = False,
+    ensemble: Members,
+    log_weights: ArrayLike,
+    *,
+    solver: Solver = "network",
+    regularisation: PositiveFloat = 0.01,
+    debias: bool = False,
+    correct: bool = False,
 ) -> Array:
     r"""Replace weighted members by as many with equal weights.
 
@@ -149,7 +179,8 @@ def transform_ensemble(
     >>> bool(transform_ensemble([[0.0], [1.0]], [-1e4, -2e4])[1, 0] == 0.0)
     True
     """
-    x, w = ensemble, normalize_weights(log_weights, ensemble.shape[:-1])
+    x = ensemble
+    w = normalize_weights(log_weights, ensemble.shape[:-1])
     solve = solver_of(solver, regularisation)
     out = apply_plan(x, w, _plans(x, w, solve))
     if debias:
@@ -204,13 +235,16 @@ def second_order(moved: Members, ensemble: AsMoved, log_weights: ArrayLike) -> A
     >>> float(second_order(transform_ensemble(x, logs), x, logs).var().round(12))
     0.1875
     """
-    return _second_order(moved, ensemble, normalize_weights(log_weights, ensemble.shape[:-1]))
+    return _second_order(
+        moved, ensemble, normalize_weights(log_weights, ensemble.shape[:-1])
+    )
 
 
 def _second_order(y: Array, x: Array, w: Array) -> Array:
     n = x.shape[-2]
     centre = w[..., None, :] @ x
-    around, spread = x - centre, y - y.mean(axis=-2, keepdims=True)
+    around = x - centre
+    spread = y - y.mean(axis=-2, keepdims=True)
     root = _graded(around.mT @ (w[..., None] * around))
     # With P = K K' the anomalies times B are the nearest orthonormal columns to those times K,
     # times K': P comes out to rounding, however little C has left of it in some direction.
@@ -238,7 +272,11 @@ def _graded(cov: Array) -> Array:
 
 @validated
 def rejuvenate(
-    moved: Annotated[Ensemble, SQUARED], ensemble: AsMoved, *, bandwidth: NonNegativeFloat, rng: Rng
+    moved: Annotated[Ensemble, SQUARED],
+    ensemble: AsMoved,
+    *,
+    bandwidth: NonNegativeFloat,
+    rng: Rng,
 ) -> Array:
     r"""Add combinations of the forecast's anomalies: new places, and the same mean.
 
@@ -263,11 +301,14 @@ def rejuvenate(
     Examples
     --------
     >>> x = np.array([[0.0], [1.0], [4.0]])
-    >>> after = rejuvenate(np.zeros((3, 1)), x, bandwidth=0.1, rng=np.random.default_rng(0))
+    >>> after = rejuvenate(
+    ...     np.zeros((3, 1)), x, bandwidth=0.1, rng=np.random.default_rng(0)
+    ... )
     >>> bool(abs(after.mean()) < 1e-15), len(set(after.ravel()))
     (True, 3)
     """
-    x, n = ensemble, ensemble.shape[-2]
+    x = ensemble
+    n = ensemble.shape[-2]
     drawn = rng.standard_normal((*x.shape[:-1], n))
     # Centring costs one part in N of the variance.
     drawn = (drawn - drawn.mean(axis=-2, keepdims=True)) * np.sqrt(n / (n - 1))
@@ -277,8 +318,11 @@ def rejuvenate(
 
 @validated
 def transform_within(
-    ensemble: Annotated[Array, "n d"], log_weights: ArrayLike,
-    pieces: Annotated[Indices, "n"], *, rng: Rng,
+    ensemble: Annotated[Array, "n d"],
+    log_weights: ArrayLike,
+    pieces: Annotated[Indices, "n"],
+    *,
+    rng: Rng,
 ) -> Array:
     r"""The transform on a set cut into pieces: no average crosses from one piece to another.
 
@@ -306,8 +350,9 @@ def transform_within(
     Examples
     --------
     >>> x = [[-1.0], [-0.9], [0.9], [1.0]]
-    >>> y = transform_within(x, np.log([0.4, 0.1, 0.1, 0.4]), [0, 0, 1, 1],
-    ...                      rng=np.random.default_rng(0))
+    >>> y = transform_within(
+    ...     x, np.log([0.4, 0.1, 0.1, 0.4]), [0, 0, 1, 1], rng=np.random.default_rng(0)
+    ... )
     >>> bool((np.abs(y) >= 0.9).all())
     True
     """
@@ -325,7 +370,8 @@ def _chosen(share: Array, rng: np.random.Generator) -> Array:
     Row by row, the columns that are still free are laid end to end, each as long as its chance,
     and those that hold a level k + u are taken.
     """
-    left, order = np.arange(share.shape[1]), np.full(share.shape[1], share.shape[0] - 1)
+    left = np.arange(share.shape[1])
+    order = np.full(share.shape[1], share.shape[0] - 1)
     rest = np.cumsum(share[::-1], axis=0)[::-1]
     for row in range(share.shape[0] - 1):
         chance = share[row, left] / np.where(rest[row, left] > 0, rest[row, left], 1.0)
@@ -340,7 +386,10 @@ def _chosen(share: Array, rng: np.random.Generator) -> Array:
 
 @validated
 def transform_along(
-    ensemble: Members, log_weights: ArrayLike, *, difference: Callable[[Array, Array], Array],
+    ensemble: Members,
+    log_weights: ArrayLike,
+    *,
+    difference: Callable[[Array, Array], Array],
     retract: Callable[[Array, Array], Array],
 ) -> Array:
     r"""The transform on a curved set: averages of tangent vectors, moved back onto the set.
@@ -373,15 +422,22 @@ def transform_along(
 
     >>> def wrapped(a, b):
     ...     return (a - b + np.pi) % (2 * np.pi) - np.pi
-    >>> transform_along([[3.0], [-3.0]], np.log([0.75, 0.25]), difference=wrapped,
-    ...                 retract=lambda x, v: wrapped(x + v, 0.0)).round(3)
+    >>> transform_along(
+    ...     [[3.0], [-3.0]],
+    ...     np.log([0.75, 0.25]),
+    ...     difference=wrapped,
+    ...     retract=lambda x, v: wrapped(x + v, 0.0),
+    ... ).round(3)
     array([[ 3.   ],
            [-3.142]])
     """
-    x, n = ensemble, ensemble.shape[-2]
+    x = ensemble
+    n = ensemble.shape[-2]
     w = normalize_weights(log_weights, x.shape[:-1])
     there, here = np.broadcast_arrays(x[..., :, None, :], x[..., None, :, :])
-    v = check_array(difference(there.copy(), here.copy()), "difference", (*x.shape[:-1], n, "k"))
+    v = check_array(
+        difference(there.copy(), here.copy()), "difference", (*x.shape[:-1], n, "k")
+    )
     matrix = _coupled((v * v).sum(axis=-1), w, solver_of("network"))
     steps = n * np.einsum("...ij,...ijk->...jk", matrix, v)
     return check_array(retract(x.copy(), steps), "retract", x.shape)

@@ -11,9 +11,17 @@ from typing import Annotated, Literal
 import numpy as np
 import scipy
 
-from ..validation import Array, NonNegativeFloat, PositiveFloat, FrozenModel, Times, validated, unchecked
 from ..models.base import path
 from ..models.swarm import Swarm
+from ..validation import (
+    Array,
+    FrozenModel,
+    NonNegativeFloat,
+    PositiveFloat,
+    Times,
+    unchecked,
+    validated,
+)
 from .grid import Grid
 
 __all__ = ["FokkerPlanck", "bernoulli"]
@@ -30,7 +38,9 @@ def bernoulli(z: Annotated[Array, "..."]) -> Array:
     """
     small = np.abs(z) < 1e-4
     safe = np.where(small, 1.0, z)
-    return np.where(small, 1 - z / 2 + z**2 / 12, safe / np.expm1(np.clip(safe, -700.0, 700.0)))
+    return np.where(
+        small, 1 - z / 2 + z**2 / 12, safe / np.expm1(np.clip(safe, -700.0, 700.0))
+    )
 
 
 _Faces = namedtuple("_Faces", "points left right axis width")
@@ -83,14 +93,17 @@ class FokkerPlanck(FrozenModel):
     swarm: Swarm
     grid: Grid
     scheme: Literal["split", "backward_euler", "crank_nicolson"] = field(
-        default="split", kw_only=True)
+        default="split", kw_only=True
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         boxes = [np.array([part.low, part.high]) for part in (self.grid, self.swarm)]
         if not np.array_equal(boxes[0], boxes[1]):
-            raise ValueError("grid: needs a grid of the swarm's box, got "
-                             f"{self.grid.shape!r} of another")
+            raise ValueError(
+                "grid: needs a grid of the swarm's box, got "
+                f"{self.grid.shape!r} of another"
+            )
 
     @cached_property
     def _faces(self) -> _Faces:
@@ -99,8 +112,11 @@ class FokkerPlanck(FrozenModel):
         left = [np.delete(cells, -1, axis=k).ravel() for k in range(grid.dim)]
         right = [np.delete(cells, 0, axis=k).ravel() for k in range(grid.dim)]
         axis = np.repeat(np.arange(grid.dim), [len(cells) for cells in left])
-        a, b = np.concatenate(left), np.concatenate(right)
-        return _Faces(0.5 * (grid.centres[a] + grid.centres[b]), a, b, axis, grid.spacing[axis])
+        a = np.concatenate(left)
+        b = np.concatenate(right)
+        return _Faces(
+            0.5 * (grid.centres[a] + grid.centres[b]), a, b, axis, grid.spacing[axis]
+        )
 
     def _rates(self, t: float) -> tuple[Array, Array]:
         """Rates at which mass crosses each face, forwards and backwards, in 1/s."""
@@ -109,7 +125,8 @@ class FokkerPlanck(FrozenModel):
         drift = self.swarm.drift_at(f.points, t)[pick]
         between = self.swarm.diffusion_at(f.points, t)[pick]
         cells = self.swarm.diffusion_at(self.grid.centres, t)
-        at_left, at_right = cells[f.left, f.axis], cells[f.right, f.axis]
+        at_left = cells[f.left, f.axis]
+        at_right = cells[f.right, f.axis]
         peclet = drift * f.width / between
         # B(-z) = z + B(z): one exponential serves both directions, without cancellation.
         small = unchecked(bernoulli)(np.abs(peclet))
@@ -117,12 +134,17 @@ class FokkerPlanck(FrozenModel):
         backwards = small + np.maximum(-peclet, 0.0)
         return forwards * at_left / f.width**2, backwards * at_right / f.width**2
 
-    def _assembled(self, t: float, scale: float, identity: float) -> scipy.sparse.csc_array:
+    def _assembled(
+        self, t: float, scale: float, identity: float
+    ) -> scipy.sparse.csc_array:
         """identity I + scale A(t)."""
         forwards, backwards = self._rates(t)
-        n, f = self.grid.size, self._faces
+        n = self.grid.size
+        f = self._faces
         leaving = np.bincount(f.left, forwards, n) + np.bincount(f.right, backwards, n)
-        data = np.concatenate([identity - scale * leaving, scale * forwards, scale * backwards])
+        data = np.concatenate(
+            [identity - scale * leaving, scale * forwards, scale * backwards]
+        )
         rows = np.concatenate([np.arange(n), f.right, f.left])
         columns = np.concatenate([np.arange(n), f.left, f.right])
         return scipy.sparse.csc_array((data, (rows, columns)), (n, n))
@@ -133,7 +155,12 @@ class FokkerPlanck(FrozenModel):
         return self._assembled(t, 1.0, 0.0)
 
     @validated
-    def step(self, values: Annotated[Array, "... self.grid.size"], t: float, dt: PositiveFloat) -> Array:
+    def step(
+        self,
+        values: Annotated[Array, "... self.grid.size"],
+        t: float,
+        dt: PositiveFloat,
+    ) -> Array:
         """Densities (..., n), or any cell values, moved from `t` to `t` + `dt`."""
         return unchecked(self.solver)(t, dt)(values)
 
@@ -145,10 +172,15 @@ class FokkerPlanck(FrozenModel):
         from scipy.sparse.linalg import splu
 
         share = dt if self.scheme == "backward_euler" else 0.5 * dt
-        explicit, matrix = self._assembled(t, dt - share, 1.0), self._assembled(t + dt, -share, 1.0)
+        explicit = self._assembled(t, dt - share, 1.0)
+        matrix = self._assembled(t + dt, -share, 1.0)
         # The pattern is symmetric and the columns are dominated by their diagonal: no pivoting.
-        factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-                       options={"SymmetricMode": True})
+        factors = splu(
+            matrix,
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
 
         def move(p: Array) -> Array:
             columns = explicit @ p.reshape(-1, self.grid.size).T
@@ -162,9 +194,12 @@ class FokkerPlanck(FrozenModel):
 
         The tridiagonal elimination has no subtraction, so it keeps signs to the last bit.
         """
-        grid, rates = self.grid, self._rates(t + dt)
-        factors = [self._eliminated(*(dt * self._across(r, k) for r in rates))
-                   for k in range(grid.dim)]
+        grid = self.grid
+        rates = self._rates(t + dt)
+        factors = [
+            self._eliminated(*(dt * self._across(r, k) for r in rates))
+            for k in range(grid.dim)
+        ]
 
         def move(p: Array) -> Array:
             x = np.array(p.reshape(-1, grid.size).T, order="C").reshape(*grid.shape, -1)
@@ -190,7 +225,8 @@ class FokkerPlanck(FrozenModel):
             stays = 1 + back * (stays / pivot[i])
         pivot[-1] = stays
         pivot = 1 / pivot
-        down, up = forwards * pivot[:-1], backwards * pivot[:-1]
+        down = forwards * pivot[:-1]
+        up = backwards * pivot[:-1]
         return down[..., None], up[..., None], pivot[..., None]
 
     def _across(self, rate: Array, k: int) -> Array:
@@ -200,7 +236,9 @@ class FokkerPlanck(FrozenModel):
         return np.moveaxis(rate[self._faces.axis == k].reshape(shape), k, 0)
 
     @validated
-    def evolve(self, values: Annotated[Array, "... self.grid.size"], times: Times) -> Array:
+    def evolve(
+        self, values: Annotated[Array, "... self.grid.size"], times: Times
+    ) -> Array:
         """Densities at `times`, (T, ..., n), of one that is `values` at time 0, a step to each.
 
         Parameters

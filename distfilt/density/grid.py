@@ -9,8 +9,17 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from ..validation import Array, Bounds, PositiveInt, Indices, NonNegativeFloat, PositiveFloat, FrozenModel, validated
 from ..models.swarm import inside
+from ..validation import (
+    Array,
+    Bounds,
+    FrozenModel,
+    Indices,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    validated,
+)
 
 __all__ = ["Grid", "zero_mean_prior"]
 
@@ -52,7 +61,9 @@ class Grid(FrozenModel):
                 raise ValueError(f"{name}: needs {self.dim} numbers, got {corner.size}")
             object.__setattr__(self, name, np.broadcast_to(corner, (self.dim,)))
         if (self.width <= 0).any():
-            raise ValueError(f"high: needs corners above low = {self.low}, got {self.high}")
+            raise ValueError(
+                f"high: needs corners above low = {self.low}, got {self.high}"
+            )
 
     @cached_property
     def width(self) -> Array:
@@ -121,7 +132,9 @@ class Grid(FrozenModel):
         """Cell values (..., n) divided by their integral, which has to be positive."""
         total = values.sum(axis=-1) * self.volume
         if not (total > 0).all():
-            raise ValueError(f"values: needs a positive integral, got {float(total.min()):g}")
+            raise ValueError(
+                f"values: needs a positive integral, got {float(total.min()):g}"
+            )
         return np.asarray(values / total[..., None])
 
     @validated
@@ -129,25 +142,31 @@ class Grid(FrozenModel):
         """Number of the cell in which each of the positions (..., d) lies, (...)."""
         at = ((self._inside(positions) - self.low) / self.spacing).astype(np.int64)
         at = np.minimum(at, np.array(self.shape) - 1)
-        return np.asarray(np.ravel_multi_index(tuple(np.moveaxis(at, -1, 0)), self.shape))
+        return np.asarray(
+            np.ravel_multi_index(tuple(np.moveaxis(at, -1, 0)), self.shape)
+        )
 
     @validated
     def histogram(self, positions: Annotated[Array, "... n self.dim"]) -> Array:
         """Histogram of agents (..., N, d), one or more, as a density (..., n)."""
-        lead, n = positions.shape[:-2], positions.shape[-2]
+        lead = positions.shape[:-2]
+        n = positions.shape[-2]
         cells = self.cell_index(positions).reshape(-1, n)
         rows = [np.bincount(row, minlength=self.size) for row in cells]
         return np.asarray(np.reshape(rows, (*lead, self.size)) / (n * self.volume))
 
     @validated
     def interpolate(
-        self, values: Annotated[Array, "self.size"], positions: Annotated[Array, "... self.dim"]
+        self,
+        values: Annotated[Array, "self.size"],
+        positions: Annotated[Array, "... self.dim"],
     ) -> Array:
         """Multilinear interpolation of cell values (n,) at positions (..., d); flat at walls."""
         from scipy.ndimage import map_coordinates
 
         flat = self._inside(positions).reshape(-1, self.dim)
-        place, v = ((flat - self.low) / self.spacing - 0.5).T, values.reshape(self.shape)
+        place = ((flat - self.low) / self.spacing - 0.5).T
+        v = values.reshape(self.shape)
         found = map_coordinates(v, place, order=1, mode="nearest")
         return np.asarray(found.reshape(positions.shape[:-1]))
 
@@ -182,7 +201,9 @@ class Grid(FrozenModel):
         if rank not in self._kept:
             x = (self.centres - self.low) / self.width
             waves = np.cos(np.pi * x[:, None, :] * self.wavenumbers(rank)).prod(axis=-1)
-            self._kept[rank] = np.asarray(waves / np.sqrt((waves**2).sum(axis=0) * self.volume))
+            self._kept[rank] = np.asarray(
+                waves / np.sqrt((waves**2).sum(axis=0) * self.volume)
+            )
             self._kept[rank].setflags(write=False)
         return self._kept[rank]
 
@@ -194,7 +215,11 @@ class Grid(FrozenModel):
 
 @validated
 def zero_mean_prior(
-    grid: Grid, *, rank: PositiveInt, length: PositiveFloat | None = None, std: PositiveFloat | None = None,
+    grid: Grid,
+    *,
+    rank: PositiveInt,
+    length: PositiveFloat | None = None,
+    std: PositiveFloat | None = None,
     mass_std: NonNegativeFloat = 0.0,
 ) -> Array:
     r"""A factor S of the prior covariance P = S Sᵀ of a density: smooth, and of zero mass.

@@ -6,10 +6,16 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveInt, PositiveFloat, validated, unchecked
+from ..validation import Array, Bounds, PositiveFloat, PositiveInt, unchecked, validated
 from .grid import Grid
 
-__all__ = ["bandwidth", "kernel_covariance", "kernel_density", "kernel_constant", "kernels"]
+__all__ = [
+    "bandwidth",
+    "kernel_covariance",
+    "kernel_density",
+    "kernel_constant",
+    "kernels",
+]
 
 Widths = PositiveFloat | Annotated[Array, "n", Bounds(above=0)]
 
@@ -40,16 +46,22 @@ def _steps(x: Array, edges: Array, scale: Array) -> Array:
 def fine_enough(grid: Grid, bandwidth: float | Array) -> None:
     """Refuse bandwidths below half a cell, and far beyond the box."""
     if np.max(bandwidth) > 20 * grid.width.max():
-        raise ValueError(f"bandwidth: needs at most 20 widths of the box, got {bandwidth}")
-    least, widest = float(np.min(bandwidth)), float(grid.spacing.max())
+        raise ValueError(
+            f"bandwidth: needs at most 20 widths of the box, got {bandwidth}"
+        )
+    least = float(np.min(bandwidth))
+    widest = float(grid.spacing.max())
     if widest > 2 * least * (1 + 1e-12):
-        raise ValueError(f"grid: needs cells no wider than two bandwidths, {2 * least:g}, "
-                         f"got {widest:g}")
+        raise ValueError(
+            f"grid: needs cells no wider than two bandwidths, {2 * least:g}, "
+            f"got {widest:g}"
+        )
 
 
 def _factors(positions: Array, grid: Grid, bandwidth: float | Array) -> list[Array]:
     fine_enough(grid, bandwidth)
-    x, h = grid._inside(positions), np.broadcast_to(bandwidth, positions.shape[:-1])
+    x = grid._inside(positions)
+    h = np.broadcast_to(bandwidth, positions.shape[:-1])
     return [_along(x[..., k], grid, k, h) for k in range(grid.dim)]
 
 
@@ -120,11 +132,15 @@ def kernel_density(
     """
     first, *rest = _factors(positions, grid, bandwidth)
     out = first.mT @ _products(np.ones((*first.shape[:-1], 1)), rest)
-    return np.asarray(out.reshape(*positions.shape[:-2], grid.size) / positions.shape[-2])
+    return np.asarray(
+        out.reshape(*positions.shape[:-2], grid.size) / positions.shape[-2]
+    )
 
 
 @validated
-def kernel_constant(grid: Grid, *, bandwidth: PositiveFloat, agents: PositiveInt) -> float:
+def kernel_constant(
+    grid: Grid, *, bandwidth: PositiveFloat, agents: PositiveInt
+) -> float:
     r"""The constant k̄ of Zheng and Lin: ∫K²/(N hᵈ), for which Var p_KDE ≈ k̄ p.
 
     For a Gaussian, :math:`\bar k = 1/\bigl(N(2\sqrt\pi h)^d\bigr)`. It is the variance of one cell.
@@ -140,8 +156,11 @@ def kernel_constant(grid: Grid, *, bandwidth: PositiveFloat, agents: PositiveInt
 
 @validated
 def kernel_covariance(
-    density: Annotated[Array, "grid.size", Bounds(at_least=0)], grid: Grid, *,
-    bandwidth: PositiveFloat, agents: PositiveInt,
+    density: Annotated[Array, "grid.size", Bounds(at_least=0)],
+    grid: Grid,
+    *,
+    bandwidth: PositiveFloat,
+    agents: PositiveInt,
 ) -> tuple[Array, Array]:
     r"""Mean and covariance of the kernel estimate of N independent agents, without approximation.
 
@@ -184,7 +203,9 @@ def kernel_covariance(
 
 @validated
 def bandwidth(
-    positions: Annotated[Array, "n grid.dim"], grid: Grid, *,
+    positions: Annotated[Array, "n grid.dim"],
+    grid: Grid,
+    *,
     rule: Literal["silverman", "least_squares"] = "silverman",
 ) -> float:
     r"""A bandwidth from the agents themselves.
@@ -210,11 +231,14 @@ def bandwidth(
     >>> round(bandwidth(x, Grid((30, 30))), 3)
     0.129
     """
-    x, (n, d) = grid._inside(positions), positions.shape
+    x = grid._inside(positions)
+    (n, d) = positions.shape
     spread = float(np.sqrt(x.var(axis=0).mean()))
     if n < 2 or spread == 0:
-        raise ValueError(f"positions: needs two agents or more in different places, got {n} "
-                         f"with a spread of {spread:g}")
+        raise ValueError(
+            f"positions: needs two agents or more in different places, got {n} "
+            f"with a spread of {spread:g}"
+        )
     least = 0.5 * float(grid.spacing.max())
     normal = spread * (4 / ((d + 2) * n)) ** (1 / (d + 4))
     if rule == "silverman":

@@ -16,9 +16,24 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..validation import Array, PositiveFloat, FrozenModel, check_array, validated, check_positive_semidefinite, unchecked
+from ..validation import (
+    Array,
+    FrozenModel,
+    PositiveFloat,
+    check_array,
+    check_positive_semidefinite,
+    unchecked,
+    validated,
+)
 
-__all__ = ["Dense", "LowRank", "dense_step", "low_rank_predict", "low_rank_start", "low_rank_step"]
+__all__ = [
+    "Dense",
+    "LowRank",
+    "dense_step",
+    "low_rank_predict",
+    "low_rank_start",
+    "low_rank_step",
+]
 
 Move = Callable[[Array], Array]
 Observed = Annotated[Array, "*state.base.shape"] | Annotated[Array, "state.size"]
@@ -48,7 +63,10 @@ class Dense(FrozenModel):
 
 @validated
 def dense_step(
-    state: Dense, move: Move, observed: Annotated[Array, "*state.mean.shape"], noise: ArrayLike,
+    state: Dense,
+    move: Move,
+    observed: Annotated[Array, "*state.mean.shape"],
+    noise: ArrayLike,
     dt: PositiveFloat,
 ) -> Dense:
     r"""One step with the whole covariance: O(n³), the reference for the other.
@@ -72,11 +90,14 @@ def dense_step(
 
     Examples
     --------
-    >>> after = dense_step(Dense(np.zeros(2), np.eye(2)), lambda p: p, [1.0, 1.0], [1.0, 3.0], 1.0)
+    >>> after = dense_step(
+    ...     Dense(np.zeros(2), np.eye(2)), lambda p: p, [1.0, 1.0], [1.0, 3.0], 1.0
+    ... )
     >>> after.mean
     array([0.5 , 0.25])
     """
-    variance, mean = _strength(noise, state.mean.shape) / dt, move(state.mean)
+    variance = _strength(noise, state.mean.shape) / dt
+    mean = move(state.mean)
     p = move(move(state.covariance).T)
     p = 0.5 * (p + p.T)
     gain = np.linalg.solve(p + np.diag(variance), p).T
@@ -165,7 +186,8 @@ class LowRank(FrozenModel):
 
 @validated
 def low_rank_start(
-    basis: Annotated[Array, "n r"] | Annotated[Array, "f n r"], base: Annotated[Array, "f n"]
+    basis: Annotated[Array, "n r"] | Annotated[Array, "f n r"],
+    base: Annotated[Array, "f n"],
 ) -> LowRank:
     """Filters before their first step: prior means `base` (F, n), prior covariances S Sᵀ.
 
@@ -174,14 +196,18 @@ def low_rank_start(
     >>> low_rank_start(np.ones((4, 1)), np.zeros((2, 4))).information.shape
     (2, 1, 1)
     """
-    filters, rank = len(base), basis.shape[-1]
+    filters = len(base)
+    rank = basis.shape[-1]
     nothing = np.tile(np.eye(rank), (filters, 1, 1)), np.zeros((filters, rank))
     return LowRank.construct(basis.copy(), base.copy(), *nothing)
 
 
 @validated
 def low_rank_predict(
-    state: LowRank, move: Move, *, process: Annotated[Array, "state.size q"] | None = None,
+    state: LowRank,
+    move: Move,
+    *,
+    process: Annotated[Array, "state.size q"] | None = None,
     dt: PositiveFloat | None = None,
 ) -> LowRank:
     r"""The filters after the model's step and before the measurement.
@@ -207,15 +233,19 @@ def low_rank_predict(
     array([[0.5, 0.5]])
     """
     if process is None:
-        rows, base = state.basis.mT, state.base
+        rows = state.basis.mT
+        base = state.base
     else:
-        rows, base = state.factors.mT, state.estimates
+        rows = state.factors.mT
+        base = state.estimates
     moved = move(np.concatenate([rows.reshape(-1, state.size), base]))
     basis = np.ascontiguousarray(moved[: -len(base)].reshape(rows.shape).mT)
     if process is None:
         return state.replace(basis=basis, base=moved[-len(base) :])
     if dt is None:
-        raise ValueError("dt: needs the step's length where there is process noise, got None")
+        raise ValueError(
+            "dt: needs the step's length where there is process noise, got None"
+        )
     added = np.broadcast_to(np.sqrt(dt) * process, (len(base), *process.shape))
     factor = np.concatenate([basis, added], axis=-1)
     _, vectors = np.linalg.eigh(factor.mT @ factor)
@@ -224,7 +254,9 @@ def low_rank_predict(
 
 
 @validated
-def low_rank_step(state: LowRank, observed: Observed, noise: ArrayLike, dt: PositiveFloat) -> LowRank:
+def low_rank_step(
+    state: LowRank, observed: Observed, noise: ArrayLike, dt: PositiveFloat
+) -> LowRank:
     r"""All filters take in a measurement each: one matrix product.
 
     .. math::
@@ -258,8 +290,10 @@ def low_rank_step(state: LowRank, observed: Observed, noise: ArrayLike, dt: Posi
     if not information.max() < _MOST:
         least, most = np.linalg.eigvalsh(information)[:, [0, -1]].T
         if not (most < _MOST * least).all():
-            raise np.linalg.LinAlgError("density filter: the step's length, the noise or the prior "
-                                        f"is out of scale, information {most.max():.3g}")
+            raise np.linalg.LinAlgError(
+                "density filter: the step's length, the noise or the prior "
+                f"is out of scale, information {most.max():.3g}"
+            )
     return state.replace(information=information, vector=state.vector + seen)
 
 
@@ -267,7 +301,8 @@ def _weighted_products(s: Array, weights: Array) -> Array:
     """Sᵀ diag(w) S for each row w of the weights, (F, r, r)."""
     if s.ndim == 3 or len(weights) < 16:
         return np.asarray((s.mT * weights[:, None, :]) @ s)
-    r, turned = s.shape[1], np.ascontiguousarray(s.T)
+    r = s.shape[1]
+    turned = np.ascontiguousarray(s.T)
     out = np.empty((len(weights), r, r))
     for i in range(r):
         out[:, i, i:] = out[:, i:, i] = weights @ (turned[i] * turned[i:]).T

@@ -9,17 +9,34 @@ from typing import Annotated, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..validation import ALLOW_NAN, Array, PositiveInt, Mask, NonNegativeFloat, DistinctIndices, PositiveFloat, FrozenModel, unchecked
 from ..network import Channel, Graph, PIState, pi_step
 from ..network import weights as weighting
 from ..network.channel import Lost
 from ..network.graphs import disk
+from ..validation import (
+    ALLOW_NAN,
+    Array,
+    DistinctIndices,
+    FrozenModel,
+    Mask,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    unchecked,
+)
 from .grid import Grid
-from .kernel import kernel_density, kernel_constant, kernels
+from .kernel import kernel_constant, kernel_density, kernels
 
-__all__ = [  # fmt: skip
-    "Centralised", "DynamicAverage", "Flooding", "Neighbours", "PIConsensus", "SwarmSnapshot", "ConsensusProtocol",
-    "alone", "present_graph",
+__all__ = [
+    "Centralised",
+    "DynamicAverage",
+    "Flooding",
+    "Neighbours",
+    "PIConsensus",
+    "SwarmSnapshot",
+    "ConsensusProtocol",
+    "alone",
+    "present_graph",
 ]
 
 Carried = tuple[Array, ...]
@@ -62,8 +79,10 @@ class SwarmSnapshot(FrozenModel):
         super().__post_init__()
         here = self.positions[~np.isnan(self.positions).all(axis=-1)]
         if np.isnan(here).any() or not len(here):
-            raise ValueError("positions: needs one agent at least, and NaN in a whole row for one "
-                             f"that has gone, got {self.positions.tolist()}")
+            raise ValueError(
+                "positions: needs one agent at least, and NaN in a whole row for one "
+                f"that has gone, got {self.positions.tolist()}"
+            )
         self.grid._inside(here)
 
     @cached_property
@@ -77,7 +96,9 @@ class SwarmSnapshot(FrozenModel):
 
     def only_here(self, payloads: Array) -> list[Array | None]:
         """What each agent sends, None for those that are gone."""
-        return [x if here else None for x, here in zip(payloads, self.present, strict=True)]
+        return [
+            x if here else None for x, here in zip(payloads, self.present, strict=True)
+        ]
 
     def _or(self, place: float | Array) -> Array:
         """The positions, with a place for agents that are gone."""
@@ -87,9 +108,14 @@ class SwarmSnapshot(FrozenModel):
     def kernels(self) -> Array:
         """Each agent's own kernel, zero for those that are gone, (A, n)."""
         x = self._or(self.grid.centres[0])
-        return unchecked(kernels)(x, self.grid, bandwidth=self.bandwidth) * self.present[:, None]
+        return (
+            unchecked(kernels)(x, self.grid, bandwidth=self.bandwidth)
+            * self.present[:, None]
+        )
 
-    def noise(self, density: Array, agents: ArrayLike, floor: float | None = None) -> Array:
+    def noise(
+        self, density: Array, agents: ArrayLike, floor: float | None = None
+    ) -> Array:
         r"""Strength R of what the wanted agents have learnt: :math:`\bar k\max(p,\epsilon)`.
 
         Parameters
@@ -116,7 +142,9 @@ class SwarmSnapshot(FrozenModel):
         Its standard deviation is .3 of the box's side, unless it is given.
 
         >>> box = Grid((3, 3), high=3.0)
-        >>> seen = SwarmSnapshot(np.array([[2.9, 2.9], [np.nan, np.nan]]), box, 1.0, 0.0)
+        >>> seen = SwarmSnapshot(
+        ...     np.array([[2.9, 2.9], [np.nan, np.nan]]), box, 1.0, 0.0
+        ... )
         >>> seen.flat().argmax(axis=1)
         array([8, 4])
         """
@@ -164,7 +192,9 @@ class ConsensusProtocol(Protocol):
         """What the agents remember before the first step: nothing, unless a rule says."""
         return ()
 
-    def update(self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float) -> Learnt:
+    def update(
+        self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float
+    ) -> Learnt:
         """One step of talking."""
         ...
 
@@ -188,7 +218,11 @@ def alone(sharing: ConsensusProtocol, seen: SwarmSnapshot) -> Array:
 
 def _coordinates(seen: SwarmSnapshot, modes: int | None, values: Array) -> Array:
     """Densities, whole or as cosine coefficients, and a 1 of the first agent that is here."""
-    z = values if modes is None else values @ seen.grid.cosines(modes) * seen.grid.volume
+    z = (
+        values
+        if modes is None
+        else values @ seen.grid.cosines(modes) * seen.grid.volume
+    )
     leader = np.arange(len(z)) == np.argmax(seen.present)
     return np.concatenate([z, leader[:, None]], axis=1)
 
@@ -235,17 +269,31 @@ class PIConsensus(FrozenModel, ConsensusProtocol):
         u = _coordinates(seen, self.modes, seen.kernels)
         if self.initial_std is None:
             return u, np.zeros_like(u), u
-        return _coordinates(seen, self.modes, seen.flat(self.initial_std)), np.zeros_like(u), u
+        return (
+            _coordinates(seen, self.modes, seen.flat(self.initial_std)),
+            np.zeros_like(u),
+            u,
+        )
 
-    def update(self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float) -> Learnt:
+    def update(
+        self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float
+    ) -> Learnt:
         """One step of (16), in as many substeps as stability asks for."""
         u = _coordinates(seen, self.modes, seen.kernels)
         estimate, integral, before = carried
         after = pi_step(
-            PIState(estimate, integral), before, channel, dt=dt, alpha=self.alpha,
-            a=self.a, b=self.b, rate=(u - before) / dt if self.rate else None,
+            PIState(estimate, integral),
+            before,
+            channel,
+            dt=dt,
+            alpha=self.alpha,
+            a=self.a,
+            b=self.b,
+            rate=(u - before) / dt if self.rate else None,
         )
-        return (after.estimate, after.integral, u), *_read(after.estimate, seen, self.modes)
+        return (after.estimate, after.integral, u), *_read(
+            after.estimate, seen, self.modes
+        )
 
 
 @dataclass(frozen=True)
@@ -273,11 +321,18 @@ class DynamicAverage(FrozenModel, ConsensusProtocol):
         u = _coordinates(seen, self.modes, seen.kernels)
         return u, u
 
-    def update(self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float) -> Learnt:
+    def update(
+        self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float
+    ) -> Learnt:
         """Average, and add what the own input has changed by."""
         u = _coordinates(seen, self.modes, seen.kernels)
-        (x, before), graph = carried, channel.graph
-        weights = weighting.doubly_stochastic(graph) if graph.directed else weighting.metropolis(graph)
+        (x, before) = carried
+        graph = channel.graph
+        weights = (
+            weighting.doubly_stochastic(graph)
+            if graph.directed
+            else weighting.metropolis(graph)
+        )
         lost: Lost = "keep" if graph.directed else "mutual"
         x = unchecked(channel.mix)(x, weights, lost=lost) + (u - before)
         return (x, u), *_read(x, seen, self.modes)
@@ -305,11 +360,14 @@ class Flooding(FrozenModel, ConsensusProtocol):
         """Tables (A, A, d + 1) of positions and times, without any entry."""
         return (_empty(seen),)
 
-    def update(self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float) -> Learnt:
+    def update(
+        self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float
+    ) -> Learnt:
         """Note the own position, send the table, keep the newest of each entry."""
         table = _noted(seen, carried[0])
         heard = channel.broadcast(seen.only_here(table))
-        new, owners = table.copy(), np.arange(len(table))
+        new = table.copy()
+        owners = np.arange(len(table))
         for i in np.flatnonzero(seen.present):
             rows = np.stack([table[i], *heard[i].values()])
             new[i] = rows[rows[..., -1].argmax(axis=0), owners]
@@ -324,12 +382,16 @@ def _empty(seen: SwarmSnapshot) -> Array:
 
 def _noted(seen: SwarmSnapshot, table: Array) -> Array:
     """Each agent's table of all agents' positions and times, with the own entry of now."""
-    out, here = table.copy(), np.flatnonzero(seen.present)
-    out[here, here, :-1], out[here, here, -1] = seen.positions[here], seen.t
+    out = table.copy()
+    here = np.flatnonzero(seen.present)
+    out[here, here, :-1] = seen.positions[here]
+    out[here, here, -1] = seen.t
     return out
 
 
-def _mean_kernels(table: Array, oldest: float, seen: SwarmSnapshot) -> tuple[Array, Array]:
+def _mean_kernels(
+    table: Array, oldest: float, seen: SwarmSnapshot
+) -> tuple[Array, Array]:
     """Kernel estimates of each table's newer entries, and their numbers.
 
     Equal entries are computed once.
@@ -345,7 +407,9 @@ def _mean_kernels(table: Array, oldest: float, seen: SwarmSnapshot) -> tuple[Arr
     z = unchecked(kernels)(x, seen.grid, bandwidth=seen.bandwidth)
     weights = np.zeros((len(table), len(x)))
     weights[row, at] = 1.0
-    return np.asarray(weights @ z / np.maximum(weights.sum(axis=1, keepdims=True), 1.0)), counted
+    return np.asarray(
+        weights @ z / np.maximum(weights.sum(axis=1, keepdims=True), 1.0)
+    ), counted
 
 
 @dataclass(frozen=True)
@@ -360,7 +424,9 @@ class Neighbours(FrozenModel, ConsensusProtocol):
     False
     """
 
-    def update(self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float) -> Learnt:
+    def update(
+        self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float
+    ) -> Learnt:
         """Send the own position; the mean of the kernels at all positions that arrive."""
         table = _noted(seen, _empty(seen))
         for i, box in enumerate(channel.broadcast(seen.only_here(seen.positions))):
@@ -381,8 +447,11 @@ class Centralised(FrozenModel, ConsensusProtocol):
 
     reference = True
 
-    def update(self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float) -> Learnt:
+    def update(
+        self, carried: Carried, seen: SwarmSnapshot, channel: Channel, dt: float
+    ) -> Learnt:
         """The kernel estimate of all that are here."""
-        x, size = seen.positions[seen.present], len(seen.positions)
+        x = seen.positions[seen.present]
+        size = len(seen.positions)
         y = unchecked(kernel_density)(x, seen.grid, bandwidth=seen.bandwidth)
         return (), np.tile(y, (size, 1)), np.full(size, float(len(x)))

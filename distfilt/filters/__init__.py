@@ -16,9 +16,26 @@ from .record import Summary, final_state
 from .saving import SensorState, State
 from .step import FilterError, Step
 
-__all__ = [  # fmt: skip
-    "DensityFilter", "DensityState", "EnsembleFilter", "Filter", "FilterError",
-    "GaussianFilter", "GaussianState", "MixtureFilter", "MixtureState", "InformationIncrementFilter",
-    "ParticleCollapse", "ParticleFilter", "Observation", "SensorState", "State", "Step", "Summary",
-    "TransportFilter", "final_state", "information_increment", "prior_moments",
+__all__ = [
+    "DensityFilter",
+    "DensityState",
+    "EnsembleFilter",
+    "Filter",
+    "FilterError",
+    "GaussianFilter",
+    "GaussianState",
+    "MixtureFilter",
+    "MixtureState",
+    "InformationIncrementFilter",
+    "ParticleCollapse",
+    "ParticleFilter",
+    "Observation",
+    "SensorState",
+    "State",
+    "Step",
+    "Summary",
+    "TransportFilter",
+    "final_state",
+    "information_increment",
+    "prior_moments",
 ]

@@ -15,12 +15,20 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
-from ..validation import Array, Bounds, NonNegativeInt, PositiveFloat, FrozenModel, Rng, validated
 from ..models import Model
 from ..network import Channel, Faults, Ledger
 from ..network.channel import kind_of_rule
 from ..network.graphs import as_graph
 from ..sensors import Sensor
+from ..validation import (
+    Array,
+    Bounds,
+    FrozenModel,
+    NonNegativeInt,
+    PositiveFloat,
+    Rng,
+    validated,
+)
 from .inputs import Observation, match_delayed, plan_steps, read_observations
 from .record import SCORES, Score, Summary, record_run
 from .saving import State
@@ -86,7 +94,11 @@ class Filter(FrozenModel, ABC):
     >>> walk, two = constant_velocity(sigma=1.0), [component([0], std=1.0), None]
     >>> for graph in (nx.path_graph(2), lambda t: [(0, 1)]):
     ...     f = GaussianFilter(walk, two, graph)
-    ...     print(f.step(f.start((np.zeros(4), np.eye(4))), 0.0, [[1.0], None]).means[:, 0])
+    ...     print(
+    ...         f.step(f.start((np.zeros(4), np.eye(4))), 0.0, [[1.0], None]).means[
+    ...             :, 0
+    ...         ]
+    ...     )
     [0.5 0.5]
     [0.5 0.5]
     >>> GaussianFilter(walk, two, graph, fusion=intersect_ensembles)
@@ -124,28 +136,52 @@ class Filter(FrozenModel, ABC):
     def __post_init__(self) -> None:
         super().__post_init__()
         for option in fields(self):
-            if option.name in self.unsupported and getattr(self, option.name) != option.default:
+            if (
+                option.name in self.unsupported
+                and getattr(self, option.name) != option.default
+            ):
                 raise ValueError(f"{option.name}: {self.unsupported[option.name]}")
         self.check_parts()
         if self.faults is not None and self.faults.has_delay:
-            raise ValueError(f"faults: needs Faults without a delay, got {self.faults!r}")
+            raise ValueError(
+                f"faults: needs Faults without a delay, got {self.faults!r}"
+            )
         if self.names and not len(self.names) == len({*self.names}) == self.n_agents:
-            raise ValueError(f"names: needs {self.n_agents} different names, got {[*self.names]}")
+            raise ValueError(
+                f"names: needs {self.n_agents} different names, got {[*self.names]}"
+            )
         kind = None if self.fusion is None else kind_of_rule(self.fusion)
         if kind is not None and kind != self.belief_kind:
-            raise ValueError(f"fusion: needs a rule that fuses {self.belief_kind}, got one of {kind}")
-        if self.exchange_interval is not None and self.share_observations and self.graph is not None and not self.lag:
-            raise ValueError("lag: needs at least 1 for readings that wait for a contact, got 0")
+            raise ValueError(
+                f"fusion: needs a rule that fuses {self.belief_kind}, got one of {kind}"
+            )
+        if (
+            self.exchange_interval is not None
+            and self.share_observations
+            and self.graph is not None
+            and not self.lag
+        ):
+            raise ValueError(
+                "lag: needs at least 1 for readings that wait for a contact, got 0"
+            )
 
     def check_parts(self) -> None:
         """Refuse sensors or a graph that this family cannot have."""
-        if not self.supports_increments and any(s.uses_previous for own in self.agent_sensors for s in own):
-            raise ValueError("sensors: needs sensors of the present state, got a differential")
+        if not self.supports_increments and any(
+            s.uses_previous for own in self.agent_sensors for s in own
+        ):
+            raise ValueError(
+                "sensors: needs sensors of the present state, got a differential"
+            )
         speak = self.share_observations or self.fusion is not None
         if self.graph is None and self.n_agents > 1 and speak:
-            raise ValueError(f"graph: needs a Graph of {self.n_agents} agents, got None")
+            raise ValueError(
+                f"graph: needs a Graph of {self.n_agents} agents, got None"
+            )
         if self.graph is not None and not callable(self.graph):
-            object.__setattr__(self, "graph", as_graph(self.graph, self.n_agents, self.names))
+            object.__setattr__(
+                self, "graph", as_graph(self.graph, self.n_agents, self.names)
+            )
 
     @cached_property
     def agent_sensors(self) -> tuple[tuple[Sensor, ...], ...]:
@@ -178,18 +214,23 @@ class Filter(FrozenModel, ABC):
         graph = as_graph(graph, self.n_agents, self.names)
         if not graph.senders.size:
             return None
-        return Channel.construct(graph, ledger=state.ledger, runs=state.runs,
-                                 faults=self.faults, t=t)
+        return Channel.construct(
+            graph, ledger=state.ledger, runs=state.runs, faults=self.faults, t=t
+        )
 
     def _contact(self, before: float, t: float) -> bool:
         if self.exchange_interval is None:
             return True
         # Whether one of the multiples lies after the step's start, and up to its end, to rounding.
         near = 1e-9 + 1e-15 * abs(t / self.exchange_interval)
-        return math.floor(t / self.exchange_interval + near) > math.floor(before / self.exchange_interval + near)
+        return math.floor(t / self.exchange_interval + near) > math.floor(
+            before / self.exchange_interval + near
+        )
 
     @abstractmethod
-    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(
+        self, prior: Any, runs: tuple[int, ...], rng: Any
+    ) -> dict[str, Any]:
         """The fields of the first state that are the family's own."""
 
     @abstractmethod
@@ -202,7 +243,12 @@ class Filter(FrozenModel, ABC):
 
     @validated
     def start(
-        self, prior: Any, *, rng: Rng | None = None, runs: tuple[int, ...] = (), t: float = 0.0
+        self,
+        prior: Any,
+        *,
+        rng: Rng | None = None,
+        runs: tuple[int, ...] = (),
+        t: float = 0.0,
     ) -> Any:
         """The state before the first step.
 
@@ -225,7 +271,9 @@ class Filter(FrozenModel, ABC):
         if self.requires_rng and rng is None:
             raise ValueError("rng: needs a numpy.random.Generator, got None")
         if runs and (not self.supports_runs or min(runs) < 1):
-            needs = "sizes of at least 1" if self.supports_runs else "(), one run at a time"
+            needs = (
+                "sizes of at least 1" if self.supports_runs else "(), one run at a time"
+            )
             raise ValueError(f"runs: needs {needs}, got {runs!r}")
         own = self.initial_state(prior, runs, rng)
         child = rng.spawn(1)[0] if self.requires_rng and rng is not None else None
@@ -233,7 +281,12 @@ class Filter(FrozenModel, ABC):
 
     @validated
     def step(
-        self, state: State, t: float, observations: Any, *, delayed: Sequence[Observation] = ()
+        self,
+        state: State,
+        t: float,
+        observations: Any,
+        *,
+        delayed: Sequence[Observation] = (),
     ) -> Any:
         """Move to time `t` and take in what was observed there.
 
@@ -263,7 +316,13 @@ class Filter(FrozenModel, ABC):
         return self._advanced(state, t, observations, delayed, own=False)
 
     def _advanced(
-        self, state: Any, t: float, observations: Any, delayed: Sequence[Observation], *, own: bool
+        self,
+        state: Any,
+        t: float,
+        observations: Any,
+        delayed: Sequence[Observation],
+        *,
+        own: bool,
     ) -> Any:
         said = self.read_observations(observations, state.runs, t)
         old = match_delayed(self, delayed, state, t) if delayed else ()
@@ -285,29 +344,49 @@ class Filter(FrozenModel, ABC):
         if (own := getattr(self, "sizes", None)) is not None and state.sizes != own:
             raise ValueError(f"state: needs sizes {own} an agent, got {state.sizes}")
 
-    def read_observations(self, observations: Any, runs: tuple[int, ...], t: float) -> Any:
+    def read_observations(
+        self, observations: Any, runs: tuple[int, ...], t: float
+    ) -> Any:
         """What is observed at one time, checked; as a rule each agent's readings."""
         return read_observations(self, observations, runs, t)
 
     def _walk(
-        self, state: Any, grid: Array, entries: Iterable[Any], delayed: Sequence[Observation], *, own: bool
+        self,
+        state: Any,
+        grid: Array,
+        entries: Iterable[Any],
+        delayed: Sequence[Observation],
+        *,
+        own: bool,
     ) -> Iterator[Any]:
         last = grid[-1] if grid.size else -np.inf
         for item in delayed:
             if item.arrival_time is None or item.arrival_time > last:
-                raise ValueError(f"delayed: needs arrivals up to {last:g}, got {item.arrival_time}")
+                raise ValueError(
+                    f"delayed: needs arrivals up to {last:g}, got {item.arrival_time}"
+                )
         waiting: list[Any] = sorted(delayed, key=lambda item: item.arrival_time or 0.0)
         for k, (t, observed) in enumerate(zip(grid.tolist(), entries, strict=True)):
-            due = [item for item in waiting if item.arrival_time <= t] if waiting else waiting
+            due = (
+                [item for item in waiting if item.arrival_time <= t]
+                if waiting
+                else waiting
+            )
             waiting = waiting[len(due) :]
             # The first state is the caller's.
             state = self._advanced(state, t, observed, due, own=own and k > 0)
             yield state
 
     def _recorded(
-        self, state: Any, times: Any, observations: Any, truth: Any, scores: Collection[Score],
-        delayed: Sequence[Observation], lag: int,
-    ) -> xarray.Dataset:  # fmt: skip
+        self,
+        state: Any,
+        times: Any,
+        observations: Any,
+        truth: Any,
+        scores: Collection[Score],
+        delayed: Sequence[Observation],
+        lag: int,
+    ) -> xarray.Dataset:
         """A run's record, each time as it is believed when `lag` more have been observed."""
         self.check_state(state)
         grid, entries = plan_steps(self, state, times, observations)
@@ -322,11 +401,18 @@ class Filter(FrozenModel, ABC):
             if len(waiting) > lag:
                 yield waiting.pop(0), last.lagged_states[-lag] if lag else last
         if waiting:
-            yield from zip(waiting, [*last.lagged_states, last][-len(waiting) :], strict=True)
+            yield from zip(
+                waiting, [*last.lagged_states, last][-len(waiting) :], strict=True
+            )
 
     @validated
     def steps(
-        self, state: State, times: Any, observations: Any, *, delayed: Sequence[Observation] = ()
+        self,
+        state: State,
+        times: Any,
+        observations: Any,
+        *,
+        delayed: Sequence[Observation] = (),
     ) -> Iterator[Any]:
         """The states at `times`, one after the other; arguments as in :meth:`run`."""
         self.check_state(state)
@@ -335,9 +421,15 @@ class Filter(FrozenModel, ABC):
 
     @validated
     def run(
-        self, state: State, times: Any, observations: Any, *, truth: Any = None,
-        scores: Collection[Score] = SCORES, delayed: Sequence[Observation] = (),
-    ) -> xarray.Dataset:  # fmt: skip
+        self,
+        state: State,
+        times: Any,
+        observations: Any,
+        *,
+        truth: Any = None,
+        scores: Collection[Score] = SCORES,
+        delayed: Sequence[Observation] = (),
+    ) -> xarray.Dataset:
         """Step through a series, or through events, and record it.
 
         Parameters
@@ -375,9 +467,15 @@ class Filter(FrozenModel, ABC):
 
     @validated
     def smooth(
-        self, state: State, times: Any, observations: Any, *, truth: Any = None,
-        scores: Collection[Score] = SCORES, delayed: Sequence[Observation] = (),
-    ) -> xarray.Dataset:  # fmt: skip
+        self,
+        state: State,
+        times: Any,
+        observations: Any,
+        *,
+        truth: Any = None,
+        scores: Collection[Score] = SCORES,
+        delayed: Sequence[Observation] = (),
+    ) -> xarray.Dataset:
         """Fixed-lag smoothing: of each time what is believed when `lag` more have been observed.
 
         Parameters and result are those of :meth:`run`. The filter needs a `lag`; near the end
@@ -386,4 +484,6 @@ class Filter(FrozenModel, ABC):
         if not self.lag:
             why = self.unsupported.get("lag", "needs at least 1 for smoothing, got 0")
             raise ValueError(f"lag: {why}")
-        return self._recorded(state, times, observations, truth, scores, delayed, self.lag)
+        return self._recorded(
+            state, times, observations, truth, scores, delayed, self.lag
+        )

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..density import (
+    ConsensusProtocol,
     FokkerPlanck,
     LowRank,
-    ConsensusProtocol,
     low_rank_predict,
     low_rank_start,
     low_rank_step,
@@ -21,9 +21,19 @@ from ..density import (
 )
 from ..density.kernel import fine_enough
 from ..density.sharing import SwarmSnapshot, alone, present_graph
-from ..validation import ALLOW_NAN, Array, Bounds, PositiveInt, NonNegativeFloat, DistinctIndices, PositiveFloat, check_array, unchecked
 from ..network import Channel, Graph
 from ..network.graphs import as_graph
+from ..validation import (
+    ALLOW_NAN,
+    Array,
+    Bounds,
+    DistinctIndices,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    check_array,
+    unchecked,
+)
 from .base import Filter
 from .inputs import one_each
 from .record import Summary
@@ -58,8 +68,17 @@ class DensityState(State):
     --------
     >>> from distfilt.network import Ledger
     >>> filters = low_rank_start(np.ones((4, 1)), np.ones((1, 4)))
-    >>> DensityState(0.0, Ledger.empty(1), None, np.zeros((1, 2)), (), np.ones((1, 4)),
-    ...              np.ones(1), 1, filters).estimates.shape
+    >>> DensityState(
+    ...     0.0,
+    ...     Ledger.empty(1),
+    ...     None,
+    ...     np.zeros((1, 2)),
+    ...     (),
+    ...     np.ones((1, 4)),
+    ...     np.ones(1),
+    ...     1,
+    ...     filters,
+    ... ).estimates.shape
     (1, 4)
     """
 
@@ -128,8 +147,14 @@ class DensityFilter(Filter):
     >>> from distfilt.density import Flooding, Grid
     >>> from distfilt.models import rotating_swarm
     >>> swarm, rng = rotating_swarm(), np.random.default_rng(1)
-    >>> f = DensityFilter(FokkerPlanck(swarm, Grid((15, 15))), 20, 0.4,
-    ...                   fusion=Flooding(), bandwidth=0.12, rank=40)
+    >>> f = DensityFilter(
+    ...     FokkerPlanck(swarm, Grid((15, 15))),
+    ...     20,
+    ...     0.4,
+    ...     fusion=Flooding(),
+    ...     bandwidth=0.12,
+    ...     rank=40,
+    ... )
     >>> x = rng.random((20, 2))
     >>> state = f.step(f.start(x), 0.1, swarm.step(x, 0.0, 0.1, rng=rng))
     >>> state.estimates.shape, state.ledger.rounds
@@ -144,7 +169,9 @@ class DensityFilter(Filter):
     share_observations: bool = False
     bandwidth: PositiveFloat
     local: DistinctIndices | None = None
-    initial_density: Literal["flat", "observed"] | Annotated[Array, "model.grid.size"] = "flat"
+    initial_density: (
+        Literal["flat", "observed"] | Annotated[Array, "model.grid.size"]
+    ) = "flat"
     initial_std: PositiveFloat | None = None
     rank: PositiveInt = 48
     prior_length: PositiveFloat | None = None
@@ -186,7 +213,9 @@ class DensityFilter(Filter):
         """Numbers of the agents that run a filter, (F,)."""
         return np.array(range(self.n_agents) if self.local is None else self.local)
 
-    def read_observations(self, observations: Any, runs: tuple[int, ...], t: float) -> Any:
+    def read_observations(
+        self, observations: Any, runs: tuple[int, ...], t: float
+    ) -> Any:
         """The agents' positions (A, d); None and NaN are agents that have gone."""
         gone = np.full(self.model.grid.dim, np.nan)
         given = one_each(observations, self.n_agents)
@@ -195,34 +224,47 @@ class DensityFilter(Filter):
     def channel(self, state: State, t: float) -> None:
         """None yet: who hears whom depends on where the agents are."""
 
-    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(
+        self, prior: Any, runs: tuple[int, ...], rng: Any
+    ) -> dict[str, Any]:
         """What is believed at the agents' first positions (A, d), NaN for those not here."""
         seen = self._seen(prior, "prior", 0.0)
         here = self.filtering
         filters = unchecked(low_rank_start)(self._basis, self._base(seen)[here])
         return {
-            "positions": seen.positions, "carried": self.fusion.initial_state(seen),
-            "observed": seen.kernels[here], "positions_sent": np.full(self.n_agents, float(self.n_agents)),
-            "parts": 1, "filters": filters,
-        }  # fmt: skip
+            "positions": seen.positions,
+            "carried": self.fusion.initial_state(seen),
+            "observed": seen.kernels[here],
+            "positions_sent": np.full(self.n_agents, float(self.n_agents)),
+            "parts": 1,
+            "filters": filters,
+        }
 
     @cached_property
     def _basis(self) -> Array:
         """A factor of the prior covariance, (n, r)."""
-        return zero_mean_prior(self.model.grid, rank=self.rank, length=self.prior_length,
-                               std=self.prior_std, mass_std=self.mass_std)
+        return zero_mean_prior(
+            self.model.grid,
+            rank=self.rank,
+            length=self.prior_length,
+            std=self.prior_std,
+            mass_std=self.mass_std,
+        )
 
     def _base(self, seen: SwarmSnapshot) -> Array:
         """Prior means of all agents, (A, n)."""
         if not isinstance(self.initial_density, str):
             return np.tile(self.initial_density, (self.n_agents, 1))
         if self.initial_density == "observed":
-            own, here = alone(self.fusion, seen), seen.present[:, None]
+            own = alone(self.fusion, seen)
+            here = seen.present[:, None]
             return np.where(here, own, seen.flat(self.initial_std))
         return seen.flat(self.initial_std)
 
     def _seen(self, positions: ArrayLike, name: str, t: float) -> SwarmSnapshot:
-        x = check_array(positions, name, (self.n_agents, self.model.grid.dim), finite=False)
+        x = check_array(
+            positions, name, (self.n_agents, self.model.grid.dim), finite=False
+        )
         return SwarmSnapshot(x, self.model.grid, self.bandwidth, t, self.local)
 
     def next_state(self, step: Step) -> Any:
@@ -240,7 +282,10 @@ class DensityFilter(Filter):
         [0 2 2 2]
         [0 0 0 0]
         """
-        state, seen, t, dt = step.state, step.observations, step.t, step.dt
+        state = step.state
+        seen = step.observations
+        t = step.t
+        dt = step.dt
         if not dt:
             raise ValueError(f"t: needs a number above {state.t:g}, got {t:g}")
         if isinstance(self.graph, float):
@@ -250,7 +295,9 @@ class DensityFilter(Filter):
             graph = present_graph(as_graph(here, self.n_agents), seen.present)
         if not self._contact(state.t, t):
             graph = Graph.from_edges(self.n_agents, np.zeros((0, 2)))
-        step.channel = channel = Channel(graph, ledger=state.ledger, faults=self.faults, t=t)
+        step.channel = channel = Channel(
+            graph, ledger=state.ledger, faults=self.faults, t=t
+        )
         carried, y, counted = self.fusion.update(state.carried, seen, channel, dt)
         y = y[self.filtering]
 
@@ -262,8 +309,12 @@ class DensityFilter(Filter):
         filters = unchecked(low_rank_step)(moved, y, noise, dt)
         parts = np.unique(graph.components[seen.present]).size
         return step.end(
-            positions=seen.positions, carried=carried, observed=y, positions_sent=counted,
-            parts=int(parts), filters=filters,
+            positions=seen.positions,
+            carried=carried,
+            observed=y,
+            positions_sent=counted,
+            parts=int(parts),
+            filters=filters,
         )
 
     def summarize(self, state: DensityState) -> Summary:
@@ -272,11 +323,17 @@ class DensityFilter(Filter):
         ``parts`` is the number of parts of the network, ``positions_sent`` how many agents each believes
         in, ``mass`` the estimate's integral.
         """
-        n, here = self.model.grid.size, self.filtering
+        n = self.model.grid.size
+        here = self.filtering
         mean, variance = (np.full((self.n_agents, n), np.nan) for _ in range(2))
-        mean[here], variance[here] = state.estimates, state.variances
-        return Summary(mean, variance, numbers={
-            "parts": np.full(self.n_agents, float(state.parts)),
-            "positions_sent": state.positions_sent,
-            "mass": mean.sum(axis=-1) * self.model.grid.volume,
-        })
+        mean[here] = state.estimates
+        variance[here] = state.variances
+        return Summary(
+            mean,
+            variance,
+            numbers={
+                "parts": np.full(self.n_agents, float(state.parts)),
+                "positions_sent": state.positions_sent,
+                "mass": mean.sum(axis=-1) * self.model.grid.volume,
+            },
+        )

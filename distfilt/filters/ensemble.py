@@ -15,17 +15,22 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 
 from .. import ensembles as moments
-from ..coupling import transport_plans, rejuvenate
+from ..coupling import rejuvenate, transport_plans
 from ..coupling.transform import apply_plan, normalize_weights
-from ..validation import Array, Bounds, NonNegativeFloat, check_array, unchecked
 from ..linalg import in_units
 from ..models import Model
 from ..network import Graph, finite_time_consensus, intersect_ensembles
 from ..sensors import Sensor
-from ..updates import enkf_exact, enkf, stochastic_forecast, with_missing
+from ..updates import enkf, enkf_exact, stochastic_forecast, with_missing
 from ..updates.decorator import has_tag
 from ..updates.gaussian import exact_forecast
-from ..updates.particles import log_likelihood, size_of, warn_of_collapse, warn_of_weights
+from ..updates.particles import (
+    log_likelihood,
+    size_of,
+    warn_of_collapse,
+    warn_of_weights,
+)
+from ..validation import Array, Bounds, NonNegativeFloat, check_array, unchecked
 from .base import Filter
 from .inbox import Received
 from .inputs import draw_members
@@ -54,7 +59,9 @@ class EnsembleState(SensorState):
     Examples
     --------
     >>> from distfilt.network import Ledger
-    >>> state = EnsembleState(0.0, Ledger.empty(2), np.random.default_rng(0), np.zeros((2, 5, 3)))
+    >>> state = EnsembleState(
+    ...     0.0, Ledger.empty(2), np.random.default_rng(0), np.zeros((2, 5, 3))
+    ... )
     >>> state.runs
     ()
     """
@@ -91,7 +98,9 @@ class MembersFilter(Filter):
         centre, a = moments.center_ensemble(x := state.ensembles)
         a *= a
         variance = unchecked(moments.mean)(a) * (self.members / (self.members - 1))
-        return Summary(state.mask_failed(centre[..., 0, :]), state.mask_failed(variance), members=x)
+        return Summary(
+            state.mask_failed(centre[..., 0, :]), state.mask_failed(variance), members=x
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +130,9 @@ class EnsembleFilter(MembersFilter):
     >>> from distfilt.network import graphs
     >>> from distfilt.sensors import component
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
-    >>> f = EnsembleFilter(walk, [component([0], std=0.5), None], graphs.path(2), members=500)
+    >>> f = EnsembleFilter(
+    ...     walk, [component([0], std=0.5), None], graphs.path(2), members=500
+    ... )
     >>> state = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0))
     >>> state = f.step(state, 1.0, [[0.8], None])
     >>> state.ensembles.mean(axis=1).round(1).ravel()
@@ -138,12 +149,17 @@ class EnsembleFilter(MembersFilter):
         try:
             signature(self.update).bind(*range(4), rng=None)
         except TypeError as error:
-            raise ValueError(f"update: needs four arrays and rng, got one with {error}") from None
+            raise ValueError(
+                f"update: needs four arrays and rng, got one with {error}"
+            ) from None
 
     @classmethod
     def exact(
-        cls, model: Model, sensors: Sequence[Sensor | None],
-        graph: Graph | Callable[[float], Graph] | None = None, **options: Any,
+        cls,
+        model: Model,
+        sensors: Sequence[Sensor | None],
+        graph: Graph | Callable[[float], Graph] | None = None,
+        **options: Any,
     ) -> EnsembleFilter:
         """Second-order exact draws and covariance intersection of least determinant.
 
@@ -175,19 +191,26 @@ class EnsembleFilter(MembersFilter):
             own["fusion"] = partial(intersect_ensembles, rule="min_determinant")
         return cls(model, sensors, graph, **(own | options))
 
-    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(
+        self, prior: Any, runs: tuple[int, ...], rng: Any
+    ) -> dict[str, Any]:
         """Members drawn for each agent."""
         return {"ensembles": self.draw_prior(prior, (*runs, self.n_agents), rng)}
 
     def next_state(self, step: Step) -> Any:
         """Forecast, condition on what was heard, agree."""
-        state, now = step.state, step.state.ensembles
+        state = step.state
+        now = step.state.ensembles
         if step.dt:
-            now = unchecked(self.forecast)(now, self.model, state.t, step.dt, rng=step.rng)
+            now = unchecked(self.forecast)(
+                now, self.model, state.t, step.dt, rng=step.rng
+            )
             now = check_array(now, "forecast", state.ensembles.shape, finite=False)
         stack = step.stack(step.check_forecast(now, state.ensembles))
         for place, group in step.received():
-            step.record_failures(self._condition(stack, place, group, step), group.agents)
+            step.record_failures(
+                self._condition(stack, place, group, step), group.agents
+            )
         (now,) = step.fuse(stack[-1])
         return step.end(ensembles=now, past=regress_past(stack, now))
 
@@ -207,20 +230,28 @@ class EnsembleFilter(MembersFilter):
             *earlier, last, noise, source = rest
             # Every time's members meet the same draw of the noise, so that all the separate
             # updates are one joint update; the last one advances the generator.
-            past = [self._updated(x, h, y, noise, copy_rng(source), None) for x in earlier]
+            past = [
+                self._updated(x, h, y, noise, copy_rng(source), None) for x in earlier
+            ]
             whole = redone and not earlier and h.shape == predicted.shape
             predict = partial(group.predict, previous=before) if whole else None
             return (*past, self._updated(last, h, y, noise, source, predict))
 
         result, errors = run_isolated(
-            compute, (predicted, group.target, *members), members, group.target.ndim - 1,
-            shared=group.noise, rng=step.rng,
+            compute,
+            (predicted, group.target, *members),
+            members,
+            group.target.ndim - 1,
+            shared=group.noise,
+            rng=step.rng,
         )
         for e, new in zip(stack, result, strict=True):
             e[..., rows, :, :] = new
         return errors
 
-    def _updated(self, x: Array, h: Array, y: Array, noise: Array, rng: Any, predict: Any) -> Array:
+    def _updated(
+        self, x: Array, h: Array, y: Array, noise: Array, rng: Any, predict: Any
+    ) -> Array:
         """One time's ensembles after the update; a plain function gets one agent's at a time."""
         if has_tag(self.update, "repredicts"):
             return unchecked(self.update)(x, h, y, noise, rng=rng, predict=predict)
@@ -235,7 +266,10 @@ class EnsembleFilter(MembersFilter):
         if stacks or x.ndim == 2:
             return one(x, h, y, noise)
         noises = noise if noise.ndim > 2 else [noise] * x.shape[-3]
-        agents = [(x[..., g, :, :], h[..., g, :, :], y[..., g, :], r) for g, r in enumerate(noises)]
+        agents = [
+            (x[..., g, :, :], h[..., g, :, :], y[..., g, :], r)
+            for g, r in enumerate(noises)
+        ]
         return np.stack([one(*own) for own in agents], axis=-3)
 
 
@@ -270,7 +304,9 @@ class TransportFilter(MembersFilter):
     >>> from distfilt.network import graphs
     >>> from distfilt.sensors import component
     >>> walk = Model(2, lambda x, t, dt: x, lambda t, dt: 0.1 * dt * np.eye(2))
-    >>> f = TransportFilter(walk, [component([0], std=0.5), component([1], std=0.5)], graphs.path(2))
+    >>> f = TransportFilter(
+    ...     walk, [component([0], std=0.5), component([1], std=0.5)], graphs.path(2)
+    ... )
     >>> state = f.start((np.zeros(2), np.eye(2)), rng=np.random.default_rng(0))
     >>> state = f.step(state, 1.0, [[0.8], [-0.8]])
     >>> bool(np.allclose(*state.ensembles)), state.ledger.scalars
@@ -287,12 +323,18 @@ class TransportFilter(MembersFilter):
     unsupported: ClassVar[dict[str, str]] = {
         "share_observations": "agents agree on what their readings say, so that these stay with them",
         "exchange_interval": "a transport filter's agents have their members in common, so that they have to "
-        "agree in every step"
+        "agree in every step",
     }
 
-    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(
+        self, prior: Any, runs: tuple[int, ...], rng: Any
+    ) -> dict[str, Any]:
         """One set of members, (N, d) or (*runs, 1, N, d), for all agents."""
-        return {"ensembles": np.repeat(self.draw_prior(prior, (*runs, 1), rng), self.n_agents, axis=-3)}
+        return {
+            "ensembles": np.repeat(
+                self.draw_prior(prior, (*runs, 1), rng), self.n_agents, axis=-3
+            )
+        }
 
     def next_state(self, step: Step) -> Any:
         """Forecast, weigh by what was seen, agree on the weights, transport.
@@ -303,10 +345,13 @@ class TransportFilter(MembersFilter):
             If one member has nearly all the weight that is carried over, or a reading is beyond
             what the members believe.
         """
-        state, now = step.state, step.state.ensembles
+        state = step.state
+        now = step.state.ensembles
         apart = self.n_agents > 1 and callable(self.graph) and step.channel is None
         if apart and any((*step.observations, step.delayed)):
-            raise ValueError(f"graph: needs links for the readings of t = {step.t:g}, got none")
+            raise ValueError(
+                f"graph: needs links for the readings of t = {step.t:g}, got none"
+            )
         if step.dt:
             draw = partial(unchecked(self.model.sample_step), t=state.t, dt=step.dt)
             now = self._for_all(draw, (now,), step.rng)
@@ -319,12 +364,16 @@ class TransportFilter(MembersFilter):
         return step.end(ensembles=stack[-1], past=stack[:-1])
 
     def _for_all(
-        self, draw: Callable[..., Array], arrays: tuple[Array, ...], rng: np.random.Generator
+        self,
+        draw: Callable[..., Array],
+        arrays: tuple[Array, ...],
+        rng: np.random.Generator,
     ) -> Array:
         """Apply `draw` agent by agent, each with the same draws; the generator advances once."""
         sources = [copy_rng(rng) for _ in range(self.n_agents - 1)] + [rng]
         parts = [
-            draw(*(x[..., a, :, :] for x in arrays), rng=source) for a, source in enumerate(sources)
+            draw(*(x[..., a, :, :] for x in arrays), rng=source)
+            for a, source in enumerate(sources)
         ]
         return np.stack(parts, axis=-3)
 
@@ -346,7 +395,8 @@ class TransportFilter(MembersFilter):
         """All times' members, carried by the coupling of the last time's; the rows that failed."""
 
         def compute(here: Array, *rest: Any) -> tuple[Array, ...]:
-            times, w = rest[:-2], normalize_weights(here)
+            times = rest[:-2]
+            w = normalize_weights(here)
             matrix = unchecked(transport_plans)(times[-1], here)
             return tuple(apply_plan(x, w, matrix, correct=self.correct) for x in times)
 
@@ -367,14 +417,18 @@ class TransportFilter(MembersFilter):
         >>> import warnings
         >>> from types import SimpleNamespace
         >>> step = SimpleNamespace(t=1.0, failed=np.array([False, False, True]))
-        >>> logs = np.array([[[0.0, 0.0]], [[0.0, 0.0]], [[0.0, -99.0]]])  # runs, agents, members
+        >>> logs = np.array(
+        ...     [[[0.0, 0.0]], [[0.0, 0.0]], [[0.0, -99.0]]]
+        ... )  # runs, agents, members
         >>> TransportFilter._warn(None, logs, step)
         >>> with warnings.catch_warnings(action="error"):
         ...     TransportFilter._warn(None, logs[::-1], step)
         Traceback (most recent call last):
         distfilt.updates.particles.ParticleCollapse: t = 1 s: an agent's weights have an ...
         """
-        if (size := size_of(normalize_weights(logs[~step.failed])).min(initial=np.inf)) < 1.1:
+        if (
+            size := size_of(normalize_weights(logs[~step.failed])).min(initial=np.inf)
+        ) < 1.1:
             what = f"t = {step.t:g} s: an agent's weights have an effective size of {size:.1f}"
             warn_of_collapse(what, "rejuvenation=")
 
@@ -389,7 +443,9 @@ def regress_past(stack: list[Array], now: Array) -> list[Array]:
         return past
     shape, unit = in_units(unchecked(moments.sample_covariance)(old))
     inverse = np.linalg.pinv(shape, rcond=1e-10, hermitian=True) / (old.shape[-2] - 1)
-    around, moved = (x / unit[..., None, :] for x in (moments.center_ensemble(old)[1], now - old))
+    around, moved = (
+        x / unit[..., None, :] for x in (moments.center_ensemble(old)[1], now - old)
+    )
     return [x + moved @ (inverse @ (around.mT @ x)) for x in past]
 
 

@@ -10,10 +10,10 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveInt, NonNegativeFloat, unchecked
 from ..gaussians.single import condition, unscented_points
 from ..linalg import EPS, cholesky, solve_upper, symmetrise
 from ..models import LinearModel
+from ..validation import Array, Bounds, NonNegativeFloat, PositiveInt, unchecked
 from .base import Filter
 from .inbox import Received
 from .inputs import prior_moments
@@ -44,7 +44,9 @@ class GaussianState(SensorState):
     Examples
     --------
     >>> from distfilt.network import Ledger
-    >>> state = GaussianState(0.0, Ledger.empty(2), None, np.zeros((2, 1)), np.ones((2, 1, 1)), 1)
+    >>> state = GaussianState(
+    ...     0.0, Ledger.empty(2), None, np.zeros((2, 1)), np.ones((2, 1, 1)), 1
+    ... )
     >>> state.means.shape, state.runs
     ((2, 1), ())
     """
@@ -63,10 +65,14 @@ class GaussianState(SensorState):
     @property
     def lagged_states(self) -> tuple[Self, ...]:
         """A state for each of these times, as what is believed of it by now."""
-        m, p, d = self.joint_means, self.joint_covariances, self.dim
+        m = self.joint_means
+        p = self.joint_covariances
+        d = self.dim
         own = [slice(k * d, (k + 1) * d) for k in range(len(self.history), 0, -1)]
         return tuple(
-            self.replace(t=t, history=(), joint_means=m[..., k], joint_covariances=p[..., k, k])
+            self.replace(
+                t=t, history=(), joint_means=m[..., k], joint_covariances=p[..., k, k]
+            )
             for t, k in zip(self.times, own, strict=True)
         )
 
@@ -112,8 +118,13 @@ class GaussianFilter(Filter):
     >>> from distfilt.network import covariance_intersection, graphs
     >>> from distfilt.sensors import component
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: dt * np.eye(1))
-    >>> f = GaussianFilter(walk, [component([0], std=1.0), None], graphs.path(2), share_observations=False,
-    ...                    fusion=covariance_intersection)
+    >>> f = GaussianFilter(
+    ...     walk,
+    ...     [component([0], std=1.0), None],
+    ...     graphs.path(2),
+    ...     share_observations=False,
+    ...     fusion=covariance_intersection,
+    ... )
     >>> f.step(f.start(([0.0], [[4.0]])), 1.0, [[2.0], None]).means.ravel().round(3)
     array([1.429, 1.429])
     """
@@ -127,11 +138,17 @@ class GaussianFilter(Filter):
     batched_summary: ClassVar[bool] = True
     belief_kind: ClassVar[str] = "gaussians"
 
-    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(
+        self, prior: Any, runs: tuple[int, ...], rng: Any
+    ) -> dict[str, Any]:
         """The prior's mean and covariance, the same for all agents and runs."""
         d = self.model.dim
-        both = prior_moments(prior, d, "semi" * (self.linearization == "extended") + "definite")
-        m, p = (np.broadcast_to(x, (*runs, self.n_agents, *x.shape)).copy() for x in both)
+        both = prior_moments(
+            prior, d, "semi" * (self.linearization == "extended") + "definite"
+        )
+        m, p = (
+            np.broadcast_to(x, (*runs, self.n_agents, *x.shape)).copy() for x in both
+        )
         return {"joint_means": m, "joint_covariances": p, "dim": d}
 
     @property
@@ -152,63 +169,96 @@ class GaussianFilter(Filter):
         covs = step.check_forecast(covs, one)
         for place, group in step.received():
             slot = len(step.times) - place
-            step.record_failures(self._condition(means, covs, slot, group, step), group.agents)
-        covs = step.keep_failed(covs, one)  # what failed here has to have a root in what follows
+            step.record_failures(
+                self._condition(means, covs, slot, group, step), group.agents
+            )
+        covs = step.keep_failed(
+            covs, one
+        )  # what failed here has to have a root in what follows
         if step.has_fusion:
             means, covs = self._agreed(means, covs, step)
-        covs, past = symmetrise(covs), step.times[::-1]
-        return step.end(joint_means=means, joint_covariances=covs, dim=step.state.dim, history=past)
+        covs = symmetrise(covs)
+        past = step.times[::-1]
+        return step.end(
+            joint_means=means, joint_covariances=covs, dim=step.state.dim, history=past
+        )
 
     def summarize(self, state: GaussianState) -> Summary:
         """Means and covariances of the present state."""
         cov = state.mask_failed(state.covariances)
-        return Summary(state.mask_failed(state.means), np.diagonal(cov, axis1=-2, axis2=-1), cov)
+        return Summary(
+            state.mask_failed(state.means), np.diagonal(cov, axis1=-2, axis2=-1), cov
+        )
 
     def _forecast(self, step: Step) -> tuple[Array, Array]:
         """Joint mean and covariance of the moved state and of the earlier ones that are kept."""
-        state, model, dt = step.state, self.model, step.dt
+        state = step.state
+        model = self.model
+        dt = step.dt
         if not dt:
             return state.joint_means.copy(), state.joint_covariances.copy()
-        d, kept = state.dim, len(step.times)
+        d = state.dim
+        kept = len(step.times)
         flow = partial(unchecked(model.step), t=state.t, dt=dt)
         jacobian = partial(unchecked(model.jacobian), t=state.t, dt=dt)
-        now, linear = (state.means, state.covariances), isinstance(model, LinearModel)
+        now = (state.means, state.covariances)
+        linear = isinstance(model, LinearModel)
         moved, slope, extra = self._linearised(flow, jacobian, *now, linear)
-        shift, old = np.ascontiguousarray(slope), state.joint_covariances
-        covs = shift @ old[..., :d, :d] @ shift.mT + (unchecked(model.Q)(state.t, dt) + extra)
+        shift = np.ascontiguousarray(slope)
+        old = state.joint_covariances
+        covs = shift @ old[..., :d, :d] @ shift.mT + (
+            unchecked(model.Q)(state.t, dt) + extra
+        )
         if kept:  # the past stays as it is, and only its products with the present move
             moved = np.concatenate([moved, state.joint_means[..., : kept * d]], axis=-1)
             across = shift @ old[..., :d, : kept * d]
-            covs = np.block([[covs, across], [across.mT, old[..., : kept * d, : kept * d]]])
+            covs = np.block(
+                [[covs, across], [across.mT, old[..., : kept * d, : kept * d]]]
+            )
         if self.inflation != 1.0:
             covs[..., :d, :] *= self.inflation
             covs[..., :, :d] *= self.inflation
         return moved, covs
 
     def _linearised(
-        self, function: Callable[[Array], Array], jacobian: Callable[[Array], Array], mean: Array,
-        cov: Array, linear: bool,
+        self,
+        function: Callable[[Array], Array],
+        jacobian: Callable[[Array], Array],
+        mean: Array,
+        cov: Array,
+        linear: bool,
     ) -> tuple[Array, Array, Array | float]:
         """Value, slope and extra covariance of a function of a Gaussian (..., d)."""
-        if linear or self.linearization == "extended":  # points would find the same of what is linear
+        if (
+            linear or self.linearization == "extended"
+        ):  # points would find the same of what is linear
             return function(mean[..., None, :])[..., 0, :], jacobian(mean), 0.0
-        root, d = cholesky(cov), mean.shape[-1]
+        root = cholesky(cov)
+        d = mean.shape[-1]
         points, w = unchecked(unscented_points)(mean, root, kappa=self.kappa)
         values = function(points)
         at = w @ values
         gap = values - at[..., None, :]
         # By opposite points: the slope times each column of the root, and what is beyond them.
-        half = (values[..., 1 : d + 1, :] - values[..., d + 1 :, :]) / (2 * np.sqrt(d + self.kappa))
+        half = (values[..., 1 : d + 1, :] - values[..., d + 1 :, :]) / (
+            2 * np.sqrt(d + self.kappa)
+        )
         slope = solve_upper(root, half).mT
         return at, slope, (w[:, None] * gap).mT @ gap - half.mT @ half
 
-    def _condition(self, means: Array, covs: Array, slot: int, group: Received, step: Step) -> Any:
+    def _condition(
+        self, means: Array, covs: Array, slot: int, group: Received, step: Step
+    ) -> Any:
         """Condition a group's joint Gaussians in place; the rows that failed."""
-        d, rows = self.model.dim, group.rows
+        d = self.model.dim
+        rows = group.rows
         here = slice(slot * d, (slot + 1) * d)
-        m, p = means[..., rows, :], covs[..., rows, :, :]
-        x, own = m[..., here], p[..., here, here]
-        predict, jacobian = group.predict, group.jacobian
+        m = means[..., rows, :]
+        p = covs[..., rows, :, :]
+        x = m[..., here]
+        own = p[..., here, here]
+        predict = group.predict
+        jacobian = group.jacobian
         at, slope, extra = self._linearised(predict, jacobian, x, own, group.linear)
 
         def alike(_: Array) -> tuple[Array, Array]:
@@ -219,13 +269,17 @@ class GaussianFilter(Filter):
         group = step.gate(group, alike, at[..., None, :])
         noise = np.full((*slope.shape[:-1], slope.shape[-2]), group.noise) + extra
         if m.shape[-1] > d:
-            part, slope = slope, np.zeros((*slope.shape[:-1], m.shape[-1]))
+            part = slope
+            slope = np.zeros((*slope.shape[:-1], m.shape[-1]))
             slope[..., here] = part
         (m, p), errors = run_isolated(
             lambda m, p, gap, h, noise, *_: unchecked(condition)(m, p, gap, h, noise),
-            (m, p, group.target - at, slope, noise), (m, p), group.target.ndim - 1,
+            (m, p, group.target - at, slope, noise),
+            (m, p),
+            group.target.ndim - 1,
         )
-        means[..., rows, :], covs[..., rows, :, :] = m, p
+        means[..., rows, :] = m
+        covs[..., rows, :, :] = p
         return errors
 
     def _agreed(self, means: Array, covs: Array, step: Step) -> tuple[Array, Array]:
@@ -245,13 +299,18 @@ class GaussianFilter(Filter):
         ValueError: fusion: needs a covariance, got a variance of -1
         """
         d = self.model.dim
-        old, now = means[..., :d], symmetrise(covs[..., :d, :d])
+        old = means[..., :d]
+        now = symmetrise(covs[..., :d, :d])
         m, p = step.fuse(old, now)
         variance = np.diagonal(p, axis1=-2, axis2=-1)
         if (variance < -1e-9 * np.abs(variance).max()).any():  # not by rounding
-            raise ValueError(f"fusion: needs a covariance, got a variance of {variance.min():g}")
+            raise ValueError(
+                f"fusion: needs a covariance, got a variance of {variance.min():g}"
+            )
         if ((variance > 0) & (variance < (EPS * m) ** 2)).any():
-            warnings.warn(f"fusion: counts twice, at t = {step.t:g} s", RuntimeWarning, 4)
+            warnings.warn(
+                f"fusion: counts twice, at t = {step.t:g} s", RuntimeWarning, 4
+            )
         if means.shape[-1] == d:
             return m, p
         gain = np.linalg.solve(now, covs[..., :d, :]).mT

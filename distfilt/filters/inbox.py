@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ..validation import Array, all_finite, unchecked
 from ..sensors import Sensor
+from ..validation import Array, all_finite, unchecked
 
 __all__ = ["Received", "group_agents"]
 
@@ -27,16 +27,22 @@ class Received:
     >>> pair.agents, pair.target.ravel(), pair.noise
     (array([0, 1]), array([1., 1.]), array([[0.25]]))
     >>> quiet, loud = component([1], std=1.0), component([1], std=2.0)
-    >>> (pair,) = group_agents([[sensor, quiet], [sensor, loud]], [[np.ones(1)] * 2] * 2)
+    >>> (pair,) = group_agents(
+    ...     [[sensor, quiet], [sensor, loud]], [[np.ones(1)] * 2] * 2
+    ... )
     >>> pair.noise[:, 1, 1]
     array([1., 4.])
     """
 
     target: Array
 
-    def __init__(self, agents: list[int], sensors: Sequence[tuple[Sensor, ...]]) -> None:
+    def __init__(
+        self, agents: list[int], sensors: Sequence[tuple[Sensor, ...]]
+    ) -> None:
         self.agents = np.array(agents, dtype=np.intp)
-        self.rows: Any = slice(None) if agents == [*range(len(sensors))] else self.agents
+        self.rows: Any = (
+            slice(None) if agents == [*range(len(sensors))] else self.agents
+        )
         places: dict[Sensor, list[tuple[int, int]]] = {}
         size = sum(s.dim for s in sensors[agents[0]])
         self.owner = np.zeros((len(agents), size), dtype=np.intp)
@@ -51,12 +57,17 @@ class Received:
         self.parts: list[tuple[Sensor, Any, Any]] = []
         noise = np.zeros((len(agents), size, size))
         for sensor, found in places.items():
-            rows, starts = (np.array(c, dtype=np.intp) for c in zip(*found, strict=True))
+            rows, starts = (
+                np.array(c, dtype=np.intp) for c in zip(*found, strict=True)
+            )
             columns = starts[:, None] + np.arange(sensor.dim)
-            across, down = columns[:, :, None], columns[:, None, :]
+            across = columns[:, :, None]
+            down = columns[:, None, :]
             noise[rows[:, None, None], across, down] = sensor.noise_cov
             whole = columns.shape == self.owner.shape  # the only sensor: views will do
-            cells: Any = (slice(None), slice(None)) if whole else (rows[:, None], columns)
+            cells: Any = (
+                (slice(None), slice(None)) if whole else (rows[:, None], columns)
+            )
             self.parts.append((sensor, slice(None) if whole else rows, cells))
         self.noise = noise[0] if (noise == noise[:1]).all() else noise
         self.linear = all(sensor.linear is not None for sensor in places)
@@ -84,7 +95,9 @@ class Received:
         vars(out).update(vars(self), target=target)
         return out
 
-    def predict(self, states: Array, previous: Array | None = None, alike: bool = False) -> Array:
+    def predict(
+        self, states: Array, previous: Array | None = None, alike: bool = False
+    ) -> Array:
         """Readings of states (*runs, G, N, d) without noise, (*runs, G, N, M).
 
         A reading that wraps lies on the branch of the observation; if they are to be `alike`, the
@@ -92,7 +105,9 @@ class Received:
         observation time before, for sensors that see changes.
         """
         if self.linear:
-            return np.asarray(states @ np.ascontiguousarray(self.H(states.shape[-1]).mT))
+            return np.asarray(
+                states @ np.ascontiguousarray(self.H(states.shape[-1]).mT)
+            )
         out = np.empty((*states.shape[:-2], self.target.shape[-1], states.shape[-2]))
         for sensor, rows, cells in self.parts:
             before = None if previous is None else previous[..., rows, :, :]
@@ -100,7 +115,9 @@ class Received:
             out[(..., *cells, slice(None))] = seen.swapaxes(-1, -2)
         out = np.ascontiguousarray(out.swapaxes(-1, -2))
         if not all_finite(out) and np.isinf(out).any():
-            raise ValueError("predicted: needs finite numbers or NaN (missing), got infinity")
+            raise ValueError(
+                "predicted: needs finite numbers or NaN (missing), got infinity"
+            )
         out = self.wrap_near(out, self.target[..., None, :])
         return self.wrap_near(out, out[..., :1, :]) if alike else out
 
@@ -109,7 +126,8 @@ class Received:
         out = seen.swapaxes(-1, -2)
         for sensor, _, cells in self.parts:
             if sensor.residual_function is not None:
-                at, goal = (..., *cells, slice(None)), (aim + 0 * seen).swapaxes(-1, -2)
+                at = (..., *cells, slice(None))
+                goal = (aim + 0 * seen).swapaxes(-1, -2)
                 here, there = (x[at].swapaxes(-1, -2) for x in (out, goal))
                 # y* - wrap(y* - h)
                 gap = unchecked(sensor.residual)(there, here)
@@ -123,7 +141,9 @@ class Received:
             return np.full((*self.target.shape, d), self.H(d))
         out = np.empty((*self.target.shape, d))
         for sensor, rows, cells in self.parts:
-            out[(..., *cells, slice(None))] = unchecked(sensor.jacobian)(states[..., rows, :])
+            out[(..., *cells, slice(None))] = unchecked(sensor.jacobian)(
+                states[..., rows, :]
+            )
         return out
 
     def gate(self, mean: Array, cov: Array, share: float) -> tuple[Received, Array]:
@@ -134,15 +154,23 @@ class Received:
         """
         from scipy.special import gammaincinv
 
-        gap, spread = self.target - mean, cov + self.noise
-        refused, out = np.zeros(gap.shape[:-1]), self.target
+        gap = self.target - mean
+        spread = cov + self.noise
+        refused = np.zeros(gap.shape[:-1])
+        out = self.target
         for k in range(int(self.owner.max()) + 1):
             here = (self.owner == k) & ~np.isnan(gap)
             some = here.sum(axis=-1)
-            inner = np.where(here[..., :, None] & here[..., None, :], spread, np.eye(gap.shape[-1]))
+            inner = np.where(
+                here[..., :, None] & here[..., None, :], spread, np.eye(gap.shape[-1])
+            )
             part = np.where(here, gap, 0.0)
-            length = (part * np.linalg.solve(inner, part[..., None])[..., 0]).sum(axis=-1)
-            bad = (some > 0) & (length > 2 * gammaincinv(np.maximum(some, 1) / 2, share))
+            length = (part * np.linalg.solve(inner, part[..., None])[..., 0]).sum(
+                axis=-1
+            )
+            bad = (some > 0) & (
+                length > 2 * gammaincinv(np.maximum(some, 1) / 2, share)
+            )
             out = np.where(here & bad[..., None], np.nan, out)
             refused += bad
         return self.with_target(out), refused
@@ -158,7 +186,9 @@ def _planned(pattern: tuple[tuple[Sensor, ...], ...]) -> list[Received]:
     return [Received(agents, pattern) for _, agents in sorted(sizes.items())]
 
 
-def group_agents(sensors: Sequence[Any], values: Sequence[Sequence[Array]]) -> list[Received]:
+def group_agents(
+    sensors: Sequence[Any], values: Sequence[Sequence[Array]]
+) -> list[Received]:
     """Agents in groups, from each one's sensors and values (*runs, m) in a list of its own.
 
     The plan of a pattern is made when it is first needed.

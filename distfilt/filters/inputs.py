@@ -11,16 +11,31 @@ from typing import Annotated, Any
 
 import numpy as np
 
-from ..validation import ALLOW_NAN, Array, NonNegativeInt, FrozenModel, check_array, check_positive_definite, check_increasing, unchecked
-from ..validation.checks import all_finite
 from ..ensembles import draw, sample_covariance
 from ..mixtures import GaussianMixture
 from ..sensors import Sensor
+from ..validation import (
+    ALLOW_NAN,
+    Array,
+    FrozenModel,
+    NonNegativeInt,
+    check_array,
+    check_increasing,
+    check_positive_definite,
+    unchecked,
+)
+from ..validation.checks import all_finite
 
 __all__ = [
-    "Observation", "match_delayed", "draw_members", "prior_mixtures", "prior_moments", "plan_steps", "read_observations",
+    "Observation",
+    "match_delayed",
+    "draw_members",
+    "prior_mixtures",
+    "prior_moments",
+    "plan_steps",
+    "read_observations",
     "sensor_of",
-]  # fmt: skip
+]
 
 _LISTED = list, Sequence, np.ndarray
 
@@ -66,12 +81,16 @@ def sensor_of(f: Any, reading: Observation) -> Sensor:
         return reading.sensor
     own: tuple[Sensor, ...] = f.agent_sensors[reading.agent]
     if reading.sensor >= len(own):
-        raise ValueError(f"observations: needs one of the {len(own)} sensors of agent "
-                         f"{reading.agent}, got {reading.sensor}")
+        raise ValueError(
+            f"observations: needs one of the {len(own)} sensors of agent "
+            f"{reading.agent}, got {reading.sensor}"
+        )
     return own[reading.sensor]
 
 
-def read_observations(f: Any, observations: Any, runs: tuple[int, ...], t: float) -> list[list[Observation]]:
+def read_observations(
+    f: Any, observations: Any, runs: tuple[int, ...], t: float
+) -> list[list[Observation]]:
     """What each agent of a filter observed at one time, checked.
 
     >>> from distfilt.filters import GaussianFilter
@@ -84,13 +103,19 @@ def read_observations(f: Any, observations: Any, runs: tuple[int, ...], t: float
     out: list[list[Observation]] = []
     for agent, given in enumerate(one_each(observations, f.n_agents)):
         own = f.agent_sensors[agent]
-        plain = type(given) is np.ndarray and given.dtype == np.float64 and len(own) == 1
-        if plain and given.shape == (*runs, own[0].dim) and all_finite(given):  # as nearly all are
+        plain = (
+            type(given) is np.ndarray and given.dtype == np.float64 and len(own) == 1
+        )
+        if (
+            plain and given.shape == (*runs, own[0].dim) and all_finite(given)
+        ):  # as nearly all are
             out.append([Observation.construct(t, agent, given)])
             continue
         name = f"observations[{agent}]"
         several = given if _are_readings(given) else () if given is None else (given,)
-        found = [_complete(f, _read(f, one, agent, t, name), runs, name) for one in several]
+        found = [
+            _complete(f, _read(f, one, agent, t, name), runs, name) for one in several
+        ]
         out.append([said for said in found if said is not None])
     return out
 
@@ -102,11 +127,15 @@ def one_each(observations: Any, agents: int) -> Any:
     Traceback (most recent call last):
     ValueError: observations: needs a list, one for each of 3 agents, got 2
     """
-    observations = observations.to_numpy() if hasattr(observations, "to_numpy") else observations
+    observations = (
+        observations.to_numpy() if hasattr(observations, "to_numpy") else observations
+    )
     listed = isinstance(observations, _LISTED)
     if not listed or len(observations) != agents:
         got = len(observations) if listed else type(observations).__name__
-        raise ValueError(f"observations: needs a list, one for each of {agents} agents, got {got}")
+        raise ValueError(
+            f"observations: needs a list, one for each of {agents} agents, got {got}"
+        )
     return observations
 
 
@@ -115,20 +144,31 @@ def _read(f: Any, given: Any, agent: int, t: float, name: str) -> Observation:
     if isinstance(given, Observation):
         if (given.agent, given.t) != (agent, t):
             got = f"one of agent {given.agent} at t = {given.t:g}"
-            raise ValueError(f"{name}: needs a Reading of agent {agent} at t = {t:g}, got {got}")
+            raise ValueError(
+                f"{name}: needs a Reading of agent {agent} at t = {t:g}, got {got}"
+            )
         if given.arrival_time is not None and given.arrival_time > t:
-            raise ValueError(f"{name}: needs what has arrived, got a Reading of {given.arrival_time:g}")
+            raise ValueError(
+                f"{name}: needs what has arrived, got a Reading of {given.arrival_time:g}"
+            )
         return given
     own = f.agent_sensors[agent]
     if len(own) != 1:
-        needs = "a Reading of each sensor" if own else "None for an agent without a sensor"
+        needs = (
+            "a Reading of each sensor" if own else "None for an agent without a sensor"
+        )
         raise ValueError(f"{name}: needs {needs}, got an array")
-    return Observation.construct(t, agent, check_array(given, name, (..., own[0].dim), finite=False))
+    return Observation.construct(
+        t, agent, check_array(given, name, (..., own[0].dim), finite=False)
+    )
 
 
-def _complete(f: Any, said: Observation, runs: tuple[int, ...], name: str) -> Observation | None:
+def _complete(
+    f: Any, said: Observation, runs: tuple[int, ...], name: str
+) -> Observation | None:
     """A reading with a value for each run; None if nothing of it is there."""
-    value, dim = said.value, sensor_of(f, said).dim
+    value = said.value
+    dim = sensor_of(f, said).dim
     if np.isinf(value).any():
         raise ValueError(f"{name}: needs numbers or NaN, got infinity")
     if np.isnan(value).all():
@@ -140,7 +180,9 @@ def _complete(f: Any, said: Observation, runs: tuple[int, ...], name: str) -> Ob
     return said.replace(value=np.broadcast_to(value, (*runs, dim)))
 
 
-def match_delayed(f: Any, late: Sequence[Observation], state: Any, t: float) -> list[Observation]:
+def match_delayed(
+    f: Any, late: Sequence[Observation], state: Any, t: float
+) -> list[Observation]:
     """Late readings, each at that one of the kept times to which it belongs.
 
     A sum of steps may differ by rounding, but by far less than the shortest of them.
@@ -152,46 +194,70 @@ def match_delayed(f: Any, late: Sequence[Observation], state: Any, t: float) -> 
         near = min(times, key=lambda known: abs(known - item.t), default=np.inf)
         if abs(near - item.t) > min(1e-9 * max(1.0, abs(item.t)), 1e-3 * shortest):
             known = ", ".join(f"{t:g}" for t in times) or "none (lag = 0)"
-            raise ValueError(f"delayed: needs an earlier time that is kept ({known}), got {item.t:g}")
+            raise ValueError(
+                f"delayed: needs an earlier time that is kept ({known}), got {item.t:g}"
+            )
         if item.agent >= f.n_agents:
-            raise ValueError(f"delayed: needs an agent below {f.n_agents}, got {item.agent}")
+            raise ValueError(
+                f"delayed: needs an agent below {f.n_agents}, got {item.agent}"
+            )
         if (sensor := sensor_of(f, item)).uses_previous:
-            raise ValueError(f"delayed: a {sensor.kind} sensor cannot be late, it compares two times")
+            raise ValueError(
+                f"delayed: a {sensor.kind} sensor cannot be late, it compares two times"
+            )
         said = _complete(f, item, state.runs, "delayed")
         if said is not None:
             out.append(said.replace(t=near))
     return out
 
 
-def plan_steps(f: Any, state: Any, times: Any, observations: Any) -> tuple[Array, Iterator[Any]]:
+def plan_steps(
+    f: Any, state: Any, times: Any, observations: Any
+) -> tuple[Array, Iterator[Any]]:
     """The times of a run's steps, and an iterator over what is observed at each of them.
 
     >>> from distfilt.filters import GaussianFilter
     >>> from distfilt.models import constant_velocity
     >>> from distfilt.sensors import component
-    >>> f = GaussianFilter(constant_velocity(sigma=1.0), [[component([0], std=1.0)] * 2])
-    >>> seen = [Observation(1.0, 0, [2.0], 1), Observation(0.5, 0, [3.0]), Observation(1.0, 0, [1.0])]
+    >>> f = GaussianFilter(
+    ...     constant_velocity(sigma=1.0), [[component([0], std=1.0)] * 2]
+    ... )
+    >>> seen = [
+    ...     Observation(1.0, 0, [2.0], 1),
+    ...     Observation(0.5, 0, [3.0]),
+    ...     Observation(1.0, 0, [1.0]),
+    ... ]
     >>> times, entries = plan_steps(f, f.start((np.zeros(4), np.eye(4))), None, seen)
-    >>> times, [[float(said.value[0]) for said in own] for own, in entries]
+    >>> times, [[float(said.value[0]) for said in own] for (own,) in entries]
     (array([0.5, 1. ]), [[3.0], [2.0, 1.0]])
     """
     grid = np.zeros(0) if times is None else check_array(times, "times", ("T",))
     check_increasing(grid, "times")
     entries: Iterator[Any]
     if _are_readings(observations) and (times is None or observations):
-        at: dict[float, list[list[Observation]]] = {t: [[] for _ in range(f.n_agents)] for t in grid}
+        at: dict[float, list[list[Observation]]] = {
+            t: [[] for _ in range(f.n_agents)] for t in grid
+        }
         for event in observations:
             if event.agent >= f.n_agents:
-                raise ValueError(f"observations: needs agents below {f.n_agents}, got {event.agent}")
-            at.setdefault(event.t, [[] for _ in range(f.n_agents)])[event.agent].append(event)
+                raise ValueError(
+                    f"observations: needs agents below {f.n_agents}, got {event.agent}"
+                )
+            at.setdefault(event.t, [[] for _ in range(f.n_agents)])[event.agent].append(
+                event
+            )
         grid = np.array(sorted(at))
         entries = iter([at[t] for t in grid])
     elif times is None:
-        raise ValueError("times: needs them, unless all observations are Readings, got None")
+        raise ValueError(
+            "times: needs them, unless all observations are Readings, got None"
+        )
     else:
         # A table whose columns have names would give a column where a row is asked for.
-        each = [o if o is None or isinstance(o, list | tuple) else np.atleast_1d(o)
-                for o in one_each(observations, f.n_agents)]
+        each = [
+            o if o is None or isinstance(o, list | tuple) else np.atleast_1d(o)
+            for o in one_each(observations, f.n_agents)
+        ]
         for agent, series in enumerate(each):
             if series is not None and (got := len(series)) != grid.size:
                 raise ValueError(
@@ -199,9 +265,13 @@ def plan_steps(f: Any, state: Any, times: Any, observations: Any) -> tuple[Array
                 )
             if isinstance(series, np.ndarray) and not isinstance(f.sensors, int):
                 _warn_of_degrees(f.agent_sensors[agent], series, agent)
-        entries = ([None if o is None else o[k] for o in each] for k in range(grid.size))
+        entries = (
+            [None if o is None else o[k] for o in each] for k in range(grid.size)
+        )
     if grid.size and grid[0] < state.t:
-        raise ValueError(f"times: needs times from the state's {state.t:g} on, got {grid[0]:g}")
+        raise ValueError(
+            f"times: needs times from the state's {state.t:g} on, got {grid[0]:g}"
+        )
     return grid, entries
 
 
@@ -212,24 +282,32 @@ def _warn_of_degrees(own: Sequence[Sensor], series: Array, agent: int) -> None:
         return
     y = np.nan_to_num(series.astype(np.float64))
     if (most := np.abs(y - wraps(y, 0 * y)).max(initial=0.0) / (2 * np.pi)) > 4:
-        text = f"observations[{agent}]: needs angles in rad, got some {most:.0f} turns off"
+        text = (
+            f"observations[{agent}]: needs angles in rad, got some {most:.0f} turns off"
+        )
         warnings.warn(text, RuntimeWarning, stacklevel=4)
 
 
 def _are_readings(given: Any) -> bool:
     """Whether these are events: Readings in a list, and nothing else."""
-    return isinstance(given, list | tuple) and all(isinstance(item, Observation) for item in given)
+    return isinstance(given, list | tuple) and all(
+        isinstance(item, Observation) for item in given
+    )
 
 
 def _is_pair(prior: Any) -> bool:
     """Whether this is (mean, cov), and no list of two members."""
-    if type(prior) is list and any(type(p) is tuple and np.ndim(p[-1]) > 1 for p in prior):
+    if type(prior) is list and any(
+        type(p) is tuple and np.ndim(p[-1]) > 1 for p in prior
+    ):
         raise ValueError("prior: needs one for all agents, got a list of (mean, cov)")
     pair = isinstance(prior, tuple | list) and len(prior) == 2
     return pair and (isinstance(prior, tuple) or np.ndim(prior[0]) < np.ndim(prior[1]))
 
 
-def prior_moments(prior: Any, dim: int, word: str = "semidefinite") -> tuple[Array, Array]:
+def prior_moments(
+    prior: Any, dim: int, word: str = "semidefinite"
+) -> tuple[Array, Array]:
     """Mean (d,) and covariance (d, d), definite or semidefinite, of a prior that has them.
 
     >>> from scipy.stats import multivariate_normal
@@ -245,22 +323,33 @@ def prior_moments(prior: Any, dim: int, word: str = "semidefinite") -> tuple[Arr
         mean, cov = prior
     elif callable(prior) or np.ndim(prior) != 2:
         got = "a function" if callable(prior) else type(prior).__name__
-        raise ValueError(f"prior: needs (mean, cov) or what has a mean and a covariance, got {got}")
+        raise ValueError(
+            f"prior: needs (mean, cov) or what has a mean and a covariance, got {got}"
+        )
     else:
         members = check_array(prior, "prior", ("N", dim))
         if len(members) <= dim:
-            raise ValueError(f"prior: needs more than {dim} members, got {len(members)}")
-        mean, cov = members.mean(axis=0), sample_covariance(members)
+            raise ValueError(
+                f"prior: needs more than {dim} members, got {len(members)}"
+            )
+        mean = members.mean(axis=0)
+        cov = sample_covariance(members)
     mean = check_array(np.atleast_1d(mean), "prior", (dim,))
     cov = check_array(cov, "prior")
     if cov.shape != (dim, dim) and not dim == cov.size == 1:
-        raise ValueError(f"prior: needs a covariance of shape {(dim, dim)}, got {cov.shape}")
+        raise ValueError(
+            f"prior: needs a covariance of shape {(dim, dim)}, got {cov.shape}"
+        )
     check_positive_definite(cov := cov.reshape(dim, dim), "prior", word)
     return mean, cov
 
 
 def draw_members(
-    prior: Any, members: int, leading: tuple[int, ...], dim: int, rng: np.random.Generator
+    prior: Any,
+    members: int,
+    leading: tuple[int, ...],
+    dim: int,
+    rng: np.random.Generator,
 ) -> Array:
     """Members (*leading, N, d) of a prior of any kind that :meth:`Filter.start` lists.
 
@@ -290,11 +379,17 @@ def prior_mixtures(prior: Any, dim: int, count: int) -> tuple[GaussianMixture, .
     """
     given = prior if isinstance(prior, list) else [prior] * count
     if len(given) != count:
-        raise ValueError(f"prior: needs one for all or for each of {count}, got {len(given)}")
+        raise ValueError(
+            f"prior: needs one for all or for each of {count}, got {len(given)}"
+        )
     out = []
     for one in given:
         mixed = isinstance(one, GaussianMixture)
-        out.append(one if mixed else GaussianMixture.gaussian(*prior_moments(one, dim, "definite")))
+        out.append(
+            one
+            if mixed
+            else GaussianMixture.gaussian(*prior_moments(one, dim, "definite"))
+        )
         if out[-1].dim != dim:
             raise ValueError(f"prior: needs dimension {dim}, got {out[-1].dim}")
     return tuple(out)

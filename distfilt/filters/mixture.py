@@ -8,10 +8,10 @@ from typing import Annotated, Any, ClassVar
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveInt, unchecked
 from ..mixtures import GaussianMixture, runnalls
 from ..mixtures.conditioning import propagate_mixture, update_mixture, within_gate
 from ..mixtures.splitting import split_nonlinear
+from ..validation import Array, Bounds, PositiveInt, unchecked
 from .base import Filter
 from .inputs import Observation, prior_mixtures, sensor_of
 from .record import Summary
@@ -93,8 +93,13 @@ class MixtureFilter(Filter):
     >>> from distfilt.network import graphs
     >>> from distfilt.sensors import component
     >>> still = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
-    >>> f = MixtureFilter(still, [component([0], std=1.0), None], graphs.path(2),
-    ...                   target_dim=1, fusion=partial(target_fusion, target_dim=1))
+    >>> f = MixtureFilter(
+    ...     still,
+    ...     [component([0], std=1.0), None],
+    ...     graphs.path(2),
+    ...     target_dim=1,
+    ...     fusion=partial(target_fusion, target_dim=1),
+    ... )
     >>> prior = GaussianMixture.gaussian([0.0, 0.0], [[1.0, 0.5], [0.5, 1.0]])
     >>> after = f.step(f.start([prior, prior]), 1.0, [[2.0], None])
     >>> after.mixtures[1].means.round(4), after.ledger.scalars
@@ -133,7 +138,9 @@ class MixtureFilter(Filter):
         Bounds(at_most=self.model.dim)(self.target_dim, "target_dim")
         Bounds(at_least=self.n_components)(self.max_components, "max_components")
 
-    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(
+        self, prior: Any, runs: tuple[int, ...], rng: Any
+    ) -> dict[str, Any]:
         """A mixture for each agent."""
         return {"mixtures": prior_mixtures(prior, self.model.dim, self.n_agents)}
 
@@ -142,43 +149,66 @@ class MixtureFilter(Filter):
         beliefs = [self._moved(b, k, step) for k, b in enumerate(step.state.mixtures)]
         after, untold = self._told(beliefs, step)
         # Without the square roots that they came with: a loaded state has none.
-        size, exact, agents = self.n_components, max(_EXACT, self.n_components), len(after)
-        plain = [None if b is None else unchecked(runnalls)(b, size, heaviest=exact).replace()
-                 for b in (*after, *untold)]  # fmt: skip
+        size = self.n_components
+        exact = max(_EXACT, self.n_components)
+        agents = len(after)
+        plain = [
+            None
+            if b is None
+            else unchecked(runnalls)(b, size, heaviest=exact).replace()
+            for b in (*after, *untold)
+        ]
         return step.end(mixtures=tuple(plain[:agents]), unsent=tuple(plain[agents:]))
 
     def summarize(self, state: MixtureState) -> Summary:
         """Means, variances and covariances of the whole mixtures, and their sizes."""
         moments = [belief.moments() for belief in state.mixtures]
         mean, cov = (np.array(part) for part in zip(*moments, strict=True))
-        sizes = np.array([belief.n_components for belief in state.mixtures], dtype=np.float64)
+        sizes = np.array(
+            [belief.n_components for belief in state.mixtures], dtype=np.float64
+        )
         variance = np.diagonal(cov, axis1=-2, axis2=-1)
         return Summary(mean, variance, cov, numbers={"mixands": sizes})
 
-    def _moved(self, belief: GaussianMixture, agent: int, step: Step) -> GaussianMixture:
+    def _moved(
+        self, belief: GaussianMixture, agent: int, step: Step
+    ) -> GaussianMixture:
         """Split where the model stretches, then forecast every mixand.
 
         >>> from distfilt.models import Model
-        >>> later = Model(1, lambda x, t, dt: x + t * dt, lambda t, dt: np.zeros((1, 1)))
+        >>> later = Model(
+        ...     1, lambda x, t, dt: x + t * dt, lambda t, dt: np.zeros((1, 1))
+        ... )
         >>> f = MixtureFilter(later, [None], target_dim=1)
         >>> f.step(f.start(([0.0], [[1.0]]), t=2.0), 3.0, [None]).mixtures[0].means
         array([[2.]])
         """
-        t, dt, model = step.state.t, step.dt, self.model
+        t = step.state.t
+        dt = step.dt
+        model = self.model
         if dt == 0:
             return belief
-        flow, derivative = unchecked(model.step), unchecked(model.jacobian)
+        flow = unchecked(model.step)
+        derivative = unchecked(model.jacobian)
         with step.failing_as(agent):
             if self.split_threshold is not None:
                 belief = unchecked(split_nonlinear)(
-                    belief, lambda x: derivative(x, t, dt), max_components=self.max_components,
-                    split_threshold=self.split_threshold, scale=self.split_scale,
+                    belief,
+                    lambda x: derivative(x, t, dt),
+                    max_components=self.max_components,
+                    split_threshold=self.split_threshold,
+                    scale=self.split_scale,
                 )
             root = unchecked(model.noise_sqrt)(t, dt)
             return propagate_mixture(belief, lambda x: flow(x, t, dt), root)
 
     def _read(
-        self, belief: Any, agent: int, said: Sequence[Observation], step: Step, beside: Any = None
+        self,
+        belief: Any,
+        agent: int,
+        said: Sequence[Observation],
+        step: Step,
+        beside: Any = None,
     ) -> tuple[Any, Any]:
         """An agent's belief after readings, without those that fail its gate, and one beside it.
 
@@ -188,23 +218,39 @@ class MixtureFilter(Filter):
         >>> eyes = [component([k], std=1.0) for k in range(2)]
         >>> f = MixtureFilter(still, [eyes], target_dim=2, gate_probability=0.99)
         >>> state = f.start((np.zeros(2), np.eye(2)))
-        >>> state = f.step(state, 0.0, [[Observation(0.0, 0, [9.0]), Observation(0.0, 0, [1.0], 1)]])
+        >>> state = f.step(
+        ...     state,
+        ...     0.0,
+        ...     [[Observation(0.0, 0, [9.0]), Observation(0.0, 0, [1.0], 1)]],
+        ... )
         >>> state.mixtures[0].means, state.rejected
         (array([[0. , 0.5]]), array([1.]))
         """
         from scipy.special import gammaincinv
 
         for reading in said:
-            sensor, y = sensor_of(self, reading), reading.value
+            sensor = sensor_of(self, reading)
+            y = reading.value
             about: Any = unchecked(sensor.predict), sensor.noise_cov
             residual = unchecked(sensor.residual)
             with step.failing_as(agent):
                 if self.gate_probability is not None:
-                    width = float(np.sqrt(2 * gammaincinv((~np.isnan(y)).sum() / 2, self.gate_probability)))
+                    width = float(
+                        np.sqrt(
+                            2
+                            * gammaincinv(
+                                (~np.isnan(y)).sum() / 2, self.gate_probability
+                            )
+                        )
+                    )
                     y = within_gate(belief, y, *about, gate=width, residual=residual)
                 belief = update_mixture(belief, y, *about, residual=residual)
                 # What passes the gate counts for both, or one would hold it to be news.
-                beside = None if beside is None else update_mixture(beside, y, *about, residual=residual)
+                beside = (
+                    None
+                    if beside is None
+                    else update_mixture(beside, y, *about, residual=residual)
+                )
             if step.rejected is not None:
                 step.rejected[agent] += np.isnan(y).all()
         return belief, beside
@@ -219,21 +265,35 @@ class MixtureFilter(Filter):
         >>> from distfilt.models import Model
         >>> from distfilt.network import Faults, graphs
         >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-        >>> f = MixtureFilter(still, [None] * 3, graphs.path(3), target_dim=1,
-        ...                   fusion=partial(target_fusion, target_dim=1),
-        ...                   faults=Faults(silent=[0]))
+        >>> f = MixtureFilter(
+        ...     still,
+        ...     [None] * 3,
+        ...     graphs.path(3),
+        ...     target_dim=1,
+        ...     fusion=partial(target_fusion, target_dim=1),
+        ...     faults=Faults(silent=[0]),
+        ... )
         >>> f.step(f.start(([0.0], [[1.0]])), 1.0, [None] * 3).ledger.messages
         array([0, 1, 1])
         """
-        after = [self._read(b, k, step.observations[k], step)[0] for k, b in enumerate(beliefs)]
+        after = [
+            self._read(b, k, step.observations[k], step)[0]
+            for k, b in enumerate(beliefs)
+        ]
         return (self._agreed(after, step) if step.has_fusion else after), ()
 
-    def _agreed(self, beliefs: list[GaussianMixture], step: Step) -> list[GaussianMixture]:
+    def _agreed(
+        self, beliefs: list[GaussianMixture], step: Step
+    ) -> list[GaussianMixture]:
         """What the rule of agreement makes of the beliefs."""
         out = list(step.filter.fusion(beliefs, step.channel))
         for k, (fused, belief) in enumerate(zip(out, beliefs, strict=True)):
             if not isinstance(fused, GaussianMixture) or fused.dim != belief.dim:
-                got = fused.dim if isinstance(fused, GaussianMixture) else type(fused).__name__
+                got = (
+                    fused.dim
+                    if isinstance(fused, GaussianMixture)
+                    else type(fused).__name__
+                )
                 raise ValueError(f"fusion: needs dimension {belief.dim}, got {got}")
             with step.failing_as(k):
                 fused.factors  # noqa: B018  # a LinAlgError where the fusion has collapsed

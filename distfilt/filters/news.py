@@ -8,9 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveInt, NonNegativeInt, validated
 from ..mixtures import GaussianMixture
 from ..mixtures.conditioning import update_mixture
+from ..validation import Array, Bounds, NonNegativeInt, PositiveInt, validated
 from .inputs import Observation, sensor_of
 from .mixture import MixtureFilter
 from .step import Step
@@ -49,7 +49,8 @@ def information_increment(before: GaussianMixture, after: GaussianMixture) -> Ar
     >>> np.abs(information_increment(old, new))
     array([[1., 0., 2.]])
     """
-    one, two = before.moment_match(), after.moment_match()
+    one = before.moment_match()
+    two = after.moment_match()
     if one.dim != two.dim:
         raise ValueError(f"after: needs dimension {one.dim}, got {two.dim}")
     # In the frame in which the old covariance is the identity.
@@ -57,7 +58,8 @@ def information_increment(before: GaussianMixture, after: GaussianMixture) -> Ar
     _, size, axes = np.linalg.svd(narrower)
     gain = size**2 - 1
     learned = gain > _NOTHING
-    root, axes = np.sqrt(gain[learned]), axes[learned]
+    root = np.sqrt(gain[learned])
+    axes = axes[learned]
     moved = axes @ np.linalg.solve(one.factors[0], two.means[0] - one.means[0])
     rows = root[:, None] * np.linalg.solve(one.factors[0].T, axes.T).T
     values = rows @ one.means[0] + size[learned] ** 2 / root * moved
@@ -107,7 +109,9 @@ class InformationIncrementFilter(MixtureFilter):
     >>> from distfilt.network import graphs
     >>> from distfilt.sensors import component
     >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-    >>> f = InformationIncrementFilter(still, [component([0], std=1.0)] * 2, graphs.path(2), target_dim=1)
+    >>> f = InformationIncrementFilter(
+    ...     still, [component([0], std=1.0)] * 2, graphs.path(2), target_dim=1
+    ... )
     >>> prior = GaussianMixture.gaussian([0.0], [[1.0]])
     >>> after = f.step(f.start([prior, prior]), 1.0, [[3.0], [0.0]])
     >>> [float(m.means[0, 0].round(9)) for m in after.mixtures], after.ledger.scalars
@@ -121,7 +125,8 @@ class InformationIncrementFilter(MixtureFilter):
 
     belief_kind: ClassVar[None] = None
     unsupported: ClassVar[dict[str, str]] = {
-        **MixtureFilter.unsupported, "fusion": "news are added, so that there is nothing to agree on"
+        **MixtureFilter.unsupported,
+        "fusion": "news are added, so that there is nothing to agree on",
     }
 
     def check_parts(self) -> None:
@@ -130,7 +135,9 @@ class InformationIncrementFilter(MixtureFilter):
         if self.graph is None:
             raise ValueError("graph: needs a Graph, got None")
         least = min((s.dim for own in self.agent_sensors for s in own), default=0)
-        Bounds(below=least)(max(self.shared_components, default=-1), "shared_components")
+        Bounds(below=least)(
+            max(self.shared_components, default=-1), "shared_components"
+        )
 
     def _told(
         self, beliefs: list[GaussianMixture], step: Step
@@ -143,20 +150,35 @@ class InformationIncrementFilter(MixtureFilter):
         >>> from distfilt.network import graphs
         >>> from distfilt.sensors import component, stack
         >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-        >>> f = InformationIncrementFilter(still, [stack([component([0], std=1.0)] * 2)] * 2, graphs.path(2),
-        ...                target_dim=1, shared_components=[1], gate_probability=0.99, exchange_interval=2.0)
-        >>> state = f.step(f.start(([0.0], [[1.0]])), 1.0, [[1.0, 99.0], [np.nan, 99.0]])
+        >>> f = InformationIncrementFilter(
+        ...     still,
+        ...     [stack([component([0], std=1.0)] * 2)] * 2,
+        ...     graphs.path(2),
+        ...     target_dim=1,
+        ...     shared_components=[1],
+        ...     gate_probability=0.99,
+        ...     exchange_interval=2.0,
+        ... )
+        >>> state = f.step(
+        ...     f.start(([0.0], [[1.0]])), 1.0, [[1.0, 99.0], [np.nan, 99.0]]
+        ... )
         >>> [m.means[0] for m in f.step(state, 2.0, [None, None]).mixtures]
         [array([0.5]), array([0.5])]
         """
-        own, alike = zip(*(self._parted(said) for said in step.observations), strict=True)
+        own, alike = zip(
+            *(self._parted(said) for said in step.observations), strict=True
+        )
         after = [self._read(b, k, own[k], step)[0] for k, b in enumerate(beliefs)]
         # What an agent would believe without what it has not told: from before the readings of now,
         # or from before those that wait.
         waiting = step.state.unsent or (None,) * len(beliefs)
         untold = [
-            (old if new is not old else None) if kept is None else self._moved(kept, k, step)
-            for k, (old, new, kept) in enumerate(zip(beliefs, after, waiting, strict=True))
+            (old if new is not old else None)
+            if kept is None
+            else self._moved(kept, k, step)
+            for k, (old, new, kept) in enumerate(
+                zip(beliefs, after, waiting, strict=True)
+            )
         ]
         if step.channel is not None:
             self._exchanged(after, untold, step)
@@ -165,18 +187,26 @@ class InformationIncrementFilter(MixtureFilter):
         return after, untold if any(before is not None for before in untold) else ()
 
     def _exchanged(
-        self, after: list[GaussianMixture], untold: list[GaussianMixture | None], step: Step
+        self,
+        after: list[GaussianMixture],
+        untold: list[GaussianMixture | None],
+        step: Step,
     ) -> None:
         """Tell what was learned to those who listen, and learn from them, in place."""
-        channel, part = step.channel, range(self.target_dim)
+        channel = step.channel
+        part = range(self.target_dim)
         said: list[Array | None] = [None] * len(after)
         # Whose radio is off tells later, and so does one whom nobody could hear.
         on = channel.faults.speaking(channel.graph, channel.ledger.rounds, channel.t)
-        for k, listeners in enumerate(np.bincount(channel.graph.senders[on], minlength=len(said))):
+        for k, listeners in enumerate(
+            np.bincount(channel.graph.senders[on], minlength=len(said))
+        ):
             before = untold[k]
             if before is not None and listeners:
                 with step.failing_as(k):
-                    news = information_increment(before.marginal(part), after[k].marginal(part))
+                    news = information_increment(
+                        before.marginal(part), after[k].marginal(part)
+                    )
                 # Numbers that are not zero by construction, 13 for two rows of six.
                 if news.size:  # too little is told with what is learned next
                     said[k] = news[np.triu_indices(len(news), 0, news.shape[1])]
@@ -189,14 +219,18 @@ class InformationIncrementFilter(MixtureFilter):
                     after[k] = _learned(after[k], news)
                     untold[k] = None if before is None else _learned(before, news)
 
-    def _parted(self, said: Sequence[Observation]) -> tuple[list[Observation], list[Observation]]:
+    def _parted(
+        self, said: Sequence[Observation]
+    ) -> tuple[list[Observation], list[Observation]]:
         """Readings without and with nothing but the common components; none where none is left."""
         own: list[Observation] = []
         alike: list[Observation] = []
         for reading in said:
             everybody = np.isin(np.arange(reading.value.size), self.shared_components)
             if sensor_of(self, reading).noise_cov[np.ix_(everybody, ~everybody)].any():
-                raise ValueError("common: needs noise of its own, got some that others share")
+                raise ValueError(
+                    "common: needs noise of its own, got some that others share"
+                )
             for part, gone in ((own, everybody), (alike, ~everybody)):
                 left = np.where(gone, np.nan, reading.value)
                 if not np.isnan(left).all():
@@ -214,5 +248,8 @@ def _unpacked(numbers: Array, n: int) -> Array:
 
 def _learned(belief: GaussianMixture, news: Array) -> GaussianMixture:
     """A belief after news of its first components."""
-    rows, values = news[:, :-1], news[:, -1]
-    return update_mixture(belief, values, lambda x: x[..., : rows.shape[1]] @ rows.T, np.eye(values.size))
+    rows = news[:, :-1]
+    values = news[:, -1]
+    return update_mixture(
+        belief, values, lambda x: x[..., : rows.shape[1]] @ rows.T, np.eye(values.size)
+    )

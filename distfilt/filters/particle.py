@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ..validation import Array, Mask, UnitInterval, unchecked
 from ..updates import particles
+from ..validation import Array, Mask, UnitInterval, unchecked
 from .ensemble import MembersFilter, Several, regress_past
 from .inbox import Received
 from .record import Summary
@@ -37,8 +37,13 @@ class ParticleState(SensorState):
     Examples
     --------
     >>> from distfilt.network import Ledger
-    >>> state = ParticleState(0.0, Ledger.empty(1), np.random.default_rng(0),
-    ...                       np.zeros((1, 5, 3)), np.full((1, 5), -np.log(5)))
+    >>> state = ParticleState(
+    ...     0.0,
+    ...     Ledger.empty(1),
+    ...     np.random.default_rng(0),
+    ...     np.zeros((1, 5, 3)),
+    ...     np.full((1, 5), -np.log(5)),
+    ... )
     >>> state.runs
     ()
     """
@@ -102,10 +107,15 @@ class ParticleFilter(MembersFilter):
     state_class: ClassVar[type[ParticleState]] = ParticleState
     batched_summary: ClassVar[bool] = True
 
-    def initial_state(self, prior: Any, runs: tuple[int, ...], rng: Any) -> dict[str, Any]:
+    def initial_state(
+        self, prior: Any, runs: tuple[int, ...], rng: Any
+    ) -> dict[str, Any]:
         """Particles drawn for each agent, with equal weights."""
         points = self.draw_prior(prior, (*runs, self.n_agents), rng)
-        return {"particles": points, "log_weights": np.full(points.shape[:-1], -np.log(self.members))}
+        return {
+            "particles": points,
+            "log_weights": np.full(points.shape[:-1], -np.log(self.members)),
+        }
 
     def next_state(self, step: Step) -> Any:
         """Resample where it is due, forecast, weigh by what was heard, agree.
@@ -119,23 +129,37 @@ class ParticleFilter(MembersFilter):
         state = step.state
         stack = step.stack(state.particles)
         weights = self._resampled(stack, state, step)
-        old = stack[-1]  # where each particle comes from, which is not where it was in the state
+        old = stack[
+            -1
+        ]  # where each particle comes from, which is not where it was in the state
         if step.dt:
-            moved = unchecked(self.model.sample_step)(stack[-1], state.t, step.dt, rng=step.rng)
+            moved = unchecked(self.model.sample_step)(
+                stack[-1], state.t, step.dt, rng=step.rng
+            )
             stack[-1] = step.check_forecast(moved, stack[-1])
         for place, group in step.received():
             rows = group.rows
             before = step.before(place, group, [old] if step.dt else stack[:-1])
             predicted = group.predict(stack[place][..., rows, :, :], before)
             logs = weights[..., rows, :]
-            group = step.gate(group, lambda x, w: weighted_moments(x, np.exp(w)), predicted, logs)
+            group = step.gate(
+                group, lambda x, w: weighted_moments(x, np.exp(w)), predicted, logs
+            )
             step.record_failures(_weigh(weights, predicted, group), group.agents)
         if step.has_fusion:
             # The particles have to be an ensemble, which the agreement can move.
             offset = step.rng.random((*weights.shape[:-1], 1))
-            self._pick(stack, weights, np.exp(weights), np.ones(weights.shape[:-1], bool), offset)
+            self._pick(
+                stack,
+                weights,
+                np.exp(weights),
+                np.ones(weights.shape[:-1], bool),
+                offset,
+            )
         (now,) = step.fuse(stack[-1])
-        after = step.end(particles=now, log_weights=weights, past=regress_past(stack, now))
+        after = step.end(
+            particles=now, log_weights=weights, past=regress_past(stack, now)
+        )
         self._warn(after)
         return after
 
@@ -144,25 +168,40 @@ class ParticleFilter(MembersFilter):
         w = state.weights
         mean, cov = weighted_moments(state.particles, w)
         cov = state.mask_failed(cov)
-        sizes, distinct = state.effective_size, particles.distinct_fraction(state.particles)
-        numbers = {"effective_size": state.mask_failed(sizes), "distinct": state.mask_failed(distinct)}
+        sizes = state.effective_size
+        distinct = particles.distinct_fraction(state.particles)
+        numbers = {
+            "effective_size": state.mask_failed(sizes),
+            "distinct": state.mask_failed(distinct),
+        }
         variance = np.diagonal(cov, axis1=-2, axis2=-1)
-        return Summary(state.mask_failed(mean), variance, cov, state.particles, w, numbers)
+        return Summary(
+            state.mask_failed(mean), variance, cov, state.particles, w, numbers
+        )
 
     def _resampled(self, stack: list[Array], state: ParticleState, step: Step) -> Array:
         """Log-weights after agents with a poor effective size have resampled, in place.
 
         >>> from distfilt.models import constant_velocity
-        >>> f = ParticleFilter(constant_velocity(sigma=1.0), [None] * 2, share_observations=False, members=4,
-        ...                    ess_threshold=0.9, jitter=0.5)
+        >>> f = ParticleFilter(
+        ...     constant_velocity(sigma=1.0),
+        ...     [None] * 2,
+        ...     share_observations=False,
+        ...     members=4,
+        ...     ess_threshold=0.9,
+        ...     jitter=0.5,
+        ... )
         >>> state = f.start((np.zeros(4), np.eye(4)), rng=np.random.default_rng(0))
         >>> fine, poor = state.log_weights[0], np.log([0.7, 0.1, 0.1, 0.1])
-        >>> moved = [f.step(state.replace(log_weights=np.array([w, poor])), 0.0, [None] * 2)
-        ...          for w in (fine, poor)]
+        >>> moved = [
+        ...     f.step(state.replace(log_weights=np.array([w, poor])), 0.0, [None] * 2)
+        ...     for w in (fine, poor)
+        ... ]
         >>> (moved[0].particles == moved[1].particles).all(axis=(1, 2))
         array([False,  True])
         """
-        weights, before = state.log_weights.copy(), stack[-1]
+        weights = state.log_weights.copy()
+        before = stack[-1]
         # Everybody draws, needed or not: an agent's luck must not depend on another's weights.
         offset = step.rng.random((*weights.shape[:-1], 1))
         width = self._bandwidth(state.t, step.dt)
@@ -176,8 +215,12 @@ class ParticleFilter(MembersFilter):
             lost = state.effective_size[poor][:, None] < 2
             shares = np.where(lost, 1 / self.members, state.weights[poor])
             cov = weighted_moments(before[poor], shares)[1]
-            copied = particles.repeat_by_count((counts > 1)[..., None], counts).reshape(-1, self.members)
-            stack[-1][poor] = particles.add_jitter(stack[-1][poor], cov, width, noise[poor], copied)
+            copied = particles.repeat_by_count((counts > 1)[..., None], counts).reshape(
+                -1, self.members
+            )
+            stack[-1][poor] = particles.add_jitter(
+                stack[-1][poor], cov, width, noise[poor], copied
+            )
         return weights
 
     def _bandwidth(self, t: float, dt: float) -> float:
@@ -188,7 +231,12 @@ class ParticleFilter(MembersFilter):
         return particles.silverman(self.members, self.model.dim) if still else 0.0
 
     def _pick(
-        self, stack: list[Array], log_weights: Array, weights: Array, poor: Mask, offset: Array
+        self,
+        stack: list[Array],
+        log_weights: Array,
+        weights: Array,
+        poor: Mask,
+        offset: Array,
     ) -> Any:
         """Resample some agents' paths in the stack; the weights are equal then."""
         rows = slice(None) if poor.all() else poor
@@ -207,21 +255,35 @@ class ParticleFilter(MembersFilter):
         >>> import warnings
         >>> from distfilt.models import constant_velocity
         >>> from distfilt.network import Ledger
-        >>> f = ParticleFilter(constant_velocity(sigma=1.0), [None] * 2, share_observations=False, members=200)
+        >>> f = ParticleFilter(
+        ...     constant_velocity(sigma=1.0),
+        ...     [None] * 2,
+        ...     share_observations=False,
+        ...     members=200,
+        ... )
         >>> apart = np.random.default_rng(0).standard_normal((2, 200, 4))
         >>> for moved in ([1.0, 0.0], [1.0, 1.0]):  # the first components are known
         ...     points = apart * np.array(moved)[:, None, None] * [0, 1, 1, 1]
         ...     with warnings.catch_warnings(record=True) as caught:
         ...         warnings.simplefilter("always")
-        ...         f._warn(ParticleState(1.0, Ledger.empty(2), None, points,
-        ...                               np.full((2, 200), -np.log(200))))
+        ...         f._warn(
+        ...             ParticleState(
+        ...                 1.0,
+        ...                 Ledger.empty(2),
+        ...                 None,
+        ...                 points,
+        ...                 np.full((2, 200), -np.log(200)),
+        ...             )
+        ...         )
         ...     [str(w.message)[:47] for w in caught]
         ["t = 1 s: 0.50% of an agent's particles are dist"]
         []
         """
-        points, size = state.particles, state.effective_size
+        points = state.particles
+        size = state.effective_size
         if np.count_nonzero(state.failed):
-            points, size = points[~state.failed], size[~state.failed]
+            points = points[~state.failed]
+            size = size[~state.failed]
         least = max(0.01 * self.members, 2.0)
         # A few whose first components differ are proof enough; all are looked at where they do not.
         few = np.sort(points[..., :: max(1, self.members // (4 * math.ceil(least))), 0])
@@ -246,12 +308,17 @@ def weighted_moments(points: Array, w: Array) -> tuple[Array, Array]:
     return mean, (w[..., None, :] * around) @ around.mT
 
 
-def _weigh(weights: Array, predicted: Array, group: Received) -> dict[tuple[int, ...], str]:
+def _weigh(
+    weights: Array, predicted: Array, group: Received
+) -> dict[tuple[int, ...], str]:
     """Multiply a group's weights by the likelihood, in place; the rows that failed."""
     old = weights[..., group.rows, :]
     (new,), errors = run_isolated(
         lambda h, y, w, noise, _: (particles.reweight(w, h, y, noise),),
-        (predicted, group.target, old), (old,), group.target.ndim - 1, shared=group.noise,
+        (predicted, group.target, old),
+        (old,),
+        group.target.ndim - 1,
+        shared=group.noise,
     )
     weights[..., group.rows, :] = new
     return errors

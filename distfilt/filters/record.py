@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ..validation import Array, check_array, unchecked
 from ..ensembles import sample_covariance
 from ..linalg import cholesky, in_units, quadratic_form
 from ..metrics import crps, gaussian_crps
+from ..validation import Array, check_array, unchecked
 from .saving import State, stack_states
 
 if TYPE_CHECKING:
@@ -37,9 +37,15 @@ _MEANING = {
     "covariance": ("covariance of the estimate", "of both components, multiplied"),
     "spread": ("root of the sum of all variances, whatever their units", "mixed"),
     "squared_error": ("squared error of the estimate", "of the component, squared"),
-    "total_squared_error": ("squared errors added over components, whatever their units", "mixed"),
+    "total_squared_error": (
+        "squared errors added over components, whatever their units",
+        "mixed",
+    ),
     "crps": ("continuous ranked probability score", "of the component"),
-    "nees": ("normalised estimation error squared; its mean is d for a consistent filter", "1"),
+    "nees": (
+        "normalised estimation error squared; its mean is d for a consistent filter",
+        "1",
+    ),
     "rejected": ("readings that the gate left out in this step", "1"),
 }
 
@@ -89,7 +95,11 @@ class Summary:
 
 
 def record_run(
-    filter_: Any, times: Array, start: Any, said: Iterable[tuple[Any, Any]], truth: Any,
+    filter_: Any,
+    times: Array,
+    start: Any,
+    said: Iterable[tuple[Any, Any]],
+    truth: Any,
     scores: Collection[Score],
 ) -> xarray.Dataset:
     """One Dataset of states, each with what it is believed as; `start` is the one before.
@@ -106,7 +116,9 @@ def record_run(
     n = len(start.runs)
     lead = ("time", *(("run",) if n == 1 else [f"run{i}" for i in range(n)]), "agent")
     axes = {"covariance": (*lead, "component", "column")}
-    axes |= {k: (*lead, "component") for k in ("mean", "variance", "squared_error", "crps")}
+    axes |= {
+        k: (*lead, "component") for k in ("mean", "variance", "squared_error", "crps")
+    }
     data = {}
     for name, values in series.items():
         meaning, unit = _MEANING.get(name, (name.replace("_", " "), "1"))
@@ -114,7 +126,9 @@ def record_run(
     for name in _SENT:
         data |= _counted(name, [getattr(ledger, name) for ledger in ledgers])
     coords = {
-        "time": ("time", times, {"units": "s"}), "agent": agents, "component": list(names),
+        "time": ("time", times, {"units": "s"}),
+        "agent": agents,
+        "component": list(names),
         "unit": ("component", list(units)),
     }
     out = xarray.Dataset(data, coords=coords)
@@ -125,7 +139,11 @@ def record_run(
 
 
 def _followed(
-    filter_: Any, last: Any, said: Iterable[tuple[Any, Any]], known: Array | None, at: Any,
+    filter_: Any,
+    last: Any,
+    said: Iterable[tuple[Any, Any]],
+    known: Array | None,
+    at: Any,
     scores: Collection[Score],
 ) -> tuple[dict[str, Array], list[Any], Any]:
     """What is recorded of all states, along a first axis, their ledgers, and the last one."""
@@ -133,28 +151,40 @@ def _followed(
     ledgers = [last.ledger]
     for block in _blocks(said, filter_.batched_summary):
         states, believed = zip(*block, strict=True)
-        done, several, last = len(ledgers) - 1, len(block) > 1, states[-1]
+        done = len(ledgers) - 1
+        several = len(block) > 1
+        last = states[-1]
         ledgers += [state.ledger for state in states]
         summary = filter_.summarize(stack_states(believed) if several else believed[0])
         row = {"mean": summary.mean, "variance": summary.variance, **summary.numbers}
         if summary.covariance is not None:
             row["covariance"] = summary.covariance
         if last.rejected is not None:
-            row["rejected"] = np.array([s.rejected for s in states]) if several else last.rejected
+            row["rejected"] = (
+                np.array([s.rejected for s in states]) if several else last.rejected
+            )
         if known is not None:
             true = known[done : len(ledgers) - 1] if several else known[done]
             row |= _scored(summary, true, at, scores)
-        rows.append(row if several else {name: value[None] for name, value in row.items()})
-    series = {name: np.concatenate([row[name] for row in rows]) for name in (rows or [{}])[0]}
+        rows.append(
+            row if several else {name: value[None] for name, value in row.items()}
+        )
+    series = {
+        name: np.concatenate([row[name] for row in rows]) for name in (rows or [{}])[0]
+    }
     if series:
         spread = np.sqrt(np.nansum(variance := series["variance"], axis=-1))
         series["spread"] = np.where(np.isnan(variance).all(axis=-1), np.nan, spread)
     return series, ledgers, last
 
 
-def _blocks(said: Iterable[tuple[Any, Any]], joins: bool) -> Iterator[list[tuple[Any, Any]]]:
+def _blocks(
+    said: Iterable[tuple[Any, Any]], joins: bool
+) -> Iterator[list[tuple[Any, Any]]]:
     """Small states of one shape together: what is recorded of them takes one call."""
-    for shape, alike in groupby(said, lambda pair: pair[1].belief.shape if joins else (_BLOCK,)):
+    for shape, alike in groupby(
+        said, lambda pair: pair[1].belief.shape if joins else (_BLOCK,)
+    ):
         while block := [*islice(alike, max(1, _BLOCK // math.prod(shape)))]:
             yield block
 
@@ -173,36 +203,58 @@ def _known(
             return x[..., None, :], slice(None)
         if x.shape != (*shape, agents, len(names)):
             needs = f"shape {(*shape, len(names))}, one for each of {agents} agents, or a dict of "
-            raise ValueError(f"truth: needs {needs}those components that are known, got {x.shape}")
+            raise ValueError(
+                f"truth: needs {needs}those components that are known, got {x.shape}"
+            )
         return x, slice(None)
     unknown = [name for name in truth if name not in names]
     if unknown or not truth:
-        raise ValueError(f"truth: needs components of {', '.join(names)}, got {unknown}")
+        raise ValueError(
+            f"truth: needs components of {', '.join(names)}, got {unknown}"
+        )
     whole = np.full((*shape, agents, len(names)), np.nan)
     for name, given in truth.items():
         x = check_array(given, f"truth[{name!r}]", None)
-        x = x[..., None] if x.shape == shape else check_array(x, "truth", (*shape, agents))
+        x = (
+            x[..., None]
+            if x.shape == shape
+            else check_array(x, "truth", (*shape, agents))
+        )
         whole[..., names.index(name)] = x
     return whole, [names.index(name) for name in truth]
 
 
-def _scored(summary: Summary, known: Array, at: Any, scores: Collection[Score]) -> dict[str, Array]:
+def _scored(
+    summary: Summary, known: Array, at: Any, scores: Collection[Score]
+) -> dict[str, Array]:
     out: dict[str, Array] = {}
-    mean, some = summary.mean, summary.members
+    mean = summary.mean
+    some = summary.members
     known = np.broadcast_to(known, mean.shape)
-    good: Any = np.isfinite(mean[..., at]).all(axis=-1) & np.isfinite(known[..., at]).all(axis=-1)
+    good: Any = np.isfinite(mean[..., at]).all(axis=-1) & np.isfinite(
+        known[..., at]
+    ).all(axis=-1)
     if "squared_error" in scores:
         squared = (mean - known) ** 2
-        out["squared_error"], out["total_squared_error"] = squared, squared[..., at].sum(axis=-1)
+        out["squared_error"] = squared
+        out["total_squared_error"] = squared[..., at].sum(axis=-1)
     if "crps" in scores:
         if some is None:
             found = unchecked(gaussian_crps)(mean, np.sqrt(summary.variance), known)
         else:
             found = unchecked(crps)(some, known, weights=summary.weights)
         out["crps"] = np.where(good[..., None] & ~np.isnan(known), found, np.nan)
-    mean, known = mean[..., at], known[..., at]
-    cov = None if summary.covariance is None else summary.covariance[..., at, :][..., at]
-    if "nees" in scores and cov is None and some is not None and some.shape[-2] > mean.shape[-1]:
+    mean = mean[..., at]
+    known = known[..., at]
+    cov = (
+        None if summary.covariance is None else summary.covariance[..., at, :][..., at]
+    )
+    if (
+        "nees" in scores
+        and cov is None
+        and some is not None
+        and some.shape[-2] > mean.shape[-1]
+    ):
         cov = unchecked(sample_covariance)(some[..., at])
     if "nees" in scores and cov is not None:
         out["nees"] = np.full(good.shape, np.nan)
@@ -235,20 +287,28 @@ def final_state(run: xarray.Dataset) -> State:
     Traceback (most recent call last):
     ValueError: run: needs the Dataset that a filter's run returned, got one without a state
     """
-    state, agents, last = getattr(run, "encoding", {}).get("final_state", (None, (), None))
+    state, agents, last = getattr(run, "encoding", {}).get(
+        "final_state", (None, (), None)
+    )
     if "mean" in run and run["time"].size and list(run["agent"].values) == agents:
         ends = np.array_equal(run["time"].values[-1], state.t)
         if ends and np.array_equal(run["mean"].values[-1], last, equal_nan=True):
             return state  # type: ignore[no-any-return]
-    raise ValueError("run: needs the Dataset that a filter's run returned, got one without a state")
+    raise ValueError(
+        "run: needs the Dataset that a filter's run returned, got one without a state"
+    )
 
 
 def _counted(name: str, values: list[Any]) -> dict[str, Any]:
     """What was sent in each step, and in all until then."""
     total = np.array(values)
-    axes, unit = ("time", "agent")[: total.ndim], "B" if name == "bytes" else "1"
+    axes = ("time", "agent")[: total.ndim]
+    unit = "B" if name == "bytes" else "1"
     now, sums = ({"long_name": f"{name} {when}", "units": unit} for when in _WHEN)
-    return {name: (axes, np.diff(total, axis=0), now), f"{name}_total": (axes, total[1:], sums)}
+    return {
+        name: (axes, np.diff(total, axis=0), now),
+        f"{name}_total": (axes, total[1:], sums),
+    }
 
 
 def _nees(mean: Array, cov: Array, known: Array) -> Array:
@@ -256,4 +316,6 @@ def _nees(mean: Array, cov: Array, known: Array) -> Array:
     shape, unit = in_units(cov)
     sure = np.linalg.eigvalsh(shape)[..., 0] <= 1e-12
     shape[sure] = np.eye(shape.shape[-1])
-    return np.where(sure, np.inf, quadratic_form(cholesky(shape), (mean - known) / unit))
+    return np.where(
+        sure, np.inf, quadratic_form(cholesky(shape), (mean - known) / unit)
+    )

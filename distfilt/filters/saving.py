@@ -15,8 +15,8 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 
-from ..validation import Array, Mask, FrozenModel, check_array
 from ..network import Ledger
+from ..validation import Array, FrozenModel, Mask, check_array
 
 __all__ = ["SensorState", "State", "stack_states"]
 
@@ -55,7 +55,9 @@ class State(FrozenModel):
 
     def __repr__(self) -> str:
         """Time and agents: the numbers themselves are many."""
-        return f"{type(self).__name__}(t={self.t:g}, {self.ledger.messages.size} agents)"
+        return (
+            f"{type(self).__name__}(t={self.t:g}, {self.ledger.messages.size} agents)"
+        )
 
     @property
     def runs(self) -> tuple[int, ...]:
@@ -74,7 +76,10 @@ class State(FrozenModel):
         >>> from distfilt.models import constant_velocity
         >>> f = GaussianFilter(constant_velocity(sigma=1.0), [None], lag=1)
         >>> state = f.step(f.start((np.zeros(4), np.eye(4))), 1.0, [None])
-        >>> state.times, [state.lagged_times(lag, t) for t in (1.0, 2.0) for lag in (0, 1, 2)]
+        >>> (
+        ...     state.times,
+        ...     [state.lagged_times(lag, t) for t in (1.0, 2.0) for lag in (0, 1, 2)],
+        ... )
         ((0.0,), [(0.0,), (0.0,), (0.0,), (), (1.0,), (0.0, 1.0)])
         """
         if t == self.t:
@@ -88,7 +93,11 @@ class State(FrozenModel):
         with the SHA-256 of all that stands before.
         """
         arrays: list[Any] = []
-        header = {"format": _FORMAT, "kind": _name(type(self)), "state": _encoded(self, arrays)}
+        header = {
+            "format": _FORMAT,
+            "kind": _name(type(self)),
+            "state": _encoded(self, arrays),
+        }
         parts = {f"a{k}": a for k, a in enumerate(arrays)}
         np.savez(made := io.BytesIO(), header=np.array(json.dumps(header)), **parts)
         unfinished = Path(path).with_name(f".{Path(path).name}.part")
@@ -99,7 +108,9 @@ class State(FrozenModel):
                 os.fsync(file.fileno())
             unfinished.replace(path)
         except OSError as error:  # a write does not tell which file
-            raise OSError(error.errno, error.strerror or str(error), str(path)) from error
+            raise OSError(
+                error.errno, error.strerror or str(error), str(path)
+            ) from error
         finally:
             unfinished.unlink(missing_ok=True)
 
@@ -124,8 +135,12 @@ class State(FrozenModel):
             if header["format"] != _FORMAT or header["kind"] != _name(cls):
                 raise ValueError(f"format {header['format']}, a {header['kind']}")
             return cls(**_decoded({"dict": header["state"]["dict"]}, parts))
-        except Exception as error:  # zip, JSON and numpy each have their own for what is damaged
-            raise ValueError(f"path: needs a saved {cls.__name__}, got {path}: {error}") from None
+        except (
+            Exception
+        ) as error:  # zip, JSON and numpy each have their own for what is damaged
+            raise ValueError(
+                f"path: needs a saved {cls.__name__}, got {path}: {error}"
+            ) from None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -199,18 +214,27 @@ class SensorState(State):
         >>> from distfilt.sensors import Sensor, component
         >>> from distfilt.updates import enkf, serially
         >>> tenth = Model(1, lambda x, t, dt: x / 10, lambda t, dt: np.zeros((1, 1)))
-        >>> cubes = Sensor(2, lambda x: np.concatenate([10 * x, x**3], axis=-1), np.eye(2))
-        >>> for f in (TransportFilter(tenth, [component([0], std=0.1)], lag=1, members=9,
-        ...                           rejuvenation=0.5),
-        ...           EnsembleFilter(tenth, [cubes], lag=1, members=9, update=serially(enkf))):
+        >>> cubes = Sensor(
+        ...     2, lambda x: np.concatenate([10 * x, x**3], axis=-1), np.eye(2)
+        ... )
+        >>> for f in (
+        ...     TransportFilter(
+        ...         tenth, [component([0], std=0.1)], lag=1, members=9, rejuvenation=0.5
+        ...     ),
+        ...     EnsembleFilter(tenth, [cubes], lag=1, members=9, update=serially(enkf)),
+        ... ):
         ...     state = f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0))
         ...     state = f.step(state, 1.0, [[0.1, 0.0][: f.sensors[0].dim]])
-        ...     print(np.allclose(state.lagged_states[0].ensembles, 10 * state.ensembles))
+        ...     print(
+        ...         np.allclose(state.lagged_states[0].ensembles, 10 * state.ensembles)
+        ...     )
         True
         True
         """
         name = self.belief_field[0]
-        return tuple(self.replace(t=t, history=(), **{name: x}) for t, x in self.history)
+        return tuple(
+            self.replace(t=t, history=(), **{name: x}) for t, x in self.history
+        )
 
     def mask_failed(self, values: Array) -> Array:
         """Values (*runs, ...) for the record: NaN in runs that have failed."""
@@ -224,7 +248,9 @@ class SensorState(State):
 def stack_states(states: Sequence[Any]) -> Any:
     """Several states of one shape as one, along a first axis of runs."""
     own = [name for name, value in vars(states[0]).items() if type(value) is np.ndarray]
-    return states[0].replace(**{k: np.array([getattr(s, k) for s in states]) for k in own})
+    return states[0].replace(
+        **{k: np.array([getattr(s, k) for s in states]) for k in own}
+    )
 
 
 def _name(kind: type) -> str:
@@ -245,13 +271,17 @@ def _encoded(value: Any, arrays: list[Any]) -> Any:
     if isinstance(value, np.random.Generator):
         bits: Any = value.bit_generator
         # With its seed's state, so that children that it spawns are the same too.
-        return {"rng": [_encoded(bits.state, arrays), _encoded(bits.seed_seq.state, arrays)]}
+        return {
+            "rng": [_encoded(bits.state, arrays), _encoded(bits.seed_seq.state, arrays)]
+        }
     if isinstance(value, dict):
         return {"dict": {name: _encoded(v, arrays) for name, v in value.items()}}
     if is_dataclass(value) and not isinstance(value, type):
         own = {f.name: getattr(value, f.name) for f in fields(value)}
         return {**_encoded(own, arrays), "of": _name(type(value))}
-    raise ValueError(f"state: needs fields that can be saved, got {type(value).__name__}")
+    raise ValueError(
+        f"state: needs fields that can be saved, got {type(value).__name__}"
+    )
 
 
 def _decoded(coded: Any, parts: dict[str, Any]) -> Any:
@@ -274,7 +304,9 @@ def _decoded(coded: Any, parts: dict[str, Any]) -> Any:
         return known
     module, _, name = coded["of"].partition(":")
     # Nothing is imported that a file names, unless it is one of this package's own structures.
-    kind = getattr(import_module(module), name) if module.startswith("distfilt.") else None
+    kind = (
+        getattr(import_module(module), name) if module.startswith("distfilt.") else None
+    )
     if not (isinstance(kind, type) and is_dataclass(kind)):
         raise ValueError(f"structure {coded['of']!r}")
     return kind(**known)

@@ -11,14 +11,21 @@ from typing import Any
 
 import numpy as np
 
-from ..validation import Array, all_finite, check_array
 from ..linalg import SolverError
 from ..sensors import Sensor
+from ..validation import Array, all_finite, check_array
 from .inbox import Received, group_agents
 from .inputs import Observation, sensor_of
 from .saving import SensorState
 
-__all__ = ["RECOVERABLE", "FilterError", "Step", "copy_rng", "run_isolated", "is_argument_error"]
+__all__ = [
+    "RECOVERABLE",
+    "FilterError",
+    "Step",
+    "copy_rng",
+    "run_isolated",
+    "is_argument_error",
+]
 
 RECOVERABLE = (np.linalg.LinAlgError, ArithmeticError, SolverError, ValueError)
 """What one row of a batch, or one agent, may fail with while the filter is right."""
@@ -48,8 +55,13 @@ class FilterError(RuntimeError):
     FilterError('run 3, agent 1, t = 2.5 s: singular matrix')
     """
 
-    def __init__(self, run: tuple[int, ...], agent: int | None, t: float, why: object) -> None:
-        self.run, self.agent, self.t, self.why = run, agent, t, str(why)
+    def __init__(
+        self, run: tuple[int, ...], agent: int | None, t: float, why: object
+    ) -> None:
+        self.run = run
+        self.agent = agent
+        self.t = t
+        self.why = str(why)
         where = f"run {', '.join(map(str, run))}, " if run else ""
         who = "" if agent is None else f"agent {agent}, "
         super().__init__(f"{where}{who}t = {t:g} s: {why}")
@@ -85,9 +97,15 @@ class Step:
     >>> heard = Graph.from_edges(3, [(0, 1), (0, 2)])
     >>> loss = np.zeros((3, 3))
     >>> loss[2, 0] = 0.5
-    >>> f = GaussianFilter(constant_velocity(sigma=0.1), [component([0], std=1.0), None, None], heard,
-    ...                    faults=Faults(loss=loss))
-    >>> state = f.step(f.start((np.zeros(4), np.eye(4)), runs=(4,)), 0.0, [[1.0], None, None])
+    >>> f = GaussianFilter(
+    ...     constant_velocity(sigma=0.1),
+    ...     [component([0], std=1.0), None, None],
+    ...     heard,
+    ...     faults=Faults(loss=loss),
+    ... )
+    >>> state = f.step(
+    ...     f.start((np.zeros(4), np.eye(4)), runs=(4,)), 0.0, [[1.0], None, None]
+    ... )
     >>> state.means[..., 0].T
     array([[0.5, 0.5, 0.5, 0.5],
            [0.5, 0.5, 0.5, 0.5],
@@ -95,11 +113,21 @@ class Step:
     """
 
     def __init__(
-        self, filter_: Any, state: Any, t: float, said: Any, late: Sequence[Observation] = (), *,
+        self,
+        filter_: Any,
+        state: Any,
+        t: float,
+        said: Any,
+        late: Sequence[Observation] = (),
+        *,
         own: bool = False,
     ) -> None:
-        self.filter, self.state, self.t, self.dt = filter_, state, t, t - state.t
-        self.observations, self.delayed = said, late
+        self.filter = filter_
+        self.state = state
+        self.t = t
+        self.dt = t - state.t
+        self.observations = said
+        self.delayed = late
         self.times = state.lagged_times(filter_.lag, t)
         self.channel: Any = filter_.channel(state, t)
         # A run's own generator need not be copied: nobody else draws from it.
@@ -107,7 +135,11 @@ class Step:
         self.failed = getattr(state, "failed", _NOBODY)
         self.lost = bool(np.count_nonzero(self.failed))
         self.pending: tuple[Any, ...] = ()
-        self.rejected: Any = None if filter_.gate_probability is None else np.zeros((*state.runs, filter_.n_agents))
+        self.rejected: Any = (
+            None
+            if filter_.gate_probability is None
+            else np.zeros((*state.runs, filter_.n_agents))
+        )
 
     def record_failures(self, errors: dict[Row, str], agents: Any = None) -> None:
         """Take the runs of these errors as failed, or raise the error that names the first.
@@ -116,7 +148,8 @@ class Step:
         """
         if not errors:
             return
-        size, (row, why) = len(self.state.runs), next(iter(errors.items()))
+        size = len(self.state.runs)
+        (row, why) = next(iter(errors.items()))
         if self.filter.on_error == "raise" or not self.failed.shape:
             agent = None if agents is None else int(agents[row[-1]])
             raise FilterError(row[:size], agent, self.t, why)
@@ -144,12 +177,16 @@ class Step:
         """The values, but `old` in failed runs."""
         if not self.lost:
             return values
-        failed = self.failed.reshape(*self.failed.shape, *(1,) * (values.ndim - self.failed.ndim))
+        failed = self.failed.reshape(
+            *self.failed.shape, *(1,) * (values.ndim - self.failed.ndim)
+        )
         return np.asarray(np.where(failed, old, values))
 
     def stack(self, now: Array) -> list[Array]:
         """Copies of what is believed of the earlier times, then what is believed of now."""
-        before = [x for _, x in self.state.history] + [self.state.belief] * (self.dt > 0)
+        before = [x for _, x in self.state.history] + [self.state.belief] * (
+            self.dt > 0
+        )
         return [x.copy() for x in before[len(before) - len(self.times) :]] + [now]
 
     def received(self) -> Iterator[tuple[int, Received]]:
@@ -168,16 +205,30 @@ class Step:
         """For each time the readings that each agent has, its own and what it heard, by sender."""
         f = self.filter
         if not self.delayed and (f.graph is None or not f.share_observations):
-            sensors = [[sensor_of(f, said) for said in mine] for mine in self.observations]
-            return {self.t: (sensors, [[said.value for said in mine] for mine in self.observations])}
-        own = [list(mine) for mine in self.observations] if self.delayed else self.observations
+            sensors = [
+                [sensor_of(f, said) for said in mine] for mine in self.observations
+            ]
+            return {
+                self.t: (
+                    sensors,
+                    [[said.value for said in mine] for mine in self.observations],
+                )
+            }
+        own = (
+            [list(mine) for mine in self.observations]
+            if self.delayed
+            else self.observations
+        )
         for late in self.delayed:
             own[late.agent].append(late)
-        told, inbox = self._told(own), [dict[int, Any]()] * len(own)
+        told = self._told(own)
+        inbox = [dict[int, Any]()] * len(own)
         if self.channel is not None and told:
             inbox = self.channel.broadcast([self._payload(mine) for mine in told])
         kinds = [[(said.t, sensor_of(f, said)) for said in mine] for mine in told]
-        known: dict[float, Any] = defaultdict(lambda: ([[] for _ in own], [[] for _ in own]))
+        known: dict[float, Any] = defaultdict(
+            lambda: ([[] for _ in own], [[] for _ in own])
+        )
         for agent, (mine, box) in enumerate(zip(own, inbox, strict=True)):
             for sender in sorted((agent, *box)):
                 if sender == agent:
@@ -201,7 +252,11 @@ class Step:
             return []
         if self.channel is None:
             if f.lag:
-                kept = [said.replace(value=said.value.copy()) for mine in own for said in mine]
+                kept = [
+                    said.replace(value=said.value.copy())
+                    for mine in own
+                    for said in mine
+                ]
                 self.pending = (*self.state.pending, *kept)
             return []
         if not self.state.pending:
@@ -221,14 +276,21 @@ class Step:
         if not told:
             return None
         which = [said.sensor if isinstance(said.sensor, int) else -1 for said in told]
-        if len(told) == 1 and told[0].t == self.t and which[0] < 1 and not told[0].metadata:
+        if (
+            len(told) == 1
+            and told[0].t == self.t
+            and which[0] < 1
+            and not told[0].metadata
+        ):
             return told[0].value
         pairs = zip(told, which, strict=True)
         about = [x for said, sensor in pairs for x in (said.t, sensor, *said.metadata)]
         numbers = np.broadcast_to(np.array(about), (*self.state.runs, len(about)))
         return (*(said.value for said in told), numbers)
 
-    def gate(self, group: Received, moments: Any, seen: Array, *rest: Array) -> Received:
+    def gate(
+        self, group: Received, moments: Any, seen: Array, *rest: Array
+    ) -> Received:
         """A group without the readings that the gate refuses.
 
         `moments` gives mean (*runs, G, M) and covariance of predictions (*runs, G, N, M) and what
@@ -263,34 +325,55 @@ class Step:
         >>> from distfilt.models import Model
         >>> from distfilt.network import graphs
         >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-        >>> f = EnsembleFilter(still, [None] * 2, graphs.path(2), members=4, lag=1,
-        ...                    fusion=lambda x, channel: np.multiply(x, 2.0, out=x))
-        >>> state = f.step(f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [None] * 2)
+        >>> f = EnsembleFilter(
+        ...     still,
+        ...     [None] * 2,
+        ...     graphs.path(2),
+        ...     members=4,
+        ...     lag=1,
+        ...     fusion=lambda x, channel: np.multiply(x, 2.0, out=x),
+        ... )
+        >>> state = f.step(
+        ...     f.start(([0.0], [[1.0]]), rng=np.random.default_rng(0)), 1.0, [None] * 2
+        ... )
         >>> bool(np.allclose(state.history[0][1], state.ensembles))
         True
         """
         if not self.has_fusion or self.failed.all():
             return values
-        good, door = tuple(np.argwhere(~self.failed)[0]), self.channel
+        good = tuple(np.argwhere(~self.failed)[0])
+        door = self.channel
         # What a run failed with may fail again: a good one stands in.
         given = tuple([self.keep_failed(v, v[good]).copy() for v in values])
         whole = np.arange(int(np.prod(self.state.runs))).reshape(self.state.runs)
-        ledger, alone = door.ledger, list[Array]()
+        ledger = door.ledger
+        alone = list[Array]()
 
         def compute(*arrays: Any) -> tuple[Array, ...]:
             *belief, run, _, _ = arrays
             channel = door.for_run(run, ledger)
-            out = self.filter.fusion(belief[0] if len(belief) == 1 else tuple(belief), channel)
+            out = self.filter.fusion(
+                belief[0] if len(belief) == 1 else tuple(belief), channel
+            )
             out = (out,) if len(belief) == 1 else tuple(out)
             if len(out) != len(belief):
-                raise ValueError(f"fusion: needs to return {len(belief)} arrays, got {len(out)}")
+                raise ValueError(
+                    f"fusion: needs to return {len(belief)} arrays, got {len(out)}"
+                )
             self.channel = channel
             alone.append(channel.ledger.lost)
-            return tuple(check_array(x, "fusion", v.shape) for x, v in zip(out, belief, strict=True))
+            return tuple(
+                check_array(x, "fusion", v.shape)
+                for x, v in zip(out, belief, strict=True)
+            )
 
         out, errors = run_isolated(compute, (*given, whole), values, whole.ndim)
-        if self.channel.runs != whole.shape:  # asked alone, each lost messages of its own
-            self.channel = door.for_run(whole, self.channel.ledger.replace(lost=np.mean(alone, axis=0)))
+        if (
+            self.channel.runs != whole.shape
+        ):  # asked alone, each lost messages of its own
+            self.channel = door.for_run(
+                whole, self.channel.ledger.replace(lost=np.mean(alone, axis=0))
+            )
         self.record_failures(errors)
         return tuple([self.keep_failed(x, v) for x, v in zip(out, values, strict=True)])
 
@@ -302,7 +385,9 @@ class Step:
                 belief["history"] = tuple(zip(self.times, past, strict=True))
             belief |= {"failed": self.failed, "pending": self.pending}
         ledger = state.ledger if self.channel is None else self.channel.ledger
-        return type(state).construct(self.t, ledger, self.rng, rejected=self.rejected, **belief)
+        return type(state).construct(
+            self.t, ledger, self.rng, rejected=self.rejected, **belief
+        )
 
 
 _NOBODY = np.zeros((), dtype=bool)
@@ -310,8 +395,13 @@ _NOTHING = np.zeros((0, 0))
 
 
 def run_isolated(
-    compute: Compute, arrays: tuple[Array, ...], fallback: tuple[Array, ...], lead: int, *,
-    shared: Array = _NOTHING, rng: np.random.Generator | None = None,
+    compute: Compute,
+    arrays: tuple[Array, ...],
+    fallback: tuple[Array, ...],
+    lead: int,
+    *,
+    shared: Array = _NOTHING,
+    rng: np.random.Generator | None = None,
 ) -> tuple[tuple[Array, ...], dict[Row, str]]:
     """A computation on a batch (*lead, …), whose rows may fail without the others' notice.
 
@@ -333,7 +423,8 @@ def run_isolated(
     try:
         out = compute(*arrays, shared, rng)
     except RECOVERABLE as error:
-        out, rows = tuple(f.copy() for f in fallback), list(np.ndindex(arrays[0].shape[:lead]))
+        out = tuple(f.copy() for f in fallback)
+        rows = list(np.ndindex(arrays[0].shape[:lead]))
         for row in rows:
             part = shared[row[-1]] if shared.ndim > 2 else shared
             try:
@@ -346,7 +437,9 @@ def run_isolated(
         if 0 < len(errors) < len(rows):
             # No row may draw otherwise because another fails: a good one stands in for that.
             good = next(row for row in rows if row not in errors)
-            where: Any = tuple(np.transpose([good if row in errors else row for row in rows]))
+            where: Any = tuple(
+                np.transpose([good if row in errors else row for row in rows])
+            )
             if rng is not None:
                 rng.bit_generator.state = at
             with suppress(*RECOVERABLE):
@@ -363,7 +456,9 @@ def run_isolated(
     return out, errors
 
 
-class _Unseeded(np.random.bit_generator.ISeedSequence):  # whose state comes from another
+class _Unseeded(
+    np.random.bit_generator.ISeedSequence
+):  # whose state comes from another
     def generate_state(self, n_words: int, dtype: Any = np.uint32) -> Any:
         return np.zeros(n_words, dtype)
 
@@ -383,7 +478,9 @@ def copy_rng(rng: Any) -> Any:
 
 def is_argument_error(error: Exception) -> bool:
     """Whether an error tells of wrong arguments; numpy's LinAlgError is a ValueError too."""
-    return isinstance(error, ValueError) and not isinstance(error, np.linalg.LinAlgError)
+    return isinstance(error, ValueError) and not isinstance(
+        error, np.linalg.LinAlgError
+    )
 
 
 def _not_finite(values: Array, lead: int, what: str) -> dict[Row, str]:
@@ -391,4 +488,6 @@ def _not_finite(values: Array, lead: int, what: str) -> dict[Row, str]:
     if all_finite(values):
         return {}
     bad = ~np.isfinite(values).reshape(*values.shape[:lead], -1).all(axis=-1)
-    return {tuple(map(int, row)): f"the {what} is not finite" for row in np.argwhere(bad)}
+    return {
+        tuple(map(int, row)): f"the {what} is not finite" for row in np.argwhere(bad)
+    }

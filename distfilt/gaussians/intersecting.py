@@ -10,8 +10,15 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..validation import ALLOW_NAN, Array, Mask, Probabilities, check_positive_definite, validated
 from ..linalg import cholesky, leading, log_det, lower_root, solve_lower, symmetrise
+from ..validation import (
+    ALLOW_NAN,
+    Array,
+    Mask,
+    Probabilities,
+    check_positive_definite,
+    validated,
+)
 
 __all__ = ["intersect_gaussians", "intersection_weights"]
 
@@ -30,7 +37,9 @@ _LEAST = 1e-30
 
 @validated
 def intersect_gaussians(
-    means: Annotated[Array, "... S d", ALLOW_NAN], covs: Covs, weights: Annotated[Probabilities, "... S"]
+    means: Annotated[Array, "... S d", ALLOW_NAN],
+    covs: Covs,
+    weights: Annotated[Probabilities, "... S"],
 ) -> tuple[Array, Array]:
     r"""Covariance intersection: the normalised weighted geometric mean of Gaussians.
 
@@ -77,16 +86,23 @@ def intersect_gaussians(
     size, d = means.shape[-2:]
     means = np.broadcast_to(means, (*lead, size, d))
     here = np.broadcast_to(weights > 0, (*lead, size))
-    m, lower = _counted(means, here, 1, "means"), cholesky(_counted(covs, here, 2, "covs"))
-    first, centre = lower[..., 0, :, :], m[..., 0, :]
-    own, others = weights[..., :1, None], np.sqrt(weights[..., 1:, None, None])
+    m = _counted(means, here, 1, "means")
+    lower = cholesky(_counted(covs, here, 2, "covs"))
+    first = lower[..., 0, :, :]
+    centre = m[..., 0, :]
+    own = weights[..., :1, None]
+    others = np.sqrt(weights[..., 1:, None, None])
     gap = m[..., 1:, :, None] - centre[..., None, :, None]
-    wide = others * solve_lower(lower[..., 1:, :, :], _beside(first[..., None, :, :], gap))
+    wide = others * solve_lower(
+        lower[..., 1:, :, :], _beside(first[..., None, :, :], gap)
+    )
     tall = wide.reshape(*wide.shape[:-3], -1, d + 1)
     turned = np.ascontiguousarray(tall[..., :d].swapaxes(-1, -2))
     total = turned @ tall
     total[..., :d] += own * np.eye(d)
-    inner = _cholesky_or_qr(total[..., :d], own, np.ones(wide.shape[:-2]), wide[..., :d])
+    inner = _cholesky_or_qr(
+        total[..., :d], own, np.ones(wide.shape[:-2]), wide[..., :d]
+    )
     both = solve_lower(inner, _beside(first.swapaxes(-1, -2), total[..., d:]))
     root = np.ascontiguousarray(both[..., :d].swapaxes(-1, -2))
     fused = root @ both
@@ -99,9 +115,13 @@ def _counted(value: Array, here: Mask, axes: int, name: str) -> Array:
         value = np.broadcast_to(value, (*here.shape, *value.shape[value.ndim - axes :]))
         wide = here.reshape(*here.shape, *(1,) * axes)
         first = wide.argmax(axis=here.ndim - 1, keepdims=True)
-        value = np.where(wide, value, np.take_along_axis(value, first, axis=here.ndim - 1))
+        value = np.where(
+            wide, value, np.take_along_axis(value, first, axis=here.ndim - 1)
+        )
     if not np.isfinite(value).all():
-        raise ValueError(f"{name}: needs finite numbers where a source counts, got NaN or infinity")
+        raise ValueError(
+            f"{name}: needs finite numbers where a source counts, got NaN or infinity"
+        )
     return value
 
 
@@ -113,8 +133,11 @@ def _beside(left: Array, right: Array) -> Array:
 
 @validated
 def intersection_weights(
-    covs: Covs, *,
-    rule: Literal["equal", "trace", "determinant", "min_trace", "min_determinant"] = "equal",
+    covs: Covs,
+    *,
+    rule: Literal[
+        "equal", "trace", "determinant", "min_trace", "min_determinant"
+    ] = "equal",
     here: Annotated[Mask, "... S"] | None = None,
 ) -> Array:
     r"""Weights (..., S) for :func:`intersection`, nonnegative with sum 1.
@@ -190,7 +213,8 @@ def intersection_weights(
 @np.errstate(over="ignore", divide="ignore", invalid="ignore")
 def _least(covs: Array, here: Mask, determinant: bool) -> Array:
     """Weights of least determinant or trace; :func:`.intersection_weights` says how and why."""
-    leading, (s, d) = here.shape[:-1], covs.shape[-3:-1]
+    leading = here.shape[:-1]
+    (s, d) = covs.shape[-3:-1]
     there = here.reshape(-1, s).astype(np.float64)
     lower = cholesky(covs).reshape(-1, s, d, d)
     # In the first one's coordinates, as in an intersection; traces are taken in the state's own.
@@ -198,8 +222,10 @@ def _least(covs: Array, here: Mask, determinant: bool) -> Array:
     roots *= there[..., None, None]
     fixed = [roots, _square(roots.mT), lower[:, 0], there]
     point = there / there.sum(axis=-1, keepdims=True)
-    best, sure = point.copy(), point
-    left, share = np.arange(len(point)), np.ones((len(point), 1))
+    best = point.copy()
+    sure = point
+    left = np.arange(len(point))
+    share = np.ones((len(point), 1))
     lowest = bound = np.full(len(point), np.inf)
     for _ in range(_STEPS):
         value, slope, curvature = _derivatives(point, fixed, determinant)
@@ -220,17 +246,26 @@ def _least(covs: Array, here: Mask, determinant: bool) -> Array:
         scaled = point * (slope / mean if determinant else np.sqrt(slope / mean))
         scaled /= scaled.sum(axis=-1, keepdims=True)
         gain = (slope * step).sum(axis=-1)
-        aim = np.where(gain > 0, value - 1e-3 * gain + 1e-13 * (1 + np.abs(value)), -np.inf)
+        aim = np.where(
+            gain > 0, value - 1e-3 * gain + 1e-13 * (1 + np.abs(value)), -np.inf
+        )
         bound = np.where(at[:, 0], aim, np.inf)
-        point, sure = np.where(at, point + step, sure), np.where(at, scaled, sure)
+        point = np.where(at, point + step, sure)
+        sure = np.where(at, scaled, sure)
         if 10 * np.count_nonzero(open_) <= 9 * len(open_):
             fixed = [part[open_] for part in fixed]
-            left, lowest, bound = left[open_], lowest[open_], bound[open_]
-            point, sure, share = point[open_], sure[open_], share[open_]
+            left = left[open_]
+            lowest = lowest[open_]
+            bound = bound[open_]
+            point = point[open_]
+            sure = sure[open_]
+            share = share[open_]
     return np.asarray(best.reshape(*leading, s))
 
 
-def _derivatives(w: Array, fixed: list[Array], determinant: bool) -> tuple[Array, Array, Array]:
+def _derivatives(
+    w: Array, fixed: list[Array], determinant: bool
+) -> tuple[Array, Array, Array]:
     """What is made least (n,), minus its gradient (n, S), its second derivatives (n, S, S)."""
     roots, information, first, _ = fixed
     n, s, d = roots.shape[:3]
@@ -253,7 +288,9 @@ def _square(root: Array) -> Array:
     return np.asarray(root @ np.ascontiguousarray(root.swapaxes(-1, -2)))
 
 
-def _newton(weights: Array, slope: Array, mean: Array, curvature: Array, there: Array) -> Array:
+def _newton(
+    weights: Array, slope: Array, mean: Array, curvature: Array, there: Array
+) -> Array:
     """A Newton step on the simplex; a weight that wants to vanish shrinks a thousandfold."""
     size = curvature.max(axis=(-2, -1))[:, None]
     held = np.maximum(mean - slope, 0.0) / np.maximum(weights, _LEAST)
@@ -262,7 +299,9 @@ def _newton(weights: Array, slope: Array, mean: Array, curvature: Array, there: 
     scale = np.sqrt(np.diagonal(matrix, axis1=-2, axis2=-1))[..., None]
     matrix /= scale * scale.swapaxes(-1, -2)
     try:
-        solved = np.linalg.solve(matrix, np.stack([slope, there], axis=-1) / scale) / scale
+        solved = (
+            np.linalg.solve(matrix, np.stack([slope, there], axis=-1) / scale) / scale
+        )
     except np.linalg.LinAlgError:
         return weights  # which is not better: the sure step follows
     pull, ones = solved.sum(axis=1).T[..., None]

@@ -7,14 +7,24 @@ from typing import Annotated
 
 import numpy as np
 
-from ..validation import ALLOW_NAN, Array, PositiveDefinite, Mask, PositiveSemidefinite, all_finite, validated
 from ..linalg import EPS, cholesky, leading, log_det, quadratic_form, solve_definite
+from ..validation import (
+    ALLOW_NAN,
+    Array,
+    Mask,
+    PositiveDefinite,
+    PositiveSemidefinite,
+    all_finite,
+    validated,
+)
 
 __all__ = ["condition", "log_density", "match_moments", "unscented_points"]
 
 
 @validated
-def log_density(x: Annotated[Array, "... d"], mean: Annotated[Array, "... d"], cov: PositiveDefinite) -> Array:
+def log_density(
+    x: Annotated[Array, "... d"], mean: Annotated[Array, "... d"], cov: PositiveDefinite
+) -> Array:
     r"""Logarithm of the Gaussian density, (...), relative to the volume in the state's units.
 
     .. math:: \log N(\mathbf x;\mathbf m,\mathbf P)=-\tfrac12\bigl(
@@ -35,13 +45,18 @@ def log_density(x: Annotated[Array, "... d"], mean: Annotated[Array, "... d"], c
     """
     lead = leading(x.shape[:-1], mean.shape[:-1], "mean")
     leading(lead, cov.shape[:-2], "cov")
-    lower, constant = cholesky(cov), x.shape[-1] * np.log(2 * np.pi)
-    return np.asarray(-0.5 * (quadratic_form(lower, x - mean) + log_det(lower) + constant))
+    lower = cholesky(cov)
+    constant = x.shape[-1] * np.log(2 * np.pi)
+    return np.asarray(
+        -0.5 * (quadratic_form(lower, x - mean) + log_det(lower) + constant)
+    )
 
 
 @validated
 def match_moments(
-    ensemble: Annotated[Array, "... N d"], mean: Annotated[Array, "... d"], cov: PositiveDefinite
+    ensemble: Annotated[Array, "... N d"],
+    mean: Annotated[Array, "... d"],
+    cov: PositiveDefinite,
 ) -> Array:
     r"""Move an ensemble affinely so that its sample mean and covariance are the given ones.
 
@@ -77,7 +92,9 @@ def match_moments(
     """
     n, d = ensemble.shape[-2:]
     if n <= d:
-        raise ValueError(f"ensemble: needs more than {d} members for {d} components, got {n}")
+        raise ValueError(
+            f"ensemble: needs more than {d} members for {d} components, got {n}"
+        )
     lead = leading(ensemble.shape[:-2], mean.shape[:-1], "mean")
     leading(lead, cov.shape[:-2], "cov")
     unit = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
@@ -90,8 +107,10 @@ def match_moments(
     own = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
     # What a component has that those before it have not, against the rounding of the members.
     if (own <= 32 * d * EPS * (length + np.abs(centre))).any():
-        raise ValueError("ensemble: needs components that are not constant and not combinations "
-                         "of others, got a singular sample covariance")
+        raise ValueError(
+            "ensemble: needs components that are not constant and not combinations "
+            "of others, got a singular sample covariance"
+        )
     target = cholesky(cov / (unit[..., :, None] * unit[..., None, :])).mT
     u, _, vh = np.linalg.svd(target @ r.mT)
     turn = vh.mT @ (u.mT @ target)
@@ -104,8 +123,11 @@ def match_moments(
 
 @validated
 def condition(
-    mean: Annotated[Array, "... d"], cov: PositiveSemidefinite, gap: Annotated[Array, "... m", ALLOW_NAN],
-    H: Annotated[Array, "... m d"], R: Annotated[PositiveDefinite, "... m m"],
+    mean: Annotated[Array, "... d"],
+    cov: PositiveSemidefinite,
+    gap: Annotated[Array, "... m", ALLOW_NAN],
+    H: Annotated[Array, "... m d"],
+    R: Annotated[PositiveDefinite, "... m m"],
 ) -> tuple[Array, Array]:
     r"""Condition Gaussians on readings :math:`\mathbf y=\mathbf H\mathbf x+\text{noise}`.
 
@@ -138,13 +160,16 @@ def condition(
     """
     missing = None if all_finite(gap) else np.isnan(gap)
     if missing is not None:  # a row of H may be missing too
-        H, gap = np.where(missing[..., None], 0.0, H), np.where(missing, 0.0, gap)
+        H = np.where(missing[..., None], 0.0, H)
+        gap = np.where(missing, 0.0, gap)
     cross, inner = innovation(cov, H, R, missing)
     gain = solve_definite(inner, cross).mT
     return mean + (gain @ gap[..., None])[..., 0], joseph(cov, gain, H, R)
 
 
-def innovation(cov: Array, H: Array, R: Array, missing: Mask | None) -> tuple[Array, Array]:
+def innovation(
+    cov: Array, H: Array, R: Array, missing: Mask | None
+) -> tuple[Array, Array]:
     """Covariance of a reading's prediction with the state, (..., m, d), and of the innovation.
 
     Components (..., m) that are missing have no gain, and a one on the innovations' diagonal: that
@@ -169,7 +194,10 @@ def joseph(cov: Array, gain: Array, H: Array, R: Array) -> Array:
 
 @validated
 def unscented_points(
-    mean: Annotated[Array, "... d"], root: Annotated[Array, "... d d"], *, kappa: float = 0.0
+    mean: Annotated[Array, "... d"],
+    root: Annotated[Array, "... d d"],
+    *,
+    kappa: float = 0.0,
 ) -> tuple[Array, Array]:
     r"""The 2d + 1 unscented points of Gaussians and their weights, which sum to 1.
 
@@ -204,5 +232,6 @@ def unscented_points(
     moves = math.sqrt(d + kappa) * root.mT
     moves = np.concatenate([0 * moves[..., :1, :], moves, -moves], axis=-2)
     weights = np.empty(2 * d + 1)
-    weights[:], weights[0] = 0.5 / (d + kappa), kappa / (d + kappa)
+    weights[:] = 0.5 / (d + kappa)
+    weights[0] = kappa / (d + kappa)
     return mean[..., None, :] + moves, weights

@@ -8,7 +8,13 @@ from .linear import FilterResult, kalman_filter, rts_smoother
 from .multiplicative import QuaternionChart, mekf
 from .reference import filterpy_ekf, filterpy_kf, filterpy_ukf
 
-__all__ = [  # fmt: skip
-    "FilterResult", "QuaternionChart", "filterpy_ekf", "filterpy_kf", "filterpy_ukf",
-    "kalman_filter", "mekf", "rts_smoother",
+__all__ = [
+    "FilterResult",
+    "QuaternionChart",
+    "filterpy_ekf",
+    "filterpy_kf",
+    "filterpy_ukf",
+    "kalman_filter",
+    "mekf",
+    "rts_smoother",
 ]

@@ -8,10 +8,18 @@ from typing import Annotated
 
 import numpy as np
 
-from ..validation import ALLOW_NAN, Array, PositiveDefinite, Mask, FrozenModel, PositiveSemidefinite, validated
 from ..gaussians.single import innovation, joseph
 from ..linalg import cholesky, leading, log_det, solve_lower, solve_upper, symmetrise
 from ..sensors import Sensor
+from ..validation import (
+    ALLOW_NAN,
+    Array,
+    FrozenModel,
+    Mask,
+    PositiveDefinite,
+    PositiveSemidefinite,
+    validated,
+)
 
 __all__ = ["FilterResult", "kalman_filter", "rts_smoother"]
 
@@ -40,7 +48,9 @@ class FilterResult(FrozenModel):
 
     Examples
     --------
-    >>> run = kalman_filter([0.0], [[1.0]], [[2.0]], F=[[1.0]], H=[[1.0]], Q=[[0.0]], R=[[1.0]])
+    >>> run = kalman_filter(
+    ...     [0.0], [[1.0]], [[2.0]], F=[[1.0]], H=[[1.0]], Q=[[0.0]], R=[[1.0]]
+    ... )
     >>> run.means, run.covariances
     (array([[1.]]), array([[[0.5]]]))
     """
@@ -57,7 +67,14 @@ class FilterResult(FrozenModel):
 
 @validated
 def kalman_filter(
-    mean: Mean, cov: PositiveDefinite, observations: Series, *, F: Matrix, H: Seen, Q: PositiveSemidefinite, R: Noise
+    mean: Mean,
+    cov: PositiveDefinite,
+    observations: Series,
+    *,
+    F: Matrix,
+    H: Seen,
+    Q: PositiveSemidefinite,
+    R: Noise,
 ) -> FilterResult:
     r"""Filter T observations of a linear Gaussian model, for any number of runs at once.
 
@@ -93,50 +110,71 @@ def kalman_filter(
     Examples
     --------
     >>> y = np.array([[1.0], [np.nan], [2.0]])
-    >>> run = kalman_filter([0.0], [[4.0]], y, F=[[1.0]], H=[[1.0]], Q=[[1.0]], R=[[2.0]])
+    >>> run = kalman_filter(
+    ...     [0.0], [[4.0]], y, F=[[1.0]], H=[[1.0]], Q=[[1.0]], R=[[2.0]]
+    ... )
     >>> run.means.ravel().round(4)
     array([0.7143, 0.7143, 1.5263])
     """
     runs, y, x, p = flatten_runs(mean, cov, observations)
     f, h, q, r = per_step(len(y), F=F, H=H, Q=Q, R=R)
-    turned, missing = np.ascontiguousarray(f.mT), np.isnan(y)
+    turned = np.ascontiguousarray(f.mT)
+    missing = np.isnan(y)
     shared = cov.ndim == 2 and bool((missing == missing[:, :1]).all())
     # Runs that share a covariance stand side by side, as the columns of one mean.
-    p, x, y = (cov[None], x.T[None], y.mT[:, None]) if shared else (p, x[..., None], y[..., None])
-    means, covs = np.empty((len(y), *x.shape)), np.empty((len(y), *p.shape))
-    density, missing = np.empty((len(y), len(x), x.shape[-1])), np.asarray(np.isnan(y).any(axis=-1))
+    p, x, y = (
+        (cov[None], x.T[None], y.mT[:, None])
+        if shared
+        else (p, x[..., None], y[..., None])
+    )
+    means = np.empty((len(y), *x.shape))
+    covs = np.empty((len(y), *p.shape))
+    density = np.empty((len(y), len(x), x.shape[-1]))
+    missing = np.asarray(np.isnan(y).any(axis=-1))
     for k in range(len(y)):
-        x, p = f[k] @ x, f[k] @ p @ turned[k] + q[k]
+        x = f[k] @ x
+        p = f[k] @ p @ turned[k] + q[k]
         gap = y[k] - h[k] @ x
         gap[missing[k]] = 0.0
         move, p, density[k] = assimilate(p, gap, h[k], r[k], missing[k])
         x = x + move
-        means[k], covs[k] = x, p
+        means[k] = x
+        covs[k] = p
     if not np.isfinite(means).all():
-        raise np.linalg.LinAlgError("kalman_filter: needs matrices without overflow, got infinity")
+        raise np.linalg.LinAlgError(
+            "kalman_filter: needs matrices without overflow, got infinity"
+        )
     return unflatten_runs(means.mT, covs, density, runs)
 
 
-def assimilate(cov: Array, gap: Array, H: Array, R: Array, missing: Mask) -> tuple[Array, ...]:
+def assimilate(
+    cov: Array, gap: Array, H: Array, R: Array, missing: Mask
+) -> tuple[Array, ...]:
     """How innovations (..., m, k) move the mean, the covariance after it, and their log densities.
 
     An innovation is 0 where it is missing.
     """
-    (cross, inner), d = innovation(cov, H, R, missing), cov.shape[-1]
+    (cross, inner) = innovation(cov, H, R, missing)
+    d = cov.shape[-1]
     try:
         lower = cholesky(inner)
     except np.linalg.LinAlgError:
-        raise np.linalg.LinAlgError("the innovation covariance is not positive definite") from None
+        raise np.linalg.LinAlgError(
+            "the innovation covariance is not positive definite"
+        ) from None
     white = solve_lower(lower, np.concatenate([cross, gap], axis=-1))
-    gain, length = solve_upper(lower, white[..., :d]).mT, (white[..., d:] ** 2).sum(axis=-2)
+    gain = solve_upper(lower, white[..., :d]).mT
+    length = (white[..., d:] ** 2).sum(axis=-2)
     constant = np.log(2 * np.pi) * (~missing).sum(axis=-1) + log_det(lower)
     return gain @ gap, joseph(cov, gain, H, R), -0.5 * (length + constant[..., None])
 
 
 @validated
 def rts_smoother(
-    run: FilterResult, *, F: Annotated[Array, "... run.dim run.dim"],
-    Q: Annotated[PositiveSemidefinite, "... run.dim run.dim"]
+    run: FilterResult,
+    *,
+    F: Annotated[Array, "... run.dim run.dim"],
+    Q: Annotated[PositiveSemidefinite, "... run.dim run.dim"],
 ) -> FilterResult:
     r"""States given all observations, backwards through a Kalman filter's run.
 
@@ -175,19 +213,25 @@ def rts_smoother(
     array([1. , 1.5])
     """
     f, q = per_step(len(run.means), F=F, Q=Q)
-    means, covs = run.means.copy(), run.covariances.copy()
+    means = run.means.copy()
+    covs = run.covariances.copy()
     for k in reversed(range(len(f) - 1)):
-        x, p = run.means[k], run.covariances[k]
+        x = run.means[k]
+        p = run.covariances[k]
         forward = f[k + 1] @ p
         gain = np.linalg.solve(symmetrise(forward @ f[k + 1].T + q[k + 1]), forward).mT
         gap = means[k + 1] - x @ f[k + 1].T
         means[k] = x + (gain @ gap[..., None])[..., 0]
         kept = np.eye(run.dim) - gain @ f[k + 1]
-        covs[k] = symmetrise(kept @ p @ kept.mT + gain @ (covs[k + 1] + q[k + 1]) @ gain.mT)
+        covs[k] = symmetrise(
+            kept @ p @ kept.mT + gain @ (covs[k + 1] + q[k + 1]) @ gain.mT
+        )
     return run.replace(means=means, covariances=covs)
 
 
-def flatten_runs(mean: Array, cov: Array, observations: Array) -> tuple[Runs, Array, Array, Array]:
+def flatten_runs(
+    mean: Array, cov: Array, observations: Array
+) -> tuple[Runs, Array, Array, Array]:
     """The axes of all runs, with observations (T, R, m), means and covariances on one such axis.
 
     New run axes of observations come in front.
@@ -202,7 +246,9 @@ def flatten_runs(mean: Array, cov: Array, observations: Array) -> tuple[Runs, Ar
     return runs, y, x, p
 
 
-def unflatten_runs(means: Array, covs: Array, density: Array, runs: Runs) -> FilterResult:
+def unflatten_runs(
+    means: Array, covs: Array, density: Array, runs: Runs
+) -> FilterResult:
     """What a filter found of all runs, (T, R, ...), with their axes apart."""
     steps = len(means)
     lead = runs if covs.shape[1] == math.prod(runs) else (1,) * len(runs)

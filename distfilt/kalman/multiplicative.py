@@ -12,11 +12,20 @@ from typing import Annotated
 
 import numpy as np
 
-from ..validation import Array, PositiveInt, PositiveDefinite, NonNegativeInt, FrozenModel, Times, validated, unchecked
 from ..linalg import central
 from ..models import Model
-from ..models.satellite import left_directions, rotation_vector_between, rotate
+from ..models.satellite import left_directions, rotate, rotation_vector_between
 from ..sensors import Sensor, stack
+from ..validation import (
+    Array,
+    FrozenModel,
+    NonNegativeInt,
+    PositiveDefinite,
+    PositiveInt,
+    Times,
+    unchecked,
+    validated,
+)
 from .linear import FilterResult, Series, assimilate, flatten_runs, grid, unflatten_runs
 
 __all__ = ["QuaternionChart", "mekf"]
@@ -39,7 +48,12 @@ class QuaternionChart(FrozenModel):
     Examples
     --------
     >>> chart = QuaternionChart(5, 1)
-    >>> chart.retract(np.array([2.0, 1, 0, 0, 0]), np.array([0.5, np.pi, 0, 0])).round(3) + 0.0
+    >>> (
+    ...     chart.retract(
+    ...         np.array([2.0, 1, 0, 0, 0]), np.array([0.5, np.pi, 0, 0])
+    ...     ).round(3)
+    ...     + 0.0
+    ... )
     array([2.5, 0. , 1. , 0. , 0. ])
     >>> chart.project([2.0, 1, 0, 0, 0], np.eye(5)).diagonal()
     array([1., 4., 4., 4.])
@@ -63,13 +77,17 @@ class QuaternionChart(FrozenModel):
         """Move states (..., d) by errors (..., k)."""
         at = self.first
         turn = unchecked(rotate)(x[..., at : at + 4], e[..., at : at + 3])
-        before, behind = x[..., :at] + e[..., :at], x[..., at + 4 :] + e[..., at + 3 :]
+        before = x[..., :at] + e[..., :at]
+        behind = x[..., at + 4 :] + e[..., at + 3 :]
         return np.concatenate([before, turn, behind], axis=-1)
 
     def local(self, x: Array, other: Array) -> Array:
         """The error that takes x to `other`, the inverse of `retract`."""
-        at, gap = self.first, other - x
-        turn = unchecked(rotation_vector_between)(x[..., at : at + 4], other[..., at : at + 4])
+        at = self.first
+        gap = other - x
+        turn = unchecked(rotation_vector_between)(
+            x[..., at : at + 4], other[..., at : at + 4]
+        )
         return np.concatenate([gap[..., :at], turn, gap[..., at + 4 :]], axis=-1)
 
     def tangent_basis(self, x: Array) -> Array:
@@ -77,13 +95,17 @@ class QuaternionChart(FrozenModel):
         at = self.first
         out = np.zeros((*x.shape, self.error_dim))
         out[..., :at, :at] = np.eye(at)
-        out[..., at : at + 4, at : at + 3] = unchecked(left_directions)(x[..., at : at + 4])
+        out[..., at : at + 4, at : at + 3] = unchecked(left_directions)(
+            x[..., at : at + 4]
+        )
         out[..., at + 4 :, at + 3 :] = np.eye(self.dim - at - 4)
         return out
 
     @validated
     def project(
-        self, x: Annotated[Array, "... self.dim"], cov: Annotated[Array, "... self.dim self.dim"]
+        self,
+        x: Annotated[Array, "... self.dim"],
+        cov: Annotated[Array, "... self.dim self.dim"],
     ) -> Array:
         """Covariance of the errors, (..., k, k), of states with covariance `cov`, (..., d, d)."""
         inwards = self.tangent_projection(x)
@@ -98,8 +120,13 @@ class QuaternionChart(FrozenModel):
 @validated
 def mekf(
     mean: Annotated[Array, "... model.dim"],
-    cov: Annotated[PositiveDefinite, "... chart.error_dim chart.error_dim"], observations: Series, *,
-    chart: QuaternionChart, model: Model, sensors: Sequence[Sensor], times: Times
+    cov: Annotated[PositiveDefinite, "... chart.error_dim chart.error_dim"],
+    observations: Series,
+    *,
+    chart: QuaternionChart,
+    model: Model,
+    sensors: Sequence[Sensor],
+    times: Times,
 ) -> FilterResult:
     r"""The extended Kalman filter on a chart's errors, over series of observations.
 
@@ -145,31 +172,48 @@ def mekf(
     >>> from distfilt.sensors import component
     >>> x = np.r_[np.zeros(6), [0.3, 0.2, 0.1], [1.0, 0.0, 0.0, 0.0]]
     >>> run = mekf(
-    ...     x, 0.01 * np.eye(12), np.zeros((1, 3)), chart=QuaternionChart(13, 9),
+    ...     x,
+    ...     0.01 * np.eye(12),
+    ...     np.zeros((1, 3)),
+    ...     chart=QuaternionChart(13, 9),
     ...     model=satellite_pose(rate=0.1, sigma=0.2, step=0.1),
-    ...     sensors=[component([10, 11, 12], std=0.1)], times=[0.1])
+    ...     sensors=[component([10, 11, 12], std=0.1)],
+    ...     times=[0.1],
+    ... )
     >>> float((run.means[0, 9:] ** 2).sum().round(9)), run.covariances.shape
     (1.0, (1, 12, 12))
     """
     sensor = stack(sensors)
     if chart.dim != model.dim:
-        raise ValueError(f"chart: needs {model.dim} components like the model, got {chart.dim}")
+        raise ValueError(
+            f"chart: needs {model.dim} components like the model, got {chart.dim}"
+        )
     clock = grid(times, observations, sensor)
     runs, y, x, p = flatten_runs(mean, cov, observations)
-    means, covs = np.empty((len(y), *x.shape)), np.empty((len(y), *p.shape))
+    means = np.empty((len(y), *x.shape))
+    covs = np.empty((len(y), *p.shape))
     density = np.empty(y.shape[:2])
     for n, t in enumerate(times):
         try:
-            x, p, density[n] = _step(x, p, y[n], chart, model, sensor, clock[n], t - clock[n])
+            x, p, density[n] = _step(
+                x, p, y[n], chart, model, sensor, clock[n], t - clock[n]
+            )
         except np.linalg.LinAlgError as error:
             raise np.linalg.LinAlgError(f"at t = {t:g}: {error}") from None
-        means[n], covs[n] = x, p
+        means[n] = x
+        covs[n] = p
     return unflatten_runs(means, covs, density, runs)
 
 
 def _step(
-    x: Array, p: Array, y: Array, chart: QuaternionChart, model: Model, sensor: Sensor, t: float,
-    dt: float
+    x: Array,
+    p: Array,
+    y: Array,
+    chart: QuaternionChart,
+    model: Model,
+    sensor: Sensor,
+    t: float,
+    dt: float,
 ) -> tuple[Array, Array, Array]:
     """Means (R, d), covariances (R, k, k) and log densities (R,) one reading later."""
     moved = _finite(unchecked(model.step)(x, t, dt))
@@ -178,15 +222,23 @@ def _step(
     joint = slope @ p @ slope.mT + inwards @ model.Q(t, dt) @ inwards.mT
     previous = None
     if sensor.uses_previous:
-        across, previous = slope @ p, x
+        across = slope @ p
+        previous = x
         joint = np.block([[joint, across], [across.mT, p]])
     gap = unchecked(sensor.residual)(y, unchecked(sensor.predict)(moved, previous))
     missing = np.isnan(gap)
     h = _errors_seen(moved, previous, sensor, chart)
-    h, gap = np.where(missing[..., None], 0.0, h), np.where(missing, 0.0, gap)
-    error, joint, density = assimilate(joint, gap[..., None], h, sensor.noise_cov, missing)
+    h = np.where(missing[..., None], 0.0, h)
+    gap = np.where(missing, 0.0, gap)
+    error, joint, density = assimilate(
+        joint, gap[..., None], h, sensor.noise_cov, missing
+    )
     k = chart.error_dim
-    return _finite(chart.retract(moved, error[:, :k, 0])), joint[:, :k, :k], density[:, 0]
+    return (
+        _finite(chart.retract(moved, error[:, :k, 0])),
+        joint[:, :k, :k],
+        density[:, 0],
+    )
 
 
 def _finite(x: Array) -> Array:
@@ -196,7 +248,9 @@ def _finite(x: Array) -> Array:
     return x
 
 
-def _errors_seen(x: Array, previous: Array | None, sensor: Sensor, chart: QuaternionChart) -> Array:
+def _errors_seen(
+    x: Array, previous: Array | None, sensor: Sensor, chart: QuaternionChart
+) -> Array:
     """How a sensor sees the errors (R, m, k), of the previous state too if it uses it."""
     slope = unchecked(sensor.jacobian)(x, previous) @ chart.tangent_basis(x)
     if previous is None:

@@ -95,21 +95,26 @@ def median_interval(values: Values, *, level: Level = 0.95) -> Interval:
     """
     from scipy.special import betainc, ndtri
 
-    v, n = np.sort(values), values.size
+    v = np.sort(values)
+    n = values.size
     # P(B <= k - 1) for k = 1, 2, ...: the chance that the k-th smallest lies above the median.
     ranks = np.arange(1, (n + 1) // 2 + 1)
     missed = 2 * betainc(n - ranks + 1, ranks, 0.5)
     k = int((missed <= 1 - level).sum())
     if k == 0:
         raise ValueError(f"values: needs more values for level {level:g}, got {n}")
-    low, high = float(v[k - 1]), float(v[n - k])
+    low = float(v[k - 1])
+    high = float(v[n - k])
     error = (high - low) / (2 * float(ndtri(0.5 + level / 2)))
     return Interval(float(np.median(v)), low, high, error)
 
 
 @validated
 def proportion_interval(
-    successes: Annotated[int, Bounds(at_least=0)], trials: PositiveInt, *, level: Level = 0.95
+    successes: Annotated[int, Bounds(at_least=0)],
+    trials: PositiveInt,
+    *,
+    level: Level = 0.95,
 ) -> Interval:
     """Clopper-Pearson interval for a probability: it covers with at least `level`, for every n.
 
@@ -135,7 +140,9 @@ def proportion_interval(
     """
     from scipy.special import betaincinv
 
-    k, n, tail = successes, trials, (1 - level) / 2
+    k = successes
+    n = trials
+    tail = (1 - level) / 2
     if k > n:
         raise ValueError(f"successes: needs at most as many as trials ({n}), got {k}")
     low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))

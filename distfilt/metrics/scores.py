@@ -12,13 +12,29 @@ from typing import Annotated
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveInt, PositiveDefinite, Probabilities, validated, unchecked
 from ..ensembles import Members
 from ..gaussians import log_density
 from ..linalg import cholesky, leading, quadratic_form
+from ..validation import (
+    Array,
+    Bounds,
+    PositiveDefinite,
+    PositiveInt,
+    Probabilities,
+    unchecked,
+    validated,
+)
 from .intervals import Interval, Level
 
-__all__ = ["crps", "gaussian_crps", "log_score", "nees", "nees_band", "nis", "squared_error"]
+__all__ = [
+    "crps",
+    "gaussian_crps",
+    "log_score",
+    "nees",
+    "nees_band",
+    "nis",
+    "squared_error",
+]
 
 Vector = Annotated[Array, "... d"]
 
@@ -73,7 +89,9 @@ def nees(estimate: Vector, cov: PositiveDefinite, truth: Vector) -> Array:
 
 
 @validated
-def nis(innovation: Annotated[Array, "... m"], cov: Annotated[PositiveDefinite, "... m m"]) -> Array:
+def nis(
+    innovation: Annotated[Array, "... m"], cov: Annotated[PositiveDefinite, "... m m"]
+) -> Array:
     r"""Normalised innovation squared, (...): how far a reading is from its prediction.
 
     :math:`\mathbf d^\top\mathbf S^{-1}\mathbf d`. Of an honest filter it is chi-square with m
@@ -99,7 +117,11 @@ def nis(innovation: Annotated[Array, "... m"], cov: Annotated[PositiveDefinite, 
 
 @validated
 def nees_band(
-    dim: PositiveInt, count: PositiveInt, *, level: Level = 0.95, normalised: bool = False
+    dim: PositiveInt,
+    count: PositiveInt,
+    *,
+    level: Level = 0.95,
+    normalised: bool = False,
 ) -> Interval:
     r"""Where the average of independent NEES values of an honest filter falls.
 
@@ -132,7 +154,8 @@ def nees_band(
     """
     from scipy.special import gammaincinv
 
-    tail, total = (1 - level) / 2, count * dim
+    tail = (1 - level) / 2
+    total = count * dim
     unit = total if normalised else count
     low, high = (2 * float(gammaincinv(total / 2, p)) / unit for p in (tail, 1 - tail))
     # At tiny levels the band lies below the mean, because the chi-square's median does.
@@ -142,7 +165,10 @@ def nees_band(
 
 @validated
 def crps(
-    ensemble: Members, truth: Vector, *, weights: Annotated[Probabilities, "... N"] | None = None
+    ensemble: Members,
+    truth: Vector,
+    *,
+    weights: Annotated[Probabilities, "... N"] | None = None,
 ) -> Array:
     r"""Continuous ranked probability score (..., d) of an ensemble by component; smaller is better.
 
@@ -176,19 +202,23 @@ def crps(
     # Distances from the truth are as good as the members, and lose fewer digits far from zero.
     gap = ensemble - truth[..., None, :]
     if weights is None:
-        gap, share = np.sort(gap, axis=-2), np.full((n, 1), 1 / n)
+        gap = np.sort(gap, axis=-2)
+        share = np.full((n, 1), 1 / n)
     else:
         leading(gap.shape[:-2], weights.shape[:-1], "weights")
         order = np.argsort(gap, axis=-2)
         gap = np.take_along_axis(gap, order, axis=-2)
-        share = np.take_along_axis(np.broadcast_to(weights[..., None], gap.shape), order, axis=-2)
+        share = np.take_along_axis(
+            np.broadcast_to(weights[..., None], gap.shape), order, axis=-2
+        )
     above = 2 * np.cumsum(share, axis=-2) - share - 1
     return np.asarray((share * (np.abs(gap) - above * gap)).sum(axis=-2))
 
 
 @validated
 def gaussian_crps(
-    mean: Annotated[Array, "..."], std: Annotated[Array, "...", Bounds(above=0)],
+    mean: Annotated[Array, "..."],
+    std: Annotated[Array, "...", Bounds(above=0)],
     truth: Annotated[Array, "..."],
 ) -> Array:
     r"""Continuous ranked probability score of Gaussians, componentwise, (...).

@@ -7,20 +7,31 @@ from typing import Literal
 
 import numpy as np
 
-from ..validation import PositiveInt, UnitInterval, validated, unchecked
 from ..linalg import log_sum
 from ..network import Channel, fusion_rule
+from ..validation import PositiveInt, UnitInterval, unchecked, validated
 from .fusion import Exponents, Others, PartialFusion, Rule, Terms
 from .gaussian import GaussianMixture, assemble_joint, regression
 from .reduction import runnalls
 
-__all__ = ["average_mixtures", "fuse_mixtures", "fuse_sequentially", "fuse_moments", "target_fusion"]
+__all__ = [
+    "average_mixtures",
+    "fuse_mixtures",
+    "fuse_sequentially",
+    "fuse_moments",
+    "target_fusion",
+]
 
 
 @validated
 def fuse_mixtures(
-    own: GaussianMixture, received: Others, *, omega: Exponents = "equal", terms: Terms = "matched",
-    rule: Rule = "C3", n_components: PositiveInt | None = None,
+    own: GaussianMixture,
+    received: Others,
+    *,
+    omega: Exponents = "equal",
+    terms: Terms = "matched",
+    rule: Rule = "C3",
+    n_components: PositiveInt | None = None,
 ) -> GaussianMixture:
     """Fuse a belief about [target; ego] with others' beliefs about the target.
 
@@ -44,7 +55,9 @@ def fuse_mixtures(
     exact = PartialFusion(own, received, omega=omega)
     fused = own
     if exact.exponents[0] != 1:
-        fused = unchecked(exact.assign_weights)(unchecked(exact.component_shapes)(terms=terms), rule=rule)
+        fused = unchecked(exact.assign_weights)(
+            unchecked(exact.component_shapes)(terms=terms), rule=rule
+        )
     return fused if n_components is None else unchecked(runnalls)(fused, n_components)
 
 
@@ -71,13 +84,18 @@ def fuse_moments(
     array([[2.]])
     """
     others = PartialFusion(own, received, omega=omega).others
-    alone = PartialFusion(own.moment_match(), [m.moment_match() for m in others], omega=omega)
+    alone = PartialFusion(
+        own.moment_match(), [m.moment_match() for m in others], omega=omega
+    )
     return unchecked(alone.component_shapes)().with_equal_weights()
 
 
 @validated
 def fuse_sequentially(
-    own: GaussianMixture, received: Others, *, omega: UnitInterval | Literal["equal"] = "equal",
+    own: GaussianMixture,
+    received: Others,
+    *,
+    omega: UnitInterval | Literal["equal"] = "equal",
     pair: Callable[..., GaussianMixture] = fuse_mixtures,
 ) -> GaussianMixture:
     """Fuse what is heard one belief after another: fewer mixands at a time than in one pass.
@@ -109,7 +127,9 @@ def fuse_sequentially(
 
 
 @validated
-def average_mixtures(own: GaussianMixture, received: GaussianMixture, *, omega: UnitInterval = 0.5) -> GaussianMixture:
+def average_mixtures(
+    own: GaussianMixture, received: GaussianMixture, *, omega: UnitInterval = 0.5
+) -> GaussianMixture:
     r"""Arithmetic average of the target beliefs, with the own conditional belief about the rest.
 
     :math:`p(\mathbf e|\mathbf t)\,[\omega\,p(\mathbf t)+(1-\omega)\,p_b(\mathbf t)]`. The weights
@@ -129,8 +149,11 @@ def average_mixtures(own: GaussianMixture, received: GaussianMixture, *, omega: 
     >>> average_mixtures(own, GaussianMixture.gaussian([2.0], [[1.0]])).mean
     array([1. , 0.5])
     """
-    target, n = PartialFusion(own, received).target, received.dim
-    logs = target.log_weights + unchecked(target.component_log_densities)(received.means)
+    target = PartialFusion(own, received).target
+    n = received.dim
+    logs = target.log_weights + unchecked(target.component_log_densities)(
+        received.means
+    )
     share = np.exp(logs - log_sum(logs))
     gain, rest = regression(own, n)
     gap = received.means[:, None] - own.means[:, :n]
@@ -139,7 +162,8 @@ def average_mixtures(own: GaussianMixture, received: GaussianMixture, *, omega: 
     means = np.concatenate([told, ego], axis=-1)
     covs = assemble_joint(received.covs[:, None], gain, rest)
     new = (received.weights[:, None] * share).ravel() * (1 - omega)
-    d, keep = own.dim, new > 0
+    d = own.dim
+    keep = new > 0
     return GaussianMixture.construct(
         np.concatenate([omega * own.weights, new[keep]]),
         np.concatenate([own.means, means.reshape(-1, d)[keep]]),
@@ -150,7 +174,10 @@ def average_mixtures(own: GaussianMixture, received: GaussianMixture, *, omega: 
 @fusion_rule("mixtures")
 @validated
 def target_fusion(
-    beliefs: Sequence[GaussianMixture], channel: Channel, *, target_dim: PositiveInt,
+    beliefs: Sequence[GaussianMixture],
+    channel: Channel,
+    *,
+    target_dim: PositiveInt,
     fuse: Callable[..., GaussianMixture] = fuse_mixtures,
 ) -> tuple[GaussianMixture, ...]:
     """Every agent sends what it believes of the target, and fuses its belief with what arrives.
@@ -188,7 +215,8 @@ def target_fusion(
     [[[1.5]], [[1.5]]]
     """
     said = [belief.marginal(range(target_dim)).pack() for belief in beliefs]
-    unpack, out = unchecked(GaussianMixture.unpack), list(beliefs)
+    unpack = unchecked(GaussianMixture.unpack)
+    out = list(beliefs)
     for agent, told in enumerate(channel.broadcast(said)):
         try:
             if told:

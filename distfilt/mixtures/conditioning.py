@@ -11,9 +11,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ..validation import Array, unchecked
 from ..gaussians.single import unscented_points
 from ..linalg import cholesky, log_det, lower_root, quadratic_form
+from ..validation import Array, unchecked
 from .gaussian import GaussianMixture
 
 __all__ = ["propagate_mixture", "update_mixture", "within_gate"]
@@ -47,12 +47,18 @@ def propagate_mixture(
     """
     means, first, second = _differences(np.asarray(function(_points(mixture))))
     if not all(np.isfinite(part).all() for part in (means, first, second)):
-        raise ValueError("function: needs finite values at the points, got NaN or an overflow")
+        raise ValueError(
+            "function: needs finite values at the points, got NaN or an overflow"
+        )
     return _of_roots(mixture.weights, means, _root(first, second, noise_factor))
 
 
 def update_mixture(
-    mixture: GaussianMixture, observed: Array, function: Callable[[Array], Array], noise: Array, *,
+    mixture: GaussianMixture,
+    observed: Array,
+    function: Callable[[Array], Array],
+    noise: Array,
+    *,
     residual: Callable[[Array, Array], Array] = np.subtract,
 ) -> GaussianMixture:
     """Condition a mixture on a reading: its mixands, and their weights by how likely it was.
@@ -85,16 +91,22 @@ def update_mixture(
     """
     if np.isnan(observed).all():
         return mixture
-    surprise, first, second, noises = _innovations(mixture, observed, function, noise, residual)
+    surprise, first, second, noises = _innovations(
+        mixture, observed, function, noise, residual
+    )
     root = _root(first, second, noises)
     cross = mixture.factors @ first.mT
     gain = np.linalg.solve(root.mT, np.linalg.solve(root, cross.mT)).mT
     factors = _root(mixture.factors - gain @ first, gain @ second, gain @ noises)
     means = mixture.means + (gain @ surprise[..., None])[..., 0]
-    logs = -0.5 * (quadratic_form(root, surprise) + log_det(root) + len(noises) * _LOG_2PI)
+    logs = -0.5 * (
+        quadratic_form(root, surprise) + log_det(root) + len(noises) * _LOG_2PI
+    )
     logs = np.where(np.isfinite(logs), mixture.log_weights + logs, -np.inf)
     if not np.isfinite(logs.max()):
-        raise ValueError("observed: needs a target that can be seen, got one that cannot")
+        raise ValueError(
+            "observed: needs a target that can be seen, got one that cannot"
+        )
     w = np.exp(logs - logs.max())
     w /= w.sum()
     keep = w > _NOTHING
@@ -102,8 +114,13 @@ def update_mixture(
 
 
 def within_gate(
-    mixture: GaussianMixture, observed: Array, function: Callable[[Array], Array], noise: Array, *,
-    gate: float, residual: Callable[[Array, Array], Array] = np.subtract,
+    mixture: GaussianMixture,
+    observed: Array,
+    function: Callable[[Array], Array],
+    noise: Array,
+    *,
+    gate: float,
+    residual: Callable[[Array, Array], Array] = np.subtract,
 ) -> Array:
     """The reading, or NaN in its place where no mixand expects it.
 
@@ -117,20 +134,28 @@ def within_gate(
     Examples
     --------
     >>> two = GaussianMixture([0.5, 0.5], [[-9.0], [9.0]], [[[1.0]], [[1.0]]])
-    >>> [within_gate(two, np.array([y]), lambda x: x, np.eye(1), gate=3.0) for y in (0.0, 9.5)]
+    >>> [
+    ...     within_gate(two, np.array([y]), lambda x: x, np.eye(1), gate=3.0)
+    ...     for y in (0.0, 9.5)
+    ... ]
     [array([nan]), array([9.5])]
     """
     surprise, *columns = _innovations(mixture, observed, function, noise, residual)
-    far = np.where(mixture.weights > 0, quadratic_form(_root(*columns), surprise), np.nan)
+    far = np.where(
+        mixture.weights > 0, quadratic_form(_root(*columns), surprise), np.nan
+    )
     # A mixand that cannot see the target expects nothing.
     refused = np.isfinite(far).any() and np.nanmin(far) > gate**2
     return np.full_like(observed, np.nan) if refused else observed
 
 
 def _innovations(
-    mixture: GaussianMixture, observed: Array, function: Callable[[Array], Array], noise: Array,
+    mixture: GaussianMixture,
+    observed: Array,
+    function: Callable[[Array], Array],
+    noise: Array,
     residual: Callable[[Array, Array], Array],
-) -> tuple[Array, Array, Array, Array]:  # fmt: skip
+) -> tuple[Array, Array, Array, Array]:
     """Innovations (L, k) of what is there, differences of its prediction, its noise's root."""
     here = np.flatnonzero(~np.isnan(observed))
     # A residual may need every component; those that are missing are zeros in both.
@@ -152,7 +177,9 @@ def _points(mixture: GaussianMixture) -> Array:
 def _differences(values: Array) -> tuple[Array, Array, Array]:
     """Mean (..., m) of a function's values at points, and first and second differences, columns."""
     d = values.shape[-2] // 2
-    centre, plus, minus = values[..., :1, :], values[..., 1 : d + 1, :], values[..., d + 1 :, :]
+    centre = values[..., :1, :]
+    plus = values[..., 1 : d + 1, :]
+    minus = values[..., d + 1 :, :]
     even = plus + minus - 2 * centre
     mean = centre[..., 0, :] + even.sum(axis=-2) / (2 * _STEP)
     first = (plus - minus).mT / (2 * np.sqrt(_STEP))
@@ -167,4 +194,6 @@ def _root(first: Array, second: Array, noise: Array) -> Array:
 
 def _of_roots(weights: Array, means: Array, factors: Array) -> GaussianMixture:
     """A mixture that keeps the square roots it came with."""
-    return GaussianMixture.construct(weights, means, factors @ factors.mT, factors=factors)
+    return GaussianMixture.construct(
+        weights, means, factors @ factors.mT, factors=factors
+    )

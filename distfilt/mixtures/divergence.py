@@ -8,7 +8,15 @@ from typing import Annotated
 
 import numpy as np
 
-from ..validation import Array, Bounds, FrozenModel, Rng, check_array, validated, unchecked
+from ..validation import (
+    Array,
+    Bounds,
+    FrozenModel,
+    Rng,
+    check_array,
+    unchecked,
+    validated,
+)
 from .gaussian import GaussianMixture
 
 __all__ = ["Divergence", "jeffreys_by_sampling", "jeffreys_of_many"]
@@ -42,8 +50,12 @@ class Divergence(FrozenModel):
 
 @validated
 def jeffreys_of_many(
-    log_p: Callable[[Array], Array], log_qs: Sequence[Callable[[Array], Array]],
-    lower: Annotated[Array, "d"], upper: Annotated[Array, "d"], *, nodes: Several = 50,
+    log_p: Callable[[Array], Array],
+    log_qs: Sequence[Callable[[Array], Array]],
+    lower: Annotated[Array, "d"],
+    upper: Annotated[Array, "d"],
+    *,
+    nodes: Several = 50,
 ) -> list[Divergence]:
     r"""Jeffreys' divergences of one density from several, by the trapezoid rule on a box.
 
@@ -66,7 +78,9 @@ def jeffreys_of_many(
     Examples
     --------
     >>> one, two = (GaussianMixture.gaussian([m], [[1.0]]) for m in (0.0, 1.0))
-    >>> found = jeffreys_of_many(one.log_density, [one.log_density, two.log_density], [-8], [9])
+    >>> found = jeffreys_of_many(
+    ...     one.log_density, [one.log_density, two.log_density], [-8], [9]
+    ... )
     >>> [round(d.value, 6) for d in found]
     [0.0, 0.5]
     """
@@ -80,7 +94,9 @@ def jeffreys_of_many(
     # One slice of the first axis at a time; each density is rescaled when a larger value comes.
     for x, part in zip(front[:, 0], front_parts, strict=True):
         at = np.concatenate([np.full((points.shape[0], 1), x), points], axis=1)
-        logs = np.stack([check_array(f(at), "log_p, log_qs", at.shape[:1]) for f in functions])
+        logs = np.stack(
+            [check_array(f(at), "log_p, log_qs", at.shape[:1]) for f in functions]
+        )
         new = np.maximum(tops, logs.max(axis=1))
         mass = part * parts * np.exp(logs - new[:, None])
         sums *= np.exp(tops - new)[:, None]
@@ -102,8 +118,12 @@ def _tensor_grid(low: Array, high: Array, nodes: int) -> tuple[Array, Array]:
 
 @validated
 def jeffreys_by_sampling(
-    log_p: Callable[[Array], Array], log_q: Callable[[Array], Array], proposal: GaussianMixture, *,
-    members: Several, rng: Rng,
+    log_p: Callable[[Array], Array],
+    log_q: Callable[[Array], Array],
+    proposal: GaussianMixture,
+    *,
+    members: Several,
+    rng: Rng,
 ) -> Divergence:
     r"""Jeffreys' divergence by importance sampling, with its standard error.
 
@@ -124,14 +144,22 @@ def jeffreys_by_sampling(
     Examples
     --------
     >>> one, two = (GaussianMixture.gaussian([m], [[1.0]]) for m in (0.0, 1.0))
-    >>> found = jeffreys_by_sampling(one.log_density, two.log_density, one, members=4000,
-    ...                              rng=np.random.default_rng(1))
+    >>> found = jeffreys_by_sampling(
+    ...     one.log_density,
+    ...     two.log_density,
+    ...     one,
+    ...     members=4000,
+    ...     rng=np.random.default_rng(1),
+    ... )
     >>> abs(found.value - 0.5) < 3 * found.error
     True
     """
     x = proposal.rvs(members, rng=rng)
     base = unchecked(proposal.log_density)(x)
-    logs = [check_array(f(x), name, base.shape) for f, name in ((log_p, "log_p"), (log_q, "log_q"))]
+    logs = [
+        check_array(f(x), name, base.shape)
+        for f, name in ((log_p, "log_p"), (log_q, "log_q"))
+    ]
     ratio = logs[0] - logs[1]
     weights = [np.exp(v - base - (v - base).max()) for v in logs]
     weights = [w / w.mean() for w in weights]

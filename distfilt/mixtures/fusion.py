@@ -20,10 +20,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import svdvals
 
-from ..validation import Array, Bounds, PositiveInt, Mask, FrozenModel, UnitInterval, validated, check_probabilities, unchecked
 from ..gaussians.single import unscented_points
 from ..linalg import SolverError, log_sum, symmetrise
-from .gaussian import GaussianMixture, inverse, assemble_joint, regression
+from ..validation import (
+    Array,
+    Bounds,
+    FrozenModel,
+    Mask,
+    PositiveInt,
+    UnitInterval,
+    check_probabilities,
+    unchecked,
+    validated,
+)
+from .gaussian import GaussianMixture, assemble_joint, inverse, regression
 from .reduction import ComponentShapes
 
 __all__ = ["PartialFusion", "nonnegative_least_squares", "tikhonov"]
@@ -83,7 +93,11 @@ class PartialFusion(FrozenModel):
     @property
     def others(self) -> tuple[GaussianMixture, ...]:
         """What is heard, one or several."""
-        return (self.received,) if isinstance(self.received, GaussianMixture) else tuple(self.received)
+        return (
+            (self.received,)
+            if isinstance(self.received, GaussianMixture)
+            else tuple(self.received)
+        )
 
     @cached_property
     def exponents(self) -> Array:
@@ -115,7 +129,9 @@ class PartialFusion(FrozenModel):
                 if weight:
                     logs = logs + weight * unchecked(other.log_density)(t)
         if np.isnan(logs).any():  # one density is divided by another, and both are zero
-            raise ValueError(f"{name}: needs points whose density is a number, got one too far out")
+            raise ValueError(
+                f"{name}: needs points whose density is a number, got one too far out"
+            )
         return logs
 
     @validated
@@ -136,7 +152,10 @@ class PartialFusion(FrozenModel):
 
     @validated
     def component_shapes(
-        self, *, terms: Terms = "matched", marginal: GaussianMixture | None = None,
+        self,
+        *,
+        terms: Terms = "matched",
+        marginal: GaussianMixture | None = None,
         received: Sequence[GaussianMixture] | None = None,
     ) -> ComponentShapes:
         """Means and covariances of the fused mixands, (22)-(28), without weights.
@@ -156,22 +175,31 @@ class PartialFusion(FrozenModel):
             What to multiply by in place of `heard` (reduced ones).
         """
         if marginal is not None and terms == "matched":
-            raise ValueError("marginal: needs terms='all', since matched terms use the own mixands")
+            raise ValueError(
+                "marginal: needs terms='all', since matched terms use the own mixands"
+            )
         divided = self.target if marginal is None else marginal
         sent = self.others if received is None else received
         n = self.target_dim
         if divided.dim != n:
             raise ValueError(f"marginal: needs dimension {n}, got {divided.dim}")
-        wanted, got = [n] * len(self.others), [other.dim for other in sent]
+        wanted = [n] * len(self.others)
+        got = [other.dim for other in sent]
         if got != wanted:
-            raise ValueError(f"received: needs mixtures of dimensions {wanted}, got {got}")
-        pairs: NDArray[np.intp] = np.indices((self.own.n_components, divided.n_components)).reshape(2, -1)
+            raise ValueError(
+                f"received: needs mixtures of dimensions {wanted}, got {got}"
+            )
+        pairs: NDArray[np.intp] = np.indices(
+            (self.own.n_components, divided.n_components)
+        ).reshape(2, -1)
         if terms == "matched":
             pairs = np.repeat(np.arange(self.own.n_components)[None], 2, axis=0)
         return _conditional(self.own, divided, sent, self.exponents, pairs)
 
     @validated
-    def assign_weights(self, shapes: ComponentShapes, *, rule: Rule = "C3", at_most: PositiveInt = 500) -> GaussianMixture:
+    def assign_weights(
+        self, shapes: ComponentShapes, *, rule: Rule = "C3", at_most: PositiveInt = 500
+    ) -> GaussianMixture:
         """The mixture of these shapes, with weights from the exact density at collocation points.
 
         Mixands whose weight is zero are left out.
@@ -196,18 +224,22 @@ class PartialFusion(FrozenModel):
         if shapes.n_components > at_most:
             best = np.argsort(mixture.log_peaks - logs, kind="stable")[:at_most]
             keep = np.isin(np.arange(shapes.n_components), best)
-            shapes, logs = unchecked(shapes.select)(keep), logs[keep]
+            shapes = unchecked(shapes.select)(keep)
+            logs = logs[keep]
             mixture = shapes.with_equal_weights()
         points = shapes.means
         if rule == "points":
             points = unchecked(unscented_points)(mixture.means, mixture.factors)[0]
             points = points.reshape(-1, mixture.dim)
             logs = unchecked(self.log_value)(points)
-        matrix = np.exp(unchecked(mixture.component_log_densities)(points) - mixture.log_peaks)
+        matrix = np.exp(
+            unchecked(mixture.component_log_densities)(points) - mixture.log_peaks
+        )
         right = np.exp(logs - logs.max())
         if rule == "points":
             rows = 1 / np.sqrt(right + _FLOOR)
-            matrix, right = matrix * rows[:, None], right * rows
+            matrix = matrix * rows[:, None]
+            right = right * rows
         found = unchecked(nonnegative_least_squares)(matrix, right)
         with np.errstate(divide="ignore"):
             return _weighed(mixture, np.log(found))
@@ -216,8 +248,11 @@ class PartialFusion(FrozenModel):
         """Log density at the shapes' means, exact or with the mixand alone that each came from."""
         if not alone:
             return unchecked(self.log_value)(shapes.means)
-        own, q = self.own, shapes.source
-        white = np.linalg.solve(own.factors[q], (shapes.means - own.means[q])[..., None])[..., 0]
+        own = self.own
+        q = shapes.source
+        white = np.linalg.solve(
+            own.factors[q], (shapes.means - own.means[q])[..., None]
+        )[..., 0]
         logs = (own.log_weights + own.log_peaks)[q] - 0.5 * (white**2).sum(axis=-1)
         return self._with_update(logs, shapes.means[:, : self.target_dim], "shapes")
 
@@ -227,20 +262,25 @@ def _weighed(mixture: GaussianMixture, logs: Array) -> GaussianMixture:
     mass = logs - mixture.log_peaks
     total = log_sum(mass)
     if not np.isfinite(total).all():
-        raise SolverError("no fused mixand has a weight: the exact density is zero at every point")
+        raise SolverError(
+            "no fused mixand has a weight: the exact density is zero at every point"
+        )
     w = np.exp(mass - total)
     keep = w > 0
     w = w[keep] / w[keep].sum()
     return GaussianMixture.construct(w, mixture.means[keep], mixture.covs[keep])
 
 
-def _told(sent: Sequence[GaussianMixture], w: Array, about: Array) -> tuple[Array, Array]:
+def _told(
+    sent: Sequence[GaussianMixture], w: Array, about: Array
+) -> tuple[Array, Array]:
     """Information (Q, T, n, n) and vectors (Q, T, n) of the product of the others' powers.
 
     One term for each choice of a mixand from each, with vectors relative to points (Q, n).
     """
     q, n = about.shape
-    information, pull = np.zeros((q, 1, n, n)), np.zeros((q, 1, n))
+    information = np.zeros((q, 1, n, n))
+    pull = np.zeros((q, 1, n))
     for weight, other in zip(w, sent, strict=True):
         j = weight * inverse(other.factors)
         eta = np.einsum("rij,srj->sri", j, other.means - about[:, None])
@@ -250,9 +290,12 @@ def _told(sent: Sequence[GaussianMixture], w: Array, about: Array) -> tuple[Arra
 
 
 def _conditional(
-    own: GaussianMixture, divided: GaussianMixture, sent: Sequence[GaussianMixture], w: Array,
+    own: GaussianMixture,
+    divided: GaussianMixture,
+    sent: Sequence[GaussianMixture],
+    w: Array,
     pairs: NDArray[np.intp],
-) -> ComponentShapes:  # fmt: skip
+) -> ComponentShapes:
     """Update the target part by Λ and η in the own mixand's whitened frame; e follows."""
     n = divided.dim
     q, p = pairs
@@ -265,7 +308,9 @@ def _conditional(
         pull = pull + (j @ gap[..., None])[:, None, :, 0]
     root = np.linalg.cholesky(own.covs[q, :n, :n])[:, None]
     # Where the own mixand is the divided one there is a factor; else it may be rounding's.
-    least = np.where((q == p) & (len(divided.means) == own.n_components), 1e-13, 1e-10)[:, None]
+    least = np.where((q == p) & (len(divided.means) == own.n_components), 1e-13, 1e-10)[
+        :, None
+    ]
     lower, good = _factored(np.eye(n) + root.mT @ symmetrise(information) @ root, least)
     half = np.linalg.solve(lower, np.broadcast_to(root.mT, lower.shape))
     target = half.mT @ half
@@ -275,7 +320,9 @@ def _conditional(
     covs = assemble_joint(target, gain, rest)
     source = np.broadcast_to(q[:, None], good.shape)
     means = own.means[q, None] + shift
-    return ComponentShapes.construct(means[good], covs[good], source[good], int((~good).sum()))
+    return ComponentShapes.construct(
+        means[good], covs[good], source[good], int((~good).sum())
+    )
 
 
 def _factored(matrices: Array, least: Array) -> tuple[Array, Mask]:
@@ -284,11 +331,16 @@ def _factored(matrices: Array, least: Array) -> tuple[Array, Mask]:
     lower = np.zeros_like(matrices)
     good = np.ones(matrices.shape[:-2], dtype=bool)
     for k in range(d):
-        column = matrices[..., k:, k] - (lower[..., k:, :k] @ lower[..., k, :k, None])[..., 0]
+        column = (
+            matrices[..., k:, k]
+            - (lower[..., k:, :k] @ lower[..., k, :k, None])[..., 0]
+        )
         # A pivot that has lost so many digits to cancellation is rounding.
         good &= column[..., 0] > least * np.abs(matrices[..., k, k])
         pivot = np.where(good, column[..., 0], 1.0)
-        lower[..., k:, k] = np.where(good[..., None], column, 0.0) / np.sqrt(pivot)[..., None]
+        lower[..., k:, k] = (
+            np.where(good[..., None], column, 0.0) / np.sqrt(pivot)[..., None]
+        )
     lower[~good] = np.eye(d)
     return lower, good
 
@@ -296,7 +348,9 @@ def _factored(matrices: Array, least: Array) -> tuple[Array, Mask]:
 @validated
 def tikhonov(
     largest: Annotated[float, Bounds(at_least=0, at_most=1e150)],
-    smallest: Annotated[float, Bounds(at_least=0, at_most=1e150)], *, condition: Condition = 1e10,
+    smallest: Annotated[float, Bounds(at_least=0, at_most=1e150)],
+    *,
+    condition: Condition = 1e10,
 ) -> float:
     r"""The smallest factor that brings a matrix's condition number down to `condition`, (66).
 
@@ -327,7 +381,9 @@ def tikhonov(
 @validated
 def nonnegative_least_squares(
     matrix: Annotated[Array, "n s", Bounds(at_least=-1e150, at_most=1e150)],
-    right: Annotated[Array, "n"], *, condition: Condition = 1e10,
+    right: Annotated[Array, "n"],
+    *,
+    condition: Condition = 1e10,
 ) -> Array:
     """Nonnegative weights that solve ``matrix @ w = right`` best, regularised by (60) and (66).
 
@@ -356,15 +412,20 @@ def nonnegative_least_squares(
 
     rows, columns = matrix.shape
     values = svdvals(matrix)
-    alpha = unchecked(tikhonov)(values[0], values[-1] * (rows >= columns), condition=condition)
+    alpha = unchecked(tikhonov)(
+        values[0], values[-1] * (rows >= columns), condition=condition
+    )
     if alpha > 0:
         matrix = np.concatenate([matrix, alpha * np.eye(columns)])
         right = np.concatenate([right, np.zeros(columns)])
     try:
         out = np.asarray(nnls(matrix, right, maxiter=20 * columns)[0], dtype=np.float64)
     except RuntimeError as error:
-        raise SolverError(f"nonnegative least squares: {error} ({columns} unknowns)") from None
-    slope, limit = matrix.T @ (matrix @ out - right), 1e-6 * values[0] * np.linalg.norm(right)
+        raise SolverError(
+            f"nonnegative least squares: {error} ({columns} unknowns)"
+        ) from None
+    slope = matrix.T @ (matrix @ out - right)
+    limit = 1e-6 * values[0] * np.linalg.norm(right)
     if slope.min() >= -limit and slope[out > 0].max(initial=0.0) <= limit:
         return out
     # It stops short at times where columns are almost the same; the optimum's slope tells.

@@ -9,8 +9,18 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 
-from ..validation import Array, PositiveInt, PositiveDefinite, DistinctIndices, FrozenModel, Rng, check_positive_definite, validated, check_probabilities
 from ..linalg import in_units, log_det, log_sum, symmetrise
+from ..validation import (
+    Array,
+    DistinctIndices,
+    FrozenModel,
+    PositiveDefinite,
+    PositiveInt,
+    Rng,
+    check_positive_definite,
+    check_probabilities,
+    validated,
+)
 
 __all__ = ["GaussianMixture"]
 
@@ -58,7 +68,9 @@ class GaussianMixture(FrozenModel):
 
     @classmethod
     @validated
-    def gaussian(cls, mean: Annotated[Array, "d"], cov: Annotated[PositiveDefinite, "d d"]) -> GaussianMixture:
+    def gaussian(
+        cls, mean: Annotated[Array, "d"], cov: Annotated[PositiveDefinite, "d d"]
+    ) -> GaussianMixture:
         """A single Gaussian as a mixture of one mixand.
 
         Parameters
@@ -143,11 +155,16 @@ class GaussianMixture(FrozenModel):
         >>> one.log_density([[0.0], [60.0]]).round(2).tolist()
         [-0.92, -1800.92]
         """
-        return self._in_blocks(x, (), lambda logs: log_sum(self.log_weights + logs)[..., 0])
+        return self._in_blocks(
+            x, (), lambda logs: log_sum(self.log_weights + logs)[..., 0]
+        )
 
-    def _in_blocks(self, x: Array, shape: tuple[int, ...], of: Callable[[Array], Array]) -> Array:
+    def _in_blocks(
+        self, x: Array, shape: tuple[int, ...], of: Callable[[Array], Array]
+    ) -> Array:
         """What is made of the mixands' log densities (n, L) at points, some points at a time."""
-        flat, (centre, white, at) = x.reshape(-1, self.dim), self._whitening
+        flat = x.reshape(-1, self.dim)
+        (centre, white, at) = self._whitening
         out = np.empty((len(flat), *shape))
         step = max(1, _CHUNK // self.means.size)
         for start in range(0, len(flat), step):
@@ -160,7 +177,9 @@ class GaussianMixture(FrozenModel):
     def _whitening(self) -> tuple[Array, Array, Array]:
         """Centre (d,), rows (d, L d) that whiten a point for each mixand, and their means."""
         centre = self.weights @ self.means
-        white = np.linalg.solve(self.factors, np.broadcast_to(np.eye(self.dim), self.covs.shape))
+        white = np.linalg.solve(
+            self.factors, np.broadcast_to(np.eye(self.dim), self.covs.shape)
+        )
         at = (white @ (self.means - centre)[..., None])[..., 0]
         return centre, np.array(white.reshape(-1, self.dim).T), at
 
@@ -180,8 +199,12 @@ class GaussianMixture(FrozenModel):
         """
         at = np.array(indices)
         if at.max() >= self.dim:
-            raise ValueError(f"indices: needs integers below {self.dim}, got {at.max()}")
-        return self.construct(self.weights, self.means[:, at], self.covs[:, at[:, None], at])
+            raise ValueError(
+                f"indices: needs integers below {self.dim}, got {at.max()}"
+            )
+        return self.construct(
+            self.weights, self.means[:, at], self.covs[:, at[:, None], at]
+        )
 
     @property
     def mean(self) -> Array:
@@ -192,7 +215,10 @@ class GaussianMixture(FrozenModel):
     def cov(self) -> Array:
         """Covariance of the whole mixture, (d, d)."""
         gap = self.means - self.mean
-        cov = np.einsum("l,lij->ij", self.weights, self.covs) + (gap.T * self.weights) @ gap
+        cov = (
+            np.einsum("l,lij->ij", self.weights, self.covs)
+            + (gap.T * self.weights) @ gap
+        )
         return symmetrise(cov)
 
     def moments(self) -> tuple[Array, Array]:
@@ -212,9 +238,13 @@ class GaussianMixture(FrozenModel):
         size : int
         rng : numpy.random.Generator
         """
-        which = rng.choice(self.n_components, size=size, p=self.weights / self.weights.sum())
+        which = rng.choice(
+            self.n_components, size=size, p=self.weights / self.weights.sum()
+        )
         noise = rng.standard_normal((size, self.dim))
-        return np.asarray(self.means[which] + (self.factors[which] @ noise[..., None])[..., 0])
+        return np.asarray(
+            self.means[which] + (self.factors[which] @ noise[..., None])[..., 0]
+        )
 
     def pack(self) -> tuple[Array, Array, Array]:
         """The mixture as a channel's payload: weights, means, and upper triangles (L, d(d+1)/2)."""
@@ -225,7 +255,9 @@ class GaussianMixture(FrozenModel):
     @validated
     def unpack(
         cls,
-        payload: tuple[Annotated[Array, "L"], Annotated[Array, "L d"], Annotated[Array, "L m"]],
+        payload: tuple[
+            Annotated[Array, "L"], Annotated[Array, "L d"], Annotated[Array, "L m"]
+        ],
     ) -> GaussianMixture:
         """The mixture from what :meth:`pack` made of it.
 
@@ -258,7 +290,9 @@ def _collapsed(covs: Array) -> str:
 
 def inverse(factors: Array) -> Array:
     """The inverse of L L', symmetric, for Cholesky factors (..., d, d)."""
-    white = np.linalg.solve(factors, np.broadcast_to(np.eye(factors.shape[-1]), factors.shape))
+    white = np.linalg.solve(
+        factors, np.broadcast_to(np.eye(factors.shape[-1]), factors.shape)
+    )
     return np.asarray(white.mT @ white)
 
 
@@ -274,7 +308,8 @@ def assemble_joint(target: Array, gain: Array, rest: Array) -> Array:
     below = symmetrise(rest + gain @ target @ gain.mT)
     n = target.shape[-1]
     out = np.empty((*below.shape[:-2], n + below.shape[-1], n + below.shape[-1]))
-    out[..., :n, :n], out[..., n:, n:] = target, below
+    out[..., :n, :n] = target
+    out[..., n:, n:] = below
     out[..., n:, :n] = gain @ target
     out[..., :n, n:] = out[..., n:, :n].mT
     return out

@@ -12,13 +12,29 @@ from typing import Annotated, Any, Literal, cast
 import numpy as np
 from scipy.linalg import qr
 
-from ..validation import Array, Bounds, PositiveInt, NonNegativeInt, Indices, Mask, FrozenModel, check_positive_definite, validated, unchecked
 from ..linalg import symmetrise
+from ..validation import (
+    Array,
+    Bounds,
+    FrozenModel,
+    Indices,
+    Mask,
+    NonNegativeInt,
+    PositiveInt,
+    check_positive_definite,
+    unchecked,
+    validated,
+)
 from .gaussian import GaussianMixture
 
 __all__ = [
-    "ComponentShapes", "cross_relevance", "merge_irrelevant", "merge_costs", "pivoted_qr", "runnalls",
-]  # fmt: skip
+    "ComponentShapes",
+    "cross_relevance",
+    "merge_irrelevant",
+    "merge_costs",
+    "pivoted_qr",
+    "runnalls",
+]
 
 # Divergence in nats up to which a mixand counts as near another's, whatever its weight.
 _GATE = 0.5
@@ -67,19 +83,28 @@ class ComponentShapes(FrozenModel):
 
         Examples
         --------
-        >>> ComponentShapes([[0.0], [1.0]], [[[1.0]], [[2.0]]], [0, 0]).select([False, True]).means
+        >>> ComponentShapes([[0.0], [1.0]], [[[1.0]], [[2.0]]], [0, 0]).select(
+        ...     [False, True]
+        ... ).means
         array([[1.]])
         """
-        return self.construct(self.means[keep], self.covs[keep], self.source[keep], self.dropped)
+        return self.construct(
+            self.means[keep], self.covs[keep], self.source[keep], self.dropped
+        )
 
     def with_equal_weights(self) -> GaussianMixture:
         """A mixture of these mixands with equal weights."""
-        return GaussianMixture.construct(np.full(self.n_components, 1 / self.n_components), self.means, self.covs)
+        return GaussianMixture.construct(
+            np.full(self.n_components, 1 / self.n_components), self.means, self.covs
+        )
 
 
 @validated
 def runnalls(
-    mixture: GaussianMixture, n_components: PositiveInt, *, heaviest: PositiveInt | None = None
+    mixture: GaussianMixture,
+    n_components: PositiveInt,
+    *,
+    heaviest: PositiveInt | None = None,
 ) -> GaussianMixture:
     r"""Merge, pair by pair, the mixands whose merger may lose least, until `size` are left.
 
@@ -108,13 +133,17 @@ def runnalls(
     >>> runnalls(three, 2).means.round(2)
     array([[0.1],
            [9. ]])
-    >>> four = GaussianMixture([0.4, 0.4, 0.1, 0.1], [[0.0], [9.0], [1.0], [8.0]], [[[1.0]]] * 4)
+    >>> four = GaussianMixture(
+    ...     [0.4, 0.4, 0.1, 0.1], [[0.0], [9.0], [1.0], [8.0]], [[[1.0]]] * 4
+    ... )
     >>> runnalls(four, 2, heaviest=2).means.round(2)
     array([[0.2],
            [8.8]])
     """
     if heaviest is not None and heaviest < n_components:
-        raise ValueError(f"heaviest: needs an integer of at least size, {n_components}, got {heaviest}")
+        raise ValueError(
+            f"heaviest: needs an integer of at least size, {n_components}, got {heaviest}"
+        )
     if heaviest is not None and heaviest < mixture.n_components:
         mixture = _absorbed(mixture, heaviest)
     if mixture.n_components <= n_components:
@@ -137,8 +166,11 @@ def merge_costs(mixture: GaussianMixture) -> Array:
     np.True_
     """
     w, m, p, _ = _whitened(mixture)
-    dets, every = np.linalg.slogdet(p)[1], np.arange(mixture.n_components)
-    return np.stack([_costs(w, m, p, dets, i, every) for i in range(mixture.n_components)])
+    dets = np.linalg.slogdet(p)[1]
+    every = np.arange(mixture.n_components)
+    return np.stack(
+        [_costs(w, m, p, dets, i, every) for i in range(mixture.n_components)]
+    )
 
 
 @validated
@@ -163,7 +195,9 @@ def cross_relevance(mixture: GaussianMixture, other: GaussianMixture) -> Array:
 
 @validated
 def merge_irrelevant(
-    mixture: GaussianMixture, other: GaussianMixture, *,
+    mixture: GaussianMixture,
+    other: GaussianMixture,
+    *,
     threshold: Annotated[float, Bounds(above=1)],
 ) -> GaussianMixture:
     r"""Merge into one the mixands that overlap with none of another's: the KLD rule (40)-(41).
@@ -188,20 +222,33 @@ def merge_irrelevant(
     >>> merge_irrelevant(mine, theirs, threshold=3.0).means
     array([[0. ],
            [8.5]])
-    >>> shared = GaussianMixture([0.9, 1e-5, 0.1 - 1e-5], [[0.0], [2.0], [9.0]], [[[1.0]]] * 3)
-    >>> merge_irrelevant(shared, GaussianMixture.gaussian([0.0], [[1.0]]), threshold=3.0).n_components
+    >>> shared = GaussianMixture(
+    ...     [0.9, 1e-5, 0.1 - 1e-5], [[0.0], [2.0], [9.0]], [[[1.0]]] * 3
+    ... )
+    >>> merge_irrelevant(
+    ...     shared, GaussianMixture.gaussian([0.0], [[1.0]]), threshold=3.0
+    ... ).n_components
     3
     """
     nearest = gaussian_divergences(mixture, other).min(axis=1)
     delta = np.where(mixture.weights > 0, mixture.weights * nearest, np.inf)
-    out = np.isfinite(delta) & (delta > threshold * max(delta.min(), _FLOOR)) & (nearest > _GATE)
+    out = (
+        np.isfinite(delta)
+        & (delta > threshold * max(delta.min(), _FLOOR))
+        & (nearest > _GATE)
+    )
     out[np.argmin(delta)] = False
     labels = np.where(out, mixture.n_components, np.arange(mixture.n_components))
     return _grouped(mixture, np.unique(labels, return_inverse=True)[1])
 
 
 @validated
-def pivoted_qr(shapes: ComponentShapes, *, n_components: PositiveInt, rest: Literal["merge", "drop"] = "merge") -> ComponentShapes:
+def pivoted_qr(
+    shapes: ComponentShapes,
+    *,
+    n_components: PositiveInt,
+    rest: Literal["merge", "drop"] = "merge",
+) -> ComponentShapes:
     r"""Keep the mixands that a pivoted QR decomposition of (33) finds independent, (42)-(43).
 
     Parameters
@@ -226,14 +273,17 @@ def pivoted_qr(shapes: ComponentShapes, *, n_components: PositiveInt, rest: Lite
     order = qr(np.exp(logs), mode="r", pivoting=True)[1]
     kept = n_components - (rest == "merge")
     keep = np.isin(np.arange(shapes.n_components), order[:kept])
-    first, lost = unchecked(shapes.select)(keep), unchecked(shapes.select)(~keep)
+    first = unchecked(shapes.select)(keep)
+    lost = unchecked(shapes.select)(~keep)
     if rest == "drop":
         return first
     one = lost.with_equal_weights()
     return ComponentShapes.construct(
-        np.concatenate([first.means, one.mean[None]]), np.concatenate([first.covs, one.cov[None]]),
-        np.append(first.source, shapes.source[order[kept]]), shapes.dropped,
-    )  # fmt: skip
+        np.concatenate([first.means, one.mean[None]]),
+        np.concatenate([first.covs, one.cov[None]]),
+        np.append(first.source, shapes.source[order[kept]]),
+        shapes.dropped,
+    )
 
 
 def gaussian_divergences(mixture: GaussianMixture, other: GaussianMixture) -> Array:
@@ -261,7 +311,8 @@ def _absorbed(mixture: GaussianMixture, heaviest: int) -> GaussianMixture:
     """The heaviest mixands after each other one has joined the cheapest of them."""
     w, m, p, _ = _whitened(mixture)
     order = np.argsort(-w, kind="stable")
-    heavy, rest = order[:heaviest], order[heaviest:]
+    heavy = order[:heaviest]
+    rest = order[heaviest:]
     dets = np.linalg.slogdet(p)[1]
     labels = np.empty(w.size, dtype=np.intp)
     labels[heavy] = np.arange(heaviest)
@@ -285,7 +336,9 @@ def _costs(w: Array, m: Array, p: Array, dets: Array, i: Any, others: Indices) -
     gap = m[others] - m[i]
     both = a[:, None, None] * p[i] + (1 - a)[:, None, None] * p[others]
     both += (a * (1 - a))[:, None, None] * gap[:, :, None] * gap[:, None, :]
-    bound = 0.5 * (total * np.linalg.slogdet(both)[1] - w[i] * dets[i] - w[others] * dets[others])
+    bound = 0.5 * (
+        total * np.linalg.slogdet(both)[1] - w[i] * dets[i] - w[others] * dets[others]
+    )
     return np.asarray(np.where(others == i, 0.0, bound))
 
 
@@ -305,13 +358,17 @@ def _merging() -> Callable[..., Mask]:
 def _costs_in_loops(w: Any, m: Any, p: Any, dets: Any, i: Any, others: Any) -> Any:
     """As :func:`_costs`, for numba: each merged covariance is formed and factored in one pass."""
     d = m.shape[1]
-    lower, out = np.empty((d, d)), np.zeros(others.size)
+    lower = np.empty((d, d))
+    out = np.zeros(others.size)
     for k, j in enumerate(others):
         total = w[i] + w[j]
         if total <= 0.0 or i == j:
             continue
-        a, b = w[i] / total, w[j] / total
-        one, other, gap = p[i], p[j], np.sqrt(a * b) * (m[i] - m[j])
+        a = w[i] / total
+        b = w[j] / total
+        one = p[i]
+        other = p[j]
+        gap = np.sqrt(a * b) * (m[i] - m[j])
         log_det = 0.0
         for r in range(d):
             for c in range(r):
@@ -322,7 +379,9 @@ def _costs_in_loops(w: Any, m: Any, p: Any, dets: Any, i: Any, others: Any) -> A
             s = a * one[r, r] + b * other[r, r] + gap[r] ** 2
             for e in range(r):
                 s -= lower[r, e] ** 2
-            lower[r, r] = 1.0 / np.sqrt(s)  # the reciprocal, so that columns need no division
+            lower[r, r] = 1.0 / np.sqrt(
+                s
+            )  # the reciprocal, so that columns need no division
             log_det += np.log(s)
         out[k] = 0.5 * (total * log_det - w[i] * dets[i] - w[j] * dets[j])
     return out
@@ -333,15 +392,24 @@ def _merged(w: Any, m: Any, p: Any, size: Any) -> Any:
 
     A merger can bring a mixand nearer to a third one than its nearest was:
 
-    >>> w, spread = np.array([8, 9, 3, 5, 7, 6]) / 38, np.array([0.1, 3.0, 1.0, 0.3, 1.0, 0.3])
+    >>> w, spread = (
+    ...     np.array([8, 9, 3, 5, 7, 6]) / 38,
+    ...     np.array([0.1, 3.0, 1.0, 0.3, 1.0, 0.3]),
+    ... )
     >>> means = [[29.0], [-7.0], [24.0], [24.0], [37.0], [-38.0]]
-    >>> (38 * runnalls(GaussianMixture(w, means, spread[:, None, None] ** 2), 2).weights).round(6)
+    >>> (
+    ...     38
+    ...     * runnalls(GaussianMixture(w, means, spread[:, None, None] ** 2), 2).weights
+    ... ).round(6)
     array([23., 15.])
     """
     n = w.size
-    every, alive = np.arange(n), np.full(n, True)
+    every = np.arange(n)
+    alive = np.full(n, True)
     dets = np.array([np.linalg.slogdet(p[i])[1] for i in range(n)])
-    table, best, nearest = np.full((n, n), np.inf), np.full(n, np.inf), np.zeros(n, np.int64)
+    table = np.full((n, n), np.inf)
+    best = np.full(n, np.inf)
+    nearest = np.zeros(n, np.int64)
     for k in range(n - 1):
         table[k, k + 1 :] = _costs(w, m, p, dets, k, every[k + 1 :])
     searched = every[:-1]
@@ -358,7 +426,10 @@ def _merged(w: Any, m: Any, p: Any, size: Any) -> Any:
         gap = m[i] - m[j]
         p[i] = a * p[i] + (1 - a) * p[j] + a * (1 - a) * np.outer(gap, gap)
         m[i] = a * m[i] + (1 - a) * m[j]
-        w[i], w[j], alive[j], best[j] = total, 0.0, False, np.inf
+        w[i] = total
+        w[j] = 0.0
+        alive[j] = False
+        best[j] = np.inf
         table[j, :] = table[:, j] = np.inf
         dets[i] = np.linalg.slogdet(p[i])[1]
         others = every[alive & (every != i)]
@@ -367,7 +438,9 @@ def _merged(w: Any, m: Any, p: Any, size: Any) -> Any:
         table[others[below], i] = row[below]
         table[i, others[~below]] = row[~below]
         # Only rows that lost their neighbour, and the merged one, are searched again.
-        searched = np.flatnonzero(alive & ((nearest == i) | (nearest == j) | (every == i)))
+        searched = np.flatnonzero(
+            alive & ((nearest == i) | (nearest == j) | (every == i))
+        )
         nearest = np.where(table[:, i] < best, i, nearest)
         best = np.minimum(table[:, i], best)
     return alive
@@ -378,7 +451,9 @@ def _grouped(mixture: GaussianMixture, labels: Indices) -> GaussianMixture:
     member = labels == np.arange(labels.max() + 1)[:, None]
     w = member @ mixture.weights
     equal = member / member.sum(axis=1, keepdims=True)
-    share = np.divide(member * mixture.weights, w[:, None], out=equal, where=w[:, None] > 0)
+    share = np.divide(
+        member * mixture.weights, w[:, None], out=equal, where=w[:, None] > 0
+    )
     means = share @ mixture.means
     gap = mixture.means - means[labels]
     covs = np.tensordot(share, mixture.covs + gap[:, :, None] * gap[:, None, :], axes=1)

@@ -8,8 +8,16 @@ from typing import Annotated
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveInt, Indices, PositiveFloat, validated, unchecked
 from ..linalg import symmetrise
+from ..validation import (
+    Array,
+    Bounds,
+    Indices,
+    PositiveFloat,
+    PositiveInt,
+    unchecked,
+    validated,
+)
 from .gaussian import GaussianMixture
 
 __all__ = ["split_components", "split_library", "split_nonlinear", "nonlinearity"]
@@ -63,13 +71,17 @@ def _library(std: float) -> tuple[Array, Array]:
         own = w @ overlap(m[:, None] - m, 2 * std**2) @ w
         return float(own - 2 * w @ overlap(m, 1 + std**2))
 
-    found = minimize_scalar(ise, bounds=(0.01, 0.49), method="bounded", options={"xatol": 1e-12})
+    found = minimize_scalar(
+        ise, bounds=(0.01, 0.49), method="bounded", options={"xatol": 1e-12}
+    )
     return parts(float(found.x))
 
 
 @validated
 def nonlinearity(
-    factors: Annotated[Array, "L d d"], jacobians: Annotated[Array, "L m d"], *,
+    factors: Annotated[Array, "L d d"],
+    jacobians: Annotated[Array, "L m d"],
+    *,
     scale: Annotated[Array, "m"] | None = None,
 ) -> tuple[Array, Array]:
     r"""How far a linearised map takes each mixand, and from where: first-order stretching.
@@ -112,8 +124,11 @@ def nonlinearity(
 
 @validated
 def split_components(
-    mixture: GaussianMixture, which: Annotated[Indices, "K", Bounds(at_least=0)],
-    directions: Annotated[Array, "K mixture.dim"], *, std: Fraction = 0.7,
+    mixture: GaussianMixture,
+    which: Annotated[Indices, "K", Bounds(at_least=0)],
+    directions: Annotated[Array, "K mixture.dim"],
+    *,
+    std: Fraction = 0.7,
 ) -> GaussianMixture:
     r"""Replace some mixands by three along a direction, keeping their mean and covariance.
 
@@ -146,10 +161,15 @@ def split_components(
         raise ValueError("directions: needs one standard deviation, got another length")
     w, m = _library(std)
     means = mixture.means[which][:, None] + m[:, None] * directions[:, None]
-    less = mixture.covs[which] - (1 - std**2) * directions[:, :, None] * directions[:, None, :]
+    less = (
+        mixture.covs[which]
+        - (1 - std**2) * directions[:, :, None] * directions[:, None, :]
+    )
     stay = np.setdiff1d(np.arange(mixture.n_components), which)
     return GaussianMixture.construct(
-        np.concatenate([mixture.weights[stay], (mixture.weights[which][:, None] * w).ravel()]),
+        np.concatenate(
+            [mixture.weights[stay], (mixture.weights[which][:, None] * w).ravel()]
+        ),
         np.concatenate([mixture.means[stay], means.reshape(-1, mixture.dim)]),
         np.concatenate([mixture.covs[stay], np.repeat(symmetrise(less), 3, axis=0)]),
     )
@@ -157,7 +177,11 @@ def split_components(
 
 @validated
 def split_nonlinear(
-    mixture: GaussianMixture, jacobian: Callable[[Array], Array], *, max_components: PositiveInt, split_threshold: PositiveFloat,
+    mixture: GaussianMixture,
+    jacobian: Callable[[Array], Array],
+    *,
+    max_components: PositiveInt,
+    split_threshold: PositiveFloat,
     scale: Annotated[Array, "m"] | None = None,
 ) -> GaussianMixture:
     """Split the mixands that a map stretches most in three, up to three times over.
@@ -178,7 +202,9 @@ def split_nonlinear(
     Examples
     --------
     >>> one = GaussianMixture.gaussian([0.0], [[1.0]])
-    >>> split_nonlinear(one, lambda x: 2 * np.ones((1, 1)), max_components=4, split_threshold=1.0).n_components
+    >>> split_nonlinear(
+    ...     one, lambda x: 2 * np.ones((1, 1)), max_components=4, split_threshold=1.0
+    ... ).n_components
     3
     """
     for _ in range(3):
@@ -187,7 +213,9 @@ def split_nonlinear(
             break
         slope = jacobian(mixture.means)
         slope = np.broadcast_to(slope, (mixture.n_components, *np.shape(slope)[-2:]))
-        directions, lengths = unchecked(nonlinearity)(mixture.factors, slope, scale=scale)
+        directions, lengths = unchecked(nonlinearity)(
+            mixture.factors, slope, scale=scale
+        )
         cost = np.where(mixture.weights > _LIGHT, mixture.weights * lengths, 0.0)
         worst = np.argsort(-cost, kind="stable")[:room]
         worst = worst[cost[worst] > split_threshold]

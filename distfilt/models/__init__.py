@@ -4,7 +4,13 @@ from . import orbit
 from .base import LinearModel, Model, simulate
 from .motion import constant_velocity, lorenz63, rk4
 from .orbit import occulted, orbits, rsw_frame
-from .pendulum import pendulum, pendulum_angle, pendulum_chart, pendulum_rate, pendulum_states
+from .pendulum import (
+    pendulum,
+    pendulum_angle,
+    pendulum_chart,
+    pendulum_rate,
+    pendulum_states,
+)
 from .satellite import (
     clohessy_wiltshire,
     cross_matrix,
@@ -14,9 +20,28 @@ from .satellite import (
 )
 from .swarm import RotatingMixture, Swarm, rotating_swarm
 
-__all__ = [  # fmt: skip
-    "LinearModel", "Model", "RotatingMixture", "Swarm", "clohessy_wiltshire", "constant_velocity",
-    "cross_matrix", "lorenz63", "occulted", "orbit", "orbits", "pendulum", "pendulum_angle",
-    "pendulum_chart", "pendulum_rate", "pendulum_states", "quaternion_rate",
-    "rk4", "rotating_swarm", "rotation_matrix", "rsw_frame", "satellite_pose", "simulate",
+__all__ = [
+    "LinearModel",
+    "Model",
+    "RotatingMixture",
+    "Swarm",
+    "clohessy_wiltshire",
+    "constant_velocity",
+    "cross_matrix",
+    "lorenz63",
+    "occulted",
+    "orbit",
+    "orbits",
+    "pendulum",
+    "pendulum_angle",
+    "pendulum_chart",
+    "pendulum_rate",
+    "pendulum_states",
+    "quaternion_rate",
+    "rk4",
+    "rotating_swarm",
+    "rotation_matrix",
+    "rsw_frame",
+    "satellite_pose",
+    "simulate",
 ]

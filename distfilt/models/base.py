@@ -11,9 +11,20 @@ from typing import Annotated
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveInt, NonNegativeFloat, FrozenModel, Rng, Times, check_array, validated, unchecked
-from ..validation.checks import call_batched, check_positive_semidefinite
 from ..linalg import as_derivative, central, factor
+from ..validation import (
+    Array,
+    Bounds,
+    FrozenModel,
+    NonNegativeFloat,
+    PositiveInt,
+    Rng,
+    Times,
+    check_array,
+    unchecked,
+    validated,
+)
+from ..validation.checks import call_batched, check_positive_semidefinite
 
 __all__ = ["LinearModel", "Model", "simulate"]
 
@@ -54,7 +65,9 @@ class Model(FrozenModel):
     dim: PositiveInt
     transition: Callable[[Array, float, float], Array]
     noise_cov: Callable[[float, float], Array]
-    derivative: Callable[[Array, float, float], Array] | None = field(default=None, kw_only=True)
+    derivative: Callable[[Array, float, float], Array] | None = field(
+        default=None, kw_only=True
+    )
     names: tuple[str, ...] = field(default=(), kw_only=True)
     units: tuple[str, ...] = field(default=(), kw_only=True)
 
@@ -65,7 +78,9 @@ class Model(FrozenModel):
                 raise ValueError(f"{name}: needs {self.dim} entries, got {len(labels)}")
 
     @validated
-    def step(self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat) -> Array:
+    def step(
+        self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat
+    ) -> Array:
         """Move states (..., d) from `t` to `t` + `dt`, without noise."""
         return call_batched(self, "transition", (x,), t, dt)
 
@@ -80,27 +95,40 @@ class Model(FrozenModel):
         return self._noise(t, dt)[1]
 
     def _noise(self, t: float, dt: float) -> tuple[Array, Array]:
-        q = check_array(self.noise_cov(t, dt), "noise_cov", (self.dim, self.dim), finite=False)
+        q = check_array(
+            self.noise_cov(t, dt), "noise_cov", (self.dim, self.dim), finite=False
+        )
         return _with_factor(q.tobytes(), self.dim)
 
     @validated
     def sample_step(
-        self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat, *, rng: Rng
+        self,
+        x: Annotated[Array, "... self.dim"],
+        t: float,
+        dt: NonNegativeFloat,
+        *,
+        rng: Rng,
     ) -> Array:
         """Move states (..., d) from `t` to `t` + `dt` and add a draw of the noise to each."""
         moved = unchecked(self.step)(x, t, dt)
-        noise = rng.standard_normal(moved.shape) @ np.ascontiguousarray(self._noise(t, dt)[1].T)
+        noise = rng.standard_normal(moved.shape) @ np.ascontiguousarray(
+            self._noise(t, dt)[1].T
+        )
         noise += moved
         return noise
 
     @validated
-    def jacobian(self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat) -> Array:
+    def jacobian(
+        self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat
+    ) -> Array:
         """Derivative of a step from states (..., d), as (..., d, d).
 
         `derivative` where the model has it, central differences of `flow` otherwise.
         """
         near = partial(central, lambda state: unchecked(self.step)(state, t, dt), x)
-        return as_derivative(self, (x, t, dt), (*x.shape, self.dim), near, np.eye(self.dim))
+        return as_derivative(
+            self, (x, t, dt), (*x.shape, self.dim), near, np.eye(self.dim)
+        )
 
 
 @lru_cache(maxsize=64)
@@ -127,7 +155,8 @@ class LinearModel(Model):
     Examples
     --------
     >>> still = LinearModel.from_transition(
-    ...     2, lambda dt: np.eye(2), lambda t, dt: dt * np.eye(2))
+    ...     2, lambda dt: np.eye(2), lambda t, dt: dt * np.eye(2)
+    ... )
     >>> still.step([1.0, 2.0], 0.0, 0.1)
     array([1., 2.])
     """
@@ -136,35 +165,56 @@ class LinearModel(Model):
 
     @classmethod
     def from_transition(
-        cls, dim: int, transition_matrix: Callable[[float], Array],
-        noise_cov: Callable[[float, float], Array], *, names: tuple[str, ...] = (),
-        units: tuple[str, ...] = ()
+        cls,
+        dim: int,
+        transition_matrix: Callable[[float], Array],
+        noise_cov: Callable[[float, float], Array],
+        *,
+        names: tuple[str, ...] = (),
+        units: tuple[str, ...] = (),
     ) -> LinearModel:
         """Build the model from its transition matrix, ``transition_matrix(dt) -> (d, d)``."""
         flow = partial(_product, transition_matrix, dim)
         return cls(
-            dim, flow, noise_cov, names=names, units=units, transition_matrix=transition_matrix
+            dim,
+            flow,
+            noise_cov,
+            names=names,
+            units=units,
+            transition_matrix=transition_matrix,
         )
 
     def _noise(self, t: float, dt: float) -> tuple[Array, Array]:
-        whole, half = super()._noise(t, dt), dt / 2
+        whole = super()._noise(t, dt)
+        half = dt / 2
         if dt and vars(self).pop("_doubted", False):
             # Two half steps add the noise of a whole one. A user's table may have no halves.
-            with suppress(AssertionError, LookupError, RuntimeError, TypeError, ValueError):
-                phi, first = self.F(half), self.noise_cov(t, half)
+            with suppress(
+                AssertionError, LookupError, RuntimeError, TypeError, ValueError
+            ):
+                phi = self.F(half)
+                first = self.noise_cov(t, half)
                 last = self.noise_cov(t + half, half) - whole[0]
-                own, other = (np.abs(p @ first @ p.T + last).max() for p in (phi, phi.T))
+                own, other = (
+                    np.abs(p @ first @ p.T + last).max() for p in (phi, phi.T)
+                )
                 if other < 1e-11 * np.abs(whole[0]).max() < 1e-2 * own:
-                    warnings.warn("transition_matrix: transposed for noise_cov", RuntimeWarning, 4)
+                    warnings.warn(
+                        "transition_matrix: transposed for noise_cov", RuntimeWarning, 4
+                    )
         return whole
 
     @validated
     def F(self, dt: NonNegativeFloat) -> Array:
         """The matrix Φ of a step of `dt` seconds, (d, d)."""
-        return check_array(self.transition_matrix(dt), "transition_matrix", (self.dim, self.dim))
+        return check_array(
+            self.transition_matrix(dt), "transition_matrix", (self.dim, self.dim)
+        )
 
     @validated
-    def jacobian(self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat) -> Array:
+    def jacobian(
+        self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat
+    ) -> Array:
         """Derivative of a step, the same matrix for all states, as (..., d, d)."""
         return np.full((*x.shape, self.dim), unchecked(self.F)(dt))
 
@@ -179,7 +229,12 @@ def _product(
 
 @validated
 def simulate(
-    model: Model, x0: Annotated[Array, "... model.dim"], times: Times, *, rng: Rng, t0: float = 0.0
+    model: Model,
+    x0: Annotated[Array, "... model.dim"],
+    times: Times,
+    *,
+    rng: Rng,
+    t0: float = 0.0,
 ) -> Array:
     """Draw trajectories of a model at the given times.
 
@@ -210,7 +265,9 @@ def simulate(
     return path(partial(unchecked(model.sample_step), rng=rng), x0, times, t0)
 
 
-def path(move: Callable[[Array, float, float], Array], x: Array, times: Array, t0: float) -> Array:
+def path(
+    move: Callable[[Array, float, float], Array], x: Array, times: Array, t0: float
+) -> Array:
     """Where ``move(x, t, dt)`` takes states from `t0`, at the times."""
     if times.size and times[0] <= t0:
         raise ValueError(f"times: needs times after t0 = {t0:g}, got {times[0]:g}")

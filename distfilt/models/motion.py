@@ -14,7 +14,15 @@ from typing import Annotated
 
 import numpy as np
 
-from ..validation import Array, Bounds, NonNegativeFloat, PositiveFloat, check_array, validated, unchecked
+from ..validation import (
+    Array,
+    Bounds,
+    NonNegativeFloat,
+    PositiveFloat,
+    check_array,
+    unchecked,
+    validated,
+)
 from .base import LinearModel, Model, Strength
 
 __all__ = ["constant_velocity", "integrate", "lorenz63", "rk4"]
@@ -24,7 +32,9 @@ _MOST = 10_000_000
 """More integration steps than this are a mistake in `longest`, not a wish."""
 _AXES = ("x", "y", "z")
 # Arrays without axes: an array of few states is multiplied by a number in half again the time.
-_PRANDTL, _RAYLEIGH, _SHAPE = np.array(10.0), np.array(28.0), np.array(8 / 3)
+_PRANDTL = np.array(10.0)
+_RAYLEIGH = np.array(28.0)
+_SHAPE = np.array(8 / 3)
 
 
 @validated
@@ -52,7 +62,9 @@ def constant_velocity(
     array([ 2. ,  1. ,  0.5, -0.5])
     """
     return LinearModel.from_transition(
-        2 * axes, partial(_straight, axes=axes), partial(_straight_noise, sigma=sigma, axes=axes),
+        2 * axes,
+        partial(_straight, axes=axes),
+        partial(_straight_noise, sigma=sigma, axes=axes),
         names=(*_AXES[:axes], *(f"v{axis}" for axis in _AXES[:axes])),
         units=("m",) * axes + ("m/s",) * axes,
     )
@@ -63,7 +75,8 @@ def _straight(dt: float, axes: int) -> Array:
 
 
 def _straight_noise(t: float, dt: float, sigma: float, axes: int) -> Array:
-    both, q = dt**2 / 2, sigma**2
+    both = dt**2 / 2
+    q = sigma**2
     return _along_axes(((q * (dt**3 / 3), q * both), (q * both, q * dt)), axes)
 
 
@@ -77,7 +90,12 @@ def _along_axes(block: tuple[tuple[float, float], ...], axes: int) -> Array:
 
 @validated
 def rk4(
-    rate: Rate, x: Array, t: float, dt: NonNegativeFloat, *, longest: PositiveFloat | None = None
+    rate: Rate,
+    x: Array,
+    t: float,
+    dt: NonNegativeFloat,
+    *,
+    longest: PositiveFloat | None = None,
 ) -> Array:
     r"""Advance :math:`\dot{\mathbf x} = \mathbf f(\mathbf x, t)` by the classical Runge-Kutta rule.
 
@@ -137,16 +155,28 @@ def equal_steps(dt: float, longest: float | None) -> int:
 
 
 def integrate(
-    rate: Rate, density: Array, *, step: float, names: tuple[str, ...], units: tuple[str, ...]
+    rate: Rate,
+    density: Array,
+    *,
+    step: float,
+    names: tuple[str, ...],
+    units: tuple[str, ...],
 ) -> Model:
     """The model that :func:`rk4` makes of a rate, with white noise of a spectral density (d, d)."""
-    return Model(len(density), partial(_flow, rate=rate, longest=step), partial(_white, density),
-                 names=names, units=units)
+    return Model(
+        len(density),
+        partial(_flow, rate=rate, longest=step),
+        partial(_white, density),
+        names=names,
+        units=units,
+    )
 
 
 def _flow(x: Array, t: float, dt: float, rate: Rate, longest: float) -> Array:
     # Each component of all states side by side in memory: twice as fast, and the same numbers.
-    return np.ascontiguousarray(unchecked(rk4)(rate, x.copy("F"), t, dt, longest=longest))
+    return np.ascontiguousarray(
+        unchecked(rk4)(rate, x.copy("F"), t, dt, longest=longest)
+    )
 
 
 def _white(density: Array, t: float, dt: float) -> Array:
@@ -176,11 +206,15 @@ def lorenz63(*, sigma: Strength = 0.0, step: PositiveFloat = 0.01) -> Model:
     >>> lorenz63().step([1.0, 1.0, 20.0], 0.0, 0.1).shape
     (3,)
     """
-    return integrate(_rate, sigma**2 * np.eye(3), step=step, names=_AXES, units=("1",) * 3)
+    return integrate(
+        _rate, sigma**2 * np.eye(3), step=step, names=_AXES, units=("1",) * 3
+    )
 
 
 def _rate(state: Array, t: float) -> Array:
-    x, y, z = state[..., 0], state[..., 1], state[..., 2]
+    x = state[..., 0]
+    y = state[..., 1]
+    z = state[..., 2]
     out = np.empty_like(state)
     np.multiply(_PRANDTL, y - x, out[..., 0])
     np.subtract(x * (_RAYLEIGH - z), y, out[..., 1])

@@ -12,12 +12,19 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveInt, PositiveFloat, validated, unchecked
+from ..validation import Array, Bounds, PositiveFloat, PositiveInt, unchecked, validated
 from .base import Model, Strength
 from .motion import equal_steps, rk4
 
-__all__ = [  # fmt: skip
-    "J2", "MU", "RADIUS", "acceleration", "occulted", "orbits", "potential", "propagate",
+__all__ = [
+    "J2",
+    "MU",
+    "RADIUS",
+    "acceleration",
+    "occulted",
+    "orbits",
+    "potential",
+    "propagate",
     "rsw_frame",
 ]
 
@@ -103,8 +110,11 @@ def _rate(x: Array, t: float = 0.0) -> Array:
 
 @validated
 def propagate(
-    x: Annotated[Array, "... 6"], dt: float, *, rule: Literal["dop853", "rk4"] = "dop853",
-    longest: PositiveFloat = 900.0
+    x: Annotated[Array, "... 6"],
+    dt: float,
+    *,
+    rule: Literal["dop853", "rk4"] = "dop853",
+    longest: PositiveFloat = 900.0,
 ) -> Array:
     """Move satellites by a fixed number of equal steps.
 
@@ -156,7 +166,8 @@ def _dop853(x: Array, h: float) -> Array:
     """E. Hairer, S. Norsett and G. Wanner, Solving Ordinary Differential Equations I (1993)."""
     from scipy.integrate import DOP853
 
-    a, b = h * DOP853.A[:12, :12], h * DOP853.B
+    a = h * DOP853.A[:12, :12]
+    b = h * DOP853.B
     stages = np.empty((12, *x.shape))
     flat = stages.reshape(12, -1)
     stages[0] = _rate(x)
@@ -167,7 +178,10 @@ def _dop853(x: Array, h: float) -> Array:
 
 @validated
 def orbits(
-    bodies: PositiveInt = 1, *, position_std: Strength = 0.0, velocity_std: Strength = 0.0,
+    bodies: PositiveInt = 1,
+    *,
+    position_std: Strength = 0.0,
+    velocity_std: Strength = 0.0,
 ) -> Model:
     """Several satellites as one model; the state is theirs one after the other.
 
@@ -188,7 +202,10 @@ def orbits(
     noise = np.diag(np.tile([position_std**2] * 3 + [velocity_std**2] * 3, bodies))
     axes = ("x", "y", "z", "vx", "vy", "vz")
     return Model(
-        6 * bodies, _flow, partial(_noise, noise), derivative=partial(_slope, bodies=bodies),
+        6 * bodies,
+        _flow,
+        partial(_noise, noise),
+        derivative=partial(_slope, bodies=bodies),
         names=tuple(f"{c}{k + 1}" for k in range(bodies) for c in axes),
         units=("km", "km", "km", "m/s", "m/s", "m/s") * bodies,
     )
@@ -207,7 +224,9 @@ def _slope(x: Array, t: float, dt: float, bodies: int) -> Array:
     """Central differences, body by body: a body's motion depends on its own state only."""
     size = np.full(6, 1e-2)
     states = x.reshape(*x.shape[:-1], bodies, 6)
-    moved = np.stack([states[..., None, :] + np.diag(size), states[..., None, :] - np.diag(size)])
+    moved = np.stack(
+        [states[..., None, :] + np.diag(size), states[..., None, :] - np.diag(size)]
+    )
     ends = _flow(moved, t, dt)
     blocks = np.swapaxes((ends[0] - ends[1]) / (2 * size[:, None]), -1, -2)
     out = np.zeros((*x.shape, x.shape[-1]))
@@ -242,7 +261,9 @@ def rsw_frame(x: Orbits) -> Array:
     normal = np.cross(x[..., :3], x[..., 3:])
     size = np.linalg.norm(normal, axis=-1, keepdims=True)
     if (size == 0).any() or not np.isfinite(radial).all():
-        raise ValueError("x: needs positions and velocities that span a plane, got others")
+        raise ValueError(
+            "x: needs positions and velocities that span a plane, got others"
+        )
     normal = normal / size
     return np.stack([radial, np.cross(normal, radial), normal], axis=-1)
 

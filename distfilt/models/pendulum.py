@@ -15,8 +15,11 @@ from ..validation import Array, Bounds, NonNegativeFloat, PositiveFloat, validat
 from .base import Model
 from .motion import integrate
 
-__all__ = [  # fmt: skip
-    "pendulum", "pendulum_angle", "pendulum_chart", "pendulum_rate",
+__all__ = [
+    "pendulum",
+    "pendulum_angle",
+    "pendulum_chart",
+    "pendulum_rate",
     "pendulum_states",
 ]
 
@@ -28,7 +31,11 @@ States = Annotated[Array, "... 4"]
 
 @validated
 def pendulum_rate(
-    states: States, *, length: Length = 1.0, gravity: NonNegativeFloat = 9.8, form: Form = "printed"
+    states: States,
+    *,
+    length: Length = 1.0,
+    gravity: NonNegativeFloat = 9.8,
+    form: Form = "printed",
 ) -> Array:
     r"""Right-hand side (..., 4) of the pendulum's equations, (14)-(15) of Das and Bhattacharya.
 
@@ -60,10 +67,14 @@ def pendulum_rate(
 
 
 def _rate(s: Array, t: float, size: float, g: float, printed: bool) -> Array:
-    x, y, u, v = s[..., 0], s[..., 1], s[..., 2], s[..., 3]
+    x = s[..., 0]
+    y = s[..., 1]
+    u = s[..., 2]
+    v = s[..., 3]
     pull = (u * u + v * v + g * y) / -(size * size)
     out = np.empty_like(s)
-    out[..., 0], out[..., 1] = u, v
+    out[..., 0] = u
+    out[..., 1] = v
     np.multiply(pull, x, out=out[..., 2])
     # g x² / L² = g - g y² / L² + g (x² + y² - L²) / L²: off the circle another force.
     weight = g * (x * x + y * y) / (size * size) if printed else g
@@ -73,8 +84,12 @@ def _rate(s: Array, t: float, size: float, g: float, printed: bool) -> Array:
 
 @validated
 def pendulum(
-    *, length: Length = 1.0, gravity: NonNegativeFloat = 9.8, form: Form = "printed",
-    sigma: tuple[NonNegativeFloat, NonNegativeFloat] = (0.0, 0.0), step: PositiveFloat = 0.01,
+    *,
+    length: Length = 1.0,
+    gravity: NonNegativeFloat = 9.8,
+    form: Form = "printed",
+    sigma: tuple[NonNegativeFloat, NonNegativeFloat] = (0.0, 0.0),
+    step: PositiveFloat = 0.01,
 ) -> Model:
     """The pendulum in Cartesian coordinates x, y, vx, vy, by Runge-Kutta of order 4.
 
@@ -96,15 +111,20 @@ def pendulum(
     """
     return integrate(
         partial(_rate, size=length, g=gravity, printed=form == "printed"),
-        np.diag(np.repeat(sigma, 2) ** 2), step=step, names=("x", "y", "vx", "vy"),
+        np.diag(np.repeat(sigma, 2) ** 2),
+        step=step,
+        names=("x", "y", "vx", "vy"),
         units=("m", "m", "m/s", "m/s"),
     )
 
 
 @validated
 def pendulum_angle(
-    *, length: Length = 1.0, gravity: NonNegativeFloat = 9.8,
-    sigma: tuple[NonNegativeFloat, NonNegativeFloat] = (0.0, 0.0), step: PositiveFloat = 0.01,
+    *,
+    length: Length = 1.0,
+    gravity: NonNegativeFloat = 9.8,
+    sigma: tuple[NonNegativeFloat, NonNegativeFloat] = (0.0, 0.0),
+    step: PositiveFloat = 0.01,
 ) -> Model:
     r"""The pendulum in its chart: the angle θ from the vertical, not wrapped, and its rate.
 
@@ -123,8 +143,11 @@ def pendulum_angle(
     array([ 0.01  , -0.9995])
     """
     return integrate(
-        partial(_swing, pull=gravity / length), np.diag(np.square(sigma)), step=step,
-        names=("theta", "omega"), units=("rad", "rad/s"),
+        partial(_swing, pull=gravity / length),
+        np.diag(np.square(sigma)),
+        step=step,
+        names=("theta", "omega"),
+        units=("rad", "rad/s"),
     )
 
 
@@ -151,7 +174,9 @@ def pendulum_states(chart: Annotated[Array, "... 2"], *, length: Length = 1.0) -
     >>> pendulum_states([np.pi / 2, 2.0]).round(12) + 0.0
     array([ 1.,  0.,  0., -2.])
     """
-    sine, cosine, rate = np.sin(chart[..., 0]), np.cos(chart[..., 0]), chart[..., 1]
+    sine = np.sin(chart[..., 0])
+    cosine = np.cos(chart[..., 0])
+    rate = chart[..., 1]
     return length * np.stack([sine, cosine, rate * cosine, -rate * sine], axis=-1)
 
 
@@ -169,7 +194,10 @@ def pendulum_chart(states: States) -> Array:
     >>> pendulum_chart(pendulum_states([2.0, -1.5])).round(12)
     array([ 2. , -1.5])
     """
-    x, y, u, v = states[..., 0], states[..., 1], states[..., 2], states[..., 3]
+    x = states[..., 0]
+    y = states[..., 1]
+    u = states[..., 2]
+    v = states[..., 3]
     square = x * x + y * y
     if (square == 0).any():
         raise ValueError("states: needs positions away from the pivot, got one at it")

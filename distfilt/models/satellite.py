@@ -18,14 +18,20 @@ from typing import Annotated, Any
 import numpy as np
 from scipy.linalg import expm
 
-from ..validation import Array, PositiveFloat, validated, unchecked
 from ..linalg import symmetrise
+from ..validation import Array, PositiveFloat, unchecked, validated
 from .base import LinearModel, Model, Strength
 from .motion import rk4
 
-__all__ = [  # fmt: skip
-    "clohessy_wiltshire", "cross_matrix", "left_directions", "quaternion_rate", "rotation_matrix",
-    "satellite_pose", "rotation_vector_between", "rotate",
+__all__ = [
+    "clohessy_wiltshire",
+    "cross_matrix",
+    "left_directions",
+    "quaternion_rate",
+    "rotation_matrix",
+    "satellite_pose",
+    "rotation_vector_between",
+    "rotate",
 ]
 
 
@@ -33,7 +39,8 @@ def _drift(rate: float) -> Array:
     """The matrix A, (6, 6), of the Clohessy-Wiltshire equations."""
     a = np.zeros((6, 6))
     a[:3, 3:] = np.eye(3)
-    a[3, 0], a[3, 4] = 3 * rate * rate, 2 * rate
+    a[3, 0] = 3 * rate * rate
+    a[3, 4] = 2 * rate
     a[4, 3] = -2 * rate
     a[5, 2] = -rate * rate
     return a
@@ -42,8 +49,10 @@ def _drift(rate: float) -> Array:
 @lru_cache(maxsize=64)
 def _transition(dt: float, rate: float) -> Array:
     """The exact transition exp(A dt); Journal of the Aerospace Sciences 27 (1960) 653-658."""
-    n, tau = rate, rate * dt
-    s, c = np.sin(tau), np.cos(tau)
+    n = rate
+    tau = rate * dt
+    s = np.sin(tau)
+    c = np.cos(tau)
     # Columns: x, y, z, and the three velocities; rows: the same after the step.
     phi = np.array(
         [
@@ -62,7 +71,8 @@ def _transition(dt: float, rate: float) -> Array:
 @lru_cache(maxsize=64)
 def _exact_noise(rate: float, sigma: float, dt: float) -> Array:
     # C. F. Van Loan, IEEE Transactions on Automatic Control 23 (1978) 395-404.
-    a, density = _drift(rate), sigma**2 * np.eye(6)
+    a = _drift(rate)
+    density = sigma**2 * np.eye(6)
     both = expm(dt * np.block([[-a, density], [np.zeros((6, 6)), a.T]]))
     cov = symmetrise(both[6:, 6:].T @ both[:6, 6:])
     cov.setflags(write=False)
@@ -92,13 +102,18 @@ def clohessy_wiltshire(*, rate: PositiveFloat, sigma: Strength) -> LinearModel:
     array([0.00401, 0.00401, 0.00401, 0.004  , 0.004  , 0.004  ])
     """
     return LinearModel.from_transition(
-        6, partial(_transition, rate=rate), partial(_noise, rate=rate, sigma=sigma),
-        names=("x", "y", "z", "vx", "vy", "vz"), units=("m", "m", "m", "m/s", "m/s", "m/s"),
+        6,
+        partial(_transition, rate=rate),
+        partial(_noise, rate=rate, sigma=sigma),
+        names=("x", "y", "z", "vx", "vy", "vz"),
+        units=("m", "m", "m", "m/s", "m/s", "m/s"),
     )
 
 
 @validated
-def satellite_pose(*, rate: PositiveFloat, sigma: Strength, step: PositiveFloat = 0.01) -> Model:
+def satellite_pose(
+    *, rate: PositiveFloat, sigma: Strength, step: PositiveFloat = 0.01
+) -> Model:
     r"""Translation and attitude together: the 13-component model of Table III of Grange et al.
 
     Translation (18) moves by its exact transition and exact noise, attitude (20)-(21) by
@@ -119,7 +134,9 @@ def satellite_pose(*, rate: PositiveFloat, sigma: Strength, step: PositiveFloat 
     """
     place = clohessy_wiltshire(rate=rate, sigma=sigma)
     return Model(
-        13, partial(_flow, rate=rate, step=step), partial(_pose_noise, rate=rate, sigma=sigma),
+        13,
+        partial(_flow, rate=rate, step=step),
+        partial(_pose_noise, rate=rate, sigma=sigma),
         names=(*place.names, "w1", "w2", "w3", "q1", "q2", "q3", "q4"),
         units=(*place.units, *["rad/s"] * 3, *["1"] * 4),
     )
@@ -142,7 +159,8 @@ def _flow(x: Array, t: float, dt: float, rate: float, step: float) -> Array:
 
 def _rates(rows: Array, t: float, alpha: float) -> Array:
     """Right-hand sides of (20) and (21) together, components first."""
-    w, q = rows[:3], rows[3:]
+    w = rows[:3]
+    q = rows[3:]
     return np.array([*_angular_acceleration(q, w, alpha), *kinematics(q, w)])
 
 
@@ -156,7 +174,10 @@ def _angular_acceleration(q: Array, w: Array, alpha: float) -> list[Array]:
     """
     a, b, c, d = q
     w1, w2, w3 = w
-    aa, bb, cc, dd = a * a, b * b, c * c, d * d
+    aa = a * a
+    bb = b * b
+    cc = c * c
+    dd = d * d
     scale = alpha / (aa + bb + cc + dd)
     v1 = 2 * scale * (b * d + a * c)
     v2 = 2 * scale * (c * d - a * b)
@@ -169,7 +190,9 @@ def _far_from_zero(value: Array, name: str) -> None:
         squares = (value**2).sum(axis=-1)
     if not (np.isfinite(squares) & (squares > 1e-280)).all():
         got = np.abs(value).max()
-        raise ValueError(f"{name}: needs quaternions that are not zero or infinite, got {got:g}")
+        raise ValueError(
+            f"{name}: needs quaternions that are not zero or infinite, got {got:g}"
+        )
 
 
 Quaternion = Annotated[Array, "... 4", _far_from_zero]
@@ -210,7 +233,9 @@ def rotation_matrix(quaternion: Quaternion) -> Array:
     >>> (rotation_matrix([1.0, 0.0, 0.0, 1.0]) @ [1.0, 0.0, 0.0]).round(12)
     array([0., 1., 0.])
     """
-    return np.reshape(_rotations(quaternion).as_matrix(), (*quaternion.shape[:-1], 3, 3))
+    return np.reshape(
+        _rotations(quaternion).as_matrix(), (*quaternion.shape[:-1], 3, 3)
+    )
 
 
 def _rotations(quaternion: Array) -> Any:
@@ -311,7 +336,9 @@ def quaternion_rate(quaternion: Quaternion, angular_velocity: Vector) -> Array:
     >>> quaternion_rate([1.0, 0.0, 0.0, 0.0], [0.2, 0.0, 0.0]) + 0.0
     array([ 0. , -0.1,  0. ,  0. ])
     """
-    rows = kinematics(np.moveaxis(quaternion, -1, 0), np.moveaxis(angular_velocity, -1, 0))
+    rows = kinematics(
+        np.moveaxis(quaternion, -1, 0), np.moveaxis(angular_velocity, -1, 0)
+    )
     return np.stack(rows, axis=-1)
 
 

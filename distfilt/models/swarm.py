@@ -9,7 +9,18 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveInt, NonNegativeFloat, PositiveFloat, FrozenModel, Rng, Times, validated, unchecked
+from ..validation import (
+    Array,
+    Bounds,
+    FrozenModel,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    Rng,
+    Times,
+    unchecked,
+    validated,
+)
 from ..validation.checks import check_array
 from .base import path
 
@@ -30,8 +41,10 @@ def inside(positions: Array, low: Array, high: Array) -> Array:
     """Positions (..., d); those outside the box are refused."""
     outside = ((positions < low) | (positions > high)).any(axis=-1)
     if outside.any():
-        raise ValueError("positions: needs agents inside the box, got "
-                         f"{outside.sum()} outside, one at {positions[outside][0].tolist()}")
+        raise ValueError(
+            "positions: needs agents inside the box, got "
+            f"{outside.sum()} outside, one at {positions[outside][0].tolist()}"
+        )
     return positions
 
 
@@ -83,16 +96,23 @@ class Swarm(FrozenModel):
 
     drift: Callable[[Array, float], Array]
     diffusion: Any
-    low: Annotated[Array, "d"] = field(default_factory=partial(np.zeros, 2), kw_only=True)
-    high: Annotated[Array, "d"] = field(default_factory=partial(np.ones, 2), kw_only=True)
+    low: Annotated[Array, "d"] = field(
+        default_factory=partial(np.zeros, 2), kw_only=True
+    )
+    high: Annotated[Array, "d"] = field(
+        default_factory=partial(np.ones, 2), kw_only=True
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if (self.low >= self.high).any():
-            low, high = self.low.tolist(), self.high.tolist()
+            low = self.low.tolist()
+            high = self.high.tolist()
             raise ValueError(f"high: needs corners above low = {low}, got {high}")
         if not callable(self.diffusion):
-            object.__setattr__(self, "diffusion", _diagonal(self.diffusion, (), self.dim).copy())
+            object.__setattr__(
+                self, "diffusion", _diagonal(self.diffusion, (), self.dim).copy()
+            )
 
     @property
     def dim(self) -> int:
@@ -111,7 +131,13 @@ class Swarm(FrozenModel):
 
     @validated
     def step(
-        self, positions: Positions, t: float, dt: PositiveFloat, *, rng: Rng, substeps: PositiveInt = 10
+        self,
+        positions: Positions,
+        t: float,
+        dt: PositiveFloat,
+        *,
+        rng: Rng,
+        substeps: PositiveInt = 10,
     ) -> Array:
         """Move agents from `t` to `t` + `dt` by Euler and Maruyama's scheme.
 
@@ -133,17 +159,27 @@ class Swarm(FrozenModel):
         """
         return self._step(inside(positions, self.low, self.high), t, dt, rng, substeps)
 
-    def _step(self, x: Array, t: float, dt: float, rng: np.random.Generator, n: int) -> Array:
+    def _step(
+        self, x: Array, t: float, dt: float, rng: np.random.Generator, n: int
+    ) -> Array:
         h = dt / n
         for k in range(n):
             now = t + k * h
-            kick = np.sqrt(2 * h * self.diffusion_at(x, now)) * rng.standard_normal(x.shape)
+            kick = np.sqrt(2 * h * self.diffusion_at(x, now)) * rng.standard_normal(
+                x.shape
+            )
             x = _reflected(x + h * self.drift_at(x, now) + kick, self.low, self.high)
         return x
 
     @validated
     def simulate(
-        self, positions: Positions, times: Times, *, rng: Rng, t0: float = 0.0, substeps: PositiveInt = 10
+        self,
+        positions: Positions,
+        times: Times,
+        *,
+        rng: Rng,
+        t0: float = 0.0,
+        substeps: PositiveInt = 10,
     ) -> Array:
         """Positions at `times`, (T, ..., d), of agents that are at `positions` at `t0`.
 
@@ -177,7 +213,9 @@ class RotatingMixture(FrozenModel):
            [0.2, 0.5]])
     """
 
-    centre: Annotated[Array, "2"] = field(default_factory=partial(np.full, 2, 0.5), kw_only=True)
+    centre: Annotated[Array, "2"] = field(
+        default_factory=partial(np.full, 2, 0.5), kw_only=True
+    )
     radius: NonNegativeFloat = field(default=0.3, kw_only=True)
     rate: float = field(default=0.04, kw_only=True)
     variance: PositiveFloat = field(default=0.02, kw_only=True)
@@ -215,7 +253,8 @@ class RotatingMixture(FrozenModel):
 
 @validated
 def rotating_swarm(
-    reading: Literal["literal", "gibbs", "slowgibbs"] = "slowgibbs", *,
+    reading: Literal["literal", "gibbs", "slowgibbs"] = "slowgibbs",
+    *,
     strength: Annotated[float, Bounds(above=0, at_most=1e150)] = 0.03,
     mixture: RotatingMixture | None = None,
 ) -> Swarm:

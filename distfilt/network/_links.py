@@ -12,7 +12,6 @@ from ..validation import Indices, check_array
 __all__: list[str] = []
 
 
-
 def of_matrix(value: Any, name: str, *, directed: bool) -> scipy.sparse.csr_array:
     """The links that a matrix of zeros and ones marks, an array or sparse."""
     if not scipy.sparse.issparse(value):
@@ -28,11 +27,15 @@ def of_matrix(value: Any, name: str, *, directed: bool) -> scipy.sparse.csr_arra
     i, j = (links - links.T).nonzero()
     if i.size and not directed:
         needs = "every link both ways (Graph.from_adjacency(..., directed=True) takes others)"
-        raise ValueError(f"{name}: needs {needs}, got one way only between {i[0]} and {j[0]}")
+        raise ValueError(
+            f"{name}: needs {needs}, got one way only between {i[0]} and {j[0]}"
+        )
     return links
 
 
-def of_edges(size: int, edges: Any, name: str, *, directed: bool) -> scipy.sparse.csr_array:
+def of_edges(
+    size: int, edges: Any, name: str, *, directed: bool
+) -> scipy.sparse.csr_array:
     """The links of pairs (listener, speaker), both ways unless the graph is directed.
 
     >>> of_edges(3, [(0, -1)], "edges", directed=False)
@@ -40,11 +43,15 @@ def of_edges(size: int, edges: Any, name: str, *, directed: bool) -> scipy.spars
     ValueError: edges: needs agents from 0 to 2, got [[0.0, -1.0]]
     """
     pairs = check_array(edges, name)
-    pairs = pairs.reshape(-1, 2) if pairs.size == 0 else check_array(pairs, name, ("E", 2))
+    pairs = (
+        pairs.reshape(-1, 2) if pairs.size == 0 else check_array(pairs, name, ("E", 2))
+    )
     listed = pairs.astype(np.int64)
     inside = not listed.size or 0 <= listed.min() <= listed.max() < size
     if (listed != pairs).any() or not inside:
-        raise ValueError(f"{name}: needs agents from 0 to {size - 1}, got {pairs.tolist()[:3]}")
+        raise ValueError(
+            f"{name}: needs agents from 0 to {size - 1}, got {pairs.tolist()[:3]}"
+        )
     both = listed if directed else np.concatenate([listed, listed[:, ::-1]])
     return linked(size, both, name)
 
@@ -77,7 +84,9 @@ def linked(size: int, pairs: Indices, name: str) -> scipy.sparse.csr_array:
     loops = pairs[pairs[:, 0] == pairs[:, 1], 0]
     if loops.size:
         raise ValueError(f"{name}: needs no self-loops, got one at agent {loops[0]}")
-    links = scipy.sparse.csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (size, size))
+    links = scipy.sparse.csr_array(
+        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (size, size)
+    )
     links.sum_duplicates()
     links.data[:] = 1.0
     links.sort_indices()

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 
-from ..validation import Array, PositiveInt, Mask, validated, unchecked
+from ..validation import Array, Mask, PositiveInt, unchecked, validated
 from . import ledger as accounts
 from .faults import Faults
 from .graphs import Graph, as_graph
@@ -28,7 +28,9 @@ PerAgent = Annotated[Array, "*channel.runs channel.graph.n_agents k"]
 Lost = Literal["mutual", "metropolis", "keep", "renormalise", "zero"]
 """What :meth:`Channel.combine` can do about a lost message; the last three are biased."""
 
-Fused = Literal["vectors", "ensembles", "gaussians", "mixtures", "densities", "particles"]
+Fused = Literal[
+    "vectors", "ensembles", "gaussians", "mixtures", "densities", "particles"
+]
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -66,10 +68,17 @@ class Channel:
 
     @validated
     def __init__(
-        self, graph: Any, *, ledger: Ledger | None = None, runs: tuple[PositiveInt, ...] = (),
-        faults: Faults | None = None, t: float | None = None,
+        self,
+        graph: Any,
+        *,
+        ledger: Ledger | None = None,
+        runs: tuple[PositiveInt, ...] = (),
+        faults: Faults | None = None,
+        t: float | None = None,
     ) -> None:
-        self.graph: Graph = as_graph(graph, None if ledger is None else ledger.messages.size)
+        self.graph: Graph = as_graph(
+            graph, None if ledger is None else ledger.messages.size
+        )
         self.runs = runs
         self._among = int(np.prod(runs, dtype=np.int64)), slice(None)
         self.faults = _PERFECT if faults is None else faults
@@ -90,9 +99,13 @@ class Channel:
 
     def for_run(self, run: Any, ledger: Ledger) -> Channel:
         """The same with another account; of the numbers of all runs, or as one loses messages."""
-        channel = Channel.construct(self.graph, ledger=ledger, runs=run.shape,
-                                    faults=self.faults, t=self.t)
-        channel._among = self._among[0], slice(None) if run.ndim else slice(run, run + 1)
+        channel = Channel.construct(
+            self.graph, ledger=ledger, runs=run.shape, faults=self.faults, t=self.t
+        )
+        channel._among = (
+            self._among[0],
+            slice(None) if run.ndim else slice(run, run + 1),
+        )
         return channel
 
     @property
@@ -100,17 +113,29 @@ class Channel:
         """The account so far."""
         for size, rounds in self._owed.items():
             messages = rounds * self.graph.out_degree.astype(np.int64)
-            self._ledger = self._charged(self._ledger, messages, size, 8 * size, rounds=rounds)
+            self._ledger = self._charged(
+                self._ledger, messages, size, 8 * size, rounds=rounds
+            )
         self._owed = {}
         return self._ledger
 
-    def _charged(self, ledger: Ledger, messages: Any, scalars: Any, bytes_: Any, *,
-                 rounds: int = 1, lost: Any = 0.0) -> Ledger:  # fmt: skip
+    def _charged(
+        self,
+        ledger: Ledger,
+        messages: Any,
+        scalars: Any,
+        bytes_: Any,
+        *,
+        rounds: int = 1,
+        lost: Any = 0.0,
+    ) -> Ledger:
         """The account after more rounds, in which agents sent so many messages of these sizes."""
         spoke = self.graph.senders.size > 0
         return ledger.replace(
-            rounds=ledger.rounds + rounds * spoke, messages=ledger.messages + messages,
-            scalars=ledger.scalars + messages * scalars, bytes=ledger.bytes + messages * bytes_,
+            rounds=ledger.rounds + rounds * spoke,
+            messages=ledger.messages + messages,
+            scalars=ledger.scalars + messages * scalars,
+            bytes=ledger.bytes + messages * bytes_,
             lost=ledger.lost + lost,
         )
 
@@ -132,20 +157,28 @@ class Channel:
             floats there.
         """
         graph = self.graph
-        sent, scalars, bytes_ = accounts.count_payload(payloads, graph.n_agents, self.runs)
+        sent, scalars, bytes_ = accounts.count_payload(
+            payloads, graph.n_agents, self.runs
+        )
         speaks = np.array([p is not None for p in sent])[graph.senders]
         arrived = self._transmit(speaks, scalars, bytes_)
         some = np.flatnonzero(arrived.any(axis=0))
         inbox = _by_receiver(graph, sent, some)
         for k in some[~arrived[:, some].all(axis=0)].tolist():
-            receiver, sender = int(graph.receivers[k]), int(graph.senders[k])
+            receiver = int(graph.receivers[k])
+            sender = int(graph.senders[k])
             here = arrived[:, k].reshape(self.runs)
             inbox[receiver][sender] = accounts.drop_lost(sent[sender], here)
         return inbox
 
     @validated
     def mix(
-        self, values: _Own, weights: ConsensusWeights, *, lost: Lost = "mutual", rounds: PositiveInt = 1
+        self,
+        values: _Own,
+        weights: ConsensusWeights,
+        *,
+        lost: Lost = "mutual",
+        rounds: PositiveInt = 1,
     ) -> Array:
         """Let every agent replace its value by a weighted sum of its own and what it hears.
 
@@ -186,8 +219,11 @@ class Channel:
 
     @validated
     def send_on_links(
-        self, values: Annotated[Array, "*self.runs self.graph.senders.size k"], *,
-        links: Annotated[Mask, "self.graph.senders.size"] | None = None, acknowledged: bool = False,
+        self,
+        values: Annotated[Array, "*self.runs self.graph.senders.size k"],
+        *,
+        links: Annotated[Mask, "self.graph.senders.size"] | None = None,
+        acknowledged: bool = False,
     ) -> Array:
         """Send a payload of its own along each link.
 
@@ -209,20 +245,26 @@ class Channel:
         arrived = self._sent(values.shape[-1], links, acknowledged=acknowledged)
         return np.where(arrived.reshape(*self.runs, edges)[..., None], values, np.nan)
 
-    def _combine_with_own(self, v: Array, w: ConsensusWeights, lost: Lost) -> tuple[Array, Array]:
+    def _combine_with_own(
+        self, v: Array, w: ConsensusWeights, lost: Lost
+    ) -> tuple[Array, Array]:
         """As :meth:`combine`, with the weight that each agent's own value got, (*runs, A)."""
         if self._perfect:
             return self._combine_all(v, w, 1), w.own
-        k, size = v.shape[-1], self.graph.n_agents
+        k = v.shape[-1]
+        size = self.graph.n_agents
         both = lost in ("mutual", "metropolis")
         if both and self.graph.directed:
             raise ValueError(f"lost: {lost!r} needs links both ways, got one-way links")
         # Metropolis weights need the degree of what is left, one number more.
         arrived = self._sent(k + (lost == "metropolis"), acknowledged=both, late=True)
-        flat, delay = v.reshape(-1, k), self.faults.has_delay
+        flat = v.reshape(-1, k)
+        delay = self.faults.has_delay
         heard, arrived = self._delayed(flat, arrived) if delay else (flat, arrived)
         own, links = _after_loss(self.graph, w, arrived, lost)
-        matrix = stack_weights(self.graph, own, links, heard_at=len(flat) if delay else 0)
+        matrix = stack_weights(
+            self.graph, own, links, heard_at=len(flat) if delay else 0
+        )
         out = matrix @ (np.concatenate([flat, heard]) if delay else flat)
         return out.reshape(v.shape), own.reshape(*self.runs, size)
 
@@ -240,21 +282,34 @@ class Channel:
         return np.zeros_like(values), np.zeros_like(arrived)
 
     def _transmit(
-        self, speaks: Mask, sizes: Any, bytes_: Any, *, acknowledged: bool = False,
+        self,
+        speaks: Mask,
+        sizes: Any,
+        bytes_: Any,
+        *,
+        acknowledged: bool = False,
         late: bool = False,
     ) -> Mask:
         """Charge one round in which the links in `speaks` are used; which arrive, (R, E)."""
         if self.faults.has_delay and not late:
-            raise ValueError(f"channel: needs no delay here, got {self.faults.has_delay} rounds")
+            raise ValueError(
+                f"channel: needs no delay here, got {self.faults.has_delay} rounds"
+            )
         now = self.ledger
-        size, (runs, here) = self.graph.n_agents, self._among
+        size = self.graph.n_agents
+        (runs, here) = self._among
         if self._perfect:
-            arrived, lost = np.broadcast_to(speaks, (runs, speaks.size))[here], np.zeros(size)
+            arrived = np.broadcast_to(speaks, (runs, speaks.size))[here]
+            lost = np.zeros(size)
         else:
             speaks = speaks & self.faults.speaking(self.graph, now.rounds, self.t)
-            arrived = speaks & ~self.faults.lost(self.graph, now.rounds, runs, self.t)[here]
+            arrived = (
+                speaks & ~self.faults.lost(self.graph, now.rounds, runs, self.t)[here]
+            )
             missing = (speaks & ~arrived).mean(axis=0)
-            lost = np.bincount(self.graph.senders, weights=missing, minlength=size).astype(float)
+            lost = np.bincount(
+                self.graph.senders, weights=missing, minlength=size
+            ).astype(float)
         messages = np.bincount(self.graph.senders[speaks], minlength=size)
         after = self._charged(now, messages, sizes, bytes_, lost=lost)
         if acknowledged:
@@ -268,13 +323,20 @@ def _by_receiver(graph: Graph, sent: Sequence[Any], links: Any) -> list[dict[int
     """What arrives on some links, given by their ascending numbers, for each agent by sender."""
     senders = graph.senders[links].tolist()
     messages = [sent[j] for j in senders]
-    ends = np.searchsorted(graph.receivers[links], np.arange(graph.n_agents + 1)).tolist()
-    return [dict(zip(senders[i:j], messages[i:j], strict=True)) for i, j in pairwise(ends)]
+    ends = np.searchsorted(
+        graph.receivers[links], np.arange(graph.n_agents + 1)
+    ).tolist()
+    return [
+        dict(zip(senders[i:j], messages[i:j], strict=True)) for i, j in pairwise(ends)
+    ]
 
 
-def _after_loss(graph: Graph, w: ConsensusWeights, arrived: Mask, lost: str) -> tuple[Array, Array]:
+def _after_loss(
+    graph: Graph, w: ConsensusWeights, arrived: Mask, lost: str
+) -> tuple[Array, Array]:
     """Own and link weights of each run, (R, A) and (R, E), once some messages are missing."""
-    ends, sums = graph.receivers, partial(graph._summed, axis=1)
+    ends = graph.receivers
+    sums = partial(graph._summed, axis=1)
     if lost in ("mutual", "metropolis"):
         arrived = arrived & arrived[:, graph.reverse]
     if lost == "metropolis":
@@ -289,8 +351,11 @@ def _after_loss(graph: Graph, w: ConsensusWeights, arrived: Mask, lost: str) -> 
     elif lost == "renormalise":
         total = own + sums(links)
         if (np.abs(total) < 1e-12).any():
-            raise ValueError("lost: 'renormalise' needs weights left, got a row that sums to 0")
-        own, links = own / total, links / total[:, ends]
+            raise ValueError(
+                "lost: 'renormalise' needs weights left, got a row that sums to 0"
+            )
+        own = own / total
+        links = links / total[:, ends]
     return np.asarray(own), links
 
 

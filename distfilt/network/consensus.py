@@ -10,15 +10,36 @@ from typing import Annotated
 
 import numpy as np
 
-from ..validation import Array, PositiveInt, PositiveFloat, FrozenModel, check_array, validated, unchecked
 from ..linalg import SolverError
+from ..validation import (
+    Array,
+    FrozenModel,
+    PositiveFloat,
+    PositiveInt,
+    check_array,
+    unchecked,
+    validated,
+)
 from .channel import Channel, Lost, PerAgent, fusion_rule
 from .graphs import Graph
-from .weights import ConsensusWeights, _keeping, _laplacian, _warn_if_unstable, metropolis
+from .weights import (
+    ConsensusWeights,
+    _keeping,
+    _laplacian,
+    _warn_if_unstable,
+    metropolis,
+)
 
-__all__ = [  # fmt: skip
-    "AdmmResult", "Disconnected", "admm", "average_consensus", "finite_time_consensus", "max_consensus", "push_sum",
+__all__ = [
+    "AdmmResult",
+    "Disconnected",
+    "admm",
+    "average_consensus",
+    "finite_time_consensus",
+    "max_consensus",
+    "push_sum",
 ]
+
 
 class Disconnected(RuntimeWarning):
     """A graph in several parts, each of which agrees on an average of its own.
@@ -41,8 +62,13 @@ def _faultless(channel: Channel) -> None:
 @fusion_rule("vectors")
 @validated
 def average_consensus(
-    values: PerAgent, channel: Channel, *, rounds: PositiveInt = 1, gain: PositiveFloat | None = None,
-    weights: ConsensusWeights | None = None, lost: Lost = "mutual",
+    values: PerAgent,
+    channel: Channel,
+    *,
+    rounds: PositiveInt = 1,
+    gain: PositiveFloat | None = None,
+    weights: ConsensusWeights | None = None,
+    lost: Lost = "mutual",
 ) -> Array:
     r"""Move every agent's value towards its neighbours', the averaging behind equation (16).
 
@@ -70,7 +96,9 @@ def average_consensus(
     Examples
     --------
     >>> from distfilt.network import Channel, graphs
-    >>> average_consensus([[0.0], [3.0], [-1.5]], Channel(graphs.star(3)), gain=0.5, rounds=40).round(4)
+    >>> average_consensus(
+    ...     [[0.0], [3.0], [-1.5]], Channel(graphs.star(3)), gain=0.5, rounds=40
+    ... ).round(4)
     array([[0.5],
            [0.5],
            [0.5]])
@@ -129,7 +157,8 @@ def finite_time_consensus(values: PerAgent, channel: Channel) -> Array:
     """
     channel.graph._joined()
     _faultless(channel)
-    combine, out = unchecked(channel.mix), values.copy()
+    combine = unchecked(channel.mix)
+    out = values.copy()
     for eigenvalue in _factors(channel.graph):
         out = combine(out, _laplacian(channel.graph, 1 / eigenvalue))
     return out
@@ -138,16 +167,21 @@ def finite_time_consensus(values: PerAgent, channel: Channel) -> Array:
 @lru_cache(maxsize=32)
 def _factors(graph: Graph) -> list[float]:
     """The eigenvalues in their order, refused where their product is not what it is on paper."""
-    found, left = _leja(_distinct(graph.laplacian_spectrum[1:])), np.eye(graph.n_agents) - 1 / graph.n_agents
+    found = _leja(_distinct(graph.laplacian_spectrum[1:]))
+    left = np.eye(graph.n_agents) - 1 / graph.n_agents
     for eigenvalue in found:
         left -= graph.laplacian @ left / eigenvalue
     if (lost := np.abs(left).max()) > 1e-9:
-        raise ValueError(f"channel: needs a graph that rounding spares, got an error of {lost:.0e}")
+        raise ValueError(
+            f"channel: needs a graph that rounding spares, got an error of {lost:.0e}"
+        )
     return found
 
 
 def _distinct(values: Array) -> Array:
-    gaps = np.diff(values, prepend=-np.inf) > 1e-9 * max(1.0, float(values.max(initial=0)))
+    gaps = np.diff(values, prepend=-np.inf) > 1e-9 * max(
+        1.0, float(values.max(initial=0))
+    )
     return values[gaps]
 
 
@@ -156,7 +190,8 @@ def _leja(points: Array) -> list[float]:
 
     Each next one is farthest, in the geometric mean, from all before it.
     """
-    score, order = np.zeros(points.size), [float(p) for p in points[-1:]]
+    score = np.zeros(points.size)
+    order = [float(p) for p in points[-1:]]
     while len(order) < points.size:
         with np.errstate(divide="ignore"):
             score += np.log(np.abs(points - order[-1]))
@@ -198,7 +233,8 @@ def push_sum(values: PerAgent, channel: Channel, *, rounds: PositiveInt) -> Arra
     array([3., 3., 3.])
     """
     channel.graph._joined()
-    graph, carry = channel.graph, unchecked(channel.send_on_links)
+    graph = channel.graph
+    carry = unchecked(channel.send_on_links)
     mass = np.concatenate([values, np.ones((*values.shape[:-1], 1))], axis=-1)
     share = 1 / (1 + graph.out_degree)[:, None]
     pushed = np.zeros_like(mass)
@@ -214,7 +250,9 @@ def push_sum(values: PerAgent, channel: Channel, *, rounds: PositiveInt) -> Arra
 
 @fusion_rule("vectors")
 @validated
-def max_consensus(values: PerAgent, channel: Channel, *, rounds: PositiveInt | None = None) -> Array:
+def max_consensus(
+    values: PerAgent, channel: Channel, *, rounds: PositiveInt | None = None
+) -> Array:
     """The largest value, component by component; exact after as many rounds as the diameter.
 
     Parameters
@@ -231,7 +269,9 @@ def max_consensus(values: PerAgent, channel: Channel, *, rounds: PositiveInt | N
     array([5., 5., 5.])
     """
     channel.graph._joined()
-    graph, carry, out = channel.graph, unchecked(channel.send_on_links), values.copy()
+    graph = channel.graph
+    carry = unchecked(channel.send_on_links)
+    out = values.copy()
     if graph.n_agents == 1:
         return out
     for _ in range(rounds or graph.diameter):
@@ -268,10 +308,15 @@ class AdmmResult(FrozenModel):
 
 @validated
 def admm(
-    local_solve: Callable[[Array, float], Array], start: Annotated[Array, "channel.graph.n_agents k"],
-    channel: Channel, *, rho: PositiveFloat = 1.0, tolerance: PositiveFloat = 1e-6, iterations: PositiveInt = 1000,
+    local_solve: Callable[[Array, float], Array],
+    start: Annotated[Array, "channel.graph.n_agents k"],
+    channel: Channel,
+    *,
+    rho: PositiveFloat = 1.0,
+    tolerance: PositiveFloat = 1e-6,
+    iterations: PositiveInt = 1000,
     average: Callable[[Array, Channel], Array] = finite_time_consensus,
-) -> AdmmResult:  # fmt: skip
+) -> AdmmResult:
     r"""Minimise :math:`\sum_l f_l(\mathbf Z)` when agent l knows only its own :math:`f_l`.
 
     .. math::
@@ -324,13 +369,17 @@ def admm(
     """
     _alone(channel)
     _faultless(channel)  # or agents would stop apart
-    z, w = start, np.zeros_like(start)
+    z = start
+    w = np.zeros_like(start)
     for n in range(1, iterations + 1):
         u = check_array(local_solve(z - w, rho), "local_solve", z.shape)
         new = check_array(average(u + w, channel), "agree", z.shape)
         w = w + u - new
-        gaps = np.stack([np.abs(u - new).max(axis=1), np.abs(new - z).max(axis=1)], axis=1)
-        residuals, z = gaps * [1.0, rho], new
+        gaps = np.stack(
+            [np.abs(u - new).max(axis=1), np.abs(new - z).max(axis=1)], axis=1
+        )
+        residuals = gaps * [1.0, rho]
+        z = new
         # After the maximum all agents hold the same two numbers; any row will do.
         primal, dual = unchecked(max_consensus)(residuals, channel)[0].tolist()
         if primal < tolerance and dual < tolerance:

@@ -7,13 +7,30 @@ from typing import Annotated
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveInt, Mask, NonNegativeFloat, PositiveFloat, FrozenModel, Rng, validated, unchecked
+from ..validation import (
+    Array,
+    Bounds,
+    FrozenModel,
+    Mask,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    Rng,
+    unchecked,
+    validated,
+)
 from .channel import Channel, PerAgent, fusion_rule
 from .consensus import _alone
 from .weights import _laplacian, metropolis
 
-__all__ = [  # fmt: skip
-    "PIState", "event_triggered", "flooding", "gossip_consensus", "pi_start", "pi_step", "stable_substeps",
+__all__ = [
+    "PIState",
+    "event_triggered",
+    "flooding",
+    "gossip_consensus",
+    "pi_start",
+    "pi_step",
+    "stable_substeps",
 ]
 
 _Gain = Annotated[float, Bounds(at_least=0, at_most=1e100)]
@@ -50,7 +67,9 @@ def pi_start(estimate: Annotated[Array, "... A k"]) -> PIState:
 
 
 @validated
-def stable_substeps(channel: Channel, dt: PositiveFloat, *, alpha: _Gain, a: _Gain, b: _Gain) -> int:
+def stable_substeps(
+    channel: Channel, dt: PositiveFloat, *, alpha: _Gain, a: _Gain, b: _Gain
+) -> int:
     r"""How many explicit steps make up `dt` so that the estimator is stable.
 
     An eigenvalue λ of the Laplacian contributes the matrix
@@ -90,8 +109,16 @@ def stable_substeps(channel: Channel, dt: PositiveFloat, *, alpha: _Gain, a: _Ga
 
 @validated
 def pi_step(
-    state: PIState, inputs: PerAgent, channel: Channel, *, dt: PositiveFloat, alpha: _Gain, a: _Gain,
-    b: _Gain, rate: PerAgent | None = None, substeps: PositiveInt | None = None,
+    state: PIState,
+    inputs: PerAgent,
+    channel: Channel,
+    *,
+    dt: PositiveFloat,
+    alpha: _Gain,
+    a: _Gain,
+    b: _Gain,
+    rate: PerAgent | None = None,
+    substeps: PositiveInt | None = None,
 ) -> PIState:
     r"""One step of the proportional-integral estimator, equation (25) of Zheng et al.
 
@@ -128,32 +155,44 @@ def pi_step(
     >>> from distfilt.network import Channel, graphs
     >>> channel, state = Channel(graphs.path(2)), pi_start([[0.0], [4.0]])
     >>> for _ in range(300):
-    ...     state = pi_step(state, [[0.0], [4.0]], channel, dt=0.1, alpha=1.0, a=1.0, b=1.0)
+    ...     state = pi_step(
+    ...         state, [[0.0], [4.0]], channel, dt=0.1, alpha=1.0, a=1.0, b=1.0
+    ...     )
     >>> state.estimate.ravel().round(6)
     array([2., 2.])
     """
     channel.graph._undirected()
     if state.estimate.shape != inputs.shape:
-        raise ValueError(f"state: needs shape {inputs.shape}, got {state.estimate.shape}")
-    nu, eta, u = state.estimate, state.integral, inputs
+        raise ValueError(
+            f"state: needs shape {inputs.shape}, got {state.estimate.shape}"
+        )
+    nu = state.estimate
+    eta = state.integral
+    u = inputs
     slope: Array | float = 0.0 if rate is None else rate
     n = substeps or unchecked(stable_substeps)(channel, dt, alpha=alpha, a=a, b=b)
-    h, k = dt / n, u.shape[-1]
+    h = dt / n
+    k = u.shape[-1]
     # One combination gives -h L of both: the weights I - h L less the values themselves.
-    weights, combine = _laplacian(channel.graph, h), unchecked(channel.mix)
+    weights = _laplacian(channel.graph, h)
+    combine = unchecked(channel.mix)
     for j in range(n):
         both = np.concatenate([nu, eta], axis=-1)
         change = combine(both, weights) - both
-        pull, spring = change[..., :k], change[..., k:]
+        pull = change[..., :k]
+        spring = change[..., k:]
         now = u + j * h * slope
         moved = nu + h * (alpha * (now - nu) + slope) + a * pull - b * spring
-        nu, eta = moved, eta + b * pull
+        nu = moved
+        eta = eta + b * pull
     return PIState.construct(nu, eta)
 
 
 @fusion_rule("vectors")
 @validated
-def gossip_consensus(values: PerAgent, channel: Channel, *, rounds: PositiveInt, rng: Rng) -> Array:
+def gossip_consensus(
+    values: PerAgent, channel: Channel, *, rounds: PositiveInt, rng: Rng
+) -> Array:
     r"""Average in pairs: in each round one agent wakes and meets one neighbour, both drawn evenly.
 
     .. math:: \mathbf x_i,\mathbf x_j\leftarrow\tfrac12(\mathbf x_i+\mathbf x_j)
@@ -183,8 +222,12 @@ def gossip_consensus(values: PerAgent, channel: Channel, *, rounds: PositiveInt,
     --------
     >>> from distfilt.network import Channel, graphs
     >>> channel = Channel(graphs.ring(4))
-    >>> gossip_consensus([[0.0], [2.0], [4.0], [6.0]], channel, rounds=200,
-    ...        rng=np.random.default_rng(1)).round(6).ravel()
+    >>> gossip_consensus(
+    ...     [[0.0], [2.0], [4.0], [6.0]],
+    ...     channel,
+    ...     rounds=200,
+    ...     rng=np.random.default_rng(1),
+    ... ).round(6).ravel()
     array([3., 3., 3., 3.])
     >>> channel.ledger.messages.sum()
     np.int64(400)
@@ -192,13 +235,17 @@ def gossip_consensus(values: PerAgent, channel: Channel, *, rounds: PositiveInt,
     An agent without a neighbour wakes in vain:
 
     >>> channel = Channel(graphs.Graph.from_edges(3, [(1, 2)]))
-    >>> gossip_consensus([[0.0], [2.0], [4.0]], channel, rounds=9, rng=np.random.default_rng(1)).ravel()
+    >>> gossip_consensus(
+    ...     [[0.0], [2.0], [4.0]], channel, rounds=9, rng=np.random.default_rng(1)
+    ... ).ravel()
     array([0., 3., 3.])
     >>> channel.ledger.messages
     array([0, 6, 6])
     """
     channel.graph._undirected()
-    graph, carry, out = channel.graph, unchecked(channel.send_on_links), values.copy()
+    graph = channel.graph
+    carry = unchecked(channel.send_on_links)
+    out = values.copy()
     awake = rng.integers(graph.n_agents, size=rounds)
     chosen = (rng.random(rounds) * graph.in_degree[awake]).astype(np.int64)
     faulty = not channel.faults.none
@@ -215,14 +262,20 @@ def gossip_consensus(values: PerAgent, channel: Channel, *, rounds: PositiveInt,
         links[pair] = False
         met = ~np.isnan(heard).any(axis=(-2, -1), keepdims=True)
         ends = graph.receivers[pair]
-        out[..., ends, :] = np.where(met, 0.5 * (out[..., ends, :] + heard), out[..., ends, :])
+        out[..., ends, :] = np.where(
+            met, 0.5 * (out[..., ends, :] + heard), out[..., ends, :]
+        )
     return out
 
 
 @fusion_rule("vectors")
 @validated
 def event_triggered(
-    values: PerAgent, channel: Channel, *, rounds: PositiveInt, threshold: NonNegativeFloat,
+    values: PerAgent,
+    channel: Channel,
+    *,
+    rounds: PositiveInt,
+    threshold: NonNegativeFloat,
     decay: Annotated[float, Bounds(above=0, at_most=1)] = 1.0,
 ) -> Array:
     r"""Average, but send only what has moved by more than a threshold since it was sent last.
@@ -260,13 +313,20 @@ def event_triggered(
     --------
     >>> from distfilt.network import Channel, graphs
     >>> channel = Channel(graphs.ring(6))
-    >>> out = event_triggered(np.arange(6.0)[:, None], channel, rounds=40, threshold=0.05)
-    >>> bool(np.abs(out - 2.5).max() < 0.1), bool(channel.ledger.messages.sum() < 40 * 12)
+    >>> out = event_triggered(
+    ...     np.arange(6.0)[:, None], channel, rounds=40, threshold=0.05
+    ... )
+    >>> (
+    ...     bool(np.abs(out - 2.5).max() < 0.1),
+    ...     bool(channel.ledger.messages.sum() < 40 * 12),
+    ... )
     (True, True)
     """
     _alone(channel)
     channel.graph._undirected()
-    graph, carry, x = channel.graph, unchecked(channel.send_on_links), values
+    graph = channel.graph
+    carry = unchecked(channel.send_on_links)
+    x = values
     w = metropolis(graph)
     faulty = not channel.faults.none
     # What link e delivered last; its sender knows by the acknowledgement.
@@ -283,7 +343,9 @@ def event_triggered(
 
 
 @validated
-def flooding(values: PerAgent, channel: Channel, *, rounds: PositiveInt | None = None) -> tuple[Array, Mask]:
+def flooding(
+    values: PerAgent, channel: Channel, *, rounds: PositiveInt | None = None
+) -> tuple[Array, Mask]:
     """Every agent passes on each value when it first hears of it: the rival of all averaging.
 
     Parameters

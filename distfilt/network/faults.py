@@ -10,7 +10,15 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..validation import Array, Bounds, NonNegativeInt, Mask, FrozenModel, UnitInterval, check_array
+from ..validation import (
+    Array,
+    Bounds,
+    FrozenModel,
+    Mask,
+    NonNegativeInt,
+    UnitInterval,
+    check_array,
+)
 from .graphs import Graph
 
 __all__ = ["Faults"]
@@ -60,7 +68,9 @@ class Faults(FrozenModel):
 
     Examples
     --------
-    >>> Faults(loss=0.2, seed=7).lost(Graph.from_adjacency([[0, 1], [1, 0]]), 0, 5).shape
+    >>> Faults(loss=0.2, seed=7).lost(
+    ...     Graph.from_adjacency([[0, 1], [1, 0]]), 0, 5
+    ... ).shape
     (5, 2)
 
     Agent 3 is off for a while, and all links fail for 8 rounds at a time:
@@ -70,7 +80,11 @@ class Faults(FrozenModel):
     False
     """
 
-    loss: UnitInterval | Annotated[Array, "A", _BETWEEN] | Annotated[Array, "A A", _BETWEEN] = 0.0
+    loss: (
+        UnitInterval
+        | Annotated[Array, "A", _BETWEEN]
+        | Annotated[Array, "A A", _BETWEEN]
+    ) = 0.0
     seed: NonNegativeInt = 0
     burst: Annotated[float, Bounds(at_least=1)] | None = None
     delay: NonNegativeInt = 0
@@ -93,7 +107,9 @@ class Faults(FrozenModel):
     def __or__(self, other: Faults) -> Faults:
         if not isinstance(other, Faults):
             return NotImplemented
-        mine, theirs = ({f.seed for f in x._all() if np.any(f.loss)} for x in (self, other))
+        mine, theirs = (
+            {f.seed for f in x._all() if np.any(f.loss)} for x in (self, other)
+        )
         if mine & theirs:
             raise ValueError(
                 f"seed: needs other seeds to lose other messages, got {min(mine & theirs)} twice"
@@ -109,7 +125,9 @@ class Faults(FrozenModel):
         for faults in self._all():
             got = np.shape(faults.loss)
             if got != (agents,) * len(got):
-                raise ValueError(f"loss: needs a number for each of {agents} agents, got {got}")
+                raise ValueError(
+                    f"loss: needs a number for each of {agents} agents, got {got}"
+                )
             Bounds(below=agents)(max(faults.silent, default=-1), "silent")
 
     @cached_property
@@ -130,7 +148,9 @@ class Faults(FrozenModel):
                 off[list(faults.silent)] = True
         return ~(off[graph.receivers] | off[graph.senders])
 
-    def lost(self, graph: Graph, round_: int, runs: int, t: float | None = None) -> Mask:
+    def lost(
+        self, graph: Graph, round_: int, runs: int, t: float | None = None
+    ) -> Mask:
         """Which links lose the message of round `round_` in each of `runs` runs, (runs, E)."""
         out = np.zeros((runs, graph.senders.size), dtype=bool)
         for faults in self._all():
@@ -140,10 +160,13 @@ class Faults(FrozenModel):
 
     def _active(self, round_: int, t: float | None) -> bool:
         now = round_ if t is None else t
-        return self.during is None or any(start <= now < stop for start, stop in self.during)
+        return self.during is None or any(
+            start <= now < stop for start, stop in self.during
+        )
 
     def _losses(self, graph: Graph, round_: int, runs: int) -> Mask:
-        i, j = graph.receivers, graph.senders
+        i = graph.receivers
+        j = graph.senders
         link = _mixed((i * graph.n_agents + j).astype(np.uint64) + np.uint64(_GOLDEN))
         loss = np.asarray(self.loss)
         rate = loss[(i, j)[: loss.ndim]]
@@ -152,12 +175,15 @@ class Faults(FrozenModel):
             return np.asarray(drawn < rate)
         rate = np.broadcast_to(rate, link.shape)
         inner = (rate > 0) & (rate < 1)
-        stay = np.where(inner, 1 - 1 / (self.burst * np.where(inner, 1 - rate, 1.0)), 0.0).clip(0)
+        stay = np.where(
+            inner, 1 - 1 / (self.burst * np.where(inner, 1 - rate, 1.0)), 0.0
+        ).clip(0)
         enter = rate * (1 - stay)
         out = drawn < enter
         run, at = np.nonzero(~out & (drawn < enter + stay))
         while run.size:  # sixteen rounds back at a time
-            before, round_ = range(round_ - 1, round_ - 17, -1), round_ - 16
+            before = range(round_ - 1, round_ - 17, -1)
+            round_ = round_ - 16
             drawn = _uniform(self._runs(before, runs)[:, run] ^ link[at])
             hit = drawn < enter[at]
             known = hit | (drawn >= (enter + stay)[at])
@@ -168,7 +194,9 @@ class Faults(FrozenModel):
     def _runs(self, rounds: Sequence[int], runs: int) -> Hashes:
         """Bits for each round and run."""
         keys = _mixed([(self.seed + _GOLDEN * (k + 1)) % 2**64 for k in rounds])
-        return _mixed(keys[:, None] ^ (np.arange(runs, dtype=np.uint64) * np.uint64(_GOLDEN)))
+        return _mixed(
+            keys[:, None] ^ (np.arange(runs, dtype=np.uint64) * np.uint64(_GOLDEN))
+        )
 
 
 def _windows(during: Any) -> tuple[tuple[float, float], ...]:

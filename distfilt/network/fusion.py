@@ -11,23 +11,39 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveInt, Mask, NonNegativeFloat, PositiveFloat, check_positive_definite, validated, unchecked
 from ..ensembles import mean, sample_covariance
 from ..gaussians import intersection_weights
 from ..gaussians.single import match_moments
 from ..linalg import cholesky, solve_lower, symmetrise
+from ..validation import (
+    Array,
+    Bounds,
+    Mask,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    check_positive_definite,
+    unchecked,
+    validated,
+)
 from .channel import Channel, fusion_rule
 from .graphs import Graph
 from .weights import _laplacian, _warn_if_unstable
 
-__all__ = [  # fmt: skip
-    "arithmetic_average", "consensus_pull", "covariance_intersection", "intersect_ensembles",
-    "naive_fusion", "mean_pull",
+__all__ = [
+    "arithmetic_average",
+    "consensus_pull",
+    "covariance_intersection",
+    "intersect_ensembles",
+    "naive_fusion",
+    "mean_pull",
 ]
 
 Gaussians = tuple[
     Annotated[Array, "*channel.runs channel.graph.n_agents d"],
-    Annotated[Array, "*channel.runs channel.graph.n_agents d d", check_positive_definite],
+    Annotated[
+        Array, "*channel.runs channel.graph.n_agents d d", check_positive_definite
+    ],
 ]
 Ensembles = Annotated[Array, "*channel.runs channel.graph.n_agents N d"]
 Pair = tuple[Array, Array]
@@ -37,7 +53,11 @@ Rule = Literal["equal", "trace", "determinant", "min_trace", "min_determinant"]
 @fusion_rule("gaussians")
 @validated
 def covariance_intersection(
-    belief: Gaussians, channel: Channel, *, rule: Rule = "equal", rounds: PositiveInt = 1
+    belief: Gaussians,
+    channel: Channel,
+    *,
+    rule: Rule = "equal",
+    rounds: PositiveInt = 1,
 ) -> Pair:
     r"""Each agent fuses its Gaussian with its neighbours', safely whatever they share.
 
@@ -68,7 +88,8 @@ def covariance_intersection(
     --------
     >>> from distfilt.network import Channel, graphs
     >>> two = covariance_intersection(
-    ...     ([[0.0], [3.0]], [[[1.0]], [[2.0]]]), Channel(graphs.path(2)), rule="trace")
+    ...     ([[0.0], [3.0]], [[[1.0]], [[2.0]]]), Channel(graphs.path(2)), rule="trace"
+    ... )
     >>> two[0].ravel().round(6), two[1].ravel().round(6)
     (array([0.6, 0.6]), array([1.2, 1.2]))
     """
@@ -81,7 +102,9 @@ def covariance_intersection(
 
 @fusion_rule("gaussians")
 @validated
-def naive_fusion(belief: Gaussians, channel: Channel, *, rounds: PositiveInt = 1) -> Pair:
+def naive_fusion(
+    belief: Gaussians, channel: Channel, *, rounds: PositiveInt = 1
+) -> Pair:
     """Multiply the densities as if their errors were independent: counts shared data twice.
 
     Right for a single fusion of independent estimates, wrong as soon as agents exchange what they
@@ -89,7 +112,9 @@ def naive_fusion(belief: Gaussians, channel: Channel, *, rounds: PositiveInt = 1
     Parameters, returns and errors as for :func:`covariance_intersection`.
 
     >>> from distfilt.network import Channel, graphs
-    >>> two = naive_fusion(([[0.0], [3.0]], [[[1.0]], [[2.0]]]), Channel(graphs.path(2)))
+    >>> two = naive_fusion(
+    ...     ([[0.0], [3.0]], [[[1.0]], [[2.0]]]), Channel(graphs.path(2))
+    ... )
     >>> two[1].ravel().round(6)
     array([0.666667, 0.666667])
     """
@@ -103,7 +128,9 @@ def naive_fusion(belief: Gaussians, channel: Channel, *, rounds: PositiveInt = 1
 
 @fusion_rule("gaussians")
 @validated
-def arithmetic_average(belief: Gaussians, channel: Channel, *, rounds: PositiveInt = 1) -> Pair:
+def arithmetic_average(
+    belief: Gaussians, channel: Channel, *, rounds: PositiveInt = 1
+) -> Pair:
     r"""Each agent takes mean and covariance of the mixture of its own and the heard densities.
 
     .. math:: \mathbf m=\sum_j\omega_j\mathbf m_j,\qquad
@@ -114,7 +141,9 @@ def arithmetic_average(belief: Gaussians, channel: Channel, *, rounds: PositiveI
     Parameters, returns and errors as for :func:`covariance_intersection`.
 
     >>> from distfilt.network import Channel, graphs
-    >>> two = arithmetic_average(([[0.0], [3.0]], [[[1.0]], [[2.0]]]), Channel(graphs.path(2)))
+    >>> two = arithmetic_average(
+    ...     ([[0.0], [3.0]], [[[1.0]], [[2.0]]]), Channel(graphs.path(2))
+    ... )
     >>> two[0].ravel(), two[1].ravel()
     (array([1.5, 1.5]), array([3.75, 3.75]))
     """
@@ -177,14 +206,19 @@ def consensus_pull(
            [3.]])
     """
     _warn_if_unstable(channel.graph, gain)
-    weights, combine = _laplacian(channel.graph, gain), unchecked(channel.mix)
+    weights = _laplacian(channel.graph, gain)
+    combine = unchecked(channel.mix)
     return combine(belief[0], weights, lost="keep", rounds=rounds), belief[1].copy()
 
 
 @fusion_rule("ensembles")
 @validated
 def mean_pull(
-    ensembles: Ensembles, channel: Channel, *, gain: NonNegativeFloat, rounds: PositiveInt = 1,
+    ensembles: Ensembles,
+    channel: Channel,
+    *,
+    gain: NonNegativeFloat,
+    rounds: PositiveInt = 1,
     include_self: bool = True,
 ) -> Array:
     r"""Pull every member towards the neighbours' ensemble means, equation (16) of Grange et al.
@@ -215,7 +249,9 @@ def mean_pull(
     --------
     >>> from distfilt.network import Channel, graphs
     >>> two = [[[0.0], [2.0]], [[4.0], [6.0]]]
-    >>> mean_pull(two, Channel(graphs.path(2)), gain=0.25, include_self=False)[0].ravel()
+    >>> mean_pull(two, Channel(graphs.path(2)), gain=0.25, include_self=False)[
+    ...     0
+    ... ].ravel()
     array([1.25, 2.75])
     """
     out = ensembles.copy()
@@ -234,8 +270,12 @@ def mean_pull(
 @fusion_rule("ensembles")
 @validated
 def intersect_ensembles(
-    ensembles: Ensembles, channel: Channel, *, rule: Rule = "min_determinant",
-    scale: Annotated[Array, "d", Bounds(above=0)] | None = None, rounds: PositiveInt = 1,
+    ensembles: Ensembles,
+    channel: Channel,
+    *,
+    rule: Rule = "min_determinant",
+    scale: Annotated[Array, "d", Bounds(above=0)] | None = None,
+    rounds: PositiveInt = 1,
 ) -> Array:
     """Fuse sample means and covariances by intersection, and move each ensemble to have those.
 
@@ -266,7 +306,9 @@ def intersect_ensembles(
     x = ensembles / size
     belief = unchecked(mean)(x), unchecked(sample_covariance)(x)
     check_positive_definite(belief[1], "ensembles")
-    fused = unchecked(covariance_intersection)(belief, channel, rule=rule, rounds=rounds)
+    fused = unchecked(covariance_intersection)(
+        belief, channel, rule=rule, rounds=rounds
+    )
     return unchecked(match_moments)(x, *fused) * size
 
 
@@ -289,11 +331,15 @@ class _Heard:
         return self.means[:, self.graph.senders] - self.means[:, self.graph.receivers]
 
 
-def _in_rounds(belief: Pair, channel: Channel, rounds: int, step: Callable[[_Heard], Pair]) -> Pair:
+def _in_rounds(
+    belief: Pair, channel: Channel, rounds: int, step: Callable[[_Heard], Pair]
+) -> Pair:
     """Exchange means and upper triangles and take a step, some times."""
     means, covs = belief
-    graph, d = channel.graph, means.shape[-1]
-    m, p = means.reshape(-1, graph.n_agents, d), covs.reshape(-1, graph.n_agents, d, d)
+    graph = channel.graph
+    d = means.shape[-1]
+    m = means.reshape(-1, graph.n_agents, d)
+    p = covs.reshape(-1, graph.n_agents, d, d)
     for _ in range(rounds):
         m, p = step(_Heard(graph, m, p, channel._sent(d + d * (d + 1) // 2)))
     return m.reshape(means.shape), p.reshape(covs.shape)
@@ -303,7 +349,8 @@ def _by_rule(heard: _Heard, rule: Rule) -> Pair:
     """Own weights (R, A) and those of links (R, E); each agent's sum to one."""
     if rule.startswith("min"):
         return _least(heard, rule)
-    own, unit = np.ones(heard.means.shape[:2]), np.eye(heard.means.shape[-1])
+    own = np.ones(heard.means.shape[:2])
+    unit = np.eye(heard.means.shape[-1])
     if rule != "equal":
         # The odds against a unit covariance: no agent's number depends on another's in any digit.
         both = np.stack([heard.covs, np.broadcast_to(unit, heard.covs.shape)], axis=-3)
@@ -316,8 +363,10 @@ def _by_rule(heard: _Heard, rule: Rule) -> Pair:
 
 def _least(heard: _Heard, rule: Rule) -> Pair:
     """The weights of least size, for all agents at once that hear equally many."""
-    graph, unit = heard.graph, np.eye(heard.means.shape[-1])
-    own, links = np.ones(heard.means.shape[:2]), np.zeros(heard.arrived.shape)
+    graph = heard.graph
+    unit = np.eye(heard.means.shape[-1])
+    own = np.ones(heard.means.shape[:2])
+    links = np.zeros(heard.arrived.shape)
     for degree in np.unique(graph.in_degree):
         agents = np.flatnonzero(graph.in_degree == degree)
         at = graph.links.indptr[agents, None] + np.arange(int(degree))
@@ -326,7 +375,8 @@ def _least(heard: _Heard, rule: Rule) -> Pair:
         covs = np.concatenate([heard.covs[:, agents, None], sent], axis=2)
         here = np.insert(got, 0, True, axis=2)
         omega = unchecked(intersection_weights)(covs, rule=rule, here=here)
-        own[:, agents], links[:, at] = omega[..., 0], omega[..., 1:]
+        own[:, agents] = omega[..., 0]
+        links[:, at] = omega[..., 1:]
     return own, links
 
 

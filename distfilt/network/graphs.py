@@ -12,7 +12,16 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from ..validation import Array, Bounds, PositiveInt, NonNegativeInt, Indices, PositiveFloat, FrozenModel, validated
+from ..validation import (
+    Array,
+    Bounds,
+    FrozenModel,
+    Indices,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    validated,
+)
 from . import _links
 
 __all__ = ["Graph", "complete", "disk", "grid", "path", "ring", "star"]
@@ -61,11 +70,15 @@ class Graph(FrozenModel):
         directed : bool
             Accept links that go one way only.
         """
-        return cls.construct(_links.of_matrix(adjacency, "adjacency", directed=directed))
+        return cls.construct(
+            _links.of_matrix(adjacency, "adjacency", directed=directed)
+        )
 
     @classmethod
     @validated
-    def from_edges(cls, agents: PositiveInt, edges: ArrayLike, *, directed: bool = False) -> Graph:
+    def from_edges(
+        cls, agents: PositiveInt, edges: ArrayLike, *, directed: bool = False
+    ) -> Graph:
         """Build a graph from its links, listed as pairs (listener, speaker).
 
         Parameters
@@ -100,11 +113,15 @@ class Graph(FrozenModel):
         Examples
         --------
         >>> import networkx
-        >>> Graph.from_networkx(networkx.path_graph(["ground", "relay", "probe"])).neighbours(1)
+        >>> Graph.from_networkx(
+        ...     networkx.path_graph(["ground", "relay", "probe"])
+        ... ).neighbours(1)
         (0, 2)
         """
         if not _links.is_networkx(graph):
-            raise ValueError(f"graph: needs a networkx graph, got {type(graph).__name__}")
+            raise ValueError(
+                f"graph: needs a networkx graph, got {type(graph).__name__}"
+            )
         labels = range(len(graph.nodes)), names, graph.nodes
         order = next(some for some in labels if {*some} == {*graph.nodes})
         if order is labels[2] and {*names} & {*order}:
@@ -152,7 +169,9 @@ class Graph(FrozenModel):
     def neighbours(self, agent: NonNegativeInt) -> tuple[int, ...]:
         """The agents that `agent` hears, ascending, without itself."""
         Bounds(below=self.n_agents)(agent, "agent")
-        row = self.links.indices[self.links.indptr[agent] : self.links.indptr[agent + 1]]
+        row = self.links.indices[
+            self.links.indptr[agent] : self.links.indptr[agent + 1]
+        ]
         return tuple(row.tolist())
 
     @cached_property
@@ -169,7 +188,9 @@ class Graph(FrozenModel):
     def directed(self) -> bool:
         """Whether some link goes one way only."""
         turned = self.links.T.tocsr()
-        same = (turned.indptr == self.links.indptr).all() and (turned.indices == self.senders).all()
+        same = (turned.indptr == self.links.indptr).all() and (
+            turned.indices == self.senders
+        ).all()
         return not same
 
     @cached_property
@@ -184,7 +205,9 @@ class Graph(FrozenModel):
         All, by a dense solver, in seconds at 2 000 agents; :attr:`max_stable_gain` needs only an end.
         """
         self._undirected()
-        return np.asarray(np.linalg.eigvalsh(self.laplacian.toarray()), dtype=np.float64)
+        return np.asarray(
+            np.linalg.eigvalsh(self.laplacian.toarray()), dtype=np.float64
+        )
 
     @cached_property
     def max_stable_gain(self) -> float:
@@ -231,7 +254,9 @@ class Graph(FrozenModel):
     @cached_property
     def components(self) -> Indices:
         """For each agent the number of its (strongly) connected component, (A,)."""
-        _, labels = scipy.sparse.csgraph.connected_components(self.links, connection="strong")
+        _, labels = scipy.sparse.csgraph.connected_components(
+            self.links, connection="strong"
+        )
         return np.asarray(labels, dtype=np.int64)
 
     @property
@@ -262,7 +287,9 @@ class Graph(FrozenModel):
         """Refuse a graph in parts."""
         if not self.connected:
             parts = self.components.max() + 1
-            raise ValueError(f"graph: needs a (strongly) connected graph, got {parts} parts")
+            raise ValueError(
+                f"graph: needs a (strongly) connected graph, got {parts} parts"
+            )
 
     def _undirected(self) -> None:
         """Refuse one-way links."""
@@ -348,7 +375,9 @@ def grid(rows: PositiveInt, columns: PositiveInt) -> Graph:
     """
     at = np.arange(rows * columns).reshape(rows, columns)
     first = np.concatenate([at[:, :-1].ravel(), at[:-1].ravel()])
-    return _both_ways(at.size, first, np.concatenate([at[:, 1:].ravel(), at[1:].ravel()]))
+    return _both_ways(
+        at.size, first, np.concatenate([at[:, 1:].ravel(), at[1:].ravel()])
+    )
 
 
 @validated
@@ -363,7 +392,8 @@ def complete(agents: PositiveInt) -> Graph:
 
 @validated
 def disk(
-    positions: Annotated[Array, "A p", Bounds(at_least=-1e150, at_most=1e150)], radius: PositiveFloat
+    positions: Annotated[Array, "A p", Bounds(at_least=-1e150, at_most=1e150)],
+    radius: PositiveFloat,
 ) -> Graph:
     """Agents hear each other within a distance: the graph of radios of one range.
 
@@ -386,6 +416,10 @@ def disk(
     from scipy.spatial import cKDTree
 
     if positions.size == 0:
-        raise ValueError(f"positions: needs at least one agent, got shape {positions.shape}")
-    pairs = cKDTree(positions).query_pairs(radius, output_type="ndarray").astype(np.int64)
+        raise ValueError(
+            f"positions: needs at least one agent, got shape {positions.shape}"
+        )
+    pairs = (
+        cKDTree(positions).query_pairs(radius, output_type="ndarray").astype(np.int64)
+    )
     return _both_ways(len(positions), pairs[:, 0], pairs[:, 1])

@@ -10,7 +10,14 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..validation import Array, PositiveInt, NonNegativeInt, Mask, FrozenModel, validated
+from ..validation import (
+    Array,
+    FrozenModel,
+    Mask,
+    NonNegativeInt,
+    PositiveInt,
+    validated,
+)
 
 __all__ = ["Ledger"]
 
@@ -74,17 +81,22 @@ def count_payload(
     """
     if not isinstance(payloads, Sequence | np.ndarray) or len(payloads) != agents:
         got = len(payloads) if hasattr(payloads, "__len__") else type(payloads).__name__
-        raise ValueError(f"payloads: needs a list, one for each agent ({agents}), got {got}")
+        raise ValueError(
+            f"payloads: needs a list, one for each agent ({agents}), got {got}"
+        )
     copies = math.prod(runs)
     sent: list[Payload | None] = [None] * agents
-    scalars, bytes_ = [0] * agents, [0] * agents
+    scalars = [0] * agents
+    bytes_ = [0] * agents
     for agent, payload in enumerate(payloads):
         if payload is None:
             continue
         several = type(payload) is tuple
         parts = [_part(p, agent, runs) for p in (payload if several else (payload,))]
         if not parts:
-            raise ValueError(f"payloads[{agent}]: needs arrays, or None to stay silent, got ()")
+            raise ValueError(
+                f"payloads[{agent}]: needs arrays, or None to stay silent, got ()"
+            )
         silent = True
         for part in parts:
             here = _present(part, copies)
@@ -103,7 +115,9 @@ def _part(part: Any, agent: int, runs: tuple[int, ...]) -> Part:
         needs = "an array of real numbers, a flat tuple of them or None"
         raise ValueError(f"payloads[{agent}]: needs {needs}, got {got}")
     if part.shape[: len(runs)] != runs:
-        raise ValueError(f"payloads[{agent}]: needs leading axes {runs}, got shape {part.shape}")
+        raise ValueError(
+            f"payloads[{agent}]: needs leading axes {runs}, got shape {part.shape}"
+        )
     out: Part = np.array(part)  # what was sent does not change any more
     out.flags.writeable = False
     return out

@@ -10,11 +10,17 @@ from typing import Annotated
 import numpy as np
 import scipy
 
-from ..validation import Array, Indices, FrozenModel, validated
+from ..validation import Array, FrozenModel, Indices, validated
 from .graphs import Graph
 
-__all__ = [  # fmt: skip
-    "UnstableGain", "ConsensusWeights", "doubly_stochastic", "best_constant_edge", "fastest_mixing", "expected_gossip", "metropolis",
+__all__ = [
+    "UnstableGain",
+    "ConsensusWeights",
+    "doubly_stochastic",
+    "best_constant_edge",
+    "fastest_mixing",
+    "expected_gossip",
+    "metropolis",
     "column_stochastic",
 ]
 
@@ -61,13 +67,16 @@ class ConsensusWeights(FrozenModel):
         return stack_weights(self.graph, self.own[None], self.links[None], heard_at=0)
 
 
-def stack_weights(graph: Graph, own: Array, links: Array, *, heard_at: int) -> scipy.sparse.csr_array:
+def stack_weights(
+    graph: Graph, own: Array, links: Array, *, heard_at: int
+) -> scipy.sparse.csr_array:
     """Matrices of R runs as one block-diagonal matrix, each row's own entry first.
 
     `own` is (R, A) and `links` (R, E). With `heard_at` = 0 both multiply the same stacked values;
     otherwise what is heard stands `heard_at` rows further on.
     """
-    (runs, size), at = own.shape, graph.links.indptr[:-1]
+    (runs, size) = own.shape
+    at = graph.links.indptr[:-1]
     run = np.arange(runs)[:, None]
     data = np.insert(links, at, own, axis=1)
     heard = graph.senders + size * run + heard_at
@@ -80,16 +89,21 @@ def stack_weights(graph: Graph, own: Array, links: Array, *, heard_at: int) -> s
 
 def _matching(graph: Graph, weights: ConsensusWeights) -> ConsensusWeights:
     """The weights themselves, or a ValueError if they are those of other links."""
-    ours, theirs = graph.links, weights.graph.links
+    ours = graph.links
+    theirs = weights.graph.links
     same = np.array_equal(ours.indptr, theirs.indptr)
     if not (same and np.array_equal(ours.indices, theirs.indices)):
-        raise ValueError("weights: needs weights of the channel's graph, got those of other links")
+        raise ValueError(
+            "weights: needs weights of the channel's graph, got those of other links"
+        )
     return weights
 
 
 def _by_links(graph: Graph, links: Array) -> ConsensusWeights:
     """Weights of links, and what is left of one for the own value."""
-    return ConsensusWeights.construct(graph, 1 - np.asarray(graph.incidence @ links), links)
+    return ConsensusWeights.construct(
+        graph, 1 - np.asarray(graph.incidence @ links), links
+    )
 
 
 @validated
@@ -159,7 +173,9 @@ def best_constant_edge(graph: Graph) -> ConsensusWeights:
     graph._joined()
     if graph.n_agents == 1:
         return _laplacian(graph, 0.0)
-    return _laplacian(graph, 2 / float(graph.laplacian_spectrum[1] + graph.laplacian_spectrum[-1]))
+    return _laplacian(
+        graph, 2 / float(graph.laplacian_spectrum[1] + graph.laplacian_spectrum[-1])
+    )
 
 
 @validated
@@ -202,7 +218,9 @@ def fastest_mixing(graph: Graph) -> ConsensusWeights:
     for mu in (1e-1, 1e-2, 1e-3, 1e-4):
         how = {"method": "L-BFGS-B", "jac": True, "options": {"maxiter": 200}}
         found.append(minimize(_smoothed, found[-1], (graph, at, mu), **how).x)
-    return _from_pairs(graph, at, min(found, key=lambda x: np.abs(_modes(graph, at, x)[0]).max()))
+    return _from_pairs(
+        graph, at, min(found, key=lambda x: np.abs(_modes(graph, at, x)[0]).max())
+    )
 
 
 def _from_pairs(graph: Graph, at: Indices, pairs: Array) -> ConsensusWeights:
@@ -216,14 +234,18 @@ def _modes(graph: Graph, at: Indices, pairs: Array) -> tuple[Array, Array]:
     return np.linalg.eigh(dense)
 
 
-def _smoothed(pairs: Array, graph: Graph, at: Indices, mu: float) -> tuple[float, Array]:
+def _smoothed(
+    pairs: Array, graph: Graph, at: Indices, mu: float
+) -> tuple[float, Array]:
     """The smoothed modulus and its gradient: a link's weight pulls both its ends together."""
     values, vectors = _modes(graph, at, pairs)
     top = np.abs(values).max()
-    up, down = np.exp((values - top) / mu), np.exp((-values - top) / mu)
+    up = np.exp((values - top) / mu)
+    down = np.exp((-values - top) / mu)
     total = up.sum() + down.sum()
     mean = (vectors * ((up - down) / total)) @ vectors.T
-    i, j = graph.receivers[at], graph.senders[at]
+    i = graph.receivers[at]
+    j = graph.senders[at]
     return float(top + mu * np.log(total)), 2 * mean[i, j] - mean[i, i] - mean[j, j]
 
 
@@ -274,7 +296,11 @@ def doubly_stochastic(graph: Graph) -> ConsensusWeights:
     array([1., 1., 1.])
     """
     graph._joined()
-    p = _left_null_vector(graph.laplacian) if graph.directed else np.ones(graph.n_agents)
+    p = (
+        _left_null_vector(graph.laplacian)
+        if graph.directed
+        else np.ones(graph.n_agents)
+    )
     links = p[graph.receivers] / (2 * (p * graph.in_degree).max())
     return _by_links(graph, links)
 
@@ -285,9 +311,14 @@ def _left_null_vector(laplacian: scipy.sparse.csr_array) -> Array:
 
     # One entry is set; the rest solves an M-matrix, which needs no pivoting.
     turned = laplacian.T.tocsc()
-    inner, right = turned[1:, 1:], -turned[1:, [0]].toarray().ravel()
-    factor = splu(inner, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-                  options={"SymmetricMode": True})
+    inner = turned[1:, 1:]
+    right = -turned[1:, [0]].toarray().ravel()
+    factor = splu(
+        inner,
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
     rest = factor.solve(right)
     rest += factor.solve(right - inner @ rest)
     p = np.abs(np.concatenate([[1.0], rest]))
@@ -296,7 +327,9 @@ def _left_null_vector(laplacian: scipy.sparse.csr_array) -> Array:
 
 def _keeping(weights: ConsensusWeights) -> ConsensusWeights:
     """The weights themselves, or a ValueError if their columns do not sum to one."""
-    graph, own, links = weights.graph, weights.own, weights.links
+    graph = weights.graph
+    own = weights.own
+    links = weights.links
     # Not by the matrix: scipy's sums sort its entries in place, which changes how sums round.
     columns = own + np.bincount(graph.senders, links, graph.n_agents)
     # Rounding grows with the weights that cancel in a sum.
@@ -306,4 +339,6 @@ def _keeping(weights: ConsensusWeights) -> ConsensusWeights:
     if off[worst] <= 1e-9:
         return weights
     got = f"{columns[worst]:.6g} for agent {worst}"
-    raise ValueError(f"weights: needs columns that sum to 1 to keep the average, got {got}")
+    raise ValueError(
+        f"weights: needs columns that sum to 1 to keep the average, got {got}"
+    )

@@ -2,17 +2,25 @@
 
 from .base import Sensor, wrap
 from .kinds import (
-    line_angle,
+    angles_only,
     component,
     distance,
-    range_bearing,
     ephemeris,
-    angles_only,
     from_name,
+    line_angle,
+    range_bearing,
     stack,
 )
 
-__all__ = [  # fmt: skip
-    "Sensor", "line_angle", "component", "distance", "range_bearing", "ephemeris",
-    "angles_only", "from_name", "stack", "wrap",
+__all__ = [
+    "Sensor",
+    "line_angle",
+    "component",
+    "distance",
+    "range_bearing",
+    "ephemeris",
+    "angles_only",
+    "from_name",
+    "stack",
+    "wrap",
 ]

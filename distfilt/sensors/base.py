@@ -15,15 +15,28 @@ from typing import Annotated
 
 import numpy as np
 
-from ..validation import ALLOW_NAN, Array, PositiveInt, PositiveDefinite, PositiveFloat, FrozenModel, Rng, check_array, validated, unchecked
-from ..validation.checks import call_batched
 from ..linalg import as_derivative, central, factor, leading
+from ..validation import (
+    ALLOW_NAN,
+    Array,
+    FrozenModel,
+    PositiveDefinite,
+    PositiveFloat,
+    PositiveInt,
+    Rng,
+    check_array,
+    unchecked,
+    validated,
+)
+from ..validation.checks import call_batched
 
 __all__ = ["Sensor", "wrap"]
 
 
 @validated
-def wrap(angles: Annotated[Array, "...", ALLOW_NAN], *, period: PositiveFloat = 2 * np.pi) -> Array:
+def wrap(
+    angles: Annotated[Array, "...", ALLOW_NAN], *, period: PositiveFloat = 2 * np.pi
+) -> Array:
     """Bring angles into [-period/2, period/2).
 
     Parameters
@@ -86,7 +99,9 @@ class Sensor(FrozenModel):
     dim: PositiveInt
     h: Callable[..., Array]
     noise_cov: Annotated[PositiveDefinite, "dim dim"]
-    residual_function: Callable[[Array, Array], Array] | None = field(default=None, kw_only=True)
+    residual_function: Callable[[Array, Array], Array] | None = field(
+        default=None, kw_only=True
+    )
     uses_previous: bool = field(default=False, kw_only=True)
     kind: str = field(default="sensor", kw_only=True)
     linear: Callable[[int], Array] | None = field(default=None, kw_only=True)
@@ -95,9 +110,13 @@ class Sensor(FrozenModel):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.residual_function is not None:
-            ahead = self.residual_function(np.full(self.dim, 1 + 1e-6), np.ones(self.dim))
+            ahead = self.residual_function(
+                np.full(self.dim, 1 + 1e-6), np.ones(self.dim)
+            )
             if (np.asarray(ahead) < -5e-7).any():
-                raise ValueError("difference: needs observed less predicted, got the opposite")
+                raise ValueError(
+                    "difference: needs observed less predicted, got the opposite"
+                )
 
     @cached_property
     def noise_sqrt(self) -> Array:
@@ -106,7 +125,9 @@ class Sensor(FrozenModel):
 
     @validated
     def predict(
-        self, x: Annotated[Array, "... d"], previous: Annotated[Array, "... d"] | None = None
+        self,
+        x: Annotated[Array, "... d"],
+        previous: Annotated[Array, "... d"] | None = None,
     ) -> Array:
         """The observation without noise of states (..., d), as (..., m).
 
@@ -120,8 +141,10 @@ class Sensor(FrozenModel):
         if not self.uses_previous:
             return (x,)
         if previous is None:
-            raise ValueError(f"previous: a {self.kind} sensor needs the states before, which at a "
-                             "state's own time a filter's lag keeps, got None")
+            raise ValueError(
+                f"previous: a {self.kind} sensor needs the states before, which at a "
+                "state's own time a filter's lag keeps, got None"
+            )
         if x.shape != previous.shape:
             leading(x.shape[:-1], previous.shape[:-1], "previous")
             x, previous = np.broadcast_arrays(x, previous)
@@ -129,8 +152,11 @@ class Sensor(FrozenModel):
 
     @validated
     def observe(
-        self, x: Annotated[Array, "... d"], *, rng: Rng,
-        previous: Annotated[Array, "... d"] | None = None
+        self,
+        x: Annotated[Array, "... d"],
+        *,
+        rng: Rng,
+        previous: Annotated[Array, "... d"] | None = None,
     ) -> Array:
         """A noisy observation of each of the states (..., d), as (..., m)."""
         seen = unchecked(self.predict)(x, previous)
@@ -138,15 +164,21 @@ class Sensor(FrozenModel):
 
     @validated
     def residual(
-        self, observed: Annotated[Array, "... self.dim", ALLOW_NAN],
-        predicted: Annotated[Array, "... self.dim", ALLOW_NAN]
+        self,
+        observed: Annotated[Array, "... self.dim", ALLOW_NAN],
+        predicted: Annotated[Array, "... self.dim", ALLOW_NAN],
     ) -> Array:
         """How far observations are from predictions, (..., m), wrapped where the sensor wraps.
 
         NaN, a missing component or one that the sensor cannot see, stays NaN.
 
         >>> seen, near = np.array([3.0]), np.array([1.0])
-        >>> eye = Sensor(1, lambda x: x, [[1.0]], residual_function=lambda a, b: np.subtract(a, b, out=a))
+        >>> eye = Sensor(
+        ...     1,
+        ...     lambda x: x,
+        ...     [[1.0]],
+        ...     residual_function=lambda a, b: np.subtract(a, b, out=a),
+        ... )
         >>> eye.residual(seen, near), seen
         (array([2.]), array([3.]))
         """
@@ -155,7 +187,9 @@ class Sensor(FrozenModel):
         wanted = leading(observed.shape, predicted.shape, "predicted")
         gap = np.asarray(self.residual_function(observed.copy(), predicted.copy()))
         if gap.shape != wanted:
-            raise ValueError(f"difference: needs to return shape {wanted}, got {gap.shape}")
+            raise ValueError(
+                f"difference: needs to return shape {wanted}, got {gap.shape}"
+            )
         return gap
 
     @validated
@@ -164,14 +198,20 @@ class Sensor(FrozenModel):
         if self.linear is None:
             raise ValueError(f"sensor: needs a linear sensor, got a {self.kind} sensor")
         h = check_array(self.linear(dim), "linear", (self.dim, dim))
-        seen = unchecked(self.predict)(np.eye(dim)) if vars(self).pop("_doubted", False) else h.T
+        seen = (
+            unchecked(self.predict)(np.eye(dim))
+            if vars(self).pop("_doubted", False)
+            else h.T
+        )
         if not np.allclose(seen, h.T, atol=1e-9):
             raise ValueError("linear: needs the matrix of its function, got another")
         return h
 
     @validated
     def jacobian(
-        self, x: Annotated[Array, "... d"], previous: Annotated[Array, "... d"] | None = None
+        self,
+        x: Annotated[Array, "... d"],
+        previous: Annotated[Array, "... d"] | None = None,
     ) -> Array:
         """Derivative of h in the present states (..., d), as (..., m, d).
 
@@ -184,6 +224,9 @@ class Sensor(FrozenModel):
         if self.linear is not None:
             return np.broadcast_to(unchecked(self.H)(d), full)
         before = [b[..., None, :] for b in states[1:]]
-        predict, residual = unchecked(self.predict), unchecked(self.residual)
-        near = partial(central, lambda moved: predict(moved, *before), states[0], residual)
+        predict = unchecked(self.predict)
+        residual = unchecked(self.residual)
+        near = partial(
+            central, lambda moved: predict(moved, *before), states[0], residual
+        )
         return as_derivative(self, states, full, near)

@@ -9,12 +9,25 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from scipy.linalg import block_diag
 
-from ..validation import Array, Bounds, NonNegativeInt, DistinctIndices, validated, unchecked
+from ..validation import (
+    Array,
+    Bounds,
+    DistinctIndices,
+    NonNegativeInt,
+    unchecked,
+    validated,
+)
 from ..validation.checks import check_distinct
 from .base import Sensor, wrap
 
-__all__ = [  # fmt: skip
-    "line_angle", "component", "distance", "range_bearing", "ephemeris", "angles_only", "from_name",
+__all__ = [
+    "line_angle",
+    "component",
+    "distance",
+    "range_bearing",
+    "ephemeris",
+    "angles_only",
+    "from_name",
     "stack",
 ]
 
@@ -61,8 +74,11 @@ def component(indices: DistinctIndices, *, std: Deviation) -> Sensor:
     array([1., 3.])
     """
     return Sensor.construct(
-        len(indices), partial(_pick, indices=indices), diagonal(*[std] * len(indices)),
-        kind="direct", linear=partial(_rows, indices=indices)
+        len(indices),
+        partial(_pick, indices=indices),
+        diagonal(*[std] * len(indices)),
+        kind="direct",
+        linear=partial(_rows, indices=indices),
     )
 
 
@@ -76,8 +92,12 @@ def increment(indices: DistinctIndices, *, std: Deviation) -> Sensor:
     array([2.])
     """
     return Sensor.construct(
-        len(indices), partial(_change, indices=indices), diagonal(*[std] * len(indices)),
-        uses_previous=True, kind="differential", derivative=partial(_change_slope, indices=indices)
+        len(indices),
+        partial(_change, indices=indices),
+        diagonal(*[std] * len(indices)),
+        uses_previous=True,
+        kind="differential",
+        derivative=partial(_change_slope, indices=indices),
     )
 
 
@@ -101,7 +121,10 @@ def _gap(x: Array, indices: Sequence[int], origin: Array) -> Array:
 
 @validated
 def distance(
-    indices: DistinctIndices, *, std: Deviation, origin: Annotated[Array, "n"] | None = None
+    indices: DistinctIndices,
+    *,
+    std: Deviation,
+    origin: Annotated[Array, "n"] | None = None,
 ) -> Sensor:
     """See the distance from a place in some components, ``h(x) = |x[indices] - origin|``.
 
@@ -127,8 +150,11 @@ def distance(
         raise ValueError(f"origin: needs shape ({len(indices)},), got {origin.shape}")
     place = _place(indices, origin)
     return Sensor.construct(
-        1, partial(_distance, **place), diagonal(std), kind="distance",
-        derivative=partial(_distance_slope, **place)
+        1,
+        partial(_distance, **place),
+        diagonal(std),
+        kind="distance",
+        derivative=partial(_distance_slope, **place),
     )
 
 
@@ -148,7 +174,11 @@ def _distance_slope(x: Array, indices: Sequence[int], origin: Array) -> Array:
 
 @validated
 def line_angle(
-    indices: Pair, *, std: Turn, full: bool = False, origin: Annotated[Array, "2"] | None = None
+    indices: Pair,
+    *,
+    std: Turn,
+    full: bool = False,
+    origin: Annotated[Array, "2"] | None = None,
 ) -> Sensor:
     """See the angle of two components (a, b), in rad.
 
@@ -180,8 +210,12 @@ def line_angle(
     period = (2 if full else 1) * np.pi
     place = _place(indices, origin)
     return Sensor.construct(
-        1, partial(_angle, period=period, **place), diagonal(std), kind="angle",
-        derivative=partial(_angle_slope, **place), residual_function=partial(_turned_at, period=period)
+        1,
+        partial(_angle, period=period, **place),
+        diagonal(std),
+        kind="angle",
+        derivative=partial(_angle_slope, **place),
+        residual_function=partial(_turned_at, period=period),
     )
 
 
@@ -190,7 +224,10 @@ def _angle(x: Array, period: float, **place: Any) -> Array:
 
 
 def _direction(gap: Array, period: float, heading: float = 0.0) -> Array:
-    turned = np.where(gap.any(axis=-1), np.arctan2(gap[..., 1], gap[..., 0]), np.nan) - heading
+    turned = (
+        np.where(gap.any(axis=-1), np.arctan2(gap[..., 1], gap[..., 0]), np.nan)
+        - heading
+    )
     return unchecked(wrap)(turned, period=period)[..., None]
 
 
@@ -204,8 +241,11 @@ def _angle_slope(x: Array, indices: Sequence[int], origin: Array) -> Array:
 
 @validated
 def range_bearing(
-    indices: Pair, *, std: tuple[Deviation, Turn], origin: Annotated[Array, "2"] | None = None,
-    heading: float = 0.0
+    indices: Pair,
+    *,
+    std: tuple[Deviation, Turn],
+    origin: Annotated[Array, "2"] | None = None,
+    heading: float = 0.0,
 ) -> Sensor:
     """See the distance and the direction of two components, as a radar or a robot does.
 
@@ -235,9 +275,12 @@ def range_bearing(
     """
     place = _place(indices, origin)
     return Sensor.construct(
-        2, partial(_sighting, heading=heading, **place), diagonal(*std),
-        residual_function=partial(_turned_at, k=1), kind="distance and angle",
-        derivative=partial(_sighting_slope, **place)
+        2,
+        partial(_sighting, heading=heading, **place),
+        diagonal(*std),
+        residual_function=partial(_turned_at, k=1),
+        kind="distance and angle",
+        derivative=partial(_sighting_slope, **place),
     )
 
 
@@ -246,7 +289,9 @@ def _sighting(x: Array, heading: float, **place: Any) -> Array:
     return np.concatenate([_length(gap), _direction(gap, 2 * np.pi, heading)], axis=-1)
 
 
-def _turned_at(observed: Array, predicted: Array, k: int = 0, period: float = 2 * np.pi) -> Array:
+def _turned_at(
+    observed: Array, predicted: Array, k: int = 0, period: float = 2 * np.pi
+) -> Array:
     """Differences, wrapped in one component."""
     gap = np.asarray(observed - predicted)
     gap[..., k] = unchecked(wrap)(gap[..., k], period=period)
@@ -254,13 +299,18 @@ def _turned_at(observed: Array, predicted: Array, k: int = 0, period: float = 2 
 
 
 def _sighting_slope(x: Array, **place: Any) -> Array:
-    return np.concatenate([_distance_slope(x, **place), _angle_slope(x, **place)], axis=-2)
+    return np.concatenate(
+        [_distance_slope(x, **place), _angle_slope(x, **place)], axis=-2
+    )
 
 
 @validated
 def angles_only(
-    *, std: Turn, form: Literal["arctan2", "printed"] = "arctan2", observer: NonNegativeInt = 6,
-    hidden: Callable[[Array, Array], Array] | None = None
+    *,
+    std: Turn,
+    form: Literal["arctan2", "printed"] = "arctan2",
+    observer: NonNegativeInt = 6,
+    hidden: Callable[[Array, Array], Array] | None = None,
 ) -> Sensor:
     r"""The direction to a target, the state's first body, from another: two angles in rad.
 
@@ -286,15 +336,18 @@ def angles_only(
     array([-2.3562,  0.    ])
     """
     return Sensor.construct(
-        2, partial(_sight, form=form, observer=observer, hidden=hidden), diagonal(std, std),
-        residual_function=_turned_at
+        2,
+        partial(_sight, form=form, observer=observer, hidden=hidden),
+        diagonal(std, std),
+        residual_function=_turned_at,
     )
 
 
 def _sight(
     x: Array, form: str, observer: int, hidden: Callable[[Array, Array], Array] | None
 ) -> Array:
-    target, own = x[..., :3], x[..., observer : observer + 3]
+    target = x[..., :3]
+    own = x[..., observer : observer + 3]
     way = target - own
     unit = np.clip(way / np.linalg.norm(way, axis=-1, keepdims=True), -1, 1)
     out: Array = np.arcsin(unit[..., 1:])
@@ -325,7 +378,10 @@ def ephemeris(*, position_std: Deviation, velocity_std: Deviation) -> Sensor:
 
 @validated
 def from_name(
-    kind: Literal["direct", "differential", "range", "angle"], indices: DistinctIndices, *, std: Deviation
+    kind: Literal["direct", "differential", "range", "angle"],
+    indices: DistinctIndices,
+    *,
+    std: Deviation,
 ) -> Sensor:
     """The sensor that a table names.
 
@@ -343,7 +399,10 @@ def from_name(
     'distance'
     """
     makers: dict[str, Callable[..., Sensor]] = {
-        "direct": component, "differential": increment, "range": distance, "angle": line_angle
+        "direct": component,
+        "differential": increment,
+        "range": distance,
+        "angle": line_angle,
     }
     return makers[kind](indices, std=std)
 
@@ -373,19 +432,30 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
     wraps = any(s.residual_function is not None for s in sensors)
     linear = all(s.linear is not None for s in sensors)
     return Sensor.construct(
-        len(cov), partial(_stacked, parts=sensors), cov, kind="stacked",
-        residual_function=partial(_stacked_differences, parts=sensors) if wraps else None,
+        len(cov),
+        partial(_stacked, parts=sensors),
+        cov,
+        kind="stacked",
+        residual_function=partial(_stacked_differences, parts=sensors)
+        if wraps
+        else None,
         uses_previous=any(s.uses_previous for s in sensors),
         linear=partial(_stacked, parts=sensors, what="H", axis=0) if linear else None,
         derivative=partial(_stacked, parts=sensors, what="jacobian", axis=-2),
     )
 
 
-def _stacked(*states: Any, parts: Sequence[Sensor], what: str = "predict", axis: int = -1) -> Array:
-    return np.concatenate([unchecked(getattr(s, what))(*states) for s in parts], axis=axis)
+def _stacked(
+    *states: Any, parts: Sequence[Sensor], what: str = "predict", axis: int = -1
+) -> Array:
+    return np.concatenate(
+        [unchecked(getattr(s, what))(*states) for s in parts], axis=axis
+    )
 
 
-def _stacked_differences(observed: Array, predicted: Array, parts: Sequence[Sensor]) -> Array:
+def _stacked_differences(
+    observed: Array, predicted: Array, parts: Sequence[Sensor]
+) -> Array:
     ends = np.cumsum([s.dim for s in parts])[:-1]
     pairs = [np.split(reading, ends, axis=-1) for reading in (observed, predicted)]
     gaps = [unchecked(s.residual)(y, p) for s, y, p in zip(parts, *pairs, strict=True)]

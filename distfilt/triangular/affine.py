@@ -20,8 +20,8 @@ from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 import numpy as np
 
 from .. import ensembles
-from ..validation import Array, Mask, FrozenModel, validated, import_optional, unchecked
 from ..linalg import SolverError, leading
+from ..validation import Array, FrozenModel, Mask, import_optional, unchecked, validated
 
 __all__ = ["AffineMap", "compose", "fit", "fit_convex", "objective"]
 
@@ -41,9 +41,14 @@ class ConditionalMap(Protocol):
     Whatever has these three methods is one:
 
     >>> class Shift:
-    ...     def __call__(self, y, x): return x - y
-    ...     def inverse(self, y, z): return z + y
-    ...     def log_det(self, y, x): return 0 * x[..., 0]
+    ...     def __call__(self, y, x):
+    ...         return x - y
+    ...
+    ...     def inverse(self, y, z):
+    ...         return z + y
+    ...
+    ...     def log_det(self, y, x):
+    ...         return 0 * x[..., 0]
     >>> import numpy as np
     >>> compose(Shift(), np.array([[1.0], [2.0]]), [[3.0], [5.0]], [10.0])
     array([[12.],
@@ -62,8 +67,10 @@ class ConditionalMap(Protocol):
 
 @validated
 def compose(
-    map_: ConditionalMap, y: Annotated[Array, "... N map_.observed"],
-    x: Annotated[Array, "... N map_.dim"], observed: Annotated[Array, "... map_.observed"],
+    map_: ConditionalMap,
+    y: Annotated[Array, "... N map_.observed"],
+    x: Annotated[Array, "... N map_.dim"],
+    observed: Annotated[Array, "... map_.observed"],
 ) -> Array:
     r"""The composed map (10) of Grange et al.: from joint samples to samples given the observation.
 
@@ -89,12 +96,19 @@ def compose(
     >>> compose(affine.fit(y, x), y, x, [2.0]).mean().round(1)
     np.float64(1.0)
     """
-    return unchecked(map_.inverse)(observed[..., None, :], unchecked(map_.__call__)(y, x))
+    return unchecked(map_.inverse)(
+        observed[..., None, :], unchecked(map_.__call__)(y, x)
+    )
 
 
 def _lower_triangular(value: Array, name: str) -> None:
-    if np.triu(value, 1).any() or not (np.diagonal(value, axis1=-2, axis2=-1) > 0).all():
-        raise ValueError(f"{name}: needs lower triangular matrices with a positive diagonal")
+    if (
+        np.triu(value, 1).any()
+        or not (np.diagonal(value, axis1=-2, axis2=-1) > 0).all()
+    ):
+        raise ValueError(
+            f"{name}: needs lower triangular matrices with a positive diagonal"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +162,9 @@ class AffineMap(FrozenModel):
     @validated
     def __call__(self, y: OwnSeen, x: OwnMembers) -> Array:
         """Reference samples S(y, x), (..., N, d), of members y (..., N, m) and x (..., N, d)."""
-        return np.asarray(np.linalg.solve(self.scale, (x - self._predicted(y, x)).mT).mT)
+        return np.asarray(
+            np.linalg.solve(self.scale, (x - self._predicted(y, x)).mT).mT
+        )
 
     @validated
     def inverse(self, y: OwnSeen, z: OwnMembers) -> Array:
@@ -166,7 +182,9 @@ class AffineMap(FrozenModel):
 def joint_samples(y: Array, x: Array) -> Array:
     """The variables (y, x) of each member, (..., N, m + d)."""
     if y.shape[:-1] != x.shape[:-1]:
-        raise ValueError(f"y: needs members {x.shape[:-1]} as x has them, got {y.shape[:-1]}")
+        raise ValueError(
+            f"y: needs members {x.shape[:-1]} as x has them, got {y.shape[:-1]}"
+        )
     return np.concatenate([y, x], axis=-1)
 
 
@@ -174,8 +192,10 @@ def enough(y: Array, x: Array, members: int) -> Array:
     """The variables joined, refused unless there are more members than variables."""
     joint = joint_samples(y, x)
     if members <= joint.shape[-1]:
-        raise ValueError(f"x: needs more than {joint.shape[-1]} members for {joint.shape[-1]} "
-                         f"variables, got {members}")
+        raise ValueError(
+            f"x: needs more than {joint.shape[-1]} members for {joint.shape[-1]} "
+            f"variables, got {members}"
+        )
     return joint
 
 
@@ -185,7 +205,9 @@ def refuse(wrong: Mask, m: int, needs: str) -> None:
     if columns.size:
         k = int(columns[0])
         name, column = ("y", k) if k < m else ("x", k - m)
-        raise ValueError(f"{name}: needs variables that {needs}, got one in column {column}")
+        raise ValueError(
+            f"{name}: needs variables that {needs}, got one in column {column}"
+        )
 
 
 @validated
@@ -230,10 +252,14 @@ def from_moments(mean: Array, cov: Array, m: int) -> AffineMap:
         raise ValueError(f"x: needs variables that {needs}") from None
     # Rounding may leave a repeated variable a tiny variance of its own.
     left = np.diagonal(lower, axis1=-2, axis2=-1) ** 2
-    refuse((left <= _ROUNDING * variance) | (variance <= (_ROUNDING * mean) ** 2), m, needs)
+    refuse(
+        (left <= _ROUNDING * variance) | (variance <= (_ROUNDING * mean) ** 2), m, needs
+    )
     # The factor of the joint covariance holds the map: its lower blocks are K L_yy and L.
     gain = np.linalg.solve(lower[..., :m, :m].mT, lower[..., m:, :m].mT)
-    return AffineMap.construct(mean[..., :m], mean[..., m:], gain.mT, lower[..., m:, m:])
+    return AffineMap.construct(
+        mean[..., :m], mean[..., m:], gain.mT, lower[..., m:, m:]
+    )
 
 
 def from_rows(u: Array, observed_mean: Array) -> AffineMap:
@@ -246,7 +272,9 @@ def from_rows(u: Array, observed_mean: Array) -> AffineMap:
     solved = np.linalg.solve(upper, u[..., : 1 + observed_mean.shape[-1]])
     gain = -solved[..., 1:]
     mean = (gain @ observed_mean[..., None])[..., 0] - solved[..., 0]
-    scale = np.linalg.solve(upper, np.broadcast_to(np.eye(upper.shape[-1]), upper.shape))
+    scale = np.linalg.solve(
+        upper, np.broadcast_to(np.eye(upper.shape[-1]), upper.shape)
+    )
     return AffineMap.construct(observed_mean, mean, gain, np.tril(scale))
 
 
@@ -275,7 +303,9 @@ def objective(map_: ConditionalMap, y: Seen, x: Members) -> Array:
 
 @validated
 def fit_convex(
-    y: Annotated[Array, "N M"], x: Annotated[Array, "N d"], *,
+    y: Annotated[Array, "N M"],
+    x: Annotated[Array, "N d"],
+    *,
     solver: Literal["ECOS", "CLARABEL"] = "ECOS",
 ) -> AffineMap:
     """Fit the affine map by the convex program (12), component by component, in cvxpy.
@@ -302,12 +332,17 @@ def fit_convex(
     >>> bool(abs(exact.scale - solved.scale).max() < 1e-4)
     True
     """
-    joint, m, cp = enough(y, x, len(x)), y.shape[-1], import_optional("cvxpy", "maps")
+    joint = enough(y, x, len(x))
+    m = y.shape[-1]
+    cp = import_optional("cvxpy", "maps")
     rows = np.zeros((x.shape[-1], 1 + joint.shape[-1]))
     # Of size one: a solver's tolerances are absolute.
-    centre, size = joint.mean(axis=0), joint.std(axis=0)
+    centre = joint.mean(axis=0)
+    size = joint.std(axis=0)
     size += size == 0
-    ones = np.column_stack([np.ones(len(joint)), (joint - centre) / size]) / np.sqrt(len(joint))
+    ones = np.column_stack([np.ones(len(joint)), (joint - centre) / size]) / np.sqrt(
+        len(joint)
+    )
     # What cvxpy would warn of, the status below tells, and it becomes an error.
     with _SOLVING, warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
@@ -320,7 +355,9 @@ def fit_convex(
             except cp.error.SolverError as error:
                 status = error
             if status != cp.OPTIMAL:
-                raise SolverError(f"{solver}: component {n - 1} of the map stopped with {status!r}")
+                raise SolverError(
+                    f"{solver}: component {n - 1} of the map stopped with {status!r}"
+                )
             rows[k, :n] = u.value
     rows[:, 1:] /= size
     rows[:, 0] -= rows[:, 1:] @ centre
@@ -338,6 +375,7 @@ def _program(n: int) -> tuple[Any, Any, Any]:
     The samples enter by |u_0 + Z u|² only, which their QR factor keeps.
     """
     cp = import_optional("cvxpy", "maps")
-    root, u = cp.Parameter((n, n)), cp.Variable(n)
+    root = cp.Parameter((n, n))
+    u = cp.Variable(n)
     loss = cp.sum_squares(root @ u) / 2 - cp.log(u[n - 1])
     return cp.Problem(cp.Minimize(loss)), root, u

@@ -13,9 +13,9 @@ from typing import Annotated
 
 import numpy as np
 
-from ..validation import Array, PositiveFloat, check_array, validated, unchecked
 from ..ensembles import mean
 from ..network import AdmmResult, Channel, admm, finite_time_consensus
+from ..validation import Array, PositiveFloat, check_array, unchecked, validated
 from .affine import AffineMap, enough, from_moments, from_rows, refuse
 
 __all__ = ["pool_by_admm", "pool_by_moments"]
@@ -61,14 +61,21 @@ def pool_by_moments(
     about = joint - centre[..., None, :]
     second = about.mT @ about / joint.shape[-2]
     rows, columns = np.triu_indices(joint.shape[-1])
-    packed = _average(np.ascontiguousarray(second[..., rows, columns]), channel, average)
+    packed = _average(
+        np.ascontiguousarray(second[..., rows, columns]), channel, average
+    )
     second[..., rows, columns] = second[..., columns, rows] = packed
     return from_moments(centre, second, y.shape[-1])
 
 
 @validated
 def pool_by_admm(
-    y: Seen, x: Members, channel: Channel, *, rho: PositiveFloat = 1.0, tolerance: PositiveFloat = 1e-6,
+    y: Seen,
+    x: Members,
+    channel: Channel,
+    *,
+    rho: PositiveFloat = 1.0,
+    tolerance: PositiveFloat = 1e-6,
     average: Agree = finite_time_consensus,
 ) -> tuple[AffineMap, AdmmResult]:
     r"""The same map by consensus ADMM on the components' coefficients, the paper's proposal.
@@ -108,8 +115,11 @@ def pool_by_admm(
     (True, True)
     """
     if channel.runs:
-        raise ValueError(f"channel: needs a single run for ADMM, got runs {channel.runs}")
-    joint, m = enough(y, x, x.shape[-3] * x.shape[-2]), y.shape[-1]
+        raise ValueError(
+            f"channel: needs a single run for ADMM, got runs {channel.runs}"
+        )
+    joint = enough(y, x, x.shape[-3] * x.shape[-2])
+    m = y.shape[-1]
     centre = _average(unchecked(mean)(joint), channel, average)
     squares = ((joint - centre[:, None, :]) ** 2).mean(axis=-2)
     spread = np.sqrt(_average(squares, channel, average))
@@ -133,12 +143,16 @@ def _average(values: Array, channel: Channel, agree: Agree) -> Array:
     # A rule that is only approximate may miss by as much as the values differ.
     slack = np.ptp(values, axis=-2, keepdims=True) + 1e-9 * np.abs(middle)
     if (np.abs(out - middle) > 2 * slack).any():
-        raise ValueError("agree: needs a rule that returns averages of the agents' values, got up "
-                         f"to {np.abs(out).max():.6g} of up to {np.abs(values).max():.6g}")
+        raise ValueError(
+            "agree: needs a rule that returns averages of the agents' values, got up "
+            f"to {np.abs(out).max():.6g} of up to {np.abs(values).max():.6g}"
+        )
     return out
 
 
-def _proximal(moments: Array, m: int) -> tuple[Callable[[Array, float], Array], Array, Array]:
+def _proximal(
+    moments: Array, m: int
+) -> tuple[Callable[[Array, float], Array], Array, Array]:
     """The proximal step of every agent, components one after the other; where to start; and which
     coefficients (d, 1 + m + d) there are.
     """
@@ -152,9 +166,13 @@ def _proximal(moments: Array, m: int) -> tuple[Callable[[Array, float], Array], 
         for k in range(d):
             n = m + k + 2
             regular = moments[:, :n, :n] + rho * np.eye(n)
-            right = np.stack([out[:, k, :n], np.tile(np.eye(n)[-1], (len(target), 1))], -1)
+            right = np.stack(
+                [out[:, k, :n], np.tile(np.eye(n)[-1], (len(target), 1))], -1
+            )
             pulled, column = np.moveaxis(np.linalg.solve(regular, right), -1, 0)
-            last = 0.5 * (pulled[:, -1] + np.sqrt(pulled[:, -1] ** 2 + 4 * column[:, -1]))
+            last = 0.5 * (
+                pulled[:, -1] + np.sqrt(pulled[:, -1] ** 2 + 4 * column[:, -1])
+            )
             out[:, k, :n] = pulled + column / last[:, None]
         return np.asarray(out[:, there])
 

@@ -21,8 +21,8 @@ from functools import partial
 import numpy as np
 
 from .. import ensembles
-from ..validation import Array, NonNegativeInt, NonNegativeFloat, validated, unchecked
 from ..linalg import SolverError, leading
+from ..validation import Array, NonNegativeFloat, NonNegativeInt, unchecked, validated
 from .affine import Members, OwnMembers, OwnSeen, Seen, joint_samples, refuse
 
 __all__ = ["SeparableMap", "fit"]
@@ -62,8 +62,16 @@ class SeparableMap:
     Examples
     --------
     >>> none = np.empty((2, 1, 0))
-    >>> double = SeparableMap(0, np.zeros(1), np.ones(1), none, none, [[]], [np.zeros(1)],
-    ...                       [np.array([2.0])])
+    >>> double = SeparableMap(
+    ...     0,
+    ...     np.zeros(1),
+    ...     np.ones(1),
+    ...     none,
+    ...     none,
+    ...     [[]],
+    ...     [np.zeros(1)],
+    ...     [np.array([2.0])],
+    ... )
     >>> double(np.empty((1, 0)), [[3.0]])
     array([[6.]])
     """
@@ -85,8 +93,12 @@ class SeparableMap:
     def _standard(self, y: Array, x: Array) -> Array:
         """Standardised (y, x), (..., N, m + d); one y for all members is repeated."""
         lead = leading(x.shape[:-1], y.shape[:-1], "y")
-        joint = np.concatenate([np.broadcast_to(v, (*lead, v.shape[-1])) for v in (y, x)], -1)
-        return np.asarray((joint - self.centre[..., None, :]) / self.spread[..., None, :])
+        joint = np.concatenate(
+            [np.broadcast_to(v, (*lead, v.shape[-1])) for v in (y, x)], -1
+        )
+        return np.asarray(
+            (joint - self.centre[..., None, :]) / self.spread[..., None, :]
+        )
 
     def _earlier(self, joint: Array, k: int) -> Array:
         """What component k makes of the variables before its own, (..., N)."""
@@ -103,17 +115,22 @@ class SeparableMap:
     @validated
     def __call__(self, y: OwnSeen, x: OwnMembers) -> Array:
         """Reference samples S(y, x), (..., N, d), of members y (..., N, m) and x (..., N, d)."""
-        joint, m = self._standard(y, x), self.observed
+        joint = self._standard(y, x)
+        m = self.observed
         own = [self._own(joint[..., m + k], k)[0] for k in range(self.dim)]
-        return np.stack([self._earlier(joint, k) + v for k, v in enumerate(own)], axis=-1)
+        return np.stack(
+            [self._earlier(joint, k) + v for k, v in enumerate(own)], axis=-1
+        )
 
     @validated
     def inverse(self, y: OwnSeen, z: OwnMembers) -> Array:
         """Members x with S(y, x) = z, (..., N, d); `y` is (..., N, m), or (..., m) for all."""
         seen = y[..., None, :] if y.ndim == self.centre.ndim else y
-        joint, m = self._standard(seen, z), self.observed
+        joint = self._standard(seen, z)
+        m = self.observed
         for k in range(self.dim):
-            aim, line = z[..., k] - self._earlier(joint, k), self.slopes[k][..., :1]
+            aim = z[..., k] - self._earlier(joint, k)
+            line = self.slopes[k][..., :1]
             # A line plus steps of known heights: its ends need no search.
             heights = _ROOT * self.steps[1][..., k, :] * self.slopes[k][..., 1:]
             low = (aim - heights.sum(axis=-1, keepdims=True)) / line
@@ -123,7 +140,8 @@ class SeparableMap:
     @validated
     def log_det(self, y: OwnSeen, x: OwnMembers) -> Array:
         """Logarithm of the determinant of the map's derivative in x at each member, (..., N)."""
-        joint, m = self._standard(y, x), self.observed
+        joint = self._standard(y, x)
+        m = self.observed
         total = -np.log(self.spread[..., m:]).sum(axis=-1)[..., None]
         for k in range(self.dim):
             total = total + np.log(self._own(joint[..., m + k], k)[1])
@@ -152,7 +170,11 @@ def _own_features(v: Array, steps: Array) -> tuple[Array, Array]:
 
 @validated
 def fit(
-    y: Seen, x: Members, *, order: NonNegativeInt | tuple[NonNegativeInt, NonNegativeInt], regularisation: NonNegativeFloat = 0.0,
+    y: Seen,
+    x: Members,
+    *,
+    order: NonNegativeInt | tuple[NonNegativeInt, NonNegativeInt],
+    regularisation: NonNegativeFloat = 0.0,
     uses: Sequence[Collection[NonNegativeInt]] | None = None,
 ) -> SeparableMap:
     r"""Fit the separable map to samples: the minimiser of (12), regularised.
@@ -201,19 +223,26 @@ def fit(
     >>> bool(abs(s(x[:, :0], x) - u).mean() < 0.1)
     True
     """
-    m, d = y.shape[-1], x.shape[-1]
+    m = y.shape[-1]
+    d = x.shape[-1]
     p, q = (order, order) if isinstance(order, int) else order
     uses = [range(m + k) for k in range(d)] if uses is None else uses
     allowed = [sorted(set(used)) for used in uses]
-    if len(uses) != d or any(len(used) < len(given) or used[-1:] >= [m + k]
-                             for k, (used, given) in enumerate(zip(allowed, uses, strict=True))):
-        raise ValueError(f"uses: needs for each of {d} components different variables before its "
-                         f"own, the {m} observations first, got {uses}")
+    if len(uses) != d or any(
+        len(used) < len(given) or used[-1:] >= [m + k]
+        for k, (used, given) in enumerate(zip(allowed, uses, strict=True))
+    ):
+        raise ValueError(
+            f"uses: needs for each of {d} components different variables before its "
+            f"own, the {m} observations first, got {uses}"
+        )
     most = max(map(len, allowed))
     needed = 2 + most if regularisation else 2 + q + most * (1 + p)
     if x.shape[-2] <= needed:
-        raise ValueError(f"x: needs more than {needed} members for as many coefficients, "
-                         f"got {x.shape[-2]}")
+        raise ValueError(
+            f"x: needs more than {needed} members for as many coefficients, "
+            f"got {x.shape[-2]}"
+        )
     joint = joint_samples(y, x)
     centre = unchecked(ensembles.mean)(joint)
     joint -= centre[..., None, :]
@@ -221,7 +250,8 @@ def fit(
     refuse(spread <= 1e-13 * np.abs(centre), m, "are not constant")
     joint /= spread[..., None, :]
     _refuse_combinations(joint, allowed, m)
-    bumps, steps = _nodes(joint, p, m), _nodes(joint[..., m:], q, 0)
+    bumps = _nodes(joint, p, m)
+    steps = _nodes(joint[..., m:], q, 0)
     found = []
     for k, used in enumerate(allowed):
         features = _earlier_features(joint[..., used], bumps[..., used, :])
@@ -238,8 +268,10 @@ def _refuse_combinations(joint: Array, uses: list[list[int]], m: int) -> None:
         for name, some in (("y", [v for v in used if v < m]), ("x", [*used, m + k])):
             least = np.linalg.eigvalsh(cov[..., some, :][..., some]).min(initial=1.0)
             if least < _SINGULAR:
-                raise ValueError(f"{name}: needs variables that are not combinations of others, "
-                                 f"got a singular correlation matrix in component {k}")
+                raise ValueError(
+                    f"{name}: needs variables that are not combinations of others, "
+                    f"got a singular correlation matrix in component {k}"
+                )
 
 
 def _nodes(joint: Array, n: int, m: int) -> Array:
@@ -247,7 +279,11 @@ def _nodes(joint: Array, n: int, m: int) -> Array:
     levels = np.arange(1, 2 * n + 2) / (2 * (n + 1))
     found = np.moveaxis(np.quantile(joint, levels, axis=-2), 0, -1)
     widths = found[..., 2::2] - found[..., :-2:2]
-    refuse(np.any(widths <= 0, axis=-1), m, "have quantiles that differ for the basis functions")
+    refuse(
+        np.any(widths <= 0, axis=-1),
+        m,
+        "have quantiles that differ for the basis functions",
+    )
     return np.stack([found[..., 1::2], widths])
 
 
@@ -267,11 +303,17 @@ def _best_coefficients(
     normal = features.mT @ features / n + np.diag(on_c)
     ends = np.linalg.eigvalsh(normal)
     if (ends[..., 0] < _SINGULAR * ends[..., -1]).any():
-        raise ValueError("regularisation: needs a positive value, for the basis functions are not "
-                         f"independent on these samples, got {penalty:g}")
+        raise ValueError(
+            "regularisation: needs a positive value, for the basis functions are not "
+            f"independent on these samples, got {penalty:g}"
+        )
     regression = np.linalg.solve(normal, features.mT @ values / n)
     left = values - features @ regression
-    quadratic = left.mT @ left / n + regression.mT @ (on_c[:, None] * regression) + np.diag(on_a)
+    quadratic = (
+        left.mT @ left / n
+        + regression.mT @ (on_c[:, None] * regression)
+        + np.diag(on_a)
+    )
     lower = np.where(np.arange(values.shape[-1]) == 0, _LEAST_SLOPE, 0.0)
     a = _nonnegative(quadratic, rates, lower)
     return -np.asarray((regression @ a[..., None])[..., 0]), a
@@ -287,7 +329,8 @@ def _nonnegative(quadratic: Array, rates: Array, lower: Array) -> Array:
         form = 0.5 * (c[..., None, :] @ quadratic @ c[..., None])[..., 0, 0]
         return np.asarray(form - np.log((rates @ c[..., None])[..., 0]).mean(axis=-1))
 
-    r, n = quadratic.shape[-1], rates.shape[-2]
+    r = quadratic.shape[-1]
+    n = rates.shape[-2]
     a = np.broadcast_to(lower, quadratic.shape[:-1]).copy()
     a[..., 0] = np.maximum(lower[0], 1 / np.sqrt(quadratic[..., 0, 0]))
     for _ in range(_ITERATIONS):
@@ -299,7 +342,9 @@ def _nonnegative(quadratic: Array, rates: Array, lower: Array) -> Array:
         system = np.where(free[..., :, None] & free[..., None, :], hessian, np.eye(r))
         slope = np.where(free, gradient, 0.0)
         step = -np.linalg.solve(system, slope[..., None])[..., 0]
-        start, before, t = a, loss(a), np.ones(a.shape[:-1])
+        start = a
+        before = loss(a)
+        t = np.ones(a.shape[:-1])
         for _ in range(40):
             a = np.maximum(lower, start + t[..., None] * step)
             wanted = 1e-4 * (gradient * (a - start)).sum(axis=-1)
@@ -314,7 +359,10 @@ def _nonnegative(quadratic: Array, rates: Array, lower: Array) -> Array:
 
 
 def invert(
-    function: Callable[[Array], tuple[Array, Array]], target: Array, low: Array, high: Array
+    function: Callable[[Array], tuple[Array, Array]],
+    target: Array,
+    low: Array,
+    high: Array,
 ) -> Array:
     """Solve ``function(v) = target`` by Newton's method inside a shrinking bracket.
 
@@ -332,11 +380,13 @@ def invert(
     >>> invert(lambda v: (np.sinh(v), np.cosh(v)), np.sinh([-2.0, 0.5]), *ends).round(9)
     array([-2. ,  0.5])
     """
-    v, moved = 0.5 * (low + high), high - low
+    v = 0.5 * (low + high)
+    moved = high - low
     for _ in range(2 * _ITERATIONS):
         value, slope = function(v)
         gap = value - target
-        low, high = np.where(gap <= 0, v, low), np.where(gap >= 0, v, high)
+        low = np.where(gap <= 0, v, low)
+        high = np.where(gap >= 0, v, high)
         newton = v - gap / slope
         step = np.abs(newton - v)
         enough = 1e-13 * (1 + np.abs(v))
@@ -344,7 +394,8 @@ def invert(
         # and half as long as the last, or Newton's method could go to and fro for ever.
         good = (newton > low) & (newton < high) & (step <= 0.5 * moved)
         new = np.where(good | (step <= enough), newton, 0.5 * (low + high))
-        moved, v = np.abs(new - v), new
+        moved = np.abs(new - v)
+        v = new
         if (moved <= enough).all():
             return np.asarray(v)
     raise SolverError("separable: the map's inverse did not settle at all targets")

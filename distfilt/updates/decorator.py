@@ -17,11 +17,26 @@ from typing import Annotated, Any, TypeVar, cast
 
 import numpy as np
 
-from ..validation import Array, PositiveDefinite, Indices, Rng, all_finite, validated, unchecked
 from ..ensembles import Ensemble
 from ..linalg import cholesky, leading
+from ..validation import (
+    Array,
+    Indices,
+    PositiveDefinite,
+    Rng,
+    all_finite,
+    unchecked,
+    validated,
+)
 
-__all__ = ["Update", "around", "perturb_observations", "has_tag", "update", "with_missing"]
+__all__ = [
+    "Update",
+    "around",
+    "perturb_observations",
+    "has_tag",
+    "update",
+    "with_missing",
+]
 
 F = TypeVar("F", bound=Callable[..., Array])
 
@@ -65,7 +80,9 @@ def update(function: F) -> F:
     >>> @update
     ... def halfway(ensemble, predicted, observed, noise, *, rng):
     ...     return ensemble + 0.5 * (observed[..., None, :] - predicted)
-    >>> halfway([[0.0], [2.0]], [[0.0], [2.0]], [4.0], [[1.0]], rng=np.random.default_rng(0))
+    >>> halfway(
+    ...     [[0.0], [2.0]], [[0.0], [2.0]], [4.0], [[1.0]], rng=np.random.default_rng(0)
+    ... )
     array([[2.],
            [3.]])
     """
@@ -82,14 +99,17 @@ def update(function: F) -> F:
         return function(**given | (_related(four) if len(four) == len(names) else {}))
 
     made: Any = checked
-    made.unchecked, made.plan, made.stacks = function, plan, True
+    made.unchecked = function
+    made.plan = plan
+    made.stacks = True
     return cast(F, made)
 
 
 def _related(four: dict[str, Array]) -> dict[str, Array]:
     """What the arguments become whose leading axes have to fit the ensemble's."""
     x, h, y, r = four.values()
-    lead, own = x.shape[:-2], (h.shape[:-2], y.shape[:-1], r.shape[:-2])
+    lead = x.shape[:-2]
+    own = (h.shape[:-2], y.shape[:-1], r.shape[:-2])
     if own[0] == own[1] == lead and own[2] in ((), lead):
         return {}
     for name, given in zip(list(four)[1:], own, strict=True):
@@ -108,7 +128,9 @@ def has_tag(update: Update, what: str) -> bool:
     >>> has_tag(print, "stacks")
     False
     """
-    return bool(getattr(update.func if isinstance(update, partial) else update, what, False))
+    return bool(
+        getattr(update.func if isinstance(update, partial) else update, what, False)
+    )
 
 
 def around(inner: Update) -> Callable[[F], F]:
@@ -120,13 +142,16 @@ def around(inner: Update) -> Callable[[F], F]:
 
     def made(wrapper: F) -> F:
         out: Any = update(wrapper)
-        out.stacks, out.whole = has_tag(inner, "stacks"), has_tag(inner, "whole")
+        out.stacks = has_tag(inner, "stacks")
+        out.whole = has_tag(inner, "whole")
         return cast(F, out)
 
     return made
 
 
-def perturb_observations(predicted: Array, noise: Array, rng: Rng, *, centred: bool = False) -> Array:
+def perturb_observations(
+    predicted: Array, noise: Array, rng: Rng, *, centred: bool = False
+) -> Array:
     """Predictions with a draw of the noise each, (..., N, m); with N - 1 in the denominator its
     sample covariance is the noise's on average, centred or not."""
     drawn = rng.standard_normal(predicted.shape)
@@ -137,7 +162,13 @@ def perturb_observations(predicted: Array, noise: Array, rng: Rng, *, centred: b
 
 
 def with_missing(
-    update: Update, ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
+    update: Update,
+    ensemble: Array,
+    predicted: Array,
+    observed: Array,
+    noise: Array,
+    *,
+    rng: Rng,
 ) -> Array:
     """Apply an update where NaN marks a missing component; without any reading nothing moves.
 
@@ -161,43 +192,64 @@ def with_missing(
     >>> from distfilt.updates import enkf_exact
     >>> x = np.array([[-1.0], [0.0], [0.5], [0.5]])
     >>> seen = np.concatenate([x, x], axis=1)
-    >>> after = with_missing(enkf_exact, x, seen, np.array([1.0, np.nan]), 0.5 * np.eye(2),
-    ...                      rng=np.random.default_rng(0))
+    >>> after = with_missing(
+    ...     enkf_exact,
+    ...     x,
+    ...     seen,
+    ...     np.array([1.0, np.nan]),
+    ...     0.5 * np.eye(2),
+    ...     rng=np.random.default_rng(0),
+    ... )
     >>> float(after.mean().round(12))
     0.5
     """
     inner = unchecked(update)
-    lead, m = observed.shape[:-1], observed.shape[-1]
+    lead = observed.shape[:-1]
+    m = observed.shape[-1]
     # What is drawn for an ensemble depends on its place and on how many readings it has, not on
     # what others miss: each number of readings has a stream, which is drawn from for all places.
     # As words of 32 bits, which seeds are made of: 63 bits each, as `integers` would draw them.
     a, b = rng.bit_generator.random_raw(2).tolist()
     base = [a // 2 % 2**32, a >> 33, b // 2 % 2**32, b >> 33]
     if all_finite(observed) and all_finite(predicted):
-        return inner(ensemble, predicted, observed, noise, rng=_stream(rng, base, m, lead))
+        return inner(
+            ensemble, predicted, observed, noise, rng=_stream(rng, base, m, lead)
+        )
     present = ~np.isnan(observed) & ~np.isnan(predicted).any(axis=-2)
     if has_tag(update, "whole"):
-        known, stream = np.where(present, observed, np.nan), _stream(rng, base, m, lead)
+        known = np.where(present, observed, np.nan)
+        stream = _stream(rng, base, m, lead)
         return inner(ensemble, predicted, known, noise, rng=stream)
-    flat, aim = present.reshape(-1, m), observed.reshape(-1, m)
+    flat = present.reshape(-1, m)
+    aim = observed.reshape(-1, m)
     rows, seen = (a.reshape(-1, *a.shape[-2:]) for a in (ensemble, predicted))
-    cov = np.broadcast_to(noise, (*lead, m, m)).reshape(-1, m, m) if noise.ndim > 2 else noise
+    cov = (
+        np.broadcast_to(noise, (*lead, m, m)).reshape(-1, m, m)
+        if noise.ndim > 2
+        else noise
+    )
     out = rows.copy()
     for pattern in np.unique(flat, axis=0):
         keep = np.flatnonzero(pattern)
         if not keep.size:
             continue
         where = np.flatnonzero((flat == pattern).all(axis=1))
-        part = cov[np.ix_(where, keep, keep)] if cov.ndim > 2 else cov[np.ix_(keep, keep)]
+        part = (
+            cov[np.ix_(where, keep, keep)] if cov.ndim > 2 else cov[np.ix_(keep, keep)]
+        )
         stream = _stream(rng, base, keep.size, lead, where)
         given = rows[where], seen[where][..., keep], aim[where][:, keep]
         out[where] = inner(*given, part, rng=stream)
     return np.asarray(out.reshape(ensemble.shape))
 
 
-def _stream(rng: Rng, base: list[int], m: int, lead: tuple[int, ...], where: Any = ...) -> Rng:
+def _stream(
+    rng: Rng, base: list[int], m: int, lead: tuple[int, ...], where: Any = ...
+) -> Rng:
     """A stream of draws for a batch, or its rows `where`; of rows of rows their places stay."""
-    bits = np.random.PCG64(np.random.SeedSequence(np.array([*base, m], dtype=np.uint32)))
+    bits = np.random.PCG64(
+        np.random.SeedSequence(np.array([*base, m], dtype=np.uint32))
+    )
     if isinstance(rng, Rows):
         return Rows(bits, rng.lead, rng.where[where])
     return Rng(bits) if where is ... else Rows(bits, lead, where)
@@ -211,15 +263,22 @@ class Rows(Rng):
     >>> def own(x, h, y, r, *, rng):
     ...     return x + rng.normal(size=x.shape)
     >>> gaps = np.array([[1.0, np.nan], [np.nan, 1.0]])
-    >>> a, b = with_missing(own, np.zeros((2, 3, 1)), np.zeros((2, 3, 2)), gaps, np.eye(2),
-    ...                     rng=np.random.default_rng(0))
+    >>> a, b = with_missing(
+    ...     own,
+    ...     np.zeros((2, 3, 1)),
+    ...     np.zeros((2, 3, 2)),
+    ...     gaps,
+    ...     np.eye(2),
+    ...     rng=np.random.default_rng(0),
+    ... )
     >>> bool((a != b).all())
     True
     """
 
     def __init__(self, bits: Any, lead: tuple[int, ...], where: Indices) -> None:
         super().__init__(bits)
-        self.lead, self.where = lead, where
+        self.lead = lead
+        self.where = where
         self.some = where.size != math.prod(lead)
 
     def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
@@ -228,7 +287,9 @@ class Rows(Rng):
 
     def standard_normal(self, size: Any = None, *args: Any, **options: Any) -> Any:
         """As numpy's, but of a batch's rows those that are asked for."""
-        if not (self.some and np.iterable(size) and tuple(size)[:1] == self.where.shape):
+        if not (
+            self.some and np.iterable(size) and tuple(size)[:1] == self.where.shape
+        ):
             return super().standard_normal(size, *args, **options)
         rest = tuple(size)[1:]
         drawn = super().standard_normal((*self.lead, *rest), *args, **options)

@@ -16,16 +16,20 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..validation import Array, NonNegativeFloat, Rng, validated, unchecked
 from ..ensembles import Ensemble, center_ensemble, exact_noise
 from ..linalg import cholesky, solve_definite
 from ..models import Model
+from ..validation import Array, NonNegativeFloat, Rng, unchecked, validated
 from .decorator import perturb_observations, update
 
 __all__ = [
-    "enkf_exact", "exact_forecast", "enkf", "stochastic_forecast", "enkf_sampled_covariance",
+    "enkf_exact",
+    "exact_forecast",
+    "enkf",
+    "stochastic_forecast",
+    "enkf_sampled_covariance",
     "etkf",
-]  # fmt: skip
+]
 
 Members = Annotated[Ensemble, "... n model.dim"]
 
@@ -77,8 +81,9 @@ def enkf_sampled_covariance(
     """
     members, m = predicted.shape[-2:]
     if members <= m:
-        raise ValueError(f"ensemble: needs at least {m + 1} members for {m} readings, "
-                         f"got {members}")
+        raise ValueError(
+            f"ensemble: needs at least {m + 1} members for {m} readings, got {members}"
+        )
     drawn = perturb_observations(predicted, noise, rng)
     b = center_ensemble(drawn)[1]
     gain = _gain(center_ensemble(ensemble)[1], b)
@@ -87,7 +92,12 @@ def enkf_sampled_covariance(
 
 @update
 def enkf(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
+    ensemble: Array,
+    predicted: Array,
+    observed: Array,
+    noise: Array,
+    *,
+    rng: Rng,
     centred: bool = False,
 ) -> Array:
     r"""Update with R itself in the gain, where :func:`enkf_sampled_covariance` has a sample covariance.
@@ -143,7 +153,8 @@ def enkf_exact(
     >>> float(after.mean().round(12)), float(after.var(ddof=1).round(12))
     (0.5, 0.25)
     """
-    a, b = center_ensemble(ensemble)[1], center_ensemble(predicted)[1]
+    a = center_ensemble(ensemble)[1]
+    b = center_ensemble(predicted)[1]
     draws = exact_noise(np.concatenate([a, b], axis=-1), cholesky(noise), rng)
     gain = _gain(a, b, noise)
     return np.asarray(ensemble + (observed[..., None, :] - predicted - draws) @ gain)
@@ -151,7 +162,12 @@ def enkf_exact(
 
 @update
 def etkf(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
+    ensemble: Array,
+    predicted: Array,
+    observed: Array,
+    noise: Array,
+    *,
+    rng: Rng,
     rotation: Literal["random", "none"] = "random",
 ) -> Array:
     r"""Update mean and anomalies without perturbations, then turn the anomalies at random.
@@ -183,7 +199,8 @@ def etkf(
     (1.0, 1.0)
     """
     n = ensemble.shape[-2]
-    (centre, a), (seen, b) = center_ensemble(ensemble), center_ensemble(predicted)
+    (centre, a) = center_ensemble(ensemble)
+    (seen, b) = center_ensemble(predicted)
     gain = _gain(a, b, noise)
     root = np.linalg.cholesky(noise)
     white = np.linalg.solve(root, b.mT).mT / np.sqrt(n - 1)
@@ -236,10 +253,13 @@ def stochastic_forecast(
     Examples
     --------
     >>> still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-    >>> stochastic_forecast([[1.0], [2.0]], still, 0.0, 0.1, rng=np.random.default_rng(0)).ravel()
+    >>> stochastic_forecast(
+    ...     [[1.0], [2.0]], still, 0.0, 0.1, rng=np.random.default_rng(0)
+    ... ).ravel()
     array([1., 2.])
     """
-    moved, root = unchecked(model.step)(ensemble, t, dt), unchecked(model.noise_sqrt)(t, dt)
+    moved = unchecked(model.step)(ensemble, t, dt)
+    root = unchecked(model.noise_sqrt)(t, dt)
     if not np.count_nonzero(root):
         return moved
     return moved + rng.standard_normal(moved.shape) @ np.ascontiguousarray(root.T)
@@ -268,7 +288,8 @@ def exact_forecast(
     >>> bool(abs(moved.mean()) < 1e-12), float(moved.var(ddof=1).round(12))
     (True, 1.0)
     """
-    moved, root = unchecked(model.step)(ensemble, t, dt), unchecked(model.noise_sqrt)(t, dt)
+    moved = unchecked(model.step)(ensemble, t, dt)
+    root = unchecked(model.noise_sqrt)(t, dt)
     if not root.any():
         return moved
     bad = ~np.isfinite(moved).all(axis=(-2, -1), keepdims=True)

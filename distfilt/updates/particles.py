@@ -9,8 +9,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..coupling.transform import normalize_weights
-from ..validation import Array, Bounds, Mask, Rng, PositiveSemidefinite, Probabilities, all_finite, validated, unchecked
 from ..linalg import cholesky, factor, log_sum, solve_lower
+from ..validation import (
+    Array,
+    Bounds,
+    Mask,
+    PositiveSemidefinite,
+    Probabilities,
+    Rng,
+    all_finite,
+    unchecked,
+    validated,
+)
 
 __all__ = ["ParticleCollapse", "effective_size", "jitter", "resample"]
 
@@ -47,11 +57,15 @@ def size_of(w: Array) -> Array:
 
 def warn_of_collapse(what: str, option: str) -> None:
     """Tell whoever called a filter, or an update, that what it believes rests on few members."""
-    text = f"{what}; more members, {option}, or more process noise keep its belief alive"
+    text = (
+        f"{what}; more members, {option}, or more process noise keep its belief alive"
+    )
     warnings.warn(text, ParticleCollapse, stacklevel=4)
 
 
-def warn_of_weights(log_weights: Array, predicted: Array, observed: Array, noise: Array) -> None:
+def warn_of_weights(
+    log_weights: Array, predicted: Array, observed: Array, noise: Array
+) -> None:
     """Warn where one member has all the weight, or the reading is beyond what members believe.
 
     >>> two = np.array([[0.0, -99.0], [0.0, 0.0]]), np.array([[[0.0], [1.0]]] * 2)
@@ -111,7 +125,9 @@ def resample(probabilities: Annotated[Probabilities, "... n"], *, rng: Rng) -> I
     >>> resample([0.5, 0.0, 0.25, 0.25], rng=np.random.default_rng(0))
     array([0, 0, 2, 3])
     """
-    counts = systematic_counts(probabilities, rng.random((*probabilities.shape[:-1], 1)))
+    counts = systematic_counts(
+        probabilities, rng.random((*probabilities.shape[:-1], 1))
+    )
     each = np.broadcast_to(np.arange(counts.shape[-1])[:, None], (*counts.shape, 1))
     return np.asarray(repeat_by_count(each, counts)[..., 0])
 
@@ -132,7 +148,10 @@ def systematic_counts(w: Array, offset: Array) -> Indices:
 
 @validated
 def jitter(
-    points: Annotated[Array, "... n d"], *, rng: Rng, bandwidth: Bandwidth,
+    points: Annotated[Array, "... n d"],
+    *,
+    rng: Rng,
+    bandwidth: Bandwidth,
     cov: PositiveSemidefinite | None = None,
 ) -> Array:
     r"""Move equally weighted particles apart without moving their mean or covariance.
@@ -179,7 +198,9 @@ def silverman(n: int, d: int) -> float:
     return float(min(1.0, (4 / (n * (d + 2))) ** (1 / (d + 4))))
 
 
-def add_jitter(x: Array, cov: Array, h: float, drawn: Array, copied: Mask | None = None) -> Array:
+def add_jitter(
+    x: Array, cov: Array, h: float, drawn: Array, copied: Mask | None = None
+) -> Array:
     """As :func:`jitter`, with standard normal draws.
 
     Where it is known which were copied, these alone move: C. Musso, N. Oudjane, F. Le Gland, in the
@@ -192,7 +213,9 @@ def add_jitter(x: Array, cov: Array, h: float, drawn: Array, copied: Mask | None
     return np.asarray(centre + np.sqrt(1 - h * h) * (x - centre) + h * moved)
 
 
-def reweight(log_weights: Array, predicted: Array, observed: Array, noise: Array) -> Array:
+def reweight(
+    log_weights: Array, predicted: Array, observed: Array, noise: Array
+) -> Array:
     """Log-weights (..., N), normalised, after a reading; refused where it rules out every point."""
     joint = log_weights + log_likelihood(predicted, observed, noise)
     total = log_sum(joint)
@@ -205,7 +228,8 @@ def reweight(log_weights: Array, predicted: Array, observed: Array, noise: Array
 def log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
     """Log-likelihood of each particle's prediction (..., N, m) but for a constant, (..., N)."""
     # Components first: sums over a few of them then run along all particles.
-    gap, cov = np.subtract(observed[..., None], predicted.mT, order="C"), noise
+    gap = np.subtract(observed[..., None], predicted.mT, order="C")
+    cov = noise
     if not all_finite(gap):
         missing = np.asarray(np.isnan(gap).any(axis=-1))
         # A missing component gets a zero residual and a unit of its own in R.
@@ -222,10 +246,17 @@ def distinct_fraction(points: Array) -> Array:
 
     Mostly that is the first, but it may be known exactly.
 
-    >>> one, other = np.array([[0.0, 1.0], [0.0, 2.0]]), np.array([[1.0, 0.0], [2.0, 0.0]])
+    >>> one, other = (
+    ...     np.array([[0.0, 1.0], [0.0, 2.0]]),
+    ...     np.array([[1.0, 0.0], [2.0, 0.0]]),
+    ... )
     >>> distinct_fraction(np.stack([one, other]))
     array([1., 1.])
     """
     changes = (points[..., 1:, :] != points[..., :-1, :]).sum(axis=-2, keepdims=True)
-    x = np.sort(np.take_along_axis(points, changes.argmax(axis=-1, keepdims=True), axis=-1)[..., 0])
+    x = np.sort(
+        np.take_along_axis(points, changes.argmax(axis=-1, keepdims=True), axis=-1)[
+            ..., 0
+        ]
+    )
     return np.asarray((1 + (x[..., 1:] > x[..., :-1]).sum(axis=-1)) / points.shape[-2])

@@ -8,14 +8,27 @@ from typing import Annotated, Literal
 import numpy as np
 
 from .. import coupling
-from ..validation import Array, Bounds, PositiveInt, NonNegativeFloat, Rng, validated, unchecked
 from ..ensembles import Ensemble, sample_covariance
 from ..triangular import affine, compose
 from ..triangular.affine import ConditionalMap
+from ..validation import (
+    Array,
+    Bounds,
+    NonNegativeFloat,
+    PositiveInt,
+    Rng,
+    unchecked,
+    validated,
+)
 from .decorator import perturb_observations, update
 from .particles import log_likelihood, warn_of_weights
 
-__all__ = ["etpf", "principal_components", "principal_directions", "transport_map_update"]
+__all__ = [
+    "etpf",
+    "principal_components",
+    "principal_directions",
+    "transport_map_update",
+]
 
 Factor = Annotated[float, Bounds(at_least=0, at_most=1e100)]
 Fit = Callable[[Array, Array], ConditionalMap]
@@ -28,8 +41,14 @@ def _noisy(seen: Array, noise: Array, factor: float, rng: Rng) -> Array:
 
 @update
 def transport_map_update(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
-    fit: Fit = affine.fit, noise_factor: Factor = 1.0,
+    ensemble: Array,
+    predicted: Array,
+    observed: Array,
+    noise: Array,
+    *,
+    rng: Rng,
+    fit: Fit = affine.fit,
+    noise_factor: Factor = 1.0,
 ) -> Array:
     """Condition an ensemble with a composed map, equations (10)-(13) of Grange et al.
 
@@ -73,7 +92,9 @@ def principal_directions(ensemble: Ensemble, n: PositiveInt) -> Array:
 
     Examples
     --------
-    >>> principal_directions([[-3.0, 0.1], [3.0, 0.1], [0.0, -0.1]], 1).round(2).tolist()
+    >>> principal_directions([[-3.0, 0.1], [3.0, 0.1], [0.0, -0.1]], 1).round(
+    ...     2
+    ... ).tolist()
     [[1.0], [0.0]]
     """
     cov = unchecked(sample_covariance)(ensemble)
@@ -82,14 +103,24 @@ def principal_directions(ensemble: Ensemble, n: PositiveInt) -> Array:
     Bounds(at_most=cov.shape[-1])(n, "n")
     _, vectors = np.linalg.eigh(cov)
     chosen = vectors[..., ::-1][..., :n]
-    largest = np.take_along_axis(chosen, np.abs(chosen).argmax(axis=-2)[..., None, :], axis=-2)
+    largest = np.take_along_axis(
+        chosen, np.abs(chosen).argmax(axis=-2)[..., None, :], axis=-2
+    )
     return np.asarray(chosen * np.sign(largest))
 
 
 @update
 def principal_components(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng, n_state: PositiveInt,
-    n_observed: PositiveInt, complement: Literal["keep", "literal"] = "keep", noise_factor: Factor = 1.0,
+    ensemble: Array,
+    predicted: Array,
+    observed: Array,
+    noise: Array,
+    *,
+    rng: Rng,
+    n_state: PositiveInt,
+    n_observed: PositiveInt,
+    complement: Literal["keep", "literal"] = "keep",
+    noise_factor: Factor = 1.0,
     fit: Fit = affine.fit,
 ) -> Array:
     r"""Condition in the leading principal directions only, Algorithm 2 of Grange et al.
@@ -113,16 +144,19 @@ def principal_components(
     >>> prior = rng.standard_normal((1000, 2)) * [2.0, 1.0]
     >>> sees_x = prior[:, :1]
     >>> post = principal_components(
-    ...     prior, sees_x, [1.0], [[1.0]], rng=rng, n_state=1, n_observed=1)
+    ...     prior, sees_x, [1.0], [[1.0]], rng=rng, n_state=1, n_observed=1
+    ... )
     >>> post.var(axis=0).round(1)
     array([0.8, 1. ])
     """
     seen = _noisy(predicted, noise, noise_factor, rng)
-    m, d = seen.shape[-1], ensemble.shape[-1]
+    m = seen.shape[-1]
+    d = ensemble.shape[-1]
     Bounds(at_most=d)(n_state, "n_state")
     v = unchecked(principal_directions)(seen, min(n_observed, m))
     w = unchecked(principal_directions)(ensemble, n_state)
-    latent, reduced = ensemble @ w, seen @ v
+    latent = ensemble @ w
+    reduced = seen @ v
     aim = (observed[..., None, :] @ v)[..., 0, :]
     moved = compose(fit(reduced, latent), reduced, latent, aim)
     back = w.mT
@@ -133,8 +167,14 @@ def principal_components(
 
 @update
 def etpf(
-    ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
-    correct: bool = False, rejuvenation: NonNegativeFloat = 0.0,
+    ensemble: Array,
+    predicted: Array,
+    observed: Array,
+    noise: Array,
+    *,
+    rng: Rng,
+    correct: bool = False,
+    rejuvenation: NonNegativeFloat = 0.0,
 ) -> Array:
     r"""Weigh the members by their likelihoods and transport the weights to equal ones, (3)-(5).
 
@@ -187,4 +227,6 @@ def etpf(
     out = unchecked(coupling.transform_ensemble)(ensemble, logs, correct=correct)
     if not rejuvenation:
         return out
-    return unchecked(coupling.rejuvenate)(out, ensemble, bandwidth=rejuvenation, rng=rng)
+    return unchecked(coupling.rejuvenate)(
+        out, ensemble, bandwidth=rejuvenation, rng=rng
+    )

@@ -13,10 +13,26 @@ import numpy as np
 
 from .. import coupling
 from ..coupling.constraints import Constraint, Motion
-from ..validation import Array, Bounds, Indices, NonNegativeFloat, PositiveFloat, Rng, validated, unchecked
+from ..validation import (
+    Array,
+    Bounds,
+    Indices,
+    NonNegativeFloat,
+    PositiveFloat,
+    Rng,
+    unchecked,
+    validated,
+)
 from .decorator import Update, around, has_tag, with_missing
 
-__all__ = ["with_augmentation", "with_inflation", "with_localization", "with_projection", "with_retraction", "serially"]
+__all__ = [
+    "with_augmentation",
+    "with_inflation",
+    "with_localization",
+    "with_projection",
+    "with_retraction",
+    "serially",
+]
 
 
 def _followed(update: Update, change: Callable[[Array], Array]) -> Update:
@@ -25,7 +41,12 @@ def _followed(update: Update, change: Callable[[Array], Array]) -> Update:
 
     @around(update)
     def both(
-        ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
+        ensemble: Array,
+        predicted: Array,
+        observed: Array,
+        noise: Array,
+        *,
+        rng: Rng,
         predict: Callable[[Array], Array] | None = None,
     ) -> Array:
         more = {} if predict is None else {"predict": predict}
@@ -36,7 +57,9 @@ def _followed(update: Update, change: Callable[[Array], Array]) -> Update:
 
 
 @validated
-def with_inflation(update: Update, *, factor: Annotated[float, Bounds(at_least=0.5)]) -> Update:
+def with_inflation(
+    update: Update, *, factor: Annotated[float, Bounds(at_least=0.5)]
+) -> Update:
     """Multiply the analysis anomalies by a factor: the remedy for a spread that is too small.
 
     Parameters
@@ -53,7 +76,11 @@ def with_inflation(update: Update, *, factor: Annotated[float, Bounds(at_least=0
     >>> from distfilt.updates import enkf_exact
     >>> x = np.array([[-1.0], [0.0], [0.5], [0.5]])
     >>> wider = with_inflation(enkf_exact, factor=2.0)
-    >>> float(wider(x, x, [1.0], [[0.5]], rng=np.random.default_rng(0)).var(ddof=1).round(12))
+    >>> float(
+    ...     wider(x, x, [1.0], [[0.5]], rng=np.random.default_rng(0))
+    ...     .var(ddof=1)
+    ...     .round(12)
+    ... )
     1.0
     """
 
@@ -66,7 +93,9 @@ def with_inflation(update: Update, *, factor: Annotated[float, Bounds(at_least=0
 
 @validated
 def with_projection(
-    update: Update, constraint: Constraint, *,
+    update: Update,
+    constraint: Constraint,
+    *,
     reading: Literal["printed", "reversed", "particle", "shift"] = "shift",
     regularisation: NonNegativeFloat = 1e-6,
 ) -> Update:
@@ -89,20 +118,30 @@ def with_projection(
     --------
     >>> from distfilt.coupling import norm_constraint
     >>> from distfilt.updates import etkf
-    >>> x = 1.3 * np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
+    >>> x = 1.3 * np.array(
+    ...     [[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]]
+    ... )
     >>> on = with_projection(etkf, norm_constraint([0, 1]))
     >>> after = on(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
-    >>> bool(abs((after**2).sum(axis=1).mean() - 1) < abs((x**2).sum(axis=1).mean() - 1) / 3)
+    >>> bool(
+    ...     abs((after**2).sum(axis=1).mean() - 1)
+    ...     < abs((x**2).sum(axis=1).mean() - 1) / 3
+    ... )
     True
     """
     project = unchecked(coupling.project)
     return _followed(
-        update, lambda x: project(x, constraint, reading=reading, regularisation=regularisation)
+        update,
+        lambda x: project(
+            x, constraint, reading=reading, regularisation=regularisation
+        ),
     )
 
 
 @validated
-def with_retraction(update: Update, constraint: Constraint, *, motion: Motion | None = None) -> Update:
+def with_retraction(
+    update: Update, constraint: Constraint, *, motion: Motion | None = None
+) -> Update:
     """Put every analysis member on the constraint by itself.
 
     Parameters
@@ -122,7 +161,9 @@ def with_retraction(update: Update, constraint: Constraint, *, motion: Motion | 
     --------
     >>> from distfilt.coupling import norm_constraint
     >>> from distfilt.updates import etkf
-    >>> x = 1.3 * np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
+    >>> x = 1.3 * np.array(
+    ...     [[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]]
+    ... )
     >>> on = with_retraction(etkf, norm_constraint([0, 1]))
     >>> after = on(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
     >>> bool(abs((after**2).sum(axis=1) - 1).max() < 1e-14)
@@ -133,7 +174,9 @@ def with_retraction(update: Update, constraint: Constraint, *, motion: Motion | 
 
 
 @validated
-def with_augmentation(update: Update, constraint: Constraint, *, std: PositiveFloat) -> Update:
+def with_augmentation(
+    update: Update, constraint: Constraint, *, std: PositiveFloat
+) -> Update:
     r"""Observe the constraint too, as a reading that is nearly perfect, equation (13).
 
     Parameters
@@ -154,24 +197,34 @@ def with_augmentation(update: Update, constraint: Constraint, *, std: PositiveFl
     --------
     >>> from distfilt.coupling import norm_constraint
     >>> from distfilt.updates import etkf
-    >>> x = 1.3 * np.array([[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]])
+    >>> x = 1.3 * np.array(
+    ...     [[0.9, 0.2], [1.2, -0.2], [1.1, 0.3], [1.0, -0.1], [0.8, 0.1]]
+    ... )
     >>> knows = with_augmentation(etkf, norm_constraint([0, 1]), std=0.01)
     >>> after = knows(x, x[:, 1:], [0.0], [[1.0]], rng=np.random.default_rng(0))
-    >>> bool(abs((after**2).sum(axis=1) - 1).mean() < abs((x**2).sum(axis=1) - 1).mean() / 5)
+    >>> bool(
+    ...     abs((after**2).sum(axis=1) - 1).mean()
+    ...     < abs((x**2).sum(axis=1) - 1).mean() / 5
+    ... )
     True
     """
-    inner, g = unchecked(update), unchecked(constraint.residual)
+    inner = unchecked(update)
+    g = unchecked(constraint.residual)
 
     @around(update)
     def augment(
         ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
     ) -> Array:
-        m, s = predicted.shape[-1], constraint.value.size
+        m = predicted.shape[-1]
+        s = constraint.value.size
         seen = np.concatenate([predicted, g(ensemble) + constraint.value], axis=-1)
         target = np.broadcast_to(constraint.value, (*observed.shape[:-1], s))
         both = np.zeros((*noise.shape[:-2], m + s, m + s))
-        both[..., :m, :m], both[..., m:, m:] = noise, std**2 * np.eye(s)
-        return inner(ensemble, seen, np.concatenate([observed, target], axis=-1), both, rng=rng)
+        both[..., :m, :m] = noise
+        both[..., m:, m:] = std**2 * np.eye(s)
+        return inner(
+            ensemble, seen, np.concatenate([observed, target], axis=-1), both, rng=rng
+        )
 
     return augment
 
@@ -212,8 +265,12 @@ def serially(update: Update) -> Update:
 
 @validated
 def with_localization(
-    update: Update, *, places: Annotated[Array, "d k"], observation_places: Annotated[Array, "m k"],
-    radius: PositiveFloat, period: PositiveFloat | None = None,
+    update: Update,
+    *,
+    places: Annotated[Array, "d k"],
+    observation_places: Annotated[Array, "m k"],
+    radius: PositiveFloat,
+    period: PositiveFloat | None = None,
 ) -> Update:
     r"""Let each reading move only components near it: the remedy for few members in a large space.
 
@@ -251,7 +308,9 @@ def with_localization(
     Two components, of which the first is seen; the second is too far to be moved.
 
     >>> from distfilt.updates import enkf
-    >>> near = with_localization(enkf, places=[[0.0], [9.0]], observation_places=[[0.0]], radius=1.0)
+    >>> near = with_localization(
+    ...     enkf, places=[[0.0], [9.0]], observation_places=[[0.0]], radius=1.0
+    ... )
     >>> x = np.array([[-1.0, -1.1], [1.0, 0.9]])
     >>> after = near(x, x[:, :1], [1.0], [[2.0]], rng=np.random.default_rng(0))
     >>> (after != x).any(axis=0)
@@ -260,9 +319,18 @@ def with_localization(
     On a ring of length 10 the second is near, from wherever it is counted.
 
     >>> for place in (9.0, -1.0, 11.0):
-    ...     ring = with_localization(enkf, places=[[0.0], [place]], observation_places=[[0.0]], radius=1.0,
-    ...                      period=10.0)
-    ...     print(ring(x, x[:, :1], [1.0], [[2.0]], rng=np.random.default_rng(0))[0].round(3))
+    ...     ring = with_localization(
+    ...         enkf,
+    ...         places=[[0.0], [place]],
+    ...         observation_places=[[0.0]],
+    ...         radius=1.0,
+    ...         period=10.0,
+    ...     )
+    ...     print(
+    ...         ring(x, x[:, :1], [1.0], [[2.0]], rng=np.random.default_rng(0))[
+    ...             0
+    ...         ].round(3)
+    ...     )
     [-0.049 -0.902]
     [-0.049 -0.902]
     [-0.049 -0.902]
@@ -289,27 +357,42 @@ def _one_by_one(update: Update, taper: Array | None) -> Update:
 
     @around(update)
     def one_by_one(
-        ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng,
+        ensemble: Array,
+        predicted: Array,
+        observed: Array,
+        noise: Array,
+        *,
+        rng: Rng,
         predict: Callable[[Array], Array] | None = None,
     ) -> Array:
-        x, h, d = ensemble, predicted, ensemble.shape[-1]
+        x = ensemble
+        h = predicted
+        d = ensemble.shape[-1]
         if taper is not None and taper.shape != (d + h.shape[-1], h.shape[-1]):
             m = taper.shape[1]
-            raise ValueError(f"readings: needs {m}, of {len(taper) - m} components, for each of "
-                             f"which there is a place; got {h.shape[-1]} of {d}")  # fmt: skip
+            raise ValueError(
+                f"readings: needs {m}, of {len(taper) - m} components, for each of "
+                f"which there is a place; got {h.shape[-1]} of {d}"
+            )
         for k, rows in enumerate(_groups(noise)):
             if predict is not None and k:
                 h = predict(x)
             both = np.concatenate([x, h], axis=-1) if predict is None else x
             block = noise[..., rows[:, None], rows]
-            moved = with_missing(update, both, h[..., rows], observed[..., rows], block, rng=rng)
+            moved = with_missing(
+                update, both, h[..., rows], observed[..., rows], block, rng=rng
+            )
             if taper is not None:
-                moved = both + taper[: both.shape[-1], rows].max(axis=-1) * (moved - both)
-            x, h = moved[..., :d], moved[..., d:] if predict is None else h
+                moved = both + taper[: both.shape[-1], rows].max(axis=-1) * (
+                    moved - both
+                )
+            x = moved[..., :d]
+            h = moved[..., d:] if predict is None else h
         return x
 
     made: Any = one_by_one
-    made.repredicts, made.whole = True, taper is not None
+    made.repredicts = True
+    made.whole = taper is not None
     return one_by_one
 
 

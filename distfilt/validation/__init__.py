@@ -35,26 +35,48 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from .decorators import FrozenModel, unchecked, validated
 from .annotations import ALLOW_NAN
 from .checks import (
     Array,
     Bounds,
     all_finite,
     check_array,
-    check_positive_definite,
     check_distinct,
     check_increasing,
-    import_optional,
+    check_positive_definite,
     check_positive_semidefinite,
     check_probabilities,
+    import_optional,
 )
+from .decorators import FrozenModel, unchecked, validated
 
-__all__ = [  # fmt: skip
-    "Array", "Bounds", "PositiveInt", "PositiveDefinite", "NonNegativeInt", "Indices", "ALLOW_NAN", "Mask", "NonNegativeFloat",
-    "DistinctIndices", "PositiveFloat", "FrozenModel", "Rng", "PositiveSemidefinite", "UnitInterval", "Times", "Probabilities",
-    "all_finite", "check_array", "check_positive_definite", "validated", "check_increasing", "import_optional", "check_positive_semidefinite",
-    "check_probabilities", "unchecked",
+__all__ = [
+    "Array",
+    "Bounds",
+    "PositiveInt",
+    "PositiveDefinite",
+    "NonNegativeInt",
+    "Indices",
+    "ALLOW_NAN",
+    "Mask",
+    "NonNegativeFloat",
+    "DistinctIndices",
+    "PositiveFloat",
+    "FrozenModel",
+    "Rng",
+    "PositiveSemidefinite",
+    "UnitInterval",
+    "Times",
+    "Probabilities",
+    "all_finite",
+    "check_array",
+    "check_positive_definite",
+    "validated",
+    "check_increasing",
+    "import_optional",
+    "check_positive_semidefinite",
+    "check_probabilities",
+    "unchecked",
 ]
 
 Mask = NDArray[np.bool_]

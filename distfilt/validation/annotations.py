@@ -28,7 +28,9 @@ class Scope:
     values: dict[str, Any]
     sizes: dict[str, int] = field(default_factory=dict)
 
-    def fits(self, got: tuple[int, ...], words: tuple[Any, ...], heads: frozenset[str]) -> bool:
+    def fits(
+        self, got: tuple[int, ...], words: tuple[Any, ...], heads: frozenset[str]
+    ) -> bool:
         """Whether a shape is what its words say; if so it binds those that were free."""
         wanted = words if heads.isdisjoint(self.values) else self.shape(words)
         if fits := _fits(got, wanted, sizes := self.sizes.copy()):
@@ -38,7 +40,9 @@ class Scope:
     def shape(self, words: Sequence[Any]) -> tuple[Any, ...]:
         """A shape as far as it is known."""
         known = [self._size(word) if isinstance(word, str) else word for word in words]
-        return tuple(chain.from_iterable(n if type(n) is tuple else (n,) for n in known))
+        return tuple(
+            chain.from_iterable(n if type(n) is tuple else (n,) for n in known)
+        )
 
     def _size(self, word: str) -> Any:
         """What a word stands for: a size, sizes, or itself while it is free."""
@@ -65,7 +69,11 @@ class Kind:
         try:
             out = self.convert(value, name, scope)
         except TypeError:
-            got = repr(value) if isinstance(value, str | int | float) else type(value).__name__
+            got = (
+                repr(value)
+                if isinstance(value, str | int | float)
+                else type(value).__name__
+            )
             raise ValueError(f"{name}: needs {self.needs}, got {got}") from None
         for rule in self.rules:
             rule(out, name)
@@ -74,7 +82,11 @@ class Kind:
 
 def _number(value: Any, name: str, scope: Scope) -> float:
     try:  # a TypeError for an array
-        out = float(value if type(value) in (float, int, np.float64) else check_array(value, name, ()))
+        out = float(
+            value
+            if type(value) in (float, int, np.float64)
+            else check_array(value, name, ())
+        )
     except ValueError:
         raise TypeError from None
     if not math.isfinite(out):
@@ -83,7 +95,9 @@ def _number(value: Any, name: str, scope: Scope) -> float:
 
 
 def _integer(value: Any, name: str, scope: Scope) -> int:
-    if not isinstance(value, int | np.integer) or isinstance(value, bool | np.timedelta64):
+    if not isinstance(value, int | np.integer) or isinstance(
+        value, bool | np.timedelta64
+    ):
         raise TypeError
     return int(value)
 
@@ -111,20 +125,29 @@ def _one_of(options: tuple[Any, ...], value: Any, name: str, scope: Scope) -> An
 
 
 def _numbers(
-    dtype: type, words: tuple[Any, ...] | None, heads: frozenset[str], missing: bool, value: Any,
-    name: str, scope: Scope,
+    dtype: type,
+    words: tuple[Any, ...] | None,
+    heads: frozenset[str],
+    missing: bool,
+    value: Any,
+    name: str,
+    scope: Scope,
 ) -> Any:
     if dtype is np.float64:
         out: Any = check_array(value, name, finite=not missing)
         if missing and np.isinf(out).any():
-            raise ValueError(f"{name}: needs finite numbers or NaN (missing), got infinity")
+            raise ValueError(
+                f"{name}: needs finite numbers or NaN (missing), got infinity"
+            )
     else:
         out = np.asarray(value)
         kinds = "b" if dtype is np.bool_ else "iu"
         if out.dtype.kind not in kinds or isinstance(value, np.ma.MaskedArray):
             raise TypeError
     if words is not None and not scope.fits(out.shape, words, heads):
-        raise ValueError(f"{name}: needs shape {_shape_text(scope.shape(words))}, got {out.shape}")
+        raise ValueError(
+            f"{name}: needs shape {_shape_text(scope.shape(words))}, got {out.shape}"
+        )
     return out
 
 
@@ -138,10 +161,14 @@ def _many(
     if len(each) != len(items):
         raise ValueError(f"{name}: needs {len(each)} entries, got {len(items)}")
     pairs = zip(each, items, strict=True)
-    return tuple([kind.take(item, name, scope) if kind else item for kind, item in pairs])
+    return tuple(
+        [kind.take(item, name, scope) if kind else item for kind, item in pairs]
+    )
 
 
-def _either(kinds: tuple[Any, ...], optional: bool, value: Any, name: str, scope: Scope) -> Any:
+def _either(
+    kinds: tuple[Any, ...], optional: bool, value: Any, name: str, scope: Scope
+) -> Any:
     if value is None and optional:
         return None
     for kind in kinds:
@@ -183,7 +210,8 @@ def kind_of(annotation: Any) -> Kind | None:
     if annotation is Any or annotation == ArrayLike:
         return None
     annotation = _meant(annotation)
-    origin, args = get_origin(annotation), get_args(annotation)
+    origin = get_origin(annotation)
+    args = get_args(annotation)
     if origin is Annotated:
         return _noted(args[0], args[1:])
     if origin in (Union, UnionType):
@@ -197,7 +225,9 @@ def kind_of(annotation: Any) -> Kind | None:
         return Kind(_words(kinds, ", "), partial(_many, kinds, True))
     if origin in _SEQUENCES:
         kinds = (kind_of(args[0]),)
-        return Kind(f"a list, of {_words(kinds, '')} each", partial(_many, kinds, False))
+        return Kind(
+            f"a list, of {_words(kinds, '')} each", partial(_many, kinds, False)
+        )
     found = origin or annotation
     if found in _PLAIN or not isinstance(found, type):
         return _PLAIN.get(found)
@@ -226,21 +256,33 @@ def _meant(annotation: Any) -> Any:
 
 def _noted(base: Any, notes: tuple[Any, ...]) -> Kind | None:
     """A type with a shape and rules beside it; the last shape counts, so that aliases can vary."""
-    shapes = [note.split() for note in notes if isinstance(note, str) and note != ALLOW_NAN]
+    shapes = [
+        note.split() for note in notes if isinstance(note, str) and note != ALLOW_NAN
+    ]
     base = _meant(base)
     if get_origin(base) is np.ndarray:
-        kind: Kind | None = _array_of(base, shapes[-1] if shapes else None, ALLOW_NAN in notes)
+        kind: Kind | None = _array_of(
+            base, shapes[-1] if shapes else None, ALLOW_NAN in notes
+        )
     else:
         kind = kind_of(base)
     rules: Any = filter(callable, notes)
     return kind and replace(kind, rules=(*kind.rules, *rules))
 
 
-def _array_of(base: Any, words: Sequence[str] | None = None, missing: bool = False) -> Kind:
+def _array_of(
+    base: Any, words: Sequence[str] | None = None, missing: bool = False
+) -> Kind:
     dtype = get_args(get_args(base)[1])[0]
-    what = {np.float64: "real numbers", np.bool_: "True and False"}.get(dtype, "integers")
+    what = {np.float64: "real numbers", np.bool_: "True and False"}.get(
+        dtype, "integers"
+    )
     shape = "" if words is None else f" of shape ({', '.join(words)})"
-    known: Any = words and tuple([int(w) if w.isdigit() else {"...": ...}.get(w, w) for w in words])
+    known: Any = words and tuple(
+        [int(w) if w.isdigit() else {"...": ...}.get(w, w) for w in words]
+    )
     # What a word may stand for: an argument, or what one has.
     heads = frozenset(word.lstrip("*").split(".")[0] for word in words or ())
-    return Kind(f"an array of {what}{shape}", partial(_numbers, dtype, known, heads, missing))
+    return Kind(
+        f"an array of {what}{shape}", partial(_numbers, dtype, known, heads, missing)
+    )

@@ -15,9 +15,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf
 
-__all__ = [  # fmt: skip
-    "Array", "Bounds", "all_finite", "check_array", "call_batched", "check_positive_definite", "check_distinct", "check_increasing",
-    "import_optional", "check_positive_semidefinite", "check_probabilities",
+__all__ = [
+    "Array",
+    "Bounds",
+    "all_finite",
+    "check_array",
+    "call_batched",
+    "check_positive_definite",
+    "check_distinct",
+    "check_increasing",
+    "import_optional",
+    "check_positive_semidefinite",
+    "check_probabilities",
 ]
 
 Array = NDArray[np.float64]
@@ -25,13 +34,27 @@ Array = NDArray[np.float64]
 _ROUNDING = 1e-9
 """Largest asymmetry and negative eigenvalue, in units of the variances, that count as rounding."""
 
-_NOT_REAL = (bool, np.bool_, complex, np.complexfloating, str, bytes, np.datetime64, np.timedelta64,
-             type(None), np.ma.MaskedArray)  # fmt: skip
+_NOT_REAL = (
+    bool,
+    np.bool_,
+    complex,
+    np.complexfloating,
+    str,
+    bytes,
+    np.datetime64,
+    np.timedelta64,
+    type(None),
+    np.ma.MaskedArray,
+)
 """What would turn into numbers inside a list or an array of objects."""
 
 
 def check_array(
-    value: ArrayLike, name: str, shape: tuple[Any, ...] | None = None, *, finite: bool = True
+    value: ArrayLike,
+    name: str,
+    shape: tuple[Any, ...] | None = None,
+    *,
+    finite: bool = True,
 ) -> Array:
     """Return `value` as a float64 array of the wanted shape: for what a user's function returned.
 
@@ -65,7 +88,9 @@ def check_array(
         raise ValueError(f"{name}: needs shape {_shape_text(shape)}, got {out.shape}")
     if finite and not all_finite(out):
         bad = int((~np.isfinite(out)).sum())
-        raise ValueError(f"{name}: needs finite numbers, got {bad} NaN or infinite of {out.size}")
+        raise ValueError(
+            f"{name}: needs finite numbers, got {bad} NaN or infinite of {out.size}"
+        )
     return out
 
 
@@ -128,10 +153,13 @@ def check_positive_definite(value: Array, name: str, word: str = "definite") -> 
         raise ValueError(f"{name}: needs a square matrix, got shape {value.shape}")
     # As a rule the same bytes, which takes a fifth of a difference's time.
     if value.tobytes() != value.mT.tobytes():
-        unit, gap = _in_units(value), np.abs(value - value.mT)
+        unit = _in_units(value)
+        gap = np.abs(value - value.mT)
         worst = gap[np.abs(unit - unit.mT) > _ROUNDING].max(initial=0.0)
         if worst > 0:
-            raise ValueError(f"{name}: needs a symmetric matrix, got an asymmetry of {worst:.3g}")
+            raise ValueError(
+                f"{name}: needs a symmetric matrix, got an asymmetry of {worst:.3g}"
+            )
     with contextlib.suppress(np.linalg.LinAlgError):
         # The first takes a fifth of the other's time for one matrix.
         if value.ndim > 2 or not value.size or dpotrf(value, lower=1)[1]:
@@ -142,7 +170,9 @@ def check_positive_definite(value: Array, name: str, word: str = "definite") -> 
     if word == "definite" or values.min() < -_ROUNDING:
         at = tuple(np.argwhere(values == values.min())[0].tolist())
         least = f"{np.linalg.eigvalsh(value[at])[0]:.6g}{f' at {[*at]}' * bool(at)}"
-        raise ValueError(f"{name}: needs a positive {word} matrix, got smallest eigenvalue {least}")
+        raise ValueError(
+            f"{name}: needs a positive {word} matrix, got smallest eigenvalue {least}"
+        )
 
 
 def check_positive_semidefinite(value: Array, name: str) -> None:
@@ -206,7 +236,9 @@ def check_distinct(value: Sequence[int], name: str) -> None:
     ValueError: local: needs distinct integers, one or more, got [2, 2]
     """
     if not len(value) or len({*value}) < len(value):
-        raise ValueError(f"{name}: needs distinct integers, one or more, got {[*value]}")
+        raise ValueError(
+            f"{name}: needs distinct integers, one or more, got {[*value]}"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,13 +264,23 @@ class Bounds:
             if bound is None or (good := holds(value, bound)) is True or np.all(good):
                 continue
             word = side.replace("_", " ")
-            needs = "an integer of" if isinstance(value, int) and word == "at least" else "a number"
-            worst = value if np.ndim(value) == 0 else value[~holds(value, bound)].flat[0]
+            needs = (
+                "an integer of"
+                if isinstance(value, int) and word == "at least"
+                else "a number"
+            )
+            worst = (
+                value if np.ndim(value) == 0 else value[~holds(value, bound)].flat[0]
+            )
             raise ValueError(f"{name}: needs {needs} {word} {bound:g}, got {worst!r}")
 
 
-_HOLDS = {"above": operator.gt, "at_least": operator.ge, "below": operator.lt,
-          "at_most": operator.le}
+_HOLDS = {
+    "above": operator.gt,
+    "at_least": operator.ge,
+    "below": operator.lt,
+    "at_most": operator.le,
+}
 
 
 def import_optional(module: str, extra: str) -> ModuleType:
@@ -261,7 +303,8 @@ def import_optional(module: str, extra: str) -> ModuleType:
         if error.name != module.partition(".")[0]:
             raise
         raise ModuleNotFoundError(
-            f"{module}: needs the extra {extra}: pip install 'distfilt[{extra}]'", name=module
+            f"{module}: needs the extra {extra}: pip install 'distfilt[{extra}]'",
+            name=module,
         ) from None
 
 
@@ -302,8 +345,10 @@ def call_batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -
     Traceback (most recent call last):
     ValueError: flow: needs to take many states at once, ...
     """
-    function, x = getattr(owner, name), states[0]
-    out, wanted = _made(function, states, rest), (*x.shape[:-1], owner.dim)
+    function = getattr(owner, name)
+    x = states[0]
+    out = _made(function, states, rest)
+    wanted = (*x.shape[:-1], owner.dim)
     fits = getattr(out, "shape", None) == wanted  # an error has none
     done = "_compared" if x.size > x.shape[-1] else "_compared_alone"
     if x.ndim > 1 and x.size and not (fits and done in vars(owner)):
@@ -312,12 +357,17 @@ def call_batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -
         if fits:
             wrong = _differs(out.reshape(-1, owner.dim)[-1], alone, last)
         else:  # an error of its own comes from some states only, and not from one of them alone
-            copies = [np.broadcast_to(one, s.shape) for one, s in zip(last, states, strict=True)]
+            copies = [
+                np.broadcast_to(one, s.shape)
+                for one, s in zip(last, states, strict=True)
+            ]
             many = _made(function, copies, rest)
             wrong = np.shape(alone) == wanted[-1:] and np.shape(many) != wanted
         if wrong:
-            raise ValueError(f"{name}: needs to take many states at once, (..., d), components "
-                             "last (x[..., 0], not x[0] or x[:, 0]), got one for other axes")
+            raise ValueError(
+                f"{name}: needs to take many states at once, (..., d), components "
+                "last (x[..., 0], not x[0] or x[:, 0]), got one for other axes"
+            )
         first = x.reshape(-1, x.shape[-1])[0]
         if fits and (first != (last[0] if done == "_compared" else first[-1])).any():
             vars(owner)[done] = True
@@ -327,14 +377,19 @@ def call_batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -
         raise ValueError(f"x: needs more components, got {x.shape}") from out
     if isinstance(out, Exception):
         raise out
-    raise ValueError(f"{name}: needs to return shape {wanted} for states {x.shape}, "
-                     f"got {out.shape}")
+    raise ValueError(
+        f"{name}: needs to return shape {wanted} for states {x.shape}, got {out.shape}"
+    )
 
 
-def _made(function: Callable[..., Any], states: Sequence[Array], rest: tuple[float, ...]) -> Any:
+def _made(
+    function: Callable[..., Any], states: Sequence[Array], rest: tuple[float, ...]
+) -> Any:
     """What a function returns, or the error that it raises."""
     try:
-        return np.asarray(function(*[s.copy() for s in states], *rest), dtype=np.float64)
+        return np.asarray(
+            function(*[s.copy() for s in states], *rest), dtype=np.float64
+        )
     except (TypeError, ValueError, IndexError) as error:
         return error
 
@@ -345,4 +400,6 @@ def _differs(row: Array, alone: Any, states: Sequence[Array]) -> bool:
     # Rules of adaptive step differ a little; wrong rows differ as much as the states move.
     moved = alone - states[0] if alone.shape == states[0].shape else alone
     bound = 1e-2 * np.abs(moved).max() + 1e-9 * np.abs(alone).max()
-    return bool((np.isnan(row) != np.isnan(alone)).any() or (np.abs(row - alone) > bound).any())
+    return bool(
+        (np.isnan(row) != np.isnan(alone)).any() or (np.abs(row - alone) > bound).any()
+    )

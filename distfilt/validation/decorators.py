@@ -21,14 +21,22 @@ __all__ = ["FrozenModel", "validated", "unchecked"]
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def _declared(annotations: Mapping[str, Any], names: Mapping[str, Any]) -> dict[str, Kind]:
+def _declared(
+    annotations: Mapping[str, Any], names: Mapping[str, Any]
+) -> dict[str, Kind]:
     """The kinds of named annotations, arrays last: their shapes may speak of the others."""
     found: dict[str, Kind | None] = {}
     for name, annotation in annotations.items():
         with suppress(NameError):  # a name that only the type checker imports
-            meant = eval(annotation, dict(names)) if isinstance(annotation, str) else annotation
+            meant = (
+                eval(annotation, dict(names))
+                if isinstance(annotation, str)
+                else annotation
+            )
             found[name] = None if name == "return" else kind_of(meant)
-    return _arrays_last({name: kind for name, kind in found.items() if kind is not None})
+    return _arrays_last(
+        {name: kind for name, kind in found.items() if kind is not None}
+    )
 
 
 def _arrays_last(kinds: dict[str, Kind]) -> dict[str, Kind]:
@@ -119,7 +127,9 @@ def unchecked(function: F) -> F:
     given: Any = function
     inner = getattr(given, "unchecked", None)  # a method has what its function has
     if inner is not None:
-        given = MethodType(inner, given.__self__) if type(given) is MethodType else inner
+        given = (
+            MethodType(inner, given.__self__) if type(given) is MethodType else inner
+        )
     elif isinstance(given, partial):
         given = partial(unchecked(given.func), *given.args, **given.keywords)
     return given  # type: ignore[no-any-return]

@@ -45,7 +45,8 @@ def timed(function: Callable[[], Any], repeats: int = 3) -> Timing:
 
     Another program on the machine disturbs it less than wall time.
     """
-    cpu, result = [], None
+    cpu = []
+    result = None
     # Waiting BLAS threads count as processor time and would hide what small matrices cost.
     with threadpool_limits(limits=1):
         for _ in range(repeats):
@@ -114,7 +115,8 @@ BUSY = 1.0
 
 def machine(busy: float) -> str:
     """Processor, core count, and how busy others kept it; `timed` holds BLAS to one thread."""
-    name, told = platform.processor() or platform.machine(), Path("/proc/cpuinfo")
+    name = platform.processor() or platform.machine()
+    told = Path("/proc/cpuinfo")
     if told.is_file():
         models = re.findall(r"model name\s*: (.*)", told.read_text(encoding="utf-8"))
         name = models[0] if models else name
@@ -134,7 +136,8 @@ def versions(packages: Sequence[str]) -> str:
 
 def write(name: str, rows: Sequence[Row], packages: Sequence[str]) -> None:
     """Print rows, and write them to data/bench/`name`.csv with versions, machine and its load."""
-    found, busy = pandas.DataFrame(rows), max(_BEFORE, load())
+    found = pandas.DataFrame(rows)
+    busy = max(_BEFORE, load())
     print(found.to_string(index=False))
     path = FOLDER / f"{name}.csv"
     if busy > BUSY and "--force" not in sys.argv:

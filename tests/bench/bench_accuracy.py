@@ -21,22 +21,35 @@ from _bench import Row, main, peer, table
 from distfilt.filters import EnsembleFilter, ParticleFilter
 from distfilt.models import lorenz63
 from distfilt.sensors import component
-from distfilt.updates import enkf_exact, with_inflation, enkf, etkf
+from distfilt.updates import enkf, enkf_exact, etkf, with_inflation
 
-RUNS, END, STD = 72, 216.0, 2**0.5
+RUNS = 72
+END = 216.0
+STD = 2**0.5
 
 
 def pairs(da: Any) -> Iterator[tuple[str, Any, Any, float]]:
     """Each filter of ours, DAPPER's with the options that it recommends, the limit of the ratio."""
     given = lorenz63(step=0.01), [component([0, 1, 2], std=STD)]
-    ours, wider = partial(EnsembleFilter, *given, members=10), partial(with_inflation, factor=1.02)
+    ours = partial(EnsembleFilter, *given, members=10)
+    wider = partial(with_inflation, factor=1.02)
     centred = with_inflation(partial(enkf, centred=True), factor=1.04)
     rotated = partial(da.EnKF, "Sqrt", N=10, infl=1.02, rot=True)
-    yield "centred draws", ours(update=centred), partial(da.EnKF, "PertObs", N=10, infl=1.04), 1.05
+    yield (
+        "centred draws",
+        ours(update=centred),
+        partial(da.EnKF, "PertObs", N=10, infl=1.04),
+        1.05,
+    )
     yield "square root", ours(update=wider(etkf)), rotated, 1.0
     yield "exact draws", ours(update=wider(enkf_exact)), rotated, 1.0
     particles = partial(da.PartFilt, N=800, reg=0.9, NER=0.2)
-    yield "particles", ParticleFilter(*given, members=800, ess_threshold=0.2), particles, 1.03
+    yield (
+        "particles",
+        ParticleFilter(*given, members=800, ess_threshold=0.2),
+        particles,
+        1.03,
+    )
 
 
 @table("accuracy", "numpy", "scipy", "dapper")
@@ -58,7 +71,9 @@ def errors() -> Iterator[Row]:
         return np.sqrt((gap**2).mean(axis=-1))
 
     for name, f, make, limit in pairs(da):
-        state = f.start((problem.x0, 2 * np.eye(3)), rng=np.random.default_rng(5), runs=(RUNS,))
+        state = f.start(
+            (problem.x0, 2 * np.eye(3)), rng=np.random.default_rng(5), runs=(RUNS,)
+        )
         own = error(f.run(state, times, [seen])["mean"][:, :, 0])
         dapper.set_seed(9000)
         means = []
@@ -69,14 +84,22 @@ def errors() -> Iterator[Row]:
         whole = own.mean() / its.mean()
         lost, its_lost = ((x > 4 * STD).any(axis=0) for x in (own, its))
         own, its = (x.mean(axis=0)[~lost & ~its_lost] for x in (own, its))
-        ratio, se = own.mean() / its.mean(), (own - its).std(ddof=1) / its.mean() / own.size**0.5
+        ratio = own.mean() / its.mean()
+        se = (own - its).std(ddof=1) / its.mean() / own.size**0.5
         more = lost.sum() - its_lost.sum() > 2 * (lost | its_lost).sum() ** 0.5
         yield {
-            "ours": name, "runs": RUNS, "ratio_of_all": f"{whole:.3f}", "lost": lost.sum(),
-            "its_lost": its_lost.sum(), "error": f"{own.mean():.4f}",
-            "its_error": f"{its.mean():.4f}", "ratio": f"{ratio:.3f}", "se": f"{se:.3f}",
-            "limit": limit, "missed": ratio - 2 * se > limit or more,
-        }  # fmt: skip
+            "ours": name,
+            "runs": RUNS,
+            "ratio_of_all": f"{whole:.3f}",
+            "lost": lost.sum(),
+            "its_lost": its_lost.sum(),
+            "error": f"{own.mean():.4f}",
+            "its_error": f"{its.mean():.4f}",
+            "ratio": f"{ratio:.3f}",
+            "se": f"{se:.3f}",
+            "limit": limit,
+            "missed": ratio - 2 * se > limit or more,
+        }
 
 
 if __name__ == "__main__":

@@ -15,7 +15,9 @@ from _bench import Row, interleaved, main, table
 
 from distfilt.coupling import squared_distances, transport_plan
 
-SIZES, MOST, NEEDED = (50, 100, 200, 500, 1000, 2000), 200, 30
+SIZES = (50, 100, 200, 500, 1000, 2000)
+MOST = 200
+NEEDED = 30
 
 
 def case(n: int) -> tuple[np.ndarray, np.ndarray]:
@@ -48,16 +50,26 @@ def rows() -> Iterator[Row]:
         calls = {"network simplex": lambda c=cost, w=w: transport_plan(c, w).value}
         if n <= MOST:
             calls["cvxpy, built anew"] = partial(built_anew, cost, w)
-            calls["entropic, 0.01"] = lambda c=cost, w=w: transport_plan(c, w, solver="entropic").value
+            calls["entropic, 0.01"] = lambda c=cost, w=w: (
+                transport_plan(c, w, solver="entropic").value
+            )
         times, ratios = interleaved(calls, 5)
-        best, spent[n] = calls["network simplex"](), times["network simplex"]
+        best = calls["network simplex"]()
+        spent[n] = times["network simplex"]
         slope = np.diff(np.log(list(spent.items())[-2:]), axis=0)
         for solver, call in calls.items():
-            gap, needed = abs(call() - best), NEEDED if "cvxpy" in solver else 0
+            gap = abs(call() - best)
+            needed = NEEDED if "cvxpy" in solver else 0
             yield {
-                "solver": solver, "members": n, "ms": f"{1e3 * times[solver]:.3f}",
-                "ratio": f"{ratios[solver]:.1f}", "needed": needed or "", "value_gap": f"{gap:.0e}",
-                "slope": "".join(f"{y / x:.2f}" for x, y in slope if solver == "network simplex"),
+                "solver": solver,
+                "members": n,
+                "ms": f"{1e3 * times[solver]:.3f}",
+                "ratio": f"{ratios[solver]:.1f}",
+                "needed": needed or "",
+                "value_gap": f"{gap:.0e}",
+                "slope": "".join(
+                    f"{y / x:.2f}" for x, y in slope if solver == "network simplex"
+                ),
                 "missed": ratios[solver] < needed or (needed and gap > 1e-11),
             }
 

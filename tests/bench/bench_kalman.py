@@ -28,8 +28,11 @@ from distfilt.models import clohessy_wiltshire, simulate
 from distfilt.sensors import component, range_bearing, stack
 from tests.support import turning
 
-RUNS, STEPS, DT = 200, 100, 0.1
-CURVED_RUNS, CURVED_STEPS = 100, 15
+RUNS = 200
+STEPS = 100
+DT = 0.1
+CURVED_RUNS = 100
+CURVED_STEPS = 15
 FLOORS = {
     ("common pattern", "filterpy"): 50.0,
     ("gaps that differ by run", "filterpy"): 12.0,
@@ -39,15 +42,26 @@ FLOORS = {
 }
 
 
-def linear_case(rng: np.random.Generator) -> tuple[tuple[np.ndarray, ...], dict[str, Any], Any]:
+def linear_case(
+    rng: np.random.Generator,
+) -> tuple[tuple[np.ndarray, ...], dict[str, Any], Any]:
     """Prior mean and covariance and observations; the matrices; model, sensors and times."""
     model = clohessy_wiltshire(rate=0.1, sigma=0.2)
     x0 = np.array([100.0, 0.0, 0.0, 10.0, 0.1, 0.0])
-    sensor = stack([component([0, 1], std=0.2), component([1, 2], std=0.2), component([3, 4, 5], std=0.1)])
+    sensor = stack(
+        [
+            component([0, 1], std=0.2),
+            component([1, 2], std=0.2),
+            component([3, 4, 5], std=0.1),
+        ]
+    )
     times = DT * np.arange(1, STEPS + 1)
     truth = simulate(model, np.tile(x0, (RUNS, 1)), times, rng=rng)
     matrices = {
-        "F": model.F(DT), "H": sensor.H(6), "Q": model.Q(0.0, DT), "R": sensor.noise_cov
+        "F": model.F(DT),
+        "H": sensor.H(6),
+        "Q": model.Q(0.0, DT),
+        "R": sensor.noise_cov,
     }
     parts = {"model": model, "sensors": (sensor,), "times": times}
     return (x0 + 3.0, 25.0 * np.eye(6), sensor.observe(truth, rng=rng)), matrices, parts
@@ -58,16 +72,20 @@ def plain_numpy(mean: Any, cov: Any, y: Any, *, F: Any, H: Any, Q: Any, R: Any) 
 
     A missing reading sees nothing, with variance one.
     """
-    runs, d = y.shape[1], len(mean)
-    x, p = np.tile(mean, (runs, 1)), np.tile(cov, (runs, 1, 1))
-    means, covs = np.empty((len(y), runs, d)), np.empty((len(y), runs, d, d))
+    runs = y.shape[1]
+    d = len(mean)
+    x = np.tile(mean, (runs, 1))
+    p = np.tile(cov, (runs, 1, 1))
+    means = np.empty((len(y), runs, d))
+    covs = np.empty((len(y), runs, d, d))
     density = np.empty((len(y), runs))
     for k, seen in enumerate(y):
         here = ~np.isnan(seen)
         h = H * here[..., None]
         both = here[..., :, None] & here[..., None, :]
         r = np.where(both, R, np.eye(len(R)))
-        x, p = x @ F.T, F @ p @ F.T + Q
+        x = x @ F.T
+        p = F @ p @ F.T + Q
         cross = h @ p
         inner = cross @ np.swapaxes(h, 1, 2) + r
         gain = np.swapaxes(np.linalg.solve(inner, cross), 1, 2)
@@ -78,11 +96,14 @@ def plain_numpy(mean: Any, cov: Any, y: Any, *, F: Any, H: Any, Q: Any, R: Any) 
         x = x + (gain @ gap[..., None])[..., 0]
         rest = np.eye(d) - gain @ h
         p = rest @ p @ np.swapaxes(rest, 1, 2) + gain @ r @ np.swapaxes(gain, 1, 2)
-        means[k], covs[k] = x, p
+        means[k] = x
+        covs[k] = p
     return means, covs
 
 
-def curved_case(rng: np.random.Generator) -> tuple[tuple[np.ndarray, ...], dict[str, Any]]:
+def curved_case(
+    rng: np.random.Generator,
+) -> tuple[tuple[np.ndarray, ...], dict[str, Any]]:
     model = turning(sigma=0.1, turn_sigma=0.02)
     sensors = (range_bearing([0, 1], std=(0.3, 0.02), origin=[-9.0, -7.0]),)
     x0 = np.array([0.0, 0.0, 1.0, 0.5, 0.1])
@@ -93,7 +114,9 @@ def curved_case(rng: np.random.Generator) -> tuple[tuple[np.ndarray, ...], dict[
     return given, {"model": model, "sensors": sensors, "times": times}
 
 
-def unscented(mean: Any, cov: Any, y: Any, *, model: Any, sensors: Any, times: Any) -> Any:
+def unscented(
+    mean: Any, cov: Any, y: Any, *, model: Any, sensors: Any, times: Any
+) -> Any:
     f = GaussianFilter(model, sensors, linearization="unscented")
     states = list(f.steps(f.start((mean, cov), runs=y.shape[1:-1]), times, [y]))
     means = np.array([s.means[:, 0] for s in states])
@@ -105,7 +128,9 @@ def moments(found: Any) -> tuple[np.ndarray, np.ndarray]:
     return found[:2] if isinstance(found, tuple) else (found.means, found.covariances)
 
 
-def compared(case: str, functions: Any, rounds: int, *given: Any, **options: Any) -> Iterator[Row]:
+def compared(
+    case: str, functions: Any, rounds: int, *given: Any, **options: Any
+) -> Iterator[Row]:
     """The table's rows: ours first, each other's time, our speed, and the largest difference."""
     calls = {name: partial(f, *given, **options) for name, f in functions.items()}
     results = {name: moments(call()) for name, call in calls.items()}
@@ -118,8 +143,12 @@ def compared(case: str, functions: Any, rounds: int, *given: Any, **options: Any
         gap = max(gap, np.abs(covs - own).max() / np.abs(own).max())
         floor = FLOORS.get((case, name), 0)
         yield {
-            "case": case, "filter": name, "seconds": f"{times[name]:.4f}",
-            "distfilt_is_faster": f"{ratios[name]:.2f}", "floor": floor or "", "gap": f"{gap:.0e}",
+            "case": case,
+            "filter": name,
+            "seconds": f"{times[name]:.4f}",
+            "distfilt_is_faster": f"{ratios[name]:.2f}",
+            "floor": floor or "",
+            "gap": f"{gap:.0e}",
             "missed": gap > 1e-9 or ratios[name] < floor,
         }
 
@@ -129,15 +158,26 @@ def filters() -> Iterator[Row]:
     rng = np.random.default_rng(20260)
     (mean, cov, whole), matrices, parts = linear_case(rng)
     gaps = np.where(rng.random(whole.shape) < 0.1, np.nan, whole)
-    filterpy.KalmanFilter.log_likelihood = filterpy.UnscentedKalmanFilter.log_likelihood = 0.0
-    calls = {"distfilt": kalman_filter, "filterpy": filterpy_kf, "plain numpy": plain_numpy}
+    filterpy.KalmanFilter.log_likelihood = (
+        filterpy.UnscentedKalmanFilter.log_likelihood
+    ) = 0.0
+    calls = {
+        "distfilt": kalman_filter,
+        "filterpy": filterpy_kf,
+        "plain numpy": plain_numpy,
+    }
     for case, y in ("common pattern", whole), ("gaps that differ by run", gaps):
         yield from compared(case, calls, 5, mean, cov, y, **matrices)
-    calls, one = {"distfilt": unscented, "filterpy": filterpy_ukf}, slice(None, 1)
-    yield from compared("unscented satellite, one run", calls, 7, mean, cov, whole[:, one], **parts)
+    calls = {"distfilt": unscented, "filterpy": filterpy_ukf}
+    one = slice(None, 1)
+    yield from compared(
+        "unscented satellite, one run", calls, 7, mean, cov, whole[:, one], **parts
+    )
     (mean, cov, seen), options = curved_case(rng)
     yield from compared("unscented turn", calls, 3, mean, cov, seen, **options)
-    yield from compared("unscented turn, one run", calls, 7, mean, cov, seen[:, one], **options)
+    yield from compared(
+        "unscented turn, one run", calls, 7, mean, cov, seen[:, one], **options
+    )
 
 
 if __name__ == "__main__":

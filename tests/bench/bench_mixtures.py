@@ -27,10 +27,12 @@ def mixture(size: int, dim: int, seed: int = 0) -> GaussianMixture:
 
 def gap(ours: GaussianMixture, weights: Any, means: Any, covs: Any) -> float:
     """Largest relative difference of two mixtures whose mixands stand in another order."""
-    mine, theirs = np.argsort(ours.weights), np.argsort(weights)
+    mine = np.argsort(ours.weights)
+    theirs = np.argsort(weights)
     pairs = ((ours.weights, weights), (ours.means, means), (ours.covs, covs))
     return max(
-        float(np.abs(a[mine] - np.asarray(b)[theirs]).max() / np.abs(a).max()) for a, b in pairs
+        float(np.abs(a[mine] - np.asarray(b)[theirs]).max() / np.abs(a).max())
+        for a, b in pairs
     )
 
 
@@ -42,14 +44,21 @@ def rows() -> Iterator[Row]:
     for dim, size, needed in PEERS:
         p = mixture(size, dim)
         there = TheirMixture(p.weights.copy(), p.means.copy(), p.covs.copy())
-        calls = {"ours": partial(runnalls, p, LEFT), "pyest": partial(merge_runnalls, there, LEFT)}
+        calls = {
+            "ours": partial(runnalls, p, LEFT),
+            "pyest": partial(merge_runnalls, there, LEFT),
+        }
         found = calls["pyest"]()
         apart = gap(calls["ours"](), found.w, found.m, found.P)
         times, ratios = interleaved(calls, 3)
         yield {
-            "components": dim, "mixands": size, "ms": f"{1e3 * times['ours']:.1f}",
-            "pyest_ms": f"{1e3 * times['pyest']:.1f}", "ratio": f"{ratios['pyest']:.1f}",
-            "needed": needed, "gap": f"{apart:.0e}",
+            "components": dim,
+            "mixands": size,
+            "ms": f"{1e3 * times['ours']:.1f}",
+            "pyest_ms": f"{1e3 * times['pyest']:.1f}",
+            "ratio": f"{ratios['pyest']:.1f}",
+            "needed": needed,
+            "gap": f"{apart:.0e}",
             "missed": ratios["pyest"] < needed or apart > 1e-12,
         }
 

@@ -25,13 +25,25 @@ from scipy.spatial import cKDTree
 
 from distfilt.filters import EnsembleFilter, GaussianFilter
 from distfilt.models import clohessy_wiltshire
-from distfilt.network import Channel, Graph, covariance_intersection, graphs, intersect_ensembles, weights
+from distfilt.network import (
+    Channel,
+    Graph,
+    covariance_intersection,
+    graphs,
+    intersect_ensembles,
+    weights,
+)
 from distfilt.sensors import component
 from distfilt.updates import enkf
 
-MODEL, PRIOR = clohessy_wiltshire(rate=0.1, sigma=0.2), (np.zeros(6), 25 * np.eye(6))
-MANY, RULES, STEP_S = 1000, ("equal", "trace", "determinant", "min_trace", "min_determinant"), 0.12
-VERY_MANY, SECONDS, MEGABYTES = 100_000, 1.0, 500.0
+MODEL = clohessy_wiltshire(rate=0.1, sigma=0.2)
+PRIOR = (np.zeros(6), 25 * np.eye(6))
+MANY = 1000
+RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
+STEP_S = 0.12
+VERY_MANY = 100_000
+SECONDS = 1.0
+MEGABYTES = 500.0
 
 
 def spread(agents: int, neighbours: float = 10) -> tuple[np.ndarray, float]:
@@ -40,13 +52,19 @@ def spread(agents: int, neighbours: float = 10) -> tuple[np.ndarray, float]:
     return places, float(np.sqrt(neighbours / np.pi / agents))
 
 
-def scaled(what: str, agents: int, spent: Any, seconds: float, memory: float = np.inf) -> Row:
+def scaled(
+    what: str, agents: int, spent: Any, seconds: float, memory: float = np.inf
+) -> Row:
     """One line of the table of many agents."""
     return {
-        "what": what, "agents": agents, "seconds": f"{spent.cpu:.3f}", "limit_s": f"{seconds:.3g}",
-        "peak_mb": f"{spent.peak_mb:.0f}", "limit_mb": f"{memory:g}" if memory < np.inf else "",
+        "what": what,
+        "agents": agents,
+        "seconds": f"{spent.cpu:.3f}",
+        "limit_s": f"{seconds:.3g}",
+        "peak_mb": f"{spent.peak_mb:.0f}",
+        "limit_mb": f"{memory:g}" if memory < np.inf else "",
         "missed": spent.cpu > seconds or spent.peak_mb > memory,
-    }  # fmt: skip
+    }
 
 
 @table("scale")
@@ -54,11 +72,20 @@ def many() -> Iterator[Row]:
     """A step of a thousand agents, and operations on very many."""
     kinds = [component([k], std=0.2) for k in range(6)]
     kinds += [component([k, (k + 1) % 6], std=0.2) for k in range(6)]
-    for agents, rule in [*((MANY, rule) for rule in RULES), (10 * MANY, "min_determinant")]:
-        sensors, graph = [kinds[k % 12] for k in range(agents)], graphs.disk(*spread(agents, 6))
-        seen, limit = [np.zeros(s.dim) for s in sensors], STEP_S if agents == MANY else SECONDS
+    for agents, rule in [
+        *((MANY, rule) for rule in RULES),
+        (10 * MANY, "min_determinant"),
+    ]:
+        sensors = [kinds[k % 12] for k in range(agents)]
+        graph = graphs.disk(*spread(agents, 6))
+        seen = [np.zeros(s.dim) for s in sensors]
+        limit = STEP_S if agents == MANY else SECONDS
         ours = partial(covariance_intersection, rule=rule)
-        own = {"update": enkf, "members": 50, "agreement": partial(intersect_ensembles, rule=rule)}
+        own = {
+            "update": enkf,
+            "members": 50,
+            "agreement": partial(intersect_ensembles, rule=rule),
+        }
         for name, f in (
             ("Gaussian", GaussianFilter(MODEL, sensors, graph, fusion=ours)),
             ("ensemble, 50 members", EnsembleFilter(MODEL, sensors, graph, **own)),
@@ -71,7 +98,9 @@ def many() -> Iterator[Row]:
             agents, spent = pool.submit(large, what).result()
         yield scaled(what, agents, spent, SECONDS, MEGABYTES)
     theirs, ours = imported("scipy.linalg", "distfilt.filters")
-    yield scaled("import of distfilt.filters", 0, Timing(ours, np.nan, None), 1.3 * theirs)
+    yield scaled(
+        "import of distfilt.filters", 0, Timing(ours, np.nan, None), 1.3 * theirs
+    )
 
 
 def imported(*names: str) -> list[float]:
@@ -102,7 +131,11 @@ def one_way() -> Graph:
 def large(what: str) -> tuple[int, Any]:
     """Agents, and what one operation on very many of them takes."""
     graph = one_way() if what == "balanced" else graphs.disk(*spread(VERY_MANY))
-    averaging = weights.column_stochastic(graph) if graph.directed else weights.metropolis(graph)
+    averaging = (
+        weights.column_stochastic(graph)
+        if graph.directed
+        else weights.metropolis(graph)
+    )
     values = np.random.default_rng(4).standard_normal((VERY_MANY, 6))
     calls = {
         "combine": lambda: Channel(graph).mix(values, averaging),

@@ -20,7 +20,9 @@ from distfilt.kalman import kalman_filter
 from distfilt.models import LinearModel, simulate
 from distfilt.sensors import Sensor
 
-STEPS, SIZES, FLOOR = 50, (1000, 10_000, 100_000), 1.0
+STEPS = 50
+SIZES = (1000, 10_000, 100_000)
+FLOOR = 1.0
 Q = np.array([[0.3, 0.1, 0.0], [0.1, 0.2, 0.05], [0.0, 0.05, 0.4]])
 R = np.array([[0.5, 0.2], [0.2, 0.4]])
 H = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 1.0]])
@@ -31,13 +33,16 @@ MODEL = LinearModel.from_transition(3, lambda dt: np.eye(3), lambda t, dt: dt * 
 def by_distfilt(n: int, seen: np.ndarray) -> np.ndarray:
     sensor = Sensor(2, lambda x: x @ H.T, R, linear=lambda d: H)
     f = ParticleFilter(MODEL, [sensor], members=n, ess_threshold=1.0)
-    states = f.steps(f.start((np.zeros(3), np.eye(3)), rng=np.random.default_rng(1)), TIMES, [seen])
+    states = f.steps(
+        f.start((np.zeros(3), np.eye(3)), rng=np.random.default_rng(1)), TIMES, [seen]
+    )
     return np.array([state.weights[0] @ state.points[0] for state in states])
 
 
 def by_particles(package: Any, n: int, seen: np.ndarray) -> np.ndarray:
     spaces = peer("particles.state_space_models")
-    laws, collectors = peer("particles.distributions"), peer("particles.collectors")
+    laws = peer("particles.distributions")
+    collectors = peer("particles.collectors")
 
     class Walk(spaces.StateSpaceModel):  # type: ignore[misc,name-defined]
         def PX0(self) -> Any:
@@ -50,9 +55,12 @@ def by_particles(package: Any, n: int, seen: np.ndarray) -> np.ndarray:
             return laws.MvNormal(loc=x @ H.T, cov=R)
 
     run = package.SMC(
-        fk=spaces.Bootstrap(ssm=Walk(), data=list(seen[:, None, :])), N=n, resampling="systematic",
-        ESSrmin=1.0, collect=[collectors.Moments(mom_func=lambda w, x: w @ x)],
-    )  # fmt: skip
+        fk=spaces.Bootstrap(ssm=Walk(), data=list(seen[:, None, :])),
+        N=n,
+        resampling="systematic",
+        ESSrmin=1.0,
+        collect=[collectors.Moments(mom_func=lambda w, x: w @ x)],
+    )
     run.run()
     return np.array(run.summaries.moments)
 
@@ -74,10 +82,14 @@ def filters() -> Iterator[Row]:
             floor = FLOOR if name == "particles" else 0
             gap = np.sqrt(((call() - exact.means) ** 2 / variance).mean())
             yield {
-                "particles": n, "steps": STEPS, "filter": name,
+                "particles": n,
+                "steps": STEPS,
+                "filter": name,
                 "ms_a_step": f"{1e3 * times[name] / STEPS:.3f}",
-                "distfilt_is_faster": f"{ratios[name]:.2f}", "floor": floor or "",
-                "mean_error": f"{gap:.3f}", "missed": ratios[name] < floor,
+                "distfilt_is_faster": f"{ratios[name]:.2f}",
+                "floor": floor or "",
+                "mean_error": f"{gap:.3f}",
+                "missed": ratios[name] < floor,
             }
 
 

@@ -18,10 +18,15 @@ import numpy as np
 from _bench import Row, interleaved, main, table
 
 from bookkit import studies
-from distfilt.validation import unchecked
 from distfilt.gaussians import intersection_weights
+from distfilt.validation import unchecked
 
-LIMITS = {("known_fused", 1): 2.0, ("known_fused", 50): 2.0, ("exact", 1): 2.0, ("exact", 50): 2.0}
+LIMITS = {
+    ("known_fused", 1): 2.0,
+    ("known_fused", 50): 2.0,
+    ("exact", 1): 2.0,
+    ("exact", 50): 2.0,
+}
 
 
 def centred(x: np.ndarray) -> np.ndarray:
@@ -38,20 +43,29 @@ def exact(z: np.ndarray, avoid: np.ndarray) -> np.ndarray:
     return z @ np.linalg.inv(own).mT
 
 
-def floor_of(setup: Any, states: np.ndarray, rng: np.random.Generator, kind: str) -> Any:
+def floor_of(
+    setup: Any, states: np.ndarray, rng: np.random.Generator, kind: str
+) -> Any:
     """One step for states (runs, A, N, d)."""
-    n, dt = states.shape[-2] - 1, float(setup.times[1] - setup.times[0])
+    n = states.shape[-2] - 1
+    dt = float(setup.times[1] - setup.times[0])
     values, vectors = np.linalg.eigh(setup.model.Q(0.0, dt))
     kept = values > 1e-14 * values.max()
     root = vectors[:, kept] * np.sqrt(values[kept])
     hears = np.eye(len(setup.sensors)) + (setup.graph.laplacian.toarray() < 0)
-    told = [[s for s, row in zip(setup.sensors, rows, strict=True) if row] for rows in hears]
+    told = [
+        [s for s, row in zip(setup.sensors, rows, strict=True) if row] for rows in hears
+    ]
 
     def read(k: int, x: np.ndarray, before: np.ndarray) -> np.ndarray:
         """What the sensors that agent k hears would read of its members, without noise."""
-        return np.concatenate([
-            s.function(x, before) if s.uses_previous else s.function(x) for s in told[k]
-        ], axis=-1)  # fmt: skip
+        return np.concatenate(
+            [
+                s.function(x, before) if s.uses_previous else s.function(x)
+                for s in told[k]
+            ],
+            axis=-1,
+        )
 
     def drawn(avoid: np.ndarray, k: int) -> np.ndarray:
         z = rng.standard_normal((*avoid.shape[:-1], k))
@@ -62,16 +76,22 @@ def floor_of(setup: Any, states: np.ndarray, rng: np.random.Generator, kind: str
         x = x + drawn(centred(x), root.shape[1]) @ root.T
         for k in range(len(told)):
             h = read(k, x[:, k], states[:, k])
-            a, b, m = centred(x[:, k]), centred(h), h.shape[-1]
+            a = centred(x[:, k])
+            b = centred(h)
+            m = h.shape[-1]
             gain = np.linalg.solve(b.mT @ b / n + np.eye(m), b.mT @ a / n)
             x[:, k] -= (h + drawn(np.concatenate([a, b], axis=-1), m)) @ gain
         a = centred(x)
         covs = a.mT @ a / n
         precise = np.linalg.inv(covs)
         if kind == "exact":
-            sources = np.broadcast_to(covs[:, None], (len(x), *hears.shape, *covs.shape[-2:]))
+            sources = np.broadcast_to(
+                covs[:, None], (len(x), *hears.shape, *covs.shape[-2:])
+            )
             rule = "min_determinant"
-            weights = unchecked(intersection_weights)(sources, rule=rule, here=hears > 0)
+            weights = unchecked(intersection_weights)(
+                sources, rule=rule, here=hears > 0
+            )
         else:
             weights = hears / np.trace(covs, axis1=-2, axis2=-1)[:, None]
             weights /= weights.sum(axis=-1, keepdims=True)
@@ -80,7 +100,9 @@ def floor_of(setup: Any, states: np.ndarray, rng: np.random.Generator, kind: str
         mean = (fused @ (weights @ sent)[..., None])[..., 0]
         lower = np.linalg.cholesky(covs)
         values, vectors = np.linalg.eigh(lower.mT @ fused @ lower)
-        turn = np.linalg.solve(lower.mT, (vectors * np.sqrt(values)[..., None, :]) @ vectors.mT)
+        turn = np.linalg.solve(
+            lower.mT, (vectors * np.sqrt(values)[..., None, :]) @ vectors.mT
+        )
         return mean[..., None, :] + a @ (turn @ np.linalg.inv(lower)).mT
 
     return call
@@ -92,7 +114,8 @@ def rows() -> Iterator[Row]:
     setup = satellites.setup("table-3")
     t = float(setup.times[0])
     for (kind, runs), limit in LIMITS.items():
-        f, rng = satellites.repaired(setup, kind), np.random.default_rng(1)
+        f = satellites.repaired(setup, kind)
+        rng = np.random.default_rng(1)
         _, seen = satellites.data(setup, rng, (runs,))
         state = f.start(setup.prior, rng=rng, runs=(runs,))
         calls = {
@@ -102,9 +125,13 @@ def rows() -> Iterator[Row]:
         times, ratios = interleaved(calls, 9, 0.05)
         ratio = 1 / ratios["floor"]
         yield {
-            "part": f"a step of Table III, {kind}", "runs": runs,
-            "ms": f"{1e3 * times['ours']:.2f}", "floor_ms": f"{1e3 * times['floor']:.2f}",
-            "ratio": f"{ratio:.2f}", "limit": limit, "missed": ratio > limit,
+            "part": f"a step of Table III, {kind}",
+            "runs": runs,
+            "ms": f"{1e3 * times['ours']:.2f}",
+            "floor_ms": f"{1e3 * times['floor']:.2f}",
+            "ratio": f"{ratio:.2f}",
+            "limit": limit,
+            "missed": ratio > limit,
         }
 
 

@@ -28,7 +28,8 @@ from distfilt.triangular import affine, compose, separable
 SIZES = ((1, 6, 80), (3, 13, 150), (10, 40, 500))
 """Observations m, state d, and the ratio that ECOS has to lose by."""
 
-SAMPLES, CALLS = 200, 200
+SAMPLES = 200
+CALLS = 200
 
 
 def seen_in_part(m: int, d: int) -> tuple[np.ndarray, np.ndarray]:
@@ -44,27 +45,36 @@ def programs() -> Iterator[Row]:
     for m, d, needed in SIZES:
         y, x = seen_in_part(m, d)
         closed = timed(lambda y=y, x=x: [affine.fit(y, x) for _ in range(CALLS)][0], 5)
-        exact, each = compose(closed.result, y, x, y[0]), closed.cpu / CALLS
+        exact = compose(closed.result, y, x, y[0])
+        each = closed.cpu / CALLS
         known = partial(affine.fit_convex, y, x, solver="ECOS")
 
         def newcomer(known: Callable[[], Any] = known) -> Any:
             affine._program.cache_clear()
             return known()
 
-        compiled_each_time, solved = timed(newcomer, 3).cpu, timed(known, 3)
+        compiled_each_time = timed(newcomer, 3).cpu
+        solved = timed(known, 3)
         gap = np.abs(compose(solved.result, y, x, y[0]) - exact).max()
         yield {
-            "variables": m + d, "closed_form_us": f"{each * 1e6:.1f}",
-            "solver_ms": f"{solved.cpu * 1e3:.1f}", "ratio": f"{solved.cpu / each:.0f}",
+            "variables": m + d,
+            "closed_form_us": f"{each * 1e6:.1f}",
+            "solver_ms": f"{solved.cpu * 1e3:.1f}",
+            "ratio": f"{solved.cpu / each:.0f}",
             "compiled_each_time_ms": f"{compiled_each_time * 1e3:.1f}",
-            "ratio_each_time": f"{compiled_each_time / each:.0f}", "needed": needed,
-            "composed_map_gap": f"{gap:.1e}", "missed": gap >= 1e-8 or solved.cpu / each < needed,
+            "ratio_each_time": f"{compiled_each_time / each:.0f}",
+            "needed": needed,
+            "composed_map_gap": f"{gap:.1e}",
+            "missed": gap >= 1e-8 or solved.cpu / each < needed,
         }
 
 
 # --- against the toolbox ----------------------------------------------------------------------
 
-BENT, SEEDS, STD, SEEN = 500, 12, 1.0, 1.5
+BENT = 500
+SEEDS = 12
+STD = 1.0
+SEEN = 1.5
 FLOOR = 4.0
 COMMIT = "7fe9d080e810c65201f521e805e5d66b11512a14 of 2025-07-17"
 
@@ -99,23 +109,35 @@ class Toolbox:
     def __init__(self, module: Any, order: int) -> None:
         bent = range(1, order + 1)
         nonmonotone = [
-            [[], *([v] for v in range(k)), *([v] * o + ["HF"] for v in range(k) for o in bent)]
+            [
+                [],
+                *([v] for v in range(k)),
+                *([v] * o + ["HF"] for v in range(k) for o in bent),
+            ]
             for k in (1, 2, 3)
         ]
-        monotone = [[f"LET {k}", *[f"iRBF {k}"] * (order - 1), f"RET {k}"] for k in (1, 2, 3)]
+        monotone = [
+            [f"LET {k}", *[f"iRBF {k}"] * (order - 1), f"RET {k}"] for k in (1, 2, 3)
+        ]
         self.map = module.transport_map(
-            X=np.random.default_rng(0).standard_normal((BENT, 4)), monotone=monotone,
-            nonmonotone=nonmonotone, polynomial_type="hermite function",
-            monotonicity="separable monotonicity", regularization="l2",
-            regularization_lambda=0.05, verbose=False,
-        )  # fmt: skip
+            X=np.random.default_rng(0).standard_normal((BENT, 4)),
+            monotone=monotone,
+            nonmonotone=nonmonotone,
+            polynomial_type="hermite function",
+            monotonicity="separable monotonicity",
+            regularization="l2",
+            regularization_lambda=0.05,
+            verbose=False,
+        )
 
     def __call__(self, y: np.ndarray, x: np.ndarray) -> np.ndarray:
         joint = np.column_stack([y, x])
         self.map.reset(joint)
         self.map.optimize()
         z = self.map.map(joint)
-        return np.asarray(self.map.inverse_map(X_star=np.full((len(x), 1), SEEN), Z=z))[:, -3:]
+        return np.asarray(self.map.inverse_map(X_star=np.full((len(x), 1), SEEN), Z=z))[
+            :, -3:
+        ]
 
 
 def error(update: Any, mean: np.ndarray) -> float:
@@ -127,15 +149,24 @@ def error(update: Any, mean: np.ndarray) -> float:
 def toolbox_beside() -> Iterator[Row]:
     module = peer("transport_map")
     for order in (2, 3) if module is not None else ():
-        (y, x), mean = bent_samples(0), exact()
+        (y, x) = bent_samples(0)
+        mean = exact()
         updates = {"ours": partial(ours, order), "toolbox": Toolbox(module, order)}
-        times, ratios = interleaved({n: partial(f, y, x) for n, f in updates.items()}, 9)
+        times, ratios = interleaved(
+            {n: partial(f, y, x) for n, f in updates.items()}, 9
+        )
         ms = {f"{name}_ms": f"{1e3 * spent:.2f}" for name, spent in times.items()}
         gaps = {f"{name}_error": f"{error(f, mean):.3f}" for name, f in updates.items()}
         yield {
-            "order": order, "members": BENT, **ms, **gaps, "ratio": f"{ratios['toolbox']:.2f}",
-            "origin": COMMIT, "floor": FLOOR, "missed": ratios["toolbox"] < FLOOR,
-        }  # fmt: skip
+            "order": order,
+            "members": BENT,
+            **ms,
+            **gaps,
+            "ratio": f"{ratios['toolbox']:.2f}",
+            "origin": COMMIT,
+            "floor": FLOOR,
+            "missed": ratios["toolbox"] < FLOOR,
+        }
 
 
 if __name__ == "__main__":

@@ -21,7 +21,10 @@ from distfilt.models import Model, lorenz63, rk4, simulate
 from distfilt.sensors import component
 from distfilt.updates import enkf
 
-MEMBERS, DIMS, CYCLES, DT = 100, (6, 13, 40), 1000, 0.05
+MEMBERS = 100
+DIMS = (6, 13, 40)
+CYCLES = 1000
+DT = 0.05
 PROBLEMS = {"Lorenz63.sakov2012": (3, 2.0), "Lorenz96.sakov2008": (40, 1.0)}
 """DAPPER's, with the components and the variance of the noise."""
 FLOORS = {"DAPPER, analysis": 1.3, "six lines of numpy": 0.85, "DAPPER, cycle": 1.0}
@@ -31,13 +34,17 @@ def case(d: int) -> tuple[np.ndarray, ...]:
     """Members, predictions, observation, noise."""
     rng = np.random.default_rng(d)
     m = d // 2
-    a, b = rng.standard_normal((d, d)) / np.sqrt(d), rng.standard_normal((m, m)) / np.sqrt(m)
+    a = rng.standard_normal((d, d)) / np.sqrt(d)
+    b = rng.standard_normal((m, m)) / np.sqrt(m)
     x = rng.standard_normal((MEMBERS, d)) @ (np.eye(d) + a)
     return x, x[:, :m].copy(), rng.standard_normal(m), b @ b.T + 0.5 * np.eye(m)
 
 
-def six_lines(x: np.ndarray, h: np.ndarray, y: np.ndarray, r: np.ndarray, rng: Any) -> np.ndarray:
-    a, b = x - x.mean(axis=0), h - h.mean(axis=0)
+def six_lines(
+    x: np.ndarray, h: np.ndarray, y: np.ndarray, r: np.ndarray, rng: Any
+) -> np.ndarray:
+    a = x - x.mean(axis=0)
+    b = h - h.mean(axis=0)
     n = len(x) - 1
     cov = b.T @ b / n + r
     drawn = h + rng.standard_normal(h.shape) @ np.linalg.cholesky(r).T
@@ -45,22 +52,31 @@ def six_lines(x: np.ndarray, h: np.ndarray, y: np.ndarray, r: np.ndarray, rng: A
     return x + (y - drawn) @ gain
 
 
-def dapper(x: np.ndarray, h: np.ndarray, y: np.ndarray, r: np.ndarray) -> Callable[[], Any] | None:
-    methods, randoms = peer("dapper.da_methods.ensemble"), peer("dapper.tools.randvars")
+def dapper(
+    x: np.ndarray, h: np.ndarray, y: np.ndarray, r: np.ndarray
+) -> Callable[[], Any] | None:
+    methods = peer("dapper.da_methods.ensemble")
+    randoms = peer("dapper.tools.randvars")
     if methods is None or randoms is None:
         return None
     noise = randoms.GaussRV(mu=np.zeros(len(r)), C=r)
     return lambda: methods.EnKF_analysis(x, h, noise, y, "PertObs")
 
 
-def dapper_s_loop(problem: str, x: np.ndarray, y: np.ndarray) -> Callable[[], None] | None:
-    methods, setup = peer("dapper.da_methods.ensemble"), peer(f"dapper.mods.{problem}")
+def dapper_s_loop(
+    problem: str, x: np.ndarray, y: np.ndarray
+) -> Callable[[], None] | None:
+    methods = peer("dapper.da_methods.ensemble")
+    setup = peer(f"dapper.mods.{problem}")
 
     def loop() -> None:
-        hmm, e = setup.HMM, x.copy()
+        hmm = setup.HMM
+        e = x.copy()
         for k, seen in enumerate(y):
             e = methods.add_noise(hmm.Dyn(e, k * DT, DT), DT, hmm.Dyn.noise, "Stoch")
-            e = methods.EnKF_analysis(e, hmm.Obs(k)(e), hmm.Obs(k).noise, seen, "PertObs")
+            e = methods.EnKF_analysis(
+                e, hmm.Obs(k)(e), hmm.Obs(k).noise, seen, "PertObs"
+            )
             e = methods.post_process(e, 1.0, False)
 
     return None if methods is None or setup is None else loop
@@ -71,41 +87,59 @@ def ring(x: np.ndarray, t: float) -> np.ndarray:
     return (np.roll(x, -1, -1) - np.roll(x, 2, -1)) * np.roll(x, 1, -1) - x + 8.0
 
 
-def compared(d: int, calls: dict[str, Any], rounds: int, each: int = 1) -> Iterator[Row]:
+def compared(
+    d: int, calls: dict[str, Any], rounds: int, each: int = 1
+) -> Iterator[Row]:
     """A row for each call that can be made, `each` of what is timed in a call."""
     calls = {name: call for name, call in calls.items() if call is not None}
     times, ratios = interleaved(calls, rounds)
     for name in calls:
         floor = FLOORS.get(name, 0)
         yield {
-            "components": d, "members": MEMBERS, "what": name, "floor": floor or "",
-            "us": f"{1e6 * times[name] / each:.1f}", "first_is_faster": f"{ratios[name]:.2f}",
+            "components": d,
+            "members": MEMBERS,
+            "what": name,
+            "floor": floor or "",
+            "us": f"{1e6 * times[name] / each:.1f}",
+            "first_is_faster": f"{ratios[name]:.2f}",
             "missed": ratios[name] < floor,
-        }  # fmt: skip
+        }
 
 
 @table("updates", "numpy", "scipy", "dapper")
 def analyses_and_cycles() -> Iterator[Row]:
     for d in DIMS:
-        given, rng = case(d), np.random.default_rng(0)
-        yield from compared(d, {
-            "enkf": partial(enkf, *given, rng=rng),
-            "DAPPER, analysis": dapper(*given),
-            "six lines of numpy": partial(six_lines, *given, rng),
-        }, 31)  # fmt: skip
+        given = case(d)
+        rng = np.random.default_rng(0)
+        yield from compared(
+            d,
+            {
+                "enkf": partial(enkf, *given, rng=rng),
+                "DAPPER, analysis": dapper(*given),
+                "six lines of numpy": partial(six_lines, *given, rng),
+            },
+            31,
+        )
     other = Model(40, partial(rk4, ring, longest=DT), lambda t, dt: np.zeros((40, 40)))
     for problem, (d, variance) in PROBLEMS.items():
         model = lorenz63(step=DT) if d == 3 else other
-        sensor, rng = component(range(d), std=variance**0.5), np.random.default_rng(d)
-        times, x0 = DT * np.arange(1, CYCLES + 1), model.step(rng.standard_normal(d), 0.0, 100.0)
+        sensor = component(range(d), std=variance**0.5)
+        rng = np.random.default_rng(d)
+        times = DT * np.arange(1, CYCLES + 1)
+        x0 = model.step(rng.standard_normal(d), 0.0, 100.0)
         y = sensor.observe(simulate(model, x0, times, rng=rng), rng=rng)
         f = EnsembleFilter(model, [sensor], members=MEMBERS)
         start = f.start((x0, variance * np.eye(d)), rng=rng)
-        yield from compared(d, {
-            "run": partial(f.run, start, times, [y]),
-            "steps": lambda f=f, given=(start, times, [y]): [*f.steps(*given)],
-            "DAPPER, cycle": dapper_s_loop(problem, start.ensembles[0], y),
-        }, 15, CYCLES)  # fmt: skip
+        yield from compared(
+            d,
+            {
+                "run": partial(f.run, start, times, [y]),
+                "steps": lambda f=f, given=(start, times, [y]): [*f.steps(*given)],
+                "DAPPER, cycle": dapper_s_loop(problem, start.ensembles[0], y),
+            },
+            15,
+            CYCLES,
+        )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Every benchmark in turn; what missed its floors is told at the end, and ends with an error.
 
-    python tests/bench/run.py [--force] [name …]
+python tests/bench/run.py [--force] [name …]
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ def main(arguments: list[str]) -> int:
         if not names or name in names:
             print(f"== {name}", flush=True)
             code = subprocess.run([sys.executable, str(script), *options]).returncode
-            missed += [f"{name}: {code} missed" if code > 0 else f"{name}: stopped"] * (code != 0)
+            missed += [f"{name}: {code} missed" if code > 0 else f"{name}: stopped"] * (
+                code != 0
+            )
     print("\n".join(missed) or "every floor holds")
     return bool(missed)
 

@@ -23,7 +23,13 @@ from common import ROOT, chapters
 BUILT = ROOT / "_build" / "html"
 LOCAL = ("file://", "data:", "blob:", "about:")
 # Pages that a Chromium opens for itself, whatever its version: what they ask for is not the book's.
-OWN = ("chrome://", "chrome-untrusted://", "chrome-extension://", "devtools://", "about:")
+OWN = (
+    "chrome://",
+    "chrome-untrusted://",
+    "chrome-extension://",
+    "devtools://",
+    "about:",
+)
 ASKS = ("Network.requestWillBeSent", "Network.webSocketCreated")
 WIDTHS = (1440, 1200, 400)
 THEMES = ("light", "dark")
@@ -139,7 +145,9 @@ def visit(driver: Any, page: Path) -> Visit:
     sliders = driver.execute_async_script(MOVE)
     entries = [json.loads(entry["message"]) for entry in driver.get_log("performance")]
     requests = asked(entries, driver.current_window_handle)
-    console = [e["message"] for e in driver.get_log("browser") if e["level"] == "SEVERE"]
+    console = [
+        e["message"] for e in driver.get_log("browser") if e["level"] == "SEVERE"
+    ]
     return Visit(report, requests, console, fit, sliders, rules)
 
 
@@ -159,7 +167,9 @@ def asked(entries: list[dict[str, Any]], tab: str) -> list[str]:
 def chromium(profile: Path, **logs: str) -> Iterator[Any]:
     """A headless Chromium; where there is none the test is skipped, except in `CI`."""
     if browser.installed() is None:
-        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(browser.ALLOW_NAN)
+        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(
+            browser.ALLOW_NAN
+        )
     with browser.chromium(profile, **logs) as found:
         yield found
 
@@ -177,7 +187,9 @@ def driver(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 def redirect(page: Path) -> Path | None:
     """Return the page that another one only sends its reader on to."""
     text = page.read_text(encoding="utf-8")
-    sent = re.search(r'http-equiv="refresh" content="0; *url=([^"]+)"', text, flags=re.IGNORECASE)
+    sent = re.search(
+        r'http-equiv="refresh" content="0; *url=([^"]+)"', text, flags=re.IGNORECASE
+    )
     return (page.parent / sent.group(1)).resolve() if sent else None
 
 
@@ -193,20 +205,28 @@ def visits(driver: Any) -> dict[Path, Visit]:
     """Return what the browser met on each page; of those that list a module's source, on one."""
     listings = {page for page in built() if "_modules" in page.parts}
     longest = max(listings, key=lambda page: page.stat().st_size)
-    return {page: visit(driver, page) for page in built() if page not in listings - {longest}}
+    return {
+        page: visit(driver, page)
+        for page in built()
+        if page not in listings - {longest}
+    }
 
 
 def broken_links(pages: list[Path]) -> list[str]:
     """Return the links to files or anchors that are not there."""
     texts = {page: page.read_text(encoding="utf-8") for page in pages}
-    anchors = {page: set(re.findall(r'\s(?:id|name)="([^"]+)"', t)) for page, t in texts.items()}
+    anchors = {
+        page: set(re.findall(r'\s(?:id|name)="([^"]+)"', t))
+        for page, t in texts.items()
+    }
     out = []
     for page, text in texts.items():
         for link in set(re.findall(r'<a\s[^>]*?href="([^"]*)"', text)):
             url, anchor = urldefrag(unquote(html.unescape(link)))
             target = Path(os.path.normpath(page.parent / url)) if url else page
             if not urlparse(url).scheme and (
-                not target.is_file() or (anchor and anchor not in anchors.get(target, {anchor}))
+                not target.is_file()
+                or (anchor and anchor not in anchors.get(target, {anchor}))
             ):
                 out.append(f"{page.name} -> {link}")
     return out
@@ -229,14 +249,18 @@ def test_console_has_no_error(visits: dict[Path, Visit]) -> None:
 
 @pytest.mark.parametrize("key", ["raw", "unset", "merror", "flat", "broken", "mute"])
 def test_mathematics_and_figures_are_shown(visits: dict[Path, Visit], key: str) -> None:
-    assert {page.name: v.report[key] for page, v in visits.items() if v.report[key]} == {}
+    assert {
+        page.name: v.report[key] for page, v in visits.items() if v.report[key]
+    } == {}
 
 
 def test_no_link_is_broken() -> None:
     assert broken_links(built()) == []
 
 
-def test_every_page_fits_and_on_a_desk_scrolls_in_no_box(visits: dict[Path, Visit]) -> None:
+def test_every_page_fits_and_on_a_desk_scrolls_in_no_box(
+    visits: dict[Path, Visit],
+) -> None:
     for page, seen in visits.items():
         for width, fit in seen.fit.items():
             assert fit["over"] == 0 and fit["cut"] == [], f"{page.name} at {width}"
@@ -252,7 +276,10 @@ def test_every_slider_moves_and_plays(visits: dict[Path, Visit]) -> None:
     for source in chapters():
         drawn = source.read_text(encoding="utf-8").count("plotting.slider(")
         moved = visits[BUILT / "book" / f"{source.stem}.html"].sliders
-        assert len(moved) == drawn and all(all(s.values()) for s in moved), (source.stem, moved)
+        assert len(moved) == drawn and all(all(s.values()) for s in moved), (
+            source.stem,
+            moved,
+        )
 
 
 BAD = r"""<!doctype html><title>bad</title><body>
@@ -278,4 +305,7 @@ def test_a_bad_page_is_found_out(driver: Any, tmp_path: Path) -> None:
     assert len(seen.fit[1200]["cut"]) == 1 and len(seen.fit[1200]["scrolls"]) == 1
     assert seen.sliders and not any(seen.sliders[0].values())
     assert seen.fit[400]["over"] > 0
-    assert {told.split(":")[0] for told in seen.rules["dark"]} >= {"no language", "empty header"}
+    assert {told.split(":")[0] for told in seen.rules["dark"]} >= {
+        "no language",
+        "empty header",
+    }

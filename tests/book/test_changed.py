@@ -12,15 +12,24 @@ import execute
 from common import ROOT, VERDICT, pinned_environment
 
 PAGES = ("04-satellite-network.md", "04b-five-agents-and-a-pose.md")
-LINKS = (('neighbours = ["A", "B"]', 'neighbours = ["A", "B", "C"]'),
-         ('neighbours = ["A", "C"]', 'neighbours = ["A", "B", "C"]'))  # fmt: skip
-SENSOR = (('kind = "angle"\nnoise = 0.2\nunit = "rad"', 'kind = "range"\nnoise = 0.2\nunit = "m"'),)
+LINKS = (
+    ('neighbours = ["A", "B"]', 'neighbours = ["A", "B", "C"]'),
+    ('neighbours = ["A", "C"]', 'neighbours = ["A", "B", "C"]'),
+)
+SENSOR = (
+    (
+        'kind = "angle"\nnoise = 0.2\nunit = "rad"',
+        'kind = "range"\nnoise = 0.2\nunit = "m"',
+    ),
+)
 
 
 def copied(target: Path, changes: tuple[tuple[str, str], ...]) -> Path:
     """A copy of what the chapter needs, with another scenario of Table II."""
     for name in ("book", "data"):
-        shutil.copytree(ROOT / name, target / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(
+            ROOT / name, target / name, ignore=shutil.ignore_patterns("__pycache__")
+        )
     path = target / "data" / "scenarios" / "grange" / "table-2.toml"
     text = path.read_text(encoding="utf-8")
     for old, new in changes:
@@ -40,7 +49,9 @@ def verdicts(notebook: Any) -> dict[str, tuple[str, str]]:
 @pytest.mark.slow
 @pytest.mark.parametrize("changes", [LINKS, LINKS + SENSOR], ids=["links", "both"])
 def test_a_changed_scenario_runs_to_the_end_and_is_not_compared(
-    changes: tuple[tuple[str, str], ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    changes: tuple[tuple[str, str], ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     folder = copied(tmp_path, changes)
     lenient = {k: v for k, v in pinned_environment().items() if k != "BOOK_STRICT"}
@@ -53,5 +64,7 @@ def test_a_changed_scenario_runs_to_the_end_and_is_not_compared(
         found |= verdicts(notebook)
     for item in ("Table II", "Fig. 1"):
         verdict, why = found[item]
-        assert verdict == "not comparable" and why.startswith("changed scenario: agents.")
+        assert verdict == "not comparable" and why.startswith(
+            "changed scenario: agents."
+        )
     assert found["Table III"][0] == "read" and found["Fig. 2"][0] == "not comparable"

@@ -16,8 +16,14 @@ CHAPTERS = [source for source in chosen([]) if source.stem[0].isdigit()]
 def import_lines(source: Path) -> int:
     """Count the lines that import methods and packages, the book's own tools apart."""
     cell = next(cell for cell in read(source).cells if cell.cell_type == "code")
-    found = [n for n in ast.parse(cell.source).body if isinstance(n, ast.Import | ast.ImportFrom)]
-    apart = [n for n in found if not (getattr(n, "module", None) or "").startswith("bookkit")]
+    found = [
+        n
+        for n in ast.parse(cell.source).body
+        if isinstance(n, ast.Import | ast.ImportFrom)
+    ]
+    apart = [
+        n for n in found if not (getattr(n, "module", None) or "").startswith("bookkit")
+    ]
     return sum((n.end_lineno or n.lineno) - n.lineno + 1 for n in apart)
 
 

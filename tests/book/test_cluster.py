@@ -18,7 +18,9 @@ import pytest
 from common import ROOT
 
 PAGE = (ROOT / "book" / "cluster.md").read_text(encoding="utf-8")
-LOCAL, SCHEDULER, WORKERS, DASK, MPI, PARTS = re.findall(r"^```sh\n(.*?)\n```$", PAGE, re.M | re.S)
+LOCAL, SCHEDULER, WORKERS, DASK, MPI, PARTS = re.findall(
+    r"^```sh\n(.*?)\n```$", PAGE, re.M | re.S
+)
 BESIDE = """
 import os, signal, time
 from pathlib import Path
@@ -34,9 +36,10 @@ def begin(which):
 """
 BIN = os.path.dirname(sys.executable)
 ENVIRONMENT = {
-    **os.environ, "PATH": os.pathsep.join([BIN, os.environ["PATH"]]),
+    **os.environ,
+    "PATH": os.pathsep.join([BIN, os.environ["PATH"]]),
     "PYTHONPATH": os.pathsep.join(p for p in sys.path if p),
-}  # fmt: skip
+}
 Start = Callable[..., subprocess.Popen[str]]
 
 
@@ -45,9 +48,12 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page's script, run in two parts; its trial tells a module beside it that it begins."""
     folder = tmp_path_factory.mktemp("page")
     text = (ROOT / "book" / "examples" / "cluster.py").read_text(encoding="utf-8")
-    for old, new in [("import sys\n", "import beside\nimport sys\n"), ("[5:,", "[:,"),
-                     ("    rng, times", "    beside.begin(seed.spawn_key[0])\n    rng, times"),
-                     ("np.arange(1, 11) * 0.5", "[0.5]")]:  # fmt: skip
+    for old, new in [
+        ("import sys\n", "import beside\nimport sys\n"),
+        ("[5:,", "[:,"),
+        ("    rng, times", "    beside.begin(seed.spawn_key[0])\n    rng, times"),
+        ("np.arange(1, 11) * 0.5", "[0.5]"),
+    ]:
         assert text.count(old) == 1
         text = text.replace(old, new)
     (folder / "cluster.py").write_text(text, encoding="utf-8")
@@ -80,10 +86,17 @@ def start(folder: Path) -> Iterator[Start]:
     def started(command: str, cwd: Path = folder) -> subprocess.Popen[str]:
         # Not through a shell that stays: a signal is for the command itself.
         lines = command if "\n" in command else f"exec {command}"
-        processes.append(subprocess.Popen(
-            ["sh", "-ec", lines], cwd=cwd, env=ENVIRONMENT, text=True, start_new_session=True,
-            stdout=(cwd / "output").open("w"), stderr=subprocess.STDOUT,
-        ))  # fmt: skip
+        processes.append(
+            subprocess.Popen(
+                ["sh", "-ec", lines],
+                cwd=cwd,
+                env=ENVIRONMENT,
+                text=True,
+                start_new_session=True,
+                stdout=(cwd / "output").open("w"),
+                stderr=subprocess.STDOUT,
+            )
+        )
         return processes[-1]
 
     yield started
@@ -144,9 +157,13 @@ def test_dask(folder: Path, script: Path, start: Start) -> None:
 
     machines = cluster()
     killed(20, folder, start, DASK)
-    (folder / "log" / "fatal").touch()  # the worker of trial 20 dies, and nobody has to know
+    (
+        folder / "log" / "fatal"
+    ).touch()  # the worker of trial 20 dies, and nobody has to know
     said = killed(28, folder, start, DASK, machines[0])
-    assert re.search(r"StudyError: .*trials that are done are in errors\.csv\.part", said)
+    assert re.search(
+        r"StudyError: .*trials that are done are in errors\.csv\.part", said
+    )
     assert not (folder / "log" / "fatal").exists()
     cluster()
     assert start(DASK).wait() == 0

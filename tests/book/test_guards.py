@@ -54,9 +54,13 @@ def execution(executed_folder: Path) -> subprocess.CompletedProcess[str]:
     """Execute the small chapter, and two that have to be refused, at once."""
     text = SMALL.read_text(encoding="utf-8")
     sources = [executed_folder / f"{name}.md" for name in ("small", "told", "failed")]
-    for path, lines in zip(sources, ([], REFUSED, ["raise ValueError('no')"]), strict=True):
+    for path, lines in zip(
+        sources, ([], REFUSED, ["raise ValueError('no')"]), strict=True
+    ):
         code = "".join(f"```{{code-cell}} ipython3\n{line}\n```\n\n" for line in lines)
-        path.write_text(text.split("```")[0] + code if lines else text, encoding="utf-8")
+        path.write_text(
+            text.split("```")[0] + code if lines else text, encoding="utf-8"
+        )
         path.with_suffix(".ipynb").write_text("as it was")
     return tool("execute.py", *sources)
 
@@ -118,9 +122,13 @@ def shade(cell: Any) -> None:
 def exchange_frames(cell: Any) -> None:
     data = bundle(cell)
     html, frames = taken_out(data["text/html"])
-    assert len(frames) == 4 and frames[0] == frames[2]  # the first one shown, then all three
+    assert (
+        len(frames) == 4 and frames[0] == frames[2]
+    )  # the first one shown, then all three
     assert len(set(frames)) == 3
-    swapped = data["text/html"].replace(frames[1], "first").replace(frames[3], frames[1])
+    swapped = (
+        data["text/html"].replace(frames[1], "first").replace(frames[3], frames[1])
+    )
     data["text/html"] = swapped.replace("first", frames[3])
     assert taken_out(data["text/html"])[0] == html
 
@@ -140,23 +148,37 @@ def exchange_picture(cell: Any) -> None:
 PRINT, FIGURE, SLIDER, VERDICT = range(4)
 FAULTS: dict[str, tuple[int, Callable[[Any], object], str]] = {
     "digit": (PRINT, lambda c: c.outputs[0].update(text="rate 2.0001\n"), "2.0001"),
-    "verdict": (VERDICT, lambda c: next(
-        v for k, v in bundle(c).items() if k.endswith("json")).update(ours="0.1354"), "0.1354"),
+    "verdict": (
+        VERDICT,
+        lambda c: next(v for k, v in bundle(c).items() if k.endswith("json")).update(
+            ours="0.1354"
+        ),
+        "0.1354",
+    ),
     "broken cell": (PRINT, source("{rate:.4f}", "{rote:.4f}"), "rote"),
     "curve": (FIGURE, source("ax.plot(t, curve)", "ax.plot(t, 1.01 * curve)"), "mean"),
-    "curve that moves": (SLIDER, source("np.exp(-rate * t)", "1.01 * np.exp(-rate * t)"),
-                         "data-frames"),
+    "curve that moves": (
+        SLIDER,
+        source("np.exp(-rate * t)", "1.01 * np.exp(-rate * t)"),
+        "data-frames",
+    ),
     "no picture": (FIGURE, lambda c: bundle(c).pop("image/png"), "0 pictures stored"),
-    "no picture beside the frames": (SLIDER, lambda c: bundle(c).pop("image/png"), "drawn"),
+    "no picture beside the frames": (
+        SLIDER,
+        lambda c: bundle(c).pop("image/png"),
+        "drawn",
+    ),
     "another picture": (FIGURE, exchange_picture, "pixels"),
     "exchanged frames": (SLIDER, exchange_frames, "pixels"),
     "another processor's shades": (FIGURE, shade, ""),
     "its shades beside the frames": (SLIDER, shade, ""),
-}  # fmt: skip
+}
 """The cell, what is done to it, and the complaint; '' for what is no fault."""
 
 
-def test_one_changed_output_or_source_fails_and_no_other(executed: Path, folder: Path) -> None:
+def test_one_changed_output_or_source_fails_and_no_other(
+    executed: Path, folder: Path
+) -> None:
     cells = code_cells(stored(executed / "small.md"))
     untouched = len(cells)
     assert pairs.check(executed / "small.md") == []
@@ -165,12 +187,16 @@ def test_one_changed_output_or_source_fails_and_no_other(executed: Path, folder:
         change(cells[-1])
     for k, cell in enumerate(cells):
         cell["id"] = f"cell-{k}"
-    notebook = nbformat.v4.new_notebook(cells=cells, metadata={"kernelspec": execute.KERNELSPEC})
+    notebook = nbformat.v4.new_notebook(
+        cells=cells, metadata={"kernelspec": execute.KERNELSPEC}
+    )
     done = tool("regress.py", store(folder / "broken.md", notebook))
     assert done.returncode == 1 and "broken: differs" in done.stdout
     parts = re.split(r"^_+ .*Cell (\d+) _+$", done.stderr, flags=re.M)
     told = dict(zip(map(int, parts[1::2]), parts[2::2], strict=True))
-    wanted = {k: text for k, (*_, text) in enumerate(FAULTS.values(), untouched) if text}
+    wanted = {
+        k: text for k, (*_, text) in enumerate(FAULTS.values(), untouched) if text
+    }
     assert set(told) == set(wanted)
     assert [k for k, text in wanted.items() if text not in told[k]] == []
 
@@ -184,13 +210,15 @@ def test_pixels_may_differ_if_few_or_little(executed: Path) -> None:
 
 def test_a_lighter_picture_shows_the_same() -> None:
     noise = np.random.default_rng(1).integers(0, 256, (200, 200, 3))
-    few, many = as_png(noise // 64 * 80), as_png(noise)
+    few = as_png(noise // 64 * 80)
+    many = as_png(noise)
     assert len(lighter(few)) < 0.9 * len(few) and difference(lighter(few), few) == ""
     assert lighter(many) == many and lighter(lighter(few)) == lighter(few)
 
 
 def clear(cell: Any) -> None:
-    cell.outputs, cell.execution_count = [], None
+    cell.outputs = []
+    cell.execution_count = None
 
 
 def copies(cell: Any, number: int) -> None:
@@ -203,11 +231,16 @@ def copies(cell: Any, number: int) -> None:
         (lambda c: clear(c[PRINT]), "execution count None"),
         (lambda c: copies(c[FIGURE], 2), "with 2 pictures, needs one"),
         (lambda c: bundle(c[FIGURE]).pop("image/png"), "with 0 pictures, needs one"),
-        (lambda c: bundle(c[FIGURE]).update({"text/plain": "<Figure size 440x275>"}),
-         "without the digest of its axes"),
-        (lambda c: c[PRINT].outputs[0].update(text="x" * 80), "80 characters printed, at most 79"),
+        (
+            lambda c: bundle(c[FIGURE]).update({"text/plain": "<Figure size 440x275>"}),
+            "without the digest of its axes",
+        ),
+        (
+            lambda c: c[PRINT].outputs[0].update(text="x" * 80),
+            "80 characters printed, at most 79",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_stored_output_is_refused(
     chapter: Path, change: Callable[[Any], object], complaint: str
 ) -> None:
@@ -220,7 +253,11 @@ def test_a_stored_output_is_refused(
 @pytest.mark.parametrize(
     ("old", "new", "complaint"),
     [
-        ("alt: One curve that falls from 1 at time 0 to 0.14 at time 1.", "width: 80%", "alt"),
+        (
+            "alt: One curve that falls from 1 at time 0 to 0.14 at time 1.",
+            "width: 80%",
+            "alt",
+        ),
         ("    caption: The curve {eq}`eq-small`.\n", "", "caption"),
         ("rate = 2.0", "rate = 2.0  # " + "x" * 70, "at most 79"),
     ],
@@ -229,16 +266,23 @@ def test_a_stored_output_is_refused(
 def test_new_sources_keep_the_outputs_and_are_checked(
     chapter: Path, old: str, new: str, complaint: str
 ) -> None:
-    before, text = stored(chapter), chapter.read_text(encoding="utf-8")
+    before = stored(chapter)
+    text = chapter.read_text(encoding="utf-8")
     assert text.count(old) == 1
     chapter.write_text(text.replace(old, new), encoding="utf-8")
-    assert "differs between the Markdown and the notebook" in "\n".join(pairs.check(chapter))
+    assert "differs between the Markdown and the notebook" in "\n".join(
+        pairs.check(chapter)
+    )
     assert execute.copy_sources(chapter) == ""
     after = stored(chapter)
-    assert [c.get("outputs") for c in before.cells] == [c.get("outputs") for c in after.cells]
+    assert [c.get("outputs") for c in before.cells] == [
+        c.get("outputs") for c in after.cells
+    ]
     (found,) = pairs.check(chapter)
     assert complaint in found
-    chapter.write_text(text + "\n```{code-cell} ipython3\n1 + 1\n```\n", encoding="utf-8")
+    chapter.write_text(
+        text + "\n```{code-cell} ipython3\n1 + 1\n```\n", encoding="utf-8"
+    )
     assert "other cells" in execute.copy_sources(chapter)
 
 
@@ -254,8 +298,14 @@ def test_execution_refuses(execution: Any, executed: Path) -> None:
     cells = re.split(r"^cell [\w-]+:\n", execution.stderr, flags=re.M)[1:]
     for cell, (line, complaint) in zip(cells, REFUSED.items(), strict=True):
         assert cell.startswith(line) and complaint in cell
-    kept = {path.stem for path in executed.glob("*.ipynb") if path.read_text() == "as it was"}
-    assert kept == {"told", "failed"} and re.findall(r"^\w+", execution.stdout, re.M) == ["small"]
+    kept = {
+        path.stem
+        for path in executed.glob("*.ipynb")
+        if path.read_text() == "as it was"
+    }
+    assert kept == {"told", "failed"} and re.findall(
+        r"^\w+", execution.stdout, re.M
+    ) == ["small"]
 
 
 def test_executing_again_gives_the_same_bytes(
@@ -265,9 +315,14 @@ def test_executing_again_gives_the_same_bytes(
     whole = path.read_text(encoding="utf-8")
     done = tool("execute.py", "--bytes", executed / "small.md")
     assert done.returncode == 0 and done.stderr == "" and "widget-state+json" in whole
-    assert "version" not in stored(chapter)["metadata"]["language_info"] and str(ROOT) not in whole
+    assert (
+        "version" not in stored(chapter)["metadata"]["language_info"]
+        and str(ROOT) not in whole
+    )
     path.write_text(whole.replace("rate 2.0000", "rate 2.0001"), encoding="utf-8")
-    monkeypatch.setattr(execute, "run", lambda new, _: new.update(stored(executed / "small.md")))
+    monkeypatch.setattr(
+        execute, "run", lambda new, _: new.update(stored(executed / "small.md"))
+    )
     monkeypatch.setattr(execute.os, "environ", dict(execute.os.environ))
     assert "does not give the stored bytes" in execute.execute(chapter, True, True)
     notebook = nbformat.reads(whole, as_version=4)

@@ -35,7 +35,9 @@ def prose(path: Path) -> str:
 
 def test_every_chapter_is_one_notebook_and_every_page_is_there(copied: Path) -> None:
     files = {p.name for p in (copied / "book").iterdir() if p.is_file()}
-    assert files == {lab.file_of(Path(page).name) for page in toc_pages() if "/api/" not in page}
+    assert files == {
+        lab.file_of(Path(page).name) for page in toc_pages() if "/api/" not in page
+    }
     stems = [name.rpartition(".")[0] for name in files]
     assert len(stems) == len(set(stems))
     assert (copied / "data" / "scenarios" / "accepted.csv").is_file()
@@ -49,21 +51,30 @@ def test_no_role_is_left_and_no_label_is_lost(copied: Path) -> None:
         assert not lab.ROLE.search(text) and "{math}" not in text
         assert "solution-" not in text
         stored = nbformat.read(source.with_suffix(".ipynb"), as_version=4)
-        labels = [x for c in stored.cells if c.cell_type == "markdown" for x in
-                  lab.labels_of(c.source)]  # fmt: skip
+        labels = [
+            x
+            for c in stored.cells
+            if c.cell_type == "markdown"
+            for x in lab.labels_of(c.source)
+        ]
         assert text.count("\\tag{") == len(labels)
         found += len(labels)
-        figures = [c for c in stored.cells if c.metadata.get("mystnb", {}).get("figure")]
+        figures = [
+            c for c in stored.cells if c.metadata.get("mystnb", {}).get("figure")
+        ]
         assert len(re.findall(r"^\*\*Fig\. [\d.]+\*\* ", text, re.M)) == len(figures)
     assert found > 0
 
 
 def test_numbers_are_those_of_the_built_book() -> None:
     pages = [ROOT / f"{page}.md" for page in toc_pages()]
-    known, numbers = lab.names(pages), {}
+    known = lab.names(pages)
+    numbers = {}
     for source in chapters():
         html = (BUILT / f"{source.stem}.html").read_text(encoding="utf-8")
-        numbers |= re.findall(r'id="equation-([\w-]+)">\s*<span class="eqno">(\([\d.]+\))', html)
+        numbers |= re.findall(
+            r'id="equation-([\w-]+)">\s*<span class="eqno">(\([\d.]+\))', html
+        )
     assert {label: known.words[label] for label in numbers} == numbers
     assert len(numbers) >= len(known.equations) > 20
 
@@ -135,7 +146,8 @@ def wait(what: Any, seconds: int = 240) -> Any:
 
 @pytest.mark.slow
 def test_in_jupyterlab_a_chapter_runs_and_is_saved_apart(tmp_path: Path) -> None:
-    folder, stem = tmp_path / "copy", "01-bayes-and-kalman"
+    folder = tmp_path / "copy"
+    stem = "01-bayes-and-kalman"
     lab.main([str(folder), "--no-open"])
     saved = folder / "book" / f"{stem}.ipynb"
     _emptied(saved)
@@ -145,18 +157,26 @@ def test_in_jupyterlab_a_chapter_runs_and_is_saved_apart(tmp_path: Path) -> None
     command = [sys.executable, "-m", "jupyterlab", f"--notebook-dir={folder / 'book'}"]
     command += ["--no-browser", "--allow-root", f"--port={address.rsplit(':')[-1]}"]
     command += ["--IdentityProvider.token=", "--expose-app-in-browser"]
-    before = subprocess.run(["git", "status", "--short"], cwd=ROOT, capture_output=True).stdout
-    server = subprocess.Popen(command, env=lab.settings(folder), stderr=subprocess.DEVNULL)
+    before = subprocess.run(
+        ["git", "status", "--short"], cwd=ROOT, capture_output=True
+    ).stdout
+    server = subprocess.Popen(
+        command, env=lab.settings(folder), stderr=subprocess.DEVNULL
+    )
     try:
         wait(lambda: urllib.request.urlopen(f"{address}/api"))
         _run_all(address, stem, tmp_path)
     finally:
         server.terminate()
         server.wait()
-    after = subprocess.run(["git", "status", "--short"], cwd=ROOT, capture_output=True).stdout
+    after = subprocess.run(
+        ["git", "status", "--short"], cwd=ROOT, capture_output=True
+    ).stdout
     assert before == after
     assert not saved.with_suffix(".md").exists()
-    cells = [c for c in nbformat.read(saved, as_version=4).cells if c.cell_type == "code"]
+    cells = [
+        c for c in nbformat.read(saved, as_version=4).cells if c.cell_type == "code"
+    ]
     assert [c.execution_count for c in cells] == list(range(1, len(cells) + 1))
     assert not [o for c in cells for o in c.outputs if o.output_type == "error"]
 
@@ -166,7 +186,8 @@ def _emptied(path: Path) -> None:
     notebook = nbformat.read(path, as_version=4)
     for cell in notebook.cells:
         if cell.cell_type == "code":
-            cell.outputs, cell.execution_count = [], None
+            cell.outputs = []
+            cell.execution_count = None
     nbformat.write(notebook, path)
 
 
@@ -174,14 +195,18 @@ def _run_all(address: str, stem: str, scratch: Path) -> None:
     """Open a chapter, run all its cells, move its sliders, save it."""
     from test_browser import chromium
 
-    command = ("const done = arguments[1]; jupyterapp.commands.execute(arguments[0])"
-               ".then(() => done('done'), e => done(String(e)));")  # fmt: skip
+    command = (
+        "const done = arguments[1]; jupyterapp.commands.execute(arguments[0])"
+        ".then(() => done('done'), e => done(String(e)));"
+    )
     with chromium(scratch / "profile") as driver:
         driver.set_script_timeout(600)
         driver.get(f"{address}/lab/tree/{stem}.ipynb")
         # Cells that are run before the kernel is there make JupyterLab ask for one.
-        ready = ("return window.jupyterapp?.shell.currentWidget?.sessionContext?.session?.kernel"
-                 "?.status === 'idle'")  # fmt: skip
+        ready = (
+            "return window.jupyterapp?.shell.currentWidget?.sessionContext?.session?.kernel"
+            "?.status === 'idle'"
+        )
         wait(lambda: driver.execute_script(ready))
         assert driver.execute_async_script(command, "notebook:run-all-cells") == "done"
         moved = driver.execute_script(

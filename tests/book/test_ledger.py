@@ -5,12 +5,28 @@ from __future__ import annotations
 import pytest
 
 from bookkit.rows import read_rows
-from ledger import COLUMNS, ITEMS, LEDGER, VERDICTS, claims_of, ledger, summaries, text_of, unmoved
+from ledger import (
+    COLUMNS,
+    ITEMS,
+    LEDGER,
+    VERDICTS,
+    claims_of,
+    ledger,
+    summaries,
+    text_of,
+    unmoved,
+)
 
 HOME = {"paper": "grange", "item": "Fig. 1", "chapter": "04-satellite-network"}
 ITEM = {**HOME, "kind": "results", "title": "Error"}
 TABLE = {**ITEM, "item": "Table I", "kind": "parameters"}
-VERDICT = {**HOME, "verdict": "differs", "ours": "0.08", "published": "unstable", "why": "a, b"}
+VERDICT = {
+    **HOME,
+    "verdict": "differs",
+    "ours": "0.08",
+    "published": "unstable",
+    "why": "a, b",
+}
 
 
 def test_ledger_has_every_item_once() -> None:
@@ -36,16 +52,28 @@ def test_a_verdict_fills_its_row() -> None:
 
 @pytest.mark.parametrize(
     "verdicts",
-    [[VERDICT, VERDICT], [{**VERDICT, "item": "Fig. 9"}], [{**VERDICT, "verdict": "read"}]],
+    [
+        [VERDICT, VERDICT],
+        [{**VERDICT, "item": "Fig. 9"}],
+        [{**VERDICT, "verdict": "read"}],
+    ],
     ids=["twice", "unknown item", "results read"],
 )
 def test_ledger_refuses(verdicts: list[dict[str, str]]) -> None:
-    with pytest.raises(ValueError, match="has a verdict already|not an item|needs one of"):
+    with pytest.raises(
+        ValueError, match="has a verdict already|not an item|needs one of"
+    ):
         ledger([ITEM, TABLE], verdicts)
 
 
 def test_what_was_read_is_counted_apart_from_what_matches() -> None:
     read = {**VERDICT, "item": "Table I", "verdict": "read"}
     found = summaries(ledger([ITEM, TABLE], [VERDICT, read]))
-    assert found["parameters"] == (1, {"read": 1, "differs": 0, "not comparable": 0, "not yet": 0})
-    assert found["results"] == (1, {"match": 0, "differs": 1, "not comparable": 0, "not yet": 0})
+    assert found["parameters"] == (
+        1,
+        {"read": 1, "differs": 0, "not comparable": 0, "not yet": 0},
+    )
+    assert found["results"] == (
+        1,
+        {"match": 0, "differs": 1, "not comparable": 0, "not yet": 0},
+    )

@@ -21,15 +21,22 @@ def clone(tmp_path: Path) -> Path:
     folder = tmp_path / "a clone"
     for place in ("book/tools", "book/kit"):
         (folder / place).mkdir(parents=True)
-    for name in ("Makefile", "requirements.txt", "pyproject.toml", "book/tools/environment.py",
-                 "book/kit/pyproject.toml"):  # fmt: skip
+    for name in (
+        "Makefile",
+        "requirements.txt",
+        "pyproject.toml",
+        "book/tools/environment.py",
+        "book/kit/pyproject.toml",
+    ):
         shutil.copy(ROOT / name, folder / name)
     return folder
 
 
 def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     env = {k: v for k, v in os.environ.items() if not k.startswith("MAKE")}
-    return subprocess.run(["make", *arguments], cwd=folder, env=env, capture_output=True, text=True)
+    return subprocess.run(
+        ["make", *arguments], cwd=folder, env=env, capture_output=True, text=True
+    )
 
 
 def pretend(folder: Path, stamp: str | None) -> None:
@@ -51,7 +58,8 @@ def test_only_a_whole_environment_is_kept(clone: Path) -> None:
     assert makes_it(clone)
     pretend(clone, None)
     assert makes_it(clone)
-    stamp, python = clone / ".venv" / "stamp", clone / ".venv" / "bin" / "python"
+    stamp = clone / ".venv" / "stamp"
+    python = clone / ".venv" / "bin" / "python"
     stamp.write_text(f"{clone}\n")
     assert not makes_it(clone)
     os.utime(stamp, (1, 1))
@@ -102,10 +110,14 @@ def steps(clone: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return done
 
 
-def test_the_stamp_comes_last_and_names_the_folder(clone: Path, steps: list[str]) -> None:
+def test_the_stamp_comes_last_and_names_the_folder(
+    clone: Path, steps: list[str]
+) -> None:
     environment.main()
     assert steps[0] == "venv" and steps.count("pip") == 3
-    assert (clone / ".venv" / "stamp").read_text() == f"{clone}\n" and not makes_it(clone)
+    assert (clone / ".venv" / "stamp").read_text() == f"{clone}\n" and not makes_it(
+        clone
+    )
     steps.clear()
     (clone / ".venv" / "kept").touch()
     environment.main()
@@ -127,7 +139,11 @@ def test_an_interrupted_update_leaves_no_stamp(clone: Path, steps: list[str]) ->
 def test_line_ends_are_fixed_whatever_a_clone_s_settings_are() -> None:
     names = ["a.csv", "a.ipynb", "a.md", "a.py"]
     found = subprocess.run(
-        ["git", "check-attr", "eol", *names], cwd=ROOT, check=True, capture_output=True, text=True
+        ["git", "check-attr", "eol", *names],
+        cwd=ROOT,
+        check=True,
+        capture_output=True,
+        text=True,
     ).stdout
     assert found.split("\n")[:-1] == [f"{name}: eol: lf" for name in names]
 
@@ -139,5 +155,7 @@ def test_every_page_with_code_is_compared() -> None:
 
 def test_the_list_of_packages_is_whole() -> None:
     """It is installed as it stands, without a look at what packages ask for."""
-    done = subprocess.run([sys.executable, "-m", "pip", "check"], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "pip", "check"], capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stdout

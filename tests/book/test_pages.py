@@ -43,7 +43,9 @@ def test_page_of_the_contents_is_built(name: str) -> None:
 def test_a_chapter_with_its_pictures_is_light(source: Path) -> None:
     text = page(f"book/{source.stem}")
     pictures = set(re.findall(r"_images/[\w.-]+\.(?:png|webp|svg)", text))
-    assert len(text) + sum((BUILT / name).stat().st_size for name in pictures) <= 3_000_000
+    assert (
+        len(text) + sum((BUILT / name).stat().st_size for name in pictures) <= 3_000_000
+    )
 
 
 def test_chapters_import_nothing_of_the_folder_they_lie_in() -> None:
@@ -51,7 +53,9 @@ def test_chapters_import_nothing_of_the_folder_they_lie_in() -> None:
     own = {path.stem for path in (ROOT / "book").iterdir()}
     for source in chapters():
         text = source.read_text(encoding="utf-8")
-        imported = set(re.findall(r"^\s*(?:from|import)\s+(\w+)", text, flags=re.MULTILINE))
+        imported = set(
+            re.findall(r"^\s*(?:from|import)\s+(\w+)", text, flags=re.MULTILINE)
+        )
         assert not imported & own, f"{source.stem} imports {imported & own}"
 
 
@@ -67,8 +71,13 @@ def test_api_pages_are_light_and_document_every_public_name_once() -> None:
 
 
 def test_api_page_is_an_index_and_chapters_and_names_lead_to_each_other() -> None:
-    linked, used = 'class="api" href="api/updates.html#distfilt.updates', "Used in</em> chapter"
-    assert linked in page("book/03-triangular-maps") and used in page("book/api/updates")
+    linked, used = (
+        'class="api" href="api/updates.html#distfilt.updates',
+        "Used in</em> chapter",
+    )
+    assert linked in page("book/03-triangular-maps") and used in page(
+        "book/api/updates"
+    )
     text = page("book/api")
     index = text[text.index("<tbody") : text.index("</tbody>")]
     rows = re.findall(r"<tr.*?</tr>", index, flags=re.DOTALL)
@@ -83,7 +92,11 @@ def test_page_of_reproductions_shows_the_ledger() -> None:
     text = page("book/reproductions")
     rows = read_rows(LEDGER)
     tables = re.findall(r"<tbody>(.*?)</tbody>", text, flags=re.DOTALL)
-    shown = [row for table in tables for row in re.findall(r"<tr.*?</tr>", table, flags=re.DOTALL)]
+    shown = [
+        row
+        for table in tables
+        for row in re.findall(r"<tr.*?</tr>", table, flags=re.DOTALL)
+    ]
     assert len(shown) == len(rows) == 21
     for row, line in zip(rows, shown, strict=True):
         assert row["item"] in plain(line) and row["verdict"] in plain(line)
@@ -94,8 +107,11 @@ def test_page_of_reproductions_shows_the_ledger() -> None:
 
 def test_build_stops_at_a_missing_page(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(common, "toc_pages", lambda: ["book/nowhere"])
-    monkeypatch.setattr(TocTreeCollector, "assign_figure_numbers", None)  # which setup changes
-    app, conf = Mock(), runpy.run_path(str(ROOT / "book" / "conf.py"))
+    monkeypatch.setattr(
+        TocTreeCollector, "assign_figure_numbers", None
+    )  # which setup changes
+    app = Mock()
+    conf = runpy.run_path(str(ROOT / "book" / "conf.py"))
     conf["setup"](app)
     assert call("builder-inited", conf["check_toc"]) in app.connect.mock_calls
     with pytest.raises(ExtensionError, match="book/nowhere"):

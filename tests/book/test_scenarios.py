@@ -15,14 +15,18 @@ from bookkit.published import scenario
 from common import BOOK, ROOT, chapters
 from execute import read
 
-NAMES = sorted((p.parent.name, p.stem) for p in (data_root() / "scenarios").glob("*/*.toml"))
+NAMES = sorted(
+    (p.parent.name, p.stem) for p in (data_root() / "scenarios").glob("*/*.toml")
+)
 
 
 def code_of(path: Path) -> str:
     """The Python of a script or of a chapter's cells."""
     if path.suffix == ".py":
         return path.read_text(encoding="utf-8")
-    return "\n".join(cell.source for cell in read(path).cells if cell.cell_type == "code")
+    return "\n".join(
+        cell.source for cell in read(path).cells if cell.cell_type == "code"
+    )
 
 
 @functools.cache
@@ -35,7 +39,9 @@ def sources() -> list[set[str]]:
 def wanted(paper: str, name: str) -> set[str]:
     """The parameters, and the columns of the rows; a network is also taken as `adjacency`."""
     s = scenario(paper, name)
-    columns = {c for rows in s.tables.values() for row in rows for c in row.value_columns}
+    columns = {
+        c for rows in s.tables.values() for row in rows for c in row.value_columns
+    }
     return set(s) | columns - {"name", "unit"}
 
 
@@ -47,7 +53,9 @@ def test_every_parameter_is_read(paper: str, name: str) -> None:
     assert not unread, f"{paper}/{name}: read by nothing, so notes: {', '.join(unread)}"
 
 
-def test_a_change_has_to_be_accepted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_change_has_to_be_accepted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     shutil.copytree(ROOT / "data" / "scenarios", tmp_path / "data" / "scenarios")
     assert tool.main([], tmp_path) == 0
     path = tmp_path / "data" / "scenarios" / "grange" / "table-2.toml"

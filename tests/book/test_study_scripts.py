@@ -90,7 +90,9 @@ def trial(seed):
 
 
 def test_scripts_share_a_module_and_store_what_their_scenario_was(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     (folder / "_common.py").write_text(SHARED, encoding="utf-8")

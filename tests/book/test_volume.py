@@ -35,5 +35,6 @@ def test_what_does_not_fit_the_paper_is_refused(tmp_path: Path) -> None:
     with chromium(tmp_path / "profile") as driver, pytest.raises(SystemExit) as told:
         volume.opened(driver, page)
     assert all(
-        f"\n{what}: " in str(told.value) for what in ("too wide", "cut", "not drawn", "not set")
+        f"\n{what}: " in str(told.value)
+        for what in ("too wide", "cut", "not drawn", "not set")
     )

@@ -9,24 +9,30 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distfilt.coupling import squared_distances, transport_plan, solvers, sorted_plan
+from distfilt.coupling import solvers, sorted_plan, squared_distances, transport_plan
 from distfilt.linalg import SolverError
 
 
 def _case(seed: int, n: int = 24, m: int = 24, d: int = 3) -> tuple[np.ndarray, ...]:
     """Points, a squared cost, masses of very different size with some of zero."""
     rng = np.random.default_rng(seed)
-    x, y = rng.standard_normal((n, d)), rng.standard_normal((m, d)) + 0.3
-    a, b = rng.random(n) ** 6, rng.random(m)
-    a[: n // 6], b[-1] = 0.0, 0.0
+    x = rng.standard_normal((n, d))
+    y = rng.standard_normal((m, d)) + 0.3
+    a = rng.random(n) ** 6
+    b = rng.random(m)
+    a[: n // 6] = 0.0
+    b[-1] = 0.0
     return squared_distances(x, y), a / a.sum(), b / b.sum()
 
 
 @given(st.integers(0, 10_000), st.integers(1, 12), st.integers(1, 12))
-def test_the_network_simplex_is_certified_by_its_dual(seed: int, n: int, m: int) -> None:
+def test_the_network_simplex_is_certified_by_its_dual(
+    seed: int, n: int, m: int
+) -> None:
     rng = np.random.default_rng(seed)
     cost = squared_distances(rng.standard_normal((n, 2)), rng.standard_normal((m, 2)))
-    a, b = rng.dirichlet(np.full(n, 0.3)), rng.dirichlet(np.ones(m))
+    a = rng.dirichlet(np.full(n, 0.3))
+    b = rng.dirichlet(np.ones(m))
     found = transport_plan(cost, a, b)
     f, g = found.potentials
     assert (f[:, None] + g <= cost + 1e-9).all()
@@ -34,14 +40,18 @@ def test_the_network_simplex_is_certified_by_its_dual(seed: int, n: int, m: int)
     assert abs(found.value - (found.matrix * cost).sum()) < 1e-12
     assert -1e-12 < found.gap < 1e-9
     assert np.abs(found.matrix.sum(axis=1) - a).max() <= 1e-14
-    assert np.abs(found.matrix.sum(axis=0) - b).max() <= 1e-14 and found.matrix.min() >= 0
+    assert (
+        np.abs(found.matrix.sum(axis=0) - b).max() <= 1e-14 and found.matrix.min() >= 0
+    )
 
 
 @given(st.integers(0, 10_000), st.integers(1, 15), st.integers(1, 15))
 def test_the_sorted_plan_is_the_cheapest(seed: int, n: int, m: int) -> None:
     rng = np.random.default_rng(seed)
-    x, y = rng.standard_normal(n), rng.standard_normal(m)
-    a, b = rng.dirichlet(np.full(n, 0.5)), rng.dirichlet(np.ones(m))
+    x = rng.standard_normal(n)
+    y = rng.standard_normal(m)
+    a = rng.dirichlet(np.full(n, 0.5))
+    b = rng.dirichlet(np.ones(m))
     found = sorted_plan(x, y, a, b)
     best = transport_plan(squared_distances(x[:, None], y[:, None]), a, b)
     assert abs(found.value - best.value) < 1e-11
@@ -88,10 +98,13 @@ def test_tiny_masses_do_not_make_a_problem_infeasible() -> None:
     assert found.gap < 1e-6
 
 
-@pytest.mark.parametrize(("limit", "value", "solver", "message"), [
-    ("_PIVOTS", 1, "network", "status 3"),
-    ("_NEWTON", 2, "entropic", "regularisation 0.001 needs to be larger"),
-])
+@pytest.mark.parametrize(
+    ("limit", "value", "solver", "message"),
+    [
+        ("_PIVOTS", 1, "network", "status 3"),
+        ("_NEWTON", 2, "entropic", "regularisation 0.001 needs to be larger"),
+    ],
+)
 def test_a_solver_that_stops_early_says_so(
     limit: str, value: int, solver: str, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -101,19 +114,24 @@ def test_a_solver_that_stops_early_says_so(
 
 
 def test_where_rounding_hides_the_dual_its_gradient_leads_on(monkeypatch: Any) -> None:
-    solve, steps = np.linalg.solve, []
+    solve = np.linalg.solve
+    steps = []
     monkeypatch.setattr(np.linalg, "solve", lambda a, b: steps.append(a) or solve(a, b))
     transport_plan(*_case(8, 15, 3, 2), solver="entropic", regularisation=1e-7)
     assert len(steps) < 100
 
 
 @given(st.integers(0, 10_000), st.sampled_from([1e-2, 1e-3, 1e-4]))
-def test_the_entropic_plan_is_that_of_its_optimality_conditions(seed: int, eps: float) -> None:
+def test_the_entropic_plan_is_that_of_its_optimality_conditions(
+    seed: int, eps: float
+) -> None:
     """Also where Sinkhorn's iteration would take more than 100 000 turns."""
     cost, a, b = _case(seed, 6, 7, 2)
     found = transport_plan(cost, a, b, solver="entropic", regularisation=eps)
     assert np.abs(found.matrix.sum(axis=0) - b).max() <= 1e-14
-    assert np.abs(found.matrix.sum(axis=1) - a).max() <= 1e-14 and found.matrix.min() >= 0
+    assert (
+        np.abs(found.matrix.sum(axis=1) - a).max() <= 1e-14 and found.matrix.min() >= 0
+    )
     best = transport_plan(cost, a, b).value
     # The entropy of a plan is at most that of a product of its marginals.
     most = eps * np.ptp(cost) * np.log(6 * 7)

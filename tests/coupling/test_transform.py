@@ -17,7 +17,9 @@ def _wrapped(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return (a - b + np.pi) % (2 * np.pi) - np.pi
 
 
-def _case(seed: int, n: int = 40, d: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _case(
+    seed: int, n: int = 40, d: int = 3
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Correlated members far from the origin, log-weights, and the weights."""
     rng = _rng(seed)
     x = 5.0 + rng.standard_normal((n, d)) @ rng.standard_normal((d, d))
@@ -52,7 +54,9 @@ def test_copies_do_not_leave_the_choice_to_rounding() -> None:
     reference = coupling.transform_ensemble(x, logs)
     for seed in range(10):
         nudged = x * (1 + 1e-15 * _rng(seed).standard_normal(x.shape))
-        assert np.abs(coupling.transform_ensemble(nudged, logs) - reference).max() < 1e-9
+        assert (
+            np.abs(coupling.transform_ensemble(nudged, logs) - reference).max() < 1e-9
+        )
 
 
 def test_weights_that_underflow_and_weights_of_zero() -> None:
@@ -73,7 +77,9 @@ def test_equal_weights_one_member_and_a_collapsed_ensemble_move_nobody() -> None
 
 @pytest.mark.parametrize("correct", [False, True])
 def test_leading_axes_are_ensembles_of_their_own(correct: bool) -> None:
-    x, logs = (np.stack(part) for part in list(zip(*map(_case, range(4)), strict=True))[:2])
+    x, logs = (
+        np.stack(part) for part in list(zip(*map(_case, range(4)), strict=True))[:2]
+    )
     batch = x.reshape(2, 2, 40, 3), logs.reshape(2, 2, 40)
     moved = coupling.transform_ensemble(*batch, correct=correct)
     alone = coupling.transform_ensemble(x[2], logs[2], correct=correct)
@@ -85,7 +91,9 @@ def test_leading_axes_are_ensembles_of_their_own(correct: bool) -> None:
 @given(st.integers(0, 10_000), st.integers(20, 40), st.integers(1, 4))
 def test_the_correction_gives_both_moments(seed: int, n: int, d: int) -> None:
     x, logs, w = _case(seed, n, d)
-    w = (w + 0.05) / (w + 0.05).sum()  # many members count, so that no direction is lost
+    w = (w + 0.05) / (
+        w + 0.05
+    ).sum()  # many members count, so that no direction is lost
     moved = coupling.transform_ensemble(x, np.log(w), correct=True)
     assert np.abs(moved.mean(axis=0) - w @ x).max() < 1e-12 * np.abs(x).max()
     p = _covariance(x, w)
@@ -98,10 +106,13 @@ def test_the_correction_is_the_symmetric_map() -> None:
     x, logs, w = _case(7)
     plain = coupling.transform_ensemble(x, logs)
     moved = coupling.second_order(plain, x, logs)
-    a, b = plain - plain.mean(axis=0), moved - moved.mean(axis=0)
+    a = plain - plain.mean(axis=0)
+    b = moved - moved.mean(axis=0)
     matrix = np.linalg.lstsq(a, b, rcond=None)[0]
     assert np.abs(a @ matrix - b).max() < 1e-10
-    assert np.abs(matrix - matrix.T).max() < 1e-9 and np.linalg.eigvalsh(matrix).min() > 0
+    assert (
+        np.abs(matrix - matrix.T).max() < 1e-9 and np.linalg.eigvalsh(matrix).min() > 0
+    )
 
 
 @pytest.mark.parametrize(
@@ -138,7 +149,9 @@ def test_entropy_shrinks_and_debiasing_restores() -> None:
     debiased = coupling.transform_ensemble(x, logs, debias=True, **entropic)
     biased, plain = (coupling.transform_ensemble(x, logs, **o) for o in (entropic, {}))
     kept = [np.trace(_covariance(e)) for e in (biased, debiased, plain)]
-    assert kept[0] < 0.7 * kept[2] and abs(kept[1] - kept[2]) < 0.5 * (kept[2] - kept[0])
+    assert kept[0] < 0.7 * kept[2] and abs(kept[1] - kept[2]) < 0.5 * (
+        kept[2] - kept[0]
+    )
     assert np.abs(debiased.mean(axis=0) - w @ x).max() < 1e-13
     free = biased + x - coupling.transform_ensemble(x, np.zeros(60), **entropic)
     assert np.allclose(debiased, free + w @ x - free.mean(axis=0))
@@ -149,7 +162,9 @@ def test_entropy_shrinks_and_debiasing_restores() -> None:
 def test_rejuvenation_keeps_the_mean_and_adds_its_share() -> None:
     x, logs, _ = _case(10, 60, 3)
     copies = np.tile(x.mean(axis=0), (4000, 60, 1))
-    added = coupling.rejuvenate(copies, np.tile(x, (4000, 1, 1)), bandwidth=0.2, rng=_rng(11))
+    added = coupling.rejuvenate(
+        copies, np.tile(x, (4000, 1, 1)), bandwidth=0.2, rng=_rng(11)
+    )
     assert np.abs(added.mean(axis=1) - x.mean(axis=0)).max() < 1e-12
     spread = added - copies
     cov = np.einsum("rni,rnj->ij", spread, spread) / (4000 * 60)
@@ -185,15 +200,21 @@ def test_pieces_keep_members_apart() -> None:
     logs = np.where(x[:, 0] > 0, 0.7, 0.0) + 0.3 * x[:, 0]
     y = coupling.transform_within(x, logs, (x[:, 0] > 0).astype(int), rng=rng)
     assert (np.abs(y) >= 1).all()
-    assert (np.abs(coupling.transform_ensemble(x, logs)) < 1).any()  # what the pieces prevent
+    assert (
+        np.abs(coupling.transform_ensemble(x, logs)) < 1
+    ).any()  # what the pieces prevent
 
 
 def test_along_a_flat_set_is_the_transform() -> None:
     x, logs, _ = _case(15)
     flat = coupling.transform_along(x, logs, difference=np.subtract, retract=np.add)
     assert np.allclose(flat, coupling.transform_ensemble(x, logs), atol=1e-12)
-    stack = coupling.transform_along(np.stack([x, 2 * x]), np.stack([logs, logs]),
-                            difference=np.subtract, retract=np.add)
+    stack = coupling.transform_along(
+        np.stack([x, 2 * x]),
+        np.stack([logs, logs]),
+        difference=np.subtract,
+        retract=np.add,
+    )
     assert np.allclose(stack, [flat, 2 * flat], atol=1e-12)
 
 
@@ -202,8 +223,13 @@ def test_angles_across_the_cut() -> None:
     rng = _rng(16)
     angle = rng.normal(0.0, 0.5, (30, 1))
     logs = -4 * (angle[:, 0] - 0.3) ** 2
-    options = {"difference": _wrapped, "retract": lambda x, v: _wrapped(x + v, np.zeros(1))}
+    options = {
+        "difference": _wrapped,
+        "retract": lambda x, v: _wrapped(x + v, np.zeros(1)),
+    }
     reference = coupling.transform_along(angle, logs, **options)
-    turned = coupling.transform_along(_wrapped(angle + 3.0, np.zeros(1)), logs, **options)
+    turned = coupling.transform_along(
+        _wrapped(angle + 3.0, np.zeros(1)), logs, **options
+    )
     assert np.abs(_wrapped(turned - 3.0, reference)).max() < 1e-12
     assert np.abs(turned).max() > 3.0

@@ -26,7 +26,9 @@ def test_histogram_counts_batches() -> None:
     assert np.allclose(h[1], other.ravel())
 
 
-@pytest.mark.parametrize("grid", [Grid((9,)), BOX, Grid((3, 4, 5), high=[1.0, 2.0, 3.0])])
+@pytest.mark.parametrize(
+    "grid", [Grid((9,)), BOX, Grid((3, 4, 5), high=[1.0, 2.0, 3.0])]
+)
 def test_cosines_are_orthonormal_and_complete(grid: Grid) -> None:
     c = grid.cosines(grid.size)
     assert np.abs(c.T @ c * grid.volume - np.eye(grid.size)).max() < 1e-12
@@ -36,13 +38,19 @@ def test_cosines_are_orthonormal_and_complete(grid: Grid) -> None:
 def test_modes_come_by_frequency_in_the_box() -> None:
     long = Grid((8, 8), high=[1.0, 10.0])
     assert np.array_equal(long.wavenumbers(4), [[0, 0], [0, 1], [0, 2], [0, 3]])
-    assert np.array_equal(Grid((9, 9), high=[1.0, 1e6]).wavenumbers(9)[:, 1], np.arange(9))
-    assert np.array_equal(Grid((8, 8)).wavenumbers(5), [[0, 0], [0, 1], [1, 0], [1, 1], [0, 2]])
+    assert np.array_equal(
+        Grid((9, 9), high=[1.0, 1e6]).wavenumbers(9)[:, 1], np.arange(9)
+    )
+    assert np.array_equal(
+        Grid((8, 8)).wavenumbers(5), [[0, 0], [0, 1], [1, 0], [1, 1], [0, 2]]
+    )
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1e5, 1e6])
 @pytest.mark.parametrize("sides", [(1.0, 1.0), (1.0, 0.7), (3.0, 1.0, 2.0)])
-def test_the_lowest_modes_are_the_same_in_every_unit(unit: float, sides: tuple[float, ...]) -> None:
+def test_the_lowest_modes_are_the_same_in_every_unit(
+    unit: float, sides: tuple[float, ...]
+) -> None:
     shape = (12, 10, 8)[: len(sides)]
     one, other = (Grid(shape, high=u * np.array(sides)) for u in (1.0, unit))
     assert np.array_equal(one.wavenumbers(one.size), other.wavenumbers(one.size))
@@ -62,12 +70,18 @@ def test_prior_has_the_variance_the_length_and_the_mass_that_it_says() -> None:
     s = zero_mean_prior(grid, rank=399, length=0.2, std=0.7)
     assert (s**2).sum() / grid.size == pytest.approx(0.49, rel=1e-10)
     assert np.abs(s.sum(axis=0)).max() < 1e-10
-    correlation = (s @ s.T)[190, 190 + 40] / (s @ s.T)[190, 190]  # two cells, 0.2, along axis 0
+    correlation = (s @ s.T)[190, 190 + 40] / (s @ s.T)[
+        190, 190
+    ]  # two cells, 0.2, along axis 0
     assert correlation == pytest.approx(np.exp(-0.5), abs=0.1)
-    assert np.array_equal(zero_mean_prior(grid, rank=50, length=0.2, std=0.7), s[:, :50])
+    assert np.array_equal(
+        zero_mean_prior(grid, rank=50, length=0.2, std=0.7), s[:, :50]
+    )
     loose = zero_mean_prior(grid, rank=30, mass_std=0.2)
     assert np.array_equal(loose[:, 1:], zero_mean_prior(grid, rank=30))
-    assert np.ptp(loose[:, 0]) == 0 and grid.integral(loose[:, 0]) == pytest.approx(0.2, rel=1e-12)
+    assert np.ptp(loose[:, 0]) == 0 and grid.integral(loose[:, 0]) == pytest.approx(
+        0.2, rel=1e-12
+    )
 
 
 def test_a_prior_is_a_tenth_of_the_box_long_and_as_wide_as_the_mean_density() -> None:

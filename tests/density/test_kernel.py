@@ -25,7 +25,9 @@ def test_reflection_keeps_the_mass(shape: tuple[int, ...], h: float) -> None:
 
 def test_reflection_solves_the_heat_equation() -> None:
     # A kernel between reflecting walls is the cosine series of the heat kernel.
-    grid, x, h = density.Grid((40,)), 0.13, 0.2
+    grid = density.Grid((40,))
+    x = 0.13
+    h = 0.2
     k = np.arange(1, 60)
     edges = grid.edges[0]
     modes = np.diff(np.sin(np.pi * k[:, None] * edges), axis=1) / (np.pi * k[:, None])
@@ -37,7 +39,9 @@ def test_reflection_solves_the_heat_equation() -> None:
 def test_axes_are_not_exchanged_and_batches_broadcast() -> None:
     z = density.kernels([[0.2, 0.8]], GRID, bandwidth=0.06)[0]
     assert np.allclose(z @ GRID.centres * GRID.volume, [0.2, 0.8], atol=1e-3)
-    many = density.kernel_density(np.stack([SOME, SOME[::-1] * 0.5]), GRID, bandwidth=0.1)
+    many = density.kernel_density(
+        np.stack([SOME, SOME[::-1] * 0.5]), GRID, bandwidth=0.1
+    )
     assert np.allclose(many[1], density.kernel_density(SOME * 0.5, GRID, bandwidth=0.1))
 
 
@@ -45,7 +49,9 @@ def test_one_bandwidth_for_each_agent() -> None:
     h = np.linspace(0.05, 0.2, 40)
     z = density.kernels(SOME, GRID, bandwidth=h)
     for i in (0, 39):
-        assert np.allclose(z[i], density.kernels(SOME[i : i + 1], GRID, bandwidth=h[i])[0])
+        assert np.allclose(
+            z[i], density.kernels(SOME[i : i + 1], GRID, bandwidth=h[i])[0]
+        )
 
 
 def test_the_constant_is_the_integral_of_the_kernel_squared() -> None:
@@ -81,8 +87,12 @@ def test_the_score_of_cross_validation_leaves_each_agent_out(apart: float) -> No
     """∫p² - 2/N Σ p₋ᵢ(Xᵢ), the estimate without i made anew for each i."""
     x = np.array([[0.2, 0.2], [0.2 + apart, 0.2], [0.25, 0.25]])
     p = density.kernel_density(x, GRID, bandwidth=0.04)
-    left = [density.kernel_density(np.delete(x, i, axis=0), GRID, bandwidth=0.04)[GRID.cell_index(x[i])]
-            for i in range(3)]
+    left = [
+        density.kernel_density(np.delete(x, i, axis=0), GRID, bandwidth=0.04)[
+            GRID.cell_index(x[i])
+        ]
+        for i in range(3)
+    ]
     wanted = (p**2).sum() * GRID.volume - 2 * np.mean(left)
     assert _least_squares(x, GRID, 0.04) == pytest.approx(wanted)
 
@@ -90,7 +100,9 @@ def test_the_score_of_cross_validation_leaves_each_agent_out(apart: float) -> No
 def test_cross_validation_has_the_least_score() -> None:
     """On two clusters far apart, for which Silverman's rule is too wide."""
     rng = np.random.default_rng(5)
-    x = np.repeat([[0.2, 0.5], [0.8, 0.5]], 50, axis=0) + 0.06 * rng.standard_normal((100, 2))
+    x = np.repeat([[0.2, 0.5], [0.8, 0.5]], 50, axis=0) + 0.06 * rng.standard_normal(
+        (100, 2)
+    )
     h = density.bandwidth(x, GRID, rule="least_squares")
     least = _least_squares(x, GRID, h)
     assert all(least < _least_squares(x, GRID, c * h) for c in (0.8, 1.25, 2.0))
@@ -99,5 +111,7 @@ def test_cross_validation_has_the_least_score() -> None:
 
 def test_a_cell_is_at_most_two_bandwidths_wide() -> None:
     fine_enough(density.Grid((10, 10)), 0.05)
-    with pytest.raises(ValueError, match="^grid: needs cells no wider than two bandwidths, 0.08"):
+    with pytest.raises(
+        ValueError, match="^grid: needs cells no wider than two bandwidths, 0.08"
+    ):
         fine_enough(density.Grid((20, 10)), np.array([0.05, 0.04]))

@@ -12,34 +12,57 @@ from typing import Any
 import numpy as np
 
 from distfilt import network
-from distfilt.filters import EnsembleFilter, GaussianFilter, ParticleFilter, TransportFilter
+from distfilt.filters import (
+    EnsembleFilter,
+    GaussianFilter,
+    ParticleFilter,
+    TransportFilter,
+)
 from distfilt.kalman import kalman_filter
 from distfilt.models import LinearModel, simulate
 from distfilt.sensors import Sensor, component, stack
-from distfilt.updates import enkf_exact, with_inflation, serially, etkf, transport_map_update
+from distfilt.updates import (
+    enkf_exact,
+    etkf,
+    serially,
+    transport_map_update,
+    with_inflation,
+)
 
 FAMILIES: dict[str, Callable[..., Any]] = {
     "ensemble": partial(EnsembleFilter, members=40),
     "ensemble, exact": partial(EnsembleFilter.exact, members=40),
     "ensemble, exact draws": partial(EnsembleFilter, update=enkf_exact, members=40),
-    "ensemble, transport": partial(EnsembleFilter, update=transport_map_update, members=60),
+    "ensemble, transport": partial(
+        EnsembleFilter, update=transport_map_update, members=60
+    ),
     "ensemble, square root": partial(
         EnsembleFilter, update=with_inflation(etkf, factor=1.01), members=40
     ),
-    "ensemble, serial": partial(EnsembleFilter, update=serially(enkf_exact), members=40),
+    "ensemble, serial": partial(
+        EnsembleFilter, update=serially(enkf_exact), members=40
+    ),
     "gaussian": GaussianFilter,
     "gaussian, unscented": partial(GaussianFilter, linearization="unscented"),
     "particle": partial(ParticleFilter, members=500),
     "particle, jitter": partial(ParticleFilter, members=500, jitter=0.2),
-    "ensemble, common": partial(TransportFilter, members=40, fusion=network.average_consensus,
-                                rejuvenation=0.1),
+    "ensemble, common": partial(
+        TransportFilter, members=40, fusion=network.average_consensus, rejuvenation=0.1
+    ),
 }
 
 RULES = {
-    "ensemble": [partial(network.mean_pull, gain=0.1), network.intersect_ensembles,
-                 partial(network.intersect_ensembles, rule="min_trace")],
-    "gaussian": [network.covariance_intersection, network.naive_fusion, network.arithmetic_average,
-                 partial(network.consensus_pull, gain=0.1)],
+    "ensemble": [
+        partial(network.mean_pull, gain=0.1),
+        network.intersect_ensembles,
+        partial(network.intersect_ensembles, rule="min_trace"),
+    ],
+    "gaussian": [
+        network.covariance_intersection,
+        network.naive_fusion,
+        network.arithmetic_average,
+        partial(network.consensus_pull, gain=0.1),
+    ],
     "common": [network.average_consensus, partial(network.average_consensus, gain=0.2)],
 }
 
@@ -59,7 +82,9 @@ def model() -> LinearModel:
     """A damped oscillator with a full process noise."""
 
     def transition(dt: float) -> np.ndarray:
-        return np.exp(-0.1 * dt) * np.array([[np.cos(dt), np.sin(dt)], [-np.sin(dt), np.cos(dt)]])
+        return np.exp(-0.1 * dt) * np.array(
+            [[np.cos(dt), np.sin(dt)], [-np.sin(dt), np.cos(dt)]]
+        )
 
     return LinearModel.from_transition(
         2, transition, lambda t, dt: dt * Q, names=("x", "v"), units=("m", "m/s")
@@ -87,7 +112,8 @@ def data(
 
 def kalman(seen: Any, sensors: Any) -> tuple[Any, dict[str, Any]]:
     """The Kalman filter of everybody's readings, with the matrices of its model."""
-    steps, every = np.diff(TIMES, prepend=0.0), stack(sensors)
+    steps = np.diff(TIMES, prepend=0.0)
+    every = stack(sensors)
     moves = {
         "F": np.array([model().F(dt) for dt in steps]),
         "Q": np.array([dt * Q for dt in steps]),
@@ -109,5 +135,11 @@ def made(family: str, agents: int = 5, **options: Any) -> tuple[Any, Any]:
 
 def values(state: Any) -> dict[str, np.ndarray]:
     """Every array that a state holds, by name."""
-    names = ("ensembles", "particles", "log_weights", "joint_means", "joint_covariances")
+    names = (
+        "ensembles",
+        "particles",
+        "log_weights",
+        "joint_means",
+        "joint_covariances",
+    )
     return {n: getattr(state, n) for n in names if hasattr(state, n)}

@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from distfilt.filters import EnsembleFilter, GaussianFilter, MixtureFilter, InformationIncrementFilter, Observation
+from distfilt.filters import (
+    EnsembleFilter,
+    GaussianFilter,
+    InformationIncrementFilter,
+    MixtureFilter,
+    Observation,
+)
 from distfilt.gaussians.single import match_moments
 from distfilt.models import LinearModel
 from distfilt.network import Graph
@@ -18,8 +24,11 @@ from distfilt.sensors import Sensor, component
 from .families import NOISE, PRIOR, Q, model
 
 SLANT = np.array([[1.0, 0.5], [0.0, 2.0]])
-KINDS = [component([0], std=0.6), component([1], std=0.5),
-         Sensor(2, lambda x: x @ SLANT.T, NOISE, linear=lambda d: SLANT)]  # fmt: skip
+KINDS = [
+    component([0], std=0.6),
+    component([1], std=0.5),
+    Sensor(2, lambda x: x @ SLANT.T, NOISE, linear=lambda d: SLANT),
+]
 FAMILIES: dict[str, Any] = {
     "gaussian": GaussianFilter,
     "unscented": partial(GaussianFilter, linearization="unscented", kappa=0.5),
@@ -31,27 +40,37 @@ FAMILIES: dict[str, Any] = {
 
 def batch(known: list[Any], times: Any, q: Any, run: Any) -> tuple[Any, Any]:
     """Means (K, 2) and covariances (K, 2, 2) at all times, given what is known in one run."""
-    lift, steps = np.eye(2 * len(times)), np.diff(times)
+    lift = np.eye(2 * len(times))
+    steps = np.diff(times)
     for k, dt in enumerate(steps, 1):
         lift[2 * k : 2 * k + 2] += model().F(dt) @ lift[2 * k - 2 : 2 * k]
     mean = lift[:, :2] @ PRIOR[0]
     noises = [dt * (1 + t) * q for t, dt in zip(times, steps, strict=False)]
     cov = lift @ block_diag(PRIOR[1], *noises) @ lift.T
-    h, r, y = np.zeros((0, len(mean))), np.zeros((0, 0)), np.zeros(0)
+    h = np.zeros((0, len(mean)))
+    r = np.zeros((0, 0))
+    y = np.zeros(0)
     for sensor, said in known:
         value = said.value[run] if said.value.ndim > 1 else said.value
-        here, at = ~np.isnan(value), np.eye(len(times))[times.tolist().index(said.t)]
+        here = ~np.isnan(value)
+        at = np.eye(len(times))[times.tolist().index(said.t)]
         h = np.concatenate([h, np.kron(at, sensor.H(2))[here]])
         r = block_diag(r, sensor.noise_cov[np.ix_(here, here)])
         y = np.concatenate([y, value[here]])
     gain = np.linalg.solve(h @ cov @ h.T + r, h @ cov).T
-    mean, cov = mean + gain @ (y - h @ mean), cov - gain @ h @ cov
-    return mean.reshape(-1, 2), np.array([cov[k : k + 2, k : k + 2] for k in range(0, len(cov), 2)])
+    mean = mean + gain @ (y - h @ mean)
+    cov = cov - gain @ h @ cov
+    return mean.reshape(-1, 2), np.array(
+        [cov[k : k + 2, k : k + 2] for k in range(0, len(cov), 2)]
+    )
 
 
 def price(told: list[Any], now: float) -> Any:
     """Numbers that are there, and of each reading when it was, of which sensor, and about it."""
-    there = [~np.isnan(said.value.reshape(-1, sensor.dim)).all(axis=0) for sensor, said in told]
+    there = [
+        ~np.isnan(said.value.reshape(-1, sensor.dim)).all(axis=0)
+        for sensor, said in told
+    ]
     numbers = sum(map(np.sum, there))
     (sensor, said), *more = told
     if not more and said.t == now and not said.metadata and said.sensor in (0, sensor):
@@ -64,25 +83,37 @@ def price(told: list[Any], now: float) -> Any:
 def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None:
     """Now and at the times kept, whatever came late, waited or is missing; and pays for it."""
     rng = np.random.default_rng(seed)
-    several, gaussian = family not in ("mixture", "news"), family in ("gaussian", "unscented")
-    agents, steps = rng.integers(1, 5), rng.integers(2, 6)
+    several = family not in ("mixture", "news")
+    gaussian = family in ("gaussian", "unscented")
+    agents = rng.integers(1, 5)
+    steps = rng.integers(2, 6)
     runs = (2,) if several and rng.random() < 0.5 else ()
-    team = [[KINDS[k] for k in rng.integers(3, size=rng.integers(3))] for _ in range(agents)]
+    team = [
+        [KINDS[k] for k in rng.integers(3, size=rng.integers(3))] for _ in range(agents)
+    ]
     times = np.cumsum(rng.uniform(0.05, 0.5, steps + 1)) - 0.3
     links = rng.random((steps + 1, agents, agents)) < rng.choice([0.3, 0.7])
     if family == "news":  # who hears one hears all
         links[:] = rng.random((steps + 1, 1, 1)) < 0.5
     links &= ~np.eye(agents, dtype=bool)
-    every, contact = rng.choice([0.0, 0.3]), links.any(axis=(1, 2))
+    every = rng.choice([0.0, 0.3])
+    contact = links.any(axis=(1, 2))
     if every:
         contact[1:] &= np.diff(np.floor(times / every)) > 0
     lag = int(rng.integers(steps + 1) if contact[1:].all() and not every else steps)
     share = family != "mixture" and (family == "news" or rng.random() < 0.8)
     q = Q if gaussian or family == "mixture" else 0 * Q
-    walk = LinearModel.from_transition(2, model().transition_matrix, lambda t, dt: dt * (1 + t) * q)
-    nets = {t: Graph.from_adjacency(a, directed=True) for t, a in zip(times, links, strict=True)}
+    walk = LinearModel.from_transition(
+        2, model().transition_matrix, lambda t, dt: dt * (1 + t) * q
+    )
+    nets = {
+        t: Graph.from_adjacency(a, directed=True)
+        for t, a in zip(times, links, strict=True)
+    }
     options: Any = {"lag": lag, "share_observations": share} if several else {}
-    f = FAMILIES[family](walk, team, nets.get, exchange_interval=every or None, **options)
+    f = FAMILIES[family](
+        walk, team, nets.get, exchange_interval=every or None, **options
+    )
     prior: Any = PRIOR  # or members of these moments, which exact updates keep
     if family == "ensemble":
         prior = match_moments(rng.standard_normal((120, 2)), *PRIOR)
@@ -94,15 +125,22 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
             k = j + several * rng.integers(2) * rng.integers(lag + 1)
             which = sensor if (own := rng.random() < 0.2) else s
             about = tuple(rng.random(own * rng.integers(3)))
-            if 0 < k <= steps and not np.isnan(value).all():  # in the first step to k, or a second
+            if (
+                0 < k <= steps and not np.isnan(value).all()
+            ):  # in the first step to k, or a second
                 said = Observation(times[j], a, value, which, metadata=about)
                 events.append((k + rng.integers(2) / 2, sensor, said))
-    known, waiting = [[] for _ in team], [[] for _ in team]
-    owed, state = np.zeros(agents), f.start(prior, rng=rng, runs=runs, t=times[0])
+    known = [[] for _ in team]
+    waiting = [[] for _ in team]
+    owed = np.zeros(agents)
+    state = f.start(prior, rng=rng, runs=runs, t=times[0])
     for when in sorted({*range(1, steps + 1), *(event[0] for event in events)}):
-        k, t = int(when), times[int(when)]
-        now = [[event[1:] for event in events if event[0] == when and event[2].agent == a]
-               for a in range(agents)]  # fmt: skip
+        k = int(when)
+        t = times[int(when)]
+        now = [
+            [event[1:] for event in events if event[0] == when and event[2].agent == a]
+            for a in range(agents)
+        ]
         late = [said for own in now for _, said in own if said.t < t]
         seen = [[said for _, said in own if said.t == t] for own in now]
         state = f.step(state, t, seen, **({"delayed": late} if several else {}))
@@ -115,12 +153,16 @@ def test_every_agent_knows_what_its_readings_say(family: str, seed: int) -> None
                     owed[a] += price(waiting[a], t)
                 waiting[a] = []
         assert family == "news" or np.array_equal(state.ledger.scalars, owed)
-        views = [(then.t, f.summarize(then)) for then in (state, *getattr(state, "lagged_states", ()))]
+        views = [
+            (then.t, f.summarize(then))
+            for then in (state, *getattr(state, "lagged_states", ()))
+        ]
         assert len(views) == 1 + min(lag * several, k)
         for a, *run in np.ndindex(agents, *runs):
             means, covs = batch(known[a], times[: k + 1], q, tuple(run))
             for then, view in views:
-                at, here = times.tolist().index(then), (*run, a)
+                at = times.tolist().index(then)
+                here = (*run, a)
                 cov = view.covariance
                 found = np.cov(view.members[here].T) if cov is None else cov[here]
                 assert np.allclose(view.mean[here], means[at], atol=1e-9)

@@ -11,7 +11,7 @@ from distfilt import metrics
 from distfilt.filters import FilterError, Observation, final_state
 from distfilt.models import LinearModel, Model
 from distfilt.network import Faults
-from distfilt.sensors import Sensor, line_angle, component
+from distfilt.sensors import Sensor, component, line_angle
 
 from .families import FAMILIES, PRIOR, TIMES, data, made, rules, team, values
 
@@ -21,7 +21,8 @@ pytestmark = pytest.mark.filterwarnings("ignore::distfilt.filters.ParticleCollap
 
 def same(a: Any, b: Any) -> bool:
     """Whether two states believe the same, to the bit."""
-    first, second = values(a), values(b)
+    first = values(a)
+    second = values(b)
     return all((first[n] == second[n]).all() for n in first)
 
 
@@ -29,7 +30,9 @@ def at(observations: list[Any], k: int) -> list[Any]:
     return [None if o is None else o[k] for o in observations]
 
 
-@pytest.mark.parametrize(("family", "rule"), [(f, rule) for f in FAMILIES for rule in rules(f)])
+@pytest.mark.parametrize(
+    ("family", "rule"), [(f, rule) for f in FAMILIES for rule in rules(f)]
+)
 def test_nobody_notices_beyond_the_neighbours(family: str, rule: Any) -> None:
     """On a path 0-1-2-3-4 a step reaches one link: agents 0, 1, 2 know nothing of agent 4."""
     f, start = made(family, fusion=rule)
@@ -60,7 +63,8 @@ def test_faults_between_two_times(family: str) -> None:
     f, state = made(family, sensors=sensors, fusion=None, faults=off)
     heard = []
     for t in (0.5, 1.0, 2.0):
-        before, state = state, f.step(state, t, [[0.3], None])
+        before = state
+        state = f.step(state, t, [[0.3], None])
         heard.append(bool((state.ledger.messages - before.ledger.messages)[0]))
     assert heard == [True, False, True]
 
@@ -74,22 +78,34 @@ def test_recorded_scores_by_their_definitions(family: str) -> None:
     assert list(run["agent"].values) == ["A", "B", "C"]
     assert list(run["component"].values) == ["x", "v"]
     assert list(run["unit"].values) == ["m", "m/s"]
-    k, r, a = 5, 1, 2
-    got, true = run.isel(time=k, run=r, agent=a), truth[k, r]
+    k = 5
+    r = 1
+    a = 2
+    got = run.isel(time=k, run=r, agent=a)
+    true = truth[k, r]
     mean = got["mean"].values
     if family.startswith("gaussian"):
         assert np.allclose(mean, states[k].means[r, a])
         cov = states[k].covariances[r, a]
         crps = metrics.gaussian_crps(mean, np.sqrt(np.diag(cov)), true)
     else:
-        w = np.exp(states[k].log_weights[r, a]) if family.startswith("particle") else None
+        w = (
+            np.exp(states[k].log_weights[r, a])
+            if family.startswith("particle")
+            else None
+        )
         x = (states[k].ensembles if w is None else states[k].particles)[r, a]
         assert np.allclose(mean, np.average(x, axis=0, weights=w), atol=1e-12)
         cov = np.cov(x.T, aweights=w, ddof=1 if w is None else 0)
         crps = metrics.crps(x, true, weights=w)
-    wanted = {"squared_error": (mean - true) ** 2, "nees": metrics.nees(mean, cov, true),
-              "total_squared_error": ((mean - true) ** 2).sum(), "crps": crps,
-              "variance": np.diag(cov), "spread": np.sqrt(np.trace(cov))}
+    wanted = {
+        "squared_error": (mean - true) ** 2,
+        "nees": metrics.nees(mean, cov, true),
+        "total_squared_error": ((mean - true) ** 2).sum(),
+        "crps": crps,
+        "variance": np.diag(cov),
+        "spread": np.sqrt(np.trace(cov)),
+    }
     for name, value in wanted.items():
         assert np.allclose(got[name].values, value, rtol=1e-9, atol=1e-12), name
 
@@ -100,7 +116,8 @@ def test_missing_component_is_a_sensor_without_it(family: str) -> None:
     f, start = made(family, sensors=sensors, graph=None)
     y = np.array([0.4, np.nan])
     less = made(family, sensors=[component([0], std=np.sqrt(0.5))], graph=None)[0]
-    a, b = f.step(start, 0.5, [y]), less.step(start, 0.5, [[0.4]])
+    a = f.step(start, 0.5, [y])
+    b = less.step(start, 0.5, [[0.4]])
     assert np.allclose(f.summarize(a).mean, less.summarize(b).mean, atol=1e-12)
     assert np.allclose(f.summarize(a).variance, less.summarize(b).variance, atol=1e-12)
 
@@ -121,7 +138,10 @@ def test_components_missing_in_some_runs_only(family: str) -> None:
 def test_direction_across_pi(family: str) -> None:
     """A truth near the negative x-axis, whose direction jumps between π and −π."""
     still = Model(2, lambda x, t, dt: x, lambda t, dt: 1e-4 * dt * np.eye(2))
-    sensors: list[Sensor | None] = [line_angle([0, 1], std=0.05, full=True), component([0], std=0.1)]
+    sensors: list[Sensor | None] = [
+        line_angle([0, 1], std=0.05, full=True),
+        component([0], std=0.1),
+    ]
     f = made(family, sensors=sensors, model=still)[0]
     prior = (np.array([-2.0, 0.0]), 0.04 * np.eye(2))
     start = f.start(prior, rng=np.random.default_rng(0), runs=(20,))
@@ -163,26 +183,44 @@ def test_late_reading_is_in_time_after_all(family: str) -> None:
     f, start = made(family, **two, lag=2, runs=(40,))
     for t in (0.5, 1.0):
         start = f.step(start, t, [None] * 2)
-    late = f.step(start, 1.5, [[0.1], None], delayed=[Observation(0.5, 0, [1.9], arrival_time=1.5)])
+    late = f.step(
+        start,
+        1.5,
+        [[0.1], None],
+        delayed=[Observation(0.5, 0, [1.9], arrival_time=1.5)],
+    )
     g, begin = made(family, **two, runs=(40,))
     begin = g.step(begin, 0.5, [[1.9], None])
     begin = g.step(g.step(begin, 1.0, [None] * 2), 1.5, [[0.1], None])
-    a, b = f.summarize(late), g.summarize(begin)
+    a = f.summarize(late)
+    b = g.summarize(begin)
     blind = g.start(PRIOR, rng=np.random.default_rng(3), runs=(40,))
     blind = g.step(g.step(blind, 1.0, [None] * 2), 1.5, [[0.1], None])
     gap = np.abs(a.mean.mean(axis=0) - b.mean.mean(axis=0)).max()
-    assert gap < 0.12 < np.abs(g.summarize(blind).mean.mean(axis=0) - b.mean.mean(axis=0)).max()
+    assert (
+        gap
+        < 0.12
+        < np.abs(g.summarize(blind).mean.mean(axis=0) - b.mean.mean(axis=0)).max()
+    )
 
 
 @EACH
 def test_a_run_takes_each_late_reading_when_it_arrives(family: str) -> None:
     f, start = made(family, sensors=[component([0], std=0.4)], graph=None, lag=2)
-    times, seen = [0.5, 1.0, 1.5, 2.0], np.array([[np.nan], [0.3], [np.nan], [0.1]])
-    late = [Observation(1.5, 0, [1.1], arrival_time=2.0), Observation(0.5, 0, [1.9], arrival_time=1.2)]
+    times = [0.5, 1.0, 1.5, 2.0]
+    seen = np.array([[np.nan], [0.3], [np.nan], [0.1]])
+    late = [
+        Observation(1.5, 0, [1.1], arrival_time=2.0),
+        Observation(0.5, 0, [1.9], arrival_time=1.2),
+    ]
     run = f.run(start, times, [seen], delayed=late)
     state = start
     for t, y in zip(times, seen, strict=True):
-        due = [r for r in late if r.arrival_time is not None and t - 0.5 < r.arrival_time <= t]
+        due = [
+            r
+            for r in late
+            if r.arrival_time is not None and t - 0.5 < r.arrival_time <= t
+        ]
         state = f.step(state, t, [y], delayed=due)
     assert same(final_state(run), state)
     with pytest.raises(ValueError, match="delayed: needs arrivals up to 1.5, got 2.0"):
@@ -191,9 +229,13 @@ def test_a_run_takes_each_late_reading_when_it_arrives(family: str) -> None:
 
 @EACH
 @pytest.mark.parametrize(("origin", "dt"), [(0.0, 1.0), (1.7e9, 1.0), (0.0, 1e-10)])
-def test_a_late_reading_belongs_to_its_own_time(family: str, origin: float, dt: float) -> None:
+def test_a_late_reading_belongs_to_its_own_time(
+    family: str, origin: float, dt: float
+) -> None:
     """Whatever the clock's zero and its unit; between the times it belongs to none."""
-    walk = LinearModel.from_transition(1, lambda h: np.eye(1), lambda t, h: h / dt * np.eye(1))
+    walk = LinearModel.from_transition(
+        1, lambda h: np.eye(1), lambda t, h: h / dt * np.eye(1)
+    )
     f = FAMILIES[family](walk, [component([0], std=0.1)], None, lag=3)
     prior = (np.zeros(1), np.eye(1))
     state = f.start(prior, rng=np.random.default_rng(0), runs=(20,), t=origin)
@@ -205,7 +247,9 @@ def test_a_late_reading_belongs_to_its_own_time(family: str, origin: float, dt: 
         return [Observation(measured, 0, [0.0], arrival_time=origin + 4 * dt)]
 
     for k in (1, 2):
-        after = f.step(state, origin + 4 * dt, [None], delayed=late(np.nextafter(times[k + 1], -1)))
+        after = f.step(
+            state, origin + 4 * dt, [None], delayed=late(np.nextafter(times[k + 1], -1))
+        )
         spread = [f.summarize(then).variance.mean() for then in after.lagged_states]
         assert np.argmin(spread) == k
     with pytest.raises(ValueError, match="delayed: needs an earlier time that is kept"):
@@ -235,16 +279,26 @@ def test_bad_run_is_named_and_others_go_on(family: str) -> None:
             out[1, 0] = np.nan
         return out
 
-    broken = Model(2, flow, lambda t, dt: dt * np.eye(2), derivative=lambda x, t, dt: np.eye(2))
+    broken = Model(
+        2, flow, lambda t, dt: dt * np.eye(2), derivative=lambda x, t, dt: np.eye(2)
+    )
     sensors = [component([0], std=0.5), component([1], std=0.5)]
     f, start = made(family, sensors=sensors, model=broken, runs=(3,))
     start = f.step(start, 0.5, [[0.1], [0.2]])
-    with pytest.raises(FilterError, match=r"run 1, agent 0, t = 1 s: the forecast is not finite"):
+    with pytest.raises(
+        FilterError, match=r"run 1, agent 0, t = 1 s: the forecast is not finite"
+    ):
         f.step(start, 1.0, [[0.1], [0.2]])
     g, state = made(family, sensors=sensors, model=broken, runs=(3,), on_error="keep")
-    run = g.run(state, [0.5, 1.0, 1.5], [np.full((3, 1), 0.1), np.full((3, 1), 0.2)],
-                truth=np.zeros((3, 3, 2)))
+    run = g.run(
+        state,
+        [0.5, 1.0, 1.5],
+        [np.full((3, 1), 0.1), np.full((3, 1), 0.2)],
+        truth=np.zeros((3, 3, 2)),
+    )
     assert np.isfinite(run["mean"].values[:, [0, 2]]).all()
     assert np.isfinite(run["mean"].values[0]).all()
     recorded = [value.values for value in run.values() if "run" in value.dims]
-    assert len(recorded) >= 6 and all(np.isnan(value[1:, 1]).all() for value in recorded)
+    assert len(recorded) >= 6 and all(
+        np.isnan(value[1:, 1]).all() for value in recorded
+    )

@@ -11,16 +11,21 @@ from distfilt.filters.record import final_state
 from distfilt.models import rotating_swarm
 from distfilt.network import Faults, Graph, graphs
 
-SIZE, H = 12, 0.12
+SIZE = 12
+H = 0.12
 GRID = density.Grid((10, 10))
 SWARM = rotating_swarm("gibbs")
 MODEL = density.FokkerPlanck(SWARM, GRID)
 START = np.random.default_rng(1).random((SIZE, 2))
-PATH = SWARM.simulate(START, np.arange(1, 9) * 0.1, rng=np.random.default_rng(2), substeps=2)
+PATH = SWARM.simulate(
+    START, np.arange(1, 9) * 0.1, rng=np.random.default_rng(2), substeps=2
+)
 
 
 def make(graph: object, rule: object, **options: object) -> DensityFilter:
-    return DensityFilter(MODEL, SIZE, graph, fusion=rule, bandwidth=H, **{"rank": 20, **options})
+    return DensityFilter(
+        MODEL, SIZE, graph, fusion=rule, bandwidth=H, **{"rank": 20, **options}
+    )
 
 
 RULES = {
@@ -33,7 +38,9 @@ RULES = {
 }
 
 
-def last(f: DensityFilter, path=PATH, start: np.ndarray = START, t: float = 0.0) -> DensityState:
+def last(
+    f: DensityFilter, path=PATH, start: np.ndarray = START, t: float = 0.0
+) -> DensityState:
     state = f.start(start, t=t)
     for k, x in enumerate(path):
         state = f.step(state, t + 0.1 * (k + 1), x)
@@ -41,10 +48,14 @@ def last(f: DensityFilter, path=PATH, start: np.ndarray = START, t: float = 0.0)
 
 
 @pytest.mark.parametrize("rule", [density.Flooding(), density.Neighbours()])
-def test_complete_graph_and_equal_starts_give_the_centralised_filter(rule: object) -> None:
+def test_complete_graph_and_equal_starts_give_the_centralised_filter(
+    rule: object,
+) -> None:
     """Criterion 7."""
     everyone = last(make(graphs.complete(SIZE), rule, initial_density=np.ones(100)))
-    central = last(make(graphs.complete(SIZE), density.Centralised(), initial_density=np.ones(100)))
+    central = last(
+        make(graphs.complete(SIZE), density.Centralised(), initial_density=np.ones(100))
+    )
     assert np.abs(everyone.estimates - central.estimates).max() < 1e-12
     assert (everyone.positions_sent == SIZE).all()
 
@@ -57,7 +68,9 @@ def test_nobody_reads_beyond_its_links(name: str) -> None:
     moved[11] = 1 - moved[11]
     substeps = 1 if not name.startswith("pi") else 2
     a, b = (f.step(f.start(START), 0.1, x) for x in (PATH[0], moved))
-    assert np.array_equal(a.estimates[: SIZE - 1 - substeps], b.estimates[: SIZE - 1 - substeps])
+    assert np.array_equal(
+        a.estimates[: SIZE - 1 - substeps], b.estimates[: SIZE - 1 - substeps]
+    )
 
 
 def test_coefficients_are_the_whole_density_to_truncation() -> None:
@@ -78,7 +91,10 @@ def test_flooding_knows_where_agents_were_as_many_steps_ago_as_hops() -> None:
         assert np.array_equal(table[j, :2], PATH[7 - max(j - 1, 0)][j])
     assert (table[9:, 2] < 0).all() and state.positions_sent[0] == 9
     x = np.stack([PATH[7 - max(j - 1, 0)][j] for j in range(9)])
-    assert np.abs(state.observed[0] - density.kernel_density(x, GRID, bandwidth=H)).max() < 1e-12
+    assert (
+        np.abs(state.observed[0] - density.kernel_density(x, GRID, bandwidth=H)).max()
+        < 1e-12
+    )
 
 
 def test_flooding_forgets() -> None:
@@ -87,7 +103,11 @@ def test_flooding_forgets() -> None:
     all_ = graphs.complete(SIZE)
     kept = last(make(all_, density.Flooding(), local=(0,)), path)
     gone = last(make(all_, density.Flooding(forget=0.35), local=(0,)), path, t=-9.0)
-    assert kept.positions_sent[0] == SIZE - 1 and gone.positions_sent[0] == SIZE - 2 and gone.positions_sent[4] == 0
+    assert (
+        kept.positions_sent[0] == SIZE - 1
+        and gone.positions_sent[0] == SIZE - 2
+        and gone.positions_sent[4] == 0
+    )
 
 
 def test_ledger_charges_what_each_rule_sends() -> None:
@@ -102,37 +122,58 @@ def test_ledger_charges_what_each_rule_sends() -> None:
 def test_agents_that_go_are_left_out_and_their_filters_go_on() -> None:
     path = PATH.copy()
     path[4:, 5] = np.nan
-    state = last(make(graphs.complete(SIZE), density.Centralised(), initial_density=np.ones(100)), path)
+    state = last(
+        make(
+            graphs.complete(SIZE), density.Centralised(), initial_density=np.ones(100)
+        ),
+        path,
+    )
     here = [i for i in range(SIZE) if i != 5]
     want = density.kernel_density(path[-1][here], GRID, bandwidth=H)
     assert np.abs(state.observed[0] - want).max() < 1e-13
     assert state.parts == 1 and np.isfinite(state.estimates).all()
-    assert np.trace(state.filters.information[5]) < np.trace(state.filters.information[4])
+    assert np.trace(state.filters.information[5]) < np.trace(
+        state.filters.information[4]
+    )
     gone = np.where(np.arange(SIZE)[:, None] == 0, np.nan, START)
-    state = last(make(graphs.complete(SIZE), density.DynamicAverage(modes=30)), gone[None], gone)
+    state = last(
+        make(graphs.complete(SIZE), density.DynamicAverage(modes=30)), gone[None], gone
+    )
     assert np.allclose(state.positions_sent[1:], SIZE - 1)
 
 
 def test_a_network_that_falls_apart_is_in_the_ledger() -> None:
     """Nobody hears anything any more: no messages, and each filter goes on with what it has."""
-    def graph(t: float, x: np.ndarray) -> Graph:
-        return graphs.ring(SIZE) if t < 0.45 else Graph.from_edges(SIZE, np.zeros((0, 2)))
 
-    for rule in (density.Flooding(), density.PIConsensus(), density.DynamicAverage(modes=30)):
+    def graph(t: float, x: np.ndarray) -> Graph:
+        return (
+            graphs.ring(SIZE) if t < 0.45 else Graph.from_edges(SIZE, np.zeros((0, 2)))
+        )
+
+    for rule in (
+        density.Flooding(),
+        density.PIConsensus(),
+        density.DynamicAverage(modes=30),
+    ):
         f = make(graph, rule)
         run = f.run(f.start(START), np.arange(1, 9) * 0.1, PATH.swapaxes(0, 1))
         sent = run["messages"].sum("agent").values
         assert (sent[:4] > 0).all() and (sent[4:] == 0).all()
         assert run["parts"].isel(agent=0).values.tolist() == [1] * 4 + [SIZE] * 4
-        assert np.isfinite(run["mean"].values).all() and np.allclose(run["mass"].values, 1)
+        assert np.isfinite(run["mean"].values).all() and np.allclose(
+            run["mass"].values, 1
+        )
 
 
 def test_the_sum_forgets_agents_that_drop_out() -> None:
     """Equation (26) and Remark 3: after a dropout Σ(y_i - z_i) over those left decays by
     1 - α h in each step, whatever the integrators of the others held.
     """
-    f = make(graphs.ring(SIZE), density.PIConsensus(b=0.4), initial_density=np.ones(100))
-    state, x = f.start(START), START.copy()
+    f = make(
+        graphs.ring(SIZE), density.PIConsensus(b=0.4), initial_density=np.ones(100)
+    )
+    state = f.start(START)
+    x = START.copy()
     for k in range(10):
         state = f.step(state, 0.1 * (k + 1), x)
     x[[2, 7]] = np.nan
@@ -147,12 +188,11 @@ def test_the_sum_forgets_agents_that_drop_out() -> None:
     assert np.abs(after - (1 - 0.2 * 0.1) ** 10 * before).max() < 1e-12
 
 
-
-
 def test_only_the_wanted_estimates_are_made() -> None:
     """Agents without a filter share as before; what the others learn does not change."""
     for rule in RULES.values():
-        everyone, few = last(make(0.5, rule)), last(make(0.5, rule, local=(7, 2)))
+        everyone = last(make(0.5, rule))
+        few = last(make(0.5, rule, local=(7, 2)))
         assert np.array_equal(everyone.ledger.scalars, few.ledger.scalars)
         assert np.array_equal(everyone.positions_sent, few.positions_sent)
         assert np.abs(everyone.observed[[7, 2]] - few.observed).max() < 1e-13
@@ -160,12 +200,16 @@ def test_only_the_wanted_estimates_are_made() -> None:
 
 
 def test_directed_graphs_flood_and_average() -> None:
-    one_way = Graph.from_edges(SIZE, [[i, (i - 1) % SIZE] for i in range(SIZE)], directed=True)
+    one_way = Graph.from_edges(
+        SIZE, [[i, (i - 1) % SIZE] for i in range(SIZE)], directed=True
+    )
     state = last(make(one_way, density.Flooding(), local=(3,)))
     assert (state.carried[0][3][:, 2] > 0).sum() == 9
     averaged = last(make(one_way, density.DynamicAverage(modes=None)))
     y = density.kernel_density(PATH[-1], GRID, bandwidth=H)
-    lossy = make(graphs.ring(SIZE), density.DynamicAverage(modes=None), faults=Faults(loss=0.3))
+    lossy = make(
+        graphs.ring(SIZE), density.DynamicAverage(modes=None), faults=Faults(loss=0.3)
+    )
     for rule in (averaged, last(lossy)):
         assert np.abs(rule.observed.mean(axis=0) - y).max() < 1e-12
     with pytest.raises(ValueError, match="both ways"):
@@ -183,7 +227,9 @@ def test_a_step_is_the_forms_step_with_the_noise_that_was_asked_for(
     state = f.step(start, 0.1, PATH[0])
 
     q = None if process is None else process * density.zero_mean_prior(GRID, rank=20)
-    moved = density.low_rank_predict(start.filters, MODEL.solver(0.0, 0.1), process=q, dt=0.1)
+    moved = density.low_rank_predict(
+        start.filters, MODEL.solver(0.0, 0.1), process=q, dt=0.1
+    )
     level = moved.estimates if noise == "forecast" else state.observed
     unit = density.kernel_constant(GRID, bandwidth=H, agents=SIZE)
     wanted = density.low_rank_step(moved, state.observed, unit * level.clip(0.7), 0.1)
@@ -207,7 +253,9 @@ def test_first_estimates() -> None:
     own = make(0.5, density.Flooding(), initial_density="observed").start(START)
     assert np.allclose(own.estimates, density.kernels(START, GRID, bandwidth=H))
     central = make(0.5, density.Centralised(), initial_density="observed").start(START)
-    assert np.allclose(central.estimates[3], density.kernel_density(START, GRID, bandwidth=H))
+    assert np.allclose(
+        central.estimates[3], density.kernel_density(START, GRID, bandwidth=H)
+    )
 
 
 def test_mass_can_change_where_the_prior_says_so() -> None:

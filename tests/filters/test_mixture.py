@@ -11,14 +11,15 @@ from distfilt.filters import FilterError, MixtureFilter
 from distfilt.mixtures import GaussianMixture, target_fusion
 from distfilt.models import Model, occulted, orbits
 from distfilt.network import graphs
-from distfilt.sensors import component, ephemeris, angles_only, stack
+from distfilt.sensors import angles_only, component, ephemeris, stack
 
 SMALL = Model(2, lambda x, t, dt: x, lambda t, dt: 0.1 * np.eye(2))
 BENT = Model(2, lambda x, t, dt: x + 0.3 * x**2, lambda t, dt: 0.01 * np.eye(2))
 OTHER = GaussianMixture.gaussian([1.2, 0.4], [[1.0, 0.4], [0.4, 1.0]])
 AGREE = partial(target_fusion, target_dim=1)
-TWO = MixtureFilter(SMALL, [component([0], std=0.5), None], graphs.path(2), target_dim=1,
-                    fusion=AGREE)
+TWO = MixtureFilter(
+    SMALL, [component([0], std=0.5), None], graphs.path(2), target_dim=1, fusion=AGREE
+)
 
 
 def test_splitting_improves_a_bent_forecast() -> None:
@@ -26,8 +27,14 @@ def test_splitting_improves_a_bent_forecast() -> None:
     x = prior.rvs(4000, rng=np.random.default_rng(1))
     moved = BENT.sample_step(x, 0.0, 1.0, rng=np.random.default_rng(2))
     scores = []
-    for options in ({}, {"split_threshold": 0.05}, {"split_threshold": 0.05, "split_scale": [1e-9, 1e-9]}):
-        f = MixtureFilter(BENT, [None], target_dim=1, n_components=15, max_components=15, **options)
+    for options in (
+        {},
+        {"split_threshold": 0.05},
+        {"split_threshold": 0.05, "split_scale": [1e-9, 1e-9]},
+    ):
+        f = MixtureFilter(
+            BENT, [None], target_dim=1, n_components=15, max_components=15, **options
+        )
         belief = f.step(f.start([prior]), 1.0, [None]).mixtures[0]
         scores.append(belief.log_density(moved).mean())
     assert scores[1] > scores[0] + 0.05 and scores[2] == scores[0]
@@ -42,7 +49,10 @@ def test_only_the_target_marginal_is_heard() -> None:
     # Nobody hears beyond its neighbours.
     three = MixtureFilter(SMALL, [None] * 3, graphs.path(3), target_dim=1, fusion=AGREE)
     far = GaussianMixture.gaussian([9.0, 0.0], np.eye(2))
-    a, b = (three.step(three.start([OTHER, OTHER, m]), 1.0, [None] * 3) for m in (OTHER, far))
+    a, b = (
+        three.step(three.start([OTHER, OTHER, m]), 1.0, [None] * 3)
+        for m in (OTHER, far)
+    )
     assert np.array_equal(a.mixtures[0].means, b.mixtures[0].means)
     assert not np.array_equal(a.mixtures[1].means, b.mixtures[1].means)
 
@@ -57,7 +67,9 @@ def in_orbit(target: np.ndarray, observer: np.ndarray, **options: object) -> tup
     see = stack([angles_only(std=1e-4, hidden=occulted), fix])
     f = MixtureFilter(orbits(2), [see], target_dim=6, **options)  # type: ignore[arg-type]
     cov = np.diag(np.tile([1.0, 1, 1, 0.1, 0.1, 0.1], 2))
-    return f, f.start([GaussianMixture.gaussian(np.concatenate([target, observer]), cov)])
+    return f, f.start(
+        [GaussianMixture.gaussian(np.concatenate([target, observer]), cov)]
+    )
 
 
 def test_a_reading_of_an_occulted_target_is_refused_and_a_missing_one_is_not() -> None:
@@ -65,9 +77,13 @@ def test_a_reading_of_an_occulted_target_is_refused_and_a_missing_one_is_not() -
     nothing = np.full(8, np.nan)
     angles = nothing.copy()
     angles[:2] = 0.1
-    with pytest.raises(FilterError, match="agent 0, t = .*: observed: needs a target that"):
+    with pytest.raises(
+        FilterError, match="agent 0, t = .*: observed: needs a target that"
+    ):
         f.step(state, 0.0, [angles])
-    assert np.array_equal(f.step(state, 0.0, [nothing]).mixtures[0].means, state.mixtures[0].means)
+    assert np.array_equal(
+        f.step(state, 0.0, [nothing]).mixtures[0].means, state.mixtures[0].means
+    )
     fix = nothing.copy()
     fix[2:] = -MEO
     after = f.step(state, 0.0, [fix]).mixtures[0]
@@ -77,7 +93,10 @@ def test_a_reading_of_an_occulted_target_is_refused_and_a_missing_one_is_not() -
 def test_an_agreement_that_loses_definiteness_is_refused() -> None:
     def broken(beliefs: list, channel: object) -> list:
         down = 10 * np.eye(2)
-        return [GaussianMixture.construct(b.weights, b.means, b.covs - down) for b in beliefs]
+        return [
+            GaussianMixture.construct(b.weights, b.means, b.covs - down)
+            for b in beliefs
+        ]
 
     f = MixtureFilter(SMALL, [None] * 2, graphs.path(2), target_dim=1, fusion=broken)
     with pytest.raises(FilterError, match="agent 0, t = 1 s: .*mixand 0 of 1 "):

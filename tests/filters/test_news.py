@@ -10,7 +10,12 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.stats import norm
 
-from distfilt.filters import GaussianFilter, MixtureFilter, InformationIncrementFilter, information_increment
+from distfilt.filters import (
+    GaussianFilter,
+    InformationIncrementFilter,
+    MixtureFilter,
+    information_increment,
+)
 from distfilt.kalman import kalman_filter
 from distfilt.mixtures import GaussianMixture
 from distfilt.models import Model
@@ -32,7 +37,9 @@ PRIOR = GaussianMixture.gaussian([1.0, -0.5, 0.2], block_diag(TARGET_COV, EGO_CO
 
 def network(agents: int, **options: object) -> InformationIncrementFilter:
     full = {"target_dim": 2, "shared_components": [1], **options}
-    return InformationIncrementFilter(MODEL, [EYE] * agents, graphs.complete(agents), **full)
+    return InformationIncrementFilter(
+        MODEL, [EYE] * agents, graphs.complete(agents), **full
+    )
 
 
 def joint(agents: int, readings: np.ndarray, speed: np.ndarray) -> tuple:
@@ -42,7 +49,8 @@ def joint(agents: int, readings: np.ndarray, speed: np.ndarray) -> tuple:
     p = block_diag(TARGET_COV, *[EGO_COV] * agents)
     f = block_diag(T, *[E] * agents)
     h = np.zeros((agents + 1, d))
-    h[:agents, 0], h[agents, 1] = 1.0, 1.0
+    h[:agents, 0] = 1.0
+    h[agents, 1] = 1.0
     h[:agents, 2:] = -np.eye(agents)
     r = np.diag(np.concatenate([np.full(agents, 0.3), [0.25]]))
     q = np.diag(np.concatenate([np.zeros(2), np.full(agents, 0.2)]))
@@ -51,8 +59,12 @@ def joint(agents: int, readings: np.ndarray, speed: np.ndarray) -> tuple:
     return exact.means[-1], exact.covariances[-1]
 
 
-@pytest.mark.parametrize(("agents", "exchange_interval"), [(2, None), (3, 2.0), (5, None)])
-def test_news_are_one_filter_with_everybodys_readings(agents: int, every: float | None) -> None:
+@pytest.mark.parametrize(
+    ("agents", "exchange_interval"), [(2, None), (3, 2.0), (5, None)]
+)
+def test_news_are_one_filter_with_everybodys_readings(
+    agents: int, every: float | None
+) -> None:
     rng = np.random.default_rng(agents)
     readings = rng.standard_normal((4, agents))
     readings[1, 0] = np.nan
@@ -70,10 +82,13 @@ def test_news_are_one_filter_with_everybodys_readings(agents: int, every: float 
 
 
 def test_what_all_receive_counts_twice_if_it_is_told() -> None:
-    readings, speed = np.full((1, 2), np.nan), np.array([0.4])
+    readings = np.full((1, 2), np.nan)
+    speed = np.array([0.4])
     _, p = joint(2, readings, speed)
     start = network(2).start([PRIOR] * 2)
-    once, twice = (network(2, common=c).step(start, 1.0, [[np.nan, 0.4]] * 2) for c in ([1], []))
+    once, twice = (
+        network(2, common=c).step(start, 1.0, [[np.nan, 0.4]] * 2) for c in ([1], [])
+    )
     assert np.allclose(once.mixtures[0].covs[0, :2, :2], p[:2, :2], atol=1e-10)
     assert once.ledger.scalars.sum() == 0
     told = np.linalg.inv(twice.mixtures[0].covs[0, :2, :2])
@@ -86,7 +101,8 @@ def test_an_increment_is_the_readings_that_taught_it(rank: int) -> None:
     rng = np.random.default_rng(rank)
     root = rng.standard_normal((4, 4))
     before = GaussianMixture.gaussian(rng.standard_normal(4), root @ root.T)
-    h, z = rng.standard_normal((rank, 4)), rng.standard_normal(rank)
+    h = rng.standard_normal((rank, 4))
+    z = rng.standard_normal(rank)
     p = before.covs[0]
     gain = p @ h.T @ np.linalg.inv(h @ p @ h.T + np.eye(rank))
     moved = before.means[0] + gain @ (z - h @ before.means[0])
@@ -104,7 +120,9 @@ def test_a_large_gain_does_not_hide_a_small_one() -> None:
     after = GaussianMixture.gaussian([2.0, -1.0, 0.0], np.diag([1e-10, 0.5, 1.0]))
     news = information_increment(before, after)
     assert news.shape == (2, 4)
-    assert np.allclose(news[:, :-1].T @ news[:, :-1], np.diag([1e10, 1.0, 0.0]), rtol=1e-6)
+    assert np.allclose(
+        news[:, :-1].T @ news[:, :-1], np.diag([1e10, 1.0, 0.0]), rtol=1e-6
+    )
     assert np.allclose(news[:, :-1].T @ news[:, -1], [2e10, -2.0, 0.0], rtol=1e-6)
 
 
@@ -123,7 +141,9 @@ def test_no_zero_is_sent(rank: int, numbers: int) -> None:
 def test_news_that_are_lost_leave_the_own_belief() -> None:
     seen = [[0.7, np.nan], [-0.4, np.nan]]
     deaf = network(2, faults=Faults(loss=1.0))
-    alone = MixtureFilter(MODEL, [EYE] * 2, target_dim=2, n_components=1, max_components=1)
+    alone = MixtureFilter(
+        MODEL, [EYE] * 2, target_dim=2, n_components=1, max_components=1
+    )
     a, b = (f.step(f.start([PRIOR] * 2), 1.0, seen) for f in (deaf, alone))
     for x, y in zip(a.mixtures, b.mixtures, strict=True):
         assert np.allclose(x.covs, y.covs) and np.allclose(x.means, y.means)
@@ -132,8 +152,14 @@ def test_news_that_are_lost_leave_the_own_belief() -> None:
 
 def test_mixands_are_weighed_by_the_news() -> None:
     still = Model(1, lambda x, t, dt: x, lambda t, dt: np.zeros((1, 1)))
-    f = InformationIncrementFilter(still, [component([0], std=1.0), None], graphs.path(2), target_dim=1, n_components=2,
-                   max_components=2)
+    f = InformationIncrementFilter(
+        still,
+        [component([0], std=1.0), None],
+        graphs.path(2),
+        target_dim=1,
+        n_components=2,
+        max_components=2,
+    )
     prior = GaussianMixture([0.3, 0.7], [[-2.0], [1.0]], [[[1.0]], [[2.0]]])
     one = GaussianMixture.gaussian([0.0], [[3.0]])
     after = f.step(f.start([one, prior]), 1.0, [[0.5], None]).mixtures[1]
@@ -149,18 +175,32 @@ def test_a_gated_reading_is_no_news() -> None:
     after = f.step(f.start([PRIOR] * 2), 1.0, [[500.0, np.nan], None])
     assert after.ledger.scalars.sum() == 0
     # Of a sum that both receive only who has read the first component expects so much.
-    still, sums = Model(2, lambda x, t, dt: x, lambda t, dt: 0 * TARGET_COV), np.tri(2)
+    still = Model(2, lambda x, t, dt: x, lambda t, dt: 0 * TARGET_COV)
+    sums = np.tri(2)
     eye = Sensor(2, lambda x: x @ sums.T, np.diag([0.09, 0.2]))
-    f = InformationIncrementFilter(still, [eye] * 2, graphs.path(2), target_dim=2, shared_components=[1], gate_probability=0.95)
-    start, y = f.start((np.zeros(2), np.eye(2))), [[1.2, 3.0]] * 2
-    a, b = (g.step(g.step(start, 1.0, y), 2.0, [None] * 2) for g in (f, replace(f, exchange_interval=2.0)))
+    f = InformationIncrementFilter(
+        still,
+        [eye] * 2,
+        graphs.path(2),
+        target_dim=2,
+        shared_components=[1],
+        gate_probability=0.95,
+    )
+    start = f.start((np.zeros(2), np.eye(2)))
+    y = [[1.2, 3.0]] * 2
+    a, b = (
+        g.step(g.step(start, 1.0, y), 2.0, [None] * 2)
+        for g in (f, replace(f, exchange_interval=2.0))
+    )
     assert np.allclose(a.mixtures[0].covs, b.mixtures[0].covs, atol=1e-12)
     with pytest.raises(ValueError, match="common: needs noise of its own"):
         replace(f, sensors=[eye.replace(noise_cov=TARGET_COV)] * 2).step(start, 1.0, y)
 
 
 def test_everybody_hears_only_neighbours() -> None:
-    f = InformationIncrementFilter(MODEL, [EYE] * 3, graphs.path(3), target_dim=2, shared_components=[1])
+    f = InformationIncrementFilter(
+        MODEL, [EYE] * 3, graphs.path(3), target_dim=2, shared_components=[1]
+    )
     step = partial(f.step, f.start([PRIOR] * 3), 1.0)
     a, b = (step([[0.1, np.nan], None, [y, np.nan]]) for y in (0.2, 9.0))
     assert np.array_equal(a.mixtures[0].means, b.mixtures[0].means)
@@ -181,14 +221,26 @@ def test_a_target_that_moves_with_noise_needs_readings_in_place_of_news(
     prior = GaussianMixture.gaussian([0.0, 0.0], np.diag([4.0, 1.0]))
     news = InformationIncrementFilter(own, [alone] * 2, graphs.path(2), target_dim=1)
     all_ = Model(3, lambda x, t, dt: x, lambda t, dt: np.diag([q, 0.0, 0.0]))
-    eyes = [Sensor(1, lambda x, a=a: x[..., :1] - x[..., a : a + 1], [[0.3]]) for a in (1, 2)]
+    eyes = [
+        Sensor(1, lambda x, a=a: x[..., :1] - x[..., a : a + 1], [[0.3]])
+        for a in (1, 2)
+    ]
     told = GaussianFilter(all_, eyes, graphs.path(2))
-    one, both = news.start([prior] * 2), told.start((np.zeros(3), np.diag([4.0, 1.0, 1.0])))
+    one = news.start([prior] * 2)
+    both = told.start((np.zeros(3), np.diag([4.0, 1.0, 1.0])))
     for k, y in enumerate(readings):
-        one, both = news.step(one, k + 1.0, y[:, None]), told.step(both, k + 1.0, y[:, None])
+        one = news.step(one, k + 1.0, y[:, None])
+        both = told.step(both, k + 1.0, y[:, None])
     h = np.array([[1.0, -1.0, 0.0], [1.0, 0.0, -1.0]])
-    exact = kalman_filter(np.zeros(3), np.diag([4.0, 1.0, 1.0]), readings, F=np.eye(3), H=h,
-                          Q=np.diag([q, 0.0, 0.0]), R=0.3 * np.eye(2))
+    exact = kalman_filter(
+        np.zeros(3),
+        np.diag([4.0, 1.0, 1.0]),
+        readings,
+        F=np.eye(3),
+        H=h,
+        Q=np.diag([q, 0.0, 0.0]),
+        R=0.3 * np.eye(2),
+    )
     assert np.allclose(both.means, exact.means[-1]) and both.ledger.scalars.sum() == 20
     assert np.allclose(both.covariances, exact.covariances[-1])
     variances = one.mixtures[0].covs[0, 0, 0], both.covariances[0, 0, 0]

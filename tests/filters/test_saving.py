@@ -30,7 +30,9 @@ def kept(rng: np.random.Generator | None) -> Kept:
     sent = np.array([3, 4])
     ledger = Ledger(1, sent, 5 * sent, 40 * sent, np.array([0.5, 0.0]))
     nested = ((0.1, np.arange(3.0)), (0.2, np.array([np.nan, np.inf, -0.0])))
-    return Kept(1.5, ledger, rng, 7, "a b", nested, None, True, np.array([1, 2], dtype=np.int32))
+    return Kept(
+        1.5, ledger, rng, 7, "a b", nested, None, True, np.array([1, 2], dtype=np.int32)
+    )
 
 
 @pytest.mark.parametrize("kind", ["PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64"])
@@ -75,7 +77,8 @@ def test_a_twin_with_the_same_fields_is_another_kind(tmp_path: Path) -> None:
 
     for made, asked in ((Twin, EnsembleState), (EnsembleState, Twin)):
         made(0.0, Ledger.empty(1), np.random.default_rng(0), np.zeros((1, 2, 1))).save(
-            tmp_path / "a.npz")
+            tmp_path / "a.npz"
+        )
         assert made.load(tmp_path / "a.npz").ensembles.shape == (1, 2, 1)
         with pytest.raises(ValueError, match=f"needs a saved {asked.__name__}"):
             asked.load(tmp_path / "a.npz")

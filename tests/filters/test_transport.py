@@ -11,7 +11,7 @@ import pytest
 
 from distfilt.coupling import transform_ensemble
 from distfilt.coupling.transform import transport_plans
-from distfilt.filters import ParticleCollapse, Observation, TransportFilter
+from distfilt.filters import Observation, ParticleCollapse, TransportFilter
 from distfilt.filters.ensemble import EnsembleState
 from distfilt.linalg import SolverError
 from distfilt.network import Graph, average_consensus, graphs
@@ -20,13 +20,17 @@ from distfilt.sensors import Sensor, component, stack
 from .families import NOISE, PRIOR, TIMES, data, model
 
 FOUR: list[Sensor | None] = [
-    component([0], std=0.6), component([1], std=0.5), Sensor(2, lambda x: x, NOISE), component([0], std=0.8),
+    component([0], std=0.6),
+    component([1], std=0.5),
+    Sensor(2, lambda x: x, NOISE),
+    component([0], std=0.8),
 ]
 
 
 def _filter(**options: Any) -> TransportFilter:
     options = {"members": 30} | options
-    sensors, graph = options.pop("sensors", FOUR), options.pop("graph", graphs.ring(4))
+    sensors = options.pop("sensors", FOUR)
+    graph = options.pop("graph", graphs.ring(4))
     return TransportFilter(model(), sensors, graph, **options)
 
 
@@ -36,7 +40,9 @@ def _start(f: TransportFilter, runs: tuple[int, ...] = ()) -> EnsembleState:
 
 def _central(state: EnsembleState, seen: list[Any], steps: int) -> np.ndarray:
     """One agent with all sensors, written out; it draws what every agent draws."""
-    x, rng, t = state.ensembles[0], state.rng, state.t
+    x = state.ensembles[0]
+    rng = state.rng
+    t = state.t
     assert rng is not None
     whole = stack([s for s in FOUR if s is not None])
     weight = np.linalg.inv(whole.noise_cov)
@@ -74,7 +80,8 @@ def test_only_log_likelihoods_are_sent() -> None:
 
 
 def test_an_agent_whom_nobody_hears_counts_its_own_reading_once() -> None:
-    f, y = _filter(graph=Graph.from_edges(4, [])), [[0.3], [1.0], [0.5, 0.2], [-0.4]]
+    f = _filter(graph=Graph.from_edges(4, []))
+    y = [[0.3], [1.0], [0.5, 0.2], [-0.4]]
     apart = f.step(_start(f), 0.5, y).ensembles
     for k in range(4):
         one = _filter(sensors=FOUR[k : k + 1], graph=None)
@@ -82,7 +89,9 @@ def test_an_agent_whom_nobody_hears_counts_its_own_reading_once() -> None:
         assert np.allclose(alone, apart[k], atol=1e-13)
     f = _filter(graph=lambda t: graphs.ring(4) if t > 0.7 else Graph.from_edges(4, []))
     for now, late in ((y, []), ([None] * 4, [Observation(0.5, 0, [0.3])])):
-        with pytest.raises(ValueError, match="graph: needs links for the readings of t = 0.6"):
+        with pytest.raises(
+            ValueError, match="graph: needs links for the readings of t = 0.6"
+        ):
             replace(f, lag=1).step(_start(f).replace(t=0.5), 0.6, now, delayed=late)
 
 
@@ -103,24 +112,35 @@ def test_a_late_reading_weighs_all_times_with_one_coupling() -> None:
     state = f.step(state, 0.5, [None] * 4)
     before = state.ensembles[0]
     plain = f.step(state, 1.0, [None] * 4).ensembles[0]
-    after = f.step(state, 1.0, [None, None, None, [0.4]], delayed=[Observation(0.5, 0, [1.3])])
-    logs = -0.5 * ((1.3 - before[:, 0]) / 0.6) ** 2 - 0.5 * ((0.4 - plain[:, 0]) / 0.8) ** 2
+    after = f.step(
+        state, 1.0, [None, None, None, [0.4]], delayed=[Observation(0.5, 0, [1.3])]
+    )
+    logs = (
+        -0.5 * ((1.3 - before[:, 0]) / 0.6) ** 2
+        - 0.5 * ((0.4 - plain[:, 0]) / 0.8) ** 2
+    )
     w = np.exp(logs - logs.max())
     w /= w.sum()
     assert np.allclose(after.ensembles[2], transform_ensemble(plain, logs), atol=1e-11)
     assert np.allclose(after.history[-1][1][1].mean(axis=0), w @ before, atol=1e-12)
 
 
-def test_weights_of_a_run_that_failed_are_no_collapse(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_of_a_run_that_failed_are_no_collapse(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def wary(x: np.ndarray, logs: np.ndarray) -> np.ndarray:
         if np.ptp(logs, axis=-1).max() > 1e4:
             raise SolverError("too far")
         return transport_plans(x, logs)
 
     monkeypatch.setattr("distfilt.filters.ensemble.transport_plans", wary)
-    f = TransportFilter(model(), [component([0], std=0.6)], None, members=30, on_error="keep")
+    f = TransportFilter(
+        model(), [component([0], std=0.6)], None, members=30, on_error="keep"
+    )
     start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(2,))
-    with pytest.warns(ParticleCollapse, match="squared distance from an ensemble's belief"):
+    with pytest.warns(
+        ParticleCollapse, match="squared distance from an ensemble's belief"
+    ):
         assert f.step(start, 0.5, [[[0.3], [3e4]]]).failed.tolist() == [False, True]
 
 
@@ -130,4 +150,6 @@ def test_a_step_without_any_reading_moves_nothing() -> None:
     out = f.step(state, 0.5, [None] * 4)
     rng = _start(f).rng
     assert rng is not None
-    assert (out.ensembles[0] == model().sample_step(state.ensembles[0], 0.0, 0.5, rng=rng)).all()
+    assert (
+        out.ensembles[0] == model().sample_step(state.ensembles[0], 0.0, 0.5, rng=rng)
+    ).all()

@@ -7,7 +7,10 @@ import numpy as np
 from distfilt.models import LinearModel
 from tests.support import spd
 
-STEPS, RUNS, D, M = 7, 4, 3, 2
+STEPS = 7
+RUNS = 4
+D = 3
+M = 2
 
 
 def problem(
@@ -24,4 +27,6 @@ def problem(
 
 
 def walk(d: int = 1) -> LinearModel:
-    return LinearModel.from_transition(d, lambda dt: np.eye(d), lambda t, dt: dt * np.eye(d))
+    return LinearModel.from_transition(
+        d, lambda dt: np.eye(d), lambda t, dt: dt * np.eye(d)
+    )

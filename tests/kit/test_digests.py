@@ -14,19 +14,27 @@ from matplotlib.figure import Figure
 
 from bookkit.digests import digest, of_axes
 
-CURVES = st.lists(st.floats(-1e6, 1e6).map(lambda v: round(v, 3)), min_size=1, max_size=60)
+CURVES = st.lists(
+    st.floats(-1e6, 1e6).map(lambda v: round(v, 3)), min_size=1, max_size=60
+)
 
 
-@settings(derandomize=True)  # a number may lie 1e-9 from a tie, by a chance of 1e-5 a number
+@settings(
+    derandomize=True
+)  # a number may lie 1e-9 from a tie, by a chance of 1e-5 a number
 @given(CURVES, st.integers(0, 2**32 - 1))
 def test_digest_survives_rounding(values, seed):
     curve = np.array(values)
     noise = np.random.default_rng(seed).uniform(-1, 1, curve.size)
     assert digest(curve=curve * (1 + 1e-9 * noise)) == digest(curve=curve)
-    assert digest(curve=curve + 1e-16 * np.abs(curve).max() * noise) == digest(curve=curve)
+    assert digest(curve=curve + 1e-16 * np.abs(curve).max() * noise) == digest(
+        curve=curve
+    )
 
 
-@pytest.mark.parametrize("value", [1.0, 10.0, 1e-3, 0.12345, 12.345, 1.0005, 9.9995, -2.5e7, 1e-9])
+@pytest.mark.parametrize(
+    "value", [1.0, 10.0, 1e-3, 0.12345, 12.345, 1.0005, 9.9995, -2.5e7, 1e-9]
+)
 def test_digest_is_steady_at_round_numbers(value):
     curve = np.array([value, 0.3 * value, -0.7 * value, 1.0])
     texts = {digest(c=curve * (1 + e)) for e in (0.0, 1e-9, -1e-9, 1e-13, -1e-13)}
@@ -36,22 +44,36 @@ def test_digest_is_steady_at_round_numbers(value):
 def test_digest_sees_order_sign_and_size():
     t = np.linspace(0, 6, 200)
     curve = np.sin(t)
-    for other in (curve[::-1], -curve, 1.001 * curve, curve + 0.001, np.sin(t + 0.01), curve[:-1]):
+    for other in (
+        curve[::-1],
+        -curve,
+        1.001 * curve,
+        curve + 0.001,
+        np.sin(t + 0.01),
+        curve[:-1],
+    ):
         assert digest(c=curve) != digest(c=other)
-    swapped, bumped = curve.copy(), curve.copy()
+    swapped = curve.copy()
+    bumped = curve.copy()
     swapped[[40, 60]] = swapped[[60, 40]]  # same range, mean and parity
     bumped[100] += 0.02
     assert len({digest(c=curve), digest(c=swapped), digest(c=bumped)}) == 3
 
 
 def test_digest_text():
-    assert digest(a=[], b=np.zeros(3)) == ("a: 0 values\nb: 3 values, 0..0, mean 0, projection 0")
+    assert digest(a=[], b=np.zeros(3)) == (
+        "a: 0 values\nb: 3 values, 0..0, mean 0, projection 0"
+    )
     assert digest(a=[np.nan, np.nan]) == "a: 2 values, 2 NaN"
     text = digest(a=[1.0, np.nan, np.inf, 2.0])
-    assert text.endswith("1 NaN, 1 infinite") and text.startswith("a: 4 values, 1..2, mean 1.5,")
+    assert text.endswith("1 NaN, 1 infinite") and text.startswith(
+        "a: 4 values, 1..2, mean 1.5,"
+    )
     assert digest(a=[np.nan, 1.0, np.inf, 2.0]) != text
     assert "mean 0," in digest(a=np.sin(np.linspace(0, 2 * np.pi, 101)[:-1]))
-    assert digest(a=np.array([123456, 234567])).startswith("a: 2 values, 1.235e+05..2.346e+05")
+    assert digest(a=np.array([123456, 234567])).startswith(
+        "a: 2 values, 1.235e+05..2.346e+05"
+    )
 
 
 def test_digest_is_the_documented_projection():
@@ -81,7 +103,9 @@ def picture(change: str = "") -> Figure:
     left.plot(scale["times"] * T, np.sin(2 * T), visible=change != "hidden curve")
     left.bar([1, 2, 3], [2.0, scale["bar"] * 5.0, 4.0])
     left.fill_between(T, np.sin(T), scale["band"] * (2 + np.cos(T)))
-    left.add_patch(matplotlib.patches.Ellipse((0, 0), scale["ellipse"] * 3.0, 1.0, angle=30))
+    left.add_patch(
+        matplotlib.patches.Ellipse((0, 0), scale["ellipse"] * 3.0, 1.0, angle=30)
+    )
     left.inset_axes([0.6, 0.6, 0.3, 0.3]).plot(T, scale["inset"] * T**2)
     if change != "missing points":
         right.scatter(T, scale["points"] * T**2, c=scale["colours"] * np.cos(T))
@@ -96,9 +120,23 @@ def picture(change: str = "") -> Figure:
 
 
 CHANGED = [
-    "small curve", "times", "bar", "band", "ellipse", "inset", "points", "colours", "one point",
-    "arrows", "levels", "mesh", "image", "extent", "bars of error", "rules",
-]  # fmt: skip
+    "small curve",
+    "times",
+    "bar",
+    "band",
+    "ellipse",
+    "inset",
+    "points",
+    "colours",
+    "one point",
+    "arrows",
+    "levels",
+    "mesh",
+    "image",
+    "extent",
+    "bars of error",
+    "rules",
+]
 
 
 def test_one_changed_artist_changes_the_text():
@@ -127,8 +165,12 @@ def test_text_of_each_kind():
     lines = of_axes(axes).splitlines()
     assert lines[0] == "axes 1: 2 lines, 2 patches, 1 image"
     assert lines[1].startswith("line 1 x: 2 values, 0..1, mean 0.5,")
-    assert lines[2].startswith("line 1 y: 2 values, 2..2,") and lines[2].endswith("1 NaN")
-    assert lines[3].startswith("line 2 y: 2 values, 5..7,")  # x is that of the line before
+    assert lines[2].startswith("line 1 y: 2 values, 2..2,") and lines[2].endswith(
+        "1 NaN"
+    )
+    assert lines[3].startswith(
+        "line 2 y: 2 values, 5..7,"
+    )  # x is that of the line before
     assert lines[4].startswith("patch 1-2 x: 10 values, 0.5..3.5,")
     assert lines[5].startswith("patch 1-2 y: 10 values, 0..4,")
     assert lines[6].startswith("image 1 value: 4 values, 1..3,") and "1 NaN" in lines[6]

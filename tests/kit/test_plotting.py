@@ -19,7 +19,16 @@ from matplotlib import pyplot
 from matplotlib.colors import to_rgb
 
 from bookkit import plotting
-from bookkit.plotting import PALETTE, SIZE, axes, colour, graph, line_style, slider, use_style
+from bookkit.plotting import (
+    PALETTE,
+    SIZE,
+    axes,
+    colour,
+    graph,
+    line_style,
+    slider,
+    use_style,
+)
 from bookkit.tables import ResultTable
 
 
@@ -46,34 +55,46 @@ PAIR = [[0, 1], [1, 0]]
 
 # --- figures ----------------------------------------------------------------------------------
 
+
 def test_colour_and_style_pairs_repeat_late():
     assert len({(colour(k), str(line_style(k))) for k in range(40)}) == 40
-    assert len(set(PALETTE)) == 8 and len({str(line_style(8 * k)) for k in range(5)}) == 5
+    assert (
+        len(set(PALETTE)) == 8 and len({str(line_style(8 * k)) for k in range(5)}) == 5
+    )
 
 
 def test_axes_are_labelled_with_units():
     ax = axes(xlabel="time", xunit="s", ylabel="error", title="Runs", yscale="log")
-    assert (ax.get_xlabel(), ax.get_ylabel(), ax.get_title()) == ("time (s)", "error", "Runs")
+    assert (ax.get_xlabel(), ax.get_ylabel(), ax.get_title()) == (
+        "time (s)",
+        "error",
+        "Runs",
+    )
     assert ax.get_yscale() == "log" and tuple(ax.figure.get_size_inches()) == SIZE
     again = axes(xlabel="lag", ylabel="error", ax=ax)
     assert again is ax and ax.get_xlabel() == "lag"
 
 
 def test_ellipse_holds_its_share():
-    cov, mean = np.array([[4.0, 1.5], [1.5, 1.0]]), np.array([3.0, -2.0])
+    cov = np.array([[4.0, 1.5], [1.5, 1.0]])
+    mean = np.array([3.0, -2.0])
     ax = plotting.ellipse(blank(), mean, cov, level=0.8, index=1, label="A")
     outline = ax.lines[0].get_xydata() - mean
     squared = (outline * np.linalg.solve(cov, outline.T).T).sum(axis=1)
     assert np.allclose(squared, -2 * np.log(0.2), rtol=1e-10)
     assert ax.lines[0].get_color() == PALETTE[1] and ax.lines[0].get_label() == "A"
     assert ax.lines[1].get_xydata().tolist() == [mean.tolist()]
-    line = plotting.ellipse(blank(), mean, [[4.0, 0.0], [0.0, 0.0]]).lines[0].get_xydata()
+    line = (
+        plotting.ellipse(blank(), mean, [[4.0, 0.0], [0.0, 0.0]]).lines[0].get_xydata()
+    )
     assert np.allclose(line[:, 1], -2.0) and np.ptp(line[:, 0]) > 9
 
 
 def test_band_shows_median_and_quantiles():
     runs = np.random.default_rng(0).standard_normal((101, 7))
-    ax = plotting.band(blank(), np.arange(7), runs, quantiles=(0.05, 0.95), index=2, label="runs")
+    ax = plotting.band(
+        blank(), np.arange(7), runs, quantiles=(0.05, 0.95), index=2, label="runs"
+    )
     ordered = np.sort(runs, axis=0)
     assert np.allclose(ax.lines[0].get_ydata(), ordered[50])
     edges = ax.collections[0].get_paths()[0].vertices[:, 1]
@@ -115,25 +136,37 @@ def found_in(html):
 def test_a_slider_holds_its_frames_and_nothing_else():
     use_style()
     assert tuple(matplotlib.rcParams["figure.figsize"]) == SIZE
-    assert matplotlib.rcParams["figure.dpi"] == matplotlib.rcParams["savefig.dpi"] == 110
+    assert (
+        matplotlib.rcParams["figure.dpi"] == matplotlib.rcParams["savefig.dpi"] == 110
+    )
     assert matplotlib.rcParams["axes.prop_cycle"].by_key()["color"] == list(PALETTE)
     rates = [0.0, 0.5, 1.0, 2.0]
-    found = slider(curve, rates, label="rate", unit="1/s", alt="A curve <falls>.", start=2)
+    found = slider(
+        curve, rates, label="rate", unit="1/s", alt="A curve <falls>.", start=2
+    )
     assert found.labels == ("rate 0 1/s", "rate 0.5 1/s", "rate 1 1/s", "rate 2 1/s")
     assert len(set(found.frames)) == 4 and not pyplot.get_fignums()
     find, data = found_in(found.html)
-    (image,), (knob,) = find("img"), find("input")
+    (image,) = find("img")
+    (knob,) = find("input")
     assert image["alt"] == "A curve <falls>. rate 1 1/s."
     first = base64.b64decode(image["src"].removeprefix("data:image/webp;base64,"))
     assert first == found.frames[2] and first[8:12] == b"WEBP"
     shown = Image.open(io.BytesIO(first))
     assert shown.size == tuple(2 * n for n in found.size)
     assert [image["width"], image["height"]] == [str(n) for n in found.size]
-    assert (knob["type"], knob["min"], knob["max"], knob["value"]) == ("range", "0", "3", "2")
+    assert (knob["type"], knob["min"], knob["max"], knob["value"]) == (
+        "range",
+        "0",
+        "3",
+        "2",
+    )
     assert knob["aria-label"] == "rate" and len(find("button")) == 1
     assert [base64.b64decode(f) for f in data["frames"]] == list(found.frames)
     assert data["said"] == list(found.labels) and data["milliseconds"] == 500
-    assert "http" not in found.html and not any("src" in s.attrs for s in find("script"))
+    assert "http" not in found.html and not any(
+        "src" in s.attrs for s in find("script")
+    )
     assert len(found.html) < 100_000
     bundle = found._repr_mimebundle_()
     assert set(bundle) == {"text/plain", "text/html", "image/png"}
@@ -144,10 +177,13 @@ def test_a_slider_holds_its_frames_and_nothing_else():
 def test_a_slider_drawn_twice_is_the_same_page_and_notices_a_changed_frame():
     use_style()
     made = [
-        slider(curve, [0.5, last], label="rate", alt="A curve.") for last in (1.0, 1.0, 1.01, 0.99)
+        slider(curve, [0.5, last], label="rate", alt="A curve.")
+        for last in (1.0, 1.0, 1.01, 0.99)
     ]
     assert made[0].html == made[1].html and len({repr(s) for s in made}) == 3
-    assert len({re.search('data-frames="([0-9a-f]{16})"', s.html)[1] for s in made}) == 3
+    assert (
+        len({re.search('data-frames="([0-9a-f]{16})"', s.html)[1] for s in made}) == 3
+    )
 
 
 def test_texts_of_a_slider_cannot_end_its_script():
@@ -157,10 +193,19 @@ def test_texts_of_a_slider_cannot_end_its_script():
 
 
 def test_a_table_marks_the_best_number_in_the_form_that_is_asked_for():
-    frame = pd.DataFrame({"m": [0.523, np.nan, 0.404], "rule": ["a<b", "c", "d"]}, index=[*"xyz"])
+    frame = pd.DataFrame(
+        {"m": [0.523, np.nan, 0.404], "rule": ["a<b", "c", "d"]}, index=[*"xyz"]
+    )
     found = ResultTable(frame, form={"m": ".2f"}, best={"m": "min"}, caption="Error")
     page = BeautifulSoup(found._repr_html_(), "html.parser")
     rows = [[c.text for c in row.find_all(["th", "td"])] for row in page.find_all("tr")]
-    assert rows == [["", "m", "rule"], ["x", "0.52", "a<b"], ["y", "nan", "c"], ["z", "0.40", "d"]]
-    assert [b.text for b in page.find_all("b")] == ["0.40"] and page.caption.text == "Error"
+    assert rows == [
+        ["", "m", "rule"],
+        ["x", "0.52", "a<b"],
+        ["y", "nan", "c"],
+        ["z", "0.40", "d"],
+    ]
+    assert [b.text for b in page.find_all("b")] == [
+        "0.40"
+    ] and page.caption.text == "Error"
     assert repr(found).split() == ["Error", *rows[0][1:], *rows[1], *rows[2], *rows[3]]

@@ -26,8 +26,16 @@ from bookkit.rows import markdown_table
 
 S = scenario("grange", "table-2")
 CHANGED = S.replace(gain=0.1)
-ROWS = [{"name": a.name, "dims": a.dims, "kind": a.kind, "noise": a.noise,
-         "neighbours": a.neighbours} for a in S.agents]  # fmt: skip
+ROWS = [
+    {
+        "name": a.name,
+        "dims": a.dims,
+        "kind": a.kind,
+        "noise": a.noise,
+        "neighbours": a.neighbours,
+    }
+    for a in S.agents
+]
 CLAIMS = [
     Claim("without-pca-unstable", "share", True, "0.4 [0.3, 0.5]"),
     Claim("pca-stable", "share", True, "0 [0, 0.04]"),
@@ -54,14 +62,20 @@ def test_every_published_file_is_of_an_item_and_lists_its_claims() -> None:
 
 def test_a_table_is_kept_cell_by_cell() -> None:
     rows = table("grange", "table-2")
-    assert rows[1] == {"name": "B", "dims": "[1, 2]", "kind": "angle", "noise": "0.2",
-                       "neighbours": "[A,B]"}  # fmt: skip
+    assert rows[1] == {
+        "name": "B",
+        "dims": "[1, 2]",
+        "kind": "angle",
+        "noise": "0.2",
+        "neighbours": "[A,B]",
+    }
 
 
 def test_the_data_are_those_of_the_working_copy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    own, deep = data_root(), tmp_path / "book" / "deep"
+    own = data_root()
+    deep = tmp_path / "book" / "deep"
     for folder in (tmp_path / "data" / "published", deep):
         folder.mkdir(parents=True)
     monkeypatch.chdir(deep)
@@ -87,15 +101,23 @@ GOOD = 'title = "A study"\n' + GAIN + AGENT.format("A") + AGENT.format("B")
     [
         ("value = 0.05", "value =", r"its form: .*line 3"),
         ("assumed", "given", r"\[parameters.gain\]: where: needs a text"),
-        ("neighbours = ['A', 'B']", "neighbours = ['A']", "agents: needs mutual neighbours"),
+        (
+            "neighbours = ['A', 'B']",
+            "neighbours = ['A']",
+            "agents: needs mutual neighbours",
+        ),
     ],
 )
-def test_a_fault_is_named_with_the_file(tmp_path: Path, old: str, new: str, words: str) -> None:
+def test_a_fault_is_named_with_the_file(
+    tmp_path: Path, old: str, new: str, words: str
+) -> None:
     (tmp_path / "some").mkdir()
     path = tmp_path / "some" / "study.toml"
     path.write_text(GOOD)
     found = read_scenario(path)
-    assert found["gain"] == 0.05 and found.changes == ("some/study is no scenario of the book",)
+    assert found["gain"] == 0.05 and found.changes == (
+        "some/study is no scenario of the book",
+    )
     path.write_text(GOOD.replace(old, new, 1))
     with pytest.raises(ValueError, match=f"^some/study.toml: (?s:.*){words}"):
         read_scenario(path)
@@ -125,32 +147,54 @@ def test_a_change_is_noticed_and_named() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "changes"),
     [
-        ('kind = "angle"\nnoise = 0.2\nunit = "rad"', 'kind = "range"\nnoise = 0.3\nunit = "m"',
-         ("agents.B.kind: range, not angle", "agents.B.noise: 0.3, not 0.2",
-          "agents.B.unit: m, not rad")),
+        (
+            'kind = "angle"\nnoise = 0.2\nunit = "rad"',
+            'kind = "range"\nnoise = 0.3\nunit = "m"',
+            (
+                "agents.B.kind: range, not angle",
+                "agents.B.noise: 0.3, not 0.2",
+                "agents.B.unit: m, not rad",
+            ),
+        ),
         ('where = "Section V.B, (18)"', 'where = "elsewhere"', ()),
-        ("[parameters.orbital_rate]", "[notes.orbital_rate]",
-         ("orbital_rate: absent, not 0.1 rad/s",)),
+        (
+            "[parameters.orbital_rate]",
+            "[notes.orbital_rate]",
+            ("orbital_rate: absent, not 0.1 rad/s",),
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_changed_file_is_noticed_by_its_values(
     tmp_path: Path, old: str, new: str, changes: tuple[str, ...]
 ) -> None:
-    text = (data_root() / "scenarios" / "grange" / "table-2.toml").read_text(encoding="utf-8")
+    text = (data_root() / "scenarios" / "grange" / "table-2.toml").read_text(
+        encoding="utf-8"
+    )
     path = tmp_path / "grange" / "table-2.toml"
     path.parent.mkdir()
     path.write_text(text.replace(old, new))
     other = read_scenario(path)
-    assert old in text and other.changes == changes and (other.digest == S.digest) == (not changes)
+    assert (
+        old in text
+        and other.changes == changes
+        and (other.digest == S.digest) == (not changes)
+    )
 
 
 def test_a_scenario_prints_every_parameter_and_its_reason() -> None:
-    text, page, markdown = " ".join(repr(S).split()), S._repr_html_(), S._repr_markdown_()
+    text = " ".join(repr(S).split())
+    page = S._repr_html_()
+    markdown = S._repr_markdown_()
     for p in (*S.parameters.values(), *S.notes.values()):
         assert p.name in text and f">{p.name}<" in page and f"| {p.name} |" in markdown
         assert p.source in markdown and p.why.replace("|", r"\|") in markdown
-    assert ">100, 0, 0, 10, 0.1, 0<" in page and ">A, B, C<" in page and "A, B, C" in text
-    assert len({len(line.split("|")) for line in markdown.split("\n\n")[0].splitlines()}) == 1
+    assert (
+        ">100, 0, 0, 10, 0.1, 0<" in page and ">A, B, C<" in page and "A, B, C" in text
+    )
+    assert (
+        len({len(line.split("|")) for line in markdown.split("\n\n")[0].splitlines()})
+        == 1
+    )
     assert markdown_table(["a"], [["x | \\y"]]).endswith(r"| x \| \\y |")
 
 
@@ -158,13 +202,19 @@ def test_a_scenario_prints_every_parameter_and_its_reason() -> None:
 
 
 def test_a_reading_remembers_what_was_taken() -> None:
-    one, two = S.reading(), S.reading()
+    one = S.reading()
+    two = S.reading()
     repr(one), one._repr_html_(), one.digest, one.changes
     first = one.agents[0]
-    assert first.dims == (0, 1) and first.get("noise") == 0.2 and first.where == "Table II"
+    assert (
+        first.dims == (0, 1) and first.get("noise") == 0.2 and first.where == "Table II"
+    )
     travelled = pickle.loads(pickle.dumps(one))
-    assert one.cells() == [{"name": "A", "dims": (0, 1), "noise": 0.2}, {"name": "B"},
-                           {"name": "C"}] == travelled.cells()  # fmt: skip
+    assert (
+        one.cells()
+        == [{"name": "A", "dims": (0, 1), "noise": 0.2}, {"name": "B"}, {"name": "C"}]
+        == travelled.cells()
+    )
     assert two.cells()[0] == {"name": "A"}
     assert (one.adjacency == S.adjacency).all() and "neighbours" in one.cells()[2]
 
@@ -176,11 +226,15 @@ def used(study: Scenario) -> Scenario:
     return study
 
 
-@pytest.mark.parametrize(("item", "name"), [("Table II", "table-2"), ("Table III", "table-3")])
+@pytest.mark.parametrize(
+    ("item", "name"), [("Table II", "table-2"), ("Table III", "table-3")]
+)
 def test_what_a_study_took_is_read_as_printed(item: str, name: str) -> None:
     found = judge_parameters("grange", item, used(scenario("grange", name).reading()))
     assert (found.verdict, found.why) == ("read", "")
-    assert judge_parameters("grange", item, table("grange", name)[::-1]).verdict == "read"
+    assert (
+        judge_parameters("grange", item, table("grange", name)[::-1]).verdict == "read"
+    )
 
 
 def test_a_cell_that_no_study_took_is_not_read() -> None:
@@ -206,9 +260,13 @@ def test_a_cell_that_no_study_took_is_not_read() -> None:
 def test_rows_of_what_ran_are_judged_to_the_first_difference(
     change: dict[str, Any], why: str
 ) -> None:
-    found = judge_parameters("grange", "Table II", [ROWS[0], {**ROWS[1], **change}, ROWS[2]])
+    found = judge_parameters(
+        "grange", "Table II", [ROWS[0], {**ROWS[1], **change}, ROWS[2]]
+    )
     assert (found.verdict, found.why) == ("differs" if why else "read", why)
-    assert judge_parameters("grange", "Table II", ROWS[:2]).why.startswith("row C is printed")
+    assert judge_parameters("grange", "Table II", ROWS[:2]).why.startswith(
+        "row C is printed"
+    )
     extra = judge_parameters("grange", "Table II", [*ROWS, {**ROWS[0], "name": "D"}])
     assert extra.why == "row D was read but is not printed"
 
@@ -232,24 +290,34 @@ def test_every_claim_has_to_hold() -> None:
     assert "pca-stable fails" in differs.ours
     with pytest.raises(ValueError, match="^why: needs a reason"):
         judge_claims("grange", "Fig. 1", DENIED)
-    for claims in (CLAIMS[:2], [*CLAIMS, CLAIMS[2]], [*CLAIMS[:2], CLAIMS[2]._replace(id="other")]):
+    for claims in (
+        CLAIMS[:2],
+        [*CLAIMS, CLAIMS[2]],
+        [*CLAIMS[:2], CLAIMS[2]._replace(id="other")],
+    ):
         with pytest.raises(ValueError, match="^claims: needs those of grange Fig. 1"):
             judge_claims("grange", "Fig. 1", claims)
 
 
 def test_a_rule_that_its_null_passes_too_shows_nothing() -> None:
     def below(limit: float) -> Claim:
-        return Claim.from_rule("pca-stable", "share", lambda s: s < limit, 0.02, 0.3, "a coin")
+        return Claim.from_rule(
+            "pca-stable", "share", lambda s: s < limit, 0.02, 0.3, "a coin"
+        )
 
-    verdicts = [judge_claims("grange", "Fig. 1", [CLAIMS[0], below(x), CLAIMS[2]], why="high")
-                for x in (0.1, 0.5, 0.01)]  # fmt: skip
+    verdicts = [
+        judge_claims("grange", "Fig. 1", [CLAIMS[0], below(x), CLAIMS[2]], why="high")
+        for x in (0.1, 0.5, 0.01)
+    ]
     assert [v.verdict for v in verdicts] == ["match", "not comparable", "differs"]
     assert ["holds too" in v.null for v in verdicts] == [False, True, False]
     assert verdicts[1].why == "the rule of pca-stable holds for its null too"
     swept = below(0.1)._replace(range="for gains from .1 on")
     verdict = judge_claims("grange", "Fig. 1", [CLAIMS[0], swept, CLAIMS[2]])
     assert verdict.range == "pca-stable for gains from .1 on"
-    hangs = judge_claims("grange", "Fig. 1", [CLAIMS[0], swept, CLAIMS[2]], free="no gain printed")
+    hangs = judge_claims(
+        "grange", "Fig. 1", [CLAIMS[0], swept, CLAIMS[2]], free="no gain printed"
+    )
     assert (hangs.verdict, hangs.why) == ("not comparable", "no gain printed")
 
 
@@ -275,4 +343,6 @@ def test_a_changed_scenario_is_not_compared() -> None:
         assert (found.verdict, found.why) == ("not comparable", why)
         assert found.ours and found.published
     for study in (None, S, S.reading()):
-        assert judge_claims("grange", "Fig. 1", CLAIMS, scenario=study).verdict == "match"
+        assert (
+            judge_claims("grange", "Fig. 1", CLAIMS, scenario=study).verdict == "match"
+        )

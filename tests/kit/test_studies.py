@@ -54,7 +54,9 @@ REFERENCE = np.array([draw(seed) for seed in SEEDS]).tobytes()
 
 def stored(path: Path, **options: Any) -> Path:
     options = {"workers": 1, "columns": COLUMNS, "parameters": {"size": 40}} | options
-    return studies.store(path, options.pop("trial", draw), options.pop("seeds", SEEDS), **options)
+    return studies.store(
+        path, options.pop("trial", draw), options.pop("seeds", SEEDS), **options
+    )
 
 
 def test_neither_workers_nor_executor_change_a_bit() -> None:
@@ -66,10 +68,16 @@ def test_neither_workers_nor_executor_change_a_bit() -> None:
 
 
 def test_seeds_are_numpy_s_own_children_whatever_was_spawned_from_them() -> None:
-    for ours, theirs in zip(studies.spawn(2023, 5), SeedSequence(2023).spawn(5), strict=True):
+    for ours, theirs in zip(
+        studies.spawn(2023, 5), SeedSequence(2023).spawn(5), strict=True
+    ):
         first = theirs.spawn(3)[0].generate_state(2)
-        study = studies.run(lambda s: s.spawn(1)[0].generate_state(2), [ours, theirs], workers=1)
-        assert (np.array(study.values) == first).all() and theirs.n_children_spawned == 3
+        study = studies.run(
+            lambda s: s.spawn(1)[0].generate_state(2), [ours, theirs], workers=1
+        )
+        assert (
+            np.array(study.values) == first
+        ).all() and theirs.n_children_spawned == 3
     study = studies.run(lambda s: s.generate_state(2), [5], workers=1)
     assert (study.values[0] == SeedSequence(5).generate_state(2)).all()
 
@@ -87,7 +95,9 @@ def test_values_that_share_a_buffer_are_kept_apart() -> None:
 
 
 def test_metrics_are_taken_by_name_or_in_order() -> None:
-    study = studies.run(lambda s: {"b": 2, "a": s.spawn_key[0]}, studies.spawn(1, 2), workers=1)
+    study = studies.run(
+        lambda s: {"b": 2, "a": s.spawn_key[0]}, studies.spawn(1, 2), workers=1
+    )
     assert study.metrics(["a"])["a"].tolist() == [0.0, 1.0]
 
 
@@ -96,7 +106,9 @@ def test_one_blas_thread_in_every_worker() -> None:
         import scipy.linalg  # noqa: F401
         from threadpoolctl import threadpool_info
 
-        return [lib["num_threads"] for lib in threadpool_info() if lib["user_api"] == "blas"]
+        return [
+            lib["num_threads"] for lib in threadpool_info() if lib["user_api"] == "blas"
+        ]
 
     for workers in (1, 2):
         study = studies.run(threads, [1, 2], workers=workers)
@@ -107,7 +119,9 @@ def test_one_blas_thread_in_every_worker() -> None:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_raised_trial_is_reported_with_its_seed_and_the_others_are_kept(workers: int) -> None:
+def test_a_raised_trial_is_reported_with_its_seed_and_the_others_are_kept(
+    workers: int,
+) -> None:
     trial = partial(fails_at, (3, 11))
     study = studies.run(trial, SEEDS, workers=workers, errors="collect")
     assert [f.which for f in study.failures] == [3, 11] and study.done.sum() == 28
@@ -123,10 +137,14 @@ def test_a_raised_trial_is_reported_with_its_seed_and_the_others_are_kept(worker
 
 @pytest.mark.parametrize("bad", [5, 29])
 def test_a_killed_worker_costs_its_own_trial_only(bad: int, tmp_path: Path) -> None:
-    with pytest.raises(StudyError, match=f"trial {bad}, .*(?s:.*)the other trials are in .*.part"):
+    with pytest.raises(
+        StudyError, match=f"trial {bad}, .*(?s:.*)the other trials are in .*.part"
+    ):
         stored(tmp_path / "a.csv", trial=partial(dies_at, bad), workers=2)
     rows = (tmp_path / "a.csv.part").read_text().splitlines()[-29:]
-    assert sorted(int(row.split(",")[0]) for row in rows) == [k for k in range(30) if k != bad]
+    assert sorted(int(row.split(",")[0]) for row in rows) == [
+        k for k in range(30) if k != bad
+    ]
     assert not (tmp_path / "a.csv").exists()
 
 
@@ -155,15 +173,25 @@ class Cluster(Executor):
 
 
 def test_as_many_trials_are_in_flight_as_the_executor_has_slots(tmp_path: Path) -> None:
-    part, seen = tmp_path / "a.csv.part", []
+    part = tmp_path / "a.csv.part"
+    seen = []
 
     def asked(calls: list[Any]) -> None:
         rows = part.read_text().count("\n") - studies_head if part.exists() else 0
         seen.append((len(calls), rows))
 
-    studies_head = 3 + 2 + 1  # versions, code and parameter; the line before the first row
-    studies.store(tmp_path / "a.csv", draw, studies.spawn(7, 48), columns=COLUMNS,
-                  parameters={"size": 40}, code=[bits], executor=Cluster(24, asked))  # fmt: skip
+    studies_head = (
+        3 + 2 + 1
+    )  # versions, code and parameter; the line before the first row
+    studies.store(
+        tmp_path / "a.csv",
+        draw,
+        studies.spawn(7, 48),
+        columns=COLUMNS,
+        parameters={"size": 40},
+        code=[bits],
+        executor=Cluster(24, asked),
+    )
     assert seen == [(24, 0), (24, 24)]  # each on disk before the next begins
 
 
@@ -183,17 +211,28 @@ def test_a_file_gives_back_every_bit(whole: Path) -> None:
 
 
 @settings(max_examples=25)
-@given(st.lists(st.floats(), min_size=1, max_size=4), st.integers(0, 2**128),
-       st.lists(st.integers(0, 2**31), max_size=3))  # fmt: skip
+@given(
+    st.lists(st.floats(), min_size=1, max_size=4),
+    st.integers(0, 2**128),
+    st.lists(st.integers(0, 2**31), max_size=3),
+)
 def test_any_number_and_seed_comes_back(
-    tmp_path_factory: pytest.TempPathFactory, numbers: list[float], entropy: int, key: list[int]
+    tmp_path_factory: pytest.TempPathFactory,
+    numbers: list[float],
+    entropy: int,
+    key: list[int],
 ) -> None:
-    seed, path = SeedSequence(entropy, spawn_key=key), tmp_path_factory.mktemp("any") / "a.csv"
+    seed = SeedSequence(entropy, spawn_key=key)
+    path = tmp_path_factory.mktemp("any") / "a.csv"
     columns = [f"c{k}" for k in range(len(numbers))]
-    found = studies.load(stored(path, trial=lambda s: numbers, seeds=[seed], columns=columns))
+    found = studies.load(
+        stored(path, trial=lambda s: numbers, seeds=[seed], columns=columns)
+    )
     for name, number in zip(columns, numbers, strict=True):
         assert np.array_equal(found.metric(name), [number], equal_nan=True)
-        assert np.signbit(found.metric(name)[0]) == np.signbit(number) or number != number
+        assert (
+            np.signbit(found.metric(name)[0]) == np.signbit(number) or number != number
+        )
     assert (found.seed(0).generate_state(4) == seed.generate_state(4)).all()
 
 
@@ -202,13 +241,17 @@ def test_a_failure_is_stored_by_its_class(tmp_path: Path) -> None:
     assert kept.failures[3] == "ArithmeticError" and np.isnan(kept.columns["mean"][3])
     assert kept.metric("mean").shape == (29,)
     studies.check(kept, partial(fails_at, (3,)))
-    with pytest.raises(AssertionError, match="trial 3: stored ArithmeticError, now a value"):
+    with pytest.raises(
+        AssertionError, match="trial 3: stored ArithmeticError, now a value"
+    ):
         studies.check(kept, draw)
 
 
 def test_every_flipped_bit_is_refused_by_name(whole: Path, tmp_path: Path) -> None:
-    raw, path = whole.read_bytes(), tmp_path / "b.csv"
-    rng, damaged = np.random.default_rng(1), [b"", raw[:-20], raw + b"\n", raw.split(b"\n")[0]]
+    raw = whole.read_bytes()
+    path = tmp_path / "b.csv"
+    rng = np.random.default_rng(1)
+    damaged = [b"", raw[:-20], raw + b"\n", raw.split(b"\n")[0]]
     for place in [0, 30, len(raw) - 1, *rng.integers(len(raw), size=200)]:
         flipped = bytearray(raw)
         flipped[place] ^= 1 << rng.integers(8)
@@ -229,8 +272,11 @@ def test_the_book_s_own_studies_are_whole() -> None:
         studies.script("../studies/table-2")
 
 
-def test_a_row_that_was_cut_off_or_damaged_runs_again(whole: Path, tmp_path: Path) -> None:
-    path, part = tmp_path / "a.csv", tmp_path / "a.csv.part"
+def test_a_row_that_was_cut_off_or_damaged_runs_again(
+    whole: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.csv"
+    part = tmp_path / "a.csv.part"
     assert stored(path, indices=range(20)) == part
     text = part.read_text()
     at = text.index("\n4,")
@@ -247,15 +293,25 @@ def test_parts_of_several_machines_merge(whole: Path, tmp_path: Path) -> None:
     assert stored(tmp_path / "a.csv").read_bytes() == whole.read_bytes()
     stored(tmp_path / "b.csv", indices=[0], parameters={"size": 41})
     with pytest.raises(ValueError, match="other code, parameters or versions"):
-        studies.merge(tmp_path / "c.csv", tmp_path / "0.csv.part", tmp_path / "b.csv.part")
+        studies.merge(
+            tmp_path / "c.csv", tmp_path / "0.csv.part", tmp_path / "b.csv.part"
+        )
     (tmp_path / "b.csv.part").write_text("# version")
     with pytest.raises(ValueError, match="b.csv.part is damaged"):
         studies.merge(tmp_path / "c.csv", tmp_path / "b.csv.part")
 
 
-@pytest.mark.parametrize("other", [{"parameters": {}}, {"trial": partial(fails_at, ())},
-                                   {"seeds": studies.spawn(8, 30)}])  # fmt: skip
-def test_a_part_of_another_study_is_refused(tmp_path: Path, other: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"parameters": {}},
+        {"trial": partial(fails_at, ())},
+        {"seeds": studies.spawn(8, 30)},
+    ],
+)
+def test_a_part_of_another_study_is_refused(
+    tmp_path: Path, other: dict[str, Any]
+) -> None:
     stored(tmp_path / "a.csv", indices=[2])
     with pytest.raises(ValueError, match="a.csv.part"):
         stored(tmp_path / "a.csv", **other)
@@ -277,10 +333,13 @@ def test_a_full_disk_is_named_and_loses_nothing(whole: Path, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("change", "options", "passes"),
     [
-        (1e-9, {}, False), (1e-9, {"rtol": 1e-6}, True), (1e-3, {"rtol": 1e-6, "odd": 2}, False),
-        (1e-3, {"atol": 1.0}, True), (1e-3, {"rough": ["mean", "norm"]}, True),
+        (1e-9, {}, False),
+        (1e-9, {"rtol": 1e-6}, True),
+        (1e-3, {"rtol": 1e-6, "odd": 2}, False),
+        (1e-3, {"atol": 1.0}, True),
+        (1e-3, {"rough": ["mean", "norm"]}, True),
     ],
-)  # fmt: skip
+)
 def test_another_run_is_compared(
     whole: Path, change: float, options: dict[str, Any], passes: bool
 ) -> None:
@@ -298,7 +357,9 @@ def test_another_run_is_compared(
 def test_a_few_trials_may_go_another_way(whole: Path) -> None:
     other = partial(fails_at, (4,))
     studies.check(whole, other, indices=[0, 4, 29], max_outliers=1)
-    with pytest.raises(AssertionError, match="trial 4: stored a value, now ArithmeticError"):
+    with pytest.raises(
+        AssertionError, match="trial 4: stored a value, now ArithmeticError"
+    ):
         studies.check(whole, other, indices=[0, 4, 29])
 
 

@@ -9,7 +9,9 @@ from distfilt.mixtures import GaussianMixture
 TARGET = [0, 1]
 
 
-def random_mixture(size: int, dim: int, seed: int, spread: float = 3.0) -> GaussianMixture:
+def random_mixture(
+    size: int, dim: int, seed: int, spread: float = 3.0
+) -> GaussianMixture:
     """Full covariances of differing shape, uneven weights."""
     rng = np.random.default_rng(seed)
     roots = rng.standard_normal((size, dim, dim)) + 0.5 * np.eye(dim)
@@ -18,7 +20,9 @@ def random_mixture(size: int, dim: int, seed: int, spread: float = 3.0) -> Gauss
     return GaussianMixture(w, spread * rng.standard_normal((size, dim)) + 1.0, covs)
 
 
-def affine(p: GaussianMixture, matrix: np.ndarray, shift: np.ndarray) -> GaussianMixture:
+def affine(
+    p: GaussianMixture, matrix: np.ndarray, shift: np.ndarray
+) -> GaussianMixture:
     """The same density in other coordinates."""
     return GaussianMixture.construct(
         p.weights.copy(), p.means @ matrix.T + shift, matrix @ p.covs @ matrix.T
@@ -35,10 +39,18 @@ def same(a: GaussianMixture, b: GaussianMixture, tolerance: float = 1e-9) -> Non
     """Both have the same mixands, in whatever order."""
     assert a.n_components == b.n_components
     first, second = (
-        np.array(sorted(np.c_[p.means, p.weights, p.covs.reshape(p.n_components, -1)].round(12).tolist()))
+        np.array(
+            sorted(
+                np.c_[p.means, p.weights, p.covs.reshape(p.n_components, -1)]
+                .round(12)
+                .tolist()
+            )
+        )
         for p in (a, b)
     )
-    np.testing.assert_allclose(first, second, rtol=tolerance, atol=tolerance * np.abs(second).max())
+    np.testing.assert_allclose(
+        first, second, rtol=tolerance, atol=tolerance * np.abs(second).max()
+    )
 
 
 def scales(dim: int, target_dim: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -46,4 +58,6 @@ def scales(dim: int, target_dim: int = 0) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(dim)
     matrix = rng.standard_normal((dim, dim)) + 2 * np.eye(dim)
     matrix[:target_dim, target_dim:] = matrix[target_dim:, :target_dim] = 0.0
-    return np.geomspace(1e-3, 1e5, dim)[:, None] * matrix, 100 * rng.standard_normal(dim)
+    return np.geomspace(1e-3, 1e5, dim)[:, None] * matrix, 100 * rng.standard_normal(
+        dim
+    )

@@ -8,8 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from distfilt.mixtures import GaussianMixture, split_components, split_library, nonlinearity
-from distfilt.mixtures.conditioning import propagate_mixture, update_mixture, within_gate
+from distfilt.mixtures import (
+    GaussianMixture,
+    nonlinearity,
+    split_components,
+    split_library,
+)
+from distfilt.mixtures.conditioning import (
+    propagate_mixture,
+    update_mixture,
+    within_gate,
+)
 from distfilt.mixtures.splitting import split_nonlinear
 
 from .examples import affine, random_mixture, same, scales, shuffled
@@ -23,8 +32,11 @@ R = random_mixture(1, 2, 2).covs[0]
 @given(st.integers(0, 100), st.integers(1, 4))
 def test_linear_problems_are_the_kalman_filter(seed: int, d: int) -> None:
     rng = np.random.default_rng(seed)
-    p, f, h = random_mixture(3, d, seed), rng.standard_normal((d, d)), rng.standard_normal((2, d))
-    q, r = random_mixture(1, d, seed + 1).factors[0], random_mixture(1, 2, seed + 2).covs[0]
+    p = random_mixture(3, d, seed)
+    f = rng.standard_normal((d, d))
+    h = rng.standard_normal((2, d))
+    q = random_mixture(1, d, seed + 1).factors[0]
+    r = random_mixture(1, 2, seed + 2).covs[0]
     ahead = propagate_mixture(p, lambda x: x @ f.T, q)
     assert np.allclose(ahead.means, p.means @ f.T)
     assert np.allclose(ahead.covs, f @ p.covs @ f.T + q @ q.T)
@@ -38,12 +50,17 @@ def test_linear_problems_are_the_kalman_filter(seed: int, d: int) -> None:
     seen = w > 1e-9 * w.sum()  # the others are left out
     assert np.allclose(after.weights, w[seen] / w[seen].sum())
     assert np.allclose(after.means, means[seen], atol=1e-7)
-    assert np.allclose(after.covs, (ahead.covs - gain @ inner @ gain.mT)[seen], atol=1e-7)
+    assert np.allclose(
+        after.covs, (ahead.covs - gain @ inner @ gain.mT)[seen], atol=1e-7
+    )
 
 
 def test_what_bends_adds_to_the_spread() -> None:
     # The variance of x² is 4 m² P + 2 P², which DD2 meets; its covariance with x is 2 m P.
-    m, p, r, y = 1.5, 0.8, 0.3, 4.0
+    m = 1.5
+    p = 0.8
+    r = 0.3
+    y = 4.0
     prior = GaussianMixture.gaussian([m], [[p]])
     spread = 4 * m**2 * p + 2 * p**2
     ahead = propagate_mixture(prior, lambda x: x**2, np.full((1, 1), np.sqrt(r)))
@@ -66,9 +83,17 @@ def test_steps_in_other_coordinates_and_in_another_order() -> None:
 
     # The unscented points depend on the square root, so both start from matching ones.
     p = affine(P, matrix, shift)
-    p = GaussianMixture.construct(p.weights, p.means, p.covs, factors=matrix @ P.factors)
-    after = propagate_mixture(p, lambda x: bent(there(x)) @ matrix.T + shift, 0.1 * matrix)
-    same(affine(after, back, -back @ shift), propagate_mixture(P, bent, 0.1 * np.eye(3)), 1e-8)
+    p = GaussianMixture.construct(
+        p.weights, p.means, p.covs, factors=matrix @ P.factors
+    )
+    after = propagate_mixture(
+        p, lambda x: bent(there(x)) @ matrix.T + shift, 0.1 * matrix
+    )
+    same(
+        affine(after, back, -back @ shift),
+        propagate_mixture(P, bent, 0.1 * np.eye(3)),
+        1e-8,
+    )
     y = np.array([0.5, 1.0])
     after = update_mixture(p, y, lambda x: bent(there(x)) @ H.T, R)
     home = update_mixture(P, y, lambda x: bent(x) @ H.T, R)
@@ -101,20 +126,28 @@ def test_angles_that_wrap_between_points() -> None:
     def wrap(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         return (a - b + np.pi) % (2 * np.pi) - np.pi
 
-    at, turn = np.array([-5.0, 0.01]), np.array([[0.0, -1.0], [1.0, 0.0]])
+    at = np.array([-5.0, 0.01])
+    turn = np.array([[0.0, -1.0], [1.0, 0.0]])
     one, two = (GaussianMixture.gaussian(m, 0.09 * np.eye(2)) for m in (at, turn @ at))
-    one = update_mixture(one, np.array([-np.pi + 0.05]), bearing, 0.01 * np.eye(1), residual=wrap)
-    two = update_mixture(two, np.array([-np.pi / 2 + 0.05]), bearing, 0.01 * np.eye(1), residual=wrap)
+    one = update_mixture(
+        one, np.array([-np.pi + 0.05]), bearing, 0.01 * np.eye(1), residual=wrap
+    )
+    two = update_mixture(
+        two, np.array([-np.pi / 2 + 0.05]), bearing, 0.01 * np.eye(1), residual=wrap
+    )
     assert np.allclose(one.means @ turn.T, two.means)
     assert np.allclose(turn @ one.covs @ turn.T, two.covs)
 
 
 def test_a_gate_measures_from_the_nearest_mixand() -> None:
-    h, cov = np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([[1.0, 0.5], [0.5, 2.0]])
+    h = np.array([[1.0, 0.0], [0.0, 1.0]])
+    cov = np.array([[1.0, 0.5], [0.5, 2.0]])
     prior = GaussianMixture([0.5, 0.5], [[0.0, 0.0], [50.0, 0.0]], [cov, cov])
 
     def passed(y: list[float], gate: float) -> bool:
-        left = within_gate(prior, np.array(y), lambda x: x @ h.T, 0.25 * np.eye(2), gate=gate)
+        left = within_gate(
+            prior, np.array(y), lambda x: x @ h.T, 0.25 * np.eye(2), gate=gate
+        )
         assert np.isnan(left).all() or np.array_equal(left, y, equal_nan=True)
         return not np.isnan(left).all()
 
@@ -132,9 +165,12 @@ def test_the_library_keeps_moments_and_is_near_the_normal() -> None:
         assert np.isclose(w @ m**2 + std**2, 1)
 
         def ise(a: float, std: float = std) -> float:
-            at, w = np.sqrt((1 - std**2) / (2 * a)), [a, 1 - 2 * a, a]
+            at = np.sqrt((1 - std**2) / (2 * a))
+            w = [a, 1 - 2 * a, a]
             p = GaussianMixture(w, [[-at], [0.0], [at]], np.full((3, 1, 1), std**2))
-            gap = np.exp(p.log_density(x[:, None])) - np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi)
+            gap = np.exp(p.log_density(x[:, None])) - np.exp(-0.5 * x**2) / np.sqrt(
+                2 * np.pi
+            )
             return float(np.trapezoid(gap**2, x))
 
         assert ise(w[0]) <= min(ise(0.9 * w[0]), ise(1.1 * w[0])) + 1e-12 < limit
@@ -153,14 +189,18 @@ def test_splits_keep_the_moments() -> None:
 
 def test_stretching_is_the_largest_image() -> None:
     rng = np.random.default_rng(2)
-    g, scale = rng.standard_normal((4, 2, 3)), np.array([1.0, 3.0])
+    g = rng.standard_normal((4, 2, 3))
+    scale = np.array([1.0, 3.0])
     u, length = nonlinearity(P.factors, g, scale=scale)
     for k in range(4):
         assert np.isclose(u[k] @ np.linalg.solve(P.covs[k], u[k]), 1)
         assert np.isclose(np.linalg.norm(scale * (g[k] @ u[k])), length[k])
         z = rng.standard_normal((500, 3))
         z /= np.linalg.norm(z, axis=1, keepdims=True)
-        assert np.linalg.norm(scale * (z @ P.factors[k].T @ g[k].T), axis=1).max() <= length[k]
+        assert (
+            np.linalg.norm(scale * (z @ P.factors[k].T @ g[k].T), axis=1).max()
+            <= length[k]
+        )
 
 
 def test_the_most_stretched_are_split_while_there_is_room() -> None:
@@ -171,6 +211,9 @@ def test_the_most_stretched_are_split_while_there_is_room() -> None:
     once = split_nonlinear(two, slope, max_components=4, split_threshold=0.6)
     assert once.n_components == 4 and (once.means > 0).sum() == 3
     # .5 · 4 is above the limit, and so is its middle piece, of deviation .7; thrice at most.
-    assert split_nonlinear(two, slope, max_components=50, split_threshold=0.6).n_components == 6
+    assert (
+        split_nonlinear(two, slope, max_components=50, split_threshold=0.6).n_components
+        == 6
+    )
     assert split_nonlinear(two, slope, max_components=3, split_threshold=0.6) is two
     assert split_nonlinear(two, slope, max_components=50, split_threshold=2.5) is two

@@ -28,16 +28,24 @@ def test_a_flow_that_works_in_place_leaves_the_caller_s_states() -> None:
     model = Model(2, _in_place, lambda t, dt: np.zeros((2, 2)))
     x = np.ones((3, 2))
     assert (model.step(x, 0.0, 0.5) == 1.5).all() and (x == 1.0).all()
-    assert (model.sample_step(x, 0.0, 0.5, rng=generator()) == 1.5).all() and (x == 1.0).all()
-    assert np.abs(model.jacobian(x, 0.0, 0.5) - np.eye(2)).max() < 1e-9 and (x == 1.0).all()
+    assert (model.sample_step(x, 0.0, 0.5, rng=generator()) == 1.5).all() and (
+        x == 1.0
+    ).all()
+    assert (
+        np.abs(model.jacobian(x, 0.0, 0.5) - np.eye(2)).max() < 1e-9
+        and (x == 1.0).all()
+    )
     path = simulate(model, x, [1.0, 2.0], rng=generator())
     assert (path[0] == 2.0).all() and (path[1] == 3.0).all() and (x == 1.0).all()
 
 
-def test_noise_cannot_be_changed_through_what_it_returns_and_its_root_is_a_factor() -> None:
+def test_noise_cannot_be_changed_through_what_it_returns_and_its_root_is_a_factor() -> (
+    None
+):
     q = FULL.copy()
     model = Model(3, lambda x, t, dt: x, lambda t, dt: q)
-    found, root = model.Q(0.0, 1.0), model.noise_sqrt(0.0, 1.0)
+    found = model.Q(0.0, 1.0)
+    root = model.noise_sqrt(0.0, 1.0)
     assert not found.flags.writeable and not np.shares_memory(found, q)
     assert np.allclose(root @ root.T, FULL, rtol=1e-14)
 
@@ -57,10 +65,14 @@ def test_drawn_noise_has_the_full_covariance(door: str) -> None:
 
 
 @pytest.mark.parametrize(("turned", "dt"), [(False, 1e-4), (True, 0.5), (True, 1e-4)])
-def test_a_transposed_derivative_or_transition_is_told_once(turned: bool, dt: float) -> None:
+def test_a_transposed_derivative_or_transition_is_told_once(
+    turned: bool, dt: float
+) -> None:
     straight = constant_velocity(sigma=0.3, axes=1)
     phi = (lambda dt: straight.F(dt).T) if turned else straight.F
-    model = Model(2, straight.transition, straight.noise_cov, derivative=lambda x, t, dt: phi(dt))
+    model = Model(
+        2, straight.transition, straight.noise_cov, derivative=lambda x, t, dt: phi(dt)
+    )
     linear = LinearModel.from_transition(2, phi, straight.noise_cov)
     with warnings.catch_warnings(record=True, action="always") as told:
         for _ in range(2):
@@ -89,14 +101,17 @@ def test_jacobian_by_differences_given_and_of_a_matrix() -> None:
 
     def exact(x: np.ndarray, t: float, dt: float) -> np.ndarray:
         out = np.zeros((*x.shape, 2))
-        out[..., 0, 0], out[..., 0, 1] = x[..., 1], x[..., 0]
+        out[..., 0, 0] = x[..., 1]
+        out[..., 0, 1] = x[..., 0]
         out[..., 1, 0] = np.cos(x[..., 0])
         return out
 
     x = generator().standard_normal((4, 3, 2))
     model = Model(2, flow, lambda t, dt: np.eye(2))
     slope = model.jacobian(x, 0.3, 0.1)
-    assert slope.shape == (4, 3, 2, 2) and np.abs(slope - exact(x, 0.3, 0.1)).max() < 1e-9
+    assert (
+        slope.shape == (4, 3, 2, 2) and np.abs(slope - exact(x, 0.3, 0.1)).max() < 1e-9
+    )
     given = Model(2, flow, lambda t, dt: np.eye(2), derivative=exact)
     assert (given.jacobian(x, 0.3, 0.1) == exact(x, 0.3, 0.1)).all()
     orbit = clohessy_wiltshire(rate=0.1, sigma=0.2)
@@ -110,11 +125,14 @@ def _column_in_place(x: np.ndarray, t: float, dt: float) -> np.ndarray:
     return x
 
 
-@pytest.mark.parametrize("flow", [
-    lambda x, t, dt: np.array([x[1], -x[0], x[2], x[3]]),
-    lambda x, t, dt: np.triu(np.ones((4, 4))) @ x,
-    _column_in_place,
-])
+@pytest.mark.parametrize(
+    "flow",
+    [
+        lambda x, t, dt: np.array([x[1], -x[0], x[2], x[3]]),
+        lambda x, t, dt: np.triu(np.ones((4, 4))) @ x,
+        _column_in_place,
+    ],
+)
 @pytest.mark.parametrize("shape", [(4, 4), (4, 7, 4), (3, 4)])
 def test_a_flow_for_one_state_is_refused(flow: Any, shape: tuple[int, ...]) -> None:
     """Also where there are as many agents or members as components and the shape is right."""
@@ -122,7 +140,9 @@ def test_a_flow_for_one_state_is_refused(flow: Any, shape: tuple[int, ...]) -> N
     assert model.step(np.arange(4.0), 0.0, 0.1).shape == (4,)
     x = generator().standard_normal(shape)
     for step in (model.step, partial(model.sample_step, rng=generator())) * 2:
-        with pytest.raises(ValueError, match="transition: needs to take many states at once"):
+        with pytest.raises(
+            ValueError, match="transition: needs to take many states at once"
+        ):
             step(x, 0.0, 0.1)
 
 
@@ -136,7 +156,11 @@ def test_a_flow_of_many_states_is_asked_once() -> None:
 
     model = Model(2, flow, lambda t, dt: np.zeros((2, 2)))
     for k, n in enumerate((1, 3)):
-        for x in (np.ones((n, 2)), np.ones((n, 2)), generator().standard_normal((n, 2))):
+        for x in (
+            np.ones((n, 2)),
+            np.ones((n, 2)),
+            generator().standard_normal((n, 2)),
+        ):
             model.step(x, 0.0, 0.1)
         model.step(generator(1).standard_normal((n, 2)), 0.0, 0.1)
         assert shapes.count((2,)) == 3 + 3 * k
@@ -146,9 +170,13 @@ def test_a_flow_of_many_states_is_asked_once() -> None:
 
 
 SHIPPED = {
-    "constant_velocity": {"sigma": 0.1}, "clohessy_wiltshire": {"rate": 0.1, "sigma": 0.2},
-    "satellite_pose": {"rate": 0.1, "sigma": 0.2}, "lorenz63": {"sigma": 0.1}, "pendulum": {},
-    "pendulum_angle": {}, "orbits": {"velocity_std": 1e-6},
+    "constant_velocity": {"sigma": 0.1},
+    "clohessy_wiltshire": {"rate": 0.1, "sigma": 0.2},
+    "satellite_pose": {"rate": 0.1, "sigma": 0.2},
+    "lorenz63": {"sigma": 0.1},
+    "pendulum": {},
+    "pendulum_angle": {},
+    "orbits": {"velocity_std": 1e-6},
 }
 
 

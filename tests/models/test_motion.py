@@ -18,9 +18,18 @@ def test_rk4_is_batched_and_exact_for_cubics_in_time(longest: float | None) -> N
 
 @pytest.mark.parametrize(
     ("dt", "longest", "steps"),
-    [(1.0, None, 1), (1.0, 2.0, 1), (1.0, 0.5, 2), (1.0, 0.4, 3), (0.1, 0.01, 10), (0.0, 0.1, 1)],
+    [
+        (1.0, None, 1),
+        (1.0, 2.0, 1),
+        (1.0, 0.5, 2),
+        (1.0, 0.4, 3),
+        (0.1, 0.01, 10),
+        (0.0, 0.1, 1),
+    ],
 )
-def test_a_step_is_cut_into_the_fewest(dt: float, longest: float | None, steps: int) -> None:
+def test_a_step_is_cut_into_the_fewest(
+    dt: float, longest: float | None, steps: int
+) -> None:
     times = []
 
     def rate(x: np.ndarray, t: float) -> np.ndarray:
@@ -31,12 +40,15 @@ def test_a_step_is_cut_into_the_fewest(dt: float, longest: float | None, steps: 
     assert len(times) == 4 * steps
     assert np.allclose(times[::4], 3.0 + dt / steps * np.arange(steps))
     h = dt / steps
-    assert np.allclose(moved, (1 - h + h**2 / 2 - h**3 / 6 + h**4 / 24) ** steps, rtol=1e-14)
+    assert np.allclose(
+        moved, (1 - h + h**2 / 2 - h**3 / 6 + h**4 / 24) ** steps, rtol=1e-14
+    )
 
 
 def test_a_rate_may_work_in_place() -> None:
     """It may return one array of its own each time, or change and return the states it gets."""
-    x, buffer = np.array([1.0, -2.0]), np.empty(2)
+    x = np.array([1.0, -2.0])
+    buffer = np.empty(2)
     wanted = rk4(lambda x, t: -x * np.cos(t), x, 0.0, 1.0, longest=0.5)
     for rate in (
         lambda x, t: np.multiply(x, -np.cos(t), out=buffer),
@@ -47,7 +59,9 @@ def test_a_rate_may_work_in_place() -> None:
         assert (x == [1.0, -2.0]).all()
 
 
-@pytest.mark.parametrize("rate", [np.int64(1), np.float32(0.5)], ids=["integers", "half"])
+@pytest.mark.parametrize(
+    "rate", [np.int64(1), np.float32(0.5)], ids=["integers", "half"]
+)
 def test_a_rate_in_another_type_keeps_the_states_digits(rate: np.generic) -> None:
     start = np.array([1.0 + 1e-12, 2.0])
     moved = rk4(lambda x, t: np.full(x.shape, rate), start, 0.0, 1.0, longest=0.25)
@@ -57,7 +71,8 @@ def test_a_rate_in_another_type_keeps_the_states_digits(rate: np.generic) -> Non
 @pytest.mark.parametrize("axes", [1, 2, 3])
 def test_straight_motion(axes: int) -> None:
     model = constant_velocity(sigma=0.3, axes=axes)
-    p, v = np.arange(1.0, 1 + axes), np.arange(axes) - 0.5
+    p = np.arange(1.0, 1 + axes)
+    v = np.arange(axes) - 0.5
     assert np.allclose(model.step([*p, *v], 0.0, 2.0), [*(p + 2 * v), *v])
     # The integral of the noise's response, by components: 0.09 (8/3, 4/2; 4/2, 2).
     exact = np.kron([[8 / 3, 2.0], [2.0, 2.0]], 0.09 * np.eye(axes))
@@ -68,13 +83,19 @@ def test_straight_motion(axes: int) -> None:
 
 def test_lorenz_agrees_with_an_adaptive_rule() -> None:
     """From twenty states near the attractor: closer with the step's fourth power; and its noise."""
-    starts = np.array([1.5, -1.5, 25.5]) + np.random.default_rng(0).standard_normal((20, 3))
+    starts = np.array([1.5, -1.5, 25.5]) + np.random.default_rng(0).standard_normal(
+        (20, 3)
+    )
 
     def rate(t: float, v: np.ndarray) -> np.ndarray:
         x, y, z = v.reshape(20, 3).T
-        return np.stack([10 * (y - x), x * (28 - z) - y, x * y - 8 / 3 * z], axis=-1).ravel()
+        return np.stack(
+            [10 * (y - x), x * (28 - z) - y, x * y - 8 / 3 * z], axis=-1
+        ).ravel()
 
-    run = solve_ivp(rate, (0, 1), starts.ravel(), method="DOP853", rtol=1e-13, atol=1e-13)
+    run = solve_ivp(
+        rate, (0, 1), starts.ravel(), method="DOP853", rtol=1e-13, atol=1e-13
+    )
     exact = run.y[:, -1].reshape(20, 3)
     steps = np.array([0.01, 0.005, 0.0025, 0.00125])
     gaps = [lorenz63(step=h).step(starts, 0.0, 1.0) - exact for h in steps]

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy.special import ellipk
 
-from distfilt.models import pendulum, pendulum_angle, pendulum_chart, pendulum_rate, pendulum_states
+from distfilt.models import (
+    pendulum,
+    pendulum_angle,
+    pendulum_chart,
+    pendulum_rate,
+    pendulum_states,
+)
 
 G = 9.8
 START = np.array([np.sin(np.pi / 3), np.cos(np.pi / 3), 0.0, 0.0])
@@ -14,7 +20,8 @@ START = np.array([np.sin(np.pi / 3), np.cos(np.pi / 3), 0.0, 0.0])
 
 def _path(step: float, form: str = "printed", start: np.ndarray = START) -> np.ndarray:
     """States at every 0.05 s over 10 s, (201, 4)."""
-    model, out = pendulum(step=step, form=form), [start]
+    model = pendulum(step=step, form=form)
+    out = [start]
     for k in range(200):
         out.append(model.step(out[-1], 0.05 * k, 0.05))
     return np.array(out)
@@ -24,11 +31,18 @@ def test_the_printed_equations() -> None:
     x, y, u, v = s = np.array([0.3, -1.1, 0.7, 2.0])
     size = 1.4
     square = u**2 + v**2
-    expected = [u, v, (-G * x * y - x * square) / size**2, (G * x**2 - y * square) / size**2]
+    expected = [
+        u,
+        v,
+        (-G * x * y - x * square) / size**2,
+        (G * x**2 - y * square) / size**2,
+    ]
     assert np.allclose(pendulum_rate(s, length=size), expected, atol=1e-13)
     pull = -(square + G * y) / size**2
     expected[2:] = [pull * x, G + pull * y]
-    assert np.allclose(pendulum_rate(s, length=size, form="multiplier"), expected, atol=1e-13)
+    assert np.allclose(
+        pendulum_rate(s, length=size, form="multiplier"), expected, atol=1e-13
+    )
 
 
 @pytest.mark.parametrize("form", ["printed", "multiplier"])
@@ -40,8 +54,12 @@ def test_both_forms_are_the_pendulum_on_the_manifold(form: str) -> None:
     assert np.abs(moved - pendulum_states(other, length=1.3)).max() < 1e-8
 
 
-@pytest.mark.parametrize(("step", "bound"), [(0.05, 4e-2), (0.01, 1e-4), (0.0025, 4e-7)])
-def test_the_length_drifts_with_the_fourth_power_of_the_step(step: float, bound: float) -> None:
+@pytest.mark.parametrize(
+    ("step", "bound"), [(0.05, 4e-2), (0.01, 1e-4), (0.0025, 4e-7)]
+)
+def test_the_length_drifts_with_the_fourth_power_of_the_step(
+    step: float, bound: float
+) -> None:
     drift = np.abs(np.hypot(*_path(step)[:, :2].T) - 1).max()
     assert bound / 4 < drift < bound
 

@@ -37,7 +37,9 @@ def test_score_is_the_gradient_of_the_logarithm() -> None:
     h = 1e-6
     for k in range(2):
         step = h * np.eye(2)[k]
-        slope = (np.log(f.density(x + step, 2.0)) - np.log(f.density(x - step, 2.0))) / (2 * h)
+        slope = (
+            np.log(f.density(x + step, 2.0)) - np.log(f.density(x - step, 2.0))
+        ) / (2 * h)
         assert np.abs(slope - f.score(x, 2.0)[:, k]).max() < 1e-6
 
 
@@ -51,7 +53,9 @@ def test_mixture_goes_round() -> None:
     f = RotatingMixture()
     assert np.allclose(f.means(np.pi / 2 / 0.04), [[0.5, 0.8], [0.5, 0.2]])
     three = RotatingMixture(components=3).means(1.0)
-    assert np.allclose(np.linalg.norm(three - three[[1, 2, 0]], axis=1), 0.3 * np.sqrt(3))
+    assert np.allclose(
+        np.linalg.norm(three - three[[1, 2, 0]], axis=1), 0.3 * np.sqrt(3)
+    )
     shifted = RotatingMixture(phase=0.3)
     assert np.allclose(shifted.means(1.0), f.means(1.0 + 0.3 / 0.04))
     # Its integral over the plane is one.
@@ -61,7 +65,8 @@ def test_mixture_goes_round() -> None:
 
 
 def test_a_path_begins_with_a_step() -> None:
-    swarm, x = rotating_swarm(), np.random.default_rng(2).random((5, 2))
+    swarm = rotating_swarm()
+    x = np.random.default_rng(2).random((5, 2))
     moved = swarm.step(x, 2.0, 0.25, rng=np.random.default_rng(3))
     path = swarm.simulate(x, [2.25, 2.5], rng=np.random.default_rng(3), t0=2.0)
     assert np.array_equal(path[0], moved) and path.shape == (2, 5, 2)
@@ -73,13 +78,22 @@ def test_agents_drift_and_spread_by_2_d_t_on_each_axis() -> None:
     x = swarm.step(np.full((40_000, 2), 0.5), 0.0, 2.0, rng=np.random.default_rng(4))
     # Four standard errors of a variance of 40 000 draws.
     assert np.abs(x.var(axis=0) / (7.6 * RATES) - 1).max() < 4 * np.sqrt(2 / 40_000)
-    assert np.abs(x.mean(axis=0) - 0.5 - 0.02 * 1.8).max() < 4 * np.sqrt(30.4e-4 / 40_000)
+    assert np.abs(x.mean(axis=0) - 0.5 - 0.02 * 1.8).max() < 4 * np.sqrt(
+        30.4e-4 / 40_000
+    )
 
 
 def test_numbers_and_functions_of_place_mean_the_same() -> None:
     x = np.random.default_rng(5).random((2, 2))  # as many agents as coordinates
-    forms = [0.02, [0.02, 0.02], lambda x, t: 0.02 + 0 * x[..., 0], lambda x, t: 0.02 + 0 * x]
-    steps = [Swarm(_still, f).step(x, 0.0, 0.1, rng=np.random.default_rng(6)) for f in forms]
+    forms = [
+        0.02,
+        [0.02, 0.02],
+        lambda x, t: 0.02 + 0 * x[..., 0],
+        lambda x, t: 0.02 + 0 * x,
+    ]
+    steps = [
+        Swarm(_still, f).step(x, 0.0, 0.1, rng=np.random.default_rng(6)) for f in forms
+    ]
     for other in steps[1:]:
         assert np.abs(other - steps[0]).max() < 1e-15
     apart = Swarm(_still, lambda x, t: np.stack([x[..., 0], 1 + x[..., 1]], axis=-1))
@@ -88,10 +102,16 @@ def test_numbers_and_functions_of_place_mean_the_same() -> None:
 
 def test_euler_and_maruyama_inflate_the_variance_as_said() -> None:
     # v = -k x about the middle: the stationary variance is D/k / (1 - k h / 2).
-    k, d, h = 4.0, 2e-3, 0.2
+    k = 4.0
+    d = 2e-3
+    h = 0.2
     swarm = Swarm(lambda x, t: k * (0.5 - x), d, low=[0.0], high=[1.0])
-    x = swarm.simulate(np.full((40_000, 1), 0.5), np.arange(1, 21) * h,
-                       rng=np.random.default_rng(7), substeps=1)[-1]
+    x = swarm.simulate(
+        np.full((40_000, 1), 0.5),
+        np.arange(1, 21) * h,
+        rng=np.random.default_rng(7),
+        substeps=1,
+    )[-1]
     wanted = d / k / (1 - k * h / 2)
     assert abs(x.var() / wanted - 1) < 4 * np.sqrt(2 / 40_000)
 
@@ -103,6 +123,9 @@ def test_euler_and_maruyama_inflate_the_variance_as_said() -> None:
 def test_readings_are_the_published_numbers(
     reading: str, mobility: float, diffusion: float
 ) -> None:
-    swarm, x = rotating_swarm(reading, strength=0.2), np.array([[0.3, 0.9]])
-    assert np.allclose(swarm.drift_at(x, 1.0), mobility * RotatingMixture().score(x, 1.0))
+    swarm = rotating_swarm(reading, strength=0.2)
+    x = np.array([[0.3, 0.9]])
+    assert np.allclose(
+        swarm.drift_at(x, 1.0), mobility * RotatingMixture().score(x, 1.0)
+    )
     assert np.allclose(swarm.diffusion_at(x, 1.0), diffusion)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from distfilt.network import Channel, Faults, Graph, ConsensusWeights, graphs
+from distfilt.network import Channel, ConsensusWeights, Faults, Graph, graphs
 
 NAN = float("nan")
 STAR = graphs.star(3)
@@ -22,7 +22,8 @@ REFERENCE = {
     "grid": graphs.grid(3, 4),
     "disk": graphs.disk(rng(3).random((30, 2)), 0.4),
 }
-GRID, DISK = REFERENCE["grid"], REFERENCE["disk"]
+GRID = REFERENCE["grid"]
+DISK = REFERENCE["disk"]
 named = pytest.mark.parametrize("graph", REFERENCE.values(), ids=REFERENCE.keys())
 
 
@@ -38,7 +39,9 @@ def lossy(loss: float = 0.3, graph: Graph = STAR, **options: object) -> Channel:
 def of_matrix(graph: Graph, matrix: object) -> ConsensusWeights:
     """The weights that stand in a matrix at the graph's links and on its diagonal."""
     dense = np.asarray(matrix, dtype=float)
-    return ConsensusWeights(graph, dense.diagonal(), dense[graph.receivers, graph.senders])
+    return ConsensusWeights(
+        graph, dense.diagonal(), dense[graph.receivers, graph.senders]
+    )
 
 
 def random_graph(seed: int, agents: int, *, directed: bool = False) -> Graph:
@@ -61,4 +64,6 @@ def gaussians(seed: int, *leading: int, d: int = 2) -> tuple[np.ndarray, np.ndar
     a = draw.standard_normal((*leading, d, d))
     size = np.logspace(-1, 1, d)
     covs = (a @ np.swapaxes(a, -1, -2) + 0.2 * np.eye(d)) * np.outer(size, size)
-    return draw.standard_normal((*leading, d)) * size, 0.5 * (covs + np.swapaxes(covs, -1, -2))
+    return draw.standard_normal((*leading, d)) * size, 0.5 * (
+        covs + np.swapaxes(covs, -1, -2)
+    )

@@ -9,21 +9,27 @@ import pytest
 
 from distfilt import gaussians as pure
 from distfilt import network
-from distfilt.validation import unchecked
 from distfilt.ensembles import mean, sample_covariance
 from distfilt.network import Channel, Faults, Graph, UnstableGain, graphs
 from distfilt.network.channel import kind_of_rule
+from distfilt.validation import unchecked
 from tests.network.helpers import DISK, STAR, gaussians, heard, lossy, rng, star
 from tests.support import unit_gap
 
 RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
 GAIN = 0.04
-ALL = {**{r: partial(network.covariance_intersection, rule=r) for r in RULES},
-       "naive": network.naive_fusion, "arithmetic": network.arithmetic_average,
-       "pull": partial(network.consensus_pull, gain=GAIN)}
+ALL = {
+    **{r: partial(network.covariance_intersection, rule=r) for r in RULES},
+    "naive": network.naive_fusion,
+    "arithmetic": network.arithmetic_average,
+    "pull": partial(network.consensus_pull, gain=GAIN),
+}
 every = pytest.mark.parametrize("rule", ALL.values(), ids=ALL.keys())
-MOVES = {"least": network.intersect_ensembles, "equal": partial(network.intersect_ensembles, rule="equal"),
-         "pull": partial(network.mean_pull, gain=0.1)}
+MOVES = {
+    "least": network.intersect_ensembles,
+    "equal": partial(network.intersect_ensembles, rule="equal"),
+    "pull": partial(network.mean_pull, gain=0.1),
+}
 SIZES = np.logspace(-1, 2, 4)
 LINKS = np.array([2, 1, 1])
 """How many hear each agent of the star."""
@@ -33,18 +39,22 @@ def _by_hand(
     name: str, graph: Graph, m: np.ndarray, p: np.ndarray, got: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """One round, agent by agent, from those whose messages arrived, `got` (A, A)."""
-    out_m, out_p = np.empty_like(m), np.empty_like(p)
+    out_m = np.empty_like(m)
+    out_p = np.empty_like(p)
     for i in range(graph.n_agents):
         who = [i, *(j for j in graph.neighbours(i) if got[i, j])]
         if name == "naive":
             equal = np.full(len(who), 1 / len(who))
-            out_m[i], out_p[i] = pure.intersect_gaussians(m[who], p[who] / len(who), equal)
+            out_m[i], out_p[i] = pure.intersect_gaussians(
+                m[who], p[who] / len(who), equal
+            )
         elif name == "arithmetic":
             out_m[i] = m[who].mean(axis=0)
             gap = m[who] - out_m[i]
             out_p[i] = (p[who] + gap[..., :, None] * gap[..., None, :]).mean(axis=0)
         elif name == "pull":
-            out_m[i], out_p[i] = m[i] + GAIN * (m[who] - m[i]).sum(axis=0), p[i]
+            out_m[i] = m[i] + GAIN * (m[who] - m[i]).sum(axis=0)
+            out_p[i] = p[i]
         else:
             omega = pure.intersection_weights(p[who], rule=name)
             out_m[i], out_p[i] = pure.intersect_gaussians(m[who], p[who], omega)
@@ -54,7 +64,9 @@ def _by_hand(
 @pytest.mark.parametrize("loss", [0.0, 0.4])
 @pytest.mark.parametrize("graph", [STAR, DISK, Graph.from_edges(3, [[0, 1]])])
 @pytest.mark.parametrize("key", ALL)
-def test_all_agents_at_once_is_each_by_its_definition(key: str, graph: Graph, loss: float) -> None:
+def test_all_agents_at_once_is_each_by_its_definition(
+    key: str, graph: Graph, loss: float
+) -> None:
     m, p = gaussians(3, 2, 1, graph.n_agents, d=3)
     faults = Faults(loss=loss, seed=6)
     out = ALL[key]((m, p), Channel(graph, runs=(2, 1), faults=faults))
@@ -72,26 +84,39 @@ def test_the_account_is_mean_and_half_the_covariance(rule: object) -> None:
         channel = lossy(0.4)
         rule((np.zeros((3, d)), np.tile(np.eye(d), (3, 1, 1))), channel, rounds=2)
         sent = 2 * (d if rule is ALL["pull"] else floats) * LINKS
-        assert (channel.ledger.scalars == sent).all() and (channel.ledger.bytes == 8 * sent).all()
+        assert (channel.ledger.scalars == sent).all() and (
+            channel.ledger.bytes == 8 * sent
+        ).all()
         assert channel.ledger.rounds == 2 and 0 < channel.ledger.lost.sum() < 8
 
 
 @every
 def test_two_rounds_are_one_after_the_other(rule: object) -> None:
-    belief, channel = gaussians(2, 6), Channel(graphs.path(6))
-    for whole, part in zip(rule(belief, channel, rounds=2), rule(rule(belief, channel), channel),
-                           strict=True):  # fmt: skip
+    belief = gaussians(2, 6)
+    channel = Channel(graphs.path(6))
+    for whole, part in zip(
+        rule(belief, channel, rounds=2),
+        rule(rule(belief, channel), channel),
+        strict=True,
+    ):
         assert np.allclose(whole, part, rtol=1e-12)
 
 
 def test_pulls_beyond_the_bound_warn_and_none_is_silence() -> None:
     e = _ensembles(1)
-    for rule, belief in ((network.consensus_pull, gaussians(5, 3)), (network.mean_pull, e)):
-        with pytest.warns(UnstableGain, match=r"0\.8 is above 2/λ_max = 0\.6666") as caught:
+    for rule, belief in (
+        (network.consensus_pull, gaussians(5, 3)),
+        (network.mean_pull, e),
+    ):
+        with pytest.warns(
+            UnstableGain, match=r"0\.8 is above 2/λ_max = 0\.6666"
+        ) as caught:
             rule(belief, star(), gain=0.8, rounds=2)
         assert len(caught) == 1 and caught[0].filename == __file__
     channel = star()
-    assert (network.mean_pull(e, channel, gain=0.0) == e).all() and channel.ledger.rounds == 0
+    assert (
+        network.mean_pull(e, channel, gain=0.0) == e
+    ).all() and channel.ledger.rounds == 0
 
 
 def _ensembles(seed: int, leading: tuple[int, ...] = (3,)) -> np.ndarray:
@@ -103,7 +128,10 @@ def _ensembles(seed: int, leading: tuple[int, ...] = (3,)) -> np.ndarray:
 
 
 def test_a_rule_says_what_it_fuses_with_and_without_its_door() -> None:
-    assert kind_of_rule(partial(partial(network.mean_pull, gain=0.1), rounds=2)) == "ensembles"
+    assert (
+        kind_of_rule(partial(partial(network.mean_pull, gain=0.1), rounds=2))
+        == "ensembles"
+    )
     assert kind_of_rule(unchecked(network.naive_fusion)) == "gaussians"
     assert kind_of_rule(network.average_consensus) == "vectors"
     assert kind_of_rule(lambda belief, channel: belief) is None
@@ -127,8 +155,11 @@ def test_a_pull_by_its_equation_with_the_means_that_are_heard(include: bool) -> 
 @pytest.mark.parametrize("rule", RULES)
 def test_intersection_gives_the_fused_moments(rule: str) -> None:
     e = _ensembles(3, (5, 3))
-    belief, channel = (mean(e), sample_covariance(e)), star(runs=(5,))
-    fused = network.covariance_intersection(belief, star(runs=(5,)), rule=rule, rounds=2)
+    belief = (mean(e), sample_covariance(e))
+    channel = star(runs=(5,))
+    fused = network.covariance_intersection(
+        belief, star(runs=(5,)), rule=rule, rounds=2
+    )
     out = network.intersect_ensembles(e, channel, rule=rule, rounds=2)
     assert np.abs((mean(out) - fused[0]) / e.std(axis=-2)).max() < 1e-10
     assert unit_gap(sample_covariance(out), fused[1]) < 1e-10
@@ -138,13 +169,17 @@ def test_intersection_gives_the_fused_moments(rule: str) -> None:
     scaled = network.intersect_ensembles(e[0], star(), rule=rule, scale=SIZES)
     plain = network.intersect_ensembles(e[0], star(), rule=rule)
     assert np.allclose(plain, scaled, rtol=1e-6, atol=1e-6) == ("trace" not in rule)
-    assert np.allclose(scaled, network.intersect_ensembles(e[0] / SIZES, star(), rule=rule) * SIZES)
+    assert np.allclose(
+        scaled, network.intersect_ensembles(e[0] / SIZES, star(), rule=rule) * SIZES
+    )
 
 
 @pytest.mark.parametrize("rule", MOVES.values(), ids=MOVES.keys())
 def test_ensembles_of_two_rounds_in_any_units_and_equal_ones(rule: object) -> None:
-    e, channel = _ensembles(2, (6,)), Channel(graphs.path(6))
-    whole, parts = rule(e, channel, rounds=2), rule(rule(e, channel), channel)
+    e = _ensembles(2, (6,))
+    channel = Channel(graphs.path(6))
+    whole = rule(e, channel, rounds=2)
+    parts = rule(rule(e, channel), channel)
     assert np.allclose(mean(whole), mean(parts), rtol=1e-9)
     for factor in (1e-8, 1e8):
         scaled = rule(factor * e[:3], star()) / factor

@@ -33,14 +33,25 @@ def test_shapes_and_spectra_are_networkx_s(name: str) -> None:
     assert (graph.links.toarray() == nx.to_numpy_array(theirs)).all()
     assert graph.diameter == nx.diameter(theirs)
     if graph.n_agents > 1:
-        assert np.allclose(graph.laplacian_spectrum, np.sort(nx.laplacian_spectrum(theirs)), atol=1e-10)
-        assert np.isclose(graph.max_stable_gain, 2 / graph.laplacian_spectrum[-1], rtol=1e-9)
+        assert np.allclose(
+            graph.laplacian_spectrum, np.sort(nx.laplacian_spectrum(theirs)), atol=1e-10
+        )
+        assert np.isclose(
+            graph.max_stable_gain, 2 / graph.laplacian_spectrum[-1], rtol=1e-9
+        )
 
 
 def test_sparse_and_dense_ends_of_the_spectrum_agree() -> None:
-    for other in (graphs.ring(301), graphs.path(400), graphs.star(300), graphs.complete(250),
-                  graphs.disk(rng(1).random((500, 2)), 0.1)):
-        assert np.isclose(other.max_stable_gain, 2 / other.laplacian_spectrum[-1], rtol=1e-9)
+    for other in (
+        graphs.ring(301),
+        graphs.path(400),
+        graphs.star(300),
+        graphs.complete(250),
+        graphs.disk(rng(1).random((500, 2)), 0.1),
+    ):
+        assert np.isclose(
+            other.max_stable_gain, 2 / other.laplacian_spectrum[-1], rtol=1e-9
+        )
 
 
 @given(st.integers(0, 1000), st.integers(1, 10), st.booleans())
@@ -50,7 +61,9 @@ def test_links_laplacian_and_hops_by_their_definition(
     graph = random_graph(seed, agents, directed=directed)
     dense = graph.links.toarray()
     assert (graph.laplacian.toarray() == np.diag(dense.sum(axis=1)) - dense).all()
-    assert (graph.out_degree == dense.sum(axis=0)).all() and (graph.in_degree == dense.sum(1)).all()
+    assert (graph.out_degree == dense.sum(axis=0)).all() and (
+        graph.in_degree == dense.sum(1)
+    ).all()
     assert (graph.incidence @ np.ones(graph.senders.size) == graph.in_degree).all()
     if not graph.directed:
         assert (graph.receivers[graph.reverse] == graph.senders).all()
@@ -58,7 +71,9 @@ def test_links_laplacian_and_hops_by_their_definition(
     # links[i, j] carries news from j to i.
     away = shortest_path(graph.links.T, unweighted=True)
     for agent in range(agents):
-        assert (graph.hops(agent) == np.where(np.isinf(away[agent]), -1, away[agent])).all()
+        assert (
+            graph.hops(agent) == np.where(np.isinf(away[agent]), -1, away[agent])
+        ).all()
         assert graph.neighbours(agent) == tuple(np.flatnonzero(dense[agent]))
     assert graph.connected == np.isfinite(away).all()
     if graph.connected:
@@ -69,7 +84,8 @@ def test_links_laplacian_and_hops_by_their_definition(
 def test_a_gain_from_degrees_is_safe(seed: int, agents: int, directed: bool) -> None:
     """Below the bound every mode but the average shrinks; at 1.001 times the limit one grows."""
     graph = random_graph(seed, agents, directed=directed)
-    safe, limit = graph.degree_bound_gain, graph.max_stable_gain
+    safe = graph.degree_bound_gain
+    limit = graph.max_stable_gain
     assert safe <= limit * (1 + 1e-9)
     values = np.linalg.eigvals(graph.laplacian.toarray())
     moving = values[np.abs(values) > 1e-8]
@@ -99,10 +115,14 @@ def test_edges_count_once_and_run_from_speaker_to_listener() -> None:
     assert one_way.directed and one_way.neighbours(2) == ()
     named = Graph.from_networkx(nx.DiGraph([("camera", "screen"), ("screen", "log")]))
     assert named.directed and named.neighbours(1) == (0,) and named.neighbours(0) == ()
-    assert Graph.from_networkx(nx.MultiGraph([(5, 7), (5, 7), (7, 9)])).senders.size == 4
+    assert (
+        Graph.from_networkx(nx.MultiGraph([(5, 7), (5, 7), (7, 9)])).senders.size == 4
+    )
     for a, b, c in ((0, 1, 2), "abc"):
         assert as_graph(nx.Graph([(c, a), (a, b)]), 3, "abc").neighbours(0) == (1, 2)
-    with pytest.raises(ValueError, match=r"graph: needs the nodes \['a', 'b', 'c'\], got"):
+    with pytest.raises(
+        ValueError, match=r"graph: needs the nodes \['a', 'b', 'c'\], got"
+    ):
         as_graph(nx.path_graph(["a", "b", "d"]), 3, "abc")
 
 
@@ -111,11 +131,25 @@ def test_a_graph_is_read_from_what_describes_it(seed: int, agents: int) -> None:
     graph = random_graph(seed, agents)
     dense = graph.links.toarray()
     edges = np.argwhere(np.triu(dense))
-    forms = [graph, nx.Graph(dense), nx.DiGraph(dense), graph.links, sparse.coo_matrix(dense),
-             dense, dense.tolist(), dense.astype(bool), dense.astype(int), edges, edges.tolist()]
+    forms = [
+        graph,
+        nx.Graph(dense),
+        nx.DiGraph(dense),
+        graph.links,
+        sparse.coo_matrix(dense),
+        dense,
+        dense.tolist(),
+        dense.astype(bool),
+        dense.astype(int),
+        edges,
+        edges.tolist(),
+    ]
     for value in forms:
         assert (as_graph(value, agents).links != graph.links).nnz == 0
-    assert as_graph([(0, 1), (1, 0)]).n_agents == 2 and as_graph([(0, 1), (1, 2)]).n_agents == 3
+    assert (
+        as_graph([(0, 1), (1, 0)]).n_agents == 2
+        and as_graph([(0, 1), (1, 2)]).n_agents == 3
+    )
     assert as_graph([(0, 1), (1, 0)], 3).in_degree.tolist() == [1.0, 1.0, 0.0]
 
 

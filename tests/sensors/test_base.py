@@ -19,7 +19,8 @@ FULL = np.array([[4.0, 1.2, -0.6], [1.2, 1.0, 0.3], [-0.6, 0.3, 0.5]])
 
 @given(st.floats(-50, 50), st.integers(-5, 5))
 def test_wrap_forgets_whole_turns(value: float, turns: int) -> None:
-    once, again = wrap([value]), wrap([value + turns * 2 * np.pi])
+    once = wrap([value])
+    again = wrap([value + turns * 2 * np.pi])
     assert abs(wrap(once - again)[0]) < 1e-9
     assert -np.pi <= once[0] < np.pi
 
@@ -28,8 +29,18 @@ def test_wrap_forgets_whole_turns(value: float, turns: int) -> None:
 def test_wrap_at_its_ends(period: float) -> None:
     """Rounding must not put an angle just below an end beyond the other."""
     half = period / 2
-    ends = np.array([-half, np.nextafter(-half, -9), np.nextafter(half, -9), half,
-                     np.nextafter(half, 9), 3 * half, -3 * half, np.nextafter(-3 * half, -9)])
+    ends = np.array(
+        [
+            -half,
+            np.nextafter(-half, -9),
+            np.nextafter(half, -9),
+            half,
+            np.nextafter(half, 9),
+            3 * half,
+            -3 * half,
+            np.nextafter(-3 * half, -9),
+        ]
+    )
     out = wrap(ends, period=period)
     assert (out >= -half).all() and (out < half).all()
     assert out[0] == -half and out[3] == -half and out[2] == ends[2]
@@ -71,7 +82,8 @@ def test_a_function_that_works_in_place_leaves_the_caller_s_states() -> None:
 
 def test_observations_have_the_full_covariance() -> None:
     """A transposed factor has another covariance: each entry lies in its 99.99% band."""
-    n, sensor = 40_000, Sensor(3, lambda x: x, FULL)
+    n = 40_000
+    sensor = Sensor(3, lambda x: x, FULL)
     draws = sensor.observe(np.full((n, 3), 7.0), rng=generator(1)) - 7.0
     error = np.sqrt((FULL**2 + np.outer(FULL.diagonal(), FULL.diagonal())) / n)
     assert (np.abs(draws.T @ draws / n - FULL) < 3.9 * error).all()
@@ -88,8 +100,12 @@ def test_residual_keeps_what_is_missing_on_either_side() -> None:
 
 def test_jacobian_without_a_formula() -> None:
     """Differences, through the sensor's own residual where readings wrap."""
-    sensor = Sensor(1, lambda x: wrap(x.sum(axis=-1, keepdims=True)), np.eye(1),
-                    residual_function=lambda y, p: wrap(y - p))
+    sensor = Sensor(
+        1,
+        lambda x: wrap(x.sum(axis=-1, keepdims=True)),
+        np.eye(1),
+        residual_function=lambda y, p: wrap(y - p),
+    )
     x = np.array([[np.pi, 0.0], [1.0, 2.0]])
     assert np.abs(sensor.jacobian(x) - 1.0).max() < 1e-9
     with pytest.raises(ValueError, match="^difference: needs observed less predicted"):
@@ -100,15 +116,21 @@ def test_a_transposed_derivative_is_told_and_a_rough_one_is_not() -> None:
     """Nor one that differences cannot see, so near to a bend."""
     turn = np.array([[0.8, 0.6], [-0.6, 0.8]])
     for x, slope, told in ((1.0, 1.05 * turn, 0), (1.0, turn.T, 1), (1e-9, turn, 0)):
-        sensor = Sensor(2, lambda x: np.abs(x) @ turn.T, np.eye(2), derivative=lambda x, s=slope: s)
+        sensor = Sensor(
+            2, lambda x: np.abs(x) @ turn.T, np.eye(2), derivative=lambda x, s=slope: s
+        )
         with warnings.catch_warnings(record=True, action="always") as caught:
             sensor.jacobian(np.full((3, 2), x))
         assert [str(one.message)[:10] for one in caught] == told * ["derivative"]
 
 
 def test_jacobian_of_changes_is_in_the_present_state() -> None:
-    bent = Sensor(1, lambda x, before: x[..., :1] ** 2 * before[..., 1:2], np.eye(1),
-                  uses_previous=True)
+    bent = Sensor(
+        1,
+        lambda x, before: x[..., :1] ** 2 * before[..., 1:2],
+        np.eye(1),
+        uses_previous=True,
+    )
     x, before = generator(0).standard_normal((2, 4, 2))
     slope = bent.jacobian(x, before)
     assert slope.shape == (4, 1, 2)

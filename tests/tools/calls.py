@@ -61,7 +61,8 @@ class Recorder:
     @contextmanager
     def listening(self) -> Iterator[None]:
         """While it lasts, what passes a door is kept."""
-        taken, made = decorators._Plan.taken, FrozenModel.__post_init__
+        taken = decorators._Plan.taken
+        made = FrozenModel.__post_init__
 
         def at_door(plan: Any, args: Any, options: Any) -> Any:
             out = taken(plan, args, options)
@@ -75,12 +76,14 @@ class Recorder:
             made(record)
             self.keep(type(record), (), given)
 
-        decorators._Plan.taken, FrozenModel.__post_init__ = at_door, at_record
+        decorators._Plan.taken = at_door
+        FrozenModel.__post_init__ = at_record
         try:
             with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
                 yield
         finally:
-            decorators._Plan.taken, FrozenModel.__post_init__ = taken, made
+            decorators._Plan.taken = taken
+            FrozenModel.__post_init__ = made
 
 
 RECORDER = Recorder()
@@ -135,7 +138,9 @@ def _modules(thing: Any) -> Iterator[ModuleType]:
     home = sys.modules[thing.__module__]
     yield home
     near = home.__name__.split(".")[1]
-    names = [info.name for info in pkgutil.walk_packages(distfilt.__path__, "distfilt.")]
+    names = [
+        info.name for info in pkgutil.walk_packages(distfilt.__path__, "distfilt.")
+    ]
     for name in sorted(names, key=lambda n: (n.split(".")[1] != near, n)):
         yield importlib.import_module(name)
 
@@ -154,7 +159,9 @@ def _call(function: Any, args: Any, options: Any) -> Call:
     signature = inspect.signature(function)
     if inspect.isclass(function) and is_dataclass(function):
         made = {f.name for f in fields(function) if f.init}
-        return Call(function, signature, {n: v for n, v in options.items() if n in made})
+        return Call(
+            function, signature, {n: v for n, v in options.items() if n in made}
+        )
     bound = signature.bind(*args, **options)
     bound.apply_defaults()
     return Call(function, signature, dict(bound.arguments))

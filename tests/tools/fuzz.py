@@ -52,7 +52,17 @@ class Finding:
 
 SAME = {"list", "fortran", "read-only", "strided", "numpy scalar", "0-d array"}
 """Kinds that mean the same as the valid value."""
-NEVER = {"complex", "dates", "masked", "text", "booleans", "None", "object", "number", "dict"}
+NEVER = {
+    "complex",
+    "dates",
+    "masked",
+    "text",
+    "booleans",
+    "None",
+    "object",
+    "number",
+    "dict",
+}
 """Kinds that mean nothing, and are refused everywhere."""
 
 
@@ -64,7 +74,8 @@ def numeric(value: Any) -> bool:
 
 
 def array_kinds(value: Any) -> Iterator[tuple[str, Any]]:
-    a, f = np.array(value), np.array(value, dtype=float)
+    a = np.array(value)
+    f = np.array(value, dtype=float)
     with np.errstate(all="ignore"):
         if a.dtype.kind == "f":
             frozen = a.copy()
@@ -80,16 +91,30 @@ def array_kinds(value: Any) -> Iterator[tuple[str, Any]]:
             one = f.copy()
             one.flat[-1] = bad
             yield name, one
-        yield from (("huge", f * 1e300), ("tiny", f * 1e-300), ("negative", -f), ("zero", 0.0 * f))
+        yield from (
+            ("huge", f * 1e300),
+            ("tiny", f * 1e-300),
+            ("negative", -f),
+            ("zero", 0.0 * f),
+        )
         yield from (("empty", np.zeros((0, *f.shape[1:]))), ("scalar", f.flat[0]))
-        yield from (("axis more", f[..., None]), ("axis before", f[None]), ("flat", f.ravel()))
+        yield from (
+            ("axis more", f[..., None]),
+            ("axis before", f[None]),
+            ("flat", f.ravel()),
+        )
         if f.ndim:
             yield from (("empty last", f[..., :0].copy()), ("shorter", f[:-1].copy()))
             yield from (("turned", f.T.copy()), ("longer", np.concatenate([f, f[-1:]])))
 
 
 def number_kinds(value: Any) -> Iterator[tuple[str, Any]]:
-    yield from (("text", "yes"), ("None", None), ("object", object()), ("dict", {"a": 1}))
+    yield from (
+        ("text", "yes"),
+        ("None", None),
+        ("object", object()),
+        ("dict", {"a": 1}),
+    )
     if isinstance(value, bool | np.bool_):
         return
     if isinstance(value, int | np.integer):
@@ -97,9 +122,21 @@ def number_kinds(value: Any) -> Iterator[tuple[str, Any]]:
     else:
         yield from (("numpy scalar", np.float64(value)), ("0-d array", np.array(value)))
         yield from (("huge", 1e300), ("tiny", 1e-300))
-    yield from (("booleans", True), ("complex", value + 1j), ("dates", np.datetime64(3, "s")))
-    yield from (("NaN", np.nan), ("infinite", np.inf), ("zero", 0), ("negative", -value))
-    yield from (("axis more", [value, value]), ("masked", np.ma.masked_array(value, True)))
+    yield from (
+        ("booleans", True),
+        ("complex", value + 1j),
+        ("dates", np.datetime64(3, "s")),
+    )
+    yield from (
+        ("NaN", np.nan),
+        ("infinite", np.inf),
+        ("zero", 0),
+        ("negative", -value),
+    )
+    yield from (
+        ("axis more", [value, value]),
+        ("masked", np.ma.masked_array(value, True)),
+    )
 
 
 def other_kinds(value: Any) -> Iterator[tuple[str, Any]]:
@@ -109,8 +146,15 @@ def other_kinds(value: Any) -> Iterator[tuple[str, Any]]:
     elif isinstance(value, str | os.PathLike):
         yield from (("None", None), ("another", "no such"), ("empty", ""))
     if isinstance(value, list | tuple) and value:
-        yield from (("empty", type(value)()), ("shorter", value[:-1]), ("dict", {"a": 1}))
-        yield from (("longer", [*value, value[-1]]), ("with text", [*value[:-1], "text"]))
+        yield from (
+            ("empty", type(value)()),
+            ("shorter", value[:-1]),
+            ("dict", {"a": 1}),
+        )
+        yield from (
+            ("longer", [*value, value[-1]]),
+            ("with text", [*value[:-1], "text"]),
+        )
 
 
 def kinds(value: Any) -> Iterator[tuple[str, Any]]:
@@ -131,7 +175,9 @@ def kinds(value: Any) -> Iterator[tuple[str, Any]]:
 PLAIN = (str, bytes, bool, int, float, complex, np.generic, np.ndarray)
 
 
-def parts(value: Any, depth: int = 0, seen: frozenset[int] = frozenset()) -> Iterator[Any]:
+def parts(
+    value: Any, depth: int = 0, seen: frozenset[int] = frozenset()
+) -> Iterator[Any]:
     """The numbers, texts and arrays that a result holds, in order."""
     if depth > 8 or id(value) in seen:
         return
@@ -157,12 +203,14 @@ def parts(value: Any, depth: int = 0, seen: frozenset[int] = frozenset()) -> Ite
 
 def same(a: Any, b: Any) -> bool:
     """Whether two results are equal, to rounding."""
-    xs, ys = list(parts(a)), list(parts(b))
+    xs = list(parts(a))
+    ys = list(parts(b))
     return len(xs) == len(ys) and all(equal(x, y) for x, y in zip(xs, ys, strict=True))
 
 
 def equal(x: Any, y: Any) -> bool:
-    x, y = np.asarray(x), np.asarray(y)
+    x = np.asarray(x)
+    y = np.asarray(y)
     if x.shape != y.shape:
         return False
     if x.dtype.kind in "fc" and y.dtype.kind in "fciu":
@@ -173,7 +221,9 @@ def equal(x: Any, y: Any) -> bool:
 
 def exact(a: Any, b: Any) -> bool:
     """Whether two arguments are the same to the bit."""
-    pairs = ((np.asarray(x), np.asarray(y)) for x, y in zip(parts(a), parts(b), strict=False))
+    pairs = (
+        (np.asarray(x), np.asarray(y)) for x, y in zip(parts(a), parts(b), strict=False)
+    )
     return all(x.dtype.kind == "O" or x.tobytes() == y.tobytes() for x, y in pairs)
 
 
@@ -211,7 +261,9 @@ def refused(error: Exception, call: Call, argument: str, kind: str) -> bool:
     return any(re.search(rf"\b{re.escape(name)}\b", text) for name in names)
 
 
-def tried(call: Call, where: tuple[str, str, str], value: Any, reference: Any) -> Finding:
+def tried(
+    call: Call, where: tuple[str, str, str], value: Any, reference: Any
+) -> Finding:
     """What the call makes of the exchanged argument."""
     _, argument, kind = where
     before = copy.deepcopy(call.given) | {argument: copy.deepcopy(value)}
@@ -253,26 +305,47 @@ def of(name: str, several: list[Call]) -> Iterator[Finding]:
                 continue
             for kind, value in kinds(valid):
                 key = argument, kind, type(valid)
-                if key not in done and not (value is None and parameter.default is None):
+                if key not in done and not (
+                    value is None and parameter.default is None
+                ):
                     done.add(key)
                     yield tried(call, (name, argument, kind), value, reference)
 
 
 GOOD = {"rejected", "same", "finite"}
 ALLOWED: dict[tuple[str, str, str], str] = {
-    (r"network\.(average|pi_step)", "gain|dt", "huge: (NaN|too long)"):
-        "an iteration that diverges, with a warning before; as many substeps as are stable",
-    (r".*", r"rounds|iterations|members|substeps", "huge: too long"):
-        "as many rounds as were asked for",
-    (r"density\.DynamicAverage", "modes", "None: taken"): "all cells in place of coefficients",
-    (r"models\.(Model\..*|rk4.*|RotatingMixture.*)", r".*", r".*: NaN"):
-        "a user's function that overflows",
-    (r"sensors\.Sensor.*", r".*", r"(tiny|zero|NaN): NaN"):
-        "a direction to where the sensor is, or a reading that is missing",
+    (
+        r"network\.(average|pi_step)",
+        "gain|dt",
+        "huge: (NaN|too long)",
+    ): "an iteration that diverges, with a warning before; as many substeps as are stable",
+    (
+        r".*",
+        r"rounds|iterations|members|substeps",
+        "huge: too long",
+    ): "as many rounds as were asked for",
+    (
+        r"density\.DynamicAverage",
+        "modes",
+        "None: taken",
+    ): "all cells in place of coefficients",
+    (
+        r"models\.(Model\..*|rk4.*|RotatingMixture.*)",
+        r".*",
+        r".*: NaN",
+    ): "a user's function that overflows",
+    (
+        r"sensors\.Sensor.*",
+        r".*",
+        r"(tiny|zero|NaN): NaN",
+    ): "a direction to where the sensor is, or a reading that is missing",
     (r"sensors\.wrap|filters\.Reading", r".*", "NaN: NaN"): "a reading that is missing",
-    (r"kalman\.filterpy_\w+|models\.pendulum_chart", r".*", r"huge: (unnamed|NaN)"):
-        "an overflow, in another package's words or an angle of nothing",
-}  # fmt: skip
+    (
+        r"kalman\.filterpy_\w+|models\.pendulum_chart",
+        r".*",
+        r"huge: (unnamed|NaN)",
+    ): "an overflow, in another package's words or an angle of nothing",
+}
 """(callable, argument, kind and result) as patterns to the reason why it may be so."""
 
 
@@ -288,7 +361,8 @@ def judged(found: Finding) -> str:
 
 def run(chosen: list[str]) -> list[Finding]:
     """All findings of the chosen rooms, in a folder of its own."""
-    here, out = Path.cwd(), []
+    here = Path.cwd()
+    out = []
     with tempfile.TemporaryDirectory(prefix="fuzz-") as scratch:
         os.chdir(scratch)
         try:
@@ -309,8 +383,10 @@ def main(arguments: list[str]) -> int:
     for f in faults:
         print(f"{f.result:9} {f.name}({f.argument}): {f.kind}: {f.text}", flush=True)
     named = len({f.name for f in found}), len({(f.name, f.argument) for f in found})
-    print(f"{len(found)} calls, {named[0]} callables, {named[1]} arguments: "
-          f"{dict(Counter(map(judged, found)))}, {time.perf_counter() - began:.0f} s")  # fmt: skip
+    print(
+        f"{len(found)} calls, {named[0]} callables, {named[1]} arguments: "
+        f"{dict(Counter(map(judged, found)))}, {time.perf_counter() - began:.0f} s"
+    )
     return len(faults)
 
 

@@ -46,8 +46,12 @@ TABLE = ROOT / "data" / "bench" / "mutants.csv"
 COLUMNS = ("module", "line", "was", "becomes", "result", "stage", "seconds", "reason")
 SECONDS = (120, 400)
 """What the tests of each stage may take; a mutant that takes longer hangs, and so is found."""
-EVERY = ("distfilt", "tests", *(f"--ignore=tests/{name}" for name in ("book", "tools")),
-         "--ignore=tests/test_package.py")  # fmt: skip
+EVERY = (
+    "distfilt",
+    "tests",
+    *(f"--ignore=tests/{name}" for name in ("book", "tools")),
+    "--ignore=tests/test_package.py",
+)
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,9 @@ def mutants(root: Path, only: str) -> Iterator[Mutant]:
             continue
         nodes = list(ast_nodes(get_ast(path.read_text(encoding="utf-8"))))
         for name, operator in plain.items():
-            places = (place for node in nodes for place in operator.mutation_positions(node))
+            places = (
+                place for node in nodes for place in operator.mutation_positions(node)
+            )
             for occurrence, (start, _) in enumerate(places):
                 yield Mutant(module, name, occurrence, *start)
 
@@ -102,7 +108,9 @@ def meaning(text: str) -> str:
 
 def keys(places: list[tuple[str, int, int]], root: Path, seed: int) -> dict[Any, str]:
     """A place's number in the lottery, from its line's text: it stays when other code changes."""
-    out, seen, lines = {}, Counter[str](), dict[str, list[str]]()
+    out = {}
+    seen = Counter[str]()
+    lines = dict[str, list[str]]()
     for module, line, column in sorted(places):
         if module not in lines:
             lines[module] = (root / module).read_text(encoding="utf-8").splitlines()
@@ -116,7 +124,9 @@ def drawn(root: Path, size: int, seed: int, only: str) -> list[Mutant]:
     """A sample of places, and one change at each, that is a change of what the code does."""
     places: dict[tuple[str, int, int], list[Mutant]] = {}
     for mutant in mutants(root, only):
-        places.setdefault((mutant.module, mutant.line, mutant.column), []).append(mutant)
+        places.setdefault((mutant.module, mutant.line, mutant.column), []).append(
+            mutant
+        )
     numbers = keys(list(places), root, seed)
     out: list[Mutant] = []
     for place in sorted(places, key=numbers.__getitem__):
@@ -136,7 +146,10 @@ def nearest(module: str, root: Path) -> list[str]:
     """The module's own examples, the file of tests that mirrors it, and what holds for all."""
     parts = Path(module).with_suffix("").parts[1:]
     name = f"test_{parts[-1].lstrip('_')}.py"
-    mirrors = [root.joinpath("tests", *parts[:-1], name), root / "tests" / f"test_{parts[0]}.py"]
+    mirrors = [
+        root.joinpath("tests", *parts[:-1], name),
+        root / "tests" / f"test_{parts[0]}.py",
+    ]
     options = [p for p in (root / "tests" / "test_validation.py",) if p.is_file()]
     near = [*[p for p in mirrors if p.is_file()][:1], *options]
     return [module, *(p.relative_to(root).as_posix() for p in near)]
@@ -148,15 +161,35 @@ def traced(root: Path, jobs: int) -> Any:
 
     path = root / "_build" / "lines.coverage"
     sources = [p for name in ("distfilt", "tests") for p in (root / name).rglob("*.py")]
-    if not path.is_file() or path.stat().st_mtime < max(p.stat().st_mtime for p in sources):
+    if not path.is_file() or path.stat().st_mtime < max(
+        p.stat().st_mtime for p in sources
+    ):
         path.parent.mkdir(exist_ok=True)
         subprocess.run(
-            [sys.executable, "-m", "pytest", "-q", "-n", str(jobs), "--dist", "loadscope",
-             "--cov=distfilt", "--cov-context=test", "--cov-report=", *EVERY],
-            cwd=root, check=True, stdin=subprocess.DEVNULL,
-            env=os.environ | {"COVERAGE_FILE": str(path), "PYTHONPATH": str(root),
-                              "HYPOTHESIS_PROFILE": "gate"},
-        )  # fmt: skip
+            [
+                sys.executable,
+                "-m",
+                "pytest",
+                "-q",
+                "-n",
+                str(jobs),
+                "--dist",
+                "loadscope",
+                "--cov=distfilt",
+                "--cov-context=test",
+                "--cov-report=",
+                *EVERY,
+            ],
+            cwd=root,
+            check=True,
+            stdin=subprocess.DEVNULL,
+            env=os.environ
+            | {
+                "COVERAGE_FILE": str(path),
+                "PYTHONPATH": str(root),
+                "HYPOTHESIS_PROFILE": "gate",
+            },
+        )
     data = CoverageData(basename=str(path))
     data.read()
     return data
@@ -167,7 +200,10 @@ def running(contexts: dict[int, list[str]], text: str, line: int) -> list[str]:
     nodes = [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.stmt)]
     spans = [(n.lineno, n.end_lineno or n.lineno) for n in nodes]
     around = [(a, b) for a, b in spans if a <= line <= b]
-    for first, last in (*sorted(around, key=lambda s: s[1] - s[0]), (1, text.count("\n") + 1)):
+    for first, last in (
+        *sorted(around, key=lambda s: s[1] - s[0]),
+        (1, text.count("\n") + 1),
+    ):
         found = {c for n in range(first, last + 1) for c in contexts.get(n, ()) if c}
         if found:
             # Without the parameters, whose names may come from the library.
@@ -177,12 +213,26 @@ def running(contexts: dict[int, list[str]], text: str, line: int) -> list[str]:
 
 def passes(tests: list[str], folder: Path, seconds: float) -> bool:
     """Whether the tests pass in a copy, in time."""
-    command = [sys.executable, "-B", "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
+    command = [
+        sys.executable,
+        "-B",
+        "-m",
+        "pytest",
+        "-q",
+        "-x",
+        "-p",
+        "no:cacheprovider",
+        *tests,
+    ]
     child = subprocess.Popen(
-        command, cwd=folder, start_new_session=True, stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        command,
+        cwd=folder,
+        start_new_session=True,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
         env=os.environ | {"PYTHONPATH": str(folder), "HYPOTHESIS_PROFILE": "gate"},
-    )  # fmt: skip
+    )
     try:
         return child.wait(seconds) in (0, 5)  # 5: no test there
     except subprocess.TimeoutExpired:
@@ -199,10 +249,18 @@ def described(mutant: Mutant, root: Path) -> dict[str, Any]:
     pairs = zip(text.splitlines(), mutant.source(text).splitlines(), strict=False)
     was, becomes = next((a.strip(), b.strip()) for a, b in pairs if a != b)
     row: dict[str, Any] = {"module": mutant.module, "line": mutant.line, "was": was}
-    return row | {"becomes": becomes, "result": "", "stage": "", "seconds": "", "reason": ""}
+    return row | {
+        "becomes": becomes,
+        "result": "",
+        "stage": "",
+        "seconds": "",
+        "reason": "",
+    }
 
 
-def tested(mutant: Mutant, stages: list[list[str]], free: SimpleQueue[Path]) -> dict[str, Any]:
+def tested(
+    mutant: Mutant, stages: list[list[str]], free: SimpleQueue[Path]
+) -> dict[str, Any]:
     """What became of one mutant, in a copy that no other one is using."""
     folder = free.get()
     path = folder / mutant.module
@@ -225,19 +283,29 @@ def tested(mutant: Mutant, stages: list[list[str]], free: SimpleQueue[Path]) -> 
 def stages(mutant: Mutant, root: Path, trace: Any) -> list[list[str]]:
     """The tests of both stages."""
     path = root / mutant.module
-    lines, text = trace.contexts_by_lineno(str(path)), path.read_text(encoding="utf-8")
+    lines = trace.contexts_by_lineno(str(path))
+    text = path.read_text(encoding="utf-8")
     return [nearest(mutant.module, root), running(lines, text, mutant.line)]
 
 
-def run(rows: list[tuple[Mutant, dict[str, Any]]], root: Path, jobs: int) -> Iterator[None]:
+def run(
+    rows: list[tuple[Mutant, dict[str, Any]]], root: Path, jobs: int
+) -> Iterator[None]:
     """Complete the rows, each job with a copy of the repository; yields after each one."""
     trace = traced(root, jobs)
-    left_out = shutil.ignore_patterns(".git", ".venv", "_build", "__pycache__", ".*_cache")
+    left_out = shutil.ignore_patterns(
+        ".git", ".venv", "_build", "__pycache__", ".*_cache"
+    )
     free: SimpleQueue[Path] = SimpleQueue()
-    with tempfile.TemporaryDirectory(prefix="mutants-") as own, ThreadPoolExecutor(jobs) as pool:
+    with (
+        tempfile.TemporaryDirectory(prefix="mutants-") as own,
+        ThreadPoolExecutor(jobs) as pool,
+    ):
         for k in range(jobs):
             free.put(shutil.copytree(root, Path(own) / str(k), ignore=left_out))
-        waiting = {pool.submit(tested, m, stages(m, root, trace), free): row for m, row in rows}
+        waiting = {
+            pool.submit(tested, m, stages(m, root, trace), free): row for m, row in rows
+        }
         try:
             for future in as_completed(waiting):
                 row = waiting[future]
@@ -261,17 +329,25 @@ def stored(rows: list[dict[str, Any]], table: Path) -> None:
     """Write the table; in one step, so that a run that is ended leaves a whole one."""
     table.parent.mkdir(parents=True, exist_ok=True)
     part = table.with_suffix(".part")
-    pandas.DataFrame(rows, columns=COLUMNS).to_csv(part, index=False, lineterminator="\n")
+    pandas.DataFrame(rows, columns=COLUMNS).to_csv(
+        part, index=False, lineterminator="\n"
+    )
     part.replace(table)
 
 
-def main(arguments: list[str] | None = None, root: Path = ROOT, table: Path = TABLE) -> int:
-    parser = argparse.ArgumentParser(description="Random faults, and whether the tests find them.")
+def main(
+    arguments: list[str] | None = None, root: Path = ROOT, table: Path = TABLE
+) -> int:
+    parser = argparse.ArgumentParser(
+        description="Random faults, and whether the tests find them."
+    )
     parser.add_argument("--sample", type=int, default=300, help="how many places")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", default="", help="a folder or module of the library")
-    parser.add_argument("--minutes", type=float, default=1e6, help="when to stop for now")
+    parser.add_argument(
+        "--minutes", type=float, default=1e6, help="when to stop for now"
+    )
     options = parser.parse_args(arguments)
     before = known(table)
     chosen = drawn(root, options.sample, options.seed, options.only)
@@ -292,7 +368,9 @@ def main(arguments: list[str] | None = None, root: Path = ROOT, table: Path = TA
     killed = sum(row["result"] == "killed" for row in ran)
     equivalent = sum(row["result"] == "survived" and bool(row["reason"]) for row in ran)
     share = killed / max(len(ran) - equivalent, 1)
-    print(f"{killed} of {len(ran)} killed, {equivalent} equivalent: {share:.1%} of the others")
+    print(
+        f"{killed} of {len(ran)} killed, {equivalent} equivalent: {share:.1%} of the others"
+    )
     return 0
 
 

@@ -36,7 +36,10 @@ def test_half():
 
 @pytest.fixture
 def repository(tmp_path: Path) -> Path:
-    for folder, name, text in ("distfilt", "a.py", LIBRARY), ("tests", "test_a.py", TESTS):
+    for folder, name, text in (
+        ("distfilt", "a.py", LIBRARY),
+        ("tests", "test_a.py", TESTS),
+    ):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / "__init__.py").touch()
         (tmp_path / folder / name).write_text(text, encoding="utf-8")
@@ -46,7 +49,9 @@ def repository(tmp_path: Path) -> Path:
 def test_types_and_texts_are_no_faults(repository: Path) -> None:
     same = LIBRARY.replace("int | None", "int & None").replace("Half.", "Whole.")
     assert mutants.meaning(same) == mutants.meaning(LIBRARY)
-    assert mutants.meaning(LIBRARY.replace("x / scale", "x * scale")) != mutants.meaning(LIBRARY)
+    assert mutants.meaning(
+        LIBRARY.replace("x / scale", "x * scale")
+    ) != mutants.meaning(LIBRARY)
     for mutant in mutants.drawn(repository, 50, 3, ""):
         made = mutant.source(LIBRARY)
         assert mutants.meaning(made) != mutants.meaning(LIBRARY)
@@ -62,7 +67,12 @@ def test_a_sample_is_the_seed_s_and_has_one_change_a_place(repository: Path) -> 
 
 def test_a_line_is_tested_by_what_runs_its_statement_or_function_or_module() -> None:
     text = "A = (\n    1\n)\n\ndef f(x,\n      y=2):\n    z = (x +\n         y)\n    return z\n"
-    contexts = {1: [""], 5: [""], 7: ["t.py::a[1]|run", "t.py::a[2]|run", ""], 9: ["t.py::b|call"]}
+    contexts = {
+        1: [""],
+        5: [""],
+        7: ["t.py::a[1]|run", "t.py::a[2]|run", ""],
+        9: ["t.py::b|call"],
+    }
     assert mutants.running(contexts, text, 8) == ["t.py::a"]
     assert mutants.running(contexts, text, 9) == ["t.py::b"]
     assert mutants.running(contexts, text, 6) == ["t.py::a", "t.py::b"]
@@ -76,19 +86,30 @@ def run(repository: Path, table: Path, *options: str) -> str:
     call += f"Path({str(repository)!r}), Path({str(table)!r}))"
     tools = Path(mutants.__file__).parent
     return subprocess.run(
-        [sys.executable, "-c", call], cwd=tools, check=True, capture_output=True, text=True
+        [sys.executable, "-c", call],
+        cwd=tools,
+        check=True,
+        capture_output=True,
+        text=True,
     ).stdout
 
 
 @pytest.mark.slow
-def test_faults_are_found_or_survive_and_a_run_goes_on(repository: Path, tmp_path: Path) -> None:
+def test_faults_are_found_or_survive_and_a_run_goes_on(
+    repository: Path, tmp_path: Path
+) -> None:
     table = tmp_path / "out" / "mutants.csv"
-    assert "of 1 killed" in run(repository, table, "--jobs", "1", "--sample", "4", "--minutes", "0")
+    assert "of 1 killed" in run(
+        repository, table, "--jobs", "1", "--sample", "4", "--minutes", "0"
+    )
     assert run(repository, table, "--sample", "4").count("distfilt/a.py") == 3
     run(repository, table, "--sample", "50")
     with table.open(newline="") as lines:
         rows = {(r["was"], r["result"]) for r in csv.DictReader(lines)}
-    assert ("return x / scale", "killed") in rows and ("return x + 1", "survived") in rows
+    assert ("return x / scale", "killed") in rows and (
+        "return x + 1",
+        "survived",
+    ) in rows
     assert ("return x / scale", "survived") not in rows
     assert (repository / "distfilt" / "a.py").read_text() == LIBRARY
     whole = table.read_text()

@@ -15,7 +15,9 @@ def samples(
     """Correlated, shifted, badly scaled samples (y, x)."""
     rng = rng_of(seed)
     mixing = rng.standard_normal((m + d, m + d)) * np.logspace(-1, 1, m + d)
-    z = rng.standard_normal((*leading, n, m + d)) @ mixing + 10 * rng.standard_normal(m + d)
+    z = rng.standard_normal((*leading, n, m + d)) @ mixing + 10 * rng.standard_normal(
+        m + d
+    )
     return z[..., :m], z[..., m:]
 
 

@@ -31,7 +31,9 @@ def test_map_whitens_and_inverts(seed: int, m: int, d: int) -> None:
 
 def test_map_log_det_and_objective_are_batched() -> None:
     y, x = samples(3, leading=(2, 4))
-    whole, one, part = fit(y, x), fit(y[1, 2], x[1, 2]), (y[1, 2], x[1, 2])
+    whole = fit(y, x)
+    one = fit(y[1, 2], x[1, 2])
+    part = (y[1, 2], x[1, 2])
     assert np.allclose(whole(y, x)[1, 2], one(*part), atol=1e-12)
     assert np.allclose(whole.log_det(y, x)[1, 2], one.log_det(*part))
     assert np.allclose(objective(whole, y, x)[1, 2], objective(one, *part), atol=1e-12)
@@ -45,7 +47,9 @@ def test_log_det_is_the_derivative_s(seed: int) -> None:
     moved = x[0] + np.eye(3)
     base = s(y[:1], x[:1])
     columns = s(np.repeat(y[:1], 3, axis=0), moved) - base
-    assert np.isclose(np.linalg.slogdet(columns)[1], s.log_det(y, x)[0], rtol=1e-9, atol=1e-9)
+    assert np.isclose(
+        np.linalg.slogdet(columns)[1], s.log_det(y, x)[0], rtol=1e-9, atol=1e-9
+    )
     assert np.allclose(np.tril(columns.T), columns.T, atol=1e-9)
 
 
@@ -63,7 +67,8 @@ def test_the_program_is_compiled_once_for_each_size() -> None:
     _program.cache_clear()
     for seed in (1, 2):
         y, x = samples(seed, m=1, d=2)
-        y, x = (y - y.mean(0)) / y.std(0), (x - x.mean(0)) / x.std(0)
+        y = (y - y.mean(0)) / y.std(0)
+        x = (x - x.mean(0)) / x.std(0)
         gap = compose(fit(y, x), y, x, y[0]) - compose(fit_convex(y, x), y, x, y[0])
         assert np.abs(gap).max() < 1e-6
     info = _program.cache_info()
@@ -79,16 +84,21 @@ def test_the_program_forgets_the_samples_before() -> None:
     assert np.array_equal(fit_convex(y, x).scale, first.scale)
 
 
-@pytest.mark.parametrize(("name", "y", "x"), [
-    ("x", _Y[:3], _X[:3]),
-    ("x", _Y, _X[:, [0, 0]]),
-    ("x", _X[:, :1], _X),
-    ("x", _Y, np.column_stack([_X, np.full(20, 0.1)])),
-    ("y", _Y @ [[1.0, 0.3]], _X),
-    ("y", np.zeros((20, 1)), _X),
-    ("y", _Y[None], _X),
-])
-def test_samples_without_a_map_are_blamed(name: str, y: np.ndarray, x: np.ndarray) -> None:
+@pytest.mark.parametrize(
+    ("name", "y", "x"),
+    [
+        ("x", _Y[:3], _X[:3]),
+        ("x", _Y, _X[:, [0, 0]]),
+        ("x", _X[:, :1], _X),
+        ("x", _Y, np.column_stack([_X, np.full(20, 0.1)])),
+        ("y", _Y @ [[1.0, 0.3]], _X),
+        ("y", np.zeros((20, 1)), _X),
+        ("y", _Y[None], _X),
+    ],
+)
+def test_samples_without_a_map_are_blamed(
+    name: str, y: np.ndarray, x: np.ndarray
+) -> None:
     """Too few, constant, or combinations of others."""
     for estimator in (fit, partial(separable.fit, order=0)):
         with pytest.raises(ValueError, match=f"^{name}: needs"):
@@ -102,13 +112,18 @@ def test_a_repeated_variable_s_rounding_is_no_variance() -> None:
         affine.from_moments(np.ones(2), almost, 1)
 
 
-@pytest.mark.parametrize(("solver", "limit"), [("ECOS", "max_iters"), ("CLARABEL", "max_iter")])
+@pytest.mark.parametrize(
+    ("solver", "limit"), [("ECOS", "max_iters"), ("CLARABEL", "max_iter")]
+)
 def test_a_solver_that_stops_short_raises_its_status(
     monkeypatch: pytest.MonkeyPatch, solver: str, limit: str
 ) -> None:
     solve = cvxpy.Problem.solve
-    monkeypatch.setattr(cvxpy.Problem, "solve",
-                        lambda problem, **options: solve(problem, **options, **{limit: 1}))
+    monkeypatch.setattr(
+        cvxpy.Problem,
+        "solve",
+        lambda problem, **options: solve(problem, **options, **{limit: 1}),
+    )
     with pytest.raises(SolverError, match=f"{solver}: component 2"):
         fit_convex(_Y, _X, solver=solver)
 
@@ -126,5 +141,6 @@ def test_composed_affine_map_is_the_enkf(seed: int, m: int, d: int) -> None:
     y, x = samples(seed, 60, m, d)
     observed = rng_of(seed + 1).standard_normal(m)
     condition = np.linalg.cond(np.cov(y, rowvar=False).reshape(m, -1))
-    ours, theirs = compose(fit(y, x), y, x, observed), _enkf(y, x, observed)
+    ours = compose(fit(y, x), y, x, observed)
+    theirs = _enkf(y, x, observed)
     assert np.abs(ours - theirs).max() < 1e-12 * max(1, np.abs(theirs).max(), condition)

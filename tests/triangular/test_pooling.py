@@ -13,7 +13,13 @@ from distfilt.triangular.pooling import pool_by_admm, pool_by_moments
 
 
 def _samples(
-    seed: int, agents: int = 3, n: int = 50, m: int = 2, d: int = 3, *, raw: bool = False
+    seed: int,
+    agents: int = 3,
+    n: int = 50,
+    m: int = 2,
+    d: int = 3,
+    *,
+    raw: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Correlated samples of each agent, whose means differ; badly scaled if `raw`."""
     rng = np.random.default_rng(seed)
@@ -32,17 +38,28 @@ def _centralised(y: np.ndarray, x: np.ndarray) -> AffineMap:
 _Y, _X = _samples(0)
 
 
-@given(st.integers(0, 10_000), st.sampled_from([graphs.path(3), graphs.star(5), graphs.ring(4)]))
-def test_averaged_moments_give_the_map_of_all_samples(seed: int, graph: graphs.Graph) -> None:
+@given(
+    st.integers(0, 10_000),
+    st.sampled_from([graphs.path(3), graphs.star(5), graphs.ring(4)]),
+)
+def test_averaged_moments_give_the_map_of_all_samples(
+    seed: int, graph: graphs.Graph
+) -> None:
     y, x = _samples(seed, graph.n_agents)
-    pooled, central = pool_by_moments(y, x, Channel(graph)), _centralised(y, x)
+    pooled = pool_by_moments(y, x, Channel(graph))
+    central = _centralised(y, x)
     for name in ("observed_mean", "mean", "gain", "scale"):
         gap = getattr(pooled, name) - getattr(central, name)
-        assert np.abs(gap).max() < 1e-12 * max(1.0, np.abs(getattr(central, name)).max())
+        assert np.abs(gap).max() < 1e-12 * max(
+            1.0, np.abs(getattr(central, name)).max()
+        )
 
 
 def test_averaged_moments_are_batched_over_runs_and_cost_what_they_say() -> None:
-    y, x = (np.stack(v) for v in zip(_samples(1, m=6, d=6), _samples(2, m=6, d=6), strict=True))
+    y, x = (
+        np.stack(v)
+        for v in zip(_samples(1, m=6, d=6), _samples(2, m=6, d=6), strict=True)
+    )
     channel = Channel(graphs.complete(3), runs=(2,))
     pooled = pool_by_moments(y, x, channel)
     for run in range(2):
@@ -64,8 +81,12 @@ def test_admm_finds_the_map_of_all_samples(graph: graphs.Graph, raw: bool) -> No
     flat = y.reshape(-1, 3), x.reshape(-1, 4)
     moved = compose(central, *flat, y[0, 0])
     for agent in range(graph.n_agents):
-        one = AffineMap(*(getattr(solved, n)[agent] for n in
-                          ("observed_mean", "mean", "gain", "scale")))
+        one = AffineMap(
+            *(
+                getattr(solved, n)[agent]
+                for n in ("observed_mean", "mean", "gain", "scale")
+            )
+        )
         assert (np.abs(compose(one, *flat, y[0, 0]) - moved) / scale).max() < 1e-4
         assert np.abs(one(*flat) - central(*flat)).max() < 1e-4
 
@@ -74,11 +95,15 @@ def test_a_rule_that_diverges_is_blamed_itself() -> None:
     """Gains far too large: not the samples are at fault, as they vary."""
     for gain in (2.0, 1000.0):
 
-        def rule(values: np.ndarray, channel: Channel, gain: float = gain) -> np.ndarray:
+        def rule(
+            values: np.ndarray, channel: Channel, gain: float = gain
+        ) -> np.ndarray:
             return values + gain * (values - values.mean(axis=0)) * 10
 
         for pool in (pool_by_moments, pool_by_admm):
-            with pytest.raises(ValueError, match="agree: needs a rule that returns averages"):
+            with pytest.raises(
+                ValueError, match="agree: needs a rule that returns averages"
+            ):
                 pool(_Y, _X, Channel(graphs.path(3)), average=rule)
 
 
@@ -91,7 +116,9 @@ def test_a_variable_that_only_differs_between_agents_is_not_constant() -> None:
 
 def test_rho_changes_the_way_and_not_the_end() -> None:
     y, x = _samples(7)
-    few = [pool_by_admm(y, x, Channel(graphs.path(3)), rho=rho, tolerance=1e-9)
-           for rho in (0.5, 2.0)]
+    few = [
+        pool_by_admm(y, x, Channel(graphs.path(3)), rho=rho, tolerance=1e-9)
+        for rho in (0.5, 2.0)
+    ]
     assert few[0][1].iterations != few[1][1].iterations
     assert np.abs(few[0][0].gain - few[1][0].gain).max() < 1e-6

@@ -20,15 +20,18 @@ def test_order_zero_is_the_affine_map(seed: int, m: int, d: int) -> None:
     rng = rng_of(seed)
     mixing = np.eye(m + d) + 0.3 * rng.standard_normal((m + d, m + d))
     z = 5 + rng.standard_normal((60, m + d)) @ mixing * np.logspace(-1, 1, m + d)
-    y, x = z[:, :m], z[:, m:]
-    ours, theirs = fit(y, x, order=0), affine.fit(y, x)
+    y = z[:, :m]
+    x = z[:, m:]
+    ours = fit(y, x, order=0)
+    theirs = affine.fit(y, x)
     assert np.abs(ours(y, x) - theirs(y, x)).max() < 1e-8
     assert np.abs(ours.log_det(y, x) - theirs.log_det(y, x)).max() < 1e-8
     assert np.abs(compose(ours, y, x, y[0]) - compose(theirs, y, x, y[0])).max() < 1e-8
 
 
 def test_a_large_penalty_gives_the_affine_map() -> None:
-    ours, theirs = fit(_Y, _X, order=2, regularisation=1e9), affine.fit(_Y, _X)
+    ours = fit(_Y, _X, order=2, regularisation=1e9)
+    theirs = affine.fit(_Y, _X)
     assert np.abs(ours(_Y, _X) - theirs(_Y, _X)).max() < 1e-6
 
 
@@ -46,17 +49,22 @@ def test_map_increases_inverts_and_is_triangular(seed: int, p: int, q: int) -> N
 
 def test_batched_fit_is_each_run_s() -> None:
     y, x, _ = banana(4, 100, (2, 3))
-    whole, one = fit(y, x, order=2), fit(y[1, 2], x[1, 2], order=2)
+    whole = fit(y, x, order=2)
+    one = fit(y[1, 2], x[1, 2], order=2)
     z = whole(y, x)
     assert np.abs(z[1, 2] - one(y[1, 2], x[1, 2])).max() < 1e-7
     assert np.abs(whole.inverse(y, z) - x).max() < 1e-9
     aim = y[..., 0, :]
-    assert np.abs(whole.inverse(aim, z)[1, 2] - one.inverse(aim[1, 2], z[1, 2])).max() < 1e-6
+    assert (
+        np.abs(whole.inverse(aim, z)[1, 2] - one.inverse(aim[1, 2], z[1, 2])).max()
+        < 1e-6
+    )
 
 
 def test_sparse_components_do_not_see_what_they_leave_out() -> None:
     y, x, _ = banana(7)
-    s, alone = fit(y, x, order=2, uses=[[], [1]]), fit(y[:, :0], x, order=2)
+    s = fit(y, x, order=2, uses=[[], [1]])
+    alone = fit(y[:, :0], x, order=2)
     assert s.weights[0].shape == (1,) and s.weights[1].shape == (4,)
     assert np.allclose(s(y, x), alone(y[:, :0], x), atol=1e-12)
     assert fit(y[:8], x[:8], order=2, uses=[[], [0]])(y, x).shape == x.shape
@@ -79,9 +87,16 @@ def test_inverse_reaches_far_beyond_the_samples() -> None:
 
 def _features(s: SeparableMap, v: np.ndarray, k: int) -> tuple[np.ndarray, ...]:
     """Component k's features of earlier variables, of its own, and the own ones' slopes."""
-    used, own = s.uses[k], v[:, v.shape[1] - len(s.uses) + k]
-    bumps = [np.exp(-0.5 * ((v[:, u] - at) / w) ** 2) for u in used for at, w in s.bumps[:, u].T]
-    steps = [np.sqrt(2 * np.pi) * w * norm.cdf((own - at) / w) for at, w in s.steps[:, k].T]
+    used = s.uses[k]
+    own = v[:, v.shape[1] - len(s.uses) + k]
+    bumps = [
+        np.exp(-0.5 * ((v[:, u] - at) / w) ** 2)
+        for u in used
+        for at, w in s.bumps[:, u].T
+    ]
+    steps = [
+        np.sqrt(2 * np.pi) * w * norm.cdf((own - at) / w) for at, w in s.steps[:, k].T
+    ]
     rates = [np.exp(-0.5 * ((own - at) / w) ** 2) for at, w in s.steps[:, k].T]
     one = np.ones(len(v))
     before = np.column_stack([one, *v[:, used].T, *bumps])
@@ -90,11 +105,17 @@ def _features(s: SeparableMap, v: np.ndarray, k: int) -> tuple[np.ndarray, ...]:
 
 def _by_hand() -> tuple[SeparableMap, np.ndarray]:
     """m = 1, d = 2, two bumps of each variable and two steps of each component, all different."""
-    bumps = np.array([[[-0.5, 0.6], [-0.4, 0.3], [0.1, 0.9]], [[0.7, 0.5], [0.8, 1.1], [0.6, 0.9]]])
+    bumps = np.array(
+        [[[-0.5, 0.6], [-0.4, 0.3], [0.1, 0.9]], [[0.7, 0.5], [0.8, 1.1], [0.6, 0.9]]]
+    )
     steps = np.array([[[-0.7, 0.2], [0.4, 1.3]], [[0.5, 0.9], [0.8, 0.6]]])
-    weights = [np.array([0.3, -0.8, 0.5, -0.2]), np.array([-0.1, 0.7, 0.4, 0.6, -0.5, 0.25, 0.9])]
+    weights = [
+        np.array([0.3, -0.8, 0.5, -0.2]),
+        np.array([-0.1, 0.7, 0.4, 0.6, -0.5, 0.25, 0.9]),
+    ]
     slopes = [np.array([0.9, 0.3, 0.2]), np.array([0.4, 0.0, 1.1])]
-    centre, spread = np.array([0.5, -1.0, 2.0]), np.array([2.0, 0.5, 1.5])
+    centre = np.array([0.5, -1.0, 2.0])
+    spread = np.array([2.0, 0.5, 1.5])
     made = SeparableMap(1, centre, spread, bumps, steps, [[0], [0, 1]], weights, slopes)
     return made, np.array([[1.2, -0.7, 2.6], [-3.0, -1.4, 0.5], [0.5, -1.0, 5.0]])
 
@@ -102,11 +123,14 @@ def _by_hand() -> tuple[SeparableMap, np.ndarray]:
 def test_hand_set_coefficients_against_the_formula() -> None:
     """Constant, lines, every bump of earlier variables, line and integrated bumps of the own."""
     s, points = _by_hand()
-    out, slope = s(points[:, :1], points[:, 1:]), s.log_det(points[:, :1], points[:, 1:])
+    out = s(points[:, :1], points[:, 1:])
+    slope = s.log_det(points[:, :1], points[:, 1:])
     rates = np.zeros(3)
     for k in range(2):
         before, own, rate = _features(s, (points - s.centre) / s.spread, k)
-        assert np.abs(out[:, k] - before @ s.weights[k] - own @ s.slopes[k]).max() < 1e-12
+        assert (
+            np.abs(out[:, k] - before @ s.weights[k] - own @ s.slopes[k]).max() < 1e-12
+        )
         rates += np.log(rate @ s.slopes[k] / s.spread[1 + k])
     assert np.abs(slope - rates).max() < 1e-12
     assert np.abs(s.inverse(points[:, :1], out) - points[:, 1:]).max() < 1e-12
@@ -151,15 +175,25 @@ def test_fitted_bumps_stand_at_quantiles() -> None:
 def _one(*slopes: float) -> SeparableMap:
     """A map of one variable, of a line and one step."""
     step = np.array([[[0.0]], [[1.0]]])
-    return SeparableMap(0, np.zeros(1), np.ones(1), np.empty((2, 1, 0)), step, [[]], [np.zeros(1)],
-                        [np.array(slopes)])
+    return SeparableMap(
+        0,
+        np.zeros(1),
+        np.ones(1),
+        np.empty((2, 1, 0)),
+        step,
+        [[]],
+        [np.zeros(1)],
+        [np.array(slopes)],
+    )
 
 
 def test_inverse_of_a_map_that_hardly_has_a_line() -> None:
     """A line so flat that its ends are far away."""
     for flat in (1e-9, 1e-3):
         z = _one(flat, 1.0)(np.empty((3, 0)), [[-1.0], [0.3], [1.5]])
-        assert np.abs(_one(flat, 1.0).inverse([], z) - [[-1.0], [0.3], [1.5]]).max() < 1e-9
+        assert (
+            np.abs(_one(flat, 1.0).inverse([], z) - [[-1.0], [0.3], [1.5]]).max() < 1e-9
+        )
 
 
 # ------------------------------------------------------------------------------- inversion
@@ -169,12 +203,18 @@ def _ends(target: np.ndarray, far: float = 64.0) -> tuple[np.ndarray, np.ndarray
     return np.full(target.shape, -far), np.full(target.shape, far)
 
 
-def test_a_separable_map_is_inverted_in_few_evaluations(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_separable_map_is_inverted_in_few_evaluations(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     y, x, _ = banana(1, 500)
     s = fit(y, x, order=3)
-    z, calls, own = s(y, x), [], SeparableMap._own
+    z = s(y, x)
+    calls = []
+    own = SeparableMap._own
 
-    def counted(self: SeparableMap, v: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    def counted(
+        self: SeparableMap, v: np.ndarray, k: int
+    ) -> tuple[np.ndarray, np.ndarray]:
         calls.append(k)
         return own(self, v, k)
 

@@ -16,9 +16,10 @@ MEAN = np.array([1.0, -2.0, 0.5])
 COV = np.array([[2.0, 0.6, 0.2], [0.6, 1.0, -0.3], [0.2, -0.3, 0.7]])
 
 PLANE = Constraint(
-    lambda x: 0.5 * x.sum(axis=-1, keepdims=True), [-0.3],
+    lambda x: 0.5 * x.sum(axis=-1, keepdims=True),
+    [-0.3],
     derivative=lambda x: np.full((*x.shape[:-1], 1, x.shape[-1]), 0.5),
-)  # fmt: skip
+)
 """A plane near the prior's mean, for any number of components."""
 FRESH = partial(updates.etpf, rejuvenation=0.1)
 
@@ -28,19 +29,27 @@ UPDATES = {
     "enkf_exact": updates.enkf_exact,
     "square_root": updates.etkf,
     "transport": updates.transport_map_update,
-    "principal_components": partial(updates.principal_components, n_state=2, n_observed=2),
+    "principal_components": partial(
+        updates.principal_components, n_state=2, n_observed=2
+    ),
     "inflated": updates.with_inflation(updates.enkf, factor=1.1),
     "serial": updates.serially(updates.enkf),
     "localised": updates.with_localization(
-        updates.enkf, places=np.zeros((3, 1)), observation_places=np.zeros((2, 1)), radius=9.0
+        updates.enkf,
+        places=np.zeros((3, 1)),
+        observation_places=np.zeros((2, 1)),
+        radius=9.0,
     ),
-    "inflated serial": updates.with_inflation(updates.serially(updates.etkf), factor=1.01),
+    "inflated serial": updates.with_inflation(
+        updates.serially(updates.etkf), factor=1.01
+    ),
     "ensemble_transform": FRESH,
     "ensemble_transform, corrected": partial(FRESH, correct=True),
     "augmented": updates.with_augmentation(updates.enkf, PLANE, std=0.5),
     "projected": updates.with_projection(updates.enkf, PLANE),
     "retracted": updates.with_retraction(updates.enkf, PLANE),
 }
+
 
 def rng(seed: int = 1) -> np.random.Generator:
     return np.random.default_rng(seed)
@@ -52,7 +61,9 @@ def members(n: int, *leading: int, seed: int = 0) -> np.ndarray:
     return MEAN + rng.standard_normal((*leading, n, 3)) @ np.linalg.cholesky(COV).T
 
 
-def kalman(mean: np.ndarray, cov: np.ndarray, h: np.ndarray, r: np.ndarray, y: np.ndarray):
+def kalman(
+    mean: np.ndarray, cov: np.ndarray, h: np.ndarray, r: np.ndarray, y: np.ndarray
+):
     """The Kalman filter's update by its formulas."""
     gain = cov @ h.T @ np.linalg.inv(h @ cov @ h.T + r)
     return mean + gain @ (y - h @ mean), (np.eye(len(mean)) - gain @ h) @ cov

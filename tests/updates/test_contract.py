@@ -13,12 +13,18 @@ BOTH = pytest.mark.parametrize("name", UPDATES)
 
 
 @BOTH
-def test_members_come_back_by_the_generator_s_bits_and_no_input_changes(name: str) -> None:
-    x, update = members(30, 2), UPDATES[name]
+def test_members_come_back_by_the_generator_s_bits_and_no_input_changes(
+    name: str,
+) -> None:
+    x = members(30, 2)
+    update = UPDATES[name]
     four = x, x @ H.T, np.tile(Y, (2, 1)), R.copy()
     before = [a.copy() for a in four]
-    out, again = update(*four, rng=rng(5)), update(*four, rng=rng(5))
-    assert out.shape == x.shape and np.isfinite(out).all() and not np.shares_memory(out, x)
+    out = update(*four, rng=rng(5))
+    again = update(*four, rng=rng(5))
+    assert (
+        out.shape == x.shape and np.isfinite(out).all() and not np.shares_memory(out, x)
+    )
     assert (out == again).all() and (out == unchecked(update)(*four, rng=rng(5))).all()
     assert (out != update(*four, rng=rng(6))).any()
     assert all((a == b).all() for a, b in zip(four, before, strict=True))
@@ -27,7 +33,9 @@ def test_members_come_back_by_the_generator_s_bits_and_no_input_changes(name: st
 @BOTH
 def test_noise_of_its_own_for_each_ensemble(name: str) -> None:
     """Of a stack each ensemble is what it is in one that has its noise throughout."""
-    x, y, noise = members(30, 2), np.stack([Y, Y]), np.stack([R, 40 * R])
+    x = members(30, 2)
+    y = np.stack([Y, Y])
+    noise = np.stack([R, 40 * R])
     both = UPDATES[name](x, x @ H.T, y, noise, rng=rng())
     for k in range(2):
         alike = UPDATES[name](x, x @ H.T, y, noise[k], rng=rng())

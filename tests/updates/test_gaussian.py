@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from distfilt.updates import enkf_exact, enkf, enkf_sampled_covariance, etkf
+from distfilt.updates import enkf, enkf_exact, enkf_sampled_covariance, etkf
 from distfilt.updates.decorator import Update
 from distfilt.updates.gaussian import _turned
 
@@ -16,7 +16,10 @@ def test_sampled_and_known_noise_by_their_formulas() -> None:
     x = members(40)
     zeta = np.random.default_rng(3).standard_normal((40, 2)) @ np.linalg.cholesky(R).T
     seen = x @ H.T + zeta
-    for update, told, noise in ((enkf_sampled_covariance, seen, 0 * R), (enkf, x @ H.T, R)):
+    for update, told, noise in (
+        (enkf_sampled_covariance, seen, 0 * R),
+        (enkf, x @ H.T, R),
+    ):
         joint = np.cov(np.hstack([x, told]).T)
         gain = joint[:3, 3:] @ np.linalg.inv(joint[3:, 3:] + noise)
         out = update(x, x @ H.T, Y, R, rng=np.random.default_rng(3))
@@ -35,7 +38,9 @@ def test_moments_after_a_curved_reading_are_exact(update: Update) -> None:
     s = joint[3:, 3:] + R
     gain = joint[:3, 3:] @ np.linalg.inv(s)
     out = update(x, h, Y, R, rng=np.random.default_rng(0))
-    assert np.allclose(out.mean(axis=0), x.mean(axis=0) + gain @ (Y - h.mean(axis=0)), atol=1e-12)
+    assert np.allclose(
+        out.mean(axis=0), x.mean(axis=0) + gain @ (Y - h.mean(axis=0)), atol=1e-12
+    )
     assert np.allclose(np.cov(out.T), joint[:3, :3] - gain @ s @ gain.T, atol=1e-12)
 
 
@@ -60,7 +65,8 @@ def test_rotation_keeps_ones_and_lengths_and_differs() -> None:
 
 def test_rotation_prefers_no_direction() -> None:
     """On average nothing is left of the anomalies, and no two members go together."""
-    n, draws = 6, 20_000
+    n = 6
+    draws = 20_000
     turn = _turned(np.broadcast_to(np.eye(n), (draws, n, n)), np.random.default_rng(1))
     assert np.allclose(turn.mean(axis=0), 1 / n, atol=5 * 0.5 / np.sqrt(draws))
     cov = np.einsum("rij,rkj->jik", turn - 1 / n, turn - 1 / n) / draws

@@ -30,15 +30,19 @@ def test_principal_directions_hold_the_largest_variance(seed: int, n: int) -> No
     w = principal_directions(e, n)
     assert np.allclose(w.T @ w, np.eye(n), atol=1e-12)
     values = np.linalg.eigvalsh(np.cov(e, rowvar=False))[::-1]
-    assert np.allclose(np.cov(e @ w, rowvar=False).reshape(n, n).diagonal(), values[:n], rtol=1e-8)
+    assert np.allclose(
+        np.cov(e @ w, rowvar=False).reshape(n, n).diagonal(), values[:n], rtol=1e-8
+    )
 
 
 def test_pca_complement() -> None:
     """Outside the leading directions: kept, or lost with the mean."""
     w = principal_directions(_FOUR[0], 2)
     outside = np.eye(3) - w @ w.T
-    keep, literal = (principal_components(*_FOUR, rng=_rng(3), n_state=2, n_observed=2,
-                                          complement=c) for c in ("keep", "literal"))
+    keep, literal = (
+        principal_components(*_FOUR, rng=_rng(3), n_state=2, n_observed=2, complement=c)
+        for c in ("keep", "literal")
+    )
     assert np.allclose(keep @ outside, _FOUR[0] @ outside, atol=1e-9)
     assert np.allclose(literal @ outside, 0, atol=1e-9)
     assert np.allclose(keep @ w, literal @ w, atol=1e-8)
@@ -54,8 +58,14 @@ def test_noise_factor_scales_the_draw_and_nothing_else(factor: float) -> None:
     out = transport_map_update(*_FOUR, rng=_rng(3), noise_factor=factor)
     assert np.allclose(out, wanted, atol=1e-10)
     for complement in ("keep", "literal"):
-        pca = principal_components(*_FOUR, rng=_rng(3), noise_factor=factor, n_state=3,
-                                   n_observed=5, complement=complement)
+        pca = principal_components(
+            *_FOUR,
+            rng=_rng(3),
+            noise_factor=factor,
+            n_state=3,
+            n_observed=5,
+            complement=complement,
+        )
         assert np.allclose(pca, wanted, atol=1e-8)
 
 
@@ -69,7 +79,9 @@ def test_the_ensemble_transform_by_its_formula() -> None:
     assert np.allclose(out, coupling.transform_ensemble(x, np.log(w)), atol=1e-10)
     assert np.abs(out.mean(axis=0) - w @ x).max() < 1e-13
     both = etpf(x, x @ H.T, Y, R, rng=_rng(), correct=True)
-    assert np.allclose(np.cov(both.T, bias=True), np.cov(x.T, aweights=w, bias=True), atol=1e-12)
+    assert np.allclose(
+        np.cov(both.T, bias=True), np.cov(x.T, aweights=w, bias=True), atol=1e-12
+    )
 
 
 def test_a_reading_far_away_underflows_nothing_and_warns() -> None:
@@ -86,7 +98,9 @@ def test_a_spread_that_is_lost_warns() -> None:
     etpf(x, x @ H.T, near + 3 * np.sqrt(np.diagonal(R)), R, rng=_rng())
     far = 6 * np.sqrt(np.diagonal(R))
     wanted = rf"squared distance .* is {far @ np.linalg.solve(R, far):.0f}, not 2;"
-    with pytest.warns(ParticleCollapse, match=wanted):  # of two ensembles that of the second
+    with pytest.warns(
+        ParticleCollapse, match=wanted
+    ):  # of two ensembles that of the second
         etpf([x, x], [x @ H.T] * 2, [near, near + far], R, rng=_rng())
 
 

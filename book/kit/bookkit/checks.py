@@ -14,14 +14,19 @@ class SoftAssert(ast.NodeTransformer):
 
     Examples
     --------
-    >>> edited = SoftAssert().visit(ast.parse("assert 1 > 2, 'the order of one and two'"))
+    >>> edited = SoftAssert().visit(
+    ...     ast.parse("assert 1 > 2, 'the order of one and two'")
+    ... )
     >>> exec(compile(ast.fix_missing_locations(edited), "cell", "exec"))
     no longer holds: the order of one and two
     """
 
     def visit_Assert(self, node: ast.Assert) -> ast.If:
         """``if not test: print(...)``, with the test itself where the check has no words."""
-        words = [ast.Constant("no longer holds:"), node.msg or ast.Constant(ast.unparse(node.test))]
+        words = [
+            ast.Constant("no longer holds:"),
+            node.msg or ast.Constant(ast.unparse(node.test)),
+        ]
         remark = ast.Expr(ast.Call(ast.Name("print", ast.Load()), words, []))
         told = ast.If(ast.UnaryOp(ast.Not(), node.test), [remark], [])
         return ast.copy_location(told, node)

@@ -35,8 +35,11 @@ def _rounded(value: float, scale: float, *, smallest: int) -> str:
 def _summary(values: Array) -> str:
     flat = values.ravel()
     good = np.isfinite(flat)
-    nans, infinities = int(np.isnan(flat).sum()), int(np.isinf(flat).sum())
-    missing = (f", {nans} NaN" if nans else "") + (f", {infinities} infinite" if infinities else "")
+    nans = int(np.isnan(flat).sum())
+    infinities = int(np.isinf(flat).sum())
+    missing = (f", {nans} NaN" if nans else "") + (
+        f", {infinities} infinite" if infinities else ""
+    )
     if not good.any():
         return f"{flat.size} values{missing}"
     kept = np.where(good, flat, 0.0)
@@ -48,9 +51,15 @@ def _summary(values: Array) -> str:
     finite = flat[good]
     scale = float(np.abs(finite).max())
     # Mean and projection cancel: their noise is that of the largest entry, not their own.
-    low, high = (_rounded(float(v), scale, smallest=99) for v in (finite.min(), finite.max()))
-    mean, along = (_rounded(v, scale, smallest=4) for v in (float(finite.mean()), projection))
-    return f"{flat.size} values, {low}..{high}, mean {mean}, projection {along}{missing}"
+    low, high = (
+        _rounded(float(v), scale, smallest=99) for v in (finite.min(), finite.max())
+    )
+    mean, along = (
+        _rounded(v, scale, smallest=4) for v in (float(finite.mean()), projection)
+    )
+    return (
+        f"{flat.size} values, {low}..{high}, mean {mean}, projection {along}{missing}"
+    )
 
 
 def digest(**arrays: ArrayLike) -> str:
@@ -78,7 +87,9 @@ def digest(**arrays: ArrayLike) -> str:
     time: 3 values, 0..0.2, mean 0.1, projection 0.03765
     error: 3 values, 2..4, mean 3, projection 0.3368, 1 NaN
     """
-    return "\n".join(f"{name}: {_summary(_plain(value))}" for name, value in arrays.items())
+    return "\n".join(
+        f"{name}: {_summary(_plain(value))}" for name, value in arrays.items()
+    )
 
 
 def of_axes(drawn: Any) -> str:
@@ -122,15 +133,27 @@ def of_axes(drawn: Any) -> str:
         lines: list[str] = []
         before: dict[str, str] = {}
         for kind, many, coordinates in entries:
-            first, counts[kind] = counts[kind] + 1, counts[kind] + many
+            first = counts[kind] + 1
+            counts[kind] = counts[kind] + many
             name = f"{kind} {first}" + (f"-{counts[kind]}" if many > 1 else "")
             now = {axis: _summary(values) for axis, values in coordinates.items()}
-            lines += [f"{name} {axis}: {t}" for axis, t in now.items() if before.get(axis) != t]
+            lines += [
+                f"{name} {axis}: {t}"
+                for axis, t in now.items()
+                if before.get(axis) != t
+            ]
             before = now
-        ends = {kind: ("es" if kind == "patch" else "s") * (n > 1) for kind, n in counts.items()}
+        ends = {
+            kind: ("es" if kind == "patch" else "s") * (n > 1)
+            for kind, n in counts.items()
+        }
         told = ", ".join(f"{n} {kind}{ends[kind]}" for kind, n in counts.items())
         out += [f"axes {k}: {told or 'empty'}", *lines]
-    return "\n".join(out) if any(": empty" not in line for line in out) else "an empty figure"
+    return (
+        "\n".join(out)
+        if any(": empty" not in line for line in out)
+        else "an empty figure"
+    )
 
 
 _Entry = tuple[str, int, dict[str, Array]]
@@ -154,12 +177,17 @@ def _entries(axes: Any) -> Iterator[_Entry]:
         yield "line", 1, _named(*np.transpose(line.get_xydata()))
     for _, group in groupby(_visible(axes.patches), key=type):
         patches = list(group)
-        outlines = [p.get_patch_transform().transform(p.get_path().vertices) for p in patches]
+        outlines = [
+            p.get_patch_transform().transform(p.get_path().vertices) for p in patches
+        ]
         yield "patch", len(patches), _named(*np.concatenate(outlines).T)
     for collection in _visible(axes.collections):
         yield "collection", 1, _collection(collection, axes.transData)
     for image in _visible(axes.images):
-        values = {"value": _plain(image.get_array()), "extent": _plain(image.get_extent())}
+        values = {
+            "value": _plain(image.get_array()),
+            "extent": _plain(image.get_extent()),
+        }
         yield "image", 1, values
 
 
@@ -178,11 +206,15 @@ def _collection(artist: Any, data: Any) -> dict[str, Array]:
     sizes: Any = artist.get_sizes() if hasattr(artist, "get_sizes") else ()
     more = {"value": artist.get_array(), "u": getattr(artist, "U", None)}
     more |= {"v": getattr(artist, "V", None), "size": sizes if len(sizes) > 1 else None}
-    return found | {name: _plain(values) for name, values in more.items() if values is not None}
+    return found | {
+        name: _plain(values) for name, values in more.items() if values is not None
+    }
 
 
 def _named(*coordinates: Any) -> dict[str, Array]:
-    return {name: _plain(values) for name, values in zip("xy", coordinates, strict=True)}
+    return {
+        name: _plain(values) for name, values in zip("xy", coordinates, strict=True)
+    }
 
 
 def _plain(values: Any) -> Array:

@@ -40,5 +40,7 @@ def inside(folder: Path, paper: str, name: str, suffix: str) -> Path:
         raise ValueError(f"paper: needs one of {', '.join(papers[1:])}, got {paper!r}")
     there = sorted(p.stem for p in (folder / paper).glob(f"*{suffix}"))
     if name not in there:
-        raise ValueError(f"name: needs one of {', '.join(there) or 'none yet'}, got {name!r}")
+        raise ValueError(
+            f"name: needs one of {', '.join(there) or 'none yet'}, got {name!r}"
+        )
     return folder / paper / f"{name}{suffix}"

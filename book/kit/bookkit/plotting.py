@@ -24,9 +24,20 @@ from .checks import use_soft_assert
 from .digests import digest, of_axes
 from .sliders import Slider, slider
 
-__all__ = [  # fmt: skip
-    "LINE_STYLES", "PALETTE", "SIZE", "Slider", "axes", "band", "colour", "digest", "ellipse",
-    "graph", "line_style", "slider", "use_style",
+__all__ = [
+    "LINE_STYLES",
+    "PALETTE",
+    "SIZE",
+    "Slider",
+    "axes",
+    "band",
+    "colour",
+    "digest",
+    "ellipse",
+    "graph",
+    "line_style",
+    "slider",
+    "use_style",
 ]
 
 # Okabe and Ito: distinct for every kind of colour vision.
@@ -116,14 +127,23 @@ def _print_digests() -> None:
         packed = {"bbox_inches": "tight", "pil_kwargs": {"compress_level": 1}}
         shell.run_line_magic("config", f"InlineBackend.print_figure_kwargs = {packed}")
         text = shell.display_formatter.formatters["text/plain"]
-        text.for_type(Figure, lambda figure, printer, cycle: printer.text(of_axes(figure)))
+        text.for_type(
+            Figure, lambda figure, printer, cycle: printer.text(of_axes(figure))
+        )
         # The backend shows a cell's figures; pyplot's own hook would draw each once more, unseen.
         pyplot.uninstall_repl_displayhook()
 
 
 def axes(
-    *, xlabel: str, ylabel: str, xunit: str | None = None, yunit: str | None = None,
-    title: str = "", ax: Axes | None = None, xscale: str = "linear", yscale: str = "linear",
+    *,
+    xlabel: str,
+    ylabel: str,
+    xunit: str | None = None,
+    yunit: str | None = None,
+    title: str = "",
+    ax: Axes | None = None,
+    xscale: str = "linear",
+    yscale: str = "linear",
     size: tuple[float, float] = SIZE,
 ) -> Axes:
     """Labelled axes, in a new figure of the book's size unless `ax` is given.
@@ -152,8 +172,10 @@ def axes(
         from matplotlib import pyplot
 
         _, ax = pyplot.subplots(figsize=size)
-    x, y = (name if unit is None else f"{name} ({unit})"
-            for name, unit in ((xlabel, xunit), (ylabel, yunit)))  # fmt: skip
+    x, y = (
+        name if unit is None else f"{name} ({unit})"
+        for name, unit in ((xlabel, xunit), (ylabel, yunit))
+    )
     ax.set(xlabel=x, ylabel=y, xscale=xscale, yscale=yscale)
     if title:
         ax.set_title(title)
@@ -161,7 +183,12 @@ def axes(
 
 
 def ellipse(
-    ax: Axes, mean: ArrayLike, covariance: ArrayLike, *, level: float = 0.95, index: int = 0,
+    ax: Axes,
+    mean: ArrayLike,
+    covariance: ArrayLike,
+    *,
+    level: float = 0.95,
+    index: int = 0,
     label: str | None = None,
 ) -> Axes:
     r"""Draw the ellipse that holds a share `level` of a plane Gaussian, and its mean.
@@ -184,7 +211,9 @@ def ellipse(
     Examples
     --------
     >>> ax = ellipse(axes(xlabel="x", ylabel="y"), [0.0, 0.0], [[4.0, 0.0], [0.0, 1.0]])
-    >>> float(ax.lines[0].get_xdata().max().round(2))  # two standard deviations of 2.448
+    >>> float(
+    ...     ax.lines[0].get_xdata().max().round(2)
+    ... )  # two standard deviations of 2.448
     4.9
     """
     centre = np.asarray(mean, dtype=float)
@@ -198,8 +227,13 @@ def ellipse(
 
 
 def band(
-    ax: Axes, x: ArrayLike, runs: ArrayLike, *, quantiles: tuple[float, float] = (0.25, 0.75),
-    index: int = 0, label: str | None = None,
+    ax: Axes,
+    x: ArrayLike,
+    runs: ArrayLike,
+    *,
+    quantiles: tuple[float, float] = (0.25, 0.75),
+    index: int = 0,
+    label: str | None = None,
 ) -> Axes:
     """Draw the median over runs as a line, and a band between two quantiles over runs.
 
@@ -219,18 +253,26 @@ def band(
     Examples
     --------
     >>> errors = [[1.0, 5.0], [2.0, 4.0], [9.0, 3.0]]
-    >>> band(axes(xlabel="time", ylabel="error"), [0.0, 1.0], errors).lines[0].get_ydata()
+    >>> band(axes(xlabel="time", ylabel="error"), [0.0, 1.0], errors).lines[
+    ...     0
+    ... ].get_ydata()
     array([2., 4.])
     """
-    low, middle, high = np.quantile(np.asarray(runs), [quantiles[0], 0.5, quantiles[1]], axis=0)
+    low, middle, high = np.quantile(
+        np.asarray(runs), [quantiles[0], 0.5, quantiles[1]], axis=0
+    )
     ax.fill_between(x, low, high, color=colour(index), alpha=0.2, linewidth=0)
     ax.plot(x, middle, color=colour(index), linestyle=line_style(index), label=label)
     return ax
 
 
 def graph(
-    ax: Axes, adjacency: ArrayLike, *, labels: Sequence[str] | None = None,
-    positions: ArrayLike | None = None, known: ArrayLike | None = None,
+    ax: Axes,
+    adjacency: ArrayLike,
+    *,
+    labels: Sequence[str] | None = None,
+    positions: ArrayLike | None = None,
+    known: ArrayLike | None = None,
     notes: Sequence[str] | None = None,
 ) -> Axes:
     """Draw agents as discs, the links between them as lines, and who knows how much.
@@ -269,13 +311,21 @@ def graph(
     faces = [1 - k + k * np.array(to_rgba(colour(5))) for k in share]
     x, y = place.T
     ax.scatter(x, y, s=340, c=faces, edgecolor=colour(0), linewidth=1.4, zorder=2)
-    for name, note, (a, b) in zip(names, notes or [""] * n, place.tolist(), strict=True):
+    for name, note, (a, b) in zip(
+        names, notes or [""] * n, place.tolist(), strict=True
+    ):
         ax.text(a, b, name, ha="center", va="center", zorder=3)
         if note:
             ax.annotate(
-                note, (a, b), (0, -13), textcoords="offset points", ha="center", va="top",
-                fontsize="small", zorder=3,
-            )  # fmt: skip
+                note,
+                (a, b),
+                (0, -13),
+                textcoords="offset points",
+                ha="center",
+                va="top",
+                fontsize="small",
+                zorder=3,
+            )
     ax.set_aspect("equal")
     ax.margins(0.2)
     ax.set_axis_off()

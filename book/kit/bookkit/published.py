@@ -13,9 +13,19 @@ from .folders import data_root, inside
 from .rows import html_table, read_rows
 from .scenarios import Scenario, read_scenario, scenario
 
-__all__ = [  # fmt: skip
-    "PAPERS", "VERDICTS", "Claim", "Item", "Scenario", "Verdict", "items", "judge_claims",
-    "judge_parameters", "read_scenario", "scenario", "table",
+__all__ = [
+    "PAPERS",
+    "VERDICTS",
+    "Claim",
+    "Item",
+    "Scenario",
+    "Verdict",
+    "items",
+    "judge_claims",
+    "judge_parameters",
+    "read_scenario",
+    "scenario",
+    "table",
 ]
 
 PAPERS = ("grange", "das", "semeraro", "zheng", "together")
@@ -124,7 +134,9 @@ class Verdict:
     def __post_init__(self) -> None:
         known = VERDICTS[_known(self.paper, self.item).kind]
         if self.verdict not in known:
-            raise ValueError(f"verdict: needs one of {', '.join(known)}, got {self.verdict!r}")
+            raise ValueError(
+                f"verdict: needs one of {', '.join(known)}, got {self.verdict!r}"
+            )
         if self.verdict in known[1:] and not self.why.strip():
             raise ValueError(f"why: needs a reason for {self.verdict!r}")
 
@@ -134,19 +146,34 @@ class Verdict:
 
     def __str__(self) -> str:
         head = f"{self.paper} {self.item}: {self.verdict}"
-        return "\n".join([head, *(f"  {name:<9}  {text}" for name, text in self._fields())])
+        return "\n".join(
+            [head, *(f"  {name:<9}  {text}" for name, text in self._fields())]
+        )
 
-    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
+    def _repr_mimebundle_(
+        self, include: Any = None, exclude: Any = None
+    ) -> dict[str, Any]:
         return {
             "text/plain": str(self),
-            "text/html": html_table((f"{self.paper} {self.item}", self.verdict), self._fields()),
-            _MIME: {name: text for name, text in vars(self).items() if text or name == "why"},
+            "text/html": html_table(
+                (f"{self.paper} {self.item}", self.verdict), self._fields()
+            ),
+            _MIME: {
+                name: text for name, text in vars(self).items() if text or name == "why"
+            },
         }
 
 
 def _judged(
-    item: Item, good: bool, ours: str, published: str, why: str, study: Scenario | None,
-    *, open_: str = "", **beside: str,
+    item: Item,
+    good: bool,
+    ours: str,
+    published: str,
+    why: str,
+    study: Scenario | None,
+    *,
+    open_: str = "",
+    **beside: str,
 ) -> Verdict:
     """What was found, unless the study was another one; the reason is needed for a difference."""
     if study is not None and study.changes:
@@ -192,25 +219,44 @@ class Claim(NamedTuple):
 
     @classmethod
     def from_rule(
-        cls, id: str, text: str, rule: Callable[[Any], bool], ours: Any, null: Any, against: str,
-        *, range: str = "", shown: Callable[[Any], str] = str,
+        cls,
+        id: str,
+        text: str,
+        rule: Callable[[Any], bool],
+        ours: Any,
+        null: Any,
+        against: str,
+        *,
+        range: str = "",
+        shown: Callable[[Any], str] = str,
     ) -> Claim:
         """A claim judged by one rule on our number and on its null, which `against` describes.
 
         Examples
         --------
-        >>> print(Claim.from_rule("order", "ratio", lambda r: r < 1, 0.8, 1.1, "agents shuffled"))
+        >>> print(
+        ...     Claim.from_rule(
+        ...         "order", "ratio", lambda r: r < 1, 0.8, 1.1, "agents shuffled"
+        ...     )
+        ... )
         order holds: ratio 0.8
         """
         beside = f"{against}: {shown(null)}{' (holds too)' if rule(null) else ''}"
-        return cls(id, text, bool(rule(ours)), shown(ours), beside, not rule(null), range)
+        return cls(
+            id, text, bool(rule(ours)), shown(ours), beside, not rule(null), range
+        )
 
     def __str__(self) -> str:
         return f"{self.id} {'holds' if self.holds else 'fails'}: {self.text} {self.evidence}"
 
 
 def judge_claims(
-    paper: str, item: str, claims: Sequence[Claim], *, why: str = "", free: str = "",
+    paper: str,
+    item: str,
+    claims: Sequence[Claim],
+    *,
+    why: str = "",
+    free: str = "",
     scenario: Scenario | None = None,
 ) -> Verdict:
     """The verdict on a figure: a match if every claim listed for it is judged and holds.
@@ -238,11 +284,17 @@ def judge_claims(
     Examples
     --------
     >>> judged = [
-    ...     Claim("without-pca-unstable", "share of unstable runs", False, "0 [0, 0.0362]"),
-    ...     Claim("pca-stable", "share of unstable runs", True, "0.02 [0.00243, 0.0704]"),
+    ...     Claim(
+    ...         "without-pca-unstable", "share of unstable runs", False, "0 [0, 0.0362]"
+    ...     ),
+    ...     Claim(
+    ...         "pca-stable", "share of unstable runs", True, "0.02 [0.00243, 0.0704]"
+    ...     ),
     ...     Claim("small-samples", "difference of shares", False, "0.05 [-0.03, 0.13]"),
     ... ]
-    >>> judge_claims("grange", "Fig. 1", judged, why="a run must exceed the prior").verdict
+    >>> judge_claims(
+    ...     "grange", "Fig. 1", judged, why="a run must exceed the prior"
+    ... ).verdict
     'differs'
     """
     known = _known(paper, item)
@@ -250,20 +302,28 @@ def judge_claims(
     listed = {row["id"]: row for row in table(paper, file)}
     given = [claim.id for claim in claims]
     if sorted(given) != sorted(listed):
-        raise ValueError(f"claims: needs those of {paper} {item}, {', '.join(listed)}, each once, "
-                         f"got {', '.join(given)}")  # fmt: skip
+        raise ValueError(
+            f"claims: needs those of {paper} {item}, {', '.join(listed)}, each once, "
+            f"got {', '.join(given)}"
+        )
     ours = "; ".join(str(c) for c in claims)
     said = "; ".join(row["claim"] for row in listed.values())
-    good, blunt = all(c.holds for c in claims), [c.id for c in claims if not c.has_power]
+    good = all(c.holds for c in claims)
+    blunt = [c.id for c in claims if not c.has_power]
     if good and blunt and not free:
         free = f"the rule of {', '.join(blunt)} holds for its null too"
     null = "; ".join(f"{c.id}, {c.null}" for c in claims if c.null)
     swept = "; ".join(f"{c.id} {c.range}" for c in claims if c.range)
-    return _judged(known, good, ours, said, why, scenario, open_=free, null=null, range=swept)
+    return _judged(
+        known, good, ours, said, why, scenario, open_=free, null=null, range=swept
+    )
 
 
 def judge_parameters(
-    paper: str, item: str, read: Scenario | Sequence[Mapping[str, Any]], *,
+    paper: str,
+    item: str,
+    read: Scenario | Sequence[Mapping[str, Any]],
+    *,
     scenario: Scenario | None = None,
 ) -> Verdict:
     """The verdict on a table of parameters: "read" if the study read every cell as printed.
@@ -316,7 +376,9 @@ def _same(a: str, b: str) -> bool:
         return re.sub(r"\s+", "", a) == re.sub(r"\s+", "", b)
 
 
-def _first_difference(rows: Sequence[Mapping[str, Any]], printed: list[dict[str, str]]) -> str:
+def _first_difference(
+    rows: Sequence[Mapping[str, Any]], printed: list[dict[str, str]]
+) -> str:
     """The first printed cell that was not read, or read otherwise, or nothing."""
     first = next(iter(printed[0]))
     by_key = {str(row[first]): row for row in rows}

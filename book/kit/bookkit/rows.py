@@ -22,7 +22,9 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         rows = list(reader)
     for number, row in enumerate(rows, start=1):
         if None in row or None in row.values():
-            raise ValueError(f"{path.name}, row {number}: has not as many cells as the first line")
+            raise ValueError(
+                f"{path.name}, row {number}: has not as many cells as the first line"
+            )
     return rows
 
 
@@ -34,7 +36,9 @@ def html_table(columns: Sequence[str], rows: Rows) -> str:
     """Rows as an HTML table with three rules."""
 
     def cells(tag: str, texts: Sequence[str]) -> str:
-        return "".join(f'<{tag} style="{_CELL}">{html.escape(t)}</{tag}>' for t in texts)
+        return "".join(
+            f'<{tag} style="{_CELL}">{html.escape(t)}</{tag}>' for t in texts
+        )
 
     body = "\n".join(f"<tr>{cells('td', row)}</tr>" for row in rows)
     return (
@@ -48,6 +52,8 @@ def markdown_table(columns: Sequence[str], rows: Rows) -> str:
     """Rows as a Markdown table."""
     lines = [columns, ["---"] * len(columns), *rows]
     return "\n".join(
-        "| " + " | ".join(t.replace("\\", "\\\\").replace("|", "\\|") for t in line) + " |"
+        "| "
+        + " | ".join(t.replace("\\", "\\\\").replace("|", "\\|") for t in line)
+        + " |"
         for line in lines
     )

@@ -81,7 +81,9 @@ def _plain(value: Any) -> Any:
 def _check_origin(cells: Mapping[str, Any]) -> None:
     """What is given says where, and what is not says why."""
     if cells.get("source") not in _SOURCES:
-        raise ValueError(f"source: needs one of {', '.join(_SOURCES)}, got {cells.get('source')!r}")
+        raise ValueError(
+            f"source: needs one of {', '.join(_SOURCES)}, got {cells.get('source')!r}"
+        )
     needed = "where" if cells["source"] == "given" else "reason"
     for key in ("name", "unit", needed):
         if not str(cells.get(key) or "").strip():
@@ -112,8 +114,17 @@ class Row(Mapping[str, Any]):
 
     Examples
     --------
-    >>> row = Row({"name": "B", "kind": "angle", "dims": [1, 2], "noise": 0.2, "unit": "rad",
-    ...            "source": "given", "where": "Table II"})
+    >>> row = Row(
+    ...     {
+    ...         "name": "B",
+    ...         "kind": "angle",
+    ...         "dims": [1, 2],
+    ...         "noise": 0.2,
+    ...         "unit": "rad",
+    ...         "source": "given",
+    ...         "where": "Table II",
+    ...     }
+    ... )
     >>> row.kind, row["dims"], row.why
     ('angle', (1, 2), 'Table II.')
     >>> Row({**row, "kind": "range"})
@@ -121,17 +132,24 @@ class Row(Mapping[str, Any]):
     ValueError: unit: needs m or km for 'range', got 'rad'
     """
 
-    def __init__(self, cells: Mapping[str, Any], note: Callable[[str], Any] = len) -> None:
+    def __init__(
+        self, cells: Mapping[str, Any], note: Callable[[str], Any] = len
+    ) -> None:
         self._cells = {key: _plain(value) for key, value in cells.items()}
         self._note = note
         _check_origin(cells)
-        kind, unit = cells.get("kind", ""), cells["unit"]
+        kind = cells.get("kind", "")
+        unit = cells["unit"]
         if unit not in (allowed := _UNITS.get(kind, (unit,))):
-            raise ValueError(f"unit: needs {' or '.join(allowed)} for {kind!r}, got {unit!r}")
+            raise ValueError(
+                f"unit: needs {' or '.join(allowed)} for {kind!r}, got {unit!r}"
+            )
 
     def __getitem__(self, key: str) -> Any:
         if key not in self._cells:
-            raise UnknownKey(f"row {self._cells['name']!r} has no column", key, list(self._cells))
+            raise UnknownKey(
+                f"row {self._cells['name']!r} has no column", key, list(self._cells)
+            )
         self._note(key)
         return self._cells[key]
 
@@ -201,8 +219,14 @@ class Scenario:
     def parameter(self, key: str) -> Parameter:
         """The parameter of that name."""
         if key not in self.parameters:
-            lacks = "keeps among its notes, which no study reads," if key in self.notes else "lacks"
-            raise UnknownKey(f"scenario {self.paper}/{self.name} {lacks}", key, list(self))
+            lacks = (
+                "keeps among its notes, which no study reads,"
+                if key in self.notes
+                else "lacks"
+            )
+            raise UnknownKey(
+                f"scenario {self.paper}/{self.name} {lacks}", key, list(self)
+            )
         return self.parameters[key]
 
     def __getitem__(self, key: str) -> Any:
@@ -223,7 +247,9 @@ class Scenario:
         if self.seen is None:
             return rows
         # Each notes in what is seen that a column of it was read.
-        return tuple(Row(r._cells, partial(_noted, self.seen, r._cells["name"])) for r in rows)
+        return tuple(
+            Row(r._cells, partial(_noted, self.seen, r._cells["name"])) for r in rows
+        )
 
     @property
     def adjacency(self) -> NDArray[np.float64]:
@@ -234,7 +260,10 @@ class Scenario:
 
     def replace(self, **values: Any) -> Scenario:
         """The scenario with other values of some parameters; units and places stay."""
-        made = {key: replace(self.parameter(key), value=value) for key, value in values.items()}
+        made = {
+            key: replace(self.parameter(key), value=value)
+            for key, value in values.items()
+        }
         return replace(self, parameters={**self.parameters, **made})
 
     def reading(self) -> Scenario:
@@ -257,7 +286,9 @@ class Scenario:
             out[table] = _json([row["name"] for row in rows])
             for row in rows:
                 cells = {c: row[c] for c in row.value_columns if c != "name"}
-                out |= {f"{table}.{row['name']}.{c}": _json(v) for c, v in cells.items()}
+                out |= {
+                    f"{table}.{row['name']}.{c}": _json(v) for c, v in cells.items()
+                }
         return out
 
     @property
@@ -273,8 +304,11 @@ class Scenario:
         own, which it does not have, is one change.
         """
         lines = read_rows(data_root() / "scenarios" / "accepted.csv")
-        here = [r for r in lines if (r["paper"], r["scenario"]) == (self.paper, self.name)]
-        known, found = {r["entry"]: r["value"] for r in here}, self.entries()
+        here = [
+            r for r in lines if (r["paper"], r["scenario"]) == (self.paper, self.name)
+        ]
+        known = {r["entry"]: r["value"] for r in here}
+        found = self.entries()
         if not known:
             return (f"{self.paper}/{self.name} is no scenario of the book",)
         return tuple(
@@ -287,13 +321,24 @@ class Scenario:
         heads = ["unit", "source", "where or why"]
         out = []
         for head, entries in (("parameter", self.parameters), ("note", self.notes)):
-            lines = [[p.name, _text(p.value), p.unit, p.source, p.why] for p in entries.values()]
+            lines = [
+                [p.name, _text(p.value), p.unit, p.source, p.why]
+                for p in entries.values()
+            ]
             out += [([head, "value", *heads], lines)] if lines else []
         for name, rows in self.tables.items():
             columns = list(dict.fromkeys(c for row in rows for c in row.value_columns))
             columns = [c for c in columns if c not in ("name", "unit")]
-            lines = [[row["name"], *(_text(row.get(c, "")) for c in columns),
-                      row["unit"], row["source"], row.why] for row in rows]  # fmt: skip
+            lines = [
+                [
+                    row["name"],
+                    *(_text(row.get(c, "")) for c in columns),
+                    row["unit"],
+                    row["source"],
+                    row.why,
+                ]
+                for row in rows
+            ]
             out.append(([name, *columns, *heads], lines))
         return out
 
@@ -323,7 +368,9 @@ def _said(entries: Mapping[str, str], name: str) -> str:
 
 def _text(value: Any) -> str:
     if isinstance(value, tuple):
-        return ", ".join(f"({_text(v)})" if isinstance(v, tuple) else _text(v) for v in value)
+        return ", ".join(
+            f"({_text(v)})" if isinstance(v, tuple) else _text(v) for v in value
+        )
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:g}" if isinstance(value, float) else str(value)
@@ -337,7 +384,8 @@ def read_scenario(path: Path) -> Scenario:
     tables, such as one ``[[agents]]`` for each agent (see `Row`). The folder's name becomes the
     paper, the file's the name.
     """
-    folder, entry = path.parent, "its form"
+    folder = path.parent
+    entry = "its form"
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
         title = data.pop("title")
@@ -352,7 +400,9 @@ def read_scenario(path: Path) -> Scenario:
             _check_links({row["name"]: row for row in tables[entry]}, len(rows))
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ValueError(f"{folder.name}/{path.name}: {entry}: {error}") from error
-    return Scenario(folder.name, path.stem, title, groups["parameters"], groups["notes"], tables)
+    return Scenario(
+        folder.name, path.stem, title, groups["parameters"], groups["notes"], tables
+    )
 
 
 def _check_links(rows: Mapping[str, Row], count: int) -> None:
@@ -361,7 +411,9 @@ def _check_links(rows: Mapping[str, Row], count: int) -> None:
     for name, row in rows.items():
         for other in row.get("neighbours", ()):
             if other not in rows or name not in rows[other]["neighbours"]:
-                raise ValueError(f"needs mutual neighbours, got {name!r} beside {other!r}")
+                raise ValueError(
+                    f"needs mutual neighbours, got {name!r} beside {other!r}"
+                )
 
 
 def scenario(paper: str, name: str) -> Scenario:

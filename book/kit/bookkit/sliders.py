@@ -64,10 +64,14 @@ class Slider:
 
     def __post_init__(self) -> None:
         if len(self.html) > LIMIT:
-            raise ValueError(f"frames: needs at most {LIMIT} characters, got {len(self.html)}")
+            raise ValueError(
+                f"frames: needs at most {LIMIT} characters, got {len(self.html)}"
+            )
 
     def __repr__(self) -> str:
-        lines = [f"slider of {len(self.frames)} frames, first {self.labels[self.start]}"]
+        lines = [
+            f"slider of {len(self.frames)} frames, first {self.labels[self.start]}"
+        ]
         for said, text in zip(self.labels, self.digests, strict=True):
             lines += [said, *(f"  {line}" for line in text.splitlines())]
         return "\n".join(lines)
@@ -96,9 +100,13 @@ class Slider:
             data=json.dumps(data, separators=(",", ":")).replace("</", "<\\/"),
         )
 
-    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, str]:
+    def _repr_mimebundle_(
+        self, include: Any = None, exclude: Any = None
+    ) -> dict[str, str]:
         still = io.BytesIO()
-        Image.open(io.BytesIO(self.frames[self.start])).save(still, "png", compress_level=1)
+        Image.open(io.BytesIO(self.frames[self.start])).save(
+            still, "png", compress_level=1
+        )
         return {
             "text/plain": repr(self),
             "text/html": self.html,
@@ -107,8 +115,14 @@ class Slider:
 
 
 def slider(
-    draw: Callable[[Any], Any], values: Sequence[Any], *, label: str, alt: str,
-    unit: str | None = None, form: str = "g", start: int = 0,
+    draw: Callable[[Any], Any],
+    values: Sequence[Any],
+    *,
+    label: str,
+    alt: str,
+    unit: str | None = None,
+    form: str = "g",
+    start: int = 0,
 ) -> Slider:
     """Draw a figure for each value, and go through them with a slider that needs no kernel.
 
@@ -142,13 +156,19 @@ def slider(
     ...     ax = axes(xlabel="time", ylabel="x", size=(3, 2))
     ...     ax.plot([0, 1, 2], [1, 1 - rate, (1 - rate) ** 2])
     ...     return ax
-    >>> found = slider(draw, [0.0, 0.5, 1.0], label="rate", alt="A curve that falls.", start=1)
+    >>> found = slider(
+    ...     draw, [0.0, 0.5, 1.0], label="rate", alt="A curve that falls.", start=1
+    ... )
     >>> len(found.frames), found.labels
     (3, ('rate 0', 'rate 0.5', 'rate 1'))
     """
-    said = tuple(f"{label} {format(value, form)} {unit or ''}".rstrip() for value in values)
+    said = tuple(
+        f"{label} {format(value, form)} {unit or ''}".rstrip() for value in values
+    )
     places: list[Any] = []
-    frames, sizes, digests = zip(*(_frame(draw(v), places) for v in values), strict=True)
+    frames, sizes, digests = zip(
+        *(_frame(draw(v), places) for v in values), strict=True
+    )
     if len(set(sizes)) != 1:
         raise ValueError("draw: needs figures of one size")
     return Slider(frames, sizes[0], said, digests, label, alt, start)
@@ -164,14 +184,17 @@ def _frame(drawn: Any, places: list[Any]) -> tuple[bytes, tuple[int, int], str]:
         figure.set_layout_engine("none")
     for ax, place in zip(figure.axes, places, strict=False):
         ax.set_position(place)
-    small, text = io.BytesIO(), of_axes(figure)
+    small = io.BytesIO()
+    text = of_axes(figure)
     pyplot.close(figure)
     canvas: Any = FigureCanvasAgg(figure)
     figure.set_dpi(2 * figure.dpi)
     canvas.draw()
     places[:] = places or [ax.get_position(original=True) for ax in figure.axes]
     # 256 colours, by an octree: half the bytes, and no shade moves by more than a sixteenth.
-    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(method=2)
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(
+        method=2
+    )
     figure.set_dpi(figure.dpi / 2)  # it may be drawn again for the next frame
     picture.save(small, "webp", lossless=True, quality=50, method=2)
     return small.getvalue(), (picture.width // 2, picture.height // 2), text

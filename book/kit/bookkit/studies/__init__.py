@@ -9,7 +9,18 @@ from .checking import check, script
 from .files import Stored, fingerprint, load, merge, store, stored
 from .running import Failure, Study, StudyError, run, spawn
 
-__all__ = [  # fmt: skip
-    "Failure", "Stored", "Study", "StudyError", "check", "fingerprint", "load", "merge", "run",
-    "script", "spawn", "store", "stored",
+__all__ = [
+    "Failure",
+    "Stored",
+    "Study",
+    "StudyError",
+    "check",
+    "fingerprint",
+    "load",
+    "merge",
+    "run",
+    "script",
+    "spawn",
+    "store",
+    "stored",
 ]

@@ -53,9 +53,16 @@ def script(name: str, *, folder: Path | None = None) -> ModuleType:
 
 
 def check(
-    path: str | Path | Stored, trial: Trial, *, indices: Iterable[int] | None = None,
-    rtol: float = 0.0, atol: float = 0.0, ill_conditioned: Collection[str] = (), max_outliers: int = 0,
-    workers: int | None = 1, executor: Executor | None = None,
+    path: str | Path | Stored,
+    trial: Trial,
+    *,
+    indices: Iterable[int] | None = None,
+    rtol: float = 0.0,
+    atol: float = 0.0,
+    ill_conditioned: Collection[str] = (),
+    max_outliers: int = 0,
+    workers: int | None = 1,
+    executor: Executor | None = None,
 ) -> Stored:
     """Run stored trials again and compare what they give now with what is stored.
 
@@ -92,36 +99,57 @@ def check(
     stored = path if isinstance(path, Stored) else load(path)
     chosen = list(range(len(stored)) if indices is None else indices)
     if max_outliers >= len(chosen):
-        raise ValueError(f"odd: needs fewer than the {len(chosen)} trials that run, got {max_outliers}")
+        raise ValueError(
+            f"odd: needs fewer than the {len(chosen)} trials that run, got {max_outliers}"
+        )
     allowed = dict.fromkeys(stored.columns, atol)
     for name in ill_conditioned:
         finite = stored.columns[name][np.isfinite(stored.columns[name])]
         allowed[name] = max(atol, float(np.ptp(finite)) if finite.size else 0.0)
-    study = run(trial, [stored.seed(i) for i in chosen], errors="collect", workers=workers,
-                executor=executor)  # fmt: skip
+    study = run(
+        trial,
+        [stored.seed(i) for i in chosen],
+        errors="collect",
+        workers=workers,
+        executor=executor,
+    )
     kinds = {failure.which: failure.kind for failure in study.failures}
     wrong = [
-        found for k, i in enumerate(chosen)
+        found
+        for k, i in enumerate(chosen)
         if (found := _differences(stored, i, study, k, kinds.get(k, ""), rtol, allowed))
-    ]  # fmt: skip
+    ]
     if len(wrong) > max_outliers:
-        raise AssertionError(_report(stored, trial, [text for each in wrong for text in each]))
+        raise AssertionError(
+            _report(stored, trial, [text for each in wrong for text in each])
+        )
     return stored
 
 
 def _differences(
-    stored: Stored, i: int, study: Study, k: int, kind: str, rtol: float,
+    stored: Stored,
+    i: int,
+    study: Study,
+    k: int,
+    kind: str,
+    rtol: float,
     allowed: Mapping[str, float],
 ) -> list[str]:
     """What one trial does not give as it is stored."""
     if kind or stored.failures[i]:
-        was, now = stored.failures[i] or "a value", kind or "a value"
+        was = stored.failures[i] or "a value"
+        now = kind or "a value"
         return [f"trial {i}: stored {was}, now {now}"] if was != now else []
     names = tuple(stored.columns)
-    pairs = [(c, float(stored.columns[c][i]), v) for c, v in
-             zip(names, row(study.values[k], names), strict=True)]  # fmt: skip
-    return [f"trial {i}: {c} stored {was!r}, now {now!r}" for c, was, now in pairs
-            if not _same(was, now, rtol, allowed[c])]  # fmt: skip
+    pairs = [
+        (c, float(stored.columns[c][i]), v)
+        for c, v in zip(names, row(study.values[k], names), strict=True)
+    ]
+    return [
+        f"trial {i}: {c} stored {was!r}, now {now!r}"
+        for c, was, now in pairs
+        if not _same(was, now, rtol, allowed[c])
+    ]
 
 
 def _same(was: float, now: float, rtol: float, atol: float) -> bool:
@@ -138,5 +166,10 @@ def _report(stored: Stored, trial: Trial, wrong: list[str]) -> str:
     if was and was != (now := fingerprint(trial)):
         kept.append(f"the source of the trial is another one: stored {was}, now {now}")
     elif stored.metadata["version"] != versions():
-        kept.append(f"the versions are others: stored {dict(stored.metadata['version'])}")
-    return f"{stored.path.name}: another run does not give what is stored\n" + "\n".join(kept)
+        kept.append(
+            f"the versions are others: stored {dict(stored.metadata['version'])}"
+        )
+    return (
+        f"{stored.path.name}: another run does not give what is stored\n"
+        + "\n".join(kept)
+    )

@@ -76,7 +76,9 @@ class Stored:
 
     def seed(self, index: int) -> SeedSequence:
         """The seed of a trial, made afresh."""
-        entropy, key = (tuple(map(int, t.split())) for t in self.seeds[index].split(","))
+        entropy, key = (
+            tuple(map(int, t.split())) for t in self.seeds[index].split(",")
+        )
         return SeedSequence(entropy if len(entropy) > 1 else entropy[0], spawn_key=key)
 
 
@@ -112,14 +114,21 @@ def plain_json(parameters: Mapping[str, Any]) -> dict[str, str]:
             return value.tolist()
         raise TypeError(f"{type(value).__name__} is not JSON")
 
-    return {k: json.dumps(v, default=listed, allow_nan=False) for k, v in parameters.items()}
+    return {
+        k: json.dumps(v, default=listed, allow_nan=False) for k, v in parameters.items()
+    }
 
 
 def _head(
-    trial: Trial, columns: Sequence[str], parameters: Mapping[str, Any], code: Iterable[Any]
+    trial: Trial,
+    columns: Sequence[str],
+    parameters: Mapping[str, Any],
+    code: Iterable[Any],
 ) -> str:
     """What a study's file says of its making, and the names of its columns."""
-    if not all(name.isidentifier() for name in columns) or len(set(columns)) != len(columns):
+    if not all(name.isidentifier() for name in columns) or len(set(columns)) != len(
+        columns
+    ):
         raise ValueError(f"columns: needs different identifiers, got {columns}")
     made_by = {plain(f).__qualname__: fingerprint(f) for f in (trial, *code)}
     lines = [f"# version {k}: {json.dumps(v)}" for k, v in running.versions().items()]
@@ -129,10 +138,17 @@ def _head(
 
 
 def store(
-    path: str | Path, trial: Trial, seeds: Iterable[SeedSequence | int], *,
-    columns: Sequence[str], parameters: Mapping[str, Any], code: Iterable[Callable[..., Any]] = (),
-    indices: Iterable[int] | None = None, executor: Executor | None = None,
-    workers: int | None = None, progress: bool = True,
+    path: str | Path,
+    trial: Trial,
+    seeds: Iterable[SeedSequence | int],
+    *,
+    columns: Sequence[str],
+    parameters: Mapping[str, Any],
+    code: Iterable[Callable[..., Any]] = (),
+    indices: Iterable[int] | None = None,
+    executor: Executor | None = None,
+    workers: int | None = None,
+    progress: bool = True,
 ) -> Path:
     """Run a study and write its metrics to a CSV file: the same study gives the same bytes.
 
@@ -169,8 +185,10 @@ def store(
     OSError
         If the disk is full; the message names the file.
     """
-    target, given = Path(path), [fresh(seed) for seed in seeds]
-    part, head = _Part(target, _head(trial, columns, parameters, code)), len(_FIRST)
+    target = Path(path)
+    given = [fresh(seed) for seed in seeds]
+    part = _Part(target, _head(trial, columns, parameters, code))
+    head = len(_FIRST)
     rows = part.rows()
     texts = [seed_text(seed) for seed in given]
     for i, text in rows.items():
@@ -188,7 +206,9 @@ def store(
                 rows[outcome.which] = _row(outcome, texts[outcome.which], columns)
                 part.append(rows[outcome.which])
     except running.ExecutorError as error:
-        raise StudyError(f"{error}; the trials that are done are in {part.path}") from error
+        raise StudyError(
+            f"{error}; the trials that are done are in {part.path}"
+        ) from error
     if died:
         raise StudyError(f"{died[0]}\nthe other trials are in {part.path}")
     return part.finished(rows) if len(rows) == len(given) else part.path
@@ -196,7 +216,9 @@ def store(
 
 def _row(outcome: Outcome, seed: str, columns: Sequence[str]) -> str:
     value = None if outcome.kind else pickle.loads(outcome.value)
-    numbers = [""] * len(columns) if outcome.kind else map(repr, running.row(value, columns))
+    numbers = (
+        [""] * len(columns) if outcome.kind else map(repr, running.row(value, columns))
+    )
     return ",".join([str(outcome.which), seed, outcome.kind, *numbers])
 
 
@@ -204,7 +226,8 @@ class _Part:
     """What is done of a study: its head, then a row a trial as they come, each with a checksum."""
 
     def __init__(self, target: Path, head: str) -> None:
-        self.target, self.head = target, head
+        self.target = target
+        self.head = head
         self.path = target.with_name(f"{target.name}.part")
         self.synced = 0.0
 
@@ -216,8 +239,10 @@ class _Part:
         if self.head.startswith(text):  # it was cut off before its first row
             self.path.unlink()
         elif not text.startswith(f"{self.head}\n"):
-            raise ValueError(f"{self.path}: begun with other code, parameters or versions: remove "
-                             "it to begin again")  # fmt: skip
+            raise ValueError(
+                f"{self.path}: begun with other code, parameters or versions: remove "
+                "it to begin again"
+            )
         out = {}
         for line in text[len(self.head) :].split("\n"):
             made, _, checksum = line.rpartition(",")
@@ -321,9 +346,13 @@ def load(path: str | Path) -> Stored:
     for found in filter(None, map(_HEADER.fullmatch, lines)):
         heads[found[1]][found[2]] = json.loads(found[3])
     skipped = sum(line.startswith("#") for line in lines)
-    table = pandas.read_csv(io.BytesIO(body), skiprows=skipped, dtype=str, keep_default_na=False)
+    table = pandas.read_csv(
+        io.BytesIO(body), skiprows=skipped, dtype=str, keep_default_na=False
+    )
     metrics = table.columns[len(_FIRST) :]
     # Python's own reading of a number, which gives back every bit that was written.
-    columns = {str(c): np.array([float(text or "nan") for text in table[c]]) for c in metrics}
+    columns = {
+        str(c): np.array([float(text or "nan") for text in table[c]]) for c in metrics
+    }
     seeds = tuple(table["entropy"] + "," + table["spawn_key"])
     return Stored(source, heads, seeds, tuple(table["failure"]), columns)

@@ -119,12 +119,16 @@ class Study:
 
     def __repr__(self) -> str:
         failed = len(self.failures)
-        return f"Study({len(self.seeds)} trials: {self.done.sum()} done, {failed} failed)"
+        return (
+            f"Study({len(self.seeds)} trials: {self.done.sum()} done, {failed} failed)"
+        )
 
     def metrics(self, columns: Sequence[str]) -> dict[str, NDArray[np.float64]]:
         """Named numbers of the trials that are done, each (done,)."""
         kept = [v for v, done in zip(self.values, self.done, strict=True) if done]
-        table = np.array([row(v, columns) for v in kept]).reshape(len(kept), len(columns))
+        table = np.array([row(v, columns) for v in kept]).reshape(
+            len(kept), len(columns)
+        )
         return dict(zip(columns, table.T, strict=True))
 
 
@@ -134,7 +138,9 @@ def row(value: Any, columns: Sequence[str]) -> list[float]:
         return [float(value[name]) for name in columns]
     numbers = [float(x) for x in np.atleast_1d(value)]
     if len(numbers) != len(columns):
-        raise ValueError(f"columns: needs {len(numbers)}, a name for each number, got {columns}")
+        raise ValueError(
+            f"columns: needs {len(numbers)}, a name for each number, got {columns}"
+        )
     return numbers
 
 
@@ -147,8 +153,13 @@ class StudyError(RuntimeError):
 
 
 def run(
-    trial: Trial, seeds: Iterable[SeedSequence | int], *, executor: Executor | None = None,
-    workers: int | None = None, errors: str = "raise", progress: bool = True,
+    trial: Trial,
+    seeds: Iterable[SeedSequence | int],
+    *,
+    executor: Executor | None = None,
+    workers: int | None = None,
+    errors: str = "raise",
+    progress: bool = True,
 ) -> Study:
     """Call ``trial(seed)`` for every seed, on as many processes as there are.
 
@@ -184,7 +195,9 @@ def run(
 
     Examples
     --------
-    >>> study = run(lambda seed: np.random.default_rng(seed).normal(), spawn(7, 100), workers=1)
+    >>> study = run(
+    ...     lambda seed: np.random.default_rng(seed).normal(), spawn(7, 100), workers=1
+    ... )
     >>> study
     Study(100 trials: 100 done, 0 failed)
     """
@@ -204,16 +217,24 @@ def run(
 
 
 def _study(seeds: tuple[SeedSequence, ...], found: Mapping[int, Outcome]) -> Study:
-    failed = tuple(Failure(i, seeds[i], *found[i][2:]) for i in sorted(found) if found[i].kind)
+    failed = tuple(
+        Failure(i, seeds[i], *found[i][2:]) for i in sorted(found) if found[i].kind
+    )
     done = np.array([i in found and not found[i].kind for i in range(len(seeds))])
-    values = tuple(pickle.loads(found[i].value) if good else None for i, good in enumerate(done))
+    values = tuple(
+        pickle.loads(found[i].value) if good else None for i, good in enumerate(done)
+    )
     return Study(seeds, values, failed, done)
 
 
 def track(items: Iterable[Any], total: int, show: bool) -> Iterable[Any]:
     """The items, behind a progress bar where a person may be watching."""
-    silent = any(os.environ.get(name) for name in ("TQDM_DISABLE", "CI", "PYTEST_CURRENT_TEST"))
-    hidden = True if silent or not show else None  # None: where the output is no terminal
+    silent = any(
+        os.environ.get(name) for name in ("TQDM_DISABLE", "CI", "PYTEST_CURRENT_TEST")
+    )
+    hidden = (
+        True if silent or not show else None
+    )  # None: where the output is no terminal
     shown: Iterable[Any] = tqdm(items, total=total, leave=False, disable=hidden)
     return shown
 
@@ -268,7 +289,9 @@ def _outcome(trial: Trial, which: int, seed: SeedSequence) -> Outcome:
         # At once: the next trial may overwrite a buffer that the value shares.
         return Outcome(which, cloudpickle.dumps(trial(seed)))
     except (Exception, SystemExit) as error:
-        inner = error.__traceback__ and error.__traceback__.tb_next  # without this function's frame
+        inner = (
+            error.__traceback__ and error.__traceback__.tb_next
+        )  # without this function's frame
         text = "".join(traceback.format_exception(type(error), error, inner))
         return Outcome(which, b"", type(error).__name__, text)
 
@@ -306,7 +329,9 @@ def _pool(workers: int) -> Executor:
     # loky starts new workers where these arguments differ: a worker keeps the folder and the
     # import path that it was born with.
     here = (os.getcwd(), *sys.path)
-    pool: Executor = get_reusable_executor(workers, timeout=10, initializer=_start, initargs=here)
+    pool: Executor = get_reusable_executor(
+        workers, timeout=10, initializer=_start, initargs=here
+    )
     return pool
 
 
@@ -321,7 +346,11 @@ def sent_by_value(folder: Path) -> None:
     """Send the functions of modules in a folder themselves: a worker need not have the folder."""
     for module in list(sys.modules.values()):
         file = getattr(module, "__file__", None)
-        if file and not module.__package__ and Path(file).resolve().parent == folder.resolve():
+        if (
+            file
+            and not module.__package__
+            and Path(file).resolve().parent == folder.resolve()
+        ):
             cloudpickle.register_pickle_by_value(module)
 
 
@@ -340,12 +369,18 @@ def _held() -> Iterator[None]:
     It replaces one whose memory has grown, as a cache's does, which costs no result.
     """
     with warnings.catch_warnings(), threadpool_limits(1, user_api="blas"):
-        warnings.filterwarnings("ignore", message="A worker (stopped|was restarted) while some")
+        warnings.filterwarnings(
+            "ignore", message="A worker (stopped|was restarted) while some"
+        )
         yield
 
 
 def outcomes(
-    trial: Trial, items: Sequence[Item], executor: Executor | None, workers: int | None, *,
+    trial: Trial,
+    items: Sequence[Item],
+    executor: Executor | None,
+    workers: int | None,
+    *,
     one_by_one: bool = False,
 ) -> Iterator[Outcome]:
     """Every trial's outcome, as it comes.
@@ -374,14 +409,26 @@ class _Flight:
     """The trials of a study on their way through an executor."""
 
     def __init__(
-        self, job: Job, items: Sequence[Item], executor: Executor | None, workers: int | None,
+        self,
+        job: Job,
+        items: Sequence[Item],
+        executor: Executor | None,
+        workers: int | None,
         one_by_one: bool,
     ) -> None:
-        self.job, self.workers, self.one_by_one = job, workers, one_by_one
-        self.executor, self.own, self.size = executor or _pool(workers or 1), executor is None, 1
-        self.waiting, self.suspects = deque(items), deque[Item]()
+        self.job = job
+        self.workers = workers
+        self.one_by_one = one_by_one
+        self.executor = executor or _pool(workers or 1)
+        self.own = executor is None
+        self.size = 1
+        self.waiting = deque(items)
+        self.suspects = deque[Item]()
         self.flying: dict[Landed, list[Item]] = {}
-        self.alone, self.broken, self.room, self.known_until = False, False, 1, 0.0
+        self.alone = False
+        self.broken = False
+        self.room = 1
+        self.known_until = 0.0
 
     def outcomes(self) -> Iterator[Outcome]:
         while self.waiting or self.suspects or self.flying:
@@ -405,27 +452,41 @@ class _Flight:
                 raise ExecutorError(f"the executor broke ({error})") from error
             self.broken = True
             if self.alone:
-                return [Outcome(items[0][0], b"", DIED, f"its worker process died: {error}")]
+                return [
+                    Outcome(items[0][0], b"", DIED, f"its worker process died: {error}")
+                ]
             self.suspects.extend(items)
             return []
         except Exception as error:
-            raise ExecutorError(f"the executor failed ({type(error).__name__}: {error})") from error
+            raise ExecutorError(
+                f"the executor failed ({type(error).__name__}: {error})"
+            ) from error
 
     def _fill(self) -> None:
         """Submit what there is room for: a worker's death is the fault of one that flies alone."""
         if self.broken and self.flying:  # the others are lost or back soon
             return
         if self.broken:
-            self.executor, self.broken = _pool(self.workers or 1), False
+            self.executor = _pool(self.workers or 1)
+            self.broken = False
         self.alone = bool(self.suspects) or (self.alone and bool(self.flying))
         if self.alone and not self.flying:
             self._submit([self.suspects.popleft()])
-        if time.monotonic() > self.known_until:  # a cluster grows and shrinks; asking it takes time
-            self.room, self.known_until = slots(self.executor), time.monotonic() + 1.0
+        if (
+            time.monotonic() > self.known_until
+        ):  # a cluster grows and shrinks; asking it takes time
+            self.room = slots(self.executor)
+            self.known_until = time.monotonic() + 1.0
         room = self.workers or self.room
         window = room if self.one_by_one else 2 * room
-        while self.waiting and len(self.flying) < window and not (self.alone or self.broken):
-            fair = ceil(len(self.waiting) / (2 * room))  # towards the end nobody is left alone
+        while (
+            self.waiting
+            and len(self.flying) < window
+            and not (self.alone or self.broken)
+        ):
+            fair = ceil(
+                len(self.waiting) / (2 * room)
+            )  # towards the end nobody is left alone
             size = 1 if self.one_by_one else min(self.size, fair)
             self._submit([self.waiting.popleft() for _ in range(size)])
 
