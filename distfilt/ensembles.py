@@ -14,7 +14,6 @@ from .validation import (
     PositiveInt,
     PositiveSemidefinite,
     Rng,
-    unchecked,
     validated,
 )
 
@@ -24,7 +23,7 @@ __all__ = ["Members", "draw", "mean", "sample_covariance"]
 def _at_least(members: int, value: Array, name: str) -> None:
     if value.shape[-2] < members:
         raise ValueError(
-            f"{name}: needs at least {members} members, got {value.shape[-2]}"
+            f"{name} must have at least {members} members, got {value.shape[-2]}"
         )
 
 
@@ -66,7 +65,7 @@ def draw(
     >>> draw([0.0, 0.0], np.eye(2), 5, rng=np.random.default_rng(0), leading=(3,)).shape
     (3, 5, 2)
     """
-    root = unchecked(factor)(cov)
+    root = factor(cov)
     return mean + rng.standard_normal((*leading, members, mean.size)) @ root.T
 
 
@@ -179,7 +178,7 @@ def _projected(drawn: Array, avoid: Array) -> Array:
     frame, independent = _frame(around / np.where(size > 0, size, 1.0))
     if n <= independent + rank:
         raise ValueError(
-            f"ensemble: needs more than {independent} + {rank} members, for "
+            f"ensemble must have more than {independent} + {rank} members, for "
             f"{independent} independent anomalies and noise of rank {rank}, got {n}"
         )
     for _ in range(2):

@@ -129,7 +129,7 @@ def leading(
         return np.broadcast_shapes(wanted, got)
     except ValueError:
         raise ValueError(
-            f"{name}: needs leading axes that broadcast with {wanted}, got {got}"
+            f"{name} must have leading axes that broadcast with {wanted}, got {got}"
         ) from None
 
 
@@ -341,7 +341,7 @@ def as_derivative(
         owner.derivative(*[np.copy(x) if np.ndim(x) else x for x in given])
     )
     if slope.shape not in (full, full[-2:]):
-        raise ValueError(f"derivative: needs to return shape {full}, got {slope.shape}")
+        raise ValueError(f"derivative must return shape {full}, got {slope.shape}")
     if vars(owner).pop("_doubted", False):
         found = near(step=_STEP)
         wide = near(step=4 * _STEP)
@@ -350,6 +350,8 @@ def as_derivative(
         bound = 0.1 * row + 1e-4 * row.max(axis=-2, keepdims=True)
         if (sure & (np.abs(slope - found) > bound)).any():
             warnings.warn(
-                "derivative: needs that of its function, got another", RuntimeWarning, 4
+                "derivative must be that of its function, got another",
+                RuntimeWarning,
+                4,
             )
     return np.broadcast_to(slope, full)

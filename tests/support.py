@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
 from distfilt.models import Model, constant_velocity
+from distfilt.validation import skip_validation
 
 NAN = float("nan")
 INDEFINITE = [[1.0, 2.0], [2.0, 1.0]]
@@ -87,3 +91,13 @@ def turning(*, sigma: float, turn_sigma: float) -> Model:
         return cov
 
     return Model(5, flow, noise, derivative=derivative)
+
+
+def without_checks(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function as the library's own loops call it, without checks of its arguments."""
+
+    def call(*args: Any, **options: Any) -> Any:
+        with skip_validation():
+            return function(*args, **options)
+
+    return call

@@ -112,7 +112,7 @@ def test_exact_noise_beside_anomalies_that_depend_on_each_other(n: int) -> None:
         both = np.concatenate([x, h], axis=-1)
         if n == 12 and slight:
             with pytest.raises(
-                ValueError, match=r"needs more than 1[12] \+ 3 members.* got 12$"
+                ValueError, match=r"must have more than 1[12] \+ 3 members.* got 12$"
             ):
                 exact_noise(both, factor(FULL), rng)
         else:
@@ -134,7 +134,9 @@ def test_exact_noise_beside_combinations_of_close_anomalies() -> None:
 def test_exact_noise_says_how_many_members_it_needs() -> None:
     x = generator(7).standard_normal((9, 4))
     assert exact_noise(x[:8], factor(FULL), generator()).shape == (8, 3)
-    with pytest.raises(ValueError, match=r"^ensemble: needs more than 4 \+ 3 members"):
+    with pytest.raises(
+        ValueError, match=r"^ensemble must have more than 4 \+ 3 members"
+    ):
         exact_noise(x[:7], factor(FULL), generator())
     rank_one = np.ones((3, 3))
     assert exact_noise(x[:6], factor(rank_one), generator()).shape == (6, 3)

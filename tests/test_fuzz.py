@@ -47,11 +47,11 @@ def test_a_door_left_open_is_found() -> None:
             type(x) not in (list, np.ndarray)
             or np.asarray(x, dtype=object).ravel()[:1].size == 0
         ):
-            raise ValueError("x: needs numbers")
+            raise ValueError("x must be numbers")
         if not all(isinstance(v, float) for v in np.asarray(x, dtype=object).ravel()):
-            raise ValueError("x: needs numbers")
+            raise ValueError("x must be numbers")
         if not np.isfinite(x).all():
-            raise ValueError("x: needs finite numbers")
+            raise ValueError("x must have finite numbers")
         return float(np.sum(x))
 
     a = np.array([[1.0, 2.0], [3.0, 4.5]])

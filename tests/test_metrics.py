@@ -49,7 +49,7 @@ def test_nees_and_nis_are_their_definitions(leading):
     one = cov[(0,) * len(leading)]
     exact = (gap * np.linalg.solve(one, gap[..., None])[..., 0]).sum(-1)
     assert np.allclose(nees(estimate, one, truth), exact, rtol=1e-10)
-    with pytest.raises(ValueError, match="^truth: needs leading axes"):
+    with pytest.raises(ValueError, match="^truth must have leading axes"):
         nees(np.ones((2, 4)), one, np.ones((3, 4)))
 
 
@@ -150,7 +150,9 @@ def test_interval_is_compact_and_holds_its_ends():
 
 
 def test_too_few_values_are_refused():
-    with pytest.raises(ValueError, match="^values: needs at least 2"):
+    with pytest.raises(ValueError, match="^values must have at least 2"):
         mean_interval([1.0])
-    with pytest.raises(ValueError, match="^values: needs more values for level 0.95"):
+    with pytest.raises(
+        ValueError, match="^values must have more values for level 0.95"
+    ):
         median_interval([1.0, 2.0, 3.0, 4.0, 5.0])

@@ -55,7 +55,7 @@ def refuses(value: Any, call: Call, name: str) -> bool:
     for other, kind in describe(call.function).items():
         try:
             if other in given:
-                kind.take(given[other], other, scope)
+                kind.check(given[other], other, scope)
         except ValueError as error:
             return other == name and str(error).startswith(name)
         except Exception:  # an object of which an array cannot be made

@@ -11,7 +11,6 @@ from distfilt.mixtures import target_fusion
 from distfilt.models import constant_velocity
 from distfilt.network import graphs
 from distfilt.sensors import range_bearing
-from distfilt.validation import unchecked
 
 STD = (0.3, 0.04)
 RATE = 0.4
@@ -60,9 +59,7 @@ def events(path):
     poses = {robot: (8.0 * robot - 16, -5.0, 0.3 * robot) for robot in range(ROBOTS)}
     for t, robot, dt, speed, turn, *sight in np.loadtxt(path, delimiter=",").tolist():
         pose = poses[robot] = rolled(poses[robot], speed, turn, dt)
-        eye = unchecked(range_bearing)(
-            [0, 1], std=STD, origin=pose[:2], heading=pose[2]
-        )
+        eye = range_bearing([0, 1], std=STD, origin=pose[:2], heading=pose[2])
         yield filters.Observation(t, int(robot), sight, eye, metadata=pose)
 
 

@@ -80,7 +80,7 @@ def setup(name: str, **changes: Any) -> Setup:
         )
         if make(sigma=0.0).names != tuple(s["state_order"]):
             raise ValueError(
-                f"state_order: needs that of satellite_pose, got {s['state_order']}"
+                f"state_order must be that of satellite_pose, got {s['state_order']}"
             )
         moved = s["prior_offset_translation"]
         wide = s["prior_variance_translation"]

@@ -667,7 +667,7 @@ class GridFilter(filters.Filter):
             variance = np.diagonal(heard.noise, axis1=-2, axis2=-1)
             if np.count_nonzero(heard.noise) > np.count_nonzero(variance):
                 raise ValueError(
-                    "sensors: needs independent errors for a grid, got correlated"
+                    "sensors must be independent errors for a grid, got correlated"
                 )
             said[..., a, :] = -0.5 * (gap / variance[..., None, :]).sum(axis=-1)
         if self.likelihoods:

@@ -18,7 +18,6 @@ from distfilt.coupling import norm_constraint, project, retract
 from distfilt.filters import ParticleCollapse
 from distfilt.models import pendulum, pendulum_states
 from distfilt.updates import etpf, with_augmentation, with_projection, with_retraction
-from distfilt.validation import unchecked
 
 # The study counts the runs that lose the truth.
 warnings.filterwarnings("ignore", category=ParticleCollapse)
@@ -92,7 +91,7 @@ def run(
     `draws` seeds the draws of rejuvenation; no other update here draws.
     """
     rng = np.random.default_rng(draws)
-    inner = [unchecked(updates[name]) for name in names]
+    inner = [updates[name] for name in names]
     x = np.stack([members] * len(inner))
     out = np.full((len(readings), *x.shape), np.nan)
     alive = np.ones(len(inner), dtype=bool)

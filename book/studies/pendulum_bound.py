@@ -29,7 +29,6 @@ from distfilt.updates import (
     with_projection,
     with_retraction,
 )
-from distfilt.validation import unchecked
 
 # The study counts the runs that lose the truth.
 warnings.filterwarnings("ignore", category=ParticleCollapse)
@@ -122,7 +121,7 @@ def many(seeds) -> tuple[np.ndarray, np.ndarray]:
 
 def ensembles(updates, members, model, see, readings, noise, noisy, rng):
     """Analysis members of filters with one model, {name: (T, N, d)}."""
-    inner = {name: unchecked(update) for name, update in updates.items()}
+    inner = {name: update for name, update in updates.items()}
     x = np.stack([members] * len(inner))
     out = np.full((STEPS, *x.shape), np.nan)
     kick = np.repeat(KICK, x.shape[-1] // 2)

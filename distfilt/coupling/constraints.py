@@ -22,7 +22,6 @@ from ..validation import (
     Mask,
     NonNegativeFloat,
     check_array,
-    unchecked,
     validated,
 )
 
@@ -75,7 +74,7 @@ class Constraint(FrozenModel):
             g = self.function(x.copy())
         except IndexError as error:
             raise ValueError(
-                f"constraint: needs states with more than {x.shape[-1]} components: {error}"
+                f"constraint must be states with more than {x.shape[-1]} components: {error}"
             ) from error
         return check_array(g, "function", shape, finite=False) - self.value
 
@@ -175,7 +174,7 @@ def project(
     """
     x = ensemble
     n = ensemble.shape[-2]
-    gap = unchecked(constraint.residual)(x)
+    gap = constraint.residual(x)
     mean = gap.mean(axis=-2, keepdims=True)
     anomalies = gap - mean
     around = x - x.mean(axis=-2, keepdims=True)
@@ -246,7 +245,7 @@ def retract(
     array([ 0.6 ,  0.8 ,  0.64, -0.48])
     """
     x = states.reshape(-1, states.shape[-1]).copy()
-    gap = unchecked(constraint.residual)(x)
+    gap = constraint.residual(x)
     left = np.arange(len(x))
     for _ in range(_STEPS):
         slope, excess = _excess(constraint, x[left], gap[left])
@@ -274,7 +273,7 @@ def retract(
 
 def _excess(constraint: Constraint, x: Array, gap: Array) -> tuple[Array, Array]:
     """Jacobians at states (n, d), and how far each is off in units of what rounding explains."""
-    slope = unchecked(constraint.jacobian)(x)
+    slope = constraint.jacobian(x)
     reach = np.linalg.norm(slope, axis=-1) * np.linalg.norm(x, axis=-1)[:, None]
     unit = np.maximum(np.abs(constraint.value), reach)
     return slope, (np.abs(gap) / np.where(gap == 0, 1.0, unit)).max(axis=-1)
@@ -288,7 +287,7 @@ def _along_normals(slope: Array, gap: Array) -> Array:
     lost = ~(least > 1e-14)
     if lost.any():
         raise ValueError(
-            "constraint: needs a Jacobian of full rank, got one that loses rank at "
+            "constraint must be a Jacobian of full rank, got one that loses rank at "
             f"state {lost.argmax()} ({lost.sum()} of {lost.size})"
         )
     dual = np.linalg.solve(slope @ slope.mT, gap[..., None])
@@ -327,7 +326,7 @@ def _make_tangent(x: Array, constraint: Constraint, motion: Motion) -> None:
         needs = (
             f"as many other indices below {x.shape[-1]} for velocities as for positions"
         )
-        raise ValueError(f"motion: needs {needs}, got {motion}")
-    slope = unchecked(constraint.jacobian)(x)[..., places]
+        raise ValueError(f"motion must be {needs}, got {motion}")
+    slope = constraint.jacobian(x)[..., places]
     along = (slope @ x[:, rates, None])[..., 0]
     x[:, rates] += _along_normals(slope, along)

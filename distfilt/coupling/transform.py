@@ -29,7 +29,6 @@ from ..validation import (
     PositiveFloat,
     Rng,
     check_array,
-    unchecked,
     validated,
 )
 from .solvers import SQUARED, Solve, Solver, scale_cost, solver_of, squared_distances
@@ -58,15 +57,15 @@ def normalize_weights(
     top = w.max(axis=-1, keepdims=True)
     if np.isneginf(top).any():
         raise ValueError(
-            "log_weights: needs a positive weight in every ensemble, got only zeros"
+            "log_weights must be a positive weight in every ensemble, got only zeros"
         )
     if not np.isfinite(top).all():
         raise ValueError(
-            "log_weights: needs numbers below infinity, got NaN or infinity"
+            "log_weights must be numbers below infinity, got NaN or infinity"
         )
     if w.shape[-1] > 2 and w.min() >= 0 and np.allclose(w.sum(axis=-1), 1):
         warnings.warn(
-            "log_weights: needs logarithms, got a sum of 1",
+            "log_weights must have logarithms, got a sum of 1",
             RuntimeWarning,
             stacklevel=4,
         )
@@ -118,7 +117,7 @@ def transport_plans(ensemble: Members, log_weights: ArrayLike) -> Array:
 def _plans(x: Array, w: Array, solve: Solve) -> Array:
     """Couplings (..., N, N) of the weights to equal masses, for the squared distance."""
     points = x.reshape(-1, *x.shape[-2:])
-    costs = np.array([unchecked(squared_distances)(p) for p in points])
+    costs = np.array([squared_distances(p) for p in points])
     return _coupled(costs.reshape(*w.shape, w.shape[-1]), w, solve)
 
 
@@ -266,7 +265,7 @@ def _graded(cov: Array) -> Array:
     """
     order = np.argsort(-np.diagonal(cov, axis1=-2, axis2=-1), axis=-1, kind="stable")
     rows = np.take_along_axis(cov, order[..., :, None], axis=-2)
-    lower = unchecked(factor)(np.take_along_axis(rows, order[..., None, :], axis=-1))
+    lower = factor(np.take_along_axis(rows, order[..., None, :], axis=-1))
     return np.take_along_axis(lower, np.argsort(order, axis=-1)[..., :, None], axis=-2)
 
 
@@ -356,7 +355,7 @@ def transform_within(
     >>> bool((np.abs(y) >= 0.9).all())
     True
     """
-    matrix = len(ensemble) * unchecked(transport_plans)(ensemble, log_weights)
+    matrix = len(ensemble) * transport_plans(ensemble, log_weights)
     names, index = np.unique(pieces, return_inverse=True)
     belongs = (index == np.arange(names.size)[:, None]).astype(np.float64)
     chosen = _chosen(belongs @ matrix, rng)

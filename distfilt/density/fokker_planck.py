@@ -19,7 +19,6 @@ from ..validation import (
     NonNegativeFloat,
     PositiveFloat,
     Times,
-    unchecked,
     validated,
 )
 from .grid import Grid
@@ -101,7 +100,7 @@ class FokkerPlanck(FrozenModel):
         boxes = [np.array([part.low, part.high]) for part in (self.grid, self.swarm)]
         if not np.array_equal(boxes[0], boxes[1]):
             raise ValueError(
-                "grid: needs a grid of the swarm's box, got "
+                "grid must be a grid of the swarm's box, got "
                 f"{self.grid.shape!r} of another"
             )
 
@@ -129,7 +128,7 @@ class FokkerPlanck(FrozenModel):
         at_right = cells[f.right, f.axis]
         peclet = drift * f.width / between
         # B(-z) = z + B(z): one exponential serves both directions, without cancellation.
-        small = unchecked(bernoulli)(np.abs(peclet))
+        small = bernoulli(np.abs(peclet))
         forwards = small + np.maximum(peclet, 0.0)
         backwards = small + np.maximum(-peclet, 0.0)
         return forwards * at_left / f.width**2, backwards * at_right / f.width**2
@@ -162,7 +161,7 @@ class FokkerPlanck(FrozenModel):
         dt: PositiveFloat,
     ) -> Array:
         """Densities (..., n), or any cell values, moved from `t` to `t` + `dt`."""
-        return unchecked(self.solver)(t, dt)(values)
+        return self.solver(t, dt)(values)
 
     @validated
     def solver(self, t: float, dt: NonNegativeFloat) -> Callable[[Array], Array]:
@@ -247,4 +246,4 @@ class FokkerPlanck(FrozenModel):
         times : array_like, (T,)
             Strictly increasing from 0, in s.
         """
-        return path(unchecked(self.step), values, times, 0.0)
+        return path(self.step, values, times, 0.0)

@@ -54,15 +54,17 @@ class Grid(FrozenModel):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 1 <= self.dim <= 3:
-            raise ValueError(f"shape: needs one to three sizes, got {self.shape!r}")
+            raise ValueError(f"shape must be one to three sizes, got {self.shape!r}")
         for name in ("low", "high"):
             corner = np.asarray(getattr(self, name), dtype=np.float64)
             if corner.shape not in ((), (self.dim,)):
-                raise ValueError(f"{name}: needs {self.dim} numbers, got {corner.size}")
+                raise ValueError(
+                    f"{name} must be {self.dim} numbers, got {corner.size}"
+                )
             object.__setattr__(self, name, np.broadcast_to(corner, (self.dim,)))
         if (self.width <= 0).any():
             raise ValueError(
-                f"high: needs corners above low = {self.low}, got {self.high}"
+                f"high must have corners above low = {self.low}, got {self.high}"
             )
 
     @cached_property
@@ -133,7 +135,7 @@ class Grid(FrozenModel):
         total = values.sum(axis=-1) * self.volume
         if not (total > 0).all():
             raise ValueError(
-                f"values: needs a positive integral, got {float(total.min()):g}"
+                f"values must be a positive integral, got {float(total.min()):g}"
             )
         return np.asarray(values / total[..., None])
 

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveFloat, PositiveInt, unchecked, validated
+from ..validation import Array, Bounds, PositiveFloat, PositiveInt, validated
 from .grid import Grid
 
 __all__ = [
@@ -47,13 +47,13 @@ def fine_enough(grid: Grid, bandwidth: float | Array) -> None:
     """Refuse bandwidths below half a cell, and far beyond the box."""
     if np.max(bandwidth) > 20 * grid.width.max():
         raise ValueError(
-            f"bandwidth: needs at most 20 widths of the box, got {bandwidth}"
+            f"bandwidth must have at most 20 widths of the box, got {bandwidth}"
         )
     least = float(np.min(bandwidth))
     widest = float(grid.spacing.max())
     if widest > 2 * least * (1 + 1e-12):
         raise ValueError(
-            f"grid: needs cells no wider than two bandwidths, {2 * least:g}, "
+            f"grid must have cells no wider than two bandwidths, {2 * least:g}, "
             f"got {widest:g}"
         )
 
@@ -195,7 +195,7 @@ def kernel_covariance(
     """
     total = float(density.sum() * grid.volume)
     if abs(total - 1) > 1e-8:
-        raise ValueError(f"density: needs an integral of 1, got {total:g}")
+        raise ValueError(f"density must be an integral of 1, got {total:g}")
     g = kernels(grid.centres, grid, bandwidth=bandwidth).T * grid.volume
     mean = g @ density
     return mean, ((g * density) @ g.T / grid.volume - np.outer(mean, mean)) / agents
@@ -236,7 +236,7 @@ def bandwidth(
     spread = float(np.sqrt(x.var(axis=0).mean()))
     if n < 2 or spread == 0:
         raise ValueError(
-            f"positions: needs two agents or more in different places, got {n} "
+            f"positions must have two agents or more in different places, got {n} "
             f"with a spread of {spread:g}"
         )
     least = 0.5 * float(grid.spacing.max())
@@ -250,7 +250,7 @@ def bandwidth(
 
 def _least_squares(x: Array, grid: Grid, h: float) -> float:
     n = len(x)
-    z = unchecked(kernels)(x, grid, bandwidth=h)
+    z = kernels(x, grid, bandwidth=h)
     mean = z.mean(axis=0)
     at = z[:, grid.cell_index(x)]  # kernel of agent i in the cell of agent j
     others = (at.sum() - np.trace(at)) / (n * (n - 1))

@@ -22,7 +22,6 @@ from ..validation import (
     PositiveFloat,
     check_array,
     check_positive_semidefinite,
-    unchecked,
     validated,
 )
 
@@ -54,7 +53,7 @@ class Dense(FrozenModel):
     np.float64(4.0)
     >>> Dense(np.ones(2), [[1.0, 2.0], [2.0, 1.0]])
     Traceback (most recent call last):
-    ValueError: covariance: needs a positive semidefinite matrix, got smallest eigenvalue -1
+    ValueError: covariance must be a positive semidefinite matrix, got smallest eigenvalue -1
     """
 
     mean: Annotated[Array, "n"]
@@ -109,9 +108,11 @@ def _strength(noise: ArrayLike, shape: tuple[int, ...]) -> Array:
     """The strength R of each filter's noise, infinite where a filter measures nothing."""
     r = check_array(noise, "noise", (..., shape[-1]), finite=False)
     if not r.min() > 0:
-        raise ValueError(f"noise: needs variances above 0, got {r.min():g}")
+        raise ValueError(f"noise must be variances above 0, got {r.min():g}")
     if r.shape not in (shape, shape[-1:]):
-        raise ValueError(f"noise: needs shape {shape} or {shape[-1:]}, got {r.shape}")
+        raise ValueError(
+            f"noise must have shape {shape} or {shape[-1:]}, got {r.shape}"
+        )
     return np.broadcast_to(r, shape)
 
 
@@ -244,13 +245,13 @@ def low_rank_predict(
         return state.replace(basis=basis, base=moved[-len(base) :])
     if dt is None:
         raise ValueError(
-            "dt: needs the step's length where there is process noise, got None"
+            "dt must be the step's length where there is process noise, got None"
         )
     added = np.broadcast_to(np.sqrt(dt) * process, (len(base), *process.shape))
     factor = np.concatenate([basis, added], axis=-1)
     _, vectors = np.linalg.eigh(factor.mT @ factor)
     kept = factor @ vectors[..., -basis.shape[-1] :]
-    return unchecked(low_rank_start)(kept, moved[-len(base) :])
+    return low_rank_start(kept, moved[-len(base) :])
 
 
 @validated

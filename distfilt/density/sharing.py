@@ -22,7 +22,6 @@ from ..validation import (
     NonNegativeFloat,
     PositiveFloat,
     PositiveInt,
-    unchecked,
 )
 from .grid import Grid
 from .kernel import kernel_constant, kernel_density, kernels
@@ -80,7 +79,7 @@ class SwarmSnapshot(FrozenModel):
         here = self.positions[~np.isnan(self.positions).all(axis=-1)]
         if np.isnan(here).any() or not len(here):
             raise ValueError(
-                "positions: needs one agent at least, and NaN in a whole row for one "
+                "positions must be one agent at least, and NaN in a whole row for one "
                 f"that has gone, got {self.positions.tolist()}"
             )
         self.grid._inside(here)
@@ -108,10 +107,7 @@ class SwarmSnapshot(FrozenModel):
     def kernels(self) -> Array:
         """Each agent's own kernel, zero for those that are gone, (A, n)."""
         x = self._or(self.grid.centres[0])
-        return (
-            unchecked(kernels)(x, self.grid, bandwidth=self.bandwidth)
-            * self.present[:, None]
-        )
+        return kernels(x, self.grid, bandwidth=self.bandwidth) * self.present[:, None]
 
     def noise(
         self, density: Array, agents: ArrayLike, floor: float | None = None
@@ -132,7 +128,7 @@ class SwarmSnapshot(FrozenModel):
         least = 0.1 / self.grid.box if floor is None else floor
         heard = np.where(self.present, np.maximum(agents, 1.0), 0.0)
         chosen = heard if self.wanted is None else heard[list(self.wanted)]
-        unit = unchecked(kernel_constant)(self.grid, bandwidth=self.bandwidth, agents=1)
+        unit = kernel_constant(self.grid, bandwidth=self.bandwidth, agents=1)
         k = np.divide(unit, chosen, out=np.full(chosen.shape, np.inf), where=chosen > 0)
         return np.asarray(k[:, None] * np.maximum(density, least))
 
@@ -334,7 +330,7 @@ class DynamicAverage(FrozenModel, ConsensusProtocol):
             else weighting.metropolis(graph)
         )
         lost: Lost = "keep" if graph.directed else "mutual"
-        x = unchecked(channel.mix)(x, weights, lost=lost) + (u - before)
+        x = channel.mix(x, weights, lost=lost) + (u - before)
         return (x, u), *_read(x, seen, self.modes)
 
 
@@ -404,7 +400,7 @@ def _mean_kernels(
     both = np.stack([owner, table[row, owner, -1]], axis=1)
     _, first, at = np.unique(both, axis=0, return_index=True, return_inverse=True)
     x = table[row[first], owner[first], :-1]
-    z = unchecked(kernels)(x, seen.grid, bandwidth=seen.bandwidth)
+    z = kernels(x, seen.grid, bandwidth=seen.bandwidth)
     weights = np.zeros((len(table), len(x)))
     weights[row, at] = 1.0
     return np.asarray(
@@ -453,5 +449,5 @@ class Centralised(FrozenModel, ConsensusProtocol):
         """The kernel estimate of all that are here."""
         x = seen.positions[seen.present]
         size = len(seen.positions)
-        y = unchecked(kernel_density)(x, seen.grid, bandwidth=seen.bandwidth)
+        y = kernel_density(x, seen.grid, bandwidth=seen.bandwidth)
         return (), np.tile(y, (size, 1)), np.full(size, float(len(x)))

@@ -103,7 +103,7 @@ class Filter(FrozenModel, ABC):
     [0.5 0.5]
     >>> GaussianFilter(walk, two, graph, fusion=intersect_ensembles)
     Traceback (most recent call last):
-    ValueError: fusion: needs a rule that fuses gaussians, got one of ensembles
+    ValueError: fusion must be a rule that fuses gaussians, got one of ensembles
     """
 
     model: Model
@@ -144,16 +144,16 @@ class Filter(FrozenModel, ABC):
         self.check_parts()
         if self.faults is not None and self.faults.has_delay:
             raise ValueError(
-                f"faults: needs Faults without a delay, got {self.faults!r}"
+                f"faults must be Faults without a delay, got {self.faults!r}"
             )
         if self.names and not len(self.names) == len({*self.names}) == self.n_agents:
             raise ValueError(
-                f"names: needs {self.n_agents} different names, got {[*self.names]}"
+                f"names must have {self.n_agents} different names, got {[*self.names]}"
             )
         kind = None if self.fusion is None else kind_of_rule(self.fusion)
         if kind is not None and kind != self.belief_kind:
             raise ValueError(
-                f"fusion: needs a rule that fuses {self.belief_kind}, got one of {kind}"
+                f"fusion must be a rule that fuses {self.belief_kind}, got one of {kind}"
             )
         if (
             self.exchange_interval is not None
@@ -162,7 +162,7 @@ class Filter(FrozenModel, ABC):
             and not self.lag
         ):
             raise ValueError(
-                "lag: needs at least 1 for readings that wait for a contact, got 0"
+                "lag must have at least 1 for readings that wait for a contact, got 0"
             )
 
     def check_parts(self) -> None:
@@ -171,12 +171,12 @@ class Filter(FrozenModel, ABC):
             s.uses_previous for own in self.agent_sensors for s in own
         ):
             raise ValueError(
-                "sensors: needs sensors of the present state, got a differential"
+                "sensors must be sensors of the present state, got a differential"
             )
         speak = self.share_observations or self.fusion is not None
         if self.graph is None and self.n_agents > 1 and speak:
             raise ValueError(
-                f"graph: needs a Graph of {self.n_agents} agents, got None"
+                f"graph must be a Graph of {self.n_agents} agents, got None"
             )
         if self.graph is not None and not callable(self.graph):
             object.__setattr__(
@@ -269,12 +269,12 @@ class Filter(FrozenModel, ABC):
             The time of the prior, in s.
         """
         if self.requires_rng and rng is None:
-            raise ValueError("rng: needs a numpy.random.Generator, got None")
+            raise ValueError("rng must be a numpy.random.Generator, got None")
         if runs and (not self.supports_runs or min(runs) < 1):
             needs = (
                 "sizes of at least 1" if self.supports_runs else "(), one run at a time"
             )
-            raise ValueError(f"runs: needs {needs}, got {runs!r}")
+            raise ValueError(f"runs must be {needs}, got {runs!r}")
         own = self.initial_state(prior, runs, rng)
         child = rng.spawn(1)[0] if self.requires_rng and rng is not None else None
         return self.state_class(t, Ledger.empty(self.n_agents), child, **own)
@@ -338,11 +338,11 @@ class Filter(FrozenModel, ABC):
         """Refuse a state that is not this filter's."""
         if not isinstance(state, self.state_class):
             needs = self.state_class.__name__
-            raise ValueError(f"state: needs a {needs}, got a {type(state).__name__}")
+            raise ValueError(f"state must be a {needs}, got a {type(state).__name__}")
         if (got := state.ledger.messages.size) != self.n_agents:
-            raise ValueError(f"state: needs {self.n_agents} agents, got {got}")
+            raise ValueError(f"state must be {self.n_agents} agents, got {got}")
         if (own := getattr(self, "sizes", None)) is not None and state.sizes != own:
-            raise ValueError(f"state: needs sizes {own} an agent, got {state.sizes}")
+            raise ValueError(f"state must have sizes {own} an agent, got {state.sizes}")
 
     def read_observations(
         self, observations: Any, runs: tuple[int, ...], t: float
@@ -363,7 +363,7 @@ class Filter(FrozenModel, ABC):
         for item in delayed:
             if item.arrival_time is None or item.arrival_time > last:
                 raise ValueError(
-                    f"delayed: needs arrivals up to {last:g}, got {item.arrival_time}"
+                    f"delayed must be arrivals up to {last:g}, got {item.arrival_time}"
                 )
         waiting: list[Any] = sorted(delayed, key=lambda item: item.arrival_time or 0.0)
         for k, (t, observed) in enumerate(zip(grid.tolist(), entries, strict=True)):

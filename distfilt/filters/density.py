@@ -32,7 +32,6 @@ from ..validation import (
     PositiveFloat,
     PositiveInt,
     check_array,
-    unchecked,
 )
 from .base import Filter
 from .inputs import one_each
@@ -230,7 +229,7 @@ class DensityFilter(Filter):
         """What is believed at the agents' first positions (A, d), NaN for those not here."""
         seen = self._seen(prior, "prior", 0.0)
         here = self.filtering
-        filters = unchecked(low_rank_start)(self._basis, self._base(seen)[here])
+        filters = low_rank_start(self._basis, self._base(seen)[here])
         return {
             "positions": seen.positions,
             "carried": self.fusion.initial_state(seen),
@@ -287,7 +286,7 @@ class DensityFilter(Filter):
         t = step.t
         dt = step.dt
         if not dt:
-            raise ValueError(f"t: needs a number above {state.t:g}, got {t:g}")
+            raise ValueError(f"t must be above {state.t:g}, got {t:g}")
         if isinstance(self.graph, float):
             graph = seen.near(self.graph)
         else:
@@ -303,10 +302,10 @@ class DensityFilter(Filter):
 
         move = self.model.solver(state.t, dt)
         q = None if self.process is None else self.process * self._basis
-        moved = unchecked(low_rank_predict)(state.filters, move, process=q, dt=dt)
+        moved = low_rank_predict(state.filters, move, process=q, dt=dt)
         level = moved.estimates if self.noise == "forecast" else y
         noise = seen.noise(level, seen.present.sum(), self.floor)
-        filters = unchecked(low_rank_step)(moved, y, noise, dt)
+        filters = low_rank_step(moved, y, noise, dt)
         parts = np.unique(graph.components[seen.present]).size
         return step.end(
             positions=seen.positions,

@@ -30,7 +30,7 @@ from ..updates.particles import (
     warn_of_collapse,
     warn_of_weights,
 )
-from ..validation import Array, Bounds, NonNegativeFloat, check_array, unchecked
+from ..validation import Array, Bounds, NonNegativeFloat, check_array
 from .base import Filter
 from .inbox import Received
 from .inputs import draw_members
@@ -97,7 +97,7 @@ class MembersFilter(Filter):
         """Means and variances of the agents' ensembles, and the members for the scores."""
         centre, a = moments.center_ensemble(x := state.ensembles)
         a *= a
-        variance = unchecked(moments.mean)(a) * (self.members / (self.members - 1))
+        variance = moments.mean(a) * (self.members / (self.members - 1))
         return Summary(
             state.mask_failed(centre[..., 0, :]), state.mask_failed(variance), members=x
         )
@@ -150,7 +150,7 @@ class EnsembleFilter(MembersFilter):
             signature(self.update).bind(*range(4), rng=None)
         except TypeError as error:
             raise ValueError(
-                f"update: needs four arrays and rng, got one with {error}"
+                f"update must have four arrays and rng, got one with {error}"
             ) from None
 
     @classmethod
@@ -202,9 +202,7 @@ class EnsembleFilter(MembersFilter):
         state = step.state
         now = step.state.ensembles
         if step.dt:
-            now = unchecked(self.forecast)(
-                now, self.model, state.t, step.dt, rng=step.rng
-            )
+            now = self.forecast(now, self.model, state.t, step.dt, rng=step.rng)
             now = check_array(now, "forecast", state.ensembles.shape, finite=False)
         stack = step.stack(step.check_forecast(now, state.ensembles))
         for place, group in step.received():
@@ -254,7 +252,7 @@ class EnsembleFilter(MembersFilter):
     ) -> Array:
         """One time's ensembles after the update; a plain function gets one agent's at a time."""
         if has_tag(self.update, "repredicts"):
-            return unchecked(self.update)(x, h, y, noise, rng=rng, predict=predict)
+            return self.update(x, h, y, noise, rng=rng, predict=predict)
         stacks = has_tag(self.update, "stacks")
 
         def one(*given: Array) -> Array:
@@ -350,10 +348,10 @@ class TransportFilter(MembersFilter):
         apart = self.n_agents > 1 and callable(self.graph) and step.channel is None
         if apart and any((*step.observations, step.delayed)):
             raise ValueError(
-                f"graph: needs links for the readings of t = {step.t:g}, got none"
+                f"graph must have links for the readings of t = {step.t:g}, got none"
             )
         if step.dt:
-            draw = partial(unchecked(self.model.sample_step), t=state.t, dt=step.dt)
+            draw = partial(self.model.sample_step, t=state.t, dt=step.dt)
             now = self._for_all(draw, (now,), step.rng)
         stack = step.stack(step.check_forecast(now, state.ensembles))
         (logs,) = step.fuse(self._log_likelihoods(stack, step))
@@ -397,12 +395,12 @@ class TransportFilter(MembersFilter):
         def compute(here: Array, *rest: Any) -> tuple[Array, ...]:
             times = rest[:-2]
             w = normalize_weights(here)
-            matrix = unchecked(transport_plans)(times[-1], here)
+            matrix = transport_plans(times[-1], here)
             return tuple(apply_plan(x, w, matrix, correct=self.correct) for x in times)
 
         out, errors = run_isolated(compute, (logs, *stack), tuple(stack), logs.ndim - 1)
         if self.rejuvenation:
-            draw = partial(unchecked(rejuvenate), bandwidth=self.rejuvenation)
+            draw = partial(rejuvenate, bandwidth=self.rejuvenation)
             # Every time's members meet the same draws; the generator advances once.
             sources = [copy_rng(rng) for _ in out[1:]] + [rng]
             both = zip(out, stack, sources, strict=True)
@@ -441,7 +439,7 @@ def regress_past(stack: list[Array], now: Array) -> list[Array]:
     *past, old = stack
     if now is old or not past:
         return past
-    shape, unit = in_units(unchecked(moments.sample_covariance)(old))
+    shape, unit = in_units(moments.sample_covariance(old))
     inverse = np.linalg.pinv(shape, rcond=1e-10, hermitian=True) / (old.shape[-2] - 1)
     around, moved = (
         x / unit[..., None, :] for x in (moments.center_ensemble(old)[1], now - old)
@@ -451,4 +449,4 @@ def regress_past(stack: list[Array], now: Array) -> list[Array]:
 
 def sample_moments(members: Array) -> tuple[Array, Array]:
     """Mean and covariance of predictions (..., N, M); NaN where some member cannot be seen."""
-    return members.mean(axis=-2), unchecked(moments.sample_covariance)(members)
+    return members.mean(axis=-2), moments.sample_covariance(members)

@@ -13,7 +13,7 @@ import numpy as np
 from ..gaussians.single import condition, unscented_points
 from ..linalg import EPS, cholesky, solve_upper, symmetrise
 from ..models import LinearModel
-from ..validation import Array, Bounds, NonNegativeFloat, PositiveInt, unchecked
+from ..validation import Array, Bounds, NonNegativeFloat, PositiveInt
 from .base import Filter
 from .inbox import Received
 from .inputs import prior_moments
@@ -199,16 +199,14 @@ class GaussianFilter(Filter):
             return state.joint_means.copy(), state.joint_covariances.copy()
         d = state.dim
         kept = len(step.times)
-        flow = partial(unchecked(model.step), t=state.t, dt=dt)
-        jacobian = partial(unchecked(model.jacobian), t=state.t, dt=dt)
+        flow = partial(model.step, t=state.t, dt=dt)
+        jacobian = partial(model.jacobian, t=state.t, dt=dt)
         now = (state.means, state.covariances)
         linear = isinstance(model, LinearModel)
         moved, slope, extra = self._linearised(flow, jacobian, *now, linear)
         shift = np.ascontiguousarray(slope)
         old = state.joint_covariances
-        covs = shift @ old[..., :d, :d] @ shift.mT + (
-            unchecked(model.Q)(state.t, dt) + extra
-        )
+        covs = shift @ old[..., :d, :d] @ shift.mT + (model.Q(state.t, dt) + extra)
         if kept:  # the past stays as it is, and only its products with the present move
             moved = np.concatenate([moved, state.joint_means[..., : kept * d]], axis=-1)
             across = shift @ old[..., :d, : kept * d]
@@ -235,7 +233,7 @@ class GaussianFilter(Filter):
             return function(mean[..., None, :])[..., 0, :], jacobian(mean), 0.0
         root = cholesky(cov)
         d = mean.shape[-1]
-        points, w = unchecked(unscented_points)(mean, root, kappa=self.kappa)
+        points, w = unscented_points(mean, root, kappa=self.kappa)
         values = function(points)
         at = w @ values
         gap = values - at[..., None, :]
@@ -273,7 +271,7 @@ class GaussianFilter(Filter):
             slope = np.zeros((*slope.shape[:-1], m.shape[-1]))
             slope[..., here] = part
         (m, p), errors = run_isolated(
-            lambda m, p, gap, h, noise, *_: unchecked(condition)(m, p, gap, h, noise),
+            lambda m, p, gap, h, noise, *_: condition(m, p, gap, h, noise),
             (m, p, group.target - at, slope, noise),
             (m, p),
             group.target.ndim - 1,
@@ -296,7 +294,7 @@ class GaussianFilter(Filter):
         >>> wrong = SimpleNamespace(t=1.0, fuse=lambda m, p: (m, p - 2 * np.eye(4)))
         >>> f._agreed(np.ones((1, 4)), np.eye(4)[None], wrong)
         Traceback (most recent call last):
-        ValueError: fusion: needs a covariance, got a variance of -1
+        ValueError: fusion must be a covariance, got a variance of -1
         """
         d = self.model.dim
         old = means[..., :d]
@@ -305,7 +303,7 @@ class GaussianFilter(Filter):
         variance = np.diagonal(p, axis1=-2, axis2=-1)
         if (variance < -1e-9 * np.abs(variance).max()).any():  # not by rounding
             raise ValueError(
-                f"fusion: needs a covariance, got a variance of {variance.min():g}"
+                f"fusion must be a covariance, got a variance of {variance.min():g}"
             )
         if ((variance > 0) & (variance < (EPS * m) ** 2)).any():
             warnings.warn(

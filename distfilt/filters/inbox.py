@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..sensors import Sensor
-from ..validation import Array, all_finite, unchecked
+from ..validation import Array, all_finite
 
 __all__ = ["Received", "group_agents"]
 
@@ -111,12 +111,12 @@ class Received:
         out = np.empty((*states.shape[:-2], self.target.shape[-1], states.shape[-2]))
         for sensor, rows, cells in self.parts:
             before = None if previous is None else previous[..., rows, :, :]
-            seen = unchecked(sensor.predict)(states[..., rows, :, :], before)
+            seen = sensor.predict(states[..., rows, :, :], before)
             out[(..., *cells, slice(None))] = seen.swapaxes(-1, -2)
         out = np.ascontiguousarray(out.swapaxes(-1, -2))
         if not all_finite(out) and np.isinf(out).any():
             raise ValueError(
-                "predicted: needs finite numbers or NaN (missing), got infinity"
+                "predicted must have finite numbers or NaN (missing), got infinity"
             )
         out = self.wrap_near(out, self.target[..., None, :])
         return self.wrap_near(out, out[..., :1, :]) if alike else out
@@ -130,7 +130,7 @@ class Received:
                 goal = (aim + 0 * seen).swapaxes(-1, -2)
                 here, there = (x[at].swapaxes(-1, -2) for x in (out, goal))
                 # y* - wrap(y* - h)
-                gap = unchecked(sensor.residual)(there, here)
+                gap = sensor.residual(there, here)
                 out[at] = np.where(np.isnan(gap), here, there - gap).swapaxes(-1, -2)
         return seen
 
@@ -141,9 +141,7 @@ class Received:
             return np.full((*self.target.shape, d), self.H(d))
         out = np.empty((*self.target.shape, d))
         for sensor, rows, cells in self.parts:
-            out[(..., *cells, slice(None))] = unchecked(sensor.jacobian)(
-                states[..., rows, :]
-            )
+            out[(..., *cells, slice(None))] = sensor.jacobian(states[..., rows, :])
         return out
 
     def gate(self, mean: Array, cov: Array, share: float) -> tuple[Received, Array]:

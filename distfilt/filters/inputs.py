@@ -22,7 +22,6 @@ from ..validation import (
     check_array,
     check_increasing,
     check_positive_definite,
-    unchecked,
 )
 from ..validation.checks import all_finite
 
@@ -82,7 +81,7 @@ def sensor_of(f: Any, reading: Observation) -> Sensor:
     own: tuple[Sensor, ...] = f.agent_sensors[reading.agent]
     if reading.sensor >= len(own):
         raise ValueError(
-            f"observations: needs one of the {len(own)} sensors of agent "
+            f"observations must be one of the {len(own)} sensors of agent "
             f"{reading.agent}, got {reading.sensor}"
         )
     return own[reading.sensor]
@@ -125,7 +124,7 @@ def one_each(observations: Any, agents: int) -> Any:
 
     >>> one_each([1.0, 2.0], 3)
     Traceback (most recent call last):
-    ValueError: observations: needs a list, one for each of 3 agents, got 2
+    ValueError: observations must be a list, one for each of 3 agents, got 2
     """
     observations = (
         observations.to_numpy() if hasattr(observations, "to_numpy") else observations
@@ -134,7 +133,7 @@ def one_each(observations: Any, agents: int) -> Any:
     if not listed or len(observations) != agents:
         got = len(observations) if listed else type(observations).__name__
         raise ValueError(
-            f"observations: needs a list, one for each of {agents} agents, got {got}"
+            f"observations must be a list, one for each of {agents} agents, got {got}"
         )
     return observations
 
@@ -145,11 +144,11 @@ def _read(f: Any, given: Any, agent: int, t: float, name: str) -> Observation:
         if (given.agent, given.t) != (agent, t):
             got = f"one of agent {given.agent} at t = {given.t:g}"
             raise ValueError(
-                f"{name}: needs a Reading of agent {agent} at t = {t:g}, got {got}"
+                f"{name} must be a Reading of agent {agent} at t = {t:g}, got {got}"
             )
         if given.arrival_time is not None and given.arrival_time > t:
             raise ValueError(
-                f"{name}: needs what has arrived, got a Reading of {given.arrival_time:g}"
+                f"{name} must be what has arrived, got a Reading of {given.arrival_time:g}"
             )
         return given
     own = f.agent_sensors[agent]
@@ -157,7 +156,7 @@ def _read(f: Any, given: Any, agent: int, t: float, name: str) -> Observation:
         needs = (
             "a Reading of each sensor" if own else "None for an agent without a sensor"
         )
-        raise ValueError(f"{name}: needs {needs}, got an array")
+        raise ValueError(f"{name} must be {needs}, got an array")
     return Observation.construct(
         t, agent, check_array(given, name, (..., own[0].dim), finite=False)
     )
@@ -170,13 +169,13 @@ def _complete(
     value = said.value
     dim = sensor_of(f, said).dim
     if np.isinf(value).any():
-        raise ValueError(f"{name}: needs numbers or NaN, got infinity")
+        raise ValueError(f"{name} must be numbers or NaN, got infinity")
     if np.isnan(value).all():
         return None
     if value.shape == (*runs, dim):
         return said
     if value.shape != (dim,):
-        raise ValueError(f"{name}: needs shape {(*runs, dim)}, got {value.shape}")
+        raise ValueError(f"{name} must have shape {(*runs, dim)}, got {value.shape}")
     return said.replace(value=np.broadcast_to(value, (*runs, dim)))
 
 
@@ -195,11 +194,11 @@ def match_delayed(
         if abs(near - item.t) > min(1e-9 * max(1.0, abs(item.t)), 1e-3 * shortest):
             known = ", ".join(f"{t:g}" for t in times) or "none (lag = 0)"
             raise ValueError(
-                f"delayed: needs an earlier time that is kept ({known}), got {item.t:g}"
+                f"delayed must be an earlier time that is kept ({known}), got {item.t:g}"
             )
         if item.agent >= f.n_agents:
             raise ValueError(
-                f"delayed: needs an agent below {f.n_agents}, got {item.agent}"
+                f"delayed must be an agent below {f.n_agents}, got {item.agent}"
             )
         if (sensor := sensor_of(f, item)).uses_previous:
             raise ValueError(
@@ -241,7 +240,7 @@ def plan_steps(
         for event in observations:
             if event.agent >= f.n_agents:
                 raise ValueError(
-                    f"observations: needs agents below {f.n_agents}, got {event.agent}"
+                    f"observations must have agents below {f.n_agents}, got {event.agent}"
                 )
             at.setdefault(event.t, [[] for _ in range(f.n_agents)])[event.agent].append(
                 event
@@ -250,7 +249,7 @@ def plan_steps(
         entries = iter([at[t] for t in grid])
     elif times is None:
         raise ValueError(
-            "times: needs them, unless all observations are Readings, got None"
+            "times must be them, unless all observations are Readings, got None"
         )
     else:
         # A table whose columns have names would give a column where a row is asked for.
@@ -270,7 +269,7 @@ def plan_steps(
         )
     if grid.size and grid[0] < state.t:
         raise ValueError(
-            f"times: needs times from the state's {state.t:g} on, got {grid[0]:g}"
+            f"times must be times from the state's {state.t:g} on, got {grid[0]:g}"
         )
     return grid, entries
 
@@ -282,9 +281,7 @@ def _warn_of_degrees(own: Sequence[Sensor], series: Array, agent: int) -> None:
         return
     y = np.nan_to_num(series.astype(np.float64))
     if (most := np.abs(y - wraps(y, 0 * y)).max(initial=0.0) / (2 * np.pi)) > 4:
-        text = (
-            f"observations[{agent}]: needs angles in rad, got some {most:.0f} turns off"
-        )
+        text = f"observations[{agent}] must be angles in rad, got some {most:.0f} turns off"
         warnings.warn(text, RuntimeWarning, stacklevel=4)
 
 
@@ -300,7 +297,7 @@ def _is_pair(prior: Any) -> bool:
     if type(prior) is list and any(
         type(p) is tuple and np.ndim(p[-1]) > 1 for p in prior
     ):
-        raise ValueError("prior: needs one for all agents, got a list of (mean, cov)")
+        raise ValueError("prior must be one for all agents, got a list of (mean, cov)")
     pair = isinstance(prior, tuple | list) and len(prior) == 2
     return pair and (isinstance(prior, tuple) or np.ndim(prior[0]) < np.ndim(prior[1]))
 
@@ -324,13 +321,13 @@ def prior_moments(
     elif callable(prior) or np.ndim(prior) != 2:
         got = "a function" if callable(prior) else type(prior).__name__
         raise ValueError(
-            f"prior: needs (mean, cov) or what has a mean and a covariance, got {got}"
+            f"prior must be (mean, cov), or have a mean and a covariance, got {got}"
         )
     else:
         members = check_array(prior, "prior", ("N", dim))
         if len(members) <= dim:
             raise ValueError(
-                f"prior: needs more than {dim} members, got {len(members)}"
+                f"prior must have more than {dim} members, got {len(members)}"
             )
         mean = members.mean(axis=0)
         cov = sample_covariance(members)
@@ -338,7 +335,7 @@ def prior_moments(
     cov = check_array(cov, "prior")
     if cov.shape != (dim, dim) and not dim == cov.size == 1:
         raise ValueError(
-            f"prior: needs a covariance of shape {(dim, dim)}, got {cov.shape}"
+            f"prior must be a covariance of shape {(dim, dim)}, got {cov.shape}"
         )
     check_positive_definite(cov := cov.reshape(dim, dim), "prior", word)
     return mean, cov
@@ -359,7 +356,7 @@ def draw_members(
     shape = (*leading, members, dim)
     if _is_pair(prior):
         mean, cov = prior_moments(prior, dim)
-        return unchecked(draw)(mean, cov, members, rng=rng, leading=leading)
+        return draw(mean, cov, members, rng=rng, leading=leading)
     if hasattr(prior, "rvs"):
         word = "rng" if isinstance(prior, GaussianMixture) else "random_state"
         found = prior.rvs(math.prod(shape[:-1]), **{word: rng})
@@ -367,7 +364,9 @@ def draw_members(
     found = prior(members, rng=rng, leading=leading) if callable(prior) else prior
     out = check_array(found, "prior", (..., members, dim))
     if out.shape != shape and out.shape != shape[-2:]:
-        raise ValueError(f"prior: needs shape {shape} or {shape[-2:]}, got {out.shape}")
+        raise ValueError(
+            f"prior must have shape {shape} or {shape[-2:]}, got {out.shape}"
+        )
     return np.broadcast_to(out, shape).copy()
 
 
@@ -380,7 +379,7 @@ def prior_mixtures(prior: Any, dim: int, count: int) -> tuple[GaussianMixture, .
     given = prior if isinstance(prior, list) else [prior] * count
     if len(given) != count:
         raise ValueError(
-            f"prior: needs one for all or for each of {count}, got {len(given)}"
+            f"prior must be one for all or for each of {count}, got {len(given)}"
         )
     out = []
     for one in given:
@@ -391,5 +390,5 @@ def prior_mixtures(prior: Any, dim: int, count: int) -> tuple[GaussianMixture, .
             else GaussianMixture.gaussian(*prior_moments(one, dim, "definite"))
         )
         if out[-1].dim != dim:
-            raise ValueError(f"prior: needs dimension {dim}, got {out[-1].dim}")
+            raise ValueError(f"prior must have dimension {dim}, got {out[-1].dim}")
     return tuple(out)

@@ -11,7 +11,7 @@ import numpy as np
 from ..mixtures import GaussianMixture, runnalls
 from ..mixtures.conditioning import propagate_mixture, update_mixture, within_gate
 from ..mixtures.splitting import split_nonlinear
-from ..validation import Array, Bounds, PositiveInt, unchecked
+from ..validation import Array, Bounds, PositiveInt
 from .base import Filter
 from .inputs import Observation, prior_mixtures, sensor_of
 from .record import Summary
@@ -153,9 +153,7 @@ class MixtureFilter(Filter):
         exact = max(_EXACT, self.n_components)
         agents = len(after)
         plain = [
-            None
-            if b is None
-            else unchecked(runnalls)(b, size, heaviest=exact).replace()
+            None if b is None else runnalls(b, size, heaviest=exact).replace()
             for b in (*after, *untold)
         ]
         return step.end(mixtures=tuple(plain[:agents]), unsent=tuple(plain[agents:]))
@@ -188,18 +186,18 @@ class MixtureFilter(Filter):
         model = self.model
         if dt == 0:
             return belief
-        flow = unchecked(model.step)
-        derivative = unchecked(model.jacobian)
+        flow = model.step
+        derivative = model.jacobian
         with step.failing_as(agent):
             if self.split_threshold is not None:
-                belief = unchecked(split_nonlinear)(
+                belief = split_nonlinear(
                     belief,
                     lambda x: derivative(x, t, dt),
                     max_components=self.max_components,
                     split_threshold=self.split_threshold,
                     scale=self.split_scale,
                 )
-            root = unchecked(model.noise_sqrt)(t, dt)
+            root = model.noise_sqrt(t, dt)
             return propagate_mixture(belief, lambda x: flow(x, t, dt), root)
 
     def _read(
@@ -231,8 +229,8 @@ class MixtureFilter(Filter):
         for reading in said:
             sensor = sensor_of(self, reading)
             y = reading.value
-            about: Any = unchecked(sensor.predict), sensor.noise_cov
-            residual = unchecked(sensor.residual)
+            about: Any = sensor.predict, sensor.noise_cov
+            residual = sensor.residual
             with step.failing_as(agent):
                 if self.gate_probability is not None:
                     width = float(
@@ -294,7 +292,7 @@ class MixtureFilter(Filter):
                     if isinstance(fused, GaussianMixture)
                     else type(fused).__name__
                 )
-                raise ValueError(f"fusion: needs dimension {belief.dim}, got {got}")
+                raise ValueError(f"fusion must have dimension {belief.dim}, got {got}")
             with step.failing_as(k):
                 fused.factors  # noqa: B018  # a LinAlgError where the fusion has collapsed
         return out

@@ -52,7 +52,7 @@ def information_increment(before: GaussianMixture, after: GaussianMixture) -> Ar
     one = before.moment_match()
     two = after.moment_match()
     if one.dim != two.dim:
-        raise ValueError(f"after: needs dimension {one.dim}, got {two.dim}")
+        raise ValueError(f"after must have dimension {one.dim}, got {two.dim}")
     # In the frame in which the old covariance is the identity.
     narrower = np.linalg.solve(two.factors[0], one.factors[0])
     _, size, axes = np.linalg.svd(narrower)
@@ -133,7 +133,7 @@ class InformationIncrementFilter(MixtureFilter):
         """Refuse what there is no news of."""
         super().check_parts()
         if self.graph is None:
-            raise ValueError("graph: needs a Graph, got None")
+            raise ValueError("graph must be a Graph, got None")
         least = min((s.dim for own in self.agent_sensors for s in own), default=0)
         Bounds(below=least)(
             max(self.shared_components, default=-1), "shared_components"
@@ -229,7 +229,7 @@ class InformationIncrementFilter(MixtureFilter):
             everybody = np.isin(np.arange(reading.value.size), self.shared_components)
             if sensor_of(self, reading).noise_cov[np.ix_(everybody, ~everybody)].any():
                 raise ValueError(
-                    "common: needs noise of its own, got some that others share"
+                    "common must be noise of its own, got some that others share"
                 )
             for part, gone in ((own, everybody), (alike, ~everybody)):
                 left = np.where(gone, np.nan, reading.value)

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..updates import particles
-from ..validation import Array, Mask, UnitInterval, unchecked
+from ..validation import Array, Mask, UnitInterval
 from .ensemble import MembersFilter, Several, regress_past
 from .inbox import Received
 from .record import Summary
@@ -133,9 +133,7 @@ class ParticleFilter(MembersFilter):
             -1
         ]  # where each particle comes from, which is not where it was in the state
         if step.dt:
-            moved = unchecked(self.model.sample_step)(
-                stack[-1], state.t, step.dt, rng=step.rng
-            )
+            moved = self.model.sample_step(stack[-1], state.t, step.dt, rng=step.rng)
             stack[-1] = step.check_forecast(moved, stack[-1])
         for place, group in step.received():
             rows = group.rows

@@ -13,7 +13,7 @@ import numpy as np
 from ..ensembles import sample_covariance
 from ..linalg import cholesky, in_units, quadratic_form
 from ..metrics import crps, gaussian_crps
-from ..validation import Array, check_array, unchecked
+from ..validation import Array, check_array
 from .saving import State, stack_states
 
 if TYPE_CHECKING:
@@ -204,13 +204,13 @@ def _known(
         if x.shape != (*shape, agents, len(names)):
             needs = f"shape {(*shape, len(names))}, one for each of {agents} agents, or a dict of "
             raise ValueError(
-                f"truth: needs {needs}those components that are known, got {x.shape}"
+                f"truth must be {needs}those components that are known, got {x.shape}"
             )
         return x, slice(None)
     unknown = [name for name in truth if name not in names]
     if unknown or not truth:
         raise ValueError(
-            f"truth: needs components of {', '.join(names)}, got {unknown}"
+            f"truth must have components of {', '.join(names)}, got {unknown}"
         )
     whole = np.full((*shape, agents, len(names)), np.nan)
     for name, given in truth.items():
@@ -240,9 +240,9 @@ def _scored(
         out["total_squared_error"] = squared[..., at].sum(axis=-1)
     if "crps" in scores:
         if some is None:
-            found = unchecked(gaussian_crps)(mean, np.sqrt(summary.variance), known)
+            found = gaussian_crps(mean, np.sqrt(summary.variance), known)
         else:
-            found = unchecked(crps)(some, known, weights=summary.weights)
+            found = crps(some, known, weights=summary.weights)
         out["crps"] = np.where(good[..., None] & ~np.isnan(known), found, np.nan)
     mean = mean[..., at]
     known = known[..., at]
@@ -255,7 +255,7 @@ def _scored(
         and some is not None
         and some.shape[-2] > mean.shape[-1]
     ):
-        cov = unchecked(sample_covariance)(some[..., at])
+        cov = sample_covariance(some[..., at])
     if "nees" in scores and cov is not None:
         out["nees"] = np.full(good.shape, np.nan)
         out["nees"][good] = _nees(mean[good], cov[good], known[good])
@@ -282,10 +282,10 @@ def final_state(run: xarray.Dataset) -> State:
     2.0
     >>> final_state(run.isel(time=[0]))
     Traceback (most recent call last):
-    ValueError: run: needs the Dataset that a filter's run returned, got one without a state
+    ValueError: run must be the Dataset that a filter's run returned, got one without a state
     >>> final_state(xarray.Dataset())
     Traceback (most recent call last):
-    ValueError: run: needs the Dataset that a filter's run returned, got one without a state
+    ValueError: run must be the Dataset that a filter's run returned, got one without a state
     """
     state, agents, last = getattr(run, "encoding", {}).get(
         "final_state", (None, (), None)
@@ -295,7 +295,7 @@ def final_state(run: xarray.Dataset) -> State:
         if ends and np.array_equal(run["mean"].values[-1], last, equal_nan=True):
             return state  # type: ignore[no-any-return]
     raise ValueError(
-        "run: needs the Dataset that a filter's run returned, got one without a state"
+        "run must be the Dataset that a filter's run returned, got one without a state"
     )
 
 

@@ -139,7 +139,7 @@ class State(FrozenModel):
             Exception
         ) as error:  # zip, JSON and numpy each have their own for what is damaged
             raise ValueError(
-                f"path: needs a saved {cls.__name__}, got {path}: {error}"
+                f"path must be a saved {cls.__name__}, got {path}: {error}"
             ) from None
 
 
@@ -263,7 +263,7 @@ def _encoded(value: Any, arrays: list[Any]) -> Any:
         return value
     if isinstance(value, np.ndarray | np.generic):
         if np.asarray(value).dtype.hasobject:
-            raise ValueError("state: needs numeric arrays to be saved, got objects")
+            raise ValueError("state must be numeric arrays to be saved, got objects")
         arrays.append(np.asarray(value))
         return {"array": len(arrays) - 1}
     if isinstance(value, tuple | list):
@@ -280,7 +280,7 @@ def _encoded(value: Any, arrays: list[Any]) -> Any:
         own = {f.name: getattr(value, f.name) for f in fields(value)}
         return {**_encoded(own, arrays), "of": _name(type(value))}
     raise ValueError(
-        f"state: needs fields that can be saved, got {type(value).__name__}"
+        f"state must have fields that can be saved, got {type(value).__name__}"
     )
 
 

@@ -265,7 +265,7 @@ class Step:
         for said in self.state.pending:
             if said.t not in self.times:
                 raise ValueError(
-                    f"lag: needs to reach back to t = {said.t:g}, from when a reading waited for "
+                    f"lag must reach back to t = {said.t:g}, from when a reading waited for "
                     f"this contact at t = {self.t:g}, got {f.lag}"
                 )
             out[said.agent].append(said)
@@ -358,7 +358,7 @@ class Step:
             out = (out,) if len(belief) == 1 else tuple(out)
             if len(out) != len(belief):
                 raise ValueError(
-                    f"fusion: needs to return {len(belief)} arrays, got {len(out)}"
+                    f"fusion must return {len(belief)} arrays, got {len(out)}"
                 )
             self.channel = channel
             alone.append(channel.ledger.lost)

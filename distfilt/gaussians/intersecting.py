@@ -120,7 +120,7 @@ def _counted(value: Array, here: Mask, axes: int, name: str) -> Array:
         )
     if not np.isfinite(value).all():
         raise ValueError(
-            f"{name}: needs finite numbers where a source counts, got NaN or infinity"
+            f"{name} must have finite numbers where a source counts, got NaN or infinity"
         )
     return value
 
@@ -192,7 +192,7 @@ def intersection_weights(
     """
     there = np.ones(covs.shape[-3], dtype=bool) if here is None else here
     if not there.any(axis=-1).all():
-        raise ValueError("here: needs at least one source that arrived, got none")
+        raise ValueError("here must have at least one source that arrived, got none")
     lead = leading(there.shape[:-1], covs.shape[:-3], "covs")
     here = np.broadcast_to(there, (*lead, *covs.shape[-3:-2]))
     covs = np.broadcast_to(covs, (*lead, *covs.shape[-3:]))

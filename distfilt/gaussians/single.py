@@ -93,7 +93,7 @@ def match_moments(
     n, d = ensemble.shape[-2:]
     if n <= d:
         raise ValueError(
-            f"ensemble: needs more than {d} members for {d} components, got {n}"
+            f"ensemble must have more than {d} members for {d} components, got {n}"
         )
     lead = leading(ensemble.shape[:-2], mean.shape[:-1], "mean")
     leading(lead, cov.shape[:-2], "cov")
@@ -108,7 +108,7 @@ def match_moments(
     # What a component has that those before it have not, against the rounding of the members.
     if (own <= 32 * d * EPS * (length + np.abs(centre))).any():
         raise ValueError(
-            "ensemble: needs components that are not constant and not combinations "
+            "ensemble must have components that are not constant and not combinations "
             "of others, got a singular sample covariance"
         )
     target = cholesky(cov / (unit[..., :, None] * unit[..., None, :])).mT
@@ -228,7 +228,7 @@ def unscented_points(
     """
     d = mean.shape[-1]
     if d + kappa <= 0:
-        raise ValueError(f"kappa: needs a number above {-d}, got {kappa:g}")
+        raise ValueError(f"kappa must be above {-d}, got {kappa:g}")
     moves = math.sqrt(d + kappa) * root.mT
     moves = np.concatenate([0 * moves[..., :1, :], moves, -moves], axis=-2)
     weights = np.empty(2 * d + 1)

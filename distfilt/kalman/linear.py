@@ -142,7 +142,7 @@ def kalman_filter(
         covs[k] = p
     if not np.isfinite(means).all():
         raise np.linalg.LinAlgError(
-            "kalman_filter: needs matrices without overflow, got infinity"
+            "kalman_filter must have matrices without overflow, got infinity"
         )
     return unflatten_runs(means.mT, covs, density, runs)
 
@@ -264,7 +264,7 @@ def per_step(steps: int, **matrices: Array) -> list[Array]:
     for name, a in matrices.items():
         if a.shape[:-2] not in ((), (steps,)):
             needs = f"shape {a.shape[-2:]} or {(steps, *a.shape[-2:])}"
-            raise ValueError(f"{name}: needs {needs}, got {a.shape}")
+            raise ValueError(f"{name} must be {needs}, got {a.shape}")
     return [np.broadcast_to(a, (steps, *a.shape[-2:])) for a in matrices.values()]
 
 
@@ -273,7 +273,7 @@ def grid(times: Array, observations: Array, sensor: Sensor) -> Array:
     wanted = len(times), sensor.dim
     if (len(observations), observations.shape[-1]) != wanted:
         needs = f"shape ({wanted[0]}, ..., {wanted[1]})"
-        raise ValueError(f"observations: needs {needs}, got {observations.shape}")
+        raise ValueError(f"observations must be {needs}, got {observations.shape}")
     if times.min(initial=np.inf) <= 0:
-        raise ValueError(f"times: needs times after 0, got {times[0]:g}")
+        raise ValueError(f"times must be times after 0, got {times[0]:g}")
     return np.concatenate([[0.0], times])

@@ -23,7 +23,6 @@ from ..validation import (
     PositiveDefinite,
     PositiveInt,
     Times,
-    unchecked,
     validated,
 )
 from .linear import FilterResult, Series, assimilate, flatten_runs, grid, unflatten_runs
@@ -66,7 +65,7 @@ class QuaternionChart(FrozenModel):
         super().__post_init__()
         if self.first + 4 > self.dim:
             needs = f"four components from there on, got {self.first} of {self.dim}"
-            raise ValueError(f"first: needs {needs}")
+            raise ValueError(f"first must be {needs}")
 
     @property
     def error_dim(self) -> int:
@@ -76,7 +75,7 @@ class QuaternionChart(FrozenModel):
     def retract(self, x: Array, e: Array) -> Array:
         """Move states (..., d) by errors (..., k)."""
         at = self.first
-        turn = unchecked(rotate)(x[..., at : at + 4], e[..., at : at + 3])
+        turn = rotate(x[..., at : at + 4], e[..., at : at + 3])
         before = x[..., :at] + e[..., :at]
         behind = x[..., at + 4 :] + e[..., at + 3 :]
         return np.concatenate([before, turn, behind], axis=-1)
@@ -85,9 +84,7 @@ class QuaternionChart(FrozenModel):
         """The error that takes x to `other`, the inverse of `retract`."""
         at = self.first
         gap = other - x
-        turn = unchecked(rotation_vector_between)(
-            x[..., at : at + 4], other[..., at : at + 4]
-        )
+        turn = rotation_vector_between(x[..., at : at + 4], other[..., at : at + 4])
         return np.concatenate([gap[..., :at], turn, gap[..., at + 4 :]], axis=-1)
 
     def tangent_basis(self, x: Array) -> Array:
@@ -95,9 +92,7 @@ class QuaternionChart(FrozenModel):
         at = self.first
         out = np.zeros((*x.shape, self.error_dim))
         out[..., :at, :at] = np.eye(at)
-        out[..., at : at + 4, at : at + 3] = unchecked(left_directions)(
-            x[..., at : at + 4]
-        )
+        out[..., at : at + 4, at : at + 3] = left_directions(x[..., at : at + 4])
         out[..., at + 4 :, at + 3 :] = np.eye(self.dim - at - 4)
         return out
 
@@ -186,7 +181,7 @@ def mekf(
     sensor = stack(sensors)
     if chart.dim != model.dim:
         raise ValueError(
-            f"chart: needs {model.dim} components like the model, got {chart.dim}"
+            f"chart must be {model.dim} components like the model, got {chart.dim}"
         )
     clock = grid(times, observations, sensor)
     runs, y, x, p = flatten_runs(mean, cov, observations)
@@ -216,16 +211,16 @@ def _step(
     dt: float,
 ) -> tuple[Array, Array, Array]:
     """Means (R, d), covariances (R, k, k) and log densities (R,) one reading later."""
-    moved = _finite(unchecked(model.step)(x, t, dt))
+    moved = _finite(model.step(x, t, dt))
     inwards = chart.tangent_projection(moved)
-    slope = inwards @ unchecked(model.jacobian)(x, t, dt) @ chart.tangent_basis(x)
+    slope = inwards @ model.jacobian(x, t, dt) @ chart.tangent_basis(x)
     joint = slope @ p @ slope.mT + inwards @ model.Q(t, dt) @ inwards.mT
     previous = None
     if sensor.uses_previous:
         across = slope @ p
         previous = x
         joint = np.block([[joint, across], [across.mT, p]])
-    gap = unchecked(sensor.residual)(y, unchecked(sensor.predict)(moved, previous))
+    gap = sensor.residual(y, sensor.predict(moved, previous))
     missing = np.isnan(gap)
     h = _errors_seen(moved, previous, sensor, chart)
     h = np.where(missing[..., None], 0.0, h)
@@ -252,12 +247,12 @@ def _errors_seen(
     x: Array, previous: Array | None, sensor: Sensor, chart: QuaternionChart
 ) -> Array:
     """How a sensor sees the errors (R, m, k), of the previous state too if it uses it."""
-    slope = unchecked(sensor.jacobian)(x, previous) @ chart.tangent_basis(x)
+    slope = sensor.jacobian(x, previous) @ chart.tangent_basis(x)
     if previous is None:
         return np.asarray(slope)
 
     def of_previous(v: Array) -> Array:
-        return unchecked(sensor.predict)(np.broadcast_to(x[:, None], v.shape), v)
+        return sensor.predict(np.broadcast_to(x[:, None], v.shape), v)
 
-    back = central(of_previous, previous, difference=unchecked(sensor.residual))
+    back = central(of_previous, previous, difference=sensor.residual)
     return np.concatenate([slope, back @ chart.tangent_basis(previous)], axis=-1)

@@ -222,7 +222,7 @@ def _present(
     sensor = stack(sensors)
     if sensor.uses_previous:
         raise ValueError(
-            "sensors: needs sensors of the present state, got a differential sensor"
+            "sensors must be sensors of the present state, got a differential sensor"
         )
     return sensor, grid(times, observations, sensor)
 

@@ -66,7 +66,7 @@ def mean_interval(values: Values, *, level: Level = 0.95) -> Interval:
     from scipy.special import stdtrit
 
     if values.size < 2:
-        raise ValueError(f"values: needs at least 2 values, got {values.size}")
+        raise ValueError(f"values must have at least 2 values, got {values.size}")
     middle = float(values.mean())
     error = float(values.std(ddof=1)) / float(np.sqrt(values.size))
     half = float(stdtrit(values.size - 1, 0.5 + level / 2)) * error
@@ -102,7 +102,7 @@ def median_interval(values: Values, *, level: Level = 0.95) -> Interval:
     missed = 2 * betainc(n - ranks + 1, ranks, 0.5)
     k = int((missed <= 1 - level).sum())
     if k == 0:
-        raise ValueError(f"values: needs more values for level {level:g}, got {n}")
+        raise ValueError(f"values must have more values for level {level:g}, got {n}")
     low = float(v[k - 1])
     high = float(v[n - k])
     error = (high - low) / (2 * float(ndtri(0.5 + level / 2)))
@@ -144,7 +144,9 @@ def proportion_interval(
     n = trials
     tail = (1 - level) / 2
     if k > n:
-        raise ValueError(f"successes: needs at most as many as trials ({n}), got {k}")
+        raise ValueError(
+            f"successes must have at most as many as trials ({n}), got {k}"
+        )
     low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
     high = 1.0 if k == n else float(betaincinv(k + 1, n - k, 1 - tail))
     share = k / n

@@ -21,7 +21,6 @@ from ..validation import (
     PositiveDefinite,
     PositiveInt,
     Probabilities,
-    unchecked,
     validated,
 )
 from .intervals import Interval, Level
@@ -85,7 +84,7 @@ def nees(estimate: Vector, cov: PositiveDefinite, truth: Vector) -> Array:
     10.0
     """
     leading(estimate.shape[:-1], truth.shape[:-1], "truth")
-    return unchecked(nis)(estimate - truth, cov)
+    return nis(estimate - truth, cov)
 
 
 @validated
@@ -195,7 +194,7 @@ def crps(
     array([0.5])
     >>> crps(np.zeros((2, 4, 1)), [1.0], weights=np.full((3, 4), 0.25))
     Traceback (most recent call last):
-    ValueError: weights: needs leading axes that broadcast with (2,), got (3,)
+    ValueError: weights must have leading axes that broadcast with (2,), got (3,)
     """
     n = ensemble.shape[-2]
     leading(ensemble.shape[:-2], truth.shape[:-1], "truth")
@@ -269,4 +268,4 @@ def log_score(estimate: Vector, cov: PositiveDefinite, truth: Vector) -> Array:
     >>> float(log_score([0.0], [[1.0]], [1.0]).round(6))
     1.418939
     """
-    return -unchecked(log_density)(truth, estimate, cov)
+    return -log_density(truth, estimate, cov)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..linalg import log_sum
 from ..network import Channel, fusion_rule
-from ..validation import PositiveInt, UnitInterval, unchecked, validated
+from ..validation import PositiveInt, UnitInterval, validated
 from .fusion import Exponents, Others, PartialFusion, Rule, Terms
 from .gaussian import GaussianMixture, assemble_joint, regression
 from .reduction import runnalls
@@ -55,10 +55,8 @@ def fuse_mixtures(
     exact = PartialFusion(own, received, omega=omega)
     fused = own
     if exact.exponents[0] != 1:
-        fused = unchecked(exact.assign_weights)(
-            unchecked(exact.component_shapes)(terms=terms), rule=rule
-        )
-    return fused if n_components is None else unchecked(runnalls)(fused, n_components)
+        fused = exact.assign_weights(exact.component_shapes(terms=terms), rule=rule)
+    return fused if n_components is None else runnalls(fused, n_components)
 
 
 @validated
@@ -87,7 +85,7 @@ def fuse_moments(
     alone = PartialFusion(
         own.moment_match(), [m.moment_match() for m in others], omega=omega
     )
-    return unchecked(alone.component_shapes)().with_equal_weights()
+    return alone.component_shapes().with_equal_weights()
 
 
 @validated
@@ -151,9 +149,7 @@ def average_mixtures(
     """
     target = PartialFusion(own, received).target
     n = received.dim
-    logs = target.log_weights + unchecked(target.component_log_densities)(
-        received.means
-    )
+    logs = target.log_weights + target.component_log_densities(received.means)
     share = np.exp(logs - log_sum(logs))
     gain, rest = regression(own, n)
     gap = received.means[:, None] - own.means[:, :n]
@@ -215,7 +211,7 @@ def target_fusion(
     [[[1.5]], [[1.5]]]
     """
     said = [belief.marginal(range(target_dim)).pack() for belief in beliefs]
-    unpack = unchecked(GaussianMixture.unpack)
+    unpack = GaussianMixture.unpack
     out = list(beliefs)
     for agent, told in enumerate(channel.broadcast(said)):
         try:

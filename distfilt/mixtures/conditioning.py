@@ -13,7 +13,7 @@ import numpy as np
 
 from ..gaussians.single import unscented_points
 from ..linalg import cholesky, log_det, lower_root, quadratic_form
-from ..validation import Array, unchecked
+from ..validation import Array
 from .gaussian import GaussianMixture
 
 __all__ = ["propagate_mixture", "update_mixture", "within_gate"]
@@ -48,7 +48,7 @@ def propagate_mixture(
     means, first, second = _differences(np.asarray(function(_points(mixture))))
     if not all(np.isfinite(part).all() for part in (means, first, second)):
         raise ValueError(
-            "function: needs finite values at the points, got NaN or an overflow"
+            "function must be finite values at the points, got NaN or an overflow"
         )
     return _of_roots(mixture.weights, means, _root(first, second, noise_factor))
 
@@ -105,7 +105,7 @@ def update_mixture(
     logs = np.where(np.isfinite(logs), mixture.log_weights + logs, -np.inf)
     if not np.isfinite(logs.max()):
         raise ValueError(
-            "observed: needs a target that can be seen, got one that cannot"
+            "observed must be a target that can be seen, got one that cannot"
         )
     w = np.exp(logs - logs.max())
     w /= w.sum()
@@ -171,7 +171,7 @@ def _innovations(
 
 def _points(mixture: GaussianMixture) -> Array:
     kappa = _STEP - mixture.dim
-    return unchecked(unscented_points)(mixture.means, mixture.factors, kappa=kappa)[0]
+    return unscented_points(mixture.means, mixture.factors, kappa=kappa)[0]
 
 
 def _differences(values: Array) -> tuple[Array, Array, Array]:

@@ -14,7 +14,6 @@ from ..validation import (
     FrozenModel,
     Rng,
     check_array,
-    unchecked,
     validated,
 )
 from .gaussian import GaussianMixture
@@ -85,7 +84,7 @@ def jeffreys_of_many(
     [0.0, 0.5]
     """
     if (upper <= lower).any():
-        raise ValueError("upper: needs numbers above lower, got an empty box")
+        raise ValueError("upper must be numbers above lower, got an empty box")
     functions = (log_p, *log_qs)
     front, front_parts = _tensor_grid(lower[:1], upper[:1], nodes)
     points, parts = _tensor_grid(lower[1:], upper[1:], nodes)
@@ -155,7 +154,7 @@ def jeffreys_by_sampling(
     True
     """
     x = proposal.rvs(members, rng=rng)
-    base = unchecked(proposal.log_density)(x)
+    base = proposal.log_density(x)
     logs = [
         check_array(f(x), name, base.shape)
         for f, name in ((log_p, "log_p"), (log_q, "log_q"))

@@ -30,7 +30,6 @@ from ..validation import (
     PositiveInt,
     UnitInterval,
     check_probabilities,
-    unchecked,
     validated,
 )
 from .gaussian import GaussianMixture, assemble_joint, inverse, regression
@@ -82,12 +81,12 @@ class PartialFusion(FrozenModel):
         sizes = {other.dim for other in self.others}
         if len(sizes) != 1 or max(sizes) > self.own.dim:
             raise ValueError(
-                f"heard: needs target beliefs, one or more, of one size, at most own's "
+                f"heard must have target beliefs, one or more, of one size, at most own's "
                 f"{self.own.dim}, got {sorted(sizes)}"
             )
         if np.ndim(self.omega) and len(self.exponents) != len(self.others) + 1:
             raise ValueError(
-                f"omega: needs {len(self.others) + 1} exponents, got {len(self.exponents)}"
+                f"omega must be {len(self.others) + 1} exponents, got {len(self.exponents)}"
             )
 
     @property
@@ -117,20 +116,20 @@ class PartialFusion(FrozenModel):
     @cached_property
     def target(self) -> GaussianMixture:
         """The own belief about the target."""
-        return unchecked(self.own.marginal)(range(self.target_dim))
+        return self.own.marginal(range(self.target_dim))
 
     def _with_update(self, logs: Array, t: Array, name: str) -> Array:
         """Logarithms of densities and that of the update factor g(t) of (15), added."""
         w = self.exponents
         with np.errstate(invalid="ignore"):
             if w[0] != 1:
-                logs = logs + (w[0] - 1) * unchecked(self.target.log_density)(t)
+                logs = logs + (w[0] - 1) * self.target.log_density(t)
             for weight, other in zip(w[1:], self.others, strict=True):
                 if weight:
-                    logs = logs + weight * unchecked(other.log_density)(t)
+                    logs = logs + weight * other.log_density(t)
         if np.isnan(logs).any():  # one density is divided by another, and both are zero
             raise ValueError(
-                f"{name}: needs points whose density is a number, got one too far out"
+                f"{name} must have points whose density is a number, got one too far out"
             )
         return logs
 
@@ -142,13 +141,13 @@ class PartialFusion(FrozenModel):
         ----------
         x : array_like, (..., d)
         """
-        logs = unchecked(self.own.log_density)(x)
+        logs = self.own.log_density(x)
         return self._with_update(logs, x[..., : self.target_dim], "x")
 
     @validated
     def log_target(self, t: Annotated[Array, "... self.target_dim"]) -> Array:
         """Logarithm of the fused target marginal, not normalised; it needs no ego state."""
-        return self._with_update(unchecked(self.target.log_density)(t), t, "t")
+        return self._with_update(self.target.log_density(t), t, "t")
 
     @validated
     def component_shapes(
@@ -176,18 +175,18 @@ class PartialFusion(FrozenModel):
         """
         if marginal is not None and terms == "matched":
             raise ValueError(
-                "marginal: needs terms='all', since matched terms use the own mixands"
+                "marginal must be terms='all', since matched terms use the own mixands"
             )
         divided = self.target if marginal is None else marginal
         sent = self.others if received is None else received
         n = self.target_dim
         if divided.dim != n:
-            raise ValueError(f"marginal: needs dimension {n}, got {divided.dim}")
+            raise ValueError(f"marginal must have dimension {n}, got {divided.dim}")
         wanted = [n] * len(self.others)
         got = [other.dim for other in sent]
         if got != wanted:
             raise ValueError(
-                f"received: needs mixtures of dimensions {wanted}, got {got}"
+                f"received must have mixtures of dimensions {wanted}, got {got}"
             )
         pairs: NDArray[np.intp] = np.indices(
             (self.own.n_components, divided.n_components)
@@ -224,30 +223,28 @@ class PartialFusion(FrozenModel):
         if shapes.n_components > at_most:
             best = np.argsort(mixture.log_peaks - logs, kind="stable")[:at_most]
             keep = np.isin(np.arange(shapes.n_components), best)
-            shapes = unchecked(shapes.select)(keep)
+            shapes = shapes.select(keep)
             logs = logs[keep]
             mixture = shapes.with_equal_weights()
         points = shapes.means
         if rule == "points":
-            points = unchecked(unscented_points)(mixture.means, mixture.factors)[0]
+            points = unscented_points(mixture.means, mixture.factors)[0]
             points = points.reshape(-1, mixture.dim)
-            logs = unchecked(self.log_value)(points)
-        matrix = np.exp(
-            unchecked(mixture.component_log_densities)(points) - mixture.log_peaks
-        )
+            logs = self.log_value(points)
+        matrix = np.exp(mixture.component_log_densities(points) - mixture.log_peaks)
         right = np.exp(logs - logs.max())
         if rule == "points":
             rows = 1 / np.sqrt(right + _FLOOR)
             matrix = matrix * rows[:, None]
             right = right * rows
-        found = unchecked(nonnegative_least_squares)(matrix, right)
+        found = nonnegative_least_squares(matrix, right)
         with np.errstate(divide="ignore"):
             return _weighed(mixture, np.log(found))
 
     def _at_means(self, shapes: ComponentShapes, *, alone: bool) -> Array:
         """Log density at the shapes' means, exact or with the mixand alone that each came from."""
         if not alone:
-            return unchecked(self.log_value)(shapes.means)
+            return self.log_value(shapes.means)
         own = self.own
         q = shapes.source
         white = np.linalg.solve(
@@ -412,9 +409,7 @@ def nonnegative_least_squares(
 
     rows, columns = matrix.shape
     values = svdvals(matrix)
-    alpha = unchecked(tikhonov)(
-        values[0], values[-1] * (rows >= columns), condition=condition
-    )
+    alpha = tikhonov(values[0], values[-1] * (rows >= columns), condition=condition)
     if alpha > 0:
         matrix = np.concatenate([matrix, alpha * np.eye(columns)])
         right = np.concatenate([right, np.zeros(columns)])

@@ -200,7 +200,7 @@ class GaussianMixture(FrozenModel):
         at = np.array(indices)
         if at.max() >= self.dim:
             raise ValueError(
-                f"indices: needs integers below {self.dim}, got {at.max()}"
+                f"indices must be integers below {self.dim}, got {at.max()}"
             )
         return self.construct(
             self.weights, self.means[:, at], self.covs[:, at[:, None], at]

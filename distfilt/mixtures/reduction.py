@@ -22,7 +22,6 @@ from ..validation import (
     NonNegativeInt,
     PositiveInt,
     check_positive_definite,
-    unchecked,
     validated,
 )
 from .gaussian import GaussianMixture
@@ -142,7 +141,7 @@ def runnalls(
     """
     if heaviest is not None and heaviest < n_components:
         raise ValueError(
-            f"heaviest: needs an integer of at least size, {n_components}, got {heaviest}"
+            f"heaviest must be at least size, {n_components}, got {heaviest}"
         )
     if heaviest is not None and heaviest < mixture.n_components:
         mixture = _absorbed(mixture, heaviest)
@@ -269,12 +268,12 @@ def pivoted_qr(
     if n_components >= shapes.n_components:
         return shapes
     mixture = shapes.with_equal_weights()
-    logs = unchecked(mixture.component_log_densities)(shapes.means) - mixture.log_peaks
+    logs = mixture.component_log_densities(shapes.means) - mixture.log_peaks
     order = qr(np.exp(logs), mode="r", pivoting=True)[1]
     kept = n_components - (rest == "merge")
     keep = np.isin(np.arange(shapes.n_components), order[:kept])
-    first = unchecked(shapes.select)(keep)
-    lost = unchecked(shapes.select)(~keep)
+    first = shapes.select(keep)
+    lost = shapes.select(~keep)
     if rest == "drop":
         return first
     one = lost.with_equal_weights()
@@ -298,7 +297,7 @@ def gaussian_divergences(mixture: GaussianMixture, other: GaussianMixture) -> Ar
     """
     d = mixture.dim
     if other.dim != d:
-        raise ValueError(f"other: needs dimension {d}, got {other.dim}")
+        raise ValueError(f"other must have dimension {d}, got {other.dim}")
     white = np.linalg.solve(other.factors, np.broadcast_to(np.eye(d), other.covs.shape))
     trace = ((white @ mixture.factors[:, None]) ** 2).sum(axis=(-2, -1))
     gap = mixture.means[:, None] - other.means

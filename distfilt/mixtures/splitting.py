@@ -15,7 +15,6 @@ from ..validation import (
     Indices,
     PositiveFloat,
     PositiveInt,
-    unchecked,
     validated,
 )
 from .gaussian import GaussianMixture
@@ -154,11 +153,13 @@ def split_components(
     """
     if (which >= mixture.n_components).any() or np.unique(which).size != which.size:
         raise ValueError(
-            f"which: needs distinct indices below {mixture.n_components}, got {which.tolist()}"
+            f"which must have distinct indices below {mixture.n_components}, got {which.tolist()}"
         )
     white = np.linalg.solve(mixture.factors[which], directions[..., None])[..., 0]
     if np.abs((white**2).sum(axis=1) - 1).max(initial=0.0) > 1e-6:
-        raise ValueError("directions: needs one standard deviation, got another length")
+        raise ValueError(
+            "directions must be one standard deviation, got another length"
+        )
     w, m = _library(std)
     means = mixture.means[which][:, None] + m[:, None] * directions[:, None]
     less = (
@@ -213,13 +214,11 @@ def split_nonlinear(
             break
         slope = jacobian(mixture.means)
         slope = np.broadcast_to(slope, (mixture.n_components, *np.shape(slope)[-2:]))
-        directions, lengths = unchecked(nonlinearity)(
-            mixture.factors, slope, scale=scale
-        )
+        directions, lengths = nonlinearity(mixture.factors, slope, scale=scale)
         cost = np.where(mixture.weights > _LIGHT, mixture.weights * lengths, 0.0)
         worst = np.argsort(-cost, kind="stable")[:room]
         worst = worst[cost[worst] > split_threshold]
         if not worst.size:
             break
-        mixture = unchecked(split_components)(mixture, worst, directions[worst])
+        mixture = split_components(mixture, worst, directions[worst])
     return mixture

@@ -21,7 +21,6 @@ from ..validation import (
     Rng,
     Times,
     check_array,
-    unchecked,
     validated,
 )
 from ..validation.checks import call_batched, check_positive_semidefinite
@@ -75,7 +74,9 @@ class Model(FrozenModel):
         super().__post_init__()
         for name, labels in (("names", self.names), ("units", self.units)):
             if labels and len(labels) != self.dim:
-                raise ValueError(f"{name}: needs {self.dim} entries, got {len(labels)}")
+                raise ValueError(
+                    f"{name} must have {self.dim} entries, got {len(labels)}"
+                )
 
     @validated
     def step(
@@ -110,7 +111,7 @@ class Model(FrozenModel):
         rng: Rng,
     ) -> Array:
         """Move states (..., d) from `t` to `t` + `dt` and add a draw of the noise to each."""
-        moved = unchecked(self.step)(x, t, dt)
+        moved = self.step(x, t, dt)
         noise = rng.standard_normal(moved.shape) @ np.ascontiguousarray(
             self._noise(t, dt)[1].T
         )
@@ -125,7 +126,7 @@ class Model(FrozenModel):
 
         `derivative` where the model has it, central differences of `flow` otherwise.
         """
-        near = partial(central, lambda state: unchecked(self.step)(state, t, dt), x)
+        near = partial(central, lambda state: self.step(state, t, dt), x)
         return as_derivative(
             self, (x, t, dt), (*x.shape, self.dim), near, np.eye(self.dim)
         )
@@ -136,7 +137,7 @@ def _with_factor(data: bytes, dim: int) -> tuple[Array, Array]:
     """A covariance and its factor; the same few come in every step of a run."""
     cov = check_array(np.frombuffer(data).reshape(dim, dim), "noise_cov")
     check_positive_semidefinite(cov, "noise_cov")
-    root = unchecked(factor)(cov)
+    root = factor(cov)
     root.setflags(write=False)
     return cov, root
 
@@ -216,7 +217,7 @@ class LinearModel(Model):
         self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat
     ) -> Array:
         """Derivative of a step, the same matrix for all states, as (..., d, d)."""
-        return np.full((*x.shape, self.dim), unchecked(self.F)(dt))
+        return np.full((*x.shape, self.dim), self.F(dt))
 
 
 def _product(
@@ -262,7 +263,7 @@ def simulate(
     >>> simulate(walk, [0.0], [1.0, 2.0], rng=np.random.default_rng(1)).shape
     (2, 1)
     """
-    return path(partial(unchecked(model.sample_step), rng=rng), x0, times, t0)
+    return path(partial(model.sample_step, rng=rng), x0, times, t0)
 
 
 def path(
@@ -270,7 +271,7 @@ def path(
 ) -> Array:
     """Where ``move(x, t, dt)`` takes states from `t0`, at the times."""
     if times.size and times[0] <= t0:
-        raise ValueError(f"times: needs times after t0 = {t0:g}, got {times[0]:g}")
+        raise ValueError(f"times must be times after t0 = {t0:g}, got {times[0]:g}")
     states = np.empty((times.size, *x.shape))
     for k, t in enumerate(times.tolist()):
         x = states[k] = move(x, t0, t - t0)

@@ -20,7 +20,6 @@ from ..validation import (
     NonNegativeFloat,
     PositiveFloat,
     check_array,
-    unchecked,
     validated,
 )
 from .base import LinearModel, Model, Strength
@@ -149,7 +148,7 @@ def equal_steps(dt: float, longest: float | None) -> int:
     needed = dt / longest - 1e-9
     if not needed <= _MOST:
         raise ValueError(
-            f"longest: needs at least {dt / _MOST:g} for steps over {dt:g} s, got {longest:g}"
+            f"longest must have at least {dt / _MOST:g} for steps over {dt:g} s, got {longest:g}"
         )
     return max(1, math.ceil(needed))
 
@@ -174,9 +173,7 @@ def integrate(
 
 def _flow(x: Array, t: float, dt: float, rate: Rate, longest: float) -> Array:
     # Each component of all states side by side in memory: twice as fast, and the same numbers.
-    return np.ascontiguousarray(
-        unchecked(rk4)(rate, x.copy("F"), t, dt, longest=longest)
-    )
+    return np.ascontiguousarray(rk4(rate, x.copy("F"), t, dt, longest=longest))
 
 
 def _white(density: Array, t: float, dt: float) -> Array:

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveFloat, PositiveInt, unchecked, validated
+from ..validation import Array, Bounds, PositiveFloat, PositiveInt, validated
 from .base import Model, Strength
 from .motion import equal_steps, rk4
 
@@ -41,7 +41,9 @@ J2 = 1.08262668e-3
 def _outside(value: Array, name: str) -> None:
     least = float(np.linalg.norm(value, axis=-1).min(initial=np.inf))
     if not least >= RADIUS:
-        raise ValueError(f"{name}: needs a distance above {RADIUS:g} km, got {least:g}")
+        raise ValueError(
+            f"{name} must be a distance above {RADIUS:g} km, got {least:g}"
+        )
 
 
 _BOUNDED = Bounds(at_least=-1e75, at_most=1e75)
@@ -104,7 +106,7 @@ def _rate(x: Array, t: float = 0.0) -> Array:
     """Time derivative of states (..., 6) in km and m/s."""
     out = np.empty_like(x)
     out[..., :3] = 1e-3 * x[..., 3:]
-    out[..., 3:] = 1e3 * unchecked(acceleration)(x[..., :3])
+    out[..., 3:] = 1e3 * acceleration(x[..., :3])
     return out
 
 
@@ -155,7 +157,7 @@ def propagate(
         for _ in range(steps):
             # A body that dives through the Earth and comes out again is found on its way.
             if rule == "rk4":
-                x = unchecked(rk4)(_rate, x, 0.0, dt / steps)
+                x = rk4(_rate, x, 0.0, dt / steps)
             else:
                 x = _dop853(x, dt / steps)
             _outside(x[..., :3], "x")
@@ -217,7 +219,7 @@ def _noise(noise: Array, t: float, dt: float) -> Array:
 
 def _flow(x: Array, t: float, dt: float) -> Array:
     states = x.reshape(*x.shape[:-1], -1, 6)
-    return unchecked(propagate)(states, dt).reshape(x.shape)
+    return propagate(states, dt).reshape(x.shape)
 
 
 def _slope(x: Array, t: float, dt: float, bodies: int) -> Array:
@@ -262,7 +264,7 @@ def rsw_frame(x: Orbits) -> Array:
     size = np.linalg.norm(normal, axis=-1, keepdims=True)
     if (size == 0).any() or not np.isfinite(radial).all():
         raise ValueError(
-            "x: needs positions and velocities that span a plane, got others"
+            "x must have positions and velocities that span a plane, got others"
         )
     normal = normal / size
     return np.stack([radial, np.cross(normal, radial), normal], axis=-1)

@@ -200,5 +200,7 @@ def pendulum_chart(states: States) -> Array:
     v = states[..., 3]
     square = x * x + y * y
     if (square == 0).any():
-        raise ValueError("states: needs positions away from the pivot, got one at it")
+        raise ValueError(
+            "states must have positions away from the pivot, got one at it"
+        )
     return np.stack([np.arctan2(x, y), (u * y - x * v) / square], axis=-1)

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from ..linalg import symmetrise
-from ..validation import Array, PositiveFloat, unchecked, validated
+from ..validation import Array, PositiveFloat, validated
 from .base import LinearModel, Model, Strength
 from .motion import rk4
 
@@ -153,7 +153,7 @@ def _flow(x: Array, t: float, dt: float, rate: float, step: float) -> Array:
     moved = x[..., :6] @ _transition(dt, rate).T
     # Components first: each operation then runs over contiguous memory.
     rows = np.ascontiguousarray(x.reshape(-1, 13)[:, 6:].T)
-    body = unchecked(rk4)(partial(_rates, alpha=rate), rows, t, dt, longest=step)
+    body = rk4(partial(_rates, alpha=rate), rows, t, dt, longest=step)
     return np.concatenate([moved, body.T.reshape(*x.shape[:-1], 7)], axis=-1)
 
 
@@ -191,7 +191,7 @@ def _far_from_zero(value: Array, name: str) -> None:
     if not (np.isfinite(squares) & (squares > 1e-280)).all():
         got = np.abs(value).max()
         raise ValueError(
-            f"{name}: needs quaternions that are not zero or infinite, got {got:g}"
+            f"{name} must have quaternions that are not zero or infinite, got {got:g}"
         )
 
 
@@ -271,7 +271,7 @@ def left_directions(quaternion: Quaternion) -> Array:
     q = quaternion
     out = np.empty((*q.shape, 3))
     out[..., 0, :] = -q[..., 1:]
-    out[..., 1:, :] = -unchecked(cross_matrix)(q[..., 1:])
+    out[..., 1:, :] = -cross_matrix(q[..., 1:])
     out[..., 1:, :] += q[..., :1, None] * np.eye(3)
     return 0.5 * out + 0.0
 
@@ -293,7 +293,7 @@ def rotate(quaternion: Quaternion, angle: Vector) -> Array:
     array([0.7071, 0.    , 0.    , 0.7071])
     """
     half = 0.5 * np.linalg.norm(angle, axis=-1)[..., None]
-    move = (unchecked(left_directions)(quaternion) @ angle[..., None])[..., 0]
+    move = (left_directions(quaternion) @ angle[..., None])[..., 0]
     return np.asarray(np.cos(half) * quaternion + np.sinc(half / np.pi) * move)
 
 

@@ -18,7 +18,6 @@ from ..validation import (
     PositiveInt,
     Rng,
     Times,
-    unchecked,
     validated,
 )
 from ..validation.checks import check_array
@@ -42,7 +41,7 @@ def inside(positions: Array, low: Array, high: Array) -> Array:
     outside = ((positions < low) | (positions > high)).any(axis=-1)
     if outside.any():
         raise ValueError(
-            "positions: needs agents inside the box, got "
+            "positions must have agents inside the box, got "
             f"{outside.sum()} outside, one at {positions[outside][0].tolist()}"
         )
     return positions
@@ -55,11 +54,11 @@ def _diagonal(value: Any, points: tuple[int, ...], dim: int) -> Array:
         d = d[..., None]
     elif d.shape not in ((dim,), (*points, dim)):
         raise ValueError(
-            f"diffusion: needs a number or one for each axis at {points} points, got {d.shape}"
+            f"diffusion must be a number or one for each axis at {points} points, got {d.shape}"
         )
     least = float(d.min(initial=np.inf))
     if not least > 0:
-        raise ValueError(f"diffusion: needs numbers above 0, got {least:g}")
+        raise ValueError(f"diffusion must be numbers above 0, got {least:g}")
     return np.broadcast_to(d, (*points, dim))
 
 
@@ -108,7 +107,7 @@ class Swarm(FrozenModel):
         if (self.low >= self.high).any():
             low = self.low.tolist()
             high = self.high.tolist()
-            raise ValueError(f"high: needs corners above low = {low}, got {high}")
+            raise ValueError(f"high must have corners above low = {low}, got {high}")
         if not callable(self.diffusion):
             object.__setattr__(
                 self, "diffusion", _diagonal(self.diffusion, (), self.dim).copy()
@@ -231,7 +230,7 @@ class RotatingMixture(FrozenModel):
         return np.asarray(self.centre + self.radius * circle)
 
     def _logs(self, x: Array, t: float) -> tuple[Array, Array]:
-        means = unchecked(self.means)(t)
+        means = self.means(t)
         gap = x[..., None, :] - means
         return -0.5 * (gap**2).sum(axis=-1) / self.variance, means
 
@@ -290,4 +289,4 @@ def rotating_swarm(
 
 
 def _drawn(x: Array, t: float, mobility: float, mixture: RotatingMixture) -> Array:
-    return np.asarray(mobility * unchecked(mixture.score)(x, t))
+    return np.asarray(mobility * mixture.score(x, t))

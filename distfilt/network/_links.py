@@ -19,16 +19,16 @@ def of_matrix(value: Any, name: str, *, directed: bool) -> scipy.sparse.csr_arra
         value = check_array(value * 1.0 if flags else value, name, ("A", "A"))
     a = scipy.sparse.csr_array(value)
     if a.shape[0] != a.shape[1] or a.shape[0] == 0:
-        raise ValueError(f"{name}: needs a square matrix, got shape {a.shape}")
+        raise ValueError(f"{name} must be a square matrix, got shape {a.shape}")
     odd = (a.data != 0) & (a.data != 1)
     if odd.any():
-        raise ValueError(f"{name}: needs zeros and ones, got {a.data[odd][0]:g}")
+        raise ValueError(f"{name} must be zeros and ones, got {a.data[odd][0]:g}")
     links = linked(a.shape[0], np.stack(a.nonzero(), axis=1), name)
     i, j = (links - links.T).nonzero()
     if i.size and not directed:
         needs = "every link both ways (Graph.from_adjacency(..., directed=True) takes others)"
         raise ValueError(
-            f"{name}: needs {needs}, got one way only between {i[0]} and {j[0]}"
+            f"{name} must be {needs}, got one way only between {i[0]} and {j[0]}"
         )
     return links
 
@@ -40,7 +40,7 @@ def of_edges(
 
     >>> of_edges(3, [(0, -1)], "edges", directed=False)
     Traceback (most recent call last):
-    ValueError: edges: needs agents from 0 to 2, got [[0.0, -1.0]]
+    ValueError: edges must have agents from 0 to 2, got [[0.0, -1.0]]
     """
     pairs = check_array(edges, name)
     pairs = (
@@ -50,7 +50,7 @@ def of_edges(
     inside = not listed.size or 0 <= listed.min() <= listed.max() < size
     if (listed != pairs).any() or not inside:
         raise ValueError(
-            f"{name}: needs agents from 0 to {size - 1}, got {pairs.tolist()[:3]}"
+            f"{name} must have agents from 0 to {size - 1}, got {pairs.tolist()[:3]}"
         )
     both = listed if directed else np.concatenate([listed, listed[:, ::-1]])
     return linked(size, both, name)
@@ -79,11 +79,11 @@ def linked(size: int, pairs: Indices, name: str) -> scipy.sparse.csr_array:
 
     >>> linked(3, np.array([[1, 1], [2, 2]]), "edges")
     Traceback (most recent call last):
-    ValueError: edges: needs no self-loops, got one at agent 1
+    ValueError: edges must have no self-loops, got one at agent 1
     """
     loops = pairs[pairs[:, 0] == pairs[:, 1], 0]
     if loops.size:
-        raise ValueError(f"{name}: needs no self-loops, got one at agent {loops[0]}")
+        raise ValueError(f"{name} must have no self-loops, got one at agent {loops[0]}")
     links = scipy.sparse.csr_array(
         (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (size, size)
     )

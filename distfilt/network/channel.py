@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 
-from ..validation import Array, Mask, PositiveInt, unchecked, validated
+from ..validation import Array, Mask, PositiveInt, skip_validation, validated
 from . import ledger as accounts
 from .faults import Faults
 from .graphs import Graph, as_graph
@@ -94,7 +94,8 @@ class Channel:
     def construct(cls, *args: Any, **options: Any) -> Channel:
         """The same for a caller that made the graph and the ledger itself, as filters do."""
         channel = cls.__new__(cls)
-        unchecked(channel.__init__)(*args, **options)  # type: ignore[misc]
+        with skip_validation():
+            channel.__init__(*args, **options)  # type: ignore[misc]
         return channel
 
     def for_run(self, run: Any, ledger: Ledger) -> Channel:
@@ -293,7 +294,7 @@ class Channel:
         """Charge one round in which the links in `speaks` are used; which arrive, (R, E)."""
         if self.faults.has_delay and not late:
             raise ValueError(
-                f"channel: needs no delay here, got {self.faults.has_delay} rounds"
+                f"channel must have no delay here, got {self.faults.has_delay} rounds"
             )
         now = self.ledger
         size = self.graph.n_agents
@@ -377,8 +378,7 @@ def fusion_rule(kind: Fused) -> Callable[[F], F]:
     """
 
     def named(rule: F) -> F:
-        for function in (rule, unchecked(rule)):
-            function.belief_kind = kind  # type: ignore[attr-defined]
+        rule.belief_kind = kind  # type: ignore[attr-defined]
         return rule
 
     return named

@@ -17,7 +17,6 @@ from ..validation import (
     PositiveFloat,
     PositiveInt,
     check_array,
-    unchecked,
     validated,
 )
 from .channel import Channel, Lost, PerAgent, fusion_rule
@@ -51,12 +50,12 @@ class Disconnected(RuntimeWarning):
 
 def _alone(channel: Channel) -> None:
     if channel.runs:
-        raise ValueError(f"channel: needs a single run, got runs {channel.runs}")
+        raise ValueError(f"channel must be a single run, got runs {channel.runs}")
 
 
 def _faultless(channel: Channel) -> None:
     if not channel.faults.none:
-        raise ValueError("channel: needs no faults here, got a faulty channel")
+        raise ValueError("channel must have no faults here, got a faulty channel")
 
 
 @fusion_rule("vectors")
@@ -105,7 +104,7 @@ def average_consensus(
     """
     graph = channel.graph
     if gain is not None and weights is not None:
-        raise ValueError("gain: needs to stand alone, got weights too")
+        raise ValueError("gain must stand alone, got weights too")
     if gain is not None:
         _warn_if_unstable(graph, gain)
         weights = _laplacian(graph, gain)
@@ -116,7 +115,7 @@ def average_consensus(
         parts = graph.components.max() + 1
         text = f"channel: the graph has {parts} parts, and each agrees on an average of its own"
         warnings.warn(text, Disconnected, stacklevel=3)
-    return unchecked(channel.mix)(values, weights, lost=lost, rounds=rounds)
+    return channel.mix(values, weights, lost=lost, rounds=rounds)
 
 
 @fusion_rule("vectors")
@@ -157,7 +156,7 @@ def finite_time_consensus(values: PerAgent, channel: Channel) -> Array:
     """
     channel.graph._joined()
     _faultless(channel)
-    combine = unchecked(channel.mix)
+    combine = channel.mix
     out = values.copy()
     for eigenvalue in _factors(channel.graph):
         out = combine(out, _laplacian(channel.graph, 1 / eigenvalue))
@@ -173,7 +172,7 @@ def _factors(graph: Graph) -> list[float]:
         left -= graph.laplacian @ left / eigenvalue
     if (lost := np.abs(left).max()) > 1e-9:
         raise ValueError(
-            f"channel: needs a graph that rounding spares, got an error of {lost:.0e}"
+            f"channel must be a graph that rounding spares, got an error of {lost:.0e}"
         )
     return found
 
@@ -234,7 +233,7 @@ def push_sum(values: PerAgent, channel: Channel, *, rounds: PositiveInt) -> Arra
     """
     channel.graph._joined()
     graph = channel.graph
-    carry = unchecked(channel.send_on_links)
+    carry = channel.send_on_links
     mass = np.concatenate([values, np.ones((*values.shape[:-1], 1))], axis=-1)
     share = 1 / (1 + graph.out_degree)[:, None]
     pushed = np.zeros_like(mass)
@@ -270,7 +269,7 @@ def max_consensus(
     """
     channel.graph._joined()
     graph = channel.graph
-    carry = unchecked(channel.send_on_links)
+    carry = channel.send_on_links
     out = values.copy()
     if graph.n_agents == 1:
         return out
@@ -381,7 +380,7 @@ def admm(
         residuals = gaps * [1.0, rho]
         z = new
         # After the maximum all agents hold the same two numbers; any row will do.
-        primal, dual = unchecked(max_consensus)(residuals, channel)[0].tolist()
+        primal, dual = max_consensus(residuals, channel)[0].tolist()
         if primal < tolerance and dual < tolerance:
             return AdmmResult.construct(z, n, primal, dual)
     raise SolverError(

@@ -16,7 +16,6 @@ from ..validation import (
     PositiveFloat,
     PositiveInt,
     Rng,
-    unchecked,
     validated,
 )
 from .channel import Channel, PerAgent, fusion_rule
@@ -99,7 +98,7 @@ def stable_substeps(
     bound = 2 * float(channel.graph.in_degree.max())
     rate = max(alpha + a * bound, 1e-300)  # without links nothing may move at all
     if alpha + a == 0:
-        raise ValueError("alpha: needs some damping, alpha or a above 0, got both 0")
+        raise ValueError("alpha must be some damping, alpha or a above 0, got both 0")
     # Real eigenvalues lie within [-rate, 0]; complex ones, where 2 b λ exceeds α + a λ, have the
     # modulus b λ and the real part -(α + a λ)/2, and the largest λ is the worst.
     spring = b * bound
@@ -164,18 +163,18 @@ def pi_step(
     channel.graph._undirected()
     if state.estimate.shape != inputs.shape:
         raise ValueError(
-            f"state: needs shape {inputs.shape}, got {state.estimate.shape}"
+            f"state must have shape {inputs.shape}, got {state.estimate.shape}"
         )
     nu = state.estimate
     eta = state.integral
     u = inputs
     slope: Array | float = 0.0 if rate is None else rate
-    n = substeps or unchecked(stable_substeps)(channel, dt, alpha=alpha, a=a, b=b)
+    n = substeps or stable_substeps(channel, dt, alpha=alpha, a=a, b=b)
     h = dt / n
     k = u.shape[-1]
     # One combination gives -h L of both: the weights I - h L less the values themselves.
     weights = _laplacian(channel.graph, h)
-    combine = unchecked(channel.mix)
+    combine = channel.mix
     for j in range(n):
         both = np.concatenate([nu, eta], axis=-1)
         change = combine(both, weights) - both
@@ -244,7 +243,7 @@ def gossip_consensus(
     """
     channel.graph._undirected()
     graph = channel.graph
-    carry = unchecked(channel.send_on_links)
+    carry = channel.send_on_links
     out = values.copy()
     awake = rng.integers(graph.n_agents, size=rounds)
     chosen = (rng.random(rounds) * graph.in_degree[awake]).astype(np.int64)
@@ -325,7 +324,7 @@ def event_triggered(
     _alone(channel)
     channel.graph._undirected()
     graph = channel.graph
-    carry = unchecked(channel.send_on_links)
+    carry = channel.send_on_links
     x = values
     w = metropolis(graph)
     faulty = not channel.faults.none

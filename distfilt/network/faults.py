@@ -98,7 +98,7 @@ class Faults(FrozenModel):
         shortest = 1 / (1 - loss[loss < 1].max(initial=0.0))
         if self.burst is not None and self.burst < shortest * (1 - 1e-9):
             raise ValueError(
-                f"burst: needs at least 1 / (1 - loss) = {shortest:g} rounds, which independent "
+                f"burst must have at least 1 / (1 - loss) = {shortest:g} rounds, which independent "
                 f"losses last, got {self.burst:g}"
             )
         if self.during is not None:
@@ -112,7 +112,7 @@ class Faults(FrozenModel):
         )
         if mine & theirs:
             raise ValueError(
-                f"seed: needs other seeds to lose other messages, got {min(mine & theirs)} twice"
+                f"seed must be other seeds to lose other messages, got {min(mine & theirs)} twice"
             )
         return replace(self, also=(*self.also, *other._all()))
 
@@ -126,7 +126,7 @@ class Faults(FrozenModel):
             got = np.shape(faults.loss)
             if got != (agents,) * len(got):
                 raise ValueError(
-                    f"loss: needs a number for each of {agents} agents, got {got}"
+                    f"loss must be a number for each of {agents} agents, got {got}"
                 )
             Bounds(below=agents)(max(faults.silent, default=-1), "silent")
 
@@ -203,7 +203,7 @@ def _windows(during: Any) -> tuple[tuple[float, float], ...]:
     ends = check_array(during, "during", finite=False)
     if ends.ndim != 2 or ends.shape[1] != 2 or not (ends[:, 0] < ends[:, 1]).all():
         raise ValueError(
-            f"during: needs windows (start, stop) with start before stop, got {during!r}"
+            f"during must have windows (start, stop) with start before stop, got {during!r}"
         )
     return tuple((float(start), float(stop)) for start, stop in ends)
 

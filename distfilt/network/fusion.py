@@ -23,7 +23,6 @@ from ..validation import (
     PositiveFloat,
     PositiveInt,
     check_positive_definite,
-    unchecked,
     validated,
 )
 from .channel import Channel, fusion_rule
@@ -207,7 +206,7 @@ def consensus_pull(
     """
     _warn_if_unstable(channel.graph, gain)
     weights = _laplacian(channel.graph, gain)
-    combine = unchecked(channel.mix)
+    combine = channel.mix
     return combine(belief[0], weights, lost="keep", rounds=rounds), belief[1].copy()
 
 
@@ -304,12 +303,10 @@ def intersect_ensembles(
     """
     size = 1.0 if scale is None else scale
     x = ensembles / size
-    belief = unchecked(mean)(x), unchecked(sample_covariance)(x)
+    belief = mean(x), sample_covariance(x)
     check_positive_definite(belief[1], "ensembles")
-    fused = unchecked(covariance_intersection)(
-        belief, channel, rule=rule, rounds=rounds
-    )
-    return unchecked(match_moments)(x, *fused) * size
+    fused = covariance_intersection(belief, channel, rule=rule, rounds=rounds)
+    return match_moments(x, *fused) * size
 
 
 @dataclass(eq=False)
@@ -354,7 +351,7 @@ def _by_rule(heard: _Heard, rule: Rule) -> Pair:
     if rule != "equal":
         # The odds against a unit covariance: no agent's number depends on another's in any digit.
         both = np.stack([heard.covs, np.broadcast_to(unit, heard.covs.shape)], axis=-3)
-        share = unchecked(intersection_weights)(both, rule=rule)
+        share = intersection_weights(both, rule=rule)
         own = share[..., 0] / share[..., 1]
     links = own[:, heard.graph.senders] * heard.arrived
     total = own + heard.graph._summed(links, 1)
@@ -374,7 +371,7 @@ def _least(heard: _Heard, rule: Rule) -> Pair:
         sent = np.where(got[..., None, None], heard.covs[:, graph.senders[at]], unit)
         covs = np.concatenate([heard.covs[:, agents, None], sent], axis=2)
         here = np.insert(got, 0, True, axis=2)
-        omega = unchecked(intersection_weights)(covs, rule=rule, here=here)
+        omega = intersection_weights(covs, rule=rule, here=here)
         own[:, agents] = omega[..., 0]
         links[:, at] = omega[..., 1:]
     return own, links

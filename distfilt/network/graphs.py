@@ -120,12 +120,12 @@ class Graph(FrozenModel):
         """
         if not _links.is_networkx(graph):
             raise ValueError(
-                f"graph: needs a networkx graph, got {type(graph).__name__}"
+                f"graph must be a networkx graph, got {type(graph).__name__}"
             )
         labels = range(len(graph.nodes)), names, graph.nodes
         order = next(some for some in labels if {*some} == {*graph.nodes})
         if order is labels[2] and {*names} & {*order}:
-            raise ValueError(f"graph: needs the nodes {[*names]}, got {[*order]}")
+            raise ValueError(f"graph must be the nodes {[*names]}, got {[*order]}")
         number_of = {node: k for k, node in enumerate(order)}
         edges = [(number_of[edge[1]], number_of[edge[0]]) for edge in graph.edges]
         return cls.from_edges(len(number_of), edges, directed=bool(graph.is_directed()))
@@ -288,13 +288,13 @@ class Graph(FrozenModel):
         if not self.connected:
             parts = self.components.max() + 1
             raise ValueError(
-                f"graph: needs a (strongly) connected graph, got {parts} parts"
+                f"graph must be a (strongly) connected graph, got {parts} parts"
             )
 
     def _undirected(self) -> None:
         """Refuse one-way links."""
         if self.directed:
-            raise ValueError("graph: needs links both ways here, got one-way links")
+            raise ValueError("graph must have links both ways here, got one-way links")
 
 
 def as_graph(value: Any, size: int | None = None, names: Sequence[str] = ()) -> Graph:
@@ -321,9 +321,11 @@ def as_graph(value: Any, size: int | None = None, names: Sequence[str] = ()) -> 
         graph = Graph.construct(_links.of_either(value, size, "graph"))
     else:
         needs = "a Graph, a networkx graph, a matrix of zeros and ones, or edges"
-        raise ValueError(f"graph: needs {needs}, got {type(value).__name__}")
+        raise ValueError(f"graph must be {needs}, got {type(value).__name__}")
     if size is not None and graph.n_agents != size:
-        raise ValueError(f"graph: needs a graph of {size} agents, got {graph.n_agents}")
+        raise ValueError(
+            f"graph must be a graph of {size} agents, got {graph.n_agents}"
+        )
     return graph
 
 
@@ -417,7 +419,7 @@ def disk(
 
     if positions.size == 0:
         raise ValueError(
-            f"positions: needs at least one agent, got shape {positions.shape}"
+            f"positions must have at least one agent, got shape {positions.shape}"
         )
     pairs = (
         cKDTree(positions).query_pairs(radius, output_type="ndarray").astype(np.int64)

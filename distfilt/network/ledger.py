@@ -61,7 +61,7 @@ class Ledger(FrozenModel):
 
         >>> Ledger.empty(0)
         Traceback (most recent call last):
-        ValueError: agents: needs an integer of at least 1, got 0
+        ValueError: agents must be at least 1, got 0
         """
         zero = np.zeros(agents, dtype=np.int64)
         return cls.construct(0, zero, zero, zero, np.zeros(agents))
@@ -82,7 +82,7 @@ def count_payload(
     if not isinstance(payloads, Sequence | np.ndarray) or len(payloads) != agents:
         got = len(payloads) if hasattr(payloads, "__len__") else type(payloads).__name__
         raise ValueError(
-            f"payloads: needs a list, one for each agent ({agents}), got {got}"
+            f"payloads must be a list, one for each agent ({agents}), got {got}"
         )
     copies = math.prod(runs)
     sent: list[Payload | None] = [None] * agents
@@ -95,7 +95,7 @@ def count_payload(
         parts = [_part(p, agent, runs) for p in (payload if several else (payload,))]
         if not parts:
             raise ValueError(
-                f"payloads[{agent}]: needs arrays, or None to stay silent, got ()"
+                f"payloads[{agent}] must have arrays, or None to stay silent, got ()"
             )
         silent = True
         for part in parts:
@@ -113,10 +113,10 @@ def _part(part: Any, agent: int, runs: tuple[int, ...]) -> Part:
     if not plain or part.dtype.kind not in "biuf":
         got = f"dtype {part.dtype}" if plain else type(part).__name__
         needs = "an array of real numbers, a flat tuple of them or None"
-        raise ValueError(f"payloads[{agent}]: needs {needs}, got {got}")
+        raise ValueError(f"payloads[{agent}] must be {needs}, got {got}")
     if part.shape[: len(runs)] != runs:
         raise ValueError(
-            f"payloads[{agent}]: needs leading axes {runs}, got shape {part.shape}"
+            f"payloads[{agent}] must have leading axes {runs}, got shape {part.shape}"
         )
     out: Part = np.array(part)  # what was sent does not change any more
     out.flags.writeable = False

@@ -94,7 +94,7 @@ def _matching(graph: Graph, weights: ConsensusWeights) -> ConsensusWeights:
     same = np.array_equal(ours.indptr, theirs.indptr)
     if not (same and np.array_equal(ours.indices, theirs.indices)):
         raise ValueError(
-            "weights: needs weights of the channel's graph, got those of other links"
+            "weights must be weights of the channel's graph, got those of other links"
         )
     return weights
 
@@ -340,5 +340,5 @@ def _keeping(weights: ConsensusWeights) -> ConsensusWeights:
         return weights
     got = f"{columns[worst]:.6g} for agent {worst}"
     raise ValueError(
-        f"weights: needs columns that sum to 1 to keep the average, got {got}"
+        f"weights must have columns that sum to 1 to keep the average, got {got}"
     )

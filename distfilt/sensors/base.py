@@ -25,7 +25,6 @@ from ..validation import (
     PositiveInt,
     Rng,
     check_array,
-    unchecked,
     validated,
 )
 from ..validation.checks import call_batched
@@ -115,13 +114,13 @@ class Sensor(FrozenModel):
             )
             if (np.asarray(ahead) < -5e-7).any():
                 raise ValueError(
-                    "difference: needs observed less predicted, got the opposite"
+                    "difference must have observed less predicted, got the opposite"
                 )
 
     @cached_property
     def noise_sqrt(self) -> Array:
         """A factor of R, (m, m)."""
-        return unchecked(factor)(self.noise_cov)
+        return factor(self.noise_cov)
 
     @validated
     def predict(
@@ -159,7 +158,7 @@ class Sensor(FrozenModel):
         previous: Annotated[Array, "... d"] | None = None,
     ) -> Array:
         """A noisy observation of each of the states (..., d), as (..., m)."""
-        seen = unchecked(self.predict)(x, previous)
+        seen = self.predict(x, previous)
         return seen + rng.standard_normal(seen.shape) @ self.noise_sqrt.T
 
     @validated
@@ -187,24 +186,20 @@ class Sensor(FrozenModel):
         wanted = leading(observed.shape, predicted.shape, "predicted")
         gap = np.asarray(self.residual_function(observed.copy(), predicted.copy()))
         if gap.shape != wanted:
-            raise ValueError(
-                f"difference: needs to return shape {wanted}, got {gap.shape}"
-            )
+            raise ValueError(f"difference must return shape {wanted}, got {gap.shape}")
         return gap
 
     @validated
     def H(self, dim: PositiveInt) -> Array:
         """The matrix H, (m, `dim`), of a linear sensor."""
         if self.linear is None:
-            raise ValueError(f"sensor: needs a linear sensor, got a {self.kind} sensor")
+            raise ValueError(
+                f"sensor must be a linear sensor, got a {self.kind} sensor"
+            )
         h = check_array(self.linear(dim), "linear", (self.dim, dim))
-        seen = (
-            unchecked(self.predict)(np.eye(dim))
-            if vars(self).pop("_doubted", False)
-            else h.T
-        )
+        seen = self.predict(np.eye(dim)) if vars(self).pop("_doubted", False) else h.T
         if not np.allclose(seen, h.T, atol=1e-9):
-            raise ValueError("linear: needs the matrix of its function, got another")
+            raise ValueError("linear must be the matrix of its function, got another")
         return h
 
     @validated
@@ -222,10 +217,10 @@ class Sensor(FrozenModel):
         d = x.shape[-1]
         full = (*states[0].shape[:-1], self.dim, d)
         if self.linear is not None:
-            return np.broadcast_to(unchecked(self.H)(d), full)
+            return np.broadcast_to(self.H(d), full)
         before = [b[..., None, :] for b in states[1:]]
-        predict = unchecked(self.predict)
-        residual = unchecked(self.residual)
+        predict = self.predict
+        residual = self.residual
         near = partial(
             central, lambda moved: predict(moved, *before), states[0], residual
         )

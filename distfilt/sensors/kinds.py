@@ -14,7 +14,6 @@ from ..validation import (
     Bounds,
     DistinctIndices,
     NonNegativeInt,
-    unchecked,
     validated,
 )
 from ..validation.checks import check_distinct
@@ -147,7 +146,9 @@ def distance(
     array([5.])
     """
     if origin is not None and len(origin) != len(indices):
-        raise ValueError(f"origin: needs shape ({len(indices)},), got {origin.shape}")
+        raise ValueError(
+            f"origin must have shape ({len(indices)},), got {origin.shape}"
+        )
     place = _place(indices, origin)
     return Sensor.construct(
         1,
@@ -228,7 +229,7 @@ def _direction(gap: Array, period: float, heading: float = 0.0) -> Array:
         np.where(gap.any(axis=-1), np.arctan2(gap[..., 1], gap[..., 0]), np.nan)
         - heading
     )
-    return unchecked(wrap)(turned, period=period)[..., None]
+    return wrap(turned, period=period)[..., None]
 
 
 def _angle_slope(x: Array, indices: Sequence[int], origin: Array) -> Array:
@@ -265,7 +266,7 @@ def range_bearing(
     -----
     At the origin itself there is no angle: it and its derivative are NaN. A sensor
     with another pose at each reading is best made without checks,
-    ``unchecked(range_bearing)(...)``: it takes some 10 µs.
+    ``range_bearing(...)``: it takes some 10 µs.
 
     Examples
     --------
@@ -294,7 +295,7 @@ def _turned_at(
 ) -> Array:
     """Differences, wrapped in one component."""
     gap = np.asarray(observed - predicted)
-    gap[..., k] = unchecked(wrap)(gap[..., k], period=period)
+    gap[..., k] = wrap(gap[..., k], period=period)
     return gap
 
 
@@ -372,7 +373,7 @@ def ephemeris(*, position_std: Deviation, velocity_std: Deviation) -> Sensor:
     >>> ephemeris(position_std=1e-3, velocity_std=1e-5).dim
     6
     """
-    read = unchecked(component)(tuple(range(6)), std=1.0)
+    read = component(tuple(range(6)), std=1.0)
     return read.replace(noise_cov=diagonal(*[position_std] * 3, *[velocity_std] * 3))
 
 
@@ -426,7 +427,7 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
     (array([1.    , 0.7854]), array([0.01, 0.04]))
     """
     if not sensors:
-        raise ValueError("sensors: needs at least one Sensor, got none")
+        raise ValueError("sensors must have at least one Sensor, got none")
     cov = block_diag(*[s.noise_cov for s in sensors])
     cov.setflags(write=False)
     wraps = any(s.residual_function is not None for s in sensors)
@@ -448,9 +449,7 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
 def _stacked(
     *states: Any, parts: Sequence[Sensor], what: str = "predict", axis: int = -1
 ) -> Array:
-    return np.concatenate(
-        [unchecked(getattr(s, what))(*states) for s in parts], axis=axis
-    )
+    return np.concatenate([getattr(s, what)(*states) for s in parts], axis=axis)
 
 
 def _stacked_differences(
@@ -458,5 +457,5 @@ def _stacked_differences(
 ) -> Array:
     ends = np.cumsum([s.dim for s in parts])[:-1]
     pairs = [np.split(reading, ends, axis=-1) for reading in (observed, predicted)]
-    gaps = [unchecked(s.residual)(y, p) for s, y, p in zip(parts, *pairs, strict=True)]
+    gaps = [s.residual(y, p) for s, y, p in zip(parts, *pairs, strict=True)]
     return np.concatenate(gaps, axis=-1)

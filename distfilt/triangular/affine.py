@@ -21,7 +21,7 @@ import numpy as np
 
 from .. import ensembles
 from ..linalg import SolverError, leading
-from ..validation import Array, FrozenModel, Mask, import_optional, unchecked, validated
+from ..validation import Array, FrozenModel, Mask, import_optional, validated
 
 __all__ = ["AffineMap", "compose", "fit", "fit_convex", "objective"]
 
@@ -96,9 +96,7 @@ def compose(
     >>> compose(affine.fit(y, x), y, x, [2.0]).mean().round(1)
     np.float64(1.0)
     """
-    return unchecked(map_.inverse)(
-        observed[..., None, :], unchecked(map_.__call__)(y, x)
-    )
+    return map_.inverse(observed[..., None, :], map_.__call__(y, x))
 
 
 def _lower_triangular(value: Array, name: str) -> None:
@@ -107,7 +105,7 @@ def _lower_triangular(value: Array, name: str) -> None:
         or not (np.diagonal(value, axis1=-2, axis2=-1) > 0).all()
     ):
         raise ValueError(
-            f"{name}: needs lower triangular matrices with a positive diagonal"
+            f"{name} must have lower triangular matrices with a positive diagonal"
         )
 
 
@@ -183,7 +181,7 @@ def joint_samples(y: Array, x: Array) -> Array:
     """The variables (y, x) of each member, (..., N, m + d)."""
     if y.shape[:-1] != x.shape[:-1]:
         raise ValueError(
-            f"y: needs members {x.shape[:-1]} as x has them, got {y.shape[:-1]}"
+            f"y must have members {x.shape[:-1]} as x has them, got {y.shape[:-1]}"
         )
     return np.concatenate([y, x], axis=-1)
 
@@ -193,7 +191,7 @@ def enough(y: Array, x: Array, members: int) -> Array:
     joint = joint_samples(y, x)
     if members <= joint.shape[-1]:
         raise ValueError(
-            f"x: needs more than {joint.shape[-1]} members for {joint.shape[-1]} "
+            f"x must have more than {joint.shape[-1]} members for {joint.shape[-1]} "
             f"variables, got {members}"
         )
     return joint
@@ -206,7 +204,7 @@ def refuse(wrong: Mask, m: int, needs: str) -> None:
         k = int(columns[0])
         name, column = ("y", k) if k < m else ("x", k - m)
         raise ValueError(
-            f"{name}: needs variables that {needs}, got one in column {column}"
+            f"{name} must have variables that {needs}, got one in column {column}"
         )
 
 
@@ -230,7 +228,7 @@ def fit(y: Seen, x: Members) -> AffineMap:
     array([1., 0.])
     """
     joint = enough(y, x, x.shape[-2])
-    mean = unchecked(ensembles.mean)(joint)
+    mean = ensembles.mean(joint)
     joint -= mean[..., None, :]
     return from_moments(mean, joint.mT @ joint / joint.shape[-2], y.shape[-1])
 
@@ -248,8 +246,8 @@ def from_moments(mean: Array, cov: Array, m: int) -> AffineMap:
         try:
             np.linalg.cholesky(cov[..., :m, :m])
         except np.linalg.LinAlgError:
-            raise ValueError(f"y: needs variables that {needs}") from None
-        raise ValueError(f"x: needs variables that {needs}") from None
+            raise ValueError(f"y must have variables that {needs}") from None
+        raise ValueError(f"x must have variables that {needs}") from None
     # Rounding may leave a repeated variable a tiny variance of its own.
     left = np.diagonal(lower, axis1=-2, axis2=-1) ** 2
     refuse(
@@ -361,7 +359,7 @@ def fit_convex(
             rows[k, :n] = u.value
     rows[:, 1:] /= size
     rows[:, 0] -= rows[:, 1:] @ centre
-    return from_rows(rows, unchecked(ensembles.mean)(y))
+    return from_rows(rows, ensembles.mean(y))
 
 
 _SOLVING = Lock()

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..ensembles import mean
 from ..network import AdmmResult, Channel, admm, finite_time_consensus
-from ..validation import Array, PositiveFloat, check_array, unchecked, validated
+from ..validation import Array, PositiveFloat, check_array, validated
 from .affine import AffineMap, enough, from_moments, from_rows, refuse
 
 __all__ = ["pool_by_admm", "pool_by_moments"]
@@ -57,7 +57,7 @@ def pool_by_moments(
     True
     """
     joint = enough(y, x, x.shape[-3] * x.shape[-2])
-    centre = _average(unchecked(mean)(joint), channel, average)
+    centre = _average(mean(joint), channel, average)
     about = joint - centre[..., None, :]
     second = about.mT @ about / joint.shape[-2]
     rows, columns = np.triu_indices(joint.shape[-1])
@@ -116,11 +116,11 @@ def pool_by_admm(
     """
     if channel.runs:
         raise ValueError(
-            f"channel: needs a single run for ADMM, got runs {channel.runs}"
+            f"channel must be a single run for ADMM, got runs {channel.runs}"
         )
     joint = enough(y, x, x.shape[-3] * x.shape[-2])
     m = y.shape[-1]
-    centre = _average(unchecked(mean)(joint), channel, average)
+    centre = _average(mean(joint), channel, average)
     squares = ((joint - centre[:, None, :]) ** 2).mean(axis=-2)
     spread = np.sqrt(_average(squares, channel, average))
     refuse(spread <= 1e-13 * np.abs(centre), m, "are not constant")
@@ -144,7 +144,7 @@ def _average(values: Array, channel: Channel, agree: Agree) -> Array:
     slack = np.ptp(values, axis=-2, keepdims=True) + 1e-9 * np.abs(middle)
     if (np.abs(out - middle) > 2 * slack).any():
         raise ValueError(
-            "agree: needs a rule that returns averages of the agents' values, got up "
+            "agree must be a rule that returns averages of the agents' values, got up "
             f"to {np.abs(out).max():.6g} of up to {np.abs(values).max():.6g}"
         )
     return out

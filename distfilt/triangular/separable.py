@@ -22,7 +22,7 @@ import numpy as np
 
 from .. import ensembles
 from ..linalg import SolverError, leading
-from ..validation import Array, NonNegativeFloat, NonNegativeInt, unchecked, validated
+from ..validation import Array, NonNegativeFloat, NonNegativeInt, validated
 from .affine import Members, OwnMembers, OwnSeen, Seen, joint_samples, refuse
 
 __all__ = ["SeparableMap", "fit"]
@@ -233,18 +233,18 @@ def fit(
         for k, (used, given) in enumerate(zip(allowed, uses, strict=True))
     ):
         raise ValueError(
-            f"uses: needs for each of {d} components different variables before its "
+            f"uses must be for each of {d} components different variables before its "
             f"own, the {m} observations first, got {uses}"
         )
     most = max(map(len, allowed))
     needed = 2 + most if regularisation else 2 + q + most * (1 + p)
     if x.shape[-2] <= needed:
         raise ValueError(
-            f"x: needs more than {needed} members for as many coefficients, "
+            f"x must have more than {needed} members for as many coefficients, "
             f"got {x.shape[-2]}"
         )
     joint = joint_samples(y, x)
-    centre = unchecked(ensembles.mean)(joint)
+    centre = ensembles.mean(joint)
     joint -= centre[..., None, :]
     spread = np.sqrt((joint**2).mean(axis=-2))
     refuse(spread <= 1e-13 * np.abs(centre), m, "are not constant")
@@ -269,7 +269,7 @@ def _refuse_combinations(joint: Array, uses: list[list[int]], m: int) -> None:
             least = np.linalg.eigvalsh(cov[..., some, :][..., some]).min(initial=1.0)
             if least < _SINGULAR:
                 raise ValueError(
-                    f"{name}: needs variables that are not combinations of others, "
+                    f"{name} must have variables that are not combinations of others, "
                     f"got a singular correlation matrix in component {k}"
                 )
 
@@ -304,7 +304,7 @@ def _best_coefficients(
     ends = np.linalg.eigvalsh(normal)
     if (ends[..., 0] < _SINGULAR * ends[..., -1]).any():
         raise ValueError(
-            "regularisation: needs a positive value, for the basis functions are not "
+            "regularisation must be a positive value, for the basis functions are not "
             f"independent on these samples, got {penalty:g}"
         )
     regression = np.linalg.solve(normal, features.mT @ values / n)

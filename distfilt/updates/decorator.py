@@ -3,15 +3,14 @@
 Every update has the signature ``(ensemble, predicted, observed, noise, *, rng, …) -> ensemble``
 and is told four things: the forecast members (..., N, d); what each of them would observe without
 noise (..., N, m), on the branch of the observation where a reading wraps; the observation (..., m);
-and the covariance of its noise, (m, m) or (..., m, m). Loops go round the door by
-:func:`distfilt.validation.unchecked`.
+and the covariance of its noise, (m, m) or (..., m, m).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import partial, wraps
+from functools import partial
 from inspect import signature
 from typing import Annotated, Any, TypeVar, cast
 
@@ -25,7 +24,6 @@ from ..validation import (
     PositiveDefinite,
     Rng,
     all_finite,
-    unchecked,
     validated,
 )
 
@@ -67,7 +65,7 @@ def update(function: F) -> F:
     Returns
     -------
     callable
-        The same with checks; :func:`distfilt.validation.unchecked` gives the function back.
+        The same function with checks.
 
     Raises
     ------
@@ -87,20 +85,15 @@ def update(function: F) -> F:
            [3.]])
     """
     if not hasattr(function, "__annotations__"):
-        raise ValueError(f"function: needs a function, got {type(function).__name__}")
+        raise ValueError(f"function must be a function, got {type(function).__name__}")
     names = list(signature(function).parameters)[:4]
     function.__annotations__ |= dict(zip(names, _KINDS, strict=True)) | {"rng": Rng}
-    plan: Any = cast(Any, validated(function)).plan
 
-    @wraps(function)
-    def checked(*args: Any, **options: Any) -> Array:
-        given = plan.taken(args, options)
+    def with_leading_axes(**given: Any) -> Array:
         four = {name: given[name] for name in names if name in given}
         return function(**given | (_related(four) if len(four) == len(names) else {}))
 
-    made: Any = checked
-    made.unchecked = function
-    made.plan = plan
+    made: Any = validated(function, call=with_leading_axes)
     made.stacks = True
     return cast(F, made)
 
@@ -114,7 +107,7 @@ def _related(four: dict[str, Array]) -> dict[str, Array]:
         return {}
     for name, given in zip(list(four)[1:], own, strict=True):
         if leading(lead, given, name) != lead:
-            raise ValueError(f"{name}: needs leading axes {lead}, got {given}")
+            raise ValueError(f"{name} must have leading axes {lead}, got {given}")
     tails = zip(list(four)[1:3], (2, 1), strict=True)
     return {n: np.broadcast_to(four[n], (*lead, *four[n].shape[-k:])) for n, k in tails}
 
@@ -203,7 +196,7 @@ def with_missing(
     >>> float(after.mean().round(12))
     0.5
     """
-    inner = unchecked(update)
+    inner = update
     lead = observed.shape[:-1]
     m = observed.shape[-1]
     # What is drawn for an ensemble depends on its place and on how many readings it has, not on

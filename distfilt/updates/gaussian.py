@@ -19,7 +19,7 @@ import numpy as np
 from ..ensembles import Ensemble, center_ensemble, exact_noise
 from ..linalg import cholesky, solve_definite
 from ..models import Model
-from ..validation import Array, NonNegativeFloat, Rng, unchecked, validated
+from ..validation import Array, NonNegativeFloat, Rng, validated
 from .decorator import perturb_observations, update
 
 __all__ = [
@@ -77,12 +77,12 @@ def enkf_sampled_covariance(
     (np.float64(1.0), np.float64(0.5))
     >>> enkf_sampled_covariance(np.eye(2), np.eye(2), [0.0, 0.0], np.eye(2), rng=rng)
     Traceback (most recent call last):
-    ValueError: ensemble: needs at least 3 members for 2 readings, got 2
+    ValueError: ensemble must have at least 3 members for 2 readings, got 2
     """
     members, m = predicted.shape[-2:]
     if members <= m:
         raise ValueError(
-            f"ensemble: needs at least {m + 1} members for {m} readings, got {members}"
+            f"ensemble must have at least {m + 1} members for {m} readings, got {members}"
         )
     drawn = perturb_observations(predicted, noise, rng)
     b = center_ensemble(drawn)[1]
@@ -258,8 +258,8 @@ def stochastic_forecast(
     ... ).ravel()
     array([1., 2.])
     """
-    moved = unchecked(model.step)(ensemble, t, dt)
-    root = unchecked(model.noise_sqrt)(t, dt)
+    moved = model.step(ensemble, t, dt)
+    root = model.noise_sqrt(t, dt)
     if not np.count_nonzero(root):
         return moved
     return moved + rng.standard_normal(moved.shape) @ np.ascontiguousarray(root.T)
@@ -288,8 +288,8 @@ def exact_forecast(
     >>> bool(abs(moved.mean()) < 1e-12), float(moved.var(ddof=1).round(12))
     (True, 1.0)
     """
-    moved = unchecked(model.step)(ensemble, t, dt)
-    root = unchecked(model.noise_sqrt)(t, dt)
+    moved = model.step(ensemble, t, dt)
+    root = model.noise_sqrt(t, dt)
     if not root.any():
         return moved
     bad = ~np.isfinite(moved).all(axis=(-2, -1), keepdims=True)

@@ -18,7 +18,6 @@ from ..validation import (
     Probabilities,
     Rng,
     all_finite,
-    unchecked,
     validated,
 )
 
@@ -206,7 +205,7 @@ def add_jitter(
     Where it is known which were copied, these alone move: C. Musso, N. Oudjane, F. Le Gland, in the
     same book, 247-271.
     """
-    moved = drawn @ unchecked(factor)(cov).mT
+    moved = drawn @ factor(cov).mT
     if copied is not None:
         return np.asarray(np.where(copied[..., None], x + h * moved, x))
     centre = x.mean(axis=-2, keepdims=True)

@@ -17,7 +17,6 @@ from ..validation import (
     NonNegativeFloat,
     PositiveInt,
     Rng,
-    unchecked,
     validated,
 )
 from .decorator import perturb_observations, update
@@ -97,9 +96,9 @@ def principal_directions(ensemble: Ensemble, n: PositiveInt) -> Array:
     ... ).tolist()
     [[1.0], [0.0]]
     """
-    cov = unchecked(sample_covariance)(ensemble)
+    cov = sample_covariance(ensemble)
     if not np.isfinite(cov).all():
-        raise ValueError("ensemble: needs members of finite variance, got infinity")
+        raise ValueError("ensemble must have members of finite variance, got infinity")
     Bounds(at_most=cov.shape[-1])(n, "n")
     _, vectors = np.linalg.eigh(cov)
     chosen = vectors[..., ::-1][..., :n]
@@ -153,8 +152,8 @@ def principal_components(
     m = seen.shape[-1]
     d = ensemble.shape[-1]
     Bounds(at_most=d)(n_state, "n_state")
-    v = unchecked(principal_directions)(seen, min(n_observed, m))
-    w = unchecked(principal_directions)(ensemble, n_state)
+    v = principal_directions(seen, min(n_observed, m))
+    w = principal_directions(ensemble, n_state)
     latent = ensemble @ w
     reduced = seen @ v
     aim = (observed[..., None, :] @ v)[..., 0, :]
@@ -224,9 +223,7 @@ def etpf(
     """
     logs = log_likelihood(predicted, observed, noise)
     warn_of_weights(logs, predicted, observed, noise)
-    out = unchecked(coupling.transform_ensemble)(ensemble, logs, correct=correct)
+    out = coupling.transform_ensemble(ensemble, logs, correct=correct)
     if not rejuvenation:
         return out
-    return unchecked(coupling.rejuvenate)(
-        out, ensemble, bandwidth=rejuvenation, rng=rng
-    )
+    return coupling.rejuvenate(out, ensemble, bandwidth=rejuvenation, rng=rng)

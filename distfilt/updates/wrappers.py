@@ -20,7 +20,6 @@ from ..validation import (
     NonNegativeFloat,
     PositiveFloat,
     Rng,
-    unchecked,
     validated,
 )
 from .decorator import Update, around, has_tag, with_missing
@@ -37,7 +36,7 @@ __all__ = [
 
 def _followed(update: Update, change: Callable[[Array], Array]) -> Update:
     """An update, and then what `change` makes of its members."""
-    inner = unchecked(update)
+    inner = update
 
     @around(update)
     def both(
@@ -129,7 +128,7 @@ def with_projection(
     ... )
     True
     """
-    project = unchecked(coupling.project)
+    project = coupling.project
     return _followed(
         update,
         lambda x: project(
@@ -169,7 +168,7 @@ def with_retraction(
     >>> bool(abs((after**2).sum(axis=1) - 1).max() < 1e-14)
     True
     """
-    retract = unchecked(coupling.retract)
+    retract = coupling.retract
     return _followed(update, lambda x: retract(x, constraint, motion=motion))
 
 
@@ -208,8 +207,8 @@ def with_augmentation(
     ... )
     True
     """
-    inner = unchecked(update)
-    g = unchecked(constraint.residual)
+    inner = update
+    g = constraint.residual
 
     @around(update)
     def augment(
@@ -371,7 +370,7 @@ def _one_by_one(update: Update, taper: Array | None) -> Update:
         if taper is not None and taper.shape != (d + h.shape[-1], h.shape[-1]):
             m = taper.shape[1]
             raise ValueError(
-                f"readings: needs {m}, of {len(taper) - m} components, for each of "
+                f"readings must be {m}, of {len(taper) - m} components, for each of "
                 f"which there is a place; got {h.shape[-1]} of {d}"
             )
         for k, rows in enumerate(_groups(noise)):

@@ -3,7 +3,7 @@ r"""Doors: what a function's arguments must be, declared once, by its annotation
 A public function stands behind :func:`validated`. Each argument whose annotation is a kind of this
 module, or a plain type, is checked and converted before the function runs; what does not fit is
 refused by an error that names the argument, what it needs and what it got. Nothing is repaired.
-:func:`unchecked` gives the function without its door, for loops.
+Nested calls are not checked again; :func:`skip_validation` does the same for a loop of one's own.
 
 ======================================  ==========================================================
 Annotation                              What may come, and what the function gets
@@ -39,6 +39,7 @@ from .annotations import ALLOW_NAN
 from .checks import (
     Array,
     Bounds,
+    InvalidArgumentError,
     all_finite,
     check_array,
     check_distinct,
@@ -48,7 +49,7 @@ from .checks import (
     check_probabilities,
     import_optional,
 )
-from .decorators import FrozenModel, unchecked, validated
+from .decorators import FrozenModel, call_user, skip_validation, validated
 
 __all__ = [
     "Array",
@@ -57,6 +58,7 @@ __all__ = [
     "PositiveDefinite",
     "NonNegativeInt",
     "Indices",
+    "InvalidArgumentError",
     "ALLOW_NAN",
     "Mask",
     "NonNegativeFloat",
@@ -76,7 +78,8 @@ __all__ = [
     "import_optional",
     "check_positive_semidefinite",
     "check_probabilities",
-    "unchecked",
+    "call_user",
+    "skip_validation",
 ]
 
 Mask = NDArray[np.bool_]

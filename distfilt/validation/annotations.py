@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .checks import _fits, _shape_text, check_array
+from .checks import InvalidArgumentError, _fits, _shape_text, check_array
 
 __all__ = ["ALLOW_NAN", "Kind", "Scope", "kind_of"]
 
@@ -64,17 +64,21 @@ class Kind:
     convert: Callable[[Any, str, Scope], Any]
     rules: tuple[Callable[[Any, str], None], ...] = ()
 
-    def take(self, value: Any, name: str, scope: Scope) -> Any:
+    def check(self, value: Any, name: str, scope: Scope) -> Any:
         """The value as the function gets it, or an error that names it."""
         try:
             out = self.convert(value, name, scope)
+        except InvalidArgumentError:
+            raise  # an entry of it has named the argument already
         except TypeError:
             got = (
                 repr(value)
                 if isinstance(value, str | int | float)
                 else type(value).__name__
             )
-            raise ValueError(f"{name}: needs {self.needs}, got {got}") from None
+            raise InvalidArgumentError(
+                f"{name} must be {self.needs}, got {got}"
+            ) from None
         for rule in self.rules:
             rule(out, name)
         return out
@@ -114,8 +118,8 @@ def _callable(value: Any, name: str, scope: Scope) -> Any:
     plan = getattr(value.func, "plan", None) if isinstance(value, partial) else None
     if plan is None:
         return value
-    # Loops call it without its door, so the options that a partial holds are looked at here.
-    return partial(value.func, *value.args, **plan.taken((), value.keywords))
+    # Inner calls are not checked, so the options that a partial holds are looked at here.
+    return partial(value.func, *value.args, **plan.validate((), value.keywords))
 
 
 def _one_of(options: tuple[Any, ...], value: Any, name: str, scope: Scope) -> Any:
@@ -137,7 +141,7 @@ def _numbers(
         out: Any = check_array(value, name, finite=not missing)
         if missing and np.isinf(out).any():
             raise ValueError(
-                f"{name}: needs finite numbers or NaN (missing), got infinity"
+                f"{name} must have finite numbers or NaN (missing), got infinity"
             )
     else:
         out = np.asarray(value)
@@ -146,7 +150,7 @@ def _numbers(
             raise TypeError
     if words is not None and not scope.fits(out.shape, words, heads):
         raise ValueError(
-            f"{name}: needs shape {_shape_text(scope.shape(words))}, got {out.shape}"
+            f"{name} must have shape {_shape_text(scope.shape(words))}, got {out.shape}"
         )
     return out
 
@@ -159,10 +163,10 @@ def _many(
     items = tuple(value)
     each = kinds if fixed else kinds * len(items)
     if len(each) != len(items):
-        raise ValueError(f"{name}: needs {len(each)} entries, got {len(items)}")
+        raise ValueError(f"{name} must have {len(each)} entries, got {len(items)}")
     pairs = zip(each, items, strict=True)
     return tuple(
-        [kind.take(item, name, scope) if kind else item for kind, item in pairs]
+        [kind.check(item, name, scope) if kind else item for kind, item in pairs]
     )
 
 
@@ -173,7 +177,7 @@ def _either(
         return None
     for kind in kinds:
         try:
-            return kind.take(value, name, scope)
+            return kind.check(value, name, scope)
         except ValueError as error:
             # A number that is out of bounds is nothing else.
             plain = type(value) in (int, float) and kind.convert in (_number, _integer)
@@ -203,9 +207,9 @@ def kind_of(annotation: Any) -> Kind | None:
     Examples
     --------
     >>> from distfilt.validation import PositiveInt
-    >>> kind_of(PositiveInt).take(0, "members", Scope({}))
+    >>> kind_of(PositiveInt).check(0, "members", Scope({}))
     Traceback (most recent call last):
-    ValueError: members: needs an integer of at least 1, got 0
+    ValueError: members must be at least 1, got 0
     """
     if annotation is Any or annotation == ArrayLike:
         return None

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf
 
 __all__ = [
+    "InvalidArgumentError",
     "Array",
     "Bounds",
     "all_finite",
@@ -30,6 +31,20 @@ __all__ = [
 ]
 
 Array = NDArray[np.float64]
+
+
+class InvalidArgumentError(ValueError, TypeError):
+    """An argument of a wrong type: both a ValueError and a TypeError.
+
+    Examples
+    --------
+    >>> check_array("abc", "x")
+    Traceback (most recent call last):
+    distfilt.validation.InvalidArgumentError: x must be an array of real numbers, got str
+    """
+
+
+InvalidArgumentError.__module__ = "distfilt.validation"
 
 _ROUNDING = 1e-9
 """Largest asymmetry and negative eigenvalue, in units of the variances, that count as rounding."""
@@ -80,16 +95,18 @@ def check_array(
     (2, 2)
     >>> check_array([1.0, np.nan, 2.0], "mean", (3,))
     Traceback (most recent call last):
-    ValueError: mean: needs finite numbers, got 1 NaN or infinite of 3
+    ValueError: mean must have finite numbers, got 1 NaN or infinite of 3
     """
     plain = type(value) is np.ndarray and value.dtype == np.float64
     out: Array = value if plain else _real(value, name)  # type: ignore[assignment]
     if shape is not None and out.shape != shape and not _fits(out.shape, shape, {}):
-        raise ValueError(f"{name}: needs shape {_shape_text(shape)}, got {out.shape}")
+        raise ValueError(
+            f"{name} must have shape {_shape_text(shape)}, got {out.shape}"
+        )
     if finite and not all_finite(out):
         bad = int((~np.isfinite(out)).sum())
         raise ValueError(
-            f"{name}: needs finite numbers, got {bad} NaN or infinite of {out.size}"
+            f"{name} must have finite numbers, got {bad} NaN or infinite of {out.size}"
         )
     return out
 
@@ -118,7 +135,9 @@ def _real(value: Any, name: str) -> Array:
         got = type(odd[0]).__name__ if odd else found.dtype.name
     except (TypeError, ValueError, OverflowError):
         pass
-    raise ValueError(f"{name}: needs an array of real numbers, got {got}") from None
+    raise InvalidArgumentError(
+        f"{name} must be an array of real numbers, got {got}"
+    ) from None
 
 
 def _fits(got: tuple[int, ...], wanted: tuple[Any, ...], sizes: dict[str, int]) -> bool:
@@ -147,10 +166,10 @@ def check_positive_definite(value: Array, name: str, word: str = "definite") -> 
     --------
     >>> check_positive_definite(np.array([[1.0, 2.0], [2.0, 1.0]]), "noise")
     Traceback (most recent call last):
-    ValueError: noise: needs a positive definite matrix, got smallest eigenvalue -1
+    ValueError: noise must be a positive definite matrix, got smallest eigenvalue -1
     """
     if value.ndim < 2 or value.shape[-1] != value.shape[-2]:
-        raise ValueError(f"{name}: needs a square matrix, got shape {value.shape}")
+        raise ValueError(f"{name} must be a square matrix, got shape {value.shape}")
     # As a rule the same bytes, which takes a fifth of a difference's time.
     if value.tobytes() != value.mT.tobytes():
         unit = _in_units(value)
@@ -158,7 +177,7 @@ def check_positive_definite(value: Array, name: str, word: str = "definite") -> 
         worst = gap[np.abs(unit - unit.mT) > _ROUNDING].max(initial=0.0)
         if worst > 0:
             raise ValueError(
-                f"{name}: needs a symmetric matrix, got an asymmetry of {worst:.3g}"
+                f"{name} must be a symmetric matrix, got an asymmetry of {worst:.3g}"
             )
     with contextlib.suppress(np.linalg.LinAlgError):
         # The first takes a fifth of the other's time for one matrix.
@@ -171,7 +190,7 @@ def check_positive_definite(value: Array, name: str, word: str = "definite") -> 
         at = tuple(np.argwhere(values == values.min())[0].tolist())
         least = f"{np.linalg.eigvalsh(value[at])[0]:.6g}{f' at {[*at]}' * bool(at)}"
         raise ValueError(
-            f"{name}: needs a positive {word} matrix, got smallest eigenvalue {least}"
+            f"{name} must be a positive {word} matrix, got smallest eigenvalue {least}"
         )
 
 
@@ -200,14 +219,14 @@ def check_probabilities(value: Array, name: str) -> None:
     --------
     >>> check_probabilities(np.array([0.5, 0.6]), "weights")
     Traceback (most recent call last):
-    ValueError: weights: needs a sum of 1, got 1.1
+    ValueError: weights must sum to 1, got 1.1
     """
     if value.size and value.min() < 0:
-        raise ValueError(f"{name}: needs nonnegative weights, got {value.min():.6g}")
+        raise ValueError(f"{name} must be nonnegative weights, got {value.min():.6g}")
     total = np.ravel(value.sum(axis=-1))
     off = np.abs(total - 1)
     if off.max(initial=0.0) > 1e-9:  # far from zero, what is missing would move a mean
-        raise ValueError(f"{name}: needs a sum of 1, got {total[off.argmax()]:.9g}")
+        raise ValueError(f"{name} must sum to 1, got {total[off.argmax()]:.9g}")
 
 
 def check_increasing(value: Array, name: str) -> None:
@@ -217,13 +236,13 @@ def check_increasing(value: Array, name: str) -> None:
     --------
     >>> check_increasing(np.array([0.0, 0.2, 0.2]), "times")
     Traceback (most recent call last):
-    ValueError: times: needs strictly increasing values, got 0.2 after 0.2
+    ValueError: times must be strictly increasing, got 0.2 after 0.2
     """
     late = value[1:] <= value[:-1]
     if late.any():
         k = int(late.argmax())
         got = f"{value[k + 1]:g} after {value[k]:g}"
-        raise ValueError(f"{name}: needs strictly increasing values, got {got}")
+        raise ValueError(f"{name} must be strictly increasing, got {got}")
 
 
 def check_distinct(value: Sequence[int], name: str) -> None:
@@ -233,11 +252,11 @@ def check_distinct(value: Sequence[int], name: str) -> None:
     --------
     >>> check_distinct((2, 2), "local")
     Traceback (most recent call last):
-    ValueError: local: needs distinct integers, one or more, got [2, 2]
+    ValueError: local must have distinct integers, one or more, got [2, 2]
     """
     if not len(value) or len({*value}) < len(value):
         raise ValueError(
-            f"{name}: needs distinct integers, one or more, got {[*value]}"
+            f"{name} must have distinct integers, one or more, got {[*value]}"
         )
 
 
@@ -249,7 +268,7 @@ class Bounds:
     --------
     >>> Bounds(at_least=0)(-0.2, "sigma")
     Traceback (most recent call last):
-    ValueError: sigma: needs a number at least 0, got -0.2
+    ValueError: sigma must be nonnegative, got -0.2
     """
 
     above: float | None = None
@@ -258,21 +277,25 @@ class Bounds:
     at_most: float | None = None
 
     def __call__(self, value: Any, name: str) -> None:
-        """Refuse what is out of bounds."""
+        """Refuse a number, or an array with an entry, that is out of bounds."""
         for side, holds in _HOLDS.items():
             bound = getattr(self, side)
-            if bound is None or (good := holds(value, bound)) is True or np.all(good):
+            if bound is None:
                 continue
-            word = side.replace("_", " ")
-            needs = (
-                "an integer of"
-                if isinstance(value, int) and word == "at least"
-                else "a number"
+            good = holds(value, bound)
+            if good is True or np.all(good):
+                continue
+            worst = value if np.ndim(value) == 0 else value[~good].flat[0]
+            raise ValueError(
+                f"{name} must be {_bound_text(side, bound)}, got {worst!r}"
             )
-            worst = (
-                value if np.ndim(value) == 0 else value[~holds(value, bound)].flat[0]
-            )
-            raise ValueError(f"{name}: needs {needs} {word} {bound:g}, got {worst!r}")
+
+
+def _bound_text(side: str, bound: float) -> str:
+    """A bound in words: "positive", "at least 1"."""
+    if bound == 0 and side in ("above", "at_least"):
+        return "positive" if side == "above" else "nonnegative"
+    return f"{side.replace('_', ' ')} {bound:g}"
 
 
 _HOLDS = {
@@ -295,7 +318,7 @@ def import_optional(module: str, extra: str) -> ModuleType:
     --------
     >>> import_optional("no_such_package", "maps")
     Traceback (most recent call last):
-    ModuleNotFoundError: no_such_package: needs the extra maps: pip install 'distfilt[maps]'
+    ModuleNotFoundError: no_such_package is not installed; it comes with the extra maps: pip install 'distfilt[maps]'
     """
     try:
         return importlib.import_module(module)
@@ -303,7 +326,7 @@ def import_optional(module: str, extra: str) -> ModuleType:
         if error.name != module.partition(".")[0]:
             raise
         raise ModuleNotFoundError(
-            f"{module}: needs the extra {extra}: pip install 'distfilt[{extra}]'",
+            f"{module} is not installed; it comes with the extra {extra}: pip install 'distfilt[{extra}]'",
             name=module,
         ) from None
 
@@ -333,17 +356,17 @@ def call_batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -
     >>> one = SimpleNamespace(dim=2, flow=lambda x: np.array([x[1], x[0]]))
     >>> call_batched(one, "flow", [x])
     Traceback (most recent call last):
-    ValueError: flow: needs to take many states at once, ...
+    ValueError: flow must take many states at once, ...
     >>> two = SimpleNamespace(dim=2, flow=lambda x: x + x[:, :1])
     >>> call_batched(two, "flow", [x])
     Traceback (most recent call last):
-    ValueError: flow: needs to take many states at once, ...
+    ValueError: flow must take many states at once, ...
     >>> unit = SimpleNamespace(dim=2, flow=lambda x: x / np.linalg.norm(x))
     >>> call_batched(unit, "flow", [x[1:]])
     array([[0.6, 0.8]])
     >>> call_batched(unit, "flow", [x])
     Traceback (most recent call last):
-    ValueError: flow: needs to take many states at once, ...
+    ValueError: flow must take many states at once, ...
     """
     function = getattr(owner, name)
     x = states[0]
@@ -365,7 +388,7 @@ def call_batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -
             wrong = np.shape(alone) == wanted[-1:] and np.shape(many) != wanted
         if wrong:
             raise ValueError(
-                f"{name}: needs to take many states at once, (..., d), components "
+                f"{name} must take many states at once, (..., d), components "
                 "last (x[..., 0], not x[0] or x[:, 0]), got one for other axes"
             )
         first = x.reshape(-1, x.shape[-1])[0]
@@ -374,11 +397,11 @@ def call_batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -
     if fits:
         return np.asarray(out)
     if isinstance(out, IndexError):
-        raise ValueError(f"x: needs more components, got {x.shape}") from out
+        raise ValueError(f"x must have more components, got {x.shape}") from out
     if isinstance(out, Exception):
         raise out
     raise ValueError(
-        f"{name}: needs to return shape {wanted} for states {x.shape}, got {out.shape}"
+        f"{name} must return shape {wanted} for states {x.shape}, got {out.shape}"
     )
 
 

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from dataclasses import MISSING as _NO_DEFAULT
 from dataclasses import fields
 from functools import cache, cached_property, partial, wraps
 from inspect import Parameter, signature
-from types import MethodType
 from typing import Any, Self, TypeVar, cast
 
 import numpy as np
 
 from .annotations import Kind, Scope, kind_of
 
-__all__ = ["FrozenModel", "validated", "unchecked"]
+__all__ = ["FrozenModel", "call_user", "skip_validation", "validated"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -66,7 +66,9 @@ class _Plan:
         known = signature(self.function).parameters.values()
         return {p.name: p.default for p in known if p.default is not Parameter.empty}
 
-    def taken(self, args: tuple[Any, ...], options: dict[str, Any]) -> dict[str, Any]:
+    def validate(
+        self, args: tuple[Any, ...], options: dict[str, Any]
+    ) -> dict[str, Any]:
         """The arguments by name, converted, or the error for the first that does not fit."""
         given = dict(zip(self.row, args, strict=False)) | options
         if len(given) < len(args) + len(options):  # too many, or one of them twice
@@ -74,65 +76,106 @@ class _Plan:
         scope = Scope(self.defaults | given)
         for name, kind in self.kinds.items():
             if name in given:
-                given[name] = scope.values[name] = kind.take(given[name], name, scope)
+                given[name] = scope.values[name] = kind.check(given[name], name, scope)
         return given
 
 
-def validated(function: F) -> F:
-    """Let a function's annotations check what it is given.
+_NESTED: ContextVar[bool] = ContextVar("nested", default=False)
+"""Whether a validated function is running, so that those which it calls need no checks."""
+
+
+def validated(function: F, *, call: Callable[..., Any] | None = None) -> F:
+    """Let a function's annotations check its arguments.
+
+    The checks are made once, at the outermost call: functions that a validated function calls get
+    arguments that the library made. A function of the user's is called by :func:`call_user`, inside
+    which arguments are checked again.
 
     Parameters
     ----------
     function : callable
         Its annotations are kinds as in the table of :mod:`distfilt.validation`. Defaults are not
         checked.
+    call : callable, optional
+        Called with the checked arguments in place of the function, by their names.
 
     Returns
     -------
     callable
-        The same with a door; :func:`unchecked` gives the function back.
+        The same function with checks.
 
     Examples
     --------
     >>> from typing import Annotated
     >>> from distfilt.validation import Array, PositiveFloat
     >>> @validated
-    ... def scaled(x: Annotated[Array, "... d"], factor: PositiveFloat = 2.0) -> Array:
+    ... def scale(x: Annotated[Array, "... d"], factor: PositiveFloat = 2.0) -> Array:
     ...     return factor * x
-    >>> scaled([1.0, 2.0])
+    >>> scale([1.0, 2.0])
     array([2., 4.])
-    >>> scaled([1.0, 2.0], factor=-1.0)
+    >>> scale([1.0, 2.0], factor=-1.0)
     Traceback (most recent call last):
-    ValueError: factor: needs a number above 0, got -1.0
+    ValueError: factor must be positive, got -1.0
     """
     plan = _Plan(function)
+    outermost = function if call is None else call
 
     @wraps(function)
-    def checked(*args: Any, **options: Any) -> Any:
-        return function(**plan.taken(args, options))
+    def wrapper(*args: Any, **options: Any) -> Any:
+        if _NESTED.get():
+            return function(*args, **options)
+        given = plan.validate(args, options)
+        token = _NESTED.set(True)
+        try:
+            return outermost(**given)
+        finally:
+            _NESTED.reset(token)
 
-    checked.unchecked = function  # type: ignore[attr-defined]
-    checked.plan = plan  # type: ignore[attr-defined]
-    return cast(F, checked)
+    wrapper.plan = plan  # type: ignore[attr-defined]
+    return cast(F, wrapper)
 
 
-def unchecked(function: F) -> F:
-    """The function, or the bound method, without its door; options of a partial stay.
+@contextmanager
+def skip_validation() -> Iterator[None]:
+    """Skip the checks of all validated functions, in a loop whose arguments are known to fit.
+
+    Arrays must then be float64 arrays of the declared shapes, since nothing is converted either.
 
     Examples
     --------
-    >>> unchecked(print) is print
-    True
+    >>> import numpy as np
+    >>> from distfilt.sensors import wrap
+    >>> with skip_validation():
+    ...     wrap(np.array([4.0])).round(3)
+    array([-2.283])
     """
-    given: Any = function
-    inner = getattr(given, "unchecked", None)  # a method has what its function has
-    if inner is not None:
-        given = (
-            MethodType(inner, given.__self__) if type(given) is MethodType else inner
-        )
-    elif isinstance(given, partial):
-        given = partial(unchecked(given.func), *given.args, **given.keywords)
-    return given  # type: ignore[no-any-return]
+    token = _NESTED.set(True)
+    try:
+        yield
+    finally:
+        _NESTED.reset(token)
+
+
+def call_user(function: Callable[..., Any], *args: Any, **options: Any) -> Any:
+    """Call a function that the user may have written, inside which arguments are checked again.
+
+    A function of the library's own is trusted and keeps its checks off.
+
+    Examples
+    --------
+    >>> call_user(max, 1, 2)
+    2
+    """
+    inner = function
+    while isinstance(inner, partial):
+        inner = inner.func
+    if (getattr(inner, "__module__", None) or "").startswith("distfilt."):
+        return function(*args, **options)
+    token = _NESTED.set(False)
+    try:
+        return function(*args, **options)
+    finally:
+        _NESTED.reset(token)
 
 
 class FrozenModel:
@@ -150,14 +193,14 @@ class FrozenModel:
     ...     size: int
     >>> Label("a", 1.5)
     Traceback (most recent call last):
-    ValueError: size: needs an integer, got 1.5
+    distfilt.validation.InvalidArgumentError: size must be an integer, got 1.5
     """
 
     def __post_init__(self) -> None:
         cls: Any = type(self)
         scope = Scope(dict(vars(self)))
         for name, kind in _of_fields(cls).items():
-            scope.values[name] = _kept(kind.take(scope.values[name], name, scope))
+            scope.values[name] = _kept(kind.check(scope.values[name], name, scope))
         # What its functions say of each other is compared when they first speak.
         vars(self).update(scope.values, _doubted=True)
 

@@ -19,7 +19,7 @@ from _bench import Row, interleaved, main, table
 
 from bookkit import studies
 from distfilt.gaussians import intersection_weights
-from distfilt.validation import unchecked
+from tests.support import without_checks
 
 LIMITS = {
     ("known_fused", 1): 2.0,
@@ -89,7 +89,7 @@ def floor_of(
                 covs[:, None], (len(x), *hears.shape, *covs.shape[-2:])
             )
             rule = "min_determinant"
-            weights = unchecked(intersection_weights)(
+            weights = without_checks(intersection_weights)(
                 sources, rule=rule, here=hears > 0
             )
         else:

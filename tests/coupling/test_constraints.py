@@ -196,9 +196,9 @@ def test_a_constraint_that_has_no_real_value_is_refused(value: complex) -> None:
     x = np.array([[0.5, 1.0], [2.0, 1.0]])
     g = Constraint(lambda v: np.where(v[..., :1] > 1, value, v[..., :1]), [0.0])
     for call in (retract, project):
-        with pytest.raises(ValueError, match="function: needs"):
+        with pytest.raises(ValueError, match="function must"):
             call(x, g)
         with pytest.raises(
-            ValueError, match="^constraint: needs states with more than 1"
+            ValueError, match="^constraint must be states with more than 1"
         ):
             call(x[..., None], norm_constraint([0, 1]))

@@ -155,7 +155,7 @@ def test_entropy_shrinks_and_debiasing_restores() -> None:
     assert np.abs(debiased.mean(axis=0) - w @ x).max() < 1e-13
     free = biased + x - coupling.transform_ensemble(x, np.zeros(60), **entropic)
     assert np.allclose(debiased, free + w @ x - free.mean(axis=0))
-    with pytest.warns(RuntimeWarning, match="needs logarithms, got a sum of 1"):
+    with pytest.warns(RuntimeWarning, match="must have logarithms, got a sum of 1"):
         coupling.transform_ensemble(x, w)
 
 

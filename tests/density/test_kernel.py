@@ -112,6 +112,6 @@ def test_cross_validation_has_the_least_score() -> None:
 def test_a_cell_is_at_most_two_bandwidths_wide() -> None:
     fine_enough(density.Grid((10, 10)), 0.05)
     with pytest.raises(
-        ValueError, match="^grid: needs cells no wider than two bandwidths, 0.08"
+        ValueError, match="^grid must have cells no wider than two bandwidths, 0.08"
     ):
         fine_enough(density.Grid((20, 10)), np.array([0.05, 0.04]))

@@ -289,7 +289,7 @@ def test_an_agreement_for_one_run_is_asked_for_each() -> None:
 
     def one(ensembles: np.ndarray, channel: Any) -> np.ndarray:
         if channel.runs:
-            raise ValueError("channel: needs a single run")
+            raise ValueError("channel must be a single run")
         return mean_pull(ensembles, channel, gain=0.3)
 
     f, start = made(

@@ -193,7 +193,7 @@ def test_a_gated_reading_is_no_news() -> None:
         for g in (f, replace(f, exchange_interval=2.0))
     )
     assert np.allclose(a.mixtures[0].covs, b.mixtures[0].covs, atol=1e-12)
-    with pytest.raises(ValueError, match="common: needs noise of its own"):
+    with pytest.raises(ValueError, match="common must be noise of its own"):
         replace(f, sensors=[eye.replace(noise_cov=TARGET_COV)] * 2).step(start, 1.0, y)
 
 

@@ -80,7 +80,7 @@ def test_a_twin_with_the_same_fields_is_another_kind(tmp_path: Path) -> None:
             tmp_path / "a.npz"
         )
         assert made.load(tmp_path / "a.npz").ensembles.shape == (1, 2, 1)
-        with pytest.raises(ValueError, match=f"needs a saved {asked.__name__}"):
+        with pytest.raises(ValueError, match=f"must be a saved {asked.__name__}"):
             asked.load(tmp_path / "a.npz")
 
 
@@ -94,7 +94,7 @@ def test_damage_is_found_at_every_byte(tmp_path: Path) -> None:
         bad = bytearray(whole)
         bad[place] ^= 1 << int(rng.integers(8))
         path.write_bytes(bad)
-        with pytest.raises(ValueError, match="path: .*a.npz: it is damaged"):
+        with pytest.raises(ValueError, match="path must .*a.npz: it is damaged"):
             Kept.load(path)
     for size in (0, 10, len(whole) // 2, len(whole) - 1):
         path.write_bytes(whole[:size])

@@ -317,10 +317,10 @@ def test_what_waits_survives_on_disk_and_a_lag_has_to_reach_it(tmp_path: Path) -
         assert np.array_equal(again.joint_means, states[3].joint_means)
     short, start, seen, _ = made("gaussian", exchange_interval=1.0, lag=1)
     with pytest.raises(
-        ValueError, match="lag: needs at least 1 for readings that wait"
+        ValueError, match="lag must have at least 1 for readings that wait"
     ):
         made("gaussian", exchange_interval=1.0)
-    with pytest.raises(ValueError, match="lag: needs to reach back to t = 0"):
+    with pytest.raises(ValueError, match="lag must reach back to t = 0"):
         short.run(start, TIMES, seen)
 
 
@@ -343,7 +343,7 @@ def test_truth_of_each_agent_and_of_named_components(family: str) -> None:
         ({"speed": truth[:, 1]}, "components"),
         (truth[:, :1], ".*or a dict of"),
     ):
-        with pytest.raises(ValueError, match=f"truth: needs {text}"):
+        with pytest.raises(ValueError, match=f"truth must be {text}"):
             f.run(start, TIMES, seen, truth=wrong)
 
 
@@ -370,10 +370,10 @@ def test_a_selection_has_no_wrong_state(family: str) -> None:
 
 def test_a_state_and_a_reading_of_another_are_refused() -> None:
     f, start, seen, _ = made("gaussian")
-    with pytest.raises(ValueError, match="state: needs a GaussianState"):
+    with pytest.raises(ValueError, match="state must be a GaussianState"):
         f.step(made("particle")[1], 0.1, seen)
     g, other, _, _ = made("ensemble")
-    with pytest.raises(ValueError, match="state: needs sizes"):
+    with pytest.raises(ValueError, match="state must have sizes"):
         g.step(
             filters.EnsembleFilter(model(), EYES, NET, members=7).start(
                 PRIOR, rng=np.random.default_rng(0)
@@ -386,7 +386,7 @@ def test_a_state_and_a_reading_of_another_are_refused() -> None:
         filters.Observation(0.2, 0, [0.3]),
     ):
         with pytest.raises(
-            ValueError, match=r"observations\[0\]: needs a Reading of agent 0 at"
+            ValueError, match=r"observations\[0\] must be a Reading of agent 0 at"
         ):
             f.step(start, 0.1, [reading, None, None])
 
@@ -410,12 +410,12 @@ def test_a_prior_of_any_kind() -> None:
         (unscented, flat, "definite"),
         (made("mixture")[0], flat, "definite"),
     ):
-        with pytest.raises(ValueError, match=f"prior: needs .*{text}"):
+        with pytest.raises(ValueError, match=f"prior must .*{text}"):
             g.start(wrong)
     rng = np.random.default_rng(1)
     e = filters.EnsembleFilter(model(), EYES, NET, members=4000)
     with pytest.raises(
-        ValueError, match=r"prior: needs shape \(3, 4000, 2\), got \(3, 4000, 3\)"
+        ValueError, match=r"prior must have shape \(3, 4000, 2\), got \(3, 4000, 3\)"
     ):
         e.start(multivariate_normal(np.zeros(3)), rng=rng)
     two = GaussianMixture([0.5, 0.5], [[-3.0, 0.0], [3.0, 0.0]], [np.eye(2)] * 2)
@@ -432,7 +432,7 @@ def test_a_prior_of_any_kind() -> None:
 def test_degrees_are_told() -> None:
     f = filters.GaussianFilter(model(), [line_angle([0, 1], std=0.1), None, None], NET)
     with pytest.warns(
-        RuntimeWarning, match=r"^observations\[0\]: .* rad, got some 14 turns"
+        RuntimeWarning, match=r"^observations\[0\] must .* rad, got some 14 turns"
     ):
         f.run(f.start(PRIOR), [1.0], [np.array([[89.6]]), None, None])
 
@@ -452,9 +452,7 @@ def test_the_extended_filter_bears_its_own_rounding() -> None:
 def test_inflation_widens_the_forecast_and_goes_with_fusion_and_the_past() -> None:
     wide = filters.GaussianFilter(model(), EYES, NET, inflation=1.3, lag=2)
     plain = filters.GaussianFilter(model(), EYES, NET, lag=2)
-    with pytest.raises(
-        ValueError, match="^inflation: needs a number at least 0.5, got 0.05"
-    ):
+    with pytest.raises(ValueError, match="^inflation must be at least 0.5, got 0.05"):
         filters.GaussianFilter(model(), EYES, NET, inflation=0.05)
     a, b = (f.step(f.start(PRIOR), 0.5, [None] * 3) for f in (wide, plain))
     assert np.allclose(a.covariances, 1.69 * b.covariances)

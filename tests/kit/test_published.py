@@ -100,11 +100,11 @@ GOOD = 'title = "A study"\n' + GAIN + AGENT.format("A") + AGENT.format("B")
     ("old", "new", "words"),
     [
         ("value = 0.05", "value =", r"its form: .*line 3"),
-        ("assumed", "given", r"\[parameters.gain\]: where: needs a text"),
+        ("assumed", "given", r"\[parameters.gain\]: where must be a text"),
         (
             "neighbours = ['A', 'B']",
             "neighbours = ['A']",
-            "agents: needs mutual neighbours",
+            "agents must be mutual neighbours",
         ),
     ],
 )
@@ -288,14 +288,14 @@ def test_every_claim_has_to_hold() -> None:
     differs = judge_claims("grange", "Fig. 1", DENIED, why="it is an EnKF")
     assert (differs.verdict, differs.why) == ("differs", "it is an EnKF")
     assert "pca-stable fails" in differs.ours
-    with pytest.raises(ValueError, match="^why: needs a reason"):
+    with pytest.raises(ValueError, match="^why must be a reason"):
         judge_claims("grange", "Fig. 1", DENIED)
     for claims in (
         CLAIMS[:2],
         [*CLAIMS, CLAIMS[2]],
         [*CLAIMS[:2], CLAIMS[2]._replace(id="other")],
     ):
-        with pytest.raises(ValueError, match="^claims: needs those of grange Fig. 1"):
+        with pytest.raises(ValueError, match="^claims must be those of grange Fig. 1"):
             judge_claims("grange", "Fig. 1", claims)
 
 

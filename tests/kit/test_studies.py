@@ -266,9 +266,9 @@ def test_the_book_s_own_studies_are_whole() -> None:
     for path in (data_root() / "studies").glob("*/*.csv"):
         assert len(studies.stored(path.parent.name, path.stem)) > 0
     for paper, name in [("grange", "../das/pendulum"), ("..", "a"), ("grange", "none")]:
-        with pytest.raises(ValueError, match="^(paper|name): needs one of"):
+        with pytest.raises(ValueError, match="^(paper|name) must be one of"):
             studies.stored(paper, name)
-    with pytest.raises(ValueError, match="^name: needs one of"):
+    with pytest.raises(ValueError, match="^name must be one of"):
         studies.script("../studies/table-2")
 
 

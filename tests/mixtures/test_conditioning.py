@@ -115,7 +115,7 @@ def test_a_mixand_that_cannot_see_is_left_out() -> None:
     two = GaussianMixture([0.5, 0.5], [[-9.0], [9.0]], np.ones((2, 1, 1)))
     after = update_mixture(two, np.full(1, 8.0), half_blind, np.eye(1))
     assert after.n_components == 1 and np.allclose(after.means, 8.5)
-    with pytest.raises(ValueError, match="^observed: needs a target that can be seen"):
+    with pytest.raises(ValueError, match="^observed must be a target that can be seen"):
         update_mixture(two, np.full(1, 8.0), lambda x: np.nan * x, np.eye(1))
 
 

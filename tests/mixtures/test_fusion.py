@@ -110,9 +110,9 @@ def test_exponents_are_equal_by_default() -> None:
         PartialFusion(OWN, others, omega=0.4).exponents, [0.4] + [0.2] * 3
     )
     same(fuse_moments(OWN, others), fuse_moments(OWN, others, omega=[0.25] * 4))
-    with pytest.raises(ValueError, match="^omega: needs 4 exponents, got 2"):
+    with pytest.raises(ValueError, match="^omega must be 4 exponents, got 2"):
         PartialFusion(OWN, others, omega=[0.5, 0.5])
-    with pytest.raises(ValueError, match="^heard: needs target beliefs"):
+    with pytest.raises(ValueError, match="^heard must have target beliefs"):
         PartialFusion(OTHER, OWN)
 
 

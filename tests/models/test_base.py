@@ -141,7 +141,7 @@ def test_a_flow_for_one_state_is_refused(flow: Any, shape: tuple[int, ...]) -> N
     x = generator().standard_normal(shape)
     for step in (model.step, partial(model.sample_step, rng=generator())) * 2:
         with pytest.raises(
-            ValueError, match="transition: needs to take many states at once"
+            ValueError, match="transition must take many states at once"
         ):
             step(x, 0.0, 0.1)
 

@@ -60,7 +60,7 @@ def test_time_can_run_back_and_batches_are_rows() -> None:
         < 1e-6
     )
     assert (propagate(both, 0.0) == both).all()
-    with pytest.raises(ValueError, match=r"x, in km: needs a number at most 1\.5e\+06"):
+    with pytest.raises(ValueError, match=r"x, in km must be at most 1\.5e\+06"):
         propagate(1e3 * GEO, 60.0)
 
 

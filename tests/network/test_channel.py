@@ -52,9 +52,11 @@ def test_what_is_no_array_is_refused_by_name_and_costs_nothing() -> None:
     """An object could carry any number of numbers past the account."""
     channel = star()
     for payload in REFUSED.values():
-        with pytest.raises(ValueError, match=r"payloads\[2\]: needs"):
+        with pytest.raises(ValueError, match=r"payloads\[2\] must"):
             channel.broadcast([np.zeros(1), None, payload])
-    with pytest.raises(ValueError, match=r"payloads\[0\]: needs leading axes \(4,\)"):
+    with pytest.raises(
+        ValueError, match=r"payloads\[0\] must have leading axes \(4,\)"
+    ):
         star(runs=(4,)).broadcast([(np.zeros((4, 3)), np.zeros(3))] * 3)
     assert channel.ledger.rounds == 0 and charged(channel, messages=0)
 
@@ -329,7 +331,7 @@ def test_late_values_are_those_that_were_sent_and_not_lost_then(delay: int) -> N
         lambda: late.send_on_links(np.zeros((14, 1))),
     ):
         with pytest.raises(
-            ValueError, match=f"channel: needs no delay here, got {delay} rounds"
+            ValueError, match=f"channel must have no delay here, got {delay} rounds"
         ):
             call()
 

@@ -133,7 +133,7 @@ def test_finite_time_on_many_eigenvalues_needs_leja_s_order() -> None:
 
 def test_finite_time_needs_every_message() -> None:
     for channel, why in (
-        (lossy(), "channel: needs no faults"),
+        (lossy(), "channel must have no faults"),
         (Channel(APART), "connected"),
     ):
         with pytest.raises(ValueError, match=why):
@@ -228,5 +228,5 @@ def test_it_says_when_it_stops_short_and_needs_every_message() -> None:
         SolverError, match=f"{primal:.3g} and {dual:.3g} after 2 iterations"
     ):
         network.admm(_quadratic, _ZERO, star(), iterations=2)
-    with pytest.raises(ValueError, match="channel: needs no faults"):
+    with pytest.raises(ValueError, match="channel must have no faults"):
         network.admm(_quadratic, _ZERO, lossy(), average=network.average_consensus)

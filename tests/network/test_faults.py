@@ -88,7 +88,7 @@ def test_each_round_of_a_burst_follows_from_the_one_before() -> None:
 def test_bursts_of_any_rate_end(seed: int, loss: float, burst: float) -> None:
     shortest = 1 / (1 - loss) if 0 < loss < 1 else 1.0
     if burst < shortest * (1 - 1e-8):
-        with pytest.raises(ValueError, match="burst: needs at least"):
+        with pytest.raises(ValueError, match="burst must have at least"):
             Faults(loss=loss, burst=burst)
         return
     lost = Faults(loss=loss, burst=max(burst, shortest), seed=seed).lost(STAR, 0, 5)
@@ -137,11 +137,11 @@ def test_faults_together_fail_in_every_way() -> None:
 def test_what_cannot_be_said_of_a_network_is_refused() -> None:
     """Bursts shorter than independence, one seed twice, rates and agents of other networks."""
     refused = {
-        "burst: needs at least": lambda: Faults(loss=[0.1, 0.8], burst=4.0),
-        "seed: needs other seeds": lambda: (
+        "burst must have at least": lambda: Faults(loss=[0.1, 0.8], burst=4.0),
+        "seed must be other seeds": lambda: (
             Faults(loss=0.1, seed=3) | Faults(loss=0.2, seed=3)
         ),
-        "loss: needs a number for each": lambda: Channel(
+        "loss must be a number for each": lambda: Channel(
             STAR, faults=Faults(loss=[0.1, 0.2])
         ),
     }

@@ -12,9 +12,8 @@ from distfilt import network
 from distfilt.ensembles import mean, sample_covariance
 from distfilt.network import Channel, Faults, Graph, UnstableGain, graphs
 from distfilt.network.channel import kind_of_rule
-from distfilt.validation import unchecked
 from tests.network.helpers import DISK, STAR, gaussians, heard, lossy, rng, star
-from tests.support import unit_gap
+from tests.support import unit_gap, without_checks
 
 RULES = ("equal", "trace", "determinant", "min_trace", "min_determinant")
 GAIN = 0.04
@@ -132,7 +131,7 @@ def test_a_rule_says_what_it_fuses_with_and_without_its_door() -> None:
         kind_of_rule(partial(partial(network.mean_pull, gain=0.1), rounds=2))
         == "ensembles"
     )
-    assert kind_of_rule(unchecked(network.naive_fusion)) == "gaussians"
+    assert kind_of_rule(without_checks(network.naive_fusion)) == "gaussians"
     assert kind_of_rule(network.average_consensus) == "vectors"
     assert kind_of_rule(lambda belief, channel: belief) is None
 

@@ -121,7 +121,7 @@ def test_edges_count_once_and_run_from_speaker_to_listener() -> None:
     for a, b, c in ((0, 1, 2), "abc"):
         assert as_graph(nx.Graph([(c, a), (a, b)]), 3, "abc").neighbours(0) == (1, 2)
     with pytest.raises(
-        ValueError, match=r"graph: needs the nodes \['a', 'b', 'c'\], got"
+        ValueError, match=r"graph must be the nodes \['a', 'b', 'c'\], got"
     ):
         as_graph(nx.path_graph(["a", "b", "d"]), 3, "abc")
 
@@ -159,5 +159,5 @@ def test_what_describes_no_graph_is_refused_with_the_ways_to_make_one() -> None:
         "a graph of 3 agents, got 4": graphs.path(4),
     }
     for text, value in refused.items():
-        with pytest.raises(ValueError, match=f"graph: needs .*{text}"):
+        with pytest.raises(ValueError, match=f"graph must .*{text}"):
             as_graph(value, 3)

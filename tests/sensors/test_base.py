@@ -64,7 +64,7 @@ def test_a_function_that_takes_one_state_only_is_refused(
     sensor = Sensor(2, function, np.eye(2))
     assert sensor.predict([1.0, 2.0, 3.0]).shape == (2,)
     x = 2.0 + np.arange(np.prod(shape)).reshape(shape)
-    with pytest.raises(ValueError, match=r"h: needs to take many states at once"):
+    with pytest.raises(ValueError, match=r"h must take many states at once"):
         sensor.predict(x)
 
 
@@ -108,7 +108,9 @@ def test_jacobian_without_a_formula() -> None:
     )
     x = np.array([[np.pi, 0.0], [1.0, 2.0]])
     assert np.abs(sensor.jacobian(x) - 1.0).max() < 1e-9
-    with pytest.raises(ValueError, match="^difference: needs observed less predicted"):
+    with pytest.raises(
+        ValueError, match="^difference must have observed less predicted"
+    ):
         Sensor(1, sensor.h, np.eye(1), residual_function=lambda y, p: wrap(p - y))
 
 

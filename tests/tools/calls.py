@@ -61,7 +61,7 @@ class Recorder:
     @contextmanager
     def listening(self) -> Iterator[None]:
         """While it lasts, what passes a door is kept."""
-        taken = decorators._Plan.taken
+        taken = decorators._Plan.validate
         made = FrozenModel.__post_init__
 
         def at_door(plan: Any, args: Any, options: Any) -> Any:
@@ -76,13 +76,13 @@ class Recorder:
             made(record)
             self.keep(type(record), (), given)
 
-        decorators._Plan.taken = at_door
+        decorators._Plan.validate = at_door
         FrozenModel.__post_init__ = at_record
         try:
             with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
                 yield
         finally:
-            decorators._Plan.taken = taken
+            decorators._Plan.validate = taken
             FrozenModel.__post_init__ = made
 
 

@@ -15,7 +15,7 @@ from distfilt.models import Model
 from distfilt.updates.decorator import Update, has_tag
 from distfilt.updates.gaussian import exact_forecast
 from distfilt.updates.wrappers import gaspari_cohn
-from distfilt.validation import unchecked
+from tests.support import without_checks
 
 from .cases import UPDATES, H, R, Y, kalman, members, moments, rng
 
@@ -99,7 +99,7 @@ def test_partial_options_survive_the_open_door() -> None:
     x = members(20)
     given = (x, x @ H.T, Y, R)
     assert np.array_equal(
-        unchecked(turned)(*given, rng=rng()), turned(*given, rng=rng())
+        without_checks(turned)(*given, rng=rng()), turned(*given, rng=rng())
     )
     assert has_tag(turned, "stacks") and not has_tag(partial(print, 3), "stacks")
     assert not has_tag(

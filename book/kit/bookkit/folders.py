@@ -33,14 +33,14 @@ def inside(folder: Path, paper: str, name: str, suffix: str) -> Path:
 
     >>> inside(data_root() / "scenarios", "grange", "../das/pendulum", ".toml")
     Traceback (most recent call last):
-    ValueError: name: needs one of table-2, table-3, got '../das/pendulum'
+    ValueError: name must be one of table-2, table-3, got '../das/pendulum'
     """
     papers = ["", *sorted(p.name for p in folder.iterdir() if p.is_dir())]
     if paper not in papers:
-        raise ValueError(f"paper: needs one of {', '.join(papers[1:])}, got {paper!r}")
+        raise ValueError(f"paper must be one of {', '.join(papers[1:])}, got {paper!r}")
     there = sorted(p.stem for p in (folder / paper).glob(f"*{suffix}"))
     if name not in there:
         raise ValueError(
-            f"name: needs one of {', '.join(there) or 'none yet'}, got {name!r}"
+            f"name must be one of {', '.join(there) or 'none yet'}, got {name!r}"
         )
     return folder / paper / f"{name}{suffix}"

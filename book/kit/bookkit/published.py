@@ -90,7 +90,7 @@ def items() -> list[Item]:
 def _known(paper: str, item: str) -> Item:
     found = [known for known in items() if known[:2] == (paper, item)]
     if not found:
-        raise ValueError(f"item: needs one of items(), got {paper} {item}")
+        raise ValueError(f"item must be one of items(), got {paper} {item}")
     return found[0]
 
 
@@ -135,10 +135,10 @@ class Verdict:
         known = VERDICTS[_known(self.paper, self.item).kind]
         if self.verdict not in known:
             raise ValueError(
-                f"verdict: needs one of {', '.join(known)}, got {self.verdict!r}"
+                f"verdict must be one of {', '.join(known)}, got {self.verdict!r}"
             )
         if self.verdict in known[1:] and not self.why.strip():
-            raise ValueError(f"why: needs a reason for {self.verdict!r}")
+            raise ValueError(f"why must be a reason for {self.verdict!r}")
 
     def _fields(self) -> list[tuple[str, str]]:
         names = ("ours", "null", "range", "published", "why")
@@ -303,7 +303,7 @@ def judge_claims(
     given = [claim.id for claim in claims]
     if sorted(given) != sorted(listed):
         raise ValueError(
-            f"claims: needs those of {paper} {item}, {', '.join(listed)}, each once, "
+            f"claims must be those of {paper} {item}, {', '.join(listed)}, each once, "
             f"got {', '.join(given)}"
         )
     ours = "; ".join(str(c) for c in claims)

@@ -82,12 +82,12 @@ def _check_origin(cells: Mapping[str, Any]) -> None:
     """What is given says where, and what is not says why."""
     if cells.get("source") not in _SOURCES:
         raise ValueError(
-            f"source: needs one of {', '.join(_SOURCES)}, got {cells.get('source')!r}"
+            f"source must be one of {', '.join(_SOURCES)}, got {cells.get('source')!r}"
         )
     needed = "where" if cells["source"] == "given" else "reason"
     for key in ("name", "unit", needed):
         if not str(cells.get(key) or "").strip():
-            raise ValueError(f"{key}: needs a text, got {cells.get(key)!r}")
+            raise ValueError(f"{key} must be a text, got {cells.get(key)!r}")
 
 
 def _why(cells: Mapping[str, Any]) -> str:
@@ -129,7 +129,7 @@ class Row(Mapping[str, Any]):
     ('angle', (1, 2), 'Table II.')
     >>> Row({**row, "kind": "range"})
     Traceback (most recent call last):
-    ValueError: unit: needs m or km for 'range', got 'rad'
+    ValueError: unit must have m or km for 'range', got 'rad'
     """
 
     def __init__(
@@ -142,7 +142,7 @@ class Row(Mapping[str, Any]):
         unit = cells["unit"]
         if unit not in (allowed := _UNITS.get(kind, (unit,))):
             raise ValueError(
-                f"unit: needs {' or '.join(allowed)} for {kind!r}, got {unit!r}"
+                f"unit must be {' or '.join(allowed)} for {kind!r}, got {unit!r}"
             )
 
     def __getitem__(self, key: str) -> Any:

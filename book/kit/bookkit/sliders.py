@@ -65,7 +65,7 @@ class Slider:
     def __post_init__(self) -> None:
         if len(self.html) > LIMIT:
             raise ValueError(
-                f"frames: needs at most {LIMIT} characters, got {len(self.html)}"
+                f"frames must have at most {LIMIT} characters, got {len(self.html)}"
             )
 
     def __repr__(self) -> str:
@@ -170,7 +170,7 @@ def slider(
         *(_frame(draw(v), places) for v in values), strict=True
     )
     if len(set(sizes)) != 1:
-        raise ValueError("draw: needs figures of one size")
+        raise ValueError("draw must have figures of one size")
     return Slider(frames, sizes[0], said, digests, label, alt, start)
 
 

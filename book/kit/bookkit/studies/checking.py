@@ -34,7 +34,7 @@ def script(name: str, *, folder: Path | None = None) -> ModuleType:
     --------
     >>> script("../studies/lorenz-63")
     Traceback (most recent call last):
-    ValueError: name: needs one of ... got '../studies/lorenz_63'
+    ValueError: name must be one of ... got '../studies/lorenz_63'
     """
     there = folder or data_root().parent / "book" / "studies"
     path = inside(there, "", name.replace("-", "_"), ".py")
@@ -100,7 +100,7 @@ def check(
     chosen = list(range(len(stored)) if indices is None else indices)
     if max_outliers >= len(chosen):
         raise ValueError(
-            f"odd: needs fewer than the {len(chosen)} trials that run, got {max_outliers}"
+            f"odd must have fewer than the {len(chosen)} trials that run, got {max_outliers}"
         )
     allowed = dict.fromkeys(stored.columns, atol)
     for name in ill_conditioned:

@@ -129,7 +129,7 @@ def _head(
     if not all(name.isidentifier() for name in columns) or len(set(columns)) != len(
         columns
     ):
-        raise ValueError(f"columns: needs different identifiers, got {columns}")
+        raise ValueError(f"columns must be different identifiers, got {columns}")
     made_by = {plain(f).__qualname__: fingerprint(f) for f in (trial, *code)}
     lines = [f"# version {k}: {json.dumps(v)}" for k, v in running.versions().items()]
     lines += [f"# code {k}: {json.dumps(v)}" for k, v in sorted(made_by.items())]

@@ -139,7 +139,7 @@ def row(value: Any, columns: Sequence[str]) -> list[float]:
     numbers = [float(x) for x in np.atleast_1d(value)]
     if len(numbers) != len(columns):
         raise ValueError(
-            f"columns: needs {len(numbers)}, a name for each number, got {columns}"
+            f"columns must be {len(numbers)}, a name for each number, got {columns}"
         )
     return numbers
 
