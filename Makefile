@@ -1,6 +1,7 @@
 # The book and its library. Needs Python 3.11 or newer, pip and make.
 #   make book      the environment, the library and the HTML, warnings as errors
-#   make test      the book, then every check; `make help` lists the rest
+#   make test      the book, then every check
+# `make help` lists the other targets.
 
 ifndef PYTHON
 PYTHON := $(shell for p in python3.11 python3 python; do \
@@ -14,9 +15,10 @@ HTML := _build/html
 BUILT := _build/book.stamp
 LAB := _build/lab
 JOBS := 2
-# The largest first, so that no core waits at the end for the other's last page.
+# The largest pages first, so that no core idles at the end.
 PAGES := $(shell ls -S $$(sed -n 's|.* \(book/[0-9].*\)|\1.ipynb|p' _toc.yml) book/index.ipynb \
 	| sed 's|book/\([0-9a-z]*\).*|regress-\1|')
+SOURCES := distfilt tests book conftest.py
 SAMPLE := 300
 VERSIONS := lowest-direct highest
 
@@ -24,40 +26,47 @@ VERSIONS := lowest-direct highest
 export OPENBLAS_NUM_THREADS := 1
 export OMP_NUM_THREADS := 1
 export PYTHONHASHSEED := 0
-# Some fifty processes of the tests import the library: each would compile it again.
+# Some fifty processes of the tests import the library; without bytecode each would compile it.
 unexport PYTHONDONTWRITEBYTECODE
 export MPLCONFIGDIR := $(CURDIR)/$(VENV)/matplotlib
 
 .DEFAULT_GOAL := help
-# One thing after the other, but for the checks of `make test`, which share the cores.
+# Targets run one after the other; only the checks of `make test` share the cores.
 ifndef CHECKING
 .NOTPARALLEL:
 endif
-.PHONY: help environment remake book test unit types style pairs regress slow outputs identical \
-	accept studies check-studies bench mutants portable versions lab lock pdf epub clean $(PAGES)
+.PHONY: help environment remake book test unit types style check-notebooks regress slow outputs \
+	check-determinism update-scenarios studies check-studies bench mutants check-portability \
+	test-versions lab lock pdf epub clean $(PAGES)
 
 help:
-	@echo "make book       environment, library and HTML (warnings are errors); prints the page's path"
-	@echo "make pdf        the book, then all of it as one PDF; make epub the same as an EPUB (needs Chromium and its driver)"
-	@echo "make test       the book, then unit, property and doc tests, types, style, pairs, stored outputs, browser"
-	@echo "make slow       the tests that take minutes, and new examples for the property tests"
-	@echo "make outputs    execute every chapter, store its outputs, write the ledger of reproductions"
-	@echo "make identical  execute chapters again (all, or CHAPTERS=...): texts byte for byte, pictures as seen"
-	@echo "make accept     take the scenarios as they are for the book's own"
-	@echo "make studies    run the studies that take too long for a chapter, store them in data/studies"
-	@echo "make check-studies  run every stored study again and compare"
-	@echo "make portable   stored outputs and the library's tests on another BLAS kernel and without numpy's newer SIMD"
-	@echo "make versions   the library's tests with the oldest and the newest packages that it admits"
-	@echo "make bench      side-by-side measurements, written to data/bench if the machine is idle"
-	@echo "make mutants    how many of SAMPLE=300 random faults the tests find, written to data/bench"
-	@echo "make lab        JupyterLab on a working copy of the chapters (LAB=folder for another one)"
-	@echo "make lock       resolve requirements.txt again"
-	@echo "make clean      remove what was built (the environment and the working copy stay)"
+	@echo "make environment        the packages and the library, in .venv"
+	@echo "make book               environment and HTML (warnings are errors); prints the page's path"
+	@echo "make pdf, make epub     the whole book in one file (needs Chromium and its driver)"
+	@echo "make test               the book, then every check: the next five, and the browser"
+	@echo "  make unit             unit, property and doc tests"
+	@echo "  make types            mypy in strict mode"
+	@echo "  make style            ruff: rules and format; warns of public names that the book never uses"
+	@echo "  make check-notebooks  each chapter's text against its notebook, numbers in prose, the ledger"
+	@echo "  make regress          every chapter executed again and compared with its stored outputs"
+	@echo "make slow               the tests that take minutes, and new examples for the property tests"
+	@echo "make outputs            execute every chapter, store its outputs, write the ledger of reproductions"
+	@echo "make check-determinism  execute chapters again (all, or CHAPTERS=...): texts byte for byte, pictures by pixels"
+	@echo "make update-scenarios   accept the scenarios as they are now"
+	@echo "make studies            run the studies that take too long for a chapter, store them in data/studies"
+	@echo "make check-studies      run every stored study again and compare"
+	@echo "make check-portability  stored outputs and the library's tests on another BLAS kernel and without newer SIMD"
+	@echo "make test-versions      the library's tests with the oldest and the newest packages that it supports"
+	@echo "make bench              side-by-side measurements, written to data/bench if the machine is idle"
+	@echo "make mutants            how many of SAMPLE=300 random mutations the tests detect, written to data/bench"
+	@echo "make lab                JupyterLab on a working copy of the chapters (LAB=folder for another one)"
+	@echo "make lock               resolve requirements.txt again"
+	@echo "make clean              remove what was built (the environment and the working copy stay)"
 
 environment: $(STAMP)
 
-# The stamp is written last and names this folder: without it, or with another one's, the
-# environment is made again.
+# The stamp is written last and holds this folder's path. If it is missing or names another
+# folder, the environment is made again.
 ifneq ($(shell $(PY) -c "" 2>/dev/null && cat $(STAMP) 2>/dev/null),$(CURDIR))
 $(STAMP): remake
 endif
@@ -67,7 +76,7 @@ $(STAMP): requirements.txt pyproject.toml book/kit/pyproject.toml
 
 remake:
 
-# Built whole or not at all: a page that is not read again would not repeat its warnings.
+# Always built from scratch: a page taken from the cache would not repeat its warnings.
 $(BUILT): $(STAMP) _toc.yml CITATION.cff \
 		$(shell find book distfilt data -type f ! -path "*/__pycache__/*" ! -path "*/_generated/*" ! -path "*/.*")
 	rm -rf $(HTML) $@
@@ -80,11 +89,11 @@ book: $(BUILT)
 pdf epub: book
 	$(PY) book/tools/volume.py $@
 
-# As many checks at a time as there are jobs, each page of the book one of them.
+# Each page of the book is a check of its own; JOBS checks run at a time.
 test: book
-	@$(MAKE) --no-print-directory -k -j$(JOBS) CHECKING=1 JOBS=1 unit types style pairs $(PAGES)
+	@$(MAKE) --no-print-directory -k -j$(JOBS) CHECKING=1 JOBS=1 unit types style check-notebooks $(PAGES)
 
-# In the order of their folders: the files with few but long tests then come first.
+# Without reordering, the files with few but long tests come first.
 unit: $(STAMP)
 	HYPOTHESIS_PROFILE=gate $(PY) -m pytest -q -n $(JOBS) --dist loadscope --no-loadscope-reorder
 
@@ -92,9 +101,11 @@ types: $(STAMP)
 	$(PY) -m mypy
 
 style: $(STAMP)
-	$(PY) -m ruff check distfilt tests book conftest.py
+	$(PY) -m ruff check $(SOURCES)
+	$(PY) -m ruff format --check $(SOURCES)
+	@$(PY) -m tests.tools.reach
 
-pairs: $(STAMP)
+check-notebooks: $(STAMP)
 	$(PY) book/tools/pairs.py
 	$(PY) book/tools/numerals.py
 	$(PY) book/tools/scenarios.py
@@ -113,18 +124,18 @@ outputs: $(STAMP)
 	$(PY) book/tools/execute.py
 	$(PY) book/tools/ledger.py
 
-identical: $(STAMP)
+check-determinism: $(STAMP)
 	$(PY) book/tools/execute.py --check $(CHAPTERS)
 
-accept: $(STAMP)
-	$(PY) book/tools/scenarios.py --accept
+update-scenarios: $(STAMP)
+	$(PY) book/tools/scenarios.py --update
 
-portable: $(STAMP)
+check-portability: $(STAMP)
 	OPENBLAS_CORETYPE=Nehalem NPY_DISABLE_CPU_FEATURES="X86_V4 X86_V3 AVX512_ICL AVX512_SPR" \
 		HYPOTHESIS_PROFILE=gate $(PY) -m pytest -q -n $(JOBS) --ignore tests/book --ignore tests/tools
 	$(PY) book/tools/regress.py --portable
 
-versions: $(STAMP)
+test-versions: $(STAMP)
 	@for which in $(VERSIONS); do \
 		$(PY) -m uv venv --quiet --clear --seed --python "$(PYTHON)" _build/$$which \
 		&& $(PY) -m uv pip install --quiet --python _build/$$which --resolution $$which \

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.linalg.lapack import dposv, dpotrf, dtrtrs
 
 from .validation import Array, PositiveSemidefinite, validated
+from .validation.first_use import is_first_use
 
 __all__ = ["SolverError", "factor"]
 
@@ -342,7 +343,7 @@ def as_derivative(
     )
     if slope.shape not in (full, full[-2:]):
         raise ValueError(f"derivative must return shape {full}, got {slope.shape}")
-    if vars(owner).pop("_doubted", False):
+    if is_first_use(owner, "derivative"):
         found = near(step=_STEP)
         wide = near(step=4 * _STEP)
         row = np.abs(found - still).max(axis=-1, keepdims=True)

@@ -1,29 +1,30 @@
-"""The package as a whole: its floors, its size, its public names, and the wheel that it makes."""
+"""The package as a whole: its layers, its public names, its version and its wheel."""
 
 from __future__ import annotations
 
 import ast
 import importlib
 import os
-import re
 import subprocess
 import sys
-import tokenize
+import tomllib
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 
 import distfilt
-from tests.tools.calls import public, rooms
+from tests.tools.reach import code_of_pages, unused_names
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "distfilt"
 PATHS = sorted(PACKAGE.rglob("*.py"))
 TREES = {path: ast.parse(path.read_text(encoding="utf-8")) for path in PATHS}
 
-# Who may import whom: a module imports from floors below its own, or within its own folder.
-LEVELS = (
+# A module imports only from layers below its own, or from its own subpackage.
+LAYERS = (
     ("validation",),
     ("linalg",),
     ("ensembles", "gaussians"),
@@ -34,221 +35,163 @@ LEVELS = (
     ("filters",),
     ("",),
 )
-FLOORS = {room: floor for floor, level in enumerate(LEVELS) for room in level}
-# A heavy package has a home.
-HOMES = {
-    "cvxpy": {"triangular"},
-    "ot": {"coupling"},
-    "filterpy": {"kalman"},
-    "networkx": {"network"},
-    "xarray": {"filters"},
+LAYER_OF = {name: k for k, layer in enumerate(LAYERS) for name in layer}
+# Each heavy package may be imported in one subpackage only.
+HEAVY = {
+    "cvxpy": "triangular",
+    "ot": "coupling",
+    "filterpy": "kalman",
+    "networkx": "network",
+    "xarray": "filters",
 }
-# What only the book's tools need: the library knows nothing of them.
+# Packages of the book's tools, which the library must not mention.
 BOOK = ("bookkit", "matplotlib", "loky", "cloudpickle", "threadpoolctl", "pandas")
+LONGEST_FUNCTION = 60
+"""Lines of a formatted function, its docstring not counted: a function fits on a screen."""
 
 
-def dotted(path: Path) -> str:
+def module_name(path: Path) -> str:
     """Return a module's name below the package: ``network.channel``, '' for the package itself."""
     name = path.relative_to(PACKAGE).with_suffix("").as_posix().replace("/", ".")
     return name.removesuffix("__init__").rstrip(".")
 
 
-def part(name: str) -> str:
-    """Return the folder or the single module that a dotted name belongs to."""
+def first_part(name: str) -> str:
+    """Return the first part of a dotted name: the subpackage or top-level module."""
     return name.split(".")[0]
 
 
 def imports(path: Path) -> set[str]:
-    """Return the full names of what a module imports, at its top or inside."""
-    out = set()
+    """Return the full names that a module imports, at its top or inside functions."""
+    names = set()
     for node in ast.walk(TREES[path]):
         if isinstance(node, ast.Import):
-            out |= {alias.name for alias in node.names}
+            names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
             if node.level:
-                here = path.relative_to(ROOT).with_suffix("").parts[: -node.level]
-                base = ".".join([*here, *filter(None, [node.module])])
-            out |= {f"{base}.{alias.name}" for alias in node.names}
-    return out
+                # A relative import: go up `level` folders from the module's own path.
+                package = path.relative_to(ROOT).with_suffix("").parts[: -node.level]
+                base = ".".join([*package, base]).rstrip(".")
+            names |= {f"{base}.{alias.name}" for alias in node.names}
+    return names
 
 
-def test_modules_import_only_from_floors_below() -> None:
+def library_imports(path: Path) -> set[str]:
+    """Return the names of the library that a module imports, without ``distfilt.``."""
+    names = imports(path)
+    return {n.removeprefix("distfilt.") for n in names if n.startswith("distfilt.")}
+
+
+def functions(folder: Path) -> Iterator[tuple[Path, ast.FunctionDef]]:
+    """Yield every function below a folder with its file."""
+    for path in sorted(folder.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                yield path, node
+
+
+def line_count(node: ast.FunctionDef) -> int:
+    """Count a function's lines from its name to its end, without the docstring."""
+    lines = (node.end_lineno or node.lineno) - node.lineno + 1
+    if ast.get_docstring(node):
+        docstring = node.body[0]
+        lines -= (docstring.end_lineno or 0) - docstring.lineno + 1
+    return lines
+
+
+def test_modules_import_only_from_layers_below() -> None:
     for path in PATHS:
-        here = part(dotted(path))
-        names = [
-            n.removeprefix("distfilt.")
-            for n in imports(path)
-            if n.startswith("distfilt.")
-        ]
-        wanted = {part(name) for name in names} - {"__version__"}
-        assert here in FLOORS, f"{here} has no floor: add it to FLOORS"
-        for other in wanted - {here}:
-            assert FLOORS[other] < FLOORS[here], (
-                f"{here} imports {other}, which is not below it"
-            )
+        importer = first_part(module_name(path))
+        assert importer in LAYER_OF, f"{importer} has no layer: add it to LAYERS"
+        imported = {first_part(name) for name in library_imports(path)}
+        for other in imported - {importer, "__version__"}:
+            below = LAYER_OF[other] < LAYER_OF[importer]
+            assert below, f"{importer} imports {other}, which is not in a layer below"
 
 
-def test_the_library_knows_nothing_of_the_book() -> None:
+def test_library_does_not_depend_on_the_book() -> None:
     for path in PATHS:
         text = path.read_text(encoding="utf-8")
         assert [name for name in BOOK if name in text] == []
 
 
-def test_heavy_packages_stay_at_home() -> None:
+def test_heavy_packages_are_imported_in_one_subpackage_only() -> None:
     for path in PATHS:
-        here = part(dotted(path))
-        for package in {part(name) for name in imports(path)} & set(HOMES):
-            home = HOMES[package]
-            assert here in home, (
-                f"{here} imports {package}, whose home is {sorted(home)}"
-            )
+        importer = first_part(module_name(path))
+        for package in {first_part(name) for name in imports(path)} & set(HEAVY):
+            allowed = HEAVY[package]
+            assert importer == allowed, f"{importer} imports {package}, not {allowed}"
 
 
-def test_modules_are_short_and_say_what_is_public() -> None:
+def test_no_subpackage_imports_private_names_of_another() -> None:
     for path in PATHS:
-        text = path.read_text(encoding="utf-8")
-        assert len(text.splitlines()) <= MODULE, f"{path.name} is too long"
-        name = f"distfilt.{dotted(path)}".rstrip(".")
+        importer = first_part(module_name(path))
+        for name in library_imports(path) - {"__version__"}:
+            parts = name.split(".")
+            private = any(part.startswith("_") for part in parts)
+            assert parts[0] == importer or not private, f"{path}: {name} is private"
+
+
+def test_modules_and_public_names_have_docstrings() -> None:
+    for path in PATHS:
+        name = f"distfilt.{module_name(path)}".rstrip(".")
         module = importlib.import_module(name)
-        assert module.__doc__, f"{name}: a module starts with what it is for"
-        for shown in module.__all__:
-            value = getattr(module, shown)
-            if callable(value) and getattr(value, "__module__", "").startswith(
-                "distfilt"
-            ):
-                assert value.__doc__, f"{shown} has no docstring"
+        assert module.__doc__, f"{name} has no docstring"
+        for public in module.__all__:
+            value = getattr(module, public)
+            home = getattr(value, "__module__", "")
+            if callable(value) and home.startswith("distfilt"):
+                assert value.__doc__, f"{name}.{public} has no docstring"
 
 
-DOCUMENTED = ast.Module | ast.ClassDef | ast.FunctionDef
+@pytest.mark.parametrize("folder", ["distfilt", "book/kit", "book/tools"])
+def test_functions_fit_on_a_screen(folder: str) -> None:
+    for path, node in functions(ROOT / folder):
+        lines = line_count(node)
+        fits = lines <= LONGEST_FUNCTION
+        assert fits, f"{path.name}: {node.name} has {lines} lines: split it"
 
 
-def spanned(node: ast.stmt) -> range:
-    """Return the numbers of a statement's lines, its decorators' included."""
-    first = min([node.lineno, *(d.lineno for d in getattr(node, "decorator_list", ()))])
-    return range(first, (node.end_lineno or first) + 1)
+def test_names_that_the_book_never_uses_are_found() -> None:
+    """The warning of ``make style``: no code uses nothing, code with every name uses all."""
+    names = unused_names("")
+    assert "filters.EnsembleFilter" in names
+    assert unused_names(" ".join(names)) == []
+    assert "filters.EnsembleFilter" not in unused_names(code_of_pages())
 
 
-def test_functions_fit_a_screen() -> None:
-    for path in PATHS:
-        for node in ast.walk(TREES[path]):
-            if isinstance(node, ast.FunctionDef):
-                told = len(spanned(node.body[0])) if ast.get_docstring(node) else 0
-                assert len(spanned(node)) - told <= 40, (
-                    f"{path.name}: {node.name} is too long"
-                )
-
-
-IDLE = {
-    tokenize.COMMENT,
-    tokenize.NL,
-    tokenize.NEWLINE,
-    tokenize.INDENT,
-    tokenize.DEDENT,
-    tokenize.ENDMARKER,
-}
-
-
-def code_lines(path: Path) -> int:
-    """Count the lines that hold code: no docstring, no comment, no blank line."""
-    found: set[int] = set()
-    with path.open("rb") as lines:
-        for token in list(tokenize.tokenize(lines.readline))[1:]:
-            if token.type not in IDLE:
-                found |= set(range(token.start[0], token.end[0] + 1))
-    for node in ast.walk(TREES[path]):
-        if isinstance(node, DOCUMENTED) and ast.get_docstring(node):
-            found -= set(spanned(node.body[0]))
-    return len(found)
-
-
-MODULE = 400
-LIMITS = {
-    "lines": 8000,
-    "files": 90,
-    "rooms": 16,
-    "names": 260,
-    "unreached": 0,
-    "private": 0,
-}
-
-
-def private_imports() -> list[str]:
-    """Names with an underscore that a room takes from another one."""
-    found = []
-    for path in PATHS:
-        here = part(dotted(path))
-        for name in imports(path):
-            inside = name.removeprefix("distfilt.").split(".")
-            other = name.startswith("distfilt.") and inside[0] != here
-            if other and any(p.startswith("_") and p != "__version__" for p in inside):
-                found.append(f"{dotted(path)}: {name}")
-    return found
-
-
-def unreached() -> list[str]:
-    """Public names that no code of a page, study or example says, and that nothing returns."""
-    book = ROOT / "book"
-    pages = "\n".join(page.read_text(encoding="utf-8") for page in book.glob("*.md"))
-    block = re.compile(r"^(`{3,}).*?^\1", re.S | re.M)
-    code = [found[0] for found in block.finditer(pages)]
-    code += re.findall(r"`[^`]+`", block.sub("", pages))
-    for folder in ("studies", "examples"):
-        code += [
-            path.read_text(encoding="utf-8") for path in (book / folder).glob("*.py")
-        ]
-    for path in PATHS:
-        code += re.findall(r"-> .*?:\n", path.read_text(encoding="utf-8"), re.S)
-    known = set(re.findall(r"\w+", " ".join(code)))
-    names = {
-        name
-        for room in rooms()
-        for name, thing in public(room).items()
-        if callable(thing)
-    }
-    return sorted(name for name in names if name.rpartition(".")[2] not in known)
-
-
-def test_the_library_stays_small() -> None:
-    found = {
-        "lines": sum(code_lines(path) for path in PATHS),
-        "files": len(PATHS),
-        "rooms": len({part(dotted(path)) for path in PATHS} - {""}),
-        "names": sum(len(public(room)) for room in rooms()),
-        "unreached": len(unreached()),
-        "private": len(private_imports()),
-    }
-    over = {what: n for what, n in found.items() if n > LIMITS[what]}
-    assert not over, f"{over} above {LIMITS}\n{unreached()}\n{private_imports()}"
-
-
-def test_every_room_is_seen_and_shows_what_it_exports() -> None:
-    """`dir` and completion find each room, and in it what a reader calls; helpers stay inside."""
-    seen = {name for name in dir(distfilt) if not name.startswith("__")}
-    inside = {part(dotted(path)) for path in PATHS} - {""}
+def test_dir_lists_subpackages_and_their_public_names() -> None:
+    """``dir`` and completion offer each subpackage and its exports, and no helper module."""
+    listed = {name for name in dir(distfilt) if not name.startswith("__")}
+    existing = {first_part(module_name(path)) for path in PATHS} - {""}
     folders = {path.parent.name for path in PATHS if path.parent.parent == PACKAGE}
-    assert folders - {"validation"} <= seen <= inside
-    faces = [getattr(distfilt, room) for room in seen]
-    assert [face for face in faces if not set(face.__all__) <= set(dir(face))] == []
+    assert folders - {"validation"} <= listed <= existing
+    for name in listed:
+        package = getattr(distfilt, name)
+        assert set(package.__all__) <= set(dir(package)), name
 
 
 def run(code: str, path: Path | None = None) -> str:
-    """Run code in a fresh interpreter, away from the repository; return what it prints."""
-    env = {**os.environ, "PYTHONPATH": str(path or "")}
-    command = [sys.executable, "-W", "error", "-c", code]
-    done = subprocess.run(
-        command, cwd=path or ROOT.parent, env=env, capture_output=True, text=True
+    """Run code in a fresh interpreter, outside the repository; return its standard output."""
+    result = subprocess.run(
+        [sys.executable, "-W", "error", "-c", code],
+        cwd=path or ROOT.parent,
+        env={**os.environ, "PYTHONPATH": str(path or "")},
+        capture_output=True,
+        text=True,
     )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    assert result.returncode == 0, result.stderr
+    return result.stdout
 
 
 def test_import_loads_no_heavy_package() -> None:
-    heavy = [*HOMES, *BOOK, "ecos", "scipy.stats", "tqdm"]
-    modules = [f"distfilt.{dotted(path)}".rstrip(".") for path in PATHS]
+    heavy = [*HEAVY, *BOOK, "ecos", "scipy.stats", "tqdm"]
+    modules = [f"distfilt.{module_name(path)}".rstrip(".") for path in PATHS]
     for names in (["distfilt"], modules):
-        code = f"import sys, {', '.join(names)}; print([h for h in {heavy} if h in sys.modules])"
-        assert run(code).strip() == "[]"
+        statement = f"import sys, {', '.join(names)}"
+        loaded = f"[name for name in {heavy} if name in sys.modules]"
+        assert run(f"{statement}; print({loaded})").strip() == "[]"
 
 
 def test_lock_names_no_registry_and_has_a_hash_for_every_file() -> None:
@@ -258,43 +201,42 @@ def test_lock_names_no_registry_and_has_a_hash_for_every_file() -> None:
     assert pins and all("==" in pin and "--hash=sha256:" in pin for pin in pins)
 
 
+def test_version_stands_in_one_place_and_is_the_one_to_cite() -> None:
+    """Both packages take it from ``distfilt/__init__.py``; citation and changelog agree."""
+    for name in ("pyproject.toml", "book/kit/pyproject.toml"):
+        settings = tomllib.loads((ROOT / name).read_text(encoding="utf-8"))
+        assert settings["project"]["dynamic"] == ["version"]
+        source = (ROOT / name).parent / settings["tool"]["hatch"]["version"]["path"]
+        assert source.resolve() == PACKAGE / "__init__.py"
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == distfilt.__version__
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert f"## [{distfilt.__version__}] - {citation['date-released']}" in changes
+
+
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build the wheel without a network and unpack it; return the folder."""
     folder = tmp_path_factory.mktemp("wheel")
-    command = [
-        sys.executable,
-        "-m",
-        "pip",
-        "wheel",
-        "--quiet",
-        "--no-index",
-        "--no-deps",
-    ]
-    command += ["--no-build-isolation", "--wheel-dir", str(folder), str(ROOT)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    (built,) = folder.glob("distfilt-*.whl")
+    options = ["--quiet", "--no-index", "--no-deps", "--no-build-isolation"]
+    command = [sys.executable, "-m", "pip", "wheel", *options]
+    command += ["--wheel-dir", str(folder), str(ROOT)]
+    result = subprocess.run(command, capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    (built,) = folder.glob(f"distfilt-{distfilt.__version__}-*.whl")
     target = folder / "installed"
     with zipfile.ZipFile(built) as archive:
         archive.extractall(target)
     return target
 
 
-def test_wheel_holds_the_library_and_nothing_else_in_one_version(wheel: Path) -> None:
-    told = ("pyproject.toml", "book/kit/pyproject.toml", "CITATION.cff", "CHANGELOG.md")
-    assert all(
-        distfilt.__version__ in (ROOT / name).read_text("utf-8") for name in told
-    )
-    assert sorted(p.name.partition("-")[0] for p in wheel.iterdir()) == [
-        "distfilt",
-        "distfilt",
-    ]
-    files = (p for p in (wheel / "distfilt").rglob("*") if p.is_file())
-    found = sorted(p.relative_to(wheel / "distfilt") for p in files)
-    assert found == sorted(
-        p.relative_to(PACKAGE) for p in [*PATHS, PACKAGE / "py.typed"]
-    )
+def test_wheel_holds_the_library_and_nothing_else(wheel: Path) -> None:
+    top = sorted(path.name.partition("-")[0] for path in wheel.iterdir())
+    assert top == ["distfilt", "distfilt"]  # the package and its metadata
+    packed = [p for p in (wheel / "distfilt").rglob("*") if p.is_file()]
+    names = sorted(path.relative_to(wheel / "distfilt") for path in packed)
+    sources = [*PATHS, PACKAGE / "py.typed"]
+    assert names == sorted(path.relative_to(PACKAGE) for path in sources)
 
 
 def test_installed_library_runs_alone(wheel: Path) -> None:

@@ -112,7 +112,7 @@ def test_derivatives_far_from_the_origin_and_of_small_things() -> None:
         want = distance([0, 1], std=1.0, origin=far).jacobian(at)
         assert np.abs(see.jacobian(at) - want).max() < 1e-4
     wrong = Sensor(1, lambda x: x[..., :1], [[1.0]], linear=lambda d: np.eye(d)[1:2])
-    with pytest.raises(ValueError, match="linear must be the matrix of its function"):
+    with pytest.raises(ValueError, match="linear must return the matrix of h"):
         wrong.H(2)
 
 

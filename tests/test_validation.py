@@ -14,10 +14,19 @@ import numpy as np
 import pytest
 
 from distfilt.validation.annotations import Scope
-from tests.tools.calls import Call, callables, calls, describe, public, rooms
+from tests.tools.calls import (
+    Call,
+    callables,
+    calls,
+    describe,
+    public_names,
+    subpackages,
+)
 from tests.tools.fuzz import exact, kinds
 
-PUBLIC = {name: thing for room in rooms() for name, thing in public(room).items()}
+PUBLIC = {
+    name: thing for room in subpackages() for name, thing in public_names(room).items()
+}
 WITHOUT = {
     r"linalg\..*": "for loops, which have checked before",
     r".*(Error|Collapse|Gain|Disconnected)": "an error or a warning, which a user catches",
@@ -50,12 +59,12 @@ IN_A_ROW = {
 
 def refuses(value: Any, call: Call, name: str) -> bool:
     """Whether the kinds themselves, asked in the door's order, refuse a value by its name."""
-    given = call.given | {name: copy.deepcopy(value)}
-    scope = Scope(dict(given))
+    arguments = call.arguments | {name: copy.deepcopy(value)}
+    scope = Scope(dict(arguments))
     for other, kind in describe(call.function).items():
         try:
-            if other in given:
-                kind.check(given[other], other, scope)
+            if other in arguments:
+                kind.check(arguments[other], other, scope)
         except ValueError as error:
             return other == name and str(error).startswith(name)
         except Exception:  # an object of which an array cannot be made
@@ -79,20 +88,22 @@ def test_a_door_refuses_by_name(name: str) -> None:
         found = calls(thing, function)
         assert found or method or inspect.isclass(thing), f"{name}: no example calls it"
         for call, (argument, kind) in product(found[:1], describe(function).items()):
-            if argument not in call.given:
+            if argument not in call.arguments:
                 continue
             bad = [
-                v for _, v in kinds(call.given[argument]) if refuses(v, call, argument)
+                v
+                for _, v in kinds(call.arguments[argument])
+                if refuses(v, call, argument)
             ]
             assert bad, f"{name}{method}({argument}): {kind.needs} refuses nothing"
             for value in bad:
-                before = copy.deepcopy(call.given)
+                before = copy.deepcopy(call.arguments)
                 with pytest.raises(ValueError) as caught:
                     call.run(**{argument: value})
                 assert str(caught.value).startswith(argument), (
                     f"{name}{method}: {caught.value}"
                 )
-                assert exact(before, call.given)
+                assert exact(before, call.arguments)
 
 
 @pytest.mark.parametrize("name", sorted(PUBLIC))
@@ -103,7 +114,7 @@ def test_a_valid_call_changes_none_of_its_arguments(name: str) -> None:
             after = call.run()[1]
             kept = {
                 k: v
-                for k, v in call.given.items()
+                for k, v in call.arguments.items()
                 if not isinstance(v, np.random.Generator)
             }
             assert exact(kept, {k: after[k] for k in kept}), function

@@ -36,8 +36,8 @@ STEPS = {k: v / SWARM["dt"] for k, v in PAPERS.items()}
 PRINTED = {"noise": "observed", "mass_std": SHARING["mass_std"]}
 HALF = Faults(loss=0.5, seed=3)
 SCHEMES: dict[str, tuple[Any, dict[str, Any]]] = {
-    "central": (density.Centralised(), {"first": "observed"}),
-    "central_printed": (density.Centralised(), {"first": "observed", **PRINTED}),
+    "central": (density.Centralised(), {"initial_density": "observed"}),
+    "central_printed": (density.Centralised(), {"initial_density": "observed", **PRINTED}),
     "paper": (density.PIConsensus(modes=MODES, **PAPERS), {}),
     "paper_printed": (density.PIConsensus(modes=MODES, **PAPERS), PRINTED),
     "paper_flat": (density.PIConsensus(modes=MODES, initial_std=FLAT, **PAPERS), {}),

@@ -277,7 +277,7 @@ def angles(s: Any = HELD, agents: int | None = None) -> Problem:
     )
     at = np.stack([np.linspace(-6, 6, agents), np.full(agents, -8.0)], axis=-1)
     eyes = [
-        sensors.line_angle((0, 1), std=s["angle_std"], full=True, origin=o) for o in at
+        sensors.bearing((0, 1), std=s["angle_std"], origin=o) for o in at
     ]
     prior = np.zeros(4), np.diag([4.0, 4.0, 0.25, 0.25])
     return Problem(
@@ -349,8 +349,8 @@ class PassedOn:
     def next_state(self, step: Any) -> Any:
         """Flood, then go on as the family does."""
         if step.channel is not None:
-            step.said = flooded(step.said, step.channel, step.t)
-        return super().advance(step)  # type: ignore[misc]
+            step.observations = flooded(step.observations, step.channel, step.t)
+        return super().next_state(step)  # type: ignore[misc]
 
 
 def flooded(
@@ -399,7 +399,7 @@ class MeasurementConsensus(GaussianFilter):
 
     _: KW_ONLY
     agree: Callable[..., Array] = network.finite_time_consensus
-    share: bool = False
+    share_observations: bool = False
 
     def next_state(self, step: Any) -> Any:
         """Forecast, linearise the own reading, agree, add the information."""
@@ -411,7 +411,7 @@ class MeasurementConsensus(GaussianFilter):
         P = slope @ step.state.covariances @ slope.mT + self.model.Q(t, dt)
         P = self.inflation**2 * P
         said = np.zeros((*m.shape[:-1], d, d + 1))
-        for _, heard in step.heard():
+        for _, heard in step.received():
             a = heard.agents
             H = heard.jacobian(m[..., a, :])
             at = m[..., a, :, None]
@@ -465,7 +465,7 @@ class OwnState(GaussianFilter):
     _: KW_ONLY
     size: int = 4
     news: bool = True
-    share: bool = False
+    share_observations: bool = False
 
     def next_state(self, step: Any) -> Any:
         """Forecast, take the own reading, tell, learn."""
@@ -479,7 +479,7 @@ class OwnState(GaussianFilter):
             F @ step.state.covariances @ F.mT + self.model.Q(t, dt)
         )
         before = information(m, P, n)
-        for _, heard in step.heard():
+        for _, heard in step.received():
             H = heard.jacobian(m)
             gain = P @ H.mT @ np.linalg.inv(H @ P @ H.mT + heard.noise)
             gap = heard.target - heard.predict(m[..., None, :])[..., 0, :]
@@ -554,7 +554,7 @@ class LikelihoodConsensus(ParticleFilter):
     agree: Callable[..., Array] = network.finite_time_consensus
     degree: int = 2
     places: tuple[int, ...] = (0, 1)
-    share: bool = False
+    share_observations: bool = False
 
     def initial_state(
         self, prior: Any, runs: tuple[int, ...], rng: Any
@@ -564,7 +564,7 @@ class LikelihoodConsensus(ParticleFilter):
             self.draw_prior(prior, (*runs, 1), rng), self.n_agents, axis=-3
         )
         return {
-            "points": points,
+            "particles": points,
             "log_weights": np.full(points.shape[:-1], -np.log(self.members)),
         }
 
@@ -572,7 +572,7 @@ class LikelihoodConsensus(ParticleFilter):
         """Resample and move alike, agree on likelihoods, weigh."""
         from distfilt.updates.particles import log_likelihood
 
-        x = step.state.points[..., 0, :, :]
+        x = step.state.particles[..., 0, :, :]
         w = step.state.weights.mean(axis=-2)
         x = np.take_along_axis(x, resample(w, rng=step.rng)[..., None], axis=-2)
         if self.jitter:
@@ -581,7 +581,7 @@ class LikelihoodConsensus(ParticleFilter):
         x = self.model.sample_step(x, step.state.t, step.dt, rng=step.rng)
         points = np.repeat(x[..., None, :, :], self.n_agents, axis=-3)
         logs = np.zeros(points.shape[:-1])
-        for _, heard in step.heard():
+        for _, heard in step.received():
             a = heard.agents
             seen = heard.predict(points[..., a, :, :])
             logs[..., a, :] = log_likelihood(seen, heard.target, heard.noise)
@@ -593,7 +593,7 @@ class LikelihoodConsensus(ParticleFilter):
         logs = np.maximum(
             logs - np.log(np.exp(logs).sum(axis=-1, keepdims=True)), -1e300
         )
-        return step.end(points=points, log_weights=logs, past=())
+        return step.end(particles=points, log_weights=logs, past=())
 
 
 def polynomials(x: Array, degree: int) -> Array:
@@ -657,7 +657,7 @@ class GridFilter(filters.Filter):
         with np.errstate(divide="ignore"):
             logs = np.maximum(np.log(moved.T.reshape(old.shape)), -700.0)
         said = np.zeros_like(logs)
-        for _, heard in step.heard():
+        for _, heard in step.received():
             a = heard.agents
             seen = heard.predict(
                 np.broadcast_to(self.centres, (*said[..., a, :].shape, 2))
@@ -671,11 +671,11 @@ class GridFilter(filters.Filter):
                 )
             said[..., a, :] = -0.5 * (gap / variance[..., None, :]).sum(axis=-1)
         if self.likelihoods:
-            (said,) = step.agreed(said)
+            (said,) = step.fuse(said)
             return step.end(logs=logs + self.n_agents * said)
         logs = logs + said
         logs = logs - logs.max(axis=-1, keepdims=True)
-        (logs,) = step.agreed(np.maximum(logs, -700.0))
+        (logs,) = step.fuse(np.maximum(logs, -700.0))
         return step.end(logs=logs)
 
     def summarize(self, state: Any) -> Any:
@@ -708,7 +708,7 @@ def spread_of(cells: int, half: float, model: Any, dt: float) -> Any:
     x = centres_of(cells, half)
     std = float(np.sqrt(model.Q(0.0, dt)[0, 0]))
     near = KDTree(x).sparse_distance_matrix(
-        KDTree(x @ model.transition(dt).T), 5 * std, output_type="coo_matrix"
+        KDTree(x @ model.F(dt).T), 5 * std, output_type="coo_matrix"
     )
     kernel = csr_array(
         (np.exp(-0.5 * (near.data / std) ** 2), (near.row, near.col)), near.shape
@@ -763,7 +763,7 @@ def gaussian(
             p.model,
             p.sensors,
             p.graph,
-            rule=rule,
+            linearization=rule,
             inflation=value,
             on_error="keep",
             **options,
@@ -916,27 +916,27 @@ CELLS_OF = "{} components need 40 to the power of {} cells"
 SIZES = {"linear": 4, "lorenz": 3, "places": 16, "star": 3, "angles": 4}
 PLANE = tuple((name, CELLS_OF.format(d, d)) for name, d in SIZES.items())
 CELLS = {
-    "ekf_alone": Cell("Kalman, extended", "nothing", gaussian(share=False), *WIDER),
+    "ekf_alone": Cell("Kalman, extended", "nothing", gaussian(share_observations=False), *WIDER),
     "ekf_near": Cell("Kalman, extended", "readings, one hop", gaussian(), *WIDER),
     "ekf_naive": Cell(
         "Kalman, extended",
         "beliefs, multiplied",
-        gaussian(share=False, agreement=network.naive_fusion),
+        gaussian(share_observations=False, fusion=network.naive_fusion),
         *WIDER,
     ),
     "ekf_trace": Cell(
-        "Kalman, extended", "readings, CI by trace", gaussian(agreement=TRACE), *WIDER
+        "Kalman, extended", "readings, CI by trace", gaussian(fusion=TRACE), *WIDER
     ),
     "ekf_ci": Cell(
         "Kalman, extended",
         "readings, CI by determinant",
-        gaussian(agreement=CI),
+        gaussian(fusion=CI),
         *WIDER,
     ),
     "ekf_info": Cell(
         "Kalman, extended",
         "beliefs, four rounds of equal CI",
-        gaussian(share=False, agreement=partial(covariance_intersection, rounds=4)),
+        gaussian(share_observations=False, fusion=partial(covariance_intersection, rounds=4)),
         *WIDER,
     ),
     "ekf_two": Cell(
@@ -956,19 +956,19 @@ CELLS = {
     "ekf_flood": Cell(
         "Kalman, extended",
         "readings, passed on",
-        gaussian(FloodedGaussian, share=False),
+        gaussian(FloodedGaussian, share_observations=False),
         *WIDER,
     ),
     "ukf_ci": Cell(
         "Kalman, unscented",
         "readings, CI by determinant",
-        gaussian(rule="unscented", agreement=CI),
+        gaussian(rule="unscented", fusion=CI),
         *WIDER,
     ),
     "ukf_flood": Cell(
         "Kalman, unscented",
         "readings, passed on",
-        gaussian(FloodedGaussian, rule="unscented", share=False),
+        gaussian(FloodedGaussian, rule="unscented", share_observations=False),
         *WIDER,
     ),
     "news": Cell(
@@ -1006,7 +1006,7 @@ CELLS = {
     "known_flood": Cell(
         "ensemble, known noise",
         "readings, passed on",
-        ensemble(enkf, FloodedEnsemble, share=False),
+        ensemble(enkf, FloodedEnsemble, share_observations=False),
         *WIDER,
     ),
     "exact_ci": Cell(
@@ -1015,13 +1015,13 @@ CELLS = {
     "root_ci": Cell(
         "ensemble, square root",
         "readings, CI by determinant",
-        ensemble(etkf, agreement=network.intersect_ensembles),
+        ensemble(etkf, fusion=network.intersect_ensembles),
         *WIDER,
     ),
     "root_flood": Cell(
         "ensemble, square root",
         "readings, passed on",
-        ensemble(etkf, FloodedEnsemble, share=False),
+        ensemble(etkf, FloodedEnsemble, share_observations=False),
         *WIDER,
     ),
     "maps_near": Cell(
@@ -1034,12 +1034,12 @@ CELLS = {
     "maps_flood": Cell(
         "ensemble, separable maps",
         "readings, passed on",
-        ensemble(SEPARABLE, FloodedEnsemble, share=False),
+        ensemble(SEPARABLE, FloodedEnsemble, share_observations=False),
         *WIDER,
         empty=MAPS,
     ),
     "pf_alone": Cell(
-        "particles", "nothing", particles(share=False), *JITTER, empty=CLOUD
+        "particles", "nothing", particles(share_observations=False), *JITTER, empty=CLOUD
     ),
     "pf_near": Cell(
         "particles", "readings, one hop", particles(), *JITTER, empty=CLOUD
@@ -1047,7 +1047,7 @@ CELLS = {
     "pf_ci": Cell(
         "particles",
         "readings, CI by determinant",
-        particles(agreement=intersected),
+        particles(fusion=intersected),
         *JITTER,
         empty=CLOUD,
     ),
@@ -1057,7 +1057,7 @@ CELLS = {
     "pf_flood": Cell(
         "particles",
         "readings, passed on",
-        particles(FloodedParticles, share=False),
+        particles(FloodedParticles, share_observations=False),
         *JITTER,
         empty=CLOUD,
     ),
@@ -1091,13 +1091,13 @@ CELLS = {
     "grid_mean": Cell(
         "density on a grid",
         "beliefs, geometric mean",
-        gridded(share=False, agreement=network.average_consensus),
+        gridded(share_observations=False, fusion=network.average_consensus),
         empty=PLANE,
     ),
     "grid_flood": Cell(
         "density on a grid",
         "readings, passed on",
-        gridded(FloodedGrid, share=False),
+        gridded(FloodedGrid, share_observations=False),
         empty=PLANE,
     ),
 }
@@ -1136,7 +1136,7 @@ def scored(
     batches: Iterable[Any] = range(runs) if alone else [slice(None)]
     for part in batches:
         state = f.start(
-            prior, rng=rng if f.draws else None, runs=() if alone else (runs,)
+            prior, rng=rng if f.requires_rng else None, runs=() if alone else (runs,)
         )
         run = f.run(
             state,
@@ -1169,7 +1169,7 @@ def log_scores(p: Problem, f: Any, data: Any, rng: Any, *, own: bool = False) ->
     state = f.start(
         p.own.prior if own and p.own else p.prior,
         runs=truth.shape[1:2],
-        rng=rng if f.draws else None,
+        rng=rng if f.requires_rng else None,
     )
     at = [list(f.model.names).index(name) for name in p.scored]
     known = np.stack(list(p.known(truth).values()), axis=-1)

@@ -47,10 +47,10 @@ class Mixtures(filters.Filter):
     rule: str = "C3"
     stretch: float | None = None
     inflation: float = 1.0
-    share: bool = False
+    share_observations: bool = False
 
-    state = MixturesState
-    unused = {"lag": "a mixture filter keeps no past"}
+    state_class = MixturesState
+    unsupported = {"lag": "a mixture filter keeps no past"}
 
     def initial_state(
         self, prior: Any, runs: tuple[int, ...], rng: Any
@@ -78,7 +78,7 @@ class Mixtures(filters.Filter):
         w, m, P = moved(
             belief, lambda x: self.model.step(x, t, dt), self.model.Q(t, dt)
         )
-        for agent, said in enumerate(step.said):
+        for agent, said in enumerate(step.observations):
             for reading in (r for r in said if not np.isnan(r.value).all()):
                 part = w[..., agent, :], m[..., agent, :, :], P[..., agent, :, :, :]
                 part = updated(part, reading.value, self.sensors[agent])

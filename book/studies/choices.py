@@ -21,15 +21,15 @@ PAPER = "das"
 
 STDS = (0.02, 0.05, 0.1, 0.2)
 """Deviations of the pretended reading of the squared length, in m²; columns have thousandths."""
-READINGS = ("shift", "particle")
+VARIANTS = ("shift", "particle")
 UPDATES = {
     f"OTMA_{round(1000 * std)}": with_augmentation(etpf, pendulum.rod, std=std)
     for std in STDS
 }
-for _reading in READINGS:
-    _how = {**pendulum.how, "reading": _reading}
-    UPDATES[f"OTNLeq_{_reading}"] = with_projection(etpf, pendulum.rod, **_how)
-    UPDATES[f"OTNLeqMA_{_reading}"] = with_projection(
+for _variant in VARIANTS:
+    _how = {**pendulum.how, "variant": _variant}
+    UPDATES[f"OTNLeq_{_variant}"] = with_projection(etpf, pendulum.rod, **_how)
+    UPDATES[f"OTNLeqMA_{_variant}"] = with_projection(
         pendulum.seen_too, pendulum.rod, **_how
     )
 SCORES = (*starts.SCORES, "normal")
@@ -72,7 +72,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
 
 
 parameters = {name: np.asarray(setting[name]).tolist() for name in setting}
-parameters |= {"stds": list(STDS), "readings": list(READINGS)}
+parameters |= {"stds": list(STDS), "variants": list(VARIANTS)}
 columns = (
     *(f"low_OTF_{key}" for key in SCORES),
     *(

@@ -32,7 +32,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One swarm."""
     filters = {
         "central": swarm.network("central", CASE),
-        "central_flat": swarm.network("central", CASE, first="flat"),
+        "central_flat": swarm.network("central", CASE, initial_density="flat"),
         "flooding": swarm.network("flooding", CASE),
     }
     run, _ = swarm.compared(CASE, np.random.default_rng(seed), filters)

@@ -95,52 +95,52 @@ def mean_of(own: GaussianMixture, heard: list[GaussianMixture]) -> GaussianMixtu
 
 SCALE = [1.0, 1.0, 1.0, 6.8, 6.8, 6.8]
 MANY = {
-    "stretch": TABLE["stretch"],
-    "scale": np.tile(SCALE, 2),
-    "size": TABLE["mixands"],
-    "most": TABLE["mixands"],
+    "split_threshold": TABLE["stretch"],
+    "split_scale": np.tile(SCALE, 2),
+    "n_components": TABLE["mixands"],
+    "max_components": TABLE["mixands"],
 }
-MORE = {**MANY, "size": TABLE["late_mixands"], "most": TABLE["late_mixands"]}
-ONE = {"size": 1, "most": 1}
+MORE = {**MANY, "n_components": TABLE["late_mixands"], "max_components": TABLE["late_mixands"]}
+ONE = {"n_components": 1, "max_components": 1}
 IN_TURN = partial(
     fuse_sequentially, pair=partial(fuse_mixtures, n_components=TABLE["mixands"])
 )
 SINGLE = {
     "one_none": ONE,
-    "one_ci": {**ONE, "agreement": partial(fuse_moments, omega="equal")},
+    "one_ci": {**ONE, "fusion": partial(fuse_moments, omega="equal")},
     "news": {"news": True},
 }
 CROWDED = {
     "none": MANY,
-    "turn": {**MANY, "agreement": IN_TURN},
+    "turn": {**MANY, "fusion": IN_TURN},
     **SINGLE,
     "half": {
         **ONE,
-        "agreement": partial(fuse_sequentially, pair=fuse_moments, omega=0.5),
+        "fusion": partial(fuse_sequentially, pair=fuse_moments, omega=0.5),
     },
 }
 ROWS = {
     "": {
         "none": MANY,
-        "c2": {**MANY, "agreement": partial(fuse_mixtures, rule="C2")},
-        "c3": {**MANY, "agreement": fuse_mixtures},
-        "all": {**MANY, "agreement": partial(fuse_mixtures, terms="all")},
-        "moments": {**MANY, "agreement": fuse_moments},
-        "average": {**MANY, "agreement": mean_of},
+        "c2": {**MANY, "fusion": partial(fuse_mixtures, rule="C2")},
+        "c3": {**MANY, "fusion": fuse_mixtures},
+        "all": {**MANY, "fusion": partial(fuse_mixtures, terms="all")},
+        "moments": {**MANY, "fusion": fuse_moments},
+        "average": {**MANY, "fusion": mean_of},
         **SINGLE,
-        "twice": {"news": True, "common": ()},
+        "twice": {"news": True, "shared_components": ()},
     },
     "late": {
         "none": MORE,
-        "c2": {**MORE, "agreement": lean},
-        "c3": {**MORE, "agreement": fuse_mixtures},
-        "moments": {**MORE, "agreement": fuse_moments},
+        "c2": {**MORE, "fusion": lean},
+        "c3": {**MORE, "fusion": fuse_mixtures},
+        "moments": {**MORE, "fusion": fuse_moments},
         **SINGLE,
         "many_news": {**MORE, "news": True},
     },
     "three": {
         **CROWDED,
-        "pass": {**MANY, "agreement": partial(fuse_mixtures, omega="equal")},
+        "pass": {**MANY, "fusion": partial(fuse_mixtures, omega="equal")},
     },
     "five": CROWDED,
     **{name: SINGLE for name in ("arctan", "sign", "fixes")},
@@ -228,10 +228,10 @@ def network(s: dict, options: dict) -> MixtureFilter:
     kind = MixtureFilter
     if chosen.pop("news", False):
         kind = InformationIncrementFilter
-        chosen = {"common": range(2, 8) if s["one_fix"] else (), **chosen}
-    if "agreement" in chosen:
-        chosen["agreement"] = partial(
-            target_fusion, target_dim=6, fuse=chosen["agreement"]
+        chosen = {"shared_components": range(2, 8) if s["one_fix"] else (), **chosen}
+    if "fusion" in chosen:
+        chosen["fusion"] = partial(
+            target_fusion, target_dim=6, fuse=chosen["fusion"]
         )
     return kind(
         moving(s, 2),
@@ -322,7 +322,7 @@ METRICS = (*ERRORS, "nees_t", "nees_e", "nees", "apart", "score")
 FEATURED = ("none", "c3")
 """Rows of the paper's scene of which what each agent errs and claims is kept too."""
 JOINT = {"bound": ONE}
-JOINT_LATE = {"bound": ONE, "joint": {**MORE, "scale": np.tile(SCALE, 3)}}
+JOINT_LATE = {"bound": ONE, "joint": {**MORE, "split_scale": np.tile(SCALE, 3)}}
 SIX = "{:.6g}"
 
 

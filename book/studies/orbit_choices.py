@@ -30,7 +30,7 @@ FIXES = {**paper.SETTING, "one_fix": False}
 
 def sized(mixands: int) -> dict[str, Any]:
     """Mixture filters that keep so many mixands."""
-    return {**paper.MANY, "size": mixands, "most": mixands}
+    return {**paper.MANY, "n_components": mixands, "max_components": mixands}
 
 
 CHOICES: dict[str, tuple[dict, dict, dict[str, Any]]] = {
@@ -45,8 +45,8 @@ CHOICES: dict[str, tuple[dict, dict, dict[str, Any]]] = {
     ),
     "mixands_6": (paper.SETTING, sized(6), {"c3": fuse_mixtures}),
     "mixands_24": (paper.SETTING, sized(24), {"c3": fuse_mixtures}),
-    "split_2": (paper.SETTING, {**paper.MANY, "stretch": 2.5}, {"c3": fuse_mixtures}),
-    "split_10": (paper.SETTING, {**paper.MANY, "stretch": 10.0}, {"c3": fuse_mixtures}),
+    "split_2": (paper.SETTING, {**paper.MANY, "split_threshold": 2.5}, {"c3": fuse_mixtures}),
+    "split_10": (paper.SETTING, {**paper.MANY, "split_threshold": 10.0}, {"c3": fuse_mixtures}),
     "fixes": (FIXES, paper.MANY, {"c3": fuse_mixtures}),
 }
 """A setting, what its filters are made of, and the rules of fusion that are tried with them."""
@@ -87,12 +87,12 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         truth, *rest = paper.data(s, np.random.default_rng(child))
         found = {"none": row(s, options, truth, tuple(rest))}
         for rule, fusion in rules.items():
-            found[rule] = row(s, {**options, "agreement": fusion}, truth, tuple(rest))
+            found[rule] = row(s, {**options, "fusion": fusion}, truth, tuple(rest))
         out |= {
             f"{name}_{rule}_{m}": v for rule, r in found.items() for m, v in r.items()
         }
     truth, *rest = paper.data(paper.SETTING, np.random.default_rng(child))
-    null = row(paper.SETTING, {**paper.ONE, "agreement": added}, truth, tuple(rest))
+    null = row(paper.SETTING, {**paper.ONE, "fusion": added}, truth, tuple(rest))
     out["added_nees"] = null["nees"]
     return {name: float(paper.SIX.format(v)) for name, v in out.items()}
 
@@ -135,8 +135,8 @@ def again(seed: np.random.SeedSequence) -> dict[str, float]:
     """The choice that is quick enough to run again wherever the study is read, and the null."""
     s, options, rules = CHOICES["mixands_6"]
     truth, *rest = paper.data(s, np.random.default_rng(seed.spawn(1)[0]))
-    fused = {**options, "agreement": rules["c3"]}
-    found = {"none": options, "c3": fused, "added": {**paper.ONE, "agreement": added}}
+    fused = {**options, "fusion": rules["c3"]}
+    found = {"none": options, "c3": fused, "added": {**paper.ONE, "fusion": added}}
     rows = {name: row(s, chosen, truth, tuple(rest)) for name, chosen in found.items()}
     out = {
         f"mixands_6_{name}_{m}": rows[name][m]

@@ -43,7 +43,7 @@ swing = pendulum(
     step=setting["integration_step"],
 )
 seen_too = with_augmentation(etpf, rod, std=setting["constraint_std"])
-how = {"reading": setting["reading"], "regularisation": setting["regularisation"]}
+how = {"variant": setting["variant"], "regularisation": setting["regularisation"]}
 UPDATES = {
     "OTF": etpf,
     "OTMA": seen_too,

@@ -63,7 +63,7 @@ options = {
 cartesian = pendulum(**options)
 chart = pendulum_angle(**options)
 seen_too = with_augmentation(etpf, rod, std=setting["constraint_std"])
-how = {"reading": setting["reading"], "regularisation": setting["regularisation"]}
+how = {"variant": setting["variant"], "regularisation": setting["regularisation"]}
 CARTESIAN = {
     "OTF": etpf,
     "OTMA": seen_too,

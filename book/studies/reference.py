@@ -40,9 +40,9 @@ STEPS = 20
 HALVINGS = 12
 ENOUGH = 1e-6
 APPLIES = [(a.kind, list(a.dims)) for a in SETUP.scenario.agents] == [
-    ("direct", [0, 1]),
-    ("angle", [1, 2]),
-    ("direct", [3, 4, 5]),
+    ("component", [0, 1]),
+    ("line_angle", [1, 2]),
+    ("component", [3, 4, 5]),
 ]
 columns = [
     *(
@@ -69,7 +69,7 @@ def guided(
     lead = (2, seen[0].shape[1])
     dt = float(SETUP.times[0])
     stds = [s.noise_cov[0, 0] for s in SETUP.sensors]
-    f = SETUP.model.transition(dt)
+    f = SETUP.model.F(dt)
     q = SETUP.model.Q(0.0, dt)
     flat = np.ix_(PLANE, PLANE)
     up = np.ix_(NORMAL, NORMAL)

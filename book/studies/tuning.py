@@ -64,7 +64,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         truth = np.broadcast_to(truth[:, None], shape)
         for name, (pca, own) in VERSIONS.items():
             f = satellites.published(s, pca=pca)
-            object.__setattr__(f, "agreement", partial(every_gain, include_self=own))
+            object.__setattr__(f, "fusion", partial(every_gain, include_self=own))
             late = satellites.run(s, f, for_filters, truth, seen).isel(time=s.settled)
             error = late["total_squared_error"].mean(("time", "agent")).values
             nees = late["nees"].mean(("time", "agent")).values / s.model.dim

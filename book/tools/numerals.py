@@ -56,7 +56,7 @@ import sys
 import tokenize
 import tomllib
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -351,7 +351,7 @@ def pieces(text: str) -> Iterator[tuple[int, str, str]]:
 FORMULA = re.compile(r"\$([^$]+)\$")
 
 
-def evaluated(text: str) -> float | None:
+def evaluate(text: str) -> float | None:
     """The value of a formula of numbers alone, or None."""
     text = re.sub(r"\\[td]?frac(\d)(\d)", r"(\1/\2)", text)
     text = re.sub(r"\\[td]?frac\{([^{}]*)\}\{([^{}]*)\}", r"((\1)/(\2))", text)
@@ -385,7 +385,7 @@ def of_formula(found: re.Match[str]) -> str:
     parts = re.split(r"(=|\\approx)", inside)
     if len(parts) > 2 and re.fullmatch(r" ?-?\d+(?:\.\d+)? ?", parts[-1]):
         given = float(parts[-1])
-        exact = evaluated(parts[-3])
+        exact = evaluate(parts[-3])
         loose = 0.02 * abs(given) if "approx" in parts[-2] else 0.0
         if exact is not None and abs(exact - given) <= max(
             loose, 0.5001 * step_of(parts[-1].strip(), given)
@@ -542,25 +542,25 @@ def constant(node: ast.AST) -> float | None:
     return None
 
 
-def compared(node: ast.AST) -> Iterator[float]:
+def compared_numbers(node: ast.AST) -> Iterator[float]:
     """Numbers that take part in a comparison by themselves, in a list, as a factor or a term."""
     value = constant(node)
     if value is not None:
         yield value
     elif isinstance(node, ast.List | ast.Tuple):
         for item in node.elts:
-            yield from compared(item)
+            yield from compared_numbers(item)
     elif isinstance(node, ast.Dict):
         for item in (*node.keys, *node.values):
             if item is not None:
-                yield from compared(item)
+                yield from compared_numbers(item)
     elif isinstance(node, ast.BinOp):
-        yield from compared(node.left)
-        yield from compared(node.right)
+        yield from compared_numbers(node.left)
+        yield from compared_numbers(node.right)
     elif isinstance(node, ast.Call) and node.args:
         name = getattr(node.func, "attr", getattr(node.func, "id", ""))
         if name in ("abs", "array", "log", "sqrt", "log10", "deg2rad"):
-            yield from compared(node.args[0])
+            yield from compared_numbers(node.args[0])
 
 
 def checks(node: ast.Assert, section: int, where: str) -> Iterator[Fact]:
@@ -575,92 +575,127 @@ def checks(node: ast.Assert, section: int, where: str) -> Iterator[Fact]:
                 low, high = sorted((ends[0], ends[2]))
                 yield Fact("check", low, high, where, section, words)
             for side in sides:
-                seen.update(compared(side))
+                seen.update(compared_numbers(side))
         elif isinstance(part, ast.Call):
             name = getattr(part.func, "attr", getattr(part.func, "id", ""))
             if name in ("isclose", "allclose", "array_equal"):
                 for side in part.args[:2]:
-                    seen.update(compared(side))
+                    seen.update(compared_numbers(side))
     for value in seen:
         yield Fact("check", value, value, where, section, words)
     message = node.msg.value if isinstance(node.msg, ast.Constant) else ""
     for said in numerals_of(str(message) + "\n", "", 0, 0):
         yield Fact(
-            "check", said.value, said.value, where, section, words, said.unit or "said"
+            "check",
+            said.value,
+            said.value,
+            where,
+            section,
+            words,
+            said.unit or "no unit",
         )
+
+
+class CodeNumbers:
+    """Walk over code and yield its numbers with the names that they are bound to."""
+
+    def __init__(self, code: str, where: str, section: int, kind: str) -> None:
+        self.where = where
+        self.section = section
+        self.kind = kind
+        self.tree = ast.parse(code)
+        self.comments: dict[int, str] = {}
+        for token in tokenize.generate_tokens(io.StringIO(code).readline):
+            if token.type == tokenize.COMMENT:
+                self.comments[token.start[0]] = token.string
+        # The first entry that fits a node says how its names are found.
+        self.visitors: list[tuple[Any, Callable[..., Iterator[Fact]]]] = [
+            (ast.Assign | ast.AnnAssign, self.visit_assignment),
+            (ast.Call, self.visit_call),
+            (ast.Dict, self.visit_dict),
+            (ast.FunctionDef, self.visit_function),
+            (ast.For, self.visit_loop),
+            (ast.BinOp | ast.Compare, self.visit_operation),
+        ]
+
+    def visit(self, node: ast.AST, names: tuple[str, ...]) -> Iterator[Fact]:
+        """Yield the numbers below a node; those of assertions are checks, not parameters."""
+        if isinstance(node, ast.Assert):
+            return
+        value = constant(node) if isinstance(node, ast.expr) else None
+        if value is not None:
+            yield self.fact(node, value, names)
+            # The terms of a sum or product of constants count as well.
+            if not isinstance(node, ast.BinOp):
+                return
+        for kind, visitor in self.visitors:
+            if isinstance(node, kind):
+                yield from visitor(node, names)
+                return
+        yield from self.visit_all(ast.iter_child_nodes(node), names)
+
+    def visit_all(
+        self, nodes: Iterable[ast.AST], names: tuple[str, ...]
+    ) -> Iterator[Fact]:
+        """Yield the numbers below several nodes."""
+        for node in nodes:
+            yield from self.visit(node, names)
+
+    def fact(self, node: Any, value: float, names: tuple[str, ...]) -> Fact:
+        """Return one number with the words of its names and of the comment beside it."""
+        words = stems(" ".join((*names[-3:], self.comments.get(node.lineno, ""))))
+        where = f"{self.where}: {'.'.join(names[-2:])}"
+        return Fact(self.kind, value, value, where, self.section, words)
+
+    def visit_assignment(self, node: Any, names: tuple[str, ...]) -> Iterator[Fact]:
+        targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+        target = " ".join(ast.unparse(t) for t in targets)
+        if node.value is not None:
+            yield from self.visit(node.value, (*names, target))
+
+    def visit_call(self, node: ast.Call, names: tuple[str, ...]) -> Iterator[Fact]:
+        call = (*names, ast.unparse(node.func)[-40:])
+        yield from self.visit_all(node.args, call)
+        for word in node.keywords:
+            yield from self.visit(word.value, (*call, word.arg or ""))
+        yield from self.visit(node.func, names)
+
+    def visit_dict(self, node: ast.Dict, names: tuple[str, ...]) -> Iterator[Fact]:
+        for key, item in zip(node.keys, node.values, strict=True):
+            label = str(key.value) if isinstance(key, ast.Constant) else ""
+            if key is not None and not label:
+                yield from self.visit(key, names)
+            yield from self.visit(item, (*names, label))
+
+    def visit_function(
+        self, node: ast.FunctionDef, names: tuple[str, ...]
+    ) -> Iterator[Fact]:
+        spec = node.args
+        # Defaults belong to the last positional arguments, so both are read from the end.
+        pairs = [
+            *zip(spec.args[::-1], spec.defaults[::-1], strict=False),
+            *zip(spec.kwonlyargs, spec.kw_defaults, strict=True),
+        ]
+        for argument, default in pairs:
+            if default is not None:
+                yield from self.visit(default, (*names, node.name, argument.arg))
+        yield from self.visit_all(node.body, (node.name,))
+
+    def visit_loop(self, node: ast.For, names: tuple[str, ...]) -> Iterator[Fact]:
+        yield from self.visit(node.iter, (*names, ast.unparse(node.target)))
+        yield from self.visit_all([*node.body, *node.orelse], names)
+
+    def visit_operation(self, node: ast.AST, names: tuple[str, ...]) -> Iterator[Fact]:
+        operands = " ".join(re.findall(r"[A-Za-z_]{3,}", ast.unparse(node)))[:80]
+        yield from self.visit_all(ast.iter_child_nodes(node), (*names, operands))
 
 
 def parameters(
     code: str, where: str, section: int = -1, kind: str = "parameter"
 ) -> Iterator[Fact]:
-    """The numbers of some code with the names that they are bound to and comments beside them."""
-    comments: dict[int, str] = {}
-    for token in tokenize.generate_tokens(io.StringIO(code).readline):
-        if token.type == tokenize.COMMENT:
-            comments[token.start[0]] = token.string
-    tree = ast.parse(code)
-
-    def walk(node: ast.AST, names: tuple[str, ...]) -> Iterator[Fact]:
-        if isinstance(node, ast.Assert):
-            return
-        value = constant(node) if isinstance(node, ast.expr) else None
-        if value is not None:
-            said = " ".join((*names[-3:], comments.get(node.lineno, "")))
-            yield Fact(
-                kind,
-                value,
-                value,
-                f"{where}: {'.'.join(names[-2:])}",
-                section,
-                stems(said),
-            )
-            if not isinstance(node, ast.BinOp):
-                return
-        if isinstance(node, ast.Assign | ast.AnnAssign):
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            names = (*names, " ".join(ast.unparse(t) for t in targets))
-            if node.value is not None:
-                yield from walk(node.value, names)
-            return
-        if isinstance(node, ast.Call):
-            call = (*names, ast.unparse(node.func)[-40:])
-            for item in node.args:
-                yield from walk(item, call)
-            for word in node.keywords:
-                yield from walk(word.value, (*call, word.arg or ""))
-            yield from walk(node.func, names)
-            return
-        if isinstance(node, ast.Dict):
-            for key, item in zip(node.keys, node.values, strict=True):
-                said = str(key.value) if isinstance(key, ast.Constant) else ""
-                if key is not None and not said:
-                    yield from walk(key, names)
-                yield from walk(item, (*names, said))
-            return
-        if isinstance(node, ast.FunctionDef):
-            spec = node.args
-            pairs = [
-                *zip(spec.args[::-1], spec.defaults[::-1], strict=False),
-                *zip(spec.kwonlyargs, spec.kw_defaults, strict=True),
-            ]
-            for arg, default in pairs:
-                if default is not None:
-                    yield from walk(default, (*names, node.name, arg.arg))
-            for item in node.body:
-                yield from walk(item, (node.name,))
-            return
-        if isinstance(node, ast.For):
-            yield from walk(node.iter, (*names, ast.unparse(node.target)))
-            for item in (*node.body, *node.orelse):
-                yield from walk(item, names)
-            return
-        if isinstance(node, ast.BinOp | ast.Compare):
-            near = " ".join(re.findall(r"[A-Za-z_]{3,}", ast.unparse(node)))[:80]
-            names = (*names, near)
-        for child in ast.iter_child_nodes(node):
-            yield from walk(child, names)
-
-    yield from walk(tree, ())
+    """Yield the numbers of some code with their names and the comments beside them."""
+    numbers = CodeNumbers(code, where, section, kind)
+    yield from numbers.visit(numbers.tree, ())
 
 
 NUMBER = re.compile(
@@ -683,7 +718,7 @@ def rows_of(page: str) -> Iterator[tuple[str, str]]:
             yield bare(row), head
 
 
-def printed(cell: Any, section: int, where: str) -> Iterator[Fact]:
+def output_facts(cell: Any, section: int, where: str) -> Iterator[Fact]:
     """The numbers that a cell's stored outputs print; pictures' digests are left out."""
     for output in cell.get("outputs", []):
         data = output.get("data", {})
@@ -721,47 +756,49 @@ def flat(value: Any) -> Iterator[float]:
         yield float(value)
 
 
+def entry_facts(
+    name: str, entry: dict[str, Any], title: str, file: str
+) -> Iterator[Fact]:
+    """Yield the numbers of one parameter or note of a scenario, and those of its reason."""
+    kind = "published" if entry.get("source") == "given" else "parameter"
+    texts = [str(entry.get(key, "")) for key in ("unit", "where", "reason", "note")]
+    reason = " ".join(texts)
+    words = stems(f"{name} {title}")
+    where = f"{file}: {name}"
+    for value in flat(entry["value"]):
+        for k in {kind, "parameter"}:
+            unit = str(entry["unit"])
+            yield Fact(k, value, value, where, words=words, unit=unit)
+    for match in NUMBER.finditer(reason):
+        if digits(match[0]) > 1:
+            value = number(match[0])
+            words_of_reason = stems(f"{name} {reason}")
+            yield Fact("parameter", value, value, where, words=words_of_reason)
+
+
+def row_facts(key: str, row: dict[str, Any], file: str) -> Iterator[Fact]:
+    """Yield the numbers of one row of a scenario's table."""
+    for name, cell in row.items():
+        words = stems(f"{key} {name}")
+        for value in flat(cell):
+            where = f"{file}: {key}.{name}"
+            yield Fact("parameter", value, value, where, words=words)
+
+
 @cache
 def scenario_facts(path: Path) -> tuple[Fact, ...]:
-    """The numbers of a scenario with names, units and reasons; what is given is the paper's."""
-    out = []
+    """Return the numbers of a scenario; a given value counts as published by the paper."""
+    facts: list[Fact] = []
     data = tomllib.loads(path.read_text(encoding="utf-8"))
+    file = f"{path.stem}.toml"
+    title = data.get("title", "")
     entries = [*data.get("parameters", {}).items(), *data.get("notes", {}).items()]
     for name, entry in entries:
-        kind = "published" if entry.get("source") == "given" else "parameter"
-        said = " ".join(
-            str(entry.get(k, "")) for k in ("unit", "where", "reason", "note")
-        )
-        words = stems(f"{name} {data.get('title', '')}")
-        where = f"{path.stem}.toml: {name}"
-        for value in flat(entry["value"]):
-            for k in {kind, "parameter"}:
-                out.append(
-                    Fact(k, value, value, where, words=words, unit=str(entry["unit"]))
-                )
-        for found in NUMBER.finditer(said):
-            if digits(found[0]) > 1:
-                value = number(found[0])
-                out.append(
-                    Fact(
-                        "parameter", value, value, where, words=stems(f"{name} {said}")
-                    )
-                )
+        facts += entry_facts(name, entry, title, file)
     for key, rows in data.items():
-        if isinstance(rows, list):
-            for row in rows:
-                for name, value in row.items():
-                    for v in flat(value):
-                        out.append(
-                            Fact(
-                                "parameter",
-                                v,
-                                v,
-                                f"{path.stem}.toml: {key}.{name}",
-                                words=stems(f"{key} {name}"),
-                            )
-                        )
-    return tuple(out)
+        for row in rows if isinstance(rows, list) else ():
+            facts += row_facts(key, row, file)
+    return tuple(facts)
 
 
 @cache
@@ -870,68 +907,107 @@ def nearby(facts: list[Fact]) -> Callable[[Numeral], list[Fact]]:
     return near
 
 
+def is_small(n: Numeral) -> bool:
+    """Return whether a numeral is a whole number of one or two digits."""
+    return n.value == int(n.value) and digits(n.text) < 3
+
+
+def is_long(n: Numeral) -> bool:
+    """Return whether a numeral has three digits that count: it is hardly there by chance."""
+    return digits(n.text) > 2
+
+
+def slack(value: float) -> float:
+    """Return by how much two equal numbers may differ by rounding."""
+    return 1e-9 + 1e-6 * abs(value)
+
+
+def matches_check(n: Numeral, f: Fact, factor: float) -> bool:
+    """Return whether an assertion compares with the numeral, or encloses it."""
+    value = n.value * factor
+    nearby_section = f.section == n.section
+    shared = bool(n.words & f.words)
+    if f.unit:  # said by the assertion's message
+        equal = f.low == value and f.unit == (n.unit or "no unit")
+        return factor == 1 and equal and (nearby_section or shared)
+    as_written = n.value >= 1 or re.search(r"\d", n.text)
+    targets = [value] if as_written else [value, 1 / value]
+    if n.unit.startswith("%") and factor < 1:
+        targets += [1 + value, 1 - value]
+    margin = slack(value)
+    enclosed = any(f.low - margin <= t <= f.high + margin for t in targets)
+    # A wide interval encloses anything: it is no trace.
+    if not enclosed or f.high - f.low > 0.41 * abs(value):
+        return False
+    here = nearby_section and (shared or not is_small(n))
+    return here or (shared and is_long(n))
+
+
+def matches_output(n: Numeral, f: Fact, factor: float) -> bool:
+    """Return whether an output prints the numeral to the digits given."""
+    half = 0.5001 * n.step * factor
+    if abs(abs(n.value * factor) - abs(f.low)) > half or f.half > half:
+        return False
+    shared = bool(n.words & f.words)
+    here = f.section == n.section and (shared or not is_small(n))
+    return is_long(n) or here
+
+
+def matches_published(n: Numeral, f: Fact, factor: float) -> bool:
+    """Return whether the paper printed the numeral and the sentence speaks of the paper."""
+    value = n.value * factor
+    if abs(abs(value) - abs(f.low)) > slack(value) or not SPEAKS.search(n.sentence):
+        return False
+    if not f.words:
+        return not is_small(n)
+    return bool(n.words & f.words)
+
+
+def matches_parameter(n: Numeral, f: Fact, factor: float) -> bool:
+    """Return whether a parameter has the value, under a name or unit of the sentence."""
+    value = n.value * factor
+    if abs(abs(value) - abs(f.low)) > slack(value):
+        return False
+    both = f.unit and n.unit
+    if both and re.search(rf"(?:^|[ ,])(?:{n.unit})", f.unit):
+        return True
+    if n.words & f.words and not both:
+        return True
+    return f.section == n.section and not is_small(n)
+
+
+MATCHERS = {
+    "check": matches_check,
+    "output": matches_output,
+    "published": matches_published,
+    "parameter": matches_parameter,
+}
+
+
 def trace(n: Numeral, facts: list[Fact]) -> str:
-    """Where a numeral comes from, or ''; the strongest trace first."""
+    """Return where a numeral comes from, or ''; the strongest trace first."""
     best: dict[str, str] = {}
-    small = n.value == int(n.value) and digits(n.text) < 3
-    long = digits(n.text) > 2
     for f in sorted(facts, key=lambda f: f.section != n.section):
-        if f.kind in best:
-            continue
-        here = f.section == n.section
-        shared = bool(n.words & f.words)
-        for factor in factors(n.unit):
-            value = n.value * factor
-            slack = 1e-9 + 1e-6 * abs(value)
-            if f.kind == "check" and f.unit:
-                hit = factor == 1 and f.low == value and f.unit == (n.unit or "said")
-                hit = hit and (here or shared)
-            elif f.kind == "check":
-                targets = (
-                    [value]
-                    if n.value >= 1 or re.search(r"\d", n.text)
-                    else [value, 1 / value]
-                )
-                if n.unit.startswith("%") and factor < 1:
-                    targets += [1 + value, 1 - value]
-                if f.low == f.high:
-                    hit = any(abs(t - f.low) <= slack for t in targets)
-                else:
-                    inside = any(f.low - slack <= t <= f.high + slack for t in targets)
-                    hit = inside and f.high - f.low <= 0.41 * abs(value)
-                hit = hit and ((here and (shared or not small)) or (shared and long))
-            elif f.kind == "output":
-                half = 0.5001 * n.step * factor
-                hit = abs(abs(value) - abs(f.low)) <= half and f.half <= half
-                hit = hit and (long or (here and (shared or not small)))
-            elif f.kind == "published":
-                hit = abs(abs(value) - abs(f.low)) <= slack and bool(
-                    SPEAKS.search(n.sentence)
-                )
-                hit = hit and (shared or not f.words) and not (small and not f.words)
-            else:
-                same = bool(
-                    f.unit and n.unit and re.search(rf"(?:^|[ ,])(?:{n.unit})", f.unit)
-                )
-                fits = same or not (n.unit and f.unit)
-                hit = abs(abs(value) - abs(f.low)) <= slack and (
-                    same or (shared and fits) or (here and not small)
-                )
-            if hit:
+        if f.kind not in best:
+            matches = MATCHERS[f.kind]
+            if any(matches(n, f, factor) for factor in factors(n.unit)):
                 best[f.kind] = f.where
-                break
     for kind in ("check", "parameter", "output", "published"):
         if kind in best:
             return f"{kind}: {best[kind]}"
     if "⸢cited⸣" in n.sentence:
         return "cited: by the sentence"
-    near = (
-        f
-        for f in facts
-        if f.section == n.section and f.low == f.high and f.kind != "output"
-    )
-    for f in near:
-        if small and any(abs(f.low) == n.value * k for k in factors(n.unit)):
+    return trace_beside(n, facts)
+
+
+def trace_beside(n: Numeral, facts: list[Fact]) -> str:
+    """Return the same small number in a cell of the section, whatever its name, or ''."""
+    if not is_small(n):
+        return ""
+    values = [n.value * k for k in factors(n.unit)]
+    for f in facts:
+        in_code = f.section == n.section and f.kind != "output"
+        if in_code and f.low == f.high and abs(f.low) in values:
             return f"beside: {f.where}"
     return ""
 
@@ -962,48 +1038,42 @@ def others(n: Numeral) -> Iterator[Numeral]:
                 yield replace(n, value=1 / k, step=0.2 / k)
 
 
-def read(source: Path) -> tuple[list[Numeral], list[Fact]]:
-    """The numerals of a chapter and the numbers of its run."""
-    text = source.read_text(encoding="utf-8")
-    cells = [
-        c
-        for c in json.loads(source.with_suffix(".ipynb").read_text(encoding="utf-8"))[
-            "cells"
-        ]
-        if c["cell_type"] == "code"
-    ]
+def prose_numerals(
+    piece: str, chapter: str, line: int, section: int
+) -> tuple[list[Numeral], int]:
+    """Return the numerals of a piece of prose, and the number of the section it ends in."""
     numerals: list[Numeral] = []
+    for part in re.split(r"^(?=#+ )", piece, flags=re.M):
+        section += part.startswith("#")
+        numerals += numerals_of(part, chapter, line, section)
+        line += part.count("\n")
+    return numerals, section
+
+
+def code_facts(piece: str, where: str, section: int) -> list[Fact]:
+    """Return the numbers of a cell's code: its assertions, then its parameters."""
     facts: list[Fact] = []
-    section = 0
-    count = 0
-    whole = ""
-    for line, kind, piece in pieces(text):
-        if kind == "prose":
-            at = line
-            for part in re.split(r"^(?=#+ )", piece, flags=re.M):
-                section += part.startswith("#")
-                numerals += numerals_of(part, source.stem, at, section)
-                at += part.count("\n")
-            continue
-        where = f"cell {count + 1}"
-        whole += piece
-        tree = ast.parse(piece)
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Assert):
-                facts += checks(node, section, where)
-            if isinstance(node, ast.keyword) and node.arg == "alt":
-                said = ast.unparse(node.value)
-                numerals += numerals_of(
-                    said.strip("'\"") + "\n", source.stem, line, section
-                )
-        facts += parameters(piece, where, section)
-        facts += printed(cells[count], section, where)
-        count += 1
-    for name in sorted(
-        set(re.findall(r"(?:script\(|stored\(\s*\"\w+\",\s*)\"([\w-]+)\"", whole))
-    ):
+    for node in ast.walk(ast.parse(piece)):
+        if isinstance(node, ast.Assert):
+            facts += checks(node, section, where)
+    facts += parameters(piece, where, section)
+    return facts
+
+
+def alternative_texts(piece: str) -> Iterator[str]:
+    """Yield the texts that a cell's code gives for readers who do not see a picture."""
+    for node in ast.walk(ast.parse(piece)):
+        if isinstance(node, ast.keyword) and node.arg == "alt":
+            yield ast.unparse(node.value).strip("'\"") + "\n"
+
+
+def related_facts(source: Path, code: str) -> list[Fact]:
+    """Return the numbers of the studies, functions, scenarios and papers of a chapter."""
+    facts: list[Fact] = []
+    studies = re.findall(r"(?:script\(|stored\(\s*\"\w+\",\s*)\"([\w-]+)\"", code)
+    for name in sorted(set(studies)):
         facts += study_facts(name)
-    for name in sorted(set(re.findall(r"\b([a-z]\w+)\(", whole))):
+    for name in sorted(set(re.findall(r"\b([a-z]\w+)\(", code))):
         facts += defaults().get(name, ())
     if source.stem == "index":
         for other in chosen(["04", "04b"]):
@@ -1013,7 +1083,30 @@ def read(source: Path) -> tuple[list[Numeral], list[Fact]]:
         for path in sorted((ROOT / "data" / "scenarios" / paper).glob("*.toml")):
             facts += scenario_facts(path)
         facts += published_facts(paper)
-    return numerals, facts
+    return facts
+
+
+def read(source: Path) -> tuple[list[Numeral], list[Fact]]:
+    """Return the numerals of a chapter and the numbers of its run."""
+    chapter = source.stem
+    notebook = json.loads(source.with_suffix(".ipynb").read_text(encoding="utf-8"))
+    cells = [c for c in notebook["cells"] if c["cell_type"] == "code"]
+    numerals: list[Numeral] = []
+    facts: list[Fact] = []
+    codes: list[str] = []
+    section = 0
+    for line, kind, piece in pieces(source.read_text(encoding="utf-8")):
+        if kind == "prose":
+            more, section = prose_numerals(piece, chapter, line, section)
+            numerals += more
+            continue
+        where = f"cell {len(codes) + 1}"
+        for text in alternative_texts(piece):
+            numerals += numerals_of(text, chapter, line, section)
+        facts += code_facts(piece, where, section)
+        facts += output_facts(cells[len(codes)], section, where)
+        codes.append(piece)
+    return numerals, facts + related_facts(source, "".join(codes))
 
 
 def main() -> int:

@@ -12,7 +12,7 @@ import json
 import math
 import re
 import types
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ForwardRef, Literal, Union, get_args, get_origin
 
@@ -180,36 +180,51 @@ def named_types() -> list[tuple[Any, str]]:
     ]
 
 
-def written(kind: Any, names: Mapping[str, Any]) -> str:
-    """Return a type as a reader would write it: ``Array['... N d']``, ``Positive | None``."""
+def format_type(kind: Any, names: Mapping[str, Any]) -> str:
+    """Return a type as a reader would write it: ``Array['... N d']``, ``PositiveInt | None``."""
     if isinstance(kind, ForwardRef):
         kind = kind.__forward_arg__
     if isinstance(kind, str):
         try:
-            return written(eval(kind, dict(names)), names)
+            return format_type(eval(kind, dict(names)), names)
         except (NameError, TypeError):
             return kind
-    if kind is Ellipsis or kind is None or kind is type(None):
-        return "..." if kind is Ellipsis else "None"
-    if isinstance(kind, list):
-        return f"[{', '.join(written(part, names) for part in kind)}]"
-    if known := next((name for value, name in named_types() if value == kind), None):
-        return known
+    if kind is Ellipsis:
+        return "..."
+    if kind is None or kind is type(None):
+        return "None"
+    if isinstance(kind, list):  # the arguments of a Callable
+        return f"[{format_types(kind, names, ', ')}]"
+    for value, name in named_types():
+        if value == kind:
+            return name
+    if get_origin(kind) is None:
+        return getattr(kind, "__name__", str(kind))
+    return format_generic(kind, names)
+
+
+def format_types(kinds: Iterable[Any], names: Mapping[str, Any], separator: str) -> str:
+    """Return several types in a row."""
+    return separator.join(format_type(kind, names) for kind in kinds)
+
+
+def format_generic(kind: Any, names: Mapping[str, Any]) -> str:
+    """Return a type that has arguments, such as a union or a sequence."""
     origin = get_origin(kind)
-    inner = get_args(kind)
+    arguments = get_args(kind)
     if origin is Annotated:
-        shapes = [
-            note for note in inner[1:] if isinstance(note, str) and note != ALLOW_NAN
-        ]
-        return written(inner[0], names) + (f"[{shapes[-1]!r}]" if shapes else "")
+        notes = [note for note in arguments[1:] if isinstance(note, str)]
+        shapes = [note for note in notes if note != ALLOW_NAN]
+        shape = f"[{shapes[-1]!r}]" if shapes else ""
+        return format_type(arguments[0], names) + shape
     if origin in (Union, types.UnionType):
-        return " | ".join(written(part, names) for part in inner)
+        return format_types(arguments, names, " | ")
     if origin is Literal:
-        return f"Literal[{', '.join(map(repr, inner))}]"
-    if origin is not None and origin is not np.ndarray:
-        name = getattr(origin, "__name__", str(origin))
-        return f"{name}[{', '.join(written(part, names) for part in inner)}]"
-    return "NDArray" if origin else getattr(kind, "__name__", str(kind))
+        return f"Literal[{', '.join(map(repr, arguments))}]"
+    if origin is np.ndarray:
+        return "NDArray"
+    name = getattr(origin, "__name__", str(origin))
+    return f"{name}[{format_types(arguments, names, ', ')}]"
 
 
 def default(value: Any) -> str:
@@ -223,7 +238,7 @@ def default(value: Any) -> str:
 
 
 def signature(what: str, value: Any) -> tuple[str, str | None] | None:
-    """Return a signature with every type as `written`; None leaves it as it is."""
+    """Return a signature with every type as `format_type` writes it; None leaves it as it is."""
     if what not in ("function", "method", "class"):
         return None
     try:
@@ -249,12 +264,12 @@ def signature(what: str, value: Any) -> tuple[str, str | None] | None:
             last, ""
         ) + part.name
         if part.annotation is not part.empty:
-            text += f": {written(part.annotation, names)}"
+            text += f": {format_type(part.annotation, names)}"
         shown.append(
             text if part.default is part.empty else f"{text} = {default(part.default)}"
         )
     given = found.return_annotation
-    returned = None if given is found.empty else written(given, names)
+    returned = None if given is found.empty else format_type(given, names)
     return f"({', '.join(shown)})", None if what == "class" else returned
 
 
@@ -561,63 +576,112 @@ def needs() -> dict[int, set[int]]:
     return out
 
 
+MAP_WIDTH = 1060
+BOX = (258, 52)
+"""Width and height of a chapter's box on the map."""
+BOX_STEP = 262
+ROW_GAP = 53
+
+
+def all_needed(n: int, needed: dict[int, set[int]]) -> set[int]:
+    """Return all chapters that one builds on, directly or through others."""
+    return needed[n].union(*(all_needed(k, needed) for k in needed[n]))
+
+
+def map_places(
+    needed: dict[int, set[int]], stacks: dict[int, list[str]]
+) -> tuple[dict[int, tuple[float, int]], int]:
+    """Return the middle of each chapter's first box, and the height of the map.
+
+    A chapter lies one row below the lowest one that it builds on; rows are centred.
+    """
+    rows: dict[int, int] = {}
+    for n in needed:
+        rows[n] = 1 + max((rows[k] for k in needed[n]), default=-1)
+    places = {}
+    top = 40
+    for row in range(max(rows.values()) + 1):
+        in_row = [k for k in rows if rows[k] == row]
+        for position, n in enumerate(in_row):
+            offset = position - (len(in_row) - 1) / 2
+            places[n] = (MAP_WIDTH / 2 + BOX_STEP * offset, top)
+        top += ROW_GAP + BOX[1] * max(len(stacks[n]) for n in in_row)
+    return places, top - 65
+
+
+def map_arrows(
+    needed: dict[int, set[int]],
+    stacks: dict[int, list[str]],
+    places: dict[int, tuple[float, int]],
+) -> list[str]:
+    """Return an arrow from each chapter to those that build on it, implied ones left out."""
+    lines = []
+    for n, (x, y) in places.items():
+        implied = {i for j in needed[n] for i in all_needed(j, needed)}
+        for k in needed[n] - implied:
+            a, b = places[k]
+            b += BOX[1] * (len(stacks[k]) - 1)
+            curve = f"M{a:g},{b + 26} C{a:g},{b + 66} {x:g},{y - 66} {x:g},{y - 27}"
+            lines.append(f'<path d="{curve}"/>')
+    return lines
+
+
+def map_boxes(
+    stacks: dict[int, list[str]],
+    places: dict[int, tuple[float, int]],
+    pages: dict[str, str],
+) -> list[str]:
+    """Return a linked box with number and title for each page of a chapter."""
+    width, height = BOX
+    lines = []
+    for n, (x, y) in places.items():
+        for k, label in enumerate(stacks[n]):
+            title = chapter_title(pages[label])
+            link = pages[label].removeprefix("book/")
+            middle = y + height * k
+            box = (
+                f'<rect x="{x - width / 2:g}" y="{middle - 26}" width="{width}" '
+                f'height="{height}" rx="8"/>'
+            )
+            text = f'<text x="{x:g}" y="{middle + 6}">{label}. {title}</text>'
+            hover = f"<title>{title}</title>"
+            lines.append(f'<a href="{link}.html">{box}{text}{hover}</a>')
+    return lines
+
+
+def map_list(
+    needed: dict[int, set[int]], stacks: dict[int, list[str]], pages: dict[str, str]
+) -> list[str]:
+    """Return the map as a list, for readers who do not see it."""
+    lines = []
+    for n, labels in stacks.items():
+        links = [f"[chapter {k}](/{pages[str(k)]}.md)" for k in sorted(needed[n])]
+        enumeration = " and ".join(", ".join(links).rsplit(", ", 1))
+        titles = []
+        for label in labels:
+            page = pages[label]
+            titles.append(f"**{label}** [{chapter_title(page)}](/{page}.md)")
+        builds_on = enumeration or "nothing of the book"
+        lines.append(f"- {' with '.join(titles)}: {builds_on}")
+    return lines
+
+
 def map_text() -> str:
-    """Return a drawing of what each chapter builds on, and the same as a list."""
+    """Return a drawing of the chapters that each chapter builds on, and the same as a list."""
     needed = needs()
     pages = chapter_pages()
-    rows = {}
     stacks: dict[int, list[str]] = {n: [] for n in needed}
     for label, page in pages.items():
         stacks[chapter_number(page) or 0].append(label)
-    titles = {label: chapter_title(page) for label, page in pages.items()}
-
-    def before(n: int) -> set[int]:
-        return needed[n].union(*map(before, needed[n]))
-
-    for n in needed:
-        rows[n] = 1 + max((rows[k] for k in needed[n]), default=-1)
-    place = {}
-    top = 40
-    for row in range(max(rows.values()) + 1):
-        beside = [k for k in rows if rows[k] == row]
-        for n in beside:
-            place[n] = (530 + 262 * (beside.index(n) - (len(beside) - 1) / 2), top)
-        top += 53 + 52 * max(len(stacks[n]) for n in beside)
-    width = 1060
-    height = top - 65
-    lines = [
-        f'<svg class="map" viewBox="0 0 {width} {height}" role="group" '
+    places, height = map_places(needed, stacks)
+    head = (
+        f'<svg class="map" viewBox="0 0 {MAP_WIDTH} {height}" role="group" '
         'aria-label="Arrows from each chapter to those that build on it">'
-    ]
-    for n, (x, y) in place.items():
-        # What another arrow implies is not drawn.
-        for k in needed[n] - {i for j in needed[n] for i in before(j)}:
-            a, b = place[k]
-            b += 52 * (len(stacks[k]) - 1)
-            lines += [
-                f'<path d="M{a},{b + 26} C{a},{b + 66} {x},{y - 66} {x},{y - 27}"/>'
-            ]
-    for n, (x, y) in place.items():
-        for k, label in enumerate(stacks[n]):
-            link = pages[label].removeprefix("book/")
-            at = y + 52 * k
-            lines += [
-                f'<a href="{link}.html"><rect x="{x - 129}" y="{at - 26}" width="258" '
-                f'height="52" rx="8"/><text x="{x}" y="{at + 6}">{label}. {titles[label]}'
-                f"</text><title>{titles[label]}</title></a>"
-            ]
-    lines += ["</svg>"]
-    told = []
-    for n, labels in stacks.items():
-        builds = [f"[chapter {k}](/{pages[str(k)]}.md)" for k in sorted(needed[n])]
-        listed = (
-            " and ".join(", ".join(builds).rsplit(", ", 1)) or "nothing of the book"
-        )
-        links = (
-            f"**{label}** [{titles[label]}](/{pages[label]}.md)" for label in labels
-        )
-        told += [f"- {' with '.join(links)}: {listed}"]
-    return "\n".join(["```{raw} html", *lines, "```", "", *told])
+    )
+    arrows = map_arrows(needed, stacks, places)
+    boxes = map_boxes(stacks, places, pages)
+    drawing = ["```{raw} html", head, *arrows, *boxes, "</svg>", "```", ""]
+    return "\n".join([*drawing, *map_list(needed, stacks, pages)])
 
 
 def chapter_title(page: str) -> str:

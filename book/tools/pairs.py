@@ -54,35 +54,40 @@ def differences(source: Path, stored: Any) -> list[str]:
 
 
 def code_faults(cell: Any, count: int) -> list[str]:
-    """Return what is wrong with one stored code cell, the `count`-th of its chapter."""
-    out = []
+    """Return the faults of one stored code cell, the `count`-th of its chapter."""
     if not cell.source.strip():
         return ["an empty code cell"]
+    faults = []
     if cell.execution_count != count:
-        out.append(
-            f"execution count {cell.execution_count}, needs {count}: make outputs"
-        )
+        wrong = f"execution count {cell.execution_count}, needs {count}"
+        faults.append(f"{wrong}: make outputs")
     for line in cell.source.splitlines():
         if len(line) > WIDTH:
-            out.append(
-                f"a line of {len(line)} characters, at most {WIDTH}: {line.strip()[:40]}…"
-            )
+            start = f"{line.strip()[:40]}…"
+            faults.append(f"a line of {len(line)} characters, at most {WIDTH}: {start}")
     for output in cell.outputs:
-        if output.output_type == "error":
-            out.append(f"a stored error: {output.ename}")
-        if output.get("name") == "stderr":
-            out.append("stored stderr")
-        for line in shown(output).splitlines():
-            if len(line) > WIDTH:
-                out.append(
-                    f"a line of {len(line)} characters printed, at most {WIDTH}: {line}"
-                )
-        if foreign := foreign_text(output):
-            out.append(f"an output holds {foreign!r}, which belongs to one machine")
-    return out + figure_faults(cell)
+        faults += output_faults(output)
+    return faults + figure_faults(cell)
 
 
-def shown(output: Any) -> str:
+def output_faults(output: Any) -> list[str]:
+    """Return the faults of one stored output."""
+    faults = []
+    if output.output_type == "error":
+        faults.append(f"a stored error: {output.ename}")
+    if output.get("name") == "stderr":
+        faults.append("stored stderr")
+    for line in shown_text(output).splitlines():
+        if len(line) > WIDTH:
+            length = f"{len(line)} characters printed, at most {WIDTH}"
+            faults.append(f"a line of {length}: {line}")
+    foreign = foreign_text(output)
+    if foreign:
+        faults.append(f"an output holds {foreign!r}, which belongs to one machine")
+    return faults
+
+
+def shown_text(output: Any) -> str:
     """Return the text that a page shows of an output; '' where it shows a picture or a table."""
     data = output.get("data", {})
     return str(output.get("text", data.get("text/plain", ""))) if len(data) < 2 else ""

@@ -1,10 +1,10 @@
 """Couplings: plans that turn weights into equally weighted members, and members that obey rules."""
 
 from .constraints import Constraint, norm_constraint, project, retract
-from .solvers import TransportPlan, sorted_plan, squared_distances, transport_plan
+from .solvers import TransportPlan, monotone_plan, squared_distances, transport_plan
 from .transform import (
     rejuvenate,
-    second_order,
+    correct_moments,
     transform_along,
     transform_ensemble,
     transform_within,
@@ -22,8 +22,8 @@ __all__ = [
     "project",
     "rejuvenate",
     "retract",
-    "second_order",
-    "sorted_plan",
+    "correct_moments",
+    "monotone_plan",
     "transform_along",
     "transform_within",
 ]

@@ -1,6 +1,6 @@
 r"""Constraints :math:`\mathbf g(\mathbf x)=\mathbf d` on members: projection and retraction.
 
-Equations (2) and (6)-(12) of Das and Bhattacharya, with what they leave open as options.
+Equations (2) and (6)-(12) of Das and Bhattacharya; the choices that they leave open are options.
 """
 
 from __future__ import annotations
@@ -21,25 +21,31 @@ from ..validation import (
     FrozenModel,
     Mask,
     NonNegativeFloat,
+    call_user,
     check_array,
     validated,
 )
 
 __all__ = ["Constraint", "norm_constraint", "project", "retract"]
 
-Reading = Literal["printed", "reversed", "particle", "shift"]
-"""Four readings of (12): the gain times D_i - d̂, d̂ - D_i, d - D_i, or d - d̂."""
+Variant = Literal["printed", "reversed", "particle", "shift"]
+"""Four variants of (12): the gain times D_i - d̂, d̂ - D_i, d - D_i, or d - d̂."""
 Motion = tuple[DistinctIndices, DistinctIndices]
 """Indices of positions and of their velocities, in the same order."""
 
-_CLOSE = 1e-15
+_TOLERANCE = 1e-15
+"""Largest relative residual after :func:`retract`."""
 _STEPS = 50
-"""What :func:`retract` leaves of the residual, relative, and its Newton steps at most."""
+"""Largest number of Newton steps in :func:`retract`."""
+_HALVINGS = 30
+"""Largest number of times that a Newton step is tried, halved each time."""
+_LEAST_EIGENVALUE = 1e-14
+"""Of the normals' correlations; a Jacobian with a smaller one has lost its rank."""
 
 
 @dataclass(frozen=True, eq=False)
 class Constraint(FrozenModel):
-    """What every state obeys, g(x) = d.
+    """An equation that every state satisfies, g(x) = d.
 
     Parameters
     ----------
@@ -48,8 +54,8 @@ class Constraint(FrozenModel):
     value : array_like, (s,)
         The right-hand side d.
     derivative : callable, optional
-        ``derivative(x)``, the Jacobian of `function`, (..., s, d); differences stand in for it. A
-        first time they are compared, and a warning tells of another function's.
+        ``derivative(x)``, the Jacobian of `function`, (..., s, d); by default finite differences.
+        At its first use it is compared with them, and a warning issued if they disagree.
 
     Examples
     --------
@@ -64,27 +70,27 @@ class Constraint(FrozenModel):
 
     @validated
     def residual(self, x: Annotated[Array, "... d"]) -> Array:
-        """By how much states (..., d) miss, g(x) - d, (..., s)."""
+        """Return the residual g(x) - d of states (..., d), (..., s)."""
         return check_array(self.violation(x), "function")
 
     def violation(self, x: Array) -> Array:
-        """The same without a door, for trial steps: NaN where the function has no value."""
+        """Return the residual without checks, for trial steps: NaN where g has no value."""
         shape = (*x.shape[:-1], self.value.size)
         try:
-            g = self.function(x.copy())
+            g = call_user(self.function, x.copy())
         except IndexError as error:
             raise ValueError(
-                f"constraint must be states with more than {x.shape[-1]} components: {error}"
+                "constraint must be a function of the components that states have, got one of "
+                f"more than {x.shape[-1]}: {error}"
             ) from error
         return check_array(g, "function", shape, finite=False) - self.value
 
     @validated
     def jacobian(self, x: Annotated[Array, "... d"]) -> Array:
-        """Derivative of g at states (..., d), (..., s, d)."""
-        near = partial(central, self.violation, x)
-        return as_derivative(
-            self, (x,), (*x.shape[:-1], self.value.size, x.shape[-1]), near
-        )
+        """Return the derivative of g at states (..., d), (..., s, d)."""
+        shape = (*x.shape[:-1], self.value.size, x.shape[-1])
+        differences = partial(central, self.violation, x)
+        return as_derivative(self, (x,), shape, differences)
 
 
 @validated
@@ -93,7 +99,7 @@ def norm_constraint(
     *,
     length: Annotated[float, Bounds(above=0, at_most=1e150)] = 1.0,
 ) -> Constraint:
-    r"""Some components form a vector of given length, :math:`|\mathbf x_I|^2=L^2`.
+    r"""Return the constraint that some components have a given norm, :math:`|\mathbf x_I|^2=L^2`.
 
     Parameters
     ----------
@@ -107,17 +113,17 @@ def norm_constraint(
     >>> norm_constraint([0, 1]).residual([0.6, 0.8, 5.0]).round(15) + 0.0
     array([0.])
     """
-    rows = list(indices)
+    columns = list(indices)
 
-    def squares(x: Array) -> Array:
-        return np.asarray((x[..., rows] ** 2).sum(axis=-1, keepdims=True))
+    def squared_norm(x: Array) -> Array:
+        return np.asarray((x[..., columns] ** 2).sum(axis=-1, keepdims=True))
 
-    def slope(x: Array) -> Array:
-        out = np.zeros((*x.shape[:-1], 1, x.shape[-1]))
-        out[..., 0, rows] = 2 * x[..., rows]
-        return out
+    def jacobian(x: Array) -> Array:
+        slope = np.zeros((*x.shape[:-1], 1, x.shape[-1]))
+        slope[..., 0, columns] = 2 * x[..., columns]
+        return slope
 
-    return Constraint(squares, np.array([length**2]), derivative=slope)
+    return Constraint(squared_norm, np.array([length**2]), derivative=jacobian)
 
 
 @validated
@@ -125,9 +131,9 @@ def project(
     ensemble: Ensemble,
     constraint: Constraint,
     *,
-    reading: Reading = "shift",
+    variant: Variant = "shift",
     regularisation: NonNegativeFloat = 1e-6,
-    guarded: bool = True,
+    safeguard: bool = True,
 ) -> Array:
     r"""Regress the members on the constraint and correct them, equations (6)-(12).
 
@@ -136,7 +142,8 @@ def project(
 
     * ``"printed"``, :math:`\mathbf x_i+\mathbf K(\mathbf D_i-\hat{\mathbf d})`: the mean stays and
       the spread along the constraint doubles;
-    * ``"reversed"``, :math:`\mathbf x_i+\mathbf K(\hat{\mathbf d}-\mathbf D_i)`: wrong aim;
+    * ``"reversed"``, :math:`\mathbf x_i+\mathbf K(\hat{\mathbf d}-\mathbf D_i)`: contracts the
+      members to their own mean, not to the constraint;
     * ``"particle"``, :math:`\mathbf x_i+\mathbf K(\mathbf d-\mathbf D_i)`: exact for linear g;
     * ``"shift"``, :math:`\mathbf x_i+\mathbf K(\mathbf d-\hat{\mathbf d})`: moves the mean only.
 
@@ -145,15 +152,15 @@ def project(
     ensemble : array_like, (..., N, d)
         Members, at least two.
     constraint : Constraint
-    reading : {"printed", "reversed", "particle", "shift"}
+    variant : {"printed", "reversed", "particle", "shift"}
         Of (12), as above.
     regularisation : float
         ε, at least 0, in the units of g squared: on the manifold the covariance is singular.
-    guarded : bool
-        Return an ensemble as it came if the projection is not finite or makes larger what it is to
-        make small: for ``"shift"``, which keeps the spread, the miss of the mean
-        :math:`|\hat{\mathbf d}-\mathbf d|`; for the others the mean of the members' misses
-        :math:`|\mathbf D_i-\mathbf d|`. The printed formula needs ``False`` to show what it does.
+    safeguard : bool
+        Return an ensemble unchanged if the projection is not finite or increases the residual that
+        it should decrease: for ``"shift"``, which keeps the spread, that of the mean,
+        :math:`|\hat{\mathbf d}-\mathbf d|`; for the others the mean of the members' residuals
+        :math:`|\mathbf D_i-\mathbf d|`. The printed formula shows its effect with ``False`` only.
 
     Returns
     -------
@@ -168,34 +175,39 @@ def project(
     --------
     >>> line = Constraint(lambda x: x[..., :1] + x[..., 1:], [1.0])
     >>> x = np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 0.0]])
-    >>> y = project(x, line, reading="particle", regularisation=0.0)
+    >>> y = project(x, line, variant="particle", regularisation=0.0)
     >>> bool(abs(line.residual(y)).max() < 1e-14)
     True
     """
-    x = ensemble
     n = ensemble.shape[-2]
-    gap = constraint.residual(x)
-    mean = gap.mean(axis=-2, keepdims=True)
-    anomalies = gap - mean
-    around = x - x.mean(axis=-2, keepdims=True)
-    spread = anomalies.mT @ anomalies / n + regularisation * np.eye(gap.shape[-1])
-    gain = np.linalg.solve(spread, anomalies.mT @ around / n)
-    aim = {
-        "printed": anomalies,
-        "reversed": -anomalies,
-        "particle": -gap,
-        "shift": -mean,
-    }[reading]
-    out = x + aim @ gain
-    if not guarded:
-        return np.asarray(out)
-    left = constraint.violation(out)
-    # The members' own misses may grow where only their mean is moved: g is curved.
-    before, after = (
-        (mean, left.mean(axis=-2, keepdims=True)) if reading == "shift" else (gap, left)
-    )
+    residual = constraint.residual(ensemble)
+    mean_residual = residual.mean(axis=-2, keepdims=True)
+    # D_i - d̂ and x_i - x̄.
+    output_anomalies = residual - mean_residual
+    anomalies = ensemble - ensemble.mean(axis=-2, keepdims=True)
+    # K' = (Σ_dd + ε I)⁻¹ Σ_dx, by a solve.
+    output_covariance = output_anomalies.mT @ output_anomalies / n
+    output_covariance += regularisation * np.eye(residual.shape[-1])
+    cross_covariance = output_anomalies.mT @ anomalies / n
+    gain = np.linalg.solve(output_covariance, cross_covariance)
+    innovations = {
+        "printed": output_anomalies,
+        "reversed": -output_anomalies,
+        "particle": -residual,
+        "shift": -mean_residual,
+    }
+    projected = ensemble + innovations[variant] @ gain
+    if not safeguard:
+        return np.asarray(projected)
+    before = residual
+    after = constraint.violation(projected)
+    # The members' own residuals may grow where only their mean is moved: g is curved.
+    if variant == "shift":
+        before = mean_residual
+        after = after.mean(axis=-2, keepdims=True)
+    # A comparison with NaN is false, so an ensemble out of the domain is refused too.
     better = np.abs(after).sum(axis=(-1, -2)) <= np.abs(before).sum(axis=(-1, -2))
-    return np.asarray(np.where(better[..., None, None], out, x))
+    return np.asarray(np.where(better[..., None, None], projected, ensemble))
 
 
 @validated
@@ -245,88 +257,106 @@ def retract(
     array([ 0.6 ,  0.8 ,  0.64, -0.48])
     """
     x = states.reshape(-1, states.shape[-1]).copy()
-    gap = constraint.residual(x)
-    left = np.arange(len(x))
+    residual = constraint.residual(x)
+    active = np.arange(len(x))
     for _ in range(_STEPS):
-        slope, excess = _excess(constraint, x[left], gap[left])
-        todo = excess > _CLOSE
-        left = left[todo]
-        slope = slope[todo]
-        excess = excess[todo]
-        if not left.size:
+        slope, error = _relative_residual(constraint, x[active], residual[active])
+        unsolved = error > _TOLERANCE
+        active = active[unsolved]
+        if not active.size:
             break
-        step = _along_normals(slope, gap[left])
-        x[left], gap[left], better = _shortened(constraint, x[left], gap[left], step)
+        step = _normal_step(slope[unsolved], residual[active])
+        x[active], residual[active], decreased = _line_search(
+            constraint, x[active], residual[active], step
+        )
         # Rounding ends the descent a little above the tolerance where g is large.
-        left = left[better | (excess > 1e3 * _CLOSE)]
+        active = active[decreased | (error[unsolved] > 1e3 * _TOLERANCE)]
     else:
-        left = left[_excess(constraint, x[left], gap[left])[1] > _CLOSE]
-    if left.size:
+        error = _relative_residual(constraint, x[active], residual[active])[1]
+        active = active[error > _TOLERANCE]
+    if active.size:
         raise SolverError(
-            f"retract: {left.size} of {len(x)} states did not reach the constraint "
-            f"in {_STEPS} Newton steps, |g - d| up to {np.abs(gap[left]).max():.3g}"
+            f"retract: {active.size} of {len(x)} states did not reach the constraint in "
+            f"{_STEPS} Newton steps, |g - d| up to {np.abs(residual[active]).max():.3g}"
         )
     if motion is not None:
         _make_tangent(x, constraint, motion)
     return np.asarray(x.reshape(states.shape))
 
 
-def _excess(constraint: Constraint, x: Array, gap: Array) -> tuple[Array, Array]:
-    """Jacobians at states (n, d), and how far each is off in units of what rounding explains."""
+def _relative_residual(
+    constraint: Constraint, x: Array, residual: Array
+) -> tuple[Array, Array]:
+    """Return Jacobians at states (n, d), and residuals in units of the values' magnitude."""
     slope = constraint.jacobian(x)
-    reach = np.linalg.norm(slope, axis=-1) * np.linalg.norm(x, axis=-1)[:, None]
-    unit = np.maximum(np.abs(constraint.value), reach)
-    return slope, (np.abs(gap) / np.where(gap == 0, 1.0, unit)).max(axis=-1)
+    # Rounding of x alone changes g_i by up to eps |grad g_i| |x|.
+    state_unit = np.linalg.norm(slope, axis=-1) * np.linalg.norm(x, axis=-1)[:, None]
+    unit = np.maximum(np.abs(constraint.value), state_unit)
+    # A residual of zero is exact, even where its unit is zero too.
+    error = np.abs(residual) / np.where(residual == 0, 1.0, unit)
+    return slope, error.max(axis=-1)
 
 
-def _along_normals(slope: Array, gap: Array) -> Array:
-    """The shortest step that takes away `gap` to first order; refuses a lost rank."""
+def _normal_step(slope: Array, residual: Array) -> Array:
+    """Return the shortest step that removes `residual` to first order, -J'(J J')⁻¹(g - d)."""
+    # The rank does not depend on the units of the constraints: normals have length one.
     with np.errstate(invalid="ignore"):
-        rows = slope / np.linalg.norm(slope, axis=-1, keepdims=True)
-    least = np.linalg.eigvalsh(np.nan_to_num(rows @ rows.mT))[..., 0]
-    lost = ~(least > 1e-14)
-    if lost.any():
+        normals = slope / np.linalg.norm(slope, axis=-1, keepdims=True)
+    correlations = np.nan_to_num(normals @ normals.mT)
+    least = np.linalg.eigvalsh(correlations)[..., 0]
+    deficient = ~(least > _LEAST_EIGENVALUE)
+    if deficient.any():
         raise ValueError(
-            "constraint must be a Jacobian of full rank, got one that loses rank at "
-            f"state {lost.argmax()} ({lost.sum()} of {lost.size})"
+            "constraint must have a Jacobian of full rank, got one that loses rank at "
+            f"state {deficient.argmax()} ({deficient.sum()} of {deficient.size})"
         )
-    dual = np.linalg.solve(slope @ slope.mT, gap[..., None])
-    return np.asarray(-(slope.mT @ dual)[..., 0])
+    multipliers = np.linalg.solve(slope @ slope.mT, residual[..., None])
+    return np.asarray(-(slope.mT @ multipliers)[..., 0])
 
 
-def _shortened(
-    constraint: Constraint, x: Array, gap: Array, step: Array
+def _line_search(
+    constraint: Constraint, x: Array, residual: Array, step: Array
 ) -> tuple[Array, Array, Mask]:
-    """The step halved in each state until its residual falls; whether it did."""
-    before = np.linalg.norm(gap, axis=-1)
-    better = np.zeros(len(x), dtype=bool)
-    place = x.copy()
-    left = gap.copy()
-    for k in range(30):
-        todo = np.flatnonzero(~better)
-        trial = x[todo] + 0.5**k * step[todo]
-        missed = constraint.violation(trial)
-        falls = np.linalg.norm(missed, axis=-1) < before[todo]
-        place[todo[falls]] = trial[falls]
-        left[todo[falls]] = missed[falls]
-        better[todo[falls]] = True
-        if better.all():
+    """Halve each state's step until its residual decreases.
+
+    Returns the states, their residuals, and whether these have decreased.
+    """
+    before = np.linalg.norm(residual, axis=-1)
+    decreased = np.zeros(len(x), dtype=bool)
+    new_x = x.copy()
+    new_residual = residual.copy()
+    for k in range(_HALVINGS):
+        rows = np.flatnonzero(~decreased)
+        trial = x[rows] + 0.5**k * step[rows]
+        trial_residual = constraint.violation(trial)
+        # False too where g has no value, NaN.
+        accepted = np.linalg.norm(trial_residual, axis=-1) < before[rows]
+        new_x[rows[accepted]] = trial[accepted]
+        new_residual[rows[accepted]] = trial_residual[accepted]
+        decreased[rows[accepted]] = True
+        if decreased.all():
             break
-    return place, left, better
+    return new_x, new_residual, decreased
 
 
 def _make_tangent(x: Array, constraint: Constraint, motion: Motion) -> None:
-    """Take from the velocities in states (n, d) their part along the normals, in place."""
-    places, rates = (list(part) for part in motion)
-    if (
-        len(places) != len(rates)
-        or {*places} & {*rates}
-        or max(places + rates) >= x.shape[-1]
-    ):
-        needs = (
-            f"as many other indices below {x.shape[-1]} for velocities as for positions"
+    """Remove the part of the velocities along the normals, in place, for states (n, d)."""
+    positions = list(motion[0])
+    velocities = list(motion[1])
+    _check_motion(motion, x.shape[-1])
+    slope = constraint.jacobian(x)[..., positions]
+    # v <- v - J'(J J')⁻¹ J v, so that J v = 0.
+    rate = (slope @ x[:, velocities, None])[..., 0]
+    x[:, velocities] += _normal_step(slope, rate)
+
+
+def _check_motion(motion: Motion, d: int) -> None:
+    """Raise an error unless every position has a velocity of its own among d components."""
+    positions, velocities = motion
+    paired = len(positions) == len(velocities)
+    disjoint = not set(positions) & set(velocities)
+    if not (paired and disjoint and max(*positions, *velocities) < d):
+        raise ValueError(
+            f"motion must have as many other indices below {d} for velocities as for "
+            f"positions, got {motion}"
         )
-        raise ValueError(f"motion must be {needs}, got {motion}")
-    slope = constraint.jacobian(x)[..., places]
-    along = (slope @ x[:, rates, None])[..., 0]
-    x[:, rates] += _along_normals(slope, along)

@@ -1,13 +1,13 @@
 r"""The ensemble transform: a coupling that turns weighted members into equally weighted ones.
 
 With the optimal coupling :math:`\mathbf T` of the weights to equal masses, each new member is an
-average of old ones,
+average of prior members,
 
 .. math:: \mathbf x_j^+ = N\sum_i t_{ij}\,\mathbf x_i,
 
 equation (3) of Das and Bhattacharya after S. Reich, SIAM Journal on Scientific Computing 35 (2013)
-A2013-A2024. The mean of the new members is the weighted mean, exactly. Within convex pieces and
-along a curved surface it samples sets.
+A2013-A2024. The mean of the new members is the weighted mean, exactly. Two variants keep the
+members on a set: within convex pieces, and along a curved surface.
 """
 
 from __future__ import annotations
@@ -24,71 +24,83 @@ from ..ensembles import Ensemble
 from ..linalg import EPS, factor
 from ..validation import (
     Array,
+    ArrayInput,
     Indices,
+    IndicesInput,
     NonNegativeFloat,
     PositiveFloat,
     Rng,
+    call_user,
     check_array,
     validated,
 )
 from .solvers import SQUARED, Solve, Solver, scale_cost, solver_of, squared_distances
 
 __all__ = [
-    "transform_ensemble",
-    "transport_plans",
+    "correct_moments",
     "rejuvenate",
-    "second_order",
     "transform_along",
+    "transform_ensemble",
     "transform_within",
+    "transport_plans",
 ]
 
-Members = Annotated[Array, "... n d", SQUARED]
-AsMoved = Annotated[Array, "*moved.shape", SQUARED]
+SquarableEnsemble = Annotated[ArrayInput, "... n d", SQUARED]
+"""Members whose squared distances are finite."""
+Forecast = Annotated[ArrayInput, "*transformed.shape", SQUARED]
+"""Members before the transform."""
 
-_TIE = 1e-7
-"""In units of the largest cost. The weighted mean stays exact, the plan costs at most this more."""
+_TIE_BREAK = 1e-7
+"""Largest addition to a cost, in units of its range. The weighted mean stays exact, the plan costs
+at most this more."""
 
 
 def normalize_weights(
     log_weights: ArrayLike, shape: tuple[int, ...] | None = None
 ) -> Array:
-    """Weights (..., N) that sum to one, from logarithms of any size; -inf is a weight of zero."""
-    w = check_array(log_weights, "log_weights", shape, finite=False)
-    top = w.max(axis=-1, keepdims=True)
-    if np.isneginf(top).any():
+    """Return weights (..., N) that sum to one, from their logarithms in any normalisation.
+
+    Minus infinity is a weight of zero.
+    """
+    logs = check_array(log_weights, "log_weights", shape, finite=False)
+    largest = logs.max(axis=-1, keepdims=True)
+    if np.isneginf(largest).any():
         raise ValueError(
-            "log_weights must be a positive weight in every ensemble, got only zeros"
+            "log_weights must have a positive weight in every ensemble, got zeros only"
         )
-    if not np.isfinite(top).all():
+    if not np.isfinite(largest).all():
         raise ValueError(
             "log_weights must be numbers below infinity, got NaN or infinity"
         )
-    if w.shape[-1] > 2 and w.min() >= 0 and np.allclose(w.sum(axis=-1), 1):
+    # Logarithms of normalised weights are negative: these are weights by mistake.
+    nonnegative = logs.shape[-1] > 2 and logs.min() >= 0
+    if nonnegative and np.allclose(logs.sum(axis=-1), 1):
         warnings.warn(
-            "log_weights must have logarithms, got a sum of 1",
+            "log_weights must be logarithms, got numbers with a sum of 1",
             RuntimeWarning,
             stacklevel=4,
         )
-    w = np.exp(w - top)
-    return np.asarray(w / w.sum(axis=-1, keepdims=True))
+    # The largest weight is one, so that none overflows.
+    weights = np.exp(logs - largest)
+    return np.asarray(weights / weights.sum(axis=-1, keepdims=True))
 
 
 @lru_cache(maxsize=8)
-def _ties(n: int) -> Array:
-    """A fixed matrix between 0 and 1e-7, added to costs of range one.
+def _tie_breaker(n: int) -> Array:
+    """Return a fixed matrix between 0 and 1e-7, an addition to costs of range one.
 
     Where members coincide, as copies do after one weight has dominated, the cheapest coupling is
-    not unique and the last bit of a cost decides between quite different ensembles. This decides
-    instead, on every machine alike.
+    not unique, and the last bit of a cost would choose between quite different ensembles. With the
+    addition the choice is the same on every machine.
     """
-    fixed = _TIE * np.random.default_rng(0).random((n, n))
-    fixed.setflags(write=False)
-    return fixed
+    addition = _TIE_BREAK * np.random.default_rng(0).random((n, n))
+    addition.setflags(write=False)
+    return addition
 
 
 @validated
-def transport_plans(ensemble: Members, log_weights: ArrayLike) -> Array:
-    """Optimal couplings of weighted members to the same members with equal weights.
+def transport_plans(ensemble: SquarableEnsemble, log_weights: ArrayLike) -> Array:
+    """Return optimal couplings of weighted members to the same members with equal weights.
 
     Parameters
     ----------
@@ -100,9 +112,9 @@ def transport_plans(ensemble: Members, log_weights: ArrayLike) -> Array:
     Returns
     -------
     ndarray, (..., N, N)
-        Row i is where the mass of member i goes; the cost is the squared distance. Where it leaves
-        a choice, as between copies of a member, a fixed addition of at most 1e-7 of the largest
-        cost decides.
+        Row i is the distribution of member i's mass; the cost is the squared distance. If several
+        plans are optimal, as with copies of a member, a fixed addition of at most 1e-7 of the
+        largest cost makes the choice.
 
     Examples
     --------
@@ -110,31 +122,33 @@ def transport_plans(ensemble: Members, log_weights: ArrayLike) -> Array:
     array([[0.5 , 0.25],
            [0.  , 0.25]])
     """
-    w = normalize_weights(log_weights, ensemble.shape[:-1])
-    return _plans(ensemble, w, solver_of("network"))
+    weights = normalize_weights(log_weights, ensemble.shape[:-1])
+    return _solve_plans(ensemble, weights, solver_of("network"))
 
 
-def _plans(x: Array, w: Array, solve: Solve) -> Array:
-    """Couplings (..., N, N) of the weights to equal masses, for the squared distance."""
-    points = x.reshape(-1, *x.shape[-2:])
-    costs = np.array([squared_distances(p) for p in points])
-    return _coupled(costs.reshape(*w.shape, w.shape[-1]), w, solve)
+def _solve_plans(ensemble: Array, weights: Array, solve: Solve) -> Array:
+    """Return couplings (..., N, N) of the weights to equal masses, for the squared distance."""
+    n = weights.shape[-1]
+    flat_ensemble = ensemble.reshape(-1, *ensemble.shape[-2:])
+    costs = np.array([squared_distances(members) for members in flat_ensemble])
+    return _solve_couplings(costs.reshape(*weights.shape, n), weights, solve)
 
 
-def _coupled(costs: Array, w: Array, solve: Solve) -> Array:
-    """Couplings for costs (..., N, N)."""
-    n = w.shape[-1]
+def _solve_couplings(costs: Array, weights: Array, solve: Solve) -> Array:
+    """Return couplings of the weights to equal masses, for costs (..., N, N)."""
+    n = weights.shape[-1]
     equal = np.full(n, 1 / n)
-    ties = _ties(n)
-    out = np.empty_like(costs)
-    for row in np.ndindex(w.shape[:-1]):
-        out[row], _ = solve(scale_cost(costs[row])[0] + ties, w[row], equal)
-    return out
+    addition = _tie_breaker(n)
+    plans = np.empty_like(costs)
+    for index in np.ndindex(weights.shape[:-1]):
+        cost = scale_cost(costs[index])[0] + addition
+        plans[index], _ = solve(cost, weights[index], equal)
+    return plans
 
 
 @validated
 def transform_ensemble(
-    ensemble: Members,
+    ensemble: SquarableEnsemble,
     log_weights: ArrayLike,
     *,
     solver: Solver = "network",
@@ -142,7 +156,7 @@ def transform_ensemble(
     debias: bool = False,
     correct: bool = False,
 ) -> Array:
-    r"""Replace weighted members by as many with equal weights.
+    r"""Replace weighted members by the same number with equal weights.
 
     .. math:: \mathbf X^+ = \mathbf X\,N\,\mathbf T
 
@@ -153,13 +167,13 @@ def transform_ensemble(
     log_weights : array_like, (..., N)
         Logarithms of their weights, in any normalisation; -inf is a weight of zero.
     solver, regularisation
-        As for :func:`~distfilt.coupling.plan`.
+        As for :func:`~distfilt.coupling.transport_plan`.
     debias : bool
-        Take off the displacement that the solver's plan gives members whose weights are equal
+        Subtract the displacement that the solver's plan gives members whose weights are equal
         already. An entropic plan shrinks the ensemble; this undoes most of it. An optimal plan
-        needs none: it only swaps what lies within the tie-breaker of :func:`plans`.
+        does not need it: it only swaps members within the tie-breaker of :func:`transport_plans`.
     correct : bool
-        Give the new members the weighted covariance too, by :func:`second_order`.
+        Give the new members the weighted covariance too, by :func:`correct_moments`.
 
     Returns
     -------
@@ -178,29 +192,42 @@ def transform_ensemble(
     >>> bool(transform_ensemble([[0.0], [1.0]], [-1e4, -2e4])[1, 0] == 0.0)
     True
     """
-    x = ensemble
-    w = normalize_weights(log_weights, ensemble.shape[:-1])
+    weights = normalize_weights(log_weights, ensemble.shape[:-1])
     solve = solver_of(solver, regularisation)
-    out = apply_plan(x, w, _plans(x, w, solve))
+    plans = _solve_plans(ensemble, weights, solve)
+    transformed = apply_plan(ensemble, weights, plans)
     if debias:
-        equal = np.full(w.shape, 1 / x.shape[-2])
-        out += x - apply_plan(x, equal, _plans(x, equal, solve))
-        out += w[..., None, :] @ x - out.mean(axis=-2, keepdims=True)
-    return _second_order(out, x, w) if correct else out
+        equal = np.full(weights.shape, 1 / ensemble.shape[-2])
+        plans = _solve_plans(ensemble, equal, solve)
+        # x_j - N sum_i t_ij x_i for equal weights is the solver's own displacement.
+        transformed += ensemble - apply_plan(ensemble, equal, plans)
+        mean = transformed.mean(axis=-2, keepdims=True)
+        transformed += weights[..., None, :] @ ensemble - mean
+    if not correct:
+        return transformed
+    return _correct_moments(transformed, ensemble, weights)
 
 
-def apply_plan(x: Array, w: Array, matrix: Array, *, correct: bool = False) -> Array:
-    """Members with weights w after a coupling `matrix` of w to equal masses, (3)."""
-    centre = w[..., None, :] @ x
-    out = np.asarray(centre + x.shape[-2] * (matrix.mT @ (x - centre)))
-    return _second_order(out, x, w) if correct else out
+def apply_plan(
+    ensemble: Array, weights: Array, plan: Array, *, correct: bool = False
+) -> Array:
+    """Transform weighted members with a coupling of the weights to equal masses, (3)."""
+    # About the weighted mean, so that members far from the origin lose no digits.
+    mean = weights[..., None, :] @ ensemble
+    shift = ensemble.shape[-2] * (plan.mT @ (ensemble - mean))
+    transformed = np.asarray(mean + shift)
+    if not correct:
+        return transformed
+    return _correct_moments(transformed, ensemble, weights)
 
 
 @validated
-def second_order(moved: Members, ensemble: AsMoved, log_weights: ArrayLike) -> Array:
+def correct_moments(
+    transformed: SquarableEnsemble, ensemble: Forecast, log_weights: ArrayLike
+) -> Array:
     r"""Give transformed members the mean and covariance of the weighted ones, exactly.
 
-    Averages vary less than what they average, so :math:`\mathbf X^+` has too small a covariance.
+    Averages vary less than the averaged members, so :math:`\mathbf X^+` has too small a covariance.
     The symmetric matrix
 
     .. math:: \mathbf B = \mathbf P^{1/2}
@@ -211,81 +238,97 @@ def second_order(moved: Members, ensemble: AsMoved, log_weights: ArrayLike) -> A
 
     Parameters
     ----------
-    moved : array_like, (..., N, d)
-        What :func:`ensemble_transform` returned.
+    transformed : array_like, (..., N, d)
+        Members from :func:`transform_ensemble`.
     ensemble, log_weights
-        What it was given.
+        The arguments of :func:`transform_ensemble`.
 
     Returns
     -------
     ndarray, (..., N, d)
-        Where `moved` has no spread in a direction in which the weighted members have one, nothing
-        can be stretched, and the covariance falls short there. Covariances are about the mean with
-        N, not N - 1, in the denominator.
+        If `transformed` has no spread in a direction in which the weighted members have some, the
+        covariance stays zero there. Covariances are about the mean with N, not N - 1, in the
+        denominator.
 
     Notes
     -----
     W. Acevedo, J. de Wiljes, S. Reich, SIAM Journal on Scientific Computing 39 (2017) A1834-A1850
-    correct the N x N transform instead; this corrects d x d and keeps the same moments.
+    correct the N x N transform instead; this corrects by a d x d matrix and has the same moments.
 
     Examples
     --------
     >>> x, logs = [[0.0], [1.0]], np.log([0.75, 0.25])
-    >>> float(second_order(transform_ensemble(x, logs), x, logs).var().round(12))
+    >>> transformed = transform_ensemble(x, logs)
+    >>> float(correct_moments(transformed, x, logs).var().round(12))
     0.1875
     """
-    return _second_order(
-        moved, ensemble, normalize_weights(log_weights, ensemble.shape[:-1])
-    )
+    weights = normalize_weights(log_weights, ensemble.shape[:-1])
+    return _correct_moments(transformed, ensemble, weights)
 
 
-def _second_order(y: Array, x: Array, w: Array) -> Array:
-    n = x.shape[-2]
-    centre = w[..., None, :] @ x
-    around = x - centre
-    spread = y - y.mean(axis=-2, keepdims=True)
-    root = _graded(around.mT @ (w[..., None] * around))
-    # With P = K K' the anomalies times B are the nearest orthonormal columns to those times K,
-    # times K': P comes out to rounding, however little C has left of it in some direction.
-    turned = spread @ root
-    u, sizes, v = np.linalg.svd(turned, full_matrices=False)
-    # What rounding leaves in a direction where there is nothing: of the members, of the columns.
-    axes = v.mT
-    members, columns = (np.abs(z).max(axis=-2, keepdims=True) for z in (y, turned))
-    lost = n * EPS * (members @ np.abs(root @ axes) + columns @ np.abs(axes))
-    u = u * (sizes[..., None, :] > lost)
+def _correct_moments(transformed: Array, ensemble: Array, weights: Array) -> Array:
+    """Give members (..., N, d) the weighted mean and covariance of the ensemble."""
+    n = ensemble.shape[-2]
+    mean = weights[..., None, :] @ ensemble
+    prior_anomalies = ensemble - mean
+    anomalies = transformed - transformed.mean(axis=-2, keepdims=True)
+    # P = K K' is the weighted covariance.
+    covariance = prior_anomalies.mT @ (weights[..., None] * prior_anomalies)
+    root = _sorted_factor(covariance)
+    # With anomalies A, A B is U V' K' sqrt(N), where U S V' = A K: its columns U V' are the
+    # orthonormal ones nearest to A K. P comes out to rounding, however small C is.
+    product = anomalies @ root
+    u, sizes, vt = np.linalg.svd(product, full_matrices=False)
+    u = u * (sizes[..., None, :] > _rounding(transformed, product, root, vt.mT, n))
     u -= u.mean(axis=-2, keepdims=True)
-    return np.asarray(centre + np.sqrt(n) * (u @ v @ root.mT))
+    return np.asarray(mean + np.sqrt(n) * (u @ vt @ root.mT))
 
 
-def _graded(cov: Array) -> Array:
-    """A factor K of covariances K K', triangular from the widest component to the narrowest.
+def _rounding(
+    transformed: Array, product: Array, root: Array, axes: Array, n: int
+) -> Array:
+    """Return the singular values that rounding alone can give the product of `transformed` and root.
 
-    Its columns then shrink as the components do, and no unit drowns in the rounding of another.
+    Rounding of the members enters through the root, rounding of the product directly.
     """
-    order = np.argsort(-np.diagonal(cov, axis1=-2, axis2=-1), axis=-1, kind="stable")
-    rows = np.take_along_axis(cov, order[..., :, None], axis=-2)
-    lower = factor(np.take_along_axis(rows, order[..., None, :], axis=-1))
-    return np.take_along_axis(lower, np.argsort(order, axis=-1)[..., :, None], axis=-2)
+    member_size = np.abs(transformed).max(axis=-2, keepdims=True)
+    column_size = np.abs(product).max(axis=-2, keepdims=True)
+    sum_of_errors = member_size @ np.abs(root @ axes) + column_size @ np.abs(axes)
+    return np.asarray(n * EPS * sum_of_errors)
+
+
+def _sorted_factor(covariance: Array) -> Array:
+    """Return a factor K of covariances K K', triangular from the widest component to the narrowest.
+
+    Its columns then shrink as the components do, and a small unit does not vanish in the rounding
+    of a large one.
+    """
+    variances = np.diagonal(covariance, axis1=-2, axis2=-1)
+    order = np.argsort(-variances, axis=-1, kind="stable")
+    sorted_rows = np.take_along_axis(covariance, order[..., :, None], axis=-2)
+    lower = factor(np.take_along_axis(sorted_rows, order[..., None, :], axis=-1))
+    # Back to the given order of components.
+    inverse_order = np.argsort(order, axis=-1)
+    return np.take_along_axis(lower, inverse_order[..., :, None], axis=-2)
 
 
 @validated
 def rejuvenate(
-    moved: Annotated[Ensemble, SQUARED],
-    ensemble: AsMoved,
+    transformed: Annotated[Ensemble, SQUARED],
+    ensemble: Forecast,
     *,
     bandwidth: NonNegativeFloat,
     rng: Rng,
 ) -> Array:
-    r"""Add combinations of the forecast's anomalies: new places, and the same mean.
+    r"""Add random combinations of the forecast's anomalies, which keep the mean.
 
     .. math:: \mathbf x_j' = \mathbf x_j^+ + \frac{h}{\sqrt{N-1}}\sum_i(\mathbf x_i-\bar{\mathbf x})
         \,\xi_{ij},\qquad \sum_j\xi_{ij}=0
 
     Parameters
     ----------
-    moved : array_like, (..., N, d)
-        What :func:`ensemble_transform` returned; N is at least two.
+    transformed : array_like, (..., N, d)
+        Members from :func:`transform_ensemble`, at least two.
     ensemble : array_like, (..., N, d)
         The forecast.
     bandwidth : float
@@ -295,7 +338,7 @@ def rejuvenate(
     Returns
     -------
     ndarray, (..., N, d)
-        The added members lie in the forecast's span, and their mean is zero.
+        The additions lie in the span of the forecast's anomalies, and their mean is zero.
 
     Examples
     --------
@@ -306,28 +349,30 @@ def rejuvenate(
     >>> bool(abs(after.mean()) < 1e-15), len(set(after.ravel()))
     (True, 3)
     """
-    x = ensemble
     n = ensemble.shape[-2]
-    drawn = rng.standard_normal((*x.shape[:-1], n))
+    normal = rng.standard_normal((*ensemble.shape[:-1], n))
     # Centring costs one part in N of the variance.
-    drawn = (drawn - drawn.mean(axis=-2, keepdims=True)) * np.sqrt(n / (n - 1))
-    around = x - x.mean(axis=-2, keepdims=True)
-    return np.asarray(moved + bandwidth / np.sqrt(n - 1) * (drawn @ around))
+    combinations = normal - normal.mean(axis=-2, keepdims=True)
+    combinations = combinations * np.sqrt(n / (n - 1))
+    anomalies = ensemble - ensemble.mean(axis=-2, keepdims=True)
+    noise = bandwidth / np.sqrt(n - 1) * (combinations @ anomalies)
+    return np.asarray(transformed + noise)
 
 
 @validated
 def transform_within(
-    ensemble: Annotated[Array, "n d"],
+    ensemble: Annotated[ArrayInput, "n d", SQUARED],
     log_weights: ArrayLike,
-    pieces: Annotated[Indices, "n"],
+    pieces: Annotated[IndicesInput, "n"],
     *,
     rng: Rng,
 ) -> Array:
-    r"""The transform on a set cut into pieces: no average crosses from one piece to another.
+    r"""Transform members on a set cut into pieces, without averages across pieces.
 
     Each new member chooses a piece p with probability :math:`N\sum_{i\in p}t_{ij}` and is the
-    average within it. Convex pieces hold their averages, so no member leaves the set. One piece is
-    :func:`ensemble_transform`; a piece for every member is random resampling by the plan.
+    average within it. Convex pieces contain their averages, so no member leaves the set. With one
+    piece it is :func:`transform_ensemble`; with a piece for every member, random resampling by the
+    plan.
 
     Parameters
     ----------
@@ -338,8 +383,8 @@ def transform_within(
     pieces : array_like of int, (N,)
         The number of each member's piece.
     rng : numpy.random.Generator
-        Chooses the pieces, systematically: each gets its share of the members on average, and
-        hardly more or less of them (by four or five where many pieces are interleaved).
+        Chooses the pieces, systematically: each gets its probability times N members on average,
+        and hardly more or fewer (by four or five where many pieces are interleaved).
 
     Returns
     -------
@@ -355,43 +400,51 @@ def transform_within(
     >>> bool((np.abs(y) >= 0.9).all())
     True
     """
-    matrix = len(ensemble) * transport_plans(ensemble, log_weights)
-    names, index = np.unique(pieces, return_inverse=True)
-    belongs = (index == np.arange(names.size)[:, None]).astype(np.float64)
-    chosen = _chosen(belongs @ matrix, rng)
-    kept = matrix * belongs[chosen].T
-    return np.asarray(kept.T @ ensemble / kept.sum(axis=0)[:, None])
+    plan = len(ensemble) * transport_plans(ensemble, log_weights)
+    labels, index = np.unique(pieces, return_inverse=True)
+    # Row p marks the members of piece p.
+    membership = (index == np.arange(labels.size)[:, None]).astype(np.float64)
+    choice = _choose_rows(membership @ plan, rng)
+    # Column j keeps the masses from its chosen piece only, and averages with them.
+    masses = plan * membership[choice].T
+    return np.asarray(masses.T @ ensemble / masses.sum(axis=0)[:, None])
 
 
-def _chosen(share: Array, rng: np.random.Generator) -> Array:
-    """For each column one row, as probable as its share; each row's total hardly varies.
+def _choose_rows(probabilities: Array, rng: Rng) -> Indices:
+    """Choose a row for each column, with the column's probabilities and hardly varying totals.
 
-    Row by row, the columns that are still free are laid end to end, each as long as its chance,
-    and those that hold a level k + u are taken.
+    Row by row, the columns without a choice are laid end to end, each as long as its conditional
+    probability, and those that contain a level k + u choose the row.
     """
-    left = np.arange(share.shape[1])
-    order = np.full(share.shape[1], share.shape[0] - 1)
-    rest = np.cumsum(share[::-1], axis=0)[::-1]
-    for row in range(share.shape[0] - 1):
-        chance = share[row, left] / np.where(rest[row, left] > 0, rest[row, left], 1.0)
-        levels = np.floor(np.cumsum(chance) + rng.random())
-        taken = np.diff(levels, prepend=0.0) > 0
-        order[left[taken]] = row
-        left = left[~taken]
-    # By rounding a column could be left with a row of zero share.
-    bare = share[order, np.arange(order.size)] <= 0
-    return np.asarray(np.where(bare, share.argmax(axis=0), order))
+    n_rows, n_columns = probabilities.shape
+    undecided = np.arange(n_columns)
+    choice = np.full(n_columns, n_rows - 1)
+    # Probability of a row or a later one, in every column.
+    tail = np.cumsum(probabilities[::-1], axis=0)[::-1]
+    for row in range(n_rows - 1):
+        remaining = tail[row, undecided]
+        conditional = probabilities[row, undecided] / np.where(
+            remaining > 0, remaining, 1.0
+        )
+        # Systematic sampling: a level lies in a column if the floor increases there.
+        levels = np.floor(np.cumsum(conditional) + rng.random())
+        chosen = np.diff(levels, prepend=0.0) > 0
+        choice[undecided[chosen]] = row
+        undecided = undecided[~chosen]
+    # By rounding a column could get a row of zero probability.
+    impossible = probabilities[choice, np.arange(n_columns)] <= 0
+    return np.asarray(np.where(impossible, probabilities.argmax(axis=0), choice))
 
 
 @validated
 def transform_along(
-    ensemble: Members,
+    ensemble: SquarableEnsemble,
     log_weights: ArrayLike,
     *,
     difference: Callable[[Array, Array], Array],
     retract: Callable[[Array, Array], Array],
 ) -> Array:
-    r"""The transform on a curved set: averages of tangent vectors, moved back onto the set.
+    r"""Transform members on a curved set by averages of tangent vectors.
 
     .. math:: \mathbf x_j^+ = \operatorname{retract}\Bigl(\mathbf x_j,\;
         N\sum_it_{ij}\operatorname{difference}(\mathbf x_i,\mathbf x_j)\Bigr)
@@ -405,15 +458,15 @@ def transform_along(
     log_weights : array_like, (..., N)
         Logarithms of their weights.
     difference : callable
-        ``difference(to, here) -> v``, (..., k): the tangent vector at `here` that points to `to`,
+        ``difference(x, base) -> v``, (..., k): the tangent vector at `base` that points to `x`,
         both (..., d). On a circle the angle between them, wrapped.
     retract : callable
-        ``retract(here, v) -> x``, (..., d): where it leads.
+        ``retract(base, v) -> x``, (..., d): the point of the set that a tangent vector leads to.
 
     Returns
     -------
     ndarray, (..., N, d)
-        On the set as nearly as `retract` leads there.
+        On the set as precisely as the points of `retract` are.
 
     Examples
     --------
@@ -430,13 +483,19 @@ def transform_along(
     array([[ 3.   ],
            [-3.142]])
     """
-    x = ensemble
     n = ensemble.shape[-2]
-    w = normalize_weights(log_weights, x.shape[:-1])
-    there, here = np.broadcast_arrays(x[..., :, None, :], x[..., None, :, :])
-    v = check_array(
-        difference(there.copy(), here.copy()), "difference", (*x.shape[:-1], n, "k")
+    weights = normalize_weights(log_weights, ensemble.shape[:-1])
+    # All pairs (i, j): the tangent vector at member j that points to member i.
+    points, bases = np.broadcast_arrays(
+        ensemble[..., :, None, :], ensemble[..., None, :, :]
     )
-    matrix = _coupled((v * v).sum(axis=-1), w, solver_of("network"))
-    steps = n * np.einsum("...ij,...ijk->...jk", matrix, v)
-    return check_array(retract(x.copy(), steps), "retract", x.shape)
+    tangents = check_array(
+        call_user(difference, points.copy(), bases.copy()),
+        "difference",
+        (*ensemble.shape[:-1], n, "k"),
+    )
+    costs = (tangents * tangents).sum(axis=-1)
+    plans = _solve_couplings(costs, weights, solver_of("network"))
+    steps = n * np.einsum("...ij,...ijk->...jk", plans, tangents)
+    transformed = call_user(retract, ensemble.copy(), steps)
+    return check_array(transformed, "retract", ensemble.shape)

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 import numpy as np
 import scipy
 
-from ..models.base import path
+from ..models.base import trajectory
 from ..models.swarm import Swarm
 from ..validation import (
     Array,
@@ -246,4 +246,4 @@ class FokkerPlanck(FrozenModel):
         times : array_like, (T,)
             Strictly increasing from 0, in s.
         """
-        return path(self.step, values, times, 0.0)
+        return trajectory(self.step, values, times, 0.0)

@@ -27,6 +27,7 @@ from ..validation import (
     NonNegativeInt,
     PositiveFloat,
     Rng,
+    skip_validation,
     validated,
 )
 from .inputs import Observation, match_delayed, plan_steps, read_observations
@@ -373,8 +374,10 @@ class Filter(FrozenModel, ABC):
                 else waiting
             )
             waiting = waiting[len(due) :]
-            # The first state is the caller's.
-            state = self._advanced(state, t, observed, due, own=own and k > 0)
+            # This generator runs after the validated call that made it has returned.
+            with skip_validation():
+                # The first state is the caller's.
+                state = self._advanced(state, t, observed, due, own=own and k > 0)
             yield state
 
     def _recorded(

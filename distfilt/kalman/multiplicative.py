@@ -14,7 +14,7 @@ import numpy as np
 
 from ..linalg import central
 from ..models import Model
-from ..models.satellite import left_directions, rotate, rotation_vector_between
+from ..models.quaternions import left_directions, rotate, rotation_vector_between
 from ..sensors import Sensor, stack
 from ..validation import (
     Array,
@@ -35,7 +35,7 @@ class QuaternionChart(FrozenModel):
     """How errors move a state with a quaternion among its components, and the rest as it is.
 
     The error's components are the state's, with the rotation vector of
-    :func:`distfilt.models.satellite.turned` in the quaternion's place: one fewer.
+    :func:`distfilt.models.quaternions.rotate` in the quaternion's place: one fewer.
 
     Parameters
     ----------

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..linalg import in_units, log_det, log_sum, symmetrise
 from ..validation import (
     Array,
+    ArrayInput,
     DistinctIndices,
     FrozenModel,
     PositiveDefinite,
@@ -25,8 +27,8 @@ from ..validation import (
 __all__ = ["GaussianMixture"]
 
 _LOG_2PI = float(np.log(2 * np.pi))
-# Numbers that one block of an evaluation may hold: half a megabyte stays in the cache.
-_CHUNK = 60_000
+# Numbers in one block of an evaluation: half a megabyte stays in the cache.
+_BLOCK_SIZE = 60_000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -43,7 +45,7 @@ class GaussianMixture(FrozenModel):
     weights : array_like, (L,)
         Nonnegative, with sum 1.
     means : array_like, (L, d)
-        The mixands' means.
+        The components' means.
     covs : array_like, (L, d, d)
         Their covariances.
 
@@ -57,7 +59,7 @@ class GaussianMixture(FrozenModel):
     --------
     >>> two = GaussianMixture([0.5, 0.5], [[-1.0], [1.0]], [[[1.0]], [[1.0]]])
     >>> two
-    GaussianMixture(size=2, dim=1)
+    GaussianMixture(n_components=2, dim=1)
     >>> two.cov
     array([[2.]])
     """
@@ -66,12 +68,18 @@ class GaussianMixture(FrozenModel):
     means: Annotated[Array, "L d"]
     covs: Annotated[Array, "L d d", check_positive_definite]
 
+    if TYPE_CHECKING:
+        # The fields are arrays, but the constructor takes anything array_like.
+        def __init__(
+            self, weights: ArrayLike, means: ArrayLike, covs: ArrayLike
+        ) -> None: ...
+
     @classmethod
     @validated
     def gaussian(
-        cls, mean: Annotated[Array, "d"], cov: Annotated[PositiveDefinite, "d d"]
+        cls, mean: Annotated[ArrayInput, "d"], cov: Annotated[PositiveDefinite, "d d"]
     ) -> GaussianMixture:
-        """A single Gaussian as a mixture of one mixand.
+        """Return a single Gaussian as a mixture of one component.
 
         Parameters
         ----------
@@ -81,29 +89,31 @@ class GaussianMixture(FrozenModel):
         Examples
         --------
         >>> GaussianMixture.gaussian([0.0, 1.0], np.eye(2))
-        GaussianMixture(size=1, dim=2)
+        GaussianMixture(n_components=1, dim=2)
         """
         return cls(np.ones(1), mean[None], cov[None])
 
     @classmethod
     def construct(cls, *args: Any, **options: Any) -> Self:
-        """Build one from what the library made itself, and freeze its arrays."""
-        out = super().construct(*args, **options)
-        for part in (out.weights, out.means, out.covs):
-            part.setflags(write=False)  # what is cached of them stays right
-        return out
+        """Build a mixture of arrays that the library made, unchecked, and freeze them."""
+        mixture = super().construct(*args, **options)
+        # Factors and densities are cached, so the arrays must not change.
+        mixture.weights.setflags(write=False)
+        mixture.means.setflags(write=False)
+        mixture.covs.setflags(write=False)
+        return mixture
 
     def __repr__(self) -> str:
-        return f"GaussianMixture(size={self.n_components}, dim={self.dim})"
+        return f"GaussianMixture(n_components={self.n_components}, dim={self.dim})"
 
     @property
     def n_components(self) -> int:
-        """Number of mixands, L."""
+        """Number of components, L."""
         return int(self.weights.size)
 
     @property
     def dim(self) -> int:
-        """Number of components of the state, d."""
+        """Size of the state, d."""
         return int(self.means.shape[1])
 
     @cached_property
@@ -119,30 +129,30 @@ class GaussianMixture(FrozenModel):
         Raises
         ------
         numpy.linalg.LinAlgError
-            If the mixture has collapsed: it names the mixand.
+            If a covariance is not positive definite: it names the component.
         """
         try:
             return np.asarray(np.linalg.cholesky(self.covs))
         except np.linalg.LinAlgError:
-            raise np.linalg.LinAlgError(_collapsed(self.covs)) from None
+            raise np.linalg.LinAlgError(_describe_collapse(self.covs)) from None
 
     @cached_property
     def log_peaks(self) -> Array:
-        """Logarithm of each mixand's largest density, -log sqrt|2 pi P|, (L,)."""
+        """Logarithm of each component's largest density, -log sqrt|2 pi P|, (L,)."""
         return np.asarray(-0.5 * (log_det(self.factors) + self.dim * _LOG_2PI))
 
     @validated
-    def component_log_densities(self, x: Annotated[Array, "... self.dim"]) -> Array:
-        """Logarithm of each mixand's density, without its weight, (..., L).
+    def component_log_densities(self, x: Annotated[ArrayInput, "... self.dim"]) -> Array:
+        """Logarithm of each component's density, without its weight, (..., L).
 
         Parameters
         ----------
         x : array_like, (..., d)
         """
-        return self._in_blocks(x, (self.n_components,), lambda logs: logs)
+        return self._evaluate(x, (self.n_components,), lambda logs: logs)
 
     @validated
-    def log_density(self, x: Annotated[Array, "... self.dim"]) -> Array:
+    def log_density(self, x: Annotated[ArrayInput, "... self.dim"]) -> Array:
         """Logarithm of the density, (...).
 
         Parameters
@@ -155,56 +165,66 @@ class GaussianMixture(FrozenModel):
         >>> one.log_density([[0.0], [60.0]]).round(2).tolist()
         [-0.92, -1800.92]
         """
-        return self._in_blocks(
-            x, (), lambda logs: log_sum(self.log_weights + logs)[..., 0]
-        )
 
-    def _in_blocks(
-        self, x: Array, shape: tuple[int, ...], of: Callable[[Array], Array]
+        # log p(x) = log Σ w_l exp(log N_l(x))
+        def add_components(logs: Array) -> Array:
+            return log_sum(self.log_weights + logs)[..., 0]
+
+        return self._evaluate(x, (), add_components)
+
+    def _evaluate(
+        self, x: Array, shape: tuple[int, ...], function: Callable[[Array], Array]
     ) -> Array:
-        """What is made of the mixands' log densities (n, L) at points, some points at a time."""
-        flat = x.reshape(-1, self.dim)
-        (centre, white, at) = self._whitening
-        out = np.empty((len(flat), *shape))
-        step = max(1, _CHUNK // self.means.size)
-        for start in range(0, len(flat), step):
-            rows = slice(start, start + step)
-            gap = ((flat[rows] - centre) @ white).reshape(-1, *at.shape) - at
-            out[rows] = of(self.log_peaks - 0.5 * np.einsum("nld,nld->nl", gap, gap))
-        return out.reshape((*x.shape[:-1], *shape))
+        """Apply a function to the components' log densities (n, L), in blocks of n points."""
+        points = x.reshape(-1, self.dim)
+        centre, whitening, white_means = self._whitening
+        result = np.empty((len(points), *shape))
+        block = max(1, _BLOCK_SIZE // self.means.size)
+        for start in range(0, len(points), block):
+            rows = slice(start, start + block)
+            # z = L_l⁻¹ (x - m_l) for each component l, and log N_l = log peak_l - ½ zᵀz.
+            white = (points[rows] - centre) @ whitening
+            z = white.reshape(-1, *white_means.shape) - white_means
+            squared_lengths = np.einsum("nld,nld->nl", z, z)
+            result[rows] = function(self.log_peaks - 0.5 * squared_lengths)
+        return result.reshape((*x.shape[:-1], *shape))
 
     @cached_property
     def _whitening(self) -> tuple[Array, Array, Array]:
-        """Centre (d,), rows (d, L d) that whiten a point for each mixand, and their means."""
+        """The mean (d,), columns (d, L d) that whiten a point, and the whitened means (L, d).
+
+        Both are relative to the mixture's mean: far from the origin differences would cancel.
+        """
         centre = self.weights @ self.means
-        white = np.linalg.solve(
-            self.factors, np.broadcast_to(np.eye(self.dim), self.covs.shape)
-        )
-        at = (white @ (self.means - centre)[..., None])[..., 0]
-        return centre, np.array(white.reshape(-1, self.dim).T), at
+        identity = np.broadcast_to(np.eye(self.dim), self.covs.shape)
+        inverse_factors = np.linalg.solve(self.factors, identity)
+        differences = self.means - centre
+        white_means = (inverse_factors @ differences[..., None])[..., 0]
+        columns = np.array(inverse_factors.reshape(-1, self.dim).T)
+        return centre, columns, white_means
 
     @validated
     def marginal(self, indices: DistinctIndices) -> GaussianMixture:
-        """The density of some components.
+        """Return the density of some components of the state.
 
         Parameters
         ----------
         indices : sequence of int
-            Which components, in the order wanted; each once.
+            Components of the state, in the order wanted; each once.
 
         Examples
         --------
         >>> GaussianMixture.gaussian([0.0, 1.0], np.eye(2)).marginal([1]).means
         array([[1.]])
         """
-        at = np.array(indices)
-        if at.max() >= self.dim:
+        index = np.array(indices)
+        if index.max() >= self.dim:
             raise ValueError(
-                f"indices must be integers below {self.dim}, got {at.max()}"
+                f"indices must be integers below {self.dim}, got {index.max()}"
             )
-        return self.construct(
-            self.weights, self.means[:, at], self.covs[:, at[:, None], at]
-        )
+        means = self.means[:, index]
+        covs = self.covs[:, index[:, None], index]
+        return self.construct(self.weights, means, covs)
 
     @property
     def mean(self) -> Array:
@@ -214,19 +234,18 @@ class GaussianMixture(FrozenModel):
     @property
     def cov(self) -> Array:
         """Covariance of the whole mixture, (d, d)."""
-        gap = self.means - self.mean
-        cov = (
-            np.einsum("l,lij->ij", self.weights, self.covs)
-            + (gap.T * self.weights) @ gap
-        )
-        return symmetrise(cov)
+        # P = Σ w_l P_l + Σ w_l (m_l - m)(m_l - m)ᵀ
+        differences = self.means - self.mean
+        within = np.einsum("l,lij->ij", self.weights, self.covs)
+        between = (differences.T * self.weights) @ differences
+        return symmetrise(within + between)
 
     def moments(self) -> tuple[Array, Array]:
-        """Mean (d,) and covariance (d, d) of the whole mixture."""
+        """Return the mean (d,) and the covariance (d, d) of the whole mixture."""
         return self.mean, self.cov
 
     def moment_match(self) -> GaussianMixture:
-        """The one Gaussian that has the mixture's mean and covariance, as a mixture."""
+        """Return the one Gaussian that has the mixture's mean and covariance, as a mixture."""
         return self.construct(np.ones(1), self.mean[None], self.cov[None])
 
     @validated
@@ -238,28 +257,29 @@ class GaussianMixture(FrozenModel):
         size : int
         rng : numpy.random.Generator
         """
-        which = rng.choice(
-            self.n_components, size=size, p=self.weights / self.weights.sum()
-        )
-        noise = rng.standard_normal((size, self.dim))
-        return np.asarray(
-            self.means[which] + (self.factors[which] @ noise[..., None])[..., 0]
-        )
+        probabilities = self.weights / self.weights.sum()
+        component = rng.choice(self.n_components, size=size, p=probabilities)
+        # x = m_l + L_l z with z ~ N(0, I)
+        z = rng.standard_normal((size, self.dim))
+        deviations = (self.factors[component] @ z[..., None])[..., 0]
+        return np.asarray(self.means[component] + deviations)
 
     def pack(self) -> tuple[Array, Array, Array]:
-        """The mixture as a channel's payload: weights, means, and upper triangles (L, d(d+1)/2)."""
-        upper = np.triu_indices(self.dim)
-        return self.weights, self.means, self.covs[:, upper[0], upper[1]]
+        """Return the payload of a channel: weights, means, and upper triangles (L, d(d+1)/2)."""
+        rows, columns = np.triu_indices(self.dim)
+        return self.weights, self.means, self.covs[:, rows, columns]
 
     @classmethod
     @validated
     def unpack(
         cls,
         payload: tuple[
-            Annotated[Array, "L"], Annotated[Array, "L d"], Annotated[Array, "L m"]
+            Annotated[ArrayInput, "L"],
+            Annotated[ArrayInput, "L d"],
+            Annotated[ArrayInput, "L m"],
         ],
     ) -> GaussianMixture:
-        """The mixture from what :meth:`pack` made of it.
+        """Rebuild a mixture from the payload that :meth:`pack` made of it.
 
         Examples
         --------
@@ -270,46 +290,55 @@ class GaussianMixture(FrozenModel):
         True
         """
         weights, means, triangles = payload
-        d = means.shape[1]
-        rows, columns = np.triu_indices(d)
-        covs = np.empty((len(means), d, d))
-        covs[:, rows, columns] = covs[:, columns, rows] = triangles
+        dim = means.shape[1]
+        rows, columns = np.triu_indices(dim)
+        covs = np.empty((len(means), dim, dim))
+        covs[:, rows, columns] = triangles
+        covs[:, columns, rows] = triangles
         return cls.construct(weights.copy(), means.copy(), covs)
 
 
-def _collapsed(covs: Array) -> str:
-    """Which mixand has no square root, and what that comes from."""
-    least = np.linalg.eigvalsh(in_units(covs)[0])
-    worst = int(least[:, 0].argmin())
+def _describe_collapse(covs: Array) -> str:
+    """Name the component whose covariance has no square root, and the usual cause."""
+    eigenvalues = np.linalg.eigvalsh(in_units(covs)[0])
+    worst = int(eigenvalues[:, 0].argmin())
     return (
-        f"mixand {worst} of {len(covs)} has a covariance that is not positive definite (smallest "
-        f"eigenvalue {least[worst, 0]:.3g} in units of its variances): a belief collapses where "
-        "information is counted more than once, as by fusing beliefs as if they were independent"
+        f"component {worst} of {len(covs)} has a covariance that is not positive definite "
+        f"(smallest eigenvalue {eigenvalues[worst, 0]:.3g} in units of its variances): a belief "
+        "collapses where information is counted more than once, as by fusing beliefs as if they "
+        "were independent"
     )
 
 
 def inverse(factors: Array) -> Array:
-    """The inverse of L L', symmetric, for Cholesky factors (..., d, d)."""
-    white = np.linalg.solve(
-        factors, np.broadcast_to(np.eye(factors.shape[-1]), factors.shape)
-    )
-    return np.asarray(white.mT @ white)
+    """Return the inverses of L Lᵀ, symmetric, for Cholesky factors L (..., d, d)."""
+    identity = np.broadcast_to(np.eye(factors.shape[-1]), factors.shape)
+    # (L Lᵀ)⁻¹ = L⁻ᵀ L⁻¹
+    inverse_factors = np.linalg.solve(factors, identity)
+    return np.asarray(inverse_factors.mT @ inverse_factors)
 
 
-def regression(own: GaussianMixture, n: int) -> tuple[Array, Array]:
-    """Gain of e on t and covariance of e given t, of each mixand."""
-    cross = own.covs[:, :n, n:]
-    gain = np.asarray(np.linalg.solve(own.covs[:, :n, :n], cross).mT, dtype=np.float64)
-    return gain, symmetrise(own.covs[:, n:, n:] - gain @ cross)
+def regression(mixture: GaussianMixture, n: int) -> tuple[Array, Array]:
+    """Return each component's gain of e on t, and its covariance of e given t.
+
+    The state is [t; e], and t its first n components.
+    """
+    target = mixture.covs[:, :n, :n]
+    cross = mixture.covs[:, :n, n:]
+    # G = P_et P_tt⁻¹ and P_e|t = P_ee - G P_te
+    gain = np.asarray(np.linalg.solve(target, cross).mT, dtype=np.float64)
+    return gain, symmetrise(mixture.covs[:, n:, n:] - gain @ cross)
 
 
-def assemble_joint(target: Array, gain: Array, rest: Array) -> Array:
-    """Covariances of [t; e] from that of t, the gain of e on t, and the covariance of e given t."""
-    below = symmetrise(rest + gain @ target @ gain.mT)
+def assemble_joint(target: Array, gain: Array, conditional: Array) -> Array:
+    """Assemble covariances of [t; e] from P_tt, the gain G of e on t, and P_e|t."""
+    # P_et = G P_tt and P_ee = P_e|t + G P_tt Gᵀ
+    ego = symmetrise(conditional + gain @ target @ gain.mT)
     n = target.shape[-1]
-    out = np.empty((*below.shape[:-2], n + below.shape[-1], n + below.shape[-1]))
-    out[..., :n, :n] = target
-    out[..., n:, n:] = below
-    out[..., n:, :n] = gain @ target
-    out[..., :n, n:] = out[..., n:, :n].mT
-    return out
+    dim = n + ego.shape[-1]
+    joint = np.empty((*ego.shape[:-2], dim, dim))
+    joint[..., :n, :n] = target
+    joint[..., n:, n:] = ego
+    joint[..., n:, :n] = gain @ target
+    joint[..., :n, n:] = joint[..., n:, :n].mT
+    return joint

@@ -1,4 +1,4 @@
-"""Models of motion: how a state moves from one time to the next, and how uncertain that is."""
+"""Models of motion: the transition of a state from one time to the next, and its noise."""
 
 from . import orbit
 from .base import LinearModel, Model, simulate
@@ -11,13 +11,8 @@ from .pendulum import (
     pendulum_rate,
     pendulum_states,
 )
-from .satellite import (
-    clohessy_wiltshire,
-    cross_matrix,
-    quaternion_rate,
-    rotation_matrix,
-    satellite_pose,
-)
+from .quaternions import cross_matrix, quaternion_rate, rotation_matrix
+from .satellite import clohessy_wiltshire, satellite_pose
 from .swarm import RotatingMixture, Swarm, rotating_swarm
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""What a model is: a step without noise, and the covariance of the noise that the step adds."""
+"""Models of motion: a transition without noise, and the covariance of its process noise."""
 
 from __future__ import annotations
 
@@ -20,16 +20,19 @@ from ..validation import (
     PositiveInt,
     Rng,
     Times,
+    call_batched,
+    call_user,
     check_array,
+    check_positive_semidefinite,
+    is_first_use,
     validated,
 )
-from ..validation.checks import call_batched, check_positive_semidefinite
 
 __all__ = ["LinearModel", "Model", "simulate"]
 
 
-Strength = Annotated[float, Bounds(at_least=0, at_most=1e150)]
-"""Of white noise, per root second: its square is finite."""
+NoiseStrength = Annotated[float, Bounds(at_least=0, at_most=1e150)]
+"""Strength of white noise, per root second; bounded, so that its square is finite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,15 +43,16 @@ class Model(FrozenModel):
     ----------
     dim : int
         Size d of the state.
-    flow : callable
-        ``flow(x, t, dt) -> x`` on arrays (..., d), without noise; times in s. It gets a copy of
-        the states, which it may change. One that takes a single state only is refused when it
-        first gets several.
+    transition : callable
+        ``transition(x, t, dt) -> x`` on arrays (..., d), without noise; times in s. It gets a
+        copy of the states, which it may change. A function that takes a single state only is
+        refused when it first gets several.
     noise_cov : callable
         ``noise_cov(t, dt) -> Q``, (d, d), positive semidefinite.
     derivative : callable, optional
-        ``derivative(x, t, dt)``, the Jacobian of `flow`, (..., d, d). Central differences stand in
-        for it; a first time they are compared, and a warning tells of another function's.
+        ``derivative(x, t, dt)``, the Jacobian of `transition`, (..., d, d). Central differences
+        by default. At its first use it is compared with them, and a warning is given if it does
+        not belong to `transition`.
     names : tuple of str, optional
         Name of each component, for labels.
     units : tuple of str, optional
@@ -88,18 +92,21 @@ class Model(FrozenModel):
     @validated
     def Q(self, t: float, dt: NonNegativeFloat) -> Array:
         """Covariance of the noise that a step from `t` to `t` + `dt` adds, (d, d), read-only."""
-        return self._noise(t, dt)[0]
+        cov, _ = self._noise(t, dt)
+        return cov
 
     @validated
     def noise_sqrt(self, t: float, dt: NonNegativeFloat) -> Array:
-        """A factor of the noise's covariance, (d, d), read-only."""
-        return self._noise(t, dt)[1]
+        """Factor L of the noise covariance Q = L Lᵀ, (d, d), read-only."""
+        _, lower = self._noise(t, dt)
+        return lower
 
     def _noise(self, t: float, dt: float) -> tuple[Array, Array]:
-        q = check_array(
-            self.noise_cov(t, dt), "noise_cov", (self.dim, self.dim), finite=False
-        )
-        return _with_factor(q.tobytes(), self.dim)
+        """Return the noise covariance and its factor, both validated."""
+        q = call_user(self.noise_cov, t, dt)
+        # Whether it is finite is checked with its factor, once for each value.
+        q = check_array(q, "noise_cov", (self.dim, self.dim), finite=False)
+        return _factorize_noise(q.tobytes(), self.dim)
 
     @validated
     def sample_step(
@@ -111,12 +118,13 @@ class Model(FrozenModel):
         rng: Rng,
     ) -> Array:
         """Move states (..., d) from `t` to `t` + `dt` and add a draw of the noise to each."""
-        moved = self.step(x, t, dt)
-        noise = rng.standard_normal(moved.shape) @ np.ascontiguousarray(
-            self._noise(t, dt)[1].T
-        )
-        noise += moved
-        return noise
+        forecast = self.step(x, t, dt)
+        _, lower = self._noise(t, dt)
+        standard = rng.standard_normal(forecast.shape)
+        # w = L z; rows are states, so z multiplies Lᵀ. A contiguous copy of it is faster.
+        sample = standard @ np.ascontiguousarray(lower.T)
+        sample += forecast
+        return sample
 
     @validated
     def jacobian(
@@ -124,34 +132,38 @@ class Model(FrozenModel):
     ) -> Array:
         """Derivative of a step from states (..., d), as (..., d, d).
 
-        `derivative` where the model has it, central differences of `flow` otherwise.
+        `derivative` where the model has it, central differences of `transition` otherwise.
         """
-        near = partial(central, lambda state: self.step(state, t, dt), x)
-        return as_derivative(
-            self, (x, t, dt), (*x.shape, self.dim), near, np.eye(self.dim)
-        )
+
+        def move(states: Array) -> Array:
+            return self.step(states, t, dt)
+
+        differences = partial(central, move, x)
+        shape = (*x.shape, self.dim)
+        return as_derivative(self, (x, t, dt), shape, differences, np.eye(self.dim))
 
 
 @lru_cache(maxsize=64)
-def _with_factor(data: bytes, dim: int) -> tuple[Array, Array]:
-    """A covariance and its factor; the same few come in every step of a run."""
-    cov = check_array(np.frombuffer(data).reshape(dim, dim), "noise_cov")
+def _factorize_noise(data: bytes, dim: int) -> tuple[Array, Array]:
+    """Return a covariance and its factor, cached: few of them recur in every step of a run."""
+    cov = np.frombuffer(data).reshape(dim, dim)
+    check_array(cov, "noise_cov")
     check_positive_semidefinite(cov, "noise_cov")
-    root = factor(cov)
-    root.setflags(write=False)
-    return cov, root
+    lower = factor(cov)
+    lower.setflags(write=False)
+    return cov, lower
 
 
 @dataclass(frozen=True, eq=False)
 class LinearModel(Model):
-    """A model whose step is a matrix: x(t + dt) = Φ(dt) x(t) + w.
+    """A model whose transition is a matrix: x(t + dt) = Φ(dt) x(t) + w.
 
     Parameters
     ----------
     transition_matrix : callable
-        ``transition_matrix(dt) -> Φ``, (d, d). `flow` has to be the product with it; build the
-        model with :meth:`from_transition`, which sees to that. A warning tells if it is the
-        transpose that fits `noise_cov`.
+        ``transition_matrix(dt) -> Φ``, (d, d). `transition` has to be the product with it, which
+        :meth:`from_transition` guarantees. A warning is given if only its transpose fits
+        `noise_cov`.
 
     Examples
     --------
@@ -175,10 +187,9 @@ class LinearModel(Model):
         units: tuple[str, ...] = (),
     ) -> LinearModel:
         """Build the model from its transition matrix, ``transition_matrix(dt) -> (d, d)``."""
-        flow = partial(_product, transition_matrix, dim)
         return cls(
             dim,
-            flow,
+            partial(_multiply, transition_matrix, dim),
             noise_cov,
             names=names,
             units=units,
@@ -186,31 +197,39 @@ class LinearModel(Model):
         )
 
     def _noise(self, t: float, dt: float) -> tuple[Array, Array]:
-        whole = super()._noise(t, dt)
-        half = dt / 2
-        if dt and vars(self).pop("_doubted", False):
-            # Two half steps add the noise of a whole one. A user's table may have no halves.
+        cov, lower = super()._noise(t, dt)
+        if dt and is_first_use(self, "transition_matrix"):
+            # The check asks for half steps, at which a user's table may have no entry.
             with suppress(
                 AssertionError, LookupError, RuntimeError, TypeError, ValueError
             ):
-                phi = self.F(half)
-                first = self.noise_cov(t, half)
-                last = self.noise_cov(t + half, half) - whole[0]
-                own, other = (
-                    np.abs(p @ first @ p.T + last).max() for p in (phi, phi.T)
-                )
-                if other < 1e-11 * np.abs(whole[0]).max() < 1e-2 * own:
+                if self._is_transposed(t, dt, cov):
                     warnings.warn(
-                        "transition_matrix: transposed for noise_cov", RuntimeWarning, 4
+                        "transition_matrix must lead from x(t) to x(t + dt), but only its "
+                        "transpose fits noise_cov: return the transposed matrix",
+                        RuntimeWarning,
+                        4,
                     )
-        return whole
+        return cov, lower
+
+    def _is_transposed(self, t: float, dt: float, cov: Array) -> bool:
+        """Whether Φᵀ in place of Φ makes two half steps add the noise of a whole step."""
+        half = dt / 2
+        phi = self.F(half)
+        first = call_user(self.noise_cov, t, half)
+        second = call_user(self.noise_cov, t + half, half)
+        # Q(t, dt) = Φ Q(t, dt/2) Φᵀ + Q(t + dt/2, dt/2)
+        remainder = second - cov
+        error = np.abs(phi @ first @ phi.T + remainder).max()
+        transposed_error = np.abs(phi.T @ first @ phi + remainder).max()
+        rounding = 1e-11 * np.abs(cov).max()
+        return bool(transposed_error < rounding < 1e-2 * error)
 
     @validated
     def F(self, dt: NonNegativeFloat) -> Array:
         """The matrix Φ of a step of `dt` seconds, (d, d)."""
-        return check_array(
-            self.transition_matrix(dt), "transition_matrix", (self.dim, self.dim)
-        )
+        phi = call_user(self.transition_matrix, dt)
+        return check_array(phi, "transition_matrix", (self.dim, self.dim))
 
     @validated
     def jacobian(
@@ -220,12 +239,14 @@ class LinearModel(Model):
         return np.full((*x.shape, self.dim), self.F(dt))
 
 
-def _product(
+def _multiply(
     transition_matrix: Callable[[float], Array], dim: int, x: Array, t: float, dt: float
 ) -> Array:
-    """The flow of a linear model; with a copy of the transpose in half the time of its view."""
-    matrix = check_array(transition_matrix(dt), "transition_matrix", (dim, dim))
-    return np.asarray(x @ np.ascontiguousarray(matrix.T))
+    """Transition of a linear model."""
+    phi = call_user(transition_matrix, dt)
+    phi = check_array(phi, "transition_matrix", (dim, dim))
+    # Rows are states: x Φᵀ. With a copy of the transpose it takes half the time of a view's.
+    return np.asarray(x @ np.ascontiguousarray(phi.T))
 
 
 @validated
@@ -263,17 +284,18 @@ def simulate(
     >>> simulate(walk, [0.0], [1.0, 2.0], rng=np.random.default_rng(1)).shape
     (2, 1)
     """
-    return path(partial(model.sample_step, rng=rng), x0, times, t0)
+    return trajectory(partial(model.sample_step, rng=rng), x0, times, t0)
 
 
-def path(
-    move: Callable[[Array, float, float], Array], x: Array, times: Array, t0: float
+def trajectory(
+    step: Callable[[Array, float, float], Array], x: Array, times: Array, t0: float
 ) -> Array:
-    """Where ``move(x, t, dt)`` takes states from `t0`, at the times."""
+    """States at the times, from `x` at `t0` by ``step(x, t, dt)``."""
     if times.size and times[0] <= t0:
-        raise ValueError(f"times must be times after t0 = {t0:g}, got {times[0]:g}")
+        raise ValueError(f"times must be after t0 = {t0:g}, got {times[0]:g}")
     states = np.empty((times.size, *x.shape))
     for k, t in enumerate(times.tolist()):
-        x = states[k] = move(x, t0, t - t0)
+        x = step(x, t0, t - t0)
+        states[k] = x
         t0 = t
     return states

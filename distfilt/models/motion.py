@@ -1,4 +1,4 @@
-r"""Motion straight on, by rates of change, and Lorenz's convection, the smallest chaotic flow.
+r"""Straight motion, motion by rates of change (Runge-Kutta), and Lorenz's chaotic convection.
 
 The states of straight motion are positions first, then velocities, in m and m/s. The noise is white
 noise on the acceleration: Y. Bar-Shalom, X. R. Li and T. Kirubarajan, Estimation with Applications
@@ -19,18 +19,19 @@ from ..validation import (
     Bounds,
     NonNegativeFloat,
     PositiveFloat,
+    call_user,
     check_array,
     validated,
 )
-from .base import LinearModel, Model, Strength
+from .base import LinearModel, Model, NoiseStrength
 
 __all__ = ["constant_velocity", "integrate", "lorenz63", "rk4"]
 
 Rate = Callable[[Array, float], Array]
-_MOST = 10_000_000
-"""More integration steps than this are a mistake in `longest`, not a wish."""
+_MAX_STEPS = 10_000_000
+"""More integration steps than this are taken for a mistake in `longest`."""
 _AXES = ("x", "y", "z")
-# Arrays without axes: an array of few states is multiplied by a number in half again the time.
+# Zero-dimensional arrays: a Python number makes the product with a small array half as slow again.
 _PRANDTL = np.array(10.0)
 _RAYLEIGH = np.array(28.0)
 _SHAPE = np.array(8 / 3)
@@ -38,7 +39,7 @@ _SHAPE = np.array(8 / 3)
 
 @validated
 def constant_velocity(
-    *, sigma: Strength, axes: Annotated[int, Bounds(at_least=1, at_most=3)] = 2
+    *, sigma: NoiseStrength, axes: Annotated[int, Bounds(at_least=1, at_most=3)] = 2
 ) -> LinearModel:
     r"""Straight motion whose velocity wanders: positions, then velocities, along `axes` axes.
 
@@ -49,8 +50,8 @@ def constant_velocity(
     Parameters
     ----------
     sigma : float
-        Strength of the acceleration's noise, at least 0: a velocity gathers a standard deviation
-        of :math:`\sigma\sqrt{dt}` m/s.
+        Strength of the acceleration's noise, at least 0: within dt, a velocity accumulates a
+        standard deviation of :math:`\sigma\sqrt{dt}` m/s.
     axes : int
         1, 2 or 3 axes.
 
@@ -60,31 +61,35 @@ def constant_velocity(
     >>> model.step([1.0, 2.0, 0.5, -0.5], 0.0, 2.0)
     array([ 2. ,  1. ,  0.5, -0.5])
     """
+    positions = _AXES[:axes]
+    velocities = tuple(f"v{axis}" for axis in positions)
     return LinearModel.from_transition(
         2 * axes,
-        partial(_straight, axes=axes),
+        partial(_straight_transition, axes=axes),
         partial(_straight_noise, sigma=sigma, axes=axes),
-        names=(*_AXES[:axes], *(f"v{axis}" for axis in _AXES[:axes])),
+        names=positions + velocities,
         units=("m",) * axes + ("m/s",) * axes,
     )
 
 
-def _straight(dt: float, axes: int) -> Array:
-    return _along_axes(((1.0, dt), (0.0, 1.0)), axes)
+def _straight_transition(dt: float, axes: int) -> Array:
+    return _repeat_along_axes(((1.0, dt), (0.0, 1.0)), axes)
 
 
 def _straight_noise(t: float, dt: float, sigma: float, axes: int) -> Array:
-    both = dt**2 / 2
     q = sigma**2
-    return _along_axes(((q * (dt**3 / 3), q * both), (q * both, q * dt)), axes)
+    position = q * (dt**3 / 3)
+    cross = q * (dt**2 / 2)
+    velocity = q * dt
+    return _repeat_along_axes(((position, cross), (cross, velocity)), axes)
 
 
 @lru_cache(maxsize=64)
-def _along_axes(block: tuple[tuple[float, float], ...], axes: int) -> Array:
-    """A block for each axis, read-only, since the same few are asked for in every step."""
-    out = np.asarray(np.kron(block, np.eye(axes)), dtype=np.float64)
-    out.setflags(write=False)
-    return out
+def _repeat_along_axes(block: tuple[tuple[float, float], ...], axes: int) -> Array:
+    """Kronecker product of a block with I, read-only and cached: few recur in every step."""
+    matrix = np.asarray(np.kron(block, np.eye(axes)), dtype=np.float64)
+    matrix.setflags(write=False)
+    return matrix
 
 
 @validated
@@ -107,10 +112,11 @@ def rk4(
     t : float
         The time, in s.
     dt : float
-        How far, in s, at least 0.
+        Length of the integration interval, in s, at least 0.
     longest : float, optional
-        Longest integration step, in s, positive: `dt` is cut into the fewest equal steps that are
-        not longer, ten million at most. One step by default. The error falls with its fourth power.
+        Longest integration step, in s, positive: `dt` is divided into the smallest number of equal
+        steps that are not longer, ten million at most. One step by default. The error falls with
+        the fourth power of the step.
 
     Notes
     -----
@@ -121,36 +127,45 @@ def rk4(
     >>> rk4(lambda x, t: -x, [1.0], 0.0, 1.0, longest=0.1).round(6)
     array([0.36788])
     """
-    h = dt / (steps := equal_steps(dt, longest))
-    state = x
+    return runge_kutta(partial(call_user, rate), x, t, dt, longest)
+
+
+def runge_kutta(
+    rate: Rate, x: Array, t: float, dt: float, longest: float | None = None
+) -> Array:
+    """Integrate like :func:`rk4`, without validation; `dt` may be negative."""
+    steps = count_steps(abs(dt), longest)
+    h = dt / steps
     for k in range(steps):
         s = t + k * h
-        # The rate may work in place: it gets arrays of its own, and what it returns is used before
-        # it is called again.
-        slope = check_array(rate(state.copy("K"), s), "rate", x.shape, finite=False)
+        # Weighted mean of four slopes: x + h/3 (k1/2 + k2 + k3 + k4/2).
+        # The rate may work in place: it gets arrays of its own, and its result is used before it
+        # is called again.
+        slope = check_array(rate(x.copy("K"), s), "rate", x.shape, finite=False)
         total = 0.5 * slope
-        slope = rate(state + 0.5 * h * slope, s + 0.5 * h)
+        slope = rate(x + 0.5 * h * slope, s + 0.5 * h)
         total += slope
-        slope = rate(state + 0.5 * h * slope, s + 0.5 * h)
+        slope = rate(x + 0.5 * h * slope, s + 0.5 * h)
         total += slope
-        total += 0.5 * rate(state + h * slope, s + h)
+        total += 0.5 * rate(x + h * slope, s + h)
         total *= h / 3
-        total += state
-        state = total
-    return np.asarray(state)
+        total += x
+        x = total
+    return np.asarray(x)
 
 
-def equal_steps(dt: float, longest: float | None) -> int:
-    """The fewest equal steps of `dt` that are not longer than `longest`."""
+def count_steps(dt: float, longest: float | None) -> int:
+    """Smallest number of equal steps over `dt` that are not longer than `longest`."""
     if longest is None:
         return 1
-    # A step that divides dt up to rounding is not cut once more.
-    needed = dt / longest - 1e-9
-    if not needed <= _MOST:
+    # A step that divides dt up to rounding is not divided once more.
+    ratio = dt / longest - 1e-9
+    if not ratio <= _MAX_STEPS:
         raise ValueError(
-            f"longest must have at least {dt / _MOST:g} for steps over {dt:g} s, got {longest:g}"
+            f"longest must be at least {dt / _MAX_STEPS:g} for an interval of {dt:g} s, "
+            f"got {longest:g}"
         )
-    return max(1, math.ceil(needed))
+    return max(1, math.ceil(ratio))
 
 
 def integrate(
@@ -161,27 +176,30 @@ def integrate(
     names: tuple[str, ...],
     units: tuple[str, ...],
 ) -> Model:
-    """The model that :func:`rk4` makes of a rate, with white noise of a spectral density (d, d)."""
+    """Build a model from a rate by :func:`rk4`, with white noise of spectral density (d, d)."""
     return Model(
         len(density),
-        partial(_flow, rate=rate, longest=step),
-        partial(_white, density),
+        partial(_integrated_transition, rate=rate, longest=step),
+        partial(_white_noise, density),
         names=names,
         units=units,
     )
 
 
-def _flow(x: Array, t: float, dt: float, rate: Rate, longest: float) -> Array:
-    # Each component of all states side by side in memory: twice as fast, and the same numbers.
-    return np.ascontiguousarray(rk4(rate, x.copy("F"), t, dt, longest=longest))
+def _integrated_transition(
+    x: Array, t: float, dt: float, rate: Rate, longest: float
+) -> Array:
+    # Fortran order: each component of all states is contiguous in memory, which is twice as fast.
+    states = x.copy("F")
+    return np.ascontiguousarray(runge_kutta(rate, states, t, dt, longest))
 
 
-def _white(density: Array, t: float, dt: float) -> Array:
+def _white_noise(density: Array, t: float, dt: float) -> Array:
     return density * dt
 
 
 @validated
-def lorenz63(*, sigma: Strength = 0.0, step: PositiveFloat = 0.01) -> Model:
+def lorenz63(*, sigma: NoiseStrength = 0.0, step: PositiveFloat = 0.01) -> Model:
     r"""Lorenz's model of 1963, integrated by Runge-Kutta of order 4 with a fixed step.
 
     .. math:: \dot x = 10\,(y-x),\quad \dot y = x(28-z)-y,\quad \dot z = xy-\tfrac83z
@@ -189,7 +207,7 @@ def lorenz63(*, sigma: Strength = 0.0, step: PositiveFloat = 0.01) -> Model:
     Parameters
     ----------
     sigma : float
-        Strength of independent white noise on each component: it gathers a standard deviation of
+        Strength of independent white noise on each component, which adds a standard deviation of
         ``sigma * sqrt(dt)`` in a step; none by default.
     step : float
         Longest integration step, positive, in units of time.
@@ -203,17 +221,17 @@ def lorenz63(*, sigma: Strength = 0.0, step: PositiveFloat = 0.01) -> Model:
     >>> lorenz63().step([1.0, 1.0, 20.0], 0.0, 0.1).shape
     (3,)
     """
-    return integrate(
-        _rate, sigma**2 * np.eye(3), step=step, names=_AXES, units=("1",) * 3
-    )
+    density = sigma**2 * np.eye(3)
+    return integrate(_lorenz_rate, density, step=step, names=_AXES, units=("1",) * 3)
 
 
-def _rate(state: Array, t: float) -> Array:
+def _lorenz_rate(state: Array, t: float) -> Array:
     x = state[..., 0]
     y = state[..., 1]
     z = state[..., 2]
-    out = np.empty_like(state)
-    np.multiply(_PRANDTL, y - x, out[..., 0])
-    np.subtract(x * (_RAYLEIGH - z), y, out[..., 1])
-    np.subtract(x * y, _SHAPE * z, out[..., 2])
-    return out
+    rate = np.empty_like(state)
+    # Written into the rate without temporary arrays: this is the inner loop of every study.
+    np.multiply(_PRANDTL, y - x, rate[..., 0])
+    np.subtract(x * (_RAYLEIGH - z), y, rate[..., 1])
+    np.subtract(x * y, _SHAPE * z, rate[..., 2])
+    return rate

@@ -1,8 +1,9 @@
 r"""Satellites about the Earth: two bodies and the Earth's oblateness, frames, lines of sight.
 
-States are (x, y, z, vx, vy, vz) in an inertial frame, in **km and m/s**: in these units the doubts
-about positions and velocities have sizes that one covariance can hold. Equation (47) of Semeraro,
-LeGrand and Kulik, with the factor :math:`r^{-5}` and the term :math:`3\mathbf r` it misprints.
+States are (x, y, z, vx, vy, vz) in an inertial frame, in **km and m/s**: in these units the
+uncertainties of positions and velocities have magnitudes that fit in one covariance matrix. The
+equation of motion is (47) of Semeraro, LeGrand and Kulik, with the factor :math:`r^{-5}` and the
+term :math:`3\mathbf r`, which are misprinted there.
 """
 
 from __future__ import annotations
@@ -13,8 +14,8 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ..validation import Array, Bounds, PositiveFloat, PositiveInt, validated
-from .base import Model, Strength
-from .motion import equal_steps, rk4
+from .base import Model, NoiseStrength
+from .motion import count_steps, runge_kutta
 
 __all__ = [
     "J2",
@@ -38,22 +39,24 @@ J2 = 1.08262668e-3
 """Coefficient of the Earth's oblateness."""
 
 
-def _outside(value: Array, name: str) -> None:
+def _check_outside(value: Array, name: str) -> None:
     least = float(np.linalg.norm(value, axis=-1).min(initial=np.inf))
+    # Written so that NaN is refused too.
     if not least >= RADIUS:
         raise ValueError(
-            f"{name} must be a distance above {RADIUS:g} km, got {least:g}"
+            f"{name} must be outside the Earth, at least {RADIUS:g} km from its centre, "
+            f"got {least:g} km"
         )
 
 
 _BOUNDED = Bounds(at_least=-1e75, at_most=1e75)
-"""Positions and velocities up to this have products whose squares are finite."""
-Place = Annotated[Array, "... 3", _BOUNDED, _outside]
+"""Up to this bound, squares of products of positions and velocities are finite."""
+Position = Annotated[Array, "... 3", _BOUNDED, _check_outside]
 Orbits = Annotated[Array, "... 6", _BOUNDED]
 
 
 @validated
-def potential(position: Place) -> Array:
+def potential(position: Position) -> Array:
     r"""Potential whose gradient is the acceleration, in km²/s².
 
     .. math:: U=\frac\mu r\Bigl[1-\frac{J_2R^2}{2r^2}\Bigl(3\frac{z^2}{r^2}-1\Bigr)\Bigr]
@@ -68,15 +71,16 @@ def potential(position: Place) -> Array:
     >>> float(potential([42164.0, 0.0, 0.0]).round(4))
     9.4537
     """
-    r = position
-    size = np.linalg.norm(r, axis=-1)
-    shape = 3 * (r[..., 2] / size) ** 2 - 1
-    return np.asarray(MU / size * (1 - 0.5 * J2 * (RADIUS / size) ** 2 * shape))
+    distance = np.linalg.norm(position, axis=-1)
+    # 3 z²/r² - 1, twice the Legendre polynomial P₂ of the latitude's sine
+    legendre = 3 * (position[..., 2] / distance) ** 2 - 1
+    oblateness = 0.5 * J2 * (RADIUS / distance) ** 2 * legendre
+    return np.asarray(MU / distance * (1 - oblateness))
 
 
 @validated
-def acceleration(position: Place) -> Array:
-    r"""Acceleration of a satellite, in km/s²: the mended (47).
+def acceleration(position: Position) -> Array:
+    r"""Acceleration of a satellite, in km/s²: equation (47), corrected.
 
     .. math:: \mathbf a=-\frac{\mu\mathbf r}{r^3}+\frac{J_2\mu R^2}{2r^5}
         \Bigl[15\mathbf r\frac{z^2}{r^2}-3\mathbf r-6z\,\hat{\mathbf k}\Bigr]
@@ -91,23 +95,25 @@ def acceleration(position: Place) -> Array:
     >>> acceleration([7000.0, 0.0, 0.0]).round(8) + 0.0
     array([-0.00814567,  0.        ,  0.        ])
     """
-    r = position
-    square = np.einsum("...i,...i->...", r, r)
-    inverse = 1 / square
-    pull = MU * inverse * np.sqrt(inverse)
-    flat = 0.5 * J2 * RADIUS**2 * inverse * pull
-    tilt = 15 * r[..., 2] ** 2 * inverse - 3
-    out = r * (flat * tilt - pull)[..., None]
-    out[..., 2] -= 6 * flat * r[..., 2]
-    return np.asarray(out)
+    z = position[..., 2]
+    inverse_square = 1 / np.einsum("...i,...i->...", position, position)
+    # μ/r³ of the central force, and J₂ μ R²/(2 r⁵) of the oblateness
+    central = MU * inverse_square * np.sqrt(inverse_square)
+    oblate = 0.5 * J2 * RADIUS**2 * inverse_square * central
+    # 15 z²/r² - 3, along r, and -6 z along the Earth's axis
+    radial = 15 * z**2 * inverse_square - 3
+    result = position * (oblate * radial - central)[..., None]
+    result[..., 2] -= 6 * oblate * z
+    return np.asarray(result)
 
 
 def _rate(x: Array, t: float = 0.0) -> Array:
     """Time derivative of states (..., 6) in km and m/s."""
-    out = np.empty_like(x)
-    out[..., :3] = 1e-3 * x[..., 3:]
-    out[..., 3:] = 1e3 * acceleration(x[..., :3])
-    return out
+    rate = np.empty_like(x)
+    # Velocities are in m/s, and positions in km: factors of 1000 both ways.
+    rate[..., :3] = 1e-3 * x[..., 3:]
+    rate[..., 3:] = 1e3 * acceleration(x[..., :3])
+    return rate
 
 
 @validated
@@ -118,17 +124,17 @@ def propagate(
     rule: Literal["dop853", "rk4"] = "dop853",
     longest: PositiveFloat = 900.0,
 ) -> Array:
-    """Move satellites by a fixed number of equal steps.
+    """Propagate satellites by a fixed number of equal steps.
 
     Parameters
     ----------
     x : array_like, (..., 6)
         States in km and m/s.
     dt : float
-        How far, in s; negative for back in time.
+        Length of the interval, in s; negative for backwards in time.
     rule : {"dop853", "rk4"}
-        Dormand and Prince's rule of order 8, twelve evaluations a step, or the classical rule of
-        order 4.
+        Dormand and Prince's rule of order 8, with twelve evaluations a step, or the classical
+        Runge-Kutta rule of order 4.
     longest : float
         Longest step, in s; ten million steps at most. Over a day and for orbits above 20 000 km,
         900 s of order 8 leave less than a millimetre, 40 s of order 4 less than a centimetre.
@@ -140,7 +146,7 @@ def propagate(
     Raises
     ------
     ValueError
-        If an orbit comes below the surface.
+        If an orbit passes below the surface.
 
     Examples
     --------
@@ -149,18 +155,16 @@ def propagate(
     >>> bool(np.abs(back - start).max() < 1e-6)
     True
     """
-    _outside(x[..., :3], "x")
-    # The Earth holds nothing that is farther away, and orbits in metres are.
+    _check_outside(x[..., :3], "x")
+    # Beyond 1.5 million km nothing orbits the Earth: such a position is probably in metres.
     Bounds(at_most=1.5e6)(np.abs(x[..., :3]), "x, in km")
-    steps = equal_steps(abs(dt), longest)
+    steps = count_steps(abs(dt), longest)
+    h = dt / steps
     with np.errstate(all="ignore"):
         for _ in range(steps):
-            # A body that dives through the Earth and comes out again is found on its way.
-            if rule == "rk4":
-                x = rk4(_rate, x, 0.0, dt / steps)
-            else:
-                x = _dop853(x, dt / steps)
-            _outside(x[..., :3], "x")
+            x = runge_kutta(_rate, x, 0.0, h) if rule == "rk4" else _dop853(x, h)
+            # Checked in each step: an orbit through the Earth may end outside it again.
+            _check_outside(x[..., :3], "x")
     return x
 
 
@@ -168,32 +172,35 @@ def _dop853(x: Array, h: float) -> Array:
     """E. Hairer, S. Norsett and G. Wanner, Solving Ordinary Differential Equations I (1993)."""
     from scipy.integrate import DOP853
 
+    # The tableau: k_i = f(x + h Σ a_ij k_j), x + h Σ b_i k_i. The equations do not depend on time.
     a = h * DOP853.A[:12, :12]
     b = h * DOP853.B
-    stages = np.empty((12, *x.shape))
-    flat = stages.reshape(12, -1)
-    stages[0] = _rate(x)
+    slopes = np.empty((12, *x.shape))
+    flat = slopes.reshape(12, -1)
+    slopes[0] = _rate(x)
     for k in range(1, 12):
-        stages[k] = _rate(x + (a[k, :k] @ flat[:k]).reshape(x.shape))
-    return np.asarray(x + (b @ flat).reshape(x.shape))
+        increment = a[k, :k] @ flat[:k]
+        slopes[k] = _rate(x + increment.reshape(x.shape))
+    increment = b @ flat
+    return np.asarray(x + increment.reshape(x.shape))
 
 
 @validated
 def orbits(
     bodies: PositiveInt = 1,
     *,
-    position_std: Strength = 0.0,
-    velocity_std: Strength = 0.0,
+    position_std: NoiseStrength = 0.0,
+    velocity_std: NoiseStrength = 0.0,
 ) -> Model:
-    """Several satellites as one model; the state is theirs one after the other.
+    """Model several satellites at once; their states are concatenated.
 
     Parameters
     ----------
     bodies : int
-        How many; the state has 6 components for each.
+        Number of satellites; each has 6 components of the state.
     position_std, velocity_std : float
-        Standard deviations of the noise that a step adds to each component, in km and m/s, whatever
-        the step's length, (50)-(51).
+        Standard deviations of the noise that a step adds to each component, in km and m/s,
+        independent of the step's length, (50)-(51).
 
     Examples
     --------
@@ -201,51 +208,51 @@ def orbits(
     >>> pair.dim, pair.names[6], pair.units[3]
     (12, 'x2', 'm/s')
     """
-    noise = np.diag(np.tile([position_std**2] * 3 + [velocity_std**2] * 3, bodies))
-    axes = ("x", "y", "z", "vx", "vy", "vz")
+    variances = [position_std**2] * 3 + [velocity_std**2] * 3
+    noise_cov = np.diag(np.tile(variances, bodies))
+    components = ("x", "y", "z", "vx", "vy", "vz")
     return Model(
         6 * bodies,
-        _flow,
-        partial(_noise, noise),
-        derivative=partial(_slope, bodies=bodies),
-        names=tuple(f"{c}{k + 1}" for k in range(bodies) for c in axes),
+        _transition,
+        partial(_constant_noise, noise_cov),
+        derivative=partial(_derivative, bodies=bodies),
+        names=tuple(f"{name}{k + 1}" for k in range(bodies) for name in components),
         units=("km", "km", "km", "m/s", "m/s", "m/s") * bodies,
     )
 
 
-def _noise(noise: Array, t: float, dt: float) -> Array:
-    return noise
+def _constant_noise(noise_cov: Array, t: float, dt: float) -> Array:
+    return noise_cov
 
 
-def _flow(x: Array, t: float, dt: float) -> Array:
+def _transition(x: Array, t: float, dt: float) -> Array:
     states = x.reshape(*x.shape[:-1], -1, 6)
     return propagate(states, dt).reshape(x.shape)
 
 
-def _slope(x: Array, t: float, dt: float, bodies: int) -> Array:
-    """Central differences, body by body: a body's motion depends on its own state only."""
-    size = np.full(6, 1e-2)
-    states = x.reshape(*x.shape[:-1], bodies, 6)
-    moved = np.stack(
-        [states[..., None, :] + np.diag(size), states[..., None, :] - np.diag(size)]
-    )
-    ends = _flow(moved, t, dt)
-    blocks = np.swapaxes((ends[0] - ends[1]) / (2 * size[:, None]), -1, -2)
-    out = np.zeros((*x.shape, x.shape[-1]))
+def _derivative(x: Array, t: float, dt: float, bodies: int) -> Array:
+    """Central differences, body by body: the motion of a body depends on its own state only."""
+    step = 1e-2
+    states = x.reshape(*x.shape[:-1], bodies, 1, 6)
+    shifts = step * np.eye(6)
+    # Axes: bodies, the component that is shifted, and the components where the orbit ends.
+    forward, backward = _transition(np.stack([states + shifts, states - shifts]), t, dt)
+    blocks = np.swapaxes((forward - backward) / (2 * step), -1, -2)
+    jacobian = np.zeros((*x.shape, x.shape[-1]))
     for k in range(bodies):
-        here = slice(6 * k, 6 * k + 6)
-        out[..., here, here] = blocks[..., k, :, :]
-    return out
+        body = slice(6 * k, 6 * k + 6)
+        jacobian[..., body, body] = blocks[..., k, :, :]
+    return jacobian
 
 
 @validated
 def rsw_frame(x: Orbits) -> Array:
-    """Axes along the radius, across it along the motion, and along the orbit's normal, (58).
+    """Axes of the RSW frame, (58): radial, along the motion across the radius, and normal.
 
     Parameters
     ----------
     x : array_like, (..., 6)
-        States.
+        States whose position and velocity are not parallel.
 
     Returns
     -------
@@ -259,19 +266,22 @@ def rsw_frame(x: Orbits) -> Array:
            [0., 1., 0.],
            [0., 0., 1.]])
     """
-    radial = x[..., :3] / np.linalg.norm(x[..., :3], axis=-1, keepdims=True)
-    normal = np.cross(x[..., :3], x[..., 3:])
-    size = np.linalg.norm(normal, axis=-1, keepdims=True)
-    if (size == 0).any() or not np.isfinite(radial).all():
+    position = x[..., :3]
+    velocity = x[..., 3:]
+    radial = position / np.linalg.norm(position, axis=-1, keepdims=True)
+    normal = np.cross(position, velocity)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    if (length == 0).any() or not np.isfinite(radial).all():
         raise ValueError(
-            "x must have positions and velocities that span a plane, got others"
+            "x must have positions and velocities that span a plane, got parallel ones"
         )
-    normal = normal / size
-    return np.stack([radial, np.cross(normal, radial), normal], axis=-1)
+    normal = normal / length
+    along = np.cross(normal, radial)
+    return np.stack([radial, along, normal], axis=-1)
 
 
 @validated
-def occulted(a: Place, b: Place) -> Array:
+def occulted(a: Position, b: Position) -> Array:
     """Whether the Earth's equatorial sphere hides two positions from each other, (...).
 
     Parameters
@@ -286,8 +296,9 @@ def occulted(a: Place, b: Place) -> Array:
     >>> bool(occulted([42164.0, 0, 0], [0, 42164.0, 0]))
     False
     """
-    way = b - a
-    size = np.einsum("...i,...i->...", way, way)
-    along = -np.einsum("...i,...i->...", a, way) / np.where(size > 0, size, 1.0)
-    nearest = a + np.clip(along, 0, 1)[..., None] * way
+    line = b - a
+    square = np.einsum("...i,...i->...", line, line)
+    # a + s (b - a) is nearest to the Earth's centre at s = -a·(b - a)/|b - a|², within [0, 1].
+    fraction = -np.einsum("...i,...i->...", a, line) / np.where(square > 0, square, 1.0)
+    nearest = a + np.clip(fraction, 0, 1)[..., None] * line
     return np.asarray(np.linalg.norm(nearest, axis=-1) < RADIUS)

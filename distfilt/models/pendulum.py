@@ -1,7 +1,8 @@
-r"""A pendulum in Cartesian coordinates, with a length that its equations of motion have to keep.
+r"""A pendulum in Cartesian coordinates, whose length is a constraint, and in its chart.
 
-The state is :math:`(x, y, \dot x, \dot y)` with x to the right and y **downwards**, so that the
-pendulum hangs at :math:`(0, L)`; or, in the chart, the angle from there and its rate.
+The Cartesian state is :math:`(x, y, \dot x, \dot y)` with x to the right and y **downwards**, so
+that the pendulum hangs at :math:`(0, L)`. In the chart it is the angle from the vertical and its
+rate.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ __all__ = [
 ]
 
 Length = Annotated[float, Bounds(at_least=1e-100, at_most=1e100)]
-"""A length whose square is a positive number."""
+"""A length whose square neither underflows nor overflows."""
 Form = Literal["printed", "multiplier"]
 States = Annotated[Array, "... 4"]
 
@@ -44,8 +45,8 @@ def pendulum_rate(
 
     On the circle :math:`x^2+y^2=L^2` these are
     :math:`\ddot{\mathbf q}=\mathbf g+\lambda\mathbf q` with the multiplier
-    :math:`\lambda=-(|\mathbf v|^2+gy)/L^2`. Off the circle the two differ: the printed form lets an
-    error of the length grow, the form with the multiplier does not.
+    :math:`\lambda=-(|\mathbf v|^2+gy)/L^2`. Off the circle the two differ: with the printed form an
+    error of the length grows, with the multiplier it does not.
 
     Parameters
     ----------
@@ -66,20 +67,22 @@ def pendulum_rate(
     return _rate(states, 0.0, length, gravity, form == "printed")
 
 
-def _rate(s: Array, t: float, size: float, g: float, printed: bool) -> Array:
-    x = s[..., 0]
-    y = s[..., 1]
-    u = s[..., 2]
-    v = s[..., 3]
-    pull = (u * u + v * v + g * y) / -(size * size)
-    out = np.empty_like(s)
-    out[..., 0] = u
-    out[..., 1] = v
-    np.multiply(pull, x, out=out[..., 2])
-    # g x² / L² = g - g y² / L² + g (x² + y² - L²) / L²: off the circle another force.
-    weight = g * (x * x + y * y) / (size * size) if printed else g
-    out[..., 3] = pull * y + weight
-    return out
+def _rate(states: Array, t: float, length: float, g: float, printed: bool) -> Array:
+    x = states[..., 0]
+    y = states[..., 1]
+    u = states[..., 2]
+    v = states[..., 3]
+    square = length * length
+    # λ = -(|v|² + g y)/L²
+    multiplier = (u * u + v * v + g * y) / -square
+    rate = np.empty_like(states)
+    rate[..., 0] = u
+    rate[..., 1] = v
+    np.multiply(multiplier, x, out=rate[..., 2])
+    # The printed g x²/L² is -g y²/L² + g (x² + y²)/L²; the last term is g only on the circle.
+    weight = g * (x * x + y * y) / square if printed else g
+    rate[..., 3] = multiplier * y + weight
+    return rate
 
 
 @validated
@@ -99,7 +102,7 @@ def pendulum(
         As for :func:`pendulum_rate`.
     sigma : (float, float)
         Strength of independent white noise on the positions, in m/√s, and on the velocities, in
-        m/s/√s; none by default. It does not know of the constraint.
+        m/s/√s; none by default. The noise does not respect the constraint.
     step : float
         Longest integration step, in s, positive.
 
@@ -110,7 +113,7 @@ def pendulum(
     1.0
     """
     return integrate(
-        partial(_rate, size=length, g=gravity, printed=form == "printed"),
+        partial(_rate, length=length, g=gravity, printed=form == "printed"),
         np.diag(np.repeat(sigma, 2) ** 2),
         step=step,
         names=("x", "y", "vx", "vy"),
@@ -143,7 +146,7 @@ def pendulum_angle(
     array([ 0.01  , -0.9995])
     """
     return integrate(
-        partial(_swing, pull=gravity / length),
+        partial(_angle_rate, ratio=gravity / length),
         np.diag(np.square(sigma)),
         step=step,
         names=("theta", "omega"),
@@ -151,11 +154,12 @@ def pendulum_angle(
     )
 
 
-def _swing(x: Array, t: float, pull: float) -> Array:
-    out = np.empty_like(x)
-    out[..., 0] = x[..., 1]
-    out[..., 1] = -pull * np.sin(x[..., 0])
-    return out
+def _angle_rate(chart: Array, t: float, ratio: float) -> Array:
+    rate = np.empty_like(chart)
+    rate[..., 0] = chart[..., 1]
+    # θ̈ = -(g/L) sin θ
+    rate[..., 1] = -ratio * np.sin(chart[..., 0])
+    return rate
 
 
 @validated
@@ -177,6 +181,7 @@ def pendulum_states(chart: Annotated[Array, "... 2"], *, length: Length = 1.0) -
     sine = np.sin(chart[..., 0])
     cosine = np.cos(chart[..., 0])
     rate = chart[..., 1]
+    # (x, y) = L (sin θ, cos θ), and its time derivative
     return length * np.stack([sine, cosine, rate * cosine, -rate * sine], axis=-1)
 
 
@@ -201,6 +206,9 @@ def pendulum_chart(states: States) -> Array:
     square = x * x + y * y
     if (square == 0).any():
         raise ValueError(
-            "states must have positions away from the pivot, got one at it"
+            "states must have positions away from the pivot, got one at the pivot"
         )
-    return np.stack([np.arctan2(x, y), (u * y - x * v) / square], axis=-1)
+    # The angle is measured from the y axis, hence arctan2(x, y).
+    angle = np.arctan2(x, y)
+    rate = (u * y - x * v) / square
+    return np.stack([angle, rate], axis=-1)

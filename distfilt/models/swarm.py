@@ -1,4 +1,4 @@
-"""Swarms: agents in a box that drift, diffuse and are reflected by its walls."""
+"""Swarms: agents that drift and diffuse in a box with reflecting walls."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..validation import (
     Array,
@@ -18,63 +19,66 @@ from ..validation import (
     PositiveInt,
     Rng,
     Times,
+    call_user,
     validated,
 )
 from ..validation.checks import check_array
-from .base import path
+from .base import trajectory
 
 __all__ = ["RotatingMixture", "Swarm", "rotating_swarm"]
 
 Positions = Annotated[Array, "... self.dim"]
 
 
-def _reflected(x: Array, low: Array, high: Array) -> Array:
-    """Fold positions back into a box, as walls do that reflect."""
+def _reflect(x: Array, low: Array, high: Array) -> Array:
+    """Fold positions back into a box with reflecting walls."""
     width = high - low
-    fold = np.abs((x - low + width) % (2 * width) - width)
+    # A triangular wave of period 2 width: 0 at the lower wall, width at the upper one.
+    folded = np.abs((x - low + width) % (2 * width) - width)
     # The sum of low and a rounded width may lie one bit beyond the wall.
-    return np.clip(low + fold, low, high)
+    return np.clip(low + folded, low, high)
 
 
-def inside(positions: Array, low: Array, high: Array) -> Array:
-    """Positions (..., d); those outside the box are refused."""
+def check_inside(positions: Array, low: Array, high: Array) -> None:
+    """Refuse positions (..., d) outside the box."""
     outside = ((positions < low) | (positions > high)).any(axis=-1)
     if outside.any():
         raise ValueError(
-            "positions must have agents inside the box, got "
-            f"{outside.sum()} outside, one at {positions[outside][0].tolist()}"
+            "positions must be inside the box, got "
+            f"{outside.sum()} outside, the first at {positions[outside][0].tolist()}"
         )
-    return positions
 
 
-def _diagonal(value: Any, points: tuple[int, ...], dim: int) -> Array:
-    """A diffusion, isotropic or per axis, as (*points, d), positive."""
-    d = check_array(value, "diffusion")
-    if d.shape in ((), points):
-        d = d[..., None]
-    elif d.shape not in ((dim,), (*points, dim)):
+def _expand_diffusion(value: ArrayLike, points: tuple[int, ...], dim: int) -> Array:
+    """Validate a diffusion, isotropic or per axis, and broadcast it to (*points, d)."""
+    diffusion = check_array(value, "diffusion")
+    if diffusion.shape in ((), points):
+        diffusion = diffusion[..., None]
+    elif diffusion.shape not in ((dim,), (*points, dim)):
         raise ValueError(
-            f"diffusion must be a number or one for each axis at {points} points, got {d.shape}"
+            "diffusion must be a number, or one number for each axis, "
+            f"at points of shape {points}, got shape {diffusion.shape}"
         )
-    least = float(d.min(initial=np.inf))
+    least = float(diffusion.min(initial=np.inf))
+    # Written so that NaN is refused too.
     if not least > 0:
-        raise ValueError(f"diffusion must be numbers above 0, got {least:g}")
-    return np.broadcast_to(d, (*points, dim))
+        raise ValueError(f"diffusion must be positive, got {least:g}")
+    return np.broadcast_to(diffusion, (*points, dim))
 
 
 @dataclass(frozen=True, eq=False)
 class Swarm(FrozenModel):
-    r"""Independent agents of one law in a box with reflecting walls.
+    r"""Independent, identical agents in a box with reflecting walls.
 
     .. math:: d\mathbf X = \mathbf v(\mathbf X, t)\,dt + \sqrt{2\mathbf D(\mathbf X,t)}\,d\mathbf B
 
-    in the sense of Itô, equation (1) of Zheng and Lin with
+    in the sense of Itô: equation (1) of Zheng and Lin, with
     :math:`\mathbf D=\tfrac12\boldsymbol\sigma\boldsymbol\sigma^\top` diagonal.
 
     Parameters
     ----------
     drift : callable
-        ``drift(x, t) -> v`` on positions (..., d), in 1/s times the positions' unit.
+        ``drift(x, t) -> v`` on positions (..., d), in the positions' unit per second.
     diffusion : float, array_like (d,), or callable
         The diagonal of D, positive; a callable ``diffusion(x, t)`` returns (...) or (..., d).
     low, high : array_like, (d,)
@@ -94,7 +98,7 @@ class Swarm(FrozenModel):
     """
 
     drift: Callable[[Array, float], Array]
-    diffusion: Any
+    diffusion: Any  # a number, one for each axis, or a function: checked below
     low: Annotated[Array, "d"] = field(
         default_factory=partial(np.zeros, 2), kw_only=True
     )
@@ -107,11 +111,10 @@ class Swarm(FrozenModel):
         if (self.low >= self.high).any():
             low = self.low.tolist()
             high = self.high.tolist()
-            raise ValueError(f"high must have corners above low = {low}, got {high}")
+            raise ValueError(f"high must be above low = {low}, got {high}")
         if not callable(self.diffusion):
-            object.__setattr__(
-                self, "diffusion", _diagonal(self.diffusion, (), self.dim).copy()
-            )
+            diffusion = _expand_diffusion(self.diffusion, (), self.dim).copy()
+            object.__setattr__(self, "diffusion", diffusion)
 
     @property
     def dim(self) -> int:
@@ -120,13 +123,15 @@ class Swarm(FrozenModel):
 
     def drift_at(self, x: Array, t: float) -> Array:
         """The drift at positions (..., d), checked for its shape."""
-        return check_array(self.drift(x, t), "drift", x.shape)
+        return check_array(call_user(self.drift, x, t), "drift", x.shape)
 
     def diffusion_at(self, x: Array, t: float) -> Array:
         """The diffusion along each axis at positions (..., d), as (..., d)."""
-        value = self.diffusion(x, t) if callable(self.diffusion) else self.diffusion
-        points = x.shape[:-1] if callable(self.diffusion) else ()
-        return np.broadcast_to(_diagonal(value, points, self.dim), x.shape)
+        if callable(self.diffusion):
+            value = call_user(self.diffusion, x, t)
+            return _expand_diffusion(value, x.shape[:-1], self.dim)
+        diffusion = _expand_diffusion(self.diffusion, (), self.dim)
+        return np.broadcast_to(diffusion, x.shape)
 
     @validated
     def step(
@@ -138,7 +143,7 @@ class Swarm(FrozenModel):
         rng: Rng,
         substeps: PositiveInt = 10,
     ) -> Array:
-        """Move agents from `t` to `t` + `dt` by Euler and Maruyama's scheme.
+        """Move agents from `t` to `t` + `dt` by the Euler-Maruyama scheme.
 
         Parameters
         ----------
@@ -156,18 +161,20 @@ class Swarm(FrozenModel):
         -------
         ndarray, (..., d)
         """
-        return self._step(inside(positions, self.low, self.high), t, dt, rng, substeps)
+        check_inside(positions, self.low, self.high)
+        return self._step(positions, t, dt, rng, substeps)
 
     def _step(
-        self, x: Array, t: float, dt: float, rng: np.random.Generator, n: int
+        self, x: Array, t: float, dt: float, rng: np.random.Generator, substeps: int
     ) -> Array:
-        h = dt / n
-        for k in range(n):
+        h = dt / substeps
+        for k in range(substeps):
             now = t + k * h
-            kick = np.sqrt(2 * h * self.diffusion_at(x, now)) * rng.standard_normal(
-                x.shape
-            )
-            x = _reflected(x + h * self.drift_at(x, now) + kick, self.low, self.high)
+            # x + h v(x) + sqrt(2 h D(x)) z, then the walls
+            std = np.sqrt(2 * h * self.diffusion_at(x, now))
+            noise = std * rng.standard_normal(x.shape)
+            proposal = x + h * self.drift_at(x, now) + noise
+            x = _reflect(proposal, self.low, self.high)
         return x
 
     @validated
@@ -180,30 +187,31 @@ class Swarm(FrozenModel):
         t0: float = 0.0,
         substeps: PositiveInt = 10,
     ) -> Array:
-        """Positions at `times`, (T, ..., d), of agents that are at `positions` at `t0`.
+        """Simulate agents that start from `positions` at `t0`; positions at `times`, (T, ..., d).
 
         Parameters are those of :meth:`step`; `times` increase strictly from `t0`.
         """
-        move = partial(self._step, rng=rng, n=substeps)
-        return path(move, inside(positions, self.low, self.high), times, t0)
+        check_inside(positions, self.low, self.high)
+        step = partial(self._step, rng=rng, substeps=substeps)
+        return trajectory(step, positions, times, t0)
 
 
 @dataclass(frozen=True, eq=False)
 class RotatingMixture(FrozenModel):
-    """Gaussians of equal weight and variance that go round a circle: f(x, t) of Zheng and Lin.
+    """Gaussians of equal weight and variance that move on a circle: f(x, t) of Zheng and Lin.
 
     Parameters
     ----------
     centre : array_like, (2,)
-        Of the circle.
+        Centre of the circle.
     radius, rate : float
-        Of the circle, and in rad/s.
+        Radius of the circle, and angular velocity in rad/s.
     variance : float
-        Of each component along each axis, positive.
+        Variance of each component along each axis, positive.
     components : int
-        How many, evenly spaced.
+        Number of components, evenly spaced.
     phase : float
-        Angle of the first at t = 0, in rad.
+        Angle of the first component at t = 0, in rad.
 
     Examples
     --------
@@ -223,53 +231,56 @@ class RotatingMixture(FrozenModel):
 
     @validated
     def means(self, t: float) -> Array:
-        """Where the components are at time `t`, (K, 2)."""
+        """Means of the components at time `t`, (K, 2)."""
         k = np.arange(self.components)
         angle = self.rate * t + self.phase + 2 * np.pi * k / self.components
         circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         return np.asarray(self.centre + self.radius * circle)
 
-    def _logs(self, x: Array, t: float) -> tuple[Array, Array]:
-        means = self.means(t)
-        gap = x[..., None, :] - means
-        return -0.5 * (gap**2).sum(axis=-1) / self.variance, means
+    def _log_kernels(self, x: Array, means: Array) -> Array:
+        """Log densities of the components at x, (..., K), without their common constant."""
+        difference = x[..., None, :] - means
+        return np.asarray(-0.5 * (difference**2).sum(axis=-1) / self.variance)
 
     @validated
     def density(self, x: Annotated[Array, "... 2"], t: float) -> Array:
-        """f at positions (..., 2), normalised over the plane."""
-        logs, _ = self._logs(x, t)
-        out = np.exp(logs).mean(axis=-1) / (2 * np.pi * self.variance)
-        return np.asarray(out)
+        """Density f at positions (..., 2), normalised over the plane."""
+        logs = self._log_kernels(x, self.means(t))
+        normalisation = 2 * np.pi * self.variance
+        return np.asarray(np.exp(logs).mean(axis=-1) / normalisation)
 
     @validated
     def score(self, x: Annotated[Array, "... 2"], t: float) -> Array:
-        """∇f/f at positions (..., 2); finite wherever f itself would underflow."""
-        logs, means = self._logs(x, t)
-        w = np.exp(logs - logs.max(axis=-1, keepdims=True))
-        w /= w.sum(axis=-1, keepdims=True)
-        return np.asarray((w @ means - x) / self.variance)
+        """Score ∇f/f at positions (..., 2); finite even where f itself underflows."""
+        means = self.means(t)
+        logs = self._log_kernels(x, means)
+        # Weights of the components at x; the largest exponent is 0, so that one weight remains.
+        weights = np.exp(logs - logs.max(axis=-1, keepdims=True))
+        weights /= weights.sum(axis=-1, keepdims=True)
+        # ∇f/f = Σ w_k (m_k - x)/σ²
+        return np.asarray((weights @ means - x) / self.variance)
 
 
 @validated
 def rotating_swarm(
-    reading: Literal["literal", "gibbs", "slowgibbs"] = "slowgibbs",
+    interpretation: Literal["literal", "gibbs", "slowgibbs"] = "slowgibbs",
     *,
     strength: Annotated[float, Bounds(above=0, at_most=1e150)] = 0.03,
     mixture: RotatingMixture | None = None,
 ) -> Swarm:
-    """The swarm of Zheng and Lin's study, equation (23), in one of three readings.
+    """The swarm of Zheng and Lin's study, equation (23), in one of three interpretations.
 
     Parameters
     ----------
-    reading : {"literal", "gibbs", "slowgibbs"}
-        The drift is c ∇f/f with a mobility c and a diffusion D. As printed, the one number s is the
-        mobility and the noise's strength, so that D = s²/2; the density then follows the power 2/s
-        of f. With both s ("gibbs"), or both s²/2 ("slowgibbs"), it follows f itself, fast or
-        slowly. All are in 1/s for a box of width 1.
+    interpretation : {"literal", "gibbs", "slowgibbs"}
+        The drift is c ∇f/f with a mobility c and a diffusion D. As printed ("literal"), the number
+        s is both the mobility and the strength of the noise, so that D = s²/2; the density then
+        approaches the power 2/s of f. With c = D = s ("gibbs") or c = D = s²/2 ("slowgibbs") it
+        approaches f itself, fast or slowly. All are in 1/s for a box of width 1.
     strength : float
         The number s, positive.
     mixture : RotatingMixture, optional
-        What the agents are drawn to.
+        The density f that attracts the agents.
 
     Returns
     -------
@@ -281,12 +292,14 @@ def rotating_swarm(
     >>> swarm.drift_at(np.array([[0.8, 0.6]]), 0.0).round(3)
     array([[-0.  , -0.15]])
     """
-    small = strength**2 / 2
-    mobility = small if reading == "slowgibbs" else strength
+    half_square = strength**2 / 2
+    mobility = half_square if interpretation == "slowgibbs" else strength
+    diffusion = strength if interpretation == "gibbs" else half_square
     f = RotatingMixture() if mixture is None else mixture
-    drift = partial(_drawn, mobility=mobility, mixture=f)
-    return Swarm(drift, strength if reading == "gibbs" else small)
+    return Swarm(partial(_score_drift, mobility=mobility, mixture=f), diffusion)
 
 
-def _drawn(x: Array, t: float, mobility: float, mixture: RotatingMixture) -> Array:
+def _score_drift(
+    x: Array, t: float, mobility: float, mixture: RotatingMixture
+) -> Array:
     return np.asarray(mobility * mixture.score(x, t))

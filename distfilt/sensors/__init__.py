@@ -1,12 +1,14 @@
-"""Sensors: what an agent sees of a state, how noisy it is, and how two readings are compared."""
+"""Sensors: the observation function of an agent, its noise, and the residual."""
 
 from .base import Sensor, wrap
 from .kinds import (
     angles_only,
+    bearing,
     component,
     distance,
     ephemeris,
     from_name,
+    increment,
     line_angle,
     range_bearing,
     stack,
@@ -14,13 +16,15 @@ from .kinds import (
 
 __all__ = [
     "Sensor",
-    "line_angle",
+    "angles_only",
+    "bearing",
     "component",
     "distance",
-    "range_bearing",
     "ephemeris",
-    "angles_only",
     "from_name",
+    "increment",
+    "line_angle",
+    "range_bearing",
     "stack",
     "wrap",
 ]

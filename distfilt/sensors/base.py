@@ -1,9 +1,9 @@
-"""What a sensor is: a prediction, its noise, and how two readings are compared.
+"""Sensors: the predicted observation, its noise, and the residual of two observations.
 
-A reading has no value where NaN stands: a component that is missing in an observation, or that the
-sensor cannot see from a state (the angle of a place where the sensor itself stands). A residual of
-either is NaN, and a filter leaves that component out of that run's update: a component is used only
-where the reading has it and every prediction that it is compared with has it too.
+An observation is missing where it is NaN: the component was not measured, or the sensor cannot
+see it from that state (the bearing of a place at which the sensor itself stands). A residual with
+such a component is NaN too, and a filter leaves it out of that run's update: a component is used
+only if the observation has it and so has every prediction that it is compared with.
 """
 
 from __future__ import annotations
@@ -24,10 +24,12 @@ from ..validation import (
     PositiveFloat,
     PositiveInt,
     Rng,
+    call_user,
     check_array,
     validated,
 )
-from ..validation.checks import call_batched
+from ..validation.batching import call_batched
+from ..validation.first_use import is_first_use
 
 __all__ = ["Sensor", "wrap"]
 
@@ -41,7 +43,7 @@ def wrap(
     Parameters
     ----------
     angles : array_like, (...)
-        Angles, in rad. One that lies there already is returned as it is, and so is NaN (missing).
+        Angles, in rad. Those inside the interval are returned unchanged, and so is NaN (missing).
     period : float
         2π for directions; π for the angle of a line, which `arctan(b/a)` measures.
 
@@ -52,12 +54,14 @@ def wrap(
     """
     half = 0.5 * period
     inside = (angles >= -half) & (angles < half)
+    # The usual case; a copy, since a caller may change the result in place.
     if inside.all():
         return np.array(angles)
-    moved = (angles + half) % period - half
-    # Rounding can put an angle just below -half at +half, which stands for the same direction.
-    moved = np.where(moved >= half, -half, moved)
-    return np.asarray(np.where(inside, angles, moved))
+    wrapped = (angles + half) % period - half
+    # Rounding can turn an angle just below -half into +half, which is the same direction.
+    wrapped = np.where(wrapped >= half, -half, wrapped)
+    # The shift by half a period costs digits: angles inside keep all of theirs.
+    return np.asarray(np.where(inside, angles, wrapped))
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,25 +72,26 @@ class Sensor(FrozenModel):
     ----------
     dim : int
         Size m of an observation.
-    function : callable
-        ``function(x) -> y`` on (..., d) to (..., m), without noise; with `uses_previous`,
-        ``function(x, previous) -> y``. It gets copies of the states. NaN where the state cannot be
-        seen. One that takes a single state only is refused when it first gets several.
-    cov : array_like, (m, m)
-        The covariance R, positive definite.
-    difference : callable, optional
-        ``difference(observed, predicted)``, for readings that wrap; subtraction by default. One
-        that falls where the reading grows is refused.
+    h : callable
+        The observation function, ``h(x) -> y`` on (..., d) to (..., m), without noise; with
+        `uses_previous`, ``h(x, previous) -> y``. It gets copies of the states. NaN where the state
+        cannot be seen. A function that takes a single state only is refused when it first gets
+        several.
+    noise_cov : array_like, (m, m)
+        The covariance R of the noise, positive definite.
+    residual_function : callable, optional
+        ``residual_function(observed, predicted)``, for observations that wrap; subtraction by
+        default. A function that decreases as the observation increases is refused.
     uses_previous : bool
-        Whether the sensor sees the change from the previous observation time.
+        Whether the sensor measures a change since the previous observation time.
     kind : str
-        A name, for tables.
+        A name, for tables and messages.
     linear : callable, optional
         ``linear(d) -> H``, (m, d), if h is linear.
     derivative : callable, optional
-        ``derivative(x)``, the Jacobian of `function` in the present state, (..., m, d), called
-        like it. Central differences stand in for it; a first time they are compared, and a
-        warning tells of another function's.
+        ``derivative(x)``, the Jacobian of h in the present state, (..., m, d), called like h.
+        Without it central differences are used. With it the two are compared once, and a warning
+        is given if they disagree.
 
     Examples
     --------
@@ -108,14 +113,15 @@ class Sensor(FrozenModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.residual_function is not None:
-            ahead = self.residual_function(
-                np.full(self.dim, 1 + 1e-6), np.ones(self.dim)
+        if self.residual_function is None:
+            return
+        # The residual of 1 + 1e-6 and 1 is 1e-6, and -1e-6 if the arguments were exchanged.
+        one = np.ones(self.dim)
+        residual = call_user(self.residual_function, one + 1e-6, one)
+        if (np.asarray(residual) < -5e-7).any():
+            raise ValueError(
+                "residual_function must return observed minus predicted, got the opposite sign"
             )
-            if (np.asarray(ahead) < -5e-7).any():
-                raise ValueError(
-                    "difference must have observed less predicted, got the opposite"
-                )
 
     @cached_property
     def noise_sqrt(self) -> Array:
@@ -128,23 +134,24 @@ class Sensor(FrozenModel):
         x: Annotated[Array, "... d"],
         previous: Annotated[Array, "... d"] | None = None,
     ) -> Array:
-        """The observation without noise of states (..., d), as (..., m).
+        """Return the observation without noise of states (..., d), as (..., m).
 
-        `previous` holds the states at the previous observation time; only a sensor that sees
+        `previous` holds the states at the previous observation time; only a sensor that measures
         changes needs it.
         """
-        return call_batched(self, "h", self._states(x, previous))
+        return call_batched(self, "h", self._arguments(x, previous))
 
-    def _states(self, x: Array, previous: Array | None) -> tuple[Array, ...]:
-        """What the function gets."""
+    def _arguments(self, x: Array, previous: Array | None) -> tuple[Array, ...]:
+        """Return the states that h takes: the present ones, and the previous ones if needed."""
         if not self.uses_previous:
             return (x,)
         if previous is None:
             raise ValueError(
-                f"previous: a {self.kind} sensor needs the states before, which at a "
-                "state's own time a filter's lag keeps, got None"
+                f"previous must be the states at the previous observation time for a "
+                f"sensor of kind {self.kind!r} (a filter keeps them with lag=), got None"
             )
         if x.shape != previous.shape:
+            # Leading axes broadcast; other shapes are refused here.
             leading(x.shape[:-1], previous.shape[:-1], "previous")
             x, previous = np.broadcast_arrays(x, previous)
         return x, previous
@@ -157,9 +164,11 @@ class Sensor(FrozenModel):
         rng: Rng,
         previous: Annotated[Array, "... d"] | None = None,
     ) -> Array:
-        """A noisy observation of each of the states (..., d), as (..., m)."""
-        seen = self.predict(x, previous)
-        return seen + rng.standard_normal(seen.shape) @ self.noise_sqrt.T
+        """Draw a noisy observation of each of the states (..., d), as (..., m)."""
+        predicted = self.predict(x, previous)
+        # With R = C Cᵀ, rows of standard normals times Cᵀ have the covariance R.
+        noise = rng.standard_normal(predicted.shape) @ self.noise_sqrt.T
+        return predicted + noise
 
     @validated
     def residual(
@@ -167,40 +176,50 @@ class Sensor(FrozenModel):
         observed: Annotated[Array, "... self.dim", ALLOW_NAN],
         predicted: Annotated[Array, "... self.dim", ALLOW_NAN],
     ) -> Array:
-        """How far observations are from predictions, (..., m), wrapped where the sensor wraps.
+        """Return observed minus predicted, (..., m), wrapped where the sensor wraps.
 
-        NaN, a missing component or one that the sensor cannot see, stays NaN.
+        NaN, a component that is missing or that the sensor cannot see, stays NaN.
 
-        >>> seen, near = np.array([3.0]), np.array([1.0])
-        >>> eye = Sensor(
+        >>> observed, predicted = np.array([3.0]), np.array([1.0])
+        >>> sensor = Sensor(
         ...     1,
         ...     lambda x: x,
         ...     [[1.0]],
         ...     residual_function=lambda a, b: np.subtract(a, b, out=a),
         ... )
-        >>> eye.residual(seen, near), seen
+        >>> sensor.residual(observed, predicted), observed
         (array([2.]), array([3.]))
         """
         if self.residual_function is None:
             return np.asarray(observed - predicted)
-        wanted = leading(observed.shape, predicted.shape, "predicted")
-        gap = np.asarray(self.residual_function(observed.copy(), predicted.copy()))
-        if gap.shape != wanted:
-            raise ValueError(f"difference must return shape {wanted}, got {gap.shape}")
-        return gap
+        shape = leading(observed.shape, predicted.shape, "predicted")
+        # Copies, since the user's function may work in place.
+        residual = np.asarray(
+            call_user(self.residual_function, observed.copy(), predicted.copy())
+        )
+        # A function written for one observation can lose the leading axes.
+        if residual.shape != shape:
+            raise ValueError(
+                f"residual_function must return shape {shape}, got {residual.shape}"
+            )
+        return residual
 
     @validated
     def H(self, dim: PositiveInt) -> Array:
-        """The matrix H, (m, `dim`), of a linear sensor."""
+        """Return the matrix H, (m, `dim`), of a linear sensor."""
         if self.linear is None:
             raise ValueError(
-                f"sensor must be a linear sensor, got a {self.kind} sensor"
+                f"sensor must be linear to have a matrix H, got one of kind {self.kind!r}"
             )
-        h = check_array(self.linear(dim), "linear", (self.dim, dim))
-        seen = self.predict(np.eye(dim)) if vars(self).pop("_doubted", False) else h.T
-        if not np.allclose(seen, h.T, atol=1e-9):
-            raise ValueError("linear must be the matrix of its function, got another")
-        return h
+        matrix = check_array(call_user(self.linear, dim), "linear", (self.dim, dim))
+        # A user's matrix is compared once with h, which maps the rows of I to those of Hᵀ.
+        if is_first_use(self, "linear"):
+            predicted = self.predict(np.eye(dim))
+            if not np.allclose(predicted, matrix.T, atol=1e-9):
+                raise ValueError(
+                    "linear must return the matrix of h, got one that does not match it"
+                )
+        return matrix
 
     @validated
     def jacobian(
@@ -208,20 +227,24 @@ class Sensor(FrozenModel):
         x: Annotated[Array, "... d"],
         previous: Annotated[Array, "... d"] | None = None,
     ) -> Array:
-        """Derivative of h in the present states (..., d), as (..., m, d).
+        """Return the derivative of h in the present states (..., d), as (..., m, d).
 
-        `derivative` where the sensor has it, central differences otherwise. NaN where the state
+        By `derivative` if the sensor has it, by central differences otherwise. NaN where the state
         cannot be seen.
         """
-        states = self._states(x, previous)
+        states = self._arguments(x, previous)
         d = x.shape[-1]
-        full = (*states[0].shape[:-1], self.dim, d)
+        shape = (*states[0].shape[:-1], self.dim, d)
+        # A linear sensor has the same matrix H at every state.
         if self.linear is not None:
-            return np.broadcast_to(self.H(d), full)
-        before = [b[..., None, :] for b in states[1:]]
+            return np.broadcast_to(self.H(d), shape)
+
+        # The previous states stay fixed while the present one is varied along a new axis.
+        fixed = [state[..., None, :] for state in states[1:]]
         predict = self.predict
-        residual = self.residual
-        near = partial(
-            central, lambda moved: predict(moved, *before), states[0], residual
-        )
-        return as_derivative(self, states, full, near)
+
+        def vary(varied: Array) -> Array:
+            return predict(varied, *fixed)
+
+        differences = partial(central, vary, states[0], self.residual)
+        return as_derivative(self, states, shape, differences)

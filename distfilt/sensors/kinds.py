@@ -1,4 +1,4 @@
-"""The built-in sensors: components, changes, distances, angles, directions, and stacks of them."""
+"""The built-in sensors: components, increments, distances, angles, and stacks of sensors."""
 
 from __future__ import annotations
 
@@ -14,58 +14,44 @@ from ..validation import (
     Bounds,
     DistinctIndices,
     NonNegativeInt,
+    call_user,
     validated,
 )
 from ..validation.checks import check_distinct
 from .base import Sensor, wrap
 
 __all__ = [
-    "line_angle",
+    "angles_only",
+    "bearing",
     "component",
     "distance",
-    "range_bearing",
     "ephemeris",
-    "angles_only",
     "from_name",
+    "increment",
+    "line_angle",
+    "range_bearing",
     "stack",
 ]
 
 Deviation = Annotated[float, Bounds(at_least=1e-150, at_most=1e150)]
-"""A standard deviation whose square is a variance that is neither zero nor infinite."""
+"""A standard deviation whose square is neither zero nor infinite."""
 
+AngleDeviation = Annotated[float, Bounds(at_least=1e-150, at_most=np.pi)]
+"""A standard deviation of an angle, in rad; a wider Gaussian, wrapped, is nearly uniform."""
 
-Turn = Annotated[float, Bounds(at_least=1e-150, at_most=np.pi)]
-"""A standard deviation of an angle, in rad: a wider Gaussian is none once it is wrapped."""
 Pair = Annotated[tuple[NonNegativeInt, NonNegativeInt], check_distinct]
+"""Two different components."""
+
+Point = Annotated[Array, "2"]
+"""A place in the plane."""
 
 
-def diagonal(*stds: float) -> Array:
-    """The covariance of independent readings, read-only."""
-    cov: Array = np.diag(np.square(np.asarray(stds)))
-    cov.setflags(write=False)
-    return cov
-
-
-def _pick(x: Array, indices: Sequence[int]) -> Array:
-    return x[..., list(indices)]
-
-
-def _spread(slope: Array, indices: Sequence[int], dim: int) -> Array:
-    """Derivatives (..., m, n) in the picked components, as ones in all `dim` of them."""
-    out = np.zeros((*slope.shape[:-1], dim))
-    out[..., list(indices)] = slope
-    return out
-
-
-def _rows(dim: int, indices: Sequence[int]) -> Array:
-    """The rows of the identity that pick components."""
-    Bounds(below=dim)(max(indices), "indices")
-    return _pick(np.eye(dim), indices).T
+# Components and their increments.
 
 
 @validated
 def component(indices: DistinctIndices, *, std: Deviation) -> Sensor:
-    """See some components as they are, ``h(x) = x[indices]``, with a standard deviation `std` each.
+    """Measure components of the state, ``h(x) = x[indices]``, with standard deviation `std` each.
 
     Examples
     --------
@@ -75,15 +61,15 @@ def component(indices: DistinctIndices, *, std: Deviation) -> Sensor:
     return Sensor.construct(
         len(indices),
         partial(_pick, indices=indices),
-        diagonal(*[std] * len(indices)),
-        kind="direct",
-        linear=partial(_rows, indices=indices),
+        _diagonal_cov([std] * len(indices)),
+        kind="component",
+        linear=partial(_selection_matrix, indices=indices),
     )
 
 
 @validated
 def increment(indices: DistinctIndices, *, std: Deviation) -> Sensor:
-    """See how much some components changed since the previous observation time, to `std` each.
+    """Measure the change of components since the previous observation time, to `std` each.
 
     Examples
     --------
@@ -92,30 +78,64 @@ def increment(indices: DistinctIndices, *, std: Deviation) -> Sensor:
     """
     return Sensor.construct(
         len(indices),
-        partial(_change, indices=indices),
-        diagonal(*[std] * len(indices)),
+        partial(_increment, indices=indices),
+        _diagonal_cov([std] * len(indices)),
         uses_previous=True,
-        kind="differential",
-        derivative=partial(_change_slope, indices=indices),
+        kind="increment",
+        # Not `linear`: H belongs to sensors of the present state alone.
+        derivative=partial(_increment_jacobian, indices=indices),
     )
 
 
-def _change(x: Array, previous: Array, indices: Sequence[int]) -> Array:
+@validated
+def ephemeris(*, position_std: Deviation, velocity_std: Deviation) -> Sensor:
+    """Measure the first body's position and velocity, in km and m/s.
+
+    Parameters
+    ----------
+    position_std, velocity_std : float
+        Standard deviations, above 0, in km and m/s.
+
+    Examples
+    --------
+    >>> ephemeris(position_std=1e-3, velocity_std=1e-5).dim
+    6
+    """
+    # The first six components of the state, with a noise of two scales.
+    stds = [position_std] * 3 + [velocity_std] * 3
+    sensor = component(tuple(range(6)), std=1.0)
+    return sensor.replace(noise_cov=_diagonal_cov(stds))
+
+
+def _diagonal_cov(stds: Sequence[float]) -> Array:
+    """Return the covariance of independent components, read-only."""
+    cov: Array = np.diag(np.square(np.asarray(stds)))
+    cov.setflags(write=False)
+    return cov
+
+
+def _pick(x: Array, indices: Sequence[int]) -> Array:
+    # A list of indices copies; a tuple would index one axis for each entry.
+    return x[..., list(indices)]
+
+
+def _selection_matrix(dim: int, indices: Sequence[int]) -> Array:
+    """Return the rows of the identity that pick components."""
+    # The dimension of the state is known only now, and with it which indices are too large.
+    Bounds(below=dim)(max(indices), "indices")
+    return _pick(np.eye(dim), indices).T
+
+
+def _increment(x: Array, previous: Array, indices: Sequence[int]) -> Array:
     return np.asarray(_pick(x, indices) - _pick(previous, indices))
 
 
-def _change_slope(x: Array, previous: Array, indices: Sequence[int]) -> Array:
-    return _rows(x.shape[-1], indices)
+def _increment_jacobian(x: Array, previous: Array, indices: Sequence[int]) -> Array:
+    # The previous state does not depend on the present one.
+    return _selection_matrix(x.shape[-1], indices)
 
 
-def _place(indices: Sequence[int], origin: Array | None) -> dict[str, Any]:
-    """Of which components a place is made, and where it is seen from: a copy, for it may move."""
-    return {"indices": indices, "origin": np.array(0.0 if origin is None else origin)}
-
-
-def _gap(x: Array, indices: Sequence[int], origin: Array) -> Array:
-    """From the origin to the place that some components are."""
-    return _pick(x, indices) - origin
+# Distances and angles in some components.
 
 
 @validated
@@ -125,7 +145,7 @@ def distance(
     std: Deviation,
     origin: Annotated[Array, "n"] | None = None,
 ) -> Sensor:
-    """See the distance from a place in some components, ``h(x) = |x[indices] - origin|``.
+    """Measure the distance of some components from a place, ``h(x) = |x[indices] - origin|``.
 
     Parameters
     ----------
@@ -134,11 +154,11 @@ def distance(
     std : float
         Standard deviation of the distance, in the components' unit, positive.
     origin : array_like, (n,), optional
-        Where it is measured from, one coordinate for each of the n indices; zero by default.
+        The place of the sensor, one coordinate for each of the n indices; zero by default.
 
     Notes
     -----
-    The distance has no derivative at the origin itself; zero stands in for it.
+    The distance has no derivative at the origin itself; zero is used there.
 
     Examples
     --------
@@ -149,39 +169,21 @@ def distance(
         raise ValueError(
             f"origin must have shape ({len(indices)},), got {origin.shape}"
         )
-    place = _place(indices, origin)
+    geometry = _geometry(indices, origin)
     return Sensor.construct(
         1,
-        partial(_distance, **place),
-        diagonal(std),
+        partial(_distance, **geometry),
+        _diagonal_cov([std]),
         kind="distance",
-        derivative=partial(_distance_slope, **place),
+        derivative=partial(_distance_jacobian, **geometry),
     )
 
 
-def _distance(x: Array, indices: Sequence[int], origin: Array) -> Array:
-    return _length(_gap(x, indices, origin))
-
-
-def _length(gap: Array) -> Array:
-    return np.asarray(np.sqrt((gap * gap).sum(axis=-1, keepdims=True)))
-
-
-def _distance_slope(x: Array, indices: Sequence[int], origin: Array) -> Array:
-    length = _length(gap := _gap(x, indices, origin))
-    slope = gap / np.where(length > 0, length, 1.0)
-    return _spread(slope[..., None, :], indices, x.shape[-1])
-
-
 @validated
-def line_angle(
-    indices: Pair,
-    *,
-    std: Turn,
-    full: bool = False,
-    origin: Annotated[Array, "2"] | None = None,
+def bearing(
+    indices: Pair, *, std: AngleDeviation, origin: Point | None = None
 ) -> Sensor:
-    """See the angle of two components (a, b), in rad.
+    """Measure the direction of two components (a, b), ``arctan2(b, a)``, with period 2π.
 
     Parameters
     ----------
@@ -189,84 +191,104 @@ def line_angle(
         The components a and b.
     std : float
         Standard deviation, in rad, positive and at most π.
-    full : bool
-        False: ``arctan(b/a)``, the angle of a line, which repeats after π (Grange et al., Table I).
-        True: ``arctan2(b, a)``, a direction, which repeats after 2π.
     origin : array_like, (2,), optional
-        Where the angle is measured from; zero by default.
+        The place of the sensor; zero by default.
 
     Notes
     -----
     At the origin itself the angle does not exist: the prediction and its derivative are NaN, and a
-    filter leaves the reading out.
+    filter leaves the observation out.
+
+    See Also
+    --------
+    line_angle : An angle that cannot tell a direction from the opposite one.
 
     Examples
     --------
-    >>> sight = line_angle([0, 1], std=0.2)
-    >>> sight.predict([1.0, 1.0]).round(4)
+    >>> sensor = bearing([0, 1], std=0.2)
+    >>> sensor.predict([-1.0, -1.0]).round(4)
+    array([-2.3562])
+    >>> sensor.residual([3.0], [-3.0]).round(4)
+    array([-0.2832])
+    """
+    return _angle_sensor("bearing", indices, std, origin, period=2 * np.pi)
+
+
+@validated
+def line_angle(
+    indices: Pair, *, std: AngleDeviation, origin: Point | None = None
+) -> Sensor:
+    """Measure the angle of the line through two components (a, b), ``arctan(b/a)``, period π.
+
+    This is the angle of Grange et al., Table I. It is the same for a direction and the opposite
+    one; :func:`bearing` tells them apart.
+
+    Parameters
+    ----------
+    indices : sequence of two int
+        The components a and b.
+    std : float
+        Standard deviation, in rad, positive and at most π.
+    origin : array_like, (2,), optional
+        The place of the sensor; zero by default.
+
+    Notes
+    -----
+    At the origin itself the angle does not exist: the prediction and its derivative are NaN, and a
+    filter leaves the observation out.
+
+    Examples
+    --------
+    >>> sensor = line_angle([0, 1], std=0.2)
+    >>> sensor.predict([-1.0, -1.0]).round(4)
     array([0.7854])
-    >>> sight.residual([1.5], [-1.5]).round(4)
+    >>> sensor.residual([1.5], [-1.5]).round(4)
     array([-0.1416])
     """
-    period = (2 if full else 1) * np.pi
-    place = _place(indices, origin)
+    return _angle_sensor("line_angle", indices, std, origin, period=np.pi)
+
+
+def _angle_sensor(
+    kind: str, indices: Sequence[int], std: float, origin: Array | None, period: float
+) -> Sensor:
+    geometry = _geometry(indices, origin)
     return Sensor.construct(
         1,
-        partial(_angle, period=period, **place),
-        diagonal(std),
-        kind="angle",
-        derivative=partial(_angle_slope, **place),
-        residual_function=partial(_turned_at, period=period),
+        partial(_angle, period=period, **geometry),
+        _diagonal_cov([std]),
+        kind=kind,
+        derivative=partial(_angle_jacobian, **geometry),
+        residual_function=partial(_wrap_residual, period=period),
     )
-
-
-def _angle(x: Array, period: float, **place: Any) -> Array:
-    return _direction(_gap(x, **place), period)
-
-
-def _direction(gap: Array, period: float, heading: float = 0.0) -> Array:
-    turned = (
-        np.where(gap.any(axis=-1), np.arctan2(gap[..., 1], gap[..., 0]), np.nan)
-        - heading
-    )
-    return wrap(turned, period=period)[..., None]
-
-
-def _angle_slope(x: Array, indices: Sequence[int], origin: Array) -> Array:
-    length = _length(gap := _gap(x, indices, origin))
-    length = np.where(length > 0, length, np.nan)
-    unit = gap / length
-    slope = np.stack([-unit[..., 1], unit[..., 0]], axis=-1) / length
-    return _spread(slope[..., None, :], indices, x.shape[-1])
 
 
 @validated
 def range_bearing(
     indices: Pair,
     *,
-    std: tuple[Deviation, Turn],
-    origin: Annotated[Array, "2"] | None = None,
+    std: tuple[Deviation, AngleDeviation],
+    origin: Point | None = None,
     heading: float = 0.0,
 ) -> Sensor:
-    """See the distance and the direction of two components, as a radar or a robot does.
+    """Measure the distance and the bearing of two components, as a radar or a robot does.
 
     Parameters
     ----------
     indices : sequence of two int
-        The components a and b that are seen.
+        The components a and b.
     std : (float, float)
         Standard deviations of the distance, in the components' unit, and of the angle, in rad.
     origin : array_like, (2,), optional
-        Where the sensor stands; zero by default.
+        The place of the sensor; zero by default.
     heading : float
-        Where it looks, in rad from the first axis to the second: the angle is measured from there,
-        and repeats after 2π.
+        The sensor's heading, in rad from the first axis to the second: the bearing is measured
+        from there, with period 2π.
 
     Notes
     -----
-    At the origin itself there is no angle: it and its derivative are NaN. A sensor
-    with another pose at each reading is best made without checks,
-    ``range_bearing(...)``: it takes some 10 µs.
+    At the origin itself there is no angle: it and its derivative are NaN. A robot that moves needs
+    a new sensor at each observation; within :func:`distfilt.validation.skip_validation` making one
+    takes about 10 µs.
 
     Examples
     --------
@@ -274,143 +296,211 @@ def range_bearing(
     >>> radar.predict([1.0, 2.0]).round(4)
     array([2.    , 1.5708])
     """
-    place = _place(indices, origin)
+    geometry = _geometry(indices, origin)
     return Sensor.construct(
         2,
-        partial(_sighting, heading=heading, **place),
-        diagonal(*std),
-        residual_function=partial(_turned_at, k=1),
-        kind="distance and angle",
-        derivative=partial(_sighting_slope, **place),
+        partial(_range_bearing, heading=heading, **geometry),
+        _diagonal_cov(std),
+        # Of (distance, bearing) only the second wraps.
+        residual_function=partial(_wrap_residual, k=1),
+        kind="range_bearing",
+        derivative=partial(_range_bearing_jacobian, **geometry),
     )
 
 
-def _sighting(x: Array, heading: float, **place: Any) -> Array:
-    gap = _gap(x, **place)
-    return np.concatenate([_length(gap), _direction(gap, 2 * np.pi, heading)], axis=-1)
+def _geometry(indices: Sequence[int], origin: Array | None) -> dict[str, Any]:
+    """Return the components that form a place, and the place of the sensor as an own copy."""
+    # A copy: the caller's array may be that of a robot that moves on.
+    place = np.array(0.0 if origin is None else origin)
+    return {"indices": indices, "origin": place}
 
 
-def _turned_at(
+def _offset(x: Array, indices: Sequence[int], origin: Array) -> Array:
+    """Return the vector from the sensor to the place that some components form."""
+    return _pick(x, indices) - origin
+
+
+def _norm(vectors: Array) -> Array:
+    """Return lengths with a last axis of one."""
+    return np.asarray(np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True)))
+
+
+def _scatter(slope: Array, indices: Sequence[int], dim: int) -> Array:
+    """Return derivatives (..., m, n) in picked components as those in all `dim` of them."""
+    # The other components do not enter.
+    jacobian = np.zeros((*slope.shape[:-1], dim))
+    jacobian[..., list(indices)] = slope
+    return jacobian
+
+
+def _distance(x: Array, indices: Sequence[int], origin: Array) -> Array:
+    return _norm(_offset(x, indices, origin))
+
+
+def _distance_jacobian(x: Array, indices: Sequence[int], origin: Array) -> Array:
+    # ∂|v|/∂v = vᵀ / |v|, and zero at v = 0.
+    offset = _offset(x, indices, origin)
+    length = _norm(offset)
+    slope = offset / np.where(length > 0, length, 1.0)
+    return _scatter(slope[..., None, :], indices, x.shape[-1])
+
+
+def _angle(x: Array, period: float, indices: Sequence[int], origin: Array) -> Array:
+    return _direction(_offset(x, indices, origin), period)
+
+
+def _direction(offset: Array, period: float, heading: float = 0.0) -> Array:
+    """Return the angles of vectors (..., 2) from a heading, NaN for the vector zero."""
+    angle = np.arctan2(offset[..., 1], offset[..., 0])
+    # arctan2(0, 0) is 0, but the sensor's own place has no direction.
+    angle = np.where(offset.any(axis=-1), angle, np.nan)
+    return wrap(angle - heading, period=period)[..., None]
+
+
+def _angle_jacobian(x: Array, indices: Sequence[int], origin: Array) -> Array:
+    # ∂ arctan2(b, a) / ∂(a, b) = (-b, a) / (a² + b²); by unit vectors, so that no square overflows.
+    offset = _offset(x, indices, origin)
+    length = _norm(offset)
+    length = np.where(length > 0, length, np.nan)
+    unit = offset / length
+    slope = np.stack([-unit[..., 1], unit[..., 0]], axis=-1) / length
+    return _scatter(slope[..., None, :], indices, x.shape[-1])
+
+
+def _range_bearing(
+    x: Array, heading: float, indices: Sequence[int], origin: Array
+) -> Array:
+    offset = _offset(x, indices, origin)
+    angle = _direction(offset, 2 * np.pi, heading)
+    return np.concatenate([_norm(offset), angle], axis=-1)
+
+
+def _range_bearing_jacobian(x: Array, indices: Sequence[int], origin: Array) -> Array:
+    # The heading only shifts the bearing, so that it does not enter.
+    rows = [
+        _distance_jacobian(x, indices, origin),
+        _angle_jacobian(x, indices, origin),
+    ]
+    return np.concatenate(rows, axis=-2)
+
+
+def _wrap_residual(
     observed: Array, predicted: Array, k: int = 0, period: float = 2 * np.pi
 ) -> Array:
-    """Differences, wrapped in one component."""
-    gap = np.asarray(observed - predicted)
-    gap[..., k] = wrap(gap[..., k], period=period)
-    return gap
+    """Return differences of which component k is wrapped."""
+    residual = np.asarray(observed - predicted)
+    residual[..., k] = wrap(residual[..., k], period=period)
+    return residual
 
 
-def _sighting_slope(x: Array, **place: Any) -> Array:
-    return np.concatenate(
-        [_distance_slope(x, **place), _angle_slope(x, **place)], axis=-2
-    )
+# The direction to a body in space.
 
 
 @validated
 def angles_only(
     *,
-    std: Turn,
+    std: AngleDeviation,
     form: Literal["arctan2", "printed"] = "arctan2",
     observer: NonNegativeInt = 6,
     hidden: Callable[[Array, Array], Array] | None = None,
 ) -> Sensor:
-    r"""The direction to a target, the state's first body, from another: two angles in rad.
+    r"""Measure the direction from an observer to a target, the state's first body: two angles.
 
     Parameters
     ----------
     std : float
         Standard deviation of each angle, in rad, at most π.
     form : {"arctan2", "printed"}
-        Right ascension and declination, or (49) of Semeraro et al., which has arcsin of the unit
-        vector's y component where the right ascension is meant.
+        Right ascension and declination, or (49) of Semeraro et al. as printed, which has the
+        arcsine of the unit vector's y component in place of the right ascension.
     observer : int
-        Where the other body's position begins in the state.
+        Index at which the observer's position begins in the state.
     hidden : callable, optional
         ``hidden(target, observer) -> bool (...)`` of positions (..., 3), such as
-        :func:`distfilt.models.occulted`; a direction that it hides is NaN.
+        :func:`distfilt.models.occulted`; a hidden direction is NaN.
 
     Examples
     --------
-    >>> eye = angles_only(std=1e-4)
+    >>> telescope = angles_only(std=1e-4)
     >>> x = np.zeros(12)
     >>> x[:3] = -1.0, -1.0, 0.0
-    >>> eye.predict(x).round(4) + 0.0
+    >>> telescope.predict(x).round(4) + 0.0
     array([-2.3562,  0.    ])
     """
     return Sensor.construct(
         2,
-        partial(_sight, form=form, observer=observer, hidden=hidden),
-        diagonal(std, std),
-        residual_function=_turned_at,
+        partial(_angles_only, form=form, observer=observer, hidden=hidden),
+        _diagonal_cov([std, std]),
+        residual_function=_wrap_residual,
+        kind="angles_only",
     )
 
 
-def _sight(
+def _angles_only(
     x: Array, form: str, observer: int, hidden: Callable[[Array, Array], Array] | None
 ) -> Array:
     target = x[..., :3]
-    own = x[..., observer : observer + 3]
-    way = target - own
-    unit = np.clip(way / np.linalg.norm(way, axis=-1, keepdims=True), -1, 1)
-    out: Array = np.arcsin(unit[..., 1:])
+    place = x[..., observer : observer + 3]
+    # The line of sight, observer to target.
+    sight = target - place
+    # Rounding can bring a component of the unit vector above one, where arcsin is NaN.
+    unit = np.clip(sight / np.linalg.norm(sight, axis=-1, keepdims=True), -1, 1)
+    # The declination is arcsin(z), the second angle of both forms; the printed first is arcsin(y).
+    angles: Array = np.arcsin(unit[..., 1:])
     if form == "arctan2":
-        out[..., 0] = np.arctan2(unit[..., 1], unit[..., 0])
+        angles[..., 0] = np.arctan2(unit[..., 1], unit[..., 0])
+    # A direction that is hidden, as by the Earth, is missing.
     if hidden is not None:
-        out[np.asarray(hidden(target, own))] = np.nan
-    return out
+        angles[np.asarray(call_user(hidden, target, place))] = np.nan
+    return angles
 
 
-@validated
-def ephemeris(*, position_std: Deviation, velocity_std: Deviation) -> Sensor:
-    """The first body's full state, read directly, in km and m/s.
-
-    Parameters
-    ----------
-    position_std, velocity_std : float
-        Above 0, in km and m/s.
-
-    Examples
-    --------
-    >>> ephemeris(position_std=1e-3, velocity_std=1e-5).dim
-    6
-    """
-    read = component(tuple(range(6)), std=1.0)
-    return read.replace(noise_cov=diagonal(*[position_std] * 3, *[velocity_std] * 3))
+# Sensors by name, and several as one.
 
 
 @validated
 def from_name(
-    kind: Literal["direct", "differential", "range", "angle"],
+    kind: Literal["component", "increment", "distance", "line_angle", "bearing"],
     indices: DistinctIndices,
     *,
     std: Deviation,
 ) -> Sensor:
-    """The sensor that a table names.
+    """Return the built-in sensor of a name, as a table of a scenario gives it.
 
     Parameters
     ----------
-    kind : {"direct", "differential", "range", "angle"}
-        The types of Grange et al., Table I: components as they are; their change since the previous
-        observation time; :func:`distance`; :func:`angle`, ``arctan(b/a)``.
+    kind : {"component", "increment", "distance", "line_angle", "bearing"}
+        The function of this module that makes the sensor. The first four are the types of Grange
+        et al., Table I, there called direct, differential, range and angle.
     indices, std
-        The components, counted from 0; the standard deviation of each reading, positive.
+        The components, counted from 0; the standard deviation of each, positive. Angles take two
+        components and at most π.
 
     Examples
     --------
-    >>> from_name("range", [0, 1], std=0.1).kind
+    >>> from_name("distance", [0, 1], std=0.1).kind
     'distance'
     """
     makers: dict[str, Callable[..., Sensor]] = {
-        "direct": component,
-        "differential": increment,
-        "range": distance,
-        "angle": line_angle,
+        "component": component,
+        "increment": increment,
+        "distance": distance,
+        "line_angle": line_angle,
+        "bearing": bearing,
     }
+    # The conditions of angles, which the annotations cannot state beside those of the others.
+    if kind in ("line_angle", "bearing"):
+        Bounds(at_most=np.pi)(std, "std")
+        if len(indices) != 2:
+            raise ValueError(
+                f"indices must have 2 entries for kind {kind!r}, got {len(indices)}"
+            )
     return makers[kind](indices, std=std)
 
 
 @validated
 def stack(sensors: Sequence[Sensor]) -> Sensor:
-    """One sensor whose observation is the observations of `sensors`, one after the other.
+    """Combine sensors into one, whose observation is theirs one after the other.
 
     It wraps the components that the given sensors wrap, is linear if all of them are, and needs
     the previous state if one of them does.
@@ -428,34 +518,48 @@ def stack(sensors: Sequence[Sensor]) -> Sensor:
     """
     if not sensors:
         raise ValueError("sensors must have at least one Sensor, got none")
-    cov = block_diag(*[s.noise_cov for s in sensors])
+    # Independent noise: R is block diagonal.
+    cov = block_diag(*[sensor.noise_cov for sensor in sensors])
     cov.setflags(write=False)
-    wraps = any(s.residual_function is not None for s in sensors)
-    linear = all(s.linear is not None for s in sensors)
+    # Residuals are split only if some part wraps; plain subtraction does for the others.
+    residual_function = None
+    if any(sensor.residual_function is not None for sensor in sensors):
+        residual_function = partial(_stack_residuals, sensors=sensors)
+    # A stack of matrices, if every part has one; otherwise Jacobians are stacked.
+    linear = None
+    if all(sensor.linear is not None for sensor in sensors):
+        linear = partial(_stack_matrices, sensors=sensors)
     return Sensor.construct(
         len(cov),
-        partial(_stacked, parts=sensors),
+        partial(_stack_predictions, sensors=sensors),
         cov,
-        kind="stacked",
-        residual_function=partial(_stacked_differences, parts=sensors)
-        if wraps
-        else None,
-        uses_previous=any(s.uses_previous for s in sensors),
-        linear=partial(_stacked, parts=sensors, what="H", axis=0) if linear else None,
-        derivative=partial(_stacked, parts=sensors, what="jacobian", axis=-2),
+        kind="stack",
+        residual_function=residual_function,
+        uses_previous=any(sensor.uses_previous for sensor in sensors),
+        linear=linear,
+        derivative=partial(_stack_jacobians, sensors=sensors),
     )
 
 
-def _stacked(
-    *states: Any, parts: Sequence[Sensor], what: str = "predict", axis: int = -1
-) -> Array:
-    return np.concatenate([getattr(s, what)(*states) for s in parts], axis=axis)
+def _stack_predictions(*states: Array, sensors: Sequence[Sensor]) -> Array:
+    return np.concatenate([s.predict(*states) for s in sensors], axis=-1)
 
 
-def _stacked_differences(
-    observed: Array, predicted: Array, parts: Sequence[Sensor]
+def _stack_jacobians(*states: Array, sensors: Sequence[Sensor]) -> Array:
+    return np.concatenate([s.jacobian(*states) for s in sensors], axis=-2)
+
+
+def _stack_matrices(dim: int, sensors: Sequence[Sensor]) -> Array:
+    return np.concatenate([s.H(dim) for s in sensors], axis=0)
+
+
+def _stack_residuals(
+    observed: Array, predicted: Array, sensors: Sequence[Sensor]
 ) -> Array:
-    ends = np.cumsum([s.dim for s in parts])[:-1]
-    pairs = [np.split(reading, ends, axis=-1) for reading in (observed, predicted)]
-    gaps = [s.residual(y, p) for s, y, p in zip(parts, *pairs, strict=True)]
-    return np.concatenate(gaps, axis=-1)
+    # Each sensor takes its own part of the components.
+    ends = np.cumsum([sensor.dim for sensor in sensors])[:-1]
+    observed_parts = np.split(observed, ends, axis=-1)
+    predicted_parts = np.split(predicted, ends, axis=-1)
+    parts = zip(sensors, observed_parts, predicted_parts, strict=True)
+    residuals = [sensor.residual(y, p) for sensor, y, p in parts]
+    return np.concatenate(residuals, axis=-1)

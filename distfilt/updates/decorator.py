@@ -1,9 +1,9 @@
-"""The door of an update, and readings that are missing.
+"""The decorator of updates, and observations with missing components.
 
-Every update has the signature ``(ensemble, predicted, observed, noise, *, rng, …) -> ensemble``
-and is told four things: the forecast members (..., N, d); what each of them would observe without
-noise (..., N, m), on the branch of the observation where a reading wraps; the observation (..., m);
-and the covariance of its noise, (m, m) or (..., m, m).
+Every update has the signature ``(ensemble, predicted, observed, noise, *, rng, …) -> ensemble``.
+Its arguments are the forecast members (..., N, d); each member's predicted observation without
+noise (..., N, m), unwrapped to the branch of the observation where a component is circular; the
+observation (..., m); and the covariance of its noise, (m, m) or (..., m, m).
 """
 
 from __future__ import annotations
@@ -19,21 +19,25 @@ import numpy as np
 from ..ensembles import Ensemble
 from ..linalg import cholesky, leading
 from ..validation import (
+    ALLOW_NAN,
     Array,
     Indices,
+    InvalidArgumentError,
+    Mask,
     PositiveDefinite,
     Rng,
     all_finite,
+    call_user,
     validated,
 )
 
 __all__ = [
     "Update",
-    "around",
-    "perturb_observations",
     "has_tag",
+    "perturb_observations",
     "update",
     "with_missing",
+    "wraps_update",
 ]
 
 F = TypeVar("F", bound=Callable[..., Array])
@@ -48,19 +52,20 @@ _KINDS = (
     Annotated[Array, "... m"],
     Annotated[PositiveDefinite, "... m m"],
 )
-"""Of an update's first four arguments, whatever their own annotations say."""
+"""Kinds of an update's first four arguments, whatever their own annotations are."""
 
 
 def update(function: F) -> F:
-    """Let a function that computes an update check what it is given.
+    """Add checks of the arguments to a function that computes an update.
 
     Parameters
     ----------
     function : callable
         ``function(ensemble, predicted, observed, noise, *, rng, …)`` for float64 arrays that fit,
-        with a noise covariance for each ensemble or one for all. The annotations of its options
-        are checked too, as :mod:`distfilt.validation` says. In a filter whose runs miss different
-        readings normal draws are each run's own where they are asked for all members at once.
+        with a noise covariance for each ensemble or one for all. Annotations of its options are
+        checked too, as :mod:`distfilt.validation` describes. In a filter whose runs miss different
+        components, every run has normal draws of its own if they are drawn for all members at
+        once.
 
     Returns
     -------
@@ -85,96 +90,113 @@ def update(function: F) -> F:
            [3.]])
     """
     if not hasattr(function, "__annotations__"):
-        raise ValueError(f"function must be a function, got {type(function).__name__}")
-    names = list(signature(function).parameters)[:4]
-    function.__annotations__ |= dict(zip(names, _KINDS, strict=True)) | {"rng": Rng}
+        raise InvalidArgumentError(
+            f"function must be a function, got {type(function).__name__}"
+        )
+    data = list(signature(function).parameters)[:4]
+    annotations = dict(function.__annotations__)
+    annotations.update(zip(data, _KINDS, strict=True))
+    annotations["rng"] = Rng
 
-    def with_leading_axes(**given: Any) -> Array:
-        four = {name: given[name] for name in names if name in given}
-        return function(**given | (_related(four) if len(four) == len(names) else {}))
+    def call_checked(**arguments: Any) -> Array:
+        arrays = {name: arguments[name] for name in data if name in arguments}
+        # An argument that is left out is the function's own error.
+        if len(arrays) == len(data):
+            arguments.update(_share_leading_axes(arrays))
+        return cast(Array, call_user(function, **arguments))
 
-    made: Any = validated(function, call=with_leading_axes)
-    made.stacks = True
-    return cast(F, made)
+    checked: Any = validated(function, call=call_checked, annotations=annotations)
+    checked.stacks = True
+    return cast(F, checked)
 
 
-def _related(four: dict[str, Array]) -> dict[str, Array]:
-    """What the arguments become whose leading axes have to fit the ensemble's."""
-    x, h, y, r = four.values()
-    lead = x.shape[:-2]
-    own = (h.shape[:-2], y.shape[:-1], r.shape[:-2])
-    if own[0] == own[1] == lead and own[2] in ((), lead):
+def _share_leading_axes(arrays: dict[str, Array]) -> dict[str, Array]:
+    """Return predictions and observation with the ensemble's leading axes, where they differ."""
+    ensemble, predicted, observed, noise = arrays.values()
+    lead = ensemble.shape[:-2]
+    leads = (predicted.shape[:-2], observed.shape[:-1], noise.shape[:-2])
+    if leads[0] == leads[1] == lead and leads[2] in ((), lead):
         return {}
-    for name, given in zip(list(four)[1:], own, strict=True):
-        if leading(lead, given, name) != lead:
-            raise ValueError(f"{name} must have leading axes {lead}, got {given}")
-    tails = zip(list(four)[1:3], (2, 1), strict=True)
-    return {n: np.broadcast_to(four[n], (*lead, *four[n].shape[-k:])) for n, k in tails}
+    _, name_predicted, name_observed, name_noise = arrays
+    names = (name_predicted, name_observed, name_noise)
+    for name, axes in zip(names, leads, strict=True):
+        # The ensemble's axes are the result's: no other argument may add to them.
+        if leading(lead, axes, name) != lead:
+            raise ValueError(f"{name} must have leading axes {lead}, got {axes}")
+    return {
+        name_predicted: np.broadcast_to(predicted, (*lead, *predicted.shape[-2:])),
+        name_observed: np.broadcast_to(observed, (*lead, observed.shape[-1])),
+    }
 
 
-def has_tag(update: Update, what: str) -> bool:
-    """What an update says of itself: that it ``stacks``, ``repredicts``, takes gaps ``whole``.
+def has_tag(update: Update, tag: str) -> bool:
+    """Return whether an update has a tag: ``stacks``, ``repredicts`` or ``accepts_missing``.
 
-    One that stacks can update ensembles with a noise covariance of their own each in one call, as
-    every update of this package does; a plain function gets one agent's at a time.
+    One that stacks updates ensembles with a noise covariance each in one call, as every update of
+    this package does; a plain function gets one agent's ensemble at a time. One that repredicts
+    takes a function ``predict``. One that accepts missing components gets them as NaN.
 
     >>> has_tag(print, "stacks")
     False
     """
-    return bool(
-        getattr(update.func if isinstance(update, partial) else update, what, False)
-    )
+    function = update.func if isinstance(update, partial) else update
+    return bool(getattr(function, tag, False))
 
 
-def around(inner: Update) -> Callable[[F], F]:
-    """The door of a wrapper, which says of itself what the update says that it wraps.
+def wraps_update(wrapped: Update) -> Callable[[F], F]:
+    """Decorate a wrapper of an update: it gets the checks of an update and the wrapped one's tags.
 
-    >>> has_tag(around(print)(lambda x, h, y, r, *, rng: x), "stacks")
+    >>> has_tag(wraps_update(print)(lambda x, h, y, r, *, rng: x), "stacks")
     False
     """
 
-    def made(wrapper: F) -> F:
-        out: Any = update(wrapper)
-        out.stacks = has_tag(inner, "stacks")
-        out.whole = has_tag(inner, "whole")
-        return cast(F, out)
+    def decorate(wrapper: F) -> F:
+        checked: Any = update(wrapper)
+        checked.stacks = has_tag(wrapped, "stacks")
+        checked.accepts_missing = has_tag(wrapped, "accepts_missing")
+        return cast(F, checked)
 
-    return made
+    return decorate
 
 
 def perturb_observations(
     predicted: Array, noise: Array, rng: Rng, *, centred: bool = False
 ) -> Array:
-    """Predictions with a draw of the noise each, (..., N, m); with N - 1 in the denominator its
-    sample covariance is the noise's on average, centred or not."""
-    drawn = rng.standard_normal(predicted.shape)
+    """Add a draw of the noise to each prediction, (..., N, m).
+
+    The draws' sample covariance, with N - 1 in the denominator, is the noise's on average,
+    centred or not.
+    """
+    normal = rng.standard_normal(predicted.shape)
     if centred:
-        drawn -= drawn.mean(axis=-2, keepdims=True)
-    out = drawn @ np.ascontiguousarray(cholesky(noise).mT)
-    return np.asarray(np.add(out, predicted, out=out))
+        normal -= normal.mean(axis=-2, keepdims=True)
+    # zeta_i = L xi_i with R = L L'.
+    perturbed = normal @ np.ascontiguousarray(cholesky(noise).mT)
+    return np.asarray(np.add(perturbed, predicted, out=perturbed))
 
 
+@validated
 def with_missing(
     update: Update,
-    ensemble: Array,
-    predicted: Array,
-    observed: Array,
-    noise: Array,
+    ensemble: Ensemble,
+    predicted: Annotated[Array, "... N m", ALLOW_NAN],
+    observed: Annotated[Array, "... m", ALLOW_NAN],
+    noise: Annotated[PositiveDefinite, "... m m"],
     *,
     rng: Rng,
 ) -> Array:
-    """Apply an update where NaN marks a missing component; without any reading nothing moves.
+    """Apply an update where NaN marks a missing component.
 
-    Ensembles that miss the same components are updated together, so a batch costs one call for
-    each pattern.
+    An ensemble without any observation stays as it is. Ensembles that miss the same components
+    are updated together, so a batch costs one call for each pattern.
 
     Parameters
     ----------
     update : callable
-        ``update(ensemble, predicted, observed, noise, *, rng)``; its checks are left out.
+        ``update(ensemble, predicted, observed, noise, *, rng)``.
     ensemble : ndarray, (..., N, d)
     predicted : ndarray, (..., N, m)
-        NaN for every member where a prediction does not exist; it is a missing reading too.
+        NaN for every member where a prediction does not exist; that component is missing too.
     observed : ndarray, (..., m)
         NaN where a component is missing.
     noise : ndarray, (m, m) or (..., m, m)
@@ -184,11 +206,11 @@ def with_missing(
     --------
     >>> from distfilt.updates import enkf_exact
     >>> x = np.array([[-1.0], [0.0], [0.5], [0.5]])
-    >>> seen = np.concatenate([x, x], axis=1)
+    >>> predicted = np.concatenate([x, x], axis=1)
     >>> after = with_missing(
     ...     enkf_exact,
     ...     x,
-    ...     seen,
+    ...     predicted,
     ...     np.array([1.0, np.nan]),
     ...     0.5 * np.eye(2),
     ...     rng=np.random.default_rng(0),
@@ -196,71 +218,104 @@ def with_missing(
     >>> float(after.mean().round(12))
     0.5
     """
-    inner = update
     lead = observed.shape[:-1]
     m = observed.shape[-1]
-    # What is drawn for an ensemble depends on its place and on how many readings it has, not on
-    # what others miss: each number of readings has a stream, which is drawn from for all places.
-    # As words of 32 bits, which seeds are made of: 63 bits each, as `integers` would draw them.
-    a, b = rng.bit_generator.random_raw(2).tolist()
-    base = [a // 2 % 2**32, a >> 33, b // 2 % 2**32, b >> 33]
+    seed = _draw_seed(rng)
     if all_finite(observed) and all_finite(predicted):
-        return inner(
-            ensemble, predicted, observed, noise, rng=_stream(rng, base, m, lead)
-        )
+        stream = _stream(rng, seed, m, lead)
+        result = call_user(update, ensemble, predicted, observed, noise, rng=stream)
+        return cast(Array, result)
     present = ~np.isnan(observed) & ~np.isnan(predicted).any(axis=-2)
-    if has_tag(update, "whole"):
-        known = np.where(present, observed, np.nan)
-        stream = _stream(rng, base, m, lead)
-        return inner(ensemble, predicted, known, noise, rng=stream)
-    flat = present.reshape(-1, m)
-    aim = observed.reshape(-1, m)
-    rows, seen = (a.reshape(-1, *a.shape[-2:]) for a in (ensemble, predicted))
-    cov = (
-        np.broadcast_to(noise, (*lead, m, m)).reshape(-1, m, m)
-        if noise.ndim > 2
-        else noise
+    if has_tag(update, "accepts_missing"):
+        marked = np.where(present, observed, np.nan)
+        stream = _stream(rng, seed, m, lead)
+        result = call_user(update, ensemble, predicted, marked, noise, rng=stream)
+        return cast(Array, result)
+    return _update_by_pattern(
+        update, (ensemble, predicted, observed, noise), present, rng, seed
     )
-    out = rows.copy()
-    for pattern in np.unique(flat, axis=0):
-        keep = np.flatnonzero(pattern)
-        if not keep.size:
+
+
+def _update_by_pattern(
+    update: Update,
+    data: tuple[Array, Array, Array, Array],
+    present: Mask,
+    rng: Rng,
+    seed: list[int],
+) -> Array:
+    """Update the ensembles of a batch, those with the same components `present` together."""
+    ensemble, predicted, observed, noise = data
+    lead = observed.shape[:-1]
+    m = observed.shape[-1]
+    # One leading axis from here on.
+    flat_present = present.reshape(-1, m)
+    flat_observed = observed.reshape(-1, m)
+    flat_ensemble = ensemble.reshape(-1, *ensemble.shape[-2:])
+    flat_predicted = predicted.reshape(-1, *predicted.shape[-2:])
+    one_noise = noise.ndim == 2
+    if not one_noise:
+        noise = np.broadcast_to(noise, (*lead, m, m)).reshape(-1, m, m)
+    result = flat_ensemble.copy()
+    for pattern in np.unique(flat_present, axis=0):
+        columns = np.flatnonzero(pattern)
+        # Without any observation the forecast is the analysis.
+        if not columns.size:
             continue
-        where = np.flatnonzero((flat == pattern).all(axis=1))
-        part = (
-            cov[np.ix_(where, keep, keep)] if cov.ndim > 2 else cov[np.ix_(keep, keep)]
+        rows = np.flatnonzero((flat_present == pattern).all(axis=1))
+        if one_noise:
+            part = noise[np.ix_(columns, columns)]
+        else:
+            part = noise[np.ix_(rows, columns, columns)]
+        result[rows] = call_user(
+            update,
+            flat_ensemble[rows],
+            flat_predicted[rows][..., columns],
+            flat_observed[rows][:, columns],
+            part,
+            rng=_stream(rng, seed, columns.size, lead, rows),
         )
-        stream = _stream(rng, base, keep.size, lead, where)
-        given = rows[where], seen[where][..., keep], aim[where][:, keep]
-        out[where] = inner(*given, part, rng=stream)
-    return np.asarray(out.reshape(ensemble.shape))
+    return np.asarray(result.reshape(ensemble.shape))
+
+
+def _draw_seed(rng: Rng) -> list[int]:
+    """Draw four words of 32 bits, of which seeds are made, in two raw draws of 64."""
+    a, b = rng.bit_generator.random_raw(2).tolist()
+    # The lowest bit is dropped: `integers` would use 63 bits of each draw.
+    return [a // 2 % 2**32, a >> 33, b // 2 % 2**32, b >> 33]
 
 
 def _stream(
-    rng: Rng, base: list[int], m: int, lead: tuple[int, ...], where: Any = ...
+    rng: Rng, seed: list[int], m: int, lead: tuple[int, ...], rows: Any = ...
 ) -> Rng:
-    """A stream of draws for a batch, or its rows `where`; of rows of rows their places stay."""
-    bits = np.random.PCG64(
-        np.random.SeedSequence(np.array([*base, m], dtype=np.uint32))
-    )
-    if isinstance(rng, Rows):
-        return Rows(bits, rng.lead, rng.where[where])
-    return Rng(bits) if where is ... else Rows(bits, lead, where)
+    """Return the random stream of updates with m components, for a batch or some of its rows.
+
+    An ensemble's draws depend on its row and on its number of components, not on the components
+    that others miss: each number has a stream of its own, drawn for all rows.
+    """
+    words = np.array([*seed, m], dtype=np.uint32)
+    bits = np.random.PCG64(np.random.SeedSequence(words))
+    if isinstance(rng, RowGenerator):
+        # Rows of rows keep their places in the whole batch.
+        return RowGenerator(bits, rng.lead, rng.rows[rows])
+    if rows is ...:
+        return Rng(bits)
+    return RowGenerator(bits, lead, rows)
 
 
-class Rows(Rng):
-    """Normal draws for all ensembles of a batch (*lead), of which those in `where` are asked for.
+class RowGenerator(Rng):
+    """A generator of normal draws for a batch (*lead) that returns those of some rows.
 
-    `where` counts them flat. So two ensembles that miss different readings draw apart:
+    `rows` are flat indices into the batch. So two ensembles that miss different components have
+    different draws:
 
-    >>> def own(x, h, y, r, *, rng):
+    >>> def add_noise(x, h, y, r, *, rng):
     ...     return x + rng.normal(size=x.shape)
-    >>> gaps = np.array([[1.0, np.nan], [np.nan, 1.0]])
+    >>> observed = np.array([[1.0, np.nan], [np.nan, 1.0]])
     >>> a, b = with_missing(
-    ...     own,
+    ...     add_noise,
     ...     np.zeros((2, 3, 1)),
     ...     np.zeros((2, 3, 2)),
-    ...     gaps,
+    ...     observed,
     ...     np.eye(2),
     ...     rng=np.random.default_rng(0),
     ... )
@@ -268,22 +323,22 @@ class Rows(Rng):
     True
     """
 
-    def __init__(self, bits: Any, lead: tuple[int, ...], where: Indices) -> None:
+    def __init__(self, bits: Any, lead: tuple[int, ...], rows: Indices) -> None:
         super().__init__(bits)
         self.lead = lead
-        self.where = where
-        self.some = where.size != math.prod(lead)
+        self.rows = rows
+        self.is_partial = rows.size != math.prod(lead)
 
     def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
-        """As numpy's, by standard normal draws."""
+        """Draw as numpy does, by standard normal draws."""
         return loc + scale * self.standard_normal(size)
 
     def standard_normal(self, size: Any = None, *args: Any, **options: Any) -> Any:
-        """As numpy's, but of a batch's rows those that are asked for."""
-        if not (
-            self.some and np.iterable(size) and tuple(size)[:1] == self.where.shape
-        ):
+        """Draw as numpy does, for the whole batch, and return the draws of the rows."""
+        shape = tuple(size) if np.iterable(size) else ()
+        # Only draws with one entry a row can be told apart by row.
+        if not self.is_partial or shape[:1] != self.rows.shape:
             return super().standard_normal(size, *args, **options)
-        rest = tuple(size)[1:]
-        drawn = super().standard_normal((*self.lead, *rest), *args, **options)
-        return drawn.reshape(-1, *rest)[self.where]
+        row_shape = shape[1:]
+        draws = super().standard_normal((*self.lead, *row_shape), *args, **options)
+        return draws.reshape(-1, *row_shape)[self.rows]

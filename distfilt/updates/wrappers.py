@@ -1,7 +1,7 @@
-"""Wrappers: what can be put around any update, one round another.
+"""Wrappers: functions that turn an update into another, and can be nested.
 
-``inflated(serial(enkf), factor=1.02)`` is an update like any other, and so is
-``projected(augmented(ensemble_transform, g, std=0.1), g)``, Das and Bhattacharya's OTNLeqMA.
+``with_inflation(serially(enkf), factor=1.02)`` is an update like any other, and so is
+``with_projection(with_augmentation(etpf, g, std=0.1), g)``, Das and Bhattacharya's OTNLeqMA.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from ..validation import (
     NonNegativeFloat,
     PositiveFloat,
     Rng,
+    call_user,
     validated,
 )
-from .decorator import Update, around, has_tag, with_missing
+from .decorator import Update, has_tag, with_missing, wraps_update
 
 __all__ = [
     "with_augmentation",
@@ -34,12 +35,11 @@ __all__ = [
 ]
 
 
-def _followed(update: Update, change: Callable[[Array], Array]) -> Update:
-    """An update, and then what `change` makes of its members."""
-    inner = update
+def _apply_after(update: Update, change: Callable[[Array], Array]) -> Update:
+    """Return an update followed by a change of the analysis members."""
 
-    @around(update)
-    def both(
+    @wraps_update(update)
+    def update_and_change(
         ensemble: Array,
         predicted: Array,
         observed: Array,
@@ -48,23 +48,28 @@ def _followed(update: Update, change: Callable[[Array], Array]) -> Update:
         rng: Rng,
         predict: Callable[[Array], Array] | None = None,
     ) -> Array:
-        more = {} if predict is None else {"predict": predict}
-        return change(inner(ensemble, predicted, observed, noise, rng=rng, **more))
+        options: dict[str, Any] = {"rng": rng}
+        if predict is not None:
+            options["predict"] = predict
+        analysis = call_user(update, ensemble, predicted, observed, noise, **options)
+        return change(analysis)
 
-    vars(both)["repredicts"] = has_tag(update, "repredicts")
-    return both
+    vars(update_and_change)["repredicts"] = has_tag(update, "repredicts")
+    return update_and_change
 
 
 @validated
 def with_inflation(
     update: Update, *, factor: Annotated[float, Bounds(at_least=0.5)]
 ) -> Update:
-    """Multiply the analysis anomalies by a factor: the remedy for a spread that is too small.
+    """Multiply the analysis anomalies by a factor, the remedy for a spread that is too small.
 
     Parameters
     ----------
-    update, factor
-        Any update; by what its standard deviations are multiplied each time, at least 0.5.
+    update : callable
+        Any update.
+    factor : float
+        Factor of the analysis standard deviations in each update, at least 0.5.
 
     Notes
     -----
@@ -83,11 +88,11 @@ def with_inflation(
     1.0
     """
 
-    def inflate(after: Array) -> Array:
-        centre = after.mean(axis=-2, keepdims=True)
-        return np.asarray(centre + factor * (after - centre))
+    def inflate(analysis: Array) -> Array:
+        mean = analysis.mean(axis=-2, keepdims=True)
+        return np.asarray(mean + factor * (analysis - mean))
 
-    return _followed(update, inflate)
+    return _apply_after(update, inflate)
 
 
 @validated
@@ -95,23 +100,23 @@ def with_projection(
     update: Update,
     constraint: Constraint,
     *,
-    reading: Literal["printed", "reversed", "particle", "shift"] = "shift",
+    variant: Literal["printed", "reversed", "particle", "shift"] = "shift",
     regularisation: NonNegativeFloat = 1e-6,
 ) -> Update:
-    """Project the analysis members by regression, equations (6)-(12), and go on from them.
+    """Project the analysis members by regression, equations (6)-(12), in every update.
 
     Parameters
     ----------
     update : callable
         Any update.
-    constraint, reading, regularisation
+    constraint, variant, regularisation
         As for :func:`distfilt.coupling.project`.
 
     Returns
     -------
     callable
-        An update; round :func:`ensemble_transform` it is OTNLeq. OTProj projects what is reported
-        only: call :func:`distfilt.coupling.project` on recorded members.
+        An update; with :func:`etpf` it is OTNLeq. OTProj projects the reported members only and
+        continues from the others: call :func:`distfilt.coupling.project` on recorded members.
 
     Examples
     --------
@@ -128,20 +133,20 @@ def with_projection(
     ... )
     True
     """
-    project = coupling.project
-    return _followed(
-        update,
-        lambda x: project(
-            x, constraint, reading=reading, regularisation=regularisation
-        ),
-    )
+
+    def project(analysis: Array) -> Array:
+        return coupling.project(
+            analysis, constraint, variant=variant, regularisation=regularisation
+        )
+
+    return _apply_after(update, project)
 
 
 @validated
 def with_retraction(
     update: Update, constraint: Constraint, *, motion: Motion | None = None
 ) -> Update:
-    """Put every analysis member on the constraint by itself.
+    """Retract every analysis member to the constraint, each by itself.
 
     Parameters
     ----------
@@ -153,7 +158,7 @@ def with_retraction(
     Returns
     -------
     callable
-        An update whose members obey the constraint to rounding. Their mean does not: a point
+        An update whose members satisfy the constraint to rounding. Their mean does not: a point
         estimate has to be retracted too.
 
     Examples
@@ -168,15 +173,18 @@ def with_retraction(
     >>> bool(abs((after**2).sum(axis=1) - 1).max() < 1e-14)
     True
     """
-    retract = coupling.retract
-    return _followed(update, lambda x: retract(x, constraint, motion=motion))
+
+    def retract(analysis: Array) -> Array:
+        return coupling.retract(analysis, constraint, motion=motion)
+
+    return _apply_after(update, retract)
 
 
 @validated
 def with_augmentation(
     update: Update, constraint: Constraint, *, std: PositiveFloat
 ) -> Update:
-    r"""Observe the constraint too, as a reading that is nearly perfect, equation (13).
+    r"""Observe the constraint too, as a nearly perfect measurement, equation (13).
 
     Parameters
     ----------
@@ -190,7 +198,7 @@ def with_augmentation(
     Returns
     -------
     callable
-        An update; round :func:`ensemble_transform` it is OTMA.
+        An update; with :func:`etpf` it is OTMA.
 
     Examples
     --------
@@ -207,55 +215,63 @@ def with_augmentation(
     ... )
     True
     """
-    inner = update
-    g = constraint.residual
+    value = constraint.value
 
-    @around(update)
+    @wraps_update(update)
     def augment(
         ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
     ) -> Array:
         m = predicted.shape[-1]
-        s = constraint.value.size
-        seen = np.concatenate([predicted, g(ensemble) + constraint.value], axis=-1)
-        target = np.broadcast_to(constraint.value, (*observed.shape[:-1], s))
-        both = np.zeros((*noise.shape[:-2], m + s, m + s))
-        both[..., :m, :m] = noise
-        both[..., m:, m:] = std**2 * np.eye(s)
-        return inner(
-            ensemble, seen, np.concatenate([observed, target], axis=-1), both, rng=rng
+        s = value.size
+        # (h, g) is observed as (y*, d) with the covariance diag(R, std² I).
+        g = constraint.residual(ensemble) + value
+        target = np.broadcast_to(value, (*observed.shape[:-1], s))
+        joint_noise = np.zeros((*noise.shape[:-2], m + s, m + s))
+        joint_noise[..., :m, :m] = noise
+        joint_noise[..., m:, m:] = std**2 * np.eye(s)
+        analysis = call_user(
+            update,
+            ensemble,
+            np.concatenate([predicted, g], axis=-1),
+            np.concatenate([observed, target], axis=-1),
+            joint_noise,
+            rng=rng,
         )
+        return np.asarray(analysis)
 
     return augment
 
 
 @validated
 def serially(update: Update) -> Update:
-    """Take independent readings in one after the other.
+    """Assimilate independent observations one after the other.
 
-    Readings are independent where the noise covariance has a zero between them; correlated ones
-    stay together. Inside a filter each group meets predictions that are made again from the members
-    as they are by then, also where the members are changed once more (:func:`inflated`,
-    :func:`projected`, :func:`retracted`); called alone, the update moves the later predictions
-    along with the members, as further components of the state.
+    Observations are independent where the noise covariance has a zero between them; correlated
+    ones stay together. In a filter each group meets predictions that are made again from the
+    members as they are by then, also if the update is wrapped once more by
+    :func:`with_inflation`, :func:`with_projection` or :func:`with_retraction`. Called without
+    `predict`, the update moves the later predictions along with the members, as further
+    components of the state.
 
     Parameters
     ----------
     update : callable
-        Any update; it never sees more readings at once than the largest group, so an agent that
-        hears more than it has members can still use :func:`~distfilt.updates.enkf_sampled_covariance`.
+        Any update. It never gets more observations at once than the largest group has, so an
+        agent that receives more observations than it has members can still use
+        :func:`~distfilt.updates.enkf_sampled_covariance`.
 
     Returns
     -------
     callable
-        An update with one more option, ``predict(members) -> predicted``, which a filter gives.
+        An update with one more option, ``predict(members) -> predicted``, which a filter passes.
 
     Examples
     --------
     >>> from distfilt.updates import enkf_exact
     >>> x = np.array([[-1.0], [0.0], [0.5], [0.5]])
     >>> twice = serially(enkf_exact)
-    >>> seen = np.concatenate([x, x], axis=1)
-    >>> after = twice(x, seen, [1.0, 1.0], np.eye(2), rng=np.random.default_rng(0))
+    >>> predicted = np.concatenate([x, x], axis=1)
+    >>> after = twice(x, predicted, [1.0, 1.0], np.eye(2), rng=np.random.default_rng(0))
     >>> float(after.mean().round(12)), float(after.var(ddof=1).round(12))
     (0.5, 0.25)
     """
@@ -271,26 +287,26 @@ def with_localization(
     radius: PositiveFloat,
     period: PositiveFloat | None = None,
 ) -> Update:
-    r"""Let each reading move only components near it: the remedy for few members in a large space.
+    r"""Let each observation change near components only, the remedy for few members in high dimension.
 
-    Readings are taken in one after the other, as by :func:`serial`, and what one changes in a
-    component at distance r is multiplied by Gaspari and Cohn's function of r over `radius`, which
-    falls from 1 to 0.21 at one radius and to 0 at two. For updates by a gain with independent
-    noise that multiplies the sample covariances by the same numbers: chance correlations of far
-    components are left out.
+    Observations are assimilated one after the other, as by :func:`serially`. The change that one
+    makes in a component at distance r is multiplied by Gaspari and Cohn's function of r over
+    `radius`, which falls from 1 to 0.21 at one radius and to 0 at two. For updates by a gain with
+    independent noise that multiplies the sample covariances by the same numbers: chance
+    correlations of far components are left out.
 
     Parameters
     ----------
     update : callable
-        An update whose draws stay with the readings: :func:`~distfilt.updates.enkf`, or
-        ``partial(square_root, rotation="none")``; not a random rotation, which mixes the members of
+        An update whose draws belong to the observations: :func:`~distfilt.updates.enkf`, or
+        ``partial(etkf, rotation="none")``; not a random rotation, which would mix the members of
         near components and not of far ones.
     places : array_like, (d, k)
-        Where each component of the state is.
-    readings : array_like, (m, k)
-        Where each reading is, in the same coordinates: of all that an agent hears in a step, by
-        agent. So it is for an agent alone, or for agents who all hear each other; some numbers may
-        be NaN, but no reading may fail to come.
+        Coordinates of each component of the state.
+    observation_places : array_like, (m, k)
+        Coordinates of each component of all observations that an agent receives in a step, in the
+        order of the sending agents. So they fit a single agent, or agents that all receive the
+        same observations. Components may be NaN, but no observation may be absent.
     radius : float
         In the units of the coordinates.
     period : float, optional
@@ -304,7 +320,7 @@ def with_localization(
 
     Examples
     --------
-    Two components, of which the first is seen; the second is too far to be moved.
+    Two components, of which the first is observed; the second is too far away to change.
 
     >>> from distfilt.updates import enkf
     >>> near = with_localization(
@@ -334,16 +350,19 @@ def with_localization(
     [-0.049 -0.902]
     [-0.049 -0.902]
     """
-    both = np.concatenate([places, observation_places])
-    gap = np.abs(both[:, None] - observation_places)
+    # Distances of all components (and of predictions, see `serially`) from each observation.
+    points = np.concatenate([places, observation_places])
+    distance = np.abs(points[:, None] - observation_places)
     if period is not None:
-        gap = np.minimum(gap % period, -gap % period)
-    return _one_by_one(update, gaspari_cohn(np.linalg.norm(gap, axis=-1) / radius))
+        distance = np.minimum(distance % period, -distance % period)
+    ratio = np.linalg.norm(distance, axis=-1) / radius
+    return _one_by_one(update, gaspari_cohn(ratio))
 
 
 def gaspari_cohn(ratio: Array) -> Array:
-    """The taper of covariances, by distances over the radius: a polynomial that ends at two."""
+    """Return the taper of covariances at ratios of distance to radius, zero from two on."""
     r = np.asarray(ratio)
+    # (4.10): two polynomials of degree five, in Horner's form, that join smoothly at one.
     near = 1 + r**2 * (-5 / 3 + r * (5 / 8 + r * (1 / 2 - r / 4)))
     far = 4 + r * (-5 + r * (5 / 3 + r * (5 / 8 + r * (-1 / 2 + r / 12))))
     with np.errstate(divide="ignore"):
@@ -352,10 +371,13 @@ def gaspari_cohn(ratio: Array) -> Array:
 
 
 def _one_by_one(update: Update, taper: Array | None) -> Update:
-    """Groups of correlated readings in turn; what each changes is tapered, (d + m, m)."""
+    """Return an update by groups of correlated observations in turn.
 
-    @around(update)
-    def one_by_one(
+    The changes by each observation are multiplied by its column of `taper`, (d + m, m).
+    """
+
+    @wraps_update(update)
+    def update_in_turn(
         ensemble: Array,
         predicted: Array,
         observed: Array,
@@ -364,41 +386,58 @@ def _one_by_one(update: Update, taper: Array | None) -> Update:
         rng: Rng,
         predict: Callable[[Array], Array] | None = None,
     ) -> Array:
-        x = ensemble
-        h = predicted
         d = ensemble.shape[-1]
-        if taper is not None and taper.shape != (d + h.shape[-1], h.shape[-1]):
-            m = taper.shape[1]
-            raise ValueError(
-                f"readings must be {m}, of {len(taper) - m} components, for each of "
-                f"which there is a place; got {h.shape[-1]} of {d}"
-            )
-        for k, rows in enumerate(_groups(noise)):
-            if predict is not None and k:
-                h = predict(x)
-            both = np.concatenate([x, h], axis=-1) if predict is None else x
-            block = noise[..., rows[:, None], rows]
-            moved = with_missing(
-                update, both, h[..., rows], observed[..., rows], block, rng=rng
+        if taper is not None:
+            _check_taper(taper, d, predicted.shape[-1])
+        # Predictions that are not made again move along, as components d to d + m of the state.
+        carries_predictions = predict is None
+        for turn, group in enumerate(_correlated_groups(noise)):
+            if predict is not None and turn:
+                predicted = call_user(predict, ensemble)
+            state = ensemble
+            if carries_predictions:
+                state = np.concatenate([ensemble, predicted], axis=-1)
+            analysis = with_missing(
+                update,
+                state,
+                predicted[..., group],
+                observed[..., group],
+                noise[..., group[:, None], group],
+                rng=rng,
             )
             if taper is not None:
-                moved = both + taper[: both.shape[-1], rows].max(axis=-1) * (
-                    moved - both
-                )
-            x = moved[..., :d]
-            h = moved[..., d:] if predict is None else h
-        return x
+                # x <- x + rho (x' - x); a group's component has its nearest observation's rho.
+                rho = taper[: state.shape[-1], group].max(axis=-1)
+                analysis = state + rho * (analysis - state)
+            ensemble = analysis[..., :d]
+            if carries_predictions:
+                predicted = analysis[..., d:]
+        return ensemble
 
-    made: Any = one_by_one
-    made.repredicts = True
-    made.whole = taper is not None
-    return one_by_one
+    tagged: Any = update_in_turn
+    tagged.repredicts = True
+    # Every observation keeps its column of the taper, also where others are missing.
+    tagged.accepts_missing = taper is not None
+    return update_in_turn
 
 
-def _groups(noise: Array) -> list[Indices]:
-    """Indices of readings that are correlated with each other, in the order of their first."""
+def _check_taper(taper: Array, d: int, m: int) -> None:
+    """Raise an error unless there are coordinates for d components and m observations."""
+    n_observed = taper.shape[1]
+    n_state = len(taper) - n_observed
+    if (n_state, n_observed) != (d, m):
+        raise ValueError(
+            f"places must have {d} rows and observation_places {m}, one for each "
+            f"component and observation, got {n_state} and {n_observed}"
+        )
+
+
+def _correlated_groups(noise: Array) -> list[Indices]:
+    """Return the indices of observations with correlated noise, in the order of their first."""
     from scipy.sparse import csgraph, csr_array
 
-    linked = (noise != 0).reshape(-1, *noise.shape[-2:]).any(axis=0)
-    labels = csgraph.connected_components(csr_array(linked), directed=False)[1]
-    return [np.flatnonzero(labels == k) for k in dict.fromkeys(labels.tolist())]
+    # Over a batch: observations that are correlated in any of its covariances stay together.
+    correlated = (noise != 0).reshape(-1, *noise.shape[-2:]).any(axis=0)
+    graph = csr_array(correlated)
+    labels = csgraph.connected_components(graph, directed=False)[1]
+    return [np.flatnonzero(labels == label) for label in dict.fromkeys(labels.tolist())]

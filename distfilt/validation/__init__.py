@@ -1,41 +1,47 @@
-r"""Doors: what a function's arguments must be, declared once, by its annotations.
+r"""Validation: an argument's type, shape and bounds are declared by its annotation.
 
-A public function stands behind :func:`validated`. Each argument whose annotation is a kind of this
-module, or a plain type, is checked and converted before the function runs; what does not fit is
-refused by an error that names the argument, what it needs and what it got. Nothing is repaired.
-Nested calls are not checked again; :func:`skip_validation` does the same for a loop of one's own.
+A public function is decorated by :func:`validated`. Each argument whose annotation is in the table
+below is checked and converted before the function runs. A wrong argument raises an error that names
+it, the values that are allowed, and the value that came. Nothing is repaired. Nested calls are not
+checked again; :func:`skip_validation` does the same for a loop of your own.
 
 ======================================  ==========================================================
-Annotation                              What may come, and what the function gets
+Annotation                              Allowed values, and what the function gets
 ======================================  ==========================================================
-``Annotated[Array, "... N d"]``         finite real numbers of this shape, as float64
-``Annotated[Array, "m", ALLOW_NAN]``      the same, where NaN stands for what is missing
-``Annotated[Array, "d d", definite]``   the same, if ``definite(value, name)`` lets it pass
-``Annotated[Mask, "A"]``                booleans; ``Indices`` for integers
-``float``, ``int``, ``bool``, ``str``   one finite number, one integer, one flag, a text not blank
-``Positive``, ``Count``, ``Share``      numbers in bounds; others by ``Annotated[float, Bounds(…)]``
+``Annotated[ArrayInput, "... N d"]``    finite real numbers of this shape, as a float64 array
+``Annotated[ArrayInput, …, ALLOW_NAN]``  the same, where NaN stands for a missing number
+``Annotated[ArrayInput, "d d", rule]``  the same, if ``rule(value, name)`` raises no error
+``Annotated[MaskInput, "A"]``           booleans; ``IndicesInput`` for integers
+``float``, ``int``, ``bool``, ``str``   a finite number, an integer, a flag, a string not blank
+``PositiveFloat``, ``UnitInterval`` …   numbers in bounds; others by ``Annotated[float, Bounds(…)]``
 ``Literal["a", "b"]``                   one of these words
 ``Rng``                                 a ``numpy.random.Generator``
 ``Callable[..., Any]``                  a function
 ``Graph``, any other class              an instance
-``Sequence[X]``, ``tuple[X, ...]``      any sequence of such things, as a tuple
-``X | Y``, ``X | None``                 what fits one of them
-``Any``, ``ArrayLike``                  anything, as it came
+``Sequence[X]``, ``tuple[X, ...]``      any sequence of such values, as a tuple
+``X | Y``, ``X | None``                 a value that fits one of them
+``Any``, ``ArrayLike``                  any value, unchanged
 ======================================  ==========================================================
 
-In a shape each word is the size of an axis. A number is exact, and so is the name of an argument
+In a shape each word names the size of an axis. A number is exact, and so is the name of an argument
 that is an integer, or a path such as ``model.dim`` or ``self.dim``; ``*channel.runs`` stands for
 several axes. Any other word is free where it first occurs, and the same from there on. A leading
 ``...`` allows any leading axes. Sizes in lower case are numbers of components, at least 1.
+
+**Static types.** A type checker has no word for an argument that is array_like for the caller and
+an array inside. So the inputs (``ArrayInput``, ``MaskInput``, ``IndicesInput`` and the aliases made
+of them) are ``Any`` for it: a list passes ``mypy --strict``. Inner functions and results are typed
+by ``Array``, ``Mask`` and ``Indices``.
 """
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .annotations import ALLOW_NAN
+from .batching import call_batched
 from .checks import (
     Array,
     Bounds,
@@ -47,48 +53,66 @@ from .checks import (
     check_positive_definite,
     check_positive_semidefinite,
     check_probabilities,
-    import_optional,
 )
-from .decorators import FrozenModel, call_user, skip_validation, validated
+from .decorators import call_user, skip_validation, validated
+from .first_use import is_first_use
+from .frozen import FrozenModel
+from .optional import import_optional
 
 __all__ = [
-    "Array",
-    "Bounds",
-    "PositiveInt",
-    "PositiveDefinite",
-    "NonNegativeInt",
-    "Indices",
-    "InvalidArgumentError",
     "ALLOW_NAN",
-    "Mask",
-    "NonNegativeFloat",
+    "Array",
+    "ArrayInput",
+    "Bounds",
     "DistinctIndices",
-    "PositiveFloat",
     "FrozenModel",
-    "Rng",
+    "Indices",
+    "IndicesInput",
+    "InvalidArgumentError",
+    "Mask",
+    "MaskInput",
+    "NonNegativeFloat",
+    "NonNegativeInt",
+    "PositiveDefinite",
+    "PositiveFloat",
+    "PositiveInt",
     "PositiveSemidefinite",
-    "UnitInterval",
-    "Times",
     "Probabilities",
+    "Rng",
+    "Times",
+    "UnitInterval",
     "all_finite",
+    "call_batched",
+    "call_user",
     "check_array",
-    "check_positive_definite",
-    "validated",
+    "check_distinct",
     "check_increasing",
-    "import_optional",
+    "check_positive_definite",
     "check_positive_semidefinite",
     "check_probabilities",
-    "call_user",
+    "import_optional",
+    "is_first_use",
     "skip_validation",
+    "validated",
 ]
 
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 Rng = np.random.Generator
-PositiveDefinite = Annotated[Array, "... d d", check_positive_definite]
-PositiveSemidefinite = Annotated[Array, "... d d", check_positive_semidefinite]
-Probabilities = Annotated[Array, "... N", check_probabilities]
-Times = Annotated[Array, "T", check_increasing]
+
+if TYPE_CHECKING:
+    ArrayInput: TypeAlias = Any
+    MaskInput: TypeAlias = Any
+    IndicesInput: TypeAlias = Any
+else:
+    ArrayInput = Array
+    MaskInput = Mask
+    IndicesInput = Indices
+
+PositiveDefinite = Annotated[ArrayInput, "... d d", check_positive_definite]
+PositiveSemidefinite = Annotated[ArrayInput, "... d d", check_positive_semidefinite]
+Probabilities = Annotated[ArrayInput, "... N", check_probabilities]
+Times = Annotated[ArrayInput, "T", check_increasing]
 PositiveFloat = Annotated[float, Bounds(above=0)]
 NonNegativeFloat = Annotated[float, Bounds(at_least=0)]
 UnitInterval = Annotated[float, Bounds(at_least=0, at_most=1)]

@@ -1,4 +1,4 @@
-"""What an annotation declares: how a value is converted, by which rules, and what is refused."""
+"""Constraints that annotations declare: an argument's conversion, its shape and its rules."""
 
 from __future__ import annotations
 
@@ -6,287 +6,397 @@ import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
-from itertools import chain
 from types import UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .checks import InvalidArgumentError, _fits, _shape_text, check_array
+from .checks import (
+    InvalidArgumentError,
+    check_array,
+    format_shape,
+    match_shape,
+    type_name,
+)
 
-__all__ = ["ALLOW_NAN", "Kind", "Scope", "kind_of"]
+__all__ = ["ALLOW_NAN", "CallContext", "Constraint", "make_constraint"]
 
 ALLOW_NAN = "missing allowed"
-"""Beside an array's shape: NaN may stand for what is missing; infinity may not."""
+"""Beside an array's shape: NaN may stand for a missing number; infinity may not."""
 
 
 @dataclass(slots=True)
-class Scope:
-    """The arguments of one call by name, and the sizes that their shapes have bound."""
+class CallContext:
+    """The arguments of one call by name, and the dimensions that their shapes have bound."""
 
-    values: dict[str, Any]
-    sizes: dict[str, int] = field(default_factory=dict)
+    arguments: dict[str, Any]
+    dimensions: dict[str, int] = field(default_factory=dict)
 
-    def fits(
-        self, got: tuple[int, ...], words: tuple[Any, ...], heads: frozenset[str]
-    ) -> bool:
-        """Whether a shape is what its words say; if so it binds those that were free."""
-        wanted = words if heads.isdisjoint(self.values) else self.shape(words)
-        if fits := _fits(got, wanted, sizes := self.sizes.copy()):
-            self.sizes = sizes
-        return fits
+    def bind_shape(self, shape: tuple[int, ...], expected: ShapeNames) -> bool:
+        """Whether a shape is as declared; if so the free names are bound to its sizes."""
+        names = expected.names
+        if not expected.references.isdisjoint(self.arguments):
+            names = self.resolve(names)
+        dimensions = self.dimensions.copy()
+        matches = match_shape(shape, names, dimensions)
+        if matches:
+            self.dimensions = dimensions
+        return matches
 
-    def shape(self, words: Sequence[Any]) -> tuple[Any, ...]:
-        """A shape as far as it is known."""
-        known = [self._size(word) if isinstance(word, str) else word for word in words]
-        return tuple(
-            chain.from_iterable(n if type(n) is tuple else (n,) for n in known)
-        )
+    def resolve(self, names: Sequence[Any]) -> tuple[Any, ...]:
+        """Replace the names of dimensions that are known by their sizes."""
+        shape: list[Any] = []
+        for name in names:
+            size = self._size(name) if isinstance(name, str) else name
+            if type(size) is tuple:
+                shape.extend(size)
+            else:
+                shape.append(size)
+        return tuple(shape)
 
-    def _size(self, word: str) -> Any:
-        """What a word stands for: a size, sizes, or itself while it is free."""
-        if word in self.sizes:
-            return self.sizes[word]
-        head, *path = word.lstrip("*").split(".")
-        found = self.values.get(head)
-        for part in path:
-            found = getattr(found, part, None)
-        return found if isinstance(found, (int, np.integer, tuple)) else word
+    def _size(self, name: str) -> Any:
+        """Return a dimension's size, sizes of several axes, or the name while it is free."""
+        if name in self.dimensions:
+            return self.dimensions[name]
+        # A path such as model.dim starts at an argument.
+        argument, *attributes = name.lstrip("*").split(".")
+        value = self.arguments.get(argument)
+        for attribute in attributes:
+            value = getattr(value, attribute, None)
+        return value if isinstance(value, int | np.integer | tuple) else name
 
 
-@cache
 @dataclass(frozen=True)
-class Kind:
-    """What an argument may be: what it needs in words, its conversion, and rules for the result."""
+class ShapeNames:
+    """The dimensions of a declared shape."""
 
-    needs: str
-    convert: Callable[[Any, str, Scope], Any]
+    names: tuple[Any, ...]
+    references: frozenset[str]
+    """The first part of each name, which may be an argument of the call."""
+
+    @classmethod
+    def parse(cls, words: Sequence[str]) -> ShapeNames:
+        """Read the words of a shape such as ``"... N model.dim"``."""
+        names: list[Any] = []
+        for word in words:
+            if word.isdigit():
+                names.append(int(word))
+            else:
+                names.append(... if word == "..." else word)
+        references = [word.lstrip("*").split(".")[0] for word in words]
+        return cls(tuple(names), frozenset(references))
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """The values that an argument may have: a description, a conversion, and further rules."""
+
+    description: str
+    convert: Callable[[Any, str, CallContext], Any]
     rules: tuple[Callable[[Any, str], None], ...] = ()
+    has_shape: bool = False
 
-    def check(self, value: Any, name: str, scope: Scope) -> Any:
-        """The value as the function gets it, or an error that names it."""
+    def validate(self, value: Any, name: str, context: CallContext) -> Any:
+        """Return the value as the function gets it, or raise an error that names it.
+
+        A conversion raises TypeError for a value of a wrong type.
+        """
         try:
-            out = self.convert(value, name, scope)
+            result = self.convert(value, name, context)
         except InvalidArgumentError:
-            raise  # an entry of it has named the argument already
+            raise  # the conversion has named the argument already
         except TypeError:
-            got = (
-                repr(value)
-                if isinstance(value, str | int | float)
-                else type(value).__name__
-            )
+            is_short = isinstance(value, str | int | float)
+            text = repr(value) if is_short else type_name(value)
             raise InvalidArgumentError(
-                f"{name} must be {self.needs}, got {got}"
+                f"{name} must be {self.description}, got {text}"
             ) from None
         for rule in self.rules:
-            rule(out, name)
-        return out
+            rule(result, name)
+        return result
 
 
-def _number(value: Any, name: str, scope: Scope) -> float:
-    try:  # a TypeError for an array
-        out = float(
-            value
-            if type(value) in (float, int, np.float64)
-            else check_array(value, name, ())
-        )
-    except ValueError:
+def _convert_float(value: Any, name: str, context: CallContext) -> float:
+    number = value
+    if type(value) not in (float, int, np.float64):
+        try:
+            number = check_array(value, name, ())
+        except ValueError:
+            raise TypeError from None
+    try:
+        result = float(number)
+    except OverflowError:  # an integer of hundreds of digits
         raise TypeError from None
-    if not math.isfinite(out):
+    if not math.isfinite(result):
         raise TypeError
-    return out
+    return result
 
 
-def _integer(value: Any, name: str, scope: Scope) -> int:
-    if not isinstance(value, int | np.integer) or isinstance(
-        value, bool | np.timedelta64
-    ):
+def _convert_int(value: Any, name: str, context: CallContext) -> int:
+    # A bool is an int in Python, and a timedelta an integer in numpy.
+    is_integer = isinstance(value, int | np.integer)
+    if not is_integer or isinstance(value, bool | np.timedelta64):
         raise TypeError
     return int(value)
 
 
-def _instance(cls: Any, value: Any, name: str, scope: Scope) -> Any:
-    if not isinstance(value, cls) or (cls is str and not value.strip()):
+def _convert_bool(value: Any, name: str, context: CallContext) -> bool:
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError
+    return bool(value)
+
+
+def _check_text(value: Any, name: str, context: CallContext) -> str:
+    if not isinstance(value, str) or not value.strip():
         raise TypeError
     return value
 
 
-def _callable(value: Any, name: str, scope: Scope) -> Any:
+def _check_instance(cls: Any, value: Any, name: str, context: CallContext) -> Any:
+    if not isinstance(value, cls):
+        raise TypeError
+    return value
+
+
+def _check_callable(value: Any, name: str, context: CallContext) -> Any:
     if not callable(value):
         raise TypeError
-    plan = getattr(value.func, "plan", None) if isinstance(value, partial) else None
-    if plan is None:
+    constraints = None
+    if isinstance(value, partial):
+        constraints = getattr(value.func, "signature_constraints", None)
+    if constraints is None:
         return value
-    # Inner calls are not checked, so the options that a partial holds are looked at here.
-    return partial(value.func, *value.args, **plan.validate((), value.keywords))
+    # Nested calls are not checked, so a partial's options are checked here.
+    options = constraints.validate((), value.keywords)
+    return partial(value.func, *value.args, **options)
 
 
-def _one_of(options: tuple[Any, ...], value: Any, name: str, scope: Scope) -> Any:
-    if not any(type(value) is type(option) and value == option for option in options):
-        raise TypeError
-    return value
+def _check_option(
+    options: tuple[Any, ...], value: Any, name: str, context: CallContext
+) -> Any:
+    for option in options:
+        # Types are compared first: 1 == True, and an array compares entry by entry.
+        if type(value) is type(option) and value == option:
+            return value
+    raise TypeError
 
 
-def _numbers(
+def _convert_array(
     dtype: type,
-    words: tuple[Any, ...] | None,
-    heads: frozenset[str],
-    missing: bool,
+    shape: ShapeNames | None,
+    allow_nan: bool,
     value: Any,
     name: str,
-    scope: Scope,
+    context: CallContext,
 ) -> Any:
     if dtype is np.float64:
-        out: Any = check_array(value, name, finite=not missing)
-        if missing and np.isinf(out).any():
+        array: Any = check_array(value, name, finite=not allow_nan)
+        if allow_nan and np.isinf(array).any():
             raise ValueError(
                 f"{name} must have finite numbers or NaN (missing), got infinity"
             )
     else:
-        out = np.asarray(value)
-        kinds = "b" if dtype is np.bool_ else "iu"
-        if out.dtype.kind not in kinds or isinstance(value, np.ma.MaskedArray):
+        array = np.asarray(value)
+        dtype_kinds = "b" if dtype is np.bool_ else "iu"
+        is_masked = isinstance(value, np.ma.MaskedArray)
+        if array.dtype.kind not in dtype_kinds or is_masked:
             raise TypeError
-    if words is not None and not scope.fits(out.shape, words, heads):
-        raise ValueError(
-            f"{name} must have shape {_shape_text(scope.shape(words))}, got {out.shape}"
-        )
-    return out
+    if shape is not None and not context.bind_shape(array.shape, shape):
+        expected = format_shape(context.resolve(shape.names))
+        raise ValueError(f"{name} must have shape {expected}, got {array.shape}")
+    return array
 
 
-def _many(
-    kinds: tuple[Kind | None, ...], fixed: bool, value: Any, name: str, scope: Scope
+def _convert_sequence(
+    entry: Constraint | None, value: Any, name: str, context: CallContext
 ) -> tuple[Any, ...]:
+    entries = _to_tuple(value)
+    if entry is None:
+        return entries
+    return tuple([entry.validate(item, name, context) for item in entries])
+
+
+def _convert_tuple(
+    constraints: tuple[Constraint | None, ...],
+    value: Any,
+    name: str,
+    context: CallContext,
+) -> tuple[Any, ...]:
+    entries = _to_tuple(value)
+    if len(entries) != len(constraints):
+        raise ValueError(
+            f"{name} must have {len(constraints)} entries, got {len(entries)}"
+        )
+    result = []
+    for constraint, item in zip(constraints, entries, strict=True):
+        if constraint is not None:
+            item = constraint.validate(item, name, context)
+        result.append(item)
+    return tuple(result)
+
+
+def _to_tuple(value: Any) -> tuple[Any, ...]:
+    """Return the entries of a sequence; a string or a mapping is none."""
     if isinstance(value, str | bytes | Mapping) or not np.iterable(value):
         raise TypeError
-    items = tuple(value)
-    each = kinds if fixed else kinds * len(items)
-    if len(each) != len(items):
-        raise ValueError(f"{name} must have {len(each)} entries, got {len(items)}")
-    pairs = zip(each, items, strict=True)
-    return tuple(
-        [kind.check(item, name, scope) if kind else item for kind, item in pairs]
-    )
+    return tuple(value)
 
 
-def _either(
-    kinds: tuple[Any, ...], optional: bool, value: Any, name: str, scope: Scope
+def _convert_union(
+    alternatives: tuple[Constraint, ...],
+    optional: bool,
+    value: Any,
+    name: str,
+    context: CallContext,
 ) -> Any:
     if value is None and optional:
         return None
-    for kind in kinds:
+    for constraint in alternatives:
         try:
-            return kind.check(value, name, scope)
+            return constraint.validate(value, name, context)
         except ValueError as error:
-            # A number that is out of bounds is nothing else.
-            plain = type(value) in (int, float) and kind.convert in (_number, _integer)
-            if len(kinds) == 1 or (plain and kind.needs not in str(error)):
+            if len(alternatives) == 1 or _is_out_of_bounds(value, constraint, error):
                 raise
     raise TypeError
 
 
-_PLAIN = {
-    float: Kind("a finite number", _number),
-    int: Kind("an integer", _integer),
-    str: Kind("a text", partial(_instance, str)),
-    bool: Kind("a bool, True or False", partial(_instance, bool)),
-    Callable: Kind("a function", _callable),
-    np.random.Generator: Kind(
+def _is_out_of_bounds(value: Any, constraint: Constraint, error: ValueError) -> bool:
+    """Whether a number has the right type for a constraint, and breaks one of its rules.
+
+    No other alternative will take it, and this error says more than a list of alternatives.
+    """
+    is_number = type(value) in (int, float)
+    takes_numbers = constraint.convert in (_convert_float, _convert_int)
+    return is_number and takes_numbers and constraint.description not in str(error)
+
+
+_PLAIN_TYPES = {
+    float: Constraint("a finite number", _convert_float),
+    int: Constraint("an integer", _convert_int),
+    str: Constraint("a string that is not blank", _check_text),
+    bool: Constraint("a bool, True or False", _convert_bool),
+    Callable: Constraint("a function", _check_callable),
+    np.random.Generator: Constraint(
         "a numpy.random.Generator (np.random.default_rng(seed))",
-        partial(_instance, np.random.Generator),
+        partial(_check_instance, np.random.Generator),
     ),
 }
 _SEQUENCES = (Sequence, Collection, Iterable, tuple, list)
 
 
 @cache
-def kind_of(annotation: Any) -> Kind | None:
-    """The kind that an annotation declares; None lets everything pass.
+def make_constraint(annotation: Any) -> Constraint | None:
+    """Return the constraint that an annotation declares, or None if any value is allowed.
 
     Examples
     --------
     >>> from distfilt.validation import PositiveInt
-    >>> kind_of(PositiveInt).check(0, "members", Scope({}))
+    >>> make_constraint(PositiveInt).validate(0, "members", CallContext({}))
     Traceback (most recent call last):
     ValueError: members must be at least 1, got 0
     """
     if annotation is Any or annotation == ArrayLike:
         return None
-    annotation = _meant(annotation)
+    annotation = _resolve_alias(annotation)
     origin = get_origin(annotation)
     args = get_args(annotation)
     if origin is Annotated:
-        return _noted(args[0], args[1:])
+        return _make_annotated(args[0], args[1:])
     if origin in (Union, UnionType):
-        return _union(args)
+        return _make_union(args)
     if origin is Literal:
-        return Kind(f"one of {', '.join(map(str, args))}", partial(_one_of, args))
+        options = ", ".join(map(str, args))
+        return Constraint(f"one of {options}", partial(_check_option, args))
     if origin is np.ndarray:
-        return _array_of(annotation)
-    if origin is tuple and args[-1] is not ...:
-        kinds = tuple(kind_of(a) for a in args)
-        return Kind(_words(kinds, ", "), partial(_many, kinds, True))
+        return _make_array(annotation)
     if origin in _SEQUENCES:
-        kinds = (kind_of(args[0]),)
-        return Kind(
-            f"a list, of {_words(kinds, '')} each", partial(_many, kinds, False)
-        )
-    found = origin or annotation
-    if found in _PLAIN or not isinstance(found, type):
-        return _PLAIN.get(found)
-    article = "an" if found.__name__[0] in "AEIOU" else "a"
-    return Kind(f"{article} {found.__name__}", partial(_instance, found))
+        return _make_sequence(origin, args)
+    cls = origin or annotation
+    if cls in _PLAIN_TYPES or not isinstance(cls, type):
+        return _PLAIN_TYPES.get(cls)
+    article = "an" if cls.__name__[0] in "AEIOU" else "a"
+    return Constraint(f"{article} {cls.__name__}", partial(_check_instance, cls))
 
 
-def _words(kinds: tuple[Kind | None, ...], between: str) -> str:
-    return between.join(kind.needs if kind else "anything" for kind in kinds)
+def _make_sequence(origin: Any, args: tuple[Any, ...]) -> Constraint:
+    """Return the constraint of a sequence of any length, or of a tuple of a fixed one."""
+    if origin is tuple and args[-1] is not ...:
+        constraints = tuple([make_constraint(arg) for arg in args])
+        description = f"a tuple of {_describe(constraints, ', ')}"
+        convert: Any = partial(_convert_tuple, constraints)
+    else:
+        constraints = (make_constraint(args[0]),)
+        description = f"a sequence, each entry {_describe(constraints, '')}"
+        convert = partial(_convert_sequence, constraints[0])
+    return Constraint(description, convert, has_shape=_have_shape(constraints))
 
 
-def _union(args: tuple[Any, ...]) -> Kind | None:
-    """What fits one of several annotations, the first that does."""
-    kinds = tuple(kind_of(a) for a in args if a is not type(None))
-    if None in kinds:
+def _make_union(args: tuple[Any, ...]) -> Constraint | None:
+    """Return the constraint of a union, whose alternatives are tried in order."""
+    alternatives = []
+    for arg in args:
+        if arg is type(None):
+            continue
+        constraint = make_constraint(arg)
+        if constraint is None:
+            return None
+        alternatives.append(constraint)
+    optional = type(None) in args
+    return Constraint(
+        _describe(alternatives, " or "),
+        partial(_convert_union, tuple(alternatives), optional),
+        has_shape=_have_shape(alternatives),
+    )
+
+
+def _make_annotated(base: Any, metadata: tuple[Any, ...]) -> Constraint | None:
+    """Return the constraint of a type with a shape and rules beside it.
+
+    Of several shapes the last one counts, so that an alias with a shape can be narrowed.
+    """
+    base = _resolve_alias(base)
+    shapes = [note for note in metadata if isinstance(note, str) and note != ALLOW_NAN]
+    if get_origin(base) is np.ndarray:
+        shape = shapes[-1].split() if shapes else None
+        constraint: Constraint | None = _make_array(base, shape, ALLOW_NAN in metadata)
+    else:
+        constraint = make_constraint(base)
+    if constraint is None:
         return None
-    return Kind(_words(kinds, " or "), partial(_either, kinds, type(None) in args))
+    rules = tuple([note for note in metadata if callable(note)])
+    return replace(constraint, rules=constraint.rules + rules)
 
 
-def _meant(annotation: Any) -> Any:
-    """What a ``type`` alias stands for, as numpy's NDArray is one since 2.5; others as they are."""
+def _make_array(
+    base: Any, words: Sequence[str] | None = None, allow_nan: bool = False
+) -> Constraint:
+    """Return the constraint of an array, of any shape if there are no words for it."""
+    dtype = get_args(get_args(base)[1])[0]
+    entries = {np.float64: "real numbers", np.bool_: "True and False"}
+    description = f"an array of {entries.get(dtype, 'integers')}"
+    shape = None
+    if words is not None:
+        description += f" of shape ({', '.join(words)})"
+        shape = ShapeNames.parse(words)
+    convert = partial(_convert_array, dtype, shape, allow_nan)
+    return Constraint(description, convert, has_shape=True)
+
+
+def _resolve_alias(annotation: Any) -> Any:
+    """Return the type that a ``type`` alias stands for; numpy's NDArray is one since 2.5."""
     args = get_args(annotation)
     value = getattr(get_origin(annotation) or annotation, "__value__", None)
-    return annotation if value is None else _meant(value[args] if args else value)
+    if value is None:
+        return annotation
+    return _resolve_alias(value[args] if args else value)
 
 
-def _noted(base: Any, notes: tuple[Any, ...]) -> Kind | None:
-    """A type with a shape and rules beside it; the last shape counts, so that aliases can vary."""
-    shapes = [
-        note.split() for note in notes if isinstance(note, str) and note != ALLOW_NAN
-    ]
-    base = _meant(base)
-    if get_origin(base) is np.ndarray:
-        kind: Kind | None = _array_of(
-            base, shapes[-1] if shapes else None, ALLOW_NAN in notes
-        )
-    else:
-        kind = kind_of(base)
-    rules: Any = filter(callable, notes)
-    return kind and replace(kind, rules=(*kind.rules, *rules))
+def _describe(constraints: Iterable[Constraint | None], separator: str) -> str:
+    """Join the descriptions of several constraints."""
+    texts = [c.description if c else "anything" for c in constraints]
+    return separator.join(texts)
 
 
-def _array_of(
-    base: Any, words: Sequence[str] | None = None, missing: bool = False
-) -> Kind:
-    dtype = get_args(get_args(base)[1])[0]
-    what = {np.float64: "real numbers", np.bool_: "True and False"}.get(
-        dtype, "integers"
-    )
-    shape = "" if words is None else f" of shape ({', '.join(words)})"
-    known: Any = words and tuple(
-        [int(w) if w.isdigit() else {"...": ...}.get(w, w) for w in words]
-    )
-    # What a word may stand for: an argument, or what one has.
-    heads = frozenset(word.lstrip("*").split(".")[0] for word in words or ())
-    return Kind(
-        f"an array of {what}{shape}", partial(_numbers, dtype, known, heads, missing)
-    )
+def _have_shape(constraints: Iterable[Constraint | None]) -> bool:
+    return any(c is not None and c.has_shape for c in constraints)

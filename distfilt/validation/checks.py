@@ -1,14 +1,12 @@
-"""What arrays, numbers and a user's functions must be: what is not is refused by its name."""
+"""Checks of arrays and numbers, with errors that name the argument."""
 
 from __future__ import annotations
 
 import contextlib
-import importlib
 import math
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -21,13 +19,14 @@ __all__ = [
     "Bounds",
     "all_finite",
     "check_array",
-    "call_batched",
     "check_positive_definite",
     "check_distinct",
     "check_increasing",
-    "import_optional",
     "check_positive_semidefinite",
     "check_probabilities",
+    "format_shape",
+    "match_shape",
+    "type_name",
 ]
 
 Array = NDArray[np.float64]
@@ -47,7 +46,7 @@ class InvalidArgumentError(ValueError, TypeError):
 InvalidArgumentError.__module__ = "distfilt.validation"
 
 _ROUNDING = 1e-9
-"""Largest asymmetry and negative eigenvalue, in units of the variances, that count as rounding."""
+"""Largest asymmetry or negative eigenvalue that counts as rounding, relative to the variances."""
 
 _NOT_REAL = (
     bool,
@@ -61,7 +60,17 @@ _NOT_REAL = (
     type(None),
     np.ma.MaskedArray,
 )
-"""What would turn into numbers inside a list or an array of objects."""
+"""Types that numpy would convert to numbers inside a list or an array of objects."""
+
+
+def type_name(value: object) -> str:
+    """Return the name of a value's type, ``np.bool`` for numpy's own scalars.
+
+    >>> type_name(True), type_name(np.True_)
+    ('bool', 'np.bool')
+    """
+    name = type(value).__name__
+    return f"np.{name}" if isinstance(value, np.generic) else name
 
 
 def check_array(
@@ -71,15 +80,15 @@ def check_array(
     *,
     finite: bool = True,
 ) -> Array:
-    """Return `value` as a float64 array of the wanted shape: for what a user's function returned.
+    """Return `value` as a float64 array of the expected shape, such as a user function's result.
 
     Parameters
     ----------
     value, name
-        What came, and what the error calls it.
+        The value, and its name in the error.
     shape : tuple, optional
-        Sizes from left to right: an integer is exact, a text is a free size with a name for the
-        error, and a leading ``...`` allows any leading axes.
+        Dimensions from left to right: an integer is exact, a string is a free dimension with a
+        name for the error, and a leading ``...`` allows any leading axes.
     finite : bool
         Refuse NaN and infinity.
 
@@ -97,18 +106,23 @@ def check_array(
     Traceback (most recent call last):
     ValueError: mean must have finite numbers, got 1 NaN or infinite of 3
     """
-    plain = type(value) is np.ndarray and value.dtype == np.float64
-    out: Array = value if plain else _real(value, name)  # type: ignore[assignment]
-    if shape is not None and out.shape != shape and not _fits(out.shape, shape, {}):
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        array: Array = value
+    else:
+        array = _convert_to_float64(value, name)
+    # Equal tuples are the rule for shapes without free dimensions.
+    fits = shape is None or array.shape == shape or match_shape(array.shape, shape, {})
+    if not fits and shape is not None:
         raise ValueError(
-            f"{name} must have shape {_shape_text(shape)}, got {out.shape}"
+            f"{name} must have shape {format_shape(shape)}, got {array.shape}"
         )
-    if finite and not all_finite(out):
-        bad = int((~np.isfinite(out)).sum())
+    if finite and not all_finite(array):
+        count = int((~np.isfinite(array)).sum())
         raise ValueError(
-            f"{name} must have finite numbers, got {bad} NaN or infinite of {out.size}"
+            f"{name} must have finite numbers, "
+            f"got {count} NaN or infinite of {array.size}"
         )
-    return out
+    return array
 
 
 def all_finite(value: Array) -> bool:
@@ -117,50 +131,69 @@ def all_finite(value: Array) -> bool:
     >>> all_finite(np.array([1.0, -np.inf])), all_finite(np.array([1e200]))
     (False, True)
     """
-    # A sum of squares says so in a fifth of the time, unless it overflows.
-    return math.isfinite(np.vdot(value, value)) or bool(np.isfinite(value).all())
+    # A finite sum of squares proves it in a fifth of the time; it may overflow.
+    if math.isfinite(np.vdot(value, value)):
+        return True
+    return bool(np.isfinite(value).all())
 
 
-def _real(value: Any, name: str) -> Array:
-    """Convert what holds real numbers and nothing else."""
-    got = type(value).__name__
+def _convert_to_float64(value: Any, name: str) -> Array:
+    """Convert a value that holds real numbers and nothing else."""
+    wrong_type = type_name(value)
     try:
         parts = value if isinstance(value, list | tuple) else (value,)
-        found = np.asarray(value)
-        entries = found.ravel() if found.dtype.kind == "O" else ()
-        got = next((type(v).__name__ for v in entries), got)
-        odd = [v for v in (*parts, *entries) if isinstance(v, _NOT_REAL)]
-        if not odd and found.dtype.kind in "fiuO":
-            return np.asarray(found, dtype=np.float64)
-        got = type(odd[0]).__name__ if odd else found.dtype.name
+        array = np.asarray(value)
+        entries = array.ravel() if array.dtype.kind == "O" else ()
+        if len(entries):
+            wrong_type = type_name(entries[0])
+        refused = [v for v in (*parts, *entries) if isinstance(v, _NOT_REAL)]
+        if refused:
+            wrong_type = type_name(refused[0])
+        elif array.dtype.kind in "fiuO":
+            return np.asarray(array, dtype=np.float64)
+        else:
+            wrong_type = array.dtype.name
     except (TypeError, ValueError, OverflowError):
-        pass
+        pass  # numpy could not convert it: refused below by its type
     raise InvalidArgumentError(
-        f"{name} must be an array of real numbers, got {got}"
+        f"{name} must be an array of real numbers, got {wrong_type}"
     ) from None
 
 
-def _fits(got: tuple[int, ...], wanted: tuple[Any, ...], sizes: dict[str, int]) -> bool:
-    """Whether a shape is what is wanted; if so the free words of `wanted` are among `sizes`."""
-    left = list(got)
-    for n in reversed(wanted):
-        if n is ...:
+def match_shape(
+    shape: tuple[int, ...], expected: tuple[Any, ...], dimensions: dict[str, int]
+) -> bool:
+    """Whether a shape is as expected; if so its named dimensions are added to `dimensions`.
+
+    >>> dimensions = {}
+    >>> match_shape((3, 5, 2), (..., "N", 2), dimensions), dimensions
+    (True, {'N': 5})
+    """
+    remaining = list(shape)
+    # From the right, since leading axes may be free.
+    for dimension in reversed(expected):
+        if dimension is ...:
             return True
-        size = left.pop() if left else -1
-        if isinstance(n, str) and (size > 0 or (size == 0 and n[0].isupper())):
-            n = sizes.setdefault(n, size)
-        if n != size:
+        size = remaining.pop() if remaining else -1
+        if isinstance(dimension, str):
+            # Numbers of components, in lower case, are at least 1.
+            may_be_empty = dimension[0].isupper()
+            if size > 0 or (size == 0 and may_be_empty):
+                dimension = dimensions.setdefault(dimension, size)
+        if dimension != size:
             return False
-    return not left
+    return not remaining
 
 
-def _shape_text(shape: tuple[Any, ...]) -> str:
-    sizes = ", ".join("..." if n is ... else str(n) for n in shape)
-    return f"({sizes},)" if len(shape) == 1 else f"({sizes})"
+def format_shape(shape: tuple[Any, ...]) -> str:
+    """Write a shape as numpy does, ``(..., N, 2)``."""
+    names = ["..." if size is ... else str(size) for size in shape]
+    text = ", ".join(names)
+    return f"({text},)" if len(shape) == 1 else f"({text})"
 
 
-def check_positive_definite(value: Array, name: str, word: str = "definite") -> None:
-    """Refuse what is not a symmetric positive definite matrix, or a stack of them.
+def check_positive_definite(value: Array, name: str) -> None:
+    """Refuse a matrix, or a stack with one, that is not symmetric positive definite.
 
     Examples
     --------
@@ -168,52 +201,80 @@ def check_positive_definite(value: Array, name: str, word: str = "definite") -> 
     Traceback (most recent call last):
     ValueError: noise must be a positive definite matrix, got smallest eigenvalue -1
     """
-    if value.ndim < 2 or value.shape[-1] != value.shape[-2]:
-        raise ValueError(f"{name} must be a square matrix, got shape {value.shape}")
-    # As a rule the same bytes, which takes a fifth of a difference's time.
-    if value.tobytes() != value.mT.tobytes():
-        unit = _in_units(value)
-        gap = np.abs(value - value.mT)
-        worst = gap[np.abs(unit - unit.mT) > _ROUNDING].max(initial=0.0)
-        if worst > 0:
-            raise ValueError(
-                f"{name} must be a symmetric matrix, got an asymmetry of {worst:.3g}"
-            )
-    with contextlib.suppress(np.linalg.LinAlgError):
-        # The first takes a fifth of the other's time for one matrix.
-        if value.ndim > 2 or not value.size or dpotrf(value, lower=1)[1]:
-            np.linalg.cholesky(value)
-        return
-    # Without a factor; rounding alone may be why, unless it has to be definite.
-    values = np.linalg.eigvalsh(_in_units(value))[..., 0]
-    if word == "definite" or values.min() < -_ROUNDING:
-        at = tuple(np.argwhere(values == values.min())[0].tolist())
-        least = f"{np.linalg.eigvalsh(value[at])[0]:.6g}{f' at {[*at]}' * bool(at)}"
-        raise ValueError(
-            f"{name} must be a positive {word} matrix, got smallest eigenvalue {least}"
-        )
+    _check_symmetric(value, name)
+    if not _has_cholesky(value):
+        smallest = np.linalg.eigvalsh(_to_unit_variances(value))[..., 0]
+        _raise_not_positive(value, name, smallest, "definite")
 
 
 def check_positive_semidefinite(value: Array, name: str) -> None:
-    """Refuse what is not a symmetric matrix without negative eigenvalues, or a stack of them.
+    """Refuse a matrix, or a stack with one, that is not symmetric positive semidefinite.
 
     Examples
     --------
     >>> check_positive_semidefinite(np.zeros((2, 2)), "noise")
     """
-    check_positive_definite(value, name, "semidefinite")
+    _check_symmetric(value, name)
+    if _has_cholesky(value):
+        return
+    # Rounding alone may have made an eigenvalue negative.
+    smallest = np.linalg.eigvalsh(_to_unit_variances(value))[..., 0]
+    if smallest.min() < -_ROUNDING:
+        _raise_not_positive(value, name, smallest, "semidefinite")
 
 
-def _in_units(cov: Array) -> Array:
-    """Covariances in units of the components' standard deviations, as far as that matters."""
+def _check_symmetric(value: Array, name: str) -> None:
+    """Refuse matrices that are not square or not symmetric up to rounding."""
+    if value.ndim < 2 or value.shape[-1] != value.shape[-2]:
+        raise ValueError(f"{name} must be a square matrix, got shape {value.shape}")
+    # Equal bytes are the rule, and compared in a fifth of a difference's time.
+    if value.tobytes() == value.mT.tobytes():
+        return
+    scaled = _to_unit_variances(value)
+    too_large = np.abs(scaled - scaled.mT) > _ROUNDING
+    asymmetry = np.abs(value - value.mT)[too_large].max(initial=0.0)
+    if asymmetry > 0:
+        raise ValueError(
+            f"{name} must be a symmetric matrix, got an asymmetry of {asymmetry:.3g}"
+        )
+
+
+def _has_cholesky(value: Array) -> bool:
+    """Whether all matrices of a stack have a Cholesky factor."""
+    if value.ndim == 2 and value.size:
+        # LAPACK itself takes a fifth of numpy's time for one matrix.
+        failed = dpotrf(value, lower=1)[1]
+        if not failed:
+            return True
+    with contextlib.suppress(np.linalg.LinAlgError):
+        np.linalg.cholesky(value)
+        return True
+    return False
+
+
+def _raise_not_positive(value: Array, name: str, smallest: Array, kind: str) -> None:
+    """Raise the error that gives the worst matrix's smallest eigenvalue and its index."""
+    index = tuple(np.argwhere(smallest == smallest.min())[0].tolist())
+    eigenvalue = np.linalg.eigvalsh(value[index])[0]
+    place = f" at {list(index)}" if index else ""
+    raise ValueError(
+        f"{name} must be a positive {kind} matrix, "
+        f"got smallest eigenvalue {eigenvalue:.6g}{place}"
+    )
+
+
+def _to_unit_variances(cov: Array) -> Array:
+    """Scale covariances to unit variances; entries are clipped to [-2, 2]."""
     std = np.sqrt(np.abs(np.diagonal(cov, axis1=-2, axis2=-1)))
     unit = np.where(std > 0, std, 1.0)
+    # Correlations lie in [-1, 1]: beyond 2 an entry is wrong by any measure.
     with np.errstate(over="ignore"):
-        return np.clip(cov / unit[..., :, None] / unit[..., None, :], -2.0, 2.0)
+        scaled = cov / unit[..., :, None] / unit[..., None, :]
+    return np.clip(scaled, -2.0, 2.0)
 
 
 def check_probabilities(value: Array, name: str) -> None:
-    """Refuse what is not nonnegative weights that sum to one along the last axis.
+    """Refuse weights that are negative or do not sum to one along the last axis.
 
     Examples
     --------
@@ -224,13 +285,14 @@ def check_probabilities(value: Array, name: str) -> None:
     if value.size and value.min() < 0:
         raise ValueError(f"{name} must be nonnegative weights, got {value.min():.6g}")
     total = np.ravel(value.sum(axis=-1))
-    off = np.abs(total - 1)
-    if off.max(initial=0.0) > 1e-9:  # far from zero, what is missing would move a mean
-        raise ValueError(f"{name} must sum to 1, got {total[off.argmax()]:.9g}")
+    error = np.abs(total - 1)
+    # Strict, since for states far from zero a small missing weight moves the mean.
+    if error.max(initial=0.0) > 1e-9:
+        raise ValueError(f"{name} must sum to 1, got {total[error.argmax()]:.9g}")
 
 
 def check_increasing(value: Array, name: str) -> None:
-    """Refuse what does not strictly increase.
+    """Refuse numbers that do not strictly increase.
 
     Examples
     --------
@@ -238,15 +300,16 @@ def check_increasing(value: Array, name: str) -> None:
     Traceback (most recent call last):
     ValueError: times must be strictly increasing, got 0.2 after 0.2
     """
-    late = value[1:] <= value[:-1]
-    if late.any():
-        k = int(late.argmax())
-        got = f"{value[k + 1]:g} after {value[k]:g}"
-        raise ValueError(f"{name} must be strictly increasing, got {got}")
+    not_above = value[1:] <= value[:-1]
+    if not_above.any():
+        k = int(not_above.argmax())
+        raise ValueError(
+            f"{name} must be strictly increasing, got {value[k + 1]:g} after {value[k]:g}"
+        )
 
 
 def check_distinct(value: Sequence[int], name: str) -> None:
-    """Refuse an empty list of places, and one that names a place twice.
+    """Refuse an empty list of indices, and one that holds an index twice.
 
     Examples
     --------
@@ -254,9 +317,9 @@ def check_distinct(value: Sequence[int], name: str) -> None:
     Traceback (most recent call last):
     ValueError: local must have distinct integers, one or more, got [2, 2]
     """
-    if not len(value) or len({*value}) < len(value):
+    if not len(value) or len(set(value)) < len(value):
         raise ValueError(
-            f"{name} must have distinct integers, one or more, got {[*value]}"
+            f"{name} must have distinct integers, one or more, got {list(value)}"
         )
 
 
@@ -278,151 +341,31 @@ class Bounds:
 
     def __call__(self, value: Any, name: str) -> None:
         """Refuse a number, or an array with an entry, that is out of bounds."""
-        for side, holds in _HOLDS.items():
+        for side, compare in _COMPARISONS.items():
             bound = getattr(self, side)
             if bound is None:
                 continue
-            good = holds(value, bound)
-            if good is True or np.all(good):
+            inside = compare(value, bound)
+            if inside is True or np.all(inside):
                 continue
-            worst = value if np.ndim(value) == 0 else value[~good].flat[0]
+            outside = value if np.ndim(value) == 0 else value[~inside].flat[0]
             raise ValueError(
-                f"{name} must be {_bound_text(side, bound)}, got {worst!r}"
+                f"{name} must be {_describe_bound(side, bound)}, got {outside!r}"
             )
 
 
-def _bound_text(side: str, bound: float) -> str:
-    """A bound in words: "positive", "at least 1"."""
-    if bound == 0 and side in ("above", "at_least"):
-        return "positive" if side == "above" else "nonnegative"
+def _describe_bound(side: str, bound: float) -> str:
+    """Write a bound as "positive" or "at least 1"."""
+    if bound == 0 and side == "above":
+        return "positive"
+    if bound == 0 and side == "at_least":
+        return "nonnegative"
     return f"{side.replace('_', ' ')} {bound:g}"
 
 
-_HOLDS = {
+_COMPARISONS = {
     "above": operator.gt,
     "at_least": operator.ge,
     "below": operator.lt,
     "at_most": operator.le,
 }
-
-
-def import_optional(module: str, extra: str) -> ModuleType:
-    """Import an optional package, or say which extra brings it.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        If the package `module` is not installed. An error inside an installed one is passed on.
-
-    Examples
-    --------
-    >>> import_optional("no_such_package", "maps")
-    Traceback (most recent call last):
-    ModuleNotFoundError: no_such_package is not installed; it comes with the extra maps: pip install 'distfilt[maps]'
-    """
-    try:
-        return importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name != module.partition(".")[0]:
-            raise
-        raise ModuleNotFoundError(
-            f"{module} is not installed; it comes with the extra {extra}: pip install 'distfilt[{extra}]'",
-            name=module,
-        ) from None
-
-
-def call_batched(owner: Any, name: str, states: Sequence[Array], *rest: float) -> Array:
-    """What a function makes of states (..., d), as (..., ``owner.dim``); it gets copies.
-
-    A function that was written for one state may return the right shape with wrong numbers. So the
-    first rows that differ are compared with one of them alone, and so is the first only row.
-
-    Parameters
-    ----------
-    owner, name
-        Where the user's function is, and as what.
-    states : sequence of ndarray, (..., d)
-        Its first arguments.
-    rest
-        Its other arguments.
-
-    Examples
-    --------
-    >>> from types import SimpleNamespace
-    >>> x = np.array([[1.0, 2.0], [3.0, 4.0]])
-    >>> call_batched(SimpleNamespace(dim=2, flow=lambda x: x[..., ::-1]), "flow", [x])
-    array([[2., 1.],
-           [4., 3.]])
-    >>> one = SimpleNamespace(dim=2, flow=lambda x: np.array([x[1], x[0]]))
-    >>> call_batched(one, "flow", [x])
-    Traceback (most recent call last):
-    ValueError: flow must take many states at once, ...
-    >>> two = SimpleNamespace(dim=2, flow=lambda x: x + x[:, :1])
-    >>> call_batched(two, "flow", [x])
-    Traceback (most recent call last):
-    ValueError: flow must take many states at once, ...
-    >>> unit = SimpleNamespace(dim=2, flow=lambda x: x / np.linalg.norm(x))
-    >>> call_batched(unit, "flow", [x[1:]])
-    array([[0.6, 0.8]])
-    >>> call_batched(unit, "flow", [x])
-    Traceback (most recent call last):
-    ValueError: flow must take many states at once, ...
-    """
-    function = getattr(owner, name)
-    x = states[0]
-    out = _made(function, states, rest)
-    wanted = (*x.shape[:-1], owner.dim)
-    fits = getattr(out, "shape", None) == wanted  # an error has none
-    done = "_compared" if x.size > x.shape[-1] else "_compared_alone"
-    if x.ndim > 1 and x.size and not (fits and done in vars(owner)):
-        last = [s.reshape(-1, s.shape[-1])[-1] for s in states]
-        alone = _made(function, last, rest)
-        if fits:
-            wrong = _differs(out.reshape(-1, owner.dim)[-1], alone, last)
-        else:  # an error of its own comes from some states only, and not from one of them alone
-            copies = [
-                np.broadcast_to(one, s.shape)
-                for one, s in zip(last, states, strict=True)
-            ]
-            many = _made(function, copies, rest)
-            wrong = np.shape(alone) == wanted[-1:] and np.shape(many) != wanted
-        if wrong:
-            raise ValueError(
-                f"{name} must take many states at once, (..., d), components "
-                "last (x[..., 0], not x[0] or x[:, 0]), got one for other axes"
-            )
-        first = x.reshape(-1, x.shape[-1])[0]
-        if fits and (first != (last[0] if done == "_compared" else first[-1])).any():
-            vars(owner)[done] = True
-    if fits:
-        return np.asarray(out)
-    if isinstance(out, IndexError):
-        raise ValueError(f"x must have more components, got {x.shape}") from out
-    if isinstance(out, Exception):
-        raise out
-    raise ValueError(
-        f"{name} must return shape {wanted} for states {x.shape}, got {out.shape}"
-    )
-
-
-def _made(
-    function: Callable[..., Any], states: Sequence[Array], rest: tuple[float, ...]
-) -> Any:
-    """What a function returns, or the error that it raises."""
-    try:
-        return np.asarray(
-            function(*[s.copy() for s in states], *rest), dtype=np.float64
-        )
-    except (TypeError, ValueError, IndexError) as error:
-        return error
-
-
-def _differs(row: Array, alone: Any, states: Sequence[Array]) -> bool:
-    if np.shape(alone) != row.shape:
-        return isinstance(alone, IndexError)  # it wants two axes, and may get three
-    # Rules of adaptive step differ a little; wrong rows differ as much as the states move.
-    moved = alone - states[0] if alone.shape == states[0].shape else alone
-    bound = 1e-2 * np.abs(moved).max() + 1e-9 * np.abs(alone).max()
-    return bool(
-        (np.isnan(row) != np.isnan(alone)).any() or (np.abs(row - alone) > bound).any()
-    )

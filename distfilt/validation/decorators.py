@@ -1,90 +1,106 @@
-"""Doors of functions and of frozen dataclasses, made from their annotations."""
+"""Validation of a function's arguments by its annotations, and how nested calls skip it."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import MISSING as _NO_DEFAULT
-from dataclasses import fields
-from functools import cache, cached_property, partial, wraps
+from functools import cached_property, partial, wraps
 from inspect import Parameter, signature
-from typing import Any, Self, TypeVar, cast
+from typing import Any, TypeVar, cast
 
-import numpy as np
+from .annotations import CallContext, Constraint
+from .resolving import make_constraints
 
-from .annotations import Kind, Scope, kind_of
-
-__all__ = ["FrozenModel", "call_user", "skip_validation", "validated"]
+__all__ = ["SignatureConstraints", "call_user", "skip_validation", "validated"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def _declared(
-    annotations: Mapping[str, Any], names: Mapping[str, Any]
-) -> dict[str, Kind]:
-    """The kinds of named annotations, arrays last: their shapes may speak of the others."""
-    found: dict[str, Kind | None] = {}
-    for name, annotation in annotations.items():
-        with suppress(NameError):  # a name that only the type checker imports
-            meant = (
-                eval(annotation, dict(names))
-                if isinstance(annotation, str)
-                else annotation
-            )
-            found[name] = None if name == "return" else kind_of(meant)
-    return _arrays_last(
-        {name: kind for name, kind in found.items() if kind is not None}
-    )
+class SignatureConstraints:
+    """The constraints of a function's parameters, evaluated when it is first called."""
 
-
-def _arrays_last(kinds: dict[str, Kind]) -> dict[str, Kind]:
-    return dict(sorted(kinds.items(), key=lambda item: "an array" in item[1].needs))
-
-
-class _Plan:
-    """The kinds of a function's arguments, read when it is first called."""
-
-    def __init__(self, function: Any) -> None:
+    def __init__(
+        self, function: Any, annotations: Mapping[str, Any] | None = None
+    ) -> None:
         self.function = function
+        self.annotations = annotations
 
     @cached_property
-    def kinds(self) -> dict[str, Kind]:
-        """Of each argument that has one."""
-        return _declared(self.function.__annotations__, self.function.__globals__)
+    def constraints(self) -> dict[str, Constraint]:
+        """Constraints by parameter, those of arrays last."""
+        function = self.function
+        annotations = self.annotations
+        if annotations is None:
+            annotations = function.__annotations__
+        return make_constraints(
+            annotations,
+            function.__module__,
+            function.__globals__,
+            f"{function.__qualname__}()",
+        )
 
     @cached_property
-    def row(self) -> tuple[str, ...]:
-        """The names of the arguments that may stand in a row."""
-        known = signature(self.function).parameters.values()
-        return tuple(p.name for p in known if p.kind <= Parameter.POSITIONAL_OR_KEYWORD)
+    def positional_names(self) -> tuple[str, ...]:
+        """Names of the parameters that may be given by position."""
+        parameters = signature(self.function).parameters.values()
+        allowed = (Parameter.POSITIONAL_ONLY, Parameter.POSITIONAL_OR_KEYWORD)
+        return tuple([p.name for p in parameters if p.kind in allowed])
 
     @cached_property
     def defaults(self) -> dict[str, Any]:
-        """What stands for the arguments that are left out."""
-        known = signature(self.function).parameters.values()
-        return {p.name: p.default for p in known if p.default is not Parameter.empty}
+        """Default values by parameter."""
+        parameters = signature(self.function).parameters.values()
+        return {
+            p.name: p.default for p in parameters if p.default is not Parameter.empty
+        }
 
     def validate(
         self, args: tuple[Any, ...], options: dict[str, Any]
     ) -> dict[str, Any]:
-        """The arguments by name, converted, or the error for the first that does not fit."""
-        given = dict(zip(self.row, args, strict=False)) | options
-        if len(given) < len(args) + len(options):  # too many, or one of them twice
+        """Return the converted arguments by name, or raise an error for the first wrong one."""
+        arguments = dict(zip(self.positional_names, args, strict=False)) | options
+        if len(arguments) < len(args) + len(options):
+            # Too many arguments, or one of them twice: Python's own error says which.
             signature(self.function).bind(*args, **options)
-        scope = Scope(self.defaults | given)
-        for name, kind in self.kinds.items():
-            if name in given:
-                given[name] = scope.values[name] = kind.check(given[name], name, scope)
-        return given
+        context = CallContext(self.defaults | arguments)
+        for name, constraint in self.constraints.items():
+            if name in arguments:
+                value = constraint.validate(arguments[name], name, context)
+                arguments[name] = value
+                context.arguments[name] = value
+        return arguments
 
 
-_NESTED: ContextVar[bool] = ContextVar("nested", default=False)
-"""Whether a validated function is running, so that those which it calls need no checks."""
+class _Flag:
+    """A context variable that is pickled by its name.
+
+    A wrapper made inside a function is sent to a worker with its globals, and a plain
+    `ContextVar` cannot be pickled.
+    """
+
+    __slots__ = ("get", "reset", "set")
+
+    def __init__(self) -> None:
+        variable = ContextVar("nested", default=False)
+        self.get = variable.get
+        self.set = variable.set
+        self.reset = variable.reset
+
+    def __reduce__(self) -> str:
+        return "_NESTED"
 
 
-def validated(function: F, *, call: Callable[..., Any] | None = None) -> F:
+_NESTED = _Flag()
+"""Whether a validated function is running, so that functions which it calls skip the checks."""
+
+
+def validated(
+    function: F,
+    *,
+    call: Callable[..., Any] | None = None,
+    annotations: Mapping[str, Any] | None = None,
+) -> F:
     """Let a function's annotations check its arguments.
 
     The checks are made once, at the outermost call: functions that a validated function calls get
@@ -94,22 +110,30 @@ def validated(function: F, *, call: Callable[..., Any] | None = None) -> F:
     Parameters
     ----------
     function : callable
-        Its annotations are kinds as in the table of :mod:`distfilt.validation`. Defaults are not
-        checked.
+        Its annotations are as in the table of :mod:`distfilt.validation`. Defaults are not checked.
     call : callable, optional
         Called with the checked arguments in place of the function, by their names.
+    annotations : mapping of str to annotation, optional
+        Annotations by argument, in place of the function's own.
 
     Returns
     -------
     callable
         The same function with checks.
 
+    Raises
+    ------
+    NameError
+        At the first call, if an annotation cannot be evaluated.
+
     Examples
     --------
     >>> from typing import Annotated
-    >>> from distfilt.validation import Array, PositiveFloat
+    >>> from distfilt.validation import Array, ArrayInput, PositiveFloat
     >>> @validated
-    ... def scale(x: Annotated[Array, "... d"], factor: PositiveFloat = 2.0) -> Array:
+    ... def scale(
+    ...     x: Annotated[ArrayInput, "... d"], factor: PositiveFloat = 2.0
+    ... ) -> Array:
     ...     return factor * x
     >>> scale([1.0, 2.0])
     array([2., 4.])
@@ -117,21 +141,21 @@ def validated(function: F, *, call: Callable[..., Any] | None = None) -> F:
     Traceback (most recent call last):
     ValueError: factor must be positive, got -1.0
     """
-    plan = _Plan(function)
+    constraints = SignatureConstraints(function, annotations)
     outermost = function if call is None else call
 
     @wraps(function)
     def wrapper(*args: Any, **options: Any) -> Any:
         if _NESTED.get():
             return function(*args, **options)
-        given = plan.validate(args, options)
+        arguments = constraints.validate(args, options)
         token = _NESTED.set(True)
         try:
-            return outermost(**given)
+            return outermost(**arguments)
         finally:
             _NESTED.reset(token)
 
-    wrapper.plan = plan  # type: ignore[attr-defined]
+    wrapper.signature_constraints = constraints  # type: ignore[attr-defined]
     return cast(F, wrapper)
 
 
@@ -159,7 +183,7 @@ def skip_validation() -> Iterator[None]:
 def call_user(function: Callable[..., Any], *args: Any, **options: Any) -> Any:
     """Call a function that the user may have written, inside which arguments are checked again.
 
-    A function of the library's own is trusted and keeps its checks off.
+    A function of the library is trusted, and skips its checks.
 
     Examples
     --------
@@ -169,81 +193,11 @@ def call_user(function: Callable[..., Any], *args: Any, **options: Any) -> Any:
     inner = function
     while isinstance(inner, partial):
         inner = inner.func
-    if (getattr(inner, "__module__", None) or "").startswith("distfilt."):
+    module = getattr(inner, "__module__", None) or ""
+    if module.startswith("distfilt."):
         return function(*args, **options)
     token = _NESTED.set(False)
     try:
         return function(*args, **options)
     finally:
         _NESTED.reset(token)
-
-
-class FrozenModel:
-    """A base of frozen dataclasses: their fields' annotations are the door of the constructor.
-
-    Arrays are copied and kept read-only. A subclass with relations between its fields extends
-    `__post_init__`.
-
-    Examples
-    --------
-    >>> from dataclasses import dataclass
-    >>> @dataclass(frozen=True, eq=False)
-    ... class Label(FrozenModel):
-    ...     text: str
-    ...     size: int
-    >>> Label("a", 1.5)
-    Traceback (most recent call last):
-    distfilt.validation.InvalidArgumentError: size must be an integer, got 1.5
-    """
-
-    def __post_init__(self) -> None:
-        cls: Any = type(self)
-        scope = Scope(dict(vars(self)))
-        for name, kind in _of_fields(cls).items():
-            scope.values[name] = _kept(kind.check(scope.values[name], name, scope))
-        # What its functions say of each other is compared when they first speak.
-        vars(self).update(scope.values, _doubted=True)
-
-    @classmethod
-    def construct(cls, *args: Any, **options: Any) -> Self:
-        """Build one from what the library made itself: nothing is checked or copied."""
-        out, (names, factories) = object.__new__(cls), _names(cls)  # type: ignore[arg-type]
-        (own := vars(out)).update(zip(names, args, strict=False), **options)
-        for name, factory in factories:
-            if name not in own:
-                own[name] = factory()
-        return out
-
-    def replace(self, **changes: Any) -> Self:
-        """The same with other values in some fields, unchecked."""
-        known = {name: getattr(self, name) for name in _names(cast(Any, type(self)))[0]}
-        return self.construct(**known | changes)
-
-
-@cache
-def _names(cls: Any) -> tuple[tuple[str, ...], tuple[tuple[str, Any], ...]]:
-    """The fields, and what makes defaults; a plain default is an attribute of the class."""
-    made = {f.name: f.default_factory for f in fields(cls)}
-    factories = [(name, make) for name, make in made.items() if make is not _NO_DEFAULT]
-    return tuple(made), tuple(factories)
-
-
-@cache
-def _of_fields(cls: Any) -> dict[str, Kind]:
-    found: dict[str, Kind] = {}
-    for base in reversed(cls.__mro__):
-        own = vars(base).get("__annotations__", {}).items()
-        own = {name: a for name, a in own if name in _names(cls)[0]}
-        found |= _declared(own, vars(sys.modules.get(base.__module__, sys)))
-    return _arrays_last(found)
-
-
-def _kept(value: Any) -> Any:
-    """Arrays as the record's own."""
-    if isinstance(value, tuple) and type(value) is tuple:
-        return tuple(_kept(v) for v in value)
-    if not isinstance(value, np.ndarray):
-        return value
-    own = value.copy()
-    own.setflags(write=False)
-    return own

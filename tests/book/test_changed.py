@@ -18,8 +18,8 @@ LINKS = (
 )
 SENSOR = (
     (
-        'kind = "angle"\nnoise = 0.2\nunit = "rad"',
-        'kind = "range"\nnoise = 0.2\nunit = "m"',
+        'kind = "line_angle"\nnoise = 0.2\nunit = "rad"',
+        'kind = "distance"\nnoise = 0.2\nunit = "m"',
     ),
 )
 

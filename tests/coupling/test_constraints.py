@@ -38,8 +38,8 @@ def test_the_readings_by_their_formulas_in_a_batch(eps: float) -> None:
         "particle": d - values,
         "shift": np.tile(d - mean, (25, 1)),
     }
-    for reading, aim in aims.items():
-        options = {"reading": reading, "regularisation": eps, "guarded": False}
+    for variant, aim in aims.items():
+        options = {"variant": variant, "regularisation": eps, "safeguard": False}
         out = project(np.stack([0.5 * x, x]), g, **options)
         assert np.allclose(out[1], x + aim @ gain.T, atol=1e-10)
         assert np.allclose(out[0], project(0.5 * x, g, **options), atol=1e-10)
@@ -48,7 +48,7 @@ def test_the_readings_by_their_formulas_in_a_batch(eps: float) -> None:
 def test_a_projection_that_makes_it_worse_is_refused() -> None:
     far = np.random.default_rng(4).standard_normal((40, 2)) * [3.0, 0.01]
     both = project(
-        np.stack([far, 0.1 * far + 0.7]), norm_constraint([0, 1]), reading="particle"
+        np.stack([far, 0.1 * far + 0.7]), norm_constraint([0, 1]), variant="particle"
     )
     assert (both[0] == far).all() and (both[1] != 0.1 * far + 0.7).all()
 
@@ -63,7 +63,7 @@ def test_the_guard_judges_what_the_reading_moves() -> None:
         centre = np.array([0.5, 0.87]) + 0.02 * rng.standard_normal(2)
         x = centre + 0.1 * rng.standard_normal((50, 2))
         out = project(x, g)
-        free = project(x, g, guarded=False)
+        free = project(x, g, safeguard=False)
         before = g.residual(x)
         after = g.residual(free)
         miss.append(abs(after.mean()) <= abs(before.mean()))
@@ -84,7 +84,7 @@ def test_a_shift_too_far_or_out_of_the_domain_is_refused(
 ) -> None:
     """At the bottom of g = x² the regression's slope is small, and the step to d far too long."""
     g = Constraint(function, [value])
-    assert (project(x, g) == x).all() and (project(x, g, guarded=False) != x).all()
+    assert (project(x, g) == x).all() and (project(x, g, safeguard=False) != x).all()
 
 
 @given(st.integers(0, 10_000), st.floats(0.2, 5.0))
@@ -199,6 +199,6 @@ def test_a_constraint_that_has_no_real_value_is_refused(value: complex) -> None:
         with pytest.raises(ValueError, match="function must"):
             call(x, g)
         with pytest.raises(
-            ValueError, match="^constraint must be states with more than 1"
+            ValueError, match="^constraint must be .* of more than 1"
         ):
             call(x[..., None], norm_constraint([0, 1]))

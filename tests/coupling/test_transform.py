@@ -8,7 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from distfilt import coupling
-from distfilt.coupling.transform import _chosen
+from distfilt.coupling.transform import _choose_rows
 
 _rng = np.random.default_rng
 
@@ -105,7 +105,7 @@ def test_the_correction_gives_both_moments(seed: int, n: int, d: int) -> None:
 def test_the_correction_is_the_symmetric_map() -> None:
     x, logs, w = _case(7)
     plain = coupling.transform_ensemble(x, logs)
-    moved = coupling.second_order(plain, x, logs)
+    moved = coupling.correct_moments(plain, x, logs)
     a = plain - plain.mean(axis=0)
     b = moved - moved.mean(axis=0)
     matrix = np.linalg.lstsq(a, b, rcond=None)[0]
@@ -127,7 +127,7 @@ def test_the_correction_in_any_units(std: list[float], place: list[float]) -> No
     """A small unit beside a large one, far from zero, keeps its moments too."""
     x, logs, w = _case(11, 30, len(std))
     x = place + x * std
-    moved = coupling.second_order(coupling.transform_ensemble(x, logs), x, logs)
+    moved = coupling.correct_moments(coupling.transform_ensemble(x, logs), x, logs)
     unit = np.outer(std, std)
     assert (np.abs(moved.mean(axis=0) - w @ x) < 1e-12 * (np.abs(place) + std)).all()
     assert np.abs((_covariance(moved) - _covariance(x, w)) / unit).max() < 1e-8
@@ -138,7 +138,7 @@ def test_the_correction_stretches_nothing_where_there_is_nothing() -> None:
         x, logs, _ = _case(seed, 12, 4)
         flat = x.copy()
         flat[:, 0] = 0.3
-        moved = coupling.second_order(flat, x, logs)
+        moved = coupling.correct_moments(flat, x, logs)
         sizes = np.linalg.svd(moved - moved.mean(axis=0), compute_uv=False)
         assert sizes[3] < 1e-12 * sizes[0] and sizes[2] > 1e-6 * sizes[0]
 
@@ -155,7 +155,7 @@ def test_entropy_shrinks_and_debiasing_restores() -> None:
     assert np.abs(debiased.mean(axis=0) - w @ x).max() < 1e-13
     free = biased + x - coupling.transform_ensemble(x, np.zeros(60), **entropic)
     assert np.allclose(debiased, free + w @ x - free.mean(axis=0))
-    with pytest.warns(RuntimeWarning, match="must have logarithms, got a sum of 1"):
+    with pytest.warns(RuntimeWarning, match="must be logarithms, got numbers with a sum of 1"):
         coupling.transform_ensemble(x, w)
 
 
@@ -185,7 +185,7 @@ def test_pieces_choose_as_often_as_the_plan_says() -> None:
     """Over 4000 draws each column's frequencies lie within five standard errors of its shares."""
     share = np.array([[0.2, 0.5, 1.0, 0.1], [0.3, 0.5, 0.0, 0.2], [0.5, 0.0, 0.0, 0.7]])
     rng = _rng(13)
-    draws = np.array([_chosen(share, rng) for _ in range(4000)])
+    draws = np.array([_choose_rows(share, rng) for _ in range(4000)])
     for row in range(3):
         gap = (draws == row).mean(axis=0) - share[row]
         bound = 5 * np.sqrt(share[row] * (1 - share[row]) / 4000)

@@ -11,7 +11,7 @@ from distfilt import metrics
 from distfilt.filters import FilterError, Observation, final_state
 from distfilt.models import LinearModel, Model
 from distfilt.network import Faults
-from distfilt.sensors import Sensor, component, line_angle
+from distfilt.sensors import Sensor, bearing, component
 
 from .families import FAMILIES, PRIOR, TIMES, data, made, rules, team, values
 
@@ -139,7 +139,7 @@ def test_direction_across_pi(family: str) -> None:
     """A truth near the negative x-axis, whose direction jumps between π and −π."""
     still = Model(2, lambda x, t, dt: x, lambda t, dt: 1e-4 * dt * np.eye(2))
     sensors: list[Sensor | None] = [
-        line_angle([0, 1], std=0.05, full=True),
+        bearing([0, 1], std=0.05),
         component([0], std=0.1),
     ]
     f = made(family, sensors=sensors, model=still)[0]

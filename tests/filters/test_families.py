@@ -114,7 +114,7 @@ def test_jitter_moves_copies_by_a_share_of_what_is_believed() -> None:
 
 def test_a_member_that_was_picked_or_moved_sees_changes_from_where_it_comes() -> None:
     """Nothing moves, and a reading says so: that tells no particle from another."""
-    eyes = [[component([0], std=0.5), from_name("differential", [0], std=0.1)]]
+    eyes = [[component([0], std=0.5), from_name("increment", [0], std=0.1)]]
     f = filters.ParticleFilter(
         STILL,
         eyes * 2,
@@ -156,7 +156,7 @@ def test_a_change_that_is_read_after_its_step_is_one_from_the_step_s_begin(
     family: str,
 ) -> None:
     """A reading moves members as in one step with it; of what is not kept it is refused."""
-    eyes = [[from_name("differential", [0], std=0.5), component([1], std=0.8)]]
+    eyes = [[from_name("increment", [0], std=0.5), component([1], std=0.8)]]
     f, start = made(family, sensors=eyes, graph=None, lag=2)
     now = [[filters.Observation(1.0, 0, [0.4]), filters.Observation(1.0, 0, [-0.7], 1)]]
     moved = f.step(start, 0.5, [None])
@@ -167,7 +167,7 @@ def test_a_change_that_is_read_after_its_step_is_one_from_the_step_s_begin(
             f.summarize(state).mean, f.summarize(at_once[0]).mean, atol=1e-9
         )
     with pytest.raises(
-        ValueError, match="needs the states before, which at a state's own time"
+        ValueError, match="previous must be the states at the previous observation time"
     ):
         replace(f, lag=0).step(start, 0.0, [filters.Observation(0.0, 0, [0.4])])
 

@@ -26,7 +26,7 @@ from distfilt.network import (
     graphs,
     mean_pull,
 )
-from distfilt.sensors import Sensor, component, line_angle
+from distfilt.sensors import Sensor, bearing, component, line_angle
 
 from .families import NOISE, PRIOR, TIMES, Q, data, kalman, model
 
@@ -210,7 +210,7 @@ def test_the_gate_lets_pass_what_its_share_says(family: str) -> None:
             assert same == bool(refused)
     # Straight behind a direction predictions lie on both sides of where its residuals jump.
     given = {
-        "sensors": [line_angle([0, 1], std=0.05, full=True), None, None],
+        "sensors": [bearing([0, 1], std=0.05), None, None],
         "gate_probability": 0.99,
     }
     f = made(

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 from distfilt.kalman import QuaternionChart, filterpy_ekf, kalman_filter, mekf
 from distfilt.linalg import central
 from distfilt.models import Model, constant_velocity, satellite_pose, simulate
-from distfilt.models.satellite import rotate
+from distfilt.models.quaternions import rotate
 from distfilt.sensors import component, range_bearing, stack
 from distfilt.sensors.kinds import increment
 from tests.support import spd, turning

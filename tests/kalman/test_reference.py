@@ -23,6 +23,7 @@ from distfilt.sensors import (
     Sensor,
     component,
     distance,
+    bearing,
     line_angle,
     range_bearing,
     stack,
@@ -140,7 +141,7 @@ def test_an_angle_may_wrap(filter_: Callable[..., Any]) -> None:
     """Bearings on either side of the cut: turned by half a turn, nothing but the signs changes."""
     options = {
         "model": walk(2),
-        "sensors": [line_angle([0, 1], std=0.01, full=True)],
+        "sensors": [bearing([0, 1], std=0.01)],
         "times": [1e-9],
     }
     mean = np.array([-1.0, 0.02])

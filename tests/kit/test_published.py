@@ -90,7 +90,7 @@ GAIN = '[parameters.gain]\nvalue = 0.05\nunit = "1"\nsource = "assumed"\nreason 
 
 
 AGENT = (
-    '[[agents]]\nname = "{}"\nkind = "direct"\nunit = "m"\nsource = "given"\n'
+    '[[agents]]\nname = "{}"\nkind = "component"\nunit = "m"\nsource = "given"\n'
     "where = \"Table II\"\nneighbours = ['A', 'B']\n"
 )
 GOOD = 'title = "A study"\n' + GAIN + AGENT.format("A") + AGENT.format("B")
@@ -148,10 +148,10 @@ def test_a_change_is_noticed_and_named() -> None:
     ("old", "new", "changes"),
     [
         (
-            'kind = "angle"\nnoise = 0.2\nunit = "rad"',
-            'kind = "range"\nnoise = 0.3\nunit = "m"',
+            'kind = "line_angle"\nnoise = 0.2\nunit = "rad"',
+            'kind = "distance"\nnoise = 0.3\nunit = "m"',
             (
-                "agents.B.kind: range, not angle",
+                "agents.B.kind: distance, not line_angle",
                 "agents.B.noise: 0.3, not 0.2",
                 "agents.B.unit: m, not rad",
             ),

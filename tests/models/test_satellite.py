@@ -12,14 +12,14 @@ from scipy.spatial.transform import Rotation
 import distfilt.models as att
 from distfilt.linalg import central
 from distfilt.models import satellite as sat
-from distfilt.models.satellite import left_directions, rotate, rotation_vector_between
+from distfilt.models.quaternions import left_directions, rotate, rotation_vector_between
 
 START = np.array([0.3, 0.2, 0.1, 1.0, 0.0, 0.0, 0.0])
 
 
 @given(st.floats(1e-3, 0.5), st.floats(0, 20))
 def test_transition_is_the_exponential_of_the_drift(rate: float, dt: float) -> None:
-    closed = sat._transition(dt, rate)
+    closed = sat._transition_matrix(dt, rate)
     assert np.allclose(closed, expm(sat._drift(rate) * dt), rtol=1e-9, atol=1e-9)
 
 
@@ -29,7 +29,7 @@ def test_drift_of_a_geostationary_orbit_keeps_its_digits() -> None:
     drift = sat._drift(rate)
     assert drift[3, 0] == 3 * rate * rate and drift[5, 2] == -rate * rate
     day = 86_164.0
-    closed = sat._transition(day, rate)
+    closed = sat._transition_matrix(day, rate)
     numeric = expm(drift * day)
     units = np.repeat([1.0, rate], 3)
     assert np.abs((closed - numeric) * units / units[:, None]).max() < 1e-10

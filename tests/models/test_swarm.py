@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from distfilt.models import RotatingMixture, Swarm, rotating_swarm
-from distfilt.models.swarm import _reflected
+from distfilt.models.swarm import _reflect
 
 CORNERS = [-1.0, 0.5], [1.0, 2.0]
 RATES = np.array([1e-4, 4e-4])
@@ -22,13 +22,13 @@ def _still(x: np.ndarray, t: float) -> np.ndarray:
 def test_reflection_is_even_and_periodic(a: float, b: float) -> None:
     low, high = (np.array(c) for c in CORNERS)
     width = high - low
-    here = _reflected(np.array([a, b]), low, high)
+    here = _reflect(np.array([a, b]), low, high)
     assert (here >= low).all() and (here <= high).all()
     # Mirrored in either wall, or moved by twice the box, a point folds to the same place.
     for other in (2 * low - [a, b], 2 * high - [a, b], np.array([a, b]) + 2 * width):
-        assert np.abs(_reflected(other, low, high) - here).max() < 1e-12 * 40
+        assert np.abs(_reflect(other, low, high) - here).max() < 1e-12 * 40
     inside = low + width * 0.3
-    assert np.abs(_reflected(inside, low, high) - inside).max() < 1e-14
+    assert np.abs(_reflect(inside, low, high) - inside).max() < 1e-14
 
 
 def test_score_is_the_gradient_of_the_logarithm() -> None:

@@ -1,4 +1,4 @@
-"""Valid calls of everything that has a door, as the examples of the documentation make them."""
+"""Valid calls of every validated callable, recorded while the docstrings' examples run."""
 
 from __future__ import annotations
 
@@ -16,152 +16,155 @@ from types import ModuleType
 from typing import Any
 
 import distfilt
-from distfilt.validation import FrozenModel, decorators
+from distfilt.validation import FrozenModel, decorators, frozen
 
-MOST = 4
-"""Recorded calls of one function."""
+MAX_CALLS = 4
+"""Calls that are recorded of one function."""
 
 
 def describe(thing: Any) -> dict[str, Any]:
-    """The kinds that a function with a door, or a class of records, declares by name."""
+    """Return the kinds that a validated function or a frozen model declares, by argument."""
     if inspect.isclass(thing):
-        return decorators._of_fields(thing) if issubclass(thing, FrozenModel) else {}
-    return dict(thing.plan.kinds) if hasattr(thing, "plan") else {}
+        return frozen.field_constraints(thing) if issubclass(thing, FrozenModel) else {}
+    return dict(thing.signature_constraints.constraints) if hasattr(thing, "signature_constraints") else {}
 
 
 @dataclass
 class Call:
-    """A valid call: what is called, and its arguments by name, defaults included."""
+    """A valid call: a callable and its arguments by name, defaults included."""
 
     function: Callable[..., Any]
     signature: inspect.Signature
-    given: dict[str, Any]
+    arguments: dict[str, Any]
 
     def run(self, **exchanged: Any) -> tuple[Any, dict[str, Any]]:
-        """The result, and the arguments as they are afterwards."""
+        """Call with some arguments exchanged; return the result and the arguments after it."""
         bound = self.signature.bind_partial()
-        bound.arguments.update(copy.deepcopy(self.given))
+        bound.arguments.update(copy.deepcopy(self.arguments))
         bound.arguments.update(exchanged)
         return self.function(*bound.args, **bound.kwargs), dict(bound.arguments)
 
 
 @dataclass
 class Recorder:
-    """The first few arguments that came to each door."""
+    """The arguments of the first few calls of each validated callable."""
 
     calls: dict[Any, list[tuple[Any, Any]]] = field(default_factory=dict)
 
-    def keep(self, key: Any, args: Any, options: Any) -> None:
-        """Copies, since a call may own what it gets."""
-        known = self.calls.setdefault(key, [])
-        if len(known) < MOST:
+    def record(self, key: Any, args: Any, options: Any) -> None:
+        """Store a copy of the arguments, which the call may change."""
+        recorded = self.calls.setdefault(key, [])
+        if len(recorded) < MAX_CALLS:
             with suppress(Exception):
-                known.append(copy.deepcopy((args, options)))
+                recorded.append(copy.deepcopy((args, options)))
 
     @contextmanager
-    def listening(self) -> Iterator[None]:
-        """While it lasts, what passes a door is kept."""
-        taken = decorators._Plan.validate
-        made = FrozenModel.__post_init__
+    def patch_validation(self) -> Iterator[None]:
+        """Record every validated call inside the context."""
+        validate = decorators.SignatureConstraints.validate
+        post_init = FrozenModel.__post_init__
 
-        def at_door(plan: Any, args: Any, options: Any) -> Any:
-            out = taken(plan, args, options)
-            with suppress(TypeError):  # the options of a partial come alone
+        def validate_and_record(plan: Any, args: Any, options: Any) -> Any:
+            checked = validate(plan, args, options)
+            # A partial is validated with some of its arguments only: not a complete call.
+            with suppress(TypeError):
                 inspect.signature(plan.function).bind(*args, **options)
-                self.keep(plan.function, args, options)
-            return out
+                self.record(plan.function, args, options)
+            return checked
 
-        def at_record(record: Any) -> None:
-            given = {f.name: getattr(record, f.name) for f in fields(record)}
-            made(record)
-            self.keep(type(record), (), given)
+        def construct_and_record(model: Any) -> None:
+            values = {f.name: getattr(model, f.name) for f in fields(model)}
+            post_init(model)
+            self.record(type(model), (), values)
 
-        decorators._Plan.validate = at_door
-        FrozenModel.__post_init__ = at_record
+        decorators.SignatureConstraints.validate = validate_and_record
+        FrozenModel.__post_init__ = construct_and_record
         try:
             with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
                 yield
         finally:
-            decorators._Plan.validate = taken
-            FrozenModel.__post_init__ = made
+            decorators.SignatureConstraints.validate = validate
+            FrozenModel.__post_init__ = post_init
 
 
 RECORDER = Recorder()
 _RUN: set[str] = set()
 
 
-def rooms() -> list[str]:
-    """The rooms that the library shows; validation are tested by their kinds."""
+def subpackages() -> list[str]:
+    """Return the public subpackages; `validation` is tested by its kinds instead."""
     return sorted(set(distfilt.__all__) - {"__version__", "validation"})
 
 
-def public(room: str) -> dict[str, Any]:
-    """What a room's face shows, and what the modules do that it hands on, by name."""
-    face = importlib.import_module(f"distfilt.{room}")
-    out: dict[str, Any] = {}
-    for name in getattr(face, "__all__", ()):
-        thing = getattr(face, name)
-        if isinstance(thing, ModuleType):
-            out |= {f"{room}.{name}.{n}": getattr(thing, n) for n in thing.__all__}
+def public_names(subpackage: str) -> dict[str, Any]:
+    """Return a subpackage's exports, and those of the modules among them, by name."""
+    package = importlib.import_module(f"distfilt.{subpackage}")
+    names: dict[str, Any] = {}
+    for name in getattr(package, "__all__", ()):
+        value = getattr(package, name)
+        if isinstance(value, ModuleType):
+            for inner_name in value.__all__:
+                names[f"{subpackage}.{name}.{inner_name}"] = getattr(value, inner_name)
         else:
-            out[f"{room}.{name}"] = thing
-    return out
+            names[f"{subpackage}.{name}"] = value
+    return names
 
 
 def callables(thing: Any) -> dict[str, Callable[..., Any]]:
-    """A function, or a class's constructor and public methods, if they declare what they take."""
+    """Return a function, or a class's constructor and public methods, if they are validated."""
+    members: dict[str, Callable[..., Any]] = {"": thing} if describe(thing) else {}
     if not inspect.isclass(thing):
-        return {"": thing} if describe(thing) else {}
-    out: dict[str, Callable[..., Any]] = {"": thing} if describe(thing) else {}
+        return members
     for base in reversed(thing.__mro__):
-        for name, found in vars(base).items():
-            function = getattr(found, "__func__", found)
+        for name, attribute in vars(base).items():
+            function = getattr(attribute, "__func__", attribute)
             if not name.startswith("_") and describe(function):
-                out[f".{name}"] = function
-    return out
+                members[f".{name}"] = function
+    return members
 
 
-def _examples(module: ModuleType) -> None:
+def _run_examples(module: ModuleType) -> None:
+    """Run a module's examples once, and record the calls that they make."""
     if module.__name__ in _RUN:
         return
     _RUN.add(module.__name__)
     runner = doctest.DocTestRunner(verbose=False, optionflags=doctest.ELLIPSIS)
     finder = doctest.DocTestFinder(exclude_empty=True)
-    with RECORDER.listening():
+    with RECORDER.patch_validation():
         for test in finder.find(module, globs=dict(vars(module))):
-            # With their globals: functions that an example defines are called again.
+            # Keep the globals: functions that an example defines are called again later.
             runner.run(test, out=lambda _: None, clear_globs=False)
 
 
 def _modules(thing: Any) -> Iterator[ModuleType]:
-    """Where a valid call may be found: its own module, its room, the whole library."""
+    """Yield the modules whose examples may call `thing`, the nearest first."""
     home = sys.modules[thing.__module__]
     yield home
-    near = home.__name__.split(".")[1]
-    names = [
-        info.name for info in pkgutil.walk_packages(distfilt.__path__, "distfilt.")
-    ]
-    for name in sorted(names, key=lambda n: (n.split(".")[1] != near, n)):
+    subpackage = home.__name__.split(".")[1]
+    packages = pkgutil.walk_packages(distfilt.__path__, "distfilt.")
+    names = [info.name for info in packages]
+    for name in sorted(names, key=lambda n: (n.split(".")[1] != subpackage, n)):
         yield importlib.import_module(name)
 
 
 def calls(thing: Any, function: Callable[..., Any]) -> list[Call]:
-    """Recorded calls of a function, a constructor or a method of the public `thing`."""
-    key = function if inspect.isclass(function) else function.plan.function  # type: ignore[attr-defined]
+    """Return recorded calls of a function, a constructor or a method of the public `thing`."""
+    key = function if inspect.isclass(function) else function.signature_constraints.function  # type: ignore[attr-defined]
     for module in _modules(thing):
-        _examples(module)
+        _run_examples(module)
         if RECORDER.calls.get(key):
             break
-    return [_call(function, *found) for found in RECORDER.calls.get(key, [])]
+    recorded = RECORDER.calls.get(key, [])
+    return [_bind(function, args, options) for args, options in recorded]
 
 
-def _call(function: Any, args: Any, options: Any) -> Call:
+def _bind(function: Any, args: Any, options: Any) -> Call:
+    """Return a recorded call with its arguments by name."""
     signature = inspect.signature(function)
     if inspect.isclass(function) and is_dataclass(function):
-        made = {f.name for f in fields(function) if f.init}
-        return Call(
-            function, signature, {n: v for n, v in options.items() if n in made}
-        )
+        accepted = {f.name for f in fields(function) if f.init}
+        arguments = {n: v for n, v in options.items() if n in accepted}
+        return Call(function, signature, arguments)
     bound = signature.bind(*args, **options)
     bound.apply_defaults()
     return Call(function, signature, dict(bound.arguments))

@@ -1,13 +1,13 @@
-"""Unusual input for every argument of everything that has a door: right, or refused by name.
+"""Unusual values for every argument of every validated callable.
 
-    python -m tests.tools.fuzz [room …]
+    python -m tests.tools.fuzz [SUBPACKAGE …]
 
-Each argument of a valid call, which an example of the documentation makes, is exchanged for other
-values, the same ones each time. One that means the same (a list, Fortran order, read-only memory)
-has to give the same result. One that means nothing (dates, complex numbers, masked arrays, text)
-has to be refused by an error that names the argument. Any other is refused by an error that names
-an argument, or gives a result without NaN. No call may change its arguments. What is otherwise
-stands in ``ALLOWED`` with the reason.
+The valid calls come from the examples of the docstrings. Each argument is exchanged for the same
+fixed list of values. An equivalent value (a list, Fortran order, read-only memory) must give the
+same result. A value of a wrong type (dates, complex numbers, masked arrays, text) must be rejected
+by an error that names the argument. Any other value is either rejected by an error that names an
+argument, or gives a result without NaN. No call may change its arguments. Exceptions stand in
+``ALLOWED`` with their reasons.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.tools.calls import Call, callables, calls, public, rooms
+from tests.tools.calls import Call, callables, calls, public_names, subpackages
 
 ROOT = Path(__file__).resolve().parents[2]
 REFUSALS = (ValueError, RuntimeError, LookupError, ImportError, FileNotFoundError)
@@ -39,7 +39,7 @@ SECONDS = 10
 
 @dataclass(frozen=True)
 class Finding:
-    """What became of one exchanged argument."""
+    """The outcome of one exchanged argument."""
 
     name: str
     argument: str
@@ -48,10 +48,10 @@ class Finding:
     text: str = ""
 
 
-# ---- what is exchanged -------------------------------------------------------------------------
+# ---- the values --------------------------------------------------------------------------------
 
 SAME = {"list", "fortran", "read-only", "strided", "numpy scalar", "0-d array"}
-"""Kinds that mean the same as the valid value."""
+"""Kinds that are equivalent to the valid value."""
 NEVER = {
     "complex",
     "dates",
@@ -63,11 +63,11 @@ NEVER = {
     "number",
     "dict",
 }
-"""Kinds that mean nothing, and are refused everywhere."""
+"""Kinds that are rejected everywhere."""
 
 
 def numeric(value: Any) -> bool:
-    """Whether a list or array is one of real numbers."""
+    """Return whether a list or array holds real numbers."""
     with suppress(Exception):
         return np.asarray(value).dtype.kind in "fiu" and np.asarray(value).size > 0
     return False
@@ -158,7 +158,7 @@ def other_kinds(value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def kinds(value: Any) -> Iterator[tuple[str, Any]]:
-    """What to put in the place of a valid value: the kind and the value."""
+    """Yield replacements of a valid value, each with the name of its kind."""
     if value is None:
         yield from (("text", "no such"), ("object", object()))
     elif isinstance(value, bool | int | float | np.number | np.bool_):
@@ -169,46 +169,50 @@ def kinds(value: Any) -> Iterator[tuple[str, Any]]:
         yield from other_kinds(value)
 
 
-# ---- what comes of it --------------------------------------------------------------------------
+# ---- the outcomes ------------------------------------------------------------------------------
 
 
 PLAIN = (str, bytes, bool, int, float, complex, np.generic, np.ndarray)
 
 
+def children(value: Any) -> Iterator[Any]:
+    """Yield the entries of a container: a mapping, a sequence or a dataclass."""
+    if isinstance(value, Mapping):
+        yield from (value[key] for key in value)
+    elif isinstance(value, list | tuple):
+        yield from value
+    elif is_dataclass(value) and not inspect.isclass(value):
+        yield from (getattr(value, field.name, None) for field in fields(value))
+
+
 def parts(
-    value: Any, depth: int = 0, seen: frozenset[int] = frozenset()
+    value: Any, depth: int = 0, visited: frozenset[int] = frozenset()
 ) -> Iterator[Any]:
-    """The numbers, texts and arrays that a result holds, in order."""
-    if depth > 8 or id(value) in seen:
+    """Yield the numbers, texts and arrays that a result holds, in order."""
+    if depth > 8 or id(value) in visited:
         return
-    seen |= {id(value)}
     if value is None or isinstance(value, PLAIN):
         yield value
-    elif isinstance(value, Mapping):
-        for key in value:
-            yield from parts(value[key], depth + 1, seen)
-    elif isinstance(value, list | tuple):
-        for v in value:
-            yield from parts(v, depth + 1, seen)
-    elif hasattr(value, "data_vars"):
+    elif hasattr(value, "data_vars"):  # an xarray.Dataset
         yield from (value[name].to_numpy() for name in value.variables)
-    elif hasattr(value, "tocoo"):
+    elif hasattr(value, "tocoo"):  # a sparse matrix
         yield value.toarray()
     elif isinstance(value, np.random.Generator):
         yield str(value.bit_generator.state)
-    elif is_dataclass(value) and not inspect.isclass(value):
-        for field in fields(value):
-            yield from parts(getattr(value, field.name, None), depth + 1, seen)
+    else:
+        for child in children(value):
+            yield from parts(child, depth + 1, visited | {id(value)})
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two results are equal, to rounding."""
+    """Return whether two results are equal, to rounding."""
     xs = list(parts(a))
     ys = list(parts(b))
     return len(xs) == len(ys) and all(equal(x, y) for x, y in zip(xs, ys, strict=True))
 
 
 def equal(x: Any, y: Any) -> bool:
+    """Return whether two arrays are equal, to rounding of the largest entry."""
     x = np.asarray(x)
     y = np.asarray(y)
     if x.shape != y.shape:
@@ -220,24 +224,27 @@ def equal(x: Any, y: Any) -> bool:
 
 
 def exact(a: Any, b: Any) -> bool:
-    """Whether two arguments are the same to the bit."""
+    """Return whether two arguments are the same to the bit."""
     pairs = (
         (np.asarray(x), np.asarray(y)) for x, y in zip(parts(a), parts(b), strict=False)
     )
     return all(x.dtype.kind == "O" or x.tobytes() == y.tobytes() for x, y in pairs)
 
 
-def nans(value: Any) -> int:
+def nan_count(value: Any) -> int:
+    """Count the NaN in all arrays of a result."""
     arrays = (np.asarray(v) for v in parts(value))
     return sum(int(np.isnan(a).sum()) for a in arrays if a.dtype.kind in "fc")
 
 
 class TooLong(BaseException):
-    pass
+    """A call took more than its time; no `except Exception` of the library catches it."""
 
 
 @contextmanager
-def limited(seconds: int) -> Iterator[None]:
+def time_limit(seconds: int) -> Iterator[None]:
+    """Raise `TooLong` after some seconds inside the context."""
+
     def stop(*_: Any) -> None:
         raise TooLong
 
@@ -250,72 +257,85 @@ def limited(seconds: int) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-def refused(error: Exception, call: Call, argument: str, kind: str) -> bool:
-    """Whether an error names the argument, or for a mere value, what was computed from it."""
+def names_argument(error: Exception, call: Call, argument: str, kind: str) -> bool:
+    """Return whether an error names the argument.
+
+    If only the value is unusual, the error may also name another argument, or a quantity that was
+    computed from it.
+    """
     text = str(error)
-    if kind not in NEVER and (
-        re.match(r"[\w .\[\]]+: ", text) or isinstance(error, np.linalg.LinAlgError)
-    ):
-        return True
-    names = {argument} if kind in NEVER else {argument, *call.given}
+    names = {argument}
+    if kind not in NEVER:
+        computed = re.match(r"[\w .\[\]]+: ", text)
+        if computed or isinstance(error, np.linalg.LinAlgError):
+            return True
+        names |= set(call.arguments)
     return any(re.search(rf"\b{re.escape(name)}\b", text) for name in names)
 
 
-def tried(
+def classify_error(error: Exception, call: Call, argument: str, kind: str) -> str:
+    """Return how good a rejection is: by a right class of error, and naming the argument."""
+    if not isinstance(error, REFUSALS):
+        return "raw"
+    if kind in SAME:
+        return "misread"
+    return "rejected" if names_argument(error, call, argument, kind) else "unnamed"
+
+
+def exchange(
     call: Call, where: tuple[str, str, str], value: Any, reference: Any
 ) -> Finding:
-    """What the call makes of the exchanged argument."""
+    """Run a call with one argument exchanged, and classify the outcome."""
     _, argument, kind = where
-    before = copy.deepcopy(call.given) | {argument: copy.deepcopy(value)}
+    before = copy.deepcopy(call.arguments) | {argument: copy.deepcopy(value)}
     try:
-        with limited(SECONDS), warnings.catch_warnings(), np.errstate(all="ignore"):
+        with time_limit(SECONDS), warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
-            out, after = call.run(**{argument: value})
+            result, after = call.run(**{argument: value})
     except TooLong:
         return Finding(*where, "too long")
     except MemoryError:
         return Finding(*where, "rejected", "memory")
     except Exception as error:
-        result = "rejected" if refused(error, call, argument, kind) else "unnamed"
-        result = "misread" if kind in SAME else result
-        result = result if isinstance(error, REFUSALS) else "raw"
-        return Finding(*where, result, f"{type(error).__name__}: {error}"[:200])
+        outcome = classify_error(error, call, argument, kind)
+        return Finding(*where, outcome, f"{type(error).__name__}: {error}"[:200])
     for name in set(before) - {"rng", "self", "cls"}:
         if not exact(before[name], after.get(name)):
             return Finding(*where, "changed", name)
     if kind in SAME:
-        return Finding(*where, "same" if same(reference, out) else "different")
+        return Finding(*where, "same" if same(reference, result) else "different")
     if kind in NEVER:
-        return Finding(*where, "taken", type(out).__name__)
-    return Finding(*where, "NaN" if nans(out) > nans(reference) else "finite")
+        return Finding(*where, "accepted", type(result).__name__)
+    return Finding(
+        *where, "NaN" if nan_count(result) > nan_count(reference) else "finite"
+    )
 
 
-def of(name: str, several: list[Call]) -> Iterator[Finding]:
-    """Every exchange of every argument of a function's calls."""
-    done: set[tuple[str, str, type]] = set()
-    for call in several:
+def fuzz_calls(name: str, valid_calls: list[Call]) -> Iterator[Finding]:
+    """Exchange every argument of a function's calls by every kind of value, once a type."""
+    tried: set[tuple[str, str, type]] = set()
+    for call in valid_calls:
         try:
             reference, _ = call.run()
         except Exception as error:
             yield Finding(name, "", "as recorded", "fails", f"{error!r}"[:200])
             continue
-        for argument, valid in call.given.items():
+        for argument, valid in call.arguments.items():
             parameter = call.signature.parameters[argument]
             if argument in ("self", "cls") or parameter.kind in (2, 4):
                 continue
             for kind, value in kinds(valid):
                 key = argument, kind, type(valid)
-                if key not in done and not (
-                    value is None and parameter.default is None
-                ):
-                    done.add(key)
-                    yield tried(call, (name, argument, kind), value, reference)
+                is_default = value is None and parameter.default is None
+                if key not in tried and not is_default:
+                    tried.add(key)
+                    yield exchange(call, (name, argument, kind), value, reference)
 
 
 GOOD = {"rejected", "same", "finite"}
 ALLOWED: dict[tuple[str, str, str], str] = {
     (
-        r"network\.(average|pi_step)",
+        r"network\.(average_consensus|pi_step)",
         "gain|dt",
         "huge: (NaN|too long)",
     ): "an iteration that diverges, with a warning before; as many substeps as are stable",
@@ -327,8 +347,8 @@ ALLOWED: dict[tuple[str, str, str], str] = {
     (
         r"density\.DynamicAverage",
         "modes",
-        "None: taken",
-    ): "all cells in place of coefficients",
+        "None: accepted",
+    ): "None stands for all cells instead of coefficients",
     (
         r"models\.(Model\..*|rk4.*|RotatingMixture.*)",
         r".*",
@@ -338,55 +358,57 @@ ALLOWED: dict[tuple[str, str, str], str] = {
         r"sensors\.Sensor.*",
         r".*",
         r"(tiny|zero|NaN): NaN",
-    ): "a direction to where the sensor is, or a reading that is missing",
-    (r"sensors\.wrap|filters\.Reading", r".*", "NaN: NaN"): "a reading that is missing",
+    ): "the direction to the sensor's own position, or a missing measurement",
+    (r"sensors\.wrap|filters\.Observation", r".*", "NaN: NaN"): "a missing measurement",
     (
         r"kalman\.filterpy_\w+|models\.pendulum_chart",
         r".*",
         r"huge: (unnamed|NaN)",
-    ): "an overflow, in another package's words or an angle of nothing",
+    ): "an overflow, reported by another package, or the angle of a zero vector",
 }
-"""(callable, argument, kind and result) as patterns to the reason why it may be so."""
+"""Patterns of (callable, argument, kind and outcome), and why that outcome is allowed."""
 
 
-def judged(found: Finding) -> str:
-    """The result, or that it is allowed."""
-    names = (found.name, found.argument, f"{found.kind}: {found.result}")
-    if found.result not in GOOD:
+def judge(finding: Finding) -> str:
+    """Return the outcome, or "allowed" if `ALLOWED` lists it."""
+    names = (finding.name, finding.argument, f"{finding.kind}: {finding.result}")
+    if finding.result not in GOOD:
         for patterns in ALLOWED:
-            if all(re.fullmatch(p, n) for p, n in zip(patterns, names, strict=True)):
+            pairs = zip(patterns, names, strict=True)
+            if all(re.fullmatch(pattern, name) for pattern, name in pairs):
                 return "allowed"
-    return found.result
+    return finding.result
 
 
 def run(chosen: list[str]) -> list[Finding]:
-    """All findings of the chosen rooms, in a folder of its own."""
-    here = Path.cwd()
-    out = []
+    """Return all findings of the chosen subpackages; files are written to a scratch folder."""
+    folder = Path.cwd()
+    findings: list[Finding] = []
     with tempfile.TemporaryDirectory(prefix="fuzz-") as scratch:
         os.chdir(scratch)
         try:
-            for room in chosen:
-                for name, thing in public(room).items():
+            for subpackage in chosen:
+                for name, thing in public_names(subpackage).items():
                     for method, function in callables(thing).items():
-                        out += of(name + method, calls(thing, function))
+                        findings += fuzz_calls(name + method, calls(thing, function))
         finally:
-            os.chdir(here)
-    return out
+            os.chdir(folder)
+    return findings
 
 
 def main(arguments: list[str]) -> int:
-    """Print the faults and the counts; how many faults there are."""
-    began = time.perf_counter()
-    found = run(arguments or rooms())
-    faults = [f for f in found if judged(f) not in {*GOOD, "allowed"}]
+    """Print the faults and the counts; return the number of faults."""
+    started = time.perf_counter()
+    findings = run(arguments or subpackages())
+    faults = [f for f in findings if judge(f) not in {*GOOD, "allowed"}]
     for f in faults:
         print(f"{f.result:9} {f.name}({f.argument}): {f.kind}: {f.text}", flush=True)
-    named = len({f.name for f in found}), len({(f.name, f.argument) for f in found})
-    print(
-        f"{len(found)} calls, {named[0]} callables, {named[1]} arguments: "
-        f"{dict(Counter(map(judged, found)))}, {time.perf_counter() - began:.0f} s"
-    )
+    n_callables = len({f.name for f in findings})
+    n_arguments = len({(f.name, f.argument) for f in findings})
+    outcomes = dict(Counter(judge(f) for f in findings))
+    seconds = time.perf_counter() - started
+    print(f"{len(findings)} calls, {n_callables} callables, {n_arguments} arguments:")
+    print(f"{outcomes}, {seconds:.0f} s")
     return len(faults)
 
 

@@ -36,7 +36,7 @@ def test_effective_size_between_one_and_n() -> None:
     assert effective_size([0.0, -np.inf, -np.inf]) == pytest.approx(1.0)
     assert effective_size(np.full(8, -1e6)) == pytest.approx(8.0)
     assert effective_size(np.log([0.5, 0.5])) == pytest.approx(2.0)
-    with pytest.warns(RuntimeWarning, match="log_weights must have logarithms"):
+    with pytest.warns(RuntimeWarning, match="log_weights must be logarithms"):
         effective_size([0.5, 0.3, 0.2])
 
 

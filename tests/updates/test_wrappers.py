@@ -151,7 +151,7 @@ def test_projection_and_retraction_follow_the_update(inner: Update) -> None:
     y = np.tile(SEEN, (3, 1))
     four = x, x[..., :2], y, NOISE
     plain = inner(*four, rng=rng())
-    how: Any = {"reading": "particle", "regularisation": 0.01}
+    how: Any = {"variant": "particle", "regularisation": 0.01}
     out = updates.with_projection(inner, CIRCLE, **how)(*four, rng=rng())
     assert np.allclose(out, project(plain, CIRCLE, **how), atol=1e-14)
     assert np.abs(out - plain).max() > 1e-3

@@ -361,12 +361,21 @@ def judge_parameters(
 
 
 def _cell(value: Any) -> str:
-    """A value as a paper's table prints it: lists in brackets."""
+    """A value as a paper's table prints it: lists in brackets, sensors by its names."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, list | tuple):
         return f"[{','.join(str(v) for v in value)}]"
-    return str(value)
+    return _PRINTED_KINDS.get(str(value), str(value))
+
+
+_PRINTED_KINDS = {
+    "component": "direct",
+    "increment": "differential",
+    "distance": "range",
+    "line_angle": "angle",
+}
+"""The names that the papers' tables have for the library's kinds of sensors."""
 
 
 def _same(a: str, b: str) -> bool:

@@ -24,7 +24,11 @@ _SOURCES = ("given", "inferred", "assumed")
 _ORIGIN = ("source", "where", "reason", "note")
 """Columns of a row that say where it comes from; the others are its values."""
 
-_UNITS = {"range": ("m", "km"), "distance": ("m", "km"), "angle": ("rad", "deg")}
+_UNITS = {
+    "distance": ("m", "km"),
+    "bearing": ("rad", "deg"),
+    "line_angle": ("rad", "deg"),
+}
 """Units in which a reading of that kind can be; every other kind may have any."""
 
 
@@ -117,7 +121,7 @@ class Row(Mapping[str, Any]):
     >>> row = Row(
     ...     {
     ...         "name": "B",
-    ...         "kind": "angle",
+    ...         "kind": "line_angle",
     ...         "dims": [1, 2],
     ...         "noise": 0.2,
     ...         "unit": "rad",
@@ -126,10 +130,10 @@ class Row(Mapping[str, Any]):
     ...     }
     ... )
     >>> row.kind, row["dims"], row.why
-    ('angle', (1, 2), 'Table II.')
-    >>> Row({**row, "kind": "range"})
+    ('line_angle', (1, 2), 'Table II.')
+    >>> Row({**row, "kind": "distance"})
     Traceback (most recent call last):
-    ValueError: unit must have m or km for 'range', got 'rad'
+    ValueError: unit must have m or km for 'distance', got 'rad'
     """
 
     def __init__(
@@ -422,6 +426,6 @@ def scenario(paper: str, name: str) -> Scenario:
     Examples
     --------
     >>> [agent.kind for agent in scenario("grange", "table-2").agents]
-    ['direct', 'angle', 'direct']
+    ['component', 'line_angle', 'component']
     """
     return read_scenario(inside(data_root() / "scenarios", paper, name, ".toml"))

@@ -1,0 +1,145 @@
+"""Calls of a user's function on many states at once, and a check that it can take them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from .checks import Array
+from .first_use import mark_checked, needs_check
+
+__all__ = ["call_batched"]
+
+_RELATIVE_TOLERANCE = 1e-2
+"""Largest difference between batched and single results, relative to the state's change."""
+
+
+def call_batched(owner: Any, name: str, states: Sequence[Array], *args: float) -> Array:
+    """Call a user's function on states (..., d), and return (..., ``owner.dim``).
+
+    A function written for one state may return the right shape with wrong numbers. The first
+    time, its result for the last state of a batch is therefore compared with its result for
+    that state alone. The function gets copies of the states.
+
+    Parameters
+    ----------
+    owner, name
+        The object that holds the user's function, and the attribute's name.
+    states : sequence of ndarray, (..., d)
+        The function's first arguments.
+    *args
+        Its other arguments.
+
+    Examples
+    --------
+    >>> class Motion:
+    ...     dim = 2
+    ...
+    ...     def __init__(self, flow):
+    ...         self.flow = flow
+    >>> x = np.array([[1.0, 2.0], [3.0, 4.0]])
+    >>> call_batched(Motion(lambda x: x[..., ::-1]), "flow", [x])
+    array([[2., 1.],
+           [4., 3.]])
+    >>> one = Motion(lambda x: np.array([x[1], x[0]]))
+    >>> call_batched(one, "flow", [x])
+    Traceback (most recent call last):
+    ValueError: flow must take many states at once, ...
+    >>> two = Motion(lambda x: x + x[:, :1])
+    >>> call_batched(two, "flow", [x])
+    Traceback (most recent call last):
+    ValueError: flow must take many states at once, ...
+    >>> unit = Motion(lambda x: x / np.linalg.norm(x))
+    >>> call_batched(unit, "flow", [x[1:]])
+    array([[0.6, 0.8]])
+    >>> call_batched(unit, "flow", [x])
+    Traceback (most recent call last):
+    ValueError: flow must take many states at once, ...
+    """
+    function = getattr(owner, name)
+    x = states[0]
+    result = _call_or_catch(function, states, args)
+    expected = (*x.shape[:-1], owner.dim)
+    has_shape = getattr(result, "shape", None) == expected  # an error has no shape
+    # A batch of one state cannot show whether rows are mixed, so it passes a weaker check.
+    check = name if x.size > x.shape[-1] else f"{name} of a single state"
+    if x.ndim > 1 and x.size and (not has_shape or needs_check(owner, check)):
+        _compare_with_single_state(owner, name, states, args, result)
+        if has_shape and _is_conclusive(x):
+            mark_checked(owner, check)
+    if has_shape:
+        return np.asarray(result)
+    if isinstance(result, IndexError):
+        raise ValueError(f"x must have more components, got {x.shape}") from result
+    if isinstance(result, Exception):
+        raise result
+    raise ValueError(
+        f"{name} must return shape {expected} for states {x.shape}, got {result.shape}"
+    )
+
+
+def _compare_with_single_state(
+    owner: Any,
+    name: str,
+    states: Sequence[Array],
+    args: tuple[float, ...],
+    result: Any,
+) -> None:
+    """Raise if a batched result differs from the result for the last state alone."""
+    function = getattr(owner, name)
+    expected = (*states[0].shape[:-1], owner.dim)
+    last_states = [state.reshape(-1, state.shape[-1])[-1] for state in states]
+    single = _call_or_catch(function, last_states, args)
+    if getattr(result, "shape", None) == expected:
+        last_row = result.reshape(-1, owner.dim)[-1]
+        differs = _is_different(last_row, single, last_states)
+    else:
+        # An error may belong to some states only. With copies of one state that it can take
+        # alone, the function is at fault if the batch still fails.
+        copies = []
+        for last, state in zip(last_states, states, strict=True):
+            copies.append(np.broadcast_to(last, state.shape))
+        repeated = _call_or_catch(function, copies, args)
+        takes_one = np.shape(single) == expected[-1:]
+        differs = takes_one and np.shape(repeated) != expected
+    if differs:
+        raise ValueError(
+            f"{name} must take many states at once, (..., d), components last "
+            "(x[..., 0], not x[0] or x[:, 0]), got one for other axes"
+        )
+
+
+def _is_conclusive(x: Array) -> bool:
+    """Whether equal results could not come from equal states or equal components."""
+    rows = x.reshape(-1, x.shape[-1])
+    if len(rows) > 1:
+        return bool((rows[0] != rows[-1]).any())
+    return bool((rows[0] != rows[0, -1]).any())
+
+
+def _call_or_catch(
+    function: Callable[..., Any], states: Sequence[Array], args: tuple[float, ...]
+) -> Any:
+    """Return a function's result as an array, or the error that it raises."""
+    copies = [state.copy() for state in states]
+    try:
+        return np.asarray(function(*copies, *args), dtype=np.float64)
+    except (TypeError, ValueError, IndexError) as error:
+        return error
+
+
+def _is_different(row: Array, single: Any, states: Sequence[Array]) -> bool:
+    """Whether a row of a batch differs from the result for its state alone."""
+    if np.shape(single) != row.shape:
+        # A function for two axes fails on one state; it may get three axes later.
+        return isinstance(single, IndexError)
+    # Solvers of adaptive step differ a little; wrong rows differ as much as the states change.
+    change = single
+    if single.shape == states[0].shape:
+        change = single - states[0]
+    scale = np.abs(single).max()
+    bound = _RELATIVE_TOLERANCE * np.abs(change).max() + 1e-9 * scale
+    differs = (np.isnan(row) != np.isnan(single)) | (np.abs(row - single) > bound)
+    return bool(differs.any())
