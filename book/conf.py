@@ -41,12 +41,12 @@ from pages import (
     drop_widgets,
     escape_stars,
     homes,
-    imported,
+    imports_of,
     keep_sliders,
-    lighter,
     link_code,
     number_chapters,
     signature,
+    simplify_signatures,
     write_generated,
 )
 
@@ -252,7 +252,7 @@ def link_names(
     """Link the library's names in a chapter's code to their entries."""
     source = ROOT / f"{page}.md"
     if page.startswith("book/api"):
-        context["body"] = lighter(context["body"])
+        context["body"] = simplify_signatures(context["body"])
     if source not in chapters():
         return
     objects = app.env.domains.python_domain.objects
@@ -268,7 +268,7 @@ def link_names(
     )
     if chapter_number(page):
         context["body"] = context["body"].replace("</h1>", f"</h1>\n{offer}", 1)
-    names = imported(code_of(source), app.env.distfilt_homes)
+    names = imports_of(code_of(source), app.env.distfilt_homes)
     context["body"] = link_code(context["body"], names, url)
 
 

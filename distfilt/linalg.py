@@ -1,6 +1,6 @@
 """Batched linear algebra on covariances: Cholesky factors and triangular solves, no inverse.
 
-Functions without a door serve loops: they take float64 arrays that fit, and Cholesky factors in
+Functions without validation serve loops: they take float64 arrays that fit, and Cholesky factors in
 place of covariances.
 """
 
@@ -15,14 +15,20 @@ from typing import Any
 import numpy as np
 from scipy.linalg.lapack import dposv, dpotrf, dtrtrs
 
-from .validation import Array, PositiveSemidefinite, validated
+from .validation import Array, PositiveSemidefinite, call_user, validated
 from .validation.first_use import is_first_use
 
 __all__ = ["SolverError", "factor"]
 
 EPS = float(np.finfo(np.float64).eps)
+# Step of central differences: about the cube root of EPS, where truncation and rounding balance.
 _STEP = 6e-6
-"""Of differences: about the cube root of EPS, where truncation and rounding balance."""
+# Steps below this are not refined further.
+_SMALLEST_STEP = 1e-10
+# Matrices up to this size are solved faster by substitution in numpy, if there are many.
+_SMALL = 12
+# Numbers in one block of small systems: half a megabyte stays in the cache.
+_BLOCK_SIZE = 2**16
 
 
 class SolverError(RuntimeError):
@@ -30,7 +36,7 @@ class SolverError(RuntimeError):
 
 
 def symmetrise(m: Array) -> Array:
-    """Average of a square matrix and its transpose, where a product loses symmetry by rounding."""
+    """Average a square matrix and its transpose, where a product loses symmetry by rounding."""
     return np.asarray(0.5 * (m + m.swapaxes(-1, -2)))
 
 
@@ -71,10 +77,10 @@ def factor(cov: PositiveSemidefinite) -> Array:
 
 
 def cholesky(cov: Array) -> Array:
-    """The lower Cholesky factor; LinAlgError if a matrix is not positive definite."""
+    """Return the lower Cholesky factor; LinAlgError if a matrix is not positive definite."""
     d = cov.shape[-1]
     if cov.size == d * d > 0:
-        # A fifth of numpy's time for one matrix.
+        # LAPACK itself takes a fifth of numpy's time for one matrix.
         lower, failed = dpotrf(cov.reshape(d, d), lower=1, clean=1)
         if failed:
             raise np.linalg.LinAlgError("Matrix is not positive definite")
@@ -83,85 +89,100 @@ def cholesky(cov: Array) -> Array:
 
 
 def _semidefinite_cholesky(cov: Array) -> Array:
-    """The lower triangular factor with a zero column where a pivot vanishes."""
+    """Return the lower triangular factor with a zero column where a pivot vanishes."""
     d = cov.shape[-1]
-    scaled, unit = in_units(cov)
+    scaled, unit = to_unit_variances(cov)
     lower = np.zeros_like(scaled)
     for j in range(d):
-        done = lower[..., j:, :j] @ lower[..., j, :j, None]
-        column = scaled[..., j:, j] - done[..., 0]
+        # Column j of the Schur complement: A[j:, j] - L[j:, :j] L[j, :j]ᵀ
+        product = lower[..., j:, :j] @ lower[..., j, :j, None]
+        column = scaled[..., j:, j] - product[..., 0]
         pivot = column[..., 0]
+        # A pivot of rounding counts as zero; division by infinity gives a zero column.
         root = np.sqrt(np.where(pivot > 16 * d * EPS, pivot, np.inf))
         lower[..., j:, j] = column / root[..., None]
-    gap = np.abs(lower @ lower.swapaxes(-1, -2) - scaled).max(
-        axis=(-2, -1), initial=0.0
-    )
-    for k in np.argwhere(gap > 32 * d * EPS):
-        lower[tuple(k)] = _from_eigenvectors(scaled[tuple(k)])
+    error = np.abs(lower @ lower.swapaxes(-1, -2) - scaled)
+    worst = error.max(axis=(-2, -1), initial=0.0)
+    for index in np.argwhere(worst > 32 * d * EPS):
+        place = tuple(index)
+        lower[place] = _factor_from_eigenvectors(scaled[place])
     return np.asarray(lower * unit[..., :, None])
 
 
-def _from_eigenvectors(cov: Array) -> Array:
-    """The lower triangular factor of one matrix by orthogonal steps, which lose nothing."""
+def _factor_from_eigenvectors(cov: Array) -> Array:
+    """Return the lower triangular factor of one matrix by orthogonal steps, which lose nothing."""
     values, vectors = np.linalg.eigh(cov)
-    kept = values > 4 * len(cov) * EPS * values[-1]
+    positive = values > 4 * len(cov) * EPS * values[-1]
+    # P = A Aᵀ with the columns √λ v of A.
+    columns = vectors[:, positive] * np.sqrt(values[positive])
     lower = np.zeros_like(cov)
-    lower[:, : kept.sum()] = lower_root(vectors[:, kept] * np.sqrt(values[kept]))
+    lower[:, : positive.sum()] = lower_root(columns)
     return lower
 
 
 def lower_root(columns: Array) -> Array:
-    """Lower triangular L with L L' = A A' for A of these columns, and a nonnegative diagonal.
+    """Return the lower triangular L with L Lᵀ = A Aᵀ for A of these columns.
 
-    By QR, which leaves no signs or rotations to the machine and loses no definiteness.
+    By QR, which loses no definiteness. The diagonal is nonnegative, which leaves no signs to the
+    machine.
     """
+    # Aᵀ = Q R, so A Aᵀ = Rᵀ R.
     upper: Array = np.asarray(np.linalg.qr(columns.mT, mode="r"))
-    sign = np.where(np.diagonal(upper, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
+    diagonal = np.diagonal(upper, axis1=-2, axis2=-1)
+    sign = np.where(diagonal < 0, -1.0, 1.0)
     return np.asarray(upper.mT * sign[..., None, :])
 
 
-def leading(
-    wanted: tuple[int, ...], got: tuple[int, ...], name: str
+def broadcast_leading(
+    first: tuple[int, ...], second: tuple[int, ...], name: str
 ) -> tuple[int, ...]:
-    """What leading axes broadcast to, or an error that names the argument that does not fit."""
-    if wanted == got:
-        return wanted
+    """Broadcast leading axes, or raise an error that names the argument with the second ones."""
+    if first == second:
+        return first
     try:
-        return np.broadcast_shapes(wanted, got)
+        return np.broadcast_shapes(first, second)
     except ValueError:
         raise ValueError(
-            f"{name} must have leading axes that broadcast with {wanted}, got {got}"
+            f"{name} must have leading axes that broadcast with {first}, got {second}"
         ) from None
 
 
 def solve_lower(lower: Array, right: Array) -> Array:
-    r"""Solve L out = right, (..., d, d) and (..., d, k); leading axes broadcast."""
-    return _triangular(lower, right, 0)
+    r"""Solve L x = b, (..., d, d) and (..., d, k); leading axes broadcast."""
+    return _solve_triangular(lower, right, transposed=False)
 
 
 def solve_upper(lower: Array, right: Array) -> Array:
-    r"""Solve Lᵀ out = right with the *lower* triangular factor."""
-    return _triangular(lower, right, 1)
+    r"""Solve Lᵀ x = b with the *lower* triangular factor."""
+    return _solve_triangular(lower, right, transposed=True)
 
 
 def solve_definite(matrix: Array, right: Array) -> Array:
     """Solve with symmetric positive definite matrices, (..., m, m) and (..., m, k)."""
     m, k = right.shape[-2:]
     if matrix.size == m * m and right.size == m * k > 0:
-        # A third of numpy's time for one system.
-        _, out, failed = dposv(matrix.reshape(m, m), right.reshape(m, k), lower=1)
+        # LAPACK itself takes a third of numpy's time for one system.
+        _, solution, failed = dposv(matrix.reshape(m, m), right.reshape(m, k), lower=1)
         if not failed:
-            return np.asarray(out.reshape(right.shape))
-    elif m <= 12 and right.size > 600 * m and matrix.shape[:-2] == right.shape[:-2]:
+            return np.asarray(solution.reshape(right.shape))
+    elif _has_many_small_systems(matrix, right):
         with suppress(np.linalg.LinAlgError):  # by rounding one may be indefinite
-            return solve_upper(lower := cholesky(matrix), solve_lower(lower, right))
+            lower = cholesky(matrix)
+            return solve_upper(lower, solve_lower(lower, right))
     return np.asarray(np.linalg.solve(matrix, right))
 
 
-def _triangular(lower: Array, right: Array, transposed: int) -> Array:
+def _has_many_small_systems(matrix: Array, right: Array) -> bool:
+    """Whether substitution in numpy is faster than a LAPACK call for each system."""
+    m = right.shape[-2]
+    same_axes = matrix.shape[:-2] == right.shape[:-2]
+    return m <= _SMALL and right.size > 600 * m and same_axes
+
+
+def _solve_triangular(lower: Array, right: Array, *, transposed: bool) -> Array:
     d, k = right.shape[-2:]
     if lower.size == d * d and lower.ndim <= right.ndim:
-        return _one_triangular(lower.reshape(d, d), right, transposed)
+        return _solve_one_factor(lower.reshape(d, d), right, transposed)
     leading = lower.shape[:-2]
     if leading != right.shape[:-2]:
         leading = np.broadcast_shapes(leading, right.shape[:-2])
@@ -171,70 +192,82 @@ def _triangular(lower: Array, right: Array, transposed: int) -> Array:
     factors = lower.reshape(n, d, d)
     sides = right.reshape(n, d, k)
     if n > 2 * d:
-        # Row after row of all of them at once beats a call for each.
-        out = _blocks(factors, sides, transposed)
+        # Row after row of all systems at once is faster than a call for each.
+        solution = _solve_in_blocks(factors, sides, transposed)
     else:
-        out = np.array(
-            [_one_triangular(*x, transposed) for x in zip(factors, sides, strict=True)]
-        )
-    return out.reshape(*leading, d, k)
+        solution = np.empty((n, d, k))
+        for i in range(n):
+            solution[i] = _solve_one_factor(factors[i], sides[i], transposed)
+    return solution.reshape(*leading, d, k)
 
 
-def _one_triangular(lower: Array, right: Array, transposed: int) -> Array:
-    """One factor; all of `right` (..., d, k) are its columns."""
+def _solve_one_factor(lower: Array, right: Array, transposed: bool) -> Array:
+    """Solve with one factor (d, d), of which all of `right` (..., d, k) are columns."""
     d, k = right.shape[-2:]
     if not right.size:
         return np.array(right)
-    alone = right.size == d * k
-    flat = right.reshape(d, k) if alone else np.moveaxis(right, -2, 0).reshape(d, -1)
-    if (
-        d <= 12 and flat.size > 200 * d * d
-    ):  # so many columns that LAPACK's own order costs more
-        out = _substituted(
-            lower[..., None], np.array(flat[:, None], order="C"), transposed
-        )
+    is_matrix = right.size == d * k
+    if is_matrix:
+        columns = right.reshape(d, k)
     else:
-        out, failed = dtrtrs(lower, flat, lower=1, trans=transposed)
+        columns = np.moveaxis(right, -2, 0).reshape(d, -1)
+    if d <= _SMALL and columns.size > 200 * d * d:
+        # With so many columns LAPACK's copy to its own order costs more than the solution.
+        x = np.array(columns[:, None], order="C")
+        solution = _substitute(lower[..., None], x, transposed)
+    else:
+        solution, failed = dtrtrs(lower, columns, lower=1, trans=int(transposed))
         if failed:
             raise np.linalg.LinAlgError("Singular matrix")
-    if alone:
-        return np.asarray(out).reshape(right.shape)
-    return np.moveaxis(out.reshape(d, *right.shape[:-2], right.shape[-1]), 0, -2)
+    if is_matrix:
+        return np.asarray(solution).reshape(right.shape)
+    solution = solution.reshape(d, *right.shape[:-2], k)
+    return np.moveaxis(solution, 0, -2)
 
 
-def _blocks(lower: Array, right: Array, transposed: int) -> Array:
-    """Many small systems, as many at once as a cache holds."""
-    out = np.empty(right.shape)
-    size = max(1, 2**16 // (1 + lower[0].size + right[0].size))
-    for here in [slice(n, n + size) for n in range(0, len(out), size)]:
-        factors = np.ascontiguousarray(lower[here].transpose(1, 2, 0))
-        x = np.array(right[here].transpose(1, 2, 0), order="C")
-        out[here] = _substituted(factors, x, transposed).transpose(2, 0, 1)
-    return out
+def _solve_in_blocks(lower: Array, right: Array, transposed: bool) -> Array:
+    """Solve many small systems (n, d, d), as many at once as the cache holds."""
+    solution = np.empty(right.shape)
+    block = max(1, _BLOCK_SIZE // (1 + lower[0].size + right[0].size))
+    for start in range(0, len(solution), block):
+        systems = slice(start, start + block)
+        # Systems last, so that each row operation runs over contiguous memory.
+        factors = np.ascontiguousarray(lower[systems].transpose(1, 2, 0))
+        x = np.array(right[systems].transpose(1, 2, 0), order="C")
+        solution[systems] = _substitute(factors, x, transposed).transpose(2, 0, 1)
+    return solution
 
 
-def _substituted(lower: Array, x: Array, transposed: int) -> Array:
+def _substitute(lower: Array, x: Array, transposed: bool) -> Array:
     """Solve in place, row after row of (d, k, n), with factors (d, d, n) or (d, d, 1)."""
-    for i in reversed(range(len(x))) if transposed else range(len(x)):
-        x[i] /= lower[i, i]
-        rest = slice(0, i) if transposed else slice(i + 1, None)
-        x[rest] -= (lower[i, rest] if transposed else lower[rest, i])[:, None] * x[i]
+    d = len(x)
+    if transposed:
+        # Backward: x_i = b_i / L_ii, then b_j -= L_ij x_i for j < i.
+        for i in reversed(range(d)):
+            x[i] /= lower[i, i]
+            x[:i] -= lower[i, :i][:, None] * x[i]
+    else:
+        # Forward: x_i = b_i / L_ii, then b_j -= L_ji x_i for j > i.
+        for i in range(d):
+            x[i] /= lower[i, i]
+            x[i + 1 :] -= lower[i + 1 :, i][:, None] * x[i]
     return x
 
 
 def whiten(lower: Array, vectors: Array) -> Array:
-    """Solve L out = v for vectors (..., d); leading axes broadcast."""
+    """Solve L z = v for vectors (..., d); leading axes broadcast."""
     if lower.ndim == 2:
-        flat = vectors.reshape(
-            math.prod(vectors.shape[:-1]), -1 if vectors.size else len(lower)
-        )
-        return _one_triangular(lower, flat.T, 0).T.reshape(vectors.shape)
+        # One factor for all vectors: they are its columns.
+        n_vectors = math.prod(vectors.shape[:-1])
+        rows = vectors.reshape(n_vectors, len(lower) if not vectors.size else -1)
+        return _solve_one_factor(lower, rows.T, False).T.reshape(vectors.shape)
     if lower.shape[-3] == 1 and vectors.ndim > 1:
-        # One factor for all vectors along the last leading axis: they are its columns.
-        return _triangular(lower[..., 0, :, :], vectors.swapaxes(-1, -2), 0).swapaxes(
-            -1, -2
-        )
-    return np.asarray(_triangular(lower, vectors[..., None], 0)[..., 0])
+        # One factor for all vectors along the last leading axis.
+        columns = vectors.swapaxes(-1, -2)
+        white = _solve_triangular(lower[..., 0, :, :], columns, transposed=False)
+        return white.swapaxes(-1, -2)
+    white = _solve_triangular(lower, vectors[..., None], transposed=False)
+    return np.asarray(white[..., 0])
 
 
 def quadratic_form(lower: Array, vector: Array) -> Array:
@@ -244,115 +277,134 @@ def quadratic_form(lower: Array, vector: Array) -> Array:
 
 def log_det(lower: Array) -> Array:
     """Logarithm of a covariance's determinant, by its Cholesky factor."""
-    return np.asarray(2.0 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(axis=-1))
+    diagonal = np.diagonal(lower, axis1=-2, axis2=-1)
+    return np.asarray(2.0 * np.log(diagonal).sum(axis=-1))
 
 
-def log_sum(logs: Array) -> Array:
+def log_sum_exp(logs: Array) -> Array:
     """Logarithm of the sum of exponentials (..., 1), in a tenth of scipy's time; -inf if all are.
 
-    >>> log_sum(np.zeros(2)).round(4)
+    >>> log_sum_exp(np.zeros(2)).round(4)
     array([0.6931])
     """
+    # The bound keeps -inf - (-inf) out of the differences.
     top = np.maximum(logs.max(axis=-1, keepdims=True), -1e300)
+    total = np.exp(logs - top).sum(axis=-1, keepdims=True)
     with np.errstate(divide="ignore"):
-        return np.asarray(top + np.log(np.exp(logs - top).sum(axis=-1, keepdims=True)))
+        return np.asarray(top + np.log(total))
 
 
-def in_units(cov: Array) -> tuple[Array, Array]:
-    """Covariances in units of the components' standard deviations, and these; 1 of a constant."""
+def to_unit_variances(cov: Array) -> tuple[Array, Array]:
+    """Scale covariances to unit variances; also return the standard deviations, 1 of a constant."""
     std = np.sqrt(np.abs(np.diagonal(cov, axis1=-2, axis2=-1)))
     unit = np.where(std > 0, std, 1.0)
     return cov / (unit[..., :, None] * unit[..., None, :]), unit
 
 
-def central(
+def central_difference(
     function: Callable[[Array], Array],
     x: Array,
     difference: Callable[[Array, Array], Array] = np.subtract,
     *,
     step: float = _STEP,
 ) -> Array:
-    """Derivative (..., m, d) by central differences, all 2 d moves in two calls.
+    """Derivative (..., m, d) by central differences, all 2 d shifted states in two calls.
 
-    Its error is about 1e-10 of the function's scale. Where the values ahead and behind do not lie
-    on a line with the one between, moves a hundred times as small are tried, and again.
+    Its error is about 1e-10 of the function's scale. Where the function bends within a step, the
+    derivative is taken again with steps a hundred times as small.
 
     Parameters
     ----------
     function : callable
         ``function(x) -> y`` on (..., d) to (..., m).
     x : ndarray, (..., d)
-        Where.
+        States at which the derivative is taken.
     difference : callable
         ``difference(ahead, behind)``, for values that wrap; subtraction by default.
     step : float
-        How far each component moves, as a share of it where it is above 1.
+        Step of each component, relative to its size where that is above 1.
 
     Examples
     --------
-    >>> central(lambda x: x**2, np.array([1.0, 3.0])).round(8)
+    >>> central_difference(lambda x: x**2, np.array([1.0, 3.0])).round(8)
     array([[2., 0.],
            [0., 6.]])
     """
     h = step * np.maximum(1.0, np.abs(x))
-    ahead = x[..., None, :] + h[..., None] * np.eye(x.shape[-1])
-    behind = x[..., None, :] - h[..., None] * np.eye(x.shape[-1])
-    # What was moved by, after rounding, is the difference of the two states.
-    moved = np.diagonal(ahead - behind, axis1=-2, axis2=-1)
-    front = function(ahead)
-    back = function(behind)
-    here = function(x[..., None, :])
-    slope = difference(front, back)
-    bend = np.abs(difference(front, here) + difference(back, here)).max(axis=-1)
-    curved = bend > 1e-2 * np.abs(slope).max(axis=-1) + 1e-9 * np.abs(here).max(axis=-1)
-    slope = slope / moved[..., None]
-    if step > 1e-10 and curved.any():
-        finer = central(function, x, difference, step=1e-2 * step)
-        slope = np.where(curved[..., None], finer.mT, slope)
+    steps = h[..., None] * np.eye(x.shape[-1])
+    ahead = x[..., None, :] + steps
+    behind = x[..., None, :] - steps
+    # After rounding the true step is the difference of the two states.
+    true_steps = np.diagonal(ahead - behind, axis1=-2, axis2=-1)
+    f_ahead = call_user(function, ahead)
+    f_behind = call_user(function, behind)
+    f_centre = call_user(function, x[..., None, :])
+    change = call_user(difference, f_ahead, f_behind)
+
+    # Second differences f(x + h) - 2 f(x) + f(x - h) vanish where the function is straight.
+    upper_half = call_user(difference, f_ahead, f_centre)
+    lower_half = call_user(difference, f_behind, f_centre)
+    bend = np.abs(upper_half + lower_half).max(axis=-1)
+    largest_change = np.abs(change).max(axis=-1)
+    rounding = 1e-9 * np.abs(f_centre).max(axis=-1)
+    is_bent = bend > 1e-2 * largest_change + rounding
+
+    slope = change / true_steps[..., None]
+    if step > _SMALLEST_STEP and is_bent.any():
+        finer = central_difference(function, x, difference, step=1e-2 * step)
+        slope = np.where(is_bent[..., None], finer.mT, slope)
     return np.asarray(slope.mT)
 
 
-def as_derivative(
+def evaluate_derivative(
     owner: Any,
-    given: tuple[Any, ...],
-    full: tuple[int, ...],
-    near: Callable[..., Array],
-    still: Array | float = 0.0,
+    args: tuple[Any, ...],
+    shape: tuple[int, ...],
+    differences: Callable[..., Array],
+    static: Array | float = 0.0,
 ) -> Array:
-    """What an owner's `derivative` returns, (m, d) or (..., m, d), as the latter; differences
-    where it has none.
+    """Call an owner's `derivative`, or take differences if it has none; return (..., m, d).
 
-    The first time it is compared with differences: a transposed one may have the right shape too.
-    Rows may be a tenth of their largest entry off, and lack what hardly matters beside others.
+    The first time the derivative is compared with differences, since a transposed one may have the
+    right shape too. Rows may be a tenth of their largest entry off, and may lack entries that are
+    negligible beside the other rows.
 
     Parameters
     ----------
     owner : FrozenModel
-        Whose derivative it is; what the library made itself is trusted.
-    given, full : tuple
-        What it gets, arrays as copies, and the shape that it needs.
-    near : callable
-        ``near(step=step)`` by :func:`central`. Rows that depend on the step say nothing.
-    still : ndarray, optional
-        The derivative of a state that stays, which is no merit of a model's.
+        The object with the derivative; one that the library constructed is trusted.
+    args, shape : tuple
+        Arguments of the derivative, whose arrays are copied, and the shape of the result.
+    differences : callable
+        ``differences(step=step)`` by :func:`central_difference`. Rows that depend on the step are
+        not compared.
+    static : ndarray, optional
+        The derivative of a state that does not change; it is subtracted before comparing.
     """
     if owner.derivative is None:
-        return near()
-    slope = np.asarray(
-        owner.derivative(*[np.copy(x) if np.ndim(x) else x for x in given])
-    )
-    if slope.shape not in (full, full[-2:]):
-        raise ValueError(f"derivative must return shape {full}, got {slope.shape}")
+        return differences()
+    copies = [np.copy(x) if np.ndim(x) else x for x in args]
+    slope = np.asarray(call_user(owner.derivative, *copies))
+    if slope.shape not in (shape, shape[-2:]):
+        raise ValueError(f"derivative must return shape {shape}, got {slope.shape}")
     if is_first_use(owner, "derivative"):
-        found = near(step=_STEP)
-        wide = near(step=4 * _STEP)
-        row = np.abs(found - still).max(axis=-1, keepdims=True)
-        sure = np.abs(found - wide).max(axis=-1, keepdims=True) <= 1e-2 * row
-        bound = 0.1 * row + 1e-4 * row.max(axis=-2, keepdims=True)
-        if (sure & (np.abs(slope - found) > bound)).any():
+        reference = differences(step=_STEP)
+        if _contradicts(slope, reference, differences(step=4 * _STEP), static):
             warnings.warn(
-                "derivative must be that of its function, got another",
+                "derivative does not match finite differences of its function",
                 RuntimeWarning,
                 4,
             )
-    return np.broadcast_to(slope, full)
+    return np.broadcast_to(slope, shape)
+
+
+def _contradicts(
+    slope: Array, reference: Array, coarse: Array, static: Array | float
+) -> bool:
+    """Whether a derivative differs from differences that do not depend on their step."""
+    row_size = np.abs(reference - static).max(axis=-1, keepdims=True)
+    step_error = np.abs(reference - coarse).max(axis=-1, keepdims=True)
+    is_reliable = step_error <= 1e-2 * row_size
+    bound = 0.1 * row_size + 1e-4 * row_size.max(axis=-2, keepdims=True)
+    is_off = np.abs(slope - reference) > bound
+    return bool((is_reliable & is_off).any())

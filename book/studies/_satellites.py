@@ -67,7 +67,7 @@ class Setup:
 
 def setup(name: str, **changes: Any) -> Setup:
     """The set-up of ``table-2`` or ``table-3``, with other values of some parameters."""
-    s = scenario(PAPER, name).replace(**changes).reading()
+    s = scenario(PAPER, name).replace(**changes).track_reads()
     start = np.array(s["initial_state"])
     dt = s["dt_observe"]
     if name == "table-2":
@@ -377,7 +377,8 @@ def _again(name: str) -> str:
             if wrong
             else ""
         )
-    options = {k: getattr(script, k) for k in ("rtol", "rough") if hasattr(script, k)}
+    names = ("rtol", "ill_conditioned")
+    options = {k: getattr(script, k) for k in names if hasattr(script, k)}
     try:
         studies.check(found, script.trial, indices=[0], **options)
     except AssertionError as error:

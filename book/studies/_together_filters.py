@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from distfilt import filters, network
-from distfilt.ensembles import sample_covariance
 from distfilt.filters import (
     EnsembleFilter,
     GaussianFilter,
@@ -28,21 +27,6 @@ from distfilt.updates.particles import log_likelihood
 Array = np.ndarray
 Information = tuple[Array, Array]
 """Information matrix (..., n, n) and information vector (..., n)."""
-
-__all__ = [
-    "FloodedEnsemble",
-    "FloodedGaussian",
-    "FloodedGrid",
-    "FloodedParticles",
-    "FloodingMixin",
-    "GridFilter",
-    "LikelihoodConsensus",
-    "MeasurementConsensus",
-    "SharedPlanFilter",
-    "TargetExchangeFilter",
-    "sample_covariance",
-]
-
 
 # ------------------------------------------------------------------------------------- flooding
 
@@ -129,9 +113,7 @@ def symmetrize(P: Array) -> Array:
     return 0.5 * (P + P.mT)
 
 
-def add_information(
-    m: Array, P: Array, J: Array, v: Array
-) -> tuple[Array, Array]:
+def add_information(m: Array, P: Array, J: Array, v: Array) -> tuple[Array, Array]:
     """Return Gaussians after information (J, v), with J of the covariance's size."""
     # P+ = P (I + J P)⁻¹ and m+ = m + P+ (v - J m)
     P = P @ np.linalg.inv(np.eye(P.shape[-1]) + J @ P)

@@ -288,9 +288,7 @@ def angles(s: Scenario = HELD, agents: int | None = None) -> Problem:
     road = np.linspace(-6, 6, agents)
     places = np.stack([road, np.full(agents, -8.0)], axis=-1)
     std = s["angle_std"]
-    bearings = [
-        sensors.bearing((0, 1), std=std, origin=place) for place in places
-    ]
+    bearings = [sensors.bearing((0, 1), std=std, origin=place) for place in places]
     return Problem(
         "angles",
         model,

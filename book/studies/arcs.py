@@ -152,4 +152,4 @@ rtol = 1e-4
 atol = 1e-12
 # Which of nearly equal shapes least squares keep hangs on the last bit, and so does a divergence
 # that a thin tail decides.
-rough = [name for name in columns if name.startswith("c3")]
+ill_conditioned = [name for name in columns if name.startswith("c3")]

@@ -86,4 +86,4 @@ code = (side, scores, starts.scores, starts.on_circle, pendulum.data, pendulum.r
 seeds = starts.seeds[:60]
 rtol = 1e-4
 # A run that has lost the swing multiplies the last bit until it decides.
-odd = 12
+max_outliers = 12

@@ -132,8 +132,8 @@ seeds = np.random.SeedSequence(512).spawn(TRIALS)
 rtol = 1e-3
 # In these filters a difference of the last bit grows with the model's chaos, tenfold in ten steps:
 # another processor's members part from the stored ones before the end.
-rough = [
+ill_conditioned = [
     name for name in columns if name.startswith(("transport", "second", "particles"))
 ]
 # With twenty members it may also lose the path, farther than it did in any stored trial.
-odd = 5
+max_outliers = 5

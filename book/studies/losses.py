@@ -22,14 +22,14 @@ LOSSES = {"none": 0.0, "some": 0.3}
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """Means over agents and the epochs from 2 to 20 h."""
     rng = np.random.default_rng(seed)
-    truth, *rest = paper.data(paper.SETTING, rng)
+    truth, *rest = paper.simulate(paper.SETTING, rng)
     which = int(rng.integers(2**31))
     out = {}
     for row in ROWS:
         for lost, share in LOSSES.items():
             options = {**paper.SINGLE[row], "faults": Faults(loss=share, seed=which)}
-            states = paper.run(paper.SETTING, options, *rest)
-            found = [paper.scored(states[k].mixtures, truth[k]) for k in paper.EARLY]
+            states = paper.run_filter(paper.SETTING, options, *rest)
+            found = [paper.score_epoch(states[k].mixtures, truth[k]) for k in paper.EARLY]
             out |= {
                 f"{row}_{lost}_{m}": float(np.mean([f[m].mean() for f in found]))
                 for m in METRICS
@@ -40,12 +40,12 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
 columns = [f"{row}_{lost}_{m}" for row in ROWS for lost in LOSSES for m in METRICS]
 parameters = {"setting": paper.SETTING, "losses": LOSSES}
 code = (
-    paper.data,
-    paper.readings,
-    paper.beliefs,
-    paper.network,
-    paper.run,
-    paper.scored,
+    paper.simulate,
+    paper.observe,
+    paper.prior_beliefs,
+    paper.make_filter,
+    paper.run_filter,
+    paper.score_epoch,
 )
 scenarios = paper.scenarios
 seeds = np.random.SeedSequence(900).spawn(96)

@@ -98,4 +98,4 @@ code = (
 seeds = starts.seeds[:40]
 rtol = 1e-4
 # A run that has lost the swing multiplies the last bit until it decides.
-odd = 8
+max_outliers = 8

@@ -64,9 +64,9 @@ def added(own: GaussianMixture, heard: list[GaussianMixture]) -> GaussianMixture
 
 def row(s: dict, options: dict, truth: np.ndarray, rest: tuple) -> dict[str, float]:
     """A filter's means over agents and the epochs from 2 to 20 h, and each agent's errors."""
-    states = paper.run(s, options, *rest)
+    states = paper.run_filter(s, options, *rest)
     found = [
-        paper.scored(x.mixtures, true) for x, true in zip(states, truth, strict=True)
+        paper.score_epoch(x.mixtures, true) for x, true in zip(states, truth, strict=True)
     ]
     early = [found[k] for k in paper.EARLY]
     out = {
@@ -84,14 +84,14 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     child = seed.spawn(1)[0]
     out = {}
     for name, (s, options, rules) in CHOICES.items():
-        truth, *rest = paper.data(s, np.random.default_rng(child))
+        truth, *rest = paper.simulate(s, np.random.default_rng(child))
         found = {"none": row(s, options, truth, tuple(rest))}
         for rule, fusion in rules.items():
             found[rule] = row(s, {**options, "fusion": fusion}, truth, tuple(rest))
         out |= {
             f"{name}_{rule}_{m}": v for rule, r in found.items() for m, v in r.items()
         }
-    truth, *rest = paper.data(paper.SETTING, np.random.default_rng(child))
+    truth, *rest = paper.simulate(paper.SETTING, np.random.default_rng(child))
     null = row(paper.SETTING, {**paper.ONE, "fusion": added}, truth, tuple(rest))
     out["added_nees"] = null["nees"]
     return {name: float(paper.SIX.format(v)) for name, v in out.items()}
@@ -117,24 +117,24 @@ code = (
     sized,
     added,
     row,
-    paper.data,
-    paper.readings,
-    paper.beliefs,
-    paper.network,
-    paper.run,
-    paper.scored,
+    paper.simulate,
+    paper.observe,
+    paper.prior_beliefs,
+    paper.make_filter,
+    paper.run_filter,
+    paper.score_epoch,
 )
 scenarios = paper.scenarios
 seeds = paper.seeds
 rtol = 1e-3
 # Which of 24 nearly equal mixands are kept hangs on the last bit, and the later hours on them.
-odd = 2
+max_outliers = 2
 
 
 def again(seed: np.random.SeedSequence) -> dict[str, float]:
     """The choice that is quick enough to run again wherever the study is read, and the null."""
     s, options, rules = CHOICES["mixands_6"]
-    truth, *rest = paper.data(s, np.random.default_rng(seed.spawn(1)[0]))
+    truth, *rest = paper.simulate(s, np.random.default_rng(seed.spawn(1)[0]))
     fused = {**options, "fusion": rules["c3"]}
     found = {"none": options, "c3": fused, "added": {**paper.ONE, "fusion": added}}
     rows = {name: row(s, chosen, truth, tuple(rest)) for name, chosen in found.items()}

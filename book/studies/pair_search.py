@@ -26,7 +26,7 @@ arcs = studies.script("arcs")
 
 NAME = "pair-search"
 PAPER = "semeraro"
-STUDY = scenario("semeraro", "table-1").reading()
+STUDY = scenario("semeraro", "table-1").track_reads()
 OMEGA = float(STUDY["omega"])
 PRINTED = np.array(
     [
@@ -316,6 +316,6 @@ scenarios = (scenario("semeraro", "table-1"),)
 seeds = np.random.SeedSequence(707).spawn(FAR + NEAR)
 rtol = 1e-3
 # Which shapes least squares keep hangs on the last bit, and a search goes on from there.
-rough = ("own", "fresh", "many", "exact", *(f"y_{k}" for k in range(12)))
+ill_conditioned = ("own", "fresh", "many", "exact", *(f"y_{k}" for k in range(12)))
 # A search from far may end at other numbers that are no worse.
-odd = 2
+max_outliers = 2

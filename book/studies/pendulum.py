@@ -196,4 +196,4 @@ seeds = np.random.SeedSequence(2024).spawn(setting["runs"])
 rtol = 1e-4
 # A run that has lost the swing multiplies the last bit until it decides, also whether OTNLeq
 # overflows: on three kinds of processor seven or eight of the hundred runs were other ones.
-odd = 10
+max_outliers = 10

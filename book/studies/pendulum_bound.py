@@ -341,4 +341,4 @@ code = (
 seeds = np.random.SeedSequence(4096).spawn(RUNS)
 rtol = 1e-3
 # Folded readings leave two swings, and which of them small ensembles keep hangs on the last bit.
-odd = 8
+max_outliers = 8

@@ -32,8 +32,8 @@ seeds = np.random.SeedSequence(satellites.SEED).spawn(SETUP.runs // BATCH)
 scenarios = (SETUP.scenario,)
 rtol = 1e-3
 # At this rate a version runs away, and which way hangs on the last bit.
-rough = [name for name in columns if name.startswith("orbit")]
-odd = 2
+ill_conditioned = [name for name in columns if name.startswith("orbit")]
+max_outliers = 2
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:

@@ -59,7 +59,7 @@ atol = 1e-9
 # Which of nearly equal shapes least squares keep hangs on the last bit, and so does a divergence
 # that a thin tail decides: in one trial of eight some number with the mild factor, whose many
 # shapes are nearly equal, is another one with another order of the sums. Medians and shares stay.
-rough = [
+ill_conditioned = [
     name
     for name in columns
     if "_qr_" in name

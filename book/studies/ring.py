@@ -236,4 +236,4 @@ code = (
 seeds = np.random.SeedSequence(808).spawn(20)
 rtol = 1e-3
 # Where a filter goes once it has lost its target, another processor need not repeat.
-rough = [name for name in columns if "_20_" in name or "news" in name]
+ill_conditioned = [name for name in columns if "_20_" in name or "news" in name]

@@ -40,10 +40,10 @@ def unscented(
 ) -> list[list[GaussianMixture]]:
     """What unscented filters of one Gaussian believe, one an epoch and agent."""
     n = len(s["agents"])
-    start = [b.moments() for b in paper.beliefs(first, covs)]
+    start = [b.moments() for b in paper.prior_beliefs(first, covs)]
     f = GaussianFilter(
-        paper.moving(s, 2),
-        [paper.sensor(s)] * n,
+        paper.orbit_model(s, 2),
+        [paper.agent_sensor(s)] * n,
         graphs.complete(n),
         share_observations=False,
         linearization="unscented",
@@ -65,17 +65,17 @@ def unscented(
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """Means over agents and the epochs from 2 to 20 h."""
     s = paper.SETTING
-    truth, *rest = paper.data(s, np.random.default_rng(seed.spawn(1)[0]))
-    beliefs = {"bound": paper.bound(s, paper.ONE, *rest)}
+    truth, *rest = paper.simulate(s, np.random.default_rng(seed.spawn(1)[0]))
+    beliefs = {"bound": paper.run_joint(s, paper.ONE, *rest)}
     for row, fuses in ROWS.items():
         if fuses is None:
-            states = paper.run(s, paper.SINGLE[row], *rest)
+            states = paper.run_filter(s, paper.SINGLE[row], *rest)
             beliefs[row] = [state.mixtures for state in states]
         else:
             beliefs[row] = unscented(s, fuses, *rest)
     out: dict[str, float] = {}
     for row, found in beliefs.items():
-        scores = [paper.scored(found[k], truth[k]) for k in paper.EARLY]
+        scores = [paper.score_epoch(found[k], truth[k]) for k in paper.EARLY]
         out |= {
             f"{row}_{m}": float(np.mean([f[m].mean() for f in scores])) for m in METRICS
         }
@@ -87,13 +87,13 @@ parameters = {"setting": paper.SETTING, "rows": sorted(ROWS)}
 code = (
     targets,
     unscented,
-    paper.data,
-    paper.readings,
-    paper.beliefs,
-    paper.network,
-    paper.run,
-    paper.bound,
-    paper.scored,
+    paper.simulate,
+    paper.observe,
+    paper.prior_beliefs,
+    paper.make_filter,
+    paper.run_filter,
+    paper.run_joint,
+    paper.score_epoch,
 )
 scenarios = paper.scenarios
 seeds = np.random.SeedSequence(480).spawn(448)

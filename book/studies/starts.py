@@ -93,4 +93,4 @@ code = (on_circle, scores, pendulum.data, pendulum.run)
 seeds = np.random.SeedSequence(3024).spawn(400)
 rtol = 1e-4
 # A run that has lost the swing multiplies the last bit until it decides.
-odd = 40
+max_outliers = 40

@@ -47,7 +47,7 @@ scenarios = (SETUP.scenario,)
 rtol = 1e-4
 # Ten undamped steps of the iterated filter do not settle; where a run is after them the last bit
 # may decide.
-rough = [name for name in columns if name.startswith("iterated")]
+ill_conditioned = [name for name in columns if name.startswith("iterated")]
 
 
 def iterated(

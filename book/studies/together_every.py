@@ -16,21 +16,21 @@ import _together as together
 NAME = "every"
 PAPER = "together"
 CELLS = {
-    p: (*together.references(together.problem(p)), *together.cells_of(p))
+    p: (*together.references(together.problem(p)), *together.cell_names(p))
     for p in together.FOUR
 }
-columns = together.columns_of(f"{p}_{c}" for p, cells in CELLS.items() for c in cells)
-parameters = {"batch": together.BATCH, "program": together.program(), "cells": CELLS}
-seeds = together.seeds_of()
+columns = together.score_columns(f"{p}_{c}" for p, cells in CELLS.items() for c in cells)
+parameters = {"batch": together.BATCH, "program": together.program_digest(), "cells": CELLS}
+seeds = together.make_seeds()
 scenarios = (
     *(together.problem(p).scenario for p in CELLS),
     together.STUDY,
     together.TUNED,
 )
 rtol = 1e-4
-rough = [f"{p}_{k}" for p, cells in CELLS.items() for k in together.loose(cells)]
+ill_conditioned = [f"{p}_{k}" for p, cells in CELLS.items() for k in together.ill_conditioned_columns(cells)]
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """References and cells of the four problems."""
-    return {f"{p}_{k}": v for p in CELLS for k, v in together.trial_of(p)(seed).items()}
+    return {f"{p}_{k}": v for p in CELLS for k, v in together.run_problem(p, seed).items()}

@@ -12,15 +12,15 @@ import _together as together
 
 NAME = "held"
 PAPER = "together"
-CELLS = {p: ("reference", *together.cells_of(p)) for p in together.THREE}
-columns = together.columns_of([f"{p}_{c}" for p, cells in CELLS.items() for c in cells])
-parameters = {"batch": together.BATCH, "program": together.program(), "cells": CELLS}
+CELLS = {p: ("reference", *together.cell_names(p)) for p in together.THREE}
+columns = together.score_columns([f"{p}_{c}" for p, cells in CELLS.items() for c in cells])
+parameters = {"batch": together.BATCH, "program": together.program_digest(), "cells": CELLS}
 seeds = np.random.SeedSequence(together.STUDY["seed"] + 2).spawn(
-    len(together.seeds_of())
+    len(together.make_seeds())
 )
 scenarios = (together.HELD, together.STUDY, together.TUNED)
 rtol = 1e-4
-rough = columns
+ill_conditioned = columns
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
@@ -28,7 +28,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     out: dict[str, float] = {}
     for name in together.THREE:
         p = together.problem(name)
-        found = together.referred(p, seed, together.drawn(p, seed))
-        found |= together.compared(name, seed, together.cells_of(name))
+        found = together.measure_references(p, seed, together.draw_data(p, seed))
+        found |= together.measure_cells(name, seed, together.cell_names(name))
         out |= {f"{name}_{k}": v for k, v in found.items() if not k.startswith("half")}
     return out

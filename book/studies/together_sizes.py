@@ -50,15 +50,15 @@ COLUMNS = [
     *(f"{p}_agents_{a}_reference" for p in GROWN for a in RINGS[p]),
     *(f"{p}_members_reference" for p in ("range", "lorenz")),
 ]
-columns = together.columns_of(COLUMNS)
+columns = together.score_columns(COLUMNS)
 parameters = {
     "batch": together.BATCH,
     "members": MEMBERS,
     "agents": AGENTS,
-    "program": together.program(),
+    "program": together.program_digest(),
 }
 seeds = np.random.SeedSequence(together.STUDY["seed"] + 1).spawn(
-    len(together.seeds_of())
+    len(together.make_seeds())
 )
 scenarios = (
     *(together.problem(p).scenario for p in ("linear", "range", "lorenz")),
@@ -66,7 +66,7 @@ scenarios = (
     together.TUNED,
 )
 rtol = 1e-4
-rough = columns
+ill_conditioned = columns
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
@@ -74,20 +74,20 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     out: dict[str, float] = {}
     for name in ("range", "lorenz"):
         p = together.problem(name)
-        data = together.drawn(p, seed)
-        out |= headed(together.referred(p, seed, data, half=False), f"{name}_members_")
+        data = together.draw_data(p, seed)
+        out |= headed(together.measure_references(p, seed, data, half=False), f"{name}_members_")
         for _, cell, n in (row for row in BY_MEMBERS if row[0] == name):
-            f = together.CELLS[cell].make(p, together.tuned(name, cell), n)
-            out |= together.measured(p, cell, f, data, seed, f"{name}_members_{n}_")
+            f = together.CELLS[cell].make(p, together.tuned_value(name, cell), n)
+            out |= together.measure(p, cell, f, data, seed, f"{name}_members_{n}_")
     for name, cells in GROWN.items():
         for agents in RINGS[name]:
-            p = together.problem(name).resized(agents)
-            data = together.drawn(p, seed)
-            found = together.referred(p, seed, data, half=False)
+            p = together.problem(name).with_agents(agents)
+            data = together.draw_data(p, seed)
+            found = together.measure_references(p, seed, data, half=False)
             out |= headed(found, f"{name}_agents_{agents}_")
             for cell in (c for c in cells if (name, c, agents) in BY_AGENTS):
-                f = together.CELLS[cell].make(p, together.tuned(name, cell))
-                out |= together.measured(
+                f = together.CELLS[cell].make(p, together.tuned_value(name, cell))
+                out |= together.measure(
                     p, cell, f, data, seed, f"{name}_agents_{agents}_"
                 )
     return out

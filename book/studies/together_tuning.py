@@ -21,19 +21,19 @@ PAPER = "together"
 SEED, RUNS = together.TUNING
 VALUES = range(5)
 TRIED = {
-    p: [c for c, cell in together.CELLS.items() if cell.grid and not cell.why_empty(p)]
+    p: [c for c, cell in together.CELLS.items() if cell.grid and not cell.why_excluded(p)]
     for p in together.FOUR
 }
 columns = [f"{p}_{c}_{k}" for p, cells in TRIED.items() for c in cells for k in VALUES]
 parameters = {
     "runs": RUNS,
     "grids": {c: v.grid for c, v in together.CELLS.items() if v.grid},
-    "program": together.program(),
+    "program": together.program_digest(),
 }
 seeds = np.random.SeedSequence(SEED).spawn(1)
 scenarios = (*(together.problem(p).scenario for p in together.FOUR), together.STUDY)
 rtol = 1e-3
-rough = [c for c in columns if any(k in c for k in ("_pf_", "_ot_", "_maps_", "_gm_"))]
+ill_conditioned = [c for c in columns if any(k in c for k in ("_pf_", "_ot_", "_maps_", "_gm_"))]
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
@@ -53,7 +53,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
                             made.make(p, value),
                             data,
                             together.stream(seed, f"{name}{cell}"),
-                            own=made.own,
+                            local=made.local,
                         ).mean()
                     except (ValueError, ArithmeticError, RuntimeError) as error:
                         print(f"{name}, {cell}, {value}: {error}", file=sys.stderr)

@@ -42,9 +42,9 @@ def joint(
     eye = partial(angles_only, std=s["angle_std"] * paper.ARCSECOND, form=s["form"])
     eyes = [eye(observer=6 * a) for a in range(1, n + 1)]
     f = GaussianFilter(
-        paper.moving(s, n + 1), eyes, graphs.complete(n), linearization="unscented"
+        paper.orbit_model(s, n + 1), eyes, graphs.complete(n), linearization="unscented"
     )
-    state = f.start((first, paper.block(covs)))
+    state = f.start((first, paper.block_diagonal(covs)))
     out = []
     for k, hour in enumerate(paper.HOURS):
         state = f.step(state, 3600.0 * hour, list(seen[k, :, :2]))
@@ -60,16 +60,16 @@ def joint(
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """The three rows on one set of data, means over agents and the epochs from 2 to 20 h."""
-    truth, *rest = paper.data(SETTING, np.random.default_rng(seed))
+    truth, *rest = paper.simulate(SETTING, np.random.default_rng(seed))
     out: dict[str, float] = {}
     for row, options in zip(ROWS, ("one_ci", "news", None), strict=True):
         if options is None:
             beliefs, sent = joint(SETTING, *rest)
         else:
-            states = paper.run(SETTING, paper.SINGLE[options], *rest)
+            states = paper.run_filter(SETTING, paper.SINGLE[options], *rest)
             beliefs = [state.mixtures for state in states]
             sent = float(states[-1].ledger.scalars.sum())
-        found = [paper.scored(beliefs[k], truth[k]) for k in paper.EARLY]
+        found = [paper.score_epoch(beliefs[k], truth[k]) for k in paper.EARLY]
         out |= {
             f"{row}_{m}": float(np.mean([f[m].mean() for f in found])) for m in METRICS
         }
@@ -81,12 +81,12 @@ columns = [f"{row}_{m}" for row in ROWS for m in (*METRICS, "floats")]
 parameters = {"setting": SETTING}
 code = (
     joint,
-    paper.data,
-    paper.readings,
-    paper.beliefs,
-    paper.network,
-    paper.run,
-    paper.scored,
+    paper.simulate,
+    paper.observe,
+    paper.prior_beliefs,
+    paper.make_filter,
+    paper.run_filter,
+    paper.score_epoch,
 )
 scenarios = paper.scenarios
 seeds = np.random.SeedSequence(1920).spawn(104)

@@ -26,10 +26,10 @@ ready.then(() => Promise.all(pictures)).then(() => done(true));
 """
 """Waits for the mathematics and the pictures of a page."""
 
-ALLOW_NAN = "chromium or chromedriver is not installed"
+NOT_INSTALLED = "chromium or chromedriver is not installed"
 
 
-def installed() -> tuple[str, str] | None:
+def find_browser() -> tuple[str, str] | None:
     """Return the paths of a browser and of what drives it, or nothing."""
     names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
     browser = next(filter(None, map(shutil.which, names)), None)
@@ -40,8 +40,8 @@ def installed() -> tuple[str, str] | None:
 @contextmanager
 def chromium(profile: Path, **logs: str) -> Iterator[Any]:
     """Yield a browser with a fresh profile, and with logs of what it does."""
-    if (found := installed()) is None:
-        raise FileNotFoundError(ALLOW_NAN)
+    if (found := find_browser()) is None:
+        raise FileNotFoundError(NOT_INSTALLED)
     from selenium import webdriver
     from selenium.webdriver.chrome.options import Options
     from selenium.webdriver.chrome.service import Service

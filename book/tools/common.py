@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from pictures import taken_out
+from pictures import extract_pictures
 
 ROOT = Path(__file__).resolve().parents[2]
 BOOK = ROOT / "book"
@@ -26,7 +26,7 @@ _FOREIGN = re.compile(
 )
 
 
-def pinned_environment() -> dict[str, str]:
+def fixed_environment() -> dict[str, str]:
     """Return the environment in which every chapter runs, wherever it is run.
 
     One thread in each BLAS and a fixed hash seed keep the digits; the reader's own IPython profile
@@ -112,7 +112,7 @@ def output_texts(output: Any) -> Iterator[str]:
     yield from output.get("traceback", [])
     for mime, value in output.get("data", {}).items():
         if not mime.startswith("image/") or mime.endswith("svg+xml"):
-            yield taken_out(value)[0] if isinstance(value, str) else repr(value)
+            yield extract_pictures(value)[0] if isinstance(value, str) else repr(value)
 
 
 def foreign_text(output: Any) -> str:

@@ -22,7 +22,7 @@ def run(python, *arguments):
         sys.exit(code)
 
 
-def made_here(folder, here):
+def is_complete(folder, here):
     """Say whether the environment is whole, works, and was made in this repository."""
     python = os.path.join(folder, "bin", "python")
     try:
@@ -46,7 +46,7 @@ def main():
         )
     stamp = os.path.join(folder, "stamp")
     python = os.path.join(folder, "bin", "python")
-    if made_here(folder, here):
+    if is_complete(folder, here):
         os.remove(stamp)  # until the update is whole too
     else:
         shutil.rmtree(folder, ignore_errors=True)

@@ -30,8 +30,8 @@ import nbformat
 from nbclient import NotebookClient
 from nbclient.exceptions import CellExecutionError
 
-from common import ROOT, chosen, foreign_text, pinned_environment
-from pictures import differences, lighten, taken_out
+from common import ROOT, chosen, fixed_environment, foreign_text
+from pictures import differences, extract_pictures, shrink_pictures
 from sockets import AsyncManager
 
 KERNELSPEC = {"display_name": "Python 3", "language": "python", "name": "python3"}
@@ -94,10 +94,10 @@ def run(notebook: Any, folder: Path) -> None:
         extra_arguments=["--log-level=40"],
         resources={"metadata": {"path": str(folder)}},
     )
-    client.execute(env=pinned_environment())
+    client.execute(env=fixed_environment())
     notebook.metadata["language_info"] = nbformat.from_dict(LANGUAGE)
     for cell in notebook.cells:
-        lighten(cell.get("outputs", []))
+        shrink_pictures(cell.get("outputs", []))
 
 
 def complaints(notebook: Any) -> list[str]:
@@ -124,10 +124,10 @@ def dump(notebook: Any) -> str:
     for k, model in enumerate(state):
         text = text.replace(model, f"{k:032d}")
     # The keys were sorted by their random names: sort again by the new ones.
-    return text if not state else _sorted(text)
+    return text if not state else _sort_keys(text)
 
 
-def _sorted(text: str) -> str:
+def _sort_keys(text: str) -> str:
     notebook = nbformat.reads(text, as_version=4)
     return (
         str(nbformat.writes(notebook, sort_keys=True, indent=1, ensure_ascii=False))
@@ -139,7 +139,7 @@ def unlike(stored: str, fresh: str, whole: bool) -> str:
     """Return how another execution differs from the stored text of a notebook, or ''."""
     if stored == fresh:
         return ""
-    if whole or taken_out(stored)[0] != taken_out(fresh)[0]:
+    if whole or extract_pictures(stored)[0] != extract_pictures(fresh)[0]:
         return "another execution does not give the stored bytes"
     pairs = zip(cells_of(stored), cells_of(fresh), strict=True)
     found = [
@@ -158,7 +158,7 @@ def cells_of(text: str) -> list[Any]:
 
 def execute(source: Path, check: bool = False, whole: bool = False) -> str:
     """Execute one chapter; return what is wrong with it, or ''."""
-    os.environ.update(pinned_environment())
+    os.environ.update(fixed_environment())
     started = time.perf_counter()
     notebook = read(source)
     try:
@@ -192,7 +192,7 @@ def copy_sources(source: Path) -> str:
         if new.cell_type == "code":
             new.outputs = old.outputs
             new.execution_count = old.execution_count
-            lighten(new.outputs)
+            shrink_pictures(new.outputs)
     if "widgets" in stored.metadata:
         fresh.metadata["widgets"] = stored.metadata["widgets"]
     target.write_text(dump(fresh), encoding="utf-8", newline="\n")

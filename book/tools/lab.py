@@ -120,7 +120,7 @@ def names(sources: list[Path]) -> Names:
     return out
 
 
-def cited(key: str, references: BibliographyData) -> tuple[str, str]:
+def cite(key: str, references: BibliographyData) -> tuple[str, str]:
     """Return an entry's authors, as a text names them, and its year."""
     entry = references.entries[key]
     people = entry.persons.get("author") or entry.persons.get("editor") or []
@@ -129,12 +129,12 @@ def cited(key: str, references: BibliographyData) -> tuple[str, str]:
     return shown, str(entry.fields.get("year", "n.d."))
 
 
-def written_out(
+def render_role(
     role: str, target: str, page: str, known: Names, refs: BibliographyData
 ) -> str:
     """Return the words that a role stands for."""
     if role.startswith("cite"):
-        entries = [cited(key.strip(), refs) for key in target.split(",")]
+        entries = [cite(key.strip(), refs) for key in target.split(",")]
         if role == "cite:t":
             return "; ".join(
                 f"[{who} ({year})](bibliography.md)" for who, year in entries
@@ -176,7 +176,7 @@ def plain(text: str, page: str, known: Names, references: BibliographyData) -> s
         "*What the build makes of the chapters stands here on the book's page.*", text
     )
     text = re.sub(r"\]\((?:/book/)?(\d\d[a-z]?-[\w-]+)\.md", r"](\1.ipynb", text)
-    return ROLE.sub(lambda m: written_out(m[1], m[2], page, known, references), text)
+    return ROLE.sub(lambda m: render_role(m[1], m[2], page, known, references), text)
 
 
 def notebook(source: Path, known: Names, references: BibliographyData) -> Any:
@@ -211,9 +211,7 @@ def bibliography(references: BibliographyData) -> str:
     """Return the list of references as Markdown."""
     style = find_plugin("pybtex.style.formatting", "plain")()
     backend = find_plugin("pybtex.backends", "markdown")()
-    entries = sorted(
-        references.entries.values(), key=lambda e: cited(e.key, references)
-    )
+    entries = sorted(references.entries.values(), key=lambda e: cite(e.key, references))
     lines = [entry.text.render(backend) for entry in style.format_entries(entries)]
     return "# Bibliography\n\n" + "\n".join(f"- {line}" for line in lines) + "\n"
 

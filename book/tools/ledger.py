@@ -166,7 +166,7 @@ def claims_of(row: dict[str, str]) -> list[Judged]:
     ]
 
 
-def unmoved(row: dict[str, str]) -> list[str]:
+def powerless_claims(row: dict[str, str]) -> list[str]:
     """Return the claims of a row whose verdict is the same on the null's numbers, or lacks one.
 
     A claim writes "holds too" behind its null when its rule, asked of the null, holds.

@@ -542,25 +542,25 @@ def constant(node: ast.AST) -> float | None:
     return None
 
 
-def compared_numbers(node: ast.AST) -> Iterator[float]:
+def numbers_compared_with(node: ast.AST) -> Iterator[float]:
     """Numbers that take part in a comparison by themselves, in a list, as a factor or a term."""
     value = constant(node)
     if value is not None:
         yield value
     elif isinstance(node, ast.List | ast.Tuple):
         for item in node.elts:
-            yield from compared_numbers(item)
+            yield from numbers_compared_with(item)
     elif isinstance(node, ast.Dict):
         for item in (*node.keys, *node.values):
             if item is not None:
-                yield from compared_numbers(item)
+                yield from numbers_compared_with(item)
     elif isinstance(node, ast.BinOp):
-        yield from compared_numbers(node.left)
-        yield from compared_numbers(node.right)
+        yield from numbers_compared_with(node.left)
+        yield from numbers_compared_with(node.right)
     elif isinstance(node, ast.Call) and node.args:
         name = getattr(node.func, "attr", getattr(node.func, "id", ""))
         if name in ("abs", "array", "log", "sqrt", "log10", "deg2rad"):
-            yield from compared_numbers(node.args[0])
+            yield from numbers_compared_with(node.args[0])
 
 
 def checks(node: ast.Assert, section: int, where: str) -> Iterator[Fact]:
@@ -575,12 +575,12 @@ def checks(node: ast.Assert, section: int, where: str) -> Iterator[Fact]:
                 low, high = sorted((ends[0], ends[2]))
                 yield Fact("check", low, high, where, section, words)
             for side in sides:
-                seen.update(compared_numbers(side))
+                seen.update(numbers_compared_with(side))
         elif isinstance(part, ast.Call):
             name = getattr(part.func, "attr", getattr(part.func, "id", ""))
             if name in ("isclose", "allclose", "array_equal"):
                 for side in part.args[:2]:
-                    seen.update(compared_numbers(side))
+                    seen.update(numbers_compared_with(side))
     for value in seen:
         yield Fact("check", value, value, where, section, words)
     message = node.msg.value if isinstance(node.msg, ast.Constant) else ""
@@ -850,7 +850,7 @@ def defaults() -> dict[str, tuple[Fact, ...]]:
 
 
 @cache
-def published_facts(paper: str) -> tuple[Fact, ...]:
+def paper_facts(paper: str) -> tuple[Fact, ...]:
     """The numbers that a paper prints, as stored."""
     out = []
     for path in sorted((ROOT / "data" / "published" / paper).iterdir()):
@@ -1067,7 +1067,7 @@ def alternative_texts(piece: str) -> Iterator[str]:
             yield ast.unparse(node.value).strip("'\"") + "\n"
 
 
-def related_facts(source: Path, code: str) -> list[Fact]:
+def facts_of_sources(source: Path, code: str) -> list[Fact]:
     """Return the numbers of the studies, functions, scenarios and papers of a chapter."""
     facts: list[Fact] = []
     studies = re.findall(r"(?:script\(|stored\(\s*\"\w+\",\s*)\"([\w-]+)\"", code)
@@ -1082,7 +1082,7 @@ def related_facts(source: Path, code: str) -> list[Fact]:
     if paper:
         for path in sorted((ROOT / "data" / "scenarios" / paper).glob("*.toml")):
             facts += scenario_facts(path)
-        facts += published_facts(paper)
+        facts += paper_facts(paper)
     return facts
 
 
@@ -1106,7 +1106,7 @@ def read(source: Path) -> tuple[list[Numeral], list[Fact]]:
         facts += code_facts(piece, where, section)
         facts += output_facts(cells[len(codes)], section, where)
         codes.append(piece)
-    return numerals, facts + related_facts(source, "".join(codes))
+    return numerals, facts + facts_of_sources(source, "".join(codes))
 
 
 def main() -> int:

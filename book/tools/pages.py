@@ -170,7 +170,7 @@ def home_of(module: Any, name: str) -> str:
 
 
 @functools.cache
-def named_types() -> list[tuple[Any, str]]:
+def type_names() -> list[tuple[Any, str]]:
     """Return the types that have a name of their own, each with it."""
     kinds = importlib.import_module("distfilt.validation")
     own = [(getattr(kinds, name), name) for name in kinds.__all__]
@@ -195,7 +195,7 @@ def format_type(kind: Any, names: Mapping[str, Any]) -> str:
         return "None"
     if isinstance(kind, list):  # the arguments of a Callable
         return f"[{format_types(kind, names, ', ')}]"
-    for value, name in named_types():
+    for value, name in type_names():
         if value == kind:
             return name
     if get_origin(kind) is None:
@@ -343,7 +343,7 @@ def code_of(source: Path) -> str:
     return re.sub(r"^[%!].*$", "", text, flags=re.MULTILINE)
 
 
-def imported(code: str, known: dict[str, str]) -> dict[str, str]:
+def imports_of(code: str, known: dict[str, str]) -> dict[str, str]:
     """Return what a text calls the library's names, each with the path of its entry."""
     out = {}
     for node in ast.walk(ast.parse(code)):
@@ -356,9 +356,9 @@ def imported(code: str, known: dict[str, str]) -> dict[str, str]:
     return out
 
 
-def used(code: str, known: dict[str, str]) -> set[str]:
+def names_used(code: str, known: dict[str, str]) -> set[str]:
     """Return the library's names that a text uses, those of a module or class too."""
-    names = imported(code, known)
+    names = imports_of(code, known)
     out = set()
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Name) and node.id in names:
@@ -383,7 +383,7 @@ def users() -> dict[str, list[str]]:
             shown = f":doc:`{label or 'the first page'} </book/{source.stem}>`"
         else:
             shown = f"``{source.relative_to(ROOT).as_posix()}``"
-        for name in used(code_of(source), known):
+        for name in names_used(code_of(source), known):
             out.setdefault(name, []).append(shown)
     return out
 
@@ -424,7 +424,7 @@ def link_code(
     return BLOCK.sub(lambda block: name.sub(link, block[0]), body)
 
 
-def lighter(body: str) -> str:
+def simplify_signatures(body: str) -> str:
     """Return a page without the marks inside its signatures, which are half of its weight."""
 
     def plain(found: re.Match[str]) -> str:
@@ -786,7 +786,7 @@ def cite_text() -> str:
     return f"```bibtex\n@software{{distfilt,\n{body}\n}}\n```"
 
 
-def measured_text() -> str:
+def comparison_text() -> str:
     """Return what chapter 11's stored study found best: a row a problem, a column a budget."""
     from bookkit import studies
 
@@ -804,7 +804,7 @@ def measured_text() -> str:
             best = read.best(name, budget)
             error = read.ratio(best, read.results(name)["reference"]).estimate
             what = read.together.CELLS[best.cell]
-            cells += [f"{error:.2f}: {what.family}; {what.talk}"]
+            cells += [f"{error:.2f}: {what.family}; {what.exchange}"]
         lines += ["| " + " | ".join(cells) + " |"]
     return "\n".join(lines)
 
@@ -816,7 +816,7 @@ def write_generated(folder: Path) -> None:
     parts["api.md"] = api_index()
     parts["map.md"] = map_text()
     parts["errata.md"] = errata_text()
-    parts["measured.md"] = measured_text()
+    parts["measured.md"] = comparison_text()
     parts["gallery.md"] = gallery_text(folder / "gallery")
     parts["cite.md"] = cite_text()
     if ITEMS.is_file() and LEDGER.is_file():

@@ -77,7 +77,7 @@ def output_faults(output: Any) -> list[str]:
         faults.append(f"a stored error: {output.ename}")
     if output.get("name") == "stderr":
         faults.append("stored stderr")
-    for line in shown_text(output).splitlines():
+    for line in printed_text(output).splitlines():
         if len(line) > WIDTH:
             length = f"{len(line)} characters printed, at most {WIDTH}"
             faults.append(f"a line of {length}: {line}")
@@ -87,7 +87,7 @@ def output_faults(output: Any) -> list[str]:
     return faults
 
 
-def shown_text(output: Any) -> str:
+def printed_text(output: Any) -> str:
     """Return the text that a page shows of an output; '' where it shows a picture or a table."""
     data = output.get("data", {})
     return str(output.get("text", data.get("text/plain", ""))) if len(data) < 2 else ""

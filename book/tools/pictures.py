@@ -33,19 +33,19 @@ TINTED = 1e-3
 """A palette of 256 colours moves no more than this share of pixels by more than this of 255."""
 
 
-def taken_out(text: str) -> tuple[str, list[str]]:
+def extract_pictures(text: str) -> tuple[str, list[str]]:
     """Return a text without the frames of sliders that are written in it, and these."""
     return _EMBEDDED.sub("…", text), _EMBEDDED.findall(text)
 
 
-def stored_pictures(output: Any) -> list[str]:
+def pictures_of(output: Any) -> list[str]:
     """Return the pictures of an output, those that its HTML embeds included, as base64."""
     data = output.get("data", {})
     out = [data["image/png"]] if "image/png" in data else []
-    return out + taken_out(_joined(data.get("text/html", "")))[1]
+    return out + extract_pictures(_join(data.get("text/html", "")))[1]
 
 
-def _joined(text: Any) -> str:
+def _join(text: Any) -> str:
     return text if isinstance(text, str) else "".join(text)
 
 
@@ -57,12 +57,12 @@ def without_pictures(outputs: list[Any]) -> list[Any]:
         if "image/png" in data:
             data["image/png"] = "…"
         if "text/html" in data:
-            data["text/html"] = taken_out(_joined(data["text/html"]))[0]
+            data["text/html"] = extract_pictures(_join(data["text/html"]))[0]
         out.append(nbformat.from_dict({**output, "data": data}) if data else output)
     return out
 
 
-def lighter(picture: str) -> str:
+def shrink_picture(picture: str) -> str:
     """Return a PNG with a palette of 256 colours, a third of the bytes, if a reader sees the same.
 
     A picture of finer shades, or one that has a palette already, comes back as it is.
@@ -71,21 +71,21 @@ def lighter(picture: str) -> str:
     if image.mode == "P" or (image.mode == "RGBA" and image.getextrema()[3][0] < 255):
         return picture
     palette = image.convert("RGB").quantize(256, kmeans=1, dither=Image.Dither.NONE)
-    if _moved(image, palette, TINT) > TINTED:
+    if _changed_share(image, palette, TINT) > TINTED:
         return picture
     out = io.BytesIO()
     palette.save(out, "png", optimize=True, dpi=image.info.get("dpi", (72, 72)))
     return base64.b64encode(out.getvalue()).decode()
 
 
-def lighten(outputs: list[Any]) -> None:
+def shrink_pictures(outputs: list[Any]) -> None:
     """Make the stored pictures of a cell lighter, in place."""
     for output in outputs:
         if "image/png" in output.get("data", {}):
-            output["data"]["image/png"] = lighter(output["data"]["image/png"])
+            output["data"]["image/png"] = shrink_picture(output["data"]["image/png"])
 
 
-def _moved(one: Image.Image, other: Image.Image, by: float) -> float:
+def _changed_share(one: Image.Image, other: Image.Image, by: float) -> float:
     """The share of pixels of which a colour differs by more than `by` of 255."""
     bands = ImageChops.difference(one.convert("RGB"), other.convert("RGB")).split()
     counts = reduce(ImageChops.lighter, bands).histogram()
@@ -98,7 +98,7 @@ def difference(one: str, other: str) -> str:
         return ""
     try:
         a, b = (Image.open(io.BytesIO(base64.b64decode(p))) for p in (one, other))
-        share = _moved(a, b, 255 * SHADE) if a.size == b.size else 1.0
+        share = _changed_share(a, b, 255 * SHADE) if a.size == b.size else 1.0
     except (OSError, ValueError, binascii.Error):
         return "is no picture"
     if a.size != b.size:
@@ -108,8 +108,8 @@ def difference(one: str, other: str) -> str:
 
 def differences(stored: list[Any], fresh: list[Any]) -> list[str]:
     """Return how the pictures of two lists of outputs differ."""
-    one = [p for output in stored for p in stored_pictures(output)]
-    two = [p for output in fresh for p in stored_pictures(output)]
+    one = [p for output in stored for p in pictures_of(output)]
+    two = [p for output in fresh for p in pictures_of(output)]
     if len(one) != len(two):
         return [f"{len(one)} pictures stored, {len(two)} drawn"]
     found = (difference(a, b) for a, b in zip(one, two, strict=True))

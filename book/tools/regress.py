@@ -20,7 +20,7 @@ from pathlib import Path
 
 import nbformat
 
-from common import ROOT, chosen, pinned_environment
+from common import ROOT, chosen, fixed_environment
 
 PROBE_BLAS = """\
 import numpy, scipy.linalg, threadpoolctl
@@ -60,7 +60,7 @@ def compare(notebook: Path, extra: dict[str, str]) -> int:
     done = subprocess.run(
         command,
         cwd=ROOT,
-        env=pinned_environment() | extra,
+        env=fixed_environment() | extra,
         capture_output=True,
         text=True,
     )

@@ -1,10 +1,10 @@
-"""Compare the scenarios with the values that the book stands for, or accept them as they are.
+"""Compare the scenarios with the accepted values, or accept them as they are.
 
-    python book/tools/scenarios.py [--accept]
+    python book/tools/scenarios.py [--update]
 
-``data/scenarios/accepted.csv`` has a line for every value of every scenario. By it a chapter
-notices a reader's change and says "not comparable: changed scenario". Who changes the book's own
-study runs ``make accept`` and commits the file with the scenario.
+``data/scenarios/accepted.csv`` has a line for every value of every scenario. With it a chapter
+detects a reader's change and shows the verdict "not comparable: changed scenario". After a change of
+the book's own scenarios, run ``make update-scenarios`` and commit the file with the scenario.
 """
 
 from __future__ import annotations
@@ -22,30 +22,32 @@ COLUMNS = ("paper", "scenario", "entry", "value")
 
 def text_of(folder: Path) -> str:
     """Return the text of ``accepted.csv`` for a folder of scenarios."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
+    buffer = io.StringIO()
+    writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(COLUMNS)
     for paper in PAPERS:
         for path in sorted((folder / paper).glob("*.toml")):
-            s = read_scenario(path)
+            scenario = read_scenario(path)
             writer.writerows(
-                [paper, s.name, key, value] for key, value in s.entries().items()
+                [paper, scenario.name, key, value]
+                for key, value in scenario.entries().items()
             )
-    return out.getvalue()
+    return buffer.getvalue()
 
 
 def main(arguments: list[str] | None = None, root: Path = ROOT) -> int:
     folder = root / "data" / "scenarios"
     target = folder / "accepted.csv"
     text = text_of(folder)
-    if "--accept" in (sys.argv[1:] if arguments is None else arguments):
+    if "--update" in (sys.argv[1:] if arguments is None else arguments):
         target.write_text(text, encoding="utf-8", newline="\n")
     elif not target.is_file() or target.read_text(encoding="utf-8") != text:
         print(
-            "the scenarios are not those of accepted.csv: make accept", file=sys.stderr
+            "the scenarios differ from accepted.csv: make update-scenarios",
+            file=sys.stderr,
         )
         return 1
-    print(f"{len(text.splitlines()) - 1} values of scenarios, as accepted")
+    print(f"{len(text.splitlines()) - 1} values of scenarios equal the accepted ones")
     return 0
 
 

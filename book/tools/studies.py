@@ -5,8 +5,8 @@
 Each ``book/studies/*.py`` defines one study, which serves one item: ``NAME`` (the item's, such as
 ``figure-2``), ``PAPER`` (a key of the papers), ``trial``, ``parameters``, ``columns`` and
 ``seeds``; and if it wants ``code`` (other functions whose source is recorded), ``rtol``, ``atol``,
-``rough`` and ``odd`` (what a later run may differ by, as in ``studies.check``; the same bits
-without them) and ``scenarios`` (those that it reads). A scenario's digest is stored among the
+``ill_conditioned`` and ``max_outliers`` (how far a later run may differ, as in ``studies.check``;
+the same bits without them) and ``scenarios`` (those that it reads). A scenario's digest is stored among the
 parameters, and one that is not as accepted is refused: what is stored is the book's own study.
 What several scripts share stands in ``book/studies/_NAME.py``, which they import by that name.
 
@@ -31,7 +31,7 @@ from bookkit.published import PAPERS
 from bookkit.studies.files import plain_json, seed_text
 from common import ROOT
 
-ALLOWED = ("rtol", "atol", "rough", "odd")
+ALLOWED = ("rtol", "atol", "ill_conditioned", "max_outliers")
 NEEDED = ("NAME", "PAPER", "trial", "parameters", "columns", "seeds")
 
 
@@ -69,7 +69,7 @@ def parameters_of(script: ModuleType) -> dict[str, Any]:
     }
 
 
-def changed(script: ModuleType) -> str:
+def changes_of(script: ModuleType) -> str:
     """Return what differs in a study's scenarios from the book's own, or ''."""
     found = [c for s in getattr(script, "scenarios", ()) for c in s.changes]
     return (
@@ -172,7 +172,7 @@ def main(arguments: list[str] | None = None, root: Path = ROOT) -> int:
     if not known:
         print("book/studies holds no script: there is no long study to run")
     for script in chosen:
-        if found := changed(script):
+        if found := changes_of(script):
             problems.append(found)
         elif options.check:
             problems.append(check(script, root, options.workers))

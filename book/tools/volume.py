@@ -102,7 +102,7 @@ def key(page: str, name: str = "") -> str:
     return f"p{stem}" + (f"--{re.sub(r'[^A-Za-z0-9_.-]', '-', name)}" if name else "")
 
 
-def shown() -> list[str]:
+def book_pages() -> list[str]:
     """Return the pages that the whole book holds, in reading order."""
     return [page for page in toc_pages() if not page.startswith(LEFT_OUT)]
 
@@ -147,9 +147,9 @@ def lead(link: Tag, page: str, pages: list[str]) -> None:
         link.unwrap()
 
 
-def assembled() -> tuple[str, list[str]]:
+def assemble() -> tuple[str, list[str]]:
     """Return the whole book as one page, and its chapters' names."""
-    pages = shown()
+    pages = book_pages()
     parts = []
     back = []
     captions = {}
@@ -237,7 +237,7 @@ def pages_of(pdf: bytes) -> dict[str, int]:
     return {name.decode(): order[number] for name, number in places}
 
 
-def printed(driver: Any) -> bytes:
+def print_page(driver: Any) -> bytes:
     """Return the open page as a PDF."""
     foot = (
         '<div style="font: 8px sans-serif; width: 100%; text-align: center">'
@@ -258,7 +258,7 @@ def printed(driver: Any) -> bytes:
     return base64.b64decode(answer["data"])
 
 
-def opened(driver: Any, page: Path) -> None:
+def open_page(driver: Any, page: Path) -> None:
     """Open the assembled page, set it, and refuse what does not fit."""
     driver.command_executor.client_config.timeout = 1800
     driver.set_script_timeout(1700)
@@ -274,20 +274,20 @@ def opened(driver: Any, page: Path) -> None:
 
 def pdf(driver: Any, parts: list[str]) -> bytes:
     """Return the book as a PDF; the second printing has the numbers of the first one's pages."""
-    places = pages_of(printed(driver))
+    places = pages_of(print_page(driver))
     starts = [places[part] for part in parts if part in places]
     if len(starts) != len(parts) or starts != sorted(set(starts)):
         sys.exit(
             f"the PDF has not every chapter: {dict(zip(parts, starts, strict=False))}"
         )
     driver.execute_script(NUMBER, places)
-    return printed(driver)
+    return print_page(driver)
 
 
 def main() -> int:
     if len(sys.argv) != 2 or sys.argv[1] not in ("pdf", "epub"):
         sys.exit(__doc__)
-    text, names = assembled()
+    text, names = assemble()
     target = TARGET / f"{NAME}.{sys.argv[1]}"
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -295,7 +295,7 @@ def main() -> int:
     ):
         page = Path(folder) / "book.html"
         page.write_text(text, encoding="utf-8")
-        opened(driver, page)
+        open_page(driver, page)
         parts = [key(name) for name in names]
         if sys.argv[1] == "pdf":
             target.write_bytes(pdf(driver, parts))

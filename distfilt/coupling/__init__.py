@@ -1,10 +1,10 @@
-"""Couplings: plans that turn weights into equally weighted members, and members that obey rules."""
+"""Couplings of weighted and equally weighted members, and members that satisfy constraints."""
 
 from .constraints import Constraint, norm_constraint, project, retract
 from .solvers import TransportPlan, monotone_plan, squared_distances, transport_plan
 from .transform import (
-    rejuvenate,
     correct_moments,
+    rejuvenate,
     transform_along,
     transform_ensemble,
     transform_within,

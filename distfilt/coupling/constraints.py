@@ -13,9 +13,10 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ..ensembles import Ensemble
-from ..linalg import SolverError, as_derivative, central
+from ..linalg import SolverError, evaluate_derivative, central_difference
 from ..validation import (
     Array,
+    ArrayInput,
     Bounds,
     DistinctIndices,
     FrozenModel,
@@ -65,11 +66,11 @@ class Constraint(FrozenModel):
     """
 
     function: Callable[[Array], Array]
-    value: Annotated[Array, "s"]
+    value: Annotated[ArrayInput, "s"]
     derivative: Callable[[Array], Array] | None = field(default=None, kw_only=True)
 
     @validated
-    def residual(self, x: Annotated[Array, "... d"]) -> Array:
+    def residual(self, x: Annotated[ArrayInput, "... d"]) -> Array:
         """Return the residual g(x) - d of states (..., d), (..., s)."""
         return check_array(self.violation(x), "function")
 
@@ -83,14 +84,15 @@ class Constraint(FrozenModel):
                 "constraint must be a function of the components that states have, got one of "
                 f"more than {x.shape[-1]}: {error}"
             ) from error
-        return check_array(g, "function", shape, finite=False) - self.value
+        values = check_array(g, "function", shape, finite=False)
+        return np.asarray(values - self.value)
 
     @validated
-    def jacobian(self, x: Annotated[Array, "... d"]) -> Array:
+    def jacobian(self, x: Annotated[ArrayInput, "... d"]) -> Array:
         """Return the derivative of g at states (..., d), (..., s, d)."""
         shape = (*x.shape[:-1], self.value.size, x.shape[-1])
-        differences = partial(central, self.violation, x)
-        return as_derivative(self, (x,), shape, differences)
+        differences = partial(central_difference, self.violation, x)
+        return evaluate_derivative(self, (x,), shape, differences)
 
 
 @validated
@@ -115,7 +117,7 @@ def norm_constraint(
     """
     columns = list(indices)
 
-    def squared_norm(x: Array) -> Array:
+    def norm_squared(x: Array) -> Array:
         return np.asarray((x[..., columns] ** 2).sum(axis=-1, keepdims=True))
 
     def jacobian(x: Array) -> Array:
@@ -123,7 +125,7 @@ def norm_constraint(
         slope[..., 0, columns] = 2 * x[..., columns]
         return slope
 
-    return Constraint(squared_norm, np.array([length**2]), derivative=jacobian)
+    return Constraint(norm_squared, np.array([length**2]), derivative=jacobian)
 
 
 @validated
@@ -206,13 +208,14 @@ def project(
         before = mean_residual
         after = after.mean(axis=-2, keepdims=True)
     # A comparison with NaN is false, so an ensemble out of the domain is refused too.
-    better = np.abs(after).sum(axis=(-1, -2)) <= np.abs(before).sum(axis=(-1, -2))
-    return np.asarray(np.where(better[..., None, None], projected, ensemble))
+    total_before = np.abs(before).sum(axis=(-1, -2), keepdims=True)
+    total_after = np.abs(after).sum(axis=(-1, -2), keepdims=True)
+    return np.asarray(np.where(total_after <= total_before, projected, ensemble))
 
 
 @validated
 def retract(
-    states: Annotated[Array, "... d"],
+    states: Annotated[ArrayInput, "... d"],
     constraint: Constraint,
     *,
     motion: Motion | None = None,

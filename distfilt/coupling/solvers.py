@@ -20,6 +20,7 @@ import numpy as np
 from ..linalg import SolverError
 from ..validation import (
     Array,
+    ArrayInput,
     Bounds,
     FrozenModel,
     PositiveFloat,
@@ -79,7 +80,8 @@ class TransportPlan(FrozenModel):
 
 @validated
 def squared_distances(
-    source: Annotated[Array, "n d"], target: Annotated[Array, "m d"] | None = None
+    source: Annotated[ArrayInput, "n d"],
+    target: Annotated[ArrayInput, "m d"] | None = None,
 ) -> Array:
     r"""Return the costs :math:`c_{ij}=|\mathbf x_i-\mathbf y_j|^2` between two sets of points.
 
@@ -112,7 +114,7 @@ def squared_distances(
 
 @validated
 def transport_plan(
-    cost: Annotated[Array, "n m"],
+    cost: Annotated[ArrayInput, "n m"],
     rows: Annotated[Probabilities, "n"],
     columns: Annotated[Probabilities, "m"] | None = None,
     *,
@@ -331,8 +333,8 @@ def _correct_marginals(matrix: Array, a: Array, b: Array) -> Array:
 
 @validated
 def monotone_plan(
-    source: Annotated[Array, "n", SQUARED],
-    target: Annotated[Array, "m", SQUARED],
+    source: Annotated[ArrayInput, "n", SQUARED],
+    target: Annotated[ArrayInput, "m", SQUARED],
     rows: Annotated[Probabilities, "n"],
     columns: Annotated[Probabilities, "m"] | None = None,
 ) -> TransportPlan:

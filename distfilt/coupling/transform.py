@@ -274,7 +274,7 @@ def _correct_moments(transformed: Array, ensemble: Array, weights: Array) -> Arr
     anomalies = transformed - transformed.mean(axis=-2, keepdims=True)
     # P = K K' is the weighted covariance.
     covariance = prior_anomalies.mT @ (weights[..., None] * prior_anomalies)
-    root = _sorted_factor(covariance)
+    root = _factor_by_size(covariance)
     # With anomalies A, A B is U V' K' sqrt(N), where U S V' = A K: its columns U V' are the
     # orthonormal ones nearest to A K. P comes out to rounding, however small C is.
     product = anomalies @ root
@@ -287,7 +287,7 @@ def _correct_moments(transformed: Array, ensemble: Array, weights: Array) -> Arr
 def _rounding(
     transformed: Array, product: Array, root: Array, axes: Array, n: int
 ) -> Array:
-    """Return the singular values that rounding alone can give the product of `transformed` and root.
+    """Return the singular values of anomalies times root that rounding alone can cause.
 
     Rounding of the members enters through the root, rounding of the product directly.
     """
@@ -297,7 +297,7 @@ def _rounding(
     return np.asarray(n * EPS * sum_of_errors)
 
 
-def _sorted_factor(covariance: Array) -> Array:
+def _factor_by_size(covariance: Array) -> Array:
     """Return a factor K of covariances K K', triangular from the widest component to the narrowest.
 
     Its columns then shrink as the components do, and a small unit does not vanish in the rounding

@@ -1,5 +1,7 @@
-"""Densities on grids: kernel estimates, the Fokker-Planck equation, and the filter of both."""
+"""Densities on grids: kernel estimates, the Fokker-Planck equation, and their Kalman filter."""
 
+from .consensus import ConsensusProtocol, DynamicAverage, PIConsensus
+from .flooding import Centralised, Flooding, Neighbours
 from .fokker_planck import FokkerPlanck, bernoulli
 from .grid import Grid, zero_mean_prior
 from .kernel import (
@@ -16,14 +18,6 @@ from .low_rank import (
     low_rank_predict,
     low_rank_start,
     low_rank_step,
-)
-from .sharing import (
-    Centralised,
-    ConsensusProtocol,
-    DynamicAverage,
-    Flooding,
-    Neighbours,
-    PIConsensus,
 )
 
 __all__ = [

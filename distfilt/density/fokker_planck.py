@@ -1,12 +1,11 @@
-"""The Fokker-Planck equation of a swarm by finite volumes that keep mass and sign."""
+"""The Fokker-Planck equation of a swarm, by finite volumes that conserve mass and positivity."""
 
 from __future__ import annotations
 
-from collections import namedtuple
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 import scipy
@@ -16,6 +15,7 @@ from ..models.swarm import Swarm
 from ..validation import (
     Array,
     FrozenModel,
+    Indices,
     NonNegativeFloat,
     PositiveFloat,
     Times,
@@ -36,40 +36,52 @@ def bernoulli(z: Annotated[Array, "..."]) -> Array:
     array([1.581977, 1.      , 0.581977])
     """
     small = np.abs(z) < 1e-4
-    safe = np.where(small, 1.0, z)
-    return np.where(
-        small, 1 - z / 2 + z**2 / 12, safe / np.expm1(np.clip(safe, -700.0, 700.0))
-    )
+    # Near zero by its Taylor series; far from it, expm1 does not overflow below 700.
+    series = 1 - z / 2 + z**2 / 12
+    nonzero = np.where(small, 1.0, z)
+    ratio = nonzero / np.expm1(np.clip(nonzero, -700.0, 700.0))
+    return np.where(small, series, ratio)
 
 
-_Faces = namedtuple("_Faces", "points left right axis width")
-"""Inner faces of a grid: where they are, which cells they part, and along which axis."""
+class _Faces(NamedTuple):
+    """Faces between the cells of a grid, in the order of their axes."""
+
+    points: Array
+    """Centres of the faces, (f, d)."""
+    left: Indices
+    """Cells below each face along its axis."""
+    right: Indices
+    """Cells above it."""
+    axis: Indices
+    """Axis that crosses it."""
+    width: Array
+    """Distance of the two cells' centres."""
 
 
 @dataclass(frozen=True, eq=False)
 class FokkerPlanck(FrozenModel):
-    r"""The density of a swarm's agents, as finite volumes with walls that nothing passes.
+    r"""Evolution of the density of a swarm's agents, by finite volumes with closed walls.
 
-    Through the face between two cells goes Scharfetter and Gummel's flux, exact where drift and
+    The flux through the face between two cells is Scharfetter and Gummel's, exact where drift and
     diffusion are constant between their centres. With the Péclet number :math:`z=v\Delta/D`,
 
     .. math:: F = \bigl[B(-z)\,D_l\,p_l - B(z)\,D_r\,p_r\bigr]/\Delta,\qquad B(z)=z/(e^z-1).
 
     The generator A of :math:`\dot p=\mathbf A p` then has columns that sum to zero and no negative
-    entry beside its diagonal, at any Péclet number: mass stays and no density becomes negative in
-    steps of backward Euler. A diffusion that varies in space is meant in the sense of Itô.
+    off-diagonal entry, at any Péclet number: steps of backward Euler conserve mass and positivity.
+    A diffusion that varies in space is meant in the sense of Itô.
 
     Parameters
     ----------
     swarm : Swarm
         Drift, diffusion and box.
     grid : Grid
-        Of the same box.
+        A grid of the swarm's box.
     scheme : {"split", "backward_euler", "crank_nicolson"}
-        The step in time. Backward Euler is of order one; `split` does it for one axis after the
-        other, which is of order one too, keeps mass and sign as well, and costs a tridiagonal
-        solve for each axis instead of a sparse factorisation. Crank and Nicolson's step is of
-        order two and does not keep signs in long steps.
+        The step in time. Backward Euler is of order one. `split` applies it to one axis after the
+        other: it is of order one too, conserves mass and positivity as well, and costs a
+        tridiagonal solve for each axis instead of a sparse factorisation. The Crank-Nicolson step
+        is of order two and can give negative densities in long steps.
 
     Raises
     ------
@@ -83,9 +95,9 @@ class FokkerPlanck(FrozenModel):
 
     Examples
     --------
-    >>> flow = FokkerPlanck(Swarm(lambda x, t: 0.1 - x, 0.01), Grid((20, 20)))
-    >>> p = flow.step(np.ones(400), 0.0, 0.5)
-    >>> bool(abs(flow.grid.integral(p) - 1) < 1e-13), bool(p.min() > 0)
+    >>> equation = FokkerPlanck(Swarm(lambda x, t: 0.1 - x, 0.01), Grid((20, 20)))
+    >>> p = equation.step(np.ones(400), 0.0, 0.5)
+    >>> bool(abs(equation.grid.integral(p) - 1) < 1e-13), bool(p.min() > 0)
     (True, True)
     """
 
@@ -97,61 +109,67 @@ class FokkerPlanck(FrozenModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        boxes = [np.array([part.low, part.high]) for part in (self.grid, self.swarm)]
-        if not np.array_equal(boxes[0], boxes[1]):
+        same_low = np.array_equal(self.grid.low, self.swarm.low)
+        same_high = np.array_equal(self.grid.high, self.swarm.high)
+        if not (same_low and same_high):
             raise ValueError(
-                "grid must be a grid of the swarm's box, got "
-                f"{self.grid.shape!r} of another"
+                "grid must cover the swarm's box, from "
+                f"{self.swarm.low.tolist()} to {self.swarm.high.tolist()}, "
+                f"got {np.asarray(self.grid.low).tolist()} to "
+                f"{np.asarray(self.grid.high).tolist()}"
             )
 
     @cached_property
     def _faces(self) -> _Faces:
         grid = self.grid
         cells = np.arange(grid.size).reshape(grid.shape)
-        left = [np.delete(cells, -1, axis=k).ravel() for k in range(grid.dim)]
-        right = [np.delete(cells, 0, axis=k).ravel() for k in range(grid.dim)]
-        axis = np.repeat(np.arange(grid.dim), [len(cells) for cells in left])
-        a = np.concatenate(left)
-        b = np.concatenate(right)
-        return _Faces(
-            0.5 * (grid.centres[a] + grid.centres[b]), a, b, axis, grid.spacing[axis]
-        )
+        below = [np.delete(cells, -1, axis=k).ravel() for k in range(grid.dim)]
+        above = [np.delete(cells, 0, axis=k).ravel() for k in range(grid.dim)]
+        axis = np.repeat(np.arange(grid.dim), [len(cells) for cells in below])
+        left = np.concatenate(below)
+        right = np.concatenate(above)
+        points = 0.5 * (grid.centres[left] + grid.centres[right])
+        return _Faces(points, left, right, axis, grid.spacing[axis])
 
     def _rates(self, t: float) -> tuple[Array, Array]:
         """Rates at which mass crosses each face, forwards and backwards, in 1/s."""
-        f = self._faces
-        pick = np.arange(f.axis.size), f.axis
-        drift = self.swarm.drift_at(f.points, t)[pick]
-        between = self.swarm.diffusion_at(f.points, t)[pick]
-        cells = self.swarm.diffusion_at(self.grid.centres, t)
-        at_left = cells[f.left, f.axis]
-        at_right = cells[f.right, f.axis]
-        peclet = drift * f.width / between
+        faces = self._faces
+        # Only the components across each face matter.
+        across = np.arange(faces.axis.size), faces.axis
+        drift = self.swarm.drift_at(faces.points, t)[across]
+        diffusion = self.swarm.diffusion_at(faces.points, t)[across]
+        peclet = drift * faces.width / diffusion
         # B(-z) = z + B(z): one exponential serves both directions, without cancellation.
-        small = bernoulli(np.abs(peclet))
-        forwards = small + np.maximum(peclet, 0.0)
-        backwards = small + np.maximum(-peclet, 0.0)
-        return forwards * at_left / f.width**2, backwards * at_right / f.width**2
+        weight = bernoulli(np.abs(peclet))
+        forwards = weight + np.maximum(peclet, 0.0)
+        backwards = weight + np.maximum(-peclet, 0.0)
+        # Itô: the diffusion that multiplies the density is that of the cell which mass leaves.
+        cells = self.swarm.diffusion_at(self.grid.centres, t)
+        diffusion_left = cells[faces.left, faces.axis]
+        diffusion_right = cells[faces.right, faces.axis]
+        square = faces.width**2
+        return forwards * diffusion_left / square, backwards * diffusion_right / square
 
-    def _assembled(
+    def _assemble(
         self, t: float, scale: float, identity: float
     ) -> scipy.sparse.csc_array:
-        """identity I + scale A(t)."""
+        """Assemble the matrix identity I + scale A(t)."""
         forwards, backwards = self._rates(t)
+        faces = self._faces
         n = self.grid.size
-        f = self._faces
-        leaving = np.bincount(f.left, forwards, n) + np.bincount(f.right, backwards, n)
-        data = np.concatenate(
-            [identity - scale * leaving, scale * forwards, scale * backwards]
-        )
-        rows = np.concatenate([np.arange(n), f.right, f.left])
-        columns = np.concatenate([np.arange(n), f.left, f.right])
+        # Columns of A sum to zero: a cell loses as much as its neighbours gain.
+        loss = np.bincount(faces.left, forwards, n)
+        loss = loss + np.bincount(faces.right, backwards, n)
+        diagonal = identity - scale * loss
+        data = np.concatenate([diagonal, scale * forwards, scale * backwards])
+        rows = np.concatenate([np.arange(n), faces.right, faces.left])
+        columns = np.concatenate([np.arange(n), faces.left, faces.right])
         return scipy.sparse.csc_array((data, (rows, columns)), (n, n))
 
     @validated
     def generator(self, t: float) -> scipy.sparse.csc_array:
         """The matrix A(t) of dp/dt = A p, (n, n), sparse."""
-        return self._assembled(t, 1.0, 0.0)
+        return self._assemble(t, 1.0, 0.0)
 
     @validated
     def step(
@@ -160,20 +178,24 @@ class FokkerPlanck(FrozenModel):
         t: float,
         dt: PositiveFloat,
     ) -> Array:
-        """Densities (..., n), or any cell values, moved from `t` to `t` + `dt`."""
+        """Move densities (..., n), or any cell values, from `t` to `t` + `dt`."""
         return self.solver(t, dt)(values)
 
     @validated
     def solver(self, t: float, dt: NonNegativeFloat) -> Callable[[Array], Array]:
-        """The step from `t` to `t` + `dt` as a function: one factorisation for any number."""
+        """The step from `t` to `t` + `dt` as a function: one factorisation for any densities."""
         if self.scheme == "split":
-            return self._split(t, dt)
+            return self._split_solver(t, dt)
+        return self._sparse_solver(t, dt)
+
+    def _sparse_solver(self, t: float, dt: float) -> Callable[[Array], Array]:
+        """Solve (I - θ Δ A(t + Δ)) p' = (I + (1 - θ) Δ A(t)) p by a sparse factorisation."""
         from scipy.sparse.linalg import splu
 
-        share = dt if self.scheme == "backward_euler" else 0.5 * dt
-        explicit = self._assembled(t, dt - share, 1.0)
-        matrix = self._assembled(t + dt, -share, 1.0)
-        # The pattern is symmetric and the columns are dominated by their diagonal: no pivoting.
+        implicit = dt if self.scheme == "backward_euler" else 0.5 * dt
+        right = self._assemble(t, dt - implicit, 1.0)
+        matrix = self._assemble(t + dt, -implicit, 1.0)
+        # The pattern is symmetric and columns are diagonally dominant: no pivoting is needed.
         factors = splu(
             matrix,
             permc_spec="MMD_AT_PLUS_A",
@@ -181,64 +203,48 @@ class FokkerPlanck(FrozenModel):
             options={"SymmetricMode": True},
         )
 
-        def move(p: Array) -> Array:
-            columns = explicit @ p.reshape(-1, self.grid.size).T
-            moved = factors.solve(np.asfortranarray(columns))
-            return np.ascontiguousarray(moved.T).reshape(p.shape)
+        def step(p: Array) -> Array:
+            columns = right @ p.reshape(-1, self.grid.size).T
+            solution = factors.solve(np.asfortranarray(columns))
+            return np.ascontiguousarray(solution.T).reshape(p.shape)
 
-        return move
+        return step
 
-    def _split(self, t: float, dt: float) -> Callable[[Array], Array]:
+    def _split_solver(self, t: float, dt: float) -> Callable[[Array], Array]:
         """Backward Euler along one axis after the other, all lines of an axis at once.
 
-        The tridiagonal elimination has no subtraction, so it keeps signs to the last bit.
+        The tridiagonal elimination has no subtraction, so that no rounding makes a density
+        negative.
         """
         grid = self.grid
-        rates = self._rates(t + dt)
-        factors = [
-            self._eliminated(*(dt * self._across(r, k) for r in rates))
-            for k in range(grid.dim)
-        ]
+        forwards, backwards = self._rates(t + dt)
+        factors = []
+        for k in range(grid.dim):
+            up = dt * self._rates_across(forwards, k)
+            down = dt * self._rates_across(backwards, k)
+            factors.append(_factorize_tridiagonal(up, down))
 
-        def move(p: Array) -> Array:
-            x = np.array(p.reshape(-1, grid.size).T, order="C").reshape(*grid.shape, -1)
-            for k, (down, up, pivot) in enumerate(factors):
-                lines = np.moveaxis(x, k, 0)
-                for i in range(len(down)):
-                    lines[i + 1] += down[i] * lines[i]
-                lines[-1] *= pivot[-1]
-                for i in range(len(up) - 1, -1, -1):
-                    lines[i] *= pivot[i]
-                    lines[i] += up[i] * lines[i + 1]
+        def step(p: Array) -> Array:
+            # Densities last: each operation runs over contiguous memory.
+            columns = np.array(p.reshape(-1, grid.size).T, order="C")
+            x = columns.reshape(*grid.shape, -1)
+            for k, axis_factors in enumerate(factors):
+                _solve_tridiagonal(np.moveaxis(x, k, 0), *axis_factors)
             return np.ascontiguousarray(x.reshape(grid.size, -1).T).reshape(p.shape)
 
-        return move
+        return step
 
-    @staticmethod
-    def _eliminated(forwards: Array, backwards: Array) -> tuple[Array, Array, Array]:
-        """Factors of I - Δ A along one axis, the first here: down, up and one over the pivot."""
-        pivot = np.ones((len(forwards) + 1, *forwards.shape[1:]))
-        stays = np.ones(forwards.shape[1:])
-        for i, (there, back) in enumerate(zip(forwards, backwards, strict=True)):
-            pivot[i] = stays + there
-            stays = 1 + back * (stays / pivot[i])
-        pivot[-1] = stays
-        pivot = 1 / pivot
-        down = forwards * pivot[:-1]
-        up = backwards * pivot[:-1]
-        return down[..., None], up[..., None], pivot[..., None]
-
-    def _across(self, rate: Array, k: int) -> Array:
+    def _rates_across(self, rates: Array, k: int) -> Array:
         """Rates at the faces across axis k, with that axis first, (n_k - 1, ...)."""
         shape = list(self.grid.shape)
         shape[k] -= 1
-        return np.moveaxis(rate[self._faces.axis == k].reshape(shape), k, 0)
+        return np.moveaxis(rates[self._faces.axis == k].reshape(shape), k, 0)
 
     @validated
     def evolve(
         self, values: Annotated[Array, "... self.grid.size"], times: Times
     ) -> Array:
-        """Densities at `times`, (T, ..., n), of one that is `values` at time 0, a step to each.
+        """Densities at `times`, (T, ..., n), from `values` at time 0, by one step to each time.
 
         Parameters
         ----------
@@ -247,3 +253,35 @@ class FokkerPlanck(FrozenModel):
             Strictly increasing from 0, in s.
         """
         return trajectory(self.step, values, times, 0.0)
+
+
+def _factorize_tridiagonal(
+    forwards: Array, backwards: Array
+) -> tuple[Array, Array, Array]:
+    """Factors of I - Δ A along the first axis: lower, upper, and the reciprocal pivots.
+
+    Column i of the matrix is (-backwards[i-1], 1 + both rates out of cell i, -forwards[i]).
+    """
+    pivots = np.ones((len(forwards) + 1, *forwards.shape[1:]))
+    # The pivot without the rate forwards: d_0 = 1, d_{i+1} = 1 + b_i d_i/(d_i + f_i).
+    partial = np.ones(forwards.shape[1:])
+    for i, (forward, backward) in enumerate(zip(forwards, backwards, strict=True)):
+        pivots[i] = partial + forward
+        partial = 1 + backward * (partial / pivots[i])
+    pivots[-1] = partial
+    reciprocals = 1 / pivots
+    lower = forwards * reciprocals[:-1]
+    upper = backwards * reciprocals[:-1]
+    return lower[..., None], upper[..., None], reciprocals[..., None]
+
+
+def _solve_tridiagonal(
+    x: Array, lower: Array, upper: Array, reciprocals: Array
+) -> None:
+    """Solve in place along the first axis, by forward and backward substitution."""
+    for i in range(len(lower)):
+        x[i + 1] += lower[i] * x[i]
+    x[-1] *= reciprocals[-1]
+    for i in range(len(upper) - 1, -1, -1):
+        x[i] *= reciprocals[i]
+        x[i] += upper[i] * x[i + 1]

@@ -1,4 +1,4 @@
-"""A box cut into equal cells: what a density on it is, integrates to, and expands in."""
+"""A box divided into equal cells: integrals, histograms and cosine modes of a density on it."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from ..models.swarm import inside
+from ..models.swarm import check_inside
 from ..validation import (
     Array,
     Bounds,
@@ -26,17 +26,17 @@ __all__ = ["Grid", "zero_mean_prior"]
 
 @dataclass(frozen=True, eq=False)
 class Grid(FrozenModel):
-    """A box in one to three dimensions, cut into equal cells.
+    """A box in one to three dimensions, divided into equal cells.
 
     A density is a vector (..., n) of its means over the n cells, the last axis fastest; so a sum
-    times the cell's volume is an exact integral.
+    times the cell volume is an exact integral.
 
     Parameters
     ----------
     shape : tuple of int
-        Cells along each axis, at least 2 each.
+        Number of cells along each axis, at least 2.
     low, high : array_like, (d,), or float, optional
-        The box's corners; zeros and ones by default.
+        Corners of the box; zeros and ones by default.
 
     Examples
     --------
@@ -54,18 +54,18 @@ class Grid(FrozenModel):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 1 <= self.dim <= 3:
-            raise ValueError(f"shape must be one to three sizes, got {self.shape!r}")
+            raise ValueError(
+                f"shape must have one to three entries, got {self.shape!r}"
+            )
         for name in ("low", "high"):
             corner = np.asarray(getattr(self, name), dtype=np.float64)
             if corner.shape not in ((), (self.dim,)):
                 raise ValueError(
-                    f"{name} must be {self.dim} numbers, got {corner.size}"
+                    f"{name} must have {self.dim} entries, got {corner.size}"
                 )
             object.__setattr__(self, name, np.broadcast_to(corner, (self.dim,)))
         if (self.width <= 0).any():
-            raise ValueError(
-                f"high must have corners above low = {self.low}, got {self.high}"
-            )
+            raise ValueError(f"high must be above low = {self.low}, got {self.high}")
 
     @cached_property
     def width(self) -> Array:
@@ -73,14 +73,14 @@ class Grid(FrozenModel):
         return np.asarray(self.high - self.low)
 
     @property
-    def box(self) -> float:
+    def box_volume(self) -> float:
         """Volume of the box."""
         return float(np.prod(self.width))
 
     @property
     def side(self) -> float:
-        """Side of the cube of this volume: the length with which others compare."""
-        return float(self.box ** (1 / self.dim))
+        """Side of the cube of the same volume, the length scale of default parameters."""
+        return float(self.box_volume ** (1 / self.dim))
 
     @property
     def dim(self) -> int:
@@ -106,18 +106,19 @@ class Grid(FrozenModel):
     def edges(self) -> tuple[NDArray[np.float64], ...]:
         """Edges of the cells along each axis, (n_k + 1,)."""
         low = np.asarray(self.low)
-        ends = zip(low, low + self.width, self.shape, strict=True)
-        return tuple(np.linspace(low, high, n + 1) for low, high, n in ends)
+        axes = zip(low, low + self.width, self.shape, strict=True)
+        return tuple(np.linspace(start, end, n + 1) for start, end, n in axes)
 
     @cached_property
     def centres(self) -> Array:
         """Centres of all cells, (n, d)."""
-        axes = np.meshgrid(*(0.5 * (e[1:] + e[:-1]) for e in self.edges), indexing="ij")
-        return np.stack([a.ravel() for a in axes], axis=-1)
+        middles = [0.5 * (edges[1:] + edges[:-1]) for edges in self.edges]
+        coordinates = np.meshgrid(*middles, indexing="ij")
+        return np.stack([c.ravel() for c in coordinates], axis=-1)
 
-    def _inside(self, positions: Array) -> Array:
-        """Positions (..., d); those outside the box are refused."""
-        return inside(positions, np.asarray(self.low), np.asarray(self.high))
+    def _check_inside(self, positions: Array) -> None:
+        """Refuse positions (..., d) outside the box."""
+        check_inside(positions, np.asarray(self.low), np.asarray(self.high))
 
     @validated
     def integral(self, values: Annotated[Array, "... self.size"]) -> Array:
@@ -131,31 +132,32 @@ class Grid(FrozenModel):
 
     @validated
     def normalize(self, values: Annotated[Array, "... self.size"]) -> Array:
-        """Cell values (..., n) divided by their integral, which has to be positive."""
-        total = values.sum(axis=-1) * self.volume
-        if not (total > 0).all():
+        """Divide cell values (..., n) by their integral, which has to be positive."""
+        integral = values.sum(axis=-1) * self.volume
+        if not (integral > 0).all():
             raise ValueError(
-                f"values must be a positive integral, got {float(total.min()):g}"
+                f"values must have a positive integral, got {float(integral.min()):g}"
             )
-        return np.asarray(values / total[..., None])
+        return np.asarray(values / integral[..., None])
 
     @validated
     def cell_index(self, positions: Annotated[Array, "... self.dim"]) -> Indices:
-        """Number of the cell in which each of the positions (..., d) lies, (...)."""
-        at = ((self._inside(positions) - self.low) / self.spacing).astype(np.int64)
-        at = np.minimum(at, np.array(self.shape) - 1)
-        return np.asarray(
-            np.ravel_multi_index(tuple(np.moveaxis(at, -1, 0)), self.shape)
-        )
+        """Flat index of the cell in which each of the positions (..., d) lies, (...)."""
+        self._check_inside(positions)
+        index = ((positions - self.low) / self.spacing).astype(np.int64)
+        # The upper wall belongs to the last cell.
+        index = np.minimum(index, np.array(self.shape) - 1)
+        axes = tuple(np.moveaxis(index, -1, 0))
+        return np.asarray(np.ravel_multi_index(axes, self.shape))
 
     @validated
     def histogram(self, positions: Annotated[Array, "... n self.dim"]) -> Array:
         """Histogram of agents (..., N, d), one or more, as a density (..., n)."""
-        lead = positions.shape[:-2]
-        n = positions.shape[-2]
-        cells = self.cell_index(positions).reshape(-1, n)
-        rows = [np.bincount(row, minlength=self.size) for row in cells]
-        return np.asarray(np.reshape(rows, (*lead, self.size)) / (n * self.volume))
+        agents = positions.shape[-2]
+        cells = self.cell_index(positions).reshape(-1, agents)
+        counts = [np.bincount(row, minlength=self.size) for row in cells]
+        counts = np.reshape(counts, (*positions.shape[:-2], self.size))
+        return np.asarray(counts / (agents * self.volume))
 
     @validated
     def interpolate(
@@ -163,27 +165,33 @@ class Grid(FrozenModel):
         values: Annotated[Array, "self.size"],
         positions: Annotated[Array, "... self.dim"],
     ) -> Array:
-        """Multilinear interpolation of cell values (n,) at positions (..., d); flat at walls."""
+        """Interpolate cell values (n,) linearly at positions (..., d); constant next to walls."""
         from scipy.ndimage import map_coordinates
 
-        flat = self._inside(positions).reshape(-1, self.dim)
-        place = ((flat - self.low) / self.spacing - 0.5).T
-        v = values.reshape(self.shape)
-        found = map_coordinates(v, place, order=1, mode="nearest")
-        return np.asarray(found.reshape(positions.shape[:-1]))
+        self._check_inside(positions)
+        # In units of cells, with the first centre as the origin.
+        rows = positions.reshape(-1, self.dim)
+        coordinates = ((rows - self.low) / self.spacing - 0.5).T
+        image = values.reshape(self.shape)
+        result = map_coordinates(image, coordinates, order=1, mode="nearest")
+        return np.asarray(result.reshape(positions.shape[:-1]))
 
     def wavenumbers(self, rank: int) -> Indices:
-        """The `rank` lowest cosine modes, (rank, d) half-waves along each axis, constant first.
+        """Wavenumbers of the `rank` lowest cosine modes: half-waves along each axis, (rank, d).
 
-        They are ordered by the frequency in the box, and ties by the number itself.
+        The constant mode is first. Modes are ordered by their frequency in the box, and ties by
+        the wavenumbers themselves.
         """
         Bounds(at_most=self.size)(rank, "rank")
-        k = np.stack([a.ravel() for a in np.indices(self.shape)], axis=-1)
-        squared = ((k / (self.width / self.width.max())) ** 2).sum(axis=-1)
-        # Nine digits of each, whatever its size: rounding splits ties, and symmetric modes are to
-        # come in one order on every machine and in every unit.
-        mantissa, exponent = np.frexp(squared)
-        order = np.lexsort((*k.T[::-1], np.ldexp(mantissa.round(9), exponent)))
+        k = np.stack([axis.ravel() for axis in np.indices(self.shape)], axis=-1)
+        relative_width = self.width / self.width.max()
+        squares = ((k / relative_width) ** 2).sum(axis=-1)
+        # Compared to nine digits: rounding errors would order symmetric modes differently on
+        # another machine or in another unit.
+        mantissa, exponent = np.frexp(squares)
+        frequency = np.ldexp(mantissa.round(9), exponent)
+        # The last key of lexsort is the first criterion; then k along axis 0, axis 1, ...
+        order = np.lexsort((*k.T[::-1], frequency))
         return np.asarray(k[order[:rank]], dtype=np.int64)
 
     @validated
@@ -191,8 +199,8 @@ class Grid(FrozenModel):
         r"""The `rank` lowest cosine modes at the centres, (n, rank), orthonormal over the box.
 
         :math:`c_k(x)\propto\prod_j\cos(\pi k_j (x_j-\text{low}_j)/w_j)`: the modes of reflecting
-        walls. Their sums over cells are orthonormal exactly, not only in the limit. The array is
-        kept, and read-only.
+        walls. They are orthonormal as sums over cells, not only in the limit of small cells. The
+        array is cached and read-only.
 
         Examples
         --------
@@ -200,18 +208,19 @@ class Grid(FrozenModel):
         >>> bool(np.abs(basis.T @ basis / 64 - np.eye(10)).max() < 1e-12)
         True
         """
-        if rank not in self._kept:
+        if rank not in self._cosine_cache:
             x = (self.centres - self.low) / self.width
-            waves = np.cos(np.pi * x[:, None, :] * self.wavenumbers(rank)).prod(axis=-1)
-            self._kept[rank] = np.asarray(
-                waves / np.sqrt((waves**2).sum(axis=0) * self.volume)
-            )
-            self._kept[rank].setflags(write=False)
-        return self._kept[rank]
+            phases = np.pi * x[:, None, :] * self.wavenumbers(rank)
+            modes = np.cos(phases).prod(axis=-1)
+            norms = np.sqrt((modes**2).sum(axis=0) * self.volume)
+            modes = np.asarray(modes / norms)
+            modes.setflags(write=False)
+            self._cosine_cache[rank] = modes
+        return self._cosine_cache[rank]
 
     @cached_property
-    def _kept(self) -> dict[int, Array]:
-        """Bases that were asked for before; consensus asks in every step."""
+    def _cosine_cache(self) -> dict[int, Array]:
+        """Cosine modes by rank; consensus needs them in every step."""
         return {}
 
 
@@ -226,23 +235,24 @@ def zero_mean_prior(
 ) -> Array:
     r"""A factor S of the prior covariance P = S Sᵀ of a density: smooth, and of zero mass.
 
-    Cosine modes without the constant one, with the spectrum of a squared exponential of length ℓ,
-    :math:`\lambda_k\propto\exp(-\pi^2\ell^2|k|^2/2)`, scaled so that all modes together have the
-    variance std² in the mean over the box. Every column integrates to zero, so no gain built from
-    S can change a density's mass, unless `mass_std` adds a column that lets it.
+    The columns are cosine modes without the constant one, with the spectrum of a squared
+    exponential of length ℓ, :math:`\lambda_k\propto\exp(-\pi^2\ell^2|k|^2/2)`, scaled so that the
+    variance of all modes together, averaged over the box, is std². Every column integrates to
+    zero, so that an update with a gain built from S conserves the density's mass, unless
+    `mass_std` adds a constant column.
 
     Parameters
     ----------
     grid : Grid
     rank : int
-        Number r of modes that are kept, below the number of cells.
+        Number r of modes that are retained, below the number of cells.
     length : float, optional
         Correlation length ℓ, in the box's unit; by default a tenth of the box's side.
     std : float, optional
         Standard deviation of the density in a cell, of all modes together; by default the mean
         density of the box.
     mass_std : float
-        Standard deviation of the total mass. Above 0, a constant column of that mass comes first.
+        Standard deviation of the total mass. If it is positive, a constant column comes first.
 
     Returns
     -------
@@ -256,11 +266,15 @@ def zero_mean_prior(
     """
     Bounds(below=grid.size)(rank, "rank")
     ell = 0.1 * grid.side if length is None else min(length, 1e6 * grid.side)
-    squared = ((grid.wavenumbers(grid.size)[1:] / grid.width) ** 2).sum(axis=-1)
-    # About the lowest mode: a length beyond the box leaves that alone, and no zero in its place.
-    spectrum = np.exp(-0.5 * (np.pi * ell) ** 2 * (squared - squared[0]))
-    scale = np.sqrt(spectrum[:rank] / (spectrum.sum() / grid.box))
-    scale *= 1 / grid.box if std is None else std
+    # |k|² of the modes without the constant one
+    squares = ((grid.wavenumbers(grid.size)[1:] / grid.width) ** 2).sum(axis=-1)
+    # Relative to the lowest mode, which then remains if a length beyond the box underflows others.
+    spectrum = np.exp(-0.5 * (np.pi * ell) ** 2 * (squares - squares[0]))
+    # Each mode has the mean square 1/volume of the box.
+    scale = np.sqrt(spectrum[:rank] / (spectrum.sum() / grid.box_volume))
+    scale *= 1 / grid.box_volume if std is None else std
     basis = np.asarray(grid.cosines(rank + 1)[:, 1:] * scale)
-    even = np.full((grid.size, 1), mass_std / (grid.size * grid.volume))
-    return np.concatenate([even, basis], axis=1) if mass_std > 0 else basis
+    if mass_std == 0:
+        return basis
+    constant = np.full((grid.size, 1), mass_std / (grid.size * grid.volume))
+    return np.concatenate([constant, basis], axis=1)

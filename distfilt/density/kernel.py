@@ -20,34 +20,38 @@ __all__ = [
 Widths = PositiveFloat | Annotated[Array, "n", Bounds(above=0)]
 
 
-def _along(x: Array, grid: Grid, k: int, width: Array) -> Array:
-    """Means of kernels folded at the walls, at x (...), over the cells of axis k, (..., n_k)."""
+def _axis_kernels(x: Array, grid: Grid, k: int, width: Array) -> Array:
+    """Means of reflected kernels at x (...) over the cells of axis k, (..., n_k)."""
     edges = grid.edges[k]
+    low = edges[0]
+    span = edges[-1] - low
     scale = np.sqrt(2.0) * width[..., None]
-    span = edges[-1] - edges[0]
-    total = _steps(x, edges, scale)
-    # Images in both walls, and images of images where kernels are as wide as the box; what is more
-    # than nine widths away adds nothing.
+    mass = _cell_masses(x, edges, scale)
+    # Reflection at both walls adds images, at x + 2 m span and 2 low - x + 2 (m + 1) span.
+    # Those more than nine widths outside the box contribute nothing.
     reach = 9 * float(np.max(width, initial=0.0)) / span
-    for m in range(-int(reach / 2 + 1), int(reach / 2 + 1) + 1):
-        if m and 2 * abs(m) - 1 < reach:
-            total = total + _steps(x + 2 * m * span, edges, scale)
+    orders = int(reach / 2 + 1)
+    for m in range(-orders, orders + 1):
+        if m != 0 and 2 * abs(m) - 1 < reach:
+            mass = mass + _cell_masses(x + 2 * m * span, edges, scale)
         if max(2 * m, -2 * m - 2) < reach:
-            total = total + _steps(2 * edges[0] - x + 2 * (m + 1) * span, edges, scale)
-    return np.asarray(total / grid.spacing[k])
+            mirrored = 2 * low - x + 2 * (m + 1) * span
+            mass = mass + _cell_masses(mirrored, edges, scale)
+    return np.asarray(mass / grid.spacing[k])
 
 
-def _steps(x: Array, edges: Array, scale: Array) -> Array:
+def _cell_masses(x: Array, edges: Array, scale: Array) -> Array:
+    """Integrals of a Gaussian at x over the intervals between the edges."""
     from scipy.special import erf
 
     return np.asarray(0.5 * np.diff(erf((edges - x[..., None]) / scale), axis=-1))
 
 
-def fine_enough(grid: Grid, bandwidth: float | Array) -> None:
-    """Refuse bandwidths below half a cell, and far beyond the box."""
+def check_resolution(grid: Grid, bandwidth: float | Array) -> None:
+    """Refuse bandwidths below half a cell, or far wider than the box."""
     if np.max(bandwidth) > 20 * grid.width.max():
         raise ValueError(
-            f"bandwidth must have at most 20 widths of the box, got {bandwidth}"
+            f"bandwidth must be at most 20 widths of the box, got {bandwidth}"
         )
     least = float(np.min(bandwidth))
     widest = float(grid.spacing.max())
@@ -59,33 +63,35 @@ def fine_enough(grid: Grid, bandwidth: float | Array) -> None:
 
 
 def _factors(positions: Array, grid: Grid, bandwidth: float | Array) -> list[Array]:
-    fine_enough(grid, bandwidth)
-    x = grid._inside(positions)
+    """Factors (..., N, n_k) of each agent's kernel, one for each axis."""
+    check_resolution(grid, bandwidth)
+    grid._check_inside(positions)
     h = np.broadcast_to(bandwidth, positions.shape[:-1])
-    return [_along(x[..., k], grid, k, h) for k in range(grid.dim)]
+    return [_axis_kernels(positions[..., k], grid, k, h) for k in range(grid.dim)]
 
 
-def _products(out: Array, factors: list[Array]) -> Array:
-    """Each agent's products over the cells of one axis and of some more, (..., N, n)."""
+def _outer_products(product: Array, factors: list[Array]) -> Array:
+    """Outer product of each agent's first factor with the others, flattened, (..., N, n)."""
     for factor in factors:
-        out = (out[..., :, None] * factor[..., None, :]).reshape(*out.shape[:-1], -1)
-    return out
+        product = product[..., :, None] * factor[..., None, :]
+        product = product.reshape(*product.shape[:-2], -1)
+    return product
 
 
 @validated
 def kernels(
     positions: Annotated[Array, "... n grid.dim"], grid: Grid, *, bandwidth: Widths
 ) -> Array:
-    """Each agent's own kernel, the z_i of equation (13) of Zheng and Lin.
+    """Kernel of each agent, the z_i of equation (13) of Zheng and Lin.
 
-    What would lie outside is folded back at the walls, so that each has mass 1 to rounding.
+    The mass beyond a wall is reflected into the box, so that each has mass 1 to rounding.
 
     Parameters
     ----------
     positions : array_like, (..., N, d)
         Agents inside the box.
     grid : Grid
-        Where the kernels are wanted, as means over cells.
+        The kernels are given as means over its cells.
     bandwidth : float or array_like, (N,)
         Standard deviation of the Gaussian, in the positions' unit, at least half a cell.
 
@@ -106,8 +112,8 @@ def kernels(
     >>> z.shape, bool(abs(grid.integral(z) - 1).max() < 1e-12)
     ((2, 400), True)
     """
-    first, *rest = _factors(positions, grid, bandwidth)
-    return _products(first, rest)
+    factors = _factors(positions, grid, bandwidth)
+    return _outer_products(factors[0], factors[1:])
 
 
 @validated
@@ -130,11 +136,13 @@ def kernel_density(
     >>> round(float(p.max() * 2 * np.pi * 0.1**2), 2)
     0.92
     """
-    first, *rest = _factors(positions, grid, bandwidth)
-    out = first.mT @ _products(np.ones((*first.shape[:-1], 1)), rest)
-    return np.asarray(
-        out.reshape(*positions.shape[:-2], grid.size) / positions.shape[-2]
-    )
+    factors = _factors(positions, grid, bandwidth)
+    first = factors[0]
+    ones = np.ones((*first.shape[:-1], 1))
+    # The sum over agents is the product of two matrices, (n_1, N) and (N, n / n_1).
+    total = first.mT @ _outer_products(ones, factors[1:])
+    agents = positions.shape[-2]
+    return np.asarray(total.reshape(*positions.shape[:-2], grid.size) / agents)
 
 
 @validated
@@ -143,8 +151,9 @@ def kernel_constant(
 ) -> float:
     r"""The constant k̄ of Zheng and Lin: ∫K²/(N hᵈ), for which Var p_KDE ≈ k̄ p.
 
-    For a Gaussian, :math:`\bar k = 1/\bigl(N(2\sqrt\pi h)^d\bigr)`. It is the variance of one cell.
-    Neighbouring cells see the same agents, so it is no white noise: see :func:`kernel_covariance`.
+    For a Gaussian, :math:`\bar k = 1/\bigl(N(2\sqrt\pi h)^d\bigr)`. It gives the variance of each
+    cell. The noise is not white, since neighbouring cells depend on the same agents: see
+    :func:`kernel_covariance`.
 
     Examples
     --------
@@ -169,16 +178,16 @@ def kernel_covariance(
         \mathrm{Cov}\,\hat p=\tfrac1N\bigl(\mathbf G\,\mathrm{diag}(\mathbf p)\mathbf G^\top\Delta
         -\mathbf G\mathbf p(\mathbf G\mathbf p)^\top\bigr)
 
-    with the kernel from each cell to each other, :math:`\mathbf G/\Delta`, and cells of volume Δ.
+    with the kernel of each cell's centre, :math:`\mathbf G/\Delta`, and cells of volume Δ.
 
     Parameters
     ----------
     density : array_like, (n,)
-        The agents' true density, of integral 1; agents sit at the centres of cells.
+        The agents' true density, of integral 1; agents are at the centres of cells.
     grid : Grid
     bandwidth : float
     agents : int
-        Their number N.
+        Number N of agents.
 
     Returns
     -------
@@ -193,12 +202,14 @@ def kernel_covariance(
     >>> print(round(cov[middle, middle] / (1 / (400 * np.pi * 0.08**2)), 2))
     0.89
     """
-    total = float(density.sum() * grid.volume)
-    if abs(total - 1) > 1e-8:
-        raise ValueError(f"density must be an integral of 1, got {total:g}")
+    integral = float(density.sum() * grid.volume)
+    if abs(integral - 1) > 1e-8:
+        raise ValueError(f"density must have the integral 1, got {integral:g}")
     g = kernels(grid.centres, grid, bandwidth=bandwidth).T * grid.volume
     mean = g @ density
-    return mean, ((g * density) @ g.T / grid.volume - np.outer(mean, mean)) / agents
+    # Second moment of one agent's kernel; the covariance of the mean of N falls as 1/N.
+    moment = (g * density) @ g.T / grid.volume
+    return mean, (moment - np.outer(mean, mean)) / agents
 
 
 @validated
@@ -208,7 +219,7 @@ def bandwidth(
     *,
     rule: Literal["silverman", "least_squares"] = "silverman",
 ) -> float:
-    r"""A bandwidth from the agents themselves.
+    r"""Choose a bandwidth from the agents' positions.
 
     Parameters
     ----------
@@ -231,27 +242,29 @@ def bandwidth(
     >>> round(bandwidth(x, Grid((30, 30))), 3)
     0.129
     """
-    x = grid._inside(positions)
-    (n, d) = positions.shape
-    spread = float(np.sqrt(x.var(axis=0).mean()))
+    grid._check_inside(positions)
+    n, d = positions.shape
+    spread = float(np.sqrt(positions.var(axis=0).mean()))
     if n < 2 or spread == 0:
         raise ValueError(
             f"positions must have two agents or more in different places, got {n} "
             f"with a spread of {spread:g}"
         )
     least = 0.5 * float(grid.spacing.max())
-    normal = spread * (4 / ((d + 2) * n)) ** (1 / (d + 4))
+    silverman = spread * (4 / ((d + 2) * n)) ** (1 / (d + 4))
     if rule == "silverman":
-        return float(max(normal, least))
-    candidates = np.maximum(normal * np.geomspace(0.15, 1.5, 20), least)
-    scores = [_least_squares(x, grid, h) for h in candidates]
+        return float(max(silverman, least))
+    candidates = np.maximum(silverman * np.geomspace(0.15, 1.5, 20), least)
+    scores = [_cross_validation_score(positions, grid, h) for h in candidates]
     return float(candidates[int(np.argmin(scores))])
 
 
-def _least_squares(x: Array, grid: Grid, h: float) -> float:
+def _cross_validation_score(x: Array, grid: Grid, h: float) -> float:
+    """∫p̂² - (2/N) Σ p̂₋ᵢ(Xᵢ), with the leave-one-out estimates p̂₋ᵢ."""
     n = len(x)
     z = kernels(x, grid, bandwidth=h)
     mean = z.mean(axis=0)
-    at = z[:, grid.cell_index(x)]  # kernel of agent i in the cell of agent j
-    others = (at.sum() - np.trace(at)) / (n * (n - 1))
-    return float((mean**2).sum() * grid.volume - 2 * others)
+    # Entry (i, j) is the kernel of agent i in the cell of agent j; the diagonal is left out.
+    pairs = z[:, grid.cell_index(x)]
+    leave_one_out = (pairs.sum() - np.trace(pairs)) / (n * (n - 1))
+    return float((mean**2).sum() * grid.volume - 2 * leave_one_out)

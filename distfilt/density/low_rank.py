@@ -2,9 +2,9 @@ r"""The Kalman filter of a density on a grid: dense, and of low rank for any num
 
 The state is the density p with :math:`\dot p=\mathbf A p` (+ noise of strength Q), the measurement
 a kernel estimate :math:`y=p+w` with w white of strength R: equations (8) and (9) of Zheng and Lin.
-A step of length Δ moves mean and covariance by the finite-volume step Φ and then takes in one
-measurement of variance R/Δ. That is stable for any Δ, where explicit steps of the Riccati equation
-are not, and the two forms below do the same step.
+A step of length Δ predicts mean and covariance by the finite-volume step Φ and then assimilates one
+measurement of variance R/Δ. This is stable for any Δ, unlike explicit steps of the Riccati
+equation. The two forms below compute the same step.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from ..validation import (
     Array,
     FrozenModel,
     PositiveFloat,
+    call_user,
     check_array,
     check_positive_semidefinite,
     validated,
@@ -34,13 +35,13 @@ __all__ = [
     "low_rank_step",
 ]
 
-Move = Callable[[Array], Array]
+Transition = Callable[[Array], Array]
 Observed = Annotated[Array, "*state.base.shape"] | Annotated[Array, "state.size"]
 
 
 @dataclass(frozen=True, eq=False)
 class Dense(FrozenModel):
-    """A density and its whole covariance matrix: the reference.
+    """A density and its full covariance matrix: the reference.
 
     Parameters
     ----------
@@ -63,12 +64,12 @@ class Dense(FrozenModel):
 @validated
 def dense_step(
     state: Dense,
-    move: Move,
+    transition: Transition,
     observed: Annotated[Array, "*state.mean.shape"],
     noise: ArrayLike,
     dt: PositiveFloat,
 ) -> Dense:
-    r"""One step with the whole covariance: O(n³), the reference for the other.
+    r"""One step with the full covariance, in O(n³): the reference for :func:`low_rank_step`.
 
     .. math::
         \mathbf P^-=\boldsymbol\Phi\mathbf P\boldsymbol\Phi^\top,\quad
@@ -78,7 +79,7 @@ def dense_step(
     Parameters
     ----------
     state : Dense
-    move : callable
+    transition : callable
         Φ on rows (..., n), as :meth:`FokkerPlanck.solver` gives it.
     observed : array_like, (n,)
         The measurement y.
@@ -95,49 +96,53 @@ def dense_step(
     >>> after.mean
     array([0.5 , 0.25])
     """
-    variance = _strength(noise, state.mean.shape) / dt
-    mean = move(state.mean)
-    p = move(move(state.covariance).T)
+    variance = _noise_strength(noise, state.mean.shape) / dt
+    mean = call_user(transition, state.mean)
+    # The transition acts on rows: Φ (Φ P)ᵀ = Φ P Φᵀ, since P is symmetric.
+    p = call_user(transition, call_user(transition, state.covariance).T)
     p = 0.5 * (p + p.T)
+    # K = P (P + R/Δ)⁻¹, by a solve instead of an inverse
     gain = np.linalg.solve(p + np.diag(variance), p).T
-    left = p - gain @ p
-    return Dense.construct(mean + gain @ (observed - mean), 0.5 * (left + left.T))
+    analysis = mean + gain @ (observed - mean)
+    covariance = p - gain @ p
+    return Dense.construct(analysis, 0.5 * (covariance + covariance.T))
 
 
-def _strength(noise: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """The strength R of each filter's noise, infinite where a filter measures nothing."""
-    r = check_array(noise, "noise", (..., shape[-1]), finite=False)
-    if not r.min() > 0:
-        raise ValueError(f"noise must be variances above 0, got {r.min():g}")
-    if r.shape not in (shape, shape[-1:]):
+def _noise_strength(noise: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Validate the strength R of each filter's noise; infinite where nothing is measured."""
+    strength = check_array(noise, "noise", (..., shape[-1]), finite=False)
+    # Written so that NaN is refused too.
+    if not strength.min() > 0:
+        raise ValueError(f"noise must be positive, got {strength.min():g}")
+    if strength.shape not in (shape, shape[-1:]):
         raise ValueError(
-            f"noise must have shape {shape} or {shape[-1:]}, got {r.shape}"
+            f"noise must have shape {shape} or {shape[-1:]}, got {strength.shape}"
         )
-    return np.broadcast_to(r, shape)
+    return np.broadcast_to(strength, shape)
 
 
-_MOST = 1e15
-"""Ratio of informations, the greatest to the least, from which on rounding decides."""
+_MAX_CONDITION = 1e15
+"""Condition number of the information from which on rounding errors dominate."""
 
 
 @dataclass(frozen=True, eq=False)
 class LowRank(FrozenModel):
     r"""Any number F of filters of one density, with covariances of low rank.
 
-    Filter i holds an r × r information matrix and a vector in a basis S:
+    Filter i has an r × r information matrix and an information vector in a basis S:
 
     .. math:: \hat p_i=\text{base}_i+\mathbf S\mathbf M_i^{-1}\mathbf b_i,\qquad
         \mathbf P_i=\mathbf S\mathbf M_i^{-1}\mathbf S^\top
 
-    Without process noise this form stays as it is, and S = Φ(t, 0) S₀ is common to all and knows
-    nothing of the data. Process noise gives each filter a basis of its own.
+    Without process noise S = Φ(t, 0) S₀ is common to all filters and independent of the data.
+    With process noise each filter has its own basis.
 
     Parameters
     ----------
     basis : ndarray, (n, r) or (F, n, r)
-        S now.
+        The present basis S.
     base : ndarray, (F, n)
-        Each filter's density at the start, moved without data.
+        Each filter's prior density, predicted without data.
     information : ndarray, (F, r, r)
         M_i, at least the identity.
     vector : ndarray, (F, r)
@@ -163,8 +168,9 @@ class LowRank(FrozenModel):
     @property
     def estimates(self) -> Array:
         """Every filter's density, (F, n)."""
-        weights = np.linalg.solve(self.information, self.vector[..., None])[..., 0]
-        return np.asarray(self.base + (self.basis @ weights[..., None])[..., 0])
+        # base + S M⁻¹ b
+        weights = np.linalg.solve(self.information, self.vector[..., None])
+        return np.asarray(self.base + (self.basis @ weights)[..., 0])
 
     @property
     def variances(self) -> Array:
@@ -174,6 +180,7 @@ class LowRank(FrozenModel):
     @property
     def factors(self) -> Array:
         """Every filter's factor L of the covariance L Lᵀ, (F, n, r)."""
+        # With M = C Cᵀ, P = S M⁻¹ Sᵀ = L Lᵀ for Lᵀ = C⁻¹ Sᵀ.
         root = np.linalg.cholesky(self.information)
         rows = np.broadcast_to(self.basis.mT, (len(root), *self.basis.mT.shape[-2:]))
         return np.linalg.solve(root, rows).mT
@@ -190,7 +197,7 @@ def low_rank_start(
     basis: Annotated[Array, "n r"] | Annotated[Array, "f n r"],
     base: Annotated[Array, "f n"],
 ) -> LowRank:
-    """Filters before their first step: prior means `base` (F, n), prior covariances S Sᵀ.
+    """Start filters from prior means `base` (F, n) and the prior covariance S Sᵀ.
 
     Examples
     --------
@@ -199,28 +206,30 @@ def low_rank_start(
     """
     filters = len(base)
     rank = basis.shape[-1]
-    nothing = np.tile(np.eye(rank), (filters, 1, 1)), np.zeros((filters, rank))
-    return LowRank.construct(basis.copy(), base.copy(), *nothing)
+    # M = I and b = 0: no data yet.
+    information = np.tile(np.eye(rank), (filters, 1, 1))
+    vector = np.zeros((filters, rank))
+    return LowRank.construct(basis.copy(), base.copy(), information, vector)
 
 
 @validated
 def low_rank_predict(
     state: LowRank,
-    move: Move,
+    transition: Transition,
     *,
     process: Annotated[Array, "state.size q"] | None = None,
     dt: PositiveFloat | None = None,
 ) -> LowRank:
-    r"""The filters after the model's step and before the measurement.
+    r"""Predict the filters to the time of the next measurement.
 
     With process noise the factor of the forecast is :math:`[\boldsymbol\Phi\mathbf L,\
-    \sqrt\Delta\,\mathbf L_Q]`. As many of its leading left singular vectors as L has columns are
-    kept, which drops the least of the variance.
+    \sqrt\Delta\,\mathbf L_Q]`. It is truncated to its leading left singular vectors, as many as L
+    has columns, which loses the least variance.
 
     Parameters
     ----------
     state : LowRank
-    move : callable
+    transition : callable
         Φ on rows (..., n), as :meth:`FokkerPlanck.solver` gives it.
     process : array_like, (n, q), optional
         A factor of Q, per root second, for filters of a model that is not exact.
@@ -234,44 +243,53 @@ def low_rank_predict(
     array([[0.5, 0.5]])
     """
     if process is None:
-        rows = state.basis.mT
-        base = state.base
-    else:
-        rows = state.factors.mT
-        base = state.estimates
-    moved = move(np.concatenate([rows.reshape(-1, state.size), base]))
-    basis = np.ascontiguousarray(moved[: -len(base)].reshape(rows.shape).mT)
-    if process is None:
-        return state.replace(basis=basis, base=moved[-len(base) :])
+        # Data are kept apart, in M and b: only the basis and the base move.
+        basis, base = _transition_columns(transition, state.basis, state.base)
+        return state.replace(basis=basis, base=base)
     if dt is None:
         raise ValueError(
-            "dt must be the step's length where there is process noise, got None"
+            "dt must be the length of the step if there is process noise, got None"
         )
-    added = np.broadcast_to(np.sqrt(dt) * process, (len(base), *process.shape))
-    factor = np.concatenate([basis, added], axis=-1)
-    _, vectors = np.linalg.eigh(factor.mT @ factor)
-    kept = factor @ vectors[..., -basis.shape[-1] :]
-    return low_rank_start(kept, moved[-len(base) :])
+    # The data go into the factor L and the estimate, which start anew with M = I and b = 0.
+    factors, base = _transition_columns(transition, state.factors, state.estimates)
+    noise = np.broadcast_to(np.sqrt(dt) * process, (len(base), *process.shape))
+    forecast = np.concatenate([factors, noise], axis=-1)
+    # Right singular vectors of the forecast's factor, by increasing singular value.
+    _, vectors = np.linalg.eigh(forecast.mT @ forecast)
+    leading = vectors[..., -factors.shape[-1] :]
+    return low_rank_start(forecast @ leading, base)
+
+
+def _transition_columns(
+    transition: Transition, columns: Array, base: Array
+) -> tuple[Array, Array]:
+    """Apply the transition to columns (..., n, r) and to densities (F, n), in one call."""
+    rows = columns.mT
+    stacked = np.concatenate([rows.reshape(-1, base.shape[-1]), base])
+    result = call_user(transition, stacked)
+    filters = len(base)
+    columns = np.ascontiguousarray(result[:-filters].reshape(rows.shape).mT)
+    return columns, result[-filters:]
 
 
 @validated
 def low_rank_step(
     state: LowRank, observed: Observed, noise: ArrayLike, dt: PositiveFloat
 ) -> LowRank:
-    r"""All filters take in a measurement each: one matrix product.
+    r"""Assimilate one measurement in each filter, by one matrix product for all.
 
     .. math::
         \mathbf M_i \leftarrow \mathbf M_i+\Delta\,\mathbf S^\top\mathbf R_i^{-1}\mathbf S,\qquad
         \mathbf b_i \leftarrow \mathbf b_i
         +\Delta\,\mathbf S^\top\mathbf R_i^{-1}(y_i-\text{base}_i)
 
-    By Woodbury's identity this is the update of :func:`dense_step`. In a common basis each pair of
-    its columns is multiplied once for all filters.
+    By Woodbury's identity this is the update of :func:`dense_step`. In a common basis the product
+    of each pair of columns serves all filters.
 
     Parameters
     ----------
     state : LowRank
-        As :func:`low_rank_predict` left it.
+        The forecast of :func:`low_rank_predict`.
     observed : array_like, (F, n) or (n,)
     noise : array_like, (F, n) or (n,)
         Strength R of the noise, positive; infinite where a filter measures nothing.
@@ -284,27 +302,39 @@ def low_rank_step(
     >>> low_rank_step(state, [1.0, 1.0], [1.0, 3.0], 1.0).estimates
     array([[0.5 , 0.25]])
     """
-    precision = dt / _strength(noise, state.base.shape)
-    gap = precision * (observed - state.base)
-    seen = (gap[:, None, :] @ state.basis)[:, 0]
+    # Δ/R of each cell, zero where nothing is measured
+    precision = dt / _noise_strength(noise, state.base.shape)
+    innovation = precision * (observed - state.base)
+    increment = (innovation[:, None, :] @ state.basis)[:, 0]
     information = state.information + _weighted_products(state.basis, precision)
-    if not information.max() < _MOST:
-        least, most = np.linalg.eigvalsh(information)[:, [0, -1]].T
-        if not (most < _MOST * least).all():
-            raise np.linalg.LinAlgError(
-                "density filter: the step's length, the noise or the prior "
-                f"is out of scale, information {most.max():.3g}"
-            )
-    return state.replace(information=information, vector=state.vector + seen)
+    # The least eigenvalue is 1 or more: without large entries no matrix is ill-conditioned.
+    if not information.max() < _MAX_CONDITION:
+        _check_condition(information)
+    return state.replace(information=information, vector=state.vector + increment)
+
+
+def _check_condition(information: Array) -> None:
+    eigenvalues = np.linalg.eigvalsh(information)
+    least = eigenvalues[:, 0]
+    greatest = eigenvalues[:, -1]
+    # Written so that NaN is refused too.
+    if not (greatest < _MAX_CONDITION * least).all():
+        raise np.linalg.LinAlgError(
+            "density filter: the step's length, the noise or the prior "
+            f"is out of scale, information {greatest.max():.3g}"
+        )
 
 
 def _weighted_products(s: Array, weights: Array) -> Array:
     """Sᵀ diag(w) S for each row w of the weights, (F, r, r)."""
     if s.ndim == 3 or len(weights) < 16:
         return np.asarray((s.mT * weights[:, None, :]) @ s)
-    r = s.shape[1]
-    turned = np.ascontiguousarray(s.T)
-    out = np.empty((len(weights), r, r))
-    for i in range(r):
-        out[:, i, i:] = out[:, i:, i] = weights @ (turned[i] * turned[i:]).T
-    return out
+    # Many filters of one basis: each product of two columns is formed once, by symmetry for j >= i.
+    columns = np.ascontiguousarray(s.T)
+    rank = len(columns)
+    products = np.empty((len(weights), rank, rank))
+    for i in range(rank):
+        row = weights @ (columns[i] * columns[i:]).T
+        products[:, i, i:] = row
+        products[:, i:, i] = row
+    return products

@@ -19,8 +19,9 @@ from ..density import (
     low_rank_step,
     zero_mean_prior,
 )
-from ..density.kernel import fine_enough
-from ..density.sharing import SwarmSnapshot, alone, present_graph
+from ..density.consensus import estimate_without_messages
+from ..density.kernel import check_resolution
+from ..density.snapshot import SwarmSnapshot, remove_absent
 from ..network import Channel, Graph
 from ..network.graphs import as_graph
 from ..validation import (
@@ -192,7 +193,7 @@ class DensityFilter(Filter):
 
     def check_parts(self) -> None:
         """Refuse places and densities that are not of the grid."""
-        fine_enough(self.model.grid, self.bandwidth)
+        check_resolution(self.model.grid, self.bandwidth)
         Bounds(below=self.n_agents)(max(self.local or (0,)), "local")
 
     @cached_property
@@ -255,10 +256,10 @@ class DensityFilter(Filter):
         if not isinstance(self.initial_density, str):
             return np.tile(self.initial_density, (self.n_agents, 1))
         if self.initial_density == "observed":
-            own = alone(self.fusion, seen)
+            own = estimate_without_messages(self.fusion, seen)
             here = seen.present[:, None]
-            return np.where(here, own, seen.flat(self.initial_std))
-        return seen.flat(self.initial_std)
+            return np.where(here, own, seen.initial_gaussians(self.initial_std))
+        return seen.initial_gaussians(self.initial_std)
 
     def _seen(self, positions: ArrayLike, name: str, t: float) -> SwarmSnapshot:
         x = check_array(
@@ -288,10 +289,10 @@ class DensityFilter(Filter):
         if not dt:
             raise ValueError(f"t must be above {state.t:g}, got {t:g}")
         if isinstance(self.graph, float):
-            graph = seen.near(self.graph)
+            graph = seen.disk_graph(self.graph)
         else:
             here = self.graph(t, seen.positions) if callable(self.graph) else self.graph
-            graph = present_graph(as_graph(here, self.n_agents), seen.present)
+            graph = remove_absent(as_graph(here, self.n_agents), seen.present)
         if not self._contact(state.t, t):
             graph = Graph.from_edges(self.n_agents, np.zeros((0, 2)))
         step.channel = channel = Channel(
@@ -304,7 +305,7 @@ class DensityFilter(Filter):
         q = None if self.process is None else self.process * self._basis
         moved = low_rank_predict(state.filters, move, process=q, dt=dt)
         level = moved.estimates if self.noise == "forecast" else y
-        noise = seen.noise(level, seen.present.sum(), self.floor)
+        noise = seen.noise_strength(level, seen.present.sum(), self.floor)
         filters = low_rank_step(moved, y, noise, dt)
         parts = np.unique(graph.components[seen.present]).size
         return step.end(

@@ -17,7 +17,7 @@ import numpy as np
 from .. import ensembles as moments
 from ..coupling import rejuvenate, transport_plans
 from ..coupling.transform import apply_plan, normalize_weights
-from ..linalg import in_units
+from ..linalg import to_unit_variances
 from ..models import Model
 from ..network import Graph, finite_time_consensus, intersect_ensembles
 from ..sensors import Sensor
@@ -439,7 +439,7 @@ def regress_past(stack: list[Array], now: Array) -> list[Array]:
     *past, old = stack
     if now is old or not past:
         return past
-    shape, unit = in_units(moments.sample_covariance(old))
+    shape, unit = to_unit_variances(moments.sample_covariance(old))
     inverse = np.linalg.pinv(shape, rcond=1e-10, hermitian=True) / (old.shape[-2] - 1)
     around, moved = (
         x / unit[..., None, :] for x in (moments.center_ensemble(old)[1], now - old)

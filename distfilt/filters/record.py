@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ..ensembles import sample_covariance
-from ..linalg import cholesky, in_units, quadratic_form
+from ..linalg import cholesky, to_unit_variances, quadratic_form
 from ..metrics import crps, gaussian_crps
 from ..validation import Array, check_array
 from .saving import State, stack_states
@@ -313,7 +313,7 @@ def _counted(name: str, values: list[Any]) -> dict[str, Any]:
 
 def _nees(mean: Array, cov: Array, known: Array) -> Array:
     """NEES, whatever the units; infinite where a cloud has collapsed, which claims certainty."""
-    shape, unit = in_units(cov)
+    shape, unit = to_unit_variances(cov)
     sure = np.linalg.eigvalsh(shape)[..., 0] <= 1e-12
     shape[sure] = np.eye(shape.shape[-1])
     return np.where(

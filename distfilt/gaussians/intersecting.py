@@ -10,7 +10,14 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from ..linalg import cholesky, leading, log_det, lower_root, solve_lower, symmetrise
+from ..linalg import (
+    cholesky,
+    broadcast_leading,
+    log_det,
+    lower_root,
+    solve_lower,
+    symmetrise,
+)
 from ..validation import (
     ALLOW_NAN,
     Array,
@@ -81,8 +88,8 @@ def intersect_gaussians(
     >>> mean.round(6), cov.round(6)
     (array([1.]), array([[1.333333]]))
     """
-    lead = leading(weights.shape[:-1], means.shape[:-2], "means")
-    lead = leading(lead, covs.shape[:-3], "covs")
+    lead = broadcast_leading(weights.shape[:-1], means.shape[:-2], "means")
+    lead = broadcast_leading(lead, covs.shape[:-3], "covs")
     size, d = means.shape[-2:]
     means = np.broadcast_to(means, (*lead, size, d))
     here = np.broadcast_to(weights > 0, (*lead, size))
@@ -193,7 +200,7 @@ def intersection_weights(
     there = np.ones(covs.shape[-3], dtype=bool) if here is None else here
     if not there.any(axis=-1).all():
         raise ValueError("here must have at least one source that arrived, got none")
-    lead = leading(there.shape[:-1], covs.shape[:-3], "covs")
+    lead = broadcast_leading(there.shape[:-1], covs.shape[:-3], "covs")
     here = np.broadcast_to(there, (*lead, *covs.shape[-3:-2]))
     covs = np.broadcast_to(covs, (*lead, *covs.shape[-3:]))
     covs = _counted(covs, here, 2, "covs")

@@ -7,7 +7,14 @@ from typing import Annotated
 
 import numpy as np
 
-from ..linalg import EPS, cholesky, leading, log_det, quadratic_form, solve_definite
+from ..linalg import (
+    EPS,
+    cholesky,
+    broadcast_leading,
+    log_det,
+    quadratic_form,
+    solve_definite,
+)
 from ..validation import (
     ALLOW_NAN,
     Array,
@@ -43,8 +50,8 @@ def log_density(
     >>> log_density([[0.0], [2.0]], [0.0], [[4.0]]).round(6)
     array([-1.612086, -2.112086])
     """
-    lead = leading(x.shape[:-1], mean.shape[:-1], "mean")
-    leading(lead, cov.shape[:-2], "cov")
+    lead = broadcast_leading(x.shape[:-1], mean.shape[:-1], "mean")
+    broadcast_leading(lead, cov.shape[:-2], "cov")
     lower = cholesky(cov)
     constant = x.shape[-1] * np.log(2 * np.pi)
     return np.asarray(
@@ -95,8 +102,8 @@ def match_moments(
         raise ValueError(
             f"ensemble must have more than {d} members for {d} components, got {n}"
         )
-    lead = leading(ensemble.shape[:-2], mean.shape[:-1], "mean")
-    leading(lead, cov.shape[:-2], "cov")
+    lead = broadcast_leading(ensemble.shape[:-2], mean.shape[:-1], "mean")
+    broadcast_leading(lead, cov.shape[:-2], "cov")
     unit = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
     scaled = ensemble / unit[..., None, :]
     average = np.full(n, 1 / n)

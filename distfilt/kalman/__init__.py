@@ -1,6 +1,6 @@
-"""Kalman filters for many runs at once: the linear one, its smoother, one on unit quaternions.
+"""Kalman filters for many runs at once: linear, with its smoother, and on unit quaternions.
 
-Filterpy's stand beside them as the reference. Extended and unscented filters are
+The filters of filterpy serve as a reference. Extended and unscented filters are
 :class:`distfilt.filters.GaussianFilter`, of one agent or of many.
 """
 

@@ -1,4 +1,4 @@
-"""The Kalman filter for many runs at once, with single components missing, and its smoother."""
+"""The Kalman filter for many runs at once, with missing components, and the RTS smoother."""
 
 from __future__ import annotations
 
@@ -9,7 +9,14 @@ from typing import Annotated
 import numpy as np
 
 from ..gaussians.single import innovation, joseph
-from ..linalg import cholesky, leading, log_det, solve_lower, solve_upper, symmetrise
+from ..linalg import (
+    broadcast_leading,
+    cholesky,
+    log_det,
+    solve_lower,
+    solve_upper,
+    symmetrise,
+)
 from ..sensors import Sensor
 from ..validation import (
     ALLOW_NAN,
@@ -23,24 +30,24 @@ from ..validation import (
 
 __all__ = ["FilterResult", "kalman_filter", "rts_smoother"]
 
-Runs = tuple[int, ...]
-Mean = Annotated[Array, "... d"]
-Matrix = Annotated[Array, "... d d"]
-Seen = Annotated[Array, "... m d"]
-Noise = Annotated[PositiveDefinite, "... m m"]
-Series = Annotated[Array, "... N m", ALLOW_NAN]
+MeanVector = Annotated[Array, "... d"]
+SquareMatrix = Annotated[Array, "... d d"]
+ObservationMatrix = Annotated[Array, "... m d"]
+ObservationNoise = Annotated[PositiveDefinite, "... m m"]
+ObservationSeries = Annotated[Array, "... N m", ALLOW_NAN]
+"""Observations (T, ..., m) with NaN for missing components."""
 
 
 @dataclass(frozen=True, eq=False)
 class FilterResult(FrozenModel):
-    """What a filter with Gaussian output leaves behind.
+    """The result of a filter with Gaussian output.
 
     Parameters
     ----------
     means : ndarray, (T, ..., d)
         Analysis means, one for each observation time; leading axes are the runs.
     covariances : ndarray, (T, ..., d, d)
-        Analysis covariances. Of :func:`kalman_filter` the run axes have length 1 where all runs
+        Analysis covariances. The run axes have length 1 if all runs of :func:`kalman_filter`
         share the covariance, so that the array broadcasts against the means.
     log_likelihood : ndarray, (T, ...)
         Log density of each observation given those before it; its sum over time is the log
@@ -67,20 +74,20 @@ class FilterResult(FrozenModel):
 
 @validated
 def kalman_filter(
-    mean: Mean,
+    mean: MeanVector,
     cov: PositiveDefinite,
-    observations: Series,
+    observations: ObservationSeries,
     *,
-    F: Matrix,
-    H: Seen,
+    F: SquareMatrix,
+    H: ObservationMatrix,
     Q: PositiveSemidefinite,
-    R: Noise,
+    R: ObservationNoise,
 ) -> FilterResult:
     r"""Filter T observations of a linear Gaussian model, for any number of runs at once.
 
     The model is :math:`\mathbf x_k = \mathbf F_k\mathbf x_{k-1} + \text{noise}(\mathbf Q_k)`,
-    :math:`\mathbf y_k = \mathbf H_k\mathbf x_k + \text{noise}(\mathbf R_k)`; the filter forecasts
-    to the first observation before it uses it.
+    :math:`\mathbf y_k = \mathbf H_k\mathbf x_k + \text{noise}(\mathbf R_k)`. The first forecast
+    leads from the prior to the first observation.
 
     Parameters
     ----------
@@ -90,7 +97,7 @@ def kalman_filter(
         Prior covariance, positive definite.
     observations : array_like, (T, ..., m)
         Observations; the middle axes are the runs. NaN marks a missing component: the result is
-        the one with its row deleted from H and R.
+        the same as with its row deleted from H and R.
     F, Q : array_like, (d, d) or (T, d, d)
         Transition and process noise covariance (positive semidefinite), constant or per step.
     H, R : array_like, (m, d) and (m, m), or (T, m, d) and (T, m, m)
@@ -103,9 +110,9 @@ def kalman_filter(
 
     Notes
     -----
-    R. E. Kalman, Journal of Basic Engineering 82 (1960) 35-45. The covariance does not depend on
-    the observed values, only on which of them are there: runs that all miss the same components
-    share one recursion. The update is :func:`distfilt.gaussians.conditioned`.
+    R. E. Kalman, Journal of Basic Engineering 82 (1960) 35-45. The covariance depends only on
+    which components are missing, not on the observed values: runs with the same missing components
+    share one recursion. The update is :func:`distfilt.gaussians.condition`.
 
     Examples
     --------
@@ -117,56 +124,73 @@ def kalman_filter(
     array([0.7143, 0.7143, 1.5263])
     """
     runs, y, x, p = flatten_runs(mean, cov, observations)
-    f, h, q, r = per_step(len(y), F=F, H=H, Q=Q, R=R)
-    turned = np.ascontiguousarray(f.mT)
-    missing = np.isnan(y)
-    shared = cov.ndim == 2 and bool((missing == missing[:, :1]).all())
-    # Runs that share a covariance stand side by side, as the columns of one mean.
-    p, x, y = (
-        (cov[None], x.T[None], y.mT[:, None])
-        if shared
-        else (p, x[..., None], y[..., None])
-    )
+    f, h, q, r = repeat_per_step(len(y), F=F, H=H, Q=Q, R=R)
+    f_transposed = np.ascontiguousarray(f.mT)
+    if _share_covariance(cov, y):
+        # One covariance for all runs, whose means are the columns of one matrix.
+        p = cov[None]
+        x = x.T[None]
+        y = y.mT[:, None]
+    else:
+        # Means and observations as columns, one for each run.
+        x = x[..., None]
+        y = y[..., None]
+    missing = np.asarray(np.isnan(y).any(axis=-1))
     means = np.empty((len(y), *x.shape))
     covs = np.empty((len(y), *p.shape))
-    density = np.empty((len(y), len(x), x.shape[-1]))
-    missing = np.asarray(np.isnan(y).any(axis=-1))
+    log_likelihood = np.empty((len(y), len(x), x.shape[-1]))
     for k in range(len(y)):
+        # Forecast: x⁻ = F x, P⁻ = F P Fᵀ + Q
         x = f[k] @ x
-        p = f[k] @ p @ turned[k] + q[k]
-        gap = y[k] - h[k] @ x
-        gap[missing[k]] = 0.0
-        move, p, density[k] = assimilate(p, gap, h[k], r[k], missing[k])
-        x = x + move
+        p = f[k] @ p @ f_transposed[k] + q[k]
+        # Innovation: y - H x⁻, zero where the observation is missing
+        innovations = y[k] - h[k] @ x
+        innovations[missing[k]] = 0.0
+        # Analysis: x = x⁻ + K (y - H x⁻), P in Joseph's form
+        increment, p, log_likelihood[k] = assimilate(
+            p, innovations, h[k], r[k], missing[k]
+        )
+        x = x + increment
         means[k] = x
         covs[k] = p
     if not np.isfinite(means).all():
         raise np.linalg.LinAlgError(
-            "kalman_filter must have matrices without overflow, got infinity"
+            "kalman_filter: a mean overflowed; rescale F, H, Q or R"
         )
-    return unflatten_runs(means.mT, covs, density, runs)
+    return unflatten_runs(means.mT, covs, log_likelihood, runs)
+
+
+def _share_covariance(cov: Array, y: Array) -> bool:
+    """Whether all runs have one prior covariance and the same missing components."""
+    missing = np.isnan(y)
+    return cov.ndim == 2 and bool((missing == missing[:, :1]).all())
 
 
 def assimilate(
-    cov: Array, gap: Array, H: Array, R: Array, missing: Mask
-) -> tuple[Array, ...]:
-    """How innovations (..., m, k) move the mean, the covariance after it, and their log densities.
+    cov: Array, innovations: Array, H: Array, R: Array, missing: Mask
+) -> tuple[Array, Array, Array]:
+    """Increments of the mean, the analysis covariance, and the innovations' log densities.
 
-    An innovation is 0 where it is missing.
+    The k columns of the innovations (..., m, k), zero where they are missing, share a covariance.
     """
-    (cross, inner) = innovation(cov, H, R, missing)
-    d = cov.shape[-1]
+    # H P and S = H P Hᵀ + R, with a one on the diagonal for missing components
+    cross, innovation_cov = innovation(cov, H, R, missing)
     try:
-        lower = cholesky(inner)
+        lower = cholesky(innovation_cov)
     except np.linalg.LinAlgError:
         raise np.linalg.LinAlgError(
             "the innovation covariance is not positive definite"
         ) from None
-    white = solve_lower(lower, np.concatenate([cross, gap], axis=-1))
-    gain = solve_upper(lower, white[..., :d]).mT
-    length = (white[..., d:] ** 2).sum(axis=-2)
+    d = cov.shape[-1]
+    # With S = L Lᵀ: L⁻¹ [H P, e] in one solve
+    whitened = solve_lower(lower, np.concatenate([cross, innovations], axis=-1))
+    # K = P Hᵀ S⁻¹ = (L⁻ᵀ L⁻¹ H P)ᵀ
+    gain = solve_upper(lower, whitened[..., :d]).mT
+    # log N(e; 0, S) = -½ (|L⁻¹ e|² + m log 2π + log det S), m without missing components
+    squares = (whitened[..., d:] ** 2).sum(axis=-2)
     constant = np.log(2 * np.pi) * (~missing).sum(axis=-1) + log_det(lower)
-    return gain @ gap, joseph(cov, gain, H, R), -0.5 * (length + constant[..., None])
+    log_density = -0.5 * (squares + constant[..., None])
+    return gain @ innovations, joseph(cov, gain, H, R), log_density
 
 
 @validated
@@ -176,7 +200,7 @@ def rts_smoother(
     F: Annotated[Array, "... run.dim run.dim"],
     Q: Annotated[PositiveSemidefinite, "... run.dim run.dim"],
 ) -> FilterResult:
-    r"""States given all observations, backwards through a Kalman filter's run.
+    r"""Smooth a Kalman filter's run: states given all observations, by a backward recursion.
 
     With the forecast :math:`\mathbf P^-_{k+1} = \mathbf F\mathbf P_k\mathbf F^\top+\mathbf Q` and
     the gain :math:`\mathbf G_k = \mathbf P_k\mathbf F^\top(\mathbf P^-_{k+1})^{-1}`,
@@ -188,10 +212,10 @@ def rts_smoother(
     Parameters
     ----------
     run : FilterResult
-        What :func:`kalman_filter` left, with any number of runs and gaps. The result has its
-        shapes and its log-likelihoods.
+        Result of :func:`kalman_filter`, for any number of runs and missing observations. The
+        smoother's result has its shapes and its log-likelihoods.
     F, Q : array_like, (d, d) or (T, d, d)
-        Those that the filter had: the first of T leads from the prior to the first observation.
+        Those of the filter: the first of T leads from the prior to the first observation.
 
     Raises
     ------
@@ -212,68 +236,83 @@ def rts_smoother(
     >>> rts_smoother(run, **model).means.ravel()
     array([1. , 1.5])
     """
-    f, q = per_step(len(run.means), F=F, Q=Q)
+    f, q = repeat_per_step(len(run.means), F=F, Q=Q)
+    identity = np.eye(run.dim)
     means = run.means.copy()
     covs = run.covariances.copy()
     for k in reversed(range(len(f) - 1)):
         x = run.means[k]
         p = run.covariances[k]
-        forward = f[k + 1] @ p
-        gain = np.linalg.solve(symmetrise(forward @ f[k + 1].T + q[k + 1]), forward).mT
-        gap = means[k + 1] - x @ f[k + 1].T
-        means[k] = x + (gain @ gap[..., None])[..., 0]
-        kept = np.eye(run.dim) - gain @ f[k + 1]
-        covs[k] = symmetrise(
-            kept @ p @ kept.mT + gain @ (covs[k + 1] + q[k + 1]) @ gain.mT
-        )
+        # G = P Fᵀ (F P Fᵀ + Q)⁻¹, by a solve instead of an inverse
+        cross = f[k + 1] @ p
+        forecast_cov = symmetrise(cross @ f[k + 1].T + q[k + 1])
+        gain = np.linalg.solve(forecast_cov, cross).mT
+        # xˢ = x + G (xˢ' - F x), with the smoothed state one step later
+        difference = means[k + 1] - x @ f[k + 1].T
+        means[k] = x + (gain @ difference[..., None])[..., 0]
+        # Pˢ = (I - G F) P (I - G F)ᵀ + G (Pˢ' + Q) Gᵀ
+        remainder = identity - gain @ f[k + 1]
+        filtered = remainder @ p @ remainder.mT
+        covs[k] = symmetrise(filtered + gain @ (covs[k + 1] + q[k + 1]) @ gain.mT)
     return run.replace(means=means, covariances=covs)
 
 
 def flatten_runs(
     mean: Array, cov: Array, observations: Array
-) -> tuple[Runs, Array, Array, Array]:
-    """The axes of all runs, with observations (T, R, m), means and covariances on one such axis.
+) -> tuple[tuple[int, ...], Array, Array, Array]:
+    """Broadcast the run axes, and flatten them to one axis of length R.
 
-    New run axes of observations come in front.
+    Returns the axes, observations (T, R, m), means (R, d) and covariances (R, d, d).
     """
-    runs = leading(observations.shape[1:-1], mean.shape[:-1], "mean")
-    runs = leading(runs, cov.shape[:-2], "cov")
-    steps, *axes, m = observations.shape
-    y = observations.reshape(steps, *(1,) * (len(runs) - len(axes)), *axes, m)
-    y = np.broadcast_to(y, (steps, *runs, m)).reshape(steps, math.prod(runs), m)
-    x = np.broadcast_to(mean, (*runs, *mean.shape[-1:])).reshape(-1, mean.shape[-1])
-    p = np.broadcast_to(cov, (*runs, *cov.shape[-2:])).reshape(-1, *cov.shape[-2:])
+    runs = broadcast_leading(observations.shape[1:-1], mean.shape[:-1], "mean")
+    runs = broadcast_leading(runs, cov.shape[:-2], "cov")
+    steps = len(observations)
+    m = observations.shape[-1]
+    d = mean.shape[-1]
+    size = math.prod(runs)
+    # Run axes that only the prior has come first, after the time.
+    new_axes = len(runs) - (observations.ndim - 2)
+    y = np.expand_dims(observations, tuple(range(1, 1 + new_axes)))
+    y = np.broadcast_to(y, (steps, *runs, m)).reshape(steps, size, m)
+    x = np.broadcast_to(mean, (*runs, d)).reshape(size, d)
+    p = np.broadcast_to(cov, (*runs, *cov.shape[-2:])).reshape(size, *cov.shape[-2:])
     return runs, y, x, p
 
 
 def unflatten_runs(
-    means: Array, covs: Array, density: Array, runs: Runs
+    means: Array, covs: Array, log_likelihood: Array, runs: tuple[int, ...]
 ) -> FilterResult:
-    """What a filter found of all runs, (T, R, ...), with their axes apart."""
+    """Restore the run axes of results (T, R, ...); axes of length 1 for a shared covariance."""
     steps = len(means)
-    lead = runs if covs.shape[1] == math.prod(runs) else (1,) * len(runs)
+    cov_runs = runs if covs.shape[1] == math.prod(runs) else (1,) * len(runs)
     return FilterResult.construct(
         means.reshape(steps, *runs, means.shape[-1]),
-        covs.reshape(steps, *lead, *covs.shape[2:]),
-        density.reshape(steps, *runs),
+        covs.reshape(steps, *cov_runs, *covs.shape[2:]),
+        log_likelihood.reshape(steps, *runs),
     )
 
 
-def per_step(steps: int, **matrices: Array) -> list[Array]:
-    """Matrices that are constant, or given per step, for every step."""
-    for name, a in matrices.items():
-        if a.shape[:-2] not in ((), (steps,)):
-            needs = f"shape {a.shape[-2:]} or {(steps, *a.shape[-2:])}"
-            raise ValueError(f"{name} must be {needs}, got {a.shape}")
-    return [np.broadcast_to(a, (steps, *a.shape[-2:])) for a in matrices.values()]
+def repeat_per_step(steps: int, **matrices: Array) -> list[Array]:
+    """Broadcast matrices that are constant or given per step to (steps, ...)."""
+    repeated = []
+    for name, matrix in matrices.items():
+        size = matrix.shape[-2:]
+        if matrix.shape[:-2] not in ((), (steps,)):
+            raise ValueError(
+                f"{name} must have shape {size} or {(steps, *size)}, got {matrix.shape}"
+            )
+        repeated.append(np.broadcast_to(matrix, (steps, *size)))
+    return repeated
 
 
-def grid(times: Array, observations: Array, sensor: Sensor) -> Array:
-    """The T + 1 times of the prior, which is 0, and of a sensor's T observations."""
-    wanted = len(times), sensor.dim
-    if (len(observations), observations.shape[-1]) != wanted:
-        needs = f"shape ({wanted[0]}, ..., {wanted[1]})"
-        raise ValueError(f"observations must be {needs}, got {observations.shape}")
+def prepend_prior_time(times: Array, observations: Array, sensor: Sensor) -> Array:
+    """Validate the observations' times and shape; the T + 1 times from the prior's, which is 0."""
+    steps = len(times)
+    if len(observations) != steps or observations.shape[-1] != sensor.dim:
+        raise ValueError(
+            f"observations must have shape ({steps}, ..., {sensor.dim}), "
+            f"got {observations.shape}"
+        )
     if times.min(initial=np.inf) <= 0:
-        raise ValueError(f"times must be times after 0, got {times[0]:g}")
+        raise ValueError(f"times must be after 0, got {times[0]:g}")
     return np.concatenate([[0.0], times])

@@ -1,7 +1,7 @@
 r"""The multiplicative extended Kalman filter, for states with a unit quaternion.
 
-The mean stays where states can be; its error lives in the tangent directions: three numbers for the
-error of an attitude, and no spread along its length.
+The mean stays on the manifold of states. Its error is a tangent vector: three components for the
+error of an attitude, and no uncertainty of the quaternion's length.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ..linalg import central
+from ..linalg import central_difference
 from ..models import Model
 from ..models.quaternions import left_directions, rotate, rotation_vector_between
 from ..sensors import Sensor, stack
@@ -25,36 +25,40 @@ from ..validation import (
     Times,
     validated,
 )
-from .linear import FilterResult, Series, assimilate, flatten_runs, grid, unflatten_runs
+from .linear import (
+    FilterResult,
+    ObservationSeries,
+    assimilate,
+    flatten_runs,
+    prepend_prior_time,
+    unflatten_runs,
+)
 
 __all__ = ["QuaternionChart", "mekf"]
 
 
 @dataclass(frozen=True, eq=False)
 class QuaternionChart(FrozenModel):
-    """How errors move a state with a quaternion among its components, and the rest as it is.
+    """Chart of states with a unit quaternion among their components.
 
-    The error's components are the state's, with the rotation vector of
-    :func:`distfilt.models.quaternions.rotate` in the quaternion's place: one fewer.
+    The components of the error are the state's, with the rotation vector of
+    :func:`distfilt.models.quaternions.rotate` in place of the quaternion: k = d - 1 components.
 
     Parameters
     ----------
     dim : int
         Size d of the state.
     first : int
-        Where the quaternion begins; its scalar part is first.
+        Index of the quaternion's first component, its scalar part.
 
     Examples
     --------
     >>> chart = QuaternionChart(5, 1)
-    >>> (
-    ...     chart.retract(
-    ...         np.array([2.0, 1, 0, 0, 0]), np.array([0.5, np.pi, 0, 0])
-    ...     ).round(3)
-    ...     + 0.0
-    ... )
+    >>> state = np.array([2.0, 1.0, 0.0, 0.0, 0.0])
+    >>> error = np.array([0.5, np.pi, 0.0, 0.0])
+    >>> chart.retract(state, error).round(3) + 0.0
     array([2.5, 0. , 1. , 0. , 0. ])
-    >>> chart.project([2.0, 1, 0, 0, 0], np.eye(5)).diagonal()
+    >>> chart.project(state, np.eye(5)).diagonal()
     array([1., 4., 4., 4.])
     """
 
@@ -64,8 +68,10 @@ class QuaternionChart(FrozenModel):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.first + 4 > self.dim:
-            needs = f"four components from there on, got {self.first} of {self.dim}"
-            raise ValueError(f"first must be {needs}")
+            raise ValueError(
+                f"first must be at most {self.dim - 4}, so that four components follow, "
+                f"got {self.first}"
+            )
 
     @property
     def error_dim(self) -> int:
@@ -74,27 +80,29 @@ class QuaternionChart(FrozenModel):
 
     def retract(self, x: Array, e: Array) -> Array:
         """Move states (..., d) by errors (..., k)."""
-        at = self.first
-        turn = rotate(x[..., at : at + 4], e[..., at : at + 3])
-        before = x[..., :at] + e[..., :at]
-        behind = x[..., at + 4 :] + e[..., at + 3 :]
-        return np.concatenate([before, turn, behind], axis=-1)
+        i = self.first
+        before = x[..., :i] + e[..., :i]
+        quaternion = rotate(x[..., i : i + 4], e[..., i : i + 3])
+        after = x[..., i + 4 :] + e[..., i + 3 :]
+        return np.concatenate([before, quaternion, after], axis=-1)
 
     def local(self, x: Array, other: Array) -> Array:
-        """The error that takes x to `other`, the inverse of `retract`."""
-        at = self.first
-        gap = other - x
-        turn = rotation_vector_between(x[..., at : at + 4], other[..., at : at + 4])
-        return np.concatenate([gap[..., :at], turn, gap[..., at + 4 :]], axis=-1)
+        """Error that moves x to `other`, the inverse of `retract`."""
+        i = self.first
+        difference = other - x
+        before = difference[..., :i]
+        angle = rotation_vector_between(x[..., i : i + 4], other[..., i : i + 4])
+        after = difference[..., i + 4 :]
+        return np.concatenate([before, angle, after], axis=-1)
 
     def tangent_basis(self, x: Array) -> Array:
-        """The derivative of `retract` at no error, (..., d, k)."""
-        at = self.first
-        out = np.zeros((*x.shape, self.error_dim))
-        out[..., :at, :at] = np.eye(at)
-        out[..., at : at + 4, at : at + 3] = left_directions(x[..., at : at + 4])
-        out[..., at + 4 :, at + 3 :] = np.eye(self.dim - at - 4)
-        return out
+        """Derivative B of `retract` with respect to the error, at zero, (..., d, k)."""
+        i = self.first
+        basis = np.zeros((*x.shape, self.error_dim))
+        basis[..., :i, :i] = np.eye(i)
+        basis[..., i : i + 4, i : i + 3] = left_directions(x[..., i : i + 4])
+        basis[..., i + 4 :, i + 3 :] = np.eye(self.dim - i - 4)
+        return basis
 
     @validated
     def project(
@@ -102,33 +110,33 @@ class QuaternionChart(FrozenModel):
         x: Annotated[Array, "... self.dim"],
         cov: Annotated[Array, "... self.dim self.dim"],
     ) -> Array:
-        """Covariance of the errors, (..., k, k), of states with covariance `cov`, (..., d, d)."""
-        inwards = self.tangent_projection(x)
-        return inwards @ cov @ inwards.mT
+        """Project covariances (..., d, d) of states to those of their errors, (..., k, k)."""
+        projection = self.tangent_projection(x)
+        return projection @ cov @ projection.mT
 
     def tangent_projection(self, x: Array) -> Array:
-        """The errors (..., k, d) of small moves of the state: the directions' pseudo-inverse."""
-        b = self.tangent_basis(x)
-        return np.asarray(np.linalg.solve(b.mT @ b, b.mT))
+        """Pseudo-inverse of the tangent basis, B⁺ = (Bᵀ B)⁻¹ Bᵀ, (..., k, d)."""
+        basis = self.tangent_basis(x)
+        return np.asarray(np.linalg.solve(basis.mT @ basis, basis.mT))
 
 
 @validated
 def mekf(
     mean: Annotated[Array, "... model.dim"],
     cov: Annotated[PositiveDefinite, "... chart.error_dim chart.error_dim"],
-    observations: Series,
+    observations: ObservationSeries,
     *,
     chart: QuaternionChart,
     model: Model,
     sensors: Sequence[Sensor],
     times: Times,
 ) -> FilterResult:
-    r"""The extended Kalman filter on a chart's errors, over series of observations.
+    r"""Multiplicative extended Kalman filter: an extended filter on the errors of a chart.
 
-    With the directions B of the chart and their pseudo-inverse, the errors' transition is
-    :math:`\mathbf B(\mathbf x')^+\,\mathbf J\,\mathbf B(\mathbf x)`, their noise
-    :math:`\mathbf B(\mathbf x')^+\mathbf Q\,\mathbf B(\mathbf x')^{+\top}`, and a sensor's matrix
-    :math:`\mathbf H\,\mathbf B(\mathbf x)`; an analysis moves the mean by `retract`. The
+    With the tangent basis B of the chart and its pseudo-inverse, the transition of the errors is
+    :math:`\mathbf B(\mathbf x')^+\,\mathbf J\,\mathbf B(\mathbf x)`, their noise covariance
+    :math:`\mathbf B(\mathbf x')^+\mathbf Q\,\mathbf B(\mathbf x')^{+\top}`, and the matrix of a
+    sensor :math:`\mathbf H\,\mathbf B(\mathbf x)`. An analysis moves the mean by `retract`. The
     covariances (T, ..., k, k) are those of the errors ``chart.local(means, truth)``.
 
     Parameters
@@ -136,30 +144,31 @@ def mekf(
     mean : array_like, (d,) or (..., d)
         Prior mean at time 0.
     cov : array_like, (k, k) or (..., k, k)
-        Prior covariance of the error; :meth:`QuaternionChart.project` makes it of the state's.
+        Prior covariance of the error; :meth:`QuaternionChart.project` computes it from the
+        state's.
     observations : array_like, (T, ..., m)
-        The observations of all sensors, one after the other; the middle axes are the runs. NaN
-        marks a missing component.
+        The observations of all sensors, concatenated; the middle axes are the runs. NaN marks a
+        missing component.
     chart : QuaternionChart
-        Which components are the quaternion.
+        It says which components are the quaternion.
     model : Model
         Linearised about each analysis mean.
     sensors : sequence of Sensor
-        Linearised about each forecast mean. Sensors of changes are welcome too: the errors of the
-        previous state are kept beside those of the present one until the reading is used.
+        Linearised about each forecast mean. Sensors of increments are supported: the errors of the
+        previous state are appended to those of the present one for the analysis.
     times : array_like, (T,)
         Observation times after 0, in s.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        If a run leaves the finite numbers or its covariance is no longer positive definite; the
-        message has the time.
+        If the mean of a run is no longer finite or its covariance no longer positive definite; the
+        message names the time.
 
     Notes
     -----
-    E. J. Lefferts, F. L. Markley and M. D. Shuster, Journal of Guidance 5 (1982) 417-429. That the
-    directions turn with the mean in an analysis is of second order and left out.
+    E. J. Lefferts, F. L. Markley and M. D. Shuster, Journal of Guidance 5 (1982) 417-429. In an
+    analysis the tangent basis rotates with the mean; this effect is of second order and neglected.
 
     Examples
     --------
@@ -181,78 +190,98 @@ def mekf(
     sensor = stack(sensors)
     if chart.dim != model.dim:
         raise ValueError(
-            f"chart must be {model.dim} components like the model, got {chart.dim}"
+            f"chart must have {model.dim} components, like the model, got {chart.dim}"
         )
-    clock = grid(times, observations, sensor)
+    clock = prepend_prior_time(times, observations, sensor)
     runs, y, x, p = flatten_runs(mean, cov, observations)
     means = np.empty((len(y), *x.shape))
     covs = np.empty((len(y), *p.shape))
-    density = np.empty(y.shape[:2])
+    log_likelihood = np.empty(y.shape[:2])
     for n, t in enumerate(times):
+        dt = t - clock[n]
         try:
-            x, p, density[n] = _step(
-                x, p, y[n], chart, model, sensor, clock[n], t - clock[n]
+            forecast, joint, previous = _predict(
+                x, p, chart, model, sensor, clock[n], dt
+            )
+            x, p, log_likelihood[n] = _assimilate(
+                forecast, joint, previous, y[n], chart, sensor
             )
         except np.linalg.LinAlgError as error:
             raise np.linalg.LinAlgError(f"at t = {t:g}: {error}") from None
         means[n] = x
         covs[n] = p
-    return unflatten_runs(means, covs, density, runs)
+    return unflatten_runs(means, covs, log_likelihood, runs)
 
 
-def _step(
+def _predict(
     x: Array,
     p: Array,
-    y: Array,
     chart: QuaternionChart,
     model: Model,
     sensor: Sensor,
     t: float,
     dt: float,
+) -> tuple[Array, Array, Array | None]:
+    """Forecast means (R, d) and covariances of their errors, and the previous means.
+
+    For a sensor of increments the covariances are joint, of the present and the previous errors,
+    (R, 2k, 2k); otherwise they are (R, k, k) and there are no previous means.
+    """
+    forecast = model.step(x, t, dt)
+    _check_finite(forecast)
+    projection = chart.tangent_projection(forecast)
+    # Transition of the errors: A = B(x')⁺ J B(x)
+    a = projection @ model.jacobian(x, t, dt) @ chart.tangent_basis(x)
+    noise_cov = projection @ model.Q(t, dt) @ projection.mT
+    cov = a @ p @ a.mT + noise_cov
+    if not sensor.uses_previous:
+        return forecast, cov, None
+    # The covariance of present and previous errors is A P.
+    cross = a @ p
+    return forecast, np.block([[cov, cross], [cross.mT, p]]), x
+
+
+def _assimilate(
+    forecast: Array,
+    cov: Array,
+    previous: Array | None,
+    y: Array,
+    chart: QuaternionChart,
+    sensor: Sensor,
 ) -> tuple[Array, Array, Array]:
-    """Means (R, d), covariances (R, k, k) and log densities (R,) one reading later."""
-    moved = _finite(model.step(x, t, dt))
-    inwards = chart.tangent_projection(moved)
-    slope = inwards @ model.jacobian(x, t, dt) @ chart.tangent_basis(x)
-    joint = slope @ p @ slope.mT + inwards @ model.Q(t, dt) @ inwards.mT
-    previous = None
-    if sensor.uses_previous:
-        across = slope @ p
-        previous = x
-        joint = np.block([[joint, across], [across.mT, p]])
-    gap = sensor.residual(y, sensor.predict(moved, previous))
-    missing = np.isnan(gap)
-    h = _errors_seen(moved, previous, sensor, chart)
+    """Analysis means (R, d), covariances (R, k, k), and log densities (R,) of observations."""
+    innovation = sensor.residual(y, sensor.predict(forecast, previous))
+    missing = np.isnan(innovation)
+    innovation = np.where(missing, 0.0, innovation)
+    h = _error_jacobian(forecast, previous, sensor, chart)
     h = np.where(missing[..., None], 0.0, h)
-    gap = np.where(missing, 0.0, gap)
-    error, joint, density = assimilate(
-        joint, gap[..., None], h, sensor.noise_cov, missing
+    error, cov, log_density = assimilate(
+        cov, innovation[..., None], h, sensor.noise_cov, missing
     )
+    # The previous errors, if any, come last and are dropped.
     k = chart.error_dim
-    return (
-        _finite(chart.retract(moved, error[:, :k, 0])),
-        joint[:, :k, :k],
-        density[:, 0],
-    )
+    x = chart.retract(forecast, error[:, :k, 0])
+    _check_finite(x)
+    return x, cov[:, :k, :k], log_density[:, 0]
 
 
-def _finite(x: Array) -> Array:
-    lost = ~np.isfinite(x).all(axis=-1)
-    if lost.any():
-        raise np.linalg.LinAlgError(f"run {lost.argmax()} is no longer finite")
-    return x
+def _check_finite(x: Array) -> None:
+    infinite = ~np.isfinite(x).all(axis=-1)
+    if infinite.any():
+        raise np.linalg.LinAlgError(f"run {infinite.argmax()} is no longer finite")
 
 
-def _errors_seen(
+def _error_jacobian(
     x: Array, previous: Array | None, sensor: Sensor, chart: QuaternionChart
 ) -> Array:
-    """How a sensor sees the errors (R, m, k), of the previous state too if it uses it."""
-    slope = sensor.jacobian(x, previous) @ chart.tangent_basis(x)
+    """Derivative of a sensor in the errors, (R, m, k); (R, m, 2k) with those of previous states."""
+    h = sensor.jacobian(x, previous) @ chart.tangent_basis(x)
     if previous is None:
-        return np.asarray(slope)
+        return np.asarray(h)
 
-    def of_previous(v: Array) -> Array:
-        return sensor.predict(np.broadcast_to(x[:, None], v.shape), v)
+    def predict(varied: Array) -> Array:
+        return sensor.predict(np.broadcast_to(x[:, None], varied.shape), varied)
 
-    back = central(of_previous, previous, difference=sensor.residual)
-    return np.concatenate([slope, back @ chart.tangent_basis(previous)], axis=-1)
+    slope = central_difference(predict, previous, difference=sensor.residual)
+    h_previous = slope @ chart.tangent_basis(previous)
+    return np.concatenate([h, h_previous], axis=-1)

@@ -1,12 +1,12 @@
-"""The Kalman, extended and unscented filters of filterpy 2.0 behind the library's shapes.
+"""The Kalman, extended and unscented filters of filterpy 2.0, with the library's interface.
 
-They are slow (one run and one step at a time) and independently written: the reference that the
-batched filters are compared with. Nothing else in the library imports filterpy.
+They are slow (one run and one step at a time) and independently written: a reference for the
+batched filters. Nothing else in the library imports filterpy.
 
-Three habits of filterpy are guarded against here: states are vectors (d,), since a column state and
-a flat observation silently give a matrix; missing components are taken out before filterpy sees
-them, since NaN passes through without an error; and every update follows a forecast, since a second
-update on the same sigma points can give a negative variance.
+Three pitfalls of filterpy are avoided here. States are vectors (d,), since a column state and a
+flat observation silently give a matrix. Missing components are removed before the update, since
+filterpy accepts NaN without an error. Every update follows a forecast, since a second update on
+the same sigma points can give a negative variance.
 """
 
 from __future__ import annotations
@@ -30,35 +30,37 @@ from ..validation import (
 )
 from .linear import (
     FilterResult,
-    Matrix,
-    Mean,
-    Noise,
-    Seen,
-    Series,
+    MeanVector,
+    ObservationMatrix,
+    ObservationNoise,
+    ObservationSeries,
+    SquareMatrix,
     flatten_runs,
-    grid,
-    per_step,
+    prepend_prior_time,
+    repeat_per_step,
     unflatten_runs,
 )
 
 __all__ = ["filterpy_ekf", "filterpy_kf", "filterpy_ukf"]
 
-State = Annotated[Array, "... model.dim"]
-Spread = Annotated[PositiveDefinite, "... model.dim model.dim"]
+StateMean = Annotated[Array, "... model.dim"]
+StateCov = Annotated[PositiveDefinite, "... model.dim model.dim"]
+Step = Callable[[Any, int, Array, Mask], None]
+"""``step(kf, k, observation, present)`` moves a filter of filterpy to step k."""
 
 
 @validated
 def filterpy_kf(
-    mean: Mean,
+    mean: MeanVector,
     cov: PositiveDefinite,
-    observations: Series,
+    observations: ObservationSeries,
     *,
-    F: Matrix,
-    H: Seen,
+    F: SquareMatrix,
+    H: ObservationMatrix,
     Q: PositiveSemidefinite,
-    R: Noise,
+    R: ObservationNoise,
 ) -> FilterResult:
-    """Filterpy's Kalman filter over a series: arguments and result of :func:`kalman_filter`.
+    """Run filterpy's Kalman filter, with arguments and result of :func:`kalman_filter`.
 
     Parameters
     ----------
@@ -73,37 +75,38 @@ def filterpy_kf(
     >>> run.means, run.covariances
     (array([[1.]]), array([[[0.5]]]))
     """
-    f, h, q, r = per_step(len(observations), F=F, H=H, Q=Q, R=R)
+    f, h, q, r = repeat_per_step(len(observations), F=F, H=H, Q=Q, R=R)
     m, d = h.shape[1:]
 
-    def step(kf: Any, k: int, z: Array, seen: Mask) -> None:
+    def step(kf: Any, k: int, z: Array, present: Mask) -> None:
         kf.predict(F=f[k], Q=q[k])
-        if seen.any():
-            kf.update(z[seen], H=h[k][seen], R=r[k][np.ix_(seen, seen)])
+        if present.any():
+            # Rows of missing components are deleted from H and R.
+            noise_cov = r[k][np.ix_(present, present)]
+            kf.update(z[present], H=h[k][present], R=noise_cov)
 
-    make = partial(
-        import_optional("filterpy.kalman", "reference").KalmanFilter, dim_x=d, dim_z=m
-    )
-    return _over_runs(mean, cov, observations, make, step)
+    filterpy = import_optional("filterpy.kalman", "reference")
+    make = partial(filterpy.KalmanFilter, dim_x=d, dim_z=m)
+    return _run_filterpy(mean, cov, observations, make, step)
 
 
 @validated
 def filterpy_ekf(
-    mean: State,
-    cov: Spread,
-    observations: Series,
+    mean: StateMean,
+    cov: StateCov,
+    observations: ObservationSeries,
     *,
     model: Model,
     sensors: Sequence[Sensor],
     times: Times,
 ) -> FilterResult:
-    r"""Filterpy's extended Kalman filter over a series: linearise the model and the sensors.
+    r"""Run filterpy's extended Kalman filter: the model and the sensors are linearised.
 
     Parameters
     ----------
     mean, cov, observations, model, sensors, times
-        As for :func:`~distfilt.kalman.mekf`, with the state's covariance, and
-        sensors of the present state.
+        As for :func:`~distfilt.kalman.mekf`, with the covariance of the state. Sensors of
+        increments are not supported.
 
     Examples
     --------
@@ -120,45 +123,40 @@ def filterpy_ekf(
     >>> run.means.round(6)
     array([[2.]])
     """
-    sensor, clock = _present(sensors, times, observations)
+    sensor, clock = _stack_sensors(sensors, times, observations)
 
-    def step(kf: Any, k: int, z: Array, seen: Mask) -> None:
+    def step(kf: Any, k: int, z: Array, present: Mask) -> None:
         t = float(clock[k])
         dt = float(clock[k + 1] - clock[k])
         kf.F = model.jacobian(kf.x, t, dt)
         kf.Q = model.Q(t, dt)
-        moved = model.step(kf.x, t, dt)
+        forecast = model.step(kf.x, t, dt)
         kf.predict()
-        kf.x = (
-            moved  # filterpy moves the mean with F; the model itself is the better step
-        )
-        if seen.any():
-            # It gets residuals, which the sensor wraps, in place of readings.
-            gap = sensor.residual(z, sensor.predict(moved))[seen]
-            h = sensor.jacobian(moved)[seen]
-            kf.update(
-                gap,
-                lambda x: h,
-                lambda x: 0 * gap,
-                sensor.noise_cov[np.ix_(seen, seen)],
-            )
+        # filterpy predicts the mean by F; the nonlinear model is more accurate.
+        kf.x = forecast
+        if present.any():
+            # The observation is the residual, which the sensor wraps, and its prediction zero.
+            residual = sensor.residual(z, sensor.predict(forecast))[present]
+            h = sensor.jacobian(forecast)[present]
+            noise_cov = sensor.noise_cov[np.ix_(present, present)]
+            kf.update(residual, lambda x: h, lambda x: 0 * residual, noise_cov)
 
-    make = import_optional("filterpy.kalman", "reference").ExtendedKalmanFilter
-    make = partial(make, dim_x=model.dim, dim_z=sensor.dim)
-    return _over_runs(mean, cov, observations, make, step)
+    filterpy = import_optional("filterpy.kalman", "reference")
+    make = partial(filterpy.ExtendedKalmanFilter, dim_x=model.dim, dim_z=sensor.dim)
+    return _run_filterpy(mean, cov, observations, make, step)
 
 
 @validated
 def filterpy_ukf(
-    mean: State,
-    cov: Spread,
-    observations: Series,
+    mean: StateMean,
+    cov: StateCov,
+    observations: ObservationSeries,
     *,
     model: Model,
     sensors: Sequence[Sensor],
     times: Times,
 ) -> FilterResult:
-    r"""Filterpy's unscented Kalman filter over a series: 2d + 1 points instead of derivatives.
+    r"""Run filterpy's unscented Kalman filter: 2d + 1 sigma points instead of derivatives.
 
     The points lie :math:`\sqrt{d+1}` standard deviations from the mean.
 
@@ -182,7 +180,7 @@ def filterpy_ukf(
     >>> run.means.round(6)
     array([[2.]])
     """
-    sensor, clock = _present(sensors, times, observations)
+    sensor, clock = _stack_sensors(sensors, times, observations)
     filterpy = import_optional("filterpy.kalman", "reference")
 
     def make() -> Any:
@@ -191,65 +189,75 @@ def filterpy_ukf(
             model.dim, sensor.dim, 0.0, None, None, points
         )
 
-    def step(kf: Any, k: int, z: Array, seen: Mask) -> None:
+    def step(kf: Any, k: int, z: Array, present: Mask) -> None:
         t = float(clock[k])
         dt = float(clock[k + 1] - clock[k])
         kf.Q = model.Q(t, dt)
-        # filterpy asks for one sigma point after the other; all of them are moved in one call.
-        moved = iter(model.step(kf.points_fn.sigma_points(kf.x, kf.P), t, dt))
-        kf.predict(dt, fx=lambda x, dt: next(moved))
-        if seen.any():
-            h = sensor.predict(kf.sigmas_f)
-            # Readings that wrap are unwrapped: the points around the central one, the observation
-            # around the points' mean. Plain differences are then right.
-            h = h[0] + sensor.residual(h, np.broadcast_to(h[0], h.shape))
-            middle = kf.Wm @ h
-            near = middle + sensor.residual(z, middle)
-            rows = iter(h[:, seen])
-            kf.update(
-                near[seen],
-                R=sensor.noise_cov[np.ix_(seen, seen)],
-                hx=lambda x: next(rows),
-            )
+        # filterpy calls fx and hx for one sigma point after the other: both are computed here in
+        # one call, and handed out in that order.
+        points = kf.points_fn.sigma_points(kf.x, kf.P)
+        forecasts = iter(model.step(points, t, dt))
+        kf.predict(dt, fx=lambda x, dt: next(forecasts))
+        if present.any():
+            predicted, observed = _unwrap(sensor, kf.sigmas_f, kf.Wm, z)
+            rows = iter(predicted[:, present])
+            noise_cov = sensor.noise_cov[np.ix_(present, present)]
+            kf.update(observed[present], R=noise_cov, hx=lambda x: next(rows))
 
-    return _over_runs(mean, cov, observations, make, step)
+    return _run_filterpy(mean, cov, observations, make, step)
 
 
-def _present(
+def _unwrap(
+    sensor: Sensor, points: Array, weights: Array, observed: Array
+) -> tuple[Array, Array]:
+    """Predictions at sigma points, and the observation, such that plain differences are right.
+
+    Values that wrap are unwrapped: the predictions about that of the central point, and the
+    observation about the mean prediction.
+    """
+    predicted = sensor.predict(points)
+    centre = np.broadcast_to(predicted[0], predicted.shape)
+    predicted = predicted[0] + sensor.residual(predicted, centre)
+    mean = weights @ predicted
+    return predicted, mean + sensor.residual(observed, mean)
+
+
+def _stack_sensors(
     sensors: Sequence[Sensor], times: Array, observations: Array
 ) -> tuple[Sensor, Array]:
-    """The stacked sensor, if none of the sensors needs the previous state, and the clock."""
+    """Stack sensors of the present state; the T + 1 times of the prior and the observations."""
     sensor = stack(sensors)
     if sensor.uses_previous:
         raise ValueError(
-            "sensors must be sensors of the present state, got a differential sensor"
+            "sensors must not be of increments: this filter keeps no previous state"
         )
-    return sensor, grid(times, observations, sensor)
+    return sensor, prepend_prior_time(times, observations, sensor)
 
 
-def _over_runs(
+def _run_filterpy(
     mean: Array,
     cov: Array,
     observations: Array,
     make: Callable[[], Any],
-    step: Callable[[Any, int, Array, Mask], None],
+    step: Step,
 ) -> FilterResult:
-    """Run one of filterpy's objects over every run and every step."""
+    """Filter every run by a filter of filterpy of its own, step after step."""
     runs, y, x, p = flatten_runs(mean, cov, observations)
     means = np.empty((len(y), *x.shape))
     covs = np.empty((len(y), *p.shape))
-    density = np.zeros(y.shape[:2])
+    log_likelihood = np.zeros(y.shape[:2])
     for run in range(len(x)):
         kf = make()
+        # filterpy changes its arrays in place.
         kf.x = x[run].copy()
         kf.P = p[run].copy()
         for k, z in enumerate(y[:, run]):
-            seen = ~np.isnan(z)
-            step(kf, k, z, seen)
+            present = ~np.isnan(z)
+            step(kf, k, z, present)
             means[k, run] = kf.x
             covs[k, run] = kf.P
-            if seen.any():
-                density[k, run] = kf.log_likelihood
+            if present.any():
+                log_likelihood[k, run] = kf.log_likelihood
     if not np.isfinite(means).all():
-        raise np.linalg.LinAlgError("filterpy's filter ended in NaN")
-    return unflatten_runs(means, covs, density, runs)
+        raise np.linalg.LinAlgError("filterpy's filter: a mean is no longer finite")
+    return unflatten_runs(means, covs, log_likelihood, runs)

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..ensembles import Members
 from ..gaussians import log_density
-from ..linalg import cholesky, leading, quadratic_form
+from ..linalg import cholesky, broadcast_leading, quadratic_form
 from ..validation import (
     Array,
     Bounds,
@@ -54,7 +54,7 @@ def squared_error(estimate: Vector, truth: Vector) -> Array:
     >>> float(squared_error([1.0, 2.0], [4.0, 6.0]))
     25.0
     """
-    leading(estimate.shape[:-1], truth.shape[:-1], "truth")
+    broadcast_leading(estimate.shape[:-1], truth.shape[:-1], "truth")
     return np.asarray(((estimate - truth) ** 2).sum(axis=-1))
 
 
@@ -83,7 +83,7 @@ def nees(estimate: Vector, cov: PositiveDefinite, truth: Vector) -> Array:
     >>> float(nees([2.0, 0.0], [[4.0, 0.0], [0.0, 1.0]], [0.0, 3.0]))
     10.0
     """
-    leading(estimate.shape[:-1], truth.shape[:-1], "truth")
+    broadcast_leading(estimate.shape[:-1], truth.shape[:-1], "truth")
     return nis(estimate - truth, cov)
 
 
@@ -110,7 +110,7 @@ def nis(
     >>> float(nis([2.0, 3.0], [[4.0, 0.0], [0.0, 1.0]]))
     10.0
     """
-    leading(innovation.shape[:-1], cov.shape[:-2], "cov")
+    broadcast_leading(innovation.shape[:-1], cov.shape[:-2], "cov")
     return quadratic_form(cholesky(cov), innovation)
 
 
@@ -197,14 +197,14 @@ def crps(
     ValueError: weights must have leading axes that broadcast with (2,), got (3,)
     """
     n = ensemble.shape[-2]
-    leading(ensemble.shape[:-2], truth.shape[:-1], "truth")
+    broadcast_leading(ensemble.shape[:-2], truth.shape[:-1], "truth")
     # Distances from the truth are as good as the members, and lose fewer digits far from zero.
     gap = ensemble - truth[..., None, :]
     if weights is None:
         gap = np.sort(gap, axis=-2)
         share = np.full((n, 1), 1 / n)
     else:
-        leading(gap.shape[:-2], weights.shape[:-1], "weights")
+        broadcast_leading(gap.shape[:-2], weights.shape[:-1], "weights")
         order = np.argsort(gap, axis=-2)
         gap = np.take_along_axis(gap, order, axis=-2)
         share = np.take_along_axis(
@@ -242,7 +242,9 @@ def gaussian_crps(
     """
     from scipy.special import ndtr
 
-    leading(leading(mean.shape, std.shape, "std"), truth.shape, "truth")
+    broadcast_leading(
+        broadcast_leading(mean.shape, std.shape, "std"), truth.shape, "truth"
+    )
     z = (truth - mean) / std
     density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
     return np.asarray(std * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi)))

@@ -1,15 +1,15 @@
 """Gaussian mixtures: densities, fusion of a shared part of the state, reduction, divergences."""
 
-from .agreement import (
+from .divergence import Divergence, jeffreys_by_sampling, jeffreys_of_many
+from .fusion import (
     average_mixtures,
     fuse_mixtures,
     fuse_moments,
     fuse_sequentially,
     target_fusion,
 )
-from .divergence import Divergence, jeffreys_by_sampling, jeffreys_of_many
-from .fusion import PartialFusion, nonnegative_least_squares, tikhonov
 from .gaussian import GaussianMixture
+from .partial_fusion import PartialFusion, nonnegative_least_squares, tikhonov
 from .reduction import (
     ComponentShapes,
     cross_relevance,

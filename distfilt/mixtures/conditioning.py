@@ -1,4 +1,4 @@
-"""A whole mixture forecast and conditioned on a reading: square-root filters at points, no slope.
+"""Forecast and update of a whole mixture by square-root filters at points, without derivatives.
 
 Divided differences of second order (DD2), with the step sqrt(3), which is exact for a Gaussian's
 fourth moments along each axis. Square roots are built by QR: no covariance can lose definiteness.
@@ -13,22 +13,22 @@ import numpy as np
 
 from ..gaussians.single import unscented_points
 from ..linalg import cholesky, log_det, lower_root, quadratic_form
-from ..validation import Array
+from ..validation import Array, call_user
 from .gaussian import GaussianMixture
 
 __all__ = ["propagate_mixture", "update_mixture", "within_gate"]
 
 _LOG_2PI = float(np.log(2 * np.pi))
-# Square of the step, in units of the variance.
+# Square of the step of the divided differences, in units of the variance.
 _STEP = 3.0
-# Mixands lighter than this are left out after a reading.
-_NOTHING = 1e-9
+# Components lighter than this are left out after an update.
+_NEGLIGIBLE = 1e-9
 
 
 def propagate_mixture(
     mixture: GaussianMixture, function: Callable[[Array], Array], noise_factor: Array
 ) -> GaussianMixture:
-    """The mixture after a function and added noise, mixand by mixand.
+    """Propagate a mixture through a function and add noise, component by component.
 
     Parameters
     ----------
@@ -45,12 +45,15 @@ def propagate_mixture(
     >>> after.means, after.covs.round(6)  # E x² = 1.25, and its variance 4 m² P + 2 P²
     (array([[1.25]]), array([[[1.125]]]))
     """
-    means, first, second = _differences(np.asarray(function(_points(mixture))))
-    if not all(np.isfinite(part).all() for part in (means, first, second)):
+    values = np.asarray(call_user(function, _unscented_points(mixture)))
+    means, first, second = _divided_differences(values)
+    is_finite = [np.isfinite(part).all() for part in (means, first, second)]
+    if not all(is_finite):
         raise ValueError(
-            "function must be finite values at the points, got NaN or an overflow"
+            "function must return finite values at the points, got NaN or an overflow"
         )
-    return _of_roots(mixture.weights, means, _root(first, second, noise_factor))
+    factors = _combine_roots(first, second, noise_factor)
+    return _build_from_factors(mixture.weights, means, factors)
 
 
 def update_mixture(
@@ -61,9 +64,10 @@ def update_mixture(
     *,
     residual: Callable[[Array, Array], Array] = np.subtract,
 ) -> GaussianMixture:
-    """Condition a mixture on a reading: its mixands, and their weights by how likely it was.
+    """Condition a mixture on an observation: each component, and the weights by its likelihood.
 
-    A mixand that cannot explain the reading (`function` is NaN at one of its points) is left out.
+    A component that cannot predict the observation (`function` is NaN at one of its points) is left
+    out.
 
     Parameters
     ----------
@@ -71,16 +75,16 @@ def update_mixture(
     observed : ndarray, (m,)
         NaN marks a missing component.
     function : callable
-        What predicts the reading, on arrays (..., d), returning (..., m).
+        Predicts the observation, on arrays (..., d), returning (..., m).
     noise : ndarray, (m, m)
         Covariance of its noise.
     residual : callable
-        ``residual(a, b)``, for readings that wrap.
+        ``residual(a, b)``, for observations that wrap.
 
     Raises
     ------
     ValueError
-        If no mixand can explain the reading.
+        If no component can predict the observation.
 
     Examples
     --------
@@ -91,26 +95,32 @@ def update_mixture(
     """
     if np.isnan(observed).all():
         return mixture
-    surprise, first, second, noises = _innovations(
+    innovations, first, second, noise_factor = _innovations(
         mixture, observed, function, noise, residual
     )
-    root = _root(first, second, noises)
+    # S = C Cᵀ with the columns C = [first, second, noise], as a triangular root.
+    root = _combine_roots(first, second, noise_factor)
+    # K = P_xy S⁻¹ by two triangular solves, with P_xy = L firstᵀ.
     cross = mixture.factors @ first.mT
     gain = np.linalg.solve(root.mT, np.linalg.solve(root, cross.mT)).mT
-    factors = _root(mixture.factors - gain @ first, gain @ second, gain @ noises)
-    means = mixture.means + (gain @ surprise[..., None])[..., 0]
-    logs = -0.5 * (
-        quadratic_form(root, surprise) + log_det(root) + len(noises) * _LOG_2PI
+    means = mixture.means + (gain @ innovations[..., None])[..., 0]
+    # P⁺ = (L - K first)(…)ᵀ + (K second)(…)ᵀ + (K noise)(…)ᵀ, a sum of squares.
+    factors = _combine_roots(
+        mixture.factors - gain @ first, gain @ second, gain @ noise_factor
     )
+    # Weights by the likelihood N(innovation; 0, S).
+    squared_lengths = quadratic_form(root, innovations)
+    logs = -0.5 * (squared_lengths + log_det(root) + len(noise_factor) * _LOG_2PI)
     logs = np.where(np.isfinite(logs), mixture.log_weights + logs, -np.inf)
     if not np.isfinite(logs.max()):
         raise ValueError(
-            "observed must be a target that can be seen, got one that cannot"
+            "observed must be predicted by at least one mixture component, got none"
         )
-    w = np.exp(logs - logs.max())
-    w /= w.sum()
-    keep = w > _NOTHING
-    return _of_roots(w[keep] / w[keep].sum(), means[keep], factors[keep])
+    weights = np.exp(logs - logs.max())
+    weights /= weights.sum()
+    large = weights > _NEGLIGIBLE
+    weights = weights[large] / weights[large].sum()
+    return _build_from_factors(weights, means[large], factors[large])
 
 
 def within_gate(
@@ -122,14 +132,15 @@ def within_gate(
     gate: float,
     residual: Callable[[Array, Array], Array] = np.subtract,
 ) -> Array:
-    """The reading, or NaN in its place where no mixand expects it.
+    """Return the observation, or NaN in its place if it lies outside every component's gate.
 
     Parameters
     ----------
     mixture, observed, function, noise, residual
-        As of :func:`updated`.
+        As of :func:`update_mixture`.
     gate : float
-        How many standard deviations a reading may lie from the nearest mixand's prediction.
+        How many standard deviations the observation may lie from the nearest component's
+        prediction.
 
     Examples
     --------
@@ -140,13 +151,17 @@ def within_gate(
     ... ]
     [array([nan]), array([9.5])]
     """
-    surprise, *columns = _innovations(mixture, observed, function, noise, residual)
-    far = np.where(
-        mixture.weights > 0, quadratic_form(_root(*columns), surprise), np.nan
+    innovations, first, second, noise_factor = _innovations(
+        mixture, observed, function, noise, residual
     )
-    # A mixand that cannot see the target expects nothing.
-    refused = np.isfinite(far).any() and np.nanmin(far) > gate**2
-    return np.full_like(observed, np.nan) if refused else observed
+    root = _combine_roots(first, second, noise_factor)
+    squared_distances = quadratic_form(root, innovations)
+    squared_distances = np.where(mixture.weights > 0, squared_distances, np.nan)
+    # Distances are NaN for components that predict nothing.
+    predicts = np.isfinite(squared_distances).any()
+    if predicts and np.nanmin(squared_distances) > gate**2:
+        return np.full_like(observed, np.nan)
+    return observed
 
 
 def _innovations(
@@ -156,44 +171,65 @@ def _innovations(
     noise: Array,
     residual: Callable[[Array, Array], Array],
 ) -> tuple[Array, Array, Array, Array]:
-    """Innovations (L, k) of what is there, differences of its prediction, its noise's root."""
-    here = np.flatnonzero(~np.isnan(observed))
+    """Innovations of the k observed components, and roots of their covariances.
+
+    Returns
+    -------
+    innovations : ndarray, (L, k)
+    first, second : ndarray, (L, k, d)
+        Divided differences of the predictions.
+    noise_factor : ndarray, (k, k)
+        Cholesky factor of the noise covariance.
+    """
+    missing = np.isnan(observed)
+    present = np.flatnonzero(~missing)
     # A residual may need every component; those that are missing are zeros in both.
-    y = np.where(np.isnan(observed), 0.0, observed)
-    seen = np.where(np.isnan(observed), 0.0, function(_points(mixture)))
-    centre = seen[:, 0]
+    y = np.where(missing, 0.0, observed)
+    predicted = call_user(function, _unscented_points(mixture))
+    predicted = np.where(missing, 0.0, predicted)
     # Relative to the prediction at the mean, so that angles do not wrap between points.
-    about = residual(seen, np.broadcast_to(centre[:, None], seen.shape))
-    mean, first, second = _differences(about[..., here])
-    surprise = residual(np.broadcast_to(y, centre.shape), centre)[..., here] - mean
-    return surprise, first, second, cholesky(noise[np.ix_(here, here)])
+    at_mean = predicted[:, 0]
+    at_means = np.broadcast_to(at_mean[:, None], predicted.shape)
+    relative = call_user(residual, predicted, at_means)[..., present]
+    mean, first, second = _divided_differences(relative)
+    difference = call_user(residual, np.broadcast_to(y, at_mean.shape), at_mean)
+    innovations = difference[..., present] - mean
+    return innovations, first, second, cholesky(noise[np.ix_(present, present)])
 
 
-def _points(mixture: GaussianMixture) -> Array:
+def _unscented_points(mixture: GaussianMixture) -> Array:
+    """Points (L, 2d + 1, d) at distance √3 standard deviations from the means."""
     kappa = _STEP - mixture.dim
     return unscented_points(mixture.means, mixture.factors, kappa=kappa)[0]
 
 
-def _differences(values: Array) -> tuple[Array, Array, Array]:
-    """Mean (..., m) of a function's values at points, and first and second differences, columns."""
+def _divided_differences(values: Array) -> tuple[Array, Array, Array]:
+    """Mean (..., m) of a function's values at points, and its first and second differences.
+
+    The differences (..., m, d) are columns of a root of the values' covariance.
+    """
     d = values.shape[-2] // 2
     centre = values[..., :1, :]
     plus = values[..., 1 : d + 1, :]
     minus = values[..., d + 1 :, :]
+    # With the step h² = 3: mean = f₀ + Σ (f₊ + f₋ - 2 f₀) / (2 h²)
     even = plus + minus - 2 * centre
     mean = centre[..., 0, :] + even.sum(axis=-2) / (2 * _STEP)
+    # first = (f₊ - f₋) / (2 h) and second = (f₊ + f₋ - 2 f₀) √(h² - 1) / (2 h²)
     first = (plus - minus).mT / (2 * np.sqrt(_STEP))
-    return mean, first, even.mT * np.sqrt(_STEP - 1) / (2 * _STEP)
+    second = even.mT * np.sqrt(_STEP - 1) / (2 * _STEP)
+    return mean, first, second
 
 
-def _root(first: Array, second: Array, noise: Array) -> Array:
-    """Lower triangular L with L L' = A A' for A of these columns."""
-    noise = np.broadcast_to(noise, (*first.shape[:-2], *noise.shape[-2:]))
+def _combine_roots(first: Array, second: Array, noise: Array) -> Array:
+    """Return the lower triangular L with L Lᵀ = A Aᵀ for A = [first, second, noise]."""
+    noise = np.broadcast_to(noise, first.shape[:-2] + noise.shape[-2:])
     return lower_root(np.concatenate([first, second, noise], axis=-1))
 
 
-def _of_roots(weights: Array, means: Array, factors: Array) -> GaussianMixture:
-    """A mixture that keeps the square roots it came with."""
-    return GaussianMixture.construct(
-        weights, means, factors @ factors.mT, factors=factors
-    )
+def _build_from_factors(
+    weights: Array, means: Array, factors: Array
+) -> GaussianMixture:
+    """Build a mixture that keeps the roots of its covariances in its cache."""
+    covs = factors @ factors.mT
+    return GaussianMixture.construct(weights, means, covs, factors=factors)

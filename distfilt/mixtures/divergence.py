@@ -1,4 +1,4 @@
-"""How far two densities are apart: by quadrature, by importance sampling."""
+"""Jeffreys' divergence of two densities, by quadrature or by importance sampling."""
 
 from __future__ import annotations
 
@@ -10,9 +10,11 @@ import numpy as np
 
 from ..validation import (
     Array,
+    ArrayInput,
     Bounds,
     FrozenModel,
     Rng,
+    call_user,
     check_array,
     validated,
 )
@@ -20,12 +22,12 @@ from .gaussian import GaussianMixture
 
 __all__ = ["Divergence", "jeffreys_by_sampling", "jeffreys_of_many"]
 
-Several = Annotated[int, Bounds(at_least=2)]
+AtLeastTwo = Annotated[int, Bounds(at_least=2)]
 
 
 @dataclass(frozen=True)
 class Divergence(FrozenModel):
-    """An estimate of Jeffreys' divergence (44) with what it rests on.
+    """An estimate of Jeffreys' divergence (44) with its standard error.
 
     Parameters
     ----------
@@ -51,10 +53,10 @@ class Divergence(FrozenModel):
 def jeffreys_of_many(
     log_p: Callable[[Array], Array],
     log_qs: Sequence[Callable[[Array], Array]],
-    lower: Annotated[Array, "d"],
-    upper: Annotated[Array, "d"],
+    lower: Annotated[ArrayInput, "d"],
+    upper: Annotated[ArrayInput, "d"],
     *,
-    nodes: Several = 50,
+    nodes: AtLeastTwo = 50,
 ) -> list[Divergence]:
     r"""Jeffreys' divergences of one density from several, by the trapezoid rule on a box.
 
@@ -66,7 +68,7 @@ def jeffreys_of_many(
     Parameters
     ----------
     log_p : callable
-        Logarithm of a density, normalised or not, of points (n, d), (n,); it is evaluated once.
+        Logarithm of a density, normalised or not: points (n, d) to values (n,).
     log_qs : sequence of callable
         The others.
     lower, upper : array_like, (d,)
@@ -77,42 +79,60 @@ def jeffreys_of_many(
     Examples
     --------
     >>> one, two = (GaussianMixture.gaussian([m], [[1.0]]) for m in (0.0, 1.0))
-    >>> found = jeffreys_of_many(
+    >>> divergences = jeffreys_of_many(
     ...     one.log_density, [one.log_density, two.log_density], [-8], [9]
     ... )
-    >>> [round(d.value, 6) for d in found]
+    >>> [round(d.value, 6) for d in divergences]
     [0.0, 0.5]
     """
     if (upper <= lower).any():
-        raise ValueError("upper must be numbers above lower, got an empty box")
-    functions = (log_p, *log_qs)
-    front, front_parts = _tensor_grid(lower[:1], upper[:1], nodes)
-    points, parts = _tensor_grid(lower[1:], upper[1:], nodes)
-    tops = np.full(len(functions), -np.inf)
-    sums = np.zeros((len(functions), 1 + len(functions)))
-    # One slice of the first axis at a time; each density is rescaled when a larger value comes.
-    for x, part in zip(front[:, 0], front_parts, strict=True):
-        at = np.concatenate([np.full((points.shape[0], 1), x), points], axis=1)
-        logs = np.stack(
-            [check_array(f(at), "log_p, log_qs", at.shape[:1]) for f in functions]
+        raise ValueError(
+            f"upper must be above lower in each component, got {upper} and {lower}"
         )
-        new = np.maximum(tops, logs.max(axis=1))
-        mass = part * parts * np.exp(logs - new[:, None])
-        sums *= np.exp(tops - new)[:, None]
-        sums[:, 0] += mass.sum(axis=1)
-        sums[:, 1:] += mass @ (logs[0] - logs).T
-        tops = new
-    ratios = sums[:, 1:] / sums[:, :1]
-    gaps = 0.5 * (ratios[0, 1:] - np.diagonal(ratios)[1:])
-    return [Divergence(float(gap), 0.0) for gap in gaps]
+    functions = [log_p]
+    functions.extend(log_qs)
+    n = len(functions)
+    first_axis, first_weights = _tensor_grid(lower[:1], upper[:1], nodes)
+    points, weights = _tensor_grid(lower[1:], upper[1:], nodes)
+    # Of each density f: its mass, and its integrals of log p - log q for all q.
+    scales = np.full(n, -np.inf)
+    masses = np.zeros(n)
+    integrals = np.zeros((n, n))
+    # One slice of the first axis at a time, so that the memory does not hold the whole box.
+    for x, weight in zip(first_axis[:, 0], first_weights, strict=True):
+        column = np.full((len(points), 1), x)
+        logs = _evaluate_all(functions, np.concatenate([column, points], axis=1))
+        # Sums are relative to each density's largest value, and rescaled when a larger comes.
+        new_scales = np.maximum(scales, logs.max(axis=1))
+        densities = weight * weights * np.exp(logs - new_scales[:, None])
+        factors = np.exp(scales - new_scales)
+        masses = factors * masses + densities.sum(axis=1)
+        integrals = factors[:, None] * integrals + densities @ (logs[0] - logs).T
+        scales = new_scales
+    # d(p, q) = ½ (E_p[log p - log q] - E_q[log p - log q])
+    expectations = integrals / masses[:, None]
+    divergences = 0.5 * (expectations[0, 1:] - np.diagonal(expectations)[1:])
+    return [Divergence(float(d), 0.0) for d in divergences]
+
+
+def _evaluate_all(functions: Sequence[Callable[[Array], Array]], x: Array) -> Array:
+    """Evaluate logarithms of densities at points (n, d), one row each."""
+    rows = []
+    for function in functions:
+        logs = call_user(function, x)
+        rows.append(check_array(logs, "log_p, log_qs", x.shape[:1]))
+    return np.stack(rows)
 
 
 def _tensor_grid(low: Array, high: Array, nodes: int) -> tuple[Array, Array]:
     """Points (nodes^d, d) of the trapezoid rule on a box, and their weights."""
-    index = np.indices((nodes,) * low.size).reshape(low.size, nodes**low.size).T
+    d = low.size
+    index = np.indices((nodes,) * d).reshape(d, nodes**d).T
     step = (high - low) / (nodes - 1)
-    ends = (index == 0) | (index == nodes - 1)
-    return low + step * index, np.prod(np.where(ends, 0.5 * step, step), axis=1)
+    # The nodes at both ends of an axis count half.
+    is_end = (index == 0) | (index == nodes - 1)
+    weights = np.prod(np.where(is_end, 0.5 * step, step), axis=1)
+    return low + step * index, weights
 
 
 @validated
@@ -121,7 +141,7 @@ def jeffreys_by_sampling(
     log_q: Callable[[Array], Array],
     proposal: GaussianMixture,
     *,
-    members: Several,
+    members: AtLeastTwo,
     rng: Rng,
 ) -> Divergence:
     r"""Jeffreys' divergence by importance sampling, with its standard error.
@@ -133,36 +153,42 @@ def jeffreys_by_sampling(
     Parameters
     ----------
     log_p, log_q : callable
-        Logarithms of densities, normalised or not, of points (n, d), (n,).
+        Logarithms of densities, normalised or not: points (n, d) to values (n,).
     proposal : GaussianMixture
-        Where the points are drawn; it should be wide enough for both.
+        Density from which the points are drawn; it should be wide enough for both.
     members : int
-        How many points.
+        Number of points.
     rng : numpy.random.Generator
 
     Examples
     --------
     >>> one, two = (GaussianMixture.gaussian([m], [[1.0]]) for m in (0.0, 1.0))
-    >>> found = jeffreys_by_sampling(
+    >>> divergence = jeffreys_by_sampling(
     ...     one.log_density,
     ...     two.log_density,
     ...     one,
     ...     members=4000,
     ...     rng=np.random.default_rng(1),
     ... )
-    >>> abs(found.value - 0.5) < 3 * found.error
+    >>> abs(divergence.value - 0.5) < 3 * divergence.error
     True
     """
     x = proposal.rvs(members, rng=rng)
-    base = proposal.log_density(x)
-    logs = [
-        check_array(f(x), name, base.shape)
-        for f, name in ((log_p, "log_p"), (log_q, "log_q"))
-    ]
-    ratio = logs[0] - logs[1]
-    weights = [np.exp(v - base - (v - base).max()) for v in logs]
-    weights = [w / w.mean() for w in weights]
-    means = [float((w * ratio).mean()) for w in weights]
-    influence = weights[0] * (ratio - means[0]) - weights[1] * (ratio - means[1])
-    error = 0.5 * influence.std(ddof=1) / np.sqrt(base.size)
-    return Divergence(0.5 * (means[0] - means[1]), float(error))
+    log_proposal = proposal.log_density(x)
+    p = check_array(call_user(log_p, x), "log_p", log_proposal.shape)
+    q = check_array(call_user(log_q, x), "log_q", log_proposal.shape)
+    ratio = p - q
+    p_weights = _importance_weights(p - log_proposal)
+    q_weights = _importance_weights(q - log_proposal)
+    p_mean = float((p_weights * ratio).mean())
+    q_mean = float((q_weights * ratio).mean())
+    # A ratio estimate Σ w r / Σ w is to first order the mean of w (r - E r) / E w.
+    influence = p_weights * (ratio - p_mean) - q_weights * (ratio - q_mean)
+    error = 0.5 * influence.std(ddof=1) / np.sqrt(ratio.size)
+    return Divergence(0.5 * (p_mean - q_mean), float(error))
+
+
+def _importance_weights(log_ratios: Array) -> Array:
+    """Weights with mean one, from logarithms of density over proposal."""
+    weights = np.exp(log_ratios - log_ratios.max())
+    return np.asarray(weights / weights.mean())

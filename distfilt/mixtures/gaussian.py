@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..linalg import in_units, log_det, log_sum, symmetrise
+from ..linalg import to_unit_variances, log_det, log_sum_exp, symmetrise
 from ..validation import (
     Array,
     ArrayInput,
@@ -142,7 +142,9 @@ class GaussianMixture(FrozenModel):
         return np.asarray(-0.5 * (log_det(self.factors) + self.dim * _LOG_2PI))
 
     @validated
-    def component_log_densities(self, x: Annotated[ArrayInput, "... self.dim"]) -> Array:
+    def component_log_densities(
+        self, x: Annotated[ArrayInput, "... self.dim"]
+    ) -> Array:
         """Logarithm of each component's density, without its weight, (..., L).
 
         Parameters
@@ -168,7 +170,7 @@ class GaussianMixture(FrozenModel):
 
         # log p(x) = log Σ w_l exp(log N_l(x))
         def add_components(logs: Array) -> Array:
-            return log_sum(self.log_weights + logs)[..., 0]
+            return log_sum_exp(self.log_weights + logs)[..., 0]
 
         return self._evaluate(x, (), add_components)
 
@@ -300,7 +302,7 @@ class GaussianMixture(FrozenModel):
 
 def _describe_collapse(covs: Array) -> str:
     """Name the component whose covariance has no square root, and the usual cause."""
-    eigenvalues = np.linalg.eigvalsh(in_units(covs)[0])
+    eigenvalues = np.linalg.eigvalsh(to_unit_variances(covs)[0])
     worst = int(eigenvalues[:, 0].argmin())
     return (
         f"component {worst} of {len(covs)} has a covariance that is not positive definite "

@@ -1,15 +1,12 @@
-"""Fewer mixands: by the cheapest merger, by relevance to another's belief, by rank."""
+"""Reduction of mixtures: by the cheapest merger, by relevance to another's belief, by rank."""
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
-from types import FunctionType
-from typing import Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.linalg import qr
 
 from ..linalg import symmetrise
@@ -18,7 +15,7 @@ from ..validation import (
     Bounds,
     FrozenModel,
     Indices,
-    Mask,
+    MaskInput,
     NonNegativeInt,
     PositiveInt,
     check_positive_definite,
@@ -29,21 +26,21 @@ from .gaussian import GaussianMixture
 __all__ = [
     "ComponentShapes",
     "cross_relevance",
-    "merge_irrelevant",
     "merge_costs",
+    "merge_irrelevant",
     "pivoted_qr",
     "runnalls",
 ]
 
-# Divergence in nats up to which a mixand counts as near another's, whatever its weight.
-_GATE = 0.5
-# The least that the smallest relevance counts as, in nats.
-_FLOOR = 1e-4
+# Divergence in nats up to which a component counts as near another's, whatever its weight.
+_NEAR = 0.5
+# Lower bound of the smallest relevance, in nats.
+_RELEVANCE_FLOOR = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class ComponentShapes(FrozenModel):
-    """Mixands before they are weighed.
+    """Means and covariances of mixture components that have no weights yet.
 
     Parameters
     ----------
@@ -51,7 +48,7 @@ class ComponentShapes(FrozenModel):
     covs : array_like, (S, d, d)
         Positive definite.
     source : array_like of int, (S,)
-        The own mixand that each came from.
+        Index of the prior's component that each came from.
     dropped : int
         How many others were left out because they had no positive definite covariance.
 
@@ -66,14 +63,22 @@ class ComponentShapes(FrozenModel):
     source: Annotated[Indices, "s", Bounds(at_least=0)]
     dropped: NonNegativeInt = 0
 
+    if TYPE_CHECKING:
+        # The fields are arrays, but the constructor takes anything array_like.
+        def __init__(
+            self, means: ArrayLike, covs: ArrayLike, source: ArrayLike, dropped: int = 0
+        ) -> None: ...
+
     @property
     def n_components(self) -> int:
-        """Number of mixands, S."""
+        """Number of components, S."""
         return int(self.means.shape[0])
 
     @validated
-    def select(self, keep: Annotated[Mask, "self.size"]) -> ComponentShapes:
-        """Some of the mixands, by a mask.
+    def select(
+        self, keep: Annotated[MaskInput, "self.n_components"]
+    ) -> ComponentShapes:
+        """Select components by a mask.
 
         Parameters
         ----------
@@ -82,9 +87,8 @@ class ComponentShapes(FrozenModel):
 
         Examples
         --------
-        >>> ComponentShapes([[0.0], [1.0]], [[[1.0]], [[2.0]]], [0, 0]).select(
-        ...     [False, True]
-        ... ).means
+        >>> two = ComponentShapes([[0.0], [1.0]], [[[1.0]], [[2.0]]], [0, 0])
+        >>> two.select([False, True]).means
         array([[1.]])
         """
         return self.construct(
@@ -92,10 +96,9 @@ class ComponentShapes(FrozenModel):
         )
 
     def with_equal_weights(self) -> GaussianMixture:
-        """A mixture of these mixands with equal weights."""
-        return GaussianMixture.construct(
-            np.full(self.n_components, 1 / self.n_components), self.means, self.covs
-        )
+        """Return a mixture of these components with equal weights."""
+        weights = np.full(self.n_components, 1 / self.n_components)
+        return GaussianMixture.construct(weights, self.means, self.covs)
 
 
 @validated
@@ -105,7 +108,7 @@ def runnalls(
     *,
     heaviest: PositiveInt | None = None,
 ) -> GaussianMixture:
-    r"""Merge, pair by pair, the mixands whose merger may lose least, until `size` are left.
+    r"""Merge the pair of components whose merger may lose least, until `n_components` are left.
 
     Merging i and j keeps their weight, mean and covariance. The loss of information is at most
 
@@ -113,18 +116,19 @@ def runnalls(
         -w_i\log|\mathbf P_i|-w_j\log|\mathbf P_j|\bigr],
 
     A. Runnalls, IEEE Transactions on Aerospace and Electronic Systems 43 (2007) 989-999. Costs are
-    kept between mergers, so that L mixands that become K cost about L² − K²/2 determinants, and the
-    memory is 8 L² bytes: of thousands let the heaviest absorb the others first. Where numba is
-    installed (the extra `speed`) it computes: the same merges, some four times as fast.
+    stored between mergers, so that L components that become K cost about L² − K²/2 determinants,
+    and the memory is 8 L² bytes: of thousands let the heaviest absorb the others first. Where numba
+    is installed (the extra `speed`) it compiles the mergers: the same result, some four times as
+    fast.
 
     Parameters
     ----------
     mixture : GaussianMixture
-    size : int
-        How many to keep; a mixture that is no larger is returned as it is.
+    n_components : int
+        Number of components of the result; a mixture that has no more is returned as it is.
     heaviest : int, optional
-        Of a larger mixture each mixand joins that of the so many heaviest with which its merger
-        costs least, all at once, before pairs are merged; at least `size`.
+        In a larger mixture each component first joins that of the so many heaviest with which its
+        merger costs least, all at once, before pairs are merged; at least `n_components`.
 
     Examples
     --------
@@ -138,25 +142,39 @@ def runnalls(
     >>> runnalls(four, 2, heaviest=2).means.round(2)
     array([[0.2],
            [8.8]])
+
+    A merger can bring a component nearer to a third one than its nearest was:
+
+    >>> weights = np.array([8, 9, 3, 5, 7, 6]) / 38
+    >>> means = [[29.0], [-7.0], [24.0], [24.0], [37.0], [-38.0]]
+    >>> std = np.array([0.1, 3.0, 1.0, 0.3, 1.0, 0.3])
+    >>> six = GaussianMixture(weights, means, std[:, None, None] ** 2)
+    >>> (38 * runnalls(six, 2).weights).round(6)
+    array([23., 15.])
     """
+    # numba takes long to import, so it is imported here, where it is used.
+    from .merging import merge_pairs
+
     if heaviest is not None and heaviest < n_components:
         raise ValueError(
-            f"heaviest must be at least size, {n_components}, got {heaviest}"
+            f"heaviest must be at least n_components, {n_components}, got {heaviest}"
         )
     if heaviest is not None and heaviest < mixture.n_components:
-        mixture = _absorbed(mixture, heaviest)
+        mixture = _absorb_into_heaviest(mixture, heaviest)
     if mixture.n_components <= n_components:
         return mixture
-    w, m, p, root = _whitened(mixture)
-    alive = _merging()(w, m, p, n_components)
-    means = mixture.mean + m[alive] @ root.T
-    covs = symmetrise(root @ p[alive] @ root.T)
-    return GaussianMixture.construct(w[alive] / w[alive].sum(), means, covs)
+    weights, means, covs, root = _whiten(mixture)
+    remaining = merge_pairs(weights, means, covs, n_components)
+    # Back from the whitened frame.
+    means = mixture.mean + means[remaining] @ root.T
+    covs = symmetrise(root @ covs[remaining] @ root.T)
+    weights = weights[remaining] / weights[remaining].sum()
+    return GaussianMixture.construct(weights, means, covs)
 
 
 @validated
 def merge_costs(mixture: GaussianMixture) -> Array:
-    """Runnalls' bound for each pair of mixands, (L, L); zero on the diagonal.
+    """Runnalls' bound for each pair of components, (L, L); zero on the diagonal.
 
     Examples
     --------
@@ -164,12 +182,11 @@ def merge_costs(mixture: GaussianMixture) -> Array:
     >>> merge_costs(two)[0, 1].round(6) == np.round(0.5 * np.log(2), 6)
     np.True_
     """
-    w, m, p, _ = _whitened(mixture)
-    dets = np.linalg.slogdet(p)[1]
-    every = np.arange(mixture.n_components)
-    return np.stack(
-        [_costs(w, m, p, dets, i, every) for i in range(mixture.n_components)]
-    )
+    weights, means, covs, _ = _whiten(mixture)
+    log_dets = np.linalg.slogdet(covs)[1]
+    index = np.arange(mixture.n_components)
+    rows = [pair_costs(weights, means, covs, log_dets, i, index) for i in index]
+    return np.stack(rows)
 
 
 @validated
@@ -189,7 +206,7 @@ def cross_relevance(mixture: GaussianMixture, other: GaussianMixture) -> Array:
     >>> cross_relevance(one, GaussianMixture.gaussian([2.0], [[1.0]]))
     array([[2.]])
     """
-    return mixture.weights[:, None] * gaussian_divergences(mixture, other)
+    return np.asarray(mixture.weights[:, None] * gaussian_divergences(mixture, other))
 
 
 @validated
@@ -199,13 +216,13 @@ def merge_irrelevant(
     *,
     threshold: Annotated[float, Bounds(above=1)],
 ) -> GaussianMixture:
-    r"""Merge into one the mixands that overlap with none of another's: the KLD rule (40)-(41).
+    r"""Merge into one the components that overlap with none of another's: the KLD rule (40)-(41).
 
-    With :math:`\delta_q=\min_r w_qD_{KL}(\mathcal N_q\|\mathcal N_r)` the mixands with
-    :math:`\delta_q>\epsilon\,\delta_{\min}` are merged. As printed, a mixand that both agents
+    With :math:`\delta_q=\min_r w_qD_{KL}(\mathcal N_q\|\mathcal N_r)` the components with
+    :math:`\delta_q>\epsilon\,\delta_{\min}` are merged. As printed, a component that both agents
     share makes :math:`\delta_{\min}` zero, or negative by rounding, and the mixture collapses.
-    Three guards: :math:`\delta_{\min}` is at least 1e-4 nats; a mixand is only merged if its
-    unweighted divergence exceeds half a nat; and the most relevant mixand is never merged.
+    Three guards: :math:`\delta_{\min}` is at least 1e-4 nats; a component is only merged if its
+    unweighted divergence exceeds half a nat; and the most relevant component is never merged.
 
     Parameters
     ----------
@@ -230,15 +247,15 @@ def merge_irrelevant(
     3
     """
     nearest = gaussian_divergences(mixture, other).min(axis=1)
+    # δ_q; a component without weight is the least relevant one.
     delta = np.where(mixture.weights > 0, mixture.weights * nearest, np.inf)
-    out = (
-        np.isfinite(delta)
-        & (delta > threshold * max(delta.min(), _FLOOR))
-        & (nearest > _GATE)
-    )
-    out[np.argmin(delta)] = False
-    labels = np.where(out, mixture.n_components, np.arange(mixture.n_components))
-    return _grouped(mixture, np.unique(labels, return_inverse=True)[1])
+    limit = threshold * max(delta.min(), _RELEVANCE_FLOOR)
+    irrelevant = np.isfinite(delta) & (delta > limit) & (nearest > _NEAR)
+    irrelevant[np.argmin(delta)] = False
+    # All irrelevant components get one label, the others one each.
+    labels = np.arange(mixture.n_components)
+    labels[irrelevant] = mixture.n_components
+    return _merge_groups(mixture, np.unique(labels, return_inverse=True)[1])
 
 
 @validated
@@ -248,13 +265,13 @@ def pivoted_qr(
     n_components: PositiveInt,
     rest: Literal["merge", "drop"] = "merge",
 ) -> ComponentShapes:
-    r"""Keep the mixands that a pivoted QR decomposition of (33) finds independent, (42)-(43).
+    r"""Select the components that a pivoted QR of the matrix (33) finds independent, (42)-(43).
 
     Parameters
     ----------
-    shapes : Shapes
-    size : int
-        How many to have in the end, those with the largest pivots.
+    shapes : ComponentShapes
+    n_components : int
+        Number of components of the result, those with the largest pivots.
     rest : {"merge", "drop"}
         Merge the others into one, with equal weights since they have none yet; or drop them.
 
@@ -268,192 +285,109 @@ def pivoted_qr(
     if n_components >= shapes.n_components:
         return shapes
     mixture = shapes.with_equal_weights()
+    # The matrix (33): each component's density at each mean, relative to its peak.
     logs = mixture.component_log_densities(shapes.means) - mixture.log_peaks
     order = qr(np.exp(logs), mode="r", pivoting=True)[1]
-    kept = n_components - (rest == "merge")
-    keep = np.isin(np.arange(shapes.n_components), order[:kept])
-    first = shapes.select(keep)
-    lost = shapes.select(~keep)
+    # A merged component takes one of the places.
+    n_selected = n_components - 1 if rest == "merge" else n_components
+    is_selected = np.isin(np.arange(shapes.n_components), order[:n_selected])
+    selected = shapes.select(is_selected)
     if rest == "drop":
-        return first
-    one = lost.with_equal_weights()
+        return selected
+    merged = shapes.select(~is_selected).with_equal_weights()
     return ComponentShapes.construct(
-        np.concatenate([first.means, one.mean[None]]),
-        np.concatenate([first.covs, one.cov[None]]),
-        np.append(first.source, shapes.source[order[kept]]),
+        np.concatenate([selected.means, merged.mean[None]]),
+        np.concatenate([selected.covs, merged.cov[None]]),
+        np.append(selected.source, shapes.source[order[n_selected]]),
         shapes.dropped,
     )
 
 
 def gaussian_divergences(mixture: GaussianMixture, other: GaussianMixture) -> Array:
-    r"""Kullback-Leibler divergences of each mixand from each of another's, (L, L'), in nats.
+    r"""Kullback-Leibler divergences of each component from each of another's, (L, L'), in nats.
 
     .. math::
         D_{KL}&=\tfrac12\bigl[\operatorname{tr}\mathbf P_r^{-1}\mathbf P_q-d
         +\log|\mathbf P_r|-\log|\mathbf P_q|\\
         &\qquad+(\mathbf m_q-\mathbf m_r)^\top\mathbf P_r^{-1}(\mathbf m_q-\mathbf m_r)\bigr]
 
-    never negative: what rounding leaves below zero is zero.
+    never negative: values that rounding leaves below zero are zero.
     """
     d = mixture.dim
     if other.dim != d:
         raise ValueError(f"other must have dimension {d}, got {other.dim}")
-    white = np.linalg.solve(other.factors, np.broadcast_to(np.eye(d), other.covs.shape))
-    trace = ((white @ mixture.factors[:, None]) ** 2).sum(axis=(-2, -1))
-    gap = mixture.means[:, None] - other.means
-    length = ((white @ gap[..., None]) ** 2).sum(axis=(-2, -1))
-    out = 0.5 * (trace - d + length) + mixture.log_peaks[:, None] - other.log_peaks
-    return np.asarray(np.maximum(out, 0.0))
+    identity = np.broadcast_to(np.eye(d), other.covs.shape)
+    inverse_factors = np.linalg.solve(other.factors, identity)
+    # tr P_r⁻¹ P_q = |L_r⁻¹ L_q|²
+    traces = ((inverse_factors @ mixture.factors[:, None]) ** 2).sum(axis=(-2, -1))
+    differences = mixture.means[:, None] - other.means
+    white = inverse_factors @ differences[..., None]
+    squared_lengths = (white**2).sum(axis=(-2, -1))
+    # The peaks are -½ log|2π P|.
+    quadratic = 0.5 * (traces - d + squared_lengths)
+    divergences = quadratic + mixture.log_peaks[:, None] - other.log_peaks
+    return np.asarray(np.maximum(divergences, 0.0))
 
 
-def _absorbed(mixture: GaussianMixture, heaviest: int) -> GaussianMixture:
-    """The heaviest mixands after each other one has joined the cheapest of them."""
-    w, m, p, _ = _whitened(mixture)
-    order = np.argsort(-w, kind="stable")
-    heavy = order[:heaviest]
-    rest = order[heaviest:]
-    dets = np.linalg.slogdet(p)[1]
-    labels = np.empty(w.size, dtype=np.intp)
-    labels[heavy] = np.arange(heaviest)
-    labels[rest] = [_costs(w, m, p, dets, i, heavy).argmin() for i in rest]
-    return _grouped(mixture, labels)
+def _absorb_into_heaviest(mixture: GaussianMixture, n_heaviest: int) -> GaussianMixture:
+    """Join every other component with the cheapest of the heaviest, all at once."""
+    weights, means, covs, _ = _whiten(mixture)
+    order = np.argsort(-weights, kind="stable")
+    heavy = order[:n_heaviest]
+    log_dets = np.linalg.slogdet(covs)[1]
+    labels = np.empty(weights.size, dtype=np.intp)
+    labels[heavy] = np.arange(n_heaviest)
+    for i in order[n_heaviest:]:
+        costs = pair_costs(weights, means, covs, log_dets, i, heavy)
+        labels[i] = costs.argmin()
+    return _merge_groups(mixture, labels)
 
 
-def _whitened(mixture: GaussianMixture) -> tuple[Array, Array, Array, Array]:
-    """Copies in the frame of the global moments, where the costs are the same and well scaled."""
+def _whiten(mixture: GaussianMixture) -> tuple[Array, Array, Array, Array]:
+    """Copies in the frame of the global moments, and the root that leads back.
+
+    The costs are the same there, and well scaled.
+    """
     root = np.linalg.cholesky(mixture.cov)
-    white = np.linalg.solve(root, np.eye(mixture.dim))
-    means = (mixture.means - mixture.mean) @ white.T
-    covs = symmetrise(white @ mixture.covs @ white.T)
+    inverse_root = np.linalg.solve(root, np.eye(mixture.dim))
+    means = (mixture.means - mixture.mean) @ inverse_root.T
+    covs = symmetrise(inverse_root @ mixture.covs @ inverse_root.T)
     return mixture.weights.copy(), means, covs, np.asarray(root)
 
 
-def _costs(w: Array, m: Array, p: Array, dets: Array, i: Any, others: Indices) -> Array:
-    """Runnalls' bound of mixand i with others; a pair without weight costs nothing."""
-    total = w[i] + w[others]
-    a = np.divide(w[i], total, out=np.full(total.shape, 0.5), where=total > 0)
-    gap = m[others] - m[i]
-    both = a[:, None, None] * p[i] + (1 - a)[:, None, None] * p[others]
-    both += (a * (1 - a))[:, None, None] * gap[:, :, None] * gap[:, None, :]
-    bound = 0.5 * (
-        total * np.linalg.slogdet(both)[1] - w[i] * dets[i] - w[others] * dets[others]
-    )
+def pair_costs(
+    weights: Array, means: Array, covs: Array, log_dets: Array, i: Any, others: Indices
+) -> Array:
+    """Runnalls' bound of component i with others; a pair without weight costs nothing."""
+    total = weights[i] + weights[others]
+    # The share a = w_i / (w_i + w_j); equal shares where both weights are zero.
+    equal = np.full(total.shape, 0.5)
+    a = np.divide(weights[i], total, out=equal, where=total > 0)
+    a_column = a[:, None, None]
+    # P_ij = a P_i + (1 - a) P_j + a (1 - a) (m_j - m_i)(m_j - m_i)ᵀ
+    differences = means[others] - means[i]
+    merged = a_column * covs[i] + (1 - a_column) * covs[others]
+    spread = (a * (1 - a))[:, None, None] * differences[:, :, None]
+    merged += spread * differences[:, None, :]
+    # 2 B_ij = (w_i + w_j) log|P_ij| - w_i log|P_i| - w_j log|P_j|
+    separate = total * np.linalg.slogdet(merged)[1] - weights[i] * log_dets[i]
+    bound = 0.5 * (separate - weights[others] * log_dets[others])
     return np.asarray(np.where(others == i, 0.0, bound))
 
 
-@cache
-def _merging() -> Callable[..., Mask]:
-    """What merges, compiled where numba is installed."""
-    try:
-        compiled = importlib.import_module("numba").njit(cache=True)
-    except ModuleNotFoundError:
-        return _merged
-    # The same function, with the other way to compute a row: numba keeps it between processes
-    # only if that is a global name.
-    names = globals() | {"_costs": compiled(_costs_in_loops)}
-    return cast(Callable[..., Mask], compiled(FunctionType(_merged.__code__, names)))
-
-
-def _costs_in_loops(w: Any, m: Any, p: Any, dets: Any, i: Any, others: Any) -> Any:
-    """As :func:`_costs`, for numba: each merged covariance is formed and factored in one pass."""
-    d = m.shape[1]
-    lower = np.empty((d, d))
-    out = np.zeros(others.size)
-    for k, j in enumerate(others):
-        total = w[i] + w[j]
-        if total <= 0.0 or i == j:
-            continue
-        a = w[i] / total
-        b = w[j] / total
-        one = p[i]
-        other = p[j]
-        gap = np.sqrt(a * b) * (m[i] - m[j])
-        log_det = 0.0
-        for r in range(d):
-            for c in range(r):
-                s = a * one[r, c] + b * other[r, c] + gap[r] * gap[c]
-                for e in range(c):
-                    s -= lower[r, e] * lower[c, e]
-                lower[r, c] = s * lower[c, c]
-            s = a * one[r, r] + b * other[r, r] + gap[r] ** 2
-            for e in range(r):
-                s -= lower[r, e] ** 2
-            lower[r, r] = 1.0 / np.sqrt(
-                s
-            )  # the reciprocal, so that columns need no division
-            log_det += np.log(s)
-        out[k] = 0.5 * (total * log_det - w[i] * dets[i] - w[j] * dets[j])
-    return out
-
-
-def _merged(w: Any, m: Any, p: Any, size: Any) -> Any:
-    """Merge the cheapest pair until `size` mixands are left, in place; which are left.
-
-    A merger can bring a mixand nearer to a third one than its nearest was:
-
-    >>> w, spread = (
-    ...     np.array([8, 9, 3, 5, 7, 6]) / 38,
-    ...     np.array([0.1, 3.0, 1.0, 0.3, 1.0, 0.3]),
-    ... )
-    >>> means = [[29.0], [-7.0], [24.0], [24.0], [37.0], [-38.0]]
-    >>> (
-    ...     38
-    ...     * runnalls(GaussianMixture(w, means, spread[:, None, None] ** 2), 2).weights
-    ... ).round(6)
-    array([23., 15.])
-    """
-    n = w.size
-    every = np.arange(n)
-    alive = np.full(n, True)
-    dets = np.array([np.linalg.slogdet(p[i])[1] for i in range(n)])
-    table = np.full((n, n), np.inf)
-    best = np.full(n, np.inf)
-    nearest = np.zeros(n, np.int64)
-    for k in range(n - 1):
-        table[k, k + 1 :] = _costs(w, m, p, dets, k, every[k + 1 :])
-    searched = every[:-1]
-    for _ in range(n - size):
-        for k in searched:
-            nearest[k] = np.argmin(table[k])
-            best[k] = table[k, nearest[k]]
-        # The first of the pairs that cost the same, so that rounding does not choose.
-        limit = best.min() + 1e-12 + 1e-9 * abs(best.min())
-        i = np.argmax(best <= limit)
-        j = np.argmax(table[i] <= limit)
-        total = w[i] + w[j]
-        a = w[i] / total if total > 0 else 0.5
-        gap = m[i] - m[j]
-        p[i] = a * p[i] + (1 - a) * p[j] + a * (1 - a) * np.outer(gap, gap)
-        m[i] = a * m[i] + (1 - a) * m[j]
-        w[i] = total
-        w[j] = 0.0
-        alive[j] = False
-        best[j] = np.inf
-        table[j, :] = table[:, j] = np.inf
-        dets[i] = np.linalg.slogdet(p[i])[1]
-        others = every[alive & (every != i)]
-        row = _costs(w, m, p, dets, i, others)
-        below = others < i
-        table[others[below], i] = row[below]
-        table[i, others[~below]] = row[~below]
-        # Only rows that lost their neighbour, and the merged one, are searched again.
-        searched = np.flatnonzero(
-            alive & ((nearest == i) | (nearest == j) | (every == i))
-        )
-        nearest = np.where(table[:, i] < best, i, nearest)
-        best = np.minimum(table[:, i], best)
-    return alive
-
-
-def _grouped(mixture: GaussianMixture, labels: Indices) -> GaussianMixture:
-    """Merge the mixands of equal label, keeping each group's weight, mean and covariance."""
-    member = labels == np.arange(labels.max() + 1)[:, None]
-    w = member @ mixture.weights
-    equal = member / member.sum(axis=1, keepdims=True)
-    share = np.divide(
-        member * mixture.weights, w[:, None], out=equal, where=w[:, None] > 0
+def _merge_groups(mixture: GaussianMixture, labels: Indices) -> GaussianMixture:
+    """Merge the components of equal label, so that each group keeps its moments."""
+    is_member = labels == np.arange(labels.max() + 1)[:, None]
+    weights = is_member @ mixture.weights
+    # Shares of a group's weight, (G, L); equal ones in a group without weight.
+    equal = is_member / is_member.sum(axis=1, keepdims=True)
+    has_weight = weights[:, None] > 0
+    shares = np.divide(
+        is_member * mixture.weights, weights[:, None], out=equal, where=has_weight
     )
-    means = share @ mixture.means
-    gap = mixture.means - means[labels]
-    covs = np.tensordot(share, mixture.covs + gap[:, :, None] * gap[:, None, :], axes=1)
-    return GaussianMixture.construct(w, means, symmetrise(covs))
+    means = shares @ mixture.means
+    # P_g = Σ a_l (P_l + (m_l - m_g)(m_l - m_g)ᵀ)
+    differences = mixture.means - means[labels]
+    squares = differences[:, :, None] * differences[:, None, :]
+    covs = np.tensordot(shares, mixture.covs + squares, axes=1)
+    return GaussianMixture.construct(weights, means, symmetrise(covs))

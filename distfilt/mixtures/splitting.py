@@ -1,4 +1,4 @@
-"""More mixands where a density bends: along the direction that a map stretches."""
+"""Splitting of components where a map is nonlinear, along the direction that it stretches most."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ import numpy as np
 from ..linalg import symmetrise
 from ..validation import (
     Array,
+    ArrayInput,
     Bounds,
-    Indices,
+    IndicesInput,
     PositiveFloat,
     PositiveInt,
+    call_user,
     validated,
 )
 from .gaussian import GaussianMixture
@@ -23,13 +25,15 @@ __all__ = ["split_components", "split_library", "split_nonlinear", "nonlinearity
 
 Fraction = Annotated[float, Bounds(above=0, below=1)]
 
-# Mixands lighter than this are not split.
-_LIGHT = 1e-3
+# Components lighter than this are not split.
+_SMALLEST_WEIGHT = 1e-3
+# Rounds of splitting.
+_MAX_ROUNDS = 3
 
 
 @validated
 def split_library(*, std: Fraction = 0.7) -> tuple[Array, Array]:
-    r"""Weights and means of three Gaussians of deviation `std` that stand for the standard normal.
+    r"""Weights and means of three Gaussians of deviation `std` that approximate the normal.
 
     Mean 0 and variance 1 are kept: with weights a, 1 - 2a, a at -m, 0, m that is
     :math:`s^2+2am^2=1`. Of the one freedom left, the smallest integrated squared difference from
@@ -38,7 +42,7 @@ def split_library(*, std: Fraction = 0.7) -> tuple[Array, Array]:
     Parameters
     ----------
     std : float
-        In (0, 1). Smaller mixands bend less, and fit the tails worse.
+        In (0, 1). Narrower components are closer to linear, and fit the tails worse.
 
     Returns
     -------
@@ -50,40 +54,46 @@ def split_library(*, std: Fraction = 0.7) -> tuple[Array, Array]:
     >>> round(float(w @ m**2 + 0.7**2), 12)
     1.0
     """
-    w, m = _library(std)
-    return w.copy(), m.copy()
+    weights, means = _optimize_library(std)
+    return weights.copy(), means.copy()
 
 
 @lru_cache(maxsize=16)
-def _library(std: float) -> tuple[Array, Array]:
+def _optimize_library(std: float) -> tuple[Array, Array]:
+    """Minimise the integrated squared difference from N(0, 1) over the outer weight a."""
     from scipy.optimize import minimize_scalar
 
-    def parts(a: float) -> tuple[Array, Array]:
+    def components(a: float) -> tuple[Array, Array]:
+        # The variance s² + 2 a m² is 1.
         m = np.sqrt((1 - std**2) / (2 * a))
         return np.array([a, 1 - 2 * a, a]), np.array([-m, 0.0, m])
 
-    def overlap(gap: Array | float, variance: float) -> Array:
-        return np.asarray(np.exp(-0.5 * np.square(gap) / variance) / np.sqrt(variance))
+    def overlap(difference: Array, variance: float) -> Array:
+        # ∫ N(x; m, u) N(x; n, v) dx = N(m - n; 0, u + v), here without 1/√(2π).
+        exponent = -0.5 * np.square(difference) / variance
+        return np.asarray(np.exp(exponent) / np.sqrt(variance))
 
-    def ise(a: float) -> float:
-        w, m = parts(a)
-        own = w @ overlap(m[:, None] - m, 2 * std**2) @ w
-        return float(own - 2 * w @ overlap(m, 1 + std**2))
+    def squared_error(a: float) -> float:
+        # ∫ (p - n)² dx = ∫ p² - 2 ∫ p n + a constant
+        weights, means = components(a)
+        pairs = overlap(means[:, None] - means, 2 * std**2)
+        square = weights @ pairs @ weights
+        return float(square - 2 * weights @ overlap(means, 1 + std**2))
 
-    found = minimize_scalar(
-        ise, bounds=(0.01, 0.49), method="bounded", options={"xatol": 1e-12}
+    result = minimize_scalar(
+        squared_error, bounds=(0.01, 0.49), method="bounded", options={"xatol": 1e-12}
     )
-    return parts(float(found.x))
+    return components(float(result.x))
 
 
 @validated
 def nonlinearity(
-    factors: Annotated[Array, "L d d"],
-    jacobians: Annotated[Array, "L m d"],
+    factors: Annotated[ArrayInput, "L d d"],
+    jacobians: Annotated[ArrayInput, "L m d"],
     *,
-    scale: Annotated[Array, "m"] | None = None,
+    scale: Annotated[ArrayInput, "m"] | None = None,
 ) -> tuple[Array, Array]:
-    r"""How far a linearised map takes each mixand, and from where: first-order stretching.
+    r"""Direction in which a linearised map stretches each component most, and by how much.
 
     The direction :math:`\mathbf u=\mathbf S\mathbf v_1` of one standard deviation, with the first
     right singular vector of :math:`\mathbf G\mathbf S`, is the one with the largest image:
@@ -93,11 +103,11 @@ def nonlinearity(
     Parameters
     ----------
     factors : array_like, (L, d, d)
-        Square roots S of the mixands' covariances.
+        Square roots S of the components' covariances.
     jacobians : array_like, (L, m, d)
         Jacobians G at their means.
     scale : array_like, (m,), optional
-        What each component of the image is multiplied by before lengths are compared.
+        Factors of the image's components, applied before lengths are compared.
 
     Returns
     -------
@@ -114,22 +124,26 @@ def nonlinearity(
     """
     if scale is not None:
         jacobians = scale[:, None] * jacobians
-    _, values, right = np.linalg.svd(jacobians @ factors)
+    # G S = U Σ Vᵀ: the largest image of a unit vector v is that of v₁, of length σ₁.
+    _, singular_values, right = np.linalg.svd(jacobians @ factors)
     first = right[:, 0]
-    # A singular vector's sign is arbitrary: fix it, though a split does not see it.
-    sign = np.sign(first[np.arange(first.shape[0]), np.abs(first).argmax(axis=1)])
-    return (factors @ (sign[:, None] * first)[..., None])[..., 0], values[:, 0]
+    # A singular vector's sign is arbitrary: its largest entry is made positive.
+    largest = np.abs(first).argmax(axis=1)
+    sign = np.sign(first[np.arange(len(first)), largest])
+    first = sign[:, None] * first
+    directions = (factors @ first[..., None])[..., 0]
+    return directions, singular_values[:, 0]
 
 
 @validated
 def split_components(
     mixture: GaussianMixture,
-    which: Annotated[Indices, "K", Bounds(at_least=0)],
-    directions: Annotated[Array, "K mixture.dim"],
+    which: Annotated[IndicesInput, "K", Bounds(at_least=0)],
+    directions: Annotated[ArrayInput, "K mixture.dim"],
     *,
     std: Fraction = 0.7,
 ) -> GaussianMixture:
-    r"""Replace some mixands by three along a direction, keeping their mean and covariance.
+    r"""Replace some components by three along a direction, keeping their mean and covariance.
 
     With :math:`\mathbf u=\mathbf S\mathbf v` for a unit vector v the pieces are
     :math:`\mathcal N(\mathbf m+m_k\mathbf u,\ \mathbf P-(1-s^2)\mathbf u\mathbf u^\top)`.
@@ -138,7 +152,7 @@ def split_components(
     ----------
     mixture : GaussianMixture
     which : array_like of int, (K,)
-        Which mixands, each once; the pieces come after those that stay.
+        Indices of the components, each once; the pieces come after those that stay.
     directions : array_like, (K, d)
         One standard deviation long, :math:`\mathbf u^\top\mathbf P^{-1}\mathbf u=1`.
     std : float
@@ -151,28 +165,33 @@ def split_components(
     >>> three.n_components, three.moments()[1].round(12).tolist()
     (3, [[1.0, 0.0], [0.0, 1.0]])
     """
-    if (which >= mixture.n_components).any() or np.unique(which).size != which.size:
+    is_distinct = np.unique(which).size == which.size
+    if not is_distinct or (which >= mixture.n_components).any():
         raise ValueError(
-            f"which must have distinct indices below {mixture.n_components}, got {which.tolist()}"
+            f"which must have distinct indices below {mixture.n_components}, "
+            f"got {which.tolist()}"
         )
+    # |L⁻¹ u|² = uᵀ P⁻¹ u must be 1.
     white = np.linalg.solve(mixture.factors[which], directions[..., None])[..., 0]
-    if np.abs((white**2).sum(axis=1) - 1).max(initial=0.0) > 1e-6:
+    squared_lengths = (white**2).sum(axis=1)
+    if np.abs(squared_lengths - 1).max(initial=0.0) > 1e-6:
+        worst = squared_lengths[np.abs(squared_lengths - 1).argmax()]
         raise ValueError(
-            "directions must be one standard deviation, got another length"
+            "directions must be one standard deviation long, "
+            f"got {np.sqrt(worst):.6g} standard deviations"
         )
-    w, m = _library(std)
-    means = mixture.means[which][:, None] + m[:, None] * directions[:, None]
-    less = (
-        mixture.covs[which]
-        - (1 - std**2) * directions[:, :, None] * directions[:, None, :]
-    )
-    stay = np.setdiff1d(np.arange(mixture.n_components), which)
+    # The pieces: weights w w_k, means m + m_k u, and covariances P - (1 - s²) u uᵀ.
+    piece_weights, piece_means = _optimize_library(std)
+    weights = mixture.weights[which][:, None] * piece_weights
+    shifts = piece_means[:, None] * directions[:, None]
+    means = mixture.means[which][:, None] + shifts
+    outer = (1 - std**2) * directions[:, :, None] * directions[:, None, :]
+    covs = np.repeat(symmetrise(mixture.covs[which] - outer), 3, axis=0)
+    unsplit = np.setdiff1d(np.arange(mixture.n_components), which)
     return GaussianMixture.construct(
-        np.concatenate(
-            [mixture.weights[stay], (mixture.weights[which][:, None] * w).ravel()]
-        ),
-        np.concatenate([mixture.means[stay], means.reshape(-1, mixture.dim)]),
-        np.concatenate([mixture.covs[stay], np.repeat(symmetrise(less), 3, axis=0)]),
+        np.concatenate([mixture.weights[unsplit], weights.ravel()]),
+        np.concatenate([mixture.means[unsplit], means.reshape(-1, mixture.dim)]),
+        np.concatenate([mixture.covs[unsplit], covs]),
     )
 
 
@@ -183,22 +202,22 @@ def split_nonlinear(
     *,
     max_components: PositiveInt,
     split_threshold: PositiveFloat,
-    scale: Annotated[Array, "m"] | None = None,
+    scale: Annotated[ArrayInput, "m"] | None = None,
 ) -> GaussianMixture:
-    """Split the mixands that a map stretches most in three, up to three times over.
+    """Split the components that a map stretches most in three, in up to three rounds.
 
     Parameters
     ----------
     mixture : GaussianMixture
     jacobian : callable
         The map's derivatives (L, m, d), or one (m, d) for all, at means (L, d).
-    most : int
-        How many mixands there may be.
-    stretch : float
-        A mixand is split if its weight times its largest stretching is above this, and its weight
-        above a thousandth.
+    max_components : int
+        Largest number of components of the result.
+    split_threshold : float
+        A component is split if its weight times its largest stretching is above this, and its
+        weight above a thousandth.
     scale : array_like, (m,), optional
-        As of :func:`stretching`.
+        As of :func:`nonlinearity`.
 
     Examples
     --------
@@ -208,16 +227,19 @@ def split_nonlinear(
     ... ).n_components
     3
     """
-    for _ in range(3):
-        room = (max_components - mixture.n_components) // 2
-        if room < 1:
+    for _ in range(_MAX_ROUNDS):
+        # A split adds two components.
+        n_splits = (max_components - mixture.n_components) // 2
+        if n_splits < 1:
             break
-        slope = jacobian(mixture.means)
-        slope = np.broadcast_to(slope, (mixture.n_components, *np.shape(slope)[-2:]))
-        directions, lengths = nonlinearity(mixture.factors, slope, scale=scale)
-        cost = np.where(mixture.weights > _LIGHT, mixture.weights * lengths, 0.0)
-        worst = np.argsort(-cost, kind="stable")[:room]
-        worst = worst[cost[worst] > split_threshold]
+        jacobians = call_user(jacobian, mixture.means)
+        shape = (mixture.n_components, *np.shape(jacobians)[-2:])
+        jacobians = np.broadcast_to(jacobians, shape)
+        directions, lengths = nonlinearity(mixture.factors, jacobians, scale=scale)
+        is_heavy = mixture.weights > _SMALLEST_WEIGHT
+        costs = np.where(is_heavy, mixture.weights * lengths, 0.0)
+        worst = np.argsort(-costs, kind="stable")[:n_splits]
+        worst = worst[costs[worst] > split_threshold]
         if not worst.size:
             break
         mixture = split_components(mixture, worst, directions[worst])

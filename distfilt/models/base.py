@@ -11,7 +11,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ..linalg import as_derivative, central, factor
+from ..linalg import evaluate_derivative, central_difference, factor
 from ..validation import (
     Array,
     Bounds,
@@ -138,9 +138,9 @@ class Model(FrozenModel):
         def move(states: Array) -> Array:
             return self.step(states, t, dt)
 
-        differences = partial(central, move, x)
+        differences = partial(central_difference, move, x)
         shape = (*x.shape, self.dim)
-        return as_derivative(self, (x, t, dt), shape, differences, np.eye(self.dim))
+        return evaluate_derivative(self, (x, t, dt), shape, differences, np.eye(self.dim))
 
 
 @lru_cache(maxsize=64)

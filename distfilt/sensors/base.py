@@ -15,7 +15,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ..linalg import as_derivative, central, factor, leading
+from ..linalg import evaluate_derivative, central_difference, factor, broadcast_leading
 from ..validation import (
     ALLOW_NAN,
     Array,
@@ -152,7 +152,7 @@ class Sensor(FrozenModel):
             )
         if x.shape != previous.shape:
             # Leading axes broadcast; other shapes are refused here.
-            leading(x.shape[:-1], previous.shape[:-1], "previous")
+            broadcast_leading(x.shape[:-1], previous.shape[:-1], "previous")
             x, previous = np.broadcast_arrays(x, previous)
         return x, previous
 
@@ -192,7 +192,7 @@ class Sensor(FrozenModel):
         """
         if self.residual_function is None:
             return np.asarray(observed - predicted)
-        shape = leading(observed.shape, predicted.shape, "predicted")
+        shape = broadcast_leading(observed.shape, predicted.shape, "predicted")
         # Copies, since the user's function may work in place.
         residual = np.asarray(
             call_user(self.residual_function, observed.copy(), predicted.copy())
@@ -246,5 +246,5 @@ class Sensor(FrozenModel):
         def vary(varied: Array) -> Array:
             return predict(varied, *fixed)
 
-        differences = partial(central, vary, states[0], self.residual)
-        return as_derivative(self, states, shape, differences)
+        differences = partial(central_difference, vary, states[0], self.residual)
+        return evaluate_derivative(self, states, shape, differences)

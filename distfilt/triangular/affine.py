@@ -5,7 +5,7 @@ The x-block of the Knothe-Rosenblatt map of a Gaussian is affine,
 .. math:: \mathbf S(\mathbf y, \mathbf x) = \mathbf L^{-1}\bigl(\mathbf x - \bar{\mathbf x}
     - \mathbf K(\mathbf y - \bar{\mathbf y})\bigr),
 
-with the regression matrix K of x on y and the Cholesky factor L of what the regression leaves. The
+with the regression matrix K of x on y and the Cholesky factor L of the residuals' covariance. The
 minimiser of (12) over affine maps has this form with sample moments, so no solver is needed.
 """
 
@@ -20,25 +20,37 @@ from typing import Annotated, Any, Literal, Protocol, runtime_checkable
 import numpy as np
 
 from .. import ensembles
-from ..linalg import SolverError, leading
-from ..validation import Array, FrozenModel, Mask, import_optional, validated
+from ..linalg import SolverError, broadcast_leading
+from ..validation import (
+    Array,
+    ArrayInput,
+    FrozenModel,
+    Mask,
+    call_user,
+    import_optional,
+    validated,
+)
 
 __all__ = ["AffineMap", "compose", "fit", "fit_convex", "objective"]
 
-Seen = Annotated[Array, "... N M"]
-Members = Annotated[Array, "... N d"]
-OwnSeen = Annotated[Array, "... self.observed"]
-OwnMembers = Annotated[Array, "... N self.dim"]
+ObservationSamples = Annotated[ArrayInput, "... N M"]
+"""Samples of y; there may be no observation, M = 0."""
+StateSamples = Annotated[ArrayInput, "... N d"]
+"""Samples of x."""
+MapObservations = Annotated[ArrayInput, "... self.n_observed"]
+"""Samples of y, or one y for all samples of x, with a map's number of observations."""
+MapStates = Annotated[ArrayInput, "... N self.dim"]
+"""Samples of x, or of the reference, with a map's number of components."""
 
 _ROUNDING = 1e-13
-"""Share of a variable's variance, or of its mean, that counts as rounding."""
+"""Fraction of a variable's variance, or of its mean, that counts as rounding."""
 
 
 @runtime_checkable
 class ConditionalMap(Protocol):
-    """What a map offers: z = S(y, x), its inverse in x, the derivative's log-determinant.
+    """A map z = S(y, x) with its inverse in x and the derivative's log-determinant.
 
-    Whatever has these three methods is one:
+    Any object with these three methods is one:
 
     >>> class Shift:
     ...     def __call__(self, y, x):
@@ -56,23 +68,23 @@ class ConditionalMap(Protocol):
     """
 
     def __call__(self, y: Array, x: Array) -> Array:
-        """Reference samples of members."""
+        """Return the reference samples of members."""
 
     def inverse(self, y: Array, z: Array) -> Array:
-        """Members of reference samples."""
+        """Return the members of reference samples."""
 
     def log_det(self, y: Array, x: Array) -> Array:
-        """Log-determinant at each member."""
+        """Return the log-determinant at each member."""
 
 
 @validated
 def compose(
     map_: ConditionalMap,
-    y: Annotated[Array, "... N map_.observed"],
-    x: Annotated[Array, "... N map_.dim"],
-    observed: Annotated[Array, "... map_.observed"],
+    y: Annotated[ArrayInput, "... N map_.n_observed"],
+    x: Annotated[ArrayInput, "... N map_.dim"],
+    observed: Annotated[ArrayInput, "... map_.n_observed"],
 ) -> Array:
-    r"""The composed map (10) of Grange et al.: from joint samples to samples given the observation.
+    r"""Condition joint samples on an observation by the composed map (10) of Grange et al.
 
     .. math:: \mathbf T(\mathbf y,\mathbf x)
         = \mathbf S(\mathbf y^*,\cdot)^{-1}\circ\mathbf S(\mathbf y,\mathbf x)
@@ -84,7 +96,7 @@ def compose(
     y, x : array_like, (..., N, m) and (..., N, d)
         Predicted observations, with noise, and members.
     observed : array_like, (..., m)
-        What was observed, y*.
+        The observation y*.
 
     Examples
     --------
@@ -96,17 +108,16 @@ def compose(
     >>> compose(affine.fit(y, x), y, x, [2.0]).mean().round(1)
     np.float64(1.0)
     """
-    return map_.inverse(observed[..., None, :], map_.__call__(y, x))
+    # The map may be the user's: its methods' own calls into the library are checked.
+    reference = call_user(map_.__call__, y, x)
+    members = call_user(map_.inverse, observed[..., None, :], reference)
+    return np.asarray(members)
 
 
-def _lower_triangular(value: Array, name: str) -> None:
-    if (
-        np.triu(value, 1).any()
-        or not (np.diagonal(value, axis1=-2, axis2=-1) > 0).all()
-    ):
-        raise ValueError(
-            f"{name} must have lower triangular matrices with a positive diagonal"
-        )
+def _check_lower_triangular(value: Array, name: str) -> None:
+    diagonal = np.diagonal(value, axis1=-2, axis2=-1)
+    if np.triu(value, 1).any() or not (diagonal > 0).all():
+        raise ValueError(f"{name} must be lower triangular with a positive diagonal")
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,17 +142,17 @@ class AffineMap(FrozenModel):
     array([[1.]])
     >>> s.inverse([0.0], [[1.0]])
     array([[2.]])
-    >>> s.observed, s.dim
+    >>> s.n_observed, s.dim
     (1, 1)
     """
 
     observed_mean: Annotated[Array, "... M"]
     mean: Annotated[Array, "... d"]
     gain: Annotated[Array, "... d M"]
-    scale: Annotated[Array, "... d d", _lower_triangular]
+    scale: Annotated[Array, "... d d", _check_lower_triangular]
 
     @property
-    def observed(self) -> int:
+    def n_observed(self) -> int:
         """Number m of observations."""
         return int(self.observed_mean.shape[-1])
 
@@ -150,35 +161,47 @@ class AffineMap(FrozenModel):
         """Number d of components."""
         return int(self.mean.shape[-1])
 
-    def _predicted(self, y: Array, members: Array) -> Array:
-        """The regression of x on y, (..., N, d), which broadcasts with these members."""
+    def _regression(self, y: Array, members: Array) -> Array:
+        """Return the regression of x on y, (..., N, d), which broadcasts with the members."""
         centred = y - self.observed_mean[..., None, :]
-        out = self.mean[..., None, :] + centred @ np.ascontiguousarray(self.gain.mT)
-        leading(members.shape[:-1], out.shape[:-1], "y")
-        return np.asarray(out)
-
-    @validated
-    def __call__(self, y: OwnSeen, x: OwnMembers) -> Array:
-        """Reference samples S(y, x), (..., N, d), of members y (..., N, m) and x (..., N, d)."""
-        return np.asarray(
-            np.linalg.solve(self.scale, (x - self._predicted(y, x)).mT).mT
+        # x̄ + K (y - ȳ).
+        predicted = self.mean[..., None, :] + centred @ np.ascontiguousarray(
+            self.gain.mT
         )
+        broadcast_leading(members.shape[:-1], predicted.shape[:-1], "y")
+        return np.asarray(predicted)
 
     @validated
-    def inverse(self, y: OwnSeen, z: OwnMembers) -> Array:
-        """Members x with S(y, x) = z, (..., N, d); `y` is (..., N, m), or (..., m) for all."""
-        seen = y[..., None, :] if y.ndim == self.observed_mean.ndim else y
-        return self._predicted(seen, z) + z @ np.ascontiguousarray(self.scale.mT)
+    def __call__(self, y: MapObservations, x: MapStates) -> Array:
+        """Return reference samples S(y, x), (..., N, d), of y (..., N, m) and x (..., N, d)."""
+        residual = x - self._regression(y, x)
+        # L⁻¹ of the residual, members as right-hand sides.
+        return np.asarray(np.linalg.solve(self.scale, residual.mT).mT)
 
     @validated
-    def log_det(self, y: OwnSeen, x: OwnMembers) -> Array:
-        """Logarithm of the determinant of the map's derivative in x at each member, (..., N)."""
-        total = -np.log(np.diagonal(self.scale, axis1=-2, axis2=-1)).sum(axis=-1)
-        return np.broadcast_to(total[..., None], x.shape[:-1]).copy()
+    def inverse(self, y: MapObservations, z: MapStates) -> Array:
+        """Return members x with S(y, x) = z, (..., N, d); y is (..., N, m), or (..., m) for all."""
+        if y.ndim == self.observed_mean.ndim:
+            y = y[..., None, :]
+        residual = z @ np.ascontiguousarray(self.scale.mT)
+        return np.asarray(self._regression(y, z) + residual)
+
+    @validated
+    def log_det(self, y: MapObservations, x: MapStates) -> Array:
+        """Return the log-determinant of the map's derivative in x at each member, (..., N)."""
+        diagonal = np.diagonal(self.scale, axis1=-2, axis2=-1)
+        # det L⁻¹, the same for all members.
+        value = -np.log(diagonal).sum(axis=-1)
+        return np.broadcast_to(value[..., None], x.shape[:-1]).copy()
 
 
-def joint_samples(y: Array, x: Array) -> Array:
-    """The variables (y, x) of each member, (..., N, m + d)."""
+def multiply_vector(matrix: Array, vector: Array) -> Array:
+    """Return products of matrices (..., n, k) and vectors (..., k), (..., n)."""
+    return np.asarray((matrix @ vector[..., None])[..., 0])
+
+
+def join_samples(y: Array, x: Array) -> Array:
+    """Return the variables (y, x) of each member, (..., N, m + d)."""
     if y.shape[:-1] != x.shape[:-1]:
         raise ValueError(
             f"y must have members {x.shape[:-1]} as x has them, got {y.shape[:-1]}"
@@ -186,30 +209,37 @@ def joint_samples(y: Array, x: Array) -> Array:
     return np.concatenate([y, x], axis=-1)
 
 
-def enough(y: Array, x: Array, members: int) -> Array:
-    """The variables joined, refused unless there are more members than variables."""
-    joint = joint_samples(y, x)
-    if members <= joint.shape[-1]:
+def join_enough_samples(y: Array, x: Array, n_members: int) -> Array:
+    """Return the variables (y, x), of which there must be fewer than members."""
+    joint = join_samples(y, x)
+    n_variables = joint.shape[-1]
+    if n_members <= n_variables:
         raise ValueError(
-            f"x must have more than {joint.shape[-1]} members for {joint.shape[-1]} "
-            f"variables, got {members}"
+            f"x must have more than {n_variables} members for {n_variables} "
+            f"variables, got {n_members}"
         )
     return joint
 
 
-def refuse(wrong: Mask, m: int, needs: str) -> None:
-    """An error if a variable of (..., m + d) is not what a fit needs, y blamed before x."""
-    columns = np.flatnonzero(wrong.reshape(-1, wrong.shape[-1]).any(axis=0))
-    if columns.size:
-        k = int(columns[0])
-        name, column = ("y", k) if k < m else ("x", k - m)
-        raise ValueError(
-            f"{name} must have variables that {needs}, got one in column {column}"
-        )
+def check_variables(wrong: Mask, m: int, needs: str) -> None:
+    """Raise an error that names the first wrong variable of (..., m + d), y before x."""
+    # Wrong in any ensemble of a batch.
+    flat_wrong = wrong.reshape(-1, wrong.shape[-1])
+    columns = np.flatnonzero(flat_wrong.any(axis=0))
+    if not columns.size:
+        return
+    column = int(columns[0])
+    name = "y"
+    if column >= m:
+        name = "x"
+        column -= m
+    raise ValueError(
+        f"{name} must have variables that {needs}, got one in column {column}"
+    )
 
 
 @validated
-def fit(y: Seen, x: Members) -> AffineMap:
+def fit(y: ObservationSamples, x: StateSamples) -> AffineMap:
     """Fit the affine map to samples in closed form: the minimiser of (12).
 
     Parameters
@@ -227,58 +257,74 @@ def fit(y: Seen, x: Members) -> AffineMap:
     >>> s.gain.round(1).ravel() + 0.0
     array([1., 0.])
     """
-    joint = enough(y, x, x.shape[-2])
+    joint = join_enough_samples(y, x, x.shape[-2])
     mean = ensembles.mean(joint)
     joint -= mean[..., None, :]
-    return from_moments(mean, joint.mT @ joint / joint.shape[-2], y.shape[-1])
+    covariance = joint.mT @ joint / joint.shape[-2]
+    return from_moments(mean, covariance, y.shape[-1])
 
 
-def from_moments(mean: Array, cov: Array, m: int) -> AffineMap:
-    """The affine map of a Gaussian (y, x), or of samples with these moments (divided by N).
+def from_moments(mean: Array, covariance: Array, m: int) -> AffineMap:
+    """Return the affine map of a Gaussian (y, x), or of samples with these moments (divided by N).
 
-    An error says which of them has no factor.
+    Raises an error that names y or x if its covariance has no Cholesky factor.
     """
     needs = "are not constant and not combinations of others"
-    variance = np.diagonal(cov, axis1=-2, axis2=-1)
+    lower = _factor_joint(covariance, m, needs)
+    # Rounding may give a repeated variable a tiny variance: L_kk² is the variance of variable k
+    # that the variables before it do not explain.
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    unexplained = np.diagonal(lower, axis1=-2, axis2=-1) ** 2
+    is_combination = unexplained <= _ROUNDING * variance
+    is_constant = variance <= (_ROUNDING * mean) ** 2
+    check_variables(is_combination | is_constant, m, needs)
+    # The factor of the joint covariance contains the map: its lower blocks are K L_yy and L.
+    observed_factor = lower[..., :m, :m]
+    cross_factor = lower[..., m:, :m]
+    gain = np.linalg.solve(observed_factor.mT, cross_factor.mT).mT
+    scale = lower[..., m:, m:]
+    return AffineMap.construct(mean[..., :m], mean[..., m:], gain, scale)
+
+
+def _factor_joint(covariance: Array, m: int, needs: str) -> Array:
+    """Return the Cholesky factor of the covariance of (y, x), or raise an error for y or x."""
     try:
-        lower = np.linalg.cholesky(cov)
+        return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
     except np.linalg.LinAlgError:
-        try:
-            np.linalg.cholesky(cov[..., :m, :m])
-        except np.linalg.LinAlgError:
-            raise ValueError(f"y must have variables that {needs}") from None
-        raise ValueError(f"x must have variables that {needs}") from None
-    # Rounding may leave a repeated variable a tiny variance of its own.
-    left = np.diagonal(lower, axis1=-2, axis2=-1) ** 2
-    refuse(
-        (left <= _ROUNDING * variance) | (variance <= (_ROUNDING * mean) ** 2), m, needs
-    )
-    # The factor of the joint covariance holds the map: its lower blocks are K L_yy and L.
-    gain = np.linalg.solve(lower[..., :m, :m].mT, lower[..., m:, :m].mT)
-    return AffineMap.construct(
-        mean[..., :m], mean[..., m:], gain.mT, lower[..., m:, m:]
-    )
+        name = "x"
+    # The observations come first, so they are at fault if their block has no factor.
+    try:
+        np.linalg.cholesky(covariance[..., :m, :m])
+    except np.linalg.LinAlgError:
+        name = "y"
+    raise ValueError(f"{name} must have variables that {needs}")
 
 
-def from_rows(u: Array, observed_mean: Array) -> AffineMap:
-    """The affine map of the coefficients of (13), component by component.
+def from_rows(coefficients: Array, observed_mean: Array) -> AffineMap:
+    """Return the affine map of the coefficients of (13), component by component.
 
     Per component of the x-block, (..., d, 1 + m + d): the constant, the coefficients of y and those
-    of x, zero to the right of the diagonal and positive on it. The map is written about any y.
+    of x, zero to the right of the diagonal and positive on it. The mean of x belongs to any
+    `observed_mean`.
     """
-    upper = u[..., 1 + observed_mean.shape[-1] :]
-    solved = np.linalg.solve(upper, u[..., : 1 + observed_mean.shape[-1]])
-    gain = -solved[..., 1:]
-    mean = (gain @ observed_mean[..., None])[..., 0] - solved[..., 0]
-    scale = np.linalg.solve(
-        upper, np.broadcast_to(np.eye(upper.shape[-1]), upper.shape)
-    )
+    split = 1 + observed_mean.shape[-1]
+    # S(y, x) = c + B y + A x with A = L⁻¹, so K = -L B and x̄ = K ȳ - L c.
+    x_coefficients = coefficients[..., split:]
+    solution = np.linalg.solve(x_coefficients, coefficients[..., :split])
+    gain = -solution[..., 1:]
+    mean = multiply_vector(gain, observed_mean) - solution[..., 0]
+    identity = np.broadcast_to(np.eye(x_coefficients.shape[-1]), x_coefficients.shape)
+    scale = np.linalg.solve(x_coefficients, identity)
     return AffineMap.construct(observed_mean, mean, gain, np.tril(scale))
 
 
 @validated
-def objective(map_: ConditionalMap, y: Seen, x: Members) -> Array:
-    """The objective (12) of the x-block, summed over its components, (...).
+def objective(
+    map_: ConditionalMap,
+    y: Annotated[ArrayInput, "... N map_.n_observed"],
+    x: Annotated[ArrayInput, "... N map_.dim"],
+) -> Array:
+    """Return the objective (12) of the x-block, summed over its components, (...).
 
     Up to a constant it is the negative mean log-likelihood of x given y under the map.
 
@@ -295,14 +341,17 @@ def objective(map_: ConditionalMap, y: Seen, x: Members) -> Array:
     >>> float(objective(fit(np.empty((4, 0)), x), np.empty((4, 0)), x))
     0.5
     """
-    squares = 0.5 * (map_(y, x) ** 2).sum(axis=-1)
-    return np.asarray((squares - map_.log_det(y, x)).mean(axis=-1))
+    reference = call_user(map_.__call__, y, x)
+    log_det = call_user(map_.log_det, y, x)
+    # |S(y, x)|² / 2 - log det.
+    squares = 0.5 * (reference**2).sum(axis=-1)
+    return np.asarray((squares - log_det).mean(axis=-1))
 
 
 @validated
 def fit_convex(
-    y: Annotated[Array, "N M"],
-    x: Annotated[Array, "N d"],
+    y: Annotated[ArrayInput, "N M"],
+    x: Annotated[ArrayInput, "N d"],
     *,
     solver: Literal["ECOS", "CLARABEL"] = "ECOS",
 ) -> AffineMap:
@@ -330,50 +379,62 @@ def fit_convex(
     >>> bool(abs(exact.scale - solved.scale).max() < 1e-4)
     True
     """
-    joint = enough(y, x, len(x))
+    joint = join_enough_samples(y, x, len(x))
     m = y.shape[-1]
-    cp = import_optional("cvxpy", "maps")
-    rows = np.zeros((x.shape[-1], 1 + joint.shape[-1]))
-    # Of size one: a solver's tolerances are absolute.
+    # Standardised variables, since a solver's tolerances are absolute.
     centre = joint.mean(axis=0)
-    size = joint.std(axis=0)
-    size += size == 0
-    ones = np.column_stack([np.ones(len(joint)), (joint - centre) / size]) / np.sqrt(
-        len(joint)
-    )
-    # What cvxpy would warn of, the status below tells, and it becomes an error.
-    with _SOLVING, warnings.catch_warnings(), np.errstate(all="ignore"):
+    std = joint.std(axis=0)
+    std += std == 0
+    standard = (joint - centre) / std
+    design = np.column_stack([np.ones(len(joint)), standard])
+    design = design / np.sqrt(len(joint))
+    coefficients = np.zeros((x.shape[-1], design.shape[-1]))
+    # The solver's warnings are silenced: the status is checked, and raises an error.
+    with _COMPILED, warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
-        for k, n in enumerate(range(m + 2, m + 2 + len(rows))):
-            problem, root, u = _program(n)
-            root.value = np.linalg.qr(ones[:, :n], mode="r")
-            try:
-                problem.solve(solver=solver, warm_start=False)
-                status = problem.status
-            except cp.error.SolverError as error:
-                status = error
-            if status != cp.OPTIMAL:
-                raise SolverError(
-                    f"{solver}: component {n - 1} of the map stopped with {status!r}"
-                )
-            rows[k, :n] = u.value
-    rows[:, 1:] /= size
-    rows[:, 0] -= rows[:, 1:] @ centre
-    return from_rows(rows, ensembles.mean(y))
+        for k in range(x.shape[-1]):
+            # Component k uses the constant, y, and x up to its own.
+            n = m + k + 2
+            coefficients[k, :n] = _solve_component(design[:, :n], solver)
+    # Back from standardised variables.
+    coefficients[:, 1:] /= std
+    coefficients[:, 0] -= coefficients[:, 1:] @ centre
+    return from_rows(coefficients, ensembles.mean(y))
 
 
-_SOLVING = Lock()
-"""A compiled program holds its last data: one thread at a time."""
+_COMPILED = Lock()
+"""A compiled program has the parameters of its last solution: one thread at a time."""
+
+
+def _solve_component(design: Array, solver: str) -> Array:
+    """Return the coefficients of one component for features (N, n), by a conic solver."""
+    cp = import_optional("cvxpy", "maps")
+    n = design.shape[-1]
+    problem, root, coefficients = _compile_program(n)
+    root.value = np.linalg.qr(design, mode="r")
+    try:
+        problem.solve(solver=solver, warm_start=False)
+        status = problem.status
+    except cp.error.SolverError as error:
+        status = error
+    if status != cp.OPTIMAL:
+        raise SolverError(
+            f"{solver}: component {n - 1} of the map stopped with {status!r}"
+        )
+    return np.asarray(coefficients.value)
 
 
 @lru_cache(maxsize=32)
-def _program(n: int) -> tuple[Any, Any, Any]:
-    """The program (12) of n coefficients, compiled once, with the samples' triangular factor open.
+def _compile_program(n: int) -> tuple[Any, Any, Any]:
+    """Return the program (12) of n coefficients, its parameter and its variable.
 
-    The samples enter by |u_0 + Z u|² only, which their QR factor keeps.
+    The samples enter by |u_0 + Z u|² only, which their QR factor keeps: the factor is the
+    parameter, and a program is compiled once for each size.
     """
     cp = import_optional("cvxpy", "maps")
     root = cp.Parameter((n, n))
-    u = cp.Variable(n)
-    loss = cp.sum_squares(root @ u) / 2 - cp.log(u[n - 1])
-    return cp.Problem(cp.Minimize(loss)), root, u
+    coefficients = cp.Variable(n)
+    squares = cp.sum_squares(root @ coefficients) / 2
+    # The last coefficient is the derivative in the component's own variable.
+    loss = squares - cp.log(coefficients[n - 1])
+    return cp.Problem(cp.Minimize(loss)), root, coefficients

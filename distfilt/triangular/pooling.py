@@ -2,8 +2,8 @@ r"""One map for all agents: the program (22) of Grange et al., by ADMM or from a
 
 Every agent l has samples of its own, and all want the affine map that minimises
 :math:`\sum_l\mathcal L_l(\mathbf U)`. For affine maps the sum depends on the samples through their
-pooled first and second moments only, so agreeing on those, once, is the whole task. ADMM gets there
-too, in many rounds; it is what the paper proposes.
+pooled first and second moments only, so one average consensus on those solves it. ADMM, which the
+paper proposes, needs many rounds.
 """
 
 from __future__ import annotations
@@ -15,24 +15,44 @@ import numpy as np
 
 from ..ensembles import mean
 from ..network import AdmmResult, Channel, admm, finite_time_consensus
-from ..validation import Array, PositiveFloat, check_array, validated
-from .affine import AffineMap, enough, from_moments, from_rows, refuse
+from ..validation import (
+    Array,
+    ArrayInput,
+    Mask,
+    PositiveFloat,
+    call_user,
+    check_array,
+    validated,
+)
+from .affine import (
+    AffineMap,
+    check_variables,
+    from_moments,
+    from_rows,
+    join_enough_samples,
+    multiply_vector,
+)
 
 __all__ = ["pool_by_admm", "pool_by_moments"]
 
-Agree = Callable[[Array, Channel], Array]
-Seen = Annotated[Array, "*channel.runs channel.graph.n_agents N M"]
-Members = Annotated[Array, "*channel.runs channel.graph.n_agents N d"]
+AverageRule = Callable[[Array, Channel], Array]
+"""``average(values, channel) -> averages``, both with an axis of agents before the last."""
+AgentObservations = Annotated[ArrayInput, "*channel.runs channel.graph.n_agents N M"]
+AgentStates = Annotated[ArrayInput, "*channel.runs channel.graph.n_agents N d"]
 
 
 @validated
 def pool_by_moments(
-    y: Seen, x: Members, channel: Channel, *, average: Agree = finite_time_consensus
+    y: AgentObservations,
+    x: AgentStates,
+    channel: Channel,
+    *,
+    average: AverageRule = finite_time_consensus,
 ) -> AffineMap:
-    """The affine map of all agents' samples together, from averaged moments: each agent's copy.
+    """Fit one affine map to all agents' samples from averaged moments.
 
-    Agents agree on the mean first and then on the second moments about it, which keeps the digits
-    that raw second moments would lose.
+    Agents average the mean first and then the second moments about it, which keeps the digits that
+    raw second moments would lose.
 
     Parameters
     ----------
@@ -41,10 +61,16 @@ def pool_by_moments(
     x : array_like, (*runs, A, N, d)
         Each agent's members; as many for all agents.
     channel : Channel
-        The door between agents; D + D(D+1)/2 scalars with D = m + d, times the rounds of `agree`.
-    agree : callable
-        ``agree(values, channel) -> values``: how an average is found. The default is exact; with an
-        approximate rule the agents' maps differ.
+        The channel between agents, which carries D + D(D+1)/2 scalars with D = m + d, times the
+        rounds of `average`.
+    average : callable
+        ``average(values, channel) -> averages``: a rule of average consensus. The default is exact;
+        with an approximate rule the agents' maps differ.
+
+    Returns
+    -------
+    AffineMap
+        With the axes (*runs, A): each agent's copy.
 
     Examples
     --------
@@ -56,31 +82,33 @@ def pool_by_moments(
     >>> bool(abs(pooled.scale - one.scale).max() < 1e-12)
     True
     """
-    joint = enough(y, x, x.shape[-3] * x.shape[-2])
-    centre = _average(mean(joint), channel, average)
-    about = joint - centre[..., None, :]
-    second = about.mT @ about / joint.shape[-2]
+    n_members = x.shape[-3] * x.shape[-2]
+    joint = join_enough_samples(y, x, n_members)
+    centre = _average_values(mean(joint), channel, average)
+    anomalies = joint - centre[..., None, :]
+    second = anomalies.mT @ anomalies / joint.shape[-2]
+    # A symmetric matrix: the upper triangle is sent.
     rows, columns = np.triu_indices(joint.shape[-1])
-    packed = _average(
-        np.ascontiguousarray(second[..., rows, columns]), channel, average
-    )
-    second[..., rows, columns] = second[..., columns, rows] = packed
+    triangle = np.ascontiguousarray(second[..., rows, columns])
+    averaged = _average_values(triangle, channel, average)
+    second[..., rows, columns] = averaged
+    second[..., columns, rows] = averaged
     return from_moments(centre, second, y.shape[-1])
 
 
 @validated
 def pool_by_admm(
-    y: Seen,
-    x: Members,
+    y: AgentObservations,
+    x: AgentStates,
     channel: Channel,
     *,
     rho: PositiveFloat = 1.0,
     tolerance: PositiveFloat = 1e-6,
-    average: Agree = finite_time_consensus,
+    average: AverageRule = finite_time_consensus,
 ) -> tuple[AffineMap, AdmmResult]:
-    r"""The same map by consensus ADMM on the components' coefficients, the paper's proposal.
+    r"""Fit the same map by consensus ADMM on the components' coefficients, the paper's proposal.
 
-    Agents agree on each variable's mean and variance first, 2 D scalars more, and work on
+    Agents average each variable's mean and variance first, 2 D scalars more, and work on
     standardised variables: badly scaled data would take thousands of iterations. Agent l's proximal
     step has a closed form. With :math:`\mathbf C_l` the second moments of
     :math:`(1, z_1,\dots,z_k)`, :math:`\mathbf H = (\mathbf C_l+\rho\mathbf I)^{-1}` and
@@ -94,7 +122,7 @@ def pool_by_admm(
     ----------
     y, x, channel
         As in :func:`pool_by_moments`; a channel of a single run.
-    rho, tolerance, agree
+    rho, tolerance, average
         As in :func:`distfilt.network.admm`.
 
     Returns
@@ -103,7 +131,7 @@ def pool_by_admm(
         With a leading axis (A,): each agent's copy. It is as exact as `tolerance`, and the number
         of iterations grows with the condition number of the variables' correlation matrix.
     run : AdmmResult
-        How ADMM ended; its ``common`` holds the coefficients.
+        The result of ADMM; its ``common`` has the coefficients.
 
     Examples
     --------
@@ -116,64 +144,92 @@ def pool_by_admm(
     """
     if channel.runs:
         raise ValueError(
-            f"channel must be a single run for ADMM, got runs {channel.runs}"
+            f"channel must have a single run for ADMM, got runs {channel.runs}"
         )
-    joint = enough(y, x, x.shape[-3] * x.shape[-2])
+    n_members = x.shape[-3] * x.shape[-2]
+    joint = join_enough_samples(y, x, n_members)
     m = y.shape[-1]
-    centre = _average(mean(joint), channel, average)
-    squares = ((joint - centre[:, None, :]) ** 2).mean(axis=-2)
-    spread = np.sqrt(_average(squares, channel, average))
-    refuse(spread <= 1e-13 * np.abs(centre), m, "are not constant")
-    joint = (joint - centre[:, None, :]) / spread[:, None, :]
-    ones = np.concatenate([np.ones((*joint.shape[:-1], 1)), joint], axis=-1)
-    solve, start, there = _proximal(ones.mT @ ones / joint.shape[-2], m)
-    run = admm(solve, start, channel, rho=rho, tolerance=tolerance, average=average)
-    rows = np.zeros((len(joint), *there.shape))
-    rows[:, there] = run.common
+    d = x.shape[-1]
+    centre, std = _average_scales(joint, m, channel, average)
+    standard = (joint - centre[:, None, :]) / std[:, None, :]
+    constant = np.ones((*standard.shape[:-1], 1))
+    design = np.concatenate([constant, standard], axis=-1)
+    moments = design.mT @ design / design.shape[-2]
+    # Component k of the state uses the constant, y, and x up to its own.
+    used = np.tri(d, 1 + m + d, m + 1, dtype=bool)
+    # The standard normal's map z_k = x_k is the start.
+    identity = np.eye(d, 1 + m + d, m + 1)
+    start = np.tile(identity[used], (len(joint), 1))
+    run = admm(
+        _proximal_step(moments, used),
+        start,
+        channel,
+        rho=rho,
+        tolerance=tolerance,
+        average=average,
+    )
+    coefficients = np.zeros((len(joint), *used.shape))
+    coefficients[:, used] = run.common
     # Back from standardised variables.
-    rows[..., 1:] /= spread[:, None, :]
-    rows[..., 0] -= (rows[..., 1:] @ centre[..., None])[..., 0]
-    return from_rows(rows, centre[:, :m]), run
+    coefficients[..., 1:] /= std[:, None, :]
+    coefficients[..., 0] -= multiply_vector(coefficients[..., 1:], centre)
+    return from_rows(coefficients, centre[:, :m]), run
 
 
-def _average(values: Array, channel: Channel, agree: Agree) -> Array:
-    """What the agents agree on, refused where it cannot be an average of the values."""
-    out = check_array(agree(values, channel), "agree", values.shape)
-    middle = values.mean(axis=-2, keepdims=True)
-    # A rule that is only approximate may miss by as much as the values differ.
-    slack = np.ptp(values, axis=-2, keepdims=True) + 1e-9 * np.abs(middle)
-    if (np.abs(out - middle) > 2 * slack).any():
+def _average_scales(
+    joint: Array, m: int, channel: Channel, average: AverageRule
+) -> tuple[Array, Array]:
+    """Return the agents' averages of each variable's mean and standard deviation, (A, m + d)."""
+    centre = _average_values(mean(joint), channel, average)
+    anomalies = joint - centre[:, None, :]
+    squares = (anomalies**2).mean(axis=-2)
+    std = np.sqrt(_average_values(squares, channel, average))
+    # A smaller deviation is rounding of the mean.
+    is_constant = std <= 1e-13 * np.abs(centre)
+    check_variables(is_constant, m, "are not constant")
+    return centre, std
+
+
+def _average_values(values: Array, channel: Channel, average: AverageRule) -> Array:
+    """Return the agents' averages, or raise an error if they cannot be averages of the values."""
+    averages = call_user(average, values, channel)
+    averages = check_array(averages, "average", values.shape)
+    exact = values.mean(axis=-2, keepdims=True)
+    # A rule that is only approximate may be off by as much as the values differ.
+    spread = np.ptp(values, axis=-2, keepdims=True)
+    tolerance = 2 * (spread + 1e-9 * np.abs(exact))
+    if (np.abs(averages - exact) > tolerance).any():
         raise ValueError(
-            "agree must be a rule that returns averages of the agents' values, got up "
-            f"to {np.abs(out).max():.6g} of up to {np.abs(values).max():.6g}"
+            "average must be a rule that returns averages of the agents' values, got up "
+            f"to {np.abs(averages).max():.6g} of up to {np.abs(values).max():.6g}"
         )
-    return out
+    return averages
 
 
-def _proximal(
-    moments: Array, m: int
-) -> tuple[Callable[[Array, float], Array], Array, Array]:
-    """The proximal step of every agent, components one after the other; where to start; and which
-    coefficients (d, 1 + m + d) there are.
+def _proximal_step(moments: Array, used: Mask) -> Callable[[Array, float], Array]:
+    """Return the proximal step of all agents, on their used coefficients (A, n).
+
+    The `moments` are those of (1, y, x), (A, 1 + m + d, 1 + m + d).
     """
-    d = moments.shape[-1] - 1 - m
-    there = np.tri(d, 1 + m + d, m + 1, dtype=bool)
-    start = np.tile(np.eye(d, 1 + m + d, m + 1)[there], (len(moments), 1))
 
     def solve(target: Array, rho: float) -> Array:
-        out = np.zeros((len(target), *there.shape))
-        out[:, there] = rho * target
-        for k in range(d):
-            n = m + k + 2
+        coefficients = np.zeros((len(target), *used.shape))
+        coefficients[:, used] = rho * target
+        for k in range(len(used)):
+            n = int(used[k].sum())
+            # H b and H e_k of all agents in one solve, H = (C + rho I)⁻¹.
             regular = moments[:, :n, :n] + rho * np.eye(n)
-            right = np.stack(
-                [out[:, k, :n], np.tile(np.eye(n)[-1], (len(target), 1))], -1
-            )
-            pulled, column = np.moveaxis(np.linalg.solve(regular, right), -1, 0)
-            last = 0.5 * (
-                pulled[:, -1] + np.sqrt(pulled[:, -1] ** 2 + 4 * column[:, -1])
-            )
-            out[:, k, :n] = pulled + column / last[:, None]
-        return np.asarray(out[:, there])
+            identity = np.eye(n)
+            last_unit = np.tile(identity[-1], (len(target), 1))
+            right = np.stack([coefficients[:, k, :n], last_unit], axis=-1)
+            solution = np.linalg.solve(regular, right)
+            hb = solution[..., 0]
+            he = solution[..., 1]
+            # u_k = ((H b)_k + sqrt((H b)_k² + 4 H_kk)) / 2, the positive root.
+            hb_last = hb[:, -1]
+            discriminant = hb_last**2 + 4 * he[:, -1]
+            last = 0.5 * (hb_last + np.sqrt(discriminant))
+            coefficients[:, k, :n] = hb + he / last[:, None]
+        return np.asarray(coefficients[:, used])
 
-    return solve, start, there
+    return solve

@@ -9,7 +9,7 @@ Component k of the x-block is
 on standardised variables, with bumps :math:`\varphi_{lj}(z)=e^{-(z-\xi_{lj})^2/2\sigma_{lj}^2}` at
 sample quantiles. The signs make it increase in :math:`z_k`. The objective (12) of Grange et al. is
 convex in the coefficients. Those of the earlier variables enter it quadratically and are
-eliminated; a few nonnegative ones are left for Newton's method, in all runs at once.
+eliminated; Newton's method finds the few nonnegative ones, in all runs at once.
 """
 
 from __future__ import annotations
@@ -21,18 +21,30 @@ from functools import partial
 import numpy as np
 
 from .. import ensembles
-from ..linalg import SolverError, leading
+from ..linalg import SolverError, broadcast_leading
 from ..validation import Array, NonNegativeFloat, NonNegativeInt, validated
-from .affine import Members, OwnMembers, OwnSeen, Seen, joint_samples, refuse
+from .affine import (
+    MapObservations,
+    MapStates,
+    ObservationSamples,
+    StateSamples,
+    check_variables,
+    join_samples,
+    multiply_vector,
+)
 
 __all__ = ["SeparableMap", "fit"]
 
-_ROOT = np.sqrt(2 * np.pi)
+_BUMP_AREA = np.sqrt(2 * np.pi)
+"""Integral of a bump of unit width."""
 _SINGULAR = 1e-12
 """Eigenvalue, relative to the largest, below which a matrix counts as singular."""
 _LEAST_SLOPE = 0.1
 """Least linear coefficient, per standard deviation; the best affine map has at least 1."""
 _ITERATIONS = 100
+"""Largest number of Newton steps."""
+_HALVINGS = 40
+"""Largest number of times that a Newton step is tried, halved each time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,10 +55,10 @@ class SeparableMap:
 
     Parameters
     ----------
-    observed : int
+    n_observed : int
         Number m of observations.
-    centre, spread : ndarray, (..., m + d)
-        What each variable is shifted and divided by.
+    centre, std : ndarray, (..., m + d)
+        Mean and standard deviation by which each variable is standardised.
     bumps : ndarray, (2, ..., m + d, p)
         Centres and widths of the bumps of each standardised variable.
     steps : ndarray, (2, ..., d, q)
@@ -61,13 +73,13 @@ class SeparableMap:
 
     Examples
     --------
-    >>> none = np.empty((2, 1, 0))
+    >>> no_bumps = np.empty((2, 1, 0))
     >>> double = SeparableMap(
     ...     0,
     ...     np.zeros(1),
     ...     np.ones(1),
-    ...     none,
-    ...     none,
+    ...     no_bumps,
+    ...     no_bumps,
     ...     [[]],
     ...     [np.zeros(1)],
     ...     [np.array([2.0])],
@@ -76,9 +88,9 @@ class SeparableMap:
     array([[6.]])
     """
 
-    observed: int
+    n_observed: int
     centre: Array
-    spread: Array
+    std: Array
     bumps: Array
     steps: Array
     uses: list[list[int]]
@@ -90,88 +102,109 @@ class SeparableMap:
         """Number d of components."""
         return len(self.uses)
 
-    def _standard(self, y: Array, x: Array) -> Array:
-        """Standardised (y, x), (..., N, m + d); one y for all members is repeated."""
-        lead = leading(x.shape[:-1], y.shape[:-1], "y")
-        joint = np.concatenate(
-            [np.broadcast_to(v, (*lead, v.shape[-1])) for v in (y, x)], -1
-        )
-        return np.asarray(
-            (joint - self.centre[..., None, :]) / self.spread[..., None, :]
-        )
+    def _standardise(self, y: Array, x: Array) -> Array:
+        """Return standardised (y, x), (..., N, m + d); one y for all members is repeated."""
+        lead = broadcast_leading(x.shape[:-1], y.shape[:-1], "y")
+        full_y = np.broadcast_to(y, (*lead, y.shape[-1]))
+        full_x = np.broadcast_to(x, (*lead, x.shape[-1]))
+        joint = np.concatenate([full_y, full_x], axis=-1)
+        centred = joint - self.centre[..., None, :]
+        return np.asarray(centred / self.std[..., None, :])
 
-    def _earlier(self, joint: Array, k: int) -> Array:
-        """What component k makes of the variables before its own, (..., N)."""
+    def _earlier_part(self, joint: Array, k: int) -> Array:
+        """Return component k's part of the variables before its own, (..., N)."""
         used = self.uses[k]
         features = _earlier_features(joint[..., used], self.bumps[..., used, :])
-        return np.asarray((features @ self.weights[k][..., None])[..., 0])
+        return multiply_vector(features, self.weights[k])
 
-    def _own(self, v: Array, k: int) -> tuple[Array, Array]:
-        """The increasing part of component k and its slope, (..., N)."""
-        values, rates = _own_features(v, self.steps[..., k, :])
-        a = self.slopes[k][..., None]
-        return np.asarray((values @ a)[..., 0]), np.asarray((rates @ a)[..., 0])
-
-    @validated
-    def __call__(self, y: OwnSeen, x: OwnMembers) -> Array:
-        """Reference samples S(y, x), (..., N, d), of members y (..., N, m) and x (..., N, d)."""
-        joint = self._standard(y, x)
-        m = self.observed
-        own = [self._own(joint[..., m + k], k)[0] for k in range(self.dim)]
-        return np.stack(
-            [self._earlier(joint, k) + v for k, v in enumerate(own)], axis=-1
-        )
+    def _increasing_part(self, v: Array, k: int) -> tuple[Array, Array]:
+        """Return component k's part of its own variable and its derivative, (..., N)."""
+        values, rates = _increasing_features(v, self.steps[..., k, :])
+        slopes = self.slopes[k]
+        return multiply_vector(values, slopes), multiply_vector(rates, slopes)
 
     @validated
-    def inverse(self, y: OwnSeen, z: OwnMembers) -> Array:
-        """Members x with S(y, x) = z, (..., N, d); `y` is (..., N, m), or (..., m) for all."""
-        seen = y[..., None, :] if y.ndim == self.centre.ndim else y
-        joint = self._standard(seen, z)
-        m = self.observed
+    def __call__(self, y: MapObservations, x: MapStates) -> Array:
+        """Return reference samples S(y, x), (..., N, d), of y (..., N, m) and x (..., N, d)."""
+        joint = self._standardise(y, x)
+        components = []
         for k in range(self.dim):
-            aim = z[..., k] - self._earlier(joint, k)
+            v = joint[..., self.n_observed + k]
+            increasing, _ = self._increasing_part(v, k)
+            components.append(self._earlier_part(joint, k) + increasing)
+        return np.stack(components, axis=-1)
+
+    @validated
+    def inverse(self, y: MapObservations, z: MapStates) -> Array:
+        """Return members x with S(y, x) = z, (..., N, d); y is (..., N, m), or (..., m) for all."""
+        if y.ndim == self.centre.ndim:
+            y = y[..., None, :]
+        m = self.n_observed
+        # The place of x is filled component by component; z only gives it its shape.
+        joint = self._standardise(y, z)
+        for k in range(self.dim):
+            target = z[..., k] - self._earlier_part(joint, k)
+            # The increasing part lies between a_0 v and a_0 v + H, with H the sum of the steps'
+            # heights, so its root lies between (target - H) / a_0 and target / a_0.
             line = self.slopes[k][..., :1]
-            # A line plus steps of known heights: its ends need no search.
-            heights = _ROOT * self.steps[1][..., k, :] * self.slopes[k][..., 1:]
-            low = (aim - heights.sum(axis=-1, keepdims=True)) / line
-            joint[..., m + k] = invert(partial(self._own, k=k), aim, low, aim / line)
-        return joint[..., m:] * self.spread[..., None, m:] + self.centre[..., None, m:]
+            areas = _BUMP_AREA * self.steps[1][..., k, :]
+            heights = areas * self.slopes[k][..., 1:]
+            total_height = heights.sum(axis=-1, keepdims=True)
+            low = (target - total_height) / line
+            high = target / line
+            part = partial(self._increasing_part, k=k)
+            joint[..., m + k] = invert(part, target, low, high)
+        std = self.std[..., None, m:]
+        centre = self.centre[..., None, m:]
+        return np.asarray(joint[..., m:] * std + centre)
 
     @validated
-    def log_det(self, y: OwnSeen, x: OwnMembers) -> Array:
-        """Logarithm of the determinant of the map's derivative in x at each member, (..., N)."""
-        joint = self._standard(y, x)
-        m = self.observed
-        total = -np.log(self.spread[..., m:]).sum(axis=-1)[..., None]
+    def log_det(self, y: MapObservations, x: MapStates) -> Array:
+        """Return the log-determinant of the map's derivative in x at each member, (..., N)."""
+        joint = self._standardise(y, x)
+        m = self.n_observed
+        # The derivative is triangular: the sum of log(dS_k / dx_k), with dv_k / dx_k = 1 / std.
+        log_scale = np.log(self.std[..., m:]).sum(axis=-1)
+        total = -log_scale[..., None]
         for k in range(self.dim):
-            total = total + np.log(self._own(joint[..., m + k], k)[1])
+            _, rate = self._increasing_part(joint[..., m + k], k)
+            total = total + np.log(rate)
         return np.asarray(total)
 
 
 def _earlier_features(v: Array, bumps: Array) -> Array:
-    """1, the variables and their bumps, (..., N, 1 + L + L p), of variables (..., N, L)."""
+    """Return 1, the variables (..., N, L) and their bumps, (..., N, 1 + L + L p)."""
     centres, widths = bumps[..., None, :, :]
-    heights = np.exp(-0.5 * ((v[..., None] - centres) / widths) ** 2)
-    flat = heights.reshape(*v.shape[:-1], heights.shape[-1] * v.shape[-1])
-    return np.concatenate([np.ones((*v.shape[:-1], 1)), v, flat], axis=-1)
+    u = (v[..., None] - centres) / widths
+    heights = np.exp(-0.5 * u**2)
+    # Bumps of one variable stand side by side.
+    lead = v.shape[:-1]
+    n_bumps = heights.shape[-1] * v.shape[-1]
+    flat_heights = heights.reshape(*lead, n_bumps)
+    constant = np.ones((*lead, 1))
+    return np.concatenate([constant, v, flat_heights], axis=-1)
 
 
-def _own_features(v: Array, steps: Array) -> tuple[Array, Array]:
-    """The variable and its integrated bumps, and their slopes, (..., N, 1 + q), of (..., N)."""
+def _increasing_features(v: Array, steps: Array) -> tuple[Array, Array]:
+    """Return the variable (..., N) and its integrated bumps, (..., N, 1 + q), and derivatives."""
     from scipy.special import ndtr
 
     centres, widths = steps[..., None, :]
     u = (v[..., None] - centres) / widths
-    values = _ROOT * widths * ndtr(u)
+    # The integral of exp(-u² / 2) is a normal distribution function times the bump's area.
+    integrals = _BUMP_AREA * widths * ndtr(u)
+    values = np.concatenate([v[..., None], integrals], axis=-1)
+    # Their derivatives are one and the bumps.
     ones = np.ones((*v.shape, 1))
-    rates = np.concatenate([ones, np.exp(-0.5 * u**2)], axis=-1)
-    return np.concatenate([v[..., None], values], axis=-1), rates
+    bumps = np.exp(-0.5 * u**2)
+    rates = np.concatenate([ones, bumps], axis=-1)
+    return values, rates
 
 
 @validated
 def fit(
-    y: Seen,
-    x: Members,
+    y: ObservationSamples,
+    x: StateSamples,
     *,
     order: NonNegativeInt | tuple[NonNegativeInt, NonNegativeInt],
     regularisation: NonNegativeFloat = 0.0,
@@ -189,7 +222,7 @@ def fit(
     y : array_like, (..., N, m)
         Predicted observations, with noise; m may be 0.
     x : array_like, (..., N, d)
-        Members.
+        StateSamples.
     order : int or (int, int)
         Bumps per earlier variable, and integrated bumps of the own variable; one number is for
         both. 0 gives the affine map.
@@ -224,73 +257,107 @@ def fit(
     True
     """
     m = y.shape[-1]
-    d = x.shape[-1]
     p, q = (order, order) if isinstance(order, int) else order
-    uses = [range(m + k) for k in range(d)] if uses is None else uses
-    allowed = [sorted(set(used)) for used in uses]
-    if len(uses) != d or any(
-        len(used) < len(given) or used[-1:] >= [m + k]
-        for k, (used, given) in enumerate(zip(allowed, uses, strict=True))
-    ):
-        raise ValueError(
-            f"uses must be for each of {d} components different variables before its "
-            f"own, the {m} observations first, got {uses}"
-        )
-    most = max(map(len, allowed))
-    needed = 2 + most if regularisation else 2 + q + most * (1 + p)
+    allowed = _check_uses(uses, m, x.shape[-1])
+    # A penalty determines the bumps' coefficients; without one the samples have to.
+    most_used = max(len(used) for used in allowed)
+    needed = 2 + most_used
+    if not regularisation:
+        needed += q + most_used * p
     if x.shape[-2] <= needed:
         raise ValueError(
             f"x must have more than {needed} members for as many coefficients, "
             f"got {x.shape[-2]}"
         )
-    joint = joint_samples(y, x)
-    centre = ensembles.mean(joint)
-    joint -= centre[..., None, :]
-    spread = np.sqrt((joint**2).mean(axis=-2))
-    refuse(spread <= 1e-13 * np.abs(centre), m, "are not constant")
-    joint /= spread[..., None, :]
-    _refuse_combinations(joint, allowed, m)
-    bumps = _nodes(joint, p, m)
-    steps = _nodes(joint[..., m:], q, 0)
-    found = []
+    joint, centre, std = _standardise_samples(y, x)
+    _check_combinations(joint, allowed, m)
+    bumps = _place_bumps(joint, p, m)
+    steps = _place_bumps(joint[..., m:], q, 0)
+    weights = []
+    slopes = []
     for k, used in enumerate(allowed):
         features = _earlier_features(joint[..., used], bumps[..., used, :])
-        own = _own_features(joint[..., m + k], steps[..., k, :])
-        found.append(_best_coefficients(features, *own, 1 + len(used), regularisation))
-    weights, slopes = map(list, zip(*found, strict=True))
-    return SeparableMap(m, centre, spread, bumps, steps, allowed, weights, slopes)
+        v = joint[..., m + k]
+        values, rates = _increasing_features(v, steps[..., k, :])
+        weight, slope = _fit_component(
+            features, values, rates, 1 + len(used), regularisation
+        )
+        weights.append(weight)
+        slopes.append(slope)
+    return SeparableMap(m, centre, std, bumps, steps, allowed, weights, slopes)
 
 
-def _refuse_combinations(joint: Array, uses: list[list[int]], m: int) -> None:
-    """Refuse variables that are combinations of others that the same component uses."""
-    cov = joint.mT @ joint / joint.shape[-2]
+def _check_uses(
+    uses: Sequence[Collection[int]] | None, m: int, d: int
+) -> list[list[int]]:
+    """Return the earlier variables that each of d components uses, sorted; all by default."""
+    if uses is None:
+        return [list(range(m + k)) for k in range(d)]
+    allowed = [sorted(set(used)) for used in uses]
+    valid = len(allowed) == d
+    for k, (used, variables) in enumerate(zip(allowed, uses, strict=True)):
+        is_distinct = len(used) == len(variables)
+        # Component k is variable m + k: all that it uses come before.
+        is_earlier = not used or used[-1] < m + k
+        valid = valid and is_distinct and is_earlier
+    if not valid:
+        raise ValueError(
+            f"uses must be for each of {d} components different variables before its "
+            f"own, the {m} observations first, got {uses}"
+        )
+    return allowed
+
+
+def _standardise_samples(y: Array, x: Array) -> tuple[Array, Array, Array]:
+    """Return standardised samples (y, x), (..., N, m + d), and their means and deviations."""
+    joint = join_samples(y, x)
+    centre = ensembles.mean(joint)
+    joint -= centre[..., None, :]
+    variance = (joint**2).mean(axis=-2)
+    std = np.sqrt(variance)
+    # A smaller deviation is rounding of the mean.
+    is_constant = std <= 1e-13 * np.abs(centre)
+    check_variables(is_constant, y.shape[-1], "are not constant")
+    joint /= std[..., None, :]
+    return joint, centre, std
+
+
+def _check_combinations(joint: Array, uses: list[list[int]], m: int) -> None:
+    """Raise an error if a component's variables are combinations of each other, y before x."""
+    correlation = joint.mT @ joint / joint.shape[-2]
     for k, used in enumerate(uses):
-        for name, some in (("y", [v for v in used if v < m]), ("x", [*used, m + k])):
-            least = np.linalg.eigvalsh(cov[..., some, :][..., some]).min(initial=1.0)
-            if least < _SINGULAR:
+        observations = [v for v in used if v < m]
+        # A combination of the observations alone is y's fault.
+        for name, variables in (("y", observations), ("x", [*used, m + k])):
+            block = correlation[..., variables, :][..., variables]
+            if np.linalg.eigvalsh(block).min(initial=1.0) < _SINGULAR:
                 raise ValueError(
                     f"{name} must have variables that are not combinations of others, "
                     f"got a singular correlation matrix in component {k}"
                 )
 
 
-def _nodes(joint: Array, n: int, m: int) -> Array:
-    """Centres at `n` quantiles of each variable, and widths from quantiles half way between."""
-    levels = np.arange(1, 2 * n + 2) / (2 * (n + 1))
-    found = np.moveaxis(np.quantile(joint, levels, axis=-2), 0, -1)
-    widths = found[..., 2::2] - found[..., :-2:2]
-    refuse(
-        np.any(widths <= 0, axis=-1),
-        m,
-        "have quantiles that differ for the basis functions",
-    )
-    return np.stack([found[..., 1::2], widths])
+def _place_bumps(joint: Array, n: int, m: int) -> Array:
+    """Return centres at `n` quantiles of each variable, and widths from the quantiles between."""
+    # With n + 1 equal parts, the odd levels are the centres; a width is the distance of the two
+    # even levels around its centre.
+    n_levels = 2 * n + 1
+    levels = np.arange(1, n_levels + 1) / (n_levels + 1)
+    quantiles = np.quantile(joint, levels, axis=-2)
+    quantiles = np.moveaxis(quantiles, 0, -1)
+    centres = quantiles[..., 1::2]
+    edges = quantiles[..., ::2]
+    widths = np.diff(edges, axis=-1)
+    is_degenerate = np.any(widths <= 0, axis=-1)
+    needs = "have quantiles that differ for the basis functions"
+    check_variables(is_degenerate, m, needs)
+    return np.stack([centres, widths])
 
 
-def _best_coefficients(
-    features: Array, values: Array, rates: Array, linear: int, penalty: float
+def _fit_component(
+    features: Array, values: Array, rates: Array, n_linear: int, penalty: float
 ) -> tuple[Array, Array]:
-    r"""Coefficients of one component: those of the earlier variables, then the nonnegative ones.
+    r"""Return a component's coefficients: of the earlier variables, then the nonnegative ones.
 
     For the component :math:`\Psi\mathbf c + \Phi\mathbf a` the objective (12) is
     :math:`\tfrac1{2N}|\Psi\mathbf c+\Phi\mathbf a|^2 - \tfrac1N\sum_i\log(\Phi'\mathbf a)_i`, to
@@ -298,64 +365,94 @@ def _best_coefficients(
     c = -W a, which leaves a quadratic form in a.
     """
     n = features.shape[-2]
-    on_c = penalty * (np.arange(features.shape[-1]) >= linear)
-    on_a = penalty * (np.arange(values.shape[-1]) >= 1)
-    normal = features.mT @ features / n + np.diag(on_c)
-    ends = np.linalg.eigvalsh(normal)
-    if (ends[..., 0] < _SINGULAR * ends[..., -1]).any():
+    # The penalty is on the bumps only.
+    is_bump = np.arange(features.shape[-1]) >= n_linear
+    is_step = np.arange(values.shape[-1]) >= 1
+    feature_penalty = penalty * is_bump
+    value_penalty = penalty * is_step
+    # W = (Psi' Psi / N + D)⁻¹ Psi' Phi / N.
+    normal_matrix = features.mT @ features / n + np.diag(feature_penalty)
+    eigenvalues = np.linalg.eigvalsh(normal_matrix)
+    smallest = eigenvalues[..., 0]
+    largest = eigenvalues[..., -1]
+    if (smallest < _SINGULAR * largest).any():
         raise ValueError(
-            "regularisation must be a positive value, for the basis functions are not "
+            "regularisation must be positive, since the basis functions are not "
             f"independent on these samples, got {penalty:g}"
         )
-    regression = np.linalg.solve(normal, features.mT @ values / n)
-    left = values - features @ regression
-    quadratic = (
-        left.mT @ left / n
-        + regression.mT @ (on_c[:, None] * regression)
-        + np.diag(on_a)
-    )
-    lower = np.where(np.arange(values.shape[-1]) == 0, _LEAST_SLOPE, 0.0)
-    a = _nonnegative(quadratic, rates, lower)
-    return -np.asarray((regression @ a[..., None])[..., 0]), a
+    regression = np.linalg.solve(normal_matrix, features.mT @ values / n)
+    residual = values - features @ regression
+    # Q = R' R / N + W' D W + E for the residuals R = Phi - Psi W.
+    quadratic = residual.mT @ residual / n
+    weighted = feature_penalty[:, None] * regression
+    quadratic = quadratic + regression.mT @ weighted
+    quadratic = quadratic + np.diag(value_penalty)
+    lower = np.where(is_step, 0.0, _LEAST_SLOPE)
+    slopes = _minimise_nonnegative(quadratic, rates, lower)
+    # c = -W a.
+    weights = -multiply_vector(regression, slopes)
+    return weights, slopes
 
 
-def _nonnegative(quadratic: Array, rates: Array, lower: Array) -> Array:
-    """Minimise a'Qa / 2 - mean(log(rates a)) over a >= lower by projected Newton steps.
+def _loss(a: Array, quadratic: Array, rates: Array) -> Array:
+    """Return a'Qa / 2 - mean(log(rates a)), (...)."""
+    column = a[..., None]
+    row = a[..., None, :]
+    form = 0.5 * (row @ quadratic @ column)[..., 0, 0]
+    logs = np.log(multiply_vector(rates, a))
+    return np.asarray(form - logs.mean(axis=-1))
 
-    Each is halved, in each run, until the objective falls enough.
-    """
 
-    def loss(c: Array) -> Array:
-        form = 0.5 * (c[..., None, :] @ quadratic @ c[..., None])[..., 0, 0]
-        return np.asarray(form - np.log((rates @ c[..., None])[..., 0]).mean(axis=-1))
-
-    r = quadratic.shape[-1]
+def _minimise_nonnegative(quadratic: Array, rates: Array, lower: Array) -> Array:
+    """Minimise a'Qa / 2 - mean(log(rates a)) over a >= lower by projected Newton steps."""
     n = rates.shape[-2]
+    identity = np.eye(quadratic.shape[-1])
+    # The best affine map without steps, a_0 = Q_00^(-1/2), is the start.
     a = np.broadcast_to(lower, quadratic.shape[:-1]).copy()
-    a[..., 0] = np.maximum(lower[0], 1 / np.sqrt(quadratic[..., 0, 0]))
+    affine_slope = 1 / np.sqrt(quadratic[..., 0, 0])
+    a[..., 0] = np.maximum(lower[0], affine_slope)
     for _ in range(_ITERATIONS):
+        # Gradient Q a - mean(r_i / r_i'a) and Hessian Q + mean(r_i r_i' / (r_i'a)²).
         ratio = rates / (rates @ a[..., None])
-        gradient = (quadratic @ a[..., None])[..., 0] - ratio.mean(axis=-2)
-        free = (a > lower) | (gradient < 0)
+        gradient = multiply_vector(quadratic, a) - ratio.mean(axis=-2)
         hessian = quadratic + ratio.mT @ ratio / n
-        # Held coefficients get a row of the identity, and so a step of zero.
-        system = np.where(free[..., :, None] & free[..., None, :], hessian, np.eye(r))
-        slope = np.where(free, gradient, 0.0)
-        step = -np.linalg.solve(system, slope[..., None])[..., 0]
-        start = a
-        before = loss(a)
-        t = np.ones(a.shape[:-1])
-        for _ in range(40):
-            a = np.maximum(lower, start + t[..., None] * step)
-            wanted = 1e-4 * (gradient * (a - start)).sum(axis=-1)
-            # Near the minimum the fall is lost in rounding.
-            good = loss(a) <= before + wanted + 1e-14 * (1 + np.abs(before))
-            if good.all():
-                break
-            t = np.where(good, t, 0.5 * t)
-        if (-(slope * step).sum(axis=-1) < 1e-13).all():
+        # A coefficient at its bound is fixed if the loss increases inwards. It gets a row of the
+        # identity, and so a step of zero.
+        free = (a > lower) | (gradient < 0)
+        both_free = free[..., :, None] & free[..., None, :]
+        system = np.where(both_free, hessian, identity)
+        free_gradient = np.where(free, gradient, 0.0)
+        solution = np.linalg.solve(system, free_gradient[..., None])
+        step = -solution[..., 0]
+        a = _search_projected(a, step, gradient, quadratic, rates, lower)
+        # The Newton decrement bounds the distance from the minimum.
+        decrement = -(free_gradient * step).sum(axis=-1)
+        if (decrement < 1e-13).all():
             return a
     raise SolverError(f"separable: no minimum of (12) after {_ITERATIONS} Newton steps")
+
+
+def _search_projected(
+    start: Array,
+    step: Array,
+    gradient: Array,
+    quadratic: Array,
+    rates: Array,
+    lower: Array,
+) -> Array:
+    """Halve the projected step, in each run, until the loss decreases enough."""
+    before = _loss(start, quadratic, rates)
+    rounding = 1e-14 * (1 + np.abs(before))
+    length = np.ones(start.shape[:-1])
+    for _ in range(_HALVINGS):
+        a = np.maximum(lower, start + length[..., None] * step)
+        # Armijo's condition; near the minimum the decrease is lost in rounding.
+        expected = 1e-4 * (gradient * (a - start)).sum(axis=-1)
+        accepted = _loss(a, quadratic, rates) <= before + expected + rounding
+        if accepted.all():
+            break
+        length = np.where(accepted, length, 0.5 * length)
+    return a
 
 
 def invert(
@@ -366,13 +463,13 @@ def invert(
 ) -> Array:
     """Solve ``function(v) = target`` by Newton's method inside a shrinking bracket.
 
-    The function gives values and positive slopes, element by element. A Newton step that would
-    leave the bracket is replaced by a bisection, so the iteration converges.
+    The function returns values and positive derivatives, element by element. A Newton step that
+    would leave the bracket is replaced by a bisection, so the iteration converges.
 
     Raises
     ------
     SolverError
-        If the iteration does not settle, as where a target is not a number.
+        If the iteration does not converge, for instance if a target is NaN.
 
     Examples
     --------
@@ -381,21 +478,23 @@ def invert(
     array([-2. ,  0.5])
     """
     v = 0.5 * (low + high)
-    moved = high - low
+    last_change = high - low
     for _ in range(2 * _ITERATIONS):
-        value, slope = function(v)
-        gap = value - target
-        low = np.where(gap <= 0, v, low)
-        high = np.where(gap >= 0, v, high)
-        newton = v - gap / slope
-        step = np.abs(newton - v)
-        enough = 1e-13 * (1 + np.abs(v))
-        # A step that has settled may stand on an end of its bracket; any other has to be inside
-        # and half as long as the last, or Newton's method could go to and fro for ever.
-        good = (newton > low) & (newton < high) & (step <= 0.5 * moved)
-        new = np.where(good | (step <= enough), newton, 0.5 * (low + high))
-        moved = np.abs(new - v)
+        value, derivative = function(v)
+        error = value - target
+        # The function increases, so the error's sign says on which side the root lies.
+        low = np.where(error <= 0, v, low)
+        high = np.where(error >= 0, v, high)
+        newton = v - error / derivative
+        change = np.abs(newton - v)
+        tolerance = 1e-13 * (1 + np.abs(v))
+        # A converged step may end on the bracket; any other has to be inside it and half as long
+        # as the last, or Newton's method could alternate for ever.
+        inside = (newton > low) & (newton < high)
+        trusted = inside & (change <= 0.5 * last_change)
+        new = np.where(trusted | (change <= tolerance), newton, 0.5 * (low + high))
+        last_change = np.abs(new - v)
         v = new
-        if (moved <= enough).all():
+        if (last_change <= tolerance).all():
             return np.asarray(v)
-    raise SolverError("separable: the map's inverse did not settle at all targets")
+    raise SolverError("separable: the map's inverse did not converge at all targets")

@@ -1,4 +1,4 @@
-"""Updates: what an ensemble makes of an observation, ``(ensemble, predicted, observed, noise)``."""
+"""Updates of an ensemble by an observation, ``(ensemble, predicted, observed, noise)``."""
 
 from .decorator import update, with_missing
 from .gaussian import (
@@ -25,24 +25,24 @@ from .wrappers import (
 )
 
 __all__ = [
-    "with_augmentation",
     "effective_size",
-    "etpf",
-    "enkf_exact",
-    "with_inflation",
-    "jitter",
     "enkf",
-    "with_localization",
+    "enkf_exact",
+    "enkf_sampled_covariance",
+    "etkf",
+    "etpf",
+    "jitter",
     "principal_components",
     "principal_directions",
-    "with_projection",
     "resample",
-    "with_retraction",
-    "stochastic_forecast",
-    "enkf_sampled_covariance",
     "serially",
-    "etkf",
+    "stochastic_forecast",
     "transport_map_update",
     "update",
+    "with_augmentation",
+    "with_inflation",
+    "with_localization",
     "with_missing",
+    "with_projection",
+    "with_retraction",
 ]

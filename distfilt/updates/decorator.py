@@ -17,10 +17,11 @@ from typing import Annotated, Any, TypeVar, cast
 import numpy as np
 
 from ..ensembles import Ensemble
-from ..linalg import cholesky, leading
+from ..linalg import cholesky, broadcast_leading
 from ..validation import (
     ALLOW_NAN,
     Array,
+    ArrayInput,
     Indices,
     InvalidArgumentError,
     Mask,
@@ -48,8 +49,8 @@ Update = Callable[..., Array]
 
 _KINDS = (
     Ensemble,
-    Annotated[Array, "... N m"],
-    Annotated[Array, "... m"],
+    Annotated[ArrayInput, "... N m"],
+    Annotated[ArrayInput, "... m"],
     Annotated[PositiveDefinite, "... m m"],
 )
 """Kinds of an update's first four arguments, whatever their own annotations are."""
@@ -121,7 +122,7 @@ def _share_leading_axes(arrays: dict[str, Array]) -> dict[str, Array]:
     names = (name_predicted, name_observed, name_noise)
     for name, axes in zip(names, leads, strict=True):
         # The ensemble's axes are the result's: no other argument may add to them.
-        if leading(lead, axes, name) != lead:
+        if broadcast_leading(lead, axes, name) != lead:
             raise ValueError(f"{name} must have leading axes {lead}, got {axes}")
     return {
         name_predicted: np.broadcast_to(predicted, (*lead, *predicted.shape[-2:])),
@@ -179,8 +180,8 @@ def perturb_observations(
 def with_missing(
     update: Update,
     ensemble: Ensemble,
-    predicted: Annotated[Array, "... N m", ALLOW_NAN],
-    observed: Annotated[Array, "... m", ALLOW_NAN],
+    predicted: Annotated[ArrayInput, "... N m", ALLOW_NAN],
+    observed: Annotated[ArrayInput, "... m", ALLOW_NAN],
     noise: Annotated[PositiveDefinite, "... m m"],
     *,
     rng: Rng,

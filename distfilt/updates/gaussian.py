@@ -6,8 +6,8 @@ With the sample covariances :math:`\hat{\mathbf C}` of members and predictions, 
 .. math:: \mathbf x_i' = \mathbf x_i + \mathbf K(\mathbf y^* - \mathbf h(\mathbf x_i) - \zeta_i),
     \qquad \mathbf K = \hat{\mathbf C}_{xh}(\hat{\mathbf C}_{hh} + \mathbf R)^{-1}.
 
-What differs is what stands for R in the gain, and how the draws are made. In a forecast the members
-meet the model's noise, plainly drawn or exact to second order.
+The updates differ in the estimate of R in the gain and in the draws. A forecast adds the model's
+noise to the members, by independent draws or exact to second order.
 """
 
 from __future__ import annotations
@@ -23,40 +23,46 @@ from ..validation import Array, NonNegativeFloat, Rng, validated
 from .decorator import perturb_observations, update
 
 __all__ = [
-    "enkf_exact",
-    "exact_forecast",
     "enkf",
-    "stochastic_forecast",
+    "enkf_exact",
     "enkf_sampled_covariance",
     "etkf",
+    "exact_forecast",
+    "stochastic_forecast",
 ]
 
-Members = Annotated[Ensemble, "... n model.dim"]
+ModelEnsemble = Annotated[Ensemble, "... n model.dim"]
+"""At least two members with a model's number of components."""
 
 
-def _gain(a: Array, b: Array, noise: Array | float = 0.0) -> Array:
-    """The gain transposed, (..., m, d), of anomalies: one solve for all members."""
-    return solve_definite(b.mT @ b + (a.shape[-2] - 1) * noise, b.mT @ a)
+def _transposed_gain(
+    anomalies: Array, predicted_anomalies: Array, noise: Array | float = 0.0
+) -> Array:
+    """Return the gain transposed, K' = (C_hh + R)⁻¹ C_hx, (..., m, d), by a solve."""
+    # Both covariances times N - 1, which cancels.
+    scaled_noise = (anomalies.shape[-2] - 1) * noise
+    innovation_covariance = predicted_anomalies.mT @ predicted_anomalies + scaled_noise
+    return solve_definite(innovation_covariance, predicted_anomalies.mT @ anomalies)
 
 
 @update
 def enkf_sampled_covariance(
     ensemble: Array, predicted: Array, observed: Array, noise: Array, *, rng: Rng
 ) -> Array:
-    r"""The ensemble Kalman filter's update with both covariances sampled, perturbations included.
+    r"""Update with the sample covariances of the perturbed predictions in the gain.
 
     The gain is :math:`\hat{\mathbf\Sigma}_{xy}\hat{\mathbf\Sigma}_{yy}^{-1}` of the perturbed
     predictions :math:`\mathbf y_i = \mathbf h(\mathbf x_i)+\zeta_i`: the composed affine map of
-    Grange et al. computes the same. Chance correlations of members and draws enter the gain, so a
-    small ensemble loses its spread; :func:`enkf` does not.
+    Grange et al. gives the same result. Chance correlations of members and draws enter the gain, so
+    a small ensemble loses its spread; with :func:`enkf` it does not.
 
     Parameters
     ----------
     ensemble : array_like, (..., N, d)
         Forecast members, more than m.
     predicted : array_like, (..., N, m)
-        What each member would observe, without noise. For a reading that wraps, on the branch of
-        the observation: ``observed - sensor.residual(observed, h(x_i))``.
+        Each member's predicted observation, without noise. A circular component must be on the
+        branch of the observation: ``observed - sensor.residual(observed, h(x_i))``.
     observed : array_like, (..., m)
         The observation y*.
     noise : array_like, (m, m) or (..., m, m)
@@ -77,17 +83,20 @@ def enkf_sampled_covariance(
     (np.float64(1.0), np.float64(0.5))
     >>> enkf_sampled_covariance(np.eye(2), np.eye(2), [0.0, 0.0], np.eye(2), rng=rng)
     Traceback (most recent call last):
-    ValueError: ensemble must have at least 3 members for 2 readings, got 2
+    ValueError: ensemble must have at least 3 members for 2 observations, got 2
     """
-    members, m = predicted.shape[-2:]
-    if members <= m:
+    n, m = predicted.shape[-2:]
+    # The sample covariance of the perturbed predictions has rank N - 1 at most.
+    if n <= m:
         raise ValueError(
-            f"ensemble must have at least {m + 1} members for {m} readings, got {members}"
+            f"ensemble must have at least {m + 1} members for {m} observations, got {n}"
         )
-    drawn = perturb_observations(predicted, noise, rng)
-    b = center_ensemble(drawn)[1]
-    gain = _gain(center_ensemble(ensemble)[1], b)
-    return np.asarray(ensemble + (observed[..., None, :] - drawn) @ gain)
+    perturbed = perturb_observations(predicted, noise, rng)
+    anomalies = center_ensemble(ensemble)[1]
+    gain = _transposed_gain(anomalies, center_ensemble(perturbed)[1])
+    # x_i + K (y* - y_i), as rows.
+    innovations = observed[..., None, :] - perturbed
+    return np.asarray(ensemble + innovations @ gain)
 
 
 @update
@@ -100,17 +109,18 @@ def enkf(
     rng: Rng,
     centred: bool = False,
 ) -> Array:
-    r"""Update with R itself in the gain, where :func:`enkf_sampled_covariance` has a sample covariance.
+    r"""Update with perturbed observations and with R itself in the gain.
 
-    The chance correlations of the members with the drawn noise stay out of the gain, and
-    :math:`\hat{\mathbf C}_{hh}+\mathbf R` can be inverted for any number of members.
+    Chance correlations of the members with the drawn noise do not enter the gain, unlike in
+    :func:`enkf_sampled_covariance`, and :math:`\hat{\mathbf C}_{hh}+\mathbf R` can be inverted for
+    any number of members.
 
     Parameters
     ----------
     ensemble, predicted, observed, noise, rng
         As in :func:`enkf_sampled_covariance`; two members are enough.
     centred : bool
-        Take the draws' mean off, so that they do not move the ensemble's: worth having with ten or
+        Subtract the draws' mean, so that they do not change the ensemble's; this helps with ten or
         twenty members.
 
     Examples
@@ -121,10 +131,13 @@ def enkf(
     >>> posterior.mean().round(1), posterior.var().round(1)
     (np.float64(0.5), np.float64(0.5))
     """
-    drawn = perturb_observations(predicted, noise, rng, centred=centred)
-    gain = _gain(center_ensemble(ensemble)[1], center_ensemble(predicted)[1], noise)
-    out = np.subtract(observed[..., None, :], drawn, out=drawn) @ gain
-    return np.asarray(np.add(out, ensemble, out=out))
+    perturbed = perturb_observations(predicted, noise, rng, centred=centred)
+    anomalies = center_ensemble(ensemble)[1]
+    gain = _transposed_gain(anomalies, center_ensemble(predicted)[1], noise)
+    # x_i + K (y* - y_i), in place.
+    innovations = np.subtract(observed[..., None, :], perturbed, out=perturbed)
+    analysis = innovations @ gain
+    return np.asarray(np.add(analysis, ensemble, out=analysis))
 
 
 @update
@@ -136,28 +149,31 @@ def enkf_exact(
     The draws are centred over the members, orthogonal to the members' and the predictions'
     anomalies, and have the sample covariance R. The sampled gain then *is* the gain of
     :func:`enkf`, and :math:`\mathbf P^+=(\mathbf I-\mathbf K\mathbf H)\mathbf P` holds for
-    the sample covariances themselves: what is known is not sampled.
+    the sample covariances themselves: no known covariance is estimated.
 
     Parameters
     ----------
     ensemble, predicted, observed, noise, rng
-        As in :func:`enkf_sampled_covariance`; more than d + 2m members (d + m where the predictions are
-        linear in the members).
+        As in :func:`enkf_sampled_covariance`; more than d + 2m members (d + m if the predictions
+        are linear in the members).
 
     Examples
     --------
-    Halfway between prior and observation, with half the variance, whatever was drawn:
+    Halfway between prior and observation, with half the variance, for any draws:
 
     >>> prior = np.array([[-1.0], [0.0], [0.5], [0.5]])
     >>> after = enkf_exact(prior, prior, [1.0], [[0.5]], rng=np.random.default_rng(0))
     >>> float(after.mean().round(12)), float(after.var(ddof=1).round(12))
     (0.5, 0.25)
     """
-    a = center_ensemble(ensemble)[1]
-    b = center_ensemble(predicted)[1]
-    draws = exact_noise(np.concatenate([a, b], axis=-1), cholesky(noise), rng)
-    gain = _gain(a, b, noise)
-    return np.asarray(ensemble + (observed[..., None, :] - predicted - draws) @ gain)
+    anomalies = center_ensemble(ensemble)[1]
+    predicted_anomalies = center_ensemble(predicted)[1]
+    # Orthogonal to both, so that no sample covariance with the draws enters P+.
+    both = np.concatenate([anomalies, predicted_anomalies], axis=-1)
+    draws = exact_noise(both, cholesky(noise), rng)
+    gain = _transposed_gain(anomalies, predicted_anomalies, noise)
+    innovations = observed[..., None, :] - predicted - draws
+    return np.asarray(ensemble + innovations @ gain)
 
 
 @update
@@ -170,21 +186,21 @@ def etkf(
     rng: Rng,
     rotation: Literal["random", "none"] = "random",
 ) -> Array:
-    r"""Update mean and anomalies without perturbations, then turn the anomalies at random.
+    r"""Update mean and anomalies without perturbations, then rotate the members at random.
 
     With the whitened predictions :math:`\mathbf s_i=\mathbf R^{-1/2}(\mathbf h(\mathbf x_i)
     -\bar{\mathbf h})/\sqrt{N-1}` as the rows of S, the mean moves by the Kalman gain and the
     anomalies are multiplied by :math:`(\mathbf I+\mathbf S\mathbf S^\top)^{-1/2}`, the symmetric
     root, which leaves their mean at zero. A random rotation of the members that keeps the vector
-    of ones changes neither mean nor covariance, and mixes away the outliers that repeated
-    deterministic updates of a nonlinear model breed.
+    of ones changes neither mean nor covariance. It removes the outliers that repeated deterministic
+    updates of a nonlinear model produce.
 
     Parameters
     ----------
     ensemble, predicted, observed, noise, rng
         As in :func:`enkf_sampled_covariance`; two members are enough.
     rotation : {"random", "none"}
-        Whether the anomalies are turned.
+        Whether the members are rotated.
 
     Notes
     -----
@@ -199,47 +215,57 @@ def etkf(
     (1.0, 1.0)
     """
     n = ensemble.shape[-2]
-    (centre, a) = center_ensemble(ensemble)
-    (seen, b) = center_ensemble(predicted)
-    gain = _gain(a, b, noise)
+    mean, anomalies = center_ensemble(ensemble)
+    predicted_mean, predicted_anomalies = center_ensemble(predicted)
+    gain = _transposed_gain(anomalies, predicted_anomalies, noise)
+    # S = U D V', so (I + S S')^(-1/2) = I + U ((1 + D²)^(-1/2) - 1) U'.
     root = np.linalg.cholesky(noise)
-    white = np.linalg.solve(root, b.mT).mT / np.sqrt(n - 1)
-    left, sizes, _ = np.linalg.svd(white, full_matrices=False)
-    shrink = 1 / np.sqrt(1 + sizes**2) - 1
-    spread = a + (left * shrink[..., None, :]) @ (left.mT @ a)
+    whitened = np.linalg.solve(root, predicted_anomalies.mT).mT / np.sqrt(n - 1)
+    u, sizes, _ = np.linalg.svd(whitened, full_matrices=False)
+    shrinkage = 1 / np.sqrt(1 + sizes**2) - 1
+    anomalies = anomalies + (u * shrinkage[..., None, :]) @ (u.mT @ anomalies)
+    # Two centred members have one direction only.
     if rotation == "random" and n > 2:
-        spread = _turned(spread, rng)
-    return np.asarray(centre + (observed[..., None, :] - seen) @ gain + spread)
+        anomalies = _rotate_members(anomalies, rng)
+    shift = (observed[..., None, :] - predicted_mean) @ gain
+    return np.asarray(mean + shift + anomalies)
 
 
-def _turned(spread: Array, rng: Rng) -> Array:
-    """Anomalies (..., N, d) after a random rotation of the members that keeps the vector of ones.
+def _rotate_members(anomalies: Array, rng: Rng) -> Array:
+    """Apply a random rotation of the members (..., N, d) that keeps the vector of ones.
 
-    Random signs and cosine transforms in turn, in the space of centred members: orthogonal to
-    rounding, in N log N steps where a random matrix takes N cubed.
+    Random signs and cosine transforms alternate in the space of centred members: orthogonal to
+    rounding, in N log N steps instead of the N³ of a random matrix.
     """
     from scipy.fft import dct
 
-    n = spread.shape[-2]
-    # A reflection takes the direction of ones to the first unit vector, and is its own inverse.
+    n = anomalies.shape[-2]
+    # The reflection I - 2 v v' takes the direction of ones to the first unit vector and is its
+    # own inverse. The other coordinates are those of the centred members.
     v = np.full(n, -1 / np.sqrt(n))
     v[0] += 1
     v /= np.linalg.norm(v)
-    out = spread - 2 * v[:, None] * (v @ spread)[..., None, :]
-    rest = out[..., 1:, :]
+    reflected = anomalies - 2 * v[:, None] * (v @ anomalies)[..., None, :]
+    first = reflected[..., :1, :]
+    rotated = reflected[..., 1:, :]
     for _ in range(3):
-        signs = np.copysign(1.0, rng.standard_normal((*rest.shape[:-1], 1)))
-        rest = dct(signs * rest, norm="ortho", axis=-2)
-    signs = np.copysign(1.0, rng.standard_normal((*rest.shape[:-1], 1)))
-    out = np.concatenate([out[..., :1, :], signs * rest], axis=-2)
-    return np.asarray(out - 2 * v[:, None] * (v @ out)[..., None, :])
+        rotated = dct(_draw_signs(rotated, rng) * rotated, norm="ortho", axis=-2)
+    rotated = _draw_signs(rotated, rng) * rotated
+    reflected = np.concatenate([first, rotated], axis=-2)
+    return np.asarray(reflected - 2 * v[:, None] * (v @ reflected)[..., None, :])
+
+
+def _draw_signs(x: Array, rng: Rng) -> Array:
+    """Draw a sign for each row of x (..., N, d), (..., N, 1)."""
+    normal = rng.standard_normal((*x.shape[:-1], 1))
+    return np.copysign(1.0, normal)
 
 
 @validated
 def stochastic_forecast(
-    ensemble: Members, model: Model, t: float, dt: NonNegativeFloat, *, rng: Rng
+    ensemble: ModelEnsemble, model: Model, t: float, dt: NonNegativeFloat, *, rng: Rng
 ) -> Array:
-    """Move every member with the model and add an independent draw of the noise, (..., N, d).
+    """Forecast every member by the model, with an independent draw of its noise, (..., N, d).
 
     Parameters
     ----------
@@ -247,7 +273,7 @@ def stochastic_forecast(
         Members at time `t`.
     model : Model
     t, dt : float
-        From when, and how far, in s.
+        Start and length of the forecast, in s.
     rng : numpy.random.Generator
 
     Examples
@@ -258,20 +284,23 @@ def stochastic_forecast(
     ... ).ravel()
     array([1., 2.])
     """
-    moved = model.step(ensemble, t, dt)
+    forecast = model.step(ensemble, t, dt)
     root = model.noise_sqrt(t, dt)
+    # Without noise nothing is drawn.
     if not np.count_nonzero(root):
-        return moved
-    return moved + rng.standard_normal(moved.shape) @ np.ascontiguousarray(root.T)
+        return forecast
+    # w_i = L xi_i with Q = L L'.
+    normal = rng.standard_normal(forecast.shape)
+    return forecast + normal @ np.ascontiguousarray(root.T)
 
 
 @validated
 def exact_forecast(
-    ensemble: Members, model: Model, t: float, dt: NonNegativeFloat, *, rng: Rng
+    ensemble: ModelEnsemble, model: Model, t: float, dt: NonNegativeFloat, *, rng: Rng
 ) -> Array:
-    r"""Move the members and add noise that is exact to second order.
+    r"""Forecast the members by the model, with noise that is exact to second order.
 
-    The draws are centred, orthogonal to the moved members' anomalies, and have the sample
+    The draws are centred, orthogonal to the forecast members' anomalies, and have the sample
     covariance Q: for a linear model the sample covariance becomes
     :math:`\boldsymbol\Phi\mathbf P\boldsymbol\Phi^\top+\mathbf Q` to rounding.
 
@@ -284,16 +313,18 @@ def exact_forecast(
     --------
     >>> walk = Model(1, lambda x, t, dt: x, lambda t, dt: np.array([[dt]]))
     >>> x = np.array([[-1.0], [0.0], [0.5], [0.5]])
-    >>> moved = exact_forecast(x, walk, 0.0, 0.5, rng=np.random.default_rng(0))
-    >>> bool(abs(moved.mean()) < 1e-12), float(moved.var(ddof=1).round(12))
+    >>> forecast = exact_forecast(x, walk, 0.0, 0.5, rng=np.random.default_rng(0))
+    >>> bool(abs(forecast.mean()) < 1e-12), float(forecast.var(ddof=1).round(12))
     (True, 1.0)
     """
-    moved = model.step(ensemble, t, dt)
+    forecast = model.step(ensemble, t, dt)
     root = model.noise_sqrt(t, dt)
+    # Without noise nothing is drawn.
     if not root.any():
-        return moved
-    bad = ~np.isfinite(moved).all(axis=(-2, -1), keepdims=True)
-    clean = np.where(bad, ensemble, moved)
-    noisy = clean + exact_noise(center_ensemble(clean)[1], root, rng)
-    # Members that the model lost stay lost, and do not take the others' noise with them.
-    return np.where(bad, np.nan, noisy)
+        return forecast
+    # An ensemble with a member that is not finite has no sample covariance. Its prior takes its
+    # place in the draws, so that the noise of the others does not depend on it.
+    failed = ~np.isfinite(forecast).all(axis=(-2, -1), keepdims=True)
+    finite = np.where(failed, ensemble, forecast)
+    noisy = finite + exact_noise(center_ensemble(finite)[1], root, rng)
+    return np.where(failed, np.nan, noisy)

@@ -1,4 +1,4 @@
-"""Weighted particles: weights from likelihoods, systematic resampling, jitter, and collapse."""
+"""Weighted particles: weights by likelihoods, systematic resampling, jitter, and collapse."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import warnings
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..coupling.transform import normalize_weights
-from ..linalg import cholesky, factor, log_sum, solve_lower
+from ..linalg import cholesky, factor, log_sum_exp, solve_lower
 from ..validation import (
     Array,
+    ArrayInput,
     Bounds,
+    Indices,
     Mask,
     PositiveSemidefinite,
     Probabilities,
@@ -23,18 +25,17 @@ from ..validation import (
 
 __all__ = ["ParticleCollapse", "effective_size", "jitter", "resample"]
 
-Indices = NDArray[np.intp]
 Bandwidth = Annotated[float, Bounds(above=0, at_most=1)]
 
 
 class ParticleCollapse(RuntimeWarning):
-    """A belief rests on few members: the others are copies, or have no weight."""
+    """A belief depends on few members: the others are copies, or have no weight."""
 
 
 def effective_size(log_weights: ArrayLike) -> Array:
-    r"""Effective sample size :math:`1/\sum_i w_i^2`: N for equal weights, 1 for a single one.
+    r"""Return the effective sample size :math:`1/\sum_i w_i^2`, between one and N.
 
-    It knows weights only: copies of one particle with equal weights count as N.
+    It depends on the weights only: copies of one particle with equal weights count as N.
 
     Parameters
     ----------
@@ -49,23 +50,21 @@ def effective_size(log_weights: ArrayLike) -> Array:
     return size_of(normalize_weights(log_weights))
 
 
-def size_of(w: Array) -> Array:
-    """Effective sample size of normalised weights."""
-    return np.asarray(1 / (w * w).sum(axis=-1))
+def size_of(weights: Array) -> Array:
+    """Return the effective sample size of normalised weights."""
+    return np.asarray(1 / (weights * weights).sum(axis=-1))
 
 
-def warn_of_collapse(what: str, option: str) -> None:
-    """Tell whoever called a filter, or an update, that what it believes rests on few members."""
-    text = (
-        f"{what}; more members, {option}, or more process noise keep its belief alive"
-    )
+def warn_of_collapse(problem: str, option: str) -> None:
+    """Warn the caller of a filter, or of an update, that a belief depends on few members."""
+    text = f"{problem}; use more members, {option}, or more process noise"
     warnings.warn(text, ParticleCollapse, stacklevel=4)
 
 
 def warn_of_weights(
     log_weights: Array, predicted: Array, observed: Array, noise: Array
 ) -> None:
-    """Warn where one member has all the weight, or the reading is beyond what members believe.
+    """Warn if one member has all the weight, or the observation is far from all predictions.
 
     >>> two = np.array([[0.0, -99.0], [0.0, 0.0]]), np.array([[[0.0], [1.0]]] * 2)
     >>> with warnings.catch_warnings(action="error"):
@@ -75,34 +74,46 @@ def warn_of_weights(
     >>> with warnings.catch_warnings(action="error"):
     ...     warn_of_weights(0 * two[0], two[1], np.array([[np.nan], [9.0]]), np.eye(1))
     Traceback (most recent call last):
-    distfilt.updates.particles.ParticleCollapse: a reading's squared distance from an ensemble's ...
+    distfilt.updates.particles.ParticleCollapse: an observation's squared distance from an ...
     """
-    m = observed.shape[-1]
-    gap = observed - predicted.mean(axis=-2)
-    around = predicted - predicted.mean(axis=-2, keepdims=True)
-    cov = around.mT @ around / predicted.shape[-2] + noise
-    miss = (gap * np.linalg.solve(cov, gap[..., None])[..., 0]).sum(axis=-1)
-    least = size_of(np.exp(log_weights - log_sum(log_weights))).min(initial=np.inf)
+    weights = np.exp(log_weights - log_sum_exp(log_weights))
+    least = size_of(weights).min(initial=np.inf)
     if least < 1.1:
-        what = f"an ensemble's weights have an effective size of {least:.1f}"
-    elif (most := np.nanmax(miss, initial=0.0)) > m + 10 * np.sqrt(2 * m):
-        what = f"a reading's squared distance from an ensemble's belief is {most:.0f}, not {m}"
-    else:
+        problem = f"an ensemble's weights have an effective size of {least:.1f}"
+        warn_of_collapse(problem, "rejuvenation=")
         return
-    warn_of_collapse(what, "rejuvenation=")
+    m = observed.shape[-1]
+    largest = np.nanmax(_squared_distance(predicted, observed, noise), initial=0.0)
+    # It has a chi-squared distribution with mean m and variance 2 m: ten deviations.
+    if largest > m + 10 * np.sqrt(2 * m):
+        problem = (
+            f"an observation's squared distance from an ensemble's predictions is "
+            f"{largest:.0f}, not {m}"
+        )
+        warn_of_collapse(problem, "rejuvenation=")
+
+
+def _squared_distance(predicted: Array, observed: Array, noise: Array) -> Array:
+    """Return the squared Mahalanobis distance of each observation from its predictions, (...)."""
+    mean = predicted.mean(axis=-2, keepdims=True)
+    innovation = observed - mean[..., 0, :]
+    anomalies = predicted - mean
+    covariance = anomalies.mT @ anomalies / predicted.shape[-2] + noise
+    whitened = np.linalg.solve(covariance, innovation[..., None])[..., 0]
+    return np.asarray((innovation * whitened).sum(axis=-1))
 
 
 def repeat_by_count(points: Any, counts: Indices) -> Any:
-    """Rows of points (..., N, d), each as often as its count (..., N), N in all."""
+    """Repeat the rows of points (..., N, d), each as often as its count (..., N), N in all."""
     rows = points.reshape(-1, points.shape[-1])
     return np.repeat(rows, counts.reshape(-1), axis=0).reshape(points.shape)
 
 
 @validated
 def resample(probabilities: Annotated[Probabilities, "... n"], *, rng: Rng) -> Indices:
-    """Draw N indices, each as often as its weight says on average: systematic resampling.
+    """Draw N indices by systematic resampling, each N times its weight on average.
 
-    One random number serves all, so that an index appears within one of N times its weight.
+    One random number serves all, so that a count differs from N times the weight by less than one.
 
     Parameters
     ----------
@@ -124,22 +135,22 @@ def resample(probabilities: Annotated[Probabilities, "... n"], *, rng: Rng) -> I
     >>> resample([0.5, 0.0, 0.25, 0.25], rng=np.random.default_rng(0))
     array([0, 0, 2, 3])
     """
-    counts = systematic_counts(
-        probabilities, rng.random((*probabilities.shape[:-1], 1))
-    )
-    each = np.broadcast_to(np.arange(counts.shape[-1])[:, None], (*counts.shape, 1))
+    offset = rng.random((*probabilities.shape[:-1], 1))
+    counts = systematic_counts(probabilities, offset)
+    indices = np.arange(counts.shape[-1])[:, None]
+    each = np.broadcast_to(indices, (*counts.shape, 1))
     return np.asarray(repeat_by_count(each, counts)[..., 0])
 
 
-def systematic_counts(w: Array, offset: Array) -> Indices:
-    """How many of the levels (k + offset) / N each weight (..., N) holds."""
-    n = w.shape[-1]
-    # How many levels lie below each edge; the last edge has all of them.
-    levels = w.cumsum(axis=-1)
-    levels /= levels[..., -1:].copy()
-    levels *= n
-    levels -= offset
-    counts: Indices = np.ceil(levels, out=levels).astype(np.intp)
+def systematic_counts(weights: Array, offset: Array) -> Indices:
+    """Return the number of levels (k + offset) / N in the interval of each weight (..., N)."""
+    n = weights.shape[-1]
+    # The number of levels below each edge of the cumulative weights; the last edge has all.
+    edges = weights.cumsum(axis=-1)
+    edges /= edges[..., -1:].copy()
+    edges *= n
+    edges -= offset
+    counts: Indices = np.ceil(edges, out=edges).astype(np.intp)
     counts[..., -1] = n
     counts[..., 1:] -= counts[..., :-1]
     return counts
@@ -147,18 +158,18 @@ def systematic_counts(w: Array, offset: Array) -> Indices:
 
 @validated
 def jitter(
-    points: Annotated[Array, "... n d"],
+    points: Annotated[ArrayInput, "... n d"],
     *,
     rng: Rng,
     bandwidth: Bandwidth,
     cov: PositiveSemidefinite | None = None,
 ) -> Array:
-    r"""Move equally weighted particles apart without moving their mean or covariance.
+    r"""Add noise to equally weighted particles that keeps their mean and covariance on average.
 
     .. math:: \mathbf x_i' = \bar{\mathbf x} + \sqrt{1-h^2}\,(\mathbf x_i-\bar{\mathbf x})
         + h\,\mathbf C^{1/2}\boldsymbol\xi_i
 
-    Copies of one particle separate, which a model without noise never does for them.
+    Copies of one particle separate, which they would never do under a model without noise.
 
     Parameters
     ----------
@@ -167,13 +178,13 @@ def jitter(
     bandwidth : float
         The kernel's width h, in (0, 1].
     cov : array_like, (..., d, d), optional
-        C; by default the particles' own. When one weight dominated before resampling the copies
-        have none: pass the covariance of the unweighted particles.
+        C; by default the particles' covariance. If one weight dominated before resampling, the
+        copies have none: pass the covariance of the unweighted particles.
 
     Returns
     -------
     ndarray, (..., N, d)
-        Mean and covariance are kept on average where C is the particles' own.
+        Mean and covariance are kept on average if C is the particles' covariance.
 
     Notes
     -----
@@ -187,75 +198,88 @@ def jitter(
     4
     """
     if cov is None:
-        around = points - points.mean(axis=-2, keepdims=True)
-        cov = around.mT @ around / points.shape[-2]
+        anomalies = points - points.mean(axis=-2, keepdims=True)
+        cov = anomalies.mT @ anomalies / points.shape[-2]
     return add_jitter(points, cov, bandwidth, rng.standard_normal(points.shape))
 
 
 def silverman(n: int, d: int) -> float:
-    """The bandwidth for n particles of d components, at most one."""
-    return float(min(1.0, (4 / (n * (d + 2))) ** (1 / (d + 4))))
+    """Return Silverman's bandwidth for n particles of d components, at most one."""
+    bandwidth = (4 / (n * (d + 2))) ** (1 / (d + 4))
+    return float(min(1.0, bandwidth))
 
 
 def add_jitter(
-    x: Array, cov: Array, h: float, drawn: Array, copied: Mask | None = None
+    points: Array,
+    covariance: Array,
+    bandwidth: float,
+    normal: Array,
+    is_copy: Mask | None = None,
 ) -> Array:
-    """As :func:`jitter`, with standard normal draws.
+    """Add the noise of :func:`jitter`, made of standard normal draws.
 
-    Where it is known which were copied, these alone move: C. Musso, N. Oudjane, F. Le Gland, in the
-    same book, 247-271.
+    If it is known which particles are copies, only they are changed: C. Musso, N. Oudjane,
+    F. Le Gland, in the same book, 247-271.
     """
-    moved = drawn @ factor(cov).mT
-    if copied is not None:
-        return np.asarray(np.where(copied[..., None], x + h * moved, x))
-    centre = x.mean(axis=-2, keepdims=True)
-    return np.asarray(centre + np.sqrt(1 - h * h) * (x - centre) + h * moved)
+    noise = normal @ factor(covariance).mT
+    if is_copy is not None:
+        moved = points + bandwidth * noise
+        return np.asarray(np.where(is_copy[..., None], moved, points))
+    # The shrinkage takes as much covariance off as the noise adds.
+    mean = points.mean(axis=-2, keepdims=True)
+    shrinkage = np.sqrt(1 - bandwidth * bandwidth)
+    return np.asarray(mean + shrinkage * (points - mean) + bandwidth * noise)
 
 
 def reweight(
     log_weights: Array, predicted: Array, observed: Array, noise: Array
 ) -> Array:
-    """Log-weights (..., N), normalised, after a reading; refused where it rules out every point."""
+    """Return normalised log-weights (..., N) after an observation, by Bayes' rule.
+
+    Raises an error if all likelihoods are zero.
+    """
     joint = log_weights + log_likelihood(predicted, observed, noise)
-    total = log_sum(joint)
+    total = log_sum_exp(joint)
     if not all_finite(total):
         raise ArithmeticError("every particle has a likelihood of zero")
-    # A weight of zero is minus infinity; kept finite, so that it can be told from failure.
+    # A weight of zero stays finite, so that minus infinity marks a failure only.
     return np.asarray(np.maximum(joint - total, -1e300))
 
 
 def log_likelihood(predicted: Array, observed: Array, noise: Array) -> Array:
-    """Log-likelihood of each particle's prediction (..., N, m) but for a constant, (..., N)."""
+    """Return the log-likelihood of each particle's prediction (..., N, m), up to a constant."""
     # Components first: sums over a few of them then run along all particles.
-    gap = np.subtract(observed[..., None], predicted.mT, order="C")
-    cov = noise
-    if not all_finite(gap):
-        missing = np.asarray(np.isnan(gap).any(axis=-1))
-        # A missing component gets a zero residual and a unit of its own in R.
-        here = ~missing[..., :, None] & ~missing[..., None, :]
-        cov = np.where(here, noise, np.eye(noise.shape[-1]))
-        gap = np.where(missing[..., None], 0.0, gap)
-    # One solve with all particles as right-hand sides: the factor is the same for them.
-    half = np.ascontiguousarray(solve_lower(cholesky(cov), gap))
-    return np.asarray(-0.5 * (half * half).sum(axis=-2))
+    residual = np.subtract(observed[..., None], predicted.mT, order="C")
+    covariance = noise
+    if not all_finite(residual):
+        missing = np.asarray(np.isnan(residual).any(axis=-1))
+        # A missing component gets a zero residual and a unit variance of its own in R.
+        present = ~missing
+        both_present = present[..., :, None] & present[..., None, :]
+        covariance = np.where(both_present, noise, np.eye(noise.shape[-1]))
+        residual = np.where(missing[..., None], 0.0, residual)
+    # -|L⁻¹ r|² / 2 with R = L L': one solve with all particles as right-hand sides.
+    whitened = solve_lower(cholesky(covariance), residual)
+    whitened = np.ascontiguousarray(whitened)
+    return np.asarray(-0.5 * (whitened * whitened).sum(axis=-2))
 
 
 def distinct_fraction(points: Array) -> Array:
-    """Share of particles that differ from all before them in the component that tells most, (...).
+    """Return the fraction of particles that differ from all others, (...).
 
-    Mostly that is the first, but it may be known exactly.
+    They are compared in the component with the most changes from particle to particle. Mostly
+    that is the first, but it may be known exactly.
 
-    >>> one, other = (
-    ...     np.array([[0.0, 1.0], [0.0, 2.0]]),
-    ...     np.array([[1.0, 0.0], [2.0, 0.0]]),
-    ... )
-    >>> distinct_fraction(np.stack([one, other]))
+    >>> exact_first = np.array([[0.0, 1.0], [0.0, 2.0]])
+    >>> exact_last = np.array([[1.0, 0.0], [2.0, 0.0]])
+    >>> distinct_fraction(np.stack([exact_first, exact_last]))
     array([1., 1.])
     """
+    n = points.shape[-2]
     changes = (points[..., 1:, :] != points[..., :-1, :]).sum(axis=-2, keepdims=True)
-    x = np.sort(
-        np.take_along_axis(points, changes.argmax(axis=-1, keepdims=True), axis=-1)[
-            ..., 0
-        ]
-    )
-    return np.asarray((1 + (x[..., 1:] > x[..., :-1]).sum(axis=-1)) / points.shape[-2])
+    component = changes.argmax(axis=-1, keepdims=True)
+    values = np.take_along_axis(points, component, axis=-1)[..., 0]
+    # Of equal values, neighbours once they are sorted, one counts.
+    values = np.sort(values)
+    increases = (values[..., 1:] > values[..., :-1]).sum(axis=-1)
+    return np.asarray((1 + increases) / n)

@@ -1,4 +1,4 @@
-"""Updates by transport: maps of the joint ensemble of (y, x), and couplings of its weights."""
+"""Updates by transport: maps of the joint ensemble of (y, x), and couplings of weighted members."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from ..validation import (
     NonNegativeFloat,
     PositiveInt,
     Rng,
+    call_user,
     validated,
 )
 from .decorator import perturb_observations, update
@@ -34,8 +35,16 @@ Fit = Callable[[Array, Array], ConditionalMap]
 """``fit(y, x) -> map``: an estimator of the map that takes the samples to the reference."""
 
 
-def _noisy(seen: Array, noise: Array, factor: float, rng: Rng) -> Array:
-    return perturb_observations(seen, factor**2 * noise, rng) if factor else seen
+def _perturb(predicted: Array, noise: Array, factor: float, rng: Rng) -> Array:
+    """Add a draw of the noise, times a factor, to each prediction; with zero nothing is drawn."""
+    if not factor:
+        return predicted
+    return perturb_observations(predicted, factor**2 * noise, rng)
+
+
+def _condition(fit: Fit, predicted: Array, members: Array, observed: Array) -> Array:
+    """Fit a map to samples (y, x), and condition them on an observation by the composed map."""
+    return compose(call_user(fit, predicted, members), predicted, members, observed)
 
 
 @update
@@ -57,14 +66,14 @@ def transport_map_update(
     Parameters
     ----------
     ensemble, predicted, observed, noise, rng
-        As in :func:`~distfilt.updates.enkf_sampled_covariance`; a draw of the noise is added to each
-        prediction.
+        As in :func:`~distfilt.updates.enkf_sampled_covariance`; a draw of the noise is added to
+        each prediction.
     fit : callable
         ``fit(y, x) -> map``: an estimator of the map, such as
         :func:`distfilt.triangular.separable.fit` with its options.
     noise_factor : float
-        By what the drawn noise is multiplied. Anything but one is a mistake; chapter 4 shows what
-        zero and a hundredth do.
+        Factor of the drawn noise. Any value but one is a mistake; chapter 4 shows the effect of
+        zero and of a hundredth.
 
     Examples
     --------
@@ -74,20 +83,20 @@ def transport_map_update(
     >>> posterior.mean().round(1), posterior.var().round(1)
     (np.float64(0.5), np.float64(0.5))
     """
-    seen = _noisy(predicted, noise, noise_factor, rng)
-    return compose(fit(seen, ensemble), seen, ensemble, observed)
+    perturbed = _perturb(predicted, noise, noise_factor, rng)
+    return _condition(fit, perturbed, ensemble, observed)
 
 
 @validated
 def principal_directions(ensemble: Ensemble, n: PositiveInt) -> Array:
-    """The `n` orthonormal directions of largest sample variance, as columns.
+    """Return the `n` orthonormal directions of largest sample variance, as columns.
 
     Parameters
     ----------
     ensemble : array_like, (..., N, d)
         Members.
     n : int
-        How many, at most d.
+        Number of directions, at most d.
 
     Examples
     --------
@@ -96,16 +105,17 @@ def principal_directions(ensemble: Ensemble, n: PositiveInt) -> Array:
     ... ).tolist()
     [[1.0], [0.0]]
     """
-    cov = sample_covariance(ensemble)
-    if not np.isfinite(cov).all():
+    covariance = sample_covariance(ensemble)
+    if not np.isfinite(covariance).all():
         raise ValueError("ensemble must have members of finite variance, got infinity")
-    Bounds(at_most=cov.shape[-1])(n, "n")
-    _, vectors = np.linalg.eigh(cov)
-    chosen = vectors[..., ::-1][..., :n]
-    largest = np.take_along_axis(
-        chosen, np.abs(chosen).argmax(axis=-2)[..., None, :], axis=-2
-    )
-    return np.asarray(chosen * np.sign(largest))
+    Bounds(at_most=covariance.shape[-1])(n, "n")
+    # Eigenvalues come in ascending order.
+    _, vectors = np.linalg.eigh(covariance)
+    directions = vectors[..., ::-1][..., :n]
+    # The sign is arbitrary: the largest entry becomes positive.
+    largest = np.abs(directions).argmax(axis=-2)
+    signs = np.sign(np.take_along_axis(directions, largest[..., None, :], axis=-2))
+    return np.asarray(directions * signs)
 
 
 @update
@@ -122,46 +132,45 @@ def principal_components(
     noise_factor: Factor = 1.0,
     fit: Fit = affine.fit,
 ) -> Array:
-    r"""Condition in the leading principal directions only, Algorithm 2 of Grange et al.
+    r"""Update in the leading principal directions only, Algorithm 2 of Grange et al.
 
     Parameters
     ----------
     ensemble, predicted, observed, noise, rng, noise_factor, fit
-        As in :func:`transport`.
+        As in :func:`transport_map_update`.
     n_state : int
-        Directions :math:`q_x` of the state that are updated, at most d.
+        Number :math:`q_x` of the state's directions that are updated, at most d.
     n_observed : int
-        Directions :math:`q_y` of the observations that are used; where there are fewer
-        observations, all of them.
+        Number :math:`q_y` of the observations' directions that are used; all of them if there are
+        fewer observations.
     complement : {"keep", "literal"}
-        What happens to the state outside the leading directions. ``"keep"`` leaves it as it was.
-        ``"literal"`` is line 8 as printed, which loses it, and the mean there too.
+        Treatment of the state outside the leading directions. ``"keep"`` leaves it unchanged.
+        ``"literal"`` is line 8 as printed, which sets it to zero, with the mean.
 
     Examples
     --------
     >>> rng = np.random.default_rng(3)
     >>> prior = rng.standard_normal((1000, 2)) * [2.0, 1.0]
-    >>> sees_x = prior[:, :1]
+    >>> predicted = prior[:, :1]
     >>> post = principal_components(
-    ...     prior, sees_x, [1.0], [[1.0]], rng=rng, n_state=1, n_observed=1
+    ...     prior, predicted, [1.0], [[1.0]], rng=rng, n_state=1, n_observed=1
     ... )
     >>> post.var(axis=0).round(1)
     array([0.8, 1. ])
     """
-    seen = _noisy(predicted, noise, noise_factor, rng)
-    m = seen.shape[-1]
-    d = ensemble.shape[-1]
-    Bounds(at_most=d)(n_state, "n_state")
-    v = principal_directions(seen, min(n_observed, m))
-    w = principal_directions(ensemble, n_state)
-    latent = ensemble @ w
-    reduced = seen @ v
-    aim = (observed[..., None, :] @ v)[..., 0, :]
-    moved = compose(fit(reduced, latent), reduced, latent, aim)
-    back = w.mT
+    perturbed = _perturb(predicted, noise, noise_factor, rng)
+    Bounds(at_most=ensemble.shape[-1])(n_state, "n_state")
+    n_observed = min(n_observed, perturbed.shape[-1])
+    observed_directions = principal_directions(perturbed, n_observed)
+    directions = principal_directions(ensemble, n_state)
+    # Coordinates in the leading directions.
+    latent = ensemble @ directions
+    latent_predicted = perturbed @ observed_directions
+    latent_observed = (observed[..., None, :] @ observed_directions)[..., 0, :]
+    analysis = _condition(fit, latent_predicted, latent, latent_observed)
     if complement == "literal":
-        return np.asarray(moved @ back)
-    return np.asarray(ensemble + (moved - latent) @ back)
+        return np.asarray(analysis @ directions.mT)
+    return np.asarray(ensemble + (analysis - latent) @ directions.mT)
 
 
 @update
@@ -175,17 +184,17 @@ def etpf(
     correct: bool = False,
     rejuvenation: NonNegativeFloat = 0.0,
 ) -> Array:
-    r"""Weigh the members by their likelihoods and transport the weights to equal ones, (3)-(5).
+    r"""Weight the members by their likelihoods and transport them to equal weights, (3)-(5).
 
-    Reich's ensemble transform particle filter: nothing is Gaussian but the noise of the reading,
-    and nothing is drawn.
+    Reich's ensemble transform particle filter: only the observation's noise has to be Gaussian, and
+    nothing is drawn.
 
     Parameters
     ----------
     ensemble : array_like, (..., N, d)
         Forecast members.
     predicted : array_like, (..., N, m)
-        What they would observe, without noise.
+        Their predicted observations, without noise.
     observed : array_like, (..., m)
         The observation y*.
     noise : array_like, (m, m) or (..., m, m)
@@ -195,7 +204,7 @@ def etpf(
     correct : bool
         Give the members the weighted covariance too.
     rejuvenation : float
-        h of :func:`distfilt.coupling.rejuvenated`; 0 draws nothing.
+        h of :func:`distfilt.coupling.rejuvenate`; 0 draws nothing.
 
     Returns
     -------
@@ -205,13 +214,13 @@ def etpf(
     Warns
     -----
     ParticleCollapse
-        If one member has nearly all the weight, so that the others become its copies, or the
-        reading is far beyond the spread that is left of the members.
+        If one member has nearly all the weight, so that the others become its copies, or if the
+        observation is far from all predictions.
 
     Raises
     ------
     SolverError
-        If a linear programme is not solved.
+        If the solver stops without a solution.
 
     Examples
     --------
@@ -221,9 +230,9 @@ def etpf(
     >>> posterior.mean().round(1), posterior.var().round(1)
     (np.float64(0.5), np.float64(0.5))
     """
-    logs = log_likelihood(predicted, observed, noise)
-    warn_of_weights(logs, predicted, observed, noise)
-    out = coupling.transform_ensemble(ensemble, logs, correct=correct)
+    log_weights = log_likelihood(predicted, observed, noise)
+    warn_of_weights(log_weights, predicted, observed, noise)
+    analysis = coupling.transform_ensemble(ensemble, log_weights, correct=correct)
     if not rejuvenation:
-        return out
-    return coupling.rejuvenate(out, ensemble, bandwidth=rejuvenation, rng=rng)
+        return analysis
+    return coupling.rejuvenate(analysis, ensemble, bandwidth=rejuvenation, rng=rng)

@@ -15,6 +15,7 @@ from .. import coupling
 from ..coupling.constraints import Constraint, Motion
 from ..validation import (
     Array,
+    ArrayInput,
     Bounds,
     Indices,
     NonNegativeFloat,
@@ -282,12 +283,12 @@ def serially(update: Update) -> Update:
 def with_localization(
     update: Update,
     *,
-    places: Annotated[Array, "d k"],
-    observation_places: Annotated[Array, "m k"],
+    places: Annotated[ArrayInput, "d k"],
+    observation_places: Annotated[ArrayInput, "m k"],
     radius: PositiveFloat,
     period: PositiveFloat | None = None,
 ) -> Update:
-    r"""Let each observation change near components only, the remedy for few members in high dimension.
+    r"""Let each observation change near components only: for few members in a large space.
 
     Observations are assimilated one after the other, as by :func:`serially`. The change that one
     makes in a component at distance r is multiplied by Gaspari and Cohn's function of r over
@@ -363,11 +364,11 @@ def gaspari_cohn(ratio: Array) -> Array:
     """Return the taper of covariances at ratios of distance to radius, zero from two on."""
     r = np.asarray(ratio)
     # (4.10): two polynomials of degree five, in Horner's form, that join smoothly at one.
-    near = 1 + r**2 * (-5 / 3 + r * (5 / 8 + r * (1 / 2 - r / 4)))
-    far = 4 + r * (-5 + r * (5 / 3 + r * (5 / 8 + r * (-1 / 2 + r / 12))))
+    inside = 1 + r**2 * (-5 / 3 + r * (5 / 8 + r * (1 / 2 - r / 4)))
+    outside = 4 + r * (-5 + r * (5 / 3 + r * (5 / 8 + r * (-1 / 2 + r / 12))))
     with np.errstate(divide="ignore"):
-        far = far - 2 / (3 * r)
-    return np.asarray(np.where(r <= 1, near, np.where(r < 2, far, 0.0)))
+        outside = outside - 2 / (3 * r)
+    return np.asarray(np.where(r <= 1, inside, np.where(r < 2, outside, 0.0)))
 
 
 def _one_by_one(update: Update, taper: Array | None) -> Update:
@@ -391,7 +392,7 @@ def _one_by_one(update: Update, taper: Array | None) -> Update:
             _check_taper(taper, d, predicted.shape[-1])
         # Predictions that are not made again move along, as components d to d + m of the state.
         carries_predictions = predict is None
-        for turn, group in enumerate(_correlated_groups(noise)):
+        for turn, group in enumerate(_group_correlated(noise)):
             if predict is not None and turn:
                 predicted = call_user(predict, ensemble)
             state = ensemble
@@ -432,7 +433,7 @@ def _check_taper(taper: Array, d: int, m: int) -> None:
         )
 
 
-def _correlated_groups(noise: Array) -> list[Indices]:
+def _group_correlated(noise: Array) -> list[Indices]:
     """Return the indices of observations with correlated noise, in the order of their first."""
     from scipy.sparse import csgraph, csr_array
 

@@ -143,7 +143,7 @@ def _convert_to_float64(value: Any, name: str) -> Array:
     try:
         parts = value if isinstance(value, list | tuple) else (value,)
         array = np.asarray(value)
-        entries = array.ravel() if array.dtype.kind == "O" else ()
+        entries: Any = array.ravel() if array.dtype.kind == "O" else ()
         if len(entries):
             wrong_type = type_name(entries[0])
         refused = [v for v in (*parts, *entries) if isinstance(v, _NOT_REAL)]
@@ -203,7 +203,7 @@ def check_positive_definite(value: Array, name: str) -> None:
     """
     _check_symmetric(value, name)
     if not _has_cholesky(value):
-        smallest = np.linalg.eigvalsh(_to_unit_variances(value))[..., 0]
+        smallest = _smallest_eigenvalues(value)
         _raise_not_positive(value, name, smallest, "definite")
 
 
@@ -218,7 +218,7 @@ def check_positive_semidefinite(value: Array, name: str) -> None:
     if _has_cholesky(value):
         return
     # Rounding alone may have made an eigenvalue negative.
-    smallest = np.linalg.eigvalsh(_to_unit_variances(value))[..., 0]
+    smallest = _smallest_eigenvalues(value)
     if smallest.min() < -_ROUNDING:
         _raise_not_positive(value, name, smallest, "semidefinite")
 
@@ -250,6 +250,12 @@ def _has_cholesky(value: Array) -> bool:
         np.linalg.cholesky(value)
         return True
     return False
+
+
+def _smallest_eigenvalues(value: Array) -> Array:
+    """Smallest eigenvalues of covariances that are scaled to unit variances."""
+    eigenvalues: Array = np.linalg.eigvalsh(_to_unit_variances(value))
+    return eigenvalues[..., 0]
 
 
 def _raise_not_positive(value: Array, name: str, smallest: Array, kind: str) -> None:

@@ -51,7 +51,8 @@ class FrozenModel:
     def construct(cls, *args: Any, **options: Any) -> Self:
         """Build an instance of values that the library made: nothing is checked or copied."""
         instance = object.__new__(cls)
-        names, factories = _fields(cls)
+        dataclass: Any = cls
+        names, factories = _fields(dataclass)
         values = vars(instance)
         values.update(zip(names, args, strict=False), **options)
         for name, factory in factories:
@@ -61,7 +62,8 @@ class FrozenModel:
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with other values in some fields, unchecked."""
-        names, _ = _fields(type(self))
+        cls: Any = type(self)
+        names, _ = _fields(cls)
         values = {name: getattr(self, name) for name in names}
         return self.construct(**values | changes)
 

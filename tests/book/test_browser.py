@@ -166,9 +166,9 @@ def asked(entries: list[dict[str, Any]], tab: str) -> list[str]:
 @contextmanager
 def chromium(profile: Path, **logs: str) -> Iterator[Any]:
     """A headless Chromium; where there is none the test is skipped, except in `CI`."""
-    if browser.installed() is None:
+    if browser.find_browser() is None:
         (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(
-            browser.ALLOW_NAN
+            browser.NOT_INSTALLED
         )
     with browser.chromium(profile, **logs) as found:
         yield found

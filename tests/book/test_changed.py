@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import execute
-from common import ROOT, VERDICT, pinned_environment
+from common import ROOT, VERDICT, fixed_environment
 
 PAGES = ("04-satellite-network.md", "04b-five-agents-and-a-pose.md")
 LINKS = (
@@ -54,8 +54,8 @@ def test_a_changed_scenario_runs_to_the_end_and_is_not_compared(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     folder = copied(tmp_path, changes)
-    lenient = {k: v for k, v in pinned_environment().items() if k != "BOOK_STRICT"}
-    monkeypatch.setattr(execute, "pinned_environment", lambda: lenient)
+    lenient = {k: v for k, v in fixed_environment().items() if k != "BOOK_STRICT"}
+    monkeypatch.setattr(execute, "fixed_environment", lambda: lenient)
     found = {}
     for page in PAGES:
         notebook = execute.read(folder / page)

@@ -161,9 +161,7 @@ def test_dask(folder: Path, script: Path, start: Start) -> None:
         folder / "log" / "fatal"
     ).touch()  # the worker of trial 20 dies, and nobody has to know
     said = killed(28, folder, start, DASK, machines[0])
-    assert re.search(
-        r"StudyError: .*trials that are done are in errors\.csv\.part", said
-    )
+    assert re.search(r"StudyError: .*finished trials are in errors\.csv\.part", said)
     assert not (folder / "log" / "fatal").exists()
     cluster()
     assert start(DASK).wait() == 0

@@ -26,7 +26,7 @@ from PIL import Image
 import execute
 import pairs
 from common import ROOT
-from pictures import difference, lighter, taken_out
+from pictures import difference, extract_pictures, shrink_picture
 
 TOOLS = ROOT / "book" / "tools"
 SMALL = Path(__file__).parent / "fixtures" / "small.md"
@@ -121,7 +121,7 @@ def shade(cell: Any) -> None:
 
 def exchange_frames(cell: Any) -> None:
     data = bundle(cell)
-    html, frames = taken_out(data["text/html"])
+    html, frames = extract_pictures(data["text/html"])
     assert (
         len(frames) == 4 and frames[0] == frames[2]
     )  # the first one shown, then all three
@@ -130,7 +130,7 @@ def exchange_frames(cell: Any) -> None:
         data["text/html"].replace(frames[1], "first").replace(frames[3], frames[1])
     )
     data["text/html"] = swapped.replace("first", frames[3])
-    assert taken_out(data["text/html"])[0] == html
+    assert extract_pictures(data["text/html"])[0] == html
 
 
 def source(old: str, new: str) -> Callable[[Any], None]:
@@ -212,8 +212,13 @@ def test_a_lighter_picture_shows_the_same() -> None:
     noise = np.random.default_rng(1).integers(0, 256, (200, 200, 3))
     few = as_png(noise // 64 * 80)
     many = as_png(noise)
-    assert len(lighter(few)) < 0.9 * len(few) and difference(lighter(few), few) == ""
-    assert lighter(many) == many and lighter(lighter(few)) == lighter(few)
+    assert (
+        len(shrink_picture(few)) < 0.9 * len(few)
+        and difference(shrink_picture(few), few) == ""
+    )
+    assert shrink_picture(many) == many and shrink_picture(
+        shrink_picture(few)
+    ) == shrink_picture(few)
 
 
 def clear(cell: Any) -> None:

@@ -1,4 +1,4 @@
-"""Every parameter of a scenario is read by a study or a chapter, or stands in its notes."""
+"""Every parameter of a scenario is read by a study or chapter, or is one of its notes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ NAMES = sorted(
 
 
 def code_of(path: Path) -> str:
-    """The Python of a script or of a chapter's cells."""
+    """Return the Python of a script or of a chapter's cells."""
     if path.suffix == ".py":
         return path.read_text(encoding="utf-8")
     return "\n".join(
@@ -31,26 +31,26 @@ def code_of(path: Path) -> str:
 
 @functools.cache
 def sources() -> list[set[str]]:
-    """What each chapter and script has as a text, or takes by a dot."""
+    """Return the strings and attributes in the code of each chapter and script."""
     paths = [*chapters(), *sorted((BOOK / "studies").glob("*.py"))]
     return [set(re.findall(r"[\"'.]([\w-]+)", code_of(path))) for path in paths]
 
 
-def wanted(paper: str, name: str) -> set[str]:
-    """The parameters, and the columns of the rows; a network is also taken as `adjacency`."""
-    s = scenario(paper, name)
+def readable_names(paper: str, name: str) -> set[str]:
+    """Return the names of the parameters and the columns of the tables."""
+    study = scenario(paper, name)
     columns = {
-        c for rows in s.tables.values() for row in rows for c in row.value_columns
+        c for rows in study.tables.values() for row in rows for c in row.value_columns
     }
-    return set(s) | columns - {"name", "unit"}
+    return set(study) | columns - {"name", "unit"}
 
 
 @pytest.mark.parametrize(("paper", "name"), NAMES)
 def test_every_parameter_is_read(paper: str, name: str) -> None:
-    found = set().union(*(words for words in sources() if {paper, name} <= words))
-    found |= {"neighbours"} if "adjacency" in found else set()
-    unread = sorted(wanted(paper, name) - found)
-    assert not unread, f"{paper}/{name}: read by nothing, so notes: {', '.join(unread)}"
+    mentioned = set().union(*(words for words in sources() if {paper, name} <= words))
+    mentioned |= {"neighbours"} if "adjacency" in mentioned else set()
+    unread = sorted(readable_names(paper, name) - mentioned)
+    assert not unread, f"{paper}/{name}: move to the notes: {', '.join(unread)}"
 
 
 def test_a_change_has_to_be_accepted(
@@ -62,5 +62,5 @@ def test_a_change_has_to_be_accepted(
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace("value = 200\n", "value = 50\n"), encoding="utf-8")
     assert tool.main([], tmp_path) == 1
-    assert "make accept" in capsys.readouterr().err
-    assert tool.main(["--accept"], tmp_path) == 0 == tool.main([], tmp_path)
+    assert "make update-scenarios" in capsys.readouterr().err
+    assert tool.main(["--update"], tmp_path) == 0 == tool.main([], tmp_path)

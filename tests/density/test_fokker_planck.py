@@ -97,5 +97,5 @@ def test_diffusion_that_varies_is_meant_in_the_sense_of_ito() -> None:
     )
     p = FokkerPlanck(swarm, grid).evolve(np.ones(200), [50.0, 1000.0])[-1]
     assert np.abs(p * (1 + grid.centres[:, 0]) * np.log(2) - 1).max() < 1e-5
-    with pytest.raises(ValueError, match="^times must be times after t0 = 0"):
+    with pytest.raises(ValueError, match="^times must be after t0 = 0"):
         FokkerPlanck(swarm, grid).evolve(np.ones(200), [0.0, 50.0])

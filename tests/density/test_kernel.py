@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from distfilt import density
-from distfilt.density.kernel import _least_squares, fine_enough
+from distfilt.density.kernel import _cross_validation_score, check_resolution
 
 GRID = density.Grid((20, 30))
 SOME = np.random.default_rng(1).random((40, 2))
@@ -94,7 +94,7 @@ def test_the_score_of_cross_validation_leaves_each_agent_out(apart: float) -> No
         for i in range(3)
     ]
     wanted = (p**2).sum() * GRID.volume - 2 * np.mean(left)
-    assert _least_squares(x, GRID, 0.04) == pytest.approx(wanted)
+    assert _cross_validation_score(x, GRID, 0.04) == pytest.approx(wanted)
 
 
 def test_cross_validation_has_the_least_score() -> None:
@@ -104,14 +104,14 @@ def test_cross_validation_has_the_least_score() -> None:
         (100, 2)
     )
     h = density.bandwidth(x, GRID, rule="least_squares")
-    least = _least_squares(x, GRID, h)
-    assert all(least < _least_squares(x, GRID, c * h) for c in (0.8, 1.25, 2.0))
+    least = _cross_validation_score(x, GRID, h)
+    assert all(least < _cross_validation_score(x, GRID, c * h) for c in (0.8, 1.25, 2.0))
     assert h < 0.7 * density.bandwidth(x, GRID)
 
 
 def test_a_cell_is_at_most_two_bandwidths_wide() -> None:
-    fine_enough(density.Grid((10, 10)), 0.05)
+    check_resolution(density.Grid((10, 10)), 0.05)
     with pytest.raises(
         ValueError, match="^grid must have cells no wider than two bandwidths, 0.08"
     ):
-        fine_enough(density.Grid((20, 10)), np.array([0.05, 0.04]))
+        check_resolution(density.Grid((20, 10)), np.array([0.05, 0.04]))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from distfilt import density
-from distfilt.density.sharing import SwarmSnapshot
+from distfilt.density.snapshot import SwarmSnapshot
 from distfilt.filters import DensityFilter
 from distfilt.models import Swarm, rotating_swarm
 from distfilt.network import Channel, graphs, weights
@@ -22,7 +22,7 @@ def test_noise_is_the_constant_times_a_density_that_is_nowhere_zero() -> None:
         np.where([[True]] * 5 + [[False]], X[0], np.nan), GRID, H, 0.0, (0, 5, 2)
     )
     p = np.random.default_rng(3).random((3, 100))
-    got = seen.noise(p, np.array([4.0, 9.0, 0.5, 1.0, 1.0, 7.0]), 0.3)
+    got = seen.noise_strength(p, np.array([4.0, 9.0, 0.5, 1.0, 1.0, 7.0]), 0.3)
     one = density.kernel_constant(GRID, bandwidth=H, agents=1)
     assert np.allclose(got[0], one / 4 * np.where(p[0] < 0.3, 0.3, p[0]), rtol=1e-14)
     assert np.isinf(got[1]).all() and np.allclose(

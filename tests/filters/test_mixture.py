@@ -99,5 +99,5 @@ def test_an_agreement_that_loses_definiteness_is_refused() -> None:
         ]
 
     f = MixtureFilter(SMALL, [None] * 2, graphs.path(2), target_dim=1, fusion=broken)
-    with pytest.raises(FilterError, match="agent 0, t = 1 s: .*mixand 0 of 1 "):
+    with pytest.raises(FilterError, match="agent 0, t = 1 s: .*component 0 of 1 "):
         f.step(f.start([OTHER, OTHER]), 1.0, [None, None])

@@ -139,7 +139,7 @@ def test_weights_of_a_run_that_failed_are_no_collapse(
     )
     start = f.start(PRIOR, rng=np.random.default_rng(0), runs=(2,))
     with pytest.warns(
-        ParticleCollapse, match="squared distance from an ensemble's belief"
+        ParticleCollapse, match="squared distance from an ensemble's predictions"
     ):
         assert f.step(start, 0.5, [[[0.3], [3e4]]]).failed.tolist() == [False, True]
 

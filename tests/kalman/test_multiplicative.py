@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg import block_diag
 
 from distfilt.kalman import QuaternionChart, filterpy_ekf, kalman_filter, mekf
-from distfilt.linalg import central
+from distfilt.linalg import central_difference
 from distfilt.models import Model, constant_velocity, satellite_pose, simulate
 from distfilt.models.quaternions import rotate
 from distfilt.sensors import component, range_bearing, stack
@@ -51,7 +51,7 @@ def test_a_quaternion_s_chart(dim: int, first: int) -> None:
     )
     assert np.allclose(np.delete(moved, range(first, first + 4), 1), others, atol=1e-15)
     for k in range(5):
-        numeric = central(
+        numeric = central_difference(
             lambda v, k=k: chart.retract(
                 np.broadcast_to(x[k], (*v.shape[:-1], dim)), v
             ),
@@ -128,8 +128,8 @@ def test_errors_move_by_the_derivative_of_the_flow_in_the_chart() -> None:
     def after(e: np.ndarray) -> np.ndarray:
         return model.step(before(e), 0.0, 0.8)
 
-    slope = central(lambda e: POSE.local(after(0 * e), after(e)), np.zeros(12))
-    change = central(lambda e: (after(e) - before(e))[..., [9, 11]], np.zeros(12))
+    slope = central_difference(lambda e: POSE.local(after(0 * e), after(e)), np.zeros(12))
+    change = central_difference(lambda e: (after(e) - before(e))[..., [9, 11]], np.zeros(12))
     there = after(np.zeros(12))
     both = block_diag(cov, POSE.project(after(np.zeros(12)), q))
     slope = np.hstack([slope, np.eye(12)])

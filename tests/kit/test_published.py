@@ -104,7 +104,7 @@ GOOD = 'title = "A study"\n' + GAIN + AGENT.format("A") + AGENT.format("B")
         (
             "neighbours = ['A', 'B']",
             "neighbours = ['A']",
-            "agents must be mutual neighbours",
+            r"agents: neighbours must be mutual, got 'A' for 'B' only",
         ),
     ],
 )
@@ -202,8 +202,8 @@ def test_a_scenario_prints_every_parameter_and_its_reason() -> None:
 
 
 def test_a_reading_remembers_what_was_taken() -> None:
-    one = S.reading()
-    two = S.reading()
+    one = S.track_reads()
+    two = S.track_reads()
     repr(one), one._repr_html_(), one.digest, one.changes
     first = one.agents[0]
     assert (
@@ -230,7 +230,7 @@ def used(study: Scenario) -> Scenario:
     ("item", "name"), [("Table II", "table-2"), ("Table III", "table-3")]
 )
 def test_what_a_study_took_is_read_as_printed(item: str, name: str) -> None:
-    found = judge_parameters("grange", item, used(scenario("grange", name).reading()))
+    found = judge_parameters("grange", item, used(scenario("grange", name).track_reads()))
     assert (found.verdict, found.why) == ("read", "")
     assert (
         judge_parameters("grange", item, table("grange", name)[::-1]).verdict == "read"
@@ -238,7 +238,7 @@ def test_what_a_study_took_is_read_as_printed(item: str, name: str) -> None:
 
 
 def test_a_cell_that_no_study_took_is_not_read() -> None:
-    study = S.reading()
+    study = S.track_reads()
     for a in study.agents:
         a.dims, a.noise, a.kind  # noqa: B018
     found = judge_parameters("grange", "Table II", study)
@@ -288,7 +288,7 @@ def test_every_claim_has_to_hold() -> None:
     differs = judge_claims("grange", "Fig. 1", DENIED, why="it is an EnKF")
     assert (differs.verdict, differs.why) == ("differs", "it is an EnKF")
     assert "pca-stable fails" in differs.ours
-    with pytest.raises(ValueError, match="^why must be a reason"):
+    with pytest.raises(ValueError, match="^why must give a reason"):
         judge_claims("grange", "Fig. 1", DENIED)
     for claims in (
         CLAIMS[:2],
@@ -337,12 +337,12 @@ def test_a_changed_scenario_is_not_compared() -> None:
         judge_claims("grange", "Fig. 1", CLAIMS, scenario=CHANGED),
         judge_claims("grange", "Fig. 1", DENIED, why="x", scenario=CHANGED),
         judge_parameters("grange", "Table II", ROWS, scenario=CHANGED),
-        judge_parameters("grange", "Table II", used(CHANGED.reading())),
+        judge_parameters("grange", "Table II", used(CHANGED.track_reads())),
     ):
         why = "changed scenario: gain: 0.1, not 0.05"
         assert (found.verdict, found.why) == ("not comparable", why)
         assert found.ours and found.published
-    for study in (None, S, S.reading()):
+    for study in (None, S, S.track_reads()):
         assert (
             judge_claims("grange", "Fig. 1", CLAIMS, scenario=study).verdict == "match"
         )

@@ -292,7 +292,7 @@ def test_parts_of_several_machines_merge(whole: Path, tmp_path: Path) -> None:
     assert (tmp_path / "a.csv.part").read_text().count("\n7,") == 1
     assert stored(tmp_path / "a.csv").read_bytes() == whole.read_bytes()
     stored(tmp_path / "b.csv", indices=[0], parameters={"size": 41})
-    with pytest.raises(ValueError, match="other code, parameters or versions"):
+    with pytest.raises(ValueError, match="must have the same code, parameters and"):
         studies.merge(
             tmp_path / "c.csv", tmp_path / "0.csv.part", tmp_path / "b.csv.part"
         )
@@ -335,9 +335,9 @@ def test_a_full_disk_is_named_and_loses_nothing(whole: Path, tmp_path: Path) -> 
     [
         (1e-9, {}, False),
         (1e-9, {"rtol": 1e-6}, True),
-        (1e-3, {"rtol": 1e-6, "odd": 2}, False),
+        (1e-3, {"rtol": 1e-6, "max_outliers": 2}, False),
         (1e-3, {"atol": 1.0}, True),
-        (1e-3, {"rough": ["mean", "norm"]}, True),
+        (1e-3, {"ill_conditioned": ["mean", "norm"]}, True),
     ],
 )
 def test_another_run_is_compared(
@@ -368,5 +368,5 @@ def test_a_difference_names_another_code(whole: Path) -> None:
         return [2 * x for x in draw(seed)]
 
     other.__qualname__ = draw.__qualname__
-    with pytest.raises(AssertionError, match="the source of the trial is another one"):
+    with pytest.raises(AssertionError, match="the source of the trial differs"):
         studies.check(whole, other, indices=[0])

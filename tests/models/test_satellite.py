@@ -10,7 +10,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 import distfilt.models as att
-from distfilt.linalg import central
+from distfilt.linalg import central_difference
 from distfilt.models import satellite as sat
 from distfilt.models.quaternions import left_directions, rotate, rotation_vector_between
 
@@ -80,7 +80,7 @@ def test_left_directions_are_the_derivative_of_turned_and_of_equation_21() -> No
     """So (21) keeps the length and turns the active matrix by -[w]R, as `turned` does."""
     q, w = _random(3, 5)
     for one in q:
-        numeric = central(lambda e, one=one: rotate(one, e), np.zeros(3))
+        numeric = central_difference(lambda e, one=one: rotate(one, e), np.zeros(3))
         assert np.abs(left_directions(one) - numeric).max() < 1e-9
     rate = -(left_directions(q) @ w[..., None])[..., 0]
     assert np.abs(att.quaternion_rate(q, w) - rate).max() < 1e-15

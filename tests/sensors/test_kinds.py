@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from distfilt import sensors
-from distfilt.linalg import central
+from distfilt.linalg import central_difference
 from distfilt.models import occulted
 from distfilt.sensors import (
     Sensor,
@@ -143,7 +143,7 @@ def test_jacobians_are_the_derivatives(sensor: Sensor) -> None:
     """Against central differences with a step of the test's own."""
     x = generator(1).standard_normal((3, 4, 6))
     slope = sensor.jacobian(x)
-    numeric = central(sensor.predict, x, sensor.residual, step=2e-5)
+    numeric = central_difference(sensor.predict, x, sensor.residual, step=2e-5)
     assert slope.shape == (3, 4, sensor.dim, 6)
     assert np.abs(slope - numeric).max() < 1e-7
 

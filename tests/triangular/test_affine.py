@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from distfilt.linalg import SolverError
 from distfilt.triangular import affine, compose, separable
-from distfilt.triangular.affine import _program, fit, fit_convex, objective
+from distfilt.triangular.affine import _compile_program, fit, fit_convex, objective
 from tests.triangular.samples import rng_of, samples
 
 _X = np.random.default_rng(9).standard_normal((20, 2))
@@ -64,14 +64,14 @@ def test_rows_and_moments_are_one_map() -> None:
 
 
 def test_the_program_is_compiled_once_for_each_size() -> None:
-    _program.cache_clear()
+    _compile_program.cache_clear()
     for seed in (1, 2):
         y, x = samples(seed, m=1, d=2)
         y = (y - y.mean(0)) / y.std(0)
         x = (x - x.mean(0)) / x.std(0)
         gap = compose(fit(y, x), y, x, y[0]) - compose(fit_convex(y, x), y, x, y[0])
         assert np.abs(gap).max() < 1e-6
-    info = _program.cache_info()
+    info = _compile_program.cache_info()
     assert (info.misses, info.hits) == (2, 2) and info.maxsize is not None
 
 

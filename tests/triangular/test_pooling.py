@@ -102,7 +102,7 @@ def test_a_rule_that_diverges_is_blamed_itself() -> None:
 
         for pool in (pool_by_moments, pool_by_admm):
             with pytest.raises(
-                ValueError, match="agree must be a rule that returns averages"
+                ValueError, match="average must be a rule that returns averages"
             ):
                 pool(_Y, _X, Channel(graphs.path(3)), average=rule)
 

@@ -127,11 +127,11 @@ def test_hand_set_coefficients_against_the_formula() -> None:
     slope = s.log_det(points[:, :1], points[:, 1:])
     rates = np.zeros(3)
     for k in range(2):
-        before, own, rate = _features(s, (points - s.centre) / s.spread, k)
+        before, own, rate = _features(s, (points - s.centre) / s.std, k)
         assert (
             np.abs(out[:, k] - before @ s.weights[k] - own @ s.slopes[k]).max() < 1e-12
         )
-        rates += np.log(rate @ s.slopes[k] / s.spread[1 + k])
+        rates += np.log(rate @ s.slopes[k] / s.std[1 + k])
     assert np.abs(slope - rates).max() < 1e-12
     assert np.abs(s.inverse(points[:, :1], out) - points[:, 1:]).max() < 1e-12
 
@@ -141,7 +141,7 @@ def test_fit_minimises_a_program_built_by_hand(penalty: float) -> None:
     """No feature of the library's: the loss at its coefficients is below that of all neighbours."""
     y, x, _ = banana(32, 150)
     s = fit(y, x, order=2, regularisation=penalty)
-    before, own, rates = _features(s, (np.hstack([y, x]) - s.centre) / s.spread, 1)
+    before, own, rates = _features(s, (np.hstack([y, x]) - s.centre) / s.std, 1)
     size = before.shape[1]
 
     def loss(c: np.ndarray) -> float:
@@ -210,7 +210,7 @@ def test_a_separable_map_is_inverted_in_few_evaluations(
     s = fit(y, x, order=3)
     z = s(y, x)
     calls = []
-    own = SeparableMap._own
+    own = SeparableMap._increasing_part
 
     def counted(
         self: SeparableMap, v: np.ndarray, k: int
@@ -218,7 +218,7 @@ def test_a_separable_map_is_inverted_in_few_evaluations(
         calls.append(k)
         return own(self, v, k)
 
-    monkeypatch.setattr(SeparableMap, "_own", counted)
+    monkeypatch.setattr(SeparableMap, "_increasing_part", counted)
     assert np.abs(s.inverse(y, z) - x).max() < 1e-12
     assert len(calls) <= 2 * 10
 

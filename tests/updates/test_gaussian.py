@@ -7,67 +7,83 @@ import pytest
 
 from distfilt.updates import enkf, enkf_exact, enkf_sampled_covariance, etkf
 from distfilt.updates.decorator import Update
-from distfilt.updates.gaussian import _turned
+from distfilt.updates.gaussian import _rotate_members
 
 from .cases import H, R, Y, members
 
 
-def test_sampled_and_known_noise_by_their_formulas() -> None:
+def _gain(x: np.ndarray, y: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Return the gain C_xy (C_yy + R)^-1 of samples by numpy, for three components."""
+    joint = np.cov(np.hstack([x, y]).T)
+    return joint[:3, 3:] @ np.linalg.inv(joint[3:, 3:] + noise)
+
+
+def test_perturbed_observations_by_their_formulas() -> None:
+    """x + K (y* - h - zeta), with R sampled or exact in the gain."""
     x = members(40)
-    zeta = np.random.default_rng(3).standard_normal((40, 2)) @ np.linalg.cholesky(R).T
-    seen = x @ H.T + zeta
-    for update, told, noise in (
-        (enkf_sampled_covariance, seen, 0 * R),
-        (enkf, x @ H.T, R),
-    ):
-        joint = np.cov(np.hstack([x, told]).T)
-        gain = joint[:3, 3:] @ np.linalg.inv(joint[3:, 3:] + noise)
-        out = update(x, x @ H.T, Y, R, rng=np.random.default_rng(3))
-        assert np.allclose(out, x + (Y - seen) @ gain.T, atol=1e-12)
+    h = x @ H.T
+    normal = np.random.default_rng(3).standard_normal((40, 2))
+    zeta = normal @ np.linalg.cholesky(R).T
+    perturbed = h + zeta
+    gain = _gain(x, perturbed, 0 * R)
+    analysis = enkf_sampled_covariance(x, h, Y, R, rng=np.random.default_rng(3))
+    assert np.allclose(analysis, x + (Y - perturbed) @ gain.T, atol=1e-12)
+    gain = _gain(x, h, R)
+    analysis = enkf(x, h, Y, R, rng=np.random.default_rng(3))
+    assert np.allclose(analysis, x + (Y - perturbed) @ gain.T, atol=1e-12)
+    # Centred draws: the same gain, and the mean of zeta is subtracted.
     zeta -= zeta.mean(axis=0)
-    centred = enkf(x, x @ H.T, Y, R, rng=np.random.default_rng(3), centred=True)
-    assert np.allclose(centred, x + (Y - x @ H.T - zeta) @ gain.T, atol=1e-12)
+    centred = enkf(x, h, Y, R, rng=np.random.default_rng(3), centred=True)
+    assert np.allclose(centred, x + (Y - h - zeta) @ gain.T, atol=1e-12)
 
 
 @pytest.mark.parametrize("update", [enkf_exact, etkf])
-def test_moments_after_a_curved_reading_are_exact(update: Update) -> None:
+def test_moments_after_a_nonlinear_observation_are_exact(update: Update) -> None:
     """P+ = P - K S K' for the sample covariances, also where h is not linear."""
     x = members(20)
     h = np.stack([x[:, 0] ** 2, x[:, 1] * x[:, 2]], axis=1)
     joint = np.cov(np.hstack([x, h]).T)
     s = joint[3:, 3:] + R
-    gain = joint[:3, 3:] @ np.linalg.inv(s)
-    out = update(x, h, Y, R, rng=np.random.default_rng(0))
-    assert np.allclose(
-        out.mean(axis=0), x.mean(axis=0) + gain @ (Y - h.mean(axis=0)), atol=1e-12
-    )
-    assert np.allclose(np.cov(out.T), joint[:3, :3] - gain @ s @ gain.T, atol=1e-12)
+    gain = _gain(x, h, R)
+    analysis = update(x, h, Y, R, rng=np.random.default_rng(0))
+    mean = x.mean(axis=0) + gain @ (Y - h.mean(axis=0))
+    covariance = joint[:3, :3] - gain @ s @ gain.T
+    assert np.allclose(analysis.mean(axis=0), mean, atol=1e-12)
+    assert np.allclose(np.cov(analysis.T), covariance, atol=1e-12)
 
 
-def test_square_root_without_rotation_is_symmetric() -> None:
-    """The transform of the anomalies is the symmetric root: no rotation hides in it."""
+def test_etkf_without_rotation_is_symmetric() -> None:
+    """The anomalies are multiplied by the symmetric (I + S S')^(-1/2): it contains no rotation."""
     x = members(9)
-    a = x - x.mean(axis=0)
-    white = np.linalg.solve(np.linalg.cholesky(R), (a @ H.T).T).T / np.sqrt(8)
-    values, vectors = np.linalg.eigh(np.eye(9) + white @ white.T)
-    root = vectors @ np.diag(values**-0.5) @ vectors.T
-    out = etkf(x, x @ H.T, Y, R, rng=np.random.default_rng(0), rotation="none")
-    assert np.allclose(out - out.mean(axis=0), root @ a, atol=1e-12)
+    anomalies = x - x.mean(axis=0)
+    root = np.linalg.cholesky(R)
+    whitened = np.linalg.solve(root, (anomalies @ H.T).T).T / np.sqrt(8)
+    values, vectors = np.linalg.eigh(np.eye(9) + whitened @ whitened.T)
+    transform = vectors @ np.diag(values**-0.5) @ vectors.T
+    analysis = etkf(x, x @ H.T, Y, R, rng=np.random.default_rng(0), rotation="none")
+    new_anomalies = analysis - analysis.mean(axis=0)
+    assert np.allclose(new_anomalies, transform @ anomalies, atol=1e-12)
 
 
-def test_rotation_keeps_ones_and_lengths_and_differs() -> None:
-    eye = np.broadcast_to(np.eye(7), (2, 7, 7))
-    turn = _turned(eye, np.random.default_rng(0))
-    assert np.allclose(turn @ np.ones(7), 1, atol=1e-13)
-    assert np.allclose(turn @ np.swapaxes(turn, -1, -2), np.eye(7), atol=1e-13)
-    assert np.abs(turn[0] - turn[1]).max() > 0.1
+def test_a_rotation_keeps_ones_and_lengths() -> None:
+    """Applied to the identity it is the rotation matrix itself: orthogonal, with Q 1 = 1."""
+    identity = np.broadcast_to(np.eye(7), (2, 7, 7))
+    rotation = _rotate_members(identity, np.random.default_rng(0))
+    assert np.allclose(rotation @ np.ones(7), 1, atol=1e-13)
+    product = rotation @ np.swapaxes(rotation, -1, -2)
+    assert np.allclose(product, np.eye(7), atol=1e-13)
+    # Ensembles of a batch have rotations of their own.
+    assert np.abs(rotation[0] - rotation[1]).max() > 0.1
 
 
-def test_rotation_prefers_no_direction() -> None:
-    """On average nothing is left of the anomalies, and no two members go together."""
+def test_a_rotation_prefers_no_direction() -> None:
+    """As for a uniform rotation, the mean is 1 1'/n and the rows' covariance (I - 1 1'/n) / n."""
     n = 6
     draws = 20_000
-    turn = _turned(np.broadcast_to(np.eye(n), (draws, n, n)), np.random.default_rng(1))
-    assert np.allclose(turn.mean(axis=0), 1 / n, atol=5 * 0.5 / np.sqrt(draws))
-    cov = np.einsum("rij,rkj->jik", turn - 1 / n, turn - 1 / n) / draws
-    assert np.allclose(cov, (np.eye(n) - 1 / n) / n, atol=0.012)
+    identity = np.broadcast_to(np.eye(n), (draws, n, n))
+    rotation = _rotate_members(identity, np.random.default_rng(1))
+    # Five standard errors of entries whose deviation is below one half.
+    assert np.allclose(rotation.mean(axis=0), 1 / n, atol=5 * 0.5 / np.sqrt(draws))
+    centred = rotation - 1 / n
+    covariance = np.einsum("rij,rkj->jik", centred, centred) / draws
+    assert np.allclose(covariance, (np.eye(n) - 1 / n) / n, atol=0.012)

@@ -20,19 +20,21 @@ from .cases import rng
 
 
 @given(st.integers(0, 10**6), st.integers(1, 60))
-def test_systematic_is_the_inverse_of_the_distribution_function(
+def test_systematic_resampling_inverts_the_distribution_function(
     seed: int, n: int
 ) -> None:
-    w = rng(seed).dirichlet(np.full(n, 0.2), size=4)
+    """The index of each level (k + u) / N is found in the cumulative weights, by numpy's search."""
+    weights = rng(seed).dirichlet(np.full(n, 0.2), size=4)
     levels = (np.arange(n) + rng(6).random((4, 1))) / n
-    wanted = [
-        np.searchsorted(np.cumsum(v) / v.sum(), u, side="right")
-        for v, u in zip(w, levels, strict=True)
-    ]
-    assert np.array_equal(resample(w, rng=rng(6)), wanted)
+    indices = resample(weights, rng=rng(6))
+    for row in range(4):
+        edges = np.cumsum(weights[row]) / weights[row].sum()
+        expected = np.searchsorted(edges, levels[row], side="right")
+        assert np.array_equal(indices[row], expected)
 
 
-def test_effective_size_between_one_and_n() -> None:
+def test_effective_size_is_between_one_and_n() -> None:
+    """One weight counts one, n equal weights count n, in any normalisation."""
     assert effective_size([0.0, -np.inf, -np.inf]) == pytest.approx(1.0)
     assert effective_size(np.full(8, -1e6)) == pytest.approx(8.0)
     assert effective_size(np.log([0.5, 0.5])) == pytest.approx(2.0)
@@ -40,57 +42,78 @@ def test_effective_size_between_one_and_n() -> None:
         effective_size([0.5, 0.3, 0.2])
 
 
+def _normalise(log_weights: np.ndarray) -> np.ndarray:
+    weights = np.exp(log_weights)
+    return weights / weights.sum()
+
+
 def test_weights_by_bayes_rule_with_a_missing_component() -> None:
-    """Log-weights plus a Gaussian's exponent, normalised; a full noise matrix, a part of it."""
+    """Log-weights plus a Gaussian's exponent; for a missing component, that of its marginal."""
     h = rng(1).standard_normal((6, 2))
-    before = np.log(rng(2).dirichlet(np.ones(6)))
+    prior = np.log(rng(2).dirichlet(np.ones(6)))
     noise = np.array([[0.5, 0.3], [0.3, 0.9]])
     y = np.array([0.4, -0.2])
-    both = before - 0.5 * np.einsum("ni,ij,nj->n", y - h, np.linalg.inv(noise), y - h)
-    one, other = (before - 0.5 * (y[k] - h[:, k]) ** 2 / noise[k, k] for k in range(2))
-    gaps = np.array([y, [np.nan, y[1]], [y[0], np.nan]])
-    for seen, wanted in zip(gaps, (both, other, one), strict=True):
-        w = np.exp(wanted) / np.exp(wanted).sum()
-        assert np.allclose(np.exp(reweight(before, h, seen, noise)), w)
-    # What one particle cannot predict says nothing of any.
+    innovation = y - h
+    precision = np.linalg.inv(noise)
+    squares = np.einsum("ni,ij,nj->n", innovation, precision, innovation)
+    full = _normalise(prior - 0.5 * squares)
+    assert np.allclose(np.exp(reweight(prior, h, y, noise)), full)
+    for k in range(2):
+        partial_y = np.full(2, np.nan)
+        partial_y[k] = y[k]
+        marginal = _normalise(prior - 0.5 * innovation[:, k] ** 2 / noise[k, k])
+        log_weights = reweight(prior, h, partial_y, noise)
+        assert np.allclose(np.exp(log_weights), marginal)
+    # A component that one particle cannot predict is missing for all of them.
     h[3, 1] = np.nan
-    assert np.allclose(np.exp(reweight(before, h, y, noise)), w)
+    marginal = _normalise(prior - 0.5 * innovation[:, 0] ** 2 / noise[0, 0])
+    assert np.allclose(np.exp(reweight(prior, h, y, noise)), marginal)
+
+
+def _mean_covariance(ensembles: np.ndarray) -> np.ndarray:
+    """Return the covariance (with N) of ensembles (R, N, d), averaged over R."""
+    anomalies = ensembles - ensembles.mean(axis=1, keepdims=True)
+    products = np.swapaxes(anomalies, -1, -2) @ anomalies
+    return (products / ensembles.shape[1]).mean(axis=0)
 
 
 def test_jitter_keeps_mean_and_covariance_on_average() -> None:
+    """(1 - h²) C from the shrinkage and h² C from the noise make C."""
     x = rng(0).standard_normal((2000, 50, 2)) @ np.array([[1.0, 0.6], [0.0, 0.4]])
-    out = jitter(x, rng=rng(1), bandwidth=0.5)
-    gap = out.mean(axis=1) - x.mean(axis=1)
-    assert np.abs(gap.mean(axis=0)).max() < 0.01
-
-    def cov(e: np.ndarray) -> np.ndarray:
-        a = e - e.mean(axis=1, keepdims=True)
-        return (np.swapaxes(a, -1, -2) @ a / e.shape[1]).mean(axis=0)
-
-    # The kernel's own mean takes a share h²/N of its variance.
-    assert np.allclose(cov(out), (1 - 0.25 / 50) * cov(x), atol=0.01)
-    own = [np.cov(e.T, ddof=0) for e in x]
-    assert np.allclose(out, jitter(x, rng=rng(1), bandwidth=0.5, cov=own))
-    assert (
-        silverman(40, 3) == pytest.approx((4 / (40 * 5)) ** (1 / 7))
-        and silverman(1, 1) == 1
-    )
+    jittered = jitter(x, rng=rng(1), bandwidth=0.5)
+    shift = jittered.mean(axis=1) - x.mean(axis=1)
+    assert np.abs(shift.mean(axis=0)).max() < 0.01
+    # The noise's own mean takes the fraction h²/N of its variance.
+    expected = (1 - 0.25 / 50) * _mean_covariance(x)
+    assert np.allclose(_mean_covariance(jittered), expected, atol=0.01)
+    # By default the covariance is that of each ensemble.
+    covariances = [np.cov(ensemble.T, ddof=0) for ensemble in x]
+    explicit = jitter(x, rng=rng(1), bandwidth=0.5, cov=covariances)
+    assert np.allclose(jittered, explicit)
 
 
-def test_jitter_of_copies_moves_them_only_and_from_the_covariance_given() -> None:
+def test_silverman_s_bandwidth() -> None:
+    """(4 / (n (d + 2)))^(1 / (d + 4)), at most one."""
+    assert silverman(40, 3) == pytest.approx((4 / (40 * 5)) ** (1 / 7))
+    assert silverman(1, 1) == 1
+
+
+def test_jitter_of_copies_changes_only_them() -> None:
+    """Of 2, 1, 3 and 1 copies the single ones stay; the others have the given covariance."""
     counts = np.tile([2, 1, 3, 1, 0, 0, 0], (4000, 1))
-    each = np.tile(np.arange(7.0), (4000, 1))
-    x = repeat_by_count(each[..., None] * [1.0, -2.0], counts)
-    copied = repeat_by_count(counts[..., None] > 1, counts)
+    values = np.tile(np.arange(7.0), (4000, 1))
+    x = repeat_by_count(values[..., None] * [1.0, -2.0], counts)
+    is_copy = repeat_by_count(counts[..., None] > 1, counts)[..., 0]
     assert np.array_equal(x[5, :, 0], [0, 0, 1, 2, 2, 2, 3])
-    cov = np.array([[2.0, 0.6], [0.6, 0.5]])
-    drawn = rng().standard_normal(x.shape)
-    out = add_jitter(x, cov, 0.5, drawn, copied[..., 0])
-    assert (out[:, [2, 6]] == x[:, [2, 6]]).all() and (
-        distinct_fraction(out) == 1
-    ).all()
-    moved = (out - x)[:, [0, 1, 3, 4, 5]].reshape(-1, 2)
-    assert np.abs(moved.mean(axis=0)).max() < 4 * 0.5 * np.sqrt(2 / len(moved))
-    assert np.allclose(
-        np.cov(moved.T), 0.25 * cov, atol=4 * 0.25 * 2 * np.sqrt(2 / len(moved))
-    )
+    covariance = np.array([[2.0, 0.6], [0.6, 0.5]])
+    normal = rng().standard_normal(x.shape)
+    jittered = add_jitter(x, covariance, 0.5, normal, is_copy)
+    single = [2, 6]
+    copies = [0, 1, 3, 4, 5]
+    assert (jittered[:, single] == x[:, single]).all()
+    assert (distinct_fraction(jittered) == 1).all()
+    noise = (jittered - x)[:, copies].reshape(-1, 2)
+    # Four standard errors of a mean, and of a covariance.
+    error = 4 * np.sqrt(2 / len(noise))
+    assert np.abs(noise.mean(axis=0)).max() < 0.5 * error
+    assert np.allclose(np.cov(noise.T), 0.25 * covariance, atol=0.25 * 2 * error)

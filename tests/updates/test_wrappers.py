@@ -1,4 +1,4 @@
-"""Wrappers against what they wrap, missing readings, and the door itself."""
+"""Wrappers against the updates that they wrap, missing observations, and the decorator."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from distfilt import updates
-from distfilt.coupling import norm_constraint, project, retract
+from distfilt.coupling import norm_constraint, project, retract, transform_ensemble
 from distfilt.models import Model
 from distfilt.updates.decorator import Update, has_tag
 from distfilt.updates.gaussian import exact_forecast
@@ -19,229 +19,330 @@ from tests.support import without_checks
 
 from .cases import UPDATES, H, R, Y, kalman, members, moments, rng
 
-ROOT = partial(updates.etkf, rotation="none")
+ETKF = partial(updates.etkf, rotation="none")
 """An update that draws nothing."""
 
 
 def test_inflation_multiplies_anomalies_only() -> None:
+    """The mean stays, and the anomalies have the factor."""
     x = members(30)
-    plain = updates.enkf(x, x @ H.T, Y, R, rng=rng())
-    wide = updates.with_inflation(updates.enkf, factor=1.3)(x, x @ H.T, Y, R, rng=rng())
-    centre = plain.mean(axis=0)
-    assert np.allclose(wide, centre + 1.3 * (plain - centre), atol=1e-12)
+    data = (x, x @ H.T, Y, R)
+    analysis = updates.enkf(*data, rng=rng())
+    inflated = updates.with_inflation(updates.enkf, factor=1.3)(*data, rng=rng())
+    mean = analysis.mean(axis=0)
+    assert np.allclose(inflated, mean + 1.3 * (analysis - mean), atol=1e-12)
 
 
-def test_missing_and_unpredicted_readings_are_deleted_rows() -> None:
+# ------------------------------------------------------------------- missing observations
+
+
+def test_a_missing_component_is_a_deleted_row() -> None:
+    """Without a value or without a prediction: the update by the other components."""
     x = members(30)
     noise = np.array([[0.5, 0.3, 0.1], [0.3, 0.9, 0.2], [0.1, 0.2, 0.4]])
     h = np.column_stack([x @ H.T, x[:, 0]])
     y = np.array([1.2, -0.7, 0.4])
-    keep = [0, 2]
-    wanted = ROOT(x, h[:, keep], y[keep], noise[np.ix_(keep, keep)], rng=rng())
-    blind = h.copy()
-    gap = y.copy()
-    blind[3, 1] = np.nan
-    gap[1] = np.nan
-    for seen, told in ((h, gap), (blind, y)):
-        out = updates.with_missing(ROOT, x, seen, told, noise, rng=rng())
-        assert np.allclose(out, wanted, atol=1e-12)
-
-
-def test_serial_without_a_sensor_is_exact_for_linear_readings() -> None:
-    x = members(20, 2)  # of two agents, whose readings' errors may go together for one
-    for noise in (
-        np.diag([0.5, 0.9]) * [[[1.0]], [[2.0]]],
-        np.stack([np.diag([0.5, 0.9]), R]),
-    ):
-        out = updates.serially(updates.enkf_exact)(x, x @ H.T, [Y, Y], noise, rng=rng())
-        for own, r, after in zip(x, noise, out, strict=True):
-            mean, cov = kalman(*moments(own), H, r, Y)
-            assert np.allclose(after.mean(axis=0), mean, atol=1e-12)
-            assert np.allclose(np.cov(after.T), cov, atol=1e-12)
-
-
-def test_serial_predicts_again() -> None:
-    """Two curved readings: the second is predicted from the members as the first left them."""
-
-    def both(e: np.ndarray) -> np.ndarray:
-        return np.stack([e[:, 0] ** 2, np.exp(e[:, 0])], axis=1)
-
-    x = members(30)
-    y = np.array([1.5, 3.0])
-    four = x, both(x), y, np.diag([0.5, 0.9])
-    out = updates.serially(ROOT)(*four, rng=rng(), predict=both)
-    first = ROOT(x, both(x)[:, :1], y[:1], [[0.5]], rng=rng())
-    second = ROOT(first, both(first)[:, 1:], y[1:], [[0.9]], rng=rng())
-    assert np.allclose(out, second, atol=1e-13)
-    assert np.abs(updates.serially(ROOT)(*four, rng=rng()) - out).max() > 1e-3
+    rows = [0, 2]
+    expected = ETKF(x, h[:, rows], y[rows], noise[np.ix_(rows, rows)], rng=rng())
+    without_value = y.copy()
+    without_value[1] = np.nan
+    analysis = updates.with_missing(ETKF, x, h, without_value, noise, rng=rng())
+    assert np.allclose(analysis, expected, atol=1e-12)
+    without_prediction = h.copy()
+    without_prediction[3, 1] = np.nan
+    analysis = updates.with_missing(ETKF, x, without_prediction, y, noise, rng=rng())
+    assert np.allclose(analysis, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", UPDATES)
-def test_missing_readings_of_a_stack_with_noise_of_its_own(name: str) -> None:
+def test_missing_components_in_a_stack_with_several_covariances(name: str) -> None:
+    """An ensemble's analysis and draws do not depend on the components that others miss."""
     x = members(30, 3)
+    h = x @ H.T
     noise = np.stack([R, 2 * R, 3 * R])
     y = np.stack([Y, [Y[0], np.nan], [np.nan, np.nan]])
-    out = updates.with_missing(UPDATES[name], x, x @ H.T, y, noise, rng=rng())
-    full = updates.with_missing(
-        UPDATES[name], x, x @ H.T, np.stack([Y] * 3), noise, rng=rng()
-    )
-    assert (out[2] == x[2]).all() and (out[1] != x[1]).any()
-    # What the others miss is no business of the first one's draws.
-    assert np.allclose(out[0], full[0], rtol=0, atol=1e-12)
-    turned = updates.with_missing(
-        UPDATES[name], x, x @ H.T, y[[1, 0, 2]], noise, rng=rng()
-    )
-    assert np.allclose(turned[1], full[1], rtol=0, atol=1e-12)
+    apply = partial(updates.with_missing, UPDATES[name], x, h)
+    analysis = apply(y, noise, rng=rng())
+    complete = apply(np.stack([Y, Y, Y]), noise, rng=rng())
+    # The third ensemble has no observation, the second one has one.
+    assert (analysis[2] == x[2]).all()
+    assert (analysis[1] != x[1]).any()
+    assert np.allclose(analysis[0], complete[0], rtol=0, atol=1e-12)
+    swapped = apply(y[[1, 0, 2]], noise, rng=rng())
+    assert np.allclose(swapped[1], complete[1], rtol=0, atol=1e-12)
 
 
-def test_partial_options_survive_the_open_door() -> None:
-    turned = partial(updates.etkf, rotation="none")
+def test_missing_is_nan_and_not_infinity() -> None:
+    """The arguments are checked, but for NaN."""
+    x = members(30)
+    with pytest.raises(ValueError, match="^observed must"):
+        updates.with_missing(ETKF, x, x @ H.T, [np.inf, 0.0], R, rng=rng())
+    with pytest.raises(ValueError, match="^noise must"):
+        updates.with_missing(ETKF, x, x @ H.T, Y, -R, rng=rng())
+
+
+# ------------------------------------------------------------------------- the decorator
+
+
+def test_the_options_of_a_partial_are_kept_and_checked() -> None:
+    """With and without checks; and a partial has the tags of its update."""
     x = members(20)
-    given = (x, x @ H.T, Y, R)
-    assert np.array_equal(
-        without_checks(turned)(*given, rng=rng()), turned(*given, rng=rng())
-    )
-    assert has_tag(turned, "stacks") and not has_tag(partial(print, 3), "stacks")
-    assert not has_tag(
-        updates.with_inflation(lambda x, h, y, r, *, rng: x, factor=1.0), "stacks"
-    )
+    data = (x, x @ H.T, Y, R)
+    unchecked = without_checks(ETKF)(*data, rng=rng())
+    assert np.array_equal(unchecked, ETKF(*data, rng=rng()))
+    assert has_tag(ETKF, "stacks")
+    assert not has_tag(partial(print, 3), "stacks")
+    plain = updates.with_inflation(lambda x, h, y, r, *, rng: x, factor=1.0)
+    assert not has_tag(plain, "stacks")
     with pytest.raises(ValueError, match="rotation"):
         updates.with_inflation(partial(updates.etkf, rotation="left"), factor=1.0)
 
 
+def test_the_decorator_does_not_change_the_function() -> None:
+    """The kinds of its arguments are the wrapper's; its annotations stay."""
+
+    def shift(x: Any, h: Any, y: Any, r: Any, *, rng: Any) -> Any:
+        return x + 1.0
+
+    annotations = dict(shift.__annotations__)
+    checked = updates.update(shift)
+    with pytest.raises(ValueError, match="^h must"):
+        checked(members(5), "a", Y, R, rng=rng())
+    assert shift.__annotations__ == annotations
+
+
+def test_calls_inside_a_user_s_update_are_checked() -> None:
+    """Validation is skipped in the library's own calls only."""
+
+    @updates.update
+    def transform(x: Any, h: Any, y: Any, r: Any, *, rng: Any) -> Any:
+        return transform_ensemble(x, np.full(len(x), np.nan), solver="simplex")
+
+    x = members(5)
+    inflated = updates.with_inflation(transform, factor=1.1)
+    for update in (transform, inflated, partial(updates.with_missing, inflated)):
+        with pytest.raises(ValueError, match="^solver must"):
+            update(x, x @ H.T, Y, R, rng=rng())
+
+
+# --------------------------------------------------------------------------- one by one
+
+
+def test_serial_updates_without_a_sensor_are_exact_for_linear_observations() -> None:
+    """The moments of the Kalman filter, for independent and for correlated noise.
+
+    There are two ensembles, and components whose noise is correlated in one of them stay
+    together in both.
+    """
+    x = members(20, 2)
+    diagonal = np.diag([0.5, 0.9])
+    update = updates.serially(updates.enkf_exact)
+    for noise in (np.stack([diagonal, 2 * diagonal]), np.stack([diagonal, R])):
+        analysis = update(x, x @ H.T, [Y, Y], noise, rng=rng())
+        for k in range(2):
+            mean, cov = kalman(*moments(x[k]), H, noise[k], Y)
+            assert np.allclose(analysis[k].mean(axis=0), mean, atol=1e-12)
+            assert np.allclose(np.cov(analysis[k].T), cov, atol=1e-12)
+
+
+def test_serial_updates_predict_again() -> None:
+    """The second of two nonlinear observations is predicted from the members after the first."""
+
+    def predict(e: np.ndarray) -> np.ndarray:
+        return np.stack([e[:, 0] ** 2, np.exp(e[:, 0])], axis=1)
+
+    x = members(30)
+    y = np.array([1.5, 3.0])
+    data = (x, predict(x), y, np.diag([0.5, 0.9]))
+    update = updates.serially(ETKF)
+    analysis = update(*data, rng=rng(), predict=predict)
+    first = ETKF(x, predict(x)[:, :1], y[:1], [[0.5]], rng=rng())
+    second = ETKF(first, predict(first)[:, 1:], y[1:], [[0.9]], rng=rng())
+    assert np.allclose(analysis, second, atol=1e-13)
+    # Predictions that move along with the members differ, since h is not linear.
+    assert np.abs(update(*data, rng=rng()) - analysis).max() > 1e-3
+
+
+# ------------------------------------------------------------------------------ forecasts
+
+
 def test_exact_forecast_adds_q_exactly() -> None:
+    """Mean and covariance of the forecast members, plus Q, to rounding."""
+    phi = np.array([[1.0, 0.3], [0.0, 0.9]])
+    q = np.array([[0.4, 0.1], [0.1, 0.2]])
+
+    def transition(x: np.ndarray, t: float, dt: float) -> np.ndarray:
+        # Nonlinear, and infinite from 50 on.
+        return np.where(x < 50, x @ phi.T + 0.3 * x**2, np.inf)
+
+    linear = Model(2, lambda x, t, dt: x @ phi.T, lambda t, dt: dt * q)
+    nonlinear = replace(linear, transition=transition)
+    x = members(12, 3)[..., :2]
+    forecast = exact_forecast(x, nonlinear, 0.0, 0.5, rng=rng())
+    steps = nonlinear.step(x, 0.0, 0.5)
+    for k in range(3):
+        assert np.allclose(forecast[k].mean(axis=0), steps[k].mean(axis=0), atol=1e-13)
+        expected = np.cov(steps[k].T) + 0.5 * q
+        assert np.allclose(np.cov(forecast[k].T), expected, atol=1e-12)
+    # A failed ensemble does not change the draws of the others.
+    x[1, 0] = 99.0
+    with_failure = exact_forecast(x, nonlinear, 0.0, 0.5, rng=rng())
+    assert np.array_equal(with_failure[::2], forecast[::2])
+    assert np.isnan(with_failure[1]).all()
+
+
+def test_stochastic_forecast_adds_q_on_average() -> None:
+    """Phi P Phi' + Q within four standard errors of 100 000 members."""
     phi = np.array([[1.0, 0.3], [0.0, 0.9]])
     q = np.array([[0.4, 0.1], [0.1, 0.2]])
     model = Model(2, lambda x, t, dt: x @ phi.T, lambda t, dt: dt * q)
-    bent = replace(
-        model,
-        transition=lambda x, t, dt: np.where(x < 50, x @ phi.T + 0.3 * x**2, np.inf),
-    )
-    x = members(12, 3)[..., :2]
-    out = exact_forecast(x, bent, 0.0, 0.5, rng=rng())
-    for e, m in zip(out, bent.step(x, 0.0, 0.5), strict=True):
-        assert np.allclose(e.mean(axis=0), m.mean(axis=0), atol=1e-13)
-        assert np.allclose(np.cov(e.T), np.cov(m.T) + 0.5 * q, atol=1e-12)
-    x[1, 0] = 99.0  # an ensemble that is lost takes no bit of the others' noise with it
-    lost = exact_forecast(x, bent, 0.0, 0.5, rng=rng())
-    assert np.array_equal(lost[::2], out[::2]) and np.isnan(lost[1]).all()
-    plain = updates.stochastic_forecast(
-        members(100_000)[:, :2], model, 0.0, 0.5, rng=rng()
-    )
-    wanted = phi @ np.cov(members(100_000)[:, :2].T) @ phi.T + 0.5 * q
-    assert np.allclose(np.cov(plain.T), wanted, atol=0.03)
+    x = members(100_000)[:, :2]
+    forecast = updates.stochastic_forecast(x, model, 0.0, 0.5, rng=rng())
+    expected = phi @ np.cov(x.T) @ phi.T + 0.5 * q
+    assert np.allclose(np.cov(forecast.T), expected, atol=0.03)
 
+
+# ---------------------------------------------------------------------------- constraints
 
 CIRCLE = norm_constraint([0, 1], length=1.2)
 NOISE = np.array([[0.02, 0.005], [0.005, 0.03]])
-SEEN = np.array([0.9, 0.7])
+OBSERVED = np.array([0.9, 0.7])
 MOTION = ([0, 1], [2, 3])
-INNERS = [updates.etpf, updates.enkf, updates.etkf]
-INNER = pytest.mark.parametrize("inner", INNERS)
+EACH_UPDATE = pytest.mark.parametrize(
+    "update", [updates.etpf, updates.enkf, updates.etkf]
+)
 
 
 def swings(*leading: int) -> np.ndarray:
-    x = np.random.default_rng(0).standard_normal((*leading, 30, 4))
-    return np.asarray([0.8, 0.6, 1.0, -1.0] + 0.15 * x)
+    """Draw positions and velocities (*leading, 30, 4) of a pendulum near the circle."""
+    normal = np.random.default_rng(0).standard_normal((*leading, 30, 4))
+    return np.asarray([0.8, 0.6, 1.0, -1.0] + 0.15 * normal)
 
 
-@INNER
-def test_projection_and_retraction_follow_the_update(inner: Update) -> None:
+@EACH_UPDATE
+def test_projection_and_retraction_follow_the_update(update: Update) -> None:
+    """The wrapped update is the composition with `project` or `retract`."""
     x = swings(3)
-    y = np.tile(SEEN, (3, 1))
-    four = x, x[..., :2], y, NOISE
-    plain = inner(*four, rng=rng())
-    how: Any = {"variant": "particle", "regularisation": 0.01}
-    out = updates.with_projection(inner, CIRCLE, **how)(*four, rng=rng())
-    assert np.allclose(out, project(plain, CIRCLE, **how), atol=1e-14)
-    assert np.abs(out - plain).max() > 1e-3
-    out = updates.with_retraction(inner, CIRCLE, motion=MOTION)(*four, rng=rng())
-    assert np.allclose(out, retract(plain, CIRCLE, motion=MOTION), atol=1e-14)
-    assert np.abs(np.hypot(out[..., 0], out[..., 1]) - 1.2).max() <= 1e-14
+    data = (x, x[..., :2], np.tile(OBSERVED, (3, 1)), NOISE)
+    analysis = update(*data, rng=rng())
+    options: Any = {"variant": "particle", "regularisation": 0.01}
+    wrapped = updates.with_projection(update, CIRCLE, **options)
+    projected = wrapped(*data, rng=rng())
+    assert np.allclose(projected, project(analysis, CIRCLE, **options), atol=1e-14)
+    assert np.abs(projected - analysis).max() > 1e-3
+    wrapped = updates.with_retraction(update, CIRCLE, motion=MOTION)
+    retracted = wrapped(*data, rng=rng())
+    expected = retract(analysis, CIRCLE, motion=MOTION)
+    assert np.allclose(retracted, expected, atol=1e-14)
+    # Every member has the length of the circle's radius.
+    radius = np.hypot(retracted[..., 0], retracted[..., 1])
+    assert np.abs(radius - 1.2).max() <= 1e-14
 
 
-@INNER
-def test_augmentation_is_one_more_reading(inner: Update) -> None:
+@EACH_UPDATE
+def test_augmentation_is_one_more_observation(update: Update) -> None:
+    """|q|² is observed as L² = 1.44 with independent noise of the given deviation."""
     x = swings()
-    both = np.column_stack([x[:, :2], (x[:, :2] ** 2).sum(axis=1)])
+    positions = x[:, :2]
+    predicted = np.column_stack([positions, (positions**2).sum(axis=1)])
     noise = np.zeros((3, 3))
     noise[:2, :2] = NOISE
     noise[2, 2] = 0.2**2
-    expected = inner(x, both, [*SEEN, 1.44], noise, rng=rng())
-    out = updates.with_augmentation(inner, CIRCLE, std=0.2)(
-        x, x[:, :2], SEEN, NOISE, rng=rng()
-    )
-    assert np.allclose(out, expected, atol=1e-12)
+    expected = update(x, predicted, [*OBSERVED, 1.44], noise, rng=rng())
+    augmented = updates.with_augmentation(update, CIRCLE, std=0.2)
+    analysis = augmented(x, positions, OBSERVED, NOISE, rng=rng())
+    assert np.allclose(analysis, expected, atol=1e-12)
 
 
-# ------------------------------------------------------------------------------ localisation
+# --------------------------------------------------------------------------- localisation
 
 
 def test_the_taper_is_a_correlation_that_ends_at_two_radii() -> None:
     """Its values by hand, its smooth joints, and no negative eigenvalue on a line or a ring."""
-    assert np.allclose(
-        gaspari_cohn(np.array([0.0, 1.0, 2.0, 3.0])), [1, 5 / 24, 0, 0], atol=1e-15
-    )
+    values = gaspari_cohn(np.array([0.0, 1.0, 2.0, 3.0]))
+    assert np.allclose(values, [1, 5 / 24, 0, 0], atol=1e-15)
+    # The differences to both sides of a joint cancel up to a power of the step.
+    step = 1e-3
     for joint, power in ((1.0, 1), (2.0, 3)):
-        left, right = gaspari_cohn(joint + np.array([-1e-3, 1e-3])) - gaspari_cohn(
-            np.array(joint)
-        )
-        assert abs(left + right) < 1e-3**power
-    gap = np.abs(np.subtract.outer(np.arange(40.0), np.arange(40.0)))
-    for distance in (gap, np.minimum(gap, 40 - gap)):
+        centre = gaspari_cohn(np.array(joint))
+        before, after = gaspari_cohn(joint + np.array([-step, step])) - centre
+        assert abs(before + after) < step**power
+    points = np.arange(40.0)
+    on_line = np.abs(np.subtract.outer(points, points))
+    on_ring = np.minimum(on_line, 40 - on_line)
+    for distance in (on_line, on_ring):
         assert np.linalg.eigvalsh(gaspari_cohn(distance / 5)).min() > -1e-12
 
 
-def test_one_reading_localised_is_the_update_with_a_tapered_gain() -> None:
+def test_a_single_observation_is_localised_by_a_tapered_gain() -> None:
+    """x + rho K (y - h - zeta), with the gain multiplied by the taper component by component."""
     x = members(20)
     places = np.array([[0.0], [1.5], [7.0]])
-    at = np.array([[0.5]])
+    observation_places = np.array([[0.5]])
     zeta = np.sqrt(0.5) * rng(3).standard_normal((20, 1))
-    share = gaspari_cohn(np.abs(places - at)[:, 0] / 2)
-    gain = np.cov(x.T)[:, 0] / (np.cov(x.T)[0, 0] + 0.5) * share
+    rho = gaspari_cohn(np.abs(places - observation_places)[:, 0] / 2)
+    covariance = np.cov(x.T)
+    gain = rho * covariance[:, 0] / (covariance[0, 0] + 0.5)
 
-    def seeded(*four: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        return updates.enkf(*four, rng=np.random.default_rng(3))
+    def seeded(*data: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        return updates.enkf(*data, rng=np.random.default_rng(3))
 
-    near = updates.with_localization(
-        seeded, places=places, observation_places=at, radius=2.0
+    local = updates.with_localization(
+        seeded, places=places, observation_places=observation_places, radius=2.0
     )
-    out = near(x, x[:, :1], [1.0], [[0.5]], rng=rng())
-    assert np.allclose(out, x + (1.0 - x[:, :1] - zeta) * gain, atol=1e-12)
-    assert (out[:, 2] == x[:, 2]).all()
+    analysis = local(x, x[:, :1], [1.0], [[0.5]], rng=rng())
+    expected = x + (1.0 - x[:, :1] - zeta) * gain
+    assert np.allclose(analysis, expected, atol=1e-12)
+    # The third component is farther than two radii.
+    assert (analysis[:, 2] == x[:, 2]).all()
 
 
-@pytest.mark.parametrize("given", [{}, {"predict": lambda e: e[:, [0, 2]]}])
-def test_readings_on_a_ring_localised_one_after_the_other(
-    given: dict[str, Any],
+RING = [[0.0], [1.5], [7.0]]
+"""Places of three components on a ring of length 8."""
+
+
+def localize_on_ring(columns: list[int]) -> Update:
+    """Return a localised update by observations of some components on the ring."""
+    return updates.with_localization(
+        ETKF,
+        places=RING,
+        observation_places=[RING[k] for k in columns],
+        radius=2.0,
+        period=8.0,
+    )
+
+
+@pytest.mark.parametrize("options", [{}, {"predict": lambda e: e[:, [0, 2]]}])
+def test_localised_observations_on_a_ring_are_assimilated_in_turn(
+    options: dict[str, Any],
 ) -> None:
-    """What the first reading moves, predictions or the members of which they are made, the second
-    meets; distances are the shorter way round.
-    """
+    """The second observation meets the members, and their predictions, after the first."""
     x = members(20)
     y = np.array([1.0, -0.5])
-    places = [[0.0], [1.5], [7.0]]
-    near = partial(
-        updates.with_localization, ROOT, places=places, radius=2.0, period=8.0
-    )
-    out = near(observation_places=[[0.0], [7.0]])(
-        x, x[:, [0, 2]], y, np.diag([0.5, 0.9]), rng=rng(), **given
-    )
-    first = near(observation_places=[[0.0]])(x, x[:, :1], y[:1], [[0.5]], rng=rng())
-    second = near(observation_places=[[7.0]])(
-        first, first[:, 2:], y[1:], [[0.9]], rng=rng()
-    )
-    assert np.allclose(out, second, atol=1e-12)
-    for k, noise, r in (
-        ([2], [[0.9]], [0.5, 1.25, 0.0]),
-        ([0, 2], R, [0.0, 0.75, 0.0]),
-    ):
-        four = (
-            x,
-            x[:, k],
-            y[-len(k) :],
-            noise,
-        )  # two whose errors go together move as one
-        local = near(observation_places=[places[i] for i in k])(*four, rng=rng())
-        share = gaspari_cohn(np.array(r))
-        assert np.allclose(local - x, share * (ROOT(*four, rng=rng()) - x), atol=1e-12)
+    noise = np.diag([0.5, 0.9])
+    update = localize_on_ring([0, 2])
+    analysis = update(x, x[:, [0, 2]], y, noise, rng=rng(), **options)
+    first = localize_on_ring([0])(x, x[:, :1], y[:1], [[0.5]], rng=rng())
+    second = localize_on_ring([2])(first, first[:, 2:], y[1:], [[0.9]], rng=rng())
+    assert np.allclose(analysis, second, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("columns", "y", "noise", "ratios"),
+    [
+        # From place 7 the others are 1 and 2.5 away, the shorter way round.
+        ([2], [-0.5], [[0.9]], [0.5, 1.25, 0.0]),
+        # Correlated observations are one group: the nearest one counts.
+        ([0, 2], [1.0, -0.5], R, [0.0, 0.75, 0.0]),
+    ],
+)
+def test_distances_on_a_ring_are_the_shorter_way_round(
+    columns: list[int], y: list[float], noise: np.ndarray, ratios: list[float]
+) -> None:
+    """The changes by a group are those of the update times the taper of these ratios."""
+    x = members(20)
+    data = (x, x[:, columns], y, noise)
+    analysis = localize_on_ring(columns)(*data, rng=rng())
+    rho = gaspari_cohn(np.array(ratios))
+    change = ETKF(*data, rng=rng()) - x
+    assert np.allclose(analysis - x, rho * change, atol=1e-12)

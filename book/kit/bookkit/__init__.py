@@ -1,5 +1,5 @@
 """The book's own tools: scenarios, published values, verdicts, studies, figures and digests.
 
-The chapters, the studies and the book's checks use them; the library ``distfilt`` knows nothing of
-them.
+They are used by chapters, studies and the checks of the book. The library ``distfilt`` does not
+depend on them.
 """

@@ -1,4 +1,4 @@
-"""What a chapter's checks do: strict where outputs are compared, words for a reader who edits."""
+"""Assertions of chapters: strict in the tests, a printed message for a reader who edits a cell."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["SoftAssert", "use_soft_assert"]
 
 
 class SoftAssert(ast.NodeTransformer):
-    """Turn each ``assert`` into a remark, so that an edited notebook runs on and says what changed.
+    """Turn each ``assert`` into a printed message, so that an edited notebook runs to its end.
 
     Examples
     --------
@@ -22,18 +22,18 @@ class SoftAssert(ast.NodeTransformer):
     """
 
     def visit_Assert(self, node: ast.Assert) -> ast.If:
-        """``if not test: print(...)``, with the test itself where the check has no words."""
+        """Return ``if not test: print(message)``; the default message is the test's source."""
         words = [
             ast.Constant("no longer holds:"),
             node.msg or ast.Constant(ast.unparse(node.test)),
         ]
-        remark = ast.Expr(ast.Call(ast.Name("print", ast.Load()), words, []))
-        told = ast.If(ast.UnaryOp(ast.Not(), node.test), [remark], [])
-        return ast.copy_location(told, node)
+        message = ast.Expr(ast.Call(ast.Name("print", ast.Load()), words, []))
+        check = ast.If(ast.UnaryOp(ast.Not(), node.test), [message], [])
+        return ast.copy_location(check, node)
 
 
 def use_soft_assert(shell: Any) -> None:
-    """Let the cells of an IPython shell tell, unless ``BOOK_STRICT`` is set, as in the tests."""
-    known = [type(transformer) for transformer in shell.ast_transformers]
-    if "BOOK_STRICT" not in os.environ and SoftAssert not in known:
+    """Let failed assertions of an IPython shell print, unless ``BOOK_STRICT`` is set."""
+    installed = [type(transformer) for transformer in shell.ast_transformers]
+    if "BOOK_STRICT" not in os.environ and SoftAssert not in installed:
         shell.ast_transformers.append(SoftAssert())

@@ -1,4 +1,4 @@
-"""A short description of plotted data, by which a test of stored outputs sees a changed curve."""
+"""Short texts that describe plotted data, so that comparing outputs detects a changed curve."""
 
 from __future__ import annotations
 
@@ -15,59 +15,64 @@ Array = NDArray[np.float64]
 
 _GOLDEN = (np.sqrt(5) - 1) / 2
 _OFFSET = 0.03183098861837907
-"""Moves the ties of a rounding away from short decimals, which plotted data often are (1/10π)."""
+"""Moves the ties of rounding away from short decimals, which are frequent in plots (1/10π)."""
 
 
 def _decade(value: float) -> int:
-    """Power of ten of a positive number; the edge lies beside 1, 10, 100, not on them."""
+    """Return the power of ten of a positive number; its steps lie just beside 1, 10, 100."""
     return int(np.floor(np.log10(value * (1 + _OFFSET))))
 
 
-def _rounded(value: float, scale: float, *, smallest: int) -> str:
-    """Four digits of `value`, but no digit `smallest` decades or more below that of `scale`."""
+def _round(value: float, scale: float, *, max_decades: int) -> str:
+    """Return four digits of `value`, but none `max_decades` decades below the first of `scale`."""
     if scale == 0 or abs(value) < 1e-9 * (1 - _OFFSET) * scale:
         return "0"
-    unit = 10.0 ** max(_decade(abs(value)) - 3, _decade(scale) - smallest)
+    unit = 10.0 ** max(_decade(abs(value)) - 3, _decade(scale) - max_decades)
     steps = np.floor(value / unit + 0.5 + _OFFSET)
     return f"{steps * unit + 0.0:.4g}"
 
 
+def _projection(values: Array) -> float:
+    """Return the inner product with a fixed unit vector.
+
+    Its signs alternate, so that a large mean does not hide a change. Its sizes lie between 1 and 2
+    and differ from entry to entry, so that an exchange of two entries changes the result.
+    """
+    k = np.arange(values.size)
+    signs = 1 - 2.0 * (k % 2)
+    vector = signs * (1 + (k * _GOLDEN) % 1)
+    return float(vector @ values / np.sqrt((vector**2).sum()))
+
+
 def _summary(values: Array) -> str:
+    """Describe an array: size, range, mean, projection, and how many entries are not finite."""
     flat = values.ravel()
-    good = np.isfinite(flat)
-    nans = int(np.isnan(flat).sum())
-    infinities = int(np.isinf(flat).sum())
-    missing = (f", {nans} NaN" if nans else "") + (
-        f", {infinities} infinite" if infinities else ""
-    )
-    if not good.any():
+    is_finite = np.isfinite(flat)
+    n_nan = int(np.isnan(flat).sum())
+    n_infinite = int(np.isinf(flat).sum())
+    missing = f", {n_nan} NaN" if n_nan else ""
+    if n_infinite:
+        missing += f", {n_infinite} infinite"
+    if not is_finite.any():
         return f"{flat.size} values{missing}"
-    kept = np.where(good, flat, 0.0)
-    # Signs alternate, so that a large mean does not drown a change; sizes differ from entry to
-    # entry, between 1 and 2, so that an exchange of two entries shows and none is overlooked.
-    k = np.arange(flat.size)
-    weights = (1 - 2.0 * (k % 2)) * (1 + (k * _GOLDEN) % 1)
-    projection = float(weights @ kept / np.sqrt((weights**2).sum()))
-    finite = flat[good]
+    finite = flat[is_finite]
     scale = float(np.abs(finite).max())
-    # Mean and projection cancel: their noise is that of the largest entry, not their own.
-    low, high = (
-        _rounded(float(v), scale, smallest=99) for v in (finite.min(), finite.max())
-    )
-    mean, along = (
-        _rounded(v, scale, smallest=4) for v in (float(finite.mean()), projection)
-    )
-    return (
-        f"{flat.size} values, {low}..{high}, mean {mean}, projection {along}{missing}"
-    )
+    low = _round(float(finite.min()), scale, max_decades=99)
+    high = _round(float(finite.max()), scale, max_decades=99)
+    # Terms cancel in mean and projection: their rounding errors scale with the largest entry.
+    mean = _round(float(finite.mean()), scale, max_decades=4)
+    along = _projection(np.where(is_finite, flat, 0.0))
+    projection = _round(along, scale, max_decades=4)
+    text = f"{flat.size} values, {low}..{high}, mean {mean}, projection {projection}"
+    return text + missing
 
 
 def digest(**arrays: ArrayLike) -> str:
-    """Describe plotted data, a line an array: who compares stored outputs sees a changed curve.
+    """Describe plotted data in a line an array, so that a comparison of texts detects changes.
 
-    A picture is not compared, this text is: the number of values, their range, their mean and
-    their inner product with one fixed unit vector, to four digits. Range digits are relative to
-    the number itself, the others to the largest value; what is below 1e-9 of it prints as 0.
+    A line has the number of values, their range, their mean and their inner product with a fixed
+    unit vector, to four digits. Digits of the range are relative to the number itself, the others
+    to the largest value; numbers below 1e-9 of it print as 0.
 
     Parameters
     ----------
@@ -87,21 +92,20 @@ def digest(**arrays: ArrayLike) -> str:
     time: 3 values, 0..0.2, mean 0.1, projection 0.03765
     error: 3 values, 2..4, mean 3, projection 0.3368, 1 NaN
     """
-    return "\n".join(
-        f"{name}: {_summary(_plain(value))}" for name, value in arrays.items()
-    )
+    lines = [f"{name}: {_summary(_plain(value))}" for name, value in arrays.items()]
+    return "\n".join(lines)
 
 
 def of_axes(drawn: Any) -> str:
-    """Describe what a figure shows, read from its artists, in the form of :func:`digest`.
+    """Describe a figure by the data of its artists, in the form of :func:`digest`.
 
-    What is described is what was drawn and not what should have been: a curve that is scaled, left
-    out or drawn in another panel changes the text.
+    The text describes the drawn figure: it changes if a curve is scaled, missing or drawn in
+    another panel.
 
     Parameters
     ----------
     drawn : matplotlib.figure.Figure, matplotlib.axes.Axes or an array or sequence of Axes
-        What to read. Of a figure, all its axes in order; insets follow their axes.
+        The axes to describe. Those of a figure come in order, each followed by its insets.
 
     Returns
     -------
@@ -112,8 +116,8 @@ def of_axes(drawn: Any) -> str:
 
     Notes
     -----
-    Positions are in the units of the data, colours and texts are not read; of what is coloured by
-    value, the values are.
+    Positions are in the units of the data. Colours and texts are ignored, but the values of artists
+    that are coloured by value are described.
 
     Examples
     --------
@@ -126,34 +130,41 @@ def of_axes(drawn: Any) -> str:
     line 1 y: 3 values, 2..4, mean 3, projection 1.971
     line 2 y: 3 values, 1..2, mean 1.5, projection 0.4607
     """
-    out: list[str] = []
+    texts: list[str] = []
     for k, axes in enumerate(_panels(drawn), start=1):
         entries = list(_entries(axes))
-        counts = {kind: 0 for kind, _, _ in entries}
-        lines: list[str] = []
-        before: dict[str, str] = {}
-        for kind, many, coordinates in entries:
-            first = counts[kind] + 1
-            counts[kind] = counts[kind] + many
-            name = f"{kind} {first}" + (f"-{counts[kind]}" if many > 1 else "")
-            now = {axis: _summary(values) for axis, values in coordinates.items()}
-            lines += [
-                f"{name} {axis}: {t}"
-                for axis, t in now.items()
-                if before.get(axis) != t
-            ]
-            before = now
-        ends = {
-            kind: ("es" if kind == "patch" else "s") * (n > 1)
-            for kind, n in counts.items()
-        }
-        told = ", ".join(f"{n} {kind}{ends[kind]}" for kind, n in counts.items())
-        out += [f"axes {k}: {told or 'empty'}", *lines]
-    return (
-        "\n".join(out)
-        if any(": empty" not in line for line in out)
-        else "an empty figure"
-    )
+        counts: dict[str, int] = {}
+        for kind, n, _ in entries:
+            counts[kind] = counts.get(kind, 0) + n
+        counted = ", ".join(_plural(kind, n) for kind, n in counts.items())
+        texts.append(f"axes {k}: {counted or 'empty'}")
+        texts += _describe_entries(entries)
+    if all(": empty" in text for text in texts):
+        return "an empty figure"
+    return "\n".join(texts)
+
+
+def _plural(kind: str, n: int) -> str:
+    """Return ``1 line``, ``2 lines``, ``2 patches``."""
+    ending = "es" if kind == "patch" else "s"
+    return f"{n} {kind}{ending if n > 1 else ''}"
+
+
+def _describe_entries(entries: list[_Entry]) -> list[str]:
+    """Describe artists in order, a line a coordinate; repeated coordinates are left out."""
+    lines: list[str] = []
+    counts: dict[str, int] = {}
+    previous: dict[str, str] = {}
+    for kind, n, coordinates in entries:
+        first = counts.get(kind, 0) + 1
+        counts[kind] = first + n - 1
+        name = f"{kind} {first}" if n <= 1 else f"{kind} {first}-{counts[kind]}"
+        summaries = {axis: _summary(values) for axis, values in coordinates.items()}
+        for axis, text in summaries.items():
+            if previous.get(axis) != text:
+                lines.append(f"{name} {axis}: {text}")
+        previous = summaries
+    return lines
 
 
 _Entry = tuple[str, int, dict[str, Array]]
@@ -161,7 +172,7 @@ _Entry = tuple[str, int, dict[str, Array]]
 
 
 def _panels(drawn: Any) -> Iterator[Any]:
-    """All axes, each followed by its insets. matplotlib is known by what its objects can do."""
+    """Yield all axes, each followed by its insets; matplotlib need not be imported for it."""
     if hasattr(drawn, "get_axes"):
         drawn = drawn.get_axes()
     elif hasattr(drawn, "transData"):
@@ -172,15 +183,15 @@ def _panels(drawn: Any) -> Iterator[Any]:
 
 
 def _entries(axes: Any) -> Iterator[_Entry]:
-    """What is visible in one axes; neighbours of one kind of patch, such as bars, are one entry."""
+    """Yield the visible artists of an axes; a row of patches, such as bars, is one."""
     for line in _visible(axes.lines):
-        yield "line", 1, _named(*np.transpose(line.get_xydata()))
+        yield "line", 1, _by_axis(*np.transpose(line.get_xydata()))
     for _, group in groupby(_visible(axes.patches), key=type):
         patches = list(group)
         outlines = [
             p.get_patch_transform().transform(p.get_path().vertices) for p in patches
         ]
-        yield "patch", len(patches), _named(*np.concatenate(outlines).T)
+        yield "patch", len(patches), _by_axis(*np.concatenate(outlines).T)
     for collection in _visible(axes.collections):
         yield "collection", 1, _collection(collection, axes.transData)
     for image in _visible(axes.images):
@@ -192,31 +203,41 @@ def _entries(axes: Any) -> Iterator[_Entry]:
 
 
 def _visible(artists: Iterable[Any]) -> list[Any]:
+    """Return the artists that are drawn."""
     return [artist for artist in artists if artist.get_visible()]
 
 
 def _collection(artist: Any, data: Any) -> dict[str, Array]:
-    """Where its points are or, where all is drawn at one place, what its outlines are."""
+    """Return the coordinates and values of a collection.
+
+    The positions are the points' offsets. If all is drawn at one place, they are the outlines.
+    """
     offsets = np.ma.filled(artist.get_offsets(), np.nan)
     if len(offsets) > 1 or artist.get_offset_transform() == data:
-        found = _named(*offsets.T)
+        positions = _by_axis(*offsets.T)
     else:
         outlines = [path.vertices for path in artist.get_paths()]
-        found = _named(*np.concatenate([np.empty((0, 2)), *outlines]).T)
+        vertices = np.concatenate([np.empty((0, 2)), *outlines])
+        positions = _by_axis(*vertices.T)
     sizes: Any = artist.get_sizes() if hasattr(artist, "get_sizes") else ()
-    more = {"value": artist.get_array(), "u": getattr(artist, "U", None)}
-    more |= {"v": getattr(artist, "V", None), "size": sizes if len(sizes) > 1 else None}
-    return found | {
-        name: _plain(values) for name, values in more.items() if values is not None
+    values = {
+        "value": artist.get_array(),
+        "u": getattr(artist, "U", None),
+        "v": getattr(artist, "V", None),
+        "size": sizes if len(sizes) > 1 else None,
     }
+    for name, entry in values.items():
+        if entry is not None:
+            positions[name] = _plain(entry)
+    return positions
 
 
-def _named(*coordinates: Any) -> dict[str, Array]:
-    return {
-        name: _plain(values) for name, values in zip("xy", coordinates, strict=True)
-    }
+def _by_axis(*coordinates: Any) -> dict[str, Array]:
+    """Return coordinates under the names x and y."""
+    pairs = zip("xy", coordinates, strict=True)
+    return {name: _plain(values) for name, values in pairs}
 
 
 def _plain(values: Any) -> Array:
-    """Numbers with NaN where they are masked."""
+    """Return an array of floats with NaN in place of masked entries."""
     return np.ma.filled(np.ma.asarray(values, dtype=np.float64), np.nan)

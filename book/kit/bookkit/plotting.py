@@ -1,7 +1,7 @@
-"""Figures of the book: arrays in, matplotlib axes out, and pictures that move without a kernel.
+"""Figures of the book: functions from arrays to matplotlib axes, and sliders without a kernel.
 
-Colours and line styles both tell curves apart, so that a figure also reads in grey and for a reader
-who does not see all colours.
+Curves differ in colour and in line style, so that a figure can be read in grey, and by readers who
+do not see all colours.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ SIZE = (6.0, 3.4)
 
 
 def colour(index: int) -> str:
-    """The palette's colour number `index`, counted from 0; it starts again after the last.
+    """Return the palette's colour number `index`, counted from 0; after the last it starts again.
 
     >>> colour(0), colour(8)
     ('#0072B2', '#0072B2')
@@ -70,7 +70,7 @@ def colour(index: int) -> str:
 
 
 def line_style(index: int) -> Any:
-    """The line style that goes with colour number `index`.
+    """Return the line style that goes with colour number `index`.
 
     >>> line_style(0), line_style(1)
     ('-', '--')
@@ -81,11 +81,11 @@ def line_style(index: int) -> Any:
 def use_style() -> None:
     """Set matplotlib's defaults for a chapter; call it once, before the first figure.
 
-    Page size, resolution and fonts are fixed, so that a figure drawn twice is the same file. In a
-    notebook the text form of a figure, which is stored beside its picture, becomes the digest of
-    what its axes hold (`bookkit.digests.of_axes`): a curve that changes is noticed by whoever
-    compares stored outputs. A check that fails after a reader's edit is told in words, and the
-    notebook runs on; it stops where the book is tested (`bookkit.checks`).
+    Page size, resolution and fonts are fixed, so that drawing a figure twice gives the same file.
+    In a notebook the text form of a figure, which is stored beside its picture, becomes the digest
+    of its axes (`bookkit.digests.of_axes`): a comparison of outputs detects a changed curve.
+    An assertion that fails after a reader's edit prints a message, and the notebook runs on; in the
+    tests it stops (`bookkit.checks`).
 
     >>> with matplotlib.rc_context():  # so that this example leaves no trace
     ...     use_style()
@@ -113,24 +113,24 @@ def use_style() -> None:
 
 
 def _print_digests() -> None:
-    """In IPython, print a figure as its digest; elsewhere there is no text beside a picture."""
+    """In IPython, print a figure as its digest."""
     from IPython import get_ipython
     from matplotlib import get_backend, pyplot
 
     shell = get_ipython()
     if shell is not None:
         use_soft_assert(shell)
-        # The notebook's backend forgets printers when it starts, with the first figure: start it.
+        # The notebook's backend resets printers when it starts with the first figure: start it now.
         pyplot.switch_backend(get_backend())
-        # Twice the pixels, at the same size on the page; packed fast, for who stores packs anew.
+        # Twice the pixels at the same size; compressed fast, since storing compresses again.
         shell.run_line_magic("config", "InlineBackend.figure_format = 'retina'")
-        packed = {"bbox_inches": "tight", "pil_kwargs": {"compress_level": 1}}
-        shell.run_line_magic("config", f"InlineBackend.print_figure_kwargs = {packed}")
+        options = {"bbox_inches": "tight", "pil_kwargs": {"compress_level": 1}}
+        shell.run_line_magic("config", f"InlineBackend.print_figure_kwargs = {options}")
         text = shell.display_formatter.formatters["text/plain"]
         text.for_type(
             Figure, lambda figure, printer, cycle: printer.text(of_axes(figure))
         )
-        # The backend shows a cell's figures; pyplot's own hook would draw each once more, unseen.
+        # The backend shows a cell's figures; pyplot's own hook would draw each of them once more.
         pyplot.uninstall_repl_displayhook()
 
 
@@ -146,16 +146,16 @@ def axes(
     yscale: str = "linear",
     size: tuple[float, float] = SIZE,
 ) -> Axes:
-    """Labelled axes, in a new figure of the book's size unless `ax` is given.
+    """Return labelled axes, in a new figure of the book's size unless `ax` is given.
 
     Parameters
     ----------
     xlabel, ylabel : str
-        What the axes show; required.
+        Labels of the axes; required.
     xunit, yunit : str, optional
         Units, put behind the labels in parentheses.
     title : str, optional
-        Only where the caption does not say it.
+        Needed only if the caption does not have it.
     ax : matplotlib Axes, optional
         Axes to label.
     xscale, yscale : {"linear", "log"}
@@ -172,10 +172,8 @@ def axes(
         from matplotlib import pyplot
 
         _, ax = pyplot.subplots(figsize=size)
-    x, y = (
-        name if unit is None else f"{name} ({unit})"
-        for name, unit in ((xlabel, xunit), (ylabel, yunit))
-    )
+    x = xlabel if xunit is None else f"{xlabel} ({xunit})"
+    y = ylabel if yunit is None else f"{ylabel} ({yunit})"
     ax.set(xlabel=x, ylabel=y, xscale=xscale, yscale=yscale)
     if title:
         ax.set_title(title)
@@ -191,7 +189,7 @@ def ellipse(
     index: int = 0,
     label: str | None = None,
 ) -> Axes:
-    r"""Draw the ellipse that holds a share `level` of a plane Gaussian, and its mean.
+    r"""Draw the mean of a plane Gaussian and the ellipse that has probability `level`.
 
     The squared Mahalanobis distance of the ellipse is the chi-square quantile with two degrees of
     freedom, :math:`-2\log(1-\text{level})`.
@@ -206,7 +204,7 @@ def ellipse(
     level : float
         Probability inside, in (0, 1). One standard deviation is 0.393.
     index, label
-        Number of the colour and line style, and what the legend says.
+        Number of the colour and line style, and text of the legend.
 
     Examples
     --------
@@ -219,8 +217,8 @@ def ellipse(
     centre = np.asarray(mean, dtype=float)
     root = factor(np.asarray(covariance, dtype=float))
     radius = np.sqrt(-2 * np.log1p(-level))
-    turn = np.linspace(0, 2 * np.pi, 181)
-    x, y = centre[:, None] + radius * root @ np.stack([np.cos(turn), np.sin(turn)])
+    angles = np.linspace(0, 2 * np.pi, 181)
+    x, y = centre[:, None] + radius * root @ np.stack([np.cos(angles), np.sin(angles)])
     ax.plot(x, y, color=colour(index), linestyle=line_style(index), label=label)
     ax.plot(*centre, marker="+", color=colour(index), linestyle="none")
     return ax
@@ -248,7 +246,7 @@ def band(
     quantiles : (float, float)
         Lower and upper end of the band.
     index, label
-        Number of the colour and line style, and what the legend says.
+        Number of the colour and line style, and text of the legend.
 
     Examples
     --------
@@ -275,20 +273,20 @@ def graph(
     known: ArrayLike | None = None,
     notes: Sequence[str] | None = None,
 ) -> Axes:
-    """Draw agents as discs, the links between them as lines, and who knows how much.
+    """Draw agents as discs and links as lines.
 
     Parameters
     ----------
     ax : matplotlib Axes
         Where to draw; its frame is hidden and both axes get one scale.
     adjacency : array_like, (A, A)
-        Nonzero where two agents talk; symmetric. The diagonal is not drawn.
+        Nonzero for a link between two agents; symmetric. The diagonal is not drawn.
     labels : sequence of str, optional
         Names of the agents; 1 to A by default.
     positions : array_like, (A, 2), optional
         On a circle by default, the first agent on top, then clockwise.
     known : array_like, (A,), optional
-        How much each agent knows, from 0, an empty disc, to 1, a full one.
+        Fill of each disc, from 0 (empty) to 1 (full), such as the share of the state that it knows.
     notes : sequence of str, optional
         A text below each agent, such as what it measures; may be empty.
 
@@ -301,18 +299,18 @@ def graph(
     links = np.asarray(adjacency)
     n = len(links)
     names = [str(k + 1) for k in range(n)] if labels is None else labels
-    turn = 2 * np.pi * np.arange(n) / n
-    circle = np.stack([np.sin(turn), np.cos(turn)], axis=-1) * (n > 1)
-    place = circle if positions is None else np.asarray(positions, dtype=float)
-    share = np.zeros(n) if known is None else np.asarray(known, dtype=float)
+    angles = 2 * np.pi * np.arange(n) / n
+    circle = np.stack([np.sin(angles), np.cos(angles)], axis=-1) * (n > 1)
+    places = circle if positions is None else np.asarray(positions, dtype=float)
+    fill = np.zeros(n) if known is None else np.asarray(known, dtype=float)
     for i, j in zip(*np.nonzero(np.triu(links, 1)), strict=True):
-        ax.plot(*place[[i, j]].T, color="0.55", linewidth=1.2, zorder=1)
-    # White shows through a disc that is not full, and hides the links behind it.
-    faces = [1 - k + k * np.array(to_rgba(colour(5))) for k in share]
-    x, y = place.T
+        ax.plot(*places[[i, j]].T, color="0.55", linewidth=1.2, zorder=1)
+    # Mix with white instead of transparency, which would show the links behind a disc.
+    faces = [1 - k + k * np.array(to_rgba(colour(5))) for k in fill]
+    x, y = places.T
     ax.scatter(x, y, s=340, c=faces, edgecolor=colour(0), linewidth=1.4, zorder=2)
     for name, note, (a, b) in zip(
-        names, notes or [""] * n, place.tolist(), strict=True
+        names, notes or [""] * n, places.tolist(), strict=True
     ):
         ax.text(a, b, name, ha="center", va="center", zorder=3)
         if note:

@@ -1,4 +1,4 @@
-"""What the papers print, and verdicts on our reproductions by rules fixed before."""
+"""Published values, and verdicts on our reproductions by rules that were fixed before."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ __all__ = [
 ]
 
 PAPERS = ("grange", "das", "semeraro", "zheng", "together")
-"""Keys: triangular maps, constrained transport, mixture fusion, density; all of them together."""
+"""Keys of the papers, and ``together`` for the comparison of all of them."""
 
 VERDICTS = {
     "parameters": ("read", "differs", "not comparable"),
     "results": ("match", "differs", "not comparable"),
 }
-"""What can be found of each kind of item: a study reads parameters and reproduces results.
+"""Possible verdicts on each kind of item.
 
-A study that read its parameters has reproduced nothing yet. An item without a verdict is "not yet"
-in the ledger.
+A table of parameters is "read" by a study; results "match" or not. Reading parameters reproduces no
+result. An item without a verdict is "not yet" in the ledger.
 """
 
 _MIME = "application/vnd.distfilt.verdict+json"
 
 
 def table(paper: str, name: str) -> list[dict[str, str]]:
-    """The rows of a paper's table as printed, from ``published/PAPER/NAME.csv``.
+    """Return the rows of a paper's table as printed, from ``published/PAPER/NAME.csv``.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ class Item(NamedTuple):
 
 
 def items() -> list[Item]:
-    """The tables and figures of the four papers that the book reproduces.
+    """Return the tables and figures of the four papers that the book reproduces.
 
     >>> len(items()), items()[1].item, items()[1].file
     (21, 'Table II', 'table-2')
@@ -87,16 +87,17 @@ def items() -> list[Item]:
     return [Item(**row) for row in read_rows(data_root() / "published" / "items.csv")]
 
 
-def _known(paper: str, item: str) -> Item:
-    found = [known for known in items() if known[:2] == (paper, item)]
-    if not found:
-        raise ValueError(f"item must be one of items(), got {paper} {item}")
-    return found[0]
+def _find_item(paper: str, item: str) -> Item:
+    """Return the item of that paper and name."""
+    for candidate in items():
+        if candidate[:2] == (paper, item):
+            return candidate
+    raise ValueError(f"item must be one of items(), got {paper} {item}")
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What came of reproducing one item; a notebook shows it and the ledger collects it.
+    """The result of reproducing one item; a notebook shows it and the ledger collects it.
 
     Parameters
     ----------
@@ -105,14 +106,14 @@ class Verdict:
     verdict : {"read", "match", "differs", "not comparable"}
         The finding: "read" only for an item of kind "parameters", "match" only for results.
     ours, published : str
-        What we find and what the paper prints.
+        Our result, and the printed one.
     why : str
-        Needed if it differs or is not comparable: the reason, or the input that the paper does
-        not give.
+        The reason, or the input that the paper does not give; required if the item differs or is
+        not comparable.
     null : str
-        What the numbers would be if the claims were false; the rules fail on them.
+        The numbers that would result if the claims were false; the rules fail on them.
     range : str
-        For which values of parameters that the paper does not print the verdict holds.
+        Values of unprinted parameters for which the verdict holds.
 
     Examples
     --------
@@ -132,13 +133,13 @@ class Verdict:
     range: str = ""
 
     def __post_init__(self) -> None:
-        known = VERDICTS[_known(self.paper, self.item).kind]
-        if self.verdict not in known:
+        allowed = VERDICTS[_find_item(self.paper, self.item).kind]
+        if self.verdict not in allowed:
             raise ValueError(
-                f"verdict must be one of {', '.join(known)}, got {self.verdict!r}"
+                f"verdict must be one of {', '.join(allowed)}, got {self.verdict!r}"
             )
-        if self.verdict in known[1:] and not self.why.strip():
-            raise ValueError(f"why must be a reason for {self.verdict!r}")
+        if self.verdict in allowed[1:] and not self.why.strip():
+            raise ValueError(f"why must give a reason for {self.verdict!r}")
 
     def _fields(self) -> list[tuple[str, str]]:
         names = ("ours", "null", "range", "published", "why")
@@ -164,7 +165,7 @@ class Verdict:
         }
 
 
-def _judged(
+def _judge(
     item: Item,
     good: bool,
     ours: str,
@@ -173,14 +174,21 @@ def _judged(
     study: Scenario | None,
     *,
     open_: str = "",
-    **beside: str,
+    **evidence: str,
 ) -> Verdict:
-    """What was found, unless the study was another one; the reason is needed for a difference."""
+    """Return the verdict; a changed scenario or an open input makes it "not comparable"."""
     if study is not None and study.changes:
         open_ = "changed scenario: " + "; ".join(study.changes)
-    word = "not comparable" if open_ else VERDICTS[item.kind][0] if good else "differs"
-    reason = open_ or ("" if good else why)
-    return Verdict(item.paper, item.item, word, ours, published, reason, **beside)
+    if open_:
+        verdict = "not comparable"
+        reason = open_
+    elif good:
+        verdict = VERDICTS[item.kind][0]
+        reason = ""
+    else:
+        verdict = "differs"
+        reason = why
+    return Verdict(item.paper, item.item, verdict, ours, published, reason, **evidence)
 
 
 class Claim(NamedTuple):
@@ -191,17 +199,17 @@ class Claim(NamedTuple):
     id : str
         Its key in ``published/PAPER/figure-N.csv``.
     text : str
-        What we computed for it, in words.
+        The computed quantity, in words.
     holds : bool
         Whether its criterion is met.
     evidence : str
         The numbers, with their interval.
     null : str
-        What the numbers would be if the claim were false, and how that was computed.
-    bites : bool
+        The numbers that would result if the claim were false, and how they were computed.
+    has_power : bool
         Whether the criterion fails on the null's numbers, as it must.
     range : str
-        For which values of a parameter that the paper does not print the claim holds.
+        Values of an unprinted parameter for which the claim holds.
 
     Examples
     --------
@@ -230,7 +238,7 @@ class Claim(NamedTuple):
         range: str = "",
         shown: Callable[[Any], str] = str,
     ) -> Claim:
-        """A claim judged by one rule on our number and on its null, which `against` describes.
+        """Judge a claim by one rule, on our number and on its null, which `against` describes.
 
         Examples
         --------
@@ -241,9 +249,9 @@ class Claim(NamedTuple):
         ... )
         order holds: ratio 0.8
         """
-        beside = f"{against}: {shown(null)}{' (holds too)' if rule(null) else ''}"
+        null_text = f"{against}: {shown(null)}{' (holds too)' if rule(null) else ''}"
         return cls(
-            id, text, bool(rule(ours)), shown(ours), beside, not rule(null), range
+            id, text, bool(rule(ours)), shown(ours), null_text, not rule(null), range
         )
 
     def __str__(self) -> str:
@@ -259,7 +267,7 @@ def judge_claims(
     free: str = "",
     scenario: Scenario | None = None,
 ) -> Verdict:
-    """The verdict on a figure: a match if every claim listed for it is judged and holds.
+    """Return the verdict on a figure: a match if every claim listed for it holds.
 
     Parameters
     ----------
@@ -271,15 +279,15 @@ def judge_claims(
     why : str
         Why it differs; needed and used only if a claim fails.
     free : str
-        What the paper does not print and the verdict hangs on, so that it is "not comparable";
-        the claims' ranges say for which values they hold.
+        An unprinted input on which the verdict depends, so that it is "not comparable"; the claims'
+        ranges give the values for which they hold.
     scenario : Scenario, optional
-        What the study ran; if it is not the paper's, the verdict is "not comparable" and names
-        what was changed.
+        The scenario of the study. If it is not the paper's, the verdict is "not comparable" and
+        names the changes.
 
     Notes
     -----
-    Where all claims hold and a criterion passes on its null too, the verdict is "not comparable".
+    If all claims hold and a criterion passes on its null too, the verdict is "not comparable".
 
     Examples
     --------
@@ -297,25 +305,37 @@ def judge_claims(
     ... ).verdict
     'differs'
     """
-    known = _known(paper, item)
-    file = known.file if known.file.startswith("figure") else f"{known.file}-claims"
+    listed_item = _find_item(paper, item)
+    file = (
+        listed_item.file
+        if listed_item.file.startswith("figure")
+        else f"{listed_item.file}-claims"
+    )
     listed = {row["id"]: row for row in table(paper, file)}
-    given = [claim.id for claim in claims]
-    if sorted(given) != sorted(listed):
+    ids = [claim.id for claim in claims]
+    if sorted(ids) != sorted(listed):
         raise ValueError(
             f"claims must be those of {paper} {item}, {', '.join(listed)}, each once, "
-            f"got {', '.join(given)}"
+            f"got {', '.join(ids)}"
         )
     ours = "; ".join(str(c) for c in claims)
-    said = "; ".join(row["claim"] for row in listed.values())
-    good = all(c.holds for c in claims)
-    blunt = [c.id for c in claims if not c.has_power]
-    if good and blunt and not free:
-        free = f"the rule of {', '.join(blunt)} holds for its null too"
+    printed = "; ".join(row["claim"] for row in listed.values())
+    all_hold = all(c.holds for c in claims)
+    powerless = [c.id for c in claims if not c.has_power]
+    if all_hold and powerless and not free:
+        free = f"the rule of {', '.join(powerless)} holds for its null too"
     null = "; ".join(f"{c.id}, {c.null}" for c in claims if c.null)
-    swept = "; ".join(f"{c.id} {c.range}" for c in claims if c.range)
-    return _judged(
-        known, good, ours, said, why, scenario, open_=free, null=null, range=swept
+    ranges = "; ".join(f"{c.id} {c.range}" for c in claims if c.range)
+    return _judge(
+        listed_item,
+        all_hold,
+        ours,
+        printed,
+        why,
+        scenario,
+        open_=free,
+        null=null,
+        range=ranges,
     )
 
 
@@ -326,24 +346,24 @@ def judge_parameters(
     *,
     scenario: Scenario | None = None,
 ) -> Verdict:
-    """The verdict on a table of parameters: "read" if the study read every cell as printed.
+    """Return the verdict on a table of parameters: "read" if the study read every cell as printed.
 
-    Rows are paired by the first printed column, and cells compared as numbers where both are
-    numbers, else as text without spaces. A cell that the study did not take counts as not read.
+    Rows are matched by the first printed column. Cells are compared as numbers if both are numbers,
+    else as texts without spaces.
 
     Parameters
     ----------
     paper, item : str
         One of `items`, of kind "parameters".
     read : Scenario or sequence of mappings
-        What the study used: the `Scenario.reading` of which it took its values, or rows from
-        column to value that are made of what ran, such as a sensor's kind and standard deviation.
+        The values that the study used: a scenario with `Scenario.track_reads`, or rows made from
+        the objects that ran, such as a sensor's kind and standard deviation.
     scenario : Scenario, optional
-        What the study ran, as of `judge_claims`; the reading itself without it.
+        The scenario of the study, as in `judge_claims`; by default `read` itself.
 
     Examples
     --------
-    >>> study = scenario("grange", "table-2").reading()
+    >>> study = scenario("grange", "table-2").track_reads()
     >>> used = [(a.kind, a.dims, a.noise) for a in study.agents]
     >>> judge_parameters("grange", "Table II", study).why
     'row A, neighbours: printed [A,B,C], not read by the study'
@@ -351,17 +371,17 @@ def judge_parameters(
     >>> judge_parameters("grange", "Table II", study).verdict
     'read'
     """
-    known = _known(paper, item)
-    printed = table(paper, known.file)
+    listed_item = _find_item(paper, item)
+    printed = table(paper, listed_item.file)
     rows = read.cells() if isinstance(read, Scenario) else read
     study = read if scenario is None and isinstance(read, Scenario) else scenario
     why = _first_difference(rows, printed)
-    said = f"{len(printed)} rows printed"
-    return _judged(known, not why, f"{len(rows)} rows read", said, why, study)
+    count = f"{len(printed)} rows printed"
+    return _judge(listed_item, not why, f"{len(rows)} rows read", count, why, study)
 
 
 def _cell(value: Any) -> str:
-    """A value as a paper's table prints it: lists in brackets, sensors by its names."""
+    """Return a value as a paper's table prints it: lists in brackets, sensors by its names."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, list | tuple):
@@ -379,6 +399,7 @@ _PRINTED_KINDS = {
 
 
 def _same(a: str, b: str) -> bool:
+    """Return whether two cells are equal as numbers, or as texts without spaces."""
     try:
         return float(a) == float(b)
     except ValueError:
@@ -388,17 +409,18 @@ def _same(a: str, b: str) -> bool:
 def _first_difference(
     rows: Sequence[Mapping[str, Any]], printed: list[dict[str, str]]
 ) -> str:
-    """The first printed cell that was not read, or read otherwise, or nothing."""
+    """Describe the first printed cell that was not read, or read differently; '' if none."""
     first = next(iter(printed[0]))
     by_key = {str(row[first]): row for row in rows}
-    for wanted in printed:
-        key = wanted.get(first, "")
+    for printed_row in printed:
+        key = printed_row.get(first, "")
         if key not in by_key:
             return f"row {key} is printed but was not read"
-        for column, text in wanted.items():
+        for column, text in printed_row.items():
             if column not in by_key[key]:
                 return f"row {key}, {column}: printed {text}, not read by the study"
-            if not _same(got := _cell(by_key[key][column]), text):
-                return f"row {key}, {column}: read {got}, printed {text}"
-    extra = by_key.keys() - {wanted[first] for wanted in printed}
+            value = _cell(by_key[key][column])
+            if not _same(value, text):
+                return f"row {key}, {column}: read {value}, printed {text}"
+    extra = by_key.keys() - {printed_row[first] for printed_row in printed}
     return f"row {min(extra)} was read but is not printed" if extra else ""

@@ -1,4 +1,4 @@
-"""CSV files as rows, and rows as tables to read."""
+"""Read CSV files as rows, and format rows as tables."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ Rows = Sequence[Sequence[str]]
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    """A CSV file's rows, cell by cell as they stand there, by the names of its first line.
+    """Return the rows of a CSV file as texts, by the names in its first line.
 
-    A row that does not fit the first line is refused by the file's name.
+    Raises an error that names the file if a row has more or fewer cells than the first line.
     """
     with path.open(encoding="utf-8", newline="") as lines:
         reader = csv.DictReader(lines, strict=True)
@@ -23,7 +23,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
     for number, row in enumerate(rows, start=1):
         if None in row or None in row.values():
             raise ValueError(
-                f"{path.name}, row {number}: has not as many cells as the first line"
+                f"{path.name}, row {number}: must have as many cells as the first line"
             )
     return rows
 
@@ -33,7 +33,7 @@ _CELL = "text-align:left;vertical-align:top;padding:.1em .8em .1em 0"
 
 
 def html_table(columns: Sequence[str], rows: Rows) -> str:
-    """Rows as an HTML table with three rules."""
+    """Return rows as an HTML table with three rules."""
 
     def cells(tag: str, texts: Sequence[str]) -> str:
         return "".join(
@@ -49,11 +49,11 @@ def html_table(columns: Sequence[str], rows: Rows) -> str:
 
 
 def markdown_table(columns: Sequence[str], rows: Rows) -> str:
-    """Rows as a Markdown table."""
-    lines = [columns, ["---"] * len(columns), *rows]
-    return "\n".join(
-        "| "
-        + " | ".join(t.replace("\\", "\\\\").replace("|", "\\|") for t in line)
-        + " |"
-        for line in lines
-    )
+    """Return rows as a Markdown table."""
+
+    def line(texts: Sequence[str]) -> str:
+        escaped = [t.replace("\\", "\\\\").replace("|", "\\|") for t in texts]
+        return f"| {' | '.join(escaped)} |"
+
+    rule = ["---"] * len(columns)
+    return "\n".join(line(texts) for texts in (columns, rule, *rows))

@@ -1,4 +1,4 @@
-"""Scenarios: every parameter of a study with its source, what was changed, what a study read."""
+"""Scenarios: every parameter of a study with its source, and changes of them."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ __all__ = ["Parameter", "Row", "Scenario", "read_scenario", "scenario"]
 
 _SOURCES = ("given", "inferred", "assumed")
 _ORIGIN = ("source", "where", "reason", "note")
-"""Columns of a row that say where it comes from; the others are its values."""
+"""Columns of a row that give its origin; the others are its values."""
 
 _UNITS = {
     "distance": ("m", "km"),
     "bearing": ("rad", "deg"),
     "line_angle": ("rad", "deg"),
 }
-"""Units in which a reading of that kind can be; every other kind may have any."""
+"""Units of each kind of sensor; other kinds may have any unit."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Parameter:
     unit : str
         ``1`` for a pure number, ``-`` where a unit has no meaning.
     source : {"given", "inferred", "assumed"}
-        Whether the paper gives it, it follows from what the paper gives, or we chose it.
+        Whether the paper gives it, it follows from given values, or we chose it.
     where : str
         The place in the paper; needed if given.
     reason : str
@@ -71,19 +71,19 @@ class Parameter:
 
     @property
     def why(self) -> str:
-        """Where it is given, or the reason for it; with the note."""
+        """The place where it is given, or the reason for it, with the note."""
         return _why(vars(self))
 
 
 def _plain(value: Any) -> Any:
-    """A value of TOML or numpy as a scalar or as (nested) tuples."""
+    """Return a value of TOML or numpy as a scalar or as (nested) tuples."""
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     return tuple(map(_plain, value)) if isinstance(value, list | tuple) else value
 
 
 def _check_origin(cells: Mapping[str, Any]) -> None:
-    """What is given says where, and what is not says why."""
+    """Check that a given value has its place in the paper, and any other a reason."""
     if cells.get("source") not in _SOURCES:
         raise ValueError(
             f"source must be one of {', '.join(_SOURCES)}, got {cells.get('source')!r}"
@@ -100,11 +100,11 @@ def _why(cells: Mapping[str, Any]) -> str:
 
 
 class UnknownKey(KeyError, ValueError):
-    """A scenario or a row has nothing of that name; the message lists the nearest names."""
+    """A scenario or a row has no such name; the message lists the nearest names."""
 
-    def __init__(self, what: str, key: Any, names: list[str]) -> None:
-        near = get_close_matches(str(key), names, n=3, cutoff=0.4) or names[:3]
-        super().__init__(f"{what} {key!r}; nearest: {', '.join(near) or 'none'}")
+    def __init__(self, text: str, key: Any, names: list[str]) -> None:
+        nearest = get_close_matches(str(key), names, n=3, cutoff=0.4) or names[:3]
+        super().__init__(f"{text} {key!r}; nearest: {', '.join(nearest) or 'none'}")
 
     def __str__(self) -> str:  # KeyError would print the message in quotes
         return str(self.args[0])
@@ -114,7 +114,7 @@ class Row(Mapping[str, Any]):
     """One row of a scenario's table, such as an agent: ``row["kind"]`` or ``row.kind``.
 
     A row has a ``name``, a ``unit``, a ``source`` with ``where`` or ``reason``, and its own
-    columns. The unit of a reading has to fit its ``kind``: an angle is no length.
+    columns. The unit must fit the sensor's ``kind``: an angle is not a length.
 
     Examples
     --------
@@ -133,18 +133,19 @@ class Row(Mapping[str, Any]):
     ('line_angle', (1, 2), 'Table II.')
     >>> Row({**row, "kind": "distance"})
     Traceback (most recent call last):
-    ValueError: unit must have m or km for 'distance', got 'rad'
+    ValueError: unit must be m or km for 'distance', got 'rad'
     """
 
     def __init__(
-        self, cells: Mapping[str, Any], note: Callable[[str], Any] = len
+        self, cells: Mapping[str, Any], on_access: Callable[[str], Any] = len
     ) -> None:
         self._cells = {key: _plain(value) for key, value in cells.items()}
-        self._note = note
+        self._on_access = on_access
         _check_origin(cells)
         kind = cells.get("kind", "")
         unit = cells["unit"]
-        if unit not in (allowed := _UNITS.get(kind, (unit,))):
+        allowed = _UNITS.get(kind, (unit,))
+        if unit not in allowed:
             raise ValueError(
                 f"unit must be {' or '.join(allowed)} for {kind!r}, got {unit!r}"
             )
@@ -154,7 +155,7 @@ class Row(Mapping[str, Any]):
             raise UnknownKey(
                 f"row {self._cells['name']!r} has no column", key, list(self._cells)
             )
-        self._note(key)
+        self._on_access(key)
         return self._cells[key]
 
     def __getattr__(self, name: str) -> Any:
@@ -170,32 +171,32 @@ class Row(Mapping[str, Any]):
 
     @property
     def why(self) -> str:
-        """Where it is given, or the reason for it; with the note."""
+        """The place where it is given, or the reason for it, with the note."""
         return _why(self._cells)
 
     @property
     def value_columns(self) -> tuple[str, ...]:
-        """The columns that hold values, without those that say where they come from."""
+        """The columns that hold values, without those of their origin."""
         return tuple(key for key in self._cells if key not in _ORIGIN)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Scenario:
-    """Every parameter of a study; ``s["gain"]`` is a value. It prints as a table.
+    """Every parameter of a study; ``s["gain"]`` is a value. It is shown as a table.
 
     Parameters
     ----------
     paper, name : str
         The paper's key and the scenario's name.
     title : str
-        What is studied.
+        Title of the study.
     parameters, notes : mapping from str to Parameter
-        What the study reads, and what describes it but is read by nothing: choices that are built
-        into a method, and values of the paper that ours does not need.
+        Values that the study reads, and values that only describe it: choices that are part of a
+        method, and values of the paper that the study does not need.
     tables : mapping from str to tuple of Row
         The file's arrays of tables, such as ``agents``.
-    seen : set of str, optional
-        Where it notes what was read, after `reading`.
+    accessed : set of str, optional
+        Names of the cells that were read, recorded after `track_reads`.
 
     Examples
     --------
@@ -218,10 +219,10 @@ class Scenario:
     parameters: Mapping[str, Parameter]
     notes: Mapping[str, Parameter]
     tables: Mapping[str, tuple[Row, ...]]
-    seen: set[str] | None = None
+    accessed: set[str] | None = None
 
     def parameter(self, key: str) -> Parameter:
-        """The parameter of that name."""
+        """Return the parameter of that name."""
         if key not in self.parameters:
             lacks = (
                 "keeps among its notes, which no study reads,"
@@ -237,9 +238,9 @@ class Scenario:
         value = self.parameter(key).value
         if not isinstance(value, tuple) or isinstance(value[0], str):
             return value
-        out = np.array(value)
-        out.setflags(write=False)
-        return out
+        array = np.array(value)
+        array.setflags(write=False)
+        return array
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.parameters)
@@ -248,92 +249,100 @@ class Scenario:
     def agents(self) -> tuple[Row, ...]:
         """The rows of the table ``agents``; none if it has no such table."""
         rows = self.tables.get("agents", ())
-        if self.seen is None:
+        if self.accessed is None:
             return rows
-        # Each notes in what is seen that a column of it was read.
-        return tuple(
-            Row(r._cells, partial(_noted, self.seen, r._cells["name"])) for r in rows
-        )
+        # Reading a column of such a row adds it to the set.
+        recording = []
+        for row in rows:
+            record = partial(_record_access, self.accessed, row._cells["name"])
+            recording.append(Row(row._cells, record))
+        return tuple(recording)
 
     @property
     def adjacency(self) -> NDArray[np.float64]:
-        """Who talks to whom, (A, A): 1 or 0, without links to oneself; from ``neighbours``."""
+        """The communication graph, (A, A): 1 for a link of ``neighbours``; no links to oneself."""
         names = [row["name"] for row in self.agents]
-        talks = [[float(a in row["neighbours"]) for a in names] for row in self.agents]
-        return np.array(talks) * (1 - np.eye(len(names)))
+        links = [[float(a in row["neighbours"]) for a in names] for row in self.agents]
+        return np.array(links) * (1 - np.eye(len(names)))
 
     def replace(self, **values: Any) -> Scenario:
-        """The scenario with other values of some parameters; units and places stay."""
-        made = {
+        """Return the scenario with other values of some parameters; their origins stay."""
+        changed = {
             key: replace(self.parameter(key), value=value)
             for key, value in values.items()
         }
-        return replace(self, parameters={**self.parameters, **made})
+        return replace(self, parameters={**self.parameters, **changed})
 
-    def reading(self) -> Scenario:
-        """The same scenario, which remembers what is read of its agents from now on."""
-        return replace(self, seen=set())
+    def track_reads(self) -> Scenario:
+        """Return the same scenario, which records the cells of its agents that are read."""
+        return replace(self, accessed=set())
 
     def cells(self) -> list[dict[str, Any]]:
-        """What was read of each agent, with its name."""
-        seen = self.seen or set()
-        return [
-            {"name": row["name"]}
-            | {c: row[c] for c in row.value_columns if f"{row['name']}.{c}" in seen}
-            for row in self.tables["agents"]
-        ]
+        """Return the cells of each agent that were read, with its name."""
+        accessed = self.accessed or set()
+        rows = []
+        for row in self.tables["agents"]:
+            name = row["name"]
+            cells = {"name": name}
+            for column in row.value_columns:
+                if f"{name}.{column}" in accessed:
+                    cells[column] = row[column]
+            rows.append(cells)
+        return rows
 
     def entries(self) -> dict[str, str]:
-        """Everything that a study can read, each as JSON: the values, not where they come from."""
-        out = {p.name: f"{_json(p.value)} {p.unit}" for p in self.parameters.values()}
+        """Return every value that a study can read as JSON, without its origin."""
+        entries = {}
+        for parameter in self.parameters.values():
+            entries[parameter.name] = f"{_json(parameter.value)} {parameter.unit}"
         for table, rows in self.tables.items():
-            out[table] = _json([row["name"] for row in rows])
+            entries[table] = _json([row["name"] for row in rows])
             for row in rows:
-                cells = {c: row[c] for c in row.value_columns if c != "name"}
-                out |= {
-                    f"{table}.{row['name']}.{c}": _json(v) for c, v in cells.items()
-                }
-        return out
+                for column in row.value_columns:
+                    if column != "name":
+                        entries[f"{table}.{row['name']}.{column}"] = _json(row[column])
+        return entries
 
     @property
     def digest(self) -> str:
-        """16 digits that change with every value that a study can read, and with no text."""
+        """16 digits that depend on every value that a study can read, and on no text."""
         return hashlib.sha256(_json(self.entries()).encode()).hexdigest()[:16]
 
     @property
     def changes(self) -> tuple[str, ...]:
-        """What differs from the paper's study as the book accepts it; empty for that study itself.
+        """Differences from the accepted scenario; empty for the accepted one itself.
 
-        ``scenarios/accepted.csv`` has a line for every entry of every scenario. One of a reader's
-        own, which it does not have, is one change.
+        ``scenarios/accepted.csv`` has a line for every entry of every accepted scenario. A scenario
+        without lines there is one change.
         """
-        lines = read_rows(data_root() / "scenarios" / "accepted.csv")
-        here = [
-            r for r in lines if (r["paper"], r["scenario"]) == (self.paper, self.name)
-        ]
-        known = {r["entry"]: r["value"] for r in here}
-        found = self.entries()
-        if not known:
+        accepted = {}
+        for row in read_rows(data_root() / "scenarios" / "accepted.csv"):
+            if (row["paper"], row["scenario"]) == (self.paper, self.name):
+                accepted[row["entry"]] = row["value"]
+        if not accepted:
             return (f"{self.paper}/{self.name} is no scenario of the book",)
-        return tuple(
-            f"{name}: {_said(found, name)}, not {_said(known, name)}"
-            for name in [*found, *(name for name in known if name not in found)]
-            if found.get(name) != known.get(name)
-        )
+        entries = self.entries()
+        changes = []
+        # Every name once, those of this scenario first.
+        for name in entries | accepted:
+            if entries.get(name) != accepted.get(name):
+                value = _format_entry(entries, name)
+                changes.append(f"{name}: {value}, not {_format_entry(accepted, name)}")
+        return tuple(changes)
 
-    def _shown(self) -> list[tuple[list[str], list[list[str]]]]:
-        heads = ["unit", "source", "where or why"]
-        out = []
+    def _table_data(self) -> list[tuple[list[str], list[list[str]]]]:
+        origin = ["unit", "source", "where or why"]
+        tables = []
         for head, entries in (("parameter", self.parameters), ("note", self.notes)):
-            lines = [
+            texts = [
                 [p.name, _text(p.value), p.unit, p.source, p.why]
                 for p in entries.values()
             ]
-            out += [([head, "value", *heads], lines)] if lines else []
+            tables += [([head, "value", *origin], texts)] if texts else []
         for name, rows in self.tables.items():
             columns = list(dict.fromkeys(c for row in rows for c in row.value_columns))
             columns = [c for c in columns if c not in ("name", "unit")]
-            lines = [
+            texts = [
                 [
                     row["name"],
                     *(_text(row.get(c, "")) for c in columns),
@@ -343,29 +352,29 @@ class Scenario:
                 ]
                 for row in rows
             ]
-            out.append(([name, *columns, *heads], lines))
-        return out
+            tables.append(([name, *columns, *origin], texts))
+        return tables
 
     def __repr__(self) -> str:
         return f"{self.paper}/{self.name}: {self.title}\n\n{self._repr_markdown_()}"
 
     def _repr_html_(self) -> str:
-        return "\n".join(html_table(*t) for t in self._shown())
+        return "\n".join(html_table(*t) for t in self._table_data())
 
     def _repr_markdown_(self) -> str:
-        return "\n\n".join(markdown_table(*t) for t in self._shown())
+        return "\n\n".join(markdown_table(*t) for t in self._table_data())
 
 
-def _noted(seen: set[str], name: str, column: str) -> None:
-    seen.add(f"{name}.{column}")
+def _record_access(accessed: set[str], name: str, column: str) -> None:
+    accessed.add(f"{name}.{column}")
 
 
 def _json(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False, sort_keys=isinstance(value, dict))
 
 
-def _said(entries: Mapping[str, str], name: str) -> str:
-    """An entry as a change prints it: without quotes and without the unit 1."""
+def _format_entry(entries: Mapping[str, str], name: str) -> str:
+    """Return an entry without quotes and without the unit 1."""
     value = entries.get(name, "absent")
     return value.removesuffix(" 1").removesuffix(" -").replace('"', "")
 
@@ -381,12 +390,12 @@ def _text(value: Any) -> str:
 
 
 def read_scenario(path: Path) -> Scenario:
-    """Read a scenario from a TOML file; a fault is refused with the file and the entry.
+    """Read a scenario from a TOML file; an error names the file and the entry.
 
     The file has a ``title``, one table ``[parameters.NAME]`` for each parameter that the study
-    reads, one table ``[notes.NAME]`` of the same form for what no study can read, and any arrays of
-    tables, such as one ``[[agents]]`` for each agent (see `Row`). The folder's name becomes the
-    paper, the file's the name.
+    reads, one table ``[notes.NAME]`` of the same form for each value that no study reads, and any
+    arrays of tables, such as one ``[[agents]]`` for each agent (see `Row`). Folder and file have
+    the names of paper and scenario.
     """
     folder = path.parent
     entry = "its form"
@@ -411,17 +420,17 @@ def read_scenario(path: Path) -> Scenario:
 
 def _check_links(rows: Mapping[str, Row], count: int) -> None:
     if len(rows) != count:
-        raise ValueError("needs distinct names")
+        raise ValueError("names must be distinct")
     for name, row in rows.items():
         for other in row.get("neighbours", ()):
             if other not in rows or name not in rows[other]["neighbours"]:
                 raise ValueError(
-                    f"needs mutual neighbours, got {name!r} beside {other!r}"
+                    f"neighbours must be mutual, got {other!r} for {name!r} only"
                 )
 
 
 def scenario(paper: str, name: str) -> Scenario:
-    """The scenario of a paper's study, from ``scenarios/PAPER/NAME.toml``.
+    """Return the scenario of a paper's study, from ``scenarios/PAPER/NAME.toml``.
 
     Examples
     --------

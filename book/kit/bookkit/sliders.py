@@ -1,4 +1,4 @@
-"""Pictures that move without a kernel: frames drawn once, and a slider that goes through them."""
+"""Sliders without a kernel: frames that are drawn once, and HTML that steps through them."""
 
 from __future__ import annotations
 
@@ -23,35 +23,35 @@ from .digests import of_axes
 __all__ = ["Slider", "slider"]
 
 LIMIT = 800_000
-"""Characters of HTML at most: a page with two of them weighs less than two megabytes.
+"""Largest number of characters of HTML, so that a page with two sliders stays below two megabytes.
 
-Fewer or smaller frames and less fine detail make it shorter.
+Use fewer or smaller frames, or less detail, to make it shorter.
 """
 
 _PAGE = Template((Path(__file__).parent / "slider.html").read_text(encoding="utf-8"))
 _SECONDS = 5.0
-"""How long all frames together play; a frame stays half a second at most."""
+"""Duration of all frames together; a frame is shown for at most half a second."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Slider:
-    """Frames and what goes through them; `slider` makes it, and a notebook shows it.
+    """Frames with a slider that steps through them; made by `slider`, shown by a notebook.
 
     Parameters
     ----------
     frames : tuple of bytes
-        One WebP a frame, of 256 colours and twice the pixels that it takes on a page.
+        One WebP image a frame, with 256 colours and twice the pixels of its size on a page.
     size : tuple of int
         Width and height on a page, in pixels.
-    said : tuple of str
-        What is shown beside each frame, such as ``gain 0.1``.
+    labels : tuple of str
+        Text beside each frame, such as ``gain 0.1``.
     digests : tuple of str
-        The digest of each frame's axes. They are the slider's text form, which is stored beside
-        it: a frame that changes is noticed by whoever compares stored outputs.
+        The digest of each frame's axes. They are the slider's text form, so that a comparison of
+        stored outputs detects a changed frame.
     label, alt : str
-        What the slider sets, and what the picture shows, for readers who do not see it.
+        Name of the slider's value, and description of the picture for readers who do not see it.
     start : int
-        The frame that is shown first.
+        Index of the frame that is shown first.
     """
 
     frames: tuple[bytes, ...]
@@ -65,20 +65,20 @@ class Slider:
     def __post_init__(self) -> None:
         if len(self.html) > LIMIT:
             raise ValueError(
-                f"frames must have at most {LIMIT} characters, got {len(self.html)}"
+                f"frames must have at most {LIMIT} characters of HTML, got {len(self.html)}"
             )
 
     def __repr__(self) -> str:
         lines = [
             f"slider of {len(self.frames)} frames, first {self.labels[self.start]}"
         ]
-        for said, text in zip(self.labels, self.digests, strict=True):
-            lines += [said, *(f"  {line}" for line in text.splitlines())]
+        for value_label, text in zip(self.labels, self.digests, strict=True):
+            lines += [value_label, *(f"  {line}" for line in text.splitlines())]
         return "\n".join(lines)
 
     @property
     def html(self) -> str:
-        """The slider as one piece of HTML that needs no kernel, no network and no other file."""
+        """The slider as HTML that needs no kernel, no network and no other file."""
         pictures = [base64.b64encode(frame).decode() for frame in self.frames]
         data = {
             "alt": self.alt,
@@ -87,7 +87,7 @@ class Slider:
             "frames": pictures,
         }
         return _PAGE.substitute(
-            # Of what the frames show, not of their bytes, which another machine may draw otherwise.
+            # A hash of the digests: the frames' bytes may differ between machines.
             key=hashlib.sha256(repr(self).encode()).hexdigest()[:16],
             label=html.escape(self.label),
             first=pictures[self.start],
@@ -124,30 +124,29 @@ def slider(
     form: str = "g",
     start: int = 0,
 ) -> Slider:
-    """Draw a figure for each value, and go through them with a slider that needs no kernel.
+    """Draw a figure for each value, and return a slider through them that needs no kernel.
 
-    Every frame is drawn now. The HTML that comes out holds them all, with a slider, a button that
-    plays them from the beginning, and a text for readers who do not see them. It works on the
-    book's pages, in JupyterLab and in a file sent by mail; without scripts the first frame is left.
+    All frames are drawn at once. The HTML contains them with a slider, a button that plays them
+    from the start, and a text for readers who do not see them. It works on the book's pages, in
+    JupyterLab and in a file sent by mail. Without scripts the first frame is shown.
 
     Parameters
     ----------
     draw : callable
-        ``draw(value)`` returns a matplotlib figure or axes; all figures of one size. Axes of one
-        scale in all frames let a reader compare them: fix their limits.
+        ``draw(value)`` returns a matplotlib figure or axes; all figures have one size. Fix the
+        limits of the axes, so that a reader can compare frames.
     values : sequence
-        One a frame; with 24 or more what moves looks smooth.
+        One value a frame; 24 or more look smooth.
     label : str
-        What the slider sets, such as ``gain``.
+        Name of the value, such as ``gain``.
     alt : str
-        What the picture shows, as a sentence.
+        Description of the picture, as a sentence.
     unit : str, optional
         Unit of the values.
     form : str
-        Format of the values, as of `format`; ``""`` for texts.
+        Format specification of the values; ``""`` for texts.
     start : int
-        The frame that is shown first, counted from 0. Choose the one that says most: it is also
-        the picture in print.
+        Index of the frame that is shown first; it is also the picture in print.
 
     Examples
     --------
@@ -162,39 +161,41 @@ def slider(
     >>> len(found.frames), found.labels
     (3, ('rate 0', 'rate 0.5', 'rate 1'))
     """
-    said = tuple(
+    labels = tuple(
         f"{label} {format(value, form)} {unit or ''}".rstrip() for value in values
     )
-    places: list[Any] = []
+    positions: list[Any] = []
     frames, sizes, digests = zip(
-        *(_frame(draw(v), places) for v in values), strict=True
+        *(_frame(draw(v), positions) for v in values), strict=True
     )
     if len(set(sizes)) != 1:
-        raise ValueError("draw must have figures of one size")
-    return Slider(frames, sizes[0], said, digests, label, alt, start)
+        raise ValueError("draw must return figures of one size")
+    return Slider(frames, sizes[0], labels, digests, label, alt, start)
 
 
-def _frame(drawn: Any, places: list[Any]) -> tuple[bytes, tuple[int, int], str]:
-    """A figure as a picture, its size and digest; it is closed, so that no cell shows it.
+def _frame(drawing: Any, positions: list[Any]) -> tuple[bytes, tuple[int, int], str]:
+    """Return a figure as an image, its size and its digest, and close the figure.
 
-    The first frame's panels find their `places`, the others take them, so that no panel jumps.
+    The layout of the first frame is stored in `positions` and used for the others, so that panels
+    do not move between frames.
     """
-    figure = getattr(drawn, "figure", drawn)
-    if places:
+    figure = getattr(drawing, "figure", drawing)
+    if positions:
         figure.set_layout_engine("none")
-    for ax, place in zip(figure.axes, places, strict=False):
-        ax.set_position(place)
-    small = io.BytesIO()
+    for ax, position in zip(figure.axes, positions, strict=False):
+        ax.set_position(position)
+    file = io.BytesIO()
     text = of_axes(figure)
     pyplot.close(figure)
     canvas: Any = FigureCanvasAgg(figure)
     figure.set_dpi(2 * figure.dpi)
     canvas.draw()
-    places[:] = places or [ax.get_position(original=True) for ax in figure.axes]
-    # 256 colours, by an octree: half the bytes, and no shade moves by more than a sixteenth.
+    positions[:] = positions or [ax.get_position(original=True) for ax in figure.axes]
+    # 256 colours by an octree (method 2): half the bytes, and no shade changes by over 1/16.
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]).quantize(
         method=2
     )
-    figure.set_dpi(figure.dpi / 2)  # it may be drawn again for the next frame
-    picture.save(small, "webp", lossless=True, quality=50, method=2)
-    return small.getvalue(), (picture.width // 2, picture.height // 2), text
+    # The same figure may be drawn again for the next frame.
+    figure.set_dpi(figure.dpi / 2)
+    picture.save(file, "webp", lossless=True, quality=50, method=2)
+    return file.getvalue(), (picture.width // 2, picture.height // 2), text

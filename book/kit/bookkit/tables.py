@@ -1,4 +1,4 @@
-"""Results as tables that a page renders, and that a comparison of stored outputs reads as text."""
+"""Tables of results, rendered on a page and compared as text."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ __all__ = ["ResultTable"]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ResultTable:
-    """A frame as a table: numbers in a given form, the best of a column in bold.
+    """A table of results: numbers in a given form, the best of a column in bold.
 
     Parameters
     ----------
     frame : DataFrame
-        Its index is the table's first column. A cell that is a text is shown as it is.
+        Its index is the table's first column. Texts are shown as they are.
     form : mapping, optional
-        Format of a column's numbers, as of `format`.
+        Format specification of each column's numbers, such as ``".2f"``.
     best : mapping, optional
         ``"min"`` or ``"max"`` for each column whose best number is shown in bold.
     caption : str
-        What the table shows, with units.
+        Caption, with units.
 
     Examples
     --------
@@ -40,19 +40,20 @@ class ResultTable:
     best: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     caption: str = field(default="", kw_only=True)
 
-    def _shown(self, name: str) -> list[str]:
+    def _format(self, name: str) -> list[str]:
+        """Return the texts of a column."""
         form = self.form.get(name, "")
         return [v if isinstance(v, str) else format(v, form) for v in self.frame[name]]
 
     def __repr__(self) -> str:
-        texts = self.frame.assign(**{name: self._shown(name) for name in self.form})
+        texts = self.frame.assign(**{name: self._format(name) for name in self.form})
         return "\n".join(filter(None, [self.caption, texts.to_string()]))
 
     def _repr_html_(self) -> str:
         cells = {}
         for name in self.frame:
             best = self.frame[name].agg(self.best[name]) if name in self.best else None
-            pairs = zip(self.frame[name], map(escape, self._shown(name)), strict=True)
+            pairs = zip(self.frame[name], map(escape, self._format(name)), strict=True)
             cells[name] = [f"<b>{t}</b>" if value == best else t for value, t in pairs]
         page = self.frame.assign(**cells).to_html(escape=False, border=0)
         head = f"<caption>{escape(self.caption)}</caption>\n<thead>"

@@ -2,7 +2,7 @@
 
 A trial is a function of one seed. `run` calls it for every seed, on this machine's cores or on any
 ``concurrent.futures.Executor``. `store` keeps a long study's metrics in a CSV file, each trial as
-soon as it is done, and goes on where it was stopped; `check` compares a later run with it.
+soon as it is done, and continues where it was stopped; `check` compares a later run with it.
 """
 
 from .checking import check, script

@@ -1,4 +1,4 @@
-"""Stored trials run again and compared, and the scripts that made them."""
+"""Run stored trials again and compare them; load the scripts that made them."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ import numpy as np
 
 from ..folders import data_root, inside
 from .files import Stored, fingerprint, load
-from .running import Study, Trial, plain, row, run, sent_by_value, versions
+from .running import Study, Trial, pickle_by_value, plain, row, run, versions
 
 __all__ = ["check", "script"]
 
 
 def script(name: str, *, folder: Path | None = None) -> ModuleType:
-    """The module of a stored study, from ``book/studies`` beside the data.
+    """Return the module of a stored study, from ``book/studies`` beside the data.
 
     It has the study's ``trial``, ``parameters``, ``columns`` and ``seeds``.
 
@@ -36,19 +36,19 @@ def script(name: str, *, folder: Path | None = None) -> ModuleType:
     Traceback (most recent call last):
     ValueError: name must be one of ... got '../studies/lorenz_63'
     """
-    there = folder or data_root().parent / "book" / "studies"
-    path = inside(there, "", name.replace("-", "_"), ".py")
+    scripts = folder or data_root().parent / "book" / "studies"
+    path = inside(scripts, "", name.replace("-", "_"), ".py")
     spec = importlib.util.spec_from_file_location(f"stored_study_{path.stem}", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    # inspect finds a class's source through sys.modules, and scripts share modules of their folder.
+    # inspect finds the source of a class through sys.modules; scripts import modules beside them.
     sys.modules[spec.name] = module
     if str(path.parent) not in sys.path:
         sys.path.insert(0, str(path.parent))
     spec.loader.exec_module(module)
-    # Last, as an import leaves it: a ufunc is sent by the name of the first module that has it.
+    # Move it to the end, as after an import: a ufunc is pickled by the first module that has it.
     sys.modules[spec.name] = sys.modules.pop(spec.name)
-    sent_by_value(path.parent)
+    pickle_by_value(path.parent)
     return module
 
 
@@ -64,7 +64,7 @@ def check(
     workers: int | None = 1,
     executor: Executor | None = None,
 ) -> Stored:
-    """Run stored trials again and compare what they give now with what is stored.
+    """Run stored trials again and compare the results with the stored ones.
 
     Parameters
     ----------
@@ -73,23 +73,23 @@ def check(
     trial : callable
         The trial that made it.
     indices : iterable of int, optional
-        Which trials, all by default.
+        Indices of the trials; all by default.
     rtol : float
-        Largest relative difference. 0 asks for the same bits, which is right on the kind of
-        machine that stored the study; another processor's linear algebra, exponentials and
-        logarithms differ in the last bits, and a trial carries that along.
+        Largest relative difference. 0 requires the same bits, as on the kind of machine that stored
+        the study. On another processor, linear algebra, exponentials and logarithms differ in the
+        last bits, and a trial amplifies that.
     atol : float
-        Largest absolute difference that passes whatever `rtol` is, for a metric that is zero to
+        Largest absolute difference that is always accepted, for a metric that is zero up to
         rounding.
-    rough : collection of str
-        Metrics that another processor need not repeat, because the last bit decides in the trial
-        (which of two couplings, which way an unstable filter goes). Such a metric may differ from
-        its stored value by as much as the stored trials differ from each other.
-    odd : int
-        How many of the trials may go another way altogether, in any metric: an unstable filter
-        overflows on one processor and not on the next.
+    ill_conditioned : collection of str
+        Metrics that depend on the last bit (which of two couplings is chosen, how an unstable
+        filter diverges). Such a metric may differ from its stored value by as much as the stored
+        trials differ from each other.
+    max_outliers : int
+        Number of trials that may differ in any metric: an unstable filter overflows on one
+        processor and not on another.
     workers, executor
-        As of `run`; by default in this process.
+        As in `run`; by default in this process.
 
     Raises
     ------
@@ -100,7 +100,8 @@ def check(
     chosen = list(range(len(stored)) if indices is None else indices)
     if max_outliers >= len(chosen):
         raise ValueError(
-            f"odd must have fewer than the {len(chosen)} trials that run, got {max_outliers}"
+            f"max_outliers must be below the number of trials, {len(chosen)}, "
+            f"got {max_outliers}"
         )
     allowed = dict.fromkeys(stored.columns, atol)
     for name in ill_conditioned:
@@ -114,15 +115,15 @@ def check(
         executor=executor,
     )
     kinds = {failure.which: failure.kind for failure in study.failures}
-    wrong = [
-        found
-        for k, i in enumerate(chosen)
-        if (found := _differences(stored, i, study, k, kinds.get(k, ""), rtol, allowed))
-    ]
-    if len(wrong) > max_outliers:
-        raise AssertionError(
-            _report(stored, trial, [text for each in wrong for text in each])
-        )
+    n_outliers = 0
+    differences: list[str] = []
+    for k, i in enumerate(chosen):
+        kind = kinds.get(k, "")
+        texts = _differences(stored, i, study, k, kind, rtol, allowed)
+        n_outliers += bool(texts)
+        differences += texts
+    if n_outliers > max_outliers:
+        raise AssertionError(_report(stored, trial, differences))
     return stored
 
 
@@ -135,41 +136,39 @@ def _differences(
     rtol: float,
     allowed: Mapping[str, float],
 ) -> list[str]:
-    """What one trial does not give as it is stored."""
+    """Describe the differences of trial i, the k-th that ran again, from the stored one."""
     if kind or stored.failures[i]:
         was = stored.failures[i] or "a value"
         now = kind or "a value"
         return [f"trial {i}: stored {was}, now {now}"] if was != now else []
+    texts = []
     names = tuple(stored.columns)
-    pairs = [
-        (c, float(stored.columns[c][i]), v)
-        for c, v in zip(names, row(study.values[k], names), strict=True)
-    ]
-    return [
-        f"trial {i}: {c} stored {was!r}, now {now!r}"
-        for c, was, now in pairs
-        if not _same(was, now, rtol, allowed[c])
-    ]
+    for name, now in zip(names, row(study.values[k], names), strict=True):
+        was = float(stored.columns[name][i])
+        if not _same(was, now, rtol, allowed[name]):
+            texts.append(f"trial {i}: {name} stored {was!r}, now {now!r}")
+    return texts
 
 
 def _same(was: float, now: float, rtol: float, atol: float) -> bool:
-    if was != was or now != now:
-        return was != was and now != now
+    """Return whether two numbers agree to the tolerances; NaN agrees with NaN."""
+    if np.isnan(was) or np.isnan(now):
+        return bool(np.isnan(was) and np.isnan(now))
     if rtol == atol == 0 or np.isinf(was) or np.isinf(now):
         return was == now and bool(np.signbit(was) == np.signbit(now))
     return abs(was - now) <= max(rtol * abs(was), atol)
 
 
-def _report(stored: Stored, trial: Trial, wrong: list[str]) -> str:
-    kept = [*wrong[:5], *([f"and {len(wrong) - 5} more"] if len(wrong) > 5 else [])]
+def _report(stored: Stored, trial: Trial, differences: list[str]) -> str:
+    """Return the first differences, and whether the code or the versions changed."""
+    lines = differences[:5]
+    if len(differences) > 5:
+        lines.append(f"and {len(differences) - 5} more")
     was = stored.metadata["code"].get(plain(trial).__qualname__)
-    if was and was != (now := fingerprint(trial)):
-        kept.append(f"the source of the trial is another one: stored {was}, now {now}")
+    now = fingerprint(trial) if was else ""
+    if was and was != now:
+        lines.append(f"the source of the trial differs: stored {was}, now {now}")
     elif stored.metadata["version"] != versions():
-        kept.append(
-            f"the versions are others: stored {dict(stored.metadata['version'])}"
-        )
-    return (
-        f"{stored.path.name}: another run does not give what is stored\n"
-        + "\n".join(kept)
-    )
+        lines.append(f"the versions differ: stored {dict(stored.metadata['version'])}")
+    head = f"{stored.path.name}: another run does not give the stored results"
+    return "\n".join([head, *lines])

@@ -1,4 +1,4 @@
-"""Long studies as files: every finished trial is on disk before the next begins."""
+"""Long studies as files: every finished trial is on disk before its worker gets the next one."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ _FORMAT = b"# distfilt study, format 3"
 _FIRST = ("index", "entropy", "spawn_key", "failure")
 _HEADER = re.compile(r"# (version|code|parameter) (\S+): (.+)")
 _SYNC_SECONDS = 0.2
-"""The disk is asked to keep what it was given no more often than this."""
+"""Shortest time between two calls of fsync."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """A study read from a file.
+    """A study that was read from a file.
 
     Parameters
     ----------
     path : Path
-        Where it was read.
-    heads : mapping
-        Under ``"parameter"``, ``"version"`` and ``"code"`` the study's parameters, the versions it
-        was made with, and the `fingerprint` of the functions that made it.
+        Its file.
+    metadata : mapping
+        The study's parameters under ``"parameter"``, the versions of its packages under
+        ``"version"``, and the `fingerprint` of its functions under ``"code"``.
     seeds : tuple of str
-        What makes each trial's seed, as the file has it.
+        Entropy and spawn key of each trial, in the form of the file.
     failures : tuple of str
-        For each trial the class of what it raised, or ''.
+        The class of each trial's exception, or ''.
     columns : mapping from str to array, (n,)
         The metrics of all trials; NaN for a trial that failed (and where the metric is NaN).
     """
@@ -71,11 +71,11 @@ class Stored:
         return self.metadata["parameter"]
 
     def metric(self, column: str) -> NDArray[np.float64]:
-        """A metric of the trials that are done, (done,)."""
+        """Return a metric of the trials that did not fail, (n,)."""
         return self.columns[column][[not kind for kind in self.failures]]
 
     def seed(self, index: int) -> SeedSequence:
-        """The seed of a trial, made afresh."""
+        """Return a new seed sequence of a trial."""
         entropy, key = (
             tuple(map(int, t.split())) for t in self.seeds[index].split(",")
         )
@@ -83,19 +83,23 @@ class Stored:
 
 
 def seed_text(seed: SeedSequence | int) -> str:
-    """What makes a seed, as a file has it: its entropy and its spawn key."""
-    made: Any = fresh(seed)
-    words = made.entropy if isinstance(made.entropy, Sequence) else [made.entropy]
-    return f"{' '.join(map(str, words))},{' '.join(map(str, made.spawn_key))}"
+    """Return a seed's entropy and spawn key, in the form of a file."""
+    sequence: Any = fresh(seed)
+    words = (
+        sequence.entropy
+        if isinstance(sequence.entropy, Sequence)
+        else [sequence.entropy]
+    )
+    return f"{' '.join(map(str, words))},{' '.join(map(str, sequence.spawn_key))}"
 
 
 def fingerprint(function: Callable[..., Any]) -> str:
-    """A digest of a function's source: the first 16 digits of its SHA-256.
+    """Return a digest of a function's source: the first 16 digits of its SHA-256.
 
     The text is that of ``inspect.getsource`` without its indentation. It changes with any edit of
-    the function, comments included, and not with an edit of what the function calls: it tells a
-    reader whether a stored study was made by the function that is printed, and running trials
-    again (`check`) tells whether everything below still gives the same numbers.
+    the function, comments included, but not with an edit of the functions that it calls. It shows
+    whether a stored study was made by this version of the function. Running trials again (`check`)
+    shows whether all code below still gives the same numbers.
 
     Examples
     --------
@@ -107,15 +111,16 @@ def fingerprint(function: Callable[..., Any]) -> str:
 
 
 def plain_json(parameters: Mapping[str, Any]) -> dict[str, str]:
-    """The parameters as they are written: each one's JSON, arrays as lists."""
+    """Return each parameter as the JSON that is written; arrays are lists."""
 
-    def listed(value: Any) -> Any:
+    def to_list(value: Any) -> Any:
         if isinstance(value, np.ndarray | np.generic):
             return value.tolist()
         raise TypeError(f"{type(value).__name__} is not JSON")
 
     return {
-        k: json.dumps(v, default=listed, allow_nan=False) for k, v in parameters.items()
+        k: json.dumps(v, default=to_list, allow_nan=False)
+        for k, v in parameters.items()
     }
 
 
@@ -125,14 +130,14 @@ def _head(
     parameters: Mapping[str, Any],
     code: Iterable[Any],
 ) -> str:
-    """What a study's file says of its making, and the names of its columns."""
+    """Return the head of a study's file: versions, code, parameters and names of columns."""
     if not all(name.isidentifier() for name in columns) or len(set(columns)) != len(
         columns
     ):
         raise ValueError(f"columns must be different identifiers, got {columns}")
-    made_by = {plain(f).__qualname__: fingerprint(f) for f in (trial, *code)}
+    fingerprints = {plain(f).__qualname__: fingerprint(f) for f in (trial, *code)}
     lines = [f"# version {k}: {json.dumps(v)}" for k, v in running.versions().items()]
-    lines += [f"# code {k}: {json.dumps(v)}" for k, v in sorted(made_by.items())]
+    lines += [f"# code {k}: {json.dumps(v)}" for k, v in sorted(fingerprints.items())]
     lines += [f"# parameter {k}: {v}" for k, v in plain_json(parameters).items()]
     return "\n".join([*lines, ",".join([*_FIRST, *columns])])
 
@@ -152,66 +157,70 @@ def store(
 ) -> Path:
     """Run a study and write its metrics to a CSV file: the same study gives the same bytes.
 
-    Each trial that is finished goes to ``PATH.part`` before its worker gets the next one. Where
-    this process is killed, the executor dies or the disk is full, the same call goes on: what was
-    in flight runs again, nothing else, and the file comes out the same.
+    Each finished trial is written to ``PATH.part`` before its worker gets the next one. If this
+    process is killed, the executor dies or the disk is full, the same call continues: only the
+    unfinished trials run, and the file is the same in the end.
 
     Parameters
     ----------
     path : path
-        ``data/studies/KEY/NAME.csv``; missing folders are made, a file that is there is replaced.
+        ``data/studies/KEY/NAME.csv``; missing folders are made, an existing file is replaced.
     trial, seeds, executor, workers, progress
-        As of `run`. A trial that raises is a row with the class of what it raised.
+        As in `run`. A trial that raises is a row with the class of the exception.
     columns : sequence of str
-        Names of the metrics: keys of what a trial returns, or of its numbers in their order.
-    parameters : mapping from str to what JSON holds
-        Everything that the trial does not draw.
+        Names of the metrics: keys of the mapping that a trial returns, or names of its numbers in
+        order.
+    parameters : mapping from str to values that JSON can hold
+        Everything that determines a trial besides its seed.
     code : iterable of callable
-        Functions, besides the trial, whose source decides what the numbers are.
+        Further functions whose source determines the numbers.
     indices : iterable of int, optional
-        Run these trials alone, as one machine of several; `merge` brings their parts together.
+        Run only these trials, as one machine of several; `merge` joins their parts.
 
     Returns
     -------
     Path
-        The file, or ``PATH.part`` where `indices` leaves trials to be run.
+        The file, or ``PATH.part`` if `indices` leaves out trials that have not run yet.
 
     Raises
     ------
     ValueError
-        If ``PATH.part`` is of another study: other code, parameters, seeds or versions.
+        If ``PATH.part`` has other code, parameters, seeds or versions.
     StudyError
-        If the executor failed, or a trial took its worker down, which may say nothing of it.
+        If the executor failed, or the worker of a trial died.
     OSError
         If the disk is full; the message names the file.
     """
     target = Path(path)
-    given = [fresh(seed) for seed in seeds]
+    seed_sequences = [fresh(seed) for seed in seeds]
     part = _Part(target, _head(trial, columns, parameters, code))
-    head = len(_FIRST)
+    n_head = len(_FIRST)
     rows = part.rows()
-    texts = [seed_text(seed) for seed in given]
+    texts = [seed_text(seed) for seed in seed_sequences]
     for i, text in rows.items():
-        if i >= len(given) or ",".join(text.split(",")[1 : head - 1]) != texts[i]:
+        if (
+            i >= len(seed_sequences)
+            or ",".join(text.split(",")[1 : n_head - 1]) != texts[i]
+        ):
             raise ValueError(f"{part.path}: its trial {i} has another seed: remove it")
-    wanted = range(len(given)) if indices is None else indices
-    items = [(i, given[i]) for i in wanted if i not in rows]
-    died = []
+    chosen = range(len(seed_sequences)) if indices is None else indices
+    items = [(i, seed_sequences[i]) for i in chosen if i not in rows]
+    deaths = []
     try:
-        flight = running.outcomes(trial, items, executor, workers, one_by_one=True)
-        for outcome in running.track(flight, len(items), progress):
+        outcomes = running.outcomes(trial, items, executor, workers, one_by_one=True)
+        for outcome in running.track(outcomes, len(items), progress):
             if outcome.kind == running.DIED:
-                died.append(Failure(outcome.which, given[outcome.which], *outcome[2:]))
+                deaths.append(
+                    Failure(outcome.which, seed_sequences[outcome.which], *outcome[2:])
+                )
             else:
                 rows[outcome.which] = _row(outcome, texts[outcome.which], columns)
                 part.append(rows[outcome.which])
     except running.ExecutorError as error:
-        raise StudyError(
-            f"{error}; the trials that are done are in {part.path}"
-        ) from error
-    if died:
-        raise StudyError(f"{died[0]}\nthe other trials are in {part.path}")
-    return part.finished(rows) if len(rows) == len(given) else part.path
+        raise StudyError(f"{error}; finished trials are in {part.path}") from error
+    if deaths:
+        raise StudyError(f"{deaths[0]}\nthe other trials are in {part.path}")
+    return part.finish(rows) if len(rows) == len(seed_sequences) else part.path
 
 
 def _row(outcome: Outcome, seed: str, columns: Sequence[str]) -> str:
@@ -223,7 +232,7 @@ def _row(outcome: Outcome, seed: str, columns: Sequence[str]) -> str:
 
 
 class _Part:
-    """What is done of a study: its head, then a row a trial as they come, each with a checksum."""
+    """An unfinished study: its head, then a row with a checksum for each finished trial."""
 
     def __init__(self, target: Path, head: str) -> None:
         self.target = target
@@ -232,47 +241,47 @@ class _Part:
         self.synced = 0.0
 
     def rows(self) -> dict[int, str]:
-        """The rows by their index; one that was cut off or damaged counts as not done."""
+        """Return the rows by their index; a truncated or damaged row is left out and runs again."""
         if not self.path.is_file():
             return {}
         text = self.path.read_text(encoding="utf-8", errors="replace")
-        if self.head.startswith(text):  # it was cut off before its first row
+        if self.head.startswith(text):  # truncated before its first row
             self.path.unlink()
         elif not text.startswith(f"{self.head}\n"):
             raise ValueError(
-                f"{self.path}: begun with other code, parameters or versions: remove "
-                "it to begin again"
+                f"{self.path}: must have the same code, parameters and versions: remove "
+                "it to start again"
             )
-        out = {}
+        rows = {}
         for line in text[len(self.head) :].split("\n"):
-            made, _, checksum = line.rpartition(",")
-            if made and checksum == _checksum(made):
-                out[int(made.split(",")[0])] = made
-        return out
+            row, _, checksum = line.rpartition(",")
+            if row and checksum == _checksum(row):
+                rows[int(row.split(",")[0])] = row
+        return rows
 
-    def append(self, made: str) -> None:
-        """Put a row on the disk."""
+    def append(self, row: str) -> None:
+        """Write a row to the disk."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         text = "" if self.path.is_file() else self.head
-        # Each begins its own line: the one before it may have been cut off.
-        text += f"\n{made},{_checksum(made)}"
-        with _named(self.path), self.path.open("ab") as out:
-            out.write(text.encode())
-            out.flush()
+        # The line break comes first, since the row before may be truncated.
+        text += f"\n{row},{_checksum(row)}"
+        with _name_file(self.path), self.path.open("ab") as file:
+            file.write(text.encode())
+            file.flush()
             if time.monotonic() - self.synced > _SYNC_SECONDS:
-                os.fsync(out.fileno())
+                os.fsync(file.fileno())
                 self.synced = time.monotonic()
 
-    def finished(self, rows: Mapping[int, str]) -> Path:
-        """Write the whole file, or none of it, and remove the part."""
+    def finish(self, rows: Mapping[int, str]) -> Path:
+        """Write the complete file in one step, and remove the part."""
         body = "\n".join([self.head, *(rows[i] for i in sorted(rows)), ""]).encode()
-        # A name of this writer's own, so that two writers leave one of two whole files.
+        # A unique name, so that two writers cannot mix their files.
         new = self.target.with_name(f".{self.target.name}-{uuid.uuid4().hex}.new")
         try:
-            with _named(self.target), new.open("xb") as out:
-                out.write(_FORMAT + b"\n" + _seal(body) + b"\n" + body)
-                out.flush()
-                os.fsync(out.fileno())
+            with _name_file(self.target), new.open("xb") as file:
+                file.write(_FORMAT + b"\n" + _seal(body) + b"\n" + body)
+                file.flush()
+                os.fsync(file.fileno())
             os.replace(new, self.target)
         finally:
             new.unlink(missing_ok=True)
@@ -289,8 +298,8 @@ def _seal(body: bytes) -> bytes:
 
 
 @contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Errors of the disk with the file in them, which a write does not tell."""
+def _name_file(path: Path) -> Iterator[None]:
+    """Add the file's name to an error of the disk."""
     try:
         yield
     except OSError as error:
@@ -298,32 +307,33 @@ def _named(path: Path) -> Iterator[None]:
 
 
 def merge(path: str | Path, *parts: str | Path) -> Path:
-    """Add the trials of other machines' parts to a study's own part; `store` then goes on.
+    """Add the trials of other machines' parts to a study's part; `store` then continues.
 
     Parameters
     ----------
     path : path
-        The study's file, as given to `store`; its part need not be there yet.
+        The study's file, as passed to `store`; its part need not exist yet.
     *parts : path
         Parts of the same study, made with the same code, parameters and versions.
     """
     first = Path(parts[0]).read_text(encoding="utf-8", errors="replace")
-    if (head := re.match(r"(#.*\n)*index,.*", first)) is None:
-        raise ValueError(f"{parts[0]} is damaged, or no part that store wrote")
-    own = _Part(Path(path), head[0])
-    known = own.rows()
-    for part in parts:
+    head = re.match(r"(#.*\n)*index,.*", first)
+    if head is None:
+        raise ValueError(f"{parts[0]} is damaged, or was not written by store")
+    merged = _Part(Path(path), head[0])
+    rows = merged.rows()
+    for source in parts:
         other = _Part(Path(path), head[0])
-        other.path = Path(part)
-        for i, made in other.rows().items():
-            if known.setdefault(i, made) != made:
-                raise ValueError(f"{part}: its trial {i} differs from another part's")
-            own.append(made)
-    return own.path
+        other.path = Path(source)
+        for i, row in other.rows().items():
+            if rows.setdefault(i, row) != row:
+                raise ValueError(f"{source}: its trial {i} differs from another part's")
+            merged.append(row)
+    return merged.path
 
 
 def stored(paper: str, name: str) -> Stored:
-    """The stored study of one item of a paper, from ``data/studies/PAPER/NAME.csv``.
+    """Load the stored study of a paper's item, from ``data/studies/PAPER/NAME.csv``.
 
     Parameters
     ----------
@@ -334,25 +344,25 @@ def stored(paper: str, name: str) -> Stored:
 
 
 def load(path: str | Path) -> Stored:
-    """Read a stored study; a file that is damaged, or another one, is refused by its name."""
+    """Read a stored study; the seal detects a file that is damaged or was edited."""
     import pandas
 
     source = Path(path)
     form, seal, body = (source.read_bytes().split(b"\n", 2) + [b"", b""])[:3]
     if form != _FORMAT or seal != _seal(body):
-        raise ValueError(f"path: {source} is damaged, or no study that store wrote")
-    heads: dict[str, dict[str, Any]] = {"version": {}, "code": {}, "parameter": {}}
+        raise ValueError(f"path: {source} is damaged, or was not written by store")
+    metadata: dict[str, dict[str, Any]] = {"version": {}, "code": {}, "parameter": {}}
     lines = body.decode().split("\n")
-    for found in filter(None, map(_HEADER.fullmatch, lines)):
-        heads[found[1]][found[2]] = json.loads(found[3])
+    for match in filter(None, map(_HEADER.fullmatch, lines)):
+        metadata[match[1]][match[2]] = json.loads(match[3])
     skipped = sum(line.startswith("#") for line in lines)
     table = pandas.read_csv(
         io.BytesIO(body), skiprows=skipped, dtype=str, keep_default_na=False
     )
     metrics = table.columns[len(_FIRST) :]
-    # Python's own reading of a number, which gives back every bit that was written.
+    # `float` restores every bit that `repr` wrote; pandas' parser need not.
     columns = {
         str(c): np.array([float(text or "nan") for text in table[c]]) for c in metrics
     }
     seeds = tuple(table["entropy"] + "," + table["spawn_key"])
-    return Stored(source, heads, seeds, tuple(table["failure"]), columns)
+    return Stored(source, metadata, seeds, tuple(table["failure"]), columns)

@@ -1,4 +1,4 @@
-"""Trials run for many seeds, on any executor, with the same bits."""
+"""Run a trial for many seeds, on any executor, with the same bits."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import cloudpickle
 import numpy as np
-import scipy.linalg  # noqa: F401  its BLAS is loaded before threads are held
+import scipy.linalg  # noqa: F401  loads its BLAS before threads are limited
 from loky import cpu_count, get_reusable_executor
 from numpy.random import SeedSequence
 from numpy.typing import NDArray
@@ -40,17 +40,16 @@ Trial = Callable[[SeedSequence], Any]
 Item = tuple[int, SeedSequence]
 
 CHUNK_SECONDS = 0.4
-"""What trials that travel together should take: long against their transport."""
+"""Aimed duration of the trials of one chunk: long compared with the time to send them."""
 
 DIED = "died"
 """The kind of failure of a trial whose worker process ended before the trial did."""
 
 
 def spawn(root: int, n: int) -> list[SeedSequence]:
-    """The seeds of n independent trials.
+    """Return the seeds of n independent trials.
 
-    Seed i is ``SeedSequence(root, spawn_key=(i,))``, whatever n is: a study that is continued
-    later keeps the trials that it has.
+    Seed i is ``SeedSequence(root, spawn_key=(i,))`` for every n, so that a study can be extended.
 
     Examples
     --------
@@ -61,23 +60,23 @@ def spawn(root: int, n: int) -> list[SeedSequence]:
 
 
 def plain(function: Any) -> Any:
-    """The function whose source says what a callable does."""
+    """Return the function below partials and decorators, whose source defines the callable."""
     while isinstance(function, functools.partial):
         function = function.func
     return inspect.unwrap(function)
 
 
 def fresh(seed: SeedSequence | int) -> SeedSequence:
-    """The same seed, which nobody has spawned from."""
+    """Return a copy of a seed from which nothing has been spawned."""
     if not isinstance(seed, SeedSequence):
         return SeedSequence(seed)
     return SeedSequence(seed.entropy, spawn_key=seed.spawn_key)
 
 
 class Failure(NamedTuple):
-    """A trial that gave no value: ``trial(failure.seed)`` fails again.
+    """A trial that returned no value: ``trial(failure.seed)`` fails again.
 
-    `kind` is the class of what it raised, or ``"died"`` if it took its worker process down.
+    `kind` is the class of its exception, or ``"died"`` if its worker process died.
     """
 
     which: int
@@ -92,18 +91,18 @@ class Failure(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Study:
-    """What came of a study's trials, in the order of the seeds.
+    """The results of a study's trials, in the order of the seeds.
 
     Parameters
     ----------
     seeds : tuple of SeedSequence
-        One a trial.
+        One seed a trial.
     values : tuple
-        What each trial returned; None where it failed or was not run.
+        The value of each trial; None if it failed or was not run.
     failures : tuple of Failure
-        Which raised or died.
+        Trials that raised or died.
     done : array of bool, (n,)
-        Which trials returned.
+        Whether each trial returned a value.
 
     Examples
     --------
@@ -124,28 +123,28 @@ class Study:
         )
 
     def metrics(self, columns: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-        """Named numbers of the trials that are done, each (done,)."""
-        kept = [v for v, done in zip(self.values, self.done, strict=True) if done]
-        table = np.array([row(v, columns) for v in kept]).reshape(
-            len(kept), len(columns)
+        """Return the named numbers of the trials that returned, each (n,)."""
+        values = [v for v, done in zip(self.values, self.done, strict=True) if done]
+        table = np.array([row(v, columns) for v in values]).reshape(
+            len(values), len(columns)
         )
         return dict(zip(columns, table.T, strict=True))
 
 
 def row(value: Any, columns: Sequence[str]) -> list[float]:
-    """The metrics of one trial's value: a mapping, or numbers in the order of the columns."""
+    """Return the metrics of a trial's value: a mapping, or numbers in the order of the columns."""
     if isinstance(value, Mapping):
         return [float(value[name]) for name in columns]
     numbers = [float(x) for x in np.atleast_1d(value)]
     if len(numbers) != len(columns):
         raise ValueError(
-            f"columns must be {len(numbers)}, a name for each number, got {columns}"
+            f"columns must have {len(numbers)} names, one for each number, got {columns}"
         )
     return numbers
 
 
 class StudyError(RuntimeError):
-    """A study with trials that failed, or an executor that did; ``study`` holds what was done."""
+    """Trials or the executor failed; the attribute ``study`` has the finished trials."""
 
     def __init__(self, message: str, study: Study | None = None) -> None:
         super().__init__(message)
@@ -161,37 +160,37 @@ def run(
     errors: str = "raise",
     progress: bool = True,
 ) -> Study:
-    """Call ``trial(seed)`` for every seed, on as many processes as there are.
+    """Call ``trial(seed)`` for every seed, on several processes.
 
-    The result depends on the trial and the seeds only: not on the executor, the number of workers
-    or the order, as long as a trial draws from its seed (``np.random.default_rng(seed)``) and
-    leaves nothing behind for the next one.
+    The result depends on the trial and the seeds only, not on the executor, the number of workers
+    or the order, if a trial draws from its seed (``np.random.default_rng(seed)``) and leaves no
+    state for the next one.
 
     Parameters
     ----------
     trial : callable
         ``trial(seed) -> value``. It may be defined in a notebook, a script or a module beside
-        them: it is sent itself, not by its name.
+        them: its code is sent, not its name.
     seeds : iterable of SeedSequence or int
-        One for each trial, all different; `spawn` makes them. A trial gets its own copy.
+        A seed for each trial, all different, as made by `spawn`. A trial gets its own copy.
     executor : concurrent.futures.Executor, optional
-        Where to run: ``dask.distributed.Client(...).get_executor()``, mpi4py's
+        The executor to run on: ``dask.distributed.Client(...).get_executor()``, mpi4py's
         ``MPIPoolExecutor``, a pool of the standard library. Its workers need this package and the
         library. By default loky's pool of processes on this machine.
     workers : int, optional
-        How many processes, by default one a core; 1 runs in this process. With an `executor`, how
-        many trials it runs at a time, where it does not tell itself.
+        Number of processes, by default one a core; 1 runs in this process. With an `executor`, the
+        number of trials that it runs at a time, if this is not one of its attributes.
     errors : {"raise", "collect"}
-        Whether failures are raised once all trials have run, or left to the caller.
+        Whether failures are raised after all trials have run, or only recorded.
     progress : bool
-        Show a bar, where a person may be watching.
+        Show a progress bar in a terminal or notebook.
 
     Raises
     ------
     StudyError
-        If a trial failed and `errors` is ``"raise"``, or if the caller's executor failed. When a
-        worker of the default pool dies, what was in flight runs again one by one: the trial that
-        takes its worker down alone is a failure of kind ``"died"``.
+        If a trial failed and `errors` is ``"raise"``, or if the given executor failed. If a worker
+        of the default pool dies, the unfinished trials run again one by one. A trial whose worker
+        dies then is a failure of kind ``"died"``.
 
     Examples
     --------
@@ -201,62 +200,67 @@ def run(
     >>> study
     Study(100 trials: 100 done, 0 failed)
     """
-    given = tuple(fresh(seed) for seed in seeds)
-    found: dict[int, Outcome] = {}
-    flight = outcomes(trial, list(enumerate(given)), executor, workers)
+    seed_sequences = tuple(fresh(seed) for seed in seeds)
+    outcomes_by_index: dict[int, Outcome] = {}
+    results = outcomes(trial, list(enumerate(seed_sequences)), executor, workers)
     try:
-        for outcome in track(flight, len(given), progress):
-            found[outcome.which] = outcome
+        for outcome in track(results, len(seed_sequences), progress):
+            outcomes_by_index[outcome.which] = outcome
     except ExecutorError as error:
-        study = _study(given, found)
+        study = _study(seed_sequences, outcomes_by_index)
         raise StudyError(f"{error}: {study!r}", study) from error
-    study = _study(given, found)
+    study = _study(seed_sequences, outcomes_by_index)
     if study.failures and errors == "raise":
         raise StudyError(f"{study!r}\n{study.failures[0]}", study)
     return study
 
 
-def _study(seeds: tuple[SeedSequence, ...], found: Mapping[int, Outcome]) -> Study:
-    failed = tuple(
-        Failure(i, seeds[i], *found[i][2:]) for i in sorted(found) if found[i].kind
-    )
-    done = np.array([i in found and not found[i].kind for i in range(len(seeds))])
-    values = tuple(
-        pickle.loads(found[i].value) if good else None for i, good in enumerate(done)
-    )
-    return Study(seeds, values, failed, done)
+def _study(seeds: tuple[SeedSequence, ...], results: Mapping[int, Outcome]) -> Study:
+    """Return a study of the outcomes by their index; a missing one has not run."""
+    values: list[Any] = [None] * len(seeds)
+    done = np.zeros(len(seeds), dtype=bool)
+    failures = []
+    for i in sorted(results):
+        outcome = results[i]
+        if outcome.kind:
+            failures.append(Failure(i, seeds[i], outcome.kind, outcome.text))
+        else:
+            values[i] = pickle.loads(outcome.value)
+            done[i] = True
+    return Study(seeds, tuple(values), tuple(failures), done)
+
+
+_NO_BAR = ("TQDM_DISABLE", "CI", "PYTEST_CURRENT_TEST")
+"""Variables of an environment in which nobody watches."""
 
 
 def track(items: Iterable[Any], total: int, show: bool) -> Iterable[Any]:
-    """The items, behind a progress bar where a person may be watching."""
-    silent = any(
-        os.environ.get(name) for name in ("TQDM_DISABLE", "CI", "PYTEST_CURRENT_TEST")
-    )
-    hidden = (
-        True if silent or not show else None
-    )  # None: where the output is no terminal
-    shown: Iterable[Any] = tqdm(items, total=total, leave=False, disable=hidden)
-    return shown
+    """Return the items with a progress bar, in a terminal or notebook."""
+    silent = any(os.environ.get(name) for name in _NO_BAR)
+    # None hides the bar if the output is not a terminal.
+    disable = True if silent or not show else None
+    tracked: Iterable[Any] = tqdm(items, total=total, leave=False, disable=disable)
+    return tracked
 
 
-# What runs in a worker.
+# Functions of a worker.
 
 _HOME = uuid.uuid4().hex
 
 
 def home() -> str:
-    """A name for this process that neither a fork of it nor another machine's process has."""
+    """Return a name of this process that no fork and no process of another machine has."""
     return f"{_HOME}-{os.getpid()}"
 
 
 def versions() -> dict[str, str]:
-    """What has to be the same everywhere for a study to give the same bits."""
+    """Return the versions that must be equal everywhere for a study to give the same bits."""
     python = ".".join(platform.python_version_tuple()[:2])
     return {"distfilt": __version__, "numpy": np.__version__, "python": python}
 
 
 class Outcome(NamedTuple):
-    """What came of one trial: its pickled value, or the kind and text of its failure."""
+    """The result of one trial: its pickled value, or the kind and text of its failure."""
 
     which: int
     value: bytes
@@ -265,60 +269,60 @@ class Outcome(NamedTuple):
 
 
 Job = tuple[bytes, str, dict[str, str]]
-"""What all trials of a study share: the pickled trial, where it started, its versions."""
+"""Common to all trials of a study: the pickled trial, the process that started it, versions."""
 
 
 def chunk(job: Job, items: Sequence[Item]) -> tuple[float, list[Outcome]]:
-    """Run some trials; say how long they took, and what came of each."""
-    trial, started, wanted = job
-    if wanted != versions():
-        raise RuntimeError(f"a worker has {versions()}, the study {wanted}")
+    """Run some trials; return how long they took, and their outcomes."""
+    trial, started, expected = job
+    if expected != versions():
+        raise RuntimeError(f"a worker has {versions()}, the study {expected}")
     call = _loaded(trial)
     if started != home():
         _one_blas_thread()
-    began = time.perf_counter()
-    found = [_outcome(call, *item) for item in items]
-    return time.perf_counter() - began, found
+    start_time = time.perf_counter()
+    results = [_run_trial(call, *item) for item in items]
+    return time.perf_counter() - start_time, results
 
 
 _loaded = functools.lru_cache(maxsize=1)(pickle.loads)
 
 
-def _outcome(trial: Trial, which: int, seed: SeedSequence) -> Outcome:
+def _run_trial(trial: Trial, which: int, seed: SeedSequence) -> Outcome:
     try:
-        # At once: the next trial may overwrite a buffer that the value shares.
+        # Pickle at once: the next trial may overwrite a buffer that the value shares.
         return Outcome(which, cloudpickle.dumps(trial(seed)))
     except (Exception, SystemExit) as error:
-        inner = (
+        frames = (
             error.__traceback__ and error.__traceback__.tb_next
         )  # without this function's frame
-        text = "".join(traceback.format_exception(type(error), error, inner))
+        text = "".join(traceback.format_exception(type(error), error, frames))
         return Outcome(which, b"", type(error).__name__, text)
 
 
 @functools.cache
 def _one_blas_thread() -> None:
-    """Hold a worker's linear algebra to one thread: with another number its last bits differ."""
+    """Limit a worker's linear algebra to one thread: the number of threads changes last bits."""
     threadpool_limits(1, user_api="blas")
 
 
 def _start(*_: str) -> None:
     """Prepare a worker: only the process that started the study decides when it ends.
 
-    Ctrl-C in a terminal reaches every process, so workers ignore it. If the first process is
-    killed, nobody tells its workers: each looks whether its parent is still the one it had.
+    Ctrl-C in a terminal reaches every process, so workers ignore it. If the parent is killed,
+    workers get no signal: each checks regularly whether its parent is still the same.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=_end_with_parent, args=(os.getppid(),), daemon=True).start()
 
 
-def _end_with(parent: int) -> None:
+def _end_with_parent(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(0.5)
     os._exit(1)
 
 
-# What runs here.
+# Functions of the process that starts a study.
 
 
 class ExecutorError(Exception):
@@ -326,24 +330,25 @@ class ExecutorError(Exception):
 
 
 def _pool(workers: int) -> Executor:
-    # loky starts new workers where these arguments differ: a worker keeps the folder and the
-    # import path that it was born with.
-    here = (os.getcwd(), *sys.path)
+    # loky starts new workers if these arguments differ: a worker keeps the folder and the import
+    # path with which it started.
+    environment = (os.getcwd(), *sys.path)
     pool: Executor = get_reusable_executor(
-        workers, timeout=10, initializer=_start, initargs=here
+        workers, timeout=10, initializer=_start, initargs=environment
     )
     return pool
 
 
 def slots(executor: Executor) -> int:
-    """How many calls an executor runs at a time: those of its cluster, not this machine's cores."""
-    if client := getattr(executor, "_client", None):  # dask's
+    """Return how many calls an executor runs at a time, on its cluster or this machine."""
+    client = getattr(executor, "_client", None)
+    if client:  # dask
         return max(1, int(sum(client.nthreads().values())))
     return int(getattr(executor, "_max_workers", None) or os.cpu_count() or 1)
 
 
-def sent_by_value(folder: Path) -> None:
-    """Send the functions of modules in a folder themselves: a worker need not have the folder."""
+def pickle_by_value(folder: Path) -> None:
+    """Let functions of modules in a folder be sent by value: workers need not have the folder."""
     for module in list(sys.modules.values()):
         file = getattr(module, "__file__", None)
         if (
@@ -354,19 +359,19 @@ def sent_by_value(folder: Path) -> None:
             cloudpickle.register_pickle_by_value(module)
 
 
-def _pickled(trial: Trial) -> bytes:
+def _pickle_trial(trial: Trial) -> bytes:
     for name in (plain(trial).__module__, "__main__"):
         file = getattr(sys.modules[name], "__file__", None)
         if file and name not in sys.stdlib_module_names:
-            sent_by_value(Path(file).parent)
+            pickle_by_value(Path(file).parent)
     return bytes(cloudpickle.dumps(trial))
 
 
 @contextmanager
-def _held() -> Iterator[None]:
-    """One thread in this process's linear algebra, and no word on a worker that loky replaces.
+def _single_threaded() -> Iterator[None]:
+    """Use one thread in linear algebra, and ignore warnings about replaced workers.
 
-    It replaces one whose memory has grown, as a cache's does, which costs no result.
+    loky replaces a worker whose memory has grown, for example by a cache; no result is lost.
     """
     with warnings.catch_warnings(), threadpool_limits(1, user_api="blas"):
         warnings.filterwarnings(
@@ -383,14 +388,14 @@ def outcomes(
     *,
     one_by_one: bool = False,
 ) -> Iterator[Outcome]:
-    """Every trial's outcome, as it comes.
+    """Yield every trial's outcome in the order in which they finish.
 
-    With `one_by_one` a slot of the executor gets its next trial only after the outcome of its last
-    one was taken here; else trials travel in chunks, two for each slot.
+    With `one_by_one` a slot of the executor gets its next trial only after the last outcome was
+    received here. Otherwise trials are sent in chunks, two for each slot.
     """
     workers = workers or (int(cpu_count()) if executor is None else None)
-    job = (_pickled(trial), home(), versions())
-    with _held():
+    job = (_pickle_trial(trial), home(), versions())
+    with _single_threaded():
         if executor is None and workers == 1:
             for item in items:
                 yield from chunk(job, [item])[1]
@@ -402,11 +407,15 @@ def outcomes(
             flight.abandon()
 
 
-Landed = Future[tuple[float, list[Outcome]]]
+Chunk = Future[tuple[float, list[Outcome]]]
 
 
 class _Flight:
-    """The trials of a study on their way through an executor."""
+    """The trials of a study while they run on an executor.
+
+    Trials wait, then are in flight. If a worker of the own pool dies, all trials in flight become
+    suspects and run one by one, so that the trial that kills its worker is found.
+    """
 
     def __init__(
         self,
@@ -420,89 +429,92 @@ class _Flight:
         self.workers = workers
         self.one_by_one = one_by_one
         self.executor = executor or _pool(workers or 1)
-        self.own = executor is None
-        self.size = 1
+        self.owns_executor = executor is None
+        self.chunk_size = 1
         self.waiting = deque(items)
         self.suspects = deque[Item]()
-        self.flying: dict[Landed, list[Item]] = {}
-        self.alone = False
+        self.in_flight: dict[Chunk, list[Item]] = {}
+        self.one_suspect = False
         self.broken = False
-        self.room = 1
-        self.known_until = 0.0
+        self.n_slots = 1
+        self.slots_valid_until = 0.0
 
     def outcomes(self) -> Iterator[Outcome]:
-        while self.waiting or self.suspects or self.flying:
+        while self.waiting or self.suspects or self.in_flight:
             self._fill()
-            # Executors do not tell those who wait of a call that was cancelled: look again.
-            wait(self.flying, timeout=1.0, return_when=FIRST_COMPLETED)
-            for future in [f for f in self.flying if f.done()]:
-                yield from self._landed(future, self.flying.pop(future))
-                self._fill()  # at once: no slot waits for the others' outcomes
+            # A cancelled call does not end the wait of some executors, hence the timeout.
+            wait(self.in_flight, timeout=1.0, return_when=FIRST_COMPLETED)
+            for future in [f for f in self.in_flight if f.done()]:
+                yield from self._collect(future, self.in_flight.pop(future))
+                # Refill at once, so that no slot waits for the others' outcomes.
+                self._fill()
 
-    def _landed(self, future: Landed, items: list[Item]) -> Iterable[Outcome]:
-        """The outcomes of a chunk; of one whose worker died, none, or the trial's that did it."""
+    def _collect(self, future: Chunk, items: list[Item]) -> Iterable[Outcome]:
+        """Return the outcomes of a chunk; if its worker died, a failure or, at first, nothing."""
         try:
-            seconds, found = future.result()
-            # One quick trial does not make a study of quick trials: grow by steps.
-            most = int(CHUNK_SECONDS * len(items) / max(seconds, 1e-9))
-            self.size = max(1, min(most, 4 * len(items)))
-            return found
+            seconds, results = future.result()
+            # Grow by a factor of 4 at most, since one fast trial may be an exception.
+            largest = int(CHUNK_SECONDS * len(items) / max(seconds, 1e-9))
+            self.chunk_size = max(1, min(largest, 4 * len(items)))
+            return results
         except BrokenExecutor as error:
-            if not self.own:
+            if not self.owns_executor:
                 raise ExecutorError(f"the executor broke ({error})") from error
             self.broken = True
-            if self.alone:
-                return [
-                    Outcome(items[0][0], b"", DIED, f"its worker process died: {error}")
-                ]
+            if self.one_suspect:
+                text = f"its worker process died: {error}"
+                return [Outcome(items[0][0], b"", DIED, text)]
             self.suspects.extend(items)
             return []
         except Exception as error:
-            raise ExecutorError(
-                f"the executor failed ({type(error).__name__}: {error})"
-            ) from error
+            text = f"{type(error).__name__}: {error}"
+            raise ExecutorError(f"the executor failed ({text})") from error
 
     def _fill(self) -> None:
-        """Submit what there is room for: a worker's death is the fault of one that flies alone."""
-        if self.broken and self.flying:  # the others are lost or back soon
+        """Submit as many trials as there are free slots; suspects run alone."""
+        # After a death the other chunks fail or finish soon: wait for all of them.
+        if self.broken and self.in_flight:
             return
         if self.broken:
             self.executor = _pool(self.workers or 1)
             self.broken = False
-        self.alone = bool(self.suspects) or (self.alone and bool(self.flying))
-        if self.alone and not self.flying:
-            self._submit([self.suspects.popleft()])
-        if (
-            time.monotonic() > self.known_until
-        ):  # a cluster grows and shrinks; asking it takes time
-            self.room = slots(self.executor)
-            self.known_until = time.monotonic() + 1.0
-        room = self.workers or self.room
-        window = room if self.one_by_one else 2 * room
-        while (
-            self.waiting
-            and len(self.flying) < window
-            and not (self.alone or self.broken)
-        ):
-            fair = ceil(
-                len(self.waiting) / (2 * room)
-            )  # towards the end nobody is left alone
-            size = 1 if self.one_by_one else min(self.size, fair)
+        # While a suspect runs alone, nothing else is submitted.
+        alone = self.one_suspect and bool(self.in_flight)
+        self.one_suspect = bool(self.suspects) or alone
+        if self.one_suspect:
+            if not self.in_flight:
+                self._submit([self.suspects.popleft()])
+            return
+        slots_now = self._count_slots()
+        window = slots_now if self.one_by_one else 2 * slots_now
+        while self.waiting and len(self.in_flight) < window and not self.broken:
+            # Smaller chunks towards the end, so that all slots finish together.
+            fair = ceil(len(self.waiting) / (2 * slots_now))
+            size = 1 if self.one_by_one else min(self.chunk_size, fair)
             self._submit([self.waiting.popleft() for _ in range(size)])
 
+    def _count_slots(self) -> int:
+        """Return the number of slots; a cluster changes, so it is asked once a second."""
+        if time.monotonic() > self.slots_valid_until:
+            self.n_slots = slots(self.executor)
+            self.slots_valid_until = time.monotonic() + 1.0
+        return self.workers or self.n_slots
+
     def _submit(self, items: list[Item]) -> None:
+        """Submit a chunk; if the own pool is broken, put its trials back."""
         try:
-            self.flying[self.executor.submit(chunk, self.job, items)] = items
+            self.in_flight[self.executor.submit(chunk, self.job, items)] = items
         except Exception as error:
-            if not self.own:
+            if not self.owns_executor:
                 raise ExecutorError(f"the executor takes no trial ({error})") from error
             self.broken = True
-            (self.suspects if self.alone else self.waiting).extendleft(reversed(items))
+            queue = self.suspects if self.one_suspect else self.waiting
+            queue.extendleft(reversed(items))
 
     def abandon(self) -> None:
-        """Give up what is in flight."""
-        for future in self.flying:
+        """Cancel all calls in flight, and end the workers of the own pool."""
+        for future in self.in_flight:
             future.cancel()
-        if self.own and self.flying:
+        if self.owns_executor and self.in_flight:
             stop: Any = self.executor.shutdown
             stop(wait=True, kill_workers=True)

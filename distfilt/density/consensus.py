@@ -1,0 +1,211 @@
+"""Consensus on kernel estimates: the protocol, and two rules that average densities or modes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from ..network import Channel, Graph, PIState, pi_step
+from ..network import weights as weighting
+from ..network.channel import Lost
+from ..validation import (
+    Array,
+    FrozenModel,
+    NonNegativeFloat,
+    PositiveFloat,
+    PositiveInt,
+    call_user,
+)
+from .snapshot import SwarmSnapshot
+
+__all__ = [
+    "ConsensusProtocol",
+    "DynamicAverage",
+    "PIConsensus",
+    "estimate_without_messages",
+]
+
+Memory = tuple[Array, ...]
+"""What the agents remember between steps: arrays whose first axis is the agents."""
+Update = tuple[Memory, Array, Array]
+"""The new memory, each agent's estimate (A, n), and its number of agents, (A,)."""
+
+
+@runtime_checkable
+class ConsensusProtocol(Protocol):
+    """A protocol by which agents estimate the swarm's density: the `fusion` of a density filter.
+
+    `initial_state` returns the agents' memory before the first step. `update` takes their memory
+    and their present positions, exchanges messages over the channel, and returns the new memory,
+    each agent's estimate (A, n), and the number of agents that each believes there are, (A,).
+
+    Examples
+    --------
+    >>> from distfilt.density import Centralised, Flooding
+    >>> Centralised().reference, Flooding().belief_kind
+    (True, 'densities')
+    """
+
+    belief_kind: str = "densities"
+    reference: bool = False
+    """Whether this is a reference for comparison, which needs no network."""
+
+    def initial_state(self, snapshot: SwarmSnapshot) -> Memory:
+        """The agents' memory before the first step: empty by default."""
+        return ()
+
+    def update(
+        self, memory: Memory, snapshot: SwarmSnapshot, channel: Channel, dt: float
+    ) -> Update:
+        """Exchange messages in one step of length `dt`, and estimate the density."""
+        ...
+
+
+def estimate_without_messages(
+    protocol: ConsensusProtocol, snapshot: SwarmSnapshot
+) -> Array:
+    """Each agent's estimate before any message has been sent, (A, n).
+
+    It is the agent's own kernel; only a reference needs no messages to know the positions of all.
+
+    Examples
+    --------
+    >>> from distfilt.density import Grid
+    >>> snapshot = SwarmSnapshot(np.full((2, 2), 0.5), Grid((9, 9)), 0.1, 0.0)
+    >>> estimates = estimate_without_messages(PIConsensus(), snapshot)
+    >>> np.array_equal(estimates, snapshot.kernels)
+    True
+    """
+    if not protocol.reference:
+        return snapshot.kernels
+    no_edges = np.zeros((0, 2))
+    channel = Channel(Graph.from_edges(len(snapshot.positions), no_edges))
+    memory = call_user(protocol.initial_state, snapshot)
+    _, estimates, _ = call_user(protocol.update, memory, snapshot, channel, 1.0)
+    return np.asarray(estimates)
+
+
+def _encode(snapshot: SwarmSnapshot, modes: int | None, densities: Array) -> Array:
+    """Densities or their cosine coefficients, and an indicator of the first present agent."""
+    values = densities
+    if modes is not None:
+        values = densities @ snapshot.grid.cosines(modes) * snapshot.grid.volume
+    leader = np.arange(len(values)) == np.argmax(snapshot.present)
+    return np.concatenate([values, leader[:, None]], axis=1)
+
+
+def _decode(
+    values: Array, snapshot: SwarmSnapshot, modes: int | None
+) -> tuple[Array, Array]:
+    """Densities and numbers of agents from averaged values, the inverse of `_encode`."""
+    densities = values[:, :-1]
+    if modes is not None:
+        densities = densities @ snapshot.grid.cosines(modes).T
+    # The average of the leader's indicator is 1/N; a transient may be zero or negative.
+    agents = 1 / np.clip(values[:, -1], 1e-6, 1.0)
+    return densities, agents
+
+
+@dataclass(frozen=True)
+class PIConsensus(FrozenModel, ConsensusProtocol):
+    """The proportional-integral estimator of equation (16) of Zheng and Lin.
+
+    Parameters
+    ----------
+    alpha, a, b : float
+        Gains, in 1/s, of :func:`distfilt.network.pi_step`.
+    modes : int, optional
+        Number of cosine coefficients on which the agents agree, instead of on all cells.
+    rate : bool
+        Add the derivative of the inputs, which (16) lacks, so that the estimates follow the average
+        without a lag.
+    initial_std : float, optional
+        Start from a Gaussian of this width about the agent instead of from its own kernel.
+
+    Examples
+    --------
+    >>> PIConsensus(modes=64).modes
+    64
+    """
+
+    alpha: NonNegativeFloat = field(default=0.2, kw_only=True)
+    a: NonNegativeFloat = field(default=0.4, kw_only=True)
+    b: NonNegativeFloat = field(default=0.04, kw_only=True)
+    modes: PositiveInt | None = field(default=None, kw_only=True)
+    rate: bool = field(default=False, kw_only=True)
+    initial_std: PositiveFloat | None = field(default=None, kw_only=True)
+
+    def initial_state(self, snapshot: SwarmSnapshot) -> Memory:
+        """Initial estimates, integrals of zero, and the present inputs."""
+        inputs = _encode(snapshot, self.modes, snapshot.kernels)
+        estimates = inputs
+        if self.initial_std is not None:
+            gaussians = snapshot.initial_gaussians(self.initial_std)
+            estimates = _encode(snapshot, self.modes, gaussians)
+        return estimates, np.zeros_like(inputs), inputs
+
+    def update(
+        self, memory: Memory, snapshot: SwarmSnapshot, channel: Channel, dt: float
+    ) -> Update:
+        """Integrate (16) over `dt`, in as many substeps as stability needs."""
+        estimates, integrals, previous = memory
+        inputs = _encode(snapshot, self.modes, snapshot.kernels)
+        state = pi_step(
+            PIState(estimates, integrals),
+            previous,
+            channel,
+            dt=dt,
+            alpha=self.alpha,
+            a=self.a,
+            b=self.b,
+            rate=(inputs - previous) / dt if self.rate else None,
+        )
+        densities, agents = _decode(state.estimate, snapshot, self.modes)
+        return (state.estimate, state.integral, inputs), densities, agents
+
+
+@dataclass(frozen=True)
+class DynamicAverage(FrozenModel, ConsensusProtocol):
+    """First-order dynamic average consensus on cosine coefficients of the density.
+
+    Metropolis weights if all links are bidirectional, otherwise weights that balance the graph
+    (M. Zhu and S. Martinez, Automatica 46 (2010) 322-329).
+
+    Parameters
+    ----------
+    modes : int, optional
+        Number of coefficients; with None the agents agree on all cells.
+
+    Examples
+    --------
+    >>> DynamicAverage().modes
+    100
+    """
+
+    modes: PositiveInt | None = field(default=100, kw_only=True)
+
+    def initial_state(self, snapshot: SwarmSnapshot) -> Memory:
+        """Initial estimates equal to the inputs, without which the average would be biased."""
+        inputs = _encode(snapshot, self.modes, snapshot.kernels)
+        return inputs, inputs
+
+    def update(
+        self, memory: Memory, snapshot: SwarmSnapshot, channel: Channel, dt: float
+    ) -> Update:
+        """Mix the estimates, and add the change of each agent's input."""
+        estimates, previous = memory
+        inputs = _encode(snapshot, self.modes, snapshot.kernels)
+        graph = channel.graph
+        if graph.directed:
+            weights = weighting.doubly_stochastic(graph)
+        else:
+            weights = weighting.metropolis(graph)
+        # A lost message must not change the sum of the estimates.
+        lost: Lost = "keep" if graph.directed else "mutual"
+        # x ← W x + (u - u_previous) conserves mean(x) = mean(u).
+        mixed = channel.mix(estimates, weights, lost=lost)
+        estimates = mixed + (inputs - previous)
+        densities, agents = _decode(estimates, snapshot, self.modes)
+        return (estimates, inputs), densities, agents

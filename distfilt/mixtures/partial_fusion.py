@@ -1,0 +1,490 @@
+r"""Fusing beliefs about a shared part of agents' states: only beliefs about the target travel.
+
+An agent's state is x = [t; e]: the target t, which all agents estimate, comes first; the agent's
+ego state e comes last and differs from agent to agent. The fused density is
+
+.. math:: p_f(\mathbf x)\propto p(\mathbf x)\,p(\mathbf t)^{\omega-1}
+    \prod_b p_b(\mathbf t)^{\omega_b},\qquad \omega+\sum_b\omega_b=1,
+
+equations (14)-(15) of Semeraro, LeGrand and Kulik for one other agent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
+from typing import Annotated, Literal
+
+import numpy as np
+from scipy.linalg import svdvals
+
+from ..gaussians.single import unscented_points
+from ..linalg import SolverError, log_sum_exp, symmetrise
+from ..validation import (
+    Array,
+    ArrayInput,
+    Bounds,
+    FrozenModel,
+    Indices,
+    Mask,
+    PositiveInt,
+    UnitInterval,
+    check_probabilities,
+    validated,
+)
+from .gaussian import GaussianMixture, assemble_joint, inverse, regression
+from .reduction import ComponentShapes
+
+__all__ = ["PartialFusion", "nonnegative_least_squares", "tikhonov"]
+
+Others = GaussianMixture | Sequence[GaussianMixture]
+Exponents = (
+    UnitInterval | Literal["equal"] | Annotated[ArrayInput, "K", check_probabilities]
+)
+Terms = Literal["matched", "all"]
+Rule = Literal["C1", "C2", "C3", "points"]
+Condition = Annotated[float, Bounds(above=1, at_most=1e150)]
+
+# Relative density below which the rows of "points" stop gaining weight.
+_DENSITY_FLOOR = 1e-3
+# Smallest pivots of a term's information matrix, relative to its diagonal entry: where prior and
+# divided component are the same a Cholesky factor exists, else a small pivot may be rounding.
+_MATCHED_PIVOT = 1e-13
+_UNMATCHED_PIVOT = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class PartialFusion(FrozenModel):
+    r"""The exact fused density, which can be evaluated but is no mixture, and its approximations.
+
+    Parameters
+    ----------
+    prior : GaussianMixture
+        The agent's belief about [t; e].
+    received : GaussianMixture or sequence of them
+        Others' beliefs about t; all of one dimension, at most that of `prior`.
+    omega : float, "equal" or array_like
+        Exponent of the prior's target marginal, in [0, 1]; the others share the remainder equally.
+        "equal" gives all the same. Or one exponent each, the prior's first, nonnegative with sum 1.
+
+    Examples
+    --------
+    >>> prior = GaussianMixture.gaussian([0.0, 0.0], [[2.0, 1.0], [1.0, 1.0]])
+    >>> other = GaussianMixture.gaussian([3.0], [[1.0]])
+    >>> exact = PartialFusion(prior, other)
+    >>> fused = exact.assign_weights(exact.component_shapes())
+    >>> fused.means.round(4), fused.covs[0, 0, 0].round(4)
+    (array([[2., 1.]]), np.float64(1.3333))
+    """
+
+    prior: GaussianMixture
+    received: Others
+    _: KW_ONLY
+    omega: Exponents = "equal"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        dims = {other.dim for other in self.others}
+        if len(dims) != 1 or max(dims) > self.prior.dim:
+            raise ValueError(
+                f"received must have target beliefs, one or more, of one dimension, at most "
+                f"the prior's {self.prior.dim}, got {sorted(dims)}"
+            )
+        n_beliefs = len(self.others) + 1
+        if np.ndim(self.omega) and len(self.exponents) != n_beliefs:
+            raise ValueError(
+                f"omega must be {n_beliefs} exponents, got {len(self.exponents)}"
+            )
+
+    @property
+    def others(self) -> tuple[GaussianMixture, ...]:
+        """The received beliefs, one or several."""
+        if isinstance(self.received, GaussianMixture):
+            return (self.received,)
+        return tuple(self.received)
+
+    @cached_property
+    def exponents(self) -> Array:
+        """Exponents of the prior's and of the others' target marginals; their sum is 1."""
+        n_others = len(self.others)
+        if isinstance(self.omega, np.ndarray):
+            return self.omega
+        if isinstance(self.omega, str):
+            return np.full(n_others + 1, 1 / (n_others + 1))
+        exponents = np.full(n_others + 1, (1 - self.omega) / n_others)
+        exponents[0] = self.omega
+        return exponents
+
+    @property
+    def target_dim(self) -> int:
+        """Number of components of the target."""
+        return self.others[0].dim
+
+    @cached_property
+    def target(self) -> GaussianMixture:
+        """The prior belief about the target."""
+        return self.prior.marginal(range(self.target_dim))
+
+    def _add_log_update(self, logs: Array, t: Array, name: str) -> Array:
+        """Add the logarithm of the update factor g(t) of (15) to log densities."""
+        # log g(t) = (ω - 1) log p(t) + Σ ω_b log p_b(t)
+        exponents = self.exponents
+        with np.errstate(invalid="ignore"):
+            if exponents[0] != 1:
+                logs = logs + (exponents[0] - 1) * self.target.log_density(t)
+            for exponent, other in zip(exponents[1:], self.others, strict=True):
+                if exponent:
+                    logs = logs + exponent * other.log_density(t)
+        # One density is divided by another, and both are zero.
+        if np.isnan(logs).any():
+            raise ValueError(
+                f"{name} must have points whose density is a number, got one too far out"
+            )
+        return logs
+
+    @validated
+    def log_value(self, x: Annotated[ArrayInput, "... self.prior.dim"]) -> Array:
+        """Logarithm of the fused density (14), not normalised, (...).
+
+        Parameters
+        ----------
+        x : array_like, (..., d)
+        """
+        logs = self.prior.log_density(x)
+        return self._add_log_update(logs, x[..., : self.target_dim], "x")
+
+    @validated
+    def log_target(self, t: Annotated[ArrayInput, "... self.target_dim"]) -> Array:
+        """Logarithm of the fused target marginal, not normalised; it needs no ego state."""
+        return self._add_log_update(self.target.log_density(t), t, "t")
+
+    @validated
+    def component_shapes(
+        self,
+        *,
+        terms: Terms = "matched",
+        marginal: GaussianMixture | None = None,
+        received: Sequence[GaussianMixture] | None = None,
+    ) -> ComponentShapes:
+        """Means and covariances of the fused components, (22)-(28), without weights.
+
+        By conditioning in the frame that whitens the prior component, which inverts nothing
+        indefinite.
+
+        Parameters
+        ----------
+        terms : {"matched", "all"}
+            Terms in which prior component and divided component are the same, L L' of them, all
+            positive definite (in floating point while the received beliefs are less than a million
+            times as sharp); or all L² L', of which some are not. Those are left out, and `dropped`
+            counts them.
+        marginal : GaussianMixture, optional
+            Divide by this (a reduced marginal) in place of the prior's target marginal; with
+            ``terms="all"``.
+        received : sequence of GaussianMixture, optional
+            Multiply by these (reduced beliefs) in place of the received ones.
+        """
+        if marginal is not None and terms == "matched":
+            raise ValueError(
+                "marginal must come with terms='all', since matched terms divide by the "
+                "prior's own components, got terms='matched'"
+            )
+        divided = self.target if marginal is None else marginal
+        factors = self.others if received is None else received
+        n = self.target_dim
+        if divided.dim != n:
+            raise ValueError(f"marginal must have dimension {n}, got {divided.dim}")
+        expected = [n] * len(self.others)
+        dims = [other.dim for other in factors]
+        if dims != expected:
+            raise ValueError(
+                f"received must have mixtures of dimensions {expected}, got {dims}"
+            )
+        index = np.arange(self.prior.n_components)
+        if terms == "matched":
+            pairs = (index, index)
+        else:
+            divided_index = np.arange(divided.n_components)
+            pairs = (
+                np.repeat(index, divided.n_components),
+                np.tile(divided_index, self.prior.n_components),
+            )
+        return _fuse_components(self.prior, divided, factors, self.exponents, pairs)
+
+    @validated
+    def assign_weights(
+        self, shapes: ComponentShapes, *, rule: Rule = "C3", at_most: PositiveInt = 500
+    ) -> GaussianMixture:
+        """Return the mixture of these shapes, weighted by the exact density at collocation points.
+
+        Components whose weight is zero are left out.
+
+        Parameters
+        ----------
+        shapes : ComponentShapes
+        rule : {"C1", "C2", "C3", "points"}
+            (30), (31), (32)-(34), or C3 with the components' sigma points as further points.
+        at_most : int
+            For "C3" and "points": how many components may take part, the largest by C2.
+
+        Raises
+        ------
+        SolverError
+            If no component has a weight, or least squares do not end.
+        """
+        if rule == "C1":
+            logs = self._log_values_by_source(shapes)
+            return _weight_by_values(shapes.with_equal_weights(), logs)
+        logs = self.log_value(shapes.means)
+        mixture = shapes.with_equal_weights()
+        if rule == "C2":
+            return _weight_by_values(mixture, logs)
+        if shapes.n_components > at_most:
+            order = np.argsort(mixture.log_peaks - logs, kind="stable")
+            largest = np.isin(np.arange(shapes.n_components), order[:at_most])
+            shapes = shapes.select(largest)
+            logs = logs[largest]
+            mixture = shapes.with_equal_weights()
+        coefficients = self._collocate(mixture, logs, with_points=rule == "points")
+        with np.errstate(divide="ignore"):
+            return _weight_by_values(mixture, np.log(coefficients))
+
+    def _log_values_by_source(self, shapes: ComponentShapes) -> Array:
+        """Log density at the shapes' means, with the prior component alone that each came from."""
+        prior = self.prior
+        source = shapes.source
+        # log w_q N_q(m) = log w_q + log peak_q - ½ |L_q⁻¹ (m - m_q)|²
+        differences = shapes.means - prior.means[source]
+        white = np.linalg.solve(prior.factors[source], differences[..., None])[..., 0]
+        log_peaks = (prior.log_weights + prior.log_peaks)[source]
+        logs = log_peaks - 0.5 * (white**2).sum(axis=-1)
+        return self._add_log_update(logs, shapes.means[:, : self.target_dim], "shapes")
+
+    def _collocate(
+        self, mixture: GaussianMixture, logs: Array, *, with_points: bool
+    ) -> Array:
+        """Return nonnegative coefficients of the components that fit the density at points, (33).
+
+        The points are the components' means, or all their sigma points.
+        """
+        points = mixture.means
+        if with_points:
+            sigma_points = unscented_points(mixture.means, mixture.factors)[0]
+            points = sigma_points.reshape(-1, mixture.dim)
+            logs = self.log_value(points)
+        log_matrix = mixture.component_log_densities(points) - mixture.log_peaks
+        matrix = np.exp(log_matrix)
+        values = np.exp(logs - logs.max())
+        if with_points:
+            # Rows by the inverse root of the density, so that the tails count too.
+            row_weights = 1 / np.sqrt(values + _DENSITY_FLOOR)
+            matrix = matrix * row_weights[:, None]
+            values = values * row_weights
+        return nonnegative_least_squares(matrix, values)
+
+
+def _weight_by_values(mixture: GaussianMixture, logs: Array) -> GaussianMixture:
+    """Weight components by the logarithms of their values at the means, (18).
+
+    Components whose weight vanishes are left out.
+    """
+    # w_s ∝ value_s / peak_s
+    log_weights = logs - mixture.log_peaks
+    total = log_sum_exp(log_weights)
+    if not np.isfinite(total).all():
+        raise SolverError(
+            "no fused component has a weight: the exact density is zero at every point"
+        )
+    weights = np.exp(log_weights - total)
+    positive = weights > 0
+    weights = weights[positive] / weights[positive].sum()
+    return GaussianMixture.construct(
+        weights, mixture.means[positive], mixture.covs[positive]
+    )
+
+
+def _multiply_received(
+    received: Sequence[GaussianMixture], exponents: Array, centres: Array
+) -> tuple[Array, Array]:
+    """Information (Q, T, n, n) and vectors (Q, T, n) of the product of the received powers.
+
+    One term for each choice of a component from each belief, with vectors relative to centres
+    (Q, n).
+    """
+    q, n = centres.shape
+    information = np.zeros((q, 1, n, n))
+    vectors = np.zeros((q, 1, n))
+    for exponent, other in zip(exponents, received, strict=True):
+        # Λ = ω P_r⁻¹ and η = Λ (m_r - c), added to every earlier term.
+        precisions = exponent * inverse(other.factors)
+        differences = other.means - centres[:, None]
+        added = np.einsum("rij,srj->sri", precisions, differences)
+        information = information[:, :, None] + precisions
+        information = information.reshape(q, -1, n, n)
+        vectors = vectors[:, :, None] + added[:, None]
+        vectors = vectors.reshape(q, -1, n)
+    return information, vectors
+
+
+def _fuse_components(
+    prior: GaussianMixture,
+    divided: GaussianMixture,
+    received: Sequence[GaussianMixture],
+    exponents: Array,
+    pairs: tuple[Indices, Indices],
+) -> ComponentShapes:
+    """Update prior components q, divided by components p, with all products of received ones.
+
+    The target part is updated with the information Λ and the vector η of
+    :math:`p_p^{\\omega-1}\\prod_b p_b^{\\omega_b}` in the frame that whitens it; e follows by
+    regression.
+    """
+    n = divided.dim
+    q, p = pairs
+    # Vectors are relative to the prior component's mean: far from the origin they would cancel.
+    centres = prior.means[q, :n]
+    information, vectors = _multiply_received(received, exponents[1:], centres)
+    if exponents[0] != 1:
+        # The division: Λ += (ω - 1) P_p⁻¹ and η += (ω - 1) P_p⁻¹ (m_p - c).
+        precisions = (exponents[0] - 1) * inverse(divided.factors)[p]
+        differences = divided.means[p] - centres
+        information = information + precisions[:, None]
+        vectors = vectors + (precisions @ differences[..., None])[:, None, :, 0]
+
+    # P_tt = S (I + Sᵀ Λ S)⁻¹ Sᵀ with the prior's own P_tt = S Sᵀ.
+    root = np.linalg.cholesky(prior.covs[q, :n, :n])[:, None]
+    inner = np.eye(n) + root.mT @ symmetrise(information) @ root
+    is_matched = (q == p) & (len(divided.means) == prior.n_components)
+    smallest_pivot = np.where(is_matched, _MATCHED_PIVOT, _UNMATCHED_PIVOT)
+    lower, is_definite = _factor_definite(inner, smallest_pivot[:, None])
+    half = np.linalg.solve(lower, np.broadcast_to(root.mT, lower.shape))
+    target = half.mT @ half
+
+    # The target moves by P_tt η, and e by the gain times that.
+    gain, conditional = regression(prior, n)
+    target_shift = (target @ vectors[..., None])[..., 0]
+    ego_shift = (gain[q, None] @ target_shift[..., None])[..., 0]
+    shift = np.concatenate([target_shift, ego_shift], axis=-1)
+    means = prior.means[q, None] + shift
+    covs = assemble_joint(target, gain[q, None], conditional[q, None])
+    source = np.broadcast_to(q[:, None], is_definite.shape)
+    return ComponentShapes.construct(
+        means[is_definite],
+        covs[is_definite],
+        source[is_definite],
+        int((~is_definite).sum()),
+    )
+
+
+def _factor_definite(matrices: Array, smallest_pivot: Array) -> tuple[Array, Mask]:
+    """Cholesky factors of a stack, and which of them exist; the identity where none does."""
+    d = matrices.shape[-1]
+    lower = np.zeros_like(matrices)
+    is_definite = np.ones(matrices.shape[:-2], dtype=bool)
+    for k in range(d):
+        # Column k of the Schur complement: A[k:, k] - L[k:, :k] L[k, :k]ᵀ
+        product = lower[..., k:, :k] @ lower[..., k, :k, None]
+        column = matrices[..., k:, k] - product[..., 0]
+        pivot = column[..., 0]
+        # A pivot that has lost so many digits to cancellation is rounding.
+        is_definite &= pivot > smallest_pivot * np.abs(matrices[..., k, k])
+        # A matrix that has failed is carried along with harmless numbers.
+        root = np.sqrt(np.where(is_definite, pivot, 1.0))
+        column = np.where(is_definite[..., None], column, 0.0)
+        lower[..., k:, k] = column / root[..., None]
+    lower[~is_definite] = np.eye(d)
+    return lower, is_definite
+
+
+@validated
+def tikhonov(
+    largest: Annotated[float, Bounds(at_least=0, at_most=1e150)],
+    smallest: Annotated[float, Bounds(at_least=0, at_most=1e150)],
+    *,
+    condition: Condition = 1e10,
+) -> float:
+    r"""Return the smallest factor that brings a matrix's condition number to `condition`, (66).
+
+    .. math:: \alpha^2=\frac{\sigma_1^2-\kappa^2\sigma_n^2}{\kappa^2-1}
+
+    and 0 where the matrix is well conditioned already. The printed (66) has an index i where the
+    largest singular value is meant.
+
+    Parameters
+    ----------
+    largest, smallest : float
+        Singular values, at least 0.
+    condition : float
+        Above 1.
+
+    Examples
+    --------
+    >>> alpha = tikhonov(1.0, 0.0, condition=10.0)
+    >>> round(float(np.sqrt(1 + alpha**2) / alpha), 9)
+    10.0
+    >>> tikhonov(1.0, 0.5, condition=10.0)
+    0.0
+    """
+    excess = largest**2 - (condition * smallest) ** 2
+    return float(np.sqrt(max(excess, 0.0) / (condition**2 - 1)))
+
+
+@validated
+def nonnegative_least_squares(
+    matrix: Annotated[ArrayInput, "n s", Bounds(at_least=-1e150, at_most=1e150)],
+    right: Annotated[ArrayInput, "n"],
+    *,
+    condition: Condition = 1e10,
+) -> Array:
+    """Nonnegative weights that solve ``matrix @ w = right`` best, regularised by (60) and (66).
+
+    Parameters
+    ----------
+    matrix : array_like, (n, S)
+    right : array_like, (n,)
+    condition : float
+        The largest condition number allowed.
+
+    Returns
+    -------
+    ndarray, (S,)
+
+    Raises
+    ------
+    SolverError
+        If the iteration does not end.
+
+    Examples
+    --------
+    >>> nonnegative_least_squares([[1.0, 0.0], [0.0, 1.0]], [2.0, -1.0])
+    array([2., 0.])
+    """
+    from scipy.optimize import lsq_linear, nnls
+
+    n_rows, n_unknowns = matrix.shape
+    singular_values = svdvals(matrix)
+    # With fewer rows than unknowns the smallest singular value of MᵀM is zero.
+    smallest = singular_values[-1] if n_rows >= n_unknowns else 0.0
+    alpha = tikhonov(singular_values[0], smallest, condition=condition)
+    if alpha > 0:
+        # |M w - r|² + α² |w|² is the least-squares problem of stacked rows.
+        matrix = np.concatenate([matrix, alpha * np.eye(n_unknowns)])
+        right = np.concatenate([right, np.zeros(n_unknowns)])
+    try:
+        solution = nnls(matrix, right, maxiter=20 * n_unknowns)[0]
+    except RuntimeError as error:
+        raise SolverError(
+            f"nonnegative least squares: {error} ({n_unknowns} unknowns)"
+        ) from None
+    weights = np.asarray(solution, dtype=np.float64)
+    # Karush-Kuhn-Tucker: the gradient is nonnegative, and zero where a weight is positive.
+    gradient = matrix.T @ (matrix @ weights - right)
+    limit = 1e-6 * singular_values[0] * np.linalg.norm(right)
+    largest_slope = gradient[weights > 0].max(initial=0.0)
+    if gradient.min() >= -limit and largest_slope <= limit:
+        return weights
+    # nnls can stop short where columns are almost the same; another method may come closer.
+    other = lsq_linear(matrix, right, (0, np.inf), method="bvls").x.clip(0)
+    residuals = [np.linalg.norm(matrix @ w - right) for w in (weights, other)]
+    return weights if residuals[0] <= residuals[1] else np.asarray(other)
