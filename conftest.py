@@ -1,8 +1,8 @@
-"""Makes nbval run a cell as Jupyter does, compare its pictures, and open no port.
+"""Let nbval run a cell as Jupyter does, compare pictures, and connect to kernels by files.
 
-nbval sends ``store_history=False``; IPython then shows the value of a last line that ends in ``;``,
-and the cell fails against an output that Jupyter stored without it. And it compares no picture: one
-that was removed or exchanged passes.
+nbval sends ``store_history=False``. IPython then shows the value of a last line that ends in ``;``,
+which Jupyter does not store, and the cell fails. Also, nbval does not compare pictures: a missing
+or different one would pass.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def _execute_cell_input(
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Nothing to change, or to import, where no notebook is run."""
+    """Patch nbval, if it runs."""
     if not config.getoption("nbval", False):
         return
     import nbval.kernel
@@ -35,13 +35,13 @@ def pytest_configure(config: pytest.Config) -> None:
     def compare_outputs(
         cell: Any, test: Any, ref: Any, skip_compare: Any = None
     ) -> bool:
-        """Texts to the letter, by nbval; pictures as a reader sees them."""
+        """Compare texts exactly, by nbval, and pictures by their pixels."""
         texts = (without_pictures(test), without_pictures(ref), skip_compare)
         if not compare_texts(cell, *texts):
             return False
-        found = differences(ref, test)
-        cell.comparison_traceback += found
-        return not found
+        picture_differences = differences(ref, test)
+        cell.comparison_traceback += picture_differences
+        return not picture_differences
 
     nbval.kernel.KernelManager = Manager
     nbval.kernel.RunningKernel.execute_cell_input = _execute_cell_input

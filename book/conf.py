@@ -1,6 +1,6 @@
-"""The book's build: Sphinx on the repository, with stored outputs and nothing from the network.
+"""Configuration of Sphinx: the book is built from stored outputs, without a network.
 
-A figure of a chapter needs a text for readers who do not see it, in the header of the cell:
+A figure of a chapter needs an alternative text, a caption and a name in the header of its cell:
 
     ```{code-cell} ipython3
     ---
@@ -71,7 +71,7 @@ extensions = [
     "numpydoc",
 ]
 
-# Pages: book/ only; a chapter is read from its notebook, never from both files of the pair.
+# Pages are in book/ only. A chapter is read from its notebook, not from its Markdown file.
 external_toc_path = "_toc.yml"
 external_toc_exclude_missing = False
 include_patterns = ["book/**"]
@@ -83,7 +83,7 @@ exclude_patterns = [
     *(p.with_suffix(".md").relative_to(ROOT).as_posix() for p in BOOK.glob("*.ipynb")),
 ]
 
-# Notebooks: the stored outputs are what a reader sees; make outputs executes them.
+# The pages show the stored outputs of notebooks; `make outputs` executes them.
 nb_execution_mode = "off"
 nb_merge_streams = True
 nb_number_source_lines = False
@@ -91,7 +91,7 @@ nb_ipywidgets_js: dict[str, Any] = {}
 nb_mime_priority_overrides = [
     ("html", "application/vnd.jupyter.widget-view+json", None)
 ]
-# A verdict is shown as text or HTML; its third form is for the ledger.
+# A verdict is shown as text or HTML; its JSON form is for the ledger.
 suppress_warnings = ["mystnb.unknown_mime_type"]
 myst_enable_extensions = [
     "amsmath",
@@ -105,8 +105,8 @@ myst_enable_extensions = [
 myst_heading_anchors = 3
 myst_dmath_double_inline = True
 
-# Numbers: (4.1) and Fig. 4.1 start with the chapter's number, which its file name gives. They go on
-# through both pages of a chapter that has two; the second one's title is numbered 1b.
+# Numbers: (4.1) and Fig. 4.1 start with the number in the chapter's file name, and are counted
+# through both pages of a chapter that has two. The title of a second page is numbered 1b.
 numfig = True
 numfig_secnum_depth = 1
 numfig_format = {"figure": "Fig. %s", "table": "Table %s", "code-block": "Listing %s"}
@@ -117,7 +117,7 @@ bibtex_bibfiles = ["refs.bib"]
 bibtex_reference_style = "author_year"
 bibtex_default_style = "plain"
 
-# Every name is documented where it is defined; what another module imports is not its own.
+# Every name is documented in the module that defines it, not where it is imported.
 viewcode_follow_imported_members = False
 
 autodoc_typehints = "signature"
@@ -130,7 +130,7 @@ python_maximum_signature_line_length = 72
 numpydoc_show_class_members = False
 numpydoc_class_members_toctree = False
 
-# A reference that leads nowhere stops the build; these names are others'.
+# A broken reference stops the build. These names belong to other packages.
 nitpicky = True
 OUTSIDE = (
     r"(np|numpy|scipy|xr|xarray|collections|typing|types|functools|pathlib|os|random)\..*",
@@ -172,7 +172,7 @@ html_theme_options = {
     "use_issues_button": False,
     "use_repository_button": False,
     "use_source_button": False,
-    # Pages of wide tables and long lines take the room of the bar on the right.
+    # Pages of wide tables and long lines have no sidebar on the right.
     "secondary_sidebar_items": {
         "**": ["page-toc"],
         **{f"book/{page}": [] for page in WIDE},
@@ -185,8 +185,9 @@ togglebutton_hint_hide = "Hide"
 
 
 def check_toc(app: Sphinx) -> None:
-    """Stop the build when a page of the table of contents has no file."""
-    if missing := missing_pages():
+    """Stop the build if a page of the table of contents has no file."""
+    missing = missing_pages()
+    if missing:
         raise ExtensionError(
             f"_toc.yml names pages that do not exist: {', '.join(missing)}"
         )
@@ -215,34 +216,36 @@ def copy_mathjax(app: Sphinx, error: Exception | None) -> None:
             shutil.copy(source / part, target / part)
 
 
-def find_name(app: Sphinx, env: Any, node: Any, shown: Any) -> Any:
-    """Resolve a name that is called by its room's path, or by itself, to its entry."""
+def find_name(app: Sphinx, env: Any, node: Any, text: Any) -> Any:
+    """Resolve a name to its entry: a full path, a path below the package, or the name alone."""
     if node.get("refdomain") != "py":
         return None
     entries = env.domains.python_domain.objects
     target = node["reftarget"].removeprefix("~")
-    known = {**env.distfilt_homes, **{path: path for path in entries}}
-    room = f"distfilt.{target}"
-    here = node.get("py:module") or ""
+    entry_of = {**env.distfilt_homes, **{path: path for path in entries}}
+    qualified = f"distfilt.{target}"
+    module = node.get("py:module") or ""
     paths = [
         target,
-        room,
-        f"{here}.{target}",
-        f"{here}.{node.get('py:class')}.{target}",
+        qualified,
+        f"{module}.{target}",
+        f"{module}.{node.get('py:class')}.{target}",
     ]
-    found = [known[path] for path in paths if path in known]
+    matches = [entry_of[path] for path in paths if path in entry_of]
     owner, _, member = target.rpartition(".")
-    found += [
-        f"{known[path]}.{member}"
+    matches += [
+        f"{entry_of[path]}.{member}"
         for path in (owner, f"distfilt.{owner}")
-        if path in known
+        if path in entry_of
     ]
-    found += sorted({known[path] for path in known if path.endswith(f".{target}")})
-    if not found or found[0] not in entries:
+    matches += sorted(
+        {entry_of[path] for path in entry_of if path.endswith(f".{target}")}
+    )
+    if not matches or matches[0] not in entries:
         return None
-    entry = entries[found[0]]
+    entry = entries[matches[0]]
     return make_refnode(
-        app.builder, node["refdoc"], entry.docname, entry.node_id, shown, found[0]
+        app.builder, node["refdoc"], entry.docname, entry.node_id, text, matches[0]
     )
 
 
@@ -259,8 +262,8 @@ def link_names(
 
     def url(path: str) -> str | None:
         entry = objects.get(app.env.distfilt_homes.get(path, path))
-        where = entry and app.builder.get_relative_uri(page, entry.docname)
-        return f"{where}#{entry.node_id}" if entry else None
+        address = entry and app.builder.get_relative_uri(page, entry.docname)
+        return f"{address}#{entry.node_id}" if entry else None
 
     offer = (
         f'<p class="notebook"><a href="_notebooks/{source.stem}.ipynb" download>'
@@ -273,7 +276,7 @@ def link_names(
 
 
 def copy_notebooks(app: Sphinx, error: Exception | None) -> None:
-    """Put the chapters beside their pages, to be taken away."""
+    """Copy the notebooks beside their pages, for download."""
     target = Path(app.outdir) / "book" / "_notebooks"
     if error is None and app.builder.name == "html":
         target.mkdir(parents=True, exist_ok=True)
@@ -282,7 +285,7 @@ def copy_notebooks(app: Sphinx, error: Exception | None) -> None:
 
 
 def finish(app: Sphinx, error: Exception | None) -> None:
-    """Make the pages light and usable by everybody, once all are written."""
+    """Make the written pages smaller and accessible."""
     if error is None and app.builder.name == "html":
         lighten(Path(app.outdir))
         for page in Path(app.outdir).rglob("*.html"):

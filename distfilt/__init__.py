@@ -1,12 +1,12 @@
 """Distributed nonlinear filtering: transport maps, mixtures, densities and their networks.
 
-The rooms are packages with a face each, ``from distfilt.filters import EnsembleFilter``. All of
-them are attributes here too, imported when they are first asked for, so that ``import distfilt``
-itself costs next to nothing.
+Names are imported from the subpackages, ``from distfilt.filters import EnsembleFilter``. The
+subpackages are attributes here too, and are imported when they are first used, so that ``import
+distfilt`` itself is fast.
 
-Every public function checks its arguments once: what does not fit raises a ``ValueError`` that
-names the argument, what it needs and what it got. A section Raises is for what else can happen,
-a section Returns for what the first line and the signature do not tell.
+Every public function checks its arguments once: a wrong one raises a ``ValueError`` that names the
+argument, the values that are allowed and the value that came. A docstring's section Raises lists
+further errors only, and a section Returns stands where the first line does not describe the result.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from types import ModuleType
 
 __version__ = "0.3.0"
 
-_ROOMS = (
+_SUBPACKAGES = (
     "coupling",
     "density",
     "validation",
@@ -34,14 +34,15 @@ _ROOMS = (
     "updates",
 )
 
-__all__ = ["__version__", *_ROOMS]
+__all__ = ["__version__", *_SUBPACKAGES]
 
 
 def __getattr__(name: str) -> ModuleType:
-    if name not in _ROOMS:
+    if name not in _SUBPACKAGES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return importlib.import_module(f".{name}", __name__)
 
 
 def __dir__() -> list[str]:
-    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})
+    special = [name for name in globals() if name.startswith("__")]
+    return sorted(set(__all__) | set(special))

@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from functools import lru_cache, partial
+from functools import partial
 from typing import Annotated
 
 import numpy as np
 
-from .linalg import EPS, cholesky, factor, lower_root, solve_upper, symmetrise
+from .linalg import (
+    EPS,
+    center_ensemble,
+    cholesky,
+    equal_weights,
+    factor,
+    lower_root,
+    solve_upper,
+    symmetrise,
+)
 from .validation import (
     Array,
+    ArrayInput,
     PositiveInt,
     PositiveSemidefinite,
     Rng,
@@ -20,25 +30,28 @@ from .validation import (
 __all__ = ["Members", "draw", "mean", "sample_covariance"]
 
 
-def _at_least(members: int, value: Array, name: str) -> None:
+def _check_size(members: int, value: Array, name: str) -> None:
+    """Refuse an ensemble of fewer members."""
     if value.shape[-2] < members:
         raise ValueError(
             f"{name} must have at least {members} members, got {value.shape[-2]}"
         )
 
 
-Members = Annotated[Array, "... N d", partial(_at_least, 1)]
-"""The kind of what has members."""
-Ensemble = Annotated[Array, "... N d", partial(_at_least, 2)]
-"""The kind of what has a sample covariance."""
+Members = Annotated[ArrayInput, "... N d", partial(_check_size, 1)]
+"""Annotation of an argument that is an ensemble of at least one member."""
+Ensemble = Annotated[ArrayInput, "... N d", partial(_check_size, 2)]
+"""Annotation of an argument that is an ensemble with a sample covariance."""
 
-# The share of a unit column beside others up to which singular values say if it is one more.
-_CLOSE = 1e-6
+# Pivots of unit columns up to which a singular value decomposition decides on their rank.
+_SMALL_PIVOT = 1e-6
+# Smallest diagonal entry of the Cholesky factor of a draw's covariance with which to solve.
+_SAFE_PIVOT = np.sqrt(0.1)
 
 
 @validated
 def draw(
-    mean: Annotated[Array, "d"],
+    mean: Annotated[ArrayInput, "d"],
     cov: Annotated[PositiveSemidefinite, "d d"],
     members: PositiveInt,
     *,
@@ -65,8 +78,10 @@ def draw(
     >>> draw([0.0, 0.0], np.eye(2), 5, rng=np.random.default_rng(0), leading=(3,)).shape
     (3, 5, 2)
     """
+    # x = m + L z with z ~ N(0, I)
     root = factor(cov)
-    return mean + rng.standard_normal((*leading, members, mean.size)) @ root.T
+    z = rng.standard_normal((*leading, members, mean.size))
+    return np.asarray(mean + z @ root.T)
 
 
 @validated
@@ -77,23 +92,8 @@ def mean(ensemble: Members) -> Array:
     array([2., 3.])
     """
     # A product with equal weights: ten times faster than a reduction over a short inner axis.
-    return np.asarray((_equal_weights(ensemble.shape[-2]) @ ensemble)[..., 0, :])
-
-
-@lru_cache(maxsize=16)
-def _equal_weights(members: int) -> Array:
-    return np.full((1, members), 1 / members)
-
-
-def center_ensemble(members: Array) -> tuple[Array, Array]:
-    """Mean (..., 1, d) and anomalies (..., N, d), members minus their mean.
-
-    >>> center_ensemble(np.array([[1.0], [3.0]]))
-    (array([[2.]]), array([[-1.],
-           [ 1.]]))
-    """
-    centre = _equal_weights(members.shape[-2]) @ members
-    return centre, members - centre
+    weights = equal_weights(ensemble.shape[-2])
+    return np.asarray((weights @ ensemble)[..., 0, :])
 
 
 @validated
@@ -104,8 +104,10 @@ def sample_covariance(ensemble: Ensemble) -> Array:
     array([[2., 4.],
            [4., 8.]])
     """
-    a = center_ensemble(ensemble)[1]
-    return symmetrise(a.swapaxes(-1, -2) @ a / (a.shape[-2] - 1))
+    # P = Aᵀ A / (N - 1) of the anomalies A.
+    anomalies = center_ensemble(ensemble)[1]
+    n = anomalies.shape[-2]
+    return symmetrise(anomalies.swapaxes(-1, -2) @ anomalies / (n - 1))
 
 
 def exact_noise(avoid: Array, root: Array, rng: Rng) -> Array:
@@ -118,8 +120,8 @@ def exact_noise(avoid: Array, root: Array, rng: Rng) -> Array:
     Parameters
     ----------
     avoid : ndarray, (..., N, p)
-        What the noise has to be uncorrelated with, by member: the ensemble, its predictions, other
-        noise. Only differences from their mean matter, so ensembles serve as well. p may be 0.
+        Quantities that the noise must be uncorrelated with, by member: the ensemble, its
+        predictions, other noise. Their mean does not matter. p may be 0.
     root : ndarray, (..., k, r)
         A factor of the noise's covariance. Leading axes broadcast.
     rng : numpy.random.Generator
@@ -151,65 +153,72 @@ def exact_noise(avoid: Array, root: Array, rng: Rng) -> Array:
     """
     n = avoid.shape[-2]
     if n <= avoid.shape[-1] + root.shape[-1]:
-        root = _narrow(root)
+        root = _drop_null_columns(root)
     rank = root.shape[-1]
-    shape = np.broadcast_shapes(avoid.shape[:-2], root.shape[:-2])
-    drawn = _projected(rng.standard_normal((*shape, n, rank)), avoid)
-    return _coloured(drawn, root)
+    leading = np.broadcast_shapes(avoid.shape[:-2], root.shape[:-2])
+    noise = rng.standard_normal((*leading, n, rank))
+    return _set_covariance(_project_out(noise, avoid), root)
 
 
-def _narrow(root: Array) -> Array:
-    """A factor with as many columns as the rank, up to rounding: it asks for fewer members."""
+def _drop_null_columns(root: Array) -> Array:
+    """Reduce a factor to as many columns as its rank, up to rounding: it needs fewer members."""
     std = np.sqrt((root**2).sum(axis=-1))
     unit = np.where(std > 0, std, 1.0)[..., None]
+    # Singular values count if their squares exceed the rounding of the covariance.
     u, s, _ = np.linalg.svd(root / unit)
-    kept = (
-        s**2 > 64 * s.shape[-1] * EPS * s.max(axis=-1, initial=0.0, keepdims=True) ** 2
-    )
-    width = int(kept.sum(axis=-1).max(initial=0))
-    return lower_root((u * (s * kept)[..., None, :])[..., :width]) * unit
+    largest = s.max(axis=-1, initial=0.0, keepdims=True)
+    is_positive = s**2 > 64 * s.shape[-1] * EPS * largest**2
+    rank = int(is_positive.sum(axis=-1).max(initial=0))
+    columns = u * (s * is_positive)[..., None, :]
+    return lower_root(columns[..., :rank]) * unit
 
 
-def _projected(drawn: Array, avoid: Array) -> Array:
-    """What is left of a draw without its mean and the anomalies."""
-    (n, rank) = drawn.shape[-2:]
-    around = center_ensemble(avoid)[1]
-    size = np.sqrt((around**2).sum(axis=-2, keepdims=True))
-    frame, independent = _frame(around / np.where(size > 0, size, 1.0))
+def _project_out(noise: Array, avoid: Array) -> Array:
+    """Subtract from a draw its mean and its projection on the anomalies."""
+    n, rank = noise.shape[-2:]
+    anomalies = center_ensemble(avoid)[1]
+    size = np.sqrt((anomalies**2).sum(axis=-2, keepdims=True))
+    basis, independent = _orthonormal_basis(anomalies / np.where(size > 0, size, 1.0))
     if n <= independent + rank:
         raise ValueError(
             f"ensemble must have more than {independent} + {rank} members, for "
             f"{independent} independent anomalies and noise of rank {rank}, got {n}"
         )
+    # Twice, since rounding leaves a small projection the first time.
     for _ in range(2):
-        drawn = center_ensemble(drawn - frame @ (frame.mT @ drawn))[1]
-    return drawn
+        noise = center_ensemble(noise - basis @ (basis.mT @ noise))[1]
+    return noise
 
 
-def _frame(columns: Array) -> tuple[Array, int]:
+def _orthonormal_basis(columns: Array) -> tuple[Array, int]:
     """Orthonormal columns, or zeros, that span unit columns (..., n, p), and the largest rank."""
     q, r = np.linalg.qr(columns)
-    good = np.abs(np.diagonal(r, axis1=-2, axis2=-1)) > _CLOSE
+    is_independent = np.abs(np.diagonal(r, axis1=-2, axis2=-1)) > _SMALL_PIVOT
     # A small pivot may be rounding, magnified by columns that are close to one another: to avoid
     # its direction would cost a member, and would leave the draw to the last bit.
-    if not good.all():
+    if not is_independent.all():
         u, values, _ = np.linalg.svd(r, full_matrices=False)
-        good = values > columns.shape[-2] * EPS * values.max(
-            axis=-1, initial=0.0, keepdims=True
-        )
+        largest = values.max(axis=-1, initial=0.0, keepdims=True)
+        is_independent = values > columns.shape[-2] * EPS * largest
         q = q @ u
-    return np.asarray(q * good[..., None, :]), int(good.sum(axis=-1).max(initial=0))
+    rank = int(is_independent.sum(axis=-1).max(initial=0))
+    return np.asarray(q * is_independent[..., None, :]), rank
 
 
-def _coloured(drawn: Array, root: Array) -> Array:
-    """The draw (..., N, r) turned linearly so that its sample covariance is root root'."""
-    n = drawn.shape[-2]
-    # A pivot so small that solving with the factor would lose digits: by orthogonal steps.
+def _set_covariance(noise: Array, root: Array) -> Array:
+    """Transform a draw (..., N, r) linearly so that its sample covariance is root rootᵀ."""
+    n = noise.shape[-2]
+    transposed_root = root.swapaxes(-1, -2)
+    # Whitening: with Zᵀ Z / (N - 1) = C Cᵀ the sample covariance of Z C⁻ᵀ is the identity.
     with suppress(np.linalg.LinAlgError):
-        lower = cholesky(np.ascontiguousarray(drawn.swapaxes(-1, -2)) @ drawn / (n - 1))
-        if np.diagonal(lower, axis1=-2, axis2=-1).min(initial=1.0) >= np.sqrt(0.1):
-            return np.asarray(drawn @ solve_upper(lower, root.swapaxes(-1, -2)))
-    q, r = np.linalg.qr(drawn)
-    # A positive diagonal makes the frame that of whitening, whatever signs LAPACK prefers.
-    sign = np.where(np.diagonal(r, axis1=-2, axis2=-1) < 0, -1.0, 1.0)[..., None, :]
-    return np.asarray(np.sqrt(n - 1) * ((q * sign) @ root.swapaxes(-1, -2)))
+        transposed = np.ascontiguousarray(noise.swapaxes(-1, -2))
+        lower = cholesky(transposed @ noise / (n - 1))
+        pivots = np.diagonal(lower, axis1=-2, axis2=-1)
+        if pivots.min(initial=1.0) >= _SAFE_PIVOT:
+            return np.asarray(noise @ solve_upper(lower, transposed_root))
+    # With a small pivot the solution would lose digits; orthogonal steps do not.
+    q, r = np.linalg.qr(noise)
+    # A positive diagonal gives the basis that whitening does, whatever signs LAPACK prefers.
+    diagonal = np.diagonal(r, axis1=-2, axis2=-1)
+    sign = np.where(diagonal < 0, -1.0, 1.0)[..., None, :]
+    return np.asarray(np.sqrt(n - 1) * ((q * sign) @ transposed_root))

@@ -12,7 +12,7 @@ from distfilt.ensembles import mean, sample_covariance
 from distfilt.gaussians import (
     condition,
     intersect_gaussians,
-    intersecting,
+    intersection,
     intersection_weights,
 )
 from distfilt.gaussians.single import log_density, match_moments, unscented_points
@@ -158,7 +158,7 @@ def test_closed_forms() -> None:
     for rule in RULES:
         assert intersection_weights(p[:1], rule=rule).tolist() == [1.0]
     here = np.array([True, False, True])
-    assert intersection_weights(p, here=[here, ~here]).tolist() == [
+    assert intersection_weights(p, present=[here, ~here]).tolist() == [
         [0.5, 0, 0.5],
         [0, 1, 0],
     ]
@@ -203,8 +203,8 @@ def test_sure_steps_alone_reach_the_optimum(monkeypatch: pytest.MonkeyPatch) -> 
     def astray(weights: np.ndarray, *rest: object) -> np.ndarray:
         return np.roll(weights, 1, axis=-1) ** 2 / (weights**2).sum(-1, keepdims=True)
 
-    monkeypatch.setattr(intersecting, "_newton", astray)
-    monkeypatch.setattr(intersecting, "_STEPS", 1500)
+    monkeypatch.setattr(intersection, "_newton_step", astray)
+    monkeypatch.setattr(intersection, "_MAX_STEPS", 1500)
     for rule in ("min_determinant", "min_trace"):
         w = intersection_weights(p, rule=rule)
         assert np.allclose(w.sum(-1), 1.0) and (w >= 0).all()

@@ -126,8 +126,8 @@ def test_networks_that_are_uneven_silent_or_without_a_link() -> None:
     box = Channel(graphs.path(3)).broadcast(list(x))
     x += 1
     assert box[1][0] == 0.0
-    nested = Faults(seed=2, also=(Faults(seed=1) | Faults(silent=[0]),))
-    assert nested.speaking(graphs.path(3)).sum() == 2
+    nested = Faults(seed=2, others=(Faults(seed=1) | Faults(silent=[0]),))
+    assert nested.active_links(graphs.path(3)).sum() == 2
     none = Channel(Graph.from_edges(3, np.zeros((0, 2))))
     assert network.stable_substeps(none, 0.1, alpha=0.0, a=0.4, b=0.04) == 1
 

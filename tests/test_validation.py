@@ -1,4 +1,4 @@
-"""Every public name stands behind its declared door, and refuses by name what does not fit."""
+"""Every public function validates its arguments, and its errors name the wrong one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from distfilt.validation.annotations import Scope
+from distfilt.validation.annotations import CallContext
 from tests.tools.calls import (
     Call,
     callables,
@@ -25,19 +25,21 @@ from tests.tools.calls import (
 from tests.tools.fuzz import exact, kinds
 
 PUBLIC = {
-    name: thing for room in subpackages() for name, thing in public_names(room).items()
+    name: thing
+    for package in subpackages()
+    for name, thing in public_names(package).items()
 }
-WITHOUT = {
-    r"linalg\..*": "for loops, which have checked before",
+NOT_VALIDATED = {
+    r"linalg\..*": "for loops, whose arguments were checked before",
     r".*(Error|Collapse|Gain|Disconnected)": "an error or a warning, which a user catches",
-    r"filters\.(\w*State|Summary|Filter)|network\.\w*(State|Result)|metrics\.Interval|coupling\.TransportPlan": "made by the library, or derived from by a user",
+    r"filters\.(\w*State|Summary|Filter)|network\.\w*(State|Result)|metrics\.Interval|coupling\.TransportPlan": "made by the library, or a base class",
     r"ensembles\.Members|models\.Swarm": "a type",
     r"density\.(Centralised|Neighbours|ConsensusProtocol)": "a protocol, and two that have no arguments",
-    r"filters\.(Step|final_state|prior_moments)|network\.fusion_rule": "for who writes a filter or a rule",
-    r"updates\.(update|effective_size|with_missing)": "looks at what has no kind: a function's signature, logarithms with -inf, a step's own",
+    r"filters\.(Step|final_state|prior_moments)|network\.fusion_rule": "for authors of a filter or a rule",
+    r"updates\.(update|effective_size)": "takes a function's signature, or logarithms with -inf",
 }
-"""Public names without a door, as patterns, and why."""
-IN_A_ROW = {
+"""Patterns of public names without validation, and why."""
+POSITIONAL = {
     "graph",
     "covariance",
     "members",
@@ -49,102 +51,103 @@ IN_A_ROW = {
     "dropped",
     "strength",
     "bodies",
-    "reading",
+    "interpretation",
     "wanted",
     "mixtures",
     "sensor",
 }
-"""Data that a call may leave out, such as a filter's graph; options are given by name."""
+"""Optional data that may be given by position; options are given by name."""
 
 
 def refuses(value: Any, call: Call, name: str) -> bool:
-    """Whether the kinds themselves, asked in the door's order, refuse a value by its name."""
+    """Whether the constraints, in the order of a call, refuse a value by its argument's name."""
     arguments = call.arguments | {name: copy.deepcopy(value)}
-    scope = Scope(dict(arguments))
-    for other, kind in describe(call.function).items():
+    context = CallContext(dict(arguments))
+    for argument, constraint in describe(call.function).items():
+        if argument not in arguments:
+            continue
         try:
-            if other in arguments:
-                kind.check(arguments[other], other, scope)
+            constraint.validate(arguments[argument], argument, context)
         except ValueError as error:
-            return other == name and str(error).startswith(name)
-        except Exception:  # an object of which an array cannot be made
+            return argument == name and str(error).startswith(name)
+        except Exception:  # an object that cannot be converted to an array
             return False
     return False
 
 
-def is_doorless(thing: Any) -> bool:
-    """Whether a public name takes arguments and declares nothing about them."""
-    return (
-        callable(thing)
-        and not callables(thing)
-        and not isinstance(thing, type(Iterator[int]))
-    )
+def is_unvalidated(thing: Any) -> bool:
+    """Whether a public name takes arguments without any constraint."""
+    is_alias = isinstance(thing, type(Iterator[int]))
+    return callable(thing) and not callables(thing) and not is_alias
 
 
 @pytest.mark.parametrize("name", sorted(PUBLIC))
-def test_a_door_refuses_by_name(name: str) -> None:
+def test_errors_name_the_wrong_argument(name: str) -> None:
+    """Exchange each argument of an example by wrong values; the error names it."""
     thing = PUBLIC[name]
     for method, function in callables(thing).items():
-        found = calls(thing, function)
-        assert found or method or inspect.isclass(thing), f"{name}: no example calls it"
-        for call, (argument, kind) in product(found[:1], describe(function).items()):
-            if argument not in call.arguments:
-                continue
-            bad = [
-                v
-                for _, v in kinds(call.arguments[argument])
-                if refuses(v, call, argument)
-            ]
-            assert bad, f"{name}{method}({argument}): {kind.needs} refuses nothing"
-            for value in bad:
-                before = copy.deepcopy(call.arguments)
-                with pytest.raises(ValueError) as caught:
-                    call.run(**{argument: value})
-                assert str(caught.value).startswith(argument), (
-                    f"{name}{method}: {caught.value}"
-                )
-                assert exact(before, call.arguments)
+        examples = calls(thing, function)
+        has_example = examples or method or inspect.isclass(thing)
+        assert has_example, f"{name}: no example calls it"
+        constraints = describe(function)
+        for call, argument in product(examples[:1], constraints):
+            if argument in call.arguments:
+                label = f"{name}{method}({argument})"
+                check_refusals(call, argument, label)
+
+
+def check_refusals(call: Call, argument: str, label: str) -> None:
+    """Every value that a constraint refuses is refused by the call, which changes nothing."""
+    values = [value for _, value in kinds(call.arguments[argument])]
+    wrong = [value for value in values if refuses(value, call, argument)]
+    assert wrong, f"{label}: no value is refused"
+    for value in wrong:
+        before = copy.deepcopy(call.arguments)
+        with pytest.raises(ValueError) as caught:
+            call.run(**{argument: value})
+        assert str(caught.value).startswith(argument), f"{label}: {caught.value}"
+        assert exact(before, call.arguments)
 
 
 @pytest.mark.parametrize("name", sorted(PUBLIC))
 def test_a_valid_call_changes_none_of_its_arguments(name: str) -> None:
-    """But for generators, which are there to be drawn from."""
+    """Generators are an exception, since they are drawn from."""
     for function in callables(PUBLIC[name]).values():
         for call in calls(PUBLIC[name], function)[:1]:
-            after = call.run()[1]
-            kept = {
-                k: v
-                for k, v in call.arguments.items()
-                if not isinstance(v, np.random.Generator)
-            }
-            assert exact(kept, {k: after[k] for k in kept}), function
+            _, after = call.run()
+            for argument, value in call.arguments.items():
+                if not isinstance(value, np.random.Generator):
+                    assert exact(value, after[argument]), function
 
 
-def test_every_public_name_has_a_door_or_a_reason() -> None:
-    found = [name for name, thing in PUBLIC.items() if is_doorless(thing)]
-    doorless = [n for n in found if not any(re.fullmatch(p, n) for p in WITHOUT)]
-    assert doorless == []
+def test_every_public_function_is_validated() -> None:
+    """Or matches a pattern with a reason."""
+    names = [name for name, thing in PUBLIC.items() if is_unvalidated(thing)]
+    unexplained = []
+    for name in names:
+        if not any(re.fullmatch(pattern, name) for pattern in NOT_VALIDATED):
+            unexplained.append(name)
+    assert unexplained == []
 
 
 def test_options_are_given_by_name() -> None:
     for name, thing in PUBLIC.items():
         if function := callables(thing).get(""):
             parameters = inspect.signature(function).parameters.values()
-            row = {
-                p.name for p in parameters if p.kind < 2 and p.default is not p.empty
-            }
-            assert row <= IN_A_ROW, (
-                f"{name}: {sorted(row - IN_A_ROW)} can stand in a row"
-            )
+            optional = [p for p in parameters if p.default is not p.empty]
+            positional = {p.name for p in optional if p.kind < p.VAR_POSITIONAL}
+            wrong = sorted(positional - POSITIONAL)
+            assert not wrong, f"{name}: {wrong} can be given by position"
 
 
 def test_structures_are_frozen_and_arrays_make_no_equality() -> None:
     """Two structures of arrays would be compared entry by entry, which is no truth value."""
-    for name, made in PUBLIC.items():
-        if inspect.isclass(made) and is_dataclass(made):
-            options: Any = made.__dataclass_params__  # type: ignore[attr-defined]
-            assert options.frozen or name == "filters.Step", f"{name} can be changed"
-            types = " ".join(
-                re.sub(r"Callable\[.*\]", "", str(f.type)) for f in fields(made)
-            )
-            assert not (options.eq and "Array" in types), f"{name} compares arrays"
+    for name, cls in PUBLIC.items():
+        if not (inspect.isclass(cls) and is_dataclass(cls)):
+            continue
+        options: Any = cls.__dataclass_params__  # type: ignore[attr-defined]
+        assert options.frozen or name == "filters.Step", f"{name} can be changed"
+        # Functions of arrays are compared by identity.
+        types = [re.sub(r"Callable\[.*\]", "", str(f.type)) for f in fields(cls)]
+        has_arrays = any("Array" in text for text in types)
+        assert not (options.eq and has_arrays), f"{name} compares arrays"

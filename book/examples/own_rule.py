@@ -1,22 +1,22 @@
-"""A rule of agreement of one's own: each agent moves to the median of the means it knows."""
+"""A fusion rule of your own: each agent moves to the median of the means it knows."""
 
 import numpy as np
 
 from distfilt.filters import EnsembleFilter
 from distfilt.models import Model
-from distfilt.network import graphs
+from distfilt.network import Channel, graphs
 from distfilt.sensors import component
 
 
-def median_of_means(ensembles, channel):
+def median_of_means(ensembles: np.ndarray, channel: Channel) -> np.ndarray:
     """Move every ensemble (A, N, d) to the median of its own mean and its neighbours'."""
     means = list(ensembles.mean(axis=-2))
     inbox = channel.broadcast(means)
-    out = ensembles.copy()
-    for agent, heard in enumerate(inbox):
-        middle = np.median([means[agent], *heard.values()], axis=0)
-        out[agent] += middle - means[agent]
-    return out
+    fused = ensembles.copy()
+    for agent, received in enumerate(inbox):
+        median = np.median([means[agent], *received.values()], axis=0)
+        fused[agent] += median - means[agent]
+    return fused
 
 
 walk = Model(1, lambda x, t, dt: x, lambda t, dt: 0.1 * dt * np.eye(1), units=("m",))
@@ -30,13 +30,8 @@ f = EnsembleFilter(
     members=100,
 )
 state = f.start(([0.0], [[4.0]]), rng=np.random.default_rng(0))
-readings = [np.full((20, 1), 1.0)] * 4 + [
-    np.full((20, 1), 30.0)
-]  # the last sensor is broken
-run = f.run(state, np.arange(1.0, 21.0), readings)
-print(
-    run["mean"].values[-1, :, 0].round(1),
-    "m;",
-    run["scalars"].values[-1].sum(),
-    "numbers",
-)
+# Four sensors work, the last one is broken.
+observations = [np.full((20, 1), 1.0)] * 4 + [np.full((20, 1), 30.0)]
+run = f.run(state, np.arange(1.0, 21.0), observations)
+means = run["mean"].values[-1, :, 0].round(1)
+print(means, "m;", run["scalars"].values[-1].sum(), "numbers")

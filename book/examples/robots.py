@@ -1,8 +1,10 @@
 """Five robots with odometry track a sixth: sightings at any time, contact every ten seconds."""
 
 import tempfile
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,84 +14,102 @@ from distfilt.models import constant_velocity
 from distfilt.network import graphs
 from distfilt.sensors import range_bearing
 
-STD = (0.3, 0.04)
-RATE = 0.4
+STD = (0.3, 0.04)  # of range, in m, and bearing, in rad
+RATE = 0.4  # sightings of a robot a second
 END = 120.0
 ROBOTS = 5
 
 
 def target(t):
-    """Where the sixth robot is, with its velocity: a wide arc."""
+    """Position and velocity of the sixth robot: a wide arc."""
     angle = np.asarray(t) / 40
-    turn = np.stack(
-        [np.sin(angle), 1 - np.cos(angle), np.cos(angle), np.sin(angle)], axis=-1
-    )
-    return turn * [20, 20, 0.5, 0.5]
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([s, 1 - c, c, s], axis=-1) * [20, 20, 0.5, 0.5]
 
 
-def rolled(pose, speed, turn, dt):
+def first_pose(robot):
+    """Where a robot starts: x, y and heading."""
+    return 8.0 * robot - 16, -5.0, 0.3 * robot
+
+
+def drive(pose, speed, turn, dt):
+    """The pose after a straight drive, then a turn."""
     x, y, heading = pose
-    return (
-        x + dt * speed * np.cos(heading),
-        y + dt * speed * np.sin(heading),
-        heading + dt * turn,
-    )
+    x = x + dt * speed * np.cos(heading)
+    y = y + dt * speed * np.sin(heading)
+    return x, y, heading + dt * turn
+
+
+def sensor_at(pose):
+    """The range-bearing sensor of a robot at a pose."""
+    x, y, heading = pose
+    return range_bearing([0, 1], std=STD, origin=(x, y), heading=heading)
 
 
 def simulate(path, rng):
-    """Write each robot's log: its odometry, and what it sees; one sighting in twenty is wild."""
+    """Write each robot's log: odometry and sightings, of which one in twenty is an outlier."""
     rows = []
     for robot in range(ROBOTS):
-        pose = (8.0 * robot - 16, -5.0, 0.3 * robot)
+        pose = first_pose(robot)
         t = 0.0
-        while (dt := rng.exponential(1 / RATE)) + t < END:
+        while True:
+            dt = rng.exponential(1 / RATE)
+            if t + dt >= END:
+                break
             speed = 0.4
             turn = 0.05 * np.sin(t / 10 + robot)
-            pose = rolled(pose, speed, turn, dt)
+            pose = drive(pose, speed, turn, dt)
             t = t + dt
-            drive = rng.normal([speed, turn], [0.005, 0.0005])
-            eye = range_bearing([0, 1], std=STD, origin=pose[:2], heading=pose[2])
-            sight = eye.observe(target(t), rng=rng) + 8.0 * (rng.random() < 0.05)
-            rows.append([t, robot, dt, *drive, *sight])
+            odometry = rng.normal([speed, turn], [0.005, 0.0005])
+            sighting = sensor_at(pose).observe(target(t), rng=rng)
+            outlier = 8.0 * (rng.random() < 0.05)
+            rows.append([t, robot, dt, *odometry, *(sighting + outlier)])
     np.savetxt(path, sorted(rows), delimiter=",")
 
 
-def events(path):
-    """A log's sightings, each by a sensor that stands where its odometry says."""
-    poses = {robot: (8.0 * robot - 16, -5.0, 0.3 * robot) for robot in range(ROBOTS)}
-    for t, robot, dt, speed, turn, *sight in np.loadtxt(path, delimiter=",").tolist():
-        pose = poses[robot] = rolled(poses[robot], speed, turn, dt)
-        eye = range_bearing([0, 1], std=STD, origin=pose[:2], heading=pose[2])
-        yield filters.Observation(t, int(robot), sight, eye, metadata=pose)
+def read_log(path):
+    """Yield a log's sightings, each by a sensor where the robot's odometry puts it."""
+    poses = {robot: first_pose(robot) for robot in range(ROBOTS)}
+    rows = np.loadtxt(path, delimiter=",").tolist()
+    for t, robot, dt, speed, turn, *sighting in rows:
+        pose = drive(poses[robot], speed, turn, dt)
+        poses[robot] = pose
+        yield filters.Observation(
+            t, int(robot), sighting, sensor_at(pose), metadata=pose
+        )
 
 
 log = Path(tempfile.mkdtemp()) / "log.csv"
 simulate(log, np.random.default_rng(0))
-seen = list(events(log))
+observations = list(read_log(log))
+times = np.unique([observation.t for observation in observations])
 model = constant_velocity(sigma=0.03)
-now = np.unique([event.t for event in seen])
+truth = dict(zip(model.names, target(times).T, strict=True))
+
+# Outliers are gated; messages are exchanged every ten seconds only.
 team = ([None] * ROBOTS, graphs.ring(ROBOTS))
 options = {"gate_probability": 0.999, "exchange_interval": 10.0}
 fuse = partial(target_fusion, target_dim=4)
 families = {
     "mixture": filters.MixtureFilter(
-        model, *team, fusion=fuse, target_dim=4, **options
+        model, sensors, ring, fusion=fuse, target_dim=4, **options
     ),
-    "gaussian": filters.GaussianFilter(model, *team, lag=40, **options),
-    "ensemble": filters.EnsembleFilter(model, *team, lag=40, members=100, **options),
-    "news": filters.InformationIncrementFilter(model, *team, target_dim=4, **options),
+    "gaussian": filters.GaussianFilter(model, sensors, ring, lag=40, **options),
+    "ensemble": filters.EnsembleFilter(
+        model, sensors, ring, lag=40, members=100, **options
+    ),
+    "increment": filters.InformationIncrementFilter(
+        model, *team, target_dim=4, **options
+    ),
 }
-print("filter    error/m  NEES/d  refused  floats")
+print("filter    error/m  NEES/d  rejected  floats")
 for name, f in families.items():
-    begin = f.start(
-        (target(0.0), np.diag([4, 4, 0.1, 0.1])), rng=np.random.default_rng(1)
-    )
-    run = f.run(
-        begin, None, seen, truth=dict(zip(model.names, target(now).T, strict=True))
-    )
+    prior = (target(0.0), np.diag([4, 4, 0.1, 0.1]))
+    state = f.start(prior, rng=np.random.default_rng(1))
+    run = f.run(state, None, observations, truth=truth)
     late = run.sel(time=slice(20, None))
     error = np.sqrt(late["squared_error"][..., :2].sum("component").mean())
-    refused, floats = (int(run[key].sum()) for key in ("rejected", "scalars"))
-    print(
-        f"{name:9s} {error:7.2f} {late['nees'].mean() / 4:7.2f} {refused:8d} {floats:7d}"
-    )
+    nees = late["nees"].mean() / 4
+    rejected = int(run["rejected"].sum())
+    floats = int(run["scalars"].sum())
+    print(f"{name:9s} {error:7.2f} {nees:7.2f} {rejected:9d} {floats:7d}")

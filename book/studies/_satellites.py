@@ -1,7 +1,7 @@
 """The set-ups of Tables II and III of Grange et al., for the stored studies and for chapter 4.
 
 A trial of these studies is a batch of a few runs, because a filter steps through five runs in
-hardly more time than through one. What is stored of a run ends in its number within the batch.
+hardly more time than through one. The columns of a run end in its number within the batch.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ EVERY = 5
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Everything that a study of one table reads of its scenario, read when it is made."""
+    """The set-up of one table, read from its scenario when it is made."""
 
     scenario: Scenario
     model: Model
@@ -56,12 +56,12 @@ class Setup:
     made: tuple[str, dict[str, Any]]
 
     def __reduce__(self) -> Any:
-        """How it reaches a worker: made again there, since a model's functions cannot travel."""
+        """A worker makes the set-up again, since a model's functions cannot be pickled."""
         return partial(setup, self.made[0], **self.made[1]), ()
 
     @property
     def changed(self) -> bool:
-        """Whether it is another study than the paper's, as the book reads it."""
+        """Whether the scenario differs from the book's own."""
         return bool(self.scenario.changes)
 
 
@@ -113,12 +113,13 @@ def setup(name: str, **changes: Any) -> Setup:
     )
 
 
-def data(
+def draw_data(
     s: Setup, rng: np.random.Generator, runs: tuple[int, ...], *, noisy: bool = True
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """The truth (T, *runs, d), with process noise or without, and each agent's observations."""
     start = np.broadcast_to(s.start, (*runs, s.start.size))
     truth = simulate(s.model if noisy else s.still, start, s.times, rng=rng)
+    # Sensors of increments see the state at the previous observation too.
     before = np.concatenate([start[None], truth[:-1]])
     seen = [
         q.observe(truth, rng=rng, previous=before if q.uses_previous else None)
@@ -127,7 +128,7 @@ def data(
     return truth, seen
 
 
-def published(
+def paper_filter(
     s: Setup, *, pca: bool, noise_factor: float = 1.0, **changes: Any
 ) -> EnsembleFilter:
     """Algorithm 1 of the paper, in principal components (Algorithm 2) or without.
@@ -136,7 +137,7 @@ def published(
     """
     options = s.pca if pca else {}
     if noise_factor == 0:
-        rule: Any = partial(noise_free, **options)
+        rule: Any = partial(noise_free_update, **options)
     elif pca:
         rule = partial(principal_components, noise_factor=noise_factor, **options)
     else:
@@ -146,11 +147,11 @@ def published(
             if full
             else partial(transport_map_update, noise_factor=noise_factor)
         )
-    return _filter(s, rule, partial(mean_pull, **(s.pull | changes)))
+    return _make_filter(s, rule, partial(mean_pull, **(s.pull | changes)))
 
 
 @update
-def noise_free(
+def noise_free_update(
     ensemble: np.ndarray,
     predicted: np.ndarray,
     observed: np.ndarray,
@@ -160,11 +161,12 @@ def noise_free(
     n_state: int | None = None,
     n_observed: int | None = None,
 ) -> np.ndarray:
-    """The update of Algorithm 2 with predictions that carry no noise: a mistake, to be shown.
+    """The update of Algorithm 2 with predictions without noise, a mistake that is shown.
 
     The members then determine the predictions, and where these are singular a map does not exist;
     a pseudo-inverse gives the gain that is nearest to it.
     """
+    # Members and predictions in their principal components
     d = ensemble.shape[-1]
     m = predicted.shape[-1]
     w = principal_directions(ensemble, n_state or d)
@@ -173,14 +175,17 @@ def noise_free(
     h = predicted @ v
     dx = x - x.mean(axis=-2, keepdims=True)
     dh = h - h.mean(axis=-2, keepdims=True)
-    across = np.swapaxes(dh, -1, -2)
-    gain = np.linalg.pinv(across @ dh, hermitian=True, rtol=1e-12) @ (across @ dx)
+    transposed = np.swapaxes(dh, -1, -2)
+    # K = (dHᵀdH)⁺ dHᵀdX, without any noise covariance
+    gain = np.linalg.pinv(transposed @ dh, hermitian=True, rtol=1e-12) @ (
+        transposed @ dx
+    )
     step = (observed[..., None, :] @ v - h) @ gain
     return np.asarray(ensemble + step @ np.swapaxes(w, -1, -2))
 
 
-def repaired(s: Setup, kind: str) -> EnsembleFilter:
-    """One of the filters of the section "Better": what the update knows, how agents agree."""
+def better_filter(s: Setup, kind: str) -> EnsembleFilter:
+    """Return a filter of the section "Better", by its update and its fusion rule."""
     fuse = partial(
         intersect_ensembles, rule="trace", scale=np.sqrt(np.diag(s.prior[1]))
     )
@@ -199,10 +204,10 @@ def repaired(s: Setup, kind: str) -> EnsembleFilter:
         "known_fused": (enkf, fuse),
         "known_best": (enkf, partial(intersect_ensembles, rule="min_determinant")),
     }[kind]
-    return _filter(s, rule, agreement)
+    return _make_filter(s, rule, agreement)
 
 
-def _filter(s: Setup, rule: Any, agreement: Any) -> EnsembleFilter:
+def _make_filter(s: Setup, rule: Any, agreement: Any) -> EnsembleFilter:
     return EnsembleFilter(
         s.model,
         s.sensors,
@@ -215,7 +220,7 @@ def _filter(s: Setup, rule: Any, agreement: Any) -> EnsembleFilter:
     )
 
 
-def run(
+def run_filter(
     s: Setup,
     f: EnsembleFilter,
     seed: np.random.SeedSequence,
@@ -228,88 +233,90 @@ def run(
     return f.run(begin, s.times, seen, truth=truth, scores=scores)
 
 
-def short(value: Any) -> float:
-    """Six digits: what is stored of a mean over runs, so that files stay small."""
+def round_six(value: Any) -> float:
+    """Round a mean over runs to six digits, so that files stay small."""
     return float(f"{float(value):.6g}")
 
 
-def scored(
+def score_runs(
     s: Setup, name: str, result: Any, *, each_agent: bool = True
 ) -> dict[str, float]:
-    """What is stored of each run: settled error (of each agent), NEES/d, distance of the means."""
+    """Return each run's settled error (of each agent), NEES/d, and distance of the means."""
+    # Means over the settled times
     late = result.isel(time=s.settled)
     error = late["total_squared_error"].mean("time").values
-    gap = late["mean"] - late["mean"].mean("agent")
-    apart = (gap**2).sum("component").mean(("time", "agent")).values
+    # Squared distance of the agents' means from their common mean
+    deviations = late["mean"] - late["mean"].mean("agent")
+    distances = (deviations**2).sum("component").mean(("time", "agent")).values
     nees = (
         late["nees"].mean(("time", "agent")).values / s.model.dim
         if "nees" in late
         else None
     )
-    out: dict[str, float] = {}
+    columns: dict[str, float] = {}
     for r in range(error.shape[0]):
         if each_agent:
-            out |= {
+            columns |= {
                 f"{name}_mse_{a}_{r}": float(error[r, k]) for k, a in enumerate(s.names)
             }
-            out[f"{name}_apart_{r}"] = float(apart[r])
+            columns[f"{name}_apart_{r}"] = float(distances[r])
         else:
-            out[f"{name}_mse_{r}"] = float(error[r].mean())
+            columns[f"{name}_mse_{r}"] = float(error[r].mean())
         if nees is not None:
-            out[f"{name}_nees_{r}"] = float(nees[r])
-    return out
+            columns[f"{name}_nees_{r}"] = float(nees[r])
+    return columns
 
 
 def score_columns(
     s: Setup, name: str, batch: int, *, each_agent: bool = True
 ) -> list[str]:
-    """The names of what `scored` gives with NEES."""
-    out = []
+    """Return the names of the columns of `score_runs` with NEES."""
+    columns = []
     for r in range(batch):
         if each_agent:
-            out += [f"{name}_mse_{a}_{r}" for a in s.names] + [f"{name}_apart_{r}"]
+            columns += [f"{name}_mse_{a}_{r}" for a in s.names] + [f"{name}_apart_{r}"]
         else:
-            out += [f"{name}_mse_{r}"]
-        out += [f"{name}_nees_{r}"]
-    return out
+            columns += [f"{name}_mse_{r}"]
+        columns += [f"{name}_nees_{r}"]
+    return columns
 
 
-def over_time(name: str, error: np.ndarray, nees: np.ndarray) -> dict[str, float]:
-    """Means over the runs (T, R, ...) of a batch, of error and NEES/d, at every fifth step."""
-    out = {}
+def time_series(name: str, error: np.ndarray, nees: np.ndarray) -> dict[str, float]:
+    """Return means over the runs (T, R, ...) of a batch, of error and NEES/d, every fifth step."""
+    columns = {}
     for k in range(EVERY - 1, error.shape[0], EVERY):
-        out[f"{name}_e{k:03d}"] = short(error[k].mean())
-        out[f"{name}_n{k:03d}"] = short(nees[k].mean())
-    return out
+        columns[f"{name}_e{k:03d}"] = round_six(error[k].mean())
+        columns[f"{name}_n{k:03d}"] = round_six(nees[k].mean())
+    return columns
 
 
-def instants(s: Setup) -> range:
-    """The steps at which `over_time` stores."""
+def stored_steps(s: Setup) -> range:
+    """Return the steps at which `time_series` stores."""
     return range(EVERY - 1, s.times.size, EVERY)
 
 
 def time_columns(s: Setup, name: str) -> list[str]:
-    """The names of what `over_time` gives."""
-    return [f"{name}_{what}{k:03d}" for k in instants(s) for what in "en"]
+    """Return the names of the columns of `time_series`."""
+    return [f"{name}_{what}{k:03d}" for k in stored_steps(s) for what in "en"]
 
 
-def of_every_step(s: Setup, name: str, result: Any) -> dict[str, float]:
+def step_series(s: Setup, name: str, result: Any) -> dict[str, float]:
     """Mean over a batch's runs of every agent's squared error, at all steps."""
     error = result["total_squared_error"].mean("run").values
     return {
-        f"{name}_{a}_t{k:03d}": short(error[k, i])
+        f"{name}_{a}_t{k:03d}": round_six(error[k, i])
         for k in range(error.shape[0])
         for i, a in enumerate(s.names)
     }
 
 
 def step_columns(s: Setup, name: str) -> list[str]:
-    """The names of what `of_every_step` gives."""
+    """Return the names of the columns of `step_series`."""
     return [f"{name}_{a}_t{k:03d}" for k in range(s.times.size) for a in s.names]
 
 
-class Kept:
-    """What a study stored, or what a changed scenario gives now, run by run and over time."""
+class StudyNumbers:
+    """A study's stored numbers, or those of a changed scenario, by run and over time."""
 
     def __init__(self, columns: Any, batch: int) -> None:
         self.columns = columns
@@ -322,8 +329,8 @@ class Kept:
 
     def each(self, name: str) -> np.ndarray:
         """One number a run, in the order of the runs, (runs,)."""
-        found = [self.columns[f"{name}_{r}"] for r in range(self.batch)]
-        return np.stack(found, axis=1).ravel()
+        batches = [self.columns[f"{name}_{r}"] for r in range(self.batch)]
+        return np.stack(batches, axis=1).ravel()
 
     def agents(self, name: str, agents: Any) -> np.ndarray:
         """One number an agent and run, (agents, runs)."""
@@ -335,7 +342,7 @@ class Kept:
 
 
 class _Repeats(dict[str, Any]):
-    """What runs again now; a worker that is sent this module gets none of it."""
+    """Studies that run again now; a worker that is sent this module gets none of them."""
 
     def __reduce__(self) -> Any:
         return _Repeats, ()
@@ -345,7 +352,7 @@ _REPEATS = _Repeats()
 
 
 def repeat(*scripts: ModuleType) -> None:
-    """Run first batches again on all cores, or parts of them; `kept` waits for its own."""
+    """Start first batches again on all cores, or parts; `load_numbers` waits for its own."""
     from loky import ProcessPoolExecutor, cpu_count
 
     # A worker whose memory has grown is replaced, at no cost; the warning is not for a reader.
@@ -355,46 +362,46 @@ def repeat(*scripts: ModuleType) -> None:
     pool = ProcessPoolExecutor(cpu_count())
     for script in scripts:
         if not script.SETUP.changed:
-            _REPEATS[script.NAME] = pool.submit(_again, script.NAME)
+            _REPEATS[script.NAME] = pool.submit(_compare_first_batch, script.NAME)
 
 
-def _again(name: str) -> str:
-    """Compare a study's first batch with what is stored; what is wrong, or nothing.
+def _compare_first_batch(name: str) -> str:
+    """Compare a study's first batch with the stored one; return an error message or ''.
 
     Where a script has a `part`, which gives some of a trial's numbers, those are compared.
     """
     script = studies.script(name)
-    found = studies.stored(script.PAPER, script.NAME)
+    study = studies.stored(script.PAPER, script.NAME)
     if hasattr(script, "part"):
-        now = script.part(found.seed(0))
-        wrong = [
+        values = script.part(study.seed(0))
+        different = [
             c
-            for c, value in now.items()
-            if not np.isclose(value, found.columns[c][0], script.rtol, 0)
+            for c, value in values.items()
+            if not np.isclose(value, study.columns[c][0], script.rtol, 0)
         ]
         return (
-            f"{name}: another run does not give what is stored: {wrong}"
-            if wrong
+            f"{name}: another run does not give the stored values: {different}"
+            if different
             else ""
         )
     names = ("rtol", "ill_conditioned")
     options = {k: getattr(script, k) for k in names if hasattr(script, k)}
     try:
-        studies.check(found, script.trial, indices=[0], **options)
+        studies.check(study, script.trial, indices=[0], **options)
     except AssertionError as error:
         return str(error)
     return ""
 
 
-def kept(script: ModuleType) -> Kept:
-    """A study's stored numbers, after its first batch, where `repeat` began it, was found equal.
+def load_numbers(script: ModuleType) -> StudyNumbers:
+    """Return a study's stored numbers, after its first batch, if started, was found equal.
 
-    Of a scenario that a reader has changed nothing is stored: two trials of it run now.
+    Nothing is stored of a scenario that a reader has changed: two trials of it run now.
     """
     if script.SETUP.changed:
-        few = studies.run(script.trial, script.seeds[:2], workers=2)
-        return Kept(few.metrics(script.columns), script.BATCH)
-    found = studies.stored(script.PAPER, script.NAME)
-    wrong = _REPEATS[script.NAME].result() if script.NAME in _REPEATS else ""
-    assert not wrong, wrong
-    return Kept({c: found.metric(c) for c in script.columns}, script.BATCH)
+        trials = studies.run(script.trial, script.seeds[:2], workers=2)
+        return StudyNumbers(trials.metrics(script.columns), script.BATCH)
+    study = studies.stored(script.PAPER, script.NAME)
+    message = _REPEATS[script.NAME].result() if script.NAME in _REPEATS else ""
+    assert not message, message
+    return StudyNumbers({c: study.metric(c) for c in script.columns}, script.BATCH)

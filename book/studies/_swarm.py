@@ -37,7 +37,10 @@ PRINTED = {"noise": "observed", "mass_std": SHARING["mass_std"]}
 HALF = Faults(loss=0.5, seed=3)
 SCHEMES: dict[str, tuple[Any, dict[str, Any]]] = {
     "central": (density.Centralised(), {"initial_density": "observed"}),
-    "central_printed": (density.Centralised(), {"initial_density": "observed", **PRINTED}),
+    "central_printed": (
+        density.Centralised(),
+        {"initial_density": "observed", **PRINTED},
+    ),
     "paper": (density.PIConsensus(modes=MODES, **PAPERS), {}),
     "paper_printed": (density.PIConsensus(modes=MODES, **PAPERS), PRINTED),
     "paper_flat": (density.PIConsensus(modes=MODES, initial_std=FLAT, **PAPERS), {}),
@@ -57,12 +60,12 @@ SCHEMES: dict[str, tuple[Any, dict[str, Any]]] = {
     "paper_half": (density.PIConsensus(modes=MODES, **PAPERS), {"faults": HALF}),
     "neighbours": (density.Neighbours(), {}),
 }
-"""By name: how agents share, and what else of the filter is not the scenario's."""
+"""By name: the consensus protocol, and the filter's options that differ from the scenario's."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A swarm to be filtered: a reading of (23), a first density, and what goes wrong.
+    """A swarm to be filtered: an interpretation of (23), an initial density, and faults.
 
     `phase` turns the filters' f against the swarm's; of all agents the share `gone` drops out at
     `gone_at`; `agents` and `cells` scale the study, with as many neighbours for each agent.
@@ -91,85 +94,90 @@ class Case:
         return float(SWARM["radio_range"] * np.sqrt(SWARM["agents"] / self.agents))
 
 
-def network(
+def make_filter(
     scheme: str, case: Case, local: int | Sequence[int] = LOCAL, **options: Any
 ) -> DensityFilter:
-    """A scheme's filter with the scenario's choices."""
-    sharing, own = SCHEMES[scheme]
+    """Return a scheme's filter with the scenario's choices."""
+    protocol, scheme_options = SCHEMES[scheme]
     model = density.FokkerPlanck(densities.swarm(case.reading, case.phase), case.grid)
-    who = tuple(range(local)) if isinstance(local, int) else tuple(local)
+    agents = tuple(range(local)) if isinstance(local, int) else tuple(local)
     return DensityFilter(
         model,
         case.agents,
         case.radio_range,
-        fusion=sharing,
+        fusion=protocol,
         bandwidth=case.bandwidth,
-        local=who[:1] if scheme.startswith("central") else who,
+        local=agents[:1] if scheme.startswith("central") else agents,
         prior_length=CHOICES["prior_length"],
         prior_std=CHOICES["prior_std"],
         initial_std=FLAT,
         floor=CHOICES["floor"],
-        **{"rank": CHOICES["rank"], **own, **options},
+        **{"rank": CHOICES["rank"], **scheme_options, **options},
     )
 
 
-def drawn(case: Case, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Agents (N, 2) and the density that they are drawn from, on the case's grid."""
+def draw_swarm(case: Case, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Draw agents (N, 2); return them and their density on the case's grid."""
     x = densities.first_agents(case.start, case.agents, rng)
     first = densities.first_density(case.start)
     return x, case.grid.normalize(first[densities.grid().cell_index(case.grid.centres)])
 
 
-def compared(
+def compare_filters(
     case: Case,
     rng: np.random.Generator,
     filters: dict[str, DensityFilter],
-    watch: Callable[..., None] | None = None,
+    callback: Callable[..., None] | None = None,
     every: int = 1,
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Errors over time, (T, filters) or (T,), and the last states, by scheme.
+    """Run filters on one swarm; return errors over time, (T, filters) or (T,), and last states.
 
-    The errors are noted every so many steps.
+    Errors are computed at every `every`-th step; `callback` is called at each step.
     """
     cells = case.grid
     dt = SWARM["dt"]
     swarm = densities.swarm(case.reading)
-    x, p = drawn(case, rng)
+    x, p = draw_swarm(case, rng)
     states = {s: f.start(x) for s, f in filters.items()}
     model = density.FokkerPlanck(swarm, cells)
-    believed = density.FokkerPlanck(densities.swarm(case.reading, case.phase), cells)
-    opened = np.stack(
+    wrong_model = density.FokkerPlanck(densities.swarm(case.reading, case.phase), cells)
+    # Two open loops without observations: from the kernel estimate, and from a flat Gaussian
+    unobserved = np.stack(
         [
             density.kernel_density(x, cells, bandwidth=case.bandwidth),
             density.kernels(x[:1], cells, bandwidth=FLAT)[0],
         ]
     )
-    out: dict[str, list[Any]] = {}
-    gone = np.arange(case.agents) >= round((1 - case.gone) * case.agents)
+    columns: dict[str, list[Any]] = {}
+    leaving = np.arange(case.agents) >= round((1 - case.gone) * case.agents)
     for j in range(round(case.end / dt)):
+        # The agents, the true density and the open loops move.
         x = swarm.step(x, j * dt, dt, rng=rng, substeps=CHOICES["substeps"])
         p = model.step(p, j * dt, dt)
-        opened = believed.step(opened, j * dt, dt)
-        late = (j + 1) * dt > case.gone_at
-        seen = np.where((gone & late)[:, None], np.nan, x)
+        unobserved = wrong_model.step(unobserved, j * dt, dt)
+        after = (j + 1) * dt > case.gone_at
+        # Agents that have dropped out report no position.
+        reported = np.where((leaving & after)[:, None], np.nan, x)
         for s, f in filters.items():
-            states[s] = f.step(states[s], (j + 1) * dt, seen)
-        if watch is not None:
-            watch((j + 1) * dt, x, p, states)
+            states[s] = f.step(states[s], (j + 1) * dt, reported)
+        if callback is not None:
+            callback((j + 1) * dt, x, p, states)
         if (j + 1) % every:
             continue
-        y = density.kernel_density(x[~(gone & late)], cells, bandwidth=case.bandwidth)
+        y = density.kernel_density(
+            x[~(leaving & after)], cells, bandwidth=case.bandwidth
+        )
         noted = {
             "kde": cells.norm(y - p),
-            "open": cells.norm(opened[0] - p),
-            "open_flat": cells.norm(opened[1] - p),
+            "open": cells.norm(unobserved[0] - p),
+            "open_flat": cells.norm(unobserved[1] - p),
         }
         for s, state in states.items():
             noted[f"{s}_error"] = cells.norm(state.estimates - p)
             noted[f"{s}_consensus"] = cells.norm(state.observed - y)
         for name, value in noted.items():
-            out.setdefault(name, []).append(value)
-    return {name: np.array(values) for name, values in out.items()}, states
+            columns.setdefault(name, []).append(value)
+    return {name: np.array(values) for name, values in columns.items()}, states
 
 
 def average(
@@ -182,5 +190,5 @@ def average(
     )
 
 
-code = (compared, network, drawn, average)
+code = (compare_filters, make_filter, draw_swarm, average)
 scenarios = (SWARM, CHOICES, SHARING)

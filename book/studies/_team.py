@@ -1,7 +1,7 @@
-"""Agents with doubtful places track a target: linear, many runs at once, three ways to cooperate.
+"""Agents uncertain of their positions track a target: linear, many runs, three ways to cooperate.
 
-A reading is the target's position as seen from the agent's own, [I 0] t - e plus noise. Each agent
-keeps [target; ego], except in joint bookkeeping, where it keeps [target; all egos].
+An observation is the target's position relative to the agent's, [I 0] t - e plus noise. Each agent
+filters [target; ego], or in the joint filter [target; all egos].
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Belief = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Team:
-    """What moves, what is doubtful at first, who hears whom; noise is the target's alone."""
+    """Model, prior and communication graph of a team; only the target has process noise."""
 
     graph: Any
     move: np.ndarray
@@ -39,23 +39,25 @@ class Team:
         return len(self.target_cov), len(self.ego_cov)
 
     def state(self, egos: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Transition, noise and first covariance of [target; egos]."""
+        """Return transition, noise and prior covariance of [target; egos]."""
         (n, e) = self.dims
-        own = np.eye(egos)
+        identity = np.eye(egos)
         blocks = (
-            (self.move, np.kron(own, np.eye(e))),
-            (self.noise, np.kron(own, np.zeros((e, e)))),
+            (self.move, np.kron(identity, np.eye(e))),
+            (self.noise, np.kron(identity, np.zeros((e, e)))),
         )
         full = [np.zeros((n + egos * e, n + egos * e)) for _ in range(3)]
-        for out, (a, b) in zip(
-            full, (*blocks, (self.target_cov, np.kron(own, self.ego_cov))), strict=True
+        for matrix, (a, b) in zip(
+            full,
+            (*blocks, (self.target_cov, np.kron(identity, self.ego_cov))),
+            strict=True,
         ):
-            out[:n, :n] = a
-            out[n:, n:] = b
+            matrix[:n, :n] = a
+            matrix[n:, n:] = b
         return full[0], full[1], full[2]
 
     def sees(self, agent: int, egos: int) -> np.ndarray:
-        """The matrix H of an agent's reading of [target; egos]."""
+        """Return the matrix H of an agent's observation of [target; egos]."""
         n, e = self.dims
         h = np.zeros((e, n + egos * e))
         h[:, :e] = np.eye(e)
@@ -64,11 +66,11 @@ class Team:
 
     @property
     def size(self) -> int:
-        """How many agents."""
+        """Number of agents."""
         return int(self.graph.n_agents)
 
     def data(self, steps: int, runs: int, rng: np.random.Generator) -> tuple:
-        """Targets (steps, runs, n) and readings (steps, runs, A, e)."""
+        """Draw targets (steps, runs, n) and observations (steps, runs, A, e)."""
         (n, e) = self.dims
         (move, noise, first) = self.state(self.size)
         x = rng.multivariate_normal(np.zeros(len(first)), first, size=runs)
@@ -87,14 +89,18 @@ class Team:
         return np.array(truth), np.array(seen)
 
     def arrived(self, k: int, runs: int) -> np.ndarray:
-        """Whether a message of step k from j reaches i, (runs, i, j)."""
-        out = np.zeros((runs, self.size, self.size), dtype=bool)
-        lost = False if self.faults is None else self.faults.lost(self.graph, k, runs)
-        out[:, self.graph.receivers, self.graph.senders] = ~np.asarray(lost)
-        return out
+        """Return whether a message of step k from j reaches i, (runs, i, j)."""
+        received = np.zeros((runs, self.size, self.size), dtype=bool)
+        lost = (
+            False
+            if self.faults is None
+            else self.faults.lost_messages(self.graph, k, runs)
+        )
+        received[:, self.graph.receivers, self.graph.senders] = ~np.asarray(lost)
+        return received
 
     def filtered(self, way: str, seen: np.ndarray) -> Belief:
-        """Beliefs about the target after each step, (steps, runs, A, n) and (steps, ..., n, n)."""
+        """Return beliefs about the target after each step, (steps, runs, A, n) and covariances."""
         if way == "joint":
             return self._joint(seen)
         (n, _) = self.dims
@@ -102,21 +108,24 @@ class Team:
         steps, runs = seen.shape[:2]
         mean = np.zeros((runs, self.size, len(first)))
         cov = np.broadcast_to(first, (runs, self.size, *first.shape))
-        out = []
+        beliefs = []
         for k in range(steps):
             before = mean @ move.T, move @ cov @ move.T + noise
-            after = known(
+            after = condition(
                 *before, self.sees(0, 1), self.reading_cov, seen[k], self.gate
             )
             mean, cov = after
             if way != "alone":
-                exchange = {"news": _news, "intersection": _intersected}[way]
+                exchange = {
+                    "news": exchange_increments,
+                    "intersection": intersect_beliefs,
+                }[way]
                 mean, cov = exchange(before, after, self.arrived(k, runs), n)
-            out.append((mean[..., :n], cov[..., :n, :n]))
-        return np.array([m for m, _ in out]), np.array([p for _, p in out])
+            beliefs.append((mean[..., :n], cov[..., :n, :n]))
+        return np.array([m for m, _ in beliefs]), np.array([p for _, p in beliefs])
 
     def joint(self) -> GaussianFilter:
-        """The filter of [target; all egos] that every agent runs, readings being told."""
+        """Return the filter of [target; all egos] that every agent runs on shared observations."""
         move, noise, _ = self.state(self.size)
         model = LinearModel.from_transition(
             len(move), lambda dt: move, lambda t, dt: noise
@@ -141,14 +150,14 @@ class Team:
         (n, _) = self.dims
         first = self.state(self.size)[2]
         state = f.start((np.zeros(len(first)), first), runs=seen.shape[1:2])
-        out = []
+        beliefs = []
         for k, y in enumerate(seen):
             state = f.step(state, k + 1.0, list(np.moveaxis(y, 1, 0)))
-            out.append((state.means[..., :n], state.covariances[..., :n, :n]))
-        return np.array([m for m, _ in out]), np.array([p for _, p in out])
+            beliefs.append((state.means[..., :n], state.covariances[..., :n, :n]))
+        return np.array([m for m, _ in beliefs]), np.array([p for _, p in beliefs])
 
 
-def known(
+def condition(
     mean: np.ndarray,
     cov: np.ndarray,
     h: np.ndarray,
@@ -156,7 +165,7 @@ def known(
     y: np.ndarray,
     gate: float | None = None,
 ) -> Belief:
-    """Gaussians after readings y of h; one that fails the gate changes nothing."""
+    """Return Gaussians after observations y of h; one outside the gate is ignored."""
     gap = (y - mean @ h.T)[..., None]
     spread = h @ cov @ h.T + r
     gain = np.linalg.solve(spread, h @ cov).mT
@@ -167,34 +176,41 @@ def known(
 
 
 def information(mean: np.ndarray, cov: np.ndarray, n: int) -> Belief:
-    """Information vector and matrix of the first n components."""
+    """Return information vector and matrix of the first n components."""
     matrix = np.linalg.inv(cov[..., :n, :n])
     return (matrix @ mean[..., :n, None])[..., 0], matrix
 
 
-def added(belief: Belief, vector: np.ndarray, matrix: np.ndarray, n: int) -> Belief:
-    """Gaussians after information about the first n components."""
+def add_information(
+    belief: Belief, vector: np.ndarray, matrix: np.ndarray, n: int
+) -> Belief:
+    """Return Gaussians after information about the first n components."""
     mean, cov = belief
+    # G = P[:, :n] (I + J P_nn)⁻¹
     gain = cov[..., :n] @ np.linalg.inv(np.eye(n) + matrix @ cov[..., :n, :n])
     gap = vector - (matrix @ mean[..., :n, None])[..., 0]
     return mean + (gain @ gap[..., None])[..., 0], cov - gain @ matrix @ cov[..., :n, :]
 
 
-def _news(before: Belief, after: Belief, arrived: np.ndarray, n: int) -> Belief:
-    """Everybody's gain in information is added by who hears it."""
+def exchange_increments(
+    before: Belief, after: Belief, arrived: np.ndarray, n: int
+) -> Belief:
+    """Add the information increments of the agents whose messages arrive."""
     (v0, j0), (v1, j1) = (information(*belief, n) for belief in (before, after))
     w = arrived.astype(np.float64)
     vector = np.einsum("rij,rjn->rin", w, v1 - v0)
-    return added(after, vector, np.einsum("rij,rjmn->rimn", w, j1 - j0), n)
+    return add_information(after, vector, np.einsum("rij,rjmn->rimn", w, j1 - j0), n)
 
 
-def _intersected(before: Belief, after: Belief, arrived: np.ndarray, n: int) -> Belief:
-    """Covariance intersection of targets with equal exponents."""
+def intersect_beliefs(
+    before: Belief, after: Belief, arrived: np.ndarray, n: int
+) -> Belief:
+    """Intersect the targets' covariances, with equal weights of the beliefs that arrive."""
     vector, matrix = information(*after, n)
     w = arrived + np.eye(arrived.shape[-1])
     w = w / w.sum(axis=-1, keepdims=True)
     fused = np.einsum("rij,rjn->rin", w, vector), np.einsum("rij,rjmn->rimn", w, matrix)
-    return added(after, fused[0] - vector, fused[1] - matrix, n)
+    return add_information(after, fused[0] - vector, fused[1] - matrix, n)
 
 
 def nees(truth: np.ndarray, belief: Belief) -> np.ndarray:
@@ -203,6 +219,6 @@ def nees(truth: np.ndarray, belief: Belief) -> np.ndarray:
     return (gap.mT @ np.linalg.solve(belief[1], gap))[..., 0, 0] / gap.shape[-2]
 
 
-def rare(share: float, n: int) -> float:
-    """The NEES per component that a right claim about n components exceeds so seldom."""
+def nees_quantile(share: float, n: int) -> float:
+    """Return the NEES per component that a consistent filter exceeds with this probability."""
     return float(chi2.isf(share, n)) / n

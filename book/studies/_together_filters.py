@@ -277,7 +277,7 @@ def unpack_information(
 class SharedPlanFilter(filters.TransportFilter):
     """A transport filter that solves one plan where all agents have the same members and weights."""
 
-    def _transported(self, stack: Any, logs: Array, rng: Any) -> Any:
+    def _transport(self, stack: Any, logs: Array, step: Any) -> Any:
         """Return the coupling of the first agent, for all."""
         first = [x[..., :1, :, :] for x in stack]
         same = all(
@@ -285,7 +285,7 @@ class SharedPlanFilter(filters.TransportFilter):
             for x, y in zip(stack, first, strict=True)
         )
         if not same or not np.allclose(logs, logs[..., :1, :], rtol=1e-9, atol=1e-9):
-            return super()._transported(stack, logs, rng)
+            return super()._transport(stack, logs, step)
         one_agent = filters.TransportFilter(
             self.model,
             self.sensors[:1],
@@ -293,8 +293,8 @@ class SharedPlanFilter(filters.TransportFilter):
             correct=self.correct,
             rejuvenation=self.rejuvenation,
         )
-        members, errors = one_agent._transported(first, logs[..., :1, :], rng)
-        return [np.repeat(x, self.n_agents, axis=-3) for x in members], errors
+        members = one_agent._transport(first, logs[..., :1, :], step)
+        return [np.repeat(x, self.n_agents, axis=-3) for x in members]
 
 
 @dataclass(frozen=True, eq=False)
@@ -376,7 +376,13 @@ class GridState(filters.SensorState):
 
 
 @dataclass(frozen=True, eq=False)
-class GridFilter(filters.Filter):
+class GridFilter(
+    filters.SensorFilter[Any],
+    filters.FusesBeliefs[Any],
+    filters.SharesObservations[Any],
+    filters.ExchangesAtIntervals[Any],
+    filters.IsolatesRuns[Any],
+):
     """Beliefs on the cells of a square, exact but for the cells' size; for models in the plane.
 
     Errors of observations are independent of each other. A fusion rule takes vectors: the agents'
@@ -391,7 +397,6 @@ class GridFilter(filters.Filter):
 
     state_class = GridState
     belief_kind = "vectors"
-    unsupported = {"lag": "a grid keeps no past"}
 
     @property
     def centres(self) -> Array:

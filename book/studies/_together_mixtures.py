@@ -39,7 +39,13 @@ class BatchedMixturesState(filters.SensorState):
 
 
 @dataclass(frozen=True, eq=False)
-class BatchedMixtures(filters.Filter):
+class BatchedMixtures(
+    filters.SensorFilter[Any],
+    filters.FusesBeliefs[Any],
+    filters.SharesObservations[Any],
+    filters.ExchangesAtIntervals[Any],
+    filters.IsolatesRuns[Any],
+):
     """Agents hold mixtures over [target; own position] and send the target's marginal.
 
     There are at most `n_components`, no fewer than three. A single component is split in three
@@ -56,7 +62,6 @@ class BatchedMixtures(filters.Filter):
     share_observations: bool = False
 
     state_class = BatchedMixturesState
-    unsupported = {"lag": "a mixture filter keeps no past"}
 
     def initial_state(
         self, prior: Any, runs: tuple[int, ...], rng: Any

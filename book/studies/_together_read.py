@@ -1,4 +1,4 @@
-"""What chapter 11 makes of its stored studies: ratios, fronts, Holm's test and a decision tree."""
+"""Results of chapter 11's stored studies: ratios, fronts, Holm's test and a decision tree."""
 
 from __future__ import annotations
 
@@ -15,10 +15,12 @@ from distfilt.metrics import Interval, mean_interval
 
 FOUR = together.FOUR
 THREE = together.THREE
-HONEST = (0.8, 1.25)
-"""NEES per component of a filter that is called honest; 0.95 to 1.05 is asked for where said."""
+CONSISTENT = (0.8, 1.25)
+"""NEES per component of a filter that is called consistent; the text says where 0.95 to 1.05."""
 BUDGETS = (3, 12, 32, 64, 400)
 """Numbers that an agent may send in a step."""
+Row = tuple[str, float]
+"""A problem's name and a budget."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,87 +34,84 @@ class Result:
 
     @property
     def failed(self) -> int:
-        """How many runs have no number."""
+        """Number of runs without a result."""
         return int((~np.isfinite(self.error)).sum())
 
     @property
-    def claim(self) -> float:
+    def mean_nees(self) -> float:
         """The mean NEES per component."""
         return float(self.nees.mean())
 
     @property
-    def honest(self) -> bool:
-        """Whether it claims about what it knows, and always ends."""
-        return not self.failed and HONEST[0] <= self.claim <= HONEST[1]
+    def consistent(self) -> bool:
+        """Whether the reported covariances fit the errors, and no run failed."""
+        return not self.failed and CONSISTENT[0] <= self.mean_nees <= CONSISTENT[1]
 
 
-def columns(stored: Any, name: str, what: str) -> np.ndarray:
-    """All runs of a cell, trial after trial."""
-    each = [stored.metric(f"{name}_{what}_{r}") for r in range(together.BATCH)]
-    return np.stack(each, axis=-1).ravel()
+def stack_runs(stored: Any, name: str, score: str) -> np.ndarray:
+    """Return a score of all runs of a cell, trial after trial."""
+    runs = [stored.metric(f"{name}_{score}_{r}") for r in range(together.BATCH)]
+    return np.stack(runs, axis=-1).ravel()
 
 
 def result(stored: Any, name: str, cell: str = "") -> Result:
-    """A cell's result; `name` is its column's."""
+    """Return a cell's result; `name` begins its columns."""
     floats = float(stored.metric(f"{name}_floats").mean())
-    return Result(
-        cell or name,
-        columns(stored, name, "error"),
-        columns(stored, name, "nees"),
-        floats,
-    )
+    error = stack_runs(stored, name, "error")
+    nees = stack_runs(stored, name, "nees")
+    return Result(cell or name, error, nees, floats)
 
 
 @cache
 def results(name: str) -> dict[str, Result]:
-    """All cells of a problem, the reference first."""
+    """Return all cells of a problem, the reference first."""
     stored = studies.stored("together", "held" if name in THREE else "every")
-    return {c: result(stored, f"{name}_{c}", c) for c in cells_in(stored, f"{name}_")}
+    prefix = f"{name}_"
+    cells = stored_cells(stored, prefix)
+    return {cell: result(stored, prefix + cell, cell) for cell in cells}
 
 
-def cells_in(stored: Any, prefix: str) -> list[str]:
-    """The cells that a study has of a problem."""
-    ends = "_floats"
-    found = [c for c in stored.columns if c.startswith(prefix) and c.endswith(ends)]
-    return [c.removeprefix(prefix).removesuffix(ends) for c in found]
+def stored_cells(stored: Any, prefix: str) -> list[str]:
+    """Return the cells that a study has of a problem."""
+    suffix = "_floats"
+    columns = [c for c in stored.columns if c.startswith(prefix) and c.endswith(suffix)]
+    return [column.removeprefix(prefix).removesuffix(suffix) for column in columns]
 
 
 def ratio(one: Result, other: Result) -> Interval:
-    """Root-mean-square error over another's on the same runs, with its 95% interval."""
+    """Return the ratio of root-mean-square errors on the same runs, with its 95% interval."""
     if one.failed:
         return Interval(np.inf, np.inf, np.inf, np.inf)
-    middle = float(np.sqrt(one.error.mean() / other.error.mean()))
-    spread = one.error / one.error.mean() - other.error / other.error.mean()
-    error = mean_interval(spread).error / 2
-    return Interval(
-        middle,
-        middle * np.exp(-1.96 * error),
-        middle * np.exp(1.96 * error),
-        middle * error,
-    )
+    estimate = float(np.sqrt(one.error.mean() / other.error.mean()))
+    # The standard error of the logarithm, by the delta method on paired runs
+    influence = one.error / one.error.mean() - other.error / other.error.mean()
+    error = mean_interval(influence).error / 2
+    low = estimate * np.exp(-1.96 * error)
+    high = estimate * np.exp(1.96 * error)
+    return Interval(estimate, low, high, estimate * error)
 
 
 def front(points: Mapping[str, tuple[float, float]]) -> list[str]:
-    """The names of (cost, error) that nothing beats in both, by rising cost."""
-    out: list[str] = []
-    for name in sorted(points, key=lambda k: points[k]):
-        if not out or points[name][1] < points[out[-1]][1]:
-            out.append(name)
-    return out
+    """Return the names of (cost, error) that no other beats in both, by rising cost."""
+    names: list[str] = []
+    for name in sorted(points, key=lambda key: points[key]):
+        if not names or points[name][1] < points[names[-1]][1]:
+            names.append(name)
+    return names
 
 
 def holm(p_values: Mapping[str, float], level: float = 0.05) -> set[str]:
-    """The hypotheses that Holm's step-down procedure rejects, all of them right with 1 - level."""
-    out: set[str] = set()
-    for k, name in enumerate(sorted(p_values, key=lambda n: p_values[n])):
+    """Return the hypotheses that Holm's step-down procedure rejects at a familywise level."""
+    rejected: set[str] = set()
+    for k, name in enumerate(sorted(p_values, key=lambda key: p_values[key])):
         if p_values[name] > level / (len(p_values) - k):
             break
-        out.add(name)
-    return out
+        rejected.add(name)
+    return rejected
 
 
 def worse(best: Result, others: Iterable[Result]) -> set[str]:
-    """The cells whose error differs from the best's on the same runs, by Holm."""
+    """Return the cells whose error differs from the best's on the same runs, by Holm."""
     from scipy.stats import ttest_rel
 
     def p_value(other: Result) -> float:
@@ -122,67 +121,86 @@ def worse(best: Result, others: Iterable[Result]) -> set[str]:
             return 1.0
         return float(ttest_rel(other.error, best.error).pvalue)
 
-    return holm({o.cell: p_value(o) for o in others if o.cell != best.cell})
+    return holm({r.cell: p_value(r) for r in others if r.cell != best.cell})
 
 
 # ------------------------------------------------------------------------------------ operations
 
+FUSION_FACTORS = {"ci": 25, "trace": 2, "naive": 2, "info": 8}
+"""Multiples of d³ for the fusion of one neighbour's belief, by rule."""
+SHARING_NEIGHBOURS = ("near", "ci", "trace", "pull")
+"""Rules under which agents use the observations of their neighbours."""
+SIZES = {"pf": "particles", "ot": "transported"}
 
-def operations(p: Any, cell: str, members: int | None = None) -> float:
-    """Leading terms of an agent's floating-point operations in a step."""
+
+def count_operations(p: Any, cell: str, members: int | None = None) -> float:
+    """Return the leading terms of an agent's floating-point operations in a step."""
+    family = cell.split("_")[0]
+    rule = cell.split("_")[-1]
     d = p.model.dim
-    agents = p.agents
-    m = p.sensors[0].dim
     near = float(p.graph.in_degree.mean())
-    talk = cell.split("_")[-1]
-    used = {
-        "near": 1 + near,
-        "ci": 1 + near,
-        "trace": 1 + near,
-        "pull": 1 + near,
-        "flood": agents,
-    }.get(talk, 1)
-    M = used * m
-    flow = 400 if "chaotic" in p.traits else 2 * d * d
-    fusing = (
-        {"ci": 25, "trace": 2, "naive": 2, "info": 8}.get(talk, 0) * (1 + near) * d**3
-    )
-    averaged = {"two": 2, "meas": agents / 2}.get(talk, 0) * near * d * d
-    size = {"pf": "particles", "ot": "transported"}.get(cell.split("_")[0], "members")
-    N = members or together.STUDY[size]
-    kind = cell.split("_")[0]
-    if kind in ("ekf", "ukf"):
-        extra = (2 * d + 1) * (flow + M * d) if kind == "ukf" else 0
-        return 4 * d**3 + 2 * M * d * (d + M) + M**3 + fusing + averaged + extra
-    if kind in ("news", "own"):
+    m = observed_components(p, rule, near)
+    transition = 400 if "chaotic" in p.traits else 2 * d * d
+    fusing = FUSION_FACTORS.get(rule, 0) * (1 + near) * d**3
+    if family in ("ekf", "ukf"):
+        rounds = {"two": 2, "meas": p.n_agents / 2}.get(rule, 0)
+        averaging = rounds * near * d * d
+        points = (2 * d + 1) * (transition + m * d) if family == "ukf" else 0
+        update = 2 * m * d * (d + m) + m**3
+        return 4 * d**3 + update + fusing + averaging + points
+    if family in ("news", "own"):
         return 10 * 6**3 + 4 * near * 4**3
-    if kind == "gm":
+    if family == "gm":
         return near * together.STUDY["mixands"] ** 2 * 10 * d**3
-    if kind == "grid":
-        return 40**2 * (100 + 10 * M)
-    if kind == "ot":
-        return N**3 * np.log2(N)
-    if kind == "pf":
+    if family == "grid":
+        return 40**2 * (100 + 10 * m)
+    n = members or together.STUDY[SIZES.get(family, "members")]
+    if family == "ot":
+        # The network simplex
+        return n**3 * np.log2(n)
+    if family == "pf":
         terms = 15 if "curved" in p.traits else 10
-        agreed = 2 * terms**2 if talk == "agreed" else 0
-        return N * (flow + 2 * d * d + 10 * M + agreed) + fusing
-    gain = N * (flow + 2 * d * d + 2 * M * (d + M)) + M**3 + fusing
-    more = {"exact": 4 * N * (d + M) ** 2, "root": 6 * N * M * min(N, M)}.get(kind, 0)
-    return gain + more + (20 * d * N * (2 * (d + M)) ** 2 if kind == "maps" else 0)
+        consensus = 2 * terms**2 if rule == "agreed" else 0
+        return n * (transition + 2 * d * d + 10 * m + consensus) + fusing
+    return count_ensemble_operations(family, n, d, m, transition) + fusing
 
 
-# ----------------------------------------------------------------------------------------- a tree
+def observed_components(p: Any, rule: str, near: float) -> float:
+    """Return how many observed components an agent uses in a step."""
+    agents = 1.0
+    if rule in SHARING_NEIGHBOURS:
+        agents = 1 + near
+    elif rule == "flood":
+        agents = p.n_agents
+    return agents * p.sensors[0].dim
+
+
+def count_ensemble_operations(
+    family: str, n: int, d: int, m: float, transition: float
+) -> float:
+    """Return the operations of an ensemble's forecast and update."""
+    update = n * (transition + 2 * d * d + 2 * m * (d + m)) + m**3
+    if family == "exact":
+        return update + 4 * n * (d + m) ** 2
+    if family == "root":
+        return update + 6 * n * m * min(n, m)
+    if family == "maps":
+        return update + 20 * d * n * (2 * (d + m)) ** 2
+    return update
+
+
+# --------------------------------------------------------------------------------- decision tree
 
 QUESTIONS = ("plane", "doubted", "chaotic", "several", "curved", *BUDGETS)
-"""What a user knows of a problem, and whether an agent may send more than so much.
+"""What a user knows of a problem, and whether an agent may send more than a number.
 
-Where two questions divide the four problems alike the first stands: what there is room for comes
-before what bends.
+Where two questions divide the four problems alike the first one stands: the dimension comes before
+the curvature.
 """
 
 
-def says(question: Any, name: str, budget: float) -> bool:
-    """The answer for a problem and a budget."""
+def answer(question: Any, name: str, budget: float) -> bool:
+    """Return the answer to a question for a problem and a budget."""
     if question == "plane":
         return bool(together.problem(name).model.dim <= 2)
     if isinstance(question, str):
@@ -192,67 +210,69 @@ def says(question: Any, name: str, budget: float) -> bool:
 
 @cache
 def regret(name: str, budget: float, cell: str) -> float:
-    """Logarithm of a cell's error over the best honest one's that the budget allows."""
-    found = results(name)
-    here = found.get(cell)
-    if here is None or not here.honest or here.floats > budget:
+    """Return the log of a cell's error over the best consistent one's within the budget."""
+    candidate = results(name).get(cell)
+    if candidate is None or not candidate.consistent or candidate.floats > budget:
         return np.inf
-    return float(0.5 * np.log(here.error.mean() / best(name, budget).error.mean()))
+    least = best(name, budget).error.mean()
+    return float(0.5 * np.log(candidate.error.mean() / least))
 
 
-def allowed(name: str, budget: float = np.inf) -> list[Result]:
-    """The honest cells that a budget allows."""
+def admissible(name: str, budget: float = np.inf) -> list[Result]:
+    """Return the consistent cells within a budget."""
     return [
         r
-        for c, r in results(name).items()
-        if c not in ("reference", "half") and r.honest and r.floats <= budget
+        for cell, r in results(name).items()
+        if cell not in ("reference", "half") and r.consistent and r.floats <= budget
     ]
 
 
 @cache
 def best(name: str, budget: float = np.inf) -> Result:
-    """The honest cell of least error that a budget allows; the cheapest of those that are alike."""
-    found = allowed(name, budget)
-    least = min(r.error.mean() for r in found)
-    return min(
-        (r for r in found if r.error.mean() < least * (1 + 1e-4)),
-        key=lambda r: r.floats,
-    )
+    """Return the consistent cell of least error within a budget; of equal ones the cheapest."""
+    candidates = admissible(name, budget)
+    least = min(r.error.mean() for r in candidates)
+    equal = [r for r in candidates if r.error.mean() < least * (1 + 1e-4)]
+    return min(equal, key=lambda r: r.floats)
 
 
-def leaf(rows: Sequence[tuple[str, float]]) -> tuple[float, str]:
-    """The cell of least mean regret on some rows, none above being infinite if possible."""
-    costs = {c: sum(min(regret(*row, c), 10.0) for row in rows) for c in together.CELLS}
-    cell = min(costs, key=lambda c: (costs[c], c))
+def best_leaf(rows: Sequence[Row]) -> tuple[float, str]:
+    """Return the least total regret on some rows, and its cell; infinite regrets count 10."""
+    costs = {}
+    for cell in together.CELLS:
+        costs[cell] = sum(min(regret(*row, cell), 10.0) for row in rows)
+    cell = min(costs, key=lambda name: (costs[name], name))
     return costs[cell], cell
 
 
-def tree(rows: Sequence[tuple[str, float]], depth: int) -> tuple[float, Any]:
-    """The tree of at most so many questions deep that has the least regret on the rows."""
-    found: tuple[float, Any] = leaf(rows)
-    if depth == 0 or found[0] < 1e-9:
-        return found
+def tree(rows: Sequence[Row], depth: int) -> tuple[float, Any]:
+    """Return the tree of limited depth that has the least regret on the rows."""
+    least: tuple[float, Any] = best_leaf(rows)
+    if depth == 0 or least[0] < 1e-9:
+        return least
     for question in QUESTIONS:
-        yes = tuple(row for row in rows if says(question, *row))
-        no = tuple(row for row in rows if not says(question, *row))
-        if yes and no:
-            (a, one) = grown(yes, depth - 1)
-            (b, two) = grown(no, depth - 1)
-            # A question has to be worth a hundredth.
-            if a + b < found[0] - 0.01:
-                found = a + b, (question, one, two)
-    return found
+        yes = tuple(row for row in rows if answer(question, *row))
+        no = tuple(row for row in rows if not answer(question, *row))
+        if not yes or not no:
+            continue
+        cost_yes, tree_yes = cached_tree(yes, depth - 1)
+        cost_no, tree_no = cached_tree(no, depth - 1)
+        cost = cost_yes + cost_no
+        # A question has to be worth a hundredth.
+        if cost < least[0] - 0.01:
+            least = cost, (question, tree_yes, tree_no)
+    return least
 
 
 @cache
-def grown(rows: tuple[tuple[str, float], ...], depth: int) -> tuple[float, Any]:
-    """As `tree`, remembered."""
+def cached_tree(rows: tuple[Row, ...], depth: int) -> tuple[float, Any]:
+    """Return `tree`, computed once."""
     return tree(rows, depth)
 
 
-def picked(node: Any, name: str, budget: float) -> str:
-    """The cell that a tree picks."""
+def pick_cell(node: Any, name: str, budget: float) -> str:
+    """Return the cell that a tree picks."""
     while isinstance(node, tuple):
         question, yes, no = node
-        node = yes if says(question, name, budget) else no
+        node = yes if answer(question, name, budget) else no
     return str(node)

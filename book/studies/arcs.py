@@ -47,7 +47,7 @@ def arc(
     width: float = 0.31,
     span: float = 1.46,
 ) -> GaussianMixture:
-    r"""What knows a distance well and a bearing badly: a belief about [target; ego], bent.
+    r"""Return a bent belief about [target; ego], of a well known range and a poor bearing.
 
     Both are in the plane, four components in all. The agent aims at the origin from a distance R.
     Mixand k lies at the angle :math:`\theta_k=\theta_0+\sigma_\theta s_k` with :math:`s_k` equally
@@ -59,31 +59,34 @@ def arc(
     """
     agent = np.asarray(agent)
     r = float(np.hypot(*agent))
+    # Angles of the components, and their standard deviations along and across the sight
     s = np.linspace(-1, 1, mixands) * span
     theta = np.arctan2(-agent[1], -agent[0]) + angle_std * s
     across = r * width * angle_std * (s[1] - s[0])
     variances = np.array([range_std, across, ego_std, ego_std]) ** 2
     u = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
     v = np.stack([-u[:, 1], u[:, 0]], axis=-1)
+    # Columns of the square root: range, bearing (the ego moves half as far back), ego errors
     slope = np.zeros((mixands, 4, 4))
     slope[:, :2, 0] = u
     slope[:, :2, 1] = v
     slope[:, 2:, 1] = -0.5 * v
     slope[:, 2:, 2] = u
     slope[:, 2:, 3] = v
+    # The target lies at range r; the ego is shifted the other way by half.
     means = np.concatenate([agent + r * u, agent - 0.5 * r * (u + agent / r)], axis=-1)
     w = np.exp(-0.5 * s**2)
     covs = (slope * variances) @ slope.mT
     return GaussianMixture(w / w.sum(), means, 0.5 * (covs + covs.mT))
 
 
-def belief(
+def draw_belief(
     bearing: float,
     rng: np.random.Generator,
     *,
     mixands: tuple[int, int] = BOUNDS["mixands"],
 ) -> GaussianMixture:
-    """One agent's belief, drawn within the bounds; its arc misses the origin a little."""
+    """Draw one agent's belief within the bounds; its arc misses the origin a little."""
     draws = {
         name: rng.uniform(*BOUNDS[name])
         for name in ("distance", "angle_std", "range_std", "ego_std", "width")
@@ -95,8 +98,8 @@ def belief(
     return GaussianMixture(bent.weights, bent.means + shift, bent.covs)
 
 
-def both(a: GaussianMixture, b: GaussianMixture, share: float) -> GaussianMixture:
-    """A proposal that covers both."""
+def mix(a: GaussianMixture, b: GaussianMixture, share: float) -> GaussianMixture:
+    """Return a proposal that covers both mixtures."""
     return GaussianMixture(
         np.concatenate([share * a.weights, (1 - share) * b.weights]),
         np.concatenate([a.means, b.means]),
@@ -105,51 +108,52 @@ def both(a: GaussianMixture, b: GaussianMixture, share: float) -> GaussianMixtur
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
-    """Jeffreys' divergences of both agents and of the targets, for each rule and for CI."""
+    """Return Jeffreys' divergences of both agents and of the targets, for each rule and for CI."""
     for_pair, for_points = (np.random.default_rng(s) for s in seed.spawn(2))
-    one = belief(np.pi, for_pair)
-    two = belief(np.pi + for_pair.uniform(*BOUNDS["turn"]), for_pair)
-    exact = [
-        PartialFusion(one, two.marginal([0, 1])),
-        PartialFusion(two, one.marginal([0, 1])),
+    first_belief = draw_belief(np.pi, for_pair)
+    second_belief = draw_belief(np.pi + for_pair.uniform(*BOUNDS["turn"]), for_pair)
+    fusions = [
+        PartialFusion(first_belief, second_belief.marginal([0, 1])),
+        PartialFusion(second_belief, first_belief.marginal([0, 1])),
     ]
     fused = {
         name: [
-            f.assign_weights(f.component_shapes(terms=terms), rule=rule) for f in exact
+            fusion.assign_weights(fusion.component_shapes(terms=terms), rule=rule)
+            for fusion in fusions
         ]
         for name, (terms, rule) in RULES.items()
     }
-    fused["moments"] = [fuse_moments(f.own, f.received) for f in exact]
-    first = int(for_points.integers(2**31))
-    out = {}
+    fused["moments"] = [fuse_moments(fusion.own, fusion.received) for fusion in fusions]
+    first_seed = int(for_points.integers(2**31))
+    columns = {}
     for name, pair in fused.items():
-        for k, (f, m) in enumerate(zip(exact, pair, strict=True)):
-            found = jeffreys_by_sampling(
-                m.log_density,
-                f.log_value,
-                both(fused["points"][k], f.own, 0.8),
+        for k, (fusion, mixture) in enumerate(zip(fusions, pair, strict=True)):
+            divergence = jeffreys_by_sampling(
+                mixture.log_density,
+                fusion.log_value,
+                mix(fused["points"][k], fusion.own, 0.8),
                 members=MEMBERS,
-                rng=np.random.default_rng(first + k),
+                rng=np.random.default_rng(first_seed + k),
             )
-            out[f"{name}_{k + 1}"] = found.value
-        a, b = (m.marginal([0, 1]) for m in pair)
-        found = jeffreys_by_sampling(
+            columns[f"{name}_{k + 1}"] = divergence.value
+        a, b = (mixture.marginal([0, 1]) for mixture in pair)
+        divergence = jeffreys_by_sampling(
             a.log_density,
             b.log_density,
-            both(a, b, 0.5),
+            mix(a, b, 0.5),
             members=MEMBERS,
-            rng=np.random.default_rng(first + 2),
+            rng=np.random.default_rng(first_seed + 2),
         )
-        out[f"{name}_target"] = found.value
-    return out
+        columns[f"{name}_target"] = divergence.value
+    return columns
 
 
 parameters = {"members": MEMBERS, "bounds": BOUNDS, "rules": RULES}
 columns = tuple(f"{m}_{k}" for m in (*RULES, "moments") for k in (1, 2, "target"))
-code = (belief, both)
+code = (draw_belief, mix)
 seeds = np.random.SeedSequence(20260).spawn(300)
 rtol = 1e-4
 atol = 1e-12
-# Which of nearly equal shapes least squares keep hangs on the last bit, and so does a divergence
-# that a thin tail decides.
+# The last bit decides which of nearly equal shapes least squares keep, and the value of a
+# divergence that depends on a thin tail.
 ill_conditioned = [name for name in columns if name.startswith("c3")]

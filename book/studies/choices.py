@@ -30,7 +30,7 @@ for _variant in VARIANTS:
     _how = {**pendulum.how, "variant": _variant}
     UPDATES[f"OTNLeq_{_variant}"] = with_projection(etpf, pendulum.rod, **_how)
     UPDATES[f"OTNLeqMA_{_variant}"] = with_projection(
-        pendulum.seen_too, pendulum.rod, **_how
+        pendulum.augmented_etpf, pendulum.rod, **_how
     )
 SCORES = (*starts.SCORES, "normal")
 
@@ -41,17 +41,17 @@ def scores(members: np.ndarray, truth: np.ndarray) -> tuple[float, ...]:
     return *starts.scores(members, truth), lengths.std(axis=1).mean()
 
 
-def side(start: str, seed: np.random.SeedSequence) -> dict[str, float]:
+def run_start(start: str, seed: np.random.SeedSequence) -> dict[str, float]:
     """All updates on one run, from one of the starts."""
-    rng, again = (np.random.default_rng(s) for s in seed.spawn(2))
+    rng, rng_circle = (np.random.default_rng(s) for s in seed.spawn(2))
     truth, readings, members = pendulum.data(rng)
     if start == "on":
-        members = starts.on_circle(again)
-    found = pendulum.run(readings, members, tuple(UPDATES), UPDATES)
+        members = starts.on_circle(rng_circle)
+    analysis = pendulum.run(readings, members, tuple(UPDATES), UPDATES)
     return {
         f"{start}_{name}_{key}": float(value)
         for k, name in enumerate(UPDATES)
-        for key, value in zip(SCORES, scores(found[:, k], truth), strict=True)
+        for key, value in zip(SCORES, scores(analysis[:, k], truth), strict=True)
     }
 
 
@@ -61,14 +61,14 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         np.random.default_rng(seed.spawn(2)[0]), 30.0
     )
     low = pendulum.run(readings, members, ("OTF",))[:, 0]
-    out = {
+    columns = {
         f"low_OTF_{key}": float(v)
         for key, v in zip(SCORES, scores(low, truth), strict=True)
     }
     for start in ("off", "on"):
         fresh = np.random.SeedSequence(seed.entropy, spawn_key=seed.spawn_key)
-        out |= side(start, fresh)
-    return out
+        columns |= run_start(start, fresh)
+    return columns
 
 
 parameters = {name: np.asarray(setting[name]).tolist() for name in setting}
@@ -82,7 +82,7 @@ columns = (
         for key in SCORES
     ),
 )
-code = (side, scores, starts.scores, starts.on_circle, pendulum.data, pendulum.run)
+code = (run_start, scores, starts.scores, starts.on_circle, pendulum.data, pendulum.run)
 seeds = starts.seeds[:60]
 rtol = 1e-4
 # A run that has lost the swing multiplies the last bit until it decides.

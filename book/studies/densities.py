@@ -46,7 +46,7 @@ def grid() -> density.Grid:
 
 
 def swarm(reading: str, phase: float = 0.0) -> Any:
-    """The swarm of (23) in one reading, its f turned by `phase`."""
+    """Return the swarm of (23) in one interpretation, its f turned by `phase`."""
     phases = SWARM["target_phases"]
     mixture = RotatingMixture(
         centre=SWARM["target_centre"],
@@ -60,7 +60,7 @@ def swarm(reading: str, phase: float = 0.0) -> Any:
 
 
 def first_density(start: str) -> np.ndarray:
-    """The density from which agents are drawn: uniform or peaked, (n,)."""
+    """Return the density from which agents are drawn, uniform or peaked, (n,)."""
     cells = grid()
     if start == "uniform":
         return np.ones(cells.size)
@@ -70,18 +70,18 @@ def first_density(start: str) -> np.ndarray:
 
 
 def first_agents(start: str, agents: int, rng: np.random.Generator) -> np.ndarray:
-    """Agents drawn from it, (N, 2)."""
+    """Draw agents from it, (N, 2)."""
     cells = grid()
     share = first_density(start) * cells.volume
     chosen = cells.centres[rng.choice(cells.size, size=agents, p=share)]
     return chosen + (rng.random((agents, 2)) - 0.5) * cells.spacing
 
 
-def informed(basis: np.ndarray, positions: np.ndarray) -> Any:
-    """The linear Bayes estimate of a density from agents alone: a filter of one row.
+def estimate_from_positions(basis: np.ndarray, positions: np.ndarray) -> Any:
+    """Return the linear Bayes estimate of a density from agents alone, a filter of one row.
 
-    A histogram of N independent agents has the variance p / (N cell). Once with p = 1, then with
-    what that gave.
+    A histogram of N independent agents has the variance p / (N cell): first with p = 1, then with
+    that estimate.
     """
     cells = grid()
     level = np.ones(grid().size)
@@ -93,7 +93,7 @@ def informed(basis: np.ndarray, positions: np.ndarray) -> Any:
     return state
 
 
-def case(
+def run_case(
     reading: str,
     start: str,
     rng: np.random.Generator,
@@ -102,7 +102,7 @@ def case(
     agents: int | None = None,
     end: float | None = None,
 ) -> dict[str, np.ndarray]:
-    """L2 errors over time by method, (T,), and NEES and CRPS per cell of two of them."""
+    """Return L2 errors over time by method, (T,), and NEES and CRPS per cell of two of them."""
     cells = grid()
     dt = SWARM["dt"]
     n = int(SWARM["agents"]) if agents is None else agents
@@ -116,6 +116,7 @@ def case(
     believed = swarm(reading, phase)
     truth, model = (density.FokkerPlanck(s, cells) for s in (true, believed))
     k = density.kernel_constant(cells, bandwidth=h, agents=n)
+    # All filters share one basis of the prior covariance.
     basis = density.zero_mean_prior(
         cells,
         rank=CHOICES["rank"],
@@ -130,7 +131,7 @@ def case(
         * ((cells.centres - x[0]) ** 2).sum(axis=-1)
         / CHOICES["local_prior_std"] ** 2
     )
-    filters = beginning(basis, np.stack([y, y, y, cells.normalize(flat)]), x)
+    filters = initial_filters(basis, np.stack([y, y, y, cells.normalize(flat)]), x)
     few = basis[:, : CHOICES["low_rank"]]
     low = density.low_rank_start(few, y[None])
     scale = dict(zip(READINGS, CHOICES["process_scale"], strict=True))[reading]
@@ -139,21 +140,26 @@ def case(
     noise = np.full(filters.base.shape, np.inf)
     for j in range(round(end / dt)):
         t = j * dt
+        # One step of the Fokker-Planck equation serves all filters.
         move = model.solver(t, dt)
         x = true.step(x, t, dt, rng=rng, substeps=CHOICES["substeps"])
         p = truth.step(p, t, dt)
         y = density.kernel_density(x, cells, bandwidth=h)
         filters = density.low_rank_predict(filters, move)
+        # R from the forecast, and R from the observed density; the others stay open (R = ∞).
         noise[0] = k * np.maximum(filters.estimates[0], floor)
         noise[1] = k * np.maximum(y, floor)
         filters = density.low_rank_step(filters, y, noise, dt)
+        # With a wrong model one more filter has process noise.
         if phase:
             low = density.low_rank_predict(low, move, process=scale * few, dt=dt)
             low = density.low_rank_step(
                 low, y, k * np.maximum(low.estimates, floor), dt
             )
-        found = np.stack([y, *filters.estimates, *low.estimates])
-        rows.append(np.concatenate([cells.norm(found - p), scored(filters, p, j)]))
+        estimates = np.stack([y, *filters.estimates, *low.estimates])
+        rows.append(
+            np.concatenate([cells.norm(estimates - p), filter_scores(filters, p, j)])
+        )
     names = (
         *EXACT,
         "process",
@@ -165,20 +171,20 @@ def case(
     return dict(zip(names, np.array(rows).T, strict=True))
 
 
-def beginning(basis: np.ndarray, base: np.ndarray, positions: np.ndarray) -> Any:
-    """Filters that start from the rows of `base`, and the bound's, informed once, as the last."""
-    known = informed(basis, positions)
+def initial_filters(basis: np.ndarray, base: np.ndarray, positions: np.ndarray) -> Any:
+    """Return filters that start from the rows of `base`; the last one, the bound, is informed."""
+    informed = estimate_from_positions(basis, positions)
     state = density.low_rank_start(basis, base)
     return density.LowRank(
         basis,
-        np.concatenate([base, known.base]),
-        np.concatenate([state.information, known.information]),
-        np.concatenate([state.vector, known.vector]),
+        np.concatenate([base, informed.base]),
+        np.concatenate([state.information, informed.information]),
+        np.concatenate([state.vector, informed.vector]),
     )
 
 
-def scored(filters: Any, p: np.ndarray, step: int) -> np.ndarray:
-    """NEES and CRPS per cell of the filter and of the bound, every two seconds; else NaN."""
+def filter_scores(filters: Any, p: np.ndarray, step: int) -> np.ndarray:
+    """Return NEES and CRPS per cell of the filter and the bound, every two seconds; else NaN."""
     if step % 20 != 19:
         return np.full(4, np.nan)
     from distfilt.metrics import gaussian_crps
@@ -190,34 +196,36 @@ def scored(filters: Any, p: np.ndarray, step: int) -> np.ndarray:
     return np.concatenate([nees, crps])
 
 
-def late(values: np.ndarray) -> float:
-    """Mean from the scenario's time on."""
+def late_mean(values: np.ndarray) -> float:
+    """Return the mean from the scenario's time on."""
     return float(np.nanmean(values[round(CHOICES["average_from"] / SWARM["dt"]) :]))
 
 
 def trial(seed: np.random.SeedSequence) -> list[float]:
     """One run of all cases: time-averaged errors in the order of `columns`."""
-    found: dict[str, float] = {}
+    means: dict[str, float] = {}
     cases = [(r, s) for r in READINGS for s in (*STARTS, "wrong")]
     for (reading, start), part in zip(cases, seed.spawn(len(cases)), strict=True):
         wrong = start == "wrong"
-        result = case(
+        result = run_case(
             reading,
             "peaked" if wrong else start,
             np.random.default_rng(part),
             phase=CHOICES["wrong_phase"] if wrong else 0.0,
             end=CHOICES["wrong_end"] if wrong else None,
         )
-        found |= {f"{reading}_{start}_{name}": late(v) for name, v in result.items()}
-    return [found[c] for c in columns]
+        means |= {
+            f"{reading}_{start}_{name}": late_mean(v) for name, v in result.items()
+        }
+    return [means[c] for c in columns]
 
 
 code: tuple[Any, ...] = (
-    case,
-    beginning,
-    informed,
-    scored,
+    run_case,
+    initial_filters,
+    estimate_from_positions,
+    filter_scores,
     first_agents,
     first_density,
-    late,
+    late_mean,
 )

@@ -30,13 +30,13 @@ rtol = 1e-4
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One run: every agent's error, averaged over time."""
-    filters = {s: swarm.network(s, CASE, CASE.agents) for s in ("central", *RULES)}
-    run, _ = swarm.compared(CASE, np.random.default_rng(seed), filters, every=5)
+    filters = {s: swarm.make_filter(s, CASE, CASE.agents) for s in ("central", *RULES)}
+    run, _ = swarm.compare_filters(CASE, np.random.default_rng(seed), filters, every=5)
     late = {k: swarm.average(v, CASE, CHOICES["average_from"]) for k, v in run.items()}
-    out = {"kde": late["kde"], "central": late["central_error"][0]}
+    errors = {"kde": late["kde"], "central": late["central_error"][0]}
     for s in RULES:
-        out |= {f"{s}_{i}": v for i, v in enumerate(late[f"{s}_error"])}
-    return {name: float(out[name]) for name in columns}
+        errors |= {f"{s}_{i}": v for i, v in enumerate(late[f"{s}_error"])}
+    return {name: float(errors[name]) for name in columns}
 
 
 code = swarm.code

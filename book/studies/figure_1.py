@@ -40,22 +40,22 @@ rtol = 1e-4
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """A batch of runs of both versions, on the same data."""
     for_data, for_filters = seed.spawn(2)
-    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
-    out: dict[str, float] = {}
+    truth, seen = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    values: dict[str, float] = {}
     for name, pca in NAMES.items():
-        f = satellites.published(SETUP, pca=pca)
-        result = satellites.run(SETUP, f, for_filters, truth, seen)
-        out |= satellites.scored(SETUP, name, result)
-        out |= satellites.of_every_step(SETUP, name, result)
+        f = satellites.paper_filter(SETUP, pca=pca)
+        result = satellites.run_filter(SETUP, f, for_filters, truth, seen)
+        values |= satellites.score_runs(SETUP, name, result)
+        values |= satellites.step_series(SETUP, name, result)
         error = result["total_squared_error"].mean("agent").values
         nees = result["nees"].mean("agent").values / SETUP.model.dim
-        out |= satellites.over_time(name, error, nees)
-        small = satellites.published(replace(SETUP, members=FEW), pca=pca)
-        result = satellites.run(
+        values |= satellites.time_series(name, error, nees)
+        small = satellites.paper_filter(replace(SETUP, members=FEW), pca=pca)
+        result = satellites.run_filter(
             SETUP, small, for_filters, truth, seen, ("squared_error",)
         )
-        out |= satellites.scored(SETUP, f"{name}_few", result, each_agent=False)
-    return out
+        values |= satellites.score_runs(SETUP, f"{name}_few", result, each_agent=False)
+    return values
 
 
-code = (satellites.data, satellites.published, satellites.scored)
+code = (satellites.draw_data, satellites.paper_filter, satellites.score_runs)

@@ -1,6 +1,6 @@
 """Fig. 2 of Grange et al.: five agents with principal components, 100 runs, at every step.
 
-With the gain of the scenario, and without any pull: what consensus does is the difference.
+With the gain of the scenario, and without any pull: the difference is the effect of consensus.
 """
 
 from __future__ import annotations
@@ -29,32 +29,32 @@ columns = [
 parameters = {"batch": BATCH, "seed": 2025, "gains": GAINS}
 seeds = np.random.SeedSequence(satellites.SEED + 1).spawn(SETUP.runs // BATCH)
 scenarios = (SETUP.scenario,)
-# The error of a filter on its own grows, and with it a difference of the last bit.
+# The error of a filter without consensus grows, and a difference of the last bit with it.
 rtol = 1e-3
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """A batch of runs with both gains, on the same data."""
     for_data, for_filters = seed.spawn(2)
-    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
-    out: dict[str, float] = {}
+    truth, seen = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    values: dict[str, float] = {}
     for name, gain in GAINS.items():
-        f = satellites.published(SETUP, pca=True, gain=gain)
-        result = satellites.run(SETUP, f, for_filters, truth, seen)
-        out |= satellites.scored(SETUP, name, result)
-        out |= satellites.of_every_step(SETUP, name, result)
-    return out
+        f = satellites.paper_filter(SETUP, pca=True, gain=gain)
+        result = satellites.run_filter(SETUP, f, for_filters, truth, seen)
+        values |= satellites.score_runs(SETUP, name, result)
+        values |= satellites.step_series(SETUP, name, result)
+    return values
 
 
 def part(seed: np.random.SeedSequence) -> dict[str, float]:
     """The paper's filter with the pull, as in the trial, for chapter 4 to run again."""
     for_data, for_filters = seed.spawn(2)
-    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
-    f = satellites.published(SETUP, pca=True, gain=GAINS["pca"])
-    result = satellites.run(SETUP, f, for_filters, truth, seen)
-    return satellites.scored(SETUP, "pca", result) | satellites.of_every_step(
+    truth, seen = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    f = satellites.paper_filter(SETUP, pca=True, gain=GAINS["pca"])
+    result = satellites.run_filter(SETUP, f, for_filters, truth, seen)
+    return satellites.score_runs(SETUP, "pca", result) | satellites.step_series(
         SETUP, "pca", result
     )
 
 
-code = (satellites.data, satellites.published, satellites.scored)
+code = (satellites.draw_data, satellites.paper_filter, satellites.score_runs)

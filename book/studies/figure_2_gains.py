@@ -29,25 +29,25 @@ rtol = 1e-3
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """A batch of runs with every gain, on the same data."""
     for_data, for_filters = seed.spawn(2)
-    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
-    out: dict[str, float] = {}
+    truth, seen = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    values: dict[str, float] = {}
     for name, gain in GAINS.items():
-        f = satellites.published(SETUP, pca=True, gain=gain)
-        out |= satellites.scored(
-            SETUP, name, satellites.run(SETUP, f, for_filters, truth, seen)
+        f = satellites.paper_filter(SETUP, pca=True, gain=gain)
+        values |= satellites.score_runs(
+            SETUP, name, satellites.run_filter(SETUP, f, for_filters, truth, seen)
         )
-    return out
+    return values
 
 
 def part(seed: np.random.SeedSequence) -> dict[str, float]:
     """The largest gain at which the claim fails, as in the trial, for chapter 4 to run again."""
     for_data, for_filters = seed.spawn(2)
-    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    truth, seen = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
     for_filters.spawn(2)  # of the two gains before it
-    f = satellites.published(SETUP, pca=True, gain=GAINS["g03"])
-    return satellites.scored(
-        SETUP, "g03", satellites.run(SETUP, f, for_filters, truth, seen)
+    f = satellites.paper_filter(SETUP, pca=True, gain=GAINS["g03"])
+    return satellites.score_runs(
+        SETUP, "g03", satellites.run_filter(SETUP, f, for_filters, truth, seen)
     )
 
 
-code = (satellites.data, satellites.published, satellites.scored)
+code = (satellites.draw_data, satellites.paper_filter, satellites.score_runs)

@@ -1,8 +1,8 @@
-"""Readings of what Zheng and Lin leave open about consensus, and what Fig. 1 looks like in each.
+"""Interpretations of the consensus of Zheng and Lin, and Fig. 1 under each of them.
 
 Gains per second or per step, a larger integral gain, where consensus starts, R as printed with a
 prior whose mass may change, and the widths that the paper does not give: of the flat Gaussian and
-of the kernel. Slow reading of (23), uniform start, 60 s.
+of the kernel. Slow interpretation of (23), uniform start, 60 s.
 """
 
 from __future__ import annotations
@@ -59,46 +59,46 @@ rtol = 1e-4
 
 
 def own_central(reading: str) -> str:
-    """The centralised filter that a reading is compared with: of the same R and kernel."""
+    """Return the centralised filter of the same R and kernel, for comparison."""
     name = f"central_{reading.split('_')[-1]}"
     return name if name in CENTRALS else "central"
 
 
 def network(scheme: str) -> DensityFilter:
-    """A scheme's filter, with another kernel or a wider flat Gaussian where its name says so."""
+    """Return a scheme's filter; its name may choose another kernel or a wider flat Gaussian."""
     base, _, last = scheme.rpartition("_")
     if last in KERNELS:
-        f = swarm.network("paper_flat" if base == "paper" else base, CASE)
+        f = swarm.make_filter("paper_flat" if base == "paper" else base, CASE)
         return replace(f, bandwidth=KERNELS[last])
     if last == "wide":
-        f = swarm.network("paper_flat", CASE)
+        f = swarm.make_filter("paper_flat", CASE)
         return replace(f, initial_std=WIDE, fusion=replace(f.fusion, initial_std=WIDE))
-    return swarm.network(scheme, CASE)
+    return swarm.make_filter(scheme, CASE)
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
-    """One run: per reading the claims of the caption, each from eight local filters."""
+    """One run: per interpretation the statements of the caption, each from eight local filters."""
     filters = {s: network(s) for s in (*CENTRALS, *READINGS)}
-    run, _ = swarm.compared(CASE, np.random.default_rng(seed), filters)
+    run, _ = swarm.compare_filters(CASE, np.random.default_rng(seed), filters)
     half = CASE.end / 2
     k = len(run["kde"]) // 12
     level = float(run["kde"].mean())
-    out = {"kde": swarm.average(run["kde"], CASE, half)}
+    values = {"kde": swarm.average(run["kde"], CASE, half)}
     for s in CENTRALS:
-        out[s] = swarm.average(run[f"{s}_error"], CASE, half)[0]
-        out[f"{s}_below"] = figure.below(run[f"{s}_error"][:, 0], level)
+        values[s] = swarm.average(run[f"{s}_error"], CASE, half)[0]
+        values[f"{s}_below"] = figure.below(run[f"{s}_error"][:, 0], level)
     for r in READINGS:
         error = run[f"{r}_error"]
-        ratio = mean_interval(swarm.average(error, CASE, half) / out[own_central(r)])
+        ratio = mean_interval(swarm.average(error, CASE, half) / values[own_central(r)])
         falls = mean_interval(error[-k:].mean(axis=0) / error[:k].mean(axis=0))
-        out |= {
+        values |= {
             f"{r}_error": swarm.average(error, CASE, half).mean(),
             f"{r}_ratio": ratio.estimate,
             f"{r}_ratio_high": ratio.high,
             f"{r}_falls_high": falls.high,
             f"{r}_below": figure.below(error.mean(axis=1), level),
         }
-    return {name: float(out[name]) for name in columns}
+    return {name: float(values[name]) for name in columns}
 
 
 code = (*swarm.code, figure.below, network, own_central)

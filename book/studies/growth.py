@@ -48,45 +48,49 @@ scenarios = swarm.scenarios
 rtol = 1e-4
 
 
-def one(case: swarm.Case, rng: np.random.Generator) -> dict[str, float]:
+def run_swarm(case: swarm.Case, rng: np.random.Generator) -> dict[str, float]:
     """Errors by rule, averaged over time, of one swarm; numbers sent by an agent in a step."""
     names = [s for s in RULES if s != "flooding" or case.agents <= TABLES]
-    filters = {s: swarm.network(s, case, min(SIXTEEN, case.agents)) for s in names}
-    parts: list[bool] = []
+    filters = {s: swarm.make_filter(s, case, min(SIXTEEN, case.agents)) for s in names}
+    connected: list[bool] = []
 
     def watch(
         t: float, x: np.ndarray, p: np.ndarray, states: dict[str, object]
     ) -> None:
-        parts.append(states["paper"].parts == 1)
+        connected.append(states["paper"].parts == 1)
 
-    run, ends = swarm.compared(case, rng, filters, watch, every=10)
+    run, ends = swarm.compare_filters(case, rng, filters, watch, every=10)
     late = {k: swarm.average(v, case, FROM).mean() for k, v in run.items()}
-    out = {"kde": late["kde"], "open": late["open"], "connected": float(np.mean(parts))}
-    out |= {s: late.get(f"{s}_error", np.nan) for s in RULES}
+    values = {
+        "kde": late["kde"],
+        "open": late["open"],
+        "connected": float(np.mean(connected)),
+    }
+    values |= {s: late.get(f"{s}_error", np.nan) for s in RULES}
     steps = case.agents * END / swarm.SWARM["dt"]
     for s in RULES[1:]:
         sent = ends[s].ledger.scalars.sum() / steps if s in ends else np.nan
-        out |= {
+        values |= {
             f"{s}_consensus": late.get(f"{s}_consensus", np.nan),
             f"{s}_numbers": float(sent),
         }
-    return out
+    return values
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """Every size once, and every grid."""
-    out: dict[str, float] = {}
+    values: dict[str, float] = {}
     draws = iter(seed.spawn(len(SIZES) + 1))
     for n in SIZES:
         case = swarm.Case(start="peaked", end=END, agents=n)
-        found = one(case, np.random.default_rng(next(draws)))
-        out |= {f"agents_{n}_{k}": v for k, v in found.items()}
+        part = run_swarm(case, np.random.default_rng(next(draws)))
+        values |= {f"agents_{n}_{k}": v for k, v in part.items()}
     same = next(draws)
     for n in GRIDS:
         case = swarm.Case(start="peaked", end=END, cells=(n, n))
-        found = one(case, np.random.default_rng(same))
-        out |= {f"cells_{n}_{k}": v for k, v in found.items()}
-    return {name: float(out[name]) for name in columns}
+        part = run_swarm(case, np.random.default_rng(same))
+        values |= {f"cells_{n}_{k}": v for k, v in part.items()}
+    return {name: float(values[name]) for name in columns}
 
 
-code = (*swarm.code, one)
+code = (*swarm.code, run_swarm)

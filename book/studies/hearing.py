@@ -31,11 +31,11 @@ rtol = 1e-4
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One swarm."""
     filters = {
-        "central": swarm.network("central", CASE),
-        "central_flat": swarm.network("central", CASE, initial_density="flat"),
-        "flooding": swarm.network("flooding", CASE),
+        "central": swarm.make_filter("central", CASE),
+        "central_flat": swarm.make_filter("central", CASE, initial_density="flat"),
+        "flooding": swarm.make_filter("flooding", CASE),
     }
-    run, _ = swarm.compared(CASE, np.random.default_rng(seed), filters)
+    run, _ = swarm.compare_filters(CASE, np.random.default_rng(seed), filters)
     return {
         s: float(swarm.average(run[f"{s}_error"], CASE, FROM).mean()) for s in columns
     }

@@ -57,8 +57,8 @@ def below(error: np.ndarray, level: float) -> float:
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One run."""
-    filters = {s: swarm.network(s, CASE) for s in NAMES}
-    run, _ = swarm.compared(CASE, np.random.default_rng(seed), filters)
+    filters = {s: swarm.make_filter(s, CASE) for s in NAMES}
+    run, _ = swarm.compare_filters(CASE, np.random.default_rng(seed), filters)
     lines = {n: run[n] for n in LINES[:3]} | {"central": run["central_error"][:, 0]}
     lines |= {
         f"{s}_{i}": run[f"{s}_error"][:, i]
@@ -67,30 +67,32 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     }
     late = CHOICES["average_from"]
     half = CASE.end / 2
-    out = {n: swarm.average(e, CASE, late) for n, e in lines.items()}
-    out |= {
+    values = {n: swarm.average(e, CASE, late) for n, e in lines.items()}
+    values |= {
         f"{n}_at_{t}": e[round(t / swarm.SWARM["dt"]) - 1]
         for n, e in lines.items()
         for t in MARKS
     }
     for s in NAMES[:1] + NAMES[2:]:
-        out[f"{s}_20_40"] = swarm.average(run[f"{s}_error"], CASE, 20.0, 40.0).mean()
+        values[f"{s}_20_40"] = swarm.average(run[f"{s}_error"], CASE, 20.0, 40.0).mean()
     for s in NAMES[1:]:
-        out[f"{s}_consensus"] = swarm.average(run[f"{s}_consensus"], CASE, late).mean()
+        values[f"{s}_consensus"] = swarm.average(
+            run[f"{s}_consensus"], CASE, late
+        ).mean()
     local = run["paper_error"]
     level = float(run["kde"].mean())
     k = round(5.0 / swarm.SWARM["dt"])
     falls = local[-k:].mean(axis=0) / local[:k].mean(axis=0)
-    out |= {
+    values |= {
         "central_half": swarm.average(lines["central"], CASE, half),
         "central_below": below(lines["central"], level),
         "paper_below": below(local.mean(axis=1), level),
     }
-    out |= {f"paper_falls_{i}": v for i, v in enumerate(falls)}
-    out |= {
+    values |= {f"paper_falls_{i}": v for i, v in enumerate(falls)}
+    values |= {
         f"paper_half_{i}": v for i, v in enumerate(swarm.average(local, CASE, half))
     }
-    return {name: float(out[name]) for name in columns}
+    return {name: float(values[name]) for name in columns}
 
 
 code = (*swarm.code, below)

@@ -42,13 +42,13 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     seen = truth + np.sqrt(VARIANCE) * rng.standard_normal(truth.shape)
     cloud = first + np.sqrt(VARIANCE) * rng.standard_normal((MEMBERS[-1], 3))
     draws = source.spawn(len(MEMBERS))
-    out = {}
+    values = {}
     for n, stream in zip(MEMBERS, draws, strict=True):
         state = stream.bit_generator.state
         for name, fit in MAPS.items():
             stream.bit_generator.state = state
-            out.update(scores(f"{name}_{n}", fit, cloud[:n], truth, seen, stream))
-    return out
+            values.update(scores(f"{name}_{n}", fit, cloud[:n], truth, seen, stream))
+    return values
 
 
 def scores(name, fit, members, truth, seen, rng):

@@ -40,7 +40,7 @@ TUNING = 5
 TRIALS = 20
 
 
-def particles(x, h, y, r, *, rng, bandwidth):
+def particle_update(x, h, y, r, *, rng, bandwidth):
     """Weigh, resample, jitter: a particle filter as an update of members."""
     logs = -0.5 * ((y - h) ** 2).sum(axis=-1) / r[0, 0]
     w = np.exp(logs - logs.max())
@@ -53,13 +53,13 @@ FAMILIES = {
     "root": [with_inflation(etkf, factor=f) for f in (1.02, 1.05, 1.1)],
     "transport": [partial(etpf, rejuvenation=h) for h in (0.1, 0.2, 0.3)],
     "second": [partial(etpf, rejuvenation=h, correct=True) for h in (0.1, 0.2, 0.3)],
-    "particles": [partial(particles, bandwidth=h) for h in (0.2, 0.3, 0.4)],
+    "particles": [partial(particle_update, bandwidth=h) for h in (0.2, 0.3, 0.4)],
 }
-bound = partial(particles, bandwidth=0.1)
+bound = partial(particle_update, bandwidth=0.1)
 model = lorenz63(step=0.03)
 
 
-def data(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def draw_data(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A truth (T, 3), its readings (T, 1), and members of the prior (PARTICLES, 3)."""
     start = rng.standard_normal(3) + [1.5, -1.5, 25.5]
     path = simulate(model, start, DT * np.arange(1, STEPS + 101), rng=rng)
@@ -78,16 +78,18 @@ def scores(update, members, truth, seen, rng):
         members = inner(members, members[:, :1], y, noise, rng=rng)
         if k >= BURN:
             gap = members.mean(axis=0) - truth[k]
-            own = members.var(axis=0, ddof=1).mean()
-            rows.append([(gap**2).mean(), own, crps(members[:100], truth[k]).mean()])
-    square, own, score = np.mean(rows, axis=0)
-    return [np.sqrt(square), np.sqrt(own), score]
+            variance = members.var(axis=0, ddof=1).mean()
+            rows.append(
+                [(gap**2).mean(), variance, crps(members[:100], truth[k]).mean()]
+            )
+    square, variance, score = np.mean(rows, axis=0)
+    return [np.sqrt(square), np.sqrt(variance), score]
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """Every family, size and strength on one truth."""
     rng, source = (np.random.default_rng(s) for s in seed.spawn(2))
-    truth, seen, cloud = data(rng)
+    truth, seen, cloud = draw_data(rng)
     cases = {
         f"{name}_{n}_{k}": (update, n)
         for n in MEMBERS
@@ -95,15 +97,15 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         for k, update in enumerate(updates)
     }
     cases["bound"] = (bound, PARTICLES)
-    out = {}
+    metrics = {}
     for (case, (update, n)), stream in zip(
         cases.items(), source.spawn(len(cases)), strict=True
     ):
-        found = scores(update, cloud[:n], truth, seen, stream)
-        out |= {
-            f"{case}_{what}": float(v) for what, v in zip(SCORES, found, strict=True)
+        values = scores(update, cloud[:n], truth, seen, stream)
+        metrics |= {
+            f"{case}_{what}": float(v) for what, v in zip(SCORES, values, strict=True)
         }
-    return out
+    return metrics
 
 
 SCORES = ("rmse", "spread", "crps")
@@ -127,7 +129,7 @@ columns = (
     ),
     *(f"bound_{what}" for what in SCORES),
 )
-code = (particles, data, scores)
+code = (particle_update, draw_data, scores)
 seeds = np.random.SeedSequence(512).spawn(TRIALS)
 rtol = 1e-3
 # In these filters a difference of the last bit grows with the model's chaos, tenfold in ten steps:

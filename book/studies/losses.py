@@ -22,19 +22,24 @@ LOSSES = {"none": 0.0, "some": 0.3}
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """Means over agents and the epochs from 2 to 20 h."""
     rng = np.random.default_rng(seed)
-    truth, *rest = paper.simulate(paper.SETTING, rng)
-    which = int(rng.integers(2**31))
-    out = {}
+    truth, *inputs = paper.simulate(paper.SETTING, rng)
+    loss_seed = int(rng.integers(2**31))
+    values = {}
     for row in ROWS:
-        for lost, share in LOSSES.items():
-            options = {**paper.SINGLE[row], "faults": Faults(loss=share, seed=which)}
-            states = paper.run_filter(paper.SETTING, options, *rest)
-            found = [paper.score_epoch(states[k].mixtures, truth[k]) for k in paper.EARLY]
-            out |= {
-                f"{row}_{lost}_{m}": float(np.mean([f[m].mean() for f in found]))
+        for label, share in LOSSES.items():
+            options = {
+                **paper.SINGLE[row],
+                "faults": Faults(loss=share, seed=loss_seed),
+            }
+            states = paper.run_filter(paper.SETTING, options, *inputs)
+            scores = [
+                paper.score_epoch(states[k].mixtures, truth[k]) for k in paper.EARLY
+            ]
+            values |= {
+                f"{row}_{label}_{m}": float(np.mean([f[m].mean() for f in scores]))
                 for m in METRICS
             }
-    return {name: float(paper.SIX.format(v)) for name, v in out.items()}
+    return {name: float(paper.SIX.format(v)) for name, v in values.items()}
 
 
 columns = [f"{row}_{lost}_{m}" for row in ROWS for lost in LOSSES for m in METRICS]

@@ -34,7 +34,7 @@ steady = motion(
 )
 
 
-def stretched(members: np.ndarray, factor: float) -> np.ndarray:
+def widen(members: np.ndarray, factor: float) -> np.ndarray:
     """Members on the circle whose distances from the true start are multiplied, in the chart."""
     start = np.array([np.deg2rad(setting["start_angle"]), setting["start_rate"]])
     chart = start + factor * (pendulum_chart(members) - start)
@@ -43,35 +43,36 @@ def stretched(members: np.ndarray, factor: float) -> np.ndarray:
 
 def departures(name: str, members: np.ndarray, truth: np.ndarray) -> dict[str, float]:
     """How errors grow and lean, and when the position is first farther off than each limit."""
-    found = pendulum.scores(name, members, truth)
-    away = np.hypot(*(members.mean(axis=-2) - truth)[:, :2].T)
-    out = {key: found[f"{name}_{key}"] for key in ("constraint", "growth", "ratio_yx")}
+    scores = pendulum.scores(name, members, truth)
+    distance = np.hypot(*(members.mean(axis=-2) - truth)[:, :2].T)
+    values = {
+        key: scores[f"{name}_{key}"] for key in ("constraint", "growth", "ratio_yx")
+    }
     for limit in LIMITS:
-        left = TIMES[(TIMES > 1 + 1e-9) & ~(away <= limit)]
-        out[f"onset_{round(100 * limit)}cm"] = float(left[0]) if left.size else np.nan
-    return out
+        departed = TIMES[(TIMES > 1 + 1e-9) & ~(distance <= limit)]
+        values[f"onset_{round(100 * limit)}cm"] = (
+            float(departed[0]) if departed.size else np.nan
+        )
+    return values
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """Both starts, both forms of the equations, and wider priors."""
-    rng, again = (np.random.default_rng(s) for s in seed.spawn(2))
+    rng, rng_circle = (np.random.default_rng(s) for s in seed.spawn(2))
     truth, readings, off = pendulum.data(rng)
-    on = starts.on_circle(again)
-    out = {}
+    on = starts.on_circle(rng_circle)
+    metrics = {}
     cases = {
         f"{start}_{form}": (members, ("OTF",), model)
         for start, members in (("off", off), ("on", on))
         for form, model in (("printed", pendulum.swing), ("multiplier", steady))
-    } | {
-        f"wide{k}": (stretched(on, k), ("OTF", "OTNLeqMA"), pendulum.swing)
-        for k in WIDER
-    }
+    } | {f"wide{k}": (widen(on, k), ("OTF", "OTNLeqMA"), pendulum.swing) for k in WIDER}
     for case, (members, names, model) in cases.items():
-        found = pendulum.run(readings, members, names, model=model)
+        members_over_time = pendulum.run(readings, members, names, model=model)
         for k, name in enumerate(names):
-            values = departures(name, found[:, k], truth)
-            out |= {f"{case}_{name}_{key}": value for key, value in values.items()}
-    return out
+            values = departures(name, members_over_time[:, k], truth)
+            metrics |= {f"{case}_{name}_{key}": value for key, value in values.items()}
+    return metrics
 
 
 parameters = {name: np.asarray(setting[name]).tolist() for name in setting}
@@ -88,7 +89,7 @@ CASES = (
 )
 columns = tuple(f"{case}_{key}" for case in CASES for key in SCORES)
 code = (
-    stretched,
+    widen,
     departures,
     starts.on_circle,
     pendulum.data,

@@ -32,7 +32,7 @@ from distfilt.sensors import Sensor, angles_only, ephemeris, stack
 
 NAME = "orbit"
 PAPER = "semeraro"
-TABLE = scenario("semeraro", "table-3").reading()
+TABLE = scenario("semeraro", "table-3").track_reads()
 HOURS = tuple(int(h) for h in TABLE["hours"])
 EARLY = [k for k, hour in enumerate(HOURS) if hour < TABLE["fix_at"]]
 ARCSECOND = np.pi / 180 / 3600

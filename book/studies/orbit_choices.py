@@ -1,4 +1,4 @@
-"""What the paper leaves open in orbit, swept: do the claims of Figs. 4 to 6 hang on it?
+"""Choices that the paper leaves open in orbit, swept: do the claims of Figs. 4 to 6 need them?
 
 The rule for weights and its terms, how many mixands an agent keeps, from which length a mixand is
 split, and whether the reading of 22 h has one error or one for each agent. The draws are those of
@@ -28,8 +28,8 @@ EARLY_HOURS = tuple(paper.HOURS[k] for k in paper.EARLY)
 FIXES = {**paper.SETTING, "one_fix": False}
 
 
-def sized(mixands: int) -> dict[str, Any]:
-    """Mixture filters that keep so many mixands."""
+def with_components(mixands: int) -> dict[str, Any]:
+    """Return the options of mixture filters with a number of components."""
     return {**paper.MANY, "n_components": mixands, "max_components": mixands}
 
 
@@ -43,17 +43,27 @@ CHOICES: dict[str, tuple[dict, dict, dict[str, Any]]] = {
             "all": partial(fuse_mixtures, terms="all"),
         },
     ),
-    "mixands_6": (paper.SETTING, sized(6), {"c3": fuse_mixtures}),
-    "mixands_24": (paper.SETTING, sized(24), {"c3": fuse_mixtures}),
-    "split_2": (paper.SETTING, {**paper.MANY, "split_threshold": 2.5}, {"c3": fuse_mixtures}),
-    "split_10": (paper.SETTING, {**paper.MANY, "split_threshold": 10.0}, {"c3": fuse_mixtures}),
+    "mixands_6": (paper.SETTING, with_components(6), {"c3": fuse_mixtures}),
+    "mixands_24": (paper.SETTING, with_components(24), {"c3": fuse_mixtures}),
+    "split_2": (
+        paper.SETTING,
+        {**paper.MANY, "split_threshold": 2.5},
+        {"c3": fuse_mixtures},
+    ),
+    "split_10": (
+        paper.SETTING,
+        {**paper.MANY, "split_threshold": 10.0},
+        {"c3": fuse_mixtures},
+    ),
     "fixes": (FIXES, paper.MANY, {"c3": fuse_mixtures}),
 }
-"""A setting, what its filters are made of, and the rules of fusion that are tried with them."""
+"""A setting, the options of its filters, and the fusion rules that are tried with them."""
 
 
-def added(own: GaussianMixture, heard: list[GaussianMixture]) -> GaussianMixture:
-    """Fusion without a discount: the beliefs multiplied."""
+def multiply_beliefs(
+    own: GaussianMixture, heard: list[GaussianMixture]
+) -> GaussianMixture:
+    """Multiply beliefs, which counts shared information twice."""
     (m, P) = own.moments()
     (mean, cov) = heard[0].moments()
     J = np.linalg.inv(cov)
@@ -62,39 +72,44 @@ def added(own: GaussianMixture, heard: list[GaussianMixture]) -> GaussianMixture
     return GaussianMixture.gaussian(m + gain @ J @ (mean - m[:6]), 0.5 * (P + P.T))
 
 
-def row(s: dict, options: dict, truth: np.ndarray, rest: tuple) -> dict[str, float]:
+def run_row(
+    s: dict, options: dict, truth: np.ndarray, inputs: tuple
+) -> dict[str, float]:
     """A filter's means over agents and the epochs from 2 to 20 h, and each agent's errors."""
-    states = paper.run_filter(s, options, *rest)
-    found = [
-        paper.score_epoch(x.mixtures, true) for x, true in zip(states, truth, strict=True)
+    states = paper.run_filter(s, options, *inputs)
+    scores = [
+        paper.score_epoch(x.mixtures, true)
+        for x, true in zip(states, truth, strict=True)
     ]
-    early = [found[k] for k in paper.EARLY]
-    out = {
+    early = [scores[k] for k in paper.EARLY]
+    means = {
         m: float(np.mean([f[m].mean() for f in early])) for m in (*paper.ERRORS, "nees")
     }
-    claims = [found[paper.HOURS.index(h)]["claim_tp"].mean() for h in (20, 22)]
-    out["claim"] = float(np.sqrt(claims[1] / claims[0]))
+    variances = [scores[paper.HOURS.index(h)]["claim_tp"].mean() for h in (20, 22)]
+    means["claim"] = float(np.sqrt(variances[1] / variances[0]))
     for hour, values in zip(EARLY_HOURS, early, strict=True):
-        out |= {f"target{a + 1}_{hour}": float(values["error_tp"][a]) for a in (0, 1)}
-    return out
+        means |= {f"target{a + 1}_{hour}": float(values["error_tp"][a]) for a in (0, 1)}
+    return means
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """All choices on one set of data."""
     child = seed.spawn(1)[0]
-    out = {}
+    metrics = {}
     for name, (s, options, rules) in CHOICES.items():
-        truth, *rest = paper.simulate(s, np.random.default_rng(child))
-        found = {"none": row(s, options, truth, tuple(rest))}
+        truth, *inputs = paper.simulate(s, np.random.default_rng(child))
+        rows = {"none": run_row(s, options, truth, tuple(inputs))}
         for rule, fusion in rules.items():
-            found[rule] = row(s, {**options, "fusion": fusion}, truth, tuple(rest))
-        out |= {
-            f"{name}_{rule}_{m}": v for rule, r in found.items() for m, v in r.items()
+            rows[rule] = run_row(s, {**options, "fusion": fusion}, truth, tuple(inputs))
+        metrics |= {
+            f"{name}_{rule}_{m}": v for rule, r in rows.items() for m, v in r.items()
         }
-    truth, *rest = paper.simulate(paper.SETTING, np.random.default_rng(child))
-    null = row(paper.SETTING, {**paper.ONE, "fusion": added}, truth, tuple(rest))
-    out["added_nees"] = null["nees"]
-    return {name: float(paper.SIX.format(v)) for name, v in out.items()}
+    truth, *inputs = paper.simulate(paper.SETTING, np.random.default_rng(child))
+    null = run_row(
+        paper.SETTING, {**paper.ONE, "fusion": multiply_beliefs}, truth, tuple(inputs)
+    )
+    metrics["added_nees"] = null["nees"]
+    return {name: float(paper.SIX.format(v)) for name, v in metrics.items()}
 
 
 METRICS = (
@@ -114,9 +129,9 @@ parameters = {
     "choices": {name: ["none", *rules] for name, (_, _, rules) in CHOICES.items()},
 }
 code = (
-    sized,
-    added,
-    row,
+    with_components,
+    multiply_beliefs,
+    run_row,
     paper.simulate,
     paper.observe,
     paper.prior_beliefs,
@@ -127,31 +142,38 @@ code = (
 scenarios = paper.scenarios
 seeds = paper.seeds
 rtol = 1e-3
-# Which of 24 nearly equal mixands are kept hangs on the last bit, and the later hours on them.
+# The last bit decides which of 24 nearly equal components are merged, and the later hours with it.
 max_outliers = 2
 
 
-def again(seed: np.random.SeedSequence) -> dict[str, float]:
-    """The choice that is quick enough to run again wherever the study is read, and the null."""
+def run_live(seed: np.random.SeedSequence) -> dict[str, float]:
+    """Run the null and the one choice that is quick enough to run wherever the study is read."""
     s, options, rules = CHOICES["mixands_6"]
-    truth, *rest = paper.simulate(s, np.random.default_rng(seed.spawn(1)[0]))
+    truth, *inputs = paper.simulate(s, np.random.default_rng(seed.spawn(1)[0]))
     fused = {**options, "fusion": rules["c3"]}
-    found = {"none": options, "c3": fused, "added": {**paper.ONE, "fusion": added}}
-    rows = {name: row(s, chosen, truth, tuple(rest)) for name, chosen in found.items()}
-    out = {
+    chosen_options = {
+        "none": options,
+        "c3": fused,
+        "added": {**paper.ONE, "fusion": multiply_beliefs},
+    }
+    rows = {
+        name: run_row(s, chosen, truth, tuple(inputs))
+        for name, chosen in chosen_options.items()
+    }
+    values = {
         f"mixands_6_{name}_{m}": rows[name][m]
         for name in ("none", "c3")
         for m in METRICS
     }
-    out["added_nees"] = rows["added"]["nees"]
-    return {name: float(paper.SIX.format(v)) for name, v in out.items()}
+    values["added_nees"] = rows["added"]["nees"]
+    return {name: float(paper.SIX.format(v)) for name, v in values.items()}
 
 
-def checked() -> Stored:
-    """The stored study, once that part of two of its seeds has run again and agrees."""
-    whole = stored(PAPER, NAME)
+def load_checked() -> Stored:
+    """Return the stored study, after that part of two trials has run again and agrees."""
+    study = stored(PAPER, NAME)
     quick = {
-        m: v for m, v in whole.columns.items() if m.startswith(("mixands_6_", "added_"))
+        m: v for m, v in study.columns.items() if m.startswith(("mixands_6_", "added_"))
     }
-    check(replace(whole, columns=quick), again, indices=[0, 1], rtol=rtol)
-    return whole
+    check(replace(study, columns=quick), run_live, indices=[0, 1], rtol=rtol)
+    return study

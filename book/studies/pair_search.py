@@ -1,11 +1,11 @@
-"""The search for a pair of beliefs that gives Table 1: how near it comes, and to what.
+"""Search for a pair of beliefs that gives Table 1, and the distance that remains.
 
 An arc of six mixands has five numbers besides its place, and turning or scaling both beliefs
 changes no divergence: twelve numbers are free. Each trial starts somewhere, "far" from anywhere
 within wide bounds or "near" the pair of the scenario with each number changed at random, and goes
 on by evolution with covariance adaptation: it lowers a norm of the nine logarithms of ours over
 printed. All divergences of a search are by importance sampling on the same places of the unit
-cube, so that two pairs can be compared. What is found is scored on those places, on fresh ones, on
+cube, so that two pairs can be compared. The result is scored on those places, on fresh ones, on
 many, and by quadrature.
 """
 
@@ -65,51 +65,52 @@ SHARES = np.array([0.3, 0.2, 0.4, 0.1])
 Cubes = list[np.ndarray]
 
 
-def numbers() -> np.ndarray:
-    """The scenario's pair as logarithms of the twelve numbers."""
-    own = [np.array([float(row[n]) for n in SHAPES]) for row in STUDY.agents]
+def scenario_parameters() -> np.ndarray:
+    """Return the scenario's pair as logarithms of the twelve numbers."""
+    shapes = [np.array([float(row[n]) for n in SHAPES]) for row in STUDY.agents]
     places = [np.array(row["place"], dtype=float) for row in STUDY.agents]
     scale = DISTANCE / np.hypot(*places[0])
-    for shape in own:
+    for shape in shapes:
         shape[1:3] *= scale
     angles = [np.arctan2(y, x) for x, y in places]
     turn = np.mod(angles[1] - angles[0], 2 * np.pi)
-    return np.log([*own[0], *own[1], scale * np.hypot(*places[1]), turn])
+    return np.log([*shapes[0], *shapes[1], scale * np.hypot(*places[1]), turn])
 
 
 def fusions(y: np.ndarray) -> list[PartialFusion]:
-    """Both agents' exact fusions for the logarithms of the twelve numbers."""
+    """Return both agents' exact fusions for the logarithms of the twelve numbers."""
     v = np.exp(y)
     angle = np.pi + v[11]
     places = (-DISTANCE, 0.0), (v[10] * np.cos(angle), v[10] * np.sin(angle))
-    own = [
+    beliefs = [
         arcs.arc(6, place, **dict(zip(SHAPES, part, strict=True)))
         for place, part in zip(places, v[:10].reshape(2, 5), strict=True)
     ]
-    said = [m.marginal([0, 1]) for m in own]
-    return [PartialFusion(own[k], said[1 - k], omega=OMEGA) for k in (0, 1)]
+    marginals = [m.marginal([0, 1]) for m in beliefs]
+    return [PartialFusion(beliefs[k], marginals[1 - k], omega=OMEGA) for k in (0, 1)]
 
 
-def weighed(fusion: PartialFusion) -> list[GaussianMixture]:
-    """The mixtures of the three rules."""
+def fuse_by_rules(fusion: PartialFusion) -> list[GaussianMixture]:
+    """Return the fused mixtures of the three rules."""
     shapes = fusion.component_shapes(terms="all")
     return [fusion.assign_weights(shapes, rule=rule) for rule in RULES]
 
 
-def cubes(rng: np.random.Generator, n: int) -> Cubes:
-    """Places of the unit cube for both agents and for the targets."""
+def draw_cubes(rng: np.random.Generator, n: int) -> Cubes:
+    """Draw places of the unit cube for both agents and for the targets."""
     return [qmc.Sobol(d, rng=rng).random(n) for d in (5, 5, 3)]
 
 
-def points(mixture: GaussianMixture, u: np.ndarray) -> np.ndarray:
-    """A mixture's points at places of the cube: which mixand, then where."""
+def map_to_points(mixture: GaussianMixture, u: np.ndarray) -> np.ndarray:
+    """Map places of the cube to a mixture's points: first the component, then the point."""
+    # The first coordinate picks a component, the others a standard normal vector.
     ends = np.cumsum(mixture.weights) / mixture.weights.sum()
     which = np.searchsorted(ends, u[:, 0]).clip(max=mixture.n_components - 1)
     noise = (mixture.factors[which] @ ndtri(u[:, 1:])[..., None])[..., 0]
     return np.asarray(mixture.means[which] + noise)
 
 
-def mixed(parts: Sequence[GaussianMixture], shares: np.ndarray) -> GaussianMixture:
+def mix(parts: Sequence[GaussianMixture], shares: np.ndarray) -> GaussianMixture:
     """A mixture of mixtures."""
     return GaussianMixture(
         np.concatenate([m.weights * s for m, s in zip(parts, shares, strict=True)]),
@@ -120,38 +121,40 @@ def mixed(parts: Sequence[GaussianMixture], shares: np.ndarray) -> GaussianMixtu
 
 def jeffreys(p: np.ndarray, q: np.ndarray, base: np.ndarray) -> float:
     """Jeffreys' divergence from logarithms at points drawn from the base."""
+    # Importance weights of both densities, normalized by themselves
     weights = [np.exp(v - base - (v - base).max()) for v in (p, q)]
     first, second = ((w * (p - q)).sum() / w.sum() for w in weights)
     return float(0.5 * (first - second))
 
 
-def sampled(y: np.ndarray, u: Cubes) -> np.ndarray:
-    """Logarithms of our nine divergences over the printed ones, on places of the cube."""
-    out = []
+def log_ratios(y: np.ndarray, u: Cubes) -> np.ndarray:
+    """Return the logarithms of our nine divergences over the printed ones, by sampling."""
+    divergences = []
     targets = []
     for fusion, places in zip(fusions(y), u[:2], strict=True):
-        parts = [*weighed(fusion), fusion.own]
-        x = points(mixed(parts, SHARES), places)
+        # The proposal mixes the three fused mixtures and the own belief.
+        parts = [*fuse_by_rules(fusion), fusion.own]
+        x = map_to_points(mix(parts, SHARES), places)
         logs = np.array([m.log_density(x) for m in parts])
         base = np.logaddexp.reduce(logs + np.log(SHARES)[:, None])
-        out.append([jeffreys(fusion.log_value(x), q, base) for q in logs[:3]])
+        divergences.append([jeffreys(fusion.log_value(x), q, base) for q in logs[:3]])
         targets += [m.marginal([0, 1]) for m in parts[:3]]
-    x = points(mixed(targets, np.full(6, 1 / 6)), u[2])
+    x = map_to_points(mix(targets, np.full(6, 1 / 6)), u[2])
     logs = np.array([m.log_density(x) for m in targets])
     base = np.logaddexp.reduce(logs)
-    out.append([jeffreys(logs[i], logs[3 + i], base) for i in range(3)])
-    return np.log(np.maximum(np.array(out).T, 1e-8) / PRINTED)
+    divergences.append([jeffreys(logs[i], logs[3 + i], base) for i in range(3)])
+    return np.log(np.maximum(np.array(divergences).T, 1e-8) / PRINTED)
 
 
-def exactly(y: np.ndarray) -> np.ndarray:
-    """The same by quadrature, on boxes that reach four deviations from the means."""
+def log_ratios_by_quadrature(y: np.ndarray) -> np.ndarray:
+    """Return the same by quadrature, on boxes of four standard deviations about the means."""
     both = fusions(y)
-    fused = [weighed(f) for f in both]
-    out = []
-    for parts, fusion in zip(fused, both, strict=True):
-        mean, cov = mixed(parts, np.full(3, 1 / 3)).moments()
+    mixtures = [fuse_by_rules(f) for f in both]
+    divergences = []
+    for parts, fusion in zip(mixtures, both, strict=True):
+        mean, cov = mix(parts, np.full(3, 1 / 3)).moments()
         half = 4.2 * np.sqrt(np.diag(cov))
-        out.append(
+        divergences.append(
             [
                 v.value
                 for v in jeffreys_of_many(
@@ -163,10 +166,10 @@ def exactly(y: np.ndarray) -> np.ndarray:
                 )
             ]
         )
-    pairs = [[m.marginal([0, 1]) for m in pair] for pair in zip(*fused, strict=True)]
-    mean, cov = mixed([m for pair in pairs for m in pair], np.full(6, 1 / 6)).moments()
+    pairs = [[m.marginal([0, 1]) for m in pair] for pair in zip(*mixtures, strict=True)]
+    mean, cov = mix([m for pair in pairs for m in pair], np.full(6, 1 / 6)).moments()
     half = 4.2 * np.sqrt(np.diag(cov))
-    out.append(
+    divergences.append(
         [
             jeffreys_of_many(
                 a.log_density, [b.log_density], mean - half, mean + half, nodes=80
@@ -174,20 +177,21 @@ def exactly(y: np.ndarray) -> np.ndarray:
             for a, b in pairs
         ]
     )
-    return np.log(np.array(out).T / PRINTED)
+    return np.log(np.array(divergences).T / PRINTED)
 
 
-def factor(logs: np.ndarray) -> float:
-    """The largest of nine factors."""
+def largest_factor(logs: np.ndarray) -> float:
+    """Return the largest of nine factors."""
     return float(np.exp(np.abs(logs).max()))
 
 
-def evolved(
+def evolve(
     y: np.ndarray, u: Cubes, steps: int, spread: float, rng: np.random.Generator
 ) -> np.ndarray:
-    """Evolution with covariance adaptation (Hansen's rules) from a start; the best pair met."""
+    """Minimize by evolution with covariance adaptation (Hansen); return the best pair found."""
     n = y.size
     mu = OFFSPRING // 2
+    # Recombination weights and Hansen's default learning rates
     w = np.log(mu + 0.5) - np.log(np.arange(1, mu + 1))
     w /= w.sum()
     mass = 1 / (w**2).sum()
@@ -196,38 +200,45 @@ def evolved(
     damping = 1 + c_s + 2 * max(0.0, np.sqrt((mass - 1) / (n + 1)) - 1)
     c_1 = 2 / ((n + 1.3) ** 2 + mass)
     c_mu = min(1 - c_1, 2 * (mass - 2 + 1 / mass) / ((n + 2) ** 2 + mass))
+    # Expected norm of a standard normal vector
     usual = np.sqrt(n) * (1 - 1 / (4 * n) + 1 / (21 * n**2))
     cov = np.eye(n)
     path_s = np.zeros(n)
     path_c = np.zeros(n)
     best = y
-    least = factor(sampled(y, u))
+    least = largest_factor(log_ratios(y, u))
     for k in range(steps // OFFSPRING):
+        # Offspring: y + σ B D z
         values, axes = np.linalg.eigh(cov)
         lengths = np.sqrt(np.maximum(values, 1e-12))
         moves = (rng.standard_normal((OFFSPRING, n)) * lengths) @ axes.T
         costs = np.empty(OFFSPRING)
         for i, move in enumerate(moves):
-            logs = sampled(y + spread * move, u)
+            logs = log_ratios(y + spread * move, u)
             costs[i] = (logs**4).sum()
-            if factor(logs) < least:
+            if largest_factor(logs) < least:
                 best = y + spread * move
-                least = factor(logs)
+                least = largest_factor(logs)
+        # The weighted mean of the best half is the next start.
         order = np.argsort(costs)[:mu]
         move = w @ moves[order]
         y = y + spread * move
+        # Evolution path of the step size, in units of the covariance's inverse root
         path_s = (1 - c_s) * path_s + np.sqrt(c_s * (2 - c_s) * mass) * (
             axes @ (axes.T @ move / lengths)
         )
         size = np.linalg.norm(path_s) / np.sqrt(1 - (1 - c_s) ** (2 * (k + 1)))
+        # Evolution path of the covariance, stalled while steps are too long
         path_c = (1 - c_c) * path_c
         if size < (1.4 + 2 / (n + 1)) * usual:
             path_c += np.sqrt(c_c * (2 - c_c) * mass) * move
+        # Rank-one and rank-μ update
         cov = (
             (1 - c_1 - c_mu) * cov
             + c_1 * np.outer(path_c, path_c)
             + c_mu * (moves[order].T * w) @ moves[order]
         )
+        # The step size grows while successive steps agree.
         spread *= float(np.exp(c_s / damping * (np.linalg.norm(path_s) / usual - 1)))
     return best
 
@@ -237,55 +248,57 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     for_start, for_points, for_moves, for_scores = seed.spawn(4)
     kind = "far" if seed.spawn_key[0] < FAR else "near"
     rng = np.random.default_rng(for_start)
-    u = cubes(np.random.default_rng(for_points), POINTS)
+    u = draw_cubes(np.random.default_rng(for_points), POINTS)
     if kind == "far":
         names = (*SHAPES, *SHAPES, "distance", "turn")
         low, high = np.log([BOUNDS[name] for name in names]).T
         drawn = low + rng.random((DRAWN, 12)) * (high - low)
-        y = min(drawn, key=lambda one: float((sampled(one, u) ** 4).sum()))
+        y = min(drawn, key=lambda one: float((log_ratios(one, u) ** 4).sum()))
     else:
-        y = numbers() + AWAY * rng.standard_normal(12)
-    began = factor(sampled(y, u))
-    y = evolved(y, u, STEPS[kind], SPREAD[kind], np.random.default_rng(for_moves))
-    own = factor(sampled(y, u))
+        y = scenario_parameters() + AWAY * rng.standard_normal(12)
+    initial = largest_factor(log_ratios(y, u))
+    y = evolve(y, u, STEPS[kind], SPREAD[kind], np.random.default_rng(for_moves))
+    final = largest_factor(log_ratios(y, u))
     return {
         "far": float(kind == "far"),
-        "start": began,
-        "own": own,
-        **again(y, for_scores),
-        "exact": factor(exactly(y)),
+        "start": initial,
+        "own": final,
+        **rescore(y, for_scores),
+        "exact": largest_factor(log_ratios_by_quadrature(y)),
         **{f"y_{k}": float(v) for k, v in enumerate(y)},
     }
 
 
-def again(y: np.ndarray, seed: np.random.SeedSequence) -> dict[str, float]:
+def rescore(y: np.ndarray, seed: np.random.SeedSequence) -> dict[str, float]:
     """Scores of a pair on fresh places: the mean of a few, and on many."""
     rng = np.random.default_rng(seed)
-    fresh = [factor(sampled(y, cubes(rng, POINTS))) for _ in range(EACH)]
+    fresh = [
+        largest_factor(log_ratios(y, draw_cubes(rng, POINTS))) for _ in range(EACH)
+    ]
     return {
         "fresh": float(np.mean(fresh)),
-        "many": factor(sampled(y, cubes(rng, MANY))),
+        "many": largest_factor(log_ratios(y, draw_cubes(rng, MANY))),
     }
 
 
-def checked() -> Stored:
+def load_checked() -> Stored:
     """The stored searches, once the first and the last end score again as they did."""
-    whole = stored(PAPER, NAME)
+    study = stored(PAPER, NAME)
 
-    def scored(seed: np.random.SeedSequence) -> dict[str, float]:
-        row = seed.spawn_key[0]
-        y = np.array([whole.columns[f"y_{k}"][row] for k in range(12)])
-        return again(y, seed.spawn(4)[3])
+    def rescore_row(seed: np.random.SeedSequence) -> dict[str, float]:
+        index = seed.spawn_key[0]
+        y = np.array([study.columns[f"y_{k}"][index] for k in range(12)])
+        return rescore(y, seed.spawn(4)[3])
 
-    part = type(whole)(
-        whole.path,
-        whole.metadata,
-        whole.seeds,
-        whole.failures,
-        {name: whole.columns[name] for name in ("fresh", "many")},
+    part = type(study)(
+        study.path,
+        study.metadata,
+        study.seeds,
+        study.failures,
+        {name: study.columns[name] for name in ("fresh", "many")},
     )
-    check(part, scored, indices=[0, len(whole) - 1], rtol=rtol)
-    return whole
+    check(part, rescore_row, indices=[0, len(study) - 1], rtol=rtol)
+    return study
 
 
 columns = (
@@ -311,11 +324,19 @@ parameters = {
     "offspring": OFFSPRING,
     "shares": SHARES.tolist(),
 }
-code = (sampled, exactly, evolved, again, fusions, points, arcs.arc)
+code = (
+    log_ratios,
+    log_ratios_by_quadrature,
+    evolve,
+    rescore,
+    fusions,
+    map_to_points,
+    arcs.arc,
+)
 scenarios = (scenario("semeraro", "table-1"),)
 seeds = np.random.SeedSequence(707).spawn(FAR + NEAR)
 rtol = 1e-3
-# Which shapes least squares keep hangs on the last bit, and a search goes on from there.
+# The last bit decides which shapes least squares keep, and a search goes on from there.
 ill_conditioned = ("own", "fresh", "many", "exact", *(f"y_{k}" for k in range(12)))
 # A search from far may end at other numbers that are no worse.
 max_outliers = 2

@@ -42,13 +42,13 @@ swing = pendulum(
     gravity=setting["gravity"],
     step=setting["integration_step"],
 )
-seen_too = with_augmentation(etpf, rod, std=setting["constraint_std"])
+augmented_etpf = with_augmentation(etpf, rod, std=setting["constraint_std"])
 how = {"variant": setting["variant"], "regularisation": setting["regularisation"]}
 UPDATES = {
     "OTF": etpf,
-    "OTMA": seen_too,
+    "OTMA": augmented_etpf,
     "OTNLeq": with_projection(etpf, rod, **how),
-    "OTNLeqMA": with_projection(seen_too, rod, **how),
+    "OTNLeqMA": with_projection(augmented_etpf, rod, **how),
     "retraction": with_retraction(etpf, rod, motion=MOTION),
     "rejuvenated": with_retraction(
         partial(etpf, rejuvenation=REJUVENATION), rod, motion=MOTION
@@ -62,7 +62,7 @@ ALGORITHMS = ("OTF", "OTProj", "OTMA", "OTNLeq", "OTNLeqMA", *ON_CIRCLE)
 def data(
     rng: np.random.Generator, degrees=setting["start_angle"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """True states (T, 4), readings (T, 2), and first members (N, 4)."""
+    """Draw true states (T, 4), observations (T, 2), and initial members (N, 4)."""
     start = [np.deg2rad(degrees), setting["start_rate"]]
     state = pendulum_states(start, length=setting["length"])
     size = setting["prior_std"]
@@ -86,32 +86,32 @@ def run(
     draws=0,
     model=swing,
 ):
-    """Analysis members of several filters side by side, (T, F, N, 4); NaN after a failure.
+    """Run several filters side by side; return members (T, F, N, 4), NaN after a failure.
 
     `draws` seeds the draws of rejuvenation; no other update here draws.
     """
     rng = np.random.default_rng(draws)
-    inner = [updates[name] for name in names]
-    x = np.stack([members] * len(inner))
-    out = np.full((len(readings), *x.shape), np.nan)
-    alive = np.ones(len(inner), dtype=bool)
+    chosen = [updates[name] for name in names]
+    x = np.stack([members] * len(chosen))
+    analysis = np.full((len(readings), *x.shape), np.nan)
+    alive = np.ones(len(chosen), dtype=bool)
     with np.errstate(all="ignore"):
         for k, y in enumerate(readings):
             x = model.transition(x, 0.0, DT)
             for f in np.flatnonzero(alive):
                 try:
-                    x[f] = inner[f](x[f], x[f, :, :2], y, NOISE, rng=rng)
+                    x[f] = chosen[f](x[f], x[f, :, :2], y, NOISE, rng=rng)
                     alive[f] = np.isfinite(x[f]).all()
                 except (ValueError, RuntimeError, ArithmeticError):
                     alive[f] = False
                 if not alive[f]:
                     x[f] = members  # something finite for the model; not recorded
-            out[k] = np.where(alive[:, None, None], x, np.nan)
-    return out
+            analysis[k] = np.where(alive[:, None, None], x, np.nan)
+    return analysis
 
 
 def estimates(members: np.ndarray, name: str) -> np.ndarray:
-    """What is reported: the mean; on the manifold the retracted mean."""
+    """Return the reported state: the mean, retracted for filters on the manifold."""
     mean = members.mean(axis=-2)
     if name in ON_CIRCLE and np.isfinite(mean).all():
         return retract(mean, rod, motion=MOTION)
@@ -119,55 +119,60 @@ def estimates(members: np.ndarray, name: str) -> np.ndarray:
 
 
 def scores(name: str, members: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """Of one filter's members (T, N, 4): errors, spreads, divergence, and the traced error."""
+    """Return errors, spreads, divergence and the traced error of one filter's members (T, N, 4)."""
     mean = estimates(members, name)
-    missed = np.abs(np.hypot(mean[:, 0], mean[:, 1]) - setting["length"])
-    missed = np.where(missed < 1e-14, 0.0, missed)  # rounding is no number to store
-    gap = mean - truth
+    length_error = np.abs(np.hypot(mean[:, 0], mean[:, 1]) - setting["length"])
+    length_error = np.where(
+        length_error < 1e-14, 0.0, length_error
+    )  # rounding is no number to store
+    error = mean - truth
     late = TIMES > setting["score_from"] + 1e-9
     spread = np.sqrt(members[late].var(axis=1, ddof=1).mean(axis=0))
-    away = (np.hypot(gap[:, 0], gap[:, 1]) > 0.3) & (TIMES > 1 + 1e-9)
-    around = members[late][:, :, :2] - members[late][:, :, :2].mean(
+    # Diverged: farther than 0.3 m from the truth after the first second
+    lost = (np.hypot(error[:, 0], error[:, 1]) > 0.3) & (TIMES > 1 + 1e-9)
+    anomalies = members[late][:, :, :2] - members[late][:, :, :2].mean(
         axis=1, keepdims=True
     )
-    cov = np.swapaxes(around, 1, 2) @ around / (members.shape[1] - 1)
+    # NEES of the position, by the members' covariance
+    cov = np.swapaxes(anomalies, 1, 2) @ anomalies / (members.shape[1] - 1)
     nees = np.nan
     if np.isfinite(cov).all() and np.linalg.det(cov).min() > 1e-30:
-        solved = np.linalg.solve(cov, gap[late, :2, None])[..., 0]
-        nees = float((gap[late, :2] * solved).sum(axis=1).mean() / 2)
-    found = {
-        "constraint": np.sqrt((missed**2).mean()),
-        "growth": missed[TIMES > 9 + 1e-9].mean()
-        / missed[(TIMES > 1 + 1e-9) & (TIMES < 2 + 1e-9)].mean(),
-        "position": np.sqrt((gap[late, :2] ** 2).sum(axis=1).mean()),
-        "velocity": np.sqrt((gap[late, 2:] ** 2).sum(axis=1).mean()),
+        solved = np.linalg.solve(cov, error[late, :2, None])[..., 0]
+        nees = float((error[late, :2] * solved).sum(axis=1).mean() / 2)
+    values = {
+        "constraint": np.sqrt((length_error**2).mean()),
+        "growth": length_error[TIMES > 9 + 1e-9].mean()
+        / length_error[(TIMES > 1 + 1e-9) & (TIMES < 2 + 1e-9)].mean(),
+        "position": np.sqrt((error[late, :2] ** 2).sum(axis=1).mean()),
+        "velocity": np.sqrt((error[late, 2:] ** 2).sum(axis=1).mean()),
         "spread": np.hypot(*spread[:2]),
         "spread_velocity": np.hypot(*spread[2:]),
         "nees": nees,
-        "ratio_yx": np.sqrt((gap[60:, 1] ** 2).mean() / (gap[60:, 0] ** 2).mean()),
-        "diverged": float(away.any() or not np.isfinite(gap).all()),
-        "onset": TIMES[away.argmax()] if away.any() else np.nan,
-        "finite": float(np.isfinite(gap).all()),
+        "ratio_yx": np.sqrt((error[60:, 1] ** 2).mean() / (error[60:, 0] ** 2).mean()),
+        "diverged": float(lost.any() or not np.isfinite(error).all()),
+        "onset": TIMES[lost.argmax()] if lost.any() else np.nan,
+        "finite": float(np.isfinite(error).all()),
     }
-    traced = np.sqrt((missed.reshape(-1, 20) ** 2).mean(axis=1))
-    found |= {f"trace{h:02d}": traced[h] for h in TRACED}
-    return {f"{name}_{key}": float(value) for key, value in found.items()}
+    # Root-mean-square constraint error over spans of twenty observations
+    traced = np.sqrt((length_error.reshape(-1, 20) ** 2).mean(axis=1))
+    values |= {f"trace{h:02d}": traced[h] for h in TRACED}
+    return {f"{name}_{key}": float(value) for key, value in values.items()}
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """All algorithms on one run."""
     truth, readings, members = data(np.random.default_rng(seed))
     draws = np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, 0))
-    found = run(readings, members, draws=draws)
-    found = dict(zip(UPDATES, np.moveaxis(found, 1, 0), strict=True))
+    analysis = run(readings, members, draws=draws)
+    analysis = dict(zip(UPDATES, np.moveaxis(analysis, 1, 0), strict=True))
     with np.errstate(all="ignore"):
-        whole = np.isfinite(found["OTF"]).all(axis=(1, 2))
-        found["OTProj"] = found["OTF"].copy()
-        found["OTProj"][whole] = project(found["OTF"][whole], rod, **how)
+        finite = np.isfinite(analysis["OTF"]).all(axis=(1, 2))
+        analysis["OTProj"] = analysis["OTF"].copy()
+        analysis["OTProj"][finite] = project(analysis["OTF"][finite], rod, **how)
         return {
             k: v
             for name in ALGORITHMS
-            for k, v in scores(name, found[name], truth).items()
+            for k, v in scores(name, analysis[name], truth).items()
         }
 
 
@@ -194,6 +199,6 @@ columns = tuple(
 code = (data, run, estimates, scores)
 seeds = np.random.SeedSequence(2024).spawn(setting["runs"])
 rtol = 1e-4
-# A run that has lost the swing multiplies the last bit until it decides, also whether OTNLeq
-# overflows: on three kinds of processor seven or eight of the hundred runs were other ones.
+# Once a run has lost the swing the last bit decides its path, and whether OTNLeq overflows: on
+# three kinds of processor seven or eight of the hundred runs differed.
 max_outliers = 10

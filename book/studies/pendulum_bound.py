@@ -62,13 +62,13 @@ options = {
 }
 cartesian = pendulum(**options)
 chart = pendulum_angle(**options)
-seen_too = with_augmentation(etpf, rod, std=setting["constraint_std"])
+augmented_etpf = with_augmentation(etpf, rod, std=setting["constraint_std"])
 how = {"variant": setting["variant"], "regularisation": setting["regularisation"]}
 CARTESIAN = {
     "OTF": etpf,
-    "OTMA": seen_too,
+    "OTMA": augmented_etpf,
     "OTNLeq": with_projection(etpf, rod, **how),
-    "OTNLeqMA": with_projection(seen_too, rod, **how),
+    "OTNLeqMA": with_projection(augmented_etpf, rod, **how),
     "OT_retracted": with_retraction(etpf, rod, motion=motion),
     "EnKF_retracted": with_retraction(enkf, rod, motion=motion),
     "EnKF": enkf,
@@ -86,7 +86,7 @@ MIRRORED = {
 FILTERS = (*CARTESIAN, *CHART, "EKF_chart", "bound")
 
 
-def place(q: np.ndarray) -> np.ndarray:
+def to_cartesian(q: np.ndarray) -> np.ndarray:
     """Cartesian states of chart coordinates."""
     return pendulum_states(q, length=LENGTH)
 
@@ -99,11 +99,13 @@ def data(rng: np.random.Generator, noisy: bool, prior=PRIOR) -> tuple[np.ndarray
     for k in range(STEPS):
         state = chart.step(state, 0.0, DT) + noisy * KICK * rng.standard_normal(2)
         truth[k] = state
-    seen = place(truth)[:, :2] + np.sqrt(NOISE[0, 0]) * rng.standard_normal((STEPS, 2))
+    seen = to_cartesian(truth)[:, :2] + np.sqrt(NOISE[0, 0]) * rng.standard_normal(
+        (STEPS, 2)
+    )
     return truth, seen, centre
 
 
-def many(seeds) -> tuple[np.ndarray, np.ndarray]:
+def simulate_many(seeds) -> tuple[np.ndarray, np.ndarray]:
     """The noisy case of many runs at once: true chart states (T, R, 2) and readings (T, R, 2)."""
     drawn = []
     for seed in seeds:
@@ -116,14 +118,16 @@ def many(seeds) -> tuple[np.ndarray, np.ndarray]:
     truth = np.empty((STEPS, len(first), 2))
     for k in range(STEPS):
         state = truth[k] = chart.step(state, 0.0, DT) + KICK * kicks[:, k]
-    return truth, place(truth)[..., :2] + np.sqrt(NOISE[0, 0]) * errors.swapaxes(0, 1)
+    return truth, to_cartesian(truth)[..., :2] + np.sqrt(NOISE[0, 0]) * errors.swapaxes(
+        0, 1
+    )
 
 
-def ensembles(updates, members, model, see, readings, noise, noisy, rng):
+def run_ensembles(updates, members, model, see, readings, noise, noisy, rng):
     """Analysis members of filters with one model, {name: (T, N, d)}."""
     inner = {name: update for name, update in updates.items()}
     x = np.stack([members] * len(inner))
-    out = np.full((STEPS, *x.shape), np.nan)
+    analysis = np.full((STEPS, *x.shape), np.nan)
     kick = np.repeat(KICK, x.shape[-1] // 2)
     with np.errstate(all="ignore"):
         for k, y in enumerate(readings):
@@ -136,16 +140,17 @@ def ensembles(updates, members, model, see, readings, noise, noisy, rng):
                         x[f] = update(x[f], see(x[f]), y, noise, rng=rng)
                     except (ValueError, RuntimeError, ArithmeticError):
                         x[f] = np.nan
-            out[k] = x
-    return dict(zip(inner, np.moveaxis(out, 1, 0), strict=True))
+            analysis[k] = x
+    return dict(zip(inner, np.moveaxis(analysis, 1, 0), strict=True))
 
 
-def extended(readings, centre, noisy, rng):
-    """The extended Kalman filter in the chart; draws of its Gaussian stand for members."""
+def run_ekf(readings, centre, noisy, rng):
+    """Run the extended Kalman filter in the chart; draws of its Gaussian stand for members."""
     m = centre
     p = setting["prior_std"] ** 2 * np.eye(2)
-    out = []
+    draws_over_time = []
     draws = rng.standard_normal((N, 2))
+    # Draws with mean zero and unit sample covariance
     draws = (draws - draws.mean(axis=0)) @ np.linalg.inv(
         np.linalg.cholesky(np.cov(draws.T))
     ).T
@@ -153,109 +158,119 @@ def extended(readings, centre, noisy, rng):
         f = chart.jacobian(m, 0.0, DT)
         m = chart.step(m, 0.0, DT)
         p = f @ p @ f.T + noisy * np.diag(KICK**2)
+        # Jacobian of the position in the angle
         h = LENGTH * np.array([[np.cos(m[0]), 0.0], [-np.sin(m[0]), 0.0]])
         gain = np.linalg.solve(h @ p @ h.T + NOISE, h @ p).T
-        m = m + gain @ (y - place(m)[:2])
+        m = m + gain @ (y - to_cartesian(m)[:2])
         p = (np.eye(2) - gain @ h) @ p
         p = 0.5 * (p + p.T)
-        out.append(m + draws @ np.linalg.cholesky(p).T)
-    return np.array(out)
+        draws_over_time.append(m + draws @ np.linalg.cholesky(p).T)
+    return np.array(draws_over_time)
 
 
-KEPT: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-"""What `paths` found. A function with a cache of its own could not be sent to a worker."""
+CACHE: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+"""Results of `motion_grid`. A function with a cache could not be sent to a worker."""
 
 
-def paths() -> tuple[np.ndarray, np.ndarray]:
+def motion_grid() -> tuple[np.ndarray, np.ndarray]:
     """A grid of initial conditions (G, 2), and where each is at every time, (T, G, 2)."""
-    if CELLS in KEPT:
-        return KEPT[CELLS]
+    if CELLS in CACHE:
+        return CACHE[CELLS]
     side = REACH * np.linspace(-1, 1, CELLS)
     grid = START + np.stack(np.meshgrid(side, side, indexing="ij"), axis=-1).reshape(
         -1, 2
     )
     x = grid
-    out = np.empty((STEPS, len(grid), 2), dtype=np.float32)
+    path = np.empty((STEPS, len(grid), 2), dtype=np.float32)
     for k in range(STEPS):
-        x = out[k] = chart.transition(x.copy(), 0.0, DT)
-    KEPT[CELLS] = grid, out
-    return grid, out
+        x = path[k] = chart.transition(x.copy(), 0.0, DT)
+    CACHE[CELLS] = grid, path
+    return grid, path
 
 
 def grid_bound(readings, centre, rng):
-    """Draws of the posterior of the motion without noise, (T, 400, 2)."""
-    grid, path = paths()
+    """Draw from the posterior of the motion without noise, (T, 400, 2)."""
+    grid, path = motion_grid()
+    # Initial conditions far outside the prior are left out.
     logs = -0.5 * ((grid - centre) ** 2).sum(axis=1) / setting["prior_std"] ** 2
-    kept = np.flatnonzero(logs > -18)
-    logs = logs[kept]
-    out = []
+    likely = np.flatnonzero(logs > -18)
+    logs = logs[likely]
+    draws = []
     for k, y in enumerate(readings):
-        here = path[k, kept].astype(np.float64)
-        gap = LENGTH * np.column_stack([np.sin(here[:, 0]), np.cos(here[:, 0])]) - y
-        logs = logs - 0.5 * (gap**2).sum(axis=1) / NOISE[0, 0]
+        states = path[k, likely].astype(np.float64)
+        residual = (
+            LENGTH * np.column_stack([np.sin(states[:, 0]), np.cos(states[:, 0])]) - y
+        )
+        logs = logs - 0.5 * (residual**2).sum(axis=1) / NOISE[0, 0]
         w = np.exp(logs - logs.max())
+        # Quantiles of the weights: 400 draws without chance
         levels = (np.arange(400) + 0.5) / 400
-        picked = np.searchsorted(np.cumsum(w) / w.sum(), levels)
-        out.append(here[np.minimum(picked, len(here) - 1)])
-    return np.array(out)
+        indices = np.searchsorted(np.cumsum(w) / w.sum(), levels)
+        draws.append(states[np.minimum(indices, len(states) - 1)])
+    return np.array(draws)
 
 
 def particle_bound(readings, members, see, noise, rng):
-    """A bootstrap filter with many particles in the chart, (T, P, 2)."""
+    """Run a bootstrap filter with many particles in the chart, (T, P, 2)."""
     x = members
-    out = []
+    draws = []
     for y in readings:
         x = chart.transition(x, 0.0, DT) + KICK * rng.standard_normal(x.shape)
         logs = -0.5 * ((see(x) - y) ** 2).sum(axis=1) / noise[0, 0]
         w = np.exp(logs - logs.max())
         x = x[resample(w / w.sum(), rng=rng)]
-        out.append(x)
-    return np.array(out)
+        draws.append(x)
+    return np.array(draws)
 
 
-def score(members: np.ndarray, truth: np.ndarray) -> float:
-    """CRPS of one component, mean over time; of at most 200 members or a few more."""
-    some = members[:, :: max(1, members.shape[1] // 200)]
-    return float(np.mean([crps(m, t) for m, t in zip(some, truth, strict=True)]))
+def mean_crps(members: np.ndarray, truth: np.ndarray) -> float:
+    """Return the CRPS of one component, mean over time, of about 200 members at most."""
+    thinned = members[:, :: max(1, members.shape[1] // 200)]
+    return float(np.mean([crps(m, t) for m, t in zip(thinned, truth, strict=True)]))
 
 
 def scores(name, members, truth) -> dict[str, float]:
-    """Of one filter's members, in the chart (T, N, 2) or Cartesian (T, N, 4)."""
-    aim = place(truth)[LATE]
-    own = members[LATE]
-    flat = members.shape[-1] == 2
-    states = place(own) if flat else own
+    """Return the scores of one filter's members, in the chart (T, N, 2) or Cartesian (T, N, 4)."""
+    target = to_cartesian(truth)[LATE]
+    late_members = members[LATE]
+    in_chart = members.shape[-1] == 2
+    states = to_cartesian(late_members) if in_chart else late_members
     mean = states.mean(axis=1)
     if not np.isfinite(mean).all():
         return {f"{name}_{key}": np.nan for key in SCORES}
-    missed = np.abs(np.hypot(mean[:, 0], mean[:, 1]) - LENGTH)
-    if flat or "retracted" in name:
+    length_error = np.abs(np.hypot(mean[:, 0], mean[:, 1]) - LENGTH)
+    if in_chart or "retracted" in name:
         mean = retract(mean, rod, motion=motion)
-        missed = np.abs(np.hypot(mean[:, 0], mean[:, 1]) - LENGTH)
-    missed = np.where(missed < 1e-14, 0.0, missed)  # rounding is no number to store
-    gap = mean - aim
-    q = own if flat else pendulum_chart(own)
-    off = (q.mean(axis=1) - truth[LATE] + np.pi) % (2 * np.pi) - np.pi
+        length_error = np.abs(np.hypot(mean[:, 0], mean[:, 1]) - LENGTH)
+    length_error = np.where(
+        length_error < 1e-14, 0.0, length_error
+    )  # rounding is no number to store
+    error = mean - target
+    q = late_members if in_chart else pendulum_chart(late_members)
+    # The angle's error, wrapped to (-π, π]
+    chart_error = (q.mean(axis=1) - truth[LATE] + np.pi) % (2 * np.pi) - np.pi
     spread = q.std(axis=1, ddof=1)
-    angle = np.sqrt((off[:, 0] ** 2).mean())
-    found = {
-        "constraint": np.sqrt((missed**2).mean()),
-        "position": np.sqrt((gap[:, :2] ** 2).sum(axis=1).mean()),
-        "velocity": np.sqrt((gap[:, 2:] ** 2).sum(axis=1).mean()),
+    angle = np.sqrt((chart_error[:, 0] ** 2).mean())
+    values = {
+        "constraint": np.sqrt((length_error**2).mean()),
+        "position": np.sqrt((error[:, :2] ** 2).sum(axis=1).mean()),
+        "velocity": np.sqrt((error[:, 2:] ** 2).sum(axis=1).mean()),
         "honest": np.sqrt((spread[:, 0] ** 2).mean()) / angle,
-        "nees": float(np.mean((off[:, 0] / np.maximum(spread[:, 0], 1e-12)) ** 2)),
-        "crps": score(q[..., :1], truth[LATE, :1]),
+        "nees": float(
+            np.mean((chart_error[:, 0] / np.maximum(spread[:, 0], 1e-12)) ** 2)
+        ),
+        "crps": mean_crps(q[..., :1], truth[LATE, :1]),
     }
-    return {f"{name}_{key}": float(value) for key, value in found.items()}
+    return {f"{name}_{key}": float(value) for key, value in values.items()}
 
 
-def case(noisy: bool, rng: np.random.Generator) -> dict[str, float]:
-    """All filters on one run of the two cases with a whole position."""
+def run_case(noisy: bool, rng: np.random.Generator) -> dict[str, float]:
+    """Run all filters once, in a case whose whole position is observed."""
     truth, seen, centre = data(rng, noisy)
     first = centre + setting["prior_std"] * rng.standard_normal((PARTICLES, 2))
-    found = ensembles(
+    analysis = run_ensembles(
         CARTESIAN,
-        place(first[:N]),
+        to_cartesian(first[:N]),
         cartesian,
         lambda x: x[:, :2],
         seen,
@@ -263,32 +278,35 @@ def case(noisy: bool, rng: np.random.Generator) -> dict[str, float]:
         noisy,
         rng,
     )
-    see = lambda q: place(q)[:, :2]  # noqa: E731
-    found |= ensembles(CHART, first[:N], chart, see, seen, NOISE, noisy, rng)
-    found["EKF_chart"] = extended(seen, centre, noisy, rng)
-    found["bound"] = (
+    see = lambda q: to_cartesian(q)[:, :2]  # noqa: E731
+    analysis |= run_ensembles(CHART, first[:N], chart, see, seen, NOISE, noisy, rng)
+    analysis["EKF_chart"] = run_ekf(seen, centre, noisy, rng)
+    analysis["bound"] = (
         particle_bound(seen, first, see, NOISE, rng)
         if noisy
         else grid_bound(seen, centre, rng)
     )
-    out: dict[str, float] = {}
+    values: dict[str, float] = {}
     for name in FILTERS:
-        out |= scores(name, found[name], truth)
-    return out
+        values |= scores(name, analysis[name], truth)
+    return values
 
 
-def mirror(rng: np.random.Generator) -> dict[str, float]:
-    """CRPS of x when only its absolute value is seen, from a prior around the vertical."""
+def run_mirror(rng: np.random.Generator) -> dict[str, float]:
+    """Return the CRPS of x when only |x| is observed, from a prior about the vertical."""
     truth, seen, _ = data(rng, True, MIRROR)
     readings = np.abs(seen[:, :1])
     noise = NOISE[:1, :1]
     first = MIRROR[0] + MIRROR[1] * rng.standard_normal((PARTICLES, 2))
-    see = lambda q: np.abs(place(q)[:, :1])  # noqa: E731
-    found = ensembles(MIRRORED, first[:N], chart, see, readings, noise, True, rng)
-    found["bound"] = particle_bound(readings, first, see, noise, rng)
-    x = place(truth)[LATE, :1]
+    see = lambda q: np.abs(to_cartesian(q)[:, :1])  # noqa: E731
+    analysis = run_ensembles(
+        MIRRORED, first[:N], chart, see, readings, noise, True, rng
+    )
+    analysis["bound"] = particle_bound(readings, first, see, noise, rng)
+    x = to_cartesian(truth)[LATE, :1]
     return {
-        f"{name}_crps": score(place(q[LATE])[..., :1], x) for name, q in found.items()
+        f"{name}_crps": mean_crps(to_cartesian(q[LATE])[..., :1], x)
+        for name, q in analysis.items()
     }
 
 
@@ -296,21 +314,21 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One run of every case."""
     streams = [np.random.default_rng(s) for s in seed.spawn(3)]
     cases = {
-        "still": case(False, streams[0]),
-        "noisy": case(True, streams[1]),
-        "mirror": mirror(streams[2]),
+        "still": run_case(False, streams[0]),
+        "noisy": run_case(True, streams[1]),
+        "mirror": run_mirror(streams[2]),
     }
     return {
-        f"{which}_{key}": v
-        for which, found in cases.items()
-        for key, v in found.items()
+        f"{name}_{key}": v
+        for name, values in cases.items()
+        for key, v in values.items()
     }
 
 
 def noisy_part(seed: np.random.SeedSequence) -> dict[str, float]:
     """The noisy case of a trial alone, which takes a fifth of its time."""
-    found = case(True, np.random.default_rng(seed.spawn(3)[1]))
-    return {f"noisy_{key}": value for key, value in found.items()}
+    values = run_case(True, np.random.default_rng(seed.spawn(3)[1]))
+    return {f"noisy_{key}": value for key, value in values.items()}
 
 
 SCORES = ("constraint", "position", "velocity", "honest", "nees", "crps")
@@ -328,17 +346,17 @@ columns = (
 )
 code = (
     data,
-    ensembles,
-    extended,
-    paths,
+    run_ensembles,
+    run_ekf,
+    motion_grid,
     grid_bound,
     particle_bound,
-    score,
+    mean_crps,
     scores,
-    case,
-    mirror,
+    run_case,
+    run_mirror,
 )
 seeds = np.random.SeedSequence(4096).spawn(RUNS)
 rtol = 1e-3
-# Folded readings leave two swings, and which of them small ensembles keep hangs on the last bit.
+# Folded observations leave two swings; the last bit decides which one a small ensemble keeps.
 max_outliers = 8

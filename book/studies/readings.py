@@ -1,4 +1,4 @@
-"""Other readings of what stands behind Fig. 1 of Grange et al.
+"""Other interpretations of the set-up of Fig. 1 of Grange et al.
 
 The truth moves without process noise, as Section V.B can be read; the predicted observations carry
 no noise or a hundredth of the stated; the orbital rate is the printed one or that of the printed
@@ -31,40 +31,49 @@ parameters = {"batch": BATCH, "seed": 2024, "orbit": ORBIT, "factors": FACTORS}
 seeds = np.random.SeedSequence(satellites.SEED).spawn(SETUP.runs // BATCH)
 scenarios = (SETUP.scenario,)
 rtol = 1e-3
-# At this rate a version runs away, and which way hangs on the last bit.
+# At this rate a version diverges, and the last bit decides in which direction.
 ill_conditioned = [name for name in columns if name.startswith("orbit")]
 max_outliers = 2
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
-    """A batch of runs of every reading, on the same data at each rate."""
+    """Run a batch under every interpretation, on the same data at each rate."""
     for_data, for_filters = seed.spawn(2)
-    out: dict[str, float] = {}
+    values: dict[str, float] = {}
     for rate, s in SETUPS.items():
-        truth, seen = satellites.data(
+        truth, seen = satellites.draw_data(
             s, np.random.default_rng(for_data), (BATCH,), noisy=False
         )
         for noise, factor in FACTORS.items():
             for v, pca in VERSIONS.items():
-                f = satellites.published(s, pca=pca, noise_factor=factor)
-                result = satellites.run(
+                f = satellites.paper_filter(s, pca=pca, noise_factor=factor)
+                result = satellites.run_filter(
                     s, f, for_filters, truth, seen, ("squared_error",)
                 )
                 name = f"{rate}_{noise}_{v}"
-                out |= satellites.scored(s, name, result, each_agent=False)
-    return out
+                values |= satellites.score_runs(s, name, result, each_agent=False)
+    return values
 
 
 def part(seed: np.random.SeedSequence) -> dict[str, float]:
-    """A reading that does not run away, as in the trial, for chapter 4 to run again."""
+    """Run an interpretation that does not diverge, as in the trial, for chapter 4 to check."""
     for_data, for_filters = seed.spawn(2)
-    truth, seen = satellites.data(
+    truth, seen = satellites.draw_data(
         SETUP, np.random.default_rng(for_data), (BATCH,), noisy=False
     )
-    for_filters.spawn(3)  # of the three readings before it
-    f = satellites.published(SETUP, pca=True, noise_factor=FACTORS["hundredth"])
-    result = satellites.run(SETUP, f, for_filters, truth, seen, ("squared_error",))
-    return satellites.scored(SETUP, "printed_hundredth_pca", result, each_agent=False)
+    for_filters.spawn(3)  # of the three interpretations before it
+    f = satellites.paper_filter(SETUP, pca=True, noise_factor=FACTORS["hundredth"])
+    result = satellites.run_filter(
+        SETUP, f, for_filters, truth, seen, ("squared_error",)
+    )
+    return satellites.score_runs(
+        SETUP, "printed_hundredth_pca", result, each_agent=False
+    )
 
 
-code = (satellites.data, satellites.published, satellites.noise_free, satellites.scored)
+code = (
+    satellites.draw_data,
+    satellites.paper_filter,
+    satellites.noise_free_update,
+    satellites.score_runs,
+)

@@ -68,47 +68,52 @@ ill_conditioned = [
 ]
 
 
-def scores(
-    exact: list[PartialFusion], pair: list[GaussianMixture], first: int
+def divergences(
+    fusions: list[PartialFusion], pair: list[GaussianMixture], first: int
 ) -> list[float]:
     """Both agents' divergences from the exact density, and that of their targets."""
-    out = [
+    values = [
         jeffreys_by_sampling(
             m.log_density,
             f.log_value,
-            arcs.both(m, f.own, 0.8),
+            arcs.mix(m, f.own, 0.8),
             members=MEMBERS,
             rng=np.random.default_rng(first + k),
         ).value
-        for k, (f, m) in enumerate(zip(exact, pair, strict=True))
+        for k, (f, m) in enumerate(zip(fusions, pair, strict=True))
     ]
     a, b = (m.marginal([0, 1]) for m in pair)
-    apart = jeffreys_by_sampling(
+    target_divergence = jeffreys_by_sampling(
         a.log_density,
         b.log_density,
-        arcs.both(a, b, 0.5),
+        arcs.mix(a, b, 0.5),
         members=MEMBERS,
         rng=np.random.default_rng(first + 2),
     )
-    return [*out, apart.value]
+    return [*values, target_divergence.value]
 
 
-def reduced(
-    exact: list[PartialFusion], said: list[GaussianMixture], threshold: float
+def reduce_shapes(
+    fusions: list[PartialFusion], marginals: list[GaussianMixture], threshold: float
 ) -> dict[str, list[ComponentShapes]]:
     """Both agents' shapes by each rule, of the sizes that the relevance rule leaves."""
-    kept = [merge_irrelevant(said[k], said[1 - k], threshold=threshold) for k in (0, 1)]
-    merged = [runnalls(m, k.n_components) for m, k in zip(said, kept, strict=True)]
+    relevant = [
+        merge_irrelevant(marginals[k], marginals[1 - k], threshold=threshold)
+        for k in (0, 1)
+    ]
+    merged = [
+        runnalls(m, k.n_components) for m, k in zip(marginals, relevant, strict=True)
+    ]
     shapes = {
         name: [
-            exact[k].component_shapes(terms="all", marginal=r[k], received=[r[1 - k]])
+            fusions[k].component_shapes(terms="all", marginal=r[k], received=[r[1 - k]])
             for k in (0, 1)
         ]
-        for name, r in (("relevance", kept), ("runnalls", merged))
+        for name, r in (("relevance", relevant), ("runnalls", merged))
     }
     shapes["qr"] = [
         pivoted_qr(f.component_shapes(terms="all"), n_components=s.n_components)
-        for f, s in zip(exact, shapes["relevance"], strict=True)
+        for f, s in zip(fusions, shapes["relevance"], strict=True)
     ]
     return shapes
 
@@ -117,27 +122,29 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One pair, reduced in three ways by each of two factors."""
     for_pair, for_points = (np.random.default_rng(s) for s in seed.spawn(2))
     turn = for_pair.uniform(*arcs.BOUNDS["turn"])
-    own = [arcs.belief(b, for_pair, mixands=MIXANDS) for b in (np.pi, np.pi + turn)]
-    said = [m.marginal([0, 1]) for m in own]
-    exact = [PartialFusion(own[k], said[1 - k], omega=OMEGA) for k in (0, 1)]
-    first = int(for_points.integers(2**31))
-    out = {}
+    beliefs = [
+        arcs.draw_belief(b, for_pair, mixands=MIXANDS) for b in (np.pi, np.pi + turn)
+    ]
+    marginals = [m.marginal([0, 1]) for m in beliefs]
+    fusions = [PartialFusion(beliefs[k], marginals[1 - k], omega=OMEGA) for k in (0, 1)]
+    first_seed = int(for_points.integers(2**31))
+    values = {}
     for name, threshold in THRESHOLDS.items():
-        for rule, shapes in reduced(exact, said, threshold).items():
-            fused = [f.assign_weights(s) for f, s in zip(exact, shapes, strict=True)]
+        for rule, shapes in reduce_shapes(fusions, marginals, threshold).items():
+            fused = [f.assign_weights(s) for f, s in zip(fusions, shapes, strict=True)]
             for k, value in zip(
-                (1, 2, "target"), scores(exact, fused, first), strict=True
+                (1, 2, "target"), divergences(fusions, fused, first_seed), strict=True
             ):
-                out[f"{name}_{rule}_{k}"] = value
+                values[f"{name}_{rule}_{k}"] = value
         for k in (0, 1):
-            left = merge_irrelevant(
-                said[k], said[1 - k], threshold=threshold
+            size = merge_irrelevant(
+                marginals[k], marginals[1 - k], threshold=threshold
             ).n_components
-            out |= {
-                f"{name}_to_{k + 1}": float(left),
-                f"from_{k + 1}": float(said[k].n_components),
+            values |= {
+                f"{name}_to_{k + 1}": float(size),
+                f"from_{k + 1}": float(marginals[k].n_components),
             }
-    return out
+    return values
 
 
-code = (arcs.belief, arcs.both, scores, reduced)
+code = (arcs.draw_belief, arcs.mix, divergences, reduce_shapes)

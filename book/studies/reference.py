@@ -3,7 +3,7 @@
 Only the angle is not linear, and the motion along the orbit's normal does not couple to the rest.
 So particles hold (z, vz), drawn given the velocity that is read; each carries a Gaussian of the
 plane (x, y, vx, vy) of its own, which takes positions and velocities as a Kalman filter does, and
-what the angle says about y by quadrature. All particles share the plane's covariance, the mean of
+the angle's likelihood of y by quadrature. All particles share the plane's covariance, the mean of
 theirs: that is all that is approximated. Two filters run with draws of their own; half the
 distance of their means tells how much chance is left.
 
@@ -61,10 +61,10 @@ scenarios = (SETUP.scenario,)
 rtol = 1e-4
 
 
-def guided(
+def run_particles(
     seen: list[np.ndarray], rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Means (T, 2, R, 6) of two filters, covariances (T, R, 6, 6) of both, effective shares."""
+    """Run two filters; return means (T, 2, R, 6), covariances (T, R, 6, 6), effective shares."""
     n = parameters["particles"] // 2
     lead = (2, seen[0].shape[1])
     dt = float(SETUP.times[0])
@@ -101,14 +101,14 @@ def guided(
         log = log - 0.5 * gap**2 / s
         z = z + gap[..., None] * spread[:, 1] / s
         root = factor(spread - np.outer(spread[:, 1], spread[1]) / s)
-        m, z, log = chosen(m, z, log, rng)
+        m, z, log = resample_poor(m, z, log, rng)
         z = z + rng.standard_normal(z.shape) @ root.T
-        m, p, log = sighted(m, p, z, log, seen[1][k][..., None], stds[1])
-        w = normal(log)
+        m, p, log = update_angle(m, p, z, log, seen[1][k][..., None], stds[1])
+        w = normalize_logs(log)
         x = np.concatenate([m, z], axis=-1)
         means.append(np.einsum("hrn,hrnj->hrj", w, x))
-        apart = x - means[-1].mean(axis=0)[:, None]
-        cov = np.einsum("hrni,hrnj->rij", 0.5 * w[..., None] * apart, apart)
+        anomalies = x - means[-1].mean(axis=0)[:, None]
+        cov = np.einsum("hrni,hrnj->rij", 0.5 * w[..., None] * anomalies, anomalies)
         cov[:, :4, :4] += p.mean(axis=0)
         covs.append(cov)
         shares.append(1 / (w**2).sum(axis=-1).max(axis=0) / n)
@@ -120,11 +120,11 @@ def guided(
     )
 
 
-def chosen(
+def resample_poor(
     m: np.ndarray, z: np.ndarray, log: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Resample where fewer than half of the particles count."""
-    w = normal(log)
+    """Resample where the effective sample size is below one half."""
+    w = normalize_logs(log)
     n = log.shape[-1]
     poor = (w**2).sum(axis=-1) > 2 / n
     if poor.any():
@@ -138,7 +138,7 @@ def chosen(
     return m, z, log
 
 
-def sighted(
+def update_angle(
     m: np.ndarray,
     p: np.ndarray,
     z: np.ndarray,
@@ -146,19 +146,21 @@ def sighted(
     angle: np.ndarray,
     noise: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The angle arctan(z/y): a weight, and the mean and variance that it leaves of y."""
+    """Update by the angle arctan(z/y): weights, and mean and variance of y."""
     nodes, shares = np.polynomial.hermite_e.hermegauss(parameters["nodes"])
     variance = p[..., 1, 1]
     steps = np.sqrt(variance)[..., None, None] * nodes
     gap = angle - np.arctan2(z[..., :1], m[..., 1:2] + steps)
+    # The angle of a line has period π.
     gap = (gap + np.pi / 2) % np.pi - np.pi / 2
     parts = np.exp(-0.5 * gap**2 / noise) * (shares / shares.sum())
     total = np.maximum(parts.sum(axis=-1), 1e-300)
     shift = (parts * steps).sum(axis=-1) / total
-    left = (parts * steps**2).sum(axis=-1) / total - shift**2
+    variance_left = (parts * steps**2).sum(axis=-1) / total - shift**2
     log = log + np.log(total)
+    # The other components follow y by regression.
     slope = p[..., 1] / variance[..., None]
-    less = (normal(log) * left).sum(axis=-1) - variance
+    less = (normalize_logs(log) * variance_left).sum(axis=-1) - variance
     p = p + less[..., None, None] * slope[..., None] * slope[..., None, :]
     return m + shift[..., None] * slope[..., None, :], p, log
 
@@ -166,19 +168,19 @@ def sighted(
 def cost(
     gap: np.ndarray, prior: np.ndarray, residual: np.ndarray, noise: np.ndarray
 ) -> np.ndarray:
-    """What a maximum of the posterior makes least, (R,): misfit to forecast and to readings."""
-    return squared(gap, prior) + squared(
+    """Return minus the log-posterior, (R,): misfit to the forecast and to the observations."""
+    return squared_distances(gap, prior) + squared_distances(
         residual, np.broadcast_to(noise, (len(gap), *noise.shape))
     )
 
 
-def squared(gap: np.ndarray, cov: np.ndarray) -> np.ndarray:
+def squared_distances(gap: np.ndarray, cov: np.ndarray) -> np.ndarray:
     """Squared lengths (R,) in units of covariances (R, d, d)."""
     return np.einsum("ri,ri->r", gap, np.linalg.solve(cov, gap[..., None])[..., 0])
 
 
-def damped(means: np.ndarray, readings: np.ndarray) -> list[np.ndarray]:
-    """The iterated extended filter of all sensors: a step that does not lower `cost` is halved."""
+def run_damped(means: np.ndarray, readings: np.ndarray) -> list[np.ndarray]:
+    """Run the iterated extended filter; a step that does not lower `cost` is halved."""
     sensor = stack(SETUP.sensors)
     s = SETUP
     cov = np.broadcast_to(s.prior[1], (*means.shape, means.shape[-1]))
@@ -196,23 +198,24 @@ def damped(means: np.ndarray, readings: np.ndarray) -> list[np.ndarray]:
                 x - means, cov, sensor.residual(y, sensor.predict(x)), sensor.noise_cov
             )
 
-        least = value(x)
+        # Gauss-Newton steps, halved until the cost falls
+        lowest_cost = value(x)
         for _ in range(STEPS):
             h = sensor.jacobian(x)
             expected = np.einsum("...ij,...j->...i", h, means - x)
             gap = sensor.residual(y, sensor.predict(x)) - expected
-            whole = condition(means, cov, gap, h, sensor.noise_cov)[0] - x
+            full_step = condition(means, cov, gap, h, sensor.noise_cov)[0] - x
             for _ in range(HALVINGS):
-                after = value(x + whole)
-                if not (worse := after > least).any():
+                after = value(x + full_step)
+                if not (worse := after > lowest_cost).any():
                     break
-                whole[worse] /= 2
-            whole[worse] = 0.0
-            after[worse] = least[worse]
-            x = x + whole
-            gained = least - after
-            least = after
-            if gained.max() < ENOUGH:
+                full_step[worse] /= 2
+            full_step[worse] = 0.0
+            after[worse] = lowest_cost[worse]
+            x = x + full_step
+            decrease = lowest_cost - after
+            lowest_cost = after
+            if decrease.max() < ENOUGH:
                 break
         h = sensor.jacobian(x)
         cov = condition(means, cov, np.zeros_like(y), h, sensor.noise_cov)[1]
@@ -222,33 +225,36 @@ def damped(means: np.ndarray, readings: np.ndarray) -> list[np.ndarray]:
     return [np.array(errors), np.array(covs)]
 
 
-def normal(log: np.ndarray) -> np.ndarray:
+def normalize_logs(log: np.ndarray) -> np.ndarray:
     """Weights that sum to one over the last axis."""
     w = np.exp(log - log.max(axis=-1, keepdims=True))
     return np.asarray(w / w.sum(axis=-1, keepdims=True))
 
 
-def scored(
-    name: str, truth: np.ndarray, found: tuple[np.ndarray, np.ndarray, np.ndarray]
+def score_means(
+    name: str, truth: np.ndarray, estimates: tuple[np.ndarray, np.ndarray, np.ndarray]
 ) -> dict[str, float]:
-    """What is stored: error, NEES/d, the error's share by chance, effective share; over time."""
-    means, covs, shares = found
+    """Return error, NEES/d, the error's share by chance, effective sample size; over time."""
+    means, covs, shares = estimates
     late = SETUP.settled
     gap = means.mean(axis=1) - truth
     error = (gap**2).sum(axis=-1)
     score = nees(means.mean(axis=1), covs, truth) / gap.shape[-1]
+    # Half the distance of two independent filters' means estimates the Monte Carlo error.
     chance = ((means[:, 0] - means[:, 1]) ** 2).sum(axis=-1) / 4
-    out = satellites.over_time(name, error, score) if name == "reference" else {}
+    values = satellites.time_series(name, error, score) if name == "reference" else {}
     for r in range(BATCH):
-        out[f"{name}_mse_{r}"] = float(error[late, r].mean())
-        out[f"{name}_nees_{r}"] = float(score[late, r].mean())
-        out[f"{name}_chance_{r}"] = float(chance[late, r].mean())
-        out[f"{name}_share_{r}"] = float(shares[late, r].min())
-    return out
+        values[f"{name}_mse_{r}"] = float(error[late, r].mean())
+        values[f"{name}_nees_{r}"] = float(score[late, r].mean())
+        values[f"{name}_chance_{r}"] = float(chance[late, r].mean())
+        values[f"{name}_share_{r}"] = float(shares[late, r].min())
+    return values
 
 
-def from_prior(rng: np.random.Generator) -> tuple[np.ndarray, list[np.ndarray]]:
-    """A batch of truths (T, R, 6) that start where the prior puts them, and what is read."""
+def simulate_from_prior(
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Draw a batch of truths (T, R, 6) that start from the prior, and observations."""
     start = rng.multivariate_normal(*SETUP.prior, size=BATCH)
     truth = simulate(SETUP.model, start, SETUP.times, rng=rng)
     return truth, [q.observe(truth, rng=rng) for q in SETUP.sensors]
@@ -259,45 +265,45 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     if not APPLIES:  # a reader's sensors: there is no such split of the readings
         return dict.fromkeys(columns, float("nan"))
     for_data, _ = seed.spawn(2)
-    own, drawn, for_filters = seed.spawn(3)
-    rng = np.random.default_rng(own)
-    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
-    out = scored("reference", truth, guided(seen, rng))
+    for_particles, for_prior, for_filters = seed.spawn(3)
+    rng = np.random.default_rng(for_particles)
+    truth, seen = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    values = score_means("reference", truth, run_particles(seen, rng))
     first = np.broadcast_to(SETUP.prior[0], truth.shape[1:])
-    found = damped(first, np.concatenate(seen, axis=-1))
+    estimates = run_damped(first, np.concatenate(seen, axis=-1))
     late = SETUP.settled
     for r in range(BATCH):
-        out[f"damped_mse_{r}"] = float(
-            ((found[0] - truth) ** 2).sum(axis=-1)[late, r].mean()
+        values[f"damped_mse_{r}"] = float(
+            ((estimates[0] - truth) ** 2).sum(axis=-1)[late, r].mean()
         )
-        score = nees(found[0][:, r], found[1][:, r], truth[:, r])[late].mean()
-        out[f"damped_nees_{r}"] = float(score) / truth.shape[-1]
-    truth, seen = from_prior(np.random.default_rng(drawn))
-    out |= scored("bound", truth, guided(seen, rng))
-    result = satellites.run(
-        SETUP, satellites.repaired(SETUP, "exact"), for_filters, truth, seen
+        score = nees(estimates[0][:, r], estimates[1][:, r], truth[:, r])[late].mean()
+        values[f"damped_nees_{r}"] = float(score) / truth.shape[-1]
+    truth, seen = simulate_from_prior(np.random.default_rng(for_prior))
+    values |= score_means("bound", truth, run_particles(seen, rng))
+    result = satellites.run_filter(
+        SETUP, satellites.better_filter(SETUP, "exact"), for_filters, truth, seen
     )
-    return out | satellites.scored(SETUP, "exact", result, each_agent=False)
+    return values | satellites.score_runs(SETUP, "exact", result, each_agent=False)
 
 
 def part(seed: np.random.SeedSequence) -> dict[str, float]:
     """The reference alone, as in the trial, for chapter 4 to run again."""
     for_data, _ = seed.spawn(2)
     rng = np.random.default_rng(seed.spawn(3)[0])
-    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
-    return scored("reference", truth, guided(seen, rng))
+    truth, seen = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    return score_means("reference", truth, run_particles(seen, rng))
 
 
 code = (
-    guided,
-    chosen,
-    sighted,
+    run_particles,
+    resample_poor,
+    update_angle,
     cost,
-    squared,
-    damped,
-    normal,
-    scored,
-    from_prior,
-    satellites.data,
-    satellites.repaired,
+    squared_distances,
+    run_damped,
+    normalize_logs,
+    score_means,
+    simulate_from_prior,
+    satellites.draw_data,
+    satellites.better_filter,
 )

@@ -1,8 +1,8 @@
-"""Eight agents on a ring lose three messages in ten: who loses the target.
+"""Eight agents on a ring lose three messages in ten; which rule loses the target?
 
-A trial is a batch of runs. The agents see the target's place relative to their own, or they see its
-distance and direction from a circle of two sizes. Agents' own places are doubtful, and the target
-moves with noise, so that news is not exact (`_team.py`).
+A trial is a batch of runs. The agents observe the target's position relative to their own, or its
+range and bearing from circles of two sizes. Agents are uncertain of their own positions, and the
+target has process noise, so that information increments are not exact (`_team.py`).
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ WAYS = ("alone", "intersection", "news", "joint")
 SIGHTED = ("alone", "news", "extended", "turned")
 
 
-def group(seed: int) -> team.Team:
-    """The agents, with losses of their own."""
+def make_team(seed: int) -> team.Team:
+    """Return the team; the seed draws its losses."""
     moves = constant_velocity(sigma=SIGMA)
     return team.Team(
         graphs.ring(AGENTS),
@@ -54,25 +54,29 @@ def group(seed: int) -> team.Team:
     )
 
 
-def places(radius: float) -> np.ndarray:
-    """Where the agents believe that they stand, (A, 2)."""
+def prior_positions(radius: float) -> np.ndarray:
+    """Return the prior means of the agents' positions, (A, 2)."""
     turn = 2 * np.pi * np.arange(AGENTS) / AGENTS
     return radius * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
 
 
-def sights(rng: np.random.Generator, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Targets (steps, runs, 4), and distances and directions (steps, runs, A, 2)."""
-    exact = replace(group(0), reading_cov=np.zeros((2, 2)))
+def simulate_sightings(
+    rng: np.random.Generator, radius: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw targets (steps, runs, 4), and ranges and bearings (steps, runs, A, 2)."""
+    exact = replace(make_team(0), reading_cov=np.zeros((2, 2)))
     truth, gaps = exact.data(STEPS, RUNS, rng)
     eye = range_bearing([0, 1], std=SIGHT_STD)
-    return truth, eye.observe(gaps - places(radius), rng=rng)
+    return truth, eye.observe(gaps - prior_positions(radius), rng=rng)
 
 
-def measured(truth: np.ndarray, belief: team.Belief, name: str) -> dict[str, float]:
-    """Mean square error, NEES and runs lost of one way to cooperate."""
+def score_beliefs(
+    truth: np.ndarray, belief: team.Belief, name: str
+) -> dict[str, float]:
+    """Return mean square error, NEES and runs lost of one way to cooperate."""
     gap = ((belief[0] - truth[:, :, None])[..., :2] ** 2).sum(axis=-1)
     score = team.nees(truth, belief)
-    lost = (score[-LATE:] > team.rare(RARE, 4)).any(axis=(0, 2))
+    lost = (score[-LATE:] > team.nees_quantile(RARE, 4)).any(axis=(0, 2))
     return {
         f"{name}_error": float(gap.mean()),
         f"{name}_median": float(np.median(gap)),
@@ -81,124 +85,130 @@ def measured(truth: np.ndarray, belief: team.Belief, name: str) -> dict[str, flo
     }
 
 
-def looking(radius: float, agent: int | None = None) -> Sensor:
-    """Distance and direction of the target in [target; ego], or in [target; all egos]."""
+def relative_sensor(radius: float, agent: int | None = None) -> Sensor:
+    """Return a range-bearing sensor of [target; ego], or of [target; all egos]."""
     eye = range_bearing([0, 1], std=SIGHT_STD)
-    at = 4 + 2 * (agent or 0)
+    ego = 4 + 2 * (agent or 0)
 
-    def gap(x: np.ndarray) -> np.ndarray:
-        return x[..., :2] - x[..., at : at + 2]
+    def relative(x: np.ndarray) -> np.ndarray:
+        return x[..., :2] - x[..., ego : ego + 2]
 
     def slope(x: np.ndarray) -> np.ndarray:
-        out = np.zeros((*x.shape[:-1], 2, x.shape[-1]))
-        part = eye.jacobian(gap(x))
-        out[..., :2] = part
-        out[..., at : at + 2] = -part
-        return out
+        matrix = np.zeros((*x.shape[:-1], 2, x.shape[-1]))
+        part = eye.jacobian(relative(x))
+        matrix[..., :2] = part
+        matrix[..., ego : ego + 2] = -part
+        return matrix
 
     return Sensor(
         2,
-        lambda x: eye.predict(gap(x)),
+        lambda x: eye.predict(relative(x)),
         eye.noise_cov,
         residual_function=eye.residual_function,
         derivative=slope,
     )
 
 
-def joint(case: team.Team, seen: np.ndarray, radius: float) -> team.Belief:
-    """Joint bookkeeping with extended Kalman filters of what is heard."""
+def run_joint(case: team.Team, seen: np.ndarray, radius: float) -> team.Belief:
+    """Run joint extended Kalman filters on the received observations."""
     move, noise, first = case.state(AGENTS)
     model = LinearModel.from_transition(len(move), lambda dt: move, lambda t, dt: noise)
-    eyes = [looking(radius, a) for a in range(AGENTS)]
+    eyes = [relative_sensor(radius, a) for a in range(AGENTS)]
     f = GaussianFilter(model, eyes, case.graph, faults=case.faults)
-    mean = np.concatenate([np.zeros(4), places(radius).ravel()])
+    mean = np.concatenate([np.zeros(4), prior_positions(radius).ravel()])
     state = f.start((mean, first), runs=(RUNS,))
-    out = []
+    beliefs = []
     for k, y in enumerate(seen):
         state = f.step(state, k + 1.0, list(np.moveaxis(y, 1, 0)))
-        out.append((state.means[..., :4], state.covariances[..., :4, :4]))
-    return np.array([m for m, _ in out]), np.array([p for _, p in out])
+        beliefs.append((state.means[..., :4], state.covariances[..., :4, :4]))
+    return np.array([m for m, _ in beliefs]), np.array([p for _, p in beliefs])
 
 
-def conditioned(
+def condition(
     mean: np.ndarray, cov: np.ndarray, gap: np.ndarray, h: np.ndarray, noise: np.ndarray
 ) -> team.Belief:
-    """Gaussians after readings that are `gap` from what was expected."""
+    """Return Gaussians after observations with innovation `gap`."""
     gain = np.linalg.solve(h @ cov @ h.mT + noise, h @ cov).mT
     after = cov - gain @ h @ cov
     return mean + (gain @ gap[..., None])[..., 0], 0.5 * (after + after.mT)
 
 
-def turned(case: team.Team, seen: np.ndarray, radius: float) -> team.Belief:
-    """Joint bookkeeping with sightings turned into relative places, which are linear readings.
+def run_converted(case: team.Team, seen: np.ndarray, radius: float) -> team.Belief:
+    """Run joint filters on sightings converted to relative positions, which are linear.
 
-    Each keeps its error along and across the sight, with the distance that was read.
+    Each keeps its errors along and across the sight, at the measured range.
     """
     move, noise, first = case.state(AGENTS)
     mean = np.tile(
-        np.concatenate([np.zeros(4), places(radius).ravel()]), (RUNS, AGENTS, 1)
+        np.concatenate([np.zeros(4), prior_positions(radius).ravel()]),
+        (RUNS, AGENTS, 1),
     )
     cov = np.broadcast_to(first, (RUNS, AGENTS, *first.shape))
-    out = []
+    beliefs = []
     for k, y in enumerate(seen):
         mean = mean @ move.T
         cov = move @ cov @ move.T + noise
-        heard = case.arrived(k, RUNS) | np.eye(AGENTS, dtype=bool)
+        received = case.arrived(k, RUNS) | np.eye(AGENTS, dtype=bool)
         for j in range(AGENTS):
+            # Range r and unit vector u give the relative position r u.
             far = y[:, j, 0]
             along = np.stack([np.cos(y[:, j, 1]), np.sin(y[:, j, 1])], axis=-1)
             across = np.stack([-along[:, 1], along[:, 0]], axis=-1) * far[:, None]
+            # Root of its covariance: σ_r u, and r σ_φ across
             error = np.stack([along * SIGHT_STD[0], across * SIGHT_STD[1]], axis=-1)
             h = case.sees(j, AGENTS)
             gap = (far[:, None] * along)[:, None] - mean @ h.T
-            after = conditioned(mean, cov, gap, h, (error @ error.mT)[:, None])
-            took = heard[:, :, j]
-            mean = np.where(took[..., None], after[0], mean)
-            cov = np.where(took[..., None, None], after[1], cov)
-        out.append((mean[..., :4], cov[..., :4, :4]))
-    return np.array([m for m, _ in out]), np.array([p for _, p in out])
+            after = condition(mean, cov, gap, h, (error @ error.mT)[:, None])
+            # Only the agents that received the observation use it.
+            updated = received[:, :, j]
+            mean = np.where(updated[..., None], after[0], mean)
+            cov = np.where(updated[..., None, None], after[1], cov)
+        beliefs.append((mean[..., :4], cov[..., :4, :4]))
+    return np.array([m for m, _ in beliefs]), np.array([p for _, p in beliefs])
 
 
-def single(
-    case: team.Team, seen: np.ndarray, radius: float, tells: bool
+def run_single(
+    case: team.Team, seen: np.ndarray, radius: float, exchange: bool
 ) -> team.Belief:
-    """Extended Kalman filters of [target; ego], alone or adding each other's news."""
+    """Run extended Kalman filters of [target; ego], alone or exchanging increments."""
     move, noise, first = case.state(1)
-    eye = looking(radius)
+    eye = relative_sensor(radius)
     mean = np.zeros((RUNS, AGENTS, 6))
-    mean[..., 4:] = places(radius)
+    mean[..., 4:] = prior_positions(radius)
     cov = np.broadcast_to(first, (RUNS, AGENTS, 6, 6))
-    out = []
+    beliefs = []
     for k, y in enumerate(seen):
         before = mean @ move.T, move @ cov @ move.T + noise
         gap = eye.residual(y, eye.predict(before[0]))
-        mean, cov = conditioned(*before, gap, eye.jacobian(before[0]), eye.noise_cov)
-        if tells:
-            mean, cov = team._news(before, (mean, cov), case.arrived(k, RUNS), 4)
+        mean, cov = condition(*before, gap, eye.jacobian(before[0]), eye.noise_cov)
+        if exchange:
+            mean, cov = team.exchange_increments(
+                before, (mean, cov), case.arrived(k, RUNS), 4
+            )
             cov = 0.5 * (cov + cov.mT)
-        out.append((mean[..., :4], cov[..., :4, :4]))
-    return np.array([m for m, _ in out]), np.array([p for _, p in out])
+        beliefs.append((mean[..., :4], cov[..., :4, :4]))
+    return np.array([m for m, _ in beliefs]), np.array([p for _, p in beliefs])
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
-    """Ten runs of each way, by relative places and by sightings on both circles."""
+    """Run ten runs of each way, with relative positions and with sightings on both circles."""
     rng = np.random.default_rng(seed)
-    case = group(int(rng.integers(2**31)))
+    case = make_team(int(rng.integers(2**31)))
     truth, seen = case.data(STEPS, RUNS, rng)
-    out: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     for way in WAYS:
-        out |= measured(truth, case.filtered(way, seen), way)
+        metrics |= score_beliefs(truth, case.filtered(way, seen), way)
     for radius in RADII:
-        truth, seen = sights(rng, radius)
+        truth, seen = simulate_sightings(rng, radius)
         beliefs = (
-            single(case, seen, radius, False),
-            single(case, seen, radius, True),
-            joint(case, seen, radius),
-            turned(case, seen, radius),
+            run_single(case, seen, radius, False),
+            run_single(case, seen, radius, True),
+            run_joint(case, seen, radius),
+            run_converted(case, seen, radius),
         )
         for way, belief in zip(SIGHTED, beliefs, strict=True):
-            out |= measured(truth, belief, f"sight_{radius:.0f}_{way}")
-    return {name: float(f"{v:.6g}") for name, v in out.items()}
+            metrics |= score_beliefs(truth, belief, f"sight_{radius:.0f}_{way}")
+    return {name: float(f"{v:.6g}") for name, v in metrics.items()}
 
 
 NAMES = (*WAYS, *(f"sight_{radius:.0f}_{way}" for radius in RADII for way in SIGHTED))
@@ -218,22 +228,22 @@ parameters = {
     "late": LATE,
 }
 code = (
-    group,
-    places,
-    sights,
-    measured,
-    looking,
-    joint,
-    conditioned,
-    turned,
-    single,
+    make_team,
+    prior_positions,
+    simulate_sightings,
+    score_beliefs,
+    relative_sensor,
+    run_joint,
+    condition,
+    run_converted,
+    run_single,
     team.Team,
-    team.known,
+    team.condition,
     team.nees,
-    team._news,
-    team._intersected,
+    team.exchange_increments,
+    team.intersect_beliefs,
 )
 seeds = np.random.SeedSequence(808).spawn(20)
 rtol = 1e-3
-# Where a filter goes once it has lost its target, another processor need not repeat.
+# Another processor need not repeat the path of a filter that has lost its target.
 ill_conditioned = [name for name in columns if "_20_" in name or "news" in name]

@@ -1,4 +1,4 @@
-"""Single Gaussians on the paper's orbit, many seeds: how close fusion comes to the joint filter.
+"""Single Gaussians on the paper's orbit, many seeds: fusion against the joint filter.
 
 The draws are those of the study `orbit`, whose 48 seeds are the first of these. The unscented rows
 are the same filters with unscented points in place of second-order differences.
@@ -25,20 +25,22 @@ METRICS = ("error_tp", "error_ep", "nees_t", "nees_e", "nees")
 ROWS = {"one_none": None, "one_ci": None, "unscented_none": False, "unscented_ci": True}
 
 
-def targets(
+def fuse_targets(
     belief: tuple[np.ndarray, np.ndarray], channel: Channel
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance intersection of the agents' targets, for the Gaussians of `GaussianFilter`."""
-    own = [GaussianMixture.gaussian(m, p) for m, p in zip(*belief, strict=True)]
+    """Intersect the targets' covariances, as a fusion rule of `GaussianFilter`."""
+    mixtures = [GaussianMixture.gaussian(m, p) for m, p in zip(*belief, strict=True)]
     fuse = partial(fuse_moments, omega="equal")
-    fused = [m.moments() for m in target_fusion(own, channel, target_dim=6, fuse=fuse)]
+    fused = [
+        m.moments() for m in target_fusion(mixtures, channel, target_dim=6, fuse=fuse)
+    ]
     return np.array([m for m, _ in fused]), np.array([p for _, p in fused])
 
 
-def unscented(
+def run_unscented(
     s: dict, fuses: bool, seen: np.ndarray, first: np.ndarray, covs: list
 ) -> list[list[GaussianMixture]]:
-    """What unscented filters of one Gaussian believe, one an epoch and agent."""
+    """Run unscented filters of one Gaussian; return beliefs by epoch and agent."""
     n = len(s["agents"])
     start = [b.moments() for b in paper.prior_beliefs(first, covs)]
     f = GaussianFilter(
@@ -48,45 +50,46 @@ def unscented(
         share_observations=False,
         linearization="unscented",
         kappa=1.0,
-        fusion=targets if fuses else None,
+        fusion=fuse_targets if fuses else None,
     )
     state = f.start(start[0])
-    out = []
+    beliefs = []
     means = np.array([m for m, _ in start])
-    both = np.array([p for _, p in start])
-    state = state.replace(joint_means=means, joint_covariances=both)
+    covariances = np.array([p for _, p in start])
+    # Each agent has a prior of its own.
+    state = state.replace(joint_means=means, joint_covariances=covariances)
     for k, hour in enumerate(paper.HOURS):
         state = f.step(state, 3600.0 * hour, list(seen[k]))
         pairs = zip(state.means, state.covariances, strict=True)
-        out.append([GaussianMixture.gaussian(m, p) for m, p in pairs])
-    return out
+        beliefs.append([GaussianMixture.gaussian(m, p) for m, p in pairs])
+    return beliefs
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """Means over agents and the epochs from 2 to 20 h."""
     s = paper.SETTING
-    truth, *rest = paper.simulate(s, np.random.default_rng(seed.spawn(1)[0]))
-    beliefs = {"bound": paper.run_joint(s, paper.ONE, *rest)}
+    truth, *inputs = paper.simulate(s, np.random.default_rng(seed.spawn(1)[0]))
+    beliefs = {"bound": paper.run_joint(s, paper.ONE, *inputs)}
     for row, fuses in ROWS.items():
         if fuses is None:
-            states = paper.run_filter(s, paper.SINGLE[row], *rest)
+            states = paper.run_filter(s, paper.SINGLE[row], *inputs)
             beliefs[row] = [state.mixtures for state in states]
         else:
-            beliefs[row] = unscented(s, fuses, *rest)
-    out: dict[str, float] = {}
-    for row, found in beliefs.items():
-        scores = [paper.score_epoch(found[k], truth[k]) for k in paper.EARLY]
-        out |= {
+            beliefs[row] = run_unscented(s, fuses, *inputs)
+    values: dict[str, float] = {}
+    for row, row_beliefs in beliefs.items():
+        scores = [paper.score_epoch(row_beliefs[k], truth[k]) for k in paper.EARLY]
+        values |= {
             f"{row}_{m}": float(np.mean([f[m].mean() for f in scores])) for m in METRICS
         }
-    return {name: float(paper.SIX.format(v)) for name, v in out.items()}
+    return {name: float(paper.SIX.format(v)) for name, v in values.items()}
 
 
 columns = [f"{row}_{m}" for row in ("bound", *ROWS) for m in METRICS]
 parameters = {"setting": paper.SETTING, "rows": sorted(ROWS)}
 code = (
-    targets,
-    unscented,
+    fuse_targets,
+    run_unscented,
     paper.simulate,
     paper.observe,
     paper.prior_beliefs,

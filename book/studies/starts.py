@@ -53,13 +53,13 @@ def scores(members: np.ndarray, truth: np.ndarray) -> tuple[float, ...]:
     return np.sqrt((missed**2).mean()), np.sqrt((away[late] ** 2).mean()), farthest
 
 
-def side(start: str, seed: np.random.SeedSequence) -> dict[str, float]:
+def run_start(start: str, seed: np.random.SeedSequence) -> dict[str, float]:
     """The paper's five algorithms from one start."""
-    rng, again = (np.random.default_rng(s) for s in seed.spawn(2))
+    rng, rng_circle = (np.random.default_rng(s) for s in seed.spawn(2))
     truth, readings, members = pendulum.data(rng)
     if start == "on":
-        members = on_circle(again)
-    found = dict(
+        members = on_circle(rng_circle)
+    analysis = dict(
         zip(
             FILTERS,
             np.moveaxis(pendulum.run(readings, members, FILTERS), 1, 0),
@@ -68,21 +68,21 @@ def side(start: str, seed: np.random.SeedSequence) -> dict[str, float]:
     )
     out = {}
     with np.errstate(all="ignore"):
-        whole = np.isfinite(found["OTF"]).all(axis=(1, 2))
-        found["OTProj"] = found["OTF"].copy()
-        found["OTProj"][whole] = project(
-            found["OTF"][whole], pendulum.rod, **pendulum.how
+        finite = np.isfinite(analysis["OTF"]).all(axis=(1, 2))
+        analysis["OTProj"] = analysis["OTF"].copy()
+        analysis["OTProj"][finite] = project(
+            analysis["OTF"][finite], pendulum.rod, **pendulum.how
         )
         for name in ALGORITHMS:
-            values = zip(SCORES, scores(found[name], truth), strict=True)
+            values = zip(SCORES, scores(analysis[name], truth), strict=True)
             out |= {f"{start}_{name}_{key}": float(value) for key, value in values}
     return out
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """The paper's five algorithms from both starts, with one true swing and the same readings."""
-    again = np.random.SeedSequence(seed.entropy, spawn_key=seed.spawn_key)
-    return side("off", seed) | side("on", again)
+    fresh_seed = np.random.SeedSequence(seed.entropy, spawn_key=seed.spawn_key)
+    return run_start("off", seed) | run_start("on", fresh_seed)
 
 
 parameters = {name: np.asarray(setting[name]).tolist() for name in setting}

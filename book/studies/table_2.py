@@ -1,7 +1,7 @@
 """Better filters for Table II of Grange et al., on the data of Fig. 1, run by run.
 
-The paper's filter as `tuning.py` has tuned it; what each repair does; the best method with three
-seeds of its own; and two central filters that linearise, the obvious things to compare with.
+The paper's filter as `tuning.py` has tuned it; each repair alone; the best method with three
+seeds of its own; and two central filters that linearize, for comparison.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ PAPER = "grange"
 BATCH = 5
 SETUP = satellites.setup("table-2")
 TUNED = {"pca": False, "include_self": False, "gain": 0.1}
-REPAIRED = ("sampled_fused", "known_pulled", "known_fused")
+REPAIRS = ("sampled_fused", "known_pulled", "known_fused")
 EXACT = ("exact", "exact_again", "exact_once_more")
 CENTRAL = ("extended", "iterated")
 columns = [
     *(
         c
-        for name in ("tuned", *REPAIRED, *EXACT)
+        for name in ("tuned", *REPAIRS, *EXACT)
         for c in satellites.score_columns(SETUP, name, BATCH)
     ),
     *(
@@ -45,15 +45,14 @@ parameters = {"batch": BATCH, "seed": 2024, "tuned": TUNED}
 seeds = np.random.SeedSequence(satellites.SEED).spawn(SETUP.runs // BATCH)
 scenarios = (SETUP.scenario,)
 rtol = 1e-4
-# Ten undamped steps of the iterated filter do not settle; where a run is after them the last bit
-# may decide.
+# Ten undamped steps of the iterated filter do not converge; the last bit may decide the result.
 ill_conditioned = [name for name in columns if name.startswith("iterated")]
 
 
-def iterated(
+def run_iterated(
     means: np.ndarray, readings: np.ndarray, steps: int = 10
 ) -> list[np.ndarray]:
-    """The iterated extended filter: linearise again where the update has led, `steps` times."""
+    """Run the iterated extended filter: linearize again at the update, `steps` times."""
     sensor = stack(SETUP.sensors)
     s = SETUP
     cov = np.broadcast_to(s.prior[1], (*means.shape, means.shape[-1]))
@@ -77,7 +76,7 @@ def iterated(
     return [np.array(errors), np.array(covs)]
 
 
-def extended(readings: np.ndarray) -> list[np.ndarray]:
+def run_extended(readings: np.ndarray) -> list[np.ndarray]:
     """The extended Kalman filter of all sensors."""
     f = GaussianFilter(SETUP.model, [stack(SETUP.sensors)])
     start = f.start(SETUP.prior, runs=readings.shape[1:-1])
@@ -88,54 +87,56 @@ def extended(readings: np.ndarray) -> list[np.ndarray]:
     ]
 
 
-def central(name: str, found: list[np.ndarray], truth: np.ndarray) -> dict[str, float]:
+def score_central(
+    name: str, moments: list[np.ndarray], truth: np.ndarray
+) -> dict[str, float]:
     """Settled error and NEES/d of a central filter, run by run."""
     late = SETUP.settled
-    error = ((found[0] - truth) ** 2).sum(axis=-1)[late].mean(axis=0)
-    score = nees(found[0], found[1], truth)[late].mean(axis=0) / truth.shape[-1]
-    out = {f"{name}_mse_{r}": float(v) for r, v in enumerate(error)}
-    return out | {f"{name}_nees_{r}": float(v) for r, v in enumerate(score)}
+    error = ((moments[0] - truth) ** 2).sum(axis=-1)[late].mean(axis=0)
+    score = nees(moments[0], moments[1], truth)[late].mean(axis=0) / truth.shape[-1]
+    values = {f"{name}_mse_{r}": float(v) for r, v in enumerate(error)}
+    return values | {f"{name}_nees_{r}": float(v) for r, v in enumerate(score)}
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """A batch of runs of every filter, on the data of the same batch of Fig. 1."""
     for_data, for_filters = seed.spawn(2)
-    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
-    out: dict[str, float] = {}
-    filters = {"tuned": satellites.published(SETUP, **TUNED)}
-    filters |= {name: satellites.repaired(SETUP, name) for name in REPAIRED}
-    filters |= dict.fromkeys(EXACT, satellites.repaired(SETUP, "exact"))
-    own = for_filters.spawn(len(EXACT))
+    truth, seen = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    values: dict[str, float] = {}
+    filters = {"tuned": satellites.paper_filter(SETUP, **TUNED)}
+    filters |= {name: satellites.better_filter(SETUP, name) for name in REPAIRS}
+    filters |= dict.fromkeys(EXACT, satellites.better_filter(SETUP, "exact"))
+    exact_seeds = for_filters.spawn(len(EXACT))
     for name, f in filters.items():
-        source = own[EXACT.index(name)] if name in EXACT else for_filters
-        result = satellites.run(SETUP, f, source, truth, seen)
-        out |= satellites.scored(SETUP, name, result)
+        source = exact_seeds[EXACT.index(name)] if name in EXACT else for_filters
+        result = satellites.run_filter(SETUP, f, source, truth, seen)
+        values |= satellites.score_runs(SETUP, name, result)
         if name == "exact":
             error = result["total_squared_error"].mean("agent").values
             score = result["nees"].mean("agent").values / SETUP.model.dim
-            out |= satellites.over_time(name, error, score)
+            values |= satellites.time_series(name, error, score)
     readings = np.concatenate(seen, axis=-1)
-    out |= central("extended", extended(readings), truth)
+    values |= score_central("extended", run_extended(readings), truth)
     first = np.broadcast_to(SETUP.prior[0], truth.shape[1:])
-    return out | central("iterated", iterated(first, readings), truth)
+    return values | score_central("iterated", run_iterated(first, readings), truth)
 
 
 def part(seed: np.random.SeedSequence) -> dict[str, float]:
-    """The filter with exact draws alone, as the trial runs it: what chapter 4 runs again."""
+    """Run the filter with exact draws alone, as in the trial, for chapter 4 to check."""
     for_data, for_filters = seed.spawn(2)
-    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
-    f = satellites.repaired(SETUP, "exact")
+    truth, seen = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    f = satellites.better_filter(SETUP, "exact")
     source = for_filters.spawn(len(EXACT))[0]
-    return satellites.scored(
-        SETUP, "exact", satellites.run(SETUP, f, source, truth, seen)
+    return satellites.score_runs(
+        SETUP, "exact", satellites.run_filter(SETUP, f, source, truth, seen)
     )
 
 
 code = (
-    iterated,
-    extended,
-    central,
-    satellites.data,
-    satellites.published,
-    satellites.repaired,
+    run_iterated,
+    run_extended,
+    score_central,
+    satellites.draw_data,
+    satellites.paper_filter,
+    satellites.better_filter,
 )

@@ -1,6 +1,6 @@
 """Better filters for Table III of Grange et al., on the data of Fig. 2, run by run.
 
-The paper's filter as printed and as `tuning.py` has tuned it, what each repair does, the best
+The paper's filter as printed and as `tuning.py` has tuned it, each repair alone, the best
 method, and a central multiplicative extended Kalman filter as the near-exact reference.
 """
 
@@ -21,12 +21,12 @@ PAPER = "grange"
 BATCH = 4
 SETUP = satellites.setup("table-3")
 TUNED = {"pca": False, "include_self": False, "gain": 0.1}
-REPAIRED = ("known_pulled", "known_fused", "exact")
+REPAIRS = ("known_pulled", "known_fused", "exact")
 TIMED = ("bare", "exact")
 columns = [
     *(
         c
-        for name in ("bare", "tuned", *REPAIRED)
+        for name in ("bare", "tuned", *REPAIRS)
         for c in satellites.score_columns(SETUP, name, BATCH)
     ),
     *(f"central_{what}_{r}" for what in ("mse", "nees") for r in range(BATCH)),
@@ -38,12 +38,12 @@ scenarios = (SETUP.scenario,)
 rtol = 1e-4
 
 
-def central(truth: np.ndarray, seen: list[np.ndarray]) -> dict[str, float]:
+def run_central(truth: np.ndarray, seen: list[np.ndarray]) -> dict[str, float]:
     """The multiplicative filter of all sensors: twelve errors, three of them of the attitude."""
     chart = QuaternionChart(13, 9)
     (mean, cov) = SETUP.prior
     unit = np.concatenate([mean[:9], mean[9:] / np.linalg.norm(mean[9:])])
-    found = mekf(
+    result = mekf(
         unit,
         chart.project(mean, cov),
         np.concatenate(seen, axis=-1),
@@ -52,48 +52,53 @@ def central(truth: np.ndarray, seen: list[np.ndarray]) -> dict[str, float]:
         sensors=SETUP.sensors,
         times=SETUP.times,
     )
-    error = ((found.means - truth) ** 2).sum(axis=-1)
-    local = chart.local(found.means, truth)
-    score = (local * np.linalg.solve(found.covariances, local[..., None])[..., 0]).sum(
+    error = ((result.means - truth) ** 2).sum(axis=-1)
+    local = chart.local(result.means, truth)
+    score = (local * np.linalg.solve(result.covariances, local[..., None])[..., 0]).sum(
         axis=-1
     )
     score = score / chart.error_dim
     late = SETUP.settled
-    out = satellites.over_time("central", error, score)
+    values = satellites.time_series("central", error, score)
     for r in range(error.shape[1]):
-        out[f"central_mse_{r}"] = float(error[late, r].mean())
-        out[f"central_nees_{r}"] = float(score[late, r].mean())
-    return out
+        values[f"central_mse_{r}"] = float(error[late, r].mean())
+        values[f"central_nees_{r}"] = float(score[late, r].mean())
+    return values
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """A batch of runs of every filter, on the data of the same batch of Fig. 2."""
     for_data, for_filters = seed.spawn(2)
-    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    truth, seen = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
     filters = {
-        "bare": satellites.published(SETUP, pca=False),
-        "tuned": satellites.published(SETUP, **TUNED),
+        "bare": satellites.paper_filter(SETUP, pca=False),
+        "tuned": satellites.paper_filter(SETUP, **TUNED),
     }
-    filters |= {name: satellites.repaired(SETUP, name) for name in REPAIRED}
-    out = central(truth, seen)
+    filters |= {name: satellites.better_filter(SETUP, name) for name in REPAIRS}
+    values = run_central(truth, seen)
     for name, f in filters.items():
-        result = satellites.run(SETUP, f, for_filters, truth, seen)
-        out |= satellites.scored(SETUP, name, result)
+        result = satellites.run_filter(SETUP, f, for_filters, truth, seen)
+        values |= satellites.score_runs(SETUP, name, result)
         if name in TIMED:
             error = result["total_squared_error"].mean("agent").values
             score = result["nees"].mean("agent").values / SETUP.model.dim
-            out |= satellites.over_time(name, error, score)
-    return out
+            values |= satellites.time_series(name, error, score)
+    return values
 
 
 def part(seed: np.random.SeedSequence) -> dict[str, float]:
     """Exact draws and the central filter, as in the trial, for chapter 4 to run again."""
     for_data, for_filters = seed.spawn(2)
-    truth, seen = satellites.data(SETUP, np.random.default_rng(for_data), (BATCH,))
+    truth, seen = satellites.draw_data(SETUP, np.random.default_rng(for_data), (BATCH,))
     for_filters.spawn(4)  # of the four filters that run before it in the trial
-    f = satellites.repaired(SETUP, "exact")
-    result = satellites.run(SETUP, f, for_filters, truth, seen)
-    return satellites.scored(SETUP, "exact", result) | central(truth, seen)
+    f = satellites.better_filter(SETUP, "exact")
+    result = satellites.run_filter(SETUP, f, for_filters, truth, seen)
+    return satellites.score_runs(SETUP, "exact", result) | run_central(truth, seen)
 
 
-code = (central, satellites.data, satellites.published, satellites.repaired)
+code = (
+    run_central,
+    satellites.draw_data,
+    satellites.paper_filter,
+    satellites.better_filter,
+)

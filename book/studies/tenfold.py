@@ -1,9 +1,9 @@
 """Figs. 1 and 2 of Zheng and Lin with the printed gains, ten times a and ten times b, six runs.
 
-Consensus starts where the filters start, at the flat Gaussian; slow reading of (23), from a uniform
-and from a peaked density. Beside them the nulls: agents that do not talk (``silent``), filters of
-zero gain from the flat Gaussian (``zero``) and from the first kernel estimate (``open``); and
-filters that start as the local ones and hear all (``central_flat``). All filters of a case share
+Consensus starts where the filters start, at the flat Gaussian; slow interpretation of (23), from a
+uniform and from a peaked density. Beside them the nulls: agents that do not communicate
+(``silent``), filters of zero gain from the flat Gaussian (``zero``) and from the first kernel
+estimate (``open``); and filters that start as the local ones and observe all (``central_flat``). All filters of a case share
 one basis, so that all of them cost little more than one; the agents of the uniform case are those
 of `locals`.
 """
@@ -72,19 +72,19 @@ def consensus(
     pull = graph.laplacian.toarray()
     steps = stable_substeps(Channel(graph), dt, **gains)
     for _ in range(steps):
-        apart = pull @ nu
+        difference = pull @ nu
         spring = pull @ eta
         nu = nu + dt / steps * (
-            gains["alpha"] * (z - nu) - gains["a"] * apart + gains["b"] * spring
+            gains["alpha"] * (z - nu) - gains["a"] * difference + gains["b"] * spring
         )
-        eta = eta - dt / steps * gains["b"] * apart
+        eta = eta - dt / steps * gains["b"] * difference
     return nu, eta
 
 
 def errors(case: swarm.Case, rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """L2 errors over time, (T, filters), and the kernel estimate's, (T,).
+    """Return L2 errors over time, (T, filters), and the kernel estimate's, (T,).
 
-    A filter of zero gain is its prior mean, moved.
+    A filter of zero gain is its prior mean, propagated.
     """
     cells = case.grid
     dt = swarm.SWARM["dt"]
@@ -97,10 +97,11 @@ def errors(case: swarm.Case, rng: np.random.Generator) -> dict[str, np.ndarray]:
         length=CHOICES["prior_length"],
         std=CHOICES["prior_std"],
     )
-    x, p = swarm.drawn(case, rng)
+    x, p = swarm.draw_swarm(case, rng)
     waves = cells.cosines(swarm.MODES)
     gap = ((cells.centres - x[:, None]) ** 2).sum(axis=-1)
     flat = cells.normalize(np.exp(-0.5 * gap / swarm.FLAT**2))  # cut off at the walls
+    # Consensus works on cosine coefficients of the kernels.
     wide = flat @ waves * cells.volume
     z = density.kernels(x, cells, bandwidth=h) @ waves * cells.volume
     talk = {s: (wide, np.zeros_like(wide)) for s in (*GAINS, "silent")}
@@ -113,7 +114,7 @@ def errors(case: swarm.Case, rng: np.random.Generator) -> dict[str, np.ndarray]:
     )
     k = density.kernel_constant(cells, bandwidth=h, agents=case.agents)
     cuts = np.cumsum([len(who) for who in ROWS.values()])
-    out: dict[str, list[np.ndarray]] = {s: [] for s in (*ROWS, *NULLS, "kde")}
+    collected: dict[str, list[np.ndarray]] = {s: [] for s in (*ROWS, *NULLS, "kde")}
     for j in range(round(case.end / dt)):
         x = law.step(x, j * dt, dt, rng=rng, substeps=CHOICES["substeps"])
         graph = graphs.disk(x, case.radio_range)
@@ -122,44 +123,45 @@ def errors(case: swarm.Case, rng: np.random.Generator) -> dict[str, np.ndarray]:
         }
         z = density.kernels(x, cells, bandwidth=h) @ waves * cells.volume
         y = density.kernel_density(x, cells, bandwidth=h)
-        heard = [
+        estimates = [
             talk[s][0][who] @ waves.T if s in talk else np.tile(y, (len(who), 1))
             for s, who in ROWS.items()
         ]
         move = model.solver(j * dt, dt)
         p = move(p)
         state = density.low_rank_predict(state, move)
+        # R = k max(p̂, floor)
         noise = k * np.maximum(state.estimates, CHOICES["floor"])
-        state = density.low_rank_step(state, np.concatenate(heard), noise, dt)
+        state = density.low_rank_step(state, np.concatenate(estimates), noise, dt)
         gaps = np.split(cells.norm(state.estimates - p), cuts[:-1])
         for s, gap in zip(ROWS, gaps, strict=True):
-            out[s].append(gap)
-        out["zero"].append(cells.norm(state.base[cuts[1] : cuts[2]] - p))
-        out["open"].append(cells.norm(state.base[:1] - p))
-        out["kde"].append(cells.norm(y - p))
-    return {s: np.array(e) for s, e in out.items()}
+            collected[s].append(gap)
+        collected["zero"].append(cells.norm(state.base[cuts[1] : cuts[2]] - p))
+        collected["open"].append(cells.norm(state.base[:1] - p))
+        collected["kde"].append(cells.norm(y - p))
+    return {s: np.array(e) for s, e in collected.items()}
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
-    """One run of each case: what the captions speak of, means over the filters."""
-    out: dict[str, float] = {}
+    """One run of each case: the quantities of the captions, means over the filters."""
+    metrics: dict[str, float] = {}
     for key, case in CASES.items():
-        found = errors(case, np.random.default_rng(seed))
-        kde = found.pop("kde")
+        case_errors = errors(case, np.random.default_rng(seed))
+        kde = case_errors.pop("kde")
         k = round(5.0 / swarm.SWARM["dt"])
-        half = {s: swarm.average(e, case, case.end / 2) for s, e in found.items()}
-        out[f"{key}_kde"] = swarm.average(kde, case, case.end / 2)
-        for s, e in found.items():
+        half = {s: swarm.average(e, case, case.end / 2) for s, e in case_errors.items()}
+        metrics[f"{key}_kde"] = swarm.average(kde, case, case.end / 2)
+        for s, e in case_errors.items():
             first = e[:k].mean(axis=0)
             last = e[-k:].mean(axis=0)
             above = np.flatnonzero(e.mean(axis=1) > kde.mean())
             below = (above[-1] + 1) * swarm.SWARM["dt"] if above.size else 0.0
             values = half[s], half[s] / half["central"], last / first, last, below
-            out |= {
+            metrics |= {
                 f"{key}_{s}_{kind}": np.mean(v)
                 for kind, v in zip(KINDS, values, strict=True)
             }
-    return {name: float(out[name]) for name in columns}
+    return {name: float(metrics[name]) for name in columns}
 
 
 code = (*swarm.code, consensus, errors)

@@ -19,8 +19,14 @@ CELLS = {
     p: (*together.references(together.problem(p)), *together.cell_names(p))
     for p in together.FOUR
 }
-columns = together.score_columns(f"{p}_{c}" for p, cells in CELLS.items() for c in cells)
-parameters = {"batch": together.BATCH, "program": together.program_digest(), "cells": CELLS}
+columns = together.score_columns(
+    f"{p}_{c}" for p, cells in CELLS.items() for c in cells
+)
+parameters = {
+    "batch": together.BATCH,
+    "program": together.program_digest(),
+    "cells": CELLS,
+}
 seeds = together.make_seeds()
 scenarios = (
     *(together.problem(p).scenario for p in CELLS),
@@ -28,9 +34,15 @@ scenarios = (
     together.TUNED,
 )
 rtol = 1e-4
-ill_conditioned = [f"{p}_{k}" for p, cells in CELLS.items() for k in together.ill_conditioned_columns(cells)]
+ill_conditioned = [
+    f"{p}_{k}"
+    for p, cells in CELLS.items()
+    for k in together.ill_conditioned_columns(cells)
+]
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """References and cells of the four problems."""
-    return {f"{p}_{k}": v for p in CELLS for k, v in together.run_problem(p, seed).items()}
+    return {
+        f"{p}_{k}": v for p in CELLS for k, v in together.run_problem(p, seed).items()
+    }

@@ -13,8 +13,14 @@ import _together as together
 NAME = "held"
 PAPER = "together"
 CELLS = {p: ("reference", *together.cell_names(p)) for p in together.THREE}
-columns = together.score_columns([f"{p}_{c}" for p, cells in CELLS.items() for c in cells])
-parameters = {"batch": together.BATCH, "program": together.program_digest(), "cells": CELLS}
+columns = together.score_columns(
+    [f"{p}_{c}" for p, cells in CELLS.items() for c in cells]
+)
+parameters = {
+    "batch": together.BATCH,
+    "program": together.program_digest(),
+    "cells": CELLS,
+}
 seeds = np.random.SeedSequence(together.STUDY["seed"] + 2).spawn(
     len(together.make_seeds())
 )
@@ -25,10 +31,12 @@ ill_conditioned = columns
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """References and cells of the three problems."""
-    out: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     for name in together.THREE:
         p = together.problem(name)
-        found = together.measure_references(p, seed, together.draw_data(p, seed))
-        found |= together.measure_cells(name, seed, together.cell_names(name))
-        out |= {f"{name}_{k}": v for k, v in found.items() if not k.startswith("half")}
-    return out
+        part = together.measure_references(p, seed, together.draw_data(p, seed))
+        part |= together.measure_cells(name, seed, together.cell_names(name))
+        metrics |= {
+            f"{name}_{k}": v for k, v in part.items() if not k.startswith("half")
+        }
+    return metrics

@@ -18,16 +18,16 @@ PAPER = "together"
 MEMBERS = (10, 30, 100, 300)
 SIZED = ("known_flood", "root_flood", "exact_ci", "pf_flood", "pf_agreed", "ot_young")
 PARTICLES = (together.STUDY["particles"], 2 * together.STUDY["particles"])
-# Transport has a linear programme to solve of three hundred times three hundred unknowns.
+# With 300 members a transport plan has 90 000 unknowns.
 LARGEST = {"ot_young": 100, "pf_flood": PARTICLES[1], "pf_agreed": PARTICLES[1]}
 AGENTS = (4, 8, 16, 32, 64)
 GROWN = {
     "linear": ("ekf_near", "ekf_ci", "ekf_meas", "ekf_flood", "known_flood"),
     "range": ("ekf_ci", "known_flood", "exact_ci", "pf_agreed"),
 }
-# What 64 ranges leave to doubt is narrower than the cells of the reference.
+# With 64 ranges the posterior is narrower than a cell of the reference.
 RINGS = {"linear": AGENTS, "range": AGENTS[:-1]}
-# Where everybody filters everybody's readings, work grows with the square of the agents.
+# Where all agents filter all observations, work grows with the square of their number.
 MOST = {"known_flood": 16}
 FEWEST = {"exact_ci": 30}
 BY_MEMBERS = [
@@ -70,29 +70,31 @@ ill_conditioned = columns
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
-    """One trial of everything."""
-    out: dict[str, float] = {}
+    """Run both sweeps once."""
+    metrics: dict[str, float] = {}
     for name in ("range", "lorenz"):
         p = together.problem(name)
         data = together.draw_data(p, seed)
-        out |= headed(together.measure_references(p, seed, data, half=False), f"{name}_members_")
+        metrics |= add_prefix(
+            together.measure_references(p, seed, data, half=False), f"{name}_members_"
+        )
         for _, cell, n in (row for row in BY_MEMBERS if row[0] == name):
             f = together.CELLS[cell].make(p, together.tuned_value(name, cell), n)
-            out |= together.measure(p, cell, f, data, seed, f"{name}_members_{n}_")
+            metrics |= together.measure(p, cell, f, data, seed, f"{name}_members_{n}_")
     for name, cells in GROWN.items():
         for agents in RINGS[name]:
             p = together.problem(name).with_agents(agents)
             data = together.draw_data(p, seed)
-            found = together.measure_references(p, seed, data, half=False)
-            out |= headed(found, f"{name}_agents_{agents}_")
+            part = together.measure_references(p, seed, data, half=False)
+            metrics |= add_prefix(part, f"{name}_agents_{agents}_")
             for cell in (c for c in cells if (name, c, agents) in BY_AGENTS):
                 f = together.CELLS[cell].make(p, together.tuned_value(name, cell))
-                out |= together.measure(
+                metrics |= together.measure(
                     p, cell, f, data, seed, f"{name}_agents_{agents}_"
                 )
-    return out
+    return metrics
 
 
-def headed(found: dict[str, float], prefix: str) -> dict[str, float]:
-    """Columns with a longer name."""
-    return {f"{prefix}{k}": v for k, v in found.items()}
+def add_prefix(columns: dict[str, float], prefix: str) -> dict[str, float]:
+    """Return columns with a prefix before their names."""
+    return {f"{prefix}{k}": v for k, v in columns.items()}

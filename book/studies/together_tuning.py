@@ -1,8 +1,8 @@
 """The one tuning budget of chapter 11: five values of one number, for every filter alike.
 
-The runs are not reported. What is compared is the mean log score, which rewards small errors and a
-claim that fits, of all components together: no filter gains by saying more than it knows, or less.
-The best values stand in data/scenarios/together/tuned.toml.
+The runs are not reported. Filters are compared by the mean log score of all scored components,
+which rewards small errors and reported covariances that fit them: no filter gains by being
+overconfident or underconfident. The best values stand in data/scenarios/together/tuned.toml.
 """
 
 from __future__ import annotations
@@ -21,7 +21,11 @@ PAPER = "together"
 SEED, RUNS = together.TUNING
 VALUES = range(5)
 TRIED = {
-    p: [c for c, cell in together.CELLS.items() if cell.grid and not cell.why_excluded(p)]
+    p: [
+        c
+        for c, cell in together.CELLS.items()
+        if cell.grid and not cell.why_excluded(p)
+    ]
     for p in together.FOUR
 }
 columns = [f"{p}_{c}_{k}" for p, cells in TRIED.items() for c in cells for k in VALUES]
@@ -33,12 +37,14 @@ parameters = {
 seeds = np.random.SeedSequence(SEED).spawn(1)
 scenarios = (*(together.problem(p).scenario for p in together.FOUR), together.STUDY)
 rtol = 1e-3
-ill_conditioned = [c for c in columns if any(k in c for k in ("_pf_", "_ot_", "_maps_", "_gm_"))]
+ill_conditioned = [
+    c for c in columns if any(k in c for k in ("_pf_", "_ot_", "_maps_", "_gm_"))
+]
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
-    """Every value of every filter on every problem; a great number where a run fails."""
-    out = {}
+    """Score every value of every filter on every problem; 1e9 where a run fails."""
+    scores = {}
     for name, cells in TRIED.items():
         p = together.problem(name)
         data = p.data(RUNS, together.stream(seed, name))
@@ -58,7 +64,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
                     except (ValueError, ArithmeticError, RuntimeError) as error:
                         print(f"{name}, {cell}, {value}: {error}", file=sys.stderr)
                         mean = np.inf
-                out[f"{name}_{cell}_{k}"] = (
+                scores[f"{name}_{cell}_{k}"] = (
                     float(f"{mean:.6g}") if np.isfinite(mean) else 1e9
                 )
-    return out
+    return scores

@@ -1,8 +1,8 @@
-"""News against readings told: what agents may add where a target moves with noise.
+"""Information increments against shared observations, of a target with process noise.
 
 The stored trial is the orbit of chapter 8 with five agents, noise on all velocities and no
-ephemeris. News is `InformationIncrementFilter`; in joint bookkeeping each agent filters [target; all agents] and
-hears readings; intersection fuses beliefs about the target.
+ephemeris. ``news`` is `InformationIncrementFilter`; in ``joint`` each agent filters
+[target; all agents] with the observations of all; ``intersection`` fuses beliefs of the target.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ METRICS = ("error_tp", "claim_tp", "nees_t", "nees")
 ROWS = ("intersection", "news", "joint")
 
 
-def joint(
+def run_joint(
     s: dict, seen: np.ndarray, first: np.ndarray, covs: list
 ) -> tuple[list[list[GaussianMixture]], float]:
-    """What each agent believes of [target; itself] if angles are told, and numbers sent."""
+    """Run joint filters on shared angles; return beliefs of [target; ego] and numbers sent."""
     n = len(s["agents"])
     eye = partial(angles_only, std=s["angle_std"] * paper.ARCSECOND, form=s["form"])
     eyes = [eye(observer=6 * a) for a in range(1, n + 1)]
@@ -45,42 +45,44 @@ def joint(
         paper.orbit_model(s, n + 1), eyes, graphs.complete(n), linearization="unscented"
     )
     state = f.start((first, paper.block_diagonal(covs)))
-    out = []
+    beliefs = []
     for k, hour in enumerate(paper.HOURS):
         state = f.step(state, 3600.0 * hour, list(seen[k, :, :2]))
-        own = [[*range(6), *range(6 * a, 6 * a + 6)] for a in range(1, n + 1)]
-        out.append(
+        components = [[*range(6), *range(6 * a, 6 * a + 6)] for a in range(1, n + 1)]
+        beliefs.append(
             [
                 GaussianMixture.gaussian(m[o], p[np.ix_(o, o)])
-                for m, p, o in zip(state.means, state.covariances, own, strict=True)
+                for m, p, o in zip(
+                    state.means, state.covariances, components, strict=True
+                )
             ]
         )
-    return out, float(state.ledger.scalars.sum())
+    return beliefs, float(state.ledger.scalars.sum())
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
-    """The three rows on one set of data, means over agents and the epochs from 2 to 20 h."""
-    truth, *rest = paper.simulate(SETTING, np.random.default_rng(seed))
-    out: dict[str, float] = {}
+    """Return the three rows on one set of data, means over agents and epochs from 2 to 20 h."""
+    truth, *inputs = paper.simulate(SETTING, np.random.default_rng(seed))
+    metrics: dict[str, float] = {}
     for row, options in zip(ROWS, ("one_ci", "news", None), strict=True):
         if options is None:
-            beliefs, sent = joint(SETTING, *rest)
+            beliefs, sent = run_joint(SETTING, *inputs)
         else:
-            states = paper.run_filter(SETTING, paper.SINGLE[options], *rest)
+            states = paper.run_filter(SETTING, paper.SINGLE[options], *inputs)
             beliefs = [state.mixtures for state in states]
             sent = float(states[-1].ledger.scalars.sum())
-        found = [paper.score_epoch(beliefs[k], truth[k]) for k in paper.EARLY]
-        out |= {
-            f"{row}_{m}": float(np.mean([f[m].mean() for f in found])) for m in METRICS
+        scores = [paper.score_epoch(beliefs[k], truth[k]) for k in paper.EARLY]
+        metrics |= {
+            f"{row}_{m}": float(np.mean([f[m].mean() for f in scores])) for m in METRICS
         }
-        out[f"{row}_floats"] = sent
-    return {name: float(paper.SIX.format(v)) for name, v in out.items()}
+        metrics[f"{row}_floats"] = sent
+    return {name: float(paper.SIX.format(v)) for name, v in metrics.items()}
 
 
 columns = [f"{row}_{m}" for row in ROWS for m in (*METRICS, "floats")]
 parameters = {"setting": SETTING}
 code = (
-    joint,
+    run_joint,
     paper.simulate,
     paper.observe,
     paper.prior_beliefs,

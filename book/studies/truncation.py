@@ -1,7 +1,7 @@
-"""What the shared basis drops, against the dense filter on the paper's own grid over the long run.
+"""The truncation of the shared basis, against the dense filter on the paper's own grid.
 
-The slow reading of (23), whose covariance keeps the most waves alive: all filters see the same
-kernel estimates and the same noise, and differ in the number of columns.
+The slow interpretation of (23), in whose covariance the most waves survive: all filters have the
+same kernel estimates and the same noise, and differ in the number of columns.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     dense = density.Dense(y, full @ full.T)
     cut = {r: density.low_rank_start(full[:, :r], y[None]) for r in RANKS}
     k = density.kernel_constant(cells, bandwidth=h, agents=agents)
-    out: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     for j in range(round(TIMES[-1] / DT)):
         move = flow.solver(j * DT, DT)
         x = swarm.step(x, j * DT, DT, rng=rng, substeps=CHOICES["substeps"])
@@ -67,12 +67,12 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
         t = round((j + 1) * DT, 6)
         if t in TIMES:
             size = np.linalg.norm(dense.mean)
-            out |= {
+            metrics |= {
                 f"rank_{r}_{t:.0f}": np.linalg.norm(s.estimates[0] - dense.mean) / size
                 for r, s in cut.items()
             }
-            out[f"error_{t:.0f}"] = np.linalg.norm(dense.mean - p) / size
-    return {name: float(out[name]) for name in columns}
+            metrics[f"error_{t:.0f}"] = np.linalg.norm(dense.mean - p) / size
+    return {name: float(metrics[name]) for name in columns}
 
 
 code: tuple[object, ...] = ()

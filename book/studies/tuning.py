@@ -1,7 +1,7 @@
 """The paper's filter with every gain, with and without the own mean, with and without PCA.
 
 Run on seeds of its own, so that the comparison of `table_2.py` and `table_3.py` is fair: there the
-paper's filter runs with what does best here. All gains run at once, as an axis of runs.
+paper's filter runs with the best values of this study. All gains run at once, as an axis of runs.
 """
 
 from __future__ import annotations
@@ -56,22 +56,26 @@ def every_gain(
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     """One run of each table, all versions on the same data."""
-    out = {}
+    metrics = {}
     for (table, s), part in zip(SETUPS.items(), seed.spawn(2), strict=True):
         for_data, for_filters = part.spawn(2)
-        truth, seen = satellites.data(s, np.random.default_rng(for_data), ())
+        truth, seen = satellites.draw_data(s, np.random.default_rng(for_data), ())
         shape = (truth.shape[0], len(GAINS), truth.shape[-1])
         truth = np.broadcast_to(truth[:, None], shape)
-        for name, (pca, own) in VERSIONS.items():
-            f = satellites.published(s, pca=pca)
-            object.__setattr__(f, "fusion", partial(every_gain, include_self=own))
-            late = satellites.run(s, f, for_filters, truth, seen).isel(time=s.settled)
+        for name, (pca, include_self) in VERSIONS.items():
+            f = satellites.paper_filter(s, pca=pca)
+            object.__setattr__(
+                f, "fusion", partial(every_gain, include_self=include_self)
+            )
+            late = satellites.run_filter(s, f, for_filters, truth, seen).isel(
+                time=s.settled
+            )
             error = late["total_squared_error"].mean(("time", "agent")).values
             nees = late["nees"].mean(("time", "agent")).values / s.model.dim
             for k in range(len(GAINS)):
-                out[f"{table}_{name}_g{k}_mse"] = float(error[k])
-                out[f"{table}_{name}_g{k}_nees"] = float(nees[k])
-    return out
+                metrics[f"{table}_{name}_g{k}_mse"] = float(error[k])
+                metrics[f"{table}_{name}_g{k}_nees"] = float(nees[k])
+    return metrics
 
 
-code = (every_gain, satellites.published)
+code = (every_gain, satellites.paper_filter)

@@ -1,4 +1,4 @@
-"""Ways of sharing beside each other, and what goes wrong: losses, dropout, a wrong model.
+"""Consensus protocols compared, and under faults: losses, dropout, a wrong model.
 
 A peaked start for the table of rules; agents that drop out; and filters whose f is out of phase,
 with and without process noise. Errors over time of the first and the last, for a figure.
@@ -64,7 +64,7 @@ scenarios = swarm.scenarios
 rtol = 1e-4
 
 
-def scored(state: object, p: np.ndarray) -> dict[str, float]:
+def final_scores(state: object, p: np.ndarray) -> dict[str, float]:
     """NEES and CRPS per cell at the end."""
     from distfilt.metrics import gaussian_crps
 
@@ -77,7 +77,7 @@ def scored(state: object, p: np.ndarray) -> dict[str, float]:
 
 
 def curves(key: str, run: dict[str, np.ndarray]) -> dict[str, float]:
-    """Errors at the marks by rule, the mean over the local filters."""
+    """Return errors at the marks by rule, means over the local filters."""
     dt = swarm.SWARM["dt"]
     lines = {
         n: run[n] if n in OPEN else run[f"{n}_error"].mean(axis=1) for n in CURVES[key]
@@ -94,20 +94,20 @@ def wrong_model(rng: np.random.Generator) -> dict[str, float]:
     scale = dict(zip(CHOICES["readings"], CHOICES["process_scale"], strict=True))[
         "gibbs"
     ]
-    filters = {f"{s}_exact": swarm.network(s, WRONG, 3) for s in BASES}
+    filters = {f"{s}_exact": swarm.make_filter(s, WRONG, 3) for s in BASES}
     filters |= {
-        f"{s}_process": swarm.network(
+        f"{s}_process": swarm.make_filter(
             s, WRONG, 3, process=scale, rank=CHOICES["low_rank"]
         )
         for s in BASES
     }
-    run, _ = swarm.compared(WRONG, rng, filters)
-    out = {
+    run, _ = swarm.compare_filters(WRONG, rng, filters)
+    errors = {
         f"wrong_{s}": swarm.average(run[f"{s}_error"], WRONG, 10.0).mean()
         for s in filters
     }
-    out |= {f"wrong_{n}": swarm.average(run[n], WRONG, 10.0) for n in OPEN}
-    return out | curves("wrong", run)
+    errors |= {f"wrong_{n}": swarm.average(run[n], WRONG, 10.0) for n in OPEN}
+    return errors | curves("wrong", run)
 
 
 def trial(seed: np.random.SeedSequence) -> dict[str, float]:
@@ -118,28 +118,30 @@ def trial(seed: np.random.SeedSequence) -> dict[str, float]:
     def keep(t: float, x: np.ndarray, p: np.ndarray, states: object) -> None:
         last[0] = p
 
-    out: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     for case, rng, names, key in (
         (TABLE, table, RULES, "table"),
         (QUICK, quick, BASES, "gibbs"),
         (DROP, drop, DROPS, "drop"),
     ):
-        filters = {s: swarm.network(s, case, 3) for s in names}
-        run, ends = swarm.compared(case, rng, filters, keep)
+        filters = {s: swarm.make_filter(s, case, 3) for s in names}
+        run, ends = swarm.compare_filters(case, rng, filters, keep)
         late = {k: swarm.average(v, case, 10.0) for k, v in run.items()}
-        out |= {f"{key}_{n}": late[n] for n in OPEN}
+        metrics |= {f"{key}_{n}": late[n] for n in OPEN}
         if key == "table":
-            out |= curves(key, run)
+            metrics |= curves(key, run)
         for s in names:
             if key == "gibbs":
-                out[f"gibbs_{s}"] = late[f"{s}_error"].mean()
+                metrics[f"gibbs_{s}"] = late[f"{s}_error"].mean()
                 continue
-            out[f"{key}_{s}_error"] = late[f"{s}_error"].mean()
-            out[f"{key}_{s}_consensus"] = late[f"{s}_consensus"].mean()
-            out[f"{key}_{s}_counted"] = float(np.median(ends[s].positions_sent[:3]))
-            out |= {f"{key}_{s}_{k}": v for k, v in scored(ends[s], last[0]).items()}
-    out |= wrong_model(wrong)
-    return {name: float(out[name]) for name in columns}
+            metrics[f"{key}_{s}_error"] = late[f"{s}_error"].mean()
+            metrics[f"{key}_{s}_consensus"] = late[f"{s}_consensus"].mean()
+            metrics[f"{key}_{s}_counted"] = float(np.median(ends[s].positions_sent[:3]))
+            metrics |= {
+                f"{key}_{s}_{k}": v for k, v in final_scores(ends[s], last[0]).items()
+            }
+    metrics |= wrong_model(wrong)
+    return {name: float(metrics[name]) for name in columns}
 
 
-code = (*swarm.code, scored, wrong_model, curves)
+code = (*swarm.code, final_scores, wrong_model, curves)

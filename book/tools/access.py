@@ -1,4 +1,4 @@
-"""Pages that everybody can use: what builders leave undone, and rules that a page has to keep."""
+"""Accessible pages: repairs of the built HTML, and rules that each page must satisfy."""
 
 from __future__ import annotations
 
@@ -6,29 +6,29 @@ import re
 from pathlib import Path
 
 MENDS = (
-    # The corner of a table heads nothing.
+    # The corner of a table is no header.
     ("<th></th>", "<td></td>"),
     ('<th class="head"><p></p></th>', "<td></td>"),
-    # A control is called what it shows, and one that shows an arrow alone has a name.
+    # The name of a control is its visible text; a control that shows only an arrow needs a name.
     ('<summary aria-label="Toggle hidden content">', "<summary>"),
     (' title="Search" aria-label="Search" data-bs-placement', " data-bs-placement"),
     ("<summary><span", '<summary aria-label="Pages below"><span'),
-    # Columns of the index are no table.
+    # The columns of the index are layout, not a table.
     ('class="indextable', 'role="presentation" class="indextable'),
-    # An exercise's text has the same id as the next one's.
+    # All exercises have texts of the same id.
     (' id="exercise-content"', ""),
     (' id="solution-content"', ""),
     (' valign="top"', ""),
 )
 BRAND = re.compile(r'<div class="[^"]*">(?=\s*<a class="navbar-brand logo")')
-"""Around the book's name in the bar on the left, which no landmark holds."""
+"""The box of the book's name in the left sidebar, which is in no landmark."""
 
 RULES = Path(__file__).with_suffix(".js").read_text(encoding="utf-8")
-"""A script that returns what is wrong on an open page."""
+"""A script that returns the violations on an open page."""
 
 
 def mend(page: Path) -> None:
-    """Write a built page again with what its makers left undone."""
+    """Repair a built page in place."""
     before = page.read_text(encoding="utf-8")
     text = before
     for old, new in MENDS:

@@ -1,4 +1,4 @@
-"""A headless Chromium, for what only a browser can show."""
+"""A headless Chromium, which sets formulas and prints pages."""
 
 from __future__ import annotations
 
@@ -24,34 +24,35 @@ const ready = window.MathJax && MathJax.startup ? MathJax.startup.promise : Prom
 const pictures = [...document.images].map(i => i.decode().catch(() => null));
 ready.then(() => Promise.all(pictures)).then(() => done(true));
 """
-"""Waits for the mathematics and the pictures of a page."""
+"""Waits until formulas and pictures of a page are there."""
 
 NOT_INSTALLED = "chromium or chromedriver is not installed"
 
 
 def find_browser() -> tuple[str, str] | None:
-    """Return the paths of a browser and of what drives it, or nothing."""
+    """Return the paths of a browser and of its driver, or None."""
     names = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
     browser = next(filter(None, map(shutil.which, names)), None)
-    helper = shutil.which("chromedriver")
-    return (browser, helper) if browser and helper else None
+    driver = shutil.which("chromedriver")
+    return (browser, driver) if browser and driver else None
 
 
 @contextmanager
 def chromium(profile: Path, **logs: str) -> Iterator[Any]:
-    """Yield a browser with a fresh profile, and with logs of what it does."""
-    if (found := find_browser()) is None:
+    """Yield a browser with a new profile and the given logs."""
+    paths = find_browser()
+    if paths is None:
         raise FileNotFoundError(NOT_INSTALLED)
     from selenium import webdriver
     from selenium.webdriver.chrome.options import Options
     from selenium.webdriver.chrome.service import Service
 
     options = Options()
-    options.binary_location = found[0]
+    options.binary_location = paths[0]
     for flag in (*FLAGS, f"--user-data-dir={profile}"):
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", logs)
-    driver = webdriver.Chrome(options=options, service=Service(found[1]))
+    driver = webdriver.Chrome(options=options, service=Service(paths[1]))
     try:
         yield driver
     finally:

@@ -1,4 +1,4 @@
-"""What the book's tools share: where things are, and the environment that a chapter runs in."""
+"""Common parts of the book's tools: folders, lists of pages, the environment of a chapter."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pictures import extract_pictures
 ROOT = Path(__file__).resolve().parents[2]
 BOOK = ROOT / "book"
 SLIDER = 'class="frames"'
-"""In the HTML of a picture that moves, which brings its own alternative text."""
+"""A mark in the HTML of a slider, which has its own alternative text."""
 VERDICT = "application/vnd.distfilt.verdict+json"
 
 # Home folders, kernel files, addresses in memory and progress bars differ on the next machine.
@@ -27,11 +27,11 @@ _FOREIGN = re.compile(
 
 
 def fixed_environment() -> dict[str, str]:
-    """Return the environment in which every chapter runs, wherever it is run.
+    """Return the environment in which every chapter runs, on every machine.
 
-    One thread in each BLAS and a fixed hash seed keep the digits; the reader's own IPython profile
-    and kernels are not looked at; progress bars, whose text holds times, are off. A check that
-    fails stops the chapter.
+    One BLAS thread and a fixed hash seed make results reproducible. The user's IPython profile and
+    kernels are ignored. Progress bars, whose text depends on time, are off. A failed assertion
+    stops the chapter.
     """
     home = ROOT / "_build" / "jupyter"
     (home / "ipython").mkdir(parents=True, exist_ok=True)
@@ -75,7 +75,7 @@ def missing_pages() -> list[str]:
 
 
 def is_chapter(source: Path) -> bool:
-    """Say whether a Markdown page is a notebook: its header names a kernel."""
+    """Return whether a Markdown page is a notebook: its header names a kernel."""
     text = source.read_text(encoding="utf-8")
     header = text.split("\n---", 1)[0] if text.startswith("---") else ""
     return "kernelspec:" in header
@@ -91,18 +91,18 @@ def chosen(names: list[str]) -> list[Path]:
     """Return the sources that the command line names (all chapters without a name)."""
     if not names:
         return chapters()
-    out = []
+    paths = []
     for name in names:
-        known = [
+        matches = [
             c for c in chapters() if c.stem == name or c.stem.startswith(f"{name}-")
         ]
-        path = known[0] if known else Path(name).with_suffix(".md").resolve()
+        path = matches[0] if matches else Path(name).with_suffix(".md").resolve()
         if not path.is_file():
             sys.exit(
                 f"{name}: no such chapter; _toc.yml has {[c.stem for c in chapters()]}"
             )
-        out.append(path)
-    return out
+        paths.append(path)
+    return paths
 
 
 def output_texts(output: Any) -> Iterator[str]:
@@ -117,12 +117,12 @@ def output_texts(output: Any) -> Iterator[str]:
 
 def foreign_text(output: Any) -> str:
     """Return a piece of the output that belongs to one machine or one run, or ''."""
-    here = [str(ROOT), str(Path.home()), tempfile.gettempdir(), sys.prefix]
+    local_paths = [str(ROOT), str(Path.home()), tempfile.gettempdir(), sys.prefix]
     for text in output_texts(output):
-        found = _FOREIGN.search(text)
-        if found:
-            return found.group()
-        for path in here:
+        match = _FOREIGN.search(text)
+        if match:
+            return match.group()
+        for path in local_paths:
             if len(path) > 1 and path in text:
                 return path
     return ""

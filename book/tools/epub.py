@@ -1,4 +1,4 @@
-"""An EPUB of a page that a browser shows: a file a part, formulas as MathML, pictures as PNG."""
+"""Write an EPUB from an open page: a file for each part, formulas as MathML, pictures as PNG."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from urllib.parse import unquote
 
 from PIL import Image
 
-# Formulas as MathML, which readers of EPUB set themselves; what was made small for paper is not.
+# Formulas as MathML, which EPUB readers set themselves. Font sizes that fit paper are removed.
 MATHML = r"""
 for (const item of MathJax.startup.document.math) {
   const text = MathJax.startup.toMML(item.root).replace(/ data-[\w-]+="[^"]*"/g, "");
@@ -26,7 +26,7 @@ document.querySelectorAll("body [style]").forEach((e) => e.removeAttribute("styl
 document.querySelectorAll("svg[role]").forEach((e) => e.removeAttribute("role"));
 document.querySelectorAll("[data-size]").forEach((e) => e.removeAttribute("data-size"));
 """
-# One part as XHTML, with its title and the titles below it, each with its place.
+# One part as XHTML, with its title and the titles below it, each with its anchor.
 PART = """
 const part = document.getElementById(arguments[0]);
 const place = (e) => (e.tagName === "H1" ? part : e.id ? e : e.closest("[id]")).id;
@@ -68,7 +68,7 @@ XHTML = 'media-type="application/xhtml+xml"'
 def write(
     driver: Any, target: Path, parts: list[str], about: dict[str, str], style: str
 ) -> None:
-    """Write an EPUB of the parts of the open page, which their ids name, in that order."""
+    """Write an EPUB of the parts of the open page with these ids, in that order."""
     driver.execute_script(MATHML)
     texts = {}
     heads = {}
@@ -107,34 +107,37 @@ def write(
 
 
 def navigation(heads: dict[str, list[tuple[str, str]]]) -> str:
-    """Return the contents: each part, and what is below it."""
+    """Return the table of contents: each part and its sections."""
     lines = []
-    for part, listed in heads.items():
-        head, *below = (
-            f'<a href="{part}.xhtml#{place}">{html.escape(words)}</a>'
-            for place, words in listed
-        )
-        inner = "".join(f"<li>{link}</li>" for link in below)
-        lines += [f"<li>{head}{f'<ol>{inner}</ol>' if inner else ''}</li>"]
+    for part, titles in heads.items():
+        links = []
+        for place, words in titles:
+            address = f"{part}.xhtml#{place}"
+            links.append(f'<a href="{address}">{html.escape(words)}</a>')
+        sections = "".join(f"<li>{link}</li>" for link in links[1:])
+        nested = f"<ol>{sections}</ol>" if sections else ""
+        lines.append(f"<li>{links[0]}{nested}</li>")
     text = f'<nav epub:type="toc"><h1>Contents</h1><ol>{"".join(lines)}</ol></nav>'
     return PAGE.format(title="Contents", text=text)
 
 
 def package(texts: dict[str, str], pictures: list[str], about: dict[str, str]) -> str:
-    """Return the list of what the EPUB holds, in reading order."""
+    """Return the manifest of the EPUB, with its files in reading order."""
     items = [
         f'<item id="nav" href="nav.xhtml" {XHTML} properties="nav"/>',
         '<item id="style" href="style.css" media-type="text/css"/>',
     ]
     for part, text in texts.items():
-        has = [
+        properties = [
             word for word, tag in (("mathml", "<math"), ("svg", "<svg")) if tag in text
         ]
-        told = f' properties="{" ".join(has)}"' if has else ""
-        items += [f'<item id="{part}" href="{part}.xhtml" {XHTML}{told}/>']
+        attribute = f' properties="{" ".join(properties)}"' if properties else ""
+        items += [f'<item id="{part}" href="{part}.xhtml" {XHTML}{attribute}/>']
     for k, name in enumerate(pictures):
         items += [f'<item id="picture-{k}" href="{name}" media-type="image/png"/>']
     spine = "".join(f'<itemref idref="{part}"/>' for part in ("nav", *texts))
     now = datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-    who = uuid.uuid5(uuid.NAMESPACE_URL, f"{about['title']} {about['version']}")
-    return PACKAGE.format(who=who, now=now, items="".join(items), spine=spine, **about)
+    identifier = uuid.uuid5(uuid.NAMESPACE_URL, f"{about['title']} {about['version']}")
+    return PACKAGE.format(
+        who=identifier, now=now, items="".join(items), spine=spine, **about
+    )

@@ -4,12 +4,12 @@
     python book/tools/execute.py [CHAPTER ...] --sources
 
 The Markdown is the source; the notebook is written from it. A chapter that raises, warns, writes to
-stderr or stores a path of this machine is refused, and its stored notebook stays as it was. With
-``--check`` nothing is written: the chapters run again and are compared with what is stored, every
-byte of text, and pictures as a reader sees them. ``--bytes`` compares the pictures' bytes too: they
-are the same on the machine that stored them, while another processor may shade a pixel otherwise.
-With ``--sources`` nothing is run: the stored notebook takes the Markdown's cells and keeps its
-outputs, for edits that change no output, such as a new name for an import.
+stderr or stores a path of this machine is rejected, and its stored notebook stays unchanged. With
+``--check`` nothing is written: the chapters run again and are compared with the stored notebooks,
+texts byte for byte, pictures by their pixels. ``--bytes`` compares the bytes of pictures too: they
+are the same on the machine that stored them, while another processor may shade a pixel differently.
+With ``--sources`` nothing runs: the stored notebook takes the Markdown's cells and keeps its
+outputs, for edits that change no output, such as a new name of an import.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ def read(source: Path) -> Any:
     """Return the Markdown source as a notebook with numbered cells and no version in its header."""
     notebook = jupytext.read(source)
     header = notebook.metadata.get("jupytext", {})
-    wanted = {
+    metadata = {
         k: v for k, v in header.items() if k in ("formats", "notebook_metadata_filter")
     }
     layout = header.get("text_representation", {})
-    wanted["text_representation"] = {
+    metadata["text_representation"] = {
         k: v for k, v in layout.items() if k in ("extension", "format_name")
     }
     notebook.metadata = nbformat.from_dict(
-        {"jupytext": wanted, "kernelspec": KERNELSPEC, "language_info": LANGUAGE}
+        {"jupytext": metadata, "kernelspec": KERNELSPEC, "language_info": LANGUAGE}
     )
     for k, cell in enumerate(notebook.cells):
         cell["id"] = f"{source.stem}-{k:03d}"
@@ -68,10 +68,10 @@ def read(source: Path) -> Any:
 
 
 class Client(NotebookClient):
-    """A client that stores what an interactive cell shows first in the cell, beside its widget.
+    """A client that stores the first output of an interactive cell beside its widget.
 
-    The HTML then has a picture where it has no widget, and nbval, which knows no widgets, finds
-    the outputs that it receives.
+    The HTML then has a picture in place of the widget, and nbval, which does not know widgets,
+    finds the outputs that it receives.
     """
 
     def __init__(self, notebook: Any, **options: Any) -> None:
@@ -79,7 +79,7 @@ class Client(NotebookClient):
         self.widget_registry: dict[str, Any] = {}
 
     def clear_output(self, outs: Any, msg: Any, cell_index: int) -> None:
-        """Keep the outputs: an interactive cell clears its widget's, not the cell's."""
+        """Keep the outputs: an interactive cell clears those of its widget only."""
 
 
 def run(notebook: Any, folder: Path) -> None:
@@ -101,18 +101,21 @@ def run(notebook: Any, folder: Path) -> None:
 
 
 def complaints(notebook: Any) -> list[str]:
-    """Return what a stored notebook must not hold: stderr, and what belongs to one machine."""
-    out = []
+    """Return outputs that must not be stored: stderr, and texts that depend on the machine."""
+    problems = []
     for cell in notebook.cells:
         for output in cell.get("outputs", []):
             where = f"cell {cell['id']}:\n{cell.source}\n"
             if output.get("name") == "stderr":
-                out.append(f"{where}wrote to stderr (fix the cause):\n{output['text']}")
-            elif foreign := foreign_text(output):
-                out.append(
-                    f"{where}its output holds {foreign!r}, which another run would not"
+                problems.append(
+                    f"{where}wrote to stderr (fix the cause):\n{output['text']}"
                 )
-    return out
+            elif foreign_text(output):
+                text = foreign_text(output)
+                problems.append(
+                    f"{where}its output holds {text!r}, which another run would not"
+                )
+    return problems
 
 
 def dump(notebook: Any) -> str:
@@ -135,19 +138,19 @@ def _sort_keys(text: str) -> str:
     )
 
 
-def unlike(stored: str, fresh: str, whole: bool) -> str:
-    """Return how another execution differs from the stored text of a notebook, or ''."""
+def unlike(stored: str, fresh: str, compare_bytes: bool) -> str:
+    """Describe how another execution differs from the stored notebook; '' if it does not."""
     if stored == fresh:
         return ""
-    if whole or extract_pictures(stored)[0] != extract_pictures(fresh)[0]:
+    if compare_bytes or extract_pictures(stored)[0] != extract_pictures(fresh)[0]:
         return "another execution does not give the stored bytes"
     pairs = zip(cells_of(stored), cells_of(fresh), strict=True)
-    found = [
+    lines = [
         f"{a['id']}: {text}"
         for a, b in pairs
         for text in differences(a["outputs"], b["outputs"])
     ]
-    return "\n".join(found)
+    return "\n".join(lines)
 
 
 def cells_of(text: str) -> list[Any]:
@@ -156,8 +159,8 @@ def cells_of(text: str) -> list[Any]:
     return [cell for cell in cells if cell.cell_type == "code"]
 
 
-def execute(source: Path, check: bool = False, whole: bool = False) -> str:
-    """Execute one chapter; return what is wrong with it, or ''."""
+def execute(source: Path, check: bool = False, compare_bytes: bool = False) -> str:
+    """Execute one chapter; return its problems, or ''."""
     os.environ.update(fixed_environment())
     started = time.perf_counter()
     notebook = read(source)
@@ -173,8 +176,9 @@ def execute(source: Path, check: bool = False, whole: bool = False) -> str:
     if check:
         if not target.is_file():
             return f"{target.name}: not stored yet: make outputs"
-        if found := unlike(target.read_text(encoding="utf-8"), text, whole):
-            return f"{target.name}: {found}"
+        difference = unlike(target.read_text(encoding="utf-8"), text, compare_bytes)
+        if difference:
+            return f"{target.name}: {difference}"
     else:
         target.write_text(text, encoding="utf-8", newline="\n")
     print(f"{source.stem}: {time.perf_counter() - started:.1f} s", flush=True)
@@ -182,7 +186,7 @@ def execute(source: Path, check: bool = False, whole: bool = False) -> str:
 
 
 def copy_sources(source: Path) -> str:
-    """Give the stored notebook the Markdown's cells, outputs kept; return what is wrong, or ''."""
+    """Copy the Markdown's cells to the stored notebook, whose outputs stay; return problems."""
     target = source.with_suffix(".ipynb")
     fresh = read(source)
     stored = nbformat.read(target, as_version=4)
@@ -215,21 +219,24 @@ def main() -> int:
     options = parser.parse_args()
     sources = chosen(options.chapters)
     if options.sources:
-        found = [copy_sources(source) for source in sources]
+        problems = [copy_sources(source) for source in sources]
     else:
         with ProcessPoolExecutor(max_workers=options.jobs) as pool:
-            many = len(sources)
-            whole = [options.bytes] * many
-            found = list(
+            n = len(sources)
+            compare_bytes = [options.bytes] * n
+            problems = list(
                 pool.map(
-                    execute, sources, [options.check or options.bytes] * many, whole
+                    execute,
+                    sources,
+                    [options.check or options.bytes] * n,
+                    compare_bytes,
                 )
             )
-    for problem in filter(None, found):
+    for problem in filter(None, problems):
         print(problem, file=sys.stderr)
     if not sources:
         print(f"{ROOT.name}: the table of contents has no chapter", file=sys.stderr)
-    return int(any(found) or not sources)
+    return int(any(problems) or not sources)
 
 
 if __name__ == "__main__":

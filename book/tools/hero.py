@@ -1,8 +1,8 @@
-"""Write the moving picture of the first page as a GIF, for the repository's front.
+"""Write the slider of the first page as a GIF, for README.md.
 
     python book/tools/hero.py
 
-The frames are those that the first page stores; `make outputs` comes first.
+The frames are those of the stored first page, so run `make outputs` first.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from common import BOOK, SLIDER
 
 TARGET = BOOK / "_static" / "hero.gif"
 LIMIT = 1_500_000
-"""Bytes at most."""
+"""Largest size, in bytes."""
 
 
 def pages() -> Iterator[str]:
@@ -32,25 +32,23 @@ def pages() -> Iterator[str]:
 
 
 def main() -> int:
-    found = next(page for page in pages() if SLIDER in page)
-    data = re.search(
-        r'<script type="application/json">(.*?)</script>', found, re.DOTALL
-    )
+    html = next(page for page in pages() if SLIDER in page)
+    data = re.search(r'<script type="application/json">(.*?)</script>', html, re.DOTALL)
     if data is None:
         sys.exit("book/index.ipynb: its slider has no frames; run make outputs")
-    shown = json.loads(data[1])
+    slider = json.loads(data[1])
     frames = [
-        Image.open(io.BytesIO(base64.b64decode(frame))) for frame in shown["frames"]
+        Image.open(io.BytesIO(base64.b64decode(frame))) for frame in slider["frames"]
     ]
-    small = [
+    resized = [
         frame.convert("RGB")
         .resize((720, 720 * frame.height // frame.width))
         .quantize(64, dither=Image.Dither.NONE)
         for frame in frames
     ]
-    times = [shown["milliseconds"]] * (len(small) - 1) + [1500]
-    small[0].save(
-        TARGET, save_all=True, append_images=small[1:], duration=times, loop=0
+    times = [slider["milliseconds"]] * (len(resized) - 1) + [1500]
+    resized[0].save(
+        TARGET, save_all=True, append_images=resized[1:], duration=times, loop=0
     )
     if TARGET.stat().st_size > LIMIT:
         sys.exit(f"{TARGET}: {TARGET.stat().st_size} bytes, at most {LIMIT}")

@@ -1,11 +1,11 @@
-"""Open JupyterLab on a working copy of the book; what is saved there is not the repository's.
+"""Open JupyterLab on a working copy of the book, so that the repository stays unchanged.
 
     python book/tools/lab.py FOLDER [--no-open]
 
-The copy has the chapters as notebooks only, so that each is one name, with their stored outputs
-trusted; the pages around them; the scripts; and the data, which the chapters read and a reader may
-edit. Citations, numbers of equations and figures, and references to other chapters are written out,
-since JupyterLab knows only one page at a time. A copy that is there already is opened as it is.
+The copy has the chapters as notebooks only, with trusted outputs, the other pages, the scripts, and
+the data, which a reader may edit. Citations, numbers of equations and figures, and references to
+other chapters are replaced by text, since JupyterLab reads one page at a time. An existing copy is
+opened unchanged.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ MADE = re.compile(r"^```\{include\} _generated/\S+\n```$", re.M)
 HELP = """# API reference
 
 The reference is a page of the built book (`make book`). In a notebook `help(name)` or `name?` shows
-the same text: what a function takes, in which shapes and units, what it raises, and an example.
+the same text: arguments with shapes and units, errors, and an example.
 `book/examples` has a filter of your own in thirty lines.
 """
 HIDDEN = {"hide-input", "remove-input", "remove-cell", "hide-cell"}
@@ -55,7 +55,7 @@ HIDDEN = {"hide-input", "remove-input", "remove-cell", "hide-cell"}
 
 @dataclass
 class Names:
-    """What every page's labels are called in words: ``(4.2)``, ``Fig. 4.1``, a section's title."""
+    """Texts of the labels of all pages: ``(4.2)``, ``Fig. 4.1``, a section's title."""
 
     words: dict[str, str] = field(default_factory=dict)
     homes: dict[str, str] = field(default_factory=dict)
@@ -69,12 +69,12 @@ class Names:
 
 def labels_of(text: str) -> Iterator[str]:
     """Yield the labels of a text's equations, in order."""
-    found = [
+    positions = [
         (m.start(), dict(OPTION.findall(m["body"])).get("label"))
         for m in MATH.finditer(text)
     ]
-    found += [(m.start(), m["label"]) for m in DOLLARS.finditer(text)]
-    return (label for _, label in sorted(found) if label)
+    positions += [(m.start(), m["label"]) for m in DOLLARS.finditer(text)]
+    return (label for _, label in sorted(positions) if label)
 
 
 def texts_of(source: Path) -> list[tuple[str, Any]]:
@@ -92,47 +92,52 @@ def texts_of(source: Path) -> list[tuple[str, Any]]:
 
 
 def names(sources: list[Path]) -> Names:
-    """Return what all labels of the book are called."""
-    out = Names()
-    last = None
+    """Return the texts of all labels of the book."""
+    all_names = Names()
+    previous_number = None
     for source in sources:
         number = chapter_number(f"book/{source.stem}")
         page = chapter_label(f"book/{source.stem}")
         head = "" if number is None else f"{number}."
-        if number is None or number != last:  # a chapter's second page counts on
+        if (
+            number is None or number != previous_number
+        ):  # a chapter's second page counts on
             equations = figures = 0
-        last = number
+        previous_number = number
         for text, figure in texts_of(source):
-            if title := TITLE.search(text):
+            title = TITLE.search(text)
+            if title:
                 chapter = title[1] if number is None else f"Chapter {page}, {title[1]}"
-                out.add(source.stem, chapter, source.stem)
+                all_names.add(source.stem, chapter, source.stem)
             for label in labels_of(text):
                 equations += 1
-                out.equations[label] = f"{head}{equations}"
-                out.add(label, f"({head}{equations})", source.stem)
+                all_names.equations[label] = f"{head}{equations}"
+                all_names.add(label, f"({head}{equations})", source.stem)
             for label, section in ANCHOR.findall(text):
-                out.add(label, section, source.stem)
+                all_names.add(label, section, source.stem)
             if figure:
                 figures += 1
                 name = str(figure.get("name", f"{source.stem}-{figures}"))
-                out.figures[name] = f"Fig. {head}{figures}"
-                out.add(name, f"Fig. {head}{figures}", source.stem)
-    return out
+                all_names.figures[name] = f"Fig. {head}{figures}"
+                all_names.add(name, f"Fig. {head}{figures}", source.stem)
+    return all_names
 
 
 def cite(key: str, references: BibliographyData) -> tuple[str, str]:
-    """Return an entry's authors, as a text names them, and its year."""
+    """Return the authors of an entry, as a citation names them, and its year."""
     entry = references.entries[key]
     people = entry.persons.get("author") or entry.persons.get("editor") or []
-    last = [" ".join([*p.prelast_names, *p.last_names]).strip("{}") for p in people]
-    shown = f"{last[0]} et al." if len(last) > 2 else " and ".join(last) or key
-    return shown, str(entry.fields.get("year", "n.d."))
+    surnames = [" ".join([*p.prelast_names, *p.last_names]).strip("{}") for p in people]
+    authors = (
+        f"{surnames[0]} et al." if len(surnames) > 2 else " and ".join(surnames) or key
+    )
+    return authors, str(entry.fields.get("year", "n.d."))
 
 
 def render_role(
-    role: str, target: str, page: str, known: Names, refs: BibliographyData
+    role: str, target: str, page: str, all_names: Names, refs: BibliographyData
 ) -> str:
-    """Return the words that a role stands for."""
+    """Return the text that replaces a role."""
     if role.startswith("cite"):
         entries = [cite(key.strip(), refs) for key in target.split(",")]
         if role == "cite:t":
@@ -144,11 +149,11 @@ def render_role(
             + "; ".join(f"{who}, {year}" for who, year in entries)
             + "](bibliography.md))"
         )
-    shown, _, inner = target.rpartition("<")
-    label = inner.rstrip(">").strip() if shown else target
+    text, _, reference = target.rpartition("<")
+    label = reference.rstrip(">").strip() if text else target
     label = label.removeprefix("/").removeprefix("book/").removesuffix(".md")
-    words = shown.strip() or known.words.get(label, label)
-    home = known.homes.get(label, page)
+    words = text.strip() or all_names.words.get(label, label)
+    home = all_names.homes.get(label, page)
     return words if home == page else f"[{words}]({file_of(home)})"
 
 
@@ -157,30 +162,32 @@ def file_of(stem: str) -> str:
     return f"{stem}.ipynb" if is_chapter(BOOK / f"{stem}.md") else f"{stem}.md"
 
 
-def plain(text: str, page: str, known: Names, references: BibliographyData) -> str:
-    """Return a page's text as JupyterLab reads it: numbers, names and authors written out."""
+def plain(text: str, page: str, all_names: Names, references: BibliographyData) -> str:
+    """Return a page's text for JupyterLab, with numbers, titles and authors in place of roles."""
 
-    def equation(found: re.Match[str]) -> str:
-        options = dict(OPTION.findall(found["body"]))
-        number = known.equations.get(options.get("label", ""))
-        body = OPTION.sub("", found["body"]).strip()
+    def equation(match: re.Match[str]) -> str:
+        options = dict(OPTION.findall(match["body"]))
+        number = all_names.equations.get(options.get("label", ""))
+        body = OPTION.sub("", match["body"]).strip()
         return f"$$\n{body}\n" + (f"\\tag{{{number}}}\n$$" if number else "$$")
 
-    def dollars(found: re.Match[str]) -> str:
-        return f"$${found['body']}\\tag{{{known.equations[found['label']]}}}$$"
+    def dollars(match: re.Match[str]) -> str:
+        return f"$${match['body']}\\tag{{{all_names.equations[match['label']]}}}$$"
 
     text = MATH.sub(equation, DOLLARS.sub(dollars, text))
     text = SOLUTION.sub(lambda m: "**Solution**\n" if m[2] == "start" else "", text)
     text = INCLUDE.sub(lambda m: reproductions_text(), text)
     text = MADE.sub(
-        "*What the build makes of the chapters stands here on the book's page.*", text
+        "*The page of the book has a list here that the build computes.*", text
     )
     text = re.sub(r"\]\((?:/book/)?(\d\d[a-z]?-[\w-]+)\.md", r"](\1.ipynb", text)
-    return ROLE.sub(lambda m: render_role(m[1], m[2], page, known, references), text)
+    return ROLE.sub(
+        lambda m: render_role(m[1], m[2], page, all_names, references), text
+    )
 
 
-def notebook(source: Path, known: Names, references: BibliographyData) -> Any:
-    """Return a chapter as a notebook of its own, which no save writes to a second file."""
+def notebook(source: Path, all_names: Names, references: BibliographyData) -> Any:
+    """Return a chapter as a notebook that is not paired with a Markdown file."""
     stored = nbformat.read(source.with_suffix(".ipynb"), as_version=4)
     stored.metadata.pop("jupytext", None)
     cells = []
@@ -188,21 +195,23 @@ def notebook(source: Path, known: Names, references: BibliographyData) -> Any:
     for cell in stored.cells:
         cells.append(cell)
         if cell.cell_type == "markdown":
-            cell.source = plain(cell.source, source.stem, known, references)
+            cell.source = plain(cell.source, source.stem, all_names, references)
             continue
         if HIDDEN & set(cell.metadata.get("tags", [])):
             cell.metadata["jupyter"] = {"source_hidden": True}
         figure = cell.metadata.get("mystnb", {}).get("figure")
         if figure:
             figures += 1
-            name = known.figures[str(figure.get("name", f"{source.stem}-{figures}"))]
+            name = all_names.figures[
+                str(figure.get("name", f"{source.stem}-{figures}"))
+            ]
             caption = plain(
-                str(figure.get("caption", "")), source.stem, known, references
+                str(figure.get("caption", "")), source.stem, all_names, references
             )
-            below = nbformat.v4.new_markdown_cell(
+            caption_cell = nbformat.v4.new_markdown_cell(
                 f"**{name}** {caption}", id=f"{cell.id}-caption"
             )
-            cells.append(below)
+            cells.append(caption_cell)
     stored.cells = cells
     return stored
 
@@ -222,33 +231,33 @@ def copy(folder: Path) -> list[Path]:
         ROOT / f"{page}.md" for page in toc_pages() if (ROOT / f"{page}.md").is_file()
     ]
     references = parse_file(str(BOOK / "refs.bib"), bib_format="bibtex")
-    known = names(pages)
+    all_names = names(pages)
     book = folder / "book"
-    out = []
+    notebooks = []
     book.mkdir(parents=True)
     for source in pages:
         if is_chapter(source):
             target = book / f"{source.stem}.ipynb"
-            nbformat.write(notebook(source, known, references), target)
-            out.append(target)
+            nbformat.write(notebook(source, all_names, references), target)
+            notebooks.append(target)
         elif source.stem == "bibliography":
             (book / source.name).write_text(bibliography(references), encoding="utf-8")
         elif source.stem == "api":
             (book / source.name).write_text(HELP, encoding="utf-8")
         elif source.parent == BOOK:
             text = plain(
-                source.read_text(encoding="utf-8"), source.stem, known, references
+                source.read_text(encoding="utf-8"), source.stem, all_names, references
             )
             (book / source.name).write_text(text, encoding="utf-8")
-    left_out = shutil.ignore_patterns("__pycache__", ".*")
+    ignored = shutil.ignore_patterns("__pycache__", ".*")
     for name in ("examples", "studies"):
-        shutil.copytree(BOOK / name, book / name, ignore=left_out)
-    shutil.copytree(ROOT / "data", folder / "data", ignore=left_out)
-    return out
+        shutil.copytree(BOOK / name, book / name, ignore=ignored)
+    shutil.copytree(ROOT / "data", folder / "data", ignore=ignored)
+    return notebooks
 
 
 def settings(folder: Path) -> dict[str, str]:
-    """Return the environment in which JupyterLab keeps everything of its own in the copy."""
+    """Return an environment in which JupyterLab stores its own files in the copy."""
     home = folder / ".jupyter"
     viewers = home / "lab" / "user-settings" / "@jupyterlab" / "docmanager-extension"
     viewers.mkdir(parents=True, exist_ok=True)
@@ -267,7 +276,7 @@ def settings(folder: Path) -> dict[str, str]:
 
 
 def trust(notebooks: list[Path], environment: dict[str, str]) -> None:
-    """Sign the notebooks, so that their pictures move before a cell is run."""
+    """Sign the notebooks, so that their sliders work before a cell is run."""
     data = Path(environment["JUPYTER_DATA_DIR"])
     data.mkdir(parents=True, exist_ok=True)
     notary = NotebookNotary(data_dir=str(data))
@@ -288,7 +297,7 @@ def main(arguments: list[str] | None = None) -> int:
     environment = settings(folder) if (folder / "book").is_dir() else {}
     if environment:
         print(
-            f"The working copy of before: {folder}\nFor a fresh one: make lab LAB=another/folder"
+            f"The existing working copy: {folder}\nFor a new one: make lab LAB=another/folder"
         )
     elif folder.is_dir() and any(folder.iterdir()):
         parser.error(f"{options.folder}: is not empty and holds no working copy")

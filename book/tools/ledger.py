@@ -2,10 +2,10 @@
 
     python book/tools/ledger.py [--check]
 
-``data/published/items.csv`` lists what the papers print; a chapter displays a verdict for an item
-that it has reproduced. An item without a verdict is "not yet"; two verdicts for one item are an
-error. With ``--check`` nothing is written and ``data/published/ledger.csv`` is compared byte for
-byte.
+``data/published/items.csv`` lists the tables and figures of the papers; a chapter displays a
+verdict for an item that it has reproduced. An item without a verdict is "not yet"; two verdicts for
+one item are an error. With ``--check`` nothing is written and ``data/published/ledger.csv`` is
+compared byte for byte.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ COLUMNS = (
     "why",
 )
 OPEN = "not yet"
-VERDICTS = {kind: (*found, OPEN) for kind, found in published.VERDICTS.items()}
-"""What can stand in the ledger for each kind of item."""
+VERDICTS = {kind: (*verdicts, OPEN) for kind, verdicts in published.VERDICTS.items()}
+"""Possible verdicts of each kind of item in the ledger."""
 WORDS = {
     "parameters": "tables of parameters",
     "results": "tables and figures of results",
@@ -54,13 +54,13 @@ WORDS = {
 def verdicts_of(notebook: Path) -> list[dict[str, str]]:
     """Return the verdicts that one stored notebook displays, each with its chapter."""
     stored: Any = nbformat.read(notebook, as_version=4)
-    found = [
+    verdicts = [
         output["data"][VERDICT]
         for cell in stored.cells
         for output in cell.get("outputs", [])
         if VERDICT in output.get("data", {})
     ]
-    return [{**verdict, "chapter": notebook.stem} for verdict in found]
+    return [{**verdict, "chapter": notebook.stem} for verdict in verdicts]
 
 
 def ledger(
@@ -75,50 +75,51 @@ def ledger(
     """
     keys = [(item["paper"], item["item"]) for item in items]
     kinds = dict(zip(keys, (item["kind"] for item in items), strict=True))
-    given: dict[tuple[str, str], dict[str, str]] = {}
+    by_item: dict[tuple[str, str], dict[str, str]] = {}
     for verdict in verdicts:
         key = (verdict["paper"], verdict["item"])
         where = f"{verdict['chapter']}: {' '.join(key)}"
         if key not in keys:
             raise ValueError(f"{where}: not an item of {ITEMS.name}")
-        if key in given:
+        if key in by_item:
             raise ValueError(
-                f"{where}: has a verdict already, in {given[key]['chapter']}"
+                f"{where}: has a verdict already, in {by_item[key]['chapter']}"
             )
-        known = VERDICTS[kinds[key]]
-        if verdict["verdict"] not in known:
+        allowed = VERDICTS[kinds[key]]
+        if verdict["verdict"] not in allowed:
             raise ValueError(
-                f"{where}: verdict {verdict['verdict']!r}, needs one of {known}"
+                f"{where}: verdict {verdict['verdict']!r}, needs one of {allowed}"
             )
-        given[key] = verdict
+        by_item[key] = verdict
     blank = dict.fromkeys(COLUMNS, "") | {"verdict": OPEN}
     return [
-        {name: (blank | item | given.get(key, {}))[name] for name in COLUMNS}
+        {name: (blank | item | by_item.get(key, {}))[name] for name in COLUMNS}
         for key, item in zip(keys, items, strict=True)
     ]
 
 
 def text_of(rows: list[dict[str, str]]) -> str:
     """Return the ledger as CSV text."""
-    out = io.StringIO()
-    writer = csv.DictWriter(out, COLUMNS, lineterminator="\n")
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, COLUMNS, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    return out.getvalue()
+    return buffer.getvalue()
 
 
 def summaries(rows: list[dict[str, str]]) -> dict[str, tuple[int, dict[str, int]]]:
-    """Return, for each kind of item, how many there are and how many have each verdict."""
-    out = {}
-    for kind, known in VERDICTS.items():
-        found = Counter(row["verdict"] for row in rows if row["kind"] == kind)
-        out[kind] = found.total(), {verdict: found[verdict] for verdict in known}
-    return out
+    """Return, for each kind of item, their number and the number with each verdict."""
+    summary = {}
+    for kind, verdicts in VERDICTS.items():
+        counts = Counter(row["verdict"] for row in rows if row["kind"] == kind)
+        by_verdict = {verdict: counts[verdict] for verdict in verdicts}
+        summary[kind] = (counts.total(), by_verdict)
+    return summary
 
 
 @dataclass(frozen=True)
-class Judged:
-    """One claim of a row as the ledger tells it, for one of the starts that were judged."""
+class LedgerClaim:
+    """One claim of a row of the ledger, for one of the starts that were judged."""
 
     id: str
     start: str
@@ -131,45 +132,44 @@ class Judged:
 START = r"(?:(?P<start>(?:off|on) the circle): )?"
 
 
-def parts(text: str, head: str) -> list[tuple[str, re.Match[str], str]]:
-    """Split a cell of the ledger at its claims: the start, the head's match, the rest."""
-    hits = list(re.finditer(rf"(?:^|; ){START}{head}", text))
-    out = []
+def split_claims(text: str, head: str) -> list[tuple[str, re.Match[str], str]]:
+    """Split a cell of the ledger at its claims: the start, the match of the head, the text."""
+    heads = list(re.finditer(rf"(?:^|; ){START}{head}", text))
+    ends = [match.start() for match in heads[1:]] + [len(text)]
+    pieces = []
     start = ""
-    ends = [h.start() for h in hits[1:]] + [len(text)] * bool(hits)
-    for hit, end in zip(hits, ends, strict=True):
-        start = hit["start"] or start
-        out.append((start, hit, text[hit.end() : end]))
-    return out
+    for match, end in zip(heads, ends, strict=False):
+        # A start holds for all claims up to the next start.
+        start = match["start"] or start
+        pieces.append((start, match, text[match.end() : end]))
+    return pieces
 
 
-def claims_of(row: dict[str, str]) -> list[Judged]:
+def claims_of(row: dict[str, str]) -> list[LedgerClaim]:
     """Return the claims of a row of results, each with its null and its range."""
-    ours = parts(row["ours"], r"(?P<id>[a-z0-9-]+) (?P<word>holds|fails): ")
-    ids = "|".join(dict.fromkeys(hit["id"] for _, hit, _ in ours))
-    nulls = {
-        (s, hit["id"]): rest for s, hit, rest in parts(row["null"], rf"(?P<id>{ids}), ")
-    }
-    ranges = {
-        (s, hit["id"]): rest for s, hit, rest in parts(row["range"], rf"(?P<id>{ids}) ")
-    }
-    return [
-        Judged(
-            hit["id"],
-            s,
-            hit["word"] == "holds",
-            rest,
-            nulls.get((s, hit["id"]), ""),
-            ranges.get((s, hit["id"]), ""),
+    ours = split_claims(row["ours"], r"(?P<id>[a-z0-9-]+) (?P<word>holds|fails): ")
+    ids = "|".join(dict.fromkeys(match["id"] for _, match, _ in ours))
+    nulls = {}
+    for start, match, text in split_claims(row["null"], rf"(?P<id>{ids}), "):
+        nulls[start, match["id"]] = text
+    ranges = {}
+    for start, match, text in split_claims(row["range"], rf"(?P<id>{ids}) "):
+        ranges[start, match["id"]] = text
+    claims = []
+    for start, match, text in ours:
+        key = (start, match["id"])
+        holds = match["word"] == "holds"
+        null = nulls.get(key, "")
+        claims.append(
+            LedgerClaim(key[1], start, holds, text, null, ranges.get(key, ""))
         )
-        for s, hit, rest in ours
-    ]
+    return claims
 
 
 def powerless_claims(row: dict[str, str]) -> list[str]:
-    """Return the claims of a row whose verdict is the same on the null's numbers, or lacks one.
+    """Return the claims of a row whose rule holds on the null's numbers too, or has no null.
 
-    A claim writes "holds too" behind its null when its rule, asked of the null, holds.
+    In the first case the text of the null ends in "(holds too)".
     """
     return [c.id for c in claims_of(row) if not c.null or "(holds too)" in c.null]
 
@@ -189,7 +189,9 @@ def main() -> int:
     if "--check" not in sys.argv[1:]:
         LEDGER.write_text(text, encoding="utf-8")
     elif not LEDGER.is_file() or LEDGER.read_text(encoding="utf-8") != text:
-        sys.exit(f"{LEDGER.name} is not what the stored chapters give: make outputs")
+        sys.exit(
+            f"{LEDGER.name} differs from the verdicts of the stored chapters: make outputs"
+        )
     for kind, (total, counts) in summaries(read_rows(LEDGER)).items():
         print(
             f"{total} {WORDS[kind]}: "

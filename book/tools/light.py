@@ -1,4 +1,4 @@
-"""Pages that weigh less: pictures as lossless WebP, a slider's frames in files of their own."""
+"""Smaller pages: pictures as lossless WebP, the frames of sliders in separate files."""
 
 from __future__ import annotations
 
@@ -18,29 +18,29 @@ FRAMES = re.compile(
     rf'<div {SLIDER}.*?<script type="application/json">(?P<data>.*?)</script>.*?</script>',
     re.S,
 )
-"""A picture that moves, on a built page."""
+"""A slider on a built page."""
 INLINE = "data:image/webp;base64,"
 AHEAD = """root.dataset.ready = "";
-    // Frames are asked for when somebody comes near.
+    // Frames are loaded when the pointer or the focus enters the slider.
     const ask = () => { data.frames.forEach((frame) => { new Image().src = frame; }); };
     root.addEventListener("pointerenter", ask, {once: true});
     root.addEventListener("focusin", ask, {once: true});"""
 
 
 def lighten(folder: Path) -> None:
-    """Make the pages of a built book lighter; what they show stays the same to the last pixel."""
+    """Make the pages of a built book smaller, without a change of any pixel."""
     images = folder / "_images"
     with ThreadPoolExecutor() as pool:
-        small = [
+        converted = [
             name for name in pool.map(as_webp, sorted(images.glob("*.png"))) if name
         ]
-    named = re.compile(rf"(_images/)({'|'.join(map(re.escape, small))})\.png")
+    references = re.compile(rf"(_images/)({'|'.join(map(re.escape, converted))})\.png")
     for page in sorted(folder.rglob("*.html")):
         before = page.read_text(encoding="utf-8")
-        text = named.sub(r"\1\2.webp", before) if small else before
-        where = os.path.relpath(images, page.parent)
+        text = references.sub(r"\1\2.webp", before) if converted else before
+        relative = os.path.relpath(images, page.parent)
         text = FRAMES.sub(
-            lambda found, where=where: outside(found, images, where), text
+            lambda found, relative=relative: outside(found, images, relative), text
         )
         if text != before:
             page.write_text(text, encoding="utf-8")
@@ -53,13 +53,13 @@ def as_webp(picture: Path) -> str | None:
         alpha = image.mode == "RGBA" and image.getextrema()[3][0] < 255
         plain = image.convert("RGBA" if alpha else "RGB")
     plain.save(target, lossless=True, quality=50, method=2)
-    worse, better = sorted((picture, target), key=lambda path: -path.stat().st_size)
-    worse.unlink()
-    return picture.stem if better == target else None
+    larger, smaller = sorted((picture, target), key=lambda path: -path.stat().st_size)
+    larger.unlink()
+    return picture.stem if smaller == target else None
 
 
 def outside(found: re.Match[str], images: Path, where: str) -> str:
-    """Return a slider whose frames are files, and write them."""
+    """Write the frames of a slider to files, and return the slider with links to them."""
     data = json.loads(found["data"])
     names = []
     for frame in data["frames"]:
@@ -70,8 +70,8 @@ def outside(found: re.Match[str], images: Path, where: str) -> str:
         zip((f"{INLINE}{frame}" for frame in data["frames"]), names, strict=True)
     )
     data["frames"] = [f"{where}/{name}" for name in names]
-    told = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
-    text = found[0].replace(found["data"], told).replace(f'"{INLINE}" + ', "")
+    text_of_data = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
+    text = found[0].replace(found["data"], text_of_data).replace(f'"{INLINE}" + ', "")
     text = re.sub(
         rf'src="({INLINE}[^"]*)"', lambda src: f'src="{where}/{links[src[1]]}"', text
     )

@@ -4,7 +4,7 @@
 
 Prose is the text between the cells with its tables, exercises and solutions, and of the cells the
 captions and alternative texts. No value is set into a sentence by the build: a chapter prints its
-numbers in outputs and asserts beside a cell what its sentences say. So a numeral is traced to
+numbers in outputs, and asserts in cells the statements of its sentences. So a numeral is traced to
 
 check
     an assertion that compares with this value, encloses it between two numbers or says it in its
@@ -16,7 +16,7 @@ parameter
     a number of a cell, of a scenario or of a study that the chapter reads, where the name that the
     number is bound to and the sentence share a word (or units are the same, for a scenario)
 published
-    a value that the paper printed (``data/published``, or what a scenario calls given), in a
+    a value that the paper printed (``data/published``, or a given value of a scenario), in a
     sentence that speaks of the paper
 beside
     nothing but the same number of one or two digits in a cell of the section, under a name that the
@@ -28,13 +28,13 @@ cited
 known
     a phrase listed in ``numerals.csv`` with a reason, each on its own line
 
-What is a numeral of another kind is left out: names, years, numbers of chapters, sections, figures,
+Numerals of other kinds are left out: names, years, numbers of chapters, sections, figures,
 equations and lines, formulas that define something (numbers behind the sign of an equation or
 inequality at a formula's end count), and **small** ones, which are counted: words and digits up to
 twelve, ordinals, halves and doubles without a unit. A small one with a unit, a percent sign or
 "times" counts as any other.
 
-A trace says that the number is there, not that the sentence is about it. What that is worth is
+A trace shows that the number exists, not that the sentence is about it. How much that is worth is
 measured: each traced numeral is replaced by others of its length, and the share of those that would
 be traced as well is printed. The tool ends with an error if a numeral has no trace, or a known
 phrase is gone.
@@ -146,7 +146,7 @@ UNITS = {
     r"orders? of": (),
     r"Hz\b": (),
 }
-"""What follows a number, and what its value may be multiplied by in the code."""
+"""Units after a number, and factors by which its value may be multiplied in the code."""
 LABELS = (
     r"chapters?|figs?\.|figures?|tables?|sections?|equations?|eqs?\.|algorithms?|lines?|steps?"
     r"|items?|agents?|parts?|exercises?|rows?|version|theorems?|pages?|panels?|mixands?|sensors?"
@@ -251,7 +251,7 @@ class Numeral:
 
 @dataclass
 class Fact:
-    """A number that a run has, between two ends, with the words that go with it."""
+    """A number of a run, or an interval, with the words of its name."""
 
     kind: str
     low: float
@@ -265,27 +265,28 @@ class Fact:
 
 
 def stems(text: str) -> frozenset[str]:
-    """Beginnings of the words that mean something."""
+    """Return the first letters of the words that carry meaning."""
     words = re.findall(
         r"[a-zA-Zε-ω]{3,}", re.sub(r"([a-z])([A-Z])|_", r"\1 \2", text).lower()
     )
-    found = [*words, *re.findall(r"[a-z]+_[a-z_]+", text)]
+    parts = [*words, *re.findall(r"[a-z]+_[a-z_]+", text)]
     return frozenset(
-        w if "_" in w else w[:5] for w in found if w not in COMMON and w not in ONES
+        w if "_" in w else w[:5] for w in parts if w not in COMMON and w not in ONES
     )
 
 
 def number(text: str) -> float:
-    """The value of a numeral in words or digits."""
+    """Return the value of a numeral in words or digits."""
     low = text.lower().replace("-", " ")
     if re.search(r"\d", text):
         return float(re.sub(r"[   \u2009]", "", text.replace("−", "-")))
     if low == "twice":
         return 2.0
-    if found := re.fullmatch(
-        r"(?:an? )?(\w+)-(hundred|thousand|million)ths?", text.lower()
-    ):
-        return 1 / (number(found[1]) * LARGE[found[2]])
+    # "three-thousandths": a count of one of the large parts.
+    pattern = r"(?:an? )?(\w+)-(hundred|thousand|million)ths?"
+    fraction = re.fullmatch(pattern, text.lower())
+    if fraction:
+        return 1 / (number(fraction[1]) * LARGE[fraction[2]])
     total = 0.0
     part = 0.0
     share = 1.0
@@ -309,12 +310,12 @@ def number(text: str) -> float:
 
 
 def digits(text: str) -> int:
-    """How many digits of a numeral count."""
+    """Return the number of significant digits."""
     return len(re.sub(r"e.*|[^0-9]", "", text).lstrip("0"))
 
 
 def step_of(text: str, value: float) -> float:
-    """One unit in the last digit given; of words, an eighth of a fraction, else one."""
+    """Return one unit in the last digit; for words, a fifth of a fraction, else one."""
     if re.search(r"\d", text):
         mantissa, _, power = text.partition("e")
         return 10.0 ** (int(power or 0) - len(mantissa.partition(".")[2]))
@@ -334,25 +335,25 @@ def pieces(text: str) -> Iterator[tuple[int, str, str]]:
     text = re.sub(
         r"\A---\n.*?^---\n", lambda m: "\n" * m[0].count("\n"), text, flags=re.M | re.S
     )
-    at = 0
+    position = 0
     for cell in CELL.finditer(text):
-        yield text.count("\n", 0, at) + 1, "prose", text[at : cell.start()]
+        yield text.count("\n", 0, position) + 1, "prose", text[position : cell.start()]
         line = text.count("\n", 0, cell.start()) + 1
         header = cell["yaml"] or ""
-        for found in re.finditer(
+        for option in re.finditer(
             r"^ *(caption|alt): >-\n((?: {6,}.*\n)+)", header, re.M
         ):
-            yield line, "prose", f"\n\n{found[2]}\n\n"
+            yield line, "prose", f"\n\n{option[2]}\n\n"
         yield line, "code", cell["code"]
-        at = cell.end()
-    yield text.count("\n", 0, at) + 1, "prose", text[at:]
+        position = cell.end()
+    yield text.count("\n", 0, position) + 1, "prose", text[position:]
 
 
 FORMULA = re.compile(r"\$([^$]+)\$")
 
 
 def evaluate(text: str) -> float | None:
-    """The value of a formula of numbers alone, or None."""
+    """Return the value of a formula of numbers only, or None."""
     text = re.sub(r"\\[td]?frac(\d)(\d)", r"(\1/\2)", text)
     text = re.sub(r"\\[td]?frac\{([^{}]*)\}\{([^{}]*)\}", r"((\1)/(\2))", text)
     text = re.sub(r"\\(sqrt|log)\s*\{?(\d+)\}?", r"\1(\2)", text)
@@ -379,32 +380,34 @@ def evaluate(text: str) -> float | None:
         return None
 
 
-def of_formula(found: re.Match[str]) -> str:
-    """What a formula leaves in the sentence: nothing, or the number that it ends in."""
-    inside = found[1].replace("{,}", "").replace("\\,", " ").replace("\\%", "%").strip()
-    parts = re.split(r"(=|\\approx)", inside)
+def of_formula(match: re.Match[str]) -> str:
+    """Return the text that replaces a formula: a blank, or the number at its end."""
+    formula = (
+        match[1].replace("{,}", "").replace("\\,", " ").replace("\\%", "%").strip()
+    )
+    parts = re.split(r"(=|\\approx)", formula)
     if len(parts) > 2 and re.fullmatch(r" ?-?\d+(?:\.\d+)? ?", parts[-1]):
-        given = float(parts[-1])
+        value = float(parts[-1])
         exact = evaluate(parts[-3])
-        loose = 0.02 * abs(given) if "approx" in parts[-2] else 0.0
-        if exact is not None and abs(exact - given) <= max(
-            loose, 0.5001 * step_of(parts[-1].strip(), given)
+        loose = 0.02 * abs(value) if "approx" in parts[-2] else 0.0
+        if exact is not None and abs(exact - value) <= max(
+            loose, 0.5001 * step_of(parts[-1].strip(), value)
         ):
             return f" {parts[-1].strip()} ≗ "
-    power = re.fullmatch(r"(?:(.*)\\(?:cdot|times) ?)?10\^\{?(-?\d+)\}?", inside)
+    power = re.fullmatch(r"(?:(.*)\\(?:cdot|times) ?)?10\^\{?(-?\d+)\}?", formula)
     if power and re.fullmatch(r"[\d.]*", power[1] or ""):
         return f" {float(power[1] or 1) * 10.0 ** int(power[2]):g} "
-    if re.fullmatch(r"\\?(?:pm)?[-\d. %]+", inside):
-        return f" {inside.removeprefix(chr(92) + 'pm')} "
+    if re.fullmatch(r"\\?(?:pm)?[-\d. %]+", formula):
+        return f" {formula.removeprefix(chr(92) + 'pm')} "
     last = re.search(
         r"(?:=|\\approx|<|>|\\leq?|\\geq?|\\pm) ?(-?\d+(?:\.\d+)?)(?:\\?[ ,;]*)$",
-        inside,
+        formula,
     )
     return f" ({last[1]}) = " if last and float(last[1]) not in (0, 1) else " "
 
 
 def plain(text: str) -> str:
-    """Prose without code, roles, addresses, comments and what defines something; lines kept."""
+    """Return prose without code, roles, addresses, comments and definitions, with its lines."""
     keep = lambda m: "\n" * m[0].count("\n")  # noqa: E731
     text = re.sub(
         r"^(`{3,})\{(?:math|include|eval-rst)\}.*?^\1$", keep, text, flags=re.M | re.S
@@ -422,20 +425,20 @@ def plain(text: str) -> str:
 
 
 def structure(sentence: str) -> str:
-    """The sentence without numbers of figures, equations and the like, as long as before."""
+    """Blank out numbers of figures, equations and the like in a sentence, without moving text."""
     blank = lambda m: re.sub(r"\S", "_", m[0])  # noqa: E731
     number_list = r"\d+[a-z]?(?:(?:, | and | to | or |-|–|/)\d+[a-z]?)*\b(?!\.\d| ?%)"
     roman = r"[IVX]+\b(?:(?:, | and | to )[IVX]+\b)*"
-    out = re.sub(
+    text = re.sub(
         rf"\b(?:{LABELS})\s+(?:{number_list}|{roman})", blank, sentence, flags=re.I
     )
-    out = re.sub(r"\((?!\d+\) =)\d{1,2}[a-z]?\)(?:-\(\d+\))?", blank, out)
-    out = re.sub(r"\b[A-Za-z]+\d[\w.]*|\b\d+-D\b|\b\d+[a-zA-Z]\w*-", blank, out)
-    out = re.sub(r"\b\d+, (?:19|20)\d\d\)", blank, out)
+    text = re.sub(r"\((?!\d+\) =)\d{1,2}[a-z]?\)(?:-\(\d+\))?", blank, text)
+    text = re.sub(r"\b[A-Za-z]+\d[\w.]*|\b\d+-D\b|\b\d+[a-zA-Z]\w*-", blank, text)
+    text = re.sub(r"\b\d+, (?:19|20)\d\d\)", blank, text)
     return re.sub(
         r"(?<![\d.] )(?<![\d.])\b(?:19|20)\d\d\b(?! ?(?:m|s|km|runs|draws|points)\b|\.\d)",
         blank,
-        out,
+        text,
     )
 
 
@@ -444,24 +447,24 @@ def numerals_of(piece: str, chapter: str, line: int, section: int) -> Iterator[N
     for block in re.finditer(r"(?:[^\n]+\n?)+", plain(piece)):
         start = line + piece_line(plain(piece), block.start())
         text = block[0]
-        for found in re.finditer(
+        for match in re.finditer(
             r"(?s).+?(?:(?<!Fig)(?<!Figs)(?<!Eq)(?<!Prop)(?<!cf)[.!?:](?=\s)|\|\n|$)",
             text,
         ):
-            sentence = " ".join(found[0].split())
+            sentence = " ".join(match[0].split())
             clean = structure(sentence)
-            taken: list[tuple[int, int]] = []
+            spans: list[tuple[int, int]] = []
             for shape in (DIGITS, WORDS):
                 for hit in shape.finditer(clean):
-                    if any(a < hit.end() and hit.start() < b for a, b in taken):
+                    if any(a < hit.end() and hit.start() < b for a, b in spans):
                         continue
-                    taken.append(hit.span())
+                    spans.append(hit.span())
                     yield from one(
                         hit,
                         clean,
                         sentence,
                         chapter,
-                        start + text[: found.start()].count("\n"),
+                        start + text[: match.start()].count("\n"),
                         section,
                     )
 
@@ -473,15 +476,15 @@ def piece_line(text: str, at: int) -> int:
 def one(
     hit: re.Match[str], clean: str, sentence: str, chapter: str, line: int, section: int
 ) -> Iterator[Numeral]:
-    """The numeral of one hit, with its unit and whether it is a small one."""
+    """Yield the numeral of one match, with its unit and whether it is a small one."""
     text = hit[0].strip()
     after = clean[hit.end() :].lstrip(" -)")
     value = number(text)
     unit = next((u for u in UNITS if re.match(u, after)), "")
     if text.lower() in ("third", "quarter", "a second") and not unit:
         return
-    whole = value == int(value)
-    tiny = (whole and abs(value) <= 12) or value == 0.5
+    is_integer = value == int(value)
+    tiny = (is_integer and abs(value) <= 12) or value == 0.5
     ordinal = text.lower().removeprefix("a ") in ORDINAL and not re.match(
         r"of\b", after
     )
@@ -492,11 +495,11 @@ def one(
             chapter, line, section, text, value, 0.0, "", sentence, "arithmetic"
         )
         return
-    spread = re.match(
+    interval = re.match(
         rf"(?:to|and|or|–) (?:{DIGITS.pattern}|{COUNT}) ?({'|'.join(UNITS)})", after
     )
-    if spread and not unit:
-        unit = next(u for u in UNITS if re.match(u, spread[1]))
+    if interval and not unit:
+        unit = next(u for u in UNITS if re.match(u, interval[1]))
     kind = "small" if (tiny and not unit) or ordinal else ""
     if text.lower() in ("one", "two") and unit.startswith(("s", "m", "day")):
         kind = "small"
@@ -514,7 +517,7 @@ def one(
     )
 
 
-# --- what the run has ----------------------------------------------------------------------------
+# --- the numbers of the code and its outputs ------------------------------------------------------
 
 
 ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
@@ -527,12 +530,12 @@ ARITHMETIC: dict[type[ast.operator], Callable[[float, float], float]] = {
 
 
 def constant(node: ast.AST) -> float | None:
-    """The number that an expression of constants is, or None."""
+    """Return the value of an expression of constants, or None."""
     if isinstance(node, ast.Constant) and type(node.value) in (int, float):
         return float(node.value)
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-        inner = constant(node.operand)
-        return None if inner is None else -inner
+        operand = constant(node.operand)
+        return None if operand is None else -operand
     if isinstance(node, ast.BinOp):
         a = constant(node.left)
         b = constant(node.right)
@@ -543,7 +546,7 @@ def constant(node: ast.AST) -> float | None:
 
 
 def numbers_compared_with(node: ast.AST) -> Iterator[float]:
-    """Numbers that take part in a comparison by themselves, in a list, as a factor or a term."""
+    """Yield the numbers of one side of a comparison: alone, in a list, as a factor or a term."""
     value = constant(node)
     if value is not None:
         yield value
@@ -564,9 +567,9 @@ def numbers_compared_with(node: ast.AST) -> Iterator[float]:
 
 
 def checks(node: ast.Assert, section: int, where: str) -> Iterator[Fact]:
-    """What an assertion compares with, and what its message says."""
+    """Yield the numbers of an assertion's comparisons and of its message."""
     words = stems(ast.unparse(node))
-    seen = set()
+    values = set()
     for part in ast.walk(node.test):
         if isinstance(part, ast.Compare):
             sides = [part.left, *part.comparators]
@@ -575,24 +578,24 @@ def checks(node: ast.Assert, section: int, where: str) -> Iterator[Fact]:
                 low, high = sorted((ends[0], ends[2]))
                 yield Fact("check", low, high, where, section, words)
             for side in sides:
-                seen.update(numbers_compared_with(side))
+                values.update(numbers_compared_with(side))
         elif isinstance(part, ast.Call):
             name = getattr(part.func, "attr", getattr(part.func, "id", ""))
             if name in ("isclose", "allclose", "array_equal"):
                 for side in part.args[:2]:
-                    seen.update(numbers_compared_with(side))
-    for value in seen:
+                    values.update(numbers_compared_with(side))
+    for value in values:
         yield Fact("check", value, value, where, section, words)
     message = node.msg.value if isinstance(node.msg, ast.Constant) else ""
-    for said in numerals_of(str(message) + "\n", "", 0, 0):
+    for numeral in numerals_of(str(message) + "\n", "", 0, 0):
         yield Fact(
             "check",
-            said.value,
-            said.value,
+            numeral.value,
+            numeral.value,
             where,
             section,
             words,
-            said.unit or "no unit",
+            numeral.unit or "no unit",
         )
 
 
@@ -704,7 +707,7 @@ NUMBER = re.compile(
 
 
 def rows_of(page: str) -> Iterator[tuple[str, str]]:
-    """The rows of the tables of some HTML, each with the words of its caption and header."""
+    """Yield the rows of the tables of HTML, each with the words of its caption and header."""
     bare = lambda t: html.unescape(re.sub(r"<[^>]+>", " ", t))  # noqa: E731
     page = re.sub(r"<style.*?</style>", "", page, flags=re.S)
     for block in re.split(r"(?=<table)", page):
@@ -719,22 +722,24 @@ def rows_of(page: str) -> Iterator[tuple[str, str]]:
 
 
 def output_facts(cell: Any, section: int, where: str) -> Iterator[Fact]:
-    """The numbers that a cell's stored outputs print; pictures' digests are left out."""
+    """Yield the numbers that a cell's stored outputs print, without digests of pictures."""
     for output in cell.get("outputs", []):
         data = output.get("data", {})
         page = "".join(data.get("text/html", ""))
         if SLIDER in page or any(mime.startswith("image/") for mime in data):
             continue
         verdict = [(str(v), "") for v in data.get(VERDICT, {}).values()]
-        plainly = "" if page else "".join(data.get("text/plain", ""))
+        plain_text_of_output = "" if page else "".join(data.get("text/plain", ""))
         lines = [
             (line, "")
-            for line in ("".join(output.get("text", "")) + plainly).splitlines()
+            for line in (
+                "".join(output.get("text", "")) + plain_text_of_output
+            ).splitlines()
         ]
         for row, head in (*rows_of(page), *verdict, *lines):
             words = stems(f"{row} {head}")
-            for found in NUMBER.finditer(f"{row}\n{head}"):
-                value = number(found[0])
+            for match in NUMBER.finditer(f"{row}\n{head}"):
+                value = number(match[0])
                 yield Fact(
                     "output",
                     value,
@@ -742,12 +747,12 @@ def output_facts(cell: Any, section: int, where: str) -> Iterator[Fact]:
                     where,
                     section,
                     words,
-                    half=0.5 * step_of(found[0], value),
+                    half=0.5 * step_of(match[0], value),
                 )
 
 
 def flat(value: Any) -> Iterator[float]:
-    """The numbers of a nested list."""
+    """Yield the numbers of a nested list, and the lengths of its parts."""
     if isinstance(value, list):
         yield float(len(value))
         for item in value:
@@ -803,16 +808,16 @@ def scenario_facts(path: Path) -> tuple[Fact, ...]:
 
 @cache
 def study_facts(name: str) -> tuple[Fact, ...]:
-    """The numbers of a study's script, of what it imports, and how many rows it has stored."""
+    """Return the numbers of a study's script and its imports, and its number of stored rows."""
     path = BOOK / "studies" / f"{name.replace('-', '_')}.py"
     if not path.is_file():
         return ()
     code = path.read_text(encoding="utf-8")
-    out = list(parameters(code, path.name))
+    facts = list(parameters(code, path.name))
     for other in re.findall(
         r"^(?:import|from) (\w+)|script\(\"([\w-]+)\"\)", code, re.M
     ):
-        out += study_facts(other[0] or other[1])
+        facts += study_facts(other[0] or other[1])
     label = re.search(r'^NAME.*?"([\w-]+)"', code, re.M)
     for stored in (ROOT / "data" / "studies").glob(
         f"*/{label[1] if label else name}.csv"
@@ -820,7 +825,7 @@ def study_facts(name: str) -> tuple[Fact, ...]:
         rows = [
             r for r in stored.read_text(encoding="utf-8").splitlines() if r[:1] != "#"
         ]
-        out.append(
+        facts.append(
             Fact(
                 "parameter",
                 len(rows) - 1,
@@ -829,13 +834,13 @@ def study_facts(name: str) -> tuple[Fact, ...]:
                 words=stems("runs seeds pairs study stored trials times draws"),
             )
         )
-    return tuple(out)
+    return tuple(facts)
 
 
 @cache
 def defaults() -> dict[str, tuple[Fact, ...]]:
-    """The numbers that the library's functions take if they are not told, by function."""
-    out: dict[str, tuple[Fact, ...]] = {}
+    """Return the default values of the library's functions, by function."""
+    facts: dict[str, tuple[Fact, ...]] = {}
     files = [
         *(ROOT / "distfilt").rglob("*.py"),
         *(BOOK / "kit" / "bookkit").rglob("*.py"),
@@ -843,23 +848,26 @@ def defaults() -> dict[str, tuple[Fact, ...]]:
     for path in sorted(files):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.FunctionDef):
-                bare = ast.FunctionDef(node.name, node.args, [ast.Pass()], [])
-                code = ast.unparse(ast.fix_missing_locations(bare))
-                out[node.name] = (*out.get(node.name, ()), *parameters(code, node.name))
-    return out
+                signature = ast.FunctionDef(node.name, node.args, [ast.Pass()], [])
+                code = ast.unparse(ast.fix_missing_locations(signature))
+                facts[node.name] = (
+                    *facts.get(node.name, ()),
+                    *parameters(code, node.name),
+                )
+    return facts
 
 
 @cache
 def paper_facts(paper: str) -> tuple[Fact, ...]:
-    """The numbers that a paper prints, as stored."""
-    out = []
+    """Return the numbers that a paper prints, as stored."""
+    facts = []
     for path in sorted((ROOT / "data" / "published" / paper).iterdir()):
-        for found in NUMBER.finditer(path.read_text(encoding="utf-8")):
-            value = number(found[0])
-            out.append(
+        for match in NUMBER.finditer(path.read_text(encoding="utf-8")):
+            value = number(match[0])
+            facts.append(
                 Fact("published", value, value, f"published/{paper}/{path.name}")
             )
-    return tuple(out)
+    return tuple(facts)
 
 
 # --- the trace -----------------------------------------------------------------------------------
@@ -886,10 +894,10 @@ def factors(unit: str) -> tuple[float, ...]:
 
 
 def nearby(facts: list[Fact]) -> Callable[[Numeral], list[Fact]]:
-    """What finds the facts that a numeral may mean, a few of thousands, for `trace` to judge."""
+    """Return a function that preselects the facts that a numeral may refer to, for `trace`."""
     low, high = np.array([(f.low, f.high) for f in facts], dtype=float).reshape(-1, 2).T
 
-    def near(n: Numeral) -> list[Fact]:
+    def find(n: Numeral) -> list[Fact]:
         scale = np.array(factors(n.unit))
         values = n.value * scale
         half = 0.501 * n.step * scale
@@ -904,7 +912,7 @@ def nearby(facts: list[Fact]) -> Callable[[Numeral], list[Fact]]:
         meets = inside | (abs(abs(low) - abs(targets)) <= reach)
         return [facts[k] for k in np.flatnonzero(meets.any(axis=0))]
 
-    return near
+    return find
 
 
 def is_small(n: Numeral) -> bool:
@@ -939,8 +947,8 @@ def matches_check(n: Numeral, f: Fact, factor: float) -> bool:
     # A wide interval encloses anything: it is no trace.
     if not enclosed or f.high - f.low > 0.41 * abs(value):
         return False
-    here = nearby_section and (shared or not is_small(n))
-    return here or (shared and is_long(n))
+    in_section = nearby_section and (shared or not is_small(n))
+    return in_section or (shared and is_long(n))
 
 
 def matches_output(n: Numeral, f: Fact, factor: float) -> bool:
@@ -949,8 +957,8 @@ def matches_output(n: Numeral, f: Fact, factor: float) -> bool:
     if abs(abs(n.value * factor) - abs(f.low)) > half or f.half > half:
         return False
     shared = bool(n.words & f.words)
-    here = f.section == n.section and (shared or not is_small(n))
-    return is_long(n) or here
+    in_section = f.section == n.section and (shared or not is_small(n))
+    return is_long(n) or in_section
 
 
 def matches_published(n: Numeral, f: Fact, factor: float) -> bool:
@@ -968,10 +976,10 @@ def matches_parameter(n: Numeral, f: Fact, factor: float) -> bool:
     value = n.value * factor
     if abs(abs(value) - abs(f.low)) > slack(value):
         return False
-    both = f.unit and n.unit
-    if both and re.search(rf"(?:^|[ ,])(?:{n.unit})", f.unit):
+    two_units = f.unit and n.unit
+    if two_units and re.search(rf"(?:^|[ ,])(?:{n.unit})", f.unit):
         return True
-    if n.words & f.words and not both:
+    if n.words & f.words and not two_units:
         return True
     return f.section == n.section and not is_small(n)
 
@@ -1013,9 +1021,9 @@ def trace_beside(n: Numeral, facts: list[Fact]) -> str:
 
 
 def others(n: Numeral) -> Iterator[Numeral]:
-    """The same sentence with another number of the same length."""
+    """Yield the same sentence with other numbers of the same length."""
     if re.search(r"\d", n.text) or n.value == int(n.value):
-        count = (
+        n_digits = (
             max(digits(n.text), 1)
             if re.search(r"\d", n.text)
             else len(str(int(n.value)))
@@ -1023,13 +1031,13 @@ def others(n: Numeral) -> Iterator[Numeral]:
         unit = (
             n.step
             if re.search(r"\d", n.text)
-            else 10.0 ** (len(str(int(n.value)).rstrip("0")) < count)
+            else 10.0 ** (len(str(int(n.value)).rstrip("0")) < n_digits)
         )
-        low = 10 ** (count - 1)
-        high = 10**count
+        low = 10 ** (n_digits - 1)
+        high = 10**n_digits
         for k in range(16):
-            whole = low + (7919 * (k + 1) + int(abs(n.value))) % (high - low)
-            value = whole * (n.step if re.search(r"\d", n.text) else 1.0)
+            digits_of_value = low + (7919 * (k + 1) + int(abs(n.value))) % (high - low)
+            value = digits_of_value * (n.step if re.search(r"\d", n.text) else 1.0)
             if abs(value - abs(n.value)) > 0.5 * unit * 1e-9:
                 yield replace(n, value=value)
     else:
@@ -1117,30 +1125,30 @@ def main() -> int:
     parser.add_argument("--all", action="store_true", help="list the traced ones too")
     options = parser.parse_args()
     with KNOWN.open(encoding="utf-8", newline="") as file:
-        known = list(csv.DictReader(file))
+        known_phrases = list(csv.DictReader(file))
     problems = 0
     for source in chosen(options.chapters):
         numerals, facts = read(source)
         text = " ".join(source.read_text(encoding="utf-8").split())
-        own = [row for row in known if row["chapter"] == source.stem]
+        phrases = [row for row in known_phrases if row["chapter"] == source.stem]
         counts = Counter[str]()
-        lucky = 0
-        tries = 0
-        near = nearby(facts)
+        n_traced = 0
+        n_replaced = 0
+        find = nearby(facts)
         for n in numerals:
             if n.kind:
                 n.source = n.kind
             else:
-                n.source = trace(n, near(n))
+                n.source = trace(n, find(n))
                 if n.source and not n.source.startswith("beside"):
-                    changed = list(others(n))
-                    tries += len(changed)
-                    found = [trace(other, near(other)) for other in changed]
-                    lucky += sum(bool(f) and f[:6] != "beside" for f in found)
+                    replacements = list(others(n))
+                    n_replaced += len(replacements)
+                    traces = [trace(other, find(other)) for other in replacements]
+                    n_traced += sum(bool(f) and f[:6] != "beside" for f in traces)
                 elif not n.source:
                     listed = (
                         r
-                        for r in own
+                        for r in phrases
                         if r["phrase"] in n.sentence and n.text in r["phrase"]
                     )
                     n.source = next((f"known: {r['reason']}" for r in listed), "")
@@ -1150,16 +1158,16 @@ def main() -> int:
                     f"{n.chapter}:{n.line}: {n.text!r}: {n.source or 'UNTRACED'} | {n.sentence}"
                 )
         problems += counts["untraced"]
-        for row in own:
+        for row in phrases:
             if " ".join(row["phrase"].split()) not in plain_text(text):
                 print(
                     f"{source.stem}: numerals.csv lists a phrase that is gone: {row['phrase']}"
                 )
                 problems += 1
-        shown = ", ".join(f"{v} {k}" for k, v in counts.most_common())
+        summary = ", ".join(f"{v} {k}" for k, v in counts.most_common())
         print(
-            f"{source.stem}: {len(numerals)} numerals: {shown}; "
-            f"of others in their place {100 * lucky / max(tries, 1):.0f}% would be traced"
+            f"{source.stem}: {len(numerals)} numerals: {summary}; "
+            f"of others in their place {100 * n_traced / max(n_replaced, 1):.0f}% would be traced"
         )
     return int(bool(problems))
 

@@ -1,4 +1,4 @@
-"""What the build computes: chapter numbers, the API page's list, the page of reproductions."""
+"""Computed parts of the book: chapter numbers, API reference, map, gallery, reproductions."""
 
 from __future__ import annotations
 
@@ -44,34 +44,35 @@ BLOCK = re.compile(r'<div class="highlight-ipython3[^>]*>.*?</pre>', re.S)
 
 
 def chapter_label(page: str) -> str | None:
-    """Return what its file name calls a page of a chapter: "1", and "1b" for the second page."""
-    found = re.match(r"book/0*(\d+[a-z]?)-", page)
-    return found.group(1) if found else None
+    """Return the label of a chapter's page: "1", and "1b" for a second page."""
+    match = re.match(r"book/0*(\d+[a-z]?)-", page)
+    return match.group(1) if match else None
 
 
 def chapter_number(page: str) -> int | None:
     """Return the number of a page's chapter."""
-    found = re.match(r"book/(\d+)[a-z]?-", page)
-    return int(found.group(1)) if found else None
+    match = re.match(r"book/(\d+)[a-z]?-", page)
+    return int(match.group(1)) if match else None
 
 
 def chapter_pages() -> dict[str, str]:
     """Return the pages of all chapters by their labels."""
-    return {label: page for page in toc_pages() if (label := chapter_label(page))}
+    pages = {chapter_label(page): page for page in toc_pages()}
+    return {label: page for label, page in pages.items() if label}
 
 
 def drop_widgets(tree: nodes.document) -> None:
-    """Remove what is left of a widget without its script: a line that names its parts."""
+    """Remove the text form of widgets, a line with the names of their parts."""
     for node in list(tree.findall(nodes.literal_block)):
         if node.astext().startswith("interactive(children="):
             node.parent.remove(node)
 
 
 def keep_sliders(tree: nodes.document) -> None:
-    """Show a picture that moves in the place of its first frame, under the figure's caption.
+    """Put a slider in the place of its first frame, so that it has the figure's caption.
 
-    An output with a slider also holds that frame as a PNG, which the notebook's figure options
-    (caption, name, number) are put around. The slider's HTML takes the PNG's place there.
+    An output with a slider also has that frame as a PNG, to which the figure options (caption,
+    name, number) apply. The slider's HTML replaces the PNG there.
     """
     bundles = [
         node
@@ -92,10 +93,10 @@ def keep_sliders(tree: nodes.document) -> None:
 
 
 def number_chapters(env: Any, number_of: Any) -> None:
-    """Give each chapter the number of its file name, whichever chapters exist.
+    """Give each chapter the number of its file name.
 
-    Sphinx counts the chapters that it finds; then equation (4.1) would be renumbered when
-    chapters 2 and 3 appear. It gives none to a chapter's second page, which lies one level deeper.
+    Sphinx would count the existing chapters, and would not number the second page of a chapter,
+    which is one level deeper.
     """
     for page, title in env.titles.items():
         number = number_of(page)
@@ -111,8 +112,8 @@ def number_chapters(env: Any, number_of: Any) -> None:
 def modules() -> list[str]:
     """Return every module of the library, the package first."""
     root = ROOT / "distfilt"
-    shown = (p for p in root.rglob("*.py") if p.stem == "__init__" or p.stem[0] != "_")
-    paths = sorted(shown)
+    public = (p for p in root.rglob("*.py") if p.stem == "__init__" or p.stem[0] != "_")
+    paths = sorted(public)
     names = [
         p.relative_to(ROOT).with_suffix("").as_posix().replace("/", ".") for p in paths
     ]
@@ -138,8 +139,8 @@ def directive(module: Any, name: str) -> list[str]:
             if get_origin(base) is np.ndarray
             else getattr(base, "__name__", base)
         )
-        shown = ", ".join(word_of(note) for note in (kind, *notes))
-        meaning = [*meaning, "", f"The type ``{shown}``."]
+        words = ", ".join(word_of(note) for note in (kind, *notes))
+        meaning = [*meaning, "", f"The type ``{words}``."]
     elif not meaning:
         meaning = [f"A constant, a ``{type(value).__name__}``."]
     text = [f"   {line}" for line in meaning]
@@ -154,28 +155,30 @@ def word_of(note: Any) -> str:
 
 
 def home_of(module: Any, name: str) -> str:
-    """Return the module that defines a public name, which packages hand on."""
+    """Return the module that defines a name which a package exports."""
     value = getattr(module, name)
     if isinstance(value, types.ModuleType):
         return value.__name__
     home = str(getattr(value, "__module__", "") or "")
-    own = home.startswith("distfilt") and hasattr(value, "__qualname__")
-    if own:
+    knows_home = home.startswith("distfilt") and hasattr(value, "__qualname__")
+    if knows_home:
         return home
-    # A constant does not know where it is from: the module below that shows the same one.
+    # A constant has no module of its own: find the module below that exports the same object.
     below = [n for n in modules() if n.startswith(f"{module.__name__}.")]
-    found = (n for n in below if vars(importlib.import_module(n)).get(name) is value)
-    shown = (n for n in found if name in importlib.import_module(n).__all__)
-    return next(shown, module.__name__)
+    same_value = (
+        n for n in below if vars(importlib.import_module(n)).get(name) is value
+    )
+    exporting = (n for n in same_value if name in importlib.import_module(n).__all__)
+    return next(exporting, module.__name__)
 
 
 @functools.cache
 def type_names() -> list[tuple[Any, str]]:
-    """Return the types that have a name of their own, each with it."""
+    """Return the aliases of types, each with its name."""
     kinds = importlib.import_module("distfilt.validation")
-    own = [(getattr(kinds, name), name) for name in kinds.__all__]
+    named = [(getattr(kinds, name), name) for name in kinds.__all__]
     return [
-        *((value, name) for value, name in own if get_origin(value)),
+        *((value, name) for value, name in named if get_origin(value)),
         (ArrayLike, "ArrayLike"),
     ]
 
@@ -228,49 +231,51 @@ def format_generic(kind: Any, names: Mapping[str, Any]) -> str:
 
 
 def default(value: Any) -> str:
-    """Return a default as code: a function's name, dots for what has no short form."""
-    shown = getattr(value, "__name__", None) or repr(value)
+    """Return a default value as code: a function's name, dots if there is no short form."""
+    text = getattr(value, "__name__", None) or repr(value)
     try:
-        ast.parse(shown)
+        ast.parse(text)
     except SyntaxError:
         return "..."
-    return shown
+    return text
 
 
-def signature(what: str, value: Any) -> tuple[str, str | None] | None:
+def signature(kind: str, value: Any) -> tuple[str, str | None] | None:
     """Return a signature with every type as `format_type` writes it; None leaves it as it is."""
-    if what not in ("function", "method", "class"):
+    if kind not in ("function", "method", "class"):
         return None
     try:
-        found = inspect.signature(value)
+        signature_ = inspect.signature(value)
     except (TypeError, ValueError):
         return None
     names: dict[str, Any] = {}
-    for owner in reversed(inspect.getmro(value) if what == "class" else [value]):
+    for owner in reversed(inspect.getmro(value) if kind == "class" else [value]):
         names |= vars(importlib.import_module(owner.__module__))
-    shown = []
+    texts = []
     kinds = inspect.Parameter
     last = None
-    for k, part in enumerate(found.parameters.values()):
+    for k, part in enumerate(signature_.parameters.values()):
         if k == 0 and part.name == "self":
             continue
         if part.kind is kinds.KEYWORD_ONLY and last not in (
             part.kind,
             kinds.VAR_POSITIONAL,
         ):
-            shown.append("*")
+            texts.append("*")
         last = part.kind
         text = {kinds.VAR_POSITIONAL: "*", kinds.VAR_KEYWORD: "**"}.get(
             last, ""
         ) + part.name
         if part.annotation is not part.empty:
             text += f": {format_type(part.annotation, names)}"
-        shown.append(
+        texts.append(
             text if part.default is part.empty else f"{text} = {default(part.default)}"
         )
-    given = found.return_annotation
-    returned = None if given is found.empty else format_type(given, names)
-    return f"({', '.join(shown)})", None if what == "class" else returned
+    annotation = signature_.return_annotation
+    returned = (
+        None if annotation is signature_.empty else format_type(annotation, names)
+    )
+    return f"({', '.join(texts)})", None if kind == "class" else returned
 
 
 def escape_stars(lines: list[str]) -> None:
@@ -305,15 +310,15 @@ FIRST = (
 
 def api_parts() -> dict[str, list[str]]:
     """Return the library's parts in the order of the page, each with its modules."""
-    found: dict[str, list[str]] = {}
+    parts: dict[str, list[str]] = {}
     for name in modules():
         if name != "distfilt":
-            found.setdefault(name.split(".")[1], []).append(name)
+            parts.setdefault(name.split(".")[1], []).append(name)
     order = [
-        *(p for p in FIRST if p in found),
-        *sorted(p for p in found if p not in FIRST),
+        *(p for p in FIRST if p in parts),
+        *sorted(p for p in parts if p not in FIRST),
     ]
-    return {part: found[part] for part in order}
+    return {part: parts[part] for part in order}
 
 
 def anchor(name: str) -> str:
@@ -322,17 +327,17 @@ def anchor(name: str) -> str:
 
 
 def homes() -> dict[str, str]:
-    """Return where each public name is documented, by every path that a reader imports it from."""
-    out = {}
+    """Return the entry of each public name, by every path from which it can be imported."""
+    entries = {}
     for path in modules():
         module = importlib.import_module(path)
         for name in module.__all__:
             value = getattr(module, name)
             if isinstance(value, types.ModuleType):
-                out[f"{path}.{name}"] = value.__name__
+                entries[f"{path}.{name}"] = value.__name__
             else:
-                out[f"{path}.{name}"] = f"{home_of(module, name)}.{name}"
-    return out
+                entries[f"{path}.{name}"] = f"{home_of(module, name)}.{name}"
+    return entries
 
 
 def code_of(source: Path) -> str:
@@ -343,59 +348,59 @@ def code_of(source: Path) -> str:
     return re.sub(r"^[%!].*$", "", text, flags=re.MULTILINE)
 
 
-def imports_of(code: str, known: dict[str, str]) -> dict[str, str]:
-    """Return what a text calls the library's names, each with the path of its entry."""
-    out = {}
+def imports_of(code: str, entry_of: dict[str, str]) -> dict[str, str]:
+    """Return the names under which code imports parts of the library, each with its entry."""
+    entries = {}
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
             "distfilt"
         ):
             for name in node.names:
                 path = f"{node.module}.{name.name}"
-                out[name.asname or name.name] = known.get(path, path)
-    return out
+                entries[name.asname or name.name] = entry_of.get(path, path)
+    return entries
 
 
-def names_used(code: str, known: dict[str, str]) -> set[str]:
-    """Return the library's names that a text uses, those of a module or class too."""
-    names = imports_of(code, known)
-    out = set()
+def names_used(code: str, entry_of: dict[str, str]) -> set[str]:
+    """Return the entries of the library that code uses, also by an attribute."""
+    names = imports_of(code, entry_of)
+    used = set()
     for node in ast.walk(ast.parse(code)):
         if isinstance(node, ast.Name) and node.id in names:
-            out.add(names[node.id])
-        elif (
-            isinstance(node, ast.Attribute)
-            and (owner := getattr(node.value, "id", "")) in names
-        ):
+            used.add(names[node.id])
+        elif isinstance(node, ast.Attribute):
+            owner = getattr(node.value, "id", "")
+            if owner not in names:
+                continue
             path = f"{names[owner]}.{node.attr}"
-            out.add(known.get(path, path))
-    return out
+            used.add(entry_of.get(path, path))
+    return used
 
 
 def users() -> dict[str, list[str]]:
     """Return, for each name of the library, links to the chapters and scripts that use it."""
-    known = homes()
-    out = {}
+    entry_of = homes()
+    links = {}
     scripts = [*(BOOK / "examples").glob("*.py"), *(BOOK / "studies").glob("*.py")]
     for source in [*chapters(), *sorted(scripts)]:
         if source.suffix == ".md":
             label = chapter_label(f"book/{source.stem}")
-            shown = f":doc:`{label or 'the first page'} </book/{source.stem}>`"
+            link = f":doc:`{label or 'the first page'} </book/{source.stem}>`"
         else:
-            shown = f"``{source.relative_to(ROOT).as_posix()}``"
-        for name in names_used(code_of(source), known):
-            out.setdefault(name, []).append(shown)
-    return out
+            link = f"``{source.relative_to(ROOT).as_posix()}``"
+        for name in names_used(code_of(source), entry_of):
+            links.setdefault(name, []).append(link)
+    return links
 
 
 def used_in(name: str, by: dict[str, list[str]]) -> list[str]:
-    """Return the line that leads from a name to the chapters that use it, else to scripts."""
-    found = by.get(name, [])
-    pages = [shown for shown in found if shown.startswith(":doc:")]
+    """Return a line with links to the chapters that use a name, or else to scripts."""
+    links = by.get(name, [])
+    pages = [link for link in links if link.startswith(":doc:")]
     word = "chapter " if pages and "first page" not in pages[0] else ""
     return (
-        ["", f"   *Used in* {word}{', '.join(pages or found[:3])}.", ""]
-        if found
+        ["", f"   *Used in* {word}{', '.join(pages or links[:3])}.", ""]
+        if links
         else [""]
     )
 
@@ -408,10 +413,10 @@ def link_code(
     A name is linked where it is used, not where it is an argument's name or another's attribute.
     """
 
-    def link(found: re.Match[str]) -> str:
-        path = names[found["name"]] + (f".{found['part']}" if found["part"] else "")
-        target = url(path) or url(names[found["name"]])
-        return f'<a class="api" href="{target}">{found[0]}</a>' if target else found[0]
+    def link(match: re.Match[str]) -> str:
+        path = names[match["name"]] + (f".{match['part']}" if match["part"] else "")
+        target = url(path) or url(names[match["name"]])
+        return f'<a class="api" href="{target}">{match[0]}</a>' if target else match[0]
 
     if not names:
         return body
@@ -427,8 +432,8 @@ def link_code(
 def simplify_signatures(body: str) -> str:
     """Return a page without the marks inside its signatures, which are half of its weight."""
 
-    def plain(found: re.Match[str]) -> str:
-        text = re.sub(r'<span class="(?:pre|[pwko])">([^<]*)</span>', r"\1", found[0])
+    def plain(match: re.Match[str]) -> str:
+        text = re.sub(r'<span class="(?:pre|[pwko])">([^<]*)</span>', r"\1", match[0])
         text = re.sub(r'<span class="(?:pre|[pwkon])">([^<]*)</span>', r"\1", text)
         # Lines of a long signature are no list of words and meanings.
         text = re.sub(r"<(/?)dl>", r"<\1div>", text).replace("</dd>", "</div>")
@@ -438,26 +443,26 @@ def simplify_signatures(body: str) -> str:
 
 
 def is_protocol(value: Any) -> bool:
-    """Say whether a public class tells what a reader's own one must offer."""
+    """Return whether a public class is a protocol for classes of users."""
     return bool(getattr(value, "_is_protocol", False)) and value.__name__[0] != "_"
 
 
 def links(module: Any) -> str:
-    """Return links to what a part's face offers, in the order of its names."""
-    out = []
+    """Return links to the names that a subpackage exports, in their order."""
+    texts = []
     for name in module.__all__:
         home = home_of(module, name)
         value = getattr(module, name)
         if isinstance(value, types.ModuleType):
-            out.append(f"[`{name}`](#{anchor(home)})")
+            texts.append(f"[`{name}`](#{anchor(home)})")
         else:
-            out.append("{py:obj}`" + f"{name} <{home}.{name}>`")
-    return ", ".join(out)
+            texts.append("{py:obj}`" + f"{name} <{home}.{name}>`")
+    return ", ".join(texts)
 
 
 def api_index() -> str:
-    """Return the reference's index: each part, what it is for, and the names of its face."""
-    lines = ["| Part | What it is for | Names |", "|---|---|---|"]
+    """Return the index of the reference: each subpackage, its purpose and its exports."""
+    lines = ["| Part | Purpose | Names |", "|---|---|---|"]
     for part in api_parts():
         face = importlib.import_module(f"distfilt.{part}")
         lines += [
@@ -472,9 +477,9 @@ def api_part(part: str, by: dict[str, list[str]]) -> str:
     head = f"distfilt.{part}"
     for name in api_parts()[part]:
         module = importlib.import_module(name)
-        own = [n for n in module.__all__ if home_of(module, n) == name]
-        # What a reader writes a class for need not be imported, and yet is looked up.
-        own += [
+        documented = [n for n in module.__all__ if home_of(module, n) == name]
+        # Protocols are documented, although users need not import them.
+        documented += [
             n
             for n, v in vars(module).items()
             if is_protocol(v) and v.__module__ == name
@@ -482,7 +487,7 @@ def api_part(part: str, by: dict[str, list[str]]) -> str:
         title = f"# `{head}`" if name == head else f"## `{name[len(head) + 1 :]}`"
         lines += [f"({anchor(name)})=", title, ""]
         body = [f".. automodule:: {name}", "   :no-members:", ""]
-        for public in dict.fromkeys(own):
+        for public in dict.fromkeys(documented):
             body += [*directive(module, public)[:-1], *used_in(f"{name}.{public}", by)]
         lines += ["```{eval-rst}", *body, "```", ""]
         if name == head and hasattr(module, "__path__"):
@@ -508,13 +513,13 @@ def reproductions_text() -> str:
     rows = read_rows(LEDGER)
     lines = []
     for kind, (total, counts) in summaries(rows).items():
-        shown = ", ".join(f"{n} *{verdict}*" for verdict, n in counts.items())
-        lines += [f"Of {total} {WORDS[kind]}: {shown}.", ""]
+        counted = ", ".join(f"{n} *{verdict}*" for verdict, n in counts.items())
+        lines += [f"Of {total} {WORDS[kind]}: {counted}.", ""]
     for paper in dict.fromkeys(row["paper"] for row in rows):
-        own = [row for row in rows if row["paper"] == paper]
+        rows_of_paper = [row for row in rows if row["paper"] == paper]
         lines += [f"## {PAPERS.get(paper, paper)} (`{paper}`)", ""]
         lines += ["| Item | Shows | Chapter | Verdict |", "|---|---|---|---|"]
-        for row in own:
+        for row in rows_of_paper:
             cells = [
                 row["item"].replace(" ", "\u00a0"),
                 cell(titles[paper, row["item"]]),
@@ -522,19 +527,19 @@ def reproductions_text() -> str:
             cells += [chapter_link(row["chapter"]), row["verdict"]]
             lines += ["| " + " | ".join(cells) + " |"]
         lines += [""]
-        for row in (row for row in own if row["verdict"] != "read"):
+        for row in (row for row in rows_of_paper if row["verdict"] != "read"):
             lines += claims_text(row, titles[paper, row["item"]])
     return "\n".join(lines)
 
 
 def claims_text(row: dict[str, str], title: str) -> list[str]:
-    """Return what stands behind one verdict: each claim with our number, its null and its range."""
+    """Return the evidence of one verdict: each claim with our number, its null and its range."""
     lines = [f"### {row['item']}: {title}", "", f"Verdict: **{row['verdict']}**."]
     if row["why"]:
         lines[-1] += f" Why: {row['why']}."
     lines += [""]
-    found = claims_of(row)
-    if not found:
+    claims = claims_of(row)
+    if not claims:
         return [
             *lines,
             f"Ours: {row['ours'] or '–'}. Published: {row['published'] or '–'}.",
@@ -545,9 +550,9 @@ def claims_text(row: dict[str, str], title: str) -> list[str]:
     stem = name.replace("fig. ", "figure-").replace("table ", "table-")
     path = folder / f"{stem}{'' if stem.startswith('figure') else '-claims'}.csv"
     listed = {claim["id"]: claim for claim in read_rows(path)}
-    for k in dict.fromkeys(claim.id for claim in found):
+    for k in dict.fromkeys(claim.id for claim in claims):
         lines += [f"{listed[k]['claim']}", f": *Rule:* {listed[k]['criterion']}"]
-        for claim in (c for c in found if c.id == k):
+        for claim in (c for c in claims if c.id == k):
             start = f", {claim.start}" if claim.start else ""
             lines += [
                 "",
@@ -561,19 +566,21 @@ def claims_text(row: dict[str, str], title: str) -> list[str]:
 
 def needs() -> dict[int, set[int]]:
     """Return the chapters that each chapter builds on, as its pages say: *You should know ...*."""
-    out: dict[int, set[int]] = {}
+    needed: dict[int, set[int]] = {}
     for page in chapter_pages().values():
         text = " ".join((ROOT / f"{page}.md").read_text(encoding="utf-8").split())
         text = re.sub(r"\[([^]]*)\]\(\d[^)]*\)", r"\1", text)
-        said = re.search(r"You should know .*?\.(?= [A-Z`:|#]|$)", text)
+        sentence = re.search(r"You should know .*?\.(?= [A-Z`:|#]|$)", text)
         number = chapter_number(page) or 0
-        found = out.setdefault(number, set())
+        chapters = needed.setdefault(number, set())
         lists = r"[Cc]hapters? ((?:\d+(?:, and |, | and | to )?)+)"
-        for few in re.findall(lists, said[0] if said else ""):
-            listed = [int(n) for n in re.findall(r"\d+", few)]
-            found |= set(range(listed[0], listed[-1] + 1) if " to " in few else listed)
-        found -= {number}
-    return out
+        for part in re.findall(lists, sentence[0] if sentence else ""):
+            listed = [int(n) for n in re.findall(r"\d+", part)]
+            chapters |= set(
+                range(listed[0], listed[-1] + 1) if " to " in part else listed
+            )
+        chapters -= {number}
+    return needed
 
 
 MAP_WIDTH = 1060
@@ -697,12 +704,12 @@ def figures(source: Path) -> Iterator[tuple[str, str, str, bytes]]:
     ]:
         options = cell["metadata"].get("mystnb", {})
         name = options.get("figure", {}).get("name")
-        found = [output.get("data", {}) for output in cell.get("outputs", ())]
-        shown = [data["image/png"] for data in found if "image/png" in data]
-        if name and shown:
+        bundles = [output.get("data", {}) for output in cell.get("outputs", ())]
+        pictures = [data["image/png"] for data in bundles if "image/png" in data]
+        if name and pictures:
             caption = options["figure"].get("caption", "")
             alt = options.get("image", {}).get("alt")
-            yield name, caption, alt or caption, base64.b64decode("".join(shown[0]))
+            yield name, caption, alt or caption, base64.b64decode("".join(pictures[0]))
 
 
 def gallery_text(folder: Path) -> str:
@@ -710,14 +717,15 @@ def gallery_text(folder: Path) -> str:
     folder.mkdir(parents=True, exist_ok=True)
     lines = []
     for source in chapters():
-        if (label := chapter_label(f"book/{source.stem}")) is None:
+        label = chapter_label(f"book/{source.stem}")
+        if label is None:
             continue
         lines += [f"## {label}. {chapter_title(f'book/{source.stem}')}", ""]
         lines += ["::::{grid} 2 2 3 4", ":gutter: 2", ""]
         for name, caption, alt, picture in figures(source):
             target = folder / f"{name}.png"
-            made = target.stat().st_mtime if target.is_file() else 0.0
-            if made < source.with_suffix(".ipynb").stat().st_mtime:
+            modified = target.stat().st_mtime if target.is_file() else 0.0
+            if modified < source.with_suffix(".ipynb").stat().st_mtime:
                 small = Image.open(io.BytesIO(picture)).convert("RGB")
                 small.thumbnail((480, 480), reducing_gap=2.0)
                 small.quantize(64).save(target)
@@ -759,9 +767,9 @@ def with_links(row: str) -> str:
     """Return a row of a table whose chapters are links."""
     pages = chapter_pages()
 
-    def link(found: re.Match[str]) -> str:
-        page = pages.get(found[2])
-        return f"[{found[1]}{found[2]}](/{page}.md)" if page else found[0]
+    def link(match: re.Match[str]) -> str:
+        page = pages.get(match[2])
+        return f"[{match[1]}{match[2]}](/{page}.md)" if page else match[0]
 
     for place in (
         r"(?<=chapter )()(\d+\w?)",
@@ -787,7 +795,7 @@ def cite_text() -> str:
 
 
 def comparison_text() -> str:
-    """Return what chapter 11's stored study found best: a row a problem, a column a budget."""
+    """Return the best filters of chapter 11's stored study: a row a problem, a column a budget."""
     from bookkit import studies
 
     read = studies.script("_together_read")
@@ -798,13 +806,13 @@ def comparison_text() -> str:
     for name in read.FOUR:
         cells = [f"*{name}*: {read.together.problem(name).scenario.title}"]
         for budget in (0, 3, 32, math.inf):
-            if not read.allowed(name, budget):
-                cells += ["nothing whose claim fits"]
+            if not read.admissible(name, budget):
+                cells += ["no filter with a consistent covariance"]
                 continue
             best = read.best(name, budget)
             error = read.ratio(best, read.results(name)["reference"]).estimate
-            what = read.together.CELLS[best.cell]
-            cells += [f"{error:.2f}: {what.family}; {what.exchange}"]
+            cell = read.together.CELLS[best.cell]
+            cells += [f"{error:.2f}: {cell.family}; {cell.exchange}"]
         lines += ["| " + " | ".join(cells) + " |"]
     return "\n".join(lines)
 

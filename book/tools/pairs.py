@@ -1,9 +1,10 @@
-"""Compare each chapter's Markdown with its stored notebook, and refuse what must not be stored.
+"""Compare each chapter's Markdown with its stored notebook, and find outputs that must not be
+stored.
 
     python book/tools/pairs.py [CHAPTER ...]
 
-No tool of the toolchain does this: jupytext does not compare the two files, and nbval passes a
-notebook whose outputs and execution counts were both cleared.
+jupytext does not compare the two files, and nbval accepts a notebook whose outputs and execution
+counts were both cleared.
 """
 
 from __future__ import annotations
@@ -35,22 +36,22 @@ WIDTH = 79
 
 
 def differences(source: Path, stored: Any) -> list[str]:
-    """Return where the stored notebook's cells are not the Markdown's."""
+    """Describe the differences between the cells of the Markdown and of the notebook."""
     fresh = read(source)
-    out = []
+    problems = []
     if len(fresh.cells) != len(stored.cells):
-        out.append(
+        problems.append(
             f"{len(fresh.cells)} cells in the Markdown, {len(stored.cells)} stored"
         )
     for ours, theirs in zip(fresh.cells, stored.cells, strict=False):
         for key in ("id", "cell_type", "source", "metadata"):
             if ours.get(key) != theirs.get(key):
-                out.append(
+                problems.append(
                     f"{ours['id']}: {key} differs between the Markdown and the notebook"
                 )
     if fresh.metadata != {k: v for k, v in stored.metadata.items() if k != "widgets"}:
-        out.append("the headers of the Markdown and of the notebook differ")
-    return out
+        problems.append("the headers of the Markdown and of the notebook differ")
+    return problems
 
 
 def code_faults(cell: Any, count: int) -> list[str]:
@@ -77,7 +78,7 @@ def output_faults(output: Any) -> list[str]:
         faults.append(f"a stored error: {output.ename}")
     if output.get("name") == "stderr":
         faults.append("stored stderr")
-    for line in printed_text(output).splitlines():
+    for line in text_of(output).splitlines():
         if len(line) > WIDTH:
             length = f"{len(line)} characters printed, at most {WIDTH}"
             faults.append(f"a line of {length}: {line}")
@@ -87,64 +88,66 @@ def output_faults(output: Any) -> list[str]:
     return faults
 
 
-def printed_text(output: Any) -> str:
+def text_of(output: Any) -> str:
     """Return the text that a page shows of an output; '' where it shows a picture or a table."""
     data = output.get("data", {})
     return str(output.get("text", data.get("text/plain", ""))) if len(data) < 2 else ""
 
 
 def figure_faults(cell: Any) -> list[str]:
-    """Return what a figure's cell lacks: its one picture, alternative text, caption, digest."""
+    """Return the faults of a figure's cell: picture, alternative text, caption, digest."""
     pictures = [
         output["data"]
         for output in cell.outputs
         if any(mime.startswith("image/") for mime in output.get("data", {}))
     ]
-    given = cell.metadata.get("mystnb", {})
-    if not pictures and not given.get("figure"):
+    options = cell.metadata.get("mystnb", {})
+    if not pictures and not options.get("figure"):
         return []
-    out = []
+    faults = []
     if len(pictures) != 1:
-        out.append(f"a figure's cell with {len(pictures)} pictures, needs one")
+        faults.append(f"a figure's cell with {len(pictures)} pictures, needs one")
     for data in pictures:
         if data.get("text/plain", "<").startswith("<"):
-            out.append("a picture without the digest of its axes: plotting.use_style()")
+            faults.append(
+                "a picture without the digest of its axes: plotting.use_style()"
+            )
     moving = [data for data in pictures if SLIDER in data.get("text/html", "")]
-    if not moving and not str(given.get("image", {}).get("alt", "")).strip():
-        out.append("a figure without mystnb.image.alt in its header")
-    if not str(given.get("figure", {}).get("caption", "")).strip():
-        out.append("a figure without mystnb.figure.caption in its header")
-    return out
+    if not moving and not str(options.get("image", {}).get("alt", "")).strip():
+        faults.append("a figure without mystnb.image.alt in its header")
+    if not str(options.get("figure", {}).get("caption", "")).strip():
+        faults.append("a figure without mystnb.figure.caption in its header")
+    return faults
 
 
 def check(source: Path) -> list[str]:
-    """Return everything that is wrong with one pair."""
+    """Return the problems of one pair."""
     target = source.with_suffix(".ipynb")
     if not target.is_file():
         return [f"{source.stem}: no stored notebook: make outputs"]
     stored = nbformat.read(target, as_version=4)
-    out = differences(source, stored)
+    problems = differences(source, stored)
     code = [cell for cell in stored.cells if cell.cell_type == "code"]
     for count, cell in enumerate(code, start=1):
-        out += [f"{cell.get('id')}: {fault}" for fault in code_faults(cell, count)]
-    return [f"{source.stem}: {problem}" for problem in out]
+        problems += [f"{cell.get('id')}: {fault}" for fault in code_faults(cell, count)]
+    return [f"{source.stem}: {problem}" for problem in problems]
 
 
 def strays() -> list[str]:
     """Return pages without a file, files without a page, and code outside notebooks."""
-    out = [f"_toc.yml names {page}, which has no file" for page in missing_pages()]
+    problems = [f"_toc.yml names {page}, which has no file" for page in missing_pages()]
     pages = set(toc_pages())
     for path in sorted([*BOOK.glob("*.md"), *BOOK.glob("*.ipynb")]):
         page = path.relative_to(ROOT).with_suffix("").as_posix()
         if page not in pages:
-            out.append(f"{path.name} is not in _toc.yml")
+            problems.append(f"{path.name} is not in _toc.yml")
         if path.suffix == ".ipynb" and not path.with_suffix(".md").is_file():
-            out.append(f"{path.name} has no Markdown source")
+            problems.append(f"{path.name} has no Markdown source")
         if path.suffix == ".md" and not is_chapter(path):
             text = path.read_text(encoding="utf-8")
             if re.search(r"^(`{3,}|:{3,})\{code-cell\}", text, flags=re.MULTILINE):
-                out.append(f"{path.name} has a code cell but no notebook header")
-    return out
+                problems.append(f"{path.name} has a code cell but no notebook header")
+    return problems
 
 
 def main() -> int:

@@ -1,8 +1,8 @@
-"""Pictures in stored outputs: found, taken out of texts, made lighter, and compared.
+"""Pictures in stored outputs: extract, shrink and compare them.
 
-A figure's curves are compared by the digest of its axes, to four digits. What is left for the
-picture itself is that it shows the same: another machine may round a pixel's shade otherwise, so
-few pixels may differ, and none by much more than a line's edge.
+A figure's curves are compared by the digest of its axes, to four digits. The pixels are compared
+loosely, since another machine may round shades differently: few pixels may differ, and none by much
+more than the edge of a line.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from typing import Any
 import nbformat
 from PIL import Image, ImageChops
 
-# A picture is told from other text by its own first bytes; a notebook escapes quotes.
+# Pictures are recognised by their first bytes, since a notebook escapes quotes.
 _EMBEDDED = re.compile(
     r'(?<=data:image/webp;base64,)[A-Za-z0-9+/=\n]+|(?<=")(?:UklGR|iVBORw0KGgo)[A-Za-z0-9+/=]+'
 )
 SHADE = 0.25
-"""A pixel differs if its shade does by more than this share of black to white."""
+"""A pixel differs if its shade differs by more than this fraction of black to white."""
 SHARE = 5e-4
-"""How many of a picture's pixels may differ."""
+"""Largest fraction of pixels that may differ."""
 TINT = 12
 TINTED = 1e-3
-"""A palette of 256 colours moves no more than this share of pixels by more than this of 255."""
+"""With 256 colours, at most a fraction `TINTED` of pixels may change by over `TINT` of 255."""
 
 
 def extract_pictures(text: str) -> tuple[str, list[str]]:
-    """Return a text without the frames of sliders that are written in it, and these."""
+    """Return a text without the pictures that it embeds, and the pictures."""
     return _EMBEDDED.sub("…", text), _EMBEDDED.findall(text)
 
 
 def pictures_of(output: Any) -> list[str]:
     """Return the pictures of an output, those that its HTML embeds included, as base64."""
     data = output.get("data", {})
-    out = [data["image/png"]] if "image/png" in data else []
-    return out + extract_pictures(_join(data.get("text/html", "")))[1]
+    pictures = [data["image/png"]] if "image/png" in data else []
+    return pictures + extract_pictures(_join(data.get("text/html", "")))[1]
 
 
 def _join(text: Any) -> str:
@@ -50,32 +50,32 @@ def _join(text: Any) -> str:
 
 
 def without_pictures(outputs: list[Any]) -> list[Any]:
-    """Return outputs with every picture replaced by its place."""
-    out = []
+    """Return outputs with a mark in place of every picture."""
+    texts = []
     for output in outputs:
         data = dict(output.get("data", {}))
         if "image/png" in data:
             data["image/png"] = "…"
         if "text/html" in data:
             data["text/html"] = extract_pictures(_join(data["text/html"]))[0]
-        out.append(nbformat.from_dict({**output, "data": data}) if data else output)
-    return out
+        texts.append(nbformat.from_dict({**output, "data": data}) if data else output)
+    return texts
 
 
 def shrink_picture(picture: str) -> str:
-    """Return a PNG with a palette of 256 colours, a third of the bytes, if a reader sees the same.
+    """Return a PNG with 256 colours, a third of the bytes, if the colours nearly stay the same.
 
-    A picture of finer shades, or one that has a palette already, comes back as it is.
+    A picture of finer shades, or one that has a palette already, is returned unchanged.
     """
     image = Image.open(io.BytesIO(base64.b64decode(picture)))
     if image.mode == "P" or (image.mode == "RGBA" and image.getextrema()[3][0] < 255):
         return picture
     palette = image.convert("RGB").quantize(256, kmeans=1, dither=Image.Dither.NONE)
-    if _changed_share(image, palette, TINT) > TINTED:
+    if _share_of_differences(image, palette, TINT) > TINTED:
         return picture
-    out = io.BytesIO()
-    palette.save(out, "png", optimize=True, dpi=image.info.get("dpi", (72, 72)))
-    return base64.b64encode(out.getvalue()).decode()
+    file = io.BytesIO()
+    palette.save(file, "png", optimize=True, dpi=image.info.get("dpi", (72, 72)))
+    return base64.b64encode(file.getvalue()).decode()
 
 
 def shrink_pictures(outputs: list[Any]) -> None:
@@ -85,20 +85,20 @@ def shrink_pictures(outputs: list[Any]) -> None:
             output["data"]["image/png"] = shrink_picture(output["data"]["image/png"])
 
 
-def _changed_share(one: Image.Image, other: Image.Image, by: float) -> float:
-    """The share of pixels of which a colour differs by more than `by` of 255."""
+def _share_of_differences(one: Image.Image, other: Image.Image, by: float) -> float:
+    """Return the fraction of pixels with a colour that differs by more than `by` of 255."""
     bands = ImageChops.difference(one.convert("RGB"), other.convert("RGB")).split()
     counts = reduce(ImageChops.lighter, bands).histogram()
     return sum(counts[int(by) + 1 :]) / sum(counts)
 
 
 def difference(one: str, other: str) -> str:
-    """Return in words how two pictures, as base64, differ; '' if a reader sees the same."""
+    """Describe how two pictures, as base64, differ; '' if nearly all pixels agree."""
     if one.strip() == other.strip():
         return ""
     try:
         a, b = (Image.open(io.BytesIO(base64.b64decode(p))) for p in (one, other))
-        share = _changed_share(a, b, 255 * SHADE) if a.size == b.size else 1.0
+        share = _share_of_differences(a, b, 255 * SHADE) if a.size == b.size else 1.0
     except (OSError, ValueError, binascii.Error):
         return "is no picture"
     if a.size != b.size:
@@ -108,9 +108,11 @@ def difference(one: str, other: str) -> str:
 
 def differences(stored: list[Any], fresh: list[Any]) -> list[str]:
     """Return how the pictures of two lists of outputs differ."""
-    one = [p for output in stored for p in pictures_of(output)]
-    two = [p for output in fresh for p in pictures_of(output)]
-    if len(one) != len(two):
-        return [f"{len(one)} pictures stored, {len(two)} drawn"]
-    found = (difference(a, b) for a, b in zip(one, two, strict=True))
-    return [f"picture {k} {text}" for k, text in enumerate(found, start=1) if text]
+    stored_pictures = [p for output in stored for p in pictures_of(output)]
+    fresh_pictures = [p for output in fresh for p in pictures_of(output)]
+    if len(stored_pictures) != len(fresh_pictures):
+        return [f"{len(stored_pictures)} pictures stored, {len(fresh_pictures)} drawn"]
+    texts = (
+        difference(a, b) for a, b in zip(stored_pictures, fresh_pictures, strict=True)
+    )
+    return [f"picture {k} {text}" for k, text in enumerate(texts, start=1) if text]

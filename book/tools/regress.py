@@ -2,8 +2,8 @@
 
     python book/tools/regress.py [CHAPTER ...] [--portable] [--jobs N]
 
-``--portable`` runs them under another BLAS kernel and with numpy's newer SIMD code off. A probe
-notebook goes through the very same command first and fails if the setting did not take hold.
+``--portable`` runs them with another BLAS kernel and without numpy's newer SIMD code. A probe
+notebook runs by the same command first, and fails if the setting has no effect.
 """
 
 from __future__ import annotations
@@ -57,24 +57,24 @@ def compare(notebook: Path, extra: dict[str, str]) -> int:
         "--nbval-current-env",
     ]
     command += ["--nbval-cell-timeout=900", str(notebook)]
-    done = subprocess.run(
+    result = subprocess.run(
         command,
         cwd=ROOT,
         env=fixed_environment() | extra,
         capture_output=True,
         text=True,
     )
-    if done.returncode:
-        print(done.stdout, done.stderr, sep="\n", file=sys.stderr)
-    state = "differs" if done.returncode else "as stored"
+    if result.returncode:
+        print(result.stdout, result.stderr, sep="\n", file=sys.stderr)
+    state = "differs" if result.returncode else "as stored"
     print(
         f"{notebook.stem}: {state}, {time.perf_counter() - started:.1f} s", flush=True
     )
-    return done.returncode
+    return result.returncode
 
 
 def probe(name: str, code: str) -> Path:
-    """Write a notebook of one cell that fails unless the setting took hold."""
+    """Write a notebook of one cell that fails if the setting has no effect."""
     target = ROOT / "_build" / "portable" / f"probe-{name}.ipynb"
     target.parent.mkdir(parents=True, exist_ok=True)
     cell = nbformat.v4.new_code_cell(code, execution_count=1, id="probe-000")
@@ -93,7 +93,7 @@ def main() -> int:
     parser.add_argument("--jobs", type=int, default=2, help="chapters at a time")
     options = parser.parse_args()
     notebooks = [source.with_suffix(".ipynb") for source in chosen(options.chapters)]
-    # The largest first, so that no core waits at the end for the other's last chapter.
+    # The largest first, so that no core idles at the end.
     notebooks.sort(key=lambda notebook: -notebook.stat().st_size)
     if not notebooks:
         print("the table of contents has no chapter", file=sys.stderr)

@@ -3,8 +3,8 @@
     python book/tools/scenarios.py [--update]
 
 ``data/scenarios/accepted.csv`` has a line for every value of every scenario. With it a chapter
-detects a reader's change and shows the verdict "not comparable: changed scenario". After a change of
-the book's own scenarios, run ``make update-scenarios`` and commit the file with the scenario.
+detects a reader's change and shows the verdict "not comparable: changed scenario". After a change
+of the book's own scenarios, run ``make update-scenarios`` and commit the file with the scenario.
 """
 
 from __future__ import annotations

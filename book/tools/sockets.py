@@ -1,8 +1,8 @@
 """Kernels that are reached through files instead of ports.
 
 A kernel's ports are chosen by the process that starts it and opened a second later by the kernel.
-Another process can be given one of them in between, and then two chapters read each other's
-messages. A file with a name of its own is no one else's.
+In between, another process may get the same port, and then two chapters read each other's messages.
+A file with a unique name cannot be shared.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from jupyter_client.manager import AsyncKernelManager, KernelManager
 
 
 class _Files:
-    """What both managers have in common; it comes before them."""
+    """Connection by files, for both managers; the first base class."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         # Not beside Jupyter's own files: a socket's path has at most a hundred characters.

@@ -1,7 +1,7 @@
-"""Imported first, it makes nbformat start in a fifth of the time.
+"""Import this module first: nbformat then starts in a fifth of the time.
 
-nbformat imports jsonschema, and that compiles a grammar of addresses in any alphabet, for one and
-a half seconds, wherever the package with the grammar is installed. No notebook needs it.
+nbformat imports jsonschema, which compiles a grammar of international addresses for one and a half
+seconds, if the package with the grammar is installed. Notebooks do not need it.
 """
 
 import sys

@@ -4,15 +4,15 @@
 
 Each ``book/studies/*.py`` defines one study, which serves one item: ``NAME`` (the item's, such as
 ``figure-2``), ``PAPER`` (a key of the papers), ``trial``, ``parameters``, ``columns`` and
-``seeds``; and if it wants ``code`` (other functions whose source is recorded), ``rtol``, ``atol``,
-``ill_conditioned`` and ``max_outliers`` (how far a later run may differ, as in ``studies.check``;
-the same bits without them) and ``scenarios`` (those that it reads). A scenario's digest is stored among the
-parameters, and one that is not as accepted is refused: what is stored is the book's own study.
-What several scripts share stands in ``book/studies/_NAME.py``, which they import by that name.
+``seeds``. Optional are ``code`` (other functions whose source is recorded), the tolerances of
+``studies.check`` (``rtol``, ``atol``, ``ill_conditioned``, ``max_outliers``; without them the bits
+must be the same), and ``scenarios`` (those that it reads). A scenario's digest is stored among the
+parameters, and a scenario that differs from the accepted one is rejected. Code of several scripts
+is in ``book/studies/_NAME.py``, which they import by that name.
 
-Metrics go to ``data/studies/PAPER/NAME.csv``; ``studies.stored(PAPER, NAME)`` finds them. A run
-that is stopped goes on with the same command. With ``--check`` nothing is written: every stored
-trial runs again and is compared.
+Metrics go to ``data/studies/PAPER/NAME.csv``; ``studies.stored(PAPER, NAME)`` loads them. The same
+command continues a run that was stopped. With ``--check`` nothing is written: every stored trial
+runs again and is compared.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ NEEDED = ("NAME", "PAPER", "trial", "parameters", "columns", "seeds")
 
 
 def load_script(path: Path) -> ModuleType:
-    """Import a study's script and check what it defines.
+    """Import a study's script and check its definitions.
 
     Raises
     ------
@@ -70,11 +70,11 @@ def parameters_of(script: ModuleType) -> dict[str, Any]:
 
 
 def changes_of(script: ModuleType) -> str:
-    """Return what differs in a study's scenarios from the book's own, or ''."""
-    found = [c for s in getattr(script, "scenarios", ()) for c in s.changes]
+    """Describe the differences of a study's scenarios from the accepted ones, or ''."""
+    changes = [c for s in getattr(script, "scenarios", ()) for c in s.changes]
     return (
-        f"{script.NAME}: changed scenario: {'; '.join(found)}: make accept"
-        if found
+        f"{script.NAME}: changed scenario: {'; '.join(changes)}: make update-scenarios"
+        if changes
         else ""
     )
 
@@ -87,24 +87,24 @@ def target(script: ModuleType, root: Path) -> Path:
 def scripts(root: Path) -> list[ModuleType]:
     """Return the scripts of a repository, in order; two for one file are an error."""
     paths = sorted((root / "book" / "studies").glob("*.py"))
-    out = [load_script(path) for path in paths if not path.name.startswith("_")]
-    targets = [target(script, root) for script in out]
+    all_scripts = [load_script(path) for path in paths if not path.name.startswith("_")]
+    targets = [target(script, root) for script in all_scripts]
     twice = sorted({t.name for t in targets if targets.count(t) > 1})
     if twice:
         raise ValueError(f"{', '.join(twice)}: made by more than one script")
-    return out
+    return all_scripts
 
 
-def orphans(root: Path, known: list[ModuleType]) -> list[str]:
+def orphans(root: Path, all_scripts: list[ModuleType]) -> list[str]:
     """Return the stored studies that no script makes."""
-    made = {target(script, root) for script in known}
+    targets = {target(script, root) for script in all_scripts}
     stored = sorted((root / "data" / "studies").rglob("*.csv"))
-    return [path.relative_to(root).as_posix() for path in stored if path not in made]
+    return [path.relative_to(root).as_posix() for path in stored if path not in targets]
 
 
 def run(script: ModuleType, root: Path, workers: int | None) -> None:
-    """Run one study at full size, or what is left of it, and store it."""
-    began = time.perf_counter()
+    """Run one study at full size, or its unfinished trials, and store it."""
+    start_time = time.perf_counter()
     path = studies.store(
         target(script, root),
         script.trial,
@@ -115,7 +115,7 @@ def run(script: ModuleType, root: Path, workers: int | None) -> None:
         workers=workers,
     )
     stored = studies.load(path)
-    seconds = time.perf_counter() - began
+    seconds = time.perf_counter() - start_time
     failed = [f"trial {k}: {kind}" for k, kind in enumerate(stored.failures) if kind]
     print(*failed, sep="\n", end="\n" * bool(failed), file=sys.stderr)
     print(
@@ -124,27 +124,27 @@ def run(script: ModuleType, root: Path, workers: int | None) -> None:
 
 
 def check(script: ModuleType, root: Path, workers: int | None) -> str:
-    """Run one study's stored trials again; return what is wrong, or ''."""
+    """Run one study's stored trials again; return the problems, or ''."""
     path = target(script, root)
-    began = time.perf_counter()
-    shown = path.relative_to(root)
+    start_time = time.perf_counter()
+    file = path.relative_to(root)
     if not path.is_file():
-        return f"{shown}: not stored yet: make studies"
+        return f"{file}: not stored yet: make studies"
     options = {name: getattr(script, name) for name in ALLOWED if hasattr(script, name)}
     try:
         stored = studies.check(path, script.trial, workers=workers, **options)
     except (AssertionError, ValueError) as error:
         return str(error)
     if tuple(map(seed_text, script.seeds)) != stored.seeds:
-        return f"{shown}: the script has other seeds: make studies"
+        return f"{file}: the script has other seeds: make studies"
     written = {
         name: json.loads(text)
         for name, text in plain_json(parameters_of(script)).items()
     }
     if written != stored.parameters or tuple(script.columns) != tuple(stored.columns):
-        return f"{shown}: the script has other parameters: make studies"
-    seconds = time.perf_counter() - began
-    print(f"{shown}: {len(stored)} trials agree, {seconds:.0f} s", flush=True)
+        return f"{file}: the script has other parameters: make studies"
+    seconds = time.perf_counter() - start_time
+    print(f"{file}: {len(stored)} trials agree, {seconds:.0f} s", flush=True)
     return ""
 
 
@@ -156,24 +156,26 @@ def main(arguments: list[str] | None = None, root: Path = ROOT) -> int:
         "--workers", type=int, default=None, help="one for each core without it"
     )
     options = parser.parse_args(arguments)
-    known = scripts(root)
-    unknown = sorted(set(options.names) - {script.NAME for script in known})
+    all_scripts = scripts(root)
+    unknown = sorted(set(options.names) - {script.NAME for script in all_scripts})
     if unknown:
         print(
             f"{', '.join(unknown)}: no such study; there are "
-            f"{', '.join(script.NAME for script in known) or 'none'}",
+            f"{', '.join(script.NAME for script in all_scripts) or 'none'}",
             file=sys.stderr,
         )
         return 1
-    chosen = [s for s in known if not options.names or s.NAME in options.names]
+    chosen = [s for s in all_scripts if not options.names or s.NAME in options.names]
     problems = [
-        f"{path}: no script in book/studies makes it" for path in orphans(root, known)
+        f"{path}: no script in book/studies makes it"
+        for path in orphans(root, all_scripts)
     ]
-    if not known:
+    if not all_scripts:
         print("book/studies holds no script: there is no long study to run")
     for script in chosen:
-        if found := changes_of(script):
-            problems.append(found)
+        changes = changes_of(script)
+        if changes:
+            problems.append(changes)
         elif options.check:
             problems.append(check(script, root, options.workers))
         else:

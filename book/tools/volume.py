@@ -3,10 +3,10 @@
     python book/tools/volume.py pdf
     python book/tools/volume.py epub
 
-A headless Chromium sets the mathematics and the pages, so that nothing but a browser is needed. A
-slider is its still picture, code that the pages fold away is left out, and the solutions of all
-exercises stand at the end. The reference of the library and the gallery stay with the pages.
-A chapter that is missing, or anything wider than the paper, is an error.
+A headless Chromium sets the formulas and the pages, so that only a browser is needed. Sliders are
+still pictures, folded code is left out, and the solutions of all exercises are at the end. The API
+reference and the gallery are left out. A missing chapter, or anything wider than the paper, is an
+error.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ TITLE = "Distributed Nonlinear Filtering"
 AUTHOR = "The distfilt authors"
 STYLE = Path(__file__).with_name("volume.css")
 LEFT_OUT = "book/api", "book/gallery"
-"""Pages that stay with the site: long to print, and made to be searched."""
+"""Pages of the site only: long to print, and made for searching."""
 GONE = (
     "script, style, .headerlink, .notebook, .frames-controls, p:has(> a.sd-btn), "
     "details.above-input, details > summary, .pst-copy, button, input"
 )
-"""What a page on a screen has and a book has not."""
+"""Elements that make sense on a screen only."""
 
-# Type that is too wide for the column becomes smaller, down to six tenths.
+# Text that is too wide for the column gets a smaller font, down to six tenths.
 FIT = r"""
 const shrink = (part, wide) => {
   for (let k = 0, size = 1; k < 8 && size > 0.6; k++) {
@@ -65,7 +65,7 @@ for (const part of document.querySelectorAll("pre, table, div.math")) {
   }
 }
 """
-# What is wider or higher than the paper, what is not set, what is not drawn.
+# Elements that are wider or higher than the paper, not set, or not drawn.
 WRONG = r"""
 const body = document.body.getBoundingClientRect(), found = [];
 const name = (e) => `${e.tagName.toLowerCase()} in ${e.closest("section.part")?.id}: `
@@ -89,7 +89,7 @@ for (const e of document.querySelectorAll("mjx-merror, [data-mml-node=merror]"))
 return [...new Set(found)];
 """
 
-# The contents tell the page of each place.
+# The table of contents shows the page of each section.
 NUMBER = """
 for (const line of document.querySelectorAll(".contents li:has(a)"))
   line.querySelector("b").textContent = arguments[0][line.querySelector("a").hash.slice(1)];
@@ -97,18 +97,18 @@ for (const line of document.querySelectorAll(".contents li:has(a)"))
 
 
 def key(page: str, name: str = "") -> str:
-    """Return what a name of one page is called in the whole book."""
+    """Return the id in the whole book of an id of one page."""
     stem = page.removeprefix("book/").replace("/", "-")
     return f"p{stem}" + (f"--{re.sub(r'[^A-Za-z0-9_.-]', '-', name)}" if name else "")
 
 
 def book_pages() -> list[str]:
-    """Return the pages that the whole book holds, in reading order."""
+    """Return the pages of the whole book, in reading order."""
     return [page for page in toc_pages() if not page.startswith(LEFT_OUT)]
 
 
 def article(page: str, pages: list[str]) -> tuple[Tag, list[Tag]]:
-    """Return a page's text as it stands in the book, and the solutions that it held."""
+    """Return the text of a page for the book, and its solutions."""
     path = BUILT / f"{page}.html"
     if not path.is_file():
         sys.exit(f"{path.relative_to(ROOT)} is not built: make book")
@@ -135,12 +135,12 @@ def article(page: str, pages: list[str]) -> tuple[Tag, list[Tag]]:
 
 
 def lead(link: Tag, page: str, pages: list[str]) -> None:
-    """Make a link lead to its place in the book; one to a page that stays away is its words."""
+    """Redirect a link to its place in the book; a link to a page that is left out becomes text."""
     where, _, name = str(link["href"]).partition("#")
     if re.match(r"\w+:", where):
         return
-    beside = posixpath.normpath(posixpath.join(posixpath.dirname(page), where))
-    target = beside.removesuffix(".html") if where else page
+    path = posixpath.normpath(posixpath.join(posixpath.dirname(page), where))
+    target = path.removesuffix(".html") if where else page
     if target in pages:
         link["href"] = "#" + key(target, unquote(name))
     else:
@@ -151,33 +151,35 @@ def assemble() -> tuple[str, list[str]]:
     """Return the whole book as one page, and its chapters' names."""
     pages = book_pages()
     parts = []
-    back = []
+    solution_texts = []
     captions = {}
     for group in yaml.safe_load((ROOT / "_toc.yml").read_text(encoding="utf-8"))[
         "parts"
     ]:
         captions[group["chapters"][0]["file"]] = group["caption"]
-    listed = []
+    contents_lines = []
     for page in pages:
         text, solutions = article(page, pages)
         parts.append(str(text))
         if page in captions:
-            listed.append(f'<li class="group">{html.escape(captions[page])}</li>')
-        listed += entries(text)
+            contents_lines.append(
+                f'<li class="group">{html.escape(captions[page])}</li>'
+            )
+        contents_lines += entries(text)
         if solutions:
             title = text.find("h1").get_text()  # type: ignore[union-attr]
-            back += [
+            solution_texts += [
                 f'<h2 id="{key(page, "solutions")}">{html.escape(title)}</h2>',
                 *map(str, solutions),
             ]
     parts.append(
-        f'<section class="part" id="psolutions"><h1>Solutions</h1>{"".join(back)}</section>'
+        f'<section class="part" id="psolutions"><h1>Solutions</h1>{"".join(solution_texts)}</section>'
     )
-    listed += entries(BeautifulSoup(parts[-1], "html.parser").section)
-    built = "".join(
+    contents_lines += entries(BeautifulSoup(parts[-1], "html.parser").section)
+    html_text = "".join(
         (BUILT / f"{page}.html").read_text(encoding="utf-8") for page in pages
     )
-    config = re.search(r"<script>(window\.MathJax = .*?)</script>", built)
+    config = re.search(r"<script>(window\.MathJax = .*?)</script>", html_text)
     assert config is not None, "pages have no mathematics"
     mathjax = (BUILT / "_static" / "mathjax" / "tex-mml-chtml.js").as_uri()
     now = datetime.date.today().isoformat()
@@ -189,10 +191,10 @@ def assemble() -> tuple[str, list[str]]:
   {{settings: {{assistiveMml: false}}}};</script>
 <script defer src="{mathjax}"></script></head><body class="tex2jax_ignore mathjax_ignore">"""
     front = f"""<section class="front"><p class="title">{TITLE}</p><p>{AUTHOR}, edition
-{distfilt.__version__}, printed {now}.</p><p class="told">What moves on the pages is a still picture
-here. Code that the pages fold away, the reference of the library and the gallery of pictures are
-with the pages and the notebooks.</p></section>"""
-    contents = f'<section class="part contents"><h1>Contents</h1><ol>{"".join(listed)}</ol></section>'
+{distfilt.__version__}, printed {now}.</p><p class="note">Sliders of the pages are still pictures
+here. Folded code, the API reference and the gallery are on the pages and in the
+notebooks.</p></section>"""
+    contents = f'<section class="part contents"><h1>Contents</h1><ol>{"".join(contents_lines)}</ol></section>'
     return "\n".join([head, front, contents, *parts, "</body></html>"]), [
         *pages,
         "solutions",
@@ -201,7 +203,7 @@ with the pages and the notebooks.</p></section>"""
 
 def entries(text: Any) -> list[str]:
     """Return the lines of the contents for one part: its title, and its sections."""
-    out = []
+    lines = []
     for head in text.find_all(["h1", "h2"]):
         place = (
             text["id"]
@@ -210,10 +212,10 @@ def entries(text: Any) -> list[str]:
         )
         kind = "chapter" if head.name == "h1" else "below"
         words = head.decode_contents().strip()
-        out.append(
+        lines.append(
             f'<li class="{kind}"><a href="#{place}">{words}</a><i></i><b></b></li>'
         )
-    return out
+    return lines
 
 
 def pages_of(pdf: bytes) -> dict[str, int]:
@@ -259,7 +261,7 @@ def print_page(driver: Any) -> bytes:
 
 
 def open_page(driver: Any, page: Path) -> None:
-    """Open the assembled page, set it, and refuse what does not fit."""
+    """Open the assembled page and set it; exit if something does not fit."""
     driver.command_executor.client_config.timeout = 1800
     driver.set_script_timeout(1700)
     driver.set_page_load_timeout(1700)
@@ -268,12 +270,13 @@ def open_page(driver: Any, page: Path) -> None:
     driver.get(page.as_uri())
     driver.execute_async_script(READY)
     driver.execute_script(FIT)
-    if wrong := driver.execute_script(WRONG):
-        sys.exit("\n".join(["the book does not fit its paper:", *wrong]))
+    problems = driver.execute_script(WRONG)
+    if problems:
+        sys.exit("\n".join(["the book does not fit its paper:", *problems]))
 
 
 def pdf(driver: Any, parts: list[str]) -> bytes:
-    """Return the book as a PDF; the second printing has the numbers of the first one's pages."""
+    """Return the book as a PDF, printed twice: the first gives the page numbers of the contents."""
     places = pages_of(print_page(driver))
     starts = [places[part] for part in parts if part in places]
     if len(starts) != len(parts) or starts != sorted(set(starts)):
@@ -312,13 +315,14 @@ def main() -> int:
 
 
 def offer(target: Path) -> None:
-    """Let the first page lead to a file whose name it tells."""
+    """Link the name of a file on the first page to the file."""
     first = TARGET / "index.html"
     name = re.escape(target.name)
-    told = re.compile(rf'<code[^>]*><span class="pre">{name}</span></code>')
+    mention = re.compile(rf'<code[^>]*><span class="pre">{name}</span></code>')
     text = first.read_text(encoding="utf-8")
     first.write_text(
-        told.sub(f'<a href="{target.name}">{target.name}</a>', text), encoding="utf-8"
+        mention.sub(f'<a href="{target.name}">{target.name}</a>', text),
+        encoding="utf-8",
     )
 
 

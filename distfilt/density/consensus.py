@@ -9,7 +9,7 @@ import numpy as np
 
 from ..network import Channel, Graph, PIState, pi_step
 from ..network import weights as weighting
-from ..network.channel import Lost
+from ..network.channel import LossRule
 from ..validation import (
     Array,
     FrozenModel,
@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 Memory = tuple[Array, ...]
-"""What the agents remember between steps: arrays whose first axis is the agents."""
+"""The agents' memory between steps: arrays whose first axis is the agents."""
 Update = tuple[Memory, Array, Array]
 """The new memory, each agent's estimate (A, n), and its number of agents, (A,)."""
 
@@ -203,9 +203,9 @@ class DynamicAverage(FrozenModel, ConsensusProtocol):
         else:
             weights = weighting.metropolis(graph)
         # A lost message must not change the sum of the estimates.
-        lost: Lost = "keep" if graph.directed else "mutual"
+        on_loss: LossRule = "keep" if graph.directed else "mutual"
         # x ← W x + (u - u_previous) conserves mean(x) = mean(u).
-        mixed = channel.mix(estimates, weights, lost=lost)
+        mixed = channel.mix(estimates, weights, on_loss=on_loss)
         estimates = mixed + (inputs - previous)
         densities, agents = _decode(estimates, snapshot, self.modes)
         return (estimates, inputs), densities, agents

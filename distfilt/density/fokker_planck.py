@@ -48,9 +48,9 @@ class _Faces(NamedTuple):
 
     points: Array
     """Centres of the faces, (f, d)."""
-    left: Indices
+    lower: Indices
     """Cells below each face along its axis."""
-    right: Indices
+    upper: Indices
     """Cells above it."""
     axis: Indices
     """Axis that crosses it."""
@@ -126,10 +126,10 @@ class FokkerPlanck(FrozenModel):
         below = [np.delete(cells, -1, axis=k).ravel() for k in range(grid.dim)]
         above = [np.delete(cells, 0, axis=k).ravel() for k in range(grid.dim)]
         axis = np.repeat(np.arange(grid.dim), [len(cells) for cells in below])
-        left = np.concatenate(below)
-        right = np.concatenate(above)
-        points = 0.5 * (grid.centres[left] + grid.centres[right])
-        return _Faces(points, left, right, axis, grid.spacing[axis])
+        lower = np.concatenate(below)
+        upper = np.concatenate(above)
+        points = 0.5 * (grid.centres[lower] + grid.centres[upper])
+        return _Faces(points, lower, upper, axis, grid.spacing[axis])
 
     def _rates(self, t: float) -> tuple[Array, Array]:
         """Rates at which mass crosses each face, forwards and backwards, in 1/s."""
@@ -145,10 +145,10 @@ class FokkerPlanck(FrozenModel):
         backwards = weight + np.maximum(-peclet, 0.0)
         # Itô: the diffusion that multiplies the density is that of the cell which mass leaves.
         cells = self.swarm.diffusion_at(self.grid.centres, t)
-        diffusion_left = cells[faces.left, faces.axis]
-        diffusion_right = cells[faces.right, faces.axis]
+        lower_diffusion = cells[faces.lower, faces.axis]
+        upper_diffusion = cells[faces.upper, faces.axis]
         square = faces.width**2
-        return forwards * diffusion_left / square, backwards * diffusion_right / square
+        return forwards * lower_diffusion / square, backwards * upper_diffusion / square
 
     def _assemble(
         self, t: float, scale: float, identity: float
@@ -158,12 +158,12 @@ class FokkerPlanck(FrozenModel):
         faces = self._faces
         n = self.grid.size
         # Columns of A sum to zero: a cell loses as much as its neighbours gain.
-        loss = np.bincount(faces.left, forwards, n)
-        loss = loss + np.bincount(faces.right, backwards, n)
+        loss = np.bincount(faces.lower, forwards, n)
+        loss = loss + np.bincount(faces.upper, backwards, n)
         diagonal = identity - scale * loss
         data = np.concatenate([diagonal, scale * forwards, scale * backwards])
-        rows = np.concatenate([np.arange(n), faces.right, faces.left])
-        columns = np.concatenate([np.arange(n), faces.left, faces.right])
+        rows = np.concatenate([np.arange(n), faces.upper, faces.lower])
+        columns = np.concatenate([np.arange(n), faces.lower, faces.upper])
         return scipy.sparse.csc_array((data, (rows, columns)), (n, n))
 
     @validated

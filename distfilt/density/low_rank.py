@@ -306,7 +306,7 @@ def low_rank_step(
     precision = dt / _noise_strength(noise, state.base.shape)
     innovation = precision * (observed - state.base)
     increment = (innovation[:, None, :] @ state.basis)[:, 0]
-    information = state.information + _weighted_products(state.basis, precision)
+    information = state.information + _gram_matrices(state.basis, precision)
     # The least eigenvalue is 1 or more: without large entries no matrix is ill-conditioned.
     if not information.max() < _MAX_CONDITION:
         _check_condition(information)
@@ -325,7 +325,7 @@ def _check_condition(information: Array) -> None:
         )
 
 
-def _weighted_products(s: Array, weights: Array) -> Array:
+def _gram_matrices(s: Array, weights: Array) -> Array:
     """Sᵀ diag(w) S for each row w of the weights, (F, r, r)."""
     if s.ndim == 3 or len(weights) < 16:
         return np.asarray((s.mT * weights[:, None, :]) @ s)

@@ -4,33 +4,48 @@
 import scipy.linalg  # noqa: F401
 
 from ..updates.particles import ParticleCollapse
-from .base import Filter
+from .base import Filter, SensorFilter
 from .density import DensityFilter, DensityState
 from .ensemble import EnsembleFilter, TransportFilter
+from .failures import FilterError
 from .gaussian import GaussianFilter, GaussianState
-from .inputs import Observation, prior_moments
+from .increments import InformationIncrementFilter, information_increment
 from .mixture import MixtureFilter, MixtureState
-from .news import InformationIncrementFilter, information_increment
+from .observations import Observation
+from .options import (
+    ExchangesAtIntervals,
+    FusesBeliefs,
+    IsolatesRuns,
+    KeepsPast,
+    SharesObservations,
+)
 from .particle import ParticleFilter
+from .priors import prior_moments
 from .record import Summary, final_state
-from .saving import SensorState, State
-from .step import FilterError, Step
+from .states import SensorState, State
+from .step import Step
 
 __all__ = [
     "DensityFilter",
     "DensityState",
     "EnsembleFilter",
+    "ExchangesAtIntervals",
     "Filter",
     "FilterError",
+    "FusesBeliefs",
     "GaussianFilter",
     "GaussianState",
     "MixtureFilter",
     "MixtureState",
     "InformationIncrementFilter",
+    "IsolatesRuns",
+    "KeepsPast",
     "ParticleCollapse",
     "ParticleFilter",
     "Observation",
+    "SensorFilter",
     "SensorState",
+    "SharesObservations",
     "State",
     "Step",
     "Summary",

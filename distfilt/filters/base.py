@@ -1,89 +1,441 @@
-"""The contract of all filters: a family supplies `begin`, `advance`, `summary`; the rest is here.
+"""The contract of all filters, and the driver that steps, runs and records any of them.
 
-One order of the constructor's arguments, one `start`, `step`, `run` and `smooth`, one meaning of
-each option. An option that means nothing to a family is refused by its name, with the reason.
+A family supplies three methods: `initial_state`, `next_state` and `summarize`. It derives from
+:class:`SensorFilter`, if its agents have sensors, and from the classes in
+:mod:`distfilt.filters.options`, one for each thing it can do.
 """
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, fields
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    ClassVar,
+    Generic,
+    Literal,
+    TypeVar,
+    cast,
+)
 
 import numpy as np
 
 from ..models import Model
 from ..network import Channel, Faults, Ledger
 from ..network.channel import kind_of_rule
-from ..network.graphs import as_graph
+from ..network.graphs import Graph, as_graph
 from ..sensors import Sensor
 from ..validation import (
     Array,
     Bounds,
     FrozenModel,
-    NonNegativeInt,
-    PositiveFloat,
+    InvalidArgumentError,
     Rng,
     skip_validation,
     validated,
 )
-from .inputs import Observation, match_delayed, plan_steps, read_observations
-from .record import SCORES, Score, Summary, record_run
-from .saving import State
-from .step import RECOVERABLE, FilterError, Step, is_argument_error
+from .failures import RECOVERABLE, FilterError, is_argument_error
+from .observations import Observation, match_delayed, read_observations
+from .plans import TimesArgument, plan_steps
+from .priors import Prior
+from .record import SCORES, Score, Summary, Truth, final_state, record_run
+from .states import SensorState, State
+from .step import Step
 
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["Filter"]
+__all__ = ["Filter", "SensorFilter"]
+
+S = TypeVar("S", bound=State)
 
 
 @dataclass(frozen=True, eq=False)
-class Filter(FrozenModel, ABC):
-    """What every family of filters is made of.
+class Filter(FrozenModel, ABC, Generic[S]):
+    """The base of every family of filters; generic in the family's state.
+
+    Parameters
+    ----------
+    faults : Faults, optional
+        Lost messages and silenced agents; a lost observation is a missing one. A delay is not
+        accepted: a delayed observation has its own time, pass it as `delayed`.
+    names : sequence of str
+        Names of the agents; their numbers by default.
+
+    Notes
+    -----
+    A family of one's own is a class that derives from
+    :class:`~distfilt.filters.SensorFilter` and from the options it offers, names its
+    `state_class`, and has three methods: `initial_state` returns the family's fields of the first
+    state, `next_state` makes the next state of a :class:`~distfilt.filters.Step`, and `summarize`
+    returns estimates of a state. With `requires_rng` steps draw from a generator; with
+    `batched_summary` `summarize` accepts states stacked along a first axis; `belief_kind` names
+    what its fusion rules fuse.
+    """
+
+    _: KW_ONLY
+    faults: Faults | None = None
+    names: Sequence[str] = ()
+
+    state_class: ClassVar[type[Any]] = State
+    requires_rng: ClassVar[bool] = False
+    supports_runs: ClassVar[bool] = True
+    batched_summary: ClassVar[bool] = False
+    belief_kind: ClassVar[str | None] = None
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        # A new summary may be written for single states only.
+        if "summarize" in vars(cls) and "batched_summary" not in vars(cls):
+            cls.batched_summary = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_parts()
+        if self.faults is not None and self.faults.total_delay:
+            raise ValueError(
+                f"faults must be Faults without a delay, got {self.faults!r}"
+            )
+        n = self.n_agents
+        if self.names and not len(self.names) == len(set(self.names)) == n:
+            raise ValueError(
+                f"names must have {n} different names, got {list(self.names)}"
+            )
+        kind = None if self.fusion is None else kind_of_rule(self.fusion)
+        if kind is not None and kind != self.belief_kind:
+            raise ValueError(
+                f"fusion must be a rule that fuses {self.belief_kind}, got one of {kind}"
+            )
+
+    def check_parts(self) -> None:
+        """Refuse options that do not fit each other; families extend it."""
+
+    # What a family without the option does. A class of `options` makes a field of it.
+
+    @cached_property
+    def fusion(self) -> Any:
+        """The fusion rule; none by default."""
+        return None
+
+    @cached_property
+    def share_observations(self) -> bool:
+        """Whether agents send their observations to their neighbours."""
+        return False
+
+    @cached_property
+    def lag(self) -> int:
+        """How many earlier times a state keeps."""
+        return 0
+
+    @cached_property
+    def on_error(self) -> Literal["raise", "keep"]:
+        """Whether a failed run raises an error, or is recorded as NaN."""
+        return "raise"
+
+    @cached_property
+    def gate_probability(self) -> float | None:
+        """How likely a good observation passes the gate; None without a gate."""
+        return None
+
+    def is_exchange_time(self, t_before: float, t: float) -> bool:
+        """Whether agents exchange in a step from `t_before` to `t`; in every one by default."""
+        return True
+
+    # What a family supplies.
+
+    @property
+    @abstractmethod
+    def n_agents(self) -> int:
+        """Number A of agents."""
+
+    @property
+    @abstractmethod
+    def components(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Names and units of the state's components."""
+
+    @abstractmethod
+    def read_observations(
+        self, observations: Any, runs: tuple[int, ...], t: float
+    ) -> Any:
+        """Check the observations of one time, and return them as `next_state` needs them."""
+
+    @abstractmethod
+    def initial_state(
+        self, prior: Any, runs: tuple[int, ...], rng: Any
+    ) -> dict[str, Any]:
+        """Return the family's own fields of the first state."""
+
+    @abstractmethod
+    def next_state(self, step: Step[S]) -> S:
+        """Return the state at the end of a step."""
+
+    @abstractmethod
+    def summarize(self, state: S) -> Summary:
+        """Return estimates and variances of a state."""
+
+    def channel(self, state: S, t: float) -> Channel | None:
+        """Return the channel of the step to `t`; None where nobody can send."""
+        return None
+
+    # The driver.
+
+    @property
+    def agents(self) -> tuple[str, ...]:
+        """Names of the agents; their numbers by default."""
+        return tuple(self.names) or tuple(str(k) for k in range(self.n_agents))
+
+    @validated
+    def start(
+        self,
+        prior: Prior,
+        *,
+        rng: Rng | None = None,
+        runs: tuple[int, ...] = (),
+        t: float = 0.0,
+    ) -> S:
+        """Return the state before the first step.
+
+        Parameters
+        ----------
+        prior : tuple, distribution, GaussianMixture, array_like or callable
+            A Gaussian's ``(mean, cov)``, (d,) and (d, d); a frozen distribution of scipy; a
+            mixture; members (N, d), or (*runs, A, N, d); or a function
+            ``prior(members, rng=rng, leading=leading)`` that draws (*leading, N, d). A family
+            refuses kinds that it cannot use. One whose agents' states differ takes a list with a
+            prior for each agent.
+        rng : numpy.random.Generator, optional
+            Draws the prior. All later steps draw from a child stream of it, which is independent
+            of whatever else is drawn from it. Filters that draw nothing need none.
+        runs : tuple of int
+            Leading axes: independent runs.
+        t : float
+            The time of the prior, in s.
+        """
+        if self.requires_rng and rng is None:
+            raise InvalidArgumentError(
+                "rng must be a numpy.random.Generator, got None: use np.random.default_rng(seed)"
+            )
+        if runs and not self.supports_runs:
+            raise ValueError(
+                f"runs must be () for a filter of one run at a time, got {runs!r}"
+            )
+        if runs and min(runs) < 1:
+            raise ValueError(f"runs must be sizes of at least 1, got {runs!r}")
+        fields = self.initial_state(prior, runs, rng)
+        child = None
+        if self.requires_rng and rng is not None:
+            (child,) = rng.spawn(1)
+        ledger = Ledger.empty(self.n_agents)
+        return cast(S, self.state_class(t, ledger, child, **fields))
+
+    @validated
+    def step(
+        self,
+        state: S,
+        t: float,
+        observations: Any,
+        *,
+        delayed: Sequence[Observation] = (),
+    ) -> S:
+        """Move to time `t` and assimilate the observations of that time.
+
+        Parameters
+        ----------
+        state : State
+            The state before; it is not changed.
+        t : float
+            The new time, in s; at the state's own time nothing is forecast.
+        observations : sequence of length A
+            Per agent (*runs, m) or (m,), or None; or one :class:`Observation`, or a list of them.
+            NaN marks a missing component, run by run.
+        delayed : sequence of Observation
+            Observations of earlier times that arrive now; the filter needs a `lag` that reaches
+            back to them.
+
+        Raises
+        ------
+        ValueError
+            If `t` is earlier than the state, an observation does not fit its sensor, or the time
+            of a delayed one is not kept.
+        FilterError
+            If an agent's computation fails; see `on_error`.
+        """
+        self.check_state(state)
+        if t < state.t:
+            Bounds(at_least=state.t)(t, "t")
+        return self._advance(state, t, observations, delayed)
+
+    def _advance(
+        self,
+        state: S,
+        t: float,
+        observations: Any,
+        delayed: Sequence[Observation],
+        *,
+        reuse_rng: bool = False,
+    ) -> S:
+        """Take one step from checked arguments."""
+        runs = state.failed.shape if isinstance(state, SensorState) else state.runs
+        read = self.read_observations(observations, runs, t)
+        matched = match_delayed(self, delayed, state, t) if delayed else ()
+        step = Step(self, state, t, read, matched, reuse_rng=reuse_rng)
+        try:
+            return self.next_state(step)
+        except RECOVERABLE as error:
+            if is_argument_error(error):
+                raise
+            raise FilterError((), None, t, error) from error
+
+    def check_state(self, state: S) -> None:
+        """Refuse a state that is not of this filter."""
+        if not isinstance(state, self.state_class):
+            raise InvalidArgumentError(
+                f"state must be a {self.state_class.__name__}, got a {type(state).__name__}"
+            )
+        n = state.ledger.messages.size
+        if n != self.n_agents:
+            raise ValueError(f"state must be of {self.n_agents} agents, got {n}")
+
+    @validated
+    def steps(
+        self,
+        state: S,
+        times: TimesArgument,
+        observations: Any,
+        *,
+        delayed: Sequence[Observation] = (),
+    ) -> Iterator[S]:
+        """Yield the states at `times`, one after the other; arguments as in :meth:`run`."""
+        self.check_state(state)
+        grid, entries = plan_steps(self, state, times, observations)
+        return self._iterate(state, grid, entries, delayed, reuse_rng=False)
+
+    def _iterate(
+        self,
+        state: S,
+        grid: Array,
+        entries: Iterable[Any],
+        delayed: Sequence[Observation],
+        *,
+        reuse_rng: bool,
+    ) -> Iterator[S]:
+        """Yield the states of a run, each delayed observation at the time when it has arrived."""
+        last = grid[-1] if grid.size else -np.inf
+        for observation in delayed:
+            arrival = observation.arrival_time
+            if arrival is None or arrival > last:
+                raise ValueError(
+                    f"delayed must have an arrival_time up to {last:g}, got {arrival}"
+                )
+        waiting = sorted(delayed, key=_arrival_time)
+        is_own = False
+        for t, observed in zip(grid.tolist(), entries, strict=True):
+            arrived: list[Observation] = []
+            while waiting and _arrival_time(waiting[0]) <= t:
+                arrived.append(waiting.pop(0))
+            # The generator runs after the validated call that made it has returned.
+            with skip_validation():
+                state = self._advance(state, t, observed, arrived, reuse_rng=is_own)
+            # The first state is the user's; the others, and their generator, are the run's.
+            is_own = reuse_rng
+            yield state
+
+    @validated
+    def run(
+        self,
+        state: S,
+        times: TimesArgument,
+        observations: Any,
+        *,
+        truth: Truth = None,
+        scores: Collection[Score] = SCORES,
+        delayed: Sequence[Observation] = (),
+    ) -> xarray.Dataset:
+        """Step through a series, or through events, and record it.
+
+        Parameters
+        ----------
+        state : State
+            The state before the run.
+        times : array_like, (T,), or None
+            Strictly increasing, in s, from the state's on; steps may differ in length. With events
+            there is a step at each of their times too, and None is enough if none is delayed.
+        observations : sequence of length A, or of Observation
+            Per agent (T, *runs, m) or (T, m), or None; NaN marks what is missing. Or events in any
+            order, several of which may have the same time.
+        truth : array_like, (T, *runs, d) or (T, *runs, A, d), or mapping, optional
+            If given, the scores are recorded too. The truth is the same for all agents, or each
+            agent's own, or it has some components only, by their names, (T, *runs) or
+            (T, *runs, A) each.
+        scores : collection of {"squared_error", "nees", "crps"}
+            Which of them; CRPS costs about as much as an ensemble filter.
+        delayed : sequence of Observation
+            Each is assimilated at the first of `times` not before its `arrival_time`. Its own time
+            has to be one of `times`, also if the other observations are events.
+
+        Returns
+        -------
+        xarray.Dataset
+            Axes ``time``, ``run`` (``run0``, ``run1``, … where there are several), ``agent``,
+            ``component``; units and meaning are in the attributes. ``mean``, ``variance`` and,
+            with `truth`, ``squared_error`` and ``crps`` for each component; ``spread`` and
+            ``total_squared_error`` add components up, whatever their units, and say so; ``nees``
+            is d on average for a consistent filter. ``messages``, ``scalars``, ``bytes``, ``lost``
+            and ``rounds`` are those of each step, the same names with ``_total`` their sums;
+            ``rejected`` counts the observations that the gate rejects.
+            :func:`distfilt.filters.final_state` returns the state at the end.
+        """
+        return self._record(state, times, observations, truth, scores, delayed, 0)
+
+    def final_state(self, run: xarray.Dataset) -> S:
+        """Return the state in which a run of this filter ended."""
+        state = cast(S, final_state(run))
+        self.check_state(state)
+        return state
+
+    def _record(
+        self,
+        state: S,
+        times: Any,
+        observations: Any,
+        truth: Truth,
+        scores: Collection[Score],
+        delayed: Sequence[Observation],
+        lag: int,
+    ) -> xarray.Dataset:
+        """Record a run: of each time the belief when `lag` more have been observed."""
+        self.check_state(state)
+        grid, entries = plan_steps(self, state, times, observations)
+        states = self._iterate(state, grid, entries, delayed, reuse_rng=True)
+        smoothed = _smooth_states(states, lag)
+        return record_run(self, grid, state, smoothed, truth, scores)
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFilter(Filter[S]):
+    """A filter of agents that observe one state, or states of one model, with sensors.
 
     Parameters
     ----------
     model : Model
-        How the state moves; known to all agents.
+        The motion of the state; known to all agents.
     sensors : sequence of length A
-        What each agent sees: a Sensor, several in a list, or None. Neighbours know each other's.
-        One that moves comes with each :class:`Reading`, and of several each reading is one.
+        Each agent's Sensor, or several of them in a list, or None. Neighbours know each other's.
+        Of several sensors, each observation is an :class:`Observation` that names its sensor; one
+        that moves comes with each Observation.
     graph : Graph, networkx graph, matrix or edges, or callable t -> one of them, optional
-        Who hears whom; needed where anybody speaks. At a time without any link nobody does.
-    fusion : callable, optional
-        ``agreement(belief, channel) -> belief``: what agents do after the update to agree, if they
-        do; the belief is the family's. A rule of this package that fuses something else is refused.
-    share_observations : bool
-        Whether agents send their readings to those that hear them, who use them too.
-    faults : Faults, optional
-        Messages lost and agents silenced; a lost observation is a missing one. A delay is not
-        accepted: an observation that comes late has its own time, pass it as `delayed`.
-    lag : int
-        How many earlier times are kept, for late observations and for smoothing.
-    names : sequence of str
-        Names of the agents; their numbers by default.
-    on_error : {"raise", "keep"}
-        What happens when one run of a batch fails: a :class:`FilterError` that names it, or the
-        other runs go on and the failed one is recorded as NaN. Where an `fusion` raises, each
-        run is asked alone.
+        Communication graph; required if agents exchange anything. Where it has no links at time
+        t, nothing is sent.
     gate_probability : float, optional
-        How likely a good reading passes, in (0, 1). Each sensor's reading is tested against what
-        was predicted; those that fail are left out and counted as ``rejected`` in the record.
-    exchange_interval : float, optional
-        Agents exchange something every so many seconds only. Readings wait for it and are told as
-        late ones, so that a `lag` has to reach back.
-
-    Notes
-    -----
-    A family of one's own is a dataclass that derives from this, names the kind of its `state`, and
-    has three methods: `begin` gives the fields of the first state, `advance` makes the next one of
-    a :class:`Step`, `summary` tells what is believed. `draws` says that steps need a generator,
-    `joins`, beside a `summary`, that this takes several states as one with an axis more in front,
-    `fuses` what its agreements fuse, and `unused` why options that it cannot have are refused.
+        How likely a good observation passes the gate, in (0, 1); no gate by default. Each
+        sensor's observation is tested against its prediction; the record counts the ``rejected``
+        ones.
+    faults, names
+        As for :class:`~distfilt.filters.Filter`.
 
     Examples
     --------
@@ -93,13 +445,10 @@ class Filter(FrozenModel, ABC):
     >>> from distfilt.network import intersect_ensembles
     >>> from distfilt.sensors import component
     >>> walk, two = constant_velocity(sigma=1.0), [component([0], std=1.0), None]
+    >>> prior = (np.zeros(4), np.eye(4))
     >>> for graph in (nx.path_graph(2), lambda t: [(0, 1)]):
     ...     f = GaussianFilter(walk, two, graph)
-    ...     print(
-    ...         f.step(f.start((np.zeros(4), np.eye(4))), 0.0, [[1.0], None]).means[
-    ...             :, 0
-    ...         ]
-    ...     )
+    ...     print(f.step(f.start(prior), 0.0, [[1.0], None]).means[:, 0])
     [0.5 0.5]
     [0.5 0.5]
     >>> GaussianFilter(walk, two, graph, fusion=intersect_ensembles)
@@ -109,384 +458,125 @@ class Filter(FrozenModel, ABC):
 
     model: Model
     sensors: Sequence[Sensor | Sequence[Sensor] | None]
+    # Any: whatever networkx or numpy accepts as a graph.
     graph: Any = None
     _: KW_ONLY
-    fusion: Callable[..., Any] | None = None
-    share_observations: bool = True
-    faults: Faults | None = None
-    lag: NonNegativeInt = 0
-    names: Sequence[str] = ()
-    on_error: Literal["raise", "keep"] = "raise"
     gate_probability: Annotated[float, Bounds(above=0, below=1)] | None = None
-    exchange_interval: PositiveFloat | None = None
 
-    state_class: ClassVar[type[Any]] = State
-    requires_rng: ClassVar[bool] = False
-    supports_runs: ClassVar[bool] = True
-    batched_summary: ClassVar[bool] = False
     supports_increments: ClassVar[bool] = False
-    belief_kind: ClassVar[str | None] = None
-    unsupported: ClassVar[Mapping[str, str]] = {}
-
-    def __init_subclass__(cls) -> None:
-        super().__init_subclass__()
-        # A summary of one's own may be right for single states only.
-        if "summarize" in vars(cls) and "batched_summary" not in vars(cls):
-            cls.batched_summary = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for option in fields(self):
-            if (
-                option.name in self.unsupported
-                and getattr(self, option.name) != option.default
-            ):
-                raise ValueError(f"{option.name}: {self.unsupported[option.name]}")
-        self.check_parts()
-        if self.faults is not None and self.faults.has_delay:
-            raise ValueError(
-                f"faults must be Faults without a delay, got {self.faults!r}"
-            )
-        if self.names and not len(self.names) == len({*self.names}) == self.n_agents:
-            raise ValueError(
-                f"names must have {self.n_agents} different names, got {[*self.names]}"
-            )
-        kind = None if self.fusion is None else kind_of_rule(self.fusion)
-        if kind is not None and kind != self.belief_kind:
-            raise ValueError(
-                f"fusion must be a rule that fuses {self.belief_kind}, got one of {kind}"
-            )
-        if (
-            self.exchange_interval is not None
-            and self.share_observations
-            and self.graph is not None
-            and not self.lag
-        ):
-            raise ValueError(
-                "lag must have at least 1 for readings that wait for a contact, got 0"
-            )
 
     def check_parts(self) -> None:
-        """Refuse sensors or a graph that this family cannot have."""
+        """Refuse sensors or a graph that this family cannot use."""
+        super().check_parts()
         if not self.supports_increments and any(
-            s.uses_previous for own in self.agent_sensors for s in own
+            sensor.uses_previous for agent in self.agent_sensors for sensor in agent
         ):
             raise ValueError(
-                "sensors must be sensors of the present state, got a differential"
+                "sensors must not be increments here: this filter keeps no previous state"
             )
-        speak = self.share_observations or self.fusion is not None
-        if self.graph is None and self.n_agents > 1 and speak:
+        if self.graph is None:
+            exchanges = self.share_observations or self.fusion is not None
+            if exchanges and self.n_agents > 1:
+                raise ValueError(
+                    f"graph must be a Graph of {self.n_agents} agents, got None"
+                )
+        elif not callable(self.graph):
+            graph = as_graph(self.graph, self.n_agents, self.names)
+            object.__setattr__(self, "graph", graph)
+        interval = getattr(self, "exchange_interval", None)
+        if interval is not None and self.sends_observations and not self.lag:
             raise ValueError(
-                f"graph must be a Graph of {self.n_agents} agents, got None"
+                "lag must be at least 1 for observations that wait for an exchange, got 0"
             )
-        if self.graph is not None and not callable(self.graph):
-            object.__setattr__(
-                self, "graph", as_graph(self.graph, self.n_agents, self.names)
-            )
-
-    @cached_property
-    def agent_sensors(self) -> tuple[tuple[Sensor, ...], ...]:
-        """Each agent's sensors."""
-        several = [() if own is None else own for own in self.sensors]
-        return tuple(own if isinstance(own, tuple) else (own,) for own in several)
 
     @cached_property
     def n_agents(self) -> int:
         """Number A of agents."""
         return len(self.sensors)
 
+    @cached_property
+    def agent_sensors(self) -> tuple[tuple[Sensor, ...], ...]:
+        """Each agent's sensors."""
+        result: list[tuple[Sensor, ...]] = []
+        for sensors in self.sensors:
+            if sensors is None:
+                result.append(())
+            elif isinstance(sensors, Sensor):
+                result.append((sensors,))
+            else:
+                result.append(tuple(sensors))
+        return tuple(result)
+
+    @cached_property
+    def observation_sizes(self) -> tuple[int | None, ...]:
+        """Size m of each agent's observation; None without a sensor, and with several."""
+        return tuple([s[0].dim if len(s) == 1 else None for s in self.agent_sensors])
+
+    @cached_property
+    def sends_observations(self) -> bool:
+        """Whether agents send their observations to their neighbours."""
+        return self.graph is not None and self.share_observations
+
     @property
     def components(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Names and units of the state's components; numbers where it has no names."""
+        """Names and units of the state's components; numbers if the model has no names."""
         model = self.model
         names = tuple(model.names) or tuple(str(k) for k in range(model.dim))
         return names, tuple(model.units) or ("",) * model.dim
 
-    @property
-    def agents(self) -> tuple[str, ...]:
-        """Names of the agents; their numbers by default."""
-        return tuple(self.names) or tuple(str(k) for k in range(self.n_agents))
-
-    def channel(self, state: State, t: float) -> Channel | None:
-        """The door of this step; none where nobody can speak, or it is not yet time."""
-        if self.graph is None or not self._contact(state.t, t):
+    def channel(self, state: S, t: float) -> Channel | None:
+        """Return the channel of the step to `t`; None where nobody can send."""
+        graph = self.graph
+        if graph is None:
             return None
-        graph = self.graph(t) if callable(self.graph) else self.graph
-        graph = as_graph(graph, self.n_agents, self.names)
+        if not self.is_exchange_time(state.t, t):
+            return None
+        if not isinstance(graph, Graph):
+            graph = as_graph(graph(t), self.n_agents, self.names)
         if not graph.senders.size:
             return None
+        runs = state.runs
         return Channel.construct(
-            graph, ledger=state.ledger, runs=state.runs, faults=self.faults, t=t
+            graph, ledger=state.ledger, runs=runs, faults=self.faults, t=t
         )
-
-    def _contact(self, before: float, t: float) -> bool:
-        if self.exchange_interval is None:
-            return True
-        # Whether one of the multiples lies after the step's start, and up to its end, to rounding.
-        near = 1e-9 + 1e-15 * abs(t / self.exchange_interval)
-        return math.floor(t / self.exchange_interval + near) > math.floor(
-            before / self.exchange_interval + near
-        )
-
-    @abstractmethod
-    def initial_state(
-        self, prior: Any, runs: tuple[int, ...], rng: Any
-    ) -> dict[str, Any]:
-        """The fields of the first state that are the family's own."""
-
-    @abstractmethod
-    def next_state(self, step: Step) -> Any:
-        """The state at the end of a step."""
-
-    @abstractmethod
-    def summarize(self, state: Any) -> Summary:
-        """Estimates and spreads of a state."""
-
-    @validated
-    def start(
-        self,
-        prior: Any,
-        *,
-        rng: Rng | None = None,
-        runs: tuple[int, ...] = (),
-        t: float = 0.0,
-    ) -> Any:
-        """The state before the first step.
-
-        Parameters
-        ----------
-        prior : tuple, distribution, GaussianMixture, array_like or callable
-            A Gaussian's ``(mean, cov)``, (d,) and (d, d); a frozen distribution of scipy; a
-            mixture; members (N, d), or (*runs, A, N, d); or a function
-            ``prior(members, rng=rng, leading=leading)`` that draws (*leading, N, d). What a family
-            cannot make of these it refuses. A family whose agents' states differ takes a list, one
-            for each agent.
-        rng : numpy.random.Generator, optional
-            Draws the prior; a child stream of it, independent of whatever else is drawn from it,
-            serves all later steps. Filters that draw nothing need none.
-        runs : tuple of int
-            Leading axes: independent runs.
-        t : float
-            The time of the prior, in s.
-        """
-        if self.requires_rng and rng is None:
-            raise ValueError("rng must be a numpy.random.Generator, got None")
-        if runs and (not self.supports_runs or min(runs) < 1):
-            needs = (
-                "sizes of at least 1" if self.supports_runs else "(), one run at a time"
-            )
-            raise ValueError(f"runs must be {needs}, got {runs!r}")
-        own = self.initial_state(prior, runs, rng)
-        child = rng.spawn(1)[0] if self.requires_rng and rng is not None else None
-        return self.state_class(t, Ledger.empty(self.n_agents), child, **own)
-
-    @validated
-    def step(
-        self,
-        state: State,
-        t: float,
-        observations: Any,
-        *,
-        delayed: Sequence[Observation] = (),
-    ) -> Any:
-        """Move to time `t` and take in what was observed there.
-
-        Parameters
-        ----------
-        state : State
-            Not changed.
-        t : float
-            The new time, in s; at the state's own nothing is forecast.
-        observations : sequence of length A
-            Per agent (*runs, m) or (m,), or None; or one :class:`Reading`, or a list of them. NaN
-            marks a missing component, run by run.
-        late : sequence of Reading
-            Those of earlier times that arrive now; needs a `lag` that reaches back to them.
-
-        Raises
-        ------
-        ValueError
-            If `t` is earlier, or an observation does not fit its sensor or no earlier state is
-            kept for a late one.
-        FilterError
-            If an agent's computation fails; see `on_error`.
-        """
-        if t < state.t:
-            Bounds(at_least=state.t)(t, "t")
-        self.check_state(state)
-        return self._advanced(state, t, observations, delayed, own=False)
-
-    def _advanced(
-        self,
-        state: Any,
-        t: float,
-        observations: Any,
-        delayed: Sequence[Observation],
-        *,
-        own: bool,
-    ) -> Any:
-        said = self.read_observations(observations, state.runs, t)
-        old = match_delayed(self, delayed, state, t) if delayed else ()
-        step = Step(self, state, t, said, old, own=own)
-        try:
-            return self.next_state(step)
-        except RECOVERABLE as error:
-            if is_argument_error(error):
-                raise
-            raise FilterError((), None, t, error) from error
-
-    def check_state(self, state: Any) -> None:
-        """Refuse a state that is not this filter's."""
-        if not isinstance(state, self.state_class):
-            needs = self.state_class.__name__
-            raise ValueError(f"state must be a {needs}, got a {type(state).__name__}")
-        if (got := state.ledger.messages.size) != self.n_agents:
-            raise ValueError(f"state must be {self.n_agents} agents, got {got}")
-        if (own := getattr(self, "sizes", None)) is not None and state.sizes != own:
-            raise ValueError(f"state must have sizes {own} an agent, got {state.sizes}")
 
     def read_observations(
         self, observations: Any, runs: tuple[int, ...], t: float
     ) -> Any:
-        """What is observed at one time, checked; as a rule each agent's readings."""
-        return read_observations(self, observations, runs, t)
+        """Check the observations of one time, and return a list of them for each agent."""
+        sizes = self.observation_sizes
+        if type(observations) is not list or len(observations) != len(sizes):
+            return read_observations(self, observations, runs, t)
+        # Nearly always every agent has one finite float64 array of the right shape.
+        result = []
+        for agent, (value, size) in enumerate(zip(observations, sizes, strict=True)):
+            if (
+                type(value) is not np.ndarray
+                or value.dtype != np.float64
+                or value.shape != (*runs, size)
+                or not np.isfinite(value).all()
+            ):
+                return read_observations(self, observations, runs, t)
+            result.append([Observation.construct(t, agent, value)])
+        return result
 
-    def _walk(
-        self,
-        state: Any,
-        grid: Array,
-        entries: Iterable[Any],
-        delayed: Sequence[Observation],
-        *,
-        own: bool,
-    ) -> Iterator[Any]:
-        last = grid[-1] if grid.size else -np.inf
-        for item in delayed:
-            if item.arrival_time is None or item.arrival_time > last:
-                raise ValueError(
-                    f"delayed must be arrivals up to {last:g}, got {item.arrival_time}"
-                )
-        waiting: list[Any] = sorted(delayed, key=lambda item: item.arrival_time or 0.0)
-        for k, (t, observed) in enumerate(zip(grid.tolist(), entries, strict=True)):
-            due = (
-                [item for item in waiting if item.arrival_time <= t]
-                if waiting
-                else waiting
-            )
-            waiting = waiting[len(due) :]
-            # This generator runs after the validated call that made it has returned.
-            with skip_validation():
-                # The first state is the caller's.
-                state = self._advanced(state, t, observed, due, own=own and k > 0)
-            yield state
 
-    def _recorded(
-        self,
-        state: Any,
-        times: Any,
-        observations: Any,
-        truth: Any,
-        scores: Collection[Score],
-        delayed: Sequence[Observation],
-        lag: int,
-    ) -> xarray.Dataset:
-        """A run's record, each time as it is believed when `lag` more have been observed."""
-        self.check_state(state)
-        grid, entries = plan_steps(self, state, times, observations)
-        walk = self._walk(state, grid, entries, delayed, own=True)
-        return record_run(self, grid, state, self._believed(walk, lag), truth, scores)
+def _arrival_time(observation: Observation) -> float:
+    return -np.inf if observation.arrival_time is None else observation.arrival_time
 
-    def _believed(self, walk: Iterable[Any], lag: int) -> Iterator[tuple[Any, Any]]:
-        """Each state of a walk, and as what it is believed when `lag` more have followed."""
-        waiting: list[Any] = []
-        for last in walk:
-            waiting.append(last)
-            if len(waiting) > lag:
-                yield waiting.pop(0), last.lagged_states[-lag] if lag else last
-        if waiting:
-            yield from zip(
-                waiting, [*last.lagged_states, last][-len(waiting) :], strict=True
-            )
 
-    @validated
-    def steps(
-        self,
-        state: State,
-        times: Any,
-        observations: Any,
-        *,
-        delayed: Sequence[Observation] = (),
-    ) -> Iterator[Any]:
-        """The states at `times`, one after the other; arguments as in :meth:`run`."""
-        self.check_state(state)
-        grid, entries = plan_steps(self, state, times, observations)
-        return self._walk(state, grid, entries, delayed, own=False)
-
-    @validated
-    def run(
-        self,
-        state: State,
-        times: Any,
-        observations: Any,
-        *,
-        truth: Any = None,
-        scores: Collection[Score] = SCORES,
-        delayed: Sequence[Observation] = (),
-    ) -> xarray.Dataset:
-        """Step through a series, or through events, and record it.
-
-        Parameters
-        ----------
-        state : State
-            Where to begin.
-        times : array_like, (T,), or None
-            Strictly increasing, in s, from the state's on; steps may differ in length. With events
-            there is a step at each of theirs too, and None is enough if none is late.
-        observations : sequence of length A, or of Reading
-            Per agent (T, *runs, m) or (T, m), or None; NaN marks what is missing. Or events of any
-            order, several of which may have one time.
-        truth : array_like, (T, *runs, d) or (T, *runs, A, d), or mapping, optional
-            If given, the scores are recorded too: of all agents alike, of each agent's own, or of
-            some components only, by their names, (T, *runs) or (T, *runs, A) each.
-        scores : collection of {"squared_error", "nees", "crps"}
-            Which of them; CRPS costs about as much as an ensemble filter.
-        late : sequence of Reading
-            Each is taken in at the first of `times` that is not before it `arrived`, and has to be
-            of one of them: with events let `times` hold those of the late ones.
-
-        Returns
-        -------
-        xarray.Dataset
-            Axes ``time``, ``run`` (``run0``, ``run1``, … where there are several), ``agent``,
-            ``component``; units and meaning stand in the attributes. ``mean``, ``variance`` and,
-            with `truth`, ``squared_error`` and ``crps`` for each component; ``spread`` and
-            ``total_squared_error`` add components up, whatever their units, and say so; ``nees``
-            is d on average for a consistent filter. ``messages``, ``scalars``, ``bytes``, ``lost``
-            and ``rounds`` are those of each step, the same names with ``_total`` their sums;
-            ``rejected`` counts what the `gate_probability` left out;
-            :func:`distfilt.filters.final_state` gives the state at the end.
-        """
-        return self._recorded(state, times, observations, truth, scores, delayed, 0)
-
-    @validated
-    def smooth(
-        self,
-        state: State,
-        times: Any,
-        observations: Any,
-        *,
-        truth: Any = None,
-        scores: Collection[Score] = SCORES,
-        delayed: Sequence[Observation] = (),
-    ) -> xarray.Dataset:
-        """Fixed-lag smoothing: of each time what is believed when `lag` more have been observed.
-
-        Parameters and result are those of :meth:`run`. The filter needs a `lag`; near the end
-        fewer times follow, and the last estimate is the filter's.
-        """
-        if not self.lag:
-            why = self.unsupported.get("lag", "needs at least 1 for smoothing, got 0")
-            raise ValueError(f"lag: {why}")
-        return self._recorded(
-            state, times, observations, truth, scores, delayed, self.lag
-        )
+def _smooth_states(states: Iterable[Any], lag: int) -> Iterator[tuple[Any, Any]]:
+    """Yield each state, and the belief about its time when `lag` more have been observed."""
+    if not lag:
+        for state in states:
+            yield state, state
+        return
+    recent: list[Any] = []
+    for state in states:
+        recent.append(state)
+        if len(recent) > lag:
+            yield recent.pop(0), state.lagged_states[-lag]
+    # Near the end fewer times follow.
+    if recent:
+        beliefs = [*recent[-1].lagged_states, recent[-1]]
+        yield from zip(recent, beliefs[-len(recent) :], strict=True)

@@ -1,14 +1,14 @@
-"""Density filters: agents that see their own position, talk, and estimate the density of all."""
+"""Density filters: agents that observe their own positions and estimate the density of all."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ..density import (
     ConsensusProtocol,
@@ -32,12 +32,14 @@ from ..validation import (
     NonNegativeFloat,
     PositiveFloat,
     PositiveInt,
+    call_user,
     check_array,
 )
-from .base import Filter
-from .inputs import one_each
+from .observations import list_by_agent
+from .options import ExchangesAtIntervals
+from .priors import Prior
 from .record import Summary
-from .saving import State
+from .states import State
 from .step import Step
 
 __all__ = ["DensityFilter", "DensityState"]
@@ -45,22 +47,22 @@ __all__ = ["DensityFilter", "DensityState"]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DensityState(State):
-    """What the agents believe between two steps.
+    """The agents' density estimates between two steps.
 
     Parameters
     ----------
     t, ledger, rng
         As for :class:`~distfilt.filters.State`; `rng` is None, as nothing is drawn.
     positions : ndarray, (A, d)
-        Where the agents are; NaN for those that have gone.
+        The agents' positions; NaN for those that have gone.
     carried : tuple of ndarray
-        What the rule of sharing remembers.
+        The memory of the consensus protocol.
     observed : ndarray, (F, n)
-        What the agents with filters believe the swarm's kernel estimate to be.
+        The swarm's kernel estimate, as each agent with a filter estimates it.
     positions_sent : ndarray, (A,)
-        How many agents each believes there are.
+        The number of agents, as each agent estimates it.
     parts : int
-        Into how many parts the network of the present agents fell in the last step.
+        Number of connected components of the present agents' graph in the last step.
     filters : LowRank
         The filters of the agents that have one.
 
@@ -101,33 +103,34 @@ class DensityState(State):
 
 
 @dataclass(frozen=True, eq=False)
-class DensityFilter(Filter):
+class DensityFilter(ExchangesAtIntervals[DensityState]):
     r"""Local filters of a swarm's density, equations (14) to (16) of Zheng and Lin.
 
-    In each step every agent sees its own position, learns by the `fusion` an estimate y_i of the
-    kernel estimate of all, and takes it into a Kalman filter of the density whose model is the
-    Fokker-Planck equation. Where the network falls apart, agents go on with what they hear, and
-    the record says into how many parts. How sure a step's estimate is follows from the true number
-    of those present, which is taken as known: who has heard of few is then too sure.
+    In each step every agent observes its own position, obtains by the `fusion` protocol an
+    estimate y_i of the kernel estimate of all, and assimilates it in a Kalman filter of the density
+    whose model is the Fokker-Planck equation. If the network falls apart, agents go on with what
+    they receive, and the record has the number of parts. The noise of a step's estimate follows
+    from the true number of present agents, which is taken as known: an agent that has received the
+    positions of few is then overconfident.
 
     Parameters
     ----------
     model : FokkerPlanck
-        What the filters believe of the swarm, and their grid.
+        The filters' model of the swarm, and their grid.
     sensors : int
-        Number A of agents that there may be: each sees its own position.
+        Largest number A of agents: each observes its own position.
     graph : float, Graph or callable
         A radio's range; a graph that does not move; or ``graph(t, positions) -> Graph``.
-    fusion : Sharing
-        The rule by which agents learn of the others, such as
+    fusion : ConsensusProtocol
+        The protocol by which agents estimate the swarm's kernel estimate, such as
         :class:`~distfilt.density.PIConsensus` or :class:`~distfilt.density.Flooding`.
-    faults, names, every
-        As for :class:`~distfilt.filters.Filter`.
+    exchange_interval, faults, names
+        As in :mod:`distfilt.filters.options` and for :class:`~distfilt.filters.Filter`.
     bandwidth : float
         Of the kernels, at least half a cell.
     local : tuple of int, optional
-        The agents that run a filter; all by default. All agents share.
-    first : {"flat", "observed"} or array_like (n,)
+        The agents that run a filter; all by default. All agents share their positions.
+    initial_density : {"flat", "observed"} or array_like (n,)
         Prior mean: a flat Gaussian about the agent, its own kernel, or a density for all.
     initial_std : float
         Width of the flat Gaussian.
@@ -135,8 +138,8 @@ class DensityFilter(Filter):
         Of :func:`~distfilt.density.zero_mean_prior`. With a `mass_std` of 0, the default, no
         measurement can change the mass; above 0 it can, as in the paper.
     noise : {"forecast", "observed"}
-        Whether R is k̄ times the filter's own density, or times what it observes as printed; the
-        second weighs by the noise itself and is biased.
+        Whether R is k̄ times the filter's own density, or times the observed one as printed; the
+        second correlates the weights with the noise and is biased.
     floor : float
         Least density in R, positive.
     process : float, optional
@@ -161,12 +164,11 @@ class DensityFilter(Filter):
     ((20, 225), 1)
     """
 
-    model: FokkerPlanck  # type: ignore[assignment]
-    sensors: PositiveInt  # type: ignore[assignment]
+    model: FokkerPlanck
+    sensors: PositiveInt
     graph: PositiveFloat | Graph | Callable[[float, Array], Graph]
     _: KW_ONLY
-    fusion: ConsensusProtocol  # type: ignore[assignment]
-    share_observations: bool = False
+    fusion: ConsensusProtocol = field()
     bandwidth: PositiveFloat
     local: DistinctIndices | None = None
     initial_density: (
@@ -181,18 +183,13 @@ class DensityFilter(Filter):
     floor: PositiveFloat | None = None
     process: PositiveFloat | None = None
 
-    state_class: ClassVar[type[DensityState]] = DensityState
+    state_class: ClassVar[type[Any]] = DensityState
     supports_runs: ClassVar[bool] = False
-    belief_kind: ClassVar[str] = "densities"
-    unsupported: ClassVar[dict[str, str]] = {
-        "share_observations": "what agents tell of their positions is the agreement's",
-        "lag": "a density filter keeps no past",
-        "on_error": "one run at a time: the graph moves with the run",
-        "gate_probability": "a position is the agent's own, and nothing predicts it",
-    }
+    belief_kind: ClassVar[str | None] = "densities"
 
     def check_parts(self) -> None:
-        """Refuse places and densities that are not of the grid."""
+        """Refuse a bandwidth below the grid's cells, and agents that do not exist."""
+        super().check_parts()
         check_resolution(self.model.grid, self.bandwidth)
         Bounds(below=self.n_agents)(max(self.local or (0,)), "local")
 
@@ -215,33 +212,31 @@ class DensityFilter(Filter):
 
     def read_observations(
         self, observations: Any, runs: tuple[int, ...], t: float
-    ) -> Any:
-        """The agents' positions (A, d); None and NaN are agents that have gone."""
-        gone = np.full(self.model.grid.dim, np.nan)
-        given = one_each(observations, self.n_agents)
-        return self._seen([gone if x is None else x for x in given], "observations", t)
-
-    def channel(self, state: State, t: float) -> None:
-        """None yet: who hears whom depends on where the agents are."""
+    ) -> SwarmSnapshot:
+        """Check the agents' positions (A, d); None and NaN are agents that have gone."""
+        missing = np.full(self.model.grid.dim, np.nan)
+        entries = list_by_agent(observations, self.n_agents)
+        positions: Any = [missing if entry is None else entry for entry in entries]
+        return self._snapshot(positions, "observations", t)
 
     def initial_state(
-        self, prior: Any, runs: tuple[int, ...], rng: Any
+        self, prior: Prior, runs: tuple[int, ...], rng: Any
     ) -> dict[str, Any]:
-        """What is believed at the agents' first positions (A, d), NaN for those not here."""
-        seen = self._seen(prior, "prior", 0.0)
-        here = self.filtering
-        filters = low_rank_start(self._basis, self._base(seen)[here])
+        """Return the estimates at the agents' first positions (A, d), NaN for absent agents."""
+        snapshot = self._snapshot(prior, "prior", 0.0)
+        agents = self.filtering
+        filters = low_rank_start(self._prior_factor, self._prior_mean(snapshot)[agents])
         return {
-            "positions": seen.positions,
-            "carried": self.fusion.initial_state(seen),
-            "observed": seen.kernels[here],
+            "positions": snapshot.positions,
+            "carried": self.fusion.initial_state(snapshot),
+            "observed": snapshot.kernels[agents],
             "positions_sent": np.full(self.n_agents, float(self.n_agents)),
             "parts": 1,
             "filters": filters,
         }
 
     @cached_property
-    def _basis(self) -> Array:
+    def _prior_factor(self) -> Array:
         """A factor of the prior covariance, (n, r)."""
         return zero_mean_prior(
             self.model.grid,
@@ -251,89 +246,97 @@ class DensityFilter(Filter):
             mass_std=self.mass_std,
         )
 
-    def _base(self, seen: SwarmSnapshot) -> Array:
-        """Prior means of all agents, (A, n)."""
+    def _prior_mean(self, snapshot: SwarmSnapshot) -> Array:
+        """Return the prior means of all agents, (A, n)."""
         if not isinstance(self.initial_density, str):
             return np.tile(self.initial_density, (self.n_agents, 1))
+        flat = snapshot.initial_gaussians(self.initial_std)
         if self.initial_density == "observed":
-            own = estimate_without_messages(self.fusion, seen)
-            here = seen.present[:, None]
-            return np.where(here, own, seen.initial_gaussians(self.initial_std))
-        return seen.initial_gaussians(self.initial_std)
+            # An absent agent has no kernel of its own.
+            kernels = estimate_without_messages(self.fusion, snapshot)
+            return np.where(snapshot.present[:, None], kernels, flat)
+        return flat
 
-    def _seen(self, positions: ArrayLike, name: str, t: float) -> SwarmSnapshot:
-        x = check_array(
-            positions, name, (self.n_agents, self.model.grid.dim), finite=False
-        )
+    def _snapshot(self, positions: Any, name: str, t: float) -> SwarmSnapshot:
+        """Check positions (A, d) and return them with their kernels."""
+        shape = (self.n_agents, self.model.grid.dim)
+        x = check_array(positions, name, shape, finite=False)
         return SwarmSnapshot(x, self.model.grid, self.bandwidth, t, self.local)
 
-    def next_state(self, step: Step) -> Any:
-        """Share what the agents see of themselves, and take it into their filters.
+    def _graph_at(self, snapshot: SwarmSnapshot, t_before: float, t: float) -> Graph:
+        """Return the communication graph of the present agents at the time of a step."""
+        if not self.is_exchange_time(t_before, t):
+            return Graph.from_edges(self.n_agents, np.zeros((0, 2)))
+        if isinstance(self.graph, float):
+            return snapshot.disk_graph(self.graph)
+        graph = self.graph
+        if not isinstance(graph, Graph):
+            graph = call_user(graph, t, snapshot.positions)
+        return remove_absent(as_graph(graph, self.n_agents), snapshot.present)
+
+    def next_state(self, step: Step[DensityState]) -> DensityState:
+        """Share the agents' positions, and assimilate the density that each agent derives.
 
         >>> from distfilt.density import Flooding, Grid
         >>> from distfilt.models import rotating_swarm
         >>> from distfilt.network import Faults
-        >>> given = FokkerPlanck(rotating_swarm(), Grid((9, 9))), 4, 2.0
-        >>> more = {"fusion": Flooding(), "bandwidth": 0.2, "rank": 9}
+        >>> parts = FokkerPlanck(rotating_swarm(), Grid((9, 9))), 4, 2.0
+        >>> options = {"fusion": Flooding(), "bandwidth": 0.2, "rank": 9}
         >>> x = np.random.default_rng(1).random((4, 2))
         >>> for option in ({"faults": Faults(silent=[0])}, {"exchange_interval": 1.0}):
-        ...     f = DensityFilter(*given, **more, **option)
+        ...     f = DensityFilter(*parts, **options, **option)
         ...     print(f.step(f.start(x), 0.5, x).ledger.messages)
         [0 2 2 2]
         [0 0 0 0]
         """
         state = step.state
-        seen = step.observations
+        snapshot: SwarmSnapshot = step.observations
         t = step.t
         dt = step.dt
         if not dt:
             raise ValueError(f"t must be above {state.t:g}, got {t:g}")
-        if isinstance(self.graph, float):
-            graph = seen.disk_graph(self.graph)
-        else:
-            here = self.graph(t, seen.positions) if callable(self.graph) else self.graph
-            graph = remove_absent(as_graph(here, self.n_agents), seen.present)
-        if not self._contact(state.t, t):
-            graph = Graph.from_edges(self.n_agents, np.zeros((0, 2)))
-        step.channel = channel = Channel(
-            graph, ledger=state.ledger, faults=self.faults, t=t
+        # The graph depends on the positions, so the channel is made here.
+        graph = self._graph_at(snapshot, state.t, t)
+        channel = Channel(graph, ledger=state.ledger, faults=self.faults, t=t)
+        step.channel = channel
+        memory, densities, counts = self.fusion.update(
+            state.carried, snapshot, channel, dt
         )
-        carried, y, counted = self.fusion.update(state.carried, seen, channel, dt)
-        y = y[self.filtering]
+        observed = densities[self.filtering]
 
-        move = self.model.solver(state.t, dt)
-        q = None if self.process is None else self.process * self._basis
-        moved = low_rank_predict(state.filters, move, process=q, dt=dt)
-        level = moved.estimates if self.noise == "forecast" else y
-        noise = seen.noise_strength(level, seen.present.sum(), self.floor)
-        filters = low_rank_step(moved, y, noise, dt)
-        parts = np.unique(graph.components[seen.present]).size
+        solver = self.model.solver(state.t, dt)
+        noise_factor = None
+        if self.process is not None:
+            noise_factor = self.process * self._prior_factor
+        forecast = low_rank_predict(state.filters, solver, process=noise_factor, dt=dt)
+        # R = k̄ diag(density), equation (15).
+        density = forecast.estimates if self.noise == "forecast" else observed
+        noise = snapshot.noise_strength(density, snapshot.present.sum(), self.floor)
+        filters = low_rank_step(forecast, observed, noise, dt)
+        parts = np.unique(graph.components[snapshot.present]).size
         return step.end(
-            positions=seen.positions,
-            carried=carried,
-            observed=y,
-            positions_sent=counted,
+            positions=snapshot.positions,
+            carried=memory,
+            observed=observed,
+            positions_sent=counts,
             parts=int(parts),
             filters=filters,
         )
 
     def summarize(self, state: DensityState) -> Summary:
-        """Densities and their variances of all agents, NaN for those without a filter.
+        """Return densities and variances of all agents, NaN for those without a filter.
 
-        ``parts`` is the number of parts of the network, ``positions_sent`` how many agents each believes
-        in, ``mass`` the estimate's integral.
+        ``parts`` is the number of parts of the network, ``positions_sent`` each agent's estimate
+        of the number of agents, ``mass`` the estimate's integral.
         """
-        n = self.model.grid.size
-        here = self.filtering
-        mean, variance = (np.full((self.n_agents, n), np.nan) for _ in range(2))
-        mean[here] = state.estimates
-        variance[here] = state.variances
-        return Summary(
-            mean,
-            variance,
-            numbers={
-                "parts": np.full(self.n_agents, float(state.parts)),
-                "positions_sent": state.positions_sent,
-                "mass": mean.sum(axis=-1) * self.model.grid.volume,
-            },
-        )
+        shape = (self.n_agents, self.model.grid.size)
+        mean = np.full(shape, np.nan)
+        variance = np.full(shape, np.nan)
+        mean[self.filtering] = state.estimates
+        variance[self.filtering] = state.variances
+        numbers = {
+            "parts": np.full(self.n_agents, float(state.parts)),
+            "positions_sent": state.positions_sent,
+            "mass": mean.sum(axis=-1) * self.model.grid.volume,
+        }
+        return Summary(mean, variance, numbers=numbers)

@@ -1,16 +1,17 @@
-"""A network of ensemble filters: forecast, assimilate what was heard, agree with the neighbours.
+"""Networks of ensemble filters: forecast, assimilate what was received, fuse with the neighbours.
 
-Algorithm 1 of Grange et al., for any model, sensors, graph, update and rule of agreement; and
-transport filters, whose agents have one set of members in common and agree on its weights.
+:class:`EnsembleFilter` is algorithm 1 of Grange et al. for any model, sensors, graph, update and
+fusion rule. The agents of a :class:`TransportFilter` have one set of members in common and agree
+on its weights.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
-from functools import partial
+from functools import cached_property, partial
 from inspect import signature
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeVar, cast
 
 import numpy as np
 
@@ -30,22 +31,38 @@ from ..updates.particles import (
     warn_of_collapse,
     warn_of_weights,
 )
-from ..validation import Array, Bounds, NonNegativeFloat, check_array
-from .base import Filter
-from .inbox import Received
-from .inputs import draw_members
+from ..validation import (
+    Array,
+    Bounds,
+    InvalidArgumentError,
+    NonNegativeFloat,
+    Rng,
+    call_user,
+    check_array,
+)
+from .base import SensorFilter
+from .options import (
+    ExchangesAtIntervals,
+    FusesBeliefs,
+    IsolatesRuns,
+    KeepsPast,
+    SharesObservations,
+)
+from .priors import Prior, draw_members
 from .record import Summary
-from .saving import SensorState
-from .step import Step, copy_rng, run_isolated
+from .states import SensorState
+from .step import Received, Step, copy_rng
 
 __all__ = ["EnsembleFilter", "EnsembleState", "TransportFilter"]
 
-Several = Annotated[int, Bounds(at_least=2)]
+AtLeastTwo = Annotated[int, Bounds(at_least=2)]
+
+MemberState = TypeVar("MemberState", bound=SensorState)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class EnsembleState(SensorState):
-    """What the agents' ensembles are between two steps.
+    """The agents' ensembles between two steps.
 
     Parameters
     ----------
@@ -54,7 +71,7 @@ class EnsembleState(SensorState):
     ensembles : ndarray, (*runs, A, N, d)
         Every agent's members.
     history : tuple of (float, ndarray)
-        Earlier times and their ensembles, oldest first, conditioned on all that came since.
+        Earlier times and their ensembles, oldest first, given all observations up to now.
 
     Examples
     --------
@@ -72,51 +89,79 @@ class EnsembleState(SensorState):
 
 
 @dataclass(frozen=True, eq=False)
-class MembersFilter(Filter):
-    """What all families have in common whose agents hold members."""
+class MembersFilter(
+    SensorFilter[MemberState],
+    FusesBeliefs[MemberState],
+    KeepsPast[MemberState],
+    IsolatesRuns[MemberState],
+):
+    """The common part of all families whose agents hold members."""
 
     _: KW_ONLY
-    members: Several = 100
+    members: AtLeastTwo = 100
 
-    state_class: ClassVar[type[SensorState]] = EnsembleState
     requires_rng: ClassVar[bool] = True
     batched_summary: ClassVar[bool] = True
     supports_increments: ClassVar[bool] = True
-    belief_kind: ClassVar[str] = "ensembles"
+    belief_kind: ClassVar[str | None] = "ensembles"
 
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """Members, and their components."""
-        return self.members, self.model.dim
+    def check_state(self, state: MemberState) -> None:
+        """Refuse a state that is not of this filter."""
+        super().check_state(state)
+        name, _ = state.belief_field
+        sizes = getattr(state, name).shape[-2:]
+        if sizes != (self.members, self.model.dim):
+            raise ValueError(
+                f"state must have sizes {(self.members, self.model.dim)} an agent, "
+                f"got {sizes}"
+            )
 
-    def draw_prior(self, prior: Any, leading: tuple[int, ...], rng: Any) -> Array:
-        """Members (*leading, N, d) of a prior."""
+    def draw_prior(self, prior: Prior, leading: tuple[int, ...], rng: Rng) -> Array:
+        """Draw members (*leading, N, d) of a prior."""
         return draw_members(prior, self.members, leading, self.model.dim, rng)
 
-    def summarize(self, state: Any) -> Summary:
-        """Means and variances of the agents' ensembles, and the members for the scores."""
-        centre, a = moments.center_ensemble(x := state.ensembles)
-        a *= a
-        variance = moments.mean(a) * (self.members / (self.members - 1))
+
+@dataclass(frozen=True, eq=False)
+class _EnsembleSummary(MembersFilter[EnsembleState]):
+    """A filter whose state is an ensemble for each agent."""
+
+    state_class: ClassVar[type[Any]] = EnsembleState
+    batched_summary: ClassVar[bool] = True
+
+    def summarize(self, state: EnsembleState) -> Summary:
+        """Return means and variances of the agents' ensembles, and the members for the scores."""
+        ensembles = state.ensembles
+        mean, anomalies = moments.center_ensemble(ensembles)
+        # Σ (xᵢ - m)² / (N - 1), as a mean of N times N / (N - 1).
+        anomalies *= anomalies
+        variance = moments.mean(anomalies) * (self.members / (self.members - 1))
         return Summary(
-            state.mask_failed(centre[..., 0, :]), state.mask_failed(variance), members=x
+            state.mask_failed(mean[..., 0, :]),
+            state.mask_failed(variance),
+            members=ensembles,
         )
 
 
 @dataclass(frozen=True, eq=False)
-class EnsembleFilter(MembersFilter):
-    """One ensemble per agent; agents share observations and agree with each other.
+class EnsembleFilter(
+    _EnsembleSummary,
+    SharesObservations[EnsembleState],
+    ExchangesAtIntervals[EnsembleState],
+):
+    """One ensemble per agent; agents share observations and fuse their ensembles.
 
-    In every step each agent moves its members with the model, sends its observation to those that
-    hear it, updates its members with what it knows, and applies the rule of agreement. All that
-    passes between agents passes through one :class:`~distfilt.network.Channel`.
+    In every step each agent moves its members with the model, sends its observation to its
+    neighbours, updates its members with the observations it has, and applies the fusion rule.
+    Everything that passes between agents passes through one
+    :class:`~distfilt.network.Channel`.
 
     Parameters
     ----------
-    model, sensors, graph, fusion, share_observations, faults, lag, names, on_error, gate_probability,
-        exchange_interval
-        As for :class:`~distfilt.filters.Filter`. The agreement is a function
-        ``agreement(ensembles, channel) -> ensembles``, such as ``partial(pull, gain=0.05)``.
+    model, sensors, graph, gate_probability, faults, names
+        As for :class:`~distfilt.filters.SensorFilter`.
+    fusion, share_observations, lag, on_error, exchange_interval
+        As in :mod:`distfilt.filters.options`. The rule is a function
+        ``fusion(ensembles, channel) -> ensembles``, such as ``partial(mean_pull, gain=0.05)``.
     update : callable
         ``update(ensemble, predicted, observed, noise, *, rng) -> ensemble``; one of
         :mod:`distfilt.updates`, or a function of one's own for a single agent's ensembles.
@@ -149,8 +194,8 @@ class EnsembleFilter(MembersFilter):
         try:
             signature(self.update).bind(*range(4), rng=None)
         except TypeError as error:
-            raise ValueError(
-                f"update must have four arrays and rng, got one with {error}"
+            raise InvalidArgumentError(
+                f"update must accept four arrays and rng, got a function with {error}"
             ) from None
 
     @classmethod
@@ -161,19 +206,20 @@ class EnsembleFilter(MembersFilter):
         graph: Graph | Callable[[float], Graph] | None = None,
         **options: Any,
     ) -> EnsembleFilter:
-        """Second-order exact draws and covariance intersection of least determinant.
+        """Second-order exact draws, and covariance intersection of least determinant.
 
         For a linear model and linear sensors every agent's sample moments are those of the Kalman
         filters that fuse by the same rule; the book's chapter 4 measures it on others. With process
-        noise, members and their past are tied by chance too: smoothing and late readings are then
-        exact to sampling errors only.
+        noise, members and their past are correlated by chance too: smoothing and delayed
+        observations are then exact to sampling errors only.
 
         Parameters
         ----------
         model, sensors, graph
             As for the class.
         **options
-            Any other option of the class; needs more `members` than d + twice the readings heard.
+            Any other option of the class; needs more `members` than d + twice the number of
+            received values.
 
         Examples
         --------
@@ -186,115 +232,143 @@ class EnsembleFilter(MembersFilter):
         >>> bool(abs(state.ensembles.var(ddof=1) - p / (p + 1.0)) < 1e-12)
         True
         """
-        own: dict[str, Any] = {"update": enkf_exact, "forecast": exact_forecast}
+        exact: dict[str, Any] = {"update": enkf_exact, "forecast": exact_forecast}
         if graph is not None:
-            own["fusion"] = partial(intersect_ensembles, rule="min_determinant")
-        return cls(model, sensors, graph, **(own | options))
+            exact["fusion"] = partial(intersect_ensembles, rule="min_determinant")
+        return cls(model, sensors, graph, **(exact | options))
+
+    @cached_property
+    def _repredicts(self) -> bool:
+        """Whether the update predicts the observations again for members it has moved."""
+        return has_tag(self.update, "repredicts")
+
+    @cached_property
+    def _stacks(self) -> bool:
+        """Whether the update accepts ensembles with a noise covariance of their own each."""
+        return has_tag(self.update, "stacks")
 
     def initial_state(
-        self, prior: Any, runs: tuple[int, ...], rng: Any
+        self, prior: Prior, runs: tuple[int, ...], rng: Any
     ) -> dict[str, Any]:
-        """Members drawn for each agent."""
+        """Draw members for each agent."""
         return {"ensembles": self.draw_prior(prior, (*runs, self.n_agents), rng)}
 
-    def next_state(self, step: Step) -> Any:
-        """Forecast, condition on what was heard, agree."""
+    def next_state(self, step: Step[EnsembleState]) -> EnsembleState:
+        """Forecast, condition on the received observations, fuse."""
         state = step.state
-        now = step.state.ensembles
+        ensembles = state.ensembles
         if step.dt:
-            now = self.forecast(now, self.model, state.t, step.dt, rng=step.rng)
-            now = check_array(now, "forecast", state.ensembles.shape, finite=False)
-        stack = step.stack(step.check_forecast(now, state.ensembles))
-        for place, group in step.received():
-            step.record_failures(
-                self._condition(stack, place, group, step), group.agents
+            ensembles = call_user(
+                self.forecast, ensembles, self.model, state.t, step.dt, rng=step.rng
             )
-        (now,) = step.fuse(stack[-1])
-        return step.end(ensembles=now, past=regress_past(stack, now))
+            _check_shape(ensembles, "forecast", state.ensembles.shape)
+        # The ensembles of the earlier times that are kept, and now.
+        stack = step.stack(step.check_forecast(ensembles, state.ensembles))
+        for place, group in step.received():
+            self._condition(stack, place, group, step)
+        (fused,) = step.fuse(stack[-1])
+        return step.end(ensembles=fused, past=regress_past(stack, fused))
 
     def _condition(
-        self, stack: list[Array], place: int, group: Received, step: Step
-    ) -> dict[tuple[int, ...], str]:
-        """Condition every time's ensembles of a group's agents, in place; the rows that failed."""
+        self, stack: list[Array], place: int, group: Received, step: Step[EnsembleState]
+    ) -> None:
+        """Condition every time's ensembles of a group's agents on its observations, in place."""
         rows = group.rows
-        members = tuple([e[..., rows, :, :] for e in stack])
-        # What a late reading tells of the time before is in the stack.
-        before = step.before(place, group, stack[:-1])
-        predicted = group.predict(members[place], before)
+        members = tuple([ensembles[..., rows, :, :] for ensembles in stack])
+        # A delayed observation of the previous time has changed it in the stack.
+        previous = step.before(place, group, stack[:-1])
+        predicted = group.predict(members[place], previous)
         group = step.gate(group, sample_moments, predicted)
-        redone = has_tag(self.update, "repredicts")
+        # An update that predicts again needs the present members alone.
+        predict = None
+        if self._repredicts and len(stack) == 1:
+            predict = partial(group.predict, previous=previous)
 
-        def compute(h: Array, y: Array, *rest: Any) -> tuple[Array, ...]:
-            *earlier, last, noise, source = rest
-            # Every time's members meet the same draw of the noise, so that all the separate
-            # updates are one joint update; the last one advances the generator.
-            past = [
-                self._updated(x, h, y, noise, copy_rng(source), None) for x in earlier
-            ]
-            whole = redone and not earlier and h.shape == predicted.shape
-            predict = partial(group.predict, previous=before) if whole else None
-            return (*past, self._updated(last, h, y, noise, source, predict))
+        def compute(h: Array, y: Array, *args: Any) -> tuple[Array, ...]:
+            *past, present, noise, rng = args
+            again = predict if h.shape == predicted.shape else None
+            # All times' members meet the same draws, so that the separate updates are one joint
+            # update; the last of them advances the generator.
+            updated = [self._update(x, h, y, noise, copy_rng(rng), None) for x in past]
+            return (*updated, self._update(present, h, y, noise, rng, again))
 
-        result, errors = run_isolated(
+        results = step.apply(
             compute,
             (predicted, group.target, *members),
             members,
-            group.target.ndim - 1,
+            group.agents,
             shared=group.noise,
             rng=step.rng,
         )
-        for e, new in zip(stack, result, strict=True):
-            e[..., rows, :, :] = new
-        return errors
+        for ensembles, new in zip(stack, results, strict=True):
+            ensembles[..., rows, :, :] = new
 
-    def _updated(
-        self, x: Array, h: Array, y: Array, noise: Array, rng: Any, predict: Any
+    def _update(
+        self, x: Array, h: Array, y: Array, noise: Array, rng: Rng, predict: Any
     ) -> Array:
-        """One time's ensembles after the update; a plain function gets one agent's at a time."""
-        if has_tag(self.update, "repredicts"):
-            return self.update(x, h, y, noise, rng=rng, predict=predict)
-        stacks = has_tag(self.update, "stacks")
+        """Update ensembles (..., G, N, d); a plain function gets one agent's at a time."""
+        if self._repredicts:
+            new = call_user(self.update, x, h, y, noise, rng=rng, predict=predict)
+            return cast(Array, new)
+        if self._stacks:
+            new = with_missing(self.update, x, h, y, noise, rng=rng)
+            _check_shape(new, "update", x.shape)
+            return new
+        if x.ndim == 2:
+            return self._update_one(x, h, y, noise, rng)
+        updated = []
+        for g in range(x.shape[-3]):
+            one_noise = noise[g] if noise.ndim > 2 else noise
+            updated.append(
+                self._update_one(
+                    x[..., g, :, :], h[..., g, :, :], y[..., g, :], one_noise, rng
+                )
+            )
+        return np.stack(updated, axis=-3)
 
-        def one(*given: Array) -> Array:
-            # A function of one's own may work in place.
-            own = given if stacks else [x.copy() for x in given]
-            new = with_missing(self.update, *own, rng=rng)
-            return check_array(new, "update", given[0].shape, finite=False)
+    def _update_one(
+        self, x: Array, h: Array, y: Array, noise: Array, rng: Rng
+    ) -> Array:
+        """Update one agent's ensembles by the user's function, which may work in place."""
+        new = with_missing(
+            self.update, x.copy(), h.copy(), y.copy(), noise.copy(), rng=rng
+        )
+        return check_array(new, "update", x.shape, finite=False)
 
-        if stacks or x.ndim == 2:
-            return one(x, h, y, noise)
-        noises = noise if noise.ndim > 2 else [noise] * x.shape[-3]
-        agents = [
-            (x[..., g, :, :], h[..., g, :, :], y[..., g, :], r)
-            for g, r in enumerate(noises)
-        ]
-        return np.stack([one(*own) for own in agents], axis=-3)
+
+def _check_shape(values: Any, name: str, shape: tuple[int, ...]) -> None:
+    """Refuse a result that is no float64 array of the ensembles' shape."""
+    is_array = type(values) is np.ndarray and values.dtype == np.float64
+    if not is_array or values.shape != shape:
+        check_array(values, name, shape, finite=False)
 
 
 @dataclass(frozen=True, eq=False)
-class TransportFilter(MembersFilter):
+class TransportFilter(_EnsembleSummary):
     r"""Agents that hold the same members, agree on their log-likelihoods, and transport alone.
 
-    Readings of different agents are independent, so the log-likelihood of all of them is A times
-    the agents' average, :math:`\log w_i=\sum_a\log p(\mathbf y^a|\mathbf x_i)`. The agreement finds
-    it; then every agent computes the same ensemble transform. All agents draw the prior, process
-    noise and rejuvenation from one seed, so that the members stay in common.
+    Observations of different agents are independent, so the log-likelihood of all of them is A
+    times the agents' average, :math:`\log w_i=\sum_a\log p(\mathbf y^a|\mathbf x_i)`. The fusion
+    rule finds it; then every agent computes the same ensemble transform. All agents draw the prior,
+    process noise and rejuvenation from one seed, so that the members stay in common. Therefore they
+    fuse in every step, and a moving graph must have links whenever there are observations; the
+    observations stay with their agents.
 
     Parameters
     ----------
-    model, sensors, graph, faults, lag, names, failures, gate
-        As for :class:`~distfilt.filters.Filter`. Members in common need an agreement in every step,
-        so that `exchange_interval` is refused, and so are readings at a time when a moving graph has no link.
+    model, sensors, graph, gate_probability, faults, names
+        As for :class:`~distfilt.filters.SensorFilter`.
+    lag, on_error
+        As in :mod:`distfilt.filters.options`.
     fusion : callable
-        ``agreement(log_likelihoods, channel) -> averages``, both (\*runs, A, N): exact finite-time
-        averaging by default, or ``partial(average, rounds=20)``. It takes the place of telling
-        readings, which stay with their agents.
+        ``fusion(log_likelihoods, channel) -> averages``, both (\*runs, A, N): exact finite-time
+        averaging by default, or ``partial(average_consensus, rounds=20)``.
     members : int
         Number N of members of the common set.
     correct : bool
         Give the members the weighted covariance too.
     rejuvenation : float
-        h of :func:`distfilt.coupling.rejuvenated`; 0 draws nothing.
+        h of :func:`distfilt.coupling.rejuvenate`; 0 draws nothing.
 
     Examples
     --------
@@ -312,105 +386,102 @@ class TransportFilter(MembersFilter):
     """
 
     _: KW_ONLY
-    fusion: Callable[..., Any] = finite_time_consensus
-    share_observations: bool = False
+    fusion: Callable[..., Any] | None = finite_time_consensus
     correct: bool = False
     rejuvenation: NonNegativeFloat = 0.0
 
-    belief_kind: ClassVar[str] = "vectors"
-    unsupported: ClassVar[dict[str, str]] = {
-        "share_observations": "agents agree on what their readings say, so that these stay with them",
-        "exchange_interval": "a transport filter's agents have their members in common, so that they have to "
-        "agree in every step",
-    }
+    belief_kind: ClassVar[str | None] = "vectors"
 
     def initial_state(
-        self, prior: Any, runs: tuple[int, ...], rng: Any
+        self, prior: Prior, runs: tuple[int, ...], rng: Any
     ) -> dict[str, Any]:
-        """One set of members, (N, d) or (*runs, 1, N, d), for all agents."""
-        return {
-            "ensembles": np.repeat(
-                self.draw_prior(prior, (*runs, 1), rng), self.n_agents, axis=-3
-            )
-        }
+        """Draw one set of members, (N, d) or (*runs, 1, N, d), for all agents."""
+        common = self.draw_prior(prior, (*runs, 1), rng)
+        return {"ensembles": np.repeat(common, self.n_agents, axis=-3)}
 
-    def next_state(self, step: Step) -> Any:
-        """Forecast, weigh by what was seen, agree on the weights, transport.
+    def next_state(self, step: Step[EnsembleState]) -> EnsembleState:
+        """Forecast, weight by the likelihood, agree on the weights, transport.
 
         Warns
         -----
         ParticleCollapse
-            If one member has nearly all the weight that is carried over, or a reading is beyond
-            what the members believe.
+            If one member has nearly all the weight, or an observation is far beyond what the
+            members predict.
         """
         state = step.state
-        now = step.state.ensembles
-        apart = self.n_agents > 1 and callable(self.graph) and step.channel is None
-        if apart and any((*step.observations, step.delayed)):
+        members = state.ensembles
+        is_cut_off = self.n_agents > 1 and callable(self.graph) and step.channel is None
+        if is_cut_off and any((*step.observations, step.delayed)):
             raise ValueError(
-                f"graph must have links for the readings of t = {step.t:g}, got none"
+                f"graph must have links for the observations of t = {step.t:g}, got none"
             )
         if step.dt:
-            draw = partial(self.model.sample_step, t=state.t, dt=step.dt)
-            now = self._for_all(draw, (now,), step.rng)
-        stack = step.stack(step.check_forecast(now, state.ensembles))
+            sample_step = partial(self.model.sample_step, t=state.t, dt=step.dt)
+            members = self._draw_in_common(sample_step, (members,), step.rng)
+        stack = step.stack(step.check_forecast(members, state.ensembles))
         (logs,) = step.fuse(self._log_likelihoods(stack, step))
-        logs = self.n_agents * logs if step.has_fusion else logs
-        stack, errors = self._transported(stack, logs, step.rng)
-        step.record_failures(errors, range(self.n_agents))
+        if step.has_fusion:
+            # The rule returns averages over the agents, and the joint likelihood is a sum.
+            logs = self.n_agents * logs
+        stack = self._transport(stack, logs, step)
         self._warn(logs, step)
         return step.end(ensembles=stack[-1], past=stack[:-1])
 
-    def _for_all(
-        self,
-        draw: Callable[..., Array],
-        arrays: tuple[Array, ...],
-        rng: np.random.Generator,
+    def _draw_in_common(
+        self, draw: Callable[..., Array], arrays: tuple[Array, ...], rng: Rng
     ) -> Array:
         """Apply `draw` agent by agent, each with the same draws; the generator advances once."""
-        sources = [copy_rng(rng) for _ in range(self.n_agents - 1)] + [rng]
-        parts = [
-            draw(*(x[..., a, :, :] for x in arrays), rng=source)
-            for a, source in enumerate(sources)
-        ]
-        return np.stack(parts, axis=-3)
+        generators = [copy_rng(rng) for _ in range(self.n_agents - 1)] + [rng]
+        results = []
+        for agent, generator in enumerate(generators):
+            of_agent = [x[..., agent, :, :] for x in arrays]
+            results.append(draw(*of_agent, rng=generator))
+        return np.stack(results, axis=-3)
 
-    def _log_likelihoods(self, stack: list[Array], step: Step) -> Array:
-        """What each agent makes of the readings it has, (*runs, A, N)."""
+    def _log_likelihoods(self, stack: list[Array], step: Step[EnsembleState]) -> Array:
+        """Return the log-likelihoods of each agent's observations, (*runs, A, N)."""
         logs = np.zeros(stack[-1].shape[:-1])
         for place, group in step.received():
             rows = group.rows
-            before = step.before(place, group, stack[:-1])
-            predicted = group.predict(stack[place][..., rows, :, :], before)
+            previous = step.before(place, group, stack[:-1])
+            predicted = group.predict(stack[place][..., rows, :, :], previous)
             group = step.gate(group, sample_moments, predicted)
             logs[..., rows, :] += log_likelihood(predicted, group.target, group.noise)
             warn_of_weights(0 * predicted[..., 0], predicted, group.target, group.noise)
         return logs
 
-    def _transported(
-        self, stack: list[Array], logs: Array, rng: np.random.Generator
-    ) -> tuple[list[Array], dict[tuple[int, ...], str]]:
-        """All times' members, carried by the coupling of the last time's; the rows that failed."""
+    def _transport(
+        self, stack: list[Array], logs: Array, step: Step[EnsembleState]
+    ) -> list[Array]:
+        """Move all times' members by the transport plan of the present ones."""
 
-        def compute(here: Array, *rest: Any) -> tuple[Array, ...]:
-            times = rest[:-2]
-            w = normalize_weights(here)
-            matrix = transport_plans(times[-1], here)
-            return tuple(apply_plan(x, w, matrix, correct=self.correct) for x in times)
+        def compute(logs: Array, *args: Any) -> tuple[Array, ...]:
+            *times, _, _ = args
+            weights = normalize_weights(logs)
+            plan = transport_plans(times[-1], logs)
+            return tuple(
+                [apply_plan(x, weights, plan, correct=self.correct) for x in times]
+            )
 
-        out, errors = run_isolated(compute, (logs, *stack), tuple(stack), logs.ndim - 1)
+        agents = range(self.n_agents)
+        moved = step.apply(compute, (logs, *stack), tuple(stack), agents)
         if self.rejuvenation:
             draw = partial(rejuvenate, bandwidth=self.rejuvenation)
-            # Every time's members meet the same draws; the generator advances once.
-            sources = [copy_rng(rng) for _ in out[1:]] + [rng]
-            both = zip(out, stack, sources, strict=True)
-            out = tuple(self._for_all(draw, (y, x), source) for y, x, source in both)
-        # Where nothing was said of the members they stay as they were.
-        told = (np.ptp(logs, axis=-1) > 0)[..., None, None]
-        return [np.where(told, y, x) for y, x in zip(out, stack, strict=True)], errors
+            # All times' members meet the same draws; the generator advances once.
+            generators = [copy_rng(step.rng) for _ in moved[1:]] + [step.rng]
+            jittered = []
+            for new, old, generator in zip(moved, stack, generators, strict=True):
+                jittered.append(self._draw_in_common(draw, (new, old), generator))
+            moved = tuple(jittered)
+        # Without an observation all likelihoods are equal, and the members stay as they were.
+        is_observed = (np.ptp(logs, axis=-1) > 0)[..., None, None]
+        return [
+            np.where(is_observed, new, old)
+            for new, old in zip(moved, stack, strict=True)
+        ]
 
-    def _warn(self, logs: Array, step: Step) -> None:
-        """A coupling that carries all to one member leaves nothing to go on from.
+    def _warn(self, logs: Array, step: Step[EnsembleState]) -> None:
+        """Warn if one member has nearly all the weight: its copies are left to go on from.
 
         >>> import warnings
         >>> from types import SimpleNamespace
@@ -424,29 +495,34 @@ class TransportFilter(MembersFilter):
         Traceback (most recent call last):
         distfilt.updates.particles.ParticleCollapse: t = 1 s: an agent's weights have an ...
         """
-        if (
-            size := size_of(normalize_weights(logs[~step.failed])).min(initial=np.inf)
-        ) < 1.1:
-            what = f"t = {step.t:g} s: an agent's weights have an effective size of {size:.1f}"
-            warn_of_collapse(what, "rejuvenation=")
+        weights = normalize_weights(logs[~step.failed])
+        size = size_of(weights).min(initial=np.inf)
+        if size < 1.1:
+            warn_of_collapse(
+                f"t = {step.t:g} s: an agent's weights have an effective size of {size:.1f}",
+                "rejuvenation=",
+            )
 
 
-def regress_past(stack: list[Array], now: Array) -> list[Array]:
-    """Members of the earlier times of a stack whose last have become those of `now` by agreement.
+def regress_past(stack: list[Array], fused: Array) -> list[Array]:
+    """Return the members of a stack's earlier times after the fusion has moved the last ones.
 
-    What agents agree on tells of the past too: by its regression on the members as they were.
+    The past follows by its linear regression on the present members before the fusion.
     """
-    *past, old = stack
-    if now is old or not past:
+    *past, present = stack
+    if fused is present or not past:
         return past
-    shape, unit = to_unit_variances(moments.sample_covariance(old))
-    inverse = np.linalg.pinv(shape, rcond=1e-10, hermitian=True) / (old.shape[-2] - 1)
-    around, moved = (
-        x / unit[..., None, :] for x in (moments.center_ensemble(old)[1], now - old)
-    )
-    return [x + moved @ (inverse @ (around.mT @ x)) for x in past]
+    # In units of the standard deviations, so that the cut of small eigenvalues has no units.
+    correlation, unit = to_unit_variances(moments.sample_covariance(present))
+    n = present.shape[-2]
+    inverse = np.linalg.pinv(correlation, rcond=1e-10, hermitian=True) / (n - 1)
+    _, anomalies = moments.center_ensemble(present)
+    scaled = anomalies / unit[..., None, :]
+    shift = (fused - present) / unit[..., None, :]
+    # x_past + Δ C⁻¹ Aᵀ x_past / (N - 1)
+    return [x + shift @ (inverse @ (scaled.mT @ x)) for x in past]
 
 
 def sample_moments(members: Array) -> tuple[Array, Array]:
-    """Mean and covariance of predictions (..., N, M); NaN where some member cannot be seen."""
+    """Mean and covariance of predictions (..., N, M); NaN if some member's does not exist."""
     return members.mean(axis=-2), moments.sample_covariance(members)

@@ -14,26 +14,33 @@ from ..gaussians.single import condition, unscented_points
 from ..linalg import EPS, cholesky, solve_upper, symmetrise
 from ..models import LinearModel
 from ..validation import Array, Bounds, NonNegativeFloat, PositiveInt
-from .base import Filter
-from .inbox import Received
-from .inputs import prior_moments
+from .base import SensorFilter
+from .options import (
+    ExchangesAtIntervals,
+    FusesBeliefs,
+    IsolatesRuns,
+    KeepsPast,
+    SharesObservations,
+)
+from .priors import Prior, prior_moments
 from .record import Summary
-from .saving import SensorState
-from .step import Step, run_isolated
+from .states import SensorState
+from .step import Received, Step
 
 __all__ = ["GaussianFilter", "GaussianState"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GaussianState(SensorState):
-    """What the agents believe between two steps.
+    """The agents' Gaussians between two steps.
 
     Parameters
     ----------
     t, ledger, rng, rejected, failed, pending
         As for :class:`~distfilt.filters.SensorState`; `rng` is None, as nothing is drawn.
     joint_means : ndarray, (*runs, A, D)
-        Means of the present state and of the kept earlier ones, latest first: D = d (1 + kept).
+        Means of the present state and of the earlier ones that are kept, latest first:
+        D = d (1 + number of earlier times).
     joint_covariances : ndarray, (*runs, A, D, D)
         Their joint covariance.
     dim : int
@@ -59,27 +66,22 @@ class GaussianState(SensorState):
 
     @property
     def times(self) -> tuple[float, ...]:
-        """The earlier times that are kept, oldest first."""
+        """The earlier times whose beliefs are kept, oldest first."""
         return self.history[::-1]
 
     @property
     def lagged_states(self) -> tuple[Self, ...]:
-        """A state for each of these times, as what is believed of it by now."""
-        m = self.joint_means
-        p = self.joint_covariances
-        d = self.dim
-        own = [slice(k * d, (k + 1) * d) for k in range(len(self.history), 0, -1)]
-        return tuple(
-            self.replace(
-                t=t, history=(), joint_means=m[..., k], joint_covariances=p[..., k, k]
+        """A state for each of these times, given all observations up to now."""
+        states = []
+        n = len(self.history)
+        for k, t in zip(range(n, 0, -1), self.times, strict=True):
+            block = slice(k * self.dim, (k + 1) * self.dim)
+            mean = self.joint_means[..., block]
+            cov = self.joint_covariances[..., block, block]
+            states.append(
+                self.replace(t=t, history=(), joint_means=mean, joint_covariances=cov)
             )
-            for t, k in zip(self.times, own, strict=True)
-        )
-
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """The components of one state."""
-        return (self.dim,)
+        return tuple(states)
 
     @property
     def means(self) -> Array:
@@ -93,24 +95,32 @@ class GaussianState(SensorState):
 
 
 @dataclass(frozen=True, eq=False)
-class GaussianFilter(Filter):
+class GaussianFilter(
+    SensorFilter[GaussianState],
+    FusesBeliefs[GaussianState],
+    SharesObservations[GaussianState],
+    ExchangesAtIntervals[GaussianState],
+    KeepsPast[GaussianState],
+    IsolatesRuns[GaussianState],
+):
     """One Kalman filter per agent; for a linear model and linear sensors it is exact.
 
     Parameters
     ----------
-    model, sensors, graph, fusion, share_observations, faults, lag, names, on_error, gate_probability,
-        exchange_interval
-        As for :class:`~distfilt.filters.Filter`. The agreement is a function
-        ``agreement((means, covs), channel) -> (means, covs)``, such as
+    model, sensors, graph, gate_probability, faults, names
+        As for :class:`~distfilt.filters.SensorFilter`.
+    fusion, share_observations, lag, on_error, exchange_interval
+        As in :mod:`distfilt.filters.options`. The rule is a function
+        ``fusion((means, covs), channel) -> (means, covs)``, such as
         :func:`distfilt.network.covariance_intersection`.
-    rule : {"extended", "unscented"}
-        How a curved model or sensor is made linear: by its derivative at the mean, or by 2d + 1
-        points about it.
+    linearization : {"extended", "unscented"}
+        How a nonlinear model or sensor is made linear: by its derivative at the mean, or by
+        2d + 1 points about it.
     kappa : float
         The unscented points lie :math:`\\sqrt{d+\\kappa}` standard deviations from the mean, at
         least 0, so that no weight is negative.
     inflation : float
-        What the forecast's standard deviations are multiplied by; at least 0.5, for 5% is 1.05.
+        Factor of the forecast's standard deviations, at least 0.5; for 5 % it is 1.05.
 
     Examples
     --------
@@ -134,183 +144,218 @@ class GaussianFilter(Filter):
     kappa: NonNegativeFloat = 1.0
     inflation: Annotated[float, Bounds(at_least=0.5)] = 1.0
 
-    state_class: ClassVar[type[GaussianState]] = GaussianState
+    state_class: ClassVar[type[Any]] = GaussianState
     batched_summary: ClassVar[bool] = True
-    belief_kind: ClassVar[str] = "gaussians"
+    belief_kind: ClassVar[str | None] = "gaussians"
+
+    def check_state(self, state: GaussianState) -> None:
+        """Refuse a state that is not of this filter."""
+        super().check_state(state)
+        if state.dim != self.model.dim:
+            raise ValueError(
+                f"state must have sizes {(self.model.dim,)} an agent, got {(state.dim,)}"
+            )
 
     def initial_state(
-        self, prior: Any, runs: tuple[int, ...], rng: Any
+        self, prior: Prior, runs: tuple[int, ...], rng: Any
     ) -> dict[str, Any]:
-        """The prior's mean and covariance, the same for all agents and runs."""
+        """Return the prior's mean and covariance, the same for all agents and runs."""
         d = self.model.dim
-        both = prior_moments(
-            prior, d, "semi" * (self.linearization == "extended") + "definite"
-        )
-        m, p = (
-            np.broadcast_to(x, (*runs, self.n_agents, *x.shape)).copy() for x in both
-        )
-        return {"joint_means": m, "joint_covariances": p, "dim": d}
+        # Unscented points need a Cholesky factor.
+        is_extended = self.linearization == "extended"
+        definiteness = "semidefinite" if is_extended else "definite"
+        mean, cov = prior_moments(prior, d, definiteness)
+        lead = (*runs, self.n_agents)
+        return {
+            "joint_means": np.broadcast_to(mean, (*lead, d)).copy(),
+            "joint_covariances": np.broadcast_to(cov, (*lead, d, d)).copy(),
+            "dim": d,
+        }
 
-    @property
-    def sizes(self) -> tuple[int, ...]:
-        """The state's components."""
-        return (self.model.dim,)
-
-    def next_state(self, step: Step) -> Any:
-        """Forecast, condition on what was heard, fuse.
+    def next_state(self, step: Step[GaussianState]) -> GaussianState:
+        """Forecast, condition on the received observations, fuse.
 
         Warns
         -----
         RuntimeWarning
-            If a deviation after the agreement is below the rounding of its mean.
+            If a standard deviation after the fusion is below the rounding of its mean.
         """
         means, covs = self._forecast(step)
-        means, one = step.check_forecast(means, 0.0), np.eye(means.shape[-1])
-        covs = step.check_forecast(covs, one)
+        unit = np.eye(means.shape[-1])
+        means = step.check_forecast(means, 0.0)
+        covs = step.check_forecast(covs, unit)
         for place, group in step.received():
-            slot = len(step.times) - place
-            step.record_failures(
-                self._condition(means, covs, slot, group, step), group.agents
-            )
-        covs = step.keep_failed(
-            covs, one
-        )  # what failed here has to have a root in what follows
+            self._condition(means, covs, place, group, step)
+        # A run that failed here needs a covariance with a Cholesky factor in the fusion.
+        covs = step.keep_failed(covs, unit)
         if step.has_fusion:
-            means, covs = self._agreed(means, covs, step)
-        covs = symmetrise(covs)
-        past = step.times[::-1]
+            means, covs = self._fuse(means, covs, step)
         return step.end(
-            joint_means=means, joint_covariances=covs, dim=step.state.dim, history=past
+            joint_means=means,
+            joint_covariances=symmetrise(covs),
+            dim=step.state.dim,
+            history=step.times[::-1],
         )
 
     def summarize(self, state: GaussianState) -> Summary:
-        """Means and covariances of the present state."""
+        """Return means and covariances of the present state."""
+        mean = state.mask_failed(state.means)
         cov = state.mask_failed(state.covariances)
-        return Summary(
-            state.mask_failed(state.means), np.diagonal(cov, axis1=-2, axis2=-1), cov
-        )
+        return Summary(mean, np.diagonal(cov, axis1=-2, axis2=-1), cov)
 
-    def _forecast(self, step: Step) -> tuple[Array, Array]:
-        """Joint mean and covariance of the moved state and of the earlier ones that are kept."""
+    def _forecast(self, step: Step[GaussianState]) -> tuple[Array, Array]:
+        """Return the joint mean and covariance of the forecast and the earlier states kept."""
         state = step.state
         model = self.model
         dt = step.dt
         if not dt:
             return state.joint_means.copy(), state.joint_covariances.copy()
         d = state.dim
-        kept = len(step.times)
-        flow = partial(model.step, t=state.t, dt=dt)
-        jacobian = partial(model.jacobian, t=state.t, dt=dt)
-        now = (state.means, state.covariances)
-        linear = isinstance(model, LinearModel)
-        moved, slope, extra = self._linearised(flow, jacobian, *now, linear)
-        shift = np.ascontiguousarray(slope)
+        mean, slope, extra = self._linearize(
+            partial(model.step, t=state.t, dt=dt),
+            partial(model.jacobian, t=state.t, dt=dt),
+            state.means,
+            state.covariances,
+            isinstance(model, LinearModel),
+        )
+        # P = F P Fᵀ + Q, with a contiguous F.
+        slope = np.ascontiguousarray(slope)
         old = state.joint_covariances
-        covs = shift @ old[..., :d, :d] @ shift.mT + (model.Q(state.t, dt) + extra)
-        if kept:  # the past stays as it is, and only its products with the present move
-            moved = np.concatenate([moved, state.joint_means[..., : kept * d]], axis=-1)
-            across = shift @ old[..., :d, : kept * d]
-            covs = np.block(
-                [[covs, across], [across.mT, old[..., : kept * d, : kept * d]]]
-            )
+        noise = model.Q(state.t, dt) + extra
+        cov = slope @ old[..., :d, :d] @ slope.mT + noise
+        size = len(step.times) * d
+        if size:
+            # The past keeps its covariance; its cross-covariance with the present becomes F P.
+            mean = np.concatenate([mean, state.joint_means[..., :size]], axis=-1)
+            cross = slope @ old[..., :d, :size]
+            cov = np.block([[cov, cross], [cross.mT, old[..., :size, :size]]])
         if self.inflation != 1.0:
-            covs[..., :d, :] *= self.inflation
-            covs[..., :, :d] *= self.inflation
-        return moved, covs
+            # Rows and columns of the present, so that its own block gets the square.
+            cov[..., :d, :] *= self.inflation
+            cov[..., :, :d] *= self.inflation
+        return mean, cov
 
-    def _linearised(
+    def _linearize(
         self,
         function: Callable[[Array], Array],
         jacobian: Callable[[Array], Array],
         mean: Array,
         cov: Array,
-        linear: bool,
+        is_linear: bool,
     ) -> tuple[Array, Array, Array | float]:
-        """Value, slope and extra covariance of a function of a Gaussian (..., d)."""
-        if (
-            linear or self.linearization == "extended"
-        ):  # points would find the same of what is linear
+        """Return value, slope and extra covariance of a function of a Gaussian (..., d)."""
+        if is_linear or self.linearization == "extended":
+            # For a linear function unscented points would give the same.
             return function(mean[..., None, :])[..., 0, :], jacobian(mean), 0.0
         root = cholesky(cov)
         d = mean.shape[-1]
-        points, w = unscented_points(mean, root, kappa=self.kappa)
+        points, weights = unscented_points(mean, root, kappa=self.kappa)
         values = function(points)
-        at = w @ values
-        gap = values - at[..., None, :]
-        # By opposite points: the slope times each column of the root, and what is beyond them.
-        half = (values[..., 1 : d + 1, :] - values[..., d + 1 :, :]) / (
-            2 * np.sqrt(d + self.kappa)
-        )
-        slope = solve_upper(root, half).mT
-        return at, slope, (w[:, None] * gap).mT @ gap - half.mT @ half
+        value = weights @ values
+        anomalies = values - value[..., None, :]
+        # Opposite points lie ±√(d+κ) columns of the root L from the mean, so that half their
+        # differences are (H L)ᵀ √(d+κ) and H follows by a triangular solve.
+        ahead = values[..., 1 : d + 1, :]
+        behind = values[..., d + 1 :, :]
+        scaled_slope = (ahead - behind) / (2 * np.sqrt(d + self.kappa))
+        slope = solve_upper(root, scaled_slope).mT
+        # The covariance of the values beyond the linear part H P Hᵀ.
+        total = (weights[:, None] * anomalies).mT @ anomalies
+        return value, slope, total - scaled_slope.mT @ scaled_slope
 
     def _condition(
-        self, means: Array, covs: Array, slot: int, group: Received, step: Step
-    ) -> Any:
-        """Condition a group's joint Gaussians in place; the rows that failed."""
+        self,
+        means: Array,
+        covs: Array,
+        place: int,
+        group: Received,
+        step: Step[GaussianState],
+    ) -> None:
+        """Condition a group's joint Gaussians on its observations, in place."""
         d = self.model.dim
         rows = group.rows
-        here = slice(slot * d, (slot + 1) * d)
-        m = means[..., rows, :]
-        p = covs[..., rows, :, :]
-        x = m[..., here]
-        own = p[..., here, here]
-        predict = group.predict
-        jacobian = group.jacobian
-        at, slope, extra = self._linearised(predict, jacobian, x, own, group.linear)
-
-        def alike(_: Array) -> tuple[Array, Array]:
-            near = partial(predict, alike=True)
-            mean, h, rest = self._linearised(near, jacobian, x, own, group.linear)
-            return mean, h @ own @ h.mT + rest
-
-        group = step.gate(group, alike, at[..., None, :])
-        noise = np.full((*slope.shape[:-1], slope.shape[-2]), group.noise) + extra
-        if m.shape[-1] > d:
-            part = slope
-            slope = np.zeros((*slope.shape[:-1], m.shape[-1]))
-            slope[..., here] = part
-        (m, p), errors = run_isolated(
-            lambda m, p, gap, h, noise, *_: condition(m, p, gap, h, noise),
-            (m, p, group.target - at, slope, noise),
-            (m, p),
-            group.target.ndim - 1,
+        # The latest time comes first in the joint state, and last among the places.
+        first = (len(step.times) - place) * d
+        block = slice(first, first + d)
+        joint_mean = means[..., rows, :]
+        joint_cov = covs[..., rows, :, :]
+        mean = joint_mean[..., block]
+        cov = joint_cov[..., block, block]
+        linear = group.linear
+        predicted, slope, extra = self._linearize(
+            group.predict, group.jacobian, mean, cov, linear
         )
-        means[..., rows, :] = m
-        covs[..., rows, :, :] = p
-        return errors
 
-    def _agreed(self, means: Array, covs: Array, step: Step) -> tuple[Array, Array]:
-        """Fuse the present states; what is believed of the past follows by its regression.
+        def predicted_moments(_: Array) -> tuple[Array, Array]:
+            """Return the moments about one branch, whatever the observed angle is."""
+            predict = partial(group.predict, same_branch=True)
+            value, h, rest = self._linearize(predict, group.jacobian, mean, cov, linear)
+            return value, h @ cov @ h.mT + rest
+
+        group = step.gate(group, predicted_moments, predicted[..., None, :])
+        noise = np.full((*slope.shape[:-1], slope.shape[-2]), group.noise) + extra
+        if joint_mean.shape[-1] > d:
+            # Zero slope in the other times' states.
+            joint_slope = np.zeros((*slope.shape[:-1], joint_mean.shape[-1]))
+            joint_slope[..., block] = slope
+            slope = joint_slope
+        innovation = group.target - predicted
+        means[..., rows, :], covs[..., rows, :, :] = step.apply(
+            _condition_rows,
+            (joint_mean, joint_cov, innovation, slope, noise),
+            (joint_mean, joint_cov),
+            group.agents,
+        )
+
+    def _fuse(
+        self, means: Array, covs: Array, step: Step[GaussianState]
+    ) -> tuple[Array, Array]:
+        """Fuse the present states; the past follows by its regression on them.
 
         >>> from types import SimpleNamespace
         >>> from distfilt.models import constant_velocity
         >>> f = GaussianFilter(constant_velocity(sigma=1.0), [None])
-        >>> sure = SimpleNamespace(t=1.0, fuse=lambda m, p: (m, 1e-40 * p))
+        >>> tiny = SimpleNamespace(t=1.0, fuse=lambda m, p: (m, 1e-40 * p))
         >>> with warnings.catch_warnings(action="error"):
-        ...     f._agreed(np.ones((1, 4)), np.eye(4)[None], sure)
+        ...     f._fuse(np.ones((1, 4)), np.eye(4)[None], tiny)
         Traceback (most recent call last):
-        RuntimeWarning: fusion: counts twice, at t = 1 s
+        RuntimeWarning: covariance after fusion is below rounding at t = 1 s: ...
         >>> wrong = SimpleNamespace(t=1.0, fuse=lambda m, p: (m, p - 2 * np.eye(4)))
-        >>> f._agreed(np.ones((1, 4)), np.eye(4)[None], wrong)
+        >>> f._fuse(np.ones((1, 4)), np.eye(4)[None], wrong)
         Traceback (most recent call last):
-        ValueError: fusion must be a covariance, got a variance of -1
+        ValueError: fusion must return a covariance, got a variance of -1
         """
         d = self.model.dim
-        old = means[..., :d]
-        now = symmetrise(covs[..., :d, :d])
-        m, p = step.fuse(old, now)
-        variance = np.diagonal(p, axis1=-2, axis2=-1)
-        if (variance < -1e-9 * np.abs(variance).max()).any():  # not by rounding
+        mean = means[..., :d]
+        cov = symmetrise(covs[..., :d, :d])
+        fused_mean, fused_cov = step.fuse(mean, cov)
+        variance = np.diagonal(fused_cov, axis1=-2, axis2=-1)
+        # A variance that is negative by rounding alone is small beside the largest one.
+        if (variance < -1e-9 * np.abs(variance).max()).any():
             raise ValueError(
-                f"fusion must be a covariance, got a variance of {variance.min():g}"
+                f"fusion must return a covariance, got a variance of {variance.min():g}"
             )
-        if ((variance > 0) & (variance < (EPS * m) ** 2)).any():
+        if ((variance > 0) & (variance < (EPS * fused_mean) ** 2)).any():
             warnings.warn(
-                f"fusion: counts twice, at t = {step.t:g} s", RuntimeWarning, 4
+                f"covariance after fusion is below rounding at t = {step.t:g} s: "
+                "information is probably counted twice",
+                RuntimeWarning,
+                4,
             )
         if means.shape[-1] == d:
-            return m, p
-        gain = np.linalg.solve(now, covs[..., :d, :]).mT
-        moved = means + (gain @ (m - old)[..., None])[..., 0]
-        return moved, covs + gain @ (p - now) @ gain.mT
+            return fused_mean, fused_cov
+        # With the gain G = P_joint,now P_now⁻¹: m + G Δm and P + G ΔP Gᵀ.
+        gain = np.linalg.solve(cov, covs[..., :d, :]).mT
+        shift = (gain @ (fused_mean - mean)[..., None])[..., 0]
+        return means + shift, covs + gain @ (fused_cov - cov) @ gain.mT
+
+
+def _condition_rows(
+    mean: Array,
+    cov: Array,
+    innovation: Array,
+    slope: Array,
+    noise: Array,
+    *_: Any,
+) -> tuple[Array, Array]:
+    return condition(mean, cov, innovation, slope, noise)

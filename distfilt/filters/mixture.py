@@ -1,44 +1,45 @@
-"""Localisation and tracking with Gaussian mixtures: agents share what they believe of a target."""
+"""Localisation and tracking with Gaussian mixtures: agents share their beliefs about a target."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field
-from typing import Annotated, Any, ClassVar
+from functools import partial
+from typing import Annotated, Any, ClassVar, cast
 
 import numpy as np
 
 from ..mixtures import GaussianMixture, runnalls
 from ..mixtures.conditioning import propagate_mixture, update_mixture, within_gate
 from ..mixtures.splitting import split_nonlinear
-from ..validation import Array, Bounds, PositiveInt
-from .base import Filter
-from .inputs import Observation, prior_mixtures, sensor_of
+from ..validation import Array, Bounds, InvalidArgumentError, PositiveInt, call_user
+from .base import SensorFilter
+from .observations import Observation, sensor_of
+from .options import ExchangesAtIntervals, FusesBeliefs
+from .priors import Prior, prior_mixtures
 from .record import Summary
-from .saving import State
+from .states import State
 from .step import Step
 
-__all__ = ["MixtureFilter", "MixtureState"]
+__all__ = ["MixtureFilter", "MixtureState", "TargetMixtureFilter"]
 
-_EXACT = 400
-"""Up to how many mixands every pair is a candidate for a merger."""
-
-_ALONE = "one run at a time: mixtures of several runs differ in size"
+_MAX_ALL_PAIRS = 400
+"""Up to how many components every pair is a candidate for a merger."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MixtureState(State):
-    """What the agents believe between two steps.
+    """The agents' mixtures between two steps.
 
     Parameters
     ----------
-    t, ledger, rng, refused
+    t, ledger, rng, rejected
         As for :class:`~distfilt.filters.State`; `rng` is None, as nothing is drawn.
     mixtures : tuple of GaussianMixture
         One for each agent, over its own state [target; ego].
-    untold : tuple of (GaussianMixture or None)
-        What each agent would believe without the readings that it has not told yet; None where
-        there are none. For :class:`InformationIncrementFilter`.
+    unsent : tuple of (GaussianMixture or None)
+        Each agent's belief without the observations whose information it has not sent yet; None
+        if there are none. For :class:`InformationIncrementFilter`.
 
     Examples
     --------
@@ -53,37 +54,193 @@ class MixtureState(State):
 
 
 @dataclass(frozen=True, eq=False)
-class MixtureFilter(Filter):
-    """Every agent holds a mixture over [target; its own state]; only target marginals travel.
+class TargetMixtureFilter(
+    SensorFilter[MixtureState], ExchangesAtIntervals[MixtureState]
+):
+    """The common part of filters whose agents hold a mixture over [target; ego].
 
-    In a step an agent splits the mixands that its model stretches most, forecasts all of them,
-    conditions them on its reading, sends its target marginal, fuses what it hears, and merges down
-    to `size` mixands. A mixand that the sensor cannot see (it predicts NaN for one of its points)
-    contradicts a reading and is left out; a reading that all mixands contradict in this way is
-    refused by an error.
+    The agents' states differ, so the observations stay with their agents and one run is filtered
+    at a time. A family supplies `_assimilate`.
+    """
+
+    _: KW_ONLY
+    target_dim: PositiveInt
+    n_components: PositiveInt = 12
+    max_components: PositiveInt = 12
+    split_threshold: Annotated[float, Bounds(above=0, at_most=1e150)] | None = None
+    split_scale: Annotated[Array, "model.dim"] | None = None
+
+    state_class: ClassVar[type[Any]] = MixtureState
+    supports_runs: ClassVar[bool] = False
+
+    def check_parts(self) -> None:
+        """Refuse a model that is smaller than the target."""
+        super().check_parts()
+        Bounds(at_most=self.model.dim)(self.target_dim, "target_dim")
+        Bounds(at_least=self.n_components)(self.max_components, "max_components")
+
+    def initial_state(
+        self, prior: Prior, runs: tuple[int, ...], rng: Any
+    ) -> dict[str, Any]:
+        """Return a mixture for each agent."""
+        return {"mixtures": prior_mixtures(prior, self.model.dim, self.n_agents)}
+
+    def next_state(self, step: Step[MixtureState]) -> MixtureState:
+        """Split and forecast, condition on the agent's observations, exchange, reduce."""
+        beliefs = [
+            self._forecast(belief, agent, step)
+            for agent, belief in enumerate(step.state.mixtures)
+        ]
+        after, unsent = self._assimilate(beliefs, step)
+        return step.end(
+            mixtures=tuple([self._reduce(belief) for belief in after]),
+            unsent=tuple(
+                [None if belief is None else self._reduce(belief) for belief in unsent]
+            ),
+        )
+
+    def _reduce(self, belief: GaussianMixture) -> GaussianMixture:
+        """Merge components until `n_components` are left."""
+        n_pairs = max(_MAX_ALL_PAIRS, self.n_components)
+        reduced = runnalls(belief, self.n_components, heaviest=n_pairs)
+        # A copy without the Cholesky factors that it came with: a loaded state has none.
+        return reduced.replace()
+
+    def summarize(self, state: MixtureState) -> Summary:
+        """Return moments of the whole mixtures, and their numbers of components."""
+        moments = [belief.moments() for belief in state.mixtures]
+        mean = np.array([m for m, _ in moments])
+        cov = np.array([p for _, p in moments])
+        sizes = [float(belief.n_components) for belief in state.mixtures]
+        variance = np.diagonal(cov, axis1=-2, axis2=-1)
+        return Summary(mean, variance, cov, numbers={"mixands": np.array(sizes)})
+
+    def _assimilate(
+        self, beliefs: list[GaussianMixture], step: Step[MixtureState]
+    ) -> tuple[Sequence[GaussianMixture], Sequence[GaussianMixture | None]]:
+        """Return the beliefs after observations and exchange, and the `unsent` of the state."""
+        raise NotImplementedError
+
+    def _forecast(
+        self, belief: GaussianMixture, agent: int, step: Step[MixtureState]
+    ) -> GaussianMixture:
+        """Split where the model is nonlinear, then forecast every component.
+
+        >>> from distfilt.models import Model
+        >>> later = Model(
+        ...     1, lambda x, t, dt: x + t * dt, lambda t, dt: np.zeros((1, 1))
+        ... )
+        >>> f = MixtureFilter(later, [None], target_dim=1)
+        >>> f.step(f.start(([0.0], [[1.0]]), t=2.0), 3.0, [None]).mixtures[0].means
+        array([[2.]])
+        """
+        t = step.state.t
+        dt = step.dt
+        model = self.model
+        if dt == 0:
+            return belief
+        with step.failing_as(agent):
+            if self.split_threshold is not None:
+                belief = split_nonlinear(
+                    belief,
+                    partial(model.jacobian, t=t, dt=dt),
+                    max_components=self.max_components,
+                    split_threshold=self.split_threshold,
+                    scale=self.split_scale,
+                )
+            noise_sqrt = model.noise_sqrt(t, dt)
+            return propagate_mixture(
+                belief, partial(model.step, t=t, dt=dt), noise_sqrt
+            )
+
+    def _condition(
+        self,
+        belief: GaussianMixture,
+        agent: int,
+        observations: Sequence[Observation],
+        step: Step[MixtureState],
+        second: GaussianMixture | None = None,
+    ) -> tuple[GaussianMixture, GaussianMixture | None]:
+        """Condition an agent's belief, and a second one, on observations that pass its gate.
+
+        >>> from distfilt.models import Model
+        >>> from distfilt.sensors import component
+        >>> still = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
+        >>> eyes = [component([k], std=1.0) for k in range(2)]
+        >>> f = MixtureFilter(still, [eyes], target_dim=2, gate_probability=0.99)
+        >>> state = f.start((np.zeros(2), np.eye(2)))
+        >>> state = f.step(
+        ...     state,
+        ...     0.0,
+        ...     [[Observation(0.0, 0, [9.0]), Observation(0.0, 0, [1.0], 1)]],
+        ... )
+        >>> state.mixtures[0].means, state.rejected
+        (array([[0. , 0.5]]), array([1.]))
+        """
+        for observation in observations:
+            sensor = sensor_of(self, observation)
+            value = observation.value
+            with step.failing_as(agent):
+                if self.gate_probability is not None:
+                    value = within_gate(
+                        belief,
+                        value,
+                        sensor.predict,
+                        sensor.noise_cov,
+                        gate=_gate_width(value, self.gate_probability),
+                        residual=sensor.residual,
+                    )
+                likelihood = (value, sensor.predict, sensor.noise_cov)
+                residual = sensor.residual
+                belief = update_mixture(belief, *likelihood, residual=residual)
+                # The same observations count for both, or their difference would hold one.
+                if second is not None:
+                    second = update_mixture(second, *likelihood, residual=residual)
+            if step.rejected is not None:
+                step.rejected[agent] += np.isnan(value).all()
+        return belief, second
+
+
+def _gate_width(value: Array, probability: float) -> float:
+    """Return the gate in standard deviations: the root of the chi-squared quantile."""
+    from scipy.special import gammaincinv
+
+    size = (~np.isnan(value)).sum()
+    return float(np.sqrt(2 * gammaincinv(size / 2, probability)))
+
+
+@dataclass(frozen=True, eq=False)
+class MixtureFilter(TargetMixtureFilter, FusesBeliefs[MixtureState]):
+    """Every agent holds a mixture over [target; its own state]; only target marginals are sent.
+
+    In a step an agent splits the components for which its model is most nonlinear, forecasts all
+    of them, conditions them on its observation, sends its target marginal, fuses what it receives,
+    and merges down to `n_components`. A component that cannot predict an observation (the sensor
+    gives NaN for one of its points) contradicts it and is left out; an observation that
+    contradicts all components raises an error.
 
     Parameters
     ----------
     model : Model
-        How an agent's [target; ego] moves.
-    sensors, graph, faults, names, gate, every
-        As for :class:`~distfilt.filters.Filter`. Agents' states differ, so that readings stay with
-        their agents and one run is filtered at a time.
-        Several readings of one time are taken one after the other, and the gate tests each against
-        what is believed after those before it.
+        The motion of an agent's [target; ego].
+    sensors, graph, gate_probability, faults, names
+        As for :class:`~distfilt.filters.SensorFilter`. Several observations of one time are
+        assimilated one after the other, and the gate tests each given those before it.
+    exchange_interval
+        As in :mod:`distfilt.filters.options`.
     fusion : callable, optional
-        ``agreement(beliefs, channel) -> beliefs`` of the agents' mixtures, such as
+        ``fusion(beliefs, channel) -> beliefs`` of the agents' mixtures, such as
         ``partial(target_fusion, target_dim=6)`` of :mod:`distfilt.mixtures`.
     target_dim : int
-        How many components, the first of every state, are the target's.
-    size : int
-        How many mixands an agent keeps after a step.
-    most : int
-        How many there may be before a forecast; no smaller than `size`.
-    stretch : float, optional
-        Split where a mixand's weight times its largest stretching is above this; never by default.
-    scale : array_like, optional
-        What each component is multiplied by before lengths are compared, the same for all agents.
+        Number of the target's components; they are the first of every state.
+    n_components : int
+        Number of components that an agent keeps after a step.
+    max_components : int
+        Their largest number before a forecast; no smaller than `n_components`.
+    split_threshold : float, optional
+        Split where a component's weight times its nonlinearity is above this; never by default.
+    split_scale : array_like, optional
+        Factors of the state's components before lengths are compared, the same for all agents.
 
     Examples
     --------
@@ -105,158 +262,19 @@ class MixtureFilter(Filter):
     >>> after.mixtures[1].means.round(4), after.ledger.scalars
     (array([[0.6667, 0.3333]]), array([3, 3]))
 
-    Mixtures differ in size from run to run, so that one run is all that a filter takes:
+    Mixtures differ in size from run to run, so a filter has a single run:
 
     >>> f.start(prior, runs=(3,))
     Traceback (most recent call last):
-    ValueError: runs: needs (), one run at a time, got (3,)
-    >>> MixtureFilter(still, [None], target_dim=1, on_error="keep")
-    Traceback (most recent call last):
-    ValueError: on_error: one run at a time: mixtures of several runs differ in size
+    ValueError: runs must be () for a filter of one run at a time, got (3,)
     """
 
-    _: KW_ONLY
-    share_observations: bool = False
-    target_dim: PositiveInt
-    n_components: PositiveInt = 12
-    max_components: PositiveInt = 12
-    split_threshold: Annotated[float, Bounds(above=0, at_most=1e150)] | None = None
-    split_scale: Annotated[Array, "model.dim"] | None = None
-
-    state_class: ClassVar[type[MixtureState]] = MixtureState
-    supports_runs: ClassVar[bool] = False
     belief_kind: ClassVar[str | None] = "mixtures"
-    unsupported: ClassVar[dict[str, str]] = {
-        "share_observations": "agents' own states differ, so that their readings stay with them",
-        "lag": "a mixture filter keeps no past",
-        "on_error": _ALONE,
-    }
 
-    def check_parts(self) -> None:
-        """Refuse a model that is smaller than the target."""
-        super().check_parts()
-        Bounds(at_most=self.model.dim)(self.target_dim, "target_dim")
-        Bounds(at_least=self.n_components)(self.max_components, "max_components")
-
-    def initial_state(
-        self, prior: Any, runs: tuple[int, ...], rng: Any
-    ) -> dict[str, Any]:
-        """A mixture for each agent."""
-        return {"mixtures": prior_mixtures(prior, self.model.dim, self.n_agents)}
-
-    def next_state(self, step: Step) -> Any:
-        """Split and forecast, condition on the own readings, exchange, fuse, reduce."""
-        beliefs = [self._moved(b, k, step) for k, b in enumerate(step.state.mixtures)]
-        after, untold = self._told(beliefs, step)
-        # Without the square roots that they came with: a loaded state has none.
-        size = self.n_components
-        exact = max(_EXACT, self.n_components)
-        agents = len(after)
-        plain = [
-            None if b is None else runnalls(b, size, heaviest=exact).replace()
-            for b in (*after, *untold)
-        ]
-        return step.end(mixtures=tuple(plain[:agents]), unsent=tuple(plain[agents:]))
-
-    def summarize(self, state: MixtureState) -> Summary:
-        """Means, variances and covariances of the whole mixtures, and their sizes."""
-        moments = [belief.moments() for belief in state.mixtures]
-        mean, cov = (np.array(part) for part in zip(*moments, strict=True))
-        sizes = np.array(
-            [belief.n_components for belief in state.mixtures], dtype=np.float64
-        )
-        variance = np.diagonal(cov, axis1=-2, axis2=-1)
-        return Summary(mean, variance, cov, numbers={"mixands": sizes})
-
-    def _moved(
-        self, belief: GaussianMixture, agent: int, step: Step
-    ) -> GaussianMixture:
-        """Split where the model stretches, then forecast every mixand.
-
-        >>> from distfilt.models import Model
-        >>> later = Model(
-        ...     1, lambda x, t, dt: x + t * dt, lambda t, dt: np.zeros((1, 1))
-        ... )
-        >>> f = MixtureFilter(later, [None], target_dim=1)
-        >>> f.step(f.start(([0.0], [[1.0]]), t=2.0), 3.0, [None]).mixtures[0].means
-        array([[2.]])
-        """
-        t = step.state.t
-        dt = step.dt
-        model = self.model
-        if dt == 0:
-            return belief
-        flow = model.step
-        derivative = model.jacobian
-        with step.failing_as(agent):
-            if self.split_threshold is not None:
-                belief = split_nonlinear(
-                    belief,
-                    lambda x: derivative(x, t, dt),
-                    max_components=self.max_components,
-                    split_threshold=self.split_threshold,
-                    scale=self.split_scale,
-                )
-            root = model.noise_sqrt(t, dt)
-            return propagate_mixture(belief, lambda x: flow(x, t, dt), root)
-
-    def _read(
-        self,
-        belief: Any,
-        agent: int,
-        said: Sequence[Observation],
-        step: Step,
-        beside: Any = None,
-    ) -> tuple[Any, Any]:
-        """An agent's belief after readings, without those that fail its gate, and one beside it.
-
-        >>> from distfilt.models import Model
-        >>> from distfilt.sensors import component
-        >>> still = Model(2, lambda x, t, dt: x, lambda t, dt: np.zeros((2, 2)))
-        >>> eyes = [component([k], std=1.0) for k in range(2)]
-        >>> f = MixtureFilter(still, [eyes], target_dim=2, gate_probability=0.99)
-        >>> state = f.start((np.zeros(2), np.eye(2)))
-        >>> state = f.step(
-        ...     state,
-        ...     0.0,
-        ...     [[Observation(0.0, 0, [9.0]), Observation(0.0, 0, [1.0], 1)]],
-        ... )
-        >>> state.mixtures[0].means, state.rejected
-        (array([[0. , 0.5]]), array([1.]))
-        """
-        from scipy.special import gammaincinv
-
-        for reading in said:
-            sensor = sensor_of(self, reading)
-            y = reading.value
-            about: Any = sensor.predict, sensor.noise_cov
-            residual = sensor.residual
-            with step.failing_as(agent):
-                if self.gate_probability is not None:
-                    width = float(
-                        np.sqrt(
-                            2
-                            * gammaincinv(
-                                (~np.isnan(y)).sum() / 2, self.gate_probability
-                            )
-                        )
-                    )
-                    y = within_gate(belief, y, *about, gate=width, residual=residual)
-                belief = update_mixture(belief, y, *about, residual=residual)
-                # What passes the gate counts for both, or one would hold it to be news.
-                beside = (
-                    None
-                    if beside is None
-                    else update_mixture(beside, y, *about, residual=residual)
-                )
-            if step.rejected is not None:
-                step.rejected[agent] += np.isnan(y).all()
-        return belief, beside
-
-    def _told(
-        self, beliefs: list[GaussianMixture], step: Step
+    def _assimilate(
+        self, beliefs: list[GaussianMixture], step: Step[MixtureState]
     ) -> tuple[Sequence[GaussianMixture], Sequence[GaussianMixture | None]]:
-        """The beliefs after the agents' readings and their exchange, and what stays untold.
+        """Return the beliefs after the agents' observations and the fusion; nothing is unsent.
 
         >>> from functools import partial
         >>> from distfilt.mixtures import target_fusion
@@ -274,25 +292,31 @@ class MixtureFilter(Filter):
         >>> f.step(f.start(([0.0], [[1.0]])), 1.0, [None] * 3).ledger.messages
         array([0, 1, 1])
         """
-        after = [
-            self._read(b, k, step.observations[k], step)[0]
-            for k, b in enumerate(beliefs)
-        ]
-        return (self._agreed(after, step) if step.has_fusion else after), ()
+        after = []
+        for agent, belief in enumerate(beliefs):
+            updated, _ = self._condition(belief, agent, step.observations[agent], step)
+            after.append(updated)
+        if step.has_fusion:
+            after = self._fuse(after, step)
+        return after, ()
 
-    def _agreed(
-        self, beliefs: list[GaussianMixture], step: Step
+    def _fuse(
+        self, beliefs: list[GaussianMixture], step: Step[MixtureState]
     ) -> list[GaussianMixture]:
-        """What the rule of agreement makes of the beliefs."""
-        out = list(step.filter.fusion(beliefs, step.channel))
-        for k, (fused, belief) in enumerate(zip(out, beliefs, strict=True)):
-            if not isinstance(fused, GaussianMixture) or fused.dim != belief.dim:
-                got = (
-                    fused.dim
-                    if isinstance(fused, GaussianMixture)
-                    else type(fused).__name__
+        """Apply the fusion rule and check its results."""
+        rule = cast(Any, self.fusion)
+        fused = list(call_user(rule, beliefs, step.channel))
+        for agent, (new, old) in enumerate(zip(fused, beliefs, strict=True)):
+            if not isinstance(new, GaussianMixture):
+                raise InvalidArgumentError(
+                    f"fusion must return mixtures of dimension {old.dim}, got a "
+                    f"{type(new).__name__}"
                 )
-                raise ValueError(f"fusion must have dimension {belief.dim}, got {got}")
-            with step.failing_as(k):
-                fused.factors  # noqa: B018  # a LinAlgError where the fusion has collapsed
-        return out
+            if new.dim != old.dim:
+                raise ValueError(
+                    f"fusion must return mixtures of dimension {old.dim}, got {new.dim}"
+                )
+            with step.failing_as(agent):
+                # Raises a LinAlgError if the fusion has made a covariance singular.
+                new.factors  # noqa: B018
+        return fused

@@ -1,4 +1,4 @@
-"""A network of particle filters: weigh draws of the forecast by the likelihood, then resample."""
+"""A network of particle filters: weight draws of the forecast by the likelihood, then resample."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ import numpy as np
 
 from ..updates import particles
 from ..validation import Array, Mask, UnitInterval
-from .ensemble import MembersFilter, Several, regress_past
-from .inbox import Received
+from .ensemble import AtLeastTwo, MembersFilter, regress_past
+from .options import ExchangesAtIntervals, SharesObservations
+from .priors import Prior
 from .record import Summary
-from .saving import SensorState
-from .step import Step, run_isolated
+from .states import SensorState
+from .step import Received, Step
 
 __all__ = ["ParticleFilter", "ParticleState"]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ParticleState(SensorState):
-    """What the agents' weighted particles are between two steps.
+    """The agents' weighted particles between two steps.
 
     Parameters
     ----------
@@ -65,22 +66,27 @@ class ParticleState(SensorState):
 
 
 @dataclass(frozen=True, eq=False)
-class ParticleFilter(MembersFilter):
+class ParticleFilter(
+    MembersFilter[ParticleState],
+    SharesObservations[ParticleState],
+    ExchangesAtIntervals[ParticleState],
+):
     """One bootstrap particle filter per agent, for any model and sensors.
 
     Parameters
     ----------
-    model, sensors, graph, fusion, share_observations, faults, lag, names, on_error, gate_probability,
-        exchange_interval
-        As for :class:`~distfilt.filters.Filter`. The agreement is one of ensembles; agents
-        resample before it.
+    model, sensors, graph, gate_probability, faults, names
+        As for :class:`~distfilt.filters.SensorFilter`.
+    fusion, share_observations, lag, on_error, exchange_interval
+        As in :mod:`distfilt.filters.options`. The rule is one of ensembles; agents resample
+        before it.
     members : int
         Number N of particles of each agent.
-    threshold : float
-        An agent resamples, by :func:`distfilt.updates.resampled`, when its effective sample size
-        falls below this share of N, in [0, 1].
+    ess_threshold : float
+        An agent resamples, by :func:`distfilt.updates.resample`, when its effective sample size
+        falls below this fraction of N, in [0, 1].
     jitter : float, optional
-        Bandwidth of the kernel that moves copies apart, in [0, 1], in units of the particles'
+        Bandwidth of the kernel that separates copies, in [0, 1], in units of the particles'
         weighted spread; 0 for none. Particles that were not copied stay. By default Silverman's
         for a model without noise, whose copies never part by themselves, and none for others.
 
@@ -100,85 +106,99 @@ class ParticleFilter(MembersFilter):
     """
 
     _: KW_ONLY
-    members: Several = 1000
+    members: AtLeastTwo = 1000
     ess_threshold: UnitInterval = 0.5
     jitter: UnitInterval | None = None
 
-    state_class: ClassVar[type[ParticleState]] = ParticleState
+    state_class: ClassVar[type[Any]] = ParticleState
     batched_summary: ClassVar[bool] = True
 
     def initial_state(
-        self, prior: Any, runs: tuple[int, ...], rng: Any
+        self, prior: Prior, runs: tuple[int, ...], rng: Any
     ) -> dict[str, Any]:
-        """Particles drawn for each agent, with equal weights."""
-        points = self.draw_prior(prior, (*runs, self.n_agents), rng)
-        return {
-            "particles": points,
-            "log_weights": np.full(points.shape[:-1], -np.log(self.members)),
-        }
+        """Draw particles for each agent, with equal weights."""
+        drawn = self.draw_prior(prior, (*runs, self.n_agents), rng)
+        log_weights = np.full(drawn.shape[:-1], -np.log(self.members))
+        return {"particles": drawn, "log_weights": log_weights}
 
-    def next_state(self, step: Step) -> Any:
-        """Resample where it is due, forecast, weigh by what was heard, agree.
+    def next_state(self, step: Step[ParticleState]) -> ParticleState:
+        """Resample where it is due, forecast, weight by the likelihood, fuse.
 
         Warns
         -----
         ParticleCollapse
-            If less than a hundredth of an agent's particles, or only one, differ from the others,
-            or if the effective size of its weights is below two.
+            If less than a hundredth of an agent's particles, or only one, are distinct, or if the
+            effective size of its weights is below two.
         """
         state = step.state
         stack = step.stack(state.particles)
-        weights = self._resampled(stack, state, step)
-        old = stack[
-            -1
-        ]  # where each particle comes from, which is not where it was in the state
+        log_weights = self._resample(stack, state, step)
+        # Where each particle comes from: resampling has moved it from its place in the state.
+        origin = stack[-1]
         if step.dt:
-            moved = self.model.sample_step(stack[-1], state.t, step.dt, rng=step.rng)
-            stack[-1] = step.check_forecast(moved, stack[-1])
+            moved = self.model.sample_step(origin, state.t, step.dt, rng=step.rng)
+            stack[-1] = step.check_forecast(moved, origin)
         for place, group in step.received():
-            rows = group.rows
-            before = step.before(place, group, [old] if step.dt else stack[:-1])
-            predicted = group.predict(stack[place][..., rows, :, :], before)
-            logs = weights[..., rows, :]
-            group = step.gate(
-                group, lambda x, w: weighted_moments(x, np.exp(w)), predicted, logs
-            )
-            step.record_failures(_weigh(weights, predicted, group), group.agents)
+            past = [origin] if step.dt else stack[:-1]
+            self._weight(log_weights, stack[place], place, group, past, step)
         if step.has_fusion:
-            # The particles have to be an ensemble, which the agreement can move.
-            offset = step.rng.random((*weights.shape[:-1], 1))
-            self._pick(
-                stack,
-                weights,
-                np.exp(weights),
-                np.ones(weights.shape[:-1], bool),
-                offset,
-            )
-        (now,) = step.fuse(stack[-1])
-        after = step.end(
-            particles=now, log_weights=weights, past=regress_past(stack, now)
-        )
+            # A fusion rule moves an ensemble, so the particles need equal weights.
+            offset = step.rng.random((*log_weights.shape[:-1], 1))
+            everybody = np.ones(log_weights.shape[:-1], bool)
+            weights = np.exp(log_weights)
+            self._select(stack, log_weights, weights, everybody, offset)
+        (fused,) = step.fuse(stack[-1])
+        past = regress_past(stack, fused)
+        after = step.end(particles=fused, log_weights=log_weights, past=past)
         self._warn(after)
         return after
 
     def summarize(self, state: ParticleState) -> Summary:
-        """Weighted means and covariances, effective sizes and the share of distinct particles."""
-        w = state.weights
-        mean, cov = weighted_moments(state.particles, w)
+        """Return weighted moments, effective sizes and the fraction of distinct particles."""
+        weights = state.weights
+        mean, cov = weighted_moments(state.particles, weights)
         cov = state.mask_failed(cov)
-        sizes = state.effective_size
         distinct = particles.distinct_fraction(state.particles)
         numbers = {
-            "effective_size": state.mask_failed(sizes),
+            "effective_size": state.mask_failed(state.effective_size),
             "distinct": state.mask_failed(distinct),
         }
         variance = np.diagonal(cov, axis1=-2, axis2=-1)
-        return Summary(
-            state.mask_failed(mean), variance, cov, state.particles, w, numbers
-        )
+        mean = state.mask_failed(mean)
+        return Summary(mean, variance, cov, state.particles, weights, numbers)
 
-    def _resampled(self, stack: list[Array], state: ParticleState, step: Step) -> Array:
-        """Log-weights after agents with a poor effective size have resampled, in place.
+    def _weight(
+        self,
+        log_weights: Array,
+        members: Array,
+        place: int,
+        group: Received,
+        past: list[Array],
+        step: Step[ParticleState],
+    ) -> None:
+        """Multiply a group's weights by the likelihood of its observations, in place."""
+        rows = group.rows
+        previous = step.before(place, group, past)
+        predicted = group.predict(members[..., rows, :, :], previous)
+        old = log_weights[..., rows, :]
+        group = step.gate(group, _moments_by_logs, predicted, old)
+
+        def compute(h: Array, y: Array, logs: Array, noise: Array, _: Any) -> Any:
+            return (particles.reweight(logs, h, y, noise),)
+
+        (new,) = step.apply(
+            compute,
+            (predicted, group.target, old),
+            (old,),
+            group.agents,
+            shared=group.noise,
+        )
+        log_weights[..., rows, :] = new
+
+    def _resample(
+        self, stack: list[Array], state: ParticleState, step: Step[ParticleState]
+    ) -> Array:
+        """Resample agents with a small effective size, in place; return the log-weights.
 
         >>> from distfilt.models import constant_velocity
         >>> f = ParticleFilter(
@@ -190,65 +210,79 @@ class ParticleFilter(MembersFilter):
         ...     jitter=0.5,
         ... )
         >>> state = f.start((np.zeros(4), np.eye(4)), rng=np.random.default_rng(0))
-        >>> fine, poor = state.log_weights[0], np.log([0.7, 0.1, 0.1, 0.1])
-        >>> moved = [
-        ...     f.step(state.replace(log_weights=np.array([w, poor])), 0.0, [None] * 2)
-        ...     for w in (fine, poor)
+        >>> equal, unequal = state.log_weights[0], np.log([0.7, 0.1, 0.1, 0.1])
+        >>> after = [
+        ...     f.step(
+        ...         state.replace(log_weights=np.array([w, unequal])), 0.0, [None] * 2
+        ...     )
+        ...     for w in (equal, unequal)
         ... ]
-        >>> (moved[0].particles == moved[1].particles).all(axis=(1, 2))
+        >>> (after[0].particles == after[1].particles).all(axis=(1, 2))
         array([False,  True])
         """
-        weights = state.log_weights.copy()
+        log_weights = state.log_weights.copy()
         before = stack[-1]
-        # Everybody draws, needed or not: an agent's luck must not depend on another's weights.
-        offset = step.rng.random((*weights.shape[:-1], 1))
-        width = self._bandwidth(state.t, step.dt)
-        noise = step.rng.standard_normal(before.shape) if width else None
-        poor = state.effective_size < self.ess_threshold * self.members
-        if not poor.any():
-            return weights
-        counts = self._pick(stack, weights, state.weights, poor, offset)
+        # Every agent draws, also if it does not resample: its numbers must not depend on
+        # another's weights.
+        offset = step.rng.random((*log_weights.shape[:-1], 1))
+        bandwidth = self._bandwidth(state.t, step.dt)
+        noise = step.rng.standard_normal(before.shape) if bandwidth else None
+        is_due = state.effective_size < self.ess_threshold * self.members
+        if not is_due.any():
+            return log_weights
+        counts = self._select(stack, log_weights, state.weights, is_due, offset)
         if noise is not None:
-            # Where one weight dominates, the spread of all particles: the weighted one is gone.
-            lost = state.effective_size[poor][:, None] < 2
-            shares = np.where(lost, 1 / self.members, state.weights[poor])
-            cov = weighted_moments(before[poor], shares)[1]
-            copied = particles.repeat_by_count((counts > 1)[..., None], counts).reshape(
-                -1, self.members
+            # Where one weight dominates, the weighted spread is gone; all particles' is used.
+            is_degenerate = state.effective_size[is_due][:, None] < 2
+            equal = 1 / self.members
+            weights = np.where(is_degenerate, equal, state.weights[is_due])
+            _, cov = weighted_moments(before[is_due], weights)
+            is_copied = (counts > 1)[..., None]
+            copied = particles.repeat_by_count(is_copied, counts)
+            stack[-1][is_due] = particles.add_jitter(
+                stack[-1][is_due],
+                cov,
+                bandwidth,
+                noise[is_due],
+                copied.reshape(-1, self.members),
             )
-            stack[-1][poor] = particles.add_jitter(
-                stack[-1][poor], cov, width, noise[poor], copied
-            )
-        return weights
+        return log_weights
 
     def _bandwidth(self, t: float, dt: float) -> float:
-        """How far copies are moved apart: by default where the model never does it."""
+        """Return the bandwidth of the jitter; by default none if the model has noise."""
         if self.jitter is not None:
             return self.jitter
-        still = not np.count_nonzero(self.model.noise_cov(t, dt or 1.0))
-        return particles.silverman(self.members, self.model.dim) if still else 0.0
+        # A step of no length adds no noise, so a unit step shows whether the model has any.
+        if np.count_nonzero(self.model.Q(t, dt or 1.0)):
+            return 0.0
+        return particles.silverman(self.members, self.model.dim)
 
-    def _pick(
+    def _select(
         self,
         stack: list[Array],
         log_weights: Array,
         weights: Array,
-        poor: Mask,
+        agents: Mask,
         offset: Array,
     ) -> Any:
-        """Resample some agents' paths in the stack; the weights are equal then."""
-        rows = slice(None) if poor.all() else poor
+        """Resample some agents' paths in the stack; their weights are equal then.
+
+        Returns how often each particle was taken.
+        """
+        rows: Any = slice(None) if agents.all() else agents
         counts = particles.systematic_counts(weights[rows], offset[rows])
         for k, path in enumerate(stack):
-            stack[k] = moved = particles.repeat_by_count(path[rows], counts)
-            if rows is poor:
+            taken = particles.repeat_by_count(path[rows], counts)
+            if rows is agents:
                 stack[k] = path.copy()
-                stack[k][rows] = moved
+                stack[k][rows] = taken
+            else:
+                stack[k] = taken
         log_weights[rows] = -np.log(self.members)
         return counts
 
     def _warn(self, state: ParticleState) -> None:
-        """Distinct particles may have no weight, and particles of equal weight may be copies.
+        """Warn if few particles are distinct, or if few of them have any weight.
 
         >>> import warnings
         >>> from distfilt.models import constant_velocity
@@ -259,9 +293,9 @@ class ParticleFilter(MembersFilter):
         ...     share_observations=False,
         ...     members=200,
         ... )
-        >>> apart = np.random.default_rng(0).standard_normal((2, 200, 4))
-        >>> for moved in ([1.0, 0.0], [1.0, 1.0]):  # the first components are known
-        ...     points = apart * np.array(moved)[:, None, None] * [0, 1, 1, 1]
+        >>> drawn = np.random.default_rng(0).standard_normal((2, 200, 4))
+        >>> for scale in ([1.0, 0.0], [1.0, 1.0]):  # the first components are known
+        ...     points = drawn * np.array(scale)[:, None, None] * [0, 1, 1, 1]
         ...     with warnings.catch_warnings(record=True) as caught:
         ...         warnings.simplefilter("always")
         ...         f._warn(
@@ -282,41 +316,36 @@ class ParticleFilter(MembersFilter):
         if np.count_nonzero(state.failed):
             points = points[~state.failed]
             size = size[~state.failed]
-        least = max(0.01 * self.members, 2.0)
-        # A few whose first components differ are proof enough; all are looked at where they do not.
-        few = np.sort(points[..., :: max(1, self.members // (4 * math.ceil(least))), 0])
-        apart = (few[..., 1:] > few[..., :-1]).sum(axis=-1)
-        distinct = apart.min(initial=self.members) / self.members
-        if distinct * self.members < least:
-            distinct = particles.distinct_fraction(points).min()
-        if distinct * self.members < least:
-            what = f"{distinct:.2%} of an agent's particles are distinct"
+        fewest = max(0.01 * self.members, 2.0)
+        distinct = self._count_distinct(points, fewest) / self.members
+        if distinct * self.members < fewest:
+            problem = f"{distinct:.2%} of an agent's particles are distinct"
         elif size.min(initial=np.inf) < 2:
-            what = f"an agent's weights have an effective size of {size.min():.1f}"
+            problem = f"an agent's weights have an effective size of {size.min():.1f}"
         else:
             return
-        particles.warn_of_collapse(f"t = {state.t:g} s: {what}", "jitter=")
+        particles.warn_of_collapse(f"t = {state.t:g} s: {problem}", "jitter=")
+
+    def _count_distinct(self, points: Array, fewest: float) -> float:
+        """Return a lower bound of each agent's number of distinct particles, above `fewest`."""
+        # A sample whose first components differ is enough. Only if they do not, e.g. because a
+        # component is known, all particles are compared.
+        stride = max(1, self.members // (4 * math.ceil(fewest)))
+        first = np.sort(points[..., ::stride, 0])
+        n_distinct = (first[..., 1:] > first[..., :-1]).sum(axis=-1)
+        bound = float(n_distinct.min(initial=self.members))
+        if bound < fewest:
+            bound = particles.distinct_fraction(points).min() * self.members
+        return bound
 
 
-def weighted_moments(points: Array, w: Array) -> tuple[Array, Array]:
+def _moments_by_logs(predicted: Array, log_weights: Array) -> tuple[Array, Array]:
+    return weighted_moments(predicted, np.exp(log_weights))
+
+
+def weighted_moments(points: Array, weights: Array) -> tuple[Array, Array]:
     """Mean (..., d) and covariance (..., d, d) of points (..., N, d) with weights (..., N)."""
-    mean = (w[..., None, :] @ points)[..., 0, :]
-    # Components first: weights then multiply along all particles.
-    around = np.subtract(points.mT, mean[..., None], order="C")
-    return mean, (w[..., None, :] * around) @ around.mT
-
-
-def _weigh(
-    weights: Array, predicted: Array, group: Received
-) -> dict[tuple[int, ...], str]:
-    """Multiply a group's weights by the likelihood, in place; the rows that failed."""
-    old = weights[..., group.rows, :]
-    (new,), errors = run_isolated(
-        lambda h, y, w, noise, _: (particles.reweight(w, h, y, noise),),
-        (predicted, group.target, old),
-        (old,),
-        group.target.ndim - 1,
-        shared=group.noise,
-    )
-    weights[..., group.rows, :] = new
-    return errors
+    mean = (weights[..., None, :] @ points)[..., 0, :]
+    # Components first, so that the weights multiply along contiguous particles.
+    anomalies = np.subtract(points.mT, mean[..., None], order="C")
+    return mean, (weights[..., None, :] * anomalies) @ anomalies.mT

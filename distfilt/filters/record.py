@@ -1,4 +1,4 @@
-"""What a run leaves behind: estimates, spreads, scores and the ledger, with named axes."""
+"""The record of a run: estimates, spreads, scores and the ledger, with named axes."""
 
 from __future__ import annotations
 
@@ -6,30 +6,38 @@ import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby, islice
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..ensembles import sample_covariance
-from ..linalg import cholesky, to_unit_variances, quadratic_form
+from ..linalg import cholesky, quadratic_form, to_unit_variances
 from ..metrics import crps, gaussian_crps
+from ..network import Ledger
 from ..validation import Array, check_array
-from .saving import State, stack_states
+from .states import State, stack_states
 
 if TYPE_CHECKING:
     import xarray
 
-__all__ = ["SCORES", "Score", "Summary", "final_state", "record_run"]
+    from .base import Filter
+
+    Truth = ArrayLike | Mapping[str, ArrayLike] | None
+else:
+    # Checked by `_read_truth`, which converts it; a table of pandas serves as a mapping.
+    Truth = Any
+
+__all__ = ["SCORES", "Score", "Summary", "Truth", "final_state", "record_run"]
 
 Score = Literal["squared_error", "nees", "crps"]
 SCORES: tuple[Score, ...] = ("squared_error", "nees", "crps")
-"""What can be recorded beside a known truth."""
+"""The scores that can be recorded with a known truth."""
 
-_BLOCK = 32768
-"""Up to how many numbers the states have whose summaries are made together."""
+_BLOCK_SIZE = 32768
+"""Up to how many numbers small states have together whose summaries are made at once."""
 
-_SENT = ("messages", "scalars", "bytes", "lost", "rounds")
-_WHEN = ("in this step", "so far")
+_LEDGER_FIELDS = ("messages", "scalars", "bytes", "lost", "rounds")
 
 _MEANING = {
     "mean": ("estimate of the state", "of the component"),
@@ -46,13 +54,17 @@ _MEANING = {
         "normalised estimation error squared; its mean is d for a consistent filter",
         "1",
     ),
-    "rejected": ("readings that the gate left out in this step", "1"),
+    "rejected": ("observations that the gate rejected in this step", "1"),
 }
+"""Long name and unit of each recorded variable."""
+
+Believed = tuple[Any, Any]
+"""A state, and the belief about its time that is recorded: with a lag, a later one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Summary:
-    """What a filter says of its state, for the record.
+    """Estimates of a state, for the record.
 
     Parameters
     ----------
@@ -61,15 +73,15 @@ class Summary:
     covariance : ndarray, (*runs, A, d, d), optional
         For NEES.
     members : ndarray, (*runs, A, N, d), optional
-        For CRPS, and for NEES where there is no covariance; without members CRPS is a Gaussian's.
+        For CRPS, and for NEES if there is no covariance; without members CRPS is a Gaussian's.
     weights : ndarray, (*runs, A, N), optional
         The members' weights, if they differ.
     numbers : mapping of str to ndarray, (*runs, A)
-        What else is worth a record, such as an effective sample size.
+        Further numbers to record, such as an effective sample size.
 
     Examples
     --------
-    One that tells for all what the agent believes who knows most:
+    A filter that records for all agents the belief of the most certain one:
 
     >>> from distfilt.filters import GaussianFilter
     >>> from distfilt.models import Model
@@ -94,182 +106,236 @@ class Summary:
     numbers: Mapping[str, Array] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, eq=False)
+class _KnownTruth:
+    """The truth, (T, *runs, 1 or A, d), and the index of the components that are known."""
+
+    values: Array
+    components: Any
+
+
 def record_run(
-    filter_: Any,
+    f: Filter[Any],
     times: Array,
-    start: Any,
-    said: Iterable[tuple[Any, Any]],
-    truth: Any,
+    start: State,
+    believed: Iterable[Believed],
+    truth: Truth,
     scores: Collection[Score],
 ) -> xarray.Dataset:
-    """One Dataset of states, each with what it is believed as; `start` is the one before.
+    """Record the states of a run in one Dataset.
 
-    Names and units are the filter's; the scores compare with the `truth`, as
-    :meth:`distfilt.filters.Filter.run` describes it.
+    Parameters
+    ----------
+    f : Filter
+        Names and units are the filter's.
+    times : ndarray, (T,)
+    start : State
+        The state before the run.
+    believed : iterable of (state, state)
+        The state at each time, and the belief about that time.
+    truth, scores
+        As for :meth:`distfilt.filters.Filter.run`.
     """
     import xarray
 
-    names, units = filter_.components
-    agents = list(filter_.agents)
-    known, chosen = _known(truth, names, (times.size, *start.runs), len(agents))
-    series, ledgers, last = _followed(filter_, start, said, known, chosen, scores)
-    n = len(start.runs)
-    lead = ("time", *(("run",) if n == 1 else [f"run{i}" for i in range(n)]), "agent")
+    names, units = f.components
+    agents = list(f.agents)
+    runs = start.runs
+    known = _read_truth(truth, names, (times.size, *runs), len(agents))
+    series, ledgers, last = _collect_series(f, start, believed, known, scores)
+
+    run_axes = ["run"] if len(runs) == 1 else [f"run{i}" for i in range(len(runs))]
+    lead = ("time", *run_axes, "agent")
     axes = {"covariance": (*lead, "component", "column")}
-    axes |= {
-        k: (*lead, "component") for k in ("mean", "variance", "squared_error", "crps")
-    }
-    data = {}
+    for name in ("mean", "variance", "squared_error", "crps"):
+        axes[name] = (*lead, "component")
+    variables: dict[str, Any] = {}
     for name, values in series.items():
         meaning, unit = _MEANING.get(name, (name.replace("_", " "), "1"))
-        data[name] = axes.get(name, lead), values, {"long_name": meaning, "units": unit}
-    for name in _SENT:
-        data |= _counted(name, [getattr(ledger, name) for ledger in ledgers])
+        attributes = {"long_name": meaning, "units": unit}
+        variables[name] = axes.get(name, lead), values, attributes
+    for name in _LEDGER_FIELDS:
+        variables |= _count_messages(name, ledgers)
     coords = {
         "time": ("time", times, {"units": "s"}),
         "agent": agents,
         "component": list(names),
         "unit": ("component", list(units)),
     }
-    out = xarray.Dataset(data, coords=coords)
-    # A selection or another run joined to this one inherits the entry: these tell them apart.
+    run = xarray.Dataset(variables, coords=coords)
+    # `encoding` is the only place that xarray hands on to copies and selections, and leaves out
+    # of tables and files. The agents and the last mean tell a part of the run from all of it.
     mean = np.array(series["mean"][-1]) if series else None
-    out.encoding["final_state"] = last, agents, mean
-    return out
+    run.encoding["final_state"] = last, agents, mean
+    return run
 
 
-def _followed(
-    filter_: Any,
-    last: Any,
-    said: Iterable[tuple[Any, Any]],
-    known: Array | None,
-    at: Any,
+def _collect_series(
+    f: Filter[Any],
+    start: State,
+    believed: Iterable[Believed],
+    known: _KnownTruth | None,
     scores: Collection[Score],
-) -> tuple[dict[str, Array], list[Any], Any]:
-    """What is recorded of all states, along a first axis, their ledgers, and the last one."""
+) -> tuple[dict[str, Array], list[Ledger], State]:
+    """Return the recorded arrays, (T, ...) each, the ledgers, and the last state."""
     rows: list[dict[str, Array]] = []
-    ledgers = [last.ledger]
-    for block in _blocks(said, filter_.batched_summary):
-        states, believed = zip(*block, strict=True)
-        done = len(ledgers) - 1
-        several = len(block) > 1
-        last = states[-1]
+    ledgers = [start.ledger]
+    last = start
+    for block in _blocks(believed, f.batched_summary):
+        first = len(ledgers) - 1
+        states = [state for state, _ in block]
         ledgers += [state.ledger for state in states]
-        summary = filter_.summarize(stack_states(believed) if several else believed[0])
-        row = {"mean": summary.mean, "variance": summary.variance, **summary.numbers}
-        if summary.covariance is not None:
-            row["covariance"] = summary.covariance
+        last = states[-1]
+        is_single = len(block) == 1
+        beliefs = [belief for _, belief in block]
+        summary = f.summarize(beliefs[0] if is_single else stack_states(beliefs))
+        row = _read_summary(summary)
         if last.rejected is not None:
-            row["rejected"] = (
-                np.array([s.rejected for s in states]) if several else last.rejected
-            )
+            rejected = [state.rejected for state in states]
+            row["rejected"] = np.array(rejected[0] if is_single else rejected)
         if known is not None:
-            true = known[done : len(ledgers) - 1] if several else known[done]
-            row |= _scored(summary, true, at, scores)
-        rows.append(
-            row if several else {name: value[None] for name, value in row.items()}
-        )
-    series = {
-        name: np.concatenate([row[name] for row in rows]) for name in (rows or [{}])[0]
-    }
-    if series:
-        spread = np.sqrt(np.nansum(variance := series["variance"], axis=-1))
-        series["spread"] = np.where(np.isnan(variance).all(axis=-1), np.nan, spread)
+            index: Any = first if is_single else slice(first, first + len(block))
+            row |= _score(summary, known.values[index], known.components, scores)
+        if is_single:
+            row = {name: value[None] for name, value in row.items()}
+        rows.append(row)
+    if not rows:
+        return {}, ledgers, last
+    series = {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+    variance = series["variance"]
+    spread = np.sqrt(np.nansum(variance, axis=-1))
+    is_missing = np.isnan(variance).all(axis=-1)
+    series["spread"] = np.where(is_missing, np.nan, spread)
     return series, ledgers, last
 
 
-def _blocks(
-    said: Iterable[tuple[Any, Any]], joins: bool
-) -> Iterator[list[tuple[Any, Any]]]:
-    """Small states of one shape together: what is recorded of them takes one call."""
-    for shape, alike in groupby(
-        said, lambda pair: pair[1].belief.shape if joins else (_BLOCK,)
-    ):
-        while block := [*islice(alike, max(1, _BLOCK // math.prod(shape)))]:
+def _read_summary(summary: Summary) -> dict[str, Array]:
+    """Return the arrays of a summary that are recorded, by name."""
+    row = {"mean": summary.mean, "variance": summary.variance, **summary.numbers}
+    if summary.covariance is not None:
+        row["covariance"] = summary.covariance
+    return row
+
+
+def _blocks(believed: Iterable[Believed], batched: bool) -> Iterator[list[Believed]]:
+    """Yield small states of one shape together, so that one call summarizes them."""
+
+    def shape_of(pair: Believed) -> tuple[int, ...]:
+        # One block for each state if they cannot be stacked.
+        return (
+            cast(tuple[int, ...], pair[1].belief.shape) if batched else (_BLOCK_SIZE,)
+        )
+
+    for shape, same_shape in groupby(believed, shape_of):
+        size = max(1, _BLOCK_SIZE // math.prod(shape))
+        block = list(islice(same_shape, size))
+        while block:
             yield block
+            block = list(islice(same_shape, size))  # noqa: B031
 
 
-def _known(
-    truth: Any, names: Sequence[str], shape: tuple[int, ...], agents: int
-) -> tuple[Array | None, Any]:
-    """The truth, (T, *runs, 1 or A, d), and which components of it are known."""
+def _read_truth(
+    truth: Any, names: Sequence[str], shape: tuple[int, ...], n_agents: int
+) -> _KnownTruth | None:
+    """Check the truth, whose shape is (T, *runs) for each component."""
     if truth is None:
-        return None, slice(None)
-    if hasattr(truth, "columns") and {*truth.columns} <= {*names}:
-        truth = dict(truth)  # a table says itself which component is which
-    if not isinstance(truth, Mapping):
-        x = check_array(truth, "truth", None, finite=False)
-        if x.shape == (*shape, len(names)):
-            return x[..., None, :], slice(None)
-        if x.shape != (*shape, agents, len(names)):
-            needs = f"shape {(*shape, len(names))}, one for each of {agents} agents, or a dict of "
-            raise ValueError(
-                f"truth must be {needs}those components that are known, got {x.shape}"
-            )
-        return x, slice(None)
+        return None
+    # A table whose columns are components says itself which is which.
+    if hasattr(truth, "columns") and set(truth.columns) <= set(names):
+        truth = dict(truth)
+    if isinstance(truth, Mapping):
+        return _read_components(truth, names, shape, n_agents)
+    values = check_array(truth, "truth", None, finite=False)
+    if values.shape == (*shape, len(names)):
+        return _KnownTruth(values[..., None, :], slice(None))
+    if values.shape != (*shape, n_agents, len(names)):
+        raise ValueError(
+            f"truth must be shape {(*shape, len(names))}, one for each of {n_agents} "
+            f"agents, or a dict of those components that are known, got {values.shape}"
+        )
+    return _KnownTruth(values, slice(None))
+
+
+def _read_components(
+    truth: Mapping[str, Any],
+    names: Sequence[str],
+    shape: tuple[int, ...],
+    n_agents: int,
+) -> _KnownTruth:
+    """Check a truth of some components, by their names; the others are NaN."""
     unknown = [name for name in truth if name not in names]
     if unknown or not truth:
         raise ValueError(
             f"truth must have components of {', '.join(names)}, got {unknown}"
         )
-    whole = np.full((*shape, agents, len(names)), np.nan)
-    for name, given in truth.items():
-        x = check_array(given, f"truth[{name!r}]", None)
-        x = (
-            x[..., None]
-            if x.shape == shape
-            else check_array(x, "truth", (*shape, agents))
-        )
-        whole[..., names.index(name)] = x
-    return whole, [names.index(name) for name in truth]
-
-
-def _scored(
-    summary: Summary, known: Array, at: Any, scores: Collection[Score]
-) -> dict[str, Array]:
-    out: dict[str, Array] = {}
-    mean = summary.mean
-    some = summary.members
-    known = np.broadcast_to(known, mean.shape)
-    good: Any = np.isfinite(mean[..., at]).all(axis=-1) & np.isfinite(
-        known[..., at]
-    ).all(axis=-1)
-    if "squared_error" in scores:
-        squared = (mean - known) ** 2
-        out["squared_error"] = squared
-        out["total_squared_error"] = squared[..., at].sum(axis=-1)
-    if "crps" in scores:
-        if some is None:
-            found = gaussian_crps(mean, np.sqrt(summary.variance), known)
+    values = np.full((*shape, n_agents, len(names)), np.nan)
+    for name, entry in truth.items():
+        series = check_array(entry, f"truth[{name!r}]", None)
+        if series.shape == shape:
+            series = series[..., None]
         else:
-            found = crps(some, known, weights=summary.weights)
-        out["crps"] = np.where(good[..., None] & ~np.isnan(known), found, np.nan)
-    mean = mean[..., at]
-    known = known[..., at]
-    cov = (
-        None if summary.covariance is None else summary.covariance[..., at, :][..., at]
-    )
-    if (
-        "nees" in scores
-        and cov is None
-        and some is not None
-        and some.shape[-2] > mean.shape[-1]
-    ):
-        cov = sample_covariance(some[..., at])
-    if "nees" in scores and cov is not None:
-        out["nees"] = np.full(good.shape, np.nan)
-        out["nees"][good] = _nees(mean[good], cov[good], known[good])
-    return out
+            series = check_array(series, "truth", (*shape, n_agents))
+        values[..., names.index(name)] = series
+    return _KnownTruth(values, [names.index(name) for name in truth])
+
+
+def _score(
+    summary: Summary, truth: Array, components: Any, scores: Collection[Score]
+) -> dict[str, Array]:
+    """Return the scores of a summary in the components that are known."""
+    result: dict[str, Array] = {}
+    mean = summary.mean
+    truth = np.broadcast_to(truth, mean.shape)
+    known_mean = mean[..., components]
+    known_truth = truth[..., components]
+    is_finite = np.isfinite(known_mean) & np.isfinite(known_truth)
+    is_scored = is_finite.all(axis=-1)
+    if "squared_error" in scores:
+        squared = (mean - truth) ** 2
+        result["squared_error"] = squared
+        result["total_squared_error"] = squared[..., components].sum(axis=-1)
+    if "crps" in scores:
+        if summary.members is None:
+            value = gaussian_crps(mean, np.sqrt(summary.variance), truth)
+        else:
+            value = crps(summary.members, truth, weights=summary.weights)
+        is_known = is_scored[..., None] & ~np.isnan(truth)
+        result["crps"] = np.where(is_known, value, np.nan)
+    cov = _known_covariance(summary, components) if "nees" in scores else None
+    if cov is not None:
+        nees = np.full(is_scored.shape, np.nan)
+        error = known_mean[is_scored] - known_truth[is_scored]
+        nees[is_scored] = _nees(error, cov[is_scored])
+        result["nees"] = nees
+    return result
+
+
+def _known_covariance(summary: Summary, components: Any) -> Array | None:
+    """Return the covariance of the known components; None if the summary has none."""
+    if summary.covariance is not None:
+        return summary.covariance[..., components, :][..., components]
+    if summary.members is None:
+        return None
+    members = summary.members[..., components]
+    if members.shape[-2] <= members.shape[-1]:
+        # A sample covariance of so few members is singular.
+        return None
+    return sample_covariance(members)
 
 
 def final_state(run: xarray.Dataset) -> State:
-    """The state in which a run ended, to be saved or gone on from.
+    """Return the state in which a run ended, to save it or to go on from it.
 
     Parameters
     ----------
     run : xarray.Dataset
-        As :meth:`Filter.run` returned it. A part of a run that ends earlier, or that lacks runs or
-        agents, has no state.
+        The result of :meth:`Filter.run`, or a copy. A part of a run that ends earlier, or that
+        lacks runs or agents, has no state.
+
+    Returns
+    -------
+    State
+        Of the filter's family; :meth:`Filter.final_state` is typed as that.
 
     Examples
     --------
@@ -287,35 +353,38 @@ def final_state(run: xarray.Dataset) -> State:
     Traceback (most recent call last):
     ValueError: run must be the Dataset that a filter's run returned, got one without a state
     """
-    state, agents, last = getattr(run, "encoding", {}).get(
-        "final_state", (None, (), None)
-    )
-    if "mean" in run and run["time"].size and list(run["agent"].values) == agents:
-        ends = np.array_equal(run["time"].values[-1], state.t)
-        if ends and np.array_equal(run["mean"].values[-1], last, equal_nan=True):
-            return state  # type: ignore[no-any-return]
+    encoding = getattr(run, "encoding", {})
+    if "final_state" in encoding and "mean" in run and run["time"].size:
+        state, agents, last_mean = encoding["final_state"]
+        has_agents = list(run["agent"].values) == agents
+        has_end = np.array_equal(run["time"].values[-1], state.t)
+        if has_agents and has_end:
+            mean = run["mean"].values[-1]
+            if np.array_equal(mean, last_mean, equal_nan=True):
+                return cast(State, state)
     raise ValueError(
         "run must be the Dataset that a filter's run returned, got one without a state"
     )
 
 
-def _counted(name: str, values: list[Any]) -> dict[str, Any]:
-    """What was sent in each step, and in all until then."""
-    total = np.array(values)
+def _count_messages(name: str, ledgers: list[Ledger]) -> dict[str, Any]:
+    """Return one field of the ledgers as variables: in each step, and up to then."""
+    total = np.array([getattr(ledger, name) for ledger in ledgers])
     axes = ("time", "agent")[: total.ndim]
     unit = "B" if name == "bytes" else "1"
-    now, sums = ({"long_name": f"{name} {when}", "units": unit} for when in _WHEN)
+    in_step = {"long_name": f"{name} in this step", "units": unit}
+    so_far = {"long_name": f"{name} so far", "units": unit}
     return {
-        name: (axes, np.diff(total, axis=0), now),
-        f"{name}_total": (axes, total[1:], sums),
+        name: (axes, np.diff(total, axis=0), in_step),
+        f"{name}_total": (axes, total[1:], so_far),
     }
 
 
-def _nees(mean: Array, cov: Array, known: Array) -> Array:
-    """NEES, whatever the units; infinite where a cloud has collapsed, which claims certainty."""
-    shape, unit = to_unit_variances(cov)
-    sure = np.linalg.eigvalsh(shape)[..., 0] <= 1e-12
-    shape[sure] = np.eye(shape.shape[-1])
-    return np.where(
-        sure, np.inf, quadratic_form(cholesky(shape), (mean - known) / unit)
-    )
+def _nees(error: Array, cov: Array) -> Array:
+    """Return e' P^-1 e; infinite where an ensemble has collapsed, so that P is singular."""
+    # In units of the standard deviations, so that units do not matter.
+    correlation, unit = to_unit_variances(cov)
+    is_singular = np.linalg.eigvalsh(correlation)[..., 0] <= 1e-12
+    correlation[is_singular] = np.eye(correlation.shape[-1])
+    nees = quadratic_form(cholesky(correlation), error / unit)
+    return np.where(is_singular, np.inf, nees)

@@ -1,4 +1,4 @@
-"""One Gaussian: its density, its update, points that stand for it, ensembles moved onto it."""
+"""One Gaussian: its density, its update, its unscented points, ensembles with its moments."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from ..linalg import (
     EPS,
-    cholesky,
     broadcast_leading,
+    cholesky,
     log_det,
     quadratic_form,
     solve_definite,
@@ -18,6 +18,7 @@ from ..linalg import (
 from ..validation import (
     ALLOW_NAN,
     Array,
+    ArrayInput,
     Mask,
     PositiveDefinite,
     PositiveSemidefinite,
@@ -30,7 +31,9 @@ __all__ = ["condition", "log_density", "match_moments", "unscented_points"]
 
 @validated
 def log_density(
-    x: Annotated[Array, "... d"], mean: Annotated[Array, "... d"], cov: PositiveDefinite
+    x: Annotated[ArrayInput, "... d"],
+    mean: Annotated[ArrayInput, "... d"],
+    cov: PositiveDefinite,
 ) -> Array:
     r"""Logarithm of the Gaussian density, (...), relative to the volume in the state's units.
 
@@ -50,29 +53,28 @@ def log_density(
     >>> log_density([[0.0], [2.0]], [0.0], [[4.0]]).round(6)
     array([-1.612086, -2.112086])
     """
-    lead = broadcast_leading(x.shape[:-1], mean.shape[:-1], "mean")
-    broadcast_leading(lead, cov.shape[:-2], "cov")
+    leading = broadcast_leading(x.shape[:-1], mean.shape[:-1], "mean")
+    broadcast_leading(leading, cov.shape[:-2], "cov")
     lower = cholesky(cov)
     constant = x.shape[-1] * np.log(2 * np.pi)
-    return np.asarray(
-        -0.5 * (quadratic_form(lower, x - mean) + log_det(lower) + constant)
-    )
+    squared_length = quadratic_form(lower, x - mean)
+    return np.asarray(-0.5 * (squared_length + log_det(lower) + constant))
 
 
 @validated
 def match_moments(
-    ensemble: Annotated[Array, "... N d"],
-    mean: Annotated[Array, "... d"],
+    ensemble: Annotated[ArrayInput, "... N d"],
+    mean: Annotated[ArrayInput, "... d"],
     cov: PositiveDefinite,
 ) -> Array:
-    r"""Move an ensemble affinely so that its sample mean and covariance are the given ones.
+    r"""Map an ensemble affinely to the given sample mean and covariance.
 
     .. math:: \mathbf x_i' = \mathbf m + \mathbf A(\mathbf x_i-\bar{\mathbf x}),\qquad
         \mathbf A = \mathbf S^{-\top}(\mathbf S^\top\mathbf P\mathbf S)^{1/2}\mathbf S^{-1},\qquad
         \hat{\mathbf C} = \mathbf S\mathbf S^\top
 
-    A is the optimal transport between Gaussians: of all affine maps with this result it moves the
-    members least, with each component measured by its new standard deviation.
+    A is the optimal transport between Gaussians: of all affine maps with this result it has the
+    least mean squared displacement, in units of the new standard deviations.
 
     Parameters
     ----------
@@ -102,51 +104,54 @@ def match_moments(
         raise ValueError(
             f"ensemble must have more than {d} members for {d} components, got {n}"
         )
-    lead = broadcast_leading(ensemble.shape[:-2], mean.shape[:-1], "mean")
-    broadcast_leading(lead, cov.shape[:-2], "cov")
-    unit = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
-    scaled = ensemble / unit[..., None, :]
-    average = np.full(n, 1 / n)
-    centre = average @ scaled
+    leading = broadcast_leading(ensemble.shape[:-2], mean.shape[:-1], "mean")
+    broadcast_leading(leading, cov.shape[:-2], "cov")
+    # Anomalies in units of the new standard deviations are Q R.
+    std = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    equal_weights = np.full(n, 1 / n)
+    scaled = ensemble / std[..., None, :]
+    centre = equal_weights @ scaled
     scaled -= centre[..., None, :]
     q, r = np.linalg.qr(scaled)
+    # The part of a component that is independent of those before it must exceed rounding.
     length = np.sqrt((r**2).sum(axis=-2))
-    own = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
-    # What a component has that those before it have not, against the rounding of the members.
-    if (own <= 32 * d * EPS * (length + np.abs(centre))).any():
+    independent = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
+    rounding = 32 * d * EPS * (length + np.abs(centre))
+    if (independent <= rounding).any():
         raise ValueError(
             "ensemble must have components that are not constant and not combinations "
             "of others, got a singular sample covariance"
         )
-    target = cholesky(cov / (unit[..., :, None] * unit[..., None, :])).mT
-    u, _, vh = np.linalg.svd(target @ r.mT)
-    turn = vh.mT @ (u.mT @ target)
-    out = q @ (np.sqrt(n - 1) * turn)
-    # Where the old spread is almost flat, Q is centred only to rounding over the flatness.
-    out -= (average @ out)[..., None, :]
-    out *= unit[..., None, :]
-    return np.asarray(out + mean[..., None, :])
+    # Kᵀ Rᵀ = U Σ Vᵀ, and the new anomalies are √(N-1) Q V Uᵀ Kᵀ.
+    upper = cholesky(cov / (std[..., :, None] * std[..., None, :])).mT
+    u, _, vh = np.linalg.svd(upper @ r.mT)
+    rotation = vh.mT @ (u.mT @ upper)
+    anomalies = q @ (np.sqrt(n - 1) * rotation)
+    # Q is centred to rounding only, which counts where the old ensemble is almost flat.
+    anomalies -= (equal_weights @ anomalies)[..., None, :]
+    anomalies *= std[..., None, :]
+    return np.asarray(anomalies + mean[..., None, :])
 
 
 @validated
 def condition(
-    mean: Annotated[Array, "... d"],
+    mean: Annotated[ArrayInput, "... d"],
     cov: PositiveSemidefinite,
-    gap: Annotated[Array, "... m", ALLOW_NAN],
-    H: Annotated[Array, "... m d"],
+    innovation: Annotated[ArrayInput, "... m", ALLOW_NAN],
+    H: Annotated[ArrayInput, "... m d"],
     R: Annotated[PositiveDefinite, "... m m"],
 ) -> tuple[Array, Array]:
-    r"""Condition Gaussians on readings :math:`\mathbf y=\mathbf H\mathbf x+\text{noise}`.
+    r"""Condition Gaussians on observations :math:`\mathbf y=\mathbf H\mathbf x+\text{noise}`.
 
     Parameters
     ----------
     mean, cov : array_like, (..., d) and (..., d, d)
         The Gaussians; the covariance may be singular.
-    gap : array_like, (..., m)
-        The innovation, :math:`\mathbf y` less its prediction: :math:`\mathbf H` times the mean, or
-        what a curved sensor makes of it. NaN leaves that component out.
+    innovation : array_like, (..., m)
+        The observation :math:`\mathbf y` minus its prediction: :math:`\mathbf H` times the mean,
+        or the prediction of a nonlinear sensor. NaN leaves that component out.
     H, R : array_like, (..., m, d) and (..., m, m)
-        How a reading depends on the state, and its noise covariance.
+        Observation matrix and noise covariance.
 
     Returns
     -------
@@ -165,44 +170,54 @@ def condition(
     >>> x, p
     (array([1.]), array([[0.5]]))
     """
-    missing = None if all_finite(gap) else np.isnan(gap)
-    if missing is not None:  # a row of H may be missing too
+    missing = None if all_finite(innovation) else np.isnan(innovation)
+    if missing is not None:
+        # A row of H may be missing too.
         H = np.where(missing[..., None], 0.0, H)
-        gap = np.where(missing, 0.0, gap)
-    cross, inner = innovation(cov, H, R, missing)
-    gain = solve_definite(inner, cross).mT
-    return mean + (gain @ gap[..., None])[..., 0], joseph(cov, gain, H, R)
+        innovation = np.where(missing, 0.0, innovation)
+    cross, innovation_cov = innovation_moments(cov, H, R, missing)
+    # K = P Hᵀ S⁻¹, by a solve instead of an inverse.
+    gain = solve_definite(innovation_cov, cross).mT
+    change = (gain @ innovation[..., None])[..., 0]
+    return mean + change, joseph(cov, gain, H, R)
 
 
-def innovation(
+def innovation_moments(
     cov: Array, H: Array, R: Array, missing: Mask | None
 ) -> tuple[Array, Array]:
-    """Covariance of a reading's prediction with the state, (..., m, d), and of the innovation.
+    """Cross-covariance H P of prediction and state, (..., m, d), and S = H P Hᵀ + R.
 
-    Components (..., m) that are missing have no gain, and a one on the innovations' diagonal: that
-    takes them out of every sum exactly.
+    Components (..., m) that are missing have no gain, and a one on the diagonal of S: that takes
+    them out of every sum exactly.
     """
     cross = H @ cov
-    inner = cross @ np.ascontiguousarray(H.mT) + R
+    # A copy of the transpose is multiplied faster than its view.
+    innovation_cov = cross @ np.ascontiguousarray(H.mT) + R
     if missing is not None and missing.any():
-        gone = np.nonzero(np.broadcast_to(missing, inner.shape[:-1]))
-        cross = np.broadcast_to(cross, (*inner.shape[:-1], cross.shape[-1])).copy()
-        cross[gone] = inner[gone] = inner.mT[gone] = 0.0
-        inner[(*gone, gone[-1])] = 1.0
-    return cross, inner
+        shape = innovation_cov.shape[:-1]
+        index = np.nonzero(np.broadcast_to(missing, shape))
+        cross = np.broadcast_to(cross, (*shape, cross.shape[-1])).copy()
+        cross[index] = 0.0
+        # Rows and columns of the missing components.
+        innovation_cov[index] = 0.0
+        innovation_cov.mT[index] = 0.0
+        innovation_cov[(*index, index[-1])] = 1.0
+    return cross, innovation_cov
 
 
 def joseph(cov: Array, gain: Array, H: Array, R: Array) -> Array:
     """The covariance after an update with any gain, as a sum of squares: Joseph's form."""
-    rest = np.eye(cov.shape[-1]) - gain @ H
-    after = rest @ cov @ np.ascontiguousarray(rest.mT) + gain @ R @ gain.mT
-    return np.asarray(0.5 * (after + after.mT))
+    # P⁺ = (I - K H) P (I - K H)ᵀ + K R Kᵀ
+    reduction = np.eye(cov.shape[-1]) - gain @ H
+    prior_part = reduction @ cov @ np.ascontiguousarray(reduction.mT)
+    posterior = prior_part + gain @ R @ gain.mT
+    return np.asarray(0.5 * (posterior + posterior.mT))
 
 
 @validated
 def unscented_points(
-    mean: Annotated[Array, "... d"],
-    root: Annotated[Array, "... d d"],
+    mean: Annotated[ArrayInput, "... d"],
+    root: Annotated[ArrayInput, "... d d"],
     *,
     kappa: float = 0.0,
 ) -> tuple[Array, Array]:
@@ -210,7 +225,7 @@ def unscented_points(
 
     The mean, then :math:`\mathbf m\pm\sqrt{d+\kappa}\,\mathbf s_i` with the columns of the square
     root, all plus first. Weighted sums over the points give the Gaussian's mean and covariance.
-    With :math:`\kappa=0` the mean weighs nothing; with :math:`\kappa=3-d` fourth moments along
+    With :math:`\kappa=0` the mean has weight 0; with :math:`\kappa=3-d` fourth moments along
     each axis are a Gaussian's. Points scaled by :math:`\alpha` are those of
     :math:`\kappa'=\alpha^2(d+\kappa)-d`.
 
@@ -236,9 +251,10 @@ def unscented_points(
     d = mean.shape[-1]
     if d + kappa <= 0:
         raise ValueError(f"kappa must be above {-d}, got {kappa:g}")
-    moves = math.sqrt(d + kappa) * root.mT
-    moves = np.concatenate([0 * moves[..., :1, :], moves, -moves], axis=-2)
-    weights = np.empty(2 * d + 1)
-    weights[:] = 0.5 / (d + kappa)
+    # Rows are √(d + κ) s_i for the columns s_i of the root.
+    offsets = math.sqrt(d + kappa) * root.mT
+    zero = 0 * offsets[..., :1, :]
+    offsets = np.concatenate([zero, offsets, -offsets], axis=-2)
+    weights = np.full(2 * d + 1, 0.5 / (d + kappa))
     weights[0] = kappa / (d + kappa)
-    return mean[..., None, :] + moves, weights
+    return mean[..., None, :] + offsets, weights

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ..gaussians.single import innovation, joseph
+from ..gaussians.single import innovation_moments, joseph
 from ..linalg import (
     broadcast_leading,
     cholesky,
@@ -174,7 +174,7 @@ def assimilate(
     The k columns of the innovations (..., m, k), zero where they are missing, share a covariance.
     """
     # H P and S = H P Hᵀ + R, with a one on the diagonal for missing components
-    cross, innovation_cov = innovation(cov, H, R, missing)
+    cross, innovation_cov = innovation_moments(cov, H, R, missing)
     try:
         lower = cholesky(innovation_cov)
     except np.linalg.LinAlgError:

@@ -1,4 +1,4 @@
-"""How good an estimate is: error, consistency and score, with intervals."""
+"""Metrics of estimates: error, consistency and scores, with confidence intervals."""
 
 from .intervals import Interval, mean_interval, median_interval, proportion_interval
 from .scores import crps, gaussian_crps, log_score, nees, nees_band, nis, squared_error

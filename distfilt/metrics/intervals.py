@@ -1,4 +1,4 @@
-"""Intervals around a mean, a median or a share, each with its confidence."""
+"""Confidence intervals of a mean, a median or a proportion."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Annotated
 
 import numpy as np
 
-from ..validation import Array, Bounds, PositiveInt, validated
+from ..validation import ArrayInput, Bounds, PositiveInt, validated
 
 __all__ = ["Interval", "mean_interval", "median_interval", "proportion_interval"]
 
-Values = Annotated[Array, "n"]
+Values = Annotated[ArrayInput, "n"]
 Level = Annotated[float, Bounds(at_least=1e-9, below=1)]
 
 
@@ -22,7 +22,7 @@ class Interval:
     Parameters
     ----------
     estimate : float
-        The estimate, inside the interval.
+        The estimate; it lies in the interval.
     low, high : float
         The interval's ends, both included: ``0.3 in interval`` asks whether it covers 0.3.
     error : float
@@ -30,8 +30,8 @@ class Interval:
 
     Examples
     --------
-    >>> share = Interval(0.25, 0.15, 0.375, 0.06)
-    >>> print(share, 0.1 in share)
+    >>> proportion = Interval(0.25, 0.15, 0.375, 0.06)
+    >>> print(proportion, 0.1 in proportion)
     0.25 [0.15, 0.375] False
     """
 
@@ -67,19 +67,22 @@ def mean_interval(values: Values, *, level: Level = 0.95) -> Interval:
 
     if values.size < 2:
         raise ValueError(f"values must have at least 2 values, got {values.size}")
-    middle = float(values.mean())
-    error = float(values.std(ddof=1)) / float(np.sqrt(values.size))
-    half = float(stdtrit(values.size - 1, 0.5 + level / 2)) * error
-    return Interval(middle, middle - half, middle + half, error)
+    n = values.size
+    mean = float(values.mean())
+    error = float(values.std(ddof=1)) / float(np.sqrt(n))
+    # t quantile with n - 1 degrees of freedom
+    quantile = float(stdtrit(n - 1, 0.5 + level / 2))
+    half_width = quantile * error
+    return Interval(mean, mean - half_width, mean + half_width, error)
 
 
 @validated
 def median_interval(values: Values, *, level: Level = 0.95) -> Interval:
-    """Interval for the median that assumes nothing about the distribution.
+    """Distribution-free interval for the median, between two order statistics.
 
-    The k-th smallest and the k-th largest value miss the median with probability
-    2 P(B < k), B binomial (n, 1/2); k is the largest with which they miss it seldom enough. The
-    error is the half width divided by the normal quantile of `level`.
+    The interval from the k-th smallest to the k-th largest value misses the median with probability
+    2 P(B < k), B binomial (n, 1/2). The largest k is taken for which that is at most 1 - `level`.
+    The error is the half width divided by the normal quantile of `level`.
 
     Parameters
     ----------
@@ -95,18 +98,19 @@ def median_interval(values: Values, *, level: Level = 0.95) -> Interval:
     """
     from scipy.special import betainc, ndtri
 
-    v = np.sort(values)
+    order_statistics = np.sort(values)
     n = values.size
-    # P(B <= k - 1) for k = 1, 2, ...: the chance that the k-th smallest lies above the median.
+    # P(B <= k - 1) for k = 1, 2, ...: the probability that the k-th smallest exceeds the median.
     ranks = np.arange(1, (n + 1) // 2 + 1)
-    missed = 2 * betainc(n - ranks + 1, ranks, 0.5)
-    k = int((missed <= 1 - level).sum())
+    miss_probability = 2 * betainc(n - ranks + 1, ranks, 0.5)
+    k = int((miss_probability <= 1 - level).sum())
     if k == 0:
         raise ValueError(f"values must have more values for level {level:g}, got {n}")
-    low = float(v[k - 1])
-    high = float(v[n - k])
-    error = (high - low) / (2 * float(ndtri(0.5 + level / 2)))
-    return Interval(float(np.median(v)), low, high, error)
+    low = float(order_statistics[k - 1])
+    high = float(order_statistics[n - k])
+    quantile = float(ndtri(0.5 + level / 2))
+    error = (high - low) / (2 * quantile)
+    return Interval(float(np.median(values)), low, high, error)
 
 
 @validated
@@ -123,7 +127,7 @@ def proportion_interval(
     Parameters
     ----------
     successes : int
-        How often it happened, 0 to `trials`.
+        Number of successes, 0 to `trials`.
     trials : int
         Independent trials, at least one.
     level : float
@@ -142,14 +146,19 @@ def proportion_interval(
 
     k = successes
     n = trials
-    tail = (1 - level) / 2
     if k > n:
-        raise ValueError(
-            f"successes must have at most as many as trials ({n}), got {k}"
-        )
-    low = 0.0 if k == 0 else float(betaincinv(k, n - k + 1, tail))
-    high = 1.0 if k == n else float(betaincinv(k + 1, n - k, 1 - tail))
-    share = k / n
-    error = float(np.sqrt(share * (1 - share) / n))
-    # A level near 0 gives ends that pass each other around the share.
-    return Interval(share, min(low, share), max(high, share), error)
+        raise ValueError(f"successes must be at most trials, {n}, got {k}")
+    # Beta quantiles: P(B >= k) at the lower end, P(B <= k) at the upper end, are one tail each.
+    tail = (1 - level) / 2
+    low = 0.0
+    high = 1.0
+    if k > 0:
+        low = float(betaincinv(k, n - k + 1, tail))
+    if k < n:
+        high = float(betaincinv(k + 1, n - k, 1 - tail))
+    proportion = k / n
+    error = float(np.sqrt(proportion * (1 - proportion) / n))
+    # At a level near 0 the ends may pass each other; the estimate stays inside.
+    low = min(low, proportion)
+    high = max(high, proportion)
+    return Interval(proportion, low, high, error)

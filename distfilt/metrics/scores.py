@@ -1,6 +1,6 @@
-"""How good an estimate is: error, consistency and score, with intervals.
+"""Errors, consistency measures and scores of estimates.
 
-Lengths sum over the components, which has a meaning only where they have one unit.
+Squared lengths are sums over the components, which make sense only if all have one unit.
 
 Shapes: estimates and truths are (..., d), ensembles (..., N, d), covariances (..., d, d). Leading
 axes (runs, agents, times) broadcast between an estimate and its truth.
@@ -14,9 +14,10 @@ import numpy as np
 
 from ..ensembles import Members
 from ..gaussians import log_density
-from ..linalg import cholesky, broadcast_leading, quadratic_form
+from ..linalg import broadcast_leading, cholesky, quadratic_form
 from ..validation import (
     Array,
+    ArrayInput,
     Bounds,
     PositiveDefinite,
     PositiveInt,
@@ -35,7 +36,7 @@ __all__ = [
     "squared_error",
 ]
 
-Vector = Annotated[Array, "... d"]
+Vector = Annotated[ArrayInput, "... d"]
 
 
 @validated
@@ -63,15 +64,15 @@ def nees(estimate: Vector, cov: PositiveDefinite, truth: Vector) -> Array:
     r"""Normalised estimation error squared, (...).
 
     :math:`\epsilon = (\hat{\mathbf x}-\mathbf x)^\top\mathbf P^{-1}(\hat{\mathbf x}-\mathbf x)`. If
-    the error is N(0, P), as an honest filter claims, it is chi-square with d degrees of freedom and
-    averages d. More means overconfidence, less means caution.
+    the error is N(0, P), as for a consistent filter, it is chi-square with d degrees of freedom and
+    averages d. More means overconfident, less means conservative.
 
     Parameters
     ----------
     estimate, truth : array_like, (..., d)
         Leading axes broadcast.
     cov : array_like, (..., d, d)
-        The filter's own covariance P, positive definite.
+        The covariance P that the filter reports, positive definite.
 
     Notes
     -----
@@ -89,18 +90,19 @@ def nees(estimate: Vector, cov: PositiveDefinite, truth: Vector) -> Array:
 
 @validated
 def nis(
-    innovation: Annotated[Array, "... m"], cov: Annotated[PositiveDefinite, "... m m"]
+    innovation: Annotated[ArrayInput, "... m"],
+    cov: Annotated[PositiveDefinite, "... m m"],
 ) -> Array:
-    r"""Normalised innovation squared, (...): how far a reading is from its prediction.
+    r"""Normalised innovation squared, (...), of an observation and its prediction.
 
-    :math:`\mathbf d^\top\mathbf S^{-1}\mathbf d`. Of an honest filter it is chi-square with m
-    degrees of freedom, so that ``nees_band(m, n)`` holds the average of n independent ones. Needs
-    no truth.
+    :math:`\mathbf d^\top\mathbf S^{-1}\mathbf d`. For a consistent filter it is chi-square with m
+    degrees of freedom, so that ``nees_band(m, n)`` applies to the average of n independent ones. It
+    needs no truth.
 
     Parameters
     ----------
     innovation : array_like, (..., m)
-        Reading minus predicted reading; angles as the shorter way round.
+        Observation minus predicted observation; angles wrapped.
     cov : array_like, (..., m, m)
         Covariance S of the innovation, HPHᵀ + R: the prediction's and the noise's. Positive
         definite; leading axes broadcast.
@@ -122,7 +124,7 @@ def nees_band(
     level: Level = 0.95,
     normalised: bool = False,
 ) -> Interval:
-    r"""Where the average of independent NEES values of an honest filter falls.
+    r"""Band in which the average of independent NEES values of a consistent filter falls.
 
     The sum of `count` values is chi-square with ``count * dim`` degrees of freedom, so the average
     lies between its quantiles divided by `count`. The average itself is not divided by `dim`: it is
@@ -156,10 +158,13 @@ def nees_band(
     tail = (1 - level) / 2
     total = count * dim
     unit = total if normalised else count
-    low, high = (2 * float(gammaincinv(total / 2, p)) / unit for p in (tail, 1 - tail))
+    # Quantiles of chi-square with k degrees of freedom are 2 gammaincinv(k / 2, p).
+    low = 2 * float(gammaincinv(total / 2, tail)) / unit
+    high = 2 * float(gammaincinv(total / 2, 1 - tail)) / unit
     # At tiny levels the band lies below the mean, because the chi-square's median does.
-    middle = float(min(max(total / unit, low), high))
-    return Interval(middle, low, high, float(np.sqrt(2 * total)) / unit)
+    expected = float(min(max(total / unit, low), high))
+    error = float(np.sqrt(2 * total)) / unit
+    return Interval(expected, low, high, error)
 
 
 @validated
@@ -173,7 +178,7 @@ def crps(
 
     :math:`\operatorname{mean}_i|x_i-y|-\tfrac12\operatorname{mean}_{i,j}|x_i-x_j|`, the integral of
     the squared difference between the members' distribution function and the truth's step. It
-    rewards a small error and a spread that fits, in the state's unit. O(N log N) by sorting.
+    rewards a small error and a fitting spread, in the state's unit. O(N log N) by sorting.
 
     Parameters
     ----------
@@ -198,27 +203,28 @@ def crps(
     """
     n = ensemble.shape[-2]
     broadcast_leading(ensemble.shape[:-2], truth.shape[:-1], "truth")
-    # Distances from the truth are as good as the members, and lose fewer digits far from zero.
-    gap = ensemble - truth[..., None, :]
+    # The score depends on differences only, which lose fewer digits far from zero.
+    errors = ensemble - truth[..., None, :]
     if weights is None:
-        gap = np.sort(gap, axis=-2)
-        share = np.full((n, 1), 1 / n)
+        errors = np.sort(errors, axis=-2)
+        w = np.full((n, 1), 1 / n)
     else:
-        broadcast_leading(gap.shape[:-2], weights.shape[:-1], "weights")
-        order = np.argsort(gap, axis=-2)
-        gap = np.take_along_axis(gap, order, axis=-2)
-        share = np.take_along_axis(
-            np.broadcast_to(weights[..., None], gap.shape), order, axis=-2
-        )
-    above = 2 * np.cumsum(share, axis=-2) - share - 1
-    return np.asarray((share * (np.abs(gap) - above * gap)).sum(axis=-2))
+        broadcast_leading(errors.shape[:-2], weights.shape[:-1], "weights")
+        order = np.argsort(errors, axis=-2)
+        errors = np.take_along_axis(errors, order, axis=-2)
+        columns = np.broadcast_to(weights[..., None], errors.shape)
+        w = np.take_along_axis(columns, order, axis=-2)
+    # ½ Σ_ij w_i w_j |e_i - e_j| = Σ_i w_i e_i (2 W_i - w_i - 1) of sorted errors, with W_i the
+    # sum of the weights up to i.
+    coefficients = 2 * np.cumsum(w, axis=-2) - w - 1
+    return np.asarray((w * (np.abs(errors) - coefficients * errors)).sum(axis=-2))
 
 
 @validated
 def gaussian_crps(
-    mean: Annotated[Array, "..."],
-    std: Annotated[Array, "...", Bounds(above=0)],
-    truth: Annotated[Array, "..."],
+    mean: Annotated[ArrayInput, "..."],
+    std: Annotated[ArrayInput, "...", Bounds(above=0)],
+    truth: Annotated[ArrayInput, "..."],
 ) -> Array:
     r"""Continuous ranked probability score of Gaussians, componentwise, (...).
 
@@ -242,20 +248,20 @@ def gaussian_crps(
     """
     from scipy.special import ndtr
 
-    broadcast_leading(
-        broadcast_leading(mean.shape, std.shape, "std"), truth.shape, "truth"
-    )
+    shape = broadcast_leading(mean.shape, std.shape, "std")
+    broadcast_leading(shape, truth.shape, "truth")
     z = (truth - mean) / std
     density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
-    return np.asarray(std * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi)))
+    score = z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi)
+    return np.asarray(std * score)
 
 
 @validated
 def log_score(estimate: Vector, cov: PositiveDefinite, truth: Vector) -> Array:
     r"""Minus the log-density of a Gaussian estimate at the truth, (...); smaller is better.
 
-    It rewards a small error and a covariance that fits, of all components together. The score of
-    an honest Gaussian is :math:`\tfrac12\log\det(2\pi e\mathbf P)` on average, and every other
+    It rewards a small error and a fitting covariance of all components together. The score of a
+    consistent Gaussian is :math:`\tfrac12\log\det(2\pi e\mathbf P)` on average, and every other
     covariance scores worse.
 
     Parameters

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..linalg import to_unit_variances, log_det, log_sum_exp, symmetrise
+from ..linalg import log_det, log_sum_exp, symmetrise, to_unit_variances
 from ..validation import (
     Array,
     ArrayInput,

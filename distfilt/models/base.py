@@ -164,6 +164,8 @@ class LinearModel(Model):
         ``transition_matrix(dt) -> Φ``, (d, d). `transition` has to be the product with it, which
         :meth:`from_transition` guarantees. A warning is given if only its transpose fits
         `noise_cov`.
+    time_invariant : bool
+        Whether `noise_cov` depends on dt alone. Then both matrices are made once for each dt.
 
     Examples
     --------
@@ -175,6 +177,7 @@ class LinearModel(Model):
     """
 
     transition_matrix: Callable[[float], Array] = field(kw_only=True)
+    time_invariant: bool = field(default=False, kw_only=True)
 
     @classmethod
     def from_transition(
@@ -185,6 +188,7 @@ class LinearModel(Model):
         *,
         names: tuple[str, ...] = (),
         units: tuple[str, ...] = (),
+        time_invariant: bool = False,
     ) -> LinearModel:
         """Build the model from its transition matrix, ``transition_matrix(dt) -> (d, d)``."""
         return cls(
@@ -194,9 +198,25 @@ class LinearModel(Model):
             names=names,
             units=units,
             transition_matrix=transition_matrix,
+            time_invariant=time_invariant,
         )
 
+    @validated
+    def step(
+        self, x: Annotated[Array, "... self.dim"], t: float, dt: NonNegativeFloat
+    ) -> Array:
+        """Move states (..., d) from `t` to `t` + `dt`, without noise."""
+        if self.time_invariant:
+            # Rows are states: x Φᵀ.
+            return np.asarray(x @ _transpose_transition(self, dt))
+        return call_batched(self, "transition", (x,), t, dt)
+
     def _noise(self, t: float, dt: float) -> tuple[Array, Array]:
+        if self.time_invariant:
+            return _noise_of_step(self, dt)
+        return self._compute_noise(t, dt)
+
+    def _compute_noise(self, t: float, dt: float) -> tuple[Array, Array]:
         cov, lower = super()._noise(t, dt)
         if dt and is_first_use(self, "transition_matrix"):
             # The check asks for half steps, at which a user's table may have no entry.
@@ -247,6 +267,18 @@ def _multiply(
     phi = check_array(phi, "transition_matrix", (dim, dim))
     # Rows are states: x Φᵀ. With a copy of the transpose it takes half the time of a view's.
     return np.asarray(x @ np.ascontiguousarray(phi.T))
+
+
+@lru_cache(maxsize=64)
+def _transpose_transition(model: LinearModel, dt: float) -> Array:
+    """Return a contiguous Φᵀ of a time-invariant model, made once for each dt."""
+    return np.ascontiguousarray(model.F(dt).T)
+
+
+@lru_cache(maxsize=64)
+def _noise_of_step(model: LinearModel, dt: float) -> tuple[Array, Array]:
+    """Return Q and its factor of a time-invariant model, made once for each dt."""
+    return model._compute_noise(0.0, dt)
 
 
 @validated

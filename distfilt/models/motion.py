@@ -69,6 +69,7 @@ def constant_velocity(
         partial(_straight_noise, sigma=sigma, axes=axes),
         names=positions + velocities,
         units=("m",) * axes + ("m/s",) * axes,
+        time_invariant=True,
     )
 
 
@@ -179,14 +180,14 @@ def integrate(
     """Build a model from a rate by :func:`rk4`, with white noise of spectral density (d, d)."""
     return Model(
         len(density),
-        partial(_integrated_transition, rate=rate, longest=step),
+        partial(_rk4_transition, rate=rate, longest=step),
         partial(_white_noise, density),
         names=names,
         units=units,
     )
 
 
-def _integrated_transition(
+def _rk4_transition(
     x: Array, t: float, dt: float, rate: Rate, longest: float
 ) -> Array:
     # Fortran order: each component of all states is contiguous in memory, which is twice as fast.

@@ -1,4 +1,4 @@
-"""Who hears whom, what a message costs, and how neighbours agree."""
+"""Networks of agents: graphs, channels with a ledger of messages, consensus and fusion."""
 
 from . import graphs, weights
 from .channel import Channel, fusion_rule
@@ -11,16 +11,9 @@ from .consensus import (
     max_consensus,
     push_sum,
 )
-from .dynamic import (
-    PIState,
-    event_triggered,
-    flooding,
-    gossip_consensus,
-    pi_start,
-    pi_step,
-    stable_substeps,
-)
+from .events import event_triggered
 from .faults import Faults
+from .flood import flooding
 from .fusion import (
     arithmetic_average,
     consensus_pull,
@@ -29,20 +22,22 @@ from .fusion import (
     mean_pull,
     naive_fusion,
 )
+from .gossip import gossip_consensus
 from .graphs import Graph
 from .ledger import Ledger
+from .pi_estimator import PIState, pi_start, pi_step, stable_substeps
 from .weights import ConsensusWeights, UnstableGain
 
 __all__ = [
     "AdmmResult",
     "Channel",
+    "ConsensusWeights",
     "Disconnected",
     "Faults",
     "Graph",
     "Ledger",
     "PIState",
     "UnstableGain",
-    "ConsensusWeights",
     "admm",
     "arithmetic_average",
     "average_consensus",
@@ -56,10 +51,10 @@ __all__ = [
     "graphs",
     "intersect_ensembles",
     "max_consensus",
+    "mean_pull",
     "naive_fusion",
     "pi_start",
     "pi_step",
-    "mean_pull",
     "push_sum",
     "stable_substeps",
     "weights",

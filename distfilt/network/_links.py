@@ -12,81 +12,108 @@ from ..validation import Indices, check_array
 __all__: list[str] = []
 
 
-def of_matrix(value: Any, name: str, *, directed: bool) -> scipy.sparse.csr_array:
-    """The links that a matrix of zeros and ones marks, an array or sparse."""
+def from_matrix(value: Any, name: str, *, directed: bool) -> scipy.sparse.csr_array:
+    """Return the links that a matrix of zeros and ones marks, an array or sparse."""
     if not scipy.sparse.issparse(value):
-        flags = isinstance(value, np.ndarray) and value.dtype == bool
-        value = check_array(value * 1.0 if flags else value, name, ("A", "A"))
-    a = scipy.sparse.csr_array(value)
-    if a.shape[0] != a.shape[1] or a.shape[0] == 0:
-        raise ValueError(f"{name} must be a square matrix, got shape {a.shape}")
-    odd = (a.data != 0) & (a.data != 1)
-    if odd.any():
-        raise ValueError(f"{name} must be zeros and ones, got {a.data[odd][0]:g}")
-    links = linked(a.shape[0], np.stack(a.nonzero(), axis=1), name)
-    i, j = (links - links.T).nonzero()
-    if i.size and not directed:
-        needs = "every link both ways (Graph.from_adjacency(..., directed=True) takes others)"
-        raise ValueError(
-            f"{name} must be {needs}, got one way only between {i[0]} and {j[0]}"
-        )
+        # Booleans are no numbers to `check_array`, but here they are zeros and ones.
+        if isinstance(value, np.ndarray) and value.dtype == bool:
+            value = value.astype(np.float64)
+        value = check_array(value, name, ("A", "A"))
+    matrix = scipy.sparse.csr_array(value)
+    if matrix.shape[0] != matrix.shape[1] or matrix.shape[0] == 0:
+        raise ValueError(f"{name} must be a square matrix, got shape {matrix.shape}")
+    wrong = (matrix.data != 0) & (matrix.data != 1)
+    if wrong.any():
+        first = matrix.data[wrong][0]
+        raise ValueError(f"{name} must be zeros and ones, got {first:g}")
+    # Sorted, without explicit zeros, and without self-loops.
+    pairs = np.stack(matrix.nonzero(), axis=1)
+    links = build_links(matrix.shape[0], pairs, name)
+    if not directed:
+        _check_symmetric(links, name)
     return links
 
 
-def of_edges(
-    size: int, edges: Any, name: str, *, directed: bool
-) -> scipy.sparse.csr_array:
-    """The links of pairs (listener, speaker), both ways unless the graph is directed.
+def _check_symmetric(links: scipy.sparse.csr_array, name: str) -> None:
+    # A link without its opposite leaves an entry of 1 or -1 in A - Aᵀ.
+    i, j = (links - links.T).nonzero()
+    if i.size:
+        raise ValueError(
+            f"{name} must have every link both ways (Graph.from_adjacency(..., "
+            f"directed=True) takes others), got one way only between {i[0]} and {j[0]}"
+        )
 
-    >>> of_edges(3, [(0, -1)], "edges", directed=False)
+
+def from_edges(
+    n_agents: int, edges: Any, name: str, *, directed: bool
+) -> scipy.sparse.csr_array:
+    """Return the links of pairs (receiver, sender), both ways unless the graph is directed.
+
+    >>> from_edges(3, [(0, -1)], "edges", directed=False)
     Traceback (most recent call last):
     ValueError: edges must have agents from 0 to 2, got [[0.0, -1.0]]
     """
-    pairs = check_array(edges, name)
-    pairs = (
-        pairs.reshape(-1, 2) if pairs.size == 0 else check_array(pairs, name, ("E", 2))
-    )
-    listed = pairs.astype(np.int64)
-    inside = not listed.size or 0 <= listed.min() <= listed.max() < size
-    if (listed != pairs).any() or not inside:
+    numbers = check_array(edges, name)
+    # No edges at all come in any shape: [], or an array (0, 2).
+    if numbers.size == 0:
+        numbers = numbers.reshape(-1, 2)
+    numbers = check_array(numbers, name, ("E", 2))
+    pairs = numbers.astype(np.int64)
+    whole = (pairs == numbers).all()
+    if not whole or pairs.min(initial=0) < 0 or pairs.max(initial=-1) >= n_agents:
         raise ValueError(
-            f"{name} must have agents from 0 to {size - 1}, got {pairs.tolist()[:3]}"
+            f"{name} must have agents from 0 to {n_agents - 1}, "
+            f"got {numbers.tolist()[:3]}"
         )
-    both = listed if directed else np.concatenate([listed, listed[:, ::-1]])
-    return linked(size, both, name)
+    if not directed:
+        pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    return build_links(n_agents, pairs, name)
 
 
-def of_either(value: Any, size: int | None, name: str) -> scipy.sparse.csr_array:
-    """The links of a matrix or of a list of edges, both ways."""
+def from_either(value: Any, n_agents: int | None, name: str) -> scipy.sparse.csr_array:
+    """Return the links of a matrix or of a list of edges, both ways."""
     if scipy.sparse.issparse(value) or getattr(value, "dtype", None) == np.dtype(bool):
-        return of_matrix(value, name, directed=False)
-    a = check_array(value, name)
-    square = a.ndim == 2 and 0 < a.shape[0] == a.shape[1] and size in (None, a.shape[0])
-    # Two edges look like a matrix of two agents.
-    if square and not (a.shape[0] == 2 and (a.diagonal().any() or (a > 1).any())):
-        return of_matrix(a, name, directed=False)
-    most = int(a.max()) + 1 if min(a.shape) else 0
-    return of_edges(most if size is None else size, a, name, directed=False)
+        return from_matrix(value, name, directed=False)
+    numbers = check_array(value, name)
+    if _is_adjacency(numbers, n_agents):
+        return from_matrix(numbers, name, directed=False)
+    if n_agents is None:
+        # One more than the largest number; an empty list has no agents.
+        n_agents = int(numbers.max()) + 1 if min(numbers.shape) else 0
+    return from_edges(n_agents, numbers, name, directed=False)
+
+
+def _is_adjacency(numbers: np.ndarray, n_agents: int | None) -> bool:
+    """Return whether numbers are a matrix of links rather than a list of edges."""
+    if numbers.ndim != 2 or numbers.shape[0] != numbers.shape[1]:
+        return False
+    size = numbers.shape[0]
+    if size == 0 or n_agents not in (None, size):
+        return False
+    # Two edges look like a matrix of two agents, which has no self-loops and no number above 1.
+    looks_like_edges = numbers.diagonal().any() or (numbers > 1).any()
+    return not (size == 2 and looks_like_edges)
 
 
 def is_networkx(value: Any) -> bool:
-    """Whether a value has what networkx's graphs have."""
+    """Return whether a value has the attributes of networkx's graphs."""
     return all(hasattr(value, name) for name in ("nodes", "edges", "is_directed"))
 
 
-def linked(size: int, pairs: Indices, name: str) -> scipy.sparse.csr_array:
-    """The matrix of a graph's links from pairs (listener, speaker), which may repeat.
+def build_links(n_agents: int, pairs: Indices, name: str) -> scipy.sparse.csr_array:
+    """Return the matrix of links from pairs (receiver, sender), which may repeat.
 
-    >>> linked(3, np.array([[1, 1], [2, 2]]), "edges")
+    >>> build_links(3, np.array([[1, 1], [2, 2]]), "edges")
     Traceback (most recent call last):
     ValueError: edges must have no self-loops, got one at agent 1
     """
     loops = pairs[pairs[:, 0] == pairs[:, 1], 0]
     if loops.size:
         raise ValueError(f"{name} must have no self-loops, got one at agent {loops[0]}")
-    links = scipy.sparse.csr_array(
-        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (size, size)
-    )
+    ones = np.ones(len(pairs))
+    coordinates = (pairs[:, 0], pairs[:, 1])
+    links = scipy.sparse.csr_array((ones, coordinates), (n_agents, n_agents))
+    # Repeated pairs add up; each link counts once. The order of links is that of the columns.
     links.sum_duplicates()
     links.data[:] = 1.0
     links.sort_indices()

@@ -1,34 +1,39 @@
-"""The one door between agents: it delivers what they send along the links and keeps the account."""
+"""The channel between agents: it delivers messages along the links and keeps the ledger."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
-from itertools import pairwise
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 
-from ..validation import Array, Mask, PositiveInt, skip_validation, validated
-from . import ledger as accounts
+from ..validation import (
+    Array,
+    Indices,
+    Mask,
+    PositiveInt,
+    skip_validation,
+    validated,
+)
 from .faults import Faults
 from .graphs import Graph, as_graph
-from .ledger import Ledger
-from .weights import ConsensusWeights, _matching, stack_weights
+from .ledger import Ledger, count_payload, mask_lost
+from .weights import ConsensusWeights, _check_same_links, stack_weights
 
-__all__ = ["Channel", "Lost", "PerAgent", "kind_of_rule", "fusion_rule"]
+__all__ = ["Channel", "LossRule", "PerAgent", "fusion_rule", "kind_of_rule"]
 
 _PERFECT = Faults()
-_Own = Annotated[Array, "*self.runs self.graph.n_agents k"]
+_Values = Annotated[Array, "*self.runs self.graph.n_agents k"]
 
 PerAgent = Annotated[Array, "*channel.runs channel.graph.n_agents k"]
 """One vector for each agent of an argument named `channel`."""
 
-Lost = Literal["mutual", "metropolis", "keep", "renormalise", "zero"]
-"""What :meth:`Channel.combine` can do about a lost message; the last three are biased."""
+LossRule = Literal["mutual", "metropolis", "keep", "renormalise", "zero"]
+"""What :meth:`Channel.mix` does about a lost message; the last three move the average."""
 
-Fused = Literal[
+BeliefKind = Literal[
     "vectors", "ensembles", "gaussians", "mixtures", "densities", "particles"
 ]
 F = TypeVar("F", bound=Callable[..., Any])
@@ -37,23 +42,23 @@ F = TypeVar("F", bound=Callable[..., Any])
 class Channel:
     """Deliver payloads along a graph's links, lose or delay some, and charge for all of them.
 
-    Everything that an agent learns from another passes through :meth:`exchange` (any payload),
-    :meth:`combine` (weighted sums of stacked vectors, one sparse product) or :meth:`carry` (a
-    vector of its own on each link).
+    Everything that an agent learns from another passes through :meth:`broadcast` (any payload, to
+    all neighbours), :meth:`mix` (weighted sums of vectors, one sparse product) or
+    :meth:`send_on_links` (a different vector on each link).
 
     Parameters
     ----------
     graph : Graph
         The links at this time; or a networkx graph, a matrix of links, or edges.
     ledger : Ledger, optional
-        What was sent before; empty by default. Its count of rounds numbers the losses.
+        The ledger so far; empty by default. Its count of rounds numbers the losses.
     runs : tuple of int
         Leading axes of every payload that are independent runs of the same network. They are
         charged once, and lose different messages.
     faults : Faults, optional
-        How the channel fails; not at all by default. A delay is for :meth:`combine` alone.
+        How the channel fails; not at all by default. A delay is for :meth:`mix` alone.
     t : float, optional
-        The time, in s, which the windows of faults count then; rounds without it.
+        The time, in s, to which the windows of faults then refer; to rounds without it.
 
     Examples
     --------
@@ -76,147 +81,117 @@ class Channel:
         faults: Faults | None = None,
         t: float | None = None,
     ) -> None:
-        self.graph: Graph = as_graph(
-            graph, None if ledger is None else ledger.messages.size
-        )
+        n_agents = None if ledger is None else ledger.messages.size
+        self.graph: Graph = as_graph(graph, n_agents)
         self.runs = runs
-        self._among = int(np.prod(runs, dtype=np.int64)), slice(None)
         self.faults = _PERFECT if faults is None else faults
         self.t = t
         self._ledger = Ledger.empty(self.graph.n_agents) if ledger is None else ledger
-        self._owed: dict[int, int] = {}
-        self._late: dict[tuple[int, ...], deque[Any]] = {}
-        self._perfect = self.faults.none
+        # Losses are drawn for `_n_drawn` runs, of which this channel's are `_drawn`.
+        self._n_drawn = int(np.prod(runs, dtype=np.int64))
+        self._drawn = slice(None)
+        # Rounds without faults that are not yet in the ledger, by the size of a message.
+        self._uncharged: dict[int, int] = {}
+        # Messages on their way in a channel with a delay, by the shape of the values.
+        self._queues: dict[tuple[int, ...], deque[tuple[Array, Mask]]] = {}
+        self._perfect = self.faults.is_perfect
         if not self._perfect:
-            self.faults.check(self.graph)
+            self.faults.check_graph(self.graph)
 
     @classmethod
     def construct(cls, *args: Any, **options: Any) -> Channel:
-        """The same for a caller that made the graph and the ledger itself, as filters do."""
-        channel = cls.__new__(cls)
+        """Build a channel without checks, from a graph and a ledger that the library made."""
         with skip_validation():
-            channel.__init__(*args, **options)  # type: ignore[misc]
-        return channel
+            return cls(*args, **options)
 
     def for_run(self, run: Any, ledger: Ledger) -> Channel:
-        """The same with another account; of the numbers of all runs, or as one loses messages."""
+        """Return a copy with another ledger, for all runs of an array or for a single one.
+
+        A single run, an array without axes, loses the messages that it loses among all.
+        """
         channel = Channel.construct(
             self.graph, ledger=ledger, runs=run.shape, faults=self.faults, t=self.t
         )
-        channel._among = (
-            self._among[0],
-            slice(None) if run.ndim else slice(run, run + 1),
-        )
+        channel._n_drawn = self._n_drawn
+        channel._drawn = slice(None) if run.ndim else slice(run, run + 1)
         return channel
 
     @property
     def ledger(self) -> Ledger:
-        """The account so far."""
-        for size, rounds in self._owed.items():
-            messages = rounds * self.graph.out_degree.astype(np.int64)
-            self._ledger = self._charged(
-                self._ledger, messages, size, 8 * size, rounds=rounds
-            )
-        self._owed = {}
+        """The ledger so far."""
+        if self._uncharged:
+            self._charge_mixing()
         return self._ledger
 
-    def _charged(
-        self,
-        ledger: Ledger,
-        messages: Any,
-        scalars: Any,
-        bytes_: Any,
-        *,
-        rounds: int = 1,
-        lost: Any = 0.0,
-    ) -> Ledger:
-        """The account after more rounds, in which agents sent so many messages of these sizes."""
-        spoke = self.graph.senders.size > 0
-        return ledger.replace(
-            rounds=ledger.rounds + rounds * spoke,
-            messages=ledger.messages + messages,
-            scalars=ledger.scalars + messages * scalars,
-            bytes=ledger.bytes + messages * bytes_,
-            lost=ledger.lost + lost,
-        )
-
     def broadcast(self, payloads: Sequence[Any]) -> list[dict[int, Any]]:
-        """Let every agent send its payload to all that hear it.
+        """Let every agent send its payload to all that receive from it.
 
         Parameters
         ----------
         payloads : sequence of length A
             Per agent a numeric array (*runs, ...), a flat tuple of them, or None to stay silent.
-            Each entry counts as one scalar, of its own item size. What is missing is not sent:
-            entries that are NaN (in all runs) cost nothing, and nothing but NaN is silence.
+            Each entry counts as one scalar, of its own item size. Missing entries are not sent:
+            those that are NaN in all runs cost nothing, and a payload of NaN alone is silence.
 
         Returns
         -------
         list of dict
-            For each agent what arrived, by sender, in ascending order; the arrays are read-only.
+            The payloads that each agent receives, by sender, ascending; the arrays are read-only.
             In a batch, the runs that lost a message find NaN in its place, and integers become
             floats there.
         """
         graph = self.graph
-        sent, scalars, bytes_ = accounts.count_payload(
-            payloads, graph.n_agents, self.runs
-        )
-        speaks = np.array([p is not None for p in sent])[graph.senders]
-        arrived = self._transmit(speaks, scalars, bytes_)
-        some = np.flatnonzero(arrived.any(axis=0))
-        inbox = _by_receiver(graph, sent, some)
-        for k in some[~arrived[:, some].all(axis=0)].tolist():
-            receiver = int(graph.receivers[k])
-            sender = int(graph.senders[k])
-            here = arrived[:, k].reshape(self.runs)
-            inbox[receiver][sender] = accounts.drop_lost(sent[sender], here)
+        sent, scalars, bytes_ = count_payload(payloads, graph.n_agents, self.runs)
+        sends = np.array([payload is not None for payload in sent])
+        arrived = self._transmit(sends[graph.senders], scalars, bytes_)
+        # A message is in the inbox if any run has received it.
+        received = np.flatnonzero(arrived.any(axis=0))
+        inbox = _group_by_receiver(graph, sent, received)
+        # Runs that have lost it find NaN.
+        in_all_runs = arrived[:, received].all(axis=0)
+        for link in received[~in_all_runs].tolist():
+            receiver = int(graph.receivers[link])
+            sender = int(graph.senders[link])
+            by_run = arrived[:, link].reshape(self.runs)
+            inbox[receiver][sender] = mask_lost(sent[sender], by_run)
         return inbox
 
     @validated
     def mix(
         self,
-        values: _Own,
+        values: _Values,
         weights: ConsensusWeights,
         *,
-        lost: Lost = "mutual",
+        on_loss: LossRule = "mutual",
         rounds: PositiveInt = 1,
     ) -> Array:
-        """Let every agent replace its value by a weighted sum of its own and what it hears.
+        """Let every agent replace its value by a weighted sum of it and the received ones.
 
         Parameters
         ----------
         values : array_like, (*runs, A, k)
             One vector per agent.
-        weights : Weights
-            What each agent makes of the values.
-        lost : {"mutual", "metropolis", "keep", "renormalise", "zero"}
-            What an agent does about a message that it misses.
+        weights : ConsensusWeights
+            The weights of the sums.
+        on_loss : {"mutual", "metropolis", "keep", "renormalise", "zero"}
+            Where the weight of a lost message goes.
 
             - ``"mutual"``: a link counts only if both its messages arrive, which acknowledgements
               tell; its weight goes to the own value on both sides. Keeps the average for
               symmetric weights.
             - ``"metropolis"``: the same, and the weights are the Metropolis weights of the links
               that are left; the given ones are not used.
-            - ``"keep"``: the receiver gives the weight to its own value, ``"renormalise"``: to all
-              that it has, ``"zero"``: to nothing. These move the average.
+            - ``"keep"``: to the receiver's own value. ``"renormalise"``: to all values that it
+              has. ``"zero"``: nowhere. These move the average.
         rounds : int
-            How many times.
+            Number of rounds.
         """
-        w = _matching(self.graph, weights)
+        _check_same_links(weights, self.graph)
         if self._perfect:
-            return self._combine_all(values, w, rounds)
+            return self._mix_without_faults(values, weights, rounds)
         for _ in range(rounds):
-            values = self._combine_with_own(values, w, lost)[0]
+            values, _ = self._mix_once(values, weights, on_loss)
         return values
-
-    def _combine_all(self, v: Array, w: ConsensusWeights, rounds: int) -> Array:
-        """Rounds without faults, agents in front throughout."""
-        self._owed[v.shape[-1]] = self._owed.get(v.shape[-1], 0) + rounds
-        front = np.moveaxis(v, -2, 0)
-        flat = front.reshape(self.graph.n_agents, -1)
-        for _ in range(rounds):
-            flat = w.matrix @ flat
-        return np.ascontiguousarray(np.moveaxis(flat.reshape(front.shape), 0, -2))
 
     @validated
     def send_on_links(
@@ -226,7 +201,7 @@ class Channel:
         links: Annotated[Mask, "self.graph.senders.size"] | None = None,
         acknowledged: bool = False,
     ) -> Array:
-        """Send a payload of its own along each link.
+        """Send a different payload along each link.
 
         Parameters
         ----------
@@ -235,138 +210,223 @@ class Channel:
         links : array_like of bool, (E,), optional
             The links that are used in this round; all by default. The others are not charged.
         acknowledged : bool
-            Charge an acknowledgement for each message, of one byte, to the agent that it was for.
+            Charge an acknowledgement of one byte for each message, to its receiver.
 
         Returns
         -------
         ndarray, (*runs, E, k)
-            The same, with NaN where nothing arrives.
+            The same values, with NaN where nothing arrives.
         """
-        edges = self.graph.senders.size
-        arrived = self._sent(values.shape[-1], links, acknowledged=acknowledged)
-        return np.where(arrived.reshape(*self.runs, edges)[..., None], values, np.nan)
-
-    def _combine_with_own(
-        self, v: Array, w: ConsensusWeights, lost: Lost
-    ) -> tuple[Array, Array]:
-        """As :meth:`combine`, with the weight that each agent's own value got, (*runs, A)."""
-        if self._perfect:
-            return self._combine_all(v, w, 1), w.own
-        k = v.shape[-1]
-        size = self.graph.n_agents
-        both = lost in ("mutual", "metropolis")
-        if both and self.graph.directed:
-            raise ValueError(f"lost: {lost!r} needs links both ways, got one-way links")
-        # Metropolis weights need the degree of what is left, one number more.
-        arrived = self._sent(k + (lost == "metropolis"), acknowledged=both, late=True)
-        flat = v.reshape(-1, k)
-        delay = self.faults.has_delay
-        heard, arrived = self._delayed(flat, arrived) if delay else (flat, arrived)
-        own, links = _after_loss(self.graph, w, arrived, lost)
-        matrix = stack_weights(
-            self.graph, own, links, heard_at=len(flat) if delay else 0
+        arrived = self._transmit_numbers(
+            values.shape[-1], links, acknowledged=acknowledged
         )
-        out = matrix @ (np.concatenate([flat, heard]) if delay else flat)
-        return out.reshape(v.shape), own.reshape(*self.runs, size)
+        by_run = arrived.reshape(*self.runs, self.graph.senders.size)
+        return np.where(by_run[..., None], values, np.nan)
 
-    def _sent(self, numbers: int, links: Mask | None = None, **options: bool) -> Mask:
-        """Send so many numbers over some links, all by default; which messages arrive, (R, E)."""
-        used = np.ones(self.graph.senders.size, dtype=bool) if links is None else links
-        return self._transmit(used, numbers, 8 * numbers, **options)
+    def _mix_without_faults(
+        self, values: Array, weights: ConsensusWeights, rounds: int
+    ) -> Array:
+        # The ledger is brought up to date when it is read: it would cost more than the product.
+        size = values.shape[-1]
+        self._uncharged[size] = self._uncharged.get(size, 0) + rounds
+        # One sparse product for all runs and components, agents first.
+        agents_first = np.moveaxis(values, -2, 0)
+        flat = agents_first.reshape(self.graph.n_agents, -1)
+        for _ in range(rounds):
+            flat = weights.matrix @ flat
+        mixed = np.moveaxis(flat.reshape(agents_first.shape), 0, -2)
+        return np.ascontiguousarray(mixed)
 
-    def _delayed(self, values: Array, arrived: Mask) -> tuple[Array, Mask]:
-        """The values of some rounds ago, and on which links those arrive now."""
-        queue = self._late.setdefault(values.shape, deque())
+    def _mix_once(
+        self, values: Array, weights: ConsensusWeights, on_loss: LossRule
+    ) -> tuple[Array, Array]:
+        """Return the mixed values, and the weight that each own value got, (*runs, A)."""
+        if self._perfect:
+            mixed = self._mix_without_faults(values, weights, 1)
+            return mixed, weights.self_weights
+        both_ways = on_loss in ("mutual", "metropolis")
+        if both_ways and self.graph.directed:
+            raise ValueError(
+                "on_loss must not be "
+                f"{on_loss!r} on a graph with one-way links, which needs links both ways"
+            )
+        size = values.shape[-1]
+        # Metropolis weights need the degree of the links that are left, one number more.
+        numbers = size + 1 if on_loss == "metropolis" else size
+        arrived = self._transmit_numbers(
+            numbers, acknowledged=both_ways, may_delay=True
+        )
+        flat = values.reshape(-1, size)
+        if self.faults.total_delay:
+            # Own values are present, received ones late: they stand below in one product.
+            received, arrived = self._delay(flat, arrived)
+            factors = np.concatenate([flat, received])
+            offset = len(flat)
+        else:
+            factors = flat
+            offset = 0
+        self_weights, link_weights = _weights_after_loss(
+            self.graph, weights, arrived, on_loss
+        )
+        matrix = stack_weights(
+            self.graph, self_weights, link_weights, received_offset=offset
+        )
+        mixed = (matrix @ factors).reshape(values.shape)
+        return mixed, self_weights.reshape(*self.runs, self.graph.n_agents)
+
+    def _delay(self, values: Array, arrived: Mask) -> tuple[Array, Mask]:
+        """Return the values of some rounds ago, and on which links those arrive now."""
+        queue = self._queues.setdefault(values.shape, deque())
         queue.append((values.copy(), arrived))
-        if len(queue) > self.faults.has_delay:
-            return queue.popleft()  # type: ignore[no-any-return]
+        if len(queue) > self.faults.total_delay:
+            return queue.popleft()
+        # Nothing has arrived yet.
         return np.zeros_like(values), np.zeros_like(arrived)
+
+    def _transmit_numbers(
+        self,
+        numbers: int,
+        links: Mask | None = None,
+        *,
+        acknowledged: bool = False,
+        may_delay: bool = False,
+    ) -> Mask:
+        """Send so many floats over some links, all by default; which arrive, (R, E)."""
+        if links is None:
+            links = np.ones(self.graph.senders.size, dtype=bool)
+        return self._transmit(
+            links, numbers, 8 * numbers, acknowledged=acknowledged, may_delay=may_delay
+        )
 
     def _transmit(
         self,
-        speaks: Mask,
-        sizes: Any,
+        used: Mask,
+        scalars: Any,
         bytes_: Any,
         *,
         acknowledged: bool = False,
-        late: bool = False,
+        may_delay: bool = False,
     ) -> Mask:
-        """Charge one round in which the links in `speaks` are used; which arrive, (R, E)."""
-        if self.faults.has_delay and not late:
+        """Charge one round on the links in use, and return which messages arrive, (R, E)."""
+        if self.faults.total_delay and not may_delay:
             raise ValueError(
-                f"channel must have no delay here, got {self.faults.has_delay} rounds"
+                "channel must have no delay here, "
+                f"got one of {self.faults.total_delay} rounds"
             )
-        now = self.ledger
-        size = self.graph.n_agents
-        (runs, here) = self._among
+        ledger = self.ledger
+        graph = self.graph
         if self._perfect:
-            arrived = np.broadcast_to(speaks, (runs, speaks.size))[here]
-            lost = np.zeros(size)
+            everywhere = np.broadcast_to(used, (self._n_drawn, used.size))
+            arrived = everywhere[self._drawn]
+            lost = np.zeros(graph.n_agents)
         else:
-            speaks = speaks & self.faults.speaking(self.graph, now.rounds, self.t)
-            arrived = (
-                speaks & ~self.faults.lost(self.graph, now.rounds, runs, self.t)[here]
+            # Radios that are off send nothing, which costs nothing.
+            used = used & self.faults.active_links(graph, ledger.rounds, self.t)
+            draws = self.faults.lost_messages(
+                graph, ledger.rounds, self._n_drawn, self.t
             )
-            missing = (speaks & ~arrived).mean(axis=0)
-            lost = np.bincount(
-                self.graph.senders, weights=missing, minlength=size
-            ).astype(float)
-        messages = np.bincount(self.graph.senders[speaks], minlength=size)
-        after = self._charged(now, messages, sizes, bytes_, lost=lost)
+            arrived = used & ~draws[self._drawn]
+            # The ledger has the mean over the runs.
+            missing = (used & ~arrived).mean(axis=0)
+            lost = self._count_by_agent(graph.senders, missing).astype(float)
+        messages = self._count_by_agent(graph.senders[used])
+        ledger = self._charge(ledger, messages, scalars, bytes_, lost=lost)
         if acknowledged:
-            back = np.bincount(self.graph.receivers[speaks], minlength=size)
-            after = self._charged(after, back, 0, 1, rounds=0)
-        self._ledger = after
+            # One byte back for each message, in the same round.
+            replies = self._count_by_agent(graph.receivers[used])
+            ledger = self._charge(ledger, replies, 0, 1, rounds=0)
+        self._ledger = ledger
         return np.asarray(arrived)
 
+    def _count_by_agent(self, agents: Indices, weights: Array | None = None) -> Any:
+        return np.bincount(agents, weights, minlength=self.graph.n_agents)
 
-def _by_receiver(graph: Graph, sent: Sequence[Any], links: Any) -> list[dict[int, Any]]:
-    """What arrives on some links, given by their ascending numbers, for each agent by sender."""
+    def _charge_mixing(self) -> None:
+        """Enter rounds of mixing without faults, in which every link carries a message."""
+        messages = self.graph.out_degree.astype(np.int64)
+        for size, rounds in self._uncharged.items():
+            self._ledger = self._charge(
+                self._ledger, rounds * messages, size, 8 * size, rounds=rounds
+            )
+        self._uncharged = {}
+
+    def _charge(
+        self,
+        ledger: Ledger,
+        messages: Any,
+        scalars: Any,
+        bytes_: Any,
+        *,
+        rounds: int = 1,
+        lost: Any = 0.0,
+    ) -> Ledger:
+        """Return the ledger after more rounds, with the agents' messages of these sizes."""
+        # Without links there is no round.
+        if self.graph.senders.size == 0:
+            rounds = 0
+        return ledger.replace(
+            rounds=ledger.rounds + rounds,
+            messages=ledger.messages + messages,
+            scalars=ledger.scalars + messages * scalars,
+            bytes=ledger.bytes + messages * bytes_,
+            lost=ledger.lost + lost,
+        )
+
+
+def _group_by_receiver(
+    graph: Graph, sent: Sequence[Any], links: Indices
+) -> list[dict[int, Any]]:
+    """Return for each agent the messages on some links, ascending numbers, by sender."""
     senders = graph.senders[links].tolist()
-    messages = [sent[j] for j in senders]
-    ends = np.searchsorted(
-        graph.receivers[links], np.arange(graph.n_agents + 1)
-    ).tolist()
-    return [
-        dict(zip(senders[i:j], messages[i:j], strict=True)) for i, j in pairwise(ends)
-    ]
+    # Links are ordered by receiver: agent i has those from bounds[i] to before bounds[i + 1].
+    agents = np.arange(graph.n_agents + 1)
+    bounds = np.searchsorted(graph.receivers[links], agents).tolist()
+    inbox = []
+    for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
+        inbox.append({sender: sent[sender] for sender in senders[start:stop]})
+    return inbox
 
 
-def _after_loss(
-    graph: Graph, w: ConsensusWeights, arrived: Mask, lost: str
+def _weights_after_loss(
+    graph: Graph, weights: ConsensusWeights, arrived: Mask, on_loss: LossRule
 ) -> tuple[Array, Array]:
-    """Own and link weights of each run, (R, A) and (R, E), once some messages are missing."""
-    ends = graph.receivers
-    sums = partial(graph._summed, axis=1)
-    if lost in ("mutual", "metropolis"):
+    """Return self-weights (R, A) and link weights (R, E) of each run after losses."""
+    receivers = graph.receivers
+    sum_links = partial(graph._sum_by_receiver, axis=1)
+    if on_loss in ("mutual", "metropolis"):
+        # A link counts only if its opposite has delivered too.
         arrived = arrived & arrived[:, graph.reverse]
-    if lost == "metropolis":
-        degrees = sums(arrived.astype(np.float64))
-        pair = np.maximum(degrees[:, ends], degrees[:, graph.senders])
-        links = arrived / (1 + pair)
-        return 1 - sums(links), links
-    links = w.links * arrived
-    own = np.broadcast_to(w.own, (arrived.shape[0], graph.n_agents))
-    if lost in ("mutual", "keep"):
-        own = own + sums(w.links * ~arrived)
-    elif lost == "renormalise":
-        total = own + sums(links)
+    if on_loss == "metropolis":
+        degrees = sum_links(arrived.astype(np.float64))
+        larger = np.maximum(degrees[:, receivers], degrees[:, graph.senders])
+        link_weights = arrived / (1 + larger)
+        return 1 - sum_links(link_weights), link_weights
+
+    link_weights = weights.link_weights * arrived
+    shape = (arrived.shape[0], graph.n_agents)
+    self_weights = np.broadcast_to(weights.self_weights, shape)
+    if on_loss in ("mutual", "keep"):
+        # The own value takes over the weights of lost messages.
+        self_weights = self_weights + sum_links(weights.link_weights * ~arrived)
+    elif on_loss == "renormalise":
+        total = self_weights + sum_links(link_weights)
         if (np.abs(total) < 1e-12).any():
             raise ValueError(
-                "lost: 'renormalise' needs weights left, got a row that sums to 0"
+                "on_loss must not be 'renormalise' where the weights of received messages "
+                "and of the own value sum to 0"
             )
-        own = own / total
-        links = links / total[:, ends]
-    return np.asarray(own), links
+        self_weights = self_weights / total
+        link_weights = link_weights / total[:, receivers]
+    return np.asarray(self_weights), link_weights
 
 
-def fusion_rule(kind: Fused) -> Callable[[F], F]:
-    """Say what a rule of agreement fuses, so that a filter can tell if the rule is for it.
+def fusion_rule(kind: BeliefKind) -> Callable[[F], F]:
+    """Declare what a fusion rule fuses, so that a filter can refuse a rule of another kind.
 
     Parameters
     ----------
     kind : {"vectors", "ensembles", "gaussians", "mixtures", "densities", "particles"}
-        What ``rule(belief, channel, *, …)`` takes and returns.
+        The beliefs that ``rule(belief, channel, *, …)`` takes and returns.
 
     Examples
     --------
@@ -377,15 +437,15 @@ def fusion_rule(kind: Fused) -> Callable[[F], F]:
     'vectors'
     """
 
-    def named(rule: F) -> F:
+    def declare(rule: F) -> F:
         rule.belief_kind = kind  # type: ignore[attr-defined]
         return rule
 
-    return named
+    return declare
 
 
 def kind_of_rule(rule: Callable[..., Any]) -> str | None:
-    """What a rule says that it fuses, also with options given by a partial; None if nothing.
+    """Return what a rule declares to fuse, also if a partial gives it options; None if nothing.
 
     >>> from distfilt.network import average_consensus
     >>> kind_of_rule(partial(average_consensus, rounds=3)), kind_of_rule(print)

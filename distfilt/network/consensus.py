@@ -1,4 +1,7 @@
-"""Rules by which agents agree, ``(values, channel, *, …) -> values``, and minimise a sum."""
+"""Consensus on the average or the maximum of the agents' values, and ADMM for a sum.
+
+A consensus rule is a function ``(values, channel, *, …) -> values``.
+"""
 
 from __future__ import annotations
 
@@ -16,15 +19,16 @@ from ..validation import (
     FrozenModel,
     PositiveFloat,
     PositiveInt,
+    call_user,
     check_array,
     validated,
 )
-from .channel import Channel, Lost, PerAgent, fusion_rule
+from .channel import Channel, LossRule, PerAgent, fusion_rule
 from .graphs import Graph
 from .weights import (
     ConsensusWeights,
-    _keeping,
-    _laplacian,
+    _check_keeps_average,
+    _laplacian_weights,
     _warn_if_unstable,
     metropolis,
 )
@@ -41,21 +45,21 @@ __all__ = [
 
 
 class Disconnected(RuntimeWarning):
-    """A graph in several parts, each of which agrees on an average of its own.
+    """A graph that is not connected, so that each component reaches an average of its own.
 
     >>> issubclass(Disconnected, RuntimeWarning)
     True
     """
 
 
-def _alone(channel: Channel) -> None:
+def _check_single_run(channel: Channel) -> None:
     if channel.runs:
         raise ValueError(f"channel must be a single run, got runs {channel.runs}")
 
 
-def _faultless(channel: Channel) -> None:
-    if not channel.faults.none:
-        raise ValueError("channel must have no faults here, got a faulty channel")
+def _check_faultless(channel: Channel) -> None:
+    if not channel.faults.is_perfect:
+        raise ValueError("channel must have no faults here, got a channel with faults")
 
 
 @fusion_rule("vectors")
@@ -67,9 +71,9 @@ def average_consensus(
     rounds: PositiveInt = 1,
     gain: PositiveFloat | None = None,
     weights: ConsensusWeights | None = None,
-    lost: Lost = "mutual",
+    on_loss: LossRule = "mutual",
 ) -> Array:
-    r"""Move every agent's value towards its neighbours', the averaging behind equation (16).
+    r"""Average consensus: move each value towards its neighbours', as in (16) of Grange et al.
 
     .. math:: \mathbf x_i \leftarrow \mathbf x_i
         + \gamma\sum_{j\in\mathcal N_i}(\mathbf x_j-\mathbf x_i)
@@ -79,18 +83,19 @@ def average_consensus(
     values : array_like, (*runs, A, k)
         One vector per agent.
     channel : Channel
-        The door between agents. On a graph that is not connected each component agrees for itself.
+        On a graph that is not connected each component reaches its own average.
     rounds : int
-        How many times. More than one on a graph in several parts raise a :class:`Disconnected`
-        warning; one does not, as graphs that change may be connected over time.
+        Number of rounds. More than one on a graph of several components give a
+        :class:`Disconnected` warning; one does not, as a graph that changes may be connected over
+        time.
     gain : float, optional
-        The gain γ, positive. The values agree if and only if the graph is connected and
-        γ < 2/λ_max of its Laplacian; above it an :class:`UnstableGain` warns.
-    weights : Weights, optional
-        Other weights instead; Metropolis by default. They have to keep the average on their own
-        account: symmetric, or :func:`distfilt.network.weights.balanced` on a digraph.
-    lost : str
-        What to do about lost messages: see :meth:`Channel.combine`.
+        The gain γ, positive. The values converge to the average if and only if the graph is
+        connected and γ < 2/λ_max of its Laplacian; above that an :class:`UnstableGain` warns.
+    weights : ConsensusWeights, optional
+        Weights in place of a gain; Metropolis by default. They must keep the average: symmetric
+        ones do, and :func:`distfilt.network.weights.doubly_stochastic` on a digraph.
+    on_loss : str
+        Where the weight of a lost message goes: see :meth:`Channel.mix`.
 
     Examples
     --------
@@ -104,24 +109,29 @@ def average_consensus(
     """
     graph = channel.graph
     if gain is not None and weights is not None:
-        raise ValueError("gain must stand alone, got weights too")
+        raise ValueError("gain must be None if weights are given, got both")
     if gain is not None:
         _warn_if_unstable(graph, gain)
-        weights = _laplacian(graph, gain)
+        weights = _laplacian_weights(graph, gain)
     elif weights is None:
         weights = metropolis(graph)
-    _keeping(weights)
+    _check_keeps_average(weights)
     if rounds > 1 and not graph.connected:
-        parts = graph.components.max() + 1
-        text = f"channel: the graph has {parts} parts, and each agrees on an average of its own"
-        warnings.warn(text, Disconnected, stacklevel=3)
-    return channel.mix(values, weights, lost=lost, rounds=rounds)
+        count = graph.components.max() + 1
+        warnings.warn(
+            "channel must have a connected graph to reach one average, "
+            f"got {count} components, each of which reaches its own",
+            Disconnected,
+            # Over the validation of this function to its caller.
+            stacklevel=3,
+        )
+    return channel.mix(values, weights, on_loss=on_loss, rounds=rounds)
 
 
 @fusion_rule("vectors")
 @validated
 def finite_time_consensus(values: PerAgent, channel: Channel) -> Array:
-    r"""The exact average in as many rounds as the Laplacian has distinct nonzero eigenvalues.
+    r"""Reach the exact average in as many rounds as the Laplacian has distinct nonzero eigenvalues.
 
     .. math:: \prod_{k}\Bigl(\mathbf I-\tfrac1{\lambda_k}\mathbf L\Bigr)\mathbf x
         = \bar x\,\mathbf 1
@@ -131,19 +141,19 @@ def finite_time_consensus(values: PerAgent, channel: Channel) -> Array:
     Parameters
     ----------
     values, channel
-        As for :func:`average`. Connected, with links both ways, and without faults: one lost
-        message spoils the product.
+        As for :func:`average_consensus`. Connected, with links both ways, and without faults: one
+        lost message spoils the product.
 
     Raises
     ------
     ValueError
-        If rounding would spoil it too, as it does where eigenvalues are many and uneven: of twenty
-        agents with a hub, or of a hundred at random. There :func:`average` is the way.
+        If rounding would spoil it too, as it does for many, unevenly spaced eigenvalues: of twenty
+        agents with a hub, or of a hundred at random. Use :func:`average_consensus` there.
 
     Notes
     -----
-    Large factors come between small ones (Leja's order), which keeps rounding small on rings,
-    paths and grids.
+    The factors are applied in Leja's order, large ones between small ones, which keeps rounding
+    errors small on rings, paths and grids.
 
     Examples
     --------
@@ -154,65 +164,71 @@ def finite_time_consensus(values: PerAgent, channel: Channel) -> Array:
     >>> channel.ledger.rounds
     2
     """
-    channel.graph._joined()
-    _faultless(channel)
-    combine = channel.mix
-    out = values.copy()
-    for eigenvalue in _factors(channel.graph):
-        out = combine(out, _laplacian(channel.graph, 1 / eigenvalue))
-    return out
+    graph = channel.graph
+    graph._check_connected()
+    _check_faultless(channel)
+    mixed = values.copy()
+    for eigenvalue in _ordered_eigenvalues(graph):
+        # The factor I - L/λ is an averaging step with the gain 1/λ.
+        mixed = channel.mix(mixed, _laplacian_weights(graph, 1 / eigenvalue))
+    return mixed
 
 
 @lru_cache(maxsize=32)
-def _factors(graph: Graph) -> list[float]:
-    """The eigenvalues in their order, refused where their product is not what it is on paper."""
-    found = _leja(_distinct(graph.laplacian_spectrum[1:]))
-    left = np.eye(graph.n_agents) - 1 / graph.n_agents
-    for eigenvalue in found:
-        left -= graph.laplacian @ left / eigenvalue
-    if (lost := np.abs(left).max()) > 1e-9:
+def _ordered_eigenvalues(graph: Graph) -> list[float]:
+    """Return the distinct nonzero eigenvalues in Leja's order, if rounding permits."""
+    eigenvalues = _leja_order(_drop_repeated(graph.laplacian_spectrum[1:]))
+    # Applied to I - 11ᵀ/A the product is zero, but for rounding.
+    remainder = np.eye(graph.n_agents) - 1 / graph.n_agents
+    for eigenvalue in eigenvalues:
+        remainder -= graph.laplacian @ remainder / eigenvalue
+    error = np.abs(remainder).max()
+    if error > 1e-9:
         raise ValueError(
-            f"channel must be a graph that rounding spares, got an error of {lost:.0e}"
+            "channel must have a graph whose Laplacian's eigenvalues permit an exact average in "
+            f"floating point, got a rounding error of {error:.0e}: use average_consensus"
         )
-    return found
+    return eigenvalues
 
 
-def _distinct(values: Array) -> Array:
-    gaps = np.diff(values, prepend=-np.inf) > 1e-9 * max(
-        1.0, float(values.max(initial=0))
-    )
-    return values[gaps]
+def _drop_repeated(ascending: Array) -> Array:
+    """Return ascending values without those that repeat the one before up to rounding."""
+    scale = max(1.0, float(ascending.max(initial=0)))
+    is_new = np.diff(ascending, prepend=-np.inf) > 1e-9 * scale
+    return ascending[is_new]
 
 
-def _leja(points: Array) -> list[float]:
-    """Ascending points in an order in which partial products of their factors stay small.
+def _leja_order(ascending: Array) -> list[float]:
+    """Return ascending points in an order in which partial products of their factors stay small.
 
-    Each next one is farthest, in the geometric mean, from all before it.
+    The first is the largest; each next one is farthest, in the geometric mean, from all before it.
     """
-    score = np.zeros(points.size)
-    order = [float(p) for p in points[-1:]]
-    while len(order) < points.size:
+    log_distance = np.zeros(ascending.size)
+    order = [float(p) for p in ascending[-1:]]
+    while len(order) < ascending.size:
+        # Points that are in the order already have the logarithm of zero.
         with np.errstate(divide="ignore"):
-            score += np.log(np.abs(points - order[-1]))
-        order.append(float(points[score.argmax()]))
+            log_distance += np.log(np.abs(ascending - order[-1]))
+        order.append(float(ascending[log_distance.argmax()]))
     return order
 
 
 @fusion_rule("vectors")
 @validated
 def push_sum(values: PerAgent, channel: Channel, *, rounds: PositiveInt) -> Array:
-    r"""Averages on any strongly connected digraph, also when messages are lost, without answers.
+    r"""Average on any strongly connected digraph, despite lost messages, without acknowledgements.
 
-    Each agent pushes shares of its value and of a weight that began at one, and the ratio tends to
-    the average. On each link it sends the *running sum* of all it ever pushed there; the receiver
-    takes the increase since what it heard last, so that a lost message is made good by the next.
+    Each agent pushes equal parts of its value and of a weight that started at one; the ratio of
+    the two tends to the average. On each link it sends the *running sum* of all that it has pushed
+    there. The receiver takes the increase since the last sum that arrived, so that a lost message
+    is made good by the next.
 
     Parameters
     ----------
     values, channel
-        As for :func:`average`. Strongly connected; messages may be lost.
+        As for :func:`average_consensus`. Strongly connected; messages may be lost.
     rounds : int
-        How many rounds; k + 1 scalars a link and round.
+        Number of rounds, with k + 1 scalars a link each.
 
     Returns
     -------
@@ -231,19 +247,21 @@ def push_sum(values: PerAgent, channel: Channel, *, rounds: PositiveInt) -> Arra
     >>> push_sum([[0.0], [3.0], [6.0]], Channel(circle), rounds=80).ravel().round(9)
     array([3., 3., 3.])
     """
-    channel.graph._joined()
     graph = channel.graph
-    carry = channel.send_on_links
-    mass = np.concatenate([values, np.ones((*values.shape[:-1], 1))], axis=-1)
-    share = 1 / (1 + graph.out_degree)[:, None]
+    graph._check_connected()
+    # Value and weight of each agent, which move together.
+    ones = np.ones((*values.shape[:-1], 1))
+    mass = np.concatenate([values, ones], axis=-1)
+    part = 1 / (1 + graph.out_degree)[:, None]
     pushed = np.zeros_like(mass)
-    heard = np.zeros((*channel.runs, graph.senders.size, mass.shape[-1]))
+    # The last running sum that arrived on each link.
+    received = np.zeros((*channel.runs, graph.senders.size, mass.shape[-1]))
     for _ in range(rounds):
-        pushed = pushed + share * mass
-        arrived = carry(pushed[..., graph.senders, :])
-        latest = np.where(np.isnan(arrived), heard, arrived)
-        mass = share * mass + graph._summed(latest - heard)
-        heard = latest
+        pushed = pushed + part * mass
+        arrived = channel.send_on_links(pushed[..., graph.senders, :])
+        latest = np.where(np.isnan(arrived), received, arrived)
+        mass = part * mass + graph._sum_by_receiver(latest - received)
+        received = latest
     return np.asarray(mass[..., :-1] / mass[..., -1:])
 
 
@@ -252,12 +270,12 @@ def push_sum(values: PerAgent, channel: Channel, *, rounds: PositiveInt) -> Arra
 def max_consensus(
     values: PerAgent, channel: Channel, *, rounds: PositiveInt | None = None
 ) -> Array:
-    """The largest value, component by component; exact after as many rounds as the diameter.
+    """Reach the largest value, component by component, in as many rounds as the diameter.
 
     Parameters
     ----------
     values, channel
-        As for :func:`average`. Connected; a lost message only costs time.
+        As for :func:`average_consensus`. Connected; a lost message only costs time.
     rounds : int, optional
         By default the graph's diameter.
 
@@ -267,31 +285,34 @@ def max_consensus(
     >>> max_consensus([[1.0], [5.0], [2.0]], Channel(graphs.path(3))).ravel()
     array([5., 5., 5.])
     """
-    channel.graph._joined()
     graph = channel.graph
-    carry = channel.send_on_links
-    out = values.copy()
+    graph._check_connected()
+    largest = values.copy()
     if graph.n_agents == 1:
-        return out
+        return largest
+    # Links are ordered by receiver, and each agent of a connected graph has one or more.
+    row_starts = graph.links.indptr[:-1]
     for _ in range(rounds or graph.diameter):
-        arrived = carry(out[..., graph.senders, :])
-        out = np.fmax(out, np.fmax.reduceat(arrived, graph.links.indptr[:-1], axis=-2))
-    return out
+        arrived = channel.send_on_links(largest[..., graph.senders, :])
+        # fmax passes over NaN, a lost message.
+        received = np.fmax.reduceat(arrived, row_starts, axis=-2)
+        largest = np.fmax(largest, received)
+    return largest
 
 
 @dataclass(frozen=True, eq=False)
 class AdmmResult(FrozenModel):
-    """What consensus ADMM found.
+    """Result of consensus ADMM.
 
     Parameters
     ----------
     common : ndarray, (A, k)
         Each agent's copy of the common variable Z.
     iterations : int
-        How many.
+        Number of iterations.
     primal, dual : float
-        The residuals at the end, over all agents: the largest distance of local from common, and ρ
-        times the largest change of the common variable.
+        The last residuals, over all agents: the largest difference of local and common variable,
+        and ρ times the largest change of the common variable.
 
     Examples
     --------
@@ -316,7 +337,7 @@ def admm(
     iterations: PositiveInt = 1000,
     average: Callable[[Array, Channel], Array] = finite_time_consensus,
 ) -> AdmmResult:
-    r"""Minimise :math:`\sum_l f_l(\mathbf Z)` when agent l knows only its own :math:`f_l`.
+    r"""Minimise :math:`\sum_l f_l(\mathbf Z)` where only agent l knows :math:`f_l`.
 
     .. math::
         \mathbf U_l &\leftarrow \arg\min_{\mathbf U} f_l(\mathbf U)
@@ -327,23 +348,23 @@ def admm(
     Parameters
     ----------
     local_solve : callable
-        ``local_solve(target, rho) -> U`` on (A, k): the proximal step of every agent for its own
-        objective at its own row of `target` = Z - W.
+        ``local_solve(target, rho) -> U`` on (A, k): the proximal step of every agent for its
+        objective at its row of `target` = Z - W.
     start : array_like, (A, k)
         Each agent's first Z.
     channel : Channel
-        The door between agents; a single run, connected, without faults. After every iteration the
-        agents agree on their largest residuals, so that all stop at once: :func:`maximum` of 2
-        scalars, as many rounds as the diameter, charged like everything else.
+        A single run, connected, without faults. After every iteration the agents agree on their
+        largest residuals, so that all stop at once: :func:`max_consensus` of 2 scalars, as many
+        rounds as the diameter, charged like everything else.
     rho : float
         Penalty, positive.
     tolerance : float
         Stop when both residuals, of every agent, are below it.
     iterations : int
         At most this many.
-    agree : callable
-        ``agree(values, channel) -> values``: how the average is found. With a rule that is only
-        approximate the agents' copies of Z differ.
+    average : callable
+        ``average(values, channel) -> values``: a consensus rule for the average. With a rule that
+        is only approximate the agents' copies of Z differ.
 
     Raises
     ------
@@ -360,30 +381,32 @@ def admm(
     The average of private numbers, each the minimiser of its agent's :math:`(u-c_l)^2/2`:
 
     >>> from distfilt.network import Channel, graphs
-    >>> own = np.array([[1.0], [2.0], [6.0]])
-    >>> run = admm(lambda v, rho: (own + rho * v) / (1 + rho), np.zeros((3, 1)),
-    ...            Channel(graphs.path(3)))
-    >>> run.common.round(5).ravel()
+    >>> c = np.array([[1.0], [2.0], [6.0]])
+    >>> def local_solve(target, rho):
+    ...     return (c + rho * target) / (1 + rho)
+    >>> result = admm(local_solve, np.zeros((3, 1)), Channel(graphs.path(3)))
+    >>> result.common.round(5).ravel()
     array([3., 3., 3.])
     """
-    _alone(channel)
-    _faultless(channel)  # or agents would stop apart
+    _check_single_run(channel)
+    # With losses agents could stop at different iterations.
+    _check_faultless(channel)
     z = start
     w = np.zeros_like(start)
-    for n in range(1, iterations + 1):
-        u = check_array(local_solve(z - w, rho), "local_solve", z.shape)
-        new = check_array(average(u + w, channel), "agree", z.shape)
+    for iteration in range(1, iterations + 1):
+        u = check_array(call_user(local_solve, z - w, rho), "local_solve", z.shape)
+        new = check_array(call_user(average, u + w, channel), "average", z.shape)
         w = w + u - new
-        gaps = np.stack(
-            [np.abs(u - new).max(axis=1), np.abs(new - z).max(axis=1)], axis=1
-        )
-        residuals = gaps * [1.0, rho]
+        # Each agent's primal residual |U - Z| and dual residual ρ |Z - Z before|.
+        local = np.abs(u - new).max(axis=1)
+        change = rho * np.abs(new - z).max(axis=1)
+        residuals = np.stack([local, change], axis=1)
         z = new
         # After the maximum all agents hold the same two numbers; any row will do.
         primal, dual = max_consensus(residuals, channel)[0].tolist()
         if primal < tolerance and dual < tolerance:
-            return AdmmResult.construct(z, n, primal, dual)
+            return AdmmResult.construct(z, iteration, primal, dual)
     raise SolverError(
-        f"admm: residuals {primal:.3g} and {dual:.3g} after {iterations} iterations, "
-        f"needs both below {tolerance:g}"
+        f"iterations must be more for residuals below {tolerance:g}, "
+        f"got {primal:.3g} and {dual:.3g} after {iterations} iterations"
     )

@@ -1,4 +1,4 @@
-"""What goes wrong on the way: messages lost, alone or in bursts, late, and agents silent."""
+"""Faults of a channel: lost messages, alone or in bursts, delays, and silent agents."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from ..validation import (
     Array,
     Bounds,
     FrozenModel,
+    Indices,
     Mask,
     NonNegativeInt,
     UnitInterval,
@@ -23,11 +24,15 @@ from .graphs import Graph
 
 __all__ = ["Faults"]
 
-_GOLDEN = 0x9E3779B97F4A7C15
-
 Hashes = NDArray[np.uint64]
 
-_BETWEEN = Bounds(at_least=0, at_most=1)
+_GOLDEN = 0x9E3779B97F4A7C15
+"""2^64 divided by the golden ratio: the increment of the generator splitmix64."""
+
+_LOOKBACK = 16
+"""Rounds of a burst that are looked up at a time; most bursts have begun within them."""
+
+_PROBABILITY = Bounds(at_least=0, at_most=1)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -38,182 +43,234 @@ class Faults(FrozenModel):
     ----------
     loss : float or array_like, (A,) or (A, A)
         Probability that a message is lost, in [0, 1]; one for each receiver, or ``loss[i, j]`` for
-        what agent i hears of agent j.
+        messages from agent j to agent i.
     seed : int
-        Of the losses. Whether a message is lost is a function of seed, run, round and link alone,
-        so that every agent, or every process of a real network, can compute it, and no draw
-        depends on what was drawn before.
-    burst : float, optional
-        Mean number of rounds for which a link that fails keeps failing. Losses are independent by
-        default, which is the shortest burst there is, 1 / (1 - loss) rounds.
+        Of the losses. Whether a message is lost is a function of seed, run, round and link alone.
+        So every agent, or every process of a real network, can compute it, and no draw depends on
+        earlier draws.
+    burst_length : float, optional
+        Mean number of rounds for which a link that fails keeps failing. By default losses are
+        independent, which gives the shortest possible bursts, 1 / (1 - loss) rounds.
     delay : int
-        Rounds that a message takes on top of its own, in a channel that lives as long; for
-        averages (:meth:`Channel.combine`) alone.
+        Rounds by which a message arrives later, in a channel that lives as long; for
+        :meth:`Channel.mix` alone.
     silent : collection of int
-        Agents whose radio is off: they neither send nor hear.
+        Agents whose radio is off: they neither send nor receive.
     during : sequence of (start, stop), optional
-        When losses happen and agents are silent: from `start` to before `stop`, in s where the
-        channel has a time `t`, as in filters, and in rounds of its ledger otherwise. Always by
-        default; `stop` may be infinite.
-    also : tuple of Faults
-        What fails besides; ``|`` fills it.
+        Windows in which messages are lost and agents are silent: from `start` to before `stop`, in
+        s where the channel has a time `t`, as in filters, and in rounds of its ledger otherwise.
+        Always by default; `stop` may be infinite.
+    others : tuple of Faults
+        Further faults; ``|`` fills it.
 
     Notes
     -----
     Bursts are a two-state Markov chain on each link (E. N. Gilbert, Bell System Technical Journal
-    39 (1960) 1253-1265, with nothing lost in one state and everything in the other). Its state in a
-    round is that of the last round, looking back, in which the number drawn leads to the same
-    state from both: exact from the first round on, and again independent of what was computed
-    before.
+    39 (1960) 1253-1265, with nothing lost in one state and everything in the other). One number is
+    drawn for each round. In most rounds it decides the next state whatever the last one was, and
+    the state in any round follows from the latest such round. It is exact from the first round on
+    and depends on no earlier computation.
 
     Examples
     --------
-    >>> Faults(loss=0.2, seed=7).lost(
+    >>> Faults(loss=0.2, seed=7).lost_messages(
     ...     Graph.from_adjacency([[0, 1], [1, 0]]), 0, 5
     ... ).shape
     (5, 2)
 
     Agent 3 is off for a while, and all links fail for 8 rounds at a time:
 
-    >>> faults = Faults(loss=0.1, burst=8.0) | Faults(silent=[3], during=[(10, 20)])
-    >>> faults.none
+    >>> faults = Faults(loss=0.1, burst_length=8.0) | Faults(
+    ...     silent=[3], during=[(10, 20)]
+    ... )
+    >>> faults.is_perfect
     False
     """
 
     loss: (
         UnitInterval
-        | Annotated[Array, "A", _BETWEEN]
-        | Annotated[Array, "A A", _BETWEEN]
+        | Annotated[Array, "A", _PROBABILITY]
+        | Annotated[Array, "A A", _PROBABILITY]
     ) = 0.0
     seed: NonNegativeInt = 0
-    burst: Annotated[float, Bounds(at_least=1)] | None = None
+    burst_length: Annotated[float, Bounds(at_least=1)] | None = None
     delay: NonNegativeInt = 0
     silent: Collection[NonNegativeInt] = ()
     during: Any = None
-    also: tuple[Faults, ...] = ()
+    others: tuple[Faults, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
         loss = np.asarray(self.loss)
+        # Independent losses repeat with probability p: runs of them last 1 / (1 - p) on average.
         shortest = 1 / (1 - loss[loss < 1].max(initial=0.0))
-        if self.burst is not None and self.burst < shortest * (1 - 1e-9):
+        if self.burst_length is not None and self.burst_length < shortest * (1 - 1e-9):
             raise ValueError(
-                f"burst must have at least 1 / (1 - loss) = {shortest:g} rounds, which independent "
-                f"losses last, got {self.burst:g}"
+                f"burst_length must be at least 1 / (1 - loss) = {shortest:g} rounds, the mean "
+                f"length with independent losses, got {self.burst_length:g}"
             )
         if self.during is not None:
-            object.__setattr__(self, "during", _windows(self.during))
+            object.__setattr__(self, "during", _check_windows(self.during))
 
     def __or__(self, other: Faults) -> Faults:
         if not isinstance(other, Faults):
             return NotImplemented
-        mine, theirs = (
-            {f.seed for f in x._all() if np.any(f.loss)} for x in (self, other)
-        )
-        if mine & theirs:
+        # Two losses of one seed would fail together.
+        common = self._seeds_of_losses() & other._seeds_of_losses()
+        if common:
             raise ValueError(
-                f"seed must be other seeds to lose other messages, got {min(mine & theirs)} twice"
+                "seed must differ between faults that lose messages, "
+                f"got {min(common)} twice"
             )
-        return replace(self, also=(*self.also, *other._all()))
+        return replace(self, others=(*self.others, *other._flatten()))
 
-    def _all(self) -> tuple[Faults, ...]:
-        return (self.replace(also=()), *(x for f in self.also for x in f._all()))
+    def _flatten(self) -> tuple[Faults, ...]:
+        """Return these faults and all further ones, each without others."""
+        flat = [self.replace(others=())]
+        for faults in self.others:
+            flat.extend(faults._flatten())
+        return tuple(flat)
 
-    def check(self, graph: Graph) -> None:
-        """Refuse a graph whose agents do not fit."""
-        agents = graph.n_agents
-        for faults in self._all():
-            got = np.shape(faults.loss)
-            if got != (agents,) * len(got):
+    def _seeds_of_losses(self) -> set[int]:
+        return {faults.seed for faults in self._flatten() if np.any(faults.loss)}
+
+    def check_graph(self, graph: Graph) -> None:
+        """Refuse a graph of which the agents do not fit."""
+        n_agents = graph.n_agents
+        for faults in self._flatten():
+            shape = np.shape(faults.loss)
+            if shape != (n_agents,) * len(shape):
                 raise ValueError(
-                    f"loss must be a number for each of {agents} agents, got {got}"
+                    f"loss must be a number for each of {n_agents} agents, got {shape}"
                 )
-            Bounds(below=agents)(max(faults.silent, default=-1), "silent")
+            Bounds(below=n_agents)(max(faults.silent, default=-1), "silent")
 
     @cached_property
-    def none(self) -> bool:
+    def is_perfect(self) -> bool:
         """Whether nothing ever fails."""
-        return not any(np.any(f.loss) or f.delay or f.silent for f in self._all())
+        for faults in self._flatten():
+            if np.any(faults.loss) or faults.delay or faults.silent:
+                return False
+        return True
 
     @cached_property
-    def has_delay(self) -> int:
-        """Rounds that a message takes on top of its own, all delays together."""
-        return sum(f.delay for f in self._all())
+    def total_delay(self) -> int:
+        """Rounds by which a message arrives later, all delays together."""
+        return sum(faults.delay for faults in self._flatten())
 
-    def speaking(self, graph: Graph, round_: int = 0, t: float | None = None) -> Mask:
-        """Links whose both ends have their radio on in a round, (E,)."""
+    def active_links(
+        self, graph: Graph, round_: int = 0, t: float | None = None
+    ) -> Mask:
+        """Return the links of which both ends have their radio on in a round, (E,)."""
         off = np.zeros(graph.n_agents, dtype=bool)
-        for faults in self._all():
-            if faults.silent and faults._active(round_, t):
+        for faults in self._flatten():
+            if faults.silent and faults._is_active(round_, t):
                 off[list(faults.silent)] = True
         return ~(off[graph.receivers] | off[graph.senders])
 
-    def lost(
+    def lost_messages(
         self, graph: Graph, round_: int, runs: int, t: float | None = None
     ) -> Mask:
-        """Which links lose the message of round `round_` in each of `runs` runs, (runs, E)."""
-        out = np.zeros((runs, graph.senders.size), dtype=bool)
-        for faults in self._all():
-            if np.any(faults.loss) and faults._active(round_, t):
-                out |= faults._losses(graph, round_, runs)
-        return out
+        """Return which links lose the message of round `round_` in each run, (runs, E)."""
+        lost = np.zeros((runs, graph.senders.size), dtype=bool)
+        for faults in self._flatten():
+            if np.any(faults.loss) and faults._is_active(round_, t):
+                lost |= faults._draw_losses(graph, round_, runs)
+        return lost
 
-    def _active(self, round_: int, t: float | None) -> bool:
+    def _is_active(self, round_: int, t: float | None) -> bool:
+        """Return whether a round, or a time if there is one, lies in a window."""
+        if self.during is None:
+            return True
         now = round_ if t is None else t
-        return self.during is None or any(
-            start <= now < stop for start, stop in self.during
-        )
+        return any(start <= now < stop for start, stop in self.during)
 
-    def _losses(self, graph: Graph, round_: int, runs: int) -> Mask:
-        i = graph.receivers
-        j = graph.senders
-        link = _mixed((i * graph.n_agents + j).astype(np.uint64) + np.uint64(_GOLDEN))
+    def _draw_losses(self, graph: Graph, round_: int, runs: int) -> Mask:
+        """Return the losses of one round, (runs, E), whatever the window."""
+        probability = self._link_probabilities(graph)
+        link_bits = _link_bits(graph)
+        uniform = _uniform(self._run_bits([round_], runs).T ^ link_bits)
+        if self.burst_length is None:
+            return np.asarray(uniform < probability)
+
+        # Gilbert's chain. A link that fails goes on with probability 1 - 1/burst_length =
+        # enter + stay; one that works fails next with probability enter. Its stationary
+        # probability of failing is then enter / (1 - stay) = loss.
+        probability = np.broadcast_to(probability, link_bits.shape)
+        random = (probability > 0) & (probability < 1)
+        works = np.where(random, 1 - probability, 1.0)
+        stay = np.where(random, 1 - 1 / (self.burst_length * works), 0.0).clip(0)
+        enter = probability * (1 - stay)
+        # u < enter: lost. enter <= u < enter + stay: as in the round before. Else it arrives.
+        lost = uniform < enter
+        unknown = np.nonzero(~lost & (uniform < enter + stay))
+        self._look_back(lost, unknown, round_, link_bits, enter, stay)
+        return np.asarray(lost)
+
+    def _look_back(
+        self,
+        lost: Mask,
+        unknown: tuple[Indices, ...],
+        round_: int,
+        link_bits: Hashes,
+        enter: Array,
+        stay: Array,
+    ) -> None:
+        """Fill in losses that are those of an earlier round, in place."""
+        run, link = unknown
+        runs = lost.shape[0]
+        while run.size:
+            earlier = range(round_ - 1, round_ - _LOOKBACK - 1, -1)
+            round_ = round_ - _LOOKBACK
+            uniform = _uniform(self._run_bits(earlier, runs)[:, run] ^ link_bits[link])
+            fails = uniform < enter[link]
+            decided = fails | (uniform >= (enter + stay)[link])
+            # The latest round that decides; argmax finds the first True, or 0 where there is none.
+            latest = decided.argmax(axis=0)
+            lost[run, link] = fails[latest, np.arange(run.size)]
+            # The others go on from an earlier round.
+            open_ = ~decided.any(axis=0)
+            run = run[open_]
+            link = link[open_]
+
+    def _link_probabilities(self, graph: Graph) -> Array:
+        """Return the probability of loss of each link, (E,), or one number for all."""
         loss = np.asarray(self.loss)
-        rate = loss[(i, j)[: loss.ndim]]
-        drawn = _uniform(self._runs([round_], runs).T ^ link)
-        if self.burst is None:
-            return np.asarray(drawn < rate)
-        rate = np.broadcast_to(rate, link.shape)
-        inner = (rate > 0) & (rate < 1)
-        stay = np.where(
-            inner, 1 - 1 / (self.burst * np.where(inner, 1 - rate, 1.0)), 0.0
-        ).clip(0)
-        enter = rate * (1 - stay)
-        out = drawn < enter
-        run, at = np.nonzero(~out & (drawn < enter + stay))
-        while run.size:  # sixteen rounds back at a time
-            before = range(round_ - 1, round_ - 17, -1)
-            round_ = round_ - 16
-            drawn = _uniform(self._runs(before, runs)[:, run] ^ link[at])
-            hit = drawn < enter[at]
-            known = hit | (drawn >= (enter + stay)[at])
-            out[run, at] = hit[known.argmax(axis=0), np.arange(run.size)]
-            run, at = (x[~known.any(axis=0)] for x in (run, at))
-        return np.asarray(out)
+        if loss.ndim == 2:
+            return np.asarray(loss[graph.receivers, graph.senders])
+        return loss[graph.receivers] if loss.ndim == 1 else loss
 
-    def _runs(self, rounds: Sequence[int], runs: int) -> Hashes:
-        """Bits for each round and run."""
-        keys = _mixed([(self.seed + _GOLDEN * (k + 1)) % 2**64 for k in rounds])
-        return _mixed(
-            keys[:, None] ^ (np.arange(runs, dtype=np.uint64) * np.uint64(_GOLDEN))
-        )
+    def _run_bits(self, rounds: Sequence[int], runs: int) -> Hashes:
+        """Return random bits for each round and run, (rounds, runs)."""
+        keys = [(self.seed + _GOLDEN * (k + 1)) % 2**64 for k in rounds]
+        numbers = np.arange(runs, dtype=np.uint64) * np.uint64(_GOLDEN)
+        return _mix_bits(_mix_bits(keys)[:, None] ^ numbers)
 
 
-def _windows(during: Any) -> tuple[tuple[float, float], ...]:
+def _check_windows(during: Any) -> tuple[tuple[float, float], ...]:
+    """Return windows as pairs of numbers."""
     ends = check_array(during, "during", finite=False)
     if ends.ndim != 2 or ends.shape[1] != 2 or not (ends[:, 0] < ends[:, 1]).all():
         raise ValueError(
-            f"during must have windows (start, stop) with start before stop, got {during!r}"
+            "during must have windows (start, stop) with start before stop, "
+            f"got {during!r}"
         )
     return tuple((float(start), float(stop)) for start, stop in ends)
 
 
+def _link_bits(graph: Graph) -> Hashes:
+    """Return random bits for each link, (E,), which depend on its two agents alone."""
+    numbers = graph.receivers * graph.n_agents + graph.senders
+    return _mix_bits(numbers.astype(np.uint64) + np.uint64(_GOLDEN))
+
+
 def _uniform(bits: Hashes) -> Array:
-    return (_mixed(bits) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+    """Return numbers in [0, 1) from the upper 53 bits, as many as a float has."""
+    return (_mix_bits(bits) >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
 
-def _mixed(bits: Hashes | list[int]) -> Hashes:
-    """The finaliser of splitmix64: every output bit depends on every input bit."""
+def _mix_bits(bits: Hashes | list[int]) -> Hashes:
+    """Apply the finaliser of splitmix64: every output bit depends on every input bit."""
     z = np.asarray(bits, dtype=np.uint64)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

@@ -1,6 +1,6 @@
-"""Rules by which Gaussians and ensembles agree, whose errors may share what nobody kept track of.
+"""Fusion rules for Gaussians and ensembles with errors of unknown correlation.
 
-A filter takes one as its ``agreement=``, with :func:`functools.partial` for the options.
+A filter takes one as its ``fusion=``, with :func:`functools.partial` for the options.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ..validation import (
 )
 from .channel import Channel, fusion_rule
 from .graphs import Graph
-from .weights import _laplacian, _warn_if_unstable
+from .weights import _laplacian_weights, _warn_if_unstable
 
 __all__ = [
     "arithmetic_average",
@@ -46,6 +46,8 @@ Gaussians = tuple[
 ]
 Ensembles = Annotated[Array, "*channel.runs channel.graph.n_agents N d"]
 Pair = tuple[Array, Array]
+"""Means and covariances, or self-weights and link weights."""
+
 Rule = Literal["equal", "trace", "determinant", "min_trace", "min_determinant"]
 
 
@@ -58,25 +60,26 @@ def covariance_intersection(
     rule: Rule = "equal",
     rounds: PositiveInt = 1,
 ) -> Pair:
-    r"""Each agent fuses its Gaussian with its neighbours', safely whatever they share.
+    r"""Fuse each Gaussian with the neighbours' by covariance intersection.
 
     .. math:: \mathbf P^{-1}=\sum_j\omega_j\mathbf P_j^{-1},\qquad
         \mathbf P^{-1}\mathbf m=\sum_j\omega_j\mathbf P_j^{-1}\mathbf m_j,\qquad
         \sum_j\omega_j=1
 
-    Weights that sum to one count nothing twice: the geometric mean of the densities. If every
-    input's covariance is an upper bound of its error's, so is the result's, for any correlation.
+    The result is the weighted geometric mean of the densities. As the weights sum to one, no
+    information is counted twice. If every input's covariance is an upper bound of the covariance of
+    its error, so is the result's, for any correlation of the errors.
 
     Parameters
     ----------
     belief : tuple (means, covs)
         Each agent's mean, (*runs, A, d), and covariance, (*runs, A, d, d), positive definite.
     channel : Channel
-        Mean and covariance go over each link, d + d(d+1)/2 scalars. What is lost is left out.
+        Mean and covariance are sent on each link, d + d(d+1)/2 scalars. A lost message is left out.
     rule : {"equal", "trace", "determinant", "min_trace", "min_determinant"}
-        How an agent weights what it has: see :func:`distfilt.gaussians.intersection_weights`.
+        The weights ω: see :func:`distfilt.gaussians.intersection_weights`.
     rounds : int
-        How many times.
+        Number of rounds.
 
     Notes
     -----
@@ -93,10 +96,11 @@ def covariance_intersection(
     (array([0.6, 0.6]), array([1.2, 1.2]))
     """
 
-    def step(heard: _Heard) -> Pair:
-        return _information_sum(heard, *_by_rule(heard, rule))
+    def fuse(received: _Received) -> Pair:
+        self_weights, link_weights = _intersection_weights(received, rule)
+        return _sum_information(received, self_weights, link_weights)
 
-    return _in_rounds(belief, channel, rounds, step)
+    return _repeat(belief, channel, rounds, fuse)
 
 
 @fusion_rule("gaussians")
@@ -104,10 +108,10 @@ def covariance_intersection(
 def naive_fusion(
     belief: Gaussians, channel: Channel, *, rounds: PositiveInt = 1
 ) -> Pair:
-    """Multiply the densities as if their errors were independent: counts shared data twice.
+    """Multiply the densities as if their errors were independent, which counts shared data twice.
 
-    Right for a single fusion of independent estimates, wrong as soon as agents exchange what they
-    fused before: the covariance shrinks in every round, the error does not. Kept to show that.
+    Right for a single fusion of independent estimates. Wrong as soon as agents exchange fused
+    estimates: the covariance shrinks in every round, the error does not. A baseline that shows it.
     Parameters, returns and errors as for :func:`covariance_intersection`.
 
     >>> from distfilt.network import Channel, graphs
@@ -118,11 +122,12 @@ def naive_fusion(
     array([0.666667, 0.666667])
     """
 
-    def step(heard: _Heard) -> Pair:
-        ones = np.ones(heard.means.shape[:2])
-        return _information_sum(heard, ones, heard.arrived.astype(np.float64))
+    def fuse(received: _Received) -> Pair:
+        self_weights = np.ones(received.means.shape[:2])
+        link_weights = received.arrived.astype(np.float64)
+        return _sum_information(received, self_weights, link_weights)
 
-    return _in_rounds(belief, channel, rounds, step)
+    return _repeat(belief, channel, rounds, fuse)
 
 
 @fusion_rule("gaussians")
@@ -130,13 +135,14 @@ def naive_fusion(
 def arithmetic_average(
     belief: Gaussians, channel: Channel, *, rounds: PositiveInt = 1
 ) -> Pair:
-    r"""Each agent takes mean and covariance of the mixture of its own and the heard densities.
+    r"""Replace each Gaussian by mean and covariance of the mixture of it and the received ones.
 
     .. math:: \mathbf m=\sum_j\omega_j\mathbf m_j,\qquad
         \mathbf P=\sum_j\omega_j\bigl(\mathbf P_j
         +(\mathbf m_j-\mathbf m)(\mathbf m_j-\mathbf m)^\top\bigr)
 
-    With equal weights. Disagreement adds to the covariance, so an outlier does not go unnoticed.
+    With equal weights. Differences between the means add to the covariance, so that an outlier
+    widens it.
     Parameters, returns and errors as for :func:`covariance_intersection`.
 
     >>> from distfilt.network import Channel, graphs
@@ -147,19 +153,21 @@ def arithmetic_average(
     (array([1.5, 1.5]), array([3.75, 3.75]))
     """
 
-    def step(heard: _Heard) -> Pair:
-        own, links = _by_rule(heard, "equal")
-        gap = heard.gaps()
-        moved = heard.graph._summed(links[..., None] * gap, 1)
-        # From the new mean: the own one lies -moved away, a heard one gap - moved.
-        left = gap - moved[:, heard.graph.receivers]
-        spread = links[..., None, None] * left[..., :, None] * left[..., None, :]
-        spread = heard.graph._summed(spread, 1)
-        spread += own[..., None, None] * moved[..., :, None] * moved[..., None, :]
-        covs = heard.mixed(own, links, heard.covs)
-        return heard.means + moved, symmetrise(covs + spread)
+    def fuse(received: _Received) -> Pair:
+        graph = received.graph
+        self_weights, link_weights = _intersection_weights(received, "equal")
+        difference = received.mean_differences()
+        shift = graph._sum_by_receiver(link_weights[..., None] * difference, 1)
+        # From the new mean the own one lies at -shift, a received one at difference - shift.
+        deviation = difference - shift[:, graph.receivers]
+        weighted = link_weights[..., None, None] * deviation[..., :, None]
+        spread = graph._sum_by_receiver(weighted * deviation[..., None, :], 1)
+        weighted = self_weights[..., None, None] * shift[..., :, None]
+        spread += weighted * shift[..., None, :]
+        covs = received.sum_matrices(self_weights, link_weights, received.covs)
+        return received.means + shift, symmetrise(covs + spread)
 
-    return _in_rounds(belief, channel, rounds, step)
+    return _repeat(belief, channel, rounds, fuse)
 
 
 @fusion_rule("gaussians")
@@ -167,29 +175,29 @@ def arithmetic_average(
 def consensus_pull(
     belief: Gaussians, channel: Channel, *, gain: PositiveFloat, rounds: PositiveInt = 1
 ) -> Pair:
-    r"""Pull each mean towards the neighbours': the consensus Kalman filter's step.
+    r"""Pull each mean towards the neighbours' means, as the Kalman consensus filter does.
 
     .. math:: \mathbf m_i\leftarrow\mathbf m_i
         +\gamma\sum_j(\mathbf m_j-\mathbf m_i)
 
-    The covariances stay as they are: the pull is not in them, which is cheap, and wrong as soon as
-    neighbours' errors are correlated.
+    The covariances are not changed. That is cheap, but they do not account for the pull, and are
+    wrong as soon as neighbours' errors are correlated.
 
     Parameters
     ----------
     belief
         As for :func:`covariance_intersection`.
     channel : Channel
-        Only means go over each link, d scalars. A mean that is lost does not pull.
+        Only means are sent on each link, d scalars. A mean that is lost does not pull.
     gain : float
         The gain γ, positive.
     rounds : int
-        How many times.
+        Number of rounds.
 
     Warns
     -----
     UnstableGain
-        If the gain is above 2/λ_max, so that the means drift apart.
+        If the gain is above 2/λ_max, with which the means diverge.
 
     Notes
     -----
@@ -205,9 +213,10 @@ def consensus_pull(
            [3.]])
     """
     _warn_if_unstable(channel.graph, gain)
-    weights = _laplacian(channel.graph, gain)
-    combine = channel.mix
-    return combine(belief[0], weights, lost="keep", rounds=rounds), belief[1].copy()
+    means, covs = belief
+    weights = _laplacian_weights(channel.graph, gain)
+    means = channel.mix(means, weights, on_loss="keep", rounds=rounds)
+    return means, covs.copy()
 
 
 @fusion_rule("ensembles")
@@ -230,19 +239,19 @@ def mean_pull(
     ensembles : array_like, (*runs, A, N, d)
         One ensemble per agent.
     channel : Channel
-        Only means go over each link, d scalars a round. A mean that is lost does not pull.
+        Only means are sent on each link, d scalars a round. A mean that is lost does not pull.
     gain : float
         The gain γ, at least 0; 0 sends nothing and changes nothing.
     rounds : int
-        How many times.
+        Number of rounds.
     include_self : bool
-        Whether Nbs(l) holds l itself, as the paper's tables print. The means do not notice, but
-        the spread shrinks by 1 - γ|Nbs(l)| either way, one neighbour more with it.
+        Whether Nbs(l) holds l itself, as the paper's tables print. It does not change the means.
+        The spread shrinks by the factor 1 - γ|Nbs(l)|, in which l itself then counts.
 
     Warns
     -----
     UnstableGain
-        If the gain is above 2/λ_max, so that the means drift apart.
+        If the gain is above 2/λ_max, with which the means diverge.
 
     Examples
     --------
@@ -253,17 +262,19 @@ def mean_pull(
     ... ].ravel()
     array([1.25, 2.75])
     """
-    out = ensembles.copy()
+    pulled = ensembles.copy()
     if gain == 0:
-        return out
+        return pulled
     _warn_if_unstable(channel.graph, gain)
-    weights = _laplacian(channel.graph, gain)
+    weights = _laplacian_weights(channel.graph, gain)
     for _ in range(rounds):
-        centre = out.mean(axis=-2)
-        moved, own = channel._combine_with_own(centre, weights, "keep")
-        kept = (own - gain * include_self)[..., None, None]
-        out = moved[..., None, :] + kept * (out - centre[..., None, :])
-    return out
+        means = pulled.mean(axis=-2)
+        new_means, self_weights = channel._mix_once(means, weights, "keep")
+        # All members get the same shift of the mean, and their deviations the factor 1 - γ |Nbs|.
+        factor = (self_weights - gain * include_self)[..., None, None]
+        deviations = pulled - means[..., None, :]
+        pulled = new_means[..., None, :] + factor * deviations
+    return pulled
 
 
 @fusion_rule("ensembles")
@@ -276,22 +287,25 @@ def intersect_ensembles(
     scale: Annotated[Array, "d", Bounds(above=0)] | None = None,
     rounds: PositiveInt = 1,
 ) -> Array:
-    """Fuse sample means and covariances by intersection, and move each ensemble to have those.
+    """Fuse sample means and covariances by covariance intersection, and move ensembles to them.
 
-    Safe whatever the agents' errors share, which in a network that exchanges observations is much.
+    Consistent for any correlation of the agents' errors, which is strong in a network that
+    exchanges observations. The rule is :func:`covariance_intersection`; an affine map then gives
+    each ensemble the fused moments.
 
     Parameters
     ----------
     ensembles : array_like, (*runs, A, N, d)
         One ensemble per agent, N > d.
     channel : Channel
-        d + d(d+1)/2 scalars a link and round. Whoever misses a message fuses without it.
+        d + d(d+1)/2 scalars a link and round. A lost message is left out.
     rule : {"equal", "trace", "determinant", "min_trace", "min_determinant"}
         As for :func:`covariance_intersection`.
     scale : array_like, (d,), optional
-        A size of each component, by which to divide before traces add variances of unlike units.
+        A scale of each component. Components are divided by it, so that a trace does not add
+        variances of different units.
     rounds : int
-        How many times.
+        Number of rounds.
 
     Examples
     --------
@@ -301,95 +315,116 @@ def intersect_ensembles(
     array([[0.5, 2.5],
            [0.5, 2.5]])
     """
-    size = 1.0 if scale is None else scale
-    x = ensembles / size
-    belief = mean(x), sample_covariance(x)
-    check_positive_definite(belief[1], "ensembles")
-    fused = covariance_intersection(belief, channel, rule=rule, rounds=rounds)
-    return match_moments(x, *fused) * size
+    unit = 1.0 if scale is None else scale
+    x = ensembles / unit
+    means = mean(x)
+    covs = sample_covariance(x)
+    check_positive_definite(covs, "ensembles")
+    fused = covariance_intersection((means, covs), channel, rule=rule, rounds=rounds)
+    return match_moments(x, *fused) * unit
 
 
 @dataclass(eq=False)
-class _Heard:
-    """One round's Gaussians, runs in one axis, and the links (R, E) over which they are heard."""
+class _Received:
+    """Gaussians of one round, with runs in one axis, and the links (R, E) on which they arrived."""
 
     graph: Graph
     means: Array
     covs: Array
     arrived: Mask
 
-    def mixed(self, own: Array, links: Array, matrices: Array) -> Array:
-        """Weighted sums of matrices (R, A, d, d), the own one and what each sender sent."""
-        heard = links[..., None, None] * matrices[:, self.graph.senders]
-        return own[..., None, None] * matrices + self.graph._summed(heard, 1)
+    def sum_matrices(
+        self, self_weights: Array, link_weights: Array, matrices: Array
+    ) -> Array:
+        """Return weighted sums of each agent's matrix, of (R, A, d, d), and the received ones."""
+        sent = link_weights[..., None, None] * matrices[:, self.graph.senders]
+        own_part = self_weights[..., None, None] * matrices
+        return own_part + self.graph._sum_by_receiver(sent, 1)
 
-    def gaps(self) -> Array:
-        """The heard mean less the own one, on each link, (R, E, d)."""
+    def mean_differences(self) -> Array:
+        """Return the received mean minus the receiver's, for each link, (R, E, d)."""
         return self.means[:, self.graph.senders] - self.means[:, self.graph.receivers]
 
 
-def _in_rounds(
-    belief: Pair, channel: Channel, rounds: int, step: Callable[[_Heard], Pair]
+def _repeat(
+    belief: Pair, channel: Channel, rounds: int, fuse: Callable[[_Received], Pair]
 ) -> Pair:
-    """Exchange means and upper triangles and take a step, some times."""
+    """Exchange means and upper triangles of covariances and fuse them, some times."""
     means, covs = belief
     graph = channel.graph
     d = means.shape[-1]
-    m = means.reshape(-1, graph.n_agents, d)
-    p = covs.reshape(-1, graph.n_agents, d, d)
+    numbers = d + d * (d + 1) // 2
+    # All runs in one axis.
+    flat_means = means.reshape(-1, graph.n_agents, d)
+    flat_covs = covs.reshape(-1, graph.n_agents, d, d)
     for _ in range(rounds):
-        m, p = step(_Heard(graph, m, p, channel._sent(d + d * (d + 1) // 2)))
-    return m.reshape(means.shape), p.reshape(covs.shape)
+        arrived = channel._transmit_numbers(numbers)
+        received = _Received(graph, flat_means, flat_covs, arrived)
+        flat_means, flat_covs = fuse(received)
+    return flat_means.reshape(means.shape), flat_covs.reshape(covs.shape)
 
 
-def _by_rule(heard: _Heard, rule: Rule) -> Pair:
-    """Own weights (R, A) and those of links (R, E); each agent's sum to one."""
+def _intersection_weights(received: _Received, rule: Rule) -> Pair:
+    """Return self-weights (R, A) and link weights (R, E) that sum to one for each agent."""
     if rule.startswith("min"):
-        return _least(heard, rule)
-    own = np.ones(heard.means.shape[:2])
-    unit = np.eye(heard.means.shape[-1])
+        return _optimal_weights(received, rule)
+    graph = received.graph
+    size = np.ones(received.means.shape[:2])
     if rule != "equal":
-        # The odds against a unit covariance: no agent's number depends on another's in any digit.
-        both = np.stack([heard.covs, np.broadcast_to(unit, heard.covs.shape)], axis=-3)
-        share = intersection_weights(both, rule=rule)
-        own = share[..., 0] / share[..., 1]
-    links = own[:, heard.graph.senders] * heard.arrived
-    total = own + heard.graph._summed(links, 1)
-    return own / total, links / total[:, heard.graph.receivers]
+        # Weights are proportional to a size of each covariance: its weight against a unit
+        # covariance, over that one's. No agent's number depends on another's in any digit.
+        unit = np.eye(received.means.shape[-1])
+        units = np.broadcast_to(unit, received.covs.shape)
+        pairs = np.stack([received.covs, units], axis=-3)
+        pair_weights = intersection_weights(pairs, rule=rule)
+        size = pair_weights[..., 0] / pair_weights[..., 1]
+    link_sizes = size[:, graph.senders] * received.arrived
+    total = size + graph._sum_by_receiver(link_sizes, 1)
+    return size / total, link_sizes / total[:, graph.receivers]
 
 
-def _least(heard: _Heard, rule: Rule) -> Pair:
-    """The weights of least size, for all agents at once that hear equally many."""
-    graph = heard.graph
-    unit = np.eye(heard.means.shape[-1])
-    own = np.ones(heard.means.shape[:2])
-    links = np.zeros(heard.arrived.shape)
+def _optimal_weights(received: _Received, rule: Rule) -> Pair:
+    """Return the weights of the smallest result, for all agents of equal degree at once."""
+    graph = received.graph
+    unit = np.eye(received.means.shape[-1])
+    self_weights = np.ones(received.means.shape[:2])
+    link_weights = np.zeros(received.arrived.shape)
     for degree in np.unique(graph.in_degree):
         agents = np.flatnonzero(graph.in_degree == degree)
-        at = graph.links.indptr[agents, None] + np.arange(int(degree))
-        got = heard.arrived[:, at]
-        sent = np.where(got[..., None, None], heard.covs[:, graph.senders[at]], unit)
-        covs = np.concatenate([heard.covs[:, agents, None], sent], axis=2)
-        here = np.insert(got, 0, True, axis=2)
-        omega = intersection_weights(covs, rule=rule, here=here)
-        own[:, agents] = omega[..., 0]
-        links[:, at] = omega[..., 1:]
-    return own, links
+        # The links of these agents, (agents, degree), which are neighbours in the order of links.
+        links = graph.links.indptr[agents, None] + np.arange(int(degree))
+        arrived = received.arrived[:, links]
+        sent = received.covs[:, graph.senders[links]]
+        # A unit matrix stands for a lost covariance, which gets no weight.
+        sent = np.where(arrived[..., None, None], sent, unit)
+        covs = np.concatenate([received.covs[:, agents, None], sent], axis=2)
+        present = np.insert(arrived, 0, True, axis=2)
+        omega = intersection_weights(covs, rule=rule, present=present)
+        self_weights[:, agents] = omega[..., 0]
+        link_weights[:, links] = omega[..., 1:]
+    return self_weights, link_weights
 
 
-def _information_sum(heard: _Heard, own: Array, links: Array) -> Pair:
-    """Weighted sum of information matrices and vectors, turned back into mean and covariance."""
-    information = _inverse(heard.covs)
-    total = _inverse(heard.mixed(own, links, information))
-    # About the own mean, so that equal means stay and large ones lose no digits.
-    turned = (information[:, heard.graph.senders] @ heard.gaps()[..., None])[..., 0]
-    pulled = heard.graph._summed(links[..., None] * turned, 1)
-    moved = (total @ pulled[..., None])[..., 0]
-    return heard.means + moved, symmetrise(total)
+def _sum_information(
+    received: _Received, self_weights: Array, link_weights: Array
+) -> Pair:
+    """Return mean and covariance of weighted sums of information matrices and vectors."""
+    graph = received.graph
+    information = _invert(received.covs)
+    covs = _invert(received.sum_matrices(self_weights, link_weights, information))
+    # m = m_i + P Σ_j ω_j P_j⁻¹ (m_j - m_i): about the own mean, so that equal means stay and large
+    # ones lose no digits.
+    difference = received.mean_differences()[..., None]
+    pull = (information[:, graph.senders] @ difference)[..., 0]
+    total_pull = graph._sum_by_receiver(link_weights[..., None] * pull, 1)
+    shift = (covs @ total_pull[..., None])[..., 0]
+    return received.means + shift, symmetrise(covs)
 
 
-def _inverse(spd: Array) -> Array:
-    """Inverse of positive definite matrices by the inverse of their Cholesky factors."""
+def _invert(spd: Array) -> Array:
+    """Return inverses of positive definite matrices."""
+    # P = L Lᵀ has the inverse L⁻ᵀ L⁻¹.
     lower = cholesky(spd)
-    half = solve_lower(lower, np.broadcast_to(np.eye(spd.shape[-1]), spd.shape))
-    return np.asarray(half.swapaxes(-1, -2) @ half)
+    identity = np.broadcast_to(np.eye(spd.shape[-1]), spd.shape)
+    inverse = solve_lower(lower, identity)
+    return np.asarray(inverse.swapaxes(-1, -2) @ inverse)

@@ -1,4 +1,4 @@
-"""Who hears whom: a graph of agents, what follows from its links, and graphs in common shapes."""
+"""Communication graphs: links, degrees, spectra, distances, and graphs in common shapes."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from ..validation import (
     Bounds,
     FrozenModel,
     Indices,
+    InvalidArgumentError,
     NonNegativeInt,
     PositiveFloat,
     PositiveInt,
@@ -32,7 +33,7 @@ _DENSE = 200
 
 @dataclass(frozen=True, eq=False)
 class Graph(FrozenModel):
-    """Links between agents, without self-loops: an agent always knows what it knows itself.
+    """A communication graph: links between agents, without self-loops.
 
     Build it with :meth:`from_adjacency`, :meth:`from_edges`, :meth:`from_networkx` or a function of
     :mod:`distfilt.network.graphs`. A graph that changes in time is a function ``t -> Graph``.
@@ -40,7 +41,7 @@ class Graph(FrozenModel):
     Parameters
     ----------
     links : scipy.sparse.csr_array, (A, A)
-        ``links[i, j] = 1`` when agent i hears agent j.
+        ``links[i, j] = 1`` when agent i receives from agent j.
 
     Examples
     --------
@@ -55,7 +56,8 @@ class Graph(FrozenModel):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        links = _links.of_matrix(self.links, "links", directed=True)
+        # Checked and with sorted columns, on which the order of links depends.
+        links = _links.from_matrix(self.links, "links", directed=True)
         object.__setattr__(self, "links", links)
 
     @classmethod
@@ -66,12 +68,12 @@ class Graph(FrozenModel):
         Parameters
         ----------
         adjacency : array_like or scipy.sparse array, (A, A)
-            Row i marks the agents that agent i hears.
+            Row i marks the agents that agent i receives from.
         directed : bool
             Accept links that go one way only.
         """
         return cls.construct(
-            _links.of_matrix(adjacency, "adjacency", directed=directed)
+            _links.from_matrix(adjacency, "adjacency", directed=directed)
         )
 
     @classmethod
@@ -79,7 +81,7 @@ class Graph(FrozenModel):
     def from_edges(
         cls, agents: PositiveInt, edges: ArrayLike, *, directed: bool = False
     ) -> Graph:
-        """Build a graph from its links, listed as pairs (listener, speaker).
+        """Build a graph from its links, listed as pairs (receiver, sender).
 
         Parameters
         ----------
@@ -95,7 +97,9 @@ class Graph(FrozenModel):
         >>> Graph.from_edges(3, [(0, 1), (1, 2)]).neighbours(1)
         (0, 2)
         """
-        return cls.construct(_links.of_edges(agents, edges, "edges", directed=directed))
+        return cls.construct(
+            _links.from_edges(agents, edges, "edges", directed=directed)
+        )
 
     @classmethod
     def from_networkx(cls, graph: Any, names: Sequence[str] = ()) -> Graph:
@@ -104,11 +108,12 @@ class Graph(FrozenModel):
         Parameters
         ----------
         graph : networkx.Graph or networkx.DiGraph
-            Of a digraph an edge runs from speaker to listener. Names, weights and parallel edges
-            are left behind.
+            Of a digraph an edge runs from sender to receiver. Names, weights and parallel edges
+            are not kept.
         names : sequence of str
-            Of the agents. Nodes that are these, or 0 to A - 1, are agents by their labels; others
-            by the order in which the graph has them. If only some of them are these, it is refused.
+            Names of the agents. If the nodes are these names, or the numbers 0 to A - 1, each node
+            is the agent of its label; otherwise nodes are numbered in the graph's order. A graph
+            in which only some nodes are names is refused.
 
         Examples
         --------
@@ -119,16 +124,28 @@ class Graph(FrozenModel):
         (0, 2)
         """
         if not _links.is_networkx(graph):
-            raise ValueError(
+            raise InvalidArgumentError(
                 f"graph must be a networkx graph, got {type(graph).__name__}"
             )
-        labels = range(len(graph.nodes)), names, graph.nodes
-        order = next(some for some in labels if {*some} == {*graph.nodes})
-        if order is labels[2] and {*names} & {*order}:
-            raise ValueError(f"graph must be the nodes {[*names]}, got {[*order]}")
-        number_of = {node: k for k, node in enumerate(order)}
+        nodes = list(graph.nodes)
+        if not nodes:
+            raise ValueError("graph must have at least one node, got none")
+        if set(nodes) == set(range(len(nodes))):
+            order: Sequence[Any] = range(len(nodes))
+        elif set(nodes) == set(names):
+            order = names
+        else:
+            order = nodes
+            # Some names among other nodes are more likely a mistake than labels.
+            if set(names) & set(nodes):
+                raise ValueError(
+                    f"graph must have the nodes {list(names)}, got {nodes}"
+                )
+        number_of = {node: number for number, node in enumerate(order)}
+        # An edge (u, v) of networkx runs from u to v, a pair here is (receiver, sender). Edges of
+        # a multigraph have a key as third entry.
         edges = [(number_of[edge[1]], number_of[edge[0]]) for edge in graph.edges]
-        return cls.from_edges(len(number_of), edges, directed=bool(graph.is_directed()))
+        return cls.from_edges(len(nodes), edges, directed=bool(graph.is_directed()))
 
     @property
     def n_agents(self) -> int:
@@ -137,119 +154,141 @@ class Graph(FrozenModel):
 
     @cached_property
     def receivers(self) -> Indices:
-        """The listener of each link, (E,), ascending."""
+        """The receiver of each link, (E,), ascending."""
+        # Row i of the matrix has one entry for each link that ends at agent i.
         return np.repeat(np.arange(self.n_agents), np.diff(self.links.indptr))
 
     @cached_property
     def senders(self) -> Indices:
-        """The speaker of each link, (E,), ascending for each listener."""
+        """The sender of each link, (E,), ascending for each receiver."""
         return np.asarray(self.links.indices, dtype=np.int64)
 
     @cached_property
     def reverse(self) -> Indices:
-        """For each link, of links both ways, the number of the one that goes back, (E,)."""
-        self._undirected()
+        """The number of the opposite link of each link, (E,), of an undirected graph."""
+        self._check_undirected()
+        # Links are ordered by (receiver, sender); sorted by (sender, receiver) they are opposite.
         return np.lexsort((self.receivers, self.senders))
 
     @cached_property
     def incidence(self) -> scipy.sparse.csr_array:
-        """Sums what arrives over an agent's links: ``incidence[i, e] = 1`` if link e ends at i."""
-        edges = self.senders.size
-        parts = np.ones(edges), np.arange(edges), self.links.indptr
-        return scipy.sparse.csr_array(parts, (self.n_agents, edges))
+        """The matrix that sums over links: ``incidence[i, e] = 1`` if link e ends at agent i."""
+        n_links = self.senders.size
+        # The rows of this matrix have as many entries as those of the adjacency matrix.
+        entries = (np.ones(n_links), np.arange(n_links), self.links.indptr)
+        return scipy.sparse.csr_array(entries, (self.n_agents, n_links))
 
-    def _summed(self, per_link: Array, axis: int = -2) -> Array:
-        """What arrives over each agent's links, added: E entries along an axis become A."""
-        front = per_link.swapaxes(axis, 0)
-        shape = (self.n_agents, *front.shape[1:])
-        out = self.incidence @ front.reshape(len(front), math.prod(shape[1:]))
-        return np.asarray(out).reshape(shape).swapaxes(0, axis)
+    def _sum_by_receiver(self, per_link: Array, axis: int = -2) -> Array:
+        """Return sums over each agent's links: E entries along an axis become A."""
+        # One sparse product over all other axes at once.
+        links_first = per_link.swapaxes(axis, 0)
+        shape = (self.n_agents, *links_first.shape[1:])
+        columns = links_first.reshape(len(links_first), math.prod(shape[1:]))
+        sums = np.asarray(self.incidence @ columns)
+        return sums.reshape(shape).swapaxes(0, axis)
 
     @validated
     def neighbours(self, agent: NonNegativeInt) -> tuple[int, ...]:
-        """The agents that `agent` hears, ascending, without itself."""
+        """Return the agents that `agent` receives from, ascending, without itself."""
         Bounds(below=self.n_agents)(agent, "agent")
-        row = self.links.indices[
-            self.links.indptr[agent] : self.links.indptr[agent + 1]
-        ]
-        return tuple(row.tolist())
+        start = self.links.indptr[agent]
+        stop = self.links.indptr[agent + 1]
+        return tuple(self.links.indices[start:stop].tolist())
 
     @cached_property
     def in_degree(self) -> Array:
-        """How many agents each agent hears, (A,)."""
+        """Number of agents that each agent receives from, (A,)."""
         return np.asarray(np.diff(self.links.indptr), dtype=np.float64)
 
     @cached_property
     def out_degree(self) -> Array:
-        """How many agents hear each agent, (A,)."""
+        """Number of agents that receive from each agent, (A,)."""
         return np.bincount(self.senders, minlength=self.n_agents).astype(np.float64)
 
     @cached_property
     def directed(self) -> bool:
         """Whether some link goes one way only."""
-        turned = self.links.T.tocsr()
-        same = (turned.indptr == self.links.indptr).all() and (
-            turned.indices == self.senders
-        ).all()
-        return not same
+        # The same structure as the transpose's; both have sorted columns.
+        transposed = self.links.T.tocsr()
+        if (transposed.indptr != self.links.indptr).any():
+            return True
+        return bool((transposed.indices != self.senders).any())
 
     @cached_property
     def laplacian(self) -> scipy.sparse.csr_array:
-        """The Laplacian, sparse: degrees on the diagonal, -1 where an agent hears another."""
+        """The Laplacian, sparse: in-degrees on the diagonal, -1 for each link."""
         return (scipy.sparse.diags_array(self.in_degree) - self.links).tocsr()
 
     @cached_property
     def laplacian_spectrum(self) -> Array:
         """Eigenvalues of the Laplacian of an undirected graph, ascending, (A,).
 
-        All, by a dense solver, in seconds at 2 000 agents; :attr:`max_stable_gain` needs only an end.
+        All of them, by a dense solver: seconds at 2 000 agents. :attr:`max_stable_gain` needs only
+        the largest.
         """
-        self._undirected()
-        return np.asarray(
-            np.linalg.eigvalsh(self.laplacian.toarray()), dtype=np.float64
-        )
+        self._check_undirected()
+        eigenvalues = np.linalg.eigvalsh(self.laplacian.toarray())
+        return np.asarray(eigenvalues, dtype=np.float64)
 
     @cached_property
     def max_stable_gain(self) -> float:
-        r"""The bound below which averaging agrees, :math:`2/\lambda_{\max}` with links both ways.
+        r"""The gain below which averaging converges, :math:`2/\lambda_{\max}` with links both ways.
 
         With one-way links the eigenvalues are complex and it is the least
-        :math:`2\operatorname{Re}\lambda/|\lambda|^2`, by a dense solver. Infinite without links;
-        :attr:`degree_bound_gain` where too many eigenvalues crowd at the end to tell them apart, as on a
-        ring of very many agents.
+        :math:`2\operatorname{Re}\lambda/|\lambda|^2`, by a dense solver. Infinite without links.
+        It is :attr:`degree_bound_gain` where the largest eigenvalues lie too close together for
+        the iterative solver, as on a ring of very many agents.
         """
-        from scipy.sparse.linalg import ArpackNoConvergence, eigsh
-
         if self.senders.size == 0:
             return float("inf")
         if self.directed:
+            # |1 - γλ| < 1 if and only if γ < 2 Re λ / |λ|²; the zero eigenvalue is the average's.
             values = np.linalg.eigvals(self.laplacian.toarray())
-            values = values[np.abs(values) > 1e-9 * np.abs(values).max()]
-            return float((2 * values.real / np.abs(values) ** 2).min(initial=np.inf))
+            sizes = np.abs(values)
+            moving = sizes > 1e-9 * sizes.max()
+            bounds = 2 * values.real[moving] / sizes[moving] ** 2
+            return float(bounds.min(initial=np.inf))
         if self.n_agents <= _DENSE:
             return float(2 / self.laplacian_spectrum[-1])
+        return self._max_stable_gain_sparse()
+
+    def _max_stable_gain_sparse(self) -> float:
+        """Return 2/λ_max by Lanczos iterations, or the bound if they do not converge."""
+        from scipy.sparse.linalg import ArpackNoConvergence, eigsh
+
         # A fixed start makes results repeatable; a random one is orthogonal to no eigenvector.
         start = np.random.default_rng(0).standard_normal(self.n_agents)
-        how = {"v0": start, "tol": 1e-8, "maxiter": 100, "return_eigenvectors": False}
         try:
-            return float(2 / eigsh(self.laplacian, 1, which="LA", **how)[0])
+            largest = eigsh(
+                self.laplacian,
+                1,
+                which="LA",
+                v0=start,
+                tol=1e-8,
+                maxiter=100,
+                return_eigenvectors=False,
+            )
         except ArpackNoConvergence:
             return self.degree_bound_gain
+        return float(2 / largest[0])
 
     @cached_property
     def degree_bound_gain(self) -> float:
-        """A gain from the degrees alone, at most :attr:`max_stable_gain`; agents can compute it.
+        """A gain from the degrees alone, at most :attr:`max_stable_gain`.
 
-        With links both ways by the largest sum of an agent's degree and its neighbours' mean degree
+        Agents can compute it by a maximum consensus. With links both ways it follows from the
+        largest sum of an agent's degree and its neighbours' mean degree
         (R. Merris, Linear Algebra and its Applications 285 (1998) 33-35), exact for stars and even
         rings; else by Gershgorin's discs.
         """
         if self.senders.size == 0:
             return float("inf")
         if self.directed:
+            # Gershgorin: every eigenvalue lies in a disc around d_i with radius d_i.
             return float(1 / self.in_degree.max())
-        near = (self.links @ self.in_degree) / np.maximum(self.in_degree, 1)
-        return float(2 / (self.in_degree + near).max())
+        # λ_max <= max_i (d_i + m_i), with the mean degree m_i of agent i's neighbours.
+        mean_degree = (self.links @ self.in_degree) / np.maximum(self.in_degree, 1)
+        return float(2 / (self.in_degree + mean_degree).max())
 
     @cached_property
     def components(self) -> Indices:
@@ -262,51 +301,58 @@ class Graph(FrozenModel):
     @property
     def connected(self) -> bool:
         """Whether every agent can reach every other along the links."""
+        # Components are numbered from 0.
         return int(self.components.max()) == 0
 
     @validated
     def hops(self, agent: NonNegativeInt) -> Indices:
-        """How many rounds news of an agent takes to reach each, (A,); -1 where it never does.
+        """Return the number of rounds from an agent to each other, (A,); -1 if there is no path.
 
         >>> from distfilt.network import graphs
         >>> graphs.path(4).hops(1)
         array([1, 0, 1, 2])
         """
         Bounds(below=self.n_agents)(agent, "agent")
+        # links[i, j] leads from j to i, against the order of scipy's graphs.
         forward = scipy.sparse.csr_array(self.links.T)
-        away = scipy.sparse.csgraph.dijkstra(forward, indices=agent, unweighted=True)
-        return np.where(np.isinf(away), -1, away).astype(np.int64)
+        hops = scipy.sparse.csgraph.dijkstra(forward, indices=agent, unweighted=True)
+        return np.where(np.isinf(hops), -1, hops).astype(np.int64)
 
     @cached_property
     def diameter(self) -> int:
         """The largest number of hops between two agents of a connected graph."""
-        self._joined()
+        self._check_connected()
         return max(int(self.hops(agent).max()) for agent in range(self.n_agents))
 
-    def _joined(self) -> None:
-        """Refuse a graph in parts."""
+    def _check_connected(self) -> None:
+        """Refuse a graph of several components."""
         if not self.connected:
-            parts = self.components.max() + 1
+            count = self.components.max() + 1
             raise ValueError(
-                f"graph must be a (strongly) connected graph, got {parts} parts"
+                f"graph must be (strongly) connected, got {count} components"
             )
 
-    def _undirected(self) -> None:
+    def _check_undirected(self) -> None:
         """Refuse one-way links."""
         if self.directed:
             raise ValueError("graph must have links both ways here, got one-way links")
 
 
-def as_graph(value: Any, size: int | None = None, names: Sequence[str] = ()) -> Graph:
-    """A graph from whatever describes one.
+def as_graph(
+    value: Any, n_agents: int | None = None, names: Sequence[str] = ()
+) -> Graph:
+    """Return a graph from any description of one.
 
     Parameters
     ----------
     value : Graph, networkx graph, matrix or edges
         A matrix of zeros and ones, an array or sparse, as in :meth:`Graph.from_adjacency`, or edges
         as in :meth:`Graph.from_edges`, both with links both ways.
-    size : int, optional
-        The number of agents that it needs to have; of edges, one more than the largest in them.
+    n_agents : int, optional
+        The number of agents that it must have. Without it, edges have one more agent than the
+        largest number in them.
+    names : sequence of str
+        Names of the agents, for a networkx graph: see :meth:`Graph.from_networkx`.
 
     Examples
     --------
@@ -318,78 +364,82 @@ def as_graph(value: Any, size: int | None = None, names: Sequence[str] = ()) -> 
     elif _links.is_networkx(value):
         graph = Graph.from_networkx(value, names)
     elif scipy.sparse.issparse(value) or isinstance(value, np.ndarray | list | tuple):
-        graph = Graph.construct(_links.of_either(value, size, "graph"))
+        graph = Graph.construct(_links.from_either(value, n_agents, "graph"))
     else:
-        needs = "a Graph, a networkx graph, a matrix of zeros and ones, or edges"
-        raise ValueError(f"graph must be {needs}, got {type(value).__name__}")
-    if size is not None and graph.n_agents != size:
-        raise ValueError(
-            f"graph must be a graph of {size} agents, got {graph.n_agents}"
+        raise InvalidArgumentError(
+            "graph must be a Graph, a networkx graph, a matrix of zeros and ones, or "
+            f"edges, got {type(value).__name__}"
         )
+    if n_agents is not None and graph.n_agents != n_agents:
+        raise ValueError(f"graph must have {n_agents} agents, got {graph.n_agents}")
     return graph
 
 
-def _both_ways(size: int, first: Indices, second: Indices) -> Graph:
+def _undirected_graph(n_agents: int, first: Indices, second: Indices) -> Graph:
+    """Return the graph with a link both ways between the agents of each pair."""
     one_way = np.stack([first.ravel(), second.ravel()], axis=1)
-    both = np.concatenate([one_way, one_way[:, ::-1]])
-    return Graph.construct(_links.linked(size, both, "graph"))
+    both_ways = np.concatenate([one_way, one_way[:, ::-1]])
+    return Graph.construct(_links.build_links(n_agents, both_ways, "graph"))
 
 
 @validated
 def path(agents: PositiveInt) -> Graph:
-    """Agents in a row.
+    """Return a graph of agents in a row.
 
     >>> path(3).neighbours(1)
     (0, 2)
     """
-    number_of = np.arange(agents)
-    return _both_ways(agents, number_of[:-1], number_of[1:])
+    numbers = np.arange(agents)
+    return _undirected_graph(agents, numbers[:-1], numbers[1:])
 
 
 @validated
 def ring(agents: Annotated[int, Bounds(at_least=3)]) -> Graph:
-    """Agents in a circle, at least three.
+    """Return a graph of agents in a circle, at least three.
 
     >>> ring(4).neighbours(0)
     (1, 3)
     """
-    number_of = np.arange(agents)
-    return _both_ways(agents, number_of, np.roll(number_of, -1))
+    numbers = np.arange(agents)
+    return _undirected_graph(agents, numbers, np.roll(numbers, -1))
 
 
 @validated
 def star(agents: PositiveInt) -> Graph:
-    """Agent 0 hears all the others and they hear only it; Tables II and III of Grange et al.
+    """Return a graph in which agent 0 has a link with each other agent, and they with it only.
+
+    The network of Tables II and III of Grange et al.
 
     >>> star(5).laplacian_spectrum.round(6) + 0.0
     array([0., 1., 1., 1., 5.])
     """
     others = np.arange(1, agents)
-    return _both_ways(agents, np.zeros_like(others), others)
+    return _undirected_graph(agents, np.zeros_like(others), others)
 
 
 @validated
 def grid(rows: PositiveInt, columns: PositiveInt) -> Graph:
-    """Agents on a rectangular grid, numbered row by row.
+    """Return a graph of agents on a rectangular grid, numbered row by row.
 
     >>> grid(2, 3).neighbours(4)
     (1, 3, 5)
     """
-    at = np.arange(rows * columns).reshape(rows, columns)
-    first = np.concatenate([at[:, :-1].ravel(), at[:-1].ravel()])
-    return _both_ways(
-        at.size, first, np.concatenate([at[:, 1:].ravel(), at[1:].ravel()])
-    )
+    numbers = np.arange(rows * columns).reshape(rows, columns)
+    # Each agent with its right neighbour, then each with the one below.
+    first = np.concatenate([numbers[:, :-1].ravel(), numbers[:-1].ravel()])
+    second = np.concatenate([numbers[:, 1:].ravel(), numbers[1:].ravel()])
+    return _undirected_graph(numbers.size, first, second)
 
 
 @validated
 def complete(agents: PositiveInt) -> Graph:
-    """Everybody hears everybody.
+    """Return the graph in which every agent has a link with every other.
 
     >>> complete(4).in_degree
     array([3., 3., 3., 3.])
     """
-    return _both_ways(agents, *np.triu_indices(agents, 1))
+    first, second = np.triu_indices(agents, 1)
+    return _undirected_graph(agents, first, second)
 
 
 @validated
@@ -397,14 +447,14 @@ def disk(
     positions: Annotated[Array, "A p", Bounds(at_least=-1e150, at_most=1e150)],
     radius: PositiveFloat,
 ) -> Graph:
-    """Agents hear each other within a distance: the graph of radios of one range.
+    """Return the disk graph: links between agents within a distance, as radios of one range have.
 
     Parameters
     ----------
     positions : array_like, (A, p)
         Where the agents are.
     radius : float
-        The range, in the positions' unit, positive; the distance itself still counts as heard.
+        The range, in the positions' unit, positive. Agents at exactly this distance have a link.
 
     Notes
     -----
@@ -421,7 +471,6 @@ def disk(
         raise ValueError(
             f"positions must have at least one agent, got shape {positions.shape}"
         )
-    pairs = (
-        cKDTree(positions).query_pairs(radius, output_type="ndarray").astype(np.int64)
-    )
-    return _both_ways(len(positions), pairs[:, 0], pairs[:, 1])
+    tree = cKDTree(positions)
+    pairs = tree.query_pairs(radius, output_type="ndarray").astype(np.int64)
+    return _undirected_graph(len(positions), pairs[:, 0], pairs[:, 1])

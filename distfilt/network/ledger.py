@@ -1,4 +1,4 @@
-"""The account of what agents sent, and what may be sent: numeric arrays, or flat tuples of them."""
+"""The communication ledger, and what can be sent: numeric arrays, or flat tuples of them."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..validation import (
     Array,
     FrozenModel,
+    InvalidArgumentError,
     Mask,
     NonNegativeInt,
     PositiveInt,
@@ -28,19 +29,19 @@ Payload = Part | tuple[Part, ...]
 
 @dataclass(frozen=True, eq=False)
 class Ledger(FrozenModel):
-    """What the agents sent: the cost of a distributed method.
+    """Counts of all that the agents sent: the cost of a distributed method.
 
-    A message is one payload on one link, also when it is lost. A batch of independent runs counts
+    A message is one payload on one link, also if it is lost. A batch of independent runs counts
     once: each run is a network of its own.
 
     Parameters
     ----------
     rounds : int
-        Rounds of communication; without any link there is none.
+        Rounds of communication; a graph without links has none.
     messages, scalars, bytes : ndarray of int, (A,)
         Sent by each agent, acknowledgements included.
     lost : ndarray, (A,)
-        How many of each agent's messages did not arrive; the mean over a batch's runs.
+        Number of each agent's messages that did not arrive; the mean over a batch's runs.
 
     Examples
     --------
@@ -57,14 +58,14 @@ class Ledger(FrozenModel):
     @classmethod
     @validated
     def empty(cls, agents: PositiveInt) -> Ledger:
-        """A ledger of `agents` agents that have not spoken.
+        """Return a ledger of `agents` agents that have sent nothing.
 
         >>> Ledger.empty(0)
         Traceback (most recent call last):
         ValueError: agents must be at least 1, got 0
         """
-        zero = np.zeros(agents, dtype=np.int64)
-        return cls.construct(0, zero, zero, zero, np.zeros(agents))
+        zeros = np.zeros(agents, dtype=np.int64)
+        return cls.construct(0, zeros, zeros, zeros, np.zeros(agents))
 
     def __repr__(self) -> str:
         names = ("messages", "scalars", "bytes", "lost")
@@ -75,67 +76,77 @@ class Ledger(FrozenModel):
 def count_payload(
     payloads: Any, agents: int, runs: tuple[int, ...]
 ) -> tuple[list[Payload | None], Counts, Counts]:
-    """Each agent's payload as read-only copies, None where it is silent, its scalars and bytes.
+    """Return read-only copies of the agents' payloads, and their scalars and bytes.
 
-    What is NaN in all runs is not sent, and a payload that holds nothing else is silence too.
+    Entries that are NaN in all runs are not sent. A payload without any other entry is silence,
+    like None, and comes back as None.
     """
     if not isinstance(payloads, Sequence | np.ndarray) or len(payloads) != agents:
         got = len(payloads) if hasattr(payloads, "__len__") else type(payloads).__name__
-        raise ValueError(
-            f"payloads must be a list, one for each agent ({agents}), got {got}"
+        raise InvalidArgumentError(
+            f"payloads must be a list with one entry for each of {agents} agents, got {got}"
         )
-    copies = math.prod(runs)
+    n_runs = math.prod(runs)
     sent: list[Payload | None] = [None] * agents
     scalars = [0] * agents
     bytes_ = [0] * agents
     for agent, payload in enumerate(payloads):
         if payload is None:
             continue
-        several = type(payload) is tuple
-        parts = [_part(p, agent, runs) for p in (payload if several else (payload,))]
+        is_tuple = type(payload) is tuple
+        parts = payload if is_tuple else (payload,)
         if not parts:
             raise ValueError(
                 f"payloads[{agent}] must have arrays, or None to stay silent, got ()"
             )
+        copies = [_copy_part(part, agent, runs) for part in parts]
         silent = True
-        for part in parts:
-            here = _present(part, copies)
-            scalars[agent] += here
-            bytes_[agent] += here * part.itemsize
-            silent = silent and here == 0 and part.size > 0
+        for part in copies:
+            count = _count_present(part, n_runs)
+            scalars[agent] += count
+            bytes_[agent] += count * part.itemsize
+            # An empty array is a message without content, not silence.
+            silent = silent and count == 0 and part.size > 0
         if not silent:
-            sent[agent] = tuple(parts) if several else parts[0]
+            sent[agent] = tuple(copies) if is_tuple else copies[0]
     return sent, np.array(scalars), np.array(bytes_)
 
 
-def _part(part: Any, agent: int, runs: tuple[int, ...]) -> Part:
+def _copy_part(part: Any, agent: int, runs: tuple[int, ...]) -> Part:
+    """Return a read-only copy of an array, or refuse anything else."""
+    # A masked array's mask, or an object, could carry numbers that are not counted.
     plain = isinstance(part, np.ndarray) and not isinstance(part, np.ma.MaskedArray)
     if not plain or part.dtype.kind not in "biuf":
         got = f"dtype {part.dtype}" if plain else type(part).__name__
-        needs = "an array of real numbers, a flat tuple of them or None"
-        raise ValueError(f"payloads[{agent}] must be {needs}, got {got}")
+        raise InvalidArgumentError(
+            f"payloads[{agent}] must be an array of real numbers, a flat tuple of them "
+            f"or None, got {got}"
+        )
     if part.shape[: len(runs)] != runs:
         raise ValueError(
             f"payloads[{agent}] must have leading axes {runs}, got shape {part.shape}"
         )
-    out: Part = np.array(part)  # what was sent does not change any more
-    out.flags.writeable = False
-    return out
+    # The sender may go on computing in its own array.
+    copy: Part = np.array(part)
+    copy.flags.writeable = False
+    return copy
 
 
-def _present(part: Part, copies: int) -> int:
-    """How many entries of one copy are not NaN in all copies."""
-    # A sum of squares is NaN only if an entry is, and takes half as long as looking for the least.
+def _count_present(part: Part, n_runs: int) -> int:
+    """Return how many entries of one run are not NaN in all runs."""
+    # A sum of squares is NaN only if an entry is, and takes half as long as np.isnan.
     if part.dtype.kind != "f" or not math.isnan(np.vdot(part, part)):
-        return part.size // copies
-    return int((~np.isnan(part)).reshape(copies, -1).any(axis=0).sum())
+        return part.size // n_runs
+    present = ~np.isnan(part).reshape(n_runs, -1)
+    return int(present.any(axis=0).sum())
 
 
-def drop_lost(payload: Any, arrived: Mask) -> Any:
-    """Read-only copies with NaN in the runs that lost the message."""
+def mask_lost(payload: Any, arrived: Mask) -> Any:
+    """Return read-only copies of a payload with NaN in the runs that lost the message."""
     if isinstance(payload, tuple):
-        return tuple([drop_lost(part, arrived) for part in payload])
-    gone = ~arrived.reshape(arrived.shape + (1,) * (payload.ndim - arrived.ndim))
-    out = np.where(gone, np.nan, payload)
-    out.flags.writeable = False
-    return out
+        return tuple([mask_lost(part, arrived) for part in payload])
+    # One flag for each run, for all of the payload's other axes.
+    axes = (1,) * (payload.ndim - arrived.ndim)
+    masked = np.where(arrived.reshape(arrived.shape + axes), payload, np.nan)
+    masked.flags.writeable = False
+    return masked

@@ -1,4 +1,4 @@
-"""Weights for combining values: what an agent makes of its own and of each that it hears."""
+"""Consensus weights: of an agent's own value and of each value that it receives."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ __all__ = [
 
 
 class UnstableGain(RuntimeWarning):
-    """A gain above 2/λ_max: what the agents exchange drives them apart instead of together.
+    """A gain above 2/λ_max, with which averaging diverges.
 
     Turn it into an error, or off, by ``warnings.filterwarnings("error", category=UnstableGain)``.
 
@@ -37,15 +37,15 @@ class UnstableGain(RuntimeWarning):
 
 @dataclass(frozen=True, eq=False)
 class ConsensusWeights(FrozenModel):
-    """One weight for each agent's own value, and one for each link.
+    """Weights of a linear consensus step: one for each agent's own value, one for each link.
 
     Parameters
     ----------
     graph : Graph
         The links.
-    own : ndarray, (A,)
-        Weight of an agent's own value.
-    links : ndarray, (E,)
+    self_weights : ndarray, (A,)
+        Weight of each agent's own value.
+    link_weights : ndarray, (E,)
         Weight of each link, in the order of ``graph.receivers`` and ``graph.senders``.
 
     Examples
@@ -58,52 +58,64 @@ class ConsensusWeights(FrozenModel):
     """
 
     graph: Graph
-    own: Annotated[Array, "graph.n_agents"]
-    links: Annotated[Array, "graph.senders.size"]
+    self_weights: Annotated[Array, "graph.n_agents"]
+    link_weights: Annotated[Array, "graph.senders.size"]
 
     @cached_property
     def matrix(self) -> scipy.sparse.csr_array:
-        """The matrix W of x <- W x, (A, A), each row's own entry stored first."""
-        return stack_weights(self.graph, self.own[None], self.links[None], heard_at=0)
+        """The matrix W of x <- W x, (A, A), each row's diagonal entry stored first."""
+        return stack_weights(
+            self.graph, self.self_weights[None], self.link_weights[None]
+        )
 
 
 def stack_weights(
-    graph: Graph, own: Array, links: Array, *, heard_at: int
+    graph: Graph, self_weights: Array, link_weights: Array, *, received_offset: int = 0
 ) -> scipy.sparse.csr_array:
-    """Matrices of R runs as one block-diagonal matrix, each row's own entry first.
+    """Return the matrices of R runs as one block-diagonal matrix, diagonal entries first.
 
-    `own` is (R, A) and `links` (R, E). With `heard_at` = 0 both multiply the same stacked values;
-    otherwise what is heard stands `heard_at` rows further on.
+    Parameters
+    ----------
+    graph : Graph
+    self_weights, link_weights : ndarray, (R, A) and (R, E)
+    received_offset : int
+        The matrix multiplies the runs' values, one below the other. With 0 the received values
+        are the same ones; delayed values stand so many rows below.
     """
-    (runs, size) = own.shape
-    at = graph.links.indptr[:-1]
-    run = np.arange(runs)[:, None]
-    data = np.insert(links, at, own, axis=1)
-    heard = graph.senders + size * run + heard_at
-    columns = np.insert(heard, at, np.arange(size) + size * run, axis=1)
-    ends = graph.links.indptr[1:] + np.arange(1, size + 1) + data.shape[1] * run
-    pointers = np.concatenate([[0], ends.ravel()])
-    shape = (runs * size, runs * size + heard_at)
+    n_runs, n_agents = self_weights.shape
+    row_starts = graph.links.indptr[:-1]
+    run = np.arange(n_runs)[:, None]
+    # Every row of a run: the diagonal entry, then those of the links, ascending by sender. Sums
+    # are added in this order, which makes them those of a loop over messages to the bit.
+    data = np.insert(link_weights, row_starts, self_weights, axis=1)
+    diagonal = np.arange(n_agents) + n_agents * run
+    received = graph.senders + n_agents * run + received_offset
+    columns = np.insert(received, row_starts, diagonal, axis=1)
+    # Each row is longer by the diagonal entry; a run follows the other.
+    row_ends = graph.links.indptr[1:] + np.arange(1, n_agents + 1)
+    row_ends = row_ends + data.shape[1] * run
+    pointers = np.concatenate([[0], row_ends.ravel()])
+    shape = (n_runs * n_agents, n_runs * n_agents + received_offset)
     return scipy.sparse.csr_array((data.ravel(), columns.ravel(), pointers), shape)
 
 
-def _matching(graph: Graph, weights: ConsensusWeights) -> ConsensusWeights:
-    """The weights themselves, or a ValueError if they are those of other links."""
-    ours = graph.links
-    theirs = weights.graph.links
-    same = np.array_equal(ours.indptr, theirs.indptr)
-    if not (same and np.array_equal(ours.indices, theirs.indices)):
-        raise ValueError(
-            "weights must be weights of the channel's graph, got those of other links"
-        )
-    return weights
-
-
-def _by_links(graph: Graph, links: Array) -> ConsensusWeights:
-    """Weights of links, and what is left of one for the own value."""
-    return ConsensusWeights.construct(
-        graph, 1 - np.asarray(graph.incidence @ links), links
+def _check_same_links(weights: ConsensusWeights, graph: Graph) -> None:
+    """Refuse weights of another graph's links."""
+    links = graph.links
+    of_weights = weights.graph.links
+    if np.array_equal(links.indptr, of_weights.indptr) and np.array_equal(
+        links.indices, of_weights.indices
+    ):
+        return
+    raise ValueError(
+        "weights must be weights of the channel's graph, got those of other links"
     )
+
+
+def _with_unit_rows(graph: Graph, link_weights: Array) -> ConsensusWeights:
+    """Return link weights with self-weights that make each row sum to one."""
+    self_weights = 1 - np.asarray(graph.incidence @ link_weights)
+    return ConsensusWeights.construct(graph, self_weights, link_weights)
 
 
 @validated
@@ -119,42 +131,44 @@ def metropolis(graph: Graph) -> ConsensusWeights:
     Examples
     --------
     >>> from distfilt.network import graphs
-    >>> metropolis(graphs.star(3)).own.round(3)
+    >>> metropolis(graphs.star(3)).self_weights.round(3)
     array([0.333, 0.667, 0.667])
     """
-    graph._undirected()
-    d = graph.in_degree
-    links = 1 / (1 + np.maximum(d[graph.receivers], d[graph.senders]))
-    return _by_links(graph, links)
+    graph._check_undirected()
+    degree = graph.in_degree
+    larger = np.maximum(degree[graph.receivers], degree[graph.senders])
+    return _with_unit_rows(graph, 1 / (1 + larger))
 
 
-def _laplacian(graph: Graph, gain: float) -> ConsensusWeights:
-    """The weights of one averaging step, I - gain L."""
-    own = 1 - gain * graph.in_degree
-    return ConsensusWeights.construct(graph, own, np.full(graph.senders.size, gain))
+def _laplacian_weights(graph: Graph, gain: float) -> ConsensusWeights:
+    """Return the weights of one averaging step, I - gain L."""
+    self_weights = 1 - gain * graph.in_degree
+    link_weights = np.full(graph.senders.size, gain)
+    return ConsensusWeights.construct(graph, self_weights, link_weights)
 
 
 def _warn_if_unstable(graph: Graph, gain: float) -> None:
-    """Warn the caller's caller of a gain at which averaging on the graph diverges.
+    """Warn the user of a gain at which averaging on the graph diverges.
 
-    A bound from the degrees clears most gains; eigenvalues are computed, once for a graph, only
-    beyond it.
+    Most gains are below a bound from the degrees. Only above it eigenvalues are computed, once for
+    a graph.
     """
     if gain <= graph.degree_bound_gain:
         return
     limit = graph.max_stable_gain
     if gain > limit * (1 + 1e-9):
         warnings.warn(
-            f"gain: {gain:.6g} is above 2/λ_max = {limit:.6g} of this graph, so the agents drift "
-            f"apart",
+            f"gain must be at most 2/λ_max = {limit:.6g} of this graph for the agents to agree, "
+            f"got {gain:.6g}",
             UnstableGain,
-            stacklevel=4,  # the rule, its door, its caller
+            # From here over the consensus rule and its validation to the caller of the rule.
+            stacklevel=4,
         )
 
 
 @validated
 def best_constant_edge(graph: Graph) -> ConsensusWeights:
-    r"""The best weights that are equal on all links, :math:`2/(\lambda_2+\lambda_{\max})`.
+    r"""Return the best weights that are equal on all links, :math:`2/(\lambda_2+\lambda_{\max})`.
 
     The slowest and the fastest mode then shrink by the same factor,
     :math:`(\lambda_{\max}-\lambda_2)/(\lambda_{\max}+\lambda_2)` a round. Both eigenvalues are
@@ -167,26 +181,27 @@ def best_constant_edge(graph: Graph) -> ConsensusWeights:
     Examples
     --------
     >>> from distfilt.network import graphs
-    >>> float(best_constant_edge(graphs.star(3)).links[0])
+    >>> float(best_constant_edge(graphs.star(3)).link_weights[0])
     0.5
     """
-    graph._joined()
+    graph._check_connected()
     if graph.n_agents == 1:
-        return _laplacian(graph, 0.0)
-    return _laplacian(
-        graph, 2 / float(graph.laplacian_spectrum[1] + graph.laplacian_spectrum[-1])
-    )
+        return _laplacian_weights(graph, 0.0)
+    # 1 - γ λ_2 = -(1 - γ λ_max): both ends of the spectrum have the same modulus.
+    eigenvalues = graph.laplacian_spectrum
+    gain = 2 / float(eigenvalues[1] + eigenvalues[-1])
+    return _laplacian_weights(graph, gain)
 
 
 @validated
 def fastest_mixing(graph: Graph) -> ConsensusWeights:
-    r"""Symmetric weights with the (nearly) smallest second largest modulus of an eigenvalue.
+    r"""Return symmetric weights with the (nearly) smallest second largest eigenvalue modulus.
 
     Fastest linear averaging on the graph: a convex problem, here smoothed by
     :math:`\mu\log\sum_k(e^{\lambda_k/\mu}+e^{-\lambda_k/\mu})` of the eigenvalues of
     :math:`\mathbf W-\mathbf 1\mathbf 1^\top\!/A` and solved by a quasi-Newton method for smaller
-    and smaller μ. Some weights may be negative. Global knowledge, and dense: for up to some hundred
-    agents.
+    and smaller μ. Some weights may be negative. The matrices are dense: for up to a few hundred
+    agents, and somebody has to know the whole graph.
 
     Parameters
     ----------
@@ -199,7 +214,7 @@ def fastest_mixing(graph: Graph) -> ConsensusWeights:
 
     Examples
     --------
-    A bridge between two groups is the bottleneck, and gets more than its share:
+    A bridge between two groups is the bottleneck and gets a larger weight:
 
     >>> from distfilt.network import Graph
     >>> edges = [(0, 1), (0, 2), (1, 2), (2, 3), (3, 4), (3, 5), (4, 5)]
@@ -211,134 +226,164 @@ def fastest_mixing(graph: Graph) -> ConsensusWeights:
     from scipy.optimize import minimize
 
     start = best_constant_edge(graph)
-    at = np.flatnonzero(graph.receivers < graph.senders)
-    if at.size < 2:
+    # One variable for each pair of opposite links.
+    forward = np.flatnonzero(graph.receivers < graph.senders)
+    if forward.size < 2:
         return start
-    found = [start.links[at]]
+    solutions = [start.link_weights[forward]]
+    # Each solution starts the next, less smooth problem.
     for mu in (1e-1, 1e-2, 1e-3, 1e-4):
-        how = {"method": "L-BFGS-B", "jac": True, "options": {"maxiter": 200}}
-        found.append(minimize(_smoothed, found[-1], (graph, at, mu), **how).x)
-    return _from_pairs(
-        graph, at, min(found, key=lambda x: np.abs(_modes(graph, at, x)[0]).max())
-    )
+        solution = minimize(
+            _smooth_modulus,
+            solutions[-1],
+            (graph, forward, mu),
+            method="L-BFGS-B",
+            jac=True,
+            options={"maxiter": 200},
+        )
+        solutions.append(solution.x)
+
+    def second_modulus(pair_weights: Array) -> float:
+        eigenvalues, _ = _decompose(graph, forward, pair_weights)
+        return float(np.abs(eigenvalues).max())
+
+    # The last need not be the best, where rounding stops the optimiser early.
+    return _symmetric_weights(graph, forward, min(solutions, key=second_modulus))
 
 
-def _from_pairs(graph: Graph, at: Indices, pairs: Array) -> ConsensusWeights:
-    links = np.empty(graph.senders.size)
-    links[at] = links[graph.reverse[at]] = pairs
-    return _by_links(graph, links)
+def _symmetric_weights(
+    graph: Graph, forward: Indices, pair_weights: Array
+) -> ConsensusWeights:
+    """Return weights that are equal on opposite links."""
+    link_weights = np.empty(graph.senders.size)
+    link_weights[forward] = pair_weights
+    link_weights[graph.reverse[forward]] = pair_weights
+    return _with_unit_rows(graph, link_weights)
 
 
-def _modes(graph: Graph, at: Indices, pairs: Array) -> tuple[Array, Array]:
-    dense = _from_pairs(graph, at, pairs).matrix.toarray() - 1 / graph.n_agents
-    return np.linalg.eigh(dense)
+def _decompose(
+    graph: Graph, forward: Indices, pair_weights: Array
+) -> tuple[Array, Array]:
+    """Return eigenvalues and eigenvectors of W - 11ᵀ/A, which has no eigenvalue of the average."""
+    weights = _symmetric_weights(graph, forward, pair_weights)
+    return np.linalg.eigh(weights.matrix.toarray() - 1 / graph.n_agents)
 
 
-def _smoothed(
-    pairs: Array, graph: Graph, at: Indices, mu: float
+def _smooth_modulus(
+    pair_weights: Array, graph: Graph, forward: Indices, mu: float
 ) -> tuple[float, Array]:
-    """The smoothed modulus and its gradient: a link's weight pulls both its ends together."""
-    values, vectors = _modes(graph, at, pairs)
-    top = np.abs(values).max()
-    up = np.exp((values - top) / mu)
-    down = np.exp((-values - top) / mu)
-    total = up.sum() + down.sum()
-    mean = (vectors * ((up - down) / total)) @ vectors.T
-    i = graph.receivers[at]
-    j = graph.senders[at]
-    return float(top + mu * np.log(total)), 2 * mean[i, j] - mean[i, i] - mean[j, j]
+    """Return the smoothed largest modulus of the eigenvalues, and its gradient."""
+    values, vectors = _decompose(graph, forward, pair_weights)
+    # μ log Σ_k (exp(λ_k/μ) + exp(-λ_k/μ)), scaled by the largest term.
+    largest = np.abs(values).max()
+    positive = np.exp((values - largest) / mu)
+    negative = np.exp((-values - largest) / mu)
+    total = positive.sum() + negative.sum()
+    modulus = float(largest + mu * np.log(total))
+    # The derivative in the matrix is G = Σ_k g_k v_k v_kᵀ.
+    derivative = (vectors * ((positive - negative) / total)) @ vectors.T
+    # The weight of a pair (i, j) enters W as -(e_i - e_j)(e_i - e_j)ᵀ.
+    i = graph.receivers[forward]
+    j = graph.senders[forward]
+    gradient = 2 * derivative[i, j] - derivative[i, i] - derivative[j, j]
+    return modulus, gradient
 
 
 @validated
 def expected_gossip(graph: Graph) -> ConsensusWeights:
-    """The mean of one meeting's averaging matrix in :func:`distfilt.network.gossip`.
+    """Return the expected weights of one round of :func:`distfilt.network.gossip_consensus`.
 
-    An agent wakes with probability 1 / A and meets one of its neighbours. The second largest
-    eigenvalue bounds the factor by which the mean squared disagreement shrinks in each meeting.
+    An agent wakes with probability 1 / A and averages with one of its neighbours. The second
+    largest eigenvalue bounds the factor by which the mean squared disagreement shrinks in a round.
 
     >>> from distfilt.network import graphs
-    >>> expected_gossip(graphs.path(2)).own
+    >>> expected_gossip(graphs.path(2)).self_weights
     array([0.5, 0.5])
     """
-    graph._undirected()
-    d = np.maximum(graph.in_degree, 1)
-    links = (1 / d[graph.receivers] + 1 / d[graph.senders]) / (2 * graph.n_agents)
-    return _by_links(graph, links)
+    graph._check_undirected()
+    # Agent i wakes and chooses j, or j wakes and chooses i; half of the difference moves.
+    degree = np.maximum(graph.in_degree, 1)
+    either = 1 / degree[graph.receivers] + 1 / degree[graph.senders]
+    return _with_unit_rows(graph, either / (2 * graph.n_agents))
 
 
 @validated
 def column_stochastic(graph: Graph) -> ConsensusWeights:
-    """Each agent splits its value evenly between itself and its listeners: columns sum to one.
+    """Return weights with which each agent splits its value evenly: columns sum to one.
 
-    An agent needs to know only how many hear it.
+    The parts go to itself and to all that receive from it. An agent needs to know only its
+    out-degree.
 
     >>> from distfilt.network import Graph
     >>> circle = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1)], directed=True)
-    >>> column_stochastic(circle).own
+    >>> column_stochastic(circle).self_weights
     array([0.5, 0.5, 0.5])
     """
-    share = 1 / (1 + graph.out_degree)
-    return ConsensusWeights.construct(graph, share, share[graph.senders])
+    part = 1 / (1 + graph.out_degree)
+    return ConsensusWeights.construct(graph, part, part[graph.senders])
 
 
 @validated
 def doubly_stochastic(graph: Graph) -> ConsensusWeights:
-    r"""Weights of a strongly connected digraph whose rows and columns sum to one.
+    r"""Return weights of a strongly connected digraph whose rows and columns sum to one.
 
-    Scaling agent i's links by the left null vector p of the Laplacian makes what it hears as heavy
-    as what others make of it, :math:`\mathbf 1^\top\operatorname{diag}(\mathbf p)\mathbf L
-    =\mathbf p^\top\mathbf L=\mathbf 0`. Averaging then keeps the average on a digraph too. The
-    vector is global knowledge: agents compute it together once, or are told.
+    The links of agent i are scaled by entry i of the left null vector p of the Laplacian. The
+    columns of the scaled Laplacian then sum to zero as well,
+    :math:`\mathbf 1^\top\operatorname{diag}(\mathbf p)\mathbf L=\mathbf p^\top\mathbf L
+    =\mathbf 0`, so that averaging keeps the average on a digraph too. The vector depends on the
+    whole graph: agents compute it together once, or it is given to them.
 
     >>> from distfilt.network import Graph
     >>> circle = Graph.from_edges(3, [(0, 2), (1, 0), (2, 1)], directed=True)
     >>> doubly_stochastic(circle).matrix.toarray().sum(axis=0)
     array([1., 1., 1.])
     """
-    graph._joined()
-    p = (
-        _left_null_vector(graph.laplacian)
-        if graph.directed
-        else np.ones(graph.n_agents)
-    )
-    links = p[graph.receivers] / (2 * (p * graph.in_degree).max())
-    return _by_links(graph, links)
+    graph._check_connected()
+    if graph.directed:
+        p = _left_null_vector(graph.laplacian)
+    else:
+        p = np.ones(graph.n_agents)
+    # The largest scaled degree leaves half of its agent's own value.
+    link_weights = p[graph.receivers] / (2 * (p * graph.in_degree).max())
+    return _with_unit_rows(graph, link_weights)
 
 
 def _left_null_vector(laplacian: scipy.sparse.csr_array) -> Array:
-    """Positive p with p' L = 0 of a strongly connected graph, largest entry 1."""
+    """Return the positive p with pᵀ L = 0 of a strongly connected graph, largest entry 1."""
     from scipy.sparse.linalg import splu
 
-    # One entry is set; the rest solves an M-matrix, which needs no pivoting.
-    turned = laplacian.T.tocsc()
-    inner = turned[1:, 1:]
-    right = -turned[1:, [0]].toarray().ravel()
+    # With p_0 = 1 the other rows of Lᵀ p = 0 are an M-matrix's, which needs no pivoting.
+    transposed = laplacian.T.tocsc()
+    matrix = transposed[1:, 1:]
+    right = -transposed[1:, [0]].toarray().ravel()
     factor = splu(
-        inner,
+        matrix,
         permc_spec="MMD_AT_PLUS_A",
         diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
     )
-    rest = factor.solve(right)
-    rest += factor.solve(right - inner @ rest)
-    p = np.abs(np.concatenate([[1.0], rest]))
+    others = factor.solve(right)
+    # One step of iterative refinement, for long rings.
+    others += factor.solve(right - matrix @ others)
+    p = np.abs(np.concatenate([[1.0], others]))
     return np.asarray(p / p.max())
 
 
-def _keeping(weights: ConsensusWeights) -> ConsensusWeights:
-    """The weights themselves, or a ValueError if their columns do not sum to one."""
+def _check_keeps_average(weights: ConsensusWeights) -> None:
+    """Refuse weights of which a column does not sum to one."""
     graph = weights.graph
-    own = weights.own
-    links = weights.links
     # Not by the matrix: scipy's sums sort its entries in place, which changes how sums round.
-    columns = own + np.bincount(graph.senders, links, graph.n_agents)
-    # Rounding grows with the weights that cancel in a sum.
-    size = np.abs(own) + np.bincount(graph.senders, np.abs(links), graph.n_agents)
-    off = np.abs(columns - 1) / np.maximum(1.0, size)
-    worst = int(off.argmax())
-    if off[worst] <= 1e-9:
-        return weights
-    got = f"{columns[worst]:.6g} for agent {worst}"
-    raise ValueError(
-        f"weights must have columns that sum to 1 to keep the average, got {got}"
+    columns = weights.self_weights + np.bincount(
+        graph.senders, weights.link_weights, graph.n_agents
     )
+    # Rounding grows with the weights that cancel in a sum.
+    scale = np.abs(weights.self_weights) + np.bincount(
+        graph.senders, np.abs(weights.link_weights), graph.n_agents
+    )
+    error = np.abs(columns - 1) / np.maximum(1.0, scale)
+    worst = int(error.argmax())
+    if error[worst] > 1e-9:
+        raise ValueError(
+            "weights must have columns that sum to 1 to keep the average, "
+            f"got {columns[worst]:.6g} for agent {worst}"
+        )

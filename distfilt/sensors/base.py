@@ -15,7 +15,7 @@ from typing import Annotated
 
 import numpy as np
 
-from ..linalg import evaluate_derivative, central_difference, factor, broadcast_leading
+from ..linalg import broadcast_leading, central_difference, evaluate_derivative, factor
 from ..validation import (
     ALLOW_NAN,
     Array,

@@ -17,7 +17,7 @@ from typing import Annotated, Any, TypeVar, cast
 import numpy as np
 
 from ..ensembles import Ensemble
-from ..linalg import cholesky, broadcast_leading
+from ..linalg import broadcast_leading, cholesky
 from ..validation import (
     ALLOW_NAN,
     Array,
@@ -27,7 +27,6 @@ from ..validation import (
     Mask,
     PositiveDefinite,
     Rng,
-    all_finite,
     call_user,
     validated,
 )
@@ -222,7 +221,7 @@ def with_missing(
     lead = observed.shape[:-1]
     m = observed.shape[-1]
     seed = _draw_seed(rng)
-    if all_finite(observed) and all_finite(predicted):
+    if np.isfinite(observed).all() and np.isfinite(predicted).all():
         stream = _stream(rng, seed, m, lead)
         result = call_user(update, ensemble, predicted, observed, noise, rng=stream)
         return cast(Array, result)

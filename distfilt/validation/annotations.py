@@ -63,7 +63,9 @@ class CallContext:
         argument, *attributes = name.lstrip("*").split(".")
         value = self.arguments.get(argument)
         for attribute in attributes:
-            value = getattr(value, attribute, None)
+            if value is None:
+                return name  # an optional argument that is absent binds nothing
+            value = getattr(value, attribute)
         return value if isinstance(value, int | np.integer | tuple) else name
 
 
@@ -271,8 +273,11 @@ def _is_out_of_bounds(value: Any, constraint: Constraint, error: ValueError) -> 
     return is_number and takes_numbers and constraint.description not in str(error)
 
 
+FINITE_FLOAT = Constraint("a finite number", _convert_float)
+"""The constraint of `float`."""
+
 _PLAIN_TYPES = {
-    float: Constraint("a finite number", _convert_float),
+    float: FINITE_FLOAT,
     int: Constraint("an integer", _convert_int),
     str: Constraint("a string that is not blank", _check_text),
     bool: Constraint("a bool, True or False", _convert_bool),

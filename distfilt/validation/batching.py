@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from .checks import Array
+from .decorators import call_user
 from .first_use import mark_checked, needs_check
 
 __all__ = ["call_batched"]
@@ -125,7 +126,7 @@ def _call_or_catch(
     """Return a function's result as an array, or the error that it raises."""
     copies = [state.copy() for state in states]
     try:
-        return np.asarray(function(*copies, *args), dtype=np.float64)
+        return np.asarray(call_user(function, *copies, *args), dtype=np.float64)
     except (TypeError, ValueError, IndexError) as error:
         return error
 

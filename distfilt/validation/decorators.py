@@ -7,9 +7,10 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cached_property, partial, wraps
 from inspect import Parameter, signature
+from math import isfinite
 from typing import Any, TypeVar, cast
 
-from .annotations import CallContext, Constraint
+from .annotations import FINITE_FLOAT, CallContext, Constraint
 from .resolving import make_constraints
 
 __all__ = ["SignatureConstraints", "call_user", "skip_validation", "validated"]
@@ -66,7 +67,12 @@ class SignatureConstraints:
         context = CallContext(self.defaults | arguments)
         for name, constraint in self.constraints.items():
             if name in arguments:
-                value = constraint.validate(arguments[name], name, context)
+                value = arguments[name]
+                is_float = type(value) is float
+                if constraint is FINITE_FLOAT and is_float and isfinite(value):
+                    # The most frequent case, a time, needs no conversion.
+                    continue
+                value = constraint.validate(value, name, context)
                 arguments[name] = value
                 context.arguments[name] = value
         return arguments

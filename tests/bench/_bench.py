@@ -40,7 +40,7 @@ class Timing:
     result: Any
 
 
-def timed(function: Callable[[], Any], repeats: int = 3) -> Timing:
+def measure_time(function: Callable[[], Any], repeats: int = 3) -> Timing:
     """Call `function` `repeats` times and take the median of processor time.
 
     Another program on the machine disturbs it less than wall time.
@@ -56,7 +56,7 @@ def timed(function: Callable[[], Any], repeats: int = 3) -> Timing:
     return Timing(statistics.median(cpu), peak_mb(), result)
 
 
-def interleaved(
+def compare_times(
     functions: Mapping[str, Callable[[], Any]], rounds: int = 15, seconds: float = 0.02
 ) -> tuple[dict[str, float], dict[str, float]]:
     """Processor time in s of a call of each, and the first one's speed as a multiple of each.
@@ -102,12 +102,12 @@ def peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
-def load(seconds: float = 1.0) -> float:
+def busy_cores(seconds: float = 1.0) -> float:
     """How many cores others keep busy, while this process waits."""
     return (os.cpu_count() or 1) * psutil.cpu_percent(seconds) / 100
 
 
-_BEFORE = load()
+_BUSY_AT_START = busy_cores()
 """Taken when the script begins; `write` looks again."""
 BUSY = 1.0
 """Times that were taken under more load are shown and not kept."""
@@ -116,36 +116,36 @@ BUSY = 1.0
 def machine(busy: float) -> str:
     """Processor, core count, and how busy others kept it; `timed` holds BLAS to one thread."""
     name = platform.processor() or platform.machine()
-    told = Path("/proc/cpuinfo")
-    if told.is_file():
-        models = re.findall(r"model name\s*: (.*)", told.read_text(encoding="utf-8"))
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.is_file():
+        models = re.findall(r"model name\s*: (.*)", cpuinfo.read_text(encoding="utf-8"))
         name = models[0] if models else name
     return f"{name}; {os.cpu_count()} cores; one BLAS thread; load {busy:.1f}"
 
 
 def versions(packages: Sequence[str]) -> str:
     """Python and the named packages with their versions, in one line."""
-    found = [f"python {platform.python_version()}"]
+    texts = [f"python {platform.python_version()}"]
     for name in packages:
         try:
-            found.append(f"{name} {version(name)}")
+            texts.append(f"{name} {version(name)}")
         except PackageNotFoundError:
-            found.append(f"{name} missing")
-    return "; ".join(found)
+            texts.append(f"{name} missing")
+    return "; ".join(texts)
 
 
 def write(name: str, rows: Sequence[Row], packages: Sequence[str]) -> None:
     """Print rows, and write them to data/bench/`name`.csv with versions, machine and its load."""
-    found = pandas.DataFrame(rows)
-    busy = max(_BEFORE, load())
-    print(found.to_string(index=False))
+    frame = pandas.DataFrame(rows)
+    busy = max(_BUSY_AT_START, busy_cores())
+    print(frame.to_string(index=False))
     path = FOLDER / f"{name}.csv"
     if busy > BUSY and "--force" not in sys.argv:
         print(f"{name}.csv: not written under a load of {busy:.1f}; --force writes it")
         return
     FOLDER.mkdir(parents=True, exist_ok=True)
     where = {"versions": versions(packages), "machine": machine(busy)}
-    found.assign(**where).to_csv(path, index=False, lineterminator="\n")
+    frame.assign(**where).to_csv(path, index=False, lineterminator="\n")
 
 
 _TABLES: dict[str, tuple[Rows, Sequence[str]]] = {}
@@ -154,19 +154,19 @@ _TABLES: dict[str, tuple[Rows, Sequence[str]]] = {}
 def table(name: str, *packages: str) -> Callable[[Rows], Rows]:
     """Have `main` show and write the rows that a function yields, with the packages' versions."""
 
-    def kept(rows: Rows) -> Rows:
+    def register(rows: Rows) -> Rows:
         _TABLES[name] = rows, packages or ("numpy", "scipy")
         return rows
 
-    return kept
+    return register
 
 
 def main() -> NoReturn:
     """Every table of the script in turn; ends with how many floors and limits were missed."""
     missed = 0
     for name, (rows, packages) in _TABLES.items():
-        found = [dict(row) for row in rows()]
-        missed += sum(int(row.pop("missed", 0)) for row in found)
-        if found:
-            write(name, found, packages)
+        results = [dict(row) for row in rows()]
+        missed += sum(int(row.pop("missed", 0)) for row in results)
+        if results:
+            write(name, results, packages)
     sys.exit(missed)

@@ -30,8 +30,8 @@ STD = 2**0.5
 
 def pairs(da: Any) -> Iterator[tuple[str, Any, Any, float]]:
     """Each filter of ours, DAPPER's with the options that it recommends, the limit of the ratio."""
-    given = lorenz63(step=0.01), [component([0, 1, 2], std=STD)]
-    ours = partial(EnsembleFilter, *given, members=10)
+    problem = lorenz63(step=0.01), [component([0, 1, 2], std=STD)]
+    ours = partial(EnsembleFilter, *problem, members=10)
     wider = partial(with_inflation, factor=1.02)
     centred = with_inflation(partial(enkf, centred=True), factor=1.04)
     rotated = partial(da.EnKF, "Sqrt", N=10, infl=1.02, rot=True)
@@ -46,7 +46,7 @@ def pairs(da: Any) -> Iterator[tuple[str, Any, Any, float]]:
     particles = partial(da.PartFilt, N=800, reg=0.9, NER=0.2)
     yield (
         "particles",
-        ParticleFilter(*given, members=800, ess_threshold=0.2),
+        ParticleFilter(*problem, members=800, ess_threshold=0.2),
         particles,
         1.03,
     )
@@ -62,43 +62,45 @@ def errors() -> Iterator[Row]:
     hmm.tseq.T = END
     times = hmm.tseq.tto
     dapper.set_seed(3000)
-    drawn = [hmm.simulate() for _ in range(RUNS)]
-    truth = np.stack([x[hmm.tseq.kko] for x, _ in drawn], axis=1)
-    seen = np.stack([np.array([*y]) for _, y in drawn], axis=1)
+    draws = [hmm.simulate() for _ in range(RUNS)]
+    truth = np.stack([x[hmm.tseq.kko] for x, _ in draws], axis=1)
+    seen = np.stack([np.array([*y]) for _, y in draws], axis=1)
 
     def error(means: Any) -> Any:
         gap = (np.asarray(means) - truth)[times > hmm.tseq.BurnIn]
         return np.sqrt((gap**2).mean(axis=-1))
 
-    for name, f, make, limit in pairs(da):
-        state = f.start(
+    for name, filter_, make, limit in pairs(da):
+        state = filter_.start(
             (problem.x0, 2 * np.eye(3)), rng=np.random.default_rng(5), runs=(RUNS,)
         )
-        own = error(f.run(state, times, [seen])["mean"][:, :, 0])
+        ours = error(filter_.run(state, times, [seen])["mean"][:, :, 0])
         dapper.set_seed(9000)
         means = []
-        for x, y in drawn:
+        for x, y in draws:
             (other := make()).assimilate(hmm, x, y, liveplots=False)
             means.append(other.stats.mu.a)
-        its = error(np.stack(means, axis=1))
-        whole = own.mean() / its.mean()
-        lost, its_lost = ((x > 4 * STD).any(axis=0) for x in (own, its))
-        own, its = (x.mean(axis=0)[~lost & ~its_lost] for x in (own, its))
-        ratio = own.mean() / its.mean()
-        se = (own - its).std(ddof=1) / its.mean() / own.size**0.5
-        more = lost.sum() - its_lost.sum() > 2 * (lost | its_lost).sum() ** 0.5
+        theirs = error(np.stack(means, axis=1))
+        ratio_of_all = ours.mean() / theirs.mean()
+        lost, lost_theirs = ((x > 4 * STD).any(axis=0) for x in (ours, theirs))
+        ours, theirs = (x.mean(axis=0)[~lost & ~lost_theirs] for x in (ours, theirs))
+        ratio = ours.mean() / theirs.mean()
+        se = (ours - theirs).std(ddof=1) / theirs.mean() / ours.size**0.5
+        lost_more = (
+            lost.sum() - lost_theirs.sum() > 2 * (lost | lost_theirs).sum() ** 0.5
+        )
         yield {
             "ours": name,
             "runs": RUNS,
-            "ratio_of_all": f"{whole:.3f}",
+            "ratio_of_all": f"{ratio_of_all:.3f}",
             "lost": lost.sum(),
-            "its_lost": its_lost.sum(),
-            "error": f"{own.mean():.4f}",
-            "its_error": f"{its.mean():.4f}",
+            "its_lost": lost_theirs.sum(),
+            "error": f"{ours.mean():.4f}",
+            "its_error": f"{theirs.mean():.4f}",
             "ratio": f"{ratio:.3f}",
             "se": f"{se:.3f}",
             "limit": limit,
-            "missed": ratio - 2 * se > limit or more,
+            "missed": ratio - 2 * se > limit or lost_more,
         }
 
 

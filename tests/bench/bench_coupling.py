@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
-from _bench import Row, interleaved, main, table
+from _bench import Row, compare_times, main, table
 
 from distfilt.coupling import squared_distances, transport_plan
 
@@ -28,7 +28,7 @@ def case(n: int) -> tuple[np.ndarray, np.ndarray]:
     return squared_distances(x), w / w.sum()
 
 
-def built_anew(cost: np.ndarray, w: np.ndarray) -> float:
+def solve_by_cvxpy(cost: np.ndarray, w: np.ndarray) -> float:
     """The linear programme written down in cvxpy and solved by HiGHS; its value."""
     import cvxpy as cp
 
@@ -49,11 +49,11 @@ def rows() -> Iterator[Row]:
         cost, w = case(n)
         calls = {"network simplex": lambda c=cost, w=w: transport_plan(c, w).value}
         if n <= MOST:
-            calls["cvxpy, built anew"] = partial(built_anew, cost, w)
+            calls["cvxpy, built anew"] = partial(solve_by_cvxpy, cost, w)
             calls["entropic, 0.01"] = lambda c=cost, w=w: (
                 transport_plan(c, w, solver="entropic").value
             )
-        times, ratios = interleaved(calls, 5)
+        times, ratios = compare_times(calls, 5)
         best = calls["network simplex"]()
         spent[n] = times["network simplex"]
         slope = np.diff(np.log(list(spent.items())[-2:]), axis=0)

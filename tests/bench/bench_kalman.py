@@ -19,7 +19,7 @@ from typing import Any
 sys.path.insert(1, str(Path(__file__).resolve().parents[2]))
 
 import numpy as np
-from _bench import Row, interleaved, main, table
+from _bench import Row, compare_times, main, table
 from filterpy import kalman as filterpy
 
 from distfilt.filters import GaussianFilter
@@ -80,28 +80,30 @@ def plain_numpy(mean: Any, cov: Any, y: Any, *, F: Any, H: Any, Q: Any, R: Any) 
     covs = np.empty((len(y), runs, d, d))
     density = np.empty((len(y), runs))
     for k, seen in enumerate(y):
-        here = ~np.isnan(seen)
-        h = H * here[..., None]
-        both = here[..., :, None] & here[..., None, :]
-        r = np.where(both, R, np.eye(len(R)))
+        present = ~np.isnan(seen)
+        h = H * present[..., None]
+        pairs = present[..., :, None] & present[..., None, :]
+        r = np.where(pairs, R, np.eye(len(R)))
         x = x @ F.T
         p = F @ p @ F.T + Q
         cross = h @ p
-        inner = cross @ np.swapaxes(h, 1, 2) + r
-        gain = np.swapaxes(np.linalg.solve(inner, cross), 1, 2)
-        gap = np.where(here, seen - x @ H.T, 0.0)
-        squares = (gap * np.linalg.solve(inner, gap[..., None])[..., 0]).sum(axis=-1)
-        size = here.sum(axis=-1) * np.log(2 * np.pi)
-        density[k] = -0.5 * (size + np.linalg.slogdet(inner)[1] + squares)
-        x = x + (gain @ gap[..., None])[..., 0]
-        rest = np.eye(d) - gain @ h
-        p = rest @ p @ np.swapaxes(rest, 1, 2) + gain @ r @ np.swapaxes(gain, 1, 2)
+        S = cross @ np.swapaxes(h, 1, 2) + r
+        gain = np.swapaxes(np.linalg.solve(S, cross), 1, 2)
+        innovation = np.where(present, seen - x @ H.T, 0.0)
+        squares = (innovation * np.linalg.solve(S, innovation[..., None])[..., 0]).sum(
+            axis=-1
+        )
+        log_two_pi = present.sum(axis=-1) * np.log(2 * np.pi)
+        density[k] = -0.5 * (log_two_pi + np.linalg.slogdet(S)[1] + squares)
+        x = x + (gain @ innovation[..., None])[..., 0]
+        factor = np.eye(d) - gain @ h
+        p = factor @ p @ np.swapaxes(factor, 1, 2) + gain @ r @ np.swapaxes(gain, 1, 2)
         means[k] = x
         covs[k] = p
     return means, covs
 
 
-def curved_case(
+def turning_case(
     rng: np.random.Generator,
 ) -> tuple[tuple[np.ndarray, ...], dict[str, Any]]:
     model = turning(sigma=0.1, turn_sigma=0.02)
@@ -110,11 +112,11 @@ def curved_case(
     times = 0.5 * np.arange(1, CURVED_STEPS + 1)
     truth = simulate(model, np.tile(x0, (CURVED_RUNS, 1)), times, rng=rng)
     seen = sensors[0].observe(truth, rng=rng)
-    given = x0, 0.05 * np.eye(model.dim), seen
-    return given, {"model": model, "sensors": sensors, "times": times}
+    inputs = x0, 0.05 * np.eye(model.dim), seen
+    return inputs, {"model": model, "sensors": sensors, "times": times}
 
 
-def unscented(
+def run_unscented(
     mean: Any, cov: Any, y: Any, *, model: Any, sensors: Any, times: Any
 ) -> Any:
     f = GaussianFilter(model, sensors, linearization="unscented")
@@ -128,19 +130,21 @@ def moments(found: Any) -> tuple[np.ndarray, np.ndarray]:
     return found[:2] if isinstance(found, tuple) else (found.means, found.covariances)
 
 
-def compared(
-    case: str, functions: Any, rounds: int, *given: Any, **options: Any
+def compare_filters(
+    case: str, functions: Any, rounds: int, *inputs: Any, **options: Any
 ) -> Iterator[Row]:
     """The table's rows: ours first, each other's time, our speed, and the largest difference."""
-    calls = {name: partial(f, *given, **options) for name, f in functions.items()}
+    calls = {name: partial(f, *inputs, **options) for name, f in functions.items()}
     results = {name: moments(call()) for name, call in calls.items()}
-    times, ratios = interleaved(calls, rounds)
-    first, mine = results["distfilt"]
+    times, ratios = compare_times(calls, rounds)
+    first_means, first_covs = results["distfilt"]
     for name, (means, covs) in results.items():
-        gap = np.abs(means - first).max() / np.abs(first).max()
+        difference = np.abs(means - first_means).max() / np.abs(first_means).max()
         covs = covs.reshape(len(covs), -1, *covs.shape[-2:])
-        own = mine.reshape(len(covs), -1, *covs.shape[-2:])
-        gap = max(gap, np.abs(covs - own).max() / np.abs(own).max())
+        expected = first_covs.reshape(len(covs), -1, *covs.shape[-2:])
+        difference = max(
+            difference, np.abs(covs - expected).max() / np.abs(expected).max()
+        )
         floor = FLOORS.get((case, name), 0)
         yield {
             "case": case,
@@ -148,16 +152,16 @@ def compared(
             "seconds": f"{times[name]:.4f}",
             "distfilt_is_faster": f"{ratios[name]:.2f}",
             "floor": floor or "",
-            "gap": f"{gap:.0e}",
-            "missed": gap > 1e-9 or ratios[name] < floor,
+            "gap": f"{difference:.0e}",
+            "missed": difference > 1e-9 or ratios[name] < floor,
         }
 
 
 @table("kalman", "numpy", "scipy", "filterpy")
 def filters() -> Iterator[Row]:
     rng = np.random.default_rng(20260)
-    (mean, cov, whole), matrices, parts = linear_case(rng)
-    gaps = np.where(rng.random(whole.shape) < 0.1, np.nan, whole)
+    (mean, cov, observed), matrices, parts = linear_case(rng)
+    with_gaps = np.where(rng.random(observed.shape) < 0.1, np.nan, observed)
     filterpy.KalmanFilter.log_likelihood = (
         filterpy.UnscentedKalmanFilter.log_likelihood
     ) = 0.0
@@ -166,16 +170,16 @@ def filters() -> Iterator[Row]:
         "filterpy": filterpy_kf,
         "plain numpy": plain_numpy,
     }
-    for case, y in ("common pattern", whole), ("gaps that differ by run", gaps):
-        yield from compared(case, calls, 5, mean, cov, y, **matrices)
-    calls = {"distfilt": unscented, "filterpy": filterpy_ukf}
+    for case, y in ("common pattern", observed), ("gaps that differ by run", with_gaps):
+        yield from compare_filters(case, calls, 5, mean, cov, y, **matrices)
+    calls = {"distfilt": run_unscented, "filterpy": filterpy_ukf}
     one = slice(None, 1)
-    yield from compared(
-        "unscented satellite, one run", calls, 7, mean, cov, whole[:, one], **parts
+    yield from compare_filters(
+        "unscented satellite, one run", calls, 7, mean, cov, observed[:, one], **parts
     )
-    (mean, cov, seen), options = curved_case(rng)
-    yield from compared("unscented turn", calls, 3, mean, cov, seen, **options)
-    yield from compared(
+    (mean, cov, seen), options = turning_case(rng)
+    yield from compare_filters("unscented turn", calls, 3, mean, cov, seen, **options)
+    yield from compare_filters(
         "unscented turn, one run", calls, 7, mean, cov, seen[:, one], **options
     )
 

@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from _bench import Row, interleaved, main, table
+from _bench import Row, compare_times, main, table
 
 from distfilt.mixtures import GaussianMixture, runnalls
 
@@ -25,13 +25,15 @@ def mixture(size: int, dim: int, seed: int = 0) -> GaussianMixture:
     return GaussianMixture(w, 3 * rng.standard_normal((size, dim)), covs)
 
 
-def gap(ours: GaussianMixture, weights: Any, means: Any, covs: Any) -> float:
+def largest_difference(
+    ours: GaussianMixture, weights: Any, means: Any, covs: Any
+) -> float:
     """Largest relative difference of two mixtures whose mixands stand in another order."""
-    mine = np.argsort(ours.weights)
-    theirs = np.argsort(weights)
+    order = np.argsort(ours.weights)
+    their_order = np.argsort(weights)
     pairs = ((ours.weights, weights), (ours.means, means), (ours.covs, covs))
     return max(
-        float(np.abs(a[mine] - np.asarray(b)[theirs]).max() / np.abs(a).max())
+        float(np.abs(a[order] - np.asarray(b)[their_order]).max() / np.abs(a).max())
         for a, b in pairs
     )
 
@@ -43,14 +45,14 @@ def rows() -> Iterator[Row]:
 
     for dim, size, needed in PEERS:
         p = mixture(size, dim)
-        there = TheirMixture(p.weights.copy(), p.means.copy(), p.covs.copy())
+        their_mixture = TheirMixture(p.weights.copy(), p.means.copy(), p.covs.copy())
         calls = {
             "ours": partial(runnalls, p, LEFT),
-            "pyest": partial(merge_runnalls, there, LEFT),
+            "pyest": partial(merge_runnalls, their_mixture, LEFT),
         }
-        found = calls["pyest"]()
-        apart = gap(calls["ours"](), found.w, found.m, found.P)
-        times, ratios = interleaved(calls, 3)
+        theirs = calls["pyest"]()
+        difference = largest_difference(calls["ours"](), theirs.w, theirs.m, theirs.P)
+        times, ratios = compare_times(calls, 3)
         yield {
             "components": dim,
             "mixands": size,
@@ -58,8 +60,8 @@ def rows() -> Iterator[Row]:
             "pyest_ms": f"{1e3 * times['pyest']:.1f}",
             "ratio": f"{ratios['pyest']:.1f}",
             "needed": needed,
-            "gap": f"{apart:.0e}",
-            "missed": ratios["pyest"] < needed or apart > 1e-12,
+            "gap": f"{difference:.0e}",
+            "missed": ratios["pyest"] < needed or difference > 1e-12,
         }
 
 

@@ -20,7 +20,7 @@ from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
-from _bench import Row, Timing, main, table, timed
+from _bench import Row, Timing, main, measure_time, table
 from scipy.spatial import cKDTree
 
 from distfilt.filters import EnsembleFilter, GaussianFilter
@@ -52,12 +52,12 @@ def spread(agents: int, neighbours: float = 10) -> tuple[np.ndarray, float]:
     return places, float(np.sqrt(neighbours / np.pi / agents))
 
 
-def scaled(
-    what: str, agents: int, spent: Any, seconds: float, memory: float = np.inf
+def scale_row(
+    operation: str, agents: int, spent: Any, seconds: float, memory: float = np.inf
 ) -> Row:
     """One line of the table of many agents."""
     return {
-        "what": what,
+        "what": operation,
         "agents": agents,
         "seconds": f"{spent.cpu:.3f}",
         "limit_s": f"{seconds:.3g}",
@@ -81,29 +81,29 @@ def many() -> Iterator[Row]:
         seen = [np.zeros(s.dim) for s in sensors]
         limit = STEP_S if agents == MANY else SECONDS
         ours = partial(covariance_intersection, rule=rule)
-        own = {
+        options = {
             "update": enkf,
             "members": 50,
-            "agreement": partial(intersect_ensembles, rule=rule),
+            "fusion": partial(intersect_ensembles, rule=rule),
         }
         for name, f in (
             ("Gaussian", GaussianFilter(MODEL, sensors, graph, fusion=ours)),
-            ("ensemble, 50 members", EnsembleFilter(MODEL, sensors, graph, **own)),
+            ("ensemble, 50 members", EnsembleFilter(MODEL, sensors, graph, **options)),
         ):
             state = f.step(f.start(PRIOR, rng=np.random.default_rng(2)), 0.1, seen)
-            spent = timed(partial(f.step, state, 0.2, seen), 5)
-            yield scaled(f"a step, {name}, {rule}", agents, spent, limit)
-    for what in ("combine", "max_stable_gain", "balanced"):
+            spent = measure_time(partial(f.step, state, 0.2, seen), 5)
+            yield scale_row(f"a step, {name}, {rule}", agents, spent, limit)
+    for operation in ("combine", "max_stable_gain", "balanced"):
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-            agents, spent = pool.submit(large, what).result()
-        yield scaled(what, agents, spent, SECONDS, MEGABYTES)
-    theirs, ours = imported("scipy.linalg", "distfilt.filters")
-    yield scaled(
+            agents, spent = pool.submit(measure_operation, operation).result()
+        yield scale_row(operation, agents, spent, SECONDS, MEGABYTES)
+    theirs, ours = import_times("scipy.linalg", "distfilt.filters")
+    yield scale_row(
         "import of distfilt.filters", 0, Timing(ours, np.nan, None), 1.3 * theirs
     )
 
 
-def imported(*names: str) -> list[float]:
+def import_times(*names: str) -> list[float]:
     """How long a process takes that imports one of these, in s: medians of fifteen, in turns."""
     taken: dict[str, list[float]] = {name: [] for name in names}
     for name in names * 15:
@@ -118,19 +118,19 @@ def one_way() -> Graph:
     rng = np.random.default_rng(3)
     places = rng.random((VERY_MANY, 2))
     reach = np.sqrt(rng.uniform(8, 16, VERY_MANY) / np.pi / VERY_MANY)
-    found = cKDTree(places).query_ball_point(places, reach)
-    heard = np.repeat(np.arange(VERY_MANY), [len(f) for f in found])
-    edges = np.stack([heard, np.concatenate(found)], axis=1)
+    neighbours = cKDTree(places).query_ball_point(places, reach)
+    receivers = np.repeat(np.arange(VERY_MANY), [len(f) for f in neighbours])
+    edges = np.stack([receivers, np.concatenate(neighbours)], axis=1)
     edges = edges[edges[:, 0] != edges[:, 1]]
     parts = Graph.from_edges(VERY_MANY, edges, directed=True).components
-    here = parts == np.bincount(parts).argmax()
-    kept = (np.cumsum(here) - 1)[edges[here[edges].all(axis=1)]]
-    return Graph.from_edges(int(here.sum()), kept, directed=True)
+    in_largest = parts == np.bincount(parts).argmax()
+    renumbered = (np.cumsum(in_largest) - 1)[edges[in_largest[edges].all(axis=1)]]
+    return Graph.from_edges(int(in_largest.sum()), renumbered, directed=True)
 
 
-def large(what: str) -> tuple[int, Any]:
+def measure_operation(operation: str) -> tuple[int, Any]:
     """Agents, and what one operation on very many of them takes."""
-    graph = one_way() if what == "balanced" else graphs.disk(*spread(VERY_MANY))
+    graph = one_way() if operation == "balanced" else graphs.disk(*spread(VERY_MANY))
     averaging = (
         weights.column_stochastic(graph)
         if graph.directed
@@ -142,7 +142,7 @@ def large(what: str) -> tuple[int, Any]:
         "max_stable_gain": lambda: graph.max_stable_gain,
         "balanced": lambda: weights.doubly_stochastic(graph),
     }
-    return graph.n_agents, replace(timed(calls[what], 1), result=None)
+    return graph.n_agents, replace(measure_time(calls[operation], 1), result=None)
 
 
 if __name__ == "__main__":

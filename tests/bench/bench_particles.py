@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from _bench import Row, interleaved, main, peer, table
+from _bench import Row, compare_times, main, peer, table
 
 from distfilt.filters import ParticleFilter
 from distfilt.kalman import kalman_filter
@@ -36,7 +36,7 @@ def by_distfilt(n: int, seen: np.ndarray) -> np.ndarray:
     states = f.steps(
         f.start((np.zeros(3), np.eye(3)), rng=np.random.default_rng(1)), TIMES, [seen]
     )
-    return np.array([state.weights[0] @ state.points[0] for state in states])
+    return np.array([state.weights[0] @ state.particles[0] for state in states])
 
 
 def by_particles(package: Any, n: int, seen: np.ndarray) -> np.ndarray:
@@ -77,7 +77,7 @@ def filters() -> Iterator[Row]:
         calls: dict[str, Any] = {"distfilt": partial(by_distfilt, n, seen)}
         if package is not None:
             calls["particles"] = partial(by_particles, package, n, seen)
-        times, ratios = interleaved(calls, 7)
+        times, ratios = compare_times(calls, 7)
         for name, call in calls.items():
             floor = FLOOR if name == "particles" else 0
             gap = np.sqrt(((call() - exact.means) ** 2 / variance).mean())

@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from _bench import Row, interleaved, main, table
+from _bench import Row, compare_times, main, table
 
 from bookkit import studies
 from distfilt.gaussians import intersection_weights
@@ -29,71 +29,72 @@ LIMITS = {
 }
 
 
-def centred(x: np.ndarray) -> np.ndarray:
+def anomalies(x: np.ndarray) -> np.ndarray:
     return x - x.mean(axis=-2, keepdims=True)
 
 
-def exact(z: np.ndarray, avoid: np.ndarray) -> np.ndarray:
+def exact_draws(z: np.ndarray, avoid: np.ndarray) -> np.ndarray:
     """Normal draws (..., N, k) made uncorrelated with anomalies and of unit sample covariance."""
     # What a linear sensor reads depends on the members: no system of normal equations.
     frame = np.linalg.qr(avoid)[0]
-    z = centred(z)
+    z = anomalies(z)
     z -= frame @ (frame.mT @ z)
-    own = np.linalg.cholesky(z.mT @ z / (z.shape[-2] - 1))
-    return z @ np.linalg.inv(own).mT
+    root = np.linalg.cholesky(z.mT @ z / (z.shape[-2] - 1))
+    return z @ np.linalg.inv(root).mT
 
 
-def floor_of(
+def plain_step(
     setup: Any, states: np.ndarray, rng: np.random.Generator, kind: str
 ) -> Any:
     """One step for states (runs, A, N, d)."""
     n = states.shape[-2] - 1
     dt = float(setup.times[1] - setup.times[0])
     values, vectors = np.linalg.eigh(setup.model.Q(0.0, dt))
-    kept = values > 1e-14 * values.max()
-    root = vectors[:, kept] * np.sqrt(values[kept])
-    hears = np.eye(len(setup.sensors)) + (setup.graph.laplacian.toarray() < 0)
-    told = [
-        [s for s, row in zip(setup.sensors, rows, strict=True) if row] for rows in hears
+    positive = values > 1e-14 * values.max()
+    root = vectors[:, positive] * np.sqrt(values[positive])
+    receives = np.eye(len(setup.sensors)) + (setup.graph.laplacian.toarray() < 0)
+    received_sensors = [
+        [s for s, row in zip(setup.sensors, rows, strict=True) if row]
+        for rows in receives
     ]
 
-    def read(k: int, x: np.ndarray, before: np.ndarray) -> np.ndarray:
+    def predict(k: int, x: np.ndarray, before: np.ndarray) -> np.ndarray:
         """What the sensors that agent k hears would read of its members, without noise."""
         return np.concatenate(
             [
-                s.function(x, before) if s.uses_previous else s.function(x)
-                for s in told[k]
+                s.h(x, before) if s.uses_previous else s.h(x)
+                for s in received_sensors[k]
             ],
             axis=-1,
         )
 
-    def drawn(avoid: np.ndarray, k: int) -> np.ndarray:
+    def draw(avoid: np.ndarray, k: int) -> np.ndarray:
         z = rng.standard_normal((*avoid.shape[:-1], k))
-        return exact(z, avoid) if kind == "exact" else z
+        return exact_draws(z, avoid) if kind == "exact" else z
 
     def call() -> np.ndarray:
         x = setup.model.step(states, 0.0, dt)
-        x = x + drawn(centred(x), root.shape[1]) @ root.T
-        for k in range(len(told)):
-            h = read(k, x[:, k], states[:, k])
-            a = centred(x[:, k])
-            b = centred(h)
+        x = x + draw(anomalies(x), root.shape[1]) @ root.T
+        for k in range(len(received_sensors)):
+            h = predict(k, x[:, k], states[:, k])
+            a = anomalies(x[:, k])
+            b = anomalies(h)
             m = h.shape[-1]
             gain = np.linalg.solve(b.mT @ b / n + np.eye(m), b.mT @ a / n)
-            x[:, k] -= (h + drawn(np.concatenate([a, b], axis=-1), m)) @ gain
-        a = centred(x)
+            x[:, k] -= (h + draw(np.concatenate([a, b], axis=-1), m)) @ gain
+        a = anomalies(x)
         covs = a.mT @ a / n
         precise = np.linalg.inv(covs)
         if kind == "exact":
             sources = np.broadcast_to(
-                covs[:, None], (len(x), *hears.shape, *covs.shape[-2:])
+                covs[:, None], (len(x), *receives.shape, *covs.shape[-2:])
             )
             rule = "min_determinant"
             weights = without_checks(intersection_weights)(
-                sources, rule=rule, here=hears > 0
+                sources, rule=rule, present=receives > 0
             )
         else:
-            weights = hears / np.trace(covs, axis1=-2, axis2=-1)[:, None]
+            weights = receives / np.trace(covs, axis1=-2, axis2=-1)[:, None]
             weights /= weights.sum(axis=-1, keepdims=True)
         fused = np.linalg.inv(np.einsum("rkj,rjde->rkde", weights, precise))
         sent = (precise @ x.mean(axis=-2)[..., None])[..., 0]
@@ -114,15 +115,15 @@ def rows() -> Iterator[Row]:
     setup = satellites.setup("table-3")
     t = float(setup.times[0])
     for (kind, runs), limit in LIMITS.items():
-        f = satellites.repaired(setup, kind)
+        f = satellites.better_filter(setup, kind)
         rng = np.random.default_rng(1)
-        _, seen = satellites.data(setup, rng, (runs,))
+        _, seen = satellites.draw_data(setup, rng, (runs,))
         state = f.start(setup.prior, rng=rng, runs=(runs,))
         calls = {
             "ours": partial(f.step, state, t, [y[0] for y in seen]),
-            "floor": floor_of(setup, state.ensembles, rng, kind),
+            "floor": plain_step(setup, state.ensembles, rng, kind),
         }
-        times, ratios = interleaved(calls, 9, 0.05)
+        times, ratios = compare_times(calls, 9, 0.05)
         ratio = 1 / ratios["floor"]
         yield {
             "part": f"a step of Table III, {kind}",

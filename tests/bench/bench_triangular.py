@@ -19,7 +19,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from _bench import Row, interleaved, main, peer, table, timed
+from _bench import Row, compare_times, main, measure_time, peer, table
 
 from distfilt.triangular import affine, compose, separable
 
@@ -32,7 +32,7 @@ SAMPLES = 200
 CALLS = 200
 
 
-def seen_in_part(m: int, d: int) -> tuple[np.ndarray, np.ndarray]:
+def partly_observed(m: int, d: int) -> tuple[np.ndarray, np.ndarray]:
     """Correlated members of unit scale and noisy observations of them."""
     rng = np.random.default_rng(100 * m + d)
     mixing = np.eye(d) + 0.3 * rng.standard_normal((d, d)) / np.sqrt(d)
@@ -43,19 +43,21 @@ def seen_in_part(m: int, d: int) -> tuple[np.ndarray, np.ndarray]:
 @table("triangular", "numpy", "cvxpy", "ecos")
 def programs() -> Iterator[Row]:
     for m, d, needed in SIZES:
-        y, x = seen_in_part(m, d)
-        closed = timed(lambda y=y, x=x: [affine.fit(y, x) for _ in range(CALLS)][0], 5)
-        exact = compose(closed.result, y, x, y[0])
+        y, x = partly_observed(m, d)
+        closed = measure_time(
+            lambda y=y, x=x: [affine.fit(y, x) for _ in range(CALLS)][0], 5
+        )
+        exact_mean = compose(closed.result, y, x, y[0])
         each = closed.cpu / CALLS
         known = partial(affine.fit_convex, y, x, solver="ECOS")
 
         def newcomer(known: Callable[[], Any] = known) -> Any:
-            affine._program.cache_clear()
+            affine._compile_program.cache_clear()
             return known()
 
-        compiled_each_time = timed(newcomer, 3).cpu
-        solved = timed(known, 3)
-        gap = np.abs(compose(solved.result, y, x, y[0]) - exact).max()
+        compiled_each_time = measure_time(newcomer, 3).cpu
+        solved = measure_time(known, 3)
+        gap = np.abs(compose(solved.result, y, x, y[0]) - exact_mean).max()
         yield {
             "variables": m + d,
             "closed_form_us": f"{each * 1e6:.1f}",
@@ -86,7 +88,7 @@ def prior(n: int, rng: np.random.Generator) -> np.ndarray:
     return x
 
 
-def exact() -> np.ndarray:
+def exact_mean() -> np.ndarray:
     x = prior(2_000_000, np.random.default_rng(99))
     w = np.exp(-0.5 * ((SEEN - x[:, 0]) / STD) ** 2)
     return (w @ x) / w.sum()
@@ -146,13 +148,13 @@ def error(update: Any, mean: np.ndarray) -> float:
 
 
 @table("transport_toolbox")
-def toolbox_beside() -> Iterator[Row]:
+def compare_with_toolbox() -> Iterator[Row]:
     module = peer("transport_map")
     for order in (2, 3) if module is not None else ():
         (y, x) = bent_samples(0)
-        mean = exact()
+        mean = exact_mean()
         updates = {"ours": partial(ours, order), "toolbox": Toolbox(module, order)}
-        times, ratios = interleaved(
+        times, ratios = compare_times(
             {n: partial(f, y, x) for n, f in updates.items()}, 9
         )
         ms = {f"{name}_ms": f"{1e3 * spent:.2f}" for name, spent in times.items()}

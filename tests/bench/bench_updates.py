@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from _bench import Row, interleaved, main, peer, table
+from _bench import Row, compare_times, main, peer, table
 
 from distfilt.filters import EnsembleFilter
 from distfilt.models import Model, lorenz63, rk4, simulate
@@ -30,7 +30,7 @@ PROBLEMS = {"Lorenz63.sakov2012": (3, 2.0), "Lorenz96.sakov2008": (40, 1.0)}
 FLOORS = {"DAPPER, analysis": 1.3, "six lines of numpy": 0.85, "DAPPER, cycle": 1.0}
 
 
-def case(d: int) -> tuple[np.ndarray, ...]:
+def analysis_case(d: int) -> tuple[np.ndarray, ...]:
     """Members, predictions, observation, noise."""
     rng = np.random.default_rng(d)
     m = d // 2
@@ -87,12 +87,12 @@ def ring(x: np.ndarray, t: float) -> np.ndarray:
     return (np.roll(x, -1, -1) - np.roll(x, 2, -1)) * np.roll(x, 1, -1) - x + 8.0
 
 
-def compared(
+def compare_calls(
     d: int, calls: dict[str, Any], rounds: int, each: int = 1
 ) -> Iterator[Row]:
     """A row for each call that can be made, `each` of what is timed in a call."""
     calls = {name: call for name, call in calls.items() if call is not None}
-    times, ratios = interleaved(calls, rounds)
+    times, ratios = compare_times(calls, rounds)
     for name in calls:
         floor = FLOORS.get(name, 0)
         yield {
@@ -109,14 +109,14 @@ def compared(
 @table("updates", "numpy", "scipy", "dapper")
 def analyses_and_cycles() -> Iterator[Row]:
     for d in DIMS:
-        given = case(d)
+        arguments = analysis_case(d)
         rng = np.random.default_rng(0)
-        yield from compared(
+        yield from compare_calls(
             d,
             {
-                "enkf": partial(enkf, *given, rng=rng),
-                "DAPPER, analysis": dapper(*given),
-                "six lines of numpy": partial(six_lines, *given, rng),
+                "enkf": partial(enkf, *arguments, rng=rng),
+                "DAPPER, analysis": dapper(*arguments),
+                "six lines of numpy": partial(six_lines, *arguments, rng),
             },
             31,
         )
@@ -130,11 +130,13 @@ def analyses_and_cycles() -> Iterator[Row]:
         y = sensor.observe(simulate(model, x0, times, rng=rng), rng=rng)
         f = EnsembleFilter(model, [sensor], members=MEMBERS)
         start = f.start((x0, variance * np.eye(d)), rng=rng)
-        yield from compared(
+        yield from compare_calls(
             d,
             {
                 "run": partial(f.run, start, times, [y]),
-                "steps": lambda f=f, given=(start, times, [y]): [*f.steps(*given)],
+                "steps": lambda f=f, arguments=(start, times, [y]): [
+                    *f.steps(*arguments)
+                ],
                 "DAPPER, cycle": dapper_s_loop(problem, start.ensembles[0], y),
             },
             15,

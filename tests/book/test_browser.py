@@ -22,7 +22,7 @@ from common import ROOT, chapters
 
 BUILT = ROOT / "_build" / "html"
 LOCAL = ("file://", "data:", "blob:", "about:")
-# Pages that a Chromium opens for itself, whatever its version: what they ask for is not the book's.
+# Pages that Chromium opens for itself: their requests do not belong to the book.
 OWN = (
     "chrome://",
     "chrome-untrusted://",
@@ -33,7 +33,7 @@ OWN = (
 ASKS = ("Network.requestWillBeSent", "Network.webSocketCreated")
 WIDTHS = (1440, 1200, 400)
 THEMES = ("light", "dark")
-# Opens what is folded, then reports what a reader would meet.
+# Opens folded parts, then reports raw markup, formulas that are not set and broken pictures.
 REPORT = r"""
 document.querySelectorAll("details").forEach(d => { d.open = true; });
 const raw = [];
@@ -58,7 +58,7 @@ return {
   mute: [...document.images].filter(i => !(i.getAttribute("alt") || "").trim()).map(name),
 };
 """
-# What does not fit: it scrolls in a box of its own, or it is cut, or makes the page too wide.
+# Elements that do not fit: they scroll in a box, are cut, or make the page too wide.
 FIT = r"""
 const whole = document.documentElement;
 const out = {cut: [], scrolls: [], over: Math.max(0, whole.scrollWidth - whole.clientWidth)};
@@ -84,7 +84,7 @@ for (const part of document.querySelectorAll("article :is(" + parts + ")")) {
 }
 return out;
 """
-# Moves every slider by one step, then plays it: the picture, its text and what is said change.
+# Moves every slider by one step, then plays it: picture, alternative text and label must change.
 MOVE = r"""
 const done = arguments[arguments.length - 1], found = [];
 const roots = [...document.querySelectorAll("[data-frames]")];
@@ -117,7 +117,7 @@ const wait = (ms) => new Promise(r => setTimeout(r, ms));
 
 @dataclass
 class Visit:
-    """What a browser met on one page."""
+    """Observations of a browser on one page."""
 
     report: dict[str, Any]
     requests: list[str]
@@ -128,8 +128,9 @@ class Visit:
 
 
 def visit(driver: Any, page: Path) -> Visit:
-    """Open a page, make it narrower, and collect what happened."""
-    driver.get("about:blank")  # the last page need not be laid out again
+    """Open a page at all widths, and collect reports, requests and errors."""
+    # Leave the last page, which would be laid out again at each width.
+    driver.get("about:blank")
     for kind in ("performance", "browser"):
         driver.get_log(kind)
     fit: dict[int, dict[str, Any]] = {}
@@ -144,48 +145,50 @@ def visit(driver: Any, page: Path) -> Visit:
         fit[width] = driver.execute_script(FIT)
     sliders = driver.execute_async_script(MOVE)
     entries = [json.loads(entry["message"]) for entry in driver.get_log("performance")]
-    requests = asked(entries, driver.current_window_handle)
+    requests = requests_of(entries, driver.current_window_handle)
     console = [
         e["message"] for e in driver.get_log("browser") if e["level"] == "SEVERE"
     ]
     return Visit(report, requests, console, fit, sliders, rules)
 
 
-def asked(entries: list[dict[str, Any]], tab: str) -> list[str]:
-    """Return what the pages of one tab asked for, from the browser's log.
+def requests_of(entries: list[dict[str, Any]], tab: str) -> list[str]:
+    """Return the requests of the pages of one tab, from the browser's log.
 
-    The log has every tab's events, and Chromium opens tabs of its own; and a new tab shows a page
-    of Chromium's own before it shows ours.
+    The log has the events of all tabs, also of those that Chromium opens for itself. A new tab
+    first shows a page of Chromium.
     """
     sent = [entry["message"] for entry in entries if entry.get("webview", tab) == tab]
-    told = [message["params"] for message in sent if message["method"] in ASKS]
-    urls = [params.get("request", params)["url"] for params in told]
+    parameters = [message["params"] for message in sent if message["method"] in ASKS]
+    urls = [params.get("request", params)["url"] for params in parameters]
     return [url for url in urls if not url.startswith(OWN)]
 
 
 @contextmanager
 def chromium(profile: Path, **logs: str) -> Iterator[Any]:
-    """A headless Chromium; where there is none the test is skipped, except in `CI`."""
+    """Yield a headless Chromium; without one the test is skipped, or fails in `CI`."""
     if browser.find_browser() is None:
         (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(
             browser.NOT_INSTALLED
         )
-    with browser.chromium(profile, **logs) as found:
-        yield found
+    with browser.chromium(profile, **logs) as driver:
+        yield driver
 
 
 @pytest.fixture(scope="module")
 def driver(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """Yield a browser that logs what it asks for and complains of."""
+    """Yield a browser that logs its requests and errors."""
     profile = tmp_path_factory.mktemp("profile")
-    with chromium(profile, performance="ALL", browser="ALL") as found:
-        found.set_script_timeout(60)
-        found.execute_cdp_cmd("Emulation.setFocusEmulationEnabled", {"enabled": True})
-        yield found
+    with chromium(profile, performance="ALL", browser="ALL") as browser_driver:
+        browser_driver.set_script_timeout(60)
+        browser_driver.execute_cdp_cmd(
+            "Emulation.setFocusEmulationEnabled", {"enabled": True}
+        )
+        yield browser_driver
 
 
 def redirect(page: Path) -> Path | None:
-    """Return the page that another one only sends its reader on to."""
+    """Return the target of a page that only redirects, or None."""
     text = page.read_text(encoding="utf-8")
     sent = re.search(
         r'http-equiv="refresh" content="0; *url=([^"]+)"', text, flags=re.IGNORECASE
@@ -193,8 +196,8 @@ def redirect(page: Path) -> Path | None:
     return (page.parent / sent.group(1)).resolve() if sent else None
 
 
-def built() -> list[Path]:
-    """Return every page of the built book that a reader stays on."""
+def content_pages() -> list[Path]:
+    """Return every page of the built book that is not a redirection."""
     pages = sorted(p for p in BUILT.rglob("*.html") if "_static" not in p.parts)
     assert pages, "the book is not built: make book"
     return [page for page in pages if redirect(page) is None]
@@ -202,24 +205,24 @@ def built() -> list[Path]:
 
 @pytest.fixture(scope="module")
 def visits(driver: Any) -> dict[Path, Visit]:
-    """Return what the browser met on each page; of those that list a module's source, on one."""
-    listings = {page for page in built() if "_modules" in page.parts}
+    """Visit every page; of the pages with a module's source only the longest."""
+    listings = {page for page in content_pages() if "_modules" in page.parts}
     longest = max(listings, key=lambda page: page.stat().st_size)
     return {
         page: visit(driver, page)
-        for page in built()
+        for page in content_pages()
         if page not in listings - {longest}
     }
 
 
 def broken_links(pages: list[Path]) -> list[str]:
-    """Return the links to files or anchors that are not there."""
+    """Return the links to files or anchors that do not exist."""
     texts = {page: page.read_text(encoding="utf-8") for page in pages}
     anchors = {
-        page: set(re.findall(r'\s(?:id|name)="([^"]+)"', t))
-        for page, t in texts.items()
+        page: set(re.findall(r'\s(?:id|name)="([^"]+)"', text))
+        for page, text in texts.items()
     }
-    out = []
+    broken = []
     for page, text in texts.items():
         for link in set(re.findall(r'<a\s[^>]*?href="([^"]*)"', text)):
             url, anchor = urldefrag(unquote(html.unescape(link)))
@@ -228,23 +231,31 @@ def broken_links(pages: list[Path]) -> list[str]:
                 not target.is_file()
                 or (anchor and anchor not in anchors.get(target, {anchor}))
             ):
-                out.append(f"{page.name} -> {link}")
-    return out
+                broken.append(f"{page.name} -> {link}")
+    return broken
 
 
-def outside(seen: Visit) -> list[str]:
+def outside(page_visit: Visit) -> list[str]:
     """Return the requests that leave the machine."""
-    return [url for url in seen.requests if not url.startswith(LOCAL)]
+    return [url for url in page_visit.requests if not url.startswith(LOCAL)]
 
 
 def test_no_request_leaves_the_machine(visits: dict[Path, Visit]) -> None:
     assert redirect(BUILT / "index.html") == BUILT / "book" / "index.html"
-    assert all(seen.requests for seen in visits.values())
-    assert {p.name: outside(seen) for p, seen in visits.items() if outside(seen)} == {}
+    assert all(page_visit.requests for page_visit in visits.values())
+    assert {
+        p.name: outside(page_visit)
+        for p, page_visit in visits.items()
+        if outside(page_visit)
+    } == {}
 
 
 def test_console_has_no_error(visits: dict[Path, Visit]) -> None:
-    assert {p.name: seen.console for p, seen in visits.items() if seen.console} == {}
+    assert {
+        p.name: page_visit.console
+        for p, page_visit in visits.items()
+        if page_visit.console
+    } == {}
 
 
 @pytest.mark.parametrize("key", ["raw", "unset", "merror", "flat", "broken", "mute"])
@@ -255,20 +266,20 @@ def test_mathematics_and_figures_are_shown(visits: dict[Path, Visit], key: str) 
 
 
 def test_no_link_is_broken() -> None:
-    assert broken_links(built()) == []
+    assert broken_links(content_pages()) == []
 
 
 def test_every_page_fits_and_on_a_desk_scrolls_in_no_box(
     visits: dict[Path, Visit],
 ) -> None:
-    for page, seen in visits.items():
-        for width, fit in seen.fit.items():
+    for page, page_visit in visits.items():
+        for width, fit in page_visit.fit.items():
             assert fit["over"] == 0 and fit["cut"] == [], f"{page.name} at {width}"
             assert width < 1200 or fit["scrolls"] == [], f"{page.name} at {width}"
 
 
 @pytest.mark.parametrize("theme", THEMES)
-def test_everybody_can_use_every_page(visits: dict[Path, Visit], theme: str) -> None:
+def test_every_page_is_accessible(visits: dict[Path, Visit], theme: str) -> None:
     assert {p.name: v.rules[theme] for p, v in visits.items() if v.rules[theme]} == {}
 
 
@@ -294,18 +305,25 @@ BAD = r"""<!doctype html><title>bad</title><body>
 <table><th></th></table><script>throw new Error("broken")</script></body>"""
 
 
-def test_a_bad_page_is_found_out(driver: Any, tmp_path: Path) -> None:
+def test_every_fault_of_a_bad_page_is_reported(driver: Any, tmp_path: Path) -> None:
     page = tmp_path / "bad.html"
     page.write_text(BAD, encoding="utf-8")
-    seen = visit(driver, page)
-    assert seen.report["raw"] and seen.report["unset"] and seen.report["mute"]
-    assert len(seen.report["broken"]) == 3
+    page_visit = visit(driver, page)
+    assert (
+        page_visit.report["raw"]
+        and page_visit.report["unset"]
+        and page_visit.report["mute"]
+    )
+    assert len(page_visit.report["broken"]) == 3
     assert len(broken_links([page])) == 2
-    assert outside(seen) and seen.console
-    assert len(seen.fit[1200]["cut"]) == 1 and len(seen.fit[1200]["scrolls"]) == 1
-    assert seen.sliders and not any(seen.sliders[0].values())
-    assert seen.fit[400]["over"] > 0
-    assert {told.split(":")[0] for told in seen.rules["dark"]} >= {
+    assert outside(page_visit) and page_visit.console
+    assert (
+        len(page_visit.fit[1200]["cut"]) == 1
+        and len(page_visit.fit[1200]["scrolls"]) == 1
+    )
+    assert page_visit.sliders and not any(page_visit.sliders[0].values())
+    assert page_visit.fit[400]["over"] > 0
+    assert {violation.split(":")[0] for violation in page_visit.rules["dark"]} >= {
         "no language",
         "empty header",
     }

@@ -1,4 +1,4 @@
-"""Chapter 4 as a template: with other links, and another sensor, it runs to its end and says so."""
+"""Chapter 4 as a template: with other links or another sensor it runs to its end."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ SENSOR = (
 )
 
 
-def copied(target: Path, changes: tuple[tuple[str, str], ...]) -> Path:
-    """A copy of what the chapter needs, with another scenario of Table II."""
+def copy_chapter(target: Path, changes: tuple[tuple[str, str], ...]) -> Path:
+    """Copy the chapter and its data, with a changed scenario of Table II."""
     for name in ("book", "data"):
         shutil.copytree(
             ROOT / name, target / name, ignore=shutil.ignore_patterns("__pycache__")
@@ -40,10 +40,14 @@ def copied(target: Path, changes: tuple[tuple[str, str], ...]) -> Path:
 
 
 def verdicts(notebook: Any) -> dict[str, tuple[str, str]]:
-    """Verdict and reason of each item, from what the cells show."""
+    """Return verdict and reason of each item, from the outputs of the cells."""
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
-    shown = [output.get("data", {}).get(VERDICT) for output in outputs]
-    return {found["item"]: (found["verdict"], found["why"]) for found in shown if found}
+    bundles = [output.get("data", {}).get(VERDICT) for output in outputs]
+    return {
+        verdict["item"]: (verdict["verdict"], verdict["why"])
+        for verdict in bundles
+        if verdict
+    }
 
 
 @pytest.mark.slow
@@ -53,18 +57,20 @@ def test_a_changed_scenario_runs_to_the_end_and_is_not_compared(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    folder = copied(tmp_path, changes)
+    folder = copy_chapter(tmp_path, changes)
     lenient = {k: v for k, v in fixed_environment().items() if k != "BOOK_STRICT"}
     monkeypatch.setattr(execute, "fixed_environment", lambda: lenient)
-    found = {}
+    results = {}
     for page in PAGES:
         notebook = execute.read(folder / page)
         execute.run(notebook, folder)
         assert execute.complaints(notebook) == []
-        found |= verdicts(notebook)
+        results |= verdicts(notebook)
     for item in ("Table II", "Fig. 1"):
-        verdict, why = found[item]
+        verdict, why = results[item]
         assert verdict == "not comparable" and why.startswith(
             "changed scenario: agents."
         )
-    assert found["Table III"][0] == "read" and found["Fig. 2"][0] == "not comparable"
+    assert (
+        results["Table III"][0] == "read" and results["Fig. 2"][0] == "not comparable"
+    )

@@ -1,4 +1,4 @@
-"""What every chapter's source keeps to."""
+"""Rules for the source of every chapter."""
 
 from __future__ import annotations
 
@@ -14,17 +14,19 @@ CHAPTERS = [source for source in chosen([]) if source.stem[0].isdigit()]
 
 
 def import_lines(source: Path) -> int:
-    """Count the lines that import methods and packages, the book's own tools apart."""
+    """Count the lines of imports in the first cell, without those from `bookkit`."""
     cell = next(cell for cell in read(source).cells if cell.cell_type == "code")
-    found = [
+    imports = [
         n
         for n in ast.parse(cell.source).body
         if isinstance(n, ast.Import | ast.ImportFrom)
     ]
-    apart = [
-        n for n in found if not (getattr(n, "module", None) or "").startswith("bookkit")
+    counted = [
+        n
+        for n in imports
+        if not (getattr(n, "module", None) or "").startswith("bookkit")
     ]
-    return sum((n.end_lineno or n.lineno) - n.lineno + 1 for n in apart)
+    return sum((n.end_lineno or n.lineno) - n.lineno + 1 for n in counted)
 
 
 @pytest.mark.parametrize("source", CHAPTERS, ids=lambda p: p.stem)

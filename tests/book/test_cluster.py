@@ -1,4 +1,4 @@
-"""Every command of the page about clusters, and what the page says of what dies."""
+"""Every command of the page about clusters, and every failure that the page describes."""
 
 from __future__ import annotations
 
@@ -45,26 +45,26 @@ Start = Callable[..., subprocess.Popen[str]]
 
 @pytest.fixture(scope="module")
 def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The page's script, run in two parts; its trial tells a module beside it that it begins."""
+    """Run the page's script in two parts; each trial reports its start to a local module."""
     folder = tmp_path_factory.mktemp("page")
     text = (ROOT / "book" / "examples" / "cluster.py").read_text(encoding="utf-8")
     for old, new in [
         ("import sys\n", "import beside\nimport sys\n"),
         ("[5:,", "[:,"),
-        ("    rng, times", "    beside.begin(seed.spawn_key[0])\n    rng, times"),
+        ("    rng = ", "    beside.begin(seed.spawn_key[0])\n    rng = "),
         ("np.arange(1, 11) * 0.5", "[0.5]"),
     ]:
         assert text.count(old) == 1
         text = text.replace(old, new)
     (folder / "cluster.py").write_text(text, encoding="utf-8")
-    counted(folder)
+    count_starts(folder)
     one = ENVIRONMENT | {"LOKY_MAX_CPU_COUNT": "1"}
     subprocess.run(["sh", "-ec", PARTS], cwd=folder, env=one, check=True)
     return folder
 
 
-def counted(folder: Path) -> None:
-    """Beside the script, what counts how often each trial begins."""
+def count_starts(folder: Path) -> None:
+    """Write a module beside the script that counts the starts of each trial."""
     (folder / "beside.py").write_text(BESIDE.replace("LOG", repr(str(folder / "log"))))
     for name in ("log", "elsewhere"):
         (folder / name).mkdir()
@@ -72,9 +72,9 @@ def counted(folder: Path) -> None:
 
 @pytest.fixture
 def folder(script: Path, tmp_path: Path) -> Path:
-    """A copy of the script, not run yet."""
+    """Copy the script, which has not run yet."""
     shutil.copy(script / "cluster.py", tmp_path)
-    counted(tmp_path)
+    count_starts(tmp_path)
     return tmp_path
 
 
@@ -83,8 +83,8 @@ def start(folder: Path) -> Iterator[Start]:
     """Start a command of the page beside the script, or in another folder."""
     processes = []
 
-    def started(command: str, cwd: Path = folder) -> subprocess.Popen[str]:
-        # Not through a shell that stays: a signal is for the command itself.
+    def start_command(command: str, cwd: Path = folder) -> subprocess.Popen[str]:
+        # `exec` replaces the shell, so that a signal reaches the command itself.
         lines = command if "\n" in command else f"exec {command}"
         processes.append(
             subprocess.Popen(
@@ -99,23 +99,23 @@ def start(folder: Path) -> Iterator[Start]:
         )
         return processes[-1]
 
-    yield started
+    yield start_command
     for process in processes:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait()
 
 
-def begun(folder: Path) -> list[int]:
+def start_counts(folder: Path) -> list[int]:
     return [len(path.read_text()) for path in (folder / "log").glob("[0-9]*")]
 
 
-def killed(n: int, folder: Path, start: Start, command: str, *victims: Any) -> str:
-    """Kill processes, or the study's own, when n trials are done; what it says at its end."""
+def kill_after(n: int, folder: Path, start: Start, command: str, *victims: Any) -> str:
+    """Kill processes, by default the client, after n trials; return the client's output."""
     hold = folder / "log" / f"hold.{n}"
     hold.touch()
     client = start(command)
-    while len(begun(folder)) <= n and client.poll() is None:
+    while len(start_counts(folder)) <= n and client.poll() is None:
         time.sleep(0.01)
     for victim in victims or [client]:
         os.killpg(victim.pid, signal.SIGKILL)
@@ -125,17 +125,17 @@ def killed(n: int, folder: Path, start: Start, command: str, *victims: Any) -> s
 
 
 def same(folder: Path, script: Path, twice: int) -> None:
-    """The file is the same, and at most so many trials ran twice."""
+    """Check that the file is the same, and that at most so many trials ran twice."""
     assert (folder / "errors.csv").read_bytes() == (script / "errors.csv").read_bytes()
     assert not (folder / "errors.csv.part").exists()
-    assert len(begun(folder)) == 40 and sum(begun(folder)) <= 40 + twice
+    assert len(start_counts(folder)) == 40 and sum(start_counts(folder)) <= 40 + twice
 
 
 def test_on_this_machine_or_in_parts_that_are_merged(
     folder: Path, script: Path, start: Start
 ) -> None:
-    killed(20, folder, start, LOCAL)
-    time.sleep(1.0)  # its workers see that it is gone
+    kill_after(20, folder, start, LOCAL)
+    time.sleep(1.0)  # workers notice that their parent is gone, and end
     assert start(LOCAL).wait() == 0
     same(folder, script, twice=os.cpu_count() or 1)
     same(script, script, twice=0)
@@ -146,7 +146,7 @@ def test_dask(folder: Path, script: Path, start: Start) -> None:
     pytest.importorskip("distributed", reason="distributed (Dask) is not installed")
 
     def cluster() -> list[subprocess.Popen[str]]:
-        """A scheduler, and workers that do not see the folder of the script."""
+        """Start a scheduler, and workers that cannot read the folder of the script."""
         (folder / "cluster.json").unlink(missing_ok=True)
         scheduler = start(SCHEDULER, folder)
         while not (folder / "cluster.json").exists():
@@ -156,12 +156,11 @@ def test_dask(folder: Path, script: Path, start: Start) -> None:
         return [scheduler, start(WORKERS, folder / "elsewhere")]
 
     machines = cluster()
-    killed(20, folder, start, DASK)
-    (
-        folder / "log" / "fatal"
-    ).touch()  # the worker of trial 20 dies, and nobody has to know
-    said = killed(28, folder, start, DASK, machines[0])
-    assert re.search(r"StudyError: .*finished trials are in errors\.csv\.part", said)
+    kill_after(20, folder, start, DASK)
+    # The worker of trial 20 dies, and Dask recovers without the client.
+    (folder / "log" / "fatal").touch()
+    output = kill_after(28, folder, start, DASK, machines[0])
+    assert re.search(r"StudyError: .*finished trials are in errors\.csv\.part", output)
     assert not (folder / "log" / "fatal").exists()
     cluster()
     assert start(DASK).wait() == 0

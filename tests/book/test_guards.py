@@ -1,8 +1,8 @@
-"""What guards the book must itself be able to fail: a small chapter is broken in every way.
+"""The checks of the book must be able to fail: a small chapter is broken in every way.
 
 The commands are those of ``make test``, on copies of the chapter in ``fixtures``: the comparison
-of the pair, and nbval over the stored outputs. What breaks one cell stands in one notebook, a cell
-a fault, so that it runs once.
+of the pair, and nbval on the stored outputs. All faults of single cells are in one notebook, so
+that nbval runs once.
 """
 
 from __future__ import annotations
@@ -51,11 +51,13 @@ executed_folder = pytest.fixture(scratch, scope="module")
 
 @pytest.fixture(scope="module")
 def execution(executed_folder: Path) -> subprocess.CompletedProcess[str]:
-    """Execute the small chapter, and two that have to be refused, at once."""
+    """Execute the small chapter, and two that must be rejected, in one call."""
     text = SMALL.read_text(encoding="utf-8")
-    sources = [executed_folder / f"{name}.md" for name in ("small", "told", "failed")]
+    sources = [
+        executed_folder / f"{name}.md" for name in ("small", "rejected", "failed")
+    ]
     for path, lines in zip(
-        sources, ([], REFUSED, ["raise ValueError('no')"]), strict=True
+        sources, ([], REJECTED, ["raise ValueError('no')"]), strict=True
     ):
         code = "".join(f"```{{code-cell}} ipython3\n{line}\n```\n\n" for line in lines)
         path.write_text(
@@ -79,7 +81,7 @@ def chapter(executed: Path, folder: Path) -> Path:
     return folder / "small.md"
 
 
-def stored(source: Path) -> Any:
+def read_notebook(source: Path) -> Any:
     return nbformat.read(source.with_suffix(".ipynb"), as_version=4)
 
 
@@ -95,13 +97,13 @@ def code_cells(notebook: Any) -> list[Any]:
 
 
 def bundle(cell: Any) -> Any:
-    """What the cell's one output that is more than text holds."""
-    (found,) = [o.data for o in cell.outputs if "data" in o]
-    return found
+    """Return the data of the cell's only output that is more than text."""
+    (data,) = [o.data for o in cell.outputs if "data" in o]
+    return data
 
 
-def shaded(png: str, share: float, by: int) -> str:
-    """The picture with some of its pixels shaded otherwise."""
+def shade_pixels(png: str, share: float, by: int) -> str:
+    """Return the picture with a changed shade in a fraction of its pixels."""
     image = Image.open(io.BytesIO(base64.b64decode(png))).convert("RGB")
     pixels = np.asarray(image).astype(int)
     chosen = np.random.default_rng(1).random(pixels.shape[:2]) < share
@@ -110,13 +112,13 @@ def shaded(png: str, share: float, by: int) -> str:
 
 
 def as_png(pixels: np.ndarray) -> str:
-    out = io.BytesIO()
-    Image.fromarray(pixels.astype(np.uint8)).save(out, format="png")
-    return base64.b64encode(out.getvalue()).decode()
+    file = io.BytesIO()
+    Image.fromarray(pixels.astype(np.uint8)).save(file, format="png")
+    return base64.b64encode(file.getvalue()).decode()
 
 
 def shade(cell: Any) -> None:
-    bundle(cell)["image/png"] = shaded(bundle(cell)["image/png"], 0.5, 20)
+    bundle(cell)["image/png"] = shade_pixels(bundle(cell)["image/png"], 0.5, 20)
 
 
 def exchange_frames(cell: Any) -> None:
@@ -142,7 +144,7 @@ def source(old: str, new: str) -> Callable[[Any], None]:
 
 
 def exchange_picture(cell: Any) -> None:
-    bundle(cell)["image/png"] = shaded(bundle(cell)["image/png"], 0.1, 120)
+    bundle(cell)["image/png"] = shade_pixels(bundle(cell)["image/png"], 0.1, 120)
 
 
 PRINT, FIGURE, SLIDER, VERDICT = range(4)
@@ -173,13 +175,13 @@ FAULTS: dict[str, tuple[int, Callable[[Any], object], str]] = {
     "another processor's shades": (FIGURE, shade, ""),
     "its shades beside the frames": (SLIDER, shade, ""),
 }
-"""The cell, what is done to it, and the complaint; '' for what is no fault."""
+"""The cell, its change, and the expected message; '' for an accepted change."""
 
 
 def test_one_changed_output_or_source_fails_and_no_other(
     executed: Path, folder: Path
 ) -> None:
-    cells = code_cells(stored(executed / "small.md"))
+    cells = code_cells(read_notebook(executed / "small.md"))
     untouched = len(cells)
     assert pairs.check(executed / "small.md") == []
     for which, change, _ in FAULTS.values():
@@ -190,35 +192,35 @@ def test_one_changed_output_or_source_fails_and_no_other(
     notebook = nbformat.v4.new_notebook(
         cells=cells, metadata={"kernelspec": execute.KERNELSPEC}
     )
-    done = tool("regress.py", store(folder / "broken.md", notebook))
-    assert done.returncode == 1 and "broken: differs" in done.stdout
-    parts = re.split(r"^_+ .*Cell (\d+) _+$", done.stderr, flags=re.M)
-    told = dict(zip(map(int, parts[1::2]), parts[2::2], strict=True))
-    wanted = {
+    result = tool("regress.py", store(folder / "broken.md", notebook))
+    assert result.returncode == 1 and "broken: differs" in result.stdout
+    parts = re.split(r"^_+ .*Cell (\d+) _+$", result.stderr, flags=re.M)
+    messages = dict(zip(map(int, parts[1::2]), parts[2::2], strict=True))
+    expected = {
         k: text for k, (*_, text) in enumerate(FAULTS.values(), untouched) if text
     }
-    assert set(told) == set(wanted)
-    assert [k for k, text in wanted.items() if text not in told[k]] == []
+    assert set(messages) == set(expected)
+    assert [k for k, text in expected.items() if text not in messages[k]] == []
 
 
 def test_pixels_may_differ_if_few_or_little(executed: Path) -> None:
-    png = bundle(code_cells(stored(executed / "small.md"))[FIGURE])["image/png"]
-    assert difference(shaded(png, 0.002, 120), png).startswith("differs in 0.2")
-    assert difference(shaded(png, 0.0001, 120), png) == ""
+    png = bundle(code_cells(read_notebook(executed / "small.md"))[FIGURE])["image/png"]
+    assert difference(shade_pixels(png, 0.002, 120), png).startswith("differs in 0.2")
+    assert difference(shade_pixels(png, 0.0001, 120), png) == ""
     assert difference(png, "a") == "is no picture"
 
 
 def test_a_lighter_picture_shows_the_same() -> None:
     noise = np.random.default_rng(1).integers(0, 256, (200, 200, 3))
-    few = as_png(noise // 64 * 80)
-    many = as_png(noise)
+    few_colours = as_png(noise // 64 * 80)
+    many_colours = as_png(noise)
     assert (
-        len(shrink_picture(few)) < 0.9 * len(few)
-        and difference(shrink_picture(few), few) == ""
+        len(shrink_picture(few_colours)) < 0.9 * len(few_colours)
+        and difference(shrink_picture(few_colours), few_colours) == ""
     )
-    assert shrink_picture(many) == many and shrink_picture(
-        shrink_picture(few)
-    ) == shrink_picture(few)
+    assert shrink_picture(many_colours) == many_colours and shrink_picture(
+        shrink_picture(few_colours)
+    ) == shrink_picture(few_colours)
 
 
 def clear(cell: Any) -> None:
@@ -246,10 +248,10 @@ def copies(cell: Any, number: int) -> None:
         ),
     ],
 )
-def test_a_stored_output_is_refused(
+def test_a_stored_output_is_rejected(
     chapter: Path, change: Callable[[Any], object], complaint: str
 ) -> None:
-    notebook = stored(chapter)
+    notebook = read_notebook(chapter)
     change(code_cells(notebook))
     store(chapter, notebook)
     assert complaint in "\n".join(pairs.check(chapter))
@@ -271,7 +273,7 @@ def test_a_stored_output_is_refused(
 def test_new_sources_keep_the_outputs_and_are_checked(
     chapter: Path, old: str, new: str, complaint: str
 ) -> None:
-    before = stored(chapter)
+    before = read_notebook(chapter)
     text = chapter.read_text(encoding="utf-8")
     assert text.count(old) == 1
     chapter.write_text(text.replace(old, new), encoding="utf-8")
@@ -279,36 +281,36 @@ def test_new_sources_keep_the_outputs_and_are_checked(
         pairs.check(chapter)
     )
     assert execute.copy_sources(chapter) == ""
-    after = stored(chapter)
+    after = read_notebook(chapter)
     assert [c.get("outputs") for c in before.cells] == [
         c.get("outputs") for c in after.cells
     ]
-    (found,) = pairs.check(chapter)
-    assert complaint in found
+    (problem,) = pairs.check(chapter)
+    assert complaint in problem
     chapter.write_text(
         text + "\n```{code-cell} ipython3\n1 + 1\n```\n", encoding="utf-8"
     )
     assert "other cells" in execute.copy_sources(chapter)
 
 
-REFUSED = {
+REJECTED = {
     "import warnings; warnings.warn('careful')": "wrote to stderr",
     "import sys; print(sys.prefix)": "its output holds",
     "object()": "its output holds",
 }
 
 
-def test_execution_refuses(execution: Any, executed: Path) -> None:
+def test_execution_rejects(execution: Any, executed: Path) -> None:
     assert execution.returncode == 1 and "failed: a cell failed" in execution.stderr
     cells = re.split(r"^cell [\w-]+:\n", execution.stderr, flags=re.M)[1:]
-    for cell, (line, complaint) in zip(cells, REFUSED.items(), strict=True):
+    for cell, (line, complaint) in zip(cells, REJECTED.items(), strict=True):
         assert cell.startswith(line) and complaint in cell
-    kept = {
+    unchanged = {
         path.stem
         for path in executed.glob("*.ipynb")
         if path.read_text() == "as it was"
     }
-    assert kept == {"told", "failed"} and re.findall(
+    assert unchanged == {"rejected", "failed"} and re.findall(
         r"^\w+", execution.stdout, re.M
     ) == ["small"]
 
@@ -317,19 +319,21 @@ def test_executing_again_gives_the_same_bytes(
     executed: Path, chapter: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = chapter.with_suffix(".ipynb")
-    whole = path.read_text(encoding="utf-8")
-    done = tool("execute.py", "--bytes", executed / "small.md")
-    assert done.returncode == 0 and done.stderr == "" and "widget-state+json" in whole
+    text = path.read_text(encoding="utf-8")
+    result = tool("execute.py", "--bytes", executed / "small.md")
     assert (
-        "version" not in stored(chapter)["metadata"]["language_info"]
-        and str(ROOT) not in whole
+        result.returncode == 0 and result.stderr == "" and "widget-state+json" in text
     )
-    path.write_text(whole.replace("rate 2.0000", "rate 2.0001"), encoding="utf-8")
+    assert (
+        "version" not in read_notebook(chapter)["metadata"]["language_info"]
+        and str(ROOT) not in text
+    )
+    path.write_text(text.replace("rate 2.0000", "rate 2.0001"), encoding="utf-8")
     monkeypatch.setattr(
-        execute, "run", lambda new, _: new.update(stored(executed / "small.md"))
+        execute, "run", lambda new, _: new.update(read_notebook(executed / "small.md"))
     )
     monkeypatch.setattr(execute.os, "environ", dict(execute.os.environ))
     assert "does not give the stored bytes" in execute.execute(chapter, True, True)
-    notebook = nbformat.reads(whole, as_version=4)
+    notebook = nbformat.reads(text, as_version=4)
     exchange_picture(code_cells(notebook)[FIGURE])
-    assert "pixels" in execute.unlike(whole, execute.dump(notebook), False)
+    assert "pixels" in execute.unlike(text, execute.dump(notebook), False)

@@ -1,4 +1,4 @@
-"""The working copy of `make lab`: readable in JupyterLab, and apart from the repository."""
+"""The working copy of `make lab`: readable in JupyterLab, and independent of the repository."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BUILT = ROOT / "_build" / "html" / "book"
 
 
 @pytest.fixture(scope="module")
-def copied(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def working_copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("lab") / "copy"
     assert lab.main([str(folder), "--no-open"]) == 0
     return folder
@@ -33,21 +33,23 @@ def prose(path: Path) -> str:
     return "\n\n".join(cell.source for cell in cells if cell.cell_type == "markdown")
 
 
-def test_every_chapter_is_one_notebook_and_every_page_is_there(copied: Path) -> None:
-    files = {p.name for p in (copied / "book").iterdir() if p.is_file()}
+def test_every_chapter_is_one_notebook_and_every_page_is_there(
+    working_copy: Path,
+) -> None:
+    files = {p.name for p in (working_copy / "book").iterdir() if p.is_file()}
     assert files == {
         lab.file_of(Path(page).name) for page in toc_pages() if "/api/" not in page
     }
     stems = [name.rpartition(".")[0] for name in files]
     assert len(stems) == len(set(stems))
-    assert (copied / "data" / "scenarios" / "accepted.csv").is_file()
-    assert (copied / "book" / "examples" / "own_filter.py").is_file()
+    assert (working_copy / "data" / "scenarios" / "accepted.csv").is_file()
+    assert (working_copy / "book" / "examples" / "own_filter.py").is_file()
 
 
-def test_no_role_is_left_and_no_label_is_lost(copied: Path) -> None:
-    found = 0
+def test_no_role_is_left_and_no_label_is_lost(working_copy: Path) -> None:
+    n_labels = 0
     for source in chapters():
-        text = prose(copied / "book" / f"{source.stem}.ipynb")
+        text = prose(working_copy / "book" / f"{source.stem}.ipynb")
         assert not lab.ROLE.search(text) and "{math}" not in text
         assert "solution-" not in text
         stored = nbformat.read(source.with_suffix(".ipynb"), as_version=4)
@@ -58,55 +60,55 @@ def test_no_role_is_left_and_no_label_is_lost(copied: Path) -> None:
             for x in lab.labels_of(c.source)
         ]
         assert text.count("\\tag{") == len(labels)
-        found += len(labels)
+        n_labels += len(labels)
         figures = [
             c for c in stored.cells if c.metadata.get("mystnb", {}).get("figure")
         ]
         assert len(re.findall(r"^\*\*Fig\. [\d.]+\*\* ", text, re.M)) == len(figures)
-    assert found > 0
+    assert n_labels > 0
 
 
 def test_numbers_are_those_of_the_built_book() -> None:
     pages = [ROOT / f"{page}.md" for page in toc_pages()]
-    known = lab.names(pages)
+    names = lab.names(pages)
     numbers = {}
     for source in chapters():
         html = (BUILT / f"{source.stem}.html").read_text(encoding="utf-8")
         numbers |= re.findall(
             r'id="equation-([\w-]+)">\s*<span class="eqno">(\([\d.]+\))', html
         )
-    assert {label: known.words[label] for label in numbers} == numbers
-    assert len(numbers) >= len(known.equations) > 20
+    assert {label: names.words[label] for label in numbers} == numbers
+    assert len(numbers) >= len(names.equations) > 20
 
 
 def test_words_for_citations_and_places() -> None:
     refs = lab.parse_file(str(BOOK / "refs.bib"), bib_format="bibtex")
-    known = lab.Names()
-    known.add("04-satellite-network", "Chapter 4, Satellites", "04-satellite-network")
-    known.add("eq-sat-step", "(4.1)", "04-satellite-network")
-    known.equations["eq-sat-step"] = "4.1"
+    names = lab.Names()
+    names.add("04-satellite-network", "Chapter 4, Satellites", "04-satellite-network")
+    names.add("eq-sat-step", "(4.1)", "04-satellite-network")
+    names.equations["eq-sat-step"] = "4.1"
     text = (
         "{cite:t}`clohessy1960terminal` and {cite:p}`evensen2003ensemble,vanloan1978computing`, "
         "{eq}`eq-sat-step`, {ref}`the step <eq-sat-step>`, {doc}`04-satellite-network`.\n\n"
         "```{math}\n:label: eq-sat-step\nx = 1\n```\n\n```{math}\ny = 2\n```\n"
         "[one](01-bayes-and-kalman.md)"
     )
-    assert lab.plain(text, "04-satellite-network", known, refs) == (
+    assert lab.plain(text, "04-satellite-network", names, refs) == (
         "[Clohessy and Wiltshire (1960)](bibliography.md) and "
         "([Evensen, 2003; Van Loan, 1978](bibliography.md)), "
         "(4.1), the step, Chapter 4, Satellites.\n\n"
         "$$\nx = 1\n\\tag{4.1}\n$$\n\n$$\ny = 2\n$$\n"
         "[one](01-bayes-and-kalman.ipynb)"
     )
-    other = lab.plain("{eq}`eq-sat-step`", "notation", known, refs)
+    other = lab.plain("{eq}`eq-sat-step`", "notation", names, refs)
     assert other == "[(4.1)](04-satellite-network.ipynb)"
 
 
 def test_outputs_are_trusted_hidden_code_is_folded_and_no_save_writes_a_second_file(
-    copied: Path,
+    working_copy: Path,
 ) -> None:
-    notary = NotebookNotary(data_dir=str(copied / ".jupyter" / "data"))
-    for path in (copied / "book").glob("*.ipynb"):
+    notary = NotebookNotary(data_dir=str(working_copy / ".jupyter" / "data"))
+    for path in (working_copy / "book").glob("*.ipynb"):
         notebook = nbformat.read(path, as_version=4)
         nbformat.validate(notebook)
         assert "jupytext" not in notebook.metadata
@@ -117,11 +119,11 @@ def test_outputs_are_trusted_hidden_code_is_folded_and_no_save_writes_a_second_f
 
 
 def test_a_copy_is_kept_and_the_repository_is_not_written_to(
-    copied: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    working_copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    note = copied / "book" / "mine.txt"
+    note = working_copy / "book" / "mine.txt"
     note.write_text("mine")
-    assert lab.main([str(copied), "--no-open"]) == 0
+    assert lab.main([str(working_copy), "--no-open"]) == 0
     assert note.read_text() == "mine" and "make lab LAB=" in capsys.readouterr().out
     note.unlink()
     full = tmp_path / "full"
@@ -132,12 +134,13 @@ def test_a_copy_is_kept_and_the_repository_is_not_written_to(
             lab.main([str(folder), "--no-open"])
 
 
-def wait(what: Any, seconds: int = 240) -> Any:
-    """What is asked for, as soon as it is there."""
+def wait(ask: Any, seconds: int = 240) -> Any:
+    """Return an answer as soon as there is one."""
     for _ in range(seconds):
         try:
-            if found := what():
-                return found
+            answer = ask()
+            if answer:
+                return answer
         except OSError:
             pass
         time.sleep(1)
@@ -150,7 +153,7 @@ def test_in_jupyterlab_a_chapter_runs_and_is_saved_apart(tmp_path: Path) -> None
     stem = "01-bayes-and-kalman"
     lab.main([str(folder), "--no-open"])
     saved = folder / "book" / f"{stem}.ipynb"
-    _emptied(saved)
+    _clear_outputs(saved)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         address = f"http://127.0.0.1:{free.getsockname()[1]}"
@@ -181,8 +184,8 @@ def test_in_jupyterlab_a_chapter_runs_and_is_saved_apart(tmp_path: Path) -> None
     assert not [o for c in cells for o in c.outputs if o.output_type == "error"]
 
 
-def _emptied(path: Path) -> None:
-    """Take the stored outputs out of a notebook: what is there later, a kernel has written."""
+def _clear_outputs(path: Path) -> None:
+    """Remove the stored outputs, so that later outputs come from a kernel."""
     notebook = nbformat.read(path, as_version=4)
     for cell in notebook.cells:
         if cell.cell_type == "code":

@@ -1,4 +1,4 @@
-"""The ledger of reproductions is complete, comes from the stored verdicts, and is on its page."""
+"""The ledger of reproductions is complete and comes from the stored verdicts."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ def test_a_verdict_fills_its_row() -> None:
     (row,) = ledger([ITEM], [])
     assert row["verdict"] == "not yet" and row["chapter"] == ITEM["chapter"]
     (row,) = ledger([ITEM], [VERDICT])
-    beside = {"kind": "results", "null": "", "range": ""}
-    assert row == VERDICT | beside and tuple(row) == COLUMNS
+    other_cells = {"kind": "results", "null": "", "range": ""}
+    assert row == VERDICT | other_cells and tuple(row) == COLUMNS
     assert text_of([row]).splitlines()[1].endswith('"a, b"')
 
 
@@ -61,21 +61,21 @@ def test_a_verdict_fills_its_row() -> None:
     ],
     ids=["twice", "unknown item", "results read"],
 )
-def test_ledger_refuses(verdicts: list[dict[str, str]]) -> None:
+def test_ledger_rejects(verdicts: list[dict[str, str]]) -> None:
     with pytest.raises(
         ValueError, match="has a verdict already|not an item|needs one of"
     ):
         ledger([ITEM, TABLE], verdicts)
 
 
-def test_what_was_read_is_counted_apart_from_what_matches() -> None:
+def test_tables_that_are_read_are_not_counted_as_matches() -> None:
     read = {**VERDICT, "item": "Table I", "verdict": "read"}
-    found = summaries(ledger([ITEM, TABLE], [VERDICT, read]))
-    assert found["parameters"] == (
+    counts = summaries(ledger([ITEM, TABLE], [VERDICT, read]))
+    assert counts["parameters"] == (
         1,
         {"read": 1, "differs": 0, "not comparable": 0, "not yet": 0},
     )
-    assert found["results"] == (
+    assert counts["results"] == (
         1,
         {"match": 0, "differs": 1, "not comparable": 0, "not yet": 0},
     )

@@ -1,4 +1,4 @@
-"""The environment is whole or made again: interrupted, moved, copied, an old Python."""
+"""The environment is complete or made again: interrupted, moved, copied, an old Python."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from common import ROOT, chapters, chosen
 
 @pytest.fixture
 def clone(tmp_path: Path) -> Path:
-    """A folder with what make looks at, under a name with a space in it."""
+    """Return a folder with the files that make needs; its name has a space."""
     folder = tmp_path / "a clone"
     for place in ("book/tools", "book/kit"):
         (folder / place).mkdir(parents=True)
@@ -40,51 +40,53 @@ def make(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def pretend(folder: Path, stamp: str | None) -> None:
-    """An environment whose Python works, with that stamp."""
+    """Make an environment with a working Python and that stamp."""
     (folder / ".venv" / "bin").mkdir(parents=True)
     (folder / ".venv" / "bin" / "python").symlink_to(sys.executable)
     if stamp is not None:
         (folder / ".venv" / "stamp").write_text(stamp + "\n")
 
 
-def makes_it(folder: Path) -> bool:
-    done = make(folder, "-n", "environment")
-    assert done.returncode == 0, done.stderr
-    return "environment.py" in done.stdout
+def makes_environment(folder: Path) -> bool:
+    result = make(folder, "-n", "environment")
+    assert result.returncode == 0, result.stderr
+    return "environment.py" in result.stdout
 
 
 def test_only_a_whole_environment_is_kept(clone: Path) -> None:
-    """None, half of one, a whole one, a changed lock, and a Python that is gone."""
-    assert makes_it(clone)
+    """No environment, an incomplete and a complete one, a newer lock, a missing Python."""
+    assert makes_environment(clone)
     pretend(clone, None)
-    assert makes_it(clone)
+    assert makes_environment(clone)
     stamp = clone / ".venv" / "stamp"
     python = clone / ".venv" / "bin" / "python"
     stamp.write_text(f"{clone}\n")
-    assert not makes_it(clone)
+    assert not makes_environment(clone)
     os.utime(stamp, (1, 1))
-    assert makes_it(clone)
+    assert makes_environment(clone)
     os.utime(stamp)
-    assert not makes_it(clone)
+    assert not makes_environment(clone)
     python.unlink()
     python.symlink_to("/nowhere/python")
-    assert makes_it(clone)
+    assert makes_environment(clone)
 
 
 def test_a_moved_or_copied_folder_makes_its_own(clone: Path, tmp_path: Path) -> None:
     pretend(clone, str(clone))
     copied = tmp_path / "copied"
     shutil.copytree(clone, copied, symlinks=True)
-    assert makes_it(copied) and not makes_it(clone)
-    assert makes_it(clone.rename(tmp_path / "moved"))
+    assert makes_environment(copied) and not makes_environment(clone)
+    assert makes_environment(clone.rename(tmp_path / "moved"))
 
 
 def test_an_old_python_or_none_is_named_and_leaves_nothing(
     clone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = sorted(clone.rglob("*"))
-    done = make(clone, "environment", "PYTHON=")
-    assert done.returncode != 0 and "Python 3.11 or newer was not found" in done.stdout
+    result = make(clone, "environment", "PYTHON=")
+    assert (
+        result.returncode != 0 and "Python 3.11 or newer was not found" in result.stdout
+    )
     monkeypatch.setattr(sys, "version_info", (3, 10, 4))
     monkeypatch.setattr(sys, "argv", ["environment.py", str(clone / ".venv")])
     with pytest.raises(SystemExit, match="Python 3.11 or newer is needed, got 3.10.4"):
@@ -94,20 +96,20 @@ def test_an_old_python_or_none_is_named_and_leaves_nothing(
 
 @pytest.fixture
 def steps(clone: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What the tool would run, in order; `fail` in it stops there."""
-    done: list[str] = []
+    """Record the commands of the tool in order; `fail` as the first makes the second one fail."""
+    commands: list[str] = []
 
     def run(python: str, *arguments: str) -> None:
         if arguments[1] == "venv":
             pretend(clone, None)
-        done.append(arguments[1])
-        if len(done) > 1 and done[0] == "fail":
+        commands.append(arguments[1])
+        if len(commands) > 1 and commands[0] == "fail":
             sys.exit(1)
 
     monkeypatch.chdir(clone)
     monkeypatch.setattr(environment, "run", run)
     monkeypatch.setattr(sys, "argv", ["environment.py", ".venv"])
-    return done
+    return commands
 
 
 def test_the_stamp_comes_last_and_names_the_folder(
@@ -115,9 +117,9 @@ def test_the_stamp_comes_last_and_names_the_folder(
 ) -> None:
     environment.main()
     assert steps[0] == "venv" and steps.count("pip") == 3
-    assert (clone / ".venv" / "stamp").read_text() == f"{clone}\n" and not makes_it(
-        clone
-    )
+    assert (
+        clone / ".venv" / "stamp"
+    ).read_text() == f"{clone}\n" and not makes_environment(clone)
     steps.clear()
     (clone / ".venv" / "kept").touch()
     environment.main()
@@ -129,7 +131,7 @@ def test_an_interrupted_update_leaves_no_stamp(clone: Path, steps: list[str]) ->
     steps[:] = ["fail"]
     with pytest.raises(SystemExit):
         environment.main()
-    assert not (clone / ".venv" / "stamp").exists() and makes_it(clone)
+    assert not (clone / ".venv" / "stamp").exists() and makes_environment(clone)
     steps.clear()
     (clone / ".venv" / "half").touch()
     environment.main()
@@ -138,24 +140,24 @@ def test_an_interrupted_update_leaves_no_stamp(clone: Path, steps: list[str]) ->
 
 def test_line_ends_are_fixed_whatever_a_clone_s_settings_are() -> None:
     names = ["a.csv", "a.ipynb", "a.md", "a.py"]
-    found = subprocess.run(
+    attributes = subprocess.run(
         ["git", "check-attr", "eol", *names],
         cwd=ROOT,
         check=True,
         capture_output=True,
         text=True,
     ).stdout
-    assert found.split("\n")[:-1] == [f"{name}: eol: lf" for name in names]
+    assert attributes.split("\n")[:-1] == [f"{name}: eol: lf" for name in names]
 
 
 def test_every_page_with_code_is_compared() -> None:
-    named = re.findall(r"regress\.py (\S+)", make(ROOT, "-n", "test").stdout)
-    assert sorted(chosen(named)) == sorted(chapters())
+    compared = re.findall(r"regress\.py (\S+)", make(ROOT, "-n", "test").stdout)
+    assert sorted(chosen(compared)) == sorted(chapters())
 
 
 def test_the_list_of_packages_is_whole() -> None:
-    """It is installed as it stands, without a look at what packages ask for."""
-    done = subprocess.run(
+    """The lock is installed without resolving dependencies, so it must have all of them."""
+    result = subprocess.run(
         [sys.executable, "-m", "pip", "check"], capture_output=True, text=True
     )
-    assert done.returncode == 0, done.stdout
+    assert result.returncode == 0, result.stdout

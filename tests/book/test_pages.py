@@ -1,4 +1,4 @@
-"""The built book: every page is there, every public name is documented, every chapter is a pair."""
+"""The built book: every page exists, and every public name is documented."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_page_of_the_contents_is_built(name: str) -> None:
 
 
 @pytest.mark.parametrize("source", chapters(), ids=lambda source: source.stem)
-def test_a_chapter_with_its_pictures_is_light(source: Path) -> None:
+def test_a_chapter_with_its_pictures_is_small(source: Path) -> None:
     text = page(f"book/{source.stem}")
     pictures = set(re.findall(r"_images/[\w.-]+\.(?:png|webp|svg)", text))
     assert (
@@ -48,26 +48,28 @@ def test_a_chapter_with_its_pictures_is_light(source: Path) -> None:
     )
 
 
-def test_chapters_import_nothing_of_the_folder_they_lie_in() -> None:
-    """So a chapter runs from any folder: what lies beside it comes by `studies.script`."""
-    own = {path.stem for path in (ROOT / "book").iterdir()}
+def test_chapters_import_nothing_from_their_folder() -> None:
+    """So a chapter runs from any folder; scripts come by `studies.script`."""
+    local_names = {path.stem for path in (ROOT / "book").iterdir()}
     for source in chapters():
         text = source.read_text(encoding="utf-8")
         imported = set(
             re.findall(r"^\s*(?:from|import)\s+(\w+)", text, flags=re.MULTILINE)
         )
-        assert not imported & own, f"{source.stem} imports {imported & own}"
+        assert not imported & local_names, (
+            f"{source.stem} imports {imported & local_names}"
+        )
 
 
-def test_api_pages_are_light_and_document_every_public_name_once() -> None:
+def test_api_pages_are_small_and_document_every_public_name_once() -> None:
     texts = [page(f"book/api/{part}") for part in api_parts()]
     assert max(map(len, texts)) <= 400_000
     text = "".join(texts)
     assert "TypeAliasForwardRef" not in text and " at 0x" not in text
     anchors = re.findall(r'<dt[^>]* id="(distfilt[^"]*)"', text)
     assert len(anchors) == len(set(anchors))
-    wanted = set(homes().values()) - {*modules(), "distfilt.__version__"}
-    assert len(wanted) > 50 and wanted <= set(anchors)
+    public = set(homes().values()) - {*modules(), "distfilt.__version__"}
+    assert len(public) > 50 and public <= set(anchors)
 
 
 def test_api_page_is_an_index_and_chapters_and_names_lead_to_each_other() -> None:
@@ -92,17 +94,17 @@ def test_page_of_reproductions_shows_the_ledger() -> None:
     text = page("book/reproductions")
     rows = read_rows(LEDGER)
     tables = re.findall(r"<tbody>(.*?)</tbody>", text, flags=re.DOTALL)
-    shown = [
+    lines = [
         row
         for table in tables
         for row in re.findall(r"<tr.*?</tr>", table, flags=re.DOTALL)
     ]
-    assert len(shown) == len(rows) == 21
-    for row, line in zip(rows, shown, strict=True):
+    assert len(lines) == len(rows) == 21
+    for row, line in zip(rows, lines, strict=True):
         assert row["item"] in plain(line) and row["verdict"] in plain(line)
     for total, counts in summaries(rows).values():
-        said = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
-        assert f"Of {total} " in plain(text) and said in plain(text)
+        counted = ", ".join(f"{n} {verdict}" for verdict, n in counts.items())
+        assert f"Of {total} " in plain(text) and counted in plain(text)
 
 
 def test_build_stops_at_a_missing_page(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""The whole book as one file: every chapter is in it, and nothing is cut at the paper's edge."""
+"""The whole book as one file: it has every chapter, and nothing is cut at the paper's edge."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ def test_the_whole_book_is_written(kind: str, monkeypatch: pytest.MonkeyPatch) -
     assert volume.main() == 0
     target = volume.TARGET / f"{volume.NAME}.{kind}"
     if kind == "epub":
-        held = {Path(name).stem for name in zipfile.ZipFile(target).namelist()}
+        parts = {Path(name).stem for name in zipfile.ZipFile(target).namelist()}
     else:
-        held = set(volume.pages_of(target.read_bytes()))
-    assert held >= {volume.key(f"book/{source.stem}") for source in chapters()}
+        parts = set(volume.pages_of(target.read_bytes()))
+    assert parts >= {volume.key(f"book/{source.stem}") for source in chapters()}
     assert target.name in (volume.TARGET / "index.html").read_text(encoding="utf-8")
 
 
-def test_what_does_not_fit_the_paper_is_refused(tmp_path: Path) -> None:
+def test_elements_that_do_not_fit_the_paper_are_rejected(tmp_path: Path) -> None:
     page = tmp_path / "bad.html"
     page.write_text(BAD.format("x" * 300), encoding="utf-8")
-    with chromium(tmp_path / "profile") as driver, pytest.raises(SystemExit) as told:
-        volume.opened(driver, page)
+    with chromium(tmp_path / "profile") as driver, pytest.raises(SystemExit) as error:
+        volume.open_page(driver, page)
     assert all(
-        f"\n{what}: " in str(told.value)
-        for what in ("too wide", "cut", "not drawn", "not set")
+        f"\n{fault}: " in str(error.value)
+        for fault in ("too wide", "cut", "not drawn", "not set")
     )

@@ -1,4 +1,4 @@
-"""The solvers of the coupling problem, against each other and against what is known exactly."""
+"""The solvers of the coupling problem, against each other and against exact solutions."""
 
 from __future__ import annotations
 
@@ -9,80 +9,96 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distfilt.coupling import solvers, monotone_plan, squared_distances, transport_plan
+from distfilt.coupling import (
+    TransportPlan,
+    monotone_plan,
+    solvers,
+    squared_distances,
+    transport_plan,
+)
 from distfilt.linalg import SolverError
 
 
 def _case(seed: int, n: int = 24, m: int = 24, d: int = 3) -> tuple[np.ndarray, ...]:
-    """Points, a squared cost, masses of very different size with some of zero."""
+    """Return a squared cost, and masses of very different sizes with some of zero."""
     rng = np.random.default_rng(seed)
     x = rng.standard_normal((n, d))
     y = rng.standard_normal((m, d)) + 0.3
-    a = rng.random(n) ** 6
-    b = rng.random(m)
-    a[: n // 6] = 0.0
-    b[-1] = 0.0
-    return squared_distances(x, y), a / a.sum(), b / b.sum()
+    rows = rng.random(n) ** 6
+    columns = rng.random(m)
+    rows[: n // 6] = 0.0
+    columns[-1] = 0.0
+    return squared_distances(x, y), rows / rows.sum(), columns / columns.sum()
+
+
+def _assert_marginals(plan: TransportPlan, a: np.ndarray, b: np.ndarray) -> None:
+    assert np.abs(plan.matrix.sum(axis=1) - a).max() <= 1e-14
+    assert np.abs(plan.matrix.sum(axis=0) - b).max() <= 1e-14
+    assert plan.matrix.min() >= 0
 
 
 @given(st.integers(0, 10_000), st.integers(1, 12), st.integers(1, 12))
 def test_the_network_simplex_is_certified_by_its_dual(
     seed: int, n: int, m: int
 ) -> None:
+    """Feasible potentials bound the cost from below; without a duality gap both are optimal."""
     rng = np.random.default_rng(seed)
     cost = squared_distances(rng.standard_normal((n, 2)), rng.standard_normal((m, 2)))
     a = rng.dirichlet(np.full(n, 0.3))
     b = rng.dirichlet(np.ones(m))
-    found = transport_plan(cost, a, b)
-    f, g = found.potentials
+    plan = transport_plan(cost, a, b)
+    f, g = plan.potentials
     assert (f[:, None] + g <= cost + 1e-9).all()
-    assert abs(found.bound - (f @ a + g @ b)) < 1e-12
-    assert abs(found.value - (found.matrix * cost).sum()) < 1e-12
-    assert -1e-12 < found.duality_gap < 1e-9
-    assert np.abs(found.matrix.sum(axis=1) - a).max() <= 1e-14
-    assert (
-        np.abs(found.matrix.sum(axis=0) - b).max() <= 1e-14 and found.matrix.min() >= 0
-    )
+    assert abs(plan.bound - (f @ a + g @ b)) < 1e-12
+    assert abs(plan.value - (plan.matrix * cost).sum()) < 1e-12
+    assert -1e-12 < plan.duality_gap < 1e-9
+    _assert_marginals(plan, a, b)
 
 
 @given(st.integers(0, 10_000), st.integers(1, 15), st.integers(1, 15))
-def test_the_sorted_plan_is_the_cheapest(seed: int, n: int, m: int) -> None:
+def test_the_monotone_plan_is_the_cheapest(seed: int, n: int, m: int) -> None:
+    """As cheap as the linear programme's solution, with a vertex's number of cells."""
     rng = np.random.default_rng(seed)
     x = rng.standard_normal(n)
     y = rng.standard_normal(m)
     a = rng.dirichlet(np.full(n, 0.5))
     b = rng.dirichlet(np.ones(m))
-    found = monotone_plan(x, y, a, b)
-    best = transport_plan(squared_distances(x[:, None], y[:, None]), a, b)
-    assert abs(found.value - best.value) < 1e-11
-    assert -1e-12 < found.duality_gap < 1e-11
-    assert np.abs(found.matrix.sum(axis=1) - a).max() <= 1e-14
-    assert np.abs(found.matrix.sum(axis=0) - b).max() <= 1e-14
-    assert (found.matrix > 0).sum() <= n + m - 1
+    plan = monotone_plan(x, y, a, b)
+    optimal = transport_plan(squared_distances(x[:, None], y[:, None]), a, b)
+    assert abs(plan.value - optimal.value) < 1e-11
+    assert -1e-12 < plan.duality_gap < 1e-11
+    _assert_marginals(plan, a, b)
+    assert (plan.matrix > 0).sum() <= n + m - 1
 
 
-def test_the_sorted_plan_with_ties_and_empty_masses() -> None:
-    found = monotone_plan([1.0, 1.0, 0.0, 5.0], [1.0, 1.0, 0.0], [0.25, 0.25, 0.5, 0.0])
-    assert abs(found.value - 1 / 6) < 1e-15  # a sixth of the mass has to move by one
-    assert found.matrix[3].sum() == 0
+def test_the_monotone_plan_with_ties_and_empty_masses() -> None:
+    """A sixth of the mass has to move by one; a row without mass is empty."""
+    plan = monotone_plan([1.0, 1.0, 0.0, 5.0], [1.0, 1.0, 0.0], [0.25, 0.25, 0.5, 0.0])
+    assert abs(plan.value - 1 / 6) < 1e-15
+    assert plan.matrix[3].sum() == 0
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1e-4, 1e6])
-def test_neither_scale_nor_offset_of_the_cost_matters(scale: float) -> None:
+def test_scale_and_offset_of_the_cost_do_not_matter(scale: float) -> None:
+    """The plan is the same, and the value follows."""
     cost, a, b = _case(4)
     reference = transport_plan(cost, a, b)
-    other = transport_plan(np.asfortranarray(scale * cost + 7 * scale), a, b)
-    assert np.abs(other.matrix - reference.matrix).max() < 1e-9
-    assert abs(other.value / scale - 7 - reference.value) < 1e-9
-    assert abs(reference.duality_gap) < 1e-12 and b.min() == 0
+    scaled_cost = np.asfortranarray(scale * cost + 7 * scale)
+    scaled = transport_plan(scaled_cost, a, b)
+    assert np.abs(scaled.matrix - reference.matrix).max() < 1e-9
+    assert abs(scaled.value / scale - 7 - reference.value) < 1e-9
+    # The potential of a column without mass is feasible too.
+    assert b.min() == 0
+    assert abs(reference.duality_gap) < 1e-12
 
 
 def test_a_constant_cost_and_single_masses() -> None:
-    flat = transport_plan(np.full((3, 4), 2.0), [0.2, 0.3, 0.5])
-    assert abs(flat.value - 2) < 1e-14
+    """Problems with one feasible value or one feasible plan."""
+    constant = transport_plan(np.full((3, 4), 2.0), [0.2, 0.3, 0.5])
+    assert abs(constant.value - 2) < 1e-14
     for solver in ("network", "entropic"):
-        one = transport_plan([[3.0]], [1.0], solver=solver)
-        assert abs(one.matrix[0, 0] - 1) < 1e-14
+        single = transport_plan([[3.0]], [1.0], solver=solver)
+        assert abs(single.matrix[0, 0] - 1) < 1e-14
         column = transport_plan([[1.0], [2.0]], [0.25, 0.75], solver=solver)
         assert np.abs(column.matrix.ravel() - [0.25, 0.75]).max() < 1e-14
 
@@ -91,11 +107,11 @@ def test_tiny_masses_do_not_make_a_problem_infeasible() -> None:
     """Weights down to 1e-40, as likelihoods are."""
     rng = np.random.default_rng(5)
     x = rng.standard_normal((60, 2))
-    w = np.exp(-40 * x[:, 0] ** 2)
-    w /= w.sum()
-    found = transport_plan(squared_distances(x), w)
-    assert np.abs(found.matrix.sum(axis=1) - w).max() <= 1e-14
-    assert found.duality_gap < 1e-6
+    weights = np.exp(-40 * x[:, 0] ** 2)
+    weights /= weights.sum()
+    plan = transport_plan(squared_distances(x), weights)
+    _assert_marginals(plan, weights, np.full(60, 1 / 60))
+    assert plan.duality_gap < 1e-6
 
 
 @pytest.mark.parametrize(
@@ -105,41 +121,51 @@ def test_tiny_masses_do_not_make_a_problem_infeasible() -> None:
         ("_NEWTON", 2, "entropic", "regularisation 0.001 needs to be larger"),
     ],
 )
-def test_a_solver_that_stops_early_says_so(
+def test_a_solver_that_stops_early_raises_an_error(
     limit: str, value: int, solver: str, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """With its status, or with the option to change."""
     monkeypatch.setattr(solvers, limit, value)
     with pytest.raises(SolverError, match=message):
         transport_plan(*_case(8), solver=solver, regularisation=1e-3)
 
 
-def test_where_rounding_hides_the_dual_its_gradient_leads_on(monkeypatch: Any) -> None:
+def test_the_entropic_solver_uses_the_gradient_near_the_optimum(
+    monkeypatch: Any,
+) -> None:
+    """If only decreases of the dual were accepted, rounding would stop the iteration."""
     solve = np.linalg.solve
-    steps = []
-    monkeypatch.setattr(np.linalg, "solve", lambda a, b: steps.append(a) or solve(a, b))
+    systems = []
+
+    def count(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        systems.append(a)
+        return solve(a, b)
+
+    monkeypatch.setattr(np.linalg, "solve", count)
     transport_plan(*_case(8, 15, 3, 2), solver="entropic", regularisation=1e-7)
-    assert len(steps) < 100
+    assert len(systems) < 100
 
 
 @given(st.integers(0, 10_000), st.sampled_from([1e-2, 1e-3, 1e-4]))
-def test_the_entropic_plan_is_that_of_its_optimality_conditions(
+def test_the_entropic_plan_satisfies_its_optimality_conditions(
     seed: int, eps: float
 ) -> None:
-    """Also where Sinkhorn's iteration would take more than 100 000 turns."""
-    cost, a, b = _case(seed, 6, 7, 2)
-    found = transport_plan(cost, a, b, solver="entropic", regularisation=eps)
-    assert np.abs(found.matrix.sum(axis=0) - b).max() <= 1e-14
-    assert (
-        np.abs(found.matrix.sum(axis=1) - a).max() <= 1e-14 and found.matrix.min() >= 0
-    )
-    best = transport_plan(cost, a, b).value
-    # The entropy of a plan is at most that of a product of its marginals.
-    most = eps * np.ptp(cost) * np.log(6 * 7)
-    assert -1e-9 < found.value - best < most
-    # On what is not next to nothing, the logarithm is a sum of potentials.
-    log = np.log(np.maximum(found.matrix, 1e-300)) + cost / (eps * np.ptp(cost))
-    i, j = (found.matrix > 1e-6).nonzero()
-    ends = np.zeros((i.size, 13))
-    ends[np.arange(i.size), i] = ends[np.arange(i.size), 6 + j] = 1.0
-    sums = ends @ np.linalg.lstsq(ends, log[i, j])[0]
-    assert np.abs(log[i, j] - sums).max() < 1e-3
+    """log t_ij + c_ij / eps = f_i + g_j, also where Sinkhorn would need 100 000 iterations."""
+    n = 6
+    m = 7
+    cost, a, b = _case(seed, n, m, 2)
+    plan = transport_plan(cost, a, b, solver="entropic", regularisation=eps)
+    _assert_marginals(plan, a, b)
+    # The entropy of a plan is at most that of the uniform one, log(n m).
+    weight = eps * np.ptp(cost)
+    excess = plan.value - transport_plan(cost, a, b).value
+    assert -1e-9 < excess < weight * np.log(n * m)
+    # On all but negligible entries the logarithm is a sum of potentials.
+    i, j = (plan.matrix > 1e-6).nonzero()
+    logs = np.log(plan.matrix[i, j]) + cost[i, j] / weight
+    design = np.zeros((i.size, n + m))
+    entries = np.arange(i.size)
+    design[entries, i] = 1.0
+    design[entries, n + j] = 1.0
+    potentials = np.linalg.lstsq(design, logs)[0]
+    assert np.abs(logs - design @ potentials).max() < 1e-3

@@ -1,6 +1,8 @@
-"""The two forms of the density's Kalman filter agree, keep mass and stay stable."""
+"""The two forms of the density's Kalman filter: their agreement, mass, compression, scale."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -11,117 +13,129 @@ from distfilt.models import rotating_swarm
 RNG = np.random.default_rng(1)
 
 
-def _stepped(
+def _predict_and_step(
     state: density.LowRank,
-    move: object,
+    transition: Callable[[np.ndarray], np.ndarray],
     y: np.ndarray,
     r: np.ndarray,
     dt: float,
     process: np.ndarray | None = None,
 ) -> density.LowRank:
-    moved = density.low_rank_predict(state, move, process=process, dt=dt)
-    return density.low_rank_step(moved, y, r, dt)
+    forecast = density.low_rank_predict(state, transition, process=process, dt=dt)
+    return density.low_rank_step(forecast, y, r, dt)
 
 
 @pytest.mark.parametrize("filters", [1, 3, 20])
 def test_two_steps_are_the_textbook_kalman_filter(filters: int) -> None:
-    """With process noise, for any number of filters with data of their own."""
+    """With process noise, for any number of filters, each with its own data."""
     n = 5
     dt = 0.3
     phi = RNG.random((n, n)) / 2
     q = RNG.standard_normal((n, 2))
+    # Two columns of zeros leave room for the process noise: nothing is truncated.
     root = np.hstack([RNG.standard_normal((n, n)), np.zeros((n, 2))])
-    base = RNG.standard_normal((filters, n))
+    means = RNG.standard_normal((filters, n))
     r = RNG.random((filters, n)) + 0.5
-    low = density.low_rank_start(root, base)
-    wanted = [(m, root @ root.T) for m in base]
+    state = density.low_rank_start(root, means)
+    covs = np.tile(root @ root.T, (filters, 1, 1))
     for y in RNG.standard_normal((2, filters, n)):
-        for i, (m, p) in enumerate(wanted):
-            p = phi @ p @ phi.T + dt * q @ q.T
-            gain = p @ np.linalg.inv(p + np.diag(r[i]) / dt)
-            wanted[i] = phi @ m + gain @ (y[i] - phi @ m), (np.eye(n) - gain) @ p
-        low = _stepped(low, lambda x: x @ phi.T, y, r, dt, q)
-    for i, (m, p) in enumerate(wanted):
-        assert np.allclose(low.estimates[i], m) and np.allclose(low.covariance(i), p)
-        assert np.allclose(low.variances[i], np.diag(p))
+        # The textbook's filter: P⁻ = Φ P Φᵀ + Q Δ, K = P⁻ (P⁻ + R/Δ)⁻¹
+        means = means @ phi.T
+        covs = phi @ covs @ phi.T + dt * q @ q.T
+        noise = r[:, :, None] * np.eye(n) / dt
+        gains = covs @ np.linalg.inv(covs + noise)
+        means = means + np.einsum("fij,fj->fi", gains, y - means)
+        covs = covs - gains @ covs
+        state = _predict_and_step(state, lambda x: x @ phi.T, y, r, dt, q)
+    assert np.allclose(state.estimates, means)
+    for i, cov in enumerate(covs):
+        assert np.allclose(state.covariance(i), cov)
+        assert np.allclose(state.variances[i], np.diag(cov))
 
 
-def test_compression_keeps_the_largest_part() -> None:
-    state = density.low_rank_start(np.diag([3.0, 1.0])[:, :1], np.zeros((2, 2)))
-    moved = density.low_rank_predict(state, np.asarray, process=np.eye(2), dt=1.0)
-    assert np.allclose(moved.covariance(0), np.diag([10.0, 0.0]))
+def test_compression_retains_the_largest_variance() -> None:
+    """Of diag(9 + 1, 1) with rank one: the first component."""
+    state = density.low_rank_start([[3.0], [0.0]], np.zeros((2, 2)))
+    forecast = density.low_rank_predict(state, np.asarray, process=np.eye(2), dt=1.0)
+    assert np.allclose(forecast.covariance(0), np.diag([10.0, 0.0]))
 
 
 @pytest.mark.parametrize(
-    ("reading", "rank", "steps"),
+    ("interpretation", "rank", "steps"),
     [
         ("gibbs", 143, 15),
         ("slowgibbs", 143, 15),
         ("slowgibbs", 60, 200),
     ],
 )
-def test_low_rank_equals_dense_with_the_same_prior_and_both_keep_the_mass(
-    reading: str, rank: int, steps: int
+def test_low_rank_equals_dense_with_the_same_prior_and_both_conserve_the_mass(
+    interpretation: str, rank: int, steps: int
 ) -> None:
-    """Criterion 8: with the same prior and measurements to 1e-10; mass over hundreds of steps."""
+    """To 1e-10 with the same measurements of a swarm, over hundreds of steps."""
     grid = density.Grid((12, 12))
-    swarm = rotating_swarm(reading)
-    flow = density.FokkerPlanck(swarm, grid)
+    swarm = rotating_swarm(interpretation)
+    equation = density.FokkerPlanck(swarm, grid)
     rng = np.random.default_rng(2)
     x = rng.random((100, 2))
     y = density.kernel_density(x, grid, bandwidth=0.08)
     prior = density.zero_mean_prior(grid, rank=rank)
     dense = density.Dense(y, prior @ prior.T)
     low = density.low_rank_start(prior, y[None])
-    k = density.kernel_constant(grid, bandwidth=0.08, agents=100)
-    for j in range(steps):
-        move = flow.solver(0.1 * j, 0.1)
-        x = swarm.step(x, 0.1 * j, 0.1, rng=rng, substeps=2)
+    constant = density.kernel_constant(grid, bandwidth=0.08, agents=100)
+    for k in range(steps):
+        transition = equation.solver(0.1 * k, 0.1)
+        x = swarm.step(x, 0.1 * k, 0.1, rng=rng, substeps=2)
         y = density.kernel_density(x, grid, bandwidth=0.08)
-        noise = k * np.maximum(move(dense.mean), 0.1)
-        dense = density.dense_step(dense, move, y, noise, 0.1)
-        low = _stepped(low, move, y, noise, 0.1)
-    assert (
-        np.abs(low.estimates[0] - dense.mean).max() < 1e-10 * np.abs(dense.mean).max()
-    )
+        # R = k̄ p, with a floor
+        noise = constant * np.maximum(transition(dense.mean), 0.1)
+        dense = density.dense_step(dense, transition, y, noise, 0.1)
+        low = _predict_and_step(low, transition, y, noise, 0.1)
+    estimate = low.estimates[0]
+    error = np.abs(estimate - dense.mean).max()
+    assert error < 1e-10 * np.abs(dense.mean).max()
     assert np.abs(low.covariance(0) - dense.covariance).max() < 1e-10
     assert np.abs(low.variances[0] - np.diag(dense.covariance)).max() < 1e-10
-    assert (
-        np.abs(grid.integral(np.stack([dense.mean, low.estimates[0]])) - 1).max()
-        < 1e-12
-    )
+    # The prior's columns have no mass, so that no update changes it.
+    masses = grid.integral(np.stack([dense.mean, estimate]))
+    assert np.abs(masses - 1).max() < 1e-12
+    # M = I + Sᵀ R⁻¹ S Δ + ... is at least the identity.
     assert np.linalg.eigvalsh(low.information[0]).min() > 1 - 1e-9
 
 
-def test_filters_do_not_see_each_other_and_infinite_noise_measures_nothing() -> None:
-    grid = density.Grid((10, 10))
-    move = density.FokkerPlanck(rotating_swarm(), grid).solver(0.0, 0.1)
-    s = density.zero_mean_prior(grid, rank=40)
-    base = RNG.random((20, 100))
-    y = RNG.random((20, 100))
-    r = 0.1 + RNG.random((20, 100))
+GRID = density.Grid((10, 10))
+BASIS = density.zero_mean_prior(GRID, rank=40)
+
+
+@pytest.mark.parametrize("process", [None, BASIS])
+def test_filters_are_independent_and_an_infinite_noise_measures_nothing(
+    process: np.ndarray | None,
+) -> None:
+    transition = density.FokkerPlanck(rotating_swarm(), GRID).solver(0.0, 0.1)
+    rng = np.random.default_rng(7)
+    base = rng.random((20, 100))
+    y = rng.random((20, 100))
+    r = 0.1 + rng.random((20, 100))
+    # Filter 3 measures nothing, filter 4 half of the cells.
     r[3] = np.inf
     r[4, 50:] = np.inf
-    for q in (None, s):
-        start = density.low_rank_predict(
-            density.low_rank_start(s, base), move, process=q, dt=0.1
-        )
-        many = density.low_rank_step(start, y, r, 0.1)
-        huge = density.low_rank_step(start, y, np.minimum(r, 1e15), 0.1)
-        assert np.abs(many.estimates - huge.estimates).max() < 1e-12
-        assert np.array_equal(many.estimates[3], start.estimates[3])
-        for i in (0, 4, 19):
-            one = _stepped(
-                density.low_rank_start(s, base[i : i + 1]), move, y[i], r[i], 0.1, q
-            )
-            assert np.abs(one.estimates[0] - many.estimates[i]).max() < 1e-12
-            assert np.abs(one.variances[0] - many.variances[i]).max() < 1e-12
+    start = density.low_rank_start(BASIS, base)
+    forecast = density.low_rank_predict(start, transition, process=process, dt=0.1)
+    analysis = density.low_rank_step(forecast, y, r, 0.1)
+    assert np.array_equal(analysis.estimates[3], forecast.estimates[3])
+    # The limit of a huge noise
+    limit = density.low_rank_step(forecast, y, np.minimum(r, 1e15), 0.1)
+    assert np.abs(analysis.estimates - limit.estimates).max() < 1e-12
+    # Each filter by itself
+    for i in (0, 4, 19):
+        single = density.low_rank_start(BASIS, base[i : i + 1])
+        single = _predict_and_step(single, transition, y[i], r[i], 0.1, process)
+        assert np.abs(single.estimates[0] - analysis.estimates[i]).max() < 1e-12
+        assert np.abs(single.variances[0] - analysis.variances[i]).max() < 1e-12
 
 
-def test_what_is_out_of_scale_is_named() -> None:
+def test_an_ill_conditioned_information_is_an_error() -> None:
+    """A step of 1e20 s, in which some cells are measured and others are not."""
     start = density.low_rank_start(np.eye(36)[:, :9], np.ones((1, 36)))
-    ones = np.ones(36)
+    noise = np.where(np.arange(36) < 4, np.inf, 1.0)
     with pytest.raises(np.linalg.LinAlgError, match="density filter: .* out of scale"):
-        density.low_rank_step(
-            start, ones, np.where(np.arange(36) < 4, np.inf, 1.0), 1e20
-        )
+        density.low_rank_step(start, np.ones(36), noise, 1e20)

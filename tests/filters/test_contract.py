@@ -223,7 +223,7 @@ def test_a_run_takes_each_late_reading_when_it_arrives(family: str) -> None:
         ]
         state = f.step(state, t, [y], delayed=due)
     assert same(final_state(run), state)
-    with pytest.raises(ValueError, match="delayed must be arrivals up to 1.5, got 2.0"):
+    with pytest.raises(ValueError, match="delayed must have an arrival_time up to 1.5, got 2.0"):
         f.run(start, times[:3], [seen[:3]], delayed=late)
 
 
@@ -253,7 +253,7 @@ def test_a_late_reading_belongs_to_its_own_time(
         spread = [f.summarize(then).variance.mean() for then in after.lagged_states]
         assert np.argmin(spread) == k
     with pytest.raises(
-        ValueError, match="delayed must be an earlier time that is kept"
+        ValueError, match="delayed must be of an earlier time that is kept"
     ):
         f.step(state, origin + 4 * dt, [None], delayed=late(origin + 2.4 * dt))
 

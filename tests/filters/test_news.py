@@ -63,13 +63,13 @@ def joint(agents: int, readings: np.ndarray, speed: np.ndarray) -> tuple:
     ("agents", "exchange_interval"), [(2, None), (3, 2.0), (5, None)]
 )
 def test_news_are_one_filter_with_everybodys_readings(
-    agents: int, every: float | None
+    agents: int, exchange_interval: float | None
 ) -> None:
     rng = np.random.default_rng(agents)
     readings = rng.standard_normal((4, agents))
     readings[1, 0] = np.nan
     speed = np.array([0.1, 0.3, np.nan, -0.2])
-    f = network(agents, exchange_interval=every)
+    f = network(agents, exchange_interval=exchange_interval)
     state = f.start([PRIOR] * agents)
     for k, (y, v) in enumerate(zip(readings, speed, strict=True)):
         state = f.step(state, k + 1.0, [[one, v] for one in y])
@@ -193,7 +193,7 @@ def test_a_gated_reading_is_no_news() -> None:
         for g in (f, replace(f, exchange_interval=2.0))
     )
     assert np.allclose(a.mixtures[0].covs, b.mixtures[0].covs, atol=1e-12)
-    with pytest.raises(ValueError, match="common must be noise of its own"):
+    with pytest.raises(ValueError, match="shared_components must have noise that is independent"):
         replace(f, sensors=[eye.replace(noise_cov=TARGET_COV)] * 2).step(start, 1.0, y)
 
 

@@ -317,7 +317,7 @@ def test_what_waits_survives_on_disk_and_a_lag_has_to_reach_it(tmp_path: Path) -
         assert np.array_equal(again.joint_means, states[3].joint_means)
     short, start, seen, _ = made("gaussian", exchange_interval=1.0, lag=1)
     with pytest.raises(
-        ValueError, match="lag must have at least 1 for readings that wait"
+        ValueError, match="lag must be at least 1 for observations that wait"
     ):
         made("gaussian", exchange_interval=1.0)
     with pytest.raises(ValueError, match="lag must reach back to t = 0"):
@@ -340,10 +340,10 @@ def test_truth_of_each_agent_and_of_named_components(family: str) -> None:
     if "nees" in some and "covariance" in some:
         assert np.allclose(some["nees"], one / some["variance"].sel(component=name))
     for wrong, text in (
-        ({"speed": truth[:, 1]}, "components"),
-        (truth[:, :1], ".*or a dict of"),
+        ({"speed": truth[:, 1]}, "have components"),
+        (truth[:, :1], "be .*or a dict of"),
     ):
-        with pytest.raises(ValueError, match=f"truth must be {text}"):
+        with pytest.raises(ValueError, match=f"truth must {text}"):
             f.run(start, TIMES, seen, truth=wrong)
 
 
@@ -386,7 +386,7 @@ def test_a_state_and_a_reading_of_another_are_refused() -> None:
         filters.Observation(0.2, 0, [0.3]),
     ):
         with pytest.raises(
-            ValueError, match=r"observations\[0\] must be a Reading of agent 0 at"
+            ValueError, match=r"observations\[0\] must be an Observation of agent 0 at"
         ):
             f.step(start, 0.1, [reading, None, None])
 
@@ -406,7 +406,7 @@ def test_a_prior_of_any_kind() -> None:
     unscented = filters.GaussianFilter(model(), EYES, NET, linearization="unscented")
     for g, wrong, text in (
         (f, lambda n, rng, leading: None, "got a function"),
-        (f, ([0.0, 0.0], [1.0, 1.0]), r"a covariance of .*, got \(2,\)"),
+        (f, ([0.0, 0.0], [1.0, 1.0]), r"have a covariance of .*, got \(2,\)"),
         (unscented, flat, "definite"),
         (made("mixture")[0], flat, "definite"),
     ):

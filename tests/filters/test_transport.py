@@ -90,7 +90,7 @@ def test_an_agent_whom_nobody_hears_counts_its_own_reading_once() -> None:
     f = _filter(graph=lambda t: graphs.ring(4) if t > 0.7 else Graph.from_edges(4, []))
     for now, late in ((y, []), ([None] * 4, [Observation(0.5, 0, [0.3])])):
         with pytest.raises(
-            ValueError, match="graph must have links for the readings of t = 0.6"
+            ValueError, match="graph must have links for the observations of t = 0.6"
         ):
             replace(f, lag=1).step(_start(f).replace(t=0.5), 0.6, now, delayed=late)
 

@@ -1,4 +1,4 @@
-"""What digests notice and overlook: of arrays, and of what was drawn."""
+"""Digests change with the data, of arrays and of figures, and not with rounding or style."""
 
 from __future__ import annotations
 
@@ -19,9 +19,8 @@ CURVES = st.lists(
 )
 
 
-@settings(
-    derandomize=True
-)  # a number may lie 1e-9 from a tie, by a chance of 1e-5 a number
+# Derandomised: a number lies within 1e-9 of a tie with a probability of 1e-5.
+@settings(derandomize=True)
 @given(CURVES, st.integers(0, 2**32 - 1))
 def test_digest_survives_rounding(values, seed):
     curve = np.array(values)
@@ -55,7 +54,8 @@ def test_digest_sees_order_sign_and_size():
         assert digest(c=curve) != digest(c=other)
     swapped = curve.copy()
     bumped = curve.copy()
-    swapped[[40, 60]] = swapped[[60, 40]]  # same range, mean and parity
+    # The swap keeps range and mean, and the alternating signs of the projection.
+    swapped[[40, 60]] = swapped[[60, 40]]
     bumped[100] += 0.02
     assert len({digest(c=curve), digest(c=swapped), digest(c=bumped)}) == 3
 
@@ -85,37 +85,37 @@ def test_digest_is_the_documented_projection():
     assert printed == pytest.approx(expected, rel=6e-4)
 
 
-# --- what was drawn ---------------------------------------------------------------------------
+# --- figures ----------------------------------------------------------------------------------
 
 T = np.linspace(0.0, 6.0, 50)
 GRID = np.add.outer(np.sin(T[:8]), np.cos(T[:9]))
 
 
 def picture(change: str = "") -> Figure:
-    """Two panels with every kind of artist, and one of them changed."""
+    """Draw two panels with every kind of artist, one of them changed."""
     figure = Figure(figsize=(6, 3))
-    left, right = figure.subplots(1, 2)
+    first, second = figure.subplots(1, 2)
     scale = {name: 1.01 if name == change else 1.0 for name in CHANGED}
     if change == "swapped panels":
-        left, right = right, left
-    left.plot(T, 1000 * np.cos(T))
-    left.plot(T, scale["small curve"] * np.sin(T))
-    left.plot(scale["times"] * T, np.sin(2 * T), visible=change != "hidden curve")
-    left.bar([1, 2, 3], [2.0, scale["bar"] * 5.0, 4.0])
-    left.fill_between(T, np.sin(T), scale["band"] * (2 + np.cos(T)))
-    left.add_patch(
+        first, second = second, first
+    first.plot(T, 1000 * np.cos(T))
+    first.plot(T, scale["small curve"] * np.sin(T))
+    first.plot(scale["times"] * T, np.sin(2 * T), visible=change != "hidden curve")
+    first.bar([1, 2, 3], [2.0, scale["bar"] * 5.0, 4.0])
+    first.fill_between(T, np.sin(T), scale["band"] * (2 + np.cos(T)))
+    first.add_patch(
         matplotlib.patches.Ellipse((0, 0), scale["ellipse"] * 3.0, 1.0, angle=30)
     )
-    left.inset_axes([0.6, 0.6, 0.3, 0.3]).plot(T, scale["inset"] * T**2)
+    first.inset_axes([0.6, 0.6, 0.3, 0.3]).plot(T, scale["inset"] * T**2)
     if change != "missing points":
-        right.scatter(T, scale["points"] * T**2, c=scale["colours"] * np.cos(T))
-    right.scatter([scale["one point"] * 3.0], [4.0])
-    right.quiver(T[:5], T[:5], scale["arrows"] * T[:5], -T[:5])
-    right.contour(scale["levels"] * GRID, levels=[-0.5, 0.5, 1.0])
-    right.pcolormesh(scale["mesh"] * GRID)
-    right.imshow(scale["image"] * GRID, extent=(0, scale["extent"] * 2.0, 0, 1))
-    right.errorbar(T[:4], T[:4], scale["bars of error"] * 0.1 * np.ones(4))
-    right.vlines([1.0, scale["rules"] * 2.0], 0, 1)
+        second.scatter(T, scale["points"] * T**2, c=scale["colours"] * np.cos(T))
+    second.scatter([scale["one point"] * 3.0], [4.0])
+    second.quiver(T[:5], T[:5], scale["arrows"] * T[:5], -T[:5])
+    second.contour(scale["levels"] * GRID, levels=[-0.5, 0.5, 1.0])
+    second.pcolormesh(scale["mesh"] * GRID)
+    second.imshow(scale["image"] * GRID, extent=(0, scale["extent"] * 2.0, 0, 1))
+    second.errorbar(T[:4], T[:4], scale["bars of error"] * 0.1 * np.ones(4))
+    second.vlines([1.0, scale["rules"] * 2.0], 0, 1)
     return figure
 
 
@@ -168,9 +168,8 @@ def test_text_of_each_kind():
     assert lines[2].startswith("line 1 y: 2 values, 2..2,") and lines[2].endswith(
         "1 NaN"
     )
-    assert lines[3].startswith(
-        "line 2 y: 2 values, 5..7,"
-    )  # x is that of the line before
+    # The x of line 2 repeats that of line 1, and is left out.
+    assert lines[3].startswith("line 2 y: 2 values, 5..7,")
     assert lines[4].startswith("patch 1-2 x: 10 values, 0.5..3.5,")
     assert lines[5].startswith("patch 1-2 y: 10 values, 0..4,")
     assert lines[6].startswith("image 1 value: 4 values, 1..3,") and "1 NaN" in lines[6]

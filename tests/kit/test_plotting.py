@@ -1,4 +1,4 @@
-"""What the figures draw, and pictures that move."""
+"""Figures, sliders and tables of results."""
 
 from __future__ import annotations
 
@@ -71,8 +71,8 @@ def test_axes_are_labelled_with_units():
         "Runs",
     )
     assert ax.get_yscale() == "log" and tuple(ax.figure.get_size_inches()) == SIZE
-    again = axes(xlabel="lag", ylabel="error", ax=ax)
-    assert again is ax and ax.get_xlabel() == "lag"
+    relabelled = axes(xlabel="lag", ylabel="error", ax=ax)
+    assert relabelled is ax and ax.get_xlabel() == "lag"
 
 
 def test_ellipse_holds_its_share():
@@ -115,7 +115,7 @@ def test_graph_draws_links_once():
     assert placed.lines[0].get_xydata().tolist() == [[0, 0], [2, 1]]
 
 
-def test_graph_shows_who_knows_what():
+def test_graph_fills_discs_and_writes_notes():
     ax = graph(blank(), PAIR, labels=["A", "B"], known=[0.0, 1.0], notes=["angle", ""])
     empty, full = ax.collections[0].get_facecolors()
     assert empty.tolist() == [1, 1, 1, 1] and np.allclose(full[:3], to_rgb(colour(5)))
@@ -124,11 +124,11 @@ def test_graph_shows_who_knows_what():
     assert [t.get_text() for t in ax.texts] == ["A", "angle", "B"]
 
 
-# --- pictures that move -----------------------------------------------------------------------
+# --- sliders ----------------------------------------------------------------------------------
 
 
-def found_in(html):
-    """The page's elements, and what its script is given."""
+def parse(html):
+    """Return a function that finds elements, and the data of the slider's script."""
     page = BeautifulSoup(html, "html.parser")
     return page.find_all, json.loads(page.script.string)
 
@@ -141,20 +141,20 @@ def test_a_slider_holds_its_frames_and_nothing_else():
     )
     assert matplotlib.rcParams["axes.prop_cycle"].by_key()["color"] == list(PALETTE)
     rates = [0.0, 0.5, 1.0, 2.0]
-    found = slider(
+    result = slider(
         curve, rates, label="rate", unit="1/s", alt="A curve <falls>.", start=2
     )
-    assert found.labels == ("rate 0 1/s", "rate 0.5 1/s", "rate 1 1/s", "rate 2 1/s")
-    assert len(set(found.frames)) == 4 and not pyplot.get_fignums()
-    find, data = found_in(found.html)
+    assert result.labels == ("rate 0 1/s", "rate 0.5 1/s", "rate 1 1/s", "rate 2 1/s")
+    assert len(set(result.frames)) == 4 and not pyplot.get_fignums()
+    find, data = parse(result.html)
     (image,) = find("img")
     (knob,) = find("input")
     assert image["alt"] == "A curve <falls>. rate 1 1/s."
     first = base64.b64decode(image["src"].removeprefix("data:image/webp;base64,"))
-    assert first == found.frames[2] and first[8:12] == b"WEBP"
-    shown = Image.open(io.BytesIO(first))
-    assert shown.size == tuple(2 * n for n in found.size)
-    assert [image["width"], image["height"]] == [str(n) for n in found.size]
+    assert first == result.frames[2] and first[8:12] == b"WEBP"
+    first_frame = Image.open(io.BytesIO(first))
+    assert first_frame.size == tuple(2 * n for n in result.size)
+    assert [image["width"], image["height"]] == [str(n) for n in result.size]
     assert (knob["type"], knob["min"], knob["max"], knob["value"]) == (
         "range",
         "0",
@@ -162,42 +162,43 @@ def test_a_slider_holds_its_frames_and_nothing_else():
         "2",
     )
     assert knob["aria-label"] == "rate" and len(find("button")) == 1
-    assert [base64.b64decode(f) for f in data["frames"]] == list(found.frames)
-    assert data["said"] == list(found.labels) and data["milliseconds"] == 500
-    assert "http" not in found.html and not any(
+    assert [base64.b64decode(f) for f in data["frames"]] == list(result.frames)
+    assert data["said"] == list(result.labels) and data["milliseconds"] == 500
+    assert "http" not in result.html and not any(
         "src" in s.attrs for s in find("script")
     )
-    assert len(found.html) < 100_000
-    bundle = found._repr_mimebundle_()
+    assert len(result.html) < 100_000
+    bundle = result._repr_mimebundle_()
     assert set(bundle) == {"text/plain", "text/html", "image/png"}
     still = Image.open(io.BytesIO(base64.b64decode(bundle["image/png"])))
-    assert (np.asarray(still) == np.asarray(shown)).all()
+    assert (np.asarray(still) == np.asarray(first_frame)).all()
 
 
-def test_a_slider_drawn_twice_is_the_same_page_and_notices_a_changed_frame():
+def test_a_slider_is_reproducible_and_its_text_changes_with_a_frame():
     use_style()
-    made = [
+    sliders = [
         slider(curve, [0.5, last], label="rate", alt="A curve.")
         for last in (1.0, 1.0, 1.01, 0.99)
     ]
-    assert made[0].html == made[1].html and len({repr(s) for s in made}) == 3
+    assert sliders[0].html == sliders[1].html and len({repr(s) for s in sliders}) == 3
     assert (
-        len({re.search('data-frames="([0-9a-f]{16})"', s.html)[1] for s in made}) == 3
+        len({re.search('data-frames="([0-9a-f]{16})"', s.html)[1] for s in sliders})
+        == 3
     )
 
 
 def test_texts_of_a_slider_cannot_end_its_script():
-    found = slider(curve, [1.0], label="rate", alt="</script><b>x</b>")
-    find, data = found_in(found.html)
+    result = slider(curve, [1.0], label="rate", alt="</script><b>x</b>")
+    find, data = parse(result.html)
     assert data["alt"] == "</script><b>x</b>" and not find("b")
 
 
-def test_a_table_marks_the_best_number_in_the_form_that_is_asked_for():
+def test_a_table_formats_numbers_and_marks_the_best_one():
     frame = pd.DataFrame(
         {"m": [0.523, np.nan, 0.404], "rule": ["a<b", "c", "d"]}, index=[*"xyz"]
     )
-    found = ResultTable(frame, form={"m": ".2f"}, best={"m": "min"}, caption="Error")
-    page = BeautifulSoup(found._repr_html_(), "html.parser")
+    result = ResultTable(frame, form={"m": ".2f"}, best={"m": "min"}, caption="Error")
+    page = BeautifulSoup(result._repr_html_(), "html.parser")
     rows = [[c.text for c in row.find_all(["th", "td"])] for row in page.find_all("tr")]
     assert rows == [
         ["", "m", "rule"],
@@ -208,4 +209,4 @@ def test_a_table_marks_the_best_number_in_the_form_that_is_asked_for():
     assert [b.text for b in page.find_all("b")] == [
         "0.40"
     ] and page.caption.text == "Error"
-    assert repr(found).split() == ["Error", *rows[0][1:], *rows[1], *rows[2], *rows[3]]
+    assert repr(result).split() == ["Error", *rows[0][1:], *rows[1], *rows[2], *rows[3]]

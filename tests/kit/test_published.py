@@ -1,4 +1,4 @@
-"""What the papers print, scenarios, and verdicts that can fail."""
+"""Published values, scenarios, and verdicts that can fail."""
 
 from __future__ import annotations
 
@@ -74,12 +74,12 @@ def test_a_table_is_kept_cell_by_cell() -> None:
 def test_the_data_are_those_of_the_working_copy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    own = data_root()
+    repository_data = data_root()
     deep = tmp_path / "book" / "deep"
     for folder in (tmp_path / "data" / "published", deep):
         folder.mkdir(parents=True)
     monkeypatch.chdir(deep)
-    assert data_root() == own  # another project's data is passed over
+    assert data_root() == repository_data  # another project's data is passed over
     (tmp_path / "data" / "published" / "items.csv").touch()
     assert data_root() == tmp_path / "data"
 
@@ -114,8 +114,8 @@ def test_a_fault_is_named_with_the_file(
     (tmp_path / "some").mkdir()
     path = tmp_path / "some" / "study.toml"
     path.write_text(GOOD)
-    found = read_scenario(path)
-    assert found["gain"] == 0.05 and found.changes == (
+    study = read_scenario(path)
+    assert study["gain"] == 0.05 and study.changes == (
         "some/study is no scenario of the book",
     )
     path.write_text(GOOD.replace(old, new, 1))
@@ -198,10 +198,10 @@ def test_a_scenario_prints_every_parameter_and_its_reason() -> None:
     assert markdown_table(["a"], [["x | \\y"]]).endswith(r"| x \| \\y |")
 
 
-# What was read.
+# Recorded reads.
 
 
-def test_a_reading_remembers_what_was_taken() -> None:
+def test_reads_of_agents_are_recorded() -> None:
     one = S.track_reads()
     two = S.track_reads()
     repr(one), one._repr_html_(), one.digest, one.changes
@@ -219,31 +219,33 @@ def test_a_reading_remembers_what_was_taken() -> None:
     assert (one.adjacency == S.adjacency).all() and "neighbours" in one.cells()[2]
 
 
-def used(study: Scenario) -> Scenario:
+def use_all(study: Scenario) -> Scenario:
     """Read every printed number of the agents, as a study does."""
-    taken = [(a.kind, a.dims, a.noise) for a in study.agents]
-    assert len(taken) == len(study.adjacency)
+    values = [(a.kind, a.dims, a.noise) for a in study.agents]
+    assert len(values) == len(study.adjacency)
     return study
 
 
 @pytest.mark.parametrize(
     ("item", "name"), [("Table II", "table-2"), ("Table III", "table-3")]
 )
-def test_what_a_study_took_is_read_as_printed(item: str, name: str) -> None:
-    found = judge_parameters("grange", item, used(scenario("grange", name).track_reads()))
-    assert (found.verdict, found.why) == ("read", "")
+def test_used_values_are_read_as_printed(item: str, name: str) -> None:
+    verdict = judge_parameters(
+        "grange", item, use_all(scenario("grange", name).track_reads())
+    )
+    assert (verdict.verdict, verdict.why) == ("read", "")
     assert (
         judge_parameters("grange", item, table("grange", name)[::-1]).verdict == "read"
     )
 
 
-def test_a_cell_that_no_study_took_is_not_read() -> None:
+def test_an_unused_cell_is_not_read() -> None:
     study = S.track_reads()
     for a in study.agents:
         a.dims, a.noise, a.kind  # noqa: B018
-    found = judge_parameters("grange", "Table II", study)
+    verdict = judge_parameters("grange", "Table II", study)
     why = "row A, neighbours: printed [A,B,C], not read by the study"
-    assert (found.verdict, found.why) == ("differs", why)
+    assert (verdict.verdict, verdict.why) == ("differs", why)
 
 
 @pytest.mark.parametrize(
@@ -257,13 +259,13 @@ def test_a_cell_that_no_study_took_is_not_read() -> None:
         ({"name": "Z"}, "row B is printed but was not read"),
     ],
 )
-def test_rows_of_what_ran_are_judged_to_the_first_difference(
+def test_rows_are_judged_to_the_first_difference(
     change: dict[str, Any], why: str
 ) -> None:
-    found = judge_parameters(
+    verdict = judge_parameters(
         "grange", "Table II", [ROWS[0], {**ROWS[1], **change}, ROWS[2]]
     )
-    assert (found.verdict, found.why) == ("differs" if why else "read", why)
+    assert (verdict.verdict, verdict.why) == ("differs" if why else "read", why)
     assert judge_parameters("grange", "Table II", ROWS[:2]).why.startswith(
         "row C is printed"
     )
@@ -321,11 +323,11 @@ def test_a_rule_that_its_null_passes_too_shows_nothing() -> None:
     assert (hangs.verdict, hangs.why) == ("not comparable", "no gain printed")
 
 
-def test_a_verdict_travels_in_a_notebook() -> None:
-    found = Verdict("grange", "Fig. 1", "differs", "a", "b", "because <so>")
-    bundle = found._repr_mimebundle_()
+def test_a_verdict_is_stored_in_a_notebook() -> None:
+    verdict = Verdict("grange", "Fig. 1", "differs", "a", "b", "because <so>")
+    bundle = verdict._repr_mimebundle_()
     data = bundle["application/vnd.distfilt.verdict+json"]
-    assert Verdict(**json.loads(json.dumps(data))) == found
+    assert Verdict(**json.loads(json.dumps(data))) == verdict
     assert bundle["text/plain"] == (
         "grange Fig. 1: differs\n  ours       a\n  published  b\n  why        because <so>"
     )
@@ -333,15 +335,15 @@ def test_a_verdict_travels_in_a_notebook() -> None:
 
 
 def test_a_changed_scenario_is_not_compared() -> None:
-    for found in (
+    for verdict in (
         judge_claims("grange", "Fig. 1", CLAIMS, scenario=CHANGED),
         judge_claims("grange", "Fig. 1", DENIED, why="x", scenario=CHANGED),
         judge_parameters("grange", "Table II", ROWS, scenario=CHANGED),
-        judge_parameters("grange", "Table II", used(CHANGED.track_reads())),
+        judge_parameters("grange", "Table II", use_all(CHANGED.track_reads())),
     ):
         why = "changed scenario: gain: 0.1, not 0.05"
-        assert (found.verdict, found.why) == ("not comparable", why)
-        assert found.ours and found.published
+        assert (verdict.verdict, verdict.why) == ("not comparable", why)
+        assert verdict.ours and verdict.published
     for study in (None, S, S.track_reads()):
         assert (
             judge_claims("grange", "Fig. 1", CLAIMS, scenario=study).verdict == "match"

@@ -1,4 +1,4 @@
-"""Studies: the same bits everywhere, and nothing lost when a trial, a worker or a client stops."""
+"""Studies: the same bits everywhere, and no loss if a trial, a worker or a client stops."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ COLUMNS = ["mean", "norm"]
 
 
 def draw(seed: SeedSequence) -> list[float]:
-    """Numbers whose last bits depend on the order of the sums."""
+    """Return numbers whose last bits depend on the order of sums."""
     rng = np.random.default_rng(seed.spawn(1)[0])
     a = rng.standard_normal((40, 40))
     return [float((a @ a).mean()), float(np.linalg.norm(a))]
@@ -52,7 +52,7 @@ SEEDS = studies.spawn(7, 30)
 REFERENCE = np.array([draw(seed) for seed in SEEDS]).tobytes()
 
 
-def stored(path: Path, **options: Any) -> Path:
+def store(path: Path, **options: Any) -> Path:
     options = {"workers": 1, "columns": COLUMNS, "parameters": {"size": 40}} | options
     return studies.store(
         path, options.pop("trial", draw), options.pop("seeds", SEEDS), **options
@@ -112,10 +112,10 @@ def test_one_blas_thread_in_every_worker() -> None:
 
     for workers in (1, 2):
         study = studies.run(threads, [1, 2], workers=workers)
-        assert all(set(found) == {1} for found in study.values)
+        assert all(set(threads_of_trial) == {1} for threads_of_trial in study.values)
 
 
-# What goes wrong.
+# Failures.
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -140,7 +140,7 @@ def test_a_killed_worker_costs_its_own_trial_only(bad: int, tmp_path: Path) -> N
     with pytest.raises(
         StudyError, match=f"trial {bad}, .*(?s:.*)the other trials are in .*.part"
     ):
-        stored(tmp_path / "a.csv", trial=partial(dies_at, bad), workers=2)
+        store(tmp_path / "a.csv", trial=partial(dies_at, bad), workers=2)
     rows = (tmp_path / "a.csv.part").read_text().splitlines()[-29:]
     assert sorted(int(row.split(",")[0]) for row in rows) == [
         k for k in range(30) if k != bad
@@ -156,33 +156,34 @@ def test_a_broken_executor_leaves_what_was_done() -> None:
 
 
 class Cluster(Executor):
-    """Calls that nobody runs until they are asked for, on as many slots as it says."""
+    """An executor that runs its calls as soon as all of its slots are taken."""
 
-    def __init__(self, slots: int, asked: Callable[[list[Any]], None]) -> None:
-        self._max_workers, self.asked, self.calls = slots, asked, []  # type: ignore[var-annotated]
+    def __init__(self, slots: int, on_full: Callable[[list[Any]], None]) -> None:
+        self._max_workers = slots
+        self.on_full = on_full
+        self.calls: list[Any] = []
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
         self.calls.append((future, fn, args))
         if len(self.calls) == self._max_workers:
-            self.asked(self.calls)
-            for made, call, given in self.calls:
-                made.set_result(call(*given))
+            self.on_full(self.calls)
+            for pending, call, arguments in self.calls:
+                pending.set_result(call(*arguments))
             self.calls = []
         return future
 
 
 def test_as_many_trials_are_in_flight_as_the_executor_has_slots(tmp_path: Path) -> None:
     part = tmp_path / "a.csv.part"
-    seen = []
+    in_flight = []
 
-    def asked(calls: list[Any]) -> None:
-        rows = part.read_text().count("\n") - studies_head if part.exists() else 0
-        seen.append((len(calls), rows))
+    def record(calls: list[Any]) -> None:
+        rows = part.read_text().count("\n") - n_head if part.exists() else 0
+        in_flight.append((len(calls), rows))
 
-    studies_head = (
-        3 + 2 + 1
-    )  # versions, code and parameter; the line before the first row
+    # Lines of versions, code and parameters.
+    n_head = 3 + 2 + 1
     studies.store(
         tmp_path / "a.csv",
         draw,
@@ -190,9 +191,10 @@ def test_as_many_trials_are_in_flight_as_the_executor_has_slots(tmp_path: Path) 
         columns=COLUMNS,
         parameters={"size": 40},
         code=[bits],
-        executor=Cluster(24, asked),
+        executor=Cluster(24, record),
     )
-    assert seen == [(24, 0), (24, 24)]  # each on disk before the next begins
+    # The first 24 rows are on disk before the next trials start.
+    assert in_flight == [(24, 0), (24, 24)]
 
 
 # Files.
@@ -200,14 +202,14 @@ def test_as_many_trials_are_in_flight_as_the_executor_has_slots(tmp_path: Path) 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return stored(tmp_path_factory.mktemp("whole") / "a.csv")
+    return store(tmp_path_factory.mktemp("whole") / "a.csv")
 
 
 def test_a_file_gives_back_every_bit(whole: Path) -> None:
-    kept = studies.load(whole)
-    assert np.stack([kept.columns[c] for c in COLUMNS], axis=1).tobytes() == REFERENCE
-    assert kept.parameters == {"size": 40} and len(kept) == 30
-    assert kept.metadata["code"] == {"draw": studies.fingerprint(draw)}
+    study = studies.load(whole)
+    assert np.stack([study.columns[c] for c in COLUMNS], axis=1).tobytes() == REFERENCE
+    assert study.parameters == {"size": 40} and len(study) == 30
+    assert study.metadata["code"] == {"draw": studies.fingerprint(draw)}
 
 
 @settings(max_examples=25)
@@ -225,26 +227,26 @@ def test_any_number_and_seed_comes_back(
     seed = SeedSequence(entropy, spawn_key=key)
     path = tmp_path_factory.mktemp("any") / "a.csv"
     columns = [f"c{k}" for k in range(len(numbers))]
-    found = studies.load(
-        stored(path, trial=lambda s: numbers, seeds=[seed], columns=columns)
+    study = studies.load(
+        store(path, trial=lambda s: numbers, seeds=[seed], columns=columns)
     )
     for name, number in zip(columns, numbers, strict=True):
-        assert np.array_equal(found.metric(name), [number], equal_nan=True)
+        assert np.array_equal(study.metric(name), [number], equal_nan=True)
         assert (
-            np.signbit(found.metric(name)[0]) == np.signbit(number) or number != number
+            np.signbit(study.metric(name)[0]) == np.signbit(number) or number != number
         )
-    assert (found.seed(0).generate_state(4) == seed.generate_state(4)).all()
+    assert (study.seed(0).generate_state(4) == seed.generate_state(4)).all()
 
 
 def test_a_failure_is_stored_by_its_class(tmp_path: Path) -> None:
-    kept = studies.load(stored(tmp_path / "a.csv", trial=partial(fails_at, (3,))))
-    assert kept.failures[3] == "ArithmeticError" and np.isnan(kept.columns["mean"][3])
-    assert kept.metric("mean").shape == (29,)
-    studies.check(kept, partial(fails_at, (3,)))
+    study = studies.load(store(tmp_path / "a.csv", trial=partial(fails_at, (3,))))
+    assert study.failures[3] == "ArithmeticError" and np.isnan(study.columns["mean"][3])
+    assert study.metric("mean").shape == (29,)
+    studies.check(study, partial(fails_at, (3,)))
     with pytest.raises(
         AssertionError, match="trial 3: stored ArithmeticError, now a value"
     ):
-        studies.check(kept, draw)
+        studies.check(study, draw)
 
 
 def test_every_flipped_bit_is_refused_by_name(whole: Path, tmp_path: Path) -> None:
@@ -277,21 +279,26 @@ def test_a_row_that_was_cut_off_or_damaged_runs_again(
 ) -> None:
     path = tmp_path / "a.csv"
     part = tmp_path / "a.csv.part"
-    assert stored(path, indices=range(20)) == part
+    assert store(path, indices=range(20)) == part
     text = part.read_text()
-    at = text.index("\n4,")
-    for damaged in (text[:-9], text[: at + 6] + "9" + text[at + 7 :], text[:40], ""):
+    position = text.index("\n4,")
+    for damaged in (
+        text[:-9],
+        text[: position + 6] + "9" + text[position + 7 :],
+        text[:40],
+        "",
+    ):
         part.write_text(damaged)
-        assert stored(path).read_bytes() == whole.read_bytes()
+        assert store(path).read_bytes() == whole.read_bytes()
 
 
 def test_parts_of_several_machines_merge(whole: Path, tmp_path: Path) -> None:
     for k in range(3):
-        stored(tmp_path / f"{k}.csv", indices=range(8 * k, 8 * k + 10))
+        store(tmp_path / f"{k}.csv", indices=range(8 * k, 8 * k + 10))
     studies.merge(tmp_path / "a.csv", *(tmp_path / f"{k}.csv.part" for k in range(3)))
     assert (tmp_path / "a.csv.part").read_text().count("\n7,") == 1
-    assert stored(tmp_path / "a.csv").read_bytes() == whole.read_bytes()
-    stored(tmp_path / "b.csv", indices=[0], parameters={"size": 41})
+    assert store(tmp_path / "a.csv").read_bytes() == whole.read_bytes()
+    store(tmp_path / "b.csv", indices=[0], parameters={"size": 41})
     with pytest.raises(ValueError, match="must have the same code, parameters and"):
         studies.merge(
             tmp_path / "c.csv", tmp_path / "0.csv.part", tmp_path / "b.csv.part"
@@ -312,9 +319,9 @@ def test_parts_of_several_machines_merge(whole: Path, tmp_path: Path) -> None:
 def test_a_part_of_another_study_is_refused(
     tmp_path: Path, other: dict[str, Any]
 ) -> None:
-    stored(tmp_path / "a.csv", indices=[2])
+    store(tmp_path / "a.csv", indices=[2])
     with pytest.raises(ValueError, match="a.csv.part"):
-        stored(tmp_path / "a.csv", **other)
+        store(tmp_path / "a.csv", **other)
 
 
 def test_a_full_disk_is_named_and_loses_nothing(whole: Path, tmp_path: Path) -> None:
@@ -323,11 +330,11 @@ def test_a_full_disk_is_named_and_loses_nothing(whole: Path, tmp_path: Path) -> 
     resource.setrlimit(resource.RLIMIT_FSIZE, (most, limits[1]))
     try:
         with pytest.raises(OSError, match=r"File too large: .*a\.csv\.part"):
-            stored(tmp_path / "a.csv")
+            store(tmp_path / "a.csv")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert (tmp_path / "a.csv.part").stat().st_size == most
-    assert stored(tmp_path / "a.csv").read_bytes() == whole.read_bytes()
+    assert store(tmp_path / "a.csv").read_bytes() == whole.read_bytes()
 
 
 @pytest.mark.parametrize(

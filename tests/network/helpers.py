@@ -9,7 +9,7 @@ from distfilt.network import Channel, ConsensusWeights, Faults, Graph, graphs
 
 NAN = float("nan")
 STAR = graphs.star(3)
-APART = Graph.from_adjacency(np.zeros((3, 3)))
+UNLINKED = Graph.from_adjacency(np.zeros((3, 3)))
 
 
 def rng(seed: int = 0) -> np.random.Generator:
@@ -24,46 +24,51 @@ REFERENCE = {
 }
 GRID = REFERENCE["grid"]
 DISK = REFERENCE["disk"]
-named = pytest.mark.parametrize("graph", REFERENCE.values(), ids=REFERENCE.keys())
+each_graph = pytest.mark.parametrize("graph", REFERENCE.values(), ids=REFERENCE.keys())
 
 
 def star(**options: object) -> Channel:
-    """A channel on a star of three."""
+    """Return a channel on a star of three."""
     return Channel(STAR, **options)
 
 
 def lossy(loss: float = 0.3, graph: Graph = STAR, **options: object) -> Channel:
+    """Return a channel that loses messages."""
     return Channel(graph, faults=Faults(loss=loss, seed=5), **options)
 
 
-def of_matrix(graph: Graph, matrix: object) -> ConsensusWeights:
-    """The weights that stand in a matrix at the graph's links and on its diagonal."""
+def weights_of_matrix(graph: Graph, matrix: object) -> ConsensusWeights:
+    """Return the weights that a matrix has at the graph's links and on its diagonal."""
     dense = np.asarray(matrix, dtype=float)
-    return ConsensusWeights(
-        graph, dense.diagonal(), dense[graph.receivers, graph.senders]
-    )
+    link_weights = dense[graph.receivers, graph.senders]
+    return ConsensusWeights(graph, dense.diagonal(), link_weights)
 
 
 def random_graph(seed: int, agents: int, *, directed: bool = False) -> Graph:
-    """Each link with probability one half."""
-    a = rng(seed).random((agents, agents)) < 0.5
-    a = np.triu(a, 1) | (np.tril(a, -1) if directed else np.triu(a, 1).T)
-    return Graph.from_adjacency(a.astype(float), directed=directed)
+    """Return a graph that has each link with probability one half."""
+    links = rng(seed).random((agents, agents)) < 0.5
+    upper = np.triu(links, 1)
+    lower = np.tril(links, -1) if directed else upper.T
+    return Graph.from_adjacency((upper | lower).astype(float), directed=directed)
 
 
-def heard(faults: Faults, graph: Graph, round_: int = 0, runs: int = 1) -> np.ndarray:
-    """Whose message arrives at whom, (runs, A, A)."""
-    out = np.zeros((runs, graph.n_agents, graph.n_agents), dtype=bool)
-    out[:, graph.receivers, graph.senders] = ~faults.lost(graph, round_, runs)
-    return out
+def arrivals(
+    faults: Faults, graph: Graph, round_: int = 0, runs: int = 1
+) -> np.ndarray:
+    """Return whether agent i receives the message of agent j, (runs, A, A)."""
+    arrived = np.zeros((runs, graph.n_agents, graph.n_agents), dtype=bool)
+    lost = faults.lost_messages(graph, round_, runs)
+    arrived[:, graph.receivers, graph.senders] = ~lost
+    return arrived
 
 
 def gaussians(seed: int, *leading: int, d: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """Means and full covariances, components of different size."""
+    """Return means and full covariances, with components of different size."""
     draw = rng(seed)
-    a = draw.standard_normal((*leading, d, d))
-    size = np.logspace(-1, 1, d)
-    covs = (a @ np.swapaxes(a, -1, -2) + 0.2 * np.eye(d)) * np.outer(size, size)
-    return draw.standard_normal((*leading, d)) * size, 0.5 * (
-        covs + np.swapaxes(covs, -1, -2)
-    )
+    factors = draw.standard_normal((*leading, d, d))
+    scale = np.logspace(-1, 1, d)
+    covs = factors @ np.swapaxes(factors, -1, -2) + 0.2 * np.eye(d)
+    covs = covs * np.outer(scale, scale)
+    covs = 0.5 * (covs + np.swapaxes(covs, -1, -2))
+    means = draw.standard_normal((*leading, d)) * scale
+    return means, covs

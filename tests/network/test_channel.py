@@ -1,4 +1,4 @@
-"""The door: what passes, what it costs, who can change it, and what arrives when it fails."""
+"""The channel: what it delivers, what that costs, who can change it, and how it fails."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from hypothesis import strategies as st
 
 from distfilt.network import Channel, Faults, Graph, Ledger, graphs, weights
 from tests.network.helpers import (
-    APART,
     GRID,
     NAN,
     REFERENCE,
     STAR,
-    heard,
+    UNLINKED,
+    arrivals,
+    each_graph,
     lossy,
-    named,
-    of_matrix,
     random_graph,
     rng,
     star,
+    weights_of_matrix,
 )
 
 _ZERO = np.zeros((3, 1))
 _ONES = [np.zeros(1)] * 3
-REFUSED = {
+WRONG = {
     "object": object(),
     "list": [np.zeros(2)],
     "object array": np.array([{"a": 1}, None], dtype=object),
@@ -36,48 +36,58 @@ REFUSED = {
 }
 
 
-def charged(channel: Channel, **wanted: object) -> bool:
-    """Whether the account of a channel has these numbers."""
-    return all(
-        (getattr(channel.ledger, name) == value).all() for name, value in wanted.items()
-    )
+def has_counts(channel: Channel, **expected: object) -> bool:
+    """Return whether the ledger of a channel has these counts."""
+    for name, value in expected.items():
+        if (getattr(channel.ledger, name) != value).any():
+            return False
+    return True
 
 
-def same_account(one: Channel, other: Channel) -> bool:
+def have_equal_counts(one: Channel, other: Channel) -> bool:
     names = ("messages", "scalars", "bytes", "lost")
-    return charged(one, **{name: getattr(other.ledger, name) for name in names})
+    counts = {name: getattr(other.ledger, name) for name in names}
+    return has_counts(one, **counts)
 
 
-def test_what_is_no_array_is_refused_by_name_and_costs_nothing() -> None:
-    """An object could carry any number of numbers past the account."""
+# Payloads and their cost.
+
+
+@pytest.mark.parametrize("payload", WRONG.values(), ids=WRONG.keys())
+def test_only_arrays_are_sent(payload: object) -> None:
+    """An object could carry any number of numbers past the ledger."""
     channel = star()
-    for payload in REFUSED.values():
-        with pytest.raises(ValueError, match=r"payloads\[2\] must"):
-            channel.broadcast([np.zeros(1), None, payload])
-    with pytest.raises(
-        ValueError, match=r"payloads\[0\] must have leading axes \(4,\)"
-    ):
-        star(runs=(4,)).broadcast([(np.zeros((4, 3)), np.zeros(3))] * 3)
-    assert channel.ledger.rounds == 0 and charged(channel, messages=0)
+    with pytest.raises(ValueError, match=r"^payloads\[2\] must"):
+        channel.broadcast([np.zeros(1), None, payload])
+    assert channel.ledger.rounds == 0
+    assert has_counts(channel, messages=0)
 
 
-def test_a_ledger_is_replaced_never_changed() -> None:
+def test_payloads_have_the_axes_of_the_runs() -> None:
+    channel = star(runs=(4,))
+    text = r"^payloads\[0\] must have leading axes \(4,\)"
+    with pytest.raises(ValueError, match=text):
+        channel.broadcast([(np.zeros((4, 3)), np.zeros(3))] * 3)
+    assert has_counts(channel, messages=0)
+
+
+def test_a_ledger_is_replaced_and_never_changed() -> None:
     before = Ledger.empty(3)
     channel = star(ledger=before)
     channel.broadcast(_ONES)
     channel.mix(_ZERO, weights.metropolis(STAR))
-    assert before.rounds == 0 and (before.messages == 0).all()
-    assert (
-        repr(channel.ledger)
-        == "Ledger(rounds=2, messages=8, scalars=8, bytes=64, lost=0)"
-    )
+    assert before.rounds == 0
+    assert (before.messages == 0).all()
+    expected = "Ledger(rounds=2, messages=8, scalars=8, bytes=64, lost=0)"
+    assert repr(channel.ledger) == expected
 
 
 def _full(*shape: int) -> np.ndarray:
     return np.full(shape, NAN)
 
 
-ACCOUNTS = {
+# Runs, payloads, and the messages, scalars and bytes of each agent; agent 0 has two receivers.
+COSTS = {
     "a mixture as a flat tuple": (
         (),
         [(np.zeros(3), np.zeros((3, 4)), np.zeros((3, 4, 4))), None, None],
@@ -146,222 +156,267 @@ ACCOUNTS = {
 }
 
 
-@pytest.mark.parametrize("name", ACCOUNTS)
-def test_every_number_is_charged_and_what_is_missing_is_not_sent(name: str) -> None:
-    runs, sent, messages, scalars, bytes_ = ACCOUNTS[name]
+@pytest.mark.parametrize("name", COSTS)
+def test_every_number_is_charged_and_missing_ones_are_not_sent(name: str) -> None:
+    runs, sent, messages, scalars, bytes_ = COSTS[name]
     channel = star(runs=runs)
-    inbox = channel.broadcast(sent)
-    assert charged(channel, messages=messages, scalars=scalars, bytes=bytes_, lost=0)
+    inboxes = channel.broadcast(sent)
+    assert has_counts(channel, messages=messages, scalars=scalars, bytes=bytes_, lost=0)
     assert channel.ledger.rounds == 1
-    for i, box in enumerate(inbox):
-        assert list(box) == [j for j in STAR.neighbours(i) if messages[j]]
-        for j, got in box.items():
-            pairs = (
-                zip(got, sent[j], strict=True)
-                if isinstance(got, tuple)
-                else [(got, sent[j])]
-            )
-            for part, wanted in pairs:
-                assert part.dtype == wanted.dtype
-                assert np.array_equal(part, wanted, equal_nan=part.dtype.kind == "f")
+    for agent, inbox in enumerate(inboxes):
+        senders = [j for j in STAR.neighbours(agent) if messages[j]]
+        assert list(inbox) == senders
+        for sender, received in inbox.items():
+            _check_same_payload(received, sent[sender])
 
 
-def test_what_arrives_cannot_be_changed_and_is_a_plain_array() -> None:
-    own = [np.array([float(i)]) for i in range(3)]
+def _check_same_payload(received: object, sent: object) -> None:
+    """Compare arrays, or tuples of them, in type and value."""
+    received_parts = received if isinstance(received, tuple) else (received,)
+    sent_parts = sent if isinstance(sent, tuple) else (sent,)
+    for part, expected in zip(received_parts, sent_parts, strict=True):
+        assert part.dtype == expected.dtype
+        is_float = part.dtype.kind == "f"
+        assert np.array_equal(part, expected, equal_nan=is_float)
+
+
+def test_received_arrays_are_read_only_and_plain() -> None:
+    values = [np.array([float(agent)]) for agent in range(3)]
     received = [
-        star().broadcast(own)[1][0],
-        star().broadcast([(own[0], own[1]), None, None])[1][0][1],
+        star().broadcast(values)[1][0],
+        star().broadcast([(values[0], values[1]), None, None])[1][0][1],
         lossy(0.5, runs=(20,)).broadcast([np.ones((20, 2))] * 3)[0][1],
     ]
     for array in received:
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 9.0
-    assert own[0][0] == 0.0 and own[0].flags.writeable
-    own_kind = np.eye(2).view(type("OwnKind", (np.ndarray,), {}))
-    assert type(star().broadcast([own_kind, None, None])[1][0]) is np.ndarray
+    # The sender can go on with its own array.
+    assert values[0][0] == 0.0
+    assert values[0].flags.writeable
+    # Subclasses of arrays arrive as plain ones.
+    subclass = type("Subclass", (np.ndarray,), {})
+    inboxes = star().broadcast([np.eye(2).view(subclass), None, None])
+    assert type(inboxes[1][0]) is np.ndarray
 
 
 def test_without_links_there_is_no_round() -> None:
-    for channel in (Channel(APART), lossy(0.5, APART)):
+    for channel in (Channel(UNLINKED), lossy(0.5, UNLINKED)):
         assert channel.broadcast(_ONES) == [{}, {}, {}]
-        channel.mix(_ZERO, weights.metropolis(APART), rounds=4)
+        channel.mix(_ZERO, weights.metropolis(UNLINKED), rounds=4)
         channel.send_on_links(np.zeros((0, 1)))
-        assert channel.ledger.rounds == 0 and charged(channel, messages=0)
+        assert channel.ledger.rounds == 0
+        assert has_counts(channel, messages=0)
+
+
+# The three ways to send agree.
 
 
 @given(st.integers(0, 1000), st.integers(1, 7), st.integers(1, 3), st.integers(1, 3))
-def test_combine_is_the_matrix_product(
-    seed: int, agents: int, k: int, rounds: int
-) -> None:
+def test_mix_is_the_matrix_product(seed: int, agents: int, k: int, rounds: int) -> None:
     """Every link is charged once a round."""
     draw = rng(seed)
     graph = random_graph(seed, agents, directed=True)
-    w = draw.standard_normal((agents, agents)) * (
-        graph.links.toarray() + np.eye(agents)
-    )
+    pattern = graph.links.toarray() + np.eye(agents)
+    w = draw.standard_normal((agents, agents)) * pattern
     values = draw.standard_normal((2, agents, k))
     channel = Channel(graph, runs=(2,))
-    out = channel.mix(values, of_matrix(graph, w), rounds=rounds)
-    exact = np.linalg.matrix_power(w, rounds) @ values
-    assert np.allclose(out, exact, rtol=1e-12, atol=1e-10)
+    mixed = channel.mix(values, weights_of_matrix(graph, w), rounds=rounds)
+    expected = np.linalg.matrix_power(w, rounds) @ values
+    assert np.allclose(mixed, expected, rtol=1e-12, atol=1e-10)
     assert channel.ledger.rounds == rounds * (graph.senders.size > 0)
     sent = rounds * graph.out_degree
-    assert charged(channel, messages=sent, scalars=k * sent, bytes=8 * k * sent)
+    assert has_counts(channel, messages=sent, scalars=k * sent, bytes=8 * k * sent)
 
 
-@named
+@each_graph
 @pytest.mark.parametrize(("runs", "loss"), [((), 0.3), ((3,), 0.0), ((2, 2), 0.3)])
-def test_combine_and_carry_are_exchange_to_the_bit(
+def test_mix_and_send_on_links_are_broadcast_to_the_bit(
     graph: Graph, runs: tuple[int, ...], loss: float
 ) -> None:
     """The same sum by messages: own value first, then the senders in ascending order."""
     w = weights.metropolis(graph)
     dense = w.matrix.toarray()
     values = rng(1).standard_normal((*runs, graph.n_agents, 3))
-    channels = [
-        Channel(graph, runs=runs, faults=Faults(loss=loss, seed=9)) for _ in range(3)
-    ]
+    faults = Faults(loss=loss, seed=9)
+    by_broadcast, by_mix, by_links = (
+        Channel(graph, runs=runs, faults=faults) for _ in range(3)
+    )
     for _ in range(2):
-        inbox = channels[0].broadcast(
-            [values[..., a, :] for a in range(graph.n_agents)]
-        )
-        whole = channels[1].mix(values, w, lost="zero")
-        carried = channels[2].send_on_links(values[..., graph.senders, :])
-        for link, (i, j) in enumerate(zip(graph.receivers, graph.senders, strict=True)):
-            got = inbox[i].get(int(j), np.full((*runs, 3), NAN))
-            assert np.array_equal(carried[..., link, :], got, equal_nan=True)
-        for a in range(graph.n_agents):
-            total = dense[a, a] * values[..., a, :]
-            for sender, payload in inbox[a].items():
-                weighted = dense[a, sender] * payload
-                total = total + np.where(np.isnan(weighted), 0.0, weighted)
-            assert (total == whole[..., a, :]).all()
-        values = whole
-    for other in channels[1:]:
-        assert same_account(channels[0], other) and other.ledger.rounds == 2
+        payloads = [values[..., agent, :] for agent in range(graph.n_agents)]
+        inboxes = by_broadcast.broadcast(payloads)
+        mixed = by_mix.mix(values, w, on_loss="zero")
+        on_links = by_links.send_on_links(values[..., graph.senders, :])
+        # A message that no run has received is in no inbox, and NaN on its link.
+        nothing = np.full((*runs, 3), NAN)
+        for link, receiver in enumerate(graph.receivers):
+            received = inboxes[receiver].get(int(graph.senders[link]), nothing)
+            assert np.array_equal(on_links[..., link, :], received, equal_nan=True)
+        for agent, inbox in enumerate(inboxes):
+            total = dense[agent, agent] * values[..., agent, :]
+            for sender, payload in inbox.items():
+                term = dense[agent, sender] * payload
+                total = total + np.where(np.isnan(term), 0.0, term)
+            assert (total == mixed[..., agent, :]).all()
+        values = mixed
+    for channel in (by_mix, by_links):
+        assert have_equal_counts(by_broadcast, channel)
+        assert channel.ledger.rounds == 2
 
 
 def test_only_the_links_in_use_are_charged() -> None:
     channel = star()
     used = np.array([True, False, False, True])
-    got = channel.send_on_links(np.arange(4.0)[:, None], links=used)
-    assert np.array_equal(got.ravel(), [0.0, NAN, NAN, 3.0], equal_nan=True)
-    assert charged(channel, messages=np.bincount(STAR.senders[used], minlength=3))
+    received = channel.send_on_links(np.arange(4.0)[:, None], links=used)
+    expected = [0.0, NAN, NAN, 3.0]
+    assert np.array_equal(received.ravel(), expected, equal_nan=True)
+    messages = np.bincount(STAR.senders[used], minlength=3)
+    assert has_counts(channel, messages=messages)
     assert channel.ledger.rounds == 1
 
 
+# Losses.
+
+
 @pytest.mark.parametrize(
-    "lost", ["mutual", "metropolis", "keep", "renormalise", "zero"]
+    "on_loss", ["mutual", "metropolis", "keep", "renormalise", "zero"]
 )
-def test_rules_for_losses_by_their_definition(lost: str) -> None:
+def test_rules_for_losses_by_their_definition(on_loss: str) -> None:
     """Values after one round from the links that arrived, written out agent by agent."""
     faults = Faults(loss=0.4, seed=2)
     values = rng(1).standard_normal((GRID.n_agents, 2))
     w = weights.metropolis(GRID)
     dense = w.matrix.toarray()
-    got = heard(faults, GRID)[0]
-    both = got & got.T
-    degree = both.sum(axis=1)
+    arrived = arrivals(faults, GRID)[0]
+    both_ways = arrived & arrived.T
+    degree = both_ways.sum(axis=1)
     expected = np.empty_like(values)
     for i in range(GRID.n_agents):
-        came = dense[i] * got[i]
-        share = {
-            "mutual": dense[i] * both[i],
-            "keep": came,
-            "zero": came,
-            "metropolis": both[i] / (1 + np.maximum(degree[i], degree)),
-            "renormalise": came / (dense[i, i] + came.sum()),
-        }[lost]
-        own = dense[i, i] if lost == "zero" else 1 - share.sum()
-        expected[i] = own * values[i] + share @ values
-    out = Channel(GRID, faults=faults).mix(values, w, lost=lost)
-    assert np.abs(out - expected).max() < 1e-14
+        received = dense[i] * arrived[i]
+        row = {
+            "mutual": dense[i] * both_ways[i],
+            "keep": received,
+            "zero": received,
+            "metropolis": both_ways[i] / (1 + np.maximum(degree[i], degree)),
+            "renormalise": received / (dense[i, i] + received.sum()),
+        }[on_loss]
+        # The own value gets the remainder of one, except where lost weights go nowhere.
+        self_weight = dense[i, i] if on_loss == "zero" else 1 - row.sum()
+        expected[i] = self_weight * values[i] + row @ values
+    mixed = Channel(GRID, faults=faults).mix(values, w, on_loss=on_loss)
+    assert np.abs(mixed - expected).max() < 1e-14
+
+
+def test_rules_that_need_acknowledgements_refuse_one_way_links() -> None:
+    graph = Graph.from_edges(3, [(1, 0), (2, 1), (0, 2)], directed=True)
+    channel = lossy(0.3, graph)
+    w = weights.column_stochastic(graph)
+    for on_loss in ("mutual", "metropolis"):
+        with pytest.raises(ValueError, match=f"^on_loss must not be '{on_loss}'"):
+            channel.mix(_ZERO, w, on_loss=on_loss)
 
 
 def test_losses_in_a_batch_are_counted_on_average() -> None:
     channel = lossy(0.5, runs=(8,))
-    inbox = channel.broadcast([np.ones((8, 1))] * 3)
-    missed = [np.isnan(inbox[0].get(j, np.full((8, 1), NAN))).mean() for j in (1, 2)]
-    assert (
-        channel.ledger.lost[1:] == missed
-    ).all() and 0 < channel.ledger.lost.sum() < 4
+    inbox = channel.broadcast([np.ones((8, 1))] * 3)[0]
+    nothing = np.full((8, 1), NAN)
+    lost = [np.isnan(inbox.get(sender, nothing)).mean() for sender in (1, 2)]
+    assert (channel.ledger.lost[1:] == lost).all()
+    assert 0 < channel.ledger.lost.sum() < 4
 
 
 def test_acknowledgements_are_charged() -> None:
-    """A byte for each, to the receiver of the message, who need not have a link of its own."""
-    plain = lossy()
-    told = lossy()
-    degrees = lossy()
-    for channel, lost in ((plain, "keep"), (told, "mutual"), (degrees, "metropolis")):
-        channel.mix(np.zeros((3, 4)), weights.metropolis(STAR), lost=lost)
-    sent = plain.ledger.messages
-    assert charged(plain, scalars=4 * sent, bytes=32 * sent)
-    assert charged(told, messages=2 * sent, scalars=4 * sent, bytes=33 * sent)
-    assert charged(degrees, messages=2 * sent, scalars=5 * sent, bytes=41 * sent)
-    graph = Graph.from_edges(
-        3, [(1, 0), (2, 0), (2, 1)], directed=True
-    )  # 2 is heard by nobody
-    one_way = Channel(graph)
-    one_way.send_on_links(np.zeros((3, 2)), acknowledged=True)
-    assert charged(
-        one_way, messages=[2, 1 + 1, 2], scalars=[4, 2, 0], bytes=[32, 16 + 1, 2]
+    """A message of one byte for each; Metropolis weights need one number more."""
+    channels = {}
+    for on_loss in ("keep", "mutual", "metropolis"):
+        channel = lossy()
+        channel.mix(np.zeros((3, 4)), weights.metropolis(STAR), on_loss=on_loss)
+        channels[on_loss] = channel
+    sent = channels["keep"].ledger.messages
+    assert has_counts(channels["keep"], scalars=4 * sent, bytes=32 * sent)
+    mutual = channels["mutual"]
+    assert has_counts(mutual, messages=2 * sent, scalars=4 * sent, bytes=33 * sent)
+    metropolis = channels["metropolis"]
+    assert has_counts(metropolis, messages=2 * sent, scalars=5 * sent, bytes=41 * sent)
+
+
+def test_acknowledgements_are_charged_to_the_receiver() -> None:
+    """It need not have a link of its own: nobody receives from agent 2."""
+    graph = Graph.from_edges(3, [(1, 0), (2, 0), (2, 1)], directed=True)
+    channel = Channel(graph)
+    channel.send_on_links(np.zeros((3, 2)), acknowledged=True)
+    assert has_counts(
+        channel, messages=[2, 1 + 1, 2], scalars=[4, 2, 0], bytes=[32, 16 + 1, 2]
     )
 
 
+# Delays, silence and windows.
+
+
 @pytest.mark.parametrize("delay", [1, 2])
-def test_late_values_are_those_that_were_sent_and_not_lost_then(delay: int) -> None:
-    """Own values are new; what is on the way stays as it was, and is lost when it is sent."""
+def test_late_values_are_those_of_the_round_of_sending(delay: int) -> None:
+    """Own values are present. A message on its way does not change, and losses are of its round."""
     graph = REFERENCE["ring"]
-    w = of_matrix(graph, np.eye(7) + graph.links.toarray())
+    w = weights_of_matrix(graph, np.eye(7) + graph.links.toarray())
     prompt, late = (
         Channel(graph, faults=Faults(loss=0.5, seed=3, delay=d)) for d in (0, delay)
     )
     values = np.zeros((7, 1))
-    news = []
+    sums = []
     for k in range(delay + 4):
-        values[:] = (10.0 * k + np.arange(7))[
-            :, None
-        ]  # goes on computing in its own array
-        news.append(prompt.mix(values, w, lost="zero") - values)
-        wanted = values + (news[k - delay] if k >= delay else 0.0)
-        assert np.allclose(late.mix(values, w, lost="zero"), wanted, atol=1e-12)
-    assert same_account(prompt, late)
-    for call in (
-        lambda: late.broadcast([np.zeros(1)] * 7),
-        lambda: late.send_on_links(np.zeros((14, 1))),
-    ):
-        with pytest.raises(
-            ValueError, match=f"channel must have no delay here, got {delay} rounds"
-        ):
-            call()
+        # In the same array, which the channel must have copied.
+        values[:, 0] = 10.0 * k + np.arange(7)
+        sums.append(prompt.mix(values, w, on_loss="zero") - values)
+        received = sums[k - delay] if k >= delay else 0.0
+        mixed = late.mix(values, w, on_loss="zero")
+        assert np.allclose(mixed, values + received, atol=1e-12)
+    assert have_equal_counts(prompt, late)
+
+
+def test_only_mix_accepts_a_delay() -> None:
+    channel = Channel(REFERENCE["ring"], faults=Faults(delay=2))
+    text = "^channel must have no delay here, got one of 2 rounds"
+    with pytest.raises(ValueError, match=text):
+        channel.broadcast([np.zeros(1)] * 7)
+    with pytest.raises(ValueError, match=text):
+        channel.send_on_links(np.zeros((14, 1)))
 
 
 def test_delayed_averaging_still_agrees_but_on_another_value() -> None:
+    """With a delay of one round each received value counts twice: when sent and when mixed."""
     values = rng(3).standard_normal((6, 1))
     w = weights.metropolis(graphs.star(6))
     channel = Channel(w.graph, faults=Faults(delay=1))
-    out = channel.mix(values, w, lost="keep", rounds=400)
-    count = 1 + (1 - w.own)
-    assert np.ptp(out) < 1e-9
-    assert abs(out[0, 0] - count @ values[:, 0] / count.sum()) < 1e-9
-    assert abs(out[0, 0] - values.mean()) > 1e-3
+    mixed = channel.mix(values, w, on_loss="keep", rounds=400)
+    assert np.ptp(mixed) < 1e-9
+    count = 1 + (1 - w.self_weights)
+    limit = count @ values[:, 0] / count.sum()
+    assert abs(mixed[0, 0] - limit) < 1e-9
+    assert abs(mixed[0, 0] - values.mean()) > 1e-3
 
 
-def test_silent_agents_neither_send_nor_hear() -> None:
+def test_silent_agents_neither_send_nor_receive() -> None:
     channel = star(faults=Faults(silent=[1]))
-    assert [sorted(box) for box in channel.broadcast(_ONES)] == [[2], [], [0]]
-    assert charged(channel, messages=[1, 0, 1], lost=0)
+    inboxes = channel.broadcast(_ONES)
+    assert [sorted(inbox) for inbox in inboxes] == [[2], [], [0]]
+    assert has_counts(channel, messages=[1, 0, 1], lost=0)
 
 
-def test_windows_follow_the_channel_s_time_or_the_ledger_s_rounds() -> None:
-    timed = Faults(silent=[0], during=[(10.0, 20.0)])
-    for make in (Channel, Channel.construct):
-        got = [
-            len(make(STAR, faults=timed, t=t).broadcast(_ONES)[0])
-            for t in (9.9, 10, 19, 20)
-        ]
-        assert got == [2, 0, 0, 2]
+@pytest.mark.parametrize("make", [Channel, Channel.construct])
+def test_windows_follow_the_channel_s_time(make: type[Channel]) -> None:
+    """From the start of a window to before its end."""
+    faults = Faults(silent=[0], during=[(10.0, 20.0)])
+    counts = []
+    for t in (9.9, 10, 19, 20):
+        channel = make(STAR, faults=faults, t=t)
+        counts.append(len(channel.broadcast(_ONES)[0]))
+    assert counts == [2, 0, 0, 2]
+
+
+def test_windows_follow_the_ledger_s_rounds_without_a_time() -> None:
     channel = star(faults=Faults(loss=1.0, during=[(1, 3), (4, 5)]))
-    assert [len(channel.broadcast(_ONES)[0]) for _ in range(6)] == [2, 0, 0, 2, 0, 2]
-    later = star(faults=Faults(loss=1.0, during=[(1, 3)]), ledger=channel.ledger)
+    counts = [len(channel.broadcast(_ONES)[0]) for _ in range(6)]
+    assert counts == [2, 0, 0, 2, 0, 2]
+    # The count goes on with the ledger, in another channel.
+    faults = Faults(loss=1.0, during=[(1, 3)])
+    later = star(faults=faults, ledger=channel.ledger)
     assert len(later.broadcast(_ONES)[0]) == 2

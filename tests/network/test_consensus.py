@@ -1,4 +1,4 @@
-"""Averages, the maximum, and the minimiser of a sum: what is kept, how fast, and at what cost."""
+"""Averages, the maximum, and the minimiser of a sum: what they keep, how fast, and at what cost."""
 
 from __future__ import annotations
 
@@ -21,212 +21,270 @@ from distfilt.network import (
     graphs,
     weights,
 )
-from distfilt.network.consensus import _distinct
+from distfilt.network.consensus import _drop_repeated
 from tests.network.helpers import (
-    APART,
     DISK,
+    GRID,
     STAR,
+    UNLINKED,
+    each_graph,
     lossy,
-    named,
     random_graph,
     rng,
     star,
 )
+
+# Averaging and its warnings.
 
 
 @given(st.integers(0, 1000), st.integers(2, 7), st.floats(0.01, 1.5))
 def test_averaging_is_steps_against_the_laplacian(
     seed: int, agents: int, gain: float
 ) -> None:
+    """x <- x - γ L x, also with gains that are too large and on graphs of several components."""
     graph = random_graph(seed, agents)
     values = rng(seed).standard_normal((agents, 2))
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # too steep, or in parts
-        after = network.average_consensus(values, Channel(graph), gain=gain, rounds=3)
-    scale = max(1.0, np.abs(after).max())
-    by_hand = values
+        warnings.simplefilter("ignore", RuntimeWarning)
+        averaged = network.average_consensus(
+            values, Channel(graph), gain=gain, rounds=3
+        )
+    expected = values
     for _ in range(3):
-        by_hand = by_hand - gain * graph.laplacian.toarray() @ by_hand
-    assert np.abs(after - by_hand).max() < 1e-12 * scale
+        expected = expected - gain * graph.laplacian.toarray() @ expected
+    scale = max(1.0, np.abs(averaged).max())
+    assert np.abs(averaged - expected).max() < 1e-12 * scale
 
 
-def test_a_gain_beyond_the_bound_warns_once_and_names_both() -> None:
+def test_a_gain_beyond_the_bound_warns_once_with_both_numbers() -> None:
+    """The bound 0 < γ < 1 that is printed elsewhere is wrong: 0.7 diverges on a star of three."""
     values = np.array([[0.0], [3.0], [-1.5]])
-    with pytest.warns(
-        UnstableGain, match=r"gain: 0\.7 is above 2/λ_max = 0\.666667"
-    ) as caught:
-        late = network.average_consensus(values, star(), gain=0.7, rounds=200)
-    assert len(caught) == 1 and caught[0].filename == __file__
-    assert (
-        np.abs(late - values.mean()).max() > 100
-    )  # the printed bound 0 < γ < 1 is wrong
+    text = r"^gain must be at most 2/λ_max = 0\.666667.* got 0\.7"
+    with pytest.warns(UnstableGain, match=text) as caught:
+        averaged = network.average_consensus(values, star(), gain=0.7, rounds=200)
+    assert len(caught) == 1
+    assert caught[0].filename == __file__
+    assert np.abs(averaged - values.mean()).max() > 100
 
 
 @pytest.mark.parametrize(
     "graph", [graphs.path(5), graphs.disk(rng(2).random((250, 2)), 0.15)]
 )
-def test_the_warning_s_edge_and_what_it_costs(graph: Graph) -> None:
-    """No eigenvalue is computed for a gain that degrees clear."""
+def test_the_warning_s_edge_and_its_cost(graph: Graph) -> None:
+    """No eigenvalue is computed for a gain below the bound from degrees."""
     values = np.zeros((graph.n_agents, 1))
-    network.average_consensus(
-        values, Channel(graph), gain=0.99 * graph.degree_bound_gain
-    )
-    assert "max_stable_gain" not in vars(graph) and "spectrum" not in vars(graph)
-    network.average_consensus(
-        values, Channel(graph), gain=graph.max_stable_gain * (1 - 1e-6)
-    )
+    average = partial(network.average_consensus, values, Channel(graph))
+    average(gain=0.99 * graph.degree_bound_gain)
+    assert "max_stable_gain" not in vars(graph)
+    assert "laplacian_spectrum" not in vars(graph)
+    average(gain=graph.max_stable_gain * (1 - 1e-6))
     with pytest.warns(UnstableGain):
-        network.average_consensus(
-            values, Channel(graph), gain=graph.max_stable_gain * (1 + 1e-6)
-        )
+        average(gain=graph.max_stable_gain * (1 + 1e-6))
 
 
-@pytest.mark.parametrize("lost", ["mutual", "metropolis"])
+@pytest.mark.parametrize("on_loss", ["mutual", "metropolis"])
 @given(st.integers(0, 500), st.floats(0, 1))
 def test_mutual_rules_keep_the_average_under_loss(
-    lost: str, seed: int, loss: float
+    on_loss: str, seed: int, loss: float
 ) -> None:
     values = rng(seed).standard_normal((2, DISK.n_agents, 2))
     channel = Channel(DISK, runs=(2,), faults=Faults(loss=loss, seed=seed))
-    after = network.average_consensus(values, channel, rounds=5, lost=lost)
-    assert np.abs(after.mean(axis=-2) - values.mean(axis=-2)).max() < 1e-12
-    assert loss > 0.5 or (np.ptp(after, axis=-2) < np.ptp(values, axis=-2)).all()
+    averaged = network.average_consensus(values, channel, rounds=5, on_loss=on_loss)
+    assert np.abs(averaged.mean(axis=-2) - values.mean(axis=-2)).max() < 1e-12
+    # With few losses the values come closer, too.
+    if loss <= 0.5:
+        assert (np.ptp(averaged, axis=-2) < np.ptp(values, axis=-2)).all()
 
 
-def test_averaging_a_graph_in_parts_warns() -> None:
-    """Each part agrees for itself; one round says nothing, as graphs that change may need it."""
+def test_averaging_on_a_disconnected_graph_warns() -> None:
+    """Each component reaches its own average. One round gives no warning, as graphs may change."""
     graph = Graph.from_adjacency([[0, 1, 0], [1, 0, 0], [0, 0, 0]])
     values = np.array([[0.0], [2.0], [7.0]])
-    with pytest.warns(Disconnected, match="has 2 parts") as caught:
-        after = network.average_consensus(values, Channel(graph), rounds=60)
-    assert np.allclose(after, [[1.0], [1.0], [7.0]])
-    assert len(caught) == 1 and caught[0].filename == __file__
+    with pytest.warns(Disconnected, match="got 2 components") as caught:
+        averaged = network.average_consensus(values, Channel(graph), rounds=60)
+    assert np.allclose(averaged, [[1.0], [1.0], [7.0]])
+    assert len(caught) == 1
+    assert caught[0].filename == __file__
     network.average_consensus(values, Channel(graph))
 
 
-@named
+# The exact average in finite time.
+
+
+@each_graph
 def test_finite_time_is_exact(graph: Graph) -> None:
     values = rng(4).standard_normal((2, graph.n_agents, 2))
     channel = Channel(graph, runs=(2,))
-    after = network.finite_time_consensus(values, channel)
-    assert np.abs(after - values.mean(axis=-2, keepdims=True)).max() < 1e-9
-    assert (
-        graph is DISK
-        or np.abs(after - values.mean(axis=-2, keepdims=True)).max() < 1e-12
-    )
-    assert (
-        channel.ledger.rounds == len(np.unique(graph.laplacian_spectrum.round(9))) - 1
-    )
+    averaged = network.finite_time_consensus(values, channel)
+    error = np.abs(averaged - values.mean(axis=-2, keepdims=True)).max()
+    # The disk graph has thirty different eigenvalues, which cost digits.
+    assert error < (1e-9 if graph is DISK else 1e-12)
+    distinct = np.unique(graph.laplacian_spectrum.round(9))
+    assert channel.ledger.rounds == len(distinct) - 1
 
 
 def test_finite_time_on_many_eigenvalues_needs_leja_s_order() -> None:
-    """A row of forty: ascending and descending orders fail there."""
-    graph = graphs.path(40)
+    """On a row of forty: ascending and descending orders fail there."""
     values = rng(4).standard_normal((40, 1))
-    assert (
-        np.abs(
-            network.finite_time_consensus(values, Channel(graph)) - values.mean()
-        ).max()
-        < 1e-9
-    )
+    averaged = network.finite_time_consensus(values, Channel(graphs.path(40)))
+    assert np.abs(averaged - values.mean()).max() < 1e-9
 
 
 def test_finite_time_needs_every_message() -> None:
-    for channel, why in (
-        (lossy(), "channel must have no faults"),
-        (Channel(APART), "connected"),
-    ):
-        with pytest.raises(ValueError, match=why):
+    cases = ((lossy(), "channel must have no faults"), (Channel(UNLINKED), "connected"))
+    for channel, text in cases:
+        with pytest.raises(ValueError, match=text):
             network.finite_time_consensus(np.zeros((3, 1)), channel)
 
 
-def test_eigenvalues_count_once_whatever_their_scale() -> None:
-    for scale in (1.0, 1e3):
-        values = scale * np.array([1.0, 1.0 + 1e-12, 2.0, 3.0, 3.0])
-        assert np.allclose(_distinct(values), scale * np.array([1.0, 2.0, 3.0]))
-    assert _distinct(np.array([1.0, 1.0 + 1e-6])).size == 2
+@pytest.mark.parametrize("scale", [1.0, 1e3])
+def test_eigenvalues_count_once_at_any_scale(scale: float) -> None:
+    values = scale * np.array([1.0, 1.0 + 1e-12, 2.0, 3.0, 3.0])
+    assert np.allclose(_drop_repeated(values), scale * np.array([1.0, 2.0, 3.0]))
+    assert _drop_repeated(np.array([1.0, 1.0 + 1e-6])).size == 2
 
 
-@named
-def test_push_sum_reaches_the_average_through_heavy_loss(graph: Graph) -> None:
+# Push-sum and digraphs.
+
+
+@each_graph
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+def test_push_sum_reaches_the_average_through_heavy_loss(
+    graph: Graph, loss: float
+) -> None:
     values = 2.16 + rng(2).standard_normal((graph.n_agents, 1))
-    for loss in (0.0, 0.3):
-        channel = lossy(loss, graph)
-        after = network.push_sum(values, channel, rounds=900)
-        assert np.abs(after - values.mean()).max() < 1e-10
-        assert (channel.ledger.scalars == 2 * 900 * graph.out_degree).all()
+    channel = lossy(loss, graph)
+    averaged = network.push_sum(values, channel, rounds=900)
+    assert np.abs(averaged - values.mean()).max() < 1e-10
+    # Value and weight on each link and round.
+    assert (channel.ledger.scalars == 2 * 900 * graph.out_degree).all()
 
 
 def test_averages_on_a_digraph() -> None:
-    graph = Graph.from_edges(4, [(1, 0), (2, 1), (3, 2), (0, 3), (2, 0)], directed=True)
+    edges = [(1, 0), (2, 1), (3, 2), (0, 3), (2, 0)]
+    graph = Graph.from_edges(4, edges, directed=True)
     values = rng(2).standard_normal((5, 4, 2))
-    balanced = partial(
-        network.average_consensus, weights=weights.doubly_stochastic(graph)
-    )
-    for rule in (network.push_sum, balanced):
-        after = rule(values, Channel(graph, runs=(5,)), rounds=400)
-        assert np.abs(after - values.mean(axis=1, keepdims=True)).max() < 1e-12
+    doubly_stochastic = weights.doubly_stochastic(graph)
+    average = partial(network.average_consensus, weights=doubly_stochastic)
+    for rule in (network.push_sum, average):
+        averaged = rule(values, Channel(graph, runs=(5,)), rounds=400)
+        assert np.abs(averaged - values.mean(axis=1, keepdims=True)).max() < 1e-12
 
 
-@named
-def test_maximum_needs_the_diameter(graph: Graph) -> None:
+@each_graph
+def test_the_maximum_needs_the_diameter(graph: Graph) -> None:
     values = rng(4).standard_normal((graph.n_agents, 2))
     channel = Channel(graph)
-    assert (network.max_consensus(values, channel) == values.max(axis=0)).all()
+    largest = values.max(axis=0)
+    assert (network.max_consensus(values, channel) == largest).all()
     assert channel.ledger.rounds == graph.diameter
-    through = network.max_consensus(
-        values, lossy(0.5, graph), rounds=20 * graph.diameter
-    )
-    assert (through == values.max(axis=0)).all()
+    # Losses cost time alone.
+    rounds = 20 * graph.diameter
+    late = network.max_consensus(values, lossy(0.5, graph), rounds=rounds)
+    assert (late == largest).all()
 
 
-_OWN = np.array([[1.0, 4.0], [2.0, -1.0], [6.0, 0.0]])
+# ADMM on a sum of quadratics |u - c_l|² / 2, which the mean of the c_l minimises.
+
+_CENTRES = np.array([[1.0, 4.0], [2.0, -1.0], [6.0, 0.0]])
 _ZERO = np.zeros((3, 2))
 
 
-def _quadratic(v: np.ndarray, rho: float) -> np.ndarray:
-    return (_OWN + rho * v) / (1 + rho)
+def _local_solve(target: np.ndarray, rho: float) -> np.ndarray:
+    return (_CENTRES + rho * target) / (1 + rho)
 
 
-def _by_hand(rho: float, iterations: int) -> list[tuple[float, float]]:
-    """Residuals of every iteration from the printed formulas, with a true average."""
-    z = w = _ZERO
-    out = []
+def _residuals(rho: float, iterations: int) -> list[tuple[float, float]]:
+    """Return residuals of every iteration from the printed formulas, with an exact average."""
+    z = _ZERO
+    w = _ZERO
+    residuals = []
     for _ in range(iterations):
-        u = _quadratic(z - w, rho)
+        u = _local_solve(z - w, rho)
         new = _ZERO + (u + w).mean(axis=0)
         w = w + u - new
-        out.append((float(np.abs(u - new).max()), float(rho * np.abs(new - z).max())))
+        primal = float(np.abs(u - new).max())
+        dual = float(rho * np.abs(new - z).max())
+        residuals.append((primal, dual))
         z = new
-    return out
+    return residuals
 
 
 @pytest.mark.parametrize("rho", [0.05, 0.3, 1.0, 8.0])
-def test_it_stops_as_soon_as_both_residuals_are_below_the_tolerance(rho: float) -> None:
+def test_admm_stops_once_both_residuals_are_below_the_tolerance(rho: float) -> None:
     """Both residuals, the dual one with its ρ: each is the last to fall for some ρ.
 
     The decision is paid for: rounds of averaging, and of the maximum of two numbers, which take
     the diameter each.
     """
-    series = _by_hand(rho, 600)
-    channel = star()
+    series = _residuals(rho, 600)
     tolerance = 1e-4
-    run = network.admm(_quadratic, _ZERO, channel, rho=rho, tolerance=tolerance)
-    n = run.iterations
-    assert n == next(
-        k for k, pair in enumerate(series, start=1) if max(pair) < tolerance
-    )
-    assert np.allclose((run.primal, run.dual), series[n - 1], rtol=1e-6, atol=1e-12)
-    assert np.abs(run.common - _OWN.mean(axis=0)).max() < 1e-3
-    assert channel.ledger.rounds == 2 * n + 2 * n
-    assert (channel.ledger.scalars == (2 * 2 * n + 2 * 2 * n) * STAR.out_degree).all()
+    below = [max(pair) < tolerance for pair in series]
+    first = below.index(True) + 1
+    channel = star()
+    result = network.admm(_local_solve, _ZERO, channel, rho=rho, tolerance=tolerance)
+    assert result.iterations == first
+    residuals = (result.primal, result.dual)
+    assert np.allclose(residuals, series[first - 1], rtol=1e-6, atol=1e-12)
+    assert np.abs(result.common - _CENTRES.mean(axis=0)).max() < 1e-3
+    # Two rounds for the average of 2 numbers and two for the maximum of 2, in each iteration.
+    assert channel.ledger.rounds == 2 * first + 2 * first
+    scalars = 2 * 2 * first + 2 * 2 * first
+    assert (channel.ledger.scalars == scalars * STAR.out_degree).all()
 
 
-def test_it_says_when_it_stops_short_and_needs_every_message() -> None:
-    primal, dual = _by_hand(1.0, 2)[-1]
-    with pytest.raises(
-        SolverError, match=f"{primal:.3g} and {dual:.3g} after 2 iterations"
-    ):
-        network.admm(_quadratic, _ZERO, star(), iterations=2)
+def test_admm_reports_residuals_and_needs_every_message() -> None:
+    primal, dual = _residuals(1.0, 2)[-1]
+    text = f"{primal:.3g} and {dual:.3g} after 2 iterations"
+    with pytest.raises(SolverError, match=text):
+        network.admm(_local_solve, _ZERO, star(), iterations=2)
     with pytest.raises(ValueError, match="channel must have no faults"):
-        network.admm(_quadratic, _ZERO, lossy(), average=network.average_consensus)
+        average = network.average_consensus
+        network.admm(_local_solve, _ZERO, lossy(), average=average)
+
+
+def test_user_functions_of_admm_call_the_library_with_checks() -> None:
+    """A wrong argument of a nested call is refused, although the outer call is checked."""
+
+    def average(values: np.ndarray, channel: Channel) -> np.ndarray:
+        return network.average_consensus(values, channel, gain=-1.0)
+
+    with pytest.raises(ValueError, match="^gain must be positive, got -1.0"):
+        network.admm(_local_solve, _ZERO, star(), average=average)
+
+
+# Symmetries of all rules that need no random numbers.
+
+RULES = {
+    "average": partial(network.average_consensus, rounds=3),
+    "push-sum": partial(network.push_sum, rounds=3),
+    "maximum": partial(network.max_consensus, rounds=2),
+    "events": partial(network.event_triggered, rounds=4, threshold=0.5),
+    "flooding": lambda values, channel: network.flooding(values, channel, rounds=2)[0],
+    "finite time": network.finite_time_consensus,
+}
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_the_agents_order_does_not_matter(name: str) -> None:
+    """With other numbers the same agents reach the same values and send as much."""
+    values = rng(1).standard_normal((GRID.n_agents, 2))
+    order = rng(2).permutation(GRID.n_agents)
+    permuted = Graph.from_adjacency(GRID.links.toarray()[np.ix_(order, order)])
+    channel = Channel(GRID)
+    other = Channel(permuted)
+    result = RULES[name](values, channel)
+    other_result = RULES[name](values[order], other)
+    assert np.abs(result[order] - other_result).max() < 1e-9
+    assert (channel.ledger.scalars[order] == other.ledger.scalars).all()
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_units_do_not_matter(name: str) -> None:
+    """Rules are homogeneous; a threshold is scaled with the values."""
+    values = rng(1).standard_normal((GRID.n_agents, 2))
+    result = RULES[name](values, Channel(GRID))
+    options = {"threshold": 0.5e5} if name == "events" else {}
+    scaled = RULES[name](1e5 * values, Channel(GRID), **options)
+    tolerance = 1e-9 if name == "finite time" else 1e-12
+    assert np.allclose(scaled, 1e5 * result, rtol=tolerance)

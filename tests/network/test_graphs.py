@@ -1,4 +1,4 @@
-"""Graphs: their making, spectra, hops, and what describes one."""
+"""Graphs: shapes, spectra, hops, gains from degrees, and descriptions of graphs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import sparse
 from scipy.sparse.csgraph import shortest_path
 
-from distfilt.network import Graph, graphs
+from distfilt.network import Channel, Graph, graphs
 from distfilt.network.graphs import as_graph
 from tests.network.helpers import DISK, random_graph, rng
 
@@ -25,74 +25,84 @@ SHAPES = {
     "complete": (graphs.complete(12), nx.complete_graph(12)),
     "disk": (DISK, nx.Graph(DISK.links.toarray())),
 }
+# More agents than the dense solver is used for.
+LARGE = {
+    "ring": graphs.ring(301),
+    "path": graphs.path(400),
+    "star": graphs.star(300),
+    "complete": graphs.complete(250),
+    "disk": graphs.disk(rng(1).random((500, 2)), 0.1),
+}
 
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_shapes_and_spectra_are_networkx_s(name: str) -> None:
-    graph, theirs = SHAPES[name]
-    assert (graph.links.toarray() == nx.to_numpy_array(theirs)).all()
-    assert graph.diameter == nx.diameter(theirs)
+    graph, reference = SHAPES[name]
+    assert (graph.links.toarray() == nx.to_numpy_array(reference)).all()
+    assert graph.diameter == nx.diameter(reference)
     if graph.n_agents > 1:
-        assert np.allclose(
-            graph.laplacian_spectrum, np.sort(nx.laplacian_spectrum(theirs)), atol=1e-10
-        )
-        assert np.isclose(
-            graph.max_stable_gain, 2 / graph.laplacian_spectrum[-1], rtol=1e-9
-        )
+        spectrum = np.sort(nx.laplacian_spectrum(reference))
+        assert np.allclose(graph.laplacian_spectrum, spectrum, atol=1e-10)
+        gain = 2 / graph.laplacian_spectrum[-1]
+        assert np.isclose(graph.max_stable_gain, gain, rtol=1e-9)
 
 
-def test_sparse_and_dense_ends_of_the_spectrum_agree() -> None:
-    for other in (
-        graphs.ring(301),
-        graphs.path(400),
-        graphs.star(300),
-        graphs.complete(250),
-        graphs.disk(rng(1).random((500, 2)), 0.1),
-    ):
-        assert np.isclose(
-            other.max_stable_gain, 2 / other.laplacian_spectrum[-1], rtol=1e-9
-        )
+@pytest.mark.parametrize("graph", LARGE.values(), ids=LARGE.keys())
+def test_sparse_and_dense_solvers_agree(graph: Graph) -> None:
+    gain = 2 / graph.laplacian_spectrum[-1]
+    assert np.isclose(graph.max_stable_gain, gain, rtol=1e-9)
 
 
 @given(st.integers(0, 1000), st.integers(1, 10), st.booleans())
-def test_links_laplacian_and_hops_by_their_definition(
+def test_links_and_laplacian_by_their_definition(
     seed: int, agents: int, directed: bool
 ) -> None:
     graph = random_graph(seed, agents, directed=directed)
     dense = graph.links.toarray()
-    assert (graph.laplacian.toarray() == np.diag(dense.sum(axis=1)) - dense).all()
-    assert (graph.out_degree == dense.sum(axis=0)).all() and (
-        graph.in_degree == dense.sum(1)
-    ).all()
-    assert (graph.incidence @ np.ones(graph.senders.size) == graph.in_degree).all()
+    degrees = dense.sum(axis=1)
+    assert (graph.laplacian.toarray() == np.diag(degrees) - dense).all()
+    assert (graph.in_degree == degrees).all()
+    assert (graph.out_degree == dense.sum(axis=0)).all()
+    # Each row of the incidence matrix counts the links that end at its agent.
+    assert (graph.incidence @ np.ones(graph.senders.size) == degrees).all()
+    for agent in range(agents):
+        assert graph.neighbours(agent) == tuple(np.flatnonzero(dense[agent]))
     if not graph.directed:
+        # The opposite link has receiver and sender exchanged.
         assert (graph.receivers[graph.reverse] == graph.senders).all()
         assert (graph.senders[graph.reverse] == graph.receivers).all()
-    # links[i, j] carries news from j to i.
-    away = shortest_path(graph.links.T, unweighted=True)
+
+
+@given(st.integers(0, 1000), st.integers(1, 10), st.booleans())
+def test_hops_are_scipy_s_shortest_paths(
+    seed: int, agents: int, directed: bool
+) -> None:
+    graph = random_graph(seed, agents, directed=directed)
+    # links[i, j] leads from j to i, against scipy's convention.
+    distances = shortest_path(graph.links.T, unweighted=True)
+    reachable = np.isfinite(distances)
+    expected = np.where(reachable, distances, -1)
     for agent in range(agents):
-        assert (
-            graph.hops(agent) == np.where(np.isinf(away[agent]), -1, away[agent])
-        ).all()
-        assert graph.neighbours(agent) == tuple(np.flatnonzero(dense[agent]))
-    assert graph.connected == np.isfinite(away).all()
+        assert (graph.hops(agent) == expected[agent]).all()
+    assert graph.connected == reachable.all()
     if graph.connected:
-        assert graph.diameter == away.max()
+        assert graph.diameter == distances.max()
 
 
 @given(st.integers(0, 1000), st.integers(1, 9), st.booleans())
-def test_a_gain_from_degrees_is_safe(seed: int, agents: int, directed: bool) -> None:
-    """Below the bound every mode but the average shrinks; at 1.001 times the limit one grows."""
+def test_a_gain_from_degrees_is_stable(seed: int, agents: int, directed: bool) -> None:
+    """Below the bound every mode but the average shrinks; at 1.001 times it one grows."""
     graph = random_graph(seed, agents, directed=directed)
-    safe = graph.degree_bound_gain
+    bound = graph.degree_bound_gain
     limit = graph.max_stable_gain
-    assert safe <= limit * (1 + 1e-9)
-    values = np.linalg.eigvals(graph.laplacian.toarray())
-    moving = values[np.abs(values) > 1e-8]
+    assert bound <= limit * (1 + 1e-9)
+    assert graph.senders.size or bound == limit == float("inf")
+    eigenvalues = np.linalg.eigvals(graph.laplacian.toarray())
+    moving = eigenvalues[np.abs(eigenvalues) > 1e-8]
     if moving.size:
-        below, above = (np.abs(1 - f * limit * moving).max() for f in (0.999, 1.001))
-        assert below < 1 < above
-    assert graph.senders.size or safe == limit == float("inf")
+        # A mode of eigenvalue λ is multiplied by 1 - γ λ in each round.
+        assert np.abs(1 - 0.999 * limit * moving).max() < 1
+        assert np.abs(1 - 1.001 * limit * moving).max() > 1
 
 
 def test_the_degree_bound_is_exact_for_stars_and_even_rings() -> None:
@@ -102,36 +112,54 @@ def test_the_degree_bound_is_exact_for_stars_and_even_rings() -> None:
 
 @given(st.integers(0, 1000), st.integers(1, 40), st.floats(0.05, 1.0))
 def test_disk_links_are_the_close_pairs(seed: int, agents: int, radius: float) -> None:
-    places = rng(seed).random((agents, 2))
-    gaps = np.linalg.norm(places[:, None] - places[None], axis=-1)
-    wanted = (gaps <= radius) & ~np.eye(agents, dtype=bool)
-    assert (graphs.disk(places, radius).links.toarray() == wanted).all()
+    positions = rng(seed).random((agents, 2))
+    differences = positions[:, None] - positions[None]
+    close = np.linalg.norm(differences, axis=-1) <= radius
+    expected = close & ~np.eye(agents, dtype=bool)
+    assert (graphs.disk(positions, radius).links.toarray() == expected).all()
 
 
-def test_edges_count_once_and_run_from_speaker_to_listener() -> None:
-    for edges in ([(0, 1), (1, 2)], [(0, 1), (1, 0), (2, 1), (1, 2), (0, 1)]):
+def test_edges_count_once_and_run_from_sender_to_receiver() -> None:
+    repeated = [(0, 1), (1, 0), (2, 1), (1, 2), (0, 1)]
+    for edges in ([(0, 1), (1, 2)], repeated):
         assert (Graph.from_edges(3, edges).links != graphs.path(3).links).nnz == 0
+    # Agent 2 receives from nobody.
     one_way = Graph.from_edges(3, [(0, 1), (1, 2)], directed=True)
-    assert one_way.directed and one_way.neighbours(2) == ()
-    named = Graph.from_networkx(nx.DiGraph([("camera", "screen"), ("screen", "log")]))
-    assert named.directed and named.neighbours(1) == (0,) and named.neighbours(0) == ()
-    assert (
-        Graph.from_networkx(nx.MultiGraph([(5, 7), (5, 7), (7, 9)])).senders.size == 4
-    )
+    assert one_way.directed
+    assert one_way.neighbours(2) == ()
+
+
+def test_graphs_of_networkx_keep_their_labels_or_their_order() -> None:
+    # In the order of the nodes: camera 0, screen 1, log 2; from sender to receiver.
+    digraph = nx.DiGraph([("camera", "screen"), ("screen", "log")])
+    graph = Graph.from_networkx(digraph)
+    assert graph.directed
+    assert graph.neighbours(0) == ()
+    assert graph.neighbours(1) == (0,)
+    # Parallel edges count once.
+    parallel = nx.MultiGraph([(5, 7), (5, 7), (7, 9)])
+    assert Graph.from_networkx(parallel).senders.size == 4
+    # Labels that are numbers, or names of agents, count before the order.
     for a, b, c in ((0, 1, 2), "abc"):
         assert as_graph(nx.Graph([(c, a), (a, b)]), 3, "abc").neighbours(0) == (1, 2)
-    with pytest.raises(
-        ValueError, match=r"graph must be the nodes \['a', 'b', 'c'\], got"
-    ):
+    expected = r"graph must have the nodes \['a', 'b', 'c'\], got"
+    with pytest.raises(ValueError, match=expected):
         as_graph(nx.path_graph(["a", "b", "d"]), 3, "abc")
 
 
+def test_a_graph_of_networkx_without_nodes_is_refused() -> None:
+    """Also inside a function that has checked its arguments already."""
+    for make in (Graph.from_networkx, Channel):
+        with pytest.raises(ValueError, match="^graph must have at least one node"):
+            make(nx.Graph())
+
+
 @given(st.integers(0, 1000), st.integers(1, 8))
-def test_a_graph_is_read_from_what_describes_it(seed: int, agents: int) -> None:
+def test_a_graph_from_each_of_its_descriptions(seed: int, agents: int) -> None:
     graph = random_graph(seed, agents)
     dense = graph.links.toarray()
     edges = np.argwhere(np.triu(dense))
-    forms = [
+    descriptions = [
         graph,
         nx.Graph(dense),
         nx.DiGraph(dense),
@@ -144,20 +172,22 @@ def test_a_graph_is_read_from_what_describes_it(seed: int, agents: int) -> None:
         edges,
         edges.tolist(),
     ]
-    for value in forms:
-        assert (as_graph(value, agents).links != graph.links).nnz == 0
-    assert (
-        as_graph([(0, 1), (1, 0)]).n_agents == 2
-        and as_graph([(0, 1), (1, 2)]).n_agents == 3
-    )
+    for description in descriptions:
+        assert (as_graph(description, agents).links != graph.links).nnz == 0
+
+
+def test_two_edges_are_no_matrix_of_two_agents() -> None:
+    assert as_graph([(0, 1), (1, 0)]).n_agents == 2
+    assert as_graph([(0, 1), (1, 2)]).n_agents == 3
+    # With three agents (0, 1) and (1, 0) are edges, and the third has no links.
     assert as_graph([(0, 1), (1, 0)], 3).in_degree.tolist() == [1.0, 1.0, 0.0]
 
 
-def test_what_describes_no_graph_is_refused_with_the_ways_to_make_one() -> None:
-    refused = {
+def test_wrong_descriptions_are_refused_with_the_way_to_mend_them() -> None:
+    wrong = {
         "both ways .*directed=True.* one way only between 0 and 1": np.eye(3, k=-1),
-        "a graph of 3 agents, got 4": graphs.path(4),
+        "have 3 agents, got 4": graphs.path(4),
     }
-    for text, value in refused.items():
-        with pytest.raises(ValueError, match=f"graph must .*{text}"):
+    for text, value in wrong.items():
+        with pytest.raises(ValueError, match=f"^graph must .*{text}"):
             as_graph(value, 3)

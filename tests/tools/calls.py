@@ -26,7 +26,11 @@ def describe(thing: Any) -> dict[str, Any]:
     """Return the kinds that a validated function or a frozen model declares, by argument."""
     if inspect.isclass(thing):
         return frozen.field_constraints(thing) if issubclass(thing, FrozenModel) else {}
-    return dict(thing.signature_constraints.constraints) if hasattr(thing, "signature_constraints") else {}
+    return (
+        dict(thing.signature_constraints.constraints)
+        if hasattr(thing, "signature_constraints")
+        else {}
+    )
 
 
 @dataclass
@@ -149,7 +153,11 @@ def _modules(thing: Any) -> Iterator[ModuleType]:
 
 def calls(thing: Any, function: Callable[..., Any]) -> list[Call]:
     """Return recorded calls of a function, a constructor or a method of the public `thing`."""
-    key = function if inspect.isclass(function) else function.signature_constraints.function  # type: ignore[attr-defined]
+    key = (
+        function
+        if inspect.isclass(function)
+        else function.signature_constraints.function
+    )  # type: ignore[attr-defined]
     for module in _modules(thing):
         _run_examples(module)
         if RECORDER.calls.get(key):

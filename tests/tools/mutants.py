@@ -1,20 +1,20 @@
-"""How many random faults in the library do its tests find?
+"""Count the random mutations of the library that its tests detect.
 
     python tests/tools/mutants.py [--sample 300] [--seed 1] [--jobs 2] [--only network]
         [--minutes 30]
 
-cosmic-ray lists the places where the library's code can be changed (an operator, a comparison, a
-number, a keyword) and makes the change; a seeded sample of places is drawn, and one change at each.
-The draw looks at a place's own line, so that most of a sample stays when other code changes.
-A mutant is tested in two stages: by the file that mirrors the module and the module's own examples,
-then by every test that runs the changed line, but for those of the book (the suite runs once with a
-tracer for that; a line that runs on import only is tested by what runs its function or module). It
-survives if all pass. A change of a type or a text only is no fault and is not drawn.
+cosmic-ray lists the positions where code can be mutated (an operator, a comparison, a number, a
+keyword) and makes the change. A seeded sample of positions is drawn, with one change at each. The
+draw depends on the text of the line, so that most of a sample stays when other code changes. A
+mutant is tested in two stages: by the examples of its module and the test file of the same name,
+then by every test outside tests/book that runs the changed line. The suite runs once with coverage
+for that; a line that runs only on import is tested by the tests of its function or module. A mutant
+survives if all pass. Changes of types or docstrings are not drawn.
 
-Writes ``data/bench/mutants.csv``, a line a mutant. A survivor that is equivalent to the original
-gets a reason there by hand, which a later run of the same mutant keeps; the share of the others is
-the result. With ``--minutes`` the run ends after that time, and the next one goes on: a mutant in
-the table is not run again. Each job works in a copy of the repository.
+Writes ``data/bench/mutants.csv``, a line a mutant. If a survivor is equivalent to the original
+code, write the reason there by hand; later runs of the same mutant keep it. The result is the
+fraction killed of the other mutants. With ``--minutes`` the run ends after that time, and the next
+run continues. Each job works in a copy of the repository.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ ROOT = Path(__file__).resolve().parents[2]
 TABLE = ROOT / "data" / "bench" / "mutants.csv"
 COLUMNS = ("module", "line", "was", "becomes", "result", "stage", "seconds", "reason")
 SECONDS = (120, 400)
-"""What the tests of each stage may take; a mutant that takes longer hangs, and so is found."""
+"""Time limit of each stage, in seconds; a mutant that takes longer counts as killed."""
 EVERY = (
     "distfilt",
     "tests",
@@ -56,7 +56,7 @@ EVERY = (
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change at one place."""
+    """One change at one position."""
 
     module: str
     operator: str
@@ -65,7 +65,7 @@ class Mutant:
     column: int
 
     def source(self, text: str) -> str:
-        """The module's text with the change."""
+        """Return the module's text with the change."""
         from cosmic_ray.mutating import mutate_code
         from cosmic_ray.plugins import get_operator
 
@@ -73,7 +73,7 @@ class Mutant:
 
 
 def mutants(root: Path, only: str) -> Iterator[Mutant]:
-    """Every change that an operator without set-up can make to the library's modules."""
+    """Yield every change that an operator without parameters can make to the library."""
     from cosmic_ray.ast import ast_nodes, get_ast
     from cosmic_ray.plugins import get_operator, operator_names
 
@@ -93,7 +93,7 @@ def mutants(root: Path, only: str) -> Iterator[Mutant]:
 
 
 def meaning(text: str) -> str:
-    """What a module's text does: its syntax tree without types and docstrings."""
+    """Return a module's syntax tree without types and docstrings, as text."""
     tree = ast.parse(text)
     for node in ast.walk(tree):
         for name in ("annotation", "returns"):
@@ -107,43 +107,45 @@ def meaning(text: str) -> str:
 
 
 def keys(places: list[tuple[str, int, int]], root: Path, seed: int) -> dict[Any, str]:
-    """A place's number in the lottery, from its line's text: it stays when other code changes."""
-    out = {}
-    seen = Counter[str]()
+    """Return a random number for each position, which depends on the text of its line only."""
+    hashes = {}
+    counts = Counter[str]()
     lines = dict[str, list[str]]()
     for module, line, column in sorted(places):
         if module not in lines:
             lines[module] = (root / module).read_text(encoding="utf-8").splitlines()
         text = f"{seed} {module} {lines[module][line - 1].strip()} {column}"
-        seen[text] += 1
-        out[module, line, column] = sha256(f"{text} {seen[text]}".encode()).hexdigest()
-    return out
+        counts[text] += 1
+        hashes[module, line, column] = sha256(
+            f"{text} {counts[text]}".encode()
+        ).hexdigest()
+    return hashes
 
 
-def drawn(root: Path, size: int, seed: int, only: str) -> list[Mutant]:
-    """A sample of places, and one change at each, that is a change of what the code does."""
+def draw_sample(root: Path, size: int, seed: int, only: str) -> list[Mutant]:
+    """Draw positions and one change at each that changes the syntax tree."""
     places: dict[tuple[str, int, int], list[Mutant]] = {}
     for mutant in mutants(root, only):
         places.setdefault((mutant.module, mutant.line, mutant.column), []).append(
             mutant
         )
     numbers = keys(list(places), root, seed)
-    out: list[Mutant] = []
+    sample: list[Mutant] = []
     for place in sorted(places, key=numbers.__getitem__):
-        if len(out) == size:
+        if len(sample) == size:
             break
         mutant = random.Random(numbers[place]).choice(places[place])
         text = (root / mutant.module).read_text(encoding="utf-8")
         try:
             if meaning(mutant.source(text)) != meaning(text):
-                out.append(mutant)
+                sample.append(mutant)
         except SyntaxError:
             continue
-    return out
+    return sample
 
 
 def nearest(module: str, root: Path) -> list[str]:
-    """The module's own examples, the file of tests that mirrors it, and what holds for all."""
+    """Return the tests of the first stage: examples, the module's test file, validation."""
     parts = Path(module).with_suffix("").parts[1:]
     name = f"test_{parts[-1].lstrip('_')}.py"
     mirrors = [
@@ -151,12 +153,12 @@ def nearest(module: str, root: Path) -> list[str]:
         root / "tests" / f"test_{parts[0]}.py",
     ]
     options = [p for p in (root / "tests" / "test_validation.py",) if p.is_file()]
-    near = [*[p for p in mirrors if p.is_file()][:1], *options]
-    return [module, *(p.relative_to(root).as_posix() for p in near)]
+    names = [*[p for p in mirrors if p.is_file()][:1], *options]
+    return [module, *(p.relative_to(root).as_posix() for p in names)]
 
 
-def traced(root: Path, jobs: int) -> Any:
-    """Which tests run which lines: the stored trace of the suite, or a new one."""
+def trace_tests(root: Path, jobs: int) -> Any:
+    """Return which tests run which lines, from the stored trace of the suite or a new one."""
     from coverage import CoverageData
 
     path = root / "_build" / "lines.coverage"
@@ -196,23 +198,23 @@ def traced(root: Path, jobs: int) -> Any:
 
 
 def running(contexts: dict[int, list[str]], text: str, line: int) -> list[str]:
-    """The tests that run a line's statement, else its function, else its module."""
+    """Return the tests that run a line's statement, else its function, else its module."""
     nodes = [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.stmt)]
     spans = [(n.lineno, n.end_lineno or n.lineno) for n in nodes]
-    around = [(a, b) for a, b in spans if a <= line <= b]
+    enclosing = [(a, b) for a, b in spans if a <= line <= b]
     for first, last in (
-        *sorted(around, key=lambda s: s[1] - s[0]),
+        *sorted(enclosing, key=lambda s: s[1] - s[0]),
         (1, text.count("\n") + 1),
     ):
-        found = {c for n in range(first, last + 1) for c in contexts.get(n, ()) if c}
-        if found:
+        tests = {c for n in range(first, last + 1) for c in contexts.get(n, ()) if c}
+        if tests:
             # Without the parameters, whose names may come from the library.
-            return sorted({c.rpartition("|")[0].partition("[")[0] for c in found})
+            return sorted({c.rpartition("|")[0].partition("[")[0] for c in tests})
     return []
 
 
 def passes(tests: list[str], folder: Path, seconds: float) -> bool:
-    """Whether the tests pass in a copy, in time."""
+    """Return whether the tests pass in a copy within the time limit."""
     command = [
         sys.executable,
         "-B",
@@ -243,8 +245,8 @@ def passes(tests: list[str], folder: Path, seconds: float) -> bool:
         child.wait()
 
 
-def described(mutant: Mutant, root: Path) -> dict[str, Any]:
-    """The line of the table for a mutant that was not run."""
+def describe(mutant: Mutant, root: Path) -> dict[str, Any]:
+    """Return the line of the table for a mutant that has not run."""
     text = (root / mutant.module).read_text(encoding="utf-8")
     pairs = zip(text.splitlines(), mutant.source(text).splitlines(), strict=False)
     was, becomes = next((a.strip(), b.strip()) for a, b in pairs if a != b)
@@ -258,30 +260,30 @@ def described(mutant: Mutant, root: Path) -> dict[str, Any]:
     }
 
 
-def tested(
+def run_mutant(
     mutant: Mutant, stages: list[list[str]], free: SimpleQueue[Path]
 ) -> dict[str, Any]:
-    """What became of one mutant, in a copy that no other one is using."""
+    """Test one mutant in a free copy of the repository; return its result."""
     folder = free.get()
     path = folder / mutant.module
     text = path.read_text(encoding="utf-8")
-    found: dict[str, Any] = {"result": "survived"}
-    began = time.perf_counter()
+    result: dict[str, Any] = {"result": "survived"}
+    started = time.perf_counter()
     path.write_text(mutant.source(text), encoding="utf-8")
     try:
         for stage, names in enumerate(stages, start=1):
-            found["stage"] = stage
+            result["stage"] = stage
             if names and not passes(names, folder, SECONDS[stage - 1]):
-                found["result"] = "killed"
+                result["result"] = "killed"
                 break
     finally:
         path.write_text(text, encoding="utf-8")
         free.put(folder)
-    return found | {"seconds": f"{time.perf_counter() - began:.0f}"}
+    return result | {"seconds": f"{time.perf_counter() - started:.0f}"}
 
 
 def stages(mutant: Mutant, root: Path, trace: Any) -> list[list[str]]:
-    """The tests of both stages."""
+    """Return the tests of both stages."""
     path = root / mutant.module
     lines = trace.contexts_by_lineno(str(path))
     text = path.read_text(encoding="utf-8")
@@ -291,20 +293,21 @@ def stages(mutant: Mutant, root: Path, trace: Any) -> list[list[str]]:
 def run(
     rows: list[tuple[Mutant, dict[str, Any]]], root: Path, jobs: int
 ) -> Iterator[None]:
-    """Complete the rows, each job with a copy of the repository; yields after each one."""
-    trace = traced(root, jobs)
+    """Run mutants and complete their rows, each job in a copy; yield after each one."""
+    trace = trace_tests(root, jobs)
     left_out = shutil.ignore_patterns(
         ".git", ".venv", "_build", "__pycache__", ".*_cache"
     )
     free: SimpleQueue[Path] = SimpleQueue()
     with (
-        tempfile.TemporaryDirectory(prefix="mutants-") as own,
+        tempfile.TemporaryDirectory(prefix="mutants-") as scratch,
         ThreadPoolExecutor(jobs) as pool,
     ):
         for k in range(jobs):
-            free.put(shutil.copytree(root, Path(own) / str(k), ignore=left_out))
+            free.put(shutil.copytree(root, Path(scratch) / str(k), ignore=left_out))
         waiting = {
-            pool.submit(tested, m, stages(m, root, trace), free): row for m, row in rows
+            pool.submit(run_mutant, m, stages(m, root, trace), free): row
+            for m, row in rows
         }
         try:
             for future in as_completed(waiting):
@@ -317,16 +320,16 @@ def run(
             pool.shutdown(cancel_futures=True)
 
 
-def known(table: Path) -> dict[tuple[str, str, str], dict[str, Any]]:
-    """The lines of an earlier run, by module and change."""
+def read_table(table: Path) -> dict[tuple[str, str, str], dict[str, Any]]:
+    """Return the lines of an earlier run, by module and change."""
     if not table.is_file():
         return {}
     rows = pandas.read_csv(table, dtype=str, keep_default_na=False).to_dict("records")
     return {(r["module"], r["was"], r["becomes"]): r for r in rows}
 
 
-def stored(rows: list[dict[str, Any]], table: Path) -> None:
-    """Write the table; in one step, so that a run that is ended leaves a whole one."""
+def write_table(rows: list[dict[str, Any]], table: Path) -> None:
+    """Write the table in one step, so that an interrupted run leaves a complete one."""
     table.parent.mkdir(parents=True, exist_ok=True)
     part = table.with_suffix(".part")
     pandas.DataFrame(rows, columns=COLUMNS).to_csv(
@@ -339,9 +342,9 @@ def main(
     arguments: list[str] | None = None, root: Path = ROOT, table: Path = TABLE
 ) -> int:
     parser = argparse.ArgumentParser(
-        description="Random faults, and whether the tests find them."
+        description="Count random mutations that the tests detect."
     )
-    parser.add_argument("--sample", type=int, default=300, help="how many places")
+    parser.add_argument("--sample", type=int, default=300, help="number of positions")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--only", default="", help="a folder or module of the library")
@@ -349,19 +352,19 @@ def main(
         "--minutes", type=float, default=1e6, help="when to stop for now"
     )
     options = parser.parse_args(arguments)
-    before = known(table)
-    chosen = drawn(root, options.sample, options.seed, options.only)
+    earlier = read_table(table)
+    chosen = draw_sample(root, options.sample, options.seed, options.only)
     pairs = []
     for mutant in chosen:
-        row = described(mutant, root)
-        old = before.get((row["module"], row["was"], row["becomes"]), {})
+        row = describe(mutant, root)
+        old = earlier.get((row["module"], row["was"], row["becomes"]), {})
         pairs.append((mutant, row | {n: old[n] for n in COLUMNS[4:] if n in old}))
     waiting = [(m, row) for m, row in pairs if not row["result"]]
     rows = [row for _, row in pairs]
     end = time.monotonic() + 60 * options.minutes
-    stored(rows, table)
+    write_table(rows, table)
     for _ in run(waiting, root, options.jobs) if waiting else ():
-        stored(rows, table)
+        write_table(rows, table)
         if time.monotonic() > end:
             break
     ran = [row for row in rows if row["result"]]
@@ -369,7 +372,7 @@ def main(
     equivalent = sum(row["result"] == "survived" and bool(row["reason"]) for row in ran)
     share = killed / max(len(ran) - equivalent, 1)
     print(
-        f"{killed} of {len(ran)} killed, {equivalent} equivalent: {share:.1%} of the others"
+        f"{killed} of {len(ran)} killed, {equivalent} equivalent: {share:.1%} of the other mutants"
     )
     return 0
 

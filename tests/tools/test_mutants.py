@@ -1,4 +1,4 @@
-"""The sampler of faults: what it draws is a fault, is told apart, and leaves the copy as it was."""
+"""The mutation tool: it draws changes of behaviour, tests them, and restores the copy."""
 
 from __future__ import annotations
 
@@ -46,26 +46,28 @@ def repository(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_types_and_texts_are_no_faults(repository: Path) -> None:
+def test_changes_of_types_and_docstrings_are_not_drawn(repository: Path) -> None:
     same = LIBRARY.replace("int | None", "int & None").replace("Half.", "Whole.")
     assert mutants.meaning(same) == mutants.meaning(LIBRARY)
     assert mutants.meaning(
         LIBRARY.replace("x / scale", "x * scale")
     ) != mutants.meaning(LIBRARY)
-    for mutant in mutants.drawn(repository, 50, 3, ""):
-        made = mutant.source(LIBRARY)
-        assert mutants.meaning(made) != mutants.meaning(LIBRARY)
+    for mutant in mutants.draw_sample(repository, 50, 3, ""):
+        mutated = mutant.source(LIBRARY)
+        assert mutants.meaning(mutated) != mutants.meaning(LIBRARY)
 
 
-def test_a_sample_is_the_seed_s_and_has_one_change_a_place(repository: Path) -> None:
-    found = mutants.drawn(repository, 50, 3, "")
-    assert found == mutants.drawn(repository, 50, 3, "") and len(found) >= 4
-    assert len({(m.line, m.column) for m in found}) == len(found)
-    assert mutants.drawn(repository, 2, 3, "") == found[:2]
-    assert mutants.drawn(repository, 50, 3, "other") == []
+def test_a_sample_depends_on_the_seed_and_has_one_change_a_position(
+    repository: Path,
+) -> None:
+    sample = mutants.draw_sample(repository, 50, 3, "")
+    assert sample == mutants.draw_sample(repository, 50, 3, "") and len(sample) >= 4
+    assert len({(m.line, m.column) for m in sample}) == len(sample)
+    assert mutants.draw_sample(repository, 2, 3, "") == sample[:2]
+    assert mutants.draw_sample(repository, 50, 3, "other") == []
 
 
-def test_a_line_is_tested_by_what_runs_its_statement_or_function_or_module() -> None:
+def test_tests_of_a_line_run_its_statement_or_function_or_module() -> None:
     text = "A = (\n    1\n)\n\ndef f(x,\n      y=2):\n    z = (x +\n         y)\n    return z\n"
     contexts = {
         1: [""],
@@ -81,7 +83,7 @@ def test_a_line_is_tested_by_what_runs_its_statement_or_function_or_module() -> 
 
 
 def run(repository: Path, table: Path, *options: str) -> str:
-    """The tool in a process of its own, on that repository."""
+    """Run the tool in a separate process, on that repository."""
     call = f"import mutants; from pathlib import Path; mutants.main({['--jobs', '2', *options]}, "
     call += f"Path({str(repository)!r}), Path({str(table)!r}))"
     tools = Path(mutants.__file__).parent
@@ -95,7 +97,7 @@ def run(repository: Path, table: Path, *options: str) -> str:
 
 
 @pytest.mark.slow
-def test_faults_are_found_or_survive_and_a_run_goes_on(
+def test_mutants_are_killed_or_survive_and_a_run_continues(
     repository: Path, tmp_path: Path
 ) -> None:
     table = tmp_path / "out" / "mutants.csv"
@@ -112,8 +114,8 @@ def test_faults_are_found_or_survive_and_a_run_goes_on(
     ) in rows
     assert ("return x / scale", "survived") not in rows
     assert (repository / "distfilt" / "a.py").read_text() == LIBRARY
-    whole = table.read_text()
-    reasoned = re.sub(r"^(.*,survived,.*)$", r"\1dead code", whole, flags=re.M)
+    text = table.read_text()
+    reasoned = re.sub(r"^(.*,survived,.*)$", r"\1dead code", text, flags=re.M)
     table.write_text(reasoned)
     assert run(repository, table, "--sample", "50").count("distfilt/a.py") == 0
-    assert table.read_text() == reasoned and whole.count(",survived,") > 0
+    assert table.read_text() == reasoned and text.count(",survived,") > 0

@@ -6,25 +6,26 @@ import numpy as np
 
 
 def rng_of(seed: int = 0) -> np.random.Generator:
+    """Return a generator."""
     return np.random.default_rng(seed)
 
 
 def samples(
     seed: int, n: int = 60, m: int = 2, d: int = 3, leading: tuple[int, ...] = ()
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Correlated, shifted, badly scaled samples (y, x)."""
+    """Draw correlated, shifted, badly scaled samples (y, x)."""
     rng = rng_of(seed)
     mixing = rng.standard_normal((m + d, m + d)) * np.logspace(-1, 1, m + d)
-    z = rng.standard_normal((*leading, n, m + d)) @ mixing + 10 * rng.standard_normal(
-        m + d
-    )
+    z = rng.standard_normal((*leading, n, m + d)) @ mixing
+    z += 10 * rng.standard_normal(m + d)
     return z[..., :m], z[..., m:]
 
 
 def banana(
     seed: int, n: int = 400, leading: tuple[int, ...] = ()
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Members on a parabola, noisy sights of the second component, and the normals behind them."""
+    """Draw members on a parabola: noisy observations of x_2, members, and their normals."""
     u = rng_of(seed).standard_normal((*leading, n, 3))
     x = np.stack([u[..., 0], 0.5 * u[..., 1] + u[..., 0] ** 2], axis=-1)
-    return x[..., 1:] + 0.3 * u[..., 2:], x, u[..., :2]
+    y = x[..., 1:] + 0.3 * u[..., 2:]
+    return y, x, u[..., :2]

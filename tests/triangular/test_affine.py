@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import cvxpy
 import numpy as np
@@ -20,7 +21,8 @@ _Y = np.random.default_rng(8).standard_normal((20, 1))
 
 
 @given(st.integers(0, 10_000), st.integers(0, 4), st.integers(1, 5))
-def test_map_whitens_and_inverts(seed: int, m: int, d: int) -> None:
+def test_a_map_whitens_and_inverts(seed: int, m: int, d: int) -> None:
+    """The reference samples have mean zero and covariance I, and the inverse gives x back."""
     y, x = samples(seed, 60, m, d)
     s = fit(y, x)
     z = s(y, x)
@@ -29,54 +31,64 @@ def test_map_whitens_and_inverts(seed: int, m: int, d: int) -> None:
     assert np.allclose(s.inverse(y, z), x, rtol=1e-9, atol=1e-9)
 
 
-def test_map_log_det_and_objective_are_batched() -> None:
+def test_maps_are_batched() -> None:
+    """A map of a batch is, ensemble by ensemble, the map of that ensemble."""
     y, x = samples(3, leading=(2, 4))
-    whole = fit(y, x)
-    one = fit(y[1, 2], x[1, 2])
-    part = (y[1, 2], x[1, 2])
-    assert np.allclose(whole(y, x)[1, 2], one(*part), atol=1e-12)
-    assert np.allclose(whole.log_det(y, x)[1, 2], one.log_det(*part))
-    assert np.allclose(objective(whole, y, x)[1, 2], objective(one, *part), atol=1e-12)
+    batch = fit(y, x)
+    ensemble = (y[1, 2], x[1, 2])
+    single = fit(*ensemble)
+    assert np.allclose(batch(y, x)[1, 2], single(*ensemble), atol=1e-12)
+    assert np.allclose(batch.log_det(y, x)[1, 2], single.log_det(*ensemble))
+    values = objective(batch, y, x)
+    assert np.allclose(values[1, 2], objective(single, *ensemble), atol=1e-12)
 
 
 @given(st.integers(0, 10_000))
-def test_log_det_is_the_derivative_s(seed: int) -> None:
-    """Finite differences of the map: it is affine, so they are exact up to rounding."""
+def test_log_det_is_that_of_the_derivative(seed: int) -> None:
+    """Differences of the map are exact up to rounding, since it is affine; and triangular."""
     y, x = samples(seed)
     s = fit(y, x)
-    moved = x[0] + np.eye(3)
-    base = s(y[:1], x[:1])
-    columns = s(np.repeat(y[:1], 3, axis=0), moved) - base
-    assert np.isclose(
-        np.linalg.slogdet(columns)[1], s.log_det(y, x)[0], rtol=1e-9, atol=1e-9
-    )
-    assert np.allclose(np.tril(columns.T), columns.T, atol=1e-9)
+    shifted = x[0] + np.eye(3)
+    rows = s(np.repeat(y[:1], 3, axis=0), shifted) - s(y[:1], x[:1])
+    derivative = rows.T
+    log_det = np.linalg.slogdet(derivative)[1]
+    assert np.isclose(log_det, s.log_det(y, x)[0], rtol=1e-9, atol=1e-9)
+    assert np.allclose(np.tril(derivative), derivative, atol=1e-9)
 
 
-def test_rows_and_moments_are_one_map() -> None:
+def test_coefficients_and_moments_give_the_same_map() -> None:
+    """S = c + B y + A x with A = L^-1, B = -L^-1 K and c = L^-1 (K mean(y) - mean(x))."""
     y, x = samples(21, m=2, d=3)
     s = fit(y, x)
-    rows = np.linalg.solve(s.scale, np.hstack([-s.gain, np.eye(3)]))
-    rows[:, 2:] = np.tril(rows[:, 2:])
+    coefficients = np.linalg.solve(s.scale, np.hstack([-s.gain, np.eye(3)]))
+    coefficients[:, 2:] = np.tril(coefficients[:, 2:])
     offset = np.linalg.solve(s.scale, s.gain @ s.observed_mean - s.mean)
-    again = affine.from_rows(np.hstack([offset[:, None], rows]), np.array([5.0, -3.0]))
+    rows = np.hstack([offset[:, None], coefficients])
+    # About any y, here another than the mean.
+    again = affine.from_rows(rows, np.array([5.0, -3.0]))
     assert np.allclose(again(y, x), s(y, x), atol=1e-7)
 
 
+# ------------------------------------------------------------------------ the convex program
+
+
 def test_the_program_is_compiled_once_for_each_size() -> None:
+    """Two fits of two components compile two programs; the composed map is the exact one's."""
     _compile_program.cache_clear()
     for seed in (1, 2):
         y, x = samples(seed, m=1, d=2)
-        y = (y - y.mean(0)) / y.std(0)
-        x = (x - x.mean(0)) / x.std(0)
-        gap = compose(fit(y, x), y, x, y[0]) - compose(fit_convex(y, x), y, x, y[0])
-        assert np.abs(gap).max() < 1e-6
+        y = (y - y.mean(axis=0)) / y.std(axis=0)
+        x = (x - x.mean(axis=0)) / x.std(axis=0)
+        exact = compose(fit(y, x), y, x, y[0])
+        solved = compose(fit_convex(y, x), y, x, y[0])
+        assert np.abs(exact - solved).max() < 1e-6
     info = _compile_program.cache_info()
-    assert (info.misses, info.hits) == (2, 2) and info.maxsize is not None
+    assert (info.misses, info.hits) == (2, 2)
+    assert info.maxsize is not None
 
 
-def test_the_program_forgets_the_samples_before() -> None:
-    """The same samples, after others and under another solver: the same bits."""
+def test_the_program_does_not_depend_on_earlier_samples() -> None:
+    """After other samples, and after another solver, the same samples give the same bits."""
     y, x = samples(3, m=1, d=2)
     first = fit_convex(y, x)
     fit_convex(*samples(4, m=1, d=2))
@@ -85,62 +97,78 @@ def test_the_program_forgets_the_samples_before() -> None:
 
 
 @pytest.mark.parametrize(
+    ("solver", "limit"), [("ECOS", "max_iters"), ("CLARABEL", "max_iter")]
+)
+def test_a_solver_that_stops_early_raises_its_status(
+    monkeypatch: pytest.MonkeyPatch, solver: str, limit: str
+) -> None:
+    """After one iteration, with the component's number."""
+    solve = cvxpy.Problem.solve
+
+    def solve_once(problem: cvxpy.Problem, **options: Any) -> Any:
+        return solve(problem, **options, **{limit: 1})
+
+    monkeypatch.setattr(cvxpy.Problem, "solve", solve_once)
+    with pytest.raises(SolverError, match=f"{solver}: component 2"):
+        fit_convex(_Y, _X, solver=solver)
+
+
+# ----------------------------------------------------------------------------------- errors
+
+
+@pytest.mark.parametrize(
     ("name", "y", "x"),
     [
+        # Too few members.
         ("x", _Y[:3], _X[:3]),
+        # A repeated variable, of x and of y.
         ("x", _Y, _X[:, [0, 0]]),
         ("x", _X[:, :1], _X),
-        ("x", _Y, np.column_stack([_X, np.full(20, 0.1)])),
         ("y", _Y @ [[1.0, 0.3]], _X),
+        # A constant variable.
+        ("x", _Y, np.column_stack([_X, np.full(20, 0.1)])),
         ("y", np.zeros((20, 1)), _X),
+        # Other leading axes.
         ("y", _Y[None], _X),
     ],
 )
-def test_samples_without_a_map_are_blamed(
+def test_samples_without_a_map_are_refused_by_name(
     name: str, y: np.ndarray, x: np.ndarray
 ) -> None:
-    """Too few, constant, or combinations of others."""
+    """By both estimators."""
     for estimator in (fit, partial(separable.fit, order=0)):
         with pytest.raises(ValueError, match=f"^{name} must"):
             estimator(y, x)
 
 
-def test_a_repeated_variable_s_rounding_is_no_variance() -> None:
-    almost = np.array([[4.0, 4.0], [4.0, 4.0 + 4e-15]])  # which has a factor
-    assert np.linalg.cholesky(almost)[1, 1] > 0
-    with pytest.raises(ValueError, match="x must .* not combinations of others"):
-        affine.from_moments(np.ones(2), almost, 1)
+def test_the_rounding_of_a_repeated_variable_is_no_variance() -> None:
+    """Such a covariance may have a Cholesky factor."""
+    covariance = np.array([[4.0, 4.0], [4.0, 4.0 + 4e-15]])
+    assert np.linalg.cholesky(covariance)[1, 1] > 0
+    with pytest.raises(ValueError, match=r"x must .* not combinations of others"):
+        affine.from_moments(np.ones(2), covariance, 1)
 
 
-@pytest.mark.parametrize(
-    ("solver", "limit"), [("ECOS", "max_iters"), ("CLARABEL", "max_iter")]
-)
-def test_a_solver_that_stops_short_raises_its_status(
-    monkeypatch: pytest.MonkeyPatch, solver: str, limit: str
-) -> None:
-    solve = cvxpy.Problem.solve
-    monkeypatch.setattr(
-        cvxpy.Problem,
-        "solve",
-        lambda problem, **options: solve(problem, **options, **{limit: 1}),
-    )
-    with pytest.raises(SolverError, match=f"{solver}: component 2"):
-        fit_convex(_Y, _X, solver=solver)
+def test_samples_of_another_size_than_the_map_are_refused() -> None:
+    """By `objective` itself, before the map is evaluated."""
+    s = fit(_Y, _X)
+    with pytest.raises(ValueError, match="^x must"):
+        objective(s, _Y, _X[:, :1])
+    with pytest.raises(ValueError, match="^y must"):
+        objective(s, _X, _X)
 
 
-def _enkf(y: np.ndarray, x: np.ndarray, observed: np.ndarray) -> np.ndarray:
-    """The textbook formula x + Σxy Σyy^-1 (y* - y), one ensemble."""
-    joint = np.cov(np.hstack([x, y]), rowvar=False)
-    d = x.shape[1]
-    gain = joint[:d, d:] @ np.linalg.inv(joint[d:, d:])
-    return x + (observed - y) @ gain.T
+# ---------------------------------------------------------------------------- Kalman filter
 
 
 @given(st.integers(0, 10_000), st.integers(1, 4), st.integers(1, 5))
-def test_composed_affine_map_is_the_enkf(seed: int, m: int, d: int) -> None:
+def test_the_composed_affine_map_is_the_enkf(seed: int, m: int, d: int) -> None:
+    """x + C_xy C_yy^-1 (y* - y), up to the condition of C_yy."""
     y, x = samples(seed, 60, m, d)
     observed = rng_of(seed + 1).standard_normal(m)
-    condition = np.linalg.cond(np.cov(y, rowvar=False).reshape(m, -1))
-    ours = compose(fit(y, x), y, x, observed)
-    theirs = _enkf(y, x, observed)
-    assert np.abs(ours - theirs).max() < 1e-12 * max(1, np.abs(theirs).max(), condition)
+    joint = np.cov(np.hstack([x, y]), rowvar=False)
+    gain = joint[:d, d:] @ np.linalg.inv(joint[d:, d:])
+    expected = x + (observed - y) @ gain.T
+    composed = compose(fit(y, x), y, x, observed)
+    unit = max(1, np.abs(expected).max(), np.linalg.cond(joint[d:, d:]))
+    assert np.abs(composed - expected).max() < 1e-12 * unit

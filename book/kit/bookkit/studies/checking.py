@@ -143,10 +143,10 @@ def _differences(
         return [f"trial {i}: stored {was}, now {now}"] if was != now else []
     texts = []
     names = tuple(stored.columns)
-    for name, now in zip(names, row(study.values[k], names), strict=True):
-        was = float(stored.columns[name][i])
-        if not _same(was, now, rtol, allowed[name]):
-            texts.append(f"trial {i}: {name} stored {was!r}, now {now!r}")
+    for name, value in zip(names, row(study.values[k], names), strict=True):
+        reference = float(stored.columns[name][i])
+        if not _same(reference, value, rtol, allowed[name]):
+            texts.append(f"trial {i}: {name} stored {reference!r}, now {value!r}")
     return texts
 
 

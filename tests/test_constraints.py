@@ -1,11 +1,14 @@
-"""Doors: what the kinds let through and refuse, how shapes are bound, records, and ways round."""
+"""Constraints of annotations, binding of shapes, frozen models, and how checks are skipped."""
 
 from __future__ import annotations
 
+import importlib
 import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -15,11 +18,13 @@ from hypothesis import strategies as st
 from typing_extensions import TypeAliasType
 
 from distfilt import validation
-from distfilt.validation.annotations import Scope, kind_of
+from distfilt.validation import first_use
+from distfilt.validation.annotations import CallContext, make_constraint
+from distfilt.validation.batching import call_batched
 from tests.support import ASYMMETRIC, INDEFINITE, NAN, generator, spd, without_checks
 
 MASKED = np.ma.masked_array([1.0, 2.0], [False, True])
-ODD = (
+NOT_REAL = (
     ["1.0"],
     "three",
     True,
@@ -37,13 +42,13 @@ ODD = (
     [[1.0, 2.0], [3.0]],
     [10**400],
 )
-KINDS: list[tuple[Any, Sequence[Any], Sequence[Any]]] = [
-    (float, [1, 2.5, np.float32(0.5), np.array(2.0)], [*ODD, NAN, np.inf, [1.0]]),
+CONSTRAINTS: list[tuple[Any, Sequence[Any], Sequence[Any]]] = [
+    (float, [1, 2.5, np.float32(0.5), np.array(2.0)], [*NOT_REAL, NAN, np.inf, [1.0]]),
     (validation.PositiveFloat, [0.5], [0, -1.0]),
     (Annotated[float, validation.Bounds(at_least=0, below=1)], [0, 0.5], [-0.1, 1.0]),
     (int, [3, np.int64(3)], [2.0, True, "2", np.timedelta64(2), np.array([2])]),
     (validation.PositiveInt, [1], [0]),
-    (bool, [True], [1, "yes"]),
+    (bool, [True, np.True_], [1, np.int64(1), "yes"]),
     (str, ["a"], ["", " ", 3]),
     (Literal["a", "b"], ["a"], ["c", None, [], np.array(["a", "b"])]),
     (validation.Rng, [generator()], [None, np.random.RandomState(0)]),
@@ -60,12 +65,12 @@ KINDS: list[tuple[Any, Sequence[Any], Sequence[Any]]] = [
     (
         Annotated[validation.Array, "2 N"],
         [[[1, 2], [3, 4]], np.zeros((2, 0))],
-        [*ODD, [1.0, 2.0], [[1, NAN]]],
+        [*NOT_REAL, [1.0, 2.0], [[1, NAN]]],
     ),
     (
         Annotated[TypeAliasType("Row", validation.Array), "2"],
         [[1, 2], np.ones(2)],
-        [*ODD, [1.0], [1, NAN]],
+        [*NOT_REAL, [1.0], [1, NAN]],
     ),
     (
         Annotated[validation.Array, "m", validation.ALLOW_NAN],
@@ -96,32 +101,40 @@ KINDS: list[tuple[Any, Sequence[Any], Sequence[Any]]] = [
 ]
 
 
-@pytest.mark.parametrize(("annotation", "good", "bad"), KINDS, ids=range(len(KINDS)))
-def test_a_kind_lets_through_and_refuses(annotation: Any, good: Any, bad: Any) -> None:
-    kind = kind_of(annotation)
-    assert kind is not None
-    for value in good:
-        out = kind.check(value, "x", Scope({}))
-        np.testing.assert_array_equal(out, value)
-    for value in bad:
+@pytest.mark.parametrize(
+    ("annotation", "valid", "invalid"), CONSTRAINTS, ids=range(len(CONSTRAINTS))
+)
+def test_a_constraint_accepts_and_refuses(
+    annotation: Any, valid: Any, invalid: Any
+) -> None:
+    constraint = make_constraint(annotation)
+    assert constraint is not None
+    for value in valid:
+        result = constraint.validate(value, "x", CallContext({}))
+        np.testing.assert_array_equal(result, value)
+    for value in invalid:
         with pytest.raises(ValueError, match="^x must .*got "):
-            kind.check(value, "x", Scope({}))
+            constraint.validate(value, "x", CallContext({}))
+
+
+def test_messages_name_numpy_s_types() -> None:
+    """A reader of "got bool" would search for a bool of Python's."""
+    for annotation in (int, float, validation.Array):
+        constraint = make_constraint(annotation)
+        assert constraint is not None
+        with pytest.raises(ValueError, match=r"got np\.bool$"):
+            constraint.validate(np.True_, "x", CallContext({}))
 
 
 def test_numbers_are_converted_and_arrays_are_not_copied() -> None:
     x = np.zeros((3, 4))
     assert validation.check_array(x, "x", (..., "N", 4)) is x
-    for given_ in (
-        [[1, 2]],
-        np.array([[1, 2]], dtype=np.int32),
-        np.array([[1, 2]], dtype=">f8"),
-    ):
-        out = validation.check_array(given_, "x", (1, 2))
-        assert (
-            type(out) is np.ndarray
-            and out.dtype == np.float64
-            and out.tolist() == [[1.0, 2.0]]
-        )
+    integers = np.array([[1, 2]], dtype=np.int32)
+    swapped_bytes = np.array([[1, 2]], dtype=">f8")
+    for value in ([[1, 2]], integers, swapped_bytes):
+        result = validation.check_array(value, "x", (1, 2))
+        assert type(result) is np.ndarray and result.dtype == np.float64
+        assert result.tolist() == [[1.0, 2.0]]
     with pytest.raises(
         ValueError, match=r"^x must have shape \(\.\.\., N, 2\), got \(3,\)$"
     ):
@@ -130,14 +143,14 @@ def test_numbers_are_converted_and_arrays_are_not_copied() -> None:
 
 @dataclass(frozen=True, eq=False)
 class Line(validation.FrozenModel):
-    """A record with a shape bound by another field, an option, and a method with a door."""
+    """A frozen model: a shape bound by another field, an option, and a validated method."""
 
     dim: validation.PositiveInt
     cov: Annotated[validation.PositiveDefinite, "dim dim"]
     parts: tuple[validation.Array, ...] = field(default=(), kw_only=True)
 
     @validation.validated
-    def moved(
+    def shift(
         self, x: Annotated[validation.Array, "... self.dim"], by: float = 1.0
     ) -> validation.Array:
         return x + by
@@ -145,7 +158,7 @@ class Line(validation.FrozenModel):
 
 def test_shapes_are_bound_by_arguments_fields_and_paths() -> None:
     @validation.validated
-    def both(
+    def collect(
         x: Annotated[validation.Array, "N d"],
         y: Annotated[validation.Array, "N"],
         line: Line,
@@ -159,13 +172,13 @@ def test_shapes_are_bound_by_arguments_fields_and_paths() -> None:
         "line": Line(2, np.eye(2)),
         "z": np.ones((2, 4)),
     }
-    both(**fits)
+    collect(**fits)
     for name, bad in (("y", np.ones(4)), ("z", np.ones((3, 4))), ("line", 3)):
-        with pytest.raises(ValueError, match=f"^{name}: "):
-            both(**(fits | {name: bad}))
+        with pytest.raises(ValueError, match=f"^{name} must"):
+            collect(**(fits | {name: bad}))
 
 
-def test_records_copy_and_freeze_and_a_way_round_does_neither() -> None:
+def test_frozen_models_copy_and_freeze_arrays_and_construct_does_neither() -> None:
     cov = np.eye(2)
     line = Line(2, cov, parts=[cov[0]])
     cov[0, 0] = 9.0
@@ -174,32 +187,32 @@ def test_records_copy_and_freeze_and_a_way_round_does_neither() -> None:
     assert line.replace(dim=7).dim == 7 and pickle.loads(pickle.dumps(line)).dim == 2
 
 
-def test_the_way_round_a_door() -> None:
+def test_validation_can_be_skipped() -> None:
     line = Line(1, [[1.0]])
-    assert without_checks(line.moved)(np.ones(2)).tolist() == [2.0, 2.0]
-    assert without_checks(partial(line.moved, by=2.0))(np.ones(2)).tolist() == [
-        3.0,
-        3.0,
-    ]
+    assert without_checks(line.shift)(np.ones(2)).tolist() == [2.0, 2.0]
+    by_two = partial(line.shift, by=2.0)
+    assert without_checks(by_two)(np.ones(2)).tolist() == [3.0, 3.0]
 
 
-def test_a_partial_s_options_are_looked_at_where_it_is_handed_in() -> None:
+def test_a_partial_s_options_are_checked_where_it_is_an_argument() -> None:
     @validation.validated
     def apply(f: Callable[..., validation.Array], x: float) -> Any:
         return without_checks(f)(x)
 
-    scaled = validation.validated(lambda x, by: x * by)
-    scaled.plan.function.__annotations__ = {"by": validation.PositiveFloat}
-    assert apply(partial(scaled, by=2), 3.0) == 6.0
+    @validation.validated
+    def scale(x: Any, by: validation.PositiveFloat) -> Any:
+        return x * by
+
+    assert apply(partial(scale, by=2), 3.0) == 6.0
     with pytest.raises(ValueError, match="^by must be positive"):
-        apply(partial(scaled, by=-2), 3.0)
+        apply(partial(scale, by=-2), 3.0)
 
 
 @given(st.integers(0, 10_000), st.integers(1, 6))
 def test_covariances_pass_in_any_units(seed: int, d: int) -> None:
     rng = generator(seed)
-    size = 10.0 ** rng.uniform(-100, 100, (3, d))
-    cov = spd(rng, d, (3,)) * size[:, :, None] * size[:, None, :]
+    unit = 10.0 ** rng.uniform(-100, 100, (3, d))
+    cov = spd(rng, d, (3,)) * unit[:, :, None] * unit[:, None, :]
     for rule in (
         validation.check_positive_definite,
         validation.check_positive_semidefinite,
@@ -210,7 +223,7 @@ def test_covariances_pass_in_any_units(seed: int, d: int) -> None:
 @pytest.mark.parametrize(
     "rule", [validation.check_positive_definite, validation.check_positive_semidefinite]
 )
-def test_each_matrix_is_judged_alone_and_each_component_in_its_units(rule: Any) -> None:
+def test_each_matrix_is_checked_in_the_units_of_its_components(rule: Any) -> None:
     hidden = np.diag([1e12, 1.0, 1.0])
     hidden[1, 2] = hidden[2, 1] = 1.1
     for cov, words in (
@@ -226,7 +239,7 @@ def test_each_matrix_is_judged_alone_and_each_component_in_its_units(rule: Any) 
             rule(np.array(cov), "P")
 
 
-def test_rounding_is_no_asymmetry_and_no_negative_eigenvalue() -> None:
+def test_rounding_counts_neither_as_asymmetry_nor_as_a_negative_eigenvalue() -> None:
     validation.check_positive_definite(
         np.array([[1e12, 3e5], [3e5 * (1 + 1e-11), 1.0]]), "P"
     )
@@ -237,3 +250,85 @@ def test_rounding_is_no_asymmetry_and_no_negative_eigenvalue() -> None:
         validation.check_positive_semidefinite(
             np.array([[1.0, 1.0 + 1e-8], [1.0 + 1e-8, 1.0]]), "P"
         )
+
+
+# --- annotations as strings -------------------------------------------------------------------
+
+MODULE = """
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from distfilt.validation import PositiveFloat, validated
+
+if TYPE_CHECKING:
+    from fractions import Fraction as Ratio
+
+
+@validated
+def scale(ratio: Ratio, by: PositiveFloat = 1.0) -> float:
+    return float(ratio * by)
+
+
+@validated
+def fail(ratio: Nowhere) -> None: ...
+"""
+
+
+def test_names_imported_for_the_type_checker_are_checked_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Annotations are strings there; a name that exists nowhere is an error of the first call."""
+    (tmp_path / "checked_module.py").write_text(MODULE)
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module("checked_module")
+    assert not hasattr(module, "Ratio")
+    assert module.scale(Fraction(1, 2)) == 0.5
+    with pytest.raises(TypeError, match="^ratio must be a Fraction, got 0.5"):
+        module.scale(0.5)
+    with pytest.raises(NameError, match=r"'Nowhere' of ratio of fail\(\)"):
+        module.fail(1)
+
+
+# --- checks that are made once ----------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A user's function behind a frozen object that compares equal to its copies."""
+
+    step: Callable[..., Any]
+    dim: int = 2
+
+
+def test_a_frozen_owner_stays_unchanged_by_the_checks_of_its_function() -> None:
+    """The comparison of a batch with one state is made once for each object."""
+    shapes = []
+
+    def step(x: np.ndarray) -> np.ndarray:
+        shapes.append(x.shape)
+        return 2 * x
+
+    motion = Motion(step)
+    before = dict(vars(motion))
+    states = np.array([[1.0, 2.0], [3.0, 4.0]])
+    for _ in range(3):
+        call_batched(motion, "step", [states])
+    assert shapes == [(2, 2), (2,), (2, 2), (2, 2)]
+    assert vars(motion) == before
+    # An equal object is another owner, and the record of an owner goes with it.
+    assert first_use.needs_check(Motion(step), "step")
+    assert not first_use.needs_check(motion, "step")
+    key = id(motion)
+    del motion
+    assert key not in first_use._CHECKED
+
+
+def test_a_user_s_function_in_a_batched_call_gets_its_own_checks() -> None:
+    @validation.validated
+    def scale(x: validation.Array, by: validation.PositiveFloat) -> Any:
+        return by * x
+
+    wrong = Motion(lambda x: scale(x, -1.0))
+    with validation.skip_validation(), pytest.raises(ValueError, match="^by must be"):
+        call_batched(wrong, "step", [np.ones((3, 2))])

@@ -1,0 +1,182 @@
+"""The exchange between the agents in a step: of observations, and of beliefs by a fusion rule.
+
+:func:`collect_observations` lets the agents share what they observed, and sorts by time what each
+of them has. :func:`fuse_beliefs` applies the filter's fusion rule after the update.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..network import Channel
+from ..sensors import Sensor
+from ..validation import Array, call_user, check_array
+from .observations import Observation
+
+if TYPE_CHECKING:
+    from .step import Step
+
+__all__ = ["Known", "collect_observations", "fuse_beliefs"]
+
+Known = dict[float, list[list[tuple[Sensor, Array]]]]
+"""By time and then by agent: the sensors and values of the observations that the agent has."""
+
+
+def collect_observations(step: Step[Any]) -> Known:
+    """Share the step's observations, and sort by time what each agent has then.
+
+    An agent has its own observations and those that its neighbours sent, ordered by sender.
+    """
+    observed = [list(of_agent) for of_agent in step.observations]
+    for observation in step.delayed:
+        observed[observation.agent].append(observation)
+    sent = _choose_outgoing(step, observed)
+    inbox: list[dict[int, Any]] = [{} for _ in observed]
+    if sent:
+        payloads = [_pack(step, of_agent) for of_agent in sent]
+        inbox = step.channel.broadcast(payloads)
+    # Receivers know their neighbours' sensors, so only values travel.
+    labels = [_label(step, of_agent) for of_agent in sent or observed]
+    known: Known = {}
+    for agent, messages in enumerate(inbox):
+        for sender in sorted((agent, *messages)):
+            if sender == agent:
+                times_and_sensors = _label(step, observed[agent])
+                values = [observation.value for observation in observed[agent]]
+            else:
+                times_and_sensors = labels[sender]
+                values = _unpack(messages[sender])
+            for (t, sensor), value in zip(times_and_sensors, values, strict=False):
+                if t not in known:
+                    known[t] = [[] for _ in observed]
+                known[t][agent].append((sensor, value))
+    return known
+
+
+def _choose_outgoing(
+    step: Step[Any], observed: list[list[Observation]]
+) -> list[list[Observation]]:
+    """Choose what each agent sends now: nothing, or what it observed and what was pending.
+
+    Without a channel at this time, the observations wait in ``step.pending`` for the next one.
+    """
+    f = step.filter
+    if not f.share_observations or f.graph is None:
+        return []
+    waiting: tuple[Observation, ...] = step.state.pending
+    if step.channel is None:
+        if f.lag:
+            # Copies, since the user's array may change before it is sent.
+            new = [
+                observation.replace(value=observation.value.copy())
+                for of_agent in observed
+                for observation in of_agent
+            ]
+            step.pending = (*waiting, *new)
+        return []
+    outgoing: list[list[Observation]] = [[] for _ in observed]
+    for observation in waiting:
+        if observation.t not in step.times:
+            raise ValueError(
+                f"lag must reach back to t = {observation.t:g}, the time of an observation "
+                f"that is sent at the contact at t = {step.t:g}, got {f.lag}"
+            )
+        outgoing[observation.agent].append(observation)
+    return [old + new for old, new in zip(outgoing, observed, strict=True)]
+
+
+def _pack(step: Step[Any], observations: list[Observation]) -> Any:
+    """Pack an agent's observations into one payload; None if there is none.
+
+    The usual case, one present observation of the agent's first sensor, is its value alone.
+    Otherwise a last part holds the time, the number of the sensor and the metadata of each.
+    """
+    if not observations:
+        return None
+    numbers: list[float] = []
+    for observation in observations:
+        number = observation.sensor if isinstance(observation.sensor, int) else -1
+        numbers += [observation.t, number, *observation.metadata]
+    if len(observations) == 1 and numbers in ([step.t, 0], [step.t, -1]):
+        return observations[0].value
+    labels = np.broadcast_to(np.array(numbers), (*step.runs, len(numbers)))
+    return (*[observation.value for observation in observations], labels)
+
+
+def _unpack(payload: Any) -> Sequence[Array]:
+    """Return the values of a payload; the part behind them only counts as communication."""
+    return payload[:-1] if type(payload) is tuple else (payload,)
+
+
+def _label(
+    step: Step[Any], observations: list[Observation]
+) -> list[tuple[float, Sensor]]:
+    """Return the time and the sensor of each observation."""
+    labels = []
+    for observation in observations:
+        sensor = observation.sensor
+        if not isinstance(sensor, Sensor):
+            sensor = step.filter.agent_sensors[observation.agent][sensor]
+        labels.append((observation.t, sensor))
+    return labels
+
+
+def fuse_beliefs(step: Step[Any], values: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Apply the filter's fusion rule to values (*runs, A, ...).
+
+    The rule gets all runs at once. If it raises, each run is fused alone. Failed runs keep their
+    values.
+    """
+    # A failed run's values may make the rule fail again, so those of a good run stand in.
+    good = tuple(np.argwhere(~step.failed)[0])
+    inputs = [step.keep_failed(v, v[good]).copy() for v in values]
+    run_numbers = np.arange(math.prod(step.runs)).reshape(step.runs)
+    channel = step.channel
+    ledger = channel.ledger
+    # The channels of the attempts that went through, each with the same ledger before.
+    used: list[Channel] = []
+
+    def fuse_runs(*arrays: Any) -> tuple[Array, ...]:
+        *beliefs, numbers, _, _ = arrays
+        attempt = channel.for_run(numbers, ledger)
+        results = _apply_rule(step.filter.fusion, beliefs, attempt)
+        used.append(attempt)
+        return results
+
+    results = step.apply(fuse_runs, (*inputs, run_numbers), values)
+    if used:
+        step.channel = _merge_channels(channel, used, run_numbers)
+    if not step.any_failed:
+        return results
+    pairs = zip(results, values, strict=True)
+    return tuple([step.keep_failed(new, old) for new, old in pairs])
+
+
+def _apply_rule(rule: Any, beliefs: list[Array], channel: Channel) -> tuple[Array, ...]:
+    """Call a fusion rule, with one array or a tuple of them, and check its results."""
+    is_single = len(beliefs) == 1
+    fused = call_user(rule, beliefs[0] if is_single else tuple(beliefs), channel)
+    results = (fused,) if is_single else tuple(fused)
+    if len(results) != len(beliefs):
+        raise ValueError(
+            f"fusion must return {len(beliefs)} arrays, got {len(results)}"
+        )
+    pairs = zip(results, beliefs, strict=True)
+    return tuple([check_array(new, "fusion", old.shape) for new, old in pairs])
+
+
+def _merge_channels(before: Channel, used: list[Channel], run_numbers: Any) -> Channel:
+    """Return the channel whose ledger counts the fusion once.
+
+    A batch is charged like one run. If only single runs could be fused, their messages cost the
+    same, and the lost ones are averaged as a batch's would be.
+    """
+    for_batch = [channel for channel in used if channel.runs == run_numbers.shape]
+    if for_batch:
+        return for_batch[-1]
+    lost = np.mean([channel.ledger.lost for channel in used], axis=0)
+    return before.for_run(run_numbers, used[-1].ledger.replace(lost=lost))

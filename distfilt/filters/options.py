@@ -1,0 +1,141 @@
+"""The options that a family of filters can offer: one class for each.
+
+A family derives from :class:`~distfilt.filters.SensorFilter` and from the classes of the options
+that it offers. The other options are no arguments of its constructor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import KW_ONLY, dataclass
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
+
+from ..validation import (
+    NonNegativeInt,
+    PositiveFloat,
+    validated,
+)
+from .base import Filter
+from .observations import Observation
+from .plans import TimesArgument
+from .record import SCORES, Score, Truth
+from .states import State
+
+if TYPE_CHECKING:
+    import xarray
+
+__all__ = [
+    "ExchangesAtIntervals",
+    "FusesBeliefs",
+    "IsolatesRuns",
+    "KeepsPast",
+    "SharesObservations",
+]
+
+S = TypeVar("S", bound=State)
+
+
+@dataclass(frozen=True, eq=False)
+class FusesBeliefs(Filter[S]):
+    """A filter whose agents fuse their beliefs after the update.
+
+    Parameters
+    ----------
+    fusion : callable, optional
+        ``fusion(belief, channel) -> belief``; the form of the belief is the family's. A rule of
+        this package that fuses another kind of belief is refused.
+    """
+
+    _: KW_ONLY
+    fusion: Callable[..., Any] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SharesObservations(Filter[S]):
+    """A filter whose agents can send their observations to their neighbours.
+
+    Parameters
+    ----------
+    share_observations : bool
+        Whether they do; the neighbours assimilate them too.
+    """
+
+    _: KW_ONLY
+    share_observations: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class ExchangesAtIntervals(Filter[S]):
+    """A filter whose agents may exchange at some times only.
+
+    Parameters
+    ----------
+    exchange_interval : float, optional
+        Agents exchange once in so many seconds; in every step by default. Observations wait until
+        then and are sent as delayed ones, so that a `lag` has to reach back to them.
+    """
+
+    _: KW_ONLY
+    exchange_interval: PositiveFloat | None = None
+
+    def is_exchange_time(self, t_before: float, t: float) -> bool:
+        """Whether a multiple of the interval lies after `t_before` and not after `t`."""
+        if self.exchange_interval is None:
+            return True
+        # To rounding: a sum of steps may fall short of the multiple.
+        tolerance = 1e-9 + 1e-15 * abs(t / self.exchange_interval)
+        number = math.floor(t / self.exchange_interval + tolerance)
+        return number > math.floor(t_before / self.exchange_interval + tolerance)
+
+
+@dataclass(frozen=True, eq=False)
+class IsolatesRuns(Filter[S]):
+    """A filter of many runs at once, in which one may fail without the others.
+
+    Parameters
+    ----------
+    on_error : {"raise", "keep"}
+        If one run of a batch fails, raise a :class:`FilterError` that names it; or let the other
+        runs go on and record the failed one as NaN. If a fusion rule raises, each run is fused
+        alone.
+    """
+
+    _: KW_ONLY
+    on_error: Literal["raise", "keep"] = "raise"
+
+
+@dataclass(frozen=True, eq=False)
+class KeepsPast(Filter[S]):
+    """A filter that keeps its beliefs about earlier times.
+
+    Parameters
+    ----------
+    lag : int
+        How many earlier times are kept, for delayed observations and for smoothing.
+    """
+
+    _: KW_ONLY
+    lag: NonNegativeInt = 0
+
+    @validated
+    def smooth(
+        self,
+        state: S,
+        times: TimesArgument,
+        observations: Any,
+        *,
+        truth: Truth = None,
+        scores: Collection[Score] = SCORES,
+        delayed: Sequence[Observation] = (),
+    ) -> xarray.Dataset:
+        """Fixed-lag smoothing: record of each time the belief when `lag` more have been observed.
+
+        Parameters and result are those of :meth:`run`. The filter needs a `lag`; near the end
+        fewer times follow, and the last estimate is the filter's.
+        """
+        if not self.lag:
+            raise ValueError("lag must be at least 1 for smoothing, got 0")
+        return self._record(
+            state, times, observations, truth, scores, delayed, self.lag
+        )

@@ -1,0 +1,173 @@
+"""Priors of any kind, as a Gaussian's moments, as members, or as mixtures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..ensembles import draw, sample_covariance
+from ..mixtures import GaussianMixture
+from ..validation import (
+    Array,
+    call_user,
+    check_array,
+    check_positive_definite,
+    check_positive_semidefinite,
+)
+
+if TYPE_CHECKING:
+    from typing import Protocol
+
+    class _Distribution(Protocol):
+        """A frozen distribution, such as scipy's multivariate_normal(mean, cov)."""
+
+        def rvs(self, size: Any = ..., random_state: Any = ...) -> Any: ...
+
+    _OnePrior = (
+        tuple[ArrayLike, ArrayLike]
+        | ArrayLike
+        | _Distribution
+        | GaussianMixture
+        | Callable[..., ArrayLike]
+    )
+    Prior = _OnePrior | Sequence[_OnePrior]
+else:
+    # Checked by the functions below, which convert it.
+    Prior = Any
+
+__all__ = ["Prior", "draw_members", "prior_mixtures", "prior_moments"]
+
+
+def _is_mean_and_cov(prior: Any) -> bool:
+    """Whether a prior is (mean, cov), and not a list of two members."""
+    if type(prior) is list:
+        for entry in prior:
+            if type(entry) is tuple and np.ndim(entry[-1]) > 1:
+                raise ValueError(
+                    "prior must be one for all agents, got a list of (mean, cov)"
+                )
+    if not isinstance(prior, tuple | list) or len(prior) != 2:
+        return False
+    return isinstance(prior, tuple) or np.ndim(prior[0]) < np.ndim(prior[1])
+
+
+def prior_moments(
+    prior: Prior, dim: int, definiteness: str = "semidefinite"
+) -> tuple[Array, Array]:
+    """Return the mean (d,) and covariance (d, d) of a prior that has them.
+
+    Parameters
+    ----------
+    prior : tuple, distribution, GaussianMixture or array_like
+        As for :meth:`distfilt.filters.Filter.start`.
+    dim : int
+        Size d of the state.
+    definiteness : {"semidefinite", "definite"}
+        What the covariance has to be.
+
+    Examples
+    --------
+    >>> from scipy.stats import multivariate_normal
+    >>> prior_moments(multivariate_normal([1.0], [[4.0]]), 1)
+    (array([1.]), array([[4.]]))
+    """
+    mean, cov = _find_moments(prior, dim)
+    mean = check_array(np.atleast_1d(mean), "prior", (dim,))
+    cov = check_array(cov, "prior")
+    is_variance = dim == cov.size == 1
+    if cov.shape != (dim, dim) and not is_variance:
+        raise ValueError(
+            f"prior must have a covariance of shape {(dim, dim)}, got {cov.shape}"
+        )
+    cov = cov.reshape(dim, dim)
+    if definiteness == "definite":
+        check_positive_definite(cov, "prior")
+    else:
+        check_positive_semidefinite(cov, "prior")
+    return mean, cov
+
+
+def _find_moments(prior: Any, dim: int) -> tuple[Any, Any]:
+    """Return the mean and covariance of a prior, unchecked."""
+    if isinstance(prior, GaussianMixture):
+        return prior.moments()
+    if hasattr(prior, "rvs"):
+        # A scalar distribution of scipy has a variance; either may be a method.
+        mean = prior.mean
+        cov = getattr(prior, "cov", None)
+        if cov is None:
+            cov = getattr(prior, "var", None)
+        return mean() if callable(mean) else mean, cov() if callable(cov) else cov
+    if _is_mean_and_cov(prior):
+        mean, cov = prior
+        return mean, cov
+    if callable(prior) or np.ndim(prior) != 2:
+        kind = "a function" if callable(prior) else type(prior).__name__
+        raise ValueError(
+            f"prior must be (mean, cov), or have a mean and a covariance, got {kind}"
+        )
+    members = check_array(prior, "prior", ("N", dim))
+    if len(members) <= dim:
+        raise ValueError(f"prior must have more than {dim} members, got {len(members)}")
+    return members.mean(axis=0), sample_covariance(members)
+
+
+def draw_members(
+    prior: Prior,
+    members: int,
+    leading: tuple[int, ...],
+    dim: int,
+    rng: np.random.Generator,
+) -> Array:
+    """Draw members (*leading, N, d) of a prior of any kind that :meth:`Filter.start` accepts.
+
+    >>> draw_members(([0.0], [[1.0]]), 5, (2,), 1, np.random.default_rng(0)).shape
+    (2, 5, 1)
+    """
+    shape = (*leading, members, dim)
+    if _is_mean_and_cov(prior):
+        mean, cov = prior_moments(prior, dim)
+        return draw(mean, cov, members, rng=rng, leading=leading)
+    given: Any = prior
+    if hasattr(given, "rvs"):
+        # scipy's name of the generator, and this package's.
+        keyword = "rng" if isinstance(given, GaussianMixture) else "random_state"
+        drawn = given.rvs(math.prod(shape[:-1]), **{keyword: rng})
+        return check_array(drawn.reshape(*shape[:-1], -1), "prior", shape)
+    if callable(given):
+        given = call_user(given, members, rng=rng, leading=leading)
+    ensemble = check_array(given, "prior", (..., members, dim))
+    if ensemble.shape != shape and ensemble.shape != shape[-2:]:
+        raise ValueError(
+            f"prior must have shape {shape} or {shape[-2:]}, got {ensemble.shape}"
+        )
+    return np.broadcast_to(ensemble, shape).copy()
+
+
+def prior_mixtures(
+    prior: Prior, dim: int, n_agents: int
+) -> tuple[GaussianMixture, ...]:
+    """Return a mixture for each agent, of one prior for all or of a list with one each.
+
+    >>> [mixture.n_components for mixture in prior_mixtures(([0.0], [[1.0]]), 1, 2)]
+    [1, 1]
+    """
+    priors: list[Any] = prior if isinstance(prior, list) else [prior] * n_agents
+    if len(priors) != n_agents:
+        raise ValueError(
+            f"prior must be one for all or for each of {n_agents}, got {len(priors)}"
+        )
+    mixtures = []
+    for one in priors:
+        if isinstance(one, GaussianMixture):
+            mixture = one
+        else:
+            mixture = GaussianMixture.gaussian(*prior_moments(one, dim, "definite"))
+        if mixture.dim != dim:
+            raise ValueError(f"prior must have dimension {dim}, got {mixture.dim}")
+        mixtures.append(mixture)
+    return tuple(mixtures)

@@ -1,0 +1,178 @@
+"""Proportional-integral estimators: consensus on the average of inputs that change in time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+
+from ..validation import (
+    Array,
+    Bounds,
+    FrozenModel,
+    PositiveFloat,
+    PositiveInt,
+    validated,
+)
+from .channel import Channel, PerAgent
+from .weights import _laplacian_weights
+
+__all__ = ["PIState", "pi_start", "pi_step", "stable_substeps"]
+
+_Gain = Annotated[float, Bounds(at_least=0, at_most=1e100)]
+
+
+@dataclass(frozen=True, eq=False)
+class PIState(FrozenModel):
+    """State of the agents' proportional-integral estimators.
+
+    Parameters
+    ----------
+    estimate, integral : ndarray, (*runs, A, k)
+        Each agent's estimate ν of the average input, and its integral η, which starts at zero.
+
+    Examples
+    --------
+    >>> pi_start([[1.0], [3.0]]).integral
+    array([[0.],
+           [0.]])
+    """
+
+    estimate: Annotated[Array, "... A k"]
+    integral: Annotated[Array, "... A k"]
+
+
+@validated
+def pi_start(estimate: Annotated[Array, "... A k"]) -> PIState:
+    """Return the state before the first step: initial estimates (*runs, A, k), integrals zero.
+
+    >>> pi_start([[1.0], [3.0]]).estimate.shape
+    (2, 1)
+    """
+    return PIState.construct(estimate.copy(), np.zeros_like(estimate))
+
+
+@validated
+def stable_substeps(
+    channel: Channel, dt: PositiveFloat, *, alpha: _Gain, a: _Gain, b: _Gain
+) -> int:
+    r"""Return the number of explicit steps in `dt` with which the estimator is stable.
+
+    An eigenvalue λ of the Laplacian contributes the matrix
+    :math:`\begin{pmatrix}-\alpha-a\lambda & b\lambda\\ -b\lambda & 0\end{pmatrix}`. Its eigenvalues
+    μ have a negative real part, and a step h is stable when :math:`|1+h\mu|<1` for all. The
+    largest λ is at most twice the largest degree (Gershgorin), which agents can agree on.
+
+    Parameters
+    ----------
+    channel, dt
+        A channel on the graph; the step, in s, positive.
+    alpha, a, b : float
+        The gains of :func:`pi_step`.
+
+    Returns
+    -------
+    int
+        A number for which h = `dt` / number is at most half of a bound of stability. At the bound a
+        mode oscillates for ever, with half of it the fastest mode does not oscillate at all.
+
+    Examples
+    --------
+    >>> from distfilt.network import Channel, graphs
+    >>> stable_substeps(Channel(graphs.complete(100)), 0.1, alpha=0.2, a=0.4, b=0.04)
+    8
+    """
+    if alpha + a == 0:
+        raise ValueError("alpha must be positive if a is 0, or nothing damps, got 0")
+    largest = 2 * float(channel.graph.in_degree.max())
+    # Without links and with alpha = 0 nothing moves, and any step will do.
+    damping = max(alpha + a * largest, 1e-300)
+    coupling = b * largest
+    # μ² + (α + a λ) μ + b² λ² = 0. Real roots lie within [-damping, 0]. Complex ones, where
+    # 2 b λ > α + a λ, have the modulus b λ and the real part -(α + a λ)/2, and |1 + h μ| < 1 for
+    # h < (α + a λ) / (b λ)²; the largest λ is the worst.
+    limit = 2 / damping
+    if 2 * coupling > damping:
+        limit = min(limit, damping / coupling**2)
+    return max(1, int(np.ceil(2 * dt / limit)))
+
+
+@validated
+def pi_step(
+    state: PIState,
+    inputs: PerAgent,
+    channel: Channel,
+    *,
+    dt: PositiveFloat,
+    alpha: _Gain,
+    a: _Gain,
+    b: _Gain,
+    rate: PerAgent | None = None,
+    substeps: PositiveInt | None = None,
+) -> PIState:
+    r"""Take one step of the proportional-integral estimator, equation (25) of Zheng et al.
+
+    .. math::
+        \dot{\boldsymbol\nu} = -\alpha(\boldsymbol\nu-\mathbf u) - a\mathbf L\boldsymbol\nu
+        + b\mathbf L^\top\boldsymbol\eta\;[+\dot{\mathbf u}],\qquad
+        \dot{\boldsymbol\eta} = -b\mathbf L\boldsymbol\nu
+
+    Without the term in brackets, as printed, the average of the estimates is a low-pass filter of
+    the average input and lags behind a ramp of slope s by exactly s/α. With it the estimates follow
+    the average without a lag.
+
+    Parameters
+    ----------
+    state : PIState
+        Not changed.
+    inputs : array_like, (*runs, A, k)
+        The agents' inputs u at the beginning of the step. Within the step they change by `rate`,
+        or not at all.
+    channel : Channel
+        Links both ways. Each substep is a round of 2k scalars a link. A link that loses a message
+        is not used in that round.
+    dt : float
+        The step, in s.
+    alpha, a, b : float
+        Gains, 1/s, at least 0: forgetting, proportional, integral.
+    rate : array_like, (*runs, A, k), optional
+        The inputs' derivative, for the term in brackets.
+    substeps : int, optional
+        Number of explicit steps; by default that of :func:`stable_substeps`.
+
+    Examples
+    --------
+    >>> from distfilt.network import Channel, graphs
+    >>> channel, state = Channel(graphs.path(2)), pi_start([[0.0], [4.0]])
+    >>> for _ in range(300):
+    ...     state = pi_step(
+    ...         state, [[0.0], [4.0]], channel, dt=0.1, alpha=1.0, a=1.0, b=1.0
+    ...     )
+    >>> state.estimate.ravel().round(6)
+    array([2., 2.])
+    """
+    channel.graph._check_undirected()
+    if state.estimate.shape != inputs.shape:
+        raise ValueError(
+            f"state must have shape {inputs.shape}, got {state.estimate.shape}"
+        )
+    nu = state.estimate
+    eta = state.integral
+    slope: Array | float = 0.0 if rate is None else rate
+    n = substeps or stable_substeps(channel, dt, alpha=alpha, a=a, b=b)
+    h = dt / n
+    k = inputs.shape[-1]
+    # One exchange of (ν, η): mixing with I - h L, less the values themselves, gives -h L of both.
+    weights = _laplacian_weights(channel.graph, h)
+    for j in range(n):
+        both = np.concatenate([nu, eta], axis=-1)
+        change = channel.mix(both, weights) - both
+        proportional = change[..., :k]
+        integral = change[..., k:]
+        # ν += h (α (u - ν) + u') - a h L ν + b h L η;  η -= b h L ν, with the old ν in both.
+        u = inputs + j * h * slope
+        drift = alpha * (u - nu) + slope
+        nu = nu + h * drift + a * proportional - b * integral
+        eta = eta + b * proportional
+    return PIState.construct(nu, eta)
